@@ -53,7 +53,9 @@
 #define GSF_VERSION "0.1.0"
 
 #ifndef GSF_API
-#ifdef GSFIXER_STATIC
+#if defined(GSFIXER_STATIC) && (defined(__GNUC__) || defined(__clang__))
+#define GSF_API static __attribute__((unused)) // a file need not call all of them
+#elif defined(GSFIXER_STATIC)
 #define GSF_API static
 #else
 #define GSF_API extern

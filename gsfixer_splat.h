@@ -300,6 +300,9 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 #ifndef GSF_SPLAT_IMPLEMENTED
 #define GSF_SPLAT_IMPLEMENTED
 
+#include "gsfixer.h" // again: internals and implementations, if all was included before without the macro
+#include "gsfixer_traj.h"
+
 #include <time.h>
 
 #ifdef GSF_USE_EMBREE

@@ -27,6 +27,8 @@ extern "C" {
 #ifndef GSF_TRAJ_IMPLEMENTED
 #define GSF_TRAJ_IMPLEMENTED
 
+#include "gsfixer.h" // again: its internals, if all was included before without an implementation macro
+
 GSF__BEGIN_IMPLEMENTATION
 
 GSF__END_IMPLEMENTATION
