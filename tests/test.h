@@ -44,6 +44,19 @@ static inline int test_check_result(gsf_context* ctx, int actual, int expected, 
                 gsf_describe_result((gsf_result)actual), gsf_describe_result((gsf_result)expected), ctx->error);
     return actual == expected;
 }
+
+// Zeroes and initialises a context; GSF_TEST_CPU=scalar|avx2 (environment) forces a cpu level. For hooks of your own
+// call test_context_zero, fill them in and call gsf_init_context.
+static inline void test_context_zero(gsf_context* ctx) {
+    memset(ctx, 0, sizeof *ctx);
+    const char* level = getenv("GSF_TEST_CPU");
+    if (level && strcmp(level, "scalar") == 0) ctx->cpu_level = GSF_CPU_SCALAR;
+    if (level && strcmp(level, "avx2") == 0) ctx->cpu_level = GSF_CPU_AVX2;
+}
+static inline void test_context_init(gsf_context* ctx) {
+    test_context_zero(ctx);
+    if (gsf_init_context(ctx) != GSF_OK) { fprintf(stderr, "gsf_init_context: %s\n", ctx->error); exit(2); }
+}
 #endif
 
 static inline int test_report(void) {
@@ -77,6 +90,38 @@ static inline const char* test_golden(const char* relative) {
     char* path = paths[turn++ & 7];
     snprintf(path, sizeof paths[0], "%s/%s", root, relative);
     return path;
+}
+
+// Path of a scratch file of this test program (its own folder in the build tree); static buffers as above.
+static inline const char* test_scratch(const char* name) {
+    static char paths[8][1024];
+    static int turn;
+#ifdef TEST_TMP
+    const char* root = TEST_TMP;
+#else
+    const char* root = ".";
+#endif
+    char* path = paths[turn++ & 7];
+    snprintf(path, sizeof paths[0], "%s/%s", root, name);
+    return path;
+}
+
+// Folder of the real photos (environment GSF_FOX, default data/fox in the shared folder beside the checkout), or NULL.
+// A test without them says so and returns TEST_SKIPPED, or goes on with a scene of its own making.
+static inline const char* test_fox(void) {
+    const char* root = getenv("GSF_FOX");
+    if (root && *root) return root;
+#ifdef TEST_SHARED
+    static char path[1024];
+    snprintf(path, sizeof path, "%s/data/fox/split.json", TEST_SHARED);
+    FILE* file = fopen(path, "rb");
+    if (file) {
+        fclose(file);
+        snprintf(path, sizeof path, "%s/data/fox", TEST_SHARED);
+        return path;
+    }
+#endif
+    return NULL;
 }
 
 static inline char* test_read_file(const char* path, size_t* size) { // exits when absent

@@ -1,0 +1,42 @@
+# cmake -D WAY=... -D SOURCE=... -D BUILD=... -D CC=... -P check.cmake: builds and runs the consumer project in one way.
+set(work "${BUILD}/tests/tmp/consumer_${WAY}")
+file(REMOVE_RECURSE "${work}")
+file(MAKE_DIRECTORY "${work}")
+get_filename_component(here "${CMAKE_CURRENT_LIST_FILE}" DIRECTORY)
+
+function(run)
+    execute_process(COMMAND ${ARGN} RESULT_VARIABLE result OUTPUT_VARIABLE output ERROR_VARIABLE output
+        WORKING_DIRECTORY "${work}")
+    if(NOT result EQUAL 0)
+        message(FATAL_ERROR "${ARGN}\nexit status ${result}\n${output}")
+    endif()
+    set(output "${output}" PARENT_SCOPE)
+endfunction()
+
+set(prefix "${work}/prefix")
+if(WAY MATCHES "find_package|pkg_config")
+    run("${CMAKE_COMMAND}" --install "${BUILD}" --prefix "${work}/first")
+    file(RENAME "${work}/first" "${prefix}") # an installed tree may be moved
+endif()
+
+if(WAY STREQUAL "pkg_config")
+    find_program(pkg_config NAMES pkg-config pkgconf)
+    if(NOT pkg_config)
+        message("SKIPPED: no pkg-config here")
+        return()
+    endif()
+    set(ENV{PKG_CONFIG_PATH} "${prefix}/share/pkgconfig")
+    run("${pkg_config}" --cflags gsfixer)
+    string(STRIP "${output}" cflags)
+    separate_arguments(cflags)
+    run("${pkg_config}" --libs gsfixer)
+    string(STRIP "${output}" libs)
+    separate_arguments(libs)
+    run("${CC}" -std=c11 ${cflags} "${here}/main.c" -o "${work}/consumer" ${libs})
+    run("${work}/consumer")
+else()
+    run("${CMAKE_COMMAND}" -S "${here}" -B "${work}/build" -D WAY=${WAY} "-DGSFIXER_SOURCE=${SOURCE}"
+        "-DCMAKE_PREFIX_PATH=${prefix}" "-DCMAKE_C_COMPILER=${CC}")
+    run("${CMAKE_COMMAND}" --build "${work}/build")
+    run("${work}/build/consumer")
+endif()

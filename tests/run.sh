@@ -1,0 +1,82 @@
+#!/usr/bin/env bash
+# tests/run.sh [CTEST ARGUMENTS]: everything there is to test, on a fresh Debian machine as well.
+#   build/        gcc, Release: all tests, and again with the scalar kernels; compile matrix; consumers; fuzz corpora
+#   build/asan/   clang, AddressSanitizer and UndefinedBehaviorSanitizer: all tests and fuzz corpora
+#   build/tsan/   clang, ThreadSanitizer: the threaded tests, on a pthread job system
+#   build/all/    one ctest run over the three; its log is build/all/Testing/Temporary/LastTest.log
+# What is missing is installed with apt-get (as root or by sudo); with everything there the network is not touched.
+# Photos beside the checkout (../shared/data/fox, or GSF_FOX=folder) are used where present, else those tests are skipped.
+# GSF_BUILD=folder builds elsewhere than in build/.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+root=$PWD
+build=${GSF_BUILD:-$root/build}
+jobs=$(nproc 2> /dev/null || echo 2)
+started=$SECONDS
+
+packages=(cmake make gcc g++ libc6-dev pkg-config clang-14 libclang-rt-14-dev libomp-14-dev libembree-dev libstb-dev libglm-dev
+    libopenimageio-dev)
+say() { printf '== %s\n' "$*"; }
+
+install_missing() {
+    command -v dpkg-query > /dev/null || { say "no dpkg here: what is missing has to be installed by hand"; return; }
+    local missing=() package
+    for package in "${packages[@]}"; do
+        [ "$(dpkg-query -W -f '${db:Status-Status}' "$package" 2> /dev/null || true)" = installed ] || missing+=("$package")
+    done
+    [ ${#missing[@]} -gt 0 ] || return 0
+    say "installing ${missing[*]}"
+    local as_root=()
+    if [ "$(id -u)" != 0 ]; then
+        command -v sudo > /dev/null || { echo "$0: not root and no sudo; install by hand: ${missing[*]}" >&2; exit 1; }
+        as_root=(sudo)
+    fi
+    "${as_root[@]}" apt-get update -q
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends "${missing[@]}"
+}
+
+mkdir -p "$build"
+# Output goes to a log, which is shown only if the step fails.
+step() { # LOG COMMAND...
+    local log=$build/$1.log
+    shift
+    "$@" > "$log" 2>&1 || { tail -n 60 "$log" >&2; echo "$0: failed: $* (whole log: $log)" >&2; exit 1; }
+}
+
+# ThreadSanitizer of clang 14 needs the old address space layout; kernels that randomise more bits kill it at start.
+tsan_launcher() {
+    local probe=$build/tsan_probe
+    printf 'int main(void) { return 0; }\n' > "$probe.c"
+    clang-14 -fsanitize=thread "$probe.c" -o "$probe"
+    local try
+    for try in 1 2 3 4 5; do
+        "$probe" 2> /dev/null || { echo "setarch;$(uname -m);-R"; return; }
+    done
+}
+
+build_tree() { # NAME SOURCE-RELATIVE-DIR CMAKE-ARGUMENT...
+    local name=$1 folder=$2
+    shift 2
+    say "building $name"
+    step "$name.configure" cmake -S "$root" -B "$folder" -DGSFIXER_WERROR=ON "$@"
+    step "$name.build" cmake --build "$folder" --parallel "$jobs"
+}
+
+install_missing
+clang=(-DCMAKE_C_COMPILER=clang-14 -DCMAKE_CXX_COMPILER=clang++-14 -DCMAKE_BUILD_TYPE=Sanitize "-DCMAKE_C_FLAGS=-O1 -g"
+    "-DCMAKE_CXX_FLAGS=-O1 -g" -DGSFIXER_BENCH=OFF)
+build_tree gcc "$build" -DCMAKE_C_COMPILER=gcc -DCMAKE_CXX_COMPILER=g++ -DCMAKE_BUILD_TYPE=Release -DGSFIXER_TEST_SCALAR=ON
+build_tree asan "$build/asan" "${clang[@]}" -DGSFIXER_SANITIZE=address,undefined -DGSFIXER_TEST_PREFIX=asan.
+build_tree tsan "$build/tsan" "${clang[@]}" -DGSFIXER_SANITIZE=thread -DGSFIXER_TEST_PREFIX=tsan. -DGSFIXER_OPENMP=OFF \
+    "-DCMAKE_CROSSCOMPILING_EMULATOR=$(tsan_launcher)"
+
+mkdir -p "$build/all"
+printf 'subdirs("%s" "%s" "%s")\n' "$build" "$build/asan" "$build/tsan" > "$build/all/CTestTestfile.cmake"
+say "built after $((SECONDS - started)) s; testing"
+export OMP_WAIT_POLICY=passive # several programs share the cores
+export ASAN_OPTIONS=${ASAN_OPTIONS:-detect_stack_use_after_return=1:allocator_may_return_null=1}
+export UBSAN_OPTIONS=${UBSAN_OPTIONS:-print_stacktrace=1}
+status=0
+(cd "$build/all" && ctest --output-on-failure --parallel "$jobs" "$@") > >(tee "$build/all/ctest.log") 2>&1 || status=$?
+wait
+exit "$status"
