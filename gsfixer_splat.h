@@ -16,7 +16,7 @@
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> where there is one, else <embree3/rtcore.h>
 
    SECTIONS    >>splats >>ply >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility >>embree
-               >>project >>bin >>raster forward >>raster backward >>project backward >>render
+               >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward >>render
                >>loss >>adam >>densify >>trainer >>warp >>fixer
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
@@ -1155,17 +1155,1514 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
 
 #endif // GSF_USE_EMBREE
 
+// ---- >>rasterizer state --------------------------------------------------------
+
+/* How a frame goes through:
+       project   every splat -> one 64-byte record (screen ellipse, colour) or radius 0
+       sort      visible splats by depth, ties by index (radix sort of the float's bits)
+       bin       in depth order into the lists of the 16x16 tiles that their ellipse meets; each (splat, tile) pair has a
+                 slot, numbered along the sorted splats, where backward leaves that tile's share of the gradient
+       forward   per tile, front to back, 8 pixels of a row at a time
+       backward  per tile: forward again, keeping alpha and T of every 8-pixel step; then back to front
+       gather    per splat: sum of its slots in tile order, then through the projection to the parameters
+   Each stage is a loop over a chunk grid that depends on sizes only, and every sum has one fixed order. */
+
+enum {
+    GSF__TILE = 16,
+    GSF__TILE_PIXELS = GSF__TILE * GSF__TILE,
+    GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 8 pixels of a row; step s: row s & 15, columns 8*(s >> 4) ...
+    GSF__SLOT_FLOATS = 12,
+    GSF__PROJECT_CHUNK = 256,
+    GSF__BUCKET = 4096,                  // kept steps per backward bucket
+};
+
+#define GSF__ALPHA_MAX 0.99f
+#define GSF__ALPHA_MIN (1.0f / 255.0f)
+#define GSF__T_MIN 1e-4f
+#define GSF__BLUR 0.3f
+#define GSF__LOG2_ALPHA_MIN (-7.99435344f)
+#define GSF__AA_FLOOR 2.5e-5f // squared compensation below which antialiasing no longer shrinks a splat
+
+// The ellipse in the coordinates that keep every digit for needles: with dy = y - v and e = (x - u) - kx*dy, the
+// exponent is a sum of two negative squares, log2(alpha) = ee*e*e + yy*dy*dy + log2_opacity. A row's extent is
+// |e| <= sqrt(h0 - h1*dy*dy).
+typedef struct gsf__record {
+    float u, v;            // pixel centres are integers here (COLMAP coordinate minus 0.5)
+    float kx, ee, yy, log2_opacity;
+    float h0, h1;
+    float r, g, b, depth;
+    float reach_x, reach_y; // half extents of the bounding box of alpha >= 1/255
+    float kx_inv;          // dy of the point of largest x, divided by reach_x
+    int32_t radius;        // official radius in pixels; 0 = not drawn
+} gsf__record;
+
+typedef struct gsf__tile_rect { int32_t x0, y0, x1, y1; } gsf__tile_rect; // tiles, end exclusive
+
+typedef struct gsf__step { // what backward keeps of 8 pixels
+    float alpha[8];        // before the 0.99 clamp; 0 where not blended
+    float T[8];            // transmittance in front of the splat
+} gsf__step;
+
+typedef struct gsf__step_head { uint32_t entry; uint32_t step; } gsf__step_head;
+
+typedef struct gsf__worker_scratch { // one per worker
+    gsf__step* steps;          // GSF__BUCKET + GSF__STEPS
+    gsf__step_head* heads;
+    float* checkpoints;        // T of the tile at each bucket's start
+    uint32_t* checkpoint_entry;
+    size_t checkpoint_capacity;
+} gsf__worker_scratch;
+
+struct gsf_rasterizer {
+    size_t splat_capacity;
+    gsf__record* records;      // per splat
+    int32_t* radii;            // per splat
+    uint32_t* visible;         // splat indices in depth order
+    uint32_t* visible_spare;
+    uint32_t* keys;
+    uint32_t* keys_spare;
+    size_t* slot_begin;        // per visible rank, + 1
+    size_t visible_count, pair_count;
+
+    size_t tile_capacity;      // of tile_begin
+    size_t* tile_begin;        // per tile, + 1
+    size_t count_capacity;
+    size_t* tile_counts;       // (chunks, tiles) while binning
+    size_t pair_capacity;
+    uint32_t* pair_rank;       // per tile list entry: rank in `visible`
+    size_t* pair_slot;         // per tile list entry
+    size_t slot_capacity;
+    float* slots;              // (pairs, GSF__SLOT_FLOATS)
+
+    size_t pixel_capacity;
+    float* final_T;            // per pixel, of the last render
+    float* depth_sum;          // per pixel: sum of w z
+    double* tile_background;   // (tiles, 3)
+    size_t tile_background_capacity;
+
+    int worker_count;
+    gsf__worker_scratch* workers;
+
+    // the last render
+    int32_t width, height, tiles_x, tiles_y, sh_bands;
+    size_t splat_count;
+    int has_depth;
+};
+
+GSF_API gsf_result gsf_splat_make_rasterizer(gsf_context* ctx, gsf_rasterizer** out) {
+    *out = (gsf_rasterizer*)gsf_alloc_zeroed(ctx, 1, sizeof(gsf_rasterizer));
+    return *out ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static void gsf__free_workers(gsf_context* ctx, gsf_rasterizer* r) {
+    for (int i = 0; i < r->worker_count; i++) {
+        gsf_free(ctx, r->workers[i].steps);
+        gsf_free(ctx, r->workers[i].heads);
+        gsf_free(ctx, r->workers[i].checkpoints);
+        gsf_free(ctx, r->workers[i].checkpoint_entry);
+    }
+    gsf_free(ctx, r->workers);
+    r->workers = NULL;
+    r->worker_count = 0;
+}
+
+GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
+    if (!r) return;
+    void* const owned[] = {r->records, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->slot_begin,
+                           r->tile_begin, r->tile_counts, r->pair_rank, r->pair_slot, r->slots, r->final_T,
+                           r->depth_sum, r->tile_background};
+    for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
+    gsf__free_workers(ctx, r);
+    gsf_free(ctx, r);
+}
+
+GSF_API const int32_t* gsf_splat_last_radii(const gsf_rasterizer* rasterizer) { return rasterizer->radii; }
+
 // ---- >>project -----------------------------------------------------------------
+
+// exp and log with the same bits on every machine; relative error below 1.2e-7 (float rounding of a double result).
+static float gsf__exp(float x) {
+    if (!(x > -87.0f)) return x != x ? x : 0.0f;
+    if (x > 88.0f) return INFINITY;
+    const double k = floor((double)x * 1.4426950408889634 + 0.5);
+    const double r = (double)x - k * 0.6931471805599453;
+    double p = 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
+    p = p * r + 1.0 / 120.0;
+    p = p * r + 1.0 / 24.0;
+    p = p * r + 1.0 / 6.0;
+    p = p * r + 0.5;
+    p = p * r + 1.0;
+    p = p * r + 1.0;
+    const int64_t bits = ((int64_t)k + 1023) << 52;
+    double scale;
+    memcpy(&scale, &bits, sizeof scale);
+    return (float)(p * scale);
+}
+
+static float gsf__log2(float x) { // x > 0, normal
+    int64_t bits;
+    double d = (double)x;
+    memcpy(&bits, &d, sizeof bits);
+    int64_t e = (bits >> 52) - 1023;
+    bits = (bits & 0xfffffffffffffLL) | 0x3ff0000000000000LL;
+    memcpy(&d, &bits, sizeof d);
+    if (d > 1.4142135623730951) {
+        d *= 0.5;
+        e++;
+    }
+    const double t = (d - 1.0) / (d + 1.0), t2 = t * t; // log(d) = 2 atanh(t), |t| < 0.1716
+    double p = 1.0 / 11.0;
+    p = p * t2 + 1.0 / 9.0;
+    p = p * t2 + 1.0 / 7.0;
+    p = p * t2 + 1.0 / 5.0;
+    p = p * t2 + 1.0 / 3.0;
+    p = p * t2 + 1.0;
+    return (float)((double)e + 2.8853900817779268 * t * p);
+}
+
+static float gsf__sigmoid(float x) {
+    const float e = gsf__exp(x < 0.0f ? x : -x); // no overflow on either side
+    return x < 0.0f ? e / (1.0f + e) : 1.0f / (1.0f + e);
+}
+
+// Everything the projection of one splat computes on its way and backward needs again.
+typedef struct gsf__projection {
+    float t[3];             // mean in camera space
+    float x, y;             // t.x, t.y after the frustum clamp
+    int clamped_x, clamped_y;
+    float q[4], inv_norm;   // unit quaternion
+    float scale[3];
+    float Q[9];             // W R, row-major
+    float T[9];             // W R S, row-major
+    float V[6];             // J T: two rows, so that cov2d = V V^T before the blur
+    float cov_a, cov_b, cov_c, det_raw, det; // blurred covariance [[a,b],[b,c]]; det without / with blur
+    float opacity, compensation; // sigmoid * opacity_scale; antialiasing factor
+} gsf__projection;
+
+typedef struct gsf__view { // what is constant over a frame
+    float W[9], t[3];       // world (relative to the splats' origin) to camera
+    float fx, fy, cx, cy;   // cx, cy minus 0.5
+    float limit_x, limit_y; // the Jacobian's x/z and y/z are clamped to +- this
+    float near_plane, opacity_scale;
+    float center[3];        // of the camera, relative to the splats' origin
+    float background[3];
+    int32_t width, height, sh_coefficients;
+    int antialiased, official_footprint, official_gradient;
+} gsf__view;
+
+static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* camera, const gsf_render_desc* desc) {
+    gsf__view view;
+    memset(&view, 0, sizeof view);
+    double origin_in_camera[3], center[3];
+    gsf__camera_transform(camera, splats->origin, origin_in_camera);
+    gsf_camera_center(camera, center);
+    for (int r = 0; r < 3; r++) {
+        for (int c = 0; c < 3; c++) view.W[3 * r + c] = (float)camera->w2c[4 * c + r];
+        view.t[r] = (float)origin_in_camera[r];
+        view.center[r] = (float)(center[r] - splats->origin[r]);
+        view.background[r] = desc->background[r];
+    }
+    view.fx = (float)camera->fx;
+    view.fy = (float)camera->fy;
+    view.cx = (float)(camera->cx - 0.5);
+    view.cy = (float)(camera->cy - 0.5);
+    view.limit_x = (float)(1.3 * camera->width / (2.0 * camera->fx));
+    view.limit_y = (float)(1.3 * camera->height / (2.0 * camera->fy));
+    view.near_plane = desc->near_plane > 0.0f ? desc->near_plane : 0.2f;
+    view.opacity_scale = desc->opacity_scale > 0.0f ? desc->opacity_scale : 1.0f;
+    view.width = camera->width;
+    view.height = camera->height;
+    const int32_t bands = desc->sh_bands > 0 ? desc->sh_bands : splats->sh_degree + 1;
+    const int32_t used = bands < splats->sh_degree + 1 ? bands : splats->sh_degree + 1;
+    view.sh_coefficients = used * used;
+    view.antialiased = desc->antialiased != 0;
+    view.official_footprint = desc->footprint == GSF_FOOTPRINT_OFFICIAL;
+    view.official_gradient = desc->gradient == GSF_GRADIENT_OFFICIAL;
+    return view;
+}
+
+// Rotation of a unit quaternion, row-major.
+static void gsf__rotation(const float q[4], float R[9]) {
+    const float w = q[0], x = q[1], y = q[2], z = q[3];
+    R[0] = 1.0f - 2.0f * (y * y + z * z); R[1] = 2.0f * (x * y - w * z); R[2] = 2.0f * (x * z + w * y);
+    R[3] = 2.0f * (x * y + w * z); R[4] = 1.0f - 2.0f * (x * x + z * z); R[5] = 2.0f * (y * z - w * x);
+    R[6] = 2.0f * (x * z - w * y); R[7] = 2.0f * (y * z + w * x); R[8] = 1.0f - 2.0f * (x * x + y * y);
+}
+
+static float gsf__dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+// Screen-space covariance of splat i. Returns 0 when it is culled by the near plane or not finite.
+static int gsf__project_splat(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__projection* p) {
+    const float* mean = splats->means + 3 * i;
+    for (int r = 0; r < 3; r++) p->t[r] = gsf__dot3(view->W + 3 * r, mean) + view->t[r];
+    if (!(p->t[2] > view->near_plane)) return 0;
+
+    const float* raw = splats->quats + 4 * i;
+    const double norm = sqrt((double)raw[0] * raw[0] + (double)raw[1] * raw[1] + (double)raw[2] * raw[2] +
+                             (double)raw[3] * raw[3]); // in double: neither tiny nor huge quaternions lose digits
+    const double inv_norm = 1.0 / (norm > 1e-12 ? norm : 1e-12);
+    for (int k = 0; k < 4; k++) p->q[k] = (float)(raw[k] * inv_norm);
+    p->inv_norm = norm > 1e-12 ? (float)inv_norm : 0.0f;
+
+    float R[9];
+    gsf__rotation(p->q, R);
+    for (int k = 0; k < 3; k++) p->scale[k] = gsf__exp(splats->log_scales[3 * i + (size_t)k]);
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) {
+            const float* w = view->W + 3 * r;
+            p->Q[3 * r + c] = w[0] * R[c] + w[1] * R[3 + c] + w[2] * R[6 + c];
+            p->T[3 * r + c] = p->Q[3 * r + c] * p->scale[c];
+        }
+
+    const float inv_z = 1.0f / p->t[2];
+    const float rx = p->t[0] * inv_z, ry = p->t[1] * inv_z;
+    p->clamped_x = !(fabsf(rx) <= view->limit_x);
+    p->clamped_y = !(fabsf(ry) <= view->limit_y);
+    p->x = p->clamped_x ? (rx < 0.0f ? -view->limit_x : view->limit_x) : rx; // per unit depth
+    p->y = p->clamped_y ? (ry < 0.0f ? -view->limit_y : view->limit_y) : ry;
+    const float jx = view->fx * inv_z, jy = view->fy * inv_z;
+    for (int c = 0; c < 3; c++) {
+        p->V[c] = jx * (p->T[c] - p->x * p->T[6 + c]);
+        p->V[3 + c] = jy * (p->T[3 + c] - p->y * p->T[6 + c]);
+    }
+    const float* V = p->V;
+    const float a = gsf__dot3(V, V), b = gsf__dot3(V, V + 3), c = gsf__dot3(V + 3, V + 3);
+    // determinant as the sum of squared 2x2 minors (Cauchy-Binet): no cancellation, however thin the ellipse
+    const float m0 = V[1] * V[5] - V[2] * V[4], m1 = V[2] * V[3] - V[0] * V[5], m2 = V[0] * V[4] - V[1] * V[3];
+    p->det_raw = m0 * m0 + m1 * m1 + m2 * m2;
+    p->det = p->det_raw + GSF__BLUR * (a + c) + GSF__BLUR * GSF__BLUR;
+    p->cov_a = a + GSF__BLUR;
+    p->cov_b = b;
+    p->cov_c = c + GSF__BLUR;
+
+    p->opacity = gsf__sigmoid(splats->opacity_logits[i]) * view->opacity_scale;
+    p->compensation = 1.0f;
+    if (view->antialiased) {
+        const float ratio = p->det_raw / p->det;
+        p->compensation = sqrtf(ratio > GSF__AA_FLOOR ? ratio : GSF__AA_FLOOR);
+    }
+    const float sum = p->det + p->cov_a + p->cov_c + p->opacity + p->t[0] + p->t[1] + p->t[2];
+    return isfinite(sum) && p->det > 0.0f;
+}
+
+// Real spherical harmonics of the 3DGS convention for a unit direction; fills `count` values (1, 4, 9 or 16).
+static void gsf__sh_basis(const float d[3], int32_t count, float basis[16]) {
+    const float x = d[0], y = d[1], z = d[2];
+    basis[0] = 0.28209479177387814f;
+    if (count < 4) return;
+    basis[1] = -0.4886025119029199f * y;
+    basis[2] = 0.4886025119029199f * z;
+    basis[3] = -0.4886025119029199f * x;
+    if (count < 9) return;
+    const float xx = x * x, yy = y * y, zz = z * z;
+    basis[4] = 1.0925484305920792f * x * y;
+    basis[5] = -1.0925484305920792f * y * z;
+    basis[6] = 0.31539156525252005f * (2.0f * zz - xx - yy);
+    basis[7] = -1.0925484305920792f * x * z;
+    basis[8] = 0.5462742152960396f * (xx - yy);
+    if (count < 16) return;
+    basis[9] = -0.5900435899266435f * y * (3.0f * xx - yy);
+    basis[10] = 2.890611442640554f * x * y * z;
+    basis[11] = -0.4570457994644658f * y * (4.0f * zz - xx - yy);
+    basis[12] = 0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy);
+    basis[13] = -0.4570457994644658f * x * (4.0f * zz - xx - yy);
+    basis[14] = 1.445305721320277f * z * (xx - yy);
+    basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
+}
+
+// Derivatives of the basis with respect to x, y, z (as polynomials, before the direction's normalisation).
+static void gsf__sh_basis_gradient(const float d[3], int32_t count, float gx[16], float gy[16], float gz[16]) {
+    const float x = d[0], y = d[1], z = d[2];
+    memset(gx, 0, 16 * sizeof(float));
+    memset(gy, 0, 16 * sizeof(float));
+    memset(gz, 0, 16 * sizeof(float));
+    if (count < 4) return;
+    gy[1] = -0.4886025119029199f;
+    gz[2] = 0.4886025119029199f;
+    gx[3] = -0.4886025119029199f;
+    if (count < 9) return;
+    gx[4] = 1.0925484305920792f * y;  gy[4] = 1.0925484305920792f * x;
+    gy[5] = -1.0925484305920792f * z; gz[5] = -1.0925484305920792f * y;
+    gx[6] = -0.6307831305050401f * x; gy[6] = -0.6307831305050401f * y; gz[6] = 1.2615662610100802f * z;
+    gx[7] = -1.0925484305920792f * z; gz[7] = -1.0925484305920792f * x;
+    gx[8] = 1.0925484305920792f * x;  gy[8] = -1.0925484305920792f * y;
+    if (count < 16) return;
+    const float xx = x * x, yy = y * y, zz = z * z;
+    gx[9] = -3.540261539559861f * x * y;
+    gy[9] = -1.7701307697799305f * (xx - yy);
+    gx[10] = 2.890611442640554f * y * z; gy[10] = 2.890611442640554f * x * z; gz[10] = 2.890611442640554f * x * y;
+    gx[11] = 0.9140915989289316f * x * y;
+    gy[11] = -0.4570457994644658f * (4.0f * zz - xx - 3.0f * yy);
+    gz[11] = -3.6563663957157264f * y * z;
+    gx[12] = -2.2390579955406924f * x * z; gy[12] = -2.2390579955406924f * y * z;
+    gz[12] = 1.1195289977703462f * (2.0f * zz - xx - yy);
+    gx[13] = -0.4570457994644658f * (4.0f * zz - 3.0f * xx - yy);
+    gy[13] = 0.9140915989289316f * x * y;
+    gz[13] = -3.6563663957157264f * x * z;
+    gx[14] = 2.890611442640554f * x * z; gy[14] = -2.890611442640554f * y * z; gz[14] = 1.445305721320277f * (xx - yy);
+    gx[15] = -1.7701307697799305f * (xx - yy);
+    gy[15] = 3.540261539559861f * x * y;
+}
+
+// Unit direction from the camera to splat i and its distance; (0,0,1) and 0 when they coincide.
+static float gsf__view_direction(const gsf__view* view, const float* mean, float d[3]) {
+    for (int k = 0; k < 3; k++) d[k] = mean[k] - view->center[k];
+    const float length = sqrtf(gsf__dot3(d, d));
+    if (!(length > 0.0f)) {
+        d[0] = d[1] = 0.0f;
+        d[2] = 1.0f;
+        return 0.0f;
+    }
+    const float inv = 1.0f / length;
+    for (int k = 0; k < 3; k++) d[k] *= inv;
+    return length;
+}
+
+static void gsf__splat_color(const gsf__view* view, const gsf_splats* splats, size_t i, float rgb[3]) {
+    const int32_t stored = gsf_splat_sh_count(splats->sh_degree);
+    const float* sh = splats->sh + 3 * (size_t)stored * i;
+    float d[3], basis[16];
+    gsf__view_direction(view, splats->means + 3 * i, d);
+    gsf__sh_basis(d, view->sh_coefficients, basis);
+    rgb[0] = rgb[1] = rgb[2] = 0.5f;
+    for (int32_t k = 0; k < view->sh_coefficients; k++)
+        for (int c = 0; c < 3; c++) rgb[c] += basis[k] * sh[3 * k + c];
+}
+
+// Tiles of the official rasterizer: 16x16 tiles of the square of half side `radius` (float division, truncation).
+static gsf__tile_rect gsf__official_rect(const gsf__record* rec, int32_t tiles_x, int32_t tiles_y) {
+    const float radius = (float)rec->radius, tile = (float)GSF__TILE;
+    const float lo[2] = {(rec->u - radius) / tile, (rec->v - radius) / tile};
+    const float hi[2] = {(rec->u + radius + tile - 1.0f) / tile, (rec->v + radius + tile - 1.0f) / tile};
+    const int32_t limit[2] = {tiles_x, tiles_y};
+    int32_t box[4];
+    for (int k = 0; k < 2; k++) {
+        const float top = (float)limit[k];
+        box[k] = lo[k] <= 0.0f ? 0 : lo[k] >= top ? limit[k] : (int32_t)lo[k];
+        box[2 + k] = hi[k] <= 0.0f ? 0 : hi[k] >= top ? limit[k] : (int32_t)hi[k];
+    }
+    gsf__tile_rect rect = {box[0], box[1], box[2], box[3]};
+    return rect;
+}
+
+typedef enum gsf__show { GSF__CULLED, GSF__TOO_FAINT, GSF__DRAWN } gsf__show;
+
+// Fills the record of splat i. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled, for the official
+// footprint, where such a splat still has a radius (and counts as a visit in densification).
+static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) {
+    gsf__projection p;
+    if (!gsf__project_splat(view, splats, i, &p)) return GSF__CULLED;
+    rec->u = view->fx * (p.t[0] / p.t[2]) + view->cx;
+    rec->v = view->fy * (p.t[1] / p.t[2]) + view->cy;
+    const float mid = 0.5f * (p.cov_a + p.cov_c);
+    const float half_gap = 0.5f * (p.cov_a - p.cov_c); // root = mid^2 - det without cancellation
+    const float root = half_gap * half_gap + p.cov_b * p.cov_b;
+    const float radius = ceilf(3.0f * sqrtf(mid + sqrtf(root > 0.1f ? root : 0.1f)));
+    rec->radius = radius < 1e9f ? (int32_t)radius : 1000000000;
+    if (!isfinite(rec->u + rec->v)) return GSF__CULLED;
+    const float opacity = p.opacity * p.compensation;
+    if (!(opacity >= GSF__ALPHA_MIN)) return GSF__TOO_FAINT;
+
+    rec->log2_opacity = gsf__log2(opacity);
+    // alpha >= 1/255 <=> mahalanobis^2 <= t2; a little more, so that rounding never hides a pixel that passes
+    const float t2 = 2.0f * 0.69314718f * (rec->log2_opacity - GSF__LOG2_ALPHA_MIN) * 1.0001f + 1e-4f;
+    const float conic_a = p.cov_c / p.det;    // of the inverse covariance [[a,b],[b,c]]
+    rec->kx = p.cov_b / p.cov_c;
+    rec->ee = -0.72134752f * conic_a;         // -log2(e)/2 times a
+    rec->yy = -0.72134752f / p.cov_c;         // (ac - b^2)/a of the inverse is 1/cov_c
+    rec->h0 = t2 / conic_a;
+    rec->h1 = (1.0f / p.cov_c) / conic_a;
+    rec->reach_x = sqrtf(t2 * p.cov_a);
+    rec->reach_y = sqrtf(t2 * p.cov_c);
+    rec->kx_inv = p.cov_b / p.cov_a;
+    rec->depth = p.t[2];
+    float rgb[3];
+    gsf__splat_color(view, splats, i, rgb);
+    rec->r = rgb[0] > 0.0f ? rgb[0] : 0.0f;
+    rec->g = rgb[1] > 0.0f ? rgb[1] : 0.0f;
+    rec->b = rgb[2] > 0.0f ? rgb[2] : 0.0f;
+    const float sum = rec->kx + rec->ee + rec->h0 + rec->h1 + rec->reach_x + rec->reach_y + rgb[0] + rgb[1] + rgb[2];
+    return isfinite(sum) ? GSF__DRAWN : GSF__CULLED;
+}
+
+typedef struct gsf__project_job {
+    gsf_rasterizer* r;
+    const gsf__view* view;
+    const gsf_splats* splats;
+    const uint8_t* hidden;
+} gsf__project_job;
+
+static int gsf__meets_image(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
+    if (view->official_footprint) {
+        const gsf__tile_rect rect = gsf__official_rect(rec, r->tiles_x, r->tiles_y);
+        return rect.x0 < rect.x1 && rect.y0 < rect.y1;
+    }
+    return rec->u + rec->reach_x >= 0.0f && rec->u - rec->reach_x <= (float)(r->width - 1) &&
+           rec->v + rec->reach_y >= 0.0f && rec->v - rec->reach_y <= (float)(r->height - 1);
+}
+
+static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__project_job* job = (const gsf__project_job*)arg;
+    gsf_rasterizer* r = job->r;
+    const size_t begin = chunk * GSF__PROJECT_CHUNK;
+    const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
+    for (size_t i = begin; i < end; i++) {
+        gsf__record* rec = r->records + i;
+        const gsf__show show =
+            job->hidden && job->hidden[i] ? GSF__CULLED : gsf__make_record(job->view, job->splats, i, rec);
+        const int kept = show == GSF__DRAWN || (show == GSF__TOO_FAINT && job->view->official_footprint);
+        r->radii[i] = kept && gsf__meets_image(r, job->view, rec) ? rec->radius : 0;
+        rec->radius = show == GSF__DRAWN ? r->radii[i] : 0;
+    }
+}
 
 // ---- >>bin ---------------------------------------------------------------------
 
+// Visible splats in index order, then a stable radix sort by the bits of the (positive) depth: ties keep index order.
+static void gsf__sort_visible(gsf_rasterizer* r) {
+    enum { BITS = 11, BINS = 1 << BITS };
+    size_t n = 0;
+    for (size_t i = 0; i < r->splat_count; i++)
+        if (r->records[i].radius > 0) {
+            memcpy(&r->keys[n], &r->records[i].depth, sizeof(uint32_t));
+            r->visible[n++] = (uint32_t)i;
+        }
+    r->visible_count = n;
+    size_t counts[3][BINS];
+    memset(counts, 0, sizeof counts);
+    for (size_t i = 0; i < n; i++)
+        for (int pass = 0; pass < 3; pass++) counts[pass][(r->keys[i] >> (BITS * pass)) & (BINS - 1)]++;
+    for (int pass = 0; pass < 3; pass++) {
+        size_t sum = 0;
+        for (int b = 0; b < BINS; b++) {
+            const size_t c = counts[pass][b];
+            counts[pass][b] = sum;
+            sum += c;
+        }
+        for (size_t i = 0; i < n; i++) {
+            const uint32_t key = r->keys[i];
+            const size_t at = counts[pass][(key >> (BITS * pass)) & (BINS - 1)]++;
+            r->keys_spare[at] = key;
+            r->visible_spare[at] = r->visible[i];
+        }
+        uint32_t* swap = r->keys; r->keys = r->keys_spare; r->keys_spare = swap;
+        swap = r->visible; r->visible = r->visible_spare; r->visible_spare = swap;
+    }
+}
+
+typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span; // end exclusive
+
+// Tile rows that the splat meets: first and one past the last.
+static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
+    const float lo = ceilf(rec->v - rec->reach_y - 0.01f), hi = floorf(rec->v + rec->reach_y + 0.01f);
+    gsf__tile_span rows = {0, 0};
+    if (hi < 0.0f || lo > (float)(r->height - 1) || lo > hi) return rows;
+    rows.x0 = lo <= 0.0f ? 0 : (int32_t)lo / GSF__TILE;
+    rows.x1 = (hi >= (float)(r->height - 1) ? r->height - 1 : (int32_t)hi) / GSF__TILE + 1;
+    if (view->official_footprint) {
+        const gsf__tile_rect rect = gsf__official_rect(rec, r->tiles_x, r->tiles_y);
+        if (rows.x0 < rect.y0) rows.x0 = rect.y0;
+        if (rows.x1 > rect.y1) rows.x1 = rect.y1;
+        if (rows.x1 < rows.x0) rows.x1 = rows.x0;
+    }
+    return rows;
+}
+
+// Tiles of tile row ty that the ellipse alpha >= 1/255 meets (exact up to the margin of t2), empty if x1 <= x0.
+static gsf__tile_span gsf__tile_columns(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec,
+                                        int32_t ty) {
+    gsf__tile_span span = {0, 0};
+    float ya = (float)(ty * GSF__TILE) - rec->v, yb = ya + (float)(GSF__TILE - 1);
+    if (ya < -rec->reach_y) ya = -rec->reach_y;
+    if (yb > rec->reach_y) yb = rec->reach_y;
+    const float da = rec->h0 - rec->h1 * ya * ya, db = rec->h0 - rec->h1 * yb * yb;
+    const float ha = sqrtf(da > 0.0f ? da : 0.0f), hb = sqrtf(db > 0.0f ? db : 0.0f);
+    const float top = rec->kx_inv * rec->reach_x; // dy of the rightmost point; the leftmost is opposite
+    float right = rec->kx * ya + ha, left = rec->kx * ya - ha;
+    if (rec->kx * yb + hb > right) right = rec->kx * yb + hb;
+    if (rec->kx * yb - hb < left) left = rec->kx * yb - hb;
+    if (top >= ya && top <= yb) right = rec->reach_x;
+    if (-top >= ya && -top <= yb) left = -rec->reach_x;
+    const float lo = ceilf(rec->u + left - 0.02f), hi = floorf(rec->u + right + 0.02f);
+    if (!(hi >= 0.0f) || !(lo <= (float)(r->width - 1)) || lo > hi) return span;
+    span.x0 = lo <= 0.0f ? 0 : (int32_t)lo / GSF__TILE;
+    span.x1 = (hi >= (float)(r->width - 1) ? r->width - 1 : (int32_t)hi) / GSF__TILE + 1;
+    if (view->official_footprint) {
+        const gsf__tile_rect rect = gsf__official_rect(rec, r->tiles_x, r->tiles_y);
+        if (span.x0 < rect.x0) span.x0 = rect.x0;
+        if (span.x1 > rect.x1) span.x1 = rect.x1;
+    }
+    return span;
+}
+
+typedef struct gsf__bin_job {
+    gsf_rasterizer* r;
+    const gsf__view* view;
+    size_t chunk_size;
+    int fill; // 0: count, 1: fill
+} gsf__bin_job;
+
+static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__bin_job* job = (const gsf__bin_job*)arg;
+    gsf_rasterizer* r = job->r;
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    size_t* counts = r->tile_counts + chunk * tiles;
+    const size_t begin = chunk * job->chunk_size;
+    const size_t end = begin + job->chunk_size < r->visible_count ? begin + job->chunk_size : r->visible_count;
+    for (size_t rank = begin; rank < end; rank++) {
+        const gsf__record* rec = r->records + r->visible[rank];
+        const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
+        size_t pairs = 0;
+        for (int32_t ty = rows.x0; ty < rows.x1; ty++) {
+            const gsf__tile_span span = gsf__tile_columns(r, job->view, rec, ty);
+            for (int32_t tx = span.x0; tx < span.x1; tx++, pairs++) {
+                size_t* count = counts + (size_t)ty * (size_t)r->tiles_x + (size_t)tx;
+                if (job->fill) {
+                    r->pair_rank[*count] = (uint32_t)rank;
+                    r->pair_slot[*count] = r->slot_begin[rank] + pairs;
+                }
+                ++*count;
+            }
+        }
+        if (!job->fill) r->slot_begin[rank + 1] = pairs;
+    }
+}
+
+static gsf_result gsf__grow(gsf_context* ctx, void** array, size_t capacity, size_t size) { // contents are not kept
+    gsf_free(ctx, *array);
+    *array = gsf_alloc(ctx, capacity, size);
+    return *array ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view* view) {
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    gsf__bin_job job;
+    job.r = r;
+    job.view = view;
+    job.fill = 0;
+    job.chunk_size = r->visible_count / 32 + 1;
+    if (job.chunk_size < 1024) job.chunk_size = 1024;
+    const size_t chunks = (r->visible_count + job.chunk_size - 1) / job.chunk_size;
+    if (tiles + 1 > r->tile_capacity) {
+        r->tile_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->tile_begin, tiles + 1, sizeof(size_t)));
+        r->tile_capacity = tiles + 1;
+    }
+    if (chunks * tiles > r->count_capacity) {
+        r->count_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->tile_counts, chunks * tiles, sizeof(size_t)));
+        r->count_capacity = chunks * tiles;
+    }
+    if (chunks) memset(r->tile_counts, 0, chunks * tiles * sizeof(size_t));
+    gsf__parallel_for(ctx, chunks, gsf__bin_chunk, &job);
+
+    size_t total = 0; // counts become the places where each chunk writes
+    for (size_t t = 0; t < tiles; t++) {
+        r->tile_begin[t] = total;
+        for (size_t c = 0; c < chunks; c++) {
+            const size_t n = r->tile_counts[c * tiles + t];
+            r->tile_counts[c * tiles + t] = total;
+            total += n;
+        }
+    }
+    r->tile_begin[tiles] = total;
+    r->slot_begin[0] = 0;
+    for (size_t i = 0; i < r->visible_count; i++) r->slot_begin[i + 1] += r->slot_begin[i];
+    r->pair_count = total;
+    if (total > r->pair_capacity) {
+        const size_t capacity = total + total / 4;
+        r->pair_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_rank, capacity, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_slot, capacity, sizeof(size_t)));
+        r->pair_capacity = capacity;
+    }
+    job.fill = 1;
+    gsf__parallel_for(ctx, chunks, gsf__bin_chunk, &job);
+    return GSF_OK;
+}
+
 // ---- >>raster forward ----------------------------------------------------------
+
+/* A tile's pixels are kept as 32 steps of 8: arrays [step][lane]. T > 0: pixel still open; T < 0: finished, |T| is its
+   final transmittance. `live` has a bit per step that has an open pixel. */
+typedef struct gsf__tile {
+    const gsf__record* records;
+    const uint32_t* visible;
+    const uint32_t* ranks;   // the tile's list, front to back
+    size_t count;
+    float x0, y0;            // of the tile's first pixel
+} gsf__tile;
+
+typedef struct gsf__tile_state {
+    float T[GSF__TILE_PIXELS], r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS], z[GSF__TILE_PIXELS];
+} gsf__tile_state;
+
+typedef struct gsf__tile_gradient { // derivatives of the loss per pixel, and the gradient-weighted feature behind
+    float r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS];
+    float z[GSF__TILE_PIXELS], a[GSF__TILE_PIXELS]; // of sum(w z) and sum(w)
+    float behind[GSF__TILE_PIXELS];
+} gsf__tile_gradient;
+
+enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2 };
+
+typedef struct gsf__raster_kernels {
+    // Blends the tile's list into `state`.
+    void (*blend)(const gsf__tile* tile, gsf__tile_state* state, int flags);
+    // Repeats the blending of T from list entry `first` on and keeps the steps. Stops after an entry when more than
+    // GSF__BUCKET steps are kept. Returns the entry to go on with, or tile->count.
+    size_t (*keep)(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps, gsf__step_head* heads,
+                   size_t* step_count);
+    // Back to front over kept steps: adds up the gradient moments of each entry into its slot (12 floats).
+    void (*reverse)(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads, size_t step_count,
+                    gsf__tile_gradient* gradient, const size_t* pair_slot, float* slots, int flags);
+} gsf__raster_kernels;
+
+// Slot layout. With p = dL/d(ln alpha) of a pixel, w = alpha*T, d = (e, dy) its place in the record's coordinates:
+enum {
+    GSF__SLOT_P, GSF__SLOT_E, GSF__SLOT_EE, GSF__SLOT_Y, GSF__SLOT_EY, GSF__SLOT_YY, // sums of p times 1 e ee dy e*dy dy*dy
+    GSF__SLOT_R, GSF__SLOT_G, GSF__SLOT_B, GSF__SLOT_Z,                              // sums of w times dL/dcolor, dL/dD
+    GSF__SLOT_ABS_X, GSF__SLOT_ABS_Y,                                                // sums of |dL/du|, |dL/dv|
+};
+
+// 2^x for x in [-126, 1], relative error below 2e-7 (minimax polynomial of degree 5 on [-1/2, 1/2]).
+static float gsf__exp2_fast(float x) {
+    const float k = floorf(x + 0.5f), f = x - k;
+    float p = 1.3276404e-3f;
+    p = p * f + 9.6755413e-3f;
+    p = p * f + 5.5507135e-2f;
+    p = p * f + 0.24022120f;
+    p = p * f + 0.69314694f;
+    p = p * f + 1.0000001f;
+    const int32_t bits = ((int32_t)k + 127) << 23;
+    float scale;
+    memcpy(&scale, &bits, sizeof scale);
+    return p * scale;
+}
+
+// Rows of a splat in a tile: centre column per row, exponent at the centre, and the steps that the ellipse meets.
+static uint32_t gsf__rows_scalar(const gsf__record* rec, const gsf__tile* tile, float center[GSF__TILE],
+                                 float exponent[GSF__TILE]) {
+    const float u = rec->u - tile->x0, v = rec->v - tile->y0;
+    uint32_t mask = 0;
+    for (int row = 0; row < GSF__TILE; row++) {
+        const float dy = (float)row - v;
+        const float half2 = rec->h0 - rec->h1 * dy * dy;
+        center[row] = u + rec->kx * dy;
+        exponent[row] = rec->yy * dy * dy + rec->log2_opacity;
+        if (!(half2 >= 0.0f)) continue;
+        const float half = sqrtf(half2) + 0.02f;
+        const float left = center[row] - half, right = center[row] + half;
+        if (left <= 7.0f && right >= 0.0f) mask |= 1u << row;
+        if (left <= 15.0f && right >= 8.0f) mask |= 1u << (row + 16);
+    }
+    return mask;
+}
+
+static uint32_t gsf__live_steps(const float* T) {
+    uint32_t live = 0;
+    for (uint32_t s = 0; s < GSF__STEPS; s++)
+        for (int lane = 0; lane < 8; lane++)
+            if (T[8 * s + (uint32_t)lane] > 0.0f) live |= 1u << s;
+    return live;
+}
+
+static int gsf__lowest_bit(uint32_t mask) {
+#if defined(__GNUC__) || defined(__clang__)
+    return __builtin_ctz(mask);
+#else
+    int bit = 0;
+    while (!(mask >> bit & 1u)) bit++;
+    return bit;
+#endif
+}
+
+// One pixel of one splat: returns alpha before the clamp (0 = not blended) and moves T on.
+static float gsf__blend_pixel(const gsf__record* rec, float column, float center, float exponent, float* T) {
+    const float e = column - center;
+    const float x = rec->ee * e * e + exponent;
+    if (!(x >= GSF__LOG2_ALPHA_MIN) || !(*T > 0.0f)) return 0.0f;
+    const float raw = gsf__exp2_fast(x);
+    const float alpha = raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX;
+    const float next = *T * (1.0f - alpha);
+    if (next < GSF__T_MIN) {
+        *T = -*T;
+        return 0.0f;
+    }
+    *T = next;
+    return raw;
+}
+
+static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int flags) {
+    uint32_t live = gsf__live_steps(state->T);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    for (size_t i = 0; i < tile->count && live; i++) {
+        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
+        for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
+            const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
+            int open = 0;
+            for (int lane = 0; lane < 8; lane++) {
+                const int k = 8 * s + lane;
+                const float T = state->T[k];
+                const float raw = gsf__blend_pixel(rec, (float)(column + lane), center[row], exponent[row], &state->T[k]);
+                const float w = (raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX) * T;
+                if (raw > 0.0f) {
+                    state->r[k] += w * rec->r;
+                    state->g[k] += w * rec->g;
+                    state->b[k] += w * rec->b;
+                    if (flags & GSF__WITH_DEPTH) state->z[k] += w * rec->depth;
+                }
+                open |= state->T[k] > 0.0f;
+            }
+            if (!open) live &= ~(1u << s);
+        }
+    }
+}
+
+#if GSF__X86
+
+// Same as gsf__rows_scalar, 8 rows at a time.
+GSF__TARGET_AVX2 static inline uint32_t gsf__rows_avx2(const gsf__record* rec, const gsf__tile* tile,
+                                                       float center[GSF__TILE], float exponent[GSF__TILE]) {
+    const __m256 u = _mm256_set1_ps(rec->u - tile->x0), v = _mm256_set1_ps(rec->v - tile->y0);
+    const __m256 kx = _mm256_set1_ps(rec->kx), yy = _mm256_set1_ps(rec->yy), lo = _mm256_set1_ps(rec->log2_opacity);
+    const __m256 h0 = _mm256_set1_ps(rec->h0), h1 = _mm256_set1_ps(rec->h1), zero = _mm256_setzero_ps();
+    uint32_t mask = 0;
+    for (int k = 0; k < 2; k++) {
+        const __m256 row = _mm256_add_ps(_mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_ps(8.0f * (float)k));
+        const __m256 dy = _mm256_sub_ps(row, v);
+        const __m256 half2 = _mm256_fnmadd_ps(_mm256_mul_ps(h1, dy), dy, h0);
+        const __m256 c = _mm256_fmadd_ps(kx, dy, u);
+        _mm256_storeu_ps(center + 8 * k, c);
+        _mm256_storeu_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
+        const __m256 half = _mm256_add_ps(_mm256_sqrt_ps(_mm256_max_ps(half2, zero)), _mm256_set1_ps(0.02f));
+        const __m256 left = _mm256_sub_ps(c, half), right = _mm256_add_ps(c, half);
+        const __m256 met = _mm256_cmp_ps(half2, zero, _CMP_GE_OQ);
+        const __m256 first = _mm256_and_ps(_mm256_cmp_ps(left, _mm256_set1_ps(7.0f), _CMP_LE_OQ),
+                                           _mm256_cmp_ps(right, zero, _CMP_GE_OQ));
+        const __m256 second = _mm256_and_ps(_mm256_cmp_ps(left, _mm256_set1_ps(15.0f), _CMP_LE_OQ),
+                                            _mm256_cmp_ps(right, _mm256_set1_ps(8.0f), _CMP_GE_OQ));
+        mask |= (uint32_t)_mm256_movemask_ps(_mm256_and_ps(met, first)) << (8 * k);
+        mask |= (uint32_t)_mm256_movemask_ps(_mm256_and_ps(met, second)) << (8 * k + 16);
+    }
+    return mask;
+}
+
+GSF__TARGET_AVX2 static inline __m256 gsf__exp2_avx2(__m256 x) {
+    const __m256 k = _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const __m256 f = _mm256_sub_ps(x, k);
+    __m256 p = _mm256_set1_ps(1.3276404e-3f);
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(9.6755413e-3f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(5.5507135e-2f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.24022120f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(0.69314694f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(1.0000001f));
+    const __m256i shift = _mm256_slli_epi32(_mm256_cvtps_epi32(k), 23);
+    return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
+}
+
+GSF__TARGET_AVX2 static inline void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
+    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), one = _mm256_set1_ps(1.0f);
+    const __m256 threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
+    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), zero = _mm256_setzero_ps(), minus = _mm256_set1_ps(-0.0f);
+    uint32_t live = gsf__live_steps(state->T);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    for (size_t i = 0; i < tile->count && live; i++) {
+        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
+        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->visible[tile->ranks[i + 4]]), _MM_HINT_T0);
+        uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live;
+        if (!m) continue;
+        const __m256 ee = _mm256_set1_ps(rec->ee);
+        const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
+        for (; m; m &= m - 1) {
+            const int s = gsf__lowest_bit(m), row = s & 15;
+            const __m256 column = s & 16 ? _mm256_add_ps(lanes, _mm256_set1_ps(8.0f)) : lanes;
+            const __m256 e = _mm256_sub_ps(column, _mm256_broadcast_ss(center + row));
+            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + row));
+            const __m256 T = _mm256_loadu_ps(state->T + 8 * s);
+            const __m256 valid = _mm256_and_ps(_mm256_cmp_ps(x, threshold, _CMP_GE_OQ), _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
+            if (_mm256_testz_ps(valid, valid)) continue;
+            const __m256 alpha = _mm256_and_ps(valid, _mm256_min_ps(gsf__exp2_avx2(x), alpha_max));
+            const __m256 next = _mm256_mul_ps(T, _mm256_sub_ps(one, alpha));
+            const __m256 stop = _mm256_and_ps(valid, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
+            const __m256 w = _mm256_mul_ps(_mm256_andnot_ps(stop, alpha), T);
+            const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
+            _mm256_storeu_ps(state->T + 8 * s, T_new);
+            _mm256_storeu_ps(state->r + 8 * s, _mm256_fmadd_ps(w, cr, _mm256_loadu_ps(state->r + 8 * s)));
+            _mm256_storeu_ps(state->g + 8 * s, _mm256_fmadd_ps(w, cg, _mm256_loadu_ps(state->g + 8 * s)));
+            _mm256_storeu_ps(state->b + 8 * s, _mm256_fmadd_ps(w, cb, _mm256_loadu_ps(state->b + 8 * s)));
+            if (with_depth)
+                _mm256_storeu_ps(state->z + 8 * s, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth),
+                                                                   _mm256_loadu_ps(state->z + 8 * s)));
+            if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s); // every sign set: all finished
+        }
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__blend_avx2(const gsf__tile* tile, gsf__tile_state* state, int flags) {
+    if (flags & GSF__WITH_DEPTH) gsf__blend_avx2_body(tile, state, 1);
+    else gsf__blend_avx2_body(tile, state, 0);
+}
+
+#endif // GSF__X86
 
 // ---- >>raster backward ---------------------------------------------------------
 
+static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps,
+                               gsf__step_head* heads, size_t* step_count) {
+    uint32_t live = gsf__live_steps(T);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    size_t kept = 0, i = first;
+    for (; i < last && live && kept <= GSF__BUCKET; i++) {
+        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
+        for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
+            const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
+            int open = 0, any = 0;
+            for (int lane = 0; lane < 8; lane++) {
+                float* t = T + 8 * s + lane;
+                steps[kept].T[lane] = *t > 0.0f ? *t : 0.0f;
+                const float raw = gsf__blend_pixel(rec, (float)(column + lane), center[row], exponent[row], t);
+                steps[kept].alpha[lane] = raw;
+                any |= raw > 0.0f;
+                open |= *t > 0.0f;
+            }
+            heads[kept].entry = (uint32_t)i;
+            heads[kept].step = (uint32_t)s;
+            kept += (size_t)any;
+            if (!open) live &= ~(1u << s);
+        }
+    }
+    *step_count = kept;
+    return live && i < last ? i : tile->count;
+}
+
+/* Reverse pass. With F = what the splat adds per unit weight, weighted by the loss gradient (c.g + z gz + ga), and B the
+   same for everything behind (the background at last), the pixel's gradient-weighted value is alpha F + (1 - alpha) B
+   seen through T, so
+       dL/dalpha = T (F - B),   B <- B + alpha (F - B)
+   without any division by 1 - alpha. */
+static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
+                                size_t step_count, gsf__tile_gradient* gradient, const size_t* pair_slot, float* slots,
+                                int flags) {
+    for (size_t k = step_count; k > 0;) {
+        const uint32_t entry = heads[k - 1].entry;
+        const gsf__record* rec = tile->records + tile->visible[tile->ranks[entry]];
+        const float u = rec->u - tile->x0, v = rec->v - tile->y0;
+        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
+        float sums[GSF__SLOT_FLOATS];
+        memset(sums, 0, sizeof sums);
+        for (; k > 0 && heads[k - 1].entry == entry; k--) {
+            const gsf__step* step = steps + k - 1;
+            const int s = (int)heads[k - 1].step;
+            const float dy = (float)(s & 15) - v, center = u + rec->kx * dy;
+            for (int lane = 0; lane < 8; lane++) {
+                const float raw = step->alpha[lane];
+                if (!(raw > 0.0f)) continue;
+                const int at = 8 * s + lane;
+                const float e = (float)(8 * (s >> 4) + lane) - center;
+                const float alpha = raw < GSF__ALPHA_MAX ? raw : GSF__ALPHA_MAX, w = alpha * step->T[lane];
+                float F = rec->r * gradient->r[at] + rec->g * gradient->g[at] + rec->b * gradient->b[at];
+                if (flags & GSF__WITH_DEPTH) F += rec->depth * gradient->z[at] + gradient->a[at];
+                const float difference = F - gradient->behind[at];
+                gradient->behind[at] += alpha * difference;
+                float p = step->T[lane] * difference * raw;
+                if (raw > GSF__ALPHA_MAX && !(flags & GSF__STRAIGHT_THROUGH)) p = 0.0f;
+                sums[GSF__SLOT_P] += p;
+                sums[GSF__SLOT_E] += p * e;
+                sums[GSF__SLOT_EE] += p * e * e;
+                sums[GSF__SLOT_Y] += p * dy;
+                sums[GSF__SLOT_EY] += p * e * dy;
+                sums[GSF__SLOT_YY] += p * dy * dy;
+                sums[GSF__SLOT_R] += w * gradient->r[at];
+                sums[GSF__SLOT_G] += w * gradient->g[at];
+                sums[GSF__SLOT_B] += w * gradient->b[at];
+                if (flags & GSF__WITH_DEPTH) sums[GSF__SLOT_Z] += w * gradient->z[at];
+                sums[GSF__SLOT_ABS_X] += fabsf(p * conic_a * e);
+                sums[GSF__SLOT_ABS_Y] += fabsf(p * (conic_b * e + conic_q * dy));
+            }
+        }
+        float* slot = slots + GSF__SLOT_FLOATS * pair_slot[entry];
+        memcpy(slot, sums, sizeof sums); // all of an entry's steps are in one bucket
+    }
+}
+
+#if GSF__X86
+
+GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
+                                              gsf__step* steps, gsf__step_head* heads, size_t* step_count) {
+    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), one = _mm256_set1_ps(1.0f);
+    const __m256 threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
+    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), zero = _mm256_setzero_ps(), minus = _mm256_set1_ps(-0.0f);
+    uint32_t live = gsf__live_steps(T_tile);
+    float center[GSF__TILE], exponent[GSF__TILE];
+    size_t kept = 0, i = first;
+    for (; i < last && live && kept <= GSF__BUCKET; i++) {
+        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
+        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->visible[tile->ranks[i + 4]]), _MM_HINT_T0);
+        uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live;
+        const __m256 ee = _mm256_set1_ps(rec->ee);
+        for (; m; m &= m - 1) {
+            const int s = gsf__lowest_bit(m), row = s & 15;
+            const __m256 column = s & 16 ? _mm256_add_ps(lanes, _mm256_set1_ps(8.0f)) : lanes;
+            const __m256 e = _mm256_sub_ps(column, _mm256_broadcast_ss(center + row));
+            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + row));
+            const __m256 T = _mm256_loadu_ps(T_tile + 8 * s);
+            const __m256 valid = _mm256_and_ps(_mm256_cmp_ps(x, threshold, _CMP_GE_OQ), _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
+            if (_mm256_testz_ps(valid, valid)) continue;
+            const __m256 raw = _mm256_and_ps(valid, gsf__exp2_avx2(x));
+            const __m256 next = _mm256_mul_ps(T, _mm256_sub_ps(one, _mm256_min_ps(raw, alpha_max)));
+            const __m256 stop = _mm256_and_ps(valid, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
+            const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
+            _mm256_storeu_ps(T_tile + 8 * s, T_new);
+            _mm256_storeu_ps(steps[kept].alpha, _mm256_andnot_ps(stop, raw));
+            _mm256_storeu_ps(steps[kept].T, _mm256_max_ps(T, zero));
+            heads[kept].entry = (uint32_t)i;
+            heads[kept].step = (uint32_t)s;
+            kept++;
+            if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
+        }
+    }
+    *step_count = kept;
+    return live && i < last ? i : tile->count;
+}
+
+// Sums of eight vectors, one per lane of the result.
+GSF__TARGET_AVX2 static inline __m256 gsf__sum8_avx2(__m256 a, __m256 b, __m256 c, __m256 d, __m256 e, __m256 f, __m256 g,
+                                                     __m256 h) {
+    const __m256 abcd = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
+    const __m256 efgh = _mm256_hadd_ps(_mm256_hadd_ps(e, f), _mm256_hadd_ps(g, h));
+    return _mm256_add_ps(_mm256_permute2f128_ps(abcd, efgh, 0x20), _mm256_permute2f128_ps(abcd, efgh, 0x31));
+}
+
+GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__step* steps,
+                                                           const gsf__step_head* heads, size_t step_count,
+                                                           gsf__tile_gradient* gradient, const size_t* pair_slot,
+                                                           float* slots, int with_depth, int straight_through) {
+    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
+    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
+    for (size_t k = step_count; k > 0;) {
+        const uint32_t entry = heads[k - 1].entry;
+        const gsf__record* rec = tile->records + tile->visible[tile->ranks[entry]];
+        const float u = rec->u - tile->x0, v = rec->v - tile->y0;
+        const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
+        __m256 sp = _mm256_setzero_ps(), se = sp, see = sp, sy = sp, sey = sp, syy = sp, sr = sp, sg = sp, sb = sp, sz = sp;
+        __m256 sax = sp, say = sp;
+        for (; k > 0 && heads[k - 1].entry == entry; k--) {
+            const gsf__step* step = steps + k - 1;
+            const int s = (int)heads[k - 1].step;
+            const float dy_row = (float)(s & 15) - v;
+            const __m256 dy = _mm256_set1_ps(dy_row);
+            const __m256 e = _mm256_sub_ps(lanes, _mm256_set1_ps(u + rec->kx * dy_row - (float)(8 * (s >> 4))));
+            const __m256 raw = _mm256_loadu_ps(step->alpha), T = _mm256_loadu_ps(step->T);
+            const __m256 gr = _mm256_loadu_ps(gradient->r + 8 * s), gg = _mm256_loadu_ps(gradient->g + 8 * s);
+            const __m256 gb = _mm256_loadu_ps(gradient->b + 8 * s), behind = _mm256_loadu_ps(gradient->behind + 8 * s);
+            const __m256 alpha = _mm256_min_ps(raw, alpha_max), w = _mm256_mul_ps(alpha, T);
+            __m256 F = _mm256_fmsub_ps(_mm256_set1_ps(rec->r), gr, behind);
+            F = _mm256_fmadd_ps(_mm256_set1_ps(rec->g), gg, F);
+            F = _mm256_fmadd_ps(_mm256_set1_ps(rec->b), gb, F);
+            if (with_depth) {
+                const __m256 gz = _mm256_loadu_ps(gradient->z + 8 * s);
+                F = _mm256_add_ps(_mm256_fmadd_ps(_mm256_set1_ps(rec->depth), gz, F), _mm256_loadu_ps(gradient->a + 8 * s));
+                sz = _mm256_fmadd_ps(w, gz, sz);
+            }
+            _mm256_storeu_ps(gradient->behind + 8 * s, _mm256_fmadd_ps(alpha, F, behind));
+            __m256 p = _mm256_mul_ps(_mm256_mul_ps(T, raw), F);
+            if (!straight_through) p = _mm256_and_ps(p, _mm256_cmp_ps(raw, alpha_max, _CMP_LE_OQ));
+            const __m256 pe = _mm256_mul_ps(p, e), py = _mm256_mul_ps(p, dy);
+            sp = _mm256_add_ps(sp, p);
+            se = _mm256_add_ps(se, pe);
+            see = _mm256_fmadd_ps(pe, e, see);
+            sy = _mm256_add_ps(sy, py);
+            sey = _mm256_fmadd_ps(pe, dy, sey);
+            syy = _mm256_fmadd_ps(py, dy, syy);
+            sr = _mm256_fmadd_ps(w, gr, sr);
+            sg = _mm256_fmadd_ps(w, gg, sg);
+            sb = _mm256_fmadd_ps(w, gb, sb);
+            sax = _mm256_add_ps(sax, _mm256_and_ps(magnitude, pe));
+            say = _mm256_add_ps(say, _mm256_and_ps(magnitude, _mm256_fmadd_ps(_mm256_set1_ps(conic_b), pe,
+                                                                             _mm256_mul_ps(_mm256_set1_ps(conic_q), py))));
+        }
+        float* slot = slots + GSF__SLOT_FLOATS * pair_slot[entry];
+        const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
+        const __m256 rest = gsf__sum8_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say, sp, sp, sp, sp);
+        _mm256_storeu_ps(slot, first); // all of an entry's steps are in one bucket
+        _mm_storeu_ps(slot + 8, _mm256_castps256_ps128(rest));
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__reverse_avx2(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
+                                               size_t step_count, gsf__tile_gradient* gradient, const size_t* pair_slot,
+                                               float* slots, int flags) {
+    if (flags & (GSF__WITH_DEPTH | GSF__STRAIGHT_THROUGH)) {
+        if (flags & GSF__STRAIGHT_THROUGH)
+            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, pair_slot, slots, 1, 1);
+        else
+            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, pair_slot, slots, 1, 0);
+    } else {
+        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, pair_slot, slots, 0, 0);
+    }
+}
+
+#endif // GSF__X86
+
+static const gsf__raster_kernels* gsf__raster_kernels_of(gsf_cpu_level level) {
+    static const gsf__raster_kernels scalar = {gsf__blend_scalar, gsf__keep_scalar, gsf__reverse_scalar};
+#if GSF__X86
+    static const gsf__raster_kernels avx2 = {gsf__blend_avx2, gsf__keep_avx2, gsf__reverse_avx2};
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
 // ---- >>project backward --------------------------------------------------------
 
+// Gradient of splat i from the sums of its slots, back through covariance, projection and colour.
+static void gsf__project_backward(const gsf__view* view, const gsf_splats* splats, size_t i, const gsf__record* rec,
+                                  const double sums[GSF__SLOT_FLOATS], const gsf_splat_grads* grads) {
+    gsf__projection p;
+    if (!gsf__project_splat(view, splats, i, &p)) return;
+    const float sp = (float)sums[GSF__SLOT_P], se = (float)sums[GSF__SLOT_E], see = (float)sums[GSF__SLOT_EE];
+    const float sy = (float)sums[GSF__SLOT_Y], sey = (float)sums[GSF__SLOT_EY], syy = (float)sums[GSF__SLOT_YY];
+    const float a = rec->ee * -1.3862944f, q = rec->yy * -1.3862944f, b = -rec->kx * a; // inverse covariance
+
+    // ln alpha = -1/2 (a e^2 + q dy^2): derivatives with respect to the screen mean
+    const float du = a * se, dv = b * se + q * sy;
+    // and to the covariance: 1/2 sum p (K d)(K d)^T, K d = (a e, b e + q dy); cov_b counted once for both entries
+    float d_cov_a = 0.5f * a * a * see;
+    float d_cov_b = a * (b * see + q * sey);
+    float d_cov_c = 0.5f * (b * b * see + 2.0f * b * q * sey + q * q * syy);
+    if (view->antialiased && p.det_raw > GSF__AA_FLOOR * p.det) {
+        // ln compensation = 1/2 (ln det_raw - ln det)
+        const float raw_a = p.cov_a - GSF__BLUR, raw_c = p.cov_c - GSF__BLUR;
+        const float hr = 0.5f * sp / p.det_raw, hb = 0.5f * sp / p.det;
+        d_cov_a += hr * raw_c - hb * p.cov_c;
+        d_cov_c += hr * raw_a - hb * p.cov_a;
+        d_cov_b += -2.0f * p.cov_b * (hr - hb);
+    }
+
+    // cov = V V^T; V = J T with rows jx (T0 - x T2), jy (T1 - y T2)
+    const float inv_z = 1.0f / p.t[2], jx = view->fx * inv_z, jy = view->fy * inv_z;
+    float dV[6], dT[9];
+    float d_jx = 0.0f, d_jy = 0.0f, d_x = 0.0f, d_y = 0.0f;
+    for (int c = 0; c < 3; c++) {
+        dV[c] = 2.0f * d_cov_a * p.V[c] + d_cov_b * p.V[3 + c];
+        dV[3 + c] = d_cov_b * p.V[c] + 2.0f * d_cov_c * p.V[3 + c];
+        d_jx += dV[c] * (p.T[c] - p.x * p.T[6 + c]);
+        d_jy += dV[3 + c] * (p.T[3 + c] - p.y * p.T[6 + c]);
+        d_x -= dV[c] * jx * p.T[6 + c];
+        d_y -= dV[3 + c] * jy * p.T[6 + c];
+        dT[c] = jx * dV[c];
+        dT[3 + c] = jy * dV[3 + c];
+        dT[6 + c] = -jx * p.x * dV[c] - jy * p.y * dV[3 + c];
+    }
+
+    // mean in camera space: through u, v, the focal scale jx = fx/z and the slope x = t.x/z (constant where clamped; the
+    // official code holds t.x = x z constant instead, which leaves -x/z)
+    float d_t[3];
+    d_t[0] = du * jx;
+    d_t[1] = dv * jy;
+    d_t[2] = -(du * jx * p.t[0] + dv * jy * p.t[1]) * inv_z - (d_jx * jx + d_jy * jy) * inv_z;
+    if (!p.clamped_x) d_t[0] += d_x * inv_z;
+    if (!p.clamped_y) d_t[1] += d_y * inv_z;
+    if (!p.clamped_x || view->official_gradient) d_t[2] -= d_x * p.x * inv_z;
+    if (!p.clamped_y || view->official_gradient) d_t[2] -= d_y * p.y * inv_z;
+    d_t[2] += (float)sums[GSF__SLOT_Z];
+
+    float d_mean[3];
+    for (int c = 0; c < 3; c++) d_mean[c] = view->W[c] * d_t[0] + view->W[3 + c] * d_t[1] + view->W[6 + c] * d_t[2];
+
+    // colour
+    const float rgb[3] = {rec->r, rec->g, rec->b};
+    float d_rgb[3];
+    for (int c = 0; c < 3; c++) d_rgb[c] = rgb[c] > 0.0f ? (float)sums[GSF__SLOT_R + c] : 0.0f;
+    const size_t stored = (size_t)gsf_splat_sh_count(splats->sh_degree);
+    const float* sh = splats->sh + 3 * stored * i;
+    float d[3], basis[16], gx[16], gy[16], gz[16];
+    const float distance = gsf__view_direction(view, splats->means + 3 * i, d);
+    gsf__sh_basis(d, view->sh_coefficients, basis);
+    if (grads->sh)
+        for (int32_t k = 0; k < view->sh_coefficients; k++)
+            for (int c = 0; c < 3; c++) grads->sh[3 * (stored * i + (size_t)k) + (size_t)c] += basis[k] * d_rgb[c];
+    if (grads->means && view->sh_coefficients > 1 && distance > 0.0f) {
+        gsf__sh_basis_gradient(d, view->sh_coefficients, gx, gy, gz);
+        float d_dir[3] = {0.0f, 0.0f, 0.0f};
+        for (int32_t k = 1; k < view->sh_coefficients; k++) {
+            const float weight = sh[3 * k] * d_rgb[0] + sh[3 * k + 1] * d_rgb[1] + sh[3 * k + 2] * d_rgb[2];
+            d_dir[0] += gx[k] * weight;
+            d_dir[1] += gy[k] * weight;
+            d_dir[2] += gz[k] * weight;
+        }
+        const float along = gsf__dot3(d, d_dir); // direction = (mean - centre) / distance
+        for (int c = 0; c < 3; c++) d_mean[c] += (d_dir[c] - along * d[c]) / distance;
+    }
+    if (grads->means)
+        for (int c = 0; c < 3; c++) grads->means[3 * i + (size_t)c] += d_mean[c];
+    if (grads->means2d) {
+        grads->means2d[2 * i] += du;
+        grads->means2d[2 * i + 1] += dv;
+    }
+    if (grads->means2d_abs) {
+        grads->means2d_abs[2 * i] += (float)sums[GSF__SLOT_ABS_X];
+        grads->means2d_abs[2 * i + 1] += (float)sums[GSF__SLOT_ABS_Y];
+    }
+    if (grads->opacity_logits) // d ln(sigmoid) / d logit = 1 - sigmoid = sigmoid(-logit)
+        grads->opacity_logits[i] += sp * gsf__sigmoid(-splats->opacity_logits[i]);
+
+    // T = Q S with Q = W R
+    if (grads->log_scales)
+        for (int c = 0; c < 3; c++)
+            grads->log_scales[3 * i + (size_t)c] += dT[c] * p.T[c] + dT[3 + c] * p.T[3 + c] + dT[6 + c] * p.T[6 + c];
+    if (grads->quats) {
+        float dR[9]; // W^T dQ, dQ = dT S
+        for (int r = 0; r < 3; r++)
+            for (int c = 0; c < 3; c++)
+                dR[3 * r + c] = (view->W[r] * dT[c] + view->W[3 + r] * dT[3 + c] + view->W[6 + r] * dT[6 + c]) * p.scale[c];
+        const float w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
+        float dq[4];
+        dq[0] = 2.0f * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
+        dq[1] = 2.0f * (y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) + w * (dR[7] - dR[5])) - 4.0f * x * (dR[4] + dR[8]);
+        dq[2] = 2.0f * (x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) + w * (dR[2] - dR[6])) - 4.0f * y * (dR[0] + dR[8]);
+        dq[3] = 2.0f * (x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) + w * (dR[3] - dR[1])) - 4.0f * z * (dR[0] + dR[4]);
+        const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
+        for (int k = 0; k < 4; k++) grads->quats[4 * i + (size_t)k] += (dq[k] - along * p.q[k]) * p.inv_norm;
+    }
+}
+
+typedef struct gsf__gather_job {
+    const gsf_rasterizer* r;
+    const gsf__view* view;
+    const gsf_splats* splats;
+    const gsf_splat_grads* grads;
+} gsf__gather_job;
+
+static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__gather_job* job = (const gsf__gather_job*)arg;
+    const gsf_rasterizer* r = job->r;
+    const size_t begin = chunk * GSF__PROJECT_CHUNK;
+    const size_t end = begin + GSF__PROJECT_CHUNK < r->visible_count ? begin + GSF__PROJECT_CHUNK : r->visible_count;
+    for (size_t rank = begin; rank < end; rank++) {
+        double sums[GSF__SLOT_FLOATS];
+        memset(sums, 0, sizeof sums);
+        int touched = 0;
+        for (size_t s = r->slot_begin[rank]; s < r->slot_begin[rank + 1]; s++) {
+            const float* slot = r->slots + GSF__SLOT_FLOATS * s;
+            for (int k = 0; k < GSF__SLOT_FLOATS; k++) {
+                sums[k] += (double)slot[k];
+                touched |= slot[k] != 0.0f;
+            }
+        }
+        const size_t i = r->visible[rank];
+        if (touched) gsf__project_backward(job->view, job->splats, i, r->records + i, sums, job->grads);
+    }
+}
+
 // ---- >>render ------------------------------------------------------------------
+
+static gsf_result gsf__check_render(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera,
+                                    const gsf_render_desc* desc) {
+    GSF__TRY(gsf_check_camera(ctx, camera));
+    if (splats->count > UINT32_MAX - 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: %zu splats are more than 2^32 - 2", splats->count);
+    if (splats->sh_degree < 0 || splats->sh_degree > 3)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: SH degree %d is not 0..3", (int)splats->sh_degree);
+    if (splats->count && !(splats->means && splats->log_scales && splats->quats && splats->opacity_logits && splats->sh))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: a parameter array is NULL");
+    if (desc->sh_bands < 0 || desc->sh_bands > 4)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: sh_bands is %d, expected 0..4", (int)desc->sh_bands);
+    if (camera->width > 65536 || camera->height > 65536)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: image of %d x %d is larger than 65536 pixels",
+                        (int)camera->width, (int)camera->height);
+    for (int c = 0; c < 3; c++)
+        if (!isfinite(desc->background[c]))
+            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "render: background[%d] is not finite", c);
+    return GSF_OK;
+}
+
+static gsf_result gsf__check_output(gsf_context* ctx, const gsf_image* image, const char* name, int channels,
+                                    const gsf_camera* camera) {
+    if (!image->data) return GSF_OK;
+    if (image->dtype != GSF_F32 || image->channels != channels || image->width != camera->width ||
+        image->height != camera->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: output %s must be f32, %d channels, %d x %d", name,
+                        channels, (int)camera->width, (int)camera->height);
+    return GSF_OK;
+}
+
+static gsf_result gsf__reserve_frame(gsf_context* ctx, gsf_rasterizer* r) {
+    const size_t pixels = (size_t)r->width * (size_t)r->height;
+    if (pixels > r->pixel_capacity) {
+        r->pixel_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->final_T, pixels, sizeof(float)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->depth_sum, pixels, sizeof(float)));
+        r->pixel_capacity = pixels;
+    }
+    if (r->splat_count > r->splat_capacity || !r->radii) {
+        const size_t n = r->splat_count + r->splat_count / 4 + 64;
+        r->splat_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->records, n, sizeof(gsf__record)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->radii, n, sizeof(int32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->visible, n, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->visible_spare, n, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->keys, n, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->keys_spare, n, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->slot_begin, n + 1, sizeof(size_t)));
+        r->splat_capacity = n;
+    }
+    return GSF_OK;
+}
+
+typedef struct gsf__raster_job {
+    gsf_rasterizer* r;
+    const gsf__raster_kernels* kernels;
+    const gsf__view* view;
+    const gsf_render_output* out;
+    const float *d_color, *d_depth, *d_alpha;
+    int flags;
+} gsf__raster_job;
+
+static gsf__tile gsf__tile_of(const gsf_rasterizer* r, size_t index) {
+    gsf__tile tile;
+    tile.records = r->records;
+    tile.visible = r->visible;
+    tile.ranks = r->pair_rank + r->tile_begin[index];
+    tile.count = r->tile_begin[index + 1] - r->tile_begin[index];
+    tile.x0 = (float)((int32_t)(index % (size_t)r->tiles_x) * GSF__TILE);
+    tile.y0 = (float)((int32_t)(index / (size_t)r->tiles_x) * GSF__TILE);
+    return tile;
+}
+
+// Columns and rows of the tile inside the image.
+static void gsf__tile_extent(const gsf_rasterizer* r, const gsf__tile* tile, int* columns, int* rows) {
+    *columns = r->width - (int)tile->x0 < GSF__TILE ? r->width - (int)tile->x0 : GSF__TILE;
+    *rows = r->height - (int)tile->y0 < GSF__TILE ? r->height - (int)tile->y0 : GSF__TILE;
+}
+
+static int gsf__lane_of(int column, int row) { return 8 * (row + 16 * (column >> 3)) + (column & 7); }
+
+// T = 1 inside the image, -1 (finished) outside.
+static void gsf__open_tile(float* T, int columns, int rows) {
+    for (int k = 0; k < GSF__TILE_PIXELS; k++) T[k] = -1.0f;
+    for (int row = 0; row < rows; row++)
+        for (int column = 0; column < columns; column++) T[gsf__lane_of(column, row)] = 1.0f;
+}
+
+static void gsf__put_pixel(const gsf_image* image, int64_t x, int64_t y, int channel, float value) {
+    char* at = (char*)image->data + y * image->stride_y + x * image->stride_x + channel * image->stride_c;
+    memcpy(at, &value, sizeof value);
+}
+
+static void gsf__blend_chunk(void* arg, size_t index, int worker) {
+    (void)worker;
+    const gsf__raster_job* job = (const gsf__raster_job*)arg;
+    gsf_rasterizer* r = job->r;
+    const gsf__tile tile = gsf__tile_of(r, index);
+    gsf__tile_state state;
+    int columns, rows;
+    gsf__tile_extent(r, &tile, &columns, &rows);
+    memset(&state, 0, sizeof state);
+    gsf__open_tile(state.T, columns, rows);
+    job->kernels->blend(&tile, &state, job->flags);
+    for (int row = 0; row < rows; row++)
+        for (int column = 0; column < columns; column++) {
+            const int k = gsf__lane_of(column, row);
+            const int64_t x = (int64_t)tile.x0 + column, y = (int64_t)tile.y0 + row;
+            const float T = fabsf(state.T[k]);
+            const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
+            r->final_T[pixel] = T;
+            r->depth_sum[pixel] = state.z[k];
+            if (job->out->color.data) {
+                gsf__put_pixel(&job->out->color, x, y, 0, state.r[k] + T * job->view->background[0]);
+                gsf__put_pixel(&job->out->color, x, y, 1, state.g[k] + T * job->view->background[1]);
+                gsf__put_pixel(&job->out->color, x, y, 2, state.b[k] + T * job->view->background[2]);
+            }
+            if (job->out->alpha.data) gsf__put_pixel(&job->out->alpha, x, y, 0, 1.0f - T);
+            if (job->out->depth.data) gsf__put_pixel(&job->out->depth, x, y, 0, T < 1.0f ? state.z[k] / (1.0f - T) : 0.0f);
+        }
+}
+
+GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const gsf_splats* splats, const gsf_camera* camera,
+                                    const gsf_render_desc* desc, const gsf_render_output* out) {
+    gsf_render_desc defaults;
+    memset(&defaults, 0, sizeof defaults);
+    if (!desc) desc = &defaults;
+    GSF__TRY(gsf__check_render(ctx, splats, camera, desc));
+    GSF__TRY(gsf__check_output(ctx, &out->color, "color", 3, camera));
+    GSF__TRY(gsf__check_output(ctx, &out->depth, "depth", 1, camera));
+    GSF__TRY(gsf__check_output(ctx, &out->alpha, "alpha", 1, camera));
+    r->width = camera->width;
+    r->height = camera->height;
+    r->tiles_x = (r->width + GSF__TILE - 1) / GSF__TILE;
+    r->tiles_y = (r->height + GSF__TILE - 1) / GSF__TILE;
+    r->splat_count = splats->count;
+    r->visible_count = 0;
+    r->has_depth = out->depth.data != NULL;
+    GSF__TRY(gsf__reserve_frame(ctx, r));
+
+    const gsf__view view = gsf__make_view(splats, camera, desc);
+    gsf__project_job project;
+    project.r = r;
+    project.view = &view;
+    project.splats = splats;
+    project.hidden = desc->hidden;
+    gsf__parallel_for(ctx, (splats->count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__project_chunk, &project);
+    gsf__sort_visible(r);
+    GSF__TRY(gsf__bin(ctx, r, &view));
+
+    gsf__raster_job job;
+    memset(&job, 0, sizeof job);
+    job.r = r;
+    job.kernels = gsf__raster_kernels_of(ctx->cpu_level);
+    job.view = &view;
+    job.out = out;
+    job.flags = r->has_depth ? GSF__WITH_DEPTH : 0;
+    gsf__parallel_for(ctx, (size_t)r->tiles_x * (size_t)r->tiles_y, gsf__blend_chunk, &job);
+    return GSF_OK;
+}
+
+static void gsf__load_tile_gradient(const gsf__raster_job* job, const gsf__tile* tile, int columns, int rows,
+                                    gsf__tile_gradient* gradient, double background[3]) {
+    const gsf_rasterizer* r = job->r;
+    memset(gradient, 0, sizeof *gradient);
+    for (int row = 0; row < rows; row++)
+        for (int column = 0; column < columns; column++) {
+            const int k = gsf__lane_of(column, row);
+            const size_t pixel = (size_t)((int)tile->y0 + row) * (size_t)r->width + (size_t)((int)tile->x0 + column);
+            const float T = r->final_T[pixel];
+            if (job->d_color) {
+                gradient->r[k] = job->d_color[3 * pixel];
+                gradient->g[k] = job->d_color[3 * pixel + 1];
+                gradient->b[k] = job->d_color[3 * pixel + 2];
+            }
+            if (job->d_alpha) gradient->a[k] = job->d_alpha[pixel];
+            if (job->d_depth && T < 1.0f) { // depth = D / A
+                const float weight = 1.0f - T;
+                gradient->z[k] = job->d_depth[pixel] / weight;
+                gradient->a[k] -= gradient->z[k] * (r->depth_sum[pixel] / weight);
+            }
+            gradient->behind[k] = gradient->r[k] * job->view->background[0] + gradient->g[k] * job->view->background[1] +
+                                  gradient->b[k] * job->view->background[2];
+            background[0] += (double)(T * gradient->r[k]);
+            background[1] += (double)(T * gradient->g[k]);
+            background[2] += (double)(T * gradient->b[k]);
+        }
+}
+
+static void gsf__reverse_chunk(void* arg, size_t index, int worker) {
+    const gsf__raster_job* job = (const gsf__raster_job*)arg;
+    gsf_rasterizer* r = job->r;
+    const gsf__tile tile = gsf__tile_of(r, index);
+    const size_t* pair_slot = r->pair_slot + r->tile_begin[index];
+    double* background = r->tile_background + 3 * index;
+    gsf__worker_scratch* scratch = r->workers + worker;
+    gsf__tile_gradient gradient;
+    float T[GSF__TILE_PIXELS];
+    int columns, rows;
+    memset(background, 0, 3 * sizeof(double));
+    gsf__tile_extent(r, &tile, &columns, &rows);
+    gsf__load_tile_gradient(job, &tile, columns, rows, &gradient, background);
+    for (size_t i = 0; i < tile.count; i++)
+        memset(r->slots + GSF__SLOT_FLOATS * pair_slot[i], 0, GSF__SLOT_FLOATS * sizeof(float));
+
+    // forward over the whole list, remembering where each bucket of kept steps begins
+    gsf__open_tile(T, columns, rows);
+    size_t buckets = 0, next = 0, kept = 0;
+    while (next < tile.count) {
+        memcpy(scratch->checkpoints + buckets * GSF__TILE_PIXELS, T, sizeof T);
+        scratch->checkpoint_entry[buckets++] = (uint32_t)next;
+        next = job->kernels->keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
+    }
+    // the last bucket's steps are at hand; earlier ones are made again from their checkpoint
+    while (buckets > 0) {
+        job->kernels->reverse(&tile, scratch->steps, scratch->heads, kept, &gradient, pair_slot, r->slots, job->flags);
+        if (--buckets == 0) break;
+        memcpy(T, scratch->checkpoints + (buckets - 1) * GSF__TILE_PIXELS, sizeof T);
+        job->kernels->keep(&tile, T, scratch->checkpoint_entry[buckets - 1], scratch->checkpoint_entry[buckets],
+                           scratch->steps, scratch->heads, &kept);
+    }
+}
+
+static gsf_result gsf__reserve_backward(gsf_context* ctx, gsf_rasterizer* r) {
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    if (r->pair_count > r->slot_capacity) {
+        const size_t capacity = r->pair_count + r->pair_count / 4;
+        r->slot_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->slots, capacity, GSF__SLOT_FLOATS * sizeof(float)));
+        r->slot_capacity = capacity;
+    }
+    if (tiles > r->tile_background_capacity) {
+        r->tile_background_capacity = 0;
+        GSF__TRY(gsf__grow(ctx, (void**)&r->tile_background, tiles, 3 * sizeof(double)));
+        r->tile_background_capacity = tiles;
+    }
+    if (r->worker_count < ctx->parallel.worker_count) {
+        gsf__free_workers(ctx, r);
+        r->workers = (gsf__worker_scratch*)gsf_alloc_zeroed(ctx, (size_t)ctx->parallel.worker_count,
+                                                            sizeof(gsf__worker_scratch));
+        if (!r->workers) return GSF_ERROR_OUT_OF_MEMORY;
+        r->worker_count = ctx->parallel.worker_count;
+    }
+    size_t longest = 0;
+    for (size_t t = 0; t < tiles; t++)
+        if (r->tile_begin[t + 1] - r->tile_begin[t] > longest) longest = r->tile_begin[t + 1] - r->tile_begin[t];
+    const size_t checkpoints = longest * GSF__STEPS / GSF__BUCKET + 2;
+    for (int i = 0; i < r->worker_count; i++) {
+        gsf__worker_scratch* w = r->workers + i;
+        if (!w->steps) w->steps = (gsf__step*)gsf_alloc(ctx, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step));
+        if (!w->heads) w->heads = (gsf__step_head*)gsf_alloc(ctx, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step_head));
+        if (!w->steps || !w->heads) return GSF_ERROR_OUT_OF_MEMORY;
+        if (checkpoints > w->checkpoint_capacity) {
+            w->checkpoint_capacity = 0;
+            GSF__TRY(gsf__grow(ctx, (void**)&w->checkpoints, checkpoints, GSF__TILE_PIXELS * sizeof(float)));
+            GSF__TRY(gsf__grow(ctx, (void**)&w->checkpoint_entry, checkpoints, sizeof(uint32_t)));
+            w->checkpoint_capacity = checkpoints;
+        }
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r, const gsf_splats* splats,
+                                             const gsf_camera* camera, const gsf_render_desc* desc, const float* d_color,
+                                             const float* d_depth, const float* d_alpha, const gsf_splat_grads* grads) {
+    gsf_render_desc defaults;
+    memset(&defaults, 0, sizeof defaults);
+    if (!desc) desc = &defaults;
+    GSF__TRY(gsf__check_render(ctx, splats, camera, desc));
+    if (splats->count != r->splat_count || camera->width != r->width || camera->height != r->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render backward: not the splats and camera of the last render");
+    if (d_depth && !r->has_depth)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render backward: d_depth given, but no depth was rendered");
+    GSF__TRY(gsf__reserve_backward(ctx, r));
+
+    const gsf__view view = gsf__make_view(splats, camera, desc);
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    gsf__raster_job job;
+    memset(&job, 0, sizeof job);
+    job.r = r;
+    job.kernels = gsf__raster_kernels_of(ctx->cpu_level);
+    job.view = &view;
+    job.d_color = d_color;
+    job.d_depth = d_depth;
+    job.d_alpha = d_alpha;
+    job.flags = (d_depth || d_alpha ? GSF__WITH_DEPTH : 0) | (view.official_gradient ? GSF__STRAIGHT_THROUGH : 0);
+    gsf__parallel_for(ctx, tiles, gsf__reverse_chunk, &job);
+    if (grads->background)
+        for (int c = 0; c < 3; c++) {
+            double sum = 0.0;
+            for (size_t t = 0; t < tiles; t++) sum += r->tile_background[3 * t + (size_t)c];
+            grads->background[c] += (float)sum;
+        }
+    gsf__gather_job gather;
+    gather.r = r;
+    gather.view = &view;
+    gather.splats = splats;
+    gather.grads = grads;
+    gsf__parallel_for(ctx, (r->visible_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__gather_chunk, &gather);
+    return GSF_OK;
+}
 
 // ---- >>loss --------------------------------------------------------------------
 
