@@ -52,11 +52,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make(gsf_context* ctx, size_t count, 
 GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 
 // The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Splats with a non-finite
-// value are dropped and counted in a warning. Origin: zero, or the rounded centre where coordinates are large.
+// value are dropped and counted in a warning. Origin: zero, or the rounded centre where coordinates are large (centre
+// beyond 1e5, or beyond 1000 times the extent; both from medians of samples, so stray splats do not matter). Ids are the
+// rows. Memory in proportion to the file; a header that promises more rows than the file can hold is an error.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_ply(gsf_context* ctx, const char* path, gsf_splats* out);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size,
                                                      gsf_splats* out);
-// Binary little-endian float32 as the official code writes it; x y z become double when origin is not zero.
+// Binary little-endian float32 as the official code writes it. x y z are world positions; they become double when they
+// are large by the loader's rule, since float32 would then cost precision (and stay float32 otherwise, whatever origin
+// is, so that every viewer reads the file). format_ply appends to `out`, which starts zeroed.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const gsf_splats* splats);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out);
 
@@ -300,6 +304,7 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 #ifndef GSF_SPLAT_IMPLEMENTED
 #define GSF_SPLAT_IMPLEMENTED
 
+#include <locale.h>
 #include "gsfixer.h" // again: internals and implementations, if all was included before without the macro
 #include "gsfixer_traj.h"
 
@@ -352,6 +357,715 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats) {
 }
 
 // ---- >>ply ---------------------------------------------------------------------
+
+/* A splat file:  "ply" | format line | "element vertex N" | property lines | "end_header" | N rows
+   Columns are found by name, so any order and additional columns do. Elements before the vertices are skipped, elements
+   after them are never reached. f_rest is channel-major in the file (all of red, then green, then blue), while
+   gsf_splats.sh is coefficient-major. */
+
+enum { // slots of the columns somebody asks for
+    GSF__PLY_X = 0,
+    GSF__PLY_DC = 3,
+    GSF__PLY_OPACITY = 6,
+    GSF__PLY_SCALE = 7,
+    GSF__PLY_ROT = 10,
+    GSF__PLY_REST = 14,
+    GSF__PLY_REST_MAX = 45,
+    GSF__PLY_RED = GSF__PLY_REST + GSF__PLY_REST_MAX,
+    GSF__PLY_SLOTS = GSF__PLY_RED + 3
+};
+
+typedef enum gsf__ply_type {
+    GSF__PLY_I8, GSF__PLY_U8, GSF__PLY_I16, GSF__PLY_U16, GSF__PLY_I32, GSF__PLY_U32, GSF__PLY_F32, GSF__PLY_F64,
+    GSF__PLY_ABSENT
+} gsf__ply_type;
+
+typedef enum gsf__ply_format { GSF__PLY_ASCII, GSF__PLY_LITTLE, GSF__PLY_BIG } gsf__ply_format;
+
+typedef struct gsf__ply { // a checked header; in binary files count rows of row_bytes lie inside the data
+    const char* name; // for error texts
+    const unsigned char* data;
+    size_t size;
+    gsf__ply_format format;
+    size_t body;      // byte offset of the first vertex row (ascii: of the text that holds it)
+    size_t count;     // vertices
+    size_t columns;   // properties of a vertex
+    size_t row_bytes; // binary only
+    gsf__ply_type type[GSF__PLY_SLOTS];
+    size_t offset[GSF__PLY_SLOTS]; // bytes into the row, or index of the column (ascii)
+} gsf__ply;
+
+static int gsf__is_blank(unsigned char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; }
+
+// Next word of [*at, end), which *at then points behind; its length, 0 at the end.
+static size_t gsf__next_word(const char** at, const char* end, const char** word) {
+    const char* p = *at;
+    while (p < end && gsf__is_blank((unsigned char)*p)) p++;
+    *word = p;
+    while (p < end && !gsf__is_blank((unsigned char)*p)) p++;
+    *at = p;
+    return (size_t)(p - *word);
+}
+
+static int gsf__word_is(const char* word, size_t length, const char* text) {
+    return strlen(text) == length && memcmp(word, text, length) == 0;
+}
+
+// Decimal digits only; 0 on anything else and on overflow.
+static int gsf__word_u64(const char* word, size_t length, uint64_t* out) {
+    uint64_t value = 0;
+    if (length == 0) return 0;
+    for (size_t i = 0; i < length; i++) {
+        const unsigned digit = (unsigned)(unsigned char)word[i] - '0';
+        if (digit > 9 || value > (UINT64_MAX - digit) / 10) return 0;
+        value = value * 10 + digit;
+    }
+    *out = value;
+    return 1;
+}
+
+static int gsf__word_is_nan_or_inf(const char* word, size_t length, double* out) {
+    char lower[10];
+    if (length && (*word == '-' || *word == '+')) word++, length--;
+    if (length < 3 || length >= sizeof lower) return 0;
+    for (size_t i = 0; i < length; i++) lower[i] = (char)(word[i] >= 'A' && word[i] <= 'Z' ? word[i] + 32 : word[i]);
+    if (gsf__word_is(lower, length, "nan")) *out = (double)NAN;
+    else if (gsf__word_is(lower, length, "inf") || gsf__word_is(lower, length, "infinity")) *out = (double)INFINITY;
+    else return 0;
+    return 1;
+}
+
+// A decimal number filling the whole word, correctly rounded in any locale; nan and inf (sign ignored) are taken too,
+// for the caller to reject. 0 when malformed.
+static int gsf__word_double(const char* word, size_t length, double* out) {
+    static const double powers[23] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
+                                      1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
+    const char *p = word, *end = word + length, *point = NULL;
+    const int negative = p < end && *p == '-';
+    if (p < end && (*p == '-' || *p == '+')) p++;
+    uint64_t mantissa = 0;
+    size_t digits = 0;
+    int64_t scale = 0;
+    int exact = 1;
+    for (; p < end; p++) {
+        if (*p == '.' && !point) {
+            point = p;
+            continue;
+        }
+        if (*p < '0' || *p > '9') break;
+        digits++;
+        if (mantissa > (UINT64_MAX - 9) / 10) exact = 0;
+        else mantissa = mantissa * 10 + (uint64_t)(*p - '0'), scale -= point != NULL;
+    }
+    if (digits == 0) return gsf__word_is_nan_or_inf(word, length, out);
+    if (p < end && (*p == 'e' || *p == 'E')) {
+        const int down = p + 1 < end && p[1] == '-';
+        p += 1 + (p + 1 < end && (p[1] == '-' || p[1] == '+'));
+        if (p == end) return 0;
+        int64_t exponent = 0;
+        for (; p < end && *p >= '0' && *p <= '9'; p++)
+            if (exponent < 100000) exponent = exponent * 10 + (*p - '0');
+        scale += down ? -exponent : exponent;
+    }
+    if (p != end) return 0;
+    if (exact && mantissa < (1ull << 53) && scale >= -22 && scale <= 22) { // both factors exact: one rounding
+        const double magnitude = scale < 0 ? (double)mantissa / powers[-scale] : (double)mantissa * powers[scale];
+        *out = negative ? -magnitude : magnitude;
+        return 1;
+    }
+    char copy[128]; // strtod wants a terminator and the locale's decimal point
+    const char* local_point = localeconv()->decimal_point;
+    const size_t point_size = strlen(local_point);
+    if (length + point_size >= sizeof copy) return 0;
+    const size_t head = point ? (size_t)(point - word) : length;
+    memcpy(copy, word, head);
+    size_t used = head;
+    if (point) {
+        memcpy(copy + used, local_point, point_size);
+        used += point_size;
+        memcpy(copy + used, point + 1, length - head - 1);
+        used += length - head - 1;
+    }
+    copy[used] = 0;
+    *out = strtod(copy, NULL);
+    return 1;
+}
+
+static gsf__ply_type gsf__ply_type_of(const char* word, size_t length) {
+    static const char* const names[8][2] = {{"char", "int8"},  {"uchar", "uint8"}, {"short", "int16"},
+                                            {"ushort", "uint16"}, {"int", "int32"}, {"uint", "uint32"},
+                                            {"float", "float32"}, {"double", "float64"}};
+    for (int i = 0; i < 8; i++)
+        if (gsf__word_is(word, length, names[i][0]) || gsf__word_is(word, length, names[i][1])) return (gsf__ply_type)i;
+    return GSF__PLY_ABSENT;
+}
+
+static size_t gsf__ply_type_size(gsf__ply_type type) {
+    static const unsigned char sizes[9] = {1, 1, 2, 2, 4, 4, 4, 8, 0};
+    return sizes[type];
+}
+
+// Slot of a column name, GSF__PLY_SLOTS when nobody wants it, -1 for an f_rest beyond degree 3.
+static int gsf__ply_slot(const char* word, size_t length) {
+    static const char* const names[GSF__PLY_REST] = {"x",       "y",       "z",       "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+                                                     "scale_0", "scale_1", "scale_2", "rot_0",  "rot_1",  "rot_2",  "rot_3"};
+    static const char* const colors[3] = {"red", "green", "blue"};
+    for (int i = 0; i < GSF__PLY_REST; i++)
+        if (gsf__word_is(word, length, names[i])) return i;
+    for (int i = 0; i < 3; i++)
+        if (gsf__word_is(word, length, colors[i])) return GSF__PLY_RED + i;
+    uint64_t index;
+    if (length > 7 && memcmp(word, "f_rest_", 7) == 0 && gsf__word_u64(word + 7, length - 7, &index))
+        return index < GSF__PLY_REST_MAX ? GSF__PLY_REST + (int)index : -1;
+    return GSF__PLY_SLOTS;
+}
+
+typedef struct gsf__ply_element { // the element whose properties are being read
+    int seen, is_vertex, has_list;
+    uint64_t rows;
+    size_t columns, row_bytes;
+} gsf__ply_element;
+
+static gsf_result gsf__ply_property(gsf_context* ctx, gsf__ply* ply, gsf__ply_element* element, size_t line,
+                                    const char* at, const char* end) {
+    const char *type_word, *name_word;
+    const size_t type_size = gsf__next_word(&at, end, &type_word);
+    if (!element->seen)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: property before any element", ply->name, line);
+    if (gsf__word_is(type_word, type_size, "list")) {
+        if (element->is_vertex)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: list property inside vertex", ply->name, line);
+        element->has_list = 1;
+        return GSF_OK;
+    }
+    const gsf__ply_type type = gsf__ply_type_of(type_word, type_size);
+    const size_t name_size = gsf__next_word(&at, end, &name_word);
+    if (type == GSF__PLY_ABSENT || name_size == 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected \"property TYPE NAME\", got type \"%.*s\"", ply->name, line,
+                        (int)(type_size < 40 ? type_size : 40), type_word);
+    if (element->is_vertex) {
+        const int slot = gsf__ply_slot(name_word, name_size);
+        if (slot < 0)
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: f_rest beyond SH degree 3 (0..44)", ply->name, line);
+        if (slot < GSF__PLY_SLOTS) {
+            if (ply->type[slot] != GSF__PLY_ABSENT)
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: column \"%.*s\" stands twice", ply->name, line,
+                                (int)(name_size < 40 ? name_size : 40), name_word);
+            ply->type[slot] = type;
+            ply->offset[slot] = ply->format == GSF__PLY_ASCII ? element->columns : element->row_bytes;
+        }
+    }
+    element->columns++;
+    element->row_bytes += gsf__ply_type_size(type);
+    return GSF_OK;
+}
+
+// Called when the properties of `element` are complete. before: bytes (ascii: words) to skip ahead of the vertices.
+static gsf_result gsf__ply_finish_element(gsf_context* ctx, gsf__ply* ply, const gsf__ply_element* element, int* found,
+                                          size_t* before) {
+    if (!element->seen || *found) return GSF_OK;
+    if (element->is_vertex) {
+        *found = 1;
+        ply->columns = element->columns;
+        ply->row_bytes = element->row_bytes;
+        return GSF_OK;
+    }
+    if (element->has_list && element->rows)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: an element with lists stands before the vertices", ply->name);
+    const size_t unit = ply->format == GSF__PLY_ASCII ? element->columns : element->row_bytes;
+    size_t skip;
+    if (element->rows > SIZE_MAX || !gsf__mul_size((size_t)element->rows, unit, &skip) || skip > ply->size ||
+        *before > ply->size - skip)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: the elements before the vertices exceed the file", ply->name);
+    *before += skip;
+    return GSF_OK;
+}
+
+static gsf_result gsf__ply_read_format(gsf_context* ctx, gsf__ply* ply, size_t line, const char* at, const char* end) {
+    static const char* const names[3] = {"ascii", "binary_little_endian", "binary_big_endian"};
+    const char* word;
+    const size_t length = gsf__next_word(&at, end, &word);
+    for (int i = 0; i < 3; i++)
+        if (gsf__word_is(word, length, names[i])) {
+            const size_t version = gsf__next_word(&at, end, &word);
+            if (!gsf__word_is(word, version, "1.0")) break;
+            ply->format = (gsf__ply_format)i;
+            return GSF_OK;
+        }
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected format ascii, binary_little_endian or binary_big_endian 1.0",
+                    ply->name, line);
+}
+
+// Moves ply->body behind `words` words.
+static gsf_result gsf__ply_skip_words(gsf_context* ctx, gsf__ply* ply, size_t words) {
+    const char *at = (const char*)ply->data + ply->body, *end = (const char*)ply->data + ply->size, *word;
+    for (; words; words--)
+        if (gsf__next_word(&at, end, &word) == 0)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file ends before the vertices", ply->name, ply->size);
+    ply->body = (size_t)(at - (const char*)ply->data);
+    return GSF_OK;
+}
+
+// Places the body and checks that `count` rows can lie in the rest of the file.
+static gsf_result gsf__ply_place_body(gsf_context* ctx, gsf__ply* ply, uint64_t rows, size_t before) {
+    if (ply->format == GSF__PLY_ASCII) {
+        GSF__TRY(gsf__ply_skip_words(ctx, ply, before));
+    } else {
+        if (before > ply->size - ply->body)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file ends before the vertices", ply->name, ply->size);
+        ply->body += before;
+    }
+    const size_t left = ply->size - ply->body;
+    // In text a value takes at least a digit and a separator, the last of the file the digit only.
+    const size_t fit = ply->columns == 0 ? 0
+                       : ply->format == GSF__PLY_ASCII ? (left + 1) / (2 * ply->columns) : left / ply->row_bytes;
+    if (rows > fit)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %llu vertices announced, the file has room for %zu", ply->name,
+                        ply->body, (unsigned long long)rows, fit);
+    ply->count = (size_t)rows;
+    return GSF_OK;
+}
+
+static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const void* data, size_t size, gsf__ply* ply) {
+    memset(ply, 0, sizeof *ply);
+    ply->name = name;
+    ply->data = (const unsigned char*)(data ? data : "");
+    ply->size = size;
+    for (int i = 0; i < GSF__PLY_SLOTS; i++) ply->type[i] = GSF__PLY_ABSENT;
+    const char* text = (const char*)ply->data;
+    gsf__ply_element element;
+    memset(&element, 0, sizeof element);
+    uint64_t vertices = 0;
+    size_t before = 0;
+    int found = 0, has_format = 0, has_vertex = 0;
+    for (size_t line = 0, number = 0;; number++) {
+        const char* stop = line < size ? (const char*)memchr(text + line, '\n', size - line) : NULL;
+        if (!stop && number == 0) stop = text + size; // so that any other short file is "no PLY", not "cut"
+        if (!stop) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: header without end_header", name, line);
+        const char *at = text + line, *word;
+        const size_t length = gsf__next_word(&at, stop, &word);
+        if (number == 0) {
+            if (word != text || !gsf__word_is(word, length, "ply") || stop == text + size)
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not a PLY file (first line \"ply\" expected)", name);
+        } else if (gsf__word_is(word, length, "format")) {
+            if (has_format || element.seen)
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: format line out of place", name, line);
+            GSF__TRY(gsf__ply_read_format(ctx, ply, line, at, stop));
+            has_format = 1;
+        } else if (gsf__word_is(word, length, "element")) {
+            GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, &found, &before));
+            memset(&element, 0, sizeof element);
+            element.seen = 1;
+            size_t n = gsf__next_word(&at, stop, &word);
+            element.is_vertex = gsf__word_is(word, n, "vertex");
+            n = gsf__next_word(&at, stop, &word);
+            if (!gsf__word_u64(word, n, &element.rows))
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element count \"%.*s\" is not a 64-bit count", name, line,
+                                (int)(n < 40 ? n : 40), word);
+            if (element.is_vertex && has_vertex)
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element vertex stands twice", name, line);
+            if (element.is_vertex) vertices = element.rows, has_vertex = 1;
+        } else if (gsf__word_is(word, length, "property")) {
+            GSF__TRY(gsf__ply_property(ctx, ply, &element, line, at, stop));
+        } else if (gsf__word_is(word, length, "end_header")) {
+            GSF__TRY(gsf__ply_finish_element(ctx, ply, &element, &found, &before));
+            ply->body = (size_t)(stop - text) + 1;
+            break;
+        } else if (!gsf__word_is(word, length, "comment") && !gsf__word_is(word, length, "obj_info") && length) {
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: unknown header line \"%.*s\"", name, line,
+                            (int)(length < 40 ? length : 40), word);
+        }
+        line = (size_t)(stop - text) + 1;
+    }
+    if (!has_format) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: header without a format line", name, ply->body);
+    if (!has_vertex) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: header without element vertex", name, ply->body);
+    return gsf__ply_place_body(ctx, ply, vertices, before);
+}
+
+static double gsf__ply_value(const unsigned char* p, gsf__ply_type type, int big) {
+    unsigned char swapped[8];
+    const size_t size = gsf__ply_type_size(type);
+    if (big) {
+        for (size_t i = 0; i < size; i++) swapped[i] = p[size - 1 - i];
+        p = swapped;
+    }
+    const uint64_t bits = gsf__load_le(p, (int)size);
+    const uint32_t low = (uint32_t)bits;
+    float narrow;
+    double wide;
+    switch (type) {
+        case GSF__PLY_I8: return (double)(low < 0x80u ? (int32_t)low : (int32_t)low - 0x100);
+        case GSF__PLY_I16: return (double)(low < 0x8000u ? (int32_t)low : (int32_t)low - 0x10000);
+        case GSF__PLY_I32: return low < 0x80000000u ? (double)low : (double)low - 4294967296.0;
+        case GSF__PLY_U8:
+        case GSF__PLY_U16:
+        case GSF__PLY_U32: return (double)low;
+        case GSF__PLY_F32: memcpy(&narrow, &low, sizeof narrow); return (double)narrow;
+        case GSF__PLY_F64: memcpy(&wide, &bits, sizeof wide); return wide;
+        case GSF__PLY_ABSENT: break;
+    }
+    return 0.0;
+}
+
+static void gsf__ply_position(const gsf__ply* ply, size_t row, double out[3]) { // binary files
+    const unsigned char* p = ply->data + ply->body + row * ply->row_bytes;
+    for (int k = 0; k < 3; k++)
+        out[k] = gsf__ply_value(p + ply->offset[k], ply->type[k], ply->format == GSF__PLY_BIG);
+}
+
+static int gsf__compare_doubles(const void* a, const void* b) {
+    const double x = *(const double*)a, y = *(const double*)b;
+    return (x > y) - (x < y);
+}
+
+enum { GSF__ORIGIN_SAMPLES = 1024 };
+
+// The origin that positions deserve: zero, or their rounded centre where float32 would cost precision (centre beyond 1e5,
+// or beyond 1000 times the extent). Centre and extent are the median and the 5..95 % range of at most 1024 evenly spread
+// positions, so stray splats do not move it. axis: n samples of x, then of y, then of z; sorted in place.
+static void gsf__choose_origin(double* axis, size_t n, double origin[3]) {
+    double centre[3], extent = 0.0, distance = 0.0;
+    memset(origin, 0, 3 * sizeof(double));
+    if (n == 0) return;
+    for (int k = 0; k < 3; k++) {
+        double* v = axis + (size_t)k * n;
+        qsort(v, n, sizeof(double), gsf__compare_doubles);
+        centre[k] = v[n / 2];
+        extent = fmax(extent, v[n - 1 - n / 20] - v[n / 20]);
+        distance = fmax(distance, fabs(centre[k]));
+    }
+    if (distance > 1e5 || (extent > 0.0 && distance > 1000.0 * extent))
+        for (int k = 0; k < 3; k++) origin[k] = floor(centre[k] + 0.5);
+}
+
+// position_fn(arg, i, xyz) gives position i of count.
+static gsf_result gsf__sample_origin(gsf_context* ctx, size_t count, void (*position_fn)(const void*, size_t, double*),
+                                     const void* arg, double origin[3]) {
+    const size_t stride = count / GSF__ORIGIN_SAMPLES + 1;
+    const size_t room = count / stride + 1;
+    double* axis = (double*)gsf_alloc(ctx, room, 3 * sizeof(double));
+    if (!axis) return GSF_ERROR_OUT_OF_MEMORY;
+    size_t n = 0;
+    for (size_t i = 0; i < count; i += stride) {
+        double p[3];
+        position_fn(arg, i, p);
+        // beyond 1e12 nothing is a coordinate any more
+        if (!(fabs(p[0]) < 1e12 && fabs(p[1]) < 1e12 && fabs(p[2]) < 1e12)) continue;
+        for (size_t k = 0; k < 3; k++) axis[k * room + n] = p[k];
+        n++;
+    }
+    memmove(axis + n, axis + room, n * sizeof(double));
+    memmove(axis + 2 * n, axis + 2 * room, n * sizeof(double));
+    gsf__choose_origin(axis, n, origin);
+    gsf_free(ctx, axis);
+    return GSF_OK;
+}
+
+static void gsf__ply_sample_position(const void* arg, size_t i, double* out) {
+    gsf__ply_position((const gsf__ply*)arg, i, out);
+}
+static void gsf__array_sample_position(const void* arg, size_t i, double* out) {
+    memcpy(out, (const double*)arg + 3 * i, 3 * sizeof(double));
+}
+
+typedef struct gsf__ply_target { // where a column's values go
+    int slot;
+    float* first;
+    size_t stride; // floats
+} gsf__ply_target;
+
+typedef struct gsf__ply_job {
+    const gsf__ply* ply;
+    gsf__ply_target targets[GSF__PLY_RED]; // all but x y z
+    size_t target_count;
+    gsf_splats* splats;
+    uint8_t* bad; // (count) rows with a value that is NaN or infinite
+} gsf__ply_job;
+
+static int gsf__float_is_bad(float f) {
+    uint32_t bits;
+    memcpy(&bits, &f, sizeof bits);
+    return (bits & 0x7f800000u) == 0x7f800000u;
+}
+
+static void gsf__ply_list_targets(gsf__ply_job* job) {
+    static const unsigned char first[5] = {GSF__PLY_DC, GSF__PLY_OPACITY, GSF__PLY_SCALE, GSF__PLY_ROT, GSF__PLY_REST};
+    gsf_splats* s = job->splats;
+    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
+    float* base[4];
+    base[0] = s->sh;
+    base[1] = s->opacity_logits;
+    base[2] = s->log_scales;
+    base[3] = s->quats;
+    const size_t stride[4] = {3 * bands, 1, 3, 4};
+    for (int group = 0; group < 4; group++)
+        for (int slot = first[group]; slot < first[group + 1]; slot++) {
+            gsf__ply_target* t = &job->targets[job->target_count++];
+            t->slot = slot;
+            t->first = base[group] + (slot - first[group]);
+            t->stride = stride[group];
+        }
+    for (size_t channel = 0; channel < 3; channel++)
+        for (size_t k = 1; k < bands; k++) {
+            gsf__ply_target* t = &job->targets[job->target_count++];
+            t->slot = GSF__PLY_REST + (int)(channel * (bands - 1) + k - 1);
+            t->first = s->sh + 3 * k + channel;
+            t->stride = 3 * bands;
+        }
+}
+
+enum { GSF__PLY_CHUNK = 4096 }; // rows
+
+static void gsf__ply_decode_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__ply_job* job = (const gsf__ply_job*)arg;
+    const gsf__ply* ply = job->ply;
+    const gsf_splats* s = job->splats;
+    const int big = ply->format == GSF__PLY_BIG;
+    const size_t begin = chunk * GSF__PLY_CHUNK;
+    const size_t end = begin + GSF__PLY_CHUNK < ply->count ? begin + GSF__PLY_CHUNK : ply->count;
+    (void)worker;
+    for (size_t i = begin; i < end; i++) {
+        const unsigned char* row = ply->data + ply->body + i * ply->row_bytes;
+        double p[3];
+        int bad = 0;
+        gsf__ply_position(ply, i, p);
+        for (size_t k = 0; k < 3; k++) {
+            const float f = (float)(p[k] - s->origin[k]);
+            bad |= gsf__float_is_bad(f);
+            s->means[3 * i + k] = f;
+        }
+        for (size_t t = 0; t < job->target_count; t++) {
+            const gsf__ply_target* target = &job->targets[t];
+            const unsigned char* at = row + ply->offset[target->slot];
+            const gsf__ply_type type = ply->type[target->slot];
+            float f;
+            if (type == GSF__PLY_F32 && !big) { // what nearly all files hold
+                const uint32_t bits = (uint32_t)at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
+                memcpy(&f, &bits, sizeof f);
+            } else {
+                f = (float)gsf__ply_value(at, type, big);
+            }
+            bad |= gsf__float_is_bad(f);
+            target->first[i * target->stride] = f;
+        }
+        job->bad[i] = (uint8_t)bad;
+    }
+}
+
+// Reads row after row of an ascii body. values: (columns), of the row; *at moves on.
+static gsf_result gsf__ply_ascii_row(gsf_context* ctx, const gsf__ply* ply, const char** at, double* values) {
+    const char *end = (const char*)ply->data + ply->size, *word;
+    for (size_t c = 0; c < ply->columns; c++) {
+        const size_t length = gsf__next_word(at, end, &word);
+        if (length == 0 || !gsf__word_double(word, length, &values[c]))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected a number, got %s\"%.*s\"", ply->name,
+                            (size_t)(word - (const char*)ply->data), length ? "" : "the end of the file ",
+                            (int)(length < 40 ? length : 40), word);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__ply_decode_ascii(gsf_context* ctx, gsf__ply_job* job) {
+    const gsf__ply* ply = job->ply;
+    gsf_splats* s = job->splats;
+    double* values = (double*)gsf_alloc(ctx, ply->columns, sizeof(double));
+    double* positions = (double*)gsf_alloc(ctx, ply->count ? ply->count : 1, 3 * sizeof(double));
+    gsf_result result = values && positions ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    const char* at = (const char*)ply->data + ply->body;
+    for (size_t i = 0; i < ply->count && result == GSF_OK; i++) {
+        result = gsf__ply_ascii_row(ctx, ply, &at, values);
+        if (result != GSF_OK) break;
+        int bad = 0;
+        for (size_t k = 0; k < 3; k++) positions[3 * i + k] = values[ply->offset[k]];
+        for (size_t t = 0; t < job->target_count; t++) {
+            const float f = (float)values[ply->offset[job->targets[t].slot]];
+            bad |= gsf__float_is_bad(f);
+            job->targets[t].first[i * job->targets[t].stride] = f;
+        }
+        job->bad[i] = (uint8_t)bad;
+    }
+    if (result == GSF_OK) result = gsf__sample_origin(ctx, ply->count, gsf__array_sample_position, positions, s->origin);
+    for (size_t i = 0; i < ply->count && result == GSF_OK; i++)
+        for (size_t k = 0; k < 3; k++) {
+            const float f = (float)(positions[3 * i + k] - s->origin[k]);
+            job->bad[i] |= (uint8_t)gsf__float_is_bad(f);
+            s->means[3 * i + k] = f;
+        }
+    gsf_free(ctx, positions);
+    gsf_free(ctx, values);
+    return result;
+}
+
+// Removes the bad rows; ids stay 0..count-1.
+static void gsf__ply_drop_rows(gsf_context* ctx, const gsf__ply* ply, const uint8_t* bad, gsf_splats* s) {
+    const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree);
+    size_t kept = 0;
+    for (size_t i = 0; i < s->count; i++) {
+        if (bad[i]) continue;
+        if (kept != i) {
+            memcpy(s->means + 3 * kept, s->means + 3 * i, 3 * sizeof(float));
+            memcpy(s->log_scales + 3 * kept, s->log_scales + 3 * i, 3 * sizeof(float));
+            memcpy(s->quats + 4 * kept, s->quats + 4 * i, 4 * sizeof(float));
+            memcpy(s->sh + sh * kept, s->sh + sh * i, sh * sizeof(float));
+            s->opacity_logits[kept] = s->opacity_logits[i];
+        }
+        kept++;
+    }
+    if (kept != s->count)
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats dropped: a value is NaN, infinite or beyond float32", ply->name,
+                s->count - kept, s->count);
+    s->count = kept;
+}
+
+// Checks that all columns of a splat are there. *sh_degree from the number of f_rest columns.
+static gsf_result gsf__ply_check_columns(gsf_context* ctx, const gsf__ply* ply, int32_t* sh_degree) {
+    static const char* const names[5] = {"x, y, z", "f_dc_0..2", "opacity", "scale_0..2", "rot_0..3"};
+    static const unsigned char group[GSF__PLY_REST] = {0, 0, 0, 1, 1, 1, 2, 3, 3, 3, 4, 4, 4, 4};
+    for (int i = 0; i < GSF__PLY_REST; i++)
+        if (ply->type[i] == GSF__PLY_ABSENT)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: no splats: a column of %s is missing", ply->name, ply->body,
+                            names[group[i]]);
+    int rest = 0, last = -1;
+    for (int i = 0; i < GSF__PLY_REST_MAX; i++)
+        if (ply->type[GSF__PLY_REST + i] != GSF__PLY_ABSENT) rest++, last = i;
+    *sh_degree = rest == 0 ? 0 : rest == 9 ? 1 : rest == 24 ? 2 : rest == 45 ? 3 : -1;
+    if (*sh_degree < 0 || last != rest - 1)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %d f_rest columns, the last f_rest_%d; 0, 9, 24 or 45 expected",
+                        ply->name, ply->body, rest, last);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
+    gsf__ply ply;
+    int32_t degree = 0;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__ply_read_header(ctx, name, data, size, &ply));
+    GSF__TRY(gsf__ply_check_columns(ctx, &ply, &degree));
+    if (ply.count > UINT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, ids hold 2^32", name, ply.count);
+    GSF__TRY(gsf_splat_make(ctx, ply.count, degree, out));
+    gsf__ply_job job;
+    memset(&job, 0, sizeof job);
+    job.ply = &ply;
+    job.splats = out;
+    job.bad = (uint8_t*)gsf_alloc_zeroed(ctx, ply.count ? ply.count : 1, 1);
+    gsf_result result = job.bad ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    gsf__ply_list_targets(&job);
+    if (result == GSF_OK && ply.format == GSF__PLY_ASCII) {
+        result = gsf__ply_decode_ascii(ctx, &job);
+    } else if (result == GSF_OK) {
+        result = gsf__sample_origin(ctx, ply.count, gsf__ply_sample_position, &ply, out->origin);
+        if (result == GSF_OK)
+            gsf__parallel_for(ctx, (ply.count + GSF__PLY_CHUNK - 1) / GSF__PLY_CHUNK, gsf__ply_decode_chunk, &job);
+    }
+    if (result == GSF_OK) gsf__ply_drop_rows(ctx, &ply, job.bad, out);
+    else gsf_splat_destroy(ctx, out);
+    gsf_free(ctx, job.bad);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_load_ply(gsf_context* ctx, const char* path, gsf_splats* out) {
+    void* data;
+    size_t size;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    const gsf_result result = gsf_splat_parse_ply(ctx, path, data, size, out);
+    gsf_free(ctx, data);
+    return result;
+}
+
+typedef struct gsf__ply_write_job {
+    const gsf_splats* splats;
+    unsigned char* rows;
+    size_t row_bytes;
+    int wide; // x y z as double
+} gsf__ply_write_job;
+
+static unsigned char* gsf__put_f32(unsigned char* p, float value) {
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    p[0] = (unsigned char)(bits & 255u);
+    p[1] = (unsigned char)(bits >> 8 & 255u);
+    p[2] = (unsigned char)(bits >> 16 & 255u);
+    p[3] = (unsigned char)(bits >> 24);
+    return p + 4;
+}
+
+static unsigned char* gsf__put_f64(unsigned char* p, double value) {
+    uint64_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    gsf__store_le(p, bits, 8);
+    return p + 8;
+}
+
+static void gsf__ply_encode_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__ply_write_job* job = (const gsf__ply_write_job*)arg;
+    const gsf_splats* s = job->splats;
+    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
+    const size_t begin = chunk * GSF__PLY_CHUNK;
+    const size_t end = begin + GSF__PLY_CHUNK < s->count ? begin + GSF__PLY_CHUNK : s->count;
+    (void)worker;
+    for (size_t i = begin; i < end; i++) {
+        unsigned char* p = job->rows + i * job->row_bytes;
+        const float* sh = s->sh + 3 * bands * i;
+        for (size_t k = 0; k < 3; k++) {
+            const double world = s->origin[k] + (double)s->means[3 * i + k];
+            p = job->wide ? gsf__put_f64(p, world) : gsf__put_f32(p, (float)world);
+        }
+        for (int k = 0; k < 3; k++) p = gsf__put_f32(p, 0.0f); // normals
+        for (int k = 0; k < 3; k++) p = gsf__put_f32(p, sh[k]);
+        for (size_t channel = 0; channel < 3; channel++)
+            for (size_t k = 1; k < bands; k++) p = gsf__put_f32(p, sh[3 * k + channel]);
+        p = gsf__put_f32(p, s->opacity_logits[i]);
+        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, s->log_scales[3 * i + k]);
+        for (size_t k = 0; k < 4; k++) p = gsf__put_f32(p, s->quats[4 * i + k]);
+    }
+}
+
+static void gsf__splats_sample_position(const void* arg, size_t i, double* out) {
+    const gsf_splats* s = (const gsf_splats*)arg;
+    for (size_t k = 0; k < 3; k++) out[k] = s->origin[k] + (double)s->means[3 * i + k];
+}
+
+GSF_API gsf_result gsf_splat_format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out) {
+    gsf__ply_write_job job;
+    double origin[3];
+    if (splats->sh_degree < 0 || splats->sh_degree > 3)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "splats: SH degree %d is not 0..3", (int)splats->sh_degree);
+    GSF__TRY(gsf__sample_origin(ctx, splats->count, gsf__splats_sample_position, splats, origin));
+    const int rest = 3 * (gsf_splat_sh_count(splats->sh_degree) - 1);
+    job.splats = splats;
+    job.wide = origin[0] != 0.0 || origin[1] != 0.0 || origin[2] != 0.0;
+    job.row_bytes = 4 * (size_t)(17 + rest) + (job.wide ? 12 : 0);
+    gsf_text_printf(ctx, out, "ply\nformat binary_little_endian 1.0\nelement vertex %zu\n", splats->count);
+    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property %s %c\n", job.wide ? "double" : "float", "xyz"[k]);
+    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property float n%c\n", "xyz"[k]);
+    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property float f_dc_%d\n", k);
+    for (int k = 0; k < rest; k++) gsf_text_printf(ctx, out, "property float f_rest_%d\n", k);
+    gsf_text_printf(ctx, out, "property float opacity\n");
+    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property float scale_%d\n", k);
+    for (int k = 0; k < 4; k++) gsf_text_printf(ctx, out, "property float rot_%d\n", k);
+    gsf_text_printf(ctx, out, "end_header\n");
+    size_t bytes;
+    if (!gsf__mul_size(splats->count, job.row_bytes, &bytes) || bytes > SIZE_MAX / 2)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", splats->count);
+    if (out->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__reserve(ctx, (void**)&out->data, &out->capacity, out->size, out->size + bytes + 1, 1));
+    job.rows = (unsigned char*)out->data + out->size;
+    gsf__parallel_for(ctx, (splats->count + GSF__PLY_CHUNK - 1) / GSF__PLY_CHUNK, gsf__ply_encode_chunk, &job);
+    out->size += bytes;
+    out->data[out->size] = 0;
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const gsf_splats* splats) {
+    gsf_text text;
+    memset(&text, 0, sizeof text);
+    gsf_result result = gsf_splat_format_ply(ctx, splats, &text);
+    if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
+    gsf_destroy_text(ctx, &text);
+    return result;
+}
 
 // ---- >>colmap ------------------------------------------------------------------
 
