@@ -535,6 +535,116 @@ GSF__SHARED void gsf__store_le(void* data, uint64_t value, int bytes) {
     for (int i = 0; i < bytes; i++, value >>= 8) p[i] = (unsigned char)(value & 255u);
 }
 
+enum { GSF__DECIMAL_DIGITS = 800 }; // more than the 767 that can decide how a double rounds
+
+// Reads [+-]digits[.digits][e[+-]digits] at the start of `text`: correctly rounded and independent of the locale (strtod
+// only ever sees digits and an exponent). Returns the bytes read, 0 where there is no number. Too large gives infinity.
+GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) {
+    static const double powers[23] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
+                                      1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
+    char digits[GSF__DECIMAL_DIGITS + 32];
+    size_t at = size && (text[0] == '-' || text[0] == '+'), kept = 0, seen = 0;
+    int64_t exponent = 0;
+    uint64_t mantissa = 0;
+    int point = 0, lost = 0;
+    for (; at < size; at++) {
+        const char c = text[at];
+        if (c == '.' && !point) { point = 1; continue; }
+        if (c < '0' || c > '9') break;
+        seen++;
+        if (kept == GSF__DECIMAL_DIGITS) { // only matters as "a little more"
+            lost |= c != '0';
+            exponent += !point;
+        } else {
+            if (kept || c != '0') digits[kept++] = c;
+            if (kept <= 19) mantissa = mantissa * 10 + (uint64_t)(c - '0');
+            exponent -= point;
+        }
+    }
+    if (!seen) return 0;
+    if (at < size && (text[at] == 'e' || text[at] == 'E')) {
+        size_t e = at + 1;
+        const int minus = e < size && text[e] == '-';
+        if (e < size && (text[e] == '-' || text[e] == '+')) e++;
+        int64_t value = 0;
+        for (; e < size && text[e] >= '0' && text[e] <= '9'; e++) {
+            if (value < (int64_t)1 << 50) value = value * 10 + (text[e] - '0');
+            at = e + 1;
+        }
+        exponent += minus ? -value : value;
+    }
+    double result = 0.0;
+    if (kept == 0) {
+        result = 0.0;
+    } else if (FLT_EVAL_METHOD == 0 && kept <= 19 && mantissa <= (uint64_t)1 << 53 && exponent >= -22 &&
+               exponent <= 22) { // both factors exact, so one rounding
+        result = exponent < 0 ? (double)mantissa / powers[-exponent] : (double)mantissa * powers[exponent];
+    } else {
+        if (lost) {
+            digits[kept++] = '1';
+            exponent--;
+        }
+        if (exponent > 9999) exponent = 9999;
+        if (exponent < -9999) exponent = -9999;
+        snprintf(digits + kept, sizeof digits - kept, "e%d", (int)exponent);
+        result = strtod(digits, NULL);
+    }
+    *out = text[0] == '-' ? -result : result;
+    return at;
+}
+
+// Length of the well-formed UTF-8 sequence at p (Unicode table 3-7), 0 where there is none.
+GSF__SHARED size_t gsf__utf8_size(const void* text, size_t left) {
+    const unsigned char* p = (const unsigned char*)text;
+    if (left == 0) return 0;
+    const unsigned c = p[0];
+    if (c < 0x80) return 1;
+    const size_t size = c >= 0xc2 && c <= 0xdf ? 2 : c >= 0xe0 && c <= 0xef ? 3 : c >= 0xf0 && c <= 0xf4 ? 4 : 0;
+    if (size == 0 || left < size) return 0;
+    for (size_t i = 1; i < size; i++)
+        if ((p[i] & 0xc0) != 0x80) return 0;
+    if ((c == 0xe0 && p[1] < 0xa0) || (c == 0xed && p[1] > 0x9f) || (c == 0xf0 && p[1] < 0x90) ||
+        (c == 0xf4 && p[1] > 0x8f))
+        return 0; // overlong, surrogate, above 10ffff
+    return size;
+}
+
+// IEEE half precision: to float exactly; from float rounded to nearest, ties to even, overflow to infinity.
+GSF__SHARED float gsf__half_to_float(uint16_t half) {
+    const uint32_t sign = (uint32_t)(half & 0x8000u) << 16, exponent = half >> 10 & 31u, fraction = half & 1023u;
+    uint32_t bits;
+    if (exponent == 0) {
+        const float tiny = (float)fraction * (1.0f / 16777216.0f); // subnormal: fraction * 2^-24
+        memcpy(&bits, &tiny, sizeof bits);
+    } else if (exponent == 31) {
+        bits = 0x7f800000u | fraction << 13;
+    } else {
+        bits = (exponent + 112u) << 23 | fraction << 13;
+    }
+    bits |= sign;
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+GSF__SHARED uint16_t gsf__float_to_half(float value) {
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    const uint32_t sign = bits >> 16 & 0x8000u;
+    bits &= 0x7fffffffu;
+    if (bits > 0x7f800000u) return (uint16_t)(sign | 0x7e00u); // NaN
+    if (bits >= 0x477ff000u) return (uint16_t)(sign | 0x7c00u); // 65520 and above
+    if (bits < 0x38800000u) { // below 2^-14: adding 0.5 leaves fraction * 2^-24 in the low bits, rounded by the FPU
+        float magnitude;
+        memcpy(&magnitude, &bits, sizeof magnitude);
+        magnitude += 0.5f;
+        memcpy(&bits, &magnitude, sizeof bits);
+        return (uint16_t)(sign | (bits - 0x3f000000u));
+    }
+    bits += 0xc8000fffu + (bits >> 13 & 1u); // rebias by -112, round half to even
+    return (uint16_t)(sign | bits >> 13);
+}
+
 GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double point[3], double out[3]) {
     const double* m = camera->w2c;
     for (int r = 0; r < 3; r++) out[r] = m[r] * point[0] + m[4 + r] * point[1] + m[8 + r] * point[2] + m[12 + r];
@@ -649,9 +759,9 @@ GSF_API void gsf_free(gsf_context* ctx, void* memory) {
 
 #ifdef _OPENMP
 static void gsf__for_openmp(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
-    const gsf_context* ctx = (const gsf_context*)user;
+    const int workers = (int)(intptr_t)user; // not the context: its struct may be moved by the host
     const int64_t count = (int64_t)chunk_count;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(ctx->parallel.worker_count)
+#pragma omp parallel for schedule(dynamic, 1) num_threads(workers)
     for (int64_t i = 0; i < count; i++) body(arg, (size_t)i, omp_get_thread_num());
 }
 #endif
@@ -680,8 +790,8 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
     if (!ctx->parallel.for_fn) {
 #ifdef _OPENMP
         ctx->parallel.for_fn = gsf__for_openmp;
-        ctx->parallel.user = ctx;
         ctx->parallel.worker_count = ctx->threads ? ctx->threads : omp_get_max_threads();
+        ctx->parallel.user = (void*)(intptr_t)ctx->parallel.worker_count;
 #else
         ctx->parallel.for_fn = gsf__for_serial;
         ctx->parallel.worker_count = 1;
@@ -756,19 +866,47 @@ GSF_API void gsf_text_printf(gsf_context* ctx, gsf_text* text, const char* forma
 }
 
 GSF_API void gsf_text_json_string(gsf_context* ctx, gsf_text* text, const char* string) {
+    const char* p = string ? string : "";
+    size_t left = strlen(p);
     gsf_text_append(ctx, text, "\"", 1);
-    for (const char* p = string ? string : ""; *p; p++) {
-        const unsigned char c = (unsigned char)*p;
+    while (left) {
+        size_t plain = 0; // bytes that need no escape
+        size_t step;
+        while (plain < left && (unsigned char)p[plain] >= 0x20 && p[plain] != '"' && p[plain] != '\\' &&
+               (step = gsf__utf8_size(p + plain, left - plain)) != 0)
+            plain += step;
+        gsf_text_append(ctx, text, p, plain);
+        p += plain;
+        left -= plain;
+        if (!left) break;
+        const unsigned char c = (unsigned char)*p++;
+        left--;
         if (c == '"' || c == '\\') gsf_text_printf(ctx, text, "\\%c", c);
         else if (c < 0x20) gsf_text_printf(ctx, text, "\\u%04x", (unsigned)c);
-        else gsf_text_append(ctx, text, p, 1);
+        else gsf_text_append(ctx, text, "\\ufffd", 6); // a byte that is no UTF-8
     }
     gsf_text_append(ctx, text, "\"", 1);
 }
 
+// The shortest of 15, 16 or 17 digits that reads back as the same double; the point is a point in every locale.
 GSF_API void gsf_text_json_number(gsf_context* ctx, gsf_text* text, double value) {
-    if (isfinite(value)) gsf_text_printf(ctx, text, "%.17g", value);
-    else gsf_text_append(ctx, text, "null", 4);
+    if (!isfinite(value)) {
+        gsf_text_append(ctx, text, "null", 4);
+        return;
+    }
+    char printed[64], plain[64];
+    size_t size = 0;
+    for (int digits = 15; digits <= 17; digits++) {
+        snprintf(printed, sizeof printed, "%.*g", digits, value);
+        size = 0;
+        for (const char* p = printed; *p; p++) {
+            if ((*p >= '0' && *p <= '9') || *p == '-' || *p == '+' || *p == 'e') plain[size++] = *p;
+            else if (size == 0 || plain[size - 1] != '.') plain[size++] = '.'; // the locale's, maybe of several bytes
+        }
+        double back = 0.0;
+        if (gsf__scan_double(plain, size, &back) == size && back == value) break;
+    }
+    gsf_text_append(ctx, text, plain, size);
 }
 
 GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text) {
@@ -778,6 +916,7 @@ GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text) {
 
 // ---- >>files -------------------------------------------------------------------
 
+// Reads a first piece before it believes the size that the file claims: a directory claims 2^63 bytes.
 static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     (void)user;
     FILE* file = fopen(path, "rb");
@@ -786,21 +925,24 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
     memset(&buffer, 0, sizeof buffer);
     gsf_result result = GSF_OK;
     size_t step = 1 << 16;
-    if (fseek(file, 0, SEEK_END) == 0) { // sized at once where the file can tell; pipes simply grow
-        const long end = ftell(file);
-        if (end > 0) step = (size_t)end;
-        rewind(file);
-    }
     for (;;) {
         result = gsf__reserve(ctx, (void**)&buffer.data, &buffer.capacity, buffer.size, buffer.size + step + 1, 1);
         if (result != GSF_OK) break;
         const size_t got = fread(buffer.data + buffer.size, 1, step, file);
+        const int first = buffer.size == 0;
         buffer.size += got;
         if (got < step) {
             if (ferror(file)) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
             break;
         }
-        step = 1 << 16;
+        if (first && fseek(file, 0, SEEK_END) == 0) { // the rest at once where the file can tell; pipes simply grow
+            const long end = ftell(file);
+            if (end >= 0 && (unsigned long)end >= buffer.size) step = (size_t)end - buffer.size + 1; // + 1: sees the end
+            if (fseek(file, (long)buffer.size, SEEK_SET) != 0) {
+                result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
+                break;
+            }
+        }
     }
     fclose(file);
     if (result != GSF_OK) {
@@ -813,29 +955,52 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
     return GSF_OK;
 }
 
+#if defined(__unix__) || defined(__APPLE__)
+#include <sys/stat.h>
+static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to rename onto
+    struct stat info;
+    return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
+}
+#else
+static int gsf__is_device(const char* path) { (void)path; return 0; }
+#endif
+
+// Writes <path>.tmp and renames it, so that path always holds a whole file, also after a kill (not after a power cut: the
+// data is not forced to the disk).
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     (void)user;
+    const int device = gsf__is_device(path);
     gsf_text name;
     memset(&name, 0, sizeof name);
-    gsf_text_printf(ctx, &name, "%s.tmp", path);
-    if (name.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_text_append(ctx, &name, path, strlen(path));
+    if (!device) gsf_text_append(ctx, &name, ".tmp", 4);
+    if (name.failed) {
+        gsf_destroy_text(ctx, &name);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
     gsf_result result = GSF_OK;
     FILE* file = fopen(name.data, "wb");
     if (!file) {
         result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", name.data, strerror(errno));
     } else {
-        int ok = fwrite(data, 1, size, file) == size && fflush(file) == 0;
-        ok = (fclose(file) == 0) && ok;
-        if (ok && rename(name.data, path) != 0) {
+        errno = 0;
+        int ok = (size == 0 || fwrite(data, 1, size, file) == size) && fflush(file) == 0;
+        int reason = errno;
+        if (fclose(file) != 0 && ok) {
+            ok = 0;
+            reason = errno;
+        }
+        if (ok && !device && rename(name.data, path) != 0) {
 #ifdef _WIN32 // rename does not replace there
             ok = remove(path) == 0 && rename(name.data, path) == 0;
 #else
             ok = 0;
 #endif
+            reason = errno;
         }
         if (!ok) {
-            result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(errno));
-            remove(name.data);
+            if (!device) remove(name.data);
+            result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(reason));
         }
     }
     gsf_destroy_text(ctx, &name);
@@ -854,15 +1019,31 @@ GSF_API gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void
 
 // ---- >>chunks ------------------------------------------------------------------
 
-static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) { // reflected 0xedb88320, 4 bits at a time
-    static const uint32_t table[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
-                                       0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
-                                       0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
+// Reflected 0xedb88320. Long inputs go 8 bytes at a time; tables[k][b] is byte b followed by k zero bytes.
+static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
+    static const uint32_t nibble[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
+                                        0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
+                                        0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
     const unsigned char* p = (const unsigned char*)data;
     crc = ~crc;
+    if (size >= 1 << 15) {
+        uint32_t tables[8][256];
+        for (uint32_t b = 0; b < 256; b++) {
+            const uint32_t half = nibble[b & 15u] ^ b >> 4;
+            tables[0][b] = nibble[half & 15u] ^ half >> 4;
+        }
+        for (int k = 1; k < 8; k++)
+            for (int b = 0; b < 256; b++)
+                tables[k][b] = tables[0][tables[k - 1][b] & 255u] ^ tables[k - 1][b] >> 8;
+        for (; size >= 8; size -= 8, p += 8) {
+            const uint32_t low = crc ^ (uint32_t)gsf__load_le(p, 4);
+            crc = tables[7][low & 255u] ^ tables[6][low >> 8 & 255u] ^ tables[5][low >> 16 & 255u] ^
+                  tables[4][low >> 24] ^ tables[3][p[4]] ^ tables[2][p[5]] ^ tables[1][p[6]] ^ tables[0][p[7]];
+        }
+    }
     for (size_t i = 0; i < size; i++) {
-        crc = table[(crc ^ p[i]) & 15u] ^ (crc >> 4);
-        crc = table[(crc ^ (uint32_t)(p[i] >> 4)) & 15u] ^ (crc >> 4);
+        crc = nibble[(crc ^ p[i]) & 15u] ^ (crc >> 4);
+        crc = nibble[(crc ^ (uint32_t)(p[i] >> 4)) & 15u] ^ (crc >> 4);
     }
     return ~crc;
 }
@@ -904,8 +1085,11 @@ GSF_API gsf_result gsf_chunks_check(gsf_context* ctx, const char* name, const vo
         if (gsf__crc32(gsf__crc32(0, p + at, GSF__CHUNK_HEAD), body, (size_t)bytes) !=
             (uint32_t)gsf__load_le(body + bytes, 4))
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: checksum mismatch", name, at);
-        if (memcmp(p + at, "END ", 4) == 0) return GSF_OK;
+        const int last = memcmp(p + at, "END ", 4) == 0;
         at += GSF__CHUNK_HEAD + (size_t)bytes + GSF__CHUNK_TAIL;
+        if (last && (bytes != 0 || at != size))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: bytes after the end", name, at - (size_t)bytes);
+        if (last) return GSF_OK;
     }
 }
 
@@ -927,7 +1111,889 @@ GSF_API int gsf_chunks_find(const void* data, size_t size, const char* tag, gsf_
 
 // ---- >>json --------------------------------------------------------------------
 
+enum { GSF__JSON_DEPTH = 64, GSF__JSON_FEW_MEMBERS = 16 };
+
+typedef struct gsf__json_parser {
+    gsf_context* ctx;
+    const char* name;
+    const char* text;
+    size_t size, at;
+    gsf_json* out;
+    size_t value_capacity;
+    char* free_string;     // next unused byte of out->strings
+    uint64_t* order;       // scratch of the search for duplicate keys: hash << 32 | index
+    size_t order_capacity;
+} gsf__json_parser;
+
+static int gsf__json_peek(const gsf__json_parser* p) { return p->at < p->size ? (unsigned char)p->text[p->at] : -1; }
+
+static void gsf__json_skip_space(gsf__json_parser* p) {
+    for (; p->at < p->size; p->at++) {
+        const char c = p->text[p->at];
+        if (c != ' ' && c != '\n' && c != '\r' && c != '\t') return;
+    }
+}
+
+static gsf_result gsf__json_fail(const gsf__json_parser* p, const char* expected) {
+    const int c = gsf__json_peek(p);
+    char got[32];
+    if (c < 0) snprintf(got, sizeof got, "the end of the text");
+    else if (c > 0x20 && c < 0x7f) snprintf(got, sizeof got, "'%c'", c);
+    else snprintf(got, sizeof got, "byte 0x%02x", (unsigned)c);
+    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got %s", p->name, p->at, expected, got);
+}
+
+// Upper bounds from one look at the text: every value but the root follows a '[', '{' or ','; a decoded string is never
+// longer than its source.
+static void gsf__json_measure(const char* text, size_t size, size_t* values, size_t* string_bytes) {
+    *values = 1;
+    *string_bytes = 1;
+    for (size_t i = 0; i < size; i++) {
+        const char c = text[i];
+        if (c == ',' || c == '[' || c == '{') {
+            (*values)++;
+        } else if (c == '"') {
+            const size_t start = ++i;
+            while (i < size && text[i] != '"') i += text[i] == '\\' ? 2 : 1;
+            *string_bytes += (i < size ? i : size) - start + 1;
+        }
+    }
+}
+
+static gsf_result gsf__json_read_hex4(gsf__json_parser* p, uint32_t* out) {
+    *out = 0;
+    for (int i = 0; i < 4; i++, p->at++) {
+        const int c = gsf__json_peek(p);
+        const int digit = c >= '0' && c <= '9' ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10
+                          : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
+        if (digit < 0) return gsf__json_fail(p, "a hexadecimal digit");
+        *out = *out << 4 | (uint32_t)digit;
+    }
+    return GSF_OK;
+}
+
+// After the backslash; appends the character's UTF-8 to p->free_string.
+static gsf_result gsf__json_read_escape(gsf__json_parser* p) {
+    static const char from[] = "\"\\/bfnrt", to[] = "\"\\/\b\f\n\r\t";
+    const int c = gsf__json_peek(p);
+    if (c != 'u') {
+        const char* found = c > 0 ? strchr(from, c) : NULL;
+        if (!found) return gsf__json_fail(p, "an escape character");
+        *p->free_string++ = to[found - from];
+        p->at++;
+        return GSF_OK;
+    }
+    const size_t start = p->at - 1;
+    uint32_t code, low;
+    p->at++;
+    GSF__TRY(gsf__json_read_hex4(p, &code));
+    if (code >= 0xd800 && code < 0xdc00) {
+        if (p->size - p->at < 2 || p->text[p->at] != '\\' || p->text[p->at + 1] != 'u')
+            return gsf__json_fail(p, "the second half of a surrogate pair");
+        p->at += 2;
+        GSF__TRY(gsf__json_read_hex4(p, &low));
+        if (low < 0xdc00 || low > 0xdfff)
+            return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%zu: half a surrogate pair", p->name, start);
+        code = 0x10000 + ((code - 0xd800) << 10) + (low - 0xdc00);
+    } else if (code >= 0xdc00 && code < 0xe000) {
+        return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%zu: half a surrogate pair", p->name, start);
+    }
+    unsigned char* s = (unsigned char*)p->free_string;
+    if (code < 0x80) {
+        *s++ = (unsigned char)code;
+    } else if (code < 0x800) {
+        *s++ = (unsigned char)(0xc0 | code >> 6);
+        *s++ = (unsigned char)(0x80 | (code & 0x3f));
+    } else if (code < 0x10000) {
+        *s++ = (unsigned char)(0xe0 | code >> 12);
+        *s++ = (unsigned char)(0x80 | (code >> 6 & 0x3f));
+        *s++ = (unsigned char)(0x80 | (code & 0x3f));
+    } else {
+        *s++ = (unsigned char)(0xf0 | code >> 18);
+        *s++ = (unsigned char)(0x80 | (code >> 12 & 0x3f));
+        *s++ = (unsigned char)(0x80 | (code >> 6 & 0x3f));
+        *s++ = (unsigned char)(0x80 | (code & 0x3f));
+    }
+    p->free_string = (char*)s;
+    return GSF_OK;
+}
+
+// At the opening quote.
+static gsf_result gsf__json_read_string(gsf__json_parser* p, const char** string, size_t* size) {
+    char* const start = p->free_string;
+    for (p->at++;;) {
+        const int c = gsf__json_peek(p);
+        if (c == '"') break;
+        if (c < 0) return gsf__json_fail(p, "the end of a string");
+        if (c < 0x20) return gsf__json_fail(p, "a character (control characters must be escaped)");
+        if (c == '\\') {
+            p->at++;
+            GSF__TRY(gsf__json_read_escape(p));
+            continue;
+        }
+        const size_t bytes = gsf__utf8_size(p->text + p->at, p->size - p->at);
+        if (bytes == 0) return gsf__json_fail(p, "UTF-8");
+        memcpy(p->free_string, p->text + p->at, bytes);
+        p->free_string += bytes;
+        p->at += bytes;
+    }
+    p->at++;
+    *string = start;
+    *size = (size_t)(p->free_string - start);
+    *p->free_string++ = 0;
+    return GSF_OK;
+}
+
+static gsf_result gsf__json_skip_digits(gsf__json_parser* p) {
+    const size_t start = p->at;
+    while (gsf__json_peek(p) >= '0' && gsf__json_peek(p) <= '9') p->at++;
+    return p->at > start ? GSF_OK : gsf__json_fail(p, "a digit");
+}
+
+static gsf_result gsf__json_read_number(gsf__json_parser* p, double* out) {
+    const size_t start = p->at;
+    if (gsf__json_peek(p) == '-') p->at++;
+    if (gsf__json_peek(p) == '0') p->at++; // no digit may follow
+    else GSF__TRY(gsf__json_skip_digits(p));
+    if (gsf__json_peek(p) == '.') {
+        p->at++;
+        GSF__TRY(gsf__json_skip_digits(p));
+    }
+    if (gsf__json_peek(p) == 'e' || gsf__json_peek(p) == 'E') {
+        p->at++;
+        if (gsf__json_peek(p) == '-' || gsf__json_peek(p) == '+') p->at++;
+        GSF__TRY(gsf__json_skip_digits(p));
+    }
+    (void)gsf__scan_double(p->text + start, p->at - start, out);
+    if (!isfinite(*out))
+        return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%zu: number is out of range", p->name, start);
+    return GSF_OK;
+}
+
+static gsf_result gsf__json_read_scalar(gsf__json_parser* p, gsf_json_value* value) {
+    static const struct { const char* word; gsf_json_type type; } words[] = {
+        {"null", GSF_JSON_NULL}, {"false", GSF_JSON_FALSE}, {"true", GSF_JSON_TRUE}};
+    const int c = gsf__json_peek(p);
+    if (c == '"') {
+        value->type = GSF_JSON_STRING;
+        return gsf__json_read_string(p, &value->string, &value->string_size);
+    }
+    if (c == '-' || (c >= '0' && c <= '9')) {
+        value->type = GSF_JSON_NUMBER;
+        return gsf__json_read_number(p, &value->number);
+    }
+    for (size_t i = 0; i < GSF__COUNT(words); i++) {
+        const size_t size = strlen(words[i].word);
+        if (p->size - p->at < size || memcmp(p->text + p->at, words[i].word, size) != 0) continue;
+        value->type = words[i].type;
+        p->at += size;
+        return GSF_OK;
+    }
+    return gsf__json_fail(p, "a value");
+}
+
+static gsf_result gsf__json_read_key(gsf__json_parser* p, gsf_json_value* value) {
+    if (gsf__json_peek(p) != '"') return gsf__json_fail(p, "a key in quotes");
+    size_t size;
+    GSF__TRY(gsf__json_read_string(p, &value->key, &size));
+    value->key_size = (uint32_t)size;
+    gsf__json_skip_space(p);
+    if (gsf__json_peek(p) != ':') return gsf__json_fail(p, "':'");
+    p->at++;
+    gsf__json_skip_space(p);
+    return GSF_OK;
+}
+
+// Order of two entries by hash, then by key, so that equal keys end up side by side whatever the hashes are.
+static int gsf__json_compare_keys(const gsf_json_value* values, uint64_t a, uint64_t b) {
+    if (a >> 32 != b >> 32) return a >> 32 < b >> 32 ? -1 : 1;
+    const gsf_json_value *x = &values[a & 0xffffffffu], *y = &values[b & 0xffffffffu];
+    if (x->key_size != y->key_size) return x->key_size < y->key_size ? -1 : 1;
+    return memcmp(x->key, y->key, x->key_size);
+}
+
+// Bottom-up merge sort of n entries; the second half of `order` (2n long) is scratch. Returns the sorted half.
+static uint64_t* gsf__json_sort_keys(const gsf_json_value* values, uint64_t* order, size_t n) {
+    uint64_t *from = order, *to = order + n;
+    for (size_t run = 1; run < n; run *= 2) {
+        for (size_t start = 0; start < n; start += 2 * run) {
+            const size_t middle = start + run < n ? start + run : n, end = middle + run < n ? middle + run : n;
+            size_t i = start, j = middle, k = start;
+            while (i < middle && j < end)
+                to[k++] = gsf__json_compare_keys(values, from[j], from[i]) < 0 ? from[j++] : from[i++];
+            while (i < middle) to[k++] = from[i++];
+            while (j < end) to[k++] = from[j++];
+        }
+        uint64_t* swap = from;
+        from = to;
+        to = swap;
+    }
+    return from;
+}
+
+static gsf_result gsf__json_refuse_duplicates(gsf__json_parser* p, const gsf_json_value* object) {
+    const gsf_json_value* values = p->out->values;
+    const size_t n = object->count;
+    const gsf_json_value* twice = NULL;
+    if (n <= GSF__JSON_FEW_MEMBERS) {
+        for (uint32_t i = object->child; i && !twice; i = values[i].next)
+            for (uint32_t j = object->child; j != i && !twice; j = values[j].next)
+                if (values[i].key_size == values[j].key_size &&
+                    memcmp(values[i].key, values[j].key, values[i].key_size) == 0)
+                    twice = &values[i];
+    } else {
+        GSF__TRY(gsf__reserve(p->ctx, (void**)&p->order, &p->order_capacity, 0, 2 * n, sizeof(uint64_t)));
+        size_t k = 0;
+        for (uint32_t i = object->child; i; i = values[i].next) {
+            uint32_t hash = 2166136261u; // FNV-1a
+            for (uint32_t c = 0; c < values[i].key_size; c++)
+                hash = (hash ^ (unsigned char)values[i].key[c]) * 16777619u;
+            p->order[k++] = (uint64_t)hash << 32 | i;
+        }
+        const uint64_t* sorted = gsf__json_sort_keys(values, p->order, n);
+        for (k = 1; k < n && !twice; k++)
+            if (gsf__json_compare_keys(values, sorted[k - 1], sorted[k]) == 0) twice = &values[sorted[k] & 0xffffffffu];
+    }
+    if (!twice) return GSF_OK;
+    char key[48];
+    snprintf(key, sizeof key, "%.40s", twice->key);
+    for (char* c = key; *c; c++)
+        if (*c < 0x20 || *c > 0x7e) *c = '?';
+    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%u: key \"%s\" stands twice in one object", p->name,
+                    (unsigned)twice->offset, key);
+}
+
+static gsf_result gsf__json_read_document(gsf__json_parser* p) {
+    uint32_t parent[GSF__JSON_DEPTH], last[GSF__JSON_DEPTH]; // open containers, and the last child of each so far
+    size_t depth = 0;
+    gsf_json_value* values = p->out->values;
+    for (;;) {
+        GSF_ASSERT(p->out->count < p->value_capacity);
+        const uint32_t index = (uint32_t)p->out->count++;
+        gsf_json_value* value = &values[index];
+        memset(value, 0, sizeof *value);
+        gsf__json_skip_space(p);
+        if (depth) {
+            gsf_json_value* owner = &values[parent[depth - 1]];
+            if (owner->count++ == 0) owner->child = index;
+            else values[last[depth - 1]].next = index;
+            last[depth - 1] = index;
+            if (owner->type == GSF_JSON_OBJECT) GSF__TRY(gsf__json_read_key(p, value));
+        }
+        value->offset = (uint32_t)p->at;
+        const int c = gsf__json_peek(p);
+        if (c == '{' || c == '[') {
+            if (depth == GSF__JSON_DEPTH)
+                return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%zu: more than %d levels deep", p->name, p->at,
+                                (int)GSF__JSON_DEPTH);
+            value->type = c == '{' ? GSF_JSON_OBJECT : GSF_JSON_ARRAY;
+            p->at++;
+            gsf__json_skip_space(p);
+            if (gsf__json_peek(p) != (c == '{' ? '}' : ']')) {
+                parent[depth++] = index;
+                continue;
+            }
+            p->at++;
+        } else {
+            GSF__TRY(gsf__json_read_scalar(p, value));
+        }
+        for (;;) { // a value is complete: close what ends here
+            gsf__json_skip_space(p);
+            if (depth == 0) return p->at == p->size ? GSF_OK : gsf__json_fail(p, "the end of the text");
+            const gsf_json_value* owner = &values[parent[depth - 1]];
+            const int is_object = owner->type == GSF_JSON_OBJECT;
+            if (gsf__json_peek(p) == ',') {
+                p->at++;
+                break;
+            }
+            if (gsf__json_peek(p) != (is_object ? '}' : ']')) return gsf__json_fail(p, is_object ? "',' or '}'" : "',' or ']'");
+            p->at++;
+            depth--;
+            if (is_object) GSF__TRY(gsf__json_refuse_duplicates(p, owner));
+        }
+    }
+}
+
+GSF_API gsf_result gsf_parse_json(gsf_context* ctx, const char* name, const char* text, size_t size, gsf_json* out) {
+    memset(out, 0, sizeof *out);
+    snprintf(out->name, sizeof out->name, "%s", name ? name : "json");
+    if (size > 0xfffffff0u)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: JSON of %zu bytes (at most 4 GiB)", out->name, size);
+    if (size >= 3 && memcmp(text, "\xef\xbb\xbf", 3) == 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: expected a value, got a byte order mark", out->name);
+    gsf__json_parser p;
+    memset(&p, 0, sizeof p);
+    p.ctx = ctx;
+    p.name = out->name;
+    p.text = text;
+    p.size = size;
+    p.out = out;
+    size_t string_bytes;
+    gsf__json_measure(text, size, &p.value_capacity, &string_bytes);
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    out->values = (gsf_json_value*)gsf_alloc(ctx, p.value_capacity, sizeof *out->values);
+    if (out->values) out->strings = (char*)gsf_alloc(ctx, string_bytes, 1);
+    if (out->strings) {
+        p.free_string = out->strings;
+        result = gsf__json_read_document(&p);
+    }
+    gsf_free(ctx, p.order);
+    if (result != GSF_OK) gsf_destroy_json(ctx, out);
+    return result;
+}
+
+GSF_API void gsf_destroy_json(gsf_context* ctx, gsf_json* json) {
+    gsf_free(ctx, json->values);
+    gsf_free(ctx, json->strings);
+    memset(json, 0, sizeof *json);
+}
+
+GSF_API const gsf_json_value* gsf_json_member(const gsf_json* json, const gsf_json_value* object, const char* key) {
+    if (!object || object->type != GSF_JSON_OBJECT) return NULL;
+    const size_t size = strlen(key);
+    for (uint32_t i = object->child; i; i = json->values[i].next)
+        if (json->values[i].key_size == size && memcmp(json->values[i].key, key, size) == 0) return &json->values[i];
+    return NULL;
+}
+
+GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_json_value* array, size_t index) {
+    if (!array || array->type != GSF_JSON_ARRAY || index >= array->count) return NULL;
+    uint32_t i = array->child;
+    while (index--) i = json->values[i].next;
+    return &json->values[i];
+}
+
 // ---- >>images ------------------------------------------------------------------
+
+#ifndef GSF_NO_STB
+#ifndef GSF_STB_IMAGE_INCLUDE
+#define GSF_STB_IMAGE_INCLUDE <stb/stb_image.h>
+#endif
+#ifndef GSF_STB_IMAGE_WRITE_INCLUDE
+#define GSF_STB_IMAGE_WRITE_INCLUDE <stb/stb_image_write.h>
+#endif
+#if defined(__GNUC__) || defined(__clang__)
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-function"
+#pragma GCC diagnostic ignored "-Wconversion"
+#pragma GCC diagnostic ignored "-Wsign-conversion"
+#pragma GCC diagnostic ignored "-Wshadow"
+#pragma GCC diagnostic ignored "-Wpedantic"
+#pragma GCC diagnostic ignored "-Wmissing-field-initializers"
+#endif
+#if defined(__clang__) // stb shifts bits out of signed integers on purpose
+#pragma clang attribute push(__attribute__((no_sanitize("shift"))), apply_to = function)
+#endif
+// Private copies, so that they never clash with the host's own. A host that includes stb in this very file before us
+// keeps its copy, and we use that one.
+#ifndef STBI_INCLUDE_STB_IMAGE_H
+#define STB_IMAGE_IMPLEMENTATION
+#define STB_IMAGE_STATIC
+#define STBIDEF GSF__SHARED
+#define STBI_ONLY_PNG
+#define STBI_ONLY_JPEG
+#define STBI_ONLY_BMP
+#define STBI_ONLY_TGA
+#define STBI_ONLY_PNM
+#define STBI_NO_GIF
+#define STBI_NO_STDIO
+#define stbi__unpremultiply_on_load_thread stbi_set_unpremultiply_on_load_thread // declared, but misnamed in 2.27
+#include GSF_STB_IMAGE_INCLUDE
+#undef stbi__unpremultiply_on_load_thread
+#undef STB_IMAGE_IMPLEMENTATION
+#endif
+#ifndef INCLUDE_STB_IMAGE_WRITE_H
+#define STB_IMAGE_WRITE_IMPLEMENTATION
+#define STB_IMAGE_WRITE_STATIC
+#define STBIWDEF GSF__SHARED
+#include GSF_STB_IMAGE_WRITE_INCLUDE
+#undef STB_IMAGE_WRITE_IMPLEMENTATION
+#endif
+#if defined(__clang__)
+#pragma clang attribute pop
+#endif
+#if defined(__GNUC__) || defined(__clang__)
+#pragma GCC diagnostic pop
+#endif
+#endif // GSF_NO_STB
+
+GSF_API size_t gsf_dtype_size(gsf_dtype dtype) {
+    switch (dtype) {
+        case GSF_U8: return 1;
+        case GSF_U16: return 2;
+        case GSF_F16: return 2;
+        case GSF_F32: return 4;
+        case GSF_F64: return 8;
+    }
+    return 0;
+}
+
+GSF_API gsf_image gsf_wrap_image(void* data, gsf_dtype dtype, int64_t width, int64_t height, int32_t channels) {
+    gsf_image image;
+    memset(&image, 0, sizeof image);
+    image.data = data;
+    image.dtype = dtype;
+    image.width = width;
+    image.height = height;
+    image.channels = channels;
+    image.stride_c = (int64_t)gsf_dtype_size(dtype);
+    image.stride_x = image.stride_c * channels;
+    image.stride_y = image.stride_x * width;
+    return image;
+}
+
+GSF_API gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtype, int64_t width, int64_t height, int32_t channels,
+                                  gsf_image* out) {
+    memset(out, 0, sizeof *out);
+    size_t count, bytes;
+    if (width < 1 || height < 1 || channels < 1 || gsf_dtype_size(dtype) == 0 || (uint64_t)width > SIZE_MAX ||
+        (uint64_t)height > SIZE_MAX || !gsf__mul_size((size_t)width, (size_t)height, &count) ||
+        !gsf__mul_size(count, (size_t)channels, &count) || !gsf__mul_size(count, gsf_dtype_size(dtype), &bytes) ||
+        bytes > INT64_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "image: %lld x %lld with %d channels of type %d",
+                        (long long)width, (long long)height, (int)channels, (int)dtype);
+    void* data = gsf_alloc_zeroed(ctx, bytes, 1);
+    if (!data) return GSF_ERROR_OUT_OF_MEMORY;
+    *out = gsf_wrap_image(data, dtype, width, height, channels);
+    out->owned = data;
+    return GSF_OK;
+}
+
+GSF_API void gsf_destroy_image(gsf_context* ctx, gsf_image* image) {
+    gsf_free(ctx, image->owned);
+    memset(image, 0, sizeof *image);
+}
+
+static gsf_result gsf__check_image(gsf_context* ctx, const char* what, const gsf_image* image) {
+    if (!image || !image->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: image without pixels", what);
+    if (image->width < 1 || image->height < 1 || image->channels < 1 || gsf_dtype_size(image->dtype) == 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: image of %lld x %lld with %d channels of type %d", what,
+                        (long long)image->width, (long long)image->height, (int)image->channels, (int)image->dtype);
+    return GSF_OK;
+}
+
+// Rows per chunk of parallel work, from sizes only: about 64k values each.
+static int64_t gsf__image_rows_per_chunk(int64_t width, int32_t channels) {
+    const int64_t row = width * channels, rows = row > 0 && row < 65536 ? 65536 / row : 1;
+    return rows;
+}
+
+// ---- conversion: runs of pixels of one channel pass through double, integers as value / maximum
+
+static void gsf__load_pixels(const char* p, int64_t stride, gsf_dtype dtype, size_t n, double* out) {
+    switch (dtype) {
+        case GSF_U8:
+            for (size_t i = 0; i < n; i++, p += stride) out[i] = *(const unsigned char*)p / 255.0;
+            break;
+        case GSF_U16:
+            for (size_t i = 0; i < n; i++, p += stride) { uint16_t v; memcpy(&v, p, sizeof v); out[i] = v / 65535.0; }
+            break;
+        case GSF_F16:
+            for (size_t i = 0; i < n; i++, p += stride) {
+                uint16_t v;
+                memcpy(&v, p, sizeof v);
+                out[i] = (double)gsf__half_to_float(v);
+            }
+            break;
+        case GSF_F32:
+            for (size_t i = 0; i < n; i++, p += stride) { float v; memcpy(&v, p, sizeof v); out[i] = (double)v; }
+            break;
+        case GSF_F64:
+            for (size_t i = 0; i < n; i++, p += stride) memcpy(&out[i], p, sizeof(double));
+            break;
+    }
+}
+
+static double gsf__quantize(double scaled, double maximum) { // NaN becomes 0
+    return scaled >= maximum ? maximum : scaled > 0.0 ? scaled : 0.0;
+}
+
+// in_float: the values were floats, so x*255 + 0.5 is rounded to float as torchvision does it.
+static void gsf__store_pixels(char* p, int64_t stride, gsf_dtype dtype, size_t n, const double* in, int in_float) {
+    switch (dtype) {
+        case GSF_U8:
+            for (size_t i = 0; i < n; i++, p += stride) {
+                const float scaled = (float)in[i] * 255.0f;
+                const double v = in_float ? (double)(scaled + 0.5f) : in[i] * 255.0 + 0.5;
+                *(unsigned char*)p = (unsigned char)gsf__quantize(v, 255.0);
+            }
+            break;
+        case GSF_U16:
+            for (size_t i = 0; i < n; i++, p += stride) {
+                const uint16_t v = (uint16_t)gsf__quantize(in[i] * 65535.0 + 0.5, 65535.0);
+                memcpy(p, &v, sizeof v);
+            }
+            break;
+        case GSF_F16:
+            for (size_t i = 0; i < n; i++, p += stride) {
+                const uint16_t v = gsf__float_to_half((float)in[i]);
+                memcpy(p, &v, sizeof v);
+            }
+            break;
+        case GSF_F32:
+            for (size_t i = 0; i < n; i++, p += stride) { const float v = (float)in[i]; memcpy(p, &v, sizeof v); }
+            break;
+        case GSF_F64:
+            for (size_t i = 0; i < n; i++, p += stride) memcpy(p, &in[i], sizeof(double));
+            break;
+    }
+}
+
+enum { GSF__CONVERT_RUN = 256 };
+
+typedef struct gsf__convert_job {
+    const gsf_image *src, *dst;
+    int64_t rows;
+} gsf__convert_job;
+
+static void gsf__convert_rows(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__convert_job* job = (const gsf__convert_job*)arg;
+    const gsf_image *src = job->src, *dst = job->dst;
+    const int in_float = src->dtype == GSF_F16 || src->dtype == GSF_F32;
+    const int64_t first = (int64_t)chunk * job->rows;
+    const int64_t end = first + job->rows < dst->height ? first + job->rows : dst->height;
+    double run[GSF__CONVERT_RUN];
+    for (int64_t y = first; y < end; y++)
+        for (int32_t c = 0; c < dst->channels; c++) {
+            const char* from = (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
+            char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
+            for (int64_t x = 0; x < dst->width; x += GSF__CONVERT_RUN) {
+                const int64_t left = dst->width - x;
+                const size_t n = left < GSF__CONVERT_RUN ? (size_t)left : (size_t)GSF__CONVERT_RUN;
+                gsf__load_pixels(from + x * src->stride_x, src->stride_x, src->dtype, n, run);
+                gsf__store_pixels(to + x * dst->stride_x, dst->stride_x, dst->dtype, n, run, in_float);
+            }
+        }
+}
+
+GSF_API gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, const gsf_image* dst) {
+    GSF__TRY(gsf__check_image(ctx, "convert: source", src));
+    GSF__TRY(gsf__check_image(ctx, "convert: destination", dst));
+    if (src->width != dst->width || src->height != dst->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "convert: sizes %lld x %lld and %lld x %lld differ",
+                        (long long)src->width, (long long)src->height, (long long)dst->width, (long long)dst->height);
+    if (src->channels != dst->channels && !(src->channels == 1 && dst->channels == 3) &&
+        !(src->channels == 4 && dst->channels == 3))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "convert: %d channels to %d", (int)src->channels,
+                        (int)dst->channels);
+    gsf__convert_job job;
+    job.src = src;
+    job.dst = dst;
+    job.rows = gsf__image_rows_per_chunk(dst->width, dst->channels);
+    gsf__parallel_for(ctx, (size_t)((dst->height + job.rows - 1) / job.rows), gsf__convert_rows, &job);
+    return GSF_OK;
+}
+
+// ---- files
+
+enum { GSF__IMAGE_PIXELS_PER_BYTE = 8256, GSF__JPEG_QUALITY = 95 };
+
+#if !defined(GSF_NO_STB) || defined(GSF_USE_OIIO)
+// No honest file holds more: deflate packs 1032:1 at most, a byte of 1-bit PNG is 8 pixels.
+static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int64_t width, int64_t height,
+                                         size_t file_size) {
+    if (width < 1 || height < 1 || width > (int64_t)1 << 28 || height > ((int64_t)1 << 28) / width ||
+        (uint64_t)(width * height) / GSF__IMAGE_PIXELS_PER_BYTE > file_size)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: a file of %zu bytes cannot hold %lld x %lld pixels", name,
+                        file_size, (long long)width, (long long)height);
+    return GSF_OK;
+}
+
+#endif
+
+#ifndef GSF_NO_STB
+// Lengths and checksums of all chunks of a PNG (stb checks neither the sums nor that the file is whole).
+static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char* data, size_t size) {
+    for (size_t at = 8;;) {
+        if (size - at < 12) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is cut (no IEND)", name, at);
+        const unsigned char* head = (const unsigned char*)data + at;
+        const size_t bytes = (size_t)head[0] << 24 | (size_t)head[1] << 16 | (size_t)head[2] << 8 | head[3];
+        if (bytes > size - at - 12)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG chunk of %zu bytes does not fit the file", name, at,
+                            bytes);
+        const unsigned char* sum = head + 8 + bytes;
+        if (gsf__crc32(0, head + 4, bytes + 4) !=
+            ((uint32_t)sum[0] << 24 | (uint32_t)sum[1] << 16 | (uint32_t)sum[2] << 8 | sum[3]))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG checksum mismatch", name, at);
+        if (memcmp(head + 4, "IEND", 4) == 0) return GSF_OK;
+        at += 12 + bytes;
+    }
+}
+
+static int gsf__is_png(const void* data, size_t size) {
+    return size >= 8 && memcmp(data, "\x89PNG\r\n\x1a\n", 8) == 0;
+}
+#endif
+
+#ifdef GSF_USE_OIIO
+#ifndef __cplusplus
+#error "GSF_USE_OIIO needs the implementation compiled as C++"
+#endif
+static gsf_result gsf__oiio_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
+                                 gsf_image* out);
+static gsf_result gsf__oiio_query(gsf_context* ctx, const char* name, const void* data, size_t size, int64_t* width,
+                                  int64_t* height, int32_t* channels);
+static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const gsf_image* image, gsf_text* out);
+#endif
+
+#ifndef GSF_NO_STB
+
+// Bytes for stb, from memory or a stdio file. `overrun` tells that it wanted more than there is: stb itself goes on with
+// zeros, which would turn a cut photo into a half grey one.
+typedef struct gsf__stb_source {
+    const char* data;
+    size_t size, at;
+    FILE* file; // instead of data
+    int overrun;
+} gsf__stb_source;
+
+static int gsf__stb_read(void* user, char* out, int size) {
+    gsf__stb_source* s = (gsf__stb_source*)user;
+    size_t got;
+    if (s->file) {
+        got = fread(out, 1, (size_t)size, s->file);
+    } else {
+        got = s->size - s->at < (size_t)size ? s->size - s->at : (size_t)size;
+        memcpy(out, s->data + s->at, got);
+    }
+    s->at += got;
+    if (got == 0) s->overrun = 1;
+    return (int)got;
+}
+
+static void gsf__stb_skip(void* user, int n) {
+    gsf__stb_source* s = (gsf__stb_source*)user;
+    if (n < 0) return;
+    if (s->file) {
+        if (fseek(s->file, n, SEEK_CUR) != 0) s->overrun = 1;
+    } else if ((size_t)n > s->size - s->at) {
+        s->overrun = 1;
+        n = (int)(s->size - s->at);
+    }
+    s->at += (size_t)n;
+}
+
+static int gsf__stb_eof(void* user) {
+    gsf__stb_source* s = (gsf__stb_source*)user;
+    return s->file ? feof(s->file) != 0 : s->at >= s->size;
+}
+
+static stbi_io_callbacks gsf__stb_callbacks(void) {
+    stbi_io_callbacks callbacks;
+    callbacks.read = gsf__stb_read;
+    callbacks.skip = gsf__stb_skip;
+    callbacks.eof = gsf__stb_eof;
+    return callbacks;
+}
+
+static gsf__stb_source gsf__stb_memory(const void* data, size_t size) {
+    gsf__stb_source source;
+    memset(&source, 0, sizeof source);
+    source.data = (const char*)data;
+    source.size = size;
+    return source;
+}
+
+static gsf_result gsf__stb_fail(gsf_context* ctx, const char* name, const gsf__stb_source* source) {
+    const char* reason = stbi_failure_reason();
+    if (!reason) reason = "unknown reason";
+    if (source->file && ferror(source->file)) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", name, strerror(errno));
+    if (strcmp(reason, "unknown image type") == 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not an image that this build reads", name);
+    if (source->overrun) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is cut", name, source->at);
+    if (strcmp(reason, "outofmem") == 0) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory", name);
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is malformed (%s)", name, source->at, reason);
+}
+
+static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
+                                 int64_t* height, int32_t* channels) {
+    const stbi_io_callbacks callbacks = gsf__stb_callbacks();
+    int w, h, c;
+    if (!stbi_info_from_callbacks(&callbacks, source, &w, &h, &c)) return gsf__stb_fail(ctx, name, source);
+    *width = w;
+    *height = h;
+    *channels = c;
+    return GSF_OK;
+}
+
+// stb's own scratch memory and the decoded pixels come from malloc (it has no hook with a context) and are gone on return.
+static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
+                                gsf_image* out) {
+    gsf__stb_source source = gsf__stb_memory(data, size);
+    int64_t width = 0, height = 0;
+    int32_t file_channels = 0;
+    GSF__TRY(gsf__stb_query(ctx, name, &source, &width, &height, &file_channels));
+    GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
+    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
+    source = gsf__stb_memory(data, size);
+    const stbi_io_callbacks callbacks = gsf__stb_callbacks();
+    int w, h, c;
+    stbi_uc* pixels = stbi_load_from_callbacks(&callbacks, &source, &w, &h, &c, channels);
+    gsf_result result = pixels && !source.overrun ? GSF_OK : gsf__stb_fail(ctx, name, &source);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, w, h, channels ? channels : c, out);
+    if (result == GSF_OK) memcpy(out->data, pixels, (size_t)out->stride_y * (size_t)h);
+    stbi_image_free(pixels);
+    return result;
+}
+
+static void gsf__stb_write(void* user, void* data, int size) {
+    void** both = (void**)user; // context, text
+    gsf_text_append((gsf_context*)both[0], (gsf_text*)both[1], (const char*)data, (size_t)size);
+}
+
+#endif // GSF_NO_STB
+
+// The last ".xyz" of a path in lower case, "" if there is none or it is long.
+static void gsf__path_extension(const char* path, char out[8]) {
+    const char* dot = strrchr(path, '.');
+    size_t n = dot ? strlen(dot) : 0;
+    if (n > 7) n = 0;
+    for (size_t i = 0; i < n; i++) out[i] = (char)(dot[i] >= 'A' && dot[i] <= 'Z' ? dot[i] + 32 : dot[i]);
+    out[n] = 0;
+}
+
+GSF_API gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                         int32_t channels, gsf_image* out) {
+    memset(out, 0, sizeof *out);
+    if (channels != 0 && channels != 1 && channels != 3 && channels != 4)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %d channels wanted (0, 1, 3 or 4)", name, (int)channels);
+    if (size == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: file is empty", name);
+#ifdef GSF_USE_OIIO
+#ifdef GSF_NO_STB
+    return gsf__oiio_load(ctx, name, data, size, channels, out);
+#else
+    gsf__stb_source source = gsf__stb_memory(data, size);
+    const stbi_io_callbacks callbacks = gsf__stb_callbacks();
+    int w, h, c;
+    const int stb_reads = stbi_info_from_callbacks(&callbacks, &source, &w, &h, &c);
+    source = gsf__stb_memory(data, size);
+    if (!stb_reads || stbi_is_16_bit_from_callbacks(&callbacks, &source)) // eight-bit files: the same in all builds
+        return gsf__oiio_load(ctx, name, data, size, channels, out);
+#endif
+#endif
+#ifndef GSF_NO_STB
+    return gsf__stb_load(ctx, name, data, size, channels, out);
+#elif !defined(GSF_USE_OIIO)
+    (void)data;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no images (GSF_NO_STB)", name);
+#endif
+}
+
+GSF_API gsf_result gsf_load_image(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out) {
+    memset(out, 0, sizeof *out);
+    void* data;
+    size_t size;
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    const gsf_result result = gsf_load_image_memory(ctx, path, data, size, channels, out);
+    gsf_free(ctx, data);
+    return result;
+}
+
+GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
+                                   int32_t* channels) {
+    *width = *height = 0;
+    *channels = 0;
+#ifndef GSF_NO_STB
+    if (ctx->io.read_fn == gsf__stdio_read) { // only as many bytes as the header has
+        gsf__stb_source source = gsf__stb_memory(NULL, 0);
+        source.file = fopen(path, "rb");
+        if (!source.file) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
+        const gsf_result result = gsf__stb_query(ctx, path, &source, width, height, channels);
+        fclose(source.file);
+#ifdef GSF_USE_OIIO
+        if (result == GSF_OK) return GSF_OK;
+#else
+        return result;
+#endif
+    }
+#endif
+    void* data;
+    size_t size;
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    gsf_result result;
+#ifndef GSF_NO_STB
+    gsf__stb_source source = gsf__stb_memory(data, size);
+    result = gsf__stb_query(ctx, path, &source, width, height, channels);
+#ifdef GSF_USE_OIIO
+    if (result != GSF_OK) result = gsf__oiio_query(ctx, path, data, size, width, height, channels);
+#endif
+#elif defined(GSF_USE_OIIO)
+    result = gsf__oiio_query(ctx, path, data, size, width, height, channels);
+#else
+    result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no images (GSF_NO_STB)", path);
+#endif
+    gsf_free(ctx, data);
+    return result;
+}
+
+// Appends the encoded file to `out`, or leaves it as it was.
+static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gsf_image* image, const char* extension,
+                                    gsf_text* out) {
+    GSF__TRY(gsf__check_image(ctx, name, image));
+#ifdef GSF_NO_STB
+    (void)out;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no %s (GSF_NO_STB)", name, extension);
+#else
+    const int png = strcmp(extension, ".png") == 0;
+    if (!png && strcmp(extension, ".jpg") != 0 && strcmp(extension, ".jpeg") != 0)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes .png and .jpg, not \"%s\"", name, extension);
+    const int32_t channels = !png && image->channels == 4 ? 3 : image->channels;
+    if (channels > 4 || (!png && channels == 2))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %d channels do not fit %s", name, (int)image->channels,
+                        extension);
+    const int64_t longest = png ? 1 << 24 : 65535;
+    if (image->width > longest || image->height > longest || image->width * image->height > (1 << 30) / (channels + 1))
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld x %lld pixels are too many for %s", name,
+                        (long long)image->width, (long long)image->height, extension);
+    gsf_image packed;
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, image->width, image->height, channels, &packed));
+    gsf_result result = gsf_convert_image(ctx, image, &packed);
+    if (result == GSF_OK) {
+        const size_t before = out->size;
+        void* user[2];
+        user[0] = ctx;
+        user[1] = out;
+        const int w = (int)image->width, h = (int)image->height;
+        const int ok = png ? stbi_write_png_to_func(gsf__stb_write, user, w, h, channels, packed.data, w * channels)
+                           : stbi_write_jpg_to_func(gsf__stb_write, user, w, h, channels, packed.data, GSF__JPEG_QUALITY);
+        if (!ok || out->failed) {
+            out->size = before;
+            result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory while encoding", name);
+        }
+    }
+    gsf_destroy_image(ctx, &packed);
+    return result;
+#endif
+}
+
+GSF_API gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension, gsf_text* out) {
+    return gsf__encode_image(ctx, "encode", image, extension, out);
+}
+
+GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image) {
+    char extension[8];
+    gsf__path_extension(path, extension);
+    gsf_text file;
+    memset(&file, 0, sizeof file);
+    gsf_result result;
+#ifdef GSF_USE_OIIO
+    GSF__TRY(gsf__check_image(ctx, path, image));
+#ifdef GSF_NO_STB
+    const int through_oiio = 1;
+#else
+    const int through_oiio = strcmp(extension, ".exr") == 0 || strcmp(extension, ".tif") == 0 ||
+                             strcmp(extension, ".tiff") == 0 ||
+                             (strcmp(extension, ".png") == 0 && image->dtype == GSF_U16);
+#endif
+    if (through_oiio) result = gsf__oiio_encode(ctx, path, image, &file);
+    else
+#endif
+        result = gsf__encode_image(ctx, path, image, extension, &file);
+    if (result == GSF_OK) result = gsf_write_file(ctx, path, file.data, file.size);
+    gsf_destroy_text(ctx, &file);
+    return result;
+}
 
 // ---- >>resize ------------------------------------------------------------------
 
@@ -998,6 +2064,9 @@ GSF_API gsf_result gsf_check_camera(gsf_context* ctx, const gsf_camera* camera) 
             if (fabs(dot - (a == b)) > 1e-4)
                 return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "camera: w2c is not rigid (columns %d, %d)", a, b);
         }
+    const double det = m[0] * (m[5] * m[10] - m[9] * m[6]) - m[4] * (m[1] * m[10] - m[9] * m[2]) +
+                       m[8] * (m[1] * m[6] - m[5] * m[2]);
+    if (!(det > 0.0)) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "camera: w2c is a reflection");
     if (m[3] != 0.0 || m[7] != 0.0 || m[11] != 0.0 || fabs(m[15] - 1.0) > 1e-12)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "camera: last row of w2c is not 0 0 0 1");
     if (!(camera->fx > 0.0 && camera->fy > 0.0 && isfinite(camera->fx) && isfinite(camera->fy)))
