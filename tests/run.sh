@@ -63,12 +63,20 @@ build_tree() { # NAME SOURCE-RELATIVE-DIR CMAKE-ARGUMENT...
 }
 
 install_missing
-clang=(-DCMAKE_C_COMPILER=clang-14 -DCMAKE_CXX_COMPILER=clang++-14 -DCMAKE_BUILD_TYPE=Sanitize "-DCMAKE_C_FLAGS=-O1 -g"
-    "-DCMAKE_CXX_FLAGS=-O1 -g" -DGSFIXER_BENCH=OFF)
-build_tree gcc "$build" -DCMAKE_C_COMPILER=gcc -DCMAKE_CXX_COMPILER=g++ -DCMAKE_BUILD_TYPE=Release -DGSFIXER_TEST_SCALAR=ON
+
+# The compiler goes by environment: given as an option, one that differs from the tree's makes CMake forget all the other
+# options. If build/ was made with another compiler, it is made anew.
+if ! grep -qE '^CMAKE_C_COMPILER:[A-Z]+=.*/(gcc|cc)$' "$build/CMakeCache.txt" 2> /dev/null; then
+    rm -rf "$build/CMakeCache.txt" "$build/CMakeFiles"
+fi
+export CC=gcc CXX=g++
+build_tree gcc "$build" -DCMAKE_BUILD_TYPE=Release -DGSFIXER_TEST_SCALAR=ON
+export CC=clang-14 CXX=clang++-14
+clang=(-DCMAKE_BUILD_TYPE=Sanitize "-DCMAKE_C_FLAGS=-O1 -g" "-DCMAKE_CXX_FLAGS=-O1 -g" -DGSFIXER_BENCH=OFF)
 build_tree asan "$build/asan" "${clang[@]}" -DGSFIXER_SANITIZE=address,undefined -DGSFIXER_TEST_PREFIX=asan.
 build_tree tsan "$build/tsan" "${clang[@]}" -DGSFIXER_SANITIZE=thread -DGSFIXER_TEST_PREFIX=tsan. -DGSFIXER_OPENMP=OFF \
     "-DCMAKE_CROSSCOMPILING_EMULATOR=$(tsan_launcher)"
+unset CC CXX
 
 mkdir -p "$build/all"
 printf 'subdirs("%s" "%s" "%s")\n' "$build" "$build/asan" "$build/tsan" > "$build/all/CTestTestfile.cmake"

@@ -1,0 +1,232 @@
+// Everything that runs in parallel, on a pthread job system behind the hook: 1, 2 and 3 workers give the same bytes.
+// Built with ThreadSanitizer it is also the test for data races.
+#define JOB_SYSTEM_ONLY
+#include "../examples/job_system.c"
+#include "test.h"
+
+enum { WIDTH = 96, HEIGHT = 72, VIEWS = 3, SPLATS = 600, POINTS = 3000 };
+
+typedef struct stage_output { // bytes of one stage, all outputs one after another
+    const char* stage;
+    char* data;
+    size_t size, capacity;
+} stage_output;
+
+enum { STAGES_MAX = 16 };
+typedef struct run_output { stage_output stages[STAGES_MAX]; int count; } run_output;
+
+static stage_output* begin_stage(run_output* run, const char* stage) {
+    stage_output* out = &run->stages[run->count++];
+    out->stage = stage;
+    return out;
+}
+
+static void add(stage_output* out, const void* data, size_t size) {
+    if (out->size + size > out->capacity) {
+        out->capacity = 2 * (out->size + size);
+        out->data = (char*)realloc(out->data, out->capacity);
+    }
+    memcpy(out->data + out->size, data, size);
+    out->size += size;
+}
+
+static void add_splats(stage_output* out, const gsf_splats* s) {
+    add(out, &s->count, sizeof s->count);
+    add(out, s->means, s->count * 3 * sizeof(float));
+    add(out, s->log_scales, s->count * 3 * sizeof(float));
+    add(out, s->quats, s->count * 4 * sizeof(float));
+    add(out, s->opacity_logits, s->count * sizeof(float));
+    add(out, s->sh, s->count * 3 * (size_t)gsf_splat_sh_count(s->sh_degree) * sizeof(float));
+    add(out, s->ids, s->count * sizeof(uint32_t));
+}
+
+// ---- a small scene ---------------------------------------------------------------
+
+static gsf_camera make_camera(int view) { // around the z axis, looking at a unit blob 3 in front
+    const double angle = 0.25 * (view - 1), c = cos(angle), s = sin(angle);
+    gsf_camera camera;
+    memset(&camera, 0, sizeof camera);
+    const double w2c[16] = {c, 0, -s, 0, 0, 1, 0, 0, s, 0, c, 0, 0, 0, 3, 1};
+    memcpy(camera.w2c, w2c, sizeof w2c);
+    camera.fx = camera.fy = 90.0;
+    camera.cx = WIDTH / 2.0;
+    camera.cy = HEIGHT / 2.0;
+    camera.width = WIDTH;
+    camera.height = HEIGHT;
+    return camera;
+}
+
+static void make_splats(gsf_context* ctx, uint64_t seed, gsf_splats* out) {
+    CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, out));
+    const size_t row = 3 * (size_t)gsf_splat_sh_count(1);
+    for (size_t i = 0; i < SPLATS; i++) {
+        for (uint64_t a = 0; a < 3; a++) {
+            out->means[3 * i + a] = (float)(1.6 * gsf_random_uniform(seed, a, i) - 0.8);
+            out->log_scales[3 * i + a] = (float)(-3.5 + gsf_random_uniform(seed, 3 + a, i));
+        }
+        for (uint64_t a = 0; a < 4; a++) out->quats[4 * i + a] = (float)gsf_random_normal(seed, 6 + a, i);
+        for (uint64_t a = 0; a < row; a++)
+            out->sh[row * i + a] = (float)((a < 3 ? 1.0 : 0.1) * gsf_random_normal(seed, 10 + a, i));
+        out->opacity_logits[i] = (float)gsf_random_normal(seed, 99, i);
+    }
+}
+
+static float* make_floats(size_t count, uint64_t stream) {
+    float* v = (float*)malloc(count * sizeof(float));
+    for (size_t i = 0; i < count; i++) v[i] = (float)gsf_random_uniform(3, stream, i);
+    return v;
+}
+
+// ---- stages ----------------------------------------------------------------------
+
+static void run_images(gsf_context* ctx, run_output* run) {
+    enum { W = 301, H = 223 };
+    float* a = make_floats(W * H * 3, 0);
+    uint8_t* bytes = (uint8_t*)malloc(W * H * 3);
+    const gsf_image image_a = gsf_wrap_image(a, GSF_F32, W, H, 3);
+    const gsf_image image_bytes = gsf_wrap_image(bytes, GSF_U8, W, H, 3);
+
+    stage_output* out = begin_stage(run, "convert");
+    CHECK_OK(ctx, gsf_convert_image(ctx, &image_a, &image_bytes));
+    add(out, bytes, W * H * 3);
+
+    free(a);
+    free(bytes);
+}
+
+static void run_points(gsf_context* ctx, run_output* run) {
+    double* points = (double*)malloc(POINTS * 3 * sizeof(double));
+    uint8_t* colors = (uint8_t*)malloc(POINTS * 3);
+    for (size_t i = 0; i < POINTS; i++)
+        for (uint64_t a = 0; a < 3; a++) {
+            points[3 * i + a] = gsf_random_uniform(4, a, i) * 1.6 - 0.8;
+            colors[3 * i + a] = (uint8_t)(gsf_random_bits(4, 3 + a, i) & 255u);
+        }
+    const double origin[3] = {0.0, 0.0, 0.0};
+    gsf_splats splats;
+    stage_output* out = begin_stage(run, "splats from points");
+    if (CHECK_OK(ctx, gsf_splat_from_points(ctx, points, colors, POINTS, NULL, 0, origin, &splats)))
+        add_splats(out, &splats);
+    gsf_splat_destroy(ctx, &splats);
+
+    gsf_scene scene; // built by hand: no tracks
+    memset(&scene, 0, sizeof scene);
+    gsf_scene_view views[VIEWS];
+    memset(views, 0, sizeof views);
+    const uint32_t chosen[VIEWS] = {0, 1, 2};
+    for (int v = 0; v < VIEWS; v++) views[v].camera = make_camera(v);
+    scene.views = views;
+    scene.view_count = VIEWS;
+    scene.points = points;
+    scene.colors = colors;
+    scene.point_count = POINTS;
+    scene.track_begin = (size_t*)calloc(POINTS + 1, sizeof(size_t));
+    uint8_t* keep = (uint8_t*)calloc(POINTS, 1);
+    gsf_visibility_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.method = GSF_VISIBILITY_RAYS;
+    for (int z = 0; z < 2; z++) {
+        desc.use_zbuffer = z;
+        out = begin_stage(run, z ? "visible points, z-buffer" : "visible points, rays");
+        CHECK_OK(ctx, gsf_splat_visible_points(ctx, &scene, chosen, VIEWS, &desc, keep, NULL));
+        add(out, keep, POINTS);
+    }
+    free(keep);
+    free(scene.track_begin);
+    free(points);
+    free(colors);
+}
+
+static void run_render(gsf_context* ctx, run_output* run) {
+    gsf_splats splats;
+    make_splats(ctx, 7, &splats);
+    const gsf_camera camera = make_camera(0);
+    float* color = make_floats(WIDTH * HEIGHT * 3, 0);
+    float* depth = make_floats(WIDTH * HEIGHT, 0);
+    float* alpha = make_floats(WIDTH * HEIGHT, 0);
+    float* d_color = make_floats(WIDTH * HEIGHT * 3, 5);
+    float* d_depth = make_floats(WIDTH * HEIGHT, 6);
+    float* d_alpha = make_floats(WIDTH * HEIGHT, 7);
+    gsf_render_output image;
+    memset(&image, 0, sizeof image);
+    image.color = gsf_wrap_image(color, GSF_F32, WIDTH, HEIGHT, 3);
+    image.depth = gsf_wrap_image(depth, GSF_F32, WIDTH, HEIGHT, 1);
+    image.alpha = gsf_wrap_image(alpha, GSF_F32, WIDTH, HEIGHT, 1);
+    gsf_rasterizer* rasterizer = NULL;
+    if (!CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &rasterizer))) return;
+
+    stage_output* out = begin_stage(run, "render");
+    CHECK_OK(ctx, gsf_splat_render(ctx, rasterizer, &splats, &camera, NULL, &image));
+    add(out, color, WIDTH * HEIGHT * 3 * sizeof(float));
+    add(out, depth, WIDTH * HEIGHT * sizeof(float));
+    add(out, alpha, WIDTH * HEIGHT * sizeof(float));
+
+    out = begin_stage(run, "render backward");
+    float gradients[SPLATS * (3 + 3 + 4 + 1 + 12 + 2 + 2) + 3]; // one after another, as in gsf_splat_grads
+    memset(gradients, 0, sizeof gradients);
+    gsf_splat_grads grads;
+    grads.means = gradients;
+    grads.log_scales = grads.means + 3 * SPLATS;
+    grads.quats = grads.log_scales + 3 * SPLATS;
+    grads.opacity_logits = grads.quats + 4 * SPLATS;
+    grads.sh = grads.opacity_logits + SPLATS;
+    grads.means2d = grads.sh + 12 * SPLATS;
+    grads.means2d_abs = grads.means2d + 2 * SPLATS;
+    grads.background = grads.means2d_abs + 2 * SPLATS;
+    CHECK_OK(ctx, gsf_splat_render_backward(ctx, rasterizer, &splats, &camera, NULL, d_color, d_depth, d_alpha, &grads));
+    add(out, gradients, sizeof gradients);
+    double sum = 0.0;
+    for (size_t i = 0; i < sizeof gradients / sizeof gradients[0]; i++) sum += fabs((double)gradients[i]);
+    CHECK(sum > 1.0); // something was compared
+
+    gsf_splat_destroy_rasterizer(ctx, rasterizer);
+    gsf_splat_destroy(ctx, &splats);
+    free(color);
+    free(depth);
+    free(alpha);
+    free(d_color);
+    free(d_depth);
+    free(d_alpha);
+}
+
+static void run_all(int workers, run_output* run) {
+    job_system jobs;
+    memset(run, 0, sizeof *run);
+    if (!CHECK(job_start(&jobs, workers))) return;
+    gsf_context ctx;
+    test_context_zero(&ctx);
+    ctx.parallel.for_fn = job_for;
+    ctx.parallel.user = &jobs;
+    ctx.parallel.worker_count = workers;
+    if (CHECK_OK(&ctx, gsf_init_context(&ctx))) {
+        run_images(&ctx, run);
+        run_points(&ctx, run);
+        run_render(&ctx, run);
+    }
+    job_stop(&jobs);
+}
+
+static void free_run(run_output* run) {
+    for (int i = 0; i < run->count; i++) free(run->stages[i].data);
+}
+
+int main(void) {
+    run_output one, more;
+    run_all(1, &one);
+    CHECK(one.count > 0);
+    for (int workers = 2; workers <= 3; workers++) {
+        run_all(workers, &more);
+        CHECK(more.count == one.count);
+        for (int i = 0; i < one.count && i < more.count; i++) {
+            const stage_output *a = &one.stages[i], *b = &more.stages[i];
+            CHECK(a->size > 0);
+            size_t same = 0;
+            while (same < a->size && same < b->size && a->data[same] == b->data[same]) same++;
+            if (!CHECK(a->size == b->size && same == a->size))
+                fprintf(stderr, "%s: %d workers differ from 1 at byte %zu of %zu\n", a->stage, workers, same, a->size);
+        }
+        free_run(&more);
+    }
+    free_run(&one);
+    return test_report();
+}
