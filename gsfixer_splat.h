@@ -220,49 +220,63 @@ GSF_API const int32_t* gsf_splat_last_radii(const gsf_rasterizer* rasterizer);
 typedef struct gsf_train_view {
     gsf_camera camera;
     gsf_image image;   // u8 or f32 RGB, same size as the camera; copied
-    gsf_image weight;  // f32, 1 channel: per-pixel weight of the loss (a restorer's confidence); data NULL = 1; copied
+    gsf_image weight;  // f32, 1 channel: per-pixel weight of the loss (a restorer's confidence); data NULL = 1; copied.
+                       // The loss is sum(weight * term) / (3 W H): weight 0 counts as already right
 } gsf_train_view;
 
-typedef struct gsf_train_desc { // zero = the official 3DGS value given beside each field
-    int32_t iterations;            // 30000; the schedules below scale with iterations / 30000 unless set
+typedef struct gsf_train_desc { // zero = the official 3DGS value given beside each field; s = iterations / 30000
+    int32_t iterations;            // 30000
     uint64_t seed;
     int32_t sh_degree;             // degree to train; 0 = the splats' own
-    int32_t sh_interval;           // 1000: iterations per further SH band
-    float lr_means, lr_means_final;// 1.6e-4, 1.6e-6, both times extent, exponential decay
+    int32_t sh_interval;           // 1000 s: iterations per further SH band; bands that the splats already use stay on
+    float lr_means, lr_means_final;// 1.6e-4, 1.6e-6, both times extent, exponential decay over all iterations
+    int32_t lr_means_delay_steps;  // 0; over so many iterations lr_means is eased in, from lr_means_delay times it
+    float lr_means_delay;
     float lr_sh_dc, lr_sh_rest, lr_opacity, lr_scales, lr_quats; // 2.5e-3, 1.25e-4, 0.025, 5e-3, 1e-3
-    float extent;                  // 1.1 * largest distance of a training camera from their mean
-    float lambda_ssim;             // 0.2
+    float extent;                  // 1.1 * largest distance of a training camera from their mean; median depth of the
+                                   // splats where the cameras coincide
+    float lambda_ssim;             // 0.2; negative = no SSIM term
     float background[3];
-    int32_t densify_from, densify_until, densify_interval; // 500, 15000, 100; densify_until < 0 = never
+    int32_t densify_from, densify_until; // 500 s, 15000 s; densify_until < 0 = never, nor opacity resets
+    int32_t densify_interval;      // 100, whatever s is
     float densify_grad;            // 2e-4
     float densify_scale;           // 0.01: clone below this share of extent, split above
     float prune_opacity;           // 0.005
     float prune_scale;             // 0.1 of extent, after the first opacity reset
-    int32_t opacity_reset_interval;// 3000
+    int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
     size_t max_splats;             // densification stops growing here; 0 = 2 million
-    gsf_render_desc render;        // footprint, gradient kind, antialiasing, near plane (background is taken from above)
+    gsf_render_desc render;        // footprint, gradient kind, antialiasing, near plane (0 = the smaller of 0.2 and 0.01
+                                   // extent); background is taken from above; hidden, sh_bands, opacity_scale stay zero
     // regularisers for few views; zero = off
-    float dropout;                 // largest share of splats hidden in a step (grows linearly over training)
-    float opacity_decay;           // opacities shrink by this factor each 100 iterations... 
-    float scale_penalty;           // weight of mean(exp(log_scale))/extent
-    float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth
+    float dropout;                 // share of splats hidden in a step, growing linearly from 0 to this; the others'
+                                   // opacities are divided by 1 - share (DropGaussian)
+    float opacity_decay;           // every opacity loses this share per iteration (applied every 10; 0.005 in Binocular3DGS)
+    float scale_penalty;           // weight of mean(exp(log_scale)) / extent
+    float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
 } gsf_train_desc;
 
 typedef struct gsf_train_stats {
     int32_t iteration;     // just done, from 1
     size_t splats;
-    double loss, l1, ssim; // of this step's view
-    size_t rejected;       // non-finite gradients or parameters neutralised so far
+    double loss, l1, ssim; // of this step's photo, without regularisers
+    double restored_loss;  // of this step's restored view, without its weight; 0 when none was taken
+    size_t rejected;       // non-finite initial splats, gradients and parameters left out or neutralised so far
 } gsf_train_stats;
 
 typedef struct gsf_trainer gsf_trainer;
 
-// The trainer copies views and splats. Steps are deterministic: same bits for any number of workers.
+// The trainer copies views and splats (non-finite ones are left out). Steps are deterministic: same bits for any number of
+// workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored views
+// and their weight is above 0, one restored view: both gradients go into one Adam step (dense: unseen splats move by their
+// momentum), and each render counts for itself in the densification statistics.
+// Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4 with a weight, and 24 more
+// for its window moments, up to 512 MiB of these (photos beyond that only train slower).
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc,
                                                         const gsf_train_view* views, size_t view_count,
                                                         const gsf_splats* initial, gsf_trainer** out);
 GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer);
-// One iteration. After the last one it is GSF_ERROR_INVALID_ARGUMENT.
+// One iteration. After the last one it is GSF_ERROR_INVALID_ARGUMENT. A step that fails (cancelled, out of memory) changes
+// nothing, so it may be tried again. stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats);
 // Replaces the restored views (their loss has weight `lambda`, may be changed at any time). count 0 removes them.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer,
@@ -275,7 +289,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
 // The current splats, borrowed until the next step.
 GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer);
-// Adds the whole state as chunks / continues from it, bit-identically. Views and desc are the caller's to give again.
+// Adds the whole state as chunks / continues from it, bit-identically. Views and desc are the caller's to give again (in any
+// order; a difference is only a warning); the restored views' weight is part of the state. `chunks` of restore is a whole
+// file of chunks, which is checked; when it is refused the trainer stays as it was.
 GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer, gsf_text* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trainer, const char* name,
                                                            const void* chunks, size_t size);
@@ -3379,12 +3395,1862 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 }
 
 // ---- >>loss --------------------------------------------------------------------
+// L = (1 - lambda) mean(w |x - t|) + lambda mean(w (1 - SSIM(x, t))),  x = clamp(render, 0, 1), t the photo, w a weight
+// per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts as already right.
+// SSIM as in the 3DGS code: 11x11 Gaussian window, sigma 1.5, zeros outside the image, variances not clamped.
+//
+// Layout: images stay interleaved, a row is 3W floats and horizontal taps lie 3 floats apart. Rows of the planes are
+// padded with zeros to a multiple of 8 floats. The window is separable: vertical sums of one row go to a row buffer
+// with zero margins, where the horizontal sums are taken. Work is split into bands of rows.
+//
+// Derivative of the SSIM m of one window with respect to the pixels in it. With blurred moments mu = G*x, E = G*x^2,
+// F = G*(x t), s = E - mu^2, c = F - mu mu_t:
+//     m = a1 a2 / (b1 b2),  a1 = 2 mu mu_t + C1,  a2 = 2 c + C2,  b1 = mu^2 + mu_t^2 + C1,  b2 = s + s_t + C2
+//     dm/dE = -m / b2,  dm/dF = 2 a1 / (b1 b2)
+//     dm/dmu = 2 mu_t a2 / (b1 b2) - 2 mu m / b1 - 2 mu dm/dE - mu_t dm/dF
+// and the pixel p collects dL/dx(p) = G*(dm/dmu) + 2 x(p) G*(dm/dE) + t(p) G*(dm/dF).
+
+enum { GSF__LOSS_RADIUS = 5, GSF__LOSS_TAPS = 11, GSF__LOSS_MARGIN = 16, GSF__LOSS_BAND = 8, GSF__LOSS_PLANES = 8 };
+
+#define GSF__SSIM_C1 0.0001f // (0.01 * 1)^2
+#define GSF__SSIM_C2 0.0009f // (0.03 * 1)^2
+
+// exp(-k^2 / (2 * 1.5^2)) / sum
+static const float gsf__loss_window[GSF__LOSS_TAPS] = {
+    0.001028380084f, 0.007598758135f, 0.03600077213f, 0.1093606895f,  0.2130055377f,  0.2660117249f,
+    0.2130055377f,   0.1093606895f,   0.03600077213f, 0.007598758135f, 0.001028380084f};
+
+typedef struct gsf__target { // a photo to be matched
+    int32_t width, height;
+    const uint8_t* u8;       // (H,W,3) packed, or NULL
+    const float* f32;        // (H,W,3) packed where u8 is NULL
+    const float* weight;     // (H,W), NULL = 1
+    float* moments;          // (2, H, stride): window mean and variance of the photo, kept; NULL = anew each time
+    int32_t moments_ready;
+} gsf__target;
+
+typedef struct gsf__loss_scratch { // grows to the largest photo, then stays
+    float* planes;           // GSF__LOSS_PLANES of (H, stride)
+    float* rows;             // per worker 3 row buffers with margins
+    double* sums;            // per band 2
+    size_t plane_capacity, row_capacity, sum_capacity; // floats, floats, doubles
+} gsf__loss_scratch;
+
+typedef struct gsf__loss_value { double total, l1, ssim; } gsf__loss_value; // total without the caller's scale
+
+typedef struct gsf__loss_kernels { // n: padded row length, valid: 3W; row buffers have zero margins
+    // x = clamp(render), NaN becomes 0; t = photo. Zeros from valid to n.
+    void (*load)(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n, float* x, float* t);
+    // Vertical sums over `taps` rows of x, x^2 and x t.
+    void (*moments)(const float* x, const float* t, size_t stride, const float* window, int taps, size_t n, float* sum_x,
+                    float* sum_xx, float* sum_xt);
+    // Vertical sums over `taps` rows of three planes.
+    void (*blur3)(const float* a, const float* b, const float* c, size_t stride, const float* window, int taps, size_t n,
+                  float* sum_a, float* sum_b, float* sum_c);
+    // Horizontal sums: window mean and variance.
+    void (*spread)(const float* sum_t, const float* sum_tt, size_t n, float* mean, float* variance);
+    // Horizontal sums and the SSIM map: its three derivatives (a, b, c), sums of w |x - t| and w (1 - m).
+    void (*map)(const float* sum_x, const float* sum_xx, const float* sum_xt, const float* x, const float* t,
+                const float* mean_t, const float* variance_t, const float* weight, size_t valid, size_t n, float* a,
+                float* b, float* c, double sums[2]);
+    // Horizontal sums of the derivatives and the gradient of the render.
+    void (*gradient)(const float* sum_a, const float* sum_b, const float* sum_c, const float* x, const float* t,
+                     const float* weight, const float* render, float l1_scale, float ssim_scale, size_t valid,
+                     float* d_render);
+} gsf__loss_kernels;
+
+static void gsf__loss_load_ref(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n, float* x,
+                               float* t) {
+    for (size_t i = 0; i < valid; i++) {
+        const float r = render[i];
+        x[i] = r > 0.0f ? (r < 1.0f ? r : 1.0f) : 0.0f;
+        t[i] = u8 ? (float)u8[i] / 255.0f : f32[i];
+    }
+    for (size_t i = valid; i < n; i++) x[i] = t[i] = 0.0f;
+}
+
+static void gsf__loss_moments_ref(const float* x, const float* t, size_t stride, const float* window, int taps, size_t n,
+                                  float* sum_x, float* sum_xx, float* sum_xt) {
+    for (size_t i = 0; i < n; i++) {
+        float s = 0.0f, ss = 0.0f, st = 0.0f;
+        for (int k = 0; k < taps; k++) {
+            const float xk = x[(size_t)k * stride + i], wx = window[k] * xk;
+            s += wx;
+            ss += wx * xk;
+            st += wx * t[(size_t)k * stride + i];
+        }
+        sum_x[i] = s;
+        sum_xx[i] = ss;
+        sum_xt[i] = st;
+    }
+}
+
+static void gsf__loss_blur3_ref(const float* a, const float* b, const float* c, size_t stride, const float* window,
+                                int taps, size_t n, float* sum_a, float* sum_b, float* sum_c) {
+    for (size_t i = 0; i < n; i++) {
+        float sa = 0.0f, sb = 0.0f, sc = 0.0f;
+        for (int k = 0; k < taps; k++) {
+            const size_t at = (size_t)k * stride + i;
+            sa += window[k] * a[at];
+            sb += window[k] * b[at];
+            sc += window[k] * c[at];
+        }
+        sum_a[i] = sa;
+        sum_b[i] = sb;
+        sum_c[i] = sc;
+    }
+}
+
+static float gsf__loss_horizontal_ref(const float* v) { // v points at the centre
+    float s = gsf__loss_window[5] * v[0];
+    for (int k = 1; k <= GSF__LOSS_RADIUS; k++) s += gsf__loss_window[5 + k] * (v[-3 * k] + v[3 * k]);
+    return s;
+}
+
+static void gsf__loss_spread_ref(const float* sum_t, const float* sum_tt, size_t n, float* mean, float* variance) {
+    for (size_t i = 0; i < n; i++) {
+        mean[i] = gsf__loss_horizontal_ref(sum_t + i);
+        variance[i] = gsf__loss_horizontal_ref(sum_tt + i) - mean[i] * mean[i];
+    }
+}
+
+static void gsf__loss_map_ref(const float* sum_x, const float* sum_xx, const float* sum_xt, const float* x,
+                              const float* t, const float* mean_t, const float* variance_t, const float* weight,
+                              size_t valid, size_t n, float* a, float* b, float* c, double sums[2]) {
+    for (size_t i = 0; i < valid; i++) {
+        const float mu = gsf__loss_horizontal_ref(sum_x + i), mu_t = mean_t[i];
+        const float s = gsf__loss_horizontal_ref(sum_xx + i) - mu * mu;
+        const float cov = gsf__loss_horizontal_ref(sum_xt + i) - mu * mu_t;
+        const float a1 = 2.0f * mu * mu_t + GSF__SSIM_C1, a2 = 2.0f * cov + GSF__SSIM_C2;
+        const float b1 = mu * mu + mu_t * mu_t + GSF__SSIM_C1, b2 = s + variance_t[i] + GSF__SSIM_C2;
+        const float r = 1.0f / (b1 * b2), m = a1 * a2 * r, w = weight ? weight[i] : 1.0f;
+        const float d_e = -m * b1 * r, d_f = 2.0f * a1 * r;
+        const float d_mu = 2.0f * (mu_t * a2 * r - mu * m * b2 * r) - 2.0f * mu * d_e - mu_t * d_f;
+        a[i] = w * d_mu;
+        b[i] = w * d_e;
+        c[i] = w * d_f;
+        sums[0] += (double)(w * fabsf(x[i] - t[i]));
+        sums[1] += (double)(w * (1.0f - m));
+    }
+    for (size_t i = valid; i < n; i++) a[i] = b[i] = c[i] = 0.0f;
+}
+
+static void gsf__loss_gradient_ref(const float* sum_a, const float* sum_b, const float* sum_c, const float* x,
+                                   const float* t, const float* weight, const float* render, float l1_scale,
+                                   float ssim_scale, size_t valid, float* d_render) {
+    for (size_t i = 0; i < valid; i++) {
+        const float ga = gsf__loss_horizontal_ref(sum_a + i), gb = gsf__loss_horizontal_ref(sum_b + i);
+        const float gc = gsf__loss_horizontal_ref(sum_c + i), diff = x[i] - t[i];
+        const float sign = diff > 0.0f ? 1.0f : diff < 0.0f ? -1.0f : 0.0f;
+        const float d = l1_scale * (weight ? weight[i] : 1.0f) * sign - ssim_scale * (ga + 2.0f * x[i] * gb + t[i] * gc);
+        d_render[i] = render[i] >= 0.0f && render[i] <= 1.0f ? d : 0.0f; // d clamp(r)/dr; 0 for NaN
+    }
+}
+
+#if GSF__X86
+// Lanes below `count` set; count >= 8 sets all.
+GSF__TARGET_AVX2 static inline __m256i gsf__avx2_lanes(size_t count) {
+    const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+    return _mm256_cmpgt_epi32(_mm256_set1_epi32(count < 8 ? (int)count : 8), lane);
+}
+
+GSF__TARGET_AVX2 static inline double gsf__avx2_sum_pd(__m256d v) { // ((0 + 2) + (1 + 3))
+    const __m128d pair = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd(v, 1));
+    return _mm_cvtsd_f64(_mm_add_sd(pair, _mm_unpackhi_pd(pair, pair)));
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_load_avx2(const float* render, const float* f32, const uint8_t* u8, size_t valid,
+                                                 size_t n, float* x, float* t) {
+    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
+    for (size_t i = 0; i < n; i += 8) {
+        const __m256i lanes = gsf__avx2_lanes(valid - i);
+        const __m256 r = _mm256_maskload_ps(render + i, lanes);
+        _mm256_storeu_ps(x + i, _mm256_min_ps(_mm256_max_ps(r, zero), one)); // max(NaN, 0) is 0
+        if (!u8) {
+            _mm256_storeu_ps(t + i, _mm256_maskload_ps(f32 + i, lanes));
+        } else {
+            uint64_t bytes = 0;
+            memcpy(&bytes, u8 + i, valid - i < 8 ? valid - i : 8);
+            const __m256i wide = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes));
+            _mm256_storeu_ps(t + i, _mm256_div_ps(_mm256_cvtepi32_ps(wide), scale));
+        }
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_moments_avx2(const float* x, const float* t, size_t stride, const float* window,
+                                                    int taps, size_t n, float* sum_x, float* sum_xx, float* sum_xt) {
+    for (size_t i = 0; i < n; i += 8) {
+        __m256 s = _mm256_setzero_ps(), ss = s, st = s;
+        for (int k = 0; k < taps; k++) {
+            const __m256 xk = _mm256_loadu_ps(x + (size_t)k * stride + i);
+            const __m256 wx = _mm256_mul_ps(_mm256_set1_ps(window[k]), xk);
+            s = _mm256_add_ps(s, wx);
+            ss = _mm256_fmadd_ps(wx, xk, ss);
+            st = _mm256_fmadd_ps(wx, _mm256_loadu_ps(t + (size_t)k * stride + i), st);
+        }
+        _mm256_storeu_ps(sum_x + i, s);
+        _mm256_storeu_ps(sum_xx + i, ss);
+        _mm256_storeu_ps(sum_xt + i, st);
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_blur3_avx2(const float* a, const float* b, const float* c, size_t stride,
+                                                  const float* window, int taps, size_t n, float* sum_a, float* sum_b,
+                                                  float* sum_c) {
+    for (size_t i = 0; i < n; i += 8) {
+        __m256 sa = _mm256_setzero_ps(), sb = sa, sc = sa;
+        for (int k = 0; k < taps; k++) {
+            const size_t at = (size_t)k * stride + i;
+            const __m256 w = _mm256_set1_ps(window[k]);
+            sa = _mm256_fmadd_ps(w, _mm256_loadu_ps(a + at), sa);
+            sb = _mm256_fmadd_ps(w, _mm256_loadu_ps(b + at), sb);
+            sc = _mm256_fmadd_ps(w, _mm256_loadu_ps(c + at), sc);
+        }
+        _mm256_storeu_ps(sum_a + i, sa);
+        _mm256_storeu_ps(sum_b + i, sb);
+        _mm256_storeu_ps(sum_c + i, sc);
+    }
+}
+
+GSF__TARGET_AVX2 static inline __m256 gsf__loss_horizontal_avx2(const float* v) {
+    __m256 s = _mm256_mul_ps(_mm256_set1_ps(gsf__loss_window[5]), _mm256_loadu_ps(v));
+    for (int k = 1; k <= GSF__LOSS_RADIUS; k++)
+        s = _mm256_fmadd_ps(_mm256_set1_ps(gsf__loss_window[5 + k]),
+                            _mm256_add_ps(_mm256_loadu_ps(v - 3 * k), _mm256_loadu_ps(v + 3 * k)), s);
+    return s;
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_spread_avx2(const float* sum_t, const float* sum_tt, size_t n, float* mean,
+                                                   float* variance) {
+    for (size_t i = 0; i < n; i += 8) {
+        const __m256 mu = gsf__loss_horizontal_avx2(sum_t + i);
+        _mm256_storeu_ps(mean + i, mu);
+        _mm256_storeu_ps(variance + i, _mm256_fnmadd_ps(mu, mu, gsf__loss_horizontal_avx2(sum_tt + i)));
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_map_avx2(const float* sum_x, const float* sum_xx, const float* sum_xt,
+                                                const float* x, const float* t, const float* mean_t,
+                                                const float* variance_t, const float* weight, size_t valid, size_t n,
+                                                float* a, float* b, float* c, double sums[2]) {
+    const __m256 c1 = _mm256_set1_ps(GSF__SSIM_C1), c2 = _mm256_set1_ps(GSF__SSIM_C2), one = _mm256_set1_ps(1.0f);
+    const __m256 two = _mm256_set1_ps(2.0f), sign = _mm256_set1_ps(-0.0f);
+    __m256d l1_low = _mm256_setzero_pd(), l1_high = l1_low, dssim_low = l1_low, dssim_high = l1_low;
+    for (size_t i = 0; i < n; i += 8) {
+        const __m256 lanes = _mm256_castsi256_ps(gsf__avx2_lanes(valid - i));
+        const __m256 mu = gsf__loss_horizontal_avx2(sum_x + i), mu_t = _mm256_loadu_ps(mean_t + i);
+        const __m256 s = _mm256_fnmadd_ps(mu, mu, gsf__loss_horizontal_avx2(sum_xx + i));
+        const __m256 cov = _mm256_fnmadd_ps(mu, mu_t, gsf__loss_horizontal_avx2(sum_xt + i));
+        const __m256 mu2 = _mm256_mul_ps(two, mu);
+        const __m256 a1 = _mm256_fmadd_ps(mu2, mu_t, c1), a2 = _mm256_fmadd_ps(two, cov, c2);
+        const __m256 b1 = _mm256_add_ps(_mm256_fmadd_ps(mu, mu, _mm256_mul_ps(mu_t, mu_t)), c1);
+        const __m256 b2 = _mm256_add_ps(_mm256_add_ps(s, _mm256_loadu_ps(variance_t + i)), c2);
+        const __m256 r = _mm256_div_ps(one, _mm256_mul_ps(b1, b2));
+        const __m256 m = _mm256_mul_ps(_mm256_mul_ps(a1, a2), r);
+        const __m256 w = _mm256_and_ps(weight ? _mm256_loadu_ps(weight + i) : one, lanes);
+        const __m256 d_e = _mm256_xor_ps(sign, _mm256_mul_ps(_mm256_mul_ps(m, b1), r));
+        const __m256 d_f = _mm256_mul_ps(_mm256_mul_ps(two, a1), r);
+        __m256 d_mu = _mm256_mul_ps(_mm256_mul_ps(mu, m), b2);
+        d_mu = _mm256_mul_ps(_mm256_mul_ps(two, r), _mm256_fmsub_ps(mu_t, a2, d_mu));
+        d_mu = _mm256_fnmadd_ps(mu_t, d_f, _mm256_fnmadd_ps(mu2, d_e, d_mu));
+        _mm256_storeu_ps(a + i, _mm256_mul_ps(w, d_mu));
+        _mm256_storeu_ps(b + i, _mm256_mul_ps(w, d_e));
+        _mm256_storeu_ps(c + i, _mm256_mul_ps(w, d_f));
+        const __m256 diff = _mm256_sub_ps(_mm256_loadu_ps(x + i), _mm256_loadu_ps(t + i));
+        const __m256 l1 = _mm256_mul_ps(w, _mm256_andnot_ps(sign, diff));
+        const __m256 dssim = _mm256_mul_ps(w, _mm256_sub_ps(one, m));
+        l1_low = _mm256_add_pd(l1_low, _mm256_cvtps_pd(_mm256_castps256_ps128(l1)));
+        l1_high = _mm256_add_pd(l1_high, _mm256_cvtps_pd(_mm256_extractf128_ps(l1, 1)));
+        dssim_low = _mm256_add_pd(dssim_low, _mm256_cvtps_pd(_mm256_castps256_ps128(dssim)));
+        dssim_high = _mm256_add_pd(dssim_high, _mm256_cvtps_pd(_mm256_extractf128_ps(dssim, 1)));
+    }
+    sums[0] += gsf__avx2_sum_pd(_mm256_add_pd(l1_low, l1_high));
+    sums[1] += gsf__avx2_sum_pd(_mm256_add_pd(dssim_low, dssim_high));
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_gradient_avx2(const float* sum_a, const float* sum_b, const float* sum_c,
+                                                     const float* x, const float* t, const float* weight,
+                                                     const float* render, float l1_scale, float ssim_scale, size_t valid,
+                                                     float* d_render) {
+    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), minus = _mm256_set1_ps(-0.0f);
+    const __m256 l1 = _mm256_set1_ps(l1_scale), ssim = _mm256_set1_ps(ssim_scale);
+    for (size_t i = 0; i < valid; i += 8) {
+        const __m256i lanes = gsf__avx2_lanes(valid - i);
+        const __m256 ga = gsf__loss_horizontal_avx2(sum_a + i), gb = gsf__loss_horizontal_avx2(sum_b + i);
+        const __m256 gc = gsf__loss_horizontal_avx2(sum_c + i);
+        const __m256 xi = _mm256_loadu_ps(x + i), ti = _mm256_loadu_ps(t + i), diff = _mm256_sub_ps(xi, ti);
+        const __m256 signed_one = _mm256_or_ps(_mm256_and_ps(diff, minus), one);
+        const __m256 sign = _mm256_and_ps(signed_one, _mm256_cmp_ps(diff, zero, _CMP_NEQ_OQ));
+        const __m256 w = weight ? _mm256_mul_ps(l1, _mm256_loadu_ps(weight + i)) : l1;
+        const __m256 blurred = _mm256_fmadd_ps(ti, gc, _mm256_fmadd_ps(_mm256_add_ps(xi, xi), gb, ga));
+        const __m256 d = _mm256_fmsub_ps(w, sign, _mm256_mul_ps(ssim, blurred));
+        const __m256 r = _mm256_maskload_ps(render + i, lanes);
+        const __m256 inside = _mm256_and_ps(_mm256_cmp_ps(r, zero, _CMP_GE_OQ), _mm256_cmp_ps(r, one, _CMP_LE_OQ));
+        _mm256_maskstore_ps(d_render + i, lanes, _mm256_and_ps(d, inside));
+    }
+}
+#endif
+
+static gsf__loss_kernels gsf__loss_kernels_of(const gsf_context* ctx) {
+    gsf__loss_kernels k = {gsf__loss_load_ref,   gsf__loss_moments_ref, gsf__loss_blur3_ref,
+                           gsf__loss_spread_ref, gsf__loss_map_ref,     gsf__loss_gradient_ref};
+#if GSF__X86
+    if (ctx->cpu_level >= GSF_CPU_AVX2) {
+        k.load = gsf__loss_load_avx2;
+        k.moments = gsf__loss_moments_avx2;
+        k.blur3 = gsf__loss_blur3_avx2;
+        k.spread = gsf__loss_spread_avx2;
+        k.map = gsf__loss_map_avx2;
+        k.gradient = gsf__loss_gradient_avx2;
+    }
+#else
+    (void)ctx;
+#endif
+    return k;
+}
+
+typedef struct gsf__loss_job {
+    gsf__loss_kernels k;
+    const gsf__target* target;
+    const float* render;
+    float *x, *t, *weight, *a, *b, *c, *mean_t, *variance_t; // planes (H, stride); weight NULL = 1
+    float* rows;
+    double* sums;
+    float* d_render;
+    float l1_scale, ssim_scale;
+    size_t stride, valid, row_size; // row_size: floats of one row buffer with margins
+} gsf__loss_job;
+
+// First row, number of taps and window start for the vertical sums of row y.
+static size_t gsf__loss_rows_of(int32_t y, int32_t height, int* taps, const float** window) {
+    const int32_t first = y < GSF__LOSS_RADIUS ? 0 : y - GSF__LOSS_RADIUS;
+    const int32_t last = height - 1 - y < GSF__LOSS_RADIUS ? height - 1 : y + GSF__LOSS_RADIUS;
+    *taps = last - first + 1;
+    *window = gsf__loss_window + (first - (y - GSF__LOSS_RADIUS));
+    return (size_t)first;
+}
+
+// The three row buffers of a worker; right margins are cleared since a wider photo may have been there before.
+static void gsf__loss_row_buffers(const gsf__loss_job* job, int worker, float* out[3]) {
+    for (int i = 0; i < 3; i++) {
+        out[i] = job->rows + (3 * (size_t)worker + (size_t)i) * job->row_size + GSF__LOSS_MARGIN;
+        memset(out[i] - GSF__LOSS_MARGIN, 0, GSF__LOSS_MARGIN * sizeof(float));
+        memset(out[i] + job->stride, 0, GSF__LOSS_MARGIN * sizeof(float));
+    }
+}
+
+static int32_t gsf__loss_band_end(const gsf__loss_job* job, size_t band) {
+    const int32_t end = (int32_t)band * GSF__LOSS_BAND + GSF__LOSS_BAND;
+    return end < job->target->height ? end : job->target->height;
+}
+
+static void gsf__loss_load_band(void* arg, size_t band, int worker) {
+    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+    const gsf__target* target = job->target;
+    (void)worker;
+    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
+        const size_t row = (size_t)y * job->stride, packed = (size_t)y * job->valid;
+        job->k.load(job->render + packed, target->f32 ? target->f32 + packed : NULL,
+                    target->u8 ? target->u8 + packed : NULL, job->valid, job->stride, job->x + row, job->t + row);
+        if (!job->weight) continue;
+        const float* weight = target->weight + (size_t)y * (size_t)target->width;
+        float* out = job->weight + row;
+        for (size_t i = 0; i < (size_t)target->width; i++) out[3 * i] = out[3 * i + 1] = out[3 * i + 2] = weight[i];
+        for (size_t i = job->valid; i < job->stride; i++) out[i] = 0.0f;
+    }
+}
+
+static void gsf__loss_target_band(void* arg, size_t band, int worker) {
+    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+    float* rows[3];
+    gsf__loss_row_buffers(job, worker, rows);
+    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
+        int taps;
+        const float* window;
+        const float* t = job->t + gsf__loss_rows_of(y, job->target->height, &taps, &window) * job->stride;
+        job->k.moments(t, t, job->stride, window, taps, job->stride, rows[0], rows[1], rows[2]);
+        const size_t row = (size_t)y * job->stride;
+        job->k.spread(rows[0], rows[1], job->stride, job->mean_t + row, job->variance_t + row);
+    }
+}
+
+static void gsf__loss_map_band(void* arg, size_t band, int worker) {
+    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+    float* rows[3];
+    gsf__loss_row_buffers(job, worker, rows);
+    double* sums = job->sums + 2 * band;
+    sums[0] = sums[1] = 0.0;
+    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
+        int taps;
+        const float* window;
+        const size_t first = gsf__loss_rows_of(y, job->target->height, &taps, &window) * job->stride;
+        job->k.moments(job->x + first, job->t + first, job->stride, window, taps, job->stride, rows[0], rows[1], rows[2]);
+        const size_t row = (size_t)y * job->stride;
+        job->k.map(rows[0], rows[1], rows[2], job->x + row, job->t + row, job->mean_t + row, job->variance_t + row,
+                   job->weight ? job->weight + row : NULL, job->valid, job->stride, job->a + row, job->b + row,
+                   job->c + row, sums);
+    }
+}
+
+static void gsf__loss_gradient_band(void* arg, size_t band, int worker) {
+    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+    float* rows[3];
+    gsf__loss_row_buffers(job, worker, rows);
+    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
+        int taps;
+        const float* window;
+        const size_t first = gsf__loss_rows_of(y, job->target->height, &taps, &window) * job->stride;
+        job->k.blur3(job->a + first, job->b + first, job->c + first, job->stride, window, taps, job->stride, rows[0],
+                     rows[1], rows[2]);
+        const size_t row = (size_t)y * job->stride, packed = (size_t)y * job->valid;
+        job->k.gradient(rows[0], rows[1], rows[2], job->x + row, job->t + row, job->weight ? job->weight + row : NULL,
+                        job->render + packed, job->l1_scale, job->ssim_scale, job->valid, job->d_render + packed);
+    }
+}
+
+static size_t gsf__loss_stride(int32_t width) { return (3 * (size_t)width + 7) & ~(size_t)7; }
+
+// Bytes of a target's kept moments: 24 per pixel, rows padded.
+static size_t gsf__loss_moments_size(int32_t width, int32_t height) {
+    return 2 * gsf__loss_stride(width) * (size_t)height * sizeof(float);
+}
+
+static gsf_result gsf__loss_reserve(gsf_context* ctx, gsf__loss_scratch* scratch, int32_t width, int32_t height) {
+    const size_t stride = gsf__loss_stride(width);
+    size_t floats;
+    if (!gsf__mul_size(stride, (size_t)height, &floats) || !gsf__mul_size(floats, GSF__LOSS_PLANES, &floats))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "loss: image of %d x %d is too large", (int)width, (int)height);
+    const size_t rows = 3 * (size_t)ctx->parallel.worker_count * (stride + 2 * GSF__LOSS_MARGIN);
+    const size_t bands = ((size_t)height + GSF__LOSS_BAND - 1) / GSF__LOSS_BAND;
+    GSF__TRY(gsf__reserve(ctx, (void**)&scratch->planes, &scratch->plane_capacity, 0, floats, sizeof(float)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&scratch->rows, &scratch->row_capacity, 0, rows, sizeof(float)));
+    return gsf__reserve(ctx, (void**)&scratch->sums, &scratch->sum_capacity, 0, 2 * bands, sizeof(double));
+}
+
+static void gsf__loss_destroy_scratch(gsf_context* ctx, gsf__loss_scratch* scratch) {
+    gsf_free(ctx, scratch->planes);
+    gsf_free(ctx, scratch->rows);
+    gsf_free(ctx, scratch->sums);
+    memset(scratch, 0, sizeof *scratch);
+}
+
+// Loss of `render` (H,W,3) against the target and its derivative times `scale`, written to d_render (H,W,3).
+// lambda: share of the SSIM term. The same bits whether or not the target keeps its moments.
+static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, gsf__target* target, const float* render,
+                            float lambda, float scale, float* d_render, gsf__loss_value* out) {
+    GSF__TRY(gsf__loss_reserve(ctx, scratch, target->width, target->height));
+    gsf__loss_job job;
+    memset(&job, 0, sizeof job);
+    job.k = gsf__loss_kernels_of(ctx);
+    job.target = target;
+    job.render = render;
+    job.stride = gsf__loss_stride(target->width);
+    job.valid = 3 * (size_t)target->width;
+    job.row_size = job.stride + 2 * GSF__LOSS_MARGIN;
+    const size_t plane = job.stride * (size_t)target->height;
+    job.x = scratch->planes;
+    job.t = job.x + plane;
+    job.a = job.t + plane;
+    job.b = job.a + plane;
+    job.c = job.b + plane;
+    job.weight = target->weight ? job.c + plane : NULL;
+    job.mean_t = target->moments ? target->moments : job.c + 2 * plane;
+    job.variance_t = job.mean_t + plane;
+    job.rows = scratch->rows;
+    job.sums = scratch->sums;
+    job.d_render = d_render;
+    const double n = 3.0 * (double)target->width * (double)target->height;
+    job.l1_scale = (float)((double)scale * (1.0 - (double)lambda) / n);
+    job.ssim_scale = (float)((double)scale * (double)lambda / n);
+
+    const size_t bands = ((size_t)target->height + GSF__LOSS_BAND - 1) / GSF__LOSS_BAND;
+    gsf__parallel_for(ctx, bands, gsf__loss_load_band, &job);
+    if (!target->moments || !target->moments_ready) gsf__parallel_for(ctx, bands, gsf__loss_target_band, &job);
+    target->moments_ready = target->moments != NULL;
+    gsf__parallel_for(ctx, bands, gsf__loss_map_band, &job);
+    gsf__parallel_for(ctx, bands, gsf__loss_gradient_band, &job);
+    double l1 = 0.0, dssim = 0.0;
+    for (size_t i = 0; i < bands; i++) {
+        l1 += scratch->sums[2 * i];
+        dssim += scratch->sums[2 * i + 1];
+    }
+    out->l1 = l1 / n;
+    out->ssim = 1.0 - dssim / n;
+    out->total = (1.0 - (double)lambda) * out->l1 + (double)lambda * (1.0 - out->ssim);
+    return GSF_OK;
+}
+
+// Edge-aware smoothness of inverse depth: weight / (H W) times the sum over neighbouring pixels p, q (right and below)
+// of e_pq |D_p - D_q| with D = extent / depth and e_pq = 1 / (1 + (|t_p - t_q| / 0.1)^2), |.| the mean over RGB. Pairs in
+// which a pixel has no depth are left out. Reads the photo where the last gsf__loss put it; d_depth (H,W) is written.
+typedef struct gsf__smooth_job {
+    const float *t, *depth;
+    float* d_depth;
+    double* sums;
+    size_t stride;
+    int32_t width, height;
+    float extent, factor;
+} gsf__smooth_job;
+
+// e_pq of two pixels given their colours.
+static float gsf__smooth_edge(const float* p, const float* q) {
+    const float d = (fabsf(p[0] - q[0]) + fabsf(p[1] - q[1]) + fabsf(p[2] - q[2])) * (10.0f / 3.0f);
+    return 1.0f / (1.0f + d * d);
+}
+
+static void gsf__smooth_band(void* arg, size_t band, int worker) {
+    const gsf__smooth_job* job = (const gsf__smooth_job*)arg;
+    (void)worker;
+    const int32_t next = ((int32_t)band + 1) * GSF__LOSS_BAND, end = next < job->height ? next : job->height;
+    double sum = 0.0;
+    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < end; y++)
+        for (int32_t x = 0; x < job->width; x++) {
+            const size_t at = (size_t)y * (size_t)job->width + (size_t)x;
+            const float* color = job->t + (size_t)y * job->stride + 3 * (size_t)x;
+            const float z = job->depth[at], here = z > 0.0f ? job->extent / z : 0.0f;
+            float slope = 0.0f; // of the sum with respect to D here
+            const int inside[4] = {x + 1 < job->width, y + 1 < job->height, x > 0, y > 0};
+            const ptrdiff_t pixel[4] = {1, job->width, -1, -(ptrdiff_t)job->width};
+            const ptrdiff_t colors[4] = {3, (ptrdiff_t)job->stride, -3, -(ptrdiff_t)job->stride};
+            for (int k = 0; z > 0.0f && k < 4; k++) {
+                if (!inside[k]) continue;
+                const float other = job->depth[(ptrdiff_t)at + pixel[k]];
+                if (!(other > 0.0f)) continue;
+                const float diff = here - job->extent / other, edge = gsf__smooth_edge(color, color + colors[k]);
+                slope += diff > 0.0f ? edge : diff < 0.0f ? -edge : 0.0f;
+                if (k < 2) sum += (double)(edge * fabsf(diff));
+            }
+            job->d_depth[at] = z > 0.0f ? -job->factor * slope * here / z : 0.0f; // dD/dz = -extent / z^2
+        }
+    job->sums[band] = sum;
+}
+
+static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* scratch, const gsf__target* target,
+                                    const float* depth, float extent, float weight, float* d_depth) {
+    gsf__smooth_job job;
+    job.stride = gsf__loss_stride(target->width);
+    job.width = target->width;
+    job.height = target->height;
+    job.t = scratch->planes + job.stride * (size_t)target->height;
+    job.depth = depth;
+    job.d_depth = d_depth;
+    job.sums = scratch->sums;
+    job.extent = extent;
+    job.factor = (float)((double)weight / ((double)target->width * (double)target->height));
+    const size_t bands = ((size_t)target->height + GSF__LOSS_BAND - 1) / GSF__LOSS_BAND;
+    gsf__parallel_for(ctx, bands, gsf__smooth_band, &job);
+    double sum = 0.0;
+    for (size_t i = 0; i < bands; i++) sum += scratch->sums[i];
+    return sum * (double)job.factor;
+}
 
 // ---- >>adam --------------------------------------------------------------------
+// The parameters under training and Adam (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15 as 3DGS has them). Dense: a splat
+// that no view touched moves on by its momentum, as in the official code. One pass reads parameters, moments and
+// gradients, writes the first two and zeroes the gradients for the next step.
+//
+// Memory per splat of SH degree 3: 59 parameters x (value, first and second moment, gradient) + 32 bytes = 976 bytes.
+
+enum { GSF__MEANS = 0, GSF__SCALES, GSF__QUATS, GSF__OPACITY, GSF__SH, GSF__GROUPS };
+enum { GSF__MODEL_CHUNK = 512 }; // splats of one unit of parallel work
+
+typedef struct gsf__group { // one parameter tensor (count, width)
+    size_t width;
+    float *value, *m, *v, *grad;
+} gsf__group;
+
+typedef struct gsf__model {
+    size_t count, capacity;  // capacity is a multiple of 64, so every array starts 64-byte aligned
+    int32_t sh_degree;
+    gsf__group groups[GSF__GROUPS];
+    uint32_t* ids;
+    float* grad_sum;         // densification: sum of screen-space gradient norms ...
+    uint32_t* visits;        // ... over this many renders in which the splat was visible
+    float* screen[2];        // (count,2) gradient of the pixel mean in this step's photo and restored view
+    uint8_t* seen[2];        // visible there?
+    uint8_t* hidden;         // dropped out of this render
+    uint8_t* action;         // densification: gsf__densify_action
+    uint32_t* rejected;      // per chunk: values neutralised in this step
+    void* block;             // all of the above
+    uint32_t next_id;
+} gsf__model;
+
+static size_t gsf__model_chunks(size_t count) { return (count + GSF__MODEL_CHUNK - 1) / GSF__MODEL_CHUNK; }
+
+static size_t gsf__model_chunk_end(size_t count, size_t chunk) {
+    const size_t end = (chunk + 1) * GSF__MODEL_CHUNK;
+    return end < count ? end : count;
+}
+
+// Places the arrays of a model of `capacity` splats in `block`; returns the bytes used (block NULL: only counts).
+static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block) {
+    const size_t widths[GSF__GROUPS] = {3, 3, 4, 1, 3 * (size_t)gsf_splat_sh_count(model->sh_degree)};
+    size_t at = 0;
+#define GSF__PLACE(pointer, type, count)                            \
+    do {                                                            \
+        if (block) (pointer) = (type*)(void*)(block + at);          \
+        at += ((count) * sizeof(type) + 63) & ~(size_t)63;          \
+    } while (0)
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        gsf__group* group = &model->groups[g];
+        group->width = widths[g];
+        GSF__PLACE(group->value, float, capacity * widths[g]);
+        GSF__PLACE(group->m, float, capacity * widths[g]);
+        GSF__PLACE(group->v, float, capacity * widths[g]);
+        GSF__PLACE(group->grad, float, capacity * widths[g]);
+    }
+    GSF__PLACE(model->ids, uint32_t, capacity);
+    GSF__PLACE(model->grad_sum, float, capacity);
+    GSF__PLACE(model->visits, uint32_t, capacity);
+    for (int i = 0; i < 2; i++) GSF__PLACE(model->screen[i], float, 2 * capacity);
+    for (int i = 0; i < 2; i++) GSF__PLACE(model->seen[i], uint8_t, capacity);
+    GSF__PLACE(model->hidden, uint8_t, capacity);
+    GSF__PLACE(model->action, uint8_t, capacity);
+    GSF__PLACE(model->rejected, uint32_t, gsf__model_chunks(capacity));
+#undef GSF__PLACE
+    return at;
+}
+
+// Makes room for `needed` splats; keeps the rows there are. The model is unchanged when memory runs out.
+static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t needed) {
+    if (needed <= model->capacity && model->block) return GSF_OK;
+    if (needed > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "trainer: %zu splats", needed);
+    size_t capacity = model->capacity + model->capacity / 2;
+    capacity = ((needed > capacity ? needed : capacity) + 64) & ~(size_t)63;
+    gsf__model grown = *model;
+    char* block = (char*)gsf_alloc_zeroed(ctx, gsf__model_layout(&grown, capacity, NULL), 1);
+    if (!block) return GSF_ERROR_OUT_OF_MEMORY;
+    (void)gsf__model_layout(&grown, capacity, block);
+    grown.block = block;
+    grown.capacity = capacity;
+    const size_t n = model->count;
+    if (n) {
+        for (int g = 0; g < GSF__GROUPS; g++) {
+            const gsf__group *from = &model->groups[g], *to = &grown.groups[g];
+            const size_t bytes = n * from->width * sizeof(float);
+            memcpy(to->value, from->value, bytes);
+            memcpy(to->m, from->m, bytes);
+            memcpy(to->v, from->v, bytes);
+            memcpy(to->grad, from->grad, bytes);
+        }
+        memcpy(grown.ids, model->ids, n * sizeof(uint32_t));
+        memcpy(grown.grad_sum, model->grad_sum, n * sizeof(float));
+        memcpy(grown.visits, model->visits, n * sizeof(uint32_t));
+        for (int i = 0; i < 2; i++) {
+            memcpy(grown.screen[i], model->screen[i], 2 * n * sizeof(float));
+            memcpy(grown.seen[i], model->seen[i], n);
+        }
+        memcpy(grown.hidden, model->hidden, n);
+        memcpy(grown.action, model->action, n);
+    }
+    gsf_free(ctx, model->block);
+    *model = grown;
+    return GSF_OK;
+}
+
+static void gsf__model_destroy(gsf_context* ctx, gsf__model* model) {
+    gsf_free(ctx, model->block);
+    memset(model, 0, sizeof *model);
+}
+
+// Learning rate at `step`: log-linear from `first` at 0 to `last` at max_steps, held there; with delay_steps > 0 it is
+// eased in from delay_factor * rate (the official get_expon_lr_func).
+static double gsf__exponential_rate(int32_t step, double first, double last, int32_t delay_steps, double delay_factor,
+                                    int32_t max_steps) {
+    if (step < 0 || (first == 0.0 && last == 0.0)) return 0.0;
+    double delay = 1.0;
+    if (delay_steps > 0) {
+        const double u = step < delay_steps ? (double)step / delay_steps : 1.0;
+        delay = delay_factor + (1.0 - delay_factor) * sin(1.5707963267948966 * u);
+    }
+    const double t = step < max_steps ? (double)step / max_steps : 1.0;
+    return delay * exp(log(first) * (1.0 - t) + log(last) * t);
+}
+
+typedef struct gsf__adam_rates { // learning rates of one step
+    double means, scales, quats, opacity, sh_dc, sh_rest;
+} gsf__adam_rates;
+
+enum { GSF__ADAM_PERIOD = 384 }; // floats in which the pattern of rates repeats: 8 rows of (16,3)
+
+typedef struct gsf__adam_job {
+    gsf__model* model;
+    float inv_correction2;           // 1 / sqrt(1 - beta2^t)
+    size_t active_sh;                // floats of an SH row that can be non-zero
+    float rates[4];                  // of the other groups, divided by 1 - beta1^t
+    float sh_rates[GSF__ADAM_PERIOD];
+    uint32_t (*update)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
+                       const float* rates, size_t period, float inv_correction2);
+} gsf__adam_job;
+
+#define GSF__ADAM_EPS 1e-15f
+// What changes nothing is flushed to zero, since it would decay to denormal numbers, on which processors are slow: first
+// moments below 1e-30 and second moments below 1e-36 (its root is 1000 times below eps).
+#define GSF__ADAM_TINY_M 1e-30f
+#define GSF__ADAM_TINY_V 1e-36f
+#define GSF__ADAM_LARGEST 1e18f // larger gradients overflow when squared; they count as not finite
+
+// Updates `rows` runs of n values, `stride` apart; rates: `period` (a multiple of 8) step sizes, repeated along a run.
+// Non-finite gradients count as 0, a step to a non-finite value is not taken; returns how many of either.
+static uint32_t gsf__adam_update_ref(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
+                                     const float* rates, size_t period, float inv_correction2) {
+    uint32_t rejected = 0;
+    for (size_t row = 0; row < rows; row++) {
+        const size_t begin = row * stride;
+        for (size_t i = begin, r = 0; i < begin + n; i++, r = r + 1 == period ? 0 : r + 1) {
+            float g = grad[i];
+            if (!(fabsf(g) <= GSF__ADAM_LARGEST)) {
+                g = 0.0f;
+                rejected++;
+            }
+            const float mi = m[i] + (g - m[i]) * 0.1f;
+            const float vi = v[i] * 0.999f + (g * 0.001f) * g;
+            m[i] = fabsf(mi) < GSF__ADAM_TINY_M ? 0.0f : mi;
+            v[i] = vi < GSF__ADAM_TINY_V ? 0.0f : vi;
+            const float next = value[i] - rates[r] * (m[i] / (sqrtf(v[i]) * inv_correction2 + GSF__ADAM_EPS));
+            if (fabsf(next) <= FLT_MAX) value[i] = next;
+            else rejected++;
+            grad[i] = 0.0f;
+        }
+    }
+    return rejected;
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static uint32_t gsf__adam_update_avx2(float* value, float* m, float* v, float* grad, size_t rows,
+                                                       size_t stride, size_t n, const float* rates, size_t period,
+                                                       float inv_correction2) {
+    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff)), zero = _mm256_setzero_ps();
+    const __m256 largest = _mm256_set1_ps(GSF__ADAM_LARGEST), finite = _mm256_set1_ps(FLT_MAX);
+    const __m256 tiny_m = _mm256_set1_ps(GSF__ADAM_TINY_M), tiny_v = _mm256_set1_ps(GSF__ADAM_TINY_V);
+    const __m256 rest1 = _mm256_set1_ps(0.1f), beta2 = _mm256_set1_ps(0.999f);
+    const __m256 rest2 = _mm256_set1_ps(0.001f), eps = _mm256_set1_ps(GSF__ADAM_EPS);
+    const __m256 correction = _mm256_set1_ps(inv_correction2);
+    uint32_t rejected = 0;
+    for (size_t row = 0; row < rows; row++) {
+        const size_t begin = row * stride, end = begin + n;
+        for (size_t i = begin, r = 0; i < end; i += 8, r = r + 8 == period ? 0 : r + 8) {
+            const __m256i lanes = gsf__avx2_lanes(end - i);
+            __m256 g = _mm256_maskload_ps(grad + i, lanes);
+            const __m256 old = _mm256_maskload_ps(value + i, lanes);
+            __m256 mi = _mm256_maskload_ps(m + i, lanes), vi = _mm256_maskload_ps(v + i, lanes);
+            const __m256 good = _mm256_cmp_ps(_mm256_and_ps(g, magnitude), largest, _CMP_LE_OQ);
+            g = _mm256_and_ps(g, good);
+            mi = _mm256_fmadd_ps(_mm256_sub_ps(g, mi), rest1, mi);
+            vi = _mm256_fmadd_ps(_mm256_mul_ps(g, rest2), g, _mm256_mul_ps(vi, beta2));
+            mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), tiny_m, _CMP_GE_OQ));
+            vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, tiny_v, _CMP_GE_OQ));
+            const __m256 root = _mm256_fmadd_ps(_mm256_sqrt_ps(vi), correction, eps);
+            const __m256 next = _mm256_fnmadd_ps(_mm256_loadu_ps(rates + r), _mm256_div_ps(mi, root), old);
+            const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), finite, _CMP_LE_OQ);
+            const int bad = ~_mm256_movemask_ps(good) & 255, bad_next = ~_mm256_movemask_ps(kept) & 255;
+            if (bad | bad_next)
+                rejected += (uint32_t)(__builtin_popcount((unsigned)bad) + __builtin_popcount((unsigned)bad_next));
+            _mm256_maskstore_ps(value + i, lanes, _mm256_blendv_ps(old, next, kept));
+            _mm256_maskstore_ps(m + i, lanes, mi);
+            _mm256_maskstore_ps(v + i, lanes, vi);
+            _mm256_maskstore_ps(grad + i, lanes, zero);
+        }
+    }
+    return rejected;
+}
+#endif
+
+static void gsf__adam_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__adam_job* job = (const gsf__adam_job*)arg;
+    gsf__model* model = job->model;
+    (void)worker;
+    const size_t begin = chunk * GSF__MODEL_CHUNK;
+    const size_t rows = gsf__model_chunk_end(model->count, chunk) - begin;
+    uint32_t rejected = 0;
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        const gsf__group* group = &model->groups[g];
+        const size_t width = group->width, at = begin * width;
+        float constant[8];
+        for (int i = 0; i < 8; i++) constant[i] = job->rates[g < GSF__SH ? g : 0];
+        const float* rates = g == GSF__SH ? job->sh_rates : constant;
+        const size_t period = g == GSF__SH ? 8 * width : 8;
+        if (g == GSF__SH && job->active_sh < width)
+            rejected += job->update(group->value + at, group->m + at, group->v + at, group->grad + at, rows, width,
+                                    job->active_sh, rates, period, job->inv_correction2);
+        else
+            rejected += job->update(group->value + at, group->m + at, group->v + at, group->grad + at, 1, 0, rows * width,
+                                    rates, period, job->inv_correction2);
+    }
+    model->rejected[chunk] = rejected;
+}
+
+// One Adam step, the t-th (from 1). sh_bands: bands with a gradient so far; the moments of the others are zero, so leaving
+// them out is exact. Returns the number of values neutralised.
+static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__adam_rates* rates, int32_t t,
+                             int32_t sh_bands) {
+    gsf__adam_job job;
+    memset(&job, 0, sizeof job);
+    job.model = model;
+    const double correction1 = 1.0 - pow(0.9, t);
+    job.inv_correction2 = (float)(1.0 / sqrt(1.0 - pow(0.999, t)));
+    job.rates[GSF__MEANS] = (float)(rates->means / correction1);
+    job.rates[GSF__SCALES] = (float)(rates->scales / correction1);
+    job.rates[GSF__QUATS] = (float)(rates->quats / correction1);
+    job.rates[GSF__OPACITY] = (float)(rates->opacity / correction1);
+    const size_t width = model->groups[GSF__SH].width;
+    for (size_t i = 0; i < 8 * width; i++)
+        job.sh_rates[i] = (float)((i % width < 3 ? rates->sh_dc : rates->sh_rest) / correction1);
+    job.active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
+    job.update = gsf__adam_update_ref;
+#if GSF__X86
+    if (ctx->cpu_level >= GSF_CPU_AVX2) job.update = gsf__adam_update_avx2;
+#endif
+    const size_t chunks = gsf__model_chunks(model->count);
+    gsf__parallel_for(ctx, chunks, gsf__adam_chunk, &job);
+    size_t rejected = 0;
+    for (size_t i = 0; i < chunks; i++) rejected += model->rejected[i];
+    return rejected;
+}
 
 // ---- >>densify -----------------------------------------------------------------
+// Adaptive density control of 3DGS: where the mean screen-space gradient is large, small splats are cloned and large ones
+// are split in two (scales / 1.6, means drawn from the splat itself); then transparent and oversized splats go.
+// Row order as in the official code: kept originals, clones, first halves, second halves. Its test of screen size never
+// fires there (the radii are zeroed before it) and does not exist here.
+
+typedef enum gsf__densify_action { GSF__KEEP = 0, GSF__CLONE, GSF__SPLIT } gsf__densify_action;
+
+typedef struct gsf__densify_rule {
+    float grad;            // threshold of the mean gradient norm
+    double clone_scale;    // splats up to this size (largest axis) are cloned, others split
+    double prune_opacity;  // below this splats are removed
+    double prune_scale;    // above this size too; 0 = off
+    size_t max_splats;
+    uint64_t seed, stream; // of the random positions: a function of the splat's id
+    const float* normals;  // (2, splits, 3) given standard normals instead; NULL = drawn
+} gsf__densify_rule;
+
+static float gsf__densify_mean_grad(const gsf__model* model, size_t i) {
+    const float mean = model->visits[i] ? model->grad_sum[i] / (float)model->visits[i] : 0.0f;
+    return mean <= FLT_MAX ? mean : 0.0f;
+}
+
+static float gsf__model_max_log_scale(const gsf__model* model, size_t i) {
+    const float* s = model->groups[GSF__SCALES].value + 3 * i;
+    const float m = s[0] > s[1] ? s[0] : s[1];
+    return m > s[2] ? m : s[2];
+}
+
+static float gsf__positive_float(uint32_t bits) { // floats >= 0 are ordered like their bits
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+// Smallest threshold >= `threshold` that at most `room` splats reach.
+static float gsf__densify_cap(const gsf__model* model, float threshold, size_t room) {
+    uint32_t low, high = 0x7f800000u; // +inf, which none reaches
+    memcpy(&low, &threshold, sizeof low);
+    while (low < high) {
+        const uint32_t middle = low + (high - low) / 2;
+        const float value = gsf__positive_float(middle);
+        size_t reached = 0;
+        for (size_t i = 0; i < model->count; i++) reached += gsf__densify_mean_grad(model, i) >= value;
+        if (reached <= room) high = middle;
+        else low = middle + 1;
+    }
+    return gsf__positive_float(low);
+}
+
+// Decides model->action of every splat and counts clones and splits. Near max_splats the largest gradients win.
+static void gsf__densify_select(const gsf__model* model, const gsf__densify_rule* rule, size_t* clones, size_t* splits) {
+    const float clone_log = (float)log(rule->clone_scale);
+    float threshold = rule->grad;
+    const size_t room = rule->max_splats > model->count ? rule->max_splats - model->count : 0;
+    *clones = *splits = 0;
+    for (int capped = 0; capped < 2; capped++) {
+        *clones = *splits = 0;
+        for (size_t i = 0; i < model->count; i++) {
+            uint8_t action = GSF__KEEP;
+            if (gsf__densify_mean_grad(model, i) >= threshold)
+                action = gsf__model_max_log_scale(model, i) <= clone_log ? GSF__CLONE : GSF__SPLIT;
+            *clones += action == GSF__CLONE;
+            *splits += action == GSF__SPLIT;
+            model->action[i] = action;
+        }
+        if (*clones + *splits <= room) return;
+        threshold = gsf__densify_cap(model, threshold, room);
+    }
+}
+
+static void gsf__model_copy_row(gsf__model* model, size_t from, size_t to) { // a new splat: moments zero, a new id
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        gsf__group* group = &model->groups[g];
+        const size_t width = group->width;
+        memcpy(group->value + to * width, group->value + from * width, width * sizeof(float));
+        memset(group->m + to * width, 0, width * sizeof(float));
+        memset(group->v + to * width, 0, width * sizeof(float));
+    }
+    model->action[to] = GSF__KEEP;
+    model->ids[to] = model->next_id++;
+}
+
+// Rotation matrix (row-major) of a raw quaternion w x y z; the zero quaternion is the identity.
+static void gsf__densify_rotation(const float* q, double r[9]) {
+    double w = (double)q[0], x = (double)q[1], y = (double)q[2], z = (double)q[3];
+    const double norm = sqrt(w * w + x * x + y * y + z * z);
+    if (norm < 1e-12) w = 1.0, x = y = z = 0.0;
+    else w /= norm, x /= norm, y /= norm, z /= norm;
+    r[0] = 1.0 - 2.0 * (y * y + z * z), r[1] = 2.0 * (x * y - w * z), r[2] = 2.0 * (x * z + w * y);
+    r[3] = 2.0 * (x * y + w * z), r[4] = 1.0 - 2.0 * (x * x + z * z), r[5] = 2.0 * (y * z - w * x);
+    r[6] = 2.0 * (x * z - w * y), r[7] = 2.0 * (y * z + w * x), r[8] = 1.0 - 2.0 * (x * x + y * y);
+}
+
+static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, const double normal[3]) {
+    gsf__model_copy_row(model, parent, child);
+    float* mean = model->groups[GSF__MEANS].value + 3 * child;
+    float* scale = model->groups[GSF__SCALES].value + 3 * child;
+    double r[9], offset[3];
+    gsf__densify_rotation(model->groups[GSF__QUATS].value + 4 * child, r);
+    for (int a = 0; a < 3; a++) offset[a] = exp((double)scale[a]) * normal[a];
+    for (int a = 0; a < 3; a++) {
+        const double moved =
+            (double)mean[a] + r[3 * a] * offset[0] + r[3 * a + 1] * offset[1] + r[3 * a + 2] * offset[2];
+        if (fabs(moved) <= (double)FLT_MAX) mean[a] = (float)moved;
+        scale[a] -= 0.47000363f; // log(1.6)
+    }
+}
+
+// Removes split parents and what the pruning rule names, keeping the order.
+static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rule) {
+    const float opacity_logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
+    const float scale_log = rule->prune_scale > 0.0 ? (float)log(rule->prune_scale) : FLT_MAX;
+    size_t kept = 0;
+    for (size_t i = 0; i < model->count; i++) {
+        if (model->action[i] == GSF__SPLIT || model->groups[GSF__OPACITY].value[i] < opacity_logit ||
+            gsf__model_max_log_scale(model, i) > scale_log)
+            continue;
+        if (kept != i) {
+            for (int g = 0; g < GSF__GROUPS; g++) { // gradients are all zero between steps
+                gsf__group* group = &model->groups[g];
+                const size_t width = group->width;
+                memcpy(group->value + kept * width, group->value + i * width, width * sizeof(float));
+                memcpy(group->m + kept * width, group->m + i * width, width * sizeof(float));
+                memcpy(group->v + kept * width, group->v + i * width, width * sizeof(float));
+            }
+            model->ids[kept] = model->ids[i];
+        }
+        kept++;
+    }
+    model->count = kept;
+    memset(model->grad_sum, 0, kept * sizeof(float));
+    memset(model->visits, 0, kept * sizeof(uint32_t));
+}
+
+// Carries out what gsf__densify_select decided. There must be room for count + clones + 2 splits.
+static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule, size_t clones, size_t splits) {
+    const size_t count = model->count;
+    size_t clone = count, child = count + clones;
+    for (size_t i = 0; i < count; i++) {
+        if (model->action[i] == GSF__CLONE) gsf__model_copy_row(model, i, clone++);
+        if (model->action[i] != GSF__SPLIT) continue;
+        for (size_t copy = 0; copy < 2; copy++) {
+            double normal[3];
+            for (size_t a = 0; a < 3; a++)
+                normal[a] = rule->normals ? (double)rule->normals[(copy * splits + (child - count - clones)) * 3 + a]
+                                          : gsf_random_normal(rule->seed, rule->stream,
+                                                              (uint64_t)model->ids[i] * 6 + copy * 3 + a);
+            gsf__densify_child(model, i, child + copy * splits, normal);
+        }
+        child++;
+    }
+    model->count = count + clones + 2 * splits;
+    gsf__densify_compact(model, rule);
+}
+
+// Opacities above `limit` fall to it; the moments of all opacities are zeroed.
+static void gsf__reset_opacity(gsf__model* model, double limit) {
+    const float logit = (float)log(limit / (1.0 - limit));
+    gsf__group* group = &model->groups[GSF__OPACITY];
+    for (size_t i = 0; i < model->count; i++)
+        if (group->value[i] > logit) group->value[i] = logit;
+    memset(group->m, 0, model->count * sizeof(float));
+    memset(group->v, 0, model->count * sizeof(float));
+}
 
 // ---- >>trainer -----------------------------------------------------------------
+// One step: photo of a random permutation (reshuffled when used up; the official loader draws with replacement) -> render
+// -> loss -> backward, the same for one restored view, then Adam on the summed gradients, then density control.
+// The official order differs in one point: there Adam comes last, and after densification its step is lost because the
+// fresh tensors have no gradient yet. Here no step is lost.
+// A step that fails (memory, cancel) leaves the trainer as it was.
+
+enum { // streams of random numbers; the iteration or epoch is added
+    GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED
+};
+
+#define GSF__MOMENT_BYTES ((size_t)512 << 20) // kept window moments of photos: at most this much, 24 bytes per pixel
+enum { GSF__DECAY_INTERVAL = 10 };            // iterations from one opacity decay to the next
+
+typedef struct gsf__photo {
+    gsf_camera camera;
+    gsf__target target;
+    void *pixels, *weight;   // what target points to
+} gsf__photo;
+
+typedef struct gsf__photo_set {
+    size_t count;
+    gsf__photo* photos;
+    uint32_t* order;         // permutation of epoch order_epoch - 1; 0 = none yet
+    uint64_t order_epoch;
+    size_t moment_bytes;
+    int32_t max_width, max_height;
+} gsf__photo_set;
+
+struct gsf_trainer {
+    gsf_train_desc desc;     // resolved
+    gsf__photo_set photos, restored;
+    gsf__model model;
+    gsf__loss_scratch loss;
+    gsf_rasterizer* rasterizer;
+    float *color, *d_color, *depth, *d_depth; // packed images of the step
+    size_t color_capacity, d_color_capacity, depth_capacity, d_depth_capacity;
+    gsf_splats view;         // the model as splats
+    int32_t iteration;       // steps done
+    int32_t first_bands;     // SH bands that the initial splats already use
+    uint64_t restored_steps;
+    float restored_weight;
+    size_t rejected;
+};
+
+static uint64_t gsf__stream(uint64_t kind, uint64_t step) { return kind << 40 | step; }
+
+static void gsf__photo_set_destroy(gsf_context* ctx, gsf__photo_set* set) {
+    for (size_t i = 0; set->photos && i < set->count; i++) {
+        gsf_free(ctx, set->photos[i].pixels);
+        gsf_free(ctx, set->photos[i].weight);
+        gsf_free(ctx, set->photos[i].target.moments);
+    }
+    gsf_free(ctx, set->photos);
+    gsf_free(ctx, set->order);
+    memset(set, 0, sizeof *set);
+}
+
+// Copies an image to packed (H,W,C) of its own dtype; a value that is not finite, or outside [low, high], is an error.
+static gsf_result gsf__photo_copy(gsf_context* ctx, const gsf_image* image, const char* what, size_t index, float low,
+                                  float high, void* out) {
+    const size_t channels = (size_t)image->channels;
+    for (int64_t y = 0; y < image->height; y++)
+        for (int64_t x = 0; x < image->width; x++)
+            for (size_t c = 0; c < channels; c++) {
+                const char* from = (const char*)image->data + y * image->stride_y + x * image->stride_x +
+                                   (int64_t)c * image->stride_c;
+                const size_t to = ((size_t)y * (size_t)image->width + (size_t)x) * channels + c;
+                if (image->dtype == GSF_U8) {
+                    ((uint8_t*)out)[to] = *(const uint8_t*)from;
+                    continue;
+                }
+                float value;
+                memcpy(&value, from, sizeof value);
+                if (!(value >= low && value <= high))
+                    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s %zu: pixel (%lld, %lld) is %g", what, index,
+                                    (long long)x, (long long)y, (double)value);
+                ((float*)out)[to] = value;
+            }
+    return GSF_OK;
+}
+
+static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, const char* what, size_t index,
+                                  gsf__photo* out) {
+    const gsf_camera* camera = &view->camera;
+    if (gsf_check_camera(ctx, camera) != GSF_OK)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s %zu: %s", what, index, ctx->error);
+    const gsf_image *image = &view->image, *weight = &view->weight;
+    if (!image->data || image->width != camera->width || image->height != camera->height || image->channels != 3 ||
+        (image->dtype != GSF_U8 && image->dtype != GSF_F32))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s %zu: image must be u8 or f32 RGB of %d x %d", what, index,
+                        (int)camera->width, (int)camera->height);
+    if (weight->data && (weight->width != camera->width || weight->height != camera->height ||
+                         weight->channels != 1 || weight->dtype != GSF_F32))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s %zu: weight must be f32, one channel, %d x %d", what, index,
+                        (int)camera->width, (int)camera->height);
+    const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+    out->camera = *camera;
+    out->target.width = camera->width;
+    out->target.height = camera->height;
+    out->pixels = gsf_alloc(ctx, pixels, 3 * gsf_dtype_size(image->dtype));
+    if (!out->pixels) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
+    if (image->dtype == GSF_U8) out->target.u8 = (const uint8_t*)out->pixels;
+    else out->target.f32 = (const float*)out->pixels;
+    if (!weight->data) return GSF_OK;
+    out->weight = gsf_alloc(ctx, pixels, sizeof(float));
+    if (!out->weight) return GSF_ERROR_OUT_OF_MEMORY;
+    out->target.weight = (const float*)out->weight;
+    return gsf__photo_copy(ctx, weight, "weight of view", index, 0.0f, 1e6f, out->weight);
+}
+
+// Memory: 3 bytes (u8) or 12 (f32) per pixel, 4 with a weight, and 24 for the photo's window moments while these fit
+// into `moment_budget`; the other photos have theirs computed at each visit, with the same result.
+static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* views, size_t count, const char* what,
+                                      size_t moment_budget, gsf__photo_set* out) {
+    memset(out, 0, sizeof *out);
+    if (count == 0) return GSF_OK;
+    if (!views || count > UINT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: %zu %ss at %p", count, what, (const void*)views);
+    out->count = count;
+    out->photos = (gsf__photo*)gsf_alloc_zeroed(ctx, count, sizeof *out->photos);
+    out->order = (uint32_t*)gsf_alloc(ctx, count, sizeof *out->order);
+    gsf_result result = out->photos && out->order ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; result == GSF_OK && i < count; i++) {
+        gsf__photo* photo = &out->photos[i];
+        result = gsf__photo_make(ctx, &views[i], what, i, photo);
+        if (result != GSF_OK) break;
+        if (photo->camera.width > out->max_width) out->max_width = photo->camera.width;
+        if (photo->camera.height > out->max_height) out->max_height = photo->camera.height;
+        const size_t bytes = gsf__loss_moments_size(photo->camera.width, photo->camera.height);
+        if (bytes > moment_budget - out->moment_bytes) continue;
+        photo->target.moments = (float*)gsf_alloc(ctx, bytes, 1);
+        if (!photo->target.moments) result = GSF_ERROR_OUT_OF_MEMORY;
+        out->moment_bytes += bytes;
+    }
+    if (result != GSF_OK) gsf__photo_set_destroy(ctx, out);
+    return result;
+}
+
+// The photo of step `step` (from 0): a new permutation every `count` steps, a function of seed, stream and step only.
+static gsf__photo* gsf__photo_at(gsf__photo_set* set, uint64_t seed, uint64_t kind, uint64_t step) {
+    const uint64_t epoch = step / set->count;
+    if (set->order_epoch != epoch + 1) {
+        for (size_t i = 0; i < set->count; i++) set->order[i] = (uint32_t)i;
+        for (size_t i = set->count - 1; i > 0; i--) {
+            const size_t j = (size_t)(gsf_random_bits(seed, gsf__stream(kind, epoch), i) % (i + 1));
+            const uint32_t swapped = set->order[i];
+            set->order[i] = set->order[j];
+            set->order[j] = swapped;
+        }
+        set->order_epoch = epoch + 1;
+    }
+    return &set->photos[set->order[step % set->count]];
+}
+
+static int32_t gsf__scaled_interval(int32_t set, int32_t official, int32_t iterations, int32_t least) {
+    if (set != 0) return set;
+    const double scaled = floor((double)official * ((double)iterations / 30000.0) + 0.5);
+    return scaled > (double)least ? (int32_t)scaled : least;
+}
+
+static float gsf__or_default(float value, float fallback) { return value != 0.0f ? value : fallback; }
+
+static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
+    gsf_train_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.iterations == 0) d.iterations = 30000;
+    d.sh_interval = gsf__scaled_interval(d.sh_interval, 1000, d.iterations, 1);
+    d.densify_from = gsf__scaled_interval(d.densify_from, 500, d.iterations, 1);
+    d.densify_until = gsf__scaled_interval(d.densify_until, 15000, d.iterations, 1);
+    if (d.densify_interval == 0) d.densify_interval = 100;
+    d.opacity_reset_interval = gsf__scaled_interval(d.opacity_reset_interval, 3000, d.iterations, 1000);
+    d.lr_means = gsf__or_default(d.lr_means, 1.6e-4f);
+    d.lr_means_final = gsf__or_default(d.lr_means_final, 1.6e-6f);
+    d.lr_sh_dc = gsf__or_default(d.lr_sh_dc, 2.5e-3f);
+    d.lr_sh_rest = gsf__or_default(d.lr_sh_rest, 1.25e-4f);
+    d.lr_opacity = gsf__or_default(d.lr_opacity, 0.025f);
+    d.lr_scales = gsf__or_default(d.lr_scales, 5e-3f);
+    d.lr_quats = gsf__or_default(d.lr_quats, 1e-3f);
+    d.lambda_ssim = d.lambda_ssim < 0.0f ? 0.0f : gsf__or_default(d.lambda_ssim, 0.2f);
+    d.densify_grad = gsf__or_default(d.densify_grad, 2e-4f);
+    d.densify_scale = gsf__or_default(d.densify_scale, 0.01f);
+    d.prune_opacity = gsf__or_default(d.prune_opacity, 0.005f);
+    d.prune_scale = gsf__or_default(d.prune_scale, 0.1f);
+    if (d.max_splats == 0) d.max_splats = 2000000;
+    memcpy(d.render.background, d.background, sizeof d.background);
+    return d;
+}
+
+// `d` is resolved but for the extent.
+static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* d) {
+    const struct { const char* name; double value, low, high; } fields[] = {
+        {"iterations", (double)d->iterations, 1, 1e9},
+        {"sh_degree", (double)d->sh_degree, 0, 3},
+        {"sh_interval", (double)d->sh_interval, 1, 1e9},
+        {"densify_from", (double)d->densify_from, 0, 1e9},
+        {"densify_interval", (double)d->densify_interval, 1, 1e9},
+        {"lr_means", (double)d->lr_means, 1e-30, 1e3},
+        {"lr_means_final", (double)d->lr_means_final, 1e-30, 1e3},
+        {"lr_means_delay_steps", (double)d->lr_means_delay_steps, 0, 1e9},
+        {"lr_means_delay", (double)d->lr_means_delay, 0, 1},
+        {"lr_sh_dc", (double)d->lr_sh_dc, 0, 1e3},
+        {"lr_sh_rest", (double)d->lr_sh_rest, 0, 1e3},
+        {"lr_opacity", (double)d->lr_opacity, 0, 1e3},
+        {"lr_scales", (double)d->lr_scales, 0, 1e3},
+        {"lr_quats", (double)d->lr_quats, 0, 1e3},
+        {"extent", (double)d->extent, 0, 1e30},
+        {"lambda_ssim", (double)d->lambda_ssim, 0, 1},
+        {"background[0]", (double)d->background[0], -1e3, 1e3},
+        {"background[1]", (double)d->background[1], -1e3, 1e3},
+        {"background[2]", (double)d->background[2], -1e3, 1e3},
+        {"densify_grad", (double)d->densify_grad, 0, 1e30},
+        {"densify_scale", (double)d->densify_scale, 0, 1e30},
+        {"prune_opacity", (double)d->prune_opacity, 0, 0.99},
+        {"prune_scale", (double)d->prune_scale, 0, 1e30},
+        {"render.near_plane", (double)d->render.near_plane, 0, 1e30},
+        {"dropout", (double)d->dropout, 0, 0.9},
+        {"opacity_decay", (double)d->opacity_decay, 0, 0.5},
+        {"scale_penalty", (double)d->scale_penalty, 0, 1e6},
+        {"depth_smoothness", (double)d->depth_smoothness, 0, 1e6},
+    };
+    for (size_t i = 0; i < GSF__COUNT(fields); i++)
+        if (!(fields[i].value >= fields[i].low && fields[i].value <= fields[i].high))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: %s is %g, allowed %g to %g", fields[i].name,
+                            fields[i].value, fields[i].low, fields[i].high);
+    if (d->render.hidden || d->render.sh_bands || (d->render.opacity_scale != 0.0f && d->render.opacity_scale != 1.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "train desc: render.hidden, sh_bands and opacity_scale belong to the trainer");
+    if (d->max_splats > UINT32_MAX / 4)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: max_splats is %zu", d->max_splats);
+    return GSF_OK;
+}
+
+static int gsf__all_finite(const float* v, size_t count) {
+    for (size_t i = 0; i < count; i++)
+        if (!(fabsf(v[i]) <= FLT_MAX)) return 0;
+    return 1;
+}
+
+// Copies the initial splats; those with a non-finite value are left out and counted.
+static gsf_result gsf__trainer_take_splats(gsf_context* ctx, gsf_trainer* trainer, const gsf_splats* initial) {
+    if (!initial || initial->sh_degree < 0 || initial->sh_degree > 3)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no initial splats");
+    for (int a = 0; a < 3; a++)
+        if (!isfinite(initial->origin[a]))
+            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "trainer: origin of the splats is not finite");
+    gsf__model* model = &trainer->model;
+    model->sh_degree = trainer->desc.sh_degree ? trainer->desc.sh_degree : initial->sh_degree;
+    GSF__TRY(gsf__model_reserve(ctx, model, initial->count));
+    const size_t from_sh = 3 * (size_t)gsf_splat_sh_count(initial->sh_degree);
+    const float* from[GSF__GROUPS] = {initial->means, initial->log_scales, initial->quats, initial->opacity_logits,
+                                      initial->sh};
+    size_t used_sh = 3; // floats of an SH row up to the last one that is not zero anywhere
+    for (size_t i = 0; i < initial->count; i++) {
+        int finite = 1;
+        for (int g = 0; g < GSF__GROUPS; g++) {
+            const size_t width = g == GSF__SH ? from_sh : model->groups[g].width;
+            finite = finite && gsf__all_finite(from[g] + i * width, width);
+        }
+        if (!finite) {
+            trainer->rejected++;
+            continue;
+        }
+        for (int g = 0; g < GSF__GROUPS; g++) {
+            const size_t from_width = g == GSF__SH ? from_sh : model->groups[g].width, to_width = model->groups[g].width;
+            const size_t width = from_width < to_width ? from_width : to_width;
+            memcpy(model->groups[g].value + model->count * to_width, from[g] + i * from_width, width * sizeof(float));
+            if (g != GSF__SH) continue;
+            for (size_t k = used_sh; k < width; k++)
+                if (from[g][i * from_width + k] != 0.0f) used_sh = k + 1;
+        }
+        const uint32_t id = initial->ids ? initial->ids[i] : (uint32_t)i;
+        if (id >= UINT32_MAX / 2)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: splat id %u leaves no room for new ones", id);
+        if (id >= model->next_id) model->next_id = id + 1;
+        model->ids[model->count++] = id;
+    }
+    if (model->count == 0)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "trainer: none of %zu initial splats can be used", initial->count);
+    if (trainer->rejected)
+        gsf_log(ctx, GSF_LOG_WARNING, "trainer: %zu initial splats with a non-finite value left out", trainer->rejected);
+    for (trainer->first_bands = 1; 3 * (size_t)trainer->first_bands * (size_t)trainer->first_bands < used_sh;)
+        trainer->first_bands++;
+    memcpy(trainer->view.origin, initial->origin, sizeof initial->origin);
+    return GSF_OK;
+}
+
+static void gsf__trainer_refresh_view(gsf_trainer* trainer) {
+    const gsf__model* model = &trainer->model;
+    trainer->view.count = model->count;
+    trainer->view.sh_degree = model->sh_degree;
+    trainer->view.means = model->groups[GSF__MEANS].value;
+    trainer->view.log_scales = model->groups[GSF__SCALES].value;
+    trainer->view.quats = model->groups[GSF__QUATS].value;
+    trainer->view.opacity_logits = model->groups[GSF__OPACITY].value;
+    trainer->view.sh = model->groups[GSF__SH].value;
+    trainer->view.ids = model->ids;
+}
+
+// Median camera depth of the splats in front of the training cameras (a sample of each camera's); 0 when none is.
+static gsf_result gsf__trainer_median_depth(gsf_context* ctx, const gsf_trainer* trainer, double* out) {
+    const gsf__model* model = &trainer->model;
+    const size_t step = model->count / 2048 + 1, per_view = (model->count + step - 1) / step;
+    const size_t view_step = trainer->photos.count / 64 + 1;
+    float* depths = (float*)gsf_alloc(ctx, per_view * (trainer->photos.count / view_step + 1), sizeof(float));
+    if (!depths) return GSF_ERROR_OUT_OF_MEMORY;
+    size_t count = 0;
+    for (size_t v = 0; v < trainer->photos.count; v += view_step)
+        for (size_t i = 0; i < model->count; i += step) {
+            const float* mean = model->groups[GSF__MEANS].value + 3 * i;
+            double world[3], p[3];
+            for (int a = 0; a < 3; a++) world[a] = trainer->view.origin[a] + (double)mean[a];
+            gsf__camera_transform(&trainer->photos.photos[v].camera, world, p);
+            if (p[2] > 0.0 && p[2] <= (double)FLT_MAX) depths[count++] = (float)p[2];
+        }
+    uint32_t low = 0, high = 0x7f800000u; // bisection over the bits, which are ordered like positive floats
+    while (low < high) {
+        const uint32_t middle = low + (high - low) / 2;
+        size_t below = 0;
+        for (size_t i = 0; i < count; i++) below += depths[i] <= gsf__positive_float(middle);
+        if (2 * below >= count) high = middle;
+        else low = middle + 1;
+    }
+    *out = count ? (double)gsf__positive_float(low) : 0.0;
+    gsf_free(ctx, depths);
+    return GSF_OK;
+}
+
+// 1.1 times the largest distance of a camera from their mean; where that is (nearly) zero, as for a single camera, the
+// median depth of the initial splats stands in, and 1 where no splat is in front of a camera.
+static gsf_result gsf__trainer_find_extent(gsf_context* ctx, gsf_trainer* trainer) {
+    double mean[3] = {0.0, 0.0, 0.0}, largest = 0.0, median = 0.0;
+    const size_t count = trainer->photos.count;
+    double first[3]; // summed relative to the first centre, so that large coordinates cost no precision
+    gsf_camera_center(&trainer->photos.photos[0].camera, first);
+    for (int pass = 0; pass < 2; pass++)
+        for (size_t i = 0; i < count; i++) {
+            double c[3], d2 = 0.0;
+            gsf_camera_center(&trainer->photos.photos[i].camera, c);
+            for (int a = 0; a < 3; a++) {
+                if (pass == 0) mean[a] += (c[a] - first[a]) / (double)count;
+                d2 += (c[a] - first[a] - mean[a]) * (c[a] - first[a] - mean[a]);
+            }
+            if (pass == 1 && sqrt(d2) > largest) largest = sqrt(d2);
+        }
+    GSF__TRY(gsf__trainer_median_depth(ctx, trainer, &median));
+    double extent = 1.1 * largest;
+    if (!(extent > 1e-6 * median) || extent < 1e-20) extent = median > 1e-20 ? median : 1.0;
+    trainer->desc.extent = extent < 1e30 ? (float)extent : 1e30f;
+    return GSF_OK;
+}
+
+static gsf_result gsf__trainer_reserve_images(gsf_context* ctx, gsf_trainer* trainer, const gsf__photo_set* set) {
+    if (set->count == 0) return GSF_OK;
+    const size_t pixels = (size_t)set->max_width * (size_t)set->max_height;
+    GSF__TRY(gsf__reserve(ctx, (void**)&trainer->color, &trainer->color_capacity, 0, pixels, 3 * sizeof(float)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&trainer->d_color, &trainer->d_color_capacity, 0, pixels, 3 * sizeof(float)));
+    if (trainer->desc.depth_smoothness > 0.0f) {
+        GSF__TRY(gsf__reserve(ctx, (void**)&trainer->depth, &trainer->depth_capacity, 0, pixels, sizeof(float)));
+        GSF__TRY(gsf__reserve(ctx, (void**)&trainer->d_depth, &trainer->d_depth_capacity, 0, pixels, sizeof(float)));
+    }
+    return gsf__loss_reserve(ctx, &trainer->loss, set->max_width, set->max_height);
+}
+
+static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
+                                     size_t view_count, const gsf_splats* initial) {
+    const int near_given = trainer->desc.render.near_plane != 0.0f;
+    GSF__TRY(gsf__train_desc_check(ctx, &trainer->desc));
+    if (view_count == 0) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no training view");
+    GSF__TRY(gsf__photo_set_make(ctx, views, view_count, "view", GSF__MOMENT_BYTES, &trainer->photos));
+    GSF__TRY(gsf__trainer_take_splats(ctx, trainer, initial));
+    if (trainer->desc.extent == 0.0f) GSF__TRY(gsf__trainer_find_extent(ctx, trainer));
+    if (!near_given) {
+        const float near_plane = 0.01f * trainer->desc.extent;
+        trainer->desc.render.near_plane = near_plane < 0.2f ? near_plane : 0.2f;
+    }
+    GSF__TRY(gsf__trainer_reserve_images(ctx, trainer, &trainer->photos));
+    gsf__trainer_refresh_view(trainer);
+    return gsf_splat_make_rasterizer(ctx, &trainer->rasterizer);
+}
+
+// Hides a random share of the splats in this render: a function of seed, iteration and splat id.
+typedef struct gsf__dropout_job {
+    const gsf__model* model;
+    uint64_t seed, stream;
+    double share;
+} gsf__dropout_job;
+
+static void gsf__dropout_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__dropout_job* job = (const gsf__dropout_job*)arg;
+    const gsf__model* model = job->model;
+    (void)worker;
+    const size_t end = gsf__model_chunk_end(model->count, chunk);
+    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
+        model->hidden[i] = gsf_random_uniform(job->seed, job->stream, model->ids[i]) < job->share;
+}
+
+// Densification statistics of this step, and the means' screen gradients back to zero.
+typedef struct gsf__visit_job {
+    gsf__model* model;
+    int counts[2];           // was there a photo / a restored view?
+    float half[2][2];        // half width and height of each
+} gsf__visit_job;
+
+static void gsf__visit_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__visit_job* job = (const gsf__visit_job*)arg;
+    gsf__model* model = job->model;
+    (void)worker;
+    const size_t end = gsf__model_chunk_end(model->count, chunk);
+    for (int k = 0; k < 2; k++) {
+        if (!job->counts[k]) continue;
+        for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
+            float* g = model->screen[k] + 2 * i;
+            if (model->seen[k][i]) {
+                const float x = g[0] * job->half[k][0], y = g[1] * job->half[k][1], norm = sqrtf(x * x + y * y);
+                if (norm <= FLT_MAX) model->grad_sum[i] += norm;
+                model->visits[i]++;
+            }
+            g[0] = g[1] = 0.0f;
+        }
+    }
+}
+
+// e^x for x <= 88 within 2e-7 (relative): 2^n times a Taylor polynomial on [-ln2/2, ln2/2].
+static float gsf__exp_poly(float x) {
+    if (x < -87.0f) return 0.0f;
+    const float n = floorf(x * 1.44269504f + 0.5f), r = (x - n * 0.693359375f) + n * 2.12194440e-4f;
+    const float p = 1.0f + r * (1.0f + r * (0.5f + r * (0.166666667f + r * (0.0416666667f + r * (8.33333333e-3f +
+                                                                                                 r * 1.38888889e-3f)))));
+    const uint32_t bits = (uint32_t)((int32_t)n + 127) << 23;
+    float power;
+    memcpy(&power, &bits, sizeof power);
+    return p * power;
+}
+
+// Gradient of weight * mean(exp(log_scale)) / extent.
+typedef struct gsf__scale_job {
+    gsf__model* model;
+    float factor; // weight / (3 count extent)
+} gsf__scale_job;
+
+static void gsf__scale_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__scale_job* job = (const gsf__scale_job*)arg;
+    const gsf__group* group = &job->model->groups[GSF__SCALES];
+    (void)worker;
+    const size_t count = job->model->count;
+    const size_t end = gsf__model_chunk_end(count, chunk);
+    for (size_t i = 3 * chunk * GSF__MODEL_CHUNK; i < 3 * end; i++)
+        group->grad[i] += job->factor * gsf__exp_poly(group->value[i] < 80.0f ? group->value[i] : 80.0f);
+}
+
+// Multiplies every opacity by `factor`, on the logits: with e = exp(-logit), log(f / (1 + e - f)).
+typedef struct gsf__decay_job {
+    gsf__model* model;
+    double factor;
+} gsf__decay_job;
+
+static void gsf__decay_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__decay_job* job = (const gsf__decay_job*)arg;
+    float* logits = job->model->groups[GSF__OPACITY].value;
+    (void)worker;
+    const size_t count = job->model->count;
+    const size_t end = gsf__model_chunk_end(count, chunk);
+    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
+        if (logits[i] > -30.0f) // what is smaller was invisible long ago
+            logits[i] = (float)(log(job->factor) - log(exp(-(double)logits[i]) + 1.0 - job->factor));
+}
+
+static int32_t gsf__trainer_bands(const gsf_trainer* trainer, int32_t iteration) {
+    const int32_t grown = iteration / trainer->desc.sh_interval + 1, all = trainer->model.sh_degree + 1;
+    const int32_t bands = grown > trainer->first_bands ? grown : trainer->first_bands;
+    return bands < all ? bands : all;
+}
+
+static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are statistics needed?
+    return iteration < trainer->desc.densify_until;
+}
+
+// Renders one photo, and adds the gradient of its loss times `scale`. which: 0 photo, 1 restored view.
+static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf__photo* photo, int which, int32_t iteration,
+                                    float scale, gsf__loss_value* value) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__model* model = &trainer->model;
+    gsf_render_desc render = d->render;
+    render.sh_bands = gsf__trainer_bands(trainer, iteration);
+    const double share = (double)d->dropout * iteration / d->iterations;
+    if (share > 0.0) {
+        gsf__dropout_job job;
+        job.model = model;
+        job.seed = d->seed;
+        job.stream = gsf__stream(which ? GSF__STREAM_DROPOUT_RESTORED : GSF__STREAM_DROPOUT, (uint64_t)iteration);
+        job.share = share;
+        gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__dropout_chunk, &job);
+        render.hidden = model->hidden;
+        render.opacity_scale = (float)(1.0 / (1.0 - share));
+    }
+    const int32_t width = photo->camera.width, height = photo->camera.height;
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.color = gsf_wrap_image(trainer->color, GSF_F32, width, height, 3);
+    const int smooth = d->depth_smoothness > 0.0f;
+    if (smooth) out.depth = gsf_wrap_image(trainer->depth, GSF_F32, width, height, 1);
+    GSF__TRY(gsf_splat_render(ctx, trainer->rasterizer, &trainer->view, &photo->camera, &render, &out));
+    GSF__TRY(gsf__loss(ctx, &trainer->loss, &photo->target, trainer->color, d->lambda_ssim, scale, trainer->d_color,
+                       value));
+    if (smooth)
+        (void)gsf__depth_smoothness(ctx, &trainer->loss, &photo->target, trainer->depth, d->extent,
+                                    scale * d->depth_smoothness, trainer->d_depth);
+    gsf_splat_grads grads;
+    memset(&grads, 0, sizeof grads);
+    grads.means = model->groups[GSF__MEANS].grad;
+    grads.log_scales = model->groups[GSF__SCALES].grad;
+    grads.quats = model->groups[GSF__QUATS].grad;
+    grads.opacity_logits = model->groups[GSF__OPACITY].grad;
+    grads.sh = model->groups[GSF__SH].grad;
+    const int densifies = gsf__trainer_densifies(trainer, iteration);
+    if (densifies) grads.means2d = model->screen[which];
+    GSF__TRY(gsf_splat_render_backward(ctx, trainer->rasterizer, &trainer->view, &photo->camera, &render,
+                                       trainer->d_color, smooth ? trainer->d_depth : NULL, NULL, &grads));
+    const int32_t* radii = gsf_splat_last_radii(trainer->rasterizer);
+    for (size_t i = 0; densifies && i < model->count; i++) model->seen[which][i] = radii[i] > 0;
+    return GSF_OK;
+}
+
+static gsf__densify_rule gsf__trainer_rule(const gsf_trainer* trainer, int32_t iteration) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__densify_rule rule;
+    memset(&rule, 0, sizeof rule);
+    rule.grad = d->densify_grad;
+    rule.clone_scale = (double)d->densify_scale * (double)d->extent;
+    rule.prune_opacity = (double)d->prune_opacity;
+    if (d->opacity_reset_interval > 0 && iteration > d->opacity_reset_interval)
+        rule.prune_scale = (double)d->prune_scale * (double)d->extent;
+    rule.max_splats = d->max_splats;
+    rule.seed = d->seed;
+    rule.stream = gsf__stream(GSF__STREAM_SPLIT, (uint64_t)iteration);
+    return rule;
+}
+
+// The part of a step that can fail: gradients into the model. Nothing else has changed when it fails.
+static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration,
+                                         gsf__visit_job* visits, gsf_train_stats* stats) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__photo* photos[2] = {NULL, NULL};
+    photos[0] = gsf__photo_at(&trainer->photos, d->seed, GSF__STREAM_PHOTOS, (uint64_t)iteration - 1);
+    if (trainer->restored.count && trainer->restored_weight > 0.0f)
+        photos[1] = gsf__photo_at(&trainer->restored, d->seed, GSF__STREAM_RESTORED, trainer->restored_steps);
+    for (int k = 0; k < 2; k++) {
+        if (!photos[k]) continue;
+        gsf__loss_value value;
+        GSF__TRY(gsf__trainer_pass(ctx, trainer, photos[k], k, iteration, k ? trainer->restored_weight : 1.0f, &value));
+        if (k == 0) {
+            stats->loss = value.total;
+            stats->l1 = value.l1;
+            stats->ssim = value.ssim;
+        } else {
+            stats->restored_loss = value.total;
+        }
+        visits->counts[k] = gsf__trainer_densifies(trainer, iteration);
+        visits->half[k][0] = 0.5f * (float)photos[k]->camera.width;
+        visits->half[k][1] = 0.5f * (float)photos[k]->camera.height;
+    }
+    return GSF_OK;
+}
+
+static void gsf__trainer_clear_gradients(gsf_trainer* trainer) {
+    gsf__model* model = &trainer->model;
+    for (int g = 0; g < GSF__GROUPS; g++)
+        memset(model->groups[g].grad, 0, model->count * model->groups[g].width * sizeof(float));
+    for (int k = 0; k < 2; k++) memset(model->screen[k], 0, 2 * model->count * sizeof(float));
+}
+
+static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__model* model = &trainer->model;
+    const size_t chunks = gsf__model_chunks(model->count);
+    if (d->scale_penalty > 0.0f) {
+        gsf__scale_job job;
+        job.model = model;
+        job.factor = (float)((double)d->scale_penalty / (3.0 * (double)model->count * (double)d->extent));
+        gsf__parallel_for(ctx, chunks, gsf__scale_chunk, &job);
+    }
+    gsf__adam_rates rates;
+    rates.means = gsf__exponential_rate(iteration, (double)d->lr_means * (double)d->extent,
+                                        (double)d->lr_means_final * (double)d->extent, d->lr_means_delay_steps,
+                                        (double)d->lr_means_delay, d->iterations);
+    rates.scales = (double)d->lr_scales;
+    rates.quats = (double)d->lr_quats;
+    rates.opacity = (double)d->lr_opacity;
+    rates.sh_dc = (double)d->lr_sh_dc;
+    rates.sh_rest = (double)d->lr_sh_rest;
+    trainer->rejected += gsf__adam_step(ctx, model, &rates, iteration, gsf__trainer_bands(trainer, iteration));
+    if (d->opacity_decay > 0.0f && iteration % GSF__DECAY_INTERVAL == 0) {
+        gsf__decay_job job;
+        job.model = model;
+        job.factor = pow(1.0 - (double)d->opacity_decay, GSF__DECAY_INTERVAL);
+        gsf__parallel_for(ctx, chunks, gsf__decay_chunk, &job);
+    }
+}
+
+GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__model* model = &trainer->model;
+    gsf_train_stats local;
+    memset(&local, 0, sizeof local);
+    if (stats) *stats = local;
+    if (trainer->iteration >= d->iterations)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: all %d iterations are done", (int)d->iterations);
+    GSF__TRY(gsf__check_cancel(ctx));
+
+    const int32_t iteration = trainer->iteration + 1;
+    gsf__visit_job visits;
+    memset(&visits, 0, sizeof visits);
+    visits.model = model;
+    const int densify = gsf__trainer_densifies(trainer, iteration) && iteration > d->densify_from &&
+                        iteration % d->densify_interval == 0;
+    gsf_result result = gsf__trainer_gradients(ctx, trainer, iteration, &visits, &local);
+    if (result == GSF_OK && densify) { // room for the worst case now, so that nothing can fail after Adam
+        const size_t room = d->max_splats > model->count ? d->max_splats - model->count : 0;
+        result = gsf__model_reserve(ctx, model, model->count + 2 * (room < model->count ? room : model->count));
+        gsf__trainer_refresh_view(trainer);
+    }
+    if (result != GSF_OK) {
+        gsf__trainer_clear_gradients(trainer);
+        return result;
+    }
+
+    gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__visit_chunk, &visits);
+    gsf__trainer_update(ctx, trainer, iteration);
+    if (densify) {
+        const gsf__densify_rule rule = gsf__trainer_rule(trainer, iteration);
+        size_t clones, splits;
+        gsf__densify_select(model, &rule, &clones, &splits);
+        gsf__densify_apply(model, &rule, clones, splits);
+    }
+    if (gsf__trainer_densifies(trainer, iteration) && d->opacity_reset_interval > 0 &&
+        iteration % d->opacity_reset_interval == 0)
+        gsf__reset_opacity(model, 0.01);
+    gsf__trainer_refresh_view(trainer);
+    if (trainer->restored.count && trainer->restored_weight > 0.0f) trainer->restored_steps++;
+    trainer->iteration = iteration;
+    local.iteration = iteration;
+    local.splats = model->count;
+    local.rejected = trainer->rejected;
+    if (stats) *stats = local;
+    return GSF_OK;
+}
+
+// A checkpoint holds, as chunks:
+//     "TRNR"  u32 byte-order mark 0x01020304 as the machine stores it; then little-endian: u32 iteration, sh degree,
+//             next id, first bands, bits of the restored weight; u64 splats, restored steps, rejected, settings; f64 bits of
+//             the origin (3)
+//     "TV0 ".."TV4 ", "TM0 ".., "TS0 .."   value, first and second moment of means, log-scales, quats, opacities, SH
+//     "TIDS", "TGRD", "TVIS"               ids, densification sums and visits
+enum { GSF__STATE_SIZE = 24 + 4 * 8 + 3 * 8 };
+#define GSF__BYTE_ORDER_MARK 0x01020304u
+
+// Fingerprint of the settings and photos, to tell a continuation under other settings.
+static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
+    const gsf_train_desc* d = &trainer->desc;
+    const double values[] = {
+        (double)d->iterations, (double)d->seed, (double)d->sh_interval, (double)d->lr_means,
+        (double)d->lr_means_final, (double)d->lr_sh_dc, (double)d->lr_sh_rest, (double)d->lr_opacity,
+        (double)d->lr_scales, (double)d->lr_quats, (double)d->extent, (double)d->lambda_ssim,
+        (double)d->background[0], (double)d->background[1], (double)d->background[2], (double)d->densify_from,
+        (double)d->densify_until, (double)d->densify_interval, (double)d->densify_grad, (double)d->densify_scale,
+        (double)d->prune_opacity, (double)d->prune_scale, (double)d->opacity_reset_interval, (double)d->max_splats,
+        (double)d->render.footprint, (double)d->render.gradient, (double)d->render.antialiased,
+        (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
+        (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
+        (double)trainer->photos.count};
+    uint64_t hash = 0;
+    for (size_t i = 0; i < GSF__COUNT(values); i++) {
+        uint64_t bits;
+        memcpy(&bits, &values[i], sizeof bits);
+        hash = gsf_random_bits(hash, bits, i);
+    }
+    return hash;
+}
+
+// Tag, start and bytes per splat of the i-th array of a checkpoint; 0 after the last.
+static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void** data, size_t* row) {
+    if (i < 3 * GSF__GROUPS) {
+        const gsf__group* group = &model->groups[i % GSF__GROUPS];
+        float* const arrays[3] = {group->value, group->m, group->v};
+        memcpy(tag, "T?? ", 5);
+        tag[1] = "VMS"[i / GSF__GROUPS];
+        tag[2] = (char)('0' + i % GSF__GROUPS);
+        *data = arrays[i / GSF__GROUPS];
+        *row = group->width * sizeof(float);
+        return 1;
+    }
+    void* const rest[3] = {model->ids, model->grad_sum, model->visits};
+    const char* const tags[3] = {"TIDS", "TGRD", "TVIS"};
+    i -= 3 * GSF__GROUPS;
+    if (i >= 3) return 0;
+    memcpy(tag, tags[i], 5);
+    *data = rest[i];
+    *row = 4;
+    return 1;
+}
+
+GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer, gsf_text* chunks) {
+    const gsf__model* model = &trainer->model;
+    char state[GSF__STATE_SIZE];
+    const uint32_t mark = GSF__BYTE_ORDER_MARK;
+    uint32_t weight;
+    memcpy(state, &mark, 4);
+    memcpy(&weight, &trainer->restored_weight, 4);
+    gsf__store_le(state + 4, (uint64_t)trainer->iteration, 4);
+    gsf__store_le(state + 8, (uint64_t)model->sh_degree, 4);
+    gsf__store_le(state + 12, model->next_id, 4);
+    gsf__store_le(state + 16, (uint64_t)trainer->first_bands, 4);
+    gsf__store_le(state + 20, weight, 4);
+    gsf__store_le(state + 24, model->count, 8);
+    gsf__store_le(state + 32, trainer->restored_steps, 8);
+    gsf__store_le(state + 40, trainer->rejected, 8);
+    gsf__store_le(state + 48, gsf__trainer_settings(trainer), 8);
+    for (int a = 0; a < 3; a++) {
+        uint64_t bits;
+        memcpy(&bits, &trainer->view.origin[a], 8);
+        gsf__store_le(state + 56 + 8 * a, bits, 8);
+    }
+    gsf_chunks_add(ctx, chunks, "TRNR", state, sizeof state);
+    char tag[5];
+    void* data;
+    size_t row;
+    for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
+        gsf_chunks_add(ctx, chunks, tag, data, model->count * row);
+}
+
+// Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids.
+static gsf_result gsf__trainer_check_array(gsf_context* ctx, const char* name, int i, const gsf_chunk* chunk,
+                                           size_t count, size_t row, uint32_t next_id) {
+    if (chunk->size != count * row)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s has %zu bytes, expected %zu", name, chunk->tag, chunk->size,
+                        count * row);
+    const char* p = (const char*)chunk->data;
+    for (size_t k = 0; k < chunk->size / 4; k++) {
+        uint32_t bits;
+        float value;
+        memcpy(&bits, p + 4 * k, 4);
+        memcpy(&value, p + 4 * k, 4);
+        int ok = 1;
+        if (i < 3 * GSF__GROUPS || i == 3 * GSF__GROUPS + 1)
+            ok = fabsf(value) <= FLT_MAX && (i < 2 * GSF__GROUPS || value >= 0.0f);
+        else if (i == 3 * GSF__GROUPS) ok = bits < next_id;
+        if (!ok) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s: bad value at %zu", name, chunk->tag, 4 * k);
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trainer, const char* name,
+                                             const void* chunks, size_t size) {
+    gsf__model* model = &trainer->model;
+    gsf_chunk chunk;
+    GSF__TRY(gsf_chunks_check(ctx, name, chunks, size));
+    if (!gsf_chunks_find(chunks, size, "TRNR", &chunk) || chunk.size != GSF__STATE_SIZE)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no trainer state (chunk TRNR of %d bytes)", name, GSF__STATE_SIZE);
+    const char* state = (const char*)chunk.data;
+    uint32_t mark;
+    memcpy(&mark, state, 4);
+    if (mark != GSF__BYTE_ORDER_MARK)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: written on a machine of another byte order", name);
+    const uint64_t iteration = gsf__load_le(state + 4, 4), sh_degree = gsf__load_le(state + 8, 4);
+    const uint32_t next_id = (uint32_t)gsf__load_le(state + 12, 4), weight = (uint32_t)gsf__load_le(state + 20, 4);
+    const uint64_t first_bands = gsf__load_le(state + 16, 4), count = gsf__load_le(state + 24, 8);
+    float restored_weight;
+    memcpy(&restored_weight, &weight, 4);
+    if (iteration > (uint64_t)trainer->desc.iterations || sh_degree != (uint64_t)model->sh_degree || first_bands < 1 ||
+        first_bands > 4 || count > size || !(fabsf(restored_weight) <= FLT_MAX))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: iteration %llu of %d, SH degree %llu (here %d), %llu splats", name,
+                        (unsigned long long)iteration, (int)trainer->desc.iterations, (unsigned long long)sh_degree,
+                        (int)model->sh_degree, (unsigned long long)count);
+    double origin[3];
+    for (int a = 0; a < 3; a++) {
+        const uint64_t bits = gsf__load_le(state + 56 + 8 * a, 8);
+        memcpy(&origin[a], &bits, 8);
+        if (!isfinite(origin[a])) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: origin is not finite", name);
+    }
+    char tag[5];
+    void* data;
+    size_t row;
+    for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++) {
+        if (!gsf_chunks_find(chunks, size, tag, &chunk))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s is missing", name, tag);
+        GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id));
+    }
+    GSF__TRY(gsf__model_reserve(ctx, model, (size_t)count));
+
+    for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
+        if (gsf_chunks_find(chunks, size, tag, &chunk) && chunk.size) memcpy(data, chunk.data, chunk.size);
+    model->count = (size_t)count;
+    model->next_id = next_id;
+    memcpy(trainer->view.origin, origin, sizeof origin);
+    trainer->iteration = (int32_t)iteration;
+    trainer->first_bands = (int32_t)first_bands;
+    trainer->restored_weight = restored_weight;
+    trainer->restored_steps = gsf__load_le(state + 32, 8);
+    trainer->rejected = (size_t)gsf__load_le(state + 40, 8);
+    gsf__trainer_refresh_view(trainer);
+    if (gsf__load_le(state + 48, 8) != gsf__trainer_settings(trainer))
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: continues with other settings or views than it was written with", name);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc, const gsf_train_view* views,
+                                          size_t view_count, const gsf_splats* initial, gsf_trainer** out) {
+    *out = NULL;
+    gsf_trainer* trainer = (gsf_trainer*)gsf_alloc_zeroed(ctx, 1, sizeof *trainer);
+    if (!trainer) return GSF_ERROR_OUT_OF_MEMORY;
+    trainer->desc = gsf__train_desc_defaults(desc);
+    trainer->restored_weight = 1.0f;
+    const gsf_result result = gsf__trainer_setup(ctx, trainer, views, view_count, initial);
+    if (result != GSF_OK) gsf_splat_destroy_trainer(ctx, trainer);
+    else *out = trainer;
+    return result;
+}
+
+GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
+    if (!trainer) return;
+    gsf__photo_set_destroy(ctx, &trainer->photos);
+    gsf__photo_set_destroy(ctx, &trainer->restored);
+    gsf__model_destroy(ctx, &trainer->model);
+    gsf__loss_destroy_scratch(ctx, &trainer->loss);
+    if (trainer->rasterizer) gsf_splat_destroy_rasterizer(ctx, trainer->rasterizer);
+    gsf_free(ctx, trainer->color);
+    gsf_free(ctx, trainer->d_color);
+    gsf_free(ctx, trainer->depth);
+    gsf_free(ctx, trainer->d_depth);
+    gsf_free(ctx, trainer);
+}
+
+GSF_API gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
+                                                size_t count) {
+    gsf__photo_set set;
+    GSF__TRY(gsf__photo_set_make(ctx, views, count, "restored view", GSF__MOMENT_BYTES - trainer->photos.moment_bytes,
+                                 &set));
+    const gsf_result result = gsf__trainer_reserve_images(ctx, trainer, &set);
+    if (result != GSF_OK) {
+        gsf__photo_set_destroy(ctx, &set);
+        return result;
+    }
+    gsf__photo_set_destroy(ctx, &trainer->restored);
+    trainer->restored = set;
+    return GSF_OK;
+}
+
+GSF_API void gsf_splat_set_restored_weight(gsf_trainer* trainer, float lambda) {
+    trainer->restored_weight = lambda > 0.0f && lambda <= 1e6f ? lambda : 0.0f;
+}
+
+GSF_API gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_trainer* trainer, const gsf_camera* camera,
+                                            const gsf_render_output* out) {
+    gsf_render_desc render = trainer->desc.render;
+    render.sh_bands = gsf__trainer_bands(trainer, trainer->iteration);
+    return gsf_splat_render(ctx, trainer->rasterizer, &trainer->view, camera, &render, out);
+}
+
+GSF_API gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out) {
+    const gsf_splats* view = &trainer->view;
+    GSF__TRY(gsf_splat_make(ctx, view->count, view->sh_degree, out));
+    const size_t n = view->count, sh = 3 * (size_t)gsf_splat_sh_count(view->sh_degree);
+    memcpy(out->origin, view->origin, sizeof out->origin);
+    if (n == 0) return GSF_OK;
+    memcpy(out->means, view->means, 3 * n * sizeof(float));
+    memcpy(out->log_scales, view->log_scales, 3 * n * sizeof(float));
+    memcpy(out->quats, view->quats, 4 * n * sizeof(float));
+    memcpy(out->opacity_logits, view->opacity_logits, n * sizeof(float));
+    memcpy(out->sh, view->sh, sh * n * sizeof(float));
+    memcpy(out->ids, view->ids, n * sizeof(uint32_t));
+    return GSF_OK;
+}
+
+GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) { return &trainer->view; }
 
 // ---- >>warp --------------------------------------------------------------------
 
