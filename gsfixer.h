@@ -321,9 +321,11 @@ typedef enum gsf_ssim_kind {
     GSF_SSIM_SKIMAGE,      // scikit-image's default: 7x7 uniform window, sample covariance, mean over the valid inside
 } gsf_ssim_kind;
 
-// Images u8 or f32 (values in [0,1] when f32), equal sizes and channels. Double accumulation in a fixed order.
+// Images of any dtype, also of two (floats in [0,1], integers stand for value / maximum), equal sizes and channels. All
+// sums in double, in a fixed order. A NaN or infinity that counts gives GSF_ERROR_NUMERIC.
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
-// them). With no pixel to count the result is GSF_ERROR_DEGENERATE. PSNR of identical images is +infinity.
+// them). With no pixel to count, or an image smaller than the window needs (6 pixels for TORCHMETRICS, 7 for SKIMAGE), the
+// result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), of identical images +infinity.
 GSF_API GSF_NODISCARD gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
                                           const gsf_image* mask, double* out);
 GSF_API GSF_NODISCARD gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
@@ -1998,6 +2000,289 @@ GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_
 // ---- >>resize ------------------------------------------------------------------
 
 // ---- >>metrics -----------------------------------------------------------------
+
+static gsf_result gsf__check_image_pair(gsf_context* ctx, const char* what, const gsf_image* a, const gsf_image* b,
+                                        const gsf_image* mask) {
+    GSF__TRY(gsf__check_image(ctx, what, a));
+    GSF__TRY(gsf__check_image(ctx, what, b));
+    if (a->width != b->width || a->height != b->height || a->channels != b->channels)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: images of %lld x %lld x %d and %lld x %lld x %d", what,
+                        (long long)a->width, (long long)a->height, (int)a->channels, (long long)b->width,
+                        (long long)b->height, (int)b->channels);
+    if (!mask) return GSF_OK;
+    GSF__TRY(gsf__check_image(ctx, what, mask));
+    if (mask->dtype != GSF_U8 || mask->channels != 1 || mask->width != a->width || mask->height != a->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: the mask must be u8 with one channel, %lld x %lld", what,
+                        (long long)a->width, (long long)a->height);
+    return GSF_OK;
+}
+
+static int gsf__mask_at(const gsf_image* mask, int64_t x, int64_t y) {
+    return !mask || *((const unsigned char*)mask->data + y * mask->stride_y + x * mask->stride_x) != 0;
+}
+
+typedef struct gsf__metric_sum { // of one chunk of rows
+    double sum;
+    uint64_t count;
+} gsf__metric_sum;
+
+// Adds the chunks in order. what: for the error text.
+static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf__metric_sum* sums, size_t chunks,
+                                   double* mean) {
+    double sum = 0.0;
+    uint64_t count = 0;
+    for (size_t i = 0; i < chunks; i++) {
+        sum += sums[i].sum;
+        count += sums[i].count;
+    }
+    if (count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: no pixel to count", what);
+    if (!isfinite(sum)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: an image holds a NaN or infinite value", what);
+    *mean = sum / (double)count;
+    return GSF_OK;
+}
+
+typedef struct gsf__psnr_job {
+    const gsf_image *a, *b, *mask;
+    int64_t rows;
+    gsf__metric_sum* sums; // one per chunk
+} gsf__psnr_job;
+
+static void gsf__psnr_rows(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__psnr_job* job = (const gsf__psnr_job*)arg;
+    const gsf_image *a = job->a, *b = job->b;
+    const int64_t first = (int64_t)chunk * job->rows, end = first + job->rows < a->height ? first + job->rows : a->height;
+    double pa[GSF__CONVERT_RUN], pb[GSF__CONVERT_RUN], sum = 0.0;
+    uint64_t count = 0;
+    for (int64_t y = first; y < end; y++)
+        for (int32_t c = 0; c < a->channels; c++)
+            for (int64_t x = 0; x < a->width; x += GSF__CONVERT_RUN) {
+                const int64_t left = a->width - x, n = left < GSF__CONVERT_RUN ? left : (int64_t)GSF__CONVERT_RUN;
+                gsf__load_pixels((const char*)a->data + y * a->stride_y + x * a->stride_x + c * a->stride_c, a->stride_x,
+                                 a->dtype, (size_t)n, pa);
+                gsf__load_pixels((const char*)b->data + y * b->stride_y + x * b->stride_x + c * b->stride_c, b->stride_x,
+                                 b->dtype, (size_t)n, pb);
+                for (int64_t i = 0; i < n; i++)
+                    if (gsf__mask_at(job->mask, x + i, y)) {
+                        sum += (pa[i] - pb[i]) * (pa[i] - pb[i]);
+                        count++;
+                    }
+            }
+    job->sums[chunk].sum = sum;
+    job->sums[chunk].count = count;
+}
+
+GSF_API gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                            double* out) {
+    GSF__TRY(gsf__check_image_pair(ctx, "psnr", a, b, mask));
+    gsf__psnr_job job;
+    job.a = a;
+    job.b = b;
+    job.mask = mask;
+    job.rows = gsf__image_rows_per_chunk(a->width, a->channels);
+    const size_t chunks = (size_t)((a->height + job.rows - 1) / job.rows);
+    job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
+    if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__parallel_for(ctx, chunks, gsf__psnr_rows, &job);
+    double mse;
+    const gsf_result result = gsf__metric_mean(ctx, "psnr", job.sums, chunks, &mse);
+    gsf_free(ctx, job.sums);
+    if (result == GSF_OK) *out = mse > 0.0 ? -10.0 * log10(mse) : (double)INFINITY;
+    return result;
+}
+
+/* SSIM, separable: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring of as many rows
+   as the window is high; a map row is the ring blurred along y. Chunks of rows warm up their own ring. */
+
+enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
+
+// out[i] = sum over t of weights[t] * rows[t][i], t ascending; the AVX2 twin does the same operations on four i at once.
+static void gsf__ssim_blur_ref(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
+    for (size_t i = 0; i < n; i++) {
+        double sum = weights[0] * rows[0][i];
+        for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
+        out[i] = sum;
+    }
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* const* rows, const double* weights, int taps,
+                                                 size_t n) {
+    size_t i = 0;
+    for (; i + 8 <= n; i += 8) {
+        const __m256d w = _mm256_set1_pd(weights[0]);
+        __m256d s0 = _mm256_mul_pd(w, _mm256_loadu_pd(rows[0] + i));
+        __m256d s1 = _mm256_mul_pd(w, _mm256_loadu_pd(rows[0] + i + 4));
+        for (int t = 1; t < taps; t++) {
+            const __m256d v = _mm256_set1_pd(weights[t]);
+            s0 = _mm256_add_pd(s0, _mm256_mul_pd(v, _mm256_loadu_pd(rows[t] + i)));
+            s1 = _mm256_add_pd(s1, _mm256_mul_pd(v, _mm256_loadu_pd(rows[t] + i + 4)));
+        }
+        _mm256_storeu_pd(out + i, s0);
+        _mm256_storeu_pd(out + i + 4, s1);
+    }
+    for (; i < n; i++) {
+        double sum = weights[0] * rows[0][i];
+        for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
+        out[i] = sum;
+    }
+}
+#endif
+
+typedef struct gsf__ssim_job {
+    const gsf_image *a, *b, *mask;
+    gsf_ssim_kind kind;
+    int taps, radius;
+    double weights[GSF__SSIM_MAX_TAPS];
+    int64_t inset;           // map rows and columns left out at each border
+    size_t chunks_per_channel;
+    gsf__metric_sum* sums;   // one per (channel, chunk)
+    double* scratch;         // per worker: padded source rows, ring, map row quantities
+    size_t scratch_size;     // doubles per worker
+    void (*blur)(double* out, const double* const* rows, const double* weights, int taps, size_t n);
+} gsf__ssim_job;
+
+static int64_t gsf__reflect(int64_t i, int64_t n) { return i < 0 ? -i : i >= n ? 2 * n - 2 - i : i; }
+
+// Row y of both images, blurred along x, into five rows of `out` that lie `pitch` doubles apart.
+// padded: 5 rows of width + 2 radius.
+static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_t y, double* padded, double* out,
+                               size_t pitch) {
+    const gsf_image *a = job->a, *b = job->b;
+    const int64_t radius = job->radius;
+    const size_t width = (size_t)a->width, wide = width + 2 * (size_t)radius;
+    if (y < 0 || y >= a->height) {
+        if (job->kind == GSF_SSIM_3DGS) { // beyond the border all is zero
+            for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) memset(out + q * pitch, 0, width * sizeof(double));
+            return;
+        }
+        y = gsf__reflect(y, a->height);
+    }
+    double *pa = padded, *pb = padded + wide;
+    gsf__load_pixels((const char*)a->data + y * a->stride_y + channel * a->stride_c, a->stride_x, a->dtype, width,
+                     pa + radius);
+    gsf__load_pixels((const char*)b->data + y * b->stride_y + channel * b->stride_c, b->stride_x, b->dtype, width,
+                     pb + radius);
+    for (int64_t x = -radius; x < 0; x++) { // zeros or the mirror image on both sides
+        const int64_t right = a->width - 1 - x; // as far beyond the right border as x is beyond the left one
+        const int mirror = job->kind == GSF_SSIM_TORCHMETRICS;
+        for (int i = 0; i < 2; i++) {
+            double* p = (i ? pb : pa) + radius;
+            p[x] = mirror ? p[-x] : 0.0;
+            p[right] = mirror ? p[gsf__reflect(right, a->width)] : 0.0;
+        }
+    }
+    double *paa = pb + wide, *pbb = paa + wide, *pab = pbb + wide;
+    for (size_t i = 0; i < wide; i++) {
+        paa[i] = pa[i] * pa[i];
+        pbb[i] = pb[i] * pb[i];
+        pab[i] = pa[i] * pb[i];
+    }
+    const double* rows[GSF__SSIM_MAX_TAPS];
+    for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) {
+        for (int t = 0; t < job->taps; t++) rows[t] = padded + q * wide + t;
+        job->blur(out + q * pitch, rows, job->weights, job->taps, width);
+    }
+}
+
+static double gsf__ssim_value(gsf_ssim_kind kind, double ma, double mb, double maa, double mbb, double mab) {
+    const double c1 = 0.01 * 0.01, c2 = 0.03 * 0.03;
+    double va = maa - ma * ma, vb = mbb - mb * mb, cov = mab - ma * mb;
+    if (kind == GSF_SSIM_TORCHMETRICS) {
+        if (va < 0.0) va = 0.0;
+        if (vb < 0.0) vb = 0.0;
+    } else if (kind == GSF_SSIM_SKIMAGE) { // sample covariance of 7 x 7 values
+        va *= 49.0 / 48.0;
+        vb *= 49.0 / 48.0;
+        cov *= 49.0 / 48.0;
+    }
+    return ((2.0 * ma * mb + c1) * (2.0 * cov + c2)) / ((ma * ma + mb * mb + c1) * (va + vb + c2));
+}
+
+static void gsf__ssim_rows(void* arg, size_t chunk, int worker) {
+    const gsf__ssim_job* job = (const gsf__ssim_job*)arg;
+    const int32_t channel = (int32_t)(chunk / job->chunks_per_channel);
+    const int64_t last = job->a->height - job->inset, radius = job->radius;
+    const int64_t first = job->inset + (int64_t)(chunk % job->chunks_per_channel) * GSF__SSIM_ROWS;
+    const int64_t end = first + GSF__SSIM_ROWS < last ? first + GSF__SSIM_ROWS : last;
+    const size_t width = (size_t)job->a->width, taps = (size_t)job->taps;
+    double* padded = job->scratch + (size_t)worker * job->scratch_size;
+    double* ring = padded + GSF__SSIM_QUANTITIES * (width + 2 * (size_t)radius); // (quantity, taps, width)
+    double* map = ring + GSF__SSIM_QUANTITIES * taps * width;                     // (quantity, width)
+    double sum = 0.0;
+    uint64_t count = 0;
+    for (int64_t y = first - radius; y < end + radius; y++) { // source rows; map row y - radius is complete after each
+        const size_t slot = (size_t)(y - (first - radius)) % taps;
+        gsf__ssim_blur_row(job, channel, y, padded, ring + slot * width, taps * width);
+        const int64_t row = y - radius;
+        if (row < first) continue;
+        const double* rows[GSF__SSIM_MAX_TAPS];
+        for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) {
+            for (size_t t = 0; t < taps; t++) rows[t] = ring + (q * taps + (slot + 1 + t) % taps) * width;
+            job->blur(map + q * width, rows, job->weights, job->taps, width);
+        }
+        for (size_t x = (size_t)job->inset; x < width - (size_t)job->inset; x++)
+            if (gsf__mask_at(job->mask, (int64_t)x, row)) {
+                sum += gsf__ssim_value(job->kind, map[x], map[width + x], map[2 * width + x], map[3 * width + x],
+                                       map[4 * width + x]);
+                count++;
+            }
+    }
+    job->sums[chunk].sum = sum;
+    job->sums[chunk].count = count;
+}
+
+GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
+                            const gsf_image* mask, double* out) {
+    // exp(-x^2 / (2 1.5^2)) / sum, as the official code has it in float32
+    static const double gauss[6] = {0.26601171493530273, 0.21300552785396576,  0.10936068743467331,
+                                    0.036000773310661316, 0.0075987582094967365, 0.001028380123898387};
+    GSF__TRY(gsf__check_image_pair(ctx, "ssim", a, b, mask));
+    gsf__ssim_job job;
+    memset(&job, 0, sizeof job);
+    job.a = a;
+    job.b = b;
+    job.mask = mask;
+    job.kind = kind;
+    switch (kind) {
+        case GSF_SSIM_3DGS:
+        case GSF_SSIM_TORCHMETRICS:
+            job.taps = 11;
+            for (int t = 0; t < 11; t++) job.weights[t] = gauss[t < 5 ? 5 - t : t - 5];
+            break;
+        case GSF_SSIM_SKIMAGE:
+            job.taps = 7;
+            job.inset = 3;
+            for (int t = 0; t < 7; t++) job.weights[t] = 1.0 / 7.0;
+            break;
+        default: return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ssim: kind %d", (int)kind);
+    }
+    job.radius = job.taps / 2;
+    const int64_t least = kind == GSF_SSIM_3DGS ? 1 : kind == GSF_SSIM_TORCHMETRICS ? 6 : 7;
+    if (a->width < least || a->height < least)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ssim: %lld x %lld is smaller than the window", (long long)a->width,
+                        (long long)a->height);
+    job.blur = gsf__ssim_blur_ref;
+#if GSF__X86
+    if (ctx->cpu_level >= GSF_CPU_AVX2) job.blur = gsf__ssim_blur_avx2;
+#endif
+    job.chunks_per_channel = (size_t)((a->height - 2 * job.inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
+    size_t chunks = 0;
+    if (!gsf__mul_size(job.chunks_per_channel, (size_t)a->channels, &chunks) ||
+        !gsf__mul_size((size_t)a->width + 2 * (size_t)job.radius, GSF__SSIM_QUANTITIES * ((size_t)job.taps + 2),
+                       &job.scratch_size))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "ssim: image too large");
+    job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
+    job.scratch = (double*)gsf_alloc(ctx, job.scratch_size, (size_t)ctx->parallel.worker_count * sizeof(double));
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    if (job.sums && job.scratch) {
+        gsf__parallel_for(ctx, chunks, gsf__ssim_rows, &job);
+        result = gsf__metric_mean(ctx, "ssim", job.sums, chunks, out);
+    }
+    gsf_free(ctx, job.sums);
+    gsf_free(ctx, job.scratch);
+    return result;
+}
 
 // ---- >>cameras -----------------------------------------------------------------
 
