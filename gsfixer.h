@@ -2234,9 +2234,12 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int worker) {
 
 GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
                             const gsf_image* mask, double* out) {
-    // exp(-x^2 / (2 1.5^2)) / sum, as the official code has it in float32
-    static const double gauss[6] = {0.26601171493530273, 0.21300552785396576,  0.10936068743467331,
-                                    0.036000773310661316, 0.0075987582094967365, 0.001028380123898387};
+    // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5: rounded to float32 as the 3DGS code has it, and in double as torchmetrics
+    // has it for double images
+    static const double gauss[2][6] = {{0.26601171493530273, 0.21300552785396576, 0.10936068743467331,
+                                        0.036000773310661316, 0.0075987582094967365, 0.001028380123898387},
+                                       {0.26601172486179436, 0.21300553771125369, 0.10936068950970002,
+                                        0.036000772128430829, 0.007598758135239185, 0.0010283800844791101}};
     GSF__TRY(gsf__check_image_pair(ctx, "ssim", a, b, mask));
     gsf__ssim_job job;
     memset(&job, 0, sizeof job);
@@ -2248,7 +2251,7 @@ GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_imag
         case GSF_SSIM_3DGS:
         case GSF_SSIM_TORCHMETRICS:
             job.taps = 11;
-            for (int t = 0; t < 11; t++) job.weights[t] = gauss[t < 5 ? 5 - t : t - 5];
+            for (int t = 0; t < 11; t++) job.weights[t] = gauss[kind == GSF_SSIM_TORCHMETRICS][t < 5 ? 5 - t : t - 5];
             break;
         case GSF_SSIM_SKIMAGE:
             job.taps = 7;
