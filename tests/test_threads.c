@@ -82,15 +82,26 @@ static float* make_floats(size_t count, uint64_t stream) {
 static void run_images(gsf_context* ctx, run_output* run) {
     enum { W = 301, H = 223 };
     float* a = make_floats(W * H * 3, 0);
+    float* b = make_floats(W * H * 3, 1);
     uint8_t* bytes = (uint8_t*)malloc(W * H * 3);
-    const gsf_image image_a = gsf_wrap_image(a, GSF_F32, W, H, 3);
+    const gsf_image image_a = gsf_wrap_image(a, GSF_F32, W, H, 3), image_b = gsf_wrap_image(b, GSF_F32, W, H, 3);
     const gsf_image image_bytes = gsf_wrap_image(bytes, GSF_U8, W, H, 3);
 
     stage_output* out = begin_stage(run, "convert");
     CHECK_OK(ctx, gsf_convert_image(ctx, &image_a, &image_bytes));
     add(out, bytes, W * H * 3);
 
+    out = begin_stage(run, "metrics");
+    double value;
+    CHECK_OK(ctx, gsf_psnr(ctx, &image_a, &image_b, NULL, &value));
+    add(out, &value, sizeof value);
+    const gsf_ssim_kind kinds[3] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
+    for (int i = 0; i < 3; i++) {
+        CHECK_OK(ctx, gsf_ssim(ctx, kinds[i], &image_a, &image_b, NULL, &value));
+        add(out, &value, sizeof value);
+    }
     free(a);
+    free(b);
     free(bytes);
 }
 
@@ -189,6 +200,73 @@ static void run_render(gsf_context* ctx, run_output* run) {
     free(d_alpha);
 }
 
+// Trains towards pictures of other splats, through densification, pruning and an opacity reset, with restored views.
+static void run_training(gsf_context* ctx, run_output* run) {
+    gsf_splats truth, start;
+    make_splats(ctx, 8, &truth);
+    make_splats(ctx, 9, &start);
+    gsf_train_view views[VIEWS];
+    memset(views, 0, sizeof views);
+    float* pixels = make_floats(VIEWS * WIDTH * HEIGHT * 3, 0);
+    float* weight = make_floats(WIDTH * HEIGHT, 1);
+    gsf_rasterizer* rasterizer = NULL;
+    if (!CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &rasterizer))) return;
+    for (int v = 0; v < VIEWS; v++) {
+        views[v].camera = make_camera(v);
+        views[v].image = gsf_wrap_image(pixels + (size_t)v * WIDTH * HEIGHT * 3, GSF_F32, WIDTH, HEIGHT, 3);
+        gsf_render_output image;
+        memset(&image, 0, sizeof image);
+        image.color = views[v].image;
+        CHECK_OK(ctx, gsf_splat_render(ctx, rasterizer, &truth, &views[v].camera, NULL, &image));
+    }
+    gsf_splat_destroy_rasterizer(ctx, rasterizer);
+
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 48;
+    desc.seed = 11;
+    desc.sh_interval = 8;
+    desc.densify_from = 6;
+    desc.densify_until = 40;
+    desc.densify_interval = 6;
+    desc.densify_grad = 1e-5f;
+    desc.opacity_reset_interval = 20;
+    desc.dropout = 0.1f;
+    gsf_trainer* trainer = NULL;
+    stage_output* out = begin_stage(run, "training");
+    if (CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, 2, &start, &trainer))) {
+        size_t most = 0;
+        for (int i = 0; i < desc.iterations; i++) {
+            gsf_train_stats stats;
+            memset(&stats, 0, sizeof stats);
+            if (i == 24) { // the third view comes in as a restored one
+                views[2].weight = gsf_wrap_image(weight, GSF_F32, WIDTH, HEIGHT, 1);
+                CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, views + 2, 1));
+                gsf_splat_set_restored_weight(trainer, 0.5f);
+            }
+            if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+            add(out, &stats.loss, sizeof stats.loss);
+            if (stats.splats > most) most = stats.splats;
+        }
+        CHECK(most > SPLATS); // it did densify
+        gsf_splats trained;
+        if (CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &trained))) add_splats(out, &trained);
+        gsf_splat_destroy(ctx, &trained);
+        out = begin_stage(run, "checkpoint");
+        gsf_text chunks;
+        memset(&chunks, 0, sizeof chunks);
+        gsf_splat_trainer_save(ctx, trainer, &chunks);
+        CHECK(!chunks.failed && chunks.size > 0);
+        add(out, chunks.data, chunks.size);
+        gsf_destroy_text(ctx, &chunks);
+        gsf_splat_destroy_trainer(ctx, trainer);
+    }
+    gsf_splat_destroy(ctx, &truth);
+    gsf_splat_destroy(ctx, &start);
+    free(pixels);
+    free(weight);
+}
+
 static void run_all(int workers, run_output* run) {
     job_system jobs;
     memset(run, 0, sizeof *run);
@@ -202,6 +280,7 @@ static void run_all(int workers, run_output* run) {
         run_images(&ctx, run);
         run_points(&ctx, run);
         run_render(&ctx, run);
+        run_training(&ctx, run);
     }
     job_stop(&jobs);
 }
