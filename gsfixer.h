@@ -306,10 +306,11 @@ typedef enum gsf_resize_filter {
     GSF_RESIZE_PIL_BILINEAR,   // PIL.Image.resize: antialiased when shrinking, u8 in two integer passes, bit-exact
     GSF_RESIZE_PIL_BICUBIC,    //   (a = -0.5)
     GSF_RESIZE_PIL_LANCZOS,    //   (a = 3)
-    GSF_RESIZE_TORCH_BILINEAR, // F.interpolate(bilinear, align_corners=False, antialias=False), f32
+    GSF_RESIZE_TORCH_BILINEAR, // F.interpolate(bilinear, align_corners=False, antialias=False), f32 in and out
 } gsf_resize_filter;
 
-// Resizes src into dst (sizes taken from the views; same dtype and channels; PIL: u8 or f32; torch: f32).
+// Resizes src into dst (sizes taken from the views, which must not overlap; same dtype and channels; PIL: u8 or f32;
+// torch: f32). Channels are resized one by one: PIL itself multiplies colours by alpha first when it resizes RGBA.
 GSF_API GSF_NODISCARD gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
                                                   const gsf_image* dst);
 
@@ -1998,6 +1999,281 @@ GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_
 }
 
 // ---- >>resize ------------------------------------------------------------------
+// What PIL.Image.resize does (Pillow's Resample.c): the filter is widened by the shrink factor and sampled at pixel
+// centres, weights are normalised in double, then rounded to 22-bit fixed point for u8; first along x,
+// rounded to u8 again, then along y. An axis whose size stays is left alone.
+
+enum { GSF__PIL_BITS = 32 - 8 - 2, GSF__RESIZE_RUN = 256 };
+
+typedef struct gsf__resize_axis { // for each output position: taps first..first+count-1 with their weights
+    int64_t in, out;
+    size_t taps;           // weights stored per position
+    int64_t *first, *count;
+    double* weights;       // (out, taps)
+    int32_t* fixed;        // (out, taps)
+    void* owned;
+} gsf__resize_axis;
+
+static double gsf__sinc(double x) {
+    const double pi = 3.14159265358979323846;
+    return x == 0.0 ? 1.0 : sin(x * pi) / (x * pi);
+}
+
+static double gsf__pil_filter(gsf_resize_filter filter, double x) {
+    const double a = -0.5;
+    if (filter == GSF_RESIZE_PIL_LANCZOS) return x >= -3.0 && x < 3.0 ? gsf__sinc(x) * gsf__sinc(x / 3.0) : 0.0;
+    x = fabs(x);
+    if (filter == GSF_RESIZE_PIL_BILINEAR) return x < 1.0 ? 1.0 - x : 0.0;
+    if (x < 1.0) return ((a + 2.0) * x - (a + 3.0)) * x * x + 1.0;
+    return x < 2.0 ? (((x - 5.0) * x + 8.0) * x - 4.0) * a : 0.0;
+}
+
+static gsf_result gsf__make_pil_axis(gsf_context* ctx, gsf_resize_filter filter, int64_t in, int64_t out,
+                                     gsf__resize_axis* axis) {
+    memset(axis, 0, sizeof *axis);
+    axis->in = in;
+    axis->out = out;
+    if (in == out) return GSF_OK;
+    const double scale = (double)in / (double)out, widened = scale < 1.0 ? 1.0 : scale, narrow = 1.0 / widened;
+    const double support = (filter == GSF_RESIZE_PIL_BILINEAR ? 1.0 : filter == GSF_RESIZE_PIL_BICUBIC ? 2.0 : 3.0) * widened;
+    axis->taps = 2 * (size_t)ceil(support) + 1;
+    size_t weights;
+    if (!gsf__mul_size(axis->taps, (size_t)out, &weights) || weights > SIZE_MAX / 32)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "resize: %lld to %lld pixels", (long long)in, (long long)out);
+    axis->owned = gsf_alloc(ctx, (size_t)out * 2 * sizeof(int64_t) + weights * (sizeof(double) + sizeof(int32_t)), 1);
+    if (!axis->owned) return GSF_ERROR_OUT_OF_MEMORY;
+    axis->first = (int64_t*)axis->owned;
+    axis->count = axis->first + out;
+    axis->weights = (double*)(void*)(axis->count + out);
+    axis->fixed = (int32_t*)(void*)(axis->weights + weights);
+    for (int64_t i = 0; i < out; i++) {
+        const double center = ((double)i + 0.5) * scale;
+        double *w = axis->weights + (size_t)i * axis->taps, sum = 0.0;
+        const double low = center - support + 0.5, high = center + support + 0.5;
+        const int64_t first = low > 0.0 ? (int64_t)low : 0, end = high < (double)in ? (int64_t)high : in;
+        for (int64_t k = 0; k < end - first; k++) {
+            w[k] = gsf__pil_filter(filter, ((double)(k + first) - center + 0.5) * narrow);
+            sum += w[k];
+        }
+        axis->first[i] = first;
+        axis->count[i] = end - first;
+        for (int64_t k = 0; k < end - first; k++) {
+            if (sum != 0.0) w[k] /= sum;
+            const double scaled = w[k] * (1 << GSF__PIL_BITS);
+            axis->fixed[(size_t)i * axis->taps + (size_t)k] = (int32_t)(w[k] < 0.0 ? scaled - 0.5 : scaled + 0.5);
+        }
+    }
+    return GSF_OK;
+}
+
+static uint8_t gsf__pil_clip(int32_t sum) { // half was added before
+    sum >>= GSF__PIL_BITS; // arithmetic
+    return (uint8_t)(sum < 0 ? 0 : sum > 255 ? 255 : sum);
+}
+
+typedef struct gsf__resize_job {
+    const gsf_image *src, *dst; // of this pass
+    const gsf__resize_axis* axis;
+    int64_t rows;
+} gsf__resize_job;
+
+// Along x, same height.
+static void gsf__resize_rows_x(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__resize_job* job = (const gsf__resize_job*)arg;
+    const gsf_image *src = job->src, *dst = job->dst;
+    const gsf__resize_axis* axis = job->axis;
+    const int64_t start = (int64_t)chunk * job->rows, end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    for (int64_t y = start; y < end; y++)
+        for (int64_t x = 0; x < dst->width; x++)
+            for (int32_t c = 0; c < dst->channels; c++) {
+                const char* from = (const char*)src->data + y * src->stride_y + axis->first[x] * src->stride_x + c * src->stride_c;
+                char* to = (char*)dst->data + y * dst->stride_y + x * dst->stride_x + c * dst->stride_c;
+                const int64_t count = axis->count[x];
+                if (src->dtype == GSF_U8) {
+                    const int32_t* w = axis->fixed + (size_t)x * axis->taps;
+                    int32_t sum = 1 << (GSF__PIL_BITS - 1);
+                    for (int64_t k = 0; k < count; k++) sum += *(const uint8_t*)(from + k * src->stride_x) * w[k];
+                    *(uint8_t*)to = gsf__pil_clip(sum);
+                } else {
+                    const double* w = axis->weights + (size_t)x * axis->taps;
+                    double sum = 0.0;
+                    for (int64_t k = 0; k < count; k++) {
+                        float v;
+                        memcpy(&v, from + k * src->stride_x, sizeof v);
+                        sum += (double)v * w[k];
+                    }
+                    const float v = (float)sum;
+                    memcpy(to, &v, sizeof v);
+                }
+            }
+}
+
+// Along y, same width: runs of pixels, so that the memory is walked along rows.
+static void gsf__resize_rows_y(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__resize_job* job = (const gsf__resize_job*)arg;
+    const gsf_image *src = job->src, *dst = job->dst;
+    const gsf__resize_axis* axis = job->axis;
+    const int64_t start = (int64_t)chunk * job->rows, end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    int32_t sums[GSF__RESIZE_RUN];
+    double wide[GSF__RESIZE_RUN];
+    for (int64_t y = start; y < end; y++)
+        for (int32_t c = 0; c < dst->channels; c++)
+            for (int64_t x = 0; x < dst->width; x += GSF__RESIZE_RUN) {
+                const int64_t left = dst->width - x, n = left < GSF__RESIZE_RUN ? left : (int64_t)GSF__RESIZE_RUN;
+                const char* from = (const char*)src->data + axis->first[y] * src->stride_y + x * src->stride_x + c * src->stride_c;
+                char* to = (char*)dst->data + y * dst->stride_y + x * dst->stride_x + c * dst->stride_c;
+                const int64_t sx = src->stride_x, dx = dst->stride_x;
+                for (int64_t i = 0; i < n; i++) {
+                    sums[i] = 1 << (GSF__PIL_BITS - 1);
+                    wide[i] = 0.0;
+                }
+                for (int64_t k = 0; k < axis->count[y]; k++, from += src->stride_y) {
+                    if (src->dtype == GSF_U8) {
+                        const int32_t w = axis->fixed[(size_t)y * axis->taps + (size_t)k];
+                        for (int64_t i = 0; i < n; i++) sums[i] += *(const uint8_t*)(from + i * sx) * w;
+                    } else {
+                        const double w = axis->weights[(size_t)y * axis->taps + (size_t)k];
+                        for (int64_t i = 0; i < n; i++) {
+                            float v;
+                            memcpy(&v, from + i * sx, sizeof v);
+                            wide[i] += (double)v * w;
+                        }
+                    }
+                }
+                for (int64_t i = 0; i < n; i++) {
+                    const float v = (float)wide[i];
+                    if (src->dtype == GSF_U8) *(uint8_t*)(to + i * dx) = gsf__pil_clip(sums[i]);
+                    else memcpy(to + i * dx, &v, sizeof v);
+                }
+            }
+}
+
+static void gsf__resize_pass(gsf_context* ctx, gsf_chunk_fn body, const gsf_image* src, const gsf_image* dst,
+                             const gsf__resize_axis* axis) {
+    gsf__resize_job job;
+    job.src = src;
+    job.dst = dst;
+    job.axis = axis;
+    job.rows = gsf__image_rows_per_chunk(dst->width, dst->channels);
+    gsf__parallel_for(ctx, (size_t)((dst->height + job.rows - 1) / job.rows), body, &job);
+}
+
+static gsf_result gsf__resize_pil(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
+                                  const gsf_image* dst) {
+    gsf__resize_axis ax, ay;
+    memset(&ay, 0, sizeof ay);
+    gsf_image middle; // src at the new width
+    memset(&middle, 0, sizeof middle);
+    gsf_result result = gsf__make_pil_axis(ctx, filter, src->width, dst->width, &ax);
+    if (result == GSF_OK) result = gsf__make_pil_axis(ctx, filter, src->height, dst->height, &ay);
+    if (result != GSF_OK) goto cleanup;
+    if (!ax.owned && !ay.owned) {
+        result = gsf_convert_image(ctx, src, dst);
+    } else if (!ay.owned) {
+        gsf__resize_pass(ctx, gsf__resize_rows_x, src, dst, &ax);
+    } else if (!ax.owned) {
+        gsf__resize_pass(ctx, gsf__resize_rows_y, src, dst, &ay);
+    } else {
+        result = gsf_make_image(ctx, src->dtype, dst->width, src->height, src->channels, &middle);
+        if (result != GSF_OK) goto cleanup;
+        gsf__resize_pass(ctx, gsf__resize_rows_x, src, &middle, &ax);
+        gsf__resize_pass(ctx, gsf__resize_rows_y, &middle, dst, &ay);
+    }
+cleanup:
+    gsf_destroy_image(ctx, &middle);
+    gsf_free(ctx, ax.owned);
+    gsf_free(ctx, ay.owned);
+    return result;
+}
+
+// torch's upsample_bilinear2d with align_corners=False: position (i + 0.5) * in / out - 0.5, not below 0. Positions and
+// sums in double, rounded once; torch's own float32 run loses up to 4e-6 of the value range in its positions.
+typedef struct gsf__torch_tap {
+    int64_t low, high;
+    double weight_low, weight_high;
+} gsf__torch_tap;
+
+static gsf__torch_tap gsf__torch_position(int64_t i, int64_t in, int64_t out) {
+    gsf__torch_tap tap;
+    double at = ((double)i + 0.5) * ((double)in / (double)out) - 0.5;
+    if (at < 0.0) at = 0.0;
+    tap.low = (int64_t)at < in - 1 ? (int64_t)at : in - 1;
+    tap.high = tap.low < in - 1 ? tap.low + 1 : tap.low;
+    double share = at - (double)tap.low;
+    if (share > 1.0) share = 1.0;
+    tap.weight_low = 1.0 - share;
+    tap.weight_high = share;
+    return tap;
+}
+
+typedef struct gsf__torch_job {
+    const gsf_image *src, *dst;
+    const gsf__torch_tap* columns;
+    int64_t rows;
+} gsf__torch_job;
+
+static double gsf__float_at(const char* p) {
+    float v;
+    memcpy(&v, p, sizeof v);
+    return (double)v;
+}
+
+static void gsf__resize_rows_torch(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__torch_job* job = (const gsf__torch_job*)arg;
+    const gsf_image *src = job->src, *dst = job->dst;
+    const int64_t start = (int64_t)chunk * job->rows, end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    for (int64_t y = start; y < end; y++) {
+        const gsf__torch_tap r = gsf__torch_position(y, src->height, dst->height);
+        for (int32_t c = 0; c < dst->channels; c++) {
+            const char* low = (const char*)src->data + r.low * src->stride_y + c * src->stride_c;
+            const char* high = (const char*)src->data + r.high * src->stride_y + c * src->stride_c;
+            char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
+            for (int64_t x = 0; x < dst->width; x++, to += dst->stride_x) {
+                const gsf__torch_tap t = job->columns[x];
+                const int64_t a = t.low * src->stride_x, b = t.high * src->stride_x;
+                const double upper = gsf__float_at(low + a) * t.weight_low + gsf__float_at(low + b) * t.weight_high;
+                const double lower = gsf__float_at(high + a) * t.weight_low + gsf__float_at(high + b) * t.weight_high;
+                const float v = (float)(upper * r.weight_low + lower * r.weight_high);
+                memcpy(to, &v, sizeof v);
+            }
+        }
+    }
+}
+
+static gsf_result gsf__resize_torch(gsf_context* ctx, const gsf_image* src, const gsf_image* dst) {
+    gsf__torch_tap* columns = (gsf__torch_tap*)gsf_alloc(ctx, (size_t)dst->width, sizeof *columns);
+    if (!columns) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t x = 0; x < dst->width; x++) columns[x] = gsf__torch_position(x, src->width, dst->width);
+    gsf__torch_job job;
+    job.src = src;
+    job.dst = dst;
+    job.columns = columns;
+    job.rows = gsf__image_rows_per_chunk(dst->width, dst->channels);
+    gsf__parallel_for(ctx, (size_t)((dst->height + job.rows - 1) / job.rows), gsf__resize_rows_torch, &job);
+    gsf_free(ctx, columns);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
+                                    const gsf_image* dst) {
+    GSF__TRY(gsf__check_image(ctx, "resize: source", src));
+    GSF__TRY(gsf__check_image(ctx, "resize: destination", dst));
+    if (src->dtype != dst->dtype || src->channels != dst->channels)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: both images must have one dtype and channel count");
+    const int torch = filter == GSF_RESIZE_TORCH_BILINEAR;
+    if ((int)filter < 0 || filter > GSF_RESIZE_TORCH_BILINEAR)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: filter %d", (int)filter);
+    if (src->dtype != GSF_F32 && (torch || src->dtype != GSF_U8))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: dtype %d (PIL filters: u8 or f32, torch: f32)",
+                        (int)src->dtype);
+    const int64_t longest = 1 << 24;
+    if (src->width > longest || src->height > longest || dst->width > longest || dst->height > longest)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "resize: more than %lld pixels along a side", (long long)longest);
+    return torch ? gsf__resize_torch(ctx, src, dst) : gsf__resize_pil(ctx, src, filter, dst);
+}
 
 // ---- >>metrics -----------------------------------------------------------------
 
