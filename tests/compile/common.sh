@@ -11,6 +11,7 @@ case $compiler:$standard in
     clang:c++17) cc=clang++ ext=cpp ;;
     *) echo "usage: $0 gcc|clang c11|c++17" >&2; exit 2 ;;
 esac
+command -v "$cc" > /dev/null || [ "$compiler" = gcc ] || cc+=-14 # Debian has clang-14 without the plain name
 command -v "$cc" > /dev/null || { echo "no $cc here"; exit 77; }
 flags=(-std="$standard" -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror -I"$root")
 [ "$ext" = c ] && flags+=(-Wstrict-prototypes)

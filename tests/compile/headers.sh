@@ -38,11 +38,10 @@ done < <(permutations "" "${headers[@]}")
 
 whole() { echo "#define GSFIXER_IMPLEMENTATION"; include_all "${headers[@]}"; }
 whole | unit "NDEBUG" -DNDEBUG
-whole | unit "optimised" -O2
 whole | unit "GSF_NO_SIMD" -DGSF_NO_SIMD
 whole | unit "GSF_NO_STB" -DGSF_NO_STB
 whole | unit "GSFIXER_STATIC" -DGSFIXER_STATIC
-[ "$compiler" = clang ] || whole | unit "OpenMP" -fopenmp
+if [ "$compiler" = gcc ] || have_include omp.h; then whole | unit "OpenMP" -fopenmp; fi
 if have_include embree4/rtcore.h || have_include embree3/rtcore.h; then whole | unit "GSF_USE_EMBREE" -DGSF_USE_EMBREE; fi
 if [ "$ext" = cpp ]; then
     if have_include glm/glm.hpp; then

@@ -19,7 +19,7 @@ link() { # NAME SOURCE...: compiles by extension, links, runs
 }
 case $compiler in
     gcc) c_compiler=gcc cxx=g++ ;;
-    clang) c_compiler=clang cxx=clang++ ;;
+    clang) c_compiler=${cc/++/} cxx=${c_compiler/clang/clang++} ;;
 esac
 other=$([ "$ext" = c ] && echo cpp || echo c)
 
