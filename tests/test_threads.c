@@ -80,16 +80,29 @@ static float* make_floats(size_t count, uint64_t stream) {
 // ---- stages ----------------------------------------------------------------------
 
 static void run_images(gsf_context* ctx, run_output* run) {
-    enum { W = 301, H = 223 };
+    enum { W = 301, H = 223, W2 = 170, H2 = 97 };
     float* a = make_floats(W * H * 3, 0);
     float* b = make_floats(W * H * 3, 1);
     uint8_t* bytes = (uint8_t*)malloc(W * H * 3);
+    uint8_t* small = (uint8_t*)malloc(W2 * H2 * 3);
+    float* small_floats = (float*)malloc(W2 * H2 * 3 * sizeof(float));
     const gsf_image image_a = gsf_wrap_image(a, GSF_F32, W, H, 3), image_b = gsf_wrap_image(b, GSF_F32, W, H, 3);
     const gsf_image image_bytes = gsf_wrap_image(bytes, GSF_U8, W, H, 3);
+    const gsf_image image_small = gsf_wrap_image(small, GSF_U8, W2, H2, 3);
+    const gsf_image image_small_floats = gsf_wrap_image(small_floats, GSF_F32, W2, H2, 3);
 
     stage_output* out = begin_stage(run, "convert");
     CHECK_OK(ctx, gsf_convert_image(ctx, &image_a, &image_bytes));
     add(out, bytes, W * H * 3);
+
+    out = begin_stage(run, "resize");
+    const gsf_resize_filter filters[3] = {GSF_RESIZE_PIL_BILINEAR, GSF_RESIZE_PIL_BICUBIC, GSF_RESIZE_PIL_LANCZOS};
+    for (int i = 0; i < 3; i++) {
+        CHECK_OK(ctx, gsf_resize_image(ctx, &image_bytes, filters[i], &image_small));
+        add(out, small, W2 * H2 * 3);
+    }
+    CHECK_OK(ctx, gsf_resize_image(ctx, &image_a, GSF_RESIZE_TORCH_BILINEAR, &image_small_floats));
+    add(out, small_floats, W2 * H2 * 3 * sizeof(float));
 
     out = begin_stage(run, "metrics");
     double value;
@@ -103,6 +116,8 @@ static void run_images(gsf_context* ctx, run_output* run) {
     free(a);
     free(b);
     free(bytes);
+    free(small);
+    free(small_floats);
 }
 
 static void run_points(gsf_context* ctx, run_output* run) {
