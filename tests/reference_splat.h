@@ -1,12 +1,12 @@
 // reference_splat.h - double-precision reference of the splat rasterizer: the oracle of tests and benches.
 //
-// Plain scalar C, one pixel after the other, nothing clever; correctness is all it is for. It follows the conventions of
-// golden/splat/README.md (3D Gaussian Splatting as the official CUDA rasterizer computes it):
+// Plain scalar C, one pixel after the other, nothing clever; correctness is all it is for. It follows the conventions
+// of golden/splat/README.md (3D Gaussian Splatting as the official CUDA rasterizer computes it):
 //     u = fx X/Z + cx - 0.5 (pixel centres are integers), J with x/z clamped at +-1.3 W/(2 fx), 0.3 px^2 of blur,
 //     front to back in order of Z (ties by index), alpha = min(0.99, o G), skipped below 1/255,
 //     stop before a splat that would bring the transmittance below 1e-4.
-// Include gsfixer_splat.h (declarations are enough) before this file. tests/test_reference.c holds it against the golden
-// data and against finite differences.
+// Include gsfixer_splat.h (declarations are enough) before this file. tests/test_reference.c holds it against the
+// golden data and against finite differences.
 //
 //     ref_splats s = ref_splats_from(&splats);                 // parameters widened to double
 //     ref_options o = ref_options_from(&desc);                 // or {0} for the defaults
@@ -33,6 +33,7 @@
 #define REF_NEAR 0.2
 #define REF_FRUSTUM 1.3
 #define REF_TILE 16
+#define REF_COMPENSATION_FLOOR 2.5e-5
 // Decision margins are exact below this and reported as this above it (a splat's far surroundings are not visited).
 #define REF_MARGIN_CAP 0.0099
 
@@ -49,7 +50,8 @@ typedef struct ref_splats { // parameters in double; arrays are owned
 typedef struct ref_options { // zero = default
     int official_footprint; // blend only in the 16x16 tiles of the 3-sigma square
     int official_gradient;  // straight through the 0.99 clamp; the clamped x/z (times z) held constant
-    int antialiased;        // opacity times sqrt(det cov / det(cov + blur))
+    int antialiased;        // opacity times sqrt(max(compensation_floor, det cov / det(cov + blur)))
+    double compensation_floor; // of the ratio; ref_options_from: 2.5e-5, as the official antialiased rasterizer
     int sh_bands;           // degree + 1; 0 = all stored
     double near_plane;      // 0 = 0.2
     double opacity_scale;   // 0 = 1
@@ -70,7 +72,10 @@ typedef struct ref_projected { // one splat on the screen; all zero but z when i
     int rect[4];            // tiles x0 y0 x1 y1 (exclusive), as getRect
     double box[4];          // pixels that can be within REF_MARGIN_CAP of alpha = 1/255: u0 v0 u1 v1
     double near_margin;     // |z / near - 1|
-    double kink_margin;     // distance of the colour clamp (absolute) and of the x/z clamp (relative): kinks of gradients
+    double official_margin;  // smallest distance of 3 sigma and of the tile rectangle's sides (in tiles) from an
+                             // integer, relative where they are above 1: what the official footprint hangs on
+    double kink_margin;     // distance of the colour clamp (absolute), of the x/z clamp and of the compensation's floor
+                            // (relative): kinks of gradients
 } ref_projected;
 
 typedef struct ref_image { // arrays are owned
@@ -138,6 +143,7 @@ static inline ref_options ref_options_from(const gsf_render_desc* desc) {
     o.official_footprint = desc->footprint == GSF_FOOTPRINT_OFFICIAL;
     o.official_gradient = desc->gradient == GSF_GRADIENT_OFFICIAL;
     o.antialiased = desc->antialiased;
+    o.compensation_floor = REF_COMPENSATION_FLOOR;
     o.sh_bands = desc->sh_bands;
     o.near_plane = (double)desc->near_plane;
     o.opacity_scale = (double)desc->opacity_scale;
@@ -185,7 +191,7 @@ static inline void ref_rotation(const double q[4], double unit[4], double R[3][3
 }
 
 // dR (3x3) to the raw quaternion, added to dq.
-static inline void ref_rotation_backward(const double q[4], const double dR[3][3], double dq[4]) {
+static inline void ref_rotation_backward(const double q[4], double dR[3][3], double dq[4]) {
     double unit[4], R[3][3];
     ref_rotation(q, unit, R);
     const double w = unit[0], x = unit[1], y = unit[2], z = unit[3];
@@ -202,7 +208,8 @@ static inline void ref_rotation_backward(const double q[4], const double dR[3][3
     for (int k = 0; k < 4; k++) dq[k] += (du[k] - along * unit[k]) / fmax(norm, 1e-12);
 }
 
-// Real spherical harmonics of degree < bands in the signs of 3DGS, and their derivatives by x, y, z taken as polynomials.
+// Real spherical harmonics of degree < bands in the signs of 3DGS, and their derivatives by x, y, z taken as
+// polynomials.
 static inline void ref_sh_basis(int bands, const double d[3], double basis[16], double derivative[16][3]) {
     static const double c2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792,
                                  0.5462742152960396};
@@ -257,7 +264,8 @@ typedef struct ref_geometry { // what projection and its backward share
     int bands;
 } ref_geometry;
 
-static inline ref_geometry ref_geometry_of(const ref_splats* s, const gsf_camera* camera, const ref_options* o, size_t i) {
+static inline ref_geometry ref_geometry_of(const ref_splats* s, const gsf_camera* camera, const ref_options* o,
+                                           size_t i) {
     ref_geometry g;
     memset(&g, 0, sizeof g);
     const double* m = camera->w2c;
@@ -306,7 +314,9 @@ static inline ref_geometry ref_geometry_of(const ref_splats* s, const gsf_camera
 }
 
 // (int) of a quotient by 16, clamped to the grid, as getRect does it but safe for any size.
-static inline int ref_tile(double pixels, int grid) { return (int)fmin(fmax(trunc(pixels / REF_TILE), 0.0), (double)grid); }
+static inline int ref_tile(double pixels, int grid) {
+    return (int)fmin(fmax(trunc(pixels / REF_TILE), 0.0), (double)grid);
+}
 
 static inline int ref_is_finite(const ref_splats* s, size_t i) {
     double sum = s->logits[i] * 0;
@@ -319,7 +329,7 @@ static inline int ref_is_finite(const ref_splats* s, size_t i) {
 static inline ref_projected ref_project(const ref_splats* s, const gsf_camera* camera, const ref_options* o, size_t i) {
     ref_projected p;
     memset(&p, 0, sizeof p);
-    p.near_margin = p.kink_margin = INFINITY;
+    p.near_margin = p.kink_margin = p.official_margin = INFINITY;
     if (!ref_is_finite(s, i)) return p;
     const ref_geometry g = ref_geometry_of(s, camera, o, i);
     const double near_plane = o->near_plane > 0 ? o->near_plane : REF_NEAR;
@@ -336,39 +346,49 @@ static inline ref_projected ref_project(const ref_splats* s, const gsf_camera* c
     p.conic[1] = -p.cov[1] / g.det_blurred;
     p.conic[2] = p.cov[0] / g.det_blurred;
     p.opacity = (o->opacity_scale > 0 ? o->opacity_scale : 1) / (1 + exp(-s->logits[i]));
-    p.compensation = o->antialiased ? sqrt(g.det / g.det_blurred) : 1;
+    p.compensation = o->antialiased ? sqrt(fmax(o->compensation_floor, g.det / g.det_blurred)) : 1;
     for (int c = 0; c < 3; c++) p.color[c] = fmax(g.raw_color[c], 0);
 
     const double mid = 0.5 * (p.cov[0] + p.cov[2]);
-    const double radius = ceil(3 * sqrt(mid + sqrt(fmax(0.1, mid * mid - g.det_blurred))));
+    const double sigma3 = 3 * sqrt(mid + sqrt(fmax(0.1, mid * mid - g.det_blurred))), radius = ceil(sigma3);
     p.radius = (int64_t)fmin(radius, 9e18);
     const int grid_x = (camera->width + REF_TILE - 1) / REF_TILE, grid_y = (camera->height + REF_TILE - 1) / REF_TILE;
-    p.rect[0] = ref_tile(p.u - radius, grid_x);
-    p.rect[1] = ref_tile(p.v - radius, grid_y);
-    p.rect[2] = ref_tile(p.u + radius + REF_TILE - 1, grid_x);
-    p.rect[3] = ref_tile(p.v + radius + REF_TILE - 1, grid_y);
+    const double sides[4] = {p.u - radius, p.v - radius, p.u + radius + REF_TILE - 1, p.v + radius + REF_TILE - 1};
+    p.official_margin = fabs(sigma3 - round(sigma3)) / fmax(1, sigma3);
+    for (int k = 0; k < 4; k++) {
+        const double tiles = sides[k] / REF_TILE;
+        p.rect[k] = ref_tile(sides[k], k % 2 ? grid_y : grid_x);
+        if (tiles > -1 && tiles < (k % 2 ? grid_y : grid_x) + 1)
+            p.official_margin = fmin(p.official_margin, fabs(tiles - round(tiles)));
+    }
     p.visible = 1;
     if (o->official_footprint && (p.rect[0] >= p.rect[2] || p.rect[1] >= p.rect[3])) {
-        const double z = p.z, near_margin = p.near_margin;
+        const double z = p.z, near_margin = p.near_margin, official_margin = p.official_margin;
         memset(&p, 0, sizeof p);
         p.z = z;
         p.near_margin = near_margin;
         p.kink_margin = INFINITY;
+        p.official_margin = official_margin;
         return p;
     }
 
-    // o G >= (1 - cap)/255 inside the ellipse d^T cov^-1 d <= t, whose box has half sides sqrt(t cov_xx), sqrt(t cov_yy).
+    // o G >= (1 - cap)/255 inside the ellipse d^T cov^-1 d <= t, whose box has half sides sqrt(t cov_xx), sqrt(t
+    // cov_yy).
     const double t = 2 * log(255 * p.opacity * p.compensation / (1 - REF_MARGIN_CAP));
     const double half_x = t > 0 ? sqrt(t * p.cov[0]) : -1, half_y = t > 0 ? sqrt(t * p.cov[2]) : -1;
     p.box[0] = p.u - half_x; p.box[1] = p.v - half_y; p.box[2] = p.u + half_x; p.box[3] = p.v + half_y;
 
     for (int c = 0; c < 3; c++) p.kink_margin = fmin(p.kink_margin, fabs(g.raw_color[c]));
-    const double limit[2] = {REF_FRUSTUM * camera->width / (2 * camera->fx), REF_FRUSTUM * camera->height / (2 * camera->fy)};
+    if (o->antialiased && o->compensation_floor > 0)
+        p.kink_margin = fmin(p.kink_margin, fabs(g.det / g.det_blurred / o->compensation_floor - 1));
+    const double limit[2] = {REF_FRUSTUM * camera->width / (2 * camera->fx),
+                             REF_FRUSTUM * camera->height / (2 * camera->fy)};
     for (int a = 0; a < 2; a++) p.kink_margin = fmin(p.kink_margin, fabs(fabs(g.p[a] / g.p[2]) / limit[a] - 1));
     return p;
 }
 
-// Gradients of one splat: from the screen (mean2d, conic as a b c, opacity with compensation, colour, depth) to parameters.
+// Gradients of one splat: from the screen (mean2d, conic as a b c, opacity with compensation, colour, depth) to
+// parameters.
 typedef struct ref_screen_grads { double mean2d[2], conic[3], opacity, color[3], z; } ref_screen_grads;
 
 static inline void ref_project_backward(const ref_splats* s, const gsf_camera* camera, const ref_options* o, size_t i,
@@ -381,7 +401,8 @@ static inline void ref_project_backward(const ref_splats* s, const gsf_camera* c
     const double sigmoid = 1 / (1 + exp(-s->logits[i]));
     const double scale = o->opacity_scale > 0 ? o->opacity_scale : 1;
     out->logits[i] += d->opacity * p->compensation * scale * sigmoid / (1 + exp(s->logits[i]));
-    const double d_compensation = o->antialiased ? d->opacity * p->opacity : 0;
+    const int floored = g.det / g.det_blurred < o->compensation_floor;
+    const double d_compensation = o->antialiased && !floored ? d->opacity * p->opacity : 0;
 
     // conic = cov^-1: d_cov = -conic d_conic conic, all symmetric 2x2
     const double K[2][2] = {{p->conic[0], p->conic[1]}, {p->conic[1], p->conic[2]}};
@@ -465,7 +486,8 @@ typedef struct ref_hit { // one blended splat of a pixel
 
 typedef struct ref_decisions { double margin, depth_gap, cancellation; } ref_decisions;
 
-// Splats blended in pixel (x, y), front to back; returns their number. hits: room for order_count. T_final: what is left.
+// Splats blended in pixel (x, y), front to back; returns their number. hits: room for order_count. T_final: what is
+// left.
 static inline size_t ref_trace(const ref_image* image, const ref_splats* s, const ref_options* o, int x, int y,
                                ref_hit* hits, double* T_final, ref_decisions* decisions) {
     size_t n = 0;
@@ -556,8 +578,8 @@ static inline ref_image ref_render(const ref_splats* s, const gsf_camera* camera
     for (size_t at = 0; at < pixels; at++) {
         ref_decisions decisions;
         double T, weight = 0, weighted_z = 0, color[3] = {0, 0, 0};
-        const size_t n = ref_trace(&image, s, o, (int)(at % (size_t)image.width), (int)(at / (size_t)image.width), hits, &T,
-                                   &decisions);
+        const size_t n = ref_trace(&image, s, o, (int)(at % (size_t)image.width), (int)(at / (size_t)image.width), hits,
+                                   &T, &decisions);
         for (size_t k = 0; k < n; k++) {
             const ref_projected* p = &image.splats[hits[k].splat];
             const double w = hits[k].alpha * hits[k].T;
@@ -595,8 +617,8 @@ static inline void ref_render_backward(const ref_splats* s, const gsf_camera* ca
     for (size_t at = 0; at < pixels; at++) {
         ref_decisions decisions;
         double T;
-        const size_t n = ref_trace(image, s, o, (int)(at % (size_t)image->width), (int)(at / (size_t)image->width), hits,
-                                   &T, &decisions);
+        const size_t n = ref_trace(image, s, o, (int)(at % (size_t)image->width), (int)(at / (size_t)image->width),
+                                   hits, &T, &decisions);
         double dc[3];
         for (int c = 0; c < 3; c++) dc[c] = d_color ? d_color[3 * at + c] : 0;
         for (int c = 0; c < 3; c++) out->background[c] += T * dc[c];

@@ -1,4 +1,5 @@
-// splat_golden.h - the golden scenes of the rasterizer as gsf_splats and gsf_camera; for test_reference.c, golden_splat.c.
+// splat_golden.h - the golden scenes of the rasterizer as gsf_splats and gsf_camera; for test_reference.c,
+// golden_splat.c.
 #ifndef SPLAT_GOLDEN_H
 #define SPLAT_GOLDEN_H
 
