@@ -1,0 +1,900 @@
+// test_trainer.c - loss and regularisers by finite differences; training on a scene made here: it learns, it is the same
+// bits for any workers, after a resume and after failures; bad input is refused.
+// gcc -O2 -std=c11 -I. -Itests tests/test_trainer.c -lm
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_splat.h"
+#include "test.h"
+
+enum { WIDTH = 44, HEIGHT = 36, VIEWS = 5, SPLATS = 70 };
+
+// ---- loss ----------------------------------------------------------------------
+
+typedef struct loss_case {
+    int32_t width, height;
+    int weighted, bytes;
+    float lambda;
+} loss_case;
+
+static void test_loss_derivative(gsf_context* ctx) {
+    static const loss_case cases[] = {{1, 1, 0, 0, 0.2f},  {3, 2, 1, 1, 0.2f},  {1, 17, 0, 1, 1.0f}, {23, 1, 1, 0, 0.5f},
+                                      {13, 11, 1, 0, 0.2f}, {19, 14, 0, 1, 0.0f}, {8, 8, 0, 0, 1.0f},  {11, 24, 1, 1, 1.0f}};
+    gsf__loss_scratch scratch;
+    memset(&scratch, 0, sizeof scratch);
+    uint64_t state = 5;
+    for (size_t c = 0; c < sizeof cases / sizeof *cases; c++) {
+        const size_t pixels = (size_t)cases[c].width * (size_t)cases[c].height, n = 3 * pixels;
+        float *render = (float*)malloc(n * sizeof(float)), *photo = (float*)malloc(n * sizeof(float));
+        float *weight = (float*)malloc(pixels * sizeof(float)), *d = (float*)malloc(n * sizeof(float));
+        float* ignored = (float*)malloc(n * sizeof(float));
+        uint8_t* bytes = (uint8_t*)malloc(n);
+        for (size_t i = 0; i < n; i++) {
+            bytes[i] = (uint8_t)test_random_in(&state, 0, 255.9);
+            photo[i] = (float)test_random_in(&state, 0, 1);
+            render[i] = (float)test_random_in(&state, -0.2, 1.2);
+            const float t = cases[c].bytes ? (float)bytes[i] / 255.0f : photo[i];
+            if (fabsf(render[i] - t) < 0.03f) render[i] = t + 0.04f; // away from the kinks
+            if (fabsf(render[i]) < 0.02f || fabsf(render[i] - 1.0f) < 0.02f) render[i] = -0.1f;
+        }
+        for (size_t i = 0; i < pixels; i++) weight[i] = i % 5 ? (float)test_random(&state) : 0.0f;
+        gsf__target target;
+        memset(&target, 0, sizeof target);
+        target.width = cases[c].width;
+        target.height = cases[c].height;
+        if (cases[c].bytes) target.u8 = bytes;
+        else target.f32 = photo;
+        if (cases[c].weighted) target.weight = weight;
+        gsf__loss_value value, low, high;
+        CHECK_OK(ctx, gsf__loss(ctx, &scratch, &target, render, cases[c].lambda, 3.0f, d, &value));
+        double largest = 0.0;
+        for (size_t i = 0; i < n; i++) largest = fmax(largest, fabs((double)d[i]));
+        for (size_t i = 0; i < n; i += 1 + n / 60) {
+            const float kept = render[i], step = 0.004f;
+            render[i] = kept + step;
+            CHECK_OK(ctx, gsf__loss(ctx, &scratch, &target, render, cases[c].lambda, 1.0f, ignored, &high));
+            render[i] = kept - step;
+            CHECK_OK(ctx, gsf__loss(ctx, &scratch, &target, render, cases[c].lambda, 1.0f, ignored, &low));
+            render[i] = kept;
+            CHECK_NEAR(d[i], 3.0 * (high.total - low.total) / 0.008, 4e-3 * largest + 1e-6);
+        }
+        // a weight of zero everywhere is a loss of zero; NaN in the render has no gradient
+        if (cases[c].weighted) {
+            memset(weight, 0, pixels * sizeof(float));
+            CHECK_OK(ctx, gsf__loss(ctx, &scratch, &target, render, cases[c].lambda, 1.0f, ignored, &low));
+            CHECK(low.total == 0.0);
+        }
+        render[n / 2] = NAN;
+        CHECK_OK(ctx, gsf__loss(ctx, &scratch, &target, render, cases[c].lambda, 1.0f, d, &value));
+        int finite = isfinite(value.total) && d[n / 2] == 0.0f;
+        for (size_t i = 0; i < n; i++) finite = finite && isfinite(d[i]);
+        CHECK(finite);
+        free(render); free(photo); free(weight); free(d); free(ignored); free(bytes);
+    }
+    gsf__loss_destroy_scratch(ctx, &scratch);
+}
+
+static void test_smoothness_derivative(gsf_context* ctx) {
+    enum { W = 9, H = 19 };
+    float photo[3 * W * H], render[3 * W * H], ignored[3 * W * H], depth[W * H], d[W * H], other[W * H];
+    uint64_t state = 9;
+    for (int i = 0; i < 3 * W * H; i++) photo[i] = render[i] = (float)test_random(&state);
+    for (int i = 0; i < W * H; i++) depth[i] = i % 7 == 3 ? 0.0f : (float)test_random_in(&state, 1, 3);
+    gsf__loss_scratch scratch;
+    memset(&scratch, 0, sizeof scratch);
+    gsf__target target;
+    memset(&target, 0, sizeof target);
+    target.width = W;
+    target.height = H;
+    target.f32 = photo;
+    gsf__loss_value value;
+    CHECK_OK(ctx, gsf__loss(ctx, &scratch, &target, render, 0.2f, 1.0f, ignored, &value));
+    (void)gsf__depth_smoothness(ctx, &scratch, &target, depth, 2.0f, 0.7f, d);
+    for (int i = 0; i < W * H; i++) {
+        if (depth[i] == 0.0f) {
+            CHECK(d[i] == 0.0f);
+            continue;
+        }
+        const float kept = depth[i];
+        depth[i] = kept + 1e-3f;
+        const double high = gsf__depth_smoothness(ctx, &scratch, &target, depth, 2.0f, 0.7f, other);
+        depth[i] = kept - 1e-3f;
+        const double low = gsf__depth_smoothness(ctx, &scratch, &target, depth, 2.0f, 0.7f, other);
+        depth[i] = kept;
+        CHECK_NEAR(d[i], (high - low) / 2e-3, 2e-5);
+    }
+    gsf__loss_destroy_scratch(ctx, &scratch);
+}
+
+// ---- Adam and regularisers on a bare model ---------------------------------------
+
+static gsf__model make_model(gsf_context* ctx, size_t count, int32_t sh_degree) {
+    gsf__model model;
+    memset(&model, 0, sizeof model);
+    model.sh_degree = sh_degree;
+    if (!CHECK_OK(ctx, gsf__model_reserve(ctx, &model, count))) exit(2);
+    model.count = count;
+    uint64_t state = 3;
+    for (int g = 0; g < GSF__GROUPS; g++)
+        for (size_t i = 0; i < count * model.groups[g].width; i++)
+            model.groups[g].value[i] = (float)test_random_in(&state, -2, 2);
+    for (size_t i = 0; i < count; i++) model.ids[i] = (uint32_t)i;
+    model.next_id = (uint32_t)count;
+    return model;
+}
+
+static void test_adam_rejects(gsf_context* ctx) { // bad gradients do nothing and are counted, rows behind stay untouched
+    for (int32_t degree = 0; degree <= 3; degree++) {
+        gsf__model model = make_model(ctx, 37, degree);
+        gsf__group* sh = &model.groups[GSF__SH];
+        for (size_t i = 37 * sh->width; i < model.capacity * sh->width; i++) sh->grad[i] = 1.0f;
+        const float before = sh->value[2], quat = model.groups[GSF__QUATS].value[147];
+        sh->grad[2] = NAN;
+        model.groups[GSF__QUATS].grad[147] = -INFINITY;
+        model.groups[GSF__OPACITY].grad[36] = 1e30f;
+        model.groups[GSF__MEANS].grad[0] = -2.0f;
+        const float mean = model.groups[GSF__MEANS].value[0];
+        gsf__adam_rates rates = {0.5, 0.1, 0.1, 0.1, 0.1, 0.1};
+        CHECK(gsf__adam_step(ctx, &model, &rates, 1, degree + 1) == 3);
+        CHECK(sh->value[2] == before && model.groups[GSF__QUATS].value[147] == quat && sh->m[2] == 0.0f);
+        CHECK_NEAR(model.groups[GSF__MEANS].value[0], mean + 0.5f, 1e-6); // the first step is the rate
+        CHECK(sh->grad[37 * sh->width] == 1.0f && sh->value[37 * sh->width] == 0.0f);
+        rates.means = 5e37; // would leave the floats
+        model.groups[GSF__MEANS].value[0] = 3e38f;
+        model.groups[GSF__MEANS].grad[0] = -2.0f;
+        CHECK(gsf__adam_step(ctx, &model, &rates, 2, degree + 1) == 1);
+        CHECK(model.groups[GSF__MEANS].value[0] == 3e38f);
+        gsf__model_destroy(ctx, &model);
+    }
+}
+
+static void test_adam_bands(gsf_context* ctx) { // leaving out bands that never had a gradient changes nothing
+    for (int32_t degree = 1; degree <= 3; degree++)
+        for (int32_t bands = 1; bands <= degree; bands++) {
+            gsf__model a = make_model(ctx, 21, degree), b = make_model(ctx, 21, degree);
+            const gsf__adam_rates rates = {0.1, 0.2, 0.3, 0.4, 0.5, 0.6};
+            for (int32_t step = 1; step <= 3; step++) {
+                for (size_t i = 0; i < 21; i++)
+                    for (int32_t k = 0; k < 3 * bands * bands; k++)
+                        a.groups[GSF__SH].grad[i * a.groups[GSF__SH].width + (size_t)k] =
+                            b.groups[GSF__SH].grad[i * a.groups[GSF__SH].width + (size_t)k] = sinf((float)(step + k));
+                CHECK(gsf__adam_step(ctx, &a, &rates, step, degree + 1) == 0);
+                CHECK(gsf__adam_step(ctx, &b, &rates, step, bands) == 0);
+            }
+            CHECK(memcmp(a.groups[GSF__SH].value, b.groups[GSF__SH].value,
+                         21 * a.groups[GSF__SH].width * sizeof(float)) == 0);
+            gsf__model_destroy(ctx, &a);
+            gsf__model_destroy(ctx, &b);
+        }
+}
+
+static void test_regularisers(gsf_context* ctx) {
+    double worst = 0.0;
+    for (float x = -86.0f; x < 88.0f; x += 0.0137f)
+        worst = fmax(worst, fabs((double)gsf__exp_poly(x) / exp((double)x) - 1.0));
+    CHECK_NEAR(worst, 0.0, 3e-7);
+    CHECK(gsf__exp_poly(-1000.0f) == 0.0f);
+
+    gsf__model model = make_model(ctx, 700, 0);
+    gsf__scale_job penalty = {&model, 0.25f};
+    gsf__parallel_for(ctx, gsf__model_chunks(model.count), gsf__scale_chunk, &penalty);
+    for (size_t i = 0; i < 3 * model.count; i += 17) { // derivative of 0.25 exp(s)
+        const double s = (double)model.groups[GSF__SCALES].value[i];
+        CHECK_NEAR(model.groups[GSF__SCALES].grad[i], 0.25 * (exp(s + 1e-4) - exp(s - 1e-4)) / 2e-4, 1e-6 * exp(s));
+    }
+    gsf__decay_job decay = {&model, 0.9};
+    float* logits = model.groups[GSF__OPACITY].value;
+    logits[0] = 80.0f;
+    logits[1] = -90.0f;
+    double before[700];
+    for (size_t i = 0; i < 700; i++) before[i] = 1.0 / (1.0 + exp(-(double)logits[i]));
+    gsf__parallel_for(ctx, gsf__model_chunks(model.count), gsf__decay_chunk, &decay);
+    for (size_t i = 0; i < 700; i++) CHECK_NEAR(1.0 / (1.0 + exp(-(double)logits[i])), 0.9 * before[i], 1e-6);
+
+    gsf__dropout_job dropout = {&model, 4, 77, 0.3};
+    gsf__parallel_for(ctx, gsf__model_chunks(model.count), gsf__dropout_chunk, &dropout);
+    size_t hidden = 0;
+    for (size_t i = 0; i < model.count; i++) hidden += model.hidden[i];
+    CHECK(hidden > 150 && hidden < 270);
+    gsf__model_destroy(ctx, &model);
+}
+
+static void test_cap(gsf_context* ctx) { // near the largest number of splats those with the largest gradients grow
+    gsf__model model = make_model(ctx, 100, 0);
+    for (size_t i = 0; i < 100; i++) {
+        model.grad_sum[i] = (float)((i * 37) % 100);
+        model.visits[i] = 2;
+    }
+    gsf__densify_rule rule;
+    memset(&rule, 0, sizeof rule);
+    rule.grad = 10.0f;
+    rule.clone_scale = 1.0;
+    rule.prune_opacity = 1e-6;
+    size_t clones, splits;
+    rule.max_splats = 1000;
+    gsf__densify_select(&model, &rule, &clones, &splits);
+    CHECK(clones + splits == 80);
+    rule.max_splats = 107;
+    gsf__densify_select(&model, &rule, &clones, &splits);
+    CHECK(clones + splits == 7);
+    for (size_t i = 0; i < 100; i++) CHECK((model.action[i] != GSF__KEEP) == ((i * 37) % 100 >= 93));
+    CHECK_OK(ctx, gsf__model_reserve(ctx, &model, 100 + clones + 2 * splits));
+    gsf__densify_apply(&model, &rule, clones, splits);
+    CHECK(model.count == 107);
+    rule.max_splats = 50;
+    gsf__densify_select(&model, &rule, &clones, &splits);
+    CHECK(clones + splits == 0);
+    gsf__model_destroy(ctx, &model);
+}
+
+// ---- a scene to train on -----------------------------------------------------------
+
+typedef struct scene {
+    gsf_splats truth, start;
+    gsf_train_view views[VIEWS + 2];  // the last two: restored views, of another size, with weights
+    float* pixels[VIEWS + 2];
+    float* weights;
+} scene;
+
+static gsf_camera make_camera(double angle, double tilt, int32_t width, int32_t height) { // 4 from the origin, facing it
+    gsf_camera camera;
+    memset(&camera, 0, sizeof camera);
+    const double c = cos(angle), s = sin(angle), ct = cos(tilt), st = sin(tilt);
+    const double right[3] = {c, 0, -s}, down[3] = {s * st, ct, c * st}, forward[3] = {s * ct, -st, c * ct};
+    for (int k = 0; k < 3; k++) {
+        camera.w2c[4 * k] = right[k];
+        camera.w2c[4 * k + 1] = down[k];
+        camera.w2c[4 * k + 2] = forward[k];
+    }
+    camera.w2c[14] = 4.0;
+    camera.w2c[15] = 1.0;
+    camera.width = width;
+    camera.height = height;
+    camera.fx = camera.fy = width;
+    camera.cx = width / 2.0;
+    camera.cy = height / 2.0;
+    return camera;
+}
+
+static void render_to(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera, float* pixels) {
+    gsf_rasterizer* rasterizer;
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.color = gsf_wrap_image(pixels, GSF_F32, camera->width, camera->height, 3);
+    CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &rasterizer));
+    CHECK_OK(ctx, gsf_splat_render(ctx, rasterizer, splats, camera, NULL, &out));
+    gsf_splat_destroy_rasterizer(ctx, rasterizer);
+}
+
+static scene make_scene(gsf_context* ctx) {
+    scene s;
+    memset(&s, 0, sizeof s);
+    uint64_t state = 11;
+    CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, &s.truth));
+    CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, &s.start));
+    for (int i = 0; i < SPLATS; i++) {
+        for (int a = 0; a < 3; a++) {
+            s.truth.means[3 * i + a] = (float)test_random_in(&state, -1, 1);
+            s.truth.log_scales[3 * i + a] = (float)test_random_in(&state, -2.5, -1.2);
+            s.truth.sh[12 * i + a] = (float)test_random_in(&state, -1.5, 1.5);
+            for (int k = 1; k < 4; k++) s.truth.sh[12 * i + 3 * k + a] = (float)test_random_in(&state, -0.3, 0.3);
+            s.start.means[3 * i + a] = s.truth.means[3 * i + a] + (float)test_random_in(&state, -0.06, 0.06);
+            s.start.log_scales[3 * i + a] = s.truth.log_scales[3 * i + a] + (float)test_random_in(&state, -0.3, 0.3);
+            s.start.sh[12 * i + a] = s.truth.sh[12 * i + a] * 0.5f;
+        }
+        for (int a = 0; a < 4; a++)
+            s.truth.quats[4 * i + a] = s.start.quats[4 * i + a] = (float)test_random_in(&state, -1, 1);
+        s.truth.opacity_logits[i] = (float)test_random_in(&state, 0, 3);
+        s.start.opacity_logits[i] = 0.0f;
+        s.start.ids[i] = (uint32_t)(1000 + 3 * i);
+    }
+    s.weights = (float*)malloc(40 * 40 * sizeof(float));
+    for (int i = 0; i < 40 * 40; i++) s.weights[i] = (float)(i % 11) / 10.0f;
+    for (int v = 0; v < VIEWS + 2; v++) {
+        gsf_train_view* view = &s.views[v];
+        view->camera = v < VIEWS ? make_camera(0.5 * (v - 2), 0.1 * v, WIDTH, HEIGHT)
+                                 : make_camera(1.4, 0.3 * (v - VIEWS), 40, 33 + v - VIEWS);
+        s.pixels[v] = (float*)malloc((size_t)(view->camera.width * view->camera.height) * 3 * sizeof(float));
+        render_to(ctx, &s.truth, &view->camera, s.pixels[v]);
+        view->image = gsf_wrap_image(s.pixels[v], GSF_F32, view->camera.width, view->camera.height, 3);
+        if (v >= VIEWS) view->weight = gsf_wrap_image(s.weights, GSF_F32, 40, view->camera.height, 1);
+    }
+    return s;
+}
+
+static void destroy_scene(gsf_context* ctx, scene* s) {
+    gsf_splat_destroy(ctx, &s->truth);
+    gsf_splat_destroy(ctx, &s->start);
+    free(s->weights);
+    for (int v = 0; v < VIEWS + 2; v++) free(s->pixels[v]);
+}
+
+// Densifies, resets and uses every regulariser within 60 iterations.
+static gsf_train_desc busy_desc(void) {
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 60;
+    desc.seed = 42;
+    desc.sh_interval = 15;
+    desc.densify_from = 5;
+    desc.densify_until = 50;
+    desc.densify_interval = 10;
+    desc.densify_grad = 5e-4f;
+    desc.opacity_reset_interval = 25;
+    desc.prune_opacity = 0.006f;
+    desc.dropout = 0.2f;
+    desc.opacity_decay = 0.002f;
+    desc.scale_penalty = 0.01f;
+    desc.depth_smoothness = 0.01f;
+    desc.background[1] = 0.2f;
+    return desc;
+}
+
+static gsf_trainer* make_busy(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc = busy_desc();
+    gsf_trainer* trainer = NULL;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) exit(2);
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+    gsf_splat_set_restored_weight(trainer, 0.5f);
+    return trainer;
+}
+
+static gsf_text save_state(gsf_context* ctx, const gsf_trainer* trainer) {
+    gsf_text text;
+    memset(&text, 0, sizeof text);
+    gsf_splat_trainer_save(ctx, trainer, &text);
+    gsf_chunks_end(ctx, &text);
+    CHECK(!text.failed);
+    return text;
+}
+
+static int same_text(const gsf_text* a, const gsf_text* b) {
+    return a->size == b->size && memcmp(a->data, b->data, a->size) == 0;
+}
+
+static void take_steps(gsf_context* ctx, gsf_trainer* trainer, int steps) {
+    for (int i = 0; i < steps; i++)
+        if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, NULL))) return;
+}
+
+// ---- learning ----------------------------------------------------------------------
+
+static double mean_square_error(gsf_context* ctx, gsf_trainer* trainer, const scene* s) {
+    double sum = 0.0;
+    static float pixels[WIDTH * HEIGHT * 3];
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.color = gsf_wrap_image(pixels, GSF_F32, WIDTH, HEIGHT, 3);
+    for (int v = 0; v < VIEWS; v++) {
+        CHECK_OK(ctx, gsf_splat_trainer_render(ctx, trainer, &s->views[v].camera, &out));
+        for (int i = 0; i < WIDTH * HEIGHT * 3; i++) {
+            const double d = (double)pixels[i] - (double)s->pixels[v][i];
+            sum += d * d / (WIDTH * HEIGHT * 3 * VIEWS);
+        }
+    }
+    return sum;
+}
+
+static void test_learns(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 300;
+    desc.densify_until = -1;
+    gsf_trainer* trainer;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
+    const double before = mean_square_error(ctx, trainer, s);
+    double first = 0.0, last = 0.0;
+    for (int i = 0; i < 300; i++) {
+        gsf_train_stats stats;
+        if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+        CHECK(stats.iteration == i + 1 && stats.splats == SPLATS && stats.rejected == 0 && stats.restored_loss == 0.0);
+        CHECK_NEAR(stats.loss, 0.8 * stats.l1 + 0.2 * (1.0 - stats.ssim), 1e-7);
+        if (i < VIEWS) first += stats.loss;
+        if (i >= 300 - VIEWS) last += stats.loss;
+    }
+    const double after = mean_square_error(ctx, trainer, s);
+    printf("learning (%s): loss %.4f -> %.4f, %.2f -> %.2f dB\n", gsf_cpu_level_name(ctx->cpu_level), first / VIEWS,
+           last / VIEWS, -10.0 * log10(before), -10.0 * log10(after));
+    CHECK(last < 0.25 * first);
+    CHECK(after < before * 0.1); // 10 dB
+    gsf_train_stats stats;
+    CHECK_RESULT(ctx, gsf_splat_train_step(ctx, trainer, &stats), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_splats copy;
+    CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &copy));
+    const gsf_splats* view = gsf_splat_trainer_splats(trainer);
+    CHECK(copy.count == view->count && memcmp(copy.means, view->means, 3 * copy.count * sizeof(float)) == 0 &&
+          memcmp(copy.ids, s->start.ids, copy.count * sizeof(uint32_t)) == 0);
+    gsf_splat_destroy(ctx, &copy);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// Every photo once in each round; each render counts as one visit.
+static void test_order_and_visits(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc = busy_desc();
+    desc.densify_from = 1000;
+    desc.dropout = 0.0f;
+    gsf_trainer* trainer;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
+    int seen[4][VIEWS] = {{0}}, differ = 0;
+    for (uint64_t step = 0; step < 4 * VIEWS; step++)
+        seen[step / VIEWS][gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step) - trainer->photos.photos]++;
+    for (int round = 0; round < 4; round++)
+        for (int v = 0; v < VIEWS; v++) CHECK(seen[round][v] == 1);
+    for (uint64_t step = 0; step < VIEWS; step++)
+        differ += gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step) !=
+                  gsf__photo_at(&trainer->photos, 1, GSF__STREAM_PHOTOS, step + VIEWS);
+    CHECK(differ > 0);
+
+    take_steps(ctx, trainer, 3);
+    size_t three = 0;
+    for (size_t i = 0; i < trainer->model.count; i++) three += trainer->model.visits[i] == 3;
+    CHECK(three == SPLATS); // all are in sight of all cameras
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+    gsf_splat_set_restored_weight(trainer, 0.0f);
+    take_steps(ctx, trainer, 1);
+    gsf_splat_set_restored_weight(trainer, 1.0f);
+    gsf_train_stats stats;
+    CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+    CHECK(stats.restored_loss > 0.0);
+    size_t six = 0;
+    for (size_t i = 0; i < trainer->model.count; i++) six += trainer->model.visits[i] == 6;
+    CHECK(six == SPLATS);
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, NULL, 0));
+    CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+    CHECK(stats.restored_loss == 0.0);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// A restored view's gradient is that of the same photo times lambda.
+static void test_restored_gradient(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 10;
+    gsf_trainer *both, *one;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &both));
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &one));
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, both, s->views, 1));
+    gsf_splat_set_restored_weight(both, 2.0f);
+    gsf__visit_job visits;
+    gsf_train_stats stats;
+    memset(&visits, 0, sizeof visits);
+    CHECK_OK(ctx, gsf__trainer_gradients(ctx, both, 1, &visits, &stats));
+    CHECK(visits.counts[0] && visits.counts[1] && stats.loss == stats.restored_loss);
+    memset(&visits, 0, sizeof visits);
+    CHECK_OK(ctx, gsf__trainer_gradients(ctx, one, 1, &visits, &stats));
+    CHECK(visits.counts[0] && !visits.counts[1]);
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        size_t wrong = 0;
+        double largest = 0.0;
+        const size_t n = one->model.count * one->model.groups[g].width;
+        for (size_t i = 0; i < n; i++) largest = fmax(largest, fabs((double)one->model.groups[g].grad[i]));
+        for (size_t i = 0; i < n; i++)
+            wrong += !(fabs((double)both->model.groups[g].grad[i] - 3.0 * (double)one->model.groups[g].grad[i]) <=
+                       1e-5 * largest);
+        CHECK(wrong == 0 && largest > 0.0);
+    }
+    CHECK(memcmp(both->model.screen[0], one->model.screen[0], 2 * SPLATS * sizeof(float)) == 0);
+    gsf_splat_destroy_trainer(ctx, both);
+    gsf_splat_destroy_trainer(ctx, one);
+}
+
+static void test_settings(gsf_context* ctx, const scene* s) {
+    gsf_trainer* trainer;
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, NULL, s->views, VIEWS, &s->start, &trainer));
+    CHECK(trainer->desc.iterations == 30000 && trainer->desc.densify_until == 15000 && trainer->desc.densify_from == 500);
+    CHECK(trainer->desc.opacity_reset_interval == 3000 && trainer->desc.sh_interval == 1000);
+    CHECK(trainer->first_bands == 1 && gsf__trainer_bands(trainer, 999) == 1 && gsf__trainer_bands(trainer, 1000) == 2 &&
+          gsf__trainer_bands(trainer, 5000) == 2);
+    // five cameras 4 from the origin
+    double centers[VIEWS][3], mean[3] = {0, 0, 0}, extent = 0.0;
+    for (int v = 0; v < VIEWS; v++) gsf_camera_center(&s->views[v].camera, centers[v]);
+    for (int v = 0; v < VIEWS; v++) for (int a = 0; a < 3; a++) mean[a] += centers[v][a] / VIEWS;
+    for (int v = 0; v < VIEWS; v++)
+        extent = fmax(extent, 1.1 * sqrt(pow(centers[v][0] - mean[0], 2) + pow(centers[v][1] - mean[1], 2) +
+                                         pow(centers[v][2] - mean[2], 2)));
+    CHECK_NEAR(trainer->desc.extent, extent, 1e-6);
+    CHECK_NEAR(trainer->desc.render.near_plane, 0.01 * extent, 1e-6);
+    gsf_splat_destroy_trainer(ctx, trainer);
+
+    desc.iterations = 3000;
+    desc.render.near_plane = 0.7f;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer)); // one camera: median depth
+    CHECK(trainer->desc.densify_until == 1500 && trainer->desc.densify_from == 50 && trainer->desc.sh_interval == 100);
+    CHECK(trainer->desc.opacity_reset_interval == 1000 && trainer->desc.densify_interval == 100);
+    CHECK(trainer->desc.render.near_plane == 0.7f);
+    CHECK_NEAR(trainer->desc.extent, 4.0, 0.4);
+    gsf_splat_destroy_trainer(ctx, trainer);
+
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
+    CHECK(trainer->first_bands == 2 && gsf__trainer_bands(trainer, 1) == 2); // bands in use stay on
+    gsf_splat_destroy_trainer(ctx, trainer);
+    desc.sh_degree = 3;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
+    CHECK(gsf_splat_trainer_splats(trainer)->sh_degree == 3 && trainer->first_bands == 2);
+    CHECK(trainer->view.sh[48 + 11] == s->truth.sh[12 + 11] && trainer->view.sh[48 + 12] == 0.0f);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// ---- determinism ---------------------------------------------------------------------
+
+static void for_backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
+    const int workers = *(const int*)user;
+    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)((i * 7 + 3) % (size_t)workers));
+}
+
+static void test_workers(const scene* s, gsf_cpu_level level) {
+    gsf_text states[3];
+    for (int run = 0; run < 3; run++) {
+        gsf_context ctx;
+        int workers = run == 1 ? 2 : 5;
+        memset(&ctx, 0, sizeof ctx);
+        ctx.cpu_level = level;
+        if (run) {
+            ctx.parallel.for_fn = for_backwards;
+            ctx.parallel.worker_count = workers;
+            ctx.parallel.user = &workers;
+        } else {
+            ctx.threads = 1;
+        }
+        CHECK_OK(&ctx, gsf_init_context(&ctx));
+        gsf_trainer* trainer = make_busy(&ctx, s);
+        take_steps(&ctx, trainer, 60);
+        states[run] = save_state(&ctx, trainer);
+        if (run == 0) printf("busy run (%s): %zu splats\n", gsf_cpu_level_name(ctx.cpu_level), trainer->model.count);
+        if (run == 0) CHECK(trainer->model.count > SPLATS + 10);
+        gsf_splat_destroy_trainer(&ctx, trainer);
+    }
+    CHECK(same_text(&states[0], &states[1]));
+    CHECK(same_text(&states[0], &states[2]));
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    for (int run = 0; run < 3; run++) gsf_destroy_text(&ctx, &states[run]);
+}
+
+// ---- checkpoints -----------------------------------------------------------------------
+
+static void test_resume(gsf_context* ctx, const scene* s) {
+    static const int stops[] = {0, 1, 9, 10, 11, 25, 37, 50, 60};
+    gsf_trainer* trainer = make_busy(ctx, s);
+    take_steps(ctx, trainer, 60);
+    gsf_text whole = save_state(ctx, trainer);
+    gsf_splat_destroy_trainer(ctx, trainer);
+    for (size_t k = 0; k < sizeof stops / sizeof *stops; k++) {
+        trainer = make_busy(ctx, s);
+        take_steps(ctx, trainer, stops[k]);
+        gsf_text state = save_state(ctx, trainer);
+        gsf_splat_destroy_trainer(ctx, trainer);
+        // the caller gives views and settings again, some before and some after
+        gsf_train_desc desc = busy_desc();
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->truth, &trainer))) exit(2);
+        if (k % 2) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+        CHECK_OK(ctx, gsf_splat_trainer_restore(ctx, trainer, "state", state.data, state.size));
+        if (k % 2 == 0) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
+        gsf_text again = save_state(ctx, trainer);
+        CHECK(same_text(&state, &again)); // save of restore is the identity
+        take_steps(ctx, trainer, 60 - stops[k]);
+        gsf_text end = save_state(ctx, trainer);
+        if (!CHECK(same_text(&whole, &end))) fprintf(stderr, "resumed at %d\n", stops[k]);
+        gsf_splat_destroy_trainer(ctx, trainer);
+        gsf_destroy_text(ctx, &state);
+        gsf_destroy_text(ctx, &again);
+        gsf_destroy_text(ctx, &end);
+    }
+    gsf_destroy_text(ctx, &whole);
+}
+
+static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
+    gsf_splats few = s->start;
+    few.count = 2;
+    gsf_train_desc desc = busy_desc();
+    gsf_trainer* trainer;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &few, &trainer))) return;
+    take_steps(ctx, trainer, 3);
+    gsf_text state = save_state(ctx, trainer);
+    size_t accepted = 0;
+    for (size_t size = 0; size < state.size; size++) { // in buffers of the exact size
+        char* cut = (char*)malloc(size ? size : 1);
+        memcpy(cut, state.data, size);
+        accepted += gsf_splat_trainer_restore(ctx, trainer, "cut", cut, size) == GSF_OK;
+        free(cut);
+    }
+    CHECK(accepted == 0);
+    for (size_t i = 0; i < state.size; i++) {
+        state.data[i] ^= (char)(1 << i % 8);
+        accepted += gsf_splat_trainer_restore(ctx, trainer, "flipped", state.data, state.size) == GSF_OK;
+        state.data[i] ^= (char)(1 << i % 8);
+    }
+    CHECK(accepted == 0);
+    gsf_text same = save_state(ctx, trainer);
+    CHECK(same_text(&state, &same)); // untouched by the refused ones
+
+    // valid chunks with wrong contents
+    const struct { const char* tag; size_t offset; uint32_t value; } lies[] = {
+        {"TRNR", 0, 0x04030201}, {"TRNR", 4, 61},         {"TRNR", 8, 2},          {"TRNR", 16, 0},
+        {"TRNR", 16, 5},         {"TRNR", 20, 0x7fc00000}, {"TRNR", 24, 3},        {"TRNR", 28, 1},
+        {"TRNR", 12, 1},         {"TRNR", 60, 0x7ff00000}, {"TV0 ", 4, 0x7f800000}, {"TM4 ", 0, 0x7fc00000},
+        {"TS2 ", 8, 0xbf800000}, {"TIDS", 4, 0xffffffff}, {"TGRD", 0, 0xff800000}};
+    for (size_t k = 0; k <= sizeof lies / sizeof *lies; k++) {
+        gsf_text lie;
+        memset(&lie, 0, sizeof lie);
+        for (int i = -1;; i++) {
+            char tag[5] = "TRNR";
+            void* data;
+            size_t row;
+            if (i >= 0 && !gsf__trainer_array(&trainer->model, i, tag, &data, &row)) break;
+            gsf_chunk chunk;
+            CHECK(gsf_chunks_find(state.data, state.size, tag, &chunk));
+            if (k == sizeof lies / sizeof *lies && strcmp(tag, "TVIS") == 0) continue; // left out
+            char* copy = (char*)malloc(chunk.size);
+            memcpy(copy, chunk.data, chunk.size);
+            if (k < sizeof lies / sizeof *lies && strcmp(tag, lies[k].tag) == 0)
+                memcpy(copy + lies[k].offset, &lies[k].value, 4);
+            gsf_chunks_add(ctx, &lie, tag, copy, chunk.size);
+            free(copy);
+        }
+        gsf_chunks_end(ctx, &lie);
+        if (!CHECK(gsf_splat_trainer_restore(ctx, trainer, "lie", lie.data, lie.size) != GSF_OK))
+            fprintf(stderr, "lie %zu\n", k);
+        gsf_destroy_text(ctx, &lie);
+    }
+    gsf_destroy_text(ctx, &same);
+    same = save_state(ctx, trainer);
+    CHECK(same_text(&state, &same));
+    gsf_destroy_text(ctx, &same);
+    gsf_destroy_text(ctx, &state);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// ---- bad input ---------------------------------------------------------------------------
+
+static void test_bad_input(gsf_context* ctx, const scene* s) {
+    gsf_trainer* trainer;
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 5;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 0, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK(trainer == NULL);
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, NULL, 2, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, NULL, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_splats splats = s->start;
+    splats.count = 0;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &splats, &trainer), GSF_ERROR_DEGENERATE);
+
+    gsf_train_view bad = s->views[0];
+    bad.camera.fx = NAN;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    bad = s->views[0];
+    bad.image.width = 3;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    bad = s->views[0];
+    bad.image.data = NULL;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    bad = s->views[VIEWS];
+    bad.weight.dtype = GSF_U8;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    s->weights[7] = -1.0f;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &s->views[VIEWS], 1, &s->start, &trainer), GSF_ERROR_NUMERIC);
+    s->weights[7] = 0.7f;
+    const float kept = s->pixels[1][5];
+    s->pixels[1][5] = NAN;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->start, &trainer), GSF_ERROR_NUMERIC);
+    s->pixels[1][5] = kept;
+
+    void* fields[] = {&desc.iterations, &desc.sh_degree, &desc.densify_interval, &desc.sh_interval};
+    for (size_t i = 0; i < sizeof fields / sizeof *fields; i++) {
+        const int32_t wrong = -7;
+        int32_t before;
+        memcpy(&before, fields[i], 4);
+        memcpy(fields[i], &wrong, 4);
+        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+        memcpy(fields[i], &before, 4);
+    }
+    float* floats[] = {&desc.lr_means, &desc.lr_opacity, &desc.extent, &desc.background[2], &desc.densify_grad,
+                       &desc.prune_opacity, &desc.dropout, &desc.opacity_decay, &desc.scale_penalty,
+                       &desc.depth_smoothness, &desc.render.near_plane, &desc.lambda_ssim};
+    for (size_t i = 0; i < sizeof floats / sizeof *floats; i++) {
+        *floats[i] = NAN;
+        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+        *floats[i] = 0.0f;
+    }
+    const uint8_t hidden[SPLATS] = {0};
+    desc.render.hidden = hidden;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    desc.render.hidden = NULL;
+
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer));
+    gsf_text before = save_state(ctx, trainer);
+    bad = s->views[0];
+    bad.image.channels = 4;
+    CHECK_RESULT(ctx, gsf_splat_set_restored_views(ctx, trainer, &bad, 1), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_request_cancel(ctx);
+    CHECK_RESULT(ctx, gsf_splat_train_step(ctx, trainer, NULL), GSF_ERROR_CANCELLED);
+    gsf_clear_cancel(ctx);
+    gsf_text after = save_state(ctx, trainer);
+    CHECK(same_text(&before, &after));
+    take_steps(ctx, trainer, 5);
+    gsf_destroy_text(ctx, &before);
+    gsf_destroy_text(ctx, &after);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+static void test_degenerate(gsf_context* ctx, const scene* s) {
+    gsf_train_desc desc = busy_desc();
+    gsf_train_stats stats;
+    gsf_trainer* trainer;
+    // NaN in splats: left out and counted
+    gsf_splats splats;
+    CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, &splats));
+    memcpy(splats.means, s->start.means, SPLATS * 23 * sizeof(float)); // one block
+    splats.means[3] = NAN;
+    splats.sh[5 * 12 + 7] = INFINITY;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &splats, &trainer));
+    CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+    CHECK(stats.rejected == 2 && stats.splats == SPLATS - 2 && trainer->view.ids[1] == 2);
+    gsf_splat_destroy_trainer(ctx, trainer);
+    for (int i = 0; i < SPLATS; i++) splats.quats[4 * i] = NAN;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &splats, &trainer), GSF_ERROR_DEGENERATE);
+    gsf_splat_destroy(ctx, &splats);
+
+    // huge values stay finite
+    gsf_splats wild = s->start;
+    float scales[SPLATS * 3];
+    for (int i = 0; i < SPLATS * 3; i++) scales[i] = i % 2 ? 85.0f : -85.0f;
+    wild.log_scales = scales;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &wild, &trainer));
+    take_steps(ctx, trainer, 60);
+    int finite = 1;
+    for (int g = 0; g < GSF__GROUPS; g++)
+        finite = finite && gsf__all_finite(trainer->model.groups[g].value, trainer->model.count * trainer->model.groups[g].width);
+    CHECK(finite);
+    gsf_splat_destroy_trainer(ctx, trainer);
+
+    // one pixel; nothing in sight; everything pruned
+    float pixel[3] = {0.3f, 0.4f, 0.5f};
+    gsf_train_view view;
+    memset(&view, 0, sizeof view);
+    view.camera = make_camera(0.0, 0.0, 1, 1);
+    view.image = gsf_wrap_image(pixel, GSF_F32, 1, 1, 3);
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, &view, 1, &s->start, &trainer));
+    take_steps(ctx, trainer, 60);
+    gsf_splat_destroy_trainer(ctx, trainer);
+    view.camera.w2c[14] = -50.0; // all behind the camera
+    desc.opacity_decay = 0.05f;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, &view, 1, &s->start, &trainer));
+    CHECK(trainer->desc.extent == 1.0f);
+    take_steps(ctx, trainer, 60);
+    CHECK(trainer->model.count == 0); // faded and pruned; training goes on with nothing
+    gsf_text state = save_state(ctx, trainer);
+    CHECK_OK(ctx, gsf_splat_trainer_restore(ctx, trainer, "empty", state.data, state.size));
+    gsf_destroy_text(ctx, &state);
+    gsf_splats none;
+    CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &none));
+    gsf_splat_destroy(ctx, &none);
+    gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// ---- memory --------------------------------------------------------------------------------
+
+typedef struct failing { size_t live, calls, fail_at; } failing; // fail_at: this allocation fails, once (0 = none)
+
+static void* failing_alloc(void* user, size_t size) {
+    failing* f = (failing*)user;
+    if (++f->calls == f->fail_at) return NULL;
+    f->live++;
+    return malloc(size);
+}
+
+static void failing_free(void* user, void* memory) {
+    ((failing*)user)->live--;
+    free(memory);
+}
+
+// A small run in which allocation `fail_at` fails. A failed step is taken again: it must have changed nothing.
+static gsf_result run_failing(const scene* s, failing* f, gsf_text* end) {
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.allocator.alloc_fn = failing_alloc;
+    ctx.allocator.free_fn = failing_free;
+    ctx.allocator.user = f;
+    ctx.threads = 1;
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    gsf_train_desc desc = busy_desc();
+    gsf_trainer* trainer;
+    gsf_text chunks;
+    memset(&chunks, 0, sizeof chunks);
+    gsf_result result = gsf_splat_make_trainer(&ctx, &desc, s->views, VIEWS, &s->start, &trainer), worst = result;
+    if (result == GSF_OK) {
+        result = gsf_splat_set_restored_views(&ctx, trainer, s->views + VIEWS, 2);
+        if (result != GSF_OK) {
+            worst = result;
+            CHECK_OK(&ctx, gsf_splat_set_restored_views(&ctx, trainer, s->views + VIEWS, 2));
+        }
+        for (int i = 0; i < 24; i++) {
+            result = gsf_splat_train_step(&ctx, trainer, NULL);
+            if (result == GSF_OK) continue;
+            worst = result;
+            CHECK_OK(&ctx, gsf_splat_train_step(&ctx, trainer, NULL));
+        }
+        gsf_splat_trainer_save(&ctx, trainer, &chunks);
+        gsf_chunks_end(&ctx, &chunks);
+        if (chunks.failed) worst = GSF_ERROR_OUT_OF_MEMORY;
+        else if (end->size == 0) {
+            end->data = (char*)malloc(chunks.size);
+            memcpy(end->data, chunks.data, end->size = chunks.size);
+        } else {
+            CHECK(same_text(end, &chunks));
+        }
+        gsf_destroy_text(&ctx, &chunks);
+        gsf_splat_destroy_trainer(&ctx, trainer);
+    }
+    CHECK(f->live == 0);
+    return worst;
+}
+
+static void test_out_of_memory(const scene* s) {
+    gsf_text end;
+    memset(&end, 0, sizeof end);
+    failing f = {0, 0, 0};
+    CHECK(run_failing(s, &f, &end) == GSF_OK);
+    const size_t calls = f.calls;
+    size_t noticed = 0;
+    for (size_t k = 1; k <= calls; k++) {
+        failing g = {0, 0, k};
+        const gsf_result result = run_failing(s, &g, &end);
+        noticed += result == GSF_ERROR_OUT_OF_MEMORY;
+        CHECK(result == GSF_ERROR_OUT_OF_MEMORY || result == GSF_OK);
+    }
+    CHECK(noticed == calls);
+    printf("%zu allocations failed one by one\n", calls);
+    free(end.data);
+}
+
+// Once all photos were visited, steps between densifications take no memory.
+static void test_steady(const scene* s) {
+    failing f = {0, 0, 0};
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.allocator.alloc_fn = failing_alloc;
+    ctx.allocator.free_fn = failing_free;
+    ctx.allocator.user = &f;
+    ctx.threads = 1;
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 100;
+    desc.densify_until = -1;
+    gsf_trainer* trainer;
+    if (!CHECK_OK(&ctx, gsf_splat_make_trainer(&ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
+    take_steps(&ctx, trainer, 2 * VIEWS);
+    const size_t before = f.calls;
+    take_steps(&ctx, trainer, 20);
+    CHECK(f.calls - before <= 2); // the rasterizer's lists may still grow a little
+    gsf_splat_destroy_trainer(&ctx, trainer);
+    CHECK(f.live == 0);
+}
+
+int main(void) {
+    gsf_context ctx;
+    test_context_init(&ctx);
+    scene s = make_scene(&ctx);
+    test_loss_derivative(&ctx);
+    test_smoothness_derivative(&ctx);
+    test_adam_rejects(&ctx);
+    test_adam_bands(&ctx);
+    test_regularisers(&ctx);
+    test_cap(&ctx);
+    test_learns(&ctx, &s);
+    test_order_and_visits(&ctx, &s);
+    test_restored_gradient(&ctx, &s);
+    test_settings(&ctx, &s);
+    test_workers(&s, ctx.cpu_level);
+    test_resume(&ctx, &s);
+    test_damaged_checkpoints(&ctx, &s);
+    test_bad_input(&ctx, &s);
+    test_degenerate(&ctx, &s);
+    test_out_of_memory(&s);
+    test_steady(&s);
+    destroy_scene(&ctx, &s);
+    return test_report();
+}
