@@ -2502,7 +2502,7 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     r->slot_begin[0] = 0;
     for (size_t i = 0; i < r->visible_count; i++) r->slot_begin[i + 1] += r->slot_begin[i];
     r->pair_count = total;
-    if (total > r->pair_capacity) {
+    if (total > r->pair_capacity || !r->pair_slot) { // never NULL, so that empty lists are pointers too
         const size_t capacity = total + total / 4;
         r->pair_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->pair_rank, capacity, sizeof(uint32_t)));
@@ -3317,7 +3317,7 @@ static void gsf__reverse_chunk(void* arg, size_t index, int worker) {
 
 static gsf_result gsf__reserve_backward(gsf_context* ctx, gsf_rasterizer* r) {
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
-    if (r->pair_count > r->slot_capacity) {
+    if (r->pair_count > r->slot_capacity || !r->slots) {
         const size_t capacity = r->pair_count + r->pair_count / 4;
         r->slot_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->slots, capacity, GSF__SLOT_FLOATS * sizeof(float)));
