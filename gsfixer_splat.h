@@ -93,27 +93,41 @@ typedef struct gsf_scene_desc {
 } gsf_scene_desc;
 
 // Reads a COLMAP folder (images/ or images_<factor>/, sparse/0/ or sparse/ with {cameras,images,points3D}.{bin,txt}) or a
-// nerfstudio / instant-ngp transforms.json (its folder or the file itself). Images are not read; their headers are, since
-// a COLMAP camera is rescaled to the actual image size as the official parser does.
+// nerfstudio / instant-ngp transforms.json (its folder or the file itself; points from its ply_file_path, else none).
+// Images are not read; their headers are, since a COLMAP camera is rescaled to the actual image size as the official
+// parser does. Views whose photo is missing are left out with a warning; photos are never enlarged. All COLMAP camera
+// models up to THIN_PRISM_FISHEYE are read. Distorted ones become pinhole cameras: perspective models by OpenCV's
+// getOptimalNewCameraMatrix (alpha 0) and crop, as the official parser; fisheye and FOV models by the smallest zoom, at
+// most 75 degrees off axis, that shows no pixel from outside the photo. Tracks that name unknown images lose those
+// entries; points that are not finite are dropped; both with a warning. Image names that lead out of the folder ("..",
+// absolute) are refused. Memory and time in proportion to the files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
                                                       gsf_scene* out);
-// In-memory twin: contents of the three COLMAP files, binary or text (told apart by content of `cameras`).
-// `points` may be NULL. No images: view images stay empty, sizes are the cameras'.
+// In-memory twin: contents of the three COLMAP files, binary or (is_text) text. `points` may be NULL. All images are kept,
+// since there is no folder to look for them; sizes are the cameras', after undistortion. View images stay empty until
+// gsf_splat_set_view_image.
 typedef struct gsf_bytes { const void* data; size_t size; const char* name; } gsf_bytes; // name: for error texts
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras,
                                                         const gsf_bytes* images, const gsf_bytes* points, gsf_scene* out);
-// In-memory twin for transforms.json.
+// In-memory twin for transforms.json; w and h must stand in it. No points.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out);
-// Decodes, undistorts and resizes one view's photo into view->image (kept if already there).
+// Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already there). Pixel rows of
+// the undistortion run in parallel. Only for scenes that were loaded from files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view);
-// Writes <folder>/sparse/0/{cameras,images,points3D}.bin (PINHOLE cameras, tracks kept; the folder must exist).
+// The same for a photo that the host has decoded: any dtype and layout, 1, 3 or 4 channels, distorted as the camera took
+// it, of any size (it is resized to the camera's). The photo is borrowed for the call; an image already there is replaced.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view,
+                                                          const gsf_image* photo);
+// Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are the views' PINHOLE ones;
+// tracks are kept, and since a scene does not hold the measured 2D points, the projections stand in for them.
 // keep: NULL or one byte per point, zero = left out.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep,
                                                        const char* folder);
 GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene);
 
-// The papers' split of n name-sorted views: every test_every-th is a test view, train = round(linspace(0, m-1, K)) over
-// the other m (half to even). Counts are returned; arrays hold up to n entries and may be NULL. K <= 0: all the rest.
+// The papers' split of n name-sorted views: every test_every-th (from 0 on) is a test view (0: none is), train =
+// round(linspace(0, m-1, K)) over the other m (half to even; with K > m views repeat, as in the official code). K = 0: all
+// the rest. Counts are returned. train holds up to max(n, K) entries, test up to n; pointers may be NULL.
 GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_target, uint32_t* train,
                                    size_t* train_count, uint32_t* test, size_t* test_count);
 
@@ -320,7 +334,6 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 #ifndef GSF_SPLAT_IMPLEMENTED
 #define GSF_SPLAT_IMPLEMENTED
 
-#include <locale.h>
 #include "gsfixer.h" // again: internals and implementations, if all was included before without the macro
 #include "gsfixer_traj.h"
 
@@ -451,60 +464,11 @@ static int gsf__word_is_nan_or_inf(const char* word, size_t length, double* out)
     return 1;
 }
 
-// A decimal number filling the whole word, correctly rounded in any locale; nan and inf (sign ignored) are taken too,
-// for the caller to reject. 0 when malformed.
+// A decimal number filling the whole word; nan and inf (sign ignored) are taken too, for the caller to reject. 0 when
+// malformed.
 static int gsf__word_double(const char* word, size_t length, double* out) {
-    static const double powers[23] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
-                                      1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
-    const char *p = word, *end = word + length, *point = NULL;
-    const int negative = p < end && *p == '-';
-    if (p < end && (*p == '-' || *p == '+')) p++;
-    uint64_t mantissa = 0;
-    size_t digits = 0;
-    int64_t scale = 0;
-    int exact = 1;
-    for (; p < end; p++) {
-        if (*p == '.' && !point) {
-            point = p;
-            continue;
-        }
-        if (*p < '0' || *p > '9') break;
-        digits++;
-        if (mantissa > (UINT64_MAX - 9) / 10) exact = 0;
-        else mantissa = mantissa * 10 + (uint64_t)(*p - '0'), scale -= point != NULL;
-    }
-    if (digits == 0) return gsf__word_is_nan_or_inf(word, length, out);
-    if (p < end && (*p == 'e' || *p == 'E')) {
-        const int down = p + 1 < end && p[1] == '-';
-        p += 1 + (p + 1 < end && (p[1] == '-' || p[1] == '+'));
-        if (p == end) return 0;
-        int64_t exponent = 0;
-        for (; p < end && *p >= '0' && *p <= '9'; p++)
-            if (exponent < 100000) exponent = exponent * 10 + (*p - '0');
-        scale += down ? -exponent : exponent;
-    }
-    if (p != end) return 0;
-    if (exact && mantissa < (1ull << 53) && scale >= -22 && scale <= 22) { // both factors exact: one rounding
-        const double magnitude = scale < 0 ? (double)mantissa / powers[-scale] : (double)mantissa * powers[scale];
-        *out = negative ? -magnitude : magnitude;
-        return 1;
-    }
-    char copy[128]; // strtod wants a terminator and the locale's decimal point
-    const char* local_point = localeconv()->decimal_point;
-    const size_t point_size = strlen(local_point);
-    if (length + point_size >= sizeof copy) return 0;
-    const size_t head = point ? (size_t)(point - word) : length;
-    memcpy(copy, word, head);
-    size_t used = head;
-    if (point) {
-        memcpy(copy + used, local_point, point_size);
-        used += point_size;
-        memcpy(copy + used, point + 1, length - head - 1);
-        used += length - head - 1;
-    }
-    copy[used] = 0;
-    *out = strtod(copy, NULL);
-    return 1;
+    const size_t used = gsf__scan_double(word, length, out);
+    return used ? used == length : gsf__word_is_nan_or_inf(word, length, out);
 }
 
 static gsf__ply_type gsf__ply_type_of(const char* word, size_t length) {
@@ -1085,11 +1049,1767 @@ GSF_API gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const 
 
 // ---- >>colmap ------------------------------------------------------------------
 
+/* COLMAP's three files are first read into a gsf__sfm (still in file order, tracks naming image ids), which >>scene
+   turns into a gsf_scene. transforms.json takes the same way. Binary files, all little-endian:
+       cameras.bin   u64 n | n x { u32 id, i32 model, u64 width, u64 height, f64 params[of the model] }
+       images.bin    u64 n | n x { u32 id, f64 qw qx qy qz, f64 tx ty tz, u32 camera, char name[] NUL,
+                                   u64 m, m x { f64 x y, u64 point } }
+       points3D.bin  u64 n | n x { u64 id, f64 x y z, u8 r g b, f64 error, u64 m, m x { u32 image, u32 index } } */
+
+typedef enum gsf__lens_kind { GSF__LENS_PINHOLE, GSF__LENS_RATIONAL, GSF__LENS_FISHEYE, GSF__LENS_FOV } gsf__lens_kind;
+
+typedef struct gsf__lens { // any COLMAP camera, brought to one of four kinds; formulas in gsf__lens_distort
+    gsf__lens_kind kind;
+    int32_t width, height;
+    double fx, fy, cx, cy;
+    double k[8]; // RATIONAL k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order); FISHEYE k1 k2 p1 p2 k3 k4 sx1 sy1; FOV omega
+} gsf__lens;
+
+typedef struct gsf__sfm_camera {
+    uint32_t id;
+    gsf__lens lens;
+    // transforms.json may leave open what only the photo tells; see gsf__camera_lens
+    int open;                // width = height = 0: the photo's; cx, cy NaN: its middle
+    double angle_x, angle_y; // fields of view in radians, for fx, fy = 0
+} gsf__sfm_camera;
+
+typedef struct gsf__sfm_image {
+    uint32_t id, camera_id;
+    size_t camera;    // index into cameras
+    size_t at;        // byte offset or line, for error texts
+    double w2c[16];
+    const char* name; // inside the source text, not terminated
+    size_t name_size;
+} gsf__sfm_image;
+
+typedef struct gsf__sfm {
+    gsf__sfm_camera* cameras;
+    gsf__sfm_image* images;
+    double* points;
+    uint8_t* colors;
+    uint64_t* point_ids;
+    size_t* track_begin; // end of the tracks so far, after each point; the scene's array has a zero before
+    uint32_t* tracks;    // image ids
+    size_t camera_count, image_count, point_count, track_count;
+    size_t camera_room, image_room, point_room, color_room, id_room, begin_room, track_room;
+    size_t dropped_points; // with a NaN or infinite position
+    const char* images_name;
+} gsf__sfm;
+
+static void gsf__sfm_destroy(gsf_context* ctx, gsf__sfm* m) {
+    gsf_free(ctx, m->cameras);
+    gsf_free(ctx, m->images);
+    gsf_free(ctx, m->points);
+    gsf_free(ctx, m->colors);
+    gsf_free(ctx, m->point_ids);
+    gsf_free(ctx, m->track_begin);
+    gsf_free(ctx, m->tracks);
+    memset(m, 0, sizeof *m);
+}
+
+enum { GSF__LENS_PARAMS_MAX = 12, GSF__LENS_SIZE_MAX = 1000000 };
+
+typedef struct gsf__lens_model { // COLMAP's camera models by id
+    const char* name;
+    unsigned char param_count, focal_count;
+    gsf__lens_kind kind;
+    signed char slot[8]; // where each parameter after the principal point goes in gsf__lens.k
+} gsf__lens_model;
+
+static const gsf__lens_model gsf__lens_models[11] = {
+    {"SIMPLE_PINHOLE", 3, 1, GSF__LENS_PINHOLE, {0, 0, 0, 0, 0, 0, 0, 0}},
+    {"PINHOLE", 4, 2, GSF__LENS_PINHOLE, {0, 0, 0, 0, 0, 0, 0, 0}},
+    {"SIMPLE_RADIAL", 4, 1, GSF__LENS_RATIONAL, {0, 0, 0, 0, 0, 0, 0, 0}},
+    {"RADIAL", 5, 1, GSF__LENS_RATIONAL, {0, 1, 0, 0, 0, 0, 0, 0}},
+    {"OPENCV", 8, 2, GSF__LENS_RATIONAL, {0, 1, 2, 3, 0, 0, 0, 0}},
+    {"OPENCV_FISHEYE", 8, 2, GSF__LENS_FISHEYE, {0, 1, 4, 5, 0, 0, 0, 0}},
+    {"FULL_OPENCV", 12, 2, GSF__LENS_RATIONAL, {0, 1, 2, 3, 4, 5, 6, 7}},
+    {"FOV", 5, 2, GSF__LENS_FOV, {0, 0, 0, 0, 0, 0, 0, 0}},
+    {"SIMPLE_RADIAL_FISHEYE", 4, 1, GSF__LENS_FISHEYE, {0, 0, 0, 0, 0, 0, 0, 0}},
+    {"RADIAL_FISHEYE", 5, 1, GSF__LENS_FISHEYE, {0, 1, 0, 0, 0, 0, 0, 0}},
+    {"THIN_PRISM_FISHEYE", 12, 2, GSF__LENS_FISHEYE, {0, 1, 2, 3, 4, 5, 6, 7}},
+};
+
+// Checks a camera and adds it. name, at: where it stands, for error texts. params: as many as the model has.
+static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id, int model,
+                                        uint64_t width, uint64_t height, const double* params) {
+    const gsf__lens_model* info = &gsf__lens_models[model];
+    gsf__sfm_camera camera;
+    memset(&camera, 0, sizeof camera);
+    gsf__lens* lens = &camera.lens;
+    camera.id = id;
+    for (int i = 0; i < info->param_count; i++)
+        if (!isfinite(params[i]))
+            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s:%zu: camera %u: parameter %d is not finite", name, at, (unsigned)id, i);
+    if (width < 1 || height < 1 || width > GSF__LENS_SIZE_MAX || height > GSF__LENS_SIZE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: image size %llu x %llu", name, at, (unsigned)id,
+                        (unsigned long long)width, (unsigned long long)height);
+    lens->kind = info->kind;
+    lens->width = (int32_t)width;
+    lens->height = (int32_t)height;
+    lens->fx = params[0];
+    lens->fy = params[info->focal_count - 1];
+    lens->cx = params[info->focal_count];
+    lens->cy = params[info->focal_count + 1];
+    int zero = 1;
+    for (int i = info->focal_count + 2; i < info->param_count; i++) {
+        lens->k[info->slot[i - info->focal_count - 2]] = params[i];
+        zero = zero && params[i] == 0.0;
+    }
+    if (zero && lens->kind != GSF__LENS_FISHEYE) lens->kind = GSF__LENS_PINHOLE;
+    if (!(lens->fx > 0.0 && lens->fy > 0.0))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: focal length %g, %g", name, at, (unsigned)id, lens->fx,
+                        lens->fy);
+    if (lens->kind == GSF__LENS_FOV && !(fabs(lens->k[0]) < 3.1))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: FOV omega %g is not below pi", name, at, (unsigned)id,
+                        lens->k[0]);
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
+                          sizeof *m->cameras));
+    m->cameras[m->camera_count++] = camera;
+    return GSF_OK;
+}
+
+static int gsf__compare_cameras(const void* a, const void* b) {
+    const uint32_t x = ((const gsf__sfm_camera*)a)->id, y = ((const gsf__sfm_camera*)b)->id;
+    return (x > y) - (x < y);
+}
+
+static gsf_result gsf__sfm_finish_cameras(gsf_context* ctx, gsf__sfm* m, const char* name) {
+    if (m->camera_count == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no camera in the file", name);
+    qsort(m->cameras, m->camera_count, sizeof *m->cameras, gsf__compare_cameras);
+    for (size_t i = 1; i < m->camera_count; i++)
+        if (m->cameras[i].id == m->cameras[i - 1].id)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: camera %u stands twice", name, (unsigned)m->cameras[i].id);
+    return GSF_OK;
+}
+
+// World-to-camera matrix of a quaternion (w x y z, any length but zero) and a translation. 0 if they are no pose.
+static int gsf__pose_from_quaternion(const double q_in[4], const double t[3], double w2c[16]) {
+    double q[4], largest = 0.0, norm = 0.0;
+    for (int i = 0; i < 4; i++) {
+        if (!isfinite(q_in[i])) return 0;
+        largest = fmax(largest, fabs(q_in[i]));
+    }
+    if (!(largest > 0.0)) return 0;
+    for (int i = 0; i < 4; i++) q[i] = q_in[i] / largest, norm += q[i] * q[i];
+    norm = sqrt(norm);
+    for (int i = 0; i < 4; i++) q[i] /= norm;
+    const double w = q[0], x = q[1], y = q[2], z = q[3];
+    const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y + w * z),     2 * (x * z - w * y), // column by column
+                         2 * (x * y - w * z),     1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+                         2 * (x * z + w * y),     2 * (y * z - w * x),     1 - 2 * (x * x + y * y)};
+    memset(w2c, 0, 16 * sizeof(double));
+    for (int c = 0; c < 3; c++) {
+        for (int i = 0; i < 3; i++) w2c[4 * c + i] = r[3 * c + i];
+        if (!(fabs(t[c]) < 1e100)) return 0; // so that no centre overflows
+        w2c[12 + c] = t[c];
+    }
+    w2c[15] = 1.0;
+    return 1;
+}
+
+static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
+                                       const double pose[7], uint32_t camera_id, const char* image, size_t image_size) {
+    gsf__sfm_image* out;
+    const gsf__sfm_camera* camera;
+    gsf__sfm_camera wanted;
+    memset(&wanted, 0, sizeof wanted);
+    wanted.id = camera_id;
+    camera = (const gsf__sfm_camera*)bsearch(&wanted, m->cameras, m->camera_count, sizeof wanted, gsf__compare_cameras);
+    if (!camera)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image %u: camera %u does not exist", name, at, (unsigned)id,
+                        (unsigned)camera_id);
+    if (image_size == 0 || memchr(image, 0, image_size))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image %u: empty or malformed name", name, at, (unsigned)id);
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
+    out = &m->images[m->image_count];
+    if (!gsf__pose_from_quaternion(pose, pose + 4, out->w2c))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s:%zu: image %u: pose %g %g %g %g, %g %g %g is no rotation and translation",
+                        name, at, (unsigned)id, pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]);
+    out->id = id;
+    out->camera_id = camera_id;
+    out->camera = (size_t)(camera - m->cameras);
+    out->at = at;
+    out->name = image;
+    out->name_size = image_size;
+    m->image_count++;
+    return GSF_OK;
+}
+
+// Adds a point without track; a position that is not finite is counted instead (*added = 0).
+static gsf_result gsf__sfm_add_point(gsf_context* ctx, gsf__sfm* m, uint64_t id, const double xyz[3],
+                                       const uint8_t rgb[3], int* added) {
+    const size_t n = m->point_count;
+    *added = isfinite(xyz[0]) && isfinite(xyz[1]) && isfinite(xyz[2]);
+    if (!*added) {
+        m->dropped_points++;
+        return GSF_OK;
+    }
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->points, &m->point_room, n, n + 1, 3 * sizeof(double)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->colors, &m->color_room, n, n + 1, 3));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->point_ids, &m->id_room, n, n + 1, sizeof(uint64_t)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->track_begin, &m->begin_room, n ? n + 1 : 0, n + 2, sizeof(size_t)));
+    memcpy(m->points + 3 * n, xyz, 3 * sizeof(double));
+    memcpy(m->colors + 3 * n, rgb, 3);
+    m->point_ids[n] = id;
+    m->track_begin[0] = 0;
+    m->track_begin[n + 1] = m->track_count;
+    m->point_count++;
+    return GSF_OK;
+}
+
+static gsf_result gsf__sfm_add_track(gsf_context* ctx, gsf__sfm* m, uint32_t image_id) { // to the last point
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, m->track_count, m->track_count + 1, sizeof(uint32_t)));
+    m->tracks[m->track_count++] = image_id;
+    m->track_begin[m->point_count] = m->track_count;
+    return GSF_OK;
+}
+
+typedef struct gsf__cursor { // a binary file being read
+    const char* name;
+    const unsigned char* data;
+    size_t size, at;
+} gsf__cursor;
+
+static gsf__cursor gsf__make_cursor(const gsf_bytes* bytes, const char* fallback_name) {
+    gsf__cursor c;
+    c.name = bytes->name ? bytes->name : fallback_name;
+    c.data = (const unsigned char*)(bytes->data ? bytes->data : "");
+    c.size = bytes->data ? bytes->size : 0;
+    c.at = 0;
+    return c;
+}
+
+// The next `bytes` bytes; NULL (and the error) when the file ends before.
+static const unsigned char* gsf__take(gsf_context* ctx, gsf__cursor* c, size_t bytes, const char* what) {
+    if (bytes > c->size - c->at) {
+        (void)gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file ends inside %s", c->name, c->at, what);
+        return NULL;
+    }
+    c->at += bytes;
+    return c->data + c->at - bytes;
+}
+
+// A count of records of at least `record` bytes each, checked against what is left of the file.
+static gsf_result gsf__take_count(gsf_context* ctx, gsf__cursor* c, size_t record, const char* what, size_t* out) {
+    const unsigned char* p = gsf__take(ctx, c, 8, what);
+    if (!p) return GSF_ERROR_FORMAT;
+    const uint64_t count = gsf__load_le(p, 8);
+    if (count > (c->size - c->at) / record)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %llu %s do not fit the file", c->name, c->at - 8,
+                        (unsigned long long)count, what);
+    *out = (size_t)count;
+    return GSF_OK;
+}
+
+static double gsf__load_f64(const unsigned char* p) {
+    const uint64_t bits = gsf__load_le(p, 8);
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static gsf_result gsf__cursor_end(gsf_context* ctx, const gsf__cursor* c) {
+    if (c->at == c->size) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes behind the last record", c->name, c->at, c->size - c->at);
+}
+
+static gsf_result gsf__colmap_cameras_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
+    size_t count;
+    GSF__TRY(gsf__take_count(ctx, c, 24 + 3 * 8, "cameras", &count));
+    for (size_t i = 0; i < count; i++) {
+        const size_t at = c->at;
+        const unsigned char* p = gsf__take(ctx, c, 24, "a camera");
+        if (!p) return GSF_ERROR_FORMAT;
+        const uint32_t id = (uint32_t)gsf__load_le(p, 4), model = (uint32_t)gsf__load_le(p + 4, 4);
+        if (model >= GSF__COUNT(gsf__lens_models))
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %u: unknown camera model %d", c->name, at + 4,
+                            (unsigned)id, (int)model);
+        const unsigned char* values = gsf__take(ctx, c, 8u * gsf__lens_models[model].param_count, "a camera's parameters");
+        if (!values) return GSF_ERROR_FORMAT;
+        double params[GSF__LENS_PARAMS_MAX];
+        for (int k = 0; k < gsf__lens_models[model].param_count; k++) params[k] = gsf__load_f64(values + 8 * k);
+        GSF__TRY(gsf__sfm_add_camera(ctx, m, c->name, at, id, (int)model, gsf__load_le(p + 8, 8), gsf__load_le(p + 16, 8),
+                                       params));
+    }
+    return gsf__cursor_end(ctx, c);
+}
+
+static gsf_result gsf__colmap_images_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
+    size_t count, observations;
+    GSF__TRY(gsf__take_count(ctx, c, 64 + 2 + 8, "images", &count));
+    for (size_t i = 0; i < count; i++) {
+        const size_t at = c->at;
+        const unsigned char* p = gsf__take(ctx, c, 64, "an image");
+        if (!p) return GSF_ERROR_FORMAT;
+        double pose[7];
+        for (int k = 0; k < 7; k++) pose[k] = gsf__load_f64(p + 4 + 8 * k);
+        const char* image = (const char*)c->data + c->at;
+        const char* stop = c->at < c->size ? (const char*)memchr(image, 0, c->size - c->at) : NULL;
+        if (!stop) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image name without end", c->name, c->at);
+        c->at += (size_t)(stop - image) + 1;
+        GSF__TRY(gsf__take_count(ctx, c, 24, "2D points", &observations));
+        c->at += 24 * observations;
+        GSF__TRY(gsf__sfm_add_image(ctx, m, c->name, at, (uint32_t)gsf__load_le(p, 4), pose,
+                                      (uint32_t)gsf__load_le(p + 60, 4), image, (size_t)(stop - image)));
+    }
+    return gsf__cursor_end(ctx, c);
+}
+
+static gsf_result gsf__colmap_points_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
+    size_t count, track;
+    int added;
+    GSF__TRY(gsf__take_count(ctx, c, 43 + 8, "points", &count));
+    // Sized once: what no record head takes must be track entries.
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->points, &m->point_room, 0, count, 3 * sizeof(double)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->colors, &m->color_room, 0, count, 3));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->point_ids, &m->id_room, 0, count, sizeof(uint64_t)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->track_begin, &m->begin_room, 0, count + 1, sizeof(size_t)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, 0, (c->size - c->at - 51 * count) / 8, 4));
+    for (size_t i = 0; i < count; i++) {
+        const unsigned char* p = gsf__take(ctx, c, 43, "a point");
+        if (!p) return GSF_ERROR_FORMAT;
+        double xyz[3];
+        for (int k = 0; k < 3; k++) xyz[k] = gsf__load_f64(p + 8 + 8 * k);
+        GSF__TRY(gsf__take_count(ctx, c, 8, "track entries", &track));
+        GSF__TRY(gsf__sfm_add_point(ctx, m, gsf__load_le(p, 8), xyz, p + 32, &added));
+        for (size_t k = 0; k < track && added; k++)
+            GSF__TRY(gsf__sfm_add_track(ctx, m, (uint32_t)gsf__load_le(c->data + c->at + 8 * k, 4)));
+        c->at += 8 * track;
+    }
+    return gsf__cursor_end(ctx, c);
+}
+
+typedef struct gsf__line { // a text file being read line by line
+    const char* name;
+    const char *next, *file_end; // not yet read
+    const char *at, *end;        // rest of the current line
+    size_t number;               // from 1
+} gsf__line;
+
+static gsf__line gsf__make_lines(const gsf_bytes* bytes, const char* fallback_name) {
+    gsf__line l;
+    memset(&l, 0, sizeof l);
+    l.name = bytes->name ? bytes->name : fallback_name;
+    l.next = (const char*)(bytes->data ? bytes->data : "");
+    l.file_end = l.next + (bytes->data ? bytes->size : 0);
+    return l;
+}
+
+static int gsf__next_line(gsf__line* l) { // 0 at the end of the file
+    if (l->next == l->file_end) return 0;
+    const char* stop = (const char*)memchr(l->next, '\n', (size_t)(l->file_end - l->next));
+    l->at = l->next;
+    l->end = stop ? stop : l->file_end;
+    l->next = stop ? stop + 1 : l->file_end;
+    l->number++;
+    return 1;
+}
+
+static int gsf__next_record(gsf__line* l) { // the same without empty lines and comments
+    while (gsf__next_line(l)) {
+        while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
+        if (l->at < l->end && *l->at != '#') return 1;
+    }
+    return 0;
+}
+
+static gsf_result gsf__take_u64(gsf_context* ctx, gsf__line* l, uint64_t max, const char* what, uint64_t* out) {
+    const char* word;
+    const size_t length = gsf__next_word(&l->at, l->end, &word);
+    if (gsf__word_u64(word, length, out) && *out <= max) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got \"%.*s\"", l->name, l->number, what,
+                    (int)(length < 40 ? length : 40), word);
+}
+
+static gsf_result gsf__take_double(gsf_context* ctx, gsf__line* l, const char* what, double* out) {
+    const char* word;
+    const size_t length = gsf__next_word(&l->at, l->end, &word);
+    if (length && gsf__word_double(word, length, out)) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got \"%.*s\"", l->name, l->number, what,
+                    (int)(length < 40 ? length : 40), word);
+}
+
+static gsf_result gsf__colmap_cameras_txt(gsf_context* ctx, gsf__line* l, gsf__sfm* m) {
+    while (gsf__next_record(l)) {
+        uint64_t id, width, height;
+        const char* word;
+        GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a camera id", &id));
+        const size_t length = gsf__next_word(&l->at, l->end, &word);
+        int model = 0;
+        while (model < (int)GSF__COUNT(gsf__lens_models) && !gsf__word_is(word, length, gsf__lens_models[model].name)) model++;
+        if (model == (int)GSF__COUNT(gsf__lens_models))
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %llu: unknown camera model \"%.*s\"", l->name,
+                            l->number, (unsigned long long)id, (int)(length < 40 ? length : 40), word);
+        GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a width", &width));
+        GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a height", &height));
+        double params[GSF__LENS_PARAMS_MAX];
+        for (int k = 0; k < gsf__lens_models[model].param_count; k++)
+            GSF__TRY(gsf__take_double(ctx, l, "a camera parameter", &params[k]));
+        if (gsf__next_word(&l->at, l->end, &word))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %llu: %s has %d parameters, there are more", l->name,
+                            l->number, (unsigned long long)id, gsf__lens_models[model].name,
+                            (int)gsf__lens_models[model].param_count);
+        GSF__TRY(gsf__sfm_add_camera(ctx, m, l->name, l->number, (uint32_t)id, model, width, height, params));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__colmap_images_txt(gsf_context* ctx, gsf__line* l, gsf__sfm* m) {
+    while (gsf__next_record(l)) {
+        uint64_t id, camera;
+        double pose[7];
+        const char* word;
+        const size_t number = l->number;
+        GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "an image id", &id));
+        for (int k = 0; k < 7; k++) GSF__TRY(gsf__take_double(ctx, l, "a pose (QW QX QY QZ TX TY TZ)", &pose[k]));
+        GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a camera id", &camera));
+        // The name is the rest of the line, so it may hold spaces.
+        while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
+        const char *image = l->at, *stop = l->end;
+        while (stop > image && gsf__is_blank((unsigned char)stop[-1])) stop--;
+        size_t values = 0; // of the line of 2D points, which may be empty; the last one may be missing
+        if (gsf__next_line(l))
+            while (gsf__next_word(&l->at, l->end, &word)) values++;
+        if (values % 3)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu values, expected 2D points as X Y POINT3D_ID", l->name,
+                            l->number, values);
+        GSF__TRY(gsf__sfm_add_image(ctx, m, l->name, number, (uint32_t)id, pose, (uint32_t)camera, image,
+                                      (size_t)(stop - image)));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__colmap_points_txt(gsf_context* ctx, gsf__line* l, gsf__sfm* m) {
+    while (gsf__next_record(l)) {
+        uint64_t id, value;
+        double xyz[3], error;
+        uint8_t rgb[3];
+        int added;
+        GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a point id", &id));
+        for (int k = 0; k < 3; k++) GSF__TRY(gsf__take_double(ctx, l, "a coordinate", &xyz[k]));
+        for (int k = 0; k < 3; k++) {
+            GSF__TRY(gsf__take_u64(ctx, l, 255, "a colour 0..255", &value));
+            rgb[k] = (uint8_t)value;
+        }
+        GSF__TRY(gsf__take_double(ctx, l, "the reprojection error", &error));
+        GSF__TRY(gsf__sfm_add_point(ctx, m, id, xyz, rgb, &added));
+        for (;;) {
+            while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
+            if (l->at == l->end) break;
+            uint64_t image, index;
+            GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "an image id", &image));
+            GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a 2D point index", &index));
+            if (added) GSF__TRY(gsf__sfm_add_track(ctx, m, (uint32_t)image));
+        }
+    }
+    return GSF_OK;
+}
+
+// points NULL = none. The model's names point into `images`. To be destroyed also after an error.
+static gsf_result gsf__colmap_read(gsf_context* ctx, int is_text, const gsf_bytes* cameras, const gsf_bytes* images,
+                                   const gsf_bytes* points, gsf__sfm* m) {
+    memset(m, 0, sizeof *m);
+    if (is_text) {
+        gsf__line l = gsf__make_lines(cameras, "cameras.txt");
+        GSF__TRY(gsf__colmap_cameras_txt(ctx, &l, m));
+        GSF__TRY(gsf__sfm_finish_cameras(ctx, m, l.name));
+        l = gsf__make_lines(images, "images.txt");
+        m->images_name = l.name;
+        GSF__TRY(gsf__colmap_images_txt(ctx, &l, m));
+        if (points) {
+            l = gsf__make_lines(points, "points3D.txt");
+            GSF__TRY(gsf__colmap_points_txt(ctx, &l, m));
+        }
+    } else {
+        gsf__cursor c = gsf__make_cursor(cameras, "cameras.bin");
+        GSF__TRY(gsf__colmap_cameras_bin(ctx, &c, m));
+        GSF__TRY(gsf__sfm_finish_cameras(ctx, m, c.name));
+        c = gsf__make_cursor(images, "images.bin");
+        m->images_name = c.name;
+        GSF__TRY(gsf__colmap_images_bin(ctx, &c, m));
+        if (points) {
+            c = gsf__make_cursor(points, "points3D.bin");
+            GSF__TRY(gsf__colmap_points_bin(ctx, &c, m));
+        }
+    }
+    return GSF_OK;
+}
+
 // ---- >>transforms --------------------------------------------------------------
+
+/* transforms.json of nerfstudio and instant-ngp: an object with "frames": [{"file_path", "transform_matrix" (camera to
+   world, OpenGL axes: x right, y up, z backward)}]. Intrinsics (w h fl_x fl_y cx cy k1..k4 p1 p2 camera_model, or
+   camera_angle_x / camera_angle_y) stand at the top, or in a frame, which then wins. The world stays the file's:
+   nerfstudio's applied_transform has already been applied to the cameras and to the points of ply_file_path, and
+   instant-ngp's scale, offset and aabb_scale only place its own grid. */
+
+static const char* gsf__json_where(const gsf_json* json) { return json->name; }
+
+// A number from the frame, else from the root, else `fallback`.
+static gsf_result gsf__json_setting(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame, const char* key,
+                                    double fallback, double* out) {
+    const gsf_json_value* value = gsf_json_member(json, frame, key);
+    if (!value) value = gsf_json_member(json, &json->values[0], key);
+    *out = fallback;
+    if (!value) return GSF_OK;
+    if (value->type != GSF_JSON_NUMBER)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: \"%s\" is not a number", gsf__json_where(json),
+                        (unsigned)value->offset, key);
+    *out = value->number;
+    return GSF_OK;
+}
+
+static gsf_result gsf__transforms_lens_kind(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
+                                            gsf__lens_kind* out) {
+    static const char* const perspective[6] = {"OPENCV", "PINHOLE",     "SIMPLE_PINHOLE",
+                                               "RADIAL", "FULL_OPENCV", "SIMPLE_RADIAL"};
+    const gsf_json_value* root = &json->values[0];
+    const gsf_json_value* model = gsf_json_member(json, frame, "camera_model");
+    const gsf_json_value* fisheye = gsf_json_member(json, frame, "is_fisheye"); // instant-ngp
+    if (!model) model = gsf_json_member(json, root, "camera_model");
+    if (!fisheye) fisheye = gsf_json_member(json, root, "is_fisheye");
+    *out = fisheye && fisheye->type == GSF_JSON_TRUE ? GSF__LENS_FISHEYE : GSF__LENS_RATIONAL;
+    if (!model) return GSF_OK;
+    const char* name = model->type == GSF_JSON_STRING ? model->string : "";
+    for (int i = 0; i < 6; i++)
+        if (strcmp(name, perspective[i]) == 0) return GSF_OK;
+    *out = GSF__LENS_FISHEYE;
+    if (strcmp(name, "OPENCV_FISHEYE") == 0) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: camera_model \"%.40s\" is not supported", gsf__json_where(json),
+                    (unsigned)model->offset, name);
+}
+
+// The camera of a frame (frame NULL: of the top level), added to the model.
+static gsf_result gsf__transforms_add_camera(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
+                                             gsf__sfm* m) {
+    static const char* const keys[8] = {"k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"};
+    const char* where = gsf__json_where(json);
+    const unsigned at = (unsigned)(frame ? frame->offset : 0);
+    gsf__sfm_camera camera;
+    double width, height;
+    int distorted = 0;
+    memset(&camera, 0, sizeof camera);
+    gsf__lens* lens = &camera.lens;
+    camera.id = (uint32_t)m->camera_count;
+    camera.open = 1;
+    GSF__TRY(gsf__transforms_lens_kind(ctx, json, frame, &lens->kind));
+    for (int i = 0; i < 6; i++) {
+        GSF__TRY(gsf__json_setting(ctx, json, frame, keys[i], 0.0, &lens->k[i]));
+        distorted = distorted || lens->k[i] != 0.0;
+    }
+    if (lens->kind == GSF__LENS_RATIONAL && !distorted) lens->kind = GSF__LENS_PINHOLE;
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "w", 0.0, &width));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "h", 0.0, &height));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "fl_x", 0.0, &lens->fx));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "fl_y", 0.0, &lens->fy));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "camera_angle_x", 0.0, &camera.angle_x));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "camera_angle_y", 0.0, &camera.angle_y));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "cx", (double)NAN, &lens->cx));
+    GSF__TRY(gsf__json_setting(ctx, json, frame, "cy", (double)NAN, &lens->cy));
+    const double size_max = (double)GSF__LENS_SIZE_MAX;
+    if (!(width >= 0.0 && height >= 0.0 && width <= size_max && height <= size_max &&
+          (width >= 1.0) == (height >= 1.0)))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: image size %g x %g", where, at, width, height);
+    lens->width = (int32_t)width;
+    lens->height = (int32_t)height;
+    const double pi = 3.14159265358979;
+    if (!(lens->fx > 0.0) && !(camera.angle_x > 0.0 && camera.angle_x < pi))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: neither fl_x > 0 nor camera_angle_x between 0 and pi", where, at);
+    if (lens->fx < 0.0 || lens->fy < 0.0 || camera.angle_y < 0.0 || camera.angle_y > pi)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: negative focal length or field of view", where, at);
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
+                          sizeof *m->cameras));
+    m->cameras[m->camera_count++] = camera;
+    return GSF_OK;
+}
+
+static int gsf__transforms_has_camera(const gsf_json* json, const gsf_json_value* frame) {
+    static const char* const keys[16] = {"w",  "h",  "fl_x", "fl_y", "cx", "cy", "k1",           "k2",
+                                         "k3", "k4", "p1",   "p2",   "camera_angle_x", "camera_angle_y",
+                                         "camera_model", "is_fisheye"};
+    for (int i = 0; i < 16; i++)
+        if (gsf_json_member(json, frame, keys[i])) return 1;
+    return 0;
+}
+
+// OpenGL camera-to-world rows to an OpenCV world-to-camera matrix; 0 if the 3x3 part is no rotation (times a scale).
+static int gsf__pose_from_opengl(const double rows[12], double w2c[16]) {
+    double axis[3][3], c2w[16];
+    for (int c = 0; c < 3; c++) {
+        double length = 0.0;
+        for (int r = 0; r < 3; r++) axis[c][r] = rows[4 * r + c], length += axis[c][r] * axis[c][r];
+        length = sqrt(length);
+        if (!(length > 1e-9 && length < 1e9)) return 0;
+        for (int r = 0; r < 3; r++) axis[c][r] /= length;
+    }
+    const double* x = axis[0];
+    double *y = axis[1], *z = axis[2];
+    for (int a = 0; a < 3; a++)
+        for (int b = a + 1; b < 3; b++)
+            if (fabs(axis[a][0] * axis[b][0] + axis[a][1] * axis[b][1] + axis[a][2] * axis[b][2]) > 1e-2) return 0;
+    const double cross[3] = {x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]};
+    if (cross[0] * z[0] + cross[1] * z[1] + cross[2] * z[2] < 0.0) return 0; // mirrored
+    const double norm = sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]);
+    for (int r = 0; r < 3; r++) z[r] = cross[r] / norm; // exactly orthonormal: z from x, y, then y from z, x
+    y[0] = z[1] * x[2] - z[2] * x[1];
+    y[1] = z[2] * x[0] - z[0] * x[2];
+    y[2] = z[0] * x[1] - z[1] * x[0];
+    memset(c2w, 0, sizeof c2w);
+    for (int r = 0; r < 3; r++) {
+        c2w[r] = x[r];
+        c2w[4 + r] = -y[r];
+        c2w[8 + r] = -z[r];
+        c2w[12 + r] = rows[4 * r + 3];
+        if (!(fabs(c2w[12 + r]) < 1e100)) return 0;
+    }
+    c2w[15] = 1.0;
+    gsf_mat4_rigid_inverse(c2w, w2c);
+    return 1;
+}
+
+static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
+                                            size_t camera, gsf__sfm* m) {
+    const char* where = gsf__json_where(json);
+    const gsf_json_value* path = gsf_json_member(json, frame, "file_path");
+    const gsf_json_value* matrix = gsf_json_member(json, frame, "transform_matrix");
+    double rows[12];
+    if (!path || path->type != GSF_JSON_STRING)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without file_path", where, (unsigned)frame->offset);
+    if (!matrix || matrix->type != GSF_JSON_ARRAY || (matrix->count != 4 && matrix->count != 3))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without a 4x4 transform_matrix", where, (unsigned)frame->offset);
+    for (size_t r = 0; r < 3; r++) {
+        const gsf_json_value* row = gsf_json_element(json, matrix, r);
+        for (size_t c = 0; c < 4; c++) {
+            const gsf_json_value* value =
+                row && row->type == GSF_JSON_ARRAY && row->count == 4 ? gsf_json_element(json, row, c) : NULL;
+            if (!value || value->type != GSF_JSON_NUMBER)
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is no 4x4 matrix of numbers", where,
+                                (unsigned)matrix->offset);
+            rows[4 * r + c] = value->number;
+        }
+    }
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
+    gsf__sfm_image* image = &m->images[m->image_count];
+    if (!gsf__pose_from_opengl(rows, image->w2c))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is no rotation and translation", where,
+                        (unsigned)matrix->offset);
+    image->name = path->string;
+    image->name_size = path->string_size;
+    while (image->name_size > 2 && image->name[0] == '.' && image->name[1] == '/') image->name += 2, image->name_size -= 2;
+    image->id = (uint32_t)m->image_count + 1;
+    image->camera = camera;
+    image->camera_id = (uint32_t)camera;
+    image->at = path->offset;
+    m->image_count++;
+    return GSF_OK;
+}
+
+// The model's names point into `json`. To be destroyed also after an error.
+static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, gsf__sfm* m) {
+    const gsf_json_value* frames = gsf_json_member(json, &json->values[0], "frames");
+    size_t shared = SIZE_MAX;
+    memset(m, 0, sizeof *m);
+    m->images_name = gsf__json_where(json);
+    if (!frames || frames->type != GSF_JSON_ARRAY)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: no \"frames\" array", gsf__json_where(json));
+    for (uint32_t i = frames->child; i; i = json->values[i].next) {
+        const gsf_json_value* frame = &json->values[i];
+        if (frame->type != GSF_JSON_OBJECT)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: a frame is no object", gsf__json_where(json),
+                            (unsigned)frame->offset);
+        const int own = gsf__transforms_has_camera(json, frame);
+        size_t camera = own ? m->camera_count : shared;
+        if (camera == SIZE_MAX) camera = shared = m->camera_count;
+        if (camera == m->camera_count) GSF__TRY(gsf__transforms_add_camera(ctx, json, own ? frame : NULL, m));
+        GSF__TRY(gsf__transforms_add_frame(ctx, json, frame, camera, m));
+    }
+    return GSF_OK;
+}
+
+// A plain point cloud (x y z, and red green blue where present: 0..255, or 0..1 as float) into the model's points.
+static gsf_result gsf__transforms_read_points(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                              gsf__sfm* m) {
+    gsf__ply ply;
+    gsf_result result = GSF_OK;
+    GSF__TRY(gsf__ply_read_header(ctx, name, data, size, &ply));
+    for (int k = 0; k < 3; k++)
+        if (ply.type[k] == GSF__PLY_ABSENT)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: no points: a column of x, y, z is missing", name, ply.body);
+    double* values = NULL;
+    const char* at = (const char*)ply.data + ply.body;
+    if (ply.format == GSF__PLY_ASCII && !(values = (double*)gsf_alloc(ctx, ply.columns, sizeof(double))))
+        return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < ply.count && result == GSF_OK; i++) {
+        const unsigned char* row = ply.data + ply.body + i * ply.row_bytes;
+        double xyz[3];
+        uint8_t rgb[3];
+        int added;
+        if (values) result = gsf__ply_ascii_row(ctx, &ply, &at, values);
+        if (result != GSF_OK) break;
+        for (int k = 0; k < 6; k++) {
+            const int slot = k < 3 ? k : GSF__PLY_RED + k - 3;
+            const gsf__ply_type type = ply.type[slot];
+            double value = 128.0;
+            if (type != GSF__PLY_ABSENT) {
+                value = values ? values[ply.offset[slot]]
+                               : gsf__ply_value(row + ply.offset[slot], type, ply.format == GSF__PLY_BIG);
+                if (k >= 3 && (type == GSF__PLY_F32 || type == GSF__PLY_F64)) value *= 255.0;
+            }
+            if (k < 3) xyz[k] = value;
+            else rgb[k - 3] = (uint8_t)(value > 0.0 ? (value < 255.0 ? value + 0.5 : 255.0) : 0.0);
+        }
+        result = gsf__sfm_add_point(ctx, m, i, xyz, rgb, &added);
+    }
+    gsf_free(ctx, values);
+    return result;
+}
 
 // ---- >>undistort ---------------------------------------------------------------
 
+// atan(t)/t for t >= 0: two exact reductions to |z| <= tan(pi/8), then the series; error below 1e-12.
+static double gsf__atan_ratio(double t) {
+    const double pi = 3.14159265358979323846;
+    double z = t, base = 0.0, sign = 1.0;
+    if (t < 1e-4) return 1.0 - t * t / 3.0;
+    if (z > 1.0) {
+        z = 1.0 / z;
+        base = pi / 2;
+        sign = -1.0;
+    }
+    if (z > 0.41421356237309503) {
+        z = (z - 1.0) / (z + 1.0);
+        base += sign * pi / 4;
+    }
+    const double s = z * z;
+    double series = 0.0;
+    for (int n = 29; n >= 1; n -= 2) series = 1.0 / n - s * series;
+    return (base + sign * z * series) / t;
+}
+
+// Undistorted ray (x, y, 1) to the distorted normalised image point; pixels are then fx u + cx, fy v + cy. The formulas
+// of COLMAP's sensor/models.h, whose RATIONAL is OpenCV's. Difference: no Taylor branches near zero in FOV.
+static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double* u, double* v) {
+    const double* k = lens->k;
+    const double r2 = x * x + y * y;
+    double scale;
+    switch (lens->kind) {
+        case GSF__LENS_PINHOLE:
+            *u = x;
+            *v = y;
+            return;
+        case GSF__LENS_RATIONAL:
+            scale = (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])));
+            *u = x * scale + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x);
+            *v = y * scale + 2.0 * k[3] * x * y + k[2] * (r2 + 2.0 * y * y);
+            return;
+        case GSF__LENS_FISHEYE: {
+            scale = gsf__atan_ratio(sqrt(r2));
+            const double a = x * scale, b = y * scale, t2 = r2 * scale * scale; // t = angle to the axis
+            const double radial = 1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[4] + t2 * k[5])));
+            *u = a * radial + 2.0 * k[2] * a * b + k[3] * (t2 + 2.0 * a * a) + k[6] * t2;
+            *v = b * radial + 2.0 * k[3] * a * b + k[2] * (t2 + 2.0 * b * b) + k[7] * t2;
+            return;
+        }
+        case GSF__LENS_FOV: // k[1] = 2 tan(omega/2), k[2] = k[1]/omega, set by gsf__rectify_make
+            scale = k[2] * gsf__atan_ratio(k[1] * sqrt(r2));
+            *u = x * scale;
+            *v = y * scale;
+            return;
+    }
+    *u = x;
+    *v = y;
+}
+
+typedef struct gsf__rectify { // how a photo becomes a pinhole image
+    gsf__lens lens;       // of the photo
+    double fx, fy, cx, cy;// of the pinhole image
+    int32_t width, height;// of the pinhole image
+    double centre;        // coordinate of the first pixel's centre in both images' intrinsics
+} gsf__rectify;
+
+// cv::undistortPoints' five steps of the fixed-point iteration for a RATIONAL lens. Not run to convergence, since the
+// rectangle, and so the new camera, should be the official one.
+static void gsf__undistort_point(const gsf__lens* lens, double px, double py, double* x_out, double* y_out) {
+    const double* k = lens->k;
+    const double x0 = (px - lens->cx) / lens->fx, y0 = (py - lens->cy) / lens->fy;
+    double x = x0, y = y0;
+    for (int i = 0; i < 5; i++) {
+        const double r2 = x * x + y * y;
+        const double inverse = (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))) / (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4])));
+        if (inverse < 0.0) {
+            x = x0;
+            y = y0;
+            break;
+        }
+        const double dx = 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x);
+        const double dy = k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y;
+        x = (x0 - dx) * inverse;
+        y = (y0 - dy) * inverse;
+    }
+    *x_out = x;
+    *y_out = y;
+}
+
+// Where pixel (i, j) of the pinhole image lies in the photo, counted in pixel centres (0 = centre of the first).
+static void gsf__rectify_map(const gsf__rectify* r, double i, double j, double* sx, double* sy) {
+    double u, v;
+    gsf__lens_distort(&r->lens, (i + r->centre - r->cx) / r->fx, (j + r->centre - r->cy) / r->fy, &u, &v);
+    *sx = r->lens.fx * u + r->lens.cx - r->centre;
+    *sy = r->lens.fy * v + r->lens.cy - r->centre;
+}
+
+// Does the border of the pinhole image come from the photo, or from at most 5 % of its size outside?
+static int gsf__rectify_is_sound(const gsf__rectify* r) {
+    const int samples = 32;
+    const double w = r->lens.width, h = r->lens.height;
+    for (int side = 0; side < 4; side++)
+        for (int i = 0; i <= samples; i++) {
+            const double along = (double)i / samples, across = side & 1 ? 1.0 : 0.0;
+            double x, y;
+            gsf__rectify_map(r, (side < 2 ? along : across) * (r->width - 1), (side < 2 ? across : along) * (r->height - 1),
+                             &x, &y);
+            if (!(x > -0.05 * w - 1 && x < 1.05 * w && y > -0.05 * h - 1 && y < 1.05 * h)) return 0;
+        }
+    return 1;
+}
+
+// cv::getOptimalNewCameraMatrix(alpha = 0): the rectangle inscribed in the undistorted 9x9 grid fills the image. The
+// region of interest it returns is then always (0, 0, width - 1, height - 1). OpenCV numbers pixel centres 0, 1, ...; the
+// official parser hands it COLMAP's intrinsics, which mean 0.5, 1.5, ...; so does this function (the image shifts by a few
+// hundredths of a pixel, the same in both). 0 when nothing is left.
+static int gsf__rectify_like_opencv(gsf__rectify* r) {
+    const gsf__lens* lens = &r->lens;
+    double x0 = -DBL_MAX, x1 = DBL_MAX, y0 = -DBL_MAX, y1 = DBL_MAX;
+    if (lens->width < 2 || lens->height < 2) return 0;
+    for (int j = 0; j < 9; j++)
+        for (int i = 0; i < 9; i++) {
+            double x, y;
+            gsf__undistort_point(lens, (double)i * (lens->width - 1) / 8.0, (double)j * (lens->height - 1) / 8.0, &x, &y);
+            if (!isfinite(x) || !isfinite(y)) return 0;
+            if (i == 0) x0 = fmax(x0, x);
+            if (i == 8) x1 = fmin(x1, x);
+            if (j == 0) y0 = fmax(y0, y);
+            if (j == 8) y1 = fmin(y1, y);
+        }
+    if (!(x1 - x0 > 1e-6 && y1 - y0 > 1e-6 && x1 - x0 < 1e3 && y1 - y0 < 1e3)) return 0;
+    r->fx = (lens->width - 1) / (x1 - x0);
+    r->fy = (lens->height - 1) / (y1 - y0);
+    r->cx = -r->fx * x0;
+    r->cy = -r->fy * y0;
+    r->width = lens->width - 1;
+    r->height = lens->height - 1;
+    r->centre = 0.0;
+    return gsf__rectify_is_sound(r);
+}
+
+// Does the pinhole image with focal lengths `zoom` times the lens's show only what lies inside the photo, on its border?
+static int gsf__rectify_fits(const gsf__rectify* r, double zoom, double radius_max) {
+    const gsf__lens* lens = &r->lens;
+    const int samples = 32;
+    for (int side = 0; side < 4; side++)
+        for (int i = 0; i <= samples; i++) {
+            const double along = (double)i / samples, across = side & 1 ? 1.0 : 0.0;
+            const double px = 0.5 + (side < 2 ? along : across) * (lens->width - 1);
+            const double py = 0.5 + (side < 2 ? across : along) * (lens->height - 1);
+            const double x = (px - lens->cx) / (zoom * lens->fx), y = (py - lens->cy) / (zoom * lens->fy);
+            double u, v;
+            if (!(x * x + y * y < radius_max * radius_max)) return 0;
+            gsf__lens_distort(lens, x, y, &u, &v);
+            u = lens->fx * u + lens->cx;
+            v = lens->fy * v + lens->cy;
+            if (!(u >= 0.5 && v >= 0.5 && u <= lens->width - 0.5 && v <= lens->height - 0.5)) return 0;
+        }
+    return 1;
+}
+
+// The tangent of the largest angle to the axis that a pinhole image may show: at most 75 degrees, and less where the
+// lens's polynomial folds back.
+static double gsf__lens_radius_max(const gsf__lens* lens) {
+    static const double directions[8][2] = {{1, 0},  {0.6, 0.8},   {0, 1},  {-0.8, 0.6},
+                                            {-1, 0}, {-0.6, -0.8}, {0, -1}, {0.8, -0.6}};
+    double limit = 3.7320508075688772;
+    for (int d = 0; d < 8; d++) {
+        double last = 0.0;
+        for (int i = 1; i <= 64; i++) {
+            const double r = 3.7320508075688772 * i / 64;
+            double u, v;
+            gsf__lens_distort(lens, directions[d][0] * r, directions[d][1] * r, &u, &v);
+            const double distance = u * u + v * v;
+            if (!(distance > last)) {
+                limit = fmin(limit, 3.7320508075688772 * (i - 1) / 64);
+                break;
+            }
+            last = distance;
+        }
+    }
+    return limit;
+}
+
+// For lenses the official parser has no sound way for (fisheye, FOV) and where OpenCV's rectangle fails: same size,
+// principal point and pixel aspect as the photo, the smallest zoom at which no pixel falls outside of it. Exact pixel
+// centres. 0 when nothing is left.
+static int gsf__rectify_by_zoom(gsf__rectify* r) {
+    const double radius_max = gsf__lens_radius_max(&r->lens);
+    double low = 1.0 / 1024, high = 64.0;
+    if (!gsf__rectify_fits(r, high, radius_max)) return 0;
+    for (int i = 0; i < 40 && high - low > 1e-7 * high; i++) {
+        const double middle = sqrt(low * high);
+        if (gsf__rectify_fits(r, middle, radius_max)) high = middle;
+        else low = middle;
+    }
+    r->fx = r->lens.fx * high;
+    r->fy = r->lens.fy * high;
+    r->cx = r->lens.cx;
+    r->cy = r->lens.cy;
+    r->width = r->lens.width;
+    r->height = r->lens.height;
+    r->centre = 0.5;
+    return 1;
+}
+
+// The pinhole camera of a lens; 0 when its distortion leaves no usable image.
+static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
+    memset(r, 0, sizeof *r);
+    r->lens = *lens;
+    if (lens->kind == GSF__LENS_FOV) {
+        const double omega = fabs(lens->k[0]);
+        r->lens.k[1] = omega < 1e-6 ? 1.0 : 2.0 * tan(0.5 * omega);
+        r->lens.k[2] = omega < 1e-6 ? 1.0 : r->lens.k[1] / omega;
+        if (omega < 1e-6) r->lens.kind = GSF__LENS_PINHOLE;
+    }
+    r->fx = lens->fx;
+    r->fy = lens->fy;
+    r->cx = lens->cx;
+    r->cy = lens->cy;
+    r->width = lens->width;
+    r->height = lens->height;
+    r->centre = 0.5;
+    if (r->lens.kind == GSF__LENS_PINHOLE) return 1;
+    if (r->lens.kind == GSF__LENS_RATIONAL && gsf__rectify_like_opencv(r)) return 1;
+    return gsf__rectify_by_zoom(r);
+}
+
+typedef struct gsf__rectify_job {
+    const gsf__rectify* r;
+    const uint8_t* src; // packed u8 RGB of the lens's size
+    uint8_t* dst;       // packed u8 RGB of the rectangle's size
+} gsf__rectify_job;
+
+enum { GSF__RECTIFY_ROWS = 16 };
+
+// One bilinear sample per pixel, weights in 1/1024 from positions in 1/32 pixel as cv::remap has them; beyond the border
+// the nearest pixel counts.
+static void gsf__rectify_rows(void* arg, size_t chunk, int worker) {
+    const gsf__rectify_job* job = (const gsf__rectify_job*)arg;
+    const gsf__rectify* r = job->r;
+    const int32_t w = r->lens.width, h = r->lens.height;
+    const int32_t first = (int32_t)chunk * GSF__RECTIFY_ROWS;
+    const int32_t last = first + GSF__RECTIFY_ROWS < r->height ? first + GSF__RECTIFY_ROWS : r->height;
+    (void)worker;
+    for (int32_t j = first; j < last; j++)
+        for (int32_t i = 0; i < r->width; i++) {
+            double sx, sy;
+            gsf__rectify_map(r, i, j, &sx, &sy);
+            sx = sx > 0.0 ? (sx < w - 1 ? sx : w - 1) : 0.0; // NaN becomes 0
+            sy = sy > 0.0 ? (sy < h - 1 ? sy : h - 1) : 0.0;
+            const int64_t tx = (int64_t)(sx * 32.0 + 0.5), ty = (int64_t)(sy * 32.0 + 0.5);
+            const uint32_t ax = (uint32_t)(tx & 31), ay = (uint32_t)(ty & 31);
+            const int64_t x0 = tx >> 5, y0 = ty >> 5;
+            const int64_t x1 = x0 + 1 < w ? x0 + 1 : w - 1, y1 = y0 + 1 < h ? y0 + 1 : h - 1;
+            const uint8_t *row0 = job->src + 3 * y0 * w, *row1 = job->src + 3 * y1 * w;
+            uint8_t* out = job->dst + 3 * ((int64_t)j * r->width + i);
+            for (int c = 0; c < 3; c++) {
+                const uint32_t top = row0[3 * x0 + c] * (32 - ax) + row0[3 * x1 + c] * ax;
+                const uint32_t bottom = row1[3 * x0 + c] * (32 - ax) + row1[3 * x1 + c] * ax;
+                out[c] = (uint8_t)((top * (32 - ay) + bottom * ay + 512) >> 10);
+            }
+        }
+}
+
+// photo: packed u8 RGB of the lens's size. out: new image of the rectangle's size.
+static gsf_result gsf__rectify_image(gsf_context* ctx, const gsf__rectify* r, const gsf_image* photo, gsf_image* out) {
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, r->width, r->height, 3, out));
+    gsf__rectify_job job;
+    job.r = r;
+    job.src = (const uint8_t*)photo->data;
+    job.dst = (uint8_t*)out->data;
+    gsf__parallel_for(ctx, ((size_t)r->height + GSF__RECTIFY_ROWS - 1) / GSF__RECTIFY_ROWS, gsf__rectify_rows, &job);
+    return GSF_OK;
+}
+
 // ---- >>scene -------------------------------------------------------------------
+
+typedef struct gsf__view_source { // what gsf_splat_load_view_image needs of a view
+    gsf__rectify rectify;    // lens: of the photo at the size at which it is undistorted
+    size_t path;             // offset in paths; SIZE_MAX: parsed from memory
+    int64_t file_width, file_height;
+} gsf__view_source;
+
+typedef struct gsf__scene_state {
+    gsf__view_source* sources; // per view
+    char* names;               // what the views' names point to
+    gsf_text paths;            // of the photos, each terminated
+} gsf__scene_state;
+
+GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene) {
+    gsf__scene_state* state = (gsf__scene_state*)scene->state;
+    for (size_t i = 0; i < scene->view_count; i++) gsf_destroy_image(ctx, &scene->views[i].image);
+    if (state) {
+        gsf_free(ctx, state->sources);
+        gsf_free(ctx, state->names);
+        gsf_destroy_text(ctx, &state->paths);
+        gsf_free(ctx, state);
+    }
+    gsf_free(ctx, scene->views);
+    gsf_free(ctx, scene->points);
+    gsf_free(ctx, scene->colors);
+    gsf_free(ctx, scene->point_ids);
+    gsf_free(ctx, scene->track_begin);
+    gsf_free(ctx, scene->track_views);
+    gsf_free(ctx, scene->folder);
+    memset(scene, 0, sizeof *scene);
+}
+
+// ---- files ----
+
+// Runs without the log hook what may fail without harm; ctx->error is left as it was.
+typedef struct gsf__hush {
+    gsf_logger logger;
+    char error[512];
+} gsf__hush;
+
+static void gsf__hush_begin(gsf_context* ctx, gsf__hush* hush) {
+    hush->logger = ctx->logger;
+    memcpy(hush->error, ctx->error, sizeof hush->error);
+    memset(&ctx->logger, 0, sizeof ctx->logger);
+}
+
+// Takes the error back if `forget`, else reports it now.
+static void gsf__hush_end(gsf_context* ctx, const gsf__hush* hush, int forget) {
+    ctx->logger = hush->logger;
+    if (forget) memcpy(ctx->error, hush->error, sizeof hush->error);
+    else gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
+}
+
+// Reads <folder><relative>; *data NULL where there is no such file.
+static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_text* path, void** data,
+                                     size_t* size) {
+    gsf__hush hush;
+    path->size = 0;
+    gsf_text_printf(ctx, path, "%s%s", folder, relative);
+    if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__hush_begin(ctx, &hush);
+    const gsf_result result = gsf_read_file(ctx, path->data, data, size);
+    gsf__hush_end(ctx, &hush, result == GSF_OK || result == GSF_ERROR_IO);
+    return result == GSF_ERROR_IO ? GSF_OK : result;
+}
+
+// Names come from files, so they must not lead out of the folder: relative, no "..", no drive.
+static gsf_result gsf__check_relative(gsf_context* ctx, const char* where, size_t at, const char* name, size_t size) {
+    int bad = size == 0 || name[0] == '/' || name[0] == '\\';
+    bad = bad || (size >= 2 && name[1] == ':' && ((name[0] | 32) >= 'a' && (name[0] | 32) <= 'z'));
+    for (size_t i = 0, start = 0; i <= size && !bad; i++) {
+        if (i < size && name[i] == 0) bad = 1;
+        if (i < size && name[i] != '/' && name[i] != '\\') continue;
+        bad = bad || (i - start == 2 && name[start] == '.' && name[start + 1] == '.');
+        start = i + 1;
+    }
+    if (!bad) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: the file name \"%.*s\" leads out of its folder", where, at,
+                    (int)(size < 100 ? size : 100), name);
+}
+
+typedef struct gsf__photos { // where the photos of a model lie; NULL instead: nowhere (parsed from memory)
+    const char* folder;   // with a separator at its end, or empty
+    const char* prefix;   // "images/" (COLMAP) or "" (transforms.json, whose paths hold the folder)
+    int32_t factor, max_size;
+} gsf__photos;
+
+// Is there an image at `path`? Its size then; *width 0 otherwise.
+static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_text* path, int64_t* width, int64_t* height) {
+    gsf__hush hush;
+    int32_t channels;
+    if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__hush_begin(ctx, &hush);
+    const gsf_result result = gsf_query_image(ctx, path->data, width, height, &channels);
+    gsf__hush_end(ctx, &hush, result == GSF_OK || result == GSF_ERROR_IO);
+    if (result == GSF_ERROR_IO) *width = *height = 0;
+    return result == GSF_ERROR_IO ? GSF_OK : result;
+}
+
+// Finds a view's photo. With a factor first in <first folder>_<factor>/, under its own name or with another extension
+// (downscaled copies often are .png of .jpg); then the full-size one; transforms.json may leave the extension out.
+// *reduced: it is the downscaled copy. *width 0: not there.
+static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, const char* name, gsf_text* path,
+                                  int64_t* width, int64_t* height, int* reduced) {
+    static const char* const extensions[6] = {".png", ".jpg", ".JPG", ".jpeg", ".PNG", ".JPEG"};
+    const int count = (int)GSF__COUNT(extensions);
+    *reduced = 1;
+    const char* first = photos->prefix[0] ? photos->prefix : name;
+    const char* slash = strchr(first, '/');
+    const char* dot = strrchr(name, '.');
+    if (dot && strchr(dot, '/')) dot = NULL;
+    if (photos->factor > 1 && slash) {
+        const char* rest = photos->prefix[0] ? name : slash + 1;
+        for (int i = -1; i < count; i++) {
+            const size_t kept = i < 0 || !dot ? strlen(rest) : (size_t)(dot - rest);
+            path->size = 0;
+            gsf_text_printf(ctx, path, "%s%.*s_%d/%.*s%s", photos->folder, (int)(slash - first), first,
+                            (int)photos->factor, (int)kept, rest, i < 0 ? "" : extensions[i]);
+            GSF__TRY(gsf__query_photo(ctx, path, width, height));
+            if (*width) return GSF_OK;
+        }
+    }
+    *reduced = 0;
+    for (int i = -1; i < (photos->prefix[0] || dot ? 0 : count); i++) {
+        path->size = 0;
+        gsf_text_printf(ctx, path, "%s%s%s%s", photos->folder, photos->prefix, name, i < 0 ? "" : extensions[i]);
+        GSF__TRY(gsf__query_photo(ctx, path, width, height));
+        if (*width) return GSF_OK;
+    }
+    return GSF_OK;
+}
+
+// ---- from model to scene ----
+
+static double gsf__round_half_even(double x) { // for x >= 0 well below 2^52, as Python's round and numpy's
+    const double down = floor(x), rest = x - down;
+    if (rest != 0.5) return rest < 0.5 ? down : down + 1.0;
+    return fmod(down, 2.0) == 0.0 ? down : down + 1.0;
+}
+
+static int gsf__compare_image_names(const void* a, const void* b) {
+    const gsf__sfm_image *x = (const gsf__sfm_image*)a, *y = (const gsf__sfm_image*)b;
+    const size_t shorter = x->name_size < y->name_size ? x->name_size : y->name_size;
+    const int order = memcmp(x->name, y->name, shorter);
+    if (order) return order;
+    return (x->name_size > y->name_size) - (x->name_size < y->name_size);
+}
+
+// The lens of a camera with what transforms.json left open taken from the photo (width 0: no photo). 0: size unknown.
+static int gsf__camera_lens(const gsf__sfm_camera* camera, int64_t width, int64_t height, gsf__lens* out) {
+    *out = camera->lens;
+    if (!camera->open) return 1;
+    if (out->width == 0) {
+        if (width == 0) return 0;
+        out->width = (int32_t)width;
+        out->height = (int32_t)height;
+    }
+    if (!(out->fx > 0.0)) out->fx = 0.5 * out->width / tan(0.5 * camera->angle_x);
+    if (!(out->fy > 0.0)) out->fy = camera->angle_y > 0.0 ? 0.5 * out->height / tan(0.5 * camera->angle_y) : out->fx;
+    if (isnan(out->cx)) out->cx = 0.5 * out->width;
+    if (isnan(out->cy)) out->cy = 0.5 * out->height;
+    return isfinite(out->fx) && isfinite(out->fy) && out->fx > 0.0 && out->fy > 0.0;
+}
+
+// The size at which a photo is used.
+static void gsf__target_size(const gsf__photos* photos, int64_t width, int64_t height, int reduced, int32_t* out_width,
+                             int32_t* out_height) {
+    double scale = 1.0;
+    const int64_t longer = width > height ? width : height;
+    if (photos->factor > 1 && !reduced) scale = 1.0 / photos->factor;
+    if (photos->max_size > 0 && longer > photos->max_size) scale = (double)photos->max_size / (double)longer;
+    *out_width = (int32_t)fmax(1.0, gsf__round_half_even((double)width * scale));
+    *out_height = (int32_t)fmax(1.0, gsf__round_half_even((double)height * scale));
+}
+
+// Fills view `out` and its source from a model image. *present = 0: its photo is missing.
+// The official parser divides K by the factor and multiplies by actual / (COLMAP size / factor, rounded down); taken here
+// without the rounding down, K simply follows the ratio of the sizes, each axis and each view for itself.
+static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, const gsf__sfm_image* image,
+                                 const gsf__photos* photos, gsf_text* path, gsf_scene_view* view, gsf__view_source* source,
+                                 int* present) {
+    int64_t width = 0, height = 0;
+    int reduced = 0;
+    gsf__lens lens;
+    if (photos) GSF__TRY(gsf__find_photo(ctx, photos, view->name, path, &width, &height, &reduced));
+    *present = !photos || width > 0;
+    if (!*present) return GSF_OK;
+    if (width > GSF__LENS_SIZE_MAX || height > GSF__LENS_SIZE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: image size %lld x %lld", path->data, (long long)width, (long long)height);
+    const int64_t full = reduced ? photos->factor : 1; // an open size means the full photo's
+    if (!gsf__camera_lens(&m->cameras[image->camera], width * full, height * full, &lens))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: \"%s\": no usable w, h or focal length", m->images_name, image->at,
+                        view->name);
+    if (photos) {
+        int32_t w, h;
+        gsf__target_size(photos, width, height, reduced, &w, &h);
+        const double sx = (double)w / lens.width, sy = (double)h / lens.height;
+        lens.fx *= sx;
+        lens.cx *= sx;
+        lens.fy *= sy;
+        lens.cy *= sy;
+        lens.width = w;
+        lens.height = h;
+    }
+    if (!gsf__rectify_make(&lens, &source->rectify))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s:%zu: \"%s\": the distortion of camera %u leaves no image", m->images_name,
+                        image->at, view->name, (unsigned)image->camera_id);
+    source->file_width = width;
+    source->file_height = height;
+    gsf_camera* camera = &view->camera;
+    memcpy(camera->w2c, image->w2c, sizeof camera->w2c);
+    camera->fx = source->rectify.fx;
+    camera->fy = source->rectify.fy;
+    camera->cx = source->rectify.cx;
+    camera->cy = source->rectify.cy;
+    camera->width = source->rectify.width;
+    camera->height = source->rectify.height;
+    view->image_id = image->id;
+    return gsf_check_camera(ctx, camera);
+}
+
+// Names, views and sources of all images whose photo is there, sorted by name. m->images is sorted too; its `camera`
+// becomes the index of the view (UINT32_MAX: left out).
+static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_scene* scene) {
+    gsf__scene_state* state = (gsf__scene_state*)scene->state;
+    gsf_text path;
+    gsf_result result = GSF_OK;
+    size_t name_bytes = 0, missing = 0;
+    memset(&path, 0, sizeof path);
+    if (m->image_count == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no image in the file", m->images_name);
+    if (m->image_count >= UINT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu images", m->images_name, m->image_count);
+    qsort(m->images, m->image_count, sizeof *m->images, gsf__compare_image_names);
+    for (size_t i = 0; i < m->image_count; i++) {
+        const gsf__sfm_image* image = &m->images[i];
+        GSF__TRY(gsf__check_relative(ctx, m->images_name, image->at, image->name, image->name_size));
+        if (i && gsf__compare_image_names(image, image - 1) == 0)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: two images are named \"%.*s\"", m->images_name, image->at,
+                            (int)(image->name_size < 100 ? image->name_size : 100), image->name);
+        name_bytes += image->name_size + 1;
+    }
+    scene->views = (gsf_scene_view*)gsf_alloc_zeroed(ctx, m->image_count, sizeof *scene->views);
+    state->sources = (gsf__view_source*)gsf_alloc_zeroed(ctx, m->image_count, sizeof *state->sources);
+    state->names = (char*)gsf_alloc(ctx, name_bytes, 1);
+    if (!scene->views || !state->sources || !state->names) return GSF_ERROR_OUT_OF_MEMORY;
+    char* names = state->names;
+    for (size_t i = 0; i < m->image_count && result == GSF_OK; i++) {
+        gsf__sfm_image* image = &m->images[i];
+        gsf_scene_view* view = &scene->views[scene->view_count];
+        gsf__view_source* source = &state->sources[scene->view_count];
+        int present = 0;
+        view->name = names;
+        memcpy(names, image->name, image->name_size);
+        names[image->name_size] = 0;
+        names += image->name_size + 1;
+        result = gsf__scene_make_view(ctx, m, image, photos, &path, view, source, &present);
+        if (result == GSF_OK && !present) {
+            if (!missing++) gsf_log(ctx, GSF_LOG_WARNING, "%s%s%s: no such photo; the view is left out", photos->folder,
+                                    photos->prefix, view->name);
+            memset(view, 0, sizeof *view);
+        }
+        image->camera = present ? scene->view_count : UINT32_MAX;
+        source->path = SIZE_MAX;
+        if (result == GSF_OK && present && photos) {
+            source->path = state->paths.size;
+            gsf_text_append(ctx, &state->paths, path.data, path.size + 1);
+            if (state->paths.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+        }
+        if (result == GSF_OK && present) scene->view_count++;
+    }
+    if (missing > 1) gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu photos are missing", photos->folder, missing, m->image_count);
+    if (result == GSF_OK && scene->view_count == 0)
+        result = gsf_fail(ctx, GSF_ERROR_IO, "%s%s: none of the %zu photos is there", photos->folder, photos->prefix,
+                          m->image_count);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
+static int gsf__compare_image_ids(const void* a, const void* b) {
+    const uint32_t x = ((const gsf__sfm_image*)a)->id, y = ((const gsf__sfm_image*)b)->id;
+    return (x > y) - (x < y);
+}
+
+static void gsf__sift_u32(uint32_t* v, size_t root, size_t n) {
+    for (size_t child; (child = 2 * root + 1) < n; root = child) {
+        if (child + 1 < n && v[child] < v[child + 1]) child++;
+        if (v[root] >= v[child]) return;
+        const uint32_t t = v[root];
+        v[root] = v[child];
+        v[child] = t;
+    }
+}
+
+// In place, O(n log n) for every input. Short ones, as tracks are, by insertion.
+static void gsf__sort_u32(uint32_t* v, size_t n) {
+    if (n <= 32) {
+        for (size_t i = 1; i < n; i++) {
+            const uint32_t x = v[i];
+            size_t j = i;
+            for (; j > 0 && v[j - 1] > x; j--) v[j] = v[j - 1];
+            v[j] = x;
+        }
+        return;
+    }
+    for (size_t i = n / 2; i-- > 0;) gsf__sift_u32(v, i, n);
+    for (size_t i = n; i-- > 1;) {
+        const uint32_t t = v[0];
+        v[0] = v[i];
+        v[i] = t;
+        gsf__sift_u32(v, 0, i);
+    }
+}
+
+// Tracks from image ids to view indices, ascending, each once. Ids of images that are left out, and ids that no image
+// has, fall away; the latter are counted in a warning. Sorts m->images by id.
+static gsf_result gsf__scene_map_tracks(gsf_context* ctx, gsf__sfm* m) {
+    qsort(m->images, m->image_count, sizeof *m->images, gsf__compare_image_ids);
+    for (size_t i = 1; i < m->image_count; i++)
+        if (m->images[i].id == m->images[i - 1].id)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image id %u stands twice", m->images_name, m->images[i].at,
+                            (unsigned)m->images[i].id);
+    if (m->track_count == 0) return GSF_OK;
+    // Ids are mostly dense, so a table serves; else binary search.
+    const uint32_t last = m->images[m->image_count - 1].id;
+    uint32_t* table = NULL;
+    if (last / 8 <= m->image_count) {
+        table = (uint32_t*)gsf_alloc(ctx, (size_t)last + 1, sizeof *table);
+        if (!table) return GSF_ERROR_OUT_OF_MEMORY;
+        memset(table, 0xff, ((size_t)last + 1) * sizeof *table);
+        for (size_t i = 0; i < m->image_count; i++) table[m->images[i].id] = (uint32_t)i;
+    }
+    size_t kept = 0, unknown = 0, begin = 0;
+    for (size_t p = 0; p < m->point_count; p++) {
+        const size_t end = m->track_begin[p + 1], first = kept;
+        for (size_t k = begin; k < end; k++) {
+            gsf__sfm_image wanted;
+            const gsf__sfm_image* image;
+            wanted.id = m->tracks[k];
+            if (table) image = wanted.id <= last && table[wanted.id] != UINT32_MAX ? &m->images[table[wanted.id]] : NULL;
+            else image = (const gsf__sfm_image*)bsearch(&wanted, m->images, m->image_count, sizeof wanted,
+                                                          gsf__compare_image_ids);
+            unknown += image == NULL;
+            if (image && image->camera != UINT32_MAX) m->tracks[kept++] = (uint32_t)image->camera;
+        }
+        gsf__sort_u32(m->tracks + first, kept - first);
+        size_t unique = first;
+        for (size_t k = first; k < kept; k++)
+            if (k == first || m->tracks[k] != m->tracks[unique - 1]) m->tracks[unique++] = m->tracks[k];
+        kept = unique;
+        begin = end;
+        m->track_begin[p + 1] = kept;
+    }
+    m->track_count = kept;
+    gsf_free(ctx, table);
+    if (unknown)
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu track entries name images that do not exist", m->images_name, unknown);
+    return GSF_OK;
+}
+
+// The model becomes a scene (the model loses its points to it). photos NULL: parsed from memory.
+static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_scene* scene) {
+    memset(scene, 0, sizeof *scene);
+    scene->state = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__scene_state));
+    gsf_result result = scene->state ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) result = gsf__scene_make_views(ctx, m, photos, scene);
+    if (result == GSF_OK) result = gsf__scene_map_tracks(ctx, m);
+    if (result == GSF_OK) {
+        scene->point_count = m->point_count;
+        scene->points = m->points;
+        scene->colors = m->colors;
+        scene->point_ids = m->point_ids;
+        scene->track_begin = m->track_begin;
+        scene->track_views = m->tracks;
+        m->points = NULL;
+        m->colors = NULL;
+        m->point_ids = NULL;
+        m->track_begin = NULL;
+        m->tracks = NULL;
+        // No array is NULL, so that nobody has to ask.
+        if (!scene->points) scene->points = (double*)gsf_alloc_zeroed(ctx, 1, 3 * sizeof(double));
+        if (!scene->colors) scene->colors = (uint8_t*)gsf_alloc_zeroed(ctx, 1, 3);
+        if (!scene->point_ids) scene->point_ids = (uint64_t*)gsf_alloc_zeroed(ctx, 1, sizeof(uint64_t));
+        if (!scene->track_views) scene->track_views = (uint32_t*)gsf_alloc_zeroed(ctx, 1, sizeof(uint32_t));
+        if (!scene->track_begin) scene->track_begin = (size_t*)gsf_alloc_zeroed(ctx, 1, sizeof(size_t));
+        if (!scene->points || !scene->colors || !scene->point_ids || !scene->track_views || !scene->track_begin)
+            result = GSF_ERROR_OUT_OF_MEMORY;
+        if (scene->point_count == 0 && scene->track_begin) scene->track_begin[0] = 0;
+    }
+    for (size_t i = 0; i < scene->view_count && result == GSF_OK; i++) {
+        double centre[3];
+        gsf_camera_center(&scene->views[i].camera, centre);
+        for (int k = 0; k < 3; k++) scene->origin[k] += centre[k] / (double)scene->view_count;
+    }
+    if (result == GSF_OK && m->dropped_points)
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu points dropped: a coordinate is NaN or infinite", m->images_name,
+                m->dropped_points);
+    if (result != GSF_OK) gsf_splat_destroy_scene(ctx, scene);
+    return result;
+}
+
+// ---- public ----
+
+GSF_API gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras, const gsf_bytes* images,
+                                          const gsf_bytes* points, gsf_scene* out) {
+    gsf__sfm m;
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf__colmap_read(ctx, is_text, cameras, images, points, &m);
+    if (result == GSF_OK) result = gsf__scene_build(ctx, &m, NULL, out);
+    gsf__sfm_destroy(ctx, &m);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out) {
+    gsf_json document;
+    gsf__sfm m;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf_parse_json(ctx, json->name ? json->name : "transforms.json", (const char*)(json->data ? json->data : ""),
+                            json->data ? json->size : 0, &document));
+    gsf_result result = gsf__transforms_read(ctx, &document, &m);
+    if (result == GSF_OK) result = gsf__scene_build(ctx, &m, NULL, out);
+    gsf__sfm_destroy(ctx, &m);
+    gsf_destroy_json(ctx, &document);
+    return result;
+}
+
+// folder: with a separator at its end. path: scratch.
+static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const void* data, size_t size, gsf__photos* photos,
+                                       gsf_text* path, gsf_scene* out) {
+    gsf_json document;
+    gsf__sfm m;
+    void* points = NULL;
+    size_t points_size = 0;
+    GSF__TRY(gsf_parse_json(ctx, name, (const char*)data, size, &document));
+    gsf_result result = gsf__transforms_read(ctx, &document, &m);
+    const gsf_json_value* ply = gsf_json_member(&document, &document.values[0], "ply_file_path");
+    if (result == GSF_OK && ply && ply->type == GSF_JSON_STRING) {
+        result = gsf__check_relative(ctx, name, ply->offset, ply->string, ply->string_size);
+        path->size = 0;
+        gsf_text_printf(ctx, path, "%s%s", photos->folder, ply->string);
+        if (result == GSF_OK && path->failed) result = GSF_ERROR_OUT_OF_MEMORY;
+        if (result == GSF_OK) result = gsf_read_file(ctx, path->data, &points, &points_size);
+        if (result == GSF_OK) result = gsf__transforms_read_points(ctx, path->data, points, points_size, &m);
+    }
+    if (result == GSF_OK) result = gsf__scene_build(ctx, &m, photos, out);
+    gsf_free(ctx, points);
+    gsf__sfm_destroy(ctx, &m);
+    gsf_destroy_json(ctx, &document);
+    return result;
+}
+
+// Reads the three files of the first model found. *found = 0: none.
+static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, gsf_text* path, int* found, gsf_scene* out) {
+    static const char* const folders[3] = {"sparse/0/", "sparse/", ""};
+    static const char* const files[3] = {"cameras", "images", "points3D"};
+    gsf_bytes bytes[3];
+    void* data[3] = {NULL, NULL, NULL};
+    gsf_text names[3];
+    gsf__sfm m;
+    gsf_result result = GSF_OK;
+    memset(bytes, 0, sizeof bytes);
+    memset(names, 0, sizeof names);
+    memset(&m, 0, sizeof m);
+    *found = 0;
+    for (int i = 0; i < 6 && !*found && result == GSF_OK; i++) { // binary before text in each folder
+        const char* extension = i & 1 ? ".txt" : ".bin";
+        char relative[32];
+        snprintf(relative, sizeof relative, "%scameras%s", folders[i / 2], extension);
+        result = gsf__read_if_there(ctx, photos->folder, relative, path, &data[0], &bytes[0].size);
+        if (result != GSF_OK || !data[0]) continue;
+        *found = 1;
+        for (int k = 0; k < 3 && result == GSF_OK; k++) {
+            gsf_text_printf(ctx, &names[k], "%s%s%s%s", photos->folder, folders[i / 2], files[k], extension);
+            if (names[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
+            else if (k > 0) result = gsf_read_file(ctx, names[k].data, &data[k], &bytes[k].size);
+            bytes[k].data = data[k];
+            bytes[k].name = names[k].data;
+        }
+        if (result == GSF_OK) result = gsf__colmap_read(ctx, i & 1, &bytes[0], &bytes[1], &bytes[2], &m);
+        if (result == GSF_OK) result = gsf__scene_build(ctx, &m, photos, out);
+    }
+    gsf__sfm_destroy(ctx, &m);
+    for (int k = 0; k < 3; k++) {
+        gsf_free(ctx, data[k]);
+        gsf_destroy_text(ctx, &names[k]);
+    }
+    return result;
+}
+
+static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__photos* photos, gsf_text* folder,
+                                     gsf_text* scratch, void** json, gsf_scene* out) {
+    const size_t length = strlen(path);
+    const int is_file = length >= 5 && strcmp(path + length - 5, ".json") == 0;
+    size_t size = 0, folder_size = length;
+    int found = 0;
+    if (is_file) {
+        while (folder_size && path[folder_size - 1] != '/' && path[folder_size - 1] != '\\') folder_size--;
+        gsf_text_append(ctx, folder, path, folder_size);
+    } else {
+        const int closed = length == 0 || path[length - 1] == '/' || path[length - 1] == '\\';
+        gsf_text_printf(ctx, folder, "%s%s", path, closed ? "" : "/");
+    }
+    if (folder->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    photos->folder = folder->data;
+    if (!is_file) {
+        photos->prefix = "images/";
+        GSF__TRY(gsf__load_colmap(ctx, photos, scratch, &found, out));
+        if (found) return GSF_OK;
+        GSF__TRY(gsf__read_if_there(ctx, folder->data, "transforms.json", scratch, json, &size));
+        if (!*json)
+            return gsf_fail(ctx, GSF_ERROR_IO, "%s: no scene: neither sparse/0/cameras.bin or .txt nor transforms.json", path);
+        path = "transforms.json";
+    } else {
+        GSF__TRY(gsf_read_file(ctx, path, json, &size));
+    }
+    photos->prefix = "";
+    return gsf__load_transforms(ctx, path, *json, size, photos, scratch, out);
+}
+
+GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc, gsf_scene* out) {
+    gsf__photos photos;
+    gsf_text folder, scratch;
+    void* json = NULL;
+    memset(&photos, 0, sizeof photos);
+    memset(&folder, 0, sizeof folder);
+    memset(&scratch, 0, sizeof scratch);
+    memset(out, 0, sizeof *out);
+    photos.factor = desc && desc->factor ? desc->factor : 1;
+    photos.max_size = desc ? desc->max_size : 0;
+    if (photos.factor < 1 || photos.max_size < 0 || (photos.factor > 1 && photos.max_size > 0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "scene: factor %d, max_size %d (not negative, not both)",
+                        (int)photos.factor, (int)photos.max_size);
+    gsf_result result = gsf__load_scene_at(ctx, path, &photos, &folder, &scratch, &json, out);
+    if (result == GSF_OK) {
+        out->folder = (char*)gsf_alloc(ctx, strlen(path) + 1, 1);
+        if (out->folder) memcpy(out->folder, path, strlen(path) + 1);
+        else result = GSF_ERROR_OUT_OF_MEMORY;
+    }
+    if (result != GSF_OK) gsf_splat_destroy_scene(ctx, out);
+    gsf_free(ctx, json);
+    gsf_destroy_text(ctx, &folder);
+    gsf_destroy_text(ctx, &scratch);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view, const gsf_image* photo) {
+    if (view >= scene->view_count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "scene: view %zu of %zu", view, scene->view_count);
+    const gsf__rectify* r = &((const gsf__scene_state*)scene->state)->sources[view].rectify;
+    gsf_image* out = &scene->views[view].image;
+    gsf_image rgb, sized;
+    memset(&rgb, 0, sizeof rgb);
+    memset(&sized, 0, sizeof sized);
+    // u8 RGB, then the size at which the camera was read, then without distortion; the last stage's result is kept
+    gsf_result result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, &rgb);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, photo, &rgb);
+    if (result == GSF_OK && (rgb.width != r->lens.width || rgb.height != r->lens.height)) {
+        result = gsf_make_image(ctx, GSF_U8, r->lens.width, r->lens.height, 3, &sized);
+        if (result == GSF_OK) result = gsf_resize_image(ctx, &rgb, GSF_RESIZE_PIL_BICUBIC, &sized);
+        gsf_destroy_image(ctx, &rgb);
+        rgb = sized;
+    }
+    if (result == GSF_OK && r->lens.kind != GSF__LENS_PINHOLE) {
+        result = gsf__rectify_image(ctx, r, &rgb, &sized);
+        gsf_destroy_image(ctx, &rgb);
+        rgb = sized;
+    }
+    if (result != GSF_OK) {
+        gsf_destroy_image(ctx, &rgb);
+        return result;
+    }
+    gsf_destroy_image(ctx, out);
+    *out = rgb;
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view) {
+    if (view >= scene->view_count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "scene: view %zu of %zu", view, scene->view_count);
+    if (scene->views[view].image.data) return GSF_OK;
+    const gsf__scene_state* state = (const gsf__scene_state*)scene->state;
+    const gsf__view_source* source = &state->sources[view];
+    if (source->path == SIZE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "\"%s\": the scene came from memory; give its photo to %s",
+                        scene->views[view].name, "gsf_splat_set_view_image");
+    const char* path = state->paths.data + source->path;
+    gsf_image photo;
+    GSF__TRY(gsf_load_image(ctx, path, 3, &photo));
+    gsf_result result = GSF_OK;
+    if (photo.width != source->file_width || photo.height != source->file_height)
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld pixels, %lld x %lld when the scene was loaded", path,
+                          (long long)photo.width, (long long)photo.height, (long long)source->file_width,
+                          (long long)source->file_height);
+    if (result == GSF_OK) result = gsf_splat_set_view_image(ctx, scene, view, &photo);
+    gsf_destroy_image(ctx, &photo);
+    return result;
+}
+
+// ---- writing ----
+
+static void gsf__put_le(gsf_context* ctx, gsf_text* out, uint64_t value, int bytes) {
+    char p[8];
+    gsf__store_le(p, value, bytes);
+    gsf_text_append(ctx, out, p, (size_t)bytes);
+}
+
+static void gsf__put_double(gsf_context* ctx, gsf_text* out, double value) {
+    uint64_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    gsf__put_le(ctx, out, bits, 8);
+}
+
+// Unit quaternion w x y z, w >= 0, of the rotation in a column-major matrix: from the largest of its four squares.
+static void gsf__quaternion_from_pose(const double m[16], double q[4]) {
+    const double squares[4] = {1 + m[0] + m[5] + m[10], 1 + m[0] - m[5] - m[10], 1 - m[0] + m[5] - m[10],
+                               1 - m[0] - m[5] + m[10]};
+    const double mixed[4][4] = {{squares[0], m[6] - m[9], m[8] - m[2], m[1] - m[4]},
+                                {m[6] - m[9], squares[1], m[1] + m[4], m[8] + m[2]},
+                                {m[8] - m[2], m[1] + m[4], squares[2], m[6] + m[9]},
+                                {m[1] - m[4], m[8] + m[2], m[6] + m[9], squares[3]}};
+    int best = 0;
+    double norm = 0.0;
+    for (int i = 1; i < 4; i++)
+        if (squares[i] > squares[best]) best = i;
+    for (int i = 0; i < 4; i++) q[i] = mixed[best][i], norm += q[i] * q[i];
+    norm = q[0] < 0.0 ? -sqrt(norm) : sqrt(norm);
+    for (int i = 0; i < 4; i++) q[i] /= norm;
+}
+
+static int gsf__same_intrinsics(const gsf_camera* a, const gsf_camera* b) {
+    return a->fx == b->fx && a->fy == b->fy && a->cx == b->cx && a->cy == b->cy && a->width == b->width &&
+           a->height == b->height;
+}
+
+// camera_of: (view_count) index of each view's camera. Cameras are numbered in the order of their first view.
+static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint32_t* camera_of, gsf_text* out) {
+    size_t count = 0;
+    for (size_t i = 0; i < scene->view_count; i++) {
+        const gsf_camera* c = &scene->views[i].camera;
+        camera_of[i] = (uint32_t)count;
+        // Compared with the view before and the first one: enough for one camera, or for photos sorted by camera.
+        if (i && gsf__same_intrinsics(c, &scene->views[i - 1].camera)) camera_of[i] = camera_of[i - 1];
+        else if (i && gsf__same_intrinsics(c, &scene->views[0].camera)) camera_of[i] = 0;
+        if (camera_of[i] != count) continue;
+        gsf__put_le(ctx, out, ++count, 4);
+        gsf__put_le(ctx, out, 1, 4); // PINHOLE
+        gsf__put_le(ctx, out, (uint64_t)c->width, 8);
+        gsf__put_le(ctx, out, (uint64_t)c->height, 8);
+        gsf__put_double(ctx, out, c->fx);
+        gsf__put_double(ctx, out, c->fy);
+        gsf__put_double(ctx, out, c->cx);
+        gsf__put_double(ctx, out, c->cy);
+    }
+    return count;
+}
+
+// Counting sort of the observations by view. first: (view_count + 1); point_of, slot_of: (observations). The k-th
+// observation of view v is point point_of[first[v] + k]; the track entry e is number slot_of[e] in its view.
+static void gsf__sort_observations(const gsf_scene* scene, const uint8_t* keep, size_t* first, size_t* point_of,
+                                   uint32_t* slot_of) {
+    memset(first, 0, (scene->view_count + 1) * sizeof *first);
+    for (size_t p = 0; p < scene->point_count; p++)
+        for (size_t e = scene->track_begin[p]; e < scene->track_begin[p + 1] && (!keep || keep[p]); e++)
+            slot_of[e] = (uint32_t)first[scene->track_views[e] + 1]++;
+    for (size_t v = 0; v < scene->view_count; v++) first[v + 1] += first[v];
+    for (size_t p = 0; p < scene->point_count; p++)
+        for (size_t e = scene->track_begin[p]; e < scene->track_begin[p + 1] && (!keep || keep[p]); e++)
+            point_of[first[scene->track_views[e]] + slot_of[e]] = p;
+}
+
+static void gsf__format_images(gsf_context* ctx, const gsf_scene* scene, const uint32_t* camera_of, const size_t* first,
+                               const size_t* point_of, gsf_text* out) {
+    gsf__put_le(ctx, out, scene->view_count, 8);
+    for (size_t v = 0; v < scene->view_count; v++) {
+        const gsf_scene_view* view = &scene->views[v];
+        double q[4];
+        gsf__quaternion_from_pose(view->camera.w2c, q);
+        gsf__put_le(ctx, out, view->image_id, 4);
+        for (int k = 0; k < 4; k++) gsf__put_double(ctx, out, q[k]);
+        for (int k = 0; k < 3; k++) gsf__put_double(ctx, out, view->camera.w2c[12 + k]);
+        gsf__put_le(ctx, out, camera_of[v] + 1u, 4);
+        gsf_text_append(ctx, out, view->name, strlen(view->name) + 1);
+        gsf__put_le(ctx, out, first[v + 1] - first[v], 8);
+        for (size_t k = first[v]; k < first[v + 1]; k++) {
+            double x = 0.0, y = 0.0, depth;
+            (void)gsf_camera_project(&view->camera, scene->points + 3 * point_of[k], &x, &y, &depth);
+            gsf__put_double(ctx, out, x);
+            gsf__put_double(ctx, out, y);
+            gsf__put_le(ctx, out, scene->point_ids[point_of[k]], 8);
+        }
+    }
+}
+
+static void gsf__format_points(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep, const uint32_t* slot_of,
+                               gsf_text* out) {
+    size_t kept = 0;
+    for (size_t p = 0; p < scene->point_count; p++) kept += !keep || keep[p];
+    gsf__put_le(ctx, out, kept, 8);
+    for (size_t p = 0; p < scene->point_count; p++) {
+        if (keep && !keep[p]) continue;
+        gsf__put_le(ctx, out, scene->point_ids[p], 8);
+        for (size_t k = 0; k < 3; k++) gsf__put_double(ctx, out, scene->points[3 * p + k]);
+        gsf_text_append(ctx, out, (const char*)scene->colors + 3 * p, 3);
+        gsf__put_double(ctx, out, -1.0); // reprojection error: unknown
+        gsf__put_le(ctx, out, scene->track_begin[p + 1] - scene->track_begin[p], 8);
+        for (size_t e = scene->track_begin[p]; e < scene->track_begin[p + 1]; e++) {
+            gsf__put_le(ctx, out, scene->views[scene->track_views[e]].image_id, 4);
+            gsf__put_le(ctx, out, slot_of[e], 4);
+        }
+    }
+}
+
+GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep, const char* folder) {
+    static const char* const names[3] = {"cameras", "images", "points3D"};
+    const size_t observations = scene->point_count ? scene->track_begin[scene->point_count] : 0;
+    gsf_text files[3], path, cameras;
+    memset(files, 0, sizeof files);
+    memset(&path, 0, sizeof path);
+    memset(&cameras, 0, sizeof cameras);
+    uint32_t* camera_of = (uint32_t*)gsf_alloc(ctx, scene->view_count + 1, sizeof *camera_of);
+    size_t* first = (size_t*)gsf_alloc(ctx, scene->view_count + 1, sizeof *first);
+    size_t* point_of = (size_t*)gsf_alloc(ctx, observations + 1, sizeof *point_of);
+    uint32_t* slot_of = (uint32_t*)gsf_alloc(ctx, observations + 1, sizeof *slot_of);
+    gsf_result result = camera_of && first && point_of && slot_of ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) {
+        gsf__put_le(ctx, &files[0], gsf__format_cameras(ctx, scene, camera_of, &cameras), 8);
+        gsf_text_append(ctx, &files[0], cameras.data ? cameras.data : "", cameras.size);
+        gsf__sort_observations(scene, keep, first, point_of, slot_of);
+        gsf__format_images(ctx, scene, camera_of, first, point_of, &files[1]);
+        gsf__format_points(ctx, scene, keep, slot_of, &files[2]);
+        if (cameras.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    }
+    for (int k = 0; k < 3; k++)
+        if (files[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    for (int k = 2; k >= 0 && result == GSF_OK; k--) { // cameras last: a reader looks for them first
+        path.size = 0;
+        gsf_text_printf(ctx, &path, "%s/sparse/0/%s.bin", folder, names[k]);
+        result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path.data, files[k].data, files[k].size);
+    }
+    for (int k = 0; k < 3; k++) gsf_destroy_text(ctx, &files[k]);
+    gsf_destroy_text(ctx, &path);
+    gsf_destroy_text(ctx, &cameras);
+    gsf_free(ctx, camera_of);
+    gsf_free(ctx, first);
+    gsf_free(ctx, point_of);
+    gsf_free(ctx, slot_of);
+    return result;
+}
+
+GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_target, uint32_t* train, size_t* train_count,
+                                   uint32_t* test, size_t* test_count) {
+    size_t tests = 0, rest = 0;
+    for (size_t i = 0; i < n; i++) {
+        if (test_every && i % test_every == 0) {
+            if (test) test[tests] = (uint32_t)i;
+            tests++;
+        } else {
+            rest++;
+        }
+    }
+    const size_t count = train_target && rest ? train_target : rest;
+    // The j-th of the others is view j + j / (test_every - 1) + 1 (without test views: view j). With test_every = 1
+    // there are no others.
+    const double step = count > 1 ? (double)(rest ? rest - 1 : 0) / (double)(count - 1) : 0.0;
+    for (size_t i = 0; i < count && train; i++) {
+        size_t j = train_target ? (size_t)gsf__round_half_even((double)i * step) : i;
+        if (train_target && i == count - 1 && i > 0) j = rest - 1; // numpy.linspace sets its end exactly
+        train[i] = (uint32_t)(test_every ? j + j / (test_every - 1) + 1 : j);
+    }
+    if (train_count) *train_count = count;
+    if (test_count) *test_count = tests;
+}
 
 // ---- >>neighbours --------------------------------------------------------------
 
