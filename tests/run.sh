@@ -31,8 +31,8 @@ install_missing() {
         command -v sudo > /dev/null || { echo "$0: not root and no sudo; install by hand: ${missing[*]}" >&2; exit 1; }
         as_root=(sudo)
     fi
-    "${as_root[@]}" apt-get update -q
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends "${missing[@]}"
+    "${as_root[@]}" apt-get -o DPkg::Lock::Timeout=300 update -q
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 install -q -y --no-install-recommends "${missing[@]}"
 }
 
 mkdir -p "$build"
