@@ -417,7 +417,7 @@ typedef struct random_scene {
 
 static random_scene random_scene_make(gsf_context* ctx, uint64_t seed) {
     static const int32_t sizes[][2] = {{65, 33}, {17, 3}, {1, 1}, {200, 130}, {48, 64}, {33, 1}, {5, 90}};
-    static const size_t counts[] = {60, 300, 7, 2000, 1, 120, 3, 600};
+    static const size_t counts[] = {60, 300, 7, 2000, 1, 120, 0, 600};
     random_scene r;
     memset(&r, 0, sizeof r);
     uint64_t state = seed * 7919 + 1;
@@ -617,9 +617,6 @@ static void test_random_scene(machine* levels, size_t level_count, uint64_t seed
     gsf_context* ctx = &levels[0].ctx;
     random_scene scene = random_scene_make(ctx, seed);
     oracle o = oracle_make(scene.label, &scene.splats, &scene.camera, &scene.desc, scene.what == NEEDLES, NULL, seed);
-    size_t blends = 0;
-    for (size_t i = 0; i < o.pixels; i++) blends += (size_t)o.image.blended[i];
-    if (blends == 0) level_count = 0; // nothing in view: not compared
     for (size_t k = 0; k < level_count; k++) {
         result r = render_both_ways(&levels[k], &o);
         oracle_compare(&o, levels[k].name, &r, scene.what == NEEDLES ? &t->needles : &t->random);
