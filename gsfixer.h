@@ -289,14 +289,17 @@ GSF_API void gsf_destroy_image(gsf_context* ctx, gsf_image* image);
 GSF_API GSF_NODISCARD gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, const gsf_image* dst);
 
 // Reads PNG, JPEG, BMP, TGA, PNM (stb) and, with GSF_USE_OIIO, whatever OpenImageIO reads. channels: 1, 3, 4 or
-// 0 = as in the file. Result is u8 (stb), or u8, u16, f16, f32 as in the file (OpenImageIO).
+// 0 = as in the file. Result is u8 (stb), or the dtype of the file (OpenImageIO: what stb cannot read, and 16 bits).
+// A file that claims more pixels than its size can hold is refused before it is decoded. EXIF rotation is not applied.
+// Scratch memory of stb and OpenImageIO does not come from the context; the returned pixels do.
 GSF_API GSF_NODISCARD gsf_result gsf_load_image(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out);
 GSF_API GSF_NODISCARD gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, const void* data,
                                                        size_t size, int32_t channels, gsf_image* out);
 // Reads only the header.
 GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
                                                  int32_t* channels);
-// Writes by extension: .png (u8, from any dtype), .jpg (quality 95) and, with GSF_USE_OIIO, .exr .tif (dtype kept).
+// Writes by extension: .png (u8, from any dtype), .jpg (quality 95) and, with GSF_USE_OIIO, .exr (f16 or else f32), .tif
+// (dtype kept, f16 as f32) and u16 images as 16-bit .png.
 GSF_API GSF_NODISCARD gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image);
 // PNG or JPEG bytes in memory (reports embed them). `extension` is ".png" or ".jpg".
 GSF_API GSF_NODISCARD gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension,
@@ -409,6 +412,61 @@ typedef struct gsf_restorer {
 #ifdef __cplusplus
 }
 #endif
+
+// ---- >>glm ---------------------------------------------------------------------
+
+#if defined(GSF_USE_GLM) && defined(__cplusplus)
+#include <glm/mat4x4.hpp>
+#include <glm/vec3.hpp>
+#include <cstring>
+
+// Matrices have glm's layout already (column-major doubles), so these only copy.
+inline glm::dmat4 gsf_to_glm(const double m[16]) {
+    glm::dmat4 out;
+    std::memcpy(&out[0][0], m, sizeof out);
+    return out;
+}
+inline void gsf_from_glm(const glm::dmat4& m, double out[16]) { std::memcpy(out, &m[0][0], sizeof m); }
+
+// World to camera in this toolkit's axes (x right, y down, z forward).
+inline glm::dmat4 gsf_to_glm_w2c(const gsf_camera& camera) { return gsf_to_glm(camera.w2c); }
+
+// World to camera in OpenGL's axes (x right, y up, z backward), what glm::lookAt returns.
+inline glm::dmat4 gsf_to_glm_view(const gsf_camera& camera) {
+    glm::dmat4 flip(1.0);
+    flip[1][1] = flip[2][2] = -1.0;
+    return flip * gsf_to_glm(camera.w2c);
+}
+// The inverse of that: sets w2c from an OpenGL view matrix (rigid).
+inline void gsf_from_glm_view(const glm::dmat4& view, gsf_camera* camera) {
+    glm::dmat4 flip(1.0);
+    flip[1][1] = flip[2][2] = -1.0;
+    gsf_from_glm(flip * view, camera->w2c);
+}
+
+// OpenGL projection (clip z in [-1,1], for use after gsf_to_glm_view): with the viewport (0, 0, width, height) a point
+// lands on pixel (u, height - v), since OpenGL counts rows from the bottom.
+inline glm::dmat4 gsf_to_glm_projection(const gsf_camera& camera, double near_plane, double far_plane) {
+    glm::dmat4 p(0.0);
+    p[0][0] = 2.0 * camera.fx / camera.width;
+    p[1][1] = 2.0 * camera.fy / camera.height;
+    p[2][0] = 1.0 - 2.0 * camera.cx / camera.width;
+    p[2][1] = 2.0 * camera.cy / camera.height - 1.0;
+    p[2][2] = -(far_plane + near_plane) / (far_plane - near_plane);
+    p[2][3] = -1.0;
+    p[3][2] = -2.0 * far_plane * near_plane / (far_plane - near_plane);
+    return p;
+}
+// Sets the intrinsics of a camera of a given size from such a projection.
+inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t height, gsf_camera* camera) {
+    camera->width = width;
+    camera->height = height;
+    camera->fx = 0.5 * p[0][0] * width;
+    camera->fy = 0.5 * p[1][1] * height;
+    camera->cx = 0.5 * (1.0 - p[2][0]) * width;
+    camera->cy = 0.5 * (1.0 + p[2][1]) * height;
+}
+#endif // GSF_USE_GLM
 
 #endif // GSF_BASE_INCLUDED
 
@@ -664,6 +722,17 @@ GSF__END_IMPLEMENTATION
 #if defined(GSFIXER_BASE_IMPLEMENTATION) || defined(__INTELLISENSE__) || defined(__JETBRAINS_IDE__)
 #ifndef GSF_BASE_IMPLEMENTED
 #define GSF_BASE_IMPLEMENTED
+
+#ifdef GSF_USE_OIIO
+#ifndef __cplusplus
+#error "GSF_USE_OIIO needs the implementation compiled as C++"
+#endif
+#include <memory>
+#include <string>
+#include <vector>
+#include <OpenImageIO/filesystem.h>
+#include <OpenImageIO/imageio.h>
+#endif
 
 GSF__BEGIN_IMPLEMENTATION
 
@@ -1703,10 +1772,7 @@ static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int
     return GSF_OK;
 }
 
-#endif
-
-#ifndef GSF_NO_STB
-// Lengths and checksums of all chunks of a PNG (stb checks neither the sums nor that the file is whole).
+// Lengths and checksums of all chunks of a PNG (stb checks neither the sums nor that the file is whole; libpng prints).
 static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char* data, size_t size) {
     for (size_t at = 8;;) {
         if (size - at < 12) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is cut (no IEND)", name, at);
@@ -1730,14 +1796,12 @@ static int gsf__is_png(const void* data, size_t size) {
 #endif
 
 #ifdef GSF_USE_OIIO
-#ifndef __cplusplus
-#error "GSF_USE_OIIO needs the implementation compiled as C++"
-#endif
 static gsf_result gsf__oiio_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
                                  gsf_image* out);
 static gsf_result gsf__oiio_query(gsf_context* ctx, const char* name, const void* data, size_t size, int64_t* width,
                                   int64_t* height, int32_t* channels);
-static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const gsf_image* image, gsf_text* out);
+static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const char* extension, const gsf_image* image,
+                                   gsf_text* out);
 #endif
 
 #ifndef GSF_NO_STB
@@ -1989,7 +2053,7 @@ GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_
                              strcmp(extension, ".tiff") == 0 ||
                              (strcmp(extension, ".png") == 0 && image->dtype == GSF_U16);
 #endif
-    if (through_oiio) result = gsf__oiio_encode(ctx, path, image, &file);
+    if (through_oiio) result = gsf__oiio_encode(ctx, path, extension, image, &file);
     else
 #endif
         result = gsf__encode_image(ctx, path, image, extension, &file);
@@ -2643,9 +2707,312 @@ GSF_API gsf_result gsf_check_camera(gsf_context* ctx, const gsf_camera* camera) 
     return GSF_OK;
 }
 
-// ---- >>glm ---------------------------------------------------------------------
+GSF_API gsf_result gsf_save_cameras(gsf_context* ctx, const char* path, const gsf_camera* cameras,
+                                    const char* const* names, size_t count) {
+    static const char* const keys[4] = {"fx", "fy", "cx", "cy"};
+    gsf_text text;
+    memset(&text, 0, sizeof text);
+    gsf_result result = GSF_OK;
+    gsf_text_printf(ctx, &text, "{\"cameras\":[");
+    for (size_t i = 0; i < count && result == GSF_OK; i++) {
+        const gsf_camera* camera = &cameras[i];
+        result = gsf_check_camera(ctx, camera);
+        if (result != GSF_OK) {
+            (void)gsf_fail(ctx, result, "%s: camera %zu: %s", path, i, ctx->error);
+            break;
+        }
+        gsf_text_printf(ctx, &text, "%s\n{", i ? "," : "");
+        if (names && names[i]) {
+            gsf_text_printf(ctx, &text, "\"name\":");
+            gsf_text_json_string(ctx, &text, names[i]);
+            gsf_text_printf(ctx, &text, ",");
+        }
+        gsf_text_printf(ctx, &text, "\"w2c\":[");
+        for (int k = 0; k < 16; k++) { // row-major
+            if (k) gsf_text_append(ctx, &text, ",", 1);
+            gsf_text_json_number(ctx, &text, camera->w2c[4 * (k % 4) + k / 4]);
+        }
+        gsf_text_append(ctx, &text, "]", 1);
+        const double values[4] = {camera->fx, camera->fy, camera->cx, camera->cy};
+        for (int k = 0; k < 4; k++) {
+            gsf_text_printf(ctx, &text, ",\"%s\":", keys[k]);
+            gsf_text_json_number(ctx, &text, values[k]);
+        }
+        gsf_text_printf(ctx, &text, ",\"width\":%d,\"height\":%d}", (int)camera->width, (int)camera->height);
+    }
+    gsf_text_printf(ctx, &text, "\n]}\n");
+    if (result == GSF_OK && text.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
+    gsf_destroy_text(ctx, &text);
+    return result;
+}
+
+static gsf_result gsf__camera_number(gsf_context* ctx, const gsf_json* json, const gsf_json_value* object,
+                                     const char* key, double* out) {
+    const gsf_json_value* value = gsf_json_member(json, object, key);
+    if (!value || value->type != GSF_JSON_NUMBER)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: camera: expected a number \"%s\"", json->name,
+                        (unsigned)(value ? value->offset : object->offset), key);
+    *out = value->number;
+    return GSF_OK;
+}
+
+static gsf_result gsf__camera_from_json(gsf_context* ctx, const gsf_json* json, const gsf_json_value* object,
+                                        gsf_camera* camera) {
+    const gsf_json_value* matrix = gsf_json_member(json, object, "w2c");
+    int good = matrix && matrix->type == GSF_JSON_ARRAY && matrix->count == 16;
+    uint32_t at = good ? matrix->child : 0;
+    for (int k = 0; k < 16 && good; k++, at = json->values[at].next) {
+        good = json->values[at].type == GSF_JSON_NUMBER;
+        camera->w2c[4 * (k % 4) + k / 4] = json->values[at].number;
+    }
+    if (!good)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: camera: expected \"w2c\" with 16 numbers", json->name,
+                        (unsigned)(matrix ? matrix->offset : object->offset));
+    double width, height;
+    GSF__TRY(gsf__camera_number(ctx, json, object, "fx", &camera->fx));
+    GSF__TRY(gsf__camera_number(ctx, json, object, "fy", &camera->fy));
+    GSF__TRY(gsf__camera_number(ctx, json, object, "cx", &camera->cx));
+    GSF__TRY(gsf__camera_number(ctx, json, object, "cy", &camera->cy));
+    GSF__TRY(gsf__camera_number(ctx, json, object, "width", &width));
+    GSF__TRY(gsf__camera_number(ctx, json, object, "height", &height));
+    if (!(width >= 1.0 && width <= 2147483647.0 && height >= 1.0 && height <= 2147483647.0) || floor(width) != width ||
+        floor(height) != height)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: camera: image size %g x %g", json->name,
+                        (unsigned)object->offset, width, height);
+    camera->width = (int32_t)width;
+    camera->height = (int32_t)height;
+    if (gsf_check_camera(ctx, camera) != GSF_OK)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: %s", json->name, (unsigned)object->offset, ctx->error);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_load_cameras(gsf_context* ctx, const char* path, gsf_camera** cameras, size_t* count) {
+    *cameras = NULL;
+    *count = 0;
+    void* data;
+    size_t size;
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    gsf_json json;
+    gsf_result result = gsf_parse_json(ctx, path, (const char*)data, size, &json);
+    gsf_free(ctx, data);
+    GSF__TRY(result);
+    const gsf_json_value* list = gsf_json_member(&json, &json.values[0], "cameras");
+    gsf_camera* out = NULL;
+    if (!list || list->type != GSF_JSON_ARRAY) {
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: expected an object with a list \"cameras\"", json.name,
+                          (unsigned)(list ? list->offset : 0));
+    } else {
+        out = (gsf_camera*)gsf_alloc_zeroed(ctx, list->count ? list->count : 1, sizeof *out);
+        if (!out) result = GSF_ERROR_OUT_OF_MEMORY;
+        uint32_t at = list->child;
+        for (size_t i = 0; i < list->count && result == GSF_OK; i++, at = json.values[at].next)
+            result = gsf__camera_from_json(ctx, &json, &json.values[at], &out[i]);
+    }
+    if (result == GSF_OK) {
+        *cameras = out;
+        *count = list->count;
+    } else {
+        gsf_free(ctx, out);
+    }
+    gsf_destroy_json(ctx, &json);
+    return result;
+}
+
 
 // ---- >>oiio --------------------------------------------------------------------
+// Everything passes through memory, so the io hook and the atomic write serve these formats too. OpenImageIO allocates with
+// new and keeps its own worker threads; nothing it throws leaves this section.
+
+#ifdef GSF_USE_OIIO
+
+static gsf_result gsf__oiio_fail(gsf_context* ctx, const char* name, gsf_result result, const char* what,
+                                 const std::string& reason) {
+    char line[200];
+    snprintf(line, sizeof line, "%s", reason.c_str());
+    for (char* c = line; *c; c++)
+        if (*c == '\n' || *c == '\r') *c = ' ';
+    return gsf_fail(ctx, result, "%s:0: %s (%s)", name, what, line);
+}
+
+// Told by the first bytes, as the name of an image in memory says nothing.
+static const char* gsf__oiio_format(const void* data, size_t size) {
+    static const struct { const char *magic, *format; } formats[] = {{"\x76\x2f\x31\x01", "openexr"},
+                                                                     {"II*\0", "tiff"}, {"MM\0*", "tiff"},
+                                                                     {"II+\0", "tiff"}, {"MM\0+", "tiff"},
+                                                                     {"\x89PNG", "png"}, {"\xff\xd8\xff\xe0", "jpeg"},
+                                                                     {"\xff\xd8\xff\xe1", "jpeg"}};
+    for (size_t i = 0; size >= 4 && i < GSF__COUNT(formats); i++)
+        if (memcmp(data, formats[i].magic, 4) == 0) return formats[i].format;
+    return NULL;
+}
+
+static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                 OIIO::Filesystem::IOMemReader* memory, std::unique_ptr<OIIO::ImageInput>* out) {
+    const char* format = gsf__oiio_format(data, size);
+    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
+    std::unique_ptr<OIIO::ImageInput> input =
+        format ? OIIO::ImageInput::create(format) : OIIO::ImageInput::open(name, nullptr, memory);
+    if (!input) return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "not an image that this build reads", OIIO::geterror());
+    if (!input->supports("ioproxy"))
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: OpenImageIO does not read %s from memory", name,
+                        input->format_name());
+    if (format) {
+        OIIO::ImageSpec spec, config;
+        config.attribute("oiio:UnassociatedAlpha", 1); // colours as they stand in the file
+        if (!input->set_ioproxy(memory) || !input->open(name, spec, config))
+            return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "image is malformed", input->geterror());
+    }
+    const OIIO::ImageSpec& spec = input->spec();
+    if (spec.deep || spec.depth > 1 || spec.nchannels < 1)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: deep, volume or empty image", name);
+    GSF__TRY(gsf__check_image_claim(ctx, name, spec.width, spec.height, size));
+    if ((size_t)spec.nchannels > size)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: %d channels", name, spec.nchannels);
+    *out = std::move(input);
+    return GSF_OK;
+}
+
+static gsf_dtype gsf__oiio_dtype(OIIO::TypeDesc type) {
+    switch (type.basetype) {
+        case OIIO::TypeDesc::UINT8: return GSF_U8;
+        case OIIO::TypeDesc::UINT16: return GSF_U16;
+        case OIIO::TypeDesc::HALF: return GSF_F16;
+        case OIIO::TypeDesc::DOUBLE: return GSF_F64;
+        default: return GSF_F32; // wider integers become value / maximum
+    }
+}
+
+static OIIO::TypeDesc gsf__oiio_type(gsf_dtype dtype) {
+    switch (dtype) {
+        case GSF_U8: return OIIO::TypeDesc::UINT8;
+        case GSF_U16: return OIIO::TypeDesc::UINT16;
+        case GSF_F16: return OIIO::TypeDesc::HALF;
+        case GSF_F32: return OIIO::TypeDesc::FLOAT;
+        case GSF_F64: return OIIO::TypeDesc::DOUBLE;
+    }
+    return OIIO::TypeDesc::UNKNOWN;
+}
+
+// src (n channels) to dst (1, 3 or 4) of the same dtype, by the rules stb has for its files: grey spreads, colour becomes
+// luma (77 R + 150 G + 29 B) / 256, a missing alpha is 1.
+static void gsf__oiio_channels(const gsf_image* src, const gsf_image* dst) {
+    double run[3][GSF__CONVERT_RUN];
+    const int is_color = src->channels >= 3;
+    for (int64_t y = 0; y < dst->height; y++)
+        for (int32_t c = 0; c < dst->channels; c++)
+            for (int64_t x = 0; x < dst->width; x += GSF__CONVERT_RUN) {
+                const int64_t left = dst->width - x;
+                const size_t n = left < GSF__CONVERT_RUN ? (size_t)left : (size_t)GSF__CONVERT_RUN;
+                const char* from = (const char*)src->data + y * src->stride_y + x * src->stride_x;
+                char* to = (char*)dst->data + y * dst->stride_y + x * dst->stride_x + c * dst->stride_c;
+                const int luma = dst->channels == 1 && is_color;
+                const int32_t alpha = src->channels == 4 ? 3 : src->channels == 2 ? 1 : -1;
+                const int32_t channel = c == 3 ? alpha : is_color ? c : 0;
+                for (int32_t k = 0; k < (luma ? 3 : 1) && channel >= 0; k++)
+                    gsf__load_pixels(from + (luma ? k : channel) * src->stride_c, src->stride_x, src->dtype, n, run[k]);
+                for (size_t i = 0; i < n && luma; i++)
+                    run[0][i] = (77.0 * run[0][i] + 150.0 * run[1][i] + 29.0 * run[2][i]) / 256.0;
+                for (size_t i = 0; i < n && channel < 0; i++) run[0][i] = 1.0;
+                gsf__store_pixels(to, dst->stride_x, dst->dtype, n, run[0], 0);
+            }
+}
+
+static gsf_result gsf__oiio_read(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
+                                 gsf_image* out) {
+    OIIO::Filesystem::IOMemReader memory(data, size);
+    std::unique_ptr<OIIO::ImageInput> input;
+    GSF__TRY(gsf__oiio_open(ctx, name, data, size, &memory, &input));
+    const OIIO::ImageSpec spec = input->spec();
+    gsf_image file;
+    GSF__TRY(gsf_make_image(ctx, gsf__oiio_dtype(spec.format), spec.width, spec.height, spec.nchannels, &file));
+    gsf_result result = GSF_OK;
+    if (!input->read_image(0, 0, 0, spec.nchannels, gsf__oiio_type(file.dtype), file.data))
+        result = gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "image is cut or malformed", input->geterror());
+    file.color_space = spec.get_string_attribute("oiio:ColorSpace") == "Linear" ? GSF_LINEAR : GSF_SRGB;
+    if (result == GSF_OK && (channels == 0 || channels == spec.nchannels)) {
+        *out = file;
+        return GSF_OK;
+    }
+    if (result == GSF_OK) result = gsf_make_image(ctx, file.dtype, spec.width, spec.height, channels, out);
+    if (result == GSF_OK) {
+        out->color_space = file.color_space;
+        gsf__oiio_channels(&file, out);
+    }
+    gsf_destroy_image(ctx, &file);
+    return result;
+}
+
+static gsf_result gsf__oiio_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
+                                 gsf_image* out) {
+    try {
+        return gsf__oiio_read(ctx, name, data, size, channels, out);
+    } catch (...) {
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO gave up", name);
+    }
+}
+
+static gsf_result gsf__oiio_query(gsf_context* ctx, const char* name, const void* data, size_t size, int64_t* width,
+                                  int64_t* height, int32_t* channels) {
+    try {
+        OIIO::Filesystem::IOMemReader memory(data, size);
+        std::unique_ptr<OIIO::ImageInput> input;
+        GSF__TRY(gsf__oiio_open(ctx, name, data, size, &memory, &input));
+        *width = input->spec().width;
+        *height = input->spec().height;
+        *channels = input->spec().nchannels;
+        return GSF_OK;
+    } catch (...) {
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO gave up", name);
+    }
+}
+
+static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char* extension, const gsf_image* image,
+                                  gsf_text* out) {
+    const int exr = strcmp(extension, ".exr") == 0, png = strcmp(extension, ".png") == 0;
+    const int tiff = strcmp(extension, ".tif") == 0 || strcmp(extension, ".tiff") == 0;
+    if (image->channels > 4 || image->width > 1 << 24 || image->height > 1 << 24)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld x %lld with %d channels", name, (long long)image->width,
+                        (long long)image->height, (int)image->channels);
+    gsf_dtype dtype = image->dtype; // the nearest the format has
+    if (exr && dtype != GSF_F16) dtype = GSF_F32;
+    if (tiff && dtype == GSF_F16) dtype = GSF_F32;
+    if (png && dtype != GSF_U16) dtype = GSF_U8;
+    const char* format = exr ? "openexr" : tiff ? "tiff" : png ? "png" : extension + (*extension == '.');
+    std::unique_ptr<OIIO::ImageOutput> output = OIIO::ImageOutput::create(format);
+    if (!output || !output->supports("ioproxy"))
+        return gsf__oiio_fail(ctx, name, GSF_ERROR_UNSUPPORTED, "this build does not write such files", OIIO::geterror());
+    gsf_image packed;
+    GSF__TRY(gsf_make_image(ctx, dtype, image->width, image->height, image->channels, &packed));
+    gsf_result result = gsf_convert_image(ctx, image, &packed);
+    std::vector<unsigned char> bytes;
+    if (result == GSF_OK) {
+        OIIO::Filesystem::IOVecOutput memory(bytes);
+        OIIO::ImageSpec spec((int)image->width, (int)image->height, (int)image->channels, gsf__oiio_type(dtype));
+        if (!tiff) // there it becomes an EXIF directory, whose writing into memory breaks the file (OpenImageIO 2.4)
+            spec.attribute("oiio:ColorSpace", image->color_space == GSF_LINEAR ? "Linear" : "sRGB");
+        if (!exr) spec.attribute("oiio:UnassociatedAlpha", 1);
+        spec.attribute("CompressionQuality", (int)GSF__JPEG_QUALITY);
+        if (!output->set_ioproxy(&memory) || !output->open(name, spec) ||
+            !output->write_image(gsf__oiio_type(dtype), packed.data) || !output->close())
+            result = gsf__oiio_fail(ctx, name, GSF_ERROR_IO, "cannot be encoded", output->geterror());
+    }
+    gsf_destroy_image(ctx, &packed);
+    GSF__TRY(result);
+    gsf_text_append(ctx, out, (const char*)bytes.data(), bytes.size());
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
+static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const char* extension, const gsf_image* image,
+                                   gsf_text* out) {
+    try {
+        return gsf__oiio_write(ctx, name, extension, image, out);
+    } catch (...) {
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO gave up", name);
+    }
+}
+
+#endif // GSF_USE_OIIO
 
 GSF__END_IMPLEMENTATION
 
