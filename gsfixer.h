@@ -2769,7 +2769,7 @@ static gsf_result gsf__camera_from_json(gsf_context* ctx, const gsf_json* json, 
     if (!good)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: camera: expected \"w2c\" with 16 numbers", json->name,
                         (unsigned)(matrix ? matrix->offset : object->offset));
-    double width, height;
+    double width = 0.0, height = 0.0;
     GSF__TRY(gsf__camera_number(ctx, json, object, "fx", &camera->fx));
     GSF__TRY(gsf__camera_number(ctx, json, object, "fy", &camera->fy));
     GSF__TRY(gsf__camera_number(ctx, json, object, "cx", &camera->cx));
