@@ -30,8 +30,9 @@
        if (gsf_traj_sample_path(&ctx, cameras, camera_count, &desc, scratch, path, reference) != GSF_OK) ...
 
    PATHS       gsf_traj_sample_path does all of it: normalise, sample, map back to the world. Three kinds:
-               reference    (GSFixer) each window leaves a photo, joins the ellipse, follows it, and ends in the photo that
-                            is nearest to where it left the ellipse. 49 = 16 + 17 + 16 frames; any other length works.
+               reference    (GSFixer) each window leaves a photo, joins the ellipse, follows it, and ends in the photo
+                            that is nearest to where it left the ellipse. 49 = 16 + 17 + 16 frames; any other length
+                            works.
                ellipse      round the scene, looking at the point nearest to all optical axes
                interpolate  through the cameras in their given order
    OFFICIAL    The released code has quirks. `official` reproduces them to rounding; zero is the corrected behaviour:
@@ -45,10 +46,10 @@
                - frames all have the first camera's intrinsics; here a frame that is a photo's has the photo's
                One thing is corrected in both: views exactly upside down are turned by half a turn, where the released
                code mirrors the world.
-   ERRORS      GSF_ERROR_NUMERIC for NaN and infinity anywhere in the input, GSF_ERROR_DEGENERATE where the geometry does
-               not say what to do (one view, parallel axes, coincident cameras, a view along its up vector),
+   ERRORS      GSF_ERROR_NUMERIC for NaN and infinity anywhere in the input, GSF_ERROR_DEGENERATE where the geometry
+               does not say what to do (one view, parallel axes, coincident cameras, a view along its up vector),
                GSF_ERROR_INVALID_ARGUMENT for the rest. Never a pose that is not a rotation: columns are orthonormal to
-               1e-12. On an error outputs are unspecified but for layouts and indices, which are zeroed.
+               1e-12. On an error outputs are untouched or zeroed.
    MEMORY      None of its own. `scratch` is the caller's: aligned for double, of as many bytes as the function named
                beside it returns (SIZE_MAX where that would overflow), contents of no meaning before and after.
                Inputs and outputs must not overlap unless said.
@@ -72,14 +73,14 @@ extern "C" {
 // Field of view of `pixels` pixels at a focal length in pixels, and back.
 GSF_API double gsf_traj_fov_from_focal(double focal, double pixels);
 GSF_API double gsf_traj_focal_from_fov(double fov, double pixels);
-// The camera of a model at an image reduced by `factor` (>= 1) whose file turned out to be width x height: intrinsics are
-// divided by factor, then scaled by actual / (model size div factor), as the official parser does. For factor 1 it is
-// gsf_camera_resized.
+// The camera of a model at an image reduced by `factor` (>= 1) whose file turned out to be width x height: intrinsics
+// are divided by factor, then scaled by actual / (model size div factor), as the official parser does. For factor 1
+// it is gsf_camera_resized.
 GSF_API gsf_camera gsf_traj_reduce_camera(const gsf_camera* camera, int32_t factor, int32_t width, int32_t height);
 // The part of the image that starts at pixel (x, y): the principal point moves.
 GSF_API gsf_camera gsf_traj_crop_camera(const gsf_camera* camera, int32_t x, int32_t y, int32_t width, int32_t height);
-// Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the official
-// full projection (near 0.01, far 100). Needs 0 < near_plane < far_plane.
+// Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the
+// official full projection (near 0.01, far 100). Needs 0 < near_plane < far_plane.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane,
                                                      double far_plane, double out[16]);
 
@@ -96,8 +97,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_view_pose(gsf_context* ctx, const doub
 // Unit quaternion (w x y z, w >= 0) of a pose's rotation, and back (any non-zero length; position untouched).
 GSF_API void gsf_traj_pose_quat(const double pose[16], double quat[4]);
 GSF_API GSF_NODISCARD gsf_result gsf_traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]);
-// Spherical interpolation of unit quaternions along the shorter arc; t beyond [0,1] goes on. Half a turn apart: one of the
-// two arcs.
+// Spherical interpolation of unit quaternions along the shorter arc; t beyond [0,1] goes on. Half a turn apart: one
+// of the two arcs.
 GSF_API void gsf_traj_slerp(const double a[4], const double b[4], double t, double out[4]);
 // Position linear, rotation slerp. out may be a or b.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
@@ -118,8 +119,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_recenter_poses(gsf_context* ctx, const
 // cameras_extent is 1.1 times radius of the training cameras.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_camera_radius(gsf_context* ctx, const double* poses, size_t count,
                                                         double center[3], double* radius);
-// Index of the view with the smallest score |position difference| + direction_weight * (1 - forward . forward); the lowest
-// index among equals (to 1e-9). scores: NULL or (count). The official weight is 0.5, in the normalised frame.
+// Index of the view with the smallest score |position difference| + direction_weight * (1 - forward . forward); the
+// lowest index among equals (to 1e-9). scores: NULL or (count). The official weight is 0.5, in the normalised frame.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_nearest_view(gsf_context* ctx, const double pose[16], const double* poses,
                                                        size_t count, double direction_weight, int32_t* index,
                                                        double* scores);
@@ -156,8 +157,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_normalize(gsf_context* ctx, const doub
                                                     const double* points, size_t point_count,
                                                     const gsf_traj_similarity_desc* desc, void* scratch,
                                                     double transform[16]);
-// Principal axes of the positions about their mean, y down on average, largest coordinate 1 (official transform_poses_pca;
-// the same sign rule). out may be poses.
+// Principal axes of the positions about their mean, y down on average, largest coordinate 1 (official
+// transform_poses_pca; the same sign rule). out may be poses.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
                                                     double transform[16]);
 // Applies a similarity; rotations stay rotations. out may be the input.
@@ -169,9 +170,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_invert_similarity(gsf_context* ctx, co
 
 // ---- splines -------------------------------------------------------------------
 
-// Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending sites,
-// not-a-knot ends (knots as FITPACK with s = 0 and scipy's make_interp_spline place them). Evaluated at `at` (at_count),
-// which is clamped to the sites' range; out (at_count,dims).
+// Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending
+// sites, not-a-knot ends (knots as FITPACK with s = 0 and scipy's make_interp_spline place them). Evaluated at `at`
+// (at_count), which is clamped to the sites' range; out (at_count,dims).
 GSF_API size_t gsf_traj_spline_scratch(size_t count, int32_t degree, size_t dims);
 GSF_API GSF_NODISCARD gsf_result gsf_traj_spline(gsf_context* ctx, const double* sites, const double* values,
                                                  size_t count, size_t dims, int32_t degree, const double* at,
@@ -183,19 +184,19 @@ typedef struct gsf_traj_spline_desc {
     double axis_length;     // 0.1: arm of the look-at and up points beside the position
 } gsf_traj_spline_desc;
 
-// Spline through (position, position - arm * forward, position + arm * down) of the poses, by chord length; frames_per_leg
-// * (count - 1) poses, the last one excluded (official generate_interpolated_path with smoothness 0; the same for two
-// poses whatever the smoothness). Degenerate where neighbouring poses coincide or directions cancel.
+// Spline through (position, position - arm * forward, position + arm * down) of the poses, by chord length;
+// frames_per_leg * (count - 1) poses, the last one excluded (official generate_interpolated_path with smoothness 0;
+// the same for two poses whatever the smoothness). Degenerate where neighbouring poses coincide or directions cancel.
 GSF_API size_t gsf_traj_spline_path_scratch(size_t count, const gsf_traj_spline_desc* desc);
 GSF_API GSF_NODISCARD gsf_result gsf_traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
                                                       const gsf_traj_spline_desc* desc, void* scratch, double* out);
 
-// Positions by a spline over even sites (degree 1, 2, 3 for 2, 3, more views), rotations slerp, then each pose moved by
-// `push` along its forward axis (official interpolate_camera_path, which draws push from [0, 0.5)). `frames` poses (>= 1),
-// both ends included.
+// Positions by a spline over even sites (degree 1, 2, 3 for 2, 3, more views), rotations slerp, then each pose moved
+// by `push` along its forward axis (official interpolate_camera_path, which draws push from [0, 0.5)). `frames` poses
+// (>= 1), both ends included.
 GSF_API size_t gsf_traj_slerp_path_scratch(size_t count);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames,
-                                                     double push, void* scratch, double* out);
+GSF_API GSF_NODISCARD gsf_result gsf_traj_slerp_path(gsf_context* ctx, const double* poses, size_t count,
+                                                     int32_t frames, double push, void* scratch, double* out);
 
 // From pose to pose with straight positions: (count - 1) * (frames_per_leg - 1) + 1 poses, both ends included (official
 // interp_traj). official: the released spacing u = 0, 1/n .. (n-2)/n of each leg, n = frames_per_leg >= 2, and its
@@ -212,8 +213,8 @@ typedef struct gsf_traj_ellipse_desc {
     double pitch_degrees; // every view is turned by this about its own x axis
 } gsf_traj_ellipse_desc;
 
-// The official parameters of an outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round, a random
-// z_phase (from seed and round). frames 0 = 85.
+// The official parameters of an outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round, a
+// random z_phase (from seed and round). frames 0 = 85.
 GSF_API gsf_traj_ellipse_desc gsf_traj_round_ellipse(int32_t round, uint64_t seed, int32_t frames);
 // Closed loop in the xy plane about the focus point of the poses, which must be normalised. Half axes are 1.2 times the
 // 90th percentile of |position - focus|; views look at the focus; down is the axis nearest to the mean column 1.
@@ -226,8 +227,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_ellipse_path(gsf_context* ctx, const d
 // Frames of one window: `side` from the first reference to the ellipse, `middle` on it, `side` to the last reference.
 // middle + 2 side = window_length; 49 gives 16 and 17. Needs window_length >= 2.
 GSF_API void gsf_traj_split_window(int32_t window_length, int32_t* side, int32_t* middle);
-// The released table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL = only
-// the count is wanted). Fails where the table leaves the sequence (total < middle, mostly).
+// The released table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL =
+// only the count is wanted). Fails where the table leaves the sequence (total < middle, mostly).
 GSF_API GSF_NODISCARD gsf_result gsf_traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle,
                                                            int32_t* starts, int32_t* overlaps, int32_t* count);
 // Weight of the generative loss, between iterations start and until (0 elsewhere): lambda * sin(x), x from 0 to pi
@@ -257,9 +258,11 @@ typedef struct gsf_traj_path_desc {
     size_t point_count;
     const double* transform; // world to normalised frame, [16], for a host that has it from more cameras than these;
                              // NULL = gsf_traj_normalize of these cameras and points
+    const gsf_traj_ellipse_desc* ellipse; // the loop's shape, its frames field not used; NULL =
+                             // gsf_traj_round_ellipse(round, seed)
     const gsf_camera* intrinsics; // size and intrinsics of the frames; NULL = those of the first camera
-    int32_t official;        // REFERENCE: the released windows (length 3n+1, count by its table over ellipse_poses = 85),
-                             // spacing and interpolation; all kinds: the released similarity. See OFFICIAL above
+    int32_t official;        // REFERENCE: the released windows (length 3n+1, count by its table over ellipse_poses =
+                             // 85), spacing and interpolation; all kinds: the released similarity. See OFFICIAL
 } gsf_traj_path_desc;
 
 typedef struct gsf_traj_path_layout { // everything resolved
@@ -270,10 +273,10 @@ typedef struct gsf_traj_path_layout { // everything resolved
 
 GSF_API GSF_NODISCARD gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count,
                                                      const gsf_traj_path_desc* desc, gsf_traj_path_layout* layout);
-// Samples a path for world cameras (camera_count). out (frame_count): window after window, in world coordinates, all of
-// one size. reference_index (frame_count) or NULL: the camera whose photo a frame is, else -1; REFERENCE windows start and
-// end with one. Such a frame has that camera's w2c bit for bit.
-// ELLIPSE and REFERENCE need two cameras whose axes are not parallel, INTERPOLATE two cameras.
+// Samples a path for world cameras (camera_count). out (frame_count): window after window, in world coordinates, all
+// of one size. reference_index (frame_count) or NULL: the camera whose photo a frame is, else -1; REFERENCE windows
+// start and end with one. Such a frame has that camera's w2c bit for bit. ELLIPSE and REFERENCE need two cameras
+// whose axes are not parallel, INTERPOLATE two cameras.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_sample_path(gsf_context* ctx, const gsf_camera* cameras, size_t camera_count,
                                                       const gsf_traj_path_desc* desc, void* scratch, gsf_camera* out,
                                                       int32_t* reference_index);
@@ -298,6 +301,1539 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_sample_path(gsf_context* ctx, const gs
 #include "gsfixer.h" // again: its internals, if all was included before without an implementation macro
 
 GSF__BEGIN_IMPLEMENTATION
+
+// ---- >>vectors -----------------------------------------------------------------
+
+static double gsf__traj_dot(const double a[3], const double b[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+static void gsf__traj_cross(const double a[3], const double b[3], double out[3]) {
+    const double x = a[1] * b[2] - a[2] * b[1], y = a[2] * b[0] - a[0] * b[2], z = a[0] * b[1] - a[1] * b[0];
+    out[0] = x;
+    out[1] = y;
+    out[2] = z;
+}
+
+static double gsf__traj_max_abs(const double v[3]) {
+    double m = fabs(v[0]);
+    if (fabs(v[1]) > m) m = fabs(v[1]);
+    if (fabs(v[2]) > m) m = fabs(v[2]);
+    return m;
+}
+
+// Length without overflow or underflow on the way.
+static double gsf__traj_length(const double v[3]) {
+    const double m = gsf__traj_max_abs(v);
+    if (!(m > 0.0)) return 0.0;
+    const double x = v[0] / m, y = v[1] / m, z = v[2] / m;
+    return m * sqrt(x * x + y * y + z * z);
+}
+
+static double gsf__traj_distance(const double a[3], const double b[3]) {
+    const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+    return gsf__traj_length(d);
+}
+
+// Unit vector; 0 where there is no direction (zero, NaN, infinite). out may be v.
+static int gsf__traj_unit(const double v[3], double out[3]) {
+    const double m = gsf__traj_max_abs(v);
+    if (!(m > 0.0) || !isfinite(v[0]) || !isfinite(v[1]) || !isfinite(v[2])) return 0;
+    const double s[3] = {v[0] / m, v[1] / m, v[2] / m};
+    const double length = sqrt(gsf__traj_dot(s, s));
+    for (int i = 0; i < 3; i++) out[i] = s[i] / length;
+    return 1;
+}
+
+static void gsf__traj_identity(double m[16]) {
+    memset(m, 0, 16 * sizeof(double));
+    m[0] = m[5] = m[10] = m[15] = 1.0;
+}
+
+static int gsf__traj_finite(const double* v, size_t count) {
+    for (size_t i = 0; i < count; i++)
+        if (!isfinite(v[i])) return 0;
+    return 1;
+}
+
+static void gsf__traj_apply(const double m[16], const double p[3], double out[3]) {
+    const double x = p[0], y = p[1], z = p[2];
+    for (int r = 0; r < 3; r++) out[r] = m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r];
+}
+
+// Pose from forward and down directions; 0 where they do not span a plane. Columns orthonormal to a few ulp: what the
+// short cross product of nearly parallel directions loses is taken out again by the second projection.
+static int gsf__traj_axes(const double forward[3], const double down[3], const double position[3], double pose[16]) {
+    double x[3], y[3], z[3], d[3];
+    if (!gsf__traj_unit(forward, z) || !gsf__traj_unit(down, d)) return 0;
+    gsf__traj_cross(d, z, x);
+    if (!(gsf__traj_length(x) > 1e-9) || !gsf__traj_unit(x, x)) return 0;
+    const double lean = gsf__traj_dot(x, z);
+    for (int i = 0; i < 3; i++) x[i] -= lean * z[i];
+    if (!gsf__traj_unit(x, x)) return 0;
+    gsf__traj_cross(z, x, y);
+    for (int i = 0; i < 3; i++) {
+        pose[i] = x[i];
+        pose[4 + i] = y[i];
+        pose[8 + i] = z[i];
+        pose[12 + i] = position[i];
+    }
+    pose[3] = pose[7] = pose[11] = 0.0;
+    pose[15] = 1.0;
+    return 1;
+}
+
+// Sizes of scratch memory: SIZE_MAX once anything overflowed.
+static size_t gsf__traj_size_mul(size_t a, size_t b) {
+    size_t out;
+    return a != SIZE_MAX && b != SIZE_MAX && gsf__mul_size(a, b, &out) ? out : SIZE_MAX;
+}
+static size_t gsf__traj_size_add(size_t a, size_t b) { return a > SIZE_MAX - b ? SIZE_MAX : a + b; }
+static size_t gsf__traj_size_max(size_t a, size_t b) { return a > b ? a : b; }
+
+// ---- >>order statistics --------------------------------------------------------
+
+// Heap sort: n log n whatever the order, and in place. NaN must not come in.
+static void gsf__traj_sort(double* v, size_t n) {
+    if (n < 2) return;
+    for (size_t start = n / 2, end = n; end > 1;) {
+        double value;
+        if (start > 0) {
+            value = v[--start];
+        } else {
+            value = v[--end];
+            v[end] = v[0];
+        }
+        size_t hole = start;
+        for (size_t child; (child = 2 * hole + 1) < end; hole = child) {
+            if (child + 1 < end && v[child + 1] > v[child]) child++;
+            if (v[child] <= value) break;
+            v[hole] = v[child];
+        }
+        v[hole] = value;
+    }
+}
+
+// Of sorted values, linear between neighbours (numpy's default); share in [0,1].
+static double gsf__traj_percentile(const double* sorted, size_t n, double share) {
+    const double at = share * (double)(n - 1);
+    size_t below = (size_t)at;
+    if (below > n - 1) below = n - 1;
+    const size_t above = below + 1 < n ? below + 1 : below;
+    return sorted[below] + (sorted[above] - sorted[below]) * (at - (double)below);
+}
+
+// numpy's median: the mean of the two middle values for even n. Sorts v.
+static double gsf__traj_median(double* v, size_t n) {
+    gsf__traj_sort(v, n);
+    return n % 2 ? v[n / 2] : 0.5 * v[n / 2 - 1] + 0.5 * v[n / 2];
+}
+
+// ---- >>eigen -------------------------------------------------------------------
+
+// Eigenvalues of a symmetric 3x3 matrix (row-major), falling, and unit eigenvectors as rows. Cyclic Jacobi:
+// eigenvectors are products of plane rotations, so they are orthonormal to rounding whatever the matrix.
+static void gsf__traj_eigen(const double matrix[9], double values[3], double rows[9]) {
+    double a[9], v[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+    memcpy(a, matrix, sizeof a);
+    for (int sweep = 0; sweep < 64; sweep++) {
+        const double off = fabs(a[1]) + fabs(a[2]) + fabs(a[5]);
+        if (!(off > 1e-300) || off < 1e-20 * (fabs(a[0]) + fabs(a[4]) + fabs(a[8]))) break;
+        for (int p = 0; p < 2; p++)
+            for (int q = p + 1; q < 3; q++) {
+                const double apq = a[3 * p + q];
+                if (apq == 0.0) continue;
+                const double half = 0.5 * (a[4 * q] - a[4 * p]) / apq;
+                const double t = (half < 0.0 ? -1.0 : 1.0) / (fabs(half) + sqrt(half * half + 1.0));
+                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
+                const int r = 3 - p - q;
+                const double arp = a[3 * r + p], arq = a[3 * r + q];
+                a[4 * p] -= t * apq;
+                a[4 * q] += t * apq;
+                a[3 * p + q] = a[3 * q + p] = 0.0;
+                a[3 * r + p] = a[3 * p + r] = c * arp - s * arq;
+                a[3 * r + q] = a[3 * q + r] = s * arp + c * arq;
+                for (int i = 0; i < 3; i++) {
+                    const double vp = v[3 * p + i], vq = v[3 * q + i];
+                    v[3 * p + i] = c * vp - s * vq;
+                    v[3 * q + i] = s * vp + c * vq;
+                }
+            }
+    }
+    int order[3] = {0, 1, 2};
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 2 - i; j++)
+            if (a[4 * order[j]] < a[4 * order[j + 1]]) {
+                const int swap = order[j];
+                order[j] = order[j + 1];
+                order[j + 1] = swap;
+            }
+    for (int i = 0; i < 3; i++) {
+        values[i] = a[4 * order[i]];
+        memcpy(rows + 3 * i, v + 3 * order[i], 3 * sizeof(double));
+    }
+}
+
+// The coordinate axis least along `away`, made perpendicular to it.
+static void gsf__traj_side_axis(const double away[3], double out[3]) {
+    const int axis = fabs(away[0]) < 0.7 ? 0 : 1;
+    for (int i = 0; i < 3; i++) out[i] = (i == axis) - away[axis] * away[i];
+    (void)gsf__traj_unit(out, out);
+}
+
+// Makes eigenvectors a function of the input where the matrix leaves them open: equal eigenvalues take coordinate axes,
+// the largest component of rows 0 and 1 is positive (the first of equal ones), the determinant is +1.
+static void gsf__traj_fix_axes(const double values[3], double rows[9]) {
+    const double tie = 1e-7 * values[0];
+    if (values[0] - values[2] <= tie) {
+        for (int i = 0; i < 9; i++) rows[i] = i % 4 == 0;
+    } else if (values[0] - values[1] <= tie) {
+        gsf__traj_side_axis(rows + 6, rows);
+        gsf__traj_cross(rows + 6, rows, rows + 3);
+    } else if (values[1] - values[2] <= tie) {
+        gsf__traj_side_axis(rows, rows + 3);
+    }
+    for (int r = 0; r < 2; r++) {
+        double* row = rows + 3 * r;
+        const double most = 0.999 * gsf__traj_max_abs(row);
+        const int first = fabs(row[0]) >= most ? 0 : fabs(row[1]) >= most ? 1 : 2;
+        if (row[first] < 0.0)
+            for (int i = 0; i < 3; i++) row[i] = -row[i];
+    }
+    gsf__traj_cross(rows, rows + 3, rows + 6);
+}
+
+// ---- >>intrinsics --------------------------------------------------------------
+
+GSF_API double gsf_traj_fov_from_focal(double focal, double pixels) { return 2.0 * atan(pixels / (2.0 * focal)); }
+GSF_API double gsf_traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
+
+GSF_API gsf_camera gsf_traj_reduce_camera(const gsf_camera* camera, int32_t factor, int32_t width, int32_t height) {
+    gsf_camera out = *camera;
+    const int32_t f = factor < 1 ? 1 : factor;
+    const int32_t w = camera->width / f, h = camera->height / f;
+    const double sx = (double)width / (w < 1 ? 1 : w) / f, sy = (double)height / (h < 1 ? 1 : h) / f;
+    out.fx *= sx;
+    out.cx *= sx;
+    out.fy *= sy;
+    out.cy *= sy;
+    out.width = width;
+    out.height = height;
+    return out;
+}
+
+GSF_API gsf_camera gsf_traj_crop_camera(const gsf_camera* camera, int32_t x, int32_t y, int32_t width, int32_t height) {
+    gsf_camera out = *camera;
+    out.cx -= x;
+    out.cy -= y;
+    out.width = width;
+    out.height = height;
+    return out;
+}
+
+GSF_API gsf_result gsf_traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane, double far_plane,
+                                       double out[16]) {
+    GSF__TRY(gsf_check_camera(ctx, camera));
+    if (!isfinite(near_plane) || !isfinite(far_plane))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "projection: planes %g, %g", near_plane, far_plane);
+    if (!(near_plane > 0.0 && near_plane < far_plane))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "projection: near plane %g, far plane %g", near_plane,
+                        far_plane);
+    memset(out, 0, 16 * sizeof(double));
+    out[0] = 2.0 * camera->fx / camera->width;
+    out[5] = 2.0 * camera->fy / camera->height;
+    out[8] = (2.0 * camera->cx - camera->width) / camera->width;
+    out[9] = (2.0 * camera->cy - camera->height) / camera->height;
+    out[10] = far_plane / (far_plane - near_plane);
+    out[14] = -far_plane * near_plane / (far_plane - near_plane);
+    out[11] = 1.0;
+    return GSF_OK;
+}
+
+// ---- >>poses -------------------------------------------------------------------
+
+GSF_API gsf_result gsf_traj_check_poses(gsf_context* ctx, const double* poses, size_t count) {
+    if (!poses && count) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "poses: none given");
+    for (size_t n = 0; n < count; n++) {
+        const double* m = poses + 16 * n;
+        if (!gsf__traj_finite(m, 16)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "pose %zu: a value is not finite", n);
+        for (int a = 0; a < 3; a++)
+            for (int b = a; b < 3; b++)
+                if (!(fabs(gsf__traj_dot(m + 4 * a, m + 4 * b) - (a == b)) <= 1e-4))
+                    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "pose %zu: not rigid (columns %d, %d)", n, a, b);
+        double z[3];
+        gsf__traj_cross(m, m + 4, z);
+        if (!(gsf__traj_dot(z, m + 8) > 0.0))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "pose %zu: a reflection", n);
+        if (m[3] != 0.0 || m[7] != 0.0 || m[11] != 0.0 || fabs(m[15] - 1.0) > 1e-12)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "pose %zu: last row is not 0 0 0 1", n);
+    }
+    return GSF_OK;
+}
+
+// Last guard of every path: coordinates near the end of double's range overflow on the way.
+static gsf_result gsf__traj_check_path(gsf_context* ctx, double* poses, size_t count) {
+    if (gsf__traj_finite(poses, 16 * count)) return GSF_OK;
+    memset(poses, 0, 16 * count * sizeof(double));
+    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "path: coordinates are too large to compute with");
+}
+
+GSF_API gsf_result gsf_traj_view_pose(gsf_context* ctx, const double forward[3], const double down[3],
+                                      const double position[3], double pose[16]) {
+    if (!gsf__traj_finite(forward, 3) || !gsf__traj_finite(down, 3) || !gsf__traj_finite(position, 3))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "view: a direction or the position is not finite");
+    if (!gsf__traj_axes(forward, down, position, pose))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "view: forward and up are parallel, or one is zero");
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const double target[3], const double up[3],
+                                    double pose[16]) {
+    if (!gsf__traj_finite(eye, 3) || !gsf__traj_finite(target, 3) || !gsf__traj_finite(up, 3))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "look-at: a value is not finite");
+    const double forward[3] = {target[0] - eye[0], target[1] - eye[1], target[2] - eye[2]};
+    const double down[3] = {-up[0], -up[1], -up[2]};
+    if (!(gsf__traj_length(forward) > 1e-14 * (gsf__traj_max_abs(eye) + gsf__traj_max_abs(target))))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "look-at: the target is where the eye is");
+    return gsf_traj_view_pose(ctx, forward, down, eye, pose);
+}
+
+// ---- >>rotations ---------------------------------------------------------------
+
+GSF_API void gsf_traj_pose_quat(const double m[16], double quat[4]) {
+    // Four times the squares of w, x, y, z; the largest is the safe one to divide by (Shepperd 1978).
+    const double s[4] = {1.0 + m[0] + m[5] + m[10], 1.0 + m[0] - m[5] - m[10], 1.0 - m[0] + m[5] - m[10],
+                         1.0 - m[0] - m[5] + m[10]};
+    int most = 0;
+    for (int i = 1; i < 4; i++)
+        if (s[i] > s[most]) most = i;
+    double q[4];
+    switch (most) {
+        case 0: q[0] = s[0]; q[1] = m[6] - m[9]; q[2] = m[8] - m[2]; q[3] = m[1] - m[4]; break;
+        case 1: q[0] = m[6] - m[9]; q[1] = s[1]; q[2] = m[1] + m[4]; q[3] = m[8] + m[2]; break;
+        case 2: q[0] = m[8] - m[2]; q[1] = m[1] + m[4]; q[2] = s[2]; q[3] = m[6] + m[9]; break;
+        default: q[0] = m[1] - m[4]; q[1] = m[8] + m[2]; q[2] = m[6] + m[9]; q[3] = s[3]; break;
+    }
+    const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    const double scale = (q[0] < 0.0 ? -1.0 : 1.0) / length;
+    for (int i = 0; i < 4; i++) quat[i] = q[i] * scale;
+}
+
+// The rotation of a quaternion of any length but zero.
+static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
+    const double w = q[0], x = q[1], y = q[2], z = q[3];
+    const double s = 2.0 / (w * w + x * x + y * y + z * z);
+    pose[0] = 1.0 - s * (y * y + z * z);
+    pose[1] = s * (x * y + w * z);
+    pose[2] = s * (x * z - w * y);
+    pose[4] = s * (x * y - w * z);
+    pose[5] = 1.0 - s * (x * x + z * z);
+    pose[6] = s * (y * z + w * x);
+    pose[8] = s * (x * z + w * y);
+    pose[9] = s * (y * z - w * x);
+    pose[10] = 1.0 - s * (x * x + y * y);
+    pose[3] = pose[7] = pose[11] = 0.0;
+    pose[15] = 1.0;
+}
+
+GSF_API gsf_result gsf_traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]) {
+    if (!gsf__traj_finite(quat, 4)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "quaternion: a value is not finite");
+    double most = 0.0, unit[4];
+    for (int i = 0; i < 4; i++)
+        if (fabs(quat[i]) > most) most = fabs(quat[i]);
+    if (!(most > 0.0)) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "quaternion: zero");
+    for (int i = 0; i < 4; i++) unit[i] = quat[i] / most;
+    gsf__traj_quat_axes(unit, pose);
+    return GSF_OK;
+}
+
+GSF_API void gsf_traj_slerp(const double a[4], const double b[4], double t, double out[4]) {
+    double dot = 0.0, apart = 0.0, along = 0.0, q[4];
+    for (int i = 0; i < 4; i++) dot += a[i] * b[i];
+    const double sign = dot < 0.0 ? -1.0 : 1.0;
+    for (int i = 0; i < 4; i++) {
+        const double d = sign * b[i] - a[i], s = sign * b[i] + a[i];
+        apart += d * d;
+        along += s * s;
+    }
+    const double angle = 2.0 * atan2(sqrt(apart), sqrt(along)); // at most a quarter turn: sin(angle) is no trouble
+    double wa = 1.0 - t, wb = t;
+    if (angle > 1e-9) {
+        wa = sin(angle * (1.0 - t)) / sin(angle);
+        wb = sin(angle * t) / sin(angle);
+    }
+    double length = 0.0;
+    for (int i = 0; i < 4; i++) {
+        q[i] = wa * a[i] + wb * sign * b[i];
+        length += q[i] * q[i];
+    }
+    length = sqrt(length);
+    for (int i = 0; i < 4; i++) out[i] = q[i] / length;
+}
+
+static void gsf__traj_blend_poses(const double a[16], const double b[16], double t, double out[16]) {
+    double qa[4], qb[4], q[4], position[3];
+    gsf_traj_pose_quat(a, qa);
+    gsf_traj_pose_quat(b, qb);
+    gsf_traj_slerp(qa, qb, t, q);
+    for (int i = 0; i < 3; i++) position[i] = a[12 + i] + (b[12 + i] - a[12 + i]) * t;
+    gsf__traj_quat_axes(q, out);
+    memcpy(out + 12, position, sizeof position);
+}
+
+GSF_API gsf_result gsf_traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
+                                       double out[16]) {
+    GSF__TRY(gsf_traj_check_poses(ctx, a, 1));
+    GSF__TRY(gsf_traj_check_poses(ctx, b, 1));
+    if (!isfinite(t)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "slerp: t is %g", t);
+    gsf__traj_blend_poses(a, b, t, out);
+    return gsf__traj_check_path(ctx, out, 1);
+}
+
+// ---- >>views -------------------------------------------------------------------
+
+static gsf_result gsf__traj_check_views(gsf_context* ctx, const char* what, const double* poses, size_t count) {
+    if (count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: no view", what);
+    return gsf_traj_check_poses(ctx, poses, count);
+}
+
+// Mean of a column of the poses (0..3), summed as differences from the first so that far-off scenes keep their digits.
+static void gsf__traj_mean_column(const double* poses, size_t count, int column, double out[3]) {
+    const double* first = poses + 4 * column;
+    double sum[3] = {0.0, 0.0, 0.0};
+    for (size_t n = 1; n < count; n++)
+        for (int i = 0; i < 3; i++) sum[i] += poses[16 * n + (size_t)(4 * column + i)] - first[i];
+    for (int i = 0; i < 3; i++) out[i] = first[i] + sum[i] / (double)count;
+}
+
+// Solves mean(M^T M) x = mean(M^T M o), M = I - d d^T, o position and d direction of a view, relative to the mean o.
+GSF_API gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, size_t count, double focus[3]) {
+    GSF__TRY(gsf__traj_check_views(ctx, "focus point", poses, count));
+    double center[3], a[9], b[3], values[3], rows[9];
+    memset(a, 0, sizeof a);
+    memset(b, 0, sizeof b);
+    gsf__traj_mean_column(poses, count, 3, center);
+    for (size_t n = 0; n < count; n++) {
+        const double* d = poses + 16 * n + 8;
+        double m[9];
+        for (int r = 0; r < 3; r++)
+            for (int c = 0; c < 3; c++) m[3 * r + c] = (r == c) - d[r] * d[c];
+        for (int r = 0; r < 3; r++)
+            for (int c = 0; c < 3; c++) {
+                const double entry = m[r] * m[c] + m[3 + r] * m[3 + c] + m[6 + r] * m[6 + c];
+                a[3 * r + c] += entry / (double)count;
+                b[r] += entry * (poses[16 * n + 12 + (size_t)c] - center[c]) / (double)count;
+            }
+    }
+    gsf__traj_eigen(a, values, rows);
+    if (!(values[2] > 1e-12)) // mean squared sine of the angles to the common direction
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "focus point: the %zu optical axes are parallel", count);
+    double x[3] = {0.0, 0.0, 0.0};
+    for (int k = 0; k < 3; k++) {
+        const double share = gsf__traj_dot(rows + 3 * k, b) / values[k];
+        for (int i = 0; i < 3; i++) x[i] += share * rows[3 * k + i];
+    }
+    for (int i = 0; i < 3; i++) focus[i] = center[i] + x[i];
+    if (!gsf__traj_finite(focus, 3)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "focus point: coordinates are too large");
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_traj_average_pose(gsf_context* ctx, const double* poses, size_t count, int32_t official,
+                                         double pose[16]) {
+    GSF__TRY(gsf__traj_check_views(ctx, "average pose", poses, count));
+    double position[3], forward[3], down[3];
+    gsf__traj_mean_column(poses, count, 3, position);
+    gsf__traj_mean_column(poses, count, 2, forward);
+    gsf__traj_mean_column(poses, count, 1, down);
+    if (gsf__traj_length(forward) < 1e-9 || gsf__traj_length(down) < 1e-9)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "average pose: the directions of the %zu views cancel", count);
+    if (official) // viewmatrix() negates the direction that average_pose() gives it
+        for (int i = 0; i < 3; i++) forward[i] = -forward[i];
+    if (!gsf__traj_axes(forward, down, position, pose))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "average pose: %zu views look along their mean up vector", count);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_traj_recenter_poses(gsf_context* ctx, const double* poses, size_t count, int32_t official,
+                                           double* out, double transform[16]) {
+    double average[16];
+    GSF__TRY(gsf_traj_average_pose(ctx, poses, count, official, average));
+    gsf_mat4_rigid_inverse(average, transform);
+    for (size_t n = 0; n < count; n++) {
+        double local[16];
+        memcpy(local, poses + 16 * n, sizeof local);
+        for (int i = 0; i < 3; i++) local[12 + i] -= average[12 + i]; // first, so that far-off scenes keep their digits
+        double rotation[16];
+        memcpy(rotation, transform, sizeof rotation);
+        memset(rotation + 12, 0, 3 * sizeof(double));
+        gsf_mat4_mul(rotation, local, out + 16 * n);
+    }
+    return gsf__traj_check_path(ctx, out, count);
+}
+
+GSF_API gsf_result gsf_traj_camera_radius(gsf_context* ctx, const double* poses, size_t count, double center[3],
+                                          double* radius) {
+    GSF__TRY(gsf__traj_check_views(ctx, "camera radius", poses, count));
+    gsf__traj_mean_column(poses, count, 3, center);
+    *radius = 0.0;
+    for (size_t n = 0; n < count; n++) {
+        const double d = gsf__traj_distance(poses + 16 * n + 12, center);
+        if (d > *radius) *radius = d;
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_traj_nearest_view(gsf_context* ctx, const double pose[16], const double* poses, size_t count,
+                                         double direction_weight, int32_t* index, double* scores) {
+    *index = 0;
+    GSF__TRY(gsf__traj_check_views(ctx, "nearest view", poses, count));
+    GSF__TRY(gsf_traj_check_poses(ctx, pose, 1));
+    if (!isfinite(direction_weight))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "nearest view: direction weight is %g", direction_weight);
+    if (count > INT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "nearest view: %zu views", count);
+    double best = 0.0;
+    for (size_t n = 0; n < count; n++) {
+        const double* view = poses + 16 * n;
+        const double score = gsf__traj_distance(view + 12, pose + 12) +
+                             direction_weight * (1.0 - gsf__traj_dot(view + 8, pose + 8));
+        if (scores) scores[n] = score;
+        if (n == 0 || score < best - 1e-9 * fabs(best)) {
+            best = score;
+            *index = (int32_t)n;
+        }
+    }
+    return GSF_OK;
+}
+
+// ---- >>normalisation -----------------------------------------------------------
+
+// The rotation (row-major) that takes unit vector u to (0,-1,0) by the shortest way: I + [v] + [v]^2 / (1 + c) with
+// v = u x (0,-1,0), c = -u_y. 1 + c is taken from |v| where it would cancel. The released code has a mirror for c = -1.
+static void gsf__traj_upright(const double u[3], double r[9]) {
+    const double across = u[0] * u[0] + u[2] * u[2]; // |v|^2
+    if (u[1] > 0.0 && across < 1e-300) {
+        const double half_turn[9] = {1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0};
+        memcpy(r, half_turn, sizeof half_turn);
+        return;
+    }
+    const double one_plus_c = u[1] > 0.0 ? across / (1.0 + u[1]) : 1.0 - u[1];
+    const double v[3] = {u[2], 0.0, -u[0]};
+    const double skew[9] = {0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0};
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            const double square = v[i] * v[j] - (i == j ? across : 0.0); // [v]^2 = v v^T - |v|^2 I
+            r[3 * i + j] = (i == j) + skew[3 * i + j] + square / one_plus_c;
+        }
+}
+
+GSF_API size_t gsf_traj_similarity_scratch(size_t count) { return gsf__traj_size_mul(count, 7 * sizeof(double)); }
+
+// magnitude: size of the coordinates before an origin was subtracted; what is smaller by 1e-13 is rounding.
+static gsf_result gsf__traj_similarity(gsf_context* ctx, const double* poses, size_t count,
+                                       const gsf_traj_similarity_desc* desc, double magnitude, double* work,
+                                       double transform[16]) {
+    double ups[3], r[9], middle[3], mean[3] = {0.0, 0.0, 0.0};
+    gsf__traj_mean_column(poses, count, 1, ups);
+    for (int i = 0; i < 3; i++) ups[i] = -ups[i];
+    if (gsf__traj_length(ups) < 1e-9 || !gsf__traj_unit(ups, ups))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "similarity: the up vectors of the %zu views cancel", count);
+    gsf__traj_upright(ups, r);
+    double *t = work, *near_points = work + 3 * count, *values = work + 6 * count;
+    for (size_t n = 0; n < count; n++)
+        for (int i = 0; i < 3; i++) t[3 * n + (size_t)i] = gsf__traj_dot(r + 3 * i, poses + 16 * n + 12);
+    if (!desc->official) {
+        double world[3];
+        gsf__traj_mean_column(poses, count, 3, world);
+        for (int i = 0; i < 3; i++) mean[i] = gsf__traj_dot(r + 3 * i, world);
+    }
+    for (size_t n = 0; n < count; n++) {
+        if (desc->center == GSF_TRAJ_CENTER_POSES) {
+            memcpy(near_points + 3 * n, t + 3 * n, 3 * sizeof(double));
+            continue;
+        }
+        double forward[3], away = 0.0;
+        for (int i = 0; i < 3; i++) forward[i] = gsf__traj_dot(r + 3 * i, poses + 16 * n + 8);
+        for (int i = 0; i < 3; i++) away += forward[i] * (mean[i] - t[3 * n + (size_t)i]);
+        for (int i = 0; i < 3; i++) near_points[3 * n + (size_t)i] = t[3 * n + (size_t)i] + away * forward[i];
+    }
+    for (int i = 0; i < 3; i++) {
+        for (size_t n = 0; n < count; n++) values[n] = near_points[3 * n + (size_t)i];
+        middle[i] = gsf__traj_median(values, count);
+    }
+    for (size_t n = 0; n < count; n++) values[n] = gsf__traj_distance(t + 3 * n, middle);
+    double size = gsf__traj_median(values, count);
+    const double rounding = 1e-13 * magnitude;
+    if (desc->strict_scaling || (!desc->official && !(size > rounding))) size = values[count - 1];
+    if (!(size > rounding))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "similarity: the %zu cameras are all at one point", count);
+    gsf__traj_identity(transform);
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) transform[4 * j + i] = r[3 * i + j] / size;
+        transform[12 + i] = -middle[i] / size;
+    }
+    return gsf__traj_check_path(ctx, transform, 1);
+}
+
+static double gsf__traj_magnitude(const double* points, size_t count, size_t stride) {
+    double most = 0.0;
+    for (size_t n = 0; n < count; n++) {
+        const double m = gsf__traj_max_abs(points + stride * n);
+        if (m > most) most = m;
+    }
+    return most;
+}
+
+static gsf_result gsf__traj_check_center(gsf_context* ctx, const gsf_traj_similarity_desc* desc) {
+    if (desc && desc->center != GSF_TRAJ_CENTER_FOCUS && desc->center != GSF_TRAJ_CENTER_POSES)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "similarity: center is %d", (int)desc->center);
+    return GSF_OK;
+}
+
+static gsf_traj_similarity_desc gsf__traj_similarity_desc_defaults(const gsf_traj_similarity_desc* desc) {
+    gsf_traj_similarity_desc out;
+    memset(&out, 0, sizeof out);
+    if (desc) out = *desc;
+    return out;
+}
+
+GSF_API gsf_result gsf_traj_similarity(gsf_context* ctx, const double* poses, size_t count,
+                                       const gsf_traj_similarity_desc* desc, void* scratch, double transform[16]) {
+    GSF__TRY(gsf__traj_check_center(ctx, desc));
+    GSF__TRY(gsf__traj_check_views(ctx, "similarity", poses, count));
+    const gsf_traj_similarity_desc d = gsf__traj_similarity_desc_defaults(desc);
+    return gsf__traj_similarity(ctx, poses, count, &d, gsf__traj_magnitude(poses + 12, count, 16), (double*)scratch,
+                                transform);
+}
+
+typedef struct gsf__traj_cloud { // points as seen after origin and transform: T (p - origin)
+    const double* points;
+    size_t count, stride; // stride in doubles
+    double origin[3];
+    double transform[16];
+} gsf__traj_cloud;
+
+static void gsf__traj_cloud_point(const gsf__traj_cloud* cloud, size_t n, double out[3]) {
+    for (int i = 0; i < 3; i++) out[i] = cloud->points[cloud->stride * n + (size_t)i] - cloud->origin[i];
+    gsf__traj_apply(cloud->transform, out, out);
+}
+
+// up: NULL, or what takes the third axis where the points lie on a line.
+static gsf_result gsf__traj_cloud_axes(gsf_context* ctx, const gsf__traj_cloud* cloud, const double* up, double* work,
+                                       double transform[16]) {
+    double median[3], mean[3] = {0.0, 0.0, 0.0}, covariance[9], values[3], rows[9], p[3];
+    if (cloud->count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "principal axes: no point");
+    for (int i = 0; i < 3; i++) {
+        for (size_t n = 0; n < cloud->count; n++) {
+            gsf__traj_cloud_point(cloud, n, p);
+            if (!gsf__traj_finite(p, 3))
+                return gsf_fail(ctx, GSF_ERROR_NUMERIC, "principal axes: point %zu is not finite", n);
+            work[n] = p[i];
+        }
+        median[i] = gsf__traj_median(work, cloud->count);
+    }
+    for (size_t n = 0; n < cloud->count; n++) {
+        gsf__traj_cloud_point(cloud, n, p);
+        for (int i = 0; i < 3; i++) mean[i] += (p[i] - median[i]) / (double)cloud->count;
+    }
+    memset(covariance, 0, sizeof covariance);
+    for (size_t n = 0; n < cloud->count; n++) {
+        gsf__traj_cloud_point(cloud, n, p);
+        for (int i = 0; i < 3; i++) p[i] -= median[i] + mean[i];
+        for (int i = 0; i < 3; i++)
+            for (int j = 0; j < 3; j++) covariance[3 * i + j] += p[i] * p[j] / (double)cloud->count;
+    }
+    if (!gsf__traj_finite(covariance, 9))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "principal axes: coordinates are too large");
+    gsf__traj_eigen(covariance, values, rows);
+    const double rounding = 1e-13 * gsf__traj_max_abs(median);
+    if (!(sqrt(values[0] > 0.0 ? values[0] : 0.0) > rounding) || !(values[0] > 0.0))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "principal axes: the %zu points coincide", cloud->count);
+    if (values[1] <= 1e-14 * values[0]) {
+        if (!up || fabs(gsf__traj_dot(up, rows)) > 1.0 - 1e-9)
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "principal axes: the %zu points lie on a line", cloud->count);
+        const double along = gsf__traj_dot(up, rows);
+        for (int i = 0; i < 3; i++) rows[6 + i] = up[i] - along * rows[i];
+        (void)gsf__traj_unit(rows + 6, rows + 6);
+        gsf__traj_cross(rows + 6, rows, rows + 3);
+        values[1] = 0.5 * values[0]; // settled: no tie left
+        values[2] = 0.0;
+    }
+    gsf__traj_fix_axes(values, rows);
+    gsf__traj_identity(transform);
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) transform[4 * j + i] = rows[3 * i + j];
+        transform[12 + i] = -gsf__traj_dot(rows + 3 * i, median);
+    }
+    return GSF_OK;
+}
+
+static void gsf__traj_cloud_init(gsf__traj_cloud* cloud, const double* points, size_t count, size_t stride) {
+    memset(cloud, 0, sizeof *cloud);
+    cloud->points = points;
+    cloud->count = count;
+    cloud->stride = stride;
+    gsf__traj_identity(cloud->transform);
+}
+
+GSF_API size_t gsf_traj_principal_axes_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
+
+GSF_API gsf_result gsf_traj_principal_axes(gsf_context* ctx, const double* points, size_t count, void* scratch,
+                                           double transform[16]) {
+    gsf__traj_cloud cloud;
+    gsf__traj_cloud_init(&cloud, points, points ? count : 0, 3);
+    return gsf__traj_cloud_axes(ctx, &cloud, NULL, (double*)scratch, transform);
+}
+
+GSF_API size_t gsf_traj_normalize_scratch(size_t count, size_t point_count) {
+    return gsf__traj_size_max(gsf_traj_similarity_scratch(count), gsf_traj_principal_axes_scratch(point_count));
+}
+
+// As the public function; poses are relative to `origin`, points are not.
+static gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
+                                      size_t point_count, const double origin[3], double magnitude,
+                                      const gsf_traj_similarity_desc* desc, double* work, double transform[16]) {
+    static const double up[3] = {0.0, -1.0, 0.0}; // where the similarity turns the mean up vector
+    double first[16], second[16];
+    GSF__TRY(gsf__traj_similarity(ctx, poses, count, desc, magnitude, work, first));
+    gsf__traj_cloud cloud;
+    if (points && point_count) {
+        gsf__traj_cloud_init(&cloud, points, point_count, 3);
+        memcpy(cloud.origin, origin, 3 * sizeof(double));
+    } else {
+        gsf__traj_cloud_init(&cloud, poses + 12, count, 16);
+    }
+    memcpy(cloud.transform, first, sizeof first);
+    GSF__TRY(gsf__traj_cloud_axes(ctx, &cloud, points && point_count ? NULL : up, work, second));
+    gsf_mat4_mul(second, first, transform);
+    return gsf__traj_check_path(ctx, transform, 1);
+}
+
+GSF_API gsf_result gsf_traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
+                                      size_t point_count, const gsf_traj_similarity_desc* desc, void* scratch,
+                                      double transform[16]) {
+    static const double origin[3] = {0.0, 0.0, 0.0};
+    GSF__TRY(gsf__traj_check_center(ctx, desc));
+    GSF__TRY(gsf__traj_check_views(ctx, "normalisation", poses, count));
+    const gsf_traj_similarity_desc d = gsf__traj_similarity_desc_defaults(desc);
+    return gsf__traj_normalize(ctx, poses, count, points, point_count, origin,
+                               gsf__traj_magnitude(poses + 12, count, 16), &d, (double*)scratch, transform);
+}
+
+GSF_API gsf_result gsf_traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
+                                      double transform[16]) {
+    GSF__TRY(gsf__traj_check_views(ctx, "principal axes", poses, count));
+    double mean[3], scatter[9], values[3], rows[9], y_axis[3];
+    gsf__traj_mean_column(poses, count, 3, mean);
+    memset(scatter, 0, sizeof scatter);
+    for (size_t n = 0; n < count; n++) {
+        const double* p = poses + 16 * n + 12;
+        for (int i = 0; i < 3; i++)
+            for (int j = 0; j < 3; j++) scatter[3 * i + j] += (p[i] - mean[i]) * (p[j] - mean[j]);
+    }
+    if (!gsf__traj_finite(scatter, 9))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "principal axes: coordinates are too large");
+    gsf__traj_eigen(scatter, values, rows);
+    const double rounding = 1e-13 * gsf__traj_magnitude(poses + 12, count, 16);
+    if (!(values[0] > rounding * rounding) || values[1] <= 1e-14 * values[0])
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "principal axes: the %zu cameras lie on a line or a point", count);
+    gsf__traj_fix_axes(values, rows);
+    gsf__traj_mean_column(poses, count, 1, y_axis);
+    if (gsf__traj_dot(rows + 6, y_axis) < 0.0)
+        for (int i = 3; i < 9; i++) rows[i] = -rows[i];
+    double most = 0.0;
+    for (size_t n = 0; n < count; n++) {
+        const double* p = poses + 16 * n + 12;
+        const double d[3] = {p[0] - mean[0], p[1] - mean[1], p[2] - mean[2]};
+        for (int i = 0; i < 3; i++) {
+            const double c = fabs(gsf__traj_dot(rows + 3 * i, d));
+            if (c > most) most = c;
+        }
+    }
+    gsf__traj_identity(transform);
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) transform[4 * j + i] = rows[3 * i + j] / most;
+        transform[12 + i] = -gsf__traj_dot(rows + 3 * i, mean) / most;
+    }
+    GSF__TRY(gsf__traj_check_path(ctx, transform, 1));
+    gsf_traj_transform_poses(transform, poses, count, out);
+    return GSF_OK;
+}
+
+GSF_API void gsf_traj_transform_poses(const double transform[16], const double* poses, size_t count, double* out) {
+    double rotation[16];
+    const double row[3] = {transform[0], transform[4], transform[8]};
+    const double scale = gsf__traj_length(row);
+    gsf__traj_identity(rotation);
+    for (int c = 0; c < 3; c++)
+        for (int r = 0; r < 3; r++) rotation[4 * c + r] = transform[4 * c + r] / scale;
+    for (size_t n = 0; n < count; n++) {
+        double position[3];
+        gsf__traj_apply(transform, poses + 16 * n + 12, position);
+        gsf_mat4_mul(rotation, poses + 16 * n, out + 16 * n);
+        memcpy(out + 16 * n + 12, position, sizeof position);
+    }
+}
+
+GSF_API void gsf_traj_transform_points(const double transform[16], const double* points, size_t count, double* out) {
+    for (size_t n = 0; n < count; n++) gsf__traj_apply(transform, points + 3 * n, out + 3 * n);
+}
+
+static gsf_result gsf__traj_check_similarity(gsf_context* ctx, const double t[16]) {
+    if (!gsf__traj_finite(t, 16)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "similarity: a value is not finite");
+    const double scale = gsf__traj_length(t);
+    if (!(scale > 0.0)) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "similarity: its scale is zero");
+    double c[3][3], z[3];
+    for (int a = 0; a < 3; a++)
+        for (int i = 0; i < 3; i++) c[a][i] = t[4 * a + i] / scale;
+    for (int a = 0; a < 3; a++)
+        for (int b = a; b < 3; b++)
+            if (!(fabs(gsf__traj_dot(c[a], c[b]) - (a == b)) <= 1e-6))
+                return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "similarity: not a rotation (columns %d, %d)", a, b);
+    gsf__traj_cross(c[0], c[1], z);
+    if (!(gsf__traj_dot(z, c[2]) > 0.0)) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "similarity: a reflection");
+    if (t[3] != 0.0 || t[7] != 0.0 || t[11] != 0.0 || fabs(t[15] - 1.0) > 1e-12)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "similarity: last row is not 0 0 0 1");
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_traj_invert_similarity(gsf_context* ctx, const double transform[16], double out[16]) {
+    GSF__TRY(gsf__traj_check_similarity(ctx, transform));
+    const double scale = gsf__traj_length(transform);
+    double rotation[9], inverse[16]; // rotation row-major
+    gsf__traj_identity(inverse);
+    for (int c = 0; c < 3; c++)
+        for (int r = 0; r < 3; r++) rotation[3 * r + c] = transform[4 * c + r] / scale;
+    for (int c = 0; c < 3; c++)
+        for (int r = 0; r < 3; r++) inverse[4 * c + r] = rotation[3 * c + r] / scale;
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) inverse[12 + r] -= inverse[4 * c + r] * transform[12 + c];
+    GSF__TRY(gsf__traj_check_path(ctx, inverse, 1));
+    memcpy(out, inverse, sizeof inverse);
+    return GSF_OK;
+}
+
+// ---- >>splines -----------------------------------------------------------------
+
+enum { GSF__TRAJ_DEGREE_MAX = 5 };
+
+typedef struct gsf__traj_curve { // views into scratch
+    size_t count, dims;
+    int degree;
+    double* knots;        // (count + degree + 1)
+    double* coefficients; // (count,dims)
+    double* band;         // (count, 2 degree + 1), only while it is made
+} gsf__traj_curve;
+
+static size_t gsf__traj_curve_doubles(size_t count, int degree, size_t dims) {
+    const size_t k = (size_t)degree;
+    return gsf__traj_size_add(gsf__traj_size_mul(count, gsf__traj_size_add(dims, 2 * k + 2)), k + 1);
+}
+
+// The knot span of u and the degree + 1 basis functions that live there (de Boor's recurrence, as A2.2 of The NURBS
+// Book).
+static size_t gsf__traj_basis(const gsf__traj_curve* curve, double u, double basis[GSF__TRAJ_DEGREE_MAX + 1]) {
+    const size_t k = (size_t)curve->degree;
+    size_t low = k, high = curve->count; // knots[low] <= u < knots[high], or the last span
+    while (high - low > 1) {
+        const size_t mid = low + (high - low) / 2;
+        if (u < curve->knots[mid]) high = mid;
+        else low = mid;
+    }
+    double left[GSF__TRAJ_DEGREE_MAX + 1], right[GSF__TRAJ_DEGREE_MAX + 1];
+    basis[0] = 1.0;
+    for (size_t j = 1; j <= k; j++) {
+        left[j] = u - curve->knots[low + 1 - j];
+        right[j] = curve->knots[low + j] - u;
+        double saved = 0.0;
+        for (size_t r = 0; r < j; r++) {
+            const double part = basis[r] / (right[r + 1] + left[j - r]);
+            basis[r] = saved + right[r + 1] * part;
+            saved = left[j - r] * part;
+        }
+        basis[j] = saved;
+    }
+    return low - k; // index of the first
+}
+
+// Makes the curve through values[i] (stride doubles apart) at sites. Collocation matrices of B-splines are totally
+// positive, so elimination inside the band needs no pivoting. 0 where a site is not above its predecessor.
+static int gsf__traj_make_curve(gsf__traj_curve* curve, const double* sites, const double* values, size_t stride,
+                                size_t count, size_t dims, int degree, double* work) {
+    const size_t k = (size_t)degree, width = 2 * k + 1;
+    curve->count = count;
+    curve->dims = dims;
+    curve->degree = degree;
+    curve->knots = work;
+    curve->coefficients = curve->knots + count + k + 1;
+    curve->band = curve->coefficients + count * dims;
+    for (size_t i = 1; i < count; i++)
+        if (!(sites[i] > sites[i - 1])) return 0;
+    for (size_t i = 0; i <= k; i++) {
+        curve->knots[i] = sites[0];
+        curve->knots[count + i] = sites[count - 1];
+    }
+    for (size_t i = 0; i + k + 1 < count; i++) // not-a-knot: sites for odd degrees, their midpoints for even ones
+        curve->knots[k + 1 + i] = k % 2 ? sites[i + (k + 1) / 2] : 0.5 * (sites[i + k / 2] + sites[i + k / 2 + 1]);
+    memset(curve->band, 0, count * width * sizeof(double));
+    for (size_t i = 0; i < count; i++) { // band[i][j] is the matrix's column i + j - k
+        double basis[GSF__TRAJ_DEGREE_MAX + 1];
+        const size_t first = gsf__traj_basis(curve, sites[i], basis);
+        for (size_t j = 0; j <= k; j++)
+            if (first + j + k >= i && first + j <= i + k) curve->band[i * width + first + j + k - i] = basis[j];
+        for (size_t d = 0; d < dims; d++) curve->coefficients[i * dims + d] = values[i * stride + d];
+    }
+    for (size_t i = 0; i < count; i++) {
+        const double pivot = curve->band[i * width + k];
+        if (!(pivot > 0.0)) return 0;
+        for (size_t r = i + 1; r < count && r <= i + k; r++) {
+            const double factor = curve->band[r * width + i + k - r] / pivot;
+            if (factor == 0.0) continue;
+            for (size_t j = 1; j <= k && i + j < count; j++)
+                curve->band[r * width + i + j + k - r] -= factor * curve->band[i * width + j + k];
+            for (size_t d = 0; d < dims; d++)
+                curve->coefficients[r * dims + d] -= factor * curve->coefficients[i * dims + d];
+        }
+    }
+    for (size_t i = count; i-- > 0;)
+        for (size_t d = 0; d < dims; d++) {
+            double sum = curve->coefficients[i * dims + d];
+            for (size_t j = 1; j <= k && i + j < count; j++)
+                sum -= curve->band[i * width + j + k] * curve->coefficients[(i + j) * dims + d];
+            curve->coefficients[i * dims + d] = sum / curve->band[i * width + k];
+        }
+    return 1;
+}
+
+static void gsf__traj_eval_curve(const gsf__traj_curve* curve, double u, double* out) {
+    double basis[GSF__TRAJ_DEGREE_MAX + 1];
+    const double first_site = curve->knots[0], last_site = curve->knots[curve->count];
+    const size_t first = gsf__traj_basis(curve, u < first_site ? first_site : u > last_site ? last_site : u, basis);
+    for (size_t d = 0; d < curve->dims; d++) {
+        double sum = 0.0;
+        for (size_t j = 0; j <= (size_t)curve->degree; j++)
+            sum += basis[j] * curve->coefficients[(first + j) * curve->dims + d];
+        out[d] = sum;
+    }
+}
+
+GSF_API size_t gsf_traj_spline_scratch(size_t count, int32_t degree, size_t dims) {
+    if (degree < 1 || degree > GSF__TRAJ_DEGREE_MAX) return SIZE_MAX;
+    return gsf__traj_size_mul(gsf__traj_curve_doubles(count, degree, dims), sizeof(double));
+}
+
+GSF_API gsf_result gsf_traj_spline(gsf_context* ctx, const double* sites, const double* values, size_t count,
+                                   size_t dims, int32_t degree, const double* at, size_t at_count, void* scratch,
+                                   double* out) {
+    if (degree < 1 || degree > GSF__TRAJ_DEGREE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline: degree %d is not 1..5", (int)degree);
+    if (count < (size_t)degree + 1)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline: %zu values for degree %d", count, (int)degree);
+    if (gsf_traj_spline_scratch(count, degree, dims) == SIZE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline: %zu x %zu values", count, dims);
+    if (!gsf__traj_finite(sites, count) || !gsf__traj_finite(values, count * dims) || !gsf__traj_finite(at, at_count))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline: a value is not finite");
+    gsf__traj_curve curve;
+    if (!gsf__traj_make_curve(&curve, sites, values, dims, count, dims, (int)degree, (double*)scratch))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline: sites do not ascend");
+    for (size_t i = 0; i < at_count; i++) gsf__traj_eval_curve(&curve, at[i], out + i * dims);
+    if (gsf__traj_finite(out, at_count * dims)) return GSF_OK;
+    memset(out, 0, at_count * dims * sizeof(double));
+    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline: values are too large to compute with");
+}
+
+static gsf_traj_spline_desc gsf__traj_spline_desc_defaults(const gsf_traj_spline_desc* desc, size_t count) {
+    gsf_traj_spline_desc out;
+    memset(&out, 0, sizeof out);
+    if (desc) out = *desc;
+    if (out.frames_per_leg == 0) out.frames_per_leg = 16;
+    if (out.degree == 0) out.degree = GSF__TRAJ_DEGREE_MAX;
+    if (count >= 2 && (size_t)(out.degree < 1 ? 1 : out.degree) > count - 1) out.degree = (int32_t)(count - 1);
+    if (out.axis_length == 0.0) out.axis_length = 0.1;
+    return out;
+}
+
+static gsf_result gsf__traj_check_spline(gsf_context* ctx, const gsf_traj_spline_desc* d) {
+    if (d->frames_per_leg < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline path: %d frames per leg", (int)d->frames_per_leg);
+    if (d->degree < 1 || d->degree > GSF__TRAJ_DEGREE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline path: degree %d is not 1..5", (int)d->degree);
+    if (!isfinite(d->axis_length))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline path: axis length %g", d->axis_length);
+    if (!(d->axis_length > 0.0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline path: axis length %g", d->axis_length);
+    return GSF_OK;
+}
+
+GSF_API size_t gsf_traj_spline_path_scratch(size_t count, const gsf_traj_spline_desc* desc) {
+    const gsf_traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
+    if (d.degree < 1 || d.degree > GSF__TRAJ_DEGREE_MAX) return SIZE_MAX;
+    const size_t rows = gsf__traj_size_mul(count, 10); // 9 coordinates and the site of each pose
+    return gsf__traj_size_mul(gsf__traj_size_add(rows, gsf__traj_curve_doubles(count, d.degree, 9)), sizeof(double));
+}
+
+GSF_API gsf_result gsf_traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
+                                        const gsf_traj_spline_desc* desc, void* scratch, double* out) {
+    const gsf_traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
+    GSF__TRY(gsf__traj_check_spline(ctx, &d));
+    GSF__TRY(gsf__traj_check_views(ctx, "spline path", poses, count));
+    if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline path: one view");
+    double *points = (double*)scratch, *sites = points + 9 * count;
+    const double* origin = poses + 12;
+    sites[0] = 0.0;
+    for (size_t n = 0; n < count; n++) { // (position, position - arm * forward, position + arm * down)
+        const double* m = poses + 16 * n;
+        double* p = points + 9 * n;
+        double square = 0.0;
+        for (int i = 0; i < 3; i++) {
+            p[i] = m[12 + i] - origin[i];
+            p[3 + i] = p[i] - d.axis_length * m[8 + i];
+            p[6 + i] = p[i] + d.axis_length * m[4 + i];
+        }
+        if (n == 0) continue;
+        for (int i = 0; i < 9; i++) square += (p[i] - p[i - 9]) * (p[i] - p[i - 9]);
+        sites[n] = sites[n - 1] + sqrt(square);
+    }
+    if (!isfinite(sites[count - 1])) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline path: coordinates are too large");
+    for (size_t n = 1; n < count; n++)
+        if (!(sites[n] - sites[n - 1] > 1e-12 * sites[count - 1]))
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline path: poses %zu and %zu coincide", n - 1, n);
+    for (size_t n = 1; n < count; n++) sites[n] /= sites[count - 1];
+    gsf__traj_curve curve;
+    if (!gsf__traj_make_curve(&curve, sites, points, 9, count, 9, (int)d.degree, sites + count))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline path: distances of poses differ too much");
+    const size_t frames = (count - 1) * (size_t)d.frames_per_leg;
+    for (size_t f = 0; f < frames; f++) {
+        double p[9], forward[3], down[3];
+        gsf__traj_eval_curve(&curve, (double)f / (double)frames, p);
+        for (int i = 0; i < 3; i++) {
+            forward[i] = p[i] - p[3 + i];
+            down[i] = p[6 + i] - p[i];
+            p[i] += origin[i];
+        }
+        if (gsf__traj_length(forward) < 1e-9 * d.axis_length || !gsf__traj_axes(forward, down, p, out + 16 * f)) {
+            memset(out, 0, 16 * frames * sizeof(double));
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline path: directions cancel at frame %zu", f);
+        }
+    }
+    return gsf__traj_check_path(ctx, out, frames);
+}
+
+GSF_API size_t gsf_traj_slerp_path_scratch(size_t count) {
+    const int degree = count < 3 ? 1 : count < 4 ? 2 : 3;
+    const size_t rows = gsf__traj_size_mul(count, 4); // site and position of each pose
+    return gsf__traj_size_mul(gsf__traj_size_add(rows, gsf__traj_curve_doubles(count, degree, 3)), sizeof(double));
+}
+
+// A path through poses at even sites, position relative to the first pose: splines of degree 1, 2, 3 for 2, 3, more.
+static int gsf__traj_make_glide(gsf__traj_curve* curve, const double* poses, size_t count, double* work) {
+    double *sites = work, *positions = work + count;
+    for (size_t n = 0; n < count; n++) {
+        sites[n] = (double)n;
+        for (int i = 0; i < 3; i++) positions[3 * n + (size_t)i] = poses[16 * n + 12 + (size_t)i] - poses[12 + i];
+    }
+    return gsf__traj_make_curve(curve, sites, positions, 3, count, 3, count < 3 ? 1 : count < 4 ? 2 : 3,
+                                positions + 3 * count);
+}
+
+// u from 0 to count - 1.
+static void gsf__traj_eval_glide(const gsf__traj_curve* curve, const double* poses, size_t count, double u,
+                                 double out[16]) {
+    size_t leg = (size_t)u;
+    if (leg > count - 2) leg = count - 2;
+    double position[3];
+    gsf__traj_eval_curve(curve, u, position);
+    gsf__traj_blend_poses(poses + 16 * leg, poses + 16 * (leg + 1), u - (double)leg, out);
+    for (int i = 0; i < 3; i++) out[12 + i] = poses[12 + i] + position[i];
+}
+
+GSF_API gsf_result gsf_traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames, double push,
+                                       void* scratch, double* out) {
+    GSF__TRY(gsf__traj_check_views(ctx, "slerp path", poses, count));
+    if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "slerp path: one view");
+    if (frames < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "slerp path: %d frames", (int)frames);
+    if (!isfinite(push)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "slerp path: push is %g", push);
+    gsf__traj_curve curve;
+    if (!gsf__traj_make_glide(&curve, poses, count, (double*)scratch))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "slerp path: no spline through %zu poses", count);
+    for (int32_t f = 0; f < frames; f++) {
+        double* pose = out + 16 * (size_t)f;
+        const double u = frames == 1 ? 0.0 : (double)f * (double)(count - 1) / (double)(frames - 1);
+        gsf__traj_eval_glide(&curve, poses, count, u, pose);
+        for (int i = 0; i < 3; i++) pose[12 + i] += push * pose[8 + i];
+    }
+    return gsf__traj_check_path(ctx, out, (size_t)frames);
+}
+
+// ---- >>ellipse -----------------------------------------------------------------
+
+GSF_API gsf_traj_ellipse_desc gsf_traj_round_ellipse(int32_t round, uint64_t seed, int32_t frames) {
+    gsf_traj_ellipse_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.frames = frames;
+    desc.z_variation = 1.5 - 0.2 * round;
+    if (desc.z_variation < 0.5) desc.z_variation = 0.5;
+    desc.z_phase = gsf_random_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // a stream of its own
+    desc.pitch_degrees = 2.0 * round;
+    return desc;
+}
+
+static gsf_traj_ellipse_desc gsf__traj_ellipse_desc_defaults(const gsf_traj_ellipse_desc* desc) {
+    gsf_traj_ellipse_desc out;
+    memset(&out, 0, sizeof out);
+    if (desc) out = *desc;
+    if (out.frames == 0) out.frames = 85;
+    return out;
+}
+
+GSF_API size_t gsf_traj_ellipse_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
+
+// generate_ellipse_path of outpaint/sample_utils.py (after multinerf), its random sign, which is never used, left out.
+GSF_API gsf_result gsf_traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
+                                         const gsf_traj_ellipse_desc* desc, void* scratch, double* out) {
+    const double two_pi = 6.283185307179586476925286766559;
+    const gsf_traj_ellipse_desc d = gsf__traj_ellipse_desc_defaults(desc);
+    if (d.frames < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "ellipse: %d frames", (int)d.frames);
+    if (!isfinite(d.z_variation) || !isfinite(d.z_phase) || !isfinite(d.pitch_degrees))
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "ellipse: a parameter is not finite");
+    double focus[3], down[3], low[2], high[2], *work = (double*)scratch;
+    GSF__TRY(gsf_traj_focus_point(ctx, poses, count, focus));
+    for (int i = 0; i < 2; i++) {
+        for (size_t n = 0; n < count; n++) work[n] = fabs(poses[16 * n + 12 + (size_t)i] - focus[i]);
+        gsf__traj_sort(work, count);
+        const double half_axis = gsf__traj_percentile(work, count, 0.9);
+        low[i] = (focus[i] - half_axis) * 1.2; // the released code enlarges the offset too
+        high[i] = (focus[i] + half_axis) * 1.2;
+    }
+    for (size_t n = 0; n < count; n++) work[n] = poses[16 * n + 14];
+    gsf__traj_sort(work, count);
+    const double z_low = gsf__traj_percentile(work, count, 0.1), z_high = gsf__traj_percentile(work, count, 0.9);
+    gsf__traj_mean_column(poses, count, 1, down);
+    const double most = gsf__traj_max_abs(down) * (1.0 - 1e-9);
+    if (!(gsf__traj_length(down) > 1e-9))
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ellipse: the up vectors of the %zu views cancel", count);
+    const int axis = fabs(down[0]) >= most ? 0 : fabs(down[1]) >= most ? 1 : 2;
+    for (int i = 0; i < 3; i++) down[i] = i != axis ? 0.0 : down[i] < 0.0 ? -1.0 : 1.0;
+    const double pitch = d.pitch_degrees * (two_pi / 360.0), c = cos(pitch), s = sin(pitch);
+    for (int32_t f = 0; f < d.frames; f++) {
+        double* pose = out + 16 * (size_t)f;
+        const double theta = two_pi * f / d.frames;
+        const double position[3] = {
+            low[0] + (high[0] - low[0]) * (cos(theta) * 0.5 + 0.5),
+            low[1] + (high[1] - low[1]) * (sin(theta) * 0.5 + 0.5),
+            d.z_variation * (z_low + (z_high - z_low) * (cos(theta + two_pi * d.z_phase) * 0.5 + 0.5))};
+        const double forward[3] = {focus[0] - position[0], focus[1] - position[1], focus[2] - position[2]};
+        const double rounding = 1e-12 * (gsf__traj_max_abs(focus) + gsf__traj_max_abs(position));
+        if (!(gsf__traj_length(forward) > rounding) || !gsf__traj_axes(forward, down, position, pose)) {
+            memset(out, 0, 16 * (size_t)d.frames * sizeof(double));
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ellipse: view %d of %d looks along its up vector", (int)f,
+                            (int)d.frames);
+        }
+        for (int i = 0; i < 3; i++) { // times [1 0 0; 0 c -s; 0 s c]
+            const double y = pose[4 + i], z = pose[8 + i];
+            pose[4 + i] = c * y + s * z;
+            pose[8 + i] = c * z - s * y;
+        }
+    }
+    return gsf__traj_check_path(ctx, out, (size_t)d.frames);
+}
+
+// ---- >>windows -----------------------------------------------------------------
+
+GSF_API void gsf_traj_split_window(int32_t window_length, int32_t* side, int32_t* middle) {
+    *side = window_length < 2 ? 0 : window_length / 3 + (window_length % 3 == 2);
+    *middle = window_length - 2 * *side;
+}
+
+typedef struct gsf__traj_table { int64_t middle, windows, each, last; } gsf__traj_table; // each, last: poses shared
+
+// generate_overlapping_indices of outpaint/base.py; total >= middle >= 1.
+static gsf__traj_table gsf__traj_make_table(int64_t total, int64_t middle) {
+    gsf__traj_table table;
+    table.middle = middle;
+    table.windows = total / middle + 2;
+    int64_t shared = table.windows * middle - total;
+    if (shared < table.windows) shared += table.windows;
+    table.each = shared / (table.windows - 1);
+    table.last = shared - table.each * (table.windows - 2);
+    return table;
+}
+
+static int64_t gsf__traj_table_start(gsf__traj_table table, int64_t w) {
+    return w < table.windows - 1 ? w * (table.middle - table.each)
+                                 : (w - 1) * (table.middle - table.each) + table.middle - table.last;
+}
+
+GSF_API gsf_result gsf_traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
+                                             int32_t* overlaps, int32_t* count) {
+    *count = 0;
+    if (middle < 1 || total < middle)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "windows: no window of %d in %d poses", (int)middle,
+                        (int)total);
+    const gsf__traj_table table = gsf__traj_make_table(total, middle);
+    const int64_t last_start = gsf__traj_table_start(table, table.windows - 1);
+    if (table.each > middle || last_start < 0 || last_start + middle > total || table.windows > INT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "windows: the released table of %d in %d poses leaves them",
+                        (int)middle, (int)total);
+    for (int64_t w = 0; w < table.windows; w++) {
+        if (starts) starts[w] = (int32_t)gsf__traj_table_start(table, w);
+        if (overlaps) overlaps[w] = (int32_t)(w == 0 ? 0 : w == table.windows - 1 ? table.last : table.each);
+    }
+    *count = (int32_t)table.windows;
+    return GSF_OK;
+}
+
+// ---- >>legs --------------------------------------------------------------------
+
+// The released interpolation of two poses: forward and down linear, then made orthonormal. 0 where they cancel.
+static int gsf__traj_blend_axes(const double a[16], const double b[16], double t, double out[16]) {
+    double forward[3], down[3], position[3];
+    for (int i = 0; i < 3; i++) {
+        forward[i] = a[8 + i] + (b[8 + i] - a[8 + i]) * t;
+        down[i] = a[4 + i] + (b[4 + i] - a[4 + i]) * t;
+        position[i] = a[12 + i] + (b[12 + i] - a[12 + i]) * t;
+    }
+    return gsf__traj_length(forward) > 1e-9 && gsf__traj_axes(forward, down, position, out);
+}
+
+GSF_API gsf_result gsf_traj_leg_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames_per_leg,
+                                     int32_t official, double* out) {
+    GSF__TRY(gsf__traj_check_views(ctx, "leg path", poses, count));
+    if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "leg path: one view");
+    if (frames_per_leg < 2)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "leg path: %d frames per leg", (int)frames_per_leg);
+    const size_t steps = (size_t)frames_per_leg - 1;
+    for (size_t leg = 0; leg + 1 < count; leg++) {
+        const double *a = poses + 16 * leg, *b = a + 16;
+        if (official && memcmp(a, b, 16 * sizeof(double)) == 0)
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "leg path: poses %zu and %zu coincide", leg, leg + 1);
+        for (size_t i = 0; i < steps; i++) {
+            double* pose = out + 16 * (leg * steps + i);
+            if (!official) {
+                gsf__traj_blend_poses(a, b, (double)i / (double)steps, pose);
+            } else if (!gsf__traj_blend_axes(a, b, (double)i / (double)frames_per_leg, pose)) {
+                memset(out, 0, 16 * (steps * (count - 1) + 1) * sizeof(double));
+                return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "leg path: directions of poses %zu and %zu cancel", leg,
+                                leg + 1);
+            }
+        }
+    }
+    memcpy(out + 16 * steps * (count - 1), poses + 16 * (count - 1), 16 * sizeof(double));
+    return gsf__traj_check_path(ctx, out, steps * (count - 1) + 1);
+}
+
+// ---- >>schedule ----------------------------------------------------------------
+
+GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
+                                          int32_t official) {
+    if (iteration <= start || iteration >= until) return 0.0;
+    const double pi = 3.1415926535897932384626433832795;
+    const double progress = ((double)iteration - (double)start) / ((double)until - (double)start);
+    return lambda * sin(progress * (official ? pi : 0.5 * pi));
+}
+
+GSF_API void gsf_traj_repair_rounds(int64_t start, int64_t every, int64_t until, int64_t* rounds, size_t* count) {
+    *count = 0;
+    if (start > until) return;
+    const uint64_t span = (uint64_t)until - (uint64_t)start, step = every < 1 ? span + 1 : (uint64_t)every;
+    *count = (size_t)(step == 0 ? 0 : span / step) + 1;
+    for (size_t i = 0; rounds && i < *count; i++) rounds[i] = (int64_t)((uint64_t)start + i * step);
+}
+
+// ---- >>paths -------------------------------------------------------------------
+
+enum { GSF__TRAJ_ELLIPSE_DEFAULT = 85, GSF__TRAJ_WINDOW_DEFAULT = 49, GSF__TRAJ_WINDOWS_DEFAULT = 7 };
+
+static int64_t gsf__traj_or(int64_t value, int64_t if_zero) { return value ? value : if_zero; }
+
+// Resolves lengths and counts of the released reference path: n + (n + 1) + n frames, windows by its table.
+static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_path_desc* d, gsf_traj_path_layout* out) {
+    const int32_t length = (int32_t)gsf__traj_or(d->window_length, GSF__TRAJ_WINDOW_DEFAULT);
+    const int32_t poses = (int32_t)gsf__traj_or(d->ellipse_poses, GSF__TRAJ_ELLIPSE_DEFAULT);
+    if (length < 7 || length % 3 != 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "path: the released windows have 3n + 1 frames, at least 7, not %d", (int)length);
+    int32_t windows;
+    GSF__TRY(gsf_traj_official_windows(ctx, poses, length / 3 + 1, NULL, NULL, &windows));
+    if (d->window_count && d->window_count != windows)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: the released table has %d windows here, not %d",
+                        (int)windows, (int)d->window_count);
+    if ((int64_t)windows * length > INT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: %d windows of %d frames are too many", (int)windows,
+                        (int)length);
+    out->window_length = length;
+    out->window_count = windows;
+    out->ellipse_poses = poses;
+    return GSF_OK;
+}
+
+static gsf_result gsf__traj_resolve_path(gsf_context* ctx, size_t cameras, const gsf_traj_path_desc* d,
+                                         gsf_traj_path_layout* out) {
+    if (d->kind == GSF_TRAJ_REFERENCE && d->official) return gsf__traj_resolve_official(ctx, d, out);
+    const int64_t length = gsf__traj_or(d->window_length, GSF__TRAJ_WINDOW_DEFAULT);
+    const int64_t legs = cameras > 1 ? (int64_t)cameras - 1 : 1;
+    const int64_t windows =
+        gsf__traj_or(d->window_count, d->kind == GSF_TRAJ_INTERPOLATE ? legs : (int64_t)GSF__TRAJ_WINDOWS_DEFAULT);
+    int64_t poses = 0;
+    if (length < 2) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: windows of %d frames", (int)length);
+    if (windows * length > INT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: %lld windows of %lld frames are too many",
+                        (long long)windows, (long long)length);
+    if (d->kind == GSF_TRAJ_REFERENCE) {
+        int32_t side, middle;
+        gsf_traj_split_window((int32_t)length, &side, &middle);
+        const int64_t room = middle < 1 ? 1 : middle, share = (5 * room * windows + 3) / 7;
+        poses = gsf__traj_or(d->ellipse_poses, windows == 1 ? room : share > room ? share : room);
+    } else if (d->kind == GSF_TRAJ_ELLIPSE) {
+        poses = gsf__traj_or(d->ellipse_poses, windows * length);
+    }
+    if (poses > INT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: %lld poses on the ellipse", (long long)poses);
+    out->window_length = (int32_t)length;
+    out->window_count = (int32_t)windows;
+    out->ellipse_poses = (int32_t)poses;
+    return GSF_OK;
+}
+
+static gsf_traj_path_desc gsf__traj_path_desc_defaults(const gsf_traj_path_desc* desc) {
+    gsf_traj_path_desc out;
+    memset(&out, 0, sizeof out);
+    if (desc) out = *desc;
+    if (!out.points || !out.point_count) {
+        out.points = NULL;
+        out.point_count = 0;
+    }
+    return out;
+}
+
+GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, const gsf_traj_path_desc* desc,
+                                       gsf_traj_path_layout* layout) {
+    memset(layout, 0, sizeof *layout);
+    const gsf_traj_path_desc d = gsf__traj_path_desc_defaults(desc);
+    if (d.kind != GSF_TRAJ_REFERENCE && d.kind != GSF_TRAJ_ELLIPSE && d.kind != GSF_TRAJ_INTERPOLATE)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: kind is %d", (int)d.kind);
+    if (d.window_length < 0 || d.window_count < 0 || d.ellipse_poses < 0 || d.round < 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "path: a count is negative (length %d, windows %d, poses %d, round %d)", (int)d.window_length,
+                        (int)d.window_count, (int)d.ellipse_poses, (int)d.round);
+    if (camera_count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "path: no camera");
+    if (camera_count > INT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: %zu cameras", camera_count);
+    gsf_traj_path_layout out;
+    memset(&out, 0, sizeof out);
+    GSF__TRY(gsf__traj_resolve_path(ctx, camera_count, &d, &out));
+    out.frame_count = gsf__traj_size_mul((size_t)out.window_count, (size_t)out.window_length);
+    // [local poses of the cameras][poses of the ellipse][work of one step at a time]
+    size_t work = gsf__traj_size_max(gsf_traj_normalize_scratch(camera_count, d.point_count),
+                                     gsf_traj_ellipse_scratch(camera_count));
+    if (d.kind == GSF_TRAJ_INTERPOLATE) work = gsf_traj_slerp_path_scratch(camera_count);
+    const size_t poses = gsf__traj_size_add(camera_count, (size_t)out.ellipse_poses);
+    out.scratch_bytes = gsf__traj_size_add(gsf__traj_size_mul(poses, 16 * sizeof(double)), work);
+    if (out.scratch_bytes == SIZE_MAX || gsf__traj_size_mul(out.frame_count, sizeof(gsf_camera)) == SIZE_MAX)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: more than memory can hold");
+    *layout = out;
+    return GSF_OK;
+}
+
+typedef struct gsf__traj_job { // what the three kinds share
+    gsf_context* ctx;
+    gsf_traj_path_desc desc;
+    gsf_traj_path_layout layout;
+    const gsf_camera* cameras;
+    size_t count;
+    gsf_camera frame;    // size and intrinsics of the frames
+    double origin[3];    // world position of the local frame, in which all poses below are until they are normalised
+    double magnitude;    // of the world coordinates
+    double to_local[16]; // normalised to local
+    double* views;       // (count,16) poses of the cameras: local, then normalised
+    double* loop;        // (ellipse_poses,16)
+    double* work;
+    gsf_camera* out;
+    int32_t* reference_index;
+} gsf__traj_job;
+
+// Writes frame `at` from a pose in the frame of `to_local`.
+static gsf_result gsf__traj_put_pose(gsf__traj_job* job, size_t at, const double pose[16]) {
+    double world[16];
+    gsf_traj_transform_poses(job->to_local, pose, 1, world);
+    for (int i = 0; i < 3; i++) world[12 + i] += job->origin[i];
+    job->out[at] = job->frame;
+    gsf_camera_set_c2w(&job->out[at], world);
+    if (job->reference_index) job->reference_index[at] = -1;
+    if (!gsf__traj_finite(job->out[at].w2c, 16))
+        return gsf_fail(job->ctx, GSF_ERROR_NUMERIC, "path: coordinates are too large to compute with");
+    return GSF_OK;
+}
+
+// Writes frame `at` as the view of a camera.
+static void gsf__traj_put_reference(gsf__traj_job* job, size_t at, int32_t camera) {
+    const gsf_camera* own = &job->cameras[camera];
+    job->out[at] = job->desc.official ? job->frame : gsf_camera_resized(own, job->frame.width, job->frame.height);
+    memcpy(job->out[at].w2c, own->w2c, sizeof own->w2c);
+    if (job->reference_index) job->reference_index[at] = camera;
+}
+
+static gsf_result gsf__traj_check_job(gsf__traj_job* job) {
+    for (size_t n = 0; n < job->count; n++) {
+        const gsf_result result = gsf_check_camera(job->ctx, &job->cameras[n]);
+        if (result != GSF_OK) return gsf_fail(job->ctx, result, "path: camera %zu: %s", n, job->ctx->error);
+    }
+    job->frame = job->cameras[0];
+    if (job->desc.intrinsics) {
+        job->frame = *job->desc.intrinsics;
+        memcpy(job->frame.w2c, job->cameras[0].w2c, sizeof job->frame.w2c);
+        GSF__TRY(gsf_check_camera(job->ctx, &job->frame));
+    }
+    for (size_t n = 0; n < job->desc.point_count; n++)
+        if (!gsf__traj_finite(job->desc.points + 3 * n, 3))
+            return gsf_fail(job->ctx, GSF_ERROR_NUMERIC, "path: point %zu is not finite", n);
+    if (job->desc.transform) GSF__TRY(gsf__traj_check_similarity(job->ctx, job->desc.transform));
+    if (job->count < 2) return gsf_fail(job->ctx, GSF_ERROR_DEGENERATE, "path: one camera is not enough");
+    return GSF_OK;
+}
+
+// Camera poses with exact rotations, relative to their mean position: what follows then rounds as in a scene at the
+// origin. The released similarity depends on where the world's origin is, so there it stays.
+static void gsf__traj_localize(gsf__traj_job* job) {
+    for (size_t n = 0; n < job->count; n++) {
+        double quat[4], *view = job->views + 16 * n;
+        gsf_camera_c2w(&job->cameras[n], view);
+        gsf_traj_pose_quat(view, quat);
+        gsf__traj_quat_axes(quat, view);
+    }
+    job->magnitude = gsf__traj_magnitude(job->views + 12, job->count, 16);
+    memset(job->origin, 0, sizeof job->origin);
+    gsf__traj_identity(job->to_local);
+    if (job->desc.official) return;
+    gsf__traj_mean_column(job->views, job->count, 3, job->origin);
+    for (size_t n = 0; n < job->count; n++)
+        for (int i = 0; i < 3; i++) job->views[16 * n + 12 + (size_t)i] -= job->origin[i];
+}
+
+// Moves the views into the normalised frame and samples the loop there.
+static gsf_result gsf__traj_make_loop(gsf__traj_job* job) {
+    double transform[16];
+    if (job->desc.transform) { // T (local + origin)
+        memcpy(transform, job->desc.transform, sizeof transform);
+        gsf__traj_apply(transform, job->origin, transform + 12);
+    } else {
+        gsf_traj_similarity_desc similarity;
+        memset(&similarity, 0, sizeof similarity);
+        similarity.official = job->desc.official;
+        GSF__TRY(gsf__traj_normalize(job->ctx, job->views, job->count, job->desc.points, job->desc.point_count,
+                                     job->origin, job->magnitude, &similarity, job->work, transform));
+    }
+    GSF__TRY(gsf_traj_invert_similarity(job->ctx, transform, job->to_local));
+    gsf_traj_transform_poses(transform, job->views, job->count, job->views);
+    GSF__TRY(gsf__traj_check_path(job->ctx, job->views, job->count));
+    gsf_traj_ellipse_desc ellipse = gsf_traj_round_ellipse(job->desc.round, job->desc.seed, 0);
+    if (job->desc.ellipse) ellipse = *job->desc.ellipse;
+    ellipse.frames = job->layout.ellipse_poses;
+    return gsf_traj_ellipse_path(job->ctx, job->views, job->count, &ellipse, job->work, job->loop);
+}
+
+static const double* gsf__traj_loop_pose(const gsf__traj_job* job, int64_t index) {
+    return job->loop + 16 * (size_t)(index % job->layout.ellipse_poses);
+}
+
+// First pose on the loop of window w: by the released table, or evenly round the loop.
+static int64_t gsf__traj_window_start(const gsf__traj_job* job, int64_t w, int32_t middle) {
+    const int64_t poses = job->layout.ellipse_poses, windows = job->layout.window_count;
+    return job->desc.official ? gsf__traj_table_start(gsf__traj_make_table(poses, middle), w) : w * poses / windows;
+}
+
+// One window of the reference-guided path: `side` frames from a photo to the loop, `middle` on it, `side` to a photo.
+static gsf_result gsf__traj_reference_window(gsf__traj_job* job, int32_t w, int32_t side, int32_t middle) {
+    const int64_t start = gsf__traj_window_start(job, w, middle);
+    const int64_t end = middle > 0 ? start + middle - 1 : gsf__traj_window_start(job, w + 1, middle);
+    const double *enter = gsf__traj_loop_pose(job, start), *leave = gsf__traj_loop_pose(job, end);
+    const size_t base = (size_t)w * (size_t)job->layout.window_length;
+    const size_t last = base + (size_t)job->layout.window_length - 1;
+    int32_t from, to;
+    GSF__TRY(gsf_traj_nearest_view(job->ctx, enter, job->views, job->count, 0.5, &from, NULL));
+    GSF__TRY(gsf_traj_nearest_view(job->ctx, leave, job->views, job->count, 0.5, &to, NULL));
+    const double *first_view = job->views + 16 * (size_t)from, *last_view = job->views + 16 * (size_t)to;
+    for (int32_t i = 1; i < side; i++) {
+        double in[16], back[16];
+        if (!job->desc.official) {
+            gsf__traj_blend_poses(first_view, enter, (double)i / side, in);
+            gsf__traj_blend_poses(leave, last_view, (double)i / side, back);
+        } else { // u = 0, 1/side .. (side - 2)/side, 1 on both legs
+            const double u = i == side - 1 ? 1.0 : (double)i / side, v = (double)(i - 1) / side;
+            if (!gsf__traj_blend_axes(first_view, enter, u, in) || !gsf__traj_blend_axes(leave, last_view, v, back))
+                return gsf_fail(job->ctx, GSF_ERROR_DEGENERATE, "path: window %d: directions cancel", (int)w);
+        }
+        GSF__TRY(gsf__traj_put_pose(job, base + (size_t)i, in));
+        GSF__TRY(gsf__traj_put_pose(job, last - (size_t)side + (size_t)i, back));
+    }
+    for (int32_t i = 0; i < middle; i++)
+        GSF__TRY(gsf__traj_put_pose(job, base + (size_t)side + (size_t)i, gsf__traj_loop_pose(job, start + i)));
+    gsf__traj_put_reference(job, base, from);
+    gsf__traj_put_reference(job, last, to);
+    return GSF_OK;
+}
+
+static gsf_result gsf__traj_sample_reference(gsf__traj_job* job) {
+    int32_t side, middle;
+    gsf_traj_split_window(job->layout.window_length, &side, &middle);
+    GSF__TRY(gsf__traj_make_loop(job));
+    for (int32_t w = 0; w < job->layout.window_count; w++) GSF__TRY(gsf__traj_reference_window(job, w, side, middle));
+    return GSF_OK;
+}
+
+static gsf_result gsf__traj_sample_ellipse(gsf__traj_job* job) {
+    GSF__TRY(gsf__traj_make_loop(job));
+    for (size_t f = 0; f < job->layout.frame_count; f++)
+        GSF__TRY(gsf__traj_put_pose(job, f, job->loop + 16 * (f % (size_t)job->layout.ellipse_poses)));
+    return GSF_OK;
+}
+
+// Each window is an equal share of the way through all cameras; neighbours share their end frames.
+static gsf_result gsf__traj_sample_interpolate(gsf__traj_job* job) {
+    gsf__traj_curve curve;
+    if (!gsf__traj_make_glide(&curve, job->views, job->count, job->work))
+        return gsf_fail(job->ctx, GSF_ERROR_DEGENERATE, "path: no spline through %zu cameras", job->count);
+    const int64_t steps = job->layout.window_length - 1, legs = (int64_t)job->count - 1;
+    const int64_t all = steps * job->layout.window_count;
+    for (size_t f = 0; f < job->layout.frame_count; f++) {
+        const int64_t window = (int64_t)f / job->layout.window_length;
+        const int64_t step = window * steps + (int64_t)f % job->layout.window_length;
+        const int64_t leg = legs * (step / all) + legs * (step % all) / all, part = legs * (step % all) % all;
+        if (part == 0) {
+            gsf__traj_put_reference(job, f, (int32_t)leg);
+            continue;
+        }
+        double pose[16];
+        gsf__traj_eval_glide(&curve, job->views, job->count, (double)leg + (double)part / (double)all, pose);
+        GSF__TRY(gsf__traj_put_pose(job, f, pose));
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_traj_sample_path(gsf_context* ctx, const gsf_camera* cameras, size_t camera_count,
+                                        const gsf_traj_path_desc* desc, void* scratch, gsf_camera* out,
+                                        int32_t* reference_index) {
+    gsf__traj_job job;
+    memset(&job, 0, sizeof job);
+    job.ctx = ctx;
+    job.desc = gsf__traj_path_desc_defaults(desc);
+    GSF__TRY(gsf_traj_query_path(ctx, camera_count, &job.desc, &job.layout));
+    job.cameras = cameras;
+    job.count = camera_count;
+    job.out = out;
+    job.reference_index = reference_index;
+    job.views = (double*)scratch;
+    job.loop = job.views + 16 * camera_count;
+    job.work = job.loop + 16 * (size_t)job.layout.ellipse_poses;
+    gsf_result result = gsf__traj_check_job(&job);
+    if (result == GSF_OK) {
+        gsf__traj_localize(&job);
+        result = job.desc.kind == GSF_TRAJ_REFERENCE ? gsf__traj_sample_reference(&job)
+                 : job.desc.kind == GSF_TRAJ_ELLIPSE ? gsf__traj_sample_ellipse(&job)
+                                                     : gsf__traj_sample_interpolate(&job);
+    }
+    if (result != GSF_OK) {
+        memset(out, 0, job.layout.frame_count * sizeof *out);
+        if (reference_index) memset(reference_index, 0, job.layout.frame_count * sizeof *reference_index);
+    }
+    return result;
+}
 
 GSF__END_IMPLEMENTATION
 
