@@ -5837,40 +5837,56 @@ static uint32_t gsf__adam_update_ref(float* value, float* m, float* v, float* gr
 }
 
 #if GSF__X86
+// One vector of eight; lanes: NULL = all, else only those set are read and written. Returns how many were neutralised.
+GSF__TARGET_AVX2 static inline uint32_t gsf__adam_vector_avx2(float* value, float* m, float* v, float* grad, __m256 rate,
+                                                              __m256 correction, const __m256i* lanes) {
+    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff)), zero = _mm256_setzero_ps();
+    __m256 g = lanes ? _mm256_maskload_ps(grad, *lanes) : _mm256_loadu_ps(grad);
+    const __m256 old = lanes ? _mm256_maskload_ps(value, *lanes) : _mm256_loadu_ps(value);
+    __m256 mi = lanes ? _mm256_maskload_ps(m, *lanes) : _mm256_loadu_ps(m);
+    __m256 vi = lanes ? _mm256_maskload_ps(v, *lanes) : _mm256_loadu_ps(v);
+    const __m256 good = _mm256_cmp_ps(_mm256_and_ps(g, magnitude), _mm256_set1_ps(GSF__ADAM_LARGEST), _CMP_LE_OQ);
+    g = _mm256_and_ps(g, good);
+    mi = _mm256_fmadd_ps(_mm256_sub_ps(g, mi), _mm256_set1_ps(0.1f), mi);
+    vi = _mm256_fmadd_ps(_mm256_mul_ps(g, _mm256_set1_ps(0.001f)), g, _mm256_mul_ps(vi, _mm256_set1_ps(0.999f)));
+    const __m256 tiny_m = _mm256_set1_ps(GSF__ADAM_TINY_M), tiny_v = _mm256_set1_ps(GSF__ADAM_TINY_V);
+    mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), tiny_m, _CMP_GE_OQ));
+    vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, tiny_v, _CMP_GE_OQ));
+    const __m256 root = _mm256_fmadd_ps(_mm256_sqrt_ps(vi), correction, _mm256_set1_ps(GSF__ADAM_EPS));
+    const __m256 next = _mm256_fnmadd_ps(rate, _mm256_div_ps(mi, root), old);
+    const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
+    const __m256 chosen = _mm256_blendv_ps(old, next, kept);
+    if (lanes) {
+        _mm256_maskstore_ps(value, *lanes, chosen);
+        _mm256_maskstore_ps(m, *lanes, mi);
+        _mm256_maskstore_ps(v, *lanes, vi);
+        _mm256_maskstore_ps(grad, *lanes, zero);
+    } else {
+        _mm256_storeu_ps(value, chosen);
+        _mm256_storeu_ps(m, mi);
+        _mm256_storeu_ps(v, vi);
+        _mm256_storeu_ps(grad, zero);
+    }
+    const int bad = ~_mm256_movemask_ps(good) & 255, bad_next = ~_mm256_movemask_ps(kept) & 255;
+    if (!(bad | bad_next)) return 0;
+    return (uint32_t)(__builtin_popcount((unsigned)bad) + __builtin_popcount((unsigned)bad_next));
+}
+
 GSF__TARGET_AVX2 static uint32_t gsf__adam_update_avx2(float* value, float* m, float* v, float* grad, size_t rows,
                                                        size_t stride, size_t n, const float* rates, size_t period,
                                                        float inv_correction2) {
-    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff)), zero = _mm256_setzero_ps();
-    const __m256 largest = _mm256_set1_ps(GSF__ADAM_LARGEST), finite = _mm256_set1_ps(FLT_MAX);
-    const __m256 tiny_m = _mm256_set1_ps(GSF__ADAM_TINY_M), tiny_v = _mm256_set1_ps(GSF__ADAM_TINY_V);
-    const __m256 rest1 = _mm256_set1_ps(0.1f), beta2 = _mm256_set1_ps(0.999f);
-    const __m256 rest2 = _mm256_set1_ps(0.001f), eps = _mm256_set1_ps(GSF__ADAM_EPS);
     const __m256 correction = _mm256_set1_ps(inv_correction2);
     uint32_t rejected = 0;
     for (size_t row = 0; row < rows; row++) {
-        const size_t begin = row * stride, end = begin + n;
-        for (size_t i = begin, r = 0; i < end; i += 8, r = r + 8 == period ? 0 : r + 8) {
-            const __m256i lanes = gsf__avx2_lanes(end - i);
-            __m256 g = _mm256_maskload_ps(grad + i, lanes);
-            const __m256 old = _mm256_maskload_ps(value + i, lanes);
-            __m256 mi = _mm256_maskload_ps(m + i, lanes), vi = _mm256_maskload_ps(v + i, lanes);
-            const __m256 good = _mm256_cmp_ps(_mm256_and_ps(g, magnitude), largest, _CMP_LE_OQ);
-            g = _mm256_and_ps(g, good);
-            mi = _mm256_fmadd_ps(_mm256_sub_ps(g, mi), rest1, mi);
-            vi = _mm256_fmadd_ps(_mm256_mul_ps(g, rest2), g, _mm256_mul_ps(vi, beta2));
-            mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), tiny_m, _CMP_GE_OQ));
-            vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, tiny_v, _CMP_GE_OQ));
-            const __m256 root = _mm256_fmadd_ps(_mm256_sqrt_ps(vi), correction, eps);
-            const __m256 next = _mm256_fnmadd_ps(_mm256_loadu_ps(rates + r), _mm256_div_ps(mi, root), old);
-            const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), finite, _CMP_LE_OQ);
-            const int bad = ~_mm256_movemask_ps(good) & 255, bad_next = ~_mm256_movemask_ps(kept) & 255;
-            if (bad | bad_next)
-                rejected += (uint32_t)(__builtin_popcount((unsigned)bad) + __builtin_popcount((unsigned)bad_next));
-            _mm256_maskstore_ps(value + i, lanes, _mm256_blendv_ps(old, next, kept));
-            _mm256_maskstore_ps(m + i, lanes, mi);
-            _mm256_maskstore_ps(v + i, lanes, vi);
-            _mm256_maskstore_ps(grad + i, lanes, zero);
-        }
+        size_t i = row * stride, r = 0;
+        const size_t end = i + n;
+        for (; i + 8 <= end; i += 8, r = r + 8 == period ? 0 : r + 8)
+            rejected += gsf__adam_vector_avx2(value + i, m + i, v + i, grad + i, _mm256_loadu_ps(rates + r), correction,
+                                              NULL);
+        if (i == end) continue;
+        const __m256i lanes = gsf__avx2_lanes(end - i);
+        rejected += gsf__adam_vector_avx2(value + i, m + i, v + i, grad + i, _mm256_loadu_ps(rates + r), correction,
+                                          &lanes);
     }
     return rejected;
 }
