@@ -53,8 +53,8 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 
 // The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Splats with a non-finite
 // value are dropped and counted in a warning. Origin: zero, or the rounded centre where coordinates are large (centre
-// beyond 1e5, or beyond 1000 times the extent; both from medians of samples, so stray splats do not matter). Ids are the
-// rows. Memory in proportion to the file; a header that promises more rows than the file can hold is an error.
+// beyond 1e5, or beyond 1000 times the extent; both from medians of samples, so stray splats do not matter). Ids are
+// the rows. Memory in proportion to the file; a header that promises more rows than the file can hold is an error.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_ply(gsf_context* ctx, const char* path, gsf_splats* out);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size,
                                                      gsf_splats* out);
@@ -67,24 +67,24 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_format_ply(gsf_context* ctx, const gs
 // ---- scenes --------------------------------------------------------------------
 
 typedef struct gsf_scene_view {
-    char* name;           // image file name relative to the image folder
-    uint32_t image_id;    // COLMAP's
-    gsf_camera camera;    // pinhole, already at the size of `image` (undistorted, scaled)
-    gsf_image image;      // u8 RGB; data is NULL until gsf_splat_load_view_image
+    char* name;         // image file name relative to the image folder
+    uint32_t image_id;  // COLMAP's
+    gsf_camera camera;  // pinhole, already at the size of `image` (undistorted, scaled)
+    gsf_image image;    // u8 RGB; data is NULL until gsf_splat_load_view_image
 } gsf_scene_view;
 
 typedef struct gsf_scene {
     size_t view_count;
-    gsf_scene_view* views;     // sorted by name (bytes)
+    gsf_scene_view* views;  // sorted by name (bytes)
     size_t point_count;
-    double* points;            // (point_count,3) world
-    uint8_t* colors;           // (point_count,3)
-    uint64_t* point_ids;       // (point_count) COLMAP's
-    size_t* track_begin;       // (point_count+1) into track_views; all zero when the scene has no tracks
-    uint32_t* track_views;     // indices into views, ascending within a point, without repeats
-    double origin[3];          // for splats made from this scene: mean camera centre
-    char* folder;              // as given to the loader
-    void* state;               // private: source cameras and sizes for gsf_splat_load_view_image
+    double* points;         // (point_count,3) world
+    uint8_t* colors;        // (point_count,3)
+    uint64_t* point_ids;    // (point_count) COLMAP's
+    size_t* track_begin;    // (point_count+1) into track_views; all zero when the scene has no tracks
+    uint32_t* track_views;  // indices into views, ascending within a point, without repeats
+    double origin[3];       // for splats made from this scene: mean camera centre
+    char* folder;           // as given to the loader
+    void* state;            // private: source cameras and sizes for gsf_splat_load_view_image
 } gsf_scene;
 
 typedef struct gsf_scene_desc {
@@ -92,8 +92,8 @@ typedef struct gsf_scene_desc {
     int32_t max_size;  // shrink so that the longer side is at most this many pixels; 0 = no limit; not with factor
 } gsf_scene_desc;
 
-// Reads a COLMAP folder (images/ or images_<factor>/, sparse/0/ or sparse/ with {cameras,images,points3D}.{bin,txt}) or a
-// nerfstudio / instant-ngp transforms.json (its folder or the file itself; points from its ply_file_path, else none).
+// Reads a COLMAP folder (images/ or images_<factor>/, sparse/0/ or sparse/ with {cameras,images,points3D}.{bin,txt}) or
+// a nerfstudio / instant-ngp transforms.json (its folder or the file itself; points from its ply_file_path, else none).
 // Images are not read; their headers are, since a COLMAP camera is rescaled to the actual image size as the official
 // parser does. Views whose photo is missing are left out with a warning; photos are never enlarged. All COLMAP camera
 // models up to THIN_PRISM_FISHEYE are read. Distorted ones become pinhole cameras: perspective models by OpenCV's
@@ -103,31 +103,38 @@ typedef struct gsf_scene_desc {
 // absolute) are refused. Memory and time in proportion to the files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
                                                       gsf_scene* out);
-// In-memory twin: contents of the three COLMAP files, binary or (is_text) text. `points` may be NULL. All images are kept,
-// since there is no folder to look for them; sizes are the cameras', after undistortion. View images stay empty until
-// gsf_splat_set_view_image.
-typedef struct gsf_bytes { const void* data; size_t size; const char* name; } gsf_bytes; // name: for error texts
+typedef struct gsf_bytes {
+    const void* data;
+    size_t size;
+    const char* name; // for error texts; NULL = the file's usual name
+} gsf_bytes;
+
+// In-memory twin: contents of the three COLMAP files, binary or (is_text) text. `points` may be NULL. All images are
+// kept, since there is no folder to look for them; sizes are the cameras', after undistortion. View images stay empty
+// until gsf_splat_set_view_image.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras,
-                                                        const gsf_bytes* images, const gsf_bytes* points, gsf_scene* out);
+                                                        const gsf_bytes* images, const gsf_bytes* points,
+                                                        gsf_scene* out);
 // In-memory twin for transforms.json; w and h must stand in it. No points.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out);
-// Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already there). Pixel rows of
-// the undistortion run in parallel. Only for scenes that were loaded from files.
+// Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already there). Pixel rows
+// of the undistortion run in parallel. Only for scenes that were loaded from files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view);
-// The same for a photo that the host has decoded: any dtype and layout, 1, 3 or 4 channels, distorted as the camera took
-// it, of any size (it is resized to the camera's). The photo is borrowed for the call; an image already there is replaced.
+// The same for a photo that the host has decoded: any dtype and layout, 1, 3 or 4 channels, distorted as the camera
+// took it, of any size (it is resized to the camera's). The photo is borrowed for the call; an image already there is
+// replaced.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view,
                                                           const gsf_image* photo);
-// Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are the views' PINHOLE ones;
-// tracks are kept, and since a scene does not hold the measured 2D points, the projections stand in for them.
+// Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are the views' PINHOLE
+// ones; tracks are kept, and since a scene does not hold the measured 2D points, the projections stand in for them.
 // keep: NULL or one byte per point, zero = left out.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep,
                                                        const char* folder);
 GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene);
 
 // The papers' split of n name-sorted views: every test_every-th (from 0 on) is a test view (0: none is), train =
-// round(linspace(0, m-1, K)) over the other m (half to even; with K > m views repeat, as in the official code). K = 0: all
-// the rest. Counts are returned. train holds up to max(n, K) entries, test up to n; pointers may be NULL.
+// round(linspace(0, m-1, K)) over the other m (half to even; with K > m views repeat, as in the official code). K = 0:
+// all the rest. Counts are returned. train holds up to max(n, K) entries, test up to n; pointers may be NULL.
 GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_target, uint32_t* train,
                                    size_t* train_count, uint32_t* test, size_t* test_count);
 
@@ -487,8 +494,9 @@ static size_t gsf__ply_type_size(gsf__ply_type type) {
 
 // Slot of a column name, GSF__PLY_SLOTS when nobody wants it, -1 for an f_rest beyond degree 3.
 static int gsf__ply_slot(const char* word, size_t length) {
-    static const char* const names[GSF__PLY_REST] = {"x",       "y",       "z",       "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
-                                                     "scale_0", "scale_1", "scale_2", "rot_0",  "rot_1",  "rot_2",  "rot_3"};
+    static const char* const names[GSF__PLY_REST] = {"x",      "y",       "z",       "f_dc_0",  "f_dc_1",
+                                                     "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+                                                     "rot_0",  "rot_1",   "rot_2",   "rot_3"};
     static const char* const colors[3] = {"red", "green", "blue"};
     for (int i = 0; i < GSF__PLY_REST; i++)
         if (gsf__word_is(word, length, names[i])) return i;
@@ -521,8 +529,8 @@ static gsf_result gsf__ply_property(gsf_context* ctx, gsf__ply* ply, gsf__ply_el
     const gsf__ply_type type = gsf__ply_type_of(type_word, type_size);
     const size_t name_size = gsf__next_word(&at, end, &name_word);
     if (type == GSF__PLY_ABSENT || name_size == 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected \"property TYPE NAME\", got type \"%.*s\"", ply->name, line,
-                        (int)(type_size < 40 ? type_size : 40), type_word);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected \"property TYPE NAME\", got type \"%.*s\"", ply->name,
+                        line, (int)(type_size < 40 ? type_size : 40), type_word);
     if (element->is_vertex) {
         const int slot = gsf__ply_slot(name_word, name_size);
         if (slot < 0)
@@ -572,8 +580,8 @@ static gsf_result gsf__ply_read_format(gsf_context* ctx, gsf__ply* ply, size_t l
             ply->format = (gsf__ply_format)i;
             return GSF_OK;
         }
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected format ascii, binary_little_endian or binary_big_endian 1.0",
-                    ply->name, line);
+    return gsf_fail(ctx, GSF_ERROR_FORMAT,
+                    "%s:%zu: expected format ascii, binary_little_endian or binary_big_endian 1.0", ply->name, line);
 }
 
 // Moves ply->body behind `words` words.
@@ -606,7 +614,8 @@ static gsf_result gsf__ply_place_body(gsf_context* ctx, gsf__ply* ply, uint64_t 
     return GSF_OK;
 }
 
-static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const void* data, size_t size, gsf__ply* ply) {
+static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                       gsf__ply* ply) {
     memset(ply, 0, sizeof *ply);
     ply->name = name;
     ply->data = (const unsigned char*)(data ? data : "");
@@ -640,8 +649,8 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
             element.is_vertex = gsf__word_is(word, n, "vertex");
             n = gsf__next_word(&at, stop, &word);
             if (!gsf__word_u64(word, n, &element.rows))
-                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element count \"%.*s\" is not a 64-bit count", name, line,
-                                (int)(n < 40 ? n : 40), word);
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element count \"%.*s\" is not a 64-bit count", name,
+                                line, (int)(n < 40 ? n : 40), word);
             if (element.is_vertex && has_vertex)
                 return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element vertex stands twice", name, line);
             if (element.is_vertex) vertices = element.rows, has_vertex = 1;
@@ -700,9 +709,9 @@ static int gsf__compare_doubles(const void* a, const void* b) {
 
 enum { GSF__ORIGIN_SAMPLES = 1024 };
 
-// The origin that positions deserve: zero, or their rounded centre where float32 would cost precision (centre beyond 1e5,
-// or beyond 1000 times the extent). Centre and extent are the median and the 5..95 % range of at most 1024 evenly spread
-// positions, so stray splats do not move it. axis: n samples of x, then of y, then of z; sorted in place.
+// The origin that positions deserve: zero, or their rounded centre where float32 would cost precision (centre beyond
+// 1e5, or beyond 1000 times the extent). Centre and extent are the median and the 5..95 % range of at most 1024 evenly
+// spread positions, so stray splats do not move it. axis: n samples of x, then of y, then of z; sorted in place.
 static void gsf__choose_origin(double* axis, size_t n, double origin[3]) {
     double centre[3], extent = 0.0, distance = 0.0;
     memset(origin, 0, 3 * sizeof(double));
@@ -752,6 +761,7 @@ typedef struct gsf__ply_target { // where a column's values go
     int slot;
     float* first;
     size_t stride; // floats
+    size_t offset; // of the column in a row, as in gsf__ply
 } gsf__ply_target;
 
 typedef struct gsf__ply_job {
@@ -759,7 +769,8 @@ typedef struct gsf__ply_job {
     gsf__ply_target targets[GSF__PLY_RED]; // all but x y z
     size_t target_count;
     gsf_splats* splats;
-    uint8_t* bad; // (count) rows with a value that is NaN or infinite
+    uint8_t* bad;     // (count) rows with a value that is NaN or infinite
+    int all_f32;      // every target column is little-endian float32, as in nearly all files
 } gsf__ply_job;
 
 static int gsf__float_is_bad(float f) {
@@ -792,6 +803,39 @@ static void gsf__ply_list_targets(gsf__ply_job* job) {
             t->first = s->sh + 3 * k + channel;
             t->stride = 3 * bands;
         }
+    job->all_f32 = job->ply->format == GSF__PLY_LITTLE;
+    for (size_t i = 0; i < job->target_count; i++) {
+        gsf__ply_target* t = &job->targets[i];
+        t->offset = job->ply->offset[t->slot];
+        job->all_f32 = job->all_f32 && job->ply->type[t->slot] == GSF__PLY_F32;
+    }
+}
+
+// One row of little-endian float32 columns; the or of all bits that would make a value NaN or infinite is looked at once.
+static int gsf__ply_decode_f32(const gsf__ply_job* job, const unsigned char* row, size_t i) {
+    uint32_t bad = 0;
+    for (size_t t = 0; t < job->target_count; t++) {
+        const gsf__ply_target* target = &job->targets[t];
+        const unsigned char* at = row + target->offset;
+        const uint32_t bits =
+            (uint32_t)at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
+        bad |= (bits & 0x7f800000u) + 0x00800000u; // carries into the top bit
+        memcpy(target->first + i * target->stride, &bits, sizeof bits);
+    }
+    return (int)(bad >> 31);
+}
+
+static int gsf__ply_decode_any(const gsf__ply_job* job, const unsigned char* row, size_t i) {
+    const gsf__ply* ply = job->ply;
+    int bad = 0;
+    for (size_t t = 0; t < job->target_count; t++) {
+        const gsf__ply_target* target = &job->targets[t];
+        const float f =
+            (float)gsf__ply_value(row + target->offset, ply->type[target->slot], ply->format == GSF__PLY_BIG);
+        bad |= gsf__float_is_bad(f);
+        target->first[i * target->stride] = f;
+    }
+    return bad;
 }
 
 enum { GSF__PLY_CHUNK = 4096 }; // rows
@@ -800,33 +844,18 @@ static void gsf__ply_decode_chunk(void* arg, size_t chunk, int worker) {
     const gsf__ply_job* job = (const gsf__ply_job*)arg;
     const gsf__ply* ply = job->ply;
     const gsf_splats* s = job->splats;
-    const int big = ply->format == GSF__PLY_BIG;
     const size_t begin = chunk * GSF__PLY_CHUNK;
     const size_t end = begin + GSF__PLY_CHUNK < ply->count ? begin + GSF__PLY_CHUNK : ply->count;
     (void)worker;
     for (size_t i = begin; i < end; i++) {
         const unsigned char* row = ply->data + ply->body + i * ply->row_bytes;
         double p[3];
-        int bad = 0;
+        int bad = job->all_f32 ? gsf__ply_decode_f32(job, row, i) : gsf__ply_decode_any(job, row, i);
         gsf__ply_position(ply, i, p);
         for (size_t k = 0; k < 3; k++) {
             const float f = (float)(p[k] - s->origin[k]);
             bad |= gsf__float_is_bad(f);
             s->means[3 * i + k] = f;
-        }
-        for (size_t t = 0; t < job->target_count; t++) {
-            const gsf__ply_target* target = &job->targets[t];
-            const unsigned char* at = row + ply->offset[target->slot];
-            const gsf__ply_type type = ply->type[target->slot];
-            float f;
-            if (type == GSF__PLY_F32 && !big) { // what nearly all files hold
-                const uint32_t bits = (uint32_t)at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
-                memcpy(&f, &bits, sizeof f);
-            } else {
-                f = (float)gsf__ply_value(at, type, big);
-            }
-            bad |= gsf__float_is_bad(f);
-            target->first[i * target->stride] = f;
         }
         job->bad[i] = (uint8_t)bad;
     }
@@ -858,13 +887,14 @@ static gsf_result gsf__ply_decode_ascii(gsf_context* ctx, gsf__ply_job* job) {
         int bad = 0;
         for (size_t k = 0; k < 3; k++) positions[3 * i + k] = values[ply->offset[k]];
         for (size_t t = 0; t < job->target_count; t++) {
-            const float f = (float)values[ply->offset[job->targets[t].slot]];
+            const float f = (float)values[job->targets[t].offset];
             bad |= gsf__float_is_bad(f);
             job->targets[t].first[i * job->targets[t].stride] = f;
         }
         job->bad[i] = (uint8_t)bad;
     }
-    if (result == GSF_OK) result = gsf__sample_origin(ctx, ply->count, gsf__array_sample_position, positions, s->origin);
+    if (result == GSF_OK)
+        result = gsf__sample_origin(ctx, ply->count, gsf__array_sample_position, positions, s->origin);
     for (size_t i = 0; i < ply->count && result == GSF_OK; i++)
         for (size_t k = 0; k < 3; k++) {
             const float f = (float)(positions[3 * i + k] - s->origin[k]);
@@ -892,8 +922,8 @@ static void gsf__ply_drop_rows(gsf_context* ctx, const gsf__ply* ply, const uint
         kept++;
     }
     if (kept != s->count)
-        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats dropped: a value is NaN, infinite or beyond float32", ply->name,
-                s->count - kept, s->count);
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats dropped: a value is NaN, infinite or beyond float32",
+                ply->name, s->count - kept, s->count);
     s->count = kept;
 }
 
@@ -915,7 +945,8 @@ static gsf_result gsf__ply_check_columns(gsf_context* ctx, const gsf__ply* ply, 
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
+GSF_API gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                       gsf_splats* out) {
     gsf__ply ply;
     int32_t degree = 0;
     memset(out, 0, sizeof *out);
@@ -1131,8 +1162,8 @@ static const gsf__lens_model gsf__lens_models[11] = {
 };
 
 // Checks a camera and adds it. name, at: where it stands, for error texts. params: as many as the model has.
-static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id, int model,
-                                        uint64_t width, uint64_t height, const double* params) {
+static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
+                                      int model, uint64_t width, uint64_t height, const double* params) {
     const gsf__lens_model* info = &gsf__lens_models[model];
     gsf__sfm_camera camera;
     memset(&camera, 0, sizeof camera);
@@ -1140,7 +1171,8 @@ static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char*
     camera.id = id;
     for (int i = 0; i < info->param_count; i++)
         if (!isfinite(params[i]))
-            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s:%zu: camera %u: parameter %d is not finite", name, at, (unsigned)id, i);
+            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s:%zu: camera %u: parameter %d is not finite", name, at,
+                            (unsigned)id, i);
     if (width < 1 || height < 1 || width > GSF__LENS_SIZE_MAX || height > GSF__LENS_SIZE_MAX)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: image size %llu x %llu", name, at, (unsigned)id,
                         (unsigned long long)width, (unsigned long long)height);
@@ -1158,11 +1190,11 @@ static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char*
     }
     if (zero && lens->kind != GSF__LENS_FISHEYE) lens->kind = GSF__LENS_PINHOLE;
     if (!(lens->fx > 0.0 && lens->fy > 0.0))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: focal length %g, %g", name, at, (unsigned)id, lens->fx,
-                        lens->fy);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: focal length %g, %g", name, at, (unsigned)id,
+                        lens->fx, lens->fy);
     if (lens->kind == GSF__LENS_FOV && !(fabs(lens->k[0]) < 3.1))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: FOV omega %g is not below pi", name, at, (unsigned)id,
-                        lens->k[0]);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: FOV omega %g is not below pi", name, at,
+                        (unsigned)id, lens->k[0]);
     GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
                           sizeof *m->cameras));
     m->cameras[m->camera_count++] = camera;
@@ -1209,7 +1241,7 @@ static int gsf__pose_from_quaternion(const double q_in[4], const double t[3], do
 }
 
 static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
-                                       const double pose[7], uint32_t camera_id, const char* image, size_t image_size) {
+                                     const double pose[7], uint32_t camera_id, const char* image, size_t image_size) {
     gsf__sfm_image* out;
     const gsf__sfm_camera* camera;
     gsf__sfm_camera wanted;
@@ -1221,11 +1253,13 @@ static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* 
                         (unsigned)camera_id);
     if (image_size == 0 || memchr(image, 0, image_size))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image %u: empty or malformed name", name, at, (unsigned)id);
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
+    GSF__TRY(
+        gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
     out = &m->images[m->image_count];
     if (!gsf__pose_from_quaternion(pose, pose + 4, out->w2c))
-        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s:%zu: image %u: pose %g %g %g %g, %g %g %g is no rotation and translation",
-                        name, at, (unsigned)id, pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]);
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC,
+                        "%s:%zu: image %u: pose %g %g %g %g, %g %g %g is no rotation and translation", name, at,
+                        (unsigned)id, pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]);
     out->id = id;
     out->camera_id = camera_id;
     out->camera = (size_t)(camera - m->cameras);
@@ -1238,7 +1272,7 @@ static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* 
 
 // Adds a point without track; a position that is not finite is counted instead (*added = 0).
 static gsf_result gsf__sfm_add_point(gsf_context* ctx, gsf__sfm* m, uint64_t id, const double xyz[3],
-                                       const uint8_t rgb[3], int* added) {
+                                     const uint8_t rgb[3], int* added) {
     const size_t n = m->point_count;
     *added = isfinite(xyz[0]) && isfinite(xyz[1]) && isfinite(xyz[2]);
     if (!*added) {
@@ -1258,8 +1292,9 @@ static gsf_result gsf__sfm_add_point(gsf_context* ctx, gsf__sfm* m, uint64_t id,
     return GSF_OK;
 }
 
-static gsf_result gsf__sfm_add_track(gsf_context* ctx, gsf__sfm* m, uint32_t image_id) { // to the last point
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, m->track_count, m->track_count + 1, sizeof(uint32_t)));
+static gsf_result gsf__sfm_add_track(gsf_context* ctx, gsf__sfm* m, uint32_t image_id) {  // to the last point
+    GSF__TRY(
+        gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, m->track_count, m->track_count + 1, sizeof(uint32_t)));
     m->tracks[m->track_count++] = image_id;
     m->track_begin[m->point_count] = m->track_count;
     return GSF_OK;
@@ -1325,12 +1360,13 @@ static gsf_result gsf__colmap_cameras_bin(gsf_context* ctx, gsf__cursor* c, gsf_
         if (model >= GSF__COUNT(gsf__lens_models))
             return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %u: unknown camera model %d", c->name, at + 4,
                             (unsigned)id, (int)model);
-        const unsigned char* values = gsf__take(ctx, c, 8u * gsf__lens_models[model].param_count, "a camera's parameters");
+        const unsigned char* values =
+            gsf__take(ctx, c, 8u * gsf__lens_models[model].param_count, "a camera's parameters");
         if (!values) return GSF_ERROR_FORMAT;
         double params[GSF__LENS_PARAMS_MAX];
         for (int k = 0; k < gsf__lens_models[model].param_count; k++) params[k] = gsf__load_f64(values + 8 * k);
-        GSF__TRY(gsf__sfm_add_camera(ctx, m, c->name, at, id, (int)model, gsf__load_le(p + 8, 8), gsf__load_le(p + 16, 8),
-                                       params));
+        GSF__TRY(gsf__sfm_add_camera(ctx, m, c->name, at, id, (int)model, gsf__load_le(p + 8, 8),
+                                     gsf__load_le(p + 16, 8), params));
     }
     return gsf__cursor_end(ctx, c);
 }
@@ -1351,7 +1387,7 @@ static gsf_result gsf__colmap_images_bin(gsf_context* ctx, gsf__cursor* c, gsf__
         GSF__TRY(gsf__take_count(ctx, c, 24, "2D points", &observations));
         c->at += 24 * observations;
         GSF__TRY(gsf__sfm_add_image(ctx, m, c->name, at, (uint32_t)gsf__load_le(p, 4), pose,
-                                      (uint32_t)gsf__load_le(p + 60, 4), image, (size_t)(stop - image)));
+                                    (uint32_t)gsf__load_le(p + 60, 4), image, (size_t)(stop - image)));
     }
     return gsf__cursor_end(ctx, c);
 }
@@ -1437,7 +1473,8 @@ static gsf_result gsf__colmap_cameras_txt(gsf_context* ctx, gsf__line* l, gsf__s
         GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a camera id", &id));
         const size_t length = gsf__next_word(&l->at, l->end, &word);
         int model = 0;
-        while (model < (int)GSF__COUNT(gsf__lens_models) && !gsf__word_is(word, length, gsf__lens_models[model].name)) model++;
+        while (model < (int)GSF__COUNT(gsf__lens_models) && !gsf__word_is(word, length, gsf__lens_models[model].name))
+            model++;
         if (model == (int)GSF__COUNT(gsf__lens_models))
             return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %llu: unknown camera model \"%.*s\"", l->name,
                             l->number, (unsigned long long)id, (int)(length < 40 ? length : 40), word);
@@ -1475,7 +1512,7 @@ static gsf_result gsf__colmap_images_txt(gsf_context* ctx, gsf__line* l, gsf__sf
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu values, expected 2D points as X Y POINT3D_ID", l->name,
                             l->number, values);
         GSF__TRY(gsf__sfm_add_image(ctx, m, l->name, number, (uint32_t)id, pose, (uint32_t)camera, image,
-                                      (size_t)(stop - image)));
+                                    (size_t)(stop - image)));
     }
     return GSF_OK;
 }
@@ -1547,8 +1584,8 @@ static gsf_result gsf__colmap_read(gsf_context* ctx, int is_text, const gsf_byte
 static const char* gsf__json_where(const gsf_json* json) { return json->name; }
 
 // A number from the frame, else from the root, else `fallback`.
-static gsf_result gsf__json_setting(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame, const char* key,
-                                    double fallback, double* out) {
+static gsf_result gsf__json_setting(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
+                                    const char* key, double fallback, double* out) {
     const gsf_json_value* value = gsf_json_member(json, frame, key);
     if (!value) value = gsf_json_member(json, &json->values[0], key);
     *out = fallback;
@@ -1615,7 +1652,8 @@ static gsf_result gsf__transforms_add_camera(gsf_context* ctx, const gsf_json* j
     lens->height = (int32_t)height;
     const double pi = 3.14159265358979;
     if (!(lens->fx > 0.0) && !(camera.angle_x > 0.0 && camera.angle_x < pi))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: neither fl_x > 0 nor camera_angle_x between 0 and pi", where, at);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: neither fl_x > 0 nor camera_angle_x between 0 and pi", where,
+                        at);
     if (lens->fx < 0.0 || lens->fy < 0.0 || camera.angle_y < 0.0 || camera.angle_y > pi)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: negative focal length or field of view", where, at);
     GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
@@ -1677,7 +1715,8 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
     if (!path || path->type != GSF_JSON_STRING)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without file_path", where, (unsigned)frame->offset);
     if (!matrix || matrix->type != GSF_JSON_ARRAY || (matrix->count != 4 && matrix->count != 3))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without a 4x4 transform_matrix", where, (unsigned)frame->offset);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without a 4x4 transform_matrix", where,
+                        (unsigned)frame->offset);
     for (size_t r = 0; r < 3; r++) {
         const gsf_json_value* row = gsf_json_element(json, matrix, r);
         for (size_t c = 0; c < 4; c++) {
@@ -1689,14 +1728,16 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
             rows[4 * r + c] = value->number;
         }
     }
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
+    GSF__TRY(
+        gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
     gsf__sfm_image* image = &m->images[m->image_count];
     if (!gsf__pose_from_opengl(rows, image->w2c))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is no rotation and translation", where,
                         (unsigned)matrix->offset);
     image->name = path->string;
     image->name_size = path->string_size;
-    while (image->name_size > 2 && image->name[0] == '.' && image->name[1] == '/') image->name += 2, image->name_size -= 2;
+    while (image->name_size > 2 && image->name[0] == '.' && image->name[1] == '/')
+        image->name += 2, image->name_size -= 2;
     image->id = (uint32_t)m->image_count + 1;
     image->camera = camera;
     image->camera_id = (uint32_t)camera;
@@ -1836,7 +1877,8 @@ static void gsf__undistort_point(const gsf__lens* lens, double px, double py, do
     double x = x0, y = y0;
     for (int i = 0; i < 5; i++) {
         const double r2 = x * x + y * y;
-        const double inverse = (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))) / (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4])));
+        const double inverse =
+            (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))) / (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4])));
         if (inverse < 0.0) {
             x = x0;
             y = y0;
@@ -1867,17 +1909,17 @@ static int gsf__rectify_is_sound(const gsf__rectify* r) {
         for (int i = 0; i <= samples; i++) {
             const double along = (double)i / samples, across = side & 1 ? 1.0 : 0.0;
             double x, y;
-            gsf__rectify_map(r, (side < 2 ? along : across) * (r->width - 1), (side < 2 ? across : along) * (r->height - 1),
-                             &x, &y);
+            gsf__rectify_map(r, (side < 2 ? along : across) * (r->width - 1),
+                             (side < 2 ? across : along) * (r->height - 1), &x, &y);
             if (!(x > -0.05 * w - 1 && x < 1.05 * w && y > -0.05 * h - 1 && y < 1.05 * h)) return 0;
         }
     return 1;
 }
 
 // cv::getOptimalNewCameraMatrix(alpha = 0): the rectangle inscribed in the undistorted 9x9 grid fills the image. The
-// region of interest it returns is then always (0, 0, width - 1, height - 1). OpenCV numbers pixel centres 0, 1, ...; the
-// official parser hands it COLMAP's intrinsics, which mean 0.5, 1.5, ...; so does this function (the image shifts by a few
-// hundredths of a pixel, the same in both). 0 when nothing is left.
+// region of interest it returns is then always (0, 0, width - 1, height - 1). OpenCV numbers pixel centres 0, 1, ...;
+// the official parser hands it COLMAP's intrinsics, which mean 0.5, 1.5, ...; so does this function (the image shifts
+// by a few hundredths of a pixel, the same in both). 0 when nothing is left.
 static int gsf__rectify_like_opencv(gsf__rectify* r) {
     const gsf__lens* lens = &r->lens;
     double x0 = -DBL_MAX, x1 = DBL_MAX, y0 = -DBL_MAX, y1 = DBL_MAX;
@@ -1885,7 +1927,8 @@ static int gsf__rectify_like_opencv(gsf__rectify* r) {
     for (int j = 0; j < 9; j++)
         for (int i = 0; i < 9; i++) {
             double x, y;
-            gsf__undistort_point(lens, (double)i * (lens->width - 1) / 8.0, (double)j * (lens->height - 1) / 8.0, &x, &y);
+            gsf__undistort_point(lens, (double)i * (lens->width - 1) / 8.0, (double)j * (lens->height - 1) / 8.0, &x,
+                                 &y);
             if (!isfinite(x) || !isfinite(y)) return 0;
             if (i == 0) x0 = fmax(x0, x);
             if (i == 8) x1 = fmin(x1, x);
@@ -1903,7 +1946,8 @@ static int gsf__rectify_like_opencv(gsf__rectify* r) {
     return gsf__rectify_is_sound(r);
 }
 
-// Does the pinhole image with focal lengths `zoom` times the lens's show only what lies inside the photo, on its border?
+// Does the pinhole image with focal lengths `zoom` times the lens's show only what lies inside the photo, on its
+// border?
 static int gsf__rectify_fits(const gsf__rectify* r, double zoom, double radius_max) {
     const gsf__lens* lens = &r->lens;
     const int samples = 32;
@@ -1998,8 +2042,8 @@ typedef struct gsf__rectify_job {
 
 enum { GSF__RECTIFY_ROWS = 16 };
 
-// One bilinear sample per pixel, weights in 1/1024 from positions in 1/32 pixel as cv::remap has them; beyond the border
-// the nearest pixel counts.
+// One bilinear sample per pixel, weights in 1/1024 from positions in 1/32 pixel as cv::remap has them; beyond the
+// border the nearest pixel counts.
 static void gsf__rectify_rows(void* arg, size_t chunk, int worker) {
     const gsf__rectify_job* job = (const gsf__rectify_job*)arg;
     const gsf__rectify* r = job->r;
@@ -2093,8 +2137,8 @@ static void gsf__hush_end(gsf_context* ctx, const gsf__hush* hush, int forget) {
 }
 
 // Reads <folder><relative>; *data NULL where there is no such file.
-static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_text* path, void** data,
-                                     size_t* size) {
+static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_text* path,
+                                     void** data, size_t* size) {
     gsf__hush hush;
     path->size = 0;
     gsf_text_printf(ctx, path, "%s%s", folder, relative);
@@ -2215,11 +2259,11 @@ static void gsf__target_size(const gsf__photos* photos, int64_t width, int64_t h
 }
 
 // Fills view `out` and its source from a model image. *present = 0: its photo is missing.
-// The official parser divides K by the factor and multiplies by actual / (COLMAP size / factor, rounded down); taken here
-// without the rounding down, K simply follows the ratio of the sizes, each axis and each view for itself.
+// The official parser divides K by the factor and multiplies by actual / (COLMAP size / factor, rounded down); taken
+// here without the rounding down, K simply follows the ratio of the sizes, each axis and each view for itself.
 static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, const gsf__sfm_image* image,
-                                 const gsf__photos* photos, gsf_text* path, gsf_scene_view* view, gsf__view_source* source,
-                                 int* present) {
+                                       const gsf__photos* photos, gsf_text* path, gsf_scene_view* view,
+                                       gsf__view_source* source, int* present) {
     int64_t width = 0, height = 0;
     int reduced = 0;
     gsf__lens lens;
@@ -2227,11 +2271,12 @@ static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, cons
     *present = !photos || width > 0;
     if (!*present) return GSF_OK;
     if (width > GSF__LENS_SIZE_MAX || height > GSF__LENS_SIZE_MAX)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: image size %lld x %lld", path->data, (long long)width, (long long)height);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: image size %lld x %lld", path->data, (long long)width,
+                        (long long)height);
     const int64_t full = reduced ? photos->factor : 1; // an open size means the full photo's
     if (!gsf__camera_lens(&m->cameras[image->camera], width * full, height * full, &lens))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: \"%s\": no usable w, h or focal length", m->images_name, image->at,
-                        view->name);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: \"%s\": no usable w, h or focal length", m->images_name,
+                        image->at, view->name);
     if (photos) {
         int32_t w, h;
         gsf__target_size(photos, width, height, reduced, &w, &h);
@@ -2244,8 +2289,8 @@ static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, cons
         lens.height = h;
     }
     if (!gsf__rectify_make(&lens, &source->rectify))
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s:%zu: \"%s\": the distortion of camera %u leaves no image", m->images_name,
-                        image->at, view->name, (unsigned)image->camera_id);
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s:%zu: \"%s\": the distortion of camera %u leaves no image",
+                        m->images_name, image->at, view->name, (unsigned)image->camera_id);
     source->file_width = width;
     source->file_height = height;
     gsf_camera* camera = &view->camera;
@@ -2309,7 +2354,8 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
         }
         if (result == GSF_OK && present) scene->view_count++;
     }
-    if (missing > 1) gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu photos are missing", photos->folder, missing, m->image_count);
+    if (missing > 1)
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu photos are missing", photos->folder, missing, m->image_count);
     if (result == GSF_OK && scene->view_count == 0)
         result = gsf_fail(ctx, GSF_ERROR_IO, "%s%s: none of the %zu photos is there", photos->folder, photos->prefix,
                           m->image_count);
@@ -2377,7 +2423,8 @@ static gsf_result gsf__scene_map_tracks(gsf_context* ctx, gsf__sfm* m) {
             gsf__sfm_image wanted;
             const gsf__sfm_image* image;
             wanted.id = m->tracks[k];
-            if (table) image = wanted.id <= last && table[wanted.id] != UINT32_MAX ? &m->images[table[wanted.id]] : NULL;
+            if (table)
+                image = wanted.id <= last && table[wanted.id] != UINT32_MAX ? &m->images[table[wanted.id]] : NULL;
             else image = (const gsf__sfm_image*)bsearch(&wanted, m->images, m->image_count, sizeof wanted,
                                                           gsf__compare_image_ids);
             unknown += image == NULL;
@@ -2441,8 +2488,8 @@ static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__pho
 
 // ---- public ----
 
-GSF_API gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras, const gsf_bytes* images,
-                                          const gsf_bytes* points, gsf_scene* out) {
+GSF_API gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras,
+                                          const gsf_bytes* images, const gsf_bytes* points, gsf_scene* out) {
     gsf__sfm m;
     memset(out, 0, sizeof *out);
     gsf_result result = gsf__colmap_read(ctx, is_text, cameras, images, points, &m);
@@ -2455,8 +2502,8 @@ GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes*
     gsf_json document;
     gsf__sfm m;
     memset(out, 0, sizeof *out);
-    GSF__TRY(gsf_parse_json(ctx, json->name ? json->name : "transforms.json", (const char*)(json->data ? json->data : ""),
-                            json->data ? json->size : 0, &document));
+    GSF__TRY(gsf_parse_json(ctx, json->name ? json->name : "transforms.json",
+                            (const char*)(json->data ? json->data : ""), json->data ? json->size : 0, &document));
     gsf_result result = gsf__transforms_read(ctx, &document, &m);
     if (result == GSF_OK) result = gsf__scene_build(ctx, &m, NULL, out);
     gsf__sfm_destroy(ctx, &m);
@@ -2465,8 +2512,8 @@ GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes*
 }
 
 // folder: with a separator at its end. path: scratch.
-static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const void* data, size_t size, gsf__photos* photos,
-                                       gsf_text* path, gsf_scene* out) {
+static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                       gsf__photos* photos, gsf_text* path, gsf_scene* out) {
     gsf_json document;
     gsf__sfm m;
     void* points = NULL;
@@ -2490,7 +2537,8 @@ static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const
 }
 
 // Reads the three files of the first model found. *found = 0: none.
-static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, gsf_text* path, int* found, gsf_scene* out) {
+static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, gsf_text* path, int* found,
+                                   gsf_scene* out) {
     static const char* const folders[3] = {"sparse/0/", "sparse/", ""};
     static const char* const files[3] = {"cameras", "images", "points3D"};
     gsf_bytes bytes[3];
@@ -2548,7 +2596,8 @@ static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__ph
         if (found) return GSF_OK;
         GSF__TRY(gsf__read_if_there(ctx, folder->data, "transforms.json", scratch, json, &size));
         if (!*json)
-            return gsf_fail(ctx, GSF_ERROR_IO, "%s: no scene: neither sparse/0/cameras.bin or .txt nor transforms.json", path);
+            return gsf_fail(ctx, GSF_ERROR_IO, "%s: no scene: neither sparse/0/cameras.bin or .txt nor transforms.json",
+                            path);
         path = "transforms.json";
     } else {
         GSF__TRY(gsf_read_file(ctx, path, json, &size));
@@ -2557,7 +2606,8 @@ static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__ph
     return gsf__load_transforms(ctx, path, *json, size, photos, scratch, out);
 }
 
-GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc, gsf_scene* out) {
+GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
+                                        gsf_scene* out) {
     gsf__photos photos;
     gsf_text folder, scratch;
     void* json = NULL;
@@ -2750,7 +2800,8 @@ static void gsf__format_points(gsf_context* ctx, const gsf_scene* scene, const u
     }
 }
 
-GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep, const char* folder) {
+GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep,
+                                         const char* folder) {
     static const char* const names[3] = {"cameras", "images", "points3D"};
     const size_t observations = scene->point_count ? scene->track_begin[scene->point_count] : 0;
     gsf_text files[3], path, cameras;
@@ -2787,8 +2838,8 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
     return result;
 }
 
-GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_target, uint32_t* train, size_t* train_count,
-                                   uint32_t* test, size_t* test_count) {
+GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_target, uint32_t* train,
+                                   size_t* train_count, uint32_t* test, size_t* test_count) {
     size_t tests = 0, rest = 0;
     for (size_t i = 0; i < n; i++) {
         if (test_every && i % test_every == 0) {
