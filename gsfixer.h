@@ -1806,6 +1806,32 @@ static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const cha
 
 #ifndef GSF_NO_STB
 
+// Huffman tables of a JPEG: stb writes past its arrays when one claims more than 256 symbols. Walks the markers as stb does;
+// a file that ends early is left to the decoder's own detection.
+static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsigned char* data, size_t size) {
+    for (size_t at = 2; at + 4 <= size;) {
+        const unsigned marker = data[at + 1];
+        if (data[at] != 0xff || marker == 0xff || marker == 0 || (marker >= 0xd0 && marker <= 0xd7)) {
+            at++; // padding, image data
+            continue;
+        }
+        if (marker == 0xd9) return GSF_OK; // end of image
+        const size_t bytes = (size_t)data[at + 2] << 8 | data[at + 3], end = at + 2 + bytes;
+        if (bytes < 2) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG segment of %zu bytes", name, at, bytes);
+        if (marker == 0xc4)
+            for (size_t table = at + 4; table < end;) {
+                size_t symbols = 0;
+                if (size < 17 || table > size - 17) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is cut", name, size);
+                for (size_t i = 1; i <= 16; i++) symbols += data[table + i];
+                if (symbols > 256 || table + 17 + symbols > end)
+                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG table of %zu symbols", name, table, symbols);
+                table += 17 + symbols;
+            }
+        at = end;
+    }
+    return GSF_OK;
+}
+
 // Bytes for stb, from memory or a stdio file. `overrun` tells that it wanted more than there is: stb itself goes on with
 // zeros, which would turn a cut photo into a half grey one.
 typedef struct gsf__stb_source {
@@ -1873,8 +1899,49 @@ static gsf_result gsf__stb_fail(gsf_context* ctx, const char* name, const gsf__s
     return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is malformed (%s)", name, source->at, reason);
 }
 
+static int gsf__source_byte(gsf__stb_source* source) {
+    unsigned char c;
+    return gsf__stb_read(source, (char*)&c, 1) == 1 ? c : -1;
+}
+
+static int gsf__source_u16(gsf__stb_source* source) { // big-endian
+    const int high = gsf__source_byte(source), low = gsf__source_byte(source);
+    return high < 0 || low < 0 ? -1 : high << 8 | low;
+}
+
+// Size of a JPEG from its frame header, behind the two bytes of the start marker. stb would parse tables on the way there.
+static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
+                                  int64_t* height, int32_t* channels) {
+    for (;;) {
+        int marker = gsf__source_byte(source);
+        if (marker >= 0 && marker != 0xff) continue; // padding
+        while (marker == 0xff) marker = gsf__source_byte(source);
+        const int bytes = gsf__source_u16(source);
+        if (marker < 0 || bytes < 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is cut", name, source->at);
+        if (bytes < 2 || marker == 0xd9 || marker == 0xda)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG without a frame header", name, source->at);
+        if (marker < 0xc0 || marker > 0xcf || marker == 0xc4 || marker == 0xc8 || marker == 0xcc) {
+            gsf__stb_skip(source, bytes - 2);
+            continue;
+        }
+        (void)gsf__source_byte(source); // bits per sample
+        const int h = gsf__source_u16(source), w = gsf__source_u16(source), c = gsf__source_byte(source);
+        if (h < 1 || w < 1 || c < 1 || marker > 0xc2)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG of %d x %d, coding %d", name, source->at, w, h,
+                            marker - 0xc0);
+        *width = w;
+        *height = h;
+        *channels = c >= 3 ? 3 : 1;
+        return GSF_OK;
+    }
+}
+
 static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
                                  int64_t* height, int32_t* channels) {
+    if (gsf__source_u16(source) == 0xffd8) return gsf__jpeg_query(ctx, name, source, width, height, channels);
+    if (source->file) rewind(source->file);
+    source->at = 0;
+    source->overrun = 0;
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
     int w, h, c;
     if (!stbi_info_from_callbacks(&callbacks, source, &w, &h, &c)) return gsf__stb_fail(ctx, name, source);
@@ -1893,8 +1960,13 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     GSF__TRY(gsf__stb_query(ctx, name, &source, &width, &height, &file_channels));
     GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
     if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
-    source = gsf__stb_memory(data, size);
+    const unsigned char* bytes = (const unsigned char*)data;
+    if (size > 2 && bytes[0] == 0xff && bytes[1] == 0xd8) GSF__TRY(gsf__check_jpeg(ctx, name, bytes, size));
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
+    source = gsf__stb_memory(data, size);
+    if (bytes[0] == 'P' && stbi_is_16_bit_from_callbacks(&callbacks, &source)) // stb 2.27 mixes the sizes up
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: PNM of 16 bits", name);
+    source = gsf__stb_memory(data, size);
     int w, h, c;
     stbi_uc* pixels = stbi_load_from_callbacks(&callbacks, &source, &w, &h, &c, channels);
     gsf_result result = pixels && !source.overrun ? GSF_OK : gsf__stb_fail(ctx, name, &source);
@@ -1933,9 +2005,11 @@ GSF_API gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, con
     gsf__stb_source source = gsf__stb_memory(data, size);
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
     int w, h, c;
-    const int stb_reads = stbi_info_from_callbacks(&callbacks, &source, &w, &h, &c);
+    const unsigned char* bytes = (const unsigned char*)data;
+    const int jpeg = size > 2 && bytes[0] == 0xff && bytes[1] == 0xd8;
+    const int stb_reads = jpeg || stbi_info_from_callbacks(&callbacks, &source, &w, &h, &c);
     source = gsf__stb_memory(data, size);
-    if (!stb_reads || stbi_is_16_bit_from_callbacks(&callbacks, &source)) // eight-bit files: the same in all builds
+    if (!stb_reads || (!jpeg && stbi_is_16_bit_from_callbacks(&callbacks, &source))) // eight-bit files: the same in all builds
         return gsf__oiio_load(ctx, name, data, size, channels, out);
 #endif
 #endif
