@@ -1,0 +1,811 @@
+// test_traj.c - gsfixer_traj.h beyond the golden data: any number of views, window lengths, seeds; scenes moved and
+// scaled; degenerate and non-finite input; scratch of exactly the promised size (for a sanitizer to see).
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_traj.h"
+#include "test.h"
+
+static gsf_context ctx;
+static uint64_t rng = 1;
+
+static double uniform(double lo, double hi) { return test_random_in(&rng, lo, hi); }
+
+static void* take(size_t bytes) { // exact
+    void* memory = malloc(bytes ? bytes : 1);
+    if (!memory) { fprintf(stderr, "out of memory\n"); exit(2); }
+    return memory;
+}
+
+// ---- scenes --------------------------------------------------------------------
+
+enum { POINTS = 60 };
+
+typedef struct scene {
+    size_t count;
+    gsf_camera cameras[32];
+    double points[3 * POINTS];
+} scene;
+
+static gsf_camera camera_at(const double pose[16]) {
+    gsf_camera camera = {{0}, 500.0, 510.0, 320.0, 230.0, 640, 480};
+    gsf_camera_set_c2w(&camera, pose);
+    return camera;
+}
+
+// Views of about unit distance that look near the origin, from an arc or from anywhere, and a flat cloud of points.
+static void make_scene(scene* s, size_t count) {
+    memset(s, 0, sizeof *s);
+    s->count = count;
+    const double up[3] = {uniform(-0.3, 0.3), 1.0, uniform(-0.3, 0.3)}, arc = uniform(1.0, 6.0);
+    for (size_t i = 0; i < count; i++) {
+        const double angle = arc * ((double)i + uniform(0.0, 0.8)) / (double)count, r = uniform(0.8, 1.4);
+        const double eye[3] = {r * cos(angle), uniform(-0.2, 0.6), r * sin(angle)};
+        const double target[3] = {uniform(-0.2, 0.2), uniform(-0.2, 0.2), uniform(-0.2, 0.2)};
+        double pose[16];
+        CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
+        s->cameras[i] = camera_at(pose);
+    }
+    for (int i = 0; i < 3 * POINTS; i++) s->points[i] = uniform(-1.0, 1.0) * (i % 3 == 1 ? 0.2 : i % 3 ? 0.6 : 1.0);
+}
+
+static void move_scene(const scene* s, double scale, const double offset[3], scene* out) {
+    *out = *s;
+    for (size_t i = 0; i < s->count; i++) {
+        double pose[16];
+        gsf_camera_c2w(&s->cameras[i], pose);
+        for (int k = 0; k < 3; k++) pose[12 + k] = pose[12 + k] * scale + offset[k];
+        gsf_camera_set_c2w(&out->cameras[i], pose);
+    }
+    for (int i = 0; i < 3 * POINTS; i++) out->points[i] = s->points[i] * scale + offset[i % 3];
+}
+
+typedef struct path { // result of one call in memory of exactly the promised size
+    gsf_result result;
+    gsf_traj_path_layout layout;
+    gsf_camera* frames;
+    int32_t* reference;
+} path;
+
+static path sample(const gsf_camera* cameras, size_t count, const gsf_traj_path_desc* desc) {
+    path p;
+    memset(&p, 0, sizeof p);
+    p.result = gsf_traj_query_path(&ctx, count, desc, &p.layout);
+    if (p.result != GSF_OK) return p;
+    p.frames = (gsf_camera*)take(p.layout.frame_count * sizeof(gsf_camera));
+    p.reference = (int32_t*)take(p.layout.frame_count * sizeof(int32_t));
+    void* scratch = take(p.layout.scratch_bytes);
+    memset(scratch, 0xff, p.layout.scratch_bytes); // NaN
+    memset(p.frames, 0xff, p.layout.frame_count * sizeof(gsf_camera));
+    p.result = gsf_traj_sample_path(&ctx, cameras, count, desc, scratch, p.frames, p.reference);
+    free(scratch);
+    return p;
+}
+static void drop(path* p) {
+    free(p->frames);
+    free(p->reference);
+    memset(p, 0, sizeof *p);
+}
+
+static double rigidity(const double m[16]) { // largest entry of R^T R - I; infinite when something is not finite
+    double worst = 0.0;
+    for (int i = 0; i < 16; i++)
+        if (!isfinite(m[i])) return INFINITY;
+    for (int a = 0; a < 3; a++)
+        for (int b = 0; b < 3; b++) {
+            const double* c = m + 4 * b;
+            const double e = fabs(m[4 * a] * c[0] + m[4 * a + 1] * c[1] + m[4 * a + 2] * c[2] - (a == b));
+            if (e > worst) worst = e;
+        }
+    return worst;
+}
+
+// Frames of a path that succeeded are cameras; those of one that failed are zero. Never NaN.
+static void check_frames(const path* p) {
+    double worst = 0.0;
+    int wrong = 0;
+    for (size_t f = 0; f < p->layout.frame_count && p->frames; f++) {
+        const gsf_camera* camera = &p->frames[f];
+        if (p->result != GSF_OK) {
+            for (int i = 0; i < 16; i++) wrong += camera->w2c[i] != 0.0;
+            continue;
+        }
+        const double e = rigidity(camera->w2c);
+        if (!(e <= worst)) worst = e;
+        wrong += gsf_check_camera(&ctx, camera) != GSF_OK;
+    }
+    CHECK(wrong == 0);
+    CHECK(worst <= 1e-12);
+}
+
+static double pose_distance(const gsf_camera* a, const gsf_camera* b) { // largest difference of pose entries
+    double x[16], y[16], worst = 0.0;
+    gsf_camera_c2w(a, x);
+    gsf_camera_c2w(b, y);
+    for (int i = 0; i < 16; i++)
+        if (!(fabs(x[i] - y[i]) <= worst)) worst = fabs(x[i] - y[i]);
+    return worst;
+}
+
+// ---- all sizes -----------------------------------------------------------------
+
+static void check_reference_windows(const scene* s, const path* p, int official) {
+    const int32_t length = p->layout.window_length;
+    int32_t side, middle;
+    gsf_traj_split_window(length, &side, &middle);
+    CHECK(side >= 1 && middle >= 0 && 2 * side + middle == length);
+    int wrong = 0, uneven = 0, twice = 0;
+    for (int32_t w = 0; w < p->layout.window_count; w++) {
+        const gsf_camera* frames = p->frames + (size_t)w * (size_t)length;
+        const int32_t* reference = p->reference + (size_t)w * (size_t)length;
+        for (int32_t f = 0; f < length; f++) {
+            const int end = f == 0 || f == length - 1;
+            if (!end) wrong += reference[f] != -1;
+            else if (reference[f] < 0 || (size_t)reference[f] >= s->count) wrong++;
+            else wrong += memcmp(frames[f].w2c, s->cameras[reference[f]].w2c, sizeof frames[f].w2c) != 0;
+            if (f > 0 && length > 2) twice += pose_distance(&frames[f - 1], &frames[f]) < 1e-12;
+        }
+        for (int32_t f = 1; f < side && !official; f++) { // equal steps of position on both legs
+            double a[3], b[3], c[3];
+            for (int leg = 0; leg < 2; leg++) {
+                const gsf_camera* at = frames + (leg ? length - 1 - f : f);
+                gsf_camera_center(at - 1, a);
+                gsf_camera_center(at, b);
+                gsf_camera_center(at + 1, c);
+                for (int i = 0; i < 3; i++) uneven += !(fabs(a[i] - 2.0 * b[i] + c[i]) < 1e-10);
+            }
+        }
+        if (official) CHECK(pose_distance(&frames[side - 1], &frames[side]) < 1e-12); // the released seams
+        if (official) CHECK(pose_distance(&frames[side + middle - 1], &frames[side + middle]) < 1e-12);
+    }
+    CHECK(wrong == 0);
+    CHECK(uneven == 0);
+    if (!official) CHECK(twice == 0);
+}
+
+static void test_all_sizes(void) {
+    for (size_t count = 1; count <= 20; count++)
+        for (int32_t length = 2; length <= 100; length++) {
+            scene s;
+            make_scene(&s, count);
+            gsf_traj_path_desc desc;
+            memset(&desc, 0, sizeof desc);
+            desc.kind = (gsf_traj_kind)(test_random_bits(&rng) % 3);
+            desc.window_length = length;
+            desc.seed = test_random_bits(&rng);
+            desc.round = (int32_t)(test_random_bits(&rng) % 8);
+            if (test_random_bits(&rng) % 2) { desc.points = s.points; desc.point_count = POINTS; }
+            desc.official = desc.kind == GSF_TRAJ_REFERENCE && length % 3 == 1 && length >= 7 && length < 85 &&
+                            test_random_bits(&rng) % 2;
+            if (!desc.official && test_random_bits(&rng) % 2) {
+                desc.window_count = 1 + (int32_t)(test_random_bits(&rng) % 9);
+                desc.ellipse_poses = length + (int32_t)(test_random_bits(&rng) % 200);
+            }
+            path p = sample(s.cameras, s.count, &desc);
+            check_frames(&p);
+            if (count == 1) {
+                CHECK(p.result == GSF_ERROR_DEGENERATE);
+            } else if (CHECK_OK(&ctx, p.result) && desc.kind == GSF_TRAJ_REFERENCE) {
+                check_reference_windows(&s, &p, desc.official);
+            } else if (p.result == GSF_OK) {
+                for (size_t f = 0; f < p.layout.frame_count; f++) {
+                    const int32_t r = p.reference[f];
+                    CHECK(desc.kind == GSF_TRAJ_ELLIPSE ? r == -1 : r >= -1 && r < (int32_t)count);
+                    if (r >= 0) CHECK(memcmp(p.frames[f].w2c, s.cameras[r].w2c, sizeof p.frames[f].w2c) == 0);
+                }
+                if (desc.kind == GSF_TRAJ_INTERPOLATE) { // starts at the first camera and ends at the last
+                    CHECK(p.reference[0] == 0);
+                    CHECK(p.reference[p.layout.frame_count - 1] == (int32_t)count - 1);
+                }
+            }
+            drop(&p);
+        }
+}
+
+static void test_defaults(void) {
+    scene s;
+    make_scene(&s, 6);
+    gsf_traj_path_layout layout;
+    CHECK_OK(&ctx, gsf_traj_query_path(&ctx, 6, NULL, &layout));
+    CHECK(layout.window_count == 7 && layout.window_length == 49);
+    CHECK(layout.ellipse_poses == 85 && layout.frame_count == 343);
+    path a = sample(s.cameras, s.count, NULL);
+    CHECK_OK(&ctx, a.result);
+    // windows go round the loop: their middles cover it, and none repeats another
+    for (int w = 1; w < 7 && a.result == GSF_OK; w++)
+        CHECK(pose_distance(&a.frames[24], &a.frames[49 * w + 24]) > 0.05);
+    gsf_traj_path_desc desc;
+    memset(&desc, 0, sizeof desc);
+    path b = sample(s.cameras, s.count, &desc); // the same bits again, and with another seed another height
+    CHECK(b.result == GSF_OK && memcmp(a.frames, b.frames, a.layout.frame_count * sizeof *a.frames) == 0);
+    drop(&b);
+    desc.seed = 5;
+    b = sample(s.cameras, s.count, &desc);
+    CHECK(b.result == GSF_OK && pose_distance(&a.frames[24], &b.frames[24]) > 1e-3);
+    drop(&b);
+    // frames have one size; a photo's frame has the photo's intrinsics, also when they differ
+    desc.seed = 0;
+    s.cameras[2].fx = 700.0;
+    s.cameras[2].width = 1280;
+    gsf_camera wanted = s.cameras[0];
+    wanted.width = 320;
+    desc.intrinsics = &wanted;
+    b = sample(s.cameras, s.count, &desc);
+    CHECK_OK(&ctx, b.result);
+    for (size_t f = 0; f < b.layout.frame_count && b.result == GSF_OK; f++) {
+        const int32_t r = b.reference[f];
+        CHECK(b.frames[f].width == 320 && b.frames[f].height == 480);
+        CHECK_NEAR(b.frames[f].fx, r < 0 ? wanted.fx : s.cameras[r].fx * 320.0 / s.cameras[r].width, 1e-12);
+    }
+    drop(&b);
+    drop(&a);
+    const int32_t wrong[][3] = {{1, 0, 0}, {-1, 0, 0}, {0, -1, 0}, {0, 0, -1}, {INT32_MAX, INT32_MAX, 0}};
+    for (size_t i = 0; i < sizeof wrong / sizeof wrong[0]; i++) {
+        memset(&desc, 0, sizeof desc);
+        desc.window_length = wrong[i][0];
+        desc.window_count = wrong[i][1];
+        desc.ellipse_poses = wrong[i][2];
+        CHECK_RESULT(&ctx, gsf_traj_query_path(&ctx, 6, &desc, &layout), GSF_ERROR_INVALID_ARGUMENT);
+        CHECK(layout.frame_count == 0);
+    }
+    memset(&desc, 0, sizeof desc);
+    desc.official = 1;
+    desc.window_length = 50; // not 3n + 1
+    CHECK_RESULT(&ctx, gsf_traj_query_path(&ctx, 6, &desc, &layout), GSF_ERROR_INVALID_ARGUMENT);
+    desc.window_length = 49;
+    desc.ellipse_poses = 16; // less than one window
+    CHECK_RESULT(&ctx, gsf_traj_query_path(&ctx, 6, &desc, &layout), GSF_ERROR_INVALID_ARGUMENT);
+}
+
+// ---- paths follow their scene --------------------------------------------------
+
+static void check_following(const scene* s, const gsf_traj_path_desc* base, double scale, const double offset[3],
+                            double tolerance) {
+    static scene moved;
+    move_scene(s, scale, offset, &moved);
+    gsf_traj_path_desc desc = *base;
+    path a = sample(s->cameras, s->count, &desc);
+    if (desc.points) desc.points = moved.points;
+    path b = sample(moved.cameras, moved.count, &desc);
+    CHECK_OK(&ctx, a.result);
+    CHECK_OK(&ctx, b.result);
+    double worst = 0.0;
+    for (size_t f = 0; f < a.layout.frame_count && a.result == GSF_OK && b.result == GSF_OK; f++) {
+        double x[16], y[16];
+        gsf_camera_c2w(&a.frames[f], x);
+        gsf_camera_c2w(&b.frames[f], y);
+        for (int i = 0; i < 3; i++) y[12 + i] = (y[12 + i] - offset[i]) / scale;
+        for (int i = 0; i < 16; i++)
+            if (!(fabs(x[i] - y[i]) <= worst)) worst = fabs(x[i] - y[i]);
+        CHECK(a.reference[f] == b.reference[f]);
+    }
+    test_check_near(worst, 0.0, tolerance, "path follows its scene", __FILE__, __LINE__);
+    drop(&a);
+    drop(&b);
+}
+
+static void test_invariance(void) {
+    const double none[3] = {0.0, 0.0, 0.0}, far_off[3] = {1e6, -1e6, 1e6}, near_by[3] = {30.0, -7.0, 11.0};
+    for (int trial = 0; trial < 60; trial++) {
+        scene s;
+        make_scene(&s, 2 + (size_t)trial % 9);
+        gsf_traj_path_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.kind = (gsf_traj_kind)(trial % 3);
+        desc.round = trial % 4;
+        if (trial % 2) { desc.points = s.points; desc.point_count = POINTS; }
+        check_following(&s, &desc, 1e-3, none, 1e-9);
+        check_following(&s, &desc, 1e3, none, 1e-9);
+        check_following(&s, &desc, 1.0, near_by, 1e-9);
+        check_following(&s, &desc, 1.0, far_off, 1e-5); // coordinates are rounded to 1e-10 there
+        check_following(&s, &desc, 1e3, far_off, 1e-8);
+        desc.official = 1; // the released one follows scale about the origin only
+        check_following(&s, &desc, 1e-3, none, 1e-9);
+        check_following(&s, &desc, 1e3, none, 1e-9);
+    }
+    for (size_t count = 3; count <= 12; count++) { // an exact ring: every axis and every nearest view is a tie
+        scene s;
+        make_scene(&s, count);
+        for (size_t i = 0; i < count; i++) {
+            const double angle = 6.283185307179586 * (double)i / (double)count;
+            const double eye[3] = {2.0 * cos(angle), 2.0 * sin(angle), 0.5}, target[3] = {0, 0, 0}, up[3] = {0, 0, 1};
+            double pose[16];
+            CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
+            s.cameras[i] = camera_at(pose);
+        }
+        gsf_traj_path_desc desc;
+        memset(&desc, 0, sizeof desc);
+        check_following(&s, &desc, 1e-3, none, 1e-9);
+        check_following(&s, &desc, 1e3, near_by, 1e-9);
+    }
+}
+
+// ---- degenerate input ----------------------------------------------------------
+
+static gsf_result result_of(const gsf_camera* cameras, size_t count, gsf_traj_kind kind, int official) {
+    gsf_traj_path_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.kind = kind;
+    desc.official = official;
+    path p = sample(cameras, count, &desc);
+    check_frames(&p);
+    const gsf_result result = p.result;
+    drop(&p);
+    return result;
+}
+
+static void look(const double eye[3], const double target[3], const double up[3], gsf_camera* out) {
+    double pose[16];
+    CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
+    *out = camera_at(pose);
+}
+
+static void test_degenerate_cameras(void) {
+    const double up[3] = {0.0, 1.0, 0.0}, x_axis[3] = {1.0, 0.0, 0.0}, at_origin[3] = {0.0, 0.0, 0.0};
+    gsf_camera c[9];
+    for (int official = 0; official < 2; official++) {
+        for (int i = 0; i < 9; i++) { // turned about one point
+            const double eye[3] = {1.0, 2.0, 3.0}, target[3] = {cos(0.3 * i), 2.0, sin(0.3 * i)};
+            look(eye, target, up, &c[i]);
+        }
+        const gsf_result turned = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
+        CHECK(turned == GSF_ERROR_DEGENERATE);
+        CHECK(result_of(c, 9, GSF_TRAJ_ELLIPSE, official) == GSF_ERROR_DEGENERATE);
+        CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
+        for (int i = 1; i < 9; i++) c[i] = c[0]; // one view nine times
+        CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
+        CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
+        for (int i = 0; i < 9; i++) { // a line of parallel views
+            const double eye[3] = {(double)i, 0.0, 0.0}, target[3] = {(double)i, 0.0, 5.0};
+            look(eye, target, up, &c[i]);
+        }
+        CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
+        CHECK(result_of(c, 2, GSF_TRAJ_ELLIPSE, official) == GSF_ERROR_DEGENERATE);
+        CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
+        for (int i = 0; i < 9; i++) { // a line of views that converge: the up vector says which way the loop lies
+            const double eye[3] = {(double)i - 4.0, 1.0, 0.0}, target[3] = {0.2 * i, 0.5, 5.0};
+            look(eye, target, up, &c[i]);
+        }
+        CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_OK);
+        CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_OK);
+        CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
+        for (int i = 0; i < 9; i++) { // a vertical line: nothing says
+            const double eye[3] = {0.0, (double)i, 0.0}, target[3] = {0.0, 4.0, 5.0};
+            look(eye, target, up, &c[i]);
+        }
+        const gsf_result vertical = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
+        CHECK(vertical == GSF_OK || vertical == GSF_ERROR_DEGENERATE);
+        for (int i = 0; i < 9; i++) { // straight down, as a drone
+            const double eye[3] = {(double)(i % 3), 10.0, (double)(i / 3)}, target[3] = {1.0, 0.0, 1.0};
+            look(eye, target, x_axis, &c[i]);
+        }
+        const gsf_result drone = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
+        CHECK(drone == GSF_OK || drone == GSF_ERROR_DEGENERATE);
+        for (int i = 0; i < 2; i++) { // up vectors cancel
+            const double eye[3] = {i ? 1.0 : -1.0, 0.0, 0.2}, flipped[3] = {0.0, i ? 1.0 : -1.0, 0.0};
+            look(eye, at_origin, flipped, &c[i]);
+        }
+        CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
+        scene s; // upside down: the released code mirrors the world when exactly so
+        make_scene(&s, 6);
+        for (size_t i = 0; i < 6; i++) {
+            const double angle = (double)i, eye[3] = {cos(angle), 0.0, sin(angle)}, down[3] = {0.0, -1.0, 0.0};
+            const double forward[3] = {-eye[0], 0.0, -eye[2]};
+            double pose[16];
+            CHECK_OK(&ctx, gsf_traj_view_pose(&ctx, forward, down, eye, pose));
+            s.cameras[i] = camera_at(pose);
+        }
+        CHECK(result_of(s.cameras, 6, GSF_TRAJ_REFERENCE, official) == GSF_OK);
+        for (int power = -150; power <= 150; power += 10) { // sizes at which squares overflow: a path or an error
+            scene big;
+            make_scene(&s, 5);
+            move_scene(&s, pow(10.0, power), at_origin, &big);
+            (void)result_of(big.cameras, 5, (gsf_traj_kind)((power + 150) / 10 % 3), official);
+        }
+    }
+    CHECK(result_of(c, 0, GSF_TRAJ_REFERENCE, 0) == GSF_ERROR_DEGENERATE);
+}
+
+static void test_degenerate_primitives(void) {
+    const double o[3] = {0, 0, 0}, x[3] = {1, 0, 0}, y[3] = {0, 1, 0}, nearly[3] = {1e-7, 1, 0};
+    double pose[16], a[16], b[16], out[64 * 16], transform[16], scratch[512], focus[3];
+    CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, o, y, y, pose), GSF_ERROR_DEGENERATE); // along up
+    CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, x, x, y, pose), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, o, x, o, pose), GSF_ERROR_DEGENERATE);
+    CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, nearly, y, pose)); // nearly along up is still a rotation
+    CHECK(rigidity(pose) < 1e-14);
+    CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, x, y, a));
+    CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 1, focus), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 0, focus), GSF_ERROR_DEGENERATE);
+    memcpy(out, a, sizeof a);
+    memcpy(out + 16, a, sizeof a);
+    double two[32];
+    memcpy(two, out, sizeof two);
+    CHECK_RESULT(&ctx, gsf_traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE); // coincide
+    CHECK_OK(&ctx, gsf_traj_leg_path(&ctx, two, 2, 8, 0, out));
+    for (int i = 0; i < 8; i++) CHECK(rigidity(out + 16 * i) < 1e-14);
+    const double back[3] = {-1, 0, 0};
+    CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, back, y, b));
+    memcpy(two + 16, b, sizeof b); // opposite directions: the released blend passes zero at u = 1/2
+    CHECK_RESULT(&ctx, gsf_traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE);
+    for (int i = 0; i < 8 * 16; i++) CHECK(out[i] == 0.0);
+    CHECK_OK(&ctx, gsf_traj_leg_path(&ctx, two, 2, 9, 0, out));
+    for (int i = 0; i < 9; i++) CHECK(rigidity(out + 16 * i) < 1e-14);
+    CHECK_NEAR(fabs(out[4 * 16 + 8]), 0.0, 1e-12); // half way it looks sideways
+    CHECK_RESULT(&ctx, gsf_traj_average_pose(&ctx, two, 2, 0, pose), GSF_ERROR_DEGENERATE);
+    memcpy(two + 16, a, sizeof a);
+    CHECK_RESULT(&ctx, gsf_traj_spline_path(&ctx, two, 2, NULL, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_spline_path(&ctx, two, 1, NULL, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_slerp_path(&ctx, two, 1, 5, 0.0, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_similarity(&ctx, two, 2, NULL, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_pca_poses(&ctx, two, 2, out, transform), GSF_ERROR_DEGENERATE);
+    const double line[9] = {1, 2, 3, 2, 4, 6, 5, 10, 15}, same[9] = {1, 2, 3, 1, 2, 3, 1, 2, 3};
+    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, line, 3, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, same, 3, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, same, 1, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, same, 0, scratch, transform), GSF_ERROR_DEGENERATE);
+    const double zero[4] = {0, 0, 0, 0}, tiny[4] = {1e-200, 0, 1e-200, 0};
+    CHECK_RESULT(&ctx, gsf_traj_set_pose_quat(&ctx, zero, pose), GSF_ERROR_DEGENERATE);
+    CHECK_OK(&ctx, gsf_traj_set_pose_quat(&ctx, tiny, pose));
+    CHECK(rigidity(pose) < 1e-14);
+    const double sites[3] = {0, 1, 1}, values[3] = {0, 1, 2};
+    CHECK_RESULT(&ctx, gsf_traj_spline(&ctx, sites, values, 3, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_spline(&ctx, sites, values, 2, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_spline(&ctx, sites, values, 3, 1, 6, sites, 3, scratch, out),
+                 GSF_ERROR_INVALID_ARGUMENT);
+    a[0] = -a[0]; a[1] = -a[1]; a[2] = -a[2]; // a mirror
+    CHECK_RESULT(&ctx, gsf_traj_check_poses(&ctx, a, 1), GSF_ERROR_INVALID_ARGUMENT);
+}
+
+// ---- NaN anywhere --------------------------------------------------------------
+
+static void test_not_finite(void) {
+    const double bad_values[3] = {NAN, INFINITY, -INFINITY};
+    scene s;
+    make_scene(&s, 4);
+    double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    for (int kind = 0; kind < 3; kind++)
+        for (int v = 0; v < 3; v++) {
+            gsf_traj_path_desc desc;
+            memset(&desc, 0, sizeof desc);
+            desc.kind = (gsf_traj_kind)kind;
+            desc.window_length = 10;
+            desc.points = s.points;
+            desc.point_count = POINTS;
+            gsf_camera intrinsics = s.cameras[0];
+            desc.intrinsics = &intrinsics;
+            double* fields[4 * 20 + 3 * POINTS + 4]; // every number that goes in
+            size_t n = 0;
+            for (size_t i = 0; i < 4; i++) {
+                for (int k = 0; k < 16; k++) fields[n++] = &s.cameras[i].w2c[k];
+                fields[n++] = &s.cameras[i].fx;
+                fields[n++] = &s.cameras[i].fy;
+                fields[n++] = &s.cameras[i].cx;
+                fields[n++] = &s.cameras[i].cy;
+            }
+            for (int i = 0; i < 3 * POINTS; i++) fields[n++] = &s.points[i];
+            fields[n++] = &intrinsics.fx;
+            fields[n++] = &intrinsics.cy;
+            for (size_t i = 0; i < n; i++) {
+                const double keep = *fields[i];
+                *fields[i] = bad_values[v];
+                path p = sample(s.cameras, 4, &desc);
+                CHECK(p.result == GSF_ERROR_NUMERIC || p.result == GSF_ERROR_INVALID_ARGUMENT);
+                CHECK(ctx.error[0] != 0);
+                check_frames(&p);
+                drop(&p);
+                *fields[i] = keep;
+            }
+            for (int i = 0; i < 16; i++) {
+                const double keep = identity[i];
+                identity[i] = bad_values[v];
+                desc.transform = identity;
+                path p = sample(s.cameras, 4, &desc);
+                CHECK(p.result == GSF_ERROR_NUMERIC);
+                drop(&p);
+                identity[i] = keep;
+            }
+            desc.transform = NULL;
+            gsf_traj_ellipse_desc ellipse = gsf_traj_round_ellipse(0, 0, 0);
+            double* shape[3] = {&ellipse.z_variation, &ellipse.z_phase, &ellipse.pitch_degrees};
+            desc.ellipse = &ellipse;
+            for (int i = 0; i < 3 && kind != GSF_TRAJ_INTERPOLATE; i++) {
+                const double keep = *shape[i];
+                *shape[i] = bad_values[v];
+                path p = sample(s.cameras, 4, &desc);
+                CHECK(p.result == GSF_ERROR_NUMERIC);
+                drop(&p);
+                *shape[i] = keep;
+            }
+        }
+}
+
+static void test_not_finite_primitives(void) {
+    scene s;
+    make_scene(&s, 4);
+    double poses[64], out[64 * 16], scratch[2048], transform[16], three[3], radius;
+    int32_t index;
+    for (size_t i = 0; i < 4; i++) gsf_camera_c2w(&s.cameras[i], poses + 16 * i);
+    for (int i = 0; i < 64; i++) {
+        const double keep = poses[i];
+        poses[i] = i % 2 ? NAN : INFINITY;
+        CHECK_RESULT(&ctx, gsf_traj_check_poses(&ctx, poses, 4), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, poses, 4, three), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_average_pose(&ctx, poses, 4, 0, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_recenter_poses(&ctx, poses, 4, 0, out, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_camera_radius(&ctx, poses, 4, three, &radius), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_nearest_view(&ctx, poses, poses, 4, 0.5, &index, NULL), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_similarity(&ctx, poses, 4, NULL, scratch, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_normalize(&ctx, poses, 4, NULL, 0, NULL, scratch, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_pca_poses(&ctx, poses, 4, out, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_spline_path(&ctx, poses, 4, NULL, scratch, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_slerp_path(&ctx, poses, 4, 8, 0.0, scratch, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_leg_path(&ctx, poses, 4, 4, 0, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_ellipse_path(&ctx, poses, 4, NULL, scratch, out), GSF_ERROR_NUMERIC);
+        if (i < 16) CHECK_RESULT(&ctx, gsf_traj_slerp_pose(&ctx, poses, poses + 16, 0.5, out), GSF_ERROR_NUMERIC);
+        if (i < 16) CHECK_RESULT(&ctx, gsf_traj_invert_similarity(&ctx, poses, out), GSF_ERROR_NUMERIC);
+        poses[i] = keep;
+    }
+    for (int i = 0; i < 9; i++) {
+        double v[9] = {0.1, 0.2, 0.3, 1.0, 0.5, 0.2, 0.0, 1.0, 0.0}, quat[4] = {1, 0, 0, 0};
+        v[i] = NAN;
+        CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, v, v + 3, v + 6, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_view_pose(&ctx, v, v + 3, v + 6, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, v, 3, scratch, transform), GSF_ERROR_NUMERIC);
+        quat[i % 4] = NAN;
+        CHECK_RESULT(&ctx, gsf_traj_set_pose_quat(&ctx, quat, transform), GSF_ERROR_NUMERIC);
+    }
+    CHECK_RESULT(&ctx, gsf_traj_slerp_pose(&ctx, poses, poses + 16, NAN, out), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf_traj_slerp_path(&ctx, poses, 4, 8, NAN, scratch, out), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf_traj_nearest_view(&ctx, poses, poses, 4, NAN, &index, NULL), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf_traj_projection(&ctx, &s.cameras[0], NAN, 1.0, out), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf_traj_projection(&ctx, &s.cameras[0], 2.0, 1.0, out), GSF_ERROR_INVALID_ARGUMENT);
+}
+
+// ---- the pieces against plain formulas -----------------------------------------
+
+static void test_order_and_eigen(void) {
+    for (int trial = 0; trial < 300; trial++) {
+        double v[40], sum = 0.0, after = 0.0;
+        const size_t n = 1 + test_random_bits(&rng) % 40;
+        for (size_t i = 0; i < n; i++) {
+            v[i] = trial % 3 ? uniform(-1.0, 1.0) : (double)(test_random_bits(&rng) % 4);
+            sum += v[i] * v[i];
+        }
+        gsf__traj_sort(v, n);
+        for (size_t i = 0; i < n; i++) after += v[i] * v[i];
+        for (size_t i = 1; i < n; i++) CHECK(v[i - 1] <= v[i]);
+        CHECK_NEAR(after, sum, 1e-12 * (1.0 + sum));
+        CHECK_NEAR(gsf__traj_percentile(v, n, 0.5), gsf__traj_median(v, n), 1e-15);
+        CHECK(gsf__traj_percentile(v, n, 0.0) == v[0]);
+        CHECK(gsf__traj_percentile(v, n, 1.0) == v[n - 1]);
+
+        double a[9], values[3], rows[9];
+        const double scale = pow(10.0, uniform(-100.0, 100.0));
+        for (int i = 0; i < 3; i++)
+            for (int j = 0; j <= i; j++) a[3 * i + j] = a[3 * j + i] = scale * uniform(-1.0, 1.0);
+        if (trial % 5 == 0) a[0] = a[4] = a[8] = scale;
+        if (trial % 7 == 0) a[1] = a[3] = a[2] = a[6] = 0.0;
+        gsf__traj_eigen(a, values, rows);
+        CHECK(values[0] >= values[1] && values[1] >= values[2]);
+        for (int k = 0; k < 3; k++)
+            for (int i = 0; i < 3; i++) {
+                const double* r = rows + 3 * k;
+                const double row = a[3 * i] * r[0] + a[3 * i + 1] * r[1] + a[3 * i + 2] * r[2];
+                CHECK_NEAR(row, values[k] * r[i], 4e-14 * scale);
+                const double* q = rows + 3 * i;
+                CHECK_NEAR(q[0] * r[0] + q[1] * r[1] + q[2] * r[2], i == k, 1e-14);
+            }
+    }
+}
+
+static void test_rotations(void) {
+    for (int trial = 0; trial < 300; trial++) {
+        double q[4], p[4], pose[16], back[4], other[16], half[16], out[4];
+        for (int i = 0; i < 4; i++) q[i] = trial < 8 ? (double)(i == trial % 4) : uniform(-1.0, 1.0);
+        for (int i = 0; i < 4; i++) p[i] = uniform(-1.0, 1.0);
+        memset(pose, 0, sizeof pose);
+        memset(other, 0, sizeof other);
+        CHECK_OK(&ctx, gsf_traj_set_pose_quat(&ctx, q, pose));
+        CHECK_OK(&ctx, gsf_traj_set_pose_quat(&ctx, p, other));
+        CHECK(rigidity(pose) < 1e-14);
+        gsf_traj_pose_quat(pose, back);
+        gsf_traj_pose_quat(other, p);
+        const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        double dot = 0.0;
+        for (int i = 0; i < 4; i++) dot += back[i] * q[i] / length;
+        CHECK_NEAR(fabs(dot), 1.0, 1e-14);
+        // slerp: ends, and the angle grows evenly
+        double angle[5];
+        for (int k = 0; k < 5; k++) {
+            gsf_traj_slerp(back, p, 0.25 * k, out);
+            double c = 0.0;
+            for (int i = 0; i < 4; i++) c += out[i] * back[i];
+            angle[k] = 2.0 * acos(fabs(c) > 1.0 ? 1.0 : fabs(c));
+        }
+        for (int k = 1; k < 4; k++) CHECK_NEAR(angle[k], 0.25 * k * angle[4], 1e-6);
+        pose[12] = 1.0;
+        other[13] = 4.0;
+        CHECK_OK(&ctx, gsf_traj_slerp_pose(&ctx, pose, other, 0.5, half));
+        CHECK(rigidity(half) < 1e-14);
+        CHECK_NEAR(half[12], 0.5, 1e-15);
+        CHECK_NEAR(half[13], 2.0, 1e-15);
+        CHECK_OK(&ctx, gsf_traj_slerp_pose(&ctx, pose, other, 1.0, half));
+        test_compare("slerp at 1", half, other, 16, 1e-14);
+        CHECK_OK(&ctx, gsf_traj_slerp_pose(&ctx, pose, pose, 0.3, pose)); // coincident, in place
+        CHECK(rigidity(pose) < 1e-14);
+    }
+}
+
+// A spline of degree k gives back every polynomial up to degree k, passes through its values, and stays C(k-1).
+static void test_splines(void) {
+    for (int trial = 0; trial < 200; trial++) {
+        const int32_t degree = 1 + trial % 5;
+        const size_t n = (size_t)degree + 1 + test_random_bits(&rng) % 12, dims = 1 + (size_t)trial % 4;
+        double sites[32], values[32 * 4], at[40], expected[40 * 4], coefficients[6 * 4];
+        sites[0] = uniform(-1.0, 1.0);
+        for (size_t i = 1; i < n; i++) sites[i] = sites[i - 1] + uniform(0.3, 1.0);
+        for (size_t i = 0; i < 24; i++) coefficients[i] = uniform(-1.0, 1.0);
+        for (int i = 0; i < 40; i++) at[i] = sites[0] + (sites[n - 1] - sites[0]) * i / 39.0;
+        for (size_t d = 0; d < dims; d++)
+            for (int i = 0; i < 40 + (int)n; i++) {
+                const double x = (i < 40 ? at[i] : sites[i - 40]) / sites[n - 1];
+                double sum = 0.0;
+                for (int k = degree; k >= 0; k--) sum = sum * x + coefficients[4 * k + (int)d];
+                if (i < 40) expected[(size_t)i * dims + d] = sum;
+                else values[(size_t)(i - 40) * dims + d] = sum;
+            }
+        void* scratch = take(gsf_traj_spline_scratch(n, degree, dims));
+        double* out = (double*)take(40 * dims * sizeof(double));
+        CHECK_OK(&ctx, gsf_traj_spline(&ctx, sites, values, n, dims, degree, at, 40, scratch, out));
+        test_compare("polynomial", out, expected, 40 * dims, 1e-9 * (1.0 + test_max_abs(expected, 40 * dims)));
+        for (size_t i = 0; i < n * dims; i++) values[i] = uniform(-1.0, 1.0);
+        CHECK_OK(&ctx, gsf_traj_spline(&ctx, sites, values, n, dims, degree, sites, n, scratch, out));
+        test_compare("interpolation", out, values, n * dims, 1e-10);
+        free(out);
+        free(scratch);
+    }
+    CHECK(gsf_traj_spline_scratch(SIZE_MAX / 8, 3, 3) == SIZE_MAX);
+    CHECK(gsf_traj_spline_scratch(4, 9, 3) == SIZE_MAX);
+    CHECK(gsf_traj_normalize_scratch(4, SIZE_MAX / 4) == SIZE_MAX);
+    for (size_t count = 2; count <= 20; count++) { // spline paths pass through their poses, in exact scratch
+        scene s;
+        make_scene(&s, count);
+        double poses[32 * 16];
+        for (size_t i = 0; i < count; i++) gsf_camera_c2w(&s.cameras[i], poses + 16 * i);
+        gsf_traj_spline_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.degree = 1 + (int32_t)count % 5;
+        desc.frames_per_leg = 7;
+        double* out = (double*)take((count - 1) * 7 * 16 * sizeof(double));
+        void* scratch = take(gsf_traj_spline_path_scratch(count, &desc));
+        CHECK_OK(&ctx, gsf_traj_spline_path(&ctx, poses, count, &desc, scratch, out));
+        test_compare("first pose", out, poses, 16, 1e-12);
+        for (size_t i = 0; i < (count - 1) * 7; i++) CHECK(rigidity(out + 16 * i) < 1e-12);
+        free(scratch);
+        free(out);
+        out = (double*)take(((count - 1) * 5 + 1) * 16 * sizeof(double));
+        scratch = take(gsf_traj_slerp_path_scratch(count));
+        CHECK_OK(&ctx, gsf_traj_slerp_path(&ctx, poses, count, (int32_t)(count - 1) * 5 + 1, 0.0, scratch, out));
+        for (size_t i = 0; i < count; i++) test_compare("slerp path", out + 80 * i, poses + 16 * i, 16, 1e-10);
+        free(scratch);
+        free(out);
+    }
+}
+
+static void test_sets_of_views(void) {
+    for (int trial = 0; trial < 100; trial++) {
+        const size_t n = 3 + (size_t)trial % 8;
+        double poses[16 * 16], out[16 * 16], transform[16], focus[3], center[3], radius;
+        const double target[3] = {uniform(-5.0, 5.0), uniform(-5.0, 5.0), uniform(-5.0, 5.0)}, up[3] = {0.1, 1.0, 0.2};
+        for (size_t i = 0; i < n; i++) {
+            double eye[3];
+            for (int k = 0; k < 3; k++)
+                eye[k] = target[k] + uniform(0.5, 2.0) * (test_random_bits(&rng) % 2 ? 1.0 : -1.0);
+            CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, poses + 16 * i));
+        }
+        CHECK_OK(&ctx, gsf_traj_focus_point(&ctx, poses, n, focus)); // axes that meet
+        test_compare("focus", focus, target, 3, 1e-10);
+        int32_t index;
+        for (size_t i = 0; i < n; i++) {
+            CHECK_OK(&ctx, gsf_traj_nearest_view(&ctx, poses + 16 * i, poses, n, 0.5, &index, NULL));
+            CHECK((size_t)index == i);
+        }
+        void* scratch = take(gsf_traj_normalize_scratch(n, 0));
+        CHECK_OK(&ctx, gsf_traj_normalize(&ctx, poses, n, NULL, 0, NULL, scratch, transform));
+        free(scratch);
+        gsf_traj_transform_poses(transform, poses, n, out);
+        for (size_t i = 0; i < n; i++) CHECK(rigidity(out + 16 * i) < 1e-13);
+        double back[16];
+        CHECK_OK(&ctx, gsf_traj_invert_similarity(&ctx, transform, back));
+        gsf_traj_transform_poses(back, out, n, out); // in place
+        test_compare("there and back", out, poses, 16 * n, 1e-12 * (1.0 + test_max_abs(poses, 16 * n)));
+        if (gsf_traj_recenter_poses(&ctx, poses, n, 0, out, transform) == GSF_OK) {
+            double mean[16];
+            CHECK_OK(&ctx, gsf_traj_average_pose(&ctx, out, n, 0, mean));
+            const double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+            test_compare("average of recentred poses", mean, identity, 16, 1e-9);
+        }
+        CHECK_OK(&ctx, gsf_traj_pca_poses(&ctx, poses, n, out, transform));
+        CHECK_OK(&ctx, gsf_traj_camera_radius(&ctx, out, n, center, &radius));
+        for (int k = 0; k < 3; k++) CHECK_NEAR(center[k], 0.0, 1e-12);
+        double most = 0.0;
+        for (size_t i = 0; i < n; i++) most = fmax(most, test_max_abs(out + 16 * i + 12, 3));
+        CHECK_NEAR(most, 1.0, 1e-12);
+    }
+}
+
+static void test_intrinsics(void) {
+    scene s;
+    make_scene(&s, 1);
+    gsf_camera camera = s.cameras[0], small;
+    camera.width = 1001;
+    camera.height = 667;
+    small = gsf_traj_reduce_camera(&camera, 4, 250, 166); // as its own 1001 / 4 x 667 / 4: nothing but the factor
+    CHECK(small.fx == camera.fx / 4 && small.cy == camera.cy / 4 && small.width == 250 && small.height == 166);
+    small = gsf_traj_reduce_camera(&camera, 1, 2002, 667);
+    CHECK(small.fx == 2.0 * camera.fx && small.fy == camera.fy);
+    small = gsf_traj_crop_camera(&camera, 10, 20, 100, 90);
+    CHECK(small.cx == camera.cx - 10.0 && small.cy == camera.cy - 20.0 && small.width == 100 && small.height == 90);
+    CHECK_NEAR(gsf_traj_fov_from_focal(50.0, 100.0), 1.5707963267948966, 1e-15);
+    double projection[16], full[16];
+    CHECK_OK(&ctx, gsf_traj_projection(&ctx, &camera, 0.01, 100.0, projection));
+    gsf_mat4_mul(projection, camera.w2c, full);
+    for (int i = 0; i < 50; i++) { // clip space against pixels
+        const double p[3] = {uniform(-0.3, 0.3), uniform(-0.3, 0.3), uniform(-0.3, 0.3)};
+        double u, v, depth, clip[4];
+        if (!CHECK(gsf_camera_project(&camera, p, &u, &v, &depth))) continue;
+        for (int r = 0; r < 4; r++) clip[r] = full[r] * p[0] + full[4 + r] * p[1] + full[8 + r] * p[2] + full[12 + r];
+        CHECK_NEAR((clip[0] / clip[3] + 1.0) * 0.5 * camera.width, u, 1e-9);
+        CHECK_NEAR((clip[1] / clip[3] + 1.0) * 0.5 * camera.height, v, 1e-9);
+        CHECK_NEAR(clip[3], depth, 1e-12);
+    }
+}
+
+static void test_schedule(void) {
+    size_t count;
+    int64_t rounds[8];
+    gsf_traj_repair_rounds(100, 50, 99, NULL, &count);
+    CHECK(count == 0);
+    gsf_traj_repair_rounds(100, 50, 210, rounds, &count);
+    CHECK(count == 3 && rounds[0] == 100 && rounds[2] == 200);
+    gsf_traj_repair_rounds(100, 0, 210, rounds, &count);
+    CHECK(count == 1 && rounds[0] == 100);
+    CHECK(gsf_traj_generative_weight(10, 10, 20, 1.0, 0) == 0.0);
+    CHECK(gsf_traj_generative_weight(20, 10, 20, 1.0, 0) == 0.0);
+    for (int i = 12; i < 20; i++) // rises all the way; the released one falls again
+        CHECK(gsf_traj_generative_weight(i, 10, 20, 2.0, 0) > gsf_traj_generative_weight(i - 1, 10, 20, 2.0, 0));
+    CHECK(gsf_traj_generative_weight(19, 10, 20, 2.0, 1) < gsf_traj_generative_weight(15, 10, 20, 2.0, 1));
+    for (int32_t total = 1; total < 300; total++) // released tables: inside the sequence, or refused
+        for (int32_t middle = 1; middle < 40; middle++) {
+            int32_t windows, starts[310], overlaps[310];
+            if (gsf_traj_official_windows(&ctx, total, middle, NULL, NULL, &windows) != GSF_OK) {
+                CHECK(windows == 0);
+                continue;
+            }
+            if (!CHECK(windows <= 310)) continue;
+            CHECK_OK(&ctx, gsf_traj_official_windows(&ctx, total, middle, starts, overlaps, &windows));
+            int wrong = starts[0] != 0;
+            for (int32_t w = 1; w < windows; w++) {
+                wrong += starts[w] < 0 || starts[w] + middle > total;
+                wrong += starts[w] != starts[w - 1] + middle - overlaps[w];
+            }
+            CHECK(wrong == 0);
+        }
+}
+
+int main(void) {
+    test_context_init(&ctx);
+    test_order_and_eigen();
+    test_rotations();
+    test_splines();
+    test_sets_of_views();
+    test_intrinsics();
+    test_schedule();
+    test_defaults();
+    test_all_sizes();
+    test_invariance();
+    test_degenerate_cameras();
+    test_degenerate_primitives();
+    test_not_finite();
+    test_not_finite_primitives();
+    return test_report();
+}
