@@ -298,8 +298,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_load_image_memory(gsf_context* ctx, const c
 // Reads only the header.
 GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
                                                  int32_t* channels);
-// Writes by extension: .png (u8, from any dtype), .jpg (quality 95) and, with GSF_USE_OIIO, .exr (f16 or else f32), .tif
-// (dtype kept, f16 as f32) and u16 images as 16-bit .png.
+// Writes by extension: .png (u8, from any dtype), .jpg (quality 95) and, with GSF_USE_OIIO, .exr (f16 or else f32),
+// .tif (dtype kept, f16 as f32) and u16 images as 16-bit .png.
 GSF_API GSF_NODISCARD gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image);
 // PNG or JPEG bytes in memory (reports embed them). `extension` is ".png" or ".jpg".
 GSF_API GSF_NODISCARD gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension,
@@ -328,8 +328,8 @@ typedef enum gsf_ssim_kind {
 // Images of any dtype, also of two (floats in [0,1], integers stand for value / maximum), equal sizes and channels. All
 // sums in double, in a fixed order. A NaN or infinity that counts gives GSF_ERROR_NUMERIC.
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
-// them). With no pixel to count, or an image smaller than the window needs (6 pixels for TORCHMETRICS, 7 for SKIMAGE), the
-// result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), of identical images +infinity.
+// them). With no pixel to count, or an image smaller than the window needs (6 pixels for TORCHMETRICS, 7 for SKIMAGE),
+// the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), of identical images +infinity.
 GSF_API GSF_NODISCARD gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
                                           const gsf_image* mask, double* out);
 GSF_API GSF_NODISCARD gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
@@ -366,8 +366,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_load_cameras(gsf_context* ctx, const char* 
                                                   size_t* count);
 
 // ---- restorer interface --------------------------------------------------------
-// What turns artifact-ridden renders into clean frames. The repair loop of gsfixer_splat.h sees only this struct; a host
-// fills in its own functions, or takes one of the toolkit's (warp in gsfixer_splat.h, the video model in gsfixer_nn.h).
+// What turns artifact-ridden renders into clean frames. The repair loop of gsfixer_splat.h sees only this struct; a
+// host fills in its own functions, or takes one of the toolkit's (warp in gsfixer_splat.h, the video model in
+// gsfixer_nn.h).
 
 typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
     int32_t frame_count_min, frame_count_max;
@@ -598,8 +599,9 @@ GSF__SHARED void gsf__store_le(void* data, uint64_t value, int bytes) {
 
 enum { GSF__DECIMAL_DIGITS = 800 }; // more than the 767 that can decide how a double rounds
 
-// Reads [+-]digits[.digits][e[+-]digits] at the start of `text`: correctly rounded and independent of the locale (strtod
-// only ever sees digits and an exponent). Returns the bytes read, 0 where there is no number. Too large gives infinity.
+// Reads [+-]digits[.digits][e[+-]digits] at the start of `text`: correctly rounded and independent of the locale
+// (strtod only ever sees digits and an exponent). Returns the bytes read, 0 where there is no number. Too large gives
+// infinity.
 GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) {
     static const double powers[23] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
                                       1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
@@ -1009,7 +1011,8 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
         }
         if (first && fseek(file, 0, SEEK_END) == 0) { // the rest at once where the file can tell; pipes simply grow
             const long end = ftell(file);
-            if (end >= 0 && (unsigned long)end >= buffer.size) step = (size_t)end - buffer.size + 1; // + 1: sees the end
+            if (end >= 0 && (unsigned long)end >= buffer.size)
+                step = (size_t)end - buffer.size + 1;  // + 1: sees the end
             if (fseek(file, (long)buffer.size, SEEK_SET) != 0) {
                 result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
                 break;
@@ -1037,8 +1040,8 @@ static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to
 static int gsf__is_device(const char* path) { (void)path; return 0; }
 #endif
 
-// Writes <path>.tmp and renames it, so that path always holds a whole file, also after a kill (not after a power cut: the
-// data is not forced to the disk).
+// Writes <path>.tmp and renames it, so that path always holds a whole file, also after a kill (not after a power cut:
+// the data is not forced to the disk).
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     (void)user;
     const int device = gsf__is_device(path);
@@ -1478,7 +1481,8 @@ static gsf_result gsf__json_read_document(gsf__json_parser* p) {
                 p->at++;
                 break;
             }
-            if (gsf__json_peek(p) != (is_object ? '}' : ']')) return gsf__json_fail(p, is_object ? "',' or '}'" : "',' or ']'");
+            if (gsf__json_peek(p) != (is_object ? '}' : ']'))
+                return gsf__json_fail(p, is_object ? "',' or '}'" : "',' or ']'");
             p->at++;
             depth--;
             if (is_object) GSF__TRY(gsf__json_refuse_duplicates(p, owner));
@@ -1728,7 +1732,8 @@ static void gsf__convert_rows(void* arg, size_t chunk, int worker) {
     double run[GSF__CONVERT_RUN];
     for (int64_t y = first; y < end; y++)
         for (int32_t c = 0; c < dst->channels; c++) {
-            const char* from = (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
+            const char* from =
+                (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
             char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
             for (int64_t x = 0; x < dst->width; x += GSF__CONVERT_RUN) {
                 const int64_t left = dst->width - x;
@@ -1806,8 +1811,8 @@ static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const cha
 
 #ifndef GSF_NO_STB
 
-// Huffman tables of a JPEG: stb writes past its arrays when one claims more than 256 symbols. Walks the markers as stb does;
-// a file that ends early is left to the decoder's own detection.
+// Huffman tables of a JPEG: stb writes past its arrays when one claims more than 256 symbols. Walks the markers as stb
+// does; a file that ends early is left to the decoder's own detection.
 static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsigned char* data, size_t size) {
     for (size_t at = 2; at + 4 <= size;) {
         const unsigned marker = data[at + 1];
@@ -1821,7 +1826,8 @@ static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsi
         if (marker == 0xc4)
             for (size_t table = at + 4; table < end;) {
                 size_t symbols = 0;
-                if (size < 17 || table > size - 17) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is cut", name, size);
+                if (size < 17 || table > size - 17)
+                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is cut", name, size);
                 for (size_t i = 1; i <= 16; i++) symbols += data[table + i];
                 if (symbols > 256 || table + 17 + symbols > end)
                     return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG table of %zu symbols", name, table, symbols);
@@ -1832,8 +1838,8 @@ static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsi
     return GSF_OK;
 }
 
-// Bytes for stb, from memory or a stdio file. `overrun` tells that it wanted more than there is: stb itself goes on with
-// zeros, which would turn a cut photo into a half grey one.
+// Bytes for stb, from memory or a stdio file. `overrun` tells that it wanted more than there is: stb itself goes on
+// with zeros, which would turn a cut photo into a half grey one.
 typedef struct gsf__stb_source {
     const char* data;
     size_t size, at;
@@ -1909,7 +1915,8 @@ static int gsf__source_u16(gsf__stb_source* source) { // big-endian
     return high < 0 || low < 0 ? -1 : high << 8 | low;
 }
 
-// Size of a JPEG from its frame header, behind the two bytes of the start marker. stb would parse tables on the way there.
+// Size of a JPEG from its frame header, behind the two bytes of the start marker. stb would parse tables on the way
+// there.
 static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
                                   int64_t* height, int32_t* channels) {
     for (;;) {
@@ -1951,7 +1958,8 @@ static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_so
     return GSF_OK;
 }
 
-// stb's own scratch memory and the decoded pixels come from malloc (it has no hook with a context) and are gone on return.
+// stb's own scratch memory and the decoded pixels come from malloc (it has no hook with a context) and are gone on
+// return.
 static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
                                 gsf_image* out) {
     gsf__stb_source source = gsf__stb_memory(data, size);
@@ -2009,7 +2017,8 @@ GSF_API gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, con
     const int jpeg = size > 2 && bytes[0] == 0xff && bytes[1] == 0xd8;
     const int stb_reads = jpeg || stbi_info_from_callbacks(&callbacks, &source, &w, &h, &c);
     source = gsf__stb_memory(data, size);
-    if (!stb_reads || (!jpeg && stbi_is_16_bit_from_callbacks(&callbacks, &source))) // eight-bit files: the same in all builds
+    if (!stb_reads ||
+        (!jpeg && stbi_is_16_bit_from_callbacks(&callbacks, &source)))  // eight-bit files: the same in all builds
         return gsf__oiio_load(ctx, name, data, size, channels, out);
 #endif
 #endif
@@ -2096,8 +2105,9 @@ static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gs
         user[0] = ctx;
         user[1] = out;
         const int w = (int)image->width, h = (int)image->height;
-        const int ok = png ? stbi_write_png_to_func(gsf__stb_write, user, w, h, channels, packed.data, w * channels)
-                           : stbi_write_jpg_to_func(gsf__stb_write, user, w, h, channels, packed.data, GSF__JPEG_QUALITY);
+        const int ok =
+            png ? stbi_write_png_to_func(gsf__stb_write, user, w, h, channels, packed.data, w * channels)
+                : stbi_write_jpg_to_func(gsf__stb_write, user, w, h, channels, packed.data, GSF__JPEG_QUALITY);
         if (!ok || out->failed) {
             out->size = before;
             result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory while encoding", name);
@@ -2173,7 +2183,10 @@ static gsf_result gsf__make_pil_axis(gsf_context* ctx, gsf_resize_filter filter,
     axis->out = out;
     if (in == out) return GSF_OK;
     const double scale = (double)in / (double)out, widened = scale < 1.0 ? 1.0 : scale, narrow = 1.0 / widened;
-    const double support = (filter == GSF_RESIZE_PIL_BILINEAR ? 1.0 : filter == GSF_RESIZE_PIL_BICUBIC ? 2.0 : 3.0) * widened;
+    const double support = (filter == GSF_RESIZE_PIL_BILINEAR  ? 1.0
+                            : filter == GSF_RESIZE_PIL_BICUBIC ? 2.0
+                                                               : 3.0) *
+                           widened;
     axis->taps = 2 * (size_t)ceil(support) + 1;
     size_t weights;
     if (!gsf__mul_size(axis->taps, (size_t)out, &weights) || weights > SIZE_MAX / 32)
@@ -2221,11 +2234,13 @@ static void gsf__resize_rows_x(void* arg, size_t chunk, int worker) {
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
     const gsf__resize_axis* axis = job->axis;
-    const int64_t start = (int64_t)chunk * job->rows, end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    const int64_t start = (int64_t)chunk * job->rows,
+                  end = start + job->rows < dst->height ? start + job->rows : dst->height;
     for (int64_t y = start; y < end; y++)
         for (int64_t x = 0; x < dst->width; x++)
             for (int32_t c = 0; c < dst->channels; c++) {
-                const char* from = (const char*)src->data + y * src->stride_y + axis->first[x] * src->stride_x + c * src->stride_c;
+                const char* from =
+                    (const char*)src->data + y * src->stride_y + axis->first[x] * src->stride_x + c * src->stride_c;
                 char* to = (char*)dst->data + y * dst->stride_y + x * dst->stride_x + c * dst->stride_c;
                 const int64_t count = axis->count[x];
                 if (src->dtype == GSF_U8) {
@@ -2253,14 +2268,16 @@ static void gsf__resize_rows_y(void* arg, size_t chunk, int worker) {
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
     const gsf__resize_axis* axis = job->axis;
-    const int64_t start = (int64_t)chunk * job->rows, end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    const int64_t start = (int64_t)chunk * job->rows,
+                  end = start + job->rows < dst->height ? start + job->rows : dst->height;
     int32_t sums[GSF__RESIZE_RUN];
     double wide[GSF__RESIZE_RUN];
     for (int64_t y = start; y < end; y++)
         for (int32_t c = 0; c < dst->channels; c++)
             for (int64_t x = 0; x < dst->width; x += GSF__RESIZE_RUN) {
                 const int64_t left = dst->width - x, n = left < GSF__RESIZE_RUN ? left : (int64_t)GSF__RESIZE_RUN;
-                const char* from = (const char*)src->data + axis->first[y] * src->stride_y + x * src->stride_x + c * src->stride_c;
+                const char* from =
+                    (const char*)src->data + axis->first[y] * src->stride_y + x * src->stride_x + c * src->stride_c;
                 char* to = (char*)dst->data + y * dst->stride_y + x * dst->stride_x + c * dst->stride_c;
                 const int64_t sx = src->stride_x, dx = dst->stride_x;
                 for (int64_t i = 0; i < n; i++) {
@@ -2362,7 +2379,8 @@ static void gsf__resize_rows_torch(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__torch_job* job = (const gsf__torch_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
-    const int64_t start = (int64_t)chunk * job->rows, end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    const int64_t start = (int64_t)chunk * job->rows,
+                  end = start + job->rows < dst->height ? start + job->rows : dst->height;
     for (int64_t y = start; y < end; y++) {
         const gsf__torch_tap r = gsf__torch_position(y, src->height, dst->height);
         for (int32_t c = 0; c < dst->channels; c++) {
@@ -2465,17 +2483,18 @@ static void gsf__psnr_rows(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__psnr_job* job = (const gsf__psnr_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
-    const int64_t first = (int64_t)chunk * job->rows, end = first + job->rows < a->height ? first + job->rows : a->height;
+    const int64_t first = (int64_t)chunk * job->rows,
+                  end = first + job->rows < a->height ? first + job->rows : a->height;
     double pa[GSF__CONVERT_RUN], pb[GSF__CONVERT_RUN], sum = 0.0;
     uint64_t count = 0;
     for (int64_t y = first; y < end; y++)
         for (int32_t c = 0; c < a->channels; c++)
             for (int64_t x = 0; x < a->width; x += GSF__CONVERT_RUN) {
                 const int64_t left = a->width - x, n = left < GSF__CONVERT_RUN ? left : (int64_t)GSF__CONVERT_RUN;
-                gsf__load_pixels((const char*)a->data + y * a->stride_y + x * a->stride_x + c * a->stride_c, a->stride_x,
-                                 a->dtype, (size_t)n, pa);
-                gsf__load_pixels((const char*)b->data + y * b->stride_y + x * b->stride_x + c * b->stride_c, b->stride_x,
-                                 b->dtype, (size_t)n, pb);
+                gsf__load_pixels((const char*)a->data + y * a->stride_y + x * a->stride_x + c * a->stride_c,
+                                 a->stride_x, a->dtype, (size_t)n, pa);
+                gsf__load_pixels((const char*)b->data + y * b->stride_y + x * b->stride_x + c * b->stride_c,
+                                 b->stride_x, b->dtype, (size_t)n, pb);
                 for (int64_t i = 0; i < n; i++)
                     if (gsf__mask_at(job->mask, x + i, y)) {
                         sum += (pa[i] - pb[i]) * (pa[i] - pb[i]);
@@ -2505,12 +2524,13 @@ GSF_API gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_imag
     return result;
 }
 
-/* SSIM, separable: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring of as many rows
-   as the window is high; a map row is the ring blurred along y. Chunks of rows warm up their own ring. */
+/* SSIM, separable: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring of as many
+   rows as the window is high; a map row is the ring blurred along y. Chunks of rows warm up their own ring. */
 
 enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
 
-// out[i] = sum over t of weights[t] * rows[t][i], t ascending; the AVX2 twin does the same operations on four i at once.
+// out[i] = sum over t of weights[t] * rows[t][i], t ascending; the AVX2 twin does the same operations on four i at
+// once.
 static void gsf__ssim_blur_ref(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
     for (size_t i = 0; i < n; i++) {
         double sum = weights[0] * rows[0][i];
@@ -2520,8 +2540,8 @@ static void gsf__ssim_blur_ref(double* out, const double* const* rows, const dou
 }
 
 #if GSF__X86
-GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* const* rows, const double* weights, int taps,
-                                                 size_t n) {
+GSF__TARGET_AVX2 static void gsf__ssim_blur_avx2(double* out, const double* const* rows, const double* weights,
+                                                 int taps, size_t n) {
     size_t i = 0;
     for (; i + 8 <= n; i += 8) {
         const __m256d w = _mm256_set1_pd(weights[0]);
@@ -2648,8 +2668,8 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int worker) {
 
 GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
                             const gsf_image* mask, double* out) {
-    // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5: rounded to float32 as the 3DGS code has it, and in double as torchmetrics
-    // has it for double images
+    // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5: rounded to float32 as the 3DGS code has it, and in double as
+    // torchmetrics has it for double images
     static const double gauss[2][6] = {{0.26601171493530273, 0.21300552785396576, 0.10936068743467331,
                                         0.036000773310661316, 0.0075987582094967365, 0.001028380123898387},
                                        {0.26601172486179436, 0.21300553771125369, 0.10936068950970002,
@@ -2893,10 +2913,9 @@ GSF_API gsf_result gsf_load_cameras(gsf_context* ctx, const char* path, gsf_came
     return result;
 }
 
-
 // ---- >>oiio --------------------------------------------------------------------
-// Everything passes through memory, so the io hook and the atomic write serve these formats too. OpenImageIO allocates with
-// new and keeps its own worker threads; nothing it throws leaves this section.
+// Everything passes through memory, so the io hook and the atomic write serve these formats too. OpenImageIO allocates
+// with new and keeps its own worker threads; nothing it throws leaves this section.
 
 #ifdef GSF_USE_OIIO
 
@@ -2927,7 +2946,8 @@ static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void*
     if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
     std::unique_ptr<OIIO::ImageInput> input =
         format ? OIIO::ImageInput::create(format) : OIIO::ImageInput::open(name, nullptr, memory);
-    if (!input) return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "not an image that this build reads", OIIO::geterror());
+    if (!input)
+        return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "not an image that this build reads", OIIO::geterror());
     if (!input->supports("ioproxy"))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: OpenImageIO does not read %s from memory", name,
                         input->format_name());
@@ -2968,8 +2988,8 @@ static OIIO::TypeDesc gsf__oiio_type(gsf_dtype dtype) {
     return OIIO::TypeDesc::UNKNOWN;
 }
 
-// src (n channels) to dst (1, 3 or 4) of the same dtype, by the rules stb has for its files: grey spreads, colour becomes
-// luma (77 R + 150 G + 29 B) / 256, a missing alpha is 1.
+// src (n channels) to dst (1, 3 or 4) of the same dtype, by the rules stb has for its files: grey spreads, colour
+// becomes luma (77 R + 150 G + 29 B) / 256, a missing alpha is 1.
 static void gsf__oiio_channels(const gsf_image* src, const gsf_image* dst) {
     double run[3][GSF__CONVERT_RUN];
     const int is_color = src->channels >= 3;
@@ -3055,7 +3075,8 @@ static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char
     const char* format = exr ? "openexr" : tiff ? "tiff" : png ? "png" : extension + (*extension == '.');
     std::unique_ptr<OIIO::ImageOutput> output = OIIO::ImageOutput::create(format);
     if (!output || !output->supports("ioproxy"))
-        return gsf__oiio_fail(ctx, name, GSF_ERROR_UNSUPPORTED, "this build does not write such files", OIIO::geterror());
+        return gsf__oiio_fail(ctx, name, GSF_ERROR_UNSUPPORTED, "this build does not write such files",
+                              OIIO::geterror());
     gsf_image packed;
     GSF__TRY(gsf_make_image(ctx, dtype, image->width, image->height, image->channels, &packed));
     gsf_result result = gsf_convert_image(ctx, image, &packed);
