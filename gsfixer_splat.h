@@ -17,7 +17,7 @@
 
    SECTIONS    >>splats >>ply >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility >>embree
                >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward >>render
-               >>loss >>adam >>densify >>trainer >>warp >>fixer
+               >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
 #ifndef GSF_SPLAT_INCLUDED
@@ -244,6 +244,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf
 // Radii in pixels (0 = culled) of the last render, (count); valid until the next render.
 GSF_API const int32_t* gsf_splat_last_radii(const gsf_rasterizer* rasterizer);
 
+// For each pixel of `camera`: 1 where its 3D point, taken from the depth of `splats` (a good model, say of all views), is
+// seen by at least one of the other cameras (inside its image and not behind its own depth by more than 5 %), else 0.
+// mask: u8, one channel, of the camera's size. Pixels with alpha below 0.5 are 0.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera,
+                                                     const gsf_camera* seeing, size_t seeing_count, const gsf_image* mask);
+
 // ---- training ------------------------------------------------------------------
 
 typedef struct gsf_train_view {
@@ -331,6 +337,60 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf
 // confidence, keeps the render where no reference sees. Fills *out; out->user is freed by gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
+
+// ---- the repair loop -----------------------------------------------------------
+/* Trains, and at set iterations runs a round: sample a path, render it window by window, have the restorer fix the frames,
+   and train on with the fixed frames beside the photos: L = L_recon + lambda * L_gen. A new round's frames replace the
+   old ones. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at any time.
+       gsf_splat_make_fixer -> gsf_splat_fix_step until stats.stage is GSF_FIX_DONE -> gsf_splat_trainer_export */
+
+typedef struct gsf_fix_desc {
+    gsf_train_desc train;         // the whole run; train.iterations counts all steps
+    gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
+    const double* points;         // (point_count,3) world points for the path's principal axes; NULL = cameras only.
+    size_t point_count;           //   Borrowed until the fixer is destroyed
+    int32_t rounds;               // restoration rounds, default 2; < 0: none
+    int32_t first_round;          // iteration before which the first round runs; 0 = 1/3 of the iterations
+    int32_t last_round;           // the others are spread evenly up to this iteration; 0 = 2/3 of the iterations
+    int32_t windows;              // per round; 0 = one per training view, at least 2
+    int32_t window_frames;        // 0 = 17, moved to the nearest count the restorer takes
+    float lambda;                 // weight of the restored views at the end of training, default 1
+    float skip_psnr;              // a window is not restored when its render agrees with the references' warp to this many
+                                  // dB over the pixels that they explain; 0 = never skip
+    int32_t max_pixels;           // longer frames are rendered smaller for the restorer; 0 = photo size
+} gsf_fix_desc;
+
+typedef enum gsf_fix_stage { GSF_FIX_TRAIN = 0, GSF_FIX_PLAN, GSF_FIX_RESTORE, GSF_FIX_DONE } gsf_fix_stage;
+
+typedef struct gsf_fix_stats { // what the last step did
+    gsf_fix_stage stage;
+    gsf_train_stats train;            // of the last training step
+    float lambda;
+    int32_t round, rounds;            // 1-based round that is planned or restored
+    int32_t window, windows;          // likewise
+    int32_t skipped;                  // windows skipped so far
+    int32_t frame_count;              // RESTORE: frames of this window, borrowed until the next step:
+    const gsf_camera* cameras;        // of the frames
+    const gsf_image *rendered, *restored, *confidence; // f32; restored is NULL where the window was skipped
+    const int32_t* reference_index;   // per frame: the training view that it is, or -1
+} gsf_fix_stats;
+
+typedef struct gsf_fixer gsf_fixer;
+
+// Views and splats are copied; the restorer (NULL: plain training) is borrowed until the fixer is destroyed.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc,
+                                                      const gsf_train_view* views, size_t view_count,
+                                                      const gsf_splats* initial, const gsf_restorer* restorer,
+                                                      gsf_fixer** out);
+GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* fixer);
+// One training iteration, or the planning of a round, or one window. After an error (or cancel) the fixer stays usable.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
+// The trainer inside, for rendering and export.
+GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer);
+// Checkpoint between steps, continued bit-identically by a fixer made from the same desc, views and initial splats.
+GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* fixer, gsf_text* chunks);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* fixer, const char* name,
+                                                         const void* chunks, size_t size);
 
 #ifdef __cplusplus
 }
@@ -3927,6 +3987,11 @@ static void gsf__rotation(const float q[4], float R[9]) {
 }
 
 static float gsf__dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+static void gsf__cross3(const float* a, const float* b, float* out) {
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
 
 // Screen-space covariance of splat i. Returns 0 when it is culled by the near plane or not finite.
 static int gsf__project_splat(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__projection* p) {
@@ -3979,7 +4044,9 @@ static int gsf__project_splat(const gsf__view* view, const gsf_splats* splats, s
         p->compensation = sqrtf(ratio > GSF__AA_FLOOR ? ratio : GSF__AA_FLOOR);
     }
     const float sum = p->det + p->cov_a + p->cov_c + p->opacity + p->t[0] + p->t[1] + p->t[2];
-    return isfinite(sum) && p->det > 0.0f;
+    for (size_t k = 0; k < 3; k++) // -inf would pass as a flat splat, an infinite logit as an opaque one
+        if (!isfinite(splats->log_scales[3 * i + k])) return 0;
+    return isfinite(sum) && isfinite(splats->opacity_logits[i]) && p->det > 0.0f;
 }
 
 // Real spherical harmonics of the 3DGS convention for a unit direction; fills `count` values (1, 4, 9 or 16).
@@ -4766,26 +4833,38 @@ static void gsf__project_backward(const gsf__view* view, const gsf_splats* splat
 
     // ln alpha = -1/2 (a e^2 + q dy^2): derivatives with respect to the screen mean
     const float du = a * se, dv = b * se + q * sy;
-    // and to the covariance: 1/2 sum p (K d)(K d)^T, K d = (a e, b e + q dy); cov_b counted once for both entries
-    float d_cov_a = 0.5f * a * a * see;
-    float d_cov_b = a * (b * see + q * sey);
-    float d_cov_c = 0.5f * (b * b * see + 2.0f * b * q * sey + q * q * syy);
+    // and to V (cov = V V^T + blur): sum p (K d)(K d)^T V. With K d = (a e, b e + q dy) and K V_c = (a g_c, b g_c + q V1c),
+    // g = V0 - kx V1, everything is a sum of like-sized terms. g itself comes from the minors n = V0 x V1,
+    // cov_c g = blur V0 + V1 x n: for a needle the plain difference has no digit left.
+    const float *V0 = p.V, *V1 = p.V + 3;
+    float n[3], g[3], dV[6], d_log_scale[3];
+    gsf__cross3(V0, V1, n);
+    float V1_n[3], n_V0[3];
+    gsf__cross3(V1, n, V1_n);
+    gsf__cross3(n, V0, n_V0);
+    for (int c = 0; c < 3; c++) {
+        g[c] = (GSF__BLUR * V0[c] + V1_n[c]) / p.cov_c;
+        const float ag = a * g[c], qv = q * V1[c];
+        dV[c] = a * (ag * see + qv * sey);
+        dV[3 + c] = b * (ag * see + qv * sey) + q * (ag * sey + qv * syy);
+        d_log_scale[c] = ag * ag * see + 2.0f * ag * qv * sey + qv * qv * syy; // (K d . V_c)^2
+    }
     if (view->antialiased && p.det_raw > GSF__AA_FLOOR * p.det) {
-        // ln compensation = 1/2 (ln det_raw - ln det)
-        const float raw_a = p.cov_a - GSF__BLUR, raw_c = p.cov_c - GSF__BLUR;
-        const float hr = 0.5f * sp / p.det_raw, hb = 0.5f * sp / p.det;
-        d_cov_a += hr * raw_c - hb * p.cov_c;
-        d_cov_c += hr * raw_a - hb * p.cov_a;
-        d_cov_b += -2.0f * p.cov_b * (hr - hb);
+        // ln compensation = 1/2 (ln det_raw - ln det); 1/2 ln det_raw by V0: V1 x n / det_raw, by ln s_c: 1 - n_c^2 / det_raw
+        const float raw = sp / p.det_raw;
+        for (int c = 0; c < 3; c++) {
+            dV[c] += raw * V1_n[c] - sp * a * g[c];
+            dV[3 + c] += raw * n_V0[c] - sp * (b * g[c] + q * V1[c]);
+            const float others = n[(c + 1) % 3] * n[(c + 1) % 3] + n[(c + 2) % 3] * n[(c + 2) % 3];
+            d_log_scale[c] += raw * others - sp * (a * g[c] * g[c] + q * V1[c] * V1[c]);
+        }
     }
 
-    // cov = V V^T; V = J T with rows jx (T0 - x T2), jy (T1 - y T2)
+    // V = J T with rows jx (T0 - x T2), jy (T1 - y T2)
     const float inv_z = 1.0f / p.t[2], jx = view->fx * inv_z, jy = view->fy * inv_z;
-    float dV[6], dT[9];
+    float dT[9];
     float d_jx = 0.0f, d_jy = 0.0f, d_x = 0.0f, d_y = 0.0f;
     for (int c = 0; c < 3; c++) {
-        dV[c] = 2.0f * d_cov_a * p.V[c] + d_cov_b * p.V[3 + c];
-        dV[3 + c] = d_cov_b * p.V[c] + 2.0f * d_cov_c * p.V[3 + c];
         d_jx += dV[c] * (p.T[c] - p.x * p.T[6 + c]);
         d_jy += dV[3 + c] * (p.T[3 + c] - p.y * p.T[6 + c]);
         d_x -= dV[c] * jx * p.T[6 + c];
@@ -4847,12 +4926,10 @@ static void gsf__project_backward(const gsf__view* view, const gsf_splats* splat
     if (grads->opacity_logits) // d ln(sigmoid) / d logit = 1 - sigmoid = sigmoid(-logit)
         grads->opacity_logits[i] += sp * gsf__sigmoid(-splats->opacity_logits[i]);
 
-    // T = Q S with Q = W R
     if (grads->log_scales)
-        for (int c = 0; c < 3; c++)
-            grads->log_scales[3 * i + (size_t)c] += dT[c] * p.T[c] + dT[3 + c] * p.T[3 + c] + dT[6 + c] * p.T[6 + c];
+        for (int c = 0; c < 3; c++) grads->log_scales[3 * i + (size_t)c] += d_log_scale[c];
     if (grads->quats) {
-        float dR[9]; // W^T dQ, dQ = dT S
+        float dR[9]; // T = Q S, Q = W R: W^T dQ, dQ = dT S
         for (int r = 0; r < 3; r++)
             for (int c = 0; c < 3; c++)
                 dR[3 * r + c] = (view->W[r] * dT[c] + view->W[3 + r] * dT[3 + c] + view->W[6 + r] * dT[6 + c]) * p.scale[c];
@@ -4989,6 +5066,13 @@ static void gsf__open_tile(float* T, int columns, int rows) {
 static void gsf__put_pixel(const gsf_image* image, int64_t x, int64_t y, int channel, float value) {
     char* at = (char*)image->data + y * image->stride_y + x * image->stride_x + channel * image->stride_c;
     memcpy(at, &value, sizeof value);
+}
+
+static float gsf__get_pixel(const gsf_image* image, int64_t x, int64_t y, int channel) {
+    float value;
+    memcpy(&value, (const char*)image->data + y * image->stride_y + x * image->stride_x + channel * image->stride_c,
+           sizeof value);
+    return value;
 }
 
 static void gsf__blend_chunk(void* arg, size_t index, int worker) {
@@ -7076,7 +7160,997 @@ GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) {
 
 // ---- >>warp --------------------------------------------------------------------
 
+/* Training-free restorer. The references' own depth maps, rendered from the splats, are the geometry: what a reference
+   photo shows lies on them, and floaters in front of the novel camera do not touch them.
+       begin     per reference: a score per pixel from the other references. A point that another reference sees at the
+                 same depth is supported; one that lies in front of what another reference sees is refuted, since that
+                 reference looks through it (free-space violation).
+       restore   per frame: each reference's depth map, cut at depth edges, is drawn as a triangle mesh into a z-buffer of
+                 the frame; per pixel the candidates of all references are grouped by depth, the nearest group of enough
+                 weight wins (occlusion), and its photos are blended by score and angle. Pixels that no reference reaches
+                 keep the render and get confidence 0, so they are not trained on. */
+
+typedef struct gsf__warp_reference {
+    gsf_camera camera;
+    double center[3];
+    float* color;  // (H,W,3)
+    float* depth;  // (H,W), 0 = nothing
+    float* score;  // (H,W), 0..1
+} gsf__warp_reference;
+
+typedef struct gsf__warp {
+    gsf__warp_reference* references;
+    int32_t count;
+} gsf__warp;
+
+#define GSF__WARP_DEPTH_TOLERANCE 0.04f // relative: the same surface
+#define GSF__WARP_EDGE 1.06f            // depth ratio across one pixel above which a surface ends
+#define GSF__WARP_ANGLE 0.35f           // radians: a reference this far off in viewing direction weighs exp(-1/2)
+#define GSF__WARP_GROUP_SHARE 0.35f     // of the heaviest group's weight that a nearer group must have to hide it
+
+static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
+                                  gsf_restorer_limits* out) {
+    const gsf__warp* warp = (const gsf__warp*)user;
+    (void)ctx;
+    memset(out, 0, sizeof *out);
+    out->needs_depth = 1;
+    out->bytes = (double)width * height * (warp->count > 0 ? warp->count : 3) * 24.0;
+    out->flops = (double)width * height * frame_count * 200.0 * (warp->count > 0 ? warp->count : 3);
+    return GSF_OK;
+}
+
+static void gsf__warp_end(void* user, gsf_context* ctx) {
+    gsf__warp* warp = (gsf__warp*)user;
+    for (int32_t i = 0; i < warp->count; i++) gsf_free(ctx, warp->references[i].color);
+    gsf_free(ctx, warp->references);
+    warp->references = NULL;
+    warp->count = 0;
+}
+
+// World point of pixel centre (x,y) at camera depth z.
+static void gsf__unproject(const gsf_camera* camera, double x, double y, double z, double out[3]) {
+    const double* m = camera->w2c;
+    const double p[3] = {(x - camera->cx) / camera->fx * z - m[12], (y - camera->cy) / camera->fy * z - m[13], z - m[14]};
+    for (int c = 0; c < 3; c++) out[c] = m[4 * c] * p[0] + m[4 * c + 1] * p[1] + m[4 * c + 2] * p[2];
+}
+
+// Bilinear sample of one channel at a continuous position (pixel centres at .5); 0 outside the image.
+static float gsf__sample(const float* plane, int32_t width, int32_t height, int channels, int channel, double x, double y) {
+    const double fx = x - 0.5, fy = y - 0.5;
+    if (!(fx > -0.5 && fy > -0.5 && fx < width - 0.5 && fy < height - 0.5)) return 0.0f;
+    const int32_t x0 = fx < 0.0 ? 0 : (int32_t)fx, y0 = fy < 0.0 ? 0 : (int32_t)fy;
+    const int32_t x1 = x0 + 1 < width ? x0 + 1 : x0, y1 = y0 + 1 < height ? y0 + 1 : y0;
+    const float ax = fx < 0.0 ? 0.0f : (float)(fx - x0), ay = fy < 0.0 ? 0.0f : (float)(fy - y0);
+    const float* p = plane + channel;
+    const size_t w = (size_t)width, c = (size_t)channels;
+    const float top = p[((size_t)y0 * w + (size_t)x0) * c] * (1.0f - ax) + p[((size_t)y0 * w + (size_t)x1) * c] * ax;
+    const float bottom = p[((size_t)y1 * w + (size_t)x0) * c] * (1.0f - ax) + p[((size_t)y1 * w + (size_t)x1) * c] * ax;
+    return top * (1.0f - ay) + bottom * ay;
+}
+
+// Depth of the pixel that contains a continuous position; 0 outside.
+static float gsf__nearest_depth(const gsf__warp_reference* ref, double u, double v) {
+    if (!(u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height)) return 0.0f;
+    return ref->depth[(size_t)v * (size_t)ref->camera.width + (size_t)u];
+}
+
+typedef struct gsf__warp_score_job {
+    const gsf__warp* warp;
+    int32_t reference;
+} gsf__warp_score_job;
+
+static void gsf__warp_score_row(void* arg, size_t row, int worker) {
+    (void)worker;
+    const gsf__warp_score_job* job = (const gsf__warp_score_job*)arg;
+    const gsf__warp_reference* ref = job->warp->references + job->reference;
+    for (int32_t x = 0; x < ref->camera.width; x++) {
+        const size_t at = row * (size_t)ref->camera.width + (size_t)x;
+        ref->score[at] = 0.0f;
+        if (!(ref->depth[at] > 0.0f)) continue;
+        double point[3];
+        gsf__unproject(&ref->camera, x + 0.5, (double)row + 0.5, (double)ref->depth[at], point);
+        int support = 0, refuted = 0;
+        for (int32_t k = 0; k < job->warp->count; k++) {
+            const gsf__warp_reference* other = job->warp->references + k;
+            double u, v, z;
+            if (k == job->reference || !gsf_camera_project(&other->camera, point, &u, &v, &z)) continue;
+            const float seen = gsf__nearest_depth(other, u, v);
+            if (!(seen > 0.0f)) continue;
+            const float off = (float)z / seen - 1.0f;
+            support += fabsf(off) <= GSF__WARP_DEPTH_TOLERANCE;
+            refuted += off < -2.0f * GSF__WARP_DEPTH_TOLERANCE;
+        }
+        ref->score[at] = support > refuted ? 1.0f : refuted > support ? 0.1f : 0.5f;
+    }
+}
+
+static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    gsf__warp* warp = (gsf__warp*)user;
+    if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
+    warp->references = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__warp_reference));
+    if (!warp->references) return GSF_ERROR_OUT_OF_MEMORY;
+    warp->count = count;
+    for (int32_t i = 0; i < count; i++) {
+        gsf__warp_reference* ref = warp->references + i;
+        const gsf_camera* camera = &references[i].camera;
+        const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+        gsf_result result = gsf_check_camera(ctx, camera);
+        if (result == GSF_OK && (!references[i].color.data || !references[i].depth.data))
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: reference %d needs colour and depth", (int)i);
+        if (result == GSF_OK) {
+            ref->camera = *camera;
+            gsf_camera_center(camera, ref->center);
+            ref->color = (float*)gsf_alloc(ctx, pixels, 5 * sizeof(float));
+            if (!ref->color) result = GSF_ERROR_OUT_OF_MEMORY;
+        }
+        if (result == GSF_OK) {
+            ref->depth = ref->color + 3 * pixels;
+            ref->score = ref->depth + pixels;
+            gsf_image color = gsf_wrap_image(ref->color, GSF_F32, camera->width, camera->height, 3);
+            gsf_image depth = gsf_wrap_image(ref->depth, GSF_F32, camera->width, camera->height, 1);
+            result = gsf_convert_image(ctx, &references[i].color, &color);
+            if (result == GSF_OK) result = gsf_convert_image(ctx, &references[i].depth, &depth);
+        }
+        if (result != GSF_OK) {
+            gsf__warp_end(user, ctx);
+            return result;
+        }
+    }
+    for (int32_t i = 0; i < count; i++) {
+        gsf__warp_score_job job;
+        job.warp = warp;
+        job.reference = i;
+        gsf__parallel_for(ctx, (size_t)warp->references[i].camera.height, gsf__warp_score_row, &job);
+    }
+    return GSF_OK;
+}
+
+typedef struct gsf__warp_vertex { float u, v, inv_z; } gsf__warp_vertex; // inv_z 0: no surface here
+
+// Draws a triangle of inverse depths into the z-buffer (largest inverse depth wins). Triangles seen from behind, or torn
+// wide open, are not surface.
+static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex* b, const gsf__warp_vertex* c, float* inv_z,
+                               int32_t width, int32_t height) {
+    const float area = (b->u - a->u) * (c->v - a->v) - (b->v - a->v) * (c->u - a->u);
+    if (!(area > 1e-6f)) return;
+    const float lo_u = fminf(a->u, fminf(b->u, c->u)), hi_u = fmaxf(a->u, fmaxf(b->u, c->u));
+    const float lo_v = fminf(a->v, fminf(b->v, c->v)), hi_v = fmaxf(a->v, fmaxf(b->v, c->v));
+    if (!(hi_u > 0.0f && hi_v > 0.0f && lo_u < (float)width && lo_v < (float)height)) return;
+    if (hi_u - lo_u > 32.0f || hi_v - lo_v > 32.0f) return;
+    const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), y0 = lo_v < 0.5f ? 0 : (int32_t)(lo_v - 0.5f);
+    const int32_t x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1, y1 = hi_v < (float)height ? (int32_t)hi_v : height - 1;
+    const float scale = 1.0f / area;
+    for (int32_t y = y0; y <= y1; y++)
+        for (int32_t x = x0; x <= x1; x++) {
+            const float px = (float)x + 0.5f, py = (float)y + 0.5f;
+            const float wb = ((px - a->u) * (c->v - a->v) - (py - a->v) * (c->u - a->u)) * scale;
+            const float wc = ((b->u - a->u) * (py - a->v) - (b->v - a->v) * (px - a->u)) * scale;
+            const float wa = 1.0f - wb - wc;
+            if (wa < -1e-4f || wb < -1e-4f || wc < -1e-4f) continue;
+            const float value = wa * a->inv_z + wb * b->inv_z + wc * c->inv_z;
+            float* at = inv_z + (size_t)y * (size_t)width + (size_t)x;
+            if (value > *at) *at = value;
+        }
+}
+
+static int gsf__warp_connected(float a, float b, float c) {
+    const float lo = fminf(a, fminf(b, c)), hi = fmaxf(a, fmaxf(b, c));
+    return lo > 0.0f && hi <= lo * GSF__WARP_EDGE;
+}
+
+// The reference's depth map as a mesh, seen by `camera`. `rows` holds two rows of vertices.
+static void gsf__warp_draw(const gsf__warp_reference* ref, const gsf_camera* camera, gsf__warp_vertex* rows, float* inv_z) {
+    const int32_t width = ref->camera.width, height = ref->camera.height;
+    for (int32_t y = 0; y < height; y++) {
+        gsf__warp_vertex* now = rows + (size_t)(y & 1) * (size_t)width;
+        const gsf__warp_vertex* above = rows + (size_t)(~y & 1) * (size_t)width;
+        const float* depth = ref->depth + (size_t)y * (size_t)width;
+        for (int32_t x = 0; x < width; x++) {
+            double point[3], u, v, z;
+            now[x].inv_z = 0.0f;
+            if (!(depth[x] > 0.0f)) continue;
+            gsf__unproject(&ref->camera, x + 0.5, y + 0.5, (double)depth[x], point);
+            if (!gsf_camera_project(camera, point, &u, &v, &z)) continue;
+            now[x].u = (float)u;
+            now[x].v = (float)v;
+            now[x].inv_z = (float)(1.0 / z);
+        }
+        if (y == 0) continue;
+        const float* depth_above = depth - width;
+        for (int32_t x = 0; x + 1 < width; x++) {
+            const gsf__warp_vertex *a = above + x, *b = above + x + 1, *c = now + x, *d = now + x + 1;
+            if (a->inv_z > 0.0f && b->inv_z > 0.0f && c->inv_z > 0.0f &&
+                gsf__warp_connected(depth_above[x], depth_above[x + 1], depth[x]))
+                gsf__warp_triangle(a, b, c, inv_z, camera->width, camera->height);
+            if (b->inv_z > 0.0f && d->inv_z > 0.0f && c->inv_z > 0.0f &&
+                gsf__warp_connected(depth_above[x + 1], depth[x + 1], depth[x]))
+                gsf__warp_triangle(b, d, c, inv_z, camera->width, camera->height);
+        }
+    }
+}
+
+enum { GSF__WARP_MAX_CANDIDATES = 32 }; // references that can compete for a pixel
+
+typedef struct gsf__warp_job {
+    const gsf__warp* warp;
+    const gsf_restore_window* window;
+    float* scratch;        // per worker: references x pixels inverse depths, then two rows of vertices
+    size_t scratch_floats, row_floats;
+} gsf__warp_job;
+
+// Blends the candidates of one pixel. Returns the confidence; 0 where no reference reaches.
+static float gsf__warp_pixel(const gsf__warp* warp, const gsf_camera* camera, const double center[3], int32_t x, int32_t y,
+                             const float* inv_z, size_t plane, float rgb[3]) {
+    float depth[GSF__WARP_MAX_CANDIDATES], weight[GSF__WARP_MAX_CANDIDATES], color[GSF__WARP_MAX_CANDIDATES][3];
+    int count = 0;
+    for (int32_t k = 0; k < warp->count && count < GSF__WARP_MAX_CANDIDATES; k++) {
+        const float inverse = inv_z[(size_t)k * plane];
+        if (!(inverse > 0.0f)) continue;
+        const gsf__warp_reference* ref = warp->references + k;
+        double point[3], u, v, z, along = 0.0, n0 = 0.0, n1 = 0.0;
+        gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
+        if (!gsf_camera_project(&ref->camera, point, &u, &v, &z)) continue;
+        for (int c = 0; c < 3; c++) {
+            const double p = point[c] - center[c], q = point[c] - ref->center[c];
+            along += p * q;
+            n0 += p * p;
+            n1 += q * q;
+        }
+        const double cosine = along / sqrt(n0 * n1 + 1e-300);
+        const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // angle squared, to second order
+        const float score = gsf__sample(ref->score, ref->camera.width, ref->camera.height, 1, 0, u, v);
+        if (!(score > 0.0f)) continue;
+        depth[count] = (float)(1.0 / (double)inverse);
+        weight[count] = score * gsf__exp(-0.5f * angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
+        for (int c = 0; c < 3; c++)
+            color[count][c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
+        count++;
+    }
+    if (count == 0) return 0.0f;
+
+    float heaviest = 0.0f, group[GSF__WARP_MAX_CANDIDATES];
+    for (int i = 0; i < count; i++) {
+        group[i] = 0.0f;
+        for (int j = 0; j < count; j++)
+            if (fabsf(depth[j] - depth[i]) <= GSF__WARP_DEPTH_TOLERANCE * depth[i]) group[i] += weight[j];
+        if (group[i] > heaviest) heaviest = group[i];
+    }
+    int front = -1;
+    for (int i = 0; i < count; i++)
+        if (group[i] >= GSF__WARP_GROUP_SHARE * heaviest && (front < 0 || depth[i] < depth[front])) front = i;
+
+    float total = 0.0f, spread = 0.0f;
+    rgb[0] = rgb[1] = rgb[2] = 0.0f;
+    for (int pass = 0; pass < 2; pass++) // mean, then weighted squared deviation
+        for (int j = 0; j < count; j++) {
+            if (!(fabsf(depth[j] - depth[front]) <= GSF__WARP_DEPTH_TOLERANCE * depth[front])) continue;
+            if (pass == 0) total += weight[j];
+            for (int c = 0; c < 3; c++) {
+                if (pass == 0) rgb[c] += weight[j] * color[j][c];
+                else spread += weight[j] * (color[j][c] - rgb[c] / total) * (color[j][c] - rgb[c] / total);
+            }
+        }
+    for (int c = 0; c < 3; c++) rgb[c] /= total;
+    const float agreement = gsf__exp(-spread / total / (3.0f * 0.15f * 0.15f));
+    const float confidence = (total < 1.0f ? total : 1.0f) * agreement;
+    return confidence < 1.0f ? confidence : 1.0f;
+}
+
+static void gsf__warp_frame(void* arg, size_t frame, int worker) {
+    const gsf__warp_job* job = (const gsf__warp_job*)arg;
+    const gsf_restore_window* window = job->window;
+    const gsf_camera* camera = window->cameras + frame;
+    const gsf_image *color = window->out_color + frame, *confidence = window->out_confidence + frame;
+    const int32_t known = window->reference_index ? window->reference_index[frame] : -1;
+    const size_t plane = (size_t)camera->width * (size_t)camera->height;
+    float* inv_z = job->scratch + (size_t)worker * job->scratch_floats;
+    gsf__warp_vertex* rows = (gsf__warp_vertex*)(void*)(inv_z + job->scratch_floats - job->row_floats);
+    double center[3];
+    gsf_camera_center(camera, center);
+    memset(inv_z, 0, (job->scratch_floats - job->row_floats) * sizeof(float));
+    for (int32_t k = 0; k < job->warp->count; k++)
+        gsf__warp_draw(job->warp->references + k, camera, rows, inv_z + (size_t)k * plane);
+    for (int32_t y = 0; y < camera->height; y++)
+        for (int32_t x = 0; x < camera->width; x++) {
+            float rgb[3];
+            const size_t at = (size_t)y * (size_t)camera->width + (size_t)x;
+            float weight = gsf__warp_pixel(job->warp, camera, center, x, y, inv_z + at, plane, rgb);
+            if (known >= 0) { // the frame is that photo's own view
+                const gsf__warp_reference* ref = job->warp->references + known;
+                const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
+                const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
+                for (int c = 0; c < 3; c++)
+                    rgb[c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
+                weight = u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height ? 1.0f : 0.0f;
+            }
+            for (int c = 0; c < 3; c++)
+                gsf__put_pixel(color, x, y, c, weight > 0.0f ? rgb[c] : gsf__get_pixel(window->color + frame, x, y, c));
+            gsf__put_pixel(confidence, x, y, 0, weight);
+        }
+}
+
+static gsf_result gsf__warp_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    const gsf__warp* warp = (const gsf__warp*)user;
+    if (window->frame_count < 1) return GSF_OK;
+    size_t pixels = 0, widest = 0;
+    for (int32_t f = 0; f < window->frame_count; f++) {
+        const gsf_camera* camera = window->cameras + f;
+        GSF__TRY(gsf_check_camera(ctx, camera));
+        GSF__TRY(gsf__check_output(ctx, window->color + f, "color", 3, camera));
+        GSF__TRY(gsf__check_output(ctx, window->out_color + f, "out_color", 3, camera));
+        GSF__TRY(gsf__check_output(ctx, window->out_confidence + f, "out_confidence", 1, camera));
+        const size_t n = (size_t)camera->width * (size_t)camera->height;
+        if (n > pixels) pixels = n;
+    }
+    for (int32_t k = 0; k < warp->count; k++)
+        if ((size_t)warp->references[k].camera.width > widest) widest = (size_t)warp->references[k].camera.width;
+    gsf__warp_job job;
+    job.warp = warp;
+    job.window = window;
+    job.row_floats = 2 * widest * (sizeof(gsf__warp_vertex) / sizeof(float));
+    job.scratch_floats = pixels * (size_t)warp->count + job.row_floats;
+    job.scratch = (float*)gsf_alloc(ctx, job.scratch_floats, (size_t)ctx->parallel.worker_count * sizeof(float));
+    if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__parallel_for(ctx, (size_t)window->frame_count, gsf__warp_frame, &job);
+    gsf_free(ctx, job.scratch);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out) {
+    memset(out, 0, sizeof *out);
+    out->user = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__warp));
+    if (!out->user) return GSF_ERROR_OUT_OF_MEMORY;
+    out->struct_size = sizeof *out;
+    out->name = "warp";
+    out->query_fn = gsf__warp_query;
+    out->begin_fn = gsf__warp_begin;
+    out->restore_fn = gsf__warp_restore;
+    out->end_fn = gsf__warp_end;
+    return GSF_OK;
+}
+
+GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer) {
+    if (restorer->user) gsf__warp_end(restorer->user, ctx);
+    gsf_free(ctx, restorer->user);
+    memset(restorer, 0, sizeof *restorer);
+}
+
+// ---- >>seen mask ---------------------------------------------------------------
+
+typedef struct gsf__seen_job {
+    const gsf_camera *camera, *seeing;
+    size_t seeing_count;
+    const float *depth, *alpha;     // of `camera`
+    const gsf__warp_reference* others;
+    const gsf_image* mask;
+} gsf__seen_job;
+
+static void gsf__seen_row(void* arg, size_t row, int worker) {
+    (void)worker;
+    const gsf__seen_job* job = (const gsf__seen_job*)arg;
+    for (int32_t x = 0; x < job->camera->width; x++) {
+        const size_t at = row * (size_t)job->camera->width + (size_t)x;
+        uint8_t seen = 0;
+        if (job->alpha[at] >= 0.5f) {
+            double point[3], u, v, z;
+            gsf__unproject(job->camera, x + 0.5, (double)row + 0.5, (double)job->depth[at], point);
+            for (size_t k = 0; k < job->seeing_count && !seen; k++) {
+                if (!gsf_camera_project(job->seeing + k, point, &u, &v, &z)) continue;
+                const float limit = gsf__nearest_depth(job->others + k, u, v);
+                seen = limit > 0.0f && z <= 1.05 * (double)limit;
+            }
+        }
+        char* out = (char*)job->mask->data + (int64_t)row * job->mask->stride_y + x * job->mask->stride_x;
+        *(uint8_t*)out = seen;
+    }
+}
+
+static gsf_result gsf__render_depth(gsf_context* ctx, gsf_rasterizer* rasterizer, const gsf_splats* splats,
+                                    const gsf_camera* camera, float* depth, float* alpha) {
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.depth = gsf_wrap_image(depth, GSF_F32, camera->width, camera->height, 1);
+    if (alpha) out.alpha = gsf_wrap_image(alpha, GSF_F32, camera->width, camera->height, 1);
+    return gsf_splat_render(ctx, rasterizer, splats, camera, NULL, &out);
+}
+
+GSF_API gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera,
+                                       const gsf_camera* seeing, size_t seeing_count, const gsf_image* mask) {
+    GSF__TRY(gsf_check_camera(ctx, camera));
+    if (mask->dtype != GSF_U8 || mask->channels != 1 || mask->width != camera->width || mask->height != camera->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "seen mask: mask must be u8, 1 channel, of the camera's size");
+    gsf_rasterizer* rasterizer = NULL;
+    gsf__warp_reference* others = NULL;
+    gsf__seen_job job;
+    memset(&job, 0, sizeof job);
+    const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+    float* planes = (float*)gsf_alloc(ctx, pixels, 2 * sizeof(float));
+    gsf_result result = planes ? gsf_splat_make_rasterizer(ctx, &rasterizer) : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) {
+        others = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, seeing_count + 1, sizeof *others);
+        if (!others) result = GSF_ERROR_OUT_OF_MEMORY;
+    }
+    if (result == GSF_OK) result = gsf__render_depth(ctx, rasterizer, splats, camera, planes, planes + pixels);
+    for (size_t k = 0; k < seeing_count && result == GSF_OK; k++) {
+        result = gsf_check_camera(ctx, seeing + k);
+        if (result != GSF_OK) break;
+        others[k].camera = seeing[k];
+        others[k].depth = (float*)gsf_alloc(ctx, (size_t)seeing[k].width * (size_t)seeing[k].height, sizeof(float));
+        result = others[k].depth ? gsf__render_depth(ctx, rasterizer, splats, seeing + k, others[k].depth, NULL)
+                                 : GSF_ERROR_OUT_OF_MEMORY;
+    }
+    if (result == GSF_OK) {
+        job.camera = camera;
+        job.seeing = seeing;
+        job.seeing_count = seeing_count;
+        job.depth = planes;
+        job.alpha = planes + pixels;
+        job.others = others;
+        job.mask = mask;
+        gsf__parallel_for(ctx, (size_t)camera->height, gsf__seen_row, &job);
+    }
+    for (size_t k = 0; others && k < seeing_count; k++) gsf_free(ctx, others[k].depth);
+    gsf_free(ctx, others);
+    gsf_free(ctx, planes);
+    gsf_splat_destroy_rasterizer(ctx, rasterizer);
+    return result;
+}
+
 // ---- >>fixer -------------------------------------------------------------------
+
+typedef struct gsf__kept_frame { // a restored frame as it is trained on
+    gsf_camera camera;
+    uint8_t* pixels;  // (H,W,3) colour, then (H,W) confidence, 1/255 steps
+} gsf__kept_frame;
+
+typedef struct gsf__kept_frames {
+    gsf__kept_frame* frames;
+    size_t count, capacity;
+} gsf__kept_frames;
+
+struct gsf_fixer {
+    gsf_fix_desc desc;              // resolved
+    const gsf_restorer* restorer;
+    gsf_restorer explain;           // a warp of our own, for the skip test
+    gsf_trainer* trainer;
+    size_t view_count;
+    gsf_camera* cameras;
+    gsf_image* photos;              // f32 copies
+    int32_t iteration, round, skipped;
+    int restoring;                  // a round is under way
+    int32_t window;                 // next one of this round
+    int32_t frames;                 // per window
+    gsf_camera* path;               // windows x frames
+    int32_t* reference_index;
+    int references_open;
+    gsf_image *rendered, *depth, *alpha, *restored, *confidence; // one window
+    gsf__kept_frames active, pending; // what the trainer has; what this round collected so far
+    gsf_restorer_limits limits;
+};
+
+static void gsf__drop_frames(gsf_context* ctx, gsf__kept_frames* list) {
+    for (size_t i = 0; i < list->count; i++) gsf_free(ctx, list->frames[i].pixels);
+    gsf_free(ctx, list->frames);
+    memset(list, 0, sizeof *list);
+}
+
+static void gsf__drop_window(gsf_context* ctx, gsf_fixer* f) {
+    gsf_image** const sets[] = {&f->rendered, &f->depth, &f->alpha, &f->restored, &f->confidence};
+    for (size_t s = 0; s < GSF__COUNT(sets); s++) {
+        for (int32_t i = 0; *sets[s] && i < f->frames; i++) gsf_destroy_image(ctx, *sets[s] + i);
+        gsf_free(ctx, *sets[s]);
+        *sets[s] = NULL;
+    }
+}
+
+static void gsf__close_references(gsf_context* ctx, gsf_fixer* f) {
+    if (!f->references_open) return;
+    f->restorer->end_fn(f->restorer->user, ctx);
+    if (f->explain.user) f->explain.end_fn(f->explain.user, ctx);
+    f->references_open = 0;
+}
+
+GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
+    if (!f) return;
+    gsf__close_references(ctx, f);
+    gsf_splat_destroy_warp(ctx, &f->explain);
+    gsf__drop_window(ctx, f);
+    gsf__drop_frames(ctx, &f->active);
+    gsf__drop_frames(ctx, &f->pending);
+    for (size_t i = 0; f->photos && i < f->view_count; i++) gsf_destroy_image(ctx, f->photos + i);
+    gsf_free(ctx, f->photos);
+    gsf_free(ctx, f->cameras);
+    gsf_free(ctx, f->path);
+    gsf_free(ctx, f->reference_index);
+    gsf_splat_destroy_trainer(ctx, f->trainer);
+    gsf_free(ctx, f);
+}
+
+static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view_count, int has_restorer) {
+    gsf_fix_desc d = *desc;
+    if (d.train.iterations == 0) d.train.iterations = 30000;
+    if (d.rounds == 0) d.rounds = 2;
+    if (d.rounds < 0 || !has_restorer) d.rounds = 0;
+    if (d.first_round == 0) d.first_round = d.train.iterations / 3;
+    if (d.last_round == 0) d.last_round = d.train.iterations * 2 / 3;
+    if (d.last_round < d.first_round) d.last_round = d.first_round;
+    if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
+    if (d.window_frames == 0) d.window_frames = 17;
+    if (d.lambda == 0.0f) d.lambda = 1.0f;
+    return d;
+}
+
+static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, const gsf_restorer* restorer) {
+    if (d->first_round < 0 || d->first_round > d->train.iterations || d->last_round > d->train.iterations)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: rounds at %d..%d of %d iterations", (int)d->first_round,
+                        (int)d->last_round, (int)d->train.iterations);
+    if (d->windows < 1 || d->windows > 4096 || d->window_frames < 3 || d->window_frames > 4096)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: %d windows of %d frames", (int)d->windows,
+                        (int)d->window_frames);
+    if (!(d->lambda >= 0.0f && d->lambda <= 1e6f) || !(d->skip_psnr >= 0.0f) || d->max_pixels < 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: lambda %g, skip_psnr %g, max_pixels %d", (double)d->lambda,
+                        (double)d->skip_psnr, (int)d->max_pixels);
+    if (restorer && (restorer->struct_size < sizeof(gsf_restorer) || !restorer->query_fn || !restorer->begin_fn ||
+                     !restorer->restore_fn || !restorer->end_fn))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer lacks struct_size or a function");
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc, const gsf_train_view* views,
+                                        size_t view_count, const gsf_splats* initial, const gsf_restorer* restorer,
+                                        gsf_fixer** out) {
+    *out = NULL;
+    gsf_fix_desc zero;
+    memset(&zero, 0, sizeof zero);
+    const gsf_fix_desc resolved = gsf__fix_desc_defaults(desc ? desc : &zero, view_count, restorer != NULL);
+    GSF__TRY(gsf__check_fix_desc(ctx, &resolved, restorer));
+    gsf_fixer* f = (gsf_fixer*)gsf_alloc_zeroed(ctx, 1, sizeof *f);
+    if (!f) return GSF_ERROR_OUT_OF_MEMORY;
+    f->desc = resolved;
+    f->restorer = restorer;
+    gsf_result result = gsf_splat_make_trainer(ctx, &f->desc.train, views, view_count, initial, &f->trainer);
+    if (result != GSF_OK) goto cleanup;
+    f->cameras = (gsf_camera*)gsf_alloc(ctx, view_count, sizeof(gsf_camera));
+    f->photos = (gsf_image*)gsf_alloc_zeroed(ctx, view_count, sizeof(gsf_image));
+    result = f->cameras && f->photos ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < view_count && result == GSF_OK && f->desc.rounds > 0; i++) {
+        const gsf_image* image = &views[i].image;
+        f->cameras[i] = views[i].camera;
+        f->view_count = i + 1;
+        result = gsf_make_image(ctx, GSF_F32, image->width, image->height, 3, f->photos + i);
+        if (result == GSF_OK) result = gsf_convert_image(ctx, image, f->photos + i);
+    }
+    if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f) result = gsf_splat_make_warp(ctx, &f->explain);
+cleanup:
+    if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
+    else *out = f;
+    return result;
+}
+
+GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer) { return fixer->trainer; }
+
+// Iteration before which round k runs.
+static int32_t gsf__round_iteration(const gsf_fix_desc* d, int32_t round) {
+    if (d->rounds <= 1) return d->first_round;
+    return d->first_round + (int32_t)((int64_t)(d->last_round - d->first_round) * round / (d->rounds - 1));
+}
+
+// Rises from 0 at the first round to desc.lambda at the end, flattening out (the paper: "gradually increase"; the
+// official code's half sine falls again).
+static float gsf__restored_weight(const gsf_fixer* f) {
+    const float span = (float)(f->desc.train.iterations - f->desc.first_round);
+    const float t = span > 0.0f ? (float)(f->iteration - f->desc.first_round) / span : 1.0f;
+    return t <= 0.0f ? 0.0f : f->desc.lambda * (t < 1.0f ? t * (2.0f - t) : 1.0f);
+}
+
+static int32_t gsf__legal(int32_t wanted, int32_t least, int32_t most, int32_t step) { // nearest of least, least+step, ...
+    if (step < 1) step = 1;
+    if (most > 0 && wanted > most) wanted = most;
+    int32_t legal = wanted <= least ? least : least + (wanted - least + step / 2) / step * step;
+    if (most > 0 && legal > most) legal -= step;
+    return legal < least ? least : legal;
+}
+
+// The path camera at a size that the restorer takes: one scale for both axes, then a little more or less field of view
+// on each side, so that nothing is squashed.
+static gsf_camera gsf__frame_camera(const gsf_fixer* f, const gsf_camera* camera) {
+    const gsf_restorer_limits* limits = &f->limits;
+    double scale = 1.0;
+    if (limits->width_max > 0 && camera->width > limits->width_max) scale = (double)limits->width_max / camera->width;
+    if (limits->height_max > 0 && camera->height * scale > limits->height_max)
+        scale = (double)limits->height_max / camera->height;
+    if (f->desc.max_pixels > 0 && camera->width * scale * camera->height * scale > f->desc.max_pixels)
+        scale = sqrt((double)f->desc.max_pixels / ((double)camera->width * camera->height));
+    const int32_t wm = limits->width_multiple > 1 ? limits->width_multiple : 1;
+    const int32_t hm = limits->height_multiple > 1 ? limits->height_multiple : 1;
+    gsf_camera out = *camera;
+    out.width = gsf__legal((int32_t)(camera->width * scale + 0.5), wm, limits->width_max, wm);
+    out.height = gsf__legal((int32_t)(camera->height * scale + 0.5), hm, limits->height_max, hm);
+    out.fx *= scale;
+    out.fy *= scale;
+    out.cx = camera->cx * scale + 0.5 * (out.width - camera->width * scale);
+    out.cy = camera->cy * scale + 0.5 * (out.height - camera->height * scale);
+    return out;
+}
+
+static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
+    gsf_traj_path_desc desc;
+    gsf_traj_path_layout layout;
+    memset(&desc, 0, sizeof desc);
+    desc.kind = f->desc.trajectory;
+    desc.window_length = f->frames;
+    desc.window_count = f->desc.windows;
+    desc.round = f->round;
+    desc.seed = f->desc.train.seed;
+    desc.points = f->desc.points;
+    desc.point_count = f->desc.point_count;
+    GSF__TRY(gsf_traj_query_path(ctx, f->view_count, &desc, &layout));
+    GSF_ASSERT(layout.frame_count == (size_t)f->desc.windows * (size_t)f->frames);
+    void* scratch = gsf_alloc(ctx, layout.scratch_bytes, 1);
+    if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_result result =
+        gsf_traj_sample_path(ctx, f->cameras, f->view_count, &desc, scratch, f->path, f->reference_index);
+    gsf_free(ctx, scratch);
+    return result;
+}
+
+// Path of this round, its frames' sizes and buffers.
+static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
+    const gsf_camera* first = f->cameras;
+    gsf__drop_window(ctx, f);
+    memset(&f->limits, 0, sizeof f->limits);
+    GSF__TRY(f->restorer->query_fn(f->restorer->user, ctx, f->desc.window_frames, first->width, first->height, &f->limits));
+    f->frames = gsf__legal(f->desc.window_frames, f->limits.frame_count_min > 0 ? f->limits.frame_count_min : 1,
+                           f->limits.frame_count_max, f->limits.frame_count_step);
+    const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
+    gsf_free(ctx, f->path);
+    gsf_free(ctx, f->reference_index);
+    f->path = (gsf_camera*)gsf_alloc(ctx, total, sizeof(gsf_camera));
+    f->reference_index = (int32_t*)gsf_alloc(ctx, total, sizeof(int32_t));
+    if (!f->path || !f->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__sample_path(ctx, f));
+    for (size_t i = 0; i < total; i++) f->path[i] = gsf__frame_camera(f, f->path + i);
+
+    gsf_image** const sets[] = {&f->rendered, &f->depth, &f->alpha, &f->restored, &f->confidence};
+    for (size_t s = 0; s < GSF__COUNT(sets); s++) {
+        *sets[s] = (gsf_image*)gsf_alloc_zeroed(ctx, (size_t)f->frames, sizeof(gsf_image));
+        if (!*sets[s]) return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    return GSF_OK;
+}
+
+// Hands the photos and the depth that the splats have at their cameras to the restorer.
+static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
+    if (f->references_open) return GSF_OK;
+    gsf_reference* references = (gsf_reference*)gsf_alloc_zeroed(ctx, f->view_count, sizeof(gsf_reference));
+    if (!references) return GSF_ERROR_OUT_OF_MEMORY;
+    const int needs_depth = f->limits.needs_depth || f->explain.user;
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < f->view_count && result == GSF_OK; i++) {
+        references[i].camera = f->cameras[i];
+        references[i].color = f->photos[i];
+        if (!needs_depth) continue;
+        result = gsf_make_image(ctx, GSF_F32, f->cameras[i].width, f->cameras[i].height, 1, &references[i].depth);
+        if (result != GSF_OK) break;
+        gsf_render_output out;
+        memset(&out, 0, sizeof out);
+        out.depth = references[i].depth;
+        result = gsf_splat_trainer_render(ctx, f->trainer, f->cameras + i, &out);
+    }
+    if (result == GSF_OK)
+        result = f->restorer->begin_fn(f->restorer->user, ctx, references, (int32_t)f->view_count);
+    if (result == GSF_OK && f->explain.user) {
+        result = f->explain.begin_fn(f->explain.user, ctx, references, (int32_t)f->view_count);
+        if (result != GSF_OK) f->restorer->end_fn(f->restorer->user, ctx);
+    }
+    if (result == GSF_OK) f->references_open = 1;
+    for (size_t i = 0; i < f->view_count; i++) gsf_destroy_image(ctx, &references[i].depth);
+    gsf_free(ctx, references);
+    return result;
+}
+
+static gsf_result gsf__fit_image(gsf_context* ctx, gsf_image* image, const gsf_camera* camera, int32_t channels) {
+    if (image->data && image->width == camera->width && image->height == camera->height) return GSF_OK;
+    gsf_destroy_image(ctx, image);
+    return gsf_make_image(ctx, GSF_F32, camera->width, camera->height, channels, image);
+}
+
+// How well the render of these frames agrees with what the references show there, in dB over the explained pixels (weighted
+// by confidence); 0 when less than half of the pixels are explained at all. Uses the restored/confidence buffers.
+static gsf_result gsf__window_agreement(gsf_context* ctx, gsf_fixer* f, gsf_restore_window* window, double* psnr) {
+    double error = 0.0, weight = 0.0, pixels = 0.0, explained = 0.0;
+    *psnr = 0.0;
+    GSF__TRY(f->explain.restore_fn(f->explain.user, ctx, window));
+    for (int32_t i = 0; i < window->frame_count; i++)
+        for (int64_t y = 0; y < window->color[i].height; y++)
+            for (int64_t x = 0; x < window->color[i].width; x++) {
+                const double w = (double)gsf__get_pixel(window->out_confidence + i, x, y, 0);
+                pixels += 1.0;
+                explained += w > 0.0;
+                weight += w;
+                for (int c = 0; c < 3 && w > 0.0; c++) {
+                    const double d = (double)gsf__get_pixel(window->color + i, x, y, c) -
+                                     (double)gsf__get_pixel(window->out_color + i, x, y, c);
+                    error += w * d * d / 3.0;
+                }
+            }
+    if (explained >= 0.5 * pixels) *psnr = error > 0.0 ? -10.0 * log10(error / weight) : INFINITY;
+    return GSF_OK;
+}
+
+static gsf_result gsf__keep_frame(gsf_context* ctx, gsf_fixer* f, const gsf_camera* camera, const gsf_image* color,
+                                  const gsf_image* confidence) {
+    gsf__kept_frames* list = &f->pending;
+    const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+    GSF__TRY(gsf__reserve(ctx, (void**)&list->frames, &list->capacity, list->count, list->count + 1, sizeof *list->frames));
+    uint8_t* memory = (uint8_t*)gsf_alloc(ctx, pixels, 4);
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_image rgb = gsf_wrap_image(memory, GSF_U8, camera->width, camera->height, 3);
+    const gsf_image weight = gsf_wrap_image(memory + 3 * pixels, GSF_U8, camera->width, camera->height, 1);
+    gsf_result result = gsf_convert_image(ctx, color, &rgb);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, confidence, &weight);
+    if (result != GSF_OK) {
+        gsf_free(ctx, memory);
+        return result;
+    }
+    list->frames[list->count].camera = *camera;
+    list->frames[list->count++].pixels = memory;
+    return GSF_OK;
+}
+
+static gsf_result gsf__install_frames(gsf_context* ctx, gsf_fixer* f, const gsf__kept_frames* list) {
+    size_t total = 0;
+    for (size_t i = 0; i < list->count; i++)
+        total += (size_t)list->frames[i].camera.width * (size_t)list->frames[i].camera.height;
+    gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, list->count + 1, sizeof(gsf_train_view));
+    float* weights = (float*)gsf_alloc(ctx, total + 1, sizeof(float));
+    gsf_result result = views && weights ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    float* next = weights;
+    for (size_t i = 0; i < list->count && result == GSF_OK; i++) {
+        const gsf_camera* camera = &list->frames[i].camera;
+        const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+        const gsf_image bytes = gsf_wrap_image(list->frames[i].pixels + 3 * pixels, GSF_U8, camera->width, camera->height, 1);
+        views[i].camera = *camera;
+        views[i].image = gsf_wrap_image(list->frames[i].pixels, GSF_U8, camera->width, camera->height, 3);
+        views[i].weight = gsf_wrap_image(next, GSF_F32, camera->width, camera->height, 1);
+        result = gsf_convert_image(ctx, &bytes, &views[i].weight);
+        next += pixels;
+    }
+    if (result == GSF_OK) result = gsf_splat_set_restored_views(ctx, f->trainer, views, list->count);
+    gsf_free(ctx, weights);
+    gsf_free(ctx, views);
+    return result;
+}
+
+static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
+    const size_t begin = (size_t)f->window * (size_t)f->frames;
+    GSF__TRY(gsf__open_references(ctx, f));
+    gsf_restore_window window;
+    memset(&window, 0, sizeof window);
+    window.struct_size = sizeof window;
+    window.frame_count = f->frames;
+    window.cameras = f->path + begin;
+    window.reference_index = f->reference_index + begin;
+    window.seed = gsf_random_bits(f->desc.train.seed, 0x77696e64u, (uint64_t)f->round * 4096u + (uint64_t)f->window);
+    for (int32_t i = 0; i < f->frames; i++) {
+        GSF__TRY(gsf__check_cancel(ctx));
+        const gsf_camera* camera = window.cameras + i;
+        GSF__TRY(gsf__fit_image(ctx, f->rendered + i, camera, 3));
+        GSF__TRY(gsf__fit_image(ctx, f->depth + i, camera, 1));
+        GSF__TRY(gsf__fit_image(ctx, f->alpha + i, camera, 1));
+        GSF__TRY(gsf__fit_image(ctx, f->restored + i, camera, 3));
+        GSF__TRY(gsf__fit_image(ctx, f->confidence + i, camera, 1));
+        gsf_render_output out;
+        memset(&out, 0, sizeof out);
+        out.color = f->rendered[i];
+        out.depth = f->depth[i];
+        out.alpha = f->alpha[i];
+        GSF__TRY(gsf_splat_trainer_render(ctx, f->trainer, camera, &out));
+    }
+    window.color = f->rendered;
+    window.depth = f->limits.needs_depth ? f->depth : NULL;
+    window.alpha = f->limits.needs_alpha ? f->alpha : NULL;
+    window.out_color = f->restored;
+    window.out_confidence = f->confidence;
+    int skip = 0;
+    if (f->explain.user) {
+        double psnr;
+        GSF__TRY(gsf__window_agreement(ctx, f, &window, &psnr));
+        skip = psnr >= (double)f->desc.skip_psnr;
+    }
+    if (!skip) {
+        GSF__TRY(f->restorer->restore_fn(f->restorer->user, ctx, &window));
+        const size_t before = f->pending.count;
+        for (int32_t i = 0; i < f->frames; i++) {
+            if (window.reference_index[i] >= 0) continue; // the photo itself is trained on anyway
+            const gsf_result result = gsf__keep_frame(ctx, f, window.cameras + i, f->restored + i, f->confidence + i);
+            if (result == GSF_OK) continue;
+            while (f->pending.count > before) gsf_free(ctx, f->pending.frames[--f->pending.count].pixels);
+            return result;
+        }
+    }
+    f->skipped += skip;
+    stats->frame_count = f->frames;
+    stats->cameras = window.cameras;
+    stats->rendered = f->rendered;
+    stats->restored = skip ? NULL : f->restored;
+    stats->confidence = skip ? NULL : f->confidence;
+    stats->reference_index = window.reference_index;
+    f->window++;
+    return GSF_OK;
+}
+
+static gsf_result gsf__finish_round(gsf_context* ctx, gsf_fixer* f) {
+    GSF__TRY(gsf__install_frames(ctx, f, &f->pending));
+    gsf__close_references(ctx, f);
+    gsf__drop_frames(ctx, &f->active);
+    f->active = f->pending;
+    memset(&f->pending, 0, sizeof f->pending);
+    f->restoring = 0;
+    f->round++;
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
+    gsf_fix_stats ignored;
+    if (!stats) stats = &ignored;
+    memset(stats, 0, sizeof *stats);
+    stats->rounds = f->desc.rounds;
+    stats->round = f->round + 1;
+    stats->windows = f->desc.windows;
+    stats->window = f->window + 1;
+    GSF__TRY(gsf__check_cancel(ctx));
+    if (f->restoring && f->window >= f->desc.windows) GSF__TRY(gsf__finish_round(ctx, f));
+    if (f->restoring) {
+        stats->stage = GSF_FIX_RESTORE;
+        GSF__TRY(gsf__restore_window(ctx, f, stats));
+    } else if (f->round < f->desc.rounds && f->iteration >= gsf__round_iteration(&f->desc, f->round)) {
+        stats->stage = GSF_FIX_PLAN;
+        GSF__TRY(gsf__plan_round(ctx, f));
+        f->restoring = 1;
+        f->window = 0;
+    } else if (f->iteration >= f->desc.train.iterations) {
+        stats->stage = GSF_FIX_DONE;
+    } else {
+        stats->stage = GSF_FIX_TRAIN;
+        stats->lambda = f->active.count ? gsf__restored_weight(f) : 0.0f;
+        gsf_splat_set_restored_weight(f->trainer, stats->lambda);
+        GSF__TRY(gsf_splat_train_step(ctx, f->trainer, &stats->train));
+        f->iteration = stats->train.iteration;
+    }
+    stats->skipped = f->skipped;
+    return GSF_OK;
+}
+
+/* Checkpoint: the trainer's chunks, "FIXR" (7 x i32: version, iteration, round, restoring, window, windows, skipped) and
+   two lists of frames "FIXA" (active), "FIXP" (pending): u64 count, then per frame 20 doubles (w2c, fx, fy, cx, cy),
+   2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
+enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
+
+static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag, const gsf__kept_frames* list) {
+    gsf_text body;
+    memset(&body, 0, sizeof body);
+    char head[GSF__FRAME_HEAD];
+    gsf__store_le(head, list->count, 8);
+    gsf_text_append(ctx, &body, head, 8);
+    for (size_t i = 0; i < list->count; i++) {
+        const gsf_camera* camera = &list->frames[i].camera;
+        double numbers[20];
+        memcpy(numbers, camera->w2c, sizeof camera->w2c);
+        numbers[16] = camera->fx;
+        numbers[17] = camera->fy;
+        numbers[18] = camera->cx;
+        numbers[19] = camera->cy;
+        for (int k = 0; k < 20; k++) {
+            uint64_t bits;
+            memcpy(&bits, numbers + k, sizeof bits);
+            gsf__store_le(head + 8 * k, bits, 8);
+        }
+        gsf__store_le(head + 160, (uint32_t)camera->width, 4);
+        gsf__store_le(head + 164, (uint32_t)camera->height, 4);
+        gsf_text_append(ctx, &body, head, sizeof head);
+        gsf_text_append(ctx, &body, (const char*)list->frames[i].pixels,
+                        4 * (size_t)camera->width * (size_t)camera->height);
+    }
+    if (body.failed) chunks->failed = 1;
+    else gsf_chunks_add(ctx, chunks, tag, body.data, body.size);
+    gsf_destroy_text(ctx, &body);
+}
+
+static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const void* data, size_t size, const char* tag,
+                                   gsf__kept_frames* out) {
+    gsf_chunk chunk;
+    memset(out, 0, sizeof *out);
+    if (!gsf_chunks_find(data, size, tag, &chunk) || chunk.size < 8)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no %s chunk", name, tag);
+    const char* p = (const char*)chunk.data;
+    const uint64_t count = gsf__load_le(p, 8);
+    size_t at = 8;
+    for (uint64_t i = 0; i < count; i++) {
+        gsf__kept_frame frame;
+        memset(&frame, 0, sizeof frame);
+        gsf_result result = GSF_OK;
+        if (chunk.size - at < GSF__FRAME_HEAD) result = GSF_ERROR_FORMAT;
+        if (result == GSF_OK) {
+            double numbers[20];
+            for (int k = 0; k < 20; k++) {
+                const uint64_t bits = gsf__load_le(p + at + 8 * (size_t)k, 8);
+                memcpy(numbers + k, &bits, sizeof bits);
+            }
+            memcpy(frame.camera.w2c, numbers, sizeof frame.camera.w2c);
+            frame.camera.fx = numbers[16];
+            frame.camera.fy = numbers[17];
+            frame.camera.cx = numbers[18];
+            frame.camera.cy = numbers[19];
+            frame.camera.width = (int32_t)gsf__load_le(p + at + 160, 4);
+            frame.camera.height = (int32_t)gsf__load_le(p + at + 164, 4);
+            at += GSF__FRAME_HEAD;
+            if (gsf_check_camera(ctx, &frame.camera) != GSF_OK || frame.camera.width > 65536 ||
+                frame.camera.height > 65536 || (chunk.size - at) / 4 / (size_t)frame.camera.width < (size_t)frame.camera.height)
+                result = GSF_ERROR_FORMAT;
+        }
+        if (result != GSF_OK) {
+            gsf__drop_frames(ctx, out);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s, frame %llu is malformed", name, tag, (unsigned long long)i);
+        }
+        const size_t bytes = 4 * (size_t)frame.camera.width * (size_t)frame.camera.height;
+        frame.pixels = (uint8_t*)gsf_alloc(ctx, bytes, 1);
+        if (!frame.pixels || gsf__reserve(ctx, (void**)&out->frames, &out->capacity, out->count, out->count + 1,
+                                          sizeof *out->frames) != GSF_OK) {
+            gsf_free(ctx, frame.pixels);
+            gsf__drop_frames(ctx, out);
+            return GSF_ERROR_OUT_OF_MEMORY;
+        }
+        memcpy(frame.pixels, p + at, bytes);
+        at += bytes;
+        out->frames[out->count++] = frame;
+    }
+    return GSF_OK;
+}
+
+GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* f, gsf_text* chunks) {
+    gsf_splat_trainer_save(ctx, f->trainer, chunks);
+    const int32_t numbers[7] = {1, f->iteration, f->round, f->restoring, f->window, f->desc.windows, f->skipped};
+    char body[28];
+    for (int k = 0; k < 7; k++) gsf__store_le(body + 4 * k, (uint32_t)numbers[k], 4);
+    gsf_chunks_add(ctx, chunks, "FIXR", body, sizeof body);
+    gsf__save_frames(ctx, chunks, "FIXA", &f->active);
+    gsf__save_frames(ctx, chunks, "FIXP", &f->pending);
+}
+
+GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const char* name, const void* data, size_t size) {
+    gsf_chunk chunk;
+    int32_t numbers[7];
+    GSF__TRY(gsf_chunks_check(ctx, name, data, size));
+    if (!gsf_chunks_find(data, size, "FIXR", &chunk) || chunk.size != 28)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no FIXR chunk: not a checkpoint of the repair loop", name);
+    for (int k = 0; k < 7; k++) numbers[k] = (int32_t)gsf__load_le((const char*)chunk.data + 4 * k, 4);
+    if (numbers[0] != 1) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: repair loop state version %d", name, (int)numbers[0]);
+    if (numbers[5] != f->desc.windows || numbers[2] < 0 || numbers[2] > f->desc.rounds || numbers[4] < 0 ||
+        numbers[4] > numbers[5] || (numbers[3] && numbers[2] >= f->desc.rounds))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: made with other rounds or windows", name);
+    gsf__kept_frames active, pending;
+    GSF__TRY(gsf__load_frames(ctx, name, data, size, "FIXA", &active));
+    gsf_result result = gsf__load_frames(ctx, name, data, size, "FIXP", &pending);
+    if (result == GSF_OK) result = gsf_splat_trainer_restore(ctx, f->trainer, name, data, size);
+    if (result == GSF_OK) result = gsf__install_frames(ctx, f, &active);
+    if (result != GSF_OK) {
+        gsf__drop_frames(ctx, &active);
+        gsf__drop_frames(ctx, &pending);
+        return result;
+    }
+    gsf__close_references(ctx, f);
+    gsf__drop_frames(ctx, &f->active);
+    gsf__drop_frames(ctx, &f->pending);
+    f->active = active;
+    f->pending = pending;
+    f->iteration = numbers[1];
+    f->round = numbers[2];
+    f->restoring = numbers[3] != 0;
+    f->window = numbers[4];
+    f->skipped = numbers[6];
+    return f->restoring ? gsf__plan_round(ctx, f) : GSF_OK; // the path is a function of views, round and seed
+}
 
 GSF__END_IMPLEMENTATION
 

@@ -1,0 +1,402 @@
+// test_fixer.c - the warp restorer against an analytic scene, and the repair loop: schedule, legal sizes, skipping,
+// failing restorers, cancel, and checkpoints that continue bit for bit.
+#include "gsfixer_splat.h"
+#include "test.h"
+
+// ---- warp ----------------------------------------------------------------------
+
+// A slanted, textured plane z = 4 + 0.3 x.
+static void plane_color(double x, double y, float rgb[3]) {
+    rgb[0] = (float)(0.5 + 0.4 * sin(3.0 * x) * cos(2.0 * y));
+    rgb[1] = (float)(0.5 + 0.4 * sin(2.0 * y + 1.0));
+    rgb[2] = (float)(0.5 + 0.4 * cos(2.5 * x + y));
+}
+
+// Camera at (x, y, 0), turned by `angle` about y.
+static gsf_camera look(double x, double y, double angle, int width, int height) {
+    gsf_camera c;
+    memset(&c, 0, sizeof c);
+    double c2w[16] = {cos(angle), 0, -sin(angle), 0, 0, 1, 0, 0, sin(angle), 0, cos(angle), 0, x, y, 0, 1};
+    c.fx = c.fy = 0.9 * width;
+    c.cx = 0.5 * width;
+    c.cy = 0.5 * height;
+    c.width = width;
+    c.height = height;
+    gsf_camera_set_c2w(&c, c2w);
+    return c;
+}
+
+static void draw_plane(const gsf_camera* camera, float* color, float* depth) {
+    double c2w[16], center[3];
+    gsf_camera_c2w(camera, c2w);
+    gsf_camera_center(camera, center);
+    for (int y = 0; y < camera->height; y++)
+        for (int x = 0; x < camera->width; x++) {
+            const double ray[3] = {(x + 0.5 - camera->cx) / camera->fx, (y + 0.5 - camera->cy) / camera->fy, 1.0};
+            double d[3];
+            for (int r = 0; r < 3; r++) d[r] = c2w[r] * ray[0] + c2w[4 + r] * ray[1] + c2w[8 + r] * ray[2];
+            const double t = (4.0 + 0.3 * center[0] - center[2]) / (d[2] - 0.3 * d[0]); // camera depth, since ray z = 1
+            const size_t at = (size_t)y * (size_t)camera->width + (size_t)x;
+            plane_color(center[0] + t * d[0], center[1] + t * d[1], color + 3 * at);
+            depth[at] = (float)t;
+        }
+}
+
+static void test_warp(gsf_context* ctx) {
+    enum { W = 96, H = 64, N = W * H };
+    static float color[3][3 * N], depth[3][N], out_color[3 * N], out_confidence[N], gray[3 * N];
+    const gsf_camera cameras[3] = {look(-0.5, 0.0, 0.1, W, H), look(0.5, 0.1, -0.1, W, H), look(0.1, 0.05, 0.0, W, H)};
+    gsf_reference references[2];
+    memset(references, 0, sizeof references);
+    for (int i = 0; i < 3; i++) draw_plane(&cameras[i], color[i], depth[i]);
+    for (int i = 0; i < 2; i++) {
+        references[i].camera = cameras[i];
+        references[i].color = gsf_wrap_image(color[i], GSF_F32, W, H, 3);
+        references[i].depth = gsf_wrap_image(depth[i], GSF_F32, W, H, 1);
+    }
+    for (int i = 0; i < 3 * N; i++) gray[i] = 0.25f;
+    gsf_image frame = gsf_wrap_image(gray, GSF_F32, W, H, 3), restored = gsf_wrap_image(out_color, GSF_F32, W, H, 3);
+    gsf_image confidence = gsf_wrap_image(out_confidence, GSF_F32, W, H, 1);
+    gsf_restorer warp;
+    gsf_restore_window window;
+    memset(&window, 0, sizeof window);
+    window.struct_size = sizeof window;
+    window.frame_count = 1;
+    window.color = &frame;
+    window.cameras = &cameras[2];
+    window.out_color = &restored;
+    window.out_confidence = &confidence;
+    CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
+    CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    int covered = 0;
+    double worst = 0.0;
+    for (int i = 0; i < N; i++) {
+        if (out_confidence[i] <= 0.0f) {
+            CHECK(out_color[3 * i] == 0.25f); // nobody sees it: the render stays
+            continue;
+        }
+        covered++;
+        for (int c = 0; c < 3; c++) worst = fmax(worst, fabs((double)(out_color[3 * i + c] - color[2][3 * i + c])));
+    }
+    CHECK(covered > N * 9 / 10);
+    CHECK_NEAR(worst, 0.0, 0.02); // bilinear sampling of the texture
+    // a reference that is far in front is refuted by the other and loses
+    for (int i = 0; i < N; i++)
+        if (i % W > 20 && i % W < 50) depth[0][i] = 1.5f;
+    warp.end_fn(warp.user, ctx);
+    CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    double error = 0.0, weight = 0.0;
+    for (int i = 0; i < N; i++) {
+        weight += (double)out_confidence[i];
+        error += (double)out_confidence[i] * fabs((double)(out_color[3 * i] - color[2][3 * i]));
+    }
+    CHECK(weight > 0.5 * N && error / weight < 0.02);
+    // the frame that is a reference is that photo
+    const int32_t known = 1;
+    window.cameras = &cameras[1];
+    window.reference_index = &known;
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    for (int i = 0; i < N; i += 7) CHECK_NEAR(out_color[3 * i], color[1][3 * i], 1e-6);
+    warp.end_fn(warp.user, ctx);
+    CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 0), GSF_ERROR_INVALID_ARGUMENT);
+    references[1].depth.data = NULL;
+    CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 2), GSF_ERROR_INVALID_ARGUMENT);
+    gsf_splat_destroy_warp(ctx, &warp);
+}
+
+// ---- a small scene to repair ---------------------------------------------------
+
+enum { WIDTH = 48, HEIGHT = 40, VIEWS = 4, TRUTH = 400, PIXELS = WIDTH * HEIGHT };
+
+typedef struct repair {
+    gsf_splats truth, start;
+    gsf_rasterizer* rasterizer;
+    gsf_train_view views[VIEWS];
+    float photos[VIEWS][3 * PIXELS];
+    gsf_restorer restorer;          // renders the truth
+    int32_t multiple, frames_step;  // the restorer's limits
+    int begun, ended, windows, fail_at, checked;
+} repair;
+
+static gsf_camera around(double angle, double height) { // on a circle of radius 4, looking at the middle
+    const double eye[3] = {4.0 * sin(angle), height, -4.0 * cos(angle)}, target[3] = {0, 0, 0}, up[3] = {0, -1, 0};
+    double pose[16];
+    gsf_camera c = look(0, 0, 0, WIDTH, HEIGHT);
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    if (gsf_traj_look_at(&ctx, eye, target, up, pose) == GSF_OK) gsf_camera_set_c2w(&c, pose);
+    return c;
+}
+
+static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
+                               gsf_restorer_limits* out) {
+    const repair* r = (const repair*)user;
+    (void)ctx; (void)frames; (void)width; (void)height;
+    memset(out, 0, sizeof *out);
+    out->frame_count_min = 1;
+    out->frame_count_step = r->frames_step;
+    out->width_multiple = out->height_multiple = r->multiple;
+    out->needs_depth = out->needs_alpha = 1;
+    return GSF_OK;
+}
+
+static gsf_result repair_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    repair* r = (repair*)user;
+    CHECK(count == VIEWS);
+    CHECK(references[0].color.data != NULL && references[0].depth.data != NULL);
+    (void)ctx;
+    r->begun++;
+    return GSF_OK;
+}
+
+static gsf_result repair_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    repair* r = (repair*)user;
+    if (r->fail_at && ++r->windows == r->fail_at) return gsf_fail(ctx, GSF_ERROR_RESTORER, "out of ideas");
+    CHECK(window->depth != NULL && window->alpha != NULL && (window->frame_count - 1) % r->frames_step == 0);
+    for (int32_t i = 0; i < window->frame_count; i++) {
+        const gsf_camera* camera = window->cameras + i;
+        CHECK(camera->width % r->multiple == 0 && camera->height % r->multiple == 0);
+        CHECK_NEAR(camera->fx / camera->fy, 1.0, 1e-9); // nothing is squashed
+        gsf_render_output out;
+        memset(&out, 0, sizeof out);
+        out.color = window->out_color[i];
+        CHECK_OK(ctx, gsf_splat_render(ctx, r->rasterizer, &r->truth, camera, NULL, &out));
+        float* confidence = (float*)window->out_confidence[i].data;
+        for (int32_t k = 0; k < camera->width * camera->height; k++) confidence[k] = 0.8f;
+        if (window->reference_index[i] >= 0) r->checked++;
+    }
+    return GSF_OK;
+}
+
+static void repair_end(void* user, gsf_context* ctx) {
+    (void)ctx;
+    ((repair*)user)->ended++;
+}
+
+static void repair_setup(gsf_context* ctx, repair* r) {
+    memset(r, 0, sizeof *r);
+    r->multiple = 8;
+    r->frames_step = 4;
+    CHECK_OK(ctx, gsf_splat_make(ctx, TRUTH, 0, &r->truth));
+    CHECK_OK(ctx, gsf_splat_make(ctx, TRUTH, 0, &r->start));
+    CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &r->rasterizer));
+    uint64_t seed = 5;
+    for (size_t i = 0; i < TRUTH; i++) {
+        for (size_t k = 0; k < 3; k++) {
+            r->truth.means[3 * i + k] = (float)test_random_in(&seed, -1.2, 1.2);
+            r->start.means[3 * i + k] = r->truth.means[3 * i + k] + (float)test_random_in(&seed, -0.05, 0.05);
+            r->truth.log_scales[3 * i + k] = (float)test_random_in(&seed, -2.5, -1.4);
+            r->start.log_scales[3 * i + k] = -2.4f;
+            r->truth.sh[3 * i + k] = (float)test_random_in(&seed, -1.5, 1.5);
+        }
+        r->truth.quats[4 * i] = r->start.quats[4 * i] = 1.0f;
+        r->truth.opacity_logits[i] = 2.0f;
+        r->start.opacity_logits[i] = -1.0f;
+    }
+    for (int i = 0; i < VIEWS; i++) {
+        r->views[i].camera = around(0.5 * i - 0.75, 0.3 * (i % 2) - 0.15);
+        r->views[i].image = gsf_wrap_image(r->photos[i], GSF_F32, WIDTH, HEIGHT, 3);
+        gsf_render_output out;
+        memset(&out, 0, sizeof out);
+        out.color = r->views[i].image;
+        CHECK_OK(ctx, gsf_splat_render(ctx, r->rasterizer, &r->truth, &r->views[i].camera, NULL, &out));
+    }
+    r->restorer.struct_size = sizeof r->restorer;
+    r->restorer.name = "truth";
+    r->restorer.user = r;
+    r->restorer.query_fn = repair_query;
+    r->restorer.begin_fn = repair_begin;
+    r->restorer.restore_fn = repair_restore;
+    r->restorer.end_fn = repair_end;
+}
+
+static void repair_teardown(gsf_context* ctx, repair* r) {
+    gsf_splat_destroy_rasterizer(ctx, r->rasterizer);
+    gsf_splat_destroy(ctx, &r->truth);
+    gsf_splat_destroy(ctx, &r->start);
+}
+
+static gsf_fix_desc repair_desc(void) {
+    gsf_fix_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.train.iterations = 120;
+    desc.train.seed = 3;
+    desc.train.densify_from = 20;
+    desc.train.densify_interval = 20;
+    desc.rounds = 2;
+    desc.windows = 2;
+    desc.window_frames = 8; // becomes 9, the nearest 4k + 1
+    desc.trajectory = GSF_TRAJ_INTERPOLATE;
+    return desc;
+}
+
+// Steps until done or `stop` steps; counts the stages.
+static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]) {
+    gsf_fix_stats stats;
+    for (int i = 0; i < stop; i++) {
+        if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) return 1;
+        if (counts) counts[stats.stage]++;
+        if (stats.stage == GSF_FIX_DONE) return 1;
+        if (stats.stage == GSF_FIX_RESTORE) CHECK(stats.frame_count == 9 && stats.rendered != NULL && stats.cameras != NULL);
+    }
+    return 0;
+}
+
+static double held_out_psnr(gsf_context* ctx, repair* r, gsf_fixer* fixer) {
+    static float a[3 * PIXELS], b[3 * PIXELS];
+    double sum = 0.0;
+    for (int i = 0; i < 3; i++) {
+        const gsf_camera camera = around(0.5 * i - 0.5, 0.2);
+        gsf_render_output out;
+        memset(&out, 0, sizeof out);
+        out.color = gsf_wrap_image(a, GSF_F32, WIDTH, HEIGHT, 3);
+        CHECK_OK(ctx, gsf_splat_render(ctx, r->rasterizer, &r->truth, &camera, NULL, &out));
+        out.color = gsf_wrap_image(b, GSF_F32, WIDTH, HEIGHT, 3);
+        CHECK_OK(ctx, gsf_splat_trainer_render(ctx, gsf_splat_fixer_trainer(fixer), &camera, &out));
+        double error = 0.0;
+        for (int k = 0; k < 3 * PIXELS; k++) error += pow((double)(a[k] - b[k]), 2.0) / (3.0 * PIXELS);
+        sum += -10.0 * log10(error) / 3.0;
+    }
+    return sum;
+}
+
+static int same_splats(gsf_fixer* a, gsf_fixer* b) {
+    const gsf_splats *x = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(a));
+    const gsf_splats *y = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(b));
+    return x->count == y->count && memcmp(x->means, y->means, 12 * x->count) == 0 &&
+           memcmp(x->sh, y->sh, 12 * x->count) == 0 && memcmp(x->opacity_logits, y->opacity_logits, 4 * x->count) == 0;
+}
+
+static void test_loop(gsf_context* ctx) {
+    static repair r;
+    repair_setup(ctx, &r);
+    const gsf_fix_desc desc = repair_desc();
+    gsf_fixer *plain, *fixed;
+    int counts[4] = {0, 0, 0, 0};
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, NULL, &plain));
+    CHECK(run_steps(ctx, plain, 1000, counts));
+    CHECK(counts[GSF_FIX_TRAIN] == 120 && counts[GSF_FIX_PLAN] == 0 && counts[GSF_FIX_RESTORE] == 0);
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixed));
+    CHECK(run_steps(ctx, fixed, 1000, counts));
+    CHECK(counts[GSF_FIX_TRAIN] == 240 && counts[GSF_FIX_PLAN] == 2 && counts[GSF_FIX_RESTORE] == 4);
+    CHECK(r.begun == 2 && r.ended == 2 && r.checked > 0); // some frames are photos
+    const double before = held_out_psnr(ctx, &r, plain), after = held_out_psnr(ctx, &r, fixed);
+    printf("held-out PSNR: plain %.2f dB, with a perfect restorer %.2f dB\n", before, after);
+    CHECK(after > before + 0.3);
+
+    // continue from a checkpoint taken after every few steps, in all stages
+    for (int stop = 1; stop < 126; stop += stop > 38 && stop < 48 ? 1 : 13) {
+        gsf_fixer *first, *second;
+        gsf_text chunks;
+        memset(&chunks, 0, sizeof chunks);
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &first));
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &second));
+        run_steps(ctx, first, stop, NULL);
+        gsf_splat_fixer_save(ctx, first, &chunks);
+        gsf_chunks_end(ctx, &chunks);
+        CHECK(!chunks.failed);
+        gsf_splat_destroy_fixer(ctx, first);
+        CHECK_OK(ctx, gsf_splat_fixer_restore(ctx, second, "checkpoint", chunks.data, chunks.size));
+        CHECK(run_steps(ctx, second, 1000, NULL));
+        if (!CHECK(same_splats(fixed, second))) fprintf(stderr, "  resumed after %d steps\n", stop);
+        for (size_t cut = 0; cut < chunks.size && stop == 1; cut += chunks.size / 50 + 1)
+            CHECK(gsf_splat_fixer_restore(ctx, second, "cut", chunks.data, cut) != GSF_OK);
+        gsf_splat_destroy_fixer(ctx, second);
+        gsf_destroy_text(ctx, &chunks);
+    }
+    CHECK(r.begun == r.ended);
+    gsf_splat_destroy_fixer(ctx, plain);
+    gsf_splat_destroy_fixer(ctx, fixed);
+    repair_teardown(ctx, &r);
+}
+
+static void test_trouble(gsf_context* ctx) {
+    static repair r;
+    repair_setup(ctx, &r);
+    gsf_fix_desc desc = repair_desc();
+    gsf_fixer *calm, *rough;
+    gsf_fix_stats stats;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &calm));
+    CHECK(run_steps(ctx, calm, 1000, NULL));
+    // a restorer that fails once, and a cancel in between, change nothing in the end
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough));
+    r.windows = 0;
+    r.fail_at = 2;
+    int errors = 0, cancels = 0, steps = 0;
+    for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE && steps < 1000; steps++) {
+        if (steps == 30 || steps == 43) gsf_request_cancel(ctx);
+        const gsf_result result = gsf_splat_fix_step(ctx, rough, &stats);
+        if (result == GSF_ERROR_CANCELLED) {
+            cancels++;
+            gsf_clear_cancel(ctx);
+        } else if (result != GSF_OK) {
+            CHECK(result == GSF_ERROR_RESTORER && strstr(ctx->error, "out of ideas"));
+            errors++;
+        }
+    }
+    CHECK(errors == 1 && cancels == 2);
+    CHECK(same_splats(calm, rough));
+    gsf_splat_destroy_fixer(ctx, rough);
+    r.fail_at = 0;
+    // every window agrees well enough with the references when next to nothing is asked for
+    desc.skip_psnr = 1.0f;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough));
+    r.checked = 0;
+    for (stats.stage = GSF_FIX_TRAIN, steps = 0; stats.stage != GSF_FIX_DONE && steps < 1000; steps++)
+        CHECK_OK(ctx, gsf_splat_fix_step(ctx, rough, &stats));
+    printf("%d of 4 windows skipped\n", (int)stats.skipped);
+    CHECK(stats.skipped > 0 && stats.skipped <= 4);
+    gsf_splat_destroy_fixer(ctx, rough);
+    gsf_splat_destroy_fixer(ctx, calm);
+    // bad descriptions
+    desc.window_frames = 1;
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough), GSF_ERROR_INVALID_ARGUMENT);
+    desc = repair_desc();
+    desc.first_round = 1000;
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough), GSF_ERROR_INVALID_ARGUMENT);
+    desc = repair_desc();
+    r.restorer.end_fn = NULL;
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough), GSF_ERROR_INVALID_ARGUMENT);
+    repair_teardown(ctx, &r);
+}
+
+static void test_seen_mask(gsf_context* ctx) {
+    static repair r;
+    static uint8_t seen[PIXELS], all[PIXELS];
+    repair_setup(ctx, &r);
+    const gsf_camera novel = around(0.1, 0.0);
+    gsf_camera cameras[VIEWS];
+    for (int i = 0; i < VIEWS; i++) cameras[i] = r.views[i].camera;
+    gsf_image mask = gsf_wrap_image(seen, GSF_U8, WIDTH, HEIGHT, 1), full = gsf_wrap_image(all, GSF_U8, WIDTH, HEIGHT, 1);
+    CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, cameras, VIEWS, &full));
+    CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, &novel, 1, &mask)); // a camera sees what it sees
+    int self = 0, more = 0, covered = 0;
+    static float alpha[PIXELS];
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.alpha = gsf_wrap_image(alpha, GSF_F32, WIDTH, HEIGHT, 1);
+    CHECK_OK(ctx, gsf_splat_render(ctx, r.rasterizer, &r.truth, &novel, NULL, &out));
+    for (int i = 0; i < PIXELS; i++) {
+        covered += alpha[i] >= 0.5f;
+        self += seen[i] == 1;
+        more += all[i] == 1;
+        CHECK(seen[i] <= 1 && all[i] <= 1 && (alpha[i] >= 0.5f || !(seen[i] | all[i])));
+    }
+    CHECK(self == covered && more <= covered && more > covered / 2);
+    CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, NULL, 0, &mask));
+    for (int i = 0; i < PIXELS; i++) CHECK(seen[i] == 0);
+    repair_teardown(ctx, &r);
+}
+
+int main(void) {
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    test_warp(&ctx);
+    test_seen_mask(&ctx);
+    test_loop(&ctx);
+    test_trouble(&ctx);
+    return test_report();
+}
