@@ -1,0 +1,1122 @@
+// gsfix.c - the toolkit's program: repairs 3D Gaussian Splatting scenes made from few photos. By hand, in one go:
+//   cc -O2 -std=c11 -fopenmp -I. -DGSFIXER_IMPLEMENTATION -DGSFIX_ONE_FILE examples/gsfix.c -o gsfix -lm
+//   (with Embree: -DGSF_USE_EMBREE and -lembree3 or -lembree4)
+// SPDX-License-Identifier: MIT
+#include "gsfix.h"
+
+#include <errno.h>
+#include <math.h>
+#include <signal.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <unistd.h>
+
+// ---- options ---------------------------------------------------------------------
+
+typedef enum option_kind { FLAG, TEXT, INT, REAL, SEED } option_kind;
+
+typedef struct option_spec {
+    const char* name;
+    option_kind kind;
+    size_t offset;
+    double least, most;   // INT, REAL
+    const char* value;    // how --help calls it; with | in it: the choices
+    const char* commands; // that take it
+    const char* help;
+} option_spec;
+
+#define AT(field) offsetof(gsfix_options, field)
+#define ALL "info fix render filter path restore metrics masks"
+static const option_spec option_specs[] = {
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks", "where the results go"},
+    {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
+     "training views: so many of those that are not test views, all of them (default), or a file of names, one per line"},
+    {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
+     "every Nth view by name is held out (default 8)"},
+    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks", "use images_N/, or photos N times smaller"},
+    {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks",
+     "shrink photos whose longer side is more than this"},
+    {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
+     "what repairs rendered frames (fix: none by default): warp = the photos, reprojected; exec = a program of yours,\n"
+     "called as COMMAND JOBDIR"},
+    {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore",
+     "a COMMAND that takes longer for a window is stopped and the run fails (default 3600)"},
+    {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix", "what guides the restorer dit:"},
+    {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
+     "regularisers for few views (default on); off is plain 3DGS"},
+    {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
+     "path of the frames to repair (default reference)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "training steps in all (default 3000)"},
+    {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
+     "initial points: those that a training view sees by ray, by track, or by either (both, the default); all points;\n"
+     "random ones (the default where the scene has no points)"},
+    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix render",
+     "approximations allowed (default balanced; exact: none)"},
+    {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix",
+     "DIR/VIEW.png per test view, white where the figures \"seen\" are to be taken (gsfix masks makes them)"},
+    {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "go on from OUT/checkpoint if there is one"},
+    {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
+     "measure the held-out views every N steps (default: a tenth of the iterations)"},
+    {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
+     "write OUT/checkpoint every N steps (default: a twentieth of the iterations) and after every repaired window"},
+    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix", "single settings of the trainer and of the loop, by name:"},
+    {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render its views"},
+    {"--path", TEXT, AT(path), 0, 0, "PATH.json", "render", "render these cameras"},
+    {"--depth", FLAG, AT(depth), 0, 0, NULL, "render", "also OUT/depth/NAME.npy (float32, scene units) and a picture of it"},
+    {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also OUT/alpha/NAME.png"},
+    {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
+     "a point is kept when a training view sees it by ray, by track, or by either (default both)"},
+    {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate", "path", "kind of path (default reference)"},
+    {"--frames", INT, AT(frames), 2, 1e6, "N", "path", "cameras on the path, in all (default 120)"},
+    {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "clips that the frames are divided into (default 1)"},
+    {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore", "the photos that guide the repair (default FRAMES_DIR/refs/)"},
+    {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "restore", "encoded photos, for the restorer dit:"},
+    {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
+     "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage (default psnr,ssim_3dgs)"},
+    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "networks, for metrics that need one"},
+    {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, say one of all views"},
+    {"--threads", INT, AT(threads), 1, 1024, "N", ALL, "workers (default: all cores); results are the same bits for any number"},
+    {"--seed", SEED, AT(seed), 0, 0, "S", ALL, "of everything random (default 0)"},
+    {"--json", FLAG, AT(json), 0, 0, NULL, ALL, "one JSON object on stdout; progress goes to stderr in any case"},
+    {"--help", FLAG, AT(help), 0, 0, NULL, ALL, "this text"},
+};
+enum { OPTION_COUNT = sizeof option_specs / sizeof option_specs[0] };
+
+static int run_info(gsfix_app* app);
+static int run_render(gsfix_app* app);
+static int run_filter(gsfix_app* app);
+static int run_path(gsfix_app* app);
+static int run_restore(gsfix_app* app);
+static int run_metrics(gsfix_app* app);
+static int run_masks(gsfix_app* app);
+
+typedef struct command_spec {
+    const char *name, *usage, *summary;
+    int inputs; // positional arguments
+    int (*run)(gsfix_app* app);
+} command_spec;
+
+static const command_spec command_specs[] = {
+    {"info", "SCENE | SPLATS.ply", "what a scene or a splat file holds", 1, run_info},
+    {"fix", "SCENE --out DIR", "photos and COLMAP model in, repaired splats and a report out", 1, gsfix_run_fix},
+    {"render", "SPLATS.ply (--scene SCENE | --path PATH.json) --out DIR", "pictures of splats", 1, run_render},
+    {"filter", "SCENE --out SCENE2", "COLMAP model with only the points that the training views see", 1, run_filter},
+    {"path", "SCENE --out PATH.json", "a camera path through a scene", 1, run_path},
+    {"restore", "FRAMES_DIR --restorer ... --out DIR", "repairs one clip of frames", 1, run_restore},
+    {"metrics", "DIR_A DIR_B", "compares pictures of the same name", 2, run_metrics},
+    {"masks", "SCENE --model ALL.ply --out DIR", "per test view: the pixels that some training view sees", 1, run_masks},
+    {"dataset", "", "", 0, NULL},  // not in this version
+    {"evaluate", "", "", 0, NULL},
+};
+enum { COMMAND_COUNT = sizeof command_specs / sizeof command_specs[0] };
+
+static int has_word(const char* words, const char* word) { // words are separated by single blanks
+    const size_t n = strlen(word);
+    for (const char* p = words; (p = strstr(p, word)) != NULL; p += n)
+        if ((p == words || p[-1] == ' ') && (p[n] == 0 || p[n] == ' ')) return 1;
+    return 0;
+}
+
+static void print_version(void) {
+    gsf_context ctx = {0};
+    if (gsf_init_context(&ctx) != GSF_OK) return;
+#ifdef GSF_USE_EMBREE
+    const char* rays = "Embree";
+#else
+    const char* rays = "z-buffer (built without Embree)";
+#endif
+    printf("gsfix %s  kernels: %s  workers: %d  visibility rays: %s\n", GSF_VERSION, gsf_cpu_level_name(ctx.cpu_level),
+           ctx.parallel.worker_count, rays);
+}
+
+static int print_overview(FILE* to) {
+    fprintf(to, "gsfix %s - repairs 3D Gaussian Splatting scenes made from few photos\n\n", GSF_VERSION);
+    for (int i = 0; i < COMMAND_COUNT; i++)
+        if (command_specs[i].run) fprintf(to, "  gsfix %-8s %s\n", command_specs[i].name, command_specs[i].summary);
+    fprintf(to, "\n  gsfix COMMAND --help tells more.  gsfix --version: version and how it was built.\n"
+                "  SCENE is a COLMAP folder (images/, sparse/0/) or a nerfstudio / instant-ngp transforms.json.\n"
+                "  Exit status: 0 done, 1 the work failed (one line says why), 2 wrong usage.\n");
+    return to == stdout ? 0 : 2;
+}
+
+void gsfix_print_settings(FILE* to); // the names that --set knows; gsfix_fix.c
+
+static void print_help(const command_spec* command) {
+    printf("gsfix %s %s [options]\n%s\n\n", command->name, command->usage, command->summary);
+    for (int i = 0; i < OPTION_COUNT; i++) {
+        const option_spec* o = &option_specs[i];
+        if (!has_word(o->commands, command->name)) continue;
+        char left[96];
+        snprintf(left, sizeof left, "%s%s%s", o->name, o->value ? " " : "", o->value ? o->value : "");
+        printf("  %s\n", left);
+        for (const char* line = o->help; *line;) {
+            const int n = (int)strcspn(line, "\n");
+            printf("        %.*s\n", n, line);
+            line += n + (line[n] == '\n');
+        }
+        if (strcmp(o->name, "--set") == 0) gsfix_print_settings(stdout);
+    }
+}
+
+static int is_choice(const char* choices, const char* value) {
+    const size_t n = strlen(value);
+    for (const char* p = choices; p; p = strchr(p, '|') ? strchr(p, '|') + 1 : NULL)
+        if (strncmp(p, value, n) == 0 && (p[n] == 0 || p[n] == '|')) return 1;
+    return 0;
+}
+
+static int set_option(gsfix_app* app, const option_spec* o, const char* value) {
+    char* field = (char*)&app->o + o->offset;
+    char* end = NULL;
+    errno = 0;
+    switch (o->kind) {
+        case FLAG: *(int*)(void*)field = 1; return 0;
+        case TEXT:
+            if (!*value) return gsfix_misused(app, "%s is empty", o->name);
+            if (strchr(o->value, '|') && !strpbrk(o->value, ":N") && !is_choice(o->value, value))
+                return gsfix_misused(app, "%s %s: choose from %s", o->name, value, o->value);
+            *(const char**)(void*)field = value;
+            return 0;
+        case INT: {
+            const long long x = strtoll(value, &end, 10);
+            if (errno || end == value || *end || (double)x < o->least || (double)x > o->most)
+                return gsfix_misused(app, "%s %s: expected a whole number from %.0f to %.0f", o->name, value, o->least, o->most);
+            *(int*)(void*)field = (int)x;
+            return 0;
+        }
+        case REAL: {
+            const double x = strtod(value, &end);
+            if (errno || end == value || *end || !(x >= o->least && x <= o->most))
+                return gsfix_misused(app, "%s %s: expected a number from %g to %g", o->name, value, o->least, o->most);
+            *(double*)(void*)field = x;
+            return 0;
+        }
+        case SEED: {
+            const unsigned long long x = strtoull(value, &end, 10);
+            if (errno || end == value || *end || *value == '-')
+                return gsfix_misused(app, "%s %s: expected a whole number", o->name, value);
+            *(uint64_t*)(void*)field = x;
+            return 0;
+        }
+    }
+    return 2;
+}
+
+static int parse_options(gsfix_app* app, const command_spec* command, int argc, char** argv) {
+    for (int i = 2; i < argc; i++) {
+        if (argv[i][0] != '-' || !argv[i][1]) {
+            app->o.inputs[app->o.input_count++] = argv[i];
+            continue;
+        }
+        const size_t length = strcspn(argv[i], "="); // --name value and --name=value
+        const option_spec* o = NULL;
+        for (int k = 0; k < OPTION_COUNT && !o; k++)
+            if (strlen(option_specs[k].name) == length && strncmp(option_specs[k].name, argv[i], length) == 0)
+                o = &option_specs[k];
+        if (!o || !has_word(o->commands, command->name)) return gsfix_misused(app, "no option %s here", argv[i]);
+        const char* value = argv[i][length] ? argv[i] + length + 1 : NULL;
+        if (o->kind == FLAG && value) return gsfix_misused(app, "%s takes no value", o->name);
+        if (o->kind != FLAG && !value && ++i >= argc) return gsfix_misused(app, "%s needs %s", o->name, o->value);
+        const int code = set_option(app, o, value ? value : o->kind == FLAG ? "" : argv[i]);
+        if (code) return code;
+    }
+    if (app->o.help) return 0;
+    if (app->o.input_count != command->inputs)
+        return gsfix_misused(app, "expected: gsfix %s %s", command->name, command->usage);
+    if (has_word("fix render filter path restore masks", command->name) && !app->o.out)
+        return gsfix_misused(app, "--out is missing");
+    if (app->o.factor && app->o.max_size) return gsfix_misused(app, "--factor and --max-size exclude each other");
+    return 0;
+}
+
+// ---- scenes and restorers --------------------------------------------------------
+
+gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out) {
+    gsf_scene_desc desc = {0};
+    desc.factor = app->o.factor;
+    desc.max_size = app->o.max_size;
+    return gsf_splat_load_scene(&app->ctx, path, &desc, out);
+}
+
+static int read_number(const char* text, long* out) {
+    char* end = NULL;
+    errno = 0;
+    *out = strtol(text, &end, 10);
+    return !errno && end != text && !*end;
+}
+
+// Training views by name; test views are the usual ones as far as they are not trained on.
+static gsf_result split_by_file(gsfix_app* app, const gsf_scene* scene, const char* path, size_t test_every,
+                                gsfix_split* split) {
+    void* data;
+    size_t size;
+    gsf_result result = gsf_read_file(&app->ctx, path, &data, &size);
+    if (result != GSF_OK) return result;
+    uint8_t* chosen = (uint8_t*)gsf_alloc_zeroed(&app->ctx, scene->view_count + 1, 1);
+    if (!chosen) result = GSF_ERROR_OUT_OF_MEMORY;
+    const char* text = (const char*)data;
+    for (size_t at = 0; at < size && result == GSF_OK;) {
+        const size_t line = at;
+        size_t end = at;
+        while (end < size && text[end] != '\n') end++;
+        at = end + 1;
+        while (end > line && (text[end - 1] == '\r' || text[end - 1] == ' ')) end--;
+        if (end == line) continue;
+        size_t i = 0;
+        while (i < scene->view_count &&
+               !(strlen(scene->views[i].name) == end - line && memcmp(scene->views[i].name, text + line, end - line) == 0))
+            i++;
+        if (i < scene->view_count) chosen[i] = 1;
+        else
+            result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "%s:%zu: no view \"%.*s\" in the scene", path, line,
+                              (int)(end - line < 200 ? end - line : 200), text + line);
+    }
+    if (result == GSF_OK) {
+        size_t kept = 0;
+        gsf_splat_split_views(scene->view_count, test_every, 0, NULL, NULL, split->test, &split->test_count);
+        for (size_t i = 0; i < split->test_count; i++)
+            if (!chosen[split->test[i]]) split->test[kept++] = split->test[i];
+        split->test_count = kept;
+        for (size_t i = 0; i < scene->view_count; i++)
+            if (chosen[i]) split->train[split->train_count++] = (uint32_t)i;
+    }
+    gsf_free(&app->ctx, chosen);
+    gsf_free(&app->ctx, data);
+    return result;
+}
+
+gsf_result gsfix_split_scene(gsfix_app* app, const gsf_scene* scene, gsfix_split* out) {
+    const size_t test_every = app->o.test_every ? (size_t)app->o.test_every : 8;
+    const char* views = app->o.views ? app->o.views : "all";
+    memset(out, 0, sizeof *out);
+    out->train = (uint32_t*)gsf_alloc(&app->ctx, scene->view_count + 1, sizeof *out->train);
+    out->test = (uint32_t*)gsf_alloc(&app->ctx, scene->view_count + 1, sizeof *out->test);
+    gsf_result result = out->train && out->test ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    long wanted = 0;
+    if (result == GSF_OK && (strcmp(views, "all") == 0 || read_number(views, &wanted))) {
+        size_t most = 0;
+        gsf_splat_split_views(scene->view_count, test_every, 0, NULL, &most, NULL, NULL);
+        if (wanted < 0 || (wanted == 0 && strcmp(views, "all") != 0))
+            result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: at least one is needed", views);
+        else if ((size_t)wanted > most)
+            result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: only %zu views are not test views", views, most);
+        else
+            gsf_splat_split_views(scene->view_count, test_every, (size_t)wanted, out->train, &out->train_count, out->test,
+                                  &out->test_count);
+    } else if (result == GSF_OK) {
+        result = split_by_file(app, scene, views, test_every, out);
+    }
+    if (result == GSF_OK && out->train_count == 0)
+        result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "no training view is left of %zu views", scene->view_count);
+    if (result != GSF_OK) gsfix_free_split(app, out);
+    return result;
+}
+
+void gsfix_free_split(gsfix_app* app, gsfix_split* split) {
+    gsf_free(&app->ctx, split->train);
+    gsf_free(&app->ctx, split->test);
+    memset(split, 0, sizeof *split);
+}
+
+gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint32_t* views, size_t count,
+                             gsf_camera** out) {
+    *out = (gsf_camera*)gsf_alloc(&app->ctx, count + 1, sizeof **out);
+    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < count; i++) (*out)[i] = scene->views[views[i]].camera;
+    return GSF_OK;
+}
+
+float gsfix_near_plane(const gsf_camera* cameras, size_t stride, size_t count) {
+    double mean[3] = {0}, most = 0.0;
+    for (int pass = 0; pass < 2; pass++)
+        for (size_t i = 0; i < count; i++) {
+            double c[3], d = 0.0;
+            gsf_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
+            for (int k = 0; k < 3; k++) {
+                if (pass == 0) mean[k] += c[k] / (double)count;
+                else d += (c[k] - mean[k]) * (c[k] - mean[k]);
+            }
+            if (d > most) most = d;
+        }
+    const double near = 0.01 * 1.1 * sqrt(most);
+    return near > 1e-6 && near < 0.2 ? (float)near : 0.2f;
+}
+
+gsf_traj_kind gsfix_path_kind(const char* name) {
+    return !name || strcmp(name, "reference") == 0 ? GSF_TRAJ_REFERENCE
+           : strcmp(name, "ellipse") == 0          ? GSF_TRAJ_ELLIPSE
+                                                   : GSF_TRAJ_INTERPOLATE;
+}
+
+int gsfix_check_restorer(gsfix_app* app) {
+    const char* r = app->o.restorer;
+    if (app->o.condition) return gsfix_misused(app, "--condition is for the restorer dit:, which is not in this version");
+    if (app->o.ref_features) return gsfix_misused(app, "--ref-features is for the restorer dit:, which is not in this version");
+    if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
+    if (strncmp(r, "dit:", 4) == 0 || strcmp(r, "dit") == 0) return gsfix_misused(app, "the restorer dit: is not in this version");
+    if (strncmp(r, "exec:", 5) == 0 && r[5]) return 0;
+    return gsfix_misused(app, "--restorer %s: choose from none|warp|exec:COMMAND", r);
+}
+
+gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present) {
+    const char* r = app->o.restorer;
+    memset(out, 0, sizeof *out);
+    *present = r && strcmp(r, "none") != 0;
+    if (!*present) return GSF_OK;
+    if (strcmp(r, "warp") == 0) return gsf_splat_make_warp(&app->ctx, out);
+    return gsfix_make_exec(&app->ctx, r + 5, job, app->o.restorer_timeout > 0.0 ? app->o.restorer_timeout : 3600.0, out);
+}
+
+void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
+    if (!restorer->user) return;
+    if (strcmp(app->o.restorer, "warp") == 0) gsf_splat_destroy_warp(&app->ctx, restorer);
+    else gsfix_destroy_exec(&app->ctx, restorer);
+}
+
+// ---- info ------------------------------------------------------------------------
+
+static int compare_doubles(const void* a, const void* b) {
+    const double x = *(const double*)a, y = *(const double*)b;
+    return x < y ? -1 : x > y;
+}
+
+static void print_box(gsfix_app* app, const char* key, const double* points, size_t count) { // of the middle 98 %
+    double low[3] = {0}, high[3] = {0};
+    double* column = (double*)gsf_alloc(&app->ctx, count + 1, sizeof *column);
+    if (!column || !count) {
+        gsf_free(&app->ctx, column);
+        return;
+    }
+    for (int a = 0; a < 3; a++) {
+        for (size_t i = 0; i < count; i++) column[i] = points[3 * i + (size_t)a];
+        qsort(column, count, sizeof *column, compare_doubles);
+        low[a] = column[count / 100];
+        high[a] = column[count - 1 - count / 100];
+    }
+    gsf_free(&app->ctx, column);
+    gsfix_json_begin(&app->ctx, &app->json, key, '[');
+    for (int a = 0; a < 6; a++) gsfix_json_number(&app->ctx, &app->json, NULL, a < 3 ? low[a] : high[a - 3]);
+    gsfix_json_end(&app->ctx, &app->json, ']');
+    gsfix_print(app, "extent     %.4g..%.4g  %.4g..%.4g  %.4g..%.4g (middle 98 %% of the points)", low[0], high[0], low[1],
+                high[1], low[2], high[2]);
+}
+
+static gsf_result info_scene(gsfix_app* app) {
+    gsf_scene scene;
+    gsfix_split split;
+    gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
+    if (result != GSF_OK) return result;
+    result = gsfix_split_scene(app, &scene, &split);
+    if (result != GSF_OK) {
+        gsf_splat_destroy_scene(&app->ctx, &scene);
+        return result;
+    }
+    gsf_context* ctx = &app->ctx;
+    gsf_text* json = &app->json;
+    int32_t least[2] = {0}, most[2] = {0};
+    for (size_t i = 0; i < scene.view_count; i++) {
+        const int32_t size[2] = {scene.views[i].camera.width, scene.views[i].camera.height};
+        for (int k = 0; k < 2; k++) {
+            if (i == 0 || size[k] < least[k]) least[k] = size[k];
+            if (size[k] > most[k]) most[k] = size[k];
+        }
+    }
+    gsfix_json_text(ctx, json, "kind", "scene");
+    gsfix_json_number(ctx, json, "views", (double)scene.view_count);
+    gsfix_json_number(ctx, json, "train_views", (double)split.train_count);
+    gsfix_json_number(ctx, json, "test_views", (double)split.test_count);
+    gsfix_json_number(ctx, json, "width", most[0]);
+    gsfix_json_number(ctx, json, "height", most[1]);
+    gsfix_json_number(ctx, json, "points", (double)scene.point_count);
+    const size_t entries = scene.point_count ? scene.track_begin[scene.point_count] : 0;
+    gsfix_json_number(ctx, json, "track_entries", (double)entries);
+    gsfix_print(app, "scene      %s", app->o.inputs[0]);
+    gsfix_print(app, "views      %zu: %zu to train on, %zu held out", scene.view_count, split.train_count, split.test_count);
+    if (least[0] == most[0] && least[1] == most[1]) gsfix_print(app, "size       %d x %d pixels", (int)most[0], (int)most[1]);
+    else gsfix_print(app, "size       %d..%d x %d..%d pixels", (int)least[0], (int)most[0], (int)least[1], (int)most[1]);
+    if (scene.view_count)
+        gsfix_print(app, "focal      %.1f, %.1f pixels (first view)", scene.views[0].camera.fx, scene.views[0].camera.fy);
+    gsfix_print(app, "points     %zu%s", scene.point_count, scene.point_count ? "" : " (training starts from random ones)");
+    if (scene.point_count)
+        gsfix_print(app, entries ? "tracks     %.2f views per point" : "tracks     none",
+                    (double)entries / (double)scene.point_count);
+    print_box(app, "extent", scene.points, scene.point_count);
+    gsfix_json_begin(ctx, json, "names", '[');
+    for (size_t i = 0; i < scene.view_count; i++) gsfix_json_text(ctx, json, NULL, scene.views[i].name);
+    gsfix_json_end(ctx, json, ']');
+    for (int k = 0; k < 2; k++) {
+        gsfix_json_begin(ctx, json, k ? "test" : "train", '[');
+        for (size_t i = 0; i < (k ? split.test_count : split.train_count); i++)
+            gsfix_json_text(ctx, json, NULL, scene.views[k ? split.test[i] : split.train[i]].name);
+        gsfix_json_end(ctx, json, ']');
+    }
+    gsfix_free_split(app, &split);
+    gsf_splat_destroy_scene(ctx, &scene);
+    return GSF_OK;
+}
+
+static gsf_result info_splats(gsfix_app* app) {
+    gsf_splats s;
+    gsf_result result = gsf_splat_load_ply(&app->ctx, app->o.inputs[0], &s);
+    if (result != GSF_OK) return result;
+    double* world = (double*)gsf_alloc(&app->ctx, s.count + 1, 3 * sizeof *world);
+    double* column = (double*)gsf_alloc(&app->ctx, s.count + 1, sizeof *column);
+    result = world && column ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) {
+        gsf_text* json = &app->json;
+        gsfix_json_text(&app->ctx, json, "kind", "splats");
+        gsfix_json_number(&app->ctx, json, "splats", (double)s.count);
+        gsfix_json_number(&app->ctx, json, "sh_degree", s.sh_degree);
+        gsfix_print(app, "splats     %zu of SH degree %d", s.count, (int)s.sh_degree);
+        for (size_t i = 0; i < 3 * s.count; i++) world[i] = (double)s.means[i] + s.origin[i % 3];
+        print_box(app, "extent", world, s.count);
+        size_t opaque = 0, faint = 0;
+        for (size_t i = 0; i < s.count; i++) {
+            const double opacity = 1.0 / (1.0 + exp(-(double)s.opacity_logits[i]));
+            opaque += opacity > 0.9;
+            faint += opacity < 0.005;
+            column[i] = exp(((double)s.log_scales[3 * i] + (double)s.log_scales[3 * i + 1] + (double)s.log_scales[3 * i + 2]) / 3.0);
+        }
+        if (s.count) {
+            qsort(column, s.count, sizeof *column, compare_doubles);
+            gsfix_json_number(&app->ctx, json, "median_scale", column[s.count / 2]);
+            gsfix_json_number(&app->ctx, json, "opaque_share", (double)opaque / (double)s.count);
+            gsfix_json_number(&app->ctx, json, "faint_share", (double)faint / (double)s.count);
+            gsfix_print(app, "scale      median %.4g, 1 %% below %.3g, 1 %% above %.3g", column[s.count / 2],
+                        column[s.count / 100], column[s.count - 1 - s.count / 100]);
+            gsfix_print(app, "opacity    %.1f %% above 0.9, %.1f %% below 0.005", 100.0 * (double)opaque / (double)s.count,
+                        100.0 * (double)faint / (double)s.count);
+        }
+        if (s.origin[0] != 0.0 || s.origin[1] != 0.0 || s.origin[2] != 0.0)
+            gsfix_print(app, "origin     %.17g %.17g %.17g", s.origin[0], s.origin[1], s.origin[2]);
+    }
+    gsf_free(&app->ctx, world);
+    gsf_free(&app->ctx, column);
+    gsf_splat_destroy(&app->ctx, &s);
+    return result;
+}
+
+static int run_info(gsfix_app* app) {
+    const char* path = app->o.inputs[0];
+    const size_t n = strlen(path);
+    const int ply = n > 4 && strcmp(path + n - 4, ".ply") == 0 && !gsfix_is_folder(path);
+    return (ply ? info_splats(app) : info_scene(app)) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+// ---- render ----------------------------------------------------------------------
+
+// One picture (and depth, alpha) into the folders; buffers grow to the largest camera.
+static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const gsf_splats* splats, const gsf_camera* camera,
+                             const gsf_render_desc* desc, const char* name) {
+    gsf_context* ctx = &app->ctx;
+    const char* out = app->o.out;
+    gsf_render_output images = {0};
+    gsf_image picture = {0};
+    gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &images.color);
+    if (result == GSF_OK && app->o.depth) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.depth);
+    if (result == GSF_OK && app->o.alpha) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.alpha);
+    if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, desc, &images);
+    if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", out, name).s, &images.color);
+    if (result == GSF_OK && app->o.depth) {
+        result = gsfix_save_npy(ctx, gsfix_pathf("%s/depth/%s.npy", out, name).s, &images.depth);
+        if (result == GSF_OK) result = gsfix_color_depth(ctx, &images.depth, &picture);
+        if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/depth/%s.png", out, name).s, &picture);
+    }
+    if (result == GSF_OK && app->o.alpha)
+        result = gsf_save_image(ctx, gsfix_pathf("%s/alpha/%s.png", out, name).s, &images.alpha);
+    gsf_destroy_image(ctx, &picture);
+    gsf_destroy_image(ctx, &images.color);
+    gsf_destroy_image(ctx, &images.depth);
+    gsf_destroy_image(ctx, &images.alpha);
+    return result;
+}
+
+static gsf_result render_all(gsfix_app* app) {
+    gsf_context* ctx = &app->ctx;
+    gsf_scene scene = {0};
+    gsf_splats splats = {0};
+    gsf_camera* path = NULL;
+    gsf_rasterizer* rasterizer = NULL;
+    size_t count = 0;
+    double seconds = 0.0;
+    gsf_render_desc desc = {0};
+    desc.footprint = gsfix_find_quality(app->o.quality)->footprint;
+    gsf_result result = gsf_splat_load_ply(ctx, app->o.inputs[0], &splats);
+    if (result == GSF_OK && app->o.scene) result = gsfix_load_scene(app, app->o.scene, &scene);
+    if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
+    if (result == GSF_OK && app->o.scene) count = scene.view_count;
+    if (result == GSF_OK && count)
+        desc.near_plane = app->o.scene ? gsfix_near_plane(&scene.views[0].camera, sizeof scene.views[0], count)
+                                       : gsfix_near_plane(path, sizeof *path, count);
+    if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
+    if (result == GSF_OK) result = gsfix_make_folder(ctx, app->o.out);
+    if (result == GSF_OK && app->o.depth) result = gsfix_make_folder(ctx, gsfix_pathf("%s/depth", app->o.out).s);
+    if (result == GSF_OK && app->o.alpha) result = gsfix_make_folder(ctx, gsfix_pathf("%s/alpha", app->o.out).s);
+    gsfix_json_begin(ctx, &app->json, "frames", '[');
+    for (size_t i = 0; i < count && result == GSF_OK; i++) {
+        const gsfix_path name = app->o.scene ? gsfix_view_stem(&scene, i) : gsfix_pathf("%05zu", i);
+        const double begin = gsfix_now();
+        result = gsf_is_cancelled(ctx) ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped after %zu of %zu frames", i, count)
+                                       : render_one(app, rasterizer, &splats, app->o.scene ? &scene.views[i].camera : path + i,
+                                                    &desc, name.s);
+        seconds += gsfix_now() - begin;
+        gsfix_json_text(ctx, &app->json, NULL, gsfix_pathf("%s.png", name.s).s);
+        gsfix_progress(app, (double)(i + 1), (double)count, "frame %zu of %zu", i + 1, count);
+    }
+    gsfix_json_end(ctx, &app->json, ']');
+    gsfix_json_number(ctx, &app->json, "seconds", seconds);
+    if (result == GSF_OK)
+        gsfix_print(app, "%zu frames of %zu splats in %.2f s, files included -> %s", count, splats.count, seconds, app->o.out);
+    gsf_splat_destroy_rasterizer(ctx, rasterizer);
+    gsf_free(ctx, path);
+    gsf_splat_destroy_scene(ctx, &scene);
+    gsf_splat_destroy(ctx, &splats);
+    return result;
+}
+
+static int run_render(gsfix_app* app) {
+    if (!app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
+    return render_all(app) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+// ---- filter ----------------------------------------------------------------------
+
+static gsf_result filter_scene(gsfix_app* app) {
+    gsf_context* ctx = &app->ctx;
+    gsf_scene scene;
+    gsfix_split split = {0};
+    gsf_visibility_stats stats = {0};
+    gsf_visibility_desc desc = {0};
+    const char* method = app->o.method ? app->o.method : "both";
+    desc.method = strcmp(method, "embree") == 0   ? GSF_VISIBILITY_RAYS
+                  : strcmp(method, "tracks") == 0 ? GSF_VISIBILITY_TRACKS
+                                                  : GSF_VISIBILITY_BOTH;
+    gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
+    if (result != GSF_OK) return result;
+    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene.point_count + 1, 1);
+    const double begin = gsfix_now();
+    if (!keep) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK && scene.point_count == 0)
+        result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points", app->o.inputs[0]);
+    if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
+    if (result == GSF_OK)
+        result = gsf_splat_visible_points(ctx, &scene, split.train, split.train_count, &desc, keep, &stats);
+    const double seconds = gsfix_now() - begin;
+    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/sparse/0", app->o.out).s);
+    if (result == GSF_OK) result = gsf_splat_save_colmap(ctx, &scene, keep, app->o.out);
+    if (result == GSF_OK) {
+        const char* rays = desc.method == GSF_VISIBILITY_TRACKS ? "none" : stats.used_embree ? "embree" : "z-buffer";
+        gsfix_json_text(ctx, &app->json, "method", method);
+        gsfix_json_text(ctx, &app->json, "rays_by", rays);
+        gsfix_json_number(ctx, &app->json, "points", (double)stats.points);
+        gsfix_json_number(ctx, &app->json, "kept", (double)stats.kept);
+        gsfix_json_number(ctx, &app->json, "by_tracks", (double)stats.by_tracks);
+        gsfix_json_number(ctx, &app->json, "by_rays", (double)stats.by_rays);
+        gsfix_json_number(ctx, &app->json, "rays", (double)stats.rays);
+        gsfix_json_number(ctx, &app->json, "seconds", seconds);
+        gsfix_print(app, "%zu of %zu points kept for %zu views: %zu by track, %zu more by ray (%s), %.2f s", stats.kept,
+                    stats.points, split.train_count, stats.by_tracks, stats.by_rays, rays, seconds);
+        gsfix_print(app, "%s/sparse/0 written; the photos stay in %s", app->o.out, app->o.inputs[0]);
+    }
+    gsf_free(ctx, keep);
+    gsfix_free_split(app, &split);
+    gsf_splat_destroy_scene(ctx, &scene);
+    return result;
+}
+
+static int run_filter(gsfix_app* app) { return filter_scene(app) == GSF_OK ? 0 : gsfix_failed(app); }
+
+// ---- path ------------------------------------------------------------------------
+
+static gsf_result write_path(gsfix_app* app, int frames, int windows) {
+    gsf_context* ctx = &app->ctx;
+    gsf_scene scene;
+    gsfix_split split = {0};
+    gsf_camera *cameras = NULL, *path = NULL;
+    int32_t* reference = NULL;
+    const char** names = NULL;
+    void* scratch = NULL;
+    gsf_traj_path_desc desc = {0};
+    gsf_traj_path_layout layout = {0};
+    gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
+    if (result != GSF_OK) return result;
+    result = gsfix_split_scene(app, &scene, &split);
+    if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &cameras);
+    desc.kind = gsfix_path_kind(app->o.kind);
+    desc.window_length = frames / windows;
+    desc.window_count = windows;
+    desc.seed = app->o.seed;
+    desc.points = scene.points;
+    desc.point_count = scene.point_count;
+    if (result == GSF_OK) result = gsf_traj_query_path(ctx, split.train_count, &desc, &layout);
+    if (result == GSF_OK) {
+        path = (gsf_camera*)gsf_alloc(ctx, layout.frame_count + 1, sizeof *path);
+        reference = (int32_t*)gsf_alloc(ctx, layout.frame_count + 1, sizeof *reference);
+        names = (const char**)gsf_alloc_zeroed(ctx, layout.frame_count + 1, sizeof *names);
+        scratch = gsf_alloc(ctx, layout.scratch_bytes + 1, 1);
+        result = path && reference && names && scratch ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    }
+    if (result == GSF_OK) result = gsf_traj_sample_path(ctx, cameras, split.train_count, &desc, scratch, path, reference);
+    size_t photos = 0;
+    for (size_t i = 0; i < layout.frame_count && result == GSF_OK; i++)
+        if (reference[i] >= 0) {
+            names[i] = scene.views[split.train[reference[i]]].name;
+            photos++;
+        }
+    if (result == GSF_OK) result = gsf_save_cameras(ctx, app->o.out, path, names, layout.frame_count);
+    if (result == GSF_OK) {
+        gsfix_json_text(ctx, &app->json, "kind", app->o.kind ? app->o.kind : "reference");
+        gsfix_json_number(ctx, &app->json, "frames", (double)layout.frame_count);
+        gsfix_json_number(ctx, &app->json, "windows", layout.window_count);
+        gsfix_json_number(ctx, &app->json, "photos", (double)photos);
+        gsfix_print(app, "%zu cameras (%zu of them at a photo) in %d windows -> %s", layout.frame_count, photos,
+                    (int)layout.window_count, app->o.out);
+    }
+    gsf_free(ctx, scratch);
+    gsf_free(ctx, (void*)names);
+    gsf_free(ctx, reference);
+    gsf_free(ctx, path);
+    gsf_free(ctx, cameras);
+    gsfix_free_split(app, &split);
+    gsf_splat_destroy_scene(ctx, &scene);
+    return result;
+}
+
+static int run_path(gsfix_app* app) {
+    const int frames = app->o.frames ? app->o.frames : 120, windows = app->o.windows ? app->o.windows : 1;
+    if (frames % windows != 0 || frames / windows < 2)
+        return gsfix_misused(app, "--frames %d cannot be divided into %d windows of two or more frames", frames, windows);
+    return write_path(app, frames, windows) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+// ---- metrics ---------------------------------------------------------------------
+
+static const char* const metric_names[] = {"psnr", "ssim_3dgs", "ssim_torchmetrics", "ssim_skimage"};
+enum { METRIC_COUNT = 4 };
+
+static gsf_result measure(gsf_context* ctx, int metric, const gsf_image* a, const gsf_image* b, double* out) {
+    if (metric == 0) return gsf_psnr(ctx, a, b, NULL, out);
+    static const gsf_ssim_kind kinds[] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
+    return gsf_ssim(ctx, kinds[metric - 1], a, b, NULL, out);
+}
+
+static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
+    gsf_context* ctx = &app->ctx;
+    const char *a = app->o.inputs[0], *b = app->o.inputs[1];
+    gsfix_names left = {0}, right = {0};
+    double sums[METRIC_COUNT] = {0};
+    size_t pairs = 0;
+    gsf_result result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
+    if (result == GSF_OK) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
+    gsfix_json_begin(ctx, &app->json, "per_image", '[');
+    for (size_t i = 0; i < left.count && result == GSF_OK; i++) {
+        const gsfix_path stem = gsfix_stem(left.names[i]);
+        size_t k = 0;
+        while (k < right.count && strcmp(gsfix_stem(right.names[k]).s, stem.s) != 0) k++;
+        if (k == right.count) continue;
+        gsf_image x = {0}, y = {0};
+        result = gsf_load_image(ctx, gsfix_pathf("%s/%s", a, left.names[i]).s, 3, &x);
+        if (result == GSF_OK) result = gsf_load_image(ctx, gsfix_pathf("%s/%s", b, right.names[k]).s, 3, &y);
+        if (result == GSF_OK && (x.width != y.width || x.height != y.height))
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %lld x %lld in %s, %lld x %lld in %s", stem.s,
+                              (long long)x.width, (long long)x.height, a, (long long)y.width, (long long)y.height, b);
+        if (result == GSF_OK) {
+            gsfix_json_begin(ctx, &app->json, NULL, '{');
+            gsfix_json_text(ctx, &app->json, "name", stem.s);
+        }
+        char line[256] = "";
+        for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
+            double value = 0.0;
+            if (!wanted[m]) continue;
+            result = measure(ctx, m, &x, &y, &value);
+            if (result != GSF_OK) break;
+            sums[m] += value;
+            gsfix_json_number(ctx, &app->json, metric_names[m], value);
+            snprintf(line + strlen(line), sizeof line - strlen(line), m ? "  %.5f" : "  %.3f", value);
+        }
+        if (result == GSF_OK) {
+            gsfix_json_end(ctx, &app->json, '}');
+            gsfix_print(app, "%-24s%s", stem.s, line);
+            pairs++;
+        }
+        gsf_destroy_image(ctx, &x);
+        gsf_destroy_image(ctx, &y);
+    }
+    gsfix_json_end(ctx, &app->json, ']');
+    if (result == GSF_OK && !pairs)
+        result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s and %s have no picture of the same name", a, b);
+    if (result == GSF_OK) {
+        gsfix_json_number(ctx, &app->json, "pairs", (double)pairs);
+        gsfix_json_number(ctx, &app->json, "unpaired", (double)(left.count + right.count - 2 * pairs));
+        gsfix_print(app, "means of %zu pairs:", pairs);
+        for (int m = 0; m < METRIC_COUNT; m++)
+            if (wanted[m]) {
+                gsfix_json_number(ctx, &app->json, metric_names[m], sums[m] / (double)pairs);
+                gsfix_print(app, "  %-18s %.5f", metric_names[m], sums[m] / (double)pairs);
+            }
+        if (left.count + right.count != 2 * pairs)
+            gsfix_note(app, "note: %zu pictures have no partner", left.count + right.count - 2 * pairs);
+    }
+    gsfix_free_names(ctx, &left);
+    gsfix_free_names(ctx, &right);
+    return result;
+}
+
+static int run_metrics(gsfix_app* app) {
+    int wanted[METRIC_COUNT] = {0};
+    const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
+    if (app->o.models) return gsfix_misused(app, "metrics that need a model are not in this version");
+    for (const char* p = which;; p++) {
+        const size_t n = strcspn(p, ",");
+        int m = 0;
+        while (m < METRIC_COUNT && !(strlen(metric_names[m]) == n && strncmp(metric_names[m], p, n) == 0)) m++;
+        if (m == METRIC_COUNT) return gsfix_misused(app, "the metric \"%.*s\" is not in this version", (int)n, p);
+        wanted[m] = 1;
+        p += n;
+        if (!*p) break;
+    }
+    return compare_folders(app, wanted) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+// ---- masks -----------------------------------------------------------------------
+
+static gsf_result write_masks(gsfix_app* app) {
+    gsf_context* ctx = &app->ctx;
+    gsf_scene scene;
+    gsf_splats splats = {0};
+    gsfix_split split = {0};
+    gsf_camera* train = NULL;
+    double mean = 0.0;
+    gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
+    if (result != GSF_OK) return result;
+    result = gsf_splat_load_ply(ctx, app->o.model, &splats);
+    if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
+    if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &train);
+    if (result == GSF_OK) result = gsfix_make_folder(ctx, app->o.out);
+    gsfix_json_begin(ctx, &app->json, "per_view", '[');
+    for (size_t i = 0; i < split.test_count && result == GSF_OK; i++) {
+        const gsf_scene_view* view = &scene.views[split.test[i]];
+        gsf_image mask = {0};
+        result = gsf_make_image(ctx, GSF_U8, view->camera.width, view->camera.height, 1, &mask);
+        if (result == GSF_OK) result = gsf_splat_seen_mask(ctx, &splats, &view->camera, train, split.train_count, &mask);
+        if (result == GSF_OK) {
+            uint8_t* p = (uint8_t*)mask.data;
+            const size_t pixels = (size_t)mask.width * (size_t)mask.height;
+            size_t seen = 0;
+            for (size_t k = 0; k < pixels; k++) {
+                seen += p[k] != 0;
+                p[k] = p[k] ? 255 : 0;
+            }
+            const double share = (double)seen / (double)pixels;
+            mean += share / (double)split.test_count;
+            gsfix_json_begin(ctx, &app->json, NULL, '{');
+            gsfix_json_text(ctx, &app->json, "name", view->name);
+            gsfix_json_number(ctx, &app->json, "seen", share);
+            gsfix_json_end(ctx, &app->json, '}');
+            gsfix_print(app, "%-24s %5.1f %% seen", view->name, 100.0 * share);
+            result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, gsfix_view_stem(&scene, split.test[i]).s).s, &mask);
+        }
+        gsf_destroy_image(ctx, &mask);
+        gsfix_progress(app, (double)(i + 1), (double)split.test_count, "mask %zu of %zu", i + 1, split.test_count);
+    }
+    gsfix_json_end(ctx, &app->json, ']');
+    gsfix_json_number(ctx, &app->json, "seen", mean);
+    if (result == GSF_OK) gsfix_print(app, "%.1f %% of the held-out pixels are seen from %zu views", 100.0 * mean, split.train_count);
+    gsf_free(ctx, train);
+    gsfix_free_split(app, &split);
+    gsf_splat_destroy(ctx, &splats);
+    gsf_splat_destroy_scene(ctx, &scene);
+    return result;
+}
+
+static int run_masks(gsfix_app* app) {
+    if (!app->o.model) return gsfix_misused(app, "--model is missing");
+    return write_masks(app) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+// ---- restore ---------------------------------------------------------------------
+
+/* One clip. FRAMES_DIR is a folder of pictures, or laid out as a restorer's job:
+       frames/NAME.png  depth/NAME.npy  cameras.json  refs/NAME.png  refs/cameras.json  refs/depth/NAME.npy
+   exec needs the frames only, warp needs all of it. */
+typedef struct clip {
+    gsfix_names frame_names, ref_names;
+    size_t frames, refs;
+    gsf_image *color, *depth, *alpha, *out_color, *out_confidence;
+    gsf_camera *cameras, *ref_cameras;
+    size_t camera_count, ref_camera_count;
+    int32_t* reference_index;
+    gsf_reference* references;
+} clip;
+
+static gsf_result load_float(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out) {
+    gsf_image bytes;
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf_load_image(ctx, path, channels, &bytes);
+    if (result != GSF_OK) return result;
+    result = gsf_make_image(ctx, GSF_F32, bytes.width, bytes.height, channels, out);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, &bytes, out);
+    gsf_destroy_image(ctx, &bytes);
+    return result;
+}
+
+static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
+    gsf_context* ctx = &app->ctx;
+    const char* folder = app->o.inputs[0];
+    const gsfix_path inner = gsfix_pathf("%s/frames", folder);
+    const char* at = gsfix_is_folder(inner.s) ? inner.s : folder;
+    const int depth = gsfix_is_folder(gsfix_pathf("%s/depth", folder).s);
+    const int alpha = gsfix_is_folder(gsfix_pathf("%s/alpha", folder).s);
+    gsf_result result = gsfix_list(ctx, at, ".png.jpg.jpeg", &c->frame_names);
+    if (result != GSF_OK) return result;
+    const size_t n = c->frame_names.count;
+    if (n == 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: no pictures there", at);
+    c->color = (gsf_image*)gsf_alloc_zeroed(ctx, 5 * n, sizeof *c->color);
+    c->reference_index = (int32_t*)gsf_alloc(ctx, n, sizeof *c->reference_index);
+    if (!c->color || !c->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
+    c->frames = n;
+    c->depth = c->color + n;
+    c->alpha = c->depth + n;
+    c->out_color = c->alpha + n;
+    c->out_confidence = c->out_color + n;
+    for (size_t i = 0; i < n && result == GSF_OK; i++) {
+        const gsfix_path stem = gsfix_stem(c->frame_names.names[i]);
+        c->reference_index[i] = -1;
+        result = load_float(ctx, gsfix_pathf("%s/%s", at, c->frame_names.names[i]).s, 3, c->color + i);
+        const int64_t width = c->color[i].width, height = c->color[i].height;
+        if (result == GSF_OK && (width != c->color[0].width || height != c->color[0].height))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/%s: %lld x %lld, but the first frame is %lld x %lld", at,
+                            c->frame_names.names[i], (long long)width, (long long)height, (long long)c->color[0].width,
+                            (long long)c->color[0].height);
+        if (result == GSF_OK && depth) result = gsfix_load_npy(ctx, gsfix_pathf("%s/depth/%s.npy", folder, stem.s).s, c->depth + i);
+        if (result == GSF_OK && depth && (c->depth[i].width != width || c->depth[i].height != height))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/depth/%s.npy: not of the frame's size", folder, stem.s);
+        if (result == GSF_OK && alpha) result = load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
+        if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 3, c->out_color + i);
+        if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 1, c->out_confidence + i);
+    }
+    if (!depth) c->depth = NULL;
+    if (!alpha) c->alpha = NULL;
+    const gsfix_path cameras = gsfix_pathf("%s/cameras.json", folder);
+    if (result == GSF_OK && gsfix_exists(cameras.s)) {
+        result = gsf_load_cameras(ctx, cameras.s, &c->cameras, &c->camera_count);
+        if (result == GSF_OK && c->camera_count != n)
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %zu cameras for %zu frames", cameras.s, c->camera_count, n);
+    }
+    return result;
+}
+
+static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
+    gsf_context* ctx = &app->ctx;
+    const gsfix_path folder = gsfix_pathf("%s/refs", app->o.inputs[0]);
+    gsf_result result = GSF_OK;
+    if (app->o.refs) {
+        size_t count = 1;
+        for (const char* p = app->o.refs; *p; p++) count += *p == ',';
+        c->ref_names.names = (char**)gsf_alloc_zeroed(ctx, count, sizeof(char*));
+        if (!c->ref_names.names) return GSF_ERROR_OUT_OF_MEMORY;
+        for (const char* p = app->o.refs; c->ref_names.count < count; p += strcspn(p, ",") + 1)
+            if (!(c->ref_names.names[c->ref_names.count++] = gsfix_copy_text(ctx, p, strcspn(p, ","))))
+                return GSF_ERROR_OUT_OF_MEMORY;
+    } else if (gsfix_is_folder(folder.s)) {
+        result = gsfix_list(ctx, folder.s, ".png.jpg.jpeg", &c->ref_names);
+    }
+    const gsfix_path cameras = gsfix_pathf("%s/cameras.json", folder.s);
+    if (result == GSF_OK && gsfix_exists(cameras.s))
+        result = gsf_load_cameras(ctx, cameras.s, &c->ref_cameras, &c->ref_camera_count);
+    if (result != GSF_OK) return result;
+    c->references = (gsf_reference*)gsf_alloc_zeroed(ctx, c->ref_names.count + 1, sizeof *c->references);
+    if (!c->references) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < c->ref_names.count && result == GSF_OK; i++) {
+        gsf_reference* r = c->references + i;
+        const char* name = c->ref_names.names[i];
+        c->refs = i + 1;
+        result = load_float(ctx, app->o.refs ? name : gsfix_pathf("%s/%s", folder.s, name).s, 3, &r->color);
+        if (result == GSF_OK && c->ref_camera_count == c->ref_names.count) r->camera = c->ref_cameras[i];
+        const gsfix_path depth = gsfix_pathf("%s/depth/%s.npy", folder.s, gsfix_stem(name).s);
+        if (result == GSF_OK && gsfix_exists(depth.s)) result = gsfix_load_npy(ctx, depth.s, &r->depth);
+    }
+    return result;
+}
+
+static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // what the warp restorer cannot do without
+    const char* folder = app->o.inputs[0];
+    const char* lacks = !c->cameras                       ? "cameras.json (where the frames are)"
+                        : !c->depth                       ? "depth/NAME.npy of each frame"
+                        : !c->refs                        ? "refs/ (the photos)"
+                        : c->ref_camera_count != c->refs  ? "refs/cameras.json with a camera for each photo"
+                                                          : NULL;
+    for (size_t i = 0; !lacks && i < c->refs; i++)
+        if (!c->references[i].depth.data) lacks = "refs/depth/NAME.npy of each photo";
+    if (!lacks) return GSF_OK;
+    return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s: the restorer warp needs %s", folder, lacks);
+}
+
+static gsf_result restore_clip(gsfix_app* app, clip* c, gsf_restorer* restorer) {
+    gsf_context* ctx = &app->ctx;
+    gsf_restore_window window = {0};
+    window.struct_size = sizeof window;
+    window.frame_count = (int32_t)c->frames;
+    window.color = c->color;
+    window.depth = c->depth;
+    window.alpha = c->alpha;
+    window.cameras = c->cameras;
+    window.reference_index = c->reference_index;
+    window.seed = app->o.seed;
+    window.out_color = c->out_color;
+    window.out_confidence = c->out_confidence;
+    gsf_result result = restorer->begin_fn(restorer->user, ctx, c->references, (int32_t)c->refs);
+    if (result != GSF_OK) return result;
+    result = restorer->restore_fn(restorer->user, ctx, &window);
+    restorer->end_fn(restorer->user, ctx);
+    return result;
+}
+
+static void free_clip(gsfix_app* app, clip* c) {
+    gsf_context* ctx = &app->ctx;
+    for (size_t i = 0; i < 5 * c->frames; i++) gsf_destroy_image(ctx, c->color + i);
+    for (size_t i = 0; i < c->refs; i++) {
+        gsf_destroy_image(ctx, &c->references[i].color);
+        gsf_destroy_image(ctx, &c->references[i].depth);
+    }
+    gsf_free(ctx, c->color);
+    gsf_free(ctx, c->references);
+    gsf_free(ctx, c->reference_index);
+    gsf_free(ctx, c->cameras);
+    gsf_free(ctx, c->ref_cameras);
+    gsfix_free_names(ctx, &c->frame_names);
+    gsfix_free_names(ctx, &c->ref_names);
+}
+
+static gsf_result restore_folder(gsfix_app* app) {
+    gsf_context* ctx = &app->ctx;
+    clip c = {0};
+    gsf_restorer restorer = {0};
+    int present = 0;
+    const double begin = gsfix_now();
+    gsf_result result = load_clip_frames(app, &c);
+    if (result == GSF_OK) result = load_clip_refs(app, &c);
+    if (result == GSF_OK && strcmp(app->o.restorer, "warp") == 0) result = check_warp_clip(app, &c);
+    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/confidence", app->o.out).s);
+    if (result == GSF_OK) result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &restorer, &present);
+    if (result == GSF_OK && present) result = restore_clip(app, &c, &restorer);
+    for (size_t i = 0; i < c.frames && result == GSF_OK; i++) {
+        const gsfix_path name = gsfix_stem(c.frame_names.names[i]);
+        result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name.s).s, present ? c.out_color + i : c.color + i);
+        if (result == GSF_OK && present)
+            result = gsf_save_image(ctx, gsfix_pathf("%s/confidence/%s.png", app->o.out, name.s).s, c.out_confidence + i);
+    }
+    if (result == GSF_OK) {
+        gsfix_json_text(ctx, &app->json, "restorer", app->o.restorer);
+        gsfix_json_number(ctx, &app->json, "frames", (double)c.frames);
+        gsfix_json_number(ctx, &app->json, "references", (double)c.refs);
+        gsfix_json_number(ctx, &app->json, "seconds", gsfix_now() - begin);
+        gsfix_print(app, "%zu frames restored by %s from %zu photos in %.2f s -> %s", c.frames, app->o.restorer, c.refs,
+                    gsfix_now() - begin, app->o.out);
+    }
+    gsfix_destroy_restorer(app, &restorer);
+    free_clip(app, &c);
+    return result;
+}
+
+static int run_restore(gsfix_app* app) {
+    if (!app->o.restorer) return gsfix_misused(app, "--restorer is missing");
+    const int code = gsfix_check_restorer(app);
+    if (code) return code;
+    return restore_folder(app) == GSF_OK ? 0 : gsfix_failed(app);
+}
+
+// ---- main ------------------------------------------------------------------------
+
+static gsf_context* volatile interrupted_context; // a signal handler has nowhere else to find it
+
+static void on_interrupt(int number) {
+    (void)number;
+    if (interrupted_context) gsf_request_cancel(interrupted_context);
+}
+
+static void on_log(void* user, gsf_log_level level, const char* text) {
+    if (level == GSF_LOG_WARNING) gsfix_note((gsfix_app*)user, "warning: %s", text); // errors are told once, at the end
+}
+
+static gsf_result quote_command(gsfix_app* app, int argc, char** argv) {
+    gsf_text text = {0};
+    for (int i = 0; i < argc; i++) {
+        if (i) gsf_text_append(&app->ctx, &text, " ", 1);
+        const char* p = argv[i];
+        if (*p && strspn(p, "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+=./,:@%") == strlen(p)) {
+            gsf_text_append(&app->ctx, &text, p, strlen(p));
+            continue;
+        }
+        gsf_text_append(&app->ctx, &text, "'", 1);
+        for (; *p; p++) gsf_text_append(&app->ctx, &text, *p == '\'' ? "'\\''" : p, *p == '\'' ? 4 : 1);
+        gsf_text_append(&app->ctx, &text, "'", 1);
+    }
+    app->command_line = text.data;
+    if (!text.failed) return GSF_OK;
+    return GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static void catch_interrupts(gsfix_app* app) { // the first one asks to stop, a second one ends the program
+    struct sigaction action;
+    memset(&action, 0, sizeof action);
+    action.sa_handler = on_interrupt;
+    action.sa_flags = (int)SA_RESETHAND;
+    sigemptyset(&action.sa_mask);
+    interrupted_context = &app->ctx;
+    sigaction(SIGINT, &action, NULL);
+    sigaction(SIGTERM, &action, NULL);
+}
+
+static int run_command(gsfix_app* app, const command_spec* command, int argc, char** argv) {
+    app->ctx.threads = app->o.threads;
+    app->ctx.logger.log_fn = on_log;
+    app->ctx.logger.user = app;
+    if (gsf_init_context(&app->ctx) != GSF_OK || quote_command(app, argc, argv) != GSF_OK) return gsfix_failed(app);
+    catch_interrupts(app);
+    gsfix_json_begin(&app->ctx, &app->json, NULL, '{');
+    int code = command->run(app);
+    gsfix_hide_bar(app);
+    if (code == 0) gsfix_json_end(&app->ctx, &app->json, '}');
+    if (app->json.failed && code == 0) code = gsfix_failed(app);
+    if (app->o.json && code != 2) puts(app->json.data ? app->json.data : "{}");
+    if (fflush(stdout) != 0 && code == 0) {
+        fprintf(stderr, "gsfix %s: stdout cannot be written: %s\n", app->command, strerror(errno));
+        code = 1;
+    }
+    interrupted_context = NULL;
+    gsf_destroy_text(&app->ctx, &app->json);
+    gsf_free(&app->ctx, app->command_line);
+    return code;
+}
+
+int main(int argc, char** argv) {
+    static gsfix_app app;
+    if (argc < 2) return print_overview(stderr);
+    if (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0 || strcmp(argv[1], "help") == 0)
+        return print_overview(stdout);
+    if (strcmp(argv[1], "--version") == 0) return print_version(), 0;
+    const command_spec* command = NULL;
+    for (int i = 0; i < COMMAND_COUNT; i++)
+        if (strcmp(command_specs[i].name, argv[1]) == 0) command = &command_specs[i];
+    if (!command) return gsfix_misused(&app, "no command \"%s\"", argv[1]);
+    if (!command->run) return gsfix_misused(&app, "the command %s is not in this version", argv[1]);
+    app.command = command->name;
+    app.started = gsfix_now();
+    app.terminal = isatty(2) && getenv("TERM") && strcmp(getenv("TERM"), "dumb") != 0;
+    app.line_share = -1;
+    app.o.inputs = (const char**)calloc((size_t)argc, sizeof(char*));
+    if (!app.o.inputs) return fputs("gsfix: out of memory\n", stderr), 1;
+    int code = parse_options(&app, command, argc, argv);
+    if (code == 0 && app.o.help) print_help(command);
+    else if (code == 0) code = run_command(&app, command, argc, argv);
+    free((void*)app.o.inputs);
+    return code;
+}
+
+#ifdef GSFIX_ONE_FILE // one compiler call for the whole program
+#include "gsfix_exec.c"
+#include "gsfix_fix.c"
+#include "gsfix_report.c"
+#include "gsfix_util.c"
+#endif

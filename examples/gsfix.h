@@ -1,0 +1,159 @@
+// gsfix.h - what the files of the program gsfix share
+// SPDX-License-Identifier: MIT
+#ifndef GSFIX_H
+#define GSFIX_H
+
+#ifndef _XOPEN_SOURCE
+#define _XOPEN_SOURCE 700 // POSIX 2008 with realpath
+#endif
+
+#include "gsfixer_splat.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
+    const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings;
+    const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *model;
+    int json, help, resume, depth, alpha;
+    int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows;
+    double restorer_timeout;
+    uint64_t seed;
+    const char** inputs;
+    int input_count;
+} gsfix_options;
+
+typedef struct gsfix_app {
+    gsf_context ctx;
+    gsfix_options o;
+    const char* command;
+    char* command_line; // as typed, quoted for a shell
+    double started;     // gsfix_now() at the start
+    gsf_text json;      // what --json prints; the other output is for people
+    int terminal;       // stderr is one
+    int bar_shown;      // a progress bar stands on the terminal's last line
+    double bar_time;
+    int line_share;     // tenth of the work that the last plain progress line told
+} gsfix_app;
+
+// ---- gsfix_util.c --------------------------------------------------------------
+
+typedef struct gsfix_path { char s[4096]; } gsfix_path;
+typedef struct gsfix_names { char** names; size_t count; } gsfix_names;
+
+double gsfix_now(void); // seconds, monotonic
+uint64_t gsfix_peak_memory(void);
+gsfix_path gsfix_pathf(const char* format, ...) GSF_PRINTF(1, 2);
+int gsfix_exists(const char* path);
+int gsfix_is_folder(const char* path);
+gsf_result gsfix_make_folder(gsf_context* ctx, const char* path); // with its parents
+// Removes a folder's *.png (and, deep, everything below it); nothing happens where there is no folder.
+gsf_result gsfix_clear_folder(gsf_context* ctx, const char* path, int deep);
+// Sorted file names of a folder that end in one of the extensions (".png.jpg", lower case).
+gsf_result gsfix_list(gsf_context* ctx, const char* folder, const char* extensions, gsfix_names* out);
+void gsfix_free_names(gsf_context* ctx, gsfix_names* names);
+char* gsfix_copy_text(gsf_context* ctx, const char* text, size_t size);
+// File name without folder and extension.
+gsfix_path gsfix_stem(const char* path);
+// Name (without extension) under which a view's pictures are written: unique within the scene, no folders.
+gsfix_path gsfix_view_stem(const gsf_scene* scene, size_t view);
+gsf_result gsfix_save_npy(gsf_context* ctx, const char* path, const gsf_image* image); // f32, one channel
+gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out);
+void gsfix_clamp(gsf_image* image); // packed f32 to [0,1], NaN to 0
+// Picture of packed f32 values: t = (value - low) / (high - low) through a perceptual map (warm: black to yellow).
+gsf_result gsfix_color_map(gsf_context* ctx, const gsf_image* values, double low, double high, gsf_image* out);
+// Depth as people like to see it: near is bright, scaled to the depths that are there; black where nothing is.
+gsf_result gsfix_color_depth(gsf_context* ctx, const gsf_image* depth, gsf_image* out);
+void gsfix_map_color(double t, uint8_t rgb[3]);
+gsf_result gsfix_mean_abs_error(gsf_context* ctx, const gsf_image* a, const gsf_image* b, gsf_image* out); // f32, 1 channel
+
+void gsfix_progress(gsfix_app* app, double done, double total, const char* format, ...) GSF_PRINTF(4, 5);
+void gsfix_note(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);   // a line on stderr
+void gsfix_print(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);  // on stdout, unless --json
+void gsfix_hide_bar(gsfix_app* app);
+int gsfix_misused(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3); // one line on stderr; returns 2
+int gsfix_failed(gsfix_app* app);                                            // likewise from ctx.error; returns 1
+
+// A JSON object grows member by member in a gsf_text.
+void gsfix_json_begin(gsf_context* ctx, gsf_text* text, const char* key, char bracket); // key NULL: none
+void gsfix_json_end(gsf_context* ctx, gsf_text* text, char bracket);
+void gsfix_json_text(gsf_context* ctx, gsf_text* text, const char* key, const char* value); // NULL: null
+void gsfix_json_number(gsf_context* ctx, gsf_text* text, const char* key, double value);
+void gsfix_json_bool(gsf_context* ctx, gsf_text* text, const char* key, int value);
+
+// ---- gsfix_exec.c --------------------------------------------------------------
+
+// Restorer that runs `COMMAND JOBDIR` for each window; `job` is the folder to use. Freed by gsfix_destroy_exec.
+gsf_result gsfix_make_exec(gsf_context* ctx, const char* command, const char* job, double timeout, gsf_restorer* out);
+void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer);
+
+// ---- gsfix.c: what several commands need -----------------------------------------
+
+typedef struct gsfix_split { uint32_t *train, *test; size_t train_count, test_count; } gsfix_split;
+
+gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out);
+gsf_result gsfix_split_scene(gsfix_app* app, const gsf_scene* scene, gsfix_split* out);
+void gsfix_free_split(gsfix_app* app, gsfix_split* split);
+gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint32_t* views, size_t count,
+                             gsf_camera** out); // freed with gsf_free
+// 0 = fine; else the exit code, with its line printed.
+int gsfix_check_restorer(gsfix_app* app);
+gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present);
+void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
+gsf_traj_kind gsfix_path_kind(const char* name);
+// Near plane for renders of a scene with these cameras (`stride` bytes apart): 0.01 times their extent, at most the official
+// 0.2. fix and render share the rule, so that splats look the same in both.
+float gsfix_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
+
+// ---- gsfix_fix.c, gsfix_report.c -------------------------------------------------
+
+typedef struct gsfix_quality { // --quality is one of these rows
+    const char* name;
+    gsf_footprint footprint;
+    float skip_psnr;    // dB from which a window counts as needing no restoring; 0 = all are restored
+    int32_t max_pixels; // of a frame that is restored; 0 = photo size
+} gsfix_quality;
+const gsfix_quality* gsfix_find_quality(const char* name); // NULL: the default
+
+typedef struct gsfix_score { double psnr, ssim, psnr_seen, ssim_seen; } gsfix_score; // NaN: not measured
+typedef struct gsfix_curve_point { int32_t iteration; uint64_t splats; double psnr, psnr_seen; } gsfix_curve_point;
+typedef struct gsfix_round { int32_t round, iteration, windows, skipped, frames; double confidence; } gsfix_round;
+typedef struct gsfix_flown { int32_t round, window, reference; double center[3], forward[3]; } gsfix_flown; // path frame
+typedef struct gsfix_sample { int32_t round, window, frame; } gsfix_sample; // pictures of it lie in DIR/report
+
+enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_SAVE, GSFIX_STAGES };
+extern const char* const gsfix_stage_names[GSFIX_STAGES];
+
+typedef struct gsfix_history { // what a run remembers beside the fixer's state; part of the checkpoint
+    double seconds[GSFIX_STAGES], seconds_total;
+    int32_t resumed;
+    int32_t has_before;
+    gsfix_score* before; // one per test view, once has_before; before the first restoration
+    size_t view_count;
+    gsfix_curve_point* curve;
+    gsfix_round* rounds;
+    gsfix_flown* path;
+    gsfix_sample* samples;
+    size_t curve_count, round_count, path_count, sample_count;
+    size_t curve_room, round_room, path_room, sample_room;
+} gsfix_history;
+
+typedef struct gsfix_result { // of a finished run, for metrics.json and the report
+    const gsf_scene* scene;
+    const gsfix_split* split;
+    const gsfix_history* history;
+    const char* out;
+    const char* switches;    // JSON object
+    gsfix_score mean, before;
+    const gsfix_score* views; // one per test view
+    const gsf_image* masks;   // per test view; NULL = none given
+    const gsf_splats* splats;
+    int32_t iterations;
+} gsfix_result;
+
+gsf_result gsfix_write_report(gsfix_app* app, const gsfix_result* result);
+
+int gsfix_run_fix(gsfix_app* app);
+
+#endif

@@ -1,0 +1,919 @@
+// gsfix_fix.c - the command fix: scene -> initial splats -> training with repair rounds -> splats, figures, report
+// SPDX-License-Identifier: MIT
+#include "gsfix.h"
+
+#include <math.h>
+#include <stddef.h>
+
+// ---- defaults: decided by measurement, kept here only ------------------------------
+
+enum { DEFAULT_ITERATIONS = 3000, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000 };
+
+static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
+    0.2f, 0.0f, 0.0f, 0.0f}; // --regularize on
+
+static const gsfix_quality qualities[] = { // footprint OFFICIAL loses what lies beyond 3 sigma
+    {"exact", GSF_FOOTPRINT_FULL, 0.0f, 0},
+    {"balanced", GSF_FOOTPRINT_FULL, 36.0f, 0},
+    {"fast", GSF_FOOTPRINT_OFFICIAL, 30.0f, 320 * 240},
+};
+
+const gsfix_quality* gsfix_find_quality(const char* name) {
+    for (size_t i = 0; name && i < sizeof qualities / sizeof *qualities; i++)
+        if (strcmp(qualities[i].name, name) == 0) return &qualities[i];
+    return &qualities[1];
+}
+
+// ---- settings --------------------------------------------------------------------
+
+typedef struct fix_setup { // everything that decides what the run computes
+    gsf_fix_desc fix;
+    int32_t sh_degree, random_points;
+    char init[16]; // method, resolved
+} fix_setup;
+
+typedef struct setting { const char* name; int is_real; size_t offset; } setting;
+#define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
+#define FIX_AT(field) offsetof(fix_setup, fix.field)
+static const setting settings[] = { // zero: the library's default, see gsf_train_desc and gsf_fix_desc
+    {"sh_degree", 0, offsetof(fix_setup, sh_degree)},
+    {"random_points", 0, offsetof(fix_setup, random_points)},
+    {"dropout", 1, TRAIN_AT(dropout)},
+    {"opacity_decay", 1, TRAIN_AT(opacity_decay)},
+    {"scale_penalty", 1, TRAIN_AT(scale_penalty)},
+    {"depth_smoothness", 1, TRAIN_AT(depth_smoothness)},
+    {"sh_interval", 0, TRAIN_AT(sh_interval)},
+    {"lr_means", 1, TRAIN_AT(lr_means)},
+    {"lr_means_final", 1, TRAIN_AT(lr_means_final)},
+    {"lr_sh_dc", 1, TRAIN_AT(lr_sh_dc)},
+    {"lr_sh_rest", 1, TRAIN_AT(lr_sh_rest)},
+    {"lr_opacity", 1, TRAIN_AT(lr_opacity)},
+    {"lr_scales", 1, TRAIN_AT(lr_scales)},
+    {"lr_quats", 1, TRAIN_AT(lr_quats)},
+    {"lambda_ssim", 1, TRAIN_AT(lambda_ssim)},
+    {"densify_from", 0, TRAIN_AT(densify_from)},
+    {"densify_until", 0, TRAIN_AT(densify_until)},
+    {"densify_interval", 0, TRAIN_AT(densify_interval)},
+    {"densify_grad", 1, TRAIN_AT(densify_grad)},
+    {"densify_scale", 1, TRAIN_AT(densify_scale)},
+    {"prune_opacity", 1, TRAIN_AT(prune_opacity)},
+    {"prune_scale", 1, TRAIN_AT(prune_scale)},
+    {"opacity_reset_interval", 0, TRAIN_AT(opacity_reset_interval)},
+    {"antialiased", 0, TRAIN_AT(render.antialiased)},
+    {"rounds", 0, FIX_AT(rounds)},
+    {"first_round", 0, FIX_AT(first_round)},
+    {"last_round", 0, FIX_AT(last_round)},
+    {"windows", 0, FIX_AT(windows)},
+    {"window_frames", 0, FIX_AT(window_frames)},
+    {"lambda", 1, FIX_AT(lambda)},
+    {"skip_psnr", 1, FIX_AT(skip_psnr)},
+    {"max_pixels", 0, FIX_AT(max_pixels)},
+};
+enum { SETTING_COUNT = sizeof settings / sizeof settings[0] };
+
+void gsfix_print_settings(FILE* to) {
+    size_t column = 0;
+    for (int i = 0; i < SETTING_COUNT; i++) {
+        fprintf(to, column ? ", %s" : "        %s", settings[i].name);
+        column += strlen(settings[i].name) + 2;
+        if (column > 90 || i + 1 == SETTING_COUNT) fprintf(to, column > 90 && i + 1 < SETTING_COUNT ? ",\n" : "\n"), column = 0;
+    }
+}
+
+static int apply_settings(gsfix_app* app, fix_setup* setup) {
+    for (const char* p = app->o.settings; p && *p;) {
+        const size_t n = strcspn(p, ","), name = strcspn(p, "=");
+        int i = 0;
+        while (i < SETTING_COUNT && !(strlen(settings[i].name) == name && strncmp(settings[i].name, p, name) == 0)) i++;
+        if (name >= n || i == SETTING_COUNT) return gsfix_misused(app, "--set: no setting \"%.*s\"", (int)n, p);
+        char value[64], *end = value;
+        snprintf(value, sizeof value, "%.*s", (int)(n - name - 1), p + name + 1);
+        char* field = (char*)setup + settings[i].offset;
+        const double x = strtod(value, &end);
+        if (end == value || *end || !(fabs(x) <= 1e9) || (!settings[i].is_real && x != (double)(int32_t)x))
+            return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, settings[i].is_real ? "number" : "whole number");
+        if (settings[i].is_real) *(float*)(void*)field = (float)x;
+        else *(int32_t*)(void*)field = (int32_t)x;
+        p += n + (p[n] == ',');
+    }
+    return 0;
+}
+
+static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit code
+    const gsfix_quality* quality = gsfix_find_quality(app->o.quality);
+    memset(setup, 0, sizeof *setup);
+    setup->sh_degree = DEFAULT_SH_DEGREE;
+    setup->random_points = RANDOM_POINTS;
+    gsf_train_desc* train = &setup->fix.train;
+    train->iterations = app->o.iterations ? app->o.iterations : DEFAULT_ITERATIONS;
+    train->seed = app->o.seed;
+    train->render.footprint = quality->footprint;
+    if (!app->o.regularize || strcmp(app->o.regularize, "on") == 0) {
+        train->dropout = few_view_regularizers.dropout;
+        train->opacity_decay = few_view_regularizers.opacity_decay;
+        train->scale_penalty = few_view_regularizers.scale_penalty;
+        train->depth_smoothness = few_view_regularizers.depth_smoothness;
+    }
+    setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
+    setup->fix.skip_psnr = quality->skip_psnr;
+    setup->fix.max_pixels = quality->max_pixels;
+    if (app->o.init && strcmp(app->o.init, "dense") == 0) return gsfix_misused(app, "--init dense is not in this version");
+    const int code = apply_settings(app, setup);
+    if (code) return code;
+    if (setup->sh_degree < 0 || setup->sh_degree > 3) return gsfix_misused(app, "--set sh_degree: expected 0 to 3");
+    if (setup->random_points < 1) return gsfix_misused(app, "--set random_points: expected 1 or more");
+    return gsfix_check_restorer(app);
+}
+
+// ---- a run -----------------------------------------------------------------------
+
+const char* const gsfix_stage_names[GSFIX_STAGES] = {"init", "train", "render", "restore", "distill", "save"};
+
+typedef struct fix_run {
+    gsfix_app* app;
+    gsf_context* ctx;
+    fix_setup setup;
+    gsf_scene scene;
+    gsfix_split split;
+    gsf_image* masks; // per test view, or NULL
+    gsf_splats initial;
+    gsf_restorer restorer;
+    int has_restorer;
+    gsf_fixer* fixer;
+    gsf_text switches; // JSON object
+    const char* rays; // what traced them
+    gsfix_history history;
+    double total_before; // seconds of earlier runs that this one continues
+    int32_t iteration, iterations, eval_every, checkpoint_every, saved_at;
+} fix_run;
+
+static void add_seconds(fix_run* run, int stage, double* since) {
+    const double now = gsfix_now();
+    run->history.seconds[stage] += now - *since;
+    *since = now;
+}
+
+// Room for one more element of a list of the history.
+static gsf_result grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size) {
+    if (count < *room) return GSF_OK;
+    const size_t more = 2 * *room + 32;
+    void* fresh = gsf_alloc(ctx, more, size);
+    if (!fresh) return GSF_ERROR_OUT_OF_MEMORY;
+    if (count) memcpy(fresh, *list, count * size);
+    gsf_free(ctx, *list);
+    *list = fresh;
+    *room = more;
+    return GSF_OK;
+}
+// list: the member, stem: how its _count and _room begin
+#define GROW(ctx, h, list, stem) grow(ctx, (void**)&(h)->list, &(h)->stem##_room, (h)->stem##_count, sizeof *(h)->list)
+
+// ---- initial splats --------------------------------------------------------------
+
+// Points drawn evenly from the volume that each training view sees around the depth of what all of them look at, with
+// the colour of their pixel.
+static gsf_result random_points(fix_run* run, double** points, uint8_t** colors, size_t count) {
+    gsf_context* ctx = run->ctx;
+    const size_t n = run->split.train_count;
+    double* poses = (double*)gsf_alloc(ctx, n, 16 * sizeof *poses);
+    *points = (double*)gsf_alloc(ctx, count, 3 * sizeof **points);
+    *colors = (uint8_t*)gsf_alloc(ctx, count, 3);
+    if (!poses || !*points || !*colors) {
+        gsf_free(ctx, poses);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    for (size_t i = 0; i < n; i++) gsf_camera_c2w(&run->scene.views[run->split.train[i]].camera, poses + 16 * i);
+    double focus[3] = {0};
+    const int has_focus = gsf_traj_focus_point(ctx, poses, n, focus) == GSF_OK;
+    for (size_t i = 0; i < count; i++) {
+        const gsf_scene_view* view = &run->scene.views[run->split.train[i % n]];
+        const double* c2w = poses + 16 * (i % n);
+        double u, v, z, far = 0.0;
+        if (!has_focus || !gsf_camera_project(&view->camera, focus, &u, &v, &far)) far = 1.0;
+        const double near = 0.3 * far, a = near * near * near;
+        far *= 2.0;
+        z = cbrt(a + (far * far * far - a) * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i));
+        u = view->camera.width * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i + 1);
+        v = view->camera.height * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i + 2);
+        const double x = (u - view->camera.cx) / view->camera.fx * z, y = (v - view->camera.cy) / view->camera.fy * z;
+        for (int k = 0; k < 3; k++) (*points)[3 * i + (size_t)k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
+        const char* pixel = (const char*)view->image.data + (int64_t)v * view->image.stride_y + (int64_t)u * view->image.stride_x;
+        for (int k = 0; k < 3; k++) (*colors)[3 * i + (size_t)k] = (uint8_t)pixel[k * view->image.stride_c];
+    }
+    gsf_free(ctx, poses);
+    return GSF_OK;
+}
+
+static gsf_result make_initial(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    const gsf_scene* scene = &run->scene;
+    const char* init = run->app->o.init ? run->app->o.init : scene->point_count ? "both" : "random";
+    snprintf(run->setup.init, sizeof run->setup.init, "%s", init);
+    run->rays = "none";
+    if (strcmp(init, "random") == 0) {
+        double* points = NULL;
+        uint8_t* colors = NULL;
+        const size_t count = (size_t)run->setup.random_points;
+        gsf_result result = random_points(run, &points, &colors, count);
+        if (result == GSF_OK)
+            result = gsf_splat_from_points(ctx, points, colors, count, NULL, run->setup.sh_degree, scene->origin, &run->initial);
+        gsf_free(ctx, points);
+        gsf_free(ctx, colors);
+        return result;
+    }
+    if (!scene->point_count)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (--init random does without)", scene->folder);
+    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count, 1);
+    if (!keep) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = GSF_OK;
+    if (strcmp(init, "all") == 0) {
+        memset(keep, 1, scene->point_count);
+    } else {
+        gsf_visibility_desc desc = {0};
+        gsf_visibility_stats stats = {0};
+        desc.method = strcmp(init, "embree") == 0   ? GSF_VISIBILITY_RAYS
+                      : strcmp(init, "tracks") == 0 ? GSF_VISIBILITY_TRACKS
+                                                    : GSF_VISIBILITY_BOTH;
+        result = gsf_splat_visible_points(ctx, scene, run->split.train, run->split.train_count, &desc, keep, &stats);
+        if (result == GSF_OK && !stats.kept)
+            result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "no point of the scene is seen by a training view (try --init all or random)");
+        if (desc.method != GSF_VISIBILITY_TRACKS) run->rays = stats.used_embree ? "embree" : "z-buffer";
+    }
+    if (result == GSF_OK)
+        result = gsf_splat_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, run->setup.sh_degree,
+                                       scene->origin, &run->initial);
+    gsf_free(ctx, keep);
+    return result;
+}
+
+// ---- held-out views --------------------------------------------------------------
+
+static gsf_result render_view(fix_run* run, size_t i, gsf_image* color) { // test view i, clamped to [0,1]
+    const gsf_camera* camera = &run->scene.views[run->split.test[i]].camera;
+    gsf_render_output out = {0};
+    gsf_result result = gsf_make_image(run->ctx, GSF_F32, camera->width, camera->height, 3, color);
+    if (result != GSF_OK) return result;
+    out.color = *color;
+    result = gsf_splat_trainer_render(run->ctx, gsf_splat_fixer_trainer(run->fixer), camera, &out);
+    if (result == GSF_OK) gsfix_clamp(color);
+    else gsf_destroy_image(run->ctx, color);
+    return result;
+}
+
+static int counts_any(const gsf_image* mask) {
+    const uint8_t* p = (const uint8_t*)mask->data;
+    for (size_t i = 0; i < (size_t)mask->width * (size_t)mask->height; i++)
+        if (p[i]) return 1;
+    return 0;
+}
+
+static gsf_result score_view(fix_run* run, size_t i, const gsf_image* color, int with_ssim, gsfix_score* out) {
+    const gsf_image* photo = &run->scene.views[run->split.test[i]].image;
+    const gsf_image* mask = run->masks && counts_any(&run->masks[i]) ? &run->masks[i] : NULL;
+    out->ssim = out->psnr_seen = out->ssim_seen = NAN;
+    gsf_result result = gsf_psnr(run->ctx, color, photo, NULL, &out->psnr);
+    if (result == GSF_OK && with_ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, NULL, &out->ssim);
+    if (result == GSF_OK && mask) result = gsf_psnr(run->ctx, color, photo, mask, &out->psnr_seen);
+    if (result == GSF_OK && mask && with_ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, &out->ssim_seen);
+    return result;
+}
+
+static gsfix_score mean_score(const gsfix_score* scores, size_t count) { // each figure over the views that have it
+    double sums[4] = {0}, counts[4] = {0};
+    for (size_t i = 0; i < count; i++) {
+        const double values[4] = {scores[i].psnr, scores[i].ssim, scores[i].psnr_seen, scores[i].ssim_seen};
+        for (int k = 0; k < 4; k++)
+            if (!isnan(values[k])) sums[k] += values[k], counts[k] += 1.0;
+    }
+    const gsfix_score mean = {sums[0] / counts[0], sums[1] / counts[1], sums[2] / counts[2], sums[3] / counts[3]};
+    return mean;
+}
+
+// All held-out views; folder: where their pictures go, or NULL. scores: one per view.
+static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfix_score* scores) {
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
+        gsf_image color;
+        result = render_view(run, i, &color);
+        if (result != GSF_OK) return result;
+        result = score_view(run, i, &color, with_ssim, scores + i);
+        const gsfix_path name = gsfix_view_stem(&run->scene, run->split.test[i]);
+        if (result == GSF_OK && folder) result = gsf_save_image(run->ctx, gsfix_pathf("%s/%s.png", folder, name.s).s, &color);
+        gsf_destroy_image(run->ctx, &color);
+    }
+    return result;
+}
+
+static gsf_result add_curve_point(fix_run* run) {
+    gsfix_history* h = &run->history;
+    if (!run->split.test_count || (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration)) return GSF_OK;
+    gsf_result result = GROW(run->ctx, h, curve, curve);
+    gsfix_score* scores = (gsfix_score*)gsf_alloc(run->ctx, run->split.test_count, sizeof *scores);
+    if (!scores) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) result = evaluate(run, NULL, 0, scores);
+    if (result == GSF_OK) {
+        const gsfix_score mean = mean_score(scores, run->split.test_count);
+        gsfix_curve_point* p = &h->curve[h->curve_count++];
+        p->iteration = run->iteration;
+        p->splats = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(run->fixer))->count;
+        p->psnr = mean.psnr;
+        p->psnr_seen = mean.psnr_seen;
+    }
+    gsf_free(run->ctx, scores);
+    return result;
+}
+
+static gsf_result load_masks(fix_run* run) {
+    run->masks = (gsf_image*)gsf_alloc_zeroed(run->ctx, run->split.test_count + 1, sizeof *run->masks);
+    if (!run->masks) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < run->split.test_count; i++) {
+        const gsf_camera* camera = &run->scene.views[run->split.test[i]].camera;
+        const gsfix_path path = gsfix_pathf("%s/%s.png", run->app->o.masks, gsfix_view_stem(&run->scene, run->split.test[i]).s);
+        const gsf_result result = gsf_load_image(run->ctx, path.s, 1, run->masks + i);
+        if (result != GSF_OK) return result;
+        if (run->masks[i].width != camera->width || run->masks[i].height != camera->height)
+            return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %lld x %lld, but the view is %d x %d", path.s,
+                            (long long)run->masks[i].width, (long long)run->masks[i].height, (int)camera->width,
+                            (int)camera->height);
+    }
+    return GSF_OK;
+}
+
+// ---- checkpoint ------------------------------------------------------------------
+
+// What the run computes, by name: printed in metrics.json, and what --resume insists on.
+static void write_switches(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    gsf_text* t = &run->switches;
+    const gsfix_options* o = &run->app->o;
+    static const char* const kinds[] = {"reference", "ellipse", "interpolate"};
+    const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
+    gsfix_json_begin(ctx, t, NULL, '{');
+    gsfix_json_number(ctx, t, "iterations", run->iterations);
+    gsfix_json_number(ctx, t, "seed", (double)o->seed);
+    gsfix_json_text(ctx, t, "restorer", o->restorer ? o->restorer : "none");
+    gsfix_json_text(ctx, t, "regularize", o->regularize ? o->regularize : "on");
+    gsfix_json_text(ctx, t, "trajectory", kinds[run->setup.fix.trajectory]);
+    gsfix_json_text(ctx, t, "init", run->setup.init);
+    gsfix_json_text(ctx, t, "quality", gsfix_find_quality(o->quality)->name);
+    gsfix_json_text(ctx, t, "footprint", run->setup.fix.train.render.footprint == GSF_FOOTPRINT_FULL ? "full" : "official");
+    gsfix_json_text(ctx, t, "gradient", run->setup.fix.train.render.gradient == GSF_GRADIENT_TRUE ? "true" : "official");
+    for (int i = 0; i < SETTING_COUNT; i++) {
+        const char* field = (const char*)&run->setup + settings[i].offset;
+        gsfix_json_number(ctx, t, settings[i].name,
+                          settings[i].is_real ? (double)*(const float*)(const void*)field : *(const int32_t*)(const void*)field);
+    }
+    gsfix_json_number(ctx, t, "near_plane", (double)run->setup.fix.train.render.near_plane);
+    gsfix_json_text(ctx, t, "views", o->views ? o->views : "all");
+    gsfix_json_number(ctx, t, "test_every", o->test_every ? o->test_every : 8);
+    gsfix_json_number(ctx, t, "factor", o->factor ? o->factor : 1);
+    gsfix_json_number(ctx, t, "max_size", o->max_size);
+    gsfix_json_number(ctx, t, "width", first->width);
+    gsfix_json_number(ctx, t, "height", first->height);
+    gsfix_json_number(ctx, t, "initial_splats", (double)run->initial.count);
+    gsfix_json_begin(ctx, t, "train_views", '[');
+    for (size_t i = 0; i < run->split.train_count; i++) gsfix_json_text(ctx, t, NULL, run->scene.views[run->split.train[i]].name);
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_end(ctx, t, '}');
+}
+
+static void write_list(gsf_context* ctx, gsf_text* t, const char* key, const double* values, size_t count) {
+    gsfix_json_begin(ctx, t, key, '[');
+    for (size_t i = 0; i < count; i++) gsfix_json_number(ctx, t, NULL, values[i]);
+    gsfix_json_end(ctx, t, ']');
+}
+
+// History as JSON: lists of numbers, so that reading back is one loop per list.
+static void write_history(fix_run* run, gsf_text* t) {
+    gsf_context* ctx = run->ctx;
+    const gsfix_history* h = &run->history;
+    gsfix_json_begin(ctx, t, NULL, '{');
+    gsfix_json_begin(ctx, t, "switches", '{');
+    t->size--; // the object itself follows
+    gsf_text_append(ctx, t, run->switches.data, run->switches.size);
+    write_list(ctx, t, "seconds", h->seconds, GSFIX_STAGES);
+    gsfix_json_number(ctx, t, "seconds_total", run->total_before + gsfix_now() - run->app->started);
+    gsfix_json_number(ctx, t, "iteration", run->iteration);
+    gsfix_json_number(ctx, t, "resumed", h->resumed);
+    gsfix_json_begin(ctx, t, "before", '[');
+    for (size_t i = 0; h->has_before && i < h->view_count; i++) write_list(ctx, t, NULL, &h->before[i].psnr, 4);
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_begin(ctx, t, "curve", '[');
+    for (size_t i = 0; i < h->curve_count; i++) {
+        const double row[4] = {h->curve[i].iteration, (double)h->curve[i].splats, h->curve[i].psnr, h->curve[i].psnr_seen};
+        write_list(ctx, t, NULL, row, 4);
+    }
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_begin(ctx, t, "rounds", '[');
+    for (size_t i = 0; i < h->round_count; i++) {
+        const gsfix_round* r = &h->rounds[i];
+        const double row[6] = {r->round, r->iteration, r->windows, r->skipped, r->frames, r->confidence};
+        write_list(ctx, t, NULL, row, 6);
+    }
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_begin(ctx, t, "path", '[');
+    for (size_t i = 0; i < h->path_count; i++) {
+        const gsfix_flown* f = &h->path[i];
+        const double row[9] = {f->round, f->window, f->reference, f->center[0], f->center[1], f->center[2],
+                               f->forward[0], f->forward[1], f->forward[2]};
+        write_list(ctx, t, NULL, row, 9);
+    }
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_begin(ctx, t, "samples", '[');
+    for (size_t i = 0; i < h->sample_count; i++) {
+        const double row[3] = {h->samples[i].round, h->samples[i].window, h->samples[i].frame};
+        write_list(ctx, t, NULL, row, 3);
+    }
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_end(ctx, t, '}');
+}
+
+static gsf_result save_checkpoint(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    gsf_text chunks = {0}, history = {0};
+    write_history(run, &history);
+    gsf_splat_fixer_save(ctx, run->fixer, &chunks);
+    gsf_chunks_add(ctx, &chunks, "GFIX", history.data, history.size);
+    gsf_chunks_end(ctx, &chunks);
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    if (!history.failed && !chunks.failed)
+        result = gsf_write_file(ctx, gsfix_pathf("%s/checkpoint", run->app->o.out).s, chunks.data, chunks.size);
+    gsf_destroy_text(ctx, &chunks);
+    gsf_destroy_text(ctx, &history);
+    if (result == GSF_OK) run->saved_at = run->iteration;
+    return result;
+}
+
+static int same_json(const gsf_json* a, const gsf_json_value* x, const gsf_json* b, const gsf_json_value* y) {
+    if (!x || !y || x->type != y->type || x->count != y->count) return 0;
+    if (x->type == GSF_JSON_STRING) return strcmp(x->string, y->string) == 0;
+    if (x->type == GSF_JSON_NUMBER) return x->number == y->number;
+    for (size_t i = 0; i < x->count; i++)
+        if (!same_json(a, gsf_json_element(a, x, i), b, gsf_json_element(b, y, i))) return 0;
+    return 1;
+}
+
+static void show_json(const gsf_json_value* v, char text[128]) {
+    if (v && v->type == GSF_JSON_STRING) snprintf(text, 128, "%.100s", v->string);
+    else if (v && v->type == GSF_JSON_NUMBER) snprintf(text, 128, "%g", v->number);
+    else snprintf(text, 128, v ? "others" : "none");
+}
+
+static gsf_result compare_switches(fix_run* run, const char* name, const gsf_json* old, const gsf_json_value* was) {
+    gsf_json now;
+    gsf_result result = gsf_parse_json(run->ctx, "switches", run->switches.data, run->switches.size, &now);
+    if (result != GSF_OK) return result;
+    for (uint32_t i = now.values[0].child; i && result == GSF_OK; i = now.values[i].next) {
+        const gsf_json_value *x = &now.values[i], *y = gsf_json_member(old, was, x->key);
+        char mine[128], theirs[128];
+        if (same_json(&now, x, old, y)) continue;
+        show_json(x, mine);
+        show_json(y, theirs);
+        result = gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: made with %s %s, now %s", name, x->key, theirs, mine);
+    }
+    gsf_destroy_json(run->ctx, &now);
+    return result;
+}
+
+// The rows of a list, at most `columns` numbers each; null is NaN.
+static size_t read_rows(const gsf_json* json, const gsf_json_value* root, const char* key, size_t columns, double** rows,
+                        gsf_context* ctx) {
+    const gsf_json_value* list = gsf_json_member(json, root, key);
+    *rows = NULL;
+    if (!list || list->type != GSF_JSON_ARRAY || !list->count) return 0;
+    *rows = (double*)gsf_alloc_zeroed(ctx, list->count, columns * sizeof(double));
+    if (!*rows) return 0;
+    size_t row = 0;
+    for (uint32_t i = list->child; i; i = json->values[i].next, row++) {
+        size_t column = 0;
+        for (uint32_t k = json->values[i].child; k && column < columns; k = json->values[k].next, column++)
+            (*rows)[row * columns + column] = json->values[k].type == GSF_JSON_NUMBER ? json->values[k].number : NAN;
+    }
+    return row;
+}
+
+static gsf_result read_history(fix_run* run, const gsf_json* json) {
+    gsf_context* ctx = run->ctx;
+    gsfix_history* h = &run->history;
+    const gsf_json_value* root = &json->values[0];
+    const gsf_json_value* seconds = gsf_json_member(json, root, "seconds");
+    const gsf_json_value* total = gsf_json_member(json, root, "seconds_total");
+    const gsf_json_value* resumed = gsf_json_member(json, root, "resumed");
+    for (size_t i = 0; i < GSFIX_STAGES; i++) {
+        const gsf_json_value* s = gsf_json_element(json, seconds, i);
+        if (s) h->seconds[i] += s->number;
+    }
+    if (total) run->total_before = total->number;
+    h->resumed = resumed ? (int32_t)resumed->number + 1 : 1;
+    gsf_result result = GSF_OK;
+    double* r = NULL;
+    size_t n = read_rows(json, root, "before", 4, &r, ctx);
+    for (size_t i = 0; i < n && n == h->view_count; i++) memcpy(&h->before[i].psnr, r + 4 * i, 4 * sizeof(double));
+    h->has_before = n > 0 && n == h->view_count;
+    gsf_free(ctx, r);
+    n = read_rows(json, root, "curve", 4, &r, ctx);
+    for (size_t i = 0; i < n && (result = GROW(ctx, h, curve, curve)) == GSF_OK; i++) {
+        const double* x = r + 4 * i;
+        const gsfix_curve_point p = {(int32_t)x[0], (uint64_t)x[1], x[2], x[3]};
+        h->curve[h->curve_count++] = p;
+    }
+    gsf_free(ctx, r);
+    n = read_rows(json, root, "rounds", 6, &r, ctx);
+    for (size_t i = 0; i < n && result == GSF_OK && (result = GROW(ctx, h, rounds, round)) == GSF_OK; i++) {
+        const double* x = r + 6 * i;
+        const gsfix_round p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], (int32_t)x[3], (int32_t)x[4], x[5]};
+        h->rounds[h->round_count++] = p;
+    }
+    gsf_free(ctx, r);
+    n = read_rows(json, root, "path", 9, &r, ctx);
+    for (size_t i = 0; i < n && result == GSF_OK && (result = GROW(ctx, h, path, path)) == GSF_OK; i++) {
+        const double* x = r + 9 * i;
+        const gsfix_flown p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], {x[3], x[4], x[5]}, {x[6], x[7], x[8]}};
+        h->path[h->path_count++] = p;
+    }
+    gsf_free(ctx, r);
+    n = read_rows(json, root, "samples", 3, &r, ctx);
+    for (size_t i = 0; i < n && result == GSF_OK && (result = GROW(ctx, h, samples, sample)) == GSF_OK; i++) {
+        const double* x = r + 3 * i;
+        const gsfix_sample p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2]};
+        h->samples[h->sample_count++] = p;
+    }
+    gsf_free(ctx, r);
+    return result;
+}
+
+static gsf_result resume(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    const gsfix_path path = gsfix_pathf("%s/checkpoint", run->app->o.out);
+    void* data;
+    size_t size;
+    gsf_chunk chunk;
+    gsf_json json = {0};
+    gsf_result result = gsf_read_file(ctx, path.s, &data, &size);
+    if (result != GSF_OK) return result;
+    result = gsf_chunks_check(ctx, path.s, data, size);
+    if (result == GSF_OK && !gsf_chunks_find(data, size, "GFIX", &chunk))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: not a checkpoint of gsfix fix", path.s);
+    if (result == GSF_OK) result = gsf_parse_json(ctx, path.s, (const char*)chunk.data, chunk.size, &json);
+    if (result == GSF_OK) result = compare_switches(run, path.s, &json, gsf_json_member(&json, &json.values[0], "switches"));
+    if (result == GSF_OK) result = gsf_splat_fixer_restore(ctx, run->fixer, path.s, data, size);
+    if (result == GSF_OK) result = read_history(run, &json);
+    const gsf_json_value* iteration = result == GSF_OK ? gsf_json_member(&json, &json.values[0], "iteration") : NULL;
+    if (iteration) run->iteration = (int32_t)iteration->number;
+    gsf_destroy_json(ctx, &json);
+    gsf_free(ctx, data);
+    return result;
+}
+
+// ---- the loop --------------------------------------------------------------------
+
+static gsf_result start_fixer(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    const size_t n = run->split.train_count;
+    gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, n, sizeof *views);
+    if (!views) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < n; i++) {
+        views[i].camera = run->scene.views[run->split.train[i]].camera;
+        views[i].image = run->scene.views[run->split.train[i]].image;
+    }
+    const gsf_result result = gsf_splat_make_fixer(ctx, &run->setup.fix, views, n, &run->initial,
+                                                   run->has_restorer ? &run->restorer : NULL, &run->fixer);
+    gsf_free(ctx, views);
+    return result;
+}
+
+static gsf_result prepare(fix_run* run) {
+    gsfix_app* app = run->app;
+    gsf_context* ctx = run->ctx;
+    gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &run->scene);
+    if (result == GSF_OK) result = gsfix_split_scene(app, &run->scene, &run->split);
+    if (result == GSF_OK)
+        run->setup.fix.train.render.near_plane =
+            gsfix_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
+    for (int k = 0; k < 2; k++)
+        for (size_t i = 0; i < (k ? run->split.test_count : run->split.train_count) && result == GSF_OK; i++)
+            result = gsf_splat_load_view_image(ctx, &run->scene, k ? run->split.test[i] : run->split.train[i]);
+    if (result == GSF_OK && app->o.masks) result = load_masks(run);
+    if (result == GSF_OK) result = make_initial(run);
+    if (result == GSF_OK) result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &run->restorer, &run->has_restorer);
+    if (result == GSF_OK) result = start_fixer(run);
+    if (result != GSF_OK) return result;
+    run->history.view_count = run->split.test_count;
+    run->history.before = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *run->history.before);
+    write_switches(run);
+    if (!run->history.before || run->switches.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    const char* const folders[] = {"test", "fixed", "report", "report/before"};
+    const int resuming = app->o.resume && gsfix_exists(gsfix_pathf("%s/checkpoint", app->o.out).s);
+    for (size_t i = 0; i < sizeof folders / sizeof *folders && result == GSF_OK; i++) {
+        const gsfix_path folder = gsfix_pathf("%s/%s", app->o.out, folders[i]);
+        result = gsfix_make_folder(ctx, folder.s);
+        if (result == GSF_OK && !resuming) result = gsfix_clear_folder(ctx, folder.s, 0);
+    }
+    if (result == GSF_OK && resuming) result = resume(run);
+    gsfix_note(app, "%zu training views, %zu held out; %zu initial splats%s", run->split.train_count, run->split.test_count,
+               run->initial.count, resuming && result == GSF_OK ? "; going on from the checkpoint" : "");
+    return result;
+}
+
+static gsf_result keep_sample(fix_run* run, const gsf_fix_stats* stats) { // the middle frame of a window, for the report
+    gsfix_history* h = &run->history;
+    const int32_t i = stats->frame_count / 2;
+    const gsf_image* const pictures[] = {stats->rendered + i, stats->restored + i, stats->confidence + i};
+    static const char* const names[] = {"render", "restored", "confidence"};
+    gsf_result result = GROW(run->ctx, h, samples, sample);
+    for (int k = 0; k < 3 && result == GSF_OK; k++)
+        result = gsf_save_image(run->ctx, gsfix_pathf("%s/report/round%d_window%d_%s.png", run->app->o.out, (int)stats->round,
+                                                      (int)stats->window, names[k]).s, pictures[k]);
+    if (result != GSF_OK) return result;
+    const gsfix_sample sample = {stats->round, stats->window, i};
+    h->samples[h->sample_count++] = sample;
+    return GSF_OK;
+}
+
+static double mean_value(const gsf_image* image) { // of one channel
+    double sum = 0.0;
+    for (int64_t y = 0; y < image->height; y++)
+        for (int64_t x = 0; x < image->width; x++)
+            sum += *(const float*)(const void*)((const char*)image->data + y * image->stride_y + x * image->stride_x);
+    return sum / ((double)image->width * (double)image->height);
+}
+
+static gsf_result after_window(fix_run* run, const gsf_fix_stats* stats) {
+    gsf_context* ctx = run->ctx;
+    gsfix_history* h = &run->history;
+    gsf_result result = GSF_OK;
+    if (!h->round_count || h->rounds[h->round_count - 1].round != stats->round) {
+        const gsfix_round fresh = {stats->round, run->iteration, 0, 0, 0, 0.0};
+        result = GROW(ctx, h, rounds, round);
+        if (result != GSF_OK) return result;
+        h->rounds[h->round_count++] = fresh;
+    }
+    gsfix_round* round = &h->rounds[h->round_count - 1];
+    const double frames_before = round->frames;
+    round->windows++;
+    round->skipped += !stats->restored;
+    for (int32_t i = 0; i < stats->frame_count && result == GSF_OK; i++) {
+        gsfix_flown flown;
+        double c2w[16];
+        gsf_camera_c2w(stats->cameras + i, c2w);
+        flown.round = stats->round;
+        flown.window = stats->window;
+        flown.reference = stats->reference_index[i];
+        memcpy(flown.center, c2w + 12, sizeof flown.center);
+        memcpy(flown.forward, c2w + 8, sizeof flown.forward);
+        result = GROW(ctx, h, path, path);
+        if (result == GSF_OK) h->path[h->path_count++] = flown;
+        if (result != GSF_OK || !stats->restored) continue;
+        round->frames++;
+        round->confidence += mean_value(stats->confidence + i);
+        result = gsf_save_image(ctx, gsfix_pathf("%s/fixed/round%d_window%d_%05d.png", run->app->o.out, (int)stats->round,
+                                                 (int)stats->window, (int)i).s, stats->restored + i);
+    }
+    if (result == GSF_OK && round->frames > frames_before) result = keep_sample(run, stats);
+    return result;
+}
+
+static gsf_result capture_before(fix_run* run) {
+    if (run->history.has_before || !run->split.test_count) return GSF_OK;
+    const gsf_result result = evaluate(run, gsfix_pathf("%s/report/before", run->app->o.out).s, 1, run->history.before);
+    run->history.has_before = result == GSF_OK;
+    return result;
+}
+
+// What is due after a step: pictures, held-out figures, checkpoint. The step itself is done and stays done.
+static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* clock) {
+    gsf_result result = GSF_OK;
+    int due = 0;
+    if (stats->stage == GSF_FIX_TRAIN) {
+        run->iteration = stats->train.iteration;
+        add_seconds(run, run->history.round_count ? GSFIX_DISTILL : GSFIX_TRAIN, clock);
+        if (run->iteration % run->eval_every == 0 || run->iteration == run->iterations) result = add_curve_point(run);
+        add_seconds(run, GSFIX_RENDER, clock);
+        due = run->iteration % run->checkpoint_every == 0 || run->iteration == run->iterations;
+    } else if (stats->stage == GSF_FIX_PLAN || stats->stage == GSF_FIX_RESTORE) {
+        add_seconds(run, GSFIX_RESTORE, clock);
+        if (stats->round == 1) result = capture_before(run);
+        if (result == GSF_OK) result = add_curve_point(run);
+        add_seconds(run, GSFIX_RENDER, clock);
+        if (result == GSF_OK && stats->stage == GSF_FIX_RESTORE) {
+            result = after_window(run, stats);
+            due = 1;
+        }
+    }
+    if (result == GSF_OK && due) result = save_checkpoint(run);
+    add_seconds(run, GSFIX_SAVE, clock);
+    return result;
+}
+
+static void show_step(fix_run* run, const gsf_fix_stats* stats) {
+    const gsfix_history* h = &run->history;
+    const double psnr = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
+    char held_out[48] = "";
+    if (!isnan(psnr)) snprintf(held_out, sizeof held_out, "  held-out %.2f dB", psnr);
+    if (stats->stage == GSF_FIX_TRAIN)
+        gsfix_progress(run->app, run->iteration, run->iterations, "step %d of %d  loss %.4f  %zu splats%s", (int)run->iteration,
+                       (int)run->iterations, stats->train.loss, stats->train.splats, held_out);
+    else if (stats->stage == GSF_FIX_RESTORE && run->app->terminal)
+        gsfix_progress(run->app, run->iteration, run->iterations, "round %d of %d: window %d of %d %s", (int)stats->round,
+                       (int)stats->rounds, (int)stats->window, (int)stats->windows, stats->restored ? "repaired" : "skipped");
+    else if (stats->stage == GSF_FIX_RESTORE && stats->window == stats->windows)
+        gsfix_note(run->app, "round %d of %d: %d windows, %d of them skipped%s", (int)stats->round, (int)stats->rounds,
+                   (int)stats->windows, (int)h->rounds[h->round_count - 1].skipped, held_out);
+}
+
+static gsf_result run_loop(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    double clock = gsfix_now();
+    gsf_result result = GSF_OK;
+    run->saved_at = -1;
+    while (result == GSF_OK) {
+        gsf_fix_stats stats;
+        result = gsf_splat_fix_step(ctx, run->fixer, &stats);
+        if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
+        const int cancelled = gsf_is_cancelled(ctx); // what follows belongs to the step
+        gsf_clear_cancel(ctx);
+        result = follow_step(run, &stats, &clock);
+        if (cancelled) gsf_request_cancel(ctx);
+        if (result == GSF_OK) show_step(run, &stats);
+    }
+    if (result != GSF_ERROR_CANCELLED) return result;
+    gsf_clear_cancel(ctx);
+    result = save_checkpoint(run);
+    if (result != GSF_OK) return result;
+    return gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped at step %d of %d; --resume goes on from %s/checkpoint",
+                    (int)run->iteration, (int)run->iterations, run->app->o.out);
+}
+
+// ---- results ---------------------------------------------------------------------
+
+static void write_scores(gsf_context* ctx, gsf_text* t, const char* suffix, const gsfix_score* s) {
+    gsfix_json_number(ctx, t, gsfix_pathf("psnr%s", suffix).s, s->psnr);
+    gsfix_json_number(ctx, t, gsfix_pathf("ssim%s", suffix).s, s->ssim);
+    gsfix_json_number(ctx, t, gsfix_pathf("psnr_seen%s", suffix).s, s->psnr_seen);
+    gsfix_json_number(ctx, t, gsfix_pathf("ssim_seen%s", suffix).s, s->ssim_seen);
+}
+
+static void write_views(fix_run* run, const gsfix_result* r, gsf_text* t) {
+    gsf_context* ctx = run->ctx;
+    gsfix_json_begin(ctx, t, "per_view", '[');
+    for (size_t i = 0; i < run->split.test_count; i++) {
+        gsfix_json_begin(ctx, t, NULL, '{');
+        gsfix_json_text(ctx, t, "name", run->scene.views[run->split.test[i]].name);
+        gsfix_json_text(ctx, t, "file", gsfix_pathf("test/%s.png", gsfix_view_stem(&run->scene, run->split.test[i]).s).s);
+        write_scores(ctx, t, "", r->views + i);
+        if (run->history.has_before) write_scores(ctx, t, "_before", run->history.before + i);
+        gsfix_json_end(ctx, t, '}');
+    }
+    gsfix_json_end(ctx, t, ']');
+}
+
+static void write_course(fix_run* run, gsf_text* t) { // rounds and curve
+    gsf_context* ctx = run->ctx;
+    const gsfix_history* h = &run->history;
+    gsfix_json_begin(ctx, t, "rounds", '[');
+    for (size_t i = 0; i < h->round_count; i++) {
+        const gsfix_round* r = &h->rounds[i];
+        gsfix_json_begin(ctx, t, NULL, '{');
+        gsfix_json_number(ctx, t, "round", r->round);
+        gsfix_json_number(ctx, t, "iteration", r->iteration);
+        gsfix_json_number(ctx, t, "windows", r->windows);
+        gsfix_json_number(ctx, t, "windows_skipped", r->skipped);
+        gsfix_json_number(ctx, t, "frames_restored", r->frames);
+        gsfix_json_number(ctx, t, "mean_confidence", r->frames ? r->confidence / r->frames : NAN);
+        gsfix_json_end(ctx, t, '}');
+    }
+    gsfix_json_end(ctx, t, ']');
+    gsfix_json_begin(ctx, t, "curve", '[');
+    for (size_t i = 0; i < h->curve_count; i++) {
+        gsfix_json_begin(ctx, t, NULL, '{');
+        gsfix_json_number(ctx, t, "iteration", h->curve[i].iteration);
+        gsfix_json_number(ctx, t, "splats", (double)h->curve[i].splats);
+        gsfix_json_number(ctx, t, "psnr", h->curve[i].psnr);
+        gsfix_json_number(ctx, t, "psnr_seen", h->curve[i].psnr_seen);
+        gsfix_json_end(ctx, t, '}');
+    }
+    gsfix_json_end(ctx, t, ']');
+}
+
+// The members of metrics.json into app->json (whose opening brace stands already).
+static void write_metrics(fix_run* run, const gsfix_result* r) {
+    gsf_context* ctx = run->ctx;
+    gsf_text* t = &run->app->json;
+    const gsfix_history* h = &run->history;
+    gsfix_json_text(ctx, t, "version", GSF_VERSION);
+    gsfix_json_text(ctx, t, "command", run->app->command_line);
+    gsfix_json_text(ctx, t, "scene", run->scene.folder);
+    write_scores(ctx, t, "", &r->mean);
+    if (h->has_before) write_scores(ctx, t, "_before", &r->before);
+    gsfix_json_text(ctx, t, "measured", "float32 render clamped to [0,1] against the 8-bit photo; ssim as ssim_3dgs");
+    write_views(run, r, t);
+    gsfix_json_begin(ctx, t, "seconds", '{');
+    gsfix_json_number(ctx, t, "total", h->seconds_total);
+    for (int i = 0; i < GSFIX_STAGES; i++) gsfix_json_number(ctx, t, gsfix_stage_names[i], h->seconds[i]);
+    gsfix_json_end(ctx, t, '}');
+    gsfix_json_number(ctx, t, "iterations", r->iterations);
+    gsfix_json_number(ctx, t, "splats", (double)r->splats->count);
+    gsfix_json_number(ctx, t, "peak_rss_bytes", (double)gsfix_peak_memory());
+    gsfix_json_number(ctx, t, "seed", (double)run->app->o.seed);
+    gsfix_json_number(ctx, t, "threads", ctx->parallel.worker_count);
+    gsfix_json_text(ctx, t, "isa", gsf_cpu_level_name(ctx->cpu_level));
+    gsfix_json_text(ctx, t, "visibility_rays", run->rays);
+    gsfix_json_number(ctx, t, "resumed", h->resumed);
+    write_course(run, t);
+    gsfix_json_begin(ctx, t, "switches", '{');
+    t->size--;
+    gsf_text_append(ctx, t, run->switches.data, run->switches.size);
+}
+
+static gsf_result save_metrics(fix_run* run) {
+    gsf_text file = {0};
+    gsf_text_append(run->ctx, &file, run->app->json.data, run->app->json.size);
+    gsf_text_append(run->ctx, &file, "}\n", 2);
+    const gsf_result result = file.failed || run->app->json.failed
+                                  ? GSF_ERROR_OUT_OF_MEMORY
+                                  : gsf_write_file(run->ctx, gsfix_pathf("%s/metrics.json", run->app->o.out).s, file.data, file.size);
+    gsf_destroy_text(run->ctx, &file);
+    return result;
+}
+
+static void print_results(fix_run* run, const gsfix_result* r) {
+    gsfix_app* app = run->app;
+    const gsfix_history* h = &run->history;
+    if (run->split.test_count) {
+        gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim, run->split.test_count);
+        if (run->masks) gsfix_print(app, "seen       PSNR %.3f dB  SSIM %.4f", r->mean.psnr_seen, r->mean.ssim_seen);
+        if (h->has_before) gsfix_print(app, "unrepaired PSNR %.3f dB  SSIM %.4f  (before the first round)", r->before.psnr, r->before.ssim);
+    }
+    gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
+                h->seconds_total, (double)gsfix_peak_memory() / 1e6);
+    gsfix_print(app, "wrote      %s/report.html  splats.ply  metrics.json  test/%s", app->o.out, h->round_count ? "  fixed/" : "");
+}
+
+static gsf_result finish(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    gsfix_history* h = &run->history;
+    const char* out = run->app->o.out;
+    double clock = gsfix_now();
+    gsfix_result r = {0};
+    gsfix_score* views = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *views);
+    if (!views) return GSF_ERROR_OUT_OF_MEMORY;
+    r.scene = &run->scene;
+    r.split = &run->split;
+    r.history = h;
+    r.out = out;
+    r.switches = run->switches.data;
+    r.masks = run->masks;
+    r.views = views;
+    r.iterations = run->iterations;
+    r.splats = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(run->fixer));
+    gsf_result result = gsf_splat_save_ply(ctx, gsfix_pathf("%s/splats.ply", out).s, r.splats);
+    add_seconds(run, GSFIX_SAVE, &clock);
+    if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
+    add_seconds(run, GSFIX_RENDER, &clock);
+    r.mean = mean_score(views, run->split.test_count);
+    r.before = mean_score(h->before, h->has_before ? run->split.test_count : 0);
+    h->seconds_total = run->total_before + gsfix_now() - run->app->started;
+    if (result == GSF_OK) {
+        write_metrics(run, &r);
+        result = save_metrics(run);
+    }
+    if (result == GSF_OK) result = gsfix_write_report(run->app, &r);
+    if (result == GSF_OK) print_results(run, &r);
+    gsf_free(ctx, views);
+    return result;
+}
+
+static void free_run(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    gsf_splat_destroy_fixer(ctx, run->fixer);
+    gsfix_destroy_restorer(run->app, &run->restorer);
+    gsf_splat_destroy(ctx, &run->initial);
+    for (size_t i = 0; run->masks && i < run->split.test_count; i++) gsf_destroy_image(ctx, run->masks + i);
+    gsf_free(ctx, run->masks);
+    gsfix_free_split(run->app, &run->split);
+    gsf_splat_destroy_scene(ctx, &run->scene);
+    gsf_destroy_text(ctx, &run->switches);
+    gsf_free(ctx, run->history.before);
+    gsf_free(ctx, run->history.curve);
+    gsf_free(ctx, run->history.rounds);
+    gsf_free(ctx, run->history.path);
+    gsf_free(ctx, run->history.samples);
+}
+
+int gsfix_run_fix(gsfix_app* app) {
+    static const fix_run zero;
+    fix_run run = zero;
+    run.app = app;
+    run.ctx = &app->ctx;
+    const int code = resolve_setup(app, &run.setup);
+    if (code) return code;
+    run.iterations = run.setup.fix.train.iterations;
+    run.eval_every = app->o.eval_every ? app->o.eval_every : run.iterations / 10 > 0 ? run.iterations / 10 : 1;
+    run.checkpoint_every = app->o.checkpoint_every ? app->o.checkpoint_every : run.iterations / 20 > 0 ? run.iterations / 20 : 1;
+    gsf_result result = prepare(&run);
+    run.history.seconds[GSFIX_INIT] += gsfix_now() - app->started;
+    if (result == GSF_OK) result = run_loop(&run);
+    if (result == GSF_OK) result = finish(&run);
+    free_run(&run);
+    return result == GSF_OK ? 0 : gsfix_failed(app);
+}

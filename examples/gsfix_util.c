@@ -1,0 +1,417 @@
+// gsfix_util.c - files, pictures, JSON and progress for gsfix
+// SPDX-License-Identifier: MIT
+#include "gsfix.h"
+
+#include <ctype.h>
+#include <dirent.h>
+#include <errno.h>
+#include <math.h>
+#include <stdarg.h>
+#include <sys/resource.h>
+#include <sys/stat.h>
+#include <time.h>
+#include <unistd.h>
+
+// ---- time, memory, files ---------------------------------------------------------
+
+double gsfix_now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+uint64_t gsfix_peak_memory(void) {
+    struct rusage usage;
+    if (getrusage(RUSAGE_SELF, &usage) != 0) return 0;
+#ifdef __APPLE__
+    return (uint64_t)usage.ru_maxrss;
+#else
+    return (uint64_t)usage.ru_maxrss * 1024u;
+#endif
+}
+
+gsfix_path gsfix_pathf(const char* format, ...) { // too long a path is cut, and then not found
+    gsfix_path path;
+    va_list args;
+    va_start(args, format);
+    if (vsnprintf(path.s, sizeof path.s, format, args) < 0) path.s[0] = 0;
+    va_end(args);
+    return path;
+}
+
+int gsfix_exists(const char* path) {
+    struct stat s;
+    return stat(path, &s) == 0;
+}
+
+int gsfix_is_folder(const char* path) {
+    struct stat s;
+    return stat(path, &s) == 0 && S_ISDIR(s.st_mode);
+}
+
+gsf_result gsfix_make_folder(gsf_context* ctx, const char* path) {
+    gsfix_path part = gsfix_pathf("%s", path);
+    for (char* p = part.s + 1;; p++) {
+        if (*p != '/' && *p != 0) continue;
+        const char end = *p;
+        *p = 0;
+        if (mkdir(part.s, 0777) != 0 && !gsfix_is_folder(part.s))
+            return gsf_fail(ctx, GSF_ERROR_IO, "%s: folder cannot be made: %s", part.s, strerror(errno));
+        *p = end;
+        if (!end) return GSF_OK;
+    }
+}
+
+gsf_result gsfix_clear_folder(gsf_context* ctx, const char* path, int deep) {
+    DIR* folder = opendir(path);
+    if (!folder) return GSF_OK;
+    gsf_result result = GSF_OK;
+    for (struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
+        if (strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0) continue;
+        const gsfix_path child = gsfix_pathf("%s/%s", path, entry->d_name);
+        const size_t length = strlen(entry->d_name);
+        struct stat s;
+        if (lstat(child.s, &s) != 0) continue;
+        if (S_ISDIR(s.st_mode)) {
+            if (!deep) continue;
+            result = gsfix_clear_folder(ctx, child.s, 1);
+            if (result == GSF_OK && rmdir(child.s) != 0)
+                result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be removed: %s", child.s, strerror(errno));
+        } else if (deep || (length > 4 && strcmp(entry->d_name + length - 4, ".png") == 0)) {
+            if (unlink(child.s) != 0)
+                result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be removed: %s", child.s, strerror(errno));
+        }
+    }
+    closedir(folder);
+    return result;
+}
+
+char* gsfix_copy_text(gsf_context* ctx, const char* text, size_t size) {
+    char* copy = (char*)gsf_alloc(ctx, size + 1, 1);
+    if (!copy) return NULL;
+    memcpy(copy, text, size);
+    copy[size] = 0;
+    return copy;
+}
+
+static int compare_names(const void* a, const void* b) { return strcmp(*(char* const*)a, *(char* const*)b); }
+
+static int has_extension(const char* name, const char* extensions) {
+    const char* dot = strrchr(name, '.');
+    if (!dot || strlen(dot) > 8) return 0;
+    char lower[16];
+    size_t n = 0;
+    for (; dot[n]; n++) lower[n] = (char)tolower((unsigned char)dot[n]);
+    lower[n] = 0;
+    const char* at = strstr(extensions, lower);
+    return n > 1 && at && (at[n] == 0 || at[n] == '.');
+}
+
+gsf_result gsfix_list(gsf_context* ctx, const char* path, const char* extensions, gsfix_names* out) {
+    memset(out, 0, sizeof *out);
+    DIR* folder = opendir(path);
+    if (!folder) return gsf_fail(ctx, GSF_ERROR_IO, "%s: folder cannot be read: %s", path, strerror(errno));
+    size_t room = 0;
+    gsf_result result = GSF_OK;
+    for (struct dirent* entry; (entry = readdir(folder)) != NULL;) {
+        if (entry->d_name[0] == '.' || !has_extension(entry->d_name, extensions)) continue;
+        if (out->count == room) {
+            const size_t more = 2 * room + 64;
+            char** names = (char**)gsf_alloc(ctx, more, sizeof *names);
+            if (!names) { result = GSF_ERROR_OUT_OF_MEMORY; break; }
+            if (out->count) memcpy(names, out->names, out->count * sizeof *names);
+            gsf_free(ctx, out->names);
+            out->names = names;
+            room = more;
+        }
+        out->names[out->count] = gsfix_copy_text(ctx, entry->d_name, strlen(entry->d_name));
+        if (!out->names[out->count]) { result = GSF_ERROR_OUT_OF_MEMORY; break; }
+        out->count++;
+    }
+    closedir(folder);
+    if (result != GSF_OK) gsfix_free_names(ctx, out);
+    else if (out->count) qsort(out->names, out->count, sizeof *out->names, compare_names);
+    return result;
+}
+
+void gsfix_free_names(gsf_context* ctx, gsfix_names* names) {
+    for (size_t i = 0; i < names->count; i++) gsf_free(ctx, names->names[i]);
+    gsf_free(ctx, names->names);
+    memset(names, 0, sizeof *names);
+}
+
+gsfix_path gsfix_stem(const char* path) {
+    const char* slash = strrchr(path, '/');
+    gsfix_path stem = gsfix_pathf("%s", slash ? slash + 1 : path);
+    char* dot = strrchr(stem.s, '.');
+    if (dot && dot != stem.s) *dot = 0;
+    return stem;
+}
+
+static gsfix_path flat_name(const char* name, int with_extension) {
+    gsfix_path flat = gsfix_pathf("%s", name);
+    for (char* p = flat.s; *p; p++)
+        if (*p == '/' || *p == '\\') *p = '_';
+    if (with_extension) return flat;
+    char* dot = strrchr(flat.s, '.');
+    if (dot && dot != flat.s) *dot = 0;
+    return flat;
+}
+
+gsfix_path gsfix_view_stem(const gsf_scene* scene, size_t view) {
+    const gsfix_path mine = flat_name(scene->views[view].name, 0);
+    for (size_t i = 0; i < scene->view_count; i++)
+        if (i != view && strcmp(flat_name(scene->views[i].name, 0).s, mine.s) == 0)
+            return flat_name(scene->views[view].name, 1); // a.jpg and a.png
+    return mine;
+}
+
+/* .npy version 1: "\x93NUMPY" 1 0 | u16 size of the header text | header text | row-major float32. */
+gsf_result gsfix_save_npy(gsf_context* ctx, const char* path, const gsf_image* image) {
+    char header[118];
+    const int used = snprintf(header, sizeof header, "{'descr': '<f4', 'fortran_order': False, 'shape': (%lld, %lld), }",
+                              (long long)image->height, (long long)image->width);
+    memset(header + used, ' ', sizeof header - (size_t)used);
+    header[sizeof header - 1] = '\n';
+    gsf_text text = {0};
+    gsf_text_append(ctx, &text, "\x93NUMPY\x01\x00\x76\x00", 10); // 118 = 0x76: the data starts at byte 128
+    gsf_text_append(ctx, &text, header, sizeof header);
+    gsf_text_append(ctx, &text, (const char*)image->data, (size_t)image->width * (size_t)image->height * sizeof(float));
+    const gsf_result result = text.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, text.data, text.size);
+    gsf_destroy_text(ctx, &text);
+    return result;
+}
+
+gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out) {
+    void* data;
+    size_t size, begin = 0;
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf_read_file(ctx, path, &data, &size);
+    if (result != GSF_OK) return result;
+    const unsigned char* p = (const unsigned char*)data;
+    char header[1024] = "";
+    if (size >= 12 && memcmp(p, "\x93NUMPY", 6) == 0 && (p[6] == 1 || p[6] == 2)) {
+        const size_t fixed = p[6] == 1 ? 10 : 12;
+        size_t text = p[8] | (size_t)p[9] << 8;
+        if (p[6] == 2) text |= (size_t)p[10] << 16 | (size_t)p[11] << 24;
+        if (text < sizeof header && size - fixed >= text) {
+            memcpy(header, p + fixed, text);
+            header[text] = 0;
+            begin = fixed + text;
+        }
+    }
+    const char* shape = strstr(header, "'shape': (");
+    long long height = 0, width = 0;
+    if (!begin || !strstr(header, "'descr': '<f4'") || !strstr(header, "'fortran_order': False") || !shape ||
+        sscanf(shape + 10, "%lld, %lld", &height, &width) != 2 || height < 1 || width < 1)
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: expected a .npy of little-endian float32, two dimensions, C order", path);
+    else if ((size - begin) / 4 / (size_t)width < (size_t)height)
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %lld x %lld values do not fit into the file", path, begin, height,
+                          width);
+    else
+        result = gsf_make_image(ctx, GSF_F32, width, height, 1, out);
+    if (result == GSF_OK) memcpy(out->data, p + begin, (size_t)width * (size_t)height * sizeof(float));
+    gsf_free(ctx, data);
+    return result;
+}
+
+// ---- pictures --------------------------------------------------------------------
+
+static size_t value_count(const gsf_image* image) {
+    return (size_t)image->width * (size_t)image->height * (size_t)image->channels;
+}
+
+void gsfix_clamp(gsf_image* image) {
+    float* p = (float*)image->data;
+    for (size_t i = 0; i < value_count(image); i++) p[i] = p[i] > 0.0f ? p[i] < 1.0f ? p[i] : 1.0f : 0.0f;
+}
+
+void gsfix_map_color(double t, uint8_t rgb[3]) { // matplotlib's inferno, as a polynomial (M. Zucker's fit, CC0)
+    static const double c[3][7] = {
+        {0.00021894, 0.10651342, 11.60249308, -41.70399613, 77.16293570, -71.31942824, 25.13112622},
+        {0.00165100, 0.56395644, -3.97285397, 17.43639888, -33.40235894, 32.62606426, -12.24266895},
+        {-0.01948090, 3.93271239, -15.94239411, 44.35414520, -81.80730926, 73.20951986, -23.07032500}};
+    t = t > 0.0 ? t < 1.0 ? t : 1.0 : 0.0;
+    for (int k = 0; k < 3; k++) {
+        double v = 0.0;
+        for (int i = 6; i >= 0; i--) v = v * t + c[k][i];
+        rgb[k] = (uint8_t)(255.0 * (v > 0.0 ? v < 1.0 ? v : 1.0 : 0.0) + 0.5);
+    }
+}
+
+gsf_result gsfix_color_map(gsf_context* ctx, const gsf_image* values, double low, double high, gsf_image* out) {
+    const gsf_result result = gsf_make_image(ctx, GSF_U8, values->width, values->height, 3, out);
+    if (result != GSF_OK) return result;
+    const float* v = (const float*)values->data;
+    const size_t count = (size_t)values->width * (size_t)values->height;
+    for (size_t i = 0; i < count; i++)
+        gsfix_map_color(((double)v[i] - low) / (high - low), (uint8_t*)out->data + 3 * i);
+    return GSF_OK;
+}
+
+static int compare_floats(const void* a, const void* b) {
+    const float x = *(const float*)a, y = *(const float*)b;
+    return x < y ? -1 : x > y;
+}
+
+gsf_result gsfix_color_depth(gsf_context* ctx, const gsf_image* depth, gsf_image* out) {
+    const size_t pixels = (size_t)depth->width * (size_t)depth->height;
+    const float* z = (const float*)depth->data;
+    float* inverse = (float*)gsf_alloc(ctx, pixels, sizeof *inverse);
+    if (!inverse) return GSF_ERROR_OUT_OF_MEMORY;
+    size_t count = 0;
+    for (size_t i = 0; i < pixels; i++)
+        if (z[i] > 0.0f) inverse[count++] = 1.0f / z[i];
+    double low = 0.0, high = 1.0;
+    if (count) {
+        qsort(inverse, count, sizeof *inverse, compare_floats);
+        low = inverse[count / 50];
+        high = inverse[count - 1 - count / 50];
+        if (!(high > low)) high = low + 1e-6;
+    }
+    gsf_free(ctx, inverse);
+    const gsf_result result = gsf_make_image(ctx, GSF_U8, depth->width, depth->height, 3, out);
+    if (result != GSF_OK) return result;
+    for (size_t i = 0; i < pixels; i++) // from 0.08, so that far differs from nothing
+        if (z[i] > 0.0f)
+            gsfix_map_color(0.08 + 0.92 * (1.0 / (double)z[i] - low) / (high - low), (uint8_t*)out->data + 3 * i);
+    return GSF_OK;
+}
+
+gsf_result gsfix_mean_abs_error(gsf_context* ctx, const gsf_image* a, const gsf_image* b, gsf_image* out) {
+    gsf_image left, right = {0};
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf_make_image(ctx, GSF_F32, a->width, a->height, 3, &left);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, b->width, b->height, 3, &right);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, a->width, a->height, 1, out);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, a, &left);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, b, &right);
+    if (result == GSF_OK) {
+        const float *p = (const float*)left.data, *q = (const float*)right.data;
+        const size_t pixels = (size_t)a->width * (size_t)a->height;
+        for (size_t i = 0; i < pixels; i++)
+            ((float*)out->data)[i] = (fabsf(p[3 * i] - q[3 * i]) + fabsf(p[3 * i + 1] - q[3 * i + 1]) +
+                                      fabsf(p[3 * i + 2] - q[3 * i + 2])) / 3.0f;
+    } else {
+        gsf_destroy_image(ctx, out);
+    }
+    gsf_destroy_image(ctx, &left);
+    gsf_destroy_image(ctx, &right);
+    return result;
+}
+
+// ---- talking ---------------------------------------------------------------------
+
+void gsfix_hide_bar(gsfix_app* app) {
+    if (app->bar_shown) fputs("\r\033[K", stderr);
+    app->bar_shown = 0;
+}
+
+static void print_time(double seconds, char text[32]) {
+    const int s = (int)(seconds + 0.5);
+    if (s < 3600) snprintf(text, 32, "%d:%02d", s / 60, s % 60);
+    else snprintf(text, 32, "%d:%02d:%02d", s / 3600, s / 60 % 60, s % 60);
+}
+
+// A bar on a terminal, at most ten times a second; elsewhere a line for each tenth of the work.
+void gsfix_progress(gsfix_app* app, double done, double total, const char* format, ...) {
+    const double now = gsfix_now(), share = total > 0.0 ? done / total : 0.0;
+    const int tenth = (int)(10.0 * share);
+    if (app->terminal ? now - app->bar_time < 0.1 : tenth <= app->line_share) return;
+    app->bar_time = now;
+    app->line_share = tenth;
+    char text[256], clock[32];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(text, sizeof text, format, args);
+    va_end(args);
+    print_time(now - app->started, clock);
+    if (!app->terminal) {
+        fprintf(stderr, "%3d %%  %s  %s\n", (int)(100.0 * share + 1e-9), clock, text);
+        return;
+    }
+    enum { WIDTH = 28 };
+    char bar[3 * WIDTH + 1] = "";
+    const int filled = (int)(WIDTH * share + 0.5);
+    for (int i = 0; i < WIDTH; i++) strcat(bar, i < filled ? "\xe2\x94\x81" : "\xc2\xb7");
+    fprintf(stderr, "\r\033[K%s %3d %%  %s  %s", bar, (int)(100.0 * share + 1e-9), clock, text);
+    fflush(stderr);
+    app->bar_shown = 1;
+}
+
+void gsfix_note(gsfix_app* app, const char* format, ...) {
+    gsfix_hide_bar(app);
+    va_list args;
+    va_start(args, format);
+    vfprintf(stderr, format, args);
+    va_end(args);
+    fputc('\n', stderr);
+}
+
+void gsfix_print(gsfix_app* app, const char* format, ...) {
+    if (app->o.json) return;
+    gsfix_hide_bar(app);
+    va_list args;
+    va_start(args, format);
+    vfprintf(stdout, format, args);
+    va_end(args);
+    fputc('\n', stdout);
+}
+
+int gsfix_misused(gsfix_app* app, const char* format, ...) {
+    char text[512];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(text, sizeof text, format, args);
+    va_end(args);
+    gsfix_hide_bar(app);
+    if (app->command) fprintf(stderr, "gsfix %s: %s (see gsfix %s --help)\n", app->command, text, app->command);
+    else fprintf(stderr, "gsfix: %s (see gsfix --help)\n", text);
+    return 2;
+}
+
+int gsfix_failed(gsfix_app* app) {
+    gsfix_hide_bar(app);
+    const char* text = app->ctx.error[0] ? app->ctx.error : "out of memory";
+    fprintf(stderr, "gsfix %s: %s\n", app->command, text);
+    if (app->o.json) {
+        gsf_destroy_text(&app->ctx, &app->json);
+        gsfix_json_begin(&app->ctx, &app->json, NULL, '{');
+        gsfix_json_text(&app->ctx, &app->json, "error", text);
+        gsfix_json_end(&app->ctx, &app->json, '}');
+    }
+    return 1;
+}
+
+// ---- JSON ------------------------------------------------------------------------
+
+static void json_member(gsf_context* ctx, gsf_text* text, const char* key) {
+    const char last = text->size ? text->data[text->size - 1] : '{';
+    if (last != '{' && last != '[') gsf_text_append(ctx, text, ",", 1);
+    if (!key) return;
+    gsf_text_json_string(ctx, text, key);
+    gsf_text_append(ctx, text, ":", 1);
+}
+
+void gsfix_json_begin(gsf_context* ctx, gsf_text* text, const char* key, char bracket) {
+    json_member(ctx, text, key);
+    gsf_text_append(ctx, text, &bracket, 1);
+}
+
+void gsfix_json_end(gsf_context* ctx, gsf_text* text, char bracket) { gsf_text_append(ctx, text, &bracket, 1); }
+
+void gsfix_json_text(gsf_context* ctx, gsf_text* text, const char* key, const char* value) {
+    json_member(ctx, text, key);
+    if (value) gsf_text_json_string(ctx, text, value);
+    else gsf_text_append(ctx, text, "null", 4);
+}
+
+void gsfix_json_number(gsf_context* ctx, gsf_text* text, const char* key, double value) {
+    json_member(ctx, text, key);
+    gsf_text_json_number(ctx, text, value);
+}
+
+void gsfix_json_bool(gsf_context* ctx, gsf_text* text, const char* key, int value) {
+    json_member(ctx, text, key);
+    gsf_text_append(ctx, text, value ? "true" : "false", value ? 4 : 5);
+}
