@@ -1,0 +1,141 @@
+#!/usr/bin/env bash
+# test_gsfix.sh GSFIX SCENE SCRATCH: every command once, exit codes, and what the files hold. SCENE: make_scene's.
+set -euo pipefail
+gsfix=$1 scene=$2 scratch=$3
+[ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no program or no scene"; exit 77; }
+rm -rf "$scratch"
+mkdir -p "$scratch"
+cd "$scratch"
+export OMP_WAIT_POLICY=passive
+failures=0
+fail() { echo "FAILED: $*"; failures=$((failures + 1)); }
+expect() { # STATUS COMMAND...: exit status, and one line that says why where it is not 0
+    local want=$1 got=0
+    shift
+    "$@" > stdout 2> stderr || got=$?
+    [ "$got" = "$want" ] || { fail "status $got, not $want: $*"; tail -n 3 stderr; }
+    if [ "$want" != 0 ]; then [ "$(grep -c '^gsfix' stderr)" = 1 ] || { fail "not one line of error: $*"; cat stderr; }; fi
+}
+holds() { grep -q -- "$1" "$2" || fail "$2 does not hold $1"; }
+is_json() { # one object on one line, and every brace of it closed
+    [ "$(wc -l < "$1")" = 1 ] && head -c 1 "$1" | grep -q '{' && tail -c 2 "$1" | grep -q '}' || fail "$1 is not one JSON object"
+    if command -v python3 > /dev/null; then python3 -c 'import json, sys; json.load(open(sys.argv[1]))' "$1" || fail "$1 is not JSON"; fi
+}
+
+# usage: 2
+expect 2 "$gsfix" bogus
+expect 2 "$gsfix" dataset "$scene"
+expect 2 "$gsfix" evaluate
+expect 2 "$gsfix" fix "$scene"
+expect 2 "$gsfix" fix "$scene" --out x --restorer dit:models
+expect 2 "$gsfix" fix "$scene" --out x --restorer nonsense
+expect 2 "$gsfix" fix "$scene" --out x --condition 3d
+expect 2 "$gsfix" fix "$scene" --out x --init dense
+expect 2 "$gsfix" fix "$scene" --out x --iterations 0
+expect 2 "$gsfix" fix "$scene" --out x --iterations 10x
+expect 2 "$gsfix" fix "$scene" --out x --set nonsense=1
+expect 2 "$gsfix" fix "$scene" --out x --set rounds=1.5
+expect 2 "$gsfix" fix "$scene" --out x --factor 2 --max-size 99
+expect 2 "$gsfix" fix "$scene" "$scene" --out x
+expect 2 "$gsfix" render x.ply --out x
+expect 2 "$gsfix" metrics a b --which lpips
+expect 2 "$gsfix" path "$scene" --out x.json --frames 10 --windows 3
+expect 2 "$gsfix" info "$scene" --out x
+# the work fails: 1
+expect 1 "$gsfix" info nothing_here
+expect 1 "$gsfix" info nothing_here.ply
+expect 1 "$gsfix" fix nothing_here --out x
+expect 1 "$gsfix" fix "$scene" --out /proc/no/such/folder --views 3
+expect 1 "$gsfix" fix "$scene" --out x --views 999
+expect 1 "$gsfix" metrics nothing_here nothing_there
+printf 'no_such_photo.png\n' > names
+expect 1 "$gsfix" fix "$scene" --out x --views names
+# help and version
+for command in info fix render filter path restore metrics masks; do
+    expect 0 "$gsfix" $command --help
+    holds --json stdout
+done
+expect 0 "$gsfix" --version
+expect 0 "$gsfix" info "$scene"
+expect 0 "$gsfix" info "$scene" --json
+is_json stdout
+
+# fix, with the repair by a program: it copies the frames (in a subfolder's job) and trusts every pixel
+cat > copy.sh <<'SH'
+#!/bin/sh
+[ -s "$1/cameras.json" ] && [ -s "$1/depth/00000.npy" ] && [ -s "$1/alpha/00000.png" ] && [ -s "$1/refs/00000.png" ] || exit 3
+cp "$1"/frames/*.png "$1/out/"
+SH
+printf '#!/bin/sh\nsleep 60\n' > slow.sh
+printf '#!/bin/sh\ncp "$1"/frames/00000.png "$1/out/"\n' > short.sh
+printf '#!/bin/sh\ncp "$1"/frames/*.png "$1/out/"; cp "$1"/refs/00000.png "$1/out/00001.png"; printf x > "$1/out/00002.png"\n' > broken.sh
+chmod +x ./*.sh
+small=(--views 3 --iterations 30 --set "rounds=1,windows=1,window_frames=4" --max-size 48)
+expect 0 "$gsfix" fix "$scene" --out a "${small[@]}" --restorer "exec:$PWD/copy.sh" --json
+is_json stdout
+is_json a/metrics.json
+cmp stdout a/metrics.json || fail "--json and metrics.json differ"
+for key in psnr ssim per_view seconds total init train render restore distill iterations splats peak_rss_bytes seed threads isa \
+    switches version command; do holds "\"$key\":" a/metrics.json; done
+for file in splats.ply report.html checkpoint fixed/round1_window1_00001.png; do [ -s a/$file ] || fail "no a/$file"; done
+[ -e a/job ] && fail "the job folder was left behind"
+if grep -oE '(src|href)="?(https?:)?//[^"]*' a/report.html; then fail "report.html points elsewhere"; fi
+expect 1 "$gsfix" fix "$scene" --out b "${small[@]}" --restorer "exec:$PWD/short.sh"
+holds "out/0000.*png was not written" stderr
+expect 1 "$gsfix" fix "$scene" --out b "${small[@]}" --restorer "exec:$PWD/broken.sh"
+holds "out/0000" stderr
+expect 1 "$gsfix" fix "$scene" --out b "${small[@]}" --restorer "exec:$PWD/slow.sh" --restorer-timeout 0.3
+holds "took longer" stderr
+expect 1 "$gsfix" fix "$scene" --out b "${small[@]}" --restorer "exec:exit 5"
+holds "status 5" stderr
+# the other ways to start, the three paths, warp, plain; no repair gives no frames
+for init in embree tracks both all random; do
+    expect 0 "$gsfix" fix "$scene" --out c --views 3 --iterations 2 --max-size 48 --init $init --json
+    holds "\"init\":\"$init\"" stdout
+done
+for trajectory in reference ellipse interpolate; do
+    expect 0 "$gsfix" fix "$scene" --out d "${small[@]}" --restorer warp --trajectory $trajectory --quality exact
+done
+expect 0 "$gsfix" fix "$scene" --out e --views 3 --iterations 5 --max-size 48 --regularize off
+[ -z "$(ls e/fixed)" ] || fail "frames without a restorer"
+
+# the smaller commands
+expect 0 "$gsfix" masks "$scene" --views 3 --model a/splats.ply --out masks --max-size 48 --json
+is_json stdout
+expect 0 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 48 --masks masks --json
+holds '"psnr_seen":' stdout
+expect 1 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 40 --masks masks
+expect 0 "$gsfix" info a/splats.ply
+expect 0 "$gsfix" render a/splats.ply --scene "$scene" --max-size 48 --out frames --depth --alpha
+expect 0 "$gsfix" metrics a/test frames --which psnr,ssim_3dgs,ssim_torchmetrics,ssim_skimage --json
+holds '"ssim_skimage":' stdout
+holds '"ssim_3dgs":1[,}]' stdout # the render of the saved splats is the picture that fix left
+expect 0 "$gsfix" path "$scene" --views 3 --frames 8 --out path.json
+expect 0 "$gsfix" render a/splats.ply --path path.json --out flight --depth
+[ "$(ls flight/*.png | wc -l)" = 8 ] && [ "$(ls flight/depth/*.npy | wc -l)" = 8 ] || fail "not 8 frames and depths"
+expect 0 "$gsfix" filter "$scene" --views 3 --out filtered
+ln -s "$scene/images" filtered/images
+expect 0 "$gsfix" info filtered
+expect 0 "$gsfix" restore flight --restorer "exec:cp \"\$1\"/frames/* \"\$1\"/out; true" --out restored
+cmp flight/00003.png restored/00003.png || fail "a copied frame changed"
+expect 1 "$gsfix" restore flight --restorer warp --out restored
+holds "cameras.json" stderr
+# a restorer's job folder is all that warp needs
+expect 1 "$gsfix" fix "$scene" --out g "${small[@]}" --restorer "exec:exit 5"
+expect 0 "$gsfix" restore g/job --restorer warp --out warped --json
+is_json stdout
+[ "$(ls warped/*.png | wc -l)" = 4 ] || fail "not 4 frames"
+
+# Ctrl-C leaves a checkpoint that goes on
+"$gsfix" fix "$scene" --out h --views 3 --iterations 100000 --max-size 48 > stdout 2> stderr &
+pid=$!
+for _ in $(seq 100); do grep -q "step" stderr && break; sleep 0.1; done
+sleep 0.3
+kill -INT $pid
+status=0
+wait $pid || status=$?
+[ "$status" = 1 ] || fail "Ctrl-C: status $status"
+holds "stopped at step" stderr
+[ -s h/checkpoint ] || fail "Ctrl-C left no checkpoint"
+[ "$failures" = 0 ] || { echo "$failures failures"; exit 1; }
+echo "all commands as they should be"
