@@ -3366,10 +3366,10 @@ typedef struct gsf__eye { // a view, prepared
     double center[3]; // relative to the discs' origin
 } gsf__eye;
 
-typedef struct gsf__sight { // a disc as seen from an eye
-    double camera[3];    // camera coordinates
+typedef struct gsf__sight { // a point as seen from an eye
     double direction[3]; // unit, from the eye, in the discs' axes
-    double distance, u, v;
+    double distance;
+    double u, v;         // pixel
 } gsf__sight;
 
 typedef struct gsf__disc_box { int16_t x0, x1, y0, y1; } gsf__disc_box; // cells [x0,x1) x [y0,y1)
@@ -3390,22 +3390,24 @@ typedef struct gsf__vis_job {
     gsf__disc_box* boxes;      // (count) cells that the disc touches
     uint32_t* cell_begin;      // (cells + 1) into cell_points
     uint32_t* cell_points;
+    gsf__sight* sights;        // (count) of the points with a cell
     double* cover;             // (count) sum of the discs before the point
+    int32_t side;              // cells along each side of the image
 } gsf__vis_job;
 
-enum { GSF__VIS_CHUNK = 1024, GSF__VIS_CELLS = 64 }; // cells along each side of the image
+enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
 
 // Frustum and grazing-angle tests; nonzero where a ray is worth shooting.
 static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i, gsf__sight* out) {
     const float* sphere = job->discs->spheres + 4 * i;
     const float* normal = job->discs->normals + 3 * i;
     const double* m = eye->camera.w2c;
-    double d[3];
+    double d[3], c[3];
     for (int k = 0; k < 3; k++) d[k] = (double)sphere[k] - eye->center[k];
-    for (int r = 0; r < 3; r++) out->camera[r] = m[r] * d[0] + m[4 + r] * d[1] + m[8 + r] * d[2];
-    if (!(out->camera[2] > 0.0)) return 0;
-    out->u = eye->camera.fx * out->camera[0] / out->camera[2] + eye->camera.cx;
-    out->v = eye->camera.fy * out->camera[1] / out->camera[2] + eye->camera.cy;
+    for (int r = 0; r < 3; r++) c[r] = m[r] * d[0] + m[4 + r] * d[1] + m[8 + r] * d[2];
+    if (!(c[2] > 0.0)) return 0;
+    out->u = eye->camera.fx * c[0] / c[2] + eye->camera.cx;
+    out->v = eye->camera.fy * c[1] / c[2] + eye->camera.cy;
     if (!(out->u >= 0.0 && out->v >= 0.0 && out->u < eye->camera.width && out->v < eye->camera.height)) return 0;
     out->distance = sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
     for (int k = 0; k < 3; k++) out->direction[k] = d[k] / out->distance;
@@ -3433,14 +3435,14 @@ static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const
     return q2 < radius * radius ? 1.0 - q2 / (radius * radius) : 0.0;
 }
 
-// Cells of [0,GSF__VIS_CELLS) that hold projections of c - e .. c + e, depths z0..z1 (both > 0). `scale` and `center` in
-// cells; a hundredth of a cell more on both sides, so that rounding loses nothing.
-static void gsf__vis_span(double c, double e, double z0, double z1, double scale, double center, int16_t* begin,
-                          int16_t* end) {
+// Cells of [0,side) that hold projections of c - e .. c + e, depths z0..z1 (both > 0). `scale` and `center` in cells; a
+// hundredth of a cell more on both sides, so that rounding loses nothing.
+static void gsf__vis_span(double c, double e, double z0, double z1, double scale, double center, int32_t side,
+                          int16_t* begin, int16_t* end) {
     const double lo = scale * (c - e) / (c - e < 0.0 ? z0 : z1) + center - 0.01;
     const double hi = scale * (c + e) / (c + e < 0.0 ? z1 : z0) + center + 0.01;
-    *begin = (int16_t)(lo <= 0.0 ? 0 : lo >= (double)GSF__VIS_CELLS ? (int)GSF__VIS_CELLS : (int)lo);
-    *end = (int16_t)(hi < 0.0 ? 0 : hi >= (double)GSF__VIS_CELLS ? (int)GSF__VIS_CELLS : (int)hi + 1);
+    *begin = (int16_t)(lo <= 0.0 ? 0 : lo >= side ? side : (int32_t)lo);
+    *end = (int16_t)(hi < 0.0 ? 0 : hi >= side ? side : (int32_t)hi + 1);
 }
 
 // Cell of every point that is worth a ray, cells of every disc.
@@ -3449,18 +3451,16 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     gsf__vis_counts* counts = job->counts + chunk;
     const gsf_camera* camera = &job->eye->camera;
-    const double *m = camera->w2c, sx = (double)GSF__VIS_CELLS / (double)camera->width;
-    const double sy = (double)GSF__VIS_CELLS / (double)camera->height;
+    const double *m = camera->w2c, sx = (double)job->side / (double)camera->width;
+    const double sy = (double)job->side / (double)camera->height;
     const size_t first = chunk * GSF__VIS_CHUNK;
     for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
-        gsf__sight sight;
         job->cells[i] = -1;
         job->cover[i] = 0.0;
         if (!job->seen[i]) {
-            if (gsf__vis_sight(job, job->eye, i, &sight)) {
-                const int32_t x = (int32_t)(sight.u * sx), y = (int32_t)(sight.v * sy);
-                job->cells[i] = (y < GSF__VIS_CELLS ? y : GSF__VIS_CELLS - 1) * GSF__VIS_CELLS +
-                                (x < GSF__VIS_CELLS ? x : GSF__VIS_CELLS - 1);
+            if (gsf__vis_sight(job, job->eye, i, job->sights + i)) {
+                const int32_t x = (int32_t)(job->sights[i].u * sx), y = (int32_t)(job->sights[i].v * sy);
+                job->cells[i] = (y < job->side ? y : job->side - 1) * job->side + (x < job->side ? x : job->side - 1);
                 counts->rays++;
             } else {
                 counts->culled++;
@@ -3478,43 +3478,53 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
         box->x0 = box->x1 = box->y0 = box->y1 = 0;
         if (c[2] + e[2] <= 0.0) continue;
         if (c[2] - e[2] <= 1e-3 * (double)sphere[3]) { // reaches behind the eye: anywhere
-            box->x1 = box->y1 = GSF__VIS_CELLS;
+            box->x1 = box->y1 = (int16_t)job->side;
             continue;
         }
-        gsf__vis_span(c[0], e[0], c[2] - e[2], c[2] + e[2], camera->fx * sx, camera->cx * sx, &box->x0, &box->x1);
-        gsf__vis_span(c[1], e[1], c[2] - e[2], c[2] + e[2], camera->fy * sy, camera->cy * sy, &box->y0, &box->y1);
+        gsf__vis_span(c[0], e[0], c[2] - e[2], c[2] + e[2], camera->fx * sx, camera->cx * sx, job->side,
+                      &box->x0, &box->x1);
+        gsf__vis_span(c[1], e[1], c[2] - e[2], c[2] + e[2], camera->fy * sy, camera->cy * sy, job->side,
+                      &box->y0, &box->y1);
     }
 }
 
-static void gsf__vis_row_of_cells(void* arg, size_t row, int worker) {
+// A band of rows of cells: its points meet the discs in the discs' order, whatever the number of workers.
+static void gsf__vis_band_of_cells(void* arg, size_t band, int worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
-    const uint32_t* begin = job->cell_begin + row * GSF__VIS_CELLS;
-    if (begin[0] == begin[GSF__VIS_CELLS]) return;
+    const int32_t y0 = (int32_t)band * job->side / GSF__VIS_BANDS, y1 = ((int32_t)band + 1) * job->side / GSF__VIS_BANDS;
+    const uint32_t first = job->cell_begin[y0 * job->side], last = job->cell_begin[y1 * job->side];
+    if (first == last) return;
     for (size_t j = 0; j < job->discs->count; j++) {
         const gsf__disc_box* box = job->boxes + j;
-        if ((int16_t)row < box->y0 || (int16_t)row >= box->y1 || box->x0 >= box->x1) continue;
-        for (uint32_t k = begin[box->x0]; k < begin[box->x1]; k++) { // the cells of a row lie one after the other
-            const uint32_t i = job->cell_points[k];
-            gsf__sight sight;
-            if (i == j || job->cover[i] >= (double)job->desc->coverage) continue;
-            if (gsf__vis_sight(job, job->eye, i, &sight)) job->cover[i] += gsf__vis_cover(job, job->eye, &sight, i, j);
+        if (box->x0 >= box->x1) continue;
+        for (int32_t y = box->y0 > y0 ? box->y0 : y0; y < box->y1 && y < y1; y++) {
+            const uint32_t* row = job->cell_begin + y * job->side; // the cells of a row lie one after the other
+            for (uint32_t k = row[box->x0]; k < row[box->x1]; k++) {
+                const uint32_t i = job->cell_points[k];
+                if (i != j && job->cover[i] < (double)job->desc->coverage)
+                    job->cover[i] += gsf__vis_cover(job, job->eye, job->sights + i, i, j);
+            }
         }
     }
-    for (uint32_t k = begin[0]; k < begin[GSF__VIS_CELLS]; k++)
+    for (uint32_t k = first; k < last; k++)
         job->seen[job->cell_points[k]] = job->cover[job->cell_points[k]] < (double)job->desc->coverage;
 }
 
 // Ray tests without Embree: per eye, every disc meets the points whose cells its projection touches.
 static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
-    const size_t n = job->discs->count ? job->discs->count : 1, cell_count = (size_t)GSF__VIS_CELLS * GSF__VIS_CELLS;
+    const size_t n = job->discs->count ? job->discs->count : 1, most = GSF__VIS_MAX_SIDE;
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    job->side = GSF__VIS_BANDS;
+    while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points in a cell
+    const size_t cell_count = (size_t)job->side * (size_t)job->side;
+    job->sights = (gsf__sight*)gsf_alloc(ctx, n, sizeof(gsf__sight));
     job->cells = (int32_t*)gsf_alloc(ctx, n, sizeof(int32_t));
     job->boxes = (gsf__disc_box*)gsf_alloc(ctx, n, sizeof(gsf__disc_box));
     job->cover = (double*)gsf_alloc(ctx, n, sizeof(double));
     job->cell_points = (uint32_t*)gsf_alloc(ctx, n, sizeof(uint32_t));
     job->cell_begin = (uint32_t*)gsf_alloc(ctx, cell_count + 2, sizeof(uint32_t));
-    if (job->cells && job->boxes && job->cover && job->cell_points && job->cell_begin) result = GSF_OK;
+    if (job->sights && job->cells && job->boxes && job->cover && job->cell_points && job->cell_begin) result = GSF_OK;
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         job->eye = job->eyes + e;
         gsf__parallel_for(ctx, (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, gsf__vis_project_chunk, job);
@@ -3525,9 +3535,10 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
         for (size_t c = 2; c < cell_count + 2; c++) begin[c] += begin[c - 1];
         for (size_t i = 0; i < job->discs->count; i++)
             if (job->cells[i] >= 0) job->cell_points[begin[job->cells[i] + 1]++] = (uint32_t)i;
-        gsf__parallel_for(ctx, GSF__VIS_CELLS, gsf__vis_row_of_cells, job);
+        gsf__parallel_for(ctx, GSF__VIS_BANDS, gsf__vis_band_of_cells, job);
         result = gsf__check_cancel(ctx);
     }
+    gsf_free(ctx, job->sights);
     gsf_free(ctx, job->cells);
     gsf_free(ctx, job->boxes);
     gsf_free(ctx, job->cover);

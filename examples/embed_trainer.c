@@ -1,12 +1,13 @@
-// embed_trainer.c - cc -O2 -std=c11 -fopenmp -I. examples/embed_trainer.c -o embed_trainer -lm && ./embed_trainer
+// embed_trainer.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/embed_trainer.c -o embed_trainer -lm
 // The splat trainer inside a host's frame loop: start, some steps per frame, a render of the half-trained scene on
 // every frame, finish.   embed_trainer [SCENE [OUT.ply [FRAMES]]]
 // SCENE is a COLMAP folder; without one the program trains on pictures of random splats. Ctrl-C stops early and saves.
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 
+#include <math.h>
 #include <signal.h>
 #include <stdio.h>
+#include <stdlib.h>
 
 enum { STEPS_PER_FRAME = 10, PREVIEW_WIDTH = 160, PREVIEW_HEIGHT = 120 };
 

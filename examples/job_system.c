@@ -1,15 +1,12 @@
-// job_system.c - cc -O2 -std=c11 -I. examples/job_system.c -o job_system -lpthread -lm && ./job_system
+// job_system.c - cc -O2 -std=c11 -DGSFIXER_IMPLEMENTATION -I. examples/job_system.c -o job_system -lpthread -lm
 // A host's own job system behind the parallel hook: here a small pool of POSIX threads. Renders random splats with one
 // worker and with four, and compares: the pictures are the same to the last bit.
 #define _POSIX_C_SOURCE 200809L
+#include "gsfixer_splat.h"
 #include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#ifndef JOB_SYSTEM_ONLY // a file that includes this one for the pool brings the implementation itself
-#define GSFIXER_IMPLEMENTATION
-#endif
-#include "gsfixer_splat.h"
 
 enum { JOB_WORKERS_MAX = 64 };
 
@@ -100,7 +97,7 @@ static int job_start(job_system* jobs, int worker_count) { // 0 on failure
     return 1;
 }
 
-#ifndef JOB_SYSTEM_ONLY
+#ifndef JOB_SYSTEM_ONLY // a file may include this one for the pool alone
 enum { WIDTH = 320, HEIGHT = 240, SPLATS = 3000 };
 
 static gsf_result render_random_splats(gsf_context* ctx, float* pixels) {

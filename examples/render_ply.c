@@ -1,11 +1,12 @@
-// render_ply.c - cc -O2 -std=c11 -fopenmp -I. examples/render_ply.c -o render_ply -lm
+// render_ply.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/render_ply.c -o render_ply -lm
 // Renders a 3DGS PLY to PNG files:   render_ply SPLATS.ply OUT_PREFIX [CAMERAS.json]
 // Without a camera list (the format of `gsfix path`) it flies one orbit of 8 pictures around the middle of the splats.
 // Writes OUT_PREFIX000.png, OUT_PREFIX001.png, ...
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 
+#include <math.h>
 #include <stdio.h>
+#include <stdlib.h>
 
 enum { ORBIT_COUNT = 8, ORBIT_WIDTH = 640, ORBIT_HEIGHT = 480 };
 

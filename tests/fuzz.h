@@ -1,11 +1,16 @@
 // fuzz.h - what the fuzz targets share: a context whose allocator traps when a reader asks for more memory than its input
 // justifies (64 times its size and 1 MiB, all live blocks together), and checks of what a reader hands out.
-// By hand: clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -I. -Itests tests/fuzz_X.c -lm
+// By hand: clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -DGSFIXER_IMPLEMENTATION -I. -Itests
+//          tests/fuzz_X.c -lm
 //          ./a.out -max_len=8192 tests/corpus/X
 #ifndef FUZZ_H
 #define FUZZ_H
 
-#include "gsfixer_splat.h" // with its implementation: GSFIXER_IMPLEMENTATION is defined by the including target
+#include "gsfixer_splat.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
 
 #define FUZZ_CHECK(condition) ((condition) ? (void)0 : abort())
 

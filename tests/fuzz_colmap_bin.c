@@ -1,6 +1,5 @@
 // fuzz_colmap_bin.c - the three binary files of a COLMAP model. Build line: fuzz.h. Input: u32 size of cameras.bin, u32
 // size of images.bin (little-endian, cut to what is there), then the three files one behind the other.
-#define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
@@ -11,7 +10,11 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     size_t at = 8;
     memset(files, 0, sizeof files);
     for (int i = 0; i < 3; i++) {
-        const size_t wanted = i < 2 ? (size_t)gsf__load_le(data + 4 * i, 4) : SIZE_MAX;
+        size_t wanted = SIZE_MAX;
+        if (i < 2) {
+            const uint8_t* p = data + 4 * i;
+            wanted = (size_t)p[0] | (size_t)p[1] << 8 | (size_t)p[2] << 16 | (size_t)p[3] << 24;
+        }
         files[i].data = data + at;
         files[i].size = wanted < size - at ? wanted : size - at;
         at += files[i].size;

@@ -1,5 +1,4 @@
 // fuzz_colmap_txt.c - the three text files of a COLMAP model, separated by form feeds. Build line: fuzz.h.
-#define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {

@@ -1,5 +1,4 @@
 // fuzz_ply.c - splat files: what is accepted is finite and survives being written and read again. Build line: fuzz.h.
-#define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {

@@ -1,5 +1,4 @@
 // fuzz_transforms.c - transforms.json. Build line: fuzz.h.
-#define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {

@@ -292,14 +292,14 @@ static void test_invariance(void) {
         desc.kind = (gsf_traj_kind)(trial % 3);
         desc.round = trial % 4;
         if (trial % 2) { desc.points = s.points; desc.point_count = POINTS; }
-        check_following(&s, &desc, 1e-3, none, 1e-9);
-        check_following(&s, &desc, 1e3, none, 1e-9);
-        check_following(&s, &desc, 1.0, near_by, 1e-9);
-        check_following(&s, &desc, 1.0, far_off, 1e-5); // coordinates are rounded to 1e-10 there
-        check_following(&s, &desc, 1e3, far_off, 1e-8);
+        check_following(&s, &desc, 1e-3, none, 1e-11);
+        check_following(&s, &desc, 1e3, none, 1e-11);
+        check_following(&s, &desc, 1.0, near_by, 1e-11);
+        check_following(&s, &desc, 1.0, far_off, 1e-7); // coordinates are rounded to 1e-10 there
+        check_following(&s, &desc, 1e3, far_off, 1e-10);
         desc.official = 1; // the released one follows scale about the origin only
-        check_following(&s, &desc, 1e-3, none, 1e-9);
-        check_following(&s, &desc, 1e3, none, 1e-9);
+        check_following(&s, &desc, 1e-3, none, 1e-11);
+        check_following(&s, &desc, 1e3, none, 1e-11);
     }
     for (size_t count = 3; count <= 12; count++) { // an exact ring: every axis and every nearest view is a tie
         scene s;
@@ -313,8 +313,8 @@ static void test_invariance(void) {
         }
         gsf_traj_path_desc desc;
         memset(&desc, 0, sizeof desc);
-        check_following(&s, &desc, 1e-3, none, 1e-9);
-        check_following(&s, &desc, 1e3, near_by, 1e-9);
+        check_following(&s, &desc, 1e-3, none, 1e-11);
+        check_following(&s, &desc, 1e3, near_by, 1e-11);
     }
 }
 
@@ -412,7 +412,24 @@ static void test_degenerate_primitives(void) {
     CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, o, x, o, pose), GSF_ERROR_DEGENERATE);
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, nearly, y, pose)); // nearly along up is still a rotation
     CHECK(rigidity(pose) < 1e-14);
+    for (int trial = 0; trial < 200; trial++) {
+        double forward[3], down[3];
+        const double apart = pow(10.0, uniform(-8.0, -1.0));
+        for (int i = 0; i < 3; i++) {
+            forward[i] = uniform(-1.0, 1.0);
+            down[i] = forward[i] * (trial % 2 ? 3.0 : -0.3) + apart * uniform(-1.0, 1.0);
+        }
+        if (gsf_traj_view_pose(&ctx, forward, down, o, pose) == GSF_OK) CHECK(rigidity(pose) < 1e-14);
+        else CHECK(apart < 1e-6);
+    }
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, x, y, a));
+    for (int i = 0; i < 3; i++) { // distances 0.1 + 0.2, 0.3, 0.3: equal but for rounding, so the first
+        memcpy(out + 16 * i, a, sizeof a);
+        out[16 * i + 12] = i ? 0.3 : 0.1 + 0.2;
+    }
+    int32_t index;
+    CHECK_OK(&ctx, gsf_traj_nearest_view(&ctx, a, out, 3, 0.5, &index, NULL));
+    CHECK(index == 0);
     CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 1, focus), GSF_ERROR_DEGENERATE);
     CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 0, focus), GSF_ERROR_DEGENERATE);
     memcpy(out, a, sizeof a);
