@@ -1015,7 +1015,7 @@ static void check_split_list(const gsf_json* json, const char* key, const gsf_sc
 }
 
 static void test_fox_photos(void) {
-    char path[1024];
+    char path[1100];
     const char* folder = test_fox();
     FILE* file = NULL;
     if (folder) {
