@@ -4,10 +4,14 @@
 //
 // Comparisons bind where the reference's yes/no decisions (1/255, 0.99, 1e-4, depth order) are clear of their
 // thresholds: other pixels get no incoming gradient, are not compared, and are counted.
+// Loss, Adam, learning rates and densification are held against their golden data, too (train_golden.h, which needs the
+// implementation in this file).
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 #include "test.h"
 #include "reference_splat.h"
 #include "splat_golden.h"
+#include "train_golden.h"
 
 // ---- contexts ------------------------------------------------------------------
 
@@ -656,5 +660,6 @@ int main(void) {
     CHECK(t.blends > 2 * t.pixels); // the scenes show something
     printf("%zu CPU levels, %zu pixels, %zu with an unclear decision, %.1f splats blended in each\n", level_count,
            t.pixels, t.skipped, (double)t.blends / (double)t.pixels);
+    train_golden_checks();
     return test_report();
 }
