@@ -210,7 +210,7 @@ static gsf_result put_samples(page* p) {
     put(p, "<section><h2>Repaired frames</h2><p>Between training steps the camera flies along a path, the restorer repairs what it "
            "sees, and training goes on with the repaired frames beside the photos: %d frames in %zu rounds", restored, h->round_count);
     if (skipped) put(p, ", %d windows skipped because their render already agreed with the photos", skipped);
-    put_raw(p, ". White confidence means the pixel counts in full, black not at all.</p>\n<div class=cards>\n");
+    put_raw(p, ". White confidence means the pixel counts in full, black not at all.</p>\n<div class=\"cards broad\">\n");
     const size_t begin = p->html.size;
     gsf_result result = put_sample(p, &h->samples[0]);
     const size_t each = p->html.size - begin;
@@ -556,8 +556,7 @@ static const char* const style[] = { // in pieces, since C only promises strings
     ".tile .up{color:var(--good)}.tile .down{color:var(--bad)}",
     ".cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,320px),1fr));gap:16px;margin-top:14px}",
     ".card{margin:0;background:var(--card);border:1px solid var(--line);border-radius:10px;overflow:hidden}",
-    ".triple{grid-column:span 1}.triple>div{display:grid;grid-template-columns:repeat(3,1fr);gap:2px}",
-    "@media(min-width:760px){.triple.broad{grid-column:span 2}}",
+    ".cards.broad{grid-template-columns:repeat(auto-fill,minmax(min(100%,480px),1fr))}.triple>div{display:grid;grid-template-columns:repeat(3,1fr);gap:2px}",
     "figcaption{display:flex;flex-wrap:wrap;gap:2px 14px;padding:8px 12px;font-size:14px;color:var(--soft);font-variant-numeric:tabular-nums}",
     "figcaption strong{color:var(--ink);flex-basis:100%;overflow-wrap:anywhere}figcaption b{color:var(--ink)}",
     ".cmp{position:relative;--x:50%;width:100%;background:#000;overflow:hidden;touch-action:pan-y}",
@@ -598,7 +597,7 @@ static const char* const style[] = { // in pieces, since C only promises strings
     ".choice,.zoom,.cmp .bar,.cmp input{display:none}.legend{display:flex}.cards{grid-template-columns:1fr}.card,.tile{break-inside:avoid}",
     ".cmp{aspect-ratio:auto!important;display:grid;grid-template-columns:repeat(5,1fr);gap:2px;background:none}",
     ".pane,.pane.left,.pane.right{position:relative;display:block;clip-path:none;order:0}.pane span,.pane.left span,.pane.right span{left:6px;right:auto}",
-    "section{margin-top:22px}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}",
+    "section{margin-top:22px}h2,h2+p{break-after:avoid}.cards.broad{grid-template-columns:1fr 1fr}svg,.stage3{break-inside:avoid}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}",
     NULL};
 
 static const char* const script[] = { // in pieces, since C only promises strings of 4095
