@@ -44,7 +44,8 @@ static gsf_camera orbit_camera(const double center[3], double radius, int index)
     const double turn = 6.283185307179586 * index / ORBIT_COUNT, tilt = 0.35;
     const double forward[3] = {cos(tilt) * sin(turn), sin(tilt), cos(tilt) * cos(turn)};
     const double right[3] = {cos(turn), 0.0, -sin(turn)};
-    const double down[3] = {forward[1] * right[2] - forward[2] * right[1], forward[2] * right[0] - forward[0] * right[2],
+    const double down[3] = {forward[1] * right[2] - forward[2] * right[1],
+                            forward[2] * right[0] - forward[0] * right[2],
                             forward[0] * right[1] - forward[1] * right[0]};
     double c2w[16] = {0};
     for (int a = 0; a < 3; a++) {
@@ -54,7 +55,12 @@ static gsf_camera orbit_camera(const double center[3], double radius, int index)
         c2w[12 + a] = center[a] - 4.0 * radius * forward[a];
     }
     c2w[15] = 1.0;
-    gsf_camera camera = {{0}, ORBIT_HEIGHT, ORBIT_HEIGHT, ORBIT_WIDTH / 2.0, ORBIT_HEIGHT / 2.0, ORBIT_WIDTH, ORBIT_HEIGHT};
+    gsf_camera camera = {0};
+    camera.fx = camera.fy = ORBIT_HEIGHT;
+    camera.cx = ORBIT_WIDTH / 2.0;
+    camera.cy = ORBIT_HEIGHT / 2.0;
+    camera.width = ORBIT_WIDTH;
+    camera.height = ORBIT_HEIGHT;
     gsf_camera_set_c2w(&camera, c2w);
     return camera;
 }

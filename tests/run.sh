@@ -5,7 +5,7 @@
 #   build/tsan/   clang, ThreadSanitizer: the threaded tests, on a pthread job system
 #   build/all/    one ctest run over the three; its log is build/all/Testing/Temporary/LastTest.log
 # What is missing is installed with apt-get (as root or by sudo); with everything there the network is not touched.
-# Photos beside the checkout (../shared/data/fox, or GSF_FOX=folder) are used where present, else those tests are skipped.
+# Photos beside the checkout (../shared/data/fox, or GSF_FOX=folder) are used where present, else their tests are skipped.
 # GSF_BUILD=folder builds elsewhere than in build/.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -14,25 +14,26 @@ build=${GSF_BUILD:-$root/build}
 jobs=$(nproc 2> /dev/null || echo 2)
 started=$SECONDS
 
-packages=(cmake make gcc g++ libc6-dev pkg-config clang-14 libclang-rt-14-dev libomp-14-dev libembree-dev libstb-dev libglm-dev
-    libopenimageio-dev)
+packages=(cmake make gcc g++ libc6-dev pkg-config clang-14 libclang-rt-14-dev libomp-14-dev libembree-dev libstb-dev
+    libglm-dev libopenimageio-dev)
 say() { printf '== %s\n' "$*"; }
 
 install_missing() {
     command -v dpkg-query > /dev/null || { say "no dpkg here: what is missing has to be installed by hand"; return; }
-    local missing=() package
+    local missing=() package state
     for package in "${packages[@]}"; do
-        [ "$(dpkg-query -W -f '${db:Status-Status}' "$package" 2> /dev/null || true)" = installed ] || missing+=("$package")
+        state=$(dpkg-query -W -f '${db:Status-Status}' "$package" 2> /dev/null || true)
+        [ "$state" = installed ] || missing+=("$package")
     done
     [ ${#missing[@]} -gt 0 ] || return 0
     say "installing ${missing[*]}"
-    local as_root=()
+    local as_root=() apt=(apt-get -q -o DPkg::Lock::Timeout=300)
     if [ "$(id -u)" != 0 ]; then
         command -v sudo > /dev/null || { echo "$0: not root and no sudo; install by hand: ${missing[*]}" >&2; exit 1; }
         as_root=(sudo)
     fi
-    "${as_root[@]}" apt-get -o DPkg::Lock::Timeout=300 update -q
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 install -q -y --no-install-recommends "${missing[@]}"
+    "${as_root[@]}" "${apt[@]}" update
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${apt[@]}" install -y --no-install-recommends "${missing[@]}"
 }
 
 mkdir -p "$build"
@@ -64,7 +65,7 @@ build_tree() { # NAME SOURCE-RELATIVE-DIR CMAKE-ARGUMENT...
 
 install_missing
 
-# The compiler goes by environment: given as an option, one that differs from the tree's makes CMake forget all the other
+# The compiler goes by environment: given as an option, one that differs from the tree's makes CMake forget all other
 # options. If build/ was made with another compiler, it is made anew.
 if ! grep -qE '^CMAKE_C_COMPILER:[A-Z]+=.*/(gcc|cc)$' "$build/CMakeCache.txt" 2> /dev/null; then
     rm -rf "$build/CMakeCache.txt" "$build/CMakeFiles"

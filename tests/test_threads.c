@@ -199,7 +199,8 @@ static void run_render(gsf_context* ctx, run_output* run) {
     grads.means2d = grads.sh + 12 * SPLATS;
     grads.means2d_abs = grads.means2d + 2 * SPLATS;
     grads.background = grads.means2d_abs + 2 * SPLATS;
-    CHECK_OK(ctx, gsf_splat_render_backward(ctx, rasterizer, &splats, &camera, NULL, d_color, d_depth, d_alpha, &grads));
+    CHECK_OK(ctx,
+             gsf_splat_render_backward(ctx, rasterizer, &splats, &camera, NULL, d_color, d_depth, d_alpha, &grads));
     add(out, gradients, sizeof gradients);
     double sum = 0.0;
     for (size_t i = 0; i < sizeof gradients / sizeof gradients[0]; i++) sum += fabs((double)gradients[i]);
@@ -215,17 +216,14 @@ static void run_render(gsf_context* ctx, run_output* run) {
     free(d_alpha);
 }
 
-// Trains towards pictures of other splats, through densification, pruning and an opacity reset, with restored views.
-static void run_training(gsf_context* ctx, run_output* run) {
-    gsf_splats truth, start;
+// Pictures of splats that training does not know. The pixels are the caller's to free.
+static float* make_views(gsf_context* ctx, gsf_train_view views[VIEWS]) {
+    gsf_splats truth;
     make_splats(ctx, 8, &truth);
-    make_splats(ctx, 9, &start);
-    gsf_train_view views[VIEWS];
-    memset(views, 0, sizeof views);
+    memset(views, 0, VIEWS * sizeof *views);
     float* pixels = make_floats(VIEWS * WIDTH * HEIGHT * 3, 0);
-    float* weight = make_floats(WIDTH * HEIGHT, 1);
     gsf_rasterizer* rasterizer = NULL;
-    if (!CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &rasterizer))) return;
+    CHECK_OK(ctx, gsf_splat_make_rasterizer(ctx, &rasterizer));
     for (int v = 0; v < VIEWS; v++) {
         views[v].camera = make_camera(v);
         views[v].image = gsf_wrap_image(pixels + (size_t)v * WIDTH * HEIGHT * 3, GSF_F32, WIDTH, HEIGHT, 3);
@@ -235,7 +233,17 @@ static void run_training(gsf_context* ctx, run_output* run) {
         CHECK_OK(ctx, gsf_splat_render(ctx, rasterizer, &truth, &views[v].camera, NULL, &image));
     }
     gsf_splat_destroy_rasterizer(ctx, rasterizer);
+    gsf_splat_destroy(ctx, &truth);
+    return pixels;
+}
 
+// Through densification, pruning and an opacity reset, with a restored view.
+static void run_training(gsf_context* ctx, run_output* run) {
+    gsf_splats start;
+    make_splats(ctx, 9, &start);
+    gsf_train_view views[VIEWS];
+    float* pixels = make_views(ctx, views);
+    float* weight = make_floats(WIDTH * HEIGHT, 1);
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 48;
@@ -276,10 +284,48 @@ static void run_training(gsf_context* ctx, run_output* run) {
         gsf_destroy_text(ctx, &chunks);
         gsf_splat_destroy_trainer(ctx, trainer);
     }
-    gsf_splat_destroy(ctx, &truth);
     gsf_splat_destroy(ctx, &start);
     free(pixels);
     free(weight);
+}
+
+// The whole loop with the warp restorer: one round, after the first half.
+static void run_repair(gsf_context* ctx, run_output* run) {
+    gsf_splats start;
+    make_splats(ctx, 9, &start);
+    gsf_train_view views[VIEWS];
+    float* pixels = make_views(ctx, views);
+    gsf_restorer warp;
+    gsf_fixer* fixer = NULL;
+    gsf_fix_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.train.iterations = 20;
+    desc.train.seed = 3;
+    desc.rounds = 1;
+    desc.first_round = 10;
+    desc.windows = 2;
+    desc.window_frames = 5;
+    stage_output* out = begin_stage(run, "repair");
+    CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
+    if (CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, views, VIEWS, &start, &warp, &fixer))) {
+        gsf_fix_stats stats;
+        memset(&stats, 0, sizeof stats);
+        int restored = 0;
+        while (stats.stage != GSF_FIX_DONE) {
+            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) break;
+            for (int32_t f = 0; stats.stage == GSF_FIX_RESTORE && stats.restored && f < stats.frame_count; f++) {
+                const gsf_image* frame = &stats.restored[f];
+                add(out, frame->data, (size_t)(frame->stride_y * frame->height));
+                restored++;
+            }
+        }
+        CHECK(restored > 0);
+        add_splats(out, gsf_splat_trainer_splats(gsf_splat_fixer_trainer(fixer)));
+        gsf_splat_destroy_fixer(ctx, fixer);
+    }
+    gsf_splat_destroy_warp(ctx, &warp);
+    gsf_splat_destroy(ctx, &start);
+    free(pixels);
 }
 
 static void run_all(int workers, run_output* run) {
@@ -296,6 +342,7 @@ static void run_all(int workers, run_output* run) {
         run_points(&ctx, run);
         run_render(&ctx, run);
         run_training(&ctx, run);
+        run_repair(&ctx, run);
     }
     job_stop(&jobs);
 }

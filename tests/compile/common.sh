@@ -1,5 +1,5 @@
 # Sourced by headers.sh and link.sh with COMPILER (gcc, clang) and STANDARD (c11, c++17) as $1 and $2.
-# Sets: root, headers (names without .h), cc, ext, flags (those of every header), work (an empty folder, removed at the end).
+# Sets: root, headers (names without .h), cc, ext, flags (those of every header), work (an empty folder, removed at exit).
 set -u
 shopt -s lastpipe # so that a function at the end of a pipe can count
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)

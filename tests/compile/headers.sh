@@ -8,7 +8,8 @@ unit() { # NAME FLAG... ; the unit's text on stdin
     shift
     { cat; echo "int test_unit_$count;"; } > "$work/unit.$ext"
     count=$((count + 1))
-    "$cc" "${flags[@]}" "$@" -fsyntax-only "$work/unit.$ext" > "$work/log" 2>&1 && [ ! -s "$work/log" ] || failed "$name" "$work/log"
+    "$cc" "${flags[@]}" "$@" -fsyntax-only "$work/unit.$ext" > "$work/log" 2>&1 && [ ! -s "$work/log" ] ||
+        failed "$name" "$work/log"
 }
 
 permutations() { # PREFIX ITEM...: one line per order of the items
@@ -42,7 +43,9 @@ whole | unit "GSF_NO_SIMD" -DGSF_NO_SIMD
 whole | unit "GSF_NO_STB" -DGSF_NO_STB
 whole | unit "GSFIXER_STATIC" -DGSFIXER_STATIC
 if [ "$compiler" = gcc ] || have_include omp.h; then whole | unit "OpenMP" -fopenmp; fi
-if have_include embree4/rtcore.h || have_include embree3/rtcore.h; then whole | unit "GSF_USE_EMBREE" -DGSF_USE_EMBREE; fi
+if have_include embree4/rtcore.h || have_include embree3/rtcore.h; then
+    whole | unit "GSF_USE_EMBREE" -DGSF_USE_EMBREE
+fi
 if [ "$ext" = cpp ]; then
     if have_include glm/glm.hpp; then
         whole | unit "GSF_USE_GLM" -DGSF_USE_GLM
