@@ -3823,11 +3823,13 @@ typedef struct gsf__worker_scratch { // one per worker
 struct gsf_rasterizer {
     size_t splat_capacity;
     gsf__record* records;      // per splat
+    gsf__record* sorted;       // those of the visible splats, in depth order
     int32_t* radii;            // per splat
     uint32_t* visible;         // splat indices in depth order
     uint32_t* visible_spare;
     uint32_t* keys;
     uint32_t* keys_spare;
+    uint32_t* rank;            // per splat that is drawn: its place in `visible`
     size_t* slot_begin;        // per visible rank, + 1
     size_t visible_count, pair_count;
 
@@ -3875,7 +3877,7 @@ static void gsf__free_workers(gsf_context* ctx, gsf_rasterizer* r) {
 
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
-    void* const owned[] = {r->records, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->slot_begin,
+    void* const owned[] = {r->records, r->sorted, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->rank, r->slot_begin,
                            r->tile_begin, r->tile_counts, r->pair_rank, r->pair_slot, r->slots, r->final_T,
                            r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
@@ -4264,6 +4266,7 @@ static void gsf__sort_visible(gsf_rasterizer* r) {
         uint32_t* swap = r->keys; r->keys = r->keys_spare; r->keys_spare = swap;
         swap = r->visible; r->visible = r->visible_spare; r->visible_spare = swap;
     }
+    for (size_t i = 0; i < n; i++) r->rank[r->visible[i]] = (uint32_t)i;
 }
 
 typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span; // end exclusive
@@ -4327,7 +4330,8 @@ static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
     const size_t begin = chunk * job->chunk_size;
     const size_t end = begin + job->chunk_size < r->visible_count ? begin + job->chunk_size : r->visible_count;
     for (size_t rank = begin; rank < end; rank++) {
-        const gsf__record* rec = r->records + r->visible[rank];
+        if (!job->fill) r->sorted[rank] = r->records[r->visible[rank]];
+        const gsf__record* rec = r->sorted + rank;
         const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
         size_t pairs = 0;
         for (int32_t ty = rows.x0; ty < rows.x1; ty++) {
@@ -4403,9 +4407,8 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
 /* A tile's pixels are kept as 32 steps of 8: arrays [step][lane]. T > 0: pixel still open; T < 0: finished, |T| is its
    final transmittance. `live` has a bit per step that has an open pixel. */
 typedef struct gsf__tile {
-    const gsf__record* records;
-    const uint32_t* visible;
-    const uint32_t* ranks;   // the tile's list, front to back
+    const gsf__record* records; // of the visible splats in depth order
+    const uint32_t* ranks;      // the tile's list, front to back
     size_t count;
     float x0, y0;            // of the tile's first pixel
 } gsf__tile;
@@ -4513,7 +4516,7 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     uint32_t live = gsf__live_steps(state->T);
     float center[GSF__TILE], exponent[GSF__TILE];
     for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
+        const gsf__record* rec = tile->records + tile->ranks[i];
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
             int open = 0;
@@ -4584,8 +4587,8 @@ GSF__TARGET_AVX2 static inline void gsf__blend_avx2_body(const gsf__tile* tile, 
     uint32_t live = gsf__live_steps(state->T);
     float center[GSF__TILE], exponent[GSF__TILE];
     for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
-        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->visible[tile->ranks[i + 4]]), _MM_HINT_T0);
+        const gsf__record* rec = tile->records + tile->ranks[i];
+        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->ranks[i + 4]), _MM_HINT_T0);
         uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live;
         if (!m) continue;
         const __m256 ee = _mm256_set1_ps(rec->ee);
@@ -4630,7 +4633,7 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, si
     float center[GSF__TILE], exponent[GSF__TILE];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
+        const gsf__record* rec = tile->records + tile->ranks[i];
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
             int open = 0, any = 0;
@@ -4662,7 +4665,7 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
                                 int flags) {
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->visible[tile->ranks[entry]];
+        const gsf__record* rec = tile->records + tile->ranks[entry];
         const float u = rec->u - tile->x0, v = rec->v - tile->y0;
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         float sums[GSF__SLOT_FLOATS];
@@ -4713,8 +4716,8 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_ti
     float center[GSF__TILE], exponent[GSF__TILE];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->visible[tile->ranks[i]];
-        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->visible[tile->ranks[i + 4]]), _MM_HINT_T0);
+        const gsf__record* rec = tile->records + tile->ranks[i];
+        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->ranks[i + 4]), _MM_HINT_T0);
         uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live;
         const __m256 ee = _mm256_set1_ps(rec->ee);
         for (; m; m &= m - 1) {
@@ -4758,7 +4761,7 @@ GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile
     const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->visible[tile->ranks[entry]];
+        const gsf__record* rec = tile->records + tile->ranks[entry];
         const float u = rec->u - tile->x0, v = rec->v - tile->y0;
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         __m256 sp = _mm256_setzero_ps(), se = sp, see = sp, sy = sp, sey = sp, syy = sp, sr = sp, sg = sp, sb = sp, sz = sp;
@@ -4962,13 +4965,16 @@ typedef struct gsf__gather_job {
     const gsf_splat_grads* grads;
 } gsf__gather_job;
 
+// In index order, so that parameters and gradients stream through the cache.
 static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__gather_job* job = (const gsf__gather_job*)arg;
     const gsf_rasterizer* r = job->r;
     const size_t begin = chunk * GSF__PROJECT_CHUNK;
-    const size_t end = begin + GSF__PROJECT_CHUNK < r->visible_count ? begin + GSF__PROJECT_CHUNK : r->visible_count;
-    for (size_t rank = begin; rank < end; rank++) {
+    const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
+    for (size_t i = begin; i < end; i++) {
+        if (r->records[i].radius <= 0) continue;
+        const size_t rank = r->rank[i];
         double sums[GSF__SLOT_FLOATS];
         memset(sums, 0, sizeof sums);
         int touched = 0;
@@ -4979,7 +4985,6 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
                 touched |= slot[k] != 0.0f;
             }
         }
-        const size_t i = r->visible[rank];
         if (touched) gsf__project_backward(job->view, job->splats, i, r->records + i, sums, job->grads);
     }
 }
@@ -5028,11 +5033,13 @@ static gsf_result gsf__reserve_frame(gsf_context* ctx, gsf_rasterizer* r) {
         const size_t n = r->splat_count + r->splat_count / 4 + 64;
         r->splat_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->records, n, sizeof(gsf__record)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->sorted, n, sizeof(gsf__record)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->radii, n, sizeof(int32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->visible, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->visible_spare, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->keys, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->keys_spare, n, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->rank, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->slot_begin, n + 1, sizeof(size_t)));
         r->splat_capacity = n;
     }
@@ -5050,8 +5057,7 @@ typedef struct gsf__raster_job {
 
 static gsf__tile gsf__tile_of(const gsf_rasterizer* r, size_t index) {
     gsf__tile tile;
-    tile.records = r->records;
-    tile.visible = r->visible;
+    tile.records = r->sorted;
     tile.ranks = r->pair_rank + r->tile_begin[index];
     tile.count = r->tile_begin[index + 1] - r->tile_begin[index];
     tile.x0 = (float)((int32_t)(index % (size_t)r->tiles_x) * GSF__TILE);
@@ -5291,7 +5297,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
     gather.view = &view;
     gather.splats = splats;
     gather.grads = grads;
-    gsf__parallel_for(ctx, (r->visible_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__gather_chunk, &gather);
+    gsf__parallel_for(ctx, (r->splat_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__gather_chunk, &gather);
     return GSF_OK;
 }
 
