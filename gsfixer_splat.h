@@ -350,8 +350,9 @@ typedef struct gsf_fix_desc {
     const double* points;         // (point_count,3) world points for the path's principal axes; NULL = cameras only.
     size_t point_count;           //   Borrowed until the fixer is destroyed
     int32_t rounds;               // restoration rounds, default 2; < 0: none
-    int32_t first_round;          // iteration before which the first round runs; 0 = 1/3 of the iterations
-    int32_t last_round;           // the others are spread evenly up to this iteration; 0 = 2/3 of the iterations
+    int32_t first_round;          // iteration after which the first round runs; 0 = about 1/3 of the iterations, shortly
+                                  // before a densification
+    int32_t last_round;           // the others are spread evenly up to this iteration; 0 = about 2/3, likewise
     int32_t windows;              // per round; 0 = one per training view, at least 2
     int32_t window_frames;        // 0 = 17, moved to the nearest count the restorer takes
     float lambda;                 // weight of the restored views at the end of training, default 1
@@ -7683,13 +7684,20 @@ GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     gsf_free(ctx, f);
 }
 
+// The iteration just before the next density control: right after one, renders are at their worst.
+static int32_t gsf__calm_iteration(const gsf_train_desc* d, int32_t iteration) {
+    const int32_t interval = d->densify_interval > 0 ? d->densify_interval : 100;
+    const int32_t calm = (iteration + interval / 2) / interval * interval - 1;
+    return calm > 0 && calm < d->iterations ? calm : iteration;
+}
+
 static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view_count, int has_restorer) {
     gsf_fix_desc d = *desc;
     if (d.train.iterations == 0) d.train.iterations = 30000;
     if (d.rounds == 0) d.rounds = 2;
     if (d.rounds < 0 || !has_restorer) d.rounds = 0;
-    if (d.first_round == 0) d.first_round = d.train.iterations / 3;
-    if (d.last_round == 0) d.last_round = d.train.iterations * 2 / 3;
+    if (d.first_round == 0) d.first_round = gsf__calm_iteration(&d.train, d.train.iterations / 3);
+    if (d.last_round == 0) d.last_round = gsf__calm_iteration(&d.train, d.train.iterations * 2 / 3);
     if (d.last_round < d.first_round) d.last_round = d.first_round;
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
     if (d.window_frames == 0) d.window_frames = 17;

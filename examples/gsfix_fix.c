@@ -10,7 +10,7 @@
 enum { DEFAULT_ITERATIONS = 3000, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000 };
 
 static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
-    0.2f, 0.0f, 0.0f, 0.0f}; // --regularize on
+    0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
 
 static const gsfix_quality qualities[] = { // footprint OFFICIAL loses what lies beyond 3 sigma
     {"exact", GSF_FOOTPRINT_FULL, 0.0f, 0},
