@@ -576,7 +576,10 @@ static gsf_result start_fixer(fix_run* run) {
         views[i].camera = run->scene.views[run->split.train[i]].camera;
         views[i].image = run->scene.views[run->split.train[i]].image;
     }
-    const gsf_result result = gsf_splat_make_fixer(ctx, &run->setup.fix, views, n, &run->initial,
+    gsf_fix_desc desc = run->setup.fix;
+    desc.points = run->scene.points; // they keep the path upright
+    desc.point_count = run->scene.point_count;
+    const gsf_result result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
                                                    run->has_restorer ? &run->restorer : NULL, &run->fixer);
     gsf_free(ctx, views);
     return result;
