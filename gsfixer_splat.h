@@ -310,6 +310,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const 
                                                         const gsf_train_view* views, size_t view_count,
                                                         const gsf_splats* initial, gsf_trainer** out);
 GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer);
+// What the trainer runs by: its desc with every default, the extent and the near plane filled in. To be shown, not to be
+// made from again: there, zero means default (lambda_ssim without an SSIM term is 0 here).
+GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer);
 // One iteration. After the last one it is GSF_ERROR_INVALID_ARGUMENT. A step that fails (cancelled, out of memory) changes
 // nothing, so it may be tried again. stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats);
@@ -384,6 +387,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gs
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
                                                       gsf_fixer** out);
 GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* fixer);
+// Likewise what the loop runs by, train as gsf_splat_trainer_desc has it (rounds is 0 without a restorer). window_frames is
+// what the restorer will be asked for; stats.frame_count is what it takes.
+GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer);
 // One training iteration, or the planning of a round, or one window. After an error (or cancel) the fixer stays usable.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
 // The trainer inside, for rendering and export.
@@ -7133,6 +7139,8 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
     gsf_free(ctx, trainer);
 }
 
+GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer) { return trainer->desc; }
+
 GSF_API gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
                                                 size_t count) {
     gsf__photo_set set;
@@ -7750,6 +7758,12 @@ cleanup:
     if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
     else *out = f;
     return result;
+}
+
+GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer) {
+    gsf_fix_desc desc = fixer->desc;
+    desc.train = gsf_splat_trainer_desc(fixer->trainer);
+    return desc;
 }
 
 GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer) { return fixer->trainer; }

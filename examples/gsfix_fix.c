@@ -32,42 +32,43 @@ typedef struct fix_setup { // everything that decides what the run computes
     char init[16]; // method, resolved
 } fix_setup;
 
-typedef struct setting { const char* name; int is_real; size_t offset; } setting;
+enum { WHOLE, REAL, SWITCH }; // int32_t, float, int32_t of 0 (off) or 1 (on)
+typedef struct setting { const char* name; int kind; size_t offset; } setting;
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
 static const setting settings[] = { // zero: the library's default, see gsf_train_desc and gsf_fix_desc
-    {"sh_degree", 0, offsetof(fix_setup, sh_degree)},
-    {"random_points", 0, offsetof(fix_setup, random_points)},
-    {"dropout", 1, TRAIN_AT(dropout)},
-    {"opacity_decay", 1, TRAIN_AT(opacity_decay)},
-    {"scale_penalty", 1, TRAIN_AT(scale_penalty)},
-    {"depth_smoothness", 1, TRAIN_AT(depth_smoothness)},
-    {"sh_interval", 0, TRAIN_AT(sh_interval)},
-    {"lr_means", 1, TRAIN_AT(lr_means)},
-    {"lr_means_final", 1, TRAIN_AT(lr_means_final)},
-    {"lr_sh_dc", 1, TRAIN_AT(lr_sh_dc)},
-    {"lr_sh_rest", 1, TRAIN_AT(lr_sh_rest)},
-    {"lr_opacity", 1, TRAIN_AT(lr_opacity)},
-    {"lr_scales", 1, TRAIN_AT(lr_scales)},
-    {"lr_quats", 1, TRAIN_AT(lr_quats)},
-    {"lambda_ssim", 1, TRAIN_AT(lambda_ssim)},
-    {"densify_from", 0, TRAIN_AT(densify_from)},
-    {"densify_until", 0, TRAIN_AT(densify_until)},
-    {"densify_interval", 0, TRAIN_AT(densify_interval)},
-    {"densify_grad", 1, TRAIN_AT(densify_grad)},
-    {"densify_scale", 1, TRAIN_AT(densify_scale)},
-    {"prune_opacity", 1, TRAIN_AT(prune_opacity)},
-    {"prune_scale", 1, TRAIN_AT(prune_scale)},
-    {"opacity_reset_interval", 0, TRAIN_AT(opacity_reset_interval)},
-    {"antialiased", 0, TRAIN_AT(render.antialiased)},
-    {"rounds", 0, FIX_AT(rounds)},
-    {"first_round", 0, FIX_AT(first_round)},
-    {"last_round", 0, FIX_AT(last_round)},
-    {"windows", 0, FIX_AT(windows)},
-    {"window_frames", 0, FIX_AT(window_frames)},
-    {"lambda", 1, FIX_AT(lambda)},
-    {"skip_psnr", 1, FIX_AT(skip_psnr)},
-    {"max_pixels", 0, FIX_AT(max_pixels)},
+    {"sh_degree", WHOLE, offsetof(fix_setup, sh_degree)},
+    {"random_points", WHOLE, offsetof(fix_setup, random_points)},
+    {"dropout", REAL, TRAIN_AT(dropout)},
+    {"opacity_decay", REAL, TRAIN_AT(opacity_decay)},
+    {"scale_penalty", REAL, TRAIN_AT(scale_penalty)},
+    {"depth_smoothness", REAL, TRAIN_AT(depth_smoothness)},
+    {"sh_interval", WHOLE, TRAIN_AT(sh_interval)},
+    {"lr_means", REAL, TRAIN_AT(lr_means)},
+    {"lr_means_final", REAL, TRAIN_AT(lr_means_final)},
+    {"lr_sh_dc", REAL, TRAIN_AT(lr_sh_dc)},
+    {"lr_sh_rest", REAL, TRAIN_AT(lr_sh_rest)},
+    {"lr_opacity", REAL, TRAIN_AT(lr_opacity)},
+    {"lr_scales", REAL, TRAIN_AT(lr_scales)},
+    {"lr_quats", REAL, TRAIN_AT(lr_quats)},
+    {"lambda_ssim", REAL, TRAIN_AT(lambda_ssim)},
+    {"densify_from", WHOLE, TRAIN_AT(densify_from)},
+    {"densify_until", WHOLE, TRAIN_AT(densify_until)},
+    {"densify_interval", WHOLE, TRAIN_AT(densify_interval)},
+    {"densify_grad", REAL, TRAIN_AT(densify_grad)},
+    {"densify_scale", REAL, TRAIN_AT(densify_scale)},
+    {"prune_opacity", REAL, TRAIN_AT(prune_opacity)},
+    {"prune_scale", REAL, TRAIN_AT(prune_scale)},
+    {"opacity_reset_interval", WHOLE, TRAIN_AT(opacity_reset_interval)},
+    {"antialiased", SWITCH, TRAIN_AT(render.antialiased)},
+    {"rounds", WHOLE, FIX_AT(rounds)},
+    {"first_round", WHOLE, FIX_AT(first_round)},
+    {"last_round", WHOLE, FIX_AT(last_round)},
+    {"windows", WHOLE, FIX_AT(windows)},
+    {"window_frames", WHOLE, FIX_AT(window_frames)},
+    {"lambda", REAL, FIX_AT(lambda)},
+    {"skip_psnr", REAL, FIX_AT(skip_psnr)},
+    {"max_pixels", WHOLE, FIX_AT(max_pixels)},
 };
 enum { SETTING_COUNT = sizeof settings / sizeof settings[0] };
 
@@ -90,9 +91,11 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
         snprintf(value, sizeof value, "%.*s", (int)(n - name - 1), p + name + 1);
         char* field = (char*)setup + settings[i].offset;
         const double x = strtod(value, &end);
-        if (end == value || *end || !(fabs(x) <= 1e9) || (!settings[i].is_real && x != (double)(int32_t)x))
-            return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, settings[i].is_real ? "number" : "whole number");
-        if (settings[i].is_real) *(float*)(void*)field = (float)x;
+        const int kind = settings[i].kind;
+        if (end == value || *end || !(fabs(x) <= 1e9) || (kind != REAL && x != (double)(int32_t)x))
+            return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, kind == REAL ? "number" : "whole number");
+        if (kind == SWITCH && x != 0.0 && x != 1.0) return gsfix_misused(app, "--set %.*s: expected 0 or 1", (int)n, p);
+        if (kind == REAL) *(float*)(void*)field = (float)x;
         else *(int32_t*)(void*)field = (int32_t)x;
         p += n + (p[n] == ',');
     }
@@ -341,29 +344,49 @@ static gsf_result load_masks(fix_run* run) {
 
 // ---- checkpoint ------------------------------------------------------------------
 
-// What the run computes, by name: printed in metrics.json, and what --resume insists on.
+static double as_written(float value) { // the shortest decimal that reads back as this float
+    char text[32];
+    for (int digits = 1; digits < 10; digits++) {
+        snprintf(text, sizeof text, "%.*g", digits, (double)value);
+        if ((float)strtod(text, NULL) == value) break;
+    }
+    return strtod(text, NULL);
+}
+
+// What the run computes, by name and with every default filled in: printed in metrics.json, and what --resume insists on.
 static void write_switches(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_text* t = &run->switches;
     const gsfix_options* o = &run->app->o;
     static const char* const kinds[] = {"reference", "ellipse", "interpolate"};
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
+    fix_setup used = run->setup;
+    used.fix = gsf_splat_fixer_desc(run->fixer);
+    const gsf_train_desc* train = &used.fix.train;
     gsfix_json_begin(ctx, t, NULL, '{');
-    gsfix_json_number(ctx, t, "iterations", run->iterations);
-    gsfix_json_number(ctx, t, "seed", (double)o->seed);
+    gsfix_json_number(ctx, t, "iterations", train->iterations);
+    gsfix_json_number(ctx, t, "seed", (double)train->seed);
     gsfix_json_text(ctx, t, "restorer", o->restorer ? o->restorer : "none");
     gsfix_json_text(ctx, t, "regularize", o->regularize ? o->regularize : "on");
-    gsfix_json_text(ctx, t, "trajectory", kinds[run->setup.fix.trajectory]);
-    gsfix_json_text(ctx, t, "init", run->setup.init);
+    gsfix_json_text(ctx, t, "trajectory", kinds[used.fix.trajectory]);
+    gsfix_json_text(ctx, t, "init", used.init);
     gsfix_json_text(ctx, t, "quality", gsfix_find_quality(o->quality)->name);
-    gsfix_json_text(ctx, t, "footprint", run->setup.fix.train.render.footprint == GSF_FOOTPRINT_FULL ? "full" : "official");
-    gsfix_json_text(ctx, t, "gradient", run->setup.fix.train.render.gradient == GSF_GRADIENT_TRUE ? "true" : "official");
+    gsfix_json_text(ctx, t, "footprint", train->render.footprint == GSF_FOOTPRINT_FULL ? "full" : "official");
+    gsfix_json_text(ctx, t, "gradient", train->render.gradient == GSF_GRADIENT_TRUE ? "true" : "official");
     for (int i = 0; i < SETTING_COUNT; i++) {
-        const char* field = (const char*)&run->setup + settings[i].offset;
-        gsfix_json_number(ctx, t, settings[i].name,
-                          settings[i].is_real ? (double)*(const float*)(const void*)field : *(const int32_t*)(const void*)field);
+        const void* field = (const char*)&used + settings[i].offset;
+        if (strcmp(settings[i].name, "random_points") == 0 && strcmp(used.init, "random") != 0) continue;
+        const int32_t whole = settings[i].kind == REAL ? 0 : *(const int32_t*)field;
+        if (settings[i].kind == REAL) gsfix_json_number(ctx, t, settings[i].name, as_written(*(const float*)field));
+        else if (settings[i].kind == WHOLE) gsfix_json_number(ctx, t, settings[i].name, whole);
+        else gsfix_json_text(ctx, t, settings[i].name, whole ? "on" : "off");
     }
-    gsfix_json_number(ctx, t, "near_plane", (double)run->setup.fix.train.render.near_plane);
+    gsfix_json_number(ctx, t, "max_splats", (double)train->max_splats);
+    gsfix_json_number(ctx, t, "extent", as_written(train->extent));
+    gsfix_json_number(ctx, t, "near_plane", as_written(train->render.near_plane));
+    gsfix_json_begin(ctx, t, "background", '[');
+    for (int c = 0; c < 3; c++) gsfix_json_number(ctx, t, NULL, as_written(train->background[c]));
+    gsfix_json_end(ctx, t, ']');
     gsfix_json_text(ctx, t, "views", o->views ? o->views : "all");
     gsfix_json_number(ctx, t, "test_every", o->test_every ? o->test_every : 8);
     gsfix_json_number(ctx, t, "factor", o->factor ? o->factor : 1);
@@ -770,6 +793,12 @@ static void write_views(fix_run* run, const gsfix_result* r, gsf_text* t) {
     gsfix_json_end(ctx, t, ']');
 }
 
+static int window_frames(const gsfix_history* h, int32_t round) { // of each window of a round, as the restorer had them
+    int count = 0;
+    for (size_t i = 0; i < h->path_count; i++) count += h->path[i].round == round && h->path[i].window == 1;
+    return count;
+}
+
 static void write_course(fix_run* run, gsf_text* t) { // rounds and curve
     gsf_context* ctx = run->ctx;
     const gsfix_history* h = &run->history;
@@ -780,6 +809,7 @@ static void write_course(fix_run* run, gsf_text* t) { // rounds and curve
         gsfix_json_number(ctx, t, "round", r->round);
         gsfix_json_number(ctx, t, "iteration", r->iteration);
         gsfix_json_number(ctx, t, "windows", r->windows);
+        gsfix_json_number(ctx, t, "window_frames", window_frames(h, r->round));
         gsfix_json_number(ctx, t, "windows_skipped", r->skipped);
         gsfix_json_number(ctx, t, "frames_restored", r->frames);
         gsfix_json_number(ctx, t, "mean_confidence", r->frames ? r->confidence / r->frames : NAN);

@@ -374,7 +374,43 @@ static void put_table(page* p) {
     put_raw(p, "</tbody></table></div></section>\n");
 }
 
+// How a switch of metrics.json is shown: under which heading, what zero (or less) means, and the unit.
+static const struct { const char *key, *group, *zero, *unit; } switches[] = {
+    {"views", "Photos", NULL, ""}, {"test_every", "Photos", "none held out", ""}, {"factor", "Photos", NULL, ""},
+    {"max_size", "Photos", "no limit", " pixels"}, {"width", "Photos", NULL, " pixels"}, {"height", "Photos", NULL, " pixels"},
+    {"train_views", "Photos", NULL, ""}, {"init", "Start", NULL, ""}, {"initial_splats", "Start", NULL, ""},
+    {"random_points", "Start", NULL, ""}, {"extent", "Start", NULL, ""}, {"near_plane", "Start", NULL, ""},
+    {"regularize", "Regularisers for few views", NULL, ""}, {"dropout", "Regularisers for few views", "off", ""},
+    {"opacity_decay", "Regularisers for few views", "off", " per step"},
+    {"scale_penalty", "Regularisers for few views", "off", ""},
+    {"depth_smoothness", "Regularisers for few views", "off", ""}, {"restorer", "Repair", NULL, ""},
+    {"trajectory", "Repair", NULL, ""}, {"rounds", "Repair", "none", ""}, {"first_round", "Repair", NULL, ". step"},
+    {"last_round", "Repair", NULL, ". step"}, {"windows", "Repair", NULL, " per round"},
+    {"window_frames", "Repair", NULL, ""}, {"lambda", "Repair", NULL, " at the end"},
+    {"skip_psnr", "Repair", "never", " dB"}, {"max_pixels", "Repair", "photo size", ""},
+    {"densify_until", "Training", "never", ". step"}, {"densify_from", "Training", NULL, ". step"},
+    {"densify_interval", "Training", NULL, " steps"}, {"sh_interval", "Training", NULL, " steps"},
+    {"opacity_reset_interval", "Training", "never", " steps"}, {"lambda_ssim", "Training", "no SSIM term", ""},
+};
+
+static void put_switch(page* p, const gsf_json* json, const gsf_json_value* v, const char* zero, const char* unit) {
+    put_raw(p, v->type == GSF_JSON_ARRAY && v->count > 3 ? "<div class=broad><dt>" : "<div><dt>");
+    put_escaped(p, v->key);
+    put_raw(p, "</dt><dd>");
+    if (v->type == GSF_JSON_NUMBER && zero && v->number <= 0.0) put_raw(p, zero);
+    else if (v->type == GSF_JSON_NUMBER) put(p, "%.9g%s", v->number, unit);
+    else if (v->type == GSF_JSON_STRING) put_escaped(p, v->string);
+    for (uint32_t k = v->type == GSF_JSON_ARRAY ? v->child : 0; k; k = json->values[k].next) {
+        if (json->values[k].string) put_escaped(p, json->values[k].string);
+        else put(p, "%.9g", json->values[k].number);
+        if (json->values[k].next) put_raw(p, ", ");
+    }
+    put_raw(p, "</dd></div>");
+}
+
 static gsf_result put_switches(page* p, const char* command) {
+    static const char* const groups[] = {"Photos", "Start", "Repair", "Regularisers for few views", "Training"};
+    enum { GROUPS = sizeof groups / sizeof *groups, SWITCHES = sizeof switches / sizeof *switches };
     gsf_json json;
     gsf_result result = gsf_parse_json(p->ctx, "switches", p->r->switches, strlen(p->r->switches), &json);
     if (result != GSF_OK) return result;
@@ -382,23 +418,19 @@ static gsf_result put_switches(page* p, const char* command) {
     put_escaped(p, command);
     put(p, "</pre><p>gsfixer %s, %s kernels, %d worker%s. The same command gives the same bits on any number of workers. "
            "PSNR and SSIM compare the render, clamped to [0,1], with the 8-bit photo; SSIM is the 3DGS papers' (11x11 Gaussian window). "
-           "A setting of 0 leaves it to the library.</p><dl class=switches>", GSF_VERSION, gsf_cpu_level_name(p->ctx->cpu_level),
-        p->ctx->parallel.worker_count, p->ctx->parallel.worker_count == 1 ? "" : "s");
-    for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
-        const gsf_json_value* v = &json.values[i];
-        put_raw(p, "<div><dt>");
-        put_escaped(p, v->key);
-        put_raw(p, "</dt><dd>");
-        if (v->type == GSF_JSON_NUMBER) put(p, "%g", v->number);
-        else if (v->type == GSF_JSON_STRING) put_escaped(p, v->string);
-        else
-            for (uint32_t k = v->child; k; k = json.values[k].next) {
-                if (json.values[k].string) put_escaped(p, json.values[k].string);
-                if (json.values[k].next) put_raw(p, ", ");
-            }
-        put_raw(p, "</dd></div>");
+           "Below stands what the run used, under the names that metrics.json has.</p>", GSF_VERSION,
+        gsf_cpu_level_name(p->ctx->cpu_level), p->ctx->parallel.worker_count, p->ctx->parallel.worker_count == 1 ? "" : "s");
+    for (int group = 0; group < GROUPS; group++) {
+        put(p, "<h3>%s</h3><dl class=switches>", groups[group]);
+        for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
+            int k = 0;
+            while (k < SWITCHES && strcmp(switches[k].key, json.values[i].key) != 0) k++;
+            if (strcmp(k < SWITCHES ? switches[k].group : "Training", groups[group]) != 0) continue;
+            put_switch(p, &json, &json.values[i], k < SWITCHES ? switches[k].zero : NULL, k < SWITCHES ? switches[k].unit : "");
+        }
+        put_raw(p, "</dl>");
     }
-    put_raw(p, "</dl></section>\n");
+    put_raw(p, "</section>\n");
     gsf_destroy_json(p->ctx, &json);
     return GSF_OK;
 }
@@ -591,6 +623,7 @@ static const char* const style[] = { // in pieces, since C only promises strings
     "pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px;white-space:pre-wrap;overflow-wrap:anywhere;font-size:13.5px;margin:8px 0}",
     ".switches{display:grid;grid-template-columns:repeat(auto-fill,minmax(230px,1fr));gap:0 26px;font-size:13.5px;margin:0}",
     ".switches div{display:flex;justify-content:space-between;gap:14px;border-bottom:1px solid var(--line);padding:3px 0}",
+    ".switches .broad{grid-column:1/-1}h3{font-size:14px;margin:16px 0 2px}",
     ".switches dt{color:var(--soft)}.switches dd{margin:0;text-align:right;overflow-wrap:anywhere}",
     "@media(max-width:560px){.wide{display:none}body{padding:18px 14px 40px}.tile dd{font-size:22px}}",
     "@media print{:root{--bg:#fff;--card:#fff;--ink:#000;--soft:#444;--line:#ccc}body{max-width:none;padding:0;font-size:12px}",

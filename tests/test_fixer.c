@@ -244,6 +244,28 @@ static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]
     return 0;
 }
 
+static void test_desc(gsf_context* ctx) { // what the loop says it runs by
+    static repair r;
+    gsf_fix_desc given, used;
+    gsf_fixer* fixer;
+    repair_setup(ctx, &r);
+    memset(&given, 0, sizeof given);
+    given.train.lambda_ssim = -1.0f;
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
+    used = gsf_splat_fixer_desc(fixer);
+    CHECK(used.rounds == 2 && used.windows == VIEWS && used.window_frames == 17 && used.lambda == 1.0f);
+    CHECK(used.first_round == 9999 && used.last_round == 19999 && used.skip_psnr == 0.0f);
+    CHECK(used.train.iterations == 30000 && used.train.lr_means == 1.6e-4f && used.train.lambda_ssim == 0.0f);
+    CHECK(used.train.extent > 1.0f && used.train.extent < 4.0f && used.train.render.near_plane == 0.01f * used.train.extent);
+    gsf_splat_destroy_fixer(ctx, fixer);
+    given = repair_desc();
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, NULL, &fixer));
+    used = gsf_splat_fixer_desc(fixer);
+    CHECK(used.rounds == 0 && used.train.densify_interval == 20); // nobody to restore
+    gsf_splat_destroy_fixer(ctx, fixer);
+    repair_teardown(ctx, &r);
+}
+
 static double held_out_psnr(gsf_context* ctx, repair* r, gsf_fixer* fixer) {
     static float a[3 * PIXELS], b[3 * PIXELS];
     double sum = 0.0;
@@ -396,6 +418,7 @@ int main(void) {
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     test_warp(&ctx);
     test_seen_mask(&ctx);
+    test_desc(&ctx);
     test_loop(&ctx);
     test_trouble(&ctx);
     return test_report();
