@@ -216,6 +216,9 @@ typedef struct gsf_chunk {
 
 // Adds a chunk to `out` (which starts as a zeroed gsf_text). Finish with gsf_chunks_end, then gsf_write_file.
 GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size);
+// The same with bytes that are appended to `out` piece by piece: open, gsf_text_append ..., close with what open returned.
+GSF_API size_t gsf_chunks_open(gsf_context* ctx, gsf_text* out, const char* tag);
+GSF_API void gsf_chunks_close(gsf_context* ctx, gsf_text* out, size_t opened);
 GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out);
 // Checks a whole file (magic, sizes, checksums, end). `name` is used in error texts.
 GSF_API GSF_NODISCARD gsf_result gsf_chunks_check(gsf_context* ctx, const char* name, const void* data, size_t size);
@@ -1094,7 +1097,7 @@ GSF_API gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void
 
 // ---- >>chunks ------------------------------------------------------------------
 
-// Reflected 0xedb88320. Long inputs go 8 bytes at a time; tables[k][b] is byte b followed by k zero bytes.
+// Reflected 0xedb88320. Long inputs go 16 bytes at a time; tables[k][b] is byte b followed by k zero bytes.
 static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
     static const uint32_t nibble[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
                                         0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
@@ -1102,18 +1105,21 @@ static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
     const unsigned char* p = (const unsigned char*)data;
     crc = ~crc;
     if (size >= 1 << 15) {
-        uint32_t tables[8][256];
+        uint32_t tables[16][256];
         for (uint32_t b = 0; b < 256; b++) {
             const uint32_t half = nibble[b & 15u] ^ b >> 4;
             tables[0][b] = nibble[half & 15u] ^ half >> 4;
         }
-        for (int k = 1; k < 8; k++)
+        for (int k = 1; k < 16; k++)
             for (int b = 0; b < 256; b++)
                 tables[k][b] = tables[0][tables[k - 1][b] & 255u] ^ tables[k - 1][b] >> 8;
-        for (; size >= 8; size -= 8, p += 8) {
-            const uint32_t low = crc ^ (uint32_t)gsf__load_le(p, 4);
-            crc = tables[7][low & 255u] ^ tables[6][low >> 8 & 255u] ^ tables[5][low >> 16 & 255u] ^
-                  tables[4][low >> 24] ^ tables[3][p[4]] ^ tables[2][p[5]] ^ tables[1][p[6]] ^ tables[0][p[7]];
+        for (; size >= 16; size -= 16, p += 16) {
+            const uint32_t w0 = crc ^ (uint32_t)gsf__load_le(p, 4), w1 = (uint32_t)gsf__load_le(p + 4, 4);
+            const uint32_t w2 = (uint32_t)gsf__load_le(p + 8, 4), w3 = (uint32_t)gsf__load_le(p + 12, 4);
+            crc = tables[15][w0 & 255u] ^ tables[14][w0 >> 8 & 255u] ^ tables[13][w0 >> 16 & 255u] ^ tables[12][w0 >> 24] ^
+                  tables[11][w1 & 255u] ^ tables[10][w1 >> 8 & 255u] ^ tables[9][w1 >> 16 & 255u] ^ tables[8][w1 >> 24] ^
+                  tables[7][w2 & 255u] ^ tables[6][w2 >> 8 & 255u] ^ tables[5][w2 >> 16 & 255u] ^ tables[4][w2 >> 24] ^
+                  tables[3][w3 & 255u] ^ tables[2][w3 >> 8 & 255u] ^ tables[1][w3 >> 16 & 255u] ^ tables[0][w3 >> 24];
         }
     }
     for (size_t i = 0; i < size; i++) {
@@ -1125,19 +1131,32 @@ static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
 
 enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 
-GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size) {
-    char head[GSF__CHUNK_HEAD];
+GSF_API size_t gsf_chunks_open(gsf_context* ctx, gsf_text* out, const char* tag) {
+    char head[GSF__CHUNK_HEAD]; // or the file's, which is as long
     if (out->size == 0) {
         memcpy(head, "GSFCHUNK", 8);
         gsf__store_le(head + 8, 1, 4);
         gsf_text_append(ctx, out, head, GSF__CHUNK_FILE_HEAD);
     }
+    const size_t opened = out->size;
+    memset(head, 0, sizeof head); // the size is filled in by close
     memcpy(head, tag, 4);
-    gsf__store_le(head + 4, size, 8);
     gsf_text_append(ctx, out, head, GSF__CHUNK_HEAD);
+    return opened;
+}
+
+GSF_API void gsf_chunks_close(gsf_context* ctx, gsf_text* out, size_t opened) {
+    char crc[GSF__CHUNK_TAIL];
+    if (out->failed) return;
+    gsf__store_le(out->data + opened + 4, out->size - opened - GSF__CHUNK_HEAD, 8);
+    gsf__store_le(crc, gsf__crc32(0, out->data + opened, out->size - opened), 4);
+    gsf_text_append(ctx, out, crc, sizeof crc);
+}
+
+GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size) {
+    const size_t opened = gsf_chunks_open(ctx, out, tag);
     gsf_text_append(ctx, out, (const char*)data, size);
-    gsf__store_le(head, gsf__crc32(gsf__crc32(0, head, GSF__CHUNK_HEAD), data, size), 4);
-    gsf_text_append(ctx, out, head, GSF__CHUNK_TAIL);
+    gsf_chunks_close(ctx, out, opened);
 }
 
 GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out) { gsf_chunks_add(ctx, out, "END ", "", 0); }

@@ -8067,11 +8067,10 @@ GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
 static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag, const gsf__kept_frames* list) {
-    gsf_text body;
-    memset(&body, 0, sizeof body);
     char head[GSF__FRAME_HEAD];
+    const size_t opened = gsf_chunks_open(ctx, chunks, tag); // frames are most of a checkpoint: copied only once
     gsf__store_le(head, list->count, 8);
-    gsf_text_append(ctx, &body, head, 8);
+    gsf_text_append(ctx, chunks, head, 8);
     for (size_t i = 0; i < list->count; i++) {
         const gsf_camera* camera = &list->frames[i].camera;
         double numbers[20];
@@ -8087,13 +8086,11 @@ static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag
         }
         gsf__store_le(head + 160, (uint32_t)camera->width, 4);
         gsf__store_le(head + 164, (uint32_t)camera->height, 4);
-        gsf_text_append(ctx, &body, head, sizeof head);
-        gsf_text_append(ctx, &body, (const char*)list->frames[i].pixels,
+        gsf_text_append(ctx, chunks, head, sizeof head);
+        gsf_text_append(ctx, chunks, (const char*)list->frames[i].pixels,
                         4 * (size_t)camera->width * (size_t)camera->height);
     }
-    if (body.failed) chunks->failed = 1;
-    else gsf_chunks_add(ctx, chunks, tag, body.data, body.size);
-    gsf_destroy_text(ctx, &body);
+    gsf_chunks_close(ctx, chunks, opened);
 }
 
 static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const void* data, size_t size, const char* tag,

@@ -60,6 +60,8 @@ gsfix_path gsfix_stem(const char* path);
 gsfix_path gsfix_view_stem(const gsf_scene* scene, size_t view);
 gsf_result gsfix_save_npy(gsf_context* ctx, const char* path, const gsf_image* image); // f32, one channel
 gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out);
+// gsf_save_image for each, all at once: encoding a PNG takes longer than rendering it.
+gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gsf_image* images, size_t count);
 void gsfix_clamp(gsf_image* image); // packed f32 to [0,1], NaN to 0
 // Picture of packed f32 values: t = (value - low) / (high - low) through a perceptual map (warm: black to yellow).
 gsf_result gsfix_color_map(gsf_context* ctx, const gsf_image* values, double low, double high, gsf_image* out);
@@ -122,7 +124,7 @@ typedef struct gsfix_round { int32_t round, iteration, windows, skipped, frames;
 typedef struct gsfix_flown { int32_t round, window, reference; double center[3], forward[3]; } gsfix_flown; // path frame
 typedef struct gsfix_sample { int32_t round, window, frame; } gsfix_sample; // pictures of it lie in DIR/report
 
-enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_SAVE, GSFIX_STAGES };
+enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_CHECKPOINT, GSFIX_SAVE, GSFIX_STAGES };
 extern const char* const gsfix_stage_names[GSFIX_STAGES];
 
 typedef struct gsfix_history { // what a run remembers beside the fixer's state; part of the checkpoint

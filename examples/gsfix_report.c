@@ -327,7 +327,8 @@ static void put_curve(page* p) {
 static void put_seconds(page* p) {
     static const char* const what[GSFIX_STAGES] = {"loading, visible points, initial splats", "training before the first round",
                                                    "rendering and measuring held-out views", "rendering and repairing path frames",
-                                                   "training with repaired frames", "files: checkpoints, pictures, splats"};
+                                                   "training with repaired frames", "checkpoints, from which --resume goes on",
+                                                   "files: pictures, splats"};
     const gsfix_history* h = p->r->history;
     double sum = 0.0;
     for (int i = 0; i < GSFIX_STAGES; i++) sum += h->seconds[i];
@@ -615,7 +616,7 @@ static const char* const style[] = { // in pieces, since C only promises strings
     "canvas{display:block;background:#17181c;width:100%;height:min(60vh,480px);cursor:grab;touch-action:pan-y}.zoom{position:absolute;right:10px;top:10px;display:flex;gap:6px}",
     ".zoom button{width:34px;height:34px;padding:0;font-size:18px}",
     ".stages{display:flex;height:26px;border-radius:6px;overflow:hidden;gap:1px;margin:12px 0}.stages i{min-width:2px;flex-basis:0}",
-    ".s0{background:#8b93a5}.s1{background:#0d7a6f}.s2{background:#4f83cc}.s3{background:#c2570c}.s4{background:#6aa84f}.s5{background:#a3788f}",
+    ".s0{background:#8b93a5}.s1{background:#0d7a6f}.s2{background:#4f83cc}.s3{background:#c2570c}.s4{background:#6aa84f}.s5{background:#c9a227}.s6{background:#a3788f}",
     ".dot{display:inline-block;width:11px;height:11px;border-radius:3px;margin-right:8px}",
     "table{border-collapse:collapse;font-size:14.5px;font-variant-numeric:tabular-nums}td,th{padding:4px 16px 4px 0;text-align:left;vertical-align:top}",
     "th{font-weight:600;color:var(--soft);border-bottom:1px solid var(--line)}th+th,td.num{text-align:right}.mean td{border-top:1px solid var(--line);font-weight:650}",

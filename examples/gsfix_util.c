@@ -221,6 +221,40 @@ static size_t value_count(const gsf_image* image) {
     return (size_t)image->width * (size_t)image->height * (size_t)image->channels;
 }
 
+typedef struct save_job {
+    const gsf_context* ctx;
+    const gsfix_path* paths;
+    const gsf_image* images;
+    gsf_result* results;
+    char (*errors)[sizeof((gsf_context*)0)->error];
+} save_job;
+
+static void save_one(void* arg, size_t i, int worker) {
+    const save_job* job = (const save_job*)arg;
+    gsf_context own = *job->ctx; // a context serves one thread; this one starts no further work and says nothing
+    (void)worker;
+    own.parallel.worker_count = 1;
+    memset(&own.logger, 0, sizeof own.logger);
+    own.error[0] = 0;
+    job->results[i] = gsf_save_image(&own, job->paths[i].s, &job->images[i]);
+    memcpy(job->errors[i], own.error, sizeof own.error);
+}
+
+gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gsf_image* images, size_t count) {
+    save_job job = {ctx, paths, images, NULL, NULL};
+    gsf_result result = GSF_OK;
+    if (!count) return GSF_OK;
+    job.results = (gsf_result*)gsf_alloc_zeroed(ctx, count, sizeof *job.results);
+    job.errors = gsf_alloc_zeroed(ctx, count, sizeof *job.errors);
+    if (!job.results || !job.errors) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) ctx->parallel.for_fn(ctx->parallel.user, count, save_one, &job);
+    for (size_t i = 0; i < count && result == GSF_OK; i++)
+        if (job.results[i] != GSF_OK) result = gsf_fail(ctx, job.results[i], "%s", job.errors[i]);
+    gsf_free(ctx, job.results);
+    gsf_free(ctx, job.errors);
+    return result;
+}
+
 void gsfix_clamp(gsf_image* image) {
     float* p = (float*)image->data;
     for (size_t i = 0; i < value_count(image); i++) p[i] = p[i] > 0.0f ? p[i] < 1.0f ? p[i] : 1.0f : 0.0f;

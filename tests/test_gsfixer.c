@@ -210,6 +210,21 @@ static void test_damaged_chunks(gsf_context* ctx) {
     gsf_chunks_add(ctx, &file, "NONE", NULL, 0);
     const size_t small_end = file.size;
     gsf_chunks_add(ctx, &file, "LONG", payload, sizeof payload);
+    const size_t long_end = file.size;
+    uint32_t crc = 0xffffffffu, stored = 0; // bit by bit, over tag, size and bytes
+    for (size_t i = small_end; i < long_end - 4; i++) {
+        crc ^= (unsigned char)file.data[i];
+        for (int bit = 0; bit < 8; bit++) crc = crc & 1u ? 0xedb88320u ^ crc >> 1 : crc >> 1;
+    }
+    for (size_t i = 0; i < 4; i++) stored |= (uint32_t)(unsigned char)file.data[long_end - 4 + i] << 8 * i;
+    CHECK(stored == ~crc);
+    const size_t opened = gsf_chunks_open(ctx, &file, "LONG"); // the same chunk in pieces
+    for (size_t i = 0; i < sizeof payload; i += 999)
+        gsf_text_append(ctx, &file, payload + i, sizeof payload - i < 999 ? sizeof payload - i : 999);
+    gsf_chunks_close(ctx, &file, opened);
+    CHECK(opened == long_end && file.size - opened == long_end - small_end);
+    CHECK(memcmp(file.data + small_end, file.data + opened, long_end - small_end) == 0);
+    file.size = long_end;
     gsf_chunks_end(ctx, &file);
     CHECK(!file.failed);
     CHECK_OK(ctx, gsf_chunks_check(ctx, "file", file.data, file.size));
