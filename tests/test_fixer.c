@@ -117,7 +117,7 @@ typedef struct repair {
     float photos[VIEWS][3 * PIXELS];
     gsf_restorer restorer;          // renders the truth
     int32_t multiple, frames_step;  // the restorer's limits
-    int begun, ended, windows, fail_at, checked;
+    int begun, ended, windows, fail_at, checked, restored;
 } repair;
 
 static gsf_camera around(double angle, double height) { // on a circle of radius 4, looking at the middle
@@ -154,6 +154,7 @@ static gsf_result repair_begin(void* user, gsf_context* ctx, const gsf_reference
 static gsf_result repair_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
     repair* r = (repair*)user;
     if (r->fail_at && ++r->windows == r->fail_at) return gsf_fail(ctx, GSF_ERROR_RESTORER, "out of ideas");
+    r->restored++;
     CHECK(window->depth != NULL && window->alpha != NULL && (window->frame_count - 1) % r->frames_step == 0);
     for (int32_t i = 0; i < window->frame_count; i++) {
         const gsf_camera* camera = window->cameras + i;
@@ -384,6 +385,87 @@ static void test_trouble(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
+// The start is the truth, so what photos 0 and 1 show is what is rendered there. Photos 2 and 3 show something else, each its
+// own: the references do not explain what lies between them.
+static void mixed_setup(gsf_context* ctx, repair* r) {
+    repair_setup(ctx, r);
+    uint64_t seed = 11;
+    for (int i = 2; i < VIEWS; i++)
+        for (int k = 0; k < 3 * PIXELS; k++) r->photos[i][k] = (float)test_random(&seed);
+    gsf_splat_destroy(ctx, &r->start);
+    r->start = r->truth;
+}
+
+// Frames in the checkpoint's list `tag`, as drawn above gsf__save_frames.
+static uint64_t frames_in(const gsf_text* chunks, const char* tag) {
+    gsf_chunk chunk;
+    uint64_t count = 0;
+    if (!CHECK(gsf_chunks_find(chunks->data, chunks->size, tag, &chunk) && chunk.size >= 8)) return 0;
+    for (int i = 7; i >= 0; i--) count = count << 8 | ((const unsigned char*)chunk.data)[i];
+    return count;
+}
+
+// One run of mixed_setup's scene: two rounds of four windows of 9 frames, of which the first `skips` are skipped in each.
+// resumed: every window is followed by a checkpoint and a new fixer that goes on from it.
+static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int skips, int resumed) {
+    gsf_fix_desc desc = repair_desc();
+    gsf_fixer *fixer, *next;
+    gsf_fix_stats stats;
+    gsf_text chunks;
+    desc.windows = 4;
+    desc.train.iterations = 12;
+    desc.first_round = 3;
+    desc.last_round = 6;
+    desc.skip_psnr = skip_psnr;
+    r->restored = r->checked = 0;
+    memset(&chunks, 0, sizeof chunks);
+    CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r->views, VIEWS, &r->start, &r->restorer, &fixer));
+    uint64_t pending = 0;
+    int skipped = 0, windows = 0;
+    for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE;) {
+        if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) break;
+        if (stats.stage != GSF_FIX_RESTORE) continue;
+        const int skip = stats.window <= skips;
+        windows++;
+        skipped += skip;
+        CHECK(stats.skipped == skipped && (stats.restored == NULL) == skip && (stats.confidence == NULL) == skip);
+        CHECK(stats.frame_count == 9 && stats.rendered != NULL);
+        pending = stats.window == 1 ? 0 : pending;
+        for (int i = 0; i < stats.frame_count; i++) pending += !skip && stats.reference_index[i] < 0;
+        if (!resumed) continue;
+        chunks.size = 0;
+        gsf_splat_fixer_save(ctx, fixer, &chunks);
+        gsf_chunks_end(ctx, &chunks);
+        CHECK(!chunks.failed && frames_in(&chunks, "FIXP") == pending);
+        gsf_splat_destroy_fixer(ctx, fixer);
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r->views, VIEWS, &r->start, &r->restorer, &next));
+        CHECK_OK(ctx, gsf_splat_fixer_restore(ctx, next, "checkpoint", chunks.data, chunks.size));
+        fixer = next;
+    }
+    CHECK(windows == 8 && r->restored == 8 - 2 * skips);
+    chunks.size = 0;
+    gsf_splat_fixer_save(ctx, fixer, &chunks);
+    CHECK(frames_in(&chunks, "FIXA") == pending); // what the second round restored, and only that, is trained on
+    gsf_destroy_text(ctx, &chunks);
+    return fixer;
+}
+
+static void test_mixed_windows(gsf_context* ctx) {
+    static repair r;
+    mixed_setup(ctx, &r);
+    gsf_fixer* all = run_mixed(ctx, &r, 0.0f, 0, 0);
+    CHECK(r.checked == 4); // photos at the path's two ends
+    gsf_fixer* some = run_mixed(ctx, &r, 17.0f, 2, 0); // 28 and 20 dB of agreement, then 13 and 11
+    CHECK(r.checked == 2); // the second end
+    gsf_fixer* resumed = run_mixed(ctx, &r, 17.0f, 2, 1);
+    CHECK(same_splats(some, resumed) && !same_splats(some, all));
+    gsf_splat_destroy_fixer(ctx, all);
+    gsf_splat_destroy_fixer(ctx, some);
+    gsf_splat_destroy_fixer(ctx, resumed);
+    memset(&r.start, 0, sizeof r.start); // was the truth
+    repair_teardown(ctx, &r);
+}
+
 static void test_seen_mask(gsf_context* ctx) {
     static repair r;
     static uint8_t seen[PIXELS], all[PIXELS];
@@ -419,6 +501,7 @@ int main(void) {
     test_warp(&ctx);
     test_seen_mask(&ctx);
     test_desc(&ctx);
+    test_mixed_windows(&ctx);
     test_loop(&ctx);
     test_trouble(&ctx);
     return test_report();
