@@ -216,7 +216,7 @@ typedef struct gsf_chunk {
 
 // Adds a chunk to `out` (which starts as a zeroed gsf_text). Finish with gsf_chunks_end, then gsf_write_file.
 GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size);
-// The same with bytes that are appended to `out` piece by piece: open, gsf_text_append ..., close with what open returned.
+// The same for bytes that are appended to `out` piece by piece: open, gsf_text_append ..., close what open returned.
 GSF_API size_t gsf_chunks_open(gsf_context* ctx, gsf_text* out, const char* tag);
 GSF_API void gsf_chunks_close(gsf_context* ctx, gsf_text* out, size_t opened);
 GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out);
@@ -1116,10 +1116,14 @@ static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
         for (; size >= 16; size -= 16, p += 16) {
             const uint32_t w0 = crc ^ (uint32_t)gsf__load_le(p, 4), w1 = (uint32_t)gsf__load_le(p + 4, 4);
             const uint32_t w2 = (uint32_t)gsf__load_le(p + 8, 4), w3 = (uint32_t)gsf__load_le(p + 12, 4);
-            crc = tables[15][w0 & 255u] ^ tables[14][w0 >> 8 & 255u] ^ tables[13][w0 >> 16 & 255u] ^ tables[12][w0 >> 24] ^
-                  tables[11][w1 & 255u] ^ tables[10][w1 >> 8 & 255u] ^ tables[9][w1 >> 16 & 255u] ^ tables[8][w1 >> 24] ^
-                  tables[7][w2 & 255u] ^ tables[6][w2 >> 8 & 255u] ^ tables[5][w2 >> 16 & 255u] ^ tables[4][w2 >> 24] ^
-                  tables[3][w3 & 255u] ^ tables[2][w3 >> 8 & 255u] ^ tables[1][w3 >> 16 & 255u] ^ tables[0][w3 >> 24];
+            crc = tables[15][w0 & 255u] ^ tables[14][w0 >> 8 & 255u] ^
+                  tables[13][w0 >> 16 & 255u] ^ tables[12][w0 >> 24] ^
+                  tables[11][w1 & 255u] ^ tables[10][w1 >> 8 & 255u] ^
+                  tables[9][w1 >> 16 & 255u] ^ tables[8][w1 >> 24] ^
+                  tables[7][w2 & 255u] ^ tables[6][w2 >> 8 & 255u] ^
+                  tables[5][w2 >> 16 & 255u] ^ tables[4][w2 >> 24] ^
+                  tables[3][w3 & 255u] ^ tables[2][w3 >> 8 & 255u] ^
+                  tables[1][w3 >> 16 & 255u] ^ tables[0][w3 >> 24];
         }
     }
     for (size_t i = 0; i < size; i++) {
@@ -1667,9 +1671,24 @@ static gsf_result gsf__check_image(gsf_context* ctx, const char* what, const gsf
     return GSF_OK;
 }
 
-// Rows per chunk of parallel work, from sizes only: about 64k values each.
-static int64_t gsf__image_rows_per_chunk(int64_t width, int32_t channels) {
-    const int64_t row = width * channels, rows = row > 0 && row < 65536 ? 65536 / row : 1;
+// Parallel work on an image goes by chunks of rows, from sizes only: about 64k values each.
+typedef struct gsf__rows { int64_t begin, end; } gsf__rows;
+
+static int64_t gsf__rows_per_chunk(const gsf_image* image) {
+    const int64_t row = image->width * image->channels;
+    return row > 0 && row < 65536 ? 65536 / row : 1;
+}
+
+static size_t gsf__row_chunks(const gsf_image* image) {
+    const int64_t rows = gsf__rows_per_chunk(image);
+    return (size_t)((image->height + rows - 1) / rows);
+}
+
+static gsf__rows gsf__chunk_rows(const gsf_image* image, size_t chunk) {
+    const int64_t count = gsf__rows_per_chunk(image);
+    gsf__rows rows;
+    rows.begin = (int64_t)chunk * count;
+    rows.end = rows.begin + count < image->height ? rows.begin + count : image->height;
     return rows;
 }
 
@@ -1738,7 +1757,6 @@ enum { GSF__CONVERT_RUN = 256 };
 
 typedef struct gsf__convert_job {
     const gsf_image *src, *dst;
-    int64_t rows;
 } gsf__convert_job;
 
 static void gsf__convert_rows(void* arg, size_t chunk, int worker) {
@@ -1746,10 +1764,9 @@ static void gsf__convert_rows(void* arg, size_t chunk, int worker) {
     const gsf__convert_job* job = (const gsf__convert_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
     const int in_float = src->dtype == GSF_F16 || src->dtype == GSF_F32;
-    const int64_t first = (int64_t)chunk * job->rows;
-    const int64_t end = first + job->rows < dst->height ? first + job->rows : dst->height;
+    const gsf__rows rows = gsf__chunk_rows(dst, chunk);
     double run[GSF__CONVERT_RUN];
-    for (int64_t y = first; y < end; y++)
+    for (int64_t y = rows.begin; y < rows.end; y++)
         for (int32_t c = 0; c < dst->channels; c++) {
             const char* from =
                 (const char*)src->data + y * src->stride_y + (src->channels == 1 ? 0 : c * src->stride_c);
@@ -1776,8 +1793,7 @@ GSF_API gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, con
     gsf__convert_job job;
     job.src = src;
     job.dst = dst;
-    job.rows = gsf__image_rows_per_chunk(dst->width, dst->channels);
-    gsf__parallel_for(ctx, (size_t)((dst->height + job.rows - 1) / job.rows), gsf__convert_rows, &job);
+    gsf__parallel_for(ctx, gsf__row_chunks(dst), gsf__convert_rows, &job);
     return GSF_OK;
 }
 
@@ -2244,7 +2260,6 @@ static uint8_t gsf__pil_clip(int32_t sum) { // half was added before
 typedef struct gsf__resize_job {
     const gsf_image *src, *dst; // of this pass
     const gsf__resize_axis* axis;
-    int64_t rows;
 } gsf__resize_job;
 
 // Along x, same height.
@@ -2253,9 +2268,8 @@ static void gsf__resize_rows_x(void* arg, size_t chunk, int worker) {
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
     const gsf__resize_axis* axis = job->axis;
-    const int64_t start = (int64_t)chunk * job->rows,
-                  end = start + job->rows < dst->height ? start + job->rows : dst->height;
-    for (int64_t y = start; y < end; y++)
+    const gsf__rows rows = gsf__chunk_rows(dst, chunk);
+    for (int64_t y = rows.begin; y < rows.end; y++)
         for (int64_t x = 0; x < dst->width; x++)
             for (int32_t c = 0; c < dst->channels; c++) {
                 const char* from =
@@ -2287,11 +2301,10 @@ static void gsf__resize_rows_y(void* arg, size_t chunk, int worker) {
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
     const gsf__resize_axis* axis = job->axis;
-    const int64_t start = (int64_t)chunk * job->rows,
-                  end = start + job->rows < dst->height ? start + job->rows : dst->height;
+    const gsf__rows rows = gsf__chunk_rows(dst, chunk);
     int32_t sums[GSF__RESIZE_RUN];
     double wide[GSF__RESIZE_RUN];
-    for (int64_t y = start; y < end; y++)
+    for (int64_t y = rows.begin; y < rows.end; y++)
         for (int32_t c = 0; c < dst->channels; c++)
             for (int64_t x = 0; x < dst->width; x += GSF__RESIZE_RUN) {
                 const int64_t left = dst->width - x, n = left < GSF__RESIZE_RUN ? left : (int64_t)GSF__RESIZE_RUN;
@@ -2330,8 +2343,7 @@ static void gsf__resize_pass(gsf_context* ctx, gsf_chunk_fn body, const gsf_imag
     job.src = src;
     job.dst = dst;
     job.axis = axis;
-    job.rows = gsf__image_rows_per_chunk(dst->width, dst->channels);
-    gsf__parallel_for(ctx, (size_t)((dst->height + job.rows - 1) / job.rows), body, &job);
+    gsf__parallel_for(ctx, gsf__row_chunks(dst), body, &job);
 }
 
 static gsf_result gsf__resize_pil(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
@@ -2385,7 +2397,6 @@ static gsf__torch_tap gsf__torch_position(int64_t i, int64_t in, int64_t out) {
 typedef struct gsf__torch_job {
     const gsf_image *src, *dst;
     const gsf__torch_tap* columns;
-    int64_t rows;
 } gsf__torch_job;
 
 static double gsf__float_at(const char* p) {
@@ -2398,9 +2409,8 @@ static void gsf__resize_rows_torch(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__torch_job* job = (const gsf__torch_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
-    const int64_t start = (int64_t)chunk * job->rows,
-                  end = start + job->rows < dst->height ? start + job->rows : dst->height;
-    for (int64_t y = start; y < end; y++) {
+    const gsf__rows rows = gsf__chunk_rows(dst, chunk);
+    for (int64_t y = rows.begin; y < rows.end; y++) {
         const gsf__torch_tap r = gsf__torch_position(y, src->height, dst->height);
         for (int32_t c = 0; c < dst->channels; c++) {
             const char* low = (const char*)src->data + r.low * src->stride_y + c * src->stride_c;
@@ -2426,8 +2436,7 @@ static gsf_result gsf__resize_torch(gsf_context* ctx, const gsf_image* src, cons
     job.src = src;
     job.dst = dst;
     job.columns = columns;
-    job.rows = gsf__image_rows_per_chunk(dst->width, dst->channels);
-    gsf__parallel_for(ctx, (size_t)((dst->height + job.rows - 1) / job.rows), gsf__resize_rows_torch, &job);
+    gsf__parallel_for(ctx, gsf__row_chunks(dst), gsf__resize_rows_torch, &job);
     gsf_free(ctx, columns);
     return GSF_OK;
 }
@@ -2502,11 +2511,10 @@ static void gsf__psnr_rows(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__psnr_job* job = (const gsf__psnr_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
-    const int64_t first = (int64_t)chunk * job->rows,
-                  end = first + job->rows < a->height ? first + job->rows : a->height;
+    const gsf__rows rows = gsf__chunk_rows(a, chunk);
     double pa[GSF__CONVERT_RUN], pb[GSF__CONVERT_RUN], sum = 0.0;
     uint64_t count = 0;
-    for (int64_t y = first; y < end; y++)
+    for (int64_t y = rows.begin; y < rows.end; y++)
         for (int32_t c = 0; c < a->channels; c++)
             for (int64_t x = 0; x < a->width; x += GSF__CONVERT_RUN) {
                 const int64_t left = a->width - x, n = left < GSF__CONVERT_RUN ? left : (int64_t)GSF__CONVERT_RUN;
@@ -2531,8 +2539,7 @@ GSF_API gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_imag
     job.a = a;
     job.b = b;
     job.mask = mask;
-    job.rows = gsf__image_rows_per_chunk(a->width, a->channels);
-    const size_t chunks = (size_t)((a->height + job.rows - 1) / job.rows);
+    const size_t chunks = gsf__row_chunks(a);
     job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__parallel_for(ctx, chunks, gsf__psnr_rows, &job);

@@ -507,17 +507,11 @@ GSF_API double gsf_traj_fov_from_focal(double focal, double pixels) { return 2.0
 GSF_API double gsf_traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
 
 GSF_API gsf_camera gsf_traj_reduce_camera(const gsf_camera* camera, int32_t factor, int32_t width, int32_t height) {
-    gsf_camera out = *camera;
+    gsf_camera model = *camera; // at the size that is `factor` times the whole pixels of the reduced image
     const int32_t f = factor < 1 ? 1 : factor;
-    const int32_t w = camera->width / f, h = camera->height / f;
-    const double sx = (double)width / (w < 1 ? 1 : w) / f, sy = (double)height / (h < 1 ? 1 : h) / f;
-    out.fx *= sx;
-    out.cx *= sx;
-    out.fy *= sy;
-    out.cy *= sy;
-    out.width = width;
-    out.height = height;
-    return out;
+    model.width = camera->width < f ? f : camera->width / f * f;
+    model.height = camera->height < f ? f : camera->height / f * f;
+    return gsf_camera_resized(&model, width, height);
 }
 
 GSF_API gsf_camera gsf_traj_crop_camera(const gsf_camera* camera, int32_t x, int32_t y, int32_t width, int32_t height) {

@@ -1,5 +1,6 @@
 // Fuzz target for the image decoders behind gsf_load_image_memory.
-//   clang -g -O1 -fsanitize=fuzzer,address,undefined -I. tests/fuzz_image.c -o fuzz_image -lm && ./fuzz_image tests/corpus/image
+//   clang -g -O1 -fsanitize=fuzzer,address,undefined -I. tests/fuzz_image.c -o fuzz_image -lm
+//   ./fuzz_image tests/corpus/image
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
 

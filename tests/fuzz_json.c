@@ -1,5 +1,6 @@
 // Fuzz target for the JSON parser. What it accepts must print as text that parses to the same values again.
-//   clang -g -O1 -fsanitize=fuzzer,address,undefined -I. tests/fuzz_json.c -o fuzz_json -lm && ./fuzz_json tests/corpus/json
+//   clang -g -O1 -fsanitize=fuzzer,address,undefined -I. tests/fuzz_json.c -o fuzz_json -lm
+//   ./fuzz_json tests/corpus/json
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
 

@@ -93,8 +93,9 @@ static double plain_ssim_skimage(const gsf_image* a, const gsf_image* b, const g
 // float32 once more; gsf_ssim leaves that second rounding out, which is all they differ by.
 static double plain_ssim_3dgs(const gsf_image* a, const gsf_image* b, const gsf_image* mask) {
     // float32 of exp(-x^2/4.5) / sum, the sum taken in torch's order
-    static const float kernel[11] = {0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f, 0.213005528f, 0.266011715f,
-                                     0.213005528f, 0.109360687f, 0.0360007733f, 0.00759875821f, 0.00102838012f};
+    static const float kernel[11] = {0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f,
+                                     0.213005528f,   0.266011715f,   0.213005528f,  0.109360687f,
+                                     0.0360007733f,  0.00759875821f, 0.00102838012f};
     double sum = 0.0;
     int64_t count = 0;
     for (int32_t c = 0; c < a->channels; c++)
@@ -127,8 +128,8 @@ static uint64_t hash_pixels(const pair* p) { // FNV-1a of both images
     return hash;
 }
 
-// structural_similarity(a / 255, b / 255, data_range=1.0, channel_axis=0) of scikit-image 0.26.0 on the committed pairs;
-// the hash tells whether the golden folder in use holds the same pixels.
+// structural_similarity(a / 255, b / 255, data_range=1.0, channel_axis=0) of scikit-image 0.26.0 on the committed
+// pairs; the hash tells whether the golden folder in use holds the same pixels.
 static const struct { const char* name; uint64_t hash; double ssim; } skimage[] = {
     {"black_white", 14272087802833798949u, 9.9990000999899988e-05},
     {"blur", 11848061275429587887u, 0.70729096266230229},

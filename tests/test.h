@@ -72,13 +72,17 @@ static inline uint64_t test_random_bits(uint64_t* state) { // splitmix64
     x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
     return x ^ (x >> 31);
 }
-static inline double test_random(uint64_t* state) { return (double)(test_random_bits(state) >> 11) / 9007199254740992.0; }
-static inline double test_random_in(uint64_t* state, double lo, double hi) { return lo + (hi - lo) * test_random(state); }
+static inline double test_random(uint64_t* state) {
+    return (double)(test_random_bits(state) >> 11) / 9007199254740992.0;
+}
+static inline double test_random_in(uint64_t* state, double lo, double hi) {
+    return lo + (hi - lo) * test_random(state);
+}
 
 // ---- golden data ---------------------------------------------------------------
 
-// Path of a file below GSF_GOLDEN (environment, default: the committed copy, compiled in as TEST_GOLDEN). Static buffers,
-// the last 8 stay valid.
+// Path of a file below GSF_GOLDEN (environment, default: the committed copy, compiled in as TEST_GOLDEN). Static
+// buffers, the last 8 stay valid.
 static inline const char* test_golden(const char* relative) {
     static char paths[8][1024];
     static int turn;
@@ -131,7 +135,10 @@ static inline char* test_read_file(const char* path, size_t* size) { // exits wh
     const long end = ftell(file);
     rewind(file);
     char* data = (char*)malloc((size_t)end + 1);
-    if (!data || fread(data, 1, (size_t)end, file) != (size_t)end) { fprintf(stderr, "%s: cannot be read\n", path); exit(2); }
+    if (!data || fread(data, 1, (size_t)end, file) != (size_t)end) {
+        fprintf(stderr, "%s: cannot be read\n", path);
+        exit(2);
+    }
     fclose(file);
     data[end] = 0;
     if (size) *size = (size_t)end;
@@ -261,8 +268,8 @@ static inline int test_compare(const char* what, const double* actual, const dou
     const int ok = count == 0 || error <= tolerance;
     test_checks++;
     if (!ok && ++test_failures <= 50)
-        fprintf(stderr, "%s: worst at %zu of %zu: %.17g, expected %.17g (error %.3g, allowed %.3g)\n", what, worst, count,
-                actual[worst], expected[worst], error, tolerance);
+        fprintf(stderr, "%s: worst at %zu of %zu: %.17g, expected %.17g (error %.3g, allowed %.3g)\n", what, worst,
+                count, actual[worst], expected[worst], error, tolerance);
     return ok;
 }
 

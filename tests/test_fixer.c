@@ -240,7 +240,8 @@ static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]
         if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) return 1;
         if (counts) counts[stats.stage]++;
         if (stats.stage == GSF_FIX_DONE) return 1;
-        if (stats.stage == GSF_FIX_RESTORE) CHECK(stats.frame_count == 9 && stats.rendered != NULL && stats.cameras != NULL);
+        if (stats.stage == GSF_FIX_RESTORE)
+            CHECK(stats.frame_count == 9 && stats.rendered != NULL && stats.cameras != NULL);
     }
     return 0;
 }
@@ -257,7 +258,8 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     CHECK(used.rounds == 2 && used.windows == VIEWS && used.window_frames == 17 && used.lambda == 1.0f);
     CHECK(used.first_round == 9999 && used.last_round == 19999 && used.skip_psnr == 0.0f);
     CHECK(used.train.iterations == 30000 && used.train.lr_means == 1.6e-4f && used.train.lambda_ssim == 0.0f);
-    CHECK(used.train.extent > 1.0f && used.train.extent < 4.0f && used.train.render.near_plane == 0.01f * used.train.extent);
+    CHECK(used.train.extent > 1.0f && used.train.extent < 4.0f &&
+          used.train.render.near_plane == 0.01f * used.train.extent);
     gsf_splat_destroy_fixer(ctx, fixer);
     given = repair_desc();
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, NULL, &fixer));
@@ -375,18 +377,21 @@ static void test_trouble(gsf_context* ctx) {
     gsf_splat_destroy_fixer(ctx, calm);
     // bad descriptions
     desc.window_frames = 1;
-    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
+                 GSF_ERROR_INVALID_ARGUMENT);
     desc = repair_desc();
     desc.first_round = 1000;
-    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
+                 GSF_ERROR_INVALID_ARGUMENT);
     desc = repair_desc();
     r.restorer.end_fn = NULL;
-    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough),
+                 GSF_ERROR_INVALID_ARGUMENT);
     repair_teardown(ctx, &r);
 }
 
-// The start is the truth, so what photos 0 and 1 show is what is rendered there. Photos 2 and 3 show something else, each its
-// own: the references do not explain what lies between them.
+// The start is the truth, so what photos 0 and 1 show is what is rendered there. Photos 2 and 3 show something else,
+// each its own: the references do not explain what lies between them.
 static void mixed_setup(gsf_context* ctx, repair* r) {
     repair_setup(ctx, r);
     uint64_t seed = 11;
@@ -405,8 +410,8 @@ static uint64_t frames_in(const gsf_text* chunks, const char* tag) {
     return count;
 }
 
-// One run of mixed_setup's scene: two rounds of four windows of 9 frames, of which the first `skips` are skipped in each.
-// resumed: every window is followed by a checkpoint and a new fixer that goes on from it.
+// One run of mixed_setup's scene: two rounds of four windows of 9 frames, of which the first `skips` are skipped in
+// each. resumed: every window is followed by a checkpoint and a new fixer that goes on from it.
 static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int skips, int resumed) {
     gsf_fix_desc desc = repair_desc();
     gsf_fixer *fixer, *next;
@@ -473,7 +478,8 @@ static void test_seen_mask(gsf_context* ctx) {
     const gsf_camera novel = around(0.1, 0.0);
     gsf_camera cameras[VIEWS];
     for (int i = 0; i < VIEWS; i++) cameras[i] = r.views[i].camera;
-    gsf_image mask = gsf_wrap_image(seen, GSF_U8, WIDTH, HEIGHT, 1), full = gsf_wrap_image(all, GSF_U8, WIDTH, HEIGHT, 1);
+    gsf_image mask = gsf_wrap_image(seen, GSF_U8, WIDTH, HEIGHT, 1),
+              full = gsf_wrap_image(all, GSF_U8, WIDTH, HEIGHT, 1);
     CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, cameras, VIEWS, &full));
     CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, &novel, 1, &mask)); // a camera sees what it sees
     int self = 0, more = 0, covered = 0;

@@ -66,7 +66,8 @@ int main() {
         // projection: glm::project counts rows from the bottom
         const glm::dmat4 view = gsf_to_glm_view(camera), projection = gsf_to_glm_projection(camera, 0.1, 100.0);
         const glm::dvec4 viewport(0, 0, camera.width, camera.height);
-        const glm::dvec3 local(test_random_in(&seed, -2, 2), test_random_in(&seed, -2, 2), test_random_in(&seed, 0.5, 9));
+        const glm::dvec3 local(test_random_in(&seed, -2, 2), test_random_in(&seed, -2, 2),
+                               test_random_in(&seed, 0.5, 9));
         const glm::dvec3 world(inverse * glm::dvec4(local, 1.0));
         const glm::dvec3 window = glm::project(world, view, projection, viewport);
         const double point[3] = {world.x, world.y, world.z};
@@ -85,7 +86,8 @@ int main() {
         // the same projection as glm::frustum of the image borders on the near plane
         const double near_plane = 0.1, l = -camera.cx / camera.fx, r = (camera.width - camera.cx) / camera.fx;
         const double t = camera.cy / camera.fy, b = -(camera.height - camera.cy) / camera.fy;
-        const glm::dmat4 frustum = glm::frustum(l * near_plane, r * near_plane, b * near_plane, t * near_plane, near_plane, 100.0);
+        const glm::dmat4 frustum =
+            glm::frustum(l * near_plane, r * near_plane, b * near_plane, t * near_plane, near_plane, 100.0);
         gsf_from_glm(frustum, wide);
         gsf_from_glm(projection, back);
         test_compare("projection", back, wide, 16, 1e-12);

@@ -266,20 +266,22 @@ static gsf_result parse(gsf_context* ctx, const char* text, size_t size) { // fr
 
 static void test_json_conformance(gsf_context* ctx) {
     static const char* const good[] = {
-        "null", "true", "false", "0", "-0", "-0.0e-0", "1E5", "1e+05", "12.5e-3", "\"\"", "[]", "{}", " [ ] ", "\t\r\n{ }\n",
-        "[1,2,[3,{}],{\"a\":[]}]", "{\"\":0}", "{\"a\":{\"a\":1},\"b\":{\"a\":2}}", "\"\\u0000\"", "\"\\ud83d\\ude00\"",
-        "\"\\\"\\\\\\/\\b\\f\\n\\r\\t\"", "\"\xc3\xa9\xe2\x82\xac\xf0\x9f\x98\x80\"", "\"\x7f\"", "\"\xf4\x8f\xbf\xbf\"",
-        "\"\xed\x9f\xbf\xee\x80\x80\"", "1e-400", "0.00000000000000000000000000000000000000000000001", "1.7976931348623157e308",
-        "123456789012345678901234567890", "[0.1,-1.5E+10]", "{\"a\\u0000\":1,\"a\":2}"};
+        "null", "true", "false", "0", "-0", "-0.0e-0", "1E5", "1e+05", "12.5e-3", "\"\"", "[]", "{}", " [ ] ",
+        "\t\r\n{ }\n", "[1,2,[3,{}],{\"a\":[]}]", "{\"\":0}", "{\"a\":{\"a\":1},\"b\":{\"a\":2}}", "\"\\u0000\"",
+        "\"\\ud83d\\ude00\"", "\"\\\"\\\\\\/\\b\\f\\n\\r\\t\"", "\"\xc3\xa9\xe2\x82\xac\xf0\x9f\x98\x80\"", "\"\x7f\"",
+        "\"\xf4\x8f\xbf\xbf\"", "\"\xed\x9f\xbf\xee\x80\x80\"", "1e-400",
+        "0.00000000000000000000000000000000000000000000001", "1.7976931348623157e308", "123456789012345678901234567890",
+        "[0.1,-1.5E+10]", "{\"a\\u0000\":1,\"a\":2}"};
     static const char* const bad[] = {
-        "", " ", "nul", "nulll", "True", "NaN", "Infinity", "-Infinity", "-", "+1", "01", "-01", "1.", ".5", "1.e5", "1e", "1e+",
-        "0x10", "1 2", "[1,]", "[,1]", "[1,,2]", "[", "]", "[1", "[1 2]", "{", "}", "{\"a\"}", "{\"a\":}", "{\"a\":1,}",
-        "{a:1}", "{'a':1}", "{\"a\":1 \"b\":2}", "{1:2}", "{\"a\" 1}", "[\"a\":1]", "\"", "\"a", "'a'", "\"\\\"", "\"\\x41\"",
-        "\"\\u12g4\"", "\"\\u123\"", "\"\\ud800\"", "\"\\udc00\"", "\"\\ud800\\u0041\"", "\"\\ud800\\ud800\"", "\"\\ud800x\"",
-        "\"\n\"", "\"\t\"", "\"\x01\"", "\"\xff\"", "\"\xc0\xaf\"", "\"\xc3\"", "\"\xe2\x82\"", "\"\xed\xa0\x80\"",
-        "\"\xf5\x80\x80\x80\"", "\"\xf4\x90\x80\x80\"", "\"\xf0\x80\x80\x80\"", "\"\x80\"", "1e999", "-1e999", "[1e400]",
-        "{\"a\":1,\"a\":2}", "{\"a\":1,\"\\u0061\":2}", "{\"x\":[{\"a\":1,\"b\":1,\"a\":1}]}", "\xef\xbb\xbf[]", "// c\n1", "/**/1",
-        "[1]x", "[1]]", "{}{}", "\f1", "\v1", "1\xa0", "[\"a\",\n4\n,1,", "{\"a\":/*c*/1}", "\xff\xfe[\0]\0"};
+        "", " ", "nul", "nulll", "True", "NaN", "Infinity", "-Infinity", "-", "+1", "01", "-01", "1.", ".5", "1.e5",
+        "1e", "1e+", "0x10", "1 2", "[1,]", "[,1]", "[1,,2]", "[", "]", "[1", "[1 2]", "{", "}", "{\"a\"}", "{\"a\":}",
+        "{\"a\":1,}", "{a:1}", "{'a':1}", "{\"a\":1 \"b\":2}", "{1:2}", "{\"a\" 1}", "[\"a\":1]", "\"", "\"a", "'a'",
+        "\"\\\"", "\"\\x41\"", "\"\\u12g4\"", "\"\\u123\"", "\"\\ud800\"", "\"\\udc00\"", "\"\\ud800\\u0041\"",
+        "\"\\ud800\\ud800\"", "\"\\ud800x\"", "\"\n\"", "\"\t\"", "\"\x01\"", "\"\xff\"", "\"\xc0\xaf\"", "\"\xc3\"",
+        "\"\xe2\x82\"", "\"\xed\xa0\x80\"", "\"\xf5\x80\x80\x80\"", "\"\xf4\x90\x80\x80\"", "\"\xf0\x80\x80\x80\"",
+        "\"\x80\"", "1e999", "-1e999", "[1e400]", "{\"a\":1,\"a\":2}", "{\"a\":1,\"\\u0061\":2}",
+        "{\"x\":[{\"a\":1,\"b\":1,\"a\":1}]}", "\xef\xbb\xbf[]", "// c\n1", "/**/1", "[1]x", "[1]]", "{}{}", "\f1",
+        "\v1", "1\xa0", "[\"a\",\n4\n,1,", "{\"a\":/*c*/1}", "\xff\xfe[\0]\0"};
     for (size_t i = 0; i < sizeof good / sizeof *good; i++)
         if (parse(ctx, good[i], strlen(good[i])) != GSF_OK) CHECK_OK(ctx, parse(ctx, good[i], strlen(good[i])));
     for (size_t i = 0; i < sizeof bad / sizeof *bad; i++) {
@@ -332,7 +334,8 @@ static void test_json_values(gsf_context* ctx) {
     for (int twice = 0; twice < 2; twice++) {
         big.size = 0;
         gsf_text_append(ctx, &big, "{", 1);
-        for (int i = 0; i < MEMBERS; i++) gsf_text_printf(ctx, &big, "%s\"k%d\":%d", i ? "," : "", i * 7919 % MEMBERS, i);
+        for (int i = 0; i < MEMBERS; i++)
+            gsf_text_printf(ctx, &big, "%s\"k%d\":%d", i ? "," : "", i * 7919 % MEMBERS, i);
         gsf_text_printf(ctx, &big, "%s}", twice ? ",\"k1234\":0" : "");
         CHECK_RESULT(ctx, parse(ctx, big.data, big.size), twice ? GSF_ERROR_FORMAT : GSF_OK);
     }
@@ -397,7 +400,8 @@ static void test_json_numbers(gsf_context* ctx) {
     static const char* const locales[] = {"de_DE.UTF-8", "fr_FR.UTF-8", "de_DE", "nl_NL.UTF-8"};
     for (size_t i = 0; i < sizeof locales / sizeof *locales; i++)
         if (setlocale(LC_ALL, locales[i])) {
-            CHECK(number_of(ctx, "1.5") == 1.5 && number_of(ctx, "1.2345678901234567890123e-5") == 1.2345678901234567890123e-5);
+            CHECK(number_of(ctx, "1.5") == 1.5 &&
+                  number_of(ctx, "1.2345678901234567890123e-5") == 1.2345678901234567890123e-5);
             check_number_round_trip(ctx, 0.1);
             setlocale(LC_ALL, "C");
         }
@@ -412,7 +416,8 @@ static void test_json_text(gsf_context* ctx) {
     gsf_text_json_string(ctx, &text, all);
     gsf_json json;
     if (CHECK_OK(ctx, gsf_parse_json(ctx, "string", text.data, text.size, &json)))
-        CHECK(memcmp(json.values[0].string, all, 127) == 0 && memcmp(json.values[0].string + 127, "\xef\xbf\xbd", 3) == 0);
+        CHECK(memcmp(json.values[0].string, all, 127) == 0 &&
+              memcmp(json.values[0].string + 127, "\xef\xbf\xbd", 3) == 0);
     gsf_destroy_json(ctx, &json);
     text.size = 0;
     static const char good[] = "a\"\\\xc3\xa9\xf0\x9f\x98\x80\n";
@@ -449,7 +454,8 @@ static void test_conversions(gsf_context* ctx) {
         CHECK(floats[i] == (float)i / 255.0f);
         CHECK(shorts[i] == 257 * i);
     }
-    static const float in[] = {-1.0f, -0.0f, 0.00196078f, 0.0019608f, 0.5f, 0.999f, 1.0f, 7.0f, NAN, INFINITY, -INFINITY};
+    static const float in[] = {-1.0f, -0.0f, 0.00196078f, 0.0019608f, 0.5f,     0.999f,
+                               1.0f,  7.0f,  NAN,         INFINITY,   -INFINITY};
     static const uint8_t expected[] = {0, 0, 0, 1, 128, 255, 255, 255, 0, 255, 0}; // (x*255 + 0.5), truncated
     memcpy(floats, in, sizeof in);
     gsf_image f = gsf_wrap_image(floats, GSF_F32, 11, 1, 1);
@@ -497,11 +503,13 @@ static void test_conversions(gsf_context* ctx) {
     CHECK(made.data == NULL);
 }
 
-static gsf_image noise_image(gsf_context* ctx, int64_t width, int64_t height, int32_t channels) { // smooth and noisy parts
+// Smooth and noisy parts.
+static gsf_image noise_image(gsf_context* ctx, int64_t width, int64_t height, int32_t channels) {
     gsf_image image;
     CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, width, height, channels, &image));
     for (int64_t i = 0; i < width * height * channels; i++)
-        ((uint8_t*)image.data)[i] = (uint8_t)(i % channels * 60 + i / channels % width * 3 + (int64_t)(gsf_random_bits(1, 2, (uint64_t)i) & 15));
+        ((uint8_t*)image.data)[i] = (uint8_t)(i % channels * 60 + i / channels % width * 3 +
+                                              (int64_t)(gsf_random_bits(1, 2, (uint64_t)i) & 15));
     return image;
 }
 
@@ -585,7 +593,8 @@ static void test_damaged_images(gsf_context* ctx, heap* h) {
             for (int change = 0; change < 3; change++) {
                 memcpy(copy, file.data, file.size);
                 copy[i] = (char)(change == 0 ? ~copy[i] : change == 1 ? copy[i] ^ 1 : 0x7f);
-                if (gsf_load_image_memory(ctx, "changed", copy, file.size, 3, &out) == GSF_OK && copy[i] != file.data[i])
+                if (gsf_load_image_memory(ctx, "changed", copy, file.size, 3, &out) == GSF_OK &&
+                    copy[i] != file.data[i])
                     accepted++;
                 gsf_destroy_image(ctx, &out);
             }
@@ -801,12 +810,15 @@ static void test_camera_files(gsf_context* ctx) {
     CHECK(gsf_save_cameras(ctx, path, cameras, names, 2) != GSF_OK && strstr(ctx->error, "camera 1") != NULL);
 
 #define M "[1,0,0,0.5,0,1,0,2,0,0,1,3,0,0,0,1]"
-    static const char good[] = "{\"x\":1,\"cameras\":[{\"w2c\":" M ",\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}";
+    static const char good[] =
+        "{\"x\":1,\"cameras\":[{\"w2c\":" M ",\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}";
     static const char* const bad[] = {
         "[]", "{}", "{\"cameras\":{}}", "{\"cameras\":[1]}", "{\"cameras\":[{}]}",
         "{\"cameras\":[{\"w2c\":[1,2],\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}",
-        "{\"cameras\":[{\"w2c\":[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,null],\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}",
-        "{\"cameras\":[{\"w2c\":[2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1],\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}",
+        "{\"cameras\":[{\"w2c\":[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,null],\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,"
+        "\"height\":3}]}",
+        "{\"cameras\":[{\"w2c\":[2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1],\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,"
+        "\"height\":3}]}",
         "{\"cameras\":[{\"w2c\":" M ",\"fx\":\"1\",\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}",
         "{\"cameras\":[{\"w2c\":" M ",\"fx\":-1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4,\"height\":3}]}",
         "{\"cameras\":[{\"w2c\":" M ",\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4.5,\"height\":3}]}",

@@ -1,5 +1,5 @@
-// The OpenImageIO section: EXR, TIFF and 16-bit PNG there and back, through files and memory; and OpenImageIO as a judge of
-// our decoder, of gsf_psnr and of half precision.
+// The OpenImageIO section: EXR, TIFF and 16-bit PNG there and back, through files and memory; and OpenImageIO as a
+// judge of our decoder, of gsf_psnr and of half precision.
 #define GSF_USE_OIIO
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
@@ -65,7 +65,8 @@ static void check_channels(gsf_context* ctx) { // what the `channels` argument d
     gsf_destroy_image(ctx, &back);
     CHECK_OK(ctx, gsf_load_image(ctx, path, 1, &back));
     for (int i = 0; i < W * H; i++)
-        CHECK_NEAR(((float*)back.data)[i], (77.0 * p[4 * i] + 150.0 * p[4 * i + 1] + 29.0 * p[4 * i + 2]) / 256.0, 1e-7);
+        CHECK_NEAR(((float*)back.data)[i], (77.0 * p[4 * i] + 150.0 * p[4 * i + 1] + 29.0 * p[4 * i + 2]) / 256.0,
+                   1e-7);
     gsf_destroy_image(ctx, &back);
     gsf_destroy_image(ctx, &image);
     image = make_test_image(ctx, GSF_U16, 1);

@@ -1,4 +1,5 @@
-// Resizes against golden/encoders/preprocess: PIL byte for byte (also whole pictures by their SHA-256), torch in float32.
+// Resizes against golden/encoders/preprocess: PIL byte for byte (also whole pictures by their SHA-256), torch in
+// float32.
 #include "gsfixer.h"
 #include "test.h"
 
@@ -25,7 +26,8 @@ static void sha256_block(uint32_t state[8], const uint8_t* p) {
     memcpy(v, state, sizeof v);
     for (int i = 0; i < 64; i++) {
         const uint32_t a = v[0], e = v[4];
-        const uint32_t t1 = v[7] + (rotate(e, 6) ^ rotate(e, 11) ^ rotate(e, 25)) + ((e & v[5]) ^ (~e & v[6])) + k[i] + w[i];
+        const uint32_t t1 =
+            v[7] + (rotate(e, 6) ^ rotate(e, 11) ^ rotate(e, 25)) + ((e & v[5]) ^ (~e & v[6])) + k[i] + w[i];
         const uint32_t t2 = (rotate(a, 2) ^ rotate(a, 13) ^ rotate(a, 22)) + ((a & v[1]) ^ (a & v[2]) ^ (v[1] & v[2]));
         memmove(v + 1, v, 7 * sizeof *v);
         v[4] += t1;
@@ -35,7 +37,8 @@ static void sha256_block(uint32_t state[8], const uint8_t* p) {
 }
 
 static void sha256_hex(const uint8_t* data, size_t size, char hex[65]) {
-    uint32_t state[8] = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a, 0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
+    uint32_t state[8] = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
+                         0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
     uint8_t tail[128] = {0};
     size_t whole = size / 64 * 64, rest = size - whole, tail_size = rest < 56 ? 64 : 128;
     for (size_t i = 0; i < whole; i += 64) sha256_block(state, data + i);
@@ -73,7 +76,8 @@ static void check_pil_resizes(gsf_context* ctx) {
             CHECK_OK(ctx, gsf_resize_image(ctx, &src, prefixes[k].filter, &dst));
             size_t different = 0;
             for (size_t p = 0; p < expected.count; p++) different += ((uint8_t*)dst.data)[p] != (uint8_t)expected.v[p];
-            if (!CHECK(different == 0)) fprintf(stderr, "%s: %zu of %zu bytes differ\n", name, different, expected.count);
+            if (!CHECK(different == 0))
+                fprintf(stderr, "%s: %zu of %zu bytes differ\n", name, different, expected.count);
             // the same through other layouts: planar and upside down
             CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, w, h, 3, &planar));
             planar.stride_x = 1;

@@ -1,5 +1,6 @@
-// test_scene.c - splat files, COLMAP models, transforms.json, undistortion, view images: golden data, round trips, every
-// truncation, flipped bytes, failing allocations. GSF_FOX may name a folder with the fox photos (see the last test).
+// test_scene.c - splat files, COLMAP models, transforms.json, undistortion, view images: golden data, round trips,
+// every truncation, flipped bytes, failing allocations. GSF_FOX may name a folder with the fox photos (see the last
+// test).
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 #include "test.h"
@@ -76,7 +77,8 @@ static void compare_ply(const char* file, const char* tensors, double tolerance)
         test_compare_floats("rotation", s.quats, rotation.v, 4 * n, tolerance);
         for (size_t i = 0; i < n; i++) {
             test_compare_floats("f_dc", s.sh + 3 * k * i, dc.v + 3 * i, 3, tolerance);
-            if (k_rest) test_compare_floats("f_rest", s.sh + 3 * k * i + 3, rest.v + 3 * k_rest * i, 3 * k_rest, tolerance);
+            if (k_rest)
+                test_compare_floats("f_rest", s.sh + 3 * k * i + 3, rest.v + 3 * k_rest * i, 3 * k_rest, tolerance);
             CHECK(s.ids[i] == i);
         }
     }
@@ -261,7 +263,8 @@ static void test_ply_variants(void) { // elements before and after, carriage ret
     CHECK(s.count == 1 && warnings == 1);
     if (s.count == 1) {
         CHECK(s.means[0] == -5.0f && s.means[1] == 300.0f && s.means[2] == 1.5f);
-        CHECK(s.sh[0] == 0.25f && s.sh[1] == -0.1f && s.sh[2] == 1e-3f && s.opacity_logits[0] == 12345678901234567890123.0f);
+        CHECK(s.sh[0] == 0.25f && s.sh[1] == -0.1f && s.sh[2] == 1e-3f &&
+              s.opacity_logits[0] == 12345678901234567890123.0f);
     }
     gsf_splat_destroy(&ctx, &s);
     CHECK(count.live == 0);
@@ -407,7 +410,8 @@ static void test_colmap_golden(int is_text) {
                 seen |= tracks.v[3 * e] == point_ids.v[p] && tracks.v[3 * e + 1] == scene.views[v].image_id;
             expected += (size_t)seen;
             int listed = 0;
-            for (size_t e = scene.track_begin[p]; e < scene.track_begin[p + 1]; e++) listed += scene.track_views[e] == v;
+            for (size_t e = scene.track_begin[p]; e < scene.track_begin[p + 1]; e++)
+                listed += scene.track_views[e] == v;
             CHECK(listed == seen);
         }
         CHECK(scene.track_begin[p + 1] - scene.track_begin[p] == expected);
@@ -500,7 +504,8 @@ static void test_colmap_bad(void) {
         ctx.error[0] = 0;
         count.asked = 0;
         CHECK_RESULT(&ctx, parse_model(&ctx, 0, &files, &scene), cases[i].result);
-        if (!CHECK(!cases[i].says || strstr(ctx.error, cases[i].says))) fprintf(stderr, "  %s: %s\n", cases[i].name, ctx.error);
+        if (!CHECK(!cases[i].says || strstr(ctx.error, cases[i].says)))
+            fprintf(stderr, "  %s: %s\n", cases[i].name, ctx.error);
         CHECK(count.asked < 1000000);
         if (i == 10) CHECK(warnings == 1 && strstr(warning, "1 track entries"));
         if (i == 13) CHECK(scene.point_count == 0 && scene.track_begin[0] == 0);
@@ -508,7 +513,8 @@ static void test_colmap_bad(void) {
         free_model(&files);
     }
     // as a folder the missing points are an error
-    CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, test_golden("splat/bad/colmap/13_points_missing"), NULL, &scene), GSF_ERROR_IO);
+    CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, test_golden("splat/bad/colmap/13_points_missing"), NULL, &scene),
+                 GSF_ERROR_IO);
     CHECK(strstr(ctx.error, "points3D.bin") != NULL);
     CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, "no/such/folder", NULL, &scene), GSF_ERROR_IO);
     CHECK(strstr(ctx.error, "no/such/folder: no scene") != NULL);
@@ -570,7 +576,8 @@ static void test_colmap_out_of_memory(int is_text) {
 }
 
 // Text oddities: comments, empty lines, names with spaces, a missing last line, malformed values.
-static gsf_result parse_text(gsf_context* ctx, const char* cameras, const char* images, const char* points, gsf_scene* out) {
+static gsf_result parse_text(gsf_context* ctx, const char* cameras, const char* images, const char* points,
+                             gsf_scene* out) {
     model_files m;
     m.data[0] = (char*)(size_t)cameras, m.data[1] = (char*)(size_t)images, m.data[2] = (char*)(size_t)points;
     for (int i = 0; i < 3; i++) m.size[i] = m.data[i] ? strlen(m.data[i]) : 0;
@@ -608,9 +615,12 @@ static void test_colmap_text(void) {
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_scene scene;
-    CHECK_OK(&ctx, parse_text(&ctx, cameras, images, "9 1 2 3 4 5 6 -1 4 0 3 0 4 1 88 2\n8 nan 0 0 0 0 0 0 4 0\n", &scene));
-    CHECK(scene.view_count == 2 && strcmp(scene.views[0].name, "a.png") == 0 && strcmp(scene.views[1].name, "b c.png") == 0);
-    CHECK(scene.point_count == 1 && scene.track_begin[1] == 2 && scene.track_views[0] == 0 && scene.track_views[1] == 1);
+    CHECK_OK(&ctx,
+             parse_text(&ctx, cameras, images, "9 1 2 3 4 5 6 -1 4 0 3 0 4 1 88 2\n8 nan 0 0 0 0 0 0 4 0\n", &scene));
+    CHECK(scene.view_count == 2 && strcmp(scene.views[0].name, "a.png") == 0 &&
+          strcmp(scene.views[1].name, "b c.png") == 0);
+    CHECK(scene.point_count == 1 && scene.track_begin[1] == 2 && scene.track_views[0] == 0 &&
+          scene.track_views[1] == 1);
     CHECK(warnings == 2 && scene.views[0].camera.fx == 35 && scene.views[0].camera.width == 40);
     CHECK_RESULT(&ctx, gsf_splat_load_view_image(&ctx, &scene, 0), GSF_ERROR_INVALID_ARGUMENT);
     gsf_splat_destroy_scene(&ctx, &scene);
@@ -655,11 +665,17 @@ static void reference_distort(int model, const double* p, double u, double v, do
 }
 
 static void test_lenses(void) {
-    static const double params[11][12] = {
-        {90, 51, 37}, {90, 95, 51, 37}, {90, 51, 37, -0.12}, {90, 51, 37, -0.1, 0.02}, {90, 95, 51, 37, -0.1, 0.02, 1e-3, -2e-3},
-        {60, 62, 51, 37, 0.02, -0.01, 0.004, -0.001}, {90, 95, 51, 37, 0.1, 0.02, 1e-3, -2e-3, 0.01, 0.2, 0.03, 0.002},
-        {60, 62, 51, 37, 0.9}, {60, 51, 37, 0.03}, {60, 51, 37, 0.03, -0.01},
-        {60, 62, 51, 37, 0.02, -0.01, 1e-3, -2e-3, 0.004, -0.001, 2e-3, -1e-3}};
+    static const double params[11][12] = {{90, 51, 37},
+                                          {90, 95, 51, 37},
+                                          {90, 51, 37, -0.12},
+                                          {90, 51, 37, -0.1, 0.02},
+                                          {90, 95, 51, 37, -0.1, 0.02, 1e-3, -2e-3},
+                                          {60, 62, 51, 37, 0.02, -0.01, 0.004, -0.001},
+                                          {90, 95, 51, 37, 0.1, 0.02, 1e-3, -2e-3, 0.01, 0.2, 0.03, 0.002},
+                                          {60, 62, 51, 37, 0.9},
+                                          {60, 51, 37, 0.03},
+                                          {60, 51, 37, 0.03, -0.01},
+                                          {60, 62, 51, 37, 0.02, -0.01, 1e-3, -2e-3, 0.004, -0.001, 2e-3, -1e-3}};
     counter count;
     gsf_context ctx = make_context(&count);
     for (int model = 0; model < 11; model++) {
@@ -673,7 +689,8 @@ static void test_lenses(void) {
             for (int32_t i = 0; i < r.width; i++) {
                 double x, y, ex, ey;
                 gsf__rectify_map(&r, i, j, &x, &y);
-                reference_distort(model, params[model], (i + r.centre - r.cx) / r.fx, (j + r.centre - r.cy) / r.fy, &ex, &ey);
+                reference_distort(model, params[model], (i + r.centre - r.cx) / r.fx, (j + r.centre - r.cy) / r.fy, &ex,
+                                  &ey);
                 worst = fmax(worst, fmax(fabs(x + r.centre - ex), fabs(y + r.centre - ey)));
                 least = fmin(least, fmin(fmin(x, y), fmin(99 - x, 71 - y)));
             }
@@ -699,7 +716,8 @@ static void compare_scenes(const gsf_scene* a, const gsf_scene* b) {
         CHECK(x->width == y->width && x->height == y->height);
         test_compare("w2c", x->w2c, y->w2c, 16, 1e-14);
     }
-    CHECK(memcmp(a->points, b->points, 24 * a->point_count) == 0 && memcmp(a->colors, b->colors, 3 * a->point_count) == 0);
+    CHECK(memcmp(a->points, b->points, 24 * a->point_count) == 0 &&
+          memcmp(a->colors, b->colors, 3 * a->point_count) == 0);
     CHECK(memcmp(a->point_ids, b->point_ids, 8 * a->point_count) == 0);
     CHECK(memcmp(a->track_begin, b->track_begin, sizeof(size_t) * (a->point_count + 1)) == 0);
     CHECK(memcmp(a->track_views, b->track_views, 4 * a->track_begin[a->point_count]) == 0);
@@ -742,7 +760,8 @@ static void test_save_load(void) {
                 i += 8 + 24 * (size_t)gsf__load_le(images->data + i, 8);
             }
             i += 64 + strlen(images->data + i + 64) + 1;
-            CHECK(index < gsf__load_le(images->data + i, 8) && gsf__load_le(images->data + i + 8 + 24 * index + 16, 8) == id);
+            CHECK(index < gsf__load_le(images->data + i, 8) &&
+                  gsf__load_le(images->data + i + 8 + 24 * index + 16, 8) == id);
         }
     }
     for (size_t k = 1;; k++) { // failing allocations while writing and reading a folder
@@ -774,7 +793,8 @@ static gsf_scene load_folder(gsf_context* ctx, const char* path, int factor, int
     return scene;
 }
 
-static void check_view(gsf_context* ctx, gsf_scene* scene, size_t v, int width, int height, double fx, double cx, double cy) {
+static void check_view(gsf_context* ctx, gsf_scene* scene, size_t v, int width, int height, double fx, double cx,
+                       double cy) {
     if (!CHECK(v < scene->view_count)) return;
     const gsf_camera* c = &scene->views[v].camera;
     CHECK(c->width == width && c->height == height);
@@ -791,12 +811,14 @@ static void test_image_folders(void) {
     counter count;
     disk_put(&disk, "s/sparse/cameras.txt", "1 PINHOLE 41 30 35 36 20 15\n2 SIMPLE_RADIAL 40 30 35 20 15 0.05\n");
     disk_put(&disk, "s/sparse/images.txt",
-             "5 1 0 0 0 0 0 0 1 sub/a.jpg\n\n2 1 0 0 0 1 0 0 1 b.png\n\n9 1 0 0 0 2 0 0 2 c.png\n\n1 1 0 0 0 2 0 0 2 d.png\n\n");
+             "5 1 0 0 0 0 0 0 1 sub/a.jpg\n\n2 1 0 0 0 1 0 0 1 b.png\n\n9 1 0 0 0 2 0 0 2 c.png\n\n1 1 0 0 0 2 0 0 2 "
+             "d.png\n\n");
     disk_put(&disk, "s/sparse/points3D.txt", "3 0 0 5 1 2 3 0 1 0 9 0 5 0 2 0\n");
     disk_put_photo(&disk, "s/images/sub/a.jpg", 41, 30, 1);
     disk_put_photo(&disk, "s/images/b.png", 82, 60, 2); // larger than COLMAP says
     disk_put_photo(&disk, "s/images/c.png", 40, 30, 3);
-    disk_put_photo(&disk, "s/images_2/sub/a.png", 20, 15, 4); // downscaled with another extension; b and c are not there
+    // downscaled with another extension; b and c are not there
+    disk_put_photo(&disk, "s/images_2/sub/a.png", 20, 15, 4);
     gsf_context ctx = make_disk_context(&count, &disk);
     gsf_scene scene = load_folder(&ctx, "s", 0, 0, GSF_OK);
     CHECK(scene.view_count == 3 && warnings == 1 && strstr(warning, "s/images/d.png")); // d.png is missing
@@ -910,15 +932,18 @@ static void test_transforms(void) {
         {"{\"frames\":[1]}", "a frame is no object"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{" POSE "}]}", "without file_path"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\"}]}", "transform_matrix"},
-        {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\",\"transform_matrix\":[[1,0,0,0],[0,1,0],[0,0,1,0]]}]}",
+        {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\",\"transform_matrix\":"
+         "[[1,0,0,0],[0,1,0],[0,0,1,0]]}]}",
          "4x4 matrix of numbers"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\",\"transform_matrix\":"
-         "[[1,0,0,0],[0,1,0,0],[0,0,-1,0]]}]}", "no rotation"},
+         "[[1,0,0,0],[0,1,0,0],[0,0,-1,0]]}]}",
+         "no rotation"},
         {"{\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "neither fl_x"},
         {"{\"fl_x\":1,\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "no usable w, h"},
         {"{\"fl_x\":\"1\",\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "\"fl_x\" is not a number"},
         {"{\"fl_x\":1,\"w\":-4,\"h\":4,\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "image size"},
-        {"{\"fl_x\":1,\"w\":4,\"h\":4,\"camera_model\":\"EQUIRECTANGULAR\",\"frames\":[{\"file_path\":\"a\"," POSE "}]}",
+        {"{\"fl_x\":1,\"w\":4,\"h\":4,\"camera_model\":\"EQUIRECTANGULAR\",\"frames\":[{\"file_path\":\"a\"," POSE
+         "}]}",
          "EQUIRECTANGULAR"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"../a\"," POSE "}]}", "leads out"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\\u0000b\"," POSE "}]}", "leads out"},
@@ -929,9 +954,11 @@ static void test_transforms(void) {
         if (!CHECK(is_refusal(r) && strstr(ctx.error, bad[i].says)))
             fprintf(stderr, "  case %zu: %s (%s)\n", i, ctx.error, gsf_describe_result(r));
     }
-    disk_put(&disk, "n/transforms.json", "{\"fl_x\":9,\"ply_file_path\":\"../x.ply\",\"frames\":[{\"file_path\":\"images/b.png\"," POSE "}]}");
+    disk_put(&disk, "n/transforms.json",
+             "{\"fl_x\":9,\"ply_file_path\":\"../x.ply\",\"frames\":[{\"file_path\":\"images/b.png\"," POSE "}]}");
     scene = load_folder(&ctx, "n", 0, 0, GSF_ERROR_FORMAT);
-    disk_put(&disk, "n/transforms.json", "{\"fl_x\":9,\"ply_file_path\":\"x.ply\",\"frames\":[{\"file_path\":\"images/b.png\"," POSE "}]}");
+    disk_put(&disk, "n/transforms.json",
+             "{\"fl_x\":9,\"ply_file_path\":\"x.ply\",\"frames\":[{\"file_path\":\"images/b.png\"," POSE "}]}");
     scene = load_folder(&ctx, "n", 0, 0, GSF_ERROR_IO);
     for (size_t size = 0; size < sizeof nerfstudio - 1; size++) { // every truncation
         char* cut = exact_copy(nerfstudio, size);
@@ -978,7 +1005,8 @@ static void test_split(void) {
         const size_t n = (size_t)gsf_json_member(&json, row, "n")->number;
         const size_t every = (size_t)gsf_json_member(&json, row, "test_every")->number;
         const size_t k = (size_t)gsf_json_member(&json, row, "K")->number;
-        const gsf_json_value *train = gsf_json_member(&json, row, "train"), *ends = gsf_json_member(&json, row, "test_first_last");
+        const gsf_json_value *train = gsf_json_member(&json, row, "train"),
+                             *ends = gsf_json_member(&json, row, "test_first_last");
         uint32_t* arrays = (uint32_t*)malloc(2 * (n + k) * sizeof(uint32_t));
         size_t train_count, test_count;
         gsf_splat_split_views(n, every, k, arrays, &train_count, arrays + n + k, &test_count);
@@ -1008,10 +1036,12 @@ static void test_split(void) {
 
 // ---- the fox photos ------------------------------------------------------------
 
-static void check_split_list(const gsf_json* json, const char* key, const gsf_scene* scene, const uint32_t* views, size_t n) {
+static void check_split_list(const gsf_json* json, const char* key, const gsf_scene* scene, const uint32_t* views,
+                             size_t n) {
     const gsf_json_value* list = gsf_json_member(json, &json->values[0], key);
     if (!CHECK(list && list->count == n)) return;
-    for (size_t i = 0; i < n; i++) CHECK(strcmp(gsf_json_element(json, list, i)->string, scene->views[views[i]].name) == 0);
+    for (size_t i = 0; i < n; i++)
+        CHECK(strcmp(gsf_json_element(json, list, i)->string, scene->views[views[i]].name) == 0);
 }
 
 static void test_fox_photos(void) {

@@ -1,5 +1,5 @@
-// test_trainer.c - loss and regularisers by finite differences; training on a scene made here: it learns, it is the same
-// bits for any workers, after a resume and after failures; bad input is refused.
+// test_trainer.c - loss and regularisers by finite differences; training on a scene made here: it learns, it is the
+// same bits for any workers, after a resume and after failures; bad input is refused.
 // gcc -O2 -std=c11 -I. -Itests tests/test_trainer.c -lm
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -16,8 +16,9 @@ typedef struct loss_case {
 } loss_case;
 
 static void test_loss_derivative(gsf_context* ctx) {
-    static const loss_case cases[] = {{1, 1, 0, 0, 0.2f},  {3, 2, 1, 1, 0.2f},  {1, 17, 0, 1, 1.0f}, {23, 1, 1, 0, 0.5f},
-                                      {13, 11, 1, 0, 0.2f}, {19, 14, 0, 1, 0.0f}, {8, 8, 0, 0, 1.0f},  {11, 24, 1, 1, 1.0f}};
+    static const loss_case cases[] = {{1, 1, 0, 0, 0.2f},  {3, 2, 1, 1, 0.2f},   {1, 17, 0, 1, 1.0f},
+                                      {23, 1, 1, 0, 0.5f}, {13, 11, 1, 0, 0.2f}, {19, 14, 0, 1, 0.0f},
+                                      {8, 8, 0, 0, 1.0f},  {11, 24, 1, 1, 1.0f}};
     gsf__loss_scratch scratch;
     memset(&scratch, 0, sizeof scratch);
     uint64_t state = 5;
@@ -121,7 +122,8 @@ static gsf__model make_model(gsf_context* ctx, size_t count, int32_t sh_degree) 
     return model;
 }
 
-static void test_adam_rejects(gsf_context* ctx) { // bad gradients do nothing and are counted, rows behind stay untouched
+// Bad gradients do nothing and are counted, rows behind stay untouched.
+static void test_adam_rejects(gsf_context* ctx) {
     for (int32_t degree = 0; degree <= 3; degree++) {
         gsf__model model = make_model(ctx, 37, degree);
         gsf__group* sh = &model.groups[GSF__SH];
@@ -234,7 +236,8 @@ typedef struct scene {
     float* weights;
 } scene;
 
-static gsf_camera make_camera(double angle, double tilt, int32_t width, int32_t height) { // 4 from the origin, facing it
+// 4 from the origin, facing it.
+static gsf_camera make_camera(double angle, double tilt, int32_t width, int32_t height) {
     gsf_camera camera;
     memset(&camera, 0, sizeof camera);
     const double c = cos(angle), s = sin(angle), ct = cos(tilt), st = sin(tilt);
@@ -481,10 +484,11 @@ static void test_settings(gsf_context* ctx, const scene* s) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, NULL, s->views, VIEWS, &s->start, &trainer));
-    CHECK(trainer->desc.iterations == 30000 && trainer->desc.densify_until == 15000 && trainer->desc.densify_from == 500);
+    CHECK(trainer->desc.iterations == 30000 && trainer->desc.densify_until == 15000 &&
+          trainer->desc.densify_from == 500);
     CHECK(trainer->desc.opacity_reset_interval == 3000 && trainer->desc.sh_interval == 1000);
-    CHECK(trainer->first_bands == 1 && gsf__trainer_bands(trainer, 999) == 1 && gsf__trainer_bands(trainer, 1000) == 2 &&
-          gsf__trainer_bands(trainer, 5000) == 2);
+    CHECK(trainer->first_bands == 1 && gsf__trainer_bands(trainer, 999) == 1 &&
+          gsf__trainer_bands(trainer, 1000) == 2 && gsf__trainer_bands(trainer, 5000) == 2);
     // five cameras 4 from the origin
     double centers[VIEWS][3], mean[3] = {0, 0, 0}, extent = 0.0;
     for (int v = 0; v < VIEWS; v++) gsf_camera_center(&s->views[v].camera, centers[v]);
@@ -687,7 +691,8 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
         int32_t before;
         memcpy(&before, fields[i], 4);
         memcpy(fields[i], &wrong, 4);
-        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer),
+                     GSF_ERROR_INVALID_ARGUMENT);
         memcpy(fields[i], &before, 4);
     }
     float* floats[] = {&desc.lr_means, &desc.lr_opacity, &desc.extent, &desc.background[2], &desc.densify_grad,
@@ -695,12 +700,14 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
                        &desc.depth_smoothness, &desc.render.near_plane, &desc.lambda_ssim};
     for (size_t i = 0; i < sizeof floats / sizeof *floats; i++) {
         *floats[i] = NAN;
-        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer),
+                     GSF_ERROR_INVALID_ARGUMENT);
         *floats[i] = 0.0f;
     }
     const uint8_t hidden[SPLATS] = {0};
     desc.render.hidden = hidden;
-    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer),
+                     GSF_ERROR_INVALID_ARGUMENT);
     desc.render.hidden = NULL;
 
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer));
@@ -746,7 +753,8 @@ static void test_degenerate(gsf_context* ctx, const scene* s) {
     take_steps(ctx, trainer, 60);
     int finite = 1;
     for (int g = 0; g < GSF__GROUPS; g++)
-        finite = finite && gsf__all_finite(trainer->model.groups[g].value, trainer->model.count * trainer->model.groups[g].width);
+        finite = finite &&
+                 gsf__all_finite(trainer->model.groups[g].value, trainer->model.count * trainer->model.groups[g].width);
     CHECK(finite);
     gsf_splat_destroy_trainer(ctx, trainer);
 

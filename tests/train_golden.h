@@ -122,7 +122,8 @@ static inline void train_golden_fill(const test_tensors* file, const char* prefi
         char name[96];
         snprintf(name, sizeof name, "%s.%s", prefix, e->name);
         test_tensor from = test_get_tensor(file, name);
-        const size_t width = model->groups[e->group].width, used = e->end < width ? e->end - e->begin : width - e->begin;
+        const size_t width = model->groups[e->group].width;
+        const size_t used = e->end < width ? e->end - e->begin : width - e->begin;
         CHECK(from.count == model->count * used);
         for (size_t i = 0; i < model->count; i++)
             for (size_t k = 0; k < used; k++)
@@ -139,7 +140,8 @@ static inline void train_golden_check(const test_tensors* file, const char* pref
         char name[96];
         snprintf(name, sizeof name, "%s.%s", prefix, e->name);
         test_tensor expected = test_get_tensor(file, name);
-        const size_t width = model->groups[e->group].width, used = e->end < width ? e->end - e->begin : width - e->begin;
+        const size_t width = model->groups[e->group].width;
+        const size_t used = e->end < width ? e->end - e->begin : width - e->begin;
         if (!CHECK(expected.count == model->count * used)) continue;
         size_t wrong = 0;
         double worst = 0.0;
@@ -171,8 +173,8 @@ static inline gsf__model train_golden_model(gsf_context* ctx, const test_tensors
 
 // ---- Adam ----------------------------------------------------------------------
 
-// Do the parameters after the steps differ from those before? In the committed files they do not, beyond the rounding to
-// float32 (the moments beside them are right), so there is nothing in them that a step could be held against.
+// Do the parameters after the steps differ from those before? In the committed files they do not, beyond the rounding
+// to float32 (the moments beside them are right), so there is nothing in them that a step could be held against.
 static inline int train_golden_moved(const test_tensors* file, const char* prefix) {
     double largest = 0.0;
     for (size_t t = 0; t < sizeof train_golden_tensors / sizeof *train_golden_tensors; t++) {
@@ -191,8 +193,8 @@ static inline int train_golden_moved(const test_tensors* file, const char* prefi
     return largest > 1e-5;
 }
 
-// torch.optim.Adam in double precision, from the file's gradients and rates. Its moments are held against the file's, its
-// parameters against the file's where these moved, and `model` (which took the same steps) against both. Row 2 has
+// torch.optim.Adam in double precision, from the file's gradients and rates. Its moments are held against the file's,
+// its parameters against the file's where these moved, and `model` (which took the same steps) against both. Row 2 has
 // gradients of 1e-13.
 static inline void train_golden_adam_reference(const test_tensors* file, const test_tensor* lr, gsf__model* model) {
     const int moved = train_golden_moved(file, "after5.f64");
@@ -201,7 +203,8 @@ static inline void train_golden_adam_reference(const test_tensors* file, const t
         char name[96];
         snprintf(name, sizeof name, "before.%s", e->name);
         test_tensor value = test_get_tensor(file, name);
-        double *m = (double*)calloc(value.count + 1, sizeof(double)), *v = (double*)calloc(value.count + 1, sizeof(double));
+        double *m = (double*)calloc(value.count + 1, sizeof(double)),
+               *v = (double*)calloc(value.count + 1, sizeof(double));
         for (int step = 1; step <= 5; step++) {
             snprintf(name, sizeof name, "grad%d.%s", step, e->name);
             test_tensor grad = test_get_tensor(file, name);
@@ -222,7 +225,8 @@ static inline void train_golden_adam_reference(const test_tensors* file, const t
         test_compare(first.name, m, first.v, value.count, 1e-12);
         test_compare(second.name, v, second.v, value.count, 1e-12);
         if (moved) test_compare(after.name, value.v, after.v, value.count, 1e-6); // the file's start is not rounded
-        const size_t width = model->groups[e->group].width, used = e->end < width ? e->end - e->begin : width - e->begin;
+        const size_t width = model->groups[e->group].width;
+        const size_t used = e->end < width ? e->end - e->begin : width - e->begin;
         size_t wrong = 0;
         for (size_t i = 0; i < value.count; i++) {
             const size_t at = i / used * width + e->begin + i % used;
@@ -282,10 +286,10 @@ static inline void train_golden_rates(void) {
         const int32_t step = (int32_t)steps.v[i];
         CHECK_NEAR(gsf__exponential_rate(step, 1.6e-4 * scale, 1.6e-6 * scale, 0, 0.01, 30000), rates.v[i],
                    1e-12 * rates.v[i]);
-        CHECK_NEAR(gsf__exponential_rate(step, train_golden_number(text, "lr_init"), train_golden_number(text, "lr_final"),
-                                         (int32_t)train_golden_number(text, "lr_delay_steps"),
-                                         train_golden_number(text, "lr_delay_mult"),
-                                         (int32_t)train_golden_number(text, "max_steps")),
+        CHECK_NEAR(gsf__exponential_rate(
+                       step, train_golden_number(text, "lr_init"), train_golden_number(text, "lr_final"),
+                       (int32_t)train_golden_number(text, "lr_delay_steps"), train_golden_number(text, "lr_delay_mult"),
+                       (int32_t)train_golden_number(text, "max_steps")),
                    delayed.v[i], 1e-12 * fabs(delayed.v[i]));
     }
     test_free_tensor(&steps); test_free_tensor(&rates); test_free_tensor(&delayed);
