@@ -10,6 +10,8 @@
        SH coefficients (K,3) with K = (degree + 1)^2, the 3DGS parametrisation:
            Sigma = R diag(exp(log_scale))^2 R^T,  opacity = sigmoid(logit),  colour = max(0, SH(direction) + 0.5)
        Means are float32 relative to a double origin, so georeferenced scenes keep their precision.
+       A desc starts zeroed: zero is every field's default. The large ones begin and end with a canary that stays zero, so
+       that one that was not zeroed is refused (GSF_ERROR_INVALID_ARGUMENT).
 
    CONFIGURATION (define before the implementation)
        GSF_USE_EMBREE   visible-point filter by ray tracing (link embree3 or embree4); without it the same discs are projected, to the same result
@@ -196,6 +198,7 @@ typedef enum gsf_gradient {
 } gsf_gradient;
 
 typedef struct gsf_render_desc {
+    uint32_t _start_canary;
     int32_t sh_bands;          // SH bands evaluated: degree + 1; 0 = all that are stored
     float background[3];
     gsf_footprint footprint;
@@ -204,6 +207,7 @@ typedef struct gsf_render_desc {
     float near_plane;          // splats with camera depth <= this are culled; 0 = 0.2 (official)
     const uint8_t* hidden;     // NULL or one byte per splat: non-zero splats are not drawn (dropout)
     float opacity_scale;       // every opacity is multiplied by this; 0 = 1
+    uint32_t _end_canary;
 } gsf_render_desc;
 
 typedef struct gsf_render_output { // caller's images, all f32 of the camera's size; data NULL = not wanted
@@ -260,6 +264,7 @@ typedef struct gsf_train_view {
 } gsf_train_view;
 
 typedef struct gsf_train_desc { // zero = the official 3DGS value given beside each field; s = iterations / 30000
+    uint32_t _start_canary;
     int32_t iterations;            // 30000
     uint64_t seed;
     int32_t sh_degree;             // degree to train; 0 = the splats' own
@@ -288,6 +293,7 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     float opacity_decay;           // every opacity loses this share per iteration (applied every 10; 0.005 in Binocular3DGS)
     float scale_penalty;           // weight of mean(exp(log_scale)) / extent
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
+    uint32_t _end_canary;
 } gsf_train_desc;
 
 typedef struct gsf_train_stats {
@@ -348,6 +354,7 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
        gsf_splat_make_fixer -> gsf_splat_fix_step until stats.stage is GSF_FIX_DONE -> gsf_splat_trainer_export */
 
 typedef struct gsf_fix_desc {
+    uint32_t _start_canary;
     gsf_train_desc train;         // the whole run; train.iterations counts all steps
     gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
     const double* points;         // (point_count,3) world points for the path's principal axes; NULL = cameras only.
@@ -362,6 +369,7 @@ typedef struct gsf_fix_desc {
     float skip_psnr;              // a window is not restored when its render agrees with the references' warp to this many
                                   // dB over the pixels that they explain; 0 = never skip
     int32_t max_pixels;           // longer frames are rendered smaller for the restorer; 0 = photo size
+    uint32_t _end_canary;
 } gsf_fix_desc;
 
 typedef enum gsf_fix_stage { GSF_FIX_TRAIN = 0, GSF_FIX_PLAN, GSF_FIX_RESTORE, GSF_FIX_DONE } gsf_fix_stage;
@@ -438,6 +446,13 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_f
 GSF__BEGIN_IMPLEMENTATION
 
 // ---- >>splats ------------------------------------------------------------------
+
+// Of a desc of the caller's; a macro, since the three types only share the members' names.
+#define GSF__CHECK_CANARIES(ctx, name, desc)                                                                          \
+    do {                                                                                                              \
+        if ((desc)->_start_canary != 0 || (desc)->_end_canary != 0)                                                   \
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s desc: was not zeroed (its canaries are not)", name); \
+    } while (0)
 
 GSF_API int32_t gsf_splat_sh_count(int32_t sh_degree) { return (sh_degree + 1) * (sh_degree + 1); }
 
@@ -5007,6 +5022,7 @@ static gsf_result gsf__check_render(gsf_context* ctx, const gsf_splats* splats, 
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: SH degree %d is not 0..3", (int)splats->sh_degree);
     if (splats->count && !(splats->means && splats->log_scales && splats->quats && splats->opacity_logits && splats->sh))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: a parameter array is NULL");
+    GSF__CHECK_CANARIES(ctx, "render", desc);
     if (desc->sh_bands < 0 || desc->sh_bands > 4)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: sh_bands is %d, expected 0..4", (int)desc->sh_bands);
     if (camera->width > 65536 || camera->height > 65536)
@@ -6539,6 +6555,12 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
     return GSF_OK;
 }
 
+static gsf_result gsf__check_train_canaries(gsf_context* ctx, const gsf_train_desc* desc) {
+    GSF__CHECK_CANARIES(ctx, "train", desc);
+    GSF__CHECK_CANARIES(ctx, "train.render", &desc->render);
+    return GSF_OK;
+}
+
 static int gsf__all_finite(const float* v, size_t count) {
     for (size_t i = 0; i < count; i++)
         if (!(fabsf(v[i]) <= FLT_MAX)) return 0;
@@ -7115,6 +7137,7 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
 GSF_API gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc, const gsf_train_view* views,
                                           size_t view_count, const gsf_splats* initial, gsf_trainer** out) {
     *out = NULL;
+    if (desc) GSF__TRY(gsf__check_train_canaries(ctx, desc));
     gsf_trainer* trainer = (gsf_trainer*)gsf_alloc_zeroed(ctx, 1, sizeof *trainer);
     if (!trainer) return GSF_ERROR_OUT_OF_MEMORY;
     trainer->desc = gsf__train_desc_defaults(desc);
@@ -7735,7 +7758,10 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     *out = NULL;
     gsf_fix_desc zero;
     memset(&zero, 0, sizeof zero);
-    const gsf_fix_desc resolved = gsf__fix_desc_defaults(desc ? desc : &zero, view_count, restorer != NULL);
+    if (!desc) desc = &zero;
+    GSF__CHECK_CANARIES(ctx, "fix", desc);
+    GSF__TRY(gsf__check_train_canaries(ctx, &desc->train));
+    const gsf_fix_desc resolved = gsf__fix_desc_defaults(desc, view_count, restorer != NULL);
     GSF__TRY(gsf__check_fix_desc(ctx, &resolved, restorer));
     gsf_fixer* f = (gsf_fixer*)gsf_alloc_zeroed(ctx, 1, sizeof *f);
     if (!f) return GSF_ERROR_OUT_OF_MEMORY;

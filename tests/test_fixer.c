@@ -266,6 +266,34 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     used = gsf_splat_fixer_desc(fixer);
     CHECK(used.rounds == 0 && used.train.densify_interval == 20); // nobody to restore
     gsf_splat_destroy_fixer(ctx, fixer);
+
+    // descs that were not zeroed: each canary by itself, and a struct full of rubbish
+    uint32_t* const canaries[] = {&given._start_canary, &given._end_canary, &given.train._start_canary,
+                                  &given.train._end_canary, &given.train.render._start_canary,
+                                  &given.train.render._end_canary};
+    gsf_trainer* trainer;
+    static float pixels[3 * PIXELS];
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    out.color = gsf_wrap_image(pixels, GSF_F32, WIDTH, HEIGHT, 3);
+    for (size_t i = 0; i <= sizeof canaries / sizeof *canaries; i++) {
+        given = repair_desc();
+        if (i < sizeof canaries / sizeof *canaries) *canaries[i] = 1;
+        else memset(&given, 0xcd, sizeof given);
+        fixer = (gsf_fixer*)&r;
+        trainer = (gsf_trainer*)&r;
+        CHECK_RESULT(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, NULL, &fixer),
+                     GSF_ERROR_INVALID_ARGUMENT);
+        CHECK(fixer == NULL && strstr(ctx->error, "zeroed"));
+        if (i < 2) continue;
+        CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &given.train, r.views, VIEWS, &r.start, &trainer),
+                     GSF_ERROR_INVALID_ARGUMENT);
+        CHECK(trainer == NULL && strstr(ctx->error, "zeroed"));
+        if (i < 4) continue;
+        CHECK_RESULT(ctx, gsf_splat_render(ctx, r.rasterizer, &r.truth, &r.views[0].camera, &given.train.render, &out),
+                     GSF_ERROR_INVALID_ARGUMENT);
+        CHECK(strstr(ctx->error, "zeroed"));
+    }
     repair_teardown(ctx, &r);
 }
 
