@@ -197,8 +197,8 @@ static gsf_result put_sample(page* p, const gsfix_sample* s) {
         put(p, "<span>%s</span></div>", labels[k]);
         gsf_destroy_image(p->ctx, &image);
     }
-    put(p, "</div><figcaption><strong>round %d, window %d</strong><span>frame %d</span></figcaption></figure>\n", (int)s->round,
-        (int)s->window, (int)s->frame);
+    put(p, "</div><figcaption><strong>round %d, window %d</strong><span>fixed/round%d_window%d_%05d.png</span></figcaption>"
+           "</figure>\n", (int)s->round, (int)s->window, (int)s->round, (int)s->window, (int)s->frame);
     return result;
 }
 
@@ -210,7 +210,8 @@ static gsf_result put_samples(page* p) {
     put(p, "<section><h2>Repaired frames</h2><p>Between training steps the camera flies along a path, the restorer repairs what it "
            "sees, and training goes on with the repaired frames beside the photos: %d frames in %zu rounds", restored, h->round_count);
     if (skipped) put(p, ", %d windows skipped because their render already agreed with the photos", skipped);
-    put_raw(p, ". White confidence means the pixel counts in full, black not at all.</p>\n<div class=\"cards broad\">\n");
+    put_raw(p, ". The brighter the confidence, the more a pixel counts; black ones, where the repair may look torn, do "
+               "not count at all.</p>\n<div class=\"cards broad\">\n");
     const size_t begin = p->html.size;
     gsf_result result = put_sample(p, &h->samples[0]);
     const size_t each = p->html.size - begin;
@@ -234,7 +235,7 @@ static void put_tile(page* p, const char* name, double value, double before, int
     if (isnan(value)) return;
     put(p, "<div class=tile><dt>%s</dt><dd>%.*f<small>%s</small></dd>", name, digits, value, unit);
     if (!isnan(before))
-        put(p, "<p class=%s>%+.*f since the first repair</p>", value >= before ? "up" : "down", digits, value - before);
+        put(p, "<p class=%s>%+.*f%s since the first repair</p>", value >= before ? "up" : "down", digits, value - before, unit);
     put_raw(p, "</div>\n");
 }
 
@@ -314,8 +315,8 @@ static void put_curve(page* p) {
     put(p, "<text x=%d y=14>dB</text><text x=%d y=%d text-anchor=end>step</text>", 12, RIGHT, BOTTOM + 36);
     for (size_t i = 0; i < h->round_count; i++) {
         const double x = f.x0 + f.sx * h->rounds[i].iteration;
-        put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>round %d</text>", x, x, TOP - 6, BOTTOM,
-            x + 5.0, TOP + 4, (int)h->rounds[i].round);
+        put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>round %d</text>", x, x, TOP - 18, BOTTOM,
+            x + 5.0, TOP - 9, (int)h->rounds[i].round);
     }
     if (has_seen) put_line(p, &f, 1, "seen pixels");
     put_line(p, &f, 0, "all pixels");
@@ -341,7 +342,7 @@ static void put_seconds(page* p) {
         if (h->seconds[i] > 0.0)
             put(p, "<tr><td><i class=\"dot s%d\"></i>%s<td class=num>%.1f s<td class=num>%.0f %%<td class=wide>%s</tr>", i, gsfix_stage_names[i],
                 h->seconds[i], 100.0 * h->seconds[i] / sum, what[i]);
-    put_raw(p, "</table></section>\n");
+    put(p, "<tr class=mean><td>total<td class=num>%.1f s<td><td class=wide></tr></table></section>\n", h->seconds_total);
 }
 
 static void put_cell(page* p, double value, int digits) {
@@ -354,11 +355,12 @@ static void put_table(page* p) {
     const int has_before = r->history->has_before, has_seen = r->masks != NULL;
     if (!r->split->test_count) return;
     put_raw(p, "<section><h2>Figures per view</h2><div class=scroll><table><thead><tr><th>view");
-    if (has_before) put_raw(p, "<th>PSNR before");
-    put_raw(p, "<th>PSNR");
-    if (has_seen) put_raw(p, "<th>PSNR, seen");
+    if (has_before) put_raw(p, "<th>PSNR before, dB");
+    put_raw(p, has_before ? "<th>after, dB" : "<th>PSNR, dB");
+    if (has_seen) put_raw(p, has_before ? "<th>after, seen pixels, dB" : "<th>seen pixels, dB");
     if (has_before) put_raw(p, "<th>SSIM before");
-    put_raw(p, "<th>SSIM</tr></thead><tbody>");
+    put_raw(p, has_before ? "<th>after" : "<th>SSIM");
+    put_raw(p, "</tr></thead><tbody>");
     for (size_t i = 0; i <= r->split->test_count; i++) {
         const int mean = i == r->split->test_count;
         const gsfix_score* now = mean ? &r->mean : &r->views[i];
@@ -375,7 +377,7 @@ static void put_table(page* p) {
     put_raw(p, "</tbody></table></div></section>\n");
 }
 
-// How a switch of metrics.json is shown: under which heading, what zero (or less) means, and the unit.
+// How a switch of metrics.json is shown: under which heading, what zero (or less) means, and the unit ("<x": before it).
 static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"views", "Photos", NULL, ""}, {"test_every", "Photos", "none held out", ""}, {"factor", "Photos", NULL, ""},
     {"max_size", "Photos", "no limit", " pixels"}, {"width", "Photos", NULL, " pixels"}, {"height", "Photos", NULL, " pixels"},
@@ -385,25 +387,42 @@ static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"opacity_decay", "Regularisers for few views", "off", " per step"},
     {"scale_penalty", "Regularisers for few views", "off", ""},
     {"depth_smoothness", "Regularisers for few views", "off", ""}, {"restorer", "Repair", NULL, ""},
-    {"trajectory", "Repair", NULL, ""}, {"rounds", "Repair", "none", ""}, {"first_round", "Repair", NULL, ". step"},
-    {"last_round", "Repair", NULL, ". step"}, {"windows", "Repair", NULL, " per round"},
+    {"trajectory", "Repair", NULL, ""}, {"rounds", "Repair", "none", ""}, {"first_round", "Repair", NULL, "<step "},
+    {"last_round", "Repair", NULL, "<step "}, {"windows", "Repair", NULL, " per round"},
     {"window_frames", "Repair", NULL, ""}, {"lambda", "Repair", NULL, " at the end"},
     {"skip_psnr", "Repair", "never", " dB"}, {"max_pixels", "Repair", "photo size", ""},
-    {"densify_until", "Training", "never", ". step"}, {"densify_from", "Training", NULL, ". step"},
+    {"densify_until", "Training", "never", "<step "}, {"densify_from", "Training", NULL, "<step "},
     {"densify_interval", "Training", NULL, " steps"}, {"sh_interval", "Training", NULL, " steps"},
     {"opacity_reset_interval", "Training", "never", " steps"}, {"lambda_ssim", "Training", "no SSIM term", ""},
 };
 
+static void put_number(page* p, double x) { // whole numbers in full
+    if (x == floor(x) && fabs(x) < 1e15) put(p, "%.0f", x);
+    else put(p, "%.6g", x);
+}
+
 static void put_switch(page* p, const gsf_json* json, const gsf_json_value* v, const char* zero, const char* unit) {
+    static const char* const meanings[][3] = {
+        {"init", "both", "tracks and rays"}, {"init", "embree", "rays"}, {"init", "all", "every point"},
+        {"trajectory", "reference", "photo to photo"}, {"trajectory", "interpolate", "spline"},
+        {"footprint", "full", "down to alpha 1/255"}, {"footprint", "official", "3 sigma"},
+    };
     put_raw(p, v->type == GSF_JSON_ARRAY && v->count > 3 ? "<div class=broad><dt>" : "<div><dt>");
     put_escaped(p, v->key);
     put_raw(p, "</dt><dd>");
     if (v->type == GSF_JSON_NUMBER && zero && v->number <= 0.0) put_raw(p, zero);
-    else if (v->type == GSF_JSON_NUMBER) put(p, "%.9g%s", v->number, unit);
-    else if (v->type == GSF_JSON_STRING) put_escaped(p, v->string);
+    else if (v->type == GSF_JSON_NUMBER) {
+        if (*unit == '<') put_raw(p, unit + 1);
+        put_number(p, v->number);
+        if (*unit != '<') put_raw(p, unit);
+    } else if (v->type == GSF_JSON_STRING) {
+        put_escaped(p, v->string);
+        for (size_t i = 0; i < sizeof meanings / sizeof *meanings; i++)
+            if (strcmp(meanings[i][0], v->key) == 0 && strcmp(meanings[i][1], v->string) == 0) put(p, " (%s)", meanings[i][2]);
+    }
     for (uint32_t k = v->type == GSF_JSON_ARRAY ? v->child : 0; k; k = json->values[k].next) {
         if (json->values[k].string) put_escaped(p, json->values[k].string);
-        else put(p, "%.9g", json->values[k].number);
+        else put_number(p, json->values[k].number);
         if (json->values[k].next) put_raw(p, ", ");
     }
     put_raw(p, "</dd></div>");
@@ -522,10 +541,11 @@ static void put_cloud(page* p, const frame3* f) { // splats that can be seen, co
     const gsf_splats* s = p->r->splats;
     const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
     size_t solid = 0, taken = 0, shown = 0;
-    for (size_t i = 0; i < s->count; i++) solid += s->opacity_logits[i] > 0.0f;
+    const float least = -1.4f; // logit of opacity 0.2
+    for (size_t i = 0; i < s->count; i++) solid += s->opacity_logits[i] > least;
     put_raw(p, "\"cloud\":[");
     for (size_t i = 0; i < s->count; i++) {
-        if (!(s->opacity_logits[i] > 0.0f)) continue;
+        if (!(s->opacity_logits[i] > least)) continue;
         if (taken++ * CLOUD_POINTS / (solid + 1) < shown) continue; // evenly
         shown++;
         double world[3];
@@ -551,7 +571,7 @@ static void put_scene(page* p) {
                "<div class=zoom><button data-z=1.25 aria-label=closer>+</button><button data-z=0.8 aria-label=farther>&minus;</button></div></div>"
                "<p class=keys><span><i class=k-train></i>training photos</span><span><i class=k-test></i>held-out photos</span>");
     for (size_t i = 0; i < h->round_count && h->path_count; i++)
-        put(p, "<span><i class=\"k-path\" style=\"background:hsl(%d 65%% 62%%)\"></i>path of round %d</span>", 150 + 110 * (int)i, (int)h->rounds[i].round);
+        put(p, "<span><i class=\"k-path\" style=\"background:hsl(%d 85%% 72%%)\"></i>path of round %d</span>", 225 + 50 * (int)i, (int)h->rounds[i].round);
     put_raw(p, "</p>\n<script type=\"application/json\" id=scene>{");
     put_cameras(p, &f, "train", r->split->train, r->split->train_count);
     put_cameras(p, &f, "test", r->split->test, r->split->test_count);
@@ -591,7 +611,7 @@ static const char* const style[] = { // in pieces, since C only promises strings
     ".card{margin:0;background:var(--card);border:1px solid var(--line);border-radius:10px;overflow:hidden}",
     ".cards.broad{grid-template-columns:repeat(auto-fill,minmax(min(100%,480px),1fr))}.triple>div{display:grid;grid-template-columns:repeat(3,1fr);gap:2px}",
     "figcaption{display:flex;flex-wrap:wrap;gap:2px 14px;padding:8px 12px;font-size:14px;color:var(--soft);font-variant-numeric:tabular-nums}",
-    "figcaption strong{color:var(--ink);flex-basis:100%;overflow-wrap:anywhere}figcaption b{color:var(--ink)}",
+    ".triple figcaption strong{flex-basis:auto}figcaption strong{color:var(--ink);flex-basis:100%;overflow-wrap:anywhere}figcaption b{color:var(--ink)}",
     ".cmp{position:relative;--x:50%;width:100%;background:#000;overflow:hidden;touch-action:pan-y}",
     ".cmp img,.still img{display:block;width:100%;height:auto}.still{position:relative}",
     ".pane{position:absolute;inset:0;display:none}.pane.left{display:block;z-index:2;clip-path:inset(0 calc(100% - var(--x)) 0 0)}",
@@ -650,7 +670,7 @@ static const char* const script[] = { // in pieces, since C only promises string
     " function at(x,y,z){x-=mid[0];y-=mid[1];z-=mid[2];var a=cy*x+sy*z,b=-sy*x+cy*z,u=cp*y-sp*b,q=sp*y+cp*b,k=s/(5200+q);return k>0&&5200+q>200?[w/2+1.9*a*k,h/2-1.9*u*k,5200+q]:null}\n",
     " var dots=[];for(var i=0;i+3<d.cloud.length;i+=4){var p=at(d.cloud[i],d.cloud[i+1],d.cloud[i+2]);if(p){p.push(d.cloud[i+3]);dots.push(p)}}\n",
     " dots.sort(function(a,b){return b[2]-a[2]});dots.forEach(function(p){g.fillStyle='#'+('000000'+p[3].toString(16)).slice(-6);var e=Math.max(1.5,11000*zoom/p[2]);g.fillRect(p[0]-e/2,p[1]-e/2,e,e)});\n",
-    " d.paths.forEach(function(l){g.strokeStyle='hsl('+(150+110*(l.round-1))+' 65% 62%)';g.lineWidth=2;g.beginPath();var on=0;for(var i=0;i<l.at.length;i+=3){var p=at(l.at[i],l.at[i+1],l.at[i+2]);if(p){on?g.lineTo(p[0],p[1]):g.moveTo(p[0],p[1]);on=1}}g.stroke()});\n",
+    " d.paths.forEach(function(l){g.strokeStyle='hsl('+(225+50*(l.round-1))+' 85% 72%)';g.lineWidth=2;g.beginPath();var on=0;for(var i=0;i<l.at.length;i+=3){var p=at(l.at[i],l.at[i+1],l.at[i+2]);if(p){on?g.lineTo(p[0],p[1]):g.moveTo(p[0],p[1]);on=1}}g.stroke()});\n",
     " function cams(list,color,width){g.strokeStyle=color;g.fillStyle=color;g.lineWidth=width;list.forEach(function(v){var o=at(v[0],v[1],v[2]);if(!o)return;var k=[],i;\n",
     "  for(i=3;i<15;i+=3){var q=at(v[0]+v[i],v[1]+v[i+1],v[2]+v[i+2]);if(!q)return;k.push(q)}\n",
     "  g.beginPath();for(i=0;i<4;i++){g.moveTo(o[0],o[1]);g.lineTo(k[i][0],k[i][1]);g.lineTo(k[(i+1)%4][0],k[(i+1)%4][1])}g.stroke();g.beginPath();g.arc(o[0],o[1],2.6,0,7);g.fill()})}\n",
