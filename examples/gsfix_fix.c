@@ -149,7 +149,7 @@ typedef struct fix_run {
     gsfix_history history;
     double total_before; // seconds of earlier runs that this one continues
     int32_t iteration, iterations, eval_every, checkpoint_every;
-    gsf_text chunks;        // the last checkpoint; its memory serves the next
+    size_t checkpoint_bytes; // of the last one
     double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds the last one took, all did; when it was done
 } fix_run;
 
@@ -456,17 +456,20 @@ static void write_history(fix_run* run, gsf_text* t) {
 
 static gsf_result save_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    gsf_text history = {0}, *chunks = &run->chunks;
+    gsf_text chunks = {0}, history = {0};
     const double begin = gsfix_now();
-    chunks->size = 0;
-    chunks->failed = 0;
+    const size_t room = run->checkpoint_bytes + run->checkpoint_bytes / 8; // mostly enough, so that nothing grows
+    chunks.data = room ? (char*)gsf_alloc(ctx, room, 1) : NULL;
+    chunks.capacity = chunks.data ? room : 0;
     write_history(run, &history);
-    gsf_splat_fixer_save(ctx, run->fixer, chunks);
-    gsf_chunks_add(ctx, chunks, "GFIX", history.data, history.size);
-    gsf_chunks_end(ctx, chunks);
+    gsf_splat_fixer_save(ctx, run->fixer, &chunks);
+    gsf_chunks_add(ctx, &chunks, "GFIX", history.data, history.size);
+    gsf_chunks_end(ctx, &chunks);
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
-    if (!history.failed && !chunks->failed)
-        result = gsf_write_file(ctx, gsfix_pathf("%s/checkpoint", run->app->o.out).s, chunks->data, chunks->size);
+    if (!history.failed && !chunks.failed)
+        result = gsf_write_file(ctx, gsfix_pathf("%s/checkpoint", run->app->o.out).s, chunks.data, chunks.size);
+    run->checkpoint_bytes = chunks.size;
+    gsf_destroy_text(ctx, &chunks);
     gsf_destroy_text(ctx, &history);
     run->checkpoint_end = gsfix_now();
     run->checkpoint_last = run->checkpoint_end - begin;
@@ -952,7 +955,6 @@ static void free_run(fix_run* run) {
     gsfix_free_split(run->app, &run->split);
     gsf_splat_destroy_scene(ctx, &run->scene);
     gsf_destroy_text(ctx, &run->switches);
-    gsf_destroy_text(ctx, &run->chunks);
     gsf_free(ctx, run->history.before);
     gsf_free(ctx, run->history.curve);
     gsf_free(ctx, run->history.rounds);
