@@ -350,6 +350,30 @@ static void test_recall(void) {
             free(tracks);
             free(rays);
         }
+    // The tracks of other points are evidence too. Points whose whole track is taken away must be found as well.
+    uint8_t* proven[3];
+    for (size_t k = 0; k < 3; k++)
+        proven[k] = visible(&scene, views, training_views(&scene, 3 * k + 3, views), GSF_VISIBILITY_TRACKS, 0, NULL);
+    for (size_t i = 0, from = 0, to = 0; i <= scene.point_count; i++) {
+        const size_t end = i < scene.point_count ? scene.track_begin[i + 1] : 0;
+        scene.track_begin[i] = to;
+        for (size_t t = from; t < end && i % 2; t++) scene.track_views[to++] = scene.track_views[t];
+        from = end;
+    }
+    for (size_t k = 0; k < 3; k++) {
+        const size_t count = training_views(&scene, 3 * k + 3, views);
+        uint8_t* rays = visible(&scene, views, count, GSF_VISIBILITY_RAYS, 0, NULL);
+        size_t all = 0, found = 0;
+        for (size_t i = 0; i < scene.point_count; i += 2) {
+            all += proven[k][i];
+            found += proven[k][i] && rays[i];
+        }
+        printf("fox, K = %zu, every second track taken away: recall %.4f of the %zu points that had one\n", count,
+               (double)found / (double)all, all);
+        CHECK(all > 500 && (double)found >= 0.95 * (double)all);
+        free(proven[k]);
+        free(rays);
+    }
     free(views);
     gsf_splat_destroy_scene(&ctx, &scene);
 }
@@ -382,17 +406,48 @@ static void remove_scene(const char* folder, int views) {
     }
 }
 
+static void count_answers(accuracy* a, const uint8_t* kept, const uint8_t* truth, size_t points, size_t views,
+                          const uint32_t* chosen, size_t count) {
+    const uint8_t* outlier = truth + points * views;
+    for (size_t i = 0; i < points; i++) {
+        int seen = 0;
+        if (outlier[i]) continue; // stands for no place of the scene
+        for (size_t v = 0; v < count; v++) seen |= truth[i * views + chosen[v]] & 1;
+        if (seen) { a->shown++; a->shown_kept += kept[i]; }
+        else { a->hidden++; a->hidden_kept += kept[i]; }
+    }
+}
+
+// Different views in random order.
+static void pick_views(uint64_t stream, size_t views, size_t count, uint32_t* chosen) {
+    for (uint64_t draw = 0, n = 0; n < count; draw++) {
+        const uint32_t view = (uint32_t)(gsf_random_bits(7, stream, draw) % views);
+        int taken = 0;
+        for (uint64_t i = 0; i < n; i++) taken |= chosen[i] == view;
+        if (!taken) chosen[n++] = view;
+    }
+}
+
+static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
+    (void)user;
+    while (count-- > 0) fn(arg, count, 0);
+}
+
+enum { SEEDS = 3, CHOICES = 3 };
+
 // The generator's own scene, through its files, against the visibility that it traced. The photos are smaller than the
-// program's and the pixel noise with them, so that the points are as good.
-static void test_procedural(void) {
+// program's and the pixel noise with them, so that the points are as good. `split` sums up, per K, the views of the
+// official split, `choices` random choices of as many.
+static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3]) {
     const char* tmp = getenv("TMPDIR");
-    char folder[1024], path[1100];
+    char folder[1024], path[1100], what[64];
     snprintf(folder, sizeof folder, "%s/gsfixer_visibility_XXXXXX", tmp && *tmp ? tmp : "/tmp");
     if (!CHECK(mkdtemp(folder) != NULL)) return;
     make_scene_options options = make_scene_defaults;
     options.width = 128;
     options.height = 96;
     options.noise *= 128.0 / 320.0;
+    options.seed = seed;
     gsf_scene scene;
     size_t size = 0;
     if (!CHECK(make_scene(&ctx, &options, folder) == 0) || !CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, NULL, &scene))) {
@@ -421,32 +476,39 @@ static void test_procedural(void) {
 
     uint32_t* chosen = (uint32_t*)malloc(views * sizeof *chosen);
     for (size_t k = 3; k <= 9; k += 3) {
+        accuracy a;
+        memset(&a, 0, sizeof a);
         const size_t count = training_views(&scene, k, chosen);
         uint8_t* rays = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 0, NULL);
         uint8_t* projected = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 1, NULL);
-        accuracy a;
-        size_t differ = 0;
-        memset(&a, 0, sizeof a);
-        for (size_t i = 0; i < n; i++) {
-            int seen = 0;
-            differ += rays[i] != projected[i];
-            for (size_t v = 0; v < count; v++) seen |= truth[i * views + chosen[v]] & 1;
-            if (outlier[i]) continue; // stands for no place of the scene
-            if (seen) { a.shown++; a.shown_kept += rays[i]; }
-            else { a.hidden++; a.hidden_kept += rays[i]; }
+        if (k == 3) {
+            const gsf_parallel parallel = ctx.parallel;
+            ctx.parallel.for_fn = backwards; // one worker, the chunks in another order: the same answers
+            uint8_t* again = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 0, NULL);
+            ctx.parallel = parallel;
+            CHECK(memcmp(rays, again, n) == 0);
+            free(again);
         }
-        char what[64];
-        snprintf(what, sizeof what, "K = %zu", k);
-        const double value = balanced(what, &a);
-        // Of six and more views hardly a point is hidden from all, so the figure is coarse there.
-        CHECK(value >= (k == 3 ? 0.90 : 0.80));
+        size_t differ = 0;
+        for (size_t i = 0; i < n; i++) differ += rays[i] != projected[i];
         CHECK(differ * 1000 <= n); // both ways to find the discs
+        count_answers(&a, rays, truth, n, views, chosen, count);
+        count_answers(split + k / 3 - 1, rays, truth, n, views, chosen, count);
+        snprintf(what, sizeof what, "seed %d, K = %zu", (int)seed, k);
+        const double value = balanced(what, &a);
+        if (k == 3) CHECK(value >= 0.92);
         free(rays);
         free(projected);
+        for (uint64_t choice = 0; choice < CHOICES; choice++) {
+            pick_views(100 * k + choice, views, k, chosen);
+            uint8_t* kept = visible(&scene, chosen, k, GSF_VISIBILITY_RAYS, 0, NULL);
+            count_answers(choices + k / 3 - 1, kept, truth, n, views, chosen, k);
+            free(kept);
+        }
     }
     accuracy pairs; // single views, the harder question: no second view makes good a wrong answer
     memset(&pairs, 0, sizeof pairs);
-    for (uint32_t v = 0; v < views; v += 4) {
+    for (uint32_t v = 0; v < views; v += 8) {
         uint8_t* rays = visible(&scene, &v, 1, GSF_VISIBILITY_RAYS, 0, NULL);
         for (size_t i = 0; i < n; i++) {
             if (outlier[i] || !(truth[i * views + v] & 2)) continue;
@@ -455,11 +517,37 @@ static void test_procedural(void) {
         }
         free(rays);
     }
-    CHECK(balanced("single views", &pairs) >= 0.82);
+    CHECK(balanced("single views", &pairs) >= 0.855); // the limit suits the union of several views
+    memset(scene.track_begin, 0, (n + 1) * sizeof *scene.track_begin);
+    accuracy bare; // the discs alone, no tracks to help
+    memset(&bare, 0, sizeof bare);
+    const size_t count = training_views(&scene, 3, chosen);
+    uint8_t* rays = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 0, NULL);
+    count_answers(&bare, rays, truth, n, views, chosen, count);
+    CHECK(balanced("K = 3 without tracks", &bare) >= 0.89);
+    free(rays);
     free(chosen);
     free(file);
     gsf_splat_destroy_scene(&ctx, &scene);
     remove_scene(folder, options.views);
+}
+
+static void test_accuracy(void) {
+    accuracy split[3], choices[3];
+    char what[64];
+    memset(split, 0, sizeof split);
+    memset(choices, 0, sizeof choices);
+    for (uint64_t seed = 1; seed <= SEEDS; seed++) test_procedural(seed, split, choices);
+    for (int k = 0; k < 3; k++) {
+        // Of six and nine views spread over the arc hardly a point is hidden from all: one seed has 77 to 183 of six
+        // views and 24 to 53 of nine, so that three points move its figure by up to 0.06. Hence all seeds together,
+        // and random choices of views, which hide more.
+        snprintf(what, sizeof what, "%d seeds, K = %d", (int)SEEDS, 3 * k + 3);
+        const double limit = k == 0 ? 0.93 : k == 1 ? 0.90 : 0.88; // reached: 0.944, 0.909, 0.899
+        CHECK(balanced(what, split + k) >= limit);
+        snprintf(what, sizeof what, "%d seeds, %d random choices of %d views", (int)SEEDS, (int)CHOICES, 3 * k + 3);
+        CHECK(balanced(what, choices + k) >= 0.91); // 0.940, 0.944, 0.920
+    }
 }
 
 #endif
@@ -472,7 +560,7 @@ int main(void) {
     test_walls();
     test_recall();
 #ifdef GSF_USE_EMBREE
-    test_procedural();
+    test_accuracy();
 #else
     printf("built without Embree: the procedural scene cannot be traced, accuracy against it skipped\n");
 #endif
