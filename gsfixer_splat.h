@@ -313,7 +313,7 @@ typedef struct gsf_trainer gsf_trainer;
 // The trainer copies views and splats (non-finite ones are left out). Steps are deterministic: same bits for any number of
 // workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored views
 // and their weight is above 0, one restored view: both gradients go into one Adam step (dense: unseen splats move by their
-// momentum), and each render counts for itself in the densification statistics.
+// momentum). For densification the gradients of photos and of restored views are averaged apart, and the larger mean counts.
 // Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4 with a weight, and 24 more
 // for its window moments, up to 512 MiB of these (photos beyond that only train slower).
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc,
@@ -346,8 +346,10 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf
 
 // ---- restorers -----------------------------------------------------------------
 
-// Training-free restorer: reprojects the reference photos through the splats' depth with occlusion tests, blends by
-// confidence, keeps the render where no reference sees. Fills *out; out->user is freed by gsf_splat_destroy_warp.
+// Training-free restorer: reprojects what the splats do not yet explain of the reference photos (photo - render) through
+// the splats' depth with occlusion tests, blends by confidence, and adds it to the frame; keeps the render where no
+// reference sees. References without a render: the photos themselves. Fills *out; out->user is freed by
+// gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -363,10 +365,10 @@ typedef struct gsf_fix_desc {
     gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
     const double* points;         // (point_count,3) world points for the path's principal axes; NULL = cameras only.
     size_t point_count;           //   Borrowed until the fixer is destroyed
-    int32_t rounds;               // restoration rounds, default 2; < 0: none
+    int32_t rounds;               // restoration rounds, default 3; < 0: none
     int32_t first_round;          // iteration after which the first round runs; 0 = about 1/3 of the iterations, shortly
                                   // before a densification
-    int32_t last_round;           // the others are spread evenly up to this iteration; 0 = about 2/3, likewise
+    int32_t last_round;           // the others are spread evenly up to this iteration; 0 = about 5/6, likewise
     int32_t windows;              // per round; 0 = one per training view, at least 2
     int32_t window_frames;        // 0 = 17, moved to the nearest count the restorer takes
     float lambda;                 // weight of the restored views at the end of training, default 1
@@ -6109,8 +6111,8 @@ typedef struct gsf__model {
     int32_t sh_degree;
     gsf__group groups[GSF__GROUPS];
     uint32_t* ids;
-    float* grad_sum;         // densification: sum of screen-space gradient norms ...
-    uint32_t* visits;        // ... over this many renders in which the splat was visible
+    float* grad_sum[2];      // densification, photos and restored views apart: sum of screen-space gradient norms ...
+    uint32_t* visits[2];     // ... over this many renders in which the splat was visible
     float* screen[2];        // (count,2) gradient of the pixel mean in this step's photo and restored view
     uint8_t* seen[2];        // visible there?
     uint8_t* hidden;         // dropped out of this render
@@ -6145,8 +6147,8 @@ static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block)
         GSF__PLACE(group->grad, float, capacity * widths[g]);
     }
     GSF__PLACE(model->ids, uint32_t, capacity);
-    GSF__PLACE(model->grad_sum, float, capacity);
-    GSF__PLACE(model->visits, uint32_t, capacity);
+    for (int i = 0; i < 2; i++) GSF__PLACE(model->grad_sum[i], float, capacity);
+    for (int i = 0; i < 2; i++) GSF__PLACE(model->visits[i], uint32_t, capacity);
     for (int i = 0; i < 2; i++) GSF__PLACE(model->screen[i], float, 2 * capacity);
     for (int i = 0; i < 2; i++) GSF__PLACE(model->seen[i], uint8_t, capacity);
     GSF__PLACE(model->hidden, uint8_t, capacity);
@@ -6179,9 +6181,9 @@ static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t
             memcpy(to->grad, from->grad, bytes);
         }
         memcpy(grown.ids, model->ids, n * sizeof(uint32_t));
-        memcpy(grown.grad_sum, model->grad_sum, n * sizeof(float));
-        memcpy(grown.visits, model->visits, n * sizeof(uint32_t));
         for (int i = 0; i < 2; i++) {
+            memcpy(grown.grad_sum[i], model->grad_sum[i], n * sizeof(float));
+            memcpy(grown.visits[i], model->visits[i], n * sizeof(uint32_t));
             memcpy(grown.screen[i], model->screen[i], 2 * n * sizeof(float));
             memcpy(grown.seen[i], model->seen[i], n);
         }
@@ -6387,9 +6389,14 @@ typedef struct gsf__densify_rule {
     const float* normals;  // (2, splits, 3) given standard normals instead; NULL = drawn
 } gsf__densify_rule;
 
+// The larger of the means over photos and over restored views: neither dilutes the other.
 static float gsf__densify_mean_grad(const gsf__model* model, size_t i) {
-    const float mean = model->visits[i] ? model->grad_sum[i] / (float)model->visits[i] : 0.0f;
-    return mean <= FLT_MAX ? mean : 0.0f;
+    float largest = 0.0f;
+    for (int k = 0; k < 2; k++) {
+        const float mean = model->visits[k][i] ? model->grad_sum[k][i] / (float)model->visits[k][i] : 0.0f;
+        if (mean <= FLT_MAX && mean > largest) largest = mean;
+    }
+    return largest;
 }
 
 static float gsf__model_max_log_scale(const gsf__model* model, size_t i) {
@@ -6500,8 +6507,8 @@ static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rul
         kept++;
     }
     model->count = kept;
-    memset(model->grad_sum, 0, kept * sizeof(float));
-    memset(model->visits, 0, kept * sizeof(uint32_t));
+    for (int k = 0; k < 2; k++) memset(model->grad_sum[k], 0, kept * sizeof(float));
+    for (int k = 0; k < 2; k++) memset(model->visits[k], 0, kept * sizeof(uint32_t));
 }
 
 // Carries out what gsf__densify_select decided. There must be room for count + clones + 2 splits.
@@ -6958,8 +6965,8 @@ static void gsf__visit_chunk(void* arg, size_t chunk, int worker) {
             float* g = model->screen[k] + 2 * i;
             if (model->seen[k][i]) {
                 const float x = g[0] * job->half[k][0], y = g[1] * job->half[k][1], norm = sqrtf(x * x + y * y);
-                if (norm <= FLT_MAX) model->grad_sum[i] += norm;
-                model->visits[i]++;
+                if (norm <= FLT_MAX) model->grad_sum[k][i] += norm;
+                model->visits[k][i]++;
             }
             g[0] = g[1] = 0.0f;
         }
@@ -7196,7 +7203,8 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
 //             next id, first bands, bits of the restored weight; u64 splats, restored steps, rejected, settings; f64 bits of
 //             the origin (3)
 //     "TV0 ".."TV4 ", "TM0 ".., "TS0 .."   value, first and second moment of means, log-scales, quats, opacities, SH
-//     "TIDS", "TGRD", "TVIS"               ids, densification sums and visits
+//     "TIDS"                               ids
+//     "TGRD", "TVIS", "TGRR", "TVIR"       densification sums and visits, of photos and of restored views
 enum { GSF__STATE_SIZE = 24 + 4 * 8 + 3 * 8 };
 #define GSF__BYTE_ORDER_MARK 0x01020304u
 
@@ -7235,10 +7243,10 @@ static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void*
         *row = group->width * sizeof(float);
         return 1;
     }
-    void* const rest[3] = {model->ids, model->grad_sum, model->visits};
-    const char* const tags[3] = {"TIDS", "TGRD", "TVIS"};
+    void* const rest[] = {model->ids, model->grad_sum[0], model->visits[0], model->grad_sum[1], model->visits[1]};
+    const char* const tags[] = {"TIDS", "TGRD", "TVIS", "TGRR", "TVIR"};
     i -= 3 * GSF__GROUPS;
-    if (i >= 3) return 0;
+    if (i >= (int)GSF__COUNT(rest)) return 0;
     memcpy(tag, tags[i], 5);
     *data = rest[i];
     *row = 4;
@@ -7424,33 +7432,42 @@ GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) {
 
 // ---- >>warp --------------------------------------------------------------------
 
-/* Training-free restorer. The references' own depth maps, rendered from the splats, are the geometry: what a reference
-   photo shows lies on them, and floaters in front of the novel camera do not touch them.
+/* Training-free restorer: restored = render + residual. What the splats do not yet explain of a photo, photo - render at
+   the photo's own camera, is carried over to the novel frame. (Carrying the photo itself is worse than the render: it
+   brings the photo's exposure and view-dependent light along, and shifts all detail by the error of the depth; residuals
+   are small, and have neither.) The geometry is the references' own depth maps, rendered from the splats: floaters in
+   front of the novel camera do not touch them.
        begin     per reference: a score per pixel from the other references. A point that another reference sees at the
                  same depth is supported; one that lies in front of what another reference sees is refuted, since that
                  reference looks through it (free-space violation).
-       restore   per frame: each reference's depth map, cut at depth edges, is drawn as a triangle mesh into a z-buffer of
-                 the frame; per pixel the candidates of all references are grouped by depth, the nearest group of enough
-                 weight wins (occlusion), and its photos are blended by score and angle. Pixels that no reference reaches
-                 keep the render and get confidence 0, so they are not trained on. */
+       restore   per frame: the depth maps of the nearest references, cut at depth edges, are drawn as triangle meshes into
+                 z-buffers of the frame; per pixel the candidates are grouped by depth, the nearest group of enough weight
+                 wins (occlusion), and its residuals are blended by score and angle. Pixels that no reference reaches keep
+                 the render and get confidence 0, so they are not trained on.
+   Where a reference comes without its render, the photos themselves are carried. */
 
 typedef struct gsf__warp_reference {
     gsf_camera camera;
     double center[3];
-    float* color;  // (H,W,3)
-    float* depth;  // (H,W), 0 = nothing
-    float* score;  // (H,W), 0..1
+    double focus[3]; // world point in the middle of what it sees
+    float* color;    // (H,W,3)
+    float* carried;  // (H,W,3): colour - render, or the colour itself
+    float* depth;    // (H,W), 0 = nothing
+    float* score;    // (H,W), 0..1
 } gsf__warp_reference;
 
 typedef struct gsf__warp {
     gsf__warp_reference* references;
     int32_t count;
+    int carries_residual;
 } gsf__warp;
 
 #define GSF__WARP_DEPTH_TOLERANCE 0.04f // relative: the same surface
 #define GSF__WARP_EDGE 1.06f            // depth ratio across one pixel above which a surface ends
-#define GSF__WARP_ANGLE 0.35f           // radians: a reference this far off in viewing direction weighs exp(-1/2)
+#define GSF__WARP_ANGLE 0.2f            // radians: a reference this far off in viewing direction weighs exp(-1/2)
 #define GSF__WARP_GROUP_SHARE 0.35f     // of the heaviest group's weight that a nearer group must have to hide it
+#define GSF__WARP_TRUST 0.5f            // weight from which on a residual is carried over whole
+enum { GSF__WARP_NEAREST = 4 };         // references drawn per frame
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                                   gsf_restorer_limits* out) {
@@ -7458,8 +7475,8 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     (void)ctx;
     memset(out, 0, sizeof *out);
     out->needs_depth = 1;
-    out->bytes = (double)width * height * (warp->count > 0 ? warp->count : 3) * 24.0;
-    out->flops = (double)width * height * frame_count * 200.0 * (warp->count > 0 ? warp->count : 3);
+    out->bytes = (double)width * height * (warp->count > 0 ? warp->count : 3) * 32.0;
+    out->flops = (double)width * height * frame_count * 200.0 * (warp->count > 0 && warp->count < GSF__WARP_NEAREST ? warp->count : GSF__WARP_NEAREST);
     return GSF_OK;
 }
 
@@ -7528,12 +7545,25 @@ static void gsf__warp_score_row(void* arg, size_t row, int worker) {
     }
 }
 
+static void gsf__warp_find_focus(gsf__warp_reference* ref) { // its middle pixel at its mean inverse depth
+    const size_t pixels = (size_t)ref->camera.width * (size_t)ref->camera.height;
+    double sum = 0.0, count = 0.0;
+    for (size_t p = 0; p < pixels; p++)
+        if (ref->depth[p] > 0.0f) {
+            sum += 1.0 / (double)ref->depth[p];
+            count += 1.0;
+        }
+    gsf__unproject(&ref->camera, 0.5 * ref->camera.width, 0.5 * ref->camera.height, sum > 0.0 ? count / sum : 1.0, ref->focus);
+}
+
 static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
     gsf__warp* warp = (gsf__warp*)user;
     if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
     warp->references = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__warp_reference));
     if (!warp->references) return GSF_ERROR_OUT_OF_MEMORY;
     warp->count = count;
+    warp->carries_residual = 1;
+    for (int32_t i = 0; i < count; i++) warp->carries_residual &= references[i].render.data != NULL;
     for (int32_t i = 0; i < count; i++) {
         gsf__warp_reference* ref = warp->references + i;
         const gsf_camera* camera = &references[i].camera;
@@ -7544,16 +7574,23 @@ static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_refere
         if (result == GSF_OK) {
             ref->camera = *camera;
             gsf_camera_center(camera, ref->center);
-            ref->color = (float*)gsf_alloc(ctx, pixels, 5 * sizeof(float));
+            ref->color = (float*)gsf_alloc(ctx, pixels, 8 * sizeof(float));
             if (!ref->color) result = GSF_ERROR_OUT_OF_MEMORY;
         }
         if (result == GSF_OK) {
-            ref->depth = ref->color + 3 * pixels;
+            ref->carried = ref->color + 3 * pixels;
+            ref->depth = ref->carried + 3 * pixels;
             ref->score = ref->depth + pixels;
             gsf_image color = gsf_wrap_image(ref->color, GSF_F32, camera->width, camera->height, 3);
             gsf_image depth = gsf_wrap_image(ref->depth, GSF_F32, camera->width, camera->height, 1);
             result = gsf_convert_image(ctx, &references[i].color, &color);
             if (result == GSF_OK) result = gsf_convert_image(ctx, &references[i].depth, &depth);
+            gsf_image carried = gsf_wrap_image(ref->carried, GSF_F32, camera->width, camera->height, 3);
+            if (result == GSF_OK)
+                result = gsf_convert_image(ctx, warp->carries_residual ? &references[i].render : &color, &carried);
+            for (size_t p = 0; p < 3 * pixels && result == GSF_OK && warp->carries_residual; p++)
+                ref->carried[p] = ref->color[p] - ref->carried[p];
+            if (result == GSF_OK) gsf__warp_find_focus(ref);
         }
         if (result != GSF_OK) {
             gsf__warp_end(user, ctx);
@@ -7633,46 +7670,70 @@ static void gsf__warp_draw(const gsf__warp_reference* ref, const gsf_camera* cam
     }
 }
 
-enum { GSF__WARP_MAX_CANDIDATES = 32 }; // references that can compete for a pixel
+// Cosine of the angle at `point` between the directions to two camera centres.
+static double gsf__warp_cosine(const double point[3], const double a[3], const double b[3]) {
+    double along = 0.0, n0 = 0.0, n1 = 0.0;
+    for (int c = 0; c < 3; c++) {
+        const double p = point[c] - a[c], q = point[c] - b[c];
+        along += p * q;
+        n0 += p * p;
+        n1 += q * q;
+    }
+    return along / sqrt(n0 * n1 + 1e-300);
+}
+
+// The references that see their focus most nearly as a camera at `center` does; ties go to the lower index.
+static int gsf__warp_nearest(const gsf__warp* warp, const double center[3], int32_t nearest[GSF__WARP_NEAREST]) {
+    double best[GSF__WARP_NEAREST];
+    int count = 0;
+    for (int32_t k = 0; k < warp->count; k++) {
+        const double cosine = gsf__warp_cosine(warp->references[k].focus, center, warp->references[k].center);
+        int at = count < GSF__WARP_NEAREST ? count++ : GSF__WARP_NEAREST;
+        for (; at > 0 && best[at - 1] < cosine; at--)
+            if (at < GSF__WARP_NEAREST) {
+                best[at] = best[at - 1];
+                nearest[at] = nearest[at - 1];
+            }
+        if (at < GSF__WARP_NEAREST) {
+            best[at] = cosine;
+            nearest[at] = k;
+        }
+    }
+    return count;
+}
 
 typedef struct gsf__warp_job {
     const gsf__warp* warp;
     const gsf_restore_window* window;
-    float* scratch;        // per worker: references x pixels inverse depths, then two rows of vertices
+    float* scratch;        // per worker: nearest references x pixels inverse depths, then two rows of vertices
     size_t scratch_floats, row_floats;
 } gsf__warp_job;
 
-// Blends the candidates of one pixel. Returns the confidence; 0 where no reference reaches.
-static float gsf__warp_pixel(const gsf__warp* warp, const gsf_camera* camera, const double center[3], int32_t x, int32_t y,
-                             const float* inv_z, size_t plane, float rgb[3]) {
-    float depth[GSF__WARP_MAX_CANDIDATES], weight[GSF__WARP_MAX_CANDIDATES], color[GSF__WARP_MAX_CANDIDATES][3];
+// Blends what the references carry to one pixel. Returns the confidence; 0 where no reference reaches.
+static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
+                             const double center[3], int32_t x, int32_t y, const float* inv_z, size_t plane, float rgb[3]) {
+    float depth[GSF__WARP_NEAREST], weight[GSF__WARP_NEAREST], carried[GSF__WARP_NEAREST][3];
     int count = 0;
-    for (int32_t k = 0; k < warp->count && count < GSF__WARP_MAX_CANDIDATES; k++) {
+    for (int k = 0; k < near_count; k++) {
         const float inverse = inv_z[(size_t)k * plane];
         if (!(inverse > 0.0f)) continue;
-        const gsf__warp_reference* ref = warp->references + k;
-        double point[3], u, v, z, along = 0.0, n0 = 0.0, n1 = 0.0;
+        const gsf__warp_reference* ref = warp->references + nearest[k];
+        double point[3], u, v, z;
         gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
         if (!gsf_camera_project(&ref->camera, point, &u, &v, &z)) continue;
-        for (int c = 0; c < 3; c++) {
-            const double p = point[c] - center[c], q = point[c] - ref->center[c];
-            along += p * q;
-            n0 += p * p;
-            n1 += q * q;
-        }
-        const double cosine = along / sqrt(n0 * n1 + 1e-300);
+        const double cosine = gsf__warp_cosine(point, center, ref->center);
         const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // angle squared, to second order
         const float score = gsf__sample(ref->score, ref->camera.width, ref->camera.height, 1, 0, u, v);
         if (!(score > 0.0f)) continue;
         depth[count] = (float)(1.0 / (double)inverse);
         weight[count] = score * gsf__exp(-0.5f * angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
         for (int c = 0; c < 3; c++)
-            color[count][c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
+            carried[count][c] = gsf__sample(ref->carried, ref->camera.width, ref->camera.height, 3, c, u, v);
         count++;
     }
     if (count == 0) return 0.0f;
 
-    float heaviest = 0.0f, group[GSF__WARP_MAX_CANDIDATES];
+    float heaviest = 0.0f, group[GSF__WARP_NEAREST];
     for (int i = 0; i < count; i++) {
         group[i] = 0.0f;
         for (int j = 0; j < count; j++)
@@ -7690,18 +7751,19 @@ static float gsf__warp_pixel(const gsf__warp* warp, const gsf_camera* camera, co
             if (!(fabsf(depth[j] - depth[front]) <= GSF__WARP_DEPTH_TOLERANCE * depth[front])) continue;
             if (pass == 0) total += weight[j];
             for (int c = 0; c < 3; c++) {
-                if (pass == 0) rgb[c] += weight[j] * color[j][c];
-                else spread += weight[j] * (color[j][c] - rgb[c] / total) * (color[j][c] - rgb[c] / total);
+                if (pass == 0) rgb[c] += weight[j] * carried[j][c];
+                else spread += weight[j] * (carried[j][c] - rgb[c] / total) * (carried[j][c] - rgb[c] / total);
             }
         }
-    for (int c = 0; c < 3; c++) rgb[c] /= total;
+    const float share = warp->carries_residual && total < GSF__WARP_TRUST ? total / GSF__WARP_TRUST : 1.0f;
+    for (int c = 0; c < 3; c++) rgb[c] *= share / total;
     const float agreement = gsf__exp(-spread / total / (3.0f * 0.15f * 0.15f));
-    const float confidence = (total < 1.0f ? total : 1.0f) * agreement;
-    return confidence < 1.0f ? confidence : 1.0f;
+    return (total < 1.0f ? total : 1.0f) * agreement;
 }
 
 static void gsf__warp_frame(void* arg, size_t frame, int worker) {
     const gsf__warp_job* job = (const gsf__warp_job*)arg;
+    const gsf__warp* warp = job->warp;
     const gsf_restore_window* window = job->window;
     const gsf_camera* camera = window->cameras + frame;
     const gsf_image *color = window->out_color + frame, *confidence = window->out_confidence + frame;
@@ -7710,25 +7772,33 @@ static void gsf__warp_frame(void* arg, size_t frame, int worker) {
     float* inv_z = job->scratch + (size_t)worker * job->scratch_floats;
     gsf__warp_vertex* rows = (gsf__warp_vertex*)(void*)(inv_z + job->scratch_floats - job->row_floats);
     double center[3];
+    int32_t nearest[GSF__WARP_NEAREST];
     gsf_camera_center(camera, center);
+    const int near_count = gsf__warp_nearest(warp, center, nearest);
     memset(inv_z, 0, (job->scratch_floats - job->row_floats) * sizeof(float));
-    for (int32_t k = 0; k < job->warp->count; k++)
-        gsf__warp_draw(job->warp->references + k, camera, rows, inv_z + (size_t)k * plane);
+    for (int k = 0; k < near_count && known < 0; k++)
+        gsf__warp_draw(warp->references + nearest[k], camera, rows, inv_z + (size_t)k * plane);
     for (int32_t y = 0; y < camera->height; y++)
         for (int32_t x = 0; x < camera->width; x++) {
-            float rgb[3];
+            float rgb[3] = {0.0f, 0.0f, 0.0f}, weight;
             const size_t at = (size_t)y * (size_t)camera->width + (size_t)x;
-            float weight = gsf__warp_pixel(job->warp, camera, center, x, y, inv_z + at, plane, rgb);
+            int keeps_render = warp->carries_residual;
             if (known >= 0) { // the frame is that photo's own view
-                const gsf__warp_reference* ref = job->warp->references + known;
+                const gsf__warp_reference* ref = warp->references + known;
                 const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
                 const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
                 for (int c = 0; c < 3; c++)
                     rgb[c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
                 weight = u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height ? 1.0f : 0.0f;
+                keeps_render = 0;
+            } else {
+                weight = gsf__warp_pixel(warp, nearest, near_count, camera, center, x, y, inv_z + at, plane, rgb);
             }
-            for (int c = 0; c < 3; c++)
-                gsf__put_pixel(color, x, y, c, weight > 0.0f ? rgb[c] : gsf__get_pixel(window->color + frame, x, y, c));
+            for (int c = 0; c < 3; c++) {
+                const float render = gsf__get_pixel(window->color + frame, x, y, c);
+                const float value = keeps_render ? render + rgb[c] : rgb[c];
+                gsf__put_pixel(color, x, y, c, !(weight > 0.0f) ? render : value);
+            }
             gsf__put_pixel(confidence, x, y, 0, weight);
         }
 }
@@ -7752,7 +7822,7 @@ static gsf_result gsf__warp_restore(void* user, gsf_context* ctx, const gsf_rest
     job.warp = warp;
     job.window = window;
     job.row_floats = 2 * widest * (sizeof(gsf__warp_vertex) / sizeof(float));
-    job.scratch_floats = pixels * (size_t)warp->count + job.row_floats;
+    job.scratch_floats = pixels * GSF__WARP_NEAREST + job.row_floats;
     job.scratch = (float*)gsf_alloc(ctx, job.scratch_floats, (size_t)ctx->parallel.worker_count * sizeof(float));
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__parallel_for(ctx, (size_t)window->frame_count, gsf__warp_frame, &job);
@@ -7940,10 +8010,10 @@ static int32_t gsf__calm_iteration(const gsf_train_desc* d, int32_t iteration) {
 static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view_count, int has_restorer) {
     gsf_fix_desc d = *desc;
     if (d.train.iterations == 0) d.train.iterations = 30000;
-    if (d.rounds == 0) d.rounds = 2;
+    if (d.rounds == 0) d.rounds = 3;
     if (d.rounds < 0 || !has_restorer) d.rounds = 0;
     if (d.first_round == 0) d.first_round = gsf__calm_iteration(&d.train, d.train.iterations / 3);
-    if (d.last_round == 0) d.last_round = gsf__calm_iteration(&d.train, d.train.iterations * 2 / 3);
+    if (d.last_round == 0) d.last_round = gsf__calm_iteration(&d.train, (int32_t)((int64_t)d.train.iterations * 5 / 6));
     if (d.last_round < d.first_round) d.last_round = d.first_round;
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
     if (d.window_frames == 0) d.window_frames = 17;
@@ -8099,7 +8169,7 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
-// Hands the photos and the depth that the splats have at their cameras to the restorer.
+// Hands the photos, and what the splats show at their cameras, to the restorer.
 static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     if (f->references_open) return GSF_OK;
     gsf_reference* references = (gsf_reference*)gsf_alloc_zeroed(ctx, f->view_count, sizeof(gsf_reference));
@@ -8111,9 +8181,12 @@ static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
         references[i].color = f->photos[i];
         if (!needs_depth) continue;
         result = gsf_make_image(ctx, GSF_F32, f->cameras[i].width, f->cameras[i].height, 1, &references[i].depth);
+        if (result == GSF_OK)
+            result = gsf_make_image(ctx, GSF_F32, f->cameras[i].width, f->cameras[i].height, 3, &references[i].render);
         if (result != GSF_OK) break;
         gsf_render_output out;
         memset(&out, 0, sizeof out);
+        out.color = references[i].render;
         out.depth = references[i].depth;
         result = gsf_splat_trainer_render(ctx, f->trainer, f->cameras + i, &out);
     }
@@ -8124,7 +8197,10 @@ static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
         if (result != GSF_OK) f->restorer->end_fn(f->restorer->user, ctx);
     }
     if (result == GSF_OK) f->references_open = 1;
-    for (size_t i = 0; i < f->view_count; i++) gsf_destroy_image(ctx, &references[i].depth);
+    for (size_t i = 0; i < f->view_count; i++) {
+        gsf_destroy_image(ctx, &references[i].render);
+        gsf_destroy_image(ctx, &references[i].depth);
+    }
     gsf_free(ctx, references);
     return result;
 }

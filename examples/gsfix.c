@@ -46,7 +46,7 @@ static const option_spec option_specs[] = {
      "regularisers for few views (default on); off is plain 3DGS"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
      "path of the frames to repair (default reference)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "training steps in all (default 3000)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "training steps in all (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
      "initial points: those that a training view sees by ray, by track, or by either (both, the default); all points;\n"
      "random ones (the default where the scene has no points)"},
@@ -838,8 +838,9 @@ static int run_masks(gsfix_app* app) {
 // ---- restore ---------------------------------------------------------------------
 
 /* One clip. FRAMES_DIR is a folder of pictures, or laid out as a restorer's job:
-       frames/NAME.png  depth/NAME.npy  cameras.json  refs/NAME.png  refs/cameras.json  refs/depth/NAME.npy
-   exec needs the frames only, warp needs all of it. */
+       frames/NAME.png  depth/NAME.npy  cameras.json
+       refs/NAME.png  refs/cameras.json  refs/depth/NAME.npy  refs/render/NAME.png
+   exec needs the frames only, warp needs all of it (without refs/render it carries over the photos themselves). */
 typedef struct clip {
     gsfix_names frame_names, ref_names;
     size_t frames, refs;
@@ -934,7 +935,9 @@ static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
         c->refs = i + 1;
         result = load_float(ctx, app->o.refs ? name : gsfix_pathf("%s/%s", folder.s, name).s, 3, &r->color);
         if (result == GSF_OK && c->ref_camera_count == c->ref_names.count) r->camera = c->ref_cameras[i];
+        const gsfix_path render = gsfix_pathf("%s/render/%s.png", folder.s, gsfix_stem(name).s);
         const gsfix_path depth = gsfix_pathf("%s/depth/%s.npy", folder.s, gsfix_stem(name).s);
+        if (result == GSF_OK && gsfix_exists(render.s)) result = load_float(ctx, render.s, 3, &r->render);
         if (result == GSF_OK && gsfix_exists(depth.s)) result = gsfix_load_npy(ctx, depth.s, &r->depth);
     }
     return result;
@@ -978,6 +981,7 @@ static void free_clip(gsfix_app* app, clip* c) {
     for (size_t i = 0; i < 5 * c->frames; i++) gsf_destroy_image(ctx, c->color + i);
     for (size_t i = 0; i < c->refs; i++) {
         gsf_destroy_image(ctx, &c->references[i].color);
+        gsf_destroy_image(ctx, &c->references[i].render);
         gsf_destroy_image(ctx, &c->references[i].depth);
     }
     gsf_free(ctx, c->color);

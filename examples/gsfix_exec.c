@@ -14,7 +14,8 @@
        depth/%05d.npy     float32 (height,width) camera depth, 0 = nothing there
        alpha/%05d.png     1 - transmittance
        cameras.json       cameras of the frames; a frame that is a photo's view is named after it ("refs/00002.png")
-       refs/%05d.png      the photos; refs/cameras.json; refs/depth/%05d.npy where depth is known
+       refs/%05d.png      the photos; refs/cameras.json; refs/depth/%05d.npy and refs/render/%05d.png (what the
+                          splats show there) where known
    and what COMMAND leaves there with exit status 0:
        out/%05d.png         as many and as large as frames/
        confidence/%05d.png  optional, for all frames or for none: white = trust the pixel (none: all are trusted)
@@ -38,6 +39,7 @@ static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, 
 static gsf_result exec_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
     const exec_state* e = (const exec_state*)user;
     gsf_result result = gsfix_clear_folder(ctx, e->job, 1);
+    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/refs/render", e->job).s);
     if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/refs/depth", e->job).s);
     gsf_camera* cameras = (gsf_camera*)gsf_alloc(ctx, (size_t)count + 1, sizeof *cameras);
     if (!cameras) return GSF_ERROR_OUT_OF_MEMORY;
@@ -46,6 +48,8 @@ static gsf_result exec_begin(void* user, gsf_context* ctx, const gsf_reference* 
         cameras[i] = references[i].camera;
         known &= cameras[i].width > 0;
         result = gsf_save_image(ctx, gsfix_pathf("%s/refs/%05d.png", e->job, (int)i).s, &references[i].color);
+        if (result == GSF_OK && references[i].render.data)
+            result = gsf_save_image(ctx, gsfix_pathf("%s/refs/render/%05d.png", e->job, (int)i).s, &references[i].render);
         if (result == GSF_OK && references[i].depth.data)
             result = gsfix_save_npy(ctx, gsfix_pathf("%s/refs/depth/%05d.npy", e->job, (int)i).s, &references[i].depth);
     }

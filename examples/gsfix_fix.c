@@ -7,15 +7,15 @@
 
 // ---- defaults: decided by measurement, kept here only ------------------------------
 
-enum { DEFAULT_ITERATIONS = 3000, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000 };
+enum { DEFAULT_ITERATIONS = 1200, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000 };
 
 static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
 
 static const gsfix_quality qualities[] = { // footprint OFFICIAL loses what lies beyond 3 sigma
     {"exact", GSF_FOOTPRINT_FULL, 0.0f, 0},
-    {"balanced", GSF_FOOTPRINT_FULL, 36.0f, 0},
-    {"fast", GSF_FOOTPRINT_OFFICIAL, 30.0f, 320 * 240},
+    {"balanced", GSF_FOOTPRINT_FULL, 45.0f, 0},
+    {"fast", GSF_FOOTPRINT_OFFICIAL, 36.0f, 320 * 240},
 };
 
 const gsfix_quality* gsfix_find_quality(const char* name) {

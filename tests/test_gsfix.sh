@@ -63,7 +63,8 @@ is_json stdout
 # fix, with the repair by a program: it copies the frames (in a subfolder's job) and trusts every pixel
 cat > copy.sh <<'SH'
 #!/bin/sh
-[ -s "$1/cameras.json" ] && [ -s "$1/depth/00000.npy" ] && [ -s "$1/alpha/00000.png" ] && [ -s "$1/refs/00000.png" ] || exit 3
+[ -s "$1/cameras.json" ] && [ -s "$1/depth/00000.npy" ] && [ -s "$1/alpha/00000.png" ] && [ -s "$1/refs/00000.png" ] &&
+[ -s "$1/refs/render/00000.png" ] || exit 3
 cp "$1"/frames/*.png "$1/out/"
 SH
 printf '#!/bin/sh\nsleep 60\n' > slow.sh
