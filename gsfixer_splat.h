@@ -7433,10 +7433,11 @@ GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) {
 // ---- >>warp --------------------------------------------------------------------
 
 /* Training-free restorer: restored = render + residual. What the splats do not yet explain of a photo, photo - render at
-   the photo's own camera, is carried over to the novel frame. (Carrying the photo itself is worse than the render: it
-   brings the photo's exposure and view-dependent light along, and shifts all detail by the error of the depth; residuals
-   are small, and have neither.) The geometry is the references' own depth maps, rendered from the splats: floaters in
-   front of the novel camera do not touch them.
+   the photo's own camera, is carried over to the novel frame. Carrying the photo itself would bring its exposure and
+   view-dependent light along, and shift all detail by the error of the depth: on real photos (a third of the way through
+   training, held-out views, 3/6/9 photos) such frames are 1.2/1.6/2.6 dB worse than the render, frames made of residuals
+   0.3/0.7/0.8 dB better. The geometry is the references' own depth maps, rendered from the splats: floaters in front of
+   the novel camera do not touch them.
        begin     per reference: a score per pixel from the other references. A point that another reference sees at the
                  same depth is supported; one that lies in front of what another reference sees is refuted, since that
                  reference looks through it (free-space violation).
@@ -7475,8 +7476,9 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     (void)ctx;
     memset(out, 0, sizeof *out);
     out->needs_depth = 1;
-    out->bytes = (double)width * height * (warp->count > 0 ? warp->count : 3) * 32.0;
-    out->flops = (double)width * height * frame_count * 200.0 * (warp->count > 0 && warp->count < GSF__WARP_NEAREST ? warp->count : GSF__WARP_NEAREST);
+    const int32_t count = warp->count > 0 ? warp->count : 3, drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
+    out->bytes = (double)width * height * (8 * count + drawn) * sizeof(float);
+    out->flops = (double)width * height * frame_count * 200.0 * drawn;
     return GSF_OK;
 }
 
