@@ -8016,7 +8016,10 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     if (d.rounds < 0 || !has_restorer) d.rounds = 0;
     if (d.first_round == 0) d.first_round = gsf__calm_iteration(&d.train, d.train.iterations / 3);
     if (d.last_round == 0) d.last_round = gsf__calm_iteration(&d.train, (int32_t)((int64_t)d.train.iterations * 5 / 6));
-    if (d.last_round < d.first_round) d.last_round = d.first_round;
+    if (d.last_round <= d.first_round) { // a short run has no two calm iterations
+        const int32_t late = (int32_t)((int64_t)d.train.iterations * 5 / 6);
+        d.last_round = desc->last_round == 0 && late > d.first_round ? late : d.first_round;
+    }
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
     if (d.window_frames == 0) d.window_frames = 17;
     if (d.lambda == 0.0f) d.lambda = 1.0f;
@@ -8317,7 +8320,8 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
         skip = psnr >= (double)f->desc.skip_psnr;
     }
     if (!skip) {
-        GSF__TRY(f->restorer->restore_fn(f->restorer->user, ctx, &window));
+        const int done = f->explain.user && f->restorer->restore_fn == gsf__warp_restore; // the test was the restoration
+        if (!done) GSF__TRY(f->restorer->restore_fn(f->restorer->user, ctx, &window));
         const size_t before = f->pending.count;
         for (int32_t i = 0; i < f->frames; i++) {
             if (window.reference_index[i] >= 0) continue; // the photo itself is trained on anyway
