@@ -2,10 +2,11 @@
 """Held-out quality of `gsfix fix`: arms x view counts x seeds, paired.
 
     bench/quality.py --gsfix build/gsfix --scene SCENE --out DIR [--views 3,6,9] [--seeds 5] [--jobs 2]
-                     [--model SPLATS.ply] [--arm NAME="ARGS" ...] [--common "ARGS"]
+                     [--model SPLATS.ply] [--arm NAME="ARGS" ...] [--common "ARGS"] [--size "ARGS"]
 
 Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`; runs that DIR already holds are not repeated. --model
-is a model of all views (made first if not given): it fixes which pixels of each test view count as seen. Writes
+is a model of all views (made first if not given): it fixes which pixels of each test view count as seen. --size is what
+masks and runs have in common, as "--max-size 240". Writes
 DIR/quality.csv and DIR/quality.md: means per arm, and per pair of neighbouring arms the mean difference with its standard
 error over the seeds. Only the standard library is needed.
 """
@@ -49,7 +50,7 @@ def fix(options, views, seed, arm, extra):
     if not os.path.exists(metrics):
         command = [options.gsfix, "fix", options.scene, "--out", out, "--views", str(views), "--seed", str(seed),
                    "--threads", "1", "--masks", os.path.join(options.out, "masks_K%s" % views)]
-        run(command + shlex.split(options.common) + shlex.split(extra))
+        run(command + shlex.split(options.size) + shlex.split(options.common) + shlex.split(extra))
     with open(metrics) as file:
         return json.load(file)
 
@@ -64,6 +65,7 @@ def main():
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--model")
     parser.add_argument("--common", default="")
+    parser.add_argument("--size", default="")
     parser.add_argument("--arm", action="append", default=[])
     options = parser.parse_args()
     arms = [tuple(text.split("=", 1)) for text in options.arm] or DEFAULT_ARMS
@@ -76,7 +78,8 @@ def main():
     for views in options.views.split(","):
         masks = os.path.join(options.out, "masks_K%s" % views)
         if not os.path.isdir(masks):
-            run([options.gsfix, "masks", options.scene, "--views", views, "--model", model, "--out", masks])
+            run([options.gsfix, "masks", options.scene, "--views", views, "--model", model, "--out", masks] +
+                shlex.split(options.size))
 
     jobs = [(views, seed, name, extra) for seed in range(1, options.seeds + 1)
             for views in options.views.split(",") for name, extra in arms]
