@@ -32,43 +32,43 @@ typedef struct fix_setup { // everything that decides what the run computes
     char init[16]; // method, resolved
 } fix_setup;
 
-enum { WHOLE, REAL, SWITCH }; // int32_t, float, int32_t of 0 (off) or 1 (on)
+enum { SET_WHOLE, SET_REAL, SET_SWITCH }; // int32_t, float, int32_t of 0 (off) or 1 (on)
 typedef struct setting { const char* name; int kind; size_t offset; } setting;
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
 static const setting settings[] = { // zero: the library's default, see gsf_train_desc and gsf_fix_desc
-    {"sh_degree", WHOLE, offsetof(fix_setup, sh_degree)},
-    {"random_points", WHOLE, offsetof(fix_setup, random_points)},
-    {"dropout", REAL, TRAIN_AT(dropout)},
-    {"opacity_decay", REAL, TRAIN_AT(opacity_decay)},
-    {"scale_penalty", REAL, TRAIN_AT(scale_penalty)},
-    {"depth_smoothness", REAL, TRAIN_AT(depth_smoothness)},
-    {"sh_interval", WHOLE, TRAIN_AT(sh_interval)},
-    {"lr_means", REAL, TRAIN_AT(lr_means)},
-    {"lr_means_final", REAL, TRAIN_AT(lr_means_final)},
-    {"lr_sh_dc", REAL, TRAIN_AT(lr_sh_dc)},
-    {"lr_sh_rest", REAL, TRAIN_AT(lr_sh_rest)},
-    {"lr_opacity", REAL, TRAIN_AT(lr_opacity)},
-    {"lr_scales", REAL, TRAIN_AT(lr_scales)},
-    {"lr_quats", REAL, TRAIN_AT(lr_quats)},
-    {"lambda_ssim", REAL, TRAIN_AT(lambda_ssim)},
-    {"densify_from", WHOLE, TRAIN_AT(densify_from)},
-    {"densify_until", WHOLE, TRAIN_AT(densify_until)},
-    {"densify_interval", WHOLE, TRAIN_AT(densify_interval)},
-    {"densify_grad", REAL, TRAIN_AT(densify_grad)},
-    {"densify_scale", REAL, TRAIN_AT(densify_scale)},
-    {"prune_opacity", REAL, TRAIN_AT(prune_opacity)},
-    {"prune_scale", REAL, TRAIN_AT(prune_scale)},
-    {"opacity_reset_interval", WHOLE, TRAIN_AT(opacity_reset_interval)},
-    {"antialiased", SWITCH, TRAIN_AT(render.antialiased)},
-    {"rounds", WHOLE, FIX_AT(rounds)},
-    {"first_round", WHOLE, FIX_AT(first_round)},
-    {"last_round", WHOLE, FIX_AT(last_round)},
-    {"windows", WHOLE, FIX_AT(windows)},
-    {"window_frames", WHOLE, FIX_AT(window_frames)},
-    {"lambda", REAL, FIX_AT(lambda)},
-    {"skip_psnr", REAL, FIX_AT(skip_psnr)},
-    {"max_pixels", WHOLE, FIX_AT(max_pixels)},
+    {"sh_degree", SET_WHOLE, offsetof(fix_setup, sh_degree)},
+    {"random_points", SET_WHOLE, offsetof(fix_setup, random_points)},
+    {"dropout", SET_REAL, TRAIN_AT(dropout)},
+    {"opacity_decay", SET_REAL, TRAIN_AT(opacity_decay)},
+    {"scale_penalty", SET_REAL, TRAIN_AT(scale_penalty)},
+    {"depth_smoothness", SET_REAL, TRAIN_AT(depth_smoothness)},
+    {"sh_interval", SET_WHOLE, TRAIN_AT(sh_interval)},
+    {"lr_means", SET_REAL, TRAIN_AT(lr_means)},
+    {"lr_means_final", SET_REAL, TRAIN_AT(lr_means_final)},
+    {"lr_sh_dc", SET_REAL, TRAIN_AT(lr_sh_dc)},
+    {"lr_sh_rest", SET_REAL, TRAIN_AT(lr_sh_rest)},
+    {"lr_opacity", SET_REAL, TRAIN_AT(lr_opacity)},
+    {"lr_scales", SET_REAL, TRAIN_AT(lr_scales)},
+    {"lr_quats", SET_REAL, TRAIN_AT(lr_quats)},
+    {"lambda_ssim", SET_REAL, TRAIN_AT(lambda_ssim)},
+    {"densify_from", SET_WHOLE, TRAIN_AT(densify_from)},
+    {"densify_until", SET_WHOLE, TRAIN_AT(densify_until)},
+    {"densify_interval", SET_WHOLE, TRAIN_AT(densify_interval)},
+    {"densify_grad", SET_REAL, TRAIN_AT(densify_grad)},
+    {"densify_scale", SET_REAL, TRAIN_AT(densify_scale)},
+    {"prune_opacity", SET_REAL, TRAIN_AT(prune_opacity)},
+    {"prune_scale", SET_REAL, TRAIN_AT(prune_scale)},
+    {"opacity_reset_interval", SET_WHOLE, TRAIN_AT(opacity_reset_interval)},
+    {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased)},
+    {"rounds", SET_WHOLE, FIX_AT(rounds)},
+    {"first_round", SET_WHOLE, FIX_AT(first_round)},
+    {"last_round", SET_WHOLE, FIX_AT(last_round)},
+    {"windows", SET_WHOLE, FIX_AT(windows)},
+    {"window_frames", SET_WHOLE, FIX_AT(window_frames)},
+    {"lambda", SET_REAL, FIX_AT(lambda)},
+    {"skip_psnr", SET_REAL, FIX_AT(skip_psnr)},
+    {"max_pixels", SET_WHOLE, FIX_AT(max_pixels)},
 };
 enum { SETTING_COUNT = sizeof settings / sizeof settings[0] };
 
@@ -92,10 +92,10 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
         char* field = (char*)setup + settings[i].offset;
         const double x = strtod(value, &end);
         const int kind = settings[i].kind;
-        if (end == value || *end || !(fabs(x) <= 1e9) || (kind != REAL && x != (double)(int32_t)x))
-            return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, kind == REAL ? "number" : "whole number");
-        if (kind == SWITCH && x != 0.0 && x != 1.0) return gsfix_misused(app, "--set %.*s: expected 0 or 1", (int)n, p);
-        if (kind == REAL) *(float*)(void*)field = (float)x;
+        if (end == value || *end || !(fabs(x) <= 1e9) || (kind != SET_REAL && x != (double)(int32_t)x))
+            return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, kind == SET_REAL ? "number" : "whole number");
+        if (kind == SET_SWITCH && x != 0.0 && x != 1.0) return gsfix_misused(app, "--set %.*s: expected 0 or 1", (int)n, p);
+        if (kind == SET_REAL) *(float*)(void*)field = (float)x;
         else *(int32_t*)(void*)field = (int32_t)x;
         p += n + (p[n] == ',');
     }
@@ -379,9 +379,9 @@ static void write_switches(fix_run* run) {
     for (int i = 0; i < SETTING_COUNT; i++) {
         const void* field = (const char*)&used + settings[i].offset;
         if (strcmp(settings[i].name, "random_points") == 0 && strcmp(used.init, "random") != 0) continue;
-        const int32_t whole = settings[i].kind == REAL ? 0 : *(const int32_t*)field;
-        if (settings[i].kind == REAL) gsfix_json_number(ctx, t, settings[i].name, as_written(*(const float*)field));
-        else if (settings[i].kind == WHOLE) gsfix_json_number(ctx, t, settings[i].name, whole);
+        const int32_t whole = settings[i].kind == SET_REAL ? 0 : *(const int32_t*)field;
+        if (settings[i].kind == SET_REAL) gsfix_json_number(ctx, t, settings[i].name, as_written(*(const float*)field));
+        else if (settings[i].kind == SET_WHOLE) gsfix_json_number(ctx, t, settings[i].name, whole);
         else gsfix_json_text(ctx, t, settings[i].name, whole ? "on" : "off");
     }
     gsfix_json_number(ctx, t, "max_splats", (double)train->max_splats);
