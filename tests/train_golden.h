@@ -324,8 +324,8 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
     train_golden_fill(&file, "before.exp_avg_sq", TRAIN_V, &model);
     test_tensor sum = test_get_tensor(&file, "in.grad_accum"), denominator = test_get_tensor(&file, "in.denom");
     for (size_t i = 0; i < before; i++) {
-        model.grad_sum[i] = (float)sum.v[i];
-        model.visits[i] = (uint32_t)denominator.v[i];
+        model.grad_sum[0][i] = (float)sum.v[i];
+        model.visits[0][i] = (uint32_t)denominator.v[i];
         model.ids[i] = (uint32_t)(7 * i);
     }
     model.next_id = (uint32_t)(7 * before);
@@ -352,7 +352,7 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
     train_golden_check(&file, "after.exp_avg_sq", TRAIN_V, &model, 0.0);
     size_t wrong = 0;
     for (size_t i = 0; i < model.count; i++) {
-        wrong += model.visits[i] != 0 || model.grad_sum[i] != 0.0f || model.ids[i] >= model.next_id;
+        wrong += model.visits[0][i] != 0 || model.grad_sum[0][i] != 0.0f || model.ids[i] >= model.next_id;
         for (size_t j = 0; j < i; j++) wrong += model.ids[i] == model.ids[j];
     }
     CHECK(wrong == 0);
