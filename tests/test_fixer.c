@@ -42,6 +42,25 @@ static void draw_plane(const gsf_camera* camera, float* color, float* depth) {
         }
 }
 
+// A window of one frame; `window` points at the images beside it.
+typedef struct one_frame {
+    gsf_image color, restored, confidence;
+    gsf_restore_window window;
+} one_frame;
+
+static void one_frame_init(one_frame* frame, const gsf_camera* camera, float* color, float* restored, float* confidence) {
+    memset(frame, 0, sizeof *frame);
+    frame->color = gsf_wrap_image(color, GSF_F32, camera->width, camera->height, 3);
+    frame->restored = gsf_wrap_image(restored, GSF_F32, camera->width, camera->height, 3);
+    frame->confidence = gsf_wrap_image(confidence, GSF_F32, camera->width, camera->height, 1);
+    frame->window.struct_size = sizeof frame->window;
+    frame->window.frame_count = 1;
+    frame->window.cameras = camera;
+    frame->window.color = &frame->color;
+    frame->window.out_color = &frame->restored;
+    frame->window.out_confidence = &frame->confidence;
+}
+
 static void test_warp(gsf_context* ctx) {
     enum { W = 96, H = 64, N = W * H };
     static float color[3][3 * N], depth[3][N], out_color[3 * N], out_confidence[N], gray[3 * N];
@@ -55,20 +74,12 @@ static void test_warp(gsf_context* ctx) {
         references[i].depth = gsf_wrap_image(depth[i], GSF_F32, W, H, 1);
     }
     for (int i = 0; i < 3 * N; i++) gray[i] = 0.25f;
-    gsf_image frame = gsf_wrap_image(gray, GSF_F32, W, H, 3), restored = gsf_wrap_image(out_color, GSF_F32, W, H, 3);
-    gsf_image confidence = gsf_wrap_image(out_confidence, GSF_F32, W, H, 1);
     gsf_restorer warp;
-    gsf_restore_window window;
-    memset(&window, 0, sizeof window);
-    window.struct_size = sizeof window;
-    window.frame_count = 1;
-    window.color = &frame;
-    window.cameras = &cameras[2];
-    window.out_color = &restored;
-    window.out_confidence = &confidence;
+    one_frame frame;
+    one_frame_init(&frame, &cameras[2], gray, out_color, out_confidence);
     CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
-    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
     int covered = 0;
     double worst = 0.0;
     for (int i = 0; i < N; i++) {
@@ -86,7 +97,7 @@ static void test_warp(gsf_context* ctx) {
         if (i % W > 20 && i % W < 50) depth[0][i] = 1.5f;
     warp.end_fn(warp.user, ctx);
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
-    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
     double error = 0.0, weight = 0.0;
     for (int i = 0; i < N; i++) {
         weight += (double)out_confidence[i];
@@ -95,9 +106,9 @@ static void test_warp(gsf_context* ctx) {
     CHECK(weight > 0.5 * N && error / weight < 0.02);
     // the frame that is a reference is that photo
     const int32_t known = 1;
-    window.cameras = &cameras[1];
-    window.reference_index = &known;
-    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    frame.window.cameras = &cameras[1];
+    frame.window.reference_index = &known;
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
     for (int i = 0; i < N; i += 7) CHECK_NEAR(out_color[3 * i], color[1][3 * i], 1e-6);
     warp.end_fn(warp.user, ctx);
     CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 0), GSF_ERROR_INVALID_ARGUMENT);
@@ -129,20 +140,12 @@ static void test_warp_residual(gsf_context* ctx) {
         references[i].render = gsf_wrap_image(render[i], GSF_F32, W, H, 3);
         references[i].depth = gsf_wrap_image(depth[i], GSF_F32, W, H, 1);
     }
-    gsf_image frame = gsf_wrap_image(render[3], GSF_F32, W, H, 3), restored = gsf_wrap_image(out_color, GSF_F32, W, H, 3);
-    gsf_image confidence = gsf_wrap_image(out_confidence, GSF_F32, W, H, 1);
     gsf_restorer warp;
-    gsf_restore_window window;
-    memset(&window, 0, sizeof window);
-    window.struct_size = sizeof window;
-    window.frame_count = 1;
-    window.color = &frame;
-    window.cameras = &cameras[3];
-    window.out_color = &restored;
-    window.out_confidence = &confidence;
+    one_frame frame;
+    one_frame_init(&frame, &cameras[3], render[3], out_color, out_confidence);
     CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 3));
-    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
     int whole = 0;
     double worst = 0.0;
     for (int i = 0; i < N; i++) {
@@ -155,7 +158,7 @@ static void test_warp_residual(gsf_context* ctx) {
     // the reference far off in viewing direction carries almost nothing by itself
     warp.end_fn(warp.user, ctx);
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references + 2, 1));
-    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &window));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
     for (int i = 0; i < N; i++) {
         CHECK(out_confidence[i] < 0.05f);
         CHECK_NEAR(out_color[3 * i + 1], render[3][3 * i + 1], 0.1);
