@@ -348,8 +348,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf
 
 // Training-free restorer: reprojects what the splats do not yet explain of the reference photos (photo - render) through
 // the splats' depth with occlusion tests, blends by confidence, and adds it to the frame; keeps the render where no
-// reference sees. References without a render: the photos themselves. Fills *out; out->user is freed by
-// gsf_splat_destroy_warp.
+// reference sees. Floaters, which two references look through, are replaced by the photos behind them. References without a
+// render: the photos themselves. Fills *out; out->user is freed by gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -7436,15 +7436,18 @@ GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) {
    the photo's own camera, is carried over to the novel frame. Carrying the photo itself would bring its exposure and
    view-dependent light along, and shift all detail by the error of the depth: on real photos (a third of the way through
    training, held-out views, 3/6/9 photos) such frames are 1.2/1.6/2.6 dB worse than the render, frames made of residuals
-   0.3/0.7/0.8 dB better. The geometry is the references' own depth maps, rendered from the splats: floaters in front of
-   the novel camera do not touch them.
+   0.3/0.7/0.8 dB better. The exception is a floater, which a residual would keep: where two references look through what
+   the frame shows, and none sees it there, the photos are carried (squared error there at 3/6/9 photos, held-out views:
+   0.51/0.68/0.85 of the render's). The geometry is the references' own depth maps, rendered from the splats: floaters in
+   front of the novel camera do not touch them.
        begin     per reference: a score per pixel from the other references. A point that another reference sees at the
                  same depth is supported; one that lies in front of what another reference sees is refuted, since that
                  reference looks through it (free-space violation).
        restore   per frame: the depth maps of the nearest references, cut at depth edges, are drawn as triangle meshes into
                  z-buffers of the frame; per pixel the candidates are grouped by depth, the nearest group of enough weight
-                 wins (occlusion), and its residuals are blended by score and angle. Pixels that no reference reaches keep
-                 the render and get confidence 0, so they are not trained on.
+                 wins (occlusion), and its residuals are blended by score and angle, or its colours with confidence 1 where
+                 it lies behind something refuted. Pixels that no reference reaches keep the render and get confidence 0,
+                 so they are not trained on.
    Where a reference comes without its render, the photos themselves are carried. */
 
 typedef struct gsf__warp_reference {
@@ -7468,6 +7471,8 @@ typedef struct gsf__warp {
 #define GSF__WARP_ANGLE 0.2f            // radians: a reference this far off in viewing direction weighs exp(-1/2)
 #define GSF__WARP_GROUP_SHARE 0.35f     // of the heaviest group's weight that a nearer group must have to hide it
 #define GSF__WARP_TRUST 0.5f            // weight from which on a residual is carried over whole
+#define GSF__WARP_BEHIND_MIN 1.02f      // depth ratios between which a carried surface lies behind what the frame shows
+#define GSF__WARP_BEHIND_MAX 2.0f
 enum { GSF__WARP_NEAREST = 4 };         // references drawn per frame
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -7711,26 +7716,53 @@ typedef struct gsf__warp_job {
     size_t scratch_floats, row_floats;
 } gsf__warp_job;
 
-// Blends what the references carry to one pixel. Returns the confidence; 0 where no reference reaches.
+// 1 where what the frame shows at camera depth `z` cannot be there: a surface that the references carry lies behind it, and
+// they look through it. One that shows the same surface there speaks for it.
+static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
+                             int32_t x, int32_t y, double z) {
+    int through = 0;
+    double point[3], u, v, depth;
+    gsf__unproject(camera, x + 0.5, y + 0.5, z, point);
+    for (int k = 0; k < near_count; k++) {
+        const gsf__warp_reference* ref = warp->references + nearest[k];
+        if (!gsf_camera_project(&ref->camera, point, &u, &v, &depth)) continue;
+        const float seen = gsf__nearest_depth(ref, u, v);
+        if (!(seen > 0.0f)) continue;
+        const float off = (float)depth / seen - 1.0f;
+        if (fabsf(off) <= GSF__WARP_DEPTH_TOLERANCE) return 0;
+        through += off < 0.0f;
+    }
+    return through >= 2;
+}
+
+typedef struct gsf__warp_candidate {
+    const gsf__warp_reference* ref;
+    double u, v; // where the reference sees it
+    float depth; // in the frame
+    float weight;
+} gsf__warp_candidate;
+
+// What the references carry to one pixel that shows rgb at depth `shown`. Returns the confidence; 0 and rgb untouched where
+// no reference reaches.
 static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
-                             const double center[3], int32_t x, int32_t y, const float* inv_z, size_t plane, float rgb[3]) {
-    float depth[GSF__WARP_NEAREST], weight[GSF__WARP_NEAREST], carried[GSF__WARP_NEAREST][3];
+                             const double center[3], int32_t x, int32_t y, const float* inv_z, size_t plane, float shown,
+                             float rgb[3]) {
+    gsf__warp_candidate candidates[GSF__WARP_NEAREST];
     int count = 0;
     for (int k = 0; k < near_count; k++) {
         const float inverse = inv_z[(size_t)k * plane];
         if (!(inverse > 0.0f)) continue;
-        const gsf__warp_reference* ref = warp->references + nearest[k];
-        double point[3], u, v, z;
+        gsf__warp_candidate* at = candidates + count;
+        at->ref = warp->references + nearest[k];
+        double point[3], z;
         gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
-        if (!gsf_camera_project(&ref->camera, point, &u, &v, &z)) continue;
-        const double cosine = gsf__warp_cosine(point, center, ref->center);
+        if (!gsf_camera_project(&at->ref->camera, point, &at->u, &at->v, &z)) continue;
+        const double cosine = gsf__warp_cosine(point, center, at->ref->center);
         const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // angle squared, to second order
-        const float score = gsf__sample(ref->score, ref->camera.width, ref->camera.height, 1, 0, u, v);
+        const float score = gsf__sample(at->ref->score, at->ref->camera.width, at->ref->camera.height, 1, 0, at->u, at->v);
         if (!(score > 0.0f)) continue;
-        depth[count] = (float)(1.0 / (double)inverse);
-        weight[count] = score * gsf__exp(-0.5f * angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
-        for (int c = 0; c < 3; c++)
-            carried[count][c] = gsf__sample(ref->carried, ref->camera.width, ref->camera.height, 3, c, u, v);
+        at->depth = (float)(1.0 / (double)inverse);
+        at->weight = score * gsf__exp(-0.5f * angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
         count++;
     }
     if (count == 0) return 0.0f;
@@ -7739,28 +7771,35 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
     for (int i = 0; i < count; i++) {
         group[i] = 0.0f;
         for (int j = 0; j < count; j++)
-            if (fabsf(depth[j] - depth[i]) <= GSF__WARP_DEPTH_TOLERANCE * depth[i]) group[i] += weight[j];
+            if (fabsf(candidates[j].depth - candidates[i].depth) <= GSF__WARP_DEPTH_TOLERANCE * candidates[i].depth)
+                group[i] += candidates[j].weight;
         if (group[i] > heaviest) heaviest = group[i];
     }
-    int front = -1;
+    float front = 0.0f;
     for (int i = 0; i < count; i++)
-        if (group[i] >= GSF__WARP_GROUP_SHARE * heaviest && (front < 0 || depth[i] < depth[front])) front = i;
+        if (group[i] >= GSF__WARP_GROUP_SHARE * heaviest && (front == 0.0f || candidates[i].depth < front))
+            front = candidates[i].depth;
 
-    float total = 0.0f, spread = 0.0f;
-    rgb[0] = rgb[1] = rgb[2] = 0.0f;
-    for (int pass = 0; pass < 2; pass++) // mean, then weighted squared deviation
-        for (int j = 0; j < count; j++) {
-            if (!(fabsf(depth[j] - depth[front]) <= GSF__WARP_DEPTH_TOLERANCE * depth[front])) continue;
-            if (pass == 0) total += weight[j];
-            for (int c = 0; c < 3; c++) {
-                if (pass == 0) rgb[c] += weight[j] * carried[j][c];
-                else spread += weight[j] * (carried[j][c] - rgb[c] / total) * (carried[j][c] - rgb[c] / total);
-            }
+    const int refuted = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX &&
+                        gsf__warp_refutes(warp, nearest, near_count, camera, x, y, (double)shown);
+    float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
+    for (int i = 0; i < count; i++) {
+        const gsf__warp_candidate* at = candidates + i;
+        if (!(fabsf(at->depth - front) <= GSF__WARP_DEPTH_TOLERANCE * front)) continue;
+        const float* source = refuted ? at->ref->color : at->ref->carried;
+        total += at->weight;
+        for (int c = 0; c < 3; c++) {
+            const float value = gsf__sample(source, at->ref->camera.width, at->ref->camera.height, 3, c, at->u, at->v);
+            sum[c] += at->weight * value;
+            square += at->weight * value * value;
         }
-    const float share = warp->carries_residual && total < GSF__WARP_TRUST ? total / GSF__WARP_TRUST : 1.0f;
-    for (int c = 0; c < 3; c++) rgb[c] *= share / total;
-    const float agreement = gsf__exp(-spread / total / (3.0f * 0.15f * 0.15f));
-    return (total < 1.0f ? total : 1.0f) * agreement;
+    }
+    float spread = square / total;
+    for (int c = 0; c < 3; c++) spread -= sum[c] / total * (sum[c] / total);
+    const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
+    for (int c = 0; c < 3; c++)
+        rgb[c] = refuted || !warp->carries_residual ? sum[c] / total : rgb[c] + sum[c] / fmaxf(total, GSF__WARP_TRUST);
+    return (refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
 static void gsf__warp_frame(void* arg, size_t frame, int worker) {
@@ -7782,25 +7821,21 @@ static void gsf__warp_frame(void* arg, size_t frame, int worker) {
         gsf__warp_draw(warp->references + nearest[k], camera, rows, inv_z + (size_t)k * plane);
     for (int32_t y = 0; y < camera->height; y++)
         for (int32_t x = 0; x < camera->width; x++) {
-            float rgb[3] = {0.0f, 0.0f, 0.0f}, weight;
+            float rgb[3], weight;
             const size_t at = (size_t)y * (size_t)camera->width + (size_t)x;
-            int keeps_render = warp->carries_residual;
+            for (int c = 0; c < 3; c++) rgb[c] = gsf__get_pixel(window->color + frame, x, y, c);
             if (known >= 0) { // the frame is that photo's own view
                 const gsf__warp_reference* ref = warp->references + known;
                 const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
                 const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
-                for (int c = 0; c < 3; c++)
-                    rgb[c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
                 weight = u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height ? 1.0f : 0.0f;
-                keeps_render = 0;
+                for (int c = 0; c < 3 && weight > 0.0f; c++)
+                    rgb[c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
             } else {
-                weight = gsf__warp_pixel(warp, nearest, near_count, camera, center, x, y, inv_z + at, plane, rgb);
+                const float shown = window->depth ? gsf__get_pixel(window->depth + frame, x, y, 0) : 0.0f;
+                weight = gsf__warp_pixel(warp, nearest, near_count, camera, center, x, y, inv_z + at, plane, shown, rgb);
             }
-            for (int c = 0; c < 3; c++) {
-                const float render = gsf__get_pixel(window->color + frame, x, y, c);
-                const float value = keeps_render ? render + rgb[c] : rgb[c];
-                gsf__put_pixel(color, x, y, c, !(weight > 0.0f) ? render : value);
-            }
+            for (int c = 0; c < 3; c++) gsf__put_pixel(color, x, y, c, rgb[c]);
             gsf__put_pixel(confidence, x, y, 0, weight);
         }
 }

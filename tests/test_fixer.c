@@ -167,6 +167,57 @@ static void test_warp_residual(gsf_context* ctx) {
     gsf_splat_destroy_warp(ctx, &warp);
 }
 
+// A splat before the plane that both photos look through: the frame takes what they show behind it, and trusts that. One
+// photo alone, or one that shows the splat in its place, does not move it.
+static void test_warp_refutes(gsf_context* ctx) {
+    enum { W = 96, H = 64, N = W * H };
+    static float color[3][3 * N], depth[3][N], shown_color[3 * N], shown_depth[N], out_color[3 * N], out_confidence[N];
+    const gsf_camera cameras[3] = {look(-0.8, 0.0, 0.1, W, H), look(0.8, 0.1, -0.1, W, H), look(0.0, 0.05, 0.0, W, H)};
+    gsf_reference references[2];
+    memset(references, 0, sizeof references);
+    for (int i = 0; i < 3; i++) draw_plane(&cameras[i], color[i], depth[i]);
+    for (int i = 0; i < 2; i++) {
+        references[i].camera = cameras[i];
+        references[i].color = references[i].render = gsf_wrap_image(color[i], GSF_F32, W, H, 3);
+        references[i].depth = gsf_wrap_image(depth[i], GSF_F32, W, H, 1);
+    }
+    memcpy(shown_color, color[2], sizeof shown_color);
+    memcpy(shown_depth, depth[2], sizeof shown_depth);
+    for (int y = 24; y < 40; y++)
+        for (int x = 40; x < 56; x++) {
+            shown_depth[y * W + x] /= 1.2f;
+            for (int c = 0; c < 3; c++) shown_color[3 * (y * W + x) + c] = 0.25f;
+        }
+    gsf_image seen = gsf_wrap_image(shown_depth, GSF_F32, W, H, 1);
+    gsf_restorer warp;
+    one_frame frame;
+    one_frame_init(&frame, &cameras[2], shown_color, out_color, out_confidence);
+    frame.window.depth = &seen;
+    CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
+    for (int photos = 1; photos <= 2; photos++) {
+        CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, photos));
+        CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
+        double worst = 0.0;
+        for (int y = 24; y < 40; y++)
+            for (int x = 40; x < 56; x++) {
+                const int at = y * W + x;
+                const float* wanted = photos == 2 ? color[2] + 3 * at : shown_color + 3 * at;
+                for (int c = 0; c < 3; c++) worst = fmax(worst, fabs((double)(out_color[3 * at + c] - wanted[c])));
+                CHECK(photos == 2 ? out_confidence[at] > 0.95f : out_confidence[at] < 0.8f);
+            }
+        CHECK_NEAR(worst, 0.0, photos == 2 ? 0.03 : 1e-6);
+        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // beside it nothing changes
+        warp.end_fn(warp.user, ctx);
+    }
+    // the second photo shows a surface there, too: then it stays
+    for (int i = 0; i < N; i++) depth[1][i] /= 1.2f;
+    CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
+    CHECK_NEAR(out_color[3 * (32 * W + 48)], 0.25f, 1e-6);
+    warp.end_fn(warp.user, ctx);
+    gsf_splat_destroy_warp(ctx, &warp);
+}
+
 // ---- a small scene to repair ---------------------------------------------------
 
 enum { WIDTH = 48, HEIGHT = 40, VIEWS = 4, TRUTH = 400, PIXELS = WIDTH * HEIGHT };
@@ -600,6 +651,7 @@ int main(void) {
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     test_warp(&ctx);
     test_warp_residual(&ctx);
+    test_warp_refutes(&ctx);
     test_seen_mask(&ctx);
     test_desc(&ctx);
     test_mixed_windows(&ctx);
