@@ -2504,7 +2504,6 @@ static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf
 
 typedef struct gsf__psnr_job {
     const gsf_image *a, *b, *mask;
-    int64_t rows;
     gsf__metric_sum* sums; // one per chunk
 } gsf__psnr_job;
 

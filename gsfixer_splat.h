@@ -14,7 +14,8 @@
        that one that was not zeroed is refused (GSF_ERROR_INVALID_ARGUMENT).
 
    CONFIGURATION (define before the implementation)
-       GSF_USE_EMBREE   visible-point filter by ray tracing (link embree3 or embree4); without it the same discs are projected, to the same result
+       GSF_USE_EMBREE   visible-point filter by ray tracing (link embree3 or embree4); without it the same discs are
+                        projected, to the same result
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> where there is one, else <embree3/rtcore.h>
 
    SECTIONS    >>splats >>ply >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility >>embree
@@ -294,7 +295,7 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     // regularisers for few views; zero = off
     float dropout;                 // share of splats hidden in a step, growing linearly from 0 to this; the others'
                                    // opacities are divided by 1 - share (DropGaussian)
-    float opacity_decay;           // every opacity loses this share per iteration (applied every 10; 0.005 in Binocular3DGS)
+    float opacity_decay;           // every opacity loses this share per iteration (applied every 10; Binocular3DGS: 0.005)
     float scale_penalty;           // weight of mean(exp(log_scale)) / extent
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
     uint32_t _end_canary;
@@ -3243,8 +3244,8 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
         d->radius_neighbour > GSF__KNN_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: neighbours %d, radius_neighbour %d (at most %d)",
                         (int)d->neighbours, (int)d->radius_neighbour, (int)GSF__KNN_MAX);
-    if (!(d->radius_scale > 0.0f && d->radius_scale < 1e6f && d->tolerance > 0.0f && d->tolerance < 1e6f && d->coverage > 0.0f &&
-          d->min_grazing_cos > 0.0f && d->min_grazing_cos < 1.0f))
+    if (!(d->radius_scale > 0.0f && d->radius_scale < 1e6f && d->tolerance > 0.0f && d->tolerance < 1e6f &&
+          d->coverage > 0.0f && d->min_grazing_cos > 0.0f && d->min_grazing_cos < 1.0f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "visible points: radius_scale %g, tolerance %g, coverage %g, min_grazing_cos %g",
                         (double)d->radius_scale, (double)d->tolerance, (double)d->coverage, (double)d->min_grazing_cos);
@@ -4116,8 +4117,8 @@ static void gsf__free_workers(gsf_context* ctx, gsf_rasterizer* r) {
 
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
-    void* const owned[] = {r->records, r->sorted, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->rank, r->slot_begin,
-                           r->tile_begin, r->tile_counts, r->pair_rank, r->pair_slot, r->slots, r->final_T,
+    void* const owned[] = {r->records, r->sorted, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->rank,
+                           r->slot_begin, r->tile_begin, r->tile_counts, r->pair_rank, r->pair_slot, r->slots, r->final_T,
                            r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
     gsf__free_workers(ctx, r);
@@ -7560,7 +7561,8 @@ static void gsf__warp_find_focus(gsf__warp_reference* ref) { // its middle pixel
             sum += 1.0 / (double)ref->depth[p];
             count += 1.0;
         }
-    gsf__unproject(&ref->camera, 0.5 * ref->camera.width, 0.5 * ref->camera.height, sum > 0.0 ? count / sum : 1.0, ref->focus);
+    gsf__unproject(&ref->camera, 0.5 * ref->camera.width, 0.5 * ref->camera.height, sum > 0.0 ? count / sum : 1.0,
+                   ref->focus);
 }
 
 static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
@@ -7617,8 +7619,8 @@ typedef struct gsf__warp_vertex { float u, v, inv_z; } gsf__warp_vertex; // inv_
 
 // Draws a triangle of inverse depths into the z-buffer (largest inverse depth wins). Triangles seen from behind, or torn
 // wide open, are not surface.
-static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex* b, const gsf__warp_vertex* c, float* inv_z,
-                               int32_t width, int32_t height) {
+static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex* b, const gsf__warp_vertex* c,
+                               float* inv_z, int32_t width, int32_t height) {
     const float area = (b->u - a->u) * (c->v - a->v) - (b->v - a->v) * (c->u - a->u);
     if (!(area > 1e-6f)) return;
     const float lo_u = fminf(a->u, fminf(b->u, c->u)), hi_u = fmaxf(a->u, fmaxf(b->u, c->u));
@@ -7626,7 +7628,8 @@ static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex
     if (!(hi_u > 0.0f && hi_v > 0.0f && lo_u < (float)width && lo_v < (float)height)) return;
     if (hi_u - lo_u > 32.0f || hi_v - lo_v > 32.0f) return;
     const int32_t x0 = lo_u < 0.5f ? 0 : (int32_t)(lo_u - 0.5f), y0 = lo_v < 0.5f ? 0 : (int32_t)(lo_v - 0.5f);
-    const int32_t x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1, y1 = hi_v < (float)height ? (int32_t)hi_v : height - 1;
+    const int32_t x1 = hi_u < (float)width ? (int32_t)hi_u : width - 1,
+                  y1 = hi_v < (float)height ? (int32_t)hi_v : height - 1;
     const float scale = 1.0f / area;
     for (int32_t y = y0; y <= y1; y++)
         for (int32_t x = x0; x <= x1; x++) {
@@ -8305,7 +8308,8 @@ static gsf_result gsf__install_frames(gsf_context* ctx, gsf_fixer* f, const gsf_
     for (size_t i = 0; i < list->count && result == GSF_OK; i++) {
         const gsf_camera* camera = &list->frames[i].camera;
         const size_t pixels = (size_t)camera->width * (size_t)camera->height;
-        const gsf_image bytes = gsf_wrap_image(list->frames[i].pixels + 3 * pixels, GSF_U8, camera->width, camera->height, 1);
+        const gsf_image bytes =
+            gsf_wrap_image(list->frames[i].pixels + 3 * pixels, GSF_U8, camera->width, camera->height, 1);
         views[i].camera = *camera;
         views[i].image = gsf_wrap_image(list->frames[i].pixels, GSF_U8, camera->width, camera->height, 3);
         views[i].weight = gsf_wrap_image(next, GSF_F32, camera->width, camera->height, 1);
@@ -8480,12 +8484,14 @@ static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const voi
             frame.camera.height = (int32_t)gsf__load_le(p + at + 164, 4);
             at += GSF__FRAME_HEAD;
             if (gsf_check_camera(ctx, &frame.camera) != GSF_OK || frame.camera.width > 65536 ||
-                frame.camera.height > 65536 || (chunk.size - at) / 4 / (size_t)frame.camera.width < (size_t)frame.camera.height)
+                frame.camera.height > 65536 ||
+                (chunk.size - at) / 4 / (size_t)frame.camera.width < (size_t)frame.camera.height)
                 result = GSF_ERROR_FORMAT;
         }
         if (result != GSF_OK) {
             gsf__drop_frames(ctx, out);
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s, frame %llu is malformed", name, tag, (unsigned long long)i);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s, frame %llu is malformed", name, tag,
+                            (unsigned long long)i);
         }
         const size_t bytes = 4 * (size_t)frame.camera.width * (size_t)frame.camera.height;
         frame.pixels = (uint8_t*)gsf_alloc(ctx, bytes, 1);
@@ -8512,14 +8518,16 @@ GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* f, gsf_text
     gsf__save_frames(ctx, chunks, "FIXP", &f->pending);
 }
 
-GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const char* name, const void* data, size_t size) {
+GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const char* name, const void* data,
+                                           size_t size) {
     gsf_chunk chunk;
     int32_t numbers[7];
     GSF__TRY(gsf_chunks_check(ctx, name, data, size));
     if (!gsf_chunks_find(data, size, "FIXR", &chunk) || chunk.size != 28)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no FIXR chunk: not a checkpoint of the repair loop", name);
     for (int k = 0; k < 7; k++) numbers[k] = (int32_t)gsf__load_le((const char*)chunk.data + 4 * k, 4);
-    if (numbers[0] != 1) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: repair loop state version %d", name, (int)numbers[0]);
+    if (numbers[0] != 1)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: repair loop state version %d", name, (int)numbers[0]);
     if (numbers[5] != f->desc.windows || numbers[2] < 0 || numbers[2] > f->desc.rounds || numbers[4] < 0 ||
         numbers[4] > numbers[5] || (numbers[3] && numbers[2] >= f->desc.rounds))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: made with other rounds or windows", name);

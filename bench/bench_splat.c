@@ -151,7 +151,8 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         const double t0 = bench_now(), c0 = bench_cpu();
         bench_require(&ctx, gsf_splat_render(&ctx, rasterizer, &splats, &camera, NULL, &out));
         const double t1 = bench_now(), c1 = bench_cpu();
-        bench_require(&ctx, gsf_splat_render_backward(&ctx, rasterizer, &splats, &camera, NULL, d_color, NULL, NULL, &grads));
+        bench_require(&ctx,
+                      gsf_splat_render_backward(&ctx, rasterizer, &splats, &camera, NULL, d_color, NULL, NULL, &grads));
         if (i < 0) continue;
         forward[i] = t1 - t0;
         backward[i] = bench_now() - t1;
@@ -231,7 +232,9 @@ static void bench_training(const bench_options* o) {
     }
     gsf_splats start;
     if (o->start) bench_require(&ctx, gsf_splat_load_ply(&ctx, o->start, &start));
-    else bench_require(&ctx, gsf_splat_from_points(&ctx, scene.points, scene.colors, scene.point_count, NULL, 3, scene.origin, &start));
+    else
+        bench_require(&ctx, gsf_splat_from_points(&ctx, scene.points, scene.colors, scene.point_count, NULL, 3,
+                                                  scene.origin, &start));
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 30000;
@@ -303,7 +306,8 @@ int main(int argc, char** argv) {
             bench_render(&o, "10k 264x480", 10000, 0.03, 264, 480, levels[k], threads, 1);
             if (o.quick) continue;
             bench_render(&o, "100k 960x540", 100000, 0.012, 960, 540, levels[k], threads, 0);
-            if (levels[k] > GSF_CPU_SCALAR) bench_render(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads, 0);
+            if (levels[k] > GSF_CPU_SCALAR)
+                bench_render(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads, 0);
         }
     return 0;
 }

@@ -33,7 +33,8 @@ static const option_spec option_specs[] = {
      "training views: so many of those that are not test views, all of them (default), or a file of names, one per line"},
     {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
      "every Nth view by name is held out (default 8)"},
-    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks", "use images_N/, or photos N times smaller"},
+    {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks",
+     "use images_N/, or photos N times smaller"},
     {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks",
      "shrink photos whose longer side is more than this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
@@ -60,23 +61,27 @@ static const option_spec option_specs[] = {
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
      "write OUT/checkpoint every N steps and after every repaired window (default: 20 times a run and after every window, "
      "but so seldom that it costs less than 2 % of the time; never more than once a second)"},
-    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix", "single settings of the trainer and of the loop, by name:"},
+    {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix",
+     "single settings of the trainer and of the loop, by name:"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render its views"},
     {"--path", TEXT, AT(path), 0, 0, "PATH.json", "render", "render these cameras"},
-    {"--depth", FLAG, AT(depth), 0, 0, NULL, "render", "also OUT/depth/NAME.npy (float32, scene units) and a picture of it"},
+    {"--depth", FLAG, AT(depth), 0, 0, NULL, "render",
+     "also OUT/depth/NAME.npy (float32, scene units) and a picture of it"},
     {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also OUT/alpha/NAME.png"},
     {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
      "a point is kept when a training view sees it by ray, by track, or by either (default both)"},
     {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate", "path", "kind of path (default reference)"},
     {"--frames", INT, AT(frames), 2, 1e6, "N", "path", "cameras on the path, in all (default 120)"},
     {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "clips that the frames are divided into (default 1)"},
-    {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore", "the photos that guide the repair (default FRAMES_DIR/refs/)"},
+    {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
+     "the photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "restore", "encoded photos, for the restorer dit:"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage (default psnr,ssim_3dgs)"},
     {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "networks, for metrics that need one"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, say one of all views"},
-    {"--threads", INT, AT(threads), 1, 1024, "N", ALL, "workers (default: all cores); results are the same bits for any number"},
+    {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
+     "workers (default: all cores); results are the same bits for any number"},
     {"--seed", SEED, AT(seed), 0, 0, "S", ALL, "of everything random (default 0)"},
     {"--json", FLAG, AT(json), 0, 0, NULL, ALL, "one JSON object on stdout; progress goes to stderr in any case"},
     {"--help", FLAG, AT(help), 0, 0, NULL, ALL, "this text"},
@@ -181,7 +186,8 @@ static int set_option(gsfix_app* app, const option_spec* o, const char* value) {
         case INT: {
             const long long x = strtoll(value, &end, 10);
             if (errno || end == value || *end || (double)x < o->least || (double)x > o->most)
-                return gsfix_misused(app, "%s %s: expected a whole number from %.0f to %.0f", o->name, value, o->least, o->most);
+                return gsfix_misused(app, "%s %s: expected a whole number from %.0f to %.0f", o->name, value, o->least,
+                                     o->most);
             *(int*)(void*)field = (int)x;
             return 0;
         }
@@ -300,7 +306,8 @@ gsf_result gsfix_split_scene(gsfix_app* app, const gsf_scene* scene, gsfix_split
         if (wanted < 0 || (wanted == 0 && strcmp(views, "all") != 0))
             result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: at least one is needed", views);
         else if ((size_t)wanted > most)
-            result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: only %zu views are not test views", views, most);
+            result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: only %zu views are not test views",
+                              views, most);
         else
             gsf_splat_split_views(scene->view_count, test_every, (size_t)wanted, out->train, &out->train_count, out->test,
                                   &out->test_count);
@@ -308,7 +315,8 @@ gsf_result gsfix_split_scene(gsfix_app* app, const gsf_scene* scene, gsfix_split
         result = split_by_file(app, scene, views, test_every, out);
     }
     if (result == GSF_OK && out->train_count == 0)
-        result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "no training view is left of %zu views", scene->view_count);
+        result =
+            gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "no training view is left of %zu views", scene->view_count);
     if (result != GSF_OK) gsfix_free_split(app, out);
     return result;
 }
@@ -352,9 +360,11 @@ gsf_traj_kind gsfix_path_kind(const char* name) {
 int gsfix_check_restorer(gsfix_app* app) {
     const char* r = app->o.restorer;
     if (app->o.condition) return gsfix_misused(app, "--condition is for the restorer dit:, which is not in this version");
-    if (app->o.ref_features) return gsfix_misused(app, "--ref-features is for the restorer dit:, which is not in this version");
+    if (app->o.ref_features)
+        return gsfix_misused(app, "--ref-features is for the restorer dit:, which is not in this version");
     if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
-    if (strncmp(r, "dit:", 4) == 0 || strcmp(r, "dit") == 0) return gsfix_misused(app, "the restorer dit: is not in this version");
+    if (strncmp(r, "dit:", 4) == 0 || strcmp(r, "dit") == 0)
+        return gsfix_misused(app, "the restorer dit: is not in this version");
     if (strncmp(r, "exec:", 5) == 0 && r[5]) return 0;
     return gsfix_misused(app, "--restorer %s: choose from none|warp|exec:COMMAND", r);
 }
@@ -432,8 +442,10 @@ static gsf_result info_scene(gsfix_app* app) {
     const size_t entries = scene.point_count ? scene.track_begin[scene.point_count] : 0;
     gsfix_json_number(ctx, json, "track_entries", (double)entries);
     gsfix_print(app, "scene      %s", app->o.inputs[0]);
-    gsfix_print(app, "views      %zu: %zu to train on, %zu held out", scene.view_count, split.train_count, split.test_count);
-    if (least[0] == most[0] && least[1] == most[1]) gsfix_print(app, "size       %d x %d pixels", (int)most[0], (int)most[1]);
+    gsfix_print(app, "views      %zu: %zu to train on, %zu held out", scene.view_count, split.train_count,
+                split.test_count);
+    if (least[0] == most[0] && least[1] == most[1])
+        gsfix_print(app, "size       %d x %d pixels", (int)most[0], (int)most[1]);
     else gsfix_print(app, "size       %d..%d x %d..%d pixels", (int)least[0], (int)most[0], (int)least[1], (int)most[1]);
     if (scene.view_count)
         gsfix_print(app, "focal      %.1f, %.1f pixels (first view)", scene.views[0].camera.fx, scene.views[0].camera.fy);
@@ -476,7 +488,9 @@ static gsf_result info_splats(gsfix_app* app) {
             const double opacity = 1.0 / (1.0 + exp(-(double)s.opacity_logits[i]));
             opaque += opacity > 0.9;
             faint += opacity < 0.005;
-            column[i] = exp(((double)s.log_scales[3 * i] + (double)s.log_scales[3 * i + 1] + (double)s.log_scales[3 * i + 2]) / 3.0);
+            column[i] =
+                exp(((double)s.log_scales[3 * i] + (double)s.log_scales[3 * i + 1] + (double)s.log_scales[3 * i + 2]) /
+                    3.0);
         }
         if (s.count) {
             qsort(column, s.count, sizeof *column, compare_doubles);
@@ -514,8 +528,10 @@ static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const g
     gsf_render_output images = {0};
     gsf_image picture = {0};
     gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &images.color);
-    if (result == GSF_OK && app->o.depth) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.depth);
-    if (result == GSF_OK && app->o.alpha) result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.alpha);
+    if (result == GSF_OK && app->o.depth)
+        result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.depth);
+    if (result == GSF_OK && app->o.alpha)
+        result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &images.alpha);
     if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, desc, &images);
     if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", out, name).s, &images.color);
     if (result == GSF_OK && app->o.depth) {
@@ -558,8 +574,8 @@ static gsf_result render_all(gsfix_app* app) {
         const gsfix_path name = app->o.scene ? gsfix_view_stem(&scene, i) : gsfix_pathf("%05zu", i);
         const double begin = gsfix_now();
         result = gsf_is_cancelled(ctx) ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped after %zu of %zu frames", i, count)
-                                       : render_one(app, rasterizer, &splats, app->o.scene ? &scene.views[i].camera : path + i,
-                                                    &desc, name.s);
+                                       : render_one(app, rasterizer, &splats,
+                                                    app->o.scene ? &scene.views[i].camera : path + i, &desc, name.s);
         seconds += gsfix_now() - begin;
         gsfix_json_text(ctx, &app->json, NULL, gsfix_pathf("%s.png", name.s).s);
         gsfix_progress(app, (double)(i + 1), (double)count, "frame %zu of %zu", i + 1, count);
@@ -567,7 +583,8 @@ static gsf_result render_all(gsfix_app* app) {
     gsfix_json_end(ctx, &app->json, ']');
     gsfix_json_number(ctx, &app->json, "seconds", seconds);
     if (result == GSF_OK)
-        gsfix_print(app, "%zu frames of %zu splats in %.2f s, files included -> %s", count, splats.count, seconds, app->o.out);
+        gsfix_print(app, "%zu frames of %zu splats in %.2f s, files included -> %s", count, splats.count, seconds,
+                    app->o.out);
     gsf_splat_destroy_rasterizer(ctx, rasterizer);
     gsf_free(ctx, path);
     gsf_splat_destroy_scene(ctx, &scene);
@@ -815,14 +832,16 @@ static gsf_result write_masks(gsfix_app* app) {
             gsfix_json_number(ctx, &app->json, "seen", share);
             gsfix_json_end(ctx, &app->json, '}');
             gsfix_print(app, "%-24s %5.1f %% seen", view->name, 100.0 * share);
-            result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, gsfix_view_stem(&scene, split.test[i]).s).s, &mask);
+            result = gsf_save_image(
+                ctx, gsfix_pathf("%s/%s.png", app->o.out, gsfix_view_stem(&scene, split.test[i]).s).s, &mask);
         }
         gsf_destroy_image(ctx, &mask);
         gsfix_progress(app, (double)(i + 1), (double)split.test_count, "mask %zu of %zu", i + 1, split.test_count);
     }
     gsfix_json_end(ctx, &app->json, ']');
     gsfix_json_number(ctx, &app->json, "seen", mean);
-    if (result == GSF_OK) gsfix_print(app, "%.1f %% of the held-out pixels are seen from %zu views", 100.0 * mean, split.train_count);
+    if (result == GSF_OK)
+        gsfix_print(app, "%.1f %% of the held-out pixels are seen from %zu views", 100.0 * mean, split.train_count);
     gsf_free(ctx, train);
     gsfix_free_split(app, &split);
     gsf_splat_destroy(ctx, &splats);
@@ -890,10 +909,12 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/%s: %lld x %lld, but the first frame is %lld x %lld", at,
                             c->frame_names.names[i], (long long)width, (long long)height, (long long)c->color[0].width,
                             (long long)c->color[0].height);
-        if (result == GSF_OK && depth) result = gsfix_load_npy(ctx, gsfix_pathf("%s/depth/%s.npy", folder, stem.s).s, c->depth + i);
+        if (result == GSF_OK && depth)
+            result = gsfix_load_npy(ctx, gsfix_pathf("%s/depth/%s.npy", folder, stem.s).s, c->depth + i);
         if (result == GSF_OK && depth && (c->depth[i].width != width || c->depth[i].height != height))
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s/depth/%s.npy: not of the frame's size", folder, stem.s);
-        if (result == GSF_OK && alpha) result = load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
+        if (result == GSF_OK && alpha)
+            result = load_float(ctx, gsfix_pathf("%s/alpha/%s.png", folder, stem.s).s, 1, c->alpha + i);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 3, c->out_color + i);
         if (result == GSF_OK) result = gsf_make_image(ctx, GSF_F32, width, height, 1, c->out_confidence + i);
     }
@@ -903,7 +924,8 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     if (result == GSF_OK && gsfix_exists(cameras.s)) {
         result = gsf_load_cameras(ctx, cameras.s, &c->cameras, &c->camera_count);
         if (result == GSF_OK && c->camera_count != n)
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %zu cameras for %zu frames", cameras.s, c->camera_count, n);
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %zu cameras for %zu frames", cameras.s,
+                              c->camera_count, n);
     }
     return result;
 }
@@ -1007,7 +1029,8 @@ static gsf_result restore_folder(gsfix_app* app) {
     if (result == GSF_OK && present) result = restore_clip(app, &c, &restorer);
     for (size_t i = 0; i < c.frames && result == GSF_OK; i++) {
         const gsfix_path name = gsfix_stem(c.frame_names.names[i]);
-        result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name.s).s, present ? c.out_color + i : c.color + i);
+        result = gsf_save_image(ctx, gsfix_pathf("%s/%s.png", app->o.out, name.s).s,
+                                present ? c.out_color + i : c.color + i);
         if (result == GSF_OK && present)
             result = gsf_save_image(ctx, gsfix_pathf("%s/confidence/%s.png", app->o.out, name.s).s, c.out_confidence + i);
     }

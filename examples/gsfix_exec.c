@@ -144,8 +144,8 @@ static gsf_result run_program(gsf_context* ctx, const exec_state* e) {
         if (cancelled || gsfix_now() - begin > e->timeout) {
             stop_group(child);
             return cancelled ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled")
-                             : gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped", e->command,
-                                        e->timeout);
+                             : gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped",
+                                        e->command, e->timeout);
         }
         const struct timespec pause = {0, 10000000};
         nanosleep(&pause, NULL);
@@ -182,7 +182,9 @@ static gsf_result exec_restore(void* user, gsf_context* ctx, const gsf_restore_w
     for (int32_t i = 0; i < w->frame_count && result == GSF_OK; i++) {
         result = read_result(ctx, gsfix_pathf("%s/out/%05d.png", e->job, (int)i).s, 3, w->out_color + i);
         if (result != GSF_OK) break;
-        if (confidences) result = read_result(ctx, gsfix_pathf("%s/confidence/%05d.png", e->job, (int)i).s, 1, w->out_confidence + i);
+        if (confidences)
+            result =
+                read_result(ctx, gsfix_pathf("%s/confidence/%05d.png", e->job, (int)i).s, 1, w->out_confidence + i);
         else fill_ones(w->out_confidence + i);
     }
     e->failed = result != GSF_OK && result != GSF_ERROR_CANCELLED;

@@ -77,7 +77,8 @@ void gsfix_print_settings(FILE* to) {
     for (int i = 0; i < SETTING_COUNT; i++) {
         fprintf(to, column ? ", %s" : "        %s", settings[i].name);
         column += strlen(settings[i].name) + 2;
-        if (column > 90 || i + 1 == SETTING_COUNT) fprintf(to, column > 90 && i + 1 < SETTING_COUNT ? ",\n" : "\n"), column = 0;
+        if (column > 90 || i + 1 == SETTING_COUNT)
+            fprintf(to, column > 90 && i + 1 < SETTING_COUNT ? ",\n" : "\n"), column = 0;
     }
 }
 
@@ -202,8 +203,10 @@ static gsf_result random_points(fix_run* run, double** points, uint8_t** colors,
         u = view->camera.width * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i + 1);
         v = view->camera.height * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i + 2);
         const double x = (u - view->camera.cx) / view->camera.fx * z, y = (v - view->camera.cy) / view->camera.fy * z;
-        for (int k = 0; k < 3; k++) (*points)[3 * i + (size_t)k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
-        const char* pixel = (const char*)view->image.data + (int64_t)v * view->image.stride_y + (int64_t)u * view->image.stride_x;
+        for (int k = 0; k < 3; k++)
+            (*points)[3 * i + (size_t)k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
+        const char* pixel =
+            (const char*)view->image.data + (int64_t)v * view->image.stride_y + (int64_t)u * view->image.stride_x;
         for (int k = 0; k < 3; k++) (*colors)[3 * i + (size_t)k] = (uint8_t)pixel[k * view->image.stride_c];
     }
     gsf_free(ctx, poses);
@@ -222,13 +225,15 @@ static gsf_result make_initial(fix_run* run) {
         const size_t count = (size_t)run->setup.random_points;
         gsf_result result = random_points(run, &points, &colors, count);
         if (result == GSF_OK)
-            result = gsf_splat_from_points(ctx, points, colors, count, NULL, run->setup.sh_degree, scene->origin, &run->initial);
+            result = gsf_splat_from_points(ctx, points, colors, count, NULL, run->setup.sh_degree, scene->origin,
+                                           &run->initial);
         gsf_free(ctx, points);
         gsf_free(ctx, colors);
         return result;
     }
     if (!scene->point_count)
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (--init random does without)", scene->folder);
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (--init random does without)",
+                        scene->folder);
     uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count, 1);
     if (!keep) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = GSF_OK;
@@ -242,7 +247,8 @@ static gsf_result make_initial(fix_run* run) {
                                                     : GSF_VISIBILITY_BOTH;
         result = gsf_splat_visible_points(ctx, scene, run->split.train, run->split.train_count, &desc, keep, &stats);
         if (result == GSF_OK && !stats.kept)
-            result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "no point of the scene is seen by a training view (try --init all or random)");
+            result = gsf_fail(ctx, GSF_ERROR_DEGENERATE,
+                              "no point of the scene is seen by a training view (try --init all or random)");
         if (desc.method != GSF_VISIBILITY_TRACKS) run->rays = stats.used_embree ? "embree" : "z-buffer";
     }
     if (result == GSF_OK)
@@ -280,7 +286,8 @@ static gsf_result score_view(fix_run* run, size_t i, const gsf_image* color, int
     gsf_result result = gsf_psnr(run->ctx, color, photo, NULL, &out->psnr);
     if (result == GSF_OK && with_ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, NULL, &out->ssim);
     if (result == GSF_OK && mask) result = gsf_psnr(run->ctx, color, photo, mask, &out->psnr_seen);
-    if (result == GSF_OK && mask && with_ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, &out->ssim_seen);
+    if (result == GSF_OK && mask && with_ssim)
+        result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, &out->ssim_seen);
     return result;
 }
 
@@ -304,7 +311,8 @@ static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfi
         if (result != GSF_OK) return result;
         result = score_view(run, i, &color, with_ssim, scores + i);
         const gsfix_path name = gsfix_view_stem(&run->scene, run->split.test[i]);
-        if (result == GSF_OK && folder) result = gsf_save_image(run->ctx, gsfix_pathf("%s/%s.png", folder, name.s).s, &color);
+        if (result == GSF_OK && folder)
+            result = gsf_save_image(run->ctx, gsfix_pathf("%s/%s.png", folder, name.s).s, &color);
         gsf_destroy_image(run->ctx, &color);
     }
     return result;
@@ -312,7 +320,8 @@ static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfi
 
 static gsf_result add_curve_point(fix_run* run) {
     gsfix_history* h = &run->history;
-    if (!run->split.test_count || (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration)) return GSF_OK;
+    if (!run->split.test_count || (h->curve_count && h->curve[h->curve_count - 1].iteration == run->iteration))
+        return GSF_OK;
     gsf_result result = GROW(run->ctx, h, curve, curve);
     gsfix_score* scores = (gsfix_score*)gsf_alloc(run->ctx, run->split.test_count, sizeof *scores);
     if (!scores) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -334,7 +343,8 @@ static gsf_result load_masks(fix_run* run) {
     if (!run->masks) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < run->split.test_count; i++) {
         const gsf_camera* camera = &run->scene.views[run->split.test[i]].camera;
-        const gsfix_path path = gsfix_pathf("%s/%s.png", run->app->o.masks, gsfix_view_stem(&run->scene, run->split.test[i]).s);
+        const gsfix_path path =
+            gsfix_pathf("%s/%s.png", run->app->o.masks, gsfix_view_stem(&run->scene, run->split.test[i]).s);
         const gsf_result result = gsf_load_image(run->ctx, path.s, 1, run->masks + i);
         if (result != GSF_OK) return result;
         if (run->masks[i].width != camera->width || run->masks[i].height != camera->height)
@@ -398,7 +408,8 @@ static void write_switches(fix_run* run) {
     gsfix_json_number(ctx, t, "height", first->height);
     gsfix_json_number(ctx, t, "initial_splats", (double)run->initial.count);
     gsfix_json_begin(ctx, t, "train_views", '[');
-    for (size_t i = 0; i < run->split.train_count; i++) gsfix_json_text(ctx, t, NULL, run->scene.views[run->split.train[i]].name);
+    for (size_t i = 0; i < run->split.train_count; i++)
+        gsfix_json_text(ctx, t, NULL, run->scene.views[run->split.train[i]].name);
     gsfix_json_end(ctx, t, ']');
     gsfix_json_end(ctx, t, '}');
 }
@@ -596,7 +607,8 @@ static gsf_result resume(fix_run* run) {
     if (result == GSF_OK && !gsf_chunks_find(data, size, "GFIX", &chunk))
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: not a checkpoint of gsfix fix", path.s);
     if (result == GSF_OK) result = gsf_parse_json(ctx, path.s, (const char*)chunk.data, chunk.size, &json);
-    if (result == GSF_OK) result = compare_switches(run, path.s, &json, gsf_json_member(&json, &json.values[0], "switches"));
+    if (result == GSF_OK)
+        result = compare_switches(run, path.s, &json, gsf_json_member(&json, &json.values[0], "switches"));
     if (result == GSF_OK) result = gsf_splat_fixer_restore(ctx, run->fixer, path.s, data, size);
     if (result == GSF_OK) result = read_history(run, &json);
     const gsf_json_value* iteration = result == GSF_OK ? gsf_json_member(&json, &json.values[0], "iteration") : NULL;
@@ -639,7 +651,8 @@ static gsf_result prepare(fix_run* run) {
             result = gsf_splat_load_view_image(ctx, &run->scene, k ? run->split.test[i] : run->split.train[i]);
     if (result == GSF_OK && app->o.masks) result = load_masks(run);
     if (result == GSF_OK) result = make_initial(run);
-    if (result == GSF_OK) result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &run->restorer, &run->has_restorer);
+    if (result == GSF_OK)
+        result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &run->restorer, &run->has_restorer);
     if (result == GSF_OK) result = start_fixer(run);
     if (result != GSF_OK) return result;
     run->history.view_count = run->split.test_count;
@@ -659,15 +672,18 @@ static gsf_result prepare(fix_run* run) {
     return result;
 }
 
-static gsf_result keep_sample(fix_run* run, const gsf_fix_stats* stats) { // the middle frame of a window, for the report
+// For the report: a frame a quarter along the window, where the camera is leaving the photo it starts from.
+static gsf_result keep_sample(fix_run* run, const gsf_fix_stats* stats) {
     gsfix_history* h = &run->history;
-    const int32_t i = stats->frame_count / 2;
+    const int32_t i = stats->frame_count / 4;
     const gsf_image* const pictures[] = {stats->rendered + i, stats->restored + i, stats->confidence + i};
     static const char* const names[] = {"render", "restored", "confidence"};
     gsf_result result = GROW(run->ctx, h, samples, sample);
-    for (int k = 0; k < 3 && result == GSF_OK; k++)
-        result = gsf_save_image(run->ctx, gsfix_pathf("%s/report/round%d_window%d_%s.png", run->app->o.out, (int)stats->round,
-                                                      (int)stats->window, names[k]).s, pictures[k]);
+    for (int k = 0; k < 3 && result == GSF_OK; k++) {
+        const gsfix_path path = gsfix_pathf("%s/report/round%d_window%d_%s.png", run->app->o.out, (int)stats->round,
+                                            (int)stats->window, names[k]);
+        result = gsf_save_image(run->ctx, path.s, pictures[k]);
+    }
     if (result != GSF_OK) return result;
     const gsfix_sample sample = {stats->round, stats->window, i};
     h->samples[h->sample_count++] = sample;
@@ -686,7 +702,8 @@ static gsf_result save_window(fix_run* run, const gsf_fix_stats* stats) {
     gsfix_path* paths = (gsfix_path*)gsf_alloc(run->ctx, (size_t)stats->frame_count, sizeof *paths);
     if (!paths) return GSF_ERROR_OUT_OF_MEMORY;
     for (int32_t i = 0; i < stats->frame_count; i++)
-        paths[i] = gsfix_pathf("%s/fixed/round%d_window%d_%05d.png", run->app->o.out, (int)stats->round, (int)stats->window, (int)i);
+        paths[i] = gsfix_pathf("%s/fixed/round%d_window%d_%05d.png", run->app->o.out, (int)stats->round,
+                               (int)stats->window, (int)i);
     const gsf_result result = gsfix_save_images(run->ctx, paths, stats->restored, (size_t)stats->frame_count);
     gsf_free(run->ctx, paths);
     return result;
@@ -766,11 +783,12 @@ static void show_step(fix_run* run, const gsf_fix_stats* stats) {
     char held_out[48] = "";
     if (!isnan(psnr)) snprintf(held_out, sizeof held_out, "  held-out %.2f dB", psnr);
     if (stats->stage == GSF_FIX_TRAIN)
-        gsfix_progress(run->app, run->iteration, run->iterations, "step %d of %d  loss %.4f  %zu splats%s", (int)run->iteration,
-                       (int)run->iterations, stats->train.loss, stats->train.splats, held_out);
+        gsfix_progress(run->app, run->iteration, run->iterations, "step %d of %d  loss %.4f  %zu splats%s",
+                       (int)run->iteration, (int)run->iterations, stats->train.loss, stats->train.splats, held_out);
     else if (stats->stage == GSF_FIX_RESTORE && run->app->terminal)
-        gsfix_progress(run->app, run->iteration, run->iterations, "round %d of %d: window %d of %d %s", (int)stats->round,
-                       (int)stats->rounds, (int)stats->window, (int)stats->windows, stats->restored ? "repaired" : "skipped");
+        gsfix_progress(run->app, run->iteration, run->iterations, "round %d of %d: window %d of %d %s",
+                       (int)stats->round, (int)stats->rounds, (int)stats->window, (int)stats->windows,
+                       stats->restored ? "repaired" : "skipped");
     else if (stats->stage == GSF_FIX_RESTORE && stats->window == stats->windows)
         gsfix_note(run->app, "round %d of %d: %d windows, %d of them skipped%s", (int)stats->round, (int)stats->rounds,
                    (int)stats->windows, (int)h->rounds[h->round_count - 1].skipped, held_out);
@@ -891,9 +909,10 @@ static gsf_result save_metrics(fix_run* run) {
     gsf_text file = {0};
     gsf_text_append(run->ctx, &file, run->app->json.data, run->app->json.size);
     gsf_text_append(run->ctx, &file, "}\n", 2);
-    const gsf_result result = file.failed || run->app->json.failed
-                                  ? GSF_ERROR_OUT_OF_MEMORY
-                                  : gsf_write_file(run->ctx, gsfix_pathf("%s/metrics.json", run->app->o.out).s, file.data, file.size);
+    const gsf_result result =
+        file.failed || run->app->json.failed
+            ? GSF_ERROR_OUT_OF_MEMORY
+            : gsf_write_file(run->ctx, gsfix_pathf("%s/metrics.json", run->app->o.out).s, file.data, file.size);
     gsf_destroy_text(run->ctx, &file);
     return result;
 }
@@ -902,13 +921,17 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     gsfix_app* app = run->app;
     const gsfix_history* h = &run->history;
     if (run->split.test_count) {
-        gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim, run->split.test_count);
+        gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim,
+                    run->split.test_count);
         if (run->masks) gsfix_print(app, "seen       PSNR %.3f dB  SSIM %.4f", r->mean.psnr_seen, r->mean.ssim_seen);
-        if (h->has_before) gsfix_print(app, "unrepaired PSNR %.3f dB  SSIM %.4f  (before the first round)", r->before.psnr, r->before.ssim);
+        if (h->has_before)
+            gsfix_print(app, "unrepaired PSNR %.3f dB  SSIM %.4f  (before the first round)", r->before.psnr,
+                        r->before.ssim);
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
-    gsfix_print(app, "wrote      %s/report.html  splats.ply  metrics.json  test/%s", app->o.out, h->round_count ? "  fixed/" : "");
+    gsfix_print(app, "wrote      %s/report.html  splats.ply  metrics.json  test/%s", app->o.out,
+                h->round_count ? "  fixed/" : "");
 }
 
 static gsf_result finish(fix_run* run) {
@@ -971,7 +994,9 @@ int gsfix_run_fix(gsfix_app* app) {
     if (code) return code;
     run.iterations = run.setup.fix.train.iterations;
     run.eval_every = app->o.eval_every ? app->o.eval_every : run.iterations / 10 > 0 ? run.iterations / 10 : 1;
-    run.checkpoint_every = app->o.checkpoint_every ? app->o.checkpoint_every : run.iterations / 20 > 0 ? run.iterations / 20 : 1;
+    run.checkpoint_every = app->o.checkpoint_every   ? app->o.checkpoint_every
+                           : run.iterations / 20 > 0 ? run.iterations / 20
+                                                     : 1;
     gsf_result result = prepare(&run);
     run.history.seconds[GSFIX_INIT] += gsfix_now() - app->started;
     if (result == GSF_OK) result = run_loop(&run);

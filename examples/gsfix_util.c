@@ -204,7 +204,8 @@ gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out) {
     long long height = 0, width = 0;
     if (!begin || !strstr(header, "'descr': '<f4'") || !strstr(header, "'fortran_order': False") || !shape ||
         sscanf(shape + 10, "%lld, %lld", &height, &width) != 2 || height < 1 || width < 1)
-        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: expected a .npy of little-endian float32, two dimensions, C order", path);
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT,
+                          "%s: expected a .npy of little-endian float32, two dimensions, C order", path);
     else if ((size - begin) / 4 / (size_t)width < (size_t)height)
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %lld x %lld values do not fit into the file", path, begin, height,
                           width);

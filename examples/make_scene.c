@@ -160,7 +160,8 @@ static look look_paving(v3 p, float w) {
     const float wobble = 0.25f * soft_noise(mul(p, 3.0f), 3.0f * w);
     const cell c = voronoi(2.6f * p.x + wobble, 2.6f * p.y - wobble, 3);
     const float joint = 1.0f - step_between(0.03f, 0.11f, c.edge);
-    const float grain = fbm(mul(p, 34.0f), 3, 34.0f * w), blotch = fbm(add(mul(p, 5.0f), v((float)(c.id & 63u), 0, 0)), 4, 5.0f * w);
+    const float grain = fbm(mul(p, 34.0f), 3, 34.0f * w),
+                blotch = fbm(add(mul(p, 5.0f), v((float)(c.id & 63u), 0, 0)), 4, 5.0f * w);
     const v3 warm = v(0.50f, 0.42f, 0.33f), cool = v(0.34f, 0.35f, 0.36f), rust = v(0.46f, 0.30f, 0.21f);
     v3 stone = mix(mix(warm, cool, part(c.id, 0)), rust, 0.55f * part(c.id, 1) * part(c.id, 1));
     stone = mul(stone, (0.62f + 0.5f * part(c.id, 2)) * (0.55f + 0.55f * blotch) * (0.6f + 0.8f * grain));
@@ -178,7 +179,8 @@ static look look_brick(float s, float z, v3 p, int32_t salt, float w) { // s alo
     const float along = s / 0.26f + (row & 1 ? 0.5f : 0.0f);
     const int32_t column = floor_int(along);
     const float fx = (along - (float)column) * 0.26f, fz = z - (float)row * 0.085f;
-    const float edge = minf(minf(fx, 0.26f - fx), minf(fz, 0.085f - fz)) + 0.008f * (soft_noise(mul(p, 30.0f), 30.0f * w) - 0.5f);
+    const float edge =
+        minf(minf(fx, 0.26f - fx), minf(fz, 0.085f - fz)) + 0.008f * (soft_noise(mul(p, 30.0f), 30.0f * w) - 0.5f);
     const float mortar = 1.0f - step_between(0.006f, 0.013f, edge);
     const uint32_t id = hash3(row, column, salt);
     v3 clay = mix(v(0.42f, 0.16f, 0.09f), v(0.54f, 0.29f, 0.16f), part(id, 0));
@@ -195,7 +197,8 @@ static look look_brick(float s, float z, v3 p, int32_t salt, float w) { // s alo
 static look look_plaster(float s, float z, v3 p, float w) { // old ochre plaster, bricks where it fell off, ivy over it
     look l = {{0, 0, 0}, 0, 0.0f};
     const float stain = fbm(v(2.2f * s, 2.0f * p.x, 0.7f * z), 4, 2.2f * w), fine = fbm(mul(p, 22.0f), 3, 22.0f * w);
-    l.albedo = mul(mix(v(0.66f, 0.50f, 0.30f), v(0.52f, 0.42f, 0.31f), stain), (0.55f + 0.6f * stain) * (0.8f + 0.4f * fine));
+    l.albedo =
+        mul(mix(v(0.66f, 0.50f, 0.30f), v(0.52f, 0.42f, 0.31f), stain), (0.55f + 0.6f * stain) * (0.8f + 0.4f * fine));
     const cell crack = voronoi(2.1f * s + 0.5f * stain, 2.1f * z + 0.5f * fine, 11);
     if (crack.edge < 0.02f) l.albedo = mul(l.albedo, 0.45f);
     if (fbm(add(mul(p, 1.4f), v(40, 0, 0)), 4, 1.4f * w) + 0.12f * (0.8f - z) > 0.57f) l = look_brick(s, z, p, 29, w);
@@ -215,7 +218,8 @@ static look look_planks(v3 p, uint32_t seed, float w) { // boards along x, 13 cm
     const float across = p.y / 0.13f + 100.0f - floorf(p.y / 0.13f + 100.0f);
     const float shade = random3(board, 1, 5), shift = 10.0f * random3(board, 2, 5);
     const float grain = fbm(v(2.5f * p.x + shift, 38.0f * p.y, 38.0f * p.z + shift), 4, 38.0f * w);
-    const float rings = 0.5f + 0.5f * sinf(55.0f * (p.y + 0.10f * fbm(v(1.6f * p.x + shift, 3.0f * p.y, p.z), 3, 3.0f * w) + shift));
+    const float rings =
+        0.5f + 0.5f * sinf(55.0f * (p.y + 0.10f * fbm(v(1.6f * p.x + shift, 3.0f * p.y, p.z), 3, 3.0f * w) + shift));
     const v3 dark = v(0.17f, 0.09f, 0.045f), light = v(0.55f, 0.36f, 0.19f);
     l.albedo = mul(mix(dark, light, clampf(2.1f * grain - 0.75f + 0.45f * rings, 0, 1)), 0.65f + 0.6f * shade);
     const float gap = minf(across, 1.0f - across);
@@ -231,7 +235,9 @@ static look look_cloth(v3 p, float w) { // gingham with a woven border
     const int a = floor_int(p.x / 0.055f) & 1, b = floor_int(p.y / 0.055f) & 1;
     const v3 white = v(0.80f, 0.77f, 0.70f), red = v(0.52f, 0.05f, 0.06f), pink = v(0.66f, 0.30f, 0.27f);
     l.albedo = a && b ? red : a || b ? pink : white;
-    if (fabsf(p.y) > 0.225f) l.albedo = floor_int(p.x / 0.02f + (p.y > 0 ? p.y : -p.y) * 50.0f) & 1 ? v(0.75f, 0.7f, 0.6f) : v(0.07f, 0.12f, 0.3f);
+    if (fabsf(p.y) > 0.225f)
+        l.albedo =
+            floor_int(p.x / 0.02f + (p.y > 0 ? p.y : -p.y) * 50.0f) & 1 ? v(0.75f, 0.7f, 0.6f) : v(0.07f, 0.12f, 0.3f);
     const float weave = 0.5f + (w < 0.002f ? 0.25f * (sinf(p.x * 1500.0f) + sinf(p.y * 1500.0f)) : 0.0f);
     l.albedo = mul(l.albedo, 0.72f + 0.2f * weave + 0.25f * fbm(mul(p, 14.0f), 3, 14.0f * w));
     return l;
@@ -246,8 +252,10 @@ static look look_glaze(v3 p, float w) { // white porcelain, blue bands and flowe
     ink = maxf(ink, step_between(0.010f, 0.006f, fabsf(z - 0.335f)));
     const float u = 7.0f * angle / 6.2831853f, up = (z - 0.19f) / 0.085f;
     const float fu = (u - floorf(u) - 0.5f) * 2.0f, radius = sqrtf(fu * fu + up * up), turn = atan2f(up, fu);
-    ink = maxf(ink, step_between(0.08f, 0.0f, radius - 0.42f - 0.3f * fabsf(sinf(2.5f * turn))) * step_between(0.12f, 0.2f, radius));
-    ink = maxf(ink, step_between(0.62f, 0.68f, noise(v(9.0f * u, 60.0f * z, 3.0f))) * step_between(1.05f, 1.3f, fabsf(up)) * (z < 0.3f && z > 0.075f));
+    ink = maxf(ink, step_between(0.08f, 0.0f, radius - 0.42f - 0.3f * fabsf(sinf(2.5f * turn))) *
+                        step_between(0.12f, 0.2f, radius));
+    ink = maxf(ink, step_between(0.62f, 0.68f, noise(v(9.0f * u, 60.0f * z, 3.0f))) *
+                        step_between(1.05f, 1.3f, fabsf(up)) * (z < 0.3f && z > 0.075f));
     l.albedo = mix(white, blue, ink * (0.7f + 0.3f * soft_noise(mul(p, 60.0f), 60.0f * w)));
     if (fabsf(z - 0.36f) < 0.006f || fabsf(z - 0.035f) < 0.005f) l.albedo = gold;
     return l;
@@ -261,7 +269,8 @@ static look look_ball(v3 p, float radius, float w) {
     const int sector = floor_int((atan2f(q.y, q.x) / 6.2831853f + 0.5f) * 5.9999f);
     l.albedo = fabsf(q.z) > 0.93f * radius ? colors[1] : colors[sector];
     l.albedo = mul(l.albedo, 0.7f + 0.45f * fbm(mul(p, 25.0f), 4, 25.0f * w));
-    if (fbm(add(mul(p, 11.0f), v(3, 8, 1)), 4, 11.0f * w) > 0.63f) l.albedo = mix(l.albedo, v(0.25f, 0.19f, 0.13f), 0.6f); // dirt
+    if (fbm(add(mul(p, 11.0f), v(3, 8, 1)), 4, 11.0f * w) > 0.63f)
+        l.albedo = mix(l.albedo, v(0.25f, 0.19f, 0.13f), 0.6f);  // dirt
     return l;
 }
 
@@ -277,7 +286,9 @@ static look look_book(v3 p, v3 n, uint32_t seed, float w) { // lies flat: pages 
         const float x = p.x / 0.10f, y = p.y / 0.15f; // about -1..1 on the cover
         const v3 light = v(0.75f, 0.70f, 0.56f);
         if (fabsf(maxf(fabsf(x), fabsf(y)) - 0.86f) < 0.035f) l.albedo = light;
-        if (fabsf(y - 0.45f) < 0.16f && fabsf(x) < 0.62f && random3(floor_int(x * 14.0f), floor_int(y * 9.0f), (int32_t)seed) > 0.42f) l.albedo = light;
+        if (fabsf(y - 0.45f) < 0.16f && fabsf(x) < 0.62f &&
+            random3(floor_int(x * 14.0f), floor_int(y * 9.0f), (int32_t)seed) > 0.42f)
+            l.albedo = light;
         if (x * x + (y + 0.3f) * (y + 0.3f) < 0.13f) l.albedo = mix(light, cover, soft_noise(mul(p, 70.0f), 70.0f * w));
         l.albedo = mul(l.albedo, 0.7f + 0.5f * fbm(mul(p, 40.0f), 3, 40.0f * w));
     }
@@ -286,7 +297,8 @@ static look look_book(v3 p, v3 n, uint32_t seed, float w) { // lies flat: pages 
 
 static look look_fruit(material m, v3 p, uint32_t seed, float w) {
     look l = {{0, 0, 0}, 0, 0.45f};
-    const float fine = fbm(mul(p, 160.0f), 2, 160.0f * w), spots = soft_noise(add(mul(p, 240.0f), v((float)seed, 0, 0)), 240.0f * w);
+    const float fine = fbm(mul(p, 160.0f), 2, 160.0f * w),
+                spots = soft_noise(add(mul(p, 240.0f), v((float)seed, 0, 0)), 240.0f * w);
     if (m == ORANGE) {
         l.albedo = mul(mix(v(0.80f, 0.30f, 0.02f), v(0.85f, 0.44f, 0.05f), fine), 0.8f + 0.3f * spots);
         l.height = 0.0012f * spots;
@@ -313,16 +325,22 @@ static look look_at(material m, v3 p, v3 n, uint32_t seed, float w) {
         case BALL: return look_ball(p, 0.26f, w);
         case BOOK: return look_book(p, n, seed, w);
         case TERRACOTTA: {
-            const float bands = 0.5f + 0.5f * sinf(p.z * 130.0f), chalk = step_between(0.5f, 0.7f, fbm(mul(p, 7.0f), 4, 7.0f * w));
-            l.albedo = mix(mul(v(0.55f, 0.22f, 0.11f), 0.55f + 0.7f * fbm(mul(p, 26.0f), 3, 26.0f * w)), v(0.62f, 0.54f, 0.46f), 0.6f * chalk);
+            const float bands = 0.5f + 0.5f * sinf(p.z * 130.0f),
+                        chalk = step_between(0.5f, 0.7f, fbm(mul(p, 7.0f), 4, 7.0f * w));
+            l.albedo = mix(mul(v(0.55f, 0.22f, 0.11f), 0.55f + 0.7f * fbm(mul(p, 26.0f), 3, 26.0f * w)),
+                           v(0.62f, 0.54f, 0.46f), 0.6f * chalk);
             if (fabsf(p.z - 0.24f) < 0.035f) // a pressed zigzag
-                l.albedo = mul(l.albedo, fabsf(fmodf(fabsf(atan2f(p.y, p.x)) * 6.0f, 1.0f) - 0.5f) * 0.1f > fabsf(p.z - 0.24f) ? 0.45f : 1.1f);
+                l.albedo =
+                    mul(l.albedo, fabsf(fmodf(fabsf(atan2f(p.y, p.x)) * 6.0f, 1.0f) - 0.5f) * 0.1f > fabsf(p.z - 0.24f)
+                                      ? 0.45f
+                                      : 1.1f);
             l.height = 0.003f * bands;
             return l;
         }
         case LEAF: {
             const float hue = random3((int32_t)seed, 5, 8), vein = fabsf(p.y) < 0.004f ? 1.35f : 1.0f;
-            l.albedo = mul(mix(v(0.07f, 0.17f, 0.03f), v(0.27f, 0.36f, 0.07f), hue), vein * (0.75f + 0.5f * soft_noise(mul(p, 90.0f), 90.0f * w)));
+            l.albedo = mul(mix(v(0.07f, 0.17f, 0.03f), v(0.27f, 0.36f, 0.07f), hue),
+                           vein * (0.75f + 0.5f * soft_noise(mul(p, 90.0f), 90.0f * w)));
             if (hue > 0.93f) l.albedo = v(0.62f, 0.10f, 0.16f); // a flower
             l.gloss = 0.15f;
             return l;
@@ -330,14 +348,16 @@ static look look_at(material m, v3 p, v3 n, uint32_t seed, float w) {
         case GRANITE: {
             const float grain = fbm(mul(p, 38.0f), 3, 38.0f * w), big = fbm(mul(p, 9.0f), 3, 9.0f * w);
             l.albedo = mul(mix(v(0.22f, 0.21f, 0.20f), v(0.62f, 0.58f, 0.53f), big), 0.45f + 1.0f * grain);
-            if (fbm(add(mul(p, 6.0f), v(9, 9, 9)), 4, 6.0f * w) > 0.58f) l.albedo = mix(l.albedo, v(0.30f, 0.31f, 0.08f), 0.7f); // lichen
+            if (fbm(add(mul(p, 6.0f), v(9, 9, 9)), 4, 6.0f * w) > 0.58f)
+                l.albedo = mix(l.albedo, v(0.30f, 0.31f, 0.08f), 0.7f);  // lichen
             l.height = 0.01f * big + 0.004f * grain;
             return l;
         }
         case ROPE: {
             const float ring = atan2f(p.y, p.x), around = atan2f(p.z, sqrtf(p.x * p.x + p.y * p.y) - 0.17f);
             const float strand = 0.5f + 0.5f * sinf(26.0f * ring + 3.0f * around);
-            l.albedo = mul(mix(v(0.30f, 0.17f, 0.07f), v(0.74f, 0.55f, 0.30f), strand), 0.6f + 0.8f * fbm(v(50.0f * ring, 5.0f * around, 0), 3, 200.0f * w));
+            l.albedo = mul(mix(v(0.30f, 0.17f, 0.07f), v(0.74f, 0.55f, 0.30f), strand),
+                           0.6f + 0.8f * fbm(v(50.0f * ring, 5.0f * around, 0), 3, 200.0f * w));
             l.height = 0.008f * strand;
             return l;
         }
@@ -432,7 +452,8 @@ static v3 patch_sphere(float u, float w, const float* s) { // radius, squash, lu
 }
 static v3 patch_apple(float u, float w, const float* s) {
     const float a = 6.2831853f * u, b = 3.1415927f * w;
-    const float r = s[0] * (0.62f + 0.42f * sinf(b)), z = -s[0] * cosf(b) * (0.72f + 0.2f * sinf(b)) * (1.0f - 0.35f * expf(-9.0f * (3.1415927f - b)));
+    const float r = s[0] * (0.62f + 0.42f * sinf(b)),
+                z = -s[0] * cosf(b) * (0.72f + 0.2f * sinf(b)) * (1.0f - 0.35f * expf(-9.0f * (3.1415927f - b)));
     return v(cosf(a) * r * sinf(b), sinf(a) * r * sinf(b), z);
 }
 static v3 patch_torus(float u, float w, const float* s) {
@@ -453,7 +474,8 @@ static v3 patch_lathe(float u, float w, const float* s) { // s[0] pairs of (radi
     return v(cosf(6.2831853f * u) * value[0], sinf(6.2831853f * u) * value[0], value[1]);
 }
 static v3 patch_leaf(float u, float w, const float* s) { // base, direction*length, side*width, curl
-    const float width = sinf(3.1415927f * clampf(0.06f + 0.94f * u, 0, 1)) * (2 * w - 1), curl = s[9] * u * u - 0.25f * width * width * s[9];
+    const float width = sinf(3.1415927f * clampf(0.06f + 0.94f * u, 0, 1)) * (2 * w - 1),
+                curl = s[9] * u * u - 0.25f * width * width * s[9];
     return v(s[0] + u * s[3] + width * s[6], s[1] + u * s[4] + width * s[7], s[2] + u * s[5] + width * s[8] - curl);
 }
 
@@ -492,7 +514,9 @@ static void build_world(world* s) {
     for (int i = 0; i < 4; i++) {
         const float top = walls[i][2] + walls[i][8];
         add_patch(s, patch_rectangle, walls[i], 60, 16, i & 1 ? PLASTER : BRICK, (uint32_t)i, here);
-        if (i & 1) add_box(s, v(walls[i][0] - 0.18f, -5.2f, top), v(walls[i][0] + 0.18f, 5.2f, top + 0.09f), 12, COPING, 0, here);
+        if (i & 1)
+            add_box(s, v(walls[i][0] - 0.18f, -5.2f, top), v(walls[i][0] + 0.18f, 5.2f, top + 0.09f), 12, COPING, 0,
+                    here);
         else add_box(s, v(-5.2f, walls[i][1] - 0.18f, top), v(5.2f, walls[i][1] + 0.18f, top + 0.09f), 12, COPING, 0, here);
     }
     // the table with its cloth
@@ -508,7 +532,8 @@ static void build_world(world* s) {
     const place cloth = {{0, 0, 0.641f}, 0.35f};
     add_patch(s, patch_cloth, length, 120, 24, CLOTH, 0, cloth);
     // on the table
-    static const float vase[] = {9, 0.0f, 0.0f, 0.075f, 0.0f, 0.085f, 0.03f, 0.125f, 0.13f, 0.135f, 0.20f, 0.10f, 0.28f, 0.052f, 0.335f, 0.06f, 0.37f, 0.078f, 0.385f};
+    static const float vase[] = {9,     0.0f,  0.0f,  0.075f, 0.0f,   0.085f, 0.03f, 0.125f, 0.13f, 0.135f,
+                                 0.20f, 0.10f, 0.28f, 0.052f, 0.335f, 0.06f,  0.37f, 0.078f, 0.385f};
     const place vase_at = {{-0.16f, 0.06f, 0.645f}, 0};
     add_patch(s, patch_lathe, vase, 48, 48, GLAZE, 0, vase_at);
     const place flowers = {{-0.16f, 0.06f, 0.96f}, 0};
@@ -519,7 +544,8 @@ static void build_world(world* s) {
         add_box(s, v(-w, -0.15f, 0), v(w, 0.15f, 0.043f), 8, BOOK, (uint32_t)i, at);
     }
     static const float apple[1] = {0.055f};
-    static const float fruit[6][3] = {{0.14f, -0.20f, 0}, {0.26f, -0.13f, 1}, {0.16f, -0.07f, 0}, {0.30f, -0.26f, 1}, {0.405f, 0.215f, 0}, {-0.50f, -0.05f, 1}};
+    static const float fruit[6][3] = {{0.14f, -0.20f, 0}, {0.26f, -0.13f, 1},  {0.16f, -0.07f, 0},
+                                      {0.30f, -0.26f, 1}, {0.405f, 0.215f, 0}, {-0.50f, -0.05f, 1}};
     for (int i = 0; i < 6; i++) {
         const float orange[4] = {0.052f, 0.95f, 0.02f, (float)i};
         const place at = {{fruit[i][0], fruit[i][1], i == 4 ? 0.872f : 0.695f}, 1.3f * (float)i};
@@ -536,7 +562,8 @@ static void build_world(world* s) {
     const place crate = {{-1.25f, -0.55f, 0}, 0.5f}, small_crate = {{-1.22f, -0.52f, 0.46f}, 1.1f};
     add_box(s, v(-0.27f, -0.27f, -0.02f), v(0.27f, 0.27f, 0.46f), 12, PLANKS, 20, crate);
     add_box(s, v(-0.16f, -0.13f, 0), v(0.16f, 0.13f, 0.24f), 10, PLANKS, 27, small_crate);
-    static const float pot[] = {8, 0.0f, 0.0f, 0.14f, 0.0f, 0.17f, 0.12f, 0.21f, 0.28f, 0.235f, 0.33f, 0.235f, 0.38f, 0.20f, 0.37f, 0.195f, 0.33f};
+    static const float pot[] = {8,      0.0f,  0.0f,   0.14f, 0.0f,  0.17f, 0.12f,  0.21f, 0.28f,
+                                0.235f, 0.33f, 0.235f, 0.38f, 0.20f, 0.37f, 0.195f, 0.33f};
     static const float soil[9] = {-0.17f, -0.17f, 0.335f, 0.34f, 0, 0, 0, 0.34f, 0};
     static const float pots[3][3] = {{1.15f, 0.75f, 0.42f}, {-0.75f, 1.25f, 0.34f}, {-2.6f, 1.2f, 0.5f}};
     for (int i = 0; i < 3; i++) {
@@ -545,7 +572,11 @@ static void build_world(world* s) {
         add_patch(s, patch_rectangle, soil, 4, 4, SOIL, 0, at);
         add_bush(s, above, 0.30f, 2.0f * pots[i][2], 230, 40 + (uint64_t)i);
     }
-    static const float rocks[5][3] = {{0.25f, 1.35f, 0.20f}, {0.55f, 1.52f, 0.13f}, {-0.35f, -1.45f, 0.17f}, {1.9f, 0.1f, 0.22f}, {-1.9f, 0.2f, 0.15f}};
+    static const float rocks[5][3] = {{0.25f, 1.35f, 0.20f},
+                                      {0.55f, 1.52f, 0.13f},
+                                      {-0.35f, -1.45f, 0.17f},
+                                      {1.9f, 0.1f, 0.22f},
+                                      {-1.9f, 0.2f, 0.15f}};
     for (int i = 0; i < 5; i++) {
         const float shape[4] = {rocks[i][2], 0.75f, 0.7f, 3.7f * (float)i};
         const place at = {{rocks[i][0], rocks[i][1], 0.45f * rocks[i][2]}, (float)i};
@@ -683,7 +714,8 @@ static v3 shade(const world* s, const hit* h, v3 d, float r1, float r2) {
         const v3 lt = mul(rotate_z(t, -h->what->yaw), e), lb = mul(rotate_z(b, -h->what->yaw), e);
         const float ht = look_at(h->what->m, add(h->local, lt), h->local_normal, h->what->seed, width).height;
         const float hb = look_at(h->what->m, add(h->local, lb), h->local_normal, h->what->seed, width).height;
-        const float limit = 0.6f, st = clampf((ht - l.height) / e, -limit, limit), sb = clampf((hb - l.height) / e, -limit, limit);
+        const float limit = 0.6f, st = clampf((ht - l.height) / e, -limit, limit),
+                    sb = clampf((hb - l.height) / e, -limit, limit);
         n = unit(sub(n, add(mul(t, st), mul(b, sb))));
     }
     const v3 from = add(h->at, mul(h->normal, 1e-3f)), to_sun = around(sun_direction, r1, r2, 0.022f);
@@ -700,10 +732,13 @@ static v3 shade(const world* s, const hit* h, v3 d, float r1, float r2) {
             hit seen;
             v3 image = sky(mirror);
             if (trace(s, from, mirror, 1e-3f, &seen))
-                image = times(look_at(seen.what->m, seen.local, seen.local_normal, seen.what->seed, 0.02f).albedo, add(seen.light, mul(sun_color, 0.3f)));
+                image = times(look_at(seen.what->m, seen.local, seen.local_normal, seen.what->seed, 0.02f).albedo,
+                              add(seen.light, mul(sun_color, 0.3f)));
             c = add(c, mul(image, l.gloss * fresnel));
         }
-        if (lit) c = add(c, mul(sun_color, l.gloss * (0.25f + fresnel) * powf(maxf(dot(mirror, sun_direction), 0.0f), 30.0f + 200.0f * l.gloss)));
+        if (lit)
+            c = add(c, mul(sun_color, l.gloss * (0.25f + fresnel) *
+                                          powf(maxf(dot(mirror, sun_direction), 0.0f), 30.0f + 200.0f * l.gloss)));
     }
     return c;
 }
@@ -725,7 +760,8 @@ static v3 eye_of(const gsf_camera* camera) {
 }
 static v3 ray_through(const gsf_camera* camera, double x, double y, float* z) { // z: camera depth per unit of length
     const double *m = camera->w2c, a = (x - camera->cx) / camera->fx, b = (y - camera->cy) / camera->fy;
-    const v3 d = v((float)(m[0] * a + m[1] * b + m[2]), (float)(m[4] * a + m[5] * b + m[6]), (float)(m[8] * a + m[9] * b + m[10]));
+    const v3 d = v((float)(m[0] * a + m[1] * b + m[2]), (float)(m[4] * a + m[5] * b + m[6]),
+                   (float)(m[8] * a + m[9] * b + m[10]));
     *z = 1.0f / sqrtf(dot(d, d));
     return unit(d);
 }
@@ -755,13 +791,15 @@ static void photo_row(void* arg, size_t row, int worker) {
             d = ray_through(&job->camera, (double)x + (double)jitter[k][0], (double)row + (double)jitter[k][1], &z);
             v3 c = sky(d);
             if (trace(job->s, eye, d, 0.01f, &h)) {
-                const float r1 = ((float)k + random3(at, 1, (int32_t)job->view)) / SAMPLES; // one of each ring of the sun's disc
+                const float r1 =
+                    ((float)k + random3(at, 1, (int32_t)job->view)) / SAMPLES;  // one of each ring of the sun's disc
                 c = shade(job->s, &h, d, r1, random3((int32_t)pixel, 2, (int32_t)job->view) + 0.381966f * (float)k);
                 c = mix(c, v(0.55f, 0.62f, 0.70f), 0.012f * h.t); // a little haze
             }
             sum = add(sum, v(minf(c.x, 4), minf(c.y, 4), minf(c.z, 4)));
         }
-        const float px = 2.0f * ((float)x + 0.5f) / (float)width - 1.0f, py = 2.0f * ((float)row + 0.5f) / (float)height - 1.0f;
+        const float px = 2.0f * ((float)x + 0.5f) / (float)width - 1.0f,
+                    py = 2.0f * ((float)row + 0.5f) / (float)height - 1.0f;
         sum = mul(sum, (1.0f - 0.11f * (px * px + py * py)) / SAMPLES); // vignetting
         const float c[3] = {film(sum.x), film(sum.y), film(sum.z)};
         for (size_t k = 0; k < 3; k++) { // sensor noise
@@ -775,7 +813,8 @@ static void photo_row(void* arg, size_t row, int worker) {
 static gsf_camera camera_of(world* s, const make_scene_options* o, int view) {
     gsf_camera c;
     memset(&c, 0, sizeof c);
-    const float t = ((float)view + 0.5f) / (float)o->views - 0.5f, step = (float)(o->arc * 3.14159265 / 180.0) / (float)o->views;
+    const float t = ((float)view + 0.5f) / (float)o->views - 0.5f,
+                step = (float)(o->arc * 3.14159265 / 180.0) / (float)o->views;
     const uint64_t k = 16 * (uint64_t)view;
     const float angle = -1.40f + (float)(o->arc * 3.14159265 / 180.0) * t + pick(s, 1, k, -0.3f, 0.3f) * step;
     const float distance = 2.25f + 0.18f * sinf(9.0f * t) + pick(s, 1, k + 1, -0.12f, 0.12f);
@@ -830,11 +869,13 @@ static uint8_t truth_of(const world* s, const gsf_camera* camera, v3 at) {
 }
 
 // Least squares over the rays of noisy observations, as triangulation does it. Returns 0 where rays are near parallel.
-static int triangulate(const gsf_scene* scene, const uint32_t* views, const double (*seen)[2], size_t count, double out[3]) {
+static int triangulate(const gsf_scene* scene, const uint32_t* views, const double (*seen)[2], size_t count,
+                       double out[3]) {
     double a[3][3] = {{0}}, b[3] = {0};
     for (size_t i = 0; i < count; i++) {
         const gsf_camera* camera = &scene->views[views[i]].camera;
-        const double *m = camera->w2c, q[3] = {(seen[i][0] - camera->cx) / camera->fx, (seen[i][1] - camera->cy) / camera->fy, 1.0};
+        const double *m = camera->w2c,
+                     q[3] = {(seen[i][0] - camera->cx) / camera->fx, (seen[i][1] - camera->cy) / camera->fy, 1.0};
         double d[3], c[3];
         const double size = sqrt(q[0] * q[0] + q[1] * q[1] + 1.0);
         for (int k = 0; k < 3; k++) d[k] = (m[4 * k] * q[0] + m[4 * k + 1] * q[1] + m[4 * k + 2]) / size;
@@ -846,7 +887,8 @@ static int triangulate(const gsf_scene* scene, const uint32_t* views, const doub
                 b[r] += w * c[k];
             }
     }
-    const double minor[3] = {a[1][1] * a[2][2] - a[1][2] * a[2][1], a[1][2] * a[2][0] - a[1][0] * a[2][2], a[1][0] * a[2][1] - a[1][1] * a[2][0]};
+    const double minor[3] = {a[1][1] * a[2][2] - a[1][2] * a[2][1], a[1][2] * a[2][0] - a[1][0] * a[2][2],
+                             a[1][0] * a[2][1] - a[1][1] * a[2][0]};
     const double det = a[0][0] * minor[0] + a[0][1] * minor[1] + a[0][2] * minor[2];
     if (det < 1e-6) return 0;
     for (int k = 0; k < 3; k++) { // Cramer
@@ -878,7 +920,8 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
     const uint64_t k = (uint64_t)try_ * 512;
     const uint32_t anchor = (uint32_t)(gsf_random_bits(s->seed, 2, k) % (uint64_t)o->views);
     const gsf_camera* camera = &scene->views[anchor].camera;
-    const double x = 2.0 + gsf_random_uniform(s->seed, 2, k + 1) * (o->width - 4.0), y = 2.0 + gsf_random_uniform(s->seed, 2, k + 2) * (o->height - 4.0);
+    const double x = 2.0 + gsf_random_uniform(s->seed, 2, k + 1) * (o->width - 4.0),
+                 y = 2.0 + gsf_random_uniform(s->seed, 2, k + 2) * (o->height - 4.0);
     const uint8_t* pixel = photos[anchor] + 3 * ((size_t)y * (size_t)o->width + (size_t)x);
     const float corner = texture_at(photos[anchor], o->width, (int)x, (int)y);
     if (gsf_random_uniform(s->seed, 2, k + 3) > fmin(1.0, 0.004 + corner / 9000.0)) return 0;
@@ -917,10 +960,13 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
         seen[length++][1] = w + o->noise * gsf_random_normal(s->seed, 4, 2 * (k + (uint64_t)i) + 1);
         widest = maxf(widest, angle);
     }
-    if (length < 2 || widest < 0.026f || !triangulate(scene, track, (const double(*)[2])seen, length, at)) return 0; // 1.5 degrees
+    if (length < 2 || widest < 0.026f || !triangulate(scene, track, (const double(*)[2])seen, length, at))
+        return 0;                         // 1.5 degrees
     for (size_t i = 0; i < length; i++) { // COLMAP's filter of 4 pixels
         double u, w, depth;
-        if (!gsf_camera_project(&scene->views[track[i]].camera, at, &u, &w, &depth) || hypot(u - seen[i][0], w - seen[i][1]) > 4.0) return 0;
+        if (!gsf_camera_project(&scene->views[track[i]].camera, at, &u, &w, &depth) ||
+            hypot(u - seen[i][0], w - seen[i][1]) > 4.0)
+            return 0;
     }
     return length;
 }
@@ -936,7 +982,8 @@ static int find_points(gsf_context* ctx, const world* s, const make_scene_option
     c->truth = (uint8_t*)gsf_alloc(ctx, wanted, views);
     c->outlier = (uint8_t*)gsf_alloc_zeroed(ctx, wanted, 1);
     double(*seen)[2] = (double(*)[2])gsf_alloc(ctx, views, sizeof *seen);
-    if (!scene->points || !scene->colors || !scene->point_ids || !scene->track_begin || !scene->track_views || !c->truth || !c->outlier || !seen) {
+    if (!scene->points || !scene->colors || !scene->point_ids || !scene->track_begin || !scene->track_views ||
+        !c->truth || !c->outlier || !seen) {
         gsf_free(ctx, seen);
         return 0;
     }
@@ -1008,8 +1055,10 @@ static int start_world(gsf_context* ctx, world* s, int bake_rays) {
     }
     RTCGeometry mesh = rtcNewGeometry(s->device, RTC_GEOMETRY_TYPE_TRIANGLE);
     s->scene = rtcNewScene(s->device);
-    rtcSetSharedGeometryBuffer(mesh, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, s->vertices, 0, sizeof(vertex), s->vertex_count);
-    rtcSetSharedGeometryBuffer(mesh, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, s->triangles, 0, sizeof(triangle), s->triangle_count);
+    rtcSetSharedGeometryBuffer(mesh, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, s->vertices, 0, sizeof(vertex),
+                               s->vertex_count);
+    rtcSetSharedGeometryBuffer(mesh, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, s->triangles, 0, sizeof(triangle),
+                               s->triangle_count);
     rtcCommitGeometry(mesh);
     rtcAttachGeometry(s->scene, mesh);
     rtcReleaseGeometry(mesh);
@@ -1031,7 +1080,8 @@ static void end_world(world* s) {
     free(s->surfaces);
 }
 
-static int take_photos(gsf_context* ctx, world* s, const make_scene_options* o, const char* folder, gsf_scene* scene, uint8_t** photos) {
+static int take_photos(gsf_context* ctx, world* s, const make_scene_options* o, const char* folder, gsf_scene* scene,
+                       uint8_t** photos) {
     const size_t pixels = (size_t)o->width * (size_t)o->height;
     float* depth = (float*)gsf_alloc(ctx, pixels, sizeof(float));
     int ok = depth != NULL;
@@ -1070,8 +1120,8 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
     make_lattice();
     uint8_t** photos = (uint8_t**)gsf_alloc_zeroed(ctx, (size_t)o->views, sizeof *photos);
     c.scene.views = (gsf_scene_view*)gsf_alloc_zeroed(ctx, (size_t)o->views, sizeof(gsf_scene_view));
-    int ok = photos && c.scene.views && make_folder(folder, "") && make_folder(folder, "/images") && make_folder(folder, "/truth") &&
-             make_folder(folder, "/sparse") && make_folder(folder, "/sparse/0");
+    int ok = photos && c.scene.views && make_folder(folder, "") && make_folder(folder, "/images") &&
+             make_folder(folder, "/truth") && make_folder(folder, "/sparse") && make_folder(folder, "/sparse/0");
     c.scene.view_count = (size_t)o->views;
     ok = ok && start_world(ctx, &s, o->width * o->height < 20000 ? 8 : 32); // small photos do not show the difference
     ok = ok && take_photos(ctx, &s, o, folder, &c.scene, photos) && find_points(ctx, &s, o, photos, &c);
@@ -1079,8 +1129,10 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
     ok = ok && gsf_splat_save_colmap(ctx, &c.scene, NULL, folder) == GSF_OK && write_truth(ctx, path, &c) == GSF_OK;
     if (!ok && ctx->error[0]) fprintf(stderr, "make_scene: %s\n", ctx->error);
     if (ok)
-        fprintf(stderr, "make_scene: %zu triangles, %d photos of %d x %d, %zu points, tracks of %.1f views\n", s.triangle_count, o->views,
-                o->width, o->height, c.scene.point_count, (double)c.scene.track_begin[c.scene.point_count] / (double)(c.scene.point_count ? c.scene.point_count : 1));
+        fprintf(
+            stderr, "make_scene: %zu triangles, %d photos of %d x %d, %zu points, tracks of %.1f views\n",
+            s.triangle_count, o->views, o->width, o->height, c.scene.point_count,
+            (double)c.scene.track_begin[c.scene.point_count] / (double)(c.scene.point_count ? c.scene.point_count : 1));
     for (int i = 0; i < o->views; i++) {
         if (photos) gsf_free(ctx, photos[i]);
         if (c.scene.views) gsf_free(ctx, c.scene.views[i].name);
@@ -1103,8 +1155,10 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
 #ifndef MAKE_SCENE_NO_MAIN
 
 static int usage(FILE* to) {
-    fprintf(to, "usage: make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]\n"
-                "Writes a ray-traced courtyard as photos with a COLMAP model, and the truth about it, into the folder OUT.\n");
+    fprintf(
+        to,
+        "usage: make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]\n"
+        "Writes a ray-traced courtyard as photos with a COLMAP model, and the truth about it, into the folder OUT.\n");
     return to == stdout ? 0 : 2;
 }
 

@@ -343,9 +343,11 @@ static void test_recall(void) {
                 found += tracks[i] && rays[i];
             }
             const double recall = (double)found / (double)proven;
-            printf("fox, K = %zu, %s: recall %.4f of the %zu points in tracks; %zu of %zu kept; normals %.3f s, build %.3f s, "
-                   "rays %.3f s\n", k, stats.used_embree ? "embree" : "projected", recall, proven, stats.kept, stats.points,
-                   stats.seconds_normals, stats.seconds_build, stats.seconds_rays);
+            printf(
+                "fox, K = %zu, %s: recall %.4f of the %zu points in tracks; %zu of %zu kept; normals %.3f s, build %.3f s, "
+                "rays %.3f s\n",
+                k, stats.used_embree ? "embree" : "projected", recall, proven, stats.kept, stats.points,
+                stats.seconds_normals, stats.seconds_build, stats.seconds_rays);
             CHECK(count == k && recall >= 0.95);
             free(tracks);
             free(rays);
@@ -450,7 +452,8 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
     options.seed = seed;
     gsf_scene scene;
     size_t size = 0;
-    if (!CHECK(make_scene(&ctx, &options, folder) == 0) || !CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, NULL, &scene))) {
+    if (!CHECK(make_scene(&ctx, &options, folder) == 0) ||
+        !CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, NULL, &scene))) {
         remove_scene(folder, options.views);
         return;
     }
