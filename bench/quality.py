@@ -6,9 +6,9 @@
 
 Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`; runs that DIR already holds are not repeated. --model
 is a model of all views (made first if not given): it fixes which pixels of each test view count as seen. --size is what
-masks and runs have in common, as "--max-size 240". Writes
-DIR/quality.csv and DIR/quality.md: means per arm, and per pair of neighbouring arms the mean difference with its standard
-error over the seeds. Only the standard library is needed.
+masks and runs have in common, as "--max-size 240". Writes DIR/quality.csv and DIR/quality.md: means per arm, and the mean
+differences to the arm before and to the first one, with their standard errors over the seeds. Only the standard library
+is needed.
 """
 import argparse
 import concurrent.futures
@@ -110,9 +110,8 @@ def main():
                     sum(r["seconds"]["total"] for r in rows) / len(rows)))
     lines += ["", "Paired differences (mean +- standard error over %d seeds):" % options.seeds, "",
               "| K | difference | PSNR | PSNR seen | SSIM seen |", "|---|---|---|---|---|"]
-    pairs = [(arms[i + 1][0], arms[i][0]) for i in range(len(arms) - 1)]
-    if len(arms) > 2:
-        pairs.append((arms[-1][0], arms[0][0]))
+    names = [name for name, _ in arms]
+    pairs = list(zip(names[1:], names)) + [(name, names[0]) for name in names[2:]]
     for views in options.views.split(","):
         for better, worse in pairs:
             cells = []
