@@ -209,11 +209,15 @@ static void test_warp_refutes(gsf_context* ctx) {
         CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // beside it nothing changes
         warp.end_fn(warp.user, ctx);
     }
-    // the second photo shows a surface there, too: then it stays
-    for (int i = 0; i < N; i++) depth[1][i] /= 1.2f;
+    // the second photo shows leaves there, too, none further than 4 pixels away: then it stays
+    for (int i = 0; i < N; i++)
+        if (i % W % 8 < 4) depth[1][i] /= 1.2f;
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
     CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
-    CHECK_NEAR(out_color[3 * (32 * W + 48)], 0.25f, 1e-6);
+    int changed = 0;
+    for (int y = 24; y < 40; y++)
+        for (int x = 40; x < 56; x++) changed += fabsf(out_color[3 * (y * W + x)] - 0.25f) > 1e-6f;
+    CHECK(changed == 0);
     warp.end_fn(warp.user, ctx);
     gsf_splat_destroy_warp(ctx, &warp);
 }

@@ -435,7 +435,7 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
     while (count-- > 0) fn(arg, count, 0);
 }
 
-enum { SEEDS = 3, CHOICES = 3 };
+enum { SEEDS = 8, CHOICES = 3 };
 
 // The generator's own scene, through its files, against the visibility that it traced. The photos are smaller than the
 // program's and the pixel noise with them, so that the points are as good. `split` sums up, per K, the views of the
@@ -535,27 +535,27 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
     remove_scene(folder, options.views);
 }
 
-static void test_accuracy(void) {
+static void test_accuracy(int seeds) {
     accuracy split[3], choices[3];
     char what[64];
     memset(split, 0, sizeof split);
     memset(choices, 0, sizeof choices);
-    for (uint64_t seed = 1; seed <= SEEDS; seed++) test_procedural(seed, split, choices);
+    for (int seed = 1; seed <= seeds; seed++) test_procedural((uint64_t)seed, split, choices);
     for (int k = 0; k < 3; k++) {
         // Of six and nine views spread over the arc hardly a point is hidden from all: one seed has 77 to 183 of six
-        // views and 24 to 53 of nine, so that three points move its figure by up to 0.06. Hence all seeds together,
+        // views and 20 to 60 of nine, so that three points move its figure by up to 0.06. Hence all seeds together,
         // and random choices of views, which hide more.
-        snprintf(what, sizeof what, "%d seeds, K = %d", (int)SEEDS, 3 * k + 3);
-        const double limit = k == 0 ? 0.93 : k == 1 ? 0.90 : 0.88; // reached: 0.944, 0.909, 0.899
-        CHECK(balanced(what, split + k) >= limit);
-        snprintf(what, sizeof what, "%d seeds, %d random choices of %d views", (int)SEEDS, (int)CHOICES, 3 * k + 3);
-        CHECK(balanced(what, choices + k) >= 0.91); // 0.940, 0.944, 0.920
+        snprintf(what, sizeof what, "%d seeds, K = %d", seeds, 3 * k + 3);
+        CHECK(balanced(what, split + k) >= 0.90);
+        snprintf(what, sizeof what, "%d seeds, %d random choices of %d views", seeds, (int)CHOICES, 3 * k + 3);
+        CHECK(balanced(what, choices + k) >= 0.90);
     }
 }
 
 #endif
 
-int main(void) {
+int main(int argc, char** argv) { // [SEEDS]: procedural scenes to trace, default 8
+    const int seeds = argc > 1 ? atoi(argv[1]) : SEEDS;
     memset(&ctx, 0, sizeof ctx);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     test_neighbours();
@@ -563,8 +563,9 @@ int main(void) {
     test_walls();
     test_recall();
 #ifdef GSF_USE_EMBREE
-    test_accuracy();
+    test_accuracy(seeds);
 #else
+    (void)seeds;
     printf("built without Embree: the procedural scene cannot be traced, accuracy against it skipped\n");
 #endif
     return test_report();
