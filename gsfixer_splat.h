@@ -4008,7 +4008,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
        project   every splat -> one 64-byte record (screen ellipse, colour) or radius 0
        sort      visible splats by depth, ties by index (radix sort of the float's bits)
        bin       in depth order into the lists of the 16x16 tiles that their ellipse meets; each (splat, tile) pair has a
-                 slot, numbered along the sorted splats, where backward leaves that tile's share of the gradient
+                 slot where backward leaves that tile's share of the gradient
        forward   per tile, front to back, 8 pixels of a row at a time
        backward  per tile: forward again, keeping alpha and T of every 8-pixel step; then back to front
        gather    per splat: sum of its slots in tile order, then through the projection to the parameters
@@ -4070,7 +4070,7 @@ struct gsf_rasterizer {
     uint32_t* keys;
     uint32_t* keys_spare;
     uint32_t* rank;            // per splat that is drawn: its place in `visible`
-    size_t* slot_begin;        // per visible rank, + 1
+    size_t* splat_begin;       // per visible rank, + 1: into splat_pairs
     size_t visible_count, pair_count;
 
     size_t tile_capacity;      // of tile_begin
@@ -4079,9 +4079,10 @@ struct gsf_rasterizer {
     size_t* tile_counts;       // (chunks, tiles) while binning
     size_t pair_capacity;
     uint32_t* pair_rank;       // per tile list entry: rank in `visible`
-    size_t* pair_slot;         // per tile list entry
+    size_t* splat_pairs;       // the tile list entries of each splat, in tile order
     size_t slot_capacity;
-    float* slots;              // (pairs, GSF__SLOT_FLOATS)
+    float* slots;              // (pairs, GSF__SLOT_FLOATS) per tile list entry: its gradient
+    uint8_t* slot_used;        // (pairs) 1 where backward found a pixel and filled the slot
 
     size_t pixel_capacity;
     float* final_T;            // per pixel, of the last render
@@ -4118,8 +4119,8 @@ static void gsf__free_workers(gsf_context* ctx, gsf_rasterizer* r) {
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
     void* const owned[] = {r->records, r->sorted, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->rank,
-                           r->slot_begin, r->tile_begin, r->tile_counts, r->pair_rank, r->pair_slot, r->slots, r->final_T,
-                           r->depth_sum, r->tile_background};
+                           r->splat_begin, r->tile_begin, r->tile_counts, r->pair_rank, r->splat_pairs, r->slots, r->slot_used,
+                           r->final_T, r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
     gsf__free_workers(ctx, r);
     gsf_free(ctx, r);
@@ -4580,12 +4581,12 @@ static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
                 size_t* count = counts + (size_t)ty * (size_t)r->tiles_x + (size_t)tx;
                 if (job->fill) {
                     r->pair_rank[*count] = (uint32_t)rank;
-                    r->pair_slot[*count] = r->slot_begin[rank] + pairs;
+                    r->splat_pairs[r->splat_begin[rank] + pairs] = *count;
                 }
                 ++*count;
             }
         }
-        if (!job->fill) r->slot_begin[rank + 1] = pairs;
+        if (!job->fill) r->splat_begin[rank + 1] = pairs;
     }
 }
 
@@ -4627,14 +4628,14 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
         }
     }
     r->tile_begin[tiles] = total;
-    r->slot_begin[0] = 0;
-    for (size_t i = 0; i < r->visible_count; i++) r->slot_begin[i + 1] += r->slot_begin[i];
+    r->splat_begin[0] = 0;
+    for (size_t i = 0; i < r->visible_count; i++) r->splat_begin[i + 1] += r->splat_begin[i];
     r->pair_count = total;
-    if (total > r->pair_capacity || !r->pair_slot) { // never NULL, so that empty lists are pointers too
+    if (total > r->pair_capacity || !r->splat_pairs) { // never NULL, so that empty lists are pointers too
         const size_t capacity = total + total / 4;
         r->pair_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->pair_rank, capacity, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_slot, capacity, sizeof(size_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->splat_pairs, capacity, sizeof(size_t)));
         r->pair_capacity = capacity;
     }
     job.fill = 1;
@@ -4674,7 +4675,7 @@ typedef struct gsf__raster_kernels {
                    size_t* step_count);
     // Back to front over kept steps: adds up the gradient moments of each entry into its slot (12 floats).
     void (*reverse)(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads, size_t step_count,
-                    gsf__tile_gradient* gradient, const size_t* pair_slot, float* slots, int flags);
+                    gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int flags);
 } gsf__raster_kernels;
 
 // Slot layout. With p = dL/d(ln alpha) of a pixel, w = alpha*T, d = (e, dy) its place in the record's coordinates:
@@ -4901,8 +4902,8 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, si
        dL/dalpha = T (F - B),   B <- B + alpha (F - B)
    without any division by 1 - alpha. */
 static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
-                                size_t step_count, gsf__tile_gradient* gradient, const size_t* pair_slot, float* slots,
-                                int flags) {
+                                size_t step_count, gsf__tile_gradient* gradient, float* slots,
+                                uint8_t* slot_used, int flags) {
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->ranks[entry];
@@ -4940,8 +4941,9 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
                 sums[GSF__SLOT_ABS_Y] += fabsf(p * (conic_b * e + conic_q * dy));
             }
         }
-        float* slot = slots + GSF__SLOT_FLOATS * pair_slot[entry];
+        float* slot = slots + GSF__SLOT_FLOATS * entry;
         memcpy(slot, sums, sizeof sums); // all of an entry's steps are in one bucket
+        slot_used[entry] = 1;
     }
 }
 
@@ -4995,8 +4997,8 @@ GSF__TARGET_AVX2 static inline __m256 gsf__sum8_avx2(__m256 a, __m256 b, __m256 
 
 GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__step* steps,
                                                            const gsf__step_head* heads, size_t step_count,
-                                                           gsf__tile_gradient* gradient, const size_t* pair_slot,
-                                                           float* slots, int with_depth, int straight_through) {
+                                                           gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int with_depth,
+                                                           int straight_through) {
     const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
     for (size_t k = step_count; k > 0;) {
@@ -5041,24 +5043,25 @@ GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile
             say = _mm256_add_ps(say, _mm256_and_ps(magnitude, _mm256_fmadd_ps(_mm256_set1_ps(conic_b), pe,
                                                                              _mm256_mul_ps(_mm256_set1_ps(conic_q), py))));
         }
-        float* slot = slots + GSF__SLOT_FLOATS * pair_slot[entry];
+        float* slot = slots + GSF__SLOT_FLOATS * entry;
         const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
         const __m256 rest = gsf__sum8_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say, sp, sp, sp, sp);
         _mm256_storeu_ps(slot, first); // all of an entry's steps are in one bucket
         _mm_storeu_ps(slot + 8, _mm256_castps256_ps128(rest));
+        slot_used[entry] = 1;
     }
 }
 
 GSF__TARGET_AVX2 static void gsf__reverse_avx2(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
-                                               size_t step_count, gsf__tile_gradient* gradient, const size_t* pair_slot,
-                                               float* slots, int flags) {
+                                               size_t step_count, gsf__tile_gradient* gradient, float* slots,
+                                               uint8_t* slot_used, int flags) {
     if (flags & (GSF__WITH_DEPTH | GSF__STRAIGHT_THROUGH)) {
         if (flags & GSF__STRAIGHT_THROUGH)
-            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, pair_slot, slots, 1, 1);
+            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 1);
         else
-            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, pair_slot, slots, 1, 0);
+            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0);
     } else {
-        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, pair_slot, slots, 0, 0);
+        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 0, 0);
     }
 }
 
@@ -5218,12 +5221,12 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
         double sums[GSF__SLOT_FLOATS];
         memset(sums, 0, sizeof sums);
         int touched = 0;
-        for (size_t s = r->slot_begin[rank]; s < r->slot_begin[rank + 1]; s++) {
-            const float* slot = r->slots + GSF__SLOT_FLOATS * s;
-            for (int k = 0; k < GSF__SLOT_FLOATS; k++) {
-                sums[k] += (double)slot[k];
-                touched |= slot[k] != 0.0f;
-            }
+        for (size_t s = r->splat_begin[rank]; s < r->splat_begin[rank + 1]; s++) {
+            const size_t pair = r->splat_pairs[s];
+            if (!r->slot_used[pair]) continue;
+            const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
+            for (int k = 0; k < GSF__SLOT_FLOATS; k++) sums[k] += (double)slot[k];
+            touched = 1;
         }
         if (touched) gsf__project_backward(job->view, job->splats, i, r->records + i, sums, job->grads);
     }
@@ -5281,7 +5284,7 @@ static gsf_result gsf__reserve_frame(gsf_context* ctx, gsf_rasterizer* r) {
         GSF__TRY(gsf__grow(ctx, (void**)&r->keys, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->keys_spare, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->rank, n, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->slot_begin, n + 1, sizeof(size_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->splat_begin, n + 1, sizeof(size_t)));
         r->splat_capacity = n;
     }
     return GSF_OK;
@@ -5293,7 +5296,7 @@ typedef struct gsf__raster_job {
     const gsf__view* view;
     const gsf_render_output* out;
     const float *d_color, *d_depth, *d_alpha;
-    int flags;
+    int flags, wants_background;
 } gsf__raster_job;
 
 static gsf__tile gsf__tile_of(const gsf_rasterizer* r, size_t index) {
@@ -5344,22 +5347,46 @@ static void gsf__blend_chunk(void* arg, size_t index, int worker) {
     memset(&state, 0, sizeof state);
     gsf__open_tile(state.T, columns, rows);
     job->kernels->blend(&tile, &state, job->flags);
-    for (int row = 0; row < rows; row++)
+    const gsf_image *color = &job->out->color, *depth = &job->out->depth, *alpha = &job->out->alpha;
+    const float* background = job->view->background;
+    for (int row = 0; row < rows; row++) {
+        const int64_t y = (int64_t)tile.y0 + row, x0 = (int64_t)tile.x0;
+        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x0;
         for (int column = 0; column < columns; column++) {
             const int k = gsf__lane_of(column, row);
-            const int64_t x = (int64_t)tile.x0 + column, y = (int64_t)tile.y0 + row;
             const float T = fabsf(state.T[k]);
-            const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
-            r->final_T[pixel] = T;
-            r->depth_sum[pixel] = state.z[k];
-            if (job->out->color.data) {
-                gsf__put_pixel(&job->out->color, x, y, 0, state.r[k] + T * job->view->background[0]);
-                gsf__put_pixel(&job->out->color, x, y, 1, state.g[k] + T * job->view->background[1]);
-                gsf__put_pixel(&job->out->color, x, y, 2, state.b[k] + T * job->view->background[2]);
-            }
-            if (job->out->alpha.data) gsf__put_pixel(&job->out->alpha, x, y, 0, 1.0f - T);
-            if (job->out->depth.data) gsf__put_pixel(&job->out->depth, x, y, 0, T < 1.0f ? state.z[k] / (1.0f - T) : 0.0f);
+            r->final_T[pixel + (size_t)column] = T;
+            state.T[k] = T;
+            state.r[k] += T * background[0];
+            state.g[k] += T * background[1];
+            state.b[k] += T * background[2];
         }
+        if (r->has_depth)
+            for (int column = 0; column < columns; column++)
+                r->depth_sum[pixel + (size_t)column] = state.z[gsf__lane_of(column, row)];
+        if (color->data && color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float)) {
+            float* out = (float*)(void*)((char*)color->data + y * color->stride_y) + 3 * x0;
+            for (int column = 0; column < columns; column++) {
+                const int k = gsf__lane_of(column, row);
+                out[3 * column] = state.r[k];
+                out[3 * column + 1] = state.g[k];
+                out[3 * column + 2] = state.b[k];
+            }
+        } else if (color->data) {
+            for (int column = 0; column < columns; column++) {
+                const int k = gsf__lane_of(column, row);
+                gsf__put_pixel(color, x0 + column, y, 0, state.r[k]);
+                gsf__put_pixel(color, x0 + column, y, 1, state.g[k]);
+                gsf__put_pixel(color, x0 + column, y, 2, state.b[k]);
+            }
+        }
+        for (int column = 0; column < columns && (alpha->data || depth->data); column++) {
+            const int k = gsf__lane_of(column, row);
+            const float a = 1.0f - state.T[k];
+            if (alpha->data) gsf__put_pixel(alpha, x0 + column, y, 0, a);
+            if (depth->data) gsf__put_pixel(depth, x0 + column, y, 0, state.T[k] < 1.0f ? state.z[k] / a : 0.0f);
+        }
+    }
 }
 
 GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const gsf_splats* splats, const gsf_camera* camera,
@@ -5404,36 +5431,44 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
 static void gsf__load_tile_gradient(const gsf__raster_job* job, const gsf__tile* tile, int columns, int rows,
                                     gsf__tile_gradient* gradient, double background[3]) {
     const gsf_rasterizer* r = job->r;
+    const float* shown = job->view->background;
     memset(gradient, 0, sizeof *gradient);
-    for (int row = 0; row < rows; row++)
-        for (int column = 0; column < columns; column++) {
+    for (int row = 0; row < rows; row++) {
+        const size_t pixel = (size_t)((int)tile->y0 + row) * (size_t)r->width + (size_t)tile->x0;
+        for (int column = 0; column < columns && job->d_color; column++) {
+            const float* d = job->d_color + 3 * (pixel + (size_t)column);
             const int k = gsf__lane_of(column, row);
-            const size_t pixel = (size_t)((int)tile->y0 + row) * (size_t)r->width + (size_t)((int)tile->x0 + column);
-            const float T = r->final_T[pixel];
-            if (job->d_color) {
-                gradient->r[k] = job->d_color[3 * pixel];
-                gradient->g[k] = job->d_color[3 * pixel + 1];
-                gradient->b[k] = job->d_color[3 * pixel + 2];
-            }
-            if (job->d_alpha) gradient->a[k] = job->d_alpha[pixel];
-            if (job->d_depth && T < 1.0f) { // depth = D / A
-                const float weight = 1.0f - T;
-                gradient->z[k] = job->d_depth[pixel] / weight;
-                gradient->a[k] -= gradient->z[k] * (r->depth_sum[pixel] / weight);
-            }
-            gradient->behind[k] = gradient->r[k] * job->view->background[0] + gradient->g[k] * job->view->background[1] +
-                                  gradient->b[k] * job->view->background[2];
+            gradient->r[k] = d[0];
+            gradient->g[k] = d[1];
+            gradient->b[k] = d[2];
+            gradient->behind[k] = d[0] * shown[0] + d[1] * shown[1] + d[2] * shown[2];
+        }
+        for (int column = 0; column < columns && job->wants_background; column++) {
+            const int k = gsf__lane_of(column, row);
+            const float T = r->final_T[pixel + (size_t)column];
             background[0] += (double)(T * gradient->r[k]);
             background[1] += (double)(T * gradient->g[k]);
             background[2] += (double)(T * gradient->b[k]);
         }
+        for (int column = 0; column < columns && job->d_alpha; column++)
+            gradient->a[gsf__lane_of(column, row)] = job->d_alpha[pixel + (size_t)column];
+        for (int column = 0; column < columns && job->d_depth; column++) { // depth = D / A
+            const size_t at = pixel + (size_t)column;
+            const int k = gsf__lane_of(column, row);
+            const float weight = 1.0f - r->final_T[at];
+            if (!(weight > 0.0f)) continue;
+            gradient->z[k] = job->d_depth[at] / weight;
+            gradient->a[k] -= gradient->z[k] * (r->depth_sum[at] / weight);
+        }
+    }
 }
 
 static void gsf__reverse_chunk(void* arg, size_t index, int worker) {
     const gsf__raster_job* job = (const gsf__raster_job*)arg;
     gsf_rasterizer* r = job->r;
     const gsf__tile tile = gsf__tile_of(r, index);
-    const size_t* pair_slot = r->pair_slot + r->tile_begin[index];
+    float* slots = r->slots + GSF__SLOT_FLOATS * r->tile_begin[index];
+    uint8_t* slot_used = r->slot_used + r->tile_begin[index];
     double* background = r->tile_background + 3 * index;
     gsf__worker_scratch* scratch = r->workers + worker;
     gsf__tile_gradient gradient;
@@ -5442,8 +5477,6 @@ static void gsf__reverse_chunk(void* arg, size_t index, int worker) {
     memset(background, 0, 3 * sizeof(double));
     gsf__tile_extent(r, &tile, &columns, &rows);
     gsf__load_tile_gradient(job, &tile, columns, rows, &gradient, background);
-    for (size_t i = 0; i < tile.count; i++)
-        memset(r->slots + GSF__SLOT_FLOATS * pair_slot[i], 0, GSF__SLOT_FLOATS * sizeof(float));
 
     // forward over the whole list, remembering where each bucket of kept steps begins
     gsf__open_tile(T, columns, rows);
@@ -5455,7 +5488,7 @@ static void gsf__reverse_chunk(void* arg, size_t index, int worker) {
     }
     // the last bucket's steps are at hand; earlier ones are made again from their checkpoint
     while (buckets > 0) {
-        job->kernels->reverse(&tile, scratch->steps, scratch->heads, kept, &gradient, pair_slot, r->slots, job->flags);
+        job->kernels->reverse(&tile, scratch->steps, scratch->heads, kept, &gradient, slots, slot_used, job->flags);
         if (--buckets == 0) break;
         memcpy(T, scratch->checkpoints + (buckets - 1) * GSF__TILE_PIXELS, sizeof T);
         job->kernels->keep(&tile, T, scratch->checkpoint_entry[buckets - 1], scratch->checkpoint_entry[buckets],
@@ -5469,6 +5502,7 @@ static gsf_result gsf__reserve_backward(gsf_context* ctx, gsf_rasterizer* r) {
         const size_t capacity = r->pair_count + r->pair_count / 4;
         r->slot_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->slots, capacity, GSF__SLOT_FLOATS * sizeof(float)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->slot_used, capacity, 1));
         r->slot_capacity = capacity;
     }
     if (tiles > r->tile_background_capacity) {
@@ -5525,7 +5559,9 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
     job.d_color = d_color;
     job.d_depth = d_depth;
     job.d_alpha = d_alpha;
+    job.wants_background = grads->background != NULL;
     job.flags = (d_depth || d_alpha ? GSF__WITH_DEPTH : 0) | (view.official_gradient ? GSF__STRAIGHT_THROUGH : 0);
+    if (r->pair_count) memset(r->slot_used, 0, r->pair_count);
     gsf__parallel_for(ctx, tiles, gsf__reverse_chunk, &job);
     if (grads->background)
         for (int c = 0; c < 3; c++) {
