@@ -4443,11 +4443,307 @@ static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splat
     return isfinite(sum) ? GSF__DRAWN : GSF__CULLED;
 }
 
+#if GSF__X86
+
+/* Eight splats at a time: the formulas above, a lane per splat. GCC and Clang define + - * / on __m256. Lanes past the last
+   splat repeat it. */
+typedef struct gsf__projection8 {
+    __m256 t[3], x, y, clamped_x, clamped_y;
+    __m256 q[4], inv_norm, scale[3], T[9], V[6];
+    __m256 cov_a, cov_b, cov_c, det_raw, det;
+    __m256 logit, opacity, compensation;
+    __m256 shown; // mask: in front of the near plane and finite
+} gsf__projection8;
+
+GSF__TARGET_AVX2 static inline __m256 gsf__all8(float x) { return _mm256_set1_ps(x); }
+GSF__TARGET_AVX2 static inline __m256 gsf__abs8(__m256 x) { return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), x); }
+GSF__TARGET_AVX2 static inline __m256 gsf__select8(__m256 mask, __m256 yes, __m256 no) {
+    return _mm256_blendv_ps(no, yes, mask);
+}
+GSF__TARGET_AVX2 static inline __m256 gsf__dot8(__m256 ax, __m256 ay, __m256 az, __m256 bx, __m256 by, __m256 bz) {
+    return _mm256_fmadd_ps(ax, bx, _mm256_fmadd_ps(ay, by, az * bz));
+}
+GSF__TARGET_AVX2 static inline __m256 gsf__minor8(__m256 a, __m256 b, __m256 c, __m256 d) { // ad - bc
+    return _mm256_fmsub_ps(a, d, b * c);
+}
+GSF__TARGET_AVX2 static inline __m256 gsf__finite8(__m256 x) { // mask
+    return _mm256_cmp_ps(x - x, _mm256_setzero_ps(), _CMP_EQ_OQ);
+}
+
+// Float `c` of eight rows of `stride` floats.
+GSF__TARGET_AVX2 static inline __m256 gsf__column8(const float* rows, __m256i lane, int stride, int c) {
+    return _mm256_i32gather_ps(rows + c, _mm256_mullo_epi32(lane, _mm256_set1_epi32(stride)), 4);
+}
+
+GSF__TARGET_AVX2 static inline __m256i gsf__lanes8(size_t left) { // 0 1 2 ..., at most left - 1
+    const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+    return left < 8 ? _mm256_min_epi32(lane, _mm256_set1_epi32((int)left - 1)) : lane;
+}
+
+GSF__TARGET_AVX2 static inline void gsf__transpose8(__m256 m[8]) {
+    __m256 a[8], b[8];
+    for (int i = 0; i < 4; i++) {
+        a[2 * i] = _mm256_unpacklo_ps(m[2 * i], m[2 * i + 1]);
+        a[2 * i + 1] = _mm256_unpackhi_ps(m[2 * i], m[2 * i + 1]);
+    }
+    for (int i = 0; i < 2; i++) {
+        b[4 * i] = _mm256_shuffle_ps(a[4 * i], a[4 * i + 2], 0x44);
+        b[4 * i + 1] = _mm256_shuffle_ps(a[4 * i], a[4 * i + 2], 0xee);
+        b[4 * i + 2] = _mm256_shuffle_ps(a[4 * i + 1], a[4 * i + 3], 0x44);
+        b[4 * i + 3] = _mm256_shuffle_ps(a[4 * i + 1], a[4 * i + 3], 0xee);
+    }
+    for (int i = 0; i < 4; i++) {
+        m[i] = _mm256_permute2f128_ps(b[i], b[4 + i], 0x20);
+        m[4 + i] = _mm256_permute2f128_ps(b[i], b[4 + i], 0x31);
+    }
+}
+
+// e^x for x in [-87, 88], clamped to it; relative error below 2e-7. NaN stays.
+GSF__TARGET_AVX2 static inline __m256 gsf__exp8(__m256 x) {
+    x = _mm256_min_ps(gsf__all8(88.0f), _mm256_max_ps(gsf__all8(-87.0f), x)); // a NaN is the second operand of both
+    const __m256 k = _mm256_round_ps(x * gsf__all8(1.44269504f), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    __m256 r = _mm256_fnmadd_ps(k, gsf__all8(0.693359375f), x); // ln 2 in two parts, the first exact
+    r = _mm256_fnmadd_ps(k, gsf__all8(-2.12194440e-4f), r);
+    __m256 p = gsf__all8(1.0f / 5040.0f);
+    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 720.0f));
+    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 120.0f));
+    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 24.0f));
+    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 6.0f));
+    p = _mm256_fmadd_ps(p, r, gsf__all8(0.5f));
+    p = _mm256_fmadd_ps(p * r, r, r) + gsf__all8(1.0f);
+    const __m256i scale = _mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(k), _mm256_set1_epi32(127)), 23);
+    return p * _mm256_castsi256_ps(scale);
+}
+
+// log2 of a normal x > 0, within 1 ulp of the result or 1e-7.
+GSF__TARGET_AVX2 static inline __m256 gsf__log2_8(__m256 x) {
+    const __m256i bits = _mm256_castps_si256(x);
+    const __m256i offset = _mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f3504f3)); // sqrt(1/2): the mantissa ends up in
+    const __m256i e = _mm256_srai_epi32(offset, 23);                              // [sqrt(1/2), sqrt(2))
+    const __m256 m = _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(e, 23)));
+    const __m256 one = gsf__all8(1.0f), t = (m - one) / (m + one), t2 = t * t;
+    __m256 p = gsf__all8(1.0f / 9.0f);
+    p = _mm256_fmadd_ps(p, t2, gsf__all8(1.0f / 7.0f));
+    p = _mm256_fmadd_ps(p, t2, gsf__all8(1.0f / 5.0f));
+    p = _mm256_fmadd_ps(p, t2, gsf__all8(1.0f / 3.0f));
+    p = _mm256_fmadd_ps(p, t2, one);
+    return _mm256_fmadd_ps(gsf__all8(2.88539008f) * t, p, _mm256_cvtepi32_ps(e));
+}
+
+GSF__TARGET_AVX2 static inline __m256 gsf__sigmoid8(__m256 x) {
+    const __m256 e = gsf__exp8(_mm256_or_ps(x, gsf__all8(-0.0f))); // of -|x|
+    return gsf__select8(x, e, gsf__all8(1.0f)) / (gsf__all8(1.0f) + e);
+}
+
+GSF__TARGET_AVX2 static inline void gsf__project8(const gsf__view* view, const gsf_splats* splats, size_t i, __m256i lane,
+                                                  gsf__projection8* p) {
+    const __m256 one = gsf__all8(1.0f), two = gsf__all8(2.0f), zero = _mm256_setzero_ps();
+    __m256 W[9], mean[3], raw[4];
+    for (int k = 0; k < 9; k++) W[k] = gsf__all8(view->W[k]);
+    for (int k = 0; k < 3; k++) mean[k] = gsf__column8(splats->means + 3 * i, lane, 3, k);
+    for (int r = 0; r < 3; r++)
+        p->t[r] = gsf__dot8(W[3 * r], W[3 * r + 1], W[3 * r + 2], mean[0], mean[1], mean[2]) + gsf__all8(view->t[r]);
+    p->shown = _mm256_cmp_ps(p->t[2], gsf__all8(view->near_plane), _CMP_GT_OQ);
+    if (_mm256_testz_ps(p->shown, p->shown)) return;
+
+    // unit quaternion: scaled by its largest component first, so that neither tiny nor huge ones lose digits
+    __m256 largest = gsf__all8(1e-30f), norm2 = zero;
+    for (int k = 0; k < 4; k++) {
+        raw[k] = gsf__column8(splats->quats + 4 * i, lane, 4, k);
+        largest = _mm256_max_ps(gsf__abs8(raw[k]), largest);
+    }
+    for (int k = 0; k < 4; k++) {
+        p->q[k] = raw[k] / largest;
+        norm2 = _mm256_fmadd_ps(p->q[k], p->q[k], norm2);
+    }
+    const __m256 root = _mm256_sqrt_ps(norm2), norm = largest * root;
+    const __m256 tiny = _mm256_cmp_ps(norm, gsf__all8(1e-12f), _CMP_LE_OQ);
+    for (int k = 0; k < 4; k++) p->q[k] = gsf__select8(tiny, raw[k] * gsf__all8(1e12f), p->q[k] / root);
+    p->inv_norm = _mm256_andnot_ps(tiny, one / norm);
+
+    __m256 finite = one;
+    for (int k = 0; k < 3; k++) {
+        const __m256 log_scale = gsf__column8(splats->log_scales + 3 * i, lane, 3, k);
+        finite = finite + (log_scale - log_scale);
+        p->scale[k] = gsf__exp8(log_scale);
+    }
+    const __m256 w = p->q[0], x = p->q[1], y = p->q[2], z = p->q[3];
+    const __m256 R[9] = {one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
+                         two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
+                         two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)};
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++)
+            p->T[3 * r + c] = gsf__dot8(W[3 * r], W[3 * r + 1], W[3 * r + 2], R[c], R[3 + c], R[6 + c]) * p->scale[c];
+
+    const __m256 inv_z = one / p->t[2], rx = p->t[0] * inv_z, ry = p->t[1] * inv_z;
+    const __m256 limit_x = gsf__all8(view->limit_x), limit_y = gsf__all8(view->limit_y);
+    p->clamped_x = _mm256_cmp_ps(gsf__abs8(rx), limit_x, _CMP_NLE_UQ);
+    p->clamped_y = _mm256_cmp_ps(gsf__abs8(ry), limit_y, _CMP_NLE_UQ);
+    p->x = _mm256_max_ps(zero - limit_x, _mm256_min_ps(limit_x, rx));
+    p->y = _mm256_max_ps(zero - limit_y, _mm256_min_ps(limit_y, ry));
+    const __m256 jx = gsf__all8(view->fx) * inv_z, jy = gsf__all8(view->fy) * inv_z;
+    for (int c = 0; c < 3; c++) {
+        p->V[c] = jx * _mm256_fnmadd_ps(p->x, p->T[6 + c], p->T[c]);
+        p->V[3 + c] = jy * _mm256_fnmadd_ps(p->y, p->T[6 + c], p->T[3 + c]);
+    }
+    const __m256* V = p->V;
+    const __m256 a = gsf__dot8(V[0], V[1], V[2], V[0], V[1], V[2]), b = gsf__dot8(V[0], V[1], V[2], V[3], V[4], V[5]);
+    const __m256 c = gsf__dot8(V[3], V[4], V[5], V[3], V[4], V[5]), blur = gsf__all8(GSF__BLUR);
+    const __m256 m0 = gsf__minor8(V[1], V[2], V[4], V[5]), m1 = gsf__minor8(V[2], V[0], V[5], V[3]);
+    const __m256 m2 = gsf__minor8(V[0], V[1], V[3], V[4]);
+    p->det_raw = gsf__dot8(m0, m1, m2, m0, m1, m2);
+    p->det = p->det_raw + blur * (a + c) + blur * blur;
+    p->cov_a = a + blur;
+    p->cov_b = b;
+    p->cov_c = c + blur;
+
+    p->logit = gsf__column8(splats->opacity_logits + i, lane, 1, 0);
+    p->opacity = gsf__sigmoid8(p->logit) * gsf__all8(view->opacity_scale);
+    p->compensation = one;
+    if (view->antialiased)
+        p->compensation = _mm256_sqrt_ps(_mm256_max_ps(p->det_raw / p->det, gsf__all8(GSF__AA_FLOOR)));
+    finite = finite + (p->det + p->cov_a + p->cov_c + p->opacity + p->t[0] + p->t[1] + p->t[2] + (p->logit - p->logit));
+    p->shown = _mm256_and_ps(p->shown, gsf__finite8(finite));
+    p->shown = _mm256_and_ps(p->shown, _mm256_cmp_ps(p->det, zero, _CMP_GT_OQ));
+}
+
+GSF__TARGET_AVX2 static inline void gsf__sh_basis8(__m256 x, __m256 y, __m256 z, int32_t count, __m256 basis[16]) {
+    basis[0] = gsf__all8(0.28209479177387814f);
+    if (count < 4) return;
+    basis[1] = gsf__all8(-0.4886025119029199f) * y;
+    basis[2] = gsf__all8(0.4886025119029199f) * z;
+    basis[3] = gsf__all8(-0.4886025119029199f) * x;
+    if (count < 9) return;
+    const __m256 xx = x * x, yy = y * y, zz = z * z, two = gsf__all8(2.0f), three = gsf__all8(3.0f), four = gsf__all8(4.0f);
+    basis[4] = gsf__all8(1.0925484305920792f) * x * y;
+    basis[5] = gsf__all8(-1.0925484305920792f) * y * z;
+    basis[6] = gsf__all8(0.31539156525252005f) * (two * zz - xx - yy);
+    basis[7] = gsf__all8(-1.0925484305920792f) * x * z;
+    basis[8] = gsf__all8(0.5462742152960396f) * (xx - yy);
+    if (count < 16) return;
+    basis[9] = gsf__all8(-0.5900435899266435f) * y * (three * xx - yy);
+    basis[10] = gsf__all8(2.890611442640554f) * x * y * z;
+    basis[11] = gsf__all8(-0.4570457994644658f) * y * (four * zz - xx - yy);
+    basis[12] = gsf__all8(0.3731763325901154f) * z * (two * zz - three * (xx + yy));
+    basis[13] = gsf__all8(-0.4570457994644658f) * x * (four * zz - xx - yy);
+    basis[14] = gsf__all8(1.445305721320277f) * z * (xx - yy);
+    basis[15] = gsf__all8(-0.5900435899266435f) * x * (xx - three * yy);
+}
+
+// Unit directions from the camera; returns the distances, 0 (and the direction 0 0 1) where a mean is at the camera.
+GSF__TARGET_AVX2 static inline __m256 gsf__view_direction8(const gsf__view* view, const gsf_splats* splats, size_t i,
+                                                           __m256i lane, __m256 d[3]) {
+    for (int k = 0; k < 3; k++) d[k] = gsf__column8(splats->means + 3 * i, lane, 3, k) - gsf__all8(view->center[k]);
+    const __m256 length = _mm256_sqrt_ps(gsf__dot8(d[0], d[1], d[2], d[0], d[1], d[2]));
+    const __m256 apart = _mm256_cmp_ps(length, _mm256_setzero_ps(), _CMP_GT_OQ);
+    const __m256 inv = _mm256_and_ps(apart, gsf__all8(1.0f) / length);
+    for (int k = 0; k < 3; k++) d[k] = d[k] * inv;
+    d[2] = gsf__select8(apart, d[2], gsf__all8(1.0f));
+    return _mm256_and_ps(apart, length);
+}
+
+// The first `count` floats of eight rows of SH coefficients, as columns.
+GSF__TARGET_AVX2 static inline void gsf__sh_columns8(const gsf_splats* splats, size_t i, __m256i lane, int count,
+                                                     __m256 sh[48]) {
+    const int stored = 3 * gsf_splat_sh_count(splats->sh_degree);
+    const float* rows = splats->sh + (size_t)stored * i;
+    int32_t at[8];
+    int k = 0;
+    _mm256_storeu_si256((__m256i*)(void*)at, lane);
+    for (; k < count && k + 8 <= stored; k += 8) {
+        for (int l = 0; l < 8; l++) sh[k + l] = _mm256_loadu_ps(rows + stored * at[l] + k);
+        gsf__transpose8(sh + k);
+    }
+    for (; k < count; k++) sh[k] = gsf__column8(rows, lane, stored, k);
+}
+
+GSF__TARGET_AVX2 static inline void gsf__colors8(const gsf__view* view, const gsf_splats* splats, size_t i, __m256i lane,
+                                                 __m256 rgb[3]) {
+    __m256 d[3], basis[16], sh[48];
+    gsf__view_direction8(view, splats, i, lane, d);
+    gsf__sh_basis8(d[0], d[1], d[2], view->sh_coefficients, basis);
+    gsf__sh_columns8(splats, i, lane, 3 * view->sh_coefficients, sh);
+    for (int c = 0; c < 3; c++) {
+        rgb[c] = gsf__all8(0.5f);
+        for (int32_t k = 0; k < view->sh_coefficients; k++) rgb[c] = _mm256_fmadd_ps(basis[k], sh[3 * k + c], rgb[c]);
+    }
+}
+
+// Records and radii of up to eight splats from i on (full footprint).
+GSF__TARGET_AVX2 static void gsf__records_avx2(gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
+                                               const uint8_t* hidden, size_t i, size_t left) {
+    const __m256i lane = gsf__lanes8(left);
+    const __m256 one = gsf__all8(1.0f), zero = _mm256_setzero_ps(), half = gsf__all8(0.5f);
+    const size_t count = left < 8 ? left : 8;
+    gsf__projection8 p;
+    gsf__project8(view, splats, i, lane, &p);
+    __m256 drawn = p.shown;
+    if (hidden)
+        for (size_t l = 0; l < count; l++)
+            if (hidden[i + l]) {
+                const __m256i other = _mm256_cmpeq_epi32(_mm256_set1_epi32((int)l), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+                drawn = _mm256_andnot_ps(_mm256_castsi256_ps(other), drawn);
+            }
+    __m256 row[16], rgb[3];
+    if (!_mm256_testz_ps(drawn, drawn)) {
+        const __m256 opacity = p.opacity * p.compensation;
+        const __m256 log2_opacity = gsf__log2_8(_mm256_max_ps(opacity, gsf__all8(1e-30f)));
+        const __m256 t2 = _mm256_fmadd_ps(gsf__all8(2.0f * 0.69314718f * 1.0001f),
+                                          log2_opacity - gsf__all8(GSF__LOG2_ALPHA_MIN), gsf__all8(1e-4f));
+        const __m256 conic_a = p.cov_c / p.det, inv_c = one / p.cov_c;
+        const __m256 half_gap = half * (p.cov_a - p.cov_c), root = _mm256_fmadd_ps(half_gap, half_gap, p.cov_b * p.cov_b);
+        const __m256 longest = half * (p.cov_a + p.cov_c) + _mm256_sqrt_ps(_mm256_max_ps(root, gsf__all8(0.1f)));
+        const __m256 radius = _mm256_min_ps(_mm256_ceil_ps(gsf__all8(3.0f) * _mm256_sqrt_ps(longest)), gsf__all8(1e9f));
+        row[0] = _mm256_fmadd_ps(gsf__all8(view->fx), p.t[0] / p.t[2], gsf__all8(view->cx));
+        row[1] = _mm256_fmadd_ps(gsf__all8(view->fy), p.t[1] / p.t[2], gsf__all8(view->cy));
+        row[2] = p.cov_b * inv_c;
+        row[3] = gsf__all8(-0.72134752f) * conic_a;
+        row[4] = gsf__all8(-0.72134752f) * inv_c;
+        row[5] = log2_opacity;
+        row[6] = t2 / conic_a;
+        row[7] = inv_c / conic_a;
+        row[11] = p.t[2];
+        row[12] = _mm256_sqrt_ps(t2 * p.cov_a);
+        row[13] = _mm256_sqrt_ps(t2 * p.cov_c);
+        row[14] = p.cov_b / p.cov_a;
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(opacity, gsf__all8(GSF__ALPHA_MIN), _CMP_GE_OQ));
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[0] + row[12], zero, _CMP_GE_OQ));
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[0] - row[12], gsf__all8((float)(r->width - 1)), _CMP_LE_OQ));
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] + row[13], zero, _CMP_GE_OQ));
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] - row[13], gsf__all8((float)(r->height - 1)), _CMP_LE_OQ));
+        row[15] = radius;
+    }
+    if (_mm256_testz_ps(drawn, drawn)) {
+        for (size_t l = 0; l < count; l++) r->radii[i + l] = r->records[i + l].radius = 0;
+        return;
+    }
+    gsf__colors8(view, splats, i, lane, rgb);
+    for (int c = 0; c < 3; c++) row[8 + c] = _mm256_max_ps(rgb[c], zero);
+    __m256 sum = rgb[0] + rgb[1] + rgb[2] + row[0] + row[1];
+    for (int k = 2; k < 15; k++) sum = sum + row[k];
+    drawn = _mm256_and_ps(drawn, gsf__finite8(sum));
+    const __m256i radius = _mm256_and_si256(_mm256_castps_si256(drawn), _mm256_cvtps_epi32(row[15]));
+    row[15] = _mm256_castsi256_ps(radius);
+    int32_t radii[8];
+    _mm256_storeu_si256((__m256i*)(void*)radii, radius);
+    gsf__transpose8(row);
+    gsf__transpose8(row + 8);
+    for (size_t l = 0; l < count; l++) {
+        float* out = (float*)(void*)(r->records + i + l);
+        _mm256_storeu_ps(out, row[l]);
+        _mm256_storeu_ps(out + 8, row[8 + l]);
+        r->radii[i + l] = radii[l];
+    }
+}
+
+#endif // GSF__X86
+
 typedef struct gsf__project_job {
     gsf_rasterizer* r;
     const gsf__view* view;
     const gsf_splats* splats;
     const uint8_t* hidden;
+    gsf_cpu_level level;
 } gsf__project_job;
 
 static int gsf__meets_image(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
@@ -4465,6 +4761,13 @@ static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
     gsf_rasterizer* r = job->r;
     const size_t begin = chunk * GSF__PROJECT_CHUNK;
     const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
+#if GSF__X86
+    if (job->level >= GSF_CPU_AVX2 && !job->view->official_footprint) {
+        for (size_t i = begin; i < end; i += 8)
+            gsf__records_avx2(r, job->view, job->splats, job->hidden, i, end - i);
+        return;
+    }
+#endif
     for (size_t i = begin; i < end; i++) {
         gsf__record* rec = r->records + i;
         const gsf__show show =
@@ -5201,11 +5504,217 @@ static void gsf__project_backward(const gsf__view* view, const gsf_splats* splat
     }
 }
 
+#if GSF__X86
+
+// Derivative of sum(weight basis) by the direction: the polynomials of gsf__sh_basis_gradient. count >= 4.
+GSF__TARGET_AVX2 static inline void gsf__sh_direction_gradient8(const __m256 d[3], int32_t count, const __m256 weight[16],
+                                                                __m256 out[3]) {
+    const __m256 x = d[0], y = d[1], z = d[2], two = gsf__all8(2.0f), three = gsf__all8(3.0f), four = gsf__all8(4.0f);
+    out[0] = gsf__all8(-0.4886025119029199f) * weight[3];
+    out[1] = gsf__all8(-0.4886025119029199f) * weight[1];
+    out[2] = gsf__all8(0.4886025119029199f) * weight[2];
+    if (count < 9) return;
+    const __m256 c4 = gsf__all8(1.0925484305920792f), c6 = gsf__all8(0.6307831305050401f);
+    out[0] = out[0] + c4 * (y * weight[4] - z * weight[7] + x * weight[8]) - c6 * x * weight[6];
+    out[1] = out[1] + c4 * (x * weight[4] - z * weight[5] - y * weight[8]) - c6 * y * weight[6];
+    out[2] = out[2] - c4 * (y * weight[5] + x * weight[7]) + two * c6 * z * weight[6];
+    if (count < 16) return;
+    const __m256 xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
+    const __m256 a = gsf__all8(0.5900435899266435f), b = gsf__all8(2.890611442640554f), c = gsf__all8(0.4570457994644658f);
+    const __m256 e = gsf__all8(0.3731763325901154f), six = gsf__all8(6.0f), eight = gsf__all8(8.0f);
+    out[0] = out[0] - six * a * xy * weight[9] + b * yz * weight[10] + two * c * xy * weight[11] -
+             six * e * xz * weight[12] - c * (four * zz - three * xx - yy) * weight[13] + b * xz * weight[14] -
+             three * a * (xx - yy) * weight[15];
+    out[1] = out[1] - three * a * (xx - yy) * weight[9] + b * xz * weight[10] -
+             c * (four * zz - xx - three * yy) * weight[11] - six * e * yz * weight[12] + two * c * xy * weight[13] -
+             b * yz * weight[14] + six * a * xy * weight[15];
+    out[2] = out[2] + b * xy * weight[10] - eight * c * yz * weight[11] + three * e * (two * zz - xx - yy) * weight[12] -
+             eight * c * xz * weight[13] + gsf__all8(1.445305721320277f) * (xx - yy) * weight[14];
+}
+
+GSF__TARGET_AVX2 static inline void gsf__add_column8(float* rows, size_t stride, __m256 value, size_t count) {
+    float lanes[8];
+    _mm256_storeu_ps(lanes, value);
+    for (size_t l = 0; l < count; l++) rows[stride * l] += lanes[l];
+}
+
+// Sums up the slots of up to eight splats from i on (12 floats of 16 in each row). Returns the mask of those that have any.
+GSF__TARGET_AVX2 static inline uint32_t gsf__sum_slots_avx2(const gsf_rasterizer* r, size_t i, size_t count, __m256 rows[16]) {
+    uint32_t touched = 0;
+    for (size_t l = 0; l < 8; l++) {
+        __m256d a = _mm256_setzero_pd(), b = a, c = a;
+        if (l < count && r->records[i + l].radius > 0) {
+            const size_t rank = r->rank[i + l];
+            for (size_t s = r->splat_begin[rank]; s < r->splat_begin[rank + 1]; s++) {
+                const size_t pair = r->splat_pairs[s];
+                if (!r->slot_used[pair]) continue;
+                const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
+                a = _mm256_add_pd(a, _mm256_cvtps_pd(_mm_loadu_ps(slot)));
+                b = _mm256_add_pd(b, _mm256_cvtps_pd(_mm_loadu_ps(slot + 4)));
+                c = _mm256_add_pd(c, _mm256_cvtps_pd(_mm_loadu_ps(slot + 8)));
+                touched |= 1u << l;
+            }
+        }
+        rows[l] = _mm256_set_m128(_mm256_cvtpd_ps(b), _mm256_cvtpd_ps(a));
+        rows[8 + l] = _mm256_castps128_ps256(_mm256_cvtpd_ps(c));
+    }
+    gsf__transpose8(rows);
+    gsf__transpose8(rows + 8);
+    return touched;
+}
+
+// gsf__project_backward of up to eight splats from i on.
+GSF__TARGET_AVX2 static void gsf__gather_avx2(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
+                                              const gsf_splat_grads* grads, size_t i, size_t left) {
+    const size_t count = left < 8 ? left : 8;
+    __m256 sums[16];
+    const uint32_t touched = gsf__sum_slots_avx2(r, i, count, sums);
+    if (!touched) return;
+    const __m256i bits = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128), lane = gsf__lanes8(left);
+    const __m256 one = gsf__all8(1.0f), two = gsf__all8(2.0f), four = gsf__all8(4.0f), zero = _mm256_setzero_ps();
+    gsf__projection8 p;
+    gsf__project8(view, splats, i, lane, &p);
+    const __m256 live = _mm256_and_ps(p.shown, _mm256_castsi256_ps(_mm256_cmpeq_epi32(
+                                                   _mm256_and_si256(_mm256_set1_epi32((int)touched), bits), bits)));
+    const __m256 sp = sums[GSF__SLOT_P], se = sums[GSF__SLOT_E], see = sums[GSF__SLOT_EE];
+    const __m256 sy = sums[GSF__SLOT_Y], sey = sums[GSF__SLOT_EY], syy = sums[GSF__SLOT_YY];
+    const __m256 a = p.cov_c / p.det, q = one / p.cov_c, b = zero - p.cov_b * q * a;
+
+    const __m256 du = a * se, dv = b * se + q * sy;
+    const __m256 *V0 = p.V, *V1 = p.V + 3;
+    __m256 n[3], V1_n[3], n_V0[3], g[3], dV[6], d_log_scale[3];
+    for (int c = 0; c < 3; c++) {
+        const int c1 = (c + 1) % 3, c2 = (c + 2) % 3;
+        n[c] = gsf__minor8(V0[c1], V0[c2], V1[c1], V1[c2]);
+    }
+    for (int c = 0; c < 3; c++) {
+        const int c1 = (c + 1) % 3, c2 = (c + 2) % 3;
+        V1_n[c] = gsf__minor8(V1[c1], V1[c2], n[c1], n[c2]);
+        n_V0[c] = gsf__minor8(n[c1], n[c2], V0[c1], V0[c2]);
+        g[c] = (gsf__all8(GSF__BLUR) * V0[c] + V1_n[c]) * q;
+        const __m256 ag = a * g[c], qv = q * V1[c], along_e = ag * see + qv * sey;
+        dV[c] = a * along_e;
+        dV[3 + c] = b * along_e + q * (ag * sey + qv * syy);
+        d_log_scale[c] = ag * ag * see + two * ag * qv * sey + qv * qv * syy;
+    }
+    if (view->antialiased) {
+        const __m256 shrunk = _mm256_cmp_ps(p.det_raw, gsf__all8(GSF__AA_FLOOR) * p.det, _CMP_GT_OQ);
+        const __m256 by_det = _mm256_and_ps(shrunk, sp), raw = _mm256_and_ps(shrunk, sp / p.det_raw);
+        for (int c = 0; c < 3; c++) {
+            const int c1 = (c + 1) % 3, c2 = (c + 2) % 3;
+            dV[c] = dV[c] + raw * V1_n[c] - by_det * a * g[c];
+            dV[3 + c] = dV[3 + c] + raw * n_V0[c] - by_det * (b * g[c] + q * V1[c]);
+            d_log_scale[c] = d_log_scale[c] + raw * (n[c1] * n[c1] + n[c2] * n[c2]) -
+                             by_det * (a * g[c] * g[c] + q * V1[c] * V1[c]);
+        }
+    }
+
+    const __m256 inv_z = one / p.t[2], jx = gsf__all8(view->fx) * inv_z, jy = gsf__all8(view->fy) * inv_z;
+    __m256 dT[9], d_jx = zero, d_jy = zero, d_x = zero, d_y = zero;
+    for (int c = 0; c < 3; c++) {
+        d_jx = d_jx + dV[c] * (p.T[c] - p.x * p.T[6 + c]);
+        d_jy = d_jy + dV[3 + c] * (p.T[3 + c] - p.y * p.T[6 + c]);
+        d_x = d_x - dV[c] * jx * p.T[6 + c];
+        d_y = d_y - dV[3 + c] * jy * p.T[6 + c];
+        dT[c] = jx * dV[c];
+        dT[3 + c] = jy * dV[3 + c];
+        dT[6 + c] = zero - jx * p.x * dV[c] - jy * p.y * dV[3 + c];
+    }
+    const __m256 free_x = _mm256_andnot_ps(p.clamped_x, d_x) * inv_z, free_y = _mm256_andnot_ps(p.clamped_y, d_y) * inv_z;
+    __m256 slope_x = free_x, slope_y = free_y;
+    if (view->official_gradient) { // see gsf__project_backward
+        slope_x = d_x * inv_z;
+        slope_y = d_y * inv_z;
+    }
+    __m256 d_t[3], d_mean[3];
+    d_t[0] = du * jx + free_x;
+    d_t[1] = dv * jy + free_y;
+    d_t[2] = sums[GSF__SLOT_Z] - slope_x * p.x - slope_y * p.y -
+             (du * jx * p.t[0] + dv * jy * p.t[1] + d_jx * jx + d_jy * jy) * inv_z;
+    for (int c = 0; c < 3; c++)
+        d_mean[c] = gsf__dot8(gsf__all8(view->W[c]), gsf__all8(view->W[3 + c]), gsf__all8(view->W[6 + c]), d_t[0], d_t[1],
+                              d_t[2]);
+
+    const int32_t bands = view->sh_coefficients;
+    const int stored = 3 * gsf_splat_sh_count(splats->sh_degree);
+    __m256 d_rgb[3], d[3], basis[16];
+    for (int c = 0; c < 3; c++) {
+        const __m256 shown = gsf__column8(&r->records[i].r, lane, sizeof(gsf__record) / sizeof(float), c);
+        d_rgb[c] = _mm256_and_ps(live, _mm256_and_ps(_mm256_cmp_ps(shown, zero, _CMP_GT_OQ), sums[GSF__SLOT_R + c]));
+    }
+    const __m256 distance = gsf__view_direction8(view, splats, i, lane, d);
+    for (int c = 0; c < 3; c++) d[c] = _mm256_and_ps(live, d[c]); // a NaN times a gradient of 0 is a NaN
+    gsf__sh_basis8(d[0], d[1], d[2], bands, basis);
+    if (grads->sh) {
+        float* rows = grads->sh + (size_t)stored * i;
+        int k = 0;
+        for (; k < 3 * bands && k + 8 <= stored; k += 8) {
+            __m256 block[8];
+            for (int j = 0; j < 8; j++) {
+                block[j] = zero;
+                if (k + j < 3 * bands) block[j] = basis[(k + j) / 3] * d_rgb[(k + j) % 3];
+            }
+            gsf__transpose8(block);
+            for (size_t l = 0; l < count; l++) {
+                float* row = rows + (size_t)stored * l + k;
+                if (touched >> l & 1u) _mm256_storeu_ps(row, _mm256_loadu_ps(row) + block[l]);
+            }
+        }
+        for (; k < 3 * bands; k++) gsf__add_column8(rows + k, (size_t)stored, basis[k / 3] * d_rgb[k % 3], count);
+    }
+    if (grads->means) {
+        if (bands > 1) {
+            __m256 sh[48], weight[16], d_dir[3];
+            gsf__sh_columns8(splats, i, lane, 3 * bands, sh);
+            for (int k = 1; k < bands; k++)
+                weight[k] = gsf__dot8(sh[3 * k], sh[3 * k + 1], sh[3 * k + 2], d_rgb[0], d_rgb[1], d_rgb[2]);
+            gsf__sh_direction_gradient8(d, bands, weight, d_dir);
+            const __m256 along = gsf__dot8(d[0], d[1], d[2], d_dir[0], d_dir[1], d_dir[2]);
+            const __m256 apart = _mm256_cmp_ps(distance, zero, _CMP_GT_OQ);
+            for (int c = 0; c < 3; c++)
+                d_mean[c] = d_mean[c] + _mm256_and_ps(apart, (d_dir[c] - along * d[c]) / distance);
+        }
+        for (size_t c = 0; c < 3; c++)
+            gsf__add_column8(grads->means + 3 * i + c, 3, _mm256_and_ps(live, d_mean[c]), count);
+    }
+    if (grads->means2d) {
+        gsf__add_column8(grads->means2d + 2 * i, 2, _mm256_and_ps(live, du), count);
+        gsf__add_column8(grads->means2d + 2 * i + 1, 2, _mm256_and_ps(live, dv), count);
+    }
+    if (grads->means2d_abs) {
+        gsf__add_column8(grads->means2d_abs + 2 * i, 2, _mm256_and_ps(live, sums[GSF__SLOT_ABS_X]), count);
+        gsf__add_column8(grads->means2d_abs + 2 * i + 1, 2, _mm256_and_ps(live, sums[GSF__SLOT_ABS_Y]), count);
+    }
+    if (grads->opacity_logits)
+        gsf__add_column8(grads->opacity_logits + i, 1, _mm256_and_ps(live, sp * gsf__sigmoid8(zero - p.logit)), count);
+    if (grads->log_scales)
+        for (size_t c = 0; c < 3; c++)
+            gsf__add_column8(grads->log_scales + 3 * i + c, 3, _mm256_and_ps(live, d_log_scale[c]), count);
+    if (grads->quats) {
+        __m256 dR[9], dq[4];
+        for (int row = 0; row < 3; row++)
+            for (int c = 0; c < 3; c++)
+                dR[3 * row + c] = p.scale[c] * gsf__dot8(gsf__all8(view->W[row]), gsf__all8(view->W[3 + row]),
+                                                         gsf__all8(view->W[6 + row]), dT[c], dT[3 + c], dT[6 + c]);
+        const __m256 w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
+        dq[0] = two * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
+        dq[1] = two * (y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) + w * (dR[7] - dR[5])) - four * x * (dR[4] + dR[8]);
+        dq[2] = two * (x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) + w * (dR[2] - dR[6])) - four * y * (dR[0] + dR[8]);
+        dq[3] = two * (x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) + w * (dR[3] - dR[1])) - four * z * (dR[0] + dR[4]);
+        const __m256 along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
+        for (size_t k = 0; k < 4; k++)
+            gsf__add_column8(grads->quats + 4 * i + k, 4, _mm256_and_ps(live, (dq[k] - along * p.q[k]) * p.inv_norm), count);
+    }
+}
+
+#endif // GSF__X86
+
 typedef struct gsf__gather_job {
     const gsf_rasterizer* r;
     const gsf__view* view;
     const gsf_splats* splats;
     const gsf_splat_grads* grads;
+    gsf_cpu_level level;
 } gsf__gather_job;
 
 // In index order, so that parameters and gradients stream through the cache.
@@ -5215,6 +5724,13 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
     const gsf_rasterizer* r = job->r;
     const size_t begin = chunk * GSF__PROJECT_CHUNK;
     const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
+#if GSF__X86
+    if (job->level >= GSF_CPU_AVX2) {
+        for (size_t i = begin; i < end; i += 8)
+            gsf__gather_avx2(r, job->view, job->splats, job->grads, i, end - i);
+        return;
+    }
+#endif
     for (size_t i = begin; i < end; i++) {
         if (r->records[i].radius <= 0) continue;
         const size_t rank = r->rank[i];
@@ -5413,6 +5929,7 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     project.view = &view;
     project.splats = splats;
     project.hidden = desc->hidden;
+    project.level = ctx->cpu_level;
     gsf__parallel_for(ctx, (splats->count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__project_chunk, &project);
     gsf__sort_visible(r);
     GSF__TRY(gsf__bin(ctx, r, &view));
@@ -5574,6 +6091,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
     gather.view = &view;
     gather.splats = splats;
     gather.grads = grads;
+    gather.level = ctx->cpu_level;
     gsf__parallel_for(ctx, (r->splat_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__gather_chunk, &gather);
     return GSF_OK;
 }
