@@ -504,6 +504,7 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__X86 1
 #include <immintrin.h>
 #define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c")))
+#define GSF__INLINE_AVX2 __attribute__((target("avx2,fma,f16c"), always_inline)) static inline
 #else
 #define GSF__X86 0
 #endif

@@ -4967,7 +4967,7 @@ typedef struct gsf__tile_gradient { // derivatives of the loss per pixel, and th
     float behind[GSF__TILE_PIXELS];
 } gsf__tile_gradient;
 
-enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2 };
+enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2, GSF__WITH_ABS = 4 };
 
 typedef struct gsf__raster_kernels {
     // Blends the tile's list into `state`.
@@ -5084,9 +5084,9 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
 
 #if GSF__X86
 
-// Same as gsf__rows_scalar, 8 rows at a time.
-GSF__TARGET_AVX2 static inline uint32_t gsf__rows_avx2(const gsf__record* rec, const gsf__tile* tile,
-                                                       float center[GSF__TILE], float exponent[GSF__TILE]) {
+// Same as gsf__rows_scalar, 8 rows at a time; centres (relative to the step's first pixel) and exponents by step.
+GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, const gsf__tile* tile, float center[GSF__STEPS],
+                                         float exponent[GSF__STEPS]) {
     const __m256 u = _mm256_set1_ps(rec->u - tile->x0), v = _mm256_set1_ps(rec->v - tile->y0);
     const __m256 kx = _mm256_set1_ps(rec->kx), yy = _mm256_set1_ps(rec->yy), lo = _mm256_set1_ps(rec->log2_opacity);
     const __m256 h0 = _mm256_set1_ps(rec->h0), h1 = _mm256_set1_ps(rec->h1), zero = _mm256_setzero_ps();
@@ -5095,23 +5095,25 @@ GSF__TARGET_AVX2 static inline uint32_t gsf__rows_avx2(const gsf__record* rec, c
         const __m256 row = _mm256_add_ps(_mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_ps(8.0f * (float)k));
         const __m256 dy = _mm256_sub_ps(row, v);
         const __m256 half2 = _mm256_fnmadd_ps(_mm256_mul_ps(h1, dy), dy, h0);
-        const __m256 c = _mm256_fmadd_ps(kx, dy, u);
+        const __m256 c = _mm256_fmadd_ps(kx, dy, u), second_c = _mm256_sub_ps(c, _mm256_set1_ps(8.0f));
+        const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo);
         _mm256_storeu_ps(center + 8 * k, c);
-        _mm256_storeu_ps(exponent + 8 * k, _mm256_fmadd_ps(_mm256_mul_ps(yy, dy), dy, lo));
+        _mm256_storeu_ps(center + 16 + 8 * k, second_c);
+        _mm256_storeu_ps(exponent + 8 * k, x);
+        _mm256_storeu_ps(exponent + 16 + 8 * k, x);
         const __m256 half = _mm256_add_ps(_mm256_sqrt_ps(_mm256_max_ps(half2, zero)), _mm256_set1_ps(0.02f));
-        const __m256 left = _mm256_sub_ps(c, half), right = _mm256_add_ps(c, half);
-        const __m256 met = _mm256_cmp_ps(half2, zero, _CMP_GE_OQ);
-        const __m256 first = _mm256_and_ps(_mm256_cmp_ps(left, _mm256_set1_ps(7.0f), _CMP_LE_OQ),
-                                           _mm256_cmp_ps(right, zero, _CMP_GE_OQ));
-        const __m256 second = _mm256_and_ps(_mm256_cmp_ps(left, _mm256_set1_ps(15.0f), _CMP_LE_OQ),
-                                            _mm256_cmp_ps(right, _mm256_set1_ps(8.0f), _CMP_GE_OQ));
+        const __m256 met = _mm256_cmp_ps(half2, zero, _CMP_GE_OQ), seven = _mm256_set1_ps(7.0f);
+        const __m256 first = _mm256_and_ps(_mm256_cmp_ps(_mm256_sub_ps(c, half), seven, _CMP_LE_OQ),
+                                           _mm256_cmp_ps(_mm256_add_ps(c, half), zero, _CMP_GE_OQ));
+        const __m256 second = _mm256_and_ps(_mm256_cmp_ps(_mm256_sub_ps(second_c, half), seven, _CMP_LE_OQ),
+                                            _mm256_cmp_ps(_mm256_add_ps(second_c, half), zero, _CMP_GE_OQ));
         mask |= (uint32_t)_mm256_movemask_ps(_mm256_and_ps(met, first)) << (8 * k);
         mask |= (uint32_t)_mm256_movemask_ps(_mm256_and_ps(met, second)) << (8 * k + 16);
     }
     return mask;
 }
 
-GSF__TARGET_AVX2 static inline __m256 gsf__exp2_avx2(__m256 x) {
+GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
     const __m256 k = _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
     const __m256 f = _mm256_sub_ps(x, k);
     __m256 p = _mm256_set1_ps(1.3276404e-3f);
@@ -5124,39 +5126,35 @@ GSF__TARGET_AVX2 static inline __m256 gsf__exp2_avx2(__m256 x) {
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
-GSF__TARGET_AVX2 static inline void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
-    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), one = _mm256_set1_ps(1.0f);
+GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
+    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps();
     const __m256 threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
-    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), zero = _mm256_setzero_ps(), minus = _mm256_set1_ps(-0.0f);
+    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
     uint32_t live = gsf__live_steps(state->T);
-    float center[GSF__TILE], exponent[GSF__TILE];
+    float center[GSF__STEPS], exponent[GSF__STEPS];
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->ranks[i];
         if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->ranks[i + 4]), _MM_HINT_T0);
-        uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live;
-        if (!m) continue;
         const __m256 ee = _mm256_set1_ps(rec->ee);
         const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
-        for (; m; m &= m - 1) {
-            const int s = gsf__lowest_bit(m), row = s & 15;
-            const __m256 column = s & 16 ? _mm256_add_ps(lanes, _mm256_set1_ps(8.0f)) : lanes;
-            const __m256 e = _mm256_sub_ps(column, _mm256_broadcast_ss(center + row));
-            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + row));
-            const __m256 T = _mm256_loadu_ps(state->T + 8 * s);
+        for (uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live; m; m &= m - 1) {
+            const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
+            const __m256 e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
+            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + s));
+            const __m256 T = _mm256_loadu_ps(state->T + at);
             const __m256 valid = _mm256_and_ps(_mm256_cmp_ps(x, threshold, _CMP_GE_OQ), _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
-            if (_mm256_testz_ps(valid, valid)) continue;
             const __m256 alpha = _mm256_and_ps(valid, _mm256_min_ps(gsf__exp2_avx2(x), alpha_max));
-            const __m256 next = _mm256_mul_ps(T, _mm256_sub_ps(one, alpha));
+            const __m256 next = _mm256_fnmadd_ps(T, alpha, T);
             const __m256 stop = _mm256_and_ps(valid, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
             const __m256 w = _mm256_mul_ps(_mm256_andnot_ps(stop, alpha), T);
             const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
-            _mm256_storeu_ps(state->T + 8 * s, T_new);
-            _mm256_storeu_ps(state->r + 8 * s, _mm256_fmadd_ps(w, cr, _mm256_loadu_ps(state->r + 8 * s)));
-            _mm256_storeu_ps(state->g + 8 * s, _mm256_fmadd_ps(w, cg, _mm256_loadu_ps(state->g + 8 * s)));
-            _mm256_storeu_ps(state->b + 8 * s, _mm256_fmadd_ps(w, cb, _mm256_loadu_ps(state->b + 8 * s)));
+            _mm256_storeu_ps(state->T + at, T_new);
+            _mm256_storeu_ps(state->r + at, _mm256_fmadd_ps(w, cr, _mm256_loadu_ps(state->r + at)));
+            _mm256_storeu_ps(state->g + at, _mm256_fmadd_ps(w, cg, _mm256_loadu_ps(state->g + at)));
+            _mm256_storeu_ps(state->b + at, _mm256_fmadd_ps(w, cb, _mm256_loadu_ps(state->b + at)));
             if (with_depth)
-                _mm256_storeu_ps(state->z + 8 * s, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth),
-                                                                   _mm256_loadu_ps(state->z + 8 * s)));
+                _mm256_storeu_ps(state->z + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth),
+                                                                _mm256_loadu_ps(state->z + at)));
             if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s); // every sign set: all finished
         }
     }
@@ -5254,35 +5252,32 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
 
 GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
                                               gsf__step* steps, gsf__step_head* heads, size_t* step_count) {
-    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), one = _mm256_set1_ps(1.0f);
+    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps();
     const __m256 threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
-    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), zero = _mm256_setzero_ps(), minus = _mm256_set1_ps(-0.0f);
+    const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
     uint32_t live = gsf__live_steps(T_tile);
-    float center[GSF__TILE], exponent[GSF__TILE];
+    float center[GSF__STEPS], exponent[GSF__STEPS];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
         const gsf__record* rec = tile->records + tile->ranks[i];
         if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->ranks[i + 4]), _MM_HINT_T0);
-        uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live;
         const __m256 ee = _mm256_set1_ps(rec->ee);
-        for (; m; m &= m - 1) {
-            const int s = gsf__lowest_bit(m), row = s & 15;
-            const __m256 column = s & 16 ? _mm256_add_ps(lanes, _mm256_set1_ps(8.0f)) : lanes;
-            const __m256 e = _mm256_sub_ps(column, _mm256_broadcast_ss(center + row));
-            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + row));
-            const __m256 T = _mm256_loadu_ps(T_tile + 8 * s);
+        for (uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live; m; m &= m - 1) {
+            const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
+            const __m256 e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
+            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + s));
+            const __m256 T = _mm256_loadu_ps(T_tile + at);
             const __m256 valid = _mm256_and_ps(_mm256_cmp_ps(x, threshold, _CMP_GE_OQ), _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
-            if (_mm256_testz_ps(valid, valid)) continue;
             const __m256 raw = _mm256_and_ps(valid, gsf__exp2_avx2(x));
-            const __m256 next = _mm256_mul_ps(T, _mm256_sub_ps(one, _mm256_min_ps(raw, alpha_max)));
+            const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, alpha_max), T);
             const __m256 stop = _mm256_and_ps(valid, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
             const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
-            _mm256_storeu_ps(T_tile + 8 * s, T_new);
+            _mm256_storeu_ps(T_tile + at, T_new);
             _mm256_storeu_ps(steps[kept].alpha, _mm256_andnot_ps(stop, raw));
-            _mm256_storeu_ps(steps[kept].T, _mm256_max_ps(T, zero));
+            _mm256_storeu_ps(steps[kept].T, T);
             heads[kept].entry = (uint32_t)i;
             heads[kept].step = (uint32_t)s;
-            kept++;
+            kept += _mm256_testz_ps(valid, valid) == 0;
             if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
         }
     }
@@ -5298,38 +5293,44 @@ GSF__TARGET_AVX2 static inline __m256 gsf__sum8_avx2(__m256 a, __m256 b, __m256 
     return _mm256_add_ps(_mm256_permute2f128_ps(abcd, efgh, 0x20), _mm256_permute2f128_ps(abcd, efgh, 0x31));
 }
 
-GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__step* steps,
-                                                           const gsf__step_head* heads, size_t step_count,
-                                                           gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int with_depth,
-                                                           int straight_through) {
+GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
+                                             size_t step_count, gsf__tile_gradient* gradient, float* slots,
+                                             uint8_t* slot_used, int with_depth, int straight_through, int with_abs) {
     const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
+    float center[GSF__STEPS], below[GSF__STEPS]; // as in gsf__rows_avx2, and dy, by step
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->ranks[entry];
-        const float u = rec->u - tile->x0, v = rec->v - tile->y0;
+        const __m256 u = _mm256_set1_ps(rec->u - tile->x0), v = _mm256_set1_ps(rec->v - tile->y0);
+        for (int h = 0; h < 2; h++) {
+            const __m256 dy = _mm256_sub_ps(_mm256_add_ps(lanes, _mm256_set1_ps(8.0f * (float)h)), v);
+            const __m256 c = _mm256_fmadd_ps(_mm256_set1_ps(rec->kx), dy, u);
+            _mm256_storeu_ps(below + 8 * h, dy);
+            _mm256_storeu_ps(below + 16 + 8 * h, dy);
+            _mm256_storeu_ps(center + 8 * h, c);
+            _mm256_storeu_ps(center + 16 + 8 * h, _mm256_sub_ps(c, _mm256_set1_ps(8.0f)));
+        }
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         __m256 sp = _mm256_setzero_ps(), se = sp, see = sp, sy = sp, sey = sp, syy = sp, sr = sp, sg = sp, sb = sp, sz = sp;
         __m256 sax = sp, say = sp;
         for (; k > 0 && heads[k - 1].entry == entry; k--) {
             const gsf__step* step = steps + k - 1;
-            const int s = (int)heads[k - 1].step;
-            const float dy_row = (float)(s & 15) - v;
-            const __m256 dy = _mm256_set1_ps(dy_row);
-            const __m256 e = _mm256_sub_ps(lanes, _mm256_set1_ps(u + rec->kx * dy_row - (float)(8 * (s >> 4))));
+            const size_t s = heads[k - 1].step, at = 8 * s;
+            const __m256 dy = _mm256_broadcast_ss(below + s), e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
             const __m256 raw = _mm256_loadu_ps(step->alpha), T = _mm256_loadu_ps(step->T);
-            const __m256 gr = _mm256_loadu_ps(gradient->r + 8 * s), gg = _mm256_loadu_ps(gradient->g + 8 * s);
-            const __m256 gb = _mm256_loadu_ps(gradient->b + 8 * s), behind = _mm256_loadu_ps(gradient->behind + 8 * s);
+            const __m256 gr = _mm256_loadu_ps(gradient->r + at), gg = _mm256_loadu_ps(gradient->g + at);
+            const __m256 gb = _mm256_loadu_ps(gradient->b + at), behind = _mm256_loadu_ps(gradient->behind + at);
             const __m256 alpha = _mm256_min_ps(raw, alpha_max), w = _mm256_mul_ps(alpha, T);
-            __m256 F = _mm256_fmsub_ps(_mm256_set1_ps(rec->r), gr, behind);
-            F = _mm256_fmadd_ps(_mm256_set1_ps(rec->g), gg, F);
-            F = _mm256_fmadd_ps(_mm256_set1_ps(rec->b), gb, F);
+            __m256 F = _mm256_fmsub_ps(_mm256_broadcast_ss(&rec->r), gr, behind);
+            F = _mm256_fmadd_ps(_mm256_broadcast_ss(&rec->g), gg, F);
+            F = _mm256_fmadd_ps(_mm256_broadcast_ss(&rec->b), gb, F);
             if (with_depth) {
-                const __m256 gz = _mm256_loadu_ps(gradient->z + 8 * s);
-                F = _mm256_add_ps(_mm256_fmadd_ps(_mm256_set1_ps(rec->depth), gz, F), _mm256_loadu_ps(gradient->a + 8 * s));
+                const __m256 gz = _mm256_loadu_ps(gradient->z + at);
+                F = _mm256_add_ps(_mm256_fmadd_ps(_mm256_set1_ps(rec->depth), gz, F), _mm256_loadu_ps(gradient->a + at));
                 sz = _mm256_fmadd_ps(w, gz, sz);
             }
-            _mm256_storeu_ps(gradient->behind + 8 * s, _mm256_fmadd_ps(alpha, F, behind));
+            _mm256_storeu_ps(gradient->behind + at, _mm256_fmadd_ps(alpha, F, behind));
             __m256 p = _mm256_mul_ps(_mm256_mul_ps(T, raw), F);
             if (!straight_through) p = _mm256_and_ps(p, _mm256_cmp_ps(raw, alpha_max, _CMP_LE_OQ));
             const __m256 pe = _mm256_mul_ps(p, e), py = _mm256_mul_ps(p, dy);
@@ -5342,9 +5343,11 @@ GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile
             sr = _mm256_fmadd_ps(w, gr, sr);
             sg = _mm256_fmadd_ps(w, gg, sg);
             sb = _mm256_fmadd_ps(w, gb, sb);
-            sax = _mm256_add_ps(sax, _mm256_and_ps(magnitude, pe));
-            say = _mm256_add_ps(say, _mm256_and_ps(magnitude, _mm256_fmadd_ps(_mm256_set1_ps(conic_b), pe,
-                                                                             _mm256_mul_ps(_mm256_set1_ps(conic_q), py))));
+            if (with_abs) {
+                const __m256 dv = _mm256_fmadd_ps(_mm256_set1_ps(conic_b), pe, _mm256_mul_ps(_mm256_set1_ps(conic_q), py));
+                sax = _mm256_add_ps(sax, _mm256_and_ps(magnitude, pe));
+                say = _mm256_add_ps(say, _mm256_and_ps(magnitude, dv));
+            }
         }
         float* slot = slots + GSF__SLOT_FLOATS * entry;
         const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
@@ -5358,14 +5361,14 @@ GSF__TARGET_AVX2 static inline void gsf__reverse_avx2_body(const gsf__tile* tile
 GSF__TARGET_AVX2 static void gsf__reverse_avx2(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
                                                size_t step_count, gsf__tile_gradient* gradient, float* slots,
                                                uint8_t* slot_used, int flags) {
-    if (flags & (GSF__WITH_DEPTH | GSF__STRAIGHT_THROUGH)) {
-        if (flags & GSF__STRAIGHT_THROUGH)
-            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 1);
-        else
-            gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0);
-    } else {
-        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 0, 0);
-    }
+    if (flags == 0)
+        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 0, 0, 0);
+    else if (flags == GSF__WITH_DEPTH)
+        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 0);
+    else if (flags & GSF__STRAIGHT_THROUGH)
+        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 1, 1);
+    else
+        gsf__reverse_avx2_body(tile, steps, heads, step_count, gradient, slots, slot_used, 1, 0, 1);
 }
 
 #endif // GSF__X86
@@ -6077,7 +6080,8 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
     job.d_depth = d_depth;
     job.d_alpha = d_alpha;
     job.wants_background = grads->background != NULL;
-    job.flags = (d_depth || d_alpha ? GSF__WITH_DEPTH : 0) | (view.official_gradient ? GSF__STRAIGHT_THROUGH : 0);
+    job.flags = (d_depth || d_alpha ? GSF__WITH_DEPTH : 0) | (view.official_gradient ? GSF__STRAIGHT_THROUGH : 0) |
+                (grads->means2d_abs ? GSF__WITH_ABS : 0);
     if (r->pair_count) memset(r->slot_used, 0, r->pair_count);
     gsf__parallel_for(ctx, tiles, gsf__reverse_chunk, &job);
     if (grads->background)
