@@ -5834,13 +5834,18 @@ static void gsf__tile_extent(const gsf_rasterizer* r, const gsf__tile* tile, int
     *rows = r->height - (int)tile->y0 < GSF__TILE ? r->height - (int)tile->y0 : GSF__TILE;
 }
 
-static int gsf__lane_of(int column, int row) { return 8 * (row + 16 * (column >> 3)) + (column & 7); }
+// The steps of a tile that lie inside the image: how many pixels of step s do; 0 where none.
+static int gsf__step_width(int s, int columns, int rows) {
+    const int left = columns - 8 * (s >> 4);
+    return (s & 15) >= rows || left <= 0 ? 0 : left < 8 ? left : 8;
+}
 
 // T = 1 inside the image, -1 (finished) outside.
 static void gsf__open_tile(float* T, int columns, int rows) {
-    for (int k = 0; k < GSF__TILE_PIXELS; k++) T[k] = -1.0f;
-    for (int row = 0; row < rows; row++)
-        for (int column = 0; column < columns; column++) T[gsf__lane_of(column, row)] = 1.0f;
+    for (int s = 0; s < GSF__STEPS; s++) {
+        const int width = gsf__step_width(s, columns, rows);
+        for (int lane = 0; lane < 8; lane++) T[8 * s + lane] = lane < width ? 1.0f : -1.0f;
+    }
 }
 
 static void gsf__put_pixel(const gsf_image* image, int64_t x, int64_t y, int channel, float value) {
@@ -5867,43 +5872,30 @@ static void gsf__blend_chunk(void* arg, size_t index, int worker) {
     gsf__open_tile(state.T, columns, rows);
     job->kernels->blend(&tile, &state, job->flags);
     const gsf_image *color = &job->out->color, *depth = &job->out->depth, *alpha = &job->out->alpha;
+    const int packed = color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float);
     const float* background = job->view->background;
-    for (int row = 0; row < rows; row++) {
-        const int64_t y = (int64_t)tile.y0 + row, x0 = (int64_t)tile.x0;
-        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x0;
-        for (int column = 0; column < columns; column++) {
-            const int k = gsf__lane_of(column, row);
-            const float T = fabsf(state.T[k]);
-            r->final_T[pixel + (size_t)column] = T;
-            state.T[k] = T;
-            state.r[k] += T * background[0];
-            state.g[k] += T * background[1];
-            state.b[k] += T * background[2];
+    for (int s = 0; s < GSF__STEPS; s++) {
+        const int width = gsf__step_width(s, columns, rows);
+        const int64_t x = (int64_t)tile.x0 + 8 * (s >> 4), y = (int64_t)tile.y0 + (s & 15);
+        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
+        float rgb[3 * 8], T[8];
+        for (int lane = 0; lane < width; lane++) {
+            const int k = 8 * s + lane;
+            T[lane] = fabsf(state.T[k]);
+            rgb[3 * lane] = state.r[k] + T[lane] * background[0];
+            rgb[3 * lane + 1] = state.g[k] + T[lane] * background[1];
+            rgb[3 * lane + 2] = state.b[k] + T[lane] * background[2];
         }
-        if (r->has_depth)
-            for (int column = 0; column < columns; column++)
-                r->depth_sum[pixel + (size_t)column] = state.z[gsf__lane_of(column, row)];
-        if (color->data && color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float)) {
-            float* out = (float*)(void*)((char*)color->data + y * color->stride_y) + 3 * x0;
-            for (int column = 0; column < columns; column++) {
-                const int k = gsf__lane_of(column, row);
-                out[3 * column] = state.r[k];
-                out[3 * column + 1] = state.g[k];
-                out[3 * column + 2] = state.b[k];
-            }
-        } else if (color->data) {
-            for (int column = 0; column < columns; column++) {
-                const int k = gsf__lane_of(column, row);
-                gsf__put_pixel(color, x0 + column, y, 0, state.r[k]);
-                gsf__put_pixel(color, x0 + column, y, 1, state.g[k]);
-                gsf__put_pixel(color, x0 + column, y, 2, state.b[k]);
-            }
-        }
-        for (int column = 0; column < columns && (alpha->data || depth->data); column++) {
-            const int k = gsf__lane_of(column, row);
-            const float a = 1.0f - state.T[k];
-            if (alpha->data) gsf__put_pixel(alpha, x0 + column, y, 0, a);
-            if (depth->data) gsf__put_pixel(depth, x0 + column, y, 0, state.T[k] < 1.0f ? state.z[k] / a : 0.0f);
+        memcpy(r->final_T + pixel, T, (size_t)width * sizeof(float));
+        if (color->data && packed)
+            memcpy((char*)color->data + y * color->stride_y + x * color->stride_x, rgb, 3 * (size_t)width * sizeof(float));
+        else if (color->data)
+            for (int k = 0; k < 3 * width; k++) gsf__put_pixel(color, x + k / 3, y, k % 3, rgb[k]);
+        if (r->has_depth) memcpy(r->depth_sum + pixel, state.z + 8 * s, (size_t)width * sizeof(float));
+        for (int lane = 0; lane < width && (alpha->data || depth->data); lane++) {
+            const float a = 1.0f - T[lane];
+            if (alpha->data) gsf__put_pixel(alpha, x + lane, y, 0, a);
+            if (depth->data) gsf__put_pixel(depth, x + lane, y, 0, T[lane] < 1.0f ? state.z[8 * s + lane] / a : 0.0f);
         }
     }
 }
@@ -5953,32 +5945,31 @@ static void gsf__load_tile_gradient(const gsf__raster_job* job, const gsf__tile*
     const gsf_rasterizer* r = job->r;
     const float* shown = job->view->background;
     memset(gradient, 0, sizeof *gradient);
-    for (int row = 0; row < rows; row++) {
-        const size_t pixel = (size_t)((int)tile->y0 + row) * (size_t)r->width + (size_t)tile->x0;
-        for (int column = 0; column < columns && job->d_color; column++) {
-            const float* d = job->d_color + 3 * (pixel + (size_t)column);
-            const int k = gsf__lane_of(column, row);
+    for (int s = 0; s < GSF__STEPS; s++) {
+        const int width = gsf__step_width(s, columns, rows);
+        const int x = (int)tile->x0 + 8 * (s >> 4), y = (int)tile->y0 + (s & 15);
+        const size_t pixel = (size_t)y * (size_t)r->width + (size_t)x;
+        for (int lane = 0; lane < width && job->d_color; lane++) {
+            const float* d = job->d_color + 3 * (pixel + (size_t)lane);
+            const int k = 8 * s + lane;
             gradient->r[k] = d[0];
             gradient->g[k] = d[1];
             gradient->b[k] = d[2];
             gradient->behind[k] = d[0] * shown[0] + d[1] * shown[1] + d[2] * shown[2];
         }
-        for (int column = 0; column < columns && job->wants_background; column++) {
-            const int k = gsf__lane_of(column, row);
-            const float T = r->final_T[pixel + (size_t)column];
-            background[0] += (double)(T * gradient->r[k]);
-            background[1] += (double)(T * gradient->g[k]);
-            background[2] += (double)(T * gradient->b[k]);
+        for (int lane = 0; lane < width && job->wants_background; lane++) {
+            const float T = r->final_T[pixel + (size_t)lane];
+            background[0] += (double)(T * gradient->r[8 * s + lane]);
+            background[1] += (double)(T * gradient->g[8 * s + lane]);
+            background[2] += (double)(T * gradient->b[8 * s + lane]);
         }
-        for (int column = 0; column < columns && job->d_alpha; column++)
-            gradient->a[gsf__lane_of(column, row)] = job->d_alpha[pixel + (size_t)column];
-        for (int column = 0; column < columns && job->d_depth; column++) { // depth = D / A
-            const size_t at = pixel + (size_t)column;
-            const int k = gsf__lane_of(column, row);
+        for (int lane = 0; lane < width && job->d_alpha; lane++) gradient->a[8 * s + lane] = job->d_alpha[pixel + (size_t)lane];
+        for (int lane = 0; lane < width && job->d_depth; lane++) { // depth = D / A
+            const size_t at = pixel + (size_t)lane;
             const float weight = 1.0f - r->final_T[at];
             if (!(weight > 0.0f)) continue;
-            gradient->z[k] = job->d_depth[at] / weight;
-            gradient->a[k] -= gradient->z[k] * (r->depth_sum[at] / weight);
+            gradient->z[8 * s + lane] = job->d_depth[at] / weight;
+            gradient->a[8 * s + lane] -= gradient->z[8 * s + lane] * (r->depth_sum[at] / weight);
         }
     }
 }
