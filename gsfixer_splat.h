@@ -4858,12 +4858,61 @@ static gsf__tile_span gsf__tile_columns(const gsf_rasterizer* r, const gsf__view
     return span;
 }
 
+enum { GSF__SPANS = 8 }; // tile rows whose columns are found at a time
+
+#if GSF__X86
+
+// Same as gsf__tile_columns, a lane per tile row (full footprint only).
+GSF__TARGET_AVX2 static void gsf__tile_spans_avx2(const gsf_rasterizer* r, const gsf__record* rec, int32_t ty,
+                                                  gsf__tile_span spans[GSF__SPANS]) {
+    const __m256 row = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps(), tile = gsf__all8(GSF__TILE);
+    const __m256 u = gsf__all8(rec->u), kx = gsf__all8(rec->kx), h0 = gsf__all8(rec->h0), h1 = gsf__all8(rec->h1);
+    const __m256 reach_x = gsf__all8(rec->reach_x), reach_y = gsf__all8(rec->reach_y);
+    const __m256 first = _mm256_fmadd_ps(row, tile, gsf__all8((float)(ty * GSF__TILE) - rec->v));
+    const __m256 ya = _mm256_max_ps(first, zero - reach_y);
+    const __m256 yb = _mm256_min_ps(first + gsf__all8(GSF__TILE - 1), reach_y);
+    const __m256 ha = _mm256_sqrt_ps(_mm256_max_ps(_mm256_fnmadd_ps(h1 * ya, ya, h0), zero));
+    const __m256 hb = _mm256_sqrt_ps(_mm256_max_ps(_mm256_fnmadd_ps(h1 * yb, yb, h0), zero));
+    const __m256 top = gsf__all8(rec->kx_inv * rec->reach_x), bottom = zero - top;
+    __m256 right = _mm256_max_ps(_mm256_fmadd_ps(kx, ya, ha), _mm256_fmadd_ps(kx, yb, hb));
+    __m256 left = _mm256_min_ps(_mm256_fmsub_ps(kx, ya, ha), _mm256_fmsub_ps(kx, yb, hb));
+    right = gsf__select8(_mm256_and_ps(_mm256_cmp_ps(top, ya, _CMP_GE_OQ), _mm256_cmp_ps(top, yb, _CMP_LE_OQ)), reach_x, right);
+    left = gsf__select8(_mm256_and_ps(_mm256_cmp_ps(bottom, ya, _CMP_GE_OQ), _mm256_cmp_ps(bottom, yb, _CMP_LE_OQ)),
+                        zero - reach_x, left);
+    const __m256 margin = gsf__all8(0.02f), last = gsf__all8((float)(r->width - 1));
+    const __m256 lo = _mm256_ceil_ps(u + left - margin), hi = _mm256_floor_ps(u + right + margin);
+    __m256 met = _mm256_and_ps(_mm256_cmp_ps(hi, zero, _CMP_GE_OQ), _mm256_cmp_ps(lo, last, _CMP_LE_OQ));
+    met = _mm256_and_ps(met, _mm256_cmp_ps(lo, hi, _CMP_LE_OQ));
+    const __m256i inside = _mm256_castps_si256(met), one = _mm256_set1_epi32(1);
+    __m256i x0 = _mm256_srai_epi32(_mm256_cvttps_epi32(_mm256_max_ps(lo, zero)), 4); // GSF__TILE is 2^4
+    __m256i x1 = _mm256_add_epi32(_mm256_srai_epi32(_mm256_cvttps_epi32(_mm256_min_ps(hi, last)), 4), one);
+    x0 = _mm256_and_si256(x0, inside);
+    x1 = _mm256_and_si256(x1, inside);
+    const __m256i a = _mm256_unpacklo_epi32(x0, x1), b = _mm256_unpackhi_epi32(x0, x1);
+    _mm256_storeu_si256((__m256i*)(void*)spans, _mm256_permute2x128_si256(a, b, 0x20));
+    _mm256_storeu_si256((__m256i*)(void*)(spans + 4), _mm256_permute2x128_si256(a, b, 0x31));
+}
+
+#endif // GSF__X86
+
 typedef struct gsf__bin_job {
     gsf_rasterizer* r;
     const gsf__view* view;
     size_t chunk_size;
     int fill; // 0: count, 1: fill
+    gsf_cpu_level level;
 } gsf__bin_job;
+
+static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int32_t ty, int32_t left,
+                            gsf__tile_span spans[GSF__SPANS]) {
+#if GSF__X86
+    if (job->level >= GSF_CPU_AVX2 && !job->view->official_footprint) {
+        gsf__tile_spans_avx2(job->r, rec, ty, spans);
+        return;
+    }
+#endif
+    for (int32_t i = 0; i < left && i < GSF__SPANS; i++) spans[i] = gsf__tile_columns(job->r, job->view, rec, ty + i);
+}
 
 static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
     (void)worker;
@@ -4877,10 +4926,12 @@ static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
         if (!job->fill) r->sorted[rank] = r->records[r->visible[rank]];
         const gsf__record* rec = r->sorted + rank;
         const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
+        gsf__tile_span spans[GSF__SPANS];
         size_t pairs = 0;
         for (int32_t ty = rows.x0; ty < rows.x1; ty++) {
-            const gsf__tile_span span = gsf__tile_columns(r, job->view, rec, ty);
-            for (int32_t tx = span.x0; tx < span.x1; tx++, pairs++) {
+            const int32_t at = (ty - rows.x0) % GSF__SPANS;
+            if (at == 0) gsf__tile_spans(job, rec, ty, rows.x1 - ty, spans);
+            for (int32_t tx = spans[at].x0; tx < spans[at].x1; tx++, pairs++) {
                 size_t* count = counts + (size_t)ty * (size_t)r->tiles_x + (size_t)tx;
                 if (job->fill) {
                     r->pair_rank[*count] = (uint32_t)rank;
@@ -4904,6 +4955,7 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     gsf__bin_job job;
     job.r = r;
     job.view = view;
+    job.level = ctx->cpu_level;
     job.fill = 0;
     job.chunk_size = r->visible_count / 32 + 1;
     if (job.chunk_size < 1024) job.chunk_size = 1024;
