@@ -4535,6 +4535,24 @@ GSF__TARGET_AVX2 static inline __m256 gsf__sigmoid8(__m256 x) {
     return gsf__select8(x, e, gsf__all8(1.0f)) / (gsf__all8(1.0f) + e);
 }
 
+// Unit quaternions and the inverse of their norms (0 where that is at most 1e-12), in double as gsf__project_splat.
+GSF__TARGET_AVX2 static inline void gsf__unit8(const __m256 raw[4], __m256 q[4], __m256* inv_norm) {
+    const __m256d least = _mm256_set1_pd(1e-12), one = _mm256_set1_pd(1.0);
+    __m128 half[2][5];
+    for (int h = 0; h < 2; h++) {
+        __m256d wide[4], norm2 = _mm256_setzero_pd();
+        for (int k = 0; k < 4; k++) {
+            wide[k] = _mm256_cvtps_pd(h ? _mm256_extractf128_ps(raw[k], 1) : _mm256_castps256_ps128(raw[k]));
+            norm2 = _mm256_fmadd_pd(wide[k], wide[k], norm2);
+        }
+        const __m256d norm = _mm256_sqrt_pd(norm2), inv = one / _mm256_max_pd(least, norm); // a NaN stays
+        for (int k = 0; k < 4; k++) half[h][k] = _mm256_cvtpd_ps(wide[k] * inv);
+        half[h][4] = _mm256_cvtpd_ps(_mm256_and_pd(inv, _mm256_cmp_pd(norm, least, _CMP_GT_OQ)));
+    }
+    for (int k = 0; k < 4; k++) q[k] = _mm256_set_m128(half[1][k], half[0][k]);
+    *inv_norm = _mm256_set_m128(half[1][4], half[0][4]);
+}
+
 GSF__TARGET_AVX2 static inline void gsf__project8(const gsf__view* view, const gsf_splats* splats, size_t i, __m256i lane,
                                                   gsf__projection8* p) {
     const __m256 one = gsf__all8(1.0f), two = gsf__all8(2.0f), zero = _mm256_setzero_ps();
@@ -4546,20 +4564,8 @@ GSF__TARGET_AVX2 static inline void gsf__project8(const gsf__view* view, const g
     p->shown = _mm256_cmp_ps(p->t[2], gsf__all8(view->near_plane), _CMP_GT_OQ);
     if (_mm256_testz_ps(p->shown, p->shown)) return;
 
-    // unit quaternion: scaled by its largest component first, so that neither tiny nor huge ones lose digits
-    __m256 largest = gsf__all8(1e-30f), norm2 = zero;
-    for (int k = 0; k < 4; k++) {
-        raw[k] = gsf__column8(splats->quats + 4 * i, lane, 4, k);
-        largest = _mm256_max_ps(gsf__abs8(raw[k]), largest);
-    }
-    for (int k = 0; k < 4; k++) {
-        p->q[k] = raw[k] / largest;
-        norm2 = _mm256_fmadd_ps(p->q[k], p->q[k], norm2);
-    }
-    const __m256 root = _mm256_sqrt_ps(norm2), norm = largest * root;
-    const __m256 tiny = _mm256_cmp_ps(norm, gsf__all8(1e-12f), _CMP_LE_OQ);
-    for (int k = 0; k < 4; k++) p->q[k] = gsf__select8(tiny, raw[k] * gsf__all8(1e12f), p->q[k] / root);
-    p->inv_norm = _mm256_andnot_ps(tiny, one / norm);
+    for (int k = 0; k < 4; k++) raw[k] = gsf__column8(splats->quats + 4 * i, lane, 4, k);
+    gsf__unit8(raw, p->q, &p->inv_norm);
 
     __m256 finite = one;
     for (int k = 0; k < 3; k++) {

@@ -3,8 +3,10 @@
 //
 //     bench_splat [--json] [--quick] [--filter TEXT] [--threads N] [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]
 //
-// Without a scene: render and backward of made-up splats at several sizes, for each instruction set of the machine, each
-// against the double-precision reference of tests/reference_splat.h (error columns) where that is affordable.
+// Without a scene: what the machine can do (multiply-adds per second, bytes per second), then for made-up splats at several
+// sizes, each instruction set and one and two threads: every stage of a training step by itself, and render and backward
+// whole, against the double-precision reference of tests/reference_splat.h where that is affordable. A pair is a splat and a
+// pixel that it is blended into. Shares are of the rates of all threads together that the first rows show.
 // With a scene: whole training steps (render, loss, backward, Adam; density control off) on its photos. --views names a
 // text file of image names, one per line; --start a PLY to begin with instead of the scene's points. The first 5 steps
 // warm up; the median, and the process' CPU seconds per step, are over the rest.
@@ -24,7 +26,15 @@ typedef struct bench_row {
     const char *name, *variant, *isa, *work_unit, *reference;
     int threads;
     double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
+    double flops, bytes; // of the whole, by the counts below; 0: not counted
 } bench_row;
+
+typedef struct bench_peak { double flops, bytes; } bench_peak; // per second
+static bench_peak bench_peaks[2][3]; // by instruction set (scalar, AVX2) and threads (1, 2)
+
+static const bench_peak* bench_peak_of(const char* isa, int threads) {
+    return &bench_peaks[strcmp(isa, "scalar") != 0][threads < 2 ? 1 : 2];
+}
 
 static double bench_now(void) {
     struct timespec t;
@@ -44,18 +54,43 @@ static double bench_median(double* values, size_t count) {
     return count ? values[count / 2] : 0.0;
 }
 
+static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threads, double seconds, double cpu_seconds,
+                                double work, const char* work_unit) {
+    bench_row row;
+    memset(&row, 0, sizeof row);
+    row.name = name;
+    row.variant = "default";
+    row.isa = gsf_cpu_level_name(level);
+    row.threads = threads;
+    row.seconds = seconds;
+    row.cpu_seconds = cpu_seconds;
+    row.work = work;
+    row.work_unit = work_unit;
+    row.reference = "none";
+    row.error_max = row.error_rel_l2 = -1.0;
+    return row;
+}
+
 static void bench_print(const bench_options* o, const bench_row* row) {
+    if (o->filter && !strstr(row->name, o->filter)) return;
     const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
+    const bench_peak* peak = bench_peak_of(row->isa, row->threads);
+    const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
+    const double byte_share = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
     if (o->json) {
         printf("{\"bench\":\"splat\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
                "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
                row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
                rate, row->reference);
+        if (row->flops > 0.0) printf(",\"peak_share\":%.4g", flop_share);
+        if (row->bytes > 0.0) printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g", row->bytes, byte_share);
         if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
         printf("}\n");
     } else {
-        printf("%-26s %-9s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->variant, row->isa, row->threads,
-               1e3 * row->seconds, 1e3 * row->cpu_seconds, rate, row->work_unit);
+        printf("%-28s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->isa, row->threads, 1e3 * row->seconds,
+               1e3 * row->cpu_seconds, rate, row->work_unit);
+        if (row->flops > 0.0) printf("  %.0f%% of the FMA peak", 100.0 * flop_share);
+        if (row->bytes > 0.0) printf("  %.0f%% of the bandwidth", 100.0 * byte_share);
         if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
         printf("\n");
     }
@@ -67,6 +102,86 @@ static void bench_require(gsf_context* ctx, gsf_result result) {
     fprintf(stderr, "bench_splat: %s (%s)\n", ctx->error, gsf_describe_result(result));
     exit(1);
 }
+
+// ---- what the machine can do ----------------------------------------------------
+
+enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 20 };
+
+static float bench_sink; // keeps the compiler from dropping the loops
+
+static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
+    float v[FMA_CHAINS];
+    (void)worker;
+    for (int k = 0; k < FMA_CHAINS; k++) v[k] = (float)k + (float)chunk;
+    for (int i = 0; i < FMA_ROUNDS; i++)
+        for (int k = 0; k < FMA_CHAINS; k++) v[k] = v[k] * 0.999f + 0.001f;
+    for (int k = 1; k < FMA_CHAINS; k++) v[0] += v[k];
+    ((float*)arg)[16 * chunk] = v[0];
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker) {
+    const __m256 a = _mm256_set1_ps(0.999f), b = _mm256_set1_ps(0.001f);
+    __m256 v[FMA_CHAINS];
+    (void)worker;
+    for (int k = 0; k < FMA_CHAINS; k++) v[k] = _mm256_set1_ps((float)k);
+    for (int i = 0; i < FMA_ROUNDS; i++)
+        for (int k = 0; k < FMA_CHAINS; k++) v[k] = _mm256_fmadd_ps(v[k], a, b);
+    for (int k = 1; k < FMA_CHAINS; k++) v[0] = _mm256_add_ps(v[0], v[k]);
+    _mm256_storeu_ps((float*)arg + 16 * chunk, v[0]);
+}
+#endif
+
+enum { TRIAD_CHUNKS = 32, TRIAD_FLOATS = 1 << 18 }; // 3 arrays of 32 MiB
+
+static void bench_triad(void* arg, size_t chunk, int worker) {
+    float *a = (float*)arg + chunk * TRIAD_FLOATS, *b = a + (size_t)TRIAD_CHUNKS * TRIAD_FLOATS;
+    const float* c = b + (size_t)TRIAD_CHUNKS * TRIAD_FLOATS;
+    (void)worker;
+    for (size_t i = 0; i < TRIAD_FLOATS; i++) a[i] = b[i] + 0.5f * c[i];
+}
+
+static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads) {
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.cpu_level = level;
+    ctx.threads = threads;
+    bench_require(&ctx, gsf_init_context(&ctx));
+    if (ctx.cpu_level != level) return;
+    float* memory = (float*)gsf_alloc_zeroed(&ctx, 3 * (size_t)TRIAD_CHUNKS * TRIAD_FLOATS, sizeof(float));
+    if (!memory) exit(1);
+    gsf_chunk_fn fma = bench_fma_scalar;
+    double lanes = 1.0;
+#if GSF__X86
+    if (level >= GSF_CPU_AVX2) {
+        fma = bench_fma_avx2;
+        lanes = 8.0;
+    }
+#endif
+    double best[2] = {1e30, 1e30};
+    for (int i = 0; i < 5; i++) {
+        const double t0 = bench_now();
+        gsf__parallel_for(&ctx, 2 * (size_t)threads, fma, memory);
+        const double t1 = bench_now();
+        gsf__parallel_for(&ctx, TRIAD_CHUNKS, bench_triad, memory);
+        const double t2 = bench_now();
+        if (t1 - t0 < best[0]) best[0] = t1 - t0;
+        if (t2 - t1 < best[1]) best[1] = t2 - t1;
+        bench_sink += memory[0];
+    }
+    const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 2.0 * threads;
+    const double bytes = 3.0 * (double)TRIAD_CHUNKS * TRIAD_FLOATS * sizeof(float);
+    bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
+    peak->flops = flops / best[0];
+    peak->bytes = bytes / best[1];
+    bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0], best[0] * threads, flops, "flop");
+    bench_print(o, &row);
+    row = bench_make_row("machine: memory", level, threads, best[1], best[1] * threads, bytes, "B");
+    bench_print(o, &row);
+    gsf_free(&ctx, memory);
+}
+
+// ---- made-up splats -------------------------------------------------------------
 
 // A cloud that covers the image about evenly: anisotropic, half transparent, SH degree 3.
 static void bench_make_splats(gsf_context* ctx, size_t count, double size, gsf_splats* s) {
@@ -95,6 +210,228 @@ static gsf_camera bench_camera(int width, int height) {
     return c;
 }
 
+// ---- the stages of a step ---------------------------------------------------------
+
+// Floating-point operations (an FMA is two) of the kernels' source, per pair: place and exponent 6, 2^x 13, transmittance 4,
+// colour 7; backward: the first three again, then gradient of alpha 12 and ten sums 20.
+#define BENCH_FORWARD_FLOPS 30.0
+#define BENCH_BACKWARD_FLOPS 55.0
+
+enum { STAGE_PROJECT, STAGE_SORT, STAGE_BIN, STAGE_BLEND, STAGE_LOSS, STAGE_REVERSE, STAGE_GATHER, STAGE_ADAM, STAGES };
+static const char* const bench_stage_names[STAGES] = {"project", "sort", "bin", "blend", "loss", "reverse", "gather", "adam"};
+
+typedef struct bench_count {
+    gsf_rasterizer* r;
+    const gsf__raster_kernels* kernels;
+    uint64_t* pairs; // per tile
+} bench_count;
+
+// Pairs of one tile: lanes with an alpha in the steps that backward keeps.
+static void bench_count_tile(void* arg, size_t index, int worker) {
+    const bench_count* job = (const bench_count*)arg;
+    const gsf__tile tile = gsf__tile_of(job->r, index);
+    const gsf__worker_scratch* scratch = job->r->workers + worker;
+    float T[GSF__TILE_PIXELS];
+    int columns, rows;
+    gsf__tile_extent(job->r, &tile, &columns, &rows);
+    gsf__open_tile(T, columns, rows);
+    job->pairs[index] = 0;
+    for (size_t next = 0, kept = 0; next < tile.count;) {
+        next = job->kernels->keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
+        for (size_t k = 0; k < kept; k++)
+            for (int lane = 0; lane < 8; lane++) job->pairs[index] += scratch->steps[k].alpha[lane] > 0.0f;
+    }
+}
+
+static double bench_pairs(gsf_context* ctx, gsf_rasterizer* r) { // of the last render; backward has made the scratch
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    bench_count job;
+    job.r = r;
+    job.kernels = gsf__raster_kernels_of(ctx->cpu_level);
+    job.pairs = (uint64_t*)gsf_alloc(ctx, tiles, sizeof(uint64_t));
+    if (!job.pairs) exit(1);
+    gsf__parallel_for(ctx, tiles, bench_count_tile, &job);
+    double sum = 0.0;
+    for (size_t t = 0; t < tiles; t++) sum += (double)job.pairs[t];
+    gsf_free(ctx, job.pairs);
+    return sum;
+}
+
+typedef struct bench_clock { double wall[STAGES], cpu[STAGES], wall_from, cpu_from; } bench_clock;
+
+static void bench_lap(bench_clock* clock, int stage) { // the time since the last lap belongs to `stage`
+    const double wall = bench_now(), cpu = bench_cpu();
+    clock->wall[stage] = wall - clock->wall_from;
+    clock->cpu[stage] = cpu - clock->cpu_from;
+    clock->wall_from = bench_now();
+    clock->cpu_from = bench_cpu();
+}
+
+// A training step stage by stage, as gsf_splat_render, gsf_splat_render_backward and the trainer run them.
+static void bench_stages(const bench_options* o, const char* name, size_t count, double size, int width, int height,
+                         gsf_cpu_level level, int threads) {
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.cpu_level = level;
+    ctx.threads = threads;
+    bench_require(&ctx, gsf_init_context(&ctx));
+    if (ctx.cpu_level != level) return;
+    gsf_splats splats;
+    bench_make_splats(&ctx, count, size, &splats);
+    const gsf_camera camera = bench_camera(width, height);
+    const size_t pixels = (size_t)width * (size_t)height;
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    bench_require(&ctx, gsf_make_image(&ctx, GSF_F32, width, height, 3, &out.color));
+    float* d_color = (float*)gsf_alloc_zeroed(&ctx, 3 * pixels, sizeof(float));
+    float* photo = (float*)gsf_alloc(&ctx, 3 * pixels, sizeof(float));
+    gsf__model model;
+    memset(&model, 0, sizeof model);
+    model.sh_degree = 3;
+    bench_require(&ctx, gsf__model_reserve(&ctx, &model, count));
+    model.count = count;
+    float* const sources[GSF__GROUPS] = {splats.means, splats.log_scales, splats.quats, splats.opacity_logits, splats.sh};
+    for (int g = 0; g < GSF__GROUPS; g++)
+        memcpy(model.groups[g].value, sources[g], count * model.groups[g].width * sizeof(float));
+    gsf_splats trained = splats;
+    trained.means = model.groups[GSF__MEANS].value;
+    trained.log_scales = model.groups[GSF__SCALES].value;
+    trained.quats = model.groups[GSF__QUATS].value;
+    trained.opacity_logits = model.groups[GSF__OPACITY].value;
+    trained.sh = model.groups[GSF__SH].value;
+    gsf_splat_grads grads;
+    memset(&grads, 0, sizeof grads);
+    grads.means = model.groups[GSF__MEANS].grad;
+    grads.log_scales = model.groups[GSF__SCALES].grad;
+    grads.quats = model.groups[GSF__QUATS].grad;
+    grads.opacity_logits = model.groups[GSF__OPACITY].grad;
+    grads.sh = model.groups[GSF__SH].grad;
+    if (!d_color || !photo) exit(1);
+    for (size_t i = 0; i < 3 * pixels; i++) photo[i] = (float)gsf_random_uniform(7, 0, i);
+    gsf_rasterizer* r;
+    bench_require(&ctx, gsf_splat_make_rasterizer(&ctx, &r));
+    // one step through the front door makes every buffer
+    bench_require(&ctx, gsf_splat_render(&ctx, r, &trained, &camera, NULL, &out));
+    bench_require(&ctx, gsf_splat_render_backward(&ctx, r, &trained, &camera, NULL, d_color, NULL, NULL, &grads));
+    float* front = (float*)gsf_alloc(&ctx, 3 * pixels, sizeof(float));
+    if (!front) exit(1);
+    memcpy(front, out.color.data, 3 * pixels * sizeof(float));
+
+    gsf_render_desc desc;
+    memset(&desc, 0, sizeof desc);
+    const gsf__view view = gsf__make_view(&trained, &camera, &desc);
+    gsf__project_job project;
+    memset(&project, 0, sizeof project);
+    project.r = r;
+    project.view = &view;
+    project.splats = &trained;
+    project.level = ctx.cpu_level;
+    gsf__raster_job raster;
+    memset(&raster, 0, sizeof raster);
+    raster.r = r;
+    raster.kernels = gsf__raster_kernels_of(ctx.cpu_level);
+    raster.view = &view;
+    raster.out = &out;
+    raster.d_color = d_color;
+    gsf__gather_job gather;
+    memset(&gather, 0, sizeof gather);
+    gather.r = r;
+    gather.view = &view;
+    gather.splats = &trained;
+    gather.grads = &grads;
+    gather.level = ctx.cpu_level;
+    gsf__loss_scratch scratch;
+    gsf__target target;
+    gsf__loss_value value;
+    memset(&scratch, 0, sizeof scratch);
+    memset(&target, 0, sizeof target);
+    target.width = width;
+    target.height = height;
+    target.f32 = photo;
+    target.moments = (float*)gsf_alloc(&ctx, gsf__loss_moments_size(width, height), 1);
+    gsf__adam_rates rates;
+    memset(&rates, 0, sizeof rates); // all work, but nothing moves: every round has the same splats
+
+    const size_t splat_chunks = (count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK;
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    enum { MOST = 9 };
+    const int rounds = o->quick ? 3 : MOST;
+    double wall[STAGES][MOST], cpu[STAGES], step[MOST], step_cpu = 0.0, pairs = 0.0;
+    memset(cpu, 0, sizeof cpu);
+    for (int i = -1; i < rounds; i++) { // one round of warming up
+        bench_clock clock;
+        clock.wall_from = bench_now();
+        clock.cpu_from = bench_cpu();
+        gsf__parallel_for(&ctx, splat_chunks, gsf__project_chunk, &project);
+        bench_lap(&clock, STAGE_PROJECT);
+        gsf__sort_visible(r);
+        bench_lap(&clock, STAGE_SORT);
+        bench_require(&ctx, gsf__bin(&ctx, r, &view));
+        bench_lap(&clock, STAGE_BIN);
+        gsf__parallel_for(&ctx, tiles, gsf__blend_chunk, &raster);
+        bench_lap(&clock, STAGE_BLEND);
+        bench_require(&ctx, gsf__loss(&ctx, &scratch, &target, (const float*)out.color.data, 0.2f, 1.0f, d_color, &value));
+        bench_lap(&clock, STAGE_LOSS);
+        if (r->pair_count) memset(r->slot_used, 0, r->pair_count);
+        gsf__parallel_for(&ctx, tiles, gsf__reverse_chunk, &raster);
+        bench_lap(&clock, STAGE_REVERSE);
+        gsf__parallel_for(&ctx, splat_chunks, gsf__gather_chunk, &gather);
+        bench_lap(&clock, STAGE_GATHER);
+        (void)gsf__adam_step(&ctx, &model, &rates, i + 2, 4);
+        bench_lap(&clock, STAGE_ADAM);
+        if (i < 0) continue;
+        step[i] = 0.0;
+        for (int k = 0; k < STAGES; k++) {
+            wall[k][i] = clock.wall[k];
+            cpu[k] += clock.cpu[k] / rounds;
+            step[i] += clock.wall[k];
+            step_cpu += clock.cpu[k] / rounds;
+        }
+    }
+    if (memcmp(front, out.color.data, 3 * pixels * sizeof(float)) != 0) {
+        fprintf(stderr, "bench_splat: the stages do not make the picture that gsf_splat_render makes\n");
+        exit(1);
+    }
+    pairs = bench_pairs(&ctx, r);
+
+    // bytes that a stage must move at least, were its caches cold: what it reads and writes once
+    const double n = (double)count, seen = (double)r->visible_count, entries = (double)r->pair_count, p = (double)pixels;
+    const double bytes[STAGES] = {
+        n * (59 * 4 + sizeof(gsf__record) + 4),
+        n * sizeof(gsf__record) + seen * (3 * 4 * 8 + 8),
+        seen * 4 * sizeof(gsf__record) + entries * (4 + 8 + 8),
+        entries * sizeof(gsf__record) + p * (3 + 1) * 4,
+        p * 3 * 4 * (2 + GSF__LOSS_PLANES + 1),
+        entries * (2 * sizeof(gsf__record) + GSF__SLOT_FLOATS * 4) + p * 4 * 4,
+        entries * (GSF__SLOT_FLOATS * 4 + 8) + n * (59 * 4 * 3 + sizeof(gsf__record)),
+        n * 59 * 4 * 7,
+    };
+    char label[80];
+    for (int k = 0; k < STAGES; k++) {
+        const int by_pair = k == STAGE_BLEND || k == STAGE_REVERSE, by_pixel = k == STAGE_LOSS;
+        snprintf(label, sizeof label, "%s: %s", name, bench_stage_names[k]);
+        bench_row row = bench_make_row(label, level, threads, bench_median(wall[k], (size_t)rounds), cpu[k],
+                                       by_pair ? pairs : by_pixel ? p : n, by_pair ? "pairs" : by_pixel ? "pixels" : "splats");
+        row.bytes = bytes[k];
+        row.flops = k == STAGE_BLEND ? pairs * BENCH_FORWARD_FLOPS : k == STAGE_REVERSE ? pairs * BENCH_BACKWARD_FLOPS : 0.0;
+        bench_print(o, &row);
+    }
+    snprintf(label, sizeof label, "%s: step", name);
+    const bench_row row = bench_make_row(label, level, threads, bench_median(step, (size_t)rounds), step_cpu, n, "splats");
+    bench_print(o, &row);
+    gsf__loss_destroy_scratch(&ctx, &scratch);
+    gsf__model_destroy(&ctx, &model);
+    gsf_splat_destroy_rasterizer(&ctx, r);
+    gsf_destroy_image(&ctx, &out.color);
+    gsf_free(&ctx, target.moments);
+    gsf_free(&ctx, front);
+    gsf_free(&ctx, photo);
+    gsf_free(&ctx, d_color);
+    gsf_splat_destroy(&ctx, &splats);
+}
+
+// ---- whole renders against float64 ------------------------------------------------
+
 static void bench_error(const float* actual, const double* expected, const double* margin, size_t count, size_t per_pixel,
                         bench_row* row) {
     double worst = 0.0, difference = 0.0, total = 0.0;
@@ -114,7 +451,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     char forward_name[64], backward_name[64];
     snprintf(forward_name, sizeof forward_name, "forward %s", name);
     snprintf(backward_name, sizeof backward_name, "backward %s", name);
-    if (o->filter && !strstr(forward_name, o->filter) && !strstr(backward_name, o->filter)) return;
+    if (o->filter && !strstr(forward_name, o->filter) && !strstr(backward_name, o->filter)) return; // the reference is slow
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     ctx.cpu_level = level;
@@ -160,19 +497,10 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         cpu[1] += (bench_cpu() - c1) / rounds;
     }
     bench_row rows[2];
-    memset(rows, 0, sizeof rows);
-    for (int k = 0; k < 2; k++) {
-        rows[k].name = k ? backward_name : forward_name;
-        rows[k].variant = "default";
-        rows[k].isa = gsf_cpu_level_name(level);
-        rows[k].threads = threads;
-        rows[k].seconds = bench_median(k ? backward : forward, (size_t)rounds);
-        rows[k].cpu_seconds = cpu[k];
-        rows[k].work = (double)width * height;
-        rows[k].work_unit = "pixels";
-        rows[k].reference = "none";
-        rows[k].error_max = rows[k].error_rel_l2 = -1.0;
-    }
+    for (int k = 0; k < 2; k++)
+        rows[k] = bench_make_row(k ? backward_name : forward_name, level, threads,
+                                 bench_median(k ? backward : forward, (size_t)rounds), cpu[k],
+                                 bench_pairs(&ctx, rasterizer), "pairs");
     if (with_reference) {
         ref_splats exact = ref_splats_from(&splats);
         ref_options options = ref_options_from(NULL);
@@ -187,8 +515,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         bench_error((const float*)out.color.data, image.color, image.margin, values, 3, &rows[0]);
         bench_error(sums.means, expected.means, NULL, 3 * count, 1, &rows[1]);
         for (int k = 0; k < 2; k++) {
-            rows[k].work = blended;
-            rows[k].work_unit = "pairs";
+            rows[k].work = blended; // the reference's own count
             rows[k].reference = "float64";
         }
         free(d_wide);
@@ -196,8 +523,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         ref_destroy_image(&image);
         ref_destroy_splats(&exact);
     }
-    for (int k = 0; k < 2; k++)
-        if (!o->filter || strstr(rows[k].name, o->filter)) bench_print(o, &rows[k]);
+    for (int k = 0; k < 2; k++) bench_print(o, &rows[k]);
     gsf_splat_destroy_rasterizer(&ctx, rasterizer);
     gsf_destroy_image(&ctx, &out.color);
     gsf_free(&ctx, d_color);
@@ -254,18 +580,9 @@ static void bench_training(const bench_options* o) {
         bench_require(&ctx, gsf_splat_train_step(&ctx, trainer, &stats));
         seconds[i] = bench_now() - t;
     }
-    bench_row row;
-    memset(&row, 0, sizeof row);
-    row.name = "train step";
-    row.variant = "default";
-    row.isa = gsf_cpu_level_name(ctx.cpu_level);
-    row.threads = ctx.parallel.worker_count;
-    row.cpu_seconds = (bench_cpu() - cpu) / o->steps;
-    row.seconds = bench_median(seconds, (size_t)o->steps);
-    row.work = (double)start.count;
-    row.work_unit = "splats";
-    row.reference = "none";
-    row.error_max = -1.0;
+    const double step_cpu = (bench_cpu() - cpu) / o->steps;
+    const bench_row row = bench_make_row("train step", ctx.cpu_level, ctx.parallel.worker_count,
+                                         bench_median(seconds, (size_t)o->steps), step_cpu, (double)start.count, "splats");
     bench_print(o, &row);
     gsf_free(&ctx, seconds);
     gsf_splat_destroy_trainer(&ctx, trainer);
@@ -301,13 +618,16 @@ int main(int argc, char** argv) {
     }
     const gsf_cpu_level levels[] = {GSF_CPU_SCALAR, GSF_CPU_AVX2};
     for (size_t k = 0; k < GSF__COUNT(levels); k++)
+        for (int threads = 1; threads <= 2; threads++) bench_machine(&o, levels[k], threads);
+    for (size_t k = 0; k < GSF__COUNT(levels); k++)
         for (int threads = 1; threads <= 2; threads++) {
             if (o.threads && threads != o.threads) continue;
             bench_render(&o, "10k 264x480", 10000, 0.03, 264, 480, levels[k], threads, 1);
+            bench_stages(&o, "10k 264x480", 10000, 0.03, 264, 480, levels[k], threads);
             if (o.quick) continue;
-            bench_render(&o, "100k 960x540", 100000, 0.012, 960, 540, levels[k], threads, 0);
+            bench_stages(&o, "100k 960x540", 100000, 0.012, 960, 540, levels[k], threads);
             if (levels[k] > GSF_CPU_SCALAR)
-                bench_render(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads, 0);
+                bench_stages(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads);
         }
     return 0;
 }
