@@ -4006,9 +4006,9 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
 
 /* How a frame goes through:
        project   every splat -> one 64-byte record (screen ellipse, colour) or radius 0
-       sort      visible splats by depth, ties by index (radix sort of the float's bits)
-       bin       in depth order into the lists of the 16x16 tiles that their ellipse meets; each (splat, tile) pair has a
+       bin       into the lists of the 16x16 tiles that the ellipse meets, in index order; each (splat, tile) pair has a
                  slot where backward leaves that tile's share of the gradient
+       sort      each tile's list by depth, ties by index (radix sort of the float's bits)
        forward   per tile, front to back, 8 pixels of a row at a time
        backward  per tile: forward again, keeping alpha and T of every 8-pixel step; then back to front
        gather    per splat: sum of its slots in tile order, then through the projection to the parameters
@@ -4060,28 +4060,27 @@ typedef struct gsf__worker_scratch { // one per worker
     size_t checkpoint_capacity;
 } gsf__worker_scratch;
 
+typedef struct gsf__pair { uint32_t splat, slot; } gsf__pair; // slot: counted from the tile's first
+
 struct gsf_rasterizer {
     size_t splat_capacity;
     gsf__record* records;      // per splat
-    gsf__record* sorted;       // those of the visible splats, in depth order
     int32_t* radii;            // per splat
-    uint32_t* visible;         // splat indices in depth order
-    uint32_t* visible_spare;
-    uint32_t* keys;
-    uint32_t* keys_spare;
-    uint32_t* rank;            // per splat that is drawn: its place in `visible`
-    size_t* splat_begin;       // per visible rank, + 1: into splat_pairs
-    size_t visible_count, pair_count;
+    size_t* splat_begin;       // per splat, + 1: into splat_pairs
+    size_t pair_count;
 
     size_t tile_capacity;      // of tile_begin
     size_t* tile_begin;        // per tile, + 1
     size_t count_capacity;
     size_t* tile_counts;       // (chunks, tiles) while binning
     size_t pair_capacity;
-    uint32_t* pair_rank;       // per tile list entry: rank in `visible`
-    size_t* splat_pairs;       // the tile list entries of each splat, in tile order
+    uint32_t* pair_splat;      // per tile and there in index order: the splat
+    size_t* splat_pairs;       // the places of each splat in pair_splat, in tile order
+    uint64_t* pair_keys;       // the same pairs in depth order: depth bits << 32 | place in the tile's part of pair_splat
+    uint64_t* pair_spare;      // while sorting
+    gsf__pair* pairs;          // what the raster loops read: the lists in depth order
     size_t slot_capacity;
-    float* slots;              // (pairs, GSF__SLOT_FLOATS) per tile list entry: its gradient
+    float* slots;              // (pairs, GSF__SLOT_FLOATS) by place in pair_splat: the pair's gradient
     uint8_t* slot_used;        // (pairs) 1 where backward found a pixel and filled the slot
 
     size_t pixel_capacity;
@@ -4118,9 +4117,9 @@ static void gsf__free_workers(gsf_context* ctx, gsf_rasterizer* r) {
 
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
-    void* const owned[] = {r->records, r->sorted, r->radii, r->visible, r->visible_spare, r->keys, r->keys_spare, r->rank,
-                           r->splat_begin, r->tile_begin, r->tile_counts, r->pair_rank, r->splat_pairs, r->slots, r->slot_used,
-                           r->final_T, r->depth_sum, r->tile_background};
+    void* const owned[] = {r->records, r->radii, r->splat_begin, r->tile_begin, r->tile_counts, r->pair_splat,
+                           r->splat_pairs, r->pair_keys, r->pair_spare, r->pairs, r->slots, r->slot_used, r->final_T,
+                           r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
     gsf__free_workers(ctx, r);
     gsf_free(ctx, r);
@@ -4786,39 +4785,6 @@ static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
 
 // ---- >>bin ---------------------------------------------------------------------
 
-// Visible splats in index order, then a stable radix sort by the bits of the (positive) depth: ties keep index order.
-static void gsf__sort_visible(gsf_rasterizer* r) {
-    enum { BITS = 11, BINS = 1 << BITS };
-    size_t n = 0;
-    for (size_t i = 0; i < r->splat_count; i++)
-        if (r->records[i].radius > 0) {
-            memcpy(&r->keys[n], &r->records[i].depth, sizeof(uint32_t));
-            r->visible[n++] = (uint32_t)i;
-        }
-    r->visible_count = n;
-    size_t counts[3][BINS];
-    memset(counts, 0, sizeof counts);
-    for (size_t i = 0; i < n; i++)
-        for (int pass = 0; pass < 3; pass++) counts[pass][(r->keys[i] >> (BITS * pass)) & (BINS - 1)]++;
-    for (int pass = 0; pass < 3; pass++) {
-        size_t sum = 0;
-        for (int b = 0; b < BINS; b++) {
-            const size_t c = counts[pass][b];
-            counts[pass][b] = sum;
-            sum += c;
-        }
-        for (size_t i = 0; i < n; i++) {
-            const uint32_t key = r->keys[i];
-            const size_t at = counts[pass][(key >> (BITS * pass)) & (BINS - 1)]++;
-            r->keys_spare[at] = key;
-            r->visible_spare[at] = r->visible[i];
-        }
-        uint32_t* swap = r->keys; r->keys = r->keys_spare; r->keys_spare = swap;
-        swap = r->visible; r->visible = r->visible_spare; r->visible_spare = swap;
-    }
-    for (size_t i = 0; i < n; i++) r->rank[r->visible[i]] = (uint32_t)i;
-}
-
 typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span; // end exclusive
 
 // Tile rows that the splat meets: first and one past the last.
@@ -4927,26 +4893,79 @@ static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
     size_t* counts = r->tile_counts + chunk * tiles;
     const size_t begin = chunk * job->chunk_size;
-    const size_t end = begin + job->chunk_size < r->visible_count ? begin + job->chunk_size : r->visible_count;
-    for (size_t rank = begin; rank < end; rank++) {
-        if (!job->fill) r->sorted[rank] = r->records[r->visible[rank]];
-        const gsf__record* rec = r->sorted + rank;
-        const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
-        gsf__tile_span spans[GSF__SPANS];
+    const size_t end = begin + job->chunk_size < r->splat_count ? begin + job->chunk_size : r->splat_count;
+    for (size_t i = begin; i < end; i++) {
+        const gsf__record* rec = r->records + i;
         size_t pairs = 0;
-        for (int32_t ty = rows.x0; ty < rows.x1; ty++) {
-            const int32_t at = (ty - rows.x0) % GSF__SPANS;
-            if (at == 0) gsf__tile_spans(job, rec, ty, rows.x1 - ty, spans);
-            for (int32_t tx = spans[at].x0; tx < spans[at].x1; tx++, pairs++) {
-                size_t* count = counts + (size_t)ty * (size_t)r->tiles_x + (size_t)tx;
-                if (job->fill) {
-                    r->pair_rank[*count] = (uint32_t)rank;
-                    r->splat_pairs[r->splat_begin[rank] + pairs] = *count;
+        if (rec->radius > 0) {
+            const gsf__tile_span rows = gsf__tile_rows(r, job->view, rec);
+            gsf__tile_span spans[GSF__SPANS];
+            for (int32_t ty = rows.x0; ty < rows.x1; ty++) {
+                const int32_t at = (ty - rows.x0) % GSF__SPANS;
+                if (at == 0) gsf__tile_spans(job, rec, ty, rows.x1 - ty, spans);
+                for (int32_t tx = spans[at].x0; tx < spans[at].x1; tx++, pairs++) {
+                    size_t* count = counts + (size_t)ty * (size_t)r->tiles_x + (size_t)tx;
+                    if (job->fill) {
+                        r->pair_splat[*count] = (uint32_t)i;
+                        r->splat_pairs[r->splat_begin[i] + pairs] = *count;
+                    }
+                    ++*count;
                 }
-                ++*count;
             }
         }
-        if (!job->fill) r->splat_begin[rank + 1] = pairs;
+        if (!job->fill) r->splat_begin[i + 1] = pairs;
+    }
+}
+
+// Sorts n keys by their upper half, stable. The lower halves ascend and break ties. Returns the array that holds the result.
+static uint64_t* gsf__sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
+    enum { SMALL = 48 };
+    if (n <= SMALL) {
+        for (size_t i = 1; i < n; i++) {
+            const uint64_t key = keys[i];
+            size_t at = i;
+            for (; at > 0 && keys[at - 1] > key; at--) keys[at] = keys[at - 1];
+            keys[at] = key;
+        }
+        return keys;
+    }
+    uint32_t counts[4][256];
+    memset(counts, 0, sizeof counts);
+    for (size_t i = 0; i < n; i++)
+        for (int pass = 0; pass < 4; pass++) counts[pass][keys[i] >> (32 + 8 * pass) & 255u]++;
+    for (int pass = 0; pass < 4; pass++) {
+        const int shift = 32 + 8 * pass;
+        if (counts[pass][keys[0] >> shift & 255u] == n) continue; // all the same here, as the first bits of a depth often are
+        uint32_t sum = 0;
+        for (int b = 0; b < 256; b++) {
+            const uint32_t count = counts[pass][b];
+            counts[pass][b] = sum;
+            sum += count;
+        }
+        for (size_t i = 0; i < n; i++) spare[counts[pass][keys[i] >> shift & 255u]++] = keys[i];
+        uint64_t* swap = keys;
+        keys = spare;
+        spare = swap;
+    }
+    return keys;
+}
+
+static void gsf__sort_tile(void* arg, size_t index, int worker) {
+    (void)worker;
+    const gsf_rasterizer* r = (const gsf_rasterizer*)arg;
+    const size_t first = r->tile_begin[index], count = r->tile_begin[index + 1] - first;
+    const uint32_t* splats = r->pair_splat + first;
+    uint64_t* keys = r->pair_keys + first;
+    for (size_t i = 0; i < count; i++) {
+        uint32_t depth; // positive, so its bits are in its order
+        memcpy(&depth, &r->records[splats[i]].depth, sizeof depth);
+        keys[i] = (uint64_t)depth << 32 | i;
+    }
+    keys = gsf__sort_keys(keys, r->pair_spare + first, count);
+    for (size_t i = 0; i < count; i++) {
+        gsf__pair* pair = r->pairs + first + i;
+        pair->slot = (uint32_t)keys[i];
+        pair->splat = splats[pair->slot];
     }
 }
 
@@ -4963,9 +4982,9 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     job.view = view;
     job.level = ctx->cpu_level;
     job.fill = 0;
-    job.chunk_size = r->visible_count / 32 + 1;
+    job.chunk_size = r->splat_count / 32 + 1;
     if (job.chunk_size < 1024) job.chunk_size = 1024;
-    const size_t chunks = (r->visible_count + job.chunk_size - 1) / job.chunk_size;
+    const size_t chunks = (r->splat_count + job.chunk_size - 1) / job.chunk_size;
     if (tiles + 1 > r->tile_capacity) {
         r->tile_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->tile_begin, tiles + 1, sizeof(size_t)));
@@ -4990,12 +5009,15 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     }
     r->tile_begin[tiles] = total;
     r->splat_begin[0] = 0;
-    for (size_t i = 0; i < r->visible_count; i++) r->splat_begin[i + 1] += r->splat_begin[i];
+    for (size_t i = 0; i < r->splat_count; i++) r->splat_begin[i + 1] += r->splat_begin[i];
     r->pair_count = total;
     if (total > r->pair_capacity || !r->splat_pairs) { // never NULL, so that empty lists are pointers too
         const size_t capacity = total + total / 4;
         r->pair_capacity = 0;
-        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_rank, capacity, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_splat, capacity, sizeof(uint32_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_keys, capacity, sizeof(uint64_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->pair_spare, capacity, sizeof(uint64_t)));
+        GSF__TRY(gsf__grow(ctx, (void**)&r->pairs, capacity, sizeof(gsf__pair)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->splat_pairs, capacity, sizeof(size_t)));
         r->pair_capacity = capacity;
     }
@@ -5009,8 +5031,8 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
 /* A tile's pixels are kept as 32 steps of 8: arrays [step][lane]. T > 0: pixel still open; T < 0: finished, |T| is its
    final transmittance. `live` has a bit per step that has an open pixel. */
 typedef struct gsf__tile {
-    const gsf__record* records; // of the visible splats in depth order
-    const uint32_t* ranks;      // the tile's list, front to back
+    const gsf__record* records; // per splat
+    const gsf__pair* pairs;     // the tile's list, front to back
     size_t count;
     float x0, y0;            // of the tile's first pixel
 } gsf__tile;
@@ -5118,7 +5140,7 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
     uint32_t live = gsf__live_steps(state->T);
     float center[GSF__TILE], exponent[GSF__TILE];
     for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->ranks[i];
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
             int open = 0;
@@ -5191,8 +5213,8 @@ GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_stat
     uint32_t live = gsf__live_steps(state->T);
     float center[GSF__STEPS], exponent[GSF__STEPS];
     for (size_t i = 0; i < tile->count && live; i++) {
-        const gsf__record* rec = tile->records + tile->ranks[i];
-        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->ranks[i + 4]), _MM_HINT_T0);
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
         const __m256 ee = _mm256_set1_ps(rec->ee);
         const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
         for (uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live; m; m &= m - 1) {
@@ -5233,7 +5255,7 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, si
     float center[GSF__TILE], exponent[GSF__TILE];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->ranks[i];
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
         for (uint32_t m = gsf__rows_scalar(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const int s = gsf__lowest_bit(m), row = s & 15, column = 8 * (s >> 4);
             int open = 0, any = 0;
@@ -5265,7 +5287,7 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
                                 uint8_t* slot_used, int flags) {
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->ranks[entry];
+        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
         const float u = rec->u - tile->x0, v = rec->v - tile->y0;
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         float sums[GSF__SLOT_FLOATS];
@@ -5300,9 +5322,9 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
                 sums[GSF__SLOT_ABS_Y] += fabsf(p * (conic_b * e + conic_q * dy));
             }
         }
-        float* slot = slots + GSF__SLOT_FLOATS * entry;
-        memcpy(slot, sums, sizeof sums); // all of an entry's steps are in one bucket
-        slot_used[entry] = 1;
+        const size_t slot = tile->pairs[entry].slot;
+        memcpy(slots + GSF__SLOT_FLOATS * slot, sums, sizeof sums); // all of an entry's steps are in one bucket
+        slot_used[slot] = 1;
     }
 }
 
@@ -5317,8 +5339,8 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_ti
     float center[GSF__STEPS], exponent[GSF__STEPS];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
-        const gsf__record* rec = tile->records + tile->ranks[i];
-        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->ranks[i + 4]), _MM_HINT_T0);
+        const gsf__record* rec = tile->records + tile->pairs[i].splat;
+        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
         const __m256 ee = _mm256_set1_ps(rec->ee);
         for (uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live; m; m &= m - 1) {
             const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
@@ -5359,7 +5381,7 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
     float center[GSF__STEPS], below[GSF__STEPS]; // as in gsf__rows_avx2, and dy, by step
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
-        const gsf__record* rec = tile->records + tile->ranks[entry];
+        const gsf__record* rec = tile->records + tile->pairs[entry].splat;
         const __m256 u = _mm256_set1_ps(rec->u - tile->x0), v = _mm256_set1_ps(rec->v - tile->y0);
         for (int h = 0; h < 2; h++) {
             const __m256 dy = _mm256_sub_ps(_mm256_add_ps(lanes, _mm256_set1_ps(8.0f * (float)h)), v);
@@ -5407,12 +5429,13 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
                 say = _mm256_add_ps(say, _mm256_and_ps(magnitude, dv));
             }
         }
-        float* slot = slots + GSF__SLOT_FLOATS * entry;
+        const size_t slot = tile->pairs[entry].slot;
+        float* to = slots + GSF__SLOT_FLOATS * slot;
         const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
         const __m256 rest = gsf__sum8_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say, sp, sp, sp, sp);
-        _mm256_storeu_ps(slot, first); // all of an entry's steps are in one bucket
-        _mm_storeu_ps(slot + 8, _mm256_castps256_ps128(rest));
-        slot_used[entry] = 1;
+        _mm256_storeu_ps(to, first); // all of an entry's steps are in one bucket
+        _mm_storeu_ps(to + 8, _mm256_castps256_ps128(rest));
+        slot_used[slot] = 1;
     }
 }
 
@@ -5605,8 +5628,7 @@ GSF__TARGET_AVX2 static inline uint32_t gsf__sum_slots_avx2(const gsf_rasterizer
     for (size_t l = 0; l < 8; l++) {
         __m256d a = _mm256_setzero_pd(), b = a, c = a;
         if (l < count && r->records[i + l].radius > 0) {
-            const size_t rank = r->rank[i + l];
-            for (size_t s = r->splat_begin[rank]; s < r->splat_begin[rank + 1]; s++) {
+            for (size_t s = r->splat_begin[i + l]; s < r->splat_begin[i + l + 1]; s++) {
                 const size_t pair = r->splat_pairs[s];
                 if (!r->slot_used[pair]) continue;
                 const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
@@ -5794,11 +5816,10 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
 #endif
     for (size_t i = begin; i < end; i++) {
         if (r->records[i].radius <= 0) continue;
-        const size_t rank = r->rank[i];
         double sums[GSF__SLOT_FLOATS];
         memset(sums, 0, sizeof sums);
         int touched = 0;
-        for (size_t s = r->splat_begin[rank]; s < r->splat_begin[rank + 1]; s++) {
+        for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + 1]; s++) {
             const size_t pair = r->splat_pairs[s];
             if (!r->slot_used[pair]) continue;
             const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
@@ -5854,13 +5875,7 @@ static gsf_result gsf__reserve_frame(gsf_context* ctx, gsf_rasterizer* r) {
         const size_t n = r->splat_count + r->splat_count / 4 + 64;
         r->splat_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->records, n, sizeof(gsf__record)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->sorted, n, sizeof(gsf__record)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->radii, n, sizeof(int32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->visible, n, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->visible_spare, n, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->keys, n, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->keys_spare, n, sizeof(uint32_t)));
-        GSF__TRY(gsf__grow(ctx, (void**)&r->rank, n, sizeof(uint32_t)));
         GSF__TRY(gsf__grow(ctx, (void**)&r->splat_begin, n + 1, sizeof(size_t)));
         r->splat_capacity = n;
     }
@@ -5878,8 +5893,8 @@ typedef struct gsf__raster_job {
 
 static gsf__tile gsf__tile_of(const gsf_rasterizer* r, size_t index) {
     gsf__tile tile;
-    tile.records = r->sorted;
-    tile.ranks = r->pair_rank + r->tile_begin[index];
+    tile.records = r->records;
+    tile.pairs = r->pairs + r->tile_begin[index];
     tile.count = r->tile_begin[index + 1] - r->tile_begin[index];
     tile.x0 = (float)((int32_t)(index % (size_t)r->tiles_x) * GSF__TILE);
     tile.y0 = (float)((int32_t)(index / (size_t)r->tiles_x) * GSF__TILE);
@@ -5972,7 +5987,6 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     r->tiles_x = (r->width + GSF__TILE - 1) / GSF__TILE;
     r->tiles_y = (r->height + GSF__TILE - 1) / GSF__TILE;
     r->splat_count = splats->count;
-    r->visible_count = 0;
     r->has_depth = out->depth.data != NULL;
     GSF__TRY(gsf__reserve_frame(ctx, r));
 
@@ -5984,8 +5998,9 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     project.hidden = desc->hidden;
     project.level = ctx->cpu_level;
     gsf__parallel_for(ctx, (splats->count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__project_chunk, &project);
-    gsf__sort_visible(r);
     GSF__TRY(gsf__bin(ctx, r, &view));
+    const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
+    gsf__parallel_for(ctx, tiles, gsf__sort_tile, r);
 
     gsf__raster_job job;
     memset(&job, 0, sizeof job);
@@ -5994,7 +6009,7 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     job.view = &view;
     job.out = out;
     job.flags = r->has_depth ? GSF__WITH_DEPTH : 0;
-    gsf__parallel_for(ctx, (size_t)r->tiles_x * (size_t)r->tiles_y, gsf__blend_chunk, &job);
+    gsf__parallel_for(ctx, tiles, gsf__blend_chunk, &job);
     return GSF_OK;
 }
 

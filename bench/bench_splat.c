@@ -217,8 +217,8 @@ static gsf_camera bench_camera(int width, int height) {
 #define BENCH_FORWARD_FLOPS 30.0
 #define BENCH_BACKWARD_FLOPS 55.0
 
-enum { STAGE_PROJECT, STAGE_SORT, STAGE_BIN, STAGE_BLEND, STAGE_LOSS, STAGE_REVERSE, STAGE_GATHER, STAGE_ADAM, STAGES };
-static const char* const bench_stage_names[STAGES] = {"project", "sort", "bin", "blend", "loss", "reverse", "gather", "adam"};
+enum { STAGE_PROJECT, STAGE_BIN, STAGE_SORT, STAGE_BLEND, STAGE_LOSS, STAGE_REVERSE, STAGE_GATHER, STAGE_ADAM, STAGES };
+static const char* const bench_stage_names[STAGES] = {"project", "bin", "sort", "blend", "loss", "reverse", "gather", "adam"};
 
 typedef struct bench_count {
     gsf_rasterizer* r;
@@ -364,10 +364,10 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
         clock.cpu_from = bench_cpu();
         gsf__parallel_for(&ctx, splat_chunks, gsf__project_chunk, &project);
         bench_lap(&clock, STAGE_PROJECT);
-        gsf__sort_visible(r);
-        bench_lap(&clock, STAGE_SORT);
         bench_require(&ctx, gsf__bin(&ctx, r, &view));
         bench_lap(&clock, STAGE_BIN);
+        gsf__parallel_for(&ctx, tiles, gsf__sort_tile, r);
+        bench_lap(&clock, STAGE_SORT);
         gsf__parallel_for(&ctx, tiles, gsf__blend_chunk, &raster);
         bench_lap(&clock, STAGE_BLEND);
         bench_require(&ctx, gsf__loss(&ctx, &scratch, &target, (const float*)out.color.data, 0.2f, 1.0f, d_color, &value));
@@ -395,11 +395,11 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     pairs = bench_pairs(&ctx, r);
 
     // bytes that a stage must move at least, were its caches cold: what it reads and writes once
-    const double n = (double)count, seen = (double)r->visible_count, entries = (double)r->pair_count, p = (double)pixels;
+    const double n = (double)count, entries = (double)r->pair_count, p = (double)pixels;
     const double bytes[STAGES] = {
         n * (59 * 4 + sizeof(gsf__record) + 4),
-        n * sizeof(gsf__record) + seen * (3 * 4 * 8 + 8),
-        seen * 4 * sizeof(gsf__record) + entries * (4 + 8 + 8),
+        n * (2 * sizeof(gsf__record) + 8) + entries * (4 + 8),
+        entries * (4 + sizeof(gsf__record) + 8 * (2 + 2 * 4) + 8),
         entries * sizeof(gsf__record) + p * (3 + 1) * 4,
         p * 3 * 4 * (2 + GSF__LOSS_PLANES + 1),
         entries * (2 * sizeof(gsf__record) + GSF__SLOT_FLOATS * 4) + p * 4 * 4,
