@@ -21,7 +21,7 @@
        paths, text     UTF-8
 
    CONFIGURATION (define before the implementation)
-       GSF_NO_STB              no image files through stb (host decodes images itself)
+       GSF_NO_STB              no image files through stb (host decodes images itself), and no .spz files
        GSF_STB_IMAGE_INCLUDE / GSF_STB_IMAGE_WRITE_INCLUDE   where stb lies (default <stb/stb_image.h>, ...)
        GSF_USE_OIIO            C++ only: EXR, TIFF, 16-bit files through OpenImageIO
        GSF_USE_GLM             C++ only: adapters to glm matrices (declared as soon as it is defined)
@@ -602,6 +602,43 @@ GSF__SHARED void gsf__store_le(void* data, uint64_t value, int bytes) {
     for (int i = 0; i < bytes; i++, value >>= 8) p[i] = (unsigned char)(value & 255u);
 }
 
+// CRC-32 of gzip and PNG (reflected 0xedb88320), continued from `crc`, which starts as 0. Long inputs go 16 bytes at a
+// time; tables[k][b] is byte b followed by k zero bytes.
+GSF__SHARED uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
+    static const uint32_t nibble[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
+                                        0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
+                                        0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
+    const unsigned char* p = (const unsigned char*)data;
+    crc = ~crc;
+    if (size >= 1 << 15) {
+        uint32_t tables[16][256];
+        for (uint32_t b = 0; b < 256; b++) {
+            const uint32_t half = nibble[b & 15u] ^ b >> 4;
+            tables[0][b] = nibble[half & 15u] ^ half >> 4;
+        }
+        for (int k = 1; k < 16; k++)
+            for (int b = 0; b < 256; b++)
+                tables[k][b] = tables[0][tables[k - 1][b] & 255u] ^ tables[k - 1][b] >> 8;
+        for (; size >= 16; size -= 16, p += 16) {
+            const uint32_t w0 = crc ^ (uint32_t)gsf__load_le(p, 4), w1 = (uint32_t)gsf__load_le(p + 4, 4);
+            const uint32_t w2 = (uint32_t)gsf__load_le(p + 8, 4), w3 = (uint32_t)gsf__load_le(p + 12, 4);
+            crc = tables[15][w0 & 255u] ^ tables[14][w0 >> 8 & 255u] ^
+                  tables[13][w0 >> 16 & 255u] ^ tables[12][w0 >> 24] ^
+                  tables[11][w1 & 255u] ^ tables[10][w1 >> 8 & 255u] ^
+                  tables[9][w1 >> 16 & 255u] ^ tables[8][w1 >> 24] ^
+                  tables[7][w2 & 255u] ^ tables[6][w2 >> 8 & 255u] ^
+                  tables[5][w2 >> 16 & 255u] ^ tables[4][w2 >> 24] ^
+                  tables[3][w3 & 255u] ^ tables[2][w3 >> 8 & 255u] ^
+                  tables[1][w3 >> 16 & 255u] ^ tables[0][w3 >> 24];
+        }
+    }
+    for (size_t i = 0; i < size; i++) {
+        crc = nibble[(crc ^ p[i]) & 15u] ^ (crc >> 4);
+        crc = nibble[(crc ^ (uint32_t)(p[i] >> 4)) & 15u] ^ (crc >> 4);
+    }
+    return ~crc;
+}
+
 enum { GSF__DECIMAL_DIGITS = 800 }; // more than the 767 that can decide how a double rounds
 
 // Reads [+-]digits[.digits][e[+-]digits] at the start of `text`: correctly rounded and independent of the locale
@@ -719,6 +756,21 @@ GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double po
 }
 
 GSF__END_IMPLEMENTATION
+
+// DEFLATE (RFC 1951) through stb, which only gsfixer.h's own implementation compiles: so these two are linked, not shared.
+// Sizes up to 2^31 bytes in, 2^30 out; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB.
+#ifdef __cplusplus
+extern "C" {
+#endif
+// Inflates what starts at byte `body` of a file to exactly `room` > 0 bytes. The 8 bytes of a gzip file's end must follow
+// it within `size`: stb 2.27 reads ahead, and takes an end too near for a cut.
+GSF_API gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
+                                size_t room);
+// Appends `data` (size > 0) compressed.
+GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+#ifdef __cplusplus
+}
+#endif
 
 #endif // GSF_INTERNALS_INCLUDED
 #endif
@@ -1098,42 +1150,6 @@ GSF_API gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void
 }
 
 // ---- >>chunks ------------------------------------------------------------------
-
-// Reflected 0xedb88320. Long inputs go 16 bytes at a time; tables[k][b] is byte b followed by k zero bytes.
-static uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
-    static const uint32_t nibble[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
-                                        0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
-                                        0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
-    const unsigned char* p = (const unsigned char*)data;
-    crc = ~crc;
-    if (size >= 1 << 15) {
-        uint32_t tables[16][256];
-        for (uint32_t b = 0; b < 256; b++) {
-            const uint32_t half = nibble[b & 15u] ^ b >> 4;
-            tables[0][b] = nibble[half & 15u] ^ half >> 4;
-        }
-        for (int k = 1; k < 16; k++)
-            for (int b = 0; b < 256; b++)
-                tables[k][b] = tables[0][tables[k - 1][b] & 255u] ^ tables[k - 1][b] >> 8;
-        for (; size >= 16; size -= 16, p += 16) {
-            const uint32_t w0 = crc ^ (uint32_t)gsf__load_le(p, 4), w1 = (uint32_t)gsf__load_le(p + 4, 4);
-            const uint32_t w2 = (uint32_t)gsf__load_le(p + 8, 4), w3 = (uint32_t)gsf__load_le(p + 12, 4);
-            crc = tables[15][w0 & 255u] ^ tables[14][w0 >> 8 & 255u] ^
-                  tables[13][w0 >> 16 & 255u] ^ tables[12][w0 >> 24] ^
-                  tables[11][w1 & 255u] ^ tables[10][w1 >> 8 & 255u] ^
-                  tables[9][w1 >> 16 & 255u] ^ tables[8][w1 >> 24] ^
-                  tables[7][w2 & 255u] ^ tables[6][w2 >> 8 & 255u] ^
-                  tables[5][w2 >> 16 & 255u] ^ tables[4][w2 >> 24] ^
-                  tables[3][w3 & 255u] ^ tables[2][w3 >> 8 & 255u] ^
-                  tables[1][w3 >> 16 & 255u] ^ tables[0][w3 >> 24];
-        }
-    }
-    for (size_t i = 0; i < size; i++) {
-        crc = nibble[(crc ^ p[i]) & 15u] ^ (crc >> 4);
-        crc = nibble[(crc ^ (uint32_t)(p[i] >> 4)) & 15u] ^ (crc >> 4);
-    }
-    return ~crc;
-}
 
 enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 
@@ -1609,6 +1625,15 @@ GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_j
 #define STBIWDEF GSF__SHARED
 #include GSF_STB_IMAGE_WRITE_INCLUDE
 #undef STB_IMAGE_WRITE_IMPLEMENTATION
+#else
+STBIWDEF unsigned char* stbi_zlib_compress(unsigned char*, int, int*, int); // which its header does not declare
+#endif
+#ifdef STBIW_MALLOC
+#define GSF__STBIW_MALLOC(size) STBIW_MALLOC(size)
+#define GSF__STBIW_FREE(p) STBIW_FREE(p)
+#else // the host's copy lies in another file
+#define GSF__STBIW_MALLOC(size) malloc(size)
+#define GSF__STBIW_FREE(p) free(p)
 #endif
 #if defined(__clang__)
 #pragma clang attribute pop
@@ -2027,6 +2052,51 @@ static void gsf__stb_write(void* user, void* data, int size) {
 }
 
 #endif // GSF_NO_STB
+
+GSF_API gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
+                                size_t room) {
+#ifdef GSF_NO_STB
+    (void)data, (void)size, (void)body, (void)out, (void)room;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no compressed files (GSF_NO_STB)", name);
+#else
+    if (size - body > (size_t)INT32_MAX || room > (size_t)INT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %zu compressed bytes for %zu: at most 2^31-1 are read", name,
+                        body, size - body, room);
+    memset(out, 0, room); // stb 2.27 takes the two distance codes that mean nothing for 0: repeats what `out` holds
+    const int got = stbi_zlib_decode_noheader_buffer((char*)out, (int)room, (const char*)data + body, (int)(size - body));
+    if (got < 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data is malformed, cut or longer than %zu bytes", name,
+                        body, room);
+    if ((size_t)got != room)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data holds %d bytes, not %zu", name, body, got, room);
+    return GSF_OK;
+#endif
+}
+
+GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+#ifdef GSF_NO_STB
+    (void)data, (void)size, (void)out;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no compressed files (GSF_NO_STB)", name);
+#else
+    enum { QUALITY = 8, HEAD = 2, TAIL = 4 }; // HEAD, TAIL: what zlib has around the data
+    const size_t most = SIZE_MAX / 8 < (size_t)1 << 30 ? SIZE_MAX / 8 : (size_t)1 << 30; // stb counts its room in int
+    if (size > most)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, at most %zu are", name, size, most);
+    // stb asserts that its memory is there: room for its output, while that grows, and for its tables is tried first
+    volatile char* probe = (volatile char*)GSF__STBIW_MALLOC(4 * size + ((size_t)8 << 20));
+    int packed_size = 0;
+    unsigned char* packed = NULL;
+    if (probe) {
+        *probe = 0; // or a compiler leaves both calls out
+        GSF__STBIW_FREE((void*)probe);
+        packed = stbi_zlib_compress((unsigned char*)(uintptr_t)data, (int)size, &packed_size, QUALITY);
+    }
+    if (!packed) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory: %zu bytes to compress", name, size);
+    gsf_text_append(ctx, out, (const char*)packed + HEAD, (size_t)(packed_size - HEAD - TAIL));
+    GSF__STBIW_FREE(packed);
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+#endif
+}
 
 // The last ".xyz" of a path in lower case, "" if there is none or it is long.
 static void gsf__path_extension(const char* path, char out[8]) {
