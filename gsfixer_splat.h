@@ -18,9 +18,9 @@
                         projected, to the same result
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> where there is one, else <embree3/rtcore.h>
 
-   SECTIONS    >>splats >>ply >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility >>embree
-               >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward >>render
-               >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer
+   SECTIONS    >>splats >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
+               >>embree >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
+               >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
 #ifndef GSF_SPLAT_INCLUDED
@@ -38,6 +38,7 @@ extern "C" {
 typedef struct gsf_splats { // structure of arrays; all arrays have `count` rows
     size_t count;
     int32_t sh_degree;      // 0..3, of the stored coefficients
+    int32_t antialiased;    // made for gsf_render_desc.antialiased; a note that only .spz files carry, nothing reads it
     double origin[3];       // world position of the means' zero
     float* means;           // (count,3) relative to origin
     float* log_scales;      // (count,3)
@@ -66,6 +67,44 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_ply(gsf_context* ctx, const cha
 // is, so that every viewer reads the file). format_ply appends to `out`, which starts zeroed.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const gsf_splats* splats);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out);
+
+/* The formats of engines and viewers beside PLY, in and out. Which one it is, the name's ending says (.ply, .splat, .spz,
+   in any case); a file of another name is known by its content if it is PLY or SPZ (a .splat has no mark).
+       .splat  32 bytes a splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0 are
+               lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
+       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes a splat. A scene of 56115 splats of degree 3 takes 22.6
+               each, 18.6 from the official writer: it has zlib, this has stb, which writes fixed codes only (stb's hook
+               STBIW_ZLIB_COMPRESS puts another compressor there). Versions 1 to 3 are read, 2 and 3 written. Errors:
+               positions half a step (2^-12, finer where the median scale is below 2^-7, coarser where a coordinate passes
+               2047), log-scales 1/32 within -10..5.94, opacity 0.5/255, colour 0.5/255/0.15 as coefficient, SH 4.5/128
+               (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15, where w is
+               small). Axes are converted to and from SPZ's (y and z turned around), as the official library does.
+               Extensions and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than
+               2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read; .spz at all under GSF_NO_STB.
+   Neither file has an origin: world positions are written, and steps that are coarse beside the splats (more than a quarter
+   of the median scale) or cannot be held at all are a warning or an error; `local` writes means without the origin instead.
+   Rows keep their order, ids are lost. Splats with a NaN or infinite value are left out, when writing as when reading, and
+   counted in a warning. An opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory in
+   proportion to the content, while stb compresses not from the context; a file that claims more than DEFLATE can hold (1032
+   times its size) is refused before it is believed. */
+typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ } gsf_splat_type;
+
+typedef struct gsf_splat_save_desc {
+    gsf_splat_type type;  // AUTO: by the ending of the name, which must then be one of the three
+    int32_t local;        // write positions relative to splats->origin, which the file does not keep
+    int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers know by now: a byte more a splat, and rotations a
+                          // tenth as wrong (which pictures of compact splats do not show). 2 is for readers from before
+                          // July 2025 and for glTF's KHR_gaussian_splatting_compression_spz_2
+} gsf_splat_save_desc;
+
+GSF_API GSF_NODISCARD gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                                 gsf_splats* out);
+// desc: NULL = all default. format appends to `out`, which starts zeroed; name: for the type and for texts.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_splats* splats,
+                                                const gsf_splat_save_desc* desc);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats,
+                                                  const gsf_splat_save_desc* desc, gsf_text* out);
 
 // ---- scenes --------------------------------------------------------------------
 
@@ -1004,7 +1043,7 @@ static gsf_result gsf__ply_decode_ascii(gsf_context* ctx, gsf__ply_job* job) {
 }
 
 // Removes the bad rows; ids stay 0..count-1.
-static void gsf__ply_drop_rows(gsf_context* ctx, const gsf__ply* ply, const uint8_t* bad, gsf_splats* s) {
+static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* bad, gsf_splats* s) {
     const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree);
     size_t kept = 0;
     for (size_t i = 0; i < s->count; i++) {
@@ -1020,7 +1059,7 @@ static void gsf__ply_drop_rows(gsf_context* ctx, const gsf__ply* ply, const uint
     }
     if (kept != s->count)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats dropped: a value is NaN, infinite or beyond float32",
-                ply->name, s->count - kept, s->count);
+                name, s->count - kept, s->count);
     s->count = kept;
 }
 
@@ -1066,7 +1105,7 @@ GSF_API gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const
         if (result == GSF_OK)
             gsf__parallel_for(ctx, (ply.count + GSF__PLY_CHUNK - 1) / GSF__PLY_CHUNK, gsf__ply_decode_chunk, &job);
     }
-    if (result == GSF_OK) gsf__ply_drop_rows(ctx, &ply, job.bad, out);
+    if (result == GSF_OK) gsf__drop_rows(ctx, name, job.bad, out);
     else gsf_splat_destroy(ctx, out);
     gsf_free(ctx, job.bad);
     return result;
@@ -1170,6 +1209,684 @@ GSF_API gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const 
     gsf_text text;
     memset(&text, 0, sizeof text);
     gsf_result result = gsf_splat_format_ply(ctx, splats, &text);
+    if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
+    gsf_destroy_text(ctx, &text);
+    return result;
+}
+
+// ---- >>formats -----------------------------------------------------------------
+
+/* What follows the PLY files: which format a name means, .splat, .spz. Both hold positions as float32 or 24-bit fixed
+   point around zero, so origin + mean is rounded; gsf__pack_plan measures by how much. */
+
+static const float gsf__dc_scale = 0.28209479177387814f; // SH band 0: colour = 0.5 + this * coefficient
+
+static gsf_splat_type gsf__type_of_name(const char* name) {
+    static const char* const endings[3] = {".ply", ".splat", ".spz"};
+    static const gsf_splat_type types[3] = {GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ};
+    const size_t size = strlen(name);
+    for (int i = 0; i < 3; i++) {
+        const size_t n = strlen(endings[i]);
+        size_t k = 0;
+        if (size < n) continue;
+        while (k < n && (name[size - n + k] == endings[i][k] || name[size - n + k] == endings[i][k] - 'a' + 'A')) k++;
+        if (k == n) return types[i];
+    }
+    return GSF_SPLAT_AUTO;
+}
+
+// To the nearest whole number in 0..255, halves up; NaN to 0.
+static unsigned char gsf__to_u8(float value) {
+    return value >= 255.0f ? (unsigned char)255 : value > 0.0f ? (unsigned char)(value + 0.5f) : (unsigned char)0;
+}
+
+static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + expf(-logit)); }
+
+// Logits of the 256 opacities; the ends, which stand for half a step, are taken in its middle, so that they are finite.
+static void gsf__make_logits(float logits[256]) {
+    for (int i = 0; i < 256; i++) {
+        const double p = (i == 0 ? 0.25 : i == 255 ? 254.75 : (double)i) / 255.0;
+        logits[i] = (float)log(p / (1.0 - p));
+    }
+}
+
+// Unit quaternion; zero gives the identity, as when it is used.
+static void gsf__unit_quat(const float* q, float out[4]) {
+    float largest = 0.0f;
+    for (int k = 0; k < 4; k++) largest = fmaxf(largest, fabsf(q[k]));
+    const float scale = largest > 1e-15f && largest < 1e15f ? 1.0f : largest; // else the squares leave float32
+    const float v[4] = {q[0] / scale, q[1] / scale, q[2] / scale, q[3] / scale};
+    const float norm = sqrtf(v[1] * v[1] + v[2] * v[2] + v[3] * v[3] + v[0] * v[0]);
+    for (int k = 0; k < 4; k++) out[k] = largest > 0.0f ? v[k] / norm : k == 0 ? 1.0f : 0.0f;
+}
+
+// Splats on the way into a file of less precision.
+typedef struct gsf__pack {
+    const gsf_splats* splats;
+    const char* name;
+    size_t count;         // that are written
+    uint32_t* rows;       // which ones; NULL = all
+    uint8_t* bad;         // (splats->count) a value is NaN or infinite
+    double farthest;      // largest |coordinate| of a position
+    double typical;       // median scale
+    unsigned char* out;
+    int version, fraction; // .spz
+    unsigned char *positions, *alphas, *colors, *scales, *rotations, *sh;
+} gsf__pack;
+
+enum { GSF__PACK_CHUNK = 4096 }; // splats
+
+static size_t gsf__pack_end(size_t count, size_t begin) {
+    return begin + GSF__PACK_CHUNK < count ? begin + GSF__PACK_CHUNK : count;
+}
+
+static int gsf__any_bad(const float* values, size_t count) {
+    int bad = 0;
+    for (size_t i = 0; i < count; i++) bad |= gsf__float_is_bad(values[i]);
+    return bad;
+}
+
+static void gsf__pack_check_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__pack* job = (const gsf__pack*)arg;
+    const gsf_splats* s = job->splats;
+    const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    (void)worker;
+    for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
+        int bad = gsf__any_bad(s->log_scales + 3 * i, 3) | gsf__any_bad(s->quats + 4 * i, 4) |
+                  gsf__any_bad(s->opacity_logits + i, 1) | gsf__any_bad(s->sh + sh * i, sh);
+        for (size_t k = 0; k < 3; k++) bad |= gsf__float_is_bad((float)(s->origin[k] + (double)s->means[3 * i + k]));
+        job->bad[i] = (uint8_t)bad;
+    }
+}
+
+static float gsf__mean_log_scale(const gsf_splats* s, size_t i) {
+    return (s->log_scales[3 * i] + s->log_scales[3 * i + 1] + s->log_scales[3 * i + 2]) / 3.0f;
+}
+
+static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf__pack* job) {
+    double samples[1024];
+    size_t n = 0;
+    memset(job, 0, sizeof *job);
+    job->splats = splats;
+    job->name = name;
+    if (splats->sh_degree < 0 || splats->sh_degree > 3)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SH degree %d is not 0..3", name, (int)splats->sh_degree);
+    if (splats->count > UINT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, the format holds 2^32", name, splats->count);
+    job->bad = (uint8_t*)gsf_alloc(ctx, splats->count ? splats->count : 1, 1);
+    if (!job->bad) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__parallel_for(ctx, (splats->count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__pack_check_chunk, job);
+    for (size_t i = 0; i < splats->count; i++) job->count += !job->bad[i];
+    if (job->count < splats->count) {
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats left out: a value is NaN, infinite or beyond float32", name,
+                splats->count - job->count, splats->count);
+        job->rows = (uint32_t*)gsf_alloc(ctx, job->count ? job->count : 1, sizeof *job->rows);
+        if (!job->rows) {
+            gsf_free(ctx, job->bad);
+            return GSF_ERROR_OUT_OF_MEMORY;
+        }
+        for (size_t i = 0, row = 0; i < splats->count; i++)
+            if (!job->bad[i]) job->rows[row++] = (uint32_t)i;
+    }
+    const size_t stride = job->count / GSF__COUNT(samples) + 1;
+    for (size_t row = 0; row < job->count; row++) {
+        const size_t i = job->rows ? job->rows[row] : row;
+        for (size_t k = 0; k < 3; k++)
+            job->farthest = fmax(job->farthest, fabs(splats->origin[k] + (double)splats->means[3 * i + k]));
+        if (row % stride == 0) samples[n++] = (double)gsf__mean_log_scale(splats, i);
+    }
+    qsort(samples, n, sizeof samples[0], gsf__compare_doubles);
+    job->typical = n ? exp(samples[n / 2]) : 1.0;
+    return GSF_OK;
+}
+
+static void gsf__pack_free(gsf_context* ctx, gsf__pack* job) {
+    gsf_free(ctx, job->rows);
+    gsf_free(ctx, job->bad);
+}
+
+// step: between neighbouring values of a coordinate.
+static void gsf__pack_warn_coarse(gsf_context* ctx, const gsf__pack* job, double step) {
+    if (job->count && step > 0.25 * job->typical)
+        gsf_log(ctx, GSF_LOG_WARNING,
+                "%s: coordinates as large as %.6g come in steps of %.3g here, and the median splat has a scale of %.3g; "
+                "write them relative to the origin (local), or a PLY",
+                job->name, job->farthest, step, job->typical);
+}
+
+/* .splat: nothing but rows of 32 bytes, little-endian
+       position 3 x float32 | scale 3 x float32, linear | red green blue opacity u8 | quaternion w x y z u8, 128 + 128 q */
+
+enum { GSF__SPLAT_ROW = 32 };
+
+typedef struct gsf__splat_job {
+    const unsigned char* rows;
+    gsf_splats* splats;
+    uint8_t* bad; // as in gsf__pack
+    float logits[256];
+} gsf__splat_job;
+
+static float gsf__get_f32(const unsigned char* p) {
+    const uint32_t bits = (uint32_t)gsf__load_le(p, 4);
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static void gsf__splat_sample_position(const void* arg, size_t i, double* out) {
+    for (int k = 0; k < 3; k++) out[k] = (double)gsf__get_f32((const unsigned char*)arg + GSF__SPLAT_ROW * i + 4 * k);
+}
+
+static void gsf__splat_decode_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__splat_job* job = (const gsf__splat_job*)arg;
+    const gsf_splats* s = job->splats;
+    const size_t begin = chunk * GSF__PACK_CHUNK;
+    (void)worker;
+    for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
+        const unsigned char* row = job->rows + GSF__SPLAT_ROW * i;
+        int bad = 0;
+        for (size_t k = 0; k < 3; k++) {
+            const float mean = (float)((double)gsf__get_f32(row + 4 * k) - s->origin[k]);
+            const float scale = gsf__get_f32(row + 12 + 4 * k);
+            bad |= gsf__float_is_bad(mean) | gsf__float_is_bad(scale) | (scale < 0.0f);
+            s->means[3 * i + k] = mean;
+            s->log_scales[3 * i + k] = logf(fmaxf(scale, FLT_MIN)); // a scale of 0 is in use, its logarithm is not
+            s->sh[3 * i + k] = ((float)row[24 + k] / 255.0f - 0.5f) / gsf__dc_scale;
+        }
+        s->opacity_logits[i] = job->logits[row[27]];
+        for (size_t k = 0; k < 4; k++) s->quats[4 * i + k] = ((float)row[28 + k] - 128.0f) / 128.0f;
+        job->bad[i] = (uint8_t)bad;
+    }
+}
+
+static gsf_result gsf__splat_parse(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
+    if (size % GSF__SPLAT_ROW != 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: .splat is cut: a row has 32 bytes, the last one %zu", name,
+                        size - size % GSF__SPLAT_ROW, size % GSF__SPLAT_ROW);
+    const size_t count = size / GSF__SPLAT_ROW;
+    if (count > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, ids hold 2^32", name, count);
+    GSF__TRY(gsf_splat_make(ctx, count, 0, out));
+    gsf__splat_job job;
+    job.rows = (const unsigned char*)data;
+    job.splats = out;
+    job.bad = (uint8_t*)gsf_alloc(ctx, count ? count : 1, 1);
+    gsf__make_logits(job.logits);
+    gsf_result result = job.bad ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) result = gsf__sample_origin(ctx, count, gsf__splat_sample_position, data, out->origin);
+    if (result == GSF_OK) {
+        gsf__parallel_for(ctx, (count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__splat_decode_chunk, &job);
+        gsf__drop_rows(ctx, name, job.bad, out);
+    } else {
+        gsf_splat_destroy(ctx, out);
+    }
+    gsf_free(ctx, job.bad);
+    return result;
+}
+
+static void gsf__splat_encode_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__pack* job = (const gsf__pack*)arg;
+    const gsf_splats* s = job->splats;
+    const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    (void)worker;
+    for (size_t row = begin; row < gsf__pack_end(job->count, begin); row++) {
+        const size_t i = job->rows ? job->rows[row] : row;
+        unsigned char* p = job->out + GSF__SPLAT_ROW * row;
+        float q[4];
+        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, (float)(s->origin[k] + (double)s->means[3 * i + k]));
+        for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, fminf(expf(s->log_scales[3 * i + k]), FLT_MAX));
+        for (size_t k = 0; k < 3; k++) *p++ = gsf__to_u8((0.5f + gsf__dc_scale * s->sh[sh * i + k]) * 255.0f);
+        *p++ = gsf__to_u8(gsf__logistic_u8(s->opacity_logits[i]));
+        gsf__unit_quat(s->quats + 4 * i, q);
+        for (size_t k = 0; k < 4; k++) *p++ = gsf__to_u8(q[k] * 128.0f + 128.0f);
+    }
+}
+
+static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf_text* out) {
+    gsf__pack job;
+    size_t bytes = 0;
+    GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
+    gsf__pack_warn_coarse(ctx, &job, job.farthest / 8388608.0); // 24 bits
+    gsf_result result = GSF_OK;
+    if (!gsf__mul_size(job.count, GSF__SPLAT_ROW, &bytes) || bytes > SIZE_MAX / 2)
+        result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", job.count);
+    else
+        result = gsf__reserve(ctx, (void**)&out->data, &out->capacity, out->size, out->size + bytes + 1, 1);
+    if (result == GSF_OK) {
+        job.out = (unsigned char*)out->data + out->size;
+        gsf__parallel_for(ctx, (job.count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__splat_encode_chunk, &job);
+        out->size += bytes;
+        out->data[out->size] = 0;
+    }
+    gsf__pack_free(ctx, &job);
+    return result;
+}
+
+/* gzip (RFC 1952) around DEFLATE:
+       1f 8b 08 flags | mtime 4 | xfl | os | [extra] [name] [comment] [crc16] | DEFLATE | crc32 4 | size modulo 2^32 4 */
+
+enum { GSF__DEFLATE_RATIO = 1032 }; // bytes that one of DEFLATE can stand for, at most
+
+static gsf_result gsf__gzip_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
+                                      size_t* body) {
+    size_t at = 10;
+    if (size < 2 || p[0] != 0x1f || p[1] != 0x8b)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not gzip (1f 8b expected)", name);
+    if (size < 18) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut", name, size);
+    if (p[2] != 8 || (p[3] & 0xe0) != 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:2: gzip method %d, flags %d: not known", name, p[2], p[3]);
+    if (p[3] & 4) at += 2 + (size_t)gsf__load_le(p + 10, 2);
+    for (int text = 8; text <= 16; text *= 2) // name, comment
+        if (p[3] & text) {
+            while (at < size && p[at]) at++;
+            at++;
+        }
+    if (p[3] & 2) at += 2;
+    if (at > size - 8) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut inside the gzip header", name, size);
+    *body = at;
+    return GSF_OK;
+}
+
+// Content of a gzip file, *out_size > 0 bytes, freed by the caller. How long it is only the end of the file says; more
+// than DEFLATE can make of the file is not believed.
+static gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
+                                 unsigned char** out, size_t* out_size) {
+    size_t body = 0;
+    *out = NULL;
+    *out_size = 0;
+    GSF__TRY(gsf__gzip_read_head(ctx, name, data, size, &body));
+    const size_t whole = (size_t)gsf__load_le(data + size - 4, 4);
+    if (whole == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: gzip file of nothing", name, size - 4);
+    if (whole / GSF__DEFLATE_RATIO > size - body - 8)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes of content claimed, more than %zu can inflate to", name,
+                        size - 4, whole, size - body - 8);
+    unsigned char* content = (unsigned char*)gsf_alloc(ctx, whole, 1);
+    if (!content) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = gsf__inflate(ctx, name, data, size, body, content, whole);
+    if (result == GSF_OK && gsf__load_le(data + size - 8, 4) != gsf__crc32(0, content, whole))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: checksum mismatch", name, size - 8);
+    if (result != GSF_OK) {
+        gsf_free(ctx, content);
+        return result;
+    }
+    *out = content;
+    *out_size = whole;
+    return GSF_OK;
+}
+
+// Appends `data` (size > 0) as a gzip file, or leaves `out` as it was.
+static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+    static const unsigned char head[10] = {0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255}; // no time, no system: same bytes always
+    const size_t before = out->size;
+    char tail[8];
+    gsf_text_append(ctx, out, (const char*)head, sizeof head);
+    gsf_result result = gsf__deflate(ctx, name, data, size, out);
+    gsf__store_le(tail, gsf__crc32(0, data, size), 4);
+    gsf__store_le(tail + 4, size & 0xffffffffu, 4);
+    gsf_text_append(ctx, out, tail, sizeof tail);
+    if (result == GSF_OK && out->failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result != GSF_OK) out->size = before;
+    return result;
+}
+
+/* .spz (Niantic), versions 1 to 3: a gzip file of, little-endian,
+       magic u32 0x5053474e | version u32 | count u32 | SH degree u8 | fraction bits u8 | flags u8 | reserved u8
+       positions   count x 3 x i24, in units of 2^-fraction; version 1: 3 x float16
+       opacities   count x u8 of [0,1]
+       colours     count x 3 x u8: 127.5 + 255 * 0.15 * coefficient of SH band 0
+       scales      count x 3 x u8: 16 * (logarithm + 10)
+       rotations   count x 3 x u8: 127.5 + 127.5 * x, y, z of the unit quaternion whose w is not negative;
+                   version 3: count x u32: index (x y z w) of the largest component in the top 2 bits, then sign and 9 bits
+                   of each other one in units of sqrt(1/2) / 511, the largest taken as positive
+       SH          count x (K - 1) x 3 x u8: 128 + 128 * coefficient, written rounded to 5 (band 1) or 4 bits
+   Axes are right, up, back; ours (and PLY's) right, down, front: y and z change sign, so do x of the rotation's other two
+   axes, and the SH coefficients that are odd in y or z, as gsf__spz_signs has it. */
+
+enum { GSF__SPZ_HEAD = 16, GSF__SPZ_ANTIALIASED = 1, GSF__SPZ_EXTENDED = 2, GSF__SPZ_FRACTION_MAX = 23 };
+
+static const float gsf__spz_signs[15] = {-1.0f, -1.0f, 1.0f, -1.0f, 1.0f, 1.0f, -1.0f, 1.0f,
+                                         -1.0f, 1.0f,  -1.0f, -1.0f, 1.0f, -1.0f, 1.0f};
+static const float gsf__spz_axes[3] = {1.0f, -1.0f, -1.0f};
+static const float gsf__spz_color = 0.15f, gsf__sqrt_half = 0.70710678118654752440f;
+
+typedef struct gsf__spz { // a file's content
+    const char* name;
+    int version, fraction, degree, flags; // degree: the file's, 0..4
+    size_t count, size;                   // size: of the content without extensions
+    double unit;                          // 2^-fraction
+    const unsigned char *positions, *alphas, *colors, *scales, *rotations, *sh;
+    gsf_splats* splats;
+    uint8_t* bad;
+    float logits[256];
+} gsf__spz;
+
+static size_t gsf__spz_row(int version, int degree) {
+    return (version == 1 ? 6u : 9u) + 1 + 3 + 3 + (version == 3 ? 4u : 3u) + 3 * (size_t)(degree * (degree + 2));
+}
+
+static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
+                                     gsf__spz* spz) {
+    memset(spz, 0, sizeof *spz);
+    spz->name = name;
+    if (size < GSF__SPZ_HEAD || memcmp(p, "NGSP", 4) != 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 0: no SPZ (magic NGSP expected)", name);
+    const unsigned version = (unsigned)gsf__load_le(p + 4, 4);
+    if (version < 1 || version > 3)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: content byte 4: SPZ version %u, 1 to 3 are read", name, version);
+    spz->version = (int)version;
+    spz->count = (size_t)gsf__load_le(p + 8, 4);
+    spz->degree = p[12];
+    spz->fraction = p[13];
+    spz->flags = p[14];
+    spz->unit = ldexp(1.0, -spz->fraction);
+    if (spz->degree > 4)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 12: SH degree %d is not 0..4", name, spz->degree);
+    if (version > 1 && spz->fraction > 30)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 13: %d fraction bits, at most 30 make sense", name,
+                        spz->fraction);
+    if (!gsf__mul_size(spz->count, gsf__spz_row(spz->version, spz->degree), &spz->size) ||
+        spz->size > SIZE_MAX - GSF__SPZ_HEAD)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: %zu splats exceed the address space", name, spz->count);
+    spz->size += GSF__SPZ_HEAD;
+    return GSF_OK;
+}
+
+static void gsf__spz_place(gsf__spz* spz, const unsigned char* content) {
+    spz->positions = content + GSF__SPZ_HEAD;
+    spz->alphas = spz->positions + spz->count * (spz->version == 1 ? 6u : 9u);
+    spz->colors = spz->alphas + spz->count;
+    spz->scales = spz->colors + 3 * spz->count;
+    spz->rotations = spz->scales + 3 * spz->count;
+    spz->sh = spz->rotations + spz->count * (spz->version == 3 ? 4u : 3u);
+}
+
+// Inflates the content into *out (freed by the caller) and finds what is where in it.
+static gsf_result gsf__spz_inflate(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
+                                   gsf__spz* spz, unsigned char** out) {
+    size_t whole = 0;
+    *out = NULL;
+    if (size >= 8 && memcmp(data, "NGSP", 4) == 0)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "%s:4: SPZ version %u without gzip (version 4 uses zstd), 1 to 3 are read", name,
+                        (unsigned)gsf__load_le(data + 4, 4));
+    GSF__TRY(gsf__gzip_read(ctx, name, data, size, out, &whole));
+    gsf_result result = gsf__spz_read_head(ctx, name, *out, whole, spz);
+    if (result == GSF_OK && (whole < spz->size || (whole > spz->size && !(spz->flags & GSF__SPZ_EXTENDED))))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 8: %zu splats take %zu bytes, the content has %zu", name,
+                          spz->count, spz->size, whole);
+    if (result == GSF_OK) {
+        if (spz->flags & GSF__SPZ_EXTENDED)
+            gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu bytes of extensions ignored (one of them can change the axes)", name,
+                    whole - spz->size);
+        gsf__spz_place(spz, *out);
+    } else {
+        gsf_free(ctx, *out);
+        *out = NULL;
+    }
+    return result;
+}
+
+static void gsf__spz_position(const void* arg, size_t i, double* out) {
+    const gsf__spz* spz = (const gsf__spz*)arg;
+    for (size_t k = 0; k < 3; k++) {
+        if (spz->version == 1) {
+            out[k] = (double)gsf__half_to_float((uint16_t)gsf__load_le(spz->positions + 6 * i + 2 * k, 2));
+        } else {
+            const int32_t fixed = (int32_t)gsf__load_le(spz->positions + 9 * i + 3 * k, 3);
+            out[k] = (double)(fixed < 0x800000 ? fixed : fixed - 0x1000000) * spz->unit;
+        }
+        out[k] *= (double)gsf__spz_axes[k];
+    }
+}
+
+// p: as the file has it; q: w x y z in our axes.
+static void gsf__spz_decode_rotation(const unsigned char* p, int version, float q[4]) {
+    float sum = 0.0f;
+    if (version < 3) {
+        for (int k = 0; k < 3; k++) {
+            q[1 + k] = (float)p[k] / 127.5f - 1.0f;
+            sum += q[1 + k] * q[1 + k];
+        }
+        q[0] = sqrtf(fmaxf(0.0f, 1.0f - sum));
+    } else {
+        uint32_t word = (uint32_t)gsf__load_le(p, 4);
+        const int largest = (int)(word >> 30); // of x y z w; component c is q[(c + 1) & 3]
+        for (int c = 3; c >= 0; c--) {
+            if (c == largest) continue;
+            const float value = gsf__sqrt_half * (float)(word & 511u) / 511.0f;
+            q[(c + 1) & 3] = word & 512u ? -value : value;
+            sum += value * value;
+            word >>= 10;
+        }
+        q[(largest + 1) & 3] = sqrtf(fmaxf(0.0f, 1.0f - sum));
+    }
+    q[2] = -q[2];
+    q[3] = -q[3];
+}
+
+static void gsf__spz_decode_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__spz* spz = (const gsf__spz*)arg;
+    const gsf_splats* s = spz->splats;
+    const size_t begin = chunk * GSF__PACK_CHUNK, rotation = spz->version == 3 ? 4 : 3;
+    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree), stored = (size_t)(spz->degree * (spz->degree + 2));
+    (void)worker;
+    for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
+        const unsigned char* sh = spz->sh + 3 * stored * i;
+        double p[3];
+        int bad = 0;
+        gsf__spz_position(spz, i, p);
+        for (size_t k = 0; k < 3; k++) {
+            s->means[3 * i + k] = (float)(p[k] - s->origin[k]);
+            bad |= gsf__float_is_bad(s->means[3 * i + k]);
+            s->log_scales[3 * i + k] = (float)spz->scales[3 * i + k] / 16.0f - 10.0f;
+            s->sh[3 * bands * i + k] = ((float)spz->colors[3 * i + k] / 255.0f - 0.5f) / gsf__spz_color;
+        }
+        for (size_t k = 1; k < bands; k++)
+            for (size_t c = 0; c < 3; c++)
+                s->sh[3 * (bands * i + k) + c] =
+                    gsf__spz_signs[k - 1] * ((float)sh[3 * (k - 1) + c] - 128.0f) / 128.0f;
+        gsf__spz_decode_rotation(spz->rotations + rotation * i, spz->version, s->quats + 4 * i);
+        s->opacity_logits[i] = spz->logits[spz->alphas[i]];
+        spz->bad[i] = (uint8_t)bad;
+    }
+}
+
+static gsf_result gsf__spz_parse(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
+    gsf__spz spz;
+    unsigned char* content;
+    GSF__TRY(gsf__spz_inflate(ctx, name, (const unsigned char*)data, size, &spz, &content));
+    gsf_result result = gsf_splat_make(ctx, spz.count, spz.degree < 3 ? spz.degree : 3, out);
+    if (result == GSF_OK) {
+        spz.splats = out;
+        spz.bad = (uint8_t*)gsf_alloc(ctx, spz.count ? spz.count : 1, 1);
+        gsf__make_logits(spz.logits);
+        out->antialiased = (spz.flags & GSF__SPZ_ANTIALIASED) != 0;
+        result = spz.bad ? gsf__sample_origin(ctx, spz.count, gsf__spz_position, &spz, out->origin)
+                         : GSF_ERROR_OUT_OF_MEMORY;
+        if (result == GSF_OK) {
+            gsf__parallel_for(ctx, (spz.count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__spz_decode_chunk, &spz);
+            gsf__drop_rows(ctx, name, spz.bad, out);
+            if (spz.degree > 3) gsf_log(ctx, GSF_LOG_WARNING, "%s: SH band 4 ignored", name);
+        } else {
+            gsf_splat_destroy(ctx, out);
+        }
+        gsf_free(ctx, spz.bad);
+    }
+    gsf_free(ctx, content);
+    return result;
+}
+
+static void gsf__spz_encode_rotation(const float* quat, int version, unsigned char* p) {
+    float q[4], v[4]; // v: x y z w in the file's axes
+    gsf__unit_quat(quat, q);
+    v[0] = q[1];
+    v[1] = -q[2];
+    v[2] = -q[3];
+    v[3] = q[0];
+    if (version < 3) {
+        for (int k = 0; k < 3; k++) p[k] = gsf__to_u8(v[k] * (v[3] < 0.0f ? -127.5f : 127.5f) + 127.5f);
+        return;
+    }
+    int largest = 0;
+    for (int c = 1; c < 4; c++)
+        if (fabsf(v[c]) > fabsf(v[largest])) largest = c;
+    uint32_t word = (uint32_t)largest;
+    for (int c = 0; c < 4; c++) {
+        if (c == largest) continue;
+        const uint32_t size = (uint32_t)(511.0f * (fabsf(v[c]) / gsf__sqrt_half) + 0.5f);
+        word = word << 10 | (uint32_t)((v[c] < 0.0f) != (v[largest] < 0.0f)) << 9 | (size < 511u ? size : 511u);
+    }
+    gsf__store_le(p, word, 4);
+}
+
+// To the nearest multiple of `bucket` on the scale of 128 per unit around 128.
+static unsigned char gsf__spz_encode_sh(float value, int bucket) {
+    const float scaled = value * 128.0f;
+    if (scaled >= 127.0f) return 255;
+    if (scaled <= -128.0f) return 0;
+    const int whole = (int)(scaled < 0.0f ? scaled - 0.5f : scaled + 0.5f) + 128;
+    const int rounded = (whole + bucket / 2) / bucket * bucket;
+    return (unsigned char)(rounded < 255 ? rounded : 255);
+}
+
+static void gsf__spz_encode_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__pack* job = (const gsf__pack*)arg;
+    const gsf_splats* s = job->splats;
+    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    const size_t rotation = job->version == 3 ? 4 : 3;
+    const double units = ldexp(1.0, job->fraction);
+    (void)worker;
+    for (size_t row = begin; row < gsf__pack_end(job->count, begin); row++) {
+        const size_t i = job->rows ? job->rows[row] : row;
+        unsigned char* sh = job->sh + 3 * (bands - 1) * row;
+        for (size_t k = 0; k < 3; k++) {
+            const double p = (s->origin[k] + (double)s->means[3 * i + k]) * units * (double)gsf__spz_axes[k];
+            const int32_t fixed = (int32_t)(p < 0.0 ? p - 0.5 : p + 0.5); // in range by the choice of fraction
+            gsf__store_le(job->positions + 9 * row + 3 * k, (uint32_t)fixed & 0xffffffu, 3);
+            job->scales[3 * row + k] = gsf__to_u8((s->log_scales[3 * i + k] + 10.0f) * 16.0f);
+            job->colors[3 * row + k] = gsf__to_u8(s->sh[3 * bands * i + k] * (gsf__spz_color * 255.0f) + 127.5f);
+        }
+        job->alphas[row] = gsf__to_u8(gsf__logistic_u8(s->opacity_logits[i]));
+        gsf__spz_encode_rotation(s->quats + 4 * i, job->version, job->rotations + rotation * row);
+        for (size_t k = 1; k < bands; k++)
+            for (size_t c = 0; c < 3; c++)
+                sh[3 * (k - 1) + c] = gsf__spz_encode_sh(gsf__spz_signs[k - 1] * s->sh[3 * (bands * i + k) + c],
+                                                         k < 4 ? 8 : 16);
+    }
+}
+
+// Fraction bits: the official 12, more where splats are small (a step is then at most 1/32 of the median scale), fewer
+// where positions do not fit 24 bits otherwise.
+static gsf_result gsf__spz_choose_fraction(gsf_context* ctx, gsf__pack* job) {
+    const double most = 8388607.0;
+    if (job->farthest > most)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "%s: a coordinate of %.9g: SPZ holds up to 8388607; write relative to the origin (local), or a PLY",
+                        job->name, job->farthest);
+    job->fraction = 12;
+    while (job->fraction < GSF__SPZ_FRACTION_MAX && ldexp(1.0, -job->fraction) > job->typical / 32.0) job->fraction++;
+    while (job->fraction > 0 && ldexp(job->farthest, job->fraction) > most) job->fraction--;
+    gsf__pack_warn_coarse(ctx, job, ldexp(1.0, -job->fraction));
+    return GSF_OK;
+}
+
+// Scales beyond what 8 bits hold; thin ones may be thinner than that without anybody seeing it.
+static void gsf__spz_warn_scales(gsf_context* ctx, const gsf__pack* job) {
+    const gsf_splats* s = job->splats;
+    size_t clamped = 0;
+    for (size_t row = 0; row < job->count; row++) {
+        const float* v = s->log_scales + 3 * (job->rows ? job->rows[row] : row);
+        const float largest = fmaxf(fmaxf(v[0], v[1]), v[2]);
+        clamped += largest > 6.0f || largest < -10.0f;
+    }
+    if (clamped)
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats are larger than 379 or smaller than 4.5e-5: clamped",
+                job->name, clamped, job->count);
+}
+
+static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_splats* splats, int version,
+                                  gsf_text* out) {
+    gsf__pack job;
+    size_t size = 0;
+    if (version != 2 && version != 3)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SPZ version %d: 2 and 3 are written", name, version);
+    GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
+    job.version = version;
+    gsf_result result = gsf__spz_choose_fraction(ctx, &job);
+    gsf__spz_warn_scales(ctx, &job);
+    if (result == GSF_OK &&
+        (!gsf__mul_size(job.count, gsf__spz_row(version, splats->sh_degree), &size) || size > SIZE_MAX / 2))
+        result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", job.count);
+    if (result == GSF_OK && !(job.out = (unsigned char*)gsf_alloc(ctx, GSF__SPZ_HEAD + size, 1)))
+        result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) {
+        memset(job.out, 0, GSF__SPZ_HEAD);
+        memcpy(job.out, "NGSP", 4);
+        gsf__store_le(job.out + 4, (uint64_t)version, 4);
+        gsf__store_le(job.out + 8, job.count, 4);
+        job.out[12] = (unsigned char)splats->sh_degree;
+        job.out[13] = (unsigned char)job.fraction;
+        job.out[14] = splats->antialiased ? GSF__SPZ_ANTIALIASED : 0;
+        job.positions = job.out + GSF__SPZ_HEAD;
+        job.alphas = job.positions + 9 * job.count;
+        job.colors = job.alphas + job.count;
+        job.scales = job.colors + 3 * job.count;
+        job.rotations = job.scales + 3 * job.count;
+        job.sh = job.rotations + (version == 3 ? 4u : 3u) * job.count;
+        gsf__parallel_for(ctx, (job.count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__spz_encode_chunk, &job);
+        result = gsf__gzip_append(ctx, name, job.out, GSF__SPZ_HEAD + size, out);
+    }
+    gsf_free(ctx, job.out);
+    gsf__pack_free(ctx, &job);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
+    const unsigned char* p = (const unsigned char*)data;
+    memset(out, 0, sizeof *out);
+    switch (gsf__type_of_name(name)) {
+        case GSF_SPLAT_PLY: return gsf_splat_parse_ply(ctx, name, data, size, out);
+        case GSF_SPLAT_SPLAT: return gsf__splat_parse(ctx, name, data, size, out);
+        case GSF_SPLAT_SPZ: return gsf__spz_parse(ctx, name, data, size, out);
+        case GSF_SPLAT_AUTO: break;
+    }
+    if (size >= 4 && memcmp(p, "ply", 3) == 0) return gsf_splat_parse_ply(ctx, name, data, size, out);
+    if (size >= 4 && ((p[0] == 0x1f && p[1] == 0x8b) || memcmp(p, "NGSP", 4) == 0))
+        return gsf__spz_parse(ctx, name, data, size, out);
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: neither PLY nor SPZ, and .splat is known by its name only", name);
+}
+
+GSF_API gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out) {
+    void* data;
+    size_t size;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    const gsf_result result = gsf_splat_parse(ctx, path, data, size, out);
+    gsf_free(ctx, data);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats,
+                                    const gsf_splat_save_desc* desc, gsf_text* out) {
+    gsf_splat_save_desc d;
+    gsf_splats view = *splats;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.type == GSF_SPLAT_AUTO) d.type = gsf__type_of_name(name);
+    if (d.local) memset(view.origin, 0, sizeof view.origin);
+    switch (d.type) {
+        case GSF_SPLAT_PLY: return gsf_splat_format_ply(ctx, &view, out);
+        case GSF_SPLAT_SPLAT: return gsf__splat_format(ctx, name, &view, out);
+        case GSF_SPLAT_SPZ: return gsf__spz_format(ctx, name, &view, d.spz_version ? d.spz_version : 3, out);
+        case GSF_SPLAT_AUTO: break;
+    }
+    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: does not end in .ply, .splat or .spz", name);
+}
+
+GSF_API gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_splats* splats,
+                                  const gsf_splat_save_desc* desc) {
+    gsf_text text;
+    memset(&text, 0, sizeof text);
+    gsf_result result = gsf_splat_format(ctx, path, splats, desc, &text);
     if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
     gsf_destroy_text(ctx, &text);
     return result;
