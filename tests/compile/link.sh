@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # link.sh COMPILER STANDARD: modules compiled in separate translation units link with a caller in the other language,
-# private copies (GSFIXER_STATIC) live side by side, and every declared function is defined.
+# private copies (GSFIXER_STATIC) live side by side, every declared function is defined, and what GSF_NO_STB leaves works.
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
 link() { # NAME SOURCE...: compiles by extension, links, runs
@@ -59,6 +59,38 @@ for file in one two; do
     } > "$work/$file.$ext"
 done
 link "GSFIXER_STATIC in two files" "one.$ext" "two.$ext"
+
+# Without stb: .spz is refused both ways, in a sentence; the other formats work.
+cat > "$work/no_stb.$ext" <<'TEXT'
+#define GSF_NO_STB
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_splat.h"
+static int unsupported(gsf_context* ctx, gsf_result result) {
+    return result == GSF_ERROR_UNSUPPORTED && strncmp(ctx->error, "a.spz: ", 7) == 0 && strstr(ctx->error, "GSF_NO_STB");
+}
+int main(void) {
+    static const unsigned char spz[] = {31, 139, 8, 0, 0, 0, 0, 0, 0, 3, 3, 0, 0, 0, 0, 0, 16, 0, 0, 0};
+    static const char* const names[2] = {"a.ply", "a.splat"};
+    gsf_context ctx;
+    gsf_splats splats, again;
+    gsf_text text;
+    memset(&ctx, 0, sizeof ctx);
+    memset(&text, 0, sizeof text);
+    if (gsf_init_context(&ctx) != GSF_OK || gsf_splat_make(&ctx, 2, 1, &splats) != GSF_OK) return 1;
+    if (!unsupported(&ctx, gsf_splat_parse(&ctx, "a.spz", spz, sizeof spz, &again)) || again.owned) return 2;
+    if (!unsupported(&ctx, gsf_splat_format(&ctx, "a.spz", &splats, NULL, &text)) || text.size) return 3;
+    for (int i = 0; i < 2; i++) {
+        text.size = 0;
+        if (gsf_splat_format(&ctx, names[i], &splats, NULL, &text) != GSF_OK) return 4;
+        if (gsf_splat_parse(&ctx, names[i], text.data, text.size, &again) != GSF_OK || again.count != 2) return 5;
+        gsf_splat_destroy(&ctx, &again);
+    }
+    gsf_destroy_text(&ctx, &text);
+    gsf_splat_destroy(&ctx, &splats);
+    return 0;
+}
+TEXT
+link "GSF_NO_STB" "no_stb.$ext"
 
 # Every function that a header declares (the text before "The API ends here") is defined somewhere.
 {

@@ -1,0 +1,70 @@
+// fuzz_spz.c - SPZ files, and the gzip inside. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION.
+//   The input is taken three times: as a file; as the content of a file (whose checksum no mutation would hit), which is
+//   packed and read; and as DEFLATE data of a content whose length the first two bytes say.
+#define GSFIXER_IMPLEMENTATION
+#include "fuzz.h"
+
+// What was accepted is finite and, unless a coordinate is out of SPZ's range, survives being written and read again.
+static void use(gsf_context* ctx, gsf_splats* splats) {
+    gsf_splats again;
+    gsf_text text;
+    const size_t sh = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree);
+    memset(&text, 0, sizeof text);
+    for (size_t i = 0; i < 3 * splats->count; i++)
+        FUZZ_CHECK(isfinite(splats->means[i]) && isfinite(splats->log_scales[i]));
+    for (size_t i = 0; i < 4 * splats->count; i++) FUZZ_CHECK(isfinite(splats->quats[i]));
+    for (size_t i = 0; i < splats->count; i++) FUZZ_CHECK(isfinite(splats->opacity_logits[i]));
+    for (size_t i = 0; i < sh * splats->count; i++) FUZZ_CHECK(isfinite(splats->sh[i]));
+    const gsf_result result = gsf_splat_format(ctx, "again.spz", splats, NULL, &text);
+    FUZZ_CHECK(result == GSF_OK || result == GSF_ERROR_UNSUPPORTED);
+    if (result == GSF_OK) {
+        FUZZ_CHECK(gsf_splat_parse(ctx, "again.spz", text.data, text.size, &again) == GSF_OK);
+        FUZZ_CHECK(again.count == splats->count && again.sh_degree == splats->sh_degree &&
+                   again.antialiased == splats->antialiased);
+        FUZZ_CHECK(memcmp(again.log_scales, splats->log_scales, 3 * splats->count * sizeof(float)) == 0);
+        FUZZ_CHECK(memcmp(again.opacity_logits, splats->opacity_logits, splats->count * sizeof(float)) == 0);
+        gsf_splat_destroy(ctx, &again);
+    }
+    gsf_destroy_text(ctx, &text);
+    gsf_splat_destroy(ctx, splats);
+}
+
+static void parse(gsf_context* ctx, const void* data, size_t size) {
+    gsf_splats splats;
+    if (gsf_splat_parse(ctx, "fuzz.spz", data, size, &splats) == GSF_OK) use(ctx, &splats);
+    else FUZZ_CHECK(splats.owned == NULL && strncmp(ctx->error, "fuzz.spz:", 9) == 0);
+    FUZZ_CHECK(splats.owned == NULL);
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
+    gsf_context ctx = fuzz_context(size);
+    fuzz_limit = (size_t)(16 * GSF__DEFLATE_RATIO) * size + ((size_t)4 << 20); // as much as DEFLATE can hold, unpacked
+    parse(&ctx, data, size);
+
+    if (size > 0) {
+        gsf_text packed;
+        unsigned char* back;
+        size_t back_size;
+        memset(&packed, 0, sizeof packed);
+        FUZZ_CHECK(gsf__gzip_append(&ctx, "packed", data, size, &packed) == GSF_OK);
+        FUZZ_CHECK(packed.size <= size + 5 * (size / 32767 + 1) + 18);
+        const unsigned char* bytes = (const unsigned char*)packed.data;
+        FUZZ_CHECK(gsf__gzip_read(&ctx, "packed", bytes, packed.size, &back, &back_size) == GSF_OK);
+        FUZZ_CHECK(back_size == size && memcmp(back, data, size) == 0);
+        gsf_free(&ctx, back);
+        parse(&ctx, packed.data, packed.size);
+        gsf_destroy_text(&ctx, &packed);
+    }
+    if (size > 2) {
+        const size_t room = 1 + data[0] + 256u * (data[1] & 15u);
+        unsigned char *out = (unsigned char*)malloc(room), *body = (unsigned char*)malloc(size - 2 + 8);
+        FUZZ_CHECK(out && body); // of exactly these sizes: a sanitizer sees the byte behind them
+        memcpy(body, data + 2, size - 2);
+        memset(body + size - 2, 0xa5, 8); // where a file has its checksum and size
+        (void)gsf__inflate(&ctx, "raw", body, size - 2 + 8, 0, out, room);
+        free(body);
+        free(out);
+    }
+    FUZZ_CHECK(fuzz_live == 0);
+    return 0;
+}
