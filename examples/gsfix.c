@@ -61,6 +61,8 @@ static const option_spec option_specs[] = {
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
      "write OUT/checkpoint every N steps and after every repaired window (default: 20 times a run and after every window, "
      "but so seldom that it costs less than 2 % of the time; never more than once a second)"},
+    {"--also", TEXT, AT(also), 0, 0, "splat|spz|splat,spz", "fix",
+     "also write the splats as OUT/splats.splat (no view-dependent colour), OUT/splats.spz"},
     {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix",
      "single settings of the trainer and of the loop, by name:"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render its views"},
@@ -103,9 +105,9 @@ typedef struct command_spec {
 } command_spec;
 
 static const command_spec command_specs[] = {
-    {"info", "SCENE | SPLATS.ply", "what a scene or a splat file holds", 1, run_info},
+    {"info", "SCENE | SPLATS.ply|.splat|.spz", "what a scene or a splat file holds", 1, run_info},
     {"fix", "SCENE --out DIR", "photos and COLMAP model in, repaired splats and a report out", 1, gsfix_run_fix},
-    {"render", "SPLATS.ply (--scene SCENE | --path PATH.json) --out DIR", "pictures of splats", 1, run_render},
+    {"render", "SPLATS.ply|.splat|.spz (--scene SCENE | --path PATH.json) --out DIR", "pictures of splats", 1, run_render},
     {"filter", "SCENE --out SCENE2", "COLMAP model with only the points that the training views see", 1, run_filter},
     {"path", "SCENE --out PATH.json", "a camera path through a scene", 1, run_path},
     {"restore", "FRAMES_DIR --restorer ... --out DIR", "repairs one clip of frames", 1, run_restore},
@@ -470,7 +472,7 @@ static gsf_result info_scene(gsfix_app* app) {
 
 static gsf_result info_splats(gsfix_app* app) {
     gsf_splats s;
-    gsf_result result = gsf_splat_load_ply(&app->ctx, app->o.inputs[0], &s);
+    gsf_result result = gsf_splat_load(&app->ctx, app->o.inputs[0], &s);
     if (result != GSF_OK) return result;
     double* world = (double*)gsf_alloc(&app->ctx, s.count + 1, 3 * sizeof *world);
     double* column = (double*)gsf_alloc(&app->ctx, s.count + 1, sizeof *column);
@@ -480,7 +482,8 @@ static gsf_result info_splats(gsfix_app* app) {
         gsfix_json_text(&app->ctx, json, "kind", "splats");
         gsfix_json_number(&app->ctx, json, "splats", (double)s.count);
         gsfix_json_number(&app->ctx, json, "sh_degree", s.sh_degree);
-        gsfix_print(app, "splats     %zu of SH degree %d", s.count, (int)s.sh_degree);
+        gsfix_json_bool(&app->ctx, json, "antialiased", s.antialiased);
+        gsfix_print(app, "splats     %zu of SH degree %d%s", s.count, (int)s.sh_degree, s.antialiased ? ", antialiased" : "");
         for (size_t i = 0; i < 3 * s.count; i++) world[i] = (double)s.means[i] + s.origin[i % 3];
         print_box(app, "extent", world, s.count);
         size_t opaque = 0, faint = 0;
@@ -513,9 +516,10 @@ static gsf_result info_splats(gsfix_app* app) {
 
 static int run_info(gsfix_app* app) {
     const char* path = app->o.inputs[0];
-    const size_t n = strlen(path);
-    const int ply = n > 4 && strcmp(path + n - 4, ".ply") == 0 && !gsfix_is_folder(path);
-    return (ply ? info_splats(app) : info_scene(app)) == GSF_OK ? 0 : gsfix_failed(app);
+    const char* ending = strrchr(path, '.');
+    const int is_splats = ending && !gsfix_is_folder(path) &&
+                          (strcmp(ending, ".ply") == 0 || strcmp(ending, ".splat") == 0 || strcmp(ending, ".spz") == 0);
+    return (is_splats ? info_splats(app) : info_scene(app)) == GSF_OK ? 0 : gsfix_failed(app);
 }
 
 // ---- render ----------------------------------------------------------------------
@@ -558,7 +562,8 @@ static gsf_result render_all(gsfix_app* app) {
     double seconds = 0.0;
     gsf_render_desc desc = {0};
     desc.footprint = gsfix_find_quality(app->o.quality)->footprint;
-    gsf_result result = gsf_splat_load_ply(ctx, app->o.inputs[0], &splats);
+    gsf_result result = gsf_splat_load(ctx, app->o.inputs[0], &splats);
+    desc.antialiased = splats.antialiased;
     if (result == GSF_OK && app->o.scene) result = gsfix_load_scene(app, app->o.scene, &scene);
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
     if (result == GSF_OK && app->o.scene) count = scene.view_count;
@@ -807,7 +812,7 @@ static gsf_result write_masks(gsfix_app* app) {
     double mean = 0.0;
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
     if (result != GSF_OK) return result;
-    result = gsf_splat_load_ply(ctx, app->o.model, &splats);
+    result = gsf_splat_load(ctx, app->o.model, &splats);
     if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
     if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &train);
     if (result == GSF_OK) result = gsfix_make_folder(ctx, app->o.out);

@@ -14,7 +14,7 @@
 #include <string.h>
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
-    const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings;
+    const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *model;
     int json, help, resume, depth, alpha;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows;

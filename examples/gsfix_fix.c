@@ -930,8 +930,23 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
-    gsfix_print(app, "wrote      %s/report.html  splats.ply  metrics.json  test/%s", app->o.out,
+    const char* also = app->o.also ? app->o.also : "";
+    gsfix_print(app, "wrote      %s/report.html  splats.ply%s%s  metrics.json  test/%s", app->o.out,
+                strstr(also, "splat") ? "  splats.splat" : "", strstr(also, "spz") ? "  splats.spz" : "",
                 h->round_count ? "  fixed/" : "");
+}
+
+static gsf_result save_splats(fix_run* run, const gsf_splats* splats) {
+    gsf_context* ctx = run->ctx;
+    const char *out = run->app->o.out, *also = run->app->o.also;
+    gsf_splats view = *splats;
+    view.antialiased = run->setup.fix.train.render.antialiased;
+    gsf_result result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.ply", out).s, &view, NULL);
+    if (result == GSF_OK && also && strstr(also, "splat"))
+        result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.splat", out).s, &view, NULL);
+    if (result == GSF_OK && also && strstr(also, "spz"))
+        result = gsf_splat_save(ctx, gsfix_pathf("%s/splats.spz", out).s, &view, NULL);
+    return result;
 }
 
 static gsf_result finish(fix_run* run) {
@@ -951,7 +966,7 @@ static gsf_result finish(fix_run* run) {
     r.views = views;
     r.iterations = run->iterations;
     r.splats = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(run->fixer));
-    gsf_result result = gsf_splat_save_ply(ctx, gsfix_pathf("%s/splats.ply", out).s, r.splats);
+    gsf_result result = save_splats(run, r.splats);
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);

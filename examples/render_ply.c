@@ -1,5 +1,5 @@
 // render_ply.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/render_ply.c -o render_ply -lm
-// Renders a 3DGS PLY to PNG files:   render_ply SPLATS.ply OUT_PREFIX [CAMERAS.json]
+// Renders splats (.ply, .splat, .spz) to PNG files:   render_ply SPLATS OUT_PREFIX [CAMERAS.json]
 // Without a camera list (the format of `gsfix path`) it flies one orbit of 8 pictures around the middle of the splats.
 // Writes OUT_PREFIX000.png, OUT_PREFIX001.png, ...
 #include "gsfixer_splat.h"
@@ -79,8 +79,10 @@ static gsf_result make_orbit(gsf_context* ctx, const gsf_splats* splats, gsf_cam
 static gsf_result render_one(gsf_context* ctx, gsf_rasterizer* rasterizer, const gsf_splats* splats,
                              const gsf_camera* camera, const char* path) {
     gsf_render_output out = {0};
+    gsf_render_desc desc = {0};
+    desc.antialiased = splats->antialiased;
     gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &out.color);
-    if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, NULL, &out);
+    if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, &desc, &out);
     if (result == GSF_OK) result = gsf_save_image(ctx, path, &out.color);
     gsf_destroy_image(ctx, &out.color);
     return result;
@@ -88,14 +90,14 @@ static gsf_result render_one(gsf_context* ctx, gsf_rasterizer* rasterizer, const
 
 int main(int argc, char** argv) {
     if (argc < 3 || argc > 4)
-        return fprintf(stderr, "usage: %s SPLATS.ply OUT_PREFIX [CAMERAS.json]\n", argv[0]), 2;
+        return fprintf(stderr, "usage: %s SPLATS OUT_PREFIX [CAMERAS.json]\n", argv[0]), 2;
     gsf_context ctx = {0};
     gsf_splats splats = {0};
     gsf_rasterizer* rasterizer = NULL;
     gsf_camera* cameras = NULL;
     size_t count = 0;
     gsf_result result = gsf_init_context(&ctx);
-    if (result == GSF_OK) result = gsf_splat_load_ply(&ctx, argv[1], &splats);
+    if (result == GSF_OK) result = gsf_splat_load(&ctx, argv[1], &splats);
     if (result == GSF_OK)
         result = argc > 3 ? gsf_load_cameras(&ctx, argv[3], &cameras, &count)
                           : make_orbit(&ctx, &splats, &cameras, &count);

@@ -41,9 +41,11 @@ expect 2 "$gsfix" render x.ply --out x
 expect 2 "$gsfix" metrics a b --which lpips
 expect 2 "$gsfix" path "$scene" --out x.json --frames 10 --windows 3
 expect 2 "$gsfix" info "$scene" --out x
+expect 2 "$gsfix" fix "$scene" --out x --also ply
 # the work fails: 1
 expect 1 "$gsfix" info nothing_here
 expect 1 "$gsfix" info nothing_here.ply
+expect 1 "$gsfix" info nothing_here.spz
 expect 1 "$gsfix" fix nothing_here --out x
 expect 1 "$gsfix" fix "$scene" --out /proc/no/such/folder --views 3
 expect 1 "$gsfix" fix "$scene" --out x --views 999
@@ -72,7 +74,7 @@ printf '#!/bin/sh\ncp "$1"/frames/00000.png "$1/out/"\n' > short.sh
 printf '#!/bin/sh\ncp "$1"/frames/*.png "$1/out/"; cp "$1"/refs/00000.png "$1/out/00001.png"; printf x > "$1/out/00002.png"\n' > broken.sh
 chmod +x ./*.sh
 small=(--views 3 --iterations 30 --set "rounds=1,windows=1,window_frames=4" --max-size 48)
-expect 0 "$gsfix" fix "$scene" --out a "${small[@]}" --restorer "exec:$PWD/copy.sh" --json
+expect 0 "$gsfix" fix "$scene" --out a "${small[@]}" --restorer "exec:$PWD/copy.sh" --also splat,spz --json
 is_json stdout
 is_json a/metrics.json
 cmp stdout a/metrics.json || fail "--json and metrics.json differ"
@@ -111,6 +113,12 @@ expect 0 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 48 --
 holds '"psnr_seen":' stdout
 expect 1 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 40 --masks masks
 expect 0 "$gsfix" info a/splats.ply
+splats=$(grep '^splats' stdout)
+for file in splats.splat splats.spz; do # as many splats
+    expect 0 "$gsfix" info a/$file
+    [ "$(grep -o '^splats *[0-9]*' stdout)" = "$(echo "$splats" | grep -o '^splats *[0-9]*')" ] || fail "a/$file has other splats"
+    expect 0 "$gsfix" render a/$file --scene "$scene" --max-size 48 --out frames_$file
+done
 expect 0 "$gsfix" render a/splats.ply --scene "$scene" --max-size 48 --out frames --depth --alpha
 expect 0 "$gsfix" metrics a/test frames --which psnr,ssim_3dgs,ssim_torchmetrics,ssim_skimage --json
 holds '"ssim_skimage":' stdout
