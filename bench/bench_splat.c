@@ -531,6 +531,75 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     gsf_splat_destroy(&ctx, &splats);
 }
 
+// ---- visible points ---------------------------------------------------------------
+
+// 27 balls of points in a 3 x 3 x 3 grid, seen from an arc of 90 degrees: no view shows a back, and the front balls hide
+// the others, so that about 30 % of the points are seen by any view.
+static void bench_visibility(const bench_options* o, const char* name, size_t count, size_t view_count, int threads) {
+    if (o->filter && !strstr(name, o->filter)) return;
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.threads = threads;
+    bench_require(&ctx, gsf_init_context(&ctx));
+    gsf_scene scene;
+    memset(&scene, 0, sizeof scene);
+    scene.view_count = view_count;
+    scene.point_count = count;
+    scene.views = (gsf_scene_view*)gsf_alloc_zeroed(&ctx, view_count, sizeof(gsf_scene_view));
+    scene.points = (double*)gsf_alloc(&ctx, 3 * count, sizeof(double));
+    scene.track_begin = (size_t*)gsf_alloc_zeroed(&ctx, count + 1, sizeof(size_t));
+    uint32_t* views = (uint32_t*)gsf_alloc(&ctx, view_count, sizeof(uint32_t));
+    uint8_t* keep = (uint8_t*)gsf_alloc(&ctx, count, 1);
+    if (!scene.views || !scene.points || !scene.track_begin || !views || !keep) exit(1);
+    for (size_t i = 0; i < count; i++) {
+        double d[3], length2 = 0.0;
+        for (uint64_t k = 0; k < 3; k++) {
+            d[k] = gsf_random_normal(11, k, i);
+            length2 += d[k] * d[k];
+        }
+        const uint64_t ball = gsf_random_bits(12, 0, i) % 27;
+        const double centre[3] = {(double)(ball % 3) - 1.0, (double)(ball / 3 % 3) - 1.0, (double)(ball / 9) - 1.0};
+        for (int k = 0; k < 3; k++) scene.points[3 * i + (size_t)k] = centre[k] + 0.42 * d[k] / sqrt(length2);
+    }
+    for (size_t v = 0; v < view_count; v++) {
+        const double angle = 1.5707963 * ((double)v + 0.5) / (double)view_count, up[3] = {0.0, -1.0, 0.0};
+        const double eye[3] = {6.0 * cos(angle), -1.5, 6.0 * sin(angle)}, target[3] = {0.0, 0.0, 0.0};
+        double pose[16];
+        bench_require(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
+        gsf_camera* c = &scene.views[v].camera;
+        *c = bench_camera(1600, 1200);
+        c->fx = c->fy = 1600.0;
+        gsf_camera_set_c2w(c, pose);
+        views[v] = (uint32_t)v;
+    }
+    gsf_visibility_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.method = GSF_VISIBILITY_RAYS;
+    gsf_visibility_stats stats;
+    const double cpu = bench_cpu();
+    bench_require(&ctx, gsf_splat_visible_points(&ctx, &scene, views, view_count, &desc, keep, &stats));
+    const double cpu_seconds = bench_cpu() - cpu;
+    const char* by = stats.used_embree ? "embree" : "cells";
+    char label[96];
+    snprintf(label, sizeof label, "%s: normals", name);
+    bench_row row = bench_make_row(label, ctx.cpu_level, threads, stats.seconds_normals, cpu_seconds, (double)count, "points");
+    row.variant = by;
+    bench_print(o, &row);
+    snprintf(label, sizeof label, "%s: build and rays", name);
+    row = bench_make_row(label, ctx.cpu_level, threads, stats.seconds_build + stats.seconds_rays, cpu_seconds,
+                         (double)stats.rays, "rays");
+    row.variant = by;
+    bench_print(o, &row);
+    if (!o->json) printf("%s: by %s, %.1f %% of the points kept\n", name, by, 100.0 * (double)stats.kept / (double)count);
+    gsf_free(&ctx, keep);
+    gsf_free(&ctx, views);
+    gsf_free(&ctx, scene.track_begin);
+    gsf_free(&ctx, scene.points);
+    gsf_free(&ctx, scene.views);
+}
+
+// ---- training steps on photos -----------------------------------------------------
+
 static int bench_listed(const char* list, const char* name) { // is `name` a line of `list`?
     const size_t length = strlen(name);
     for (const char* p = list; p && *p; p = strchr(p, '\n') ? strchr(p, '\n') + 1 : NULL)
@@ -629,5 +698,7 @@ int main(int argc, char** argv) {
             if (levels[k] > GSF_CPU_SCALAR)
                 bench_stages(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads);
         }
+    bench_visibility(&o, "visibility 100k 20 views", 100000, 20, o.threads ? o.threads : 2);
+    if (o.filter && !o.quick) bench_visibility(&o, "visibility 5M 100 views", 5000000, 100, o.threads ? o.threads : 2);
     return 0;
 }
