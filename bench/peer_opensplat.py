@@ -1,0 +1,61 @@
+#!/usr/bin/env python3
+"""Time per training step of OpenSplat on the CPU, as a row of bench_splat --json.
+
+    bench/peer_opensplat.py OPENSPLAT SCENE [START.ply] [--steps 200]
+
+OpenSplat prints a line per step, after backward and before Adam, so that the time between two lines is one whole step.
+Density control is off (a warm-up longer than the run), all SH bands are in from the first step, no downscaling. Its
+START.ply must be one that it wrote itself. Wall and CPU seconds are medians and means over the steps after the first.
+"""
+import argparse
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("opensplat")
+    parser.add_argument("scene")
+    parser.add_argument("start", nargs="?")
+    parser.add_argument("--steps", type=int, default=200)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [options.opensplat, options.scene, "-n", str(options.steps + 1), "--num-downscales", "0", "--keep-crs",
+                   "--sh-degree-interval", "1", "--warmup-length", "1000000", "-o", os.path.join(folder, "out.ply")]
+        if options.start:
+            command += ["--resume", options.start]
+        environment = dict(os.environ, OMP_NUM_THREADS="2")
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, bufsize=0)
+        clock = ((~process.pid) << 3) | 2  # the CPU clock of another process, as clock_getcpuclockid makes it
+        stamps, rest = [], b""
+        while True:
+            block = os.read(process.stdout.fileno(), 65536)
+            if not block:
+                break
+            now = time.monotonic()
+            try:
+                cpu = time.clock_gettime(clock)
+            except OSError:
+                cpu = float("nan")
+            *lines, rest = (rest + block).split(b"\n")
+            stamps += [(now, cpu) for line in lines if re.match(rb"Step \d+: ", line)]
+        _, status, usage = os.wait4(process.pid, 0)
+    if status != 0 or len(stamps) < 10:
+        sys.exit("peer_opensplat: no timings (exit status %d, %d steps)" % (status, len(stamps)))
+    wall = [b[0] - a[0] for a, b in zip(stamps, stamps[1:])]
+    print(json.dumps({
+        "bench": "splat", "case": "train step", "variant": "OpenSplat", "isa": "host", "threads": 2,
+        "seconds": statistics.median(wall), "cpu_seconds": (stamps[-1][1] - stamps[0][1]) / len(wall),
+        "work": len(wall), "work_unit": "steps", "rate": 1.0 / statistics.median(wall), "reference": "none",
+        "peak_rss_bytes": usage.ru_maxrss * 1024,
+    }))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+#!/usr/bin/env python3
+"""Turns rows of bench_splat --json into tables and charts.
+
+    bench/results.py ROWS.jsonl DIR
+
+Writes DIR/results.csv (every row), DIR/stages.svg (where a training step's time goes, by size) and DIR/RESULTS.md. Several
+rows of the same case, instruction set and thread count are rounds: the median counts. Only the standard library is needed.
+"""
+import collections
+import csv
+import json
+import os
+import statistics
+import sys
+
+COLUMNS = ["bench", "case", "variant", "isa", "threads", "seconds", "cpu_seconds", "work", "work_unit", "rate",
+           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes"]
+STAGES = ["project", "bin", "sort", "blend", "loss", "reverse", "gather", "adam"]
+COLORS = ["#8896ab", "#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "#bbbbbb"]
+
+
+def machine():
+    try:
+        with open("/proc/cpuinfo") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+        return "%d x %s" % (len(names), names[0])
+    except (OSError, IndexError):
+        return "unknown processor"
+
+
+def medians(rows):
+    groups = collections.OrderedDict()
+    for row in rows:
+        groups.setdefault((row["case"], row["variant"], row["isa"], row["threads"]), []).append(row)
+    result = []
+    for group in groups.values():
+        row = dict(group[0])
+        for key in ("seconds", "cpu_seconds", "rate", "peak_share", "bandwidth_share"):
+            if key in row:
+                row[key] = statistics.median(r[key] for r in group)
+        row["rounds"] = len(group)
+        result.append(row)
+    return result
+
+
+def write_csv(path, rows):
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def stages_of(rows):  # {(size, isa, threads): {stage: row}}
+    result = collections.OrderedDict()
+    for row in rows:
+        size, colon, stage = row["case"].partition(": ")
+        if colon and stage in STAGES:
+            result.setdefault((size, row["isa"], row["threads"]), {})[stage] = row
+    return result
+
+
+def write_stages(path, rows):
+    bars = [(key, stages) for key, stages in stages_of(rows).items() if len(stages) == len(STAGES)]
+    left, width, bar, gap, top = 210, 560, 18, 8, 46
+    height = top + len(bars) * (bar + gap) + 10
+    out = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
+           % (left + width + 90, height),
+           '<rect width="100%" height="100%" fill="white"/>',
+           '<text x="10" y="18" font-size="14">Share of each stage in a training step, and the whole step</text>']
+    x = left
+    for stage, color in zip(STAGES, COLORS):
+        out.append('<rect x="%d" y="26" width="10" height="10" fill="%s"/><text x="%d" y="35">%s</text>'
+                   % (x, color, x + 13, stage))
+        x += 24 + 7 * len(stage)
+    for i, ((size, isa, threads), stages) in enumerate(bars):
+        y = top + i * (bar + gap)
+        total = sum(stages[stage]["seconds"] for stage in STAGES)
+        out.append('<text x="%d" y="%d" text-anchor="end">%s, %s, %d thread%s</text>'
+                   % (left - 8, y + 13, size, isa, threads, "s" if threads > 1 else ""))
+        x = float(left)
+        for stage, color in zip(STAGES, COLORS):
+            w = width * stages[stage]["seconds"] / total
+            out.append('<rect x="%.1f" y="%d" width="%.1f" height="%d" fill="%s"/>' % (x, y, w, bar, color))
+            x += w
+        out.append('<text x="%d" y="%d">%.3g ms</text>' % (left + width + 8, y + 13, 1e3 * total))
+    out.append("</svg>")
+    with open(path, "w") as file:
+        file.write("\n".join(out) + "\n")
+
+
+def table(lines, head, rows):
+    lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    lines.append("")
+
+
+def percent(row, key):
+    return "%.0f %%" % (100.0 * row[key]) if key in row else ""
+
+
+def write_markdown(path, rows):
+    lines = ["# Speed beside error", "",
+             "Written by `bench/run.sh` on %s, which may have run other work: compare rows of one run, not of two."
+             % machine(), ""]
+    peaks = [r for r in rows if r["case"].startswith("machine: ")]
+    lines += ["## The machine", "",
+              "What the bench itself reaches: chained multiply-adds, and a sum of two arrays into a third.", ""]
+    table(lines, ["", "instructions", "threads", "per second"],
+          [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
+    lines += ["## Whole renders against double precision", "",
+              "A pair is a splat and a pixel that the reference blends it into. Errors are those of the picture (forward; where "
+              "no yes/no decision of the pixel is within 1e-4 of its threshold) and of the gradient of the means (backward).", ""]
+    table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M pairs/s", "largest error", "relative L2"],
+          [[r["case"], r["isa"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]), "%.3g" % (1e3 * r["cpu_seconds"]),
+            "%.0f" % (1e-6 * r["rate"]), "%.2g" % r["error_max"], "%.2g" % r["error_rel_l2"]]
+           for r in rows if r["case"].startswith(("forward", "backward"))])
+    lines += ["## Stages of a training step", "", "![Share of each stage](stages.svg)", "",
+              "Shares are of what the machine reaches above with as many threads: floating-point operations as the kernels' "
+              "source has them, bytes as each stage must move at least were its caches cold.", ""]
+    table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M/s", "FMA peak", "bandwidth"],
+          [[r["case"], r["isa"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]), "%.3g" % (1e3 * r["cpu_seconds"]),
+            "%.3g %s" % (1e-6 * r["rate"], r["work_unit"]), percent(r, "peak_share"), percent(r, "bandwidth_share")]
+           for r in rows if ": " in r["case"] and not r["case"].startswith(("machine", "visibility"))])
+    filters = [r for r in rows if r["case"].startswith("visibility")]
+    if filters:
+        lines += ["## Visible-point filter", ""]
+        table(lines, ["", "by", "threads", "seconds", "M/s"],
+              [[r["case"][11:], r["variant"], str(r["threads"]), "%.3g" % r["seconds"],
+                "%.3g %s" % (1e-6 * r["rate"], r["work_unit"])] for r in filters])
+    steps = [r for r in rows if r["case"] == "train step"]
+    if steps:
+        lines += ["## Training steps on photos", "",
+                  "Render, loss, gradients and Adam, density control off; medians over %d rounds in turns."
+                  % max(r["rounds"] for r in steps), ""]
+        table(lines, ["", "threads", "ms", "CPU ms"],
+              [["ours, " + r["isa"] if r["variant"] == "default" else r["variant"], str(r["threads"]),
+                "%.4g" % (1e3 * r["seconds"]), "%.4g" % (1e3 * r["cpu_seconds"])] for r in steps])
+        ours = [r for r in steps if r["variant"] == "default"]
+        for peer in (r for r in steps if r["variant"] != "default"):
+            lines += ["%s takes %.1f times as long, and %.1f times the CPU seconds."
+                      % (peer["variant"], peer["seconds"] / ours[0]["seconds"],
+                         peer["cpu_seconds"] / ours[0]["cpu_seconds"]), ""]
+    with open(path, "w") as file:
+        file.write("\n".join(lines).rstrip() + "\n")
+
+
+def main():
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    with open(sys.argv[1]) as file:
+        all_rows = [json.loads(line) for line in file if line.startswith("{")]
+    if not all_rows:
+        sys.exit("results: no rows in " + sys.argv[1])
+    rows = medians(all_rows)
+    write_csv(os.path.join(sys.argv[2], "results.csv"), rows)
+    write_stages(os.path.join(sys.argv[2], "stages.svg"), rows)
+    write_markdown(os.path.join(sys.argv[2], "RESULTS.md"), rows)
+
+
+if __name__ == "__main__":
+    main()

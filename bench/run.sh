@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg and bench/RESULTS.md.
+#   SCENE=COLMAP_FOLDER       training steps on its photos as well
+#   START=PLY                 from these splats instead of the scene's points
+#   OPENSPLAT=/path/opensplat and the same steps by OpenSplat in turns with ours, with the ratio (needs SCENE)
+#   ROUNDS=5 STEPS=200        of that comparison
+# About ten minutes; --quick is a look at it in one. The machine should do nothing else.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+build=${GSF_BUILD:-build}
+quick=()
+[ "${1:-}" = --quick ] && quick=(--quick)
+export OMP_WAIT_POLICY=passive # two workers that spin while they wait take each other's time
+
+cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release > "$build.cmake.log" 2>&1 || { cat "$build.cmake.log" >&2; exit 1; }
+rm -f "$build.cmake.log"
+cmake --build "$build" -j "$(nproc)" --target bench_splat > /dev/null
+rows=$(mktemp)
+trap 'rm -f "$rows"' EXIT
+"$build/bench_splat" --json ${quick[@]+"${quick[@]}"} | tee "$rows"
+if [ -n "${SCENE:-}" ]; then
+    steps=${STEPS:-200}
+    for ((round = 0; round < ${ROUNDS:-5}; round++)); do
+        "$build/bench_splat" --json --scene "$SCENE" ${START:+--start "$START"} --threads 2 --steps "$steps" | tee -a "$rows"
+        [ -z "${OPENSPLAT:-}" ] || python3 bench/peer_opensplat.py "$OPENSPLAT" "$SCENE" ${START:+"$START"} --steps "$steps" |
+            tee -a "$rows"
+    done
+fi
+python3 bench/results.py "$rows" bench
