@@ -5923,26 +5923,38 @@ GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
+// Alpha before the clamp at the steps of `mask`, 0 where it is below 1/255. Apart from the blending, whose chain of
+// operations through T is short, so that the long one here runs ahead of it.
+GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float center[GSF__STEPS],
+                                       const float exponent[GSF__STEPS], uint32_t mask, float raw[GSF__TILE_PIXELS]) {
+    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN);
+    const __m256 ee = _mm256_set1_ps(rec->ee);
+    for (uint32_t m = mask; m; m &= m - 1) {
+        const size_t s = (size_t)gsf__lowest_bit(m);
+        const __m256 e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
+        const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + s));
+        const __m256 seen = _mm256_cmp_ps(x, threshold, _CMP_GE_OQ);
+        _mm256_storeu_ps(raw + 8 * s, _mm256_and_ps(seen, gsf__exp2_avx2(x)));
+    }
+}
+
 GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
-    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps();
-    const __m256 threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
+    const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
     uint32_t live = gsf__live_steps(state->T);
-    float center[GSF__STEPS], exponent[GSF__STEPS];
+    float center[GSF__STEPS], exponent[GSF__STEPS], raws[GSF__TILE_PIXELS];
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
-        const __m256 ee = _mm256_set1_ps(rec->ee);
+        const uint32_t mask = gsf__rows_avx2(rec, tile, center, exponent) & live;
+        gsf__alphas_avx2(rec, center, exponent, mask, raws);
         const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
-        for (uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live; m; m &= m - 1) {
+        for (uint32_t m = mask; m; m &= m - 1) {
             const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
-            const __m256 e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
-            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + s));
-            const __m256 T = _mm256_loadu_ps(state->T + at);
-            const __m256 valid = _mm256_and_ps(_mm256_cmp_ps(x, threshold, _CMP_GE_OQ), _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
-            const __m256 alpha = _mm256_and_ps(valid, _mm256_min_ps(gsf__exp2_avx2(x), alpha_max));
+            const __m256 T = _mm256_loadu_ps(state->T + at), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
+            const __m256 alpha = _mm256_and_ps(open, _mm256_min_ps(_mm256_loadu_ps(raws + at), alpha_max));
             const __m256 next = _mm256_fnmadd_ps(T, alpha, T);
-            const __m256 stop = _mm256_and_ps(valid, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
+            const __m256 stop = _mm256_and_ps(open, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
             const __m256 w = _mm256_mul_ps(_mm256_andnot_ps(stop, alpha), T);
             const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
             _mm256_storeu_ps(state->T + at, T_new);
@@ -6049,32 +6061,29 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
 
 GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_tile, size_t first, size_t last,
                                               gsf__step* steps, gsf__step_head* heads, size_t* step_count) {
-    const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps();
-    const __m256 threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
+    const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
     uint32_t live = gsf__live_steps(T_tile);
-    float center[GSF__STEPS], exponent[GSF__STEPS];
+    float center[GSF__STEPS], exponent[GSF__STEPS], raws[GSF__TILE_PIXELS];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
-        const __m256 ee = _mm256_set1_ps(rec->ee);
-        for (uint32_t m = gsf__rows_avx2(rec, tile, center, exponent) & live; m; m &= m - 1) {
+        const uint32_t mask = gsf__rows_avx2(rec, tile, center, exponent) & live;
+        gsf__alphas_avx2(rec, center, exponent, mask, raws);
+        for (uint32_t m = mask; m; m &= m - 1) {
             const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
-            const __m256 e = _mm256_sub_ps(lanes, _mm256_broadcast_ss(center + s));
-            const __m256 x = _mm256_fmadd_ps(_mm256_mul_ps(ee, e), e, _mm256_broadcast_ss(exponent + s));
-            const __m256 T = _mm256_loadu_ps(T_tile + at);
-            const __m256 valid = _mm256_and_ps(_mm256_cmp_ps(x, threshold, _CMP_GE_OQ), _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
-            const __m256 raw = _mm256_and_ps(valid, gsf__exp2_avx2(x));
+            const __m256 T = _mm256_loadu_ps(T_tile + at), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
+            const __m256 raw = _mm256_and_ps(open, _mm256_loadu_ps(raws + at));
             const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, alpha_max), T);
-            const __m256 stop = _mm256_and_ps(valid, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
+            const __m256 stop = _mm256_and_ps(open, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
             const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
             _mm256_storeu_ps(T_tile + at, T_new);
             _mm256_storeu_ps(steps[kept].alpha, _mm256_andnot_ps(stop, raw));
             _mm256_storeu_ps(steps[kept].T, T);
             heads[kept].entry = (uint32_t)i;
             heads[kept].step = (uint32_t)s;
-            kept += _mm256_testz_ps(valid, valid) == 0;
+            kept += _mm256_movemask_ps(_mm256_cmp_ps(raw, zero, _CMP_GT_OQ)) != 0;
             if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
         }
     }

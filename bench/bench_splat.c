@@ -105,30 +105,34 @@ static void bench_require(gsf_context* ctx, gsf_result result) {
 
 // ---- what the machine can do ----------------------------------------------------
 
-enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 20 };
+enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 22 };
 
 static float bench_sink; // keeps the compiler from dropping the loops
 
+#define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would lie in memory at -O2
+
 static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
-    float v[FMA_CHAINS];
     (void)worker;
-    for (int k = 0; k < FMA_CHAINS; k++) v[k] = (float)k + (float)chunk;
-    for (int i = 0; i < FMA_ROUNDS; i++)
-        for (int k = 0; k < FMA_CHAINS; k++) v[k] = v[k] * 0.999f + 0.001f;
-    for (int k = 1; k < FMA_CHAINS; k++) v[0] += v[k];
-    ((float*)arg)[16 * chunk] = v[0];
+#define BENCH_SCALAR(k) float v##k = (float)k;
+    BENCH_TEN(BENCH_SCALAR)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_SCALAR_STEP(k) v##k = v##k * 0.999f + 0.001f;
+        BENCH_TEN(BENCH_SCALAR_STEP)
+    }
+    ((float*)arg)[16 * chunk] = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
 }
 
 #if GSF__X86
 GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker) {
     const __m256 a = _mm256_set1_ps(0.999f), b = _mm256_set1_ps(0.001f);
-    __m256 v[FMA_CHAINS];
     (void)worker;
-    for (int k = 0; k < FMA_CHAINS; k++) v[k] = _mm256_set1_ps((float)k);
-    for (int i = 0; i < FMA_ROUNDS; i++)
-        for (int k = 0; k < FMA_CHAINS; k++) v[k] = _mm256_fmadd_ps(v[k], a, b);
-    for (int k = 1; k < FMA_CHAINS; k++) v[0] = _mm256_add_ps(v[0], v[k]);
-    _mm256_storeu_ps((float*)arg + 16 * chunk, v[0]);
+#define BENCH_VECTOR(k) __m256 v##k = _mm256_set1_ps((float)k);
+    BENCH_TEN(BENCH_VECTOR)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_VECTOR_STEP(k) v##k = _mm256_fmadd_ps(v##k, a, b);
+        BENCH_TEN(BENCH_VECTOR_STEP)
+    }
+    _mm256_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
 }
 #endif
 
