@@ -19,7 +19,7 @@
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> where there is one, else <embree3/rtcore.h>
 
    SECTIONS    >>splats >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
-               >>embree >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
+               >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
                >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
@@ -228,6 +228,70 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_visible_points(gsf_context* ctx, cons
 GSF_API GSF_NODISCARD gsf_result gsf_splat_from_points(gsf_context* ctx, const double* points, const uint8_t* colors,
                                                        size_t count, const uint8_t* keep, int32_t sh_degree,
                                                        const double origin[3], gsf_splats* out);
+
+// ---- dense stereo --------------------------------------------------------------
+
+/* Points where the photos of a few posed views agree, by PatchMatch multi-view stereo: every pixel of every view holds a
+   plane (inverse depth and slope); planes spread over the image and are perturbed at random as long as they make the
+   photo's window match better in the other views (weighted normalised cross-correlation, views weighted per pixel by how
+   well they match around it). Coarse to fine. A pixel counts when its match is good and at least one other view's plane at
+   its place there leads back to it; such pixels are merged over the views and thinned.
+   Zero is every field's default. Pixels are those of the working size. */
+typedef struct gsf_dense_desc {
+    uint64_t seed;
+    int32_t max_size;        // longer side of the working images; photos that are larger are shrunk; 0 = 640
+    int32_t levels;          // sizes halved this often, at most, less one; 0 = 3 (as long as 48 pixels are left)
+    int32_t iterations;      // per level, 0 = 4 (the finest: 3)
+    int32_t sources;         // other views that a view is compared with, at most 8; 0 = 4
+    int32_t radius;          // of the matching window, pixels, at most 15; 0 = 5
+    int32_t stride;          // between its samples; 0 = 2
+    float color_sigma;       // grey levels of 255 at which a sample's weight falls to 1/e; 0 = 18
+    float min_angle;         // degrees between two views' rays to a point below which they do not help; 0 = 1
+    float max_cost;          // 1 - correlation that a pixel may have; 0 = 0.35
+    float max_reprojection;  // pixels between a pixel and its way to the other view and back; 0 = 1
+    float max_depth_error;   // relative difference of the two depths; 0 = 0.02
+    float max_normal_angle;  // degrees between the two normals; 0 = 40
+    int32_t min_consistent;  // other views that must agree; 0 = 1
+    int32_t spacing;         // pixels between points, at least 1; 0 = 3
+    size_t max_points;       // spacing grows until no more than this are left; 0 = no limit
+    int32_t skip_sparse;     // no points closer than `spacing` to a sparse point (of `keep`), so that both may be united
+    double depth_min, depth_max; // search range of the camera depth; 0 = from the sparse points and the camera poses
+    int32_t want_maps;       // fill in `maps`
+} gsf_dense_desc;
+
+typedef struct gsf_dense_map { // one view
+    uint32_t view;           // index into the scene's views
+    gsf_camera camera;       // at the map's size
+    float* depth;            // (height,width) camera depth at the pixels' centres where the views agree, else 0
+    float* normals;          // (height,width,3) world, unit, towards the camera; 0 where depth is
+} gsf_dense_map;
+
+typedef struct gsf_dense_stats {
+    size_t views, pairs;     // different views; ordered pairs compared
+    size_t pixels, matched, consistent; // of all views: with any texture; that match; that the other views confirm
+    int32_t spacing;         // used
+    double seconds_prepare, seconds_match, seconds_fuse;
+} gsf_dense_stats;
+
+typedef struct gsf_dense {
+    size_t count;
+    double* points;          // (count,3) world
+    float* normals;          // (count,3) world, unit, towards the views
+    uint8_t* colors;         // (count,3) mean of the views that agree
+    float* confidence;       // (count) 1 - cost, of the best view's pixel
+    uint8_t* view_counts;    // (count) views that agree, at least 2
+    size_t map_count;
+    gsf_dense_map* maps;     // NULL unless wanted
+} gsf_dense;
+
+// Views are indices into scene->views, whose images must be loaded; repeated ones count once. keep: NULL or one byte per
+// sparse point, zero = not to be used; the points only guide the search. With fewer than two different views, or none that
+// overlap, the result is GSF_OK and no points. stats may be NULL. Same bits for any number of workers and instruction set.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                                        size_t view_count, const uint8_t* keep,
+                                                        const gsf_dense_desc* desc, gsf_dense* out,
+                                                        gsf_dense_stats* stats);
+GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense);
 
 // ---- rendering -----------------------------------------------------------------
 
@@ -4718,6 +4782,1328 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
 }
 
 #endif // GSF_USE_EMBREE
+
+// ---- >>stereo ------------------------------------------------------------------
+
+/* PatchMatch stereo in the manner of Zheng et al. 2014 and Schoenberger et al. 2016 (COLMAP), Galliani et al. 2015 (Gipuma:
+   red-black propagation), Xu and Tao 2019 (ACMH: eight propagation regions, views weighted per pixel; geometric
+   consistency). A plane is inverse depth as an affine function of the pixel, 1/z = w + gx dx + gy dy: so a pixel (x,y) maps
+   to another view by (X,Y,Z) = M (x,y,1) + t (1/z), which makes the homography of a window three multiply-adds a corner.
+
+       prepare   photos to the working sizes (grey, the 2x2 neighbours of a texel in one word); which views to compare
+       match     per level, coarse to fine: start planes, then iterations of (red pixels, black pixels)
+       fuse      pixels whose planes lead there and back, thinned by marking the pixels around every point taken
+
+   Work is split by blocks of rows over all views together. A red pixel reads planes of black ones only, so neither order
+   nor number of workers matters. Pixel centres are at integers here. */
+
+enum {
+    GSF__DENSE_SOURCES = 8,
+    GSF__DENSE_SAMPLES = 256,
+    GSF__DENSE_ROWS = 4,       // of a chunk
+    GSF__DENSE_PLANES = 9,     // own, and one from each region
+    GSF__DENSE_MIN_SIDE = 48,
+};
+
+#define GSF__DENSE_BAD 2.0f        // cost of a plane that cannot be judged
+#define GSF__DENSE_MIN_VARIANCE 2.0f // grey levels squared; less is noise
+#define GSF__DENSE_MIN_COS 0.15f   // between plane normal and ray
+
+typedef struct gsf__dense_plane { float w, gx, gy, cost; } gsf__dense_plane;
+
+typedef struct gsf__dense_source { // another view, as this one's pixels map to it
+    int32_t view;            // place in the list of views
+    float m[9], t[3];        // row-major; w times Z is 1/depth there
+    float back_m[9], back_t[3];
+    float rotation[9];       // this camera's axes to the other's
+} gsf__dense_source;
+
+typedef struct gsf__dense_view {
+    uint32_t index;          // of the scene's views
+    int32_t width, height;   // at this level, as the camera
+    gsf_camera camera;
+    float fx, fy, cx, cy;    // its, pixel centres at integers
+    gsf_image color;         // u8 RGB
+    size_t first;            // pixel of the level's arrays
+    int32_t source_count;
+    gsf__dense_source sources[GSF__DENSE_SOURCES];
+    float w_min, w_max;
+} gsf__dense_view;
+
+typedef struct gsf__dense_window { // samples of the matching window, padded to whole eights by samples without weight
+    int32_t count;
+    float dx[GSF__DENSE_SAMPLES], dy[GSF__DENSE_SAMPLES];
+    float spatial[GSF__DENSE_SAMPLES];
+    float tonal[256];        // weight by difference in grey
+} gsf__dense_window;
+
+typedef struct gsf__dense_patch { // the window around one pixel of the reference
+    float weight[GSF__DENSE_SAMPLES], value[GSF__DENSE_SAMPLES]; // value: grey minus center
+    float center, weight_sum;
+} gsf__dense_patch;
+
+typedef struct gsf__dense_warp { // homography of a window: (X,Y,Z) at its middle and per step in x and y
+    float middle[3], along_x[3], along_y[3];
+    const uint32_t* texels;
+    int32_t width, height;
+} gsf__dense_warp;
+
+// 1 - correlation between a patch and what a warp shows of another photo, 0..2.
+typedef float (*gsf__dense_cost_fn)(const gsf__dense_window* window, const gsf__dense_patch* patch,
+                                    const gsf__dense_warp* warp);
+
+typedef struct gsf__dense_block { uint32_t view; int32_t row; } gsf__dense_block;
+
+typedef struct gsf__dense_job {
+    gsf_context* ctx;
+    const gsf_scene* scene;
+    gsf_dense_desc desc;
+    const uint8_t* keep;
+    gsf__dense_cost_fn cost_fn;
+    gsf__dense_window window;
+    size_t view_count;
+    gsf__dense_view* views;
+    size_t pixel_count;            // of all views at this level
+    uint32_t* texels;
+    gsf__dense_plane* planes;
+    gsf__dense_plane* others;      // planes as they were before a geometric iteration, else NULL
+    float* source_costs;           // (pixels,GSF__DENSE_SOURCES)
+    uint8_t* links;                // per pixel: bit s = source s agrees
+    size_t block_count;
+    gsf__dense_block* blocks;
+    // the coarser level, while planes are taken over from it
+    gsf__dense_view* coarse_views;
+    gsf__dense_plane* coarse_planes;
+    float* seeds;                  // coarsest level: inverse depth of the nearest sparse point, 0 = none
+    int32_t level, iteration, color;
+    float step_pixels, step_normal; // perturbation at this iteration: pixels in the other view, sine
+    int32_t roam;                  // also try planes from the whole range
+} gsf__dense_job;
+
+static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
+    gsf_dense_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.max_size == 0) d.max_size = 640;
+    if (d.levels == 0) d.levels = 3;
+    if (d.iterations == 0) d.iterations = 4;
+    if (d.sources == 0) d.sources = 4;
+    if (d.radius == 0) d.radius = 5;
+    if (d.stride == 0) d.stride = 2;
+    if (d.color_sigma == 0.0f) d.color_sigma = 18.0f;
+    if (d.min_angle == 0.0f) d.min_angle = 1.0f;
+    if (d.max_cost == 0.0f) d.max_cost = 0.35f;
+    if (d.max_reprojection == 0.0f) d.max_reprojection = 1.0f;
+    if (d.max_depth_error == 0.0f) d.max_depth_error = 0.02f;
+    if (d.max_normal_angle == 0.0f) d.max_normal_angle = 40.0f;
+    if (d.min_consistent == 0) d.min_consistent = 1;
+    if (d.spacing == 0) d.spacing = 3;
+    return d;
+}
+
+static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                   const gsf_dense_desc* d) {
+    if (d->max_size < GSF__DENSE_MIN_SIDE || d->max_size > 16384 || d->levels < 1 || d->levels > 8 || d->iterations < 1 ||
+        d->iterations > 100 || d->sources < 1 || d->sources > GSF__DENSE_SOURCES || d->radius < 1 || d->radius > 15 ||
+        d->stride < 1 || d->stride > d->radius || d->min_consistent < 1 || d->spacing < 1 || d->spacing > 1024)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "dense points: max_size %d, levels %d, iterations %d, sources %d, radius %d, stride %d, "
+                        "min_consistent %d, spacing %d", (int)d->max_size, (int)d->levels, (int)d->iterations,
+                        (int)d->sources, (int)d->radius, (int)d->stride, (int)d->min_consistent, (int)d->spacing);
+    const int side = 2 * (d->radius / d->stride) + 1;
+    if (side * side > GSF__DENSE_SAMPLES)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: radius %d by stride %d is more than %d samples",
+                        (int)d->radius, (int)d->stride, (int)GSF__DENSE_SAMPLES);
+    if (!(d->color_sigma > 0.0f && d->min_angle >= 0.0f && d->max_cost > 0.0f && d->max_cost < GSF__DENSE_BAD &&
+          d->max_reprojection > 0.0f && d->max_depth_error > 0.0f && d->max_normal_angle > 0.0f &&
+          d->max_normal_angle <= 180.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "dense points: color_sigma %g, min_angle %g, max_cost %g, max_reprojection %g, max_depth_error %g, "
+                        "max_normal_angle %g", (double)d->color_sigma, (double)d->min_angle, (double)d->max_cost,
+                        (double)d->max_reprojection, (double)d->max_depth_error, (double)d->max_normal_angle);
+    if (!(d->depth_min >= 0.0 && isfinite(d->depth_max) && (d->depth_max == 0.0 || d->depth_max > d->depth_min)))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: depths from %g to %g", d->depth_min, d->depth_max);
+    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: no list of views");
+    for (size_t i = 0; i < view_count; i++) {
+        if (views[i] >= scene->view_count)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u, the scene has %zu", (unsigned)views[i],
+                            scene->view_count);
+        const gsf_scene_view* view = &scene->views[views[i]];
+        GSF__TRY(gsf_check_camera(ctx, &view->camera));
+        if (!view->image.data)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: the photo of view %u is not loaded",
+                            (unsigned)views[i]);
+        if (view->image.width != view->camera.width || view->image.height != view->camera.height)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u: photo %lld x %lld, camera %d x %d",
+                            (unsigned)views[i], (long long)view->image.width, (long long)view->image.height,
+                            (int)view->camera.width, (int)view->camera.height);
+    }
+    return GSF_OK;
+}
+
+// ---- matching cost
+
+// sums: weight, weighted value and its square of the reference; value and square of the other photo; product.
+static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sums[6]) {
+    if (!(sums[0] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // too much of the window is outside
+    const float inv = 1.0f / sums[0], mean_r = sums[1] * inv, mean_s = sums[3] * inv;
+    const float var_r = sums[2] * inv - mean_r * mean_r, var_s = sums[4] * inv - mean_s * mean_s;
+    if (!(var_r > GSF__DENSE_MIN_VARIANCE && var_s > GSF__DENSE_MIN_VARIANCE)) return GSF__DENSE_BAD;
+    const float cost = 1.0f - (sums[5] * inv - mean_r * mean_s) / sqrtf(var_r * var_s);
+    return cost < 0.0f ? 0.0f : cost < GSF__DENSE_BAD ? cost : GSF__DENSE_BAD;
+}
+
+// Eight partial sums side by side, added at the end as the vector twin does: both give the same bits.
+static float gsf__dense_cost_scalar(const gsf__dense_window* window, const gsf__dense_patch* patch,
+                                    const gsf__dense_warp* warp) {
+    float lanes[6][8], sums[6];
+    memset(lanes, 0, sizeof lanes);
+    const float u_max = (float)(warp->width - 1), v_max = (float)(warp->height - 1);
+    for (int i = 0; i < window->count; i++) {
+        const float dx = window->dx[i], dy = window->dy[i];
+        const float X = warp->middle[0] + dx * warp->along_x[0] + dy * warp->along_y[0];
+        const float Y = warp->middle[1] + dx * warp->along_x[1] + dy * warp->along_y[1];
+        const float Z = warp->middle[2] + dx * warp->along_x[2] + dy * warp->along_y[2];
+        const float inv = 1.0f / Z, u = X * inv, v = Y * inv;
+        if (!(Z > 0.0f && u >= 0.0f && u <= u_max && v >= 0.0f && v <= v_max)) continue;
+        const int32_t iu = (int32_t)u, iv = (int32_t)v;
+        const float fu = u - (float)iu, fv = v - (float)iv;
+        const uint32_t texel = warp->texels[iv * warp->width + iu];
+        const float a = (float)(texel & 255u), b = (float)(texel >> 8 & 255u);
+        const float c = (float)(texel >> 16 & 255u), d = (float)(texel >> 24);
+        const float top = a + fu * (b - a), bottom = c + fu * (d - c);
+        const float s = top + fv * (bottom - top) - patch->center;
+        const float weight = patch->weight[i], r = patch->value[i];
+        const float wr = weight * r, ws = weight * s;
+        const int lane = i & 7;
+        lanes[0][lane] += weight;
+        lanes[1][lane] += wr;
+        lanes[2][lane] += wr * r;
+        lanes[3][lane] += ws;
+        lanes[4][lane] += ws * s;
+        lanes[5][lane] += wr * s;
+    }
+    for (int k = 0; k < 6; k++) {
+        const float* p = lanes[k];
+        sums[k] = ((p[0] + p[1]) + (p[2] + p[3])) + ((p[4] + p[5]) + (p[6] + p[7]));
+    }
+    return gsf__dense_correlate(patch, sums);
+}
+
+#if GSF__X86
+// No fused multiply-adds, so that the bits are the scalar twin's.
+__attribute__((target("avx2"))) static float gsf__dense_cost_avx2(const gsf__dense_window* window,
+                                                                  const gsf__dense_patch* patch,
+                                                                  const gsf__dense_warp* warp) {
+    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f);
+    const __m256 u_max = _mm256_set1_ps((float)(warp->width - 1)), v_max = _mm256_set1_ps((float)(warp->height - 1));
+    const __m256i width = _mm256_set1_epi32(warp->width), byte = _mm256_set1_epi32(255);
+    const __m256 x0 = _mm256_set1_ps(warp->middle[0]), xx = _mm256_set1_ps(warp->along_x[0]);
+    const __m256 xy = _mm256_set1_ps(warp->along_y[0]);
+    const __m256 y0 = _mm256_set1_ps(warp->middle[1]), yx = _mm256_set1_ps(warp->along_x[1]);
+    const __m256 yy = _mm256_set1_ps(warp->along_y[1]);
+    const __m256 z0 = _mm256_set1_ps(warp->middle[2]), zx = _mm256_set1_ps(warp->along_x[2]);
+    const __m256 zy = _mm256_set1_ps(warp->along_y[2]);
+    const __m256 center = _mm256_set1_ps(patch->center);
+    __m256 sw = zero, sr = zero, srr = zero, ss = zero, sss = zero, srs = zero;
+    for (int i = 0; i < window->count; i += 8) {
+        const __m256 dx = _mm256_loadu_ps(window->dx + i), dy = _mm256_loadu_ps(window->dy + i);
+        const __m256 X = _mm256_add_ps(_mm256_add_ps(x0, _mm256_mul_ps(dx, xx)), _mm256_mul_ps(dy, xy));
+        const __m256 Y = _mm256_add_ps(_mm256_add_ps(y0, _mm256_mul_ps(dx, yx)), _mm256_mul_ps(dy, yy));
+        const __m256 Z = _mm256_add_ps(_mm256_add_ps(z0, _mm256_mul_ps(dx, zx)), _mm256_mul_ps(dy, zy));
+        const __m256 inv = _mm256_div_ps(one, Z);
+        __m256 u = _mm256_mul_ps(X, inv), v = _mm256_mul_ps(Y, inv);
+        __m256 inside = _mm256_and_ps(_mm256_cmp_ps(u, zero, _CMP_GE_OQ), _mm256_cmp_ps(u, u_max, _CMP_LE_OQ));
+        inside = _mm256_and_ps(inside, _mm256_cmp_ps(v, zero, _CMP_GE_OQ));
+        inside = _mm256_and_ps(inside, _mm256_cmp_ps(v, v_max, _CMP_LE_OQ));
+        inside = _mm256_and_ps(inside, _mm256_cmp_ps(Z, zero, _CMP_GT_OQ));
+        u = _mm256_and_ps(u, inside); // a sample outside reads the first texel and weighs nothing
+        v = _mm256_and_ps(v, inside);
+        const __m256i iu = _mm256_cvttps_epi32(u), iv = _mm256_cvttps_epi32(v);
+        const __m256 fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(iu)), fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(iv));
+        const __m256i at = _mm256_add_epi32(_mm256_mullo_epi32(iv, width), iu);
+        const __m256i texel = _mm256_i32gather_epi32((const int*)(const void*)warp->texels, at, 4);
+        const __m256 a = _mm256_cvtepi32_ps(_mm256_and_si256(texel, byte));
+        const __m256 b = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32(texel, 8), byte));
+        const __m256 c = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32(texel, 16), byte));
+        const __m256 d = _mm256_cvtepi32_ps(_mm256_srli_epi32(texel, 24));
+        const __m256 top = _mm256_add_ps(a, _mm256_mul_ps(fu, _mm256_sub_ps(b, a)));
+        const __m256 bottom = _mm256_add_ps(c, _mm256_mul_ps(fu, _mm256_sub_ps(d, c)));
+        const __m256 s = _mm256_sub_ps(_mm256_add_ps(top, _mm256_mul_ps(fv, _mm256_sub_ps(bottom, top))), center);
+        const __m256 weight = _mm256_and_ps(_mm256_loadu_ps(patch->weight + i), inside);
+        const __m256 r = _mm256_loadu_ps(patch->value + i);
+        const __m256 wr = _mm256_mul_ps(weight, r), ws = _mm256_mul_ps(weight, s);
+        sw = _mm256_add_ps(sw, weight);
+        sr = _mm256_add_ps(sr, wr);
+        srr = _mm256_add_ps(srr, _mm256_mul_ps(wr, r));
+        ss = _mm256_add_ps(ss, ws);
+        sss = _mm256_add_ps(sss, _mm256_mul_ps(ws, s));
+        srs = _mm256_add_ps(srs, _mm256_mul_ps(wr, s));
+    }
+    const __m256 abcd = _mm256_hadd_ps(_mm256_hadd_ps(sw, sr), _mm256_hadd_ps(srr, ss));
+    const __m256 ef = _mm256_hadd_ps(_mm256_hadd_ps(sss, srs), zero);
+    float sums[8];
+    _mm256_storeu_ps(sums, _mm256_add_ps(_mm256_permute2f128_ps(abcd, ef, 0x20), _mm256_permute2f128_ps(abcd, ef, 0x31)));
+    return gsf__dense_correlate(patch, sums);
+}
+#endif
+
+static gsf__dense_cost_fn gsf__dense_cost_of(gsf_cpu_level level) {
+#if GSF__X86
+    if (level >= GSF_CPU_AVX2) return gsf__dense_cost_avx2;
+#endif
+    (void)level;
+    return gsf__dense_cost_scalar;
+}
+
+static void gsf__dense_make_window(const gsf_dense_desc* d, gsf__dense_window* window) {
+    memset(window, 0, sizeof *window);
+    const int reach = d->radius / d->stride * d->stride;
+    for (int dy = -reach; dy <= reach; dy += d->stride)
+        for (int dx = -reach; dx <= reach; dx += d->stride) {
+            window->dx[window->count] = (float)dx;
+            window->dy[window->count] = (float)dy;
+            window->spatial[window->count++] =
+                (float)exp(-(double)(dx * dx + dy * dy) / (2.0 * (double)d->radius * (double)d->radius));
+        }
+    window->count = (window->count + 7) / 8 * 8;
+    for (int i = 0; i < 256; i++) window->tonal[i] = (float)exp(-(double)i / (double)d->color_sigma);
+}
+
+// Returns 0 where the window shows nothing to match.
+static int gsf__dense_make_patch(const gsf__dense_window* window, const gsf__dense_view* view, const uint32_t* texels,
+                                 int x, int y, gsf__dense_patch* patch) {
+    const int center = (int)(texels[y * view->width + x] & 255u);
+    float sum = 0.0f, first = 0.0f, second = 0.0f;
+    for (int i = 0; i < window->count; i++) {
+        const int px = x + (int)window->dx[i], py = y + (int)window->dy[i];
+        float weight = 0.0f, value = 0.0f;
+        if (window->spatial[i] > 0.0f && px >= 0 && px < view->width && py >= 0 && py < view->height) {
+            const int difference = (int)(texels[py * view->width + px] & 255u) - center;
+            weight = window->spatial[i] * window->tonal[difference < 0 ? -difference : difference];
+            value = (float)difference;
+        }
+        patch->weight[i] = weight;
+        patch->value[i] = value;
+        sum += weight;
+        first += weight * value;
+        second += weight * value * value;
+    }
+    patch->center = (float)center;
+    patch->weight_sum = sum;
+    return second * sum - first * first > GSF__DENSE_MIN_VARIANCE * sum * sum;
+}
+
+// ---- planes
+
+// Within the depth range, and not seen edge-on?
+static int gsf__dense_plane_valid(const gsf__dense_view* view, int x, int y, const gsf__dense_plane* plane) {
+    if (!(plane->w >= view->w_min && plane->w <= view->w_max)) return 0;
+    const float ex = view->cx - (float)x, ey = view->cy - (float)y; // the normal is (fx gx, fy gy, 1/z at the axis)
+    const float nx = view->fx * plane->gx, ny = view->fy * plane->gy, nz = plane->w + plane->gx * ex + plane->gy * ey;
+    const float rx = ex / view->fx, ry = ey / view->fy;
+    const float squares = (nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + 1.0f);
+    return plane->w * plane->w >= GSF__DENSE_MIN_COS * GSF__DENSE_MIN_COS * squares;
+}
+
+// Unit normal in camera axes, pointing away from the camera.
+static void gsf__dense_normal(const gsf__dense_view* view, int x, int y, const gsf__dense_plane* plane, float n[3]) {
+    n[0] = view->fx * plane->gx;
+    n[1] = view->fy * plane->gy;
+    n[2] = plane->w + plane->gx * (view->cx - (float)x) + plane->gy * (view->cy - (float)y);
+    const float inv = 1.0f / sqrtf(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+    for (int k = 0; k < 3; k++) n[k] *= inv;
+}
+
+// The plane of inverse depth w at the pixel with a normal of any length; returns 0 where it faces away.
+static int gsf__dense_plane_of(const gsf__dense_view* view, int x, int y, float w, const float n[3],
+                               gsf__dense_plane* plane) {
+    const float rx = ((float)x - view->cx) / view->fx, ry = ((float)y - view->cy) / view->fy;
+    const float facing = n[0] * rx + n[1] * ry + n[2];
+    if (!(facing > 1e-6f)) return 0;
+    plane->w = w;
+    plane->gx = n[0] / (view->fx * facing) * w;
+    plane->gy = n[1] / (view->fy * facing) * w;
+    plane->cost = GSF__DENSE_BAD;
+    return gsf__dense_plane_valid(view, x, y, plane);
+}
+
+// Four numbers in (-1,1).
+static void gsf__dense_random(uint64_t seed, uint64_t stream, uint64_t index, float out[4]) {
+    const uint64_t bits = gsf_random_bits(seed, stream, index);
+    for (int k = 0; k < 4; k++) out[k] = ((float)(bits >> (16 * k) & 65535u) - 32767.5f) * (1.0f / 32768.0f);
+}
+
+static uint64_t gsf__dense_stream(const gsf__dense_job* job, const gsf__dense_view* view) {
+    return (uint64_t)view->index << 32 | (uint64_t)(uint32_t)job->level << 16 | (uint64_t)(uint32_t)(job->iteration + 1);
+}
+
+// ---- one pixel
+
+typedef struct gsf__dense_pixel {
+    const gsf__dense_job* job;
+    const gsf__dense_view* view;
+    int x, y;
+    gsf__dense_patch patch;
+    float base[GSF__DENSE_SOURCES][3];  // M (x,y,1)
+    float weights[GSF__DENSE_SOURCES];  // of the sources, sum 1
+    float motion;                       // pixels in the other view per unit of inverse depth, the largest
+} gsf__dense_pixel;
+
+// Returns 0 where there is nothing to match.
+static int gsf__dense_begin(gsf__dense_pixel* p, const gsf__dense_job* job, const gsf__dense_view* view, int x, int y) {
+    p->job = job;
+    p->view = view;
+    p->x = x;
+    p->y = y;
+    for (int s = 0; s < view->source_count; s++) {
+        const float* m = view->sources[s].m;
+        for (int k = 0; k < 3; k++) p->base[s][k] = m[3 * k] * (float)x + m[3 * k + 1] * (float)y + m[3 * k + 2];
+    }
+    return gsf__dense_make_patch(&job->window, view, job->texels + view->first, x, y, &p->patch);
+}
+
+static float gsf__dense_cost(const gsf__dense_pixel* p, int s, const gsf__dense_plane* plane) {
+    const gsf__dense_source* source = &p->view->sources[s];
+    const gsf__dense_view* other = &p->job->views[source->view];
+    gsf__dense_warp warp;
+    for (int k = 0; k < 3; k++) {
+        warp.middle[k] = p->base[s][k] + source->t[k] * plane->w;
+        warp.along_x[k] = source->m[3 * k] + source->t[k] * plane->gx;
+        warp.along_y[k] = source->m[3 * k + 1] + source->t[k] * plane->gy;
+    }
+    warp.texels = p->job->texels + other->first;
+    warp.width = other->width;
+    warp.height = other->height;
+    if (!(warp.middle[2] > 0.0f)) return GSF__DENSE_BAD;
+    const float u = warp.middle[0], v = warp.middle[1], z = warp.middle[2];
+    const float right = ((float)other->width - 0.5f) * z, bottom = ((float)other->height - 0.5f) * z;
+    if (!(u >= -0.5f * z && u <= right && v >= -0.5f * z && v <= bottom)) return GSF__DENSE_BAD;
+    return p->job->cost_fn(&p->job->window, &p->patch, &warp);
+}
+
+// How far the pixel's way to the other view's plane there and back ends from where it began, at most 3 pixels.
+static float gsf__dense_detour(const gsf__dense_pixel* p, int s, const gsf__dense_plane* plane) {
+    const gsf__dense_source* source = &p->view->sources[s];
+    const gsf__dense_view* other = &p->job->views[source->view];
+    const float X = p->base[s][0] + source->t[0] * plane->w, Y = p->base[s][1] + source->t[1] * plane->w;
+    const float Z = p->base[s][2] + source->t[2] * plane->w;
+    if (!(Z > 0.0f)) return 3.0f;
+    const float u = X / Z, v = Y / Z;
+    if (!(u > -0.5f && u < (float)other->width - 0.5f && v > -0.5f && v < (float)other->height - 0.5f)) return 3.0f;
+    const int iu = (int)(u + 0.5f), iv = (int)(v + 0.5f);
+    const gsf__dense_plane* there = p->job->others + other->first + (size_t)iv * (size_t)other->width + (size_t)iu;
+    if (!(there->cost < 1.0f)) return 3.0f;
+    const float w = there->w + there->gx * (u - (float)iu) + there->gy * (v - (float)iv);
+    const float *m = source->back_m, *t = source->back_t;
+    const float bz = m[6] * u + m[7] * v + m[8] + t[2] * w;
+    if (!(bz > 0.0f)) return 3.0f;
+    const float dx = (m[0] * u + m[1] * v + m[2] + t[0] * w) / bz - (float)p->x;
+    const float dy = (m[3] * u + m[4] * v + m[5] + t[1] * w) / bz - (float)p->y;
+    const float squared = dx * dx + dy * dy;
+    return squared < 9.0f ? sqrtf(squared) : 3.0f;
+}
+
+// Weights of the sources: how well the best three of the planes that the neighbourhood proposes match there. An occluded
+// view matches none of them.
+static void gsf__dense_weigh(gsf__dense_pixel* p, float costs[][GSF__DENSE_SOURCES], int count) {
+    float sum = 0.0f, best = 0.0f;
+    for (int s = 0; s < p->view->source_count; s++) {
+        float top[3] = {0.0f, 0.0f, 0.0f};
+        for (int i = 0; i < count; i++) {
+            float c = costs[i][s] * (1.0f / 0.3f);
+            c *= c;
+            float good = 1.0f / (1.0f + c * c);
+            for (int k = 0; k < 3; k++)
+                if (good > top[k]) {
+                    const float swap = top[k];
+                    top[k] = good;
+                    good = swap;
+                }
+        }
+        p->weights[s] = count >= 3 ? top[0] + top[1] + top[2] : top[0];
+        if (p->weights[s] > best) best = p->weights[s];
+    }
+    for (int s = 0; s < p->view->source_count; s++) {
+        if (p->weights[s] < 0.1f * best) p->weights[s] = 0.0f;
+        sum += p->weights[s];
+    }
+    for (int s = 0; s < p->view->source_count; s++) p->weights[s] /= sum;
+}
+
+static float gsf__dense_mean(const gsf__dense_pixel* p, const float* costs) {
+    float sum = 0.0f;
+    for (int s = 0; s < p->view->source_count; s++) sum += p->weights[s] * costs[s];
+    return sum;
+}
+
+// Weighted cost of a plane with the geometric term, per source in `costs` (without it); stops when above `limit`.
+static float gsf__dense_judge(const gsf__dense_pixel* p, const gsf__dense_plane* plane, float limit, float* costs) {
+    float sum = 0.0f;
+    for (int s = 0; s < p->view->source_count; s++) {
+        if (p->weights[s] == 0.0f) continue;
+        costs[s] = gsf__dense_cost(p, s, plane);
+        sum += p->weights[s] * costs[s];
+        if (p->job->others) sum += p->weights[s] * 0.1f * gsf__dense_detour(p, s, plane);
+        if (sum >= limit) break;
+    }
+    return sum;
+}
+
+static void gsf__dense_measure_motion(gsf__dense_pixel* p, float w) {
+    float best = 0.0f;
+    for (int s = 0; s < p->view->source_count; s++) {
+        const float* t = p->view->sources[s].t;
+        const float z = p->base[s][2] + t[2] * w;
+        if (!(z > 0.0f)) continue;
+        const float u = (p->base[s][0] + t[0] * w) / z, v = (p->base[s][1] + t[1] * w) / z;
+        const float du = (t[0] - u * t[2]) / z, dv = (t[1] - v * t[2]) / z;
+        const float squared = du * du + dv * dv;
+        if (squared > best) best = squared;
+    }
+    p->motion = sqrtf(best);
+}
+
+// Planes worth a try at the pixel: from each of eight regions the one of the lowest cost (Xu and Tao 2019): four
+// V-shaped ones near it and four straight ones up to 23 pixels away, all of the other colour.
+static int gsf__dense_gather(const gsf__dense_pixel* p, gsf__dense_plane* planes) {
+    static const int8_t near_offsets[7][2] = {{0, 1}, {-1, 2}, {1, 2}, {-2, 3}, {2, 3}, {-3, 4}, {3, 4}};
+    const gsf__dense_view* view = p->view;
+    const gsf__dense_plane* all = p->job->planes + view->first;
+    int count = 0;
+    for (int region = 0; region < 8; region++) {
+        const int side = region & 3; // down, up, right, left
+        const int steps = region < 4 ? 7 : 11;
+        const gsf__dense_plane* best = NULL;
+        int best_dx = 0, best_dy = 0;
+        for (int i = 0; i < steps; i++) {
+            const int across = region < 4 ? near_offsets[i][0] : 0;
+            const int along = region < 4 ? near_offsets[i][1] : 2 * i + 3;
+            const int dx = side < 2 ? across : side == 2 ? along : -along;
+            const int dy = side >= 2 ? across : side == 0 ? along : -along;
+            const int x = p->x + dx, y = p->y + dy;
+            if (x < 0 || x >= view->width || y < 0 || y >= view->height) continue;
+            const gsf__dense_plane* plane = all + (size_t)y * (size_t)view->width + (size_t)x;
+            if (best ? plane->cost < best->cost : plane->cost < GSF__DENSE_BAD) {
+                best = plane;
+                best_dx = dx;
+                best_dy = dy;
+            }
+        }
+        if (!best) continue;
+        gsf__dense_plane* out = planes + count;
+        *out = *best;
+        out->w = best->w - best->gx * (float)best_dx - best->gy * (float)best_dy;
+        count += gsf__dense_plane_valid(view, p->x, p->y, out);
+    }
+    return count;
+}
+
+// Do two planes differ by less than a few hundredths of a pixel in every other view, all over the window?
+static int gsf__dense_same(const gsf__dense_pixel* p, const gsf__dense_plane* a, const gsf__dense_plane* b) {
+    const float limit = 0.03f, reach = (float)p->job->desc.radius;
+    const float dw = a->w - b->w, dx = a->gx - b->gx, dy = a->gy - b->gy;
+    return ((dw < 0.0f ? -dw : dw) + reach * (dx < 0.0f ? -dx : dx) + reach * (dy < 0.0f ? -dy : dy)) * p->motion < limit;
+}
+
+// Tries planes near the best one, and at the coarsest level planes from anywhere.
+static void gsf__dense_refine(const gsf__dense_pixel* p, gsf__dense_plane* best, float* best_costs, float* best_sum) {
+    const gsf__dense_job* job = p->job;
+    const gsf__dense_view* view = p->view;
+    const uint64_t stream = gsf__dense_stream(job, view);
+    const uint64_t index = (uint64_t)p->y * (uint64_t)view->width + (uint64_t)p->x;
+    const float step_w = job->step_pixels / (p->motion > 1e-20f ? p->motion : 1e-20f);
+    const int tries = job->roam ? 6 : 3;
+    for (int k = 0; k < tries; k++) {
+        float r[4], n[3], costs[GSF__DENSE_SOURCES];
+        gsf__dense_random(job->desc.seed, stream, 8 * index + (uint64_t)k, r);
+        gsf__dense_plane plane = *best;
+        float w = best->w;
+        if (k == 0 || k == 2) w += step_w * r[3];
+        if (k == 3 || k == 4) w = view->w_min + (view->w_max - view->w_min) * 0.5f * (r[3] + 1.0f);
+        if (k == 4 || k == 5) {
+            n[0] = 1.5f * r[0] + ((float)p->x - view->cx) / view->fx;
+            n[1] = 1.5f * r[1] + ((float)p->y - view->cy) / view->fy;
+            n[2] = 1.0f;
+        } else {
+            gsf__dense_normal(view, p->x, p->y, best, n);
+            if (k == 1 || k == 2)
+                for (int a = 0; a < 3; a++) n[a] += job->step_normal * r[a];
+        }
+        if (!gsf__dense_plane_of(view, p->x, p->y, w, n, &plane)) continue;
+        const float sum = gsf__dense_judge(p, &plane, *best_sum, costs);
+        if (!(sum < *best_sum)) continue;
+        *best = plane;
+        *best_sum = sum;
+        for (int s = 0; s < view->source_count; s++)
+            if (p->weights[s] > 0.0f) best_costs[s] = costs[s];
+    }
+    for (int s = 0; s < view->source_count; s++) // those that were not asked while it changed
+        if (p->weights[s] == 0.0f) best_costs[s] = gsf__dense_cost(p, s, best);
+}
+
+static void gsf__dense_visit(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y) {
+    const size_t at = view->first + (size_t)y * (size_t)view->width + (size_t)x;
+    gsf__dense_pixel p;
+    if (!gsf__dense_begin(&p, job, view, x, y)) return;
+    gsf__dense_plane planes[GSF__DENSE_PLANES];
+    float costs[GSF__DENSE_PLANES][GSF__DENSE_SOURCES], sums[GSF__DENSE_PLANES];
+    float* own = job->source_costs + GSF__DENSE_SOURCES * at;
+    planes[0] = job->planes[at];
+    gsf__dense_measure_motion(&p, planes[0].w);
+    memcpy(costs[0], own, sizeof costs[0]);
+    const int count = 1 + gsf__dense_gather(&p, planes + 1);
+    for (int i = 1; i < count; i++) {
+        int twin = -1;
+        for (int k = 0; k < i && twin < 0; k++)
+            if (gsf__dense_same(&p, planes + i, planes + k)) twin = k;
+        for (int s = 0; s < view->source_count; s++)
+            costs[i][s] = twin >= 0 ? costs[twin][s] : gsf__dense_cost(&p, s, planes + i);
+    }
+    gsf__dense_weigh(&p, costs, count);
+    int best = 0;
+    for (int i = 0; i < count; i++) {
+        sums[i] = gsf__dense_mean(&p, costs[i]);
+        if (job->others)
+            for (int s = 0; s < view->source_count; s++)
+                if (p.weights[s] > 0.0f) sums[i] += p.weights[s] * 0.1f * gsf__dense_detour(&p, s, planes + i);
+        if (sums[i] < sums[best]) best = i;
+    }
+    gsf__dense_refine(&p, planes + best, costs[best], sums + best);
+    planes[best].cost = gsf__dense_mean(&p, costs[best]);
+    job->planes[at] = planes[best];
+    memcpy(own, costs[best], sizeof costs[0]);
+}
+
+static void gsf__dense_sweep_chunk(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__dense_job* job = (const gsf__dense_job*)arg;
+    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
+    const int first = job->blocks[chunk].row;
+    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
+        for (int x = (y + job->color) & 1; x < view->width; x += 2) gsf__dense_visit(job, view, x, y);
+}
+
+// Start planes: of the coarser level, or near the sparse points and at random.
+static void gsf__dense_start_chunk(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__dense_job* job = (const gsf__dense_job*)arg;
+    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
+    const int first = job->blocks[chunk].row;
+    const uint64_t stream = gsf__dense_stream(job, view);
+    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
+        for (int x = 0; x < view->width; x++) {
+            const size_t pixel = (size_t)y * (size_t)view->width + (size_t)x, at = view->first + pixel;
+            gsf__dense_plane plane;
+            float* costs = job->source_costs + GSF__DENSE_SOURCES * at;
+            gsf__dense_pixel p;
+            int valid = 0;
+            if (job->coarse_planes) {
+                const gsf__dense_view* coarse = job->coarse_views + job->blocks[chunk].view;
+                const float sx = (float)coarse->width / (float)view->width;
+                const float sy = (float)coarse->height / (float)view->height;
+                const float u = ((float)x + 0.5f) * sx - 0.5f, v = ((float)y + 0.5f) * sy - 0.5f;
+                const int iu = (int)(u + 0.5f), iv = (int)(v + 0.5f);
+                plane = job->coarse_planes[coarse->first + (size_t)iv * (size_t)coarse->width + (size_t)iu];
+                plane.w += plane.gx * (u - (float)iu) + plane.gy * (v - (float)iv);
+                plane.gx *= sx;
+                plane.gy *= sy;
+                valid = gsf__dense_plane_valid(view, x, y, &plane);
+            }
+            for (uint64_t attempt = 0; !valid && attempt < 8; attempt++) {
+                float r[4], n[3];
+                gsf__dense_random(job->desc.seed, stream, 8 * (uint64_t)pixel + attempt, r);
+                const float seed = job->seeds ? job->seeds[at] : 0.0f, spread = 0.5f * (view->w_max - view->w_min);
+                float w = view->w_min + spread * (r[3] + 1.0f);
+                if (seed > 0.0f && r[2] > -0.5f) w = seed * (1.0f + 0.05f * r[3]); // three in four
+                n[0] = r[0] + ((float)x - view->cx) / view->fx;
+                n[1] = r[1] + ((float)y - view->cy) / view->fy;
+                n[2] = 1.0f;
+                valid = gsf__dense_plane_of(view, x, y, w, n, &plane);
+            }
+            if (!valid) {
+                plane.w = 0.5f * (view->w_min + view->w_max);
+                plane.gx = plane.gy = 0.0f;
+            }
+            for (int s = 0; s < GSF__DENSE_SOURCES; s++) costs[s] = GSF__DENSE_BAD;
+            plane.cost = GSF__DENSE_BAD;
+            if (gsf__dense_begin(&p, job, view, x, y)) {
+                for (int s = 0; s < view->source_count; s++) costs[s] = gsf__dense_cost(&p, s, &plane);
+                gsf__dense_weigh(&p, (float(*)[GSF__DENSE_SOURCES])(void*)costs, 1);
+                plane.cost = gsf__dense_mean(&p, costs);
+            }
+            job->planes[at] = plane;
+        }
+}
+
+// ---- which views to compare, and how
+
+static int gsf__dense_tracked(const gsf_scene* scene, size_t point, uint32_t view) {
+    for (size_t i = scene->track_begin[point]; i < scene->track_begin[point + 1]; i++)
+        if (scene->track_views[i] == view) return 1;
+    return 0;
+}
+
+static int gsf__dense_in_view(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth) {
+    return gsf_camera_project(camera, point, u, v, depth) && *u >= 0.0 && *u < camera->width && *v >= 0.0 &&
+           *v < camera->height;
+}
+
+static int gsf__dense_usable(const gsf__dense_job* job, size_t i) {
+    const double* p = job->scene->points + 3 * i;
+    return (!job->keep || job->keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]);
+}
+
+// Depth range of a view: that of the sparse points in it with a margin, or what the distances between the views can
+// measure: from a third to sixty times the median one.
+static gsf_result gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double* depths, double* low, double* high) {
+    const gsf_scene* scene = job->scene;
+    size_t n = 0;
+    double u, v, z;
+    for (size_t i = 0; i < scene->point_count; i++)
+        if (gsf__dense_usable(job, i) && gsf__dense_in_view(&view->camera, scene->points + 3 * i, &u, &v, &z))
+            depths[n++] = z;
+    if (n >= 20) {
+        qsort(depths, n, sizeof *depths, gsf__compare_doubles);
+        *low = 0.7 * depths[n / 50];
+        *high = 1.4 * depths[n - 1 - n / 50];
+    } else {
+        double center[3], other[3];
+        gsf_camera_center(&view->camera, center);
+        n = 0;
+        for (size_t i = 0; i < job->view_count; i++) {
+            gsf_camera_center(&job->views[i].camera, other);
+            const double dx = other[0] - center[0], dy = other[1] - center[1], dz = other[2] - center[2];
+            if (&job->views[i] != view) depths[n++] = sqrt(dx * dx + dy * dy + dz * dz);
+        }
+        qsort(depths, n, sizeof *depths, gsf__compare_doubles);
+        *low = depths[n / 2] / 3.0;
+        *high = depths[n / 2] * 60.0;
+    }
+    if (job->desc.depth_min > 0.0) *low = job->desc.depth_min;
+    if (job->desc.depth_max > 0.0) *high = job->desc.depth_max;
+    if (!(*low > 0.0 && *high > *low && isfinite(*high)))
+        *low = *high = 0.0; // all views at one place, or a range that the caller's excludes
+    view->w_min = *high > 0.0 ? (float)(1.0 / *high) : 0.0f;
+    view->w_max = *low > 0.0 ? (float)(1.0 / *low) : 0.0f;
+    return GSF_OK;
+}
+
+// What a point says for comparing two views: 0 where the rays are closer than min_angle, most around ten degrees, less
+// where they are far apart or the scale differs.
+static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, const gsf_camera* b, const double point[3],
+                              double depth_a, double depth_b) {
+    double ca[3], cb[3], dot = 0.0, aa = 0.0, bb = 0.0;
+    gsf_camera_center(a, ca);
+    gsf_camera_center(b, cb);
+    for (int k = 0; k < 3; k++) {
+        const double x = point[k] - ca[k], y = point[k] - cb[k];
+        dot += x * y;
+        aa += x * x;
+        bb += y * y;
+    }
+    const double c = dot / sqrt(aa * bb);
+    const double degrees = acos(c < -1.0 ? -1.0 : c > 1.0 ? 1.0 : c) * 57.29577951308232;
+    if (!(degrees >= (double)job->desc.min_angle)) return 0.0;
+    const double off = (degrees - 10.0) / (degrees < 10.0 ? 4.0 : 20.0), scale = a->fx / depth_a / (b->fx / depth_b);
+    return (scale < 1.0 ? scale : 1.0 / scale) / (1.0 + off * off);
+}
+
+// Fills in view->sources (their view only): the best by the sparse points that both see, or without such by points spread
+// through the depth range.
+static void gsf__dense_choose_sources(gsf__dense_job* job, size_t r, double low, double high, double* scores) {
+    const gsf_scene* scene = job->scene;
+    gsf__dense_view* view = job->views + r;
+    double c2w[16], u, v, z, z2;
+    size_t votes = 0;
+    for (size_t s = 0; s < job->view_count; s++) scores[s] = 0.0;
+    for (size_t i = 0; i < scene->point_count; i++) {
+        const double* point = scene->points + 3 * i;
+        if (!gsf__dense_usable(job, i) || !gsf__dense_in_view(&view->camera, point, &u, &v, &z)) continue;
+        const int here = gsf__dense_tracked(scene, i, view->index);
+        votes++;
+        for (size_t s = 0; s < job->view_count; s++) {
+            const gsf_camera* camera = &job->views[s].camera;
+            if (s == r || !gsf__dense_in_view(camera, point, &u, &v, &z2)) continue;
+            const int both = here && gsf__dense_tracked(scene, i, job->views[s].index);
+            scores[s] += (both ? 1.0 : 0.2) * gsf__dense_vote(job, &view->camera, camera, point, z, z2);
+        }
+    }
+    gsf_camera_c2w(&view->camera, c2w);
+    for (int i = 0; i < 6 * 6 * 6 && votes < 20 && low > 0.0; i++) {
+        z = 1.0 / (1.0 / high + (1.0 / low - 1.0 / high) * (i / 36 + 0.5) / 6.0);
+        const double x = ((i % 6 + 0.5) / 6.0 * view->camera.width - view->camera.cx) / view->camera.fx * z;
+        const double y = ((i / 6 % 6 + 0.5) / 6.0 * view->camera.height - view->camera.cy) / view->camera.fy * z;
+        double point[3];
+        for (int k = 0; k < 3; k++) point[k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
+        for (size_t s = 0; s < job->view_count; s++)
+            if (s != r && gsf__dense_in_view(&job->views[s].camera, point, &u, &v, &z2))
+                scores[s] += gsf__dense_vote(job, &view->camera, &job->views[s].camera, point, z, z2);
+    }
+    view->source_count = 0;
+    while (low > 0.0 && view->source_count < job->desc.sources) {
+        size_t best = r;
+        for (size_t s = 0; s < job->view_count; s++)
+            if (s != r && scores[s] > 0.0 && (best == r || scores[s] > scores[best])) best = s;
+        if (best == r) break;
+        view->sources[view->source_count++].view = (int32_t)best;
+        scores[best] = 0.0;
+    }
+}
+
+// m, t, rotation of camera `from` to camera `to`, pixel centres at integers.
+static void gsf__dense_relate(const gsf_camera* from, const gsf_camera* to, float m[9], float t[3], float rotation[9]) {
+    double c2w[16], rel[16];
+    gsf_camera_c2w(from, c2w);
+    gsf_mat4_mul(to->w2c, c2w, rel);
+    const double fx = from->fx, fy = from->fy, cx = from->cx - 0.5, cy = from->cy - 0.5;
+    double rk[3][3]; // R K^-1
+    for (int i = 0; i < 3; i++) {
+        const double a = rel[i], b = rel[4 + i], c = rel[8 + i];
+        rk[i][0] = a / fx;
+        rk[i][1] = b / fy;
+        rk[i][2] = c - a * cx / fx - b * cy / fy;
+        if (rotation) {
+            rotation[3 * i] = (float)a;
+            rotation[3 * i + 1] = (float)b;
+            rotation[3 * i + 2] = (float)c;
+        }
+    }
+    for (int j = 0; j < 3; j++) {
+        m[j] = (float)(to->fx * rk[0][j] + (to->cx - 0.5) * rk[2][j]);
+        m[3 + j] = (float)(to->fy * rk[1][j] + (to->cy - 0.5) * rk[2][j]);
+        m[6 + j] = (float)rk[2][j];
+    }
+    t[0] = (float)(to->fx * rel[12] + (to->cx - 0.5) * rel[14]);
+    t[1] = (float)(to->fy * rel[13] + (to->cy - 0.5) * rel[14]);
+    t[2] = (float)rel[14];
+}
+
+// ---- levels
+
+static void gsf__dense_free_level(gsf__dense_job* job) {
+    for (size_t i = 0; i < job->view_count; i++) gsf_destroy_image(job->ctx, &job->views[i].color);
+    gsf_free(job->ctx, job->texels);
+    gsf_free(job->ctx, job->planes);
+    gsf_free(job->ctx, job->others);
+    gsf_free(job->ctx, job->source_costs);
+    gsf_free(job->ctx, job->blocks);
+    gsf_free(job->ctx, job->seeds);
+    job->texels = NULL;
+    job->planes = job->others = NULL;
+    job->source_costs = job->seeds = NULL;
+    job->blocks = NULL;
+}
+
+static void gsf__dense_texels(const gsf__dense_view* view, uint32_t* texels) {
+    const uint8_t* rgb = (const uint8_t*)view->color.data;
+    const int32_t width = view->width, height = view->height;
+    for (size_t i = 0; i < (size_t)width * (size_t)height; i++)
+        texels[i] = (77u * rgb[3 * i] + 150u * rgb[3 * i + 1] + 29u * rgb[3 * i + 2] + 128u) >> 8;
+    for (int32_t y = 0; y < height; y++) // the words below and to the right still hold plain grey in their low byte
+        for (int32_t x = 0; x < width; x++) {
+            const int32_t right = x + 1 < width, below = y + 1 < height ? width : 0;
+            uint32_t* t = texels + (size_t)y * (size_t)width + (size_t)x;
+            t[0] |= (t[right] & 255u) << 8 | (t[below] & 255u) << 16 | (t[below + right] & 255u) << 24;
+        }
+}
+
+// The working size of a view at a level.
+static void gsf__dense_size(const gsf_camera* camera, int32_t max_size, int32_t level, int32_t* width, int32_t* height) {
+    const int32_t longer = camera->width > camera->height ? camera->width : camera->height;
+    const double scale = (longer > max_size ? (double)max_size / longer : 1.0) / (double)(1 << level);
+    *width = (int32_t)(camera->width * scale + 0.5);
+    *height = (int32_t)(camera->height * scale + 0.5);
+    if (*width < 1) *width = 1;
+    if (*height < 1) *height = 1;
+}
+
+// Photo of a view at its working size: u8 RGB.
+static gsf_result gsf__dense_load_color(gsf__dense_job* job, gsf__dense_view* view) {
+    const gsf_image* photo = &job->scene->views[view->index].image;
+    gsf_image full;
+    GSF__TRY(gsf_make_image(job->ctx, GSF_U8, photo->width, photo->height, 3, &full));
+    gsf_result result = gsf_convert_image(job->ctx, photo, &full);
+    if (result == GSF_OK && (photo->width != view->width || photo->height != view->height)) {
+        result = gsf_make_image(job->ctx, GSF_U8, view->width, view->height, 3, &view->color);
+        if (result == GSF_OK) result = gsf_resize_image(job->ctx, &full, GSF_RESIZE_PIL_BILINEAR, &view->color);
+        gsf_destroy_image(job->ctx, &full);
+    } else if (result == GSF_OK) {
+        view->color = full;
+    } else {
+        gsf_destroy_image(job->ctx, &full);
+    }
+    return result;
+}
+
+// Inverse depths of the sparse points at their pixels, spread to the nearest pixels (two passes, city block distance).
+static void gsf__dense_spread_seeds(gsf__dense_job* job, gsf__dense_view* view, int32_t* distance) {
+    const gsf_scene* scene = job->scene;
+    const int32_t width = view->width, height = view->height, none = 1 << 28;
+    float* seeds = job->seeds + view->first;
+    for (int32_t i = 0; i < width * height; i++) distance[i] = none;
+    for (size_t i = 0; i < scene->point_count; i++) {
+        double u, v, z;
+        if (!gsf__dense_usable(job, i) || !gsf__dense_in_view(&view->camera, scene->points + 3 * i, &u, &v, &z)) continue;
+        const int32_t at = (int32_t)v * width + (int32_t)u;
+        const float w = (float)(1.0 / z);
+        if (distance[at] && w >= view->w_min && w <= view->w_max) {
+            distance[at] = 0;
+            seeds[at] = w;
+        } else if (!distance[at] && w > seeds[at] && w <= view->w_max) {
+            seeds[at] = w; // the nearer one hides the other
+        }
+    }
+    for (int pass = 0; pass < 2; pass++)
+        for (int32_t k = 0; k < width * height; k++) {
+            const int32_t i = pass ? width * height - 1 - k : k, x = i % width, y = i / width;
+            const int32_t beside = pass ? (x + 1 < width ? i + 1 : i) : (x ? i - 1 : i);
+            const int32_t along = pass ? (y + 1 < height ? i + width : i) : (y ? i - width : i);
+            const int32_t from = distance[beside] < distance[along] ? beside : along;
+            if (distance[from] + 1 < distance[i]) {
+                distance[i] = distance[from] + 1;
+                seeds[i] = seeds[from];
+            }
+        }
+}
+
+// Sets the views up for a level. The coarser level's arrays are the caller's by then.
+static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int with_seeds) {
+    gsf_context* ctx = job->ctx;
+    job->level = level;
+    job->pixel_count = job->block_count = 0;
+    int32_t most = 0;
+    for (size_t i = 0; i < job->view_count; i++) {
+        gsf__dense_view* view = job->views + i;
+        const gsf_camera* camera = &job->scene->views[view->index].camera;
+        gsf__dense_size(camera, job->desc.max_size, level, &view->width, &view->height);
+        view->camera = gsf_camera_resized(camera, view->width, view->height);
+        view->fx = (float)view->camera.fx;
+        view->fy = (float)view->camera.fy;
+        view->cx = (float)(view->camera.cx - 0.5);
+        view->cy = (float)(view->camera.cy - 0.5);
+        view->first = job->pixel_count;
+        if (view->width * view->height > most) most = view->width * view->height;
+        job->pixel_count += (size_t)view->width * (size_t)view->height;
+        job->block_count += (size_t)((view->height + GSF__DENSE_ROWS - 1) / GSF__DENSE_ROWS);
+        GSF__TRY(gsf__dense_load_color(job, view));
+    }
+    if (job->pixel_count >= UINT32_MAX)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dense points: %zu pixels in all are too many", job->pixel_count);
+    job->texels = (uint32_t*)gsf_alloc(ctx, job->pixel_count, sizeof(uint32_t));
+    job->planes = (gsf__dense_plane*)gsf_alloc(ctx, job->pixel_count, sizeof(gsf__dense_plane));
+    job->source_costs = (float*)gsf_alloc(ctx, job->pixel_count, GSF__DENSE_SOURCES * sizeof(float));
+    job->blocks = (gsf__dense_block*)gsf_alloc(ctx, job->block_count, sizeof(gsf__dense_block));
+    if (!job->texels || !job->planes || !job->source_costs || !job->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    size_t block = 0;
+    for (size_t i = 0; i < job->view_count; i++) {
+        gsf__dense_view* view = job->views + i;
+        gsf__dense_texels(view, job->texels + view->first);
+        for (int32_t row = 0; row < view->height; row += GSF__DENSE_ROWS, block++) {
+            job->blocks[block].view = (uint32_t)i;
+            job->blocks[block].row = row;
+        }
+        for (int32_t s = 0; s < view->source_count; s++) {
+            gsf__dense_source* source = view->sources + s;
+            const gsf_camera* other = &job->scene->views[job->views[source->view].index].camera;
+            int32_t width, height;
+            gsf__dense_size(other, job->desc.max_size, level, &width, &height);
+            const gsf_camera to = gsf_camera_resized(other, width, height);
+            gsf__dense_relate(&view->camera, &to, source->m, source->t, source->rotation);
+            gsf__dense_relate(&to, &view->camera, source->back_m, source->back_t, NULL);
+        }
+    }
+    if (!with_seeds) return GSF_OK;
+    int32_t* distance = (int32_t*)gsf_alloc(ctx, (size_t)most, sizeof(int32_t));
+    job->seeds = (float*)gsf_alloc_zeroed(ctx, job->pixel_count, sizeof(float));
+    if (distance && job->seeds)
+        for (size_t i = 0; i < job->view_count; i++) gsf__dense_spread_seeds(job, job->views + i, distance);
+    gsf_free(ctx, distance);
+    return distance && job->seeds ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int finest, double* done, double total) {
+    const int32_t geometric = 2; // of the finest level's, after the others
+    const int32_t count = finest && job->desc.iterations > 1 && !coarsest ? job->desc.iterations - 1 : job->desc.iterations;
+    float scale = 1.0f;
+    job->roam = coarsest;
+    for (job->iteration = 0; job->iteration < count + (finest ? geometric : 0); job->iteration++, scale *= 0.5f) {
+        GSF__TRY(gsf__check_cancel(job->ctx));
+        if (job->iteration >= count) {
+            if (!job->others)
+                job->others = (gsf__dense_plane*)gsf_alloc(job->ctx, job->pixel_count, sizeof(gsf__dense_plane));
+            if (!job->others) return GSF_ERROR_OUT_OF_MEMORY;
+            memcpy(job->others, job->planes, job->pixel_count * sizeof(gsf__dense_plane));
+            job->roam = 0;
+        }
+        job->step_pixels = (coarsest ? 4.0f : 1.0f) * scale;
+        job->step_normal = (coarsest ? 0.6f : 0.4f) * scale;
+        if (job->step_pixels < 0.1f) job->step_pixels = 0.1f;
+        if (job->step_normal < 0.05f) job->step_normal = 0.05f;
+        for (job->color = 0; job->color < 2; job->color++)
+            gsf__parallel_for(job->ctx, job->block_count, gsf__dense_sweep_chunk, job);
+        *done += (double)job->pixel_count;
+        gsf__progress(job->ctx, "stereo", *done < total ? *done : total, total);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__dense_match(gsf__dense_job* job, int32_t levels) {
+    gsf_result result = GSF_OK;
+    gsf__dense_view* coarse_views = (gsf__dense_view*)gsf_alloc_zeroed(job->ctx, job->view_count, sizeof(gsf__dense_view));
+    if (!coarse_views) return GSF_ERROR_OUT_OF_MEMORY;
+    double done = 0.0, total = 0.0;
+    for (int32_t level = 0; level < levels; level++)
+        for (size_t i = 0; i < job->view_count; i++) {
+            int32_t width, height;
+            gsf__dense_size(&job->scene->views[job->views[i].index].camera, job->desc.max_size, level, &width, &height);
+            total += (double)width * height * (job->desc.iterations + (level == 0 ? 1 + (levels == 1) : 0));
+        }
+    for (int32_t level = levels - 1; level >= 0 && result == GSF_OK; level--) {
+        gsf__dense_plane* coarse_planes = job->planes; // of the level before, NULL at the first
+        memcpy(coarse_views, job->views, job->view_count * sizeof *coarse_views);
+        job->planes = NULL;
+        gsf__dense_free_level(job);
+        job->coarse_views = coarse_views;
+        job->coarse_planes = coarse_planes;
+        job->iteration = -1;
+        result = gsf__dense_begin_level(job, level, !coarse_planes);
+        if (result == GSF_OK) gsf__parallel_for(job->ctx, job->block_count, gsf__dense_start_chunk, job);
+        gsf_free(job->ctx, coarse_planes);
+        job->coarse_planes = NULL;
+        if (result == GSF_OK) result = gsf__dense_sweeps(job, level == levels - 1, level == 0, &done, total);
+    }
+    gsf_free(job->ctx, coarse_views);
+    job->coarse_views = NULL;
+    return result;
+}
+
+// ---- consistency and fusion
+
+// Does source s confirm the plane at a pixel? *pixel: where in the other view.
+static int gsf__dense_confirmed(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y, int s,
+                                size_t* pixel) {
+    const gsf__dense_plane* plane = job->planes + view->first + (size_t)y * (size_t)view->width + (size_t)x;
+    const gsf__dense_source* source = view->sources + s;
+    const gsf__dense_view* other = job->views + source->view;
+    const float *m = source->m, *t = source->t, *bm = source->back_m, *bt = source->back_t;
+    const float fx = (float)x, fy = (float)y;
+    const float Z = m[6] * fx + m[7] * fy + m[8] + t[2] * plane->w;
+    if (!(Z > 0.0f)) return 0;
+    const float u = (m[0] * fx + m[1] * fy + m[2] + t[0] * plane->w) / Z;
+    const float v = (m[3] * fx + m[4] * fy + m[5] + t[1] * plane->w) / Z;
+    if (!(u > -0.5f && u < (float)other->width - 0.5f && v > -0.5f && v < (float)other->height - 0.5f)) return 0;
+    const int iu = (int)(u + 0.5f), iv = (int)(v + 0.5f);
+    *pixel = other->first + (size_t)iv * (size_t)other->width + (size_t)iu;
+    const gsf__dense_plane* there = job->planes + *pixel;
+    if (!(there->cost <= job->desc.max_cost)) return 0;
+    const float w = there->w + there->gx * (u - (float)iu) + there->gy * (v - (float)iv), expected = plane->w / Z;
+    const float difference = w < expected ? expected - w : w - expected;
+    if (!(difference <= job->desc.max_depth_error * expected)) return 0;
+    const float bz = bm[6] * u + bm[7] * v + bm[8] + bt[2] * w;
+    if (!(bz > 0.0f)) return 0;
+    const float dx = (bm[0] * u + bm[1] * v + bm[2] + bt[0] * w) / bz - fx;
+    const float dy = (bm[3] * u + bm[4] * v + bm[5] + bt[1] * w) / bz - fy;
+    if (!(dx * dx + dy * dy <= job->desc.max_reprojection * job->desc.max_reprojection)) return 0;
+    float a[3], b[3], dot = 0.0f;
+    gsf__dense_normal(view, x, y, plane, a);
+    gsf__dense_normal(other, iu, iv, there, b);
+    const float* r = source->rotation;
+    for (int k = 0; k < 3; k++) dot += b[k] * (r[3 * k] * a[0] + r[3 * k + 1] * a[1] + r[3 * k + 2] * a[2]);
+    return dot >= job->step_normal; // the cosine, while fusing
+}
+
+static void gsf__dense_link_chunk(void* arg, size_t chunk, int worker) {
+    (void)worker;
+    const gsf__dense_job* job = (const gsf__dense_job*)arg;
+    const gsf__dense_view* view = job->views + job->blocks[chunk].view;
+    const int first = job->blocks[chunk].row;
+    for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
+        for (int x = 0; x < view->width; x++) {
+            const size_t at = view->first + (size_t)y * (size_t)view->width + (size_t)x;
+            int links = 0, count = 0;
+            for (int s = 0; s < view->source_count && job->planes[at].cost <= job->desc.max_cost; s++) {
+                size_t pixel;
+                if (!gsf__dense_confirmed(job, view, x, y, s, &pixel)) continue;
+                links |= 1 << s;
+                count++;
+            }
+            job->links[at] = (uint8_t)(count >= job->desc.min_consistent ? links : 0);
+        }
+}
+
+static const gsf__dense_view* gsf__dense_view_of(const gsf__dense_job* job, size_t pixel, int* x, int* y) {
+    const gsf__dense_view* view = job->views;
+    while (pixel - view->first >= (size_t)view->width * (size_t)view->height) view++;
+    *x = (int)((pixel - view->first) % (size_t)view->width);
+    *y = (int)((pixel - view->first) / (size_t)view->width);
+    return view;
+}
+
+static void gsf__dense_cover(const gsf__dense_job* job, size_t pixel, int32_t spacing, uint8_t* covered) {
+    int x, y;
+    const gsf__dense_view* view = gsf__dense_view_of(job, pixel, &x, &y);
+    const int reach = spacing - 1;
+    for (int v = y > reach ? y - reach : 0; v < view->height && v <= y + reach; v++)
+        for (int u = x > reach ? x - reach : 0; u < view->width && u <= x + reach; u++)
+            covered[view->first + (size_t)v * (size_t)view->width + (size_t)u] = 1;
+}
+
+// Marks the pixels around the sparse points, where the depths agree (else something hides the point).
+static void gsf__dense_cover_sparse(const gsf__dense_job* job, int32_t spacing, uint8_t* covered) {
+    for (size_t i = 0; i < job->scene->point_count; i++)
+        for (size_t k = 0; k < job->view_count && gsf__dense_usable(job, i); k++) {
+            const gsf__dense_view* view = job->views + k;
+            double u, v, z;
+            if (!gsf__dense_in_view(&view->camera, job->scene->points + 3 * i, &u, &v, &z)) continue;
+            const size_t pixel = view->first + (size_t)v * (size_t)view->width + (size_t)u;
+            const double w = (double)job->planes[pixel].w;
+            if (fabs(1.0 / z - w) <= 2.0 * (double)job->desc.max_depth_error * w)
+                gsf__dense_cover(job, pixel, spacing, covered);
+        }
+}
+
+// The pixels to make points of, best match first, none closer than `spacing` to another in any view that confirms it.
+static size_t gsf__dense_thin(const gsf__dense_job* job, const uint32_t* order, size_t count, int32_t spacing,
+                              uint8_t* covered, uint32_t* chosen) {
+    size_t n = 0;
+    memset(covered, 0, job->pixel_count);
+    if (job->desc.skip_sparse) gsf__dense_cover_sparse(job, spacing, covered);
+    for (size_t i = 0; i < count; i++) {
+        if (covered[order[i]]) continue;
+        int x, y;
+        const gsf__dense_view* view = gsf__dense_view_of(job, order[i], &x, &y);
+        gsf__dense_cover(job, order[i], spacing, covered);
+        for (int s = 0; s < view->source_count; s++) {
+            size_t pixel;
+            if ((job->links[order[i]] >> s & 1) && gsf__dense_confirmed(job, view, x, y, s, &pixel))
+                gsf__dense_cover(job, pixel, spacing, covered);
+        }
+        chosen[n++] = order[i];
+    }
+    return n;
+}
+
+// World position, and world normal towards the camera, of a pixel's plane.
+static void gsf__dense_locate(const gsf__dense_job* job, size_t pixel, double point[3], double normal[3]) {
+    int x, y;
+    const gsf__dense_view* view = gsf__dense_view_of(job, pixel, &x, &y);
+    const gsf__dense_plane* plane = job->planes + pixel;
+    const double z = 1.0 / (double)plane->w;
+    const gsf_camera* camera = &view->camera;
+    const double ray[3] = {(x + 0.5 - camera->cx) / camera->fx * z, (y + 0.5 - camera->cy) / camera->fy * z, z};
+    double c2w[16];
+    float n[3];
+    gsf_camera_c2w(camera, c2w);
+    gsf__dense_normal(view, x, y, plane, n);
+    for (int k = 0; k < 3; k++) {
+        point[k] = c2w[12 + k];
+        normal[k] = 0.0;
+        for (int a = 0; a < 3; a++) {
+            point[k] += c2w[4 * a + k] * ray[a];
+            normal[k] -= c2w[4 * a + k] * (double)n[a];
+        }
+    }
+}
+
+static void gsf__dense_merge(const gsf__dense_job* job, size_t pixel, gsf_dense* out, size_t row) {
+    size_t pixels[1 + GSF__DENSE_SOURCES];
+    int count = 1, x, y;
+    const gsf__dense_view* view = gsf__dense_view_of(job, pixel, &x, &y);
+    pixels[0] = pixel;
+    for (int s = 0; s < view->source_count; s++)
+        if ((job->links[pixel] >> s & 1) && gsf__dense_confirmed(job, view, x, y, s, pixels + count)) count++;
+    double mean[3] = {0.0, 0.0, 0.0}, normal[3] = {0.0, 0.0, 0.0};
+    int color[3] = {0, 0, 0};
+    for (int i = 0; i < count; i++) {
+        double p[3], n[3];
+        gsf__dense_locate(job, pixels[i], p, n);
+        const gsf__dense_view* seen = gsf__dense_view_of(job, pixels[i], &x, &y);
+        const uint8_t* rgb = (const uint8_t*)seen->color.data + 3 * (pixels[i] - seen->first);
+        for (int k = 0; k < 3; k++) {
+            mean[k] += p[k] / count;
+            normal[k] += n[k];
+            color[k] += rgb[k];
+        }
+    }
+    const double length = sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]);
+    for (int k = 0; k < 3; k++) {
+        out->points[3 * row + (size_t)k] = mean[k];
+        out->normals[3 * row + (size_t)k] = (float)(normal[k] / (length > 0.0 ? length : 1.0));
+        out->colors[3 * row + (size_t)k] = (uint8_t)((color[k] + count / 2) / count);
+    }
+    out->confidence[row] = 1.0f - job->planes[pixel].cost;
+    out->view_counts[row] = (uint8_t)count;
+}
+
+static gsf_result gsf__dense_make_maps(const gsf__dense_job* job, gsf_dense* out) {
+    gsf_context* ctx = job->ctx;
+    out->maps = (gsf_dense_map*)gsf_alloc_zeroed(ctx, job->view_count, sizeof(gsf_dense_map));
+    if (!out->maps) return GSF_ERROR_OUT_OF_MEMORY;
+    out->map_count = job->view_count;
+    for (size_t i = 0; i < job->view_count; i++) {
+        const gsf__dense_view* view = job->views + i;
+        const size_t pixels = (size_t)view->width * (size_t)view->height;
+        gsf_dense_map* map = out->maps + i;
+        map->view = view->index;
+        map->camera = view->camera;
+        map->depth = (float*)gsf_alloc_zeroed(ctx, pixels, sizeof(float));
+        map->normals = (float*)gsf_alloc_zeroed(ctx, pixels, 3 * sizeof(float));
+        if (!map->depth || !map->normals) return GSF_ERROR_OUT_OF_MEMORY;
+        for (size_t k = 0; k < pixels; k++) {
+            double point[3], normal[3];
+            if (!job->links[view->first + k]) continue;
+            gsf__dense_locate(job, view->first + k, point, normal);
+            map->depth[k] = 1.0f / job->planes[view->first + k].w;
+            for (int a = 0; a < 3; a++) map->normals[3 * k + (size_t)a] = (float)normal[a];
+        }
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense_stats* stats) {
+    enum { BINS = 64 };
+    gsf_context* ctx = job->ctx;
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    uint32_t *order = NULL, *chosen = NULL;
+    uint8_t* covered = NULL;
+    size_t starts[BINS + 1], count = 0, n = 0;
+    job->links = (uint8_t*)gsf_alloc(ctx, job->pixel_count, 1);
+    if (!job->links) goto cleanup;
+    job->step_normal = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
+    gsf__parallel_for(ctx, job->block_count, gsf__dense_link_chunk, job);
+    memset(starts, 0, sizeof starts);
+    for (size_t i = 0; i < job->pixel_count; i++) {
+        const float cost = job->planes[i].cost;
+        stats->pixels += cost < GSF__DENSE_BAD;
+        stats->matched += cost <= job->desc.max_cost;
+        if (!job->links[i]) continue;
+        starts[1 + (size_t)(cost / job->desc.max_cost * (BINS - 0.5f))]++;
+        count++;
+    }
+    stats->consistent = count;
+    for (int b = 0; b < BINS; b++) starts[b + 1] += starts[b];
+    order = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t));
+    chosen = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t));
+    covered = (uint8_t*)gsf_alloc(ctx, job->pixel_count, 1);
+    if (!order || !chosen || !covered) goto cleanup;
+    for (size_t i = 0; i < job->pixel_count; i++)
+        if (job->links[i])
+            order[starts[(size_t)(job->planes[i].cost / job->desc.max_cost * (BINS - 0.5f))]++] = (uint32_t)i;
+    stats->spacing = job->desc.spacing;
+    n = gsf__dense_thin(job, order, count, stats->spacing, covered, chosen);
+    while (job->desc.max_points && n > job->desc.max_points && stats->spacing < 1024)
+        n = gsf__dense_thin(job, order, count, ++stats->spacing, covered, chosen);
+    if (job->desc.max_points && n > job->desc.max_points) n = job->desc.max_points;
+    out->points = (double*)gsf_alloc(ctx, n ? n : 1, 3 * sizeof(double));
+    out->normals = (float*)gsf_alloc(ctx, n ? n : 1, 3 * sizeof(float));
+    out->colors = (uint8_t*)gsf_alloc(ctx, n ? n : 1, 3);
+    out->confidence = (float*)gsf_alloc(ctx, n ? n : 1, sizeof(float));
+    out->view_counts = (uint8_t*)gsf_alloc(ctx, n ? n : 1, 1);
+    if (!out->points || !out->normals || !out->colors || !out->confidence || !out->view_counts) goto cleanup;
+    out->count = n;
+    for (size_t i = 0; i < n; i++) gsf__dense_merge(job, chosen[i], out, i);
+    result = job->desc.want_maps ? gsf__dense_make_maps(job, out) : GSF_OK;
+cleanup:
+    gsf_free(ctx, order);
+    gsf_free(ctx, chosen);
+    gsf_free(ctx, covered);
+    gsf_free(ctx, job->links);
+    job->links = NULL;
+    return result;
+}
+
+// The different views of the list, their depth ranges and sources. *pairs: how many there are.
+static gsf_result gsf__dense_prepare(gsf__dense_job* job, const uint32_t* views, size_t view_count, size_t* pairs) {
+    gsf_context* ctx = job->ctx;
+    const size_t room = job->scene->point_count > view_count ? job->scene->point_count : view_count;
+    double* scratch = (double*)gsf_alloc(ctx, room ? room : 1, sizeof(double));
+    job->views = (gsf__dense_view*)gsf_alloc_zeroed(ctx, view_count ? view_count : 1, sizeof(gsf__dense_view));
+    if (!scratch || !job->views) {
+        gsf_free(ctx, scratch);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    for (size_t i = 0; i < view_count; i++) {
+        size_t k = 0;
+        while (k < job->view_count && job->views[k].index != views[i]) k++;
+        if (k < job->view_count) continue;
+        job->views[k].index = views[i];
+        job->views[k].camera = job->scene->views[views[i]].camera;
+        job->view_count++;
+    }
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < job->view_count && job->view_count > 1 && result == GSF_OK; i++) {
+        double low, high;
+        result = gsf__dense_range(job, job->views + i, scratch, &low, &high);
+        if (result != GSF_OK) break;
+        gsf__dense_choose_sources(job, i, low, high, scratch);
+        *pairs += (size_t)job->views[i].source_count;
+        result = gsf__check_cancel(ctx);
+    }
+    gsf_free(ctx, scratch);
+    return result;
+}
+
+GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense) {
+    for (size_t i = 0; i < dense->map_count; i++) {
+        gsf_free(ctx, dense->maps[i].depth);
+        gsf_free(ctx, dense->maps[i].normals);
+    }
+    gsf_free(ctx, dense->maps);
+    gsf_free(ctx, dense->points);
+    gsf_free(ctx, dense->normals);
+    gsf_free(ctx, dense->colors);
+    gsf_free(ctx, dense->confidence);
+    gsf_free(ctx, dense->view_counts);
+    memset(dense, 0, sizeof *dense);
+}
+
+GSF_API gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                          size_t view_count, const uint8_t* keep, const gsf_dense_desc* desc,
+                                          gsf_dense* out, gsf_dense_stats* stats) {
+    gsf_dense_stats counted;
+    memset(&counted, 0, sizeof counted);
+    memset(out, 0, sizeof *out);
+    if (stats) *stats = counted;
+    const gsf_dense_desc d = gsf__dense_desc_defaults(desc);
+    GSF__TRY(gsf__dense_check(ctx, scene, views, view_count, &d));
+    gsf__dense_job* job = (gsf__dense_job*)gsf_alloc_zeroed(ctx, 1, sizeof(gsf__dense_job));
+    if (!job) return GSF_ERROR_OUT_OF_MEMORY;
+    job->ctx = ctx;
+    job->scene = scene;
+    job->desc = d;
+    job->keep = keep;
+    job->cost_fn = gsf__dense_cost_of(ctx->cpu_level);
+    gsf__dense_make_window(&d, &job->window);
+    double start = gsf__vis_seconds();
+    gsf_result result = gsf__dense_prepare(job, views, view_count, &counted.pairs);
+    counted.views = job->view_count;
+    counted.seconds_prepare = gsf__vis_seconds() - start;
+    start += counted.seconds_prepare;
+    int32_t levels = 1;
+    for (; levels < d.levels; levels++) {
+        int fits = 1;
+        for (size_t i = 0; i < job->view_count; i++) {
+            int32_t width, height;
+            gsf__dense_size(&job->scene->views[job->views[i].index].camera, d.max_size, levels, &width, &height);
+            fits &= width >= GSF__DENSE_MIN_SIDE && height >= GSF__DENSE_MIN_SIDE;
+        }
+        if (!fits) break;
+    }
+    if (result == GSF_OK && counted.pairs) result = gsf__dense_match(job, levels);
+    counted.seconds_match = gsf__vis_seconds() - start;
+    start += counted.seconds_match;
+    if (result == GSF_OK && counted.pairs) result = gsf__dense_fuse(job, out, &counted);
+    counted.seconds_fuse = gsf__vis_seconds() - start;
+    if (result == GSF_OK && !counted.pairs)
+        gsf_log(ctx, GSF_LOG_WARNING, "dense points: no two of %zu views overlap, so there are none", job->view_count);
+    gsf__dense_free_level(job);
+    gsf_free(ctx, job->views);
+    gsf_free(ctx, job);
+    if (result != GSF_OK) gsf_splat_destroy_dense(ctx, out);
+    else if (stats) *stats = counted;
+    return result;
+}
 
 // ---- >>rasterizer state --------------------------------------------------------
 

@@ -28,6 +28,7 @@ const gsfix_quality* gsfix_find_quality(const char* name) {
 
 typedef struct fix_setup { // everything that decides what the run computes
     gsf_fix_desc fix;
+    gsf_dense_desc dense;
     int32_t sh_degree, random_points;
     char init[16]; // method, resolved
 } fix_setup;
@@ -36,7 +37,8 @@ enum { SET_WHOLE, SET_REAL, SET_SWITCH }; // int32_t, float, int32_t of 0 (off) 
 typedef struct setting { const char* name; int kind; size_t offset; } setting;
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
-static const setting settings[] = { // zero: the library's default, see gsf_train_desc and gsf_fix_desc
+#define DENSE_AT(field) offsetof(fix_setup, dense.field)
+static const setting settings[] = { // zero: the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc
     {"sh_degree", SET_WHOLE, offsetof(fix_setup, sh_degree)},
     {"random_points", SET_WHOLE, offsetof(fix_setup, random_points)},
     {"dropout", SET_REAL, TRAIN_AT(dropout)},
@@ -69,6 +71,12 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"lambda", SET_REAL, FIX_AT(lambda)},
     {"skip_psnr", SET_REAL, FIX_AT(skip_psnr)},
     {"max_pixels", SET_WHOLE, FIX_AT(max_pixels)},
+    {"dense_spacing", SET_WHOLE, DENSE_AT(spacing)},
+    {"dense_max_cost", SET_REAL, DENSE_AT(max_cost)},
+    {"dense_max_reprojection", SET_REAL, DENSE_AT(max_reprojection)},
+    {"dense_max_depth_error", SET_REAL, DENSE_AT(max_depth_error)},
+    {"dense_max_normal_angle", SET_REAL, DENSE_AT(max_normal_angle)},
+    {"dense_min_consistent", SET_WHOLE, DENSE_AT(min_consistent)},
 };
 enum { SETTING_COUNT = sizeof settings / sizeof settings[0] };
 
@@ -121,7 +129,6 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
     setup->fix.skip_psnr = quality->skip_psnr;
     setup->fix.max_pixels = quality->max_pixels;
-    if (app->o.init && strcmp(app->o.init, "dense") == 0) return gsfix_misused(app, "--init dense is not in this version");
     const int code = apply_settings(app, setup);
     if (code) return code;
     if (setup->sh_degree < 0 || setup->sh_degree > 3) return gsfix_misused(app, "--set sh_degree: expected 0 to 3");
@@ -213,6 +220,46 @@ static gsf_result random_points(fix_run* run, double** points, uint8_t** colors,
     return GSF_OK;
 }
 
+// The points marked by `keep`, and points where the training photos agree that lie apart from these.
+static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** points, uint8_t** colors, size_t* count) {
+    gsf_context* ctx = run->ctx;
+    const gsf_scene* scene = &run->scene;
+    gsf_dense dense;
+    gsf_dense_stats stats;
+    gsf_dense_desc desc = run->setup.dense;
+    desc.seed = run->setup.fix.train.seed;
+    desc.skip_sparse = 1;
+    gsf_result result = gsf_splat_dense_points(ctx, scene, run->split.train, run->split.train_count, keep, &desc, &dense,
+                                               &stats);
+    if (result != GSF_OK) return result;
+    size_t n = 0;
+    for (size_t i = 0; i < scene->point_count; i++) n += keep[i] != 0;
+    gsfix_note(run->app, "%zu points that a training view sees; %zu more by stereo between %zu pairs of views in %.1f s", n,
+               dense.count, stats.pairs, stats.seconds_prepare + stats.seconds_match + stats.seconds_fuse);
+    *points = (double*)gsf_alloc(ctx, n + dense.count + 1, 3 * sizeof **points);
+    *colors = (uint8_t*)gsf_alloc(ctx, n + dense.count + 1, 3);
+    if (*points && *colors) {
+        n = 0;
+        for (size_t i = 0; i < scene->point_count; i++) {
+            if (!keep[i]) continue;
+            memcpy(*points + 3 * n, scene->points + 3 * i, 3 * sizeof **points);
+            memcpy(*colors + 3 * n++, scene->colors + 3 * i, 3);
+        }
+        if (dense.count) {
+            memcpy(*points + 3 * n, dense.points, dense.count * 3 * sizeof **points);
+            memcpy(*colors + 3 * n, dense.colors, dense.count * 3);
+        }
+        *count = n + dense.count;
+        if (!*count)
+            result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "no sparse point is seen by a training view, and no two of them "
+                              "agree anywhere (try --init random)");
+    } else {
+        result = GSF_ERROR_OUT_OF_MEMORY;
+    }
+    gsf_splat_destroy_dense(ctx, &dense);
+    return result;
+}
+
 static gsf_result make_initial(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const gsf_scene* scene = &run->scene;
@@ -231,29 +278,37 @@ static gsf_result make_initial(fix_run* run) {
         gsf_free(ctx, colors);
         return result;
     }
-    if (!scene->point_count)
+    const int is_dense = strcmp(init, "dense") == 0;
+    if (!scene->point_count && !is_dense)
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (--init random does without)",
                         scene->folder);
-    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count, 1);
+    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count + 1, 1);
     if (!keep) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = GSF_OK;
     if (strcmp(init, "all") == 0) {
         memset(keep, 1, scene->point_count);
-    } else {
+    } else if (scene->point_count) {
         gsf_visibility_desc desc = {0};
         gsf_visibility_stats stats = {0};
         desc.method = strcmp(init, "embree") == 0   ? GSF_VISIBILITY_RAYS
                       : strcmp(init, "tracks") == 0 ? GSF_VISIBILITY_TRACKS
                                                     : GSF_VISIBILITY_BOTH;
         result = gsf_splat_visible_points(ctx, scene, run->split.train, run->split.train_count, &desc, keep, &stats);
-        if (result == GSF_OK && !stats.kept)
+        if (result == GSF_OK && !stats.kept && !is_dense)
             result = gsf_fail(ctx, GSF_ERROR_DEGENERATE,
                               "no point of the scene is seen by a training view (try --init all or random)");
         if (desc.method != GSF_VISIBILITY_TRACKS) run->rays = stats.used_embree ? "embree" : "z-buffer";
     }
+    double* points = NULL;
+    uint8_t* colors = NULL;
+    size_t count = 0;
+    if (result == GSF_OK && is_dense) result = dense_points(run, keep, &points, &colors, &count);
     if (result == GSF_OK)
-        result = gsf_splat_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, run->setup.sh_degree,
+        result = gsf_splat_from_points(ctx, is_dense ? points : scene->points, is_dense ? colors : scene->colors,
+                                       is_dense ? count : scene->point_count, is_dense ? NULL : keep, run->setup.sh_degree,
                                        scene->origin, &run->initial);
+    gsf_free(ctx, points);
+    gsf_free(ctx, colors);
     gsf_free(ctx, keep);
     return result;
 }
@@ -389,6 +444,7 @@ static void write_switches(fix_run* run) {
     for (int i = 0; i < SETTING_COUNT; i++) {
         const void* field = (const char*)&used + settings[i].offset;
         if (strcmp(settings[i].name, "random_points") == 0 && strcmp(used.init, "random") != 0) continue;
+        if (strncmp(settings[i].name, "dense_", 6) == 0 && strcmp(used.init, "dense") != 0) continue;
         const int32_t whole = settings[i].kind == SET_REAL ? 0 : *(const int32_t*)field;
         if (settings[i].kind == SET_REAL) gsfix_json_number(ctx, t, settings[i].name, as_written(*(const float*)field));
         else if (settings[i].kind == SET_WHOLE) gsfix_json_number(ctx, t, settings[i].name, whole);

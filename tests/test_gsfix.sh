@@ -30,7 +30,7 @@ expect 2 "$gsfix" fix "$scene"
 expect 2 "$gsfix" fix "$scene" --out x --restorer dit:models
 expect 2 "$gsfix" fix "$scene" --out x --restorer nonsense
 expect 2 "$gsfix" fix "$scene" --out x --condition 3d
-expect 2 "$gsfix" fix "$scene" --out x --init dense
+expect 2 "$gsfix" fix "$scene" --out x --init nonsense
 expect 2 "$gsfix" fix "$scene" --out x --iterations 0
 expect 2 "$gsfix" fix "$scene" --out x --iterations 10x
 expect 2 "$gsfix" fix "$scene" --out x --set nonsense=1
@@ -96,7 +96,7 @@ holds "took longer" stderr
 expect 1 "$gsfix" fix "$scene" --out b "${small[@]}" --restorer "exec:exit 5"
 holds "status 5" stderr
 # the other ways to start, the three paths, warp, plain; no repair gives no frames
-for init in embree tracks both all random; do
+for init in embree tracks both all dense random; do
     expect 0 "$gsfix" fix "$scene" --out c --views 3 --iterations 2 --max-size 48 --init $init --json
     holds "\"init\":\"$init\"" stdout
 done
