@@ -241,13 +241,15 @@ typedef struct gsf_dense_desc {
     uint64_t seed;
     int32_t max_size;        // longer side of the working images; photos that are larger are shrunk; 0 = 640
     int32_t levels;          // sizes halved this often, at most, less one; 0 = 3 (as long as 48 pixels are left)
-    int32_t iterations;      // per level, 0 = 4 (the finest: 3)
+    int32_t iterations;      // per level, 0 = 2; two more at the coarsest, half as many at the finest, where two more follow
+                             // that also weigh how well the views' depths agree
     int32_t sources;         // other views that a view is compared with, at most 8; 0 = 4
     int32_t radius;          // of the matching window, pixels, at most 15; 0 = 5
     int32_t stride;          // between its samples; 0 = 2
     float color_sigma;       // grey levels of 255 at which a sample's weight falls to 1/e; 0 = 18
     float min_angle;         // degrees between two views' rays to a point below which they do not help; 0 = 1
-    float max_cost;          // 1 - correlation that a pixel may have; 0 = 0.35
+    float max_cost;          // 1 - correlation that a pixel may have, and those that confirm it; 0 = 0.35
+    float max_cost_many;     // the same where one more view agrees than must; 0 = 0.5
     float max_reprojection;  // pixels between a pixel and its way to the other view and back; 0 = 1
     float max_depth_error;   // relative difference of the two depths; 0 = 0.02
     float max_normal_angle;  // degrees between the two normals; 0 = 40
@@ -4886,13 +4888,15 @@ static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
     if (desc) d = *desc;
     if (d.max_size == 0) d.max_size = 640;
     if (d.levels == 0) d.levels = 3;
-    if (d.iterations == 0) d.iterations = 4;
+    if (d.iterations == 0) d.iterations = 2;
     if (d.sources == 0) d.sources = 4;
     if (d.radius == 0) d.radius = 5;
     if (d.stride == 0) d.stride = 2;
     if (d.color_sigma == 0.0f) d.color_sigma = 18.0f;
     if (d.min_angle == 0.0f) d.min_angle = 1.0f;
     if (d.max_cost == 0.0f) d.max_cost = 0.35f;
+    if (d.max_cost_many == 0.0f) d.max_cost_many = 0.5f;
+    if (d.max_cost_many < d.max_cost) d.max_cost_many = d.max_cost;
     if (d.max_reprojection == 0.0f) d.max_reprojection = 1.0f;
     if (d.max_depth_error == 0.0f) d.max_depth_error = 0.02f;
     if (d.max_normal_angle == 0.0f) d.max_normal_angle = 40.0f;
@@ -4914,7 +4918,7 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
     if (side * side > GSF__DENSE_SAMPLES)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: radius %d by stride %d is more than %d samples",
                         (int)d->radius, (int)d->stride, (int)GSF__DENSE_SAMPLES);
-    if (!(d->color_sigma > 0.0f && d->min_angle >= 0.0f && d->max_cost > 0.0f && d->max_cost < GSF__DENSE_BAD &&
+    if (!(d->color_sigma > 0.0f && d->min_angle >= 0.0f && d->max_cost > 0.0f && d->max_cost_many < GSF__DENSE_BAD &&
           d->max_reprojection > 0.0f && d->max_depth_error > 0.0f && d->max_normal_angle > 0.0f &&
           d->max_normal_angle <= 180.0f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
@@ -5271,7 +5275,8 @@ static int gsf__dense_gather(const gsf__dense_pixel* p, gsf__dense_plane* planes
     const gsf__dense_view* view = p->view;
     const gsf__dense_plane* all = p->job->planes + view->first;
     int count = 0;
-    for (int region = 0; region < 8; region++) {
+    const int regions = p->job->roam ? 8 : 4; // what the coarsest level brought far need not travel again
+    for (int region = 0; region < regions; region++) {
         const int side = region & 3; // down, up, right, left
         const int steps = region < 4 ? 7 : 11;
         const gsf__dense_plane* best = NULL;
@@ -5724,7 +5729,8 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
 
 static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int finest, double* done, double total) {
     const int32_t geometric = 2; // of the finest level's, after the others
-    const int32_t count = finest && job->desc.iterations > 1 && !coarsest ? job->desc.iterations - 1 : job->desc.iterations;
+    const int32_t some = finest ? (job->desc.iterations + 1) / 2 : job->desc.iterations;
+    const int32_t count = coarsest ? job->desc.iterations + 2 : some;
     float scale = 1.0f;
     job->roam = coarsest;
     for (job->iteration = 0; job->iteration < count + (finest ? geometric : 0); job->iteration++, scale *= 0.5f) {
@@ -5757,7 +5763,7 @@ static gsf_result gsf__dense_match(gsf__dense_job* job, int32_t levels) {
         for (size_t i = 0; i < job->view_count; i++) {
             int32_t width, height;
             gsf__dense_size(&job->scene->views[job->views[i].index].camera, job->desc.max_size, level, &width, &height);
-            total += (double)width * height * (job->desc.iterations + (level == 0 ? 1 + (levels == 1) : 0));
+            total += (double)width * height * (job->desc.iterations + 2);
         }
     for (int32_t level = levels - 1; level >= 0 && result == GSF_OK; level--) {
         gsf__dense_plane* coarse_planes = job->planes; // of the level before, NULL at the first
@@ -5796,7 +5802,7 @@ static int gsf__dense_confirmed(const gsf__dense_job* job, const gsf__dense_view
     const int iu = (int)(u + 0.5f), iv = (int)(v + 0.5f);
     *pixel = other->first + (size_t)iv * (size_t)other->width + (size_t)iu;
     const gsf__dense_plane* there = job->planes + *pixel;
-    if (!(there->cost <= job->desc.max_cost)) return 0;
+    if (!(there->cost <= job->desc.max_cost_many)) return 0;
     const float w = there->w + there->gx * (u - (float)iu) + there->gy * (v - (float)iv), expected = plane->w / Z;
     const float difference = w < expected ? expected - w : w - expected;
     if (!(difference <= job->desc.max_depth_error * expected)) return 0;
@@ -5821,14 +5827,19 @@ static void gsf__dense_link_chunk(void* arg, size_t chunk, int worker) {
     for (int y = first; y < view->height && y < first + GSF__DENSE_ROWS; y++)
         for (int x = 0; x < view->width; x++) {
             const size_t at = view->first + (size_t)y * (size_t)view->width + (size_t)x;
-            int links = 0, count = 0;
-            for (int s = 0; s < view->source_count && job->planes[at].cost <= job->desc.max_cost; s++) {
+            const float cost = job->planes[at].cost;
+            int links = 0, good_links = 0, count = 0, good = 0;
+            for (int s = 0; s < view->source_count && cost <= job->desc.max_cost_many; s++) {
                 size_t pixel;
                 if (!gsf__dense_confirmed(job, view, x, y, s, &pixel)) continue;
                 links |= 1 << s;
                 count++;
+                if (!(cost <= job->desc.max_cost && job->planes[pixel].cost <= job->desc.max_cost)) continue;
+                good_links |= 1 << s;
+                good++;
             }
-            job->links[at] = (uint8_t)(count >= job->desc.min_consistent ? links : 0);
+            if (count <= job->desc.min_consistent) links = good >= job->desc.min_consistent ? good_links : 0;
+            job->links[at] = (uint8_t)links;
         }
 }
 
@@ -5976,9 +5987,9 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     for (size_t i = 0; i < job->pixel_count; i++) {
         const float cost = job->planes[i].cost;
         stats->pixels += cost < GSF__DENSE_BAD;
-        stats->matched += cost <= job->desc.max_cost;
+        stats->matched += cost <= job->desc.max_cost_many;
         if (!job->links[i]) continue;
-        starts[1 + (size_t)(cost / job->desc.max_cost * (BINS - 0.5f))]++;
+        starts[1 + (size_t)(cost / job->desc.max_cost_many * (BINS - 0.5f))]++;
         count++;
     }
     stats->consistent = count;
@@ -5989,7 +6000,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     if (!order || !chosen || !covered) goto cleanup;
     for (size_t i = 0; i < job->pixel_count; i++)
         if (job->links[i])
-            order[starts[(size_t)(job->planes[i].cost / job->desc.max_cost * (BINS - 0.5f))]++] = (uint32_t)i;
+            order[starts[(size_t)(job->planes[i].cost / job->desc.max_cost_many * (BINS - 0.5f))]++] = (uint32_t)i;
     stats->spacing = job->desc.spacing;
     n = gsf__dense_thin(job, order, count, stats->spacing, covered, chosen);
     while (job->desc.max_points && n > job->desc.max_points && stats->spacing < 1024)

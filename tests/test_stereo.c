@@ -158,14 +158,15 @@ static void check_plane(double tilt, double offset) {
         }
         on += fabs(distance) < 0.05;
         near += dot > 0.94;
-        CHECK(dense.view_counts[i] >= 2 && dense.view_counts[i] <= VIEWS && dense.confidence[i] > 0.6f);
+        CHECK(dense.view_counts[i] >= 2 && dense.view_counts[i] <= VIEWS && dense.confidence[i] >= 0.5f);
     }
     printf("plane tilted %.0f degrees, %g from the zero: %zu of %d pixels, mean error %.5f, %.4f within 1 %%, normals %.3f; "
            "%zu points\n", tilt * 57.3, offset, accepted, VIEWS * WIDTH * HEIGHT, sum / (double)accepted,
            (double)good / (double)accepted, (double)facing / (double)accepted, dense.count);
     CHECK(accepted > (size_t)(0.6 * VIEWS * WIDTH * HEIGHT));
-    CHECK(sum / (double)accepted < 0.003 && good > 0.98 * (double)accepted && facing > 0.85 * (double)accepted);
-    CHECK(dense.count > 500 && on > 0.98 * (double)dense.count && near > 0.85 * (double)dense.count);
+    // 1 % of the depth is 0.14 pixels here
+    CHECK(sum / (double)accepted < 0.005 && good > 0.92 * (double)accepted && facing > 0.9 * (double)accepted);
+    CHECK(dense.count > 500 && on > 0.95 * (double)dense.count && near > 0.9 * (double)dense.count);
     CHECK(stats.views == VIEWS && stats.pairs == 6 && stats.consistent == accepted && stats.matched >= accepted);
     gsf_splat_destroy_dense(&ctx, &dense);
     CHECK(dense.points == NULL && dense.count == 0);
