@@ -254,7 +254,7 @@ typedef struct gsf_dense_desc {
     float max_depth_error;   // relative difference of the two depths; 0 = 0.02
     float max_normal_angle;  // degrees between the two normals; 0 = 40
     int32_t min_consistent;  // other views that must agree; 0 = 1
-    int32_t spacing;         // pixels between points, at least 1; 0 = 3
+    int32_t spacing;         // pixels between points, at least 1; 0 = 2
     size_t max_points;       // spacing grows until no more than this are left; 0 = no limit
     int32_t skip_sparse;     // no points closer than `spacing` to a sparse point (of `keep`), so that both may be united
     double depth_min, depth_max; // search range of the camera depth; 0 = from the sparse points and the camera poses
@@ -4870,7 +4870,7 @@ typedef struct gsf__dense_job {
     gsf__dense_plane* planes;
     gsf__dense_plane* others;      // planes as they were before a geometric iteration, else NULL
     float* source_costs;           // (pixels,GSF__DENSE_SOURCES)
-    uint8_t* links;                // per pixel: bit s = source s agrees
+    uint8_t* links;                // per pixel: bit s = source s agrees, 0 where too few do
     size_t block_count;
     gsf__dense_block* blocks;
     // the coarser level, while planes are taken over from it
@@ -4878,7 +4878,8 @@ typedef struct gsf__dense_job {
     gsf__dense_plane* coarse_planes;
     float* seeds;                  // coarsest level: inverse depth of the nearest sparse point, 0 = none
     int32_t level, iteration, color;
-    float step_pixels, step_normal; // perturbation at this iteration: pixels in the other view, sine
+    float step_pixels, step_normal; // perturbation at this iteration: pixels in the other view; of the unit normal
+    float min_normal_dot;          // of two views' normals that agree
     int32_t roam;                  // also try planes from the whole range
 } gsf__dense_job;
 
@@ -4901,7 +4902,7 @@ static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
     if (d.max_depth_error == 0.0f) d.max_depth_error = 0.02f;
     if (d.max_normal_angle == 0.0f) d.max_normal_angle = 40.0f;
     if (d.min_consistent == 0) d.min_consistent = 1;
-    if (d.spacing == 0) d.spacing = 3;
+    if (d.spacing == 0) d.spacing = 2;
     return d;
 }
 
@@ -5461,7 +5462,7 @@ static int gsf__dense_usable(const gsf__dense_job* job, size_t i) {
 
 // Depth range of a view: that of the sparse points in it with a margin, or what the distances between the views can
 // measure: from a third to sixty times the median one.
-static gsf_result gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double* depths, double* low, double* high) {
+static void gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double* depths, double* low, double* high) {
     const gsf_scene* scene = job->scene;
     size_t n = 0;
     double u, v, z;
@@ -5491,7 +5492,6 @@ static gsf_result gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, d
         *low = *high = 0.0; // all views at one place, or a range that the caller's excludes
     view->w_min = *high > 0.0 ? (float)(1.0 / *high) : 0.0f;
     view->w_max = *low > 0.0 ? (float)(1.0 / *low) : 0.0f;
-    return GSF_OK;
 }
 
 // What a point says for comparing two views: 0 where the rays are closer than min_angle, most around ten degrees, less
@@ -5816,7 +5816,7 @@ static int gsf__dense_confirmed(const gsf__dense_job* job, const gsf__dense_view
     gsf__dense_normal(other, iu, iv, there, b);
     const float* r = source->rotation;
     for (int k = 0; k < 3; k++) dot += b[k] * (r[3 * k] * a[0] + r[3 * k + 1] * a[1] + r[3 * k + 2] * a[2]);
-    return dot >= job->step_normal; // the cosine, while fusing
+    return dot >= job->min_normal_dot;
 }
 
 static void gsf__dense_link_chunk(void* arg, size_t chunk, int worker) {
@@ -5981,7 +5981,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     size_t starts[BINS + 1], count = 0, n = 0;
     job->links = (uint8_t*)gsf_alloc(ctx, job->pixel_count, 1);
     if (!job->links) goto cleanup;
-    job->step_normal = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
+    job->min_normal_dot = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
     gsf__parallel_for(ctx, job->block_count, gsf__dense_link_chunk, job);
     memset(starts, 0, sizeof starts);
     for (size_t i = 0; i < job->pixel_count; i++) {
@@ -5989,7 +5989,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
         stats->pixels += cost < GSF__DENSE_BAD;
         stats->matched += cost <= job->desc.max_cost_many;
         if (!job->links[i]) continue;
-        starts[1 + (size_t)(cost / job->desc.max_cost_many * (BINS - 0.5f))]++;
+        starts[1 + (size_t)(cost / job->desc.max_cost_many * ((float)BINS - 0.5f))]++;
         count++;
     }
     stats->consistent = count;
@@ -6000,7 +6000,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     if (!order || !chosen || !covered) goto cleanup;
     for (size_t i = 0; i < job->pixel_count; i++)
         if (job->links[i])
-            order[starts[(size_t)(job->planes[i].cost / job->desc.max_cost_many * (BINS - 0.5f))]++] = (uint32_t)i;
+            order[starts[(size_t)(job->planes[i].cost / job->desc.max_cost_many * ((float)BINS - 0.5f))]++] = (uint32_t)i;
     stats->spacing = job->desc.spacing;
     n = gsf__dense_thin(job, order, count, stats->spacing, covered, chosen);
     while (job->desc.max_points && n > job->desc.max_points && stats->spacing < 1024)
@@ -6045,8 +6045,7 @@ static gsf_result gsf__dense_prepare(gsf__dense_job* job, const uint32_t* views,
     gsf_result result = GSF_OK;
     for (size_t i = 0; i < job->view_count && job->view_count > 1 && result == GSF_OK; i++) {
         double low, high;
-        result = gsf__dense_range(job, job->views + i, scratch, &low, &high);
-        if (result != GSF_OK) break;
+        gsf__dense_range(job, job->views + i, scratch, &low, &high);
         gsf__dense_choose_sources(job, i, low, high, scratch);
         *pairs += (size_t)job->views[i].source_count;
         result = gsf__check_cancel(ctx);

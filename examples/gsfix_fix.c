@@ -29,7 +29,6 @@ const gsfix_quality* gsfix_find_quality(const char* name) {
 typedef struct fix_setup { // everything that decides what the run computes
     gsf_fix_desc fix;
     gsf_dense_desc dense;
-    float dense_thickness, dense_opacity;
     int32_t sh_degree, random_points;
     char init[16]; // method, resolved
 } fix_setup;
@@ -78,8 +77,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"dense_max_depth_error", SET_REAL, DENSE_AT(max_depth_error)},
     {"dense_max_normal_angle", SET_REAL, DENSE_AT(max_normal_angle)},
     {"dense_min_consistent", SET_WHOLE, DENSE_AT(min_consistent)},
-    {"dense_thickness", SET_REAL, offsetof(fix_setup, dense_thickness)},
-    {"dense_opacity", SET_REAL, offsetof(fix_setup, dense_opacity)},
+    {"dense_max_cost_many", SET_REAL, DENSE_AT(max_cost_many)},
 };
 enum { SETTING_COUNT = sizeof settings / sizeof settings[0] };
 
@@ -223,27 +221,8 @@ static gsf_result random_points(fix_run* run, double** points, uint8_t** colors,
     return GSF_OK;
 }
 
-// Splats of dense points lie flat on their surface: thickness is the share of the scale that is left along the normal.
-static void flatten_splats(gsf_splats* splats, size_t first, const float* normals, float thickness, float opacity) {
-    for (size_t i = 0; i < splats->count; i++) {
-        if (splats->ids[i] < first) continue;
-        const float* n = normals + 3 * (splats->ids[i] - first);
-        float* q = splats->quats + 4 * i; // turns z to the normal (or its opposite, for which the turn is smaller)
-        const float sign = n[2] < 0.0f ? -1.0f : 1.0f;
-        q[0] = 1.0f + sign * n[2];
-        q[1] = -sign * n[1];
-        q[2] = sign * n[0];
-        q[3] = 0.0f;
-        const float length = sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]);
-        for (int k = 0; k < 3; k++) q[k] /= length;
-        splats->log_scales[3 * i + 2] += logf(thickness);
-        splats->opacity_logits[i] = logf(opacity / (1.0f - opacity));
-    }
-}
-
 // The points marked by `keep`, and points where the training photos agree that lie apart from these.
-static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** points, uint8_t** colors, float** normals,
-                               size_t* count) {
+static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** points, uint8_t** colors, size_t* count) {
     gsf_context* ctx = run->ctx;
     const gsf_scene* scene = &run->scene;
     gsf_dense dense;
@@ -278,8 +257,6 @@ static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** point
     } else {
         result = GSF_ERROR_OUT_OF_MEMORY;
     }
-    *normals = dense.normals;
-    dense.normals = NULL;
     gsf_splat_destroy_dense(ctx, &dense);
     return result;
 }
@@ -325,22 +302,14 @@ static gsf_result make_initial(fix_run* run) {
     }
     double* points = NULL;
     uint8_t* colors = NULL;
-    float* normals = NULL; // of the last ones
     size_t count = 0;
-    if (result == GSF_OK && is_dense) result = dense_points(run, keep, &points, &colors, &normals, &count);
+    if (result == GSF_OK && is_dense) result = dense_points(run, keep, &points, &colors, &count);
     if (result == GSF_OK)
         result = gsf_splat_from_points(ctx, is_dense ? points : scene->points, is_dense ? colors : scene->colors,
                                        is_dense ? count : scene->point_count, is_dense ? NULL : keep, run->setup.sh_degree,
                                        scene->origin, &run->initial);
-    if (result == GSF_OK && is_dense) {
-        size_t sparse = 0;
-        for (size_t i = 0; i < scene->point_count; i++) sparse += keep[i] != 0;
-        flatten_splats(&run->initial, sparse, normals, run->setup.dense_thickness > 0 ? run->setup.dense_thickness : 1.0f,
-                       run->setup.dense_opacity > 0 ? run->setup.dense_opacity : 0.1f);
-    }
     gsf_free(ctx, points);
     gsf_free(ctx, colors);
-    gsf_free(ctx, normals);
     gsf_free(ctx, keep);
     return result;
 }

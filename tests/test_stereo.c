@@ -160,9 +160,9 @@ static void check_plane(double tilt, double offset) {
         near += dot > 0.94;
         CHECK(dense.view_counts[i] >= 2 && dense.view_counts[i] <= VIEWS && dense.confidence[i] >= 0.5f);
     }
-    printf("plane tilted %.0f degrees, %g from the zero: %zu of %d pixels, mean error %.5f, %.4f within 1 %%, normals %.3f; "
-           "%zu points, %.3f on it, %.3f normals\n", tilt * 57.3, offset, accepted, VIEWS * WIDTH * HEIGHT, sum / (double)accepted,
-           (double)good / (double)accepted, (double)facing / (double)accepted, dense.count,
+    printf("plane tilted %.0f degrees, %g from the zero: %zu of %d pixels, mean error %.5f, %.4f within 1 %%, "
+           "normals %.3f; %zu points, %.3f on it, %.3f normals\n", tilt * 57.3, offset, accepted, VIEWS * WIDTH * HEIGHT,
+           sum / (double)accepted, (double)good / (double)accepted, (double)facing / (double)accepted, dense.count,
            (double)on / (double)dense.count, (double)near / (double)dense.count);
     CHECK(accepted > (size_t)(0.6 * VIEWS * WIDTH * HEIGHT));
     // 1 % of the depth is 0.14 pixels here
@@ -244,7 +244,8 @@ static void test_refused(void) {
 
 static gsf_dense_desc quick_desc(void) {
     gsf_dense_desc desc = {0};
-    desc.iterations = 2;
+    desc.iterations = 1;
+    desc.spacing = 3;
     desc.want_maps = 1;
     return desc;
 }
@@ -322,7 +323,8 @@ static void test_beside_sparse_points(void) {
             double* nearest = keep[k] ? &nearest_kept : &nearest_left;
             if (sqrt(sum) < *nearest) *nearest = sqrt(sum);
         }
-    printf("beside sparse points: %zu points, %.3f from those in use, %.3f from others\n", dense.count, nearest_kept, nearest_left);
+    printf("beside sparse points: %zu points, %.3f from those in use, %.3f from others\n", dense.count, nearest_kept,
+           nearest_left);
     CHECK(dense.count > 300 && nearest_kept > 0.08 && nearest_left < 0.05); // a pixel is 0.05 wide, the spacing 3
     gsf_splat_destroy_dense(&ctx, &dense);
     free_plane(&s);
@@ -461,9 +463,9 @@ static void check_courtyard(const gsf_scene* scene, const char* folder, const co
     CHECK(n == stats.consistent && n > 0);
     qsort(errors, n, sizeof *errors, compare_floats);
     const double all = (double)n, complete = (double)found / (double)possible;
-    printf("courtyard, %zu views: median error %.5f, within 1, 2, 5 %%: %.3f %.3f %.3f; complete %.3f; %zu points, %.2f s\n",
-           limits->views, (double)errors[n / 2], (double)within[0] / all, (double)within[1] / all, (double)within[2] / all,
-           complete, dense.count, stats.seconds_prepare + stats.seconds_match + stats.seconds_fuse);
+    printf("courtyard, %zu views: median error %.5f, within 1, 2, 5 %%: %.3f %.3f %.3f; complete %.3f; %zu points, "
+           "%.2f s\n", limits->views, (double)errors[n / 2], (double)within[0] / all, (double)within[1] / all,
+           (double)within[2] / all, complete, dense.count, stats.seconds_prepare + stats.seconds_match + stats.seconds_fuse);
     CHECK((double)errors[n / 2] < limits->median);
     CHECK((double)within[0] / all > limits->within_1 && (double)within[2] / all > limits->within_5);
     CHECK(complete > limits->complete);
@@ -485,7 +487,8 @@ static void test_courtyard(void) {
     options.noise *= 0.5;
     options.arc = 90.0;
     gsf_scene scene;
-    if (CHECK(make_scene(&ctx, &options, folder) == 0) && CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, NULL, &scene))) {
+    if (CHECK(make_scene(&ctx, &options, folder) == 0) &&
+        CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, NULL, &scene))) {
         for (size_t i = 0; i < scene.view_count; i++) CHECK_OK(&ctx, gsf_splat_load_view_image(&ctx, &scene, i));
         for (size_t i = 0; i < sizeof limits / sizeof *limits; i++) check_courtyard(&scene, folder, &limits[i]);
         gsf_splat_destroy_scene(&ctx, &scene);
