@@ -240,7 +240,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_from_points(gsf_context* ctx, const d
 typedef struct gsf_dense_desc {
     uint64_t seed;
     int32_t max_size;        // longer side of the working images; photos that are larger are shrunk; 0 = 640
-    int32_t levels;          // sizes halved this often, at most, less one; 0 = 3 (as long as 48 pixels are left)
+    int32_t levels;          // sizes halved this often, at most, less one; 0 = 3 (as long as 40 pixels are left)
     int32_t iterations;      // per level, 0 = 2; two more at the coarsest, half as many at the finest, where two more follow
                              // that also weigh how well the views' depths agree
     int32_t sources;         // other views that a view is compared with, at most 8; 0 = 4
@@ -4804,7 +4804,7 @@ enum {
     GSF__DENSE_SAMPLES = 256,
     GSF__DENSE_ROWS = 4,       // of a chunk
     GSF__DENSE_PLANES = 9,     // own, and one from each region
-    GSF__DENSE_MIN_SIDE = 48,
+    GSF__DENSE_MIN_SIDE = 40,  // of the coarsest level, pixels
 };
 
 #define GSF__DENSE_BAD 2.0f        // cost of a plane that cannot be judged
