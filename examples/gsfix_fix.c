@@ -7,7 +7,7 @@
 
 // ---- defaults: decided by measurement, kept here only ------------------------------
 
-enum { DEFAULT_ITERATIONS = 1200, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000 };
+enum { DEFAULT_ITERATIONS = 1200, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000, DENSE_POINTS = 40000 };
 
 static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
@@ -29,7 +29,7 @@ const gsfix_quality* gsfix_find_quality(const char* name) {
 typedef struct fix_setup { // everything that decides what the run computes
     gsf_fix_desc fix;
     gsf_dense_desc dense;
-    int32_t sh_degree, random_points;
+    int32_t sh_degree, random_points, dense_points; // dense_points: at most
     char init[16]; // method, resolved
 } fix_setup;
 
@@ -71,6 +71,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"lambda", SET_REAL, FIX_AT(lambda)},
     {"skip_psnr", SET_REAL, FIX_AT(skip_psnr)},
     {"max_pixels", SET_WHOLE, FIX_AT(max_pixels)},
+    {"dense_points", SET_WHOLE, offsetof(fix_setup, dense_points)},
     {"dense_spacing", SET_WHOLE, DENSE_AT(spacing)},
     {"dense_max_cost", SET_REAL, DENSE_AT(max_cost)},
     {"dense_max_reprojection", SET_REAL, DENSE_AT(max_reprojection)},
@@ -117,6 +118,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     memset(setup, 0, sizeof *setup);
     setup->sh_degree = DEFAULT_SH_DEGREE;
     setup->random_points = RANDOM_POINTS;
+    setup->dense_points = DENSE_POINTS;
     gsf_train_desc* train = &setup->fix.train;
     train->iterations = app->o.iterations ? app->o.iterations : DEFAULT_ITERATIONS;
     train->seed = app->o.seed;
@@ -134,6 +136,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     if (code) return code;
     if (setup->sh_degree < 0 || setup->sh_degree > 3) return gsfix_misused(app, "--set sh_degree: expected 0 to 3");
     if (setup->random_points < 1) return gsfix_misused(app, "--set random_points: expected 1 or more");
+    if (setup->dense_points < 1) return gsfix_misused(app, "--set dense_points: expected 1 or more");
     return gsfix_check_restorer(app);
 }
 
@@ -230,6 +233,7 @@ static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** point
     gsf_dense_desc desc = run->setup.dense;
     desc.seed = run->setup.fix.train.seed;
     desc.skip_sparse = 1;
+    desc.max_points = (size_t)run->setup.dense_points;
     gsf_result result = gsf_splat_dense_points(ctx, scene, run->split.train, run->split.train_count, keep, &desc, &dense,
                                                &stats);
     if (result != GSF_OK) return result;
