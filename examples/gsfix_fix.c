@@ -435,6 +435,7 @@ static void write_switches(fix_run* run) {
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
     fix_setup used = run->setup;
     used.fix = gsf_splat_fixer_desc(run->fixer);
+    used.dense = gsf_splat_dense_desc(&used.dense);
     const gsf_train_desc* train = &used.fix.train;
     gsfix_json_begin(ctx, t, NULL, '{');
     gsfix_json_number(ctx, t, "iterations", train->iterations);
