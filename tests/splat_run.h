@@ -1,5 +1,5 @@
 // splat_run.h - what the tests of the rasterizer share: machines (a context of a given CPU level and order of work, with a
-// rasterizer), one render with all its gradients, random cameras. Include gsfixer_splat.h, test.h and reference_splat.h first.
+// rasterizer), one render with all its gradients, random cameras. Include gsfixer_splat.h, test.h, reference_splat.h first.
 #ifndef SPLAT_RUN_H
 #define SPLAT_RUN_H
 
@@ -147,7 +147,9 @@ static inline double* random_values(uint64_t* state, size_t count, double size) 
     return v;
 }
 
-static inline double random_log(uint64_t* state, double lo, double hi) { return exp(test_random_in(state, log(lo), log(hi))); }
+static inline double random_log(uint64_t* state, double lo, double hi) {
+    return exp(test_random_in(state, log(lo), log(hi)));
+}
 
 static inline gsf_camera random_camera(uint64_t* state, int32_t width, int32_t height, const double look_at[3],
                                 double distance) {
