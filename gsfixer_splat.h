@@ -6149,14 +6149,15 @@ enum {
 
 // The ellipse in the coordinates that keep every digit for needles: with dy = y - v and e = (x - u) - kx*dy, the
 // exponent is a sum of two negative squares, log2(alpha) = ee*e*e + yy*dy*dy + log2_opacity. A row's extent is
-// |e| <= sqrt(h0 - h1*dy*dy).
+// |e| <= sqrt(h0 - h1*dy*dy). In an image 2000 wide a float places a splat to 1e-4 of a pixel, and the flank of a small one
+// is off by as much: u and v have a second float.
 typedef struct gsf__record {
     float u, v;            // pixel centres are integers here (COLMAP coordinate minus 0.5)
     float kx, ee, yy, log2_opacity;
     float h0, h1;
     float r, g, b, depth;
-    float reach_x, reach_y; // half extents of the bounding box of alpha >= 1/255
-    float kx_inv;          // dy of the point of largest x, divided by reach_x
+    float reach_x;         // half width of alpha >= 1/255; half height: gsf__reach_y
+    float u_low, v_low;    // to be added to u and v
     int32_t radius;        // official radius in pixels; 0 = not drawn
 } gsf__record;
 
@@ -6295,6 +6296,7 @@ static float gsf__sigmoid(float x) {
 // Everything the projection of one splat computes on its way and backward needs again.
 typedef struct gsf__projection {
     float t[3];             // mean in camera space
+    float u, v, u_low, v_low; // on the screen, as in gsf__record
     float x, y;             // t.x, t.y after the frustum clamp
     int clamped_x, clamped_y;
     float q[4], inv_norm;   // unit quaternion
@@ -6307,11 +6309,12 @@ typedef struct gsf__projection {
 } gsf__projection;
 
 typedef struct gsf__view { // what is constant over a frame
-    float W[9], t[3];       // world (relative to the splats' origin) to camera
-    float fx, fy, cx, cy;   // cx, cy minus 0.5
+    double rotation[9], t[3]; // world (relative to the splats' origin) to camera
+    double focal[2], middle[2]; // fx fy, and cx cy minus 0.5
+    float W[9], fx, fy;     // the same, rounded
     float limit_x, limit_y; // the Jacobian's x/z and y/z are clamped to +- this
     float near_plane, opacity_scale;
-    float center[3];        // of the camera, relative to the splats' origin
+    float center[3], center_low[3]; // of the camera, relative to the splats' origin: a sum of two
     float background[3];
     int32_t width, height, sh_coefficients;
     int antialiased, official_footprint, official_gradient;
@@ -6324,15 +6327,19 @@ static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* came
     gsf__camera_transform(camera, splats->origin, origin_in_camera);
     gsf_camera_center(camera, center);
     for (int r = 0; r < 3; r++) {
-        for (int c = 0; c < 3; c++) view.W[3 * r + c] = (float)camera->w2c[4 * c + r];
-        view.t[r] = (float)origin_in_camera[r];
+        for (int c = 0; c < 3; c++) {
+            view.rotation[3 * r + c] = camera->w2c[4 * c + r];
+            view.W[3 * r + c] = (float)camera->w2c[4 * c + r];
+        }
+        view.t[r] = origin_in_camera[r];
         view.center[r] = (float)(center[r] - splats->origin[r]);
+        view.center_low[r] = (float)(center[r] - splats->origin[r] - (double)view.center[r]);
         view.background[r] = desc->background[r];
     }
-    view.fx = (float)camera->fx;
-    view.fy = (float)camera->fy;
-    view.cx = (float)(camera->cx - 0.5);
-    view.cy = (float)(camera->cy - 0.5);
+    view.fx = (float)(view.focal[0] = camera->fx);
+    view.fy = (float)(view.focal[1] = camera->fy);
+    view.middle[0] = camera->cx - 0.5;
+    view.middle[1] = camera->cy - 0.5;
     view.limit_x = (float)(1.3 * camera->width / (2.0 * camera->fx));
     view.limit_y = (float)(1.3 * camera->height / (2.0 * camera->fy));
     view.near_plane = desc->near_plane > 0.0f ? desc->near_plane : 0.2f;
@@ -6363,11 +6370,22 @@ static void gsf__cross3(const float* a, const float* b, float* out) {
     out[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// Screen-space covariance of splat i. Returns 0 when it is culled by the near plane or not finite.
+// Place and covariance of splat i on the screen. Returns 0 when it is culled by the near plane or not finite. The place is
+// found in double: in float, a camera far from the splats' origin, a long lens or a large image would cost digits.
 static int gsf__project_splat(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__projection* p) {
     const float* mean = splats->means + 3 * i;
-    for (int r = 0; r < 3; r++) p->t[r] = gsf__dot3(view->W + 3 * r, mean) + view->t[r];
+    double t[3];
+    for (int r = 0; r < 3; r++) {
+        const double* w = view->rotation + 3 * r;
+        t[r] = w[0] * (double)mean[0] + w[1] * (double)mean[1] + w[2] * (double)mean[2] + view->t[r];
+        p->t[r] = (float)t[r];
+    }
     if (!(p->t[2] > view->near_plane)) return 0;
+    const double u = view->focal[0] * t[0] / t[2] + view->middle[0], v = view->focal[1] * t[1] / t[2] + view->middle[1];
+    p->u = (float)u;
+    p->v = (float)v;
+    p->u_low = (float)(u - (double)p->u);
+    p->v_low = (float)(v - (double)p->v);
 
     const float* raw = splats->quats + 4 * i;
     const double norm = sqrt((double)raw[0] * raw[0] + (double)raw[1] * raw[1] + (double)raw[2] * raw[2] +
@@ -6480,7 +6498,7 @@ static void gsf__sh_basis_gradient(const float d[3], int32_t count, float gx[16]
 
 // Unit direction from the camera to splat i and its distance; (0,0,1) and 0 when they coincide.
 static float gsf__view_direction(const gsf__view* view, const float* mean, float d[3]) {
-    for (int k = 0; k < 3; k++) d[k] = mean[k] - view->center[k];
+    for (int k = 0; k < 3; k++) d[k] = (mean[k] - view->center[k]) - view->center_low[k];
     const float length = sqrtf(gsf__dot3(d, d));
     if (!(length > 0.0f)) {
         d[0] = d[1] = 0.0f;
@@ -6519,6 +6537,9 @@ static gsf__tile_rect gsf__official_rect(const gsf__record* rec, int32_t tiles_x
     return rect;
 }
 
+// Half height of alpha >= 1/255: where h0 - h1 dy^2 is zero.
+static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->h1); }
+
 typedef enum gsf__show { GSF__CULLED, GSF__TOO_FAINT, GSF__DRAWN } gsf__show;
 
 // Fills the record of splat i. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled, for the official
@@ -6526,8 +6547,10 @@ typedef enum gsf__show { GSF__CULLED, GSF__TOO_FAINT, GSF__DRAWN } gsf__show;
 static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) {
     gsf__projection p;
     if (!gsf__project_splat(view, splats, i, &p)) return GSF__CULLED;
-    rec->u = view->fx * (p.t[0] / p.t[2]) + view->cx;
-    rec->v = view->fy * (p.t[1] / p.t[2]) + view->cy;
+    rec->u = p.u;
+    rec->v = p.v;
+    rec->u_low = p.u_low;
+    rec->v_low = p.v_low;
     const float mid = 0.5f * (p.cov_a + p.cov_c);
     const float half_gap = 0.5f * (p.cov_a - p.cov_c); // root = mid^2 - det without cancellation
     const float root = half_gap * half_gap + p.cov_b * p.cov_b;
@@ -6547,15 +6570,13 @@ static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splat
     rec->h0 = t2 / conic_a;
     rec->h1 = (1.0f / p.cov_c) / conic_a;
     rec->reach_x = sqrtf(t2 * p.cov_a);
-    rec->reach_y = sqrtf(t2 * p.cov_c);
-    rec->kx_inv = p.cov_b / p.cov_a;
     rec->depth = p.t[2];
     float rgb[3];
     gsf__splat_color(view, splats, i, rgb);
     rec->r = rgb[0] > 0.0f ? rgb[0] : 0.0f;
     rec->g = rgb[1] > 0.0f ? rgb[1] : 0.0f;
     rec->b = rgb[2] > 0.0f ? rgb[2] : 0.0f;
-    const float sum = rec->kx + rec->ee + rec->h0 + rec->h1 + rec->reach_x + rec->reach_y + rgb[0] + rgb[1] + rgb[2];
+    const float sum = rec->kx + rec->ee + rec->h0 + rec->h1 + rec->reach_x + rgb[0] + rgb[1] + rgb[2];
     return isfinite(sum) ? GSF__DRAWN : GSF__CULLED;
 }
 
@@ -6564,7 +6585,7 @@ static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splat
 /* Eight splats at a time: the formulas above, a lane per splat. GCC and Clang define + - * / on __m256. Lanes past the last
    splat repeat it. */
 typedef struct gsf__projection8 {
-    __m256 t[3], x, y, clamped_x, clamped_y;
+    __m256 t[3], u, v, u_low, v_low, x, y, clamped_x, clamped_y;
     __m256 q[4], inv_norm, scale[3], T[9], V[6];
     __m256 cov_a, cov_b, cov_c, det_raw, det;
     __m256 logit, opacity, compensation;
@@ -6612,6 +6633,35 @@ GSF__TARGET_AVX2 static inline void gsf__transpose8(__m256 m[8]) {
         m[i] = _mm256_permute2f128_ps(b[i], b[4 + i], 0x20);
         m[4 + i] = _mm256_permute2f128_ps(b[i], b[4 + i], 0x31);
     }
+}
+
+// p->t, u, v, u_low and v_low, in double.
+GSF__TARGET_AVX2 static inline void gsf__place8(const gsf__view* view, const __m256 mean[3], gsf__projection8* p) {
+    __m128 half[2][7];
+    for (int h = 0; h < 2; h++) {
+        __m256d m[3], t[3];
+        for (int k = 0; k < 3; k++)
+            m[k] = _mm256_cvtps_pd(h ? _mm256_extractf128_ps(mean[k], 1) : _mm256_castps256_ps128(mean[k]));
+        for (int r = 0; r < 3; r++) {
+            const double* w = view->rotation + 3 * r;
+            t[r] = _mm256_fmadd_pd(_mm256_set1_pd(w[0]), m[0], _mm256_set1_pd(view->t[r]));
+            t[r] = _mm256_fmadd_pd(_mm256_set1_pd(w[1]), m[1], t[r]);
+            t[r] = _mm256_fmadd_pd(_mm256_set1_pd(w[2]), m[2], t[r]);
+            half[h][r] = _mm256_cvtpd_ps(t[r]);
+        }
+        const __m256d inv_z = _mm256_set1_pd(1.0) / t[2];
+        for (int k = 0; k < 2; k++) {
+            const __m256d slope = t[k] * inv_z;
+            const __m256d at = _mm256_fmadd_pd(_mm256_set1_pd(view->focal[k]), slope, _mm256_set1_pd(view->middle[k]));
+            half[h][3 + k] = _mm256_cvtpd_ps(at);
+            half[h][5 + k] = _mm256_cvtpd_ps(at - _mm256_cvtps_pd(half[h][3 + k]));
+        }
+    }
+    for (int r = 0; r < 3; r++) p->t[r] = _mm256_set_m128(half[1][r], half[0][r]);
+    p->u = _mm256_set_m128(half[1][3], half[0][3]);
+    p->v = _mm256_set_m128(half[1][4], half[0][4]);
+    p->u_low = _mm256_set_m128(half[1][5], half[0][5]);
+    p->v_low = _mm256_set_m128(half[1][6], half[0][6]);
 }
 
 // e^x for x in [-87, 88], clamped to it; relative error below 2e-7. NaN stays.
@@ -6675,8 +6725,7 @@ GSF__TARGET_AVX2 static inline void gsf__project8(const gsf__view* view, const g
     __m256 W[9], mean[3], raw[4];
     for (int k = 0; k < 9; k++) W[k] = gsf__all8(view->W[k]);
     for (int k = 0; k < 3; k++) mean[k] = gsf__column8(splats->means + 3 * i, lane, 3, k);
-    for (int r = 0; r < 3; r++)
-        p->t[r] = gsf__dot8(W[3 * r], W[3 * r + 1], W[3 * r + 2], mean[0], mean[1], mean[2]) + gsf__all8(view->t[r]);
+    gsf__place8(view, mean, p);
     p->shown = _mm256_cmp_ps(p->t[2], gsf__all8(view->near_plane), _CMP_GT_OQ);
     if (_mm256_testz_ps(p->shown, p->shown)) return;
 
@@ -6755,7 +6804,10 @@ GSF__TARGET_AVX2 static inline void gsf__sh_basis8(__m256 x, __m256 y, __m256 z,
 // Unit directions from the camera; returns the distances, 0 (and the direction 0 0 1) where a mean is at the camera.
 GSF__TARGET_AVX2 static inline __m256 gsf__view_direction8(const gsf__view* view, const gsf_splats* splats, size_t i,
                                                            __m256i lane, __m256 d[3]) {
-    for (int k = 0; k < 3; k++) d[k] = gsf__column8(splats->means + 3 * i, lane, 3, k) - gsf__all8(view->center[k]);
+    for (int k = 0; k < 3; k++) {
+        const __m256 mean = gsf__column8(splats->means + 3 * i, lane, 3, k);
+        d[k] = (mean - gsf__all8(view->center[k])) - gsf__all8(view->center_low[k]);
+    }
     const __m256 length = _mm256_sqrt_ps(gsf__dot8(d[0], d[1], d[2], d[0], d[1], d[2]));
     const __m256 apart = _mm256_cmp_ps(length, _mm256_setzero_ps(), _CMP_GT_OQ);
     const __m256 inv = _mm256_and_ps(apart, gsf__all8(1.0f) / length);
@@ -6816,8 +6868,8 @@ GSF__TARGET_AVX2 static void gsf__records_avx2(gsf_rasterizer* r, const gsf__vie
         const __m256 half_gap = half * (p.cov_a - p.cov_c), root = _mm256_fmadd_ps(half_gap, half_gap, p.cov_b * p.cov_b);
         const __m256 longest = half * (p.cov_a + p.cov_c) + _mm256_sqrt_ps(_mm256_max_ps(root, gsf__all8(0.1f)));
         const __m256 radius = _mm256_min_ps(_mm256_ceil_ps(gsf__all8(3.0f) * _mm256_sqrt_ps(longest)), gsf__all8(1e9f));
-        row[0] = _mm256_fmadd_ps(gsf__all8(view->fx), p.t[0] / p.t[2], gsf__all8(view->cx));
-        row[1] = _mm256_fmadd_ps(gsf__all8(view->fy), p.t[1] / p.t[2], gsf__all8(view->cy));
+        row[0] = p.u;
+        row[1] = p.v;
         row[2] = p.cov_b * inv_c;
         row[3] = gsf__all8(-0.72134752f) * conic_a;
         row[4] = gsf__all8(-0.72134752f) * inv_c;
@@ -6826,13 +6878,14 @@ GSF__TARGET_AVX2 static void gsf__records_avx2(gsf_rasterizer* r, const gsf__vie
         row[7] = inv_c / conic_a;
         row[11] = p.t[2];
         row[12] = _mm256_sqrt_ps(t2 * p.cov_a);
-        row[13] = _mm256_sqrt_ps(t2 * p.cov_c);
-        row[14] = p.cov_b / p.cov_a;
+        row[13] = p.u_low;
+        row[14] = p.v_low;
+        const __m256 reach_y = _mm256_sqrt_ps(t2 * p.cov_c);
         drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(opacity, gsf__all8(GSF__ALPHA_MIN), _CMP_GE_OQ));
         drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[0] + row[12], zero, _CMP_GE_OQ));
         drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[0] - row[12], gsf__all8((float)(r->width - 1)), _CMP_LE_OQ));
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] + row[13], zero, _CMP_GE_OQ));
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] - row[13], gsf__all8((float)(r->height - 1)), _CMP_LE_OQ));
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] + reach_y, zero, _CMP_GE_OQ));
+        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] - reach_y, gsf__all8((float)(r->height - 1)), _CMP_LE_OQ));
         row[15] = radius;
     }
     if (_mm256_testz_ps(drawn, drawn)) {
@@ -6873,8 +6926,9 @@ static int gsf__meets_image(const gsf_rasterizer* r, const gsf__view* view, cons
         const gsf__tile_rect rect = gsf__official_rect(rec, r->tiles_x, r->tiles_y);
         return rect.x0 < rect.x1 && rect.y0 < rect.y1;
     }
+    const float reach_y = gsf__reach_y(rec);
     return rec->u + rec->reach_x >= 0.0f && rec->u - rec->reach_x <= (float)(r->width - 1) &&
-           rec->v + rec->reach_y >= 0.0f && rec->v - rec->reach_y <= (float)(r->height - 1);
+           rec->v + reach_y >= 0.0f && rec->v - reach_y <= (float)(r->height - 1);
 }
 
 static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
@@ -6906,7 +6960,8 @@ typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span; // end exclusi
 
 // Tile rows that the splat meets: first and one past the last.
 static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
-    const float lo = ceilf(rec->v - rec->reach_y - 0.01f), hi = floorf(rec->v + rec->reach_y + 0.01f);
+    const float reach_y = gsf__reach_y(rec);
+    const float lo = ceilf(rec->v - reach_y - 0.01f), hi = floorf(rec->v + reach_y + 0.01f);
     gsf__tile_span rows = {0, 0};
     if (hi < 0.0f || lo > (float)(r->height - 1) || lo > hi) return rows;
     rows.x0 = lo <= 0.0f ? 0 : (int32_t)lo / GSF__TILE;
@@ -6924,12 +6979,13 @@ static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* v
 static gsf__tile_span gsf__tile_columns(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec,
                                         int32_t ty) {
     gsf__tile_span span = {0, 0};
+    const float reach_y = gsf__reach_y(rec);
     float ya = (float)(ty * GSF__TILE) - rec->v, yb = ya + (float)(GSF__TILE - 1);
-    if (ya < -rec->reach_y) ya = -rec->reach_y;
-    if (yb > rec->reach_y) yb = rec->reach_y;
+    if (ya < -reach_y) ya = -reach_y;
+    if (yb > reach_y) yb = reach_y;
     const float da = rec->h0 - rec->h1 * ya * ya, db = rec->h0 - rec->h1 * yb * yb;
     const float ha = sqrtf(da > 0.0f ? da : 0.0f), hb = sqrtf(db > 0.0f ? db : 0.0f);
-    const float top = rec->kx_inv * rec->reach_x; // dy of the rightmost point; the leftmost is opposite
+    const float top = rec->kx * reach_y * (reach_y / rec->reach_x); // dy of the rightmost point; the leftmost is opposite
     float right = rec->kx * ya + ha, left = rec->kx * ya - ha;
     if (rec->kx * yb + hb > right) right = rec->kx * yb + hb;
     if (rec->kx * yb - hb < left) left = rec->kx * yb - hb;
@@ -6956,13 +7012,14 @@ GSF__TARGET_AVX2 static void gsf__tile_spans_avx2(const gsf_rasterizer* r, const
                                                   gsf__tile_span spans[GSF__SPANS]) {
     const __m256 row = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps(), tile = gsf__all8(GSF__TILE);
     const __m256 u = gsf__all8(rec->u), kx = gsf__all8(rec->kx), h0 = gsf__all8(rec->h0), h1 = gsf__all8(rec->h1);
-    const __m256 reach_x = gsf__all8(rec->reach_x), reach_y = gsf__all8(rec->reach_y);
+    const float half_height = gsf__reach_y(rec);
+    const __m256 reach_x = gsf__all8(rec->reach_x), reach_y = gsf__all8(half_height);
     const __m256 first = _mm256_fmadd_ps(row, tile, gsf__all8((float)(ty * GSF__TILE) - rec->v));
     const __m256 ya = _mm256_max_ps(first, zero - reach_y);
     const __m256 yb = _mm256_min_ps(first + gsf__all8(GSF__TILE - 1), reach_y);
     const __m256 ha = _mm256_sqrt_ps(_mm256_max_ps(_mm256_fnmadd_ps(h1 * ya, ya, h0), zero));
     const __m256 hb = _mm256_sqrt_ps(_mm256_max_ps(_mm256_fnmadd_ps(h1 * yb, yb, h0), zero));
-    const __m256 top = gsf__all8(rec->kx_inv * rec->reach_x), bottom = zero - top;
+    const __m256 top = gsf__all8(rec->kx * half_height * (half_height / rec->reach_x)), bottom = zero - top;
     __m256 right = _mm256_max_ps(_mm256_fmadd_ps(kx, ya, ha), _mm256_fmadd_ps(kx, yb, hb));
     __m256 left = _mm256_min_ps(_mm256_fmsub_ps(kx, ya, ha), _mm256_fmsub_ps(kx, yb, hb));
     right = gsf__select8(_mm256_and_ps(_mm256_cmp_ps(top, ya, _CMP_GE_OQ), _mm256_cmp_ps(top, yb, _CMP_LE_OQ)), reach_x, right);
@@ -7203,7 +7260,7 @@ static float gsf__exp2_fast(float x) {
 // Rows of a splat in a tile: centre column per row, exponent at the centre, and the steps that the ellipse meets.
 static uint32_t gsf__rows_scalar(const gsf__record* rec, const gsf__tile* tile, float center[GSF__TILE],
                                  float exponent[GSF__TILE]) {
-    const float u = rec->u - tile->x0, v = rec->v - tile->y0;
+    const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
     uint32_t mask = 0;
     for (int row = 0; row < GSF__TILE; row++) {
         const float dy = (float)row - v;
@@ -7284,7 +7341,7 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
 // Same as gsf__rows_scalar, 8 rows at a time; centres (relative to the step's first pixel) and exponents by step.
 GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, const gsf__tile* tile, float center[GSF__STEPS],
                                          float exponent[GSF__STEPS]) {
-    const __m256 u = _mm256_set1_ps(rec->u - tile->x0), v = _mm256_set1_ps(rec->v - tile->y0);
+    const __m256 u = _mm256_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm256_set1_ps(rec->v - tile->y0 + rec->v_low);
     const __m256 kx = _mm256_set1_ps(rec->kx), yy = _mm256_set1_ps(rec->yy), lo = _mm256_set1_ps(rec->log2_opacity);
     const __m256 h0 = _mm256_set1_ps(rec->h0), h1 = _mm256_set1_ps(rec->h1), zero = _mm256_setzero_ps();
     uint32_t mask = 0;
@@ -7417,7 +7474,7 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->pairs[entry].splat;
-        const float u = rec->u - tile->x0, v = rec->v - tile->y0;
+        const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
         const float conic_a = rec->ee * -1.3862944f, conic_q = rec->yy * -1.3862944f, conic_b = -rec->kx * conic_a;
         float sums[GSF__SLOT_FLOATS];
         memset(sums, 0, sizeof sums);
@@ -7508,7 +7565,7 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->pairs[entry].splat;
-        const __m256 u = _mm256_set1_ps(rec->u - tile->x0), v = _mm256_set1_ps(rec->v - tile->y0);
+        const __m256 u = _mm256_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm256_set1_ps(rec->v - tile->y0 + rec->v_low);
         for (int h = 0; h < 2; h++) {
             const __m256 dy = _mm256_sub_ps(_mm256_add_ps(lanes, _mm256_set1_ps(8.0f * (float)h)), v);
             const __m256 c = _mm256_fmadd_ps(_mm256_set1_ps(rec->kx), dy, u);
