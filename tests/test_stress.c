@@ -125,6 +125,9 @@ typedef struct limits {
 
 // The default quality that is promised.
 static const limits ordinary = {2e-5, 8e-3, 1e-3, 2e-4};
+// The same where many large splats lie over each other: every blend makes about 1e-4 of the pixels unclear, so their number
+// says nothing about the rasterizer.
+static const limits crowded = {2e-5, 8e-3, 1, 2e-4};
 
 typedef struct scene {
     gsf_splats splats;
@@ -428,6 +431,126 @@ static void test_opacities(void) {
     check_recipes("opacities", list, COUNT(list), &ordinary);
 }
 
+// ---- stacks, quaternions, offsets, ties, image sizes, values that are no numbers ---
+
+// `count` splats of one pixel's width up to several images, one behind the other, opacities as the recipe says.
+static void test_stacks(void) {
+    const recipe list[] = {
+        {.name = "5000 layers of 0.0043", .logit_low = -5.45, .logit_high = -5.44, .count = 5000},
+        {.name = "5000 layers of 0.006..0.02", .logit_low = -5.1, .logit_high = -3.9, .count = 5000},
+        {.name = "5000 layers below 1/255", .logit_low = -9, .logit_high = -5.6, .count = 5000},
+        {.name = "5000 layers of 0.9..1", .logit_low = 2.2, .logit_high = 12, .count = 5000},
+        {.name = "5000 layers of any opacity", .logit_low = -12, .logit_high = 6, .count = 5000},
+    };
+    for (size_t k = 0; k < COUNT(list); k++) {
+        recipe r = list[k];
+        r.seed = k + 1;
+        r.width = 24;
+        r.height = 20;
+        r.size_low = 30;
+        r.size_high = 300;
+        r.z_high = 9;
+        scene s = scene_make(&r);
+        check_scene("stacks", &s, &crowded);
+        scene_free(&s);
+    }
+}
+
+static void test_quaternions(void) {
+    recipe r;
+    memset(&r, 0, sizeof r);
+    r.seed = 3;
+    r.count = 300;
+    r.name = "lengths 1e-6..1e6, zero";
+    scene s = scene_make(&r);
+    uint64_t state = 8;
+    for (size_t i = 0; i < s.splats.count; i++) {
+        float* q = s.splats.quats + 4 * i;
+        const double length = i % 10 == 0 ? 0 : random_log(&state, 1e-6, 1e6);
+        for (int k = 0; k < 4; k++) q[k] = (float)((double)q[k] * length);
+        if (i % 10 == 1) q[1] = q[2] = q[3] = 0;
+    }
+    check_scene("quaternions", &s, &ordinary);
+    scene_free(&s);
+    r.shape = 1;
+    r.aspect_low = r.aspect_high = 1e3;
+    r.name = "the same of needles";
+    s = scene_make(&r);
+    for (size_t i = 0; i < s.splats.count; i++)
+        for (size_t k = 0; k < 4; k++) s.splats.quats[4 * i + k] *= i % 2 ? 1e-6f : 1e6f;
+    check_scene("quaternions", &s, &ordinary);
+    scene_free(&s);
+}
+
+static void test_offsets(void) {
+    const recipe list[] = {
+        {.name = "1e5 from zero", .origin = 1e5, .sh_degree = 3},
+        {.name = "1e6 from zero", .origin = 1e6, .sh_degree = 3},
+        {.name = "1e6 from zero, needles", .origin = 1e6, .shape = 1, .aspect_low = 1e3, .aspect_high = 1e4,
+         .size_high = 60},
+    };
+    check_recipes("offsets", list, COUNT(list), &ordinary);
+}
+
+// Depths are multiples of 1/16 and the camera looks along z: many are the same number in float32 as in float64, and among
+// these the order is that of the indices. Turned round in memory, the splats make another picture.
+static void test_ties(void) {
+    recipe r;
+    memset(&r, 0, sizeof r);
+    r.name = "depths of 48 values";
+    r.seed = 5;
+    r.count = 400;
+    scene s = scene_make(&r);
+    memset(s.camera.w2c, 0, sizeof s.camera.w2c);
+    for (int k = 0; k < 4; k++) s.camera.w2c[5 * k] = 1;
+    s.camera.w2c[14] = 3.5;
+    uint64_t state = 4;
+    for (size_t i = 0; i < s.splats.count; i++) {
+        draw_clear_splat(&s, &r, i, &state);
+        s.splats.means[3 * i + 2] = (float)floor(16 * (double)s.splats.means[3 * i + 2]) / 16;
+    }
+    s.exact_ties = 1;
+    check_scene("ties", &s, &ordinary);
+
+    const size_t n = s.splats.count;
+    gsf_splats turned;
+    CHECK_OK(&levels[0].ctx, gsf_splat_make(&levels[0].ctx, n, 0, &turned));
+    for (size_t i = 0; i < n; i++) {
+        const size_t j = n - 1 - i;
+        memcpy(turned.means + 3 * i, s.splats.means + 3 * j, 3 * sizeof(float));
+        memcpy(turned.log_scales + 3 * i, s.splats.log_scales + 3 * j, 3 * sizeof(float));
+        memcpy(turned.quats + 4 * i, s.splats.quats + 4 * j, 4 * sizeof(float));
+        turned.opacity_logits[i] = s.splats.opacity_logits[j];
+        memcpy(turned.sh + 3 * i, s.splats.sh + 3 * j, 3 * sizeof(float));
+    }
+    scene t = s;
+    t.splats = turned;
+    t.name = "the same turned round";
+    oracle a = oracle_make(&s), b = oracle_make(&t);
+    double change = 0;
+    for (size_t i = 0; i < 3 * a.pixels; i++) change = fmax(change, fabs(a.image.color[i] - b.image.color[i]));
+    CHECK(change > 0.1);
+    oracle_free(&a);
+    oracle_free(&b);
+    check_scene("ties", &t, &ordinary);
+    scene_free(&t);
+    scene_free(&s);
+}
+
+static void test_image_sizes(void) {
+    const recipe list[] = {
+        {.name = "1x1", .width = 1, .height = 1, .size_high = 3},
+        {.name = "1x17", .width = 1, .height = 17, .count = 60},
+        {.name = "33x1", .width = 33, .height = 1, .count = 60},
+        {.name = "15x16", .width = 15, .height = 16},
+        {.name = "17x33", .width = 17, .height = 33},
+        {.name = "480x270", .width = 480, .height = 270, .size_low = 0.3, .count = 1500},
+        {.name = "1920x16", .width = 1920, .height = 16, .size_low = 0.3, .count = 1500},
+        {.name = "8192x16", .width = 8192, .height = 16, .size_low = 0.3, .count = 3000},
+    };
+    check_recipes("image sizes", list, COUNT(list), &ordinary);
+}
+
 // ---- main ----------------------------------------------------------------------
 
 typedef struct test_entry { const char* name; void (*run)(void); } test_entry;
@@ -435,6 +558,8 @@ typedef struct test_entry { const char* name; void (*run)(void); } test_entry;
 int main(int argc, char** argv) {
     static const test_entry tests[] = {
         {"shapes", test_shapes}, {"depths", test_depths}, {"sizes", test_sizes}, {"opacities", test_opacities},
+        {"stacks", test_stacks}, {"quaternions", test_quaternions}, {"offsets", test_offsets}, {"ties", test_ties},
+        {"image sizes", test_image_sizes},
     };
     int json = 0;
     const char* only = NULL;
