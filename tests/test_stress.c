@@ -378,6 +378,7 @@ static recipe shape_recipe(const char* name, double aspect, int shape, double si
     memset(&r, 0, sizeof r);
     r.name = name;
     r.shape = shape;
+    r.count = shape == 2 ? 100 : 200;
     r.aspect_low = 0.5 * aspect;
     r.aspect_high = aspect;
     r.size_low = 10;
@@ -387,12 +388,17 @@ static recipe shape_recipe(const char* name, double aspect, int shape, double si
 
 static void test_shapes(void) {
     const recipe list[] = {
-        shape_recipe("needles 1e2", 1e2, 1, 100),   shape_recipe("needles 1e4", 1e4, 1, 100),
-        shape_recipe("needles 1e6", 1e6, 1, 100),   shape_recipe("pancakes 1e2", 1e2, 2, 30),
-        shape_recipe("pancakes 1e4", 1e4, 2, 30),   shape_recipe("pancakes 1e6", 1e6, 2, 30),
-        shape_recipe("long needles 1e4", 1e4, 1, 1e3), shape_recipe("long needles 1e6", 1e6, 1, 1e3),
+        shape_recipe("needles 1e2", 1e2, 1, 100), shape_recipe("needles 1e4", 1e4, 1, 100),
+        shape_recipe("needles 1e6", 1e6, 1, 100), shape_recipe("pancakes 1e2", 1e2, 2, 12),
+        shape_recipe("pancakes 1e4", 1e4, 2, 12), shape_recipe("pancakes 1e6", 1e6, 2, 12),
     };
     check_recipes("shapes", list, COUNT(list), &ordinary);
+    // Needles of up to 3000 pixels, half a pixel thin, through the whole picture and with their centres far outside: in
+    // float32 their direction is known to 3e-7, which at a lever of 100 pixels moves the flank by 3e-5 pixels, and alpha
+    // changes there by 1.1 per pixel.
+    const limits long_needles = {5e-5, 8e-3, 1e-3, 2e-4};
+    const recipe far_out[] = {shape_recipe("long needles 1e4", 1e4, 1, 1e3), shape_recipe("long needles 1e6", 1e6, 1, 1e3)};
+    check_recipes("shapes", far_out, COUNT(far_out), &long_needles);
 }
 
 static void test_depths(void) {
@@ -421,10 +427,10 @@ static void test_sizes(void) {
 
 static void test_opacities(void) {
     const recipe list[] = {
-        {.name = "logits -20..20", .logit_low = -20, .logit_high = 20, .count = 400},
+        {.name = "logits -20..20", .logit_low = -20, .logit_high = 20, .count = 300},
         {.name = "logits 15..20", .logit_low = 15, .logit_high = 20},
         {.name = "logits -20..-15", .logit_low = -20, .logit_high = -15},
-        {.name = "logits -5.6..-5.4", .logit_low = -5.6, .logit_high = -5.4, .count = 600}, // around 1/255
+        {.name = "logits -5.6..-5.4", .logit_low = -5.6, .logit_high = -5.4, .count = 300}, // around 1/255
         {.name = "logits 4.5..4.7", .logit_low = 4.5, .logit_high = 4.7},                   // around 0.99
         {.name = "logits -20..20, antialiased", .logit_low = -20, .logit_high = 20, .count = 400, .antialiased = 1},
     };
@@ -551,6 +557,430 @@ static void test_image_sizes(void) {
     check_recipes("image sizes", list, COUNT(list), &ordinary);
 }
 
+// Every parameter is NaN or infinite in some splat: these are as good as hidden, and nothing gets a gradient from them.
+static void test_not_finite(void) {
+    enum { PARAMETERS = 3 + 3 + 4 + 1 + 48, BROKEN = 3 * PARAMETERS };
+    static const float values[3] = {NAN, INFINITY, -INFINITY};
+    recipe r;
+    memset(&r, 0, sizeof r);
+    r.name = "every parameter, three values";
+    r.count = BROKEN + 60;
+    r.sh_degree = 3;
+    r.seed = 6;
+    for (int antialiased = 0; antialiased < 2; antialiased++) {
+        r.antialiased = antialiased;
+        scene s = scene_make(&r), t = scene_make(&r);
+        uint8_t* hidden = (uint8_t*)calloc(r.count, 1);
+        size_t row_of[BROKEN];
+        for (size_t k = 0; k < BROKEN; k++) { // spread over the lanes of the vector kernels
+            const size_t i = row_of[k] = k * 73 % r.count, p = k / 3;
+            hidden[i] = 1;
+            float* at = p < 3    ? t.splats.means + 3 * i + p
+                        : p < 6  ? t.splats.log_scales + 3 * i + p - 3
+                        : p < 10 ? t.splats.quats + 4 * i + p - 6
+                        : p < 11 ? t.splats.opacity_logits + i
+                                 : t.splats.sh + 48 * i + p - 11;
+            *at = values[k % 3];
+        }
+        s.desc.hidden = hidden;
+        oracle o = oracle_make(&s);
+        for (size_t k = 0; k < level_count; k++) {
+            result expected = render(&levels[k], &s.splats, &s.camera, &s.desc, &o.l);
+            result actual = render(&levels[k], &t.splats, &t.camera, &t.desc, &o.l);
+            compare("not finite", &o, &levels[k], &actual, &ordinary);
+            CHECK(same_bits(&expected, &actual));
+            for (size_t b = 0; b < BROKEN; b++) CHECK(actual.radii[row_of[b]] == 0);
+            result_free(&expected);
+            result_free(&actual);
+        }
+        oracle_free(&o);
+        free(hidden);
+        scene_free(&s);
+        scene_free(&t);
+    }
+}
+
+// Finite, but out of all measure: the picture stays finite, and the splats that have ordinary values keep the gradients that
+// they had (a splat that hides them counts as in the reference, which has the range of double).
+static void test_huge_values(void) {
+    enum { PARAMETERS = 3 + 3 + 4 + 1 + 3 };
+    static const float values[] = {1e30f, -1e30f, 3e38f, -3e38f, 100, -100, 1e-42f, -1e-42f};
+    recipe r;
+    memset(&r, 0, sizeof r);
+    r.name = "1e30, 3e38, 100, 1e-42";
+    r.count = 200;
+    r.seed = 7;
+    for (size_t k = 0; k < level_count; k++) {
+        row* w = add_row("huge values", r.name, levels[k].name);
+        w->clear_error = 0;
+        for (size_t p = 0; p < PARAMETERS; p++)
+            for (size_t v = 0; v < COUNT(values); v++) {
+                scene s = scene_make(&r);
+                const size_t i = 8 * p + v;
+                float* at = p < 3    ? s.splats.means + 3 * i + p
+                            : p < 6  ? s.splats.log_scales + 3 * i + p - 3
+                            : p < 10 ? s.splats.quats + 4 * i + p - 6
+                            : p < 11 ? s.splats.opacity_logits + i
+                                     : s.splats.sh + 3 * i + p - 11;
+                *at = values[v];
+                if (p >= 11 && fabsf(values[v]) > 1e20f) *at *= 1e-10f; // a colour times a weight must stay a float
+                w->pixels += 9600;
+                loss l;
+                uint64_t state = 1;
+                l.d_color = random_values(&state, 3 * 9600, 1);
+                l.d_depth = l.d_alpha = NULL;
+                result a = render(&levels[k], &s.splats, &s.camera, &s.desc, &l);
+                size_t bad = 0;
+                for (size_t n = 0; n < 5 * a.pixels; n++) bad += !isfinite(a.block[n]);
+                const size_t others = s.splats.count; // gradients of all but the huge one
+                for (size_t n = 0; n < 3 * others; n++) bad += n / 3 != i && !isfinite(a.grads.means[n]);
+                for (size_t n = 0; n < 4 * others; n++) bad += n / 4 != i && !isfinite(a.grads.quats[n]);
+                if (!CHECK(bad == 0))
+                    fprintf(stderr, "parameter %zu = %g, %s: %zu values are not finite\n", p, (double)*at,
+                            levels[k].name, bad);
+                result_free(&a);
+                free(l.d_color);
+                scene_free(&s);
+            }
+    }
+}
+
+// ---- the oracle swept over conditions ------------------------------------------
+
+// Aspect ratio of the splats, near plane (and with it where they begin), and focal length over the image's longer side: from
+// 120 degrees wide to a telescope of half a degree. Cut-offs are those of production.
+static void test_sweep(void) {
+    static const double aspects[] = {1, 10, 100, 1e3, 1e4}, nears[] = {0.01, 0.2, 20}, focals[] = {0.3, 1, 10, 100};
+    const size_t first = row_count;
+    for (size_t a = 0; a < COUNT(aspects); a++)
+        for (size_t n = 0; n < COUNT(nears); n++)
+            for (size_t f = 0; f < COUNT(focals); f++) {
+                recipe r;
+                char name[64];
+                memset(&r, 0, sizeof r);
+                snprintf(name, sizeof name, "aspect %g, near %g, focal %g", aspects[a], nears[n], focals[f]);
+                r.name = name;
+                r.width = 80;
+                r.height = 56;
+                r.count = 120;
+                r.seed = 1 + f + 4 * (n + 3 * a);
+                r.aspect_low = r.aspect_high = aspects[a];
+                r.size_low = aspects[a] > 1 ? 3 : 1;
+                r.size_high = aspects[a] > 10 ? 60 : 12;
+                r.near_plane = nears[n];
+                r.z_low = 1.001 * nears[n];
+                r.z_high = 40 * nears[n];
+                r.focal = focals[f];
+                r.sh_degree = (int32_t)(f % 4);
+                r.antialiased = (int)(n + f + a) % 3 == 0;
+                scene s = scene_make(&r);
+                check_scene("sweep", &s, &crowded); // a scene of 4480 pixels is too small for shares of 0.1 %
+                scene_free(&s);
+            }
+    size_t pixels = 0, unclear = 0;
+    for (size_t k = first; k < row_count; k++) pixels += rows[k].pixels, unclear += rows[k].unclear;
+    CHECK((double)unclear <= ordinary.share * (double)pixels);
+}
+
+// ---- culling, by brute force ---------------------------------------------------
+
+// Every splat alone in the picture, the others hidden: the set of pixels that it reaches is that of the reference, which
+// looks at every pixel. So no tile list, no row span and no image border loses a (splat, pixel) pair, or adds one.
+static void test_culling(void) {
+    static const recipe list[] = {
+        {.name = "ordinary"},
+        {.name = "needles 1e2", .shape = 1, .aspect_low = 30, .aspect_high = 100, .size_high = 60},
+        {.name = "needles 1e4", .shape = 1, .aspect_low = 1e3, .aspect_high = 1e4, .size_high = 200},
+        {.name = "pancakes 1e3", .shape = 2, .aspect_low = 100, .aspect_high = 1e3, .size_high = 40},
+        {.name = "below a pixel", .size_low = 1e-3, .size_high = 0.3},
+        {.name = "faint", .logit_low = -5.6, .logit_high = -4},
+        {.name = "opaque", .logit_low = 4, .logit_high = 20},
+        {.name = "larger than the image", .size_low = 40, .size_high = 2000},
+        {.name = "across the near plane", .z_low = -0.3, .z_high = 1},
+        {.name = "antialiased", .antialiased = 1, .size_low = 0.1},
+        {.name = "official footprint", .official = 1},
+        {.name = "official footprint, needles", .official = 1, .shape = 1, .aspect_low = 30, .aspect_high = 300,
+         .size_high = 60},
+    };
+    enum { EACH = 3, SPLATS = 61 };
+    for (size_t k = 0; k < COUNT(list) * EACH; k++) {
+        recipe r = list[k / EACH];
+        r.width = 75;
+        r.height = 52;
+        r.count = SPLATS;
+        r.seed = k + 1;
+        scene s = scene_make(&r);
+        const size_t pixels = (size_t)r.width * (size_t)r.height;
+        ref_splats wide = ref_splats_from(&s.splats);
+        ref_options options = ref_options_from(&s.desc);
+        uint8_t hidden[SPLATS];
+        float* alpha = (float*)calloc(pixels, sizeof(float));
+        row w[MACHINES];
+        memset(w, 0, sizeof w);
+        size_t reached = 0;
+        options.hidden = s.desc.hidden = hidden;
+        for (size_t i = 0; i < SPLATS; i++) {
+            memset(hidden, 1, sizeof hidden);
+            hidden[i] = 0;
+            ref_image image = ref_render(&wide, &s.camera, &options);
+            for (size_t m = 0; m < level_count; m++) {
+                gsf_render_output out;
+                memset(&out, 0, sizeof out);
+                out.alpha = packed_view(alpha, &s.camera, 1);
+                CHECK_OK(&levels[m].ctx, gsf_splat_render(&levels[m].ctx, levels[m].rasterizer, &s.splats, &s.camera,
+                                                          &s.desc, &out));
+                size_t wrong = 0;
+                for (size_t p = 0; p < pixels; p++) {
+                    const int clear = image.margin[p] >= MARGIN;
+                    const double error = fabs((double)alpha[p] - (1 - image.T[p]));
+                    if (m == 0) reached += image.blended[p] > 0;
+                    wrong += clear && (alpha[p] > 0) != (image.blended[p] > 0);
+                    w[m].unclear += !clear;
+                    if (clear) w[m].clear_error = nan_max(w[m].clear_error, error);
+                    else w[m].unclear_error = nan_max(w[m].unclear_error, error);
+                }
+                if (!CHECK(wrong == 0))
+                    fprintf(stderr, "culling, %s, splat %zu, %s: %zu pixels wrong\n", r.name, i, levels[m].name, wrong);
+                w[m].pixels += pixels;
+            }
+            ref_destroy_image(&image);
+        }
+        CHECK(reached > 100);
+        for (size_t m = 0; m < level_count; m++) {
+            row* out = add_row("culling", r.name, levels[m].name);
+            out->pixels = w[m].pixels;
+            out->unclear = w[m].unclear;
+            out->clear_error = w[m].clear_error;
+            if (w[m].unclear) out->unclear_error = w[m].unclear_error;
+            check_limit(out, "clear pixels are off by", out->clear_error, ordinary.clear);
+            if (w[m].unclear) check_limit(out, "unclear pixels are off by", out->unclear_error, ordinary.unclear);
+        }
+        free(alpha);
+        ref_destroy_splats(&wide);
+        scene_free(&s);
+    }
+}
+
+// ---- scaling and offset --------------------------------------------------------
+
+static scene scene_copy(const scene* s) {
+    scene c = *s;
+    const size_t n = s->splats.count, K = (size_t)gsf_splat_sh_count(s->splats.sh_degree);
+    CHECK_OK(&levels[0].ctx, gsf_splat_make(&levels[0].ctx, n, s->splats.sh_degree, &c.splats));
+    memcpy(c.splats.origin, s->splats.origin, sizeof c.splats.origin);
+    memcpy(c.splats.means, s->splats.means, 3 * n * sizeof(float));
+    memcpy(c.splats.log_scales, s->splats.log_scales, 3 * n * sizeof(float));
+    memcpy(c.splats.quats, s->splats.quats, 4 * n * sizeof(float));
+    memcpy(c.splats.opacity_logits, s->splats.opacity_logits, n * sizeof(float));
+    memcpy(c.splats.sh, s->splats.sh, 3 * K * n * sizeof(float));
+    return c;
+}
+
+static void scale_scene(scene* s, double scale) {
+    for (size_t i = 0; i < 3 * s->splats.count; i++) {
+        s->splats.means[i] = (float)((double)s->splats.means[i] * scale);
+        s->splats.log_scales[i] = (float)((double)s->splats.log_scales[i] + log(scale));
+    }
+    for (int k = 0; k < 3; k++) s->camera.w2c[12 + k] *= scale;
+    s->desc.near_plane = (float)(0.2 * scale);
+}
+
+static void move_camera(gsf_camera* camera, const double by[3]) {
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) camera->w2c[12 + r] -= camera->w2c[4 * c + r] * by[c];
+}
+
+static double relative_l2(const float* a, const float* b, double b_scale, size_t count) {
+    double size = 0, error = 0;
+    for (size_t i = 0; i < count; i++) {
+        const double e = (double)a[i] - (double)b[i] * b_scale;
+        size += (double)b[i] * b_scale * (double)b[i] * b_scale;
+        error += e * e;
+    }
+    return error > 0 ? sqrt(error / size) : error;
+}
+
+// The base scene's picture and gradients against those of the same scene scaled by `scale`. Its parameters are rounded anew
+// (log-scales by 2^-24 of their value, which scales a splat by up to 5e-7), so the limits are those of the accuracy.
+static void compare_scaled(const char* name, const machine* m, const oracle* base, const result* a, const result* b,
+                           double scale) {
+    row* w = add_row("invariance", name, m->name);
+    const size_t n = a->splat_count;
+    w->pixels = base->pixels;
+    w->unclear = base->unclear;
+    w->clear_error = w->depth_error = w->unclear_error = 0;
+    for (size_t i = 0; i < base->pixels; i++) {
+        double* error = base->skip[i] ? &w->unclear_error : &w->clear_error;
+        for (size_t c = 0; c < 3; c++)
+            *error = nan_max(*error, fabs((double)a->color[3 * i + c] - (double)b->color[3 * i + c]) / base->brightest);
+        *error = nan_max(*error, fabs((double)a->alpha[i] - (double)b->alpha[i]));
+        if (!base->skip[i])
+            w->depth_error = nan_max(
+                w->depth_error, fabs((double)a->depth[i] - (double)b->depth[i] / scale) / base->farthest);
+    }
+    w->gradient = relative_l2(b->grads.means, a->grads.means, 1 / scale, 3 * n);
+    w->gradient = nan_max(w->gradient, relative_l2(b->grads.log_scales, a->grads.log_scales, 1, 3 * n));
+    w->gradient = nan_max(w->gradient, relative_l2(b->grads.quats, a->grads.quats, 1, 4 * n));
+    w->gradient = nan_max(w->gradient, relative_l2(b->grads.opacity_logits, a->grads.opacity_logits, 1, n));
+    w->gradient = nan_max(w->gradient, relative_l2(b->grads.sh, a->grads.sh, 1, a->sh_floats * n));
+    w->gradient = nan_max(w->gradient, relative_l2(b->grads.means2d, a->grads.means2d, 1, 2 * n));
+    check_limit(w, "clear pixels differ by", w->clear_error, ordinary.clear);
+    check_limit(w, "unclear pixels differ by", w->unclear_error, ordinary.unclear);
+    check_limit(w, "depths of clear pixels differ by", w->depth_error, 2.5 * ordinary.clear);
+    check_limit(w, "gradients differ by", w->gradient, ordinary.gradient);
+}
+
+static void test_invariance(void) {
+    static const double scales[] = {1e-3, 1.0 / 1024, 0.1, 7, 1e3, 1024};
+    static const double far_away[3] = {1e6, -1e6, 1e6}, near_by[3] = {0, 0, 0};
+    recipe r;
+    memset(&r, 0, sizeof r);
+    r.name = "base";
+    r.sh_degree = 2;
+    r.seed = 9;
+    r.count = 300;
+    scene base = scene_make(&r);
+    oracle o = oracle_make(&base);
+    for (size_t m = 0; m < level_count; m++) {
+        result a = render(&levels[m], &base.splats, &base.camera, &base.desc, &o.l);
+        for (size_t k = 0; k < 2 * COUNT(scales) + 1; k++) {
+            const double scale = k < 2 * COUNT(scales) ? scales[k / 2] : 1, *by = k % 2 == 0 && k < 2 * COUNT(scales)
+                                                                                      ? near_by : far_away;
+            scene s = scene_copy(&base);
+            scale_scene(&s, scale);
+            memcpy(s.splats.origin, by, sizeof s.splats.origin);
+            move_camera(&s.camera, by);
+            loss l = o.l;
+            l.d_depth = (double*)malloc(o.pixels * sizeof(double));
+            for (size_t i = 0; i < o.pixels; i++) l.d_depth[i] = o.l.d_depth[i] / scale;
+            result b = render(&levels[m], &s.splats, &s.camera, &s.desc, &l);
+            char name[64];
+            snprintf(name, sizeof name, "times %g%s", scale, by == far_away ? ", 1e6 away" : "");
+            compare_scaled(name, &levels[m], &o, &a, &b, scale);
+            result_free(&b);
+            free(l.d_depth);
+            scene_free(&s);
+        }
+        result_free(&a);
+    }
+    oracle_free(&o);
+
+    // where the offset is exact in double (axes along the world's, whole numbers), nothing changes at all
+    memset(base.camera.w2c, 0, sizeof base.camera.w2c);
+    base.camera.w2c[1] = base.camera.w2c[6] = base.camera.w2c[8] = base.camera.w2c[15] = 1;
+    base.camera.w2c[14] = 3.5;
+    uint64_t state = 4;
+    for (size_t i = 0; i < base.splats.count; i++) draw_clear_splat(&base, &r, i, &state);
+    scene away = base;
+    memcpy(away.splats.origin, far_away, sizeof far_away);
+    move_camera(&away.camera, far_away);
+    o = oracle_make(&base);
+    for (size_t m = 0; m < level_count; m++) {
+        result a = render(&levels[m], &base.splats, &base.camera, &base.desc, &o.l);
+        result b = render(&levels[m], &away.splats, &away.camera, &away.desc, &o.l);
+        CHECK(same_bits(&a, &b));
+        result_free(&a);
+        result_free(&b);
+    }
+    oracle_free(&o);
+    scene_free(&base);
+}
+
+// ---- backgrounds ---------------------------------------------------------------
+
+typedef struct difference_case { // a loss of the reference as a function of the parameters
+    ref_splats s;
+    const scene* scene;
+    ref_options o;
+    const loss* l;
+    size_t pixels;
+} difference_case;
+
+static double reference_loss(const difference_case* d) {
+    ref_image image = ref_render(&d->s, &d->scene->camera, &d->o);
+    double sum = 0;
+    for (size_t i = 0; i < d->pixels; i++) {
+        for (size_t c = 0; c < 3; c++) sum += d->l->d_color[3 * i + c] * image.color[3 * i + c];
+        sum += d->l->d_depth[i] * image.depth[i] + d->l->d_alpha[i] * (1 - image.T[i]);
+    }
+    ref_destroy_image(&image);
+    return sum;
+}
+
+// Relative L2 of a gradient against central differences of the loss.
+static double difference_error(const difference_case* d, double* parameters, const double* gradient, size_t count) {
+    const double step = 1e-6;
+    double size = 0, error = 0;
+    for (size_t i = 0; i < count; i++) {
+        const double kept = parameters[i];
+        parameters[i] = kept + step;
+        const double above = reference_loss(d);
+        parameters[i] = kept - step;
+        const double below = reference_loss(d);
+        parameters[i] = kept;
+        const double numeric = (above - below) / (2 * step);
+        size += numeric * numeric;
+        error += (numeric - gradient[i]) * (numeric - gradient[i]);
+    }
+    CHECK(size > 0);
+    return sqrt(error / size);
+}
+
+// Gradients over a background that is not black, in every mode: the reference's against central differences in double, the
+// rasterizer's against the reference's. The official gradient is no derivative where it passes the 0.99 clamp or holds a
+// clamped x/z: where it should be one, no splat does either.
+static void test_backgrounds(void) {
+    static const recipe modes[] = {
+        {.name = "plain", .logit_high = 7},
+        {.name = "antialiased", .logit_high = 7, .antialiased = 1},
+        {.name = "official footprint", .logit_high = 7, .official = 2},
+        {.name = "official footprint and gradient", .logit_high = 3, .official = 1},
+        {.name = "official, antialiased", .logit_high = 3, .official = 1, .antialiased = 1},
+        {.name = "official gradient", .logit_high = 3, .official = 3},
+    };
+    for (size_t k = 0; k < COUNT(modes); k++) {
+        recipe r = modes[k];
+        r.width = 37;
+        r.height = 23;
+        r.count = 16;
+        r.sh_degree = 1;
+        r.seed = k + 20;
+        r.size_high = 8;
+        scene s = scene_make(&r);
+        if (r.official == 2) s.desc.gradient = GSF_GRADIENT_TRUE;
+        if (r.official == 3) s.desc.footprint = GSF_FOOTPRINT_FULL;
+        const float colors[3] = {0.7f, 0.3f, 0.9f};
+        memcpy(s.desc.background, colors, sizeof colors);
+        check_scene("backgrounds", &s, &crowded);
+
+        oracle o = oracle_make(&s);
+        difference_case d;
+        d.s = ref_splats_from(&s.splats);
+        d.scene = &s;
+        d.o = ref_options_from(&s.desc);
+        d.l = &o.l;
+        d.pixels = o.pixels;
+        for (size_t i = 0; i < o.pixels; i++) // a step must not reach a decision
+            if (o.image.margin[i] < 1e-3 || o.image.depth_gap[i] < 1e-4)
+                o.l.d_color[3 * i] = o.l.d_color[3 * i + 1] = o.l.d_color[3 * i + 2] = o.l.d_depth[i] = o.l.d_alpha[i] = 0;
+        ref_grads g = ref_make_grads(d.s.count, d.s.sh_count);
+        ref_render_backward(&d.s, &s.camera, &d.o, &o.image, o.l.d_color, o.l.d_depth, o.l.d_alpha, &g);
+        row* w = add_row("backgrounds", r.name, "differences");
+        w->pixels = o.pixels;
+        w->gradient = difference_error(&d, d.o.background, g.background, 3);
+        w->gradient = nan_max(w->gradient, difference_error(&d, d.s.means, g.means, 3 * d.s.count));
+        w->gradient = nan_max(w->gradient, difference_error(&d, d.s.log_scales, g.log_scales, 3 * d.s.count));
+        w->gradient = nan_max(w->gradient, difference_error(&d, d.s.quats, g.quats, 4 * d.s.count));
+        w->gradient = nan_max(w->gradient, difference_error(&d, d.s.logits, g.logits, d.s.count));
+        w->gradient = nan_max(w->gradient, difference_error(&d, d.s.sh, g.sh, 12 * d.s.count));
+        check_limit(w, "gradients are off by", w->gradient, 1e-6);
+        ref_destroy_grads(&g);
+        ref_destroy_splats(&d.s);
+        oracle_free(&o);
+        scene_free(&s);
+    }
+}
+
 // ---- main ----------------------------------------------------------------------
 
 typedef struct test_entry { const char* name; void (*run)(void); } test_entry;
@@ -559,7 +989,9 @@ int main(int argc, char** argv) {
     static const test_entry tests[] = {
         {"shapes", test_shapes}, {"depths", test_depths}, {"sizes", test_sizes}, {"opacities", test_opacities},
         {"stacks", test_stacks}, {"quaternions", test_quaternions}, {"offsets", test_offsets}, {"ties", test_ties},
-        {"image sizes", test_image_sizes},
+        {"image sizes", test_image_sizes}, {"not finite", test_not_finite}, {"huge values", test_huge_values},
+        {"sweep", test_sweep}, {"culling", test_culling}, {"invariance", test_invariance},
+        {"backgrounds", test_backgrounds},
     };
     int json = 0;
     const char* only = NULL;
