@@ -103,6 +103,14 @@ static void bench_require(gsf_context* ctx, gsf_result result) {
     exit(1);
 }
 
+static int bench_context(gsf_context* ctx, gsf_cpu_level level, int threads) { // 0: the machine lacks the instructions
+    memset(ctx, 0, sizeof *ctx);
+    ctx->cpu_level = level;
+    ctx->threads = threads;
+    bench_require(ctx, gsf_init_context(ctx));
+    return ctx->cpu_level == level;
+}
+
 // ---- what the machine can do ----------------------------------------------------
 
 enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 22 };
@@ -147,11 +155,7 @@ static void bench_triad(void* arg, size_t chunk, int worker) {
 
 static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads) {
     gsf_context ctx;
-    memset(&ctx, 0, sizeof ctx);
-    ctx.cpu_level = level;
-    ctx.threads = threads;
-    bench_require(&ctx, gsf_init_context(&ctx));
-    if (ctx.cpu_level != level) return;
+    if (!bench_context(&ctx, level, threads)) return;
     float* memory = (float*)gsf_alloc_zeroed(&ctx, 3 * (size_t)TRIAD_CHUNKS * TRIAD_FLOATS, sizeof(float));
     if (!memory) exit(1);
     gsf_chunk_fn fma = bench_fma_scalar;
@@ -275,11 +279,7 @@ static void bench_lap(bench_clock* clock, int stage) { // the time since the las
 static void bench_stages(const bench_options* o, const char* name, size_t count, double size, int width, int height,
                          gsf_cpu_level level, int threads) {
     gsf_context ctx;
-    memset(&ctx, 0, sizeof ctx);
-    ctx.cpu_level = level;
-    ctx.threads = threads;
-    bench_require(&ctx, gsf_init_context(&ctx));
-    if (ctx.cpu_level != level) return;
+    if (!bench_context(&ctx, level, threads)) return;
     gsf_splats splats;
     bench_make_splats(&ctx, count, size, &splats);
     const gsf_camera camera = bench_camera(width, height);
@@ -457,11 +457,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     snprintf(backward_name, sizeof backward_name, "backward %s", name);
     if (o->filter && !strstr(forward_name, o->filter) && !strstr(backward_name, o->filter)) return; // the reference is slow
     gsf_context ctx;
-    memset(&ctx, 0, sizeof ctx);
-    ctx.cpu_level = level;
-    ctx.threads = threads;
-    bench_require(&ctx, gsf_init_context(&ctx));
-    if (ctx.cpu_level != level) return;
+    if (!bench_context(&ctx, level, threads)) return;
 
     gsf_splats splats, sums;
     bench_make_splats(&ctx, count, size, &splats);

@@ -3,36 +3,13 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 #include "test.h"
+#include "test_hooks.h"
 
 #ifdef TEST_GOLDEN
 #define TESTS TEST_GOLDEN "/.."
 #else
 #define TESTS "tests"
 #endif
-
-typedef struct counter { size_t live, calls, fail_at, asked; } counter; // fail_at: 1 = the first call; 0 = never
-
-static void* counted_alloc(void* user, size_t size) {
-    counter* c = (counter*)user;
-    if (++c->calls == c->fail_at) return NULL;
-    c->asked += size;
-    void* p = malloc(size);
-    if (p) c->live++;
-    return p;
-}
-static void counted_free(void* user, void* memory) {
-    if (memory) ((counter*)user)->live--;
-    free(memory);
-}
-
-static char warning[1024]; // last one logged
-static int warnings;
-static void keep_warning(void* user, gsf_log_level level, const char* text) {
-    (void)user;
-    if (level != GSF_LOG_WARNING) return;
-    snprintf(warning, sizeof warning, "%s", text);
-    warnings++;
-}
 
 static void backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) { // as no serial loop would run them
     (void)user;

@@ -5,12 +5,8 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 
-#ifdef GSF_USE_EMBREE
-#define MAKE_SCENE_NO_MAIN
-#include "../examples/make_scene.c"
-#endif
-
 #include "test.h"
+#include "made_scene.h"
 
 #include <unistd.h>
 
@@ -369,29 +365,8 @@ static void test_out_of_memory_and_cancel(void) {
 
 #ifdef GSF_USE_EMBREE
 
-static void remove_scene(const char* folder, int views) {
-    char path[256];
-    static const char* const files[] = {"sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin",
-                                        "truth/visibility.bin"};
-    static const char* const folders[] = {"sparse/0", "sparse", "images", "truth", "."};
-    for (size_t i = 0; i < sizeof files / sizeof *files; i++) {
-        snprintf(path, sizeof path, "%s/%s", folder, files[i]);
-        unlink(path);
-    }
-    for (int i = 1; i <= views; i++) {
-        snprintf(path, sizeof path, "%s/images/frame_%03d.png", folder, i);
-        unlink(path);
-        snprintf(path, sizeof path, "%s/truth/depth_%03d.npy", folder, i);
-        unlink(path);
-    }
-    for (size_t i = 0; i < sizeof folders / sizeof *folders; i++) {
-        snprintf(path, sizeof path, "%s/%s", folder, folders[i]);
-        rmdir(path);
-    }
-}
-
 static float* load_truth(const char* folder, const char* name, size_t pixels) { // frame_007.png -> depth_007.npy
-    char path[256];
+    char path[1200];
     size_t size = 0;
     snprintf(path, sizeof path, "%s/truth/depth_%.3s.npy", folder, name + 6);
     char* file = test_read_file(path, &size);
@@ -477,7 +452,9 @@ static void check_courtyard(const gsf_scene* scene, const char* folder, const co
 static void test_courtyard(void) {
     static const courtyard_limits limits[] = {
         {3, 0.0035, 0.82, 0.975, 0.34}, {6, 0.0052, 0.72, 0.95, 0.47}, {9, 0.0056, 0.69, 0.945, 0.49}};
-    char folder[] = "/tmp/gsf_stereo_XXXXXX";
+    const char* tmp = getenv("TMPDIR");
+    char folder[1024];
+    snprintf(folder, sizeof folder, "%s/gsf_stereo_XXXXXX", tmp && *tmp ? tmp : "/tmp");
     if (!CHECK(mkdtemp(folder) != NULL)) return;
     make_scene_options options = make_scene_defaults;
     options.views = 16;

@@ -5,14 +5,12 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 
-#ifdef GSF_USE_EMBREE
-#define MAKE_SCENE_NO_MAIN
-#include "../examples/make_scene.c"
-#endif
-
 #include "test.h"
+#include "made_scene.h"
 
 #include <unistd.h>
+
+enum { SEEDS = 8, CHOICES = 3 }; // procedural scenes, and random choices of views in each
 
 static gsf_context ctx;
 
@@ -392,22 +390,6 @@ static double balanced(const char* what, const accuracy* a) {
     return value;
 }
 
-static void remove_scene(const char* folder, int views) {
-    static const char* const files[] = {"sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin",
-                                        "truth/visibility.bin", "sparse/0", "sparse", "images", "truth", ""};
-    char path[1200];
-    for (int i = 0; i < views; i++) {
-        snprintf(path, sizeof path, "%s/images/frame_%03d.png", folder, i + 1);
-        remove(path);
-        snprintf(path, sizeof path, "%s/truth/depth_%03d.npy", folder, i + 1);
-        remove(path);
-    }
-    for (size_t i = 0; i < sizeof files / sizeof *files; i++) {
-        snprintf(path, sizeof path, "%s/%s", folder, files[i]);
-        remove(path);
-    }
-}
-
 static void count_answers(accuracy* a, const uint8_t* kept, const uint8_t* truth, size_t points, size_t views,
                           const uint32_t* chosen, size_t count) {
     const uint8_t* outlier = truth + points * views;
@@ -434,8 +416,6 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
     (void)user;
     while (count-- > 0) fn(arg, count, 0);
 }
-
-enum { SEEDS = 8, CHOICES = 3 };
 
 // The generator's own scene, through its files, against the visibility that it traced. The photos are smaller than the
 // program's and the pixel noise with them, so that the points are as good. `split` sums up, per K, the views of the
@@ -520,7 +500,7 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
         }
         free(rays);
     }
-    CHECK(balanced("single views", &pairs) >= 0.85); // the limit suits the union of several views
+    CHECK(balanced("single views", &pairs) >= 0.855); // the limit suits the union of several views
     memset(scene.track_begin, 0, (n + 1) * sizeof *scene.track_begin);
     accuracy bare; // the discs alone, no tracks to help
     memset(&bare, 0, sizeof bare);
@@ -546,9 +526,9 @@ static void test_accuracy(int seeds) {
         // views and 20 to 60 of nine, so that three points move its figure by up to 0.06. Hence all seeds together,
         // and random choices of views, which hide more.
         snprintf(what, sizeof what, "%d seeds, K = %d", seeds, 3 * k + 3);
-        CHECK(balanced(what, split + k) >= 0.90);
+        CHECK(balanced(what, split + k) >= (k == 0 ? 0.93 : 0.90)); // reached: 0.943, 0.919, 0.914
         snprintf(what, sizeof what, "%d seeds, %d random choices of %d views", seeds, (int)CHOICES, 3 * k + 3);
-        CHECK(balanced(what, choices + k) >= 0.90);
+        CHECK(balanced(what, choices + k) >= 0.91); // 0.937, 0.946, 0.918
     }
 }
 
