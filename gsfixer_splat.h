@@ -4208,6 +4208,9 @@ typedef struct gsf__vis_counts {
     uint32_t tries[GSF__VIS_BINS], finds[GSF__VIS_BINS]; // pairs in frame by distance from the nearest other track view
 } gsf__vis_counts;
 
+typedef struct gsf__rays8 gsf__rays8;
+typedef struct gsf__hider gsf__hider;
+
 typedef struct gsf__vis_job {
     const gsf_visibility_desc* desc;
     const gsf__discs* discs;
@@ -4216,13 +4219,14 @@ typedef struct gsf__vis_job {
     uint8_t* seen;             // by place in the discs; what is set on entry gets no ray
     gsf__vis_counts* counts;   // per chunk of discs, so that their sum needs no atomics
     void* embree_scene;
+    int (*hide8)(gsf__rays8* rays, const gsf__hider* hider); // scalar or AVX2: see >>embree
     // what the tracks say
     const gsf_scene* scene;
     double* centers;           // (view_count,3) of all views, relative to the discs' origin
+    float* regions;            // (chunks,6) minimum and maximum of a chunk's centres
     float* facing;             // (count,3) sum of the directions in which the point's track looks at it
     float* apart;              // (count) to the current eye: see gsf__vis_apart
-    float* evidence;           // (count) log likelihood of being seen by the current eye against not
-    float* limits;             // (count) cover at which the current eye does not see the point
+    float* evidence;           // (count) log likelihood of being seen by the current eye against not; NULL: no tracks
     double found[GSF__VIS_BINS], missed[GSF__VIS_BINS]; // that log likelihood where the track has the view, has it not
     const gsf__eye* eye;       // the current one
     // without Embree: one eye's image as a grid of cells that hold the points to decide
@@ -4231,11 +4235,48 @@ typedef struct gsf__vis_job {
     uint32_t* cell_begin;      // (cells + 1) into cell_points
     uint32_t* cell_points;
     gsf__sight* sights;        // (count) of the points with a cell
+    float* limits;             // (count) their gsf__vis_limit
     double* cover;             // (count) sum of the discs before the point
     int32_t side;              // cells along each side of the image
 } gsf__vis_job;
 
 enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
+
+static void gsf__vis_region(const gsf__discs* discs, size_t first, size_t end, float region[6]) {
+    for (int k = 0; k < 3; k++) region[k] = region[3 + k] = discs->spheres[4 * first + (size_t)k];
+    for (size_t i = first + 1; i < end; i++)
+        for (int k = 0; k < 3; k++) {
+            const float x = discs->spheres[4 * i + (size_t)k];
+            if (x < region[k]) region[k] = x;
+            if (x > region[3 + k]) region[3 + k] = x;
+        }
+}
+
+// -1: no point of the region is in the eye's frustum, since all lie beyond one of its five planes; 1: all are; 0: perhaps.
+static int gsf__vis_side(const gsf__eye* eye, const float region[6]) {
+    const gsf_camera* camera = &eye->camera;
+    const double w = (double)camera->width, h = (double)camera->height;
+    const double planes[5][3] = { // times a point in the camera's axes: positive inside
+        {0.0, 0.0, 1.0},
+        {camera->fx, 0.0, camera->cx}, {-camera->fx, 0.0, w - camera->cx},
+        {0.0, camera->fy, camera->cy}, {0.0, -camera->fy, h - camera->cy},
+    };
+    int side = 1;
+    for (int p = 0; p < 5; p++) {
+        double least = 0.0, most = 0.0, rounding = 0.0;
+        for (int k = 0; k < 3; k++) {
+            const double* m = camera->w2c + 4 * k;
+            const double n = planes[p][0] * m[0] + planes[p][1] * m[1] + planes[p][2] * m[2];
+            const double a = n * ((double)region[k] - eye->center[k]), b = n * ((double)region[3 + k] - eye->center[k]);
+            least += a < b ? a : b;
+            most += a < b ? b : a;
+            rounding += 1e-9 * (fabs(a) + fabs(b));
+        }
+        if (most < -rounding) return -1;
+        if (!(least > rounding)) side = 0;
+    }
+    return side;
+}
 
 // Frustum and grazing-angle tests; nonzero where a ray is worth shooting.
 static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i, gsf__sight* out) {
@@ -4265,7 +4306,6 @@ static float gsf__vis_apart(const gsf__vis_job* job, const gsf__eye* eye, size_t
     const size_t row = job->discs->rows[i];
     double best = -2.0; // largest cosine, as its square with its sign
     *tracked = 0;
-    if (!scene->track_begin) return -1.0f;
     for (size_t t = scene->track_begin[row]; t < scene->track_begin[row + 1]; t++) {
         const uint32_t view = scene->track_views[t];
         if (view == eye->view) { *tracked = 1; continue; }
@@ -4288,19 +4328,20 @@ static int gsf__vis_bin(float apart) {
     return bin < GSF__VIS_BINS ? bin : GSF__VIS_BINS - 1;
 }
 
-// Mean direction of each track; how often tracks hold the eyes' views.
+// Region of each chunk, mean direction of each track, how often tracks hold the eyes' views.
 static void gsf__vis_survey_chunk(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const gsf_scene* scene = job->scene;
     gsf__vis_counts* counts = job->counts + chunk;
-    const size_t first = chunk * GSF__VIS_CHUNK;
-    for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
+    const size_t first = chunk * GSF__VIS_CHUNK, count = job->discs->count;
+    const size_t end = count - first < GSF__VIS_CHUNK ? count : first + GSF__VIS_CHUNK;
+    gsf__vis_region(job->discs, first, end, job->regions + 6 * chunk);
+    if (!job->evidence) return;
+    for (size_t i = first; i < end; i++) {
         const size_t row = job->discs->rows[i];
         double sum[3] = {0.0, 0.0, 0.0};
-        const size_t begin = scene->track_begin ? scene->track_begin[row] : 0;
-        const size_t end = scene->track_begin ? scene->track_begin[row + 1] : 0;
-        for (size_t t = begin; t < end; t++) {
+        for (size_t t = scene->track_begin[row]; t < scene->track_begin[row + 1]; t++) {
             const double* center = job->centers + 3 * (size_t)scene->track_views[t];
             double d[3], length2 = 0.0;
             for (int k = 0; k < 3; k++) {
@@ -4311,7 +4352,10 @@ static void gsf__vis_survey_chunk(void* arg, size_t chunk, int worker) {
                 for (int k = 0; k < 3; k++) sum[k] += d[k] / sqrt(length2);
         }
         for (int k = 0; k < 3; k++) job->facing[3 * i + (size_t)k] = (float)sum[k];
-        for (size_t e = 0; e < job->eye_count; e++) {
+    }
+    for (size_t e = 0; e < job->eye_count; e++) {
+        if (gsf__vis_side(job->eyes + e, job->regions + 6 * chunk) < 0) continue;
+        for (size_t i = first; i < end; i++) {
             gsf__sight sight;
             int tracked;
             if (!gsf__vis_sight(job, job->eyes + e, i, &sight)) continue;
@@ -4363,12 +4407,13 @@ static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const size_t first = chunk * GSF__VIS_CHUNK;
+    const int outside = gsf__vis_side(job->eye, job->regions + 6 * chunk) < 0;
     for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
         gsf__sight sight;
         int tracked;
         job->apart[i] = -1.0f;
         job->evidence[i] = 0.0f;
-        if (!gsf__vis_sight(job, job->eye, i, &sight)) continue;
+        if (outside || !gsf__vis_sight(job, job->eye, i, &sight)) continue;
         job->apart[i] = gsf__vis_apart(job, job->eye, i, &sight, &tracked);
         if (!(job->apart[i] >= 0.0f)) continue;
         const int bin = gsf__vis_bin(job->apart[i]);
@@ -4376,44 +4421,40 @@ static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int worker) {
     }
 }
 
-// The limits of the current eye. The weights are a logistic fit on three ray-traced scenes, in units of the coverage;
-// the constant one is chosen for the union over several views.
-static void gsf__vis_limits_chunk(void* arg, size_t chunk, int worker) {
-    (void)worker;
-    const gsf__vis_job* job = (const gsf__vis_job*)arg;
+// Cover at which the current eye does not see point i. The weights are a logistic fit on three ray-traced scenes, in
+// units of the coverage; the constant one is chosen for the union over several views.
+static float gsf__vis_limit(const gsf__vis_job* job, size_t i) {
     const gsf__discs* discs = job->discs;
-    const size_t first = chunk * GSF__VIS_CHUNK, near_count = (size_t)discs->near_count;
-    for (size_t i = first; i < discs->count && i < first + GSF__VIS_CHUNK; i++) {
-        const float *sphere = discs->spheres + 4 * i, *normal = discs->normals + 3 * i;
-        double sum = 0.0, along = 0.0, length2 = 0.0, limit = 1.0;
-        for (size_t n = 0; n < near_count; n++) { // neighbours on a surface of another slope say less
-            const size_t j = discs->nearest[near_count * i + n];
-            const float* other = discs->normals + 3 * j;
-            const double same = (double)(normal[0] * other[0] + normal[1] * other[1] + normal[2] * other[2]);
-            sum += same * same * (double)job->evidence[j];
-        }
-        if (near_count) sum *= 12.0 / (double)near_count;
-        limit += 0.095 * (sum < 12.0 ? sum : 12.0); // neighbours may be seen past what hides the point
-        if (job->apart[i] >= 0.0f) limit -= 0.15 + 0.85 * (double)(job->apart[i] < 1.0f ? job->apart[i] : 1.0f);
-        for (int k = 0; k < 3; k++) {
-            const double d = (double)sphere[k] - job->eye->center[k];
-            along += d * (double)normal[k];
-            length2 += d * d;
-        }
-        if (discs->oriented[i] && along > 0.0) { // seen from behind
-            const double back = along / sqrt(length2);
-            limit -= 2.5 * (back < 0.5 ? back : 0.5);
-        }
-        job->limits[i] = (float)((double)job->desc->coverage * limit);
+    if (!job->evidence) return (float)(double)job->desc->coverage;
+    const size_t near_count = (size_t)discs->near_count;
+    const float *sphere = discs->spheres + 4 * i, *normal = discs->normals + 3 * i;
+    double sum = 0.0, along = 0.0, length2 = 0.0, limit = 1.0;
+    for (size_t n = 0; n < near_count; n++) { // neighbours on a surface of another slope say less
+        const size_t j = discs->nearest[near_count * i + n];
+        const float* other = discs->normals + 3 * j;
+        const double same = (double)(normal[0] * other[0] + normal[1] * other[1] + normal[2] * other[2]);
+        sum += same * same * (double)job->evidence[j];
     }
+    if (near_count) sum *= 12.0 / (double)near_count;
+    limit += 0.095 * (sum < 12.0 ? sum : 12.0); // neighbours may be seen past what hides the point
+    if (job->apart[i] >= 0.0f) limit -= 0.15 + 0.85 * (double)(job->apart[i] < 1.0f ? job->apart[i] : 1.0f);
+    for (int k = 0; k < 3; k++) {
+        const double d = (double)sphere[k] - job->eye->center[k];
+        along += d * (double)normal[k];
+        length2 += d * d;
+    }
+    if (discs->oriented[i] && along > 0.0) { // seen from behind
+        const double back = along / sqrt(length2);
+        limit -= 2.5 * (back < 0.5 ? back : 0.5);
+    }
+    return (float)((double)job->desc->coverage * limit);
 }
 
 // Makes an eye the current one.
 static void gsf__vis_look(gsf_context* ctx, gsf__vis_job* job, size_t e) {
     const size_t chunks = (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
     job->eye = job->eyes + e;
-    gsf__parallel_for(ctx, chunks, gsf__vis_evidence_chunk, job);
-    gsf__parallel_for(ctx, chunks, gsf__vis_limits_chunk, job);
+    if (job->evidence) gsf__parallel_for(ctx, chunks, gsf__vis_evidence_chunk, job);
 }
 
 // What disc j adds to the cover of the ray from the eye to point i. The one definition behind both ways to find the discs.
@@ -4458,7 +4499,8 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
         job->cells[i] = -1;
         job->cover[i] = 0.0;
         if (!job->seen[i]) {
-            if (gsf__vis_sight(job, job->eye, i, job->sights + i) && job->limits[i] > 0.0f) {
+            if (gsf__vis_sight(job, job->eye, i, job->sights + i) &&
+                (job->limits[i] = gsf__vis_limit(job, i)) > 0.0f) {
                 const int32_t x = (int32_t)(job->sights[i].u * sx), y = (int32_t)(job->sights[i].v * sy);
                 job->cells[i] = (y < job->side ? y : job->side - 1) * job->side + (x < job->side ? x : job->side - 1);
                 counts->rays++;
@@ -4521,10 +4563,12 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
     job->sights = (gsf__sight*)gsf_alloc(ctx, n, sizeof(gsf__sight));
     job->cells = (int32_t*)gsf_alloc(ctx, n, sizeof(int32_t));
     job->boxes = (gsf__disc_box*)gsf_alloc(ctx, n, sizeof(gsf__disc_box));
+    job->limits = (float*)gsf_alloc(ctx, n, sizeof(float));
     job->cover = (double*)gsf_alloc(ctx, n, sizeof(double));
     job->cell_points = (uint32_t*)gsf_alloc(ctx, n, sizeof(uint32_t));
     job->cell_begin = (uint32_t*)gsf_alloc(ctx, cell_count + 2, sizeof(uint32_t));
-    if (job->sights && job->cells && job->boxes && job->cover && job->cell_points && job->cell_begin) result = GSF_OK;
+    if (job->sights && job->limits && job->cells && job->boxes && job->cover && job->cell_points && job->cell_begin)
+        result = GSF_OK;
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__parallel_for(ctx, (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, gsf__vis_project_chunk, job);
@@ -4539,6 +4583,7 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
         result = gsf__check_cancel(ctx);
     }
     gsf_free(ctx, job->sights);
+    gsf_free(ctx, job->limits);
     gsf_free(ctx, job->cells);
     gsf_free(ctx, job->boxes);
     gsf_free(ctx, job->cover);
@@ -4585,12 +4630,14 @@ static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, con
         job.counts = (gsf__vis_counts*)gsf_alloc_zeroed(ctx, chunks ? chunks : 1, sizeof *job.counts);
         const size_t n = discs.count ? discs.count : 1;
         job.centers = (double*)gsf_alloc(ctx, scene->view_count, 3 * sizeof(double));
-        job.facing = (float*)gsf_alloc(ctx, n, 3 * sizeof(float));
-        job.apart = (float*)gsf_alloc(ctx, n, sizeof(float));
-        job.evidence = (float*)gsf_alloc(ctx, n, sizeof(float));
-        job.limits = (float*)gsf_alloc(ctx, n, sizeof(float));
-        if (!job.seen || !job.counts || !job.centers || !job.facing || !job.apart || !job.evidence || !job.limits)
-            goto cleanup;
+        job.regions = (float*)gsf_alloc(ctx, chunks ? chunks : 1, 6 * sizeof(float));
+        if (!job.seen || !job.counts || !job.centers || !job.regions) goto cleanup;
+        if (scene->track_begin && scene->track_begin[scene->point_count] > scene->track_begin[0]) {
+            job.facing = (float*)gsf_alloc(ctx, n, 3 * sizeof(float));
+            job.apart = (float*)gsf_alloc(ctx, n, sizeof(float));
+            job.evidence = (float*)gsf_alloc(ctx, n, sizeof(float));
+            if (!job.facing || !job.apart || !job.evidence) goto cleanup;
+        }
         for (size_t i = 0; i < scene->view_count; i++) {
             gsf_camera_center(&scene->views[i].camera, job.centers + 3 * i);
             for (int k = 0; k < 3; k++) job.centers[3 * i + (size_t)k] -= origin[k];
@@ -4603,8 +4650,10 @@ static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, con
         job.scene = scene;
         start = gsf__vis_seconds();
         gsf__parallel_for(ctx, chunks, gsf__vis_survey_chunk, &job);
-        gsf__parallel_for(ctx, chunks, gsf__vis_orient_chunk, &job);
-        gsf__vis_likelihoods(&job, chunks);
+        if (job.evidence) {
+            gsf__parallel_for(ctx, chunks, gsf__vis_orient_chunk, &job);
+            gsf__vis_likelihoods(&job, chunks);
+        }
 #ifdef GSF_USE_EMBREE
         if (!desc->use_zbuffer) {
             stats->used_embree = 1;
@@ -4633,7 +4682,7 @@ cleanup:
     gsf_free(ctx, job.facing);
     gsf_free(ctx, job.apart);
     gsf_free(ctx, job.evidence);
-    gsf_free(ctx, job.limits);
+    gsf_free(ctx, job.regions);
     gsf__discs_destroy(ctx, &discs);
     gsf_free(ctx, eyes);
     return result;
@@ -4674,6 +4723,73 @@ GSF_API gsf_result gsf_splat_visible_points(gsf_context* ctx, const gsf_scene* s
 
 #ifdef GSF_USE_EMBREE
 
+/* Most pairs of point and view in a dense cloud are hidden, and what hides one point hides those about it. So eight points
+   of a neighbourhood first meet the discs that hid those before them, then the neighbours of the discs that helped, in
+   float with a bound on every error; a ray is shot at the points that these do not hide for certain. */
+struct gsf__rays8 {
+    float direction[3][8], distance[8];
+    float own[8];              // tolerance times the point's radius
+    float cover[8], need[8];   // certain so far; enough to be hidden
+};
+
+struct gsf__hider { // a disc, ready to be met; relative to the eye
+    float center[3], normal[3], plane, inverse2, reach; // distance of its plane, 1 / radius^2, tolerance times radius
+    uint32_t disc;
+    int32_t covered; // of the present rays, as bits
+};
+
+enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
+
+// Adds to each ray's cover what the disc covers at the least. Bits 0-7: it covers the ray; 8-15: the ray needs more.
+static int gsf__hide8_scalar(gsf__rays8* rays, const gsf__hider* hider) {
+    const float *c = hider->center, *n = hider->normal;
+    int bits = 0;
+    for (int l = 0; l < 8; l++) {
+        const float x = rays->direction[0][l], y = rays->direction[1][l], z = rays->direction[2][l];
+        const float inverse = 1.0f / (x * n[0] + y * n[1] + z * n[2]), t = hider->plane * inverse;
+        const float error = 1e-6f * rays->distance[l] * fabsf(inverse);
+        const float gap = rays->distance[l] - t - (rays->own[l] > hider->reach ? rays->own[l] : hider->reach);
+        const float qx = t * x - c[0], qy = t * y - c[1], qz = t * z - c[2];
+        const float q2 = 1.01f * (qx * qx + qy * qy + qz * qz) + 101.0f * error * error; // (q + error)^2 is at most that
+        const float cover = 1.0f - q2 * hider->inverse2;
+        if (t > error && gap > 2.0f * error && cover > 0.0f) {
+            rays->cover[l] += cover;
+            bits |= 1 << l;
+        }
+        bits |= (rays->cover[l] < rays->need[l]) << (8 + l);
+    }
+    return bits;
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static int gsf__hide8_avx2(gsf__rays8* rays, const gsf__hider* hider) {
+    const float *c = hider->center, *n = hider->normal;
+    const __m256 one = _mm256_set1_ps(1.0f), zero = _mm256_setzero_ps(), distance = _mm256_loadu_ps(rays->distance);
+    const __m256 x = _mm256_loadu_ps(rays->direction[0]), y = _mm256_loadu_ps(rays->direction[1]);
+    const __m256 z = _mm256_loadu_ps(rays->direction[2]);
+    const __m256 slope = _mm256_fmadd_ps(x, _mm256_set1_ps(n[0]),
+                         _mm256_fmadd_ps(y, _mm256_set1_ps(n[1]), _mm256_mul_ps(z, _mm256_set1_ps(n[2]))));
+    const __m256 inverse = _mm256_div_ps(one, slope), t = _mm256_mul_ps(_mm256_set1_ps(hider->plane), inverse);
+    const __m256 error = _mm256_mul_ps(_mm256_mul_ps(_mm256_set1_ps(1e-6f), distance),
+                                       _mm256_andnot_ps(_mm256_set1_ps(-0.0f), inverse));
+    const __m256 gap = _mm256_sub_ps(_mm256_sub_ps(distance, t),
+                                     _mm256_max_ps(_mm256_loadu_ps(rays->own), _mm256_set1_ps(hider->reach)));
+    const __m256 qx = _mm256_fmsub_ps(t, x, _mm256_set1_ps(c[0])), qy = _mm256_fmsub_ps(t, y, _mm256_set1_ps(c[1]));
+    const __m256 qz = _mm256_fmsub_ps(t, z, _mm256_set1_ps(c[2]));
+    const __m256 length2 = _mm256_fmadd_ps(qx, qx, _mm256_fmadd_ps(qy, qy, _mm256_mul_ps(qz, qz)));
+    const __m256 q2 = _mm256_fmadd_ps(_mm256_set1_ps(1.01f), length2,
+                                      _mm256_mul_ps(_mm256_set1_ps(101.0f), _mm256_mul_ps(error, error)));
+    const __m256 cover = _mm256_fnmadd_ps(q2, _mm256_set1_ps(hider->inverse2), one);
+    const __m256 hit = _mm256_and_ps(_mm256_cmp_ps(t, error, _CMP_GT_OQ),
+                                     _mm256_and_ps(_mm256_cmp_ps(gap, _mm256_add_ps(error, error), _CMP_GT_OQ),
+                                                   _mm256_cmp_ps(cover, zero, _CMP_GT_OQ)));
+    const __m256 sum = _mm256_add_ps(_mm256_loadu_ps(rays->cover), _mm256_and_ps(cover, hit));
+    _mm256_storeu_ps(rays->cover, sum);
+    return _mm256_movemask_ps(hit) |
+           _mm256_movemask_ps(_mm256_cmp_ps(sum, _mm256_loadu_ps(rays->need), _CMP_LT_OQ)) << 8;
+}
+#endif
+
 typedef struct gsf__embree_query { // Embree hands the filter a pointer to its own part, which comes first
 #if RTC_VERSION_MAJOR < 4
     struct RTCIntersectContext context;
@@ -4682,18 +4798,120 @@ typedef struct gsf__embree_query { // Embree hands the filter a pointer to its o
 #endif
     const gsf__vis_job* job;
     const gsf__eye* eye;
+    // the ray under way
     gsf__sight sight;
     size_t point;
-    double cover;
+    double cover, limit;              // of the discs met so far; where the point is hidden
+    // eight points
+    size_t points[8];
+    int ray_count;
+    gsf__rays8 rays;
+    gsf__hider queue[GSF__VIS_QUEUE]; // first the discs that hid the points before
+    int queue_count;
+    uint64_t queued[16];              // a bit for each disc in the queue, which it shares with others
 } gsf__embree_query;
+
+static void gsf__embree_enqueue(gsf__embree_query* q, uint32_t disc) {
+    uint64_t *word = q->queued + (disc >> 6 & 15u), bit = (uint64_t)1 << (disc & 63u);
+    if ((*word & bit) || q->queue_count == GSF__VIS_QUEUE) return;
+    *word |= bit;
+    const float *sphere = q->job->discs->spheres + 4 * (size_t)disc, *normal = q->job->discs->normals + 3 * (size_t)disc;
+    gsf__hider* hider = q->queue + q->queue_count++;
+    for (int k = 0; k < 3; k++) {
+        hider->center[k] = (float)((double)sphere[k] - q->eye->center[k]);
+        hider->normal[k] = normal[k];
+    }
+    hider->plane = hider->center[0] * normal[0] + hider->center[1] * normal[1] + hider->center[2] * normal[2];
+    hider->inverse2 = 1.0f / (sphere[3] * sphere[3]);
+    hider->reach = q->job->desc->tolerance * sphere[3];
+    hider->disc = disc;
+}
 
 // Called at every disc on the ray, in no order: refused (so that the search goes on) until the cover is full.
 static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
     gsf__embree_query* q = (gsf__embree_query*)(void*)args->context;
     const struct RTCHit* hit = (const struct RTCHit*)(const void*)args->hit; // single rays only: N is 1
     if (args->valid[0] == 0) return;
-    q->cover += gsf__vis_cover(q->job, q->eye, &q->sight, q->point, hit->primID);
-    if (q->cover < (double)q->job->limits[q->point]) args->valid[0] = 0;
+    const double cover = gsf__vis_cover(q->job, q->eye, &q->sight, q->point, hit->primID);
+    q->cover += cover;
+    if (q->cover < q->limit) args->valid[0] = 0;
+    if (cover > 0.0) gsf__embree_enqueue(q, hit->primID);
+}
+
+static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
+    const gsf__vis_job* job = q->job;
+    if (!gsf__vis_sight(job, q->eye, i, &q->sight)) return;
+    q->point = i;
+    q->cover = 0.0;
+    q->limit = (double)gsf__vis_limit(job, i);
+    // From the eye and not to the end, so that the point's own disc is never met (an origin inside a disc is a trap:
+    // some versions report it, some do not).
+    const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs->spheres[4 * i + 3]);
+    if (reach > 0.0) {
+        struct RTCRay ray;
+        memset(&ray, 0, sizeof ray);
+        ray.org_x = (float)q->eye->center[0];
+        ray.org_y = (float)q->eye->center[1];
+        ray.org_z = (float)q->eye->center[2];
+        ray.dir_x = (float)q->sight.direction[0];
+        ray.dir_y = (float)q->sight.direction[1];
+        ray.dir_z = (float)q->sight.direction[2];
+        ray.tfar = (float)reach;
+        ray.mask = 0xffffffffu;
+#if RTC_VERSION_MAJOR < 4
+        rtcOccluded1((RTCScene)job->embree_scene, &q->context, &ray);
+#else
+        struct RTCOccludedArguments args;
+        rtcInitOccludedArguments(&args);
+        args.context = &q->context;
+        rtcOccluded1((RTCScene)job->embree_scene, &ray, &args);
+#endif
+    }
+    job->seen[i] = q->cover < q->limit;
+}
+
+// Meets the discs of the queue from *next on, and the neighbours of those that cover an open ray; returns the rays of
+// `open` that stay open, as bits.
+static int gsf__embree_meet(gsf__embree_query* q, int* next, int* expanded, int open) {
+    const gsf__discs* discs = q->job->discs;
+    while (open) {
+        if (*next < q->queue_count) {
+            gsf__hider* hider = q->queue + (*next)++;
+            hider->covered = q->job->hide8(&q->rays, hider);
+            open &= hider->covered >> 8;
+        } else if (*expanded < *next) {
+            const gsf__hider* hider = q->queue + (*expanded)++;
+            if (!(hider->covered & open)) continue;
+            const uint32_t* nearest = discs->nearest + (size_t)discs->near_count * hider->disc;
+            for (int n = 0; n < discs->near_count; n++) gsf__embree_enqueue(q, nearest[n]);
+        } else {
+            break;
+        }
+    }
+    return open;
+}
+
+static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
+    for (int l = q->ray_count; l < 8; l++) { // lanes that nothing covers
+        q->rays.direction[0][l] = q->rays.direction[1][l] = q->rays.direction[2][l] = 0.0f;
+        q->rays.distance[l] = q->rays.own[l] = q->rays.cover[l] = q->rays.need[l] = 0.0f;
+    }
+    int next = 0, expanded = 0, open = gsf__embree_meet(q, &next, &expanded, (1 << q->ray_count) - 1);
+    for (int l = 0; l < q->ray_count; l++) {
+        counts->rays += open >> l & 1;
+        counts->culled += !(open >> l & 1);
+        if (!(open >> l & 1)) continue;
+        gsf__embree_ray(q, q->points[l]);
+        open = gsf__embree_meet(q, &next, &expanded, open & ~(1 << l)); // what hides this point may hide the others
+    }
+    memset(q->queued, 0, sizeof q->queued);
+    q->queue_count = q->ray_count = 0;
+    for (int k = 0; k < next && q->queue_count < GSF__VIS_HIDERS; k++) {
+        if (!(q->queue[k].covered & 255)) continue;
+        const uint32_t disc = q->queue[k].disc;
+        q->queued[disc >> 6 & 15u] |= (uint64_t)1 << (disc & 63u);
+        q->queue[q->queue_count++] = q->queue[k];
+    }
 }
 
 static void gsf__vis_embree_chunk(void* arg, size_t chunk, int worker) {
@@ -4701,48 +4919,43 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int worker) {
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     gsf__vis_counts* counts = job->counts + chunk;
     const size_t first = chunk * GSF__VIS_CHUNK;
+    const int side = gsf__vis_side(job->eye, job->regions + 6 * chunk);
     gsf__embree_query query;
+    gsf__rays8* rays = &query.rays;
     query.job = job;
+    query.eye = job->eye;
+    query.queue_count = query.ray_count = 0;
+    memset(query.queued, 0, sizeof query.queued);
 #if RTC_VERSION_MAJOR < 4
     rtcInitIntersectContext(&query.context);
 #else
-    struct RTCOccludedArguments args;
     rtcInitRayQueryContext(&query.context);
-    rtcInitOccludedArguments(&args);
-    args.context = &query.context;
 #endif
-    query.eye = job->eye;
+    const float grazing = job->desc->min_grazing_cos + 1e-5f;
     for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
         if (job->seen[i]) continue;
-        if (!gsf__vis_sight(job, query.eye, i, &query.sight) || !(job->limits[i] > 0.0f)) {
+        const float *sphere = job->discs->spheres + 4 * i, *normal = job->discs->normals + 3 * i;
+        const int l = query.ray_count;
+        float d[3];
+        for (int k = 0; k < 3; k++) d[k] = (float)((double)sphere[k] - query.eye->center[k]);
+        const float distance = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), inverse = 1.0f / distance;
+        for (int k = 0; k < 3; k++) rays->direction[k][l] = d[k] * inverse;
+        const float cosine = (d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]) * inverse;
+        const int clear = side > 0 && fabsf(cosine) > grazing; // else in double
+        float limit = 0.0f;
+        if (clear || (side >= 0 && gsf__vis_sight(job, query.eye, i, &query.sight))) limit = gsf__vis_limit(job, i);
+        if (!(limit > 0.0f)) {
             counts->culled++;
             continue;
         }
-        counts->rays++;
-        query.point = i;
-        query.cover = 0.0;
-        // From the eye and not to the end, so that the point's own disc is never met (an origin inside a disc is a
-        // trap: some versions report it, some do not).
-        const double reach = query.sight.distance - (double)(job->desc->tolerance * job->discs->spheres[4 * i + 3]);
-        if (reach > 0.0) {
-            struct RTCRay ray;
-            memset(&ray, 0, sizeof ray);
-            ray.org_x = (float)query.eye->center[0];
-            ray.org_y = (float)query.eye->center[1];
-            ray.org_z = (float)query.eye->center[2];
-            ray.dir_x = (float)query.sight.direction[0];
-            ray.dir_y = (float)query.sight.direction[1];
-            ray.dir_z = (float)query.sight.direction[2];
-            ray.tfar = (float)reach;
-            ray.mask = 0xffffffffu;
-#if RTC_VERSION_MAJOR < 4
-            rtcOccluded1((RTCScene)job->embree_scene, &query.context, &ray);
-#else
-            rtcOccluded1((RTCScene)job->embree_scene, &ray, &args);
-#endif
-        }
-        job->seen[i] = query.cover < (double)job->limits[i];
+        query.points[l] = i;
+        rays->distance[l] = distance;
+        rays->own[l] = job->desc->tolerance * sphere[3];
+        rays->cover[l] = 0.0f;
+        rays->need[l] = limit * 1.00001f;
+        if (++query.ray_count == 8) gsf__embree_group(&query, counts);
     }
+    if (query.ray_count) gsf__embree_group(&query, counts);
 }
 
 static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double* build_seconds) {
@@ -4772,6 +4985,10 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
     } else {
         *build_seconds = gsf__vis_seconds() - start;
         job->embree_scene = scene;
+        job->hide8 = gsf__hide8_scalar;
+#if GSF__X86
+        if (ctx->cpu_level >= GSF_CPU_AVX2) job->hide8 = gsf__hide8_avx2;
+#endif
         for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
             gsf__vis_look(ctx, job, e);
             gsf__parallel_for(ctx, (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, gsf__vis_embree_chunk,
