@@ -4213,8 +4213,8 @@ typedef struct gsf__hider gsf__hider;
 
 typedef struct gsf__vis_job {
     const gsf_visibility_desc* desc;
-    const gsf__discs* discs;
-    const gsf__eye* eyes;
+    gsf__discs discs;
+    gsf__eye* eyes;
     size_t eye_count;
     uint8_t* seen;             // by place in the discs; what is set on entry gets no ray
     gsf__vis_counts* counts;   // per chunk of discs, so that their sum needs no atomics
@@ -4241,6 +4241,10 @@ typedef struct gsf__vis_job {
 } gsf__vis_job;
 
 enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
+
+static void gsf__vis_run(gsf_context* ctx, gsf__vis_job* job, void (*chunk)(void* arg, size_t chunk, int worker)) {
+    gsf__parallel_for(ctx, (job->discs.count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, chunk, job);
+}
 
 static void gsf__vis_region(const gsf__discs* discs, size_t first, size_t end, float region[6]) {
     for (int k = 0; k < 3; k++) region[k] = region[3 + k] = discs->spheres[4 * first + (size_t)k];
@@ -4280,8 +4284,8 @@ static int gsf__vis_side(const gsf__eye* eye, const float region[6]) {
 
 // Frustum and grazing-angle tests; nonzero where a ray is worth shooting.
 static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i, gsf__sight* out) {
-    const float* sphere = job->discs->spheres + 4 * i;
-    const float* normal = job->discs->normals + 3 * i;
+    const float* sphere = job->discs.spheres + 4 * i;
+    const float* normal = job->discs.normals + 3 * i;
     const double* m = eye->camera.w2c;
     double d[3], c[3];
     for (int k = 0; k < 3; k++) d[k] = (double)sphere[k] - eye->center[k];
@@ -4302,8 +4306,8 @@ static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i
 static float gsf__vis_apart(const gsf__vis_job* job, const gsf__eye* eye, size_t i, const gsf__sight* sight,
                             int* tracked) {
     const gsf_scene* scene = job->scene;
-    const float* sphere = job->discs->spheres + 4 * i;
-    const size_t row = job->discs->rows[i];
+    const float* sphere = job->discs.spheres + 4 * i;
+    const size_t row = job->discs.rows[i];
     double best = -2.0; // largest cosine, as its square with its sign
     *tracked = 0;
     for (size_t t = scene->track_begin[row]; t < scene->track_begin[row + 1]; t++) {
@@ -4334,18 +4338,18 @@ static void gsf__vis_survey_chunk(void* arg, size_t chunk, int worker) {
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const gsf_scene* scene = job->scene;
     gsf__vis_counts* counts = job->counts + chunk;
-    const size_t first = chunk * GSF__VIS_CHUNK, count = job->discs->count;
+    const size_t first = chunk * GSF__VIS_CHUNK, count = job->discs.count;
     const size_t end = count - first < GSF__VIS_CHUNK ? count : first + GSF__VIS_CHUNK;
-    gsf__vis_region(job->discs, first, end, job->regions + 6 * chunk);
+    gsf__vis_region(&job->discs, first, end, job->regions + 6 * chunk);
     if (!job->evidence) return;
     for (size_t i = first; i < end; i++) {
-        const size_t row = job->discs->rows[i];
+        const size_t row = job->discs.rows[i];
         double sum[3] = {0.0, 0.0, 0.0};
         for (size_t t = scene->track_begin[row]; t < scene->track_begin[row + 1]; t++) {
             const double* center = job->centers + 3 * (size_t)scene->track_views[t];
             double d[3], length2 = 0.0;
             for (int k = 0; k < 3; k++) {
-                d[k] = (double)job->discs->spheres[4 * i + (size_t)k] - center[k];
+                d[k] = (double)job->discs.spheres[4 * i + (size_t)k] - center[k];
                 length2 += d[k] * d[k];
             }
             if (length2 > 0.0)
@@ -4371,7 +4375,7 @@ static void gsf__vis_survey_chunk(void* arg, size_t chunk, int worker) {
 static void gsf__vis_orient_chunk(void* arg, size_t chunk, int worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
-    const gsf__discs* discs = job->discs;
+    const gsf__discs* discs = &job->discs;
     const size_t first = chunk * GSF__VIS_CHUNK, near_count = (size_t)discs->near_count;
     for (size_t i = first; i < discs->count && i < first + GSF__VIS_CHUNK; i++) {
         float* normal = discs->normals + 3 * i;
@@ -4388,11 +4392,11 @@ static void gsf__vis_orient_chunk(void* arg, size_t chunk, int worker) {
 
 // How often a track holds a view, by the distance from the nearest other one, gives the likelihoods: a visible point is
 // found so often, a hidden one (by a wrong match, or since its neighbour is not) in 3 of 100 views.
-static void gsf__vis_likelihoods(gsf__vis_job* job, size_t chunks) {
+static void gsf__vis_likelihoods(gsf__vis_job* job) {
     const double wrong = 0.03;
     for (int b = 0; b < GSF__VIS_BINS; b++) {
         double tries = 0.0, finds = 0.0;
-        for (size_t c = 0; c < chunks; c++) {
+        for (size_t c = 0; c * GSF__VIS_CHUNK < job->discs.count; c++) {
             tries += job->counts[c].tries[b];
             finds += job->counts[c].finds[b];
         }
@@ -4408,7 +4412,7 @@ static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int worker) {
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const size_t first = chunk * GSF__VIS_CHUNK;
     const int outside = gsf__vis_side(job->eye, job->regions + 6 * chunk) < 0;
-    for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
+    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
         gsf__sight sight;
         int tracked;
         job->apart[i] = -1.0f;
@@ -4424,7 +4428,7 @@ static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int worker) {
 // Cover at which the current eye does not see point i. The weights are a logistic fit on three ray-traced scenes, in
 // units of the coverage; the constant one is chosen for the union over several views.
 static float gsf__vis_limit(const gsf__vis_job* job, size_t i) {
-    const gsf__discs* discs = job->discs;
+    const gsf__discs* discs = &job->discs;
     if (!job->evidence) return (float)(double)job->desc->coverage;
     const size_t near_count = (size_t)discs->near_count;
     const float *sphere = discs->spheres + 4 * i, *normal = discs->normals + 3 * i;
@@ -4452,14 +4456,13 @@ static float gsf__vis_limit(const gsf__vis_job* job, size_t i) {
 
 // Makes an eye the current one.
 static void gsf__vis_look(gsf_context* ctx, gsf__vis_job* job, size_t e) {
-    const size_t chunks = (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
     job->eye = job->eyes + e;
-    if (job->evidence) gsf__parallel_for(ctx, chunks, gsf__vis_evidence_chunk, job);
+    if (job->evidence) gsf__vis_run(ctx, job, gsf__vis_evidence_chunk);
 }
 
 // What disc j adds to the cover of the ray from the eye to point i. The one definition behind both ways to find the discs.
 static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const gsf__sight* sight, size_t i, size_t j) {
-    const float *sphere = job->discs->spheres + 4 * j, *normal = job->discs->normals + 3 * j;
+    const float *sphere = job->discs.spheres + 4 * j, *normal = job->discs.normals + 3 * j;
     double d[3], plane = 0.0, slope = 0.0, q2 = 0.0;
     for (int k = 0; k < 3; k++) {
         d[k] = (double)sphere[k] - eye->center[k];
@@ -4467,7 +4470,7 @@ static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const
         slope += sight->direction[k] * (double)normal[k];
     }
     if (slope == 0.0) return 0.0;
-    const double t = plane / slope, radius = (double)sphere[3], own = (double)job->discs->spheres[4 * i + 3];
+    const double t = plane / slope, radius = (double)sphere[3], own = (double)job->discs.spheres[4 * i + 3];
     if (!(t > 0.0 && sight->distance - t >= (double)job->desc->tolerance * (own > radius ? own : radius))) return 0.0;
     for (int k = 0; k < 3; k++) {
         const double x = t * sight->direction[k] - d[k];
@@ -4495,7 +4498,7 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
     const double *m = camera->w2c, sx = (double)job->side / (double)camera->width;
     const double sy = (double)job->side / (double)camera->height;
     const size_t first = chunk * GSF__VIS_CHUNK;
-    for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
+    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
         job->cells[i] = -1;
         job->cover[i] = 0.0;
         if (!job->seen[i]) {
@@ -4508,7 +4511,7 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
                 counts->culled++;
             }
         }
-        const float *sphere = job->discs->spheres + 4 * i, *normal = job->discs->normals + 3 * i;
+        const float *sphere = job->discs.spheres + 4 * i, *normal = job->discs.normals + 3 * i;
         double d[3], c[3], e[3];
         for (int k = 0; k < 3; k++) d[k] = (double)sphere[k] - job->eye->center[k];
         for (int r = 0; r < 3; r++) { // centre and half extent along the camera's axes
@@ -4537,7 +4540,7 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int worker) {
     const int32_t y0 = (int32_t)band * job->side / GSF__VIS_BANDS, y1 = ((int32_t)band + 1) * job->side / GSF__VIS_BANDS;
     const uint32_t first = job->cell_begin[y0 * job->side], last = job->cell_begin[y1 * job->side];
     if (first == last) return;
-    for (size_t j = 0; j < job->discs->count; j++) {
+    for (size_t j = 0; j < job->discs.count; j++) {
         const gsf__disc_box* box = job->boxes + j;
         if (box->x0 >= box->x1) continue;
         for (int32_t y = box->y0 > y0 ? box->y0 : y0; y < box->y1 && y < y1; y++) {
@@ -4555,7 +4558,7 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int worker) {
 
 // Ray tests without Embree: per eye, every disc meets the points whose cells its projection touches.
 static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
-    const size_t n = job->discs->count ? job->discs->count : 1, most = GSF__VIS_MAX_SIDE;
+    const size_t n = job->discs.count ? job->discs.count : 1, most = GSF__VIS_MAX_SIDE;
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
     job->side = GSF__VIS_BANDS;
     while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points in a cell
@@ -4571,13 +4574,13 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
         result = GSF_OK;
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
-        gsf__parallel_for(ctx, (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, gsf__vis_project_chunk, job);
+        gsf__vis_run(ctx, job, gsf__vis_project_chunk);
         uint32_t* begin = job->cell_begin; // counting sort; begin[c + 2] counts cell c, then begin[c + 1] walks through it
         memset(begin, 0, (cell_count + 2) * sizeof(uint32_t));
-        for (size_t i = 0; i < job->discs->count; i++)
+        for (size_t i = 0; i < job->discs.count; i++)
             if (job->cells[i] >= 0) begin[job->cells[i] + 2]++;
         for (size_t c = 2; c < cell_count + 2; c++) begin[c] += begin[c - 1];
-        for (size_t i = 0; i < job->discs->count; i++)
+        for (size_t i = 0; i < job->discs.count; i++)
             if (job->cells[i] >= 0) job->cell_points[begin[job->cells[i] + 1]++] = (uint32_t)i;
         gsf__parallel_for(ctx, GSF__VIS_BANDS, gsf__vis_band_of_cells, job);
         result = gsf__check_cancel(ctx);
@@ -4602,89 +4605,95 @@ static void gsf__vis_by_tracks(const gsf_scene* scene, const uint8_t* chosen, ui
             keep[i] = chosen[scene->track_views[t]];
 }
 
-static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
-                                   const gsf_visibility_desc* desc, uint8_t* keep, gsf_visibility_stats* stats) {
-    gsf__discs discs;
-    gsf__vis_job job;
-    memset(&job, 0, sizeof job);
-    gsf__eye* eyes = (gsf__eye*)gsf_alloc(ctx, view_count, sizeof *eyes);
-    if (!eyes) return GSF_ERROR_OUT_OF_MEMORY;
+static void gsf__vis_end(gsf_context* ctx, gsf__vis_job* job) {
+    gsf_free(ctx, job->seen);
+    gsf_free(ctx, job->counts);
+    gsf_free(ctx, job->centers);
+    gsf_free(ctx, job->regions);
+    gsf_free(ctx, job->facing);
+    gsf_free(ctx, job->apart);
+    gsf_free(ctx, job->evidence);
+    gsf_free(ctx, job->eyes);
+    gsf__discs_destroy(ctx, &job->discs);
+    memset(job, 0, sizeof *job);
+}
+
+// Discs, eyes and what the tracks say. gsf__vis_end also after a failure.
+static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                 const gsf_visibility_desc* desc, const uint8_t* keep, gsf__vis_job* job,
+                                 gsf_visibility_stats* stats) {
+    memset(job, 0, sizeof *job);
+    job->desc = desc;
+    job->scene = scene;
+    job->eyes = (gsf__eye*)gsf_alloc(ctx, view_count, sizeof(gsf__eye));
+    job->centers = (double*)gsf_alloc(ctx, scene->view_count, 3 * sizeof(double));
+    if (!job->eyes || !job->centers) return GSF_ERROR_OUT_OF_MEMORY;
+    job->eye_count = view_count;
     double origin[3] = {0.0, 0.0, 0.0};
     for (size_t i = 0; i < view_count; i++) {
-        eyes[i].camera = scene->views[views[i]].camera;
-        gsf_camera_center(&eyes[i].camera, eyes[i].center);
-        eyes[i].view = views[i];
-        for (int k = 0; k < 3; k++) origin[k] += eyes[i].center[k] / (double)view_count;
+        gsf__eye* eye = job->eyes + i;
+        eye->camera = scene->views[views[i]].camera;
+        gsf_camera_center(&eye->camera, eye->center);
+        eye->view = views[i];
+        for (int k = 0; k < 3; k++) origin[k] += eye->center[k] / (double)view_count;
     }
     for (size_t i = 0; i < view_count; i++)
-        for (int k = 0; k < 3; k++) eyes[i].center[k] -= origin[k];
+        for (int k = 0; k < 3; k++) job->eyes[i].center[k] -= origin[k];
+    for (size_t i = 0; i < scene->view_count; i++) {
+        gsf_camera_center(&scene->views[i].camera, job->centers + 3 * i);
+        for (int k = 0; k < 3; k++) job->centers[3 * i + (size_t)k] -= origin[k];
+    }
 
-    double start = gsf__vis_seconds();
-    gsf_result result = gsf__discs_make(ctx, scene, origin, desc, &discs);
+    const double start = gsf__vis_seconds();
+    GSF__TRY(gsf__discs_make(ctx, scene, origin, desc, &job->discs));
     stats->seconds_normals = gsf__vis_seconds() - start;
-    if (result != GSF_OK) goto cleanup;
-    {
-        const size_t chunks = (discs.count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
-        result = GSF_ERROR_OUT_OF_MEMORY;
-        job.seen = (uint8_t*)gsf_alloc(ctx, discs.count ? discs.count : 1, 1);
-        job.counts = (gsf__vis_counts*)gsf_alloc_zeroed(ctx, chunks ? chunks : 1, sizeof *job.counts);
-        const size_t n = discs.count ? discs.count : 1;
-        job.centers = (double*)gsf_alloc(ctx, scene->view_count, 3 * sizeof(double));
-        job.regions = (float*)gsf_alloc(ctx, chunks ? chunks : 1, 6 * sizeof(float));
-        if (!job.seen || !job.counts || !job.centers || !job.regions) goto cleanup;
-        if (scene->track_begin && scene->track_begin[scene->point_count] > scene->track_begin[0]) {
-            job.facing = (float*)gsf_alloc(ctx, n, 3 * sizeof(float));
-            job.apart = (float*)gsf_alloc(ctx, n, sizeof(float));
-            job.evidence = (float*)gsf_alloc(ctx, n, sizeof(float));
-            if (!job.facing || !job.apart || !job.evidence) goto cleanup;
-        }
-        for (size_t i = 0; i < scene->view_count; i++) {
-            gsf_camera_center(&scene->views[i].camera, job.centers + 3 * i);
-            for (int k = 0; k < 3; k++) job.centers[3 * i + (size_t)k] -= origin[k];
-        }
-        for (size_t i = 0; i < discs.count; i++) job.seen[i] = keep[discs.rows[i]];
-        job.desc = desc;
-        job.discs = &discs;
-        job.eyes = eyes;
-        job.eye_count = view_count;
-        job.scene = scene;
-        start = gsf__vis_seconds();
-        gsf__parallel_for(ctx, chunks, gsf__vis_survey_chunk, &job);
-        if (job.evidence) {
-            gsf__parallel_for(ctx, chunks, gsf__vis_orient_chunk, &job);
-            gsf__vis_likelihoods(&job, chunks);
-        }
+    const size_t n = job->discs.count ? job->discs.count : 1, chunks = (n + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
+    job->seen = (uint8_t*)gsf_alloc(ctx, n, 1);
+    job->counts = (gsf__vis_counts*)gsf_alloc_zeroed(ctx, chunks, sizeof *job->counts);
+    job->regions = (float*)gsf_alloc(ctx, chunks, 6 * sizeof(float));
+    if (!job->seen || !job->counts || !job->regions) return GSF_ERROR_OUT_OF_MEMORY;
+    if (scene->track_begin && scene->track_begin[scene->point_count] > scene->track_begin[0]) {
+        job->facing = (float*)gsf_alloc(ctx, n, 3 * sizeof(float));
+        job->apart = (float*)gsf_alloc(ctx, n, sizeof(float));
+        job->evidence = (float*)gsf_alloc(ctx, n, sizeof(float));
+        if (!job->facing || !job->apart || !job->evidence) return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    for (size_t i = 0; i < job->discs.count; i++) job->seen[i] = keep[job->discs.rows[i]];
+    gsf__vis_run(ctx, job, gsf__vis_survey_chunk);
+    if (job->evidence) {
+        gsf__vis_run(ctx, job, gsf__vis_orient_chunk);
+        gsf__vis_likelihoods(job);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                   const gsf_visibility_desc* desc, uint8_t* keep, gsf_visibility_stats* stats) {
+    gsf__vis_job job;
+    const double start = gsf__vis_seconds();
+    gsf_result result = gsf__vis_begin(ctx, scene, views, view_count, desc, keep, &job, stats);
 #ifdef GSF_USE_EMBREE
-        if (!desc->use_zbuffer) {
-            stats->used_embree = 1;
-            result = gsf__vis_by_embree(ctx, &job, &stats->seconds_build);
-        } else
+    if (result == GSF_OK && !desc->use_zbuffer) {
+        stats->used_embree = 1;
+        result = gsf__vis_by_embree(ctx, &job, &stats->seconds_build);
+    } else
 #endif
-            result = gsf__vis_by_cells(ctx, &job);
-        stats->seconds_rays = gsf__vis_seconds() - start - stats->seconds_build;
-        if (result != GSF_OK) goto cleanup;
-        for (size_t i = 0; i < chunks; i++) {
+    if (result == GSF_OK) result = gsf__vis_by_cells(ctx, &job);
+    if (result == GSF_OK) {
+        stats->seconds_rays = gsf__vis_seconds() - start - stats->seconds_normals - stats->seconds_build;
+        for (size_t i = 0; i * GSF__VIS_CHUNK < job.discs.count; i++) {
             stats->rays += job.counts[i].rays;
             stats->culled += job.counts[i].culled;
         }
-        for (size_t i = 0; i < discs.count; i++) {
-            stats->by_rays += job.seen[i] && !keep[discs.rows[i]];
-            keep[discs.rows[i]] = job.seen[i];
+        for (size_t i = 0; i < job.discs.count; i++) {
+            stats->by_rays += job.seen[i] && !keep[job.discs.rows[i]];
+            keep[job.discs.rows[i]] = job.seen[i];
         }
-        if (discs.count < scene->point_count)
+        if (job.discs.count < scene->point_count)
             gsf_log(ctx, GSF_LOG_WARNING, "visible points: %zu points with a non-finite coordinate get no ray",
-                    scene->point_count - discs.count);
+                    scene->point_count - job.discs.count);
     }
-cleanup:
-    gsf_free(ctx, job.seen);
-    gsf_free(ctx, job.counts);
-    gsf_free(ctx, job.centers);
-    gsf_free(ctx, job.facing);
-    gsf_free(ctx, job.apart);
-    gsf_free(ctx, job.evidence);
-    gsf_free(ctx, job.regions);
-    gsf__discs_destroy(ctx, &discs);
-    gsf_free(ctx, eyes);
+    gsf__vis_end(ctx, &job);
     return result;
 }
 
@@ -4815,7 +4824,7 @@ static void gsf__embree_enqueue(gsf__embree_query* q, uint32_t disc) {
     uint64_t *word = q->queued + (disc >> 6 & 15u), bit = (uint64_t)1 << (disc & 63u);
     if ((*word & bit) || q->queue_count == GSF__VIS_QUEUE) return;
     *word |= bit;
-    const float *sphere = q->job->discs->spheres + 4 * (size_t)disc, *normal = q->job->discs->normals + 3 * (size_t)disc;
+    const float *sphere = q->job->discs.spheres + 4 * (size_t)disc, *normal = q->job->discs.normals + 3 * (size_t)disc;
     gsf__hider* hider = q->queue + q->queue_count++;
     for (int k = 0; k < 3; k++) {
         hider->center[k] = (float)((double)sphere[k] - q->eye->center[k]);
@@ -4846,7 +4855,7 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
     q->limit = (double)gsf__vis_limit(job, i);
     // From the eye and not to the end, so that the point's own disc is never met (an origin inside a disc is a trap:
     // some versions report it, some do not).
-    const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs->spheres[4 * i + 3]);
+    const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs.spheres[4 * i + 3]);
     if (reach > 0.0) {
         struct RTCRay ray;
         memset(&ray, 0, sizeof ray);
@@ -4873,7 +4882,7 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
 // Meets the discs of the queue from *next on, and the neighbours of those that cover an open ray; returns the rays of
 // `open` that stay open, as bits.
 static int gsf__embree_meet(gsf__embree_query* q, int* next, int* expanded, int open) {
-    const gsf__discs* discs = q->job->discs;
+    const gsf__discs* discs = &q->job->discs;
     while (open) {
         if (*next < q->queue_count) {
             gsf__hider* hider = q->queue + (*next)++;
@@ -4932,9 +4941,9 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int worker) {
     rtcInitRayQueryContext(&query.context);
 #endif
     const float grazing = job->desc->min_grazing_cos + 1e-5f;
-    for (size_t i = first; i < job->discs->count && i < first + GSF__VIS_CHUNK; i++) {
+    for (size_t i = first; i < job->discs.count && i < first + GSF__VIS_CHUNK; i++) {
         if (job->seen[i]) continue;
-        const float *sphere = job->discs->spheres + 4 * i, *normal = job->discs->normals + 3 * i;
+        const float *sphere = job->discs.spheres + 4 * i, *normal = job->discs.normals + 3 * i;
         const int l = query.ray_count;
         float d[3];
         for (int k = 0; k < 3; k++) d[k] = (float)((double)sphere[k] - query.eye->center[k]);
@@ -4969,10 +4978,10 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
     geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_ORIENTED_DISC_POINT);
     scene = rtcNewScene(device);
     if (geometry && scene) {
-        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT4, job->discs->spheres, 0,
-                                   4 * sizeof(float), job->discs->count);
-        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_NORMAL, 0, RTC_FORMAT_FLOAT3, job->discs->normals, 0,
-                                   3 * sizeof(float), job->discs->count);
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT4, job->discs.spheres, 0,
+                                   4 * sizeof(float), job->discs.count);
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_NORMAL, 0, RTC_FORMAT_FLOAT3, job->discs.normals, 0,
+                                   3 * sizeof(float), job->discs.count);
         rtcSetGeometryOccludedFilterFunction(geometry, gsf__embree_filter);
         rtcCommitGeometry(geometry);
         rtcAttachGeometry(scene, geometry);
@@ -4981,7 +4990,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
     const enum RTCError error = rtcGetDeviceError(device);
     if (error != RTC_ERROR_NONE) {
         result = gsf_fail(ctx, error == RTC_ERROR_OUT_OF_MEMORY ? GSF_ERROR_OUT_OF_MEMORY : GSF_ERROR_UNSUPPORTED,
-                          "Embree: error %d while %zu discs are built", (int)error, job->discs->count);
+                          "Embree: error %d while %zu discs are built", (int)error, job->discs.count);
     } else {
         *build_seconds = gsf__vis_seconds() - start;
         job->embree_scene = scene;
@@ -4991,8 +5000,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
 #endif
         for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
             gsf__vis_look(ctx, job, e);
-            gsf__parallel_for(ctx, (job->discs->count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, gsf__vis_embree_chunk,
-                              job);
+            gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
             result = gsf__check_cancel(ctx);
         }
     }

@@ -587,10 +587,11 @@ static void bench_visibility(const bench_options* o, const char* name, size_t co
     bench_print(o, &row);
     snprintf(label, sizeof label, "%s: build and rays", name);
     row = bench_make_row(label, ctx.cpu_level, threads, stats.seconds_build + stats.seconds_rays, cpu_seconds,
-                         (double)stats.rays, "rays");
+                         (double)count * (double)view_count, "point views");
     row.variant = by;
     bench_print(o, &row);
-    if (!o->json) printf("build %.2f rays %.2f\n%s: by %s, %.1f %% of the points kept\n", stats.seconds_build, stats.seconds_rays, name, by, 100.0 * (double)stats.kept / (double)count);
+    if (!o->json) printf("%s: by %s, %.1f %% of the points kept, %.3g rays, %.2f s to build\n", name, by,
+                         100.0 * (double)stats.kept / (double)count, (double)stats.rays, stats.seconds_build);
     gsf_free(&ctx, keep);
     gsf_free(&ctx, views);
     gsf_free(&ctx, scene.track_begin);
