@@ -2,6 +2,7 @@
 // By hand: cc -O2 -fopenmp -I. bench/bench_splat.c -o bench_splat -lm
 //
 //     bench_splat [--json] [--quick] [--filter TEXT] [--threads N] [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]
+//     bench_splat --growth [--json]
 //
 // Without a scene: what the machine can do (multiply-adds per second, bytes per second), then for made-up splats at several
 // sizes, each instruction set and one and two threads: every stage of a training step by itself, and render and backward
@@ -10,15 +11,18 @@
 // With a scene: whole training steps (render, loss, backward, Adam; density control off) on its photos. --views names a
 // text file of image names, one per line; --start a PLY to begin with instead of the scene's points. The first 5 steps
 // warm up; the median, and the process' CPU seconds per step, are over the rest.
+// --growth: how a step's cost grows with the splats, with the pixels and with the share of the splats in the frame.
+#define _XOPEN_SOURCE 700 // getrusage
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_splat.h"
 #include "../tests/reference_splat.h"
 
+#include <sys/resource.h>
 #include <time.h>
 
 typedef struct bench_options {
-    int json, quick, threads, steps;
+    int json, quick, growth, threads, steps;
     const char *filter, *scene, *views, *start;
 } bench_options;
 
@@ -27,6 +31,7 @@ typedef struct bench_row {
     int threads;
     double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
     double flops, bytes; // of the whole, by the counts below; 0: not counted
+    double peak_rss;     // bytes; 0: not measured
 } bench_row;
 
 typedef struct bench_peak { double flops, bytes; } bench_peak; // per second
@@ -84,6 +89,7 @@ static void bench_print(const bench_options* o, const bench_row* row) {
                rate, row->reference);
         if (row->flops > 0.0) printf(",\"peak_share\":%.4g", flop_share);
         if (row->bytes > 0.0) printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g", row->bytes, byte_share);
+        if (row->peak_rss > 0.0) printf(",\"peak_rss_bytes\":%.0f", row->peak_rss);
         if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
         printf("}\n");
     } else {
@@ -91,6 +97,7 @@ static void bench_print(const bench_options* o, const bench_row* row) {
                1e3 * row->cpu_seconds, rate, row->work_unit);
         if (row->flops > 0.0) printf("  %.0f%% of the FMA peak", 100.0 * flop_share);
         if (row->bytes > 0.0) printf("  %.0f%% of the bandwidth", 100.0 * byte_share);
+        if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
         if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
         printf("\n");
     }
@@ -531,10 +538,76 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     gsf_splat_destroy(&ctx, &splats);
 }
 
+// ---- growth -----------------------------------------------------------------------
+
+// Render and backward of splats that shrink as their number grows, so that about as many lie over a pixel; `zoom` enlarges
+// the picture, so that less of the splats is in it.
+static void bench_growth_row(const bench_options* o, const char* by, double amount, size_t count, int width, int height,
+                             double zoom) {
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.threads = o->threads;
+    bench_require(&ctx, gsf_init_context(&ctx));
+    gsf_splats splats, sums;
+    bench_make_splats(&ctx, count, 2.0 / sqrt((double)count), &splats);
+    bench_require(&ctx, gsf_splat_make(&ctx, count, 3, &sums));
+    gsf_camera camera = bench_camera(width, height);
+    camera.fx *= zoom;
+    camera.fy *= zoom;
+    const size_t values = 3 * (size_t)width * (size_t)height;
+    float* d_color = (float*)gsf_alloc(&ctx, values, sizeof(float));
+    gsf_render_output out;
+    memset(&out, 0, sizeof out);
+    bench_require(&ctx, gsf_make_image(&ctx, GSF_F32, width, height, 3, &out.color));
+    if (!d_color) exit(1);
+    for (size_t i = 0; i < values; i++) d_color[i] = (float)gsf_random_normal(6, 0, i);
+    gsf_splat_grads grads;
+    memset(&grads, 0, sizeof grads);
+    grads.means = sums.means;
+    grads.log_scales = sums.log_scales;
+    grads.quats = sums.quats;
+    grads.opacity_logits = sums.opacity_logits;
+    grads.sh = sums.sh;
+    gsf_rasterizer* r;
+    bench_require(&ctx, gsf_splat_make_rasterizer(&ctx, &r));
+    enum { ROUNDS = 7 };
+    double seconds[ROUNDS], cpu = 0.0;
+    for (int i = -1; i < ROUNDS; i++) {
+        const double t = bench_now(), c = bench_cpu();
+        bench_require(&ctx, gsf_splat_render(&ctx, r, &splats, &camera, NULL, &out));
+        bench_require(&ctx, gsf_splat_render_backward(&ctx, r, &splats, &camera, NULL, d_color, NULL, NULL, &grads));
+        if (i < 0) continue;
+        seconds[i] = bench_now() - t;
+        cpu += (bench_cpu() - c) / ROUNDS;
+    }
+    char label[64];
+    snprintf(label, sizeof label, "growth: %s %g", by, amount);
+    bench_row row = bench_make_row(label, ctx.cpu_level, ctx.parallel.worker_count, bench_median(seconds, ROUNDS), cpu,
+                                   amount, by);
+    bench_print(o, &row);
+    gsf_splat_destroy_rasterizer(&ctx, r);
+    gsf_destroy_image(&ctx, &out.color);
+    gsf_free(&ctx, d_color);
+    gsf_splat_destroy(&ctx, &sums);
+    gsf_splat_destroy(&ctx, &splats);
+}
+
+static void bench_growth(const bench_options* o) {
+    static const size_t counts[] = {1000, 3000, 10000, 30000, 100000, 300000, 1000000};
+    static const int heights[] = {68, 135, 270, 540, 1080, 2160};
+    static const double zooms[] = {1.0, 2.0, 4.0, 8.0, 16.0};
+    for (size_t k = 0; k < GSF__COUNT(counts); k++)
+        bench_growth_row(o, "splats", (double)counts[k], counts[k], 960, 540, 1.0);
+    for (size_t k = 0; k < GSF__COUNT(heights); k++)
+        bench_growth_row(o, "pixels", heights[k] * (heights[k] * 16 / 9), 100000, heights[k] * 16 / 9, heights[k], 1.0);
+    for (size_t k = 0; k < GSF__COUNT(zooms); k++)
+        bench_growth_row(o, "zoom", zooms[k], 300000, 960, 540, zooms[k]);
+}
+
 // ---- visible points ---------------------------------------------------------------
 
-// 125 balls of points in a 5 x 5 x 5 grid, nearly touching, seen from an arc of 60 degrees: no view shows a back, and the front balls hide
-// most of the others, so that about 30 % of the points are seen.
+// 125 balls of points in a 5 x 5 x 5 grid, nearly touching, seen from an arc of 60 degrees: no view shows a back, and the
+// front balls hide most of the others, so that about 30 % of the points are seen.
 static void bench_visibility(const bench_options* o, const char* name, size_t count, size_t view_count, int threads) {
     if (o->filter && !strstr(name, o->filter)) return;
     gsf_context ctx;
@@ -651,8 +724,10 @@ static void bench_training(const bench_options* o) {
         seconds[i] = bench_now() - t;
     }
     const double step_cpu = (bench_cpu() - cpu) / o->steps;
-    const bench_row row = bench_make_row("train step", ctx.cpu_level, ctx.parallel.worker_count,
-                                         bench_median(seconds, (size_t)o->steps), step_cpu, (double)start.count, "splats");
+    bench_row row = bench_make_row("train step", ctx.cpu_level, ctx.parallel.worker_count,
+                                   bench_median(seconds, (size_t)o->steps), step_cpu, (double)start.count, "splats");
+    struct rusage usage;
+    if (getrusage(RUSAGE_SELF, &usage) == 0) row.peak_rss = 1024.0 * (double)usage.ru_maxrss; // KiB on Linux
     bench_print(o, &row);
     gsf_free(&ctx, seconds);
     gsf_splat_destroy_trainer(&ctx, trainer);
@@ -670,6 +745,7 @@ int main(int argc, char** argv) {
         const char* value = i + 1 < argc ? argv[i + 1] : NULL;
         if (strcmp(argv[i], "--json") == 0) o.json = 1;
         else if (strcmp(argv[i], "--quick") == 0) o.quick = 1;
+        else if (strcmp(argv[i], "--growth") == 0) o.growth = 1;
         else if (value && strcmp(argv[i], "--filter") == 0) o.filter = argv[++i];
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
         else if (value && strcmp(argv[i], "--scene") == 0) o.scene = argv[++i];
@@ -677,13 +753,17 @@ int main(int argc, char** argv) {
         else if (value && strcmp(argv[i], "--start") == 0) o.start = argv[++i];
         else if (value && strcmp(argv[i], "--steps") == 0 && atoi(value) > 0) o.steps = atoi(argv[++i]);
         else {
-            fprintf(stderr, "usage: bench_splat [--json] [--quick] [--filter TEXT] [--threads N]\n"
+            fprintf(stderr, "usage: bench_splat [--json] [--quick] [--growth] [--filter TEXT] [--threads N]\n"
                             "                   [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]\n");
             return 2;
         }
     }
     if (o.scene) {
         bench_training(&o);
+        return 0;
+    }
+    if (o.growth) {
+        bench_growth(&o);
         return 0;
     }
     const gsf_cpu_level levels[] = {GSF_CPU_SCALAR, GSF_CPU_AVX2};

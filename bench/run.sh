@@ -14,10 +14,13 @@ export OMP_WAIT_POLICY=passive # two workers that spin while they wait take each
 
 cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release > "$build.cmake.log" 2>&1 || { cat "$build.cmake.log" >&2; exit 1; }
 rm -f "$build.cmake.log"
-cmake --build "$build" -j "$(nproc)" --target bench_splat > /dev/null
+cmake --build "$build" -j "$(nproc)" --target bench_splat test_stress > /dev/null
 rows=$(mktemp)
 trap 'rm -f "$rows"' EXIT
 "$build/bench_splat" --json ${quick[@]+"${quick[@]}"} | tee "$rows"
+"$build/bench_splat" --json --growth | tee -a "$rows"
+[ ${#quick[@]} -gt 0 ] || "$build/bench_splat" --json --filter "visibility 5M" | tee -a "$rows"
+"$build/tests/test_stress" --json 2> /dev/null >> "$rows"
 if [ -n "${SCENE:-}" ]; then
     steps=${STEPS:-200}
     for ((round = 0; round < ${ROUNDS:-5}; round++)); do
