@@ -392,6 +392,7 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     int32_t densify_from, densify_until; // 500 s, 15000 s; densify_until < 0 = never, nor opacity resets
     int32_t densify_interval;      // 100, whatever s is
     float densify_grad;            // 2e-4
+    int32_t densify_absolute;      // 0; 1: gradients whose pixels cannot cancel (AbsGS; densify_grad is then 4e-4 to 8e-4)
     float densify_scale;           // 0.01: clone below this share of extent, split above
     float prune_opacity;           // 0.005
     float prune_scale;             // 0.1 of extent, after the first opacity reset
@@ -10097,7 +10098,8 @@ static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf_
     grads.opacity_logits = model->groups[GSF__OPACITY].grad;
     grads.sh = model->groups[GSF__SH].grad;
     const int densifies = gsf__trainer_densifies(trainer, iteration);
-    if (densifies) grads.means2d = model->screen[which];
+    if (densifies && d->densify_absolute) grads.means2d_abs = model->screen[which];
+    else if (densifies) grads.means2d = model->screen[which];
     GSF__TRY(gsf_splat_render_backward(ctx, trainer->rasterizer, &trainer->view, &photo->camera, &render,
                                        trainer->d_color, smooth ? trainer->d_depth : NULL, NULL, &grads));
     const int32_t* radii = gsf_splat_last_radii(trainer->rasterizer);
@@ -10252,7 +10254,7 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
         (double)d->render.footprint, (double)d->render.gradient, (double)d->render.antialiased,
         (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
         (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
-        (double)trainer->photos.count};
+        (double)d->densify_absolute, (double)trainer->photos.count};
     uint64_t hash = 0;
     for (size_t i = 0; i < GSF__COUNT(values); i++) {
         uint64_t bits;

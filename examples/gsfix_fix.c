@@ -58,6 +58,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"densify_until", SET_WHOLE, TRAIN_AT(densify_until)},
     {"densify_interval", SET_WHOLE, TRAIN_AT(densify_interval)},
     {"densify_grad", SET_REAL, TRAIN_AT(densify_grad)},
+    {"densify_absolute", SET_SWITCH, TRAIN_AT(densify_absolute)},
     {"densify_scale", SET_REAL, TRAIN_AT(densify_scale)},
     {"prune_opacity", SET_REAL, TRAIN_AT(prune_opacity)},
     {"prune_scale", SET_REAL, TRAIN_AT(prune_scale)},

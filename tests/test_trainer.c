@@ -448,6 +448,29 @@ static void test_order_and_visits(gsf_context* ctx, const scene* s) {
 }
 
 // A restored view's gradient is that of the same photo times lambda.
+// The first step's statistic is the norm of the gradient that backward makes of the same picture; without cancelling it is
+// never smaller, and for most splats larger.
+static void test_absolute_statistic(gsf_context* ctx, const scene* s) {
+    float sums[2][SPLATS];
+    for (int absolute = 0; absolute < 2; absolute++) {
+        gsf_train_desc desc = busy_desc();
+        desc.densify_absolute = absolute;
+        desc.dropout = 0.0f;
+        gsf_trainer* trainer;
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) return;
+        take_steps(ctx, trainer, 1);
+        CHECK(trainer->model.count == SPLATS);
+        memcpy(sums[absolute], trainer->model.grad_sum[0], sizeof sums[absolute]);
+        gsf_splat_destroy_trainer(ctx, trainer);
+    }
+    int smaller = 0, larger = 0;
+    for (int i = 0; i < SPLATS; i++) {
+        smaller += sums[1][i] < 0.9999f * sums[0][i];
+        larger += sums[1][i] > 1.05f * sums[0][i];
+    }
+    CHECK(smaller == 0 && larger > SPLATS / 2);
+}
+
 static void test_restored_gradient(gsf_context* ctx, const scene* s) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
@@ -895,6 +918,7 @@ int main(void) {
     test_cap(&ctx);
     test_learns(&ctx, &s);
     test_order_and_visits(&ctx, &s);
+    test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
     test_settings(&ctx, &s);
     test_workers(&s, ctx.cpu_level);
