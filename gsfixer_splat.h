@@ -7621,11 +7621,21 @@ GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float cente
     }
 }
 
+// In here a finished pixel has T = 0, which nothing changes, so that only the step in which a pixel ends looks at it.
 GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
     const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
-    uint32_t live = gsf__live_steps(state->T);
     float center[GSF__STEPS], exponent[GSF__STEPS], raws[GSF__TILE_PIXELS];
+    float ends[GSF__TILE_PIXELS]; // T of the finished pixels, as `state` has it
+    int ended[GSF__STEPS];        // bits of them
+    uint32_t live = 0;
+    for (uint32_t s = 0; s < GSF__STEPS; s++) {
+        const __m256 T = _mm256_loadu_ps(state->T + 8 * s), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
+        _mm256_storeu_ps(ends + 8 * s, T);
+        _mm256_storeu_ps(state->T + 8 * s, _mm256_and_ps(T, open));
+        ended[s] = _mm256_movemask_ps(open) ^ 255;
+        live |= (uint32_t)(ended[s] != 255) << s;
+    }
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
         if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
@@ -7634,21 +7644,31 @@ GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_stat
         const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
         for (uint32_t m = mask; m; m &= m - 1) {
             const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
-            const __m256 T = _mm256_loadu_ps(state->T + at), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
-            const __m256 alpha = _mm256_and_ps(open, _mm256_min_ps(_mm256_loadu_ps(raws + at), alpha_max));
-            const __m256 next = _mm256_fnmadd_ps(T, alpha, T);
-            const __m256 stop = _mm256_and_ps(open, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
-            const __m256 w = _mm256_mul_ps(_mm256_andnot_ps(stop, alpha), T);
-            const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
-            _mm256_storeu_ps(state->T + at, T_new);
+            const __m256 T = _mm256_loadu_ps(state->T + at);
+            __m256 alpha = _mm256_min_ps(_mm256_loadu_ps(raws + at), alpha_max), next = _mm256_fnmadd_ps(T, alpha, T);
+            const __m256 low = _mm256_cmp_ps(next, t_min, _CMP_LT_OQ);
+            if (_mm256_movemask_ps(low) != ended[s]) { // a pixel ends in front of this splat
+                const __m256 stop = _mm256_and_ps(low, _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
+                _mm256_storeu_ps(ends + at, _mm256_blendv_ps(_mm256_loadu_ps(ends + at), _mm256_xor_ps(T, minus), stop));
+                alpha = _mm256_andnot_ps(stop, alpha);
+                next = _mm256_andnot_ps(stop, next);
+                ended[s] = _mm256_movemask_ps(low);
+                if (ended[s] == 255) live &= ~(1u << s);
+            }
+            const __m256 w = _mm256_mul_ps(alpha, T);
+            _mm256_storeu_ps(state->T + at, next);
             _mm256_storeu_ps(state->r + at, _mm256_fmadd_ps(w, cr, _mm256_loadu_ps(state->r + at)));
             _mm256_storeu_ps(state->g + at, _mm256_fmadd_ps(w, cg, _mm256_loadu_ps(state->g + at)));
             _mm256_storeu_ps(state->b + at, _mm256_fmadd_ps(w, cb, _mm256_loadu_ps(state->b + at)));
             if (with_depth)
                 _mm256_storeu_ps(state->z + at, _mm256_fmadd_ps(w, _mm256_set1_ps(rec->depth),
                                                                 _mm256_loadu_ps(state->z + at)));
-            if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s); // every sign set: all finished
         }
+    }
+    for (uint32_t s = 0; s < GSF__STEPS; s++) {
+        const __m256 T = _mm256_loadu_ps(state->T + 8 * s);
+        _mm256_storeu_ps(state->T + 8 * s, _mm256_blendv_ps(_mm256_loadu_ps(ends + 8 * s), T,
+                                                            _mm256_cmp_ps(T, zero, _CMP_GT_OQ)));
     }
 }
 
@@ -7760,14 +7780,18 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_ti
             const __m256 raw = _mm256_and_ps(open, _mm256_loadu_ps(raws + at));
             const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, alpha_max), T);
             const __m256 stop = _mm256_and_ps(open, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
-            const __m256 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
+            __m256 T_new = next, alpha = raw;
+            if (_mm256_movemask_ps(stop)) { // a pixel ends in front of this splat
+                T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
+                alpha = _mm256_andnot_ps(stop, raw);
+                if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
+            }
             _mm256_storeu_ps(T_tile + at, T_new);
-            _mm256_storeu_ps(steps[kept].alpha, _mm256_andnot_ps(stop, raw));
+            _mm256_storeu_ps(steps[kept].alpha, alpha);
             _mm256_storeu_ps(steps[kept].T, T);
             heads[kept].entry = (uint32_t)i;
             heads[kept].step = (uint32_t)s;
             kept += _mm256_movemask_ps(_mm256_cmp_ps(raw, zero, _CMP_GT_OQ)) != 0;
-            if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
         }
     }
     *step_count = kept;
