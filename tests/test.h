@@ -103,7 +103,8 @@ static inline const char* test_scratch(const char* name) {
 #ifdef TEST_TMP
     const char* root = TEST_TMP;
 #else
-    const char* root = ".";
+    const char* root = getenv("TMPDIR");
+    if (!root || !*root) root = "/tmp";
 #endif
     char* path = paths[turn++ & 7];
     snprintf(path, sizeof paths[0], "%s/%s", root, name);
