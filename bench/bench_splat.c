@@ -443,6 +443,57 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
 
 // ---- whole renders against float64 ------------------------------------------------
 
+typedef struct bench_pass { // a render and its backward, with what they need
+    gsf_rasterizer* r;
+    gsf_camera camera;
+    gsf_splats splats, sums; // the sums hold the gradients
+    gsf_splat_grads grads;
+    gsf_render_output out;
+    float* d_color;
+    size_t values;           // of a picture
+} bench_pass;
+
+static void bench_open_pass(gsf_context* ctx, bench_pass* p, size_t count, double size, int width, int height, double zoom) {
+    memset(p, 0, sizeof *p);
+    bench_make_splats(ctx, count, size, &p->splats);
+    bench_require(ctx, gsf_splat_make(ctx, count, 3, &p->sums));
+    p->camera = bench_camera(width, height);
+    p->camera.fx *= zoom;
+    p->camera.fy *= zoom;
+    p->values = 3 * (size_t)width * (size_t)height;
+    p->d_color = (float*)gsf_alloc(ctx, p->values, sizeof(float));
+    bench_require(ctx, gsf_make_image(ctx, GSF_F32, width, height, 3, &p->out.color));
+    if (!p->d_color) exit(1);
+    for (size_t i = 0; i < p->values; i++) p->d_color[i] = (float)gsf_random_normal(6, 0, i);
+    p->grads.means = p->sums.means;
+    p->grads.log_scales = p->sums.log_scales;
+    p->grads.quats = p->sums.quats;
+    p->grads.opacity_logits = p->sums.opacity_logits;
+    p->grads.sh = p->sums.sh;
+    bench_require(ctx, gsf_splat_make_rasterizer(ctx, &p->r));
+}
+
+static void bench_close_pass(gsf_context* ctx, bench_pass* p) {
+    gsf_splat_destroy_rasterizer(ctx, p->r);
+    gsf_destroy_image(ctx, &p->out.color);
+    gsf_free(ctx, p->d_color);
+    gsf_splat_destroy(ctx, &p->sums);
+    gsf_splat_destroy(ctx, &p->splats);
+}
+
+// One round: wall and CPU seconds of the render, then of its backward.
+static void bench_run_pass(gsf_context* ctx, bench_pass* p, double wall[2], double cpu[2]) {
+    memset(p->sums.owned, 0, p->splats.count * (3 + 3 + 4 + 1 + 48) * sizeof(float));
+    const double t0 = bench_now(), c0 = bench_cpu();
+    bench_require(ctx, gsf_splat_render(ctx, p->r, &p->splats, &p->camera, NULL, &p->out));
+    const double t1 = bench_now(), c1 = bench_cpu();
+    bench_require(ctx, gsf_splat_render_backward(ctx, p->r, &p->splats, &p->camera, NULL, p->d_color, NULL, NULL, &p->grads));
+    wall[0] = t1 - t0;
+    wall[1] = bench_now() - t1;
+    cpu[0] = c1 - c0;
+    cpu[1] = bench_cpu() - c1;
+}
+
 static void bench_error(const float* actual, const double* expected, const double* margin, size_t count, size_t per_pixel,
                         bench_row* row) {
     double worst = 0.0, difference = 0.0, total = 0.0;
@@ -466,61 +517,38 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     gsf_context ctx;
     if (!bench_context(&ctx, level, threads)) return;
 
-    gsf_splats splats, sums;
-    bench_make_splats(&ctx, count, size, &splats);
-    bench_require(&ctx, gsf_splat_make(&ctx, count, 3, &sums));
-    const gsf_camera camera = bench_camera(width, height);
-    const size_t values = 3 * (size_t)width * (size_t)height;
-    float* d_color = (float*)gsf_alloc(&ctx, values, sizeof(float));
-    gsf_render_output out;
-    memset(&out, 0, sizeof out);
-    bench_require(&ctx, gsf_make_image(&ctx, GSF_F32, width, height, 3, &out.color));
-    if (!d_color) exit(1);
-    for (size_t i = 0; i < values; i++) d_color[i] = (float)gsf_random_normal(6, 0, i);
-    gsf_splat_grads grads;
-    memset(&grads, 0, sizeof grads);
-    grads.means = sums.means;
-    grads.log_scales = sums.log_scales;
-    grads.quats = sums.quats;
-    grads.opacity_logits = sums.opacity_logits;
-    grads.sh = sums.sh;
-    gsf_rasterizer* rasterizer;
-    bench_require(&ctx, gsf_splat_make_rasterizer(&ctx, &rasterizer));
+    bench_pass p;
+    bench_open_pass(&ctx, &p, count, size, width, height, 1.0);
 
     enum { MOST = 15 };
     double forward[MOST], backward[MOST], cpu[2] = {0.0, 0.0};
     const int rounds = o->quick ? 5 : MOST;
     for (int i = -1; i < rounds; i++) { // one round of warming up
-        memset(sums.owned, 0, splats.count * (3 + 3 + 4 + 1 + 48) * sizeof(float));
-        const double t0 = bench_now(), c0 = bench_cpu();
-        bench_require(&ctx, gsf_splat_render(&ctx, rasterizer, &splats, &camera, NULL, &out));
-        const double t1 = bench_now(), c1 = bench_cpu();
-        bench_require(&ctx,
-                      gsf_splat_render_backward(&ctx, rasterizer, &splats, &camera, NULL, d_color, NULL, NULL, &grads));
+        double wall[2], seconds[2];
+        bench_run_pass(&ctx, &p, wall, seconds);
         if (i < 0) continue;
-        forward[i] = t1 - t0;
-        backward[i] = bench_now() - t1;
-        cpu[0] += (c1 - c0) / rounds;
-        cpu[1] += (bench_cpu() - c1) / rounds;
+        forward[i] = wall[0];
+        backward[i] = wall[1];
+        for (int k = 0; k < 2; k++) cpu[k] += seconds[k] / rounds;
     }
     bench_row rows[2];
     for (int k = 0; k < 2; k++)
         rows[k] = bench_make_row(k ? backward_name : forward_name, level, threads,
                                  bench_median(k ? backward : forward, (size_t)rounds), cpu[k],
-                                 bench_pairs(&ctx, rasterizer), "pairs");
+                                 bench_pairs(&ctx, p.r), "pairs");
     if (with_reference) {
-        ref_splats exact = ref_splats_from(&splats);
+        ref_splats exact = ref_splats_from(&p.splats);
         ref_options options = ref_options_from(NULL);
-        ref_image image = ref_render(&exact, &camera, &options);
-        double* d_wide = (double*)malloc(values * sizeof(double));
+        ref_image image = ref_render(&exact, &p.camera, &options);
+        double* d_wide = (double*)malloc(p.values * sizeof(double));
         if (!d_wide) exit(1);
         double blended = 0.0;
-        for (size_t i = 0; i < values; i++) d_wide[i] = (double)d_color[i];
-        for (size_t i = 0; i < values / 3; i++) blended += image.blended[i];
+        for (size_t i = 0; i < p.values; i++) d_wide[i] = (double)p.d_color[i];
+        for (size_t i = 0; i < p.values / 3; i++) blended += image.blended[i];
         ref_grads expected = ref_make_grads(exact.count, exact.sh_count);
-        ref_render_backward(&exact, &camera, &options, &image, d_wide, NULL, NULL, &expected);
-        bench_error((const float*)out.color.data, image.color, image.margin, values, 3, &rows[0]);
-        bench_error(sums.means, expected.means, NULL, 3 * count, 1, &rows[1]);
+        ref_render_backward(&exact, &p.camera, &options, &image, d_wide, NULL, NULL, &expected);
+        bench_error((const float*)p.out.color.data, image.color, image.margin, p.values, 3, &rows[0]);
+        bench_error(p.sums.means, expected.means, NULL, 3 * count, 1, &rows[1]);
         for (int k = 0; k < 2; k++) {
             rows[k].work = blended; // the reference's own count
             rows[k].reference = "float64";
@@ -531,11 +559,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         ref_destroy_splats(&exact);
     }
     for (int k = 0; k < 2; k++) bench_print(o, &rows[k]);
-    gsf_splat_destroy_rasterizer(&ctx, rasterizer);
-    gsf_destroy_image(&ctx, &out.color);
-    gsf_free(&ctx, d_color);
-    gsf_splat_destroy(&ctx, &sums);
-    gsf_splat_destroy(&ctx, &splats);
+    bench_close_pass(&ctx, &p);
 }
 
 // ---- growth -----------------------------------------------------------------------
@@ -548,48 +572,23 @@ static void bench_growth_row(const bench_options* o, const char* by, double amou
     memset(&ctx, 0, sizeof ctx);
     ctx.threads = o->threads;
     bench_require(&ctx, gsf_init_context(&ctx));
-    gsf_splats splats, sums;
-    bench_make_splats(&ctx, count, 2.0 / sqrt((double)count), &splats);
-    bench_require(&ctx, gsf_splat_make(&ctx, count, 3, &sums));
-    gsf_camera camera = bench_camera(width, height);
-    camera.fx *= zoom;
-    camera.fy *= zoom;
-    const size_t values = 3 * (size_t)width * (size_t)height;
-    float* d_color = (float*)gsf_alloc(&ctx, values, sizeof(float));
-    gsf_render_output out;
-    memset(&out, 0, sizeof out);
-    bench_require(&ctx, gsf_make_image(&ctx, GSF_F32, width, height, 3, &out.color));
-    if (!d_color) exit(1);
-    for (size_t i = 0; i < values; i++) d_color[i] = (float)gsf_random_normal(6, 0, i);
-    gsf_splat_grads grads;
-    memset(&grads, 0, sizeof grads);
-    grads.means = sums.means;
-    grads.log_scales = sums.log_scales;
-    grads.quats = sums.quats;
-    grads.opacity_logits = sums.opacity_logits;
-    grads.sh = sums.sh;
-    gsf_rasterizer* r;
-    bench_require(&ctx, gsf_splat_make_rasterizer(&ctx, &r));
+    bench_pass p;
+    bench_open_pass(&ctx, &p, count, 2.0 / sqrt((double)count), width, height, zoom);
     enum { ROUNDS = 7 };
     double seconds[ROUNDS], cpu = 0.0;
-    for (int i = -1; i < ROUNDS; i++) {
-        const double t = bench_now(), c = bench_cpu();
-        bench_require(&ctx, gsf_splat_render(&ctx, r, &splats, &camera, NULL, &out));
-        bench_require(&ctx, gsf_splat_render_backward(&ctx, r, &splats, &camera, NULL, d_color, NULL, NULL, &grads));
+    for (int i = -1; i < ROUNDS; i++) { // one round of warming up
+        double wall[2], used[2];
+        bench_run_pass(&ctx, &p, wall, used);
         if (i < 0) continue;
-        seconds[i] = bench_now() - t;
-        cpu += (bench_cpu() - c) / ROUNDS;
+        seconds[i] = wall[0] + wall[1];
+        cpu += (used[0] + used[1]) / ROUNDS;
     }
     char label[64];
     snprintf(label, sizeof label, "growth: %s %g", by, amount);
     bench_row row = bench_make_row(label, ctx.cpu_level, ctx.parallel.worker_count, bench_median(seconds, ROUNDS), cpu,
                                    amount, by);
     bench_print(o, &row);
-    gsf_splat_destroy_rasterizer(&ctx, r);
-    gsf_destroy_image(&ctx, &out.color);
-    gsf_free(&ctx, d_color);
-    gsf_splat_destroy(&ctx, &sums);
-    gsf_splat_destroy(&ctx, &splats);
+    bench_close_pass(&ctx, &p);
 }
 
 static void bench_growth(const bench_options* o) {

@@ -1,6 +1,6 @@
 // Dense points by PatchMatch stereo: planes of known depth, a ray-traced scene, and what must not happen.
 // gcc -O2 -std=c11 -fopenmp -I. -Itests -DGSF_USE_EMBREE tests/test_stereo.c -lembree3 -lm
-#define _XOPEN_SOURCE 700 // mkdtemp, mkdir
+#define _XOPEN_SOURCE 700 // mkdir
 #define _POSIX_C_SOURCE 200809L
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -452,10 +452,8 @@ static void check_courtyard(const gsf_scene* scene, const char* folder, const co
 static void test_courtyard(void) {
     static const courtyard_limits limits[] = {
         {3, 0.0035, 0.82, 0.975, 0.34}, {6, 0.0052, 0.72, 0.95, 0.47}, {9, 0.0056, 0.69, 0.945, 0.49}};
-    const char* tmp = getenv("TMPDIR");
     char folder[1024];
-    snprintf(folder, sizeof folder, "%s/gsf_stereo_XXXXXX", tmp && *tmp ? tmp : "/tmp");
-    if (!CHECK(mkdtemp(folder) != NULL)) return;
+    snprintf(folder, sizeof folder, "%s", test_scratch("courtyard"));
     make_scene_options options = make_scene_defaults;
     options.views = 16;
     options.width = 128;

@@ -1,6 +1,6 @@
 // Neighbours, initial splats from points, visible-point filter.
 // gcc -O2 -std=c11 -I. -Itests -DGSF_USE_EMBREE tests/test_visibility.c -lembree3 -lm
-#define _XOPEN_SOURCE 700 // mkdtemp, mkdir
+#define _XOPEN_SOURCE 700 // mkdir
 #define _POSIX_C_SOURCE 200809L
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -521,10 +521,8 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
 // program's and the pixel noise with them, so that the points are as good. `split` sums up, per K, the views of the
 // official split, `choices` random choices of as many.
 static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3]) {
-    const char* tmp = getenv("TMPDIR");
     char folder[1024], path[1100], what[64];
-    snprintf(folder, sizeof folder, "%s/gsfixer_visibility_XXXXXX", tmp && *tmp ? tmp : "/tmp");
-    if (!CHECK(mkdtemp(folder) != NULL)) return;
+    snprintf(folder, sizeof folder, "%s", test_scratch("procedural"));
     make_scene_options options = make_scene_defaults;
     options.width = 128;
     options.height = 96;
