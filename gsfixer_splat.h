@@ -423,8 +423,7 @@ typedef struct gsf_trainer gsf_trainer;
 // workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored views
 // and their weight is above 0, one restored view: both gradients go into one Adam step (dense: unseen splats move by their
 // momentum). For densification the gradients of photos and of restored views are averaged apart, and the larger mean counts.
-// Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4 with a weight, and 24 more
-// for its window moments, up to 512 MiB of these (photos beyond that only train slower).
+// Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4 with a weight.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc,
                                                         const gsf_train_view* views, size_t view_count,
                                                         const gsf_splats* initial, gsf_trainer** out);
@@ -8602,150 +8601,123 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 // per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts as already right.
 // SSIM as in the 3DGS code: 11x11 Gaussian window, sigma 1.5, zeros outside the image, variances not clamped.
 //
-// Layout: images stay interleaved, a row is 3W floats and horizontal taps lie 3 floats apart. Rows of the planes are
-// padded with zeros to a multiple of 8 floats. The window is separable: vertical sums of one row go to a row buffer
-// with zero margins, where the horizontal sums are taken. Work is split into bands of rows.
+// SSIM needs the sum of both variances only. With u = x - h, v = t - h (h = 1/2, which makes the squares small: a variance
+// is a difference of them) and window sums U = G*u, V = G*v, E = G*(u^2 + v^2), F = G*(u v):
+//     m = a1 a2 / (b1 b2),  mu = U + h,  mu_t = V + h,  a1 = 2 mu mu_t + C1,  a2 = 2 (F - U V) + C2,
+//     b1 = mu^2 + mu_t^2 + C1,  b2 = E - U^2 - V^2 + C2
+//     dm/dE = -m / b2,  1/2 dm/dF = a1 / (b1 b2)
+//     1/2 dm/dU = mu_t a2 / (b1 b2) - mu m / b1 - U dm/dE - V 1/2 dm/dF
+// and the pixel p collects 1/2 dm/dx(p) = G*(1/2 dm/dU) + u(p) G*(dm/dE) + v(p) G*(1/2 dm/dF).
 //
-// Derivative of the SSIM m of one window with respect to the pixels in it. With blurred moments mu = G*x, E = G*x^2,
-// F = G*(x t), s = E - mu^2, c = F - mu mu_t:
-//     m = a1 a2 / (b1 b2),  a1 = 2 mu mu_t + C1,  a2 = 2 c + C2,  b1 = mu^2 + mu_t^2 + C1,  b2 = s + s_t + C2
-//     dm/dE = -m / b2,  dm/dF = 2 a1 / (b1 b2)
-//     dm/dmu = 2 mu_t a2 / (b1 b2) - 2 mu m / b1 - 2 mu dm/dE - mu_t dm/dF
-// and the pixel p collects dL/dx(p) = G*(dm/dmu) + 2 x(p) G*(dm/dE) + t(p) G*(dm/dF).
+// Images stay interleaved: a row is 3W floats, padded to a multiple of 8, and horizontal taps lie 3 floats apart. Rows go
+// in groups of four, which share the loads of their vertical sums. A band of rows goes through rings of a worker:
+//     images   u, v, u^2 + v^2, u v                         5 groups, from row first - 10 of the band on
+//     slopes   w/2 dm/dU, w dm/dE, w/2 dm/dF                4 groups, from row first - 5 on
+// so that images g .. g + 3 give slopes g, and slopes g .. g + 3 the gradient of rows first + 4 g .. first + 4 g + 3.
+// Bands overlap: 20 rows are loaded and 10 mapped twice.
 
-enum { GSF__LOSS_RADIUS = 5, GSF__LOSS_TAPS = 11, GSF__LOSS_MARGIN = 16, GSF__LOSS_BAND = 8, GSF__LOSS_PLANES = 8 };
+enum {
+    GSF__LOSS_RADIUS = 5, GSF__LOSS_MARGIN = 16, GSF__LOSS_GROUP = 4,
+    GSF__LOSS_IMAGES = 5 * GSF__LOSS_GROUP, GSF__LOSS_SLOPES = 4 * GSF__LOSS_GROUP, // rows of a ring
+    GSF__LOSS_BAND = 64,                                                            // rows of a band at most
+    // of a worker: rings, sums of four planes, of one plane, weights
+    GSF__LOSS_WORKER_ROWS = 4 * GSF__LOSS_IMAGES + 3 * GSF__LOSS_SLOPES + (4 + 1) * GSF__LOSS_GROUP + 1
+};
 
 #define GSF__SSIM_C1 0.0001f // (0.01 * 1)^2
 #define GSF__SSIM_C2 0.0009f // (0.03 * 1)^2
+#define GSF__LOSS_SHIFT 0.5f // h
 
-// exp(-k^2 / (2 * 1.5^2)) / sum
-static const float gsf__loss_window[GSF__LOSS_TAPS] = {
-    0.001028380084f, 0.007598758135f, 0.03600077213f, 0.1093606895f,  0.2130055377f,  0.2660117249f,
-    0.2130055377f,   0.1093606895f,   0.03600077213f, 0.007598758135f, 0.001028380084f};
+// exp(-k^2 / (2 * 1.5^2)) / sum over k = -5..5
+static const float gsf__loss_window[GSF__LOSS_RADIUS + 1] = {0.2660117249f,  0.2130055377f,   0.1093606895f,
+                                                             0.03600077213f, 0.007598758135f, 0.001028380084f};
 
 typedef struct gsf__target { // a photo to be matched
     int32_t width, height;
     const uint8_t* u8;       // (H,W,3) packed, or NULL
     const float* f32;        // (H,W,3) packed where u8 is NULL
     const float* weight;     // (H,W), NULL = 1
-    float* moments;          // (2, H, stride): window mean and variance of the photo, kept; NULL = anew each time
-    int32_t moments_ready;
 } gsf__target;
 
 typedef struct gsf__loss_scratch { // grows to the largest photo, then stays
-    float* planes;           // GSF__LOSS_PLANES of (H, stride)
-    float* rows;             // per worker 3 row buffers with margins
+    float* rows;             // per worker GSF__LOSS_WORKER_ROWS, with margins
     double* sums;            // per band 2
-    size_t plane_capacity, row_capacity, sum_capacity; // floats, floats, doubles
+    size_t row_capacity, sum_capacity; // floats, doubles
 } gsf__loss_scratch;
 
 typedef struct gsf__loss_value { double total, l1, ssim; } gsf__loss_value; // total without the caller's scale
 
-typedef struct gsf__loss_kernels { // n: padded row length, valid: 3W; row buffers have zero margins
-    // x = clamp(render), NaN becomes 0; t = photo. Zeros from valid to n.
-    void (*load)(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n, float* x, float* t);
-    // Vertical sums over `taps` rows of x, x^2 and x t.
-    void (*moments)(const float* x, const float* t, size_t stride, const float* window, int taps, size_t n, float* sum_x,
-                    float* sum_xx, float* sum_xt);
-    // Vertical sums over `taps` rows of three planes.
-    void (*blur3)(const float* a, const float* b, const float* c, size_t stride, const float* window, int taps, size_t n,
-                  float* sum_a, float* sum_b, float* sum_c);
-    // Horizontal sums: window mean and variance.
-    void (*spread)(const float* sum_t, const float* sum_tt, size_t n, float* mean, float* variance);
-    // Horizontal sums and the SSIM map: its three derivatives (a, b, c), sums of w |x - t| and w (1 - m).
-    void (*map)(const float* sum_x, const float* sum_xx, const float* sum_xt, const float* x, const float* t,
-                const float* mean_t, const float* variance_t, const float* weight, size_t valid, size_t n, float* a,
-                float* b, float* c, double sums[2]);
-    // Horizontal sums of the derivatives and the gradient of the render.
-    void (*gradient)(const float* sum_a, const float* sum_b, const float* sum_c, const float* x, const float* t,
-                     const float* weight, const float* render, float l1_scale, float ssim_scale, size_t valid,
-                     float* d_render);
+// n: padded row length, valid: 3W, or 0 outside the image; planes lie `step` floats apart.
+typedef struct gsf__loss_kernels {
+    // u, v, u^2 + v^2 and u v of clamp(render), where NaN becomes 0, and the photo; from valid to n of zeros.
+    void (*load)(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n, float* images,
+                 size_t step);
+    // Vertical sums of a group of rows from four groups; the first is centred on the sixth row. Rows are `stride` apart.
+    void (*down)(const float* const v[4], size_t stride, size_t n, float* sums);
+    // Horizontal sums of a row, which begins at a cache line and has margins.
+    void (*across)(const float* v, size_t n, float* sums);
+    // From window sums the SSIM map: its three slopes, sums of w |x - t| and w (1 - m). weight: 0 from valid to n.
+    void (*map)(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight, size_t n,
+                float* slopes, size_t step, double totals[2]);
+    // From window sums of the slopes the gradient of the render.
+    void (*gradient)(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight,
+                     const float* render, float l1_scale, float ssim_scale, size_t valid, float* d_render);
 } gsf__loss_kernels;
 
-static void gsf__loss_load_ref(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n, float* x,
-                               float* t) {
-    for (size_t i = 0; i < valid; i++) {
-        const float r = render[i];
-        x[i] = r > 0.0f ? (r < 1.0f ? r : 1.0f) : 0.0f;
-        t[i] = u8 ? (float)u8[i] / 255.0f : f32[i];
+static void gsf__loss_load_ref(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n,
+                               float* images, size_t step) {
+    for (size_t i = 0; i < n; i++) {
+        const float r = i < valid ? render[i] : 0.0f, t = i >= valid ? 0.0f : u8 ? (float)u8[i] / 255.0f : f32[i];
+        const float u = (r > 0.0f ? (r < 1.0f ? r : 1.0f) : 0.0f) - GSF__LOSS_SHIFT, v = t - GSF__LOSS_SHIFT;
+        images[i] = u;
+        images[step + i] = v;
+        images[2 * step + i] = u * u + v * v;
+        images[3 * step + i] = u * v;
     }
-    for (size_t i = valid; i < n; i++) x[i] = t[i] = 0.0f;
 }
 
-static void gsf__loss_moments_ref(const float* x, const float* t, size_t stride, const float* window, int taps, size_t n,
-                                  float* sum_x, float* sum_xx, float* sum_xt) {
-    for (size_t i = 0; i < n; i++) {
-        float s = 0.0f, ss = 0.0f, st = 0.0f;
-        for (int k = 0; k < taps; k++) {
-            const float xk = x[(size_t)k * stride + i], wx = window[k] * xk;
-            s += wx;
-            ss += wx * xk;
-            st += wx * t[(size_t)k * stride + i];
+static void gsf__loss_down_ref(const float* const v[4], size_t stride, size_t n, float* sums) {
+    for (size_t row = 0; row < GSF__LOSS_GROUP; row++)
+        for (size_t i = 0; i < n; i++) {
+            float s = 0.0f;
+            for (size_t k = 0; k <= 2 * GSF__LOSS_RADIUS; k++) {
+                const size_t at = row + k, away = k < GSF__LOSS_RADIUS ? GSF__LOSS_RADIUS - k : k - GSF__LOSS_RADIUS;
+                s += gsf__loss_window[away] * v[at / GSF__LOSS_GROUP][at % GSF__LOSS_GROUP * stride + i];
+            }
+            sums[row * stride + i] = s;
         }
-        sum_x[i] = s;
-        sum_xx[i] = ss;
-        sum_xt[i] = st;
+}
+
+static void gsf__loss_across_ref(const float* v, size_t n, float* sums) {
+    for (size_t i = 0; i < n; i++, v++) {
+        sums[i] = gsf__loss_window[0] * v[0];
+        for (int k = 1; k <= GSF__LOSS_RADIUS; k++) sums[i] += gsf__loss_window[k] * (v[-3 * k] + v[3 * k]);
     }
 }
 
-static void gsf__loss_blur3_ref(const float* a, const float* b, const float* c, size_t stride, const float* window,
-                                int taps, size_t n, float* sum_a, float* sum_b, float* sum_c) {
+static void gsf__loss_map_ref(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight,
+                              size_t n, float* slopes, size_t step, double totals[2]) {
     for (size_t i = 0; i < n; i++) {
-        float sa = 0.0f, sb = 0.0f, sc = 0.0f;
-        for (int k = 0; k < taps; k++) {
-            const size_t at = (size_t)k * stride + i;
-            sa += window[k] * a[at];
-            sb += window[k] * b[at];
-            sc += window[k] * c[at];
-        }
-        sum_a[i] = sa;
-        sum_b[i] = sb;
-        sum_c[i] = sc;
+        const float U = sums[i], V = sums[sums_step + i], E = sums[2 * sums_step + i], F = sums[3 * sums_step + i];
+        const float mu = U + GSF__LOSS_SHIFT, mu_t = V + GSF__LOSS_SHIFT;
+        const float a1 = 2.0f * mu * mu_t + GSF__SSIM_C1, a2 = 2.0f * (F - U * V) + GSF__SSIM_C2;
+        const float b1 = mu * mu + mu_t * mu_t + GSF__SSIM_C1, b2 = E - U * U - V * V + GSF__SSIM_C2;
+        const float r = 1.0f / (b1 * b2), f = a1 * r, m = f * a2, e = m * (b1 * r);
+        slopes[i] = weight[i] * (mu_t * (a2 * r) - mu * m * (b2 * r) + U * e - V * f);
+        slopes[step + i] = -weight[i] * e;
+        slopes[2 * step + i] = weight[i] * f;
+        totals[0] += (double)(weight[i] * fabsf(u[i] - v[i]));
+        totals[1] += (double)(weight[i] * (1.0f - m));
     }
 }
 
-static float gsf__loss_horizontal_ref(const float* v) { // v points at the centre
-    float s = gsf__loss_window[5] * v[0];
-    for (int k = 1; k <= GSF__LOSS_RADIUS; k++) s += gsf__loss_window[5 + k] * (v[-3 * k] + v[3 * k]);
-    return s;
-}
-
-static void gsf__loss_spread_ref(const float* sum_t, const float* sum_tt, size_t n, float* mean, float* variance) {
-    for (size_t i = 0; i < n; i++) {
-        mean[i] = gsf__loss_horizontal_ref(sum_t + i);
-        variance[i] = gsf__loss_horizontal_ref(sum_tt + i) - mean[i] * mean[i];
-    }
-}
-
-static void gsf__loss_map_ref(const float* sum_x, const float* sum_xx, const float* sum_xt, const float* x,
-                              const float* t, const float* mean_t, const float* variance_t, const float* weight,
-                              size_t valid, size_t n, float* a, float* b, float* c, double sums[2]) {
+static void gsf__loss_gradient_ref(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight,
+                                   const float* render, float l1_scale, float ssim_scale, size_t valid,
+                                   float* d_render) {
     for (size_t i = 0; i < valid; i++) {
-        const float mu = gsf__loss_horizontal_ref(sum_x + i), mu_t = mean_t[i];
-        const float s = gsf__loss_horizontal_ref(sum_xx + i) - mu * mu;
-        const float cov = gsf__loss_horizontal_ref(sum_xt + i) - mu * mu_t;
-        const float a1 = 2.0f * mu * mu_t + GSF__SSIM_C1, a2 = 2.0f * cov + GSF__SSIM_C2;
-        const float b1 = mu * mu + mu_t * mu_t + GSF__SSIM_C1, b2 = s + variance_t[i] + GSF__SSIM_C2;
-        const float r = 1.0f / (b1 * b2), m = a1 * a2 * r, w = weight ? weight[i] : 1.0f;
-        const float d_e = -m * b1 * r, d_f = 2.0f * a1 * r;
-        const float d_mu = 2.0f * (mu_t * a2 * r - mu * m * b2 * r) - 2.0f * mu * d_e - mu_t * d_f;
-        a[i] = w * d_mu;
-        b[i] = w * d_e;
-        c[i] = w * d_f;
-        sums[0] += (double)(w * fabsf(x[i] - t[i]));
-        sums[1] += (double)(w * (1.0f - m));
-    }
-    for (size_t i = valid; i < n; i++) a[i] = b[i] = c[i] = 0.0f;
-}
-
-static void gsf__loss_gradient_ref(const float* sum_a, const float* sum_b, const float* sum_c, const float* x,
-                                   const float* t, const float* weight, const float* render, float l1_scale,
-                                   float ssim_scale, size_t valid, float* d_render) {
-    for (size_t i = 0; i < valid; i++) {
-        const float ga = gsf__loss_horizontal_ref(sum_a + i), gb = gsf__loss_horizontal_ref(sum_b + i);
-        const float gc = gsf__loss_horizontal_ref(sum_c + i), diff = x[i] - t[i];
+        const float half = sums[i] + u[i] * sums[sums_step + i] + v[i] * sums[2 * sums_step + i], diff = u[i] - v[i];
         const float sign = diff > 0.0f ? 1.0f : diff < 0.0f ? -1.0f : 0.0f;
-        const float d = l1_scale * (weight ? weight[i] : 1.0f) * sign - ssim_scale * (ga + 2.0f * x[i] * gb + t[i] * gc);
+        const float d = l1_scale * weight[i] * sign - 2.0f * ssim_scale * half;
         d_render[i] = render[i] >= 0.0f && render[i] <= 1.0f ? d : 0.0f; // d clamp(r)/dr; 0 for NaN
     }
 }
@@ -8757,152 +8729,162 @@ GSF__TARGET_AVX2 static inline __m256i gsf__avx2_lanes(size_t count) {
     return _mm256_cmpgt_epi32(_mm256_set1_epi32(count < 8 ? (int)count : 8), lane);
 }
 
+// The first `count` floats, then zeros.
+GSF__TARGET_AVX2 static inline __m256 gsf__loss_first_avx2(const float* p, size_t count) {
+    return count >= 8 ? _mm256_loadu_ps(p) : _mm256_maskload_ps(p, gsf__avx2_lanes(count));
+}
+
 GSF__TARGET_AVX2 static inline double gsf__avx2_sum_pd(__m256d v) { // ((0 + 2) + (1 + 3))
     const __m128d pair = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd(v, 1));
     return _mm_cvtsd_f64(_mm_add_sd(pair, _mm_unpackhi_pd(pair, pair)));
 }
 
 GSF__TARGET_AVX2 static void gsf__loss_load_avx2(const float* render, const float* f32, const uint8_t* u8, size_t valid,
-                                                 size_t n, float* x, float* t) {
+                                                 size_t n, float* images, size_t step) {
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
+    const __m256 shift = _mm256_set1_ps(GSF__LOSS_SHIFT);
     for (size_t i = 0; i < n; i += 8) {
-        const __m256i lanes = gsf__avx2_lanes(valid - i);
-        const __m256 r = _mm256_maskload_ps(render + i, lanes);
-        _mm256_storeu_ps(x + i, _mm256_min_ps(_mm256_max_ps(r, zero), one)); // max(NaN, 0) is 0
-        if (!u8) {
-            _mm256_storeu_ps(t + i, _mm256_maskload_ps(f32 + i, lanes));
-        } else {
-            uint64_t bytes = 0;
-            memcpy(&bytes, u8 + i, valid - i < 8 ? valid - i : 8);
-            const __m256i wide = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes));
-            _mm256_storeu_ps(t + i, _mm256_div_ps(_mm256_cvtepi32_ps(wide), scale));
+        const size_t left = i < valid ? valid - i : 0;
+        __m256 x = zero, t = zero;
+        if (left) {
+            x = _mm256_min_ps(_mm256_max_ps(gsf__loss_first_avx2(render + i, left), zero), one); // max(NaN, 0) is 0
+            if (!u8) {
+                t = gsf__loss_first_avx2(f32 + i, left);
+            } else {
+                uint64_t bytes = 0;
+                if (left >= 8) memcpy(&bytes, u8 + i, 8);
+                else memcpy(&bytes, u8 + i, left);
+                t = _mm256_div_ps(_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes))), scale);
+            }
         }
+        const __m256 u = _mm256_sub_ps(x, shift), v = _mm256_sub_ps(t, shift);
+        _mm256_storeu_ps(images + i, u);
+        _mm256_storeu_ps(images + step + i, v);
+        _mm256_storeu_ps(images + 2 * step + i, _mm256_fmadd_ps(u, u, _mm256_mul_ps(v, v)));
+        _mm256_storeu_ps(images + 3 * step + i, _mm256_mul_ps(u, v));
     }
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_moments_avx2(const float* x, const float* t, size_t stride, const float* window,
-                                                    int taps, size_t n, float* sum_x, float* sum_xx, float* sum_xt) {
+GSF__TARGET_AVX2 static inline __m256 gsf__loss_taps_avx2(int k, __m256 a, __m256 b, __m256 sum) {
+    return _mm256_fmadd_ps(_mm256_set1_ps(gsf__loss_window[k]), _mm256_add_ps(a, b), sum);
+}
+
+// Each of the 14 rows is loaded once, from the outermost to the middle.
+GSF__TARGET_AVX2 static void gsf__loss_down_avx2(const float* const v[4], size_t stride, size_t n, float* sums) {
+    const __m256 zero = _mm256_setzero_ps(), middle = _mm256_set1_ps(gsf__loss_window[0]);
+    const float *v0 = v[0], *v1 = v[1], *v2 = v[2], *v3 = v[3];
     for (size_t i = 0; i < n; i += 8) {
-        __m256 s = _mm256_setzero_ps(), ss = s, st = s;
-        for (int k = 0; k < taps; k++) {
-            const __m256 xk = _mm256_loadu_ps(x + (size_t)k * stride + i);
-            const __m256 wx = _mm256_mul_ps(_mm256_set1_ps(window[k]), xk);
-            s = _mm256_add_ps(s, wx);
-            ss = _mm256_fmadd_ps(wx, xk, ss);
-            st = _mm256_fmadd_ps(wx, _mm256_loadu_ps(t + (size_t)k * stride + i), st);
-        }
-        _mm256_storeu_ps(sum_x + i, s);
-        _mm256_storeu_ps(sum_xx + i, ss);
-        _mm256_storeu_ps(sum_xt + i, st);
+#define GSF__LOSS_ROW(k, block) const __m256 r##k = _mm256_loadu_ps(block + k % GSF__LOSS_GROUP * stride + i)
+        GSF__LOSS_ROW(0, v0); GSF__LOSS_ROW(1, v0); GSF__LOSS_ROW(2, v0); GSF__LOSS_ROW(3, v0);
+        GSF__LOSS_ROW(10, v2); GSF__LOSS_ROW(11, v2); GSF__LOSS_ROW(12, v3); GSF__LOSS_ROW(13, v3);
+        __m256 a = gsf__loss_taps_avx2(5, r0, r10, zero), b = gsf__loss_taps_avx2(5, r1, r11, zero);
+        __m256 c = gsf__loss_taps_avx2(5, r2, r12, zero), d = gsf__loss_taps_avx2(5, r3, r13, zero);
+        GSF__LOSS_ROW(4, v1); GSF__LOSS_ROW(9, v2);
+        a = gsf__loss_taps_avx2(4, r1, r9, a), b = gsf__loss_taps_avx2(4, r2, r10, b);
+        c = gsf__loss_taps_avx2(4, r3, r11, c), d = gsf__loss_taps_avx2(4, r4, r12, d);
+        GSF__LOSS_ROW(5, v1); GSF__LOSS_ROW(8, v2);
+        a = gsf__loss_taps_avx2(3, r2, r8, a), b = gsf__loss_taps_avx2(3, r3, r9, b);
+        c = gsf__loss_taps_avx2(3, r4, r10, c), d = gsf__loss_taps_avx2(3, r5, r11, d);
+        GSF__LOSS_ROW(6, v1); GSF__LOSS_ROW(7, v1);
+        a = gsf__loss_taps_avx2(2, r3, r7, a), b = gsf__loss_taps_avx2(2, r4, r8, b);
+        c = gsf__loss_taps_avx2(2, r5, r9, c), d = gsf__loss_taps_avx2(2, r6, r10, d);
+        a = gsf__loss_taps_avx2(1, r4, r6, a), b = gsf__loss_taps_avx2(1, r5, r7, b);
+        c = gsf__loss_taps_avx2(1, r6, r8, c), d = gsf__loss_taps_avx2(1, r7, r9, d);
+#undef GSF__LOSS_ROW
+        _mm256_storeu_ps(sums + i, _mm256_fmadd_ps(middle, r5, a));
+        _mm256_storeu_ps(sums + stride + i, _mm256_fmadd_ps(middle, r6, b));
+        _mm256_storeu_ps(sums + 2 * stride + i, _mm256_fmadd_ps(middle, r7, c));
+        _mm256_storeu_ps(sums + 3 * stride + i, _mm256_fmadd_ps(middle, r8, d));
     }
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_blur3_avx2(const float* a, const float* b, const float* c, size_t stride,
-                                                  const float* window, int taps, size_t n, float* sum_a, float* sum_b,
-                                                  float* sum_c) {
+// The eight floats from the one `by` (1..3) behind the start of `low` on; high: those 4 behind low.
+#define GSF__LOSS_BETWEEN(low, high, by) _mm256_castsi256_ps(_mm256_alignr_epi8(high, low, 4 * (by)))
+
+// Half of all loads that are not aligned cross a cache line. So the outer taps are put together from aligned ones, and what
+// is needed again stays in registers: m16 .. p16 are the eight floats from i - 16 .. i + 16 on.
+GSF__TARGET_AVX2 static void gsf__loss_across_avx2(const float* v, size_t n, float* sums) {
+    const __m256 middle = _mm256_set1_ps(gsf__loss_window[0]);
+#define GSF__LOSS_EIGHT(at) _mm256_loadu_si256((const __m256i*)(const void*)(at))
+    __m256i m16 = GSF__LOSS_EIGHT(v - 16), m12 = GSF__LOSS_EIGHT(v - 12), m8 = GSF__LOSS_EIGHT(v - 8);
+    __m256i m4 = GSF__LOSS_EIGHT(v - 4), p0 = GSF__LOSS_EIGHT(v), p4 = GSF__LOSS_EIGHT(v + 4), p8 = GSF__LOSS_EIGHT(v + 8);
     for (size_t i = 0; i < n; i += 8) {
-        __m256 sa = _mm256_setzero_ps(), sb = sa, sc = sa;
-        for (int k = 0; k < taps; k++) {
-            const size_t at = (size_t)k * stride + i;
-            const __m256 w = _mm256_set1_ps(window[k]);
-            sa = _mm256_fmadd_ps(w, _mm256_loadu_ps(a + at), sa);
-            sb = _mm256_fmadd_ps(w, _mm256_loadu_ps(b + at), sb);
-            sc = _mm256_fmadd_ps(w, _mm256_loadu_ps(c + at), sc);
-        }
-        _mm256_storeu_ps(sum_a + i, sa);
-        _mm256_storeu_ps(sum_b + i, sb);
-        _mm256_storeu_ps(sum_c + i, sc);
+        const __m256i p16 = GSF__LOSS_EIGHT(v + i + 16), p12 = _mm256_permute2x128_si256(p8, p16, 0x21);
+        __m256 s = _mm256_mul_ps(middle, _mm256_castsi256_ps(p0));
+        s = gsf__loss_taps_avx2(1, _mm256_loadu_ps(v + i - 3), _mm256_loadu_ps(v + i + 3), s);
+        s = gsf__loss_taps_avx2(2, _mm256_loadu_ps(v + i - 6), _mm256_loadu_ps(v + i + 6), s);
+        s = gsf__loss_taps_avx2(3, GSF__LOSS_BETWEEN(m12, m8, 3), GSF__LOSS_BETWEEN(p8, p12, 1), s);
+        s = gsf__loss_taps_avx2(4, _mm256_castsi256_ps(m12), _mm256_castsi256_ps(p12), s);
+        s = gsf__loss_taps_avx2(5, GSF__LOSS_BETWEEN(m16, m12, 1), GSF__LOSS_BETWEEN(p12, p16, 3), s);
+        _mm256_storeu_ps(sums + i, s);
+        m16 = m8, m8 = p0, p0 = p8, p8 = p16;
+        m12 = m4, m4 = p4, p4 = p12;
     }
+#undef GSF__LOSS_EIGHT
 }
 
-GSF__TARGET_AVX2 static inline __m256 gsf__loss_horizontal_avx2(const float* v) {
-    __m256 s = _mm256_mul_ps(_mm256_set1_ps(gsf__loss_window[5]), _mm256_loadu_ps(v));
-    for (int k = 1; k <= GSF__LOSS_RADIUS; k++)
-        s = _mm256_fmadd_ps(_mm256_set1_ps(gsf__loss_window[5 + k]),
-                            _mm256_add_ps(_mm256_loadu_ps(v - 3 * k), _mm256_loadu_ps(v + 3 * k)), s);
-    return s;
+GSF__TARGET_AVX2 static inline __m256d gsf__loss_add_avx2(__m256d sum, __m256 v) { // pairs are added as floats
+    return _mm256_add_pd(sum, _mm256_cvtps_pd(_mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1))));
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_spread_avx2(const float* sum_t, const float* sum_tt, size_t n, float* mean,
-                                                   float* variance) {
-    for (size_t i = 0; i < n; i += 8) {
-        const __m256 mu = gsf__loss_horizontal_avx2(sum_t + i);
-        _mm256_storeu_ps(mean + i, mu);
-        _mm256_storeu_ps(variance + i, _mm256_fnmadd_ps(mu, mu, gsf__loss_horizontal_avx2(sum_tt + i)));
-    }
-}
-
-GSF__TARGET_AVX2 static void gsf__loss_map_avx2(const float* sum_x, const float* sum_xx, const float* sum_xt,
-                                                const float* x, const float* t, const float* mean_t,
-                                                const float* variance_t, const float* weight, size_t valid, size_t n,
-                                                float* a, float* b, float* c, double sums[2]) {
+GSF__TARGET_AVX2 static void gsf__loss_map_avx2(const float* sums, size_t sums_step, const float* u, const float* v,
+                                                const float* weight, size_t n, float* slopes, size_t step,
+                                                double totals[2]) {
     const __m256 c1 = _mm256_set1_ps(GSF__SSIM_C1), c2 = _mm256_set1_ps(GSF__SSIM_C2), one = _mm256_set1_ps(1.0f);
-    const __m256 two = _mm256_set1_ps(2.0f), sign = _mm256_set1_ps(-0.0f);
-    __m256d l1_low = _mm256_setzero_pd(), l1_high = l1_low, dssim_low = l1_low, dssim_high = l1_low;
+    const __m256 sign = _mm256_set1_ps(-0.0f), shift = _mm256_set1_ps(GSF__LOSS_SHIFT);
+    __m256d l1 = _mm256_setzero_pd(), dssim = l1;
     for (size_t i = 0; i < n; i += 8) {
-        const __m256 lanes = _mm256_castsi256_ps(gsf__avx2_lanes(valid - i));
-        const __m256 mu = gsf__loss_horizontal_avx2(sum_x + i), mu_t = _mm256_loadu_ps(mean_t + i);
-        const __m256 s = _mm256_fnmadd_ps(mu, mu, gsf__loss_horizontal_avx2(sum_xx + i));
-        const __m256 cov = _mm256_fnmadd_ps(mu, mu_t, gsf__loss_horizontal_avx2(sum_xt + i));
-        const __m256 mu2 = _mm256_mul_ps(two, mu);
-        const __m256 a1 = _mm256_fmadd_ps(mu2, mu_t, c1), a2 = _mm256_fmadd_ps(two, cov, c2);
-        const __m256 b1 = _mm256_add_ps(_mm256_fmadd_ps(mu, mu, _mm256_mul_ps(mu_t, mu_t)), c1);
-        const __m256 b2 = _mm256_add_ps(_mm256_add_ps(s, _mm256_loadu_ps(variance_t + i)), c2);
+        const __m256 U = _mm256_loadu_ps(sums + i), V = _mm256_loadu_ps(sums + sums_step + i);
+        const __m256 E = _mm256_loadu_ps(sums + 2 * sums_step + i), F = _mm256_loadu_ps(sums + 3 * sums_step + i);
+        const __m256 mu = _mm256_add_ps(U, shift), mu_t = _mm256_add_ps(V, shift), cov = _mm256_fnmadd_ps(U, V, F);
+        const __m256 a1 = _mm256_fmadd_ps(_mm256_add_ps(mu, mu), mu_t, c1), a2 = _mm256_add_ps(_mm256_add_ps(cov, cov), c2);
+        const __m256 b1 = _mm256_fmadd_ps(mu, mu, _mm256_fmadd_ps(mu_t, mu_t, c1));
+        const __m256 b2 = _mm256_add_ps(_mm256_fnmadd_ps(U, U, _mm256_fnmadd_ps(V, V, E)), c2);
         const __m256 r = _mm256_div_ps(one, _mm256_mul_ps(b1, b2));
-        const __m256 m = _mm256_mul_ps(_mm256_mul_ps(a1, a2), r);
-        const __m256 w = _mm256_and_ps(weight ? _mm256_loadu_ps(weight + i) : one, lanes);
-        const __m256 d_e = _mm256_xor_ps(sign, _mm256_mul_ps(_mm256_mul_ps(m, b1), r));
-        const __m256 d_f = _mm256_mul_ps(_mm256_mul_ps(two, a1), r);
-        __m256 d_mu = _mm256_mul_ps(_mm256_mul_ps(mu, m), b2);
-        d_mu = _mm256_mul_ps(_mm256_mul_ps(two, r), _mm256_fmsub_ps(mu_t, a2, d_mu));
-        d_mu = _mm256_fnmadd_ps(mu_t, d_f, _mm256_fnmadd_ps(mu2, d_e, d_mu));
-        _mm256_storeu_ps(a + i, _mm256_mul_ps(w, d_mu));
-        _mm256_storeu_ps(b + i, _mm256_mul_ps(w, d_e));
-        _mm256_storeu_ps(c + i, _mm256_mul_ps(w, d_f));
-        const __m256 diff = _mm256_sub_ps(_mm256_loadu_ps(x + i), _mm256_loadu_ps(t + i));
-        const __m256 l1 = _mm256_mul_ps(w, _mm256_andnot_ps(sign, diff));
-        const __m256 dssim = _mm256_mul_ps(w, _mm256_sub_ps(one, m));
-        l1_low = _mm256_add_pd(l1_low, _mm256_cvtps_pd(_mm256_castps256_ps128(l1)));
-        l1_high = _mm256_add_pd(l1_high, _mm256_cvtps_pd(_mm256_extractf128_ps(l1, 1)));
-        dssim_low = _mm256_add_pd(dssim_low, _mm256_cvtps_pd(_mm256_castps256_ps128(dssim)));
-        dssim_high = _mm256_add_pd(dssim_high, _mm256_cvtps_pd(_mm256_extractf128_ps(dssim, 1)));
+        const __m256 f = _mm256_mul_ps(a1, r), m = _mm256_mul_ps(f, a2), w = _mm256_loadu_ps(weight + i);
+        const __m256 b1r = _mm256_mul_ps(b1, r);
+        __m256 d = _mm256_fmsub_ps(mu_t, _mm256_mul_ps(a2, r), _mm256_mul_ps(V, f));
+        d = _mm256_fmadd_ps(m, _mm256_fmsub_ps(U, b1r, _mm256_mul_ps(mu, _mm256_mul_ps(b2, r))), d);
+        _mm256_storeu_ps(slopes + i, _mm256_mul_ps(w, d));
+        _mm256_storeu_ps(slopes + step + i, _mm256_mul_ps(_mm256_xor_ps(sign, w), _mm256_mul_ps(m, b1r)));
+        _mm256_storeu_ps(slopes + 2 * step + i, _mm256_mul_ps(w, f));
+        const __m256 diff = _mm256_sub_ps(_mm256_loadu_ps(u + i), _mm256_loadu_ps(v + i));
+        l1 = gsf__loss_add_avx2(l1, _mm256_mul_ps(w, _mm256_andnot_ps(sign, diff)));
+        dssim = gsf__loss_add_avx2(dssim, _mm256_mul_ps(w, _mm256_sub_ps(one, m)));
     }
-    sums[0] += gsf__avx2_sum_pd(_mm256_add_pd(l1_low, l1_high));
-    sums[1] += gsf__avx2_sum_pd(_mm256_add_pd(dssim_low, dssim_high));
+    totals[0] += gsf__avx2_sum_pd(l1);
+    totals[1] += gsf__avx2_sum_pd(dssim);
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_gradient_avx2(const float* sum_a, const float* sum_b, const float* sum_c,
-                                                     const float* x, const float* t, const float* weight,
-                                                     const float* render, float l1_scale, float ssim_scale, size_t valid,
-                                                     float* d_render) {
+GSF__TARGET_AVX2 static void gsf__loss_gradient_avx2(const float* sums, size_t sums_step, const float* u, const float* v,
+                                                     const float* weight, const float* render, float l1_scale,
+                                                     float ssim_scale, size_t valid, float* d_render) {
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), minus = _mm256_set1_ps(-0.0f);
-    const __m256 l1 = _mm256_set1_ps(l1_scale), ssim = _mm256_set1_ps(ssim_scale);
+    const __m256 l1 = _mm256_set1_ps(l1_scale), ssim = _mm256_set1_ps(-2.0f * ssim_scale);
     for (size_t i = 0; i < valid; i += 8) {
-        const __m256i lanes = gsf__avx2_lanes(valid - i);
-        const __m256 ga = gsf__loss_horizontal_avx2(sum_a + i), gb = gsf__loss_horizontal_avx2(sum_b + i);
-        const __m256 gc = gsf__loss_horizontal_avx2(sum_c + i);
-        const __m256 xi = _mm256_loadu_ps(x + i), ti = _mm256_loadu_ps(t + i), diff = _mm256_sub_ps(xi, ti);
-        const __m256 signed_one = _mm256_or_ps(_mm256_and_ps(diff, minus), one);
-        const __m256 sign = _mm256_and_ps(signed_one, _mm256_cmp_ps(diff, zero, _CMP_NEQ_OQ));
-        const __m256 w = weight ? _mm256_mul_ps(l1, _mm256_loadu_ps(weight + i)) : l1;
-        const __m256 blurred = _mm256_fmadd_ps(ti, gc, _mm256_fmadd_ps(_mm256_add_ps(xi, xi), gb, ga));
-        const __m256 d = _mm256_fmsub_ps(w, sign, _mm256_mul_ps(ssim, blurred));
-        const __m256 r = _mm256_maskload_ps(render + i, lanes);
+        const __m256 ui = _mm256_loadu_ps(u + i), vi = _mm256_loadu_ps(v + i), diff = _mm256_sub_ps(ui, vi);
+        __m256 half = _mm256_fmadd_ps(ui, _mm256_loadu_ps(sums + sums_step + i), _mm256_loadu_ps(sums + i));
+        half = _mm256_fmadd_ps(vi, _mm256_loadu_ps(sums + 2 * sums_step + i), half);
+        const __m256 w = _mm256_mul_ps(l1, _mm256_loadu_ps(weight + i));
+        const __m256 signed_w = _mm256_xor_ps(w, _mm256_and_ps(diff, minus));
+        const __m256 d = _mm256_fmadd_ps(ssim, half, _mm256_and_ps(signed_w, _mm256_cmp_ps(diff, zero, _CMP_NEQ_OQ)));
+        const __m256 r = gsf__loss_first_avx2(render + i, valid - i);
         const __m256 inside = _mm256_and_ps(_mm256_cmp_ps(r, zero, _CMP_GE_OQ), _mm256_cmp_ps(r, one, _CMP_LE_OQ));
-        _mm256_maskstore_ps(d_render + i, lanes, _mm256_and_ps(d, inside));
+        const __m256 out = _mm256_and_ps(d, inside);
+        if (valid - i >= 8) _mm256_storeu_ps(d_render + i, out); // masked stores are slow
+        else _mm256_maskstore_ps(d_render + i, gsf__avx2_lanes(valid - i), out);
     }
 }
 #endif
 
 static gsf__loss_kernels gsf__loss_kernels_of(const gsf_context* ctx) {
-    gsf__loss_kernels k = {gsf__loss_load_ref,   gsf__loss_moments_ref, gsf__loss_blur3_ref,
-                           gsf__loss_spread_ref, gsf__loss_map_ref,     gsf__loss_gradient_ref};
+    gsf__loss_kernels k = {gsf__loss_load_ref, gsf__loss_down_ref, gsf__loss_across_ref, gsf__loss_map_ref,
+                           gsf__loss_gradient_ref};
 #if GSF__X86
     if (ctx->cpu_level >= GSF_CPU_AVX2) {
         k.load = gsf__loss_load_avx2;
-        k.moments = gsf__loss_moments_avx2;
-        k.blur3 = gsf__loss_blur3_avx2;
-        k.spread = gsf__loss_spread_avx2;
+        k.down = gsf__loss_down_avx2;
+        k.across = gsf__loss_across_avx2;
         k.map = gsf__loss_map_avx2;
         k.gradient = gsf__loss_gradient_avx2;
     }
@@ -8916,162 +8898,161 @@ typedef struct gsf__loss_job {
     gsf__loss_kernels k;
     const gsf__target* target;
     const float* render;
-    float *x, *t, *weight, *a, *b, *c, *mean_t, *variance_t; // planes (H, stride); weight NULL = 1
     float* rows;
     double* sums;
     float* d_render;
     float l1_scale, ssim_scale;
-    size_t stride, valid, row_size; // row_size: floats of one row buffer with margins
+    size_t valid, n, row; // floats: of a row of the image, padded, with margins
 } gsf__loss_job;
 
-// First row, number of taps and window start for the vertical sums of row y.
-static size_t gsf__loss_rows_of(int32_t y, int32_t height, int* taps, const float** window) {
-    const int32_t first = y < GSF__LOSS_RADIUS ? 0 : y - GSF__LOSS_RADIUS;
-    const int32_t last = height - 1 - y < GSF__LOSS_RADIUS ? height - 1 : y + GSF__LOSS_RADIUS;
-    *taps = last - first + 1;
-    *window = gsf__loss_window + (first - (y - GSF__LOSS_RADIUS));
-    return (size_t)first;
+typedef struct gsf__loss_buffers { // of a worker at a band; they point to column 0 of row 0
+    float *images, *slopes, *sums, *vertical, *weight; // vertical: sums of one plane, not yet horizontal
+    int32_t first, end;                                // rows of the band
+} gsf__loss_buffers;
+
+static size_t gsf__loss_padded(int32_t width) { return (3 * (size_t)width + 7) & ~(size_t)7; }
+
+// Floats of a row with its margins: an odd number of cache lines, so that rows do not compete for the same places.
+static size_t gsf__loss_row(int32_t width) {
+    return ((gsf__loss_padded(width) + 2 * GSF__LOSS_MARGIN + 15) & ~(size_t)15) | 16;
 }
 
-// The three row buffers of a worker; right margins are cleared since a wider photo may have been there before.
-static void gsf__loss_row_buffers(const gsf__loss_job* job, int worker, float* out[3]) {
-    for (int i = 0; i < 3; i++) {
-        out[i] = job->rows + (3 * (size_t)worker + (size_t)i) * job->row_size + GSF__LOSS_MARGIN;
-        memset(out[i] - GSF__LOSS_MARGIN, 0, GSF__LOSS_MARGIN * sizeof(float));
-        memset(out[i] + job->stride, 0, GSF__LOSS_MARGIN * sizeof(float));
+// Bands are about equally high.
+static int32_t gsf__loss_band_rows(int32_t height) {
+    const int32_t bands = (height - 1) / GSF__LOSS_BAND + 1;
+    return (height - 1) / bands + 1;
+}
+
+static size_t gsf__loss_band_count(int32_t height) { return (size_t)((height - 1) / gsf__loss_band_rows(height)) + 1; }
+
+// The weights of row y, one for each float.
+static const float* gsf__loss_weights(const gsf__loss_job* job, int32_t y, float* out) {
+    const size_t width = (size_t)job->target->width;
+    if (!job->target->weight) return out; // ones
+    const float* weight = job->target->weight + (size_t)y * width;
+    for (size_t i = 0; i < width; i++) out[3 * i] = out[3 * i + 1] = out[3 * i + 2] = weight[i];
+    return out;
+}
+
+// Window sums of the group of rows in the middle of groups g .. g + 3 of a ring, whose planes are outside[] beyond the
+// image's sides.
+static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b, const float* ring, size_t ring_rows,
+                           size_t g, size_t planes, const float* outside) {
+    for (size_t p = 0; p < planes; p++) {
+        const float* v[4];
+        for (size_t k = 0; k < 4; k++) v[k] = ring + (p * ring_rows + (g + k) * GSF__LOSS_GROUP % ring_rows) * job->row;
+        job->k.down(v, job->row, job->n, b->vertical);
+        for (size_t j = 0; j < GSF__LOSS_GROUP; j++) {
+            float* sums = b->vertical + j * job->row;
+            for (size_t i = 0; i < GSF__LOSS_MARGIN; i++) sums[job->n + i] = *(sums - GSF__LOSS_MARGIN + i) = outside[p];
+            job->k.across(sums, job->n, b->sums + (p * GSF__LOSS_GROUP + j) * job->row);
+        }
     }
 }
 
-static int32_t gsf__loss_band_end(const gsf__loss_job* job, size_t band) {
-    const int32_t end = (int32_t)band * GSF__LOSS_BAND + GSF__LOSS_BAND;
-    return end < job->target->height ? end : job->target->height;
-}
-
-static void gsf__loss_load_band(void* arg, size_t band, int worker) {
-    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+// Group g of the images.
+static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g) {
     const gsf__target* target = job->target;
-    (void)worker;
-    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
-        const size_t row = (size_t)y * job->stride, packed = (size_t)y * job->valid;
-        job->k.load(job->render + packed, target->f32 ? target->f32 + packed : NULL,
-                    target->u8 ? target->u8 + packed : NULL, job->valid, job->stride, job->x + row, job->t + row);
-        if (!job->weight) continue;
-        const float* weight = target->weight + (size_t)y * (size_t)target->width;
-        float* out = job->weight + row;
-        for (size_t i = 0; i < (size_t)target->width; i++) out[3 * i] = out[3 * i + 1] = out[3 * i + 2] = weight[i];
-        for (size_t i = job->valid; i < job->stride; i++) out[i] = 0.0f;
+    for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP; at++) {
+        const int32_t y = b->first - 2 * GSF__LOSS_RADIUS + at;
+        const int inside = y >= 0 && y < target->height;
+        const size_t from = inside ? (size_t)y * job->valid : 0;
+        job->k.load(job->render + from, target->f32 ? target->f32 + from : NULL, target->u8 ? target->u8 + from : NULL,
+                    inside ? job->valid : 0, job->n, b->images + (size_t)(at % GSF__LOSS_IMAGES) * job->row,
+                    GSF__LOSS_IMAGES * job->row);
     }
 }
 
-static void gsf__loss_target_band(void* arg, size_t band, int worker) {
-    const gsf__loss_job* job = (const gsf__loss_job*)arg;
-    float* rows[3];
-    gsf__loss_row_buffers(job, worker, rows);
-    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
-        int taps;
-        const float* window;
-        const float* t = job->t + gsf__loss_rows_of(y, job->target->height, &taps, &window) * job->stride;
-        job->k.moments(t, t, job->stride, window, taps, job->stride, rows[0], rows[1], rows[2]);
-        const size_t row = (size_t)y * job->stride;
-        job->k.spread(rows[0], rows[1], job->stride, job->mean_t + row, job->variance_t + row);
+// Group g of the slopes, zeros outside the image; rows of the band are counted.
+static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g, double* totals) {
+    static const float outside[4] = {-GSF__LOSS_SHIFT, -GSF__LOSS_SHIFT, 2.0f * GSF__LOSS_SHIFT * GSF__LOSS_SHIFT,
+                                     GSF__LOSS_SHIFT * GSF__LOSS_SHIFT};
+    gsf__loss_blur(job, b, b->images, GSF__LOSS_IMAGES, (size_t)g, 4, outside);
+    for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP; at++) {
+        const int32_t y = b->first - GSF__LOSS_RADIUS + at;
+        const float* sums = b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row;
+        const float* u = b->images + (size_t)((at + GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
+        float* slopes = b->slopes + (size_t)(at % GSF__LOSS_SLOPES) * job->row;
+        double other[2] = {0.0, 0.0};
+        if (y >= 0 && y < job->target->height)
+            job->k.map(sums, GSF__LOSS_GROUP * job->row, u, u + GSF__LOSS_IMAGES * job->row,
+                       gsf__loss_weights(job, y, b->weight), job->n, slopes, GSF__LOSS_SLOPES * job->row,
+                       y >= b->first && y < b->end ? totals : other);
+        else
+            for (size_t p = 0; p < 3; p++) memset(slopes + p * GSF__LOSS_SLOPES * job->row, 0, job->n * sizeof(float));
     }
 }
 
-static void gsf__loss_map_band(void* arg, size_t band, int worker) {
-    const gsf__loss_job* job = (const gsf__loss_job*)arg;
-    float* rows[3];
-    gsf__loss_row_buffers(job, worker, rows);
-    double* sums = job->sums + 2 * band;
-    sums[0] = sums[1] = 0.0;
-    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
-        int taps;
-        const float* window;
-        const size_t first = gsf__loss_rows_of(y, job->target->height, &taps, &window) * job->stride;
-        job->k.moments(job->x + first, job->t + first, job->stride, window, taps, job->stride, rows[0], rows[1], rows[2]);
-        const size_t row = (size_t)y * job->stride;
-        job->k.map(rows[0], rows[1], rows[2], job->x + row, job->t + row, job->mean_t + row, job->variance_t + row,
-                   job->weight ? job->weight + row : NULL, job->valid, job->stride, job->a + row, job->b + row,
-                   job->c + row, sums);
-    }
-}
-
-static void gsf__loss_gradient_band(void* arg, size_t band, int worker) {
-    const gsf__loss_job* job = (const gsf__loss_job*)arg;
-    float* rows[3];
-    gsf__loss_row_buffers(job, worker, rows);
-    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < gsf__loss_band_end(job, band); y++) {
-        int taps;
-        const float* window;
-        const size_t first = gsf__loss_rows_of(y, job->target->height, &taps, &window) * job->stride;
-        job->k.blur3(job->a + first, job->b + first, job->c + first, job->stride, window, taps, job->stride, rows[0],
-                     rows[1], rows[2]);
-        const size_t row = (size_t)y * job->stride, packed = (size_t)y * job->valid;
-        job->k.gradient(rows[0], rows[1], rows[2], job->x + row, job->t + row, job->weight ? job->weight + row : NULL,
+// Group g of the band's rows.
+static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g) {
+    static const float outside[3] = {0.0f, 0.0f, 0.0f};
+    gsf__loss_blur(job, b, b->slopes, GSF__LOSS_SLOPES, (size_t)g, 3, outside);
+    for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP && b->first + at < b->end; at++) {
+        const size_t packed = (size_t)(b->first + at) * job->valid;
+        const float* u = b->images + (size_t)((at + 2 * GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
+        job->k.gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, u,
+                        u + GSF__LOSS_IMAGES * job->row, gsf__loss_weights(job, b->first + at, b->weight),
                         job->render + packed, job->l1_scale, job->ssim_scale, job->valid, job->d_render + packed);
     }
 }
 
-static size_t gsf__loss_stride(int32_t width) { return (3 * (size_t)width + 7) & ~(size_t)7; }
-
-// Bytes of a target's kept moments: 24 per pixel, rows padded.
-static size_t gsf__loss_moments_size(int32_t width, int32_t height) {
-    return 2 * gsf__loss_stride(width) * (size_t)height * sizeof(float);
+static void gsf__loss_band(void* arg, size_t band, int worker) {
+    const gsf__loss_job* job = (const gsf__loss_job*)arg;
+    const int32_t height = job->target->height, rows = gsf__loss_band_rows(height);
+    gsf__loss_buffers b;
+    b.first = (int32_t)band * rows;
+    b.end = height - b.first > rows ? b.first + rows : height;
+    b.images = job->rows + (size_t)worker * GSF__LOSS_WORKER_ROWS * job->row + GSF__LOSS_MARGIN;
+    b.slopes = b.images + 4 * GSF__LOSS_IMAGES * job->row;
+    b.sums = b.slopes + 3 * GSF__LOSS_SLOPES * job->row;
+    b.vertical = b.sums + 4 * GSF__LOSS_GROUP * job->row;
+    b.weight = b.vertical + GSF__LOSS_GROUP * job->row;
+    for (size_t i = 0; i < job->n; i++) b.weight[i] = i < job->valid ? 1.0f : 0.0f;
+    double* totals = job->sums + 2 * band;
+    totals[0] = totals[1] = 0.0;
+    for (int32_t g = 0; g < 3; g++) gsf__loss_load_group(job, &b, g);
+    for (int32_t g = 0; b.first + (g - 3) * GSF__LOSS_GROUP < b.end; g++) {
+        gsf__loss_load_group(job, &b, g + 3);
+        gsf__loss_map_group(job, &b, g, totals);
+        if (g >= 3) gsf__loss_gradient_group(job, &b, g - 3);
+    }
 }
 
 static gsf_result gsf__loss_reserve(gsf_context* ctx, gsf__loss_scratch* scratch, int32_t width, int32_t height) {
-    const size_t stride = gsf__loss_stride(width);
     size_t floats;
-    if (!gsf__mul_size(stride, (size_t)height, &floats) || !gsf__mul_size(floats, GSF__LOSS_PLANES, &floats))
+    if (!gsf__mul_size((size_t)ctx->parallel.worker_count * GSF__LOSS_WORKER_ROWS, gsf__loss_row(width), &floats))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "loss: image of %d x %d is too large", (int)width, (int)height);
-    const size_t rows = 3 * (size_t)ctx->parallel.worker_count * (stride + 2 * GSF__LOSS_MARGIN);
-    const size_t bands = ((size_t)height + GSF__LOSS_BAND - 1) / GSF__LOSS_BAND;
-    GSF__TRY(gsf__reserve(ctx, (void**)&scratch->planes, &scratch->plane_capacity, 0, floats, sizeof(float)));
-    GSF__TRY(gsf__reserve(ctx, (void**)&scratch->rows, &scratch->row_capacity, 0, rows, sizeof(float)));
-    return gsf__reserve(ctx, (void**)&scratch->sums, &scratch->sum_capacity, 0, 2 * bands, sizeof(double));
+    GSF__TRY(gsf__reserve(ctx, (void**)&scratch->rows, &scratch->row_capacity, 0, floats, sizeof(float)));
+    return gsf__reserve(ctx, (void**)&scratch->sums, &scratch->sum_capacity, 0, 2 * gsf__loss_band_count(height),
+                        sizeof(double));
 }
 
 static void gsf__loss_destroy_scratch(gsf_context* ctx, gsf__loss_scratch* scratch) {
-    gsf_free(ctx, scratch->planes);
     gsf_free(ctx, scratch->rows);
     gsf_free(ctx, scratch->sums);
     memset(scratch, 0, sizeof *scratch);
 }
 
 // Loss of `render` (H,W,3) against the target and its derivative times `scale`, written to d_render (H,W,3).
-// lambda: share of the SSIM term. The same bits whether or not the target keeps its moments.
-static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, gsf__target* target, const float* render,
+// lambda: share of the SSIM term.
+static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const gsf__target* target, const float* render,
                             float lambda, float scale, float* d_render, gsf__loss_value* out) {
     GSF__TRY(gsf__loss_reserve(ctx, scratch, target->width, target->height));
     gsf__loss_job job;
-    memset(&job, 0, sizeof job);
     job.k = gsf__loss_kernels_of(ctx);
     job.target = target;
     job.render = render;
-    job.stride = gsf__loss_stride(target->width);
-    job.valid = 3 * (size_t)target->width;
-    job.row_size = job.stride + 2 * GSF__LOSS_MARGIN;
-    const size_t plane = job.stride * (size_t)target->height;
-    job.x = scratch->planes;
-    job.t = job.x + plane;
-    job.a = job.t + plane;
-    job.b = job.a + plane;
-    job.c = job.b + plane;
-    job.weight = target->weight ? job.c + plane : NULL;
-    job.mean_t = target->moments ? target->moments : job.c + 2 * plane;
-    job.variance_t = job.mean_t + plane;
     job.rows = scratch->rows;
     job.sums = scratch->sums;
     job.d_render = d_render;
+    job.valid = 3 * (size_t)target->width;
+    job.n = gsf__loss_padded(target->width);
+    job.row = gsf__loss_row(target->width);
     const double n = 3.0 * (double)target->width * (double)target->height;
     job.l1_scale = (float)((double)scale * (1.0 - (double)lambda) / n);
     job.ssim_scale = (float)((double)scale * (double)lambda / n);
-
-    const size_t bands = ((size_t)target->height + GSF__LOSS_BAND - 1) / GSF__LOSS_BAND;
-    gsf__parallel_for(ctx, bands, gsf__loss_load_band, &job);
-    if (!target->moments || !target->moments_ready) gsf__parallel_for(ctx, bands, gsf__loss_target_band, &job);
-    target->moments_ready = target->moments != NULL;
-    gsf__parallel_for(ctx, bands, gsf__loss_map_band, &job);
-    gsf__parallel_for(ctx, bands, gsf__loss_gradient_band, &job);
+    const size_t bands = gsf__loss_band_count(target->height);
+    gsf__parallel_for(ctx, bands, gsf__loss_band, &job);
     double l1 = 0.0, dssim = 0.0;
     for (size_t i = 0; i < bands; i++) {
         l1 += scratch->sums[2 * i];
@@ -9085,41 +9066,43 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, gsf__t
 
 // Edge-aware smoothness of inverse depth: weight / (H W) times the sum over neighbouring pixels p, q (right and below)
 // of e_pq |D_p - D_q| with D = extent / depth and e_pq = 1 / (1 + (|t_p - t_q| / 0.1)^2), |.| the mean over RGB. Pairs in
-// which a pixel has no depth are left out. Reads the photo where the last gsf__loss put it; d_depth (H,W) is written.
+// which a pixel has no depth are left out. d_depth (H,W) is written.
 typedef struct gsf__smooth_job {
-    const float *t, *depth;
+    const gsf__target* target;
+    const float* depth;
     float* d_depth;
     double* sums;
-    size_t stride;
-    int32_t width, height;
     float extent, factor;
 } gsf__smooth_job;
 
-// e_pq of two pixels given their colours.
-static float gsf__smooth_edge(const float* p, const float* q) {
-    const float d = (fabsf(p[0] - q[0]) + fabsf(p[1] - q[1]) + fabsf(p[2] - q[2])) * (10.0f / 3.0f);
-    return 1.0f / (1.0f + d * d);
+// e_pq of two pixels.
+static float gsf__smooth_edge(const gsf__target* target, size_t p, size_t q) {
+    const float *f = target->f32, scale = (f ? 1.0f : 1.0f / 255.0f) * (10.0f / 3.0f);
+    float d = 0.0f;
+    for (size_t c = 0; c < 3; c++)
+        d += f ? fabsf(f[3 * p + c] - f[3 * q + c]) : fabsf((float)(target->u8[3 * p + c] - target->u8[3 * q + c]));
+    return 1.0f / (1.0f + scale * d * (scale * d));
 }
 
 static void gsf__smooth_band(void* arg, size_t band, int worker) {
     const gsf__smooth_job* job = (const gsf__smooth_job*)arg;
     (void)worker;
-    const int32_t next = ((int32_t)band + 1) * GSF__LOSS_BAND, end = next < job->height ? next : job->height;
+    const int32_t width = job->target->width, height = job->target->height, rows = gsf__loss_band_rows(height);
+    const int32_t first = (int32_t)band * rows, end = height - first > rows ? first + rows : height;
     double sum = 0.0;
-    for (int32_t y = (int32_t)band * GSF__LOSS_BAND; y < end; y++)
-        for (int32_t x = 0; x < job->width; x++) {
-            const size_t at = (size_t)y * (size_t)job->width + (size_t)x;
-            const float* color = job->t + (size_t)y * job->stride + 3 * (size_t)x;
+    for (int32_t y = first; y < end; y++)
+        for (int32_t x = 0; x < width; x++) {
+            const size_t at = (size_t)y * (size_t)width + (size_t)x;
             const float z = job->depth[at], here = z > 0.0f ? job->extent / z : 0.0f;
             float slope = 0.0f; // of the sum with respect to D here
-            const int inside[4] = {x + 1 < job->width, y + 1 < job->height, x > 0, y > 0};
-            const ptrdiff_t pixel[4] = {1, job->width, -1, -(ptrdiff_t)job->width};
-            const ptrdiff_t colors[4] = {3, (ptrdiff_t)job->stride, -3, -(ptrdiff_t)job->stride};
+            const int inside[4] = {x + 1 < width, y + 1 < height, x > 0, y > 0};
+            const ptrdiff_t pixel[4] = {1, width, -1, -(ptrdiff_t)width};
             for (int k = 0; z > 0.0f && k < 4; k++) {
                 if (!inside[k]) continue;
-                const float other = job->depth[(ptrdiff_t)at + pixel[k]];
+                const size_t next = (size_t)((ptrdiff_t)at + pixel[k]);
+                const float other = job->depth[next];
                 if (!(other > 0.0f)) continue;
-                const float diff = here - job->extent / other, edge = gsf__smooth_edge(color, color + colors[k]);
+                const float diff = here - job->extent / other, edge = gsf__smooth_edge(job->target, at, next);
                 slope += diff > 0.0f ? edge : diff < 0.0f ? -edge : 0.0f;
                 if (k < 2) sum += (double)(edge * fabsf(diff));
             }
@@ -9131,16 +9114,13 @@ static void gsf__smooth_band(void* arg, size_t band, int worker) {
 static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* scratch, const gsf__target* target,
                                     const float* depth, float extent, float weight, float* d_depth) {
     gsf__smooth_job job;
-    job.stride = gsf__loss_stride(target->width);
-    job.width = target->width;
-    job.height = target->height;
-    job.t = scratch->planes + job.stride * (size_t)target->height;
+    job.target = target;
     job.depth = depth;
     job.d_depth = d_depth;
     job.sums = scratch->sums;
     job.extent = extent;
     job.factor = (float)((double)weight / ((double)target->width * (double)target->height));
-    const size_t bands = ((size_t)target->height + GSF__LOSS_BAND - 1) / GSF__LOSS_BAND;
+    const size_t bands = gsf__loss_band_count(target->height);
     gsf__parallel_for(ctx, bands, gsf__smooth_band, &job);
     double sum = 0.0;
     for (size_t i = 0; i < bands; i++) sum += scratch->sums[i];
@@ -9609,8 +9589,7 @@ enum { // streams of random numbers; the iteration or epoch is added
     GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED
 };
 
-#define GSF__MOMENT_BYTES ((size_t)512 << 20) // kept window moments of photos: at most this much, 24 bytes per pixel
-enum { GSF__DECAY_INTERVAL = 10 };            // iterations from one opacity decay to the next
+enum { GSF__DECAY_INTERVAL = 10 }; // iterations from one opacity decay to the next
 
 typedef struct gsf__photo {
     gsf_camera camera;
@@ -9623,7 +9602,6 @@ typedef struct gsf__photo_set {
     gsf__photo* photos;
     uint32_t* order;         // permutation of epoch order_epoch - 1; 0 = none yet
     uint64_t order_epoch;
-    size_t moment_bytes;
     int32_t max_width, max_height;
 } gsf__photo_set;
 
@@ -9649,7 +9627,6 @@ static void gsf__photo_set_destroy(gsf_context* ctx, gsf__photo_set* set) {
     for (size_t i = 0; set->photos && i < set->count; i++) {
         gsf_free(ctx, set->photos[i].pixels);
         gsf_free(ctx, set->photos[i].weight);
-        gsf_free(ctx, set->photos[i].target.moments);
     }
     gsf_free(ctx, set->photos);
     gsf_free(ctx, set->order);
@@ -9710,10 +9687,9 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     return gsf__photo_copy(ctx, weight, "weight of view", index, 0.0f, 1e6f, out->weight);
 }
 
-// Memory: 3 bytes (u8) or 12 (f32) per pixel, 4 with a weight, and 24 for the photo's window moments while these fit
-// into `moment_budget`; the other photos have theirs computed at each visit, with the same result.
+// Memory: 3 bytes (u8) or 12 (f32) per pixel, and 4 with a weight.
 static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* views, size_t count, const char* what,
-                                      size_t moment_budget, gsf__photo_set* out) {
+                                      gsf__photo_set* out) {
     memset(out, 0, sizeof *out);
     if (count == 0) return GSF_OK;
     if (!views || count > UINT32_MAX)
@@ -9728,11 +9704,6 @@ static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* vi
         if (result != GSF_OK) break;
         if (photo->camera.width > out->max_width) out->max_width = photo->camera.width;
         if (photo->camera.height > out->max_height) out->max_height = photo->camera.height;
-        const size_t bytes = gsf__loss_moments_size(photo->camera.width, photo->camera.height);
-        if (bytes > moment_budget - out->moment_bytes) continue;
-        photo->target.moments = (float*)gsf_alloc(ctx, bytes, 1);
-        if (!photo->target.moments) result = GSF_ERROR_OUT_OF_MEMORY;
-        out->moment_bytes += bytes;
     }
     if (result != GSF_OK) gsf__photo_set_destroy(ctx, out);
     return result;
@@ -9975,7 +9946,7 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     const int near_given = trainer->desc.render.near_plane != 0.0f;
     GSF__TRY(gsf__train_desc_check(ctx, &trainer->desc));
     if (view_count == 0) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no training view");
-    GSF__TRY(gsf__photo_set_make(ctx, views, view_count, "view", GSF__MOMENT_BYTES, &trainer->photos));
+    GSF__TRY(gsf__photo_set_make(ctx, views, view_count, "view", &trainer->photos));
     GSF__TRY(gsf__trainer_take_splats(ctx, trainer, initial));
     if (trainer->desc.extent == 0.0f) GSF__TRY(gsf__trainer_find_extent(ctx, trainer));
     if (!near_given) {
@@ -10447,8 +10418,7 @@ GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer) { retu
 GSF_API gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
                                                 size_t count) {
     gsf__photo_set set;
-    GSF__TRY(gsf__photo_set_make(ctx, views, count, "restored view", GSF__MOMENT_BYTES - trainer->photos.moment_bytes,
-                                 &set));
+    GSF__TRY(gsf__photo_set_make(ctx, views, count, "restored view", &set));
     const gsf_result result = gsf__trainer_reserve_images(ctx, trainer, &set);
     if (result != GSF_OK) {
         gsf__photo_set_destroy(ctx, &set);

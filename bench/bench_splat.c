@@ -359,7 +359,6 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     target.width = width;
     target.height = height;
     target.f32 = photo;
-    target.moments = (float*)gsf_alloc(&ctx, gsf__loss_moments_size(width, height), 1);
     gsf__adam_rates rates;
     memset(&rates, 0, sizeof rates); // all work, but nothing moves: every round has the same splats
 
@@ -412,7 +411,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
         n * (2 * sizeof(gsf__record) + 8) + entries * (4 + 8),
         entries * (4 + sizeof(gsf__record) + 8 * (2 + 2 * 4) + 8),
         entries * sizeof(gsf__record) + p * (3 + 1) * 4,
-        p * 3 * 4 * (2 + GSF__LOSS_PLANES + 1),
+        p * 3 * 4 * 3,
         entries * (2 * sizeof(gsf__record) + GSF__SLOT_FLOATS * 4) + p * 4 * 4,
         entries * (GSF__SLOT_FLOATS * 4 + 8) + n * (59 * 4 * 3 + sizeof(gsf__record)),
         n * 59 * 4 * 7,
@@ -434,7 +433,6 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     gsf__model_destroy(&ctx, &model);
     gsf_splat_destroy_rasterizer(&ctx, r);
     gsf_destroy_image(&ctx, &out.color);
-    gsf_free(&ctx, target.moments);
     gsf_free(&ctx, front);
     gsf_free(&ctx, photo);
     gsf_free(&ctx, d_color);

@@ -7,6 +7,11 @@
 
 enum { WIDTH = 44, HEIGHT = 36, VIEWS = 5, SPLATS = 70 };
 
+static void for_backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
+    const int workers = *(const int*)user;
+    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)((i * 7 + 3) % (size_t)workers));
+}
+
 // ---- loss ----------------------------------------------------------------------
 
 typedef struct loss_case {
@@ -18,7 +23,7 @@ typedef struct loss_case {
 static void test_loss_derivative(gsf_context* ctx) {
     static const loss_case cases[] = {{1, 1, 0, 0, 0.2f},  {3, 2, 1, 1, 0.2f},   {1, 17, 0, 1, 1.0f},
                                       {23, 1, 1, 0, 0.5f}, {13, 11, 1, 0, 0.2f}, {19, 14, 0, 1, 0.0f},
-                                      {8, 8, 0, 0, 1.0f},  {11, 24, 1, 1, 1.0f}};
+                                      {8, 8, 0, 0, 1.0f},  {11, 24, 1, 1, 1.0f},  {3, 131, 1, 1, 0.5f}};
     gsf__loss_scratch scratch;
     memset(&scratch, 0, sizeof scratch);
     uint64_t state = 5;
@@ -71,6 +76,92 @@ static void test_loss_derivative(gsf_context* ctx) {
         free(render); free(photo); free(weight); free(d); free(ignored); free(bytes);
     }
     gsf__loss_destroy_scratch(ctx, &scratch);
+}
+
+// Mean SSIM and the gradient of 1 - SSIM in double precision, as the formula has them.
+static double exact_ssim(int width, int height, const float* x, const float* t, double* gradient) {
+    const size_t n = 3 * (size_t)width * (size_t)height;
+    double window[11], sum = 0.0, ssim = 0.0, *slopes = (double*)calloc(3 * n, sizeof(double));
+    for (int k = 0; k < 11; k++) sum += window[k] = exp(-(k - 5) * (k - 5) / 4.5);
+    for (int pass = 0; pass < 2; pass++) // slopes of every window, then what each pixel collects
+        for (size_t i = 0; i < n; i++) {
+            const int px = (int)(i / 3) % width, py = (int)(i / 3) / width;
+            double s[5] = {0}, g[3] = {0};
+            for (int y = py < 5 ? 0 : py - 5; y < height && y <= py + 5; y++)
+                for (int c = px < 5 ? 0 : px - 5; c < width && c <= px + 5; c++) {
+                    const size_t at = 3 * ((size_t)y * (size_t)width + (size_t)c) + i % 3;
+                    const double w = window[y - py + 5] * window[c - px + 5] / (sum * sum), u = x[at], v = t[at];
+                    const double terms[5] = {u, v, u * u, v * v, u * v};
+                    for (int k = 0; k < 5; k++) s[k] += w * terms[k];
+                    for (size_t k = 0; k < 3; k++) g[k] += w * slopes[k * n + at];
+                }
+            if (pass) {
+                gradient[i] = -(g[0] + 2.0 * x[i] * g[1] + t[i] * g[2]) / (double)n;
+                continue;
+            }
+            const double a1 = 2.0 * s[0] * s[1] + 1e-4, a2 = 2.0 * (s[4] - s[0] * s[1]) + 9e-4;
+            const double b1 = s[0] * s[0] + s[1] * s[1] + 1e-4, b2 = s[2] - s[0] * s[0] + s[3] - s[1] * s[1] + 9e-4;
+            const double m = a1 * a2 / (b1 * b2), e = -m / b2, f = 2.0 * a1 / (b1 * b2);
+            slopes[i] = 2.0 * s[1] * a2 / (b1 * b2) - 2.0 * s[0] * m / b1 - 2.0 * s[0] * e - s[1] * f;
+            slopes[n + i] = e;
+            slopes[2 * n + i] = f;
+            ssim += m / (double)n;
+        }
+    free(slopes);
+    return ssim;
+}
+
+// SSIM takes small variances from large squares. Gradients are within `tolerance` of the largest one: where both images
+// are flat it is C2 = 9e-4 that float32 squares of about 1 are held against. Three bands of rows, the last ones in any
+// order by any worker: the same bits.
+static void test_loss_accuracy(gsf_cpu_level level) {
+    enum { W = 37, H = 141, N = 3 * W * H };
+    static const struct { const char* name; double ssim, tolerance; } cases[] = {
+        {"noise", 1e-7, 1e-6},
+        {"smooth", 1e-6, 2e-4},
+        {"bright, little noise", 2e-6, 5e-4},
+        {"flat and bright", 1e-4, 2e-2}};
+    static float render[N], photo[N], d[N], other[N];
+    static double exact[N];
+    int workers = 3;
+    gsf_context plain, shuffled;
+    memset(&plain, 0, sizeof plain);
+    plain.cpu_level = level;
+    plain.threads = 1;
+    CHECK_OK(&plain, gsf_init_context(&plain));
+    memset(&shuffled, 0, sizeof shuffled);
+    shuffled.cpu_level = level;
+    shuffled.parallel.for_fn = for_backwards;
+    shuffled.parallel.worker_count = workers;
+    shuffled.parallel.user = &workers;
+    CHECK_OK(&shuffled, gsf_init_context(&shuffled));
+    gsf__loss_scratch scratch, another;
+    memset(&scratch, 0, sizeof scratch);
+    memset(&another, 0, sizeof another);
+    gsf__target target;
+    memset(&target, 0, sizeof target);
+    target.width = W;
+    target.height = H;
+    target.f32 = photo;
+    uint64_t state = 11;
+    for (int c = 0; c < 4; c++) {
+        for (int i = 0; i < N; i++) {
+            const double x = i / 3 % W, y = i / 3 / W, wave = 0.5 + 0.45 * sin(0.07 * x + i % 3) * cos(0.05 * y);
+            const double noise[2] = {test_random(&state), test_random(&state)};
+            photo[i] = (float)(c == 0 ? noise[0] : c == 1 ? wave : c == 2 ? 0.95 + 1e-3 * noise[0] : 0.97);
+            render[i] = (float)(c == 0 ? noise[1] : c == 1 ? wave + 0.03 * sin(0.11 * x + 0.04 * y)
+                                                  : c == 2 ? 0.95 + 1e-3 * noise[1] : 0.99);
+        }
+        const double ssim = exact_ssim(W, H, render, photo, exact);
+        gsf__loss_value value, again;
+        CHECK_OK(&plain, gsf__loss(&plain, &scratch, &target, render, 1.0f, 1.0f, d, &value));
+        CHECK_NEAR(value.ssim, ssim, cases[c].ssim);
+        test_compare_floats(cases[c].name, d, exact, N, cases[c].tolerance * test_max_abs(exact, N));
+        CHECK_OK(&shuffled, gsf__loss(&shuffled, &another, &target, render, 1.0f, 1.0f, other, &again));
+        CHECK(memcmp(d, other, sizeof d) == 0 && memcmp(&value, &again, sizeof value) == 0);
+    }
+    gsf__loss_destroy_scratch(&plain, &scratch);
+    gsf__loss_destroy_scratch(&shuffled, &another);
 }
 
 static void test_smoothness_derivative(gsf_context* ctx) {
@@ -545,11 +636,6 @@ static void test_settings(gsf_context* ctx, const scene* s) {
 
 // ---- determinism ---------------------------------------------------------------------
 
-static void for_backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
-    const int workers = *(const int*)user;
-    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)((i * 7 + 3) % (size_t)workers));
-}
-
 static void test_workers(const scene* s, gsf_cpu_level level) {
     gsf_text states[3];
     for (int run = 0; run < 3; run++) {
@@ -911,6 +997,8 @@ int main(void) {
     test_context_init(&ctx);
     scene s = make_scene(&ctx);
     test_loss_derivative(&ctx);
+    test_loss_accuracy(GSF_CPU_SCALAR);
+    if (ctx.cpu_level > GSF_CPU_SCALAR) test_loss_accuracy(ctx.cpu_level);
     test_smoothness_derivative(&ctx);
     test_adam_rejects(&ctx);
     test_adam_bands(&ctx);
