@@ -9066,7 +9066,7 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const 
 
 // Edge-aware smoothness of inverse depth: weight / (H W) times the sum over neighbouring pixels p, q (right and below)
 // of e_pq |D_p - D_q| with D = extent / depth and e_pq = 1 / (1 + (|t_p - t_q| / 0.1)^2), |.| the mean over RGB. Pairs in
-// which a pixel has no depth are left out. d_depth (H,W) is written.
+// which a pixel has no depth are left out. d_depth (H,W) is written. Scratch: as gsf__loss left it for this photo.
 typedef struct gsf__smooth_job {
     const gsf__target* target;
     const float* depth;
