@@ -406,6 +406,8 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     float opacity_decay;           // every opacity loses this share per iteration (applied every 10; Binocular3DGS: 0.005)
     float scale_penalty;           // weight of mean(exp(log_scale)) / extent
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
+    int32_t dense_adam;            // 0: the SH of splats that are not drawn catch up later with the same result but for
+                                   // rounding (1e-6); 1: all move in every step
     uint32_t _end_canary;
 } gsf_train_desc;
 
@@ -421,7 +423,7 @@ typedef struct gsf_trainer gsf_trainer;
 
 // The trainer copies views and splats (non-finite ones are left out). Steps are deterministic: same bits for any number of
 // workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored views
-// and their weight is above 0, one restored view: both gradients go into one Adam step (dense: unseen splats move by their
+// and their weight is above 0, one restored view: both gradients go into one Adam step (unseen splats, too, move by their
 // momentum). For densification the gradients of photos and of restored views are averaged apart, and the larger mean counts.
 // Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4 with a weight.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc,
@@ -443,7 +445,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_
                                                           const gsf_camera* camera, const gsf_render_output* out);
 // A copy of the current splats.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
-// The current splats, borrowed until the next step.
+// The current splats, borrowed until the next step or call of restore.
 GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer);
 // Adds the whole state as chunks / continues from it, bit-identically. Views and desc are the caller's to give again (in any
 // order; a difference is only a warning); the restored views' weight is part of the state. `chunks` of restore is a whole
@@ -6439,6 +6441,11 @@ struct gsf_rasterizer {
     int32_t width, height, tiles_x, tiles_y, sh_bands;
     size_t splat_count;
     int has_depth;
+
+    // The trainer's (lazy Adam), else NULL: called before the SH of splats that are about to be drawn are read, a bit of
+    // `splats` for each of first, first + 1, ... Splats of different chunks may be woken at the same time.
+    void (*wake)(void* user, size_t first, uint32_t splats);
+    void* wake_user;
 };
 
 GSF_API gsf_result gsf_splat_make_rasterizer(gsf_context* ctx, gsf_rasterizer** out) {
@@ -6767,7 +6774,7 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 
 typedef enum gsf__show { GSF__CULLED, GSF__TOO_FAINT, GSF__DRAWN } gsf__show;
 
-// Fills the record of splat i. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled, for the official
+// Fills the record of splat i but for its colour. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled, for the official
 // footprint, where such a splat still has a radius (and counts as a visit in densification).
 static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) {
     gsf__projection p;
@@ -6796,13 +6803,16 @@ static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splat
     rec->h1 = (1.0f / p.cov_c) / conic_a;
     rec->reach_x = sqrtf(t2 * p.cov_a);
     rec->depth = p.t[2];
+    return isfinite(rec->kx + rec->ee + rec->h0 + rec->h1 + rec->reach_x) ? GSF__DRAWN : GSF__CULLED;
+}
+
+static int gsf__color_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) { // finite?
     float rgb[3];
     gsf__splat_color(view, splats, i, rgb);
     rec->r = rgb[0] > 0.0f ? rgb[0] : 0.0f;
     rec->g = rgb[1] > 0.0f ? rgb[1] : 0.0f;
     rec->b = rgb[2] > 0.0f ? rgb[2] : 0.0f;
-    const float sum = rec->kx + rec->ee + rec->h0 + rec->h1 + rec->reach_x + rgb[0] + rgb[1] + rgb[2];
-    return isfinite(sum) ? GSF__DRAWN : GSF__CULLED;
+    return isfinite(rgb[0] + rgb[1] + rgb[2]);
 }
 
 #if GSF__X86
@@ -7117,6 +7127,7 @@ GSF__TARGET_AVX2 static void gsf__records_avx2(gsf_rasterizer* r, const gsf__vie
         for (size_t l = 0; l < count; l++) r->radii[i + l] = r->records[i + l].radius = 0;
         return;
     }
+    if (r->wake) r->wake(r->wake_user, i, (uint32_t)_mm256_movemask_ps(drawn) & ((1u << count) - 1));
     gsf__colors8(view, splats, i, lane, rgb);
     for (int c = 0; c < 3; c++) row[8 + c] = _mm256_max_ps(rgb[c], zero);
     __m256 sum = rgb[0] + rgb[1] + rgb[2] + row[0] + row[1];
@@ -7173,8 +7184,13 @@ static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
         gsf__record* rec = r->records + i;
         const gsf__show show =
             job->hidden && job->hidden[i] ? GSF__CULLED : gsf__make_record(job->view, job->splats, i, rec);
-        const int kept = show == GSF__DRAWN || (show == GSF__TOO_FAINT && job->view->official_footprint);
-        r->radii[i] = kept && gsf__meets_image(r, job->view, rec) ? rec->radius : 0;
+        int kept = show == GSF__DRAWN || (show == GSF__TOO_FAINT && job->view->official_footprint);
+        kept = kept && gsf__meets_image(r, job->view, rec);
+        if (kept && show == GSF__DRAWN) {
+            if (r->wake) r->wake(r->wake_user, i, 1);
+            kept = gsf__color_record(job->view, job->splats, i, rec);
+        }
+        r->radii[i] = kept ? rec->radius : 0;
         rec->radius = show == GSF__DRAWN ? r->radii[i] : 0;
     }
 }
@@ -9128,14 +9144,19 @@ static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* s
 }
 
 // ---- >>adam --------------------------------------------------------------------
-// The parameters under training and Adam (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15 as 3DGS has them). Dense: a splat
-// that no view touched moves on by its momentum, as in the official code. One pass reads parameters, moments and
-// gradients, writes the first two and zeroes the gradients for the next step.
+// The parameters under training and Adam (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15 as 3DGS has them). A splat that no
+// view touched moves on by its momentum, as in the official code. One pass reads parameters, moments and gradients, writes
+// the first two and zeroes the gradients for the next step.
 //
-// Memory per splat of SH degree 3: 59 parameters x (value, first and second moment, gradient) + 32 bytes = 976 bytes.
+// The SH coefficients, 48 of 59 parameters, are lazy: those of a splat that is not drawn rest, and when it is drawn again
+// (or has rested for GSF__REST_MOST steps, or all are needed) they catch up with the steps in between, whose gradients were
+// zero, at once. All that decides what is drawn stays dense.
+//
+// Memory per splat of SH degree 3: 59 parameters x (value, first and second moment, gradient) + 41 bytes = 985 bytes.
 
 enum { GSF__MEANS = 0, GSF__SCALES, GSF__QUATS, GSF__OPACITY, GSF__SH, GSF__GROUPS };
 enum { GSF__MODEL_CHUNK = 512 }; // splats of one unit of parallel work
+enum { GSF__REST_MOST = 254, GSF__AWAKE = 255 }; // for gsf__model.rest
 
 typedef struct gsf__group { // one parameter tensor (count, width)
     size_t width;
@@ -9152,6 +9173,8 @@ typedef struct gsf__model {
     float* screen[2];        // (count,2) gradient of the pixel mean in this step's photo and restored view
     uint8_t* seen[2];        // visible there?
     uint8_t* hidden;         // dropped out of this render
+    uint8_t* rest;           // Adam steps that the SH are behind; GSF__AWAKE: none, and drawn in this step
+    struct gsf__lazy* lazy;  // how SH catch up after the last step; NULL: all SH take part in every step
     uint8_t* action;         // densification: gsf__densify_action
     uint32_t* rejected;      // per chunk: values neutralised in this step
     void* block;             // all of the above
@@ -9188,6 +9211,7 @@ static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block)
     for (int i = 0; i < 2; i++) GSF__PLACE(model->screen[i], float, 2 * capacity);
     for (int i = 0; i < 2; i++) GSF__PLACE(model->seen[i], uint8_t, capacity);
     GSF__PLACE(model->hidden, uint8_t, capacity);
+    GSF__PLACE(model->rest, uint8_t, capacity);
     GSF__PLACE(model->action, uint8_t, capacity);
     GSF__PLACE(model->rejected, uint32_t, gsf__model_chunks(capacity));
 #undef GSF__PLACE
@@ -9224,6 +9248,7 @@ static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t
             memcpy(grown.seen[i], model->seen[i], n);
         }
         memcpy(grown.hidden, model->hidden, n);
+        memcpy(grown.rest, model->rest, n);
         memcpy(grown.action, model->action, n);
     }
     gsf_free(ctx, model->block);
@@ -9256,14 +9281,31 @@ typedef struct gsf__adam_rates { // learning rates of one step
 
 enum { GSF__ADAM_PERIOD = 384 }; // floats in which the pattern of rates repeats: 8 rows of (16,3)
 
+typedef uint32_t (*gsf__adam_update_fn)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
+                                        const float* rates, size_t period, float inv_correction2);
+
+typedef struct gsf__rest { // what n steps without a gradient do to a value, and how the first of them was taken
+    float drift, eps;      // the value falls by rate * drift * m / (sqrt(v) + eps)
+    float decay1, decay2;  // m and v are multiplied by these
+    float rate, inv_correction2;
+} gsf__rest;
+
+typedef struct gsf__lazy { // after step t: how to catch up
+    gsf__model* model;
+    gsf__adam_update_fn update;
+    int (*catch_up)(float* value, float* m, float* v, size_t n, const float* rates, const gsf__rest* rest);
+    size_t active_sh;
+    float rates[48];                      // of an SH row
+    gsf__rest rests[GSF__REST_MOST + 1];  // by the number of steps, the last of which was step t; none of 0
+} gsf__lazy;
+
 typedef struct gsf__adam_job {
     gsf__model* model;
     float inv_correction2;           // 1 / sqrt(1 - beta2^t)
     size_t active_sh;                // floats of an SH row that can be non-zero
     float rates[4];                  // of the other groups, divided by 1 - beta1^t
     float sh_rates[GSF__ADAM_PERIOD];
-    uint32_t (*update)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
-                       const float* rates, size_t period, float inv_correction2);
+    gsf__adam_update_fn update;
 } gsf__adam_job;
 
 #define GSF__ADAM_EPS 1e-15f
@@ -9355,6 +9397,169 @@ GSF__TARGET_AVX2 static uint32_t gsf__adam_update_avx2(float* value, float* m, f
 }
 #endif
 
+/* Catching up. Step j with a zero gradient: m *= b1, v *= b2, value -= rate m / (c1_j (sqrt(v) / c2_j + eps)), where
+   c1_j = 1 - b1^j and c2_j = sqrt(1 - b2^j). With m and v of before the n steps, the k-th of them (j = t - n + k) takes
+       rate m / sqrt(v) * q^k c2_j / c1_j / (1 + x_k eps / sqrt(v)),   q = b1 / sqrt(b2),   x_k = c2_j b2^(-k/2).
+   Where eps is small beside sqrt(v), x_k may be replaced by its mean with the weights q^k c2_j / c1_j: the error is of second
+   order. So all values need two sums, drift = sum(q^k c2_j / c1_j) and eps = eps sum(q^k c2_j / c1_j x_k) / drift, by n
+   for a given t. With the first step taken out, the rest is the same sum for n - 1 steps, times q: one pass makes them all,
+   from t backwards. A row where eps is not small takes the steps one by one. */
+#define GSF__LAZY_LEAST_V 1e-24f // sqrt(v) is 1000 eps: the second order is below 1e-7
+
+// Returns 0, with nothing changed, where a step is to be taken that eps counts in.
+static int gsf__lazy_catch_up_ref(float* value, float* m, float* v, size_t n, const float* rates, const gsf__rest* rest) {
+    for (size_t i = 0; i < n; i++)
+        if (m[i] != 0.0f && !(v[i] >= GSF__LAZY_LEAST_V)) return 0;
+    for (size_t i = 0; i < n; i++) {
+        const float next = value[i] - rates[i] * rest->drift * (m[i] / (sqrtf(v[i]) + rest->eps));
+        if (fabsf(next) <= FLT_MAX) value[i] = next;
+        const float mi = m[i] * rest->decay1, vi = v[i] * rest->decay2;
+        m[i] = fabsf(mi) < GSF__ADAM_TINY_M ? 0.0f : mi;
+        v[i] = vi < GSF__ADAM_TINY_V ? 0.0f : vi;
+    }
+    return 1;
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static int gsf__lazy_catch_up_avx2(float* value, float* m, float* v, size_t n, const float* rates,
+                                                    const gsf__rest* rest) {
+    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff)), zero = _mm256_setzero_ps();
+    __m256i lanes[6];
+    __m256 small = zero;
+    size_t vectors = 0;
+    for (size_t i = 0; i < n; i += 8, vectors++) {
+        lanes[vectors] = i + 8 <= n ? _mm256_set1_epi32(-1) : gsf__avx2_lanes(n - i);
+        const __m256 mi = _mm256_maskload_ps(m + i, lanes[vectors]), vi = _mm256_maskload_ps(v + i, lanes[vectors]);
+        small = _mm256_or_ps(small, _mm256_and_ps(_mm256_cmp_ps(mi, zero, _CMP_NEQ_UQ),
+                                                  _mm256_cmp_ps(vi, _mm256_set1_ps(GSF__LAZY_LEAST_V), _CMP_NGE_UQ)));
+    }
+    if (_mm256_movemask_ps(small)) return 0;
+    for (size_t k = 0; k < vectors; k++) {
+        const size_t i = 8 * k;
+        const __m256 old = _mm256_maskload_ps(value + i, lanes[k]), rate = _mm256_loadu_ps(rates + i);
+        __m256 mi = _mm256_maskload_ps(m + i, lanes[k]), vi = _mm256_maskload_ps(v + i, lanes[k]);
+        const __m256 root = _mm256_add_ps(_mm256_sqrt_ps(vi), _mm256_set1_ps(rest->eps));
+        const __m256 next = _mm256_fnmadd_ps(_mm256_mul_ps(rate, _mm256_set1_ps(rest->drift)), _mm256_div_ps(mi, root), old);
+        const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
+        mi = _mm256_mul_ps(mi, _mm256_set1_ps(rest->decay1));
+        vi = _mm256_mul_ps(vi, _mm256_set1_ps(rest->decay2));
+        mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), _mm256_set1_ps(GSF__ADAM_TINY_M), _CMP_GE_OQ));
+        vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, _mm256_set1_ps(GSF__ADAM_TINY_V), _CMP_GE_OQ));
+        _mm256_maskstore_ps(value + i, lanes[k], _mm256_blendv_ps(old, next, kept));
+        _mm256_maskstore_ps(m + i, lanes[k], mi);
+        _mm256_maskstore_ps(v + i, lanes[k], vi);
+    }
+    return 1;
+}
+#endif
+
+// For rows as they are after step t; the rates of SH are the same in all steps.
+static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* model, const gsf__adam_rates* rates,
+                              int32_t t, int32_t sh_bands) {
+    lazy->model = model;
+    lazy->active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
+    for (int i = 0; i < 48; i++) lazy->rates[i] = (float)(i < 3 ? rates->sh_dc : rates->sh_rest);
+    lazy->update = gsf__adam_update_ref;
+    lazy->catch_up = gsf__lazy_catch_up_ref;
+#if GSF__X86
+    if (level >= GSF_CPU_AVX2) {
+        lazy->update = gsf__adam_update_avx2;
+        lazy->catch_up = gsf__lazy_catch_up_avx2;
+    }
+#endif
+    (void)level;
+    memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
+    const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // as the updates multiply
+    double power1 = pow(0.9, t), power2 = pow(0.999, t), decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
+    for (int32_t n = 1; n <= GSF__REST_MOST && n <= t; n++) {
+        gsf__rest* rest = &lazy->rests[n];
+        const double c1 = 1.0 - power1, c2 = sqrt(1.0 - power2);
+        power1 /= 0.9;
+        power2 /= 0.999;
+        drift = b1 / root2 * (c2 / c1 + drift);
+        scaled = b1 / b2 * (c2 * c2 / c1 + scaled);
+        rest->drift = (float)drift;
+        rest->eps = (float)((double)GSF__ADAM_EPS * scaled / drift);
+        rest->decay1 = (float)(decay1 *= b1);
+        rest->decay2 = (float)(decay2 *= b2);
+        rest->rate = (float)(1.0 / c1);
+        rest->inv_correction2 = (float)(1.0 / c2);
+    }
+}
+
+static void gsf__lazy_catch_up_row(const gsf__lazy* lazy, float* value, float* m, float* v, size_t rest) {
+    if (lazy->catch_up(value, m, v, lazy->active_sh, lazy->rates, &lazy->rests[rest])) return;
+    for (; rest > 0; rest--) {
+        float rates[48], grad[48];
+        memset(grad, 0, sizeof grad);
+        for (int i = 0; i < 48; i++) rates[i] = lazy->rates[i] * lazy->rests[rest].rate;
+        (void)lazy->update(value, m, v, grad, 1, 0, lazy->active_sh, rates, 48, lazy->rests[rest].inv_correction2);
+    }
+}
+
+static void gsf__lazy_catch_up_splat(const gsf__lazy* lazy, size_t i) {
+    const gsf__group* sh = &lazy->model->groups[GSF__SH];
+    const size_t at = i * sh->width;
+    gsf__lazy_catch_up_row(lazy, sh->value + at, sh->m + at, sh->v + at, lazy->model->rest[i]);
+    lazy->model->rest[i] = 0;
+}
+
+static void gsf__lazy_wake(void* user, size_t first, uint32_t splats) { // for gsf_rasterizer.wake
+    const gsf__lazy* lazy = (const gsf__lazy*)user;
+    uint8_t* rest = lazy->model->rest + first;
+    for (size_t i = 0; splats; i++, splats >>= 1) {
+        if (!(splats & 1u) || rest[i] == GSF__AWAKE) continue;
+        if (rest[i]) gsf__lazy_catch_up_splat(lazy, first + i);
+        rest[i] = GSF__AWAKE;
+    }
+}
+
+static void gsf__lazy_all_chunk(void* arg, size_t chunk, int worker) { // all of the chunk catch up
+    const gsf__lazy* lazy = (const gsf__lazy*)arg;
+    (void)worker;
+    const size_t end = gsf__model_chunk_end(lazy->model->count, chunk);
+    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
+        if (lazy->model->rest[i]) gsf__lazy_catch_up_splat(lazy, i);
+}
+
+static void gsf__lazy_show_chunk(void* arg, size_t chunk, int worker) { // caught-up SH to where the gradients were; see trainer
+    const gsf__lazy* lazy = (const gsf__lazy*)arg;
+    const gsf__group* sh = &lazy->model->groups[GSF__SH];
+    const size_t row = sh->width * sizeof(float), end = gsf__model_chunk_end(lazy->model->count, chunk);
+    (void)worker;
+    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
+        float m[48], v[48], *shown = sh->grad + i * sh->width;
+        memcpy(shown, sh->value + i * sh->width, row);
+        if (!lazy->model->rest[i]) continue;
+        memcpy(m, sh->m + i * sh->width, row);
+        memcpy(v, sh->v + i * sh->width, row);
+        gsf__lazy_catch_up_row(lazy, shown, m, v, lazy->model->rest[i]);
+    }
+}
+
+// The SH of a chunk in a lazy step: runs of drawn splats are updated, the others rest.
+static uint32_t gsf__adam_lazy_sh(const gsf__adam_job* job, size_t begin, size_t end) {
+    const gsf__group* sh = &job->model->groups[GSF__SH];
+    const size_t width = sh->width;
+    uint8_t* rest = job->model->rest;
+    uint32_t rejected = 0;
+    while (begin < end) {
+        size_t run = begin;
+        for (; run < end && rest[run] == GSF__AWAKE; run++) rest[run] = 0;
+        const size_t at = begin * width, rows = run - begin;
+        if (job->active_sh < width)
+            rejected += job->update(sh->value + at, sh->m + at, sh->v + at, sh->grad + at, rows, width, job->active_sh,
+                                    job->sh_rates, 8 * width, job->inv_correction2);
+        else if (rows)
+            rejected += job->update(sh->value + at, sh->m + at, sh->v + at, sh->grad + at, 1, 0, rows * width,
+                                    job->sh_rates, 8 * width, job->inv_correction2);
+        for (; run < end && rest[run] != GSF__AWAKE; run++)
+            if (++rest[run] == GSF__REST_MOST) gsf__lazy_catch_up_splat(job->model->lazy, run);
+        begin = run;
+    }
+    return rejected;
+}
+
 static void gsf__adam_chunk(void* arg, size_t chunk, int worker) {
     const gsf__adam_job* job = (const gsf__adam_job*)arg;
     gsf__model* model = job->model;
@@ -9362,7 +9567,8 @@ static void gsf__adam_chunk(void* arg, size_t chunk, int worker) {
     const size_t begin = chunk * GSF__MODEL_CHUNK;
     const size_t rows = gsf__model_chunk_end(model->count, chunk) - begin;
     uint32_t rejected = 0;
-    for (int g = 0; g < GSF__GROUPS; g++) {
+    if (model->lazy) rejected = gsf__adam_lazy_sh(job, begin, begin + rows);
+    for (int g = 0; g < GSF__GROUPS - (model->lazy != NULL); g++) {
         const gsf__group* group = &model->groups[g];
         const size_t width = group->width, at = begin * width;
         float constant[8];
@@ -9380,7 +9586,8 @@ static void gsf__adam_chunk(void* arg, size_t chunk, int worker) {
 }
 
 // One Adam step, the t-th (from 1). sh_bands: bands with a gradient so far; the moments of the others are zero, so leaving
-// them out is exact. Returns the number of values neutralised.
+// them out is exact. Lazy models: only splats that are GSF__AWAKE may have a gradient of their SH. Returns the number of
+// values neutralised.
 static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__adam_rates* rates, int32_t t,
                              int32_t sh_bands) {
     gsf__adam_job job;
@@ -9400,6 +9607,7 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
 #if GSF__X86
     if (ctx->cpu_level >= GSF_CPU_AVX2) job.update = gsf__adam_update_avx2;
 #endif
+    if (model->lazy) gsf__lazy_prepare(ctx->cpu_level, model->lazy, model, rates, t, sh_bands);
     const size_t chunks = gsf__model_chunks(model->count);
     gsf__parallel_for(ctx, chunks, gsf__adam_chunk, &job);
     size_t rejected = 0;
@@ -9613,7 +9821,10 @@ struct gsf_trainer {
     gsf_rasterizer* rasterizer;
     float *color, *d_color, *depth, *d_depth; // packed images of the step
     size_t color_capacity, d_color_capacity, depth_capacity, d_depth_capacity;
-    gsf_splats view;         // the model as splats
+    gsf_splats view;         // the model as splats; SH of resting splats are behind
+    gsf__lazy lazy;          // where the model points, unless desc.dense_adam
+    gsf_splats shown;        // the view with all SH caught up, if shows
+    int shows;
     int32_t iteration;       // steps done
     int32_t first_bands;     // SH bands that the initial splats already use
     uint64_t restored_steps;
@@ -9791,6 +10002,7 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"opacity_decay", (double)d->opacity_decay, 0, 0.5},
         {"scale_penalty", (double)d->scale_penalty, 0, 1e6},
         {"depth_smoothness", (double)d->depth_smoothness, 0, 1e6},
+        {"dense_adam", (double)d->dense_adam, 0, 1},
     };
     for (size_t i = 0; i < GSF__COUNT(fields); i++)
         if (!(fields[i].value >= fields[i].low && fields[i].value <= fields[i].high))
@@ -9941,6 +10153,32 @@ static gsf_result gsf__trainer_reserve_images(gsf_context* ctx, gsf_trainer* tra
     return gsf__loss_reserve(ctx, &trainer->loss, set->max_width, set->max_height);
 }
 
+static int32_t gsf__trainer_bands(const gsf_trainer* trainer, int32_t iteration) {
+    const int32_t grown = iteration / trainer->desc.sh_interval + 1, all = trainer->model.sh_degree + 1;
+    const int32_t bands = grown > trainer->first_bands ? grown : trainer->first_bands;
+    return bands < all ? bands : all;
+}
+
+static gsf__adam_rates gsf__trainer_rates(const gsf_trainer* trainer, int32_t iteration) {
+    const gsf_train_desc* d = &trainer->desc;
+    gsf__adam_rates rates;
+    rates.means = gsf__exponential_rate(iteration, (double)d->lr_means * (double)d->extent,
+                                        (double)d->lr_means_final * (double)d->extent, d->lr_means_delay_steps,
+                                        (double)d->lr_means_delay, d->iterations);
+    rates.scales = (double)d->lr_scales;
+    rates.quats = (double)d->lr_quats;
+    rates.opacity = (double)d->lr_opacity;
+    rates.sh_dc = (double)d->lr_sh_dc;
+    rates.sh_rest = (double)d->lr_sh_rest;
+    return rates;
+}
+
+static void gsf__trainer_prepare_lazy(const gsf_context* ctx, gsf_trainer* trainer) { // for the iterations done
+    const gsf__adam_rates rates = gsf__trainer_rates(trainer, trainer->iteration);
+    gsf__lazy_prepare(ctx->cpu_level, &trainer->lazy, &trainer->model, &rates, trainer->iteration,
+                      gsf__trainer_bands(trainer, trainer->iteration));
+}
+
 static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
                                      size_t view_count, const gsf_splats* initial) {
     const int near_given = trainer->desc.render.near_plane != 0.0f;
@@ -9955,6 +10193,8 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     }
     GSF__TRY(gsf__trainer_reserve_images(ctx, trainer, &trainer->photos));
     gsf__trainer_refresh_view(trainer);
+    gsf__trainer_prepare_lazy(ctx, trainer);
+    if (!trainer->desc.dense_adam) trainer->model.lazy = &trainer->lazy;
     return gsf_splat_make_rasterizer(ctx, &trainer->rasterizer);
 }
 
@@ -10045,14 +10285,30 @@ static void gsf__decay_chunk(void* arg, size_t chunk, int worker) {
             logits[i] = (float)(log(job->factor) - log(exp(-(double)logits[i]) + 1.0 - job->factor));
 }
 
-static int32_t gsf__trainer_bands(const gsf_trainer* trainer, int32_t iteration) {
-    const int32_t grown = iteration / trainer->desc.sh_interval + 1, all = trainer->model.sh_degree + 1;
-    const int32_t bands = grown > trainer->first_bands ? grown : trainer->first_bands;
-    return bands < all ? bands : all;
-}
-
 static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are statistics needed?
     return iteration < trainer->desc.densify_until;
+}
+
+/* The splats with all SH caught up, for everyone but the trainer. That must not change the state, or a run would depend (in
+   its rounding) on who looked when; so the SH are shown where their gradients are in a step, which are zero between steps.
+   ctx NULL: by the calling thread. */
+static const gsf_splats* gsf__trainer_show(gsf_context* ctx, gsf_trainer* trainer) {
+    gsf__model* model = &trainer->model;
+    if (!model->lazy) return &trainer->view;
+    if (trainer->shows) return &trainer->shown;
+    const size_t chunks = gsf__model_chunks(model->count);
+    if (ctx) gsf__parallel_for(ctx, chunks, gsf__lazy_show_chunk, model->lazy);
+    for (size_t i = 0; !ctx && i < chunks; i++) gsf__lazy_show_chunk(model->lazy, i, 0);
+    trainer->shown = trainer->view;
+    trainer->shown.sh = model->groups[GSF__SH].grad;
+    trainer->shows = 1;
+    return &trainer->shown;
+}
+
+static void gsf__trainer_hide(gsf_trainer* trainer) { // before the gradients are needed
+    const gsf__group* sh = &trainer->model.groups[GSF__SH];
+    if (trainer->shows && trainer->model.count) memset(sh->grad, 0, trainer->model.count * sh->width * sizeof(float));
+    trainer->shows = 0;
 }
 
 // Renders one photo, and adds the gradient of its loss times `scale`. which: 0 photo, 1 restored view.
@@ -10079,7 +10335,11 @@ static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf_
     out.color = gsf_wrap_image(trainer->color, GSF_F32, width, height, 3);
     const int smooth = d->depth_smoothness > 0.0f;
     if (smooth) out.depth = gsf_wrap_image(trainer->depth, GSF_F32, width, height, 1);
-    GSF__TRY(gsf_splat_render(ctx, trainer->rasterizer, &trainer->view, &photo->camera, &render, &out));
+    trainer->rasterizer->wake = model->lazy ? gsf__lazy_wake : NULL;
+    trainer->rasterizer->wake_user = model->lazy;
+    const gsf_result rendered = gsf_splat_render(ctx, trainer->rasterizer, &trainer->view, &photo->camera, &render, &out);
+    trainer->rasterizer->wake = NULL;
+    if (rendered != GSF_OK) return rendered;
     GSF__TRY(gsf__loss(ctx, &trainer->loss, &photo->target, trainer->color, d->lambda_ssim, scale, trainer->d_color,
                        value));
     if (smooth)
@@ -10148,6 +10408,8 @@ static void gsf__trainer_clear_gradients(gsf_trainer* trainer) {
     for (int g = 0; g < GSF__GROUPS; g++)
         memset(model->groups[g].grad, 0, model->count * model->groups[g].width * sizeof(float));
     for (int k = 0; k < 2; k++) memset(model->screen[k], 0, 2 * model->count * sizeof(float));
+    for (size_t i = 0; i < model->count; i++)
+        if (model->rest[i] == GSF__AWAKE) model->rest[i] = 0;
 }
 
 static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration) {
@@ -10160,15 +10422,7 @@ static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t 
         job.factor = (float)((double)d->scale_penalty / (3.0 * (double)model->count * (double)d->extent));
         gsf__parallel_for(ctx, chunks, gsf__scale_chunk, &job);
     }
-    gsf__adam_rates rates;
-    rates.means = gsf__exponential_rate(iteration, (double)d->lr_means * (double)d->extent,
-                                        (double)d->lr_means_final * (double)d->extent, d->lr_means_delay_steps,
-                                        (double)d->lr_means_delay, d->iterations);
-    rates.scales = (double)d->lr_scales;
-    rates.quats = (double)d->lr_quats;
-    rates.opacity = (double)d->lr_opacity;
-    rates.sh_dc = (double)d->lr_sh_dc;
-    rates.sh_rest = (double)d->lr_sh_rest;
+    const gsf__adam_rates rates = gsf__trainer_rates(trainer, iteration);
     trainer->rejected += gsf__adam_step(ctx, model, &rates, iteration, gsf__trainer_bands(trainer, iteration));
     if (d->opacity_decay > 0.0f && iteration % GSF__DECAY_INTERVAL == 0) {
         gsf__decay_job job;
@@ -10188,6 +10442,7 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: all %d iterations are done", (int)d->iterations);
     GSF__TRY(gsf__check_cancel(ctx));
 
+    gsf__trainer_hide(trainer);
     const int32_t iteration = trainer->iteration + 1;
     gsf__visit_job visits;
     memset(&visits, 0, sizeof visits);
@@ -10208,6 +10463,7 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
     gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__visit_chunk, &visits);
     gsf__trainer_update(ctx, trainer, iteration);
     if (densify) {
+        if (model->lazy) gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__lazy_all_chunk, model->lazy);
         const gsf__densify_rule rule = gsf__trainer_rule(trainer, iteration);
         size_t clones, splits;
         gsf__densify_select(model, &rule, &clones, &splits);
@@ -10233,6 +10489,7 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
 //     "TV0 ".."TV4 ", "TM0 ".., "TS0 .."   value, first and second moment of means, log-scales, quats, opacities, SH
 //     "TIDS"                               ids
 //     "TGRD", "TVIS", "TGRR", "TVIR"       densification sums and visits, of photos and of restored views
+//     "TRST"                               u8: steps that the SH are behind
 enum { GSF__STATE_SIZE = 24 + 4 * 8 + 3 * 8 };
 #define GSF__BYTE_ORDER_MARK 0x01020304u
 
@@ -10249,7 +10506,7 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
         (double)d->render.footprint, (double)d->render.gradient, (double)d->render.antialiased,
         (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
         (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
-        (double)d->densify_absolute, (double)trainer->photos.count};
+        (double)d->densify_absolute, (double)d->dense_adam, (double)trainer->photos.count};
     uint64_t hash = 0;
     for (size_t i = 0; i < GSF__COUNT(values); i++) {
         uint64_t bits;
@@ -10271,13 +10528,14 @@ static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void*
         *row = group->width * sizeof(float);
         return 1;
     }
-    void* const rest[] = {model->ids, model->grad_sum[0], model->visits[0], model->grad_sum[1], model->visits[1]};
-    const char* const tags[] = {"TIDS", "TGRD", "TVIS", "TGRR", "TVIR"};
+    void* const rest[] = {model->ids, model->grad_sum[0], model->visits[0], model->grad_sum[1], model->visits[1],
+                          model->rest};
+    const char* const tags[] = {"TIDS", "TGRD", "TVIS", "TGRR", "TVIR", "TRST"};
     i -= 3 * GSF__GROUPS;
     if (i >= (int)GSF__COUNT(rest)) return 0;
     memcpy(tag, tags[i], 5);
     *data = rest[i];
-    *row = 4;
+    *row = rest[i] == model->rest ? 1 : 4;
     return 1;
 }
 
@@ -10310,14 +10568,18 @@ GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer
         gsf_chunks_add(ctx, chunks, tag, data, model->count * row);
 }
 
-// Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids.
+// Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids, and no
+// SH further behind than it can be.
 static gsf_result gsf__trainer_check_array(gsf_context* ctx, const char* name, int i, const gsf_chunk* chunk,
-                                           size_t count, size_t row, uint32_t next_id) {
+                                           size_t count, size_t row, uint32_t next_id, uint64_t iteration) {
     if (chunk->size != count * row)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s has %zu bytes, expected %zu", name, chunk->tag, chunk->size,
                         count * row);
     const char* p = (const char*)chunk->data;
-    for (size_t k = 0; k < chunk->size / 4; k++) {
+    for (size_t k = 0; k < count && row == 1; k++)
+        if ((unsigned char)p[k] >= GSF__REST_MOST || (unsigned char)p[k] > iteration)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s: bad value at %zu", name, chunk->tag, k);
+    for (size_t k = 0; k < chunk->size / 4 && row != 1; k++) {
         uint32_t bits;
         float value;
         memcpy(&bits, p + 4 * k, 4);
@@ -10365,10 +10627,11 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++) {
         if (!gsf_chunks_find(chunks, size, tag, &chunk))
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s is missing", name, tag);
-        GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id));
+        GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id, iteration));
     }
     GSF__TRY(gsf__model_reserve(ctx, model, (size_t)count));
 
+    gsf__trainer_hide(trainer);
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
         if (gsf_chunks_find(chunks, size, tag, &chunk) && chunk.size) memcpy(data, chunk.data, chunk.size);
     model->count = (size_t)count;
@@ -10380,6 +10643,8 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     trainer->restored_steps = gsf__load_le(state + 32, 8);
     trainer->rejected = (size_t)gsf__load_le(state + 40, 8);
     gsf__trainer_refresh_view(trainer);
+    gsf__trainer_prepare_lazy(ctx, trainer);
+    if (!model->lazy) gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__lazy_all_chunk, &trainer->lazy);
     if (gsf__load_le(state + 48, 8) != gsf__trainer_settings(trainer))
         gsf_log(ctx, GSF_LOG_WARNING, "%s: continues with other settings or views than it was written with", name);
     return GSF_OK;
@@ -10437,11 +10702,11 @@ GSF_API gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_trainer* train
                                             const gsf_render_output* out) {
     gsf_render_desc render = trainer->desc.render;
     render.sh_bands = gsf__trainer_bands(trainer, trainer->iteration);
-    return gsf_splat_render(ctx, trainer->rasterizer, &trainer->view, camera, &render, out);
+    return gsf_splat_render(ctx, trainer->rasterizer, gsf__trainer_show(ctx, trainer), camera, &render, out);
 }
 
 GSF_API gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out) {
-    const gsf_splats* view = &trainer->view;
+    const gsf_splats* view = gsf__trainer_show(ctx, (gsf_trainer*)trainer);
     GSF__TRY(gsf_splat_make(ctx, view->count, view->sh_degree, out));
     const size_t n = view->count, sh = 3 * (size_t)gsf_splat_sh_count(view->sh_degree);
     memcpy(out->origin, view->origin, sizeof out->origin);
@@ -10455,7 +10720,9 @@ GSF_API gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer*
     return GSF_OK;
 }
 
-GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) { return &trainer->view; }
+GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) {
+    return gsf__trainer_show(NULL, (gsf_trainer*)trainer);
+}
 
 // ---- >>warp --------------------------------------------------------------------
 
