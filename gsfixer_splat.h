@@ -9400,10 +9400,10 @@ GSF__TARGET_AVX2 static uint32_t gsf__adam_update_avx2(float* value, float* m, f
 /* Catching up. Step j with a zero gradient: m *= b1, v *= b2, value -= rate m / (c1_j (sqrt(v) / c2_j + eps)), where
    c1_j = 1 - b1^j and c2_j = sqrt(1 - b2^j). With m and v of before the n steps, the k-th of them (j = t - n + k) takes
        rate m / sqrt(v) * q^k c2_j / c1_j / (1 + x_k eps / sqrt(v)),   q = b1 / sqrt(b2),   x_k = c2_j b2^(-k/2).
-   Where eps is small beside sqrt(v), x_k may be replaced by its mean with the weights q^k c2_j / c1_j: the error is of second
-   order. So all values need two sums, drift = sum(q^k c2_j / c1_j) and eps = eps sum(q^k c2_j / c1_j x_k) / drift, by n
-   for a given t. With the first step taken out, the rest is the same sum for n - 1 steps, times q: one pass makes them all,
-   from t backwards. A row where eps is not small takes the steps one by one. */
+   Where eps is small beside sqrt(v), x_k may be replaced by its mean with the weights q^k c2_j / c1_j: the error is of
+   second order. So all values need two sums, drift = sum(q^k c2_j / c1_j) and eps sum(q^k c2_j / c1_j x_k) / drift, for the
+   given t and n. With its first step taken out such a sum is the one for n - 1, times q: one pass makes those of all n. A
+   row where eps is not small takes the steps one by one. */
 #define GSF__LAZY_LEAST_V 1e-24f // sqrt(v) is 1000 eps: the second order is below 1e-7
 
 // Returns 0, with nothing changed, where a step is to be taken that eps counts in.
@@ -9439,7 +9439,8 @@ GSF__TARGET_AVX2 static int gsf__lazy_catch_up_avx2(float* value, float* m, floa
         const __m256 old = _mm256_maskload_ps(value + i, lanes[k]), rate = _mm256_loadu_ps(rates + i);
         __m256 mi = _mm256_maskload_ps(m + i, lanes[k]), vi = _mm256_maskload_ps(v + i, lanes[k]);
         const __m256 root = _mm256_add_ps(_mm256_sqrt_ps(vi), _mm256_set1_ps(rest->eps));
-        const __m256 next = _mm256_fnmadd_ps(_mm256_mul_ps(rate, _mm256_set1_ps(rest->drift)), _mm256_div_ps(mi, root), old);
+        const __m256 reach = _mm256_mul_ps(rate, _mm256_set1_ps(rest->drift));
+        const __m256 next = _mm256_fnmadd_ps(reach, _mm256_div_ps(mi, root), old);
         const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
         mi = _mm256_mul_ps(mi, _mm256_set1_ps(rest->decay1));
         vi = _mm256_mul_ps(vi, _mm256_set1_ps(rest->decay2));
@@ -9522,7 +9523,8 @@ static void gsf__lazy_all_chunk(void* arg, size_t chunk, int worker) { // all of
         if (lazy->model->rest[i]) gsf__lazy_catch_up_splat(lazy, i);
 }
 
-static void gsf__lazy_show_chunk(void* arg, size_t chunk, int worker) { // caught-up SH to where the gradients were; see trainer
+// Puts what the SH are, caught up, where their gradients are in a step.
+static void gsf__lazy_show_chunk(void* arg, size_t chunk, int worker) {
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     const gsf__group* sh = &lazy->model->groups[GSF__SH];
     const size_t row = sh->width * sizeof(float), end = gsf__model_chunk_end(lazy->model->count, chunk);

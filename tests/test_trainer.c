@@ -259,6 +259,85 @@ static void test_adam_bands(gsf_context* ctx) { // leaving out bands that never 
         }
 }
 
+static double relative(float actual, double expected) { // a value around zero: to 0.2
+    return fabs((double)actual - expected) / fmax(fabs(expected), 0.2);
+}
+
+// SH rows that rest for 1 to 500 steps against rows that take part in every one, both with the same gradients, of sizes
+// from far below eps on; as values are when their splat is drawn and at the end. Also the dense model in double.
+static void test_lazy_adam(gsf_context* ctx) {
+    enum { COUNT = 96, STEPS = 1000, WIDE = 48 };
+    gsf__model dense = make_model(ctx, COUNT, 3), lazy = make_model(ctx, COUNT, 3);
+    gsf__lazy state;
+    const gsf__adam_rates rates = {1e-3, 5e-3, 1e-3, 0.025, 2.5e-3, 1.25e-4};
+    gsf__lazy_prepare(ctx->cpu_level, &state, &lazy, &rates, 0, 1);
+    lazy.lazy = &state;
+    gsf__group *a = &dense.groups[GSF__SH], *b = &lazy.groups[GSF__SH];
+    double* exact = (double*)calloc(3 * COUNT * WIDE, sizeof(double));
+    double *m = exact + COUNT * WIDE, *v = m + COUNT * WIDE;
+    for (size_t i = 0; i < COUNT * WIDE; i++) exact[i] = (double)a->value[i];
+    int left[COUNT], longest = 0, replayed = 0;
+    int drawn[COUNT];
+    uint64_t random = 31;
+    double worst = 0.0, sum[3] = {0.0, 0.0, 0.0}, total = 0.0, worst_exact[2] = {0.0, 0.0};
+    for (int i = 0; i < COUNT; i++) left[i] = i % 7, drawn[i] = i % 2;
+    for (int32_t t = 1; t <= STEPS; t++) {
+        const int32_t bands = 1 + t / 150 < 4 ? 1 + t / 150 : 4;
+        for (size_t i = 0; i < COUNT; i++) {
+            if (left[i]-- <= 0) { // rests of 1 to 500 steps, short ones oftener; drawn for 1 to 20
+                drawn[i] = !drawn[i];
+                left[i] = (int)exp(test_random_in(&random, 0.0, drawn[i] ? log(20.0) : log(500.9))) - 1;
+                if (!drawn[i] && left[i] + 1 > longest) longest = left[i] + 1;
+            }
+            if (!drawn[i]) continue;
+            const double size = pow(10.0, i < 64 ? -(double)(i % 8) - 1.0 : -(double)(i % 16) - 6.0);
+            const size_t at = i * WIDE;
+            for (size_t k = 0; k < WIDE; k++)
+                replayed += lazy.rest[i] && b->m[at + k] != 0.0f && b->v[at + k] < GSF__LAZY_LEAST_V;
+            gsf__lazy_wake(&state, i, 1u);
+            for (size_t k = 0; k < WIDE; k++) {
+                worst = fmax(worst, relative(b->value[at + k], (double)a->value[at + k]));
+                if ((int32_t)k < 3 * bands * bands)
+                    a->grad[at + k] = b->grad[at + k] = (float)(size * test_random_in(&random, -0.7, 1.0));
+            }
+        }
+        for (size_t k = 0; k < 4 * COUNT; k++)
+            dense.groups[GSF__QUATS].grad[k] = lazy.groups[GSF__QUATS].grad[k] = sinf((float)(t + (int)k));
+        const double c1 = 1.0 - pow(0.9, t), c2 = sqrt(1.0 - pow(0.999, t));
+        for (size_t i = 0; i < COUNT * WIDE; i++) {
+            const double g = (double)a->grad[i], rate = i % WIDE < 3 ? rates.sh_dc : rates.sh_rest;
+            m[i] += (g - m[i]) * (double)0.1f;
+            v[i] = v[i] * (double)0.999f + g * g * (double)0.001f;
+            exact[i] -= rate / c1 * m[i] / (sqrt(v[i]) / c2 + 1e-15);
+        }
+        CHECK(gsf__adam_step(ctx, &dense, &rates, t, bands) == 0);
+        CHECK(gsf__adam_step(ctx, &lazy, &rates, t, bands) == 0);
+    }
+    gsf__parallel_for(ctx, gsf__model_chunks(COUNT), gsf__lazy_all_chunk, &state);
+    for (size_t i = 0; i < COUNT * WIDE; i++) {
+        const double x = (double)a->value[i], y = (double)b->value[i];
+        worst = fmax(worst, relative(b->value[i], x));
+        worst_exact[0] = fmax(worst_exact[0], relative(a->value[i], exact[i]));
+        worst_exact[1] = fmax(worst_exact[1], relative(b->value[i], exact[i]));
+        sum[0] += (y - x) * (y - x);
+        sum[1] += (x - exact[i]) * (x - exact[i]);
+        sum[2] += (y - exact[i]) * (y - exact[i]);
+        total += exact[i] * exact[i];
+    }
+    printf("lazy Adam (%s): rel L2 %.2g, worst %.2g against dense; against double: dense %.2g, %.2g, lazy %.2g, %.2g\n",
+           gsf_cpu_level_name(ctx->cpu_level), sqrt(sum[0] / total), worst, sqrt(sum[1] / total), worst_exact[0],
+           sqrt(sum[2] / total), worst_exact[1]);
+    CHECK(longest > 400 && replayed > 100);
+    CHECK(sqrt(sum[0] / total) < 1e-6 && sum[0] > 0.0);
+    CHECK(sum[2] < sum[1] && worst_exact[1] < 1.1 * worst_exact[0]); // what differs is the rounding of the dense steps
+    CHECK(worst < 5e-6);
+    CHECK(memcmp(dense.groups[GSF__QUATS].value, lazy.groups[GSF__QUATS].value, 4 * COUNT * sizeof(float)) == 0);
+    for (size_t i = 0; i < COUNT; i++) CHECK(lazy.rest[i] == 0);
+    free(exact);
+    gsf__model_destroy(ctx, &dense);
+    gsf__model_destroy(ctx, &lazy);
+}
+
 static void test_regularisers(gsf_context* ctx) {
     double worst = 0.0;
     for (float x = -86.0f; x < 88.0f; x += 0.0137f)
@@ -728,7 +807,7 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
         {"TRNR", 0, 0x04030201}, {"TRNR", 4, 61},         {"TRNR", 8, 2},          {"TRNR", 16, 0},
         {"TRNR", 16, 5},         {"TRNR", 20, 0x7fc00000}, {"TRNR", 24, 3},        {"TRNR", 28, 1},
         {"TRNR", 12, 1},         {"TRNR", 60, 0x7ff00000}, {"TV0 ", 4, 0x7f800000}, {"TM4 ", 0, 0x7fc00000},
-        {"TS2 ", 8, 0xbf800000}, {"TIDS", 4, 0xffffffff}, {"TGRD", 0, 0xff800000}};
+        {"TS2 ", 8, 0xbf800000}, {"TIDS", 4, 0xffffffff}, {"TGRD", 0, 0xff800000}, {"TRST", 1, 4}};
     for (size_t k = 0; k <= sizeof lies / sizeof *lies; k++) {
         gsf_text lie;
         memset(&lie, 0, sizeof lie);
@@ -743,7 +822,7 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
             char* copy = (char*)malloc(chunk.size);
             memcpy(copy, chunk.data, chunk.size);
             if (k < sizeof lies / sizeof *lies && strcmp(tag, lies[k].tag) == 0)
-                memcpy(copy + lies[k].offset, &lies[k].value, 4);
+                memcpy(copy + lies[k].offset, &lies[k].value, strcmp(tag, "TRST") ? 4 : 1); // (its low byte)
             gsf_chunks_add(ctx, &lie, tag, copy, chunk.size);
             free(copy);
         }
@@ -758,6 +837,135 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
     gsf_destroy_text(ctx, &same);
     gsf_destroy_text(ctx, &state);
     gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// Views so narrow that each sees a part of the splats.
+enum { LAZY_STEPS = 400 };
+static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int dense_adam) {
+    gsf_train_view views[VIEWS + 2];
+    for (int v = 0; v < VIEWS + 2; v++) {
+        views[v] = s->views[v];
+        views[v].camera.fx *= 4.0;
+        views[v].camera.fy *= 4.0;
+    }
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = LAZY_STEPS;
+    desc.sh_interval = 100;
+    desc.densify_from = 20;
+    desc.densify_until = 120;
+    desc.densify_interval = 50;
+    desc.dropout = 0.1f;
+    desc.dense_adam = dense_adam;
+    gsf_trainer* trainer = NULL;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, VIEWS, &s->start, &trainer))) exit(2);
+    CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, views + VIEWS, 1));
+    return trainer;
+}
+
+static float* export_sh(gsf_context* ctx, const gsf_trainer* trainer, size_t* count) {
+    gsf_splats splats;
+    CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &splats));
+    const gsf_splats* same = gsf_splat_trainer_splats(trainer);
+    *count = splats.count * 3 * (size_t)gsf_splat_sh_count(splats.sh_degree);
+    CHECK(same->count == splats.count && memcmp(same->sh, splats.sh, *count * sizeof(float)) == 0);
+    float* sh = (float*)malloc(*count * sizeof(float));
+    memcpy(sh, splats.sh, *count * sizeof(float));
+    gsf_splat_destroy(ctx, &splats);
+    return sh;
+}
+
+// Lazy training gives what dense training gives; with any workers, when it is looked at, and when it is continued from a
+// checkpoint, it gives the same bits.
+static void test_lazy_training(const scene* s, gsf_cpu_level level) {
+    gsf_context ctx, other;
+    int workers = 5;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.threads = 1;
+    ctx.cpu_level = level;
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    memset(&other, 0, sizeof other);
+    other.cpu_level = level;
+    other.parallel.for_fn = for_backwards;
+    other.parallel.worker_count = workers;
+    other.parallel.user = &workers;
+    CHECK_OK(&other, gsf_init_context(&other));
+
+    gsf_trainer *dense = make_narrow(&ctx, s, 1), *lazy = make_narrow(&ctx, s, 0), *watched = make_narrow(&other, s, 0);
+    size_t rests = 0, longest = 0, drawn = 0, n, dense_n;
+    gsf_text middle;
+    memset(&middle, 0, sizeof middle);
+    for (int i = 0; i < LAZY_STEPS; i++) {
+        gsf_train_stats a, b;
+        CHECK_OK(&ctx, gsf_splat_train_step(&ctx, dense, &a));
+        CHECK_OK(&ctx, gsf_splat_train_step(&ctx, lazy, &b));
+        CHECK_OK(&other, gsf_splat_train_step(&other, watched, NULL));
+        if (!CHECK(a.splats == b.splats)) break;
+        CHECK_NEAR(b.loss, a.loss, 1e-3 * a.loss);
+        for (size_t k = 0; k < lazy->model.count; k++) {
+            rests += lazy->model.rest[k] > 0;
+            drawn += lazy->model.rest[k] == 0;
+            if (lazy->model.rest[k] > longest) longest = lazy->model.rest[k];
+        }
+        if (i % 37 == 5) free(export_sh(&other, watched, &n));
+        if (i % 41 == 7) {
+            float pixels[WIDTH * HEIGHT * 3], exported[WIDTH * HEIGHT * 3];
+            gsf_render_output out;
+            memset(&out, 0, sizeof out);
+            out.color = gsf_wrap_image(pixels, GSF_F32, WIDTH, HEIGHT, 3);
+            CHECK_OK(&other, gsf_splat_trainer_render(&other, watched, &s->views[1].camera, &out));
+            gsf_splats splats;
+            CHECK_OK(&other, gsf_splat_trainer_export(&other, watched, &splats));
+            gsf_render_desc desc = watched->desc.render;
+            desc.sh_bands = gsf__trainer_bands(watched, watched->iteration);
+            out.color = gsf_wrap_image(exported, GSF_F32, WIDTH, HEIGHT, 3);
+            CHECK_OK(&other, gsf_splat_render(&other, watched->rasterizer, &splats, &s->views[1].camera, &desc, &out));
+            CHECK(memcmp(pixels, exported, sizeof pixels) == 0);
+            gsf_splat_destroy(&other, &splats);
+        }
+        if (i == LAZY_STEPS / 2 + 3) middle = save_state(&other, watched);
+    }
+    float *a = export_sh(&ctx, dense, &dense_n), *b = export_sh(&ctx, lazy, &n);
+    double sum = 0.0, total = 0.0;
+    if (CHECK(n == dense_n))
+        for (size_t i = 0; i < n; i++) {
+            sum += ((double)b[i] - (double)a[i]) * ((double)b[i] - (double)a[i]);
+            total += (double)a[i] * (double)a[i];
+        }
+    printf("lazy training (%s): %zu splats, %.0f %% of them at rest in a step, for up to %zu steps; SH differ by %.2g\n",
+           gsf_cpu_level_name(level), lazy->model.count, 100.0 * (double)rests / (double)(rests + drawn), longest,
+           sqrt(sum / total));
+    CHECK(rests > drawn / 4 && longest > 100 && sqrt(sum / total) < 1e-3);
+
+    gsf_text end = save_state(&ctx, lazy), seen = save_state(&other, watched), resumed, again;
+    CHECK(same_text(&end, &seen));
+    gsf_trainer* late = make_narrow(&ctx, s, 0);
+    (void)gsf_splat_trainer_splats(late); // shown, then replaced
+    CHECK_OK(&ctx, gsf_splat_trainer_restore(&ctx, late, "middle", middle.data, middle.size));
+    again = save_state(&ctx, late);
+    CHECK(same_text(&middle, &again));
+    take_steps(&ctx, late, LAZY_STEPS / 2 - 4);
+    resumed = save_state(&ctx, late);
+    CHECK(same_text(&end, &resumed));
+    gsf_splat_destroy_trainer(&ctx, late);
+
+    late = make_narrow(&ctx, s, 1); // a dense run takes over
+    CHECK_OK(&ctx, gsf_splat_trainer_restore(&ctx, late, "end", end.data, end.size));
+    free(a);
+    a = export_sh(&ctx, late, &dense_n);
+    CHECK(dense_n == n && memcmp(a, b, n * sizeof(float)) == 0);
+    size_t behind = 0;
+    for (size_t k = 0; k < late->model.count; k++) behind += late->model.rest[k] != 0;
+    CHECK(behind == 0);
+    gsf_splat_destroy_trainer(&ctx, late);
+
+    free(a);
+    free(b);
+    gsf_text* const texts[] = {&middle, &end, &seen, &resumed, &again};
+    for (size_t i = 0; i < sizeof texts / sizeof *texts; i++) gsf_destroy_text(&ctx, texts[i]);
+    gsf_splat_destroy_trainer(&ctx, dense);
+    gsf_splat_destroy_trainer(&ctx, lazy);
+    gsf_splat_destroy_trainer(&other, watched);
 }
 
 // ---- bad input ---------------------------------------------------------------------------
@@ -1002,6 +1210,13 @@ int main(void) {
     test_smoothness_derivative(&ctx);
     test_adam_rejects(&ctx);
     test_adam_bands(&ctx);
+    for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) {
+        gsf_context one;
+        test_context_zero(&one);
+        one.cpu_level = (gsf_cpu_level)level;
+        CHECK_OK(&one, gsf_init_context(&one));
+        test_lazy_adam(&one);
+    }
     test_regularisers(&ctx);
     test_cap(&ctx);
     test_learns(&ctx, &s);
@@ -1010,6 +1225,7 @@ int main(void) {
     test_restored_gradient(&ctx, &s);
     test_settings(&ctx, &s);
     test_workers(&s, ctx.cpu_level);
+    for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_lazy_training(&s, (gsf_cpu_level)level);
     test_resume(&ctx, &s);
     test_damaged_checkpoints(&ctx, &s);
     test_bad_input(&ctx, &s);
