@@ -6442,9 +6442,9 @@ struct gsf_rasterizer {
     size_t splat_count;
     int has_depth;
 
-    // The trainer's (lazy Adam), else NULL: called before the SH of splats that are about to be drawn are read, a bit of
-    // `splats` for each of first, first + 1, ... Splats of different chunks may be woken at the same time.
-    void (*wake)(void* user, size_t first, uint32_t splats);
+    // The trainer's (lazy Adam), else NULL: called before the SH of `splat`, and of those after it up to the next multiple
+    // of 8, are read to draw some of them. Splats of different chunks may be woken at the same time.
+    void (*wake)(void* user, size_t splat);
     void* wake_user;
 };
 
@@ -7127,7 +7127,7 @@ GSF__TARGET_AVX2 static void gsf__records_avx2(gsf_rasterizer* r, const gsf__vie
         for (size_t l = 0; l < count; l++) r->radii[i + l] = r->records[i + l].radius = 0;
         return;
     }
-    if (r->wake) r->wake(r->wake_user, i, (uint32_t)_mm256_movemask_ps(drawn) & ((1u << count) - 1));
+    if (r->wake) r->wake(r->wake_user, i);
     gsf__colors8(view, splats, i, lane, rgb);
     for (int c = 0; c < 3; c++) row[8 + c] = _mm256_max_ps(rgb[c], zero);
     __m256 sum = rgb[0] + rgb[1] + rgb[2] + row[0] + row[1];
@@ -7187,7 +7187,7 @@ static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
         int kept = show == GSF__DRAWN || (show == GSF__TOO_FAINT && job->view->official_footprint);
         kept = kept && gsf__meets_image(r, job->view, rec);
         if (kept && show == GSF__DRAWN) {
-            if (r->wake) r->wake(r->wake_user, i, 1);
+            if (r->wake) r->wake(r->wake_user, i);
             kept = gsf__color_record(job->view, job->splats, i, rec);
         }
         r->radii[i] = kept ? rec->radius : 0;
@@ -9148,15 +9148,20 @@ static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* s
 // view touched moves on by its momentum, as in the official code. One pass reads parameters, moments and gradients, writes
 // the first two and zeroes the gradients for the next step.
 //
-// The SH coefficients, 48 of 59 parameters, are lazy: those of a splat that is not drawn rest, and when it is drawn again
-// (or has rested for GSF__REST_MOST steps, or all are needed) they catch up with the steps in between, whose gradients were
-// zero, at once. All that decides what is drawn stays dense.
+// The SH coefficients, 48 of 59 parameters, are lazy: those of a block of splats none of which is drawn rest, and when one
+// is drawn again (or the block has rested for GSF__REST_MOST steps, or all are needed) they catch up with the steps in
+// between, whose gradients were zero, at once. All that decides what is drawn stays dense. In blocks, because rows here and
+// there cost as much memory traffic as all of them.
 //
-// Memory per splat of SH degree 3: 59 parameters x (value, first and second moment, gradient) + 41 bytes = 985 bytes.
+// Memory per splat of SH degree 3: 59 parameters x (value, first and second moment, gradient) + 40 bytes = 984 bytes.
 
 enum { GSF__MEANS = 0, GSF__SCALES, GSF__QUATS, GSF__OPACITY, GSF__SH, GSF__GROUPS };
 enum { GSF__MODEL_CHUNK = 512 }; // splats of one unit of parallel work
-enum { GSF__REST_MOST = 254, GSF__AWAKE = 255 }; // for gsf__model.rest
+enum {
+    GSF__BLOCK = 32,       // splats that rest together; of a chunk here and in the projection a whole number
+    GSF__REST_MOST = 254,  // steps
+    GSF__AWAKE = 255,      // in gsf__model.rest: has no step to catch up with, and is drawn in this one
+};
 
 typedef struct gsf__group { // one parameter tensor (count, width)
     size_t width;
@@ -9173,7 +9178,7 @@ typedef struct gsf__model {
     float* screen[2];        // (count,2) gradient of the pixel mean in this step's photo and restored view
     uint8_t* seen[2];        // visible there?
     uint8_t* hidden;         // dropped out of this render
-    uint8_t* rest;           // Adam steps that the SH are behind; GSF__AWAKE: none, and drawn in this step
+    uint8_t* rest;           // per block: Adam steps that the SH are behind, or GSF__AWAKE
     struct gsf__lazy* lazy;  // how SH catch up after the last step; NULL: all SH take part in every step
     uint8_t* action;         // densification: gsf__densify_action
     uint32_t* rejected;      // per chunk: values neutralised in this step
@@ -9182,6 +9187,8 @@ typedef struct gsf__model {
 } gsf__model;
 
 static size_t gsf__model_chunks(size_t count) { return (count + GSF__MODEL_CHUNK - 1) / GSF__MODEL_CHUNK; }
+
+static size_t gsf__model_blocks(size_t count) { return (count + GSF__BLOCK - 1) / GSF__BLOCK; }
 
 static size_t gsf__model_chunk_end(size_t count, size_t chunk) {
     const size_t end = (chunk + 1) * GSF__MODEL_CHUNK;
@@ -9211,7 +9218,7 @@ static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block)
     for (int i = 0; i < 2; i++) GSF__PLACE(model->screen[i], float, 2 * capacity);
     for (int i = 0; i < 2; i++) GSF__PLACE(model->seen[i], uint8_t, capacity);
     GSF__PLACE(model->hidden, uint8_t, capacity);
-    GSF__PLACE(model->rest, uint8_t, capacity);
+    GSF__PLACE(model->rest, uint8_t, gsf__model_blocks(capacity));
     GSF__PLACE(model->action, uint8_t, capacity);
     GSF__PLACE(model->rejected, uint32_t, gsf__model_chunks(capacity));
 #undef GSF__PLACE
@@ -9248,7 +9255,7 @@ static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t
             memcpy(grown.seen[i], model->seen[i], n);
         }
         memcpy(grown.hidden, model->hidden, n);
-        memcpy(grown.rest, model->rest, n);
+        memcpy(grown.rest, model->rest, gsf__model_blocks(n));
         memcpy(grown.action, model->action, n);
     }
     gsf_free(ctx, model->block);
@@ -9421,35 +9428,50 @@ static int gsf__lazy_catch_up_ref(float* value, float* m, float* v, size_t n, co
 }
 
 #if GSF__X86
+// One vector of eight, as gsf__adam_vector_avx2. Masked accesses are slow on some processors.
+GSF__TARGET_AVX2 static inline void gsf__lazy_vector_avx2(float* value, float* m, float* v, __m256 rate,
+                                                          const gsf__rest* rest, const __m256i* lanes) {
+    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
+    const __m256 old = lanes ? _mm256_maskload_ps(value, *lanes) : _mm256_loadu_ps(value);
+    __m256 mi = lanes ? _mm256_maskload_ps(m, *lanes) : _mm256_loadu_ps(m);
+    __m256 vi = lanes ? _mm256_maskload_ps(v, *lanes) : _mm256_loadu_ps(v);
+    const __m256 root = _mm256_add_ps(_mm256_sqrt_ps(vi), _mm256_set1_ps(rest->eps));
+    const __m256 reach = _mm256_mul_ps(rate, _mm256_set1_ps(rest->drift));
+    const __m256 next = _mm256_fnmadd_ps(reach, _mm256_div_ps(mi, root), old);
+    const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
+    const __m256 chosen = _mm256_blendv_ps(old, next, kept);
+    mi = _mm256_mul_ps(mi, _mm256_set1_ps(rest->decay1));
+    vi = _mm256_mul_ps(vi, _mm256_set1_ps(rest->decay2));
+    mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), _mm256_set1_ps(GSF__ADAM_TINY_M), _CMP_GE_OQ));
+    vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, _mm256_set1_ps(GSF__ADAM_TINY_V), _CMP_GE_OQ));
+    if (lanes) {
+        _mm256_maskstore_ps(value, *lanes, chosen);
+        _mm256_maskstore_ps(m, *lanes, mi);
+        _mm256_maskstore_ps(v, *lanes, vi);
+    } else {
+        _mm256_storeu_ps(value, chosen);
+        _mm256_storeu_ps(m, mi);
+        _mm256_storeu_ps(v, vi);
+    }
+}
+
 GSF__TARGET_AVX2 static int gsf__lazy_catch_up_avx2(float* value, float* m, float* v, size_t n, const float* rates,
                                                     const gsf__rest* rest) {
-    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff)), zero = _mm256_setzero_ps();
-    __m256i lanes[6];
+    const __m256 zero = _mm256_setzero_ps(), least = _mm256_set1_ps(GSF__LAZY_LEAST_V);
+    const size_t whole = n & ~(size_t)7;
+    const __m256i lanes = gsf__avx2_lanes(n - whole);
     __m256 small = zero;
-    size_t vectors = 0;
-    for (size_t i = 0; i < n; i += 8, vectors++) {
-        lanes[vectors] = i + 8 <= n ? _mm256_set1_epi32(-1) : gsf__avx2_lanes(n - i);
-        const __m256 mi = _mm256_maskload_ps(m + i, lanes[vectors]), vi = _mm256_maskload_ps(v + i, lanes[vectors]);
+    for (size_t i = 0; i < n; i += 8) {
+        const __m256 mi = i < whole ? _mm256_loadu_ps(m + i) : _mm256_maskload_ps(m + i, lanes);
+        const __m256 vi = i < whole ? _mm256_loadu_ps(v + i) : _mm256_maskload_ps(v + i, lanes);
         small = _mm256_or_ps(small, _mm256_and_ps(_mm256_cmp_ps(mi, zero, _CMP_NEQ_UQ),
-                                                  _mm256_cmp_ps(vi, _mm256_set1_ps(GSF__LAZY_LEAST_V), _CMP_NGE_UQ)));
+                                                  _mm256_cmp_ps(vi, least, _CMP_NGE_UQ)));
     }
     if (_mm256_movemask_ps(small)) return 0;
-    for (size_t k = 0; k < vectors; k++) {
-        const size_t i = 8 * k;
-        const __m256 old = _mm256_maskload_ps(value + i, lanes[k]), rate = _mm256_loadu_ps(rates + i);
-        __m256 mi = _mm256_maskload_ps(m + i, lanes[k]), vi = _mm256_maskload_ps(v + i, lanes[k]);
-        const __m256 root = _mm256_add_ps(_mm256_sqrt_ps(vi), _mm256_set1_ps(rest->eps));
-        const __m256 reach = _mm256_mul_ps(rate, _mm256_set1_ps(rest->drift));
-        const __m256 next = _mm256_fnmadd_ps(reach, _mm256_div_ps(mi, root), old);
-        const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
-        mi = _mm256_mul_ps(mi, _mm256_set1_ps(rest->decay1));
-        vi = _mm256_mul_ps(vi, _mm256_set1_ps(rest->decay2));
-        mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), _mm256_set1_ps(GSF__ADAM_TINY_M), _CMP_GE_OQ));
-        vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, _mm256_set1_ps(GSF__ADAM_TINY_V), _CMP_GE_OQ));
-        _mm256_maskstore_ps(value + i, lanes[k], _mm256_blendv_ps(old, next, kept));
-        _mm256_maskstore_ps(m + i, lanes[k], mi);
-        _mm256_maskstore_ps(v + i, lanes[k], vi);
-    }
+    for (size_t i = 0; i < whole; i += 8)
+        gsf__lazy_vector_avx2(value + i, m + i, v + i, _mm256_loadu_ps(rates + i), rest, NULL);
+    if (whole < n)
+        gsf__lazy_vector_avx2(value + whole, m + whole, v + whole, _mm256_loadu_ps(rates + whole), rest, &lanes);
     return 1;
 }
 #endif
@@ -9498,29 +9520,29 @@ static void gsf__lazy_catch_up_row(const gsf__lazy* lazy, float* value, float* m
     }
 }
 
-static void gsf__lazy_catch_up_splat(const gsf__lazy* lazy, size_t i) {
+static void gsf__lazy_catch_up_block(const gsf__lazy* lazy, size_t block) {
     const gsf__group* sh = &lazy->model->groups[GSF__SH];
-    const size_t at = i * sh->width;
-    gsf__lazy_catch_up_row(lazy, sh->value + at, sh->m + at, sh->v + at, lazy->model->rest[i]);
-    lazy->model->rest[i] = 0;
+    const size_t rest = lazy->model->rest[block], end = (block + 1) * GSF__BLOCK, count = lazy->model->count;
+    for (size_t i = block * GSF__BLOCK; rest && i < end && i < count; i++) {
+        const size_t at = i * sh->width;
+        gsf__lazy_catch_up_row(lazy, sh->value + at, sh->m + at, sh->v + at, rest);
+    }
+    lazy->model->rest[block] = 0;
 }
 
-static void gsf__lazy_wake(void* user, size_t first, uint32_t splats) { // for gsf_rasterizer.wake
+static void gsf__lazy_wake(void* user, size_t splat) { // for gsf_rasterizer.wake
     const gsf__lazy* lazy = (const gsf__lazy*)user;
-    uint8_t* rest = lazy->model->rest + first;
-    for (size_t i = 0; splats; i++, splats >>= 1) {
-        if (!(splats & 1u) || rest[i] == GSF__AWAKE) continue;
-        if (rest[i]) gsf__lazy_catch_up_splat(lazy, first + i);
-        rest[i] = GSF__AWAKE;
-    }
+    const size_t block = splat / GSF__BLOCK;
+    if (lazy->model->rest[block] == GSF__AWAKE) return;
+    gsf__lazy_catch_up_block(lazy, block);
+    lazy->model->rest[block] = GSF__AWAKE;
 }
 
 static void gsf__lazy_all_chunk(void* arg, size_t chunk, int worker) { // all of the chunk catch up
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     (void)worker;
-    const size_t end = gsf__model_chunk_end(lazy->model->count, chunk);
-    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
-        if (lazy->model->rest[i]) gsf__lazy_catch_up_splat(lazy, i);
+    const size_t end = gsf__model_blocks(gsf__model_chunk_end(lazy->model->count, chunk));
+    for (size_t b = chunk * (GSF__MODEL_CHUNK / GSF__BLOCK); b < end; b++) gsf__lazy_catch_up_block(lazy, b);
 }
 
 // Puts what the SH are, caught up, where their gradients are in a step.
@@ -9530,34 +9552,33 @@ static void gsf__lazy_show_chunk(void* arg, size_t chunk, int worker) {
     const size_t row = sh->width * sizeof(float), end = gsf__model_chunk_end(lazy->model->count, chunk);
     (void)worker;
     for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
+        const size_t rest = lazy->model->rest[i / GSF__BLOCK];
         float m[48], v[48], *shown = sh->grad + i * sh->width;
         memcpy(shown, sh->value + i * sh->width, row);
-        if (!lazy->model->rest[i]) continue;
+        if (!rest) continue;
         memcpy(m, sh->m + i * sh->width, row);
         memcpy(v, sh->v + i * sh->width, row);
-        gsf__lazy_catch_up_row(lazy, shown, m, v, lazy->model->rest[i]);
+        gsf__lazy_catch_up_row(lazy, shown, m, v, rest);
     }
 }
 
-// The SH of a chunk in a lazy step: runs of drawn splats are updated, the others rest.
+// The SH of splats begin to end - 1 in a lazy step: runs of awake blocks are updated, the others rest.
 static uint32_t gsf__adam_lazy_sh(const gsf__adam_job* job, size_t begin, size_t end) {
     const gsf__group* sh = &job->model->groups[GSF__SH];
-    const size_t width = sh->width;
+    const size_t width = sh->width, whole = job->active_sh == width, blocks = gsf__model_blocks(end);
     uint8_t* rest = job->model->rest;
     uint32_t rejected = 0;
-    while (begin < end) {
-        size_t run = begin;
-        for (; run < end && rest[run] == GSF__AWAKE; run++) rest[run] = 0;
-        const size_t at = begin * width, rows = run - begin;
-        if (job->active_sh < width)
-            rejected += job->update(sh->value + at, sh->m + at, sh->v + at, sh->grad + at, rows, width, job->active_sh,
-                                    job->sh_rates, 8 * width, job->inv_correction2);
-        else if (rows)
-            rejected += job->update(sh->value + at, sh->m + at, sh->v + at, sh->grad + at, 1, 0, rows * width,
-                                    job->sh_rates, 8 * width, job->inv_correction2);
-        for (; run < end && rest[run] != GSF__AWAKE; run++)
-            if (++rest[run] == GSF__REST_MOST) gsf__lazy_catch_up_splat(job->model->lazy, run);
-        begin = run;
+    for (size_t b = begin / GSF__BLOCK; b < blocks;) {
+        if (rest[b] != GSF__AWAKE) {
+            if (++rest[b] == GSF__REST_MOST) gsf__lazy_catch_up_block(job->model->lazy, b);
+            b++;
+            continue;
+        }
+        const size_t from = b * GSF__BLOCK;
+        for (; b < blocks && rest[b] == GSF__AWAKE; b++) rest[b] = 0;
+        const size_t at = from * width, rows = (b * GSF__BLOCK < end ? b * GSF__BLOCK : end) - from;
+        rejected += job->update(sh->value + at, sh->m + at, sh->v + at, sh->grad + at, whole ? 1 : rows, width,
+                                whole ? rows * width : job->active_sh, job->sh_rates, 8 * width, job->inv_correction2);
     }
     return rejected;
 }
@@ -9588,7 +9609,7 @@ static void gsf__adam_chunk(void* arg, size_t chunk, int worker) {
 }
 
 // One Adam step, the t-th (from 1). sh_bands: bands with a gradient so far; the moments of the others are zero, so leaving
-// them out is exact. Lazy models: only splats that are GSF__AWAKE may have a gradient of their SH. Returns the number of
+// them out is exact. Lazy models: only splats of GSF__AWAKE blocks may have a gradient of their SH. Returns the number of
 // values neutralised.
 static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__adam_rates* rates, int32_t t,
                              int32_t sh_bands) {
@@ -10410,8 +10431,8 @@ static void gsf__trainer_clear_gradients(gsf_trainer* trainer) {
     for (int g = 0; g < GSF__GROUPS; g++)
         memset(model->groups[g].grad, 0, model->count * model->groups[g].width * sizeof(float));
     for (int k = 0; k < 2; k++) memset(model->screen[k], 0, 2 * model->count * sizeof(float));
-    for (size_t i = 0; i < model->count; i++)
-        if (model->rest[i] == GSF__AWAKE) model->rest[i] = 0;
+    for (size_t b = 0; b < gsf__model_blocks(model->count); b++)
+        if (model->rest[b] == GSF__AWAKE) model->rest[b] = 0;
 }
 
 static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration) {
@@ -10491,7 +10512,7 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
 //     "TV0 ".."TV4 ", "TM0 ".., "TS0 .."   value, first and second moment of means, log-scales, quats, opacities, SH
 //     "TIDS"                               ids
 //     "TGRD", "TVIS", "TGRR", "TVIR"       densification sums and visits, of photos and of restored views
-//     "TRST"                               u8: steps that the SH are behind
+//     "TRST"                               u8 per block of 32 splats: steps that their SH are behind
 enum { GSF__STATE_SIZE = 24 + 4 * 8 + 3 * 8 };
 #define GSF__BYTE_ORDER_MARK 0x01020304u
 
@@ -10530,14 +10551,13 @@ static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void*
         *row = group->width * sizeof(float);
         return 1;
     }
-    void* const rest[] = {model->ids, model->grad_sum[0], model->visits[0], model->grad_sum[1], model->visits[1],
-                          model->rest};
-    const char* const tags[] = {"TIDS", "TGRD", "TVIS", "TGRR", "TVIR", "TRST"};
+    void* const rest[] = {model->ids, model->grad_sum[0], model->visits[0], model->grad_sum[1], model->visits[1]};
+    const char* const tags[] = {"TIDS", "TGRD", "TVIS", "TGRR", "TVIR"};
     i -= 3 * GSF__GROUPS;
     if (i >= (int)GSF__COUNT(rest)) return 0;
     memcpy(tag, tags[i], 5);
     *data = rest[i];
-    *row = rest[i] == model->rest ? 1 : 4;
+    *row = 4;
     return 1;
 }
 
@@ -10568,20 +10588,17 @@ GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer
     size_t row;
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
         gsf_chunks_add(ctx, chunks, tag, data, model->count * row);
+    gsf_chunks_add(ctx, chunks, "TRST", model->rest, gsf__model_blocks(model->count));
 }
 
-// Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids, and no
-// SH further behind than it can be.
+// Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids.
 static gsf_result gsf__trainer_check_array(gsf_context* ctx, const char* name, int i, const gsf_chunk* chunk,
-                                           size_t count, size_t row, uint32_t next_id, uint64_t iteration) {
+                                           size_t count, size_t row, uint32_t next_id) {
     if (chunk->size != count * row)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s has %zu bytes, expected %zu", name, chunk->tag, chunk->size,
                         count * row);
     const char* p = (const char*)chunk->data;
-    for (size_t k = 0; k < count && row == 1; k++)
-        if ((unsigned char)p[k] >= GSF__REST_MOST || (unsigned char)p[k] > iteration)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s: bad value at %zu", name, chunk->tag, k);
-    for (size_t k = 0; k < chunk->size / 4 && row != 1; k++) {
+    for (size_t k = 0; k < chunk->size / 4; k++) {
         uint32_t bits;
         float value;
         memcpy(&bits, p + 4 * k, 4);
@@ -10629,11 +10646,21 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++) {
         if (!gsf_chunks_find(chunks, size, tag, &chunk))
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s is missing", name, tag);
-        GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id, iteration));
+        GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id));
+    }
+    const size_t blocks = gsf__model_blocks((size_t)count);
+    if (!gsf_chunks_find(chunks, size, "TRST", &chunk) || chunk.size != blocks)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no chunk TRST of %zu bytes", name, blocks);
+    for (size_t b = 0; b < blocks; b++) {
+        const unsigned behind = ((const unsigned char*)chunk.data)[b];
+        if (behind >= GSF__REST_MOST || behind > iteration)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk TRST: bad value at %zu", name, b);
     }
     GSF__TRY(gsf__model_reserve(ctx, model, (size_t)count));
 
     gsf__trainer_hide(trainer);
+    memset(model->rest, 0, gsf__model_blocks(model->capacity));
+    if (blocks) memcpy(model->rest, chunk.data, blocks);
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
         if (gsf_chunks_find(chunks, size, tag, &chunk) && chunk.size) memcpy(data, chunk.data, chunk.size);
     model->count = (size_t)count;

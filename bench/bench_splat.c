@@ -560,6 +560,92 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     bench_close_pass(&ctx, &p);
 }
 
+// ---- lazy Adam --------------------------------------------------------------------
+
+// Training steps with dense and with lazy Adam in turns, on five views that see different parts of the splats where `zoom`
+// is above 1. What lazy Adam catches up with counts in the step, not in its Adam stage. The error is that of the SH against
+// the dense trainer's after all steps, relative to at least 0.2 and in L2.
+static void bench_lazy(const bench_options* o, const char* size_name, size_t count, double size, int width, int height,
+                       double zoom, int rounds, int threads) {
+    if (o->filter && !strstr("lazy: adam step", o->filter)) return;
+    enum { VIEWS = 5, MOST = 400 };
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.threads = threads;
+    bench_require(&ctx, gsf_init_context(&ctx));
+    gsf_splats splats;
+    bench_make_splats(&ctx, count, size, &splats);
+    gsf_train_view views[VIEWS];
+    memset(views, 0, sizeof views);
+    for (uint64_t v = 0; v < VIEWS; v++) {
+        gsf_camera* c = &views[v].camera;
+        *c = bench_camera(width, height);
+        c->fx *= zoom;
+        c->fy *= zoom;
+        c->cx += 0.25 * width * (zoom - 1.0) * ((double)v - 2.0);
+        bench_require(&ctx, gsf_make_image(&ctx, GSF_U8, width, height, 3, &views[v].image));
+        for (size_t i = 0; i < 3 * (size_t)width * (size_t)height; i++)
+            ((uint8_t*)views[v].image.data)[i] = (uint8_t)(gsf_random_bits(8, v, i) & 255u);
+    }
+    gsf_trainer* trainers[2]; // dense, lazy
+    for (int k = 0; k < 2; k++) {
+        gsf_train_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.densify_until = -1;
+        desc.sh_interval = 1;
+        desc.dense_adam = !k;
+        bench_require(&ctx, gsf_splat_make_trainer(&ctx, &desc, views, VIEWS, &splats, &trainers[k]));
+    }
+    double adam[2][MOST], step[2][MOST], cpu[2][2] = {{0.0, 0.0}, {0.0, 0.0}}, drawn = 0.0;
+    if (rounds > MOST) rounds = MOST;
+    for (int i = -2 * VIEWS; i < rounds; i++)
+        for (int turn = 0; turn < 2; turn++) {
+            const int k = turn ^ (i & 1); // none always comes first
+            gsf_trainer* trainer = trainers[k];
+            gsf__visit_job visits;
+            gsf_train_stats stats;
+            memset(&visits, 0, sizeof visits);
+            memset(&stats, 0, sizeof stats);
+            const double t0 = bench_now(), c0 = bench_cpu();
+            bench_require(&ctx, gsf__trainer_gradients(&ctx, trainer, trainer->iteration + 1, &visits, &stats));
+            const double t1 = bench_now(), c1 = bench_cpu();
+            gsf__trainer_update(&ctx, trainer, ++trainer->iteration);
+            if (i < 0) continue;
+            adam[k][i] = bench_now() - t1;
+            step[k][i] = bench_now() - t0;
+            cpu[k][0] += (bench_cpu() - c1) / rounds;
+            cpu[k][1] += (bench_cpu() - c0) / rounds;
+            for (size_t j = 0; k == 0 && j < count; j++) drawn += trainer->rasterizer->radii[j] > 0 ? 1.0 / rounds : 0.0;
+        }
+    const gsf_splats* shown[2] = {gsf_splat_trainer_splats(trainers[0]), gsf_splat_trainer_splats(trainers[1])};
+    double worst = 0.0, difference = 0.0, total = 0.0;
+    for (size_t i = 0; i < 48 * count; i++) {
+        const double a = (double)shown[0]->sh[i], d = (double)shown[1]->sh[i] - a;
+        worst = fmax(worst, fabs(d) / fmax(fabs(a), 0.2));
+        difference += d * d;
+        total += a * a;
+    }
+    for (int stage = 0; stage < 2; stage++)
+        for (int k = 0; k < 2; k++) {
+            char label[96];
+            snprintf(label, sizeof label, "lazy: %s %s, %.0f %% drawn", stage ? "step" : "adam", size_name,
+                     100.0 * drawn / (double)count);
+            bench_row row = bench_make_row(label, ctx.cpu_level, threads,
+                                           bench_median(stage ? step[k] : adam[k], (size_t)rounds), cpu[k][stage],
+                                           (double)count, "splats");
+            row.variant = k ? "lazy" : "dense";
+            row.reference = k ? "dense" : "none";
+            if (k) {
+                row.error_max = worst;
+                row.error_rel_l2 = sqrt(difference / total);
+            }
+            bench_print(o, &row);
+        }
+    for (int k = 0; k < 2; k++) gsf_splat_destroy_trainer(&ctx, trainers[k]);
+    for (int v = 0; v < VIEWS; v++) gsf_destroy_image(&ctx, &views[v].image);
+    gsf_splat_destroy(&ctx, &splats);
+}
+
 // ---- growth -----------------------------------------------------------------------
 
 // Render and backward of splats that shrink as their number grows, so that about as many lie over a pixel; `zoom` enlarges
@@ -776,6 +862,11 @@ int main(int argc, char** argv) {
             if (levels[k] > GSF_CPU_SCALAR)
                 bench_stages(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, levels[k], threads);
         }
+    for (int threads = 1; threads <= 2; threads++) {
+        if (o.threads && threads != o.threads) continue;
+        bench_lazy(&o, "10k 264x480", 10000, 0.03, 264, 480, 1.0, o.quick ? 20 : 100, threads);
+        if (!o.quick) bench_lazy(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, 2.0, 15, threads);
+    }
     bench_visibility(&o, "visibility 100k 20 views", 100000, 20, o.threads ? o.threads : 2);
     if (o.filter && !o.quick) bench_visibility(&o, "visibility 5M 100 views", 5000000, 100, o.threads ? o.threads : 2);
     return 0;
