@@ -562,11 +562,20 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
 
 // ---- lazy Adam --------------------------------------------------------------------
 
+static int bench_compare_place(const void* a, const void* b) { // by cells of 1/16, then along z
+    const float *p = (const float*)a, *q = (const float*)b;
+    for (int k = 0; k < 2; k++) {
+        const double x = floor(16.0 * (double)p[k]), y = floor(16.0 * (double)q[k]);
+        if (x != y) return x < y ? -1 : 1;
+    }
+    return (p[2] > q[2]) - (p[2] < q[2]);
+}
+
 // Training steps with dense and with lazy Adam in turns, on five views that see different parts of the splats where `zoom`
-// is above 1. What lazy Adam catches up with counts in the step, not in its Adam stage. The error is that of the SH against
+// is above 1. The splats lie in memory by their place, or at random. What lazy Adam catches up with counts in the step, not in its Adam stage. The error is that of the SH against
 // the dense trainer's after all steps, relative to at least 0.2 and in L2.
 static void bench_lazy(const bench_options* o, const char* size_name, size_t count, double size, int width, int height,
-                       double zoom, int rounds, int threads) {
+                       double zoom, int in_order, int rounds, int threads) {
     if (o->filter && !strstr("lazy: adam step", o->filter)) return;
     enum { VIEWS = 5, MOST = 400 };
     gsf_context ctx;
@@ -575,6 +584,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
     bench_require(&ctx, gsf_init_context(&ctx));
     gsf_splats splats;
     bench_make_splats(&ctx, count, size, &splats);
+    if (in_order) qsort(splats.means, count, 3 * sizeof(float), bench_compare_place);
     gsf_train_view views[VIEWS];
     memset(views, 0, sizeof views);
     for (uint64_t v = 0; v < VIEWS; v++) {
@@ -628,8 +638,8 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
     for (int stage = 0; stage < 2; stage++)
         for (int k = 0; k < 2; k++) {
             char label[96];
-            snprintf(label, sizeof label, "lazy: %s %s, %.0f %% drawn", stage ? "step" : "adam", size_name,
-                     100.0 * drawn / (double)count);
+            snprintf(label, sizeof label, "lazy: %s %s, %.0f %% drawn%s", stage ? "step" : "adam", size_name,
+                     100.0 * drawn / (double)count, in_order ? "" : ", shuffled");
             bench_row row = bench_make_row(label, ctx.cpu_level, threads,
                                            bench_median(stage ? step[k] : adam[k], (size_t)rounds), cpu[k][stage],
                                            (double)count, "splats");
@@ -864,8 +874,10 @@ int main(int argc, char** argv) {
         }
     for (int threads = 1; threads <= 2; threads++) {
         if (o.threads && threads != o.threads) continue;
-        bench_lazy(&o, "10k 264x480", 10000, 0.03, 264, 480, 1.0, o.quick ? 20 : 100, threads);
-        if (!o.quick) bench_lazy(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, 2.0, 15, threads);
+        bench_lazy(&o, "10k 264x480", 10000, 0.03, 264, 480, 1.0, 0, o.quick ? 20 : 100, threads);
+        for (int in_order = 1; in_order >= 0 && !o.quick; in_order--)
+            bench_lazy(&o, "1M 960x540", 1000000, 0.005, 960, 540, 2.0, in_order, 10, threads);
+        if (!o.quick) bench_lazy(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, 2.0, 1, 10, threads);
     }
     bench_visibility(&o, "visibility 100k 20 views", 100000, 20, o.threads ? o.threads : 2);
     if (o.filter && !o.quick) bench_visibility(&o, "visibility 5M 100 views", 5000000, 100, o.threads ? o.threads : 2);

@@ -63,6 +63,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"prune_opacity", SET_REAL, TRAIN_AT(prune_opacity)},
     {"prune_scale", SET_REAL, TRAIN_AT(prune_scale)},
     {"opacity_reset_interval", SET_WHOLE, TRAIN_AT(opacity_reset_interval)},
+    {"dense_adam", SET_SWITCH, TRAIN_AT(dense_adam)},
     {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased)},
     {"rounds", SET_WHOLE, FIX_AT(rounds)},
     {"first_round", SET_WHOLE, FIX_AT(first_round)},
