@@ -6774,8 +6774,8 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 
 typedef enum gsf__show { GSF__CULLED, GSF__TOO_FAINT, GSF__DRAWN } gsf__show;
 
-// Fills the record of splat i but for its colour. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled, for the official
-// footprint, where such a splat still has a radius (and counts as a visit in densification).
+// Fills the record of splat i but for its colour. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled,
+// for the official footprint, where such a splat still has a radius (and counts as a visit in densification).
 static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) {
     gsf__projection p;
     if (!gsf__project_splat(view, splats, i, &p)) return GSF__CULLED;
