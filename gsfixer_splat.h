@@ -7621,6 +7621,25 @@ GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
+// The row tests of eight list entries, ahead of the work on them, which then waits neither for a record to come from memory
+// nor for the tests. To be called for every entry i >= first in turn.
+enum { GSF__AHEAD = 8 };
+typedef struct gsf__row_tests { // by i % GSF__AHEAD
+    float center[GSF__AHEAD][GSF__STEPS], exponent[GSF__AHEAD][GSF__STEPS];
+    uint32_t mask[GSF__AHEAD];
+} gsf__row_tests;
+
+GSF__INLINE_AVX2 void gsf__rows_ahead_avx2(const gsf__tile* tile, size_t first, size_t i, gsf__row_tests* tests) {
+    if (i + 4 * GSF__AHEAD < tile->count)
+        _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4 * GSF__AHEAD].splat), _MM_HINT_T0);
+    if (i != first && i % GSF__AHEAD != 0) return;
+    const size_t next = (i / GSF__AHEAD + 1) * GSF__AHEAD, end = next < tile->count ? next : tile->count;
+    for (size_t k = i; k < end; k++) {
+        const size_t at = k % GSF__AHEAD;
+        tests->mask[at] = gsf__rows_avx2(tile->records + tile->pairs[k].splat, tile, tests->center[at], tests->exponent[at]);
+    }
+}
+
 // Alpha before the clamp at the steps of `mask`, 0 where it is below 1/255. Apart from the blending, whose chain of
 // operations through T is short, so that the long one here runs ahead of it.
 GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float center[GSF__STEPS],
@@ -7640,7 +7659,8 @@ GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float cente
 GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
     const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
-    float center[GSF__STEPS], exponent[GSF__STEPS], raws[GSF__TILE_PIXELS];
+    gsf__row_tests tests;
+    float raws[GSF__TILE_PIXELS];
     float ends[GSF__TILE_PIXELS]; // T of the finished pixels, as `state` has it
     int ended[GSF__STEPS];        // bits of them
     uint32_t live = 0;
@@ -7653,9 +7673,10 @@ GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_stat
     }
     for (size_t i = 0; i < tile->count && live; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
-        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
-        const uint32_t mask = gsf__rows_avx2(rec, tile, center, exponent) & live;
-        gsf__alphas_avx2(rec, center, exponent, mask, raws);
+        gsf__rows_ahead_avx2(tile, 0, i, &tests);
+        const size_t at_test = i % GSF__AHEAD;
+        const uint32_t mask = tests.mask[at_test] & live;
+        gsf__alphas_avx2(rec, tests.center[at_test], tests.exponent[at_test], mask, raws);
         const __m256 cr = _mm256_set1_ps(rec->r), cg = _mm256_set1_ps(rec->g), cb = _mm256_set1_ps(rec->b);
         for (uint32_t m = mask; m; m &= m - 1) {
             const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
@@ -7782,13 +7803,15 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_ti
     const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
     uint32_t live = gsf__live_steps(T_tile);
-    float center[GSF__STEPS], exponent[GSF__STEPS], raws[GSF__TILE_PIXELS];
+    gsf__row_tests tests;
+    float raws[GSF__TILE_PIXELS];
     size_t kept = 0, i = first;
     for (; i < last && live && kept <= GSF__BUCKET; i++) {
         const gsf__record* rec = tile->records + tile->pairs[i].splat;
-        if (i + 4 < tile->count) _mm_prefetch((const char*)(tile->records + tile->pairs[i + 4].splat), _MM_HINT_T0);
-        const uint32_t mask = gsf__rows_avx2(rec, tile, center, exponent) & live;
-        gsf__alphas_avx2(rec, center, exponent, mask, raws);
+        gsf__rows_ahead_avx2(tile, first, i, &tests);
+        const size_t at_test = i % GSF__AHEAD;
+        const uint32_t mask = tests.mask[at_test] & live;
+        gsf__alphas_avx2(rec, tests.center[at_test], tests.exponent[at_test], mask, raws);
         for (uint32_t m = mask; m; m &= m - 1) {
             const size_t s = (size_t)gsf__lowest_bit(m), at = 8 * s;
             const __m256 T = _mm256_loadu_ps(T_tile + at), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
@@ -8094,10 +8117,25 @@ GSF__TARGET_AVX2 static inline uint32_t gsf__sum_slots_avx2(const gsf_rasterizer
     return touched;
 }
 
+// Fetches what the eight splats from i on will need: their slots lie all over memory, and rows of SH are long.
+static inline void gsf__gather_ahead(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads, size_t i) {
+    for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + 8]; s++) {
+        const char* slot = (const char*)(r->slots + GSF__SLOT_FLOATS * r->splat_pairs[s]);
+        _mm_prefetch(slot, _MM_HINT_T0);
+        _mm_prefetch(slot + GSF__SLOT_FLOATS * sizeof(float) - 1, _MM_HINT_T0);
+    }
+    const size_t row = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree);
+    for (size_t k = 0; k < 8 * row; k += 16) {
+        _mm_prefetch((const char*)(splats->sh + row * i + k), _MM_HINT_T0);
+        if (grads->sh) _mm_prefetch((const char*)(grads->sh + row * i + k), _MM_HINT_T0);
+    }
+}
+
 // gsf__project_backward of up to eight splats from i on.
 GSF__TARGET_AVX2 static void gsf__gather_avx2(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                               const gsf_splat_grads* grads, size_t i, size_t left) {
     const size_t count = left < 8 ? left : 8;
+    if (left >= 16) gsf__gather_ahead(r, splats, grads, i + 8);
     __m256 sums[16];
     const uint32_t touched = gsf__sum_slots_avx2(r, i, count, sums);
     if (!touched) return;
