@@ -18,7 +18,7 @@
                         projected, to the same result
        GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> where there is one, else <embree3/rtcore.h>
 
-   SECTIONS    >>splats >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
+   SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
                >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
@@ -54,6 +54,10 @@ GSF_API int32_t gsf_splat_sh_count(int32_t sh_degree);
 // Zeroed splats with ids 0..count-1.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make(gsf_context* ctx, size_t count, int32_t sh_degree, gsf_splats* out);
 GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
+
+// Morton order of the means: neighbours in space become neighbours in memory, which at a million splats saves a sixth of a
+// training step. Renders stay the same but for the order of splats of equal depth. The trainer does it whenever it densifies.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats);
 
 // The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Splats with a non-finite
 // value are dropped and counted in a warning. Origin: zero, or the rounded centre where coordinates are large (centre
@@ -596,6 +600,106 @@ GSF_API gsf_result gsf_splat_make(gsf_context* ctx, size_t count, int32_t sh_deg
 GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats) {
     gsf_free(ctx, splats->owned);
     memset(splats, 0, sizeof *splats);
+}
+
+// ---- >>order -------------------------------------------------------------------
+
+// Sorts n keys by their upper half, stable. The lower halves ascend and break ties. Returns the array that holds the result.
+static uint64_t* gsf__sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
+    enum { SMALL = 48 };
+    if (n <= SMALL) {
+        for (size_t i = 1; i < n; i++) {
+            const uint64_t key = keys[i];
+            size_t at = i;
+            for (; at > 0 && keys[at - 1] > key; at--) keys[at] = keys[at - 1];
+            keys[at] = key;
+        }
+        return keys;
+    }
+    uint32_t counts[4][256];
+    memset(counts, 0, sizeof counts);
+    for (size_t i = 0; i < n; i++)
+        for (int pass = 0; pass < 4; pass++) counts[pass][keys[i] >> (32 + 8 * pass) & 255u]++;
+    for (int pass = 0; pass < 4; pass++) {
+        const int shift = 32 + 8 * pass;
+        if (counts[pass][keys[0] >> shift & 255u] == n) continue; // all the same here, as the first bits of a depth often are
+        uint32_t sum = 0;
+        for (int b = 0; b < 256; b++) {
+            const uint32_t count = counts[pass][b];
+            counts[pass][b] = sum;
+            sum += count;
+        }
+        for (size_t i = 0; i < n; i++) spare[counts[pass][keys[i] >> shift & 255u]++] = keys[i];
+        uint64_t* swap = keys;
+        keys = spare;
+        spare = swap;
+    }
+    return keys;
+}
+
+// Every third bit of the result is one of the 10 bits of v.
+static uint64_t gsf__spread_bits(uint64_t v) {
+    v = (v | v << 16) & 0x030000ff;
+    v = (v | v << 8) & 0x0300f00f;
+    v = (v | v << 4) & 0x030c30c3;
+    return (v | v << 2) & 0x09249249;
+}
+
+// Keys (code << 32 | index) in Morton order of the means: 1024 cells along each side of the box of those within 3 standard
+// deviations, the others in the cells of its faces. keys, spare: room for `count`; returns the one that holds the result.
+static uint64_t* gsf__morton_order(const float* means, size_t count, uint64_t* keys, uint64_t* spare) {
+    double low[3], scale[3];
+    for (size_t c = 0; c < 3; c++) {
+        double sum = 0.0, sum2 = 0.0;
+        size_t n = 0;
+        for (size_t i = 0; i < count; i++) {
+            const double x = (double)means[3 * i + c];
+            if (!(fabs(x) <= 1e30)) continue;
+            sum += x;
+            sum2 += x * x;
+            n++;
+        }
+        const double mean = n ? sum / (double)n : 0.0, variance = n ? sum2 / (double)n - mean * mean : 0.0;
+        const double reach = variance > 0.0 ? 3.0 * sqrt(variance) : 0.0;
+        low[c] = mean - reach;
+        scale[c] = reach > 0.0 ? 1024.0 / (2.0 * reach) : 0.0;
+    }
+    for (size_t i = 0; i < count; i++) {
+        uint64_t code = 0;
+        for (size_t c = 0; c < 3; c++) {
+            const double cell = ((double)means[3 * i + c] - low[c]) * scale[c];
+            code |= gsf__spread_bits(cell > 0.0 ? (cell < 1023.0 ? (uint64_t)cell : 1023) : 0) << c; // NaN: 0
+        }
+        keys[i] = code << 32 | i;
+    }
+    return gsf__sort_keys(keys, spare, count);
+}
+
+// Row i becomes the row that order[i] names; `spare` has room for the rows.
+static void gsf__reorder(void* rows, size_t row_size, const uint64_t* order, size_t count, void* spare) {
+    for (size_t i = 0; i < count; i++)
+        memcpy((char*)spare + i * row_size, (const char*)rows + (size_t)(uint32_t)order[i] * row_size, row_size);
+    memcpy(rows, spare, count * row_size);
+}
+
+GSF_API gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats) {
+    const size_t count = splats->count, sh_row = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree) * sizeof(float);
+    if (count > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sort: %zu splats are too many", count);
+    uint64_t* keys = (uint64_t*)gsf_alloc(ctx, count ? count : 1, 2 * sizeof(uint64_t));
+    void* spare = gsf_alloc(ctx, count ? count : 1, sh_row > 16 ? sh_row : 16);
+    const gsf_result result = keys && spare ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK && count) {
+        const uint64_t* order = gsf__morton_order(splats->means, count, keys, keys + count);
+        gsf__reorder(splats->means, 3 * sizeof(float), order, count, spare);
+        gsf__reorder(splats->log_scales, 3 * sizeof(float), order, count, spare);
+        gsf__reorder(splats->quats, 4 * sizeof(float), order, count, spare);
+        gsf__reorder(splats->opacity_logits, sizeof(float), order, count, spare);
+        gsf__reorder(splats->sh, sh_row, order, count, spare);
+        if (splats->ids) gsf__reorder(splats->ids, sizeof(uint32_t), order, count, spare);
+    }
+    gsf_free(ctx, keys);
+    gsf_free(ctx, spare);
+    return result;
 }
 
 // ---- >>ply ---------------------------------------------------------------------
@@ -7332,39 +7436,6 @@ static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
     }
 }
 
-// Sorts n keys by their upper half, stable. The lower halves ascend and break ties. Returns the array that holds the result.
-static uint64_t* gsf__sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
-    enum { SMALL = 48 };
-    if (n <= SMALL) {
-        for (size_t i = 1; i < n; i++) {
-            const uint64_t key = keys[i];
-            size_t at = i;
-            for (; at > 0 && keys[at - 1] > key; at--) keys[at] = keys[at - 1];
-            keys[at] = key;
-        }
-        return keys;
-    }
-    uint32_t counts[4][256];
-    memset(counts, 0, sizeof counts);
-    for (size_t i = 0; i < n; i++)
-        for (int pass = 0; pass < 4; pass++) counts[pass][keys[i] >> (32 + 8 * pass) & 255u]++;
-    for (int pass = 0; pass < 4; pass++) {
-        const int shift = 32 + 8 * pass;
-        if (counts[pass][keys[0] >> shift & 255u] == n) continue; // all the same here, as the first bits of a depth often are
-        uint32_t sum = 0;
-        for (int b = 0; b < 256; b++) {
-            const uint32_t count = counts[pass][b];
-            counts[pass][b] = sum;
-            sum += count;
-        }
-        for (size_t i = 0; i < n; i++) spare[counts[pass][keys[i] >> shift & 255u]++] = keys[i];
-        uint64_t* swap = keys;
-        keys = spare;
-        spare = swap;
-    }
-    return keys;
-}
-
 static void gsf__sort_tile(void* arg, size_t index, int worker) {
     (void)worker;
     const gsf_rasterizer* r = (const gsf_rasterizer*)arg;
@@ -9837,6 +9908,25 @@ static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule,
     gsf__densify_compact(model, rule);
 }
 
+// Morton order: new splats were appended. Between steps the gradients and statistics are zero, and serve as scratch.
+static void gsf__model_sort(gsf__model* model) {
+    const size_t n = model->count;
+    uint64_t* keys[2];
+    for (int k = 0; k < 2; k++) keys[k] = (uint64_t*)(void*)model->screen[k]; // two floats a splat each
+    const uint64_t* order = gsf__morton_order(model->groups[GSF__MEANS].value, n, keys[0], keys[1]);
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        gsf__group* group = &model->groups[g];
+        const size_t row = group->width * sizeof(float);
+        gsf__reorder(group->value, row, order, n, group->grad);
+        gsf__reorder(group->m, row, order, n, group->grad);
+        gsf__reorder(group->v, row, order, n, group->grad);
+        memset(group->grad, 0, n * row);
+    }
+    gsf__reorder(model->ids, sizeof(uint32_t), order, n, model->grad_sum[0]);
+    memset(model->grad_sum[0], 0, n * sizeof(float));
+    for (int k = 0; k < 2; k++) memset(model->screen[k], 0, 2 * n * sizeof(float));
+}
+
 // Opacities above `limit` fall to it; the moments of all opacities are zeroed.
 static void gsf__reset_opacity(gsf__model* model, double limit) {
     const float logit = (float)log(limit / (1.0 - limit));
@@ -10529,6 +10619,7 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
         size_t clones, splits;
         gsf__densify_select(model, &rule, &clones, &splits);
         gsf__densify_apply(model, &rule, clones, splits);
+        gsf__model_sort(model);
     }
     if (gsf__trainer_densifies(trainer, iteration) && d->opacity_reset_interval > 0 &&
         iteration % d->opacity_reset_interval == 0)

@@ -1223,9 +1223,61 @@ static void test_steady(const scene* s) {
     CHECK(f.live == 0);
 }
 
+// ---- order ---------------------------------------------------------------------
+
+// Every row moves as a whole (its id says where it was), neighbours in memory come near each other, odd values are kept, and
+// a second sort changes nothing.
+static void test_sort(gsf_context* ctx) {
+    enum { COUNT = 3000 };
+    gsf_splats s, was;
+    CHECK_OK(ctx, gsf_splat_make(ctx, COUNT, 1, &s));
+    CHECK_OK(ctx, gsf_splat_make(ctx, COUNT, 1, &was));
+    uint64_t state = 11;
+    const size_t floats = COUNT * (size_t)(3 + 3 + 4 + 1 + 12); // one block, see gsf_splat_make
+    for (size_t i = 0; i < floats; i++) s.means[i] = (float)test_random_in(&state, -2, 2);
+    s.means[3 * 7] = NAN;
+    s.means[3 * 8 + 1] = INFINITY;
+    s.means[3 * 9 + 2] = -3e38f;
+    memcpy(was.means, s.means, floats * sizeof(float));
+    double before = 0.0, after = 0.0;
+    CHECK_OK(ctx, gsf_splat_sort(ctx, &s));
+    uint8_t met[COUNT];
+    memset(met, 0, sizeof met);
+    for (size_t i = 0; i < COUNT; i++) {
+        const size_t from = s.ids[i];
+        if (!CHECK(from < COUNT && !met[from])) break;
+        met[from] = 1;
+        CHECK(memcmp(s.means + 3 * i, was.means + 3 * from, 3 * sizeof(float)) == 0);
+        CHECK(memcmp(s.log_scales + 3 * i, was.log_scales + 3 * from, 3 * sizeof(float)) == 0);
+        CHECK(memcmp(s.quats + 4 * i, was.quats + 4 * from, 4 * sizeof(float)) == 0);
+        CHECK(s.opacity_logits[i] == was.opacity_logits[from]);
+        CHECK(memcmp(s.sh + 12 * i, was.sh + 12 * from, 12 * sizeof(float)) == 0);
+        for (size_t c = 0; c < 3 && i > 0; c++) {
+            const double a = fabs((double)s.means[3 * i + c] - (double)s.means[3 * i - 3 + c]);
+            const double b = fabs((double)was.means[3 * i + c] - (double)was.means[3 * i - 3 + c]);
+            if (a < 10.0) after += a;
+            if (b < 10.0) before += b;
+        }
+    }
+    CHECK(after < 0.2 * before);
+    gsf_splat_destroy(ctx, &was);
+    CHECK_OK(ctx, gsf_splat_make(ctx, COUNT, 1, &was));
+    memcpy(was.means, s.means, floats * sizeof(float));
+    memcpy(was.ids, s.ids, COUNT * sizeof(uint32_t));
+    CHECK_OK(ctx, gsf_splat_sort(ctx, &s));
+    CHECK(memcmp(was.means, s.means, floats * sizeof(float)) == 0);
+    CHECK(memcmp(was.ids, s.ids, COUNT * sizeof(uint32_t)) == 0);
+    gsf_splat_destroy(ctx, &was);
+    gsf_splat_destroy(ctx, &s);
+    CHECK_OK(ctx, gsf_splat_make(ctx, 0, 0, &s));
+    CHECK_OK(ctx, gsf_splat_sort(ctx, &s));
+    gsf_splat_destroy(ctx, &s);
+}
+
 int main(void) {
     gsf_context ctx;
     test_context_init(&ctx);
+    test_sort(&ctx);
     scene s = make_scene(&ctx);
     test_loss_derivative(&ctx);
     test_loss_accuracy(GSF_CPU_SCALAR);
