@@ -49,9 +49,9 @@ static const option_spec option_specs[] = {
      "path of the frames to repair (default reference)"},
     {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "training steps in all (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
-     "initial points: those that a training view sees by ray, by track, or by either (both, the default); all points;\n"
-     "those of both and, more densely, where the training photos agree by stereo (dense); random ones (the default where\n"
-     "the scene has no points)"},
+     "initial points: those that a training view sees by ray, by track, or by either (both, the default below 6 photos);\n"
+     "all points; those of both and, more densely, where the training photos agree by stereo (dense, the default from 6\n"
+     "photos on); random ones (the default where the scene has no points)"},
     {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix render",
      "approximations allowed (default balanced; exact: none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix",

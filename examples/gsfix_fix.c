@@ -8,6 +8,7 @@
 // ---- defaults: decided by measurement, kept here only ------------------------------
 
 enum { DEFAULT_ITERATIONS = 1200, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000, DENSE_POINTS = 40000 };
+enum { DENSE_FROM = 6 }; // photos from which --init dense is the default: see bench/QUALITY.md
 
 static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
@@ -270,7 +271,8 @@ static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** point
 static gsf_result make_initial(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const gsf_scene* scene = &run->scene;
-    const char* init = run->app->o.init ? run->app->o.init : scene->point_count ? "both" : "random";
+    const char* init = run->app->o.init;
+    if (!init) init = !scene->point_count ? "random" : run->split.train_count < DENSE_FROM ? "both" : "dense";
     snprintf(run->setup.init, sizeof run->setup.init, "%s", init);
     run->rays = "none";
     if (strcmp(init, "random") == 0) {
