@@ -289,6 +289,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     if (!bench_context(&ctx, level, threads)) return;
     gsf_splats splats;
     bench_make_splats(&ctx, count, size, &splats);
+    bench_require(&ctx, gsf_splat_sort(&ctx, &splats)); // as the trainer has them
     const gsf_camera camera = bench_camera(width, height);
     const size_t pixels = (size_t)width * (size_t)height;
     gsf_render_output out;
@@ -446,6 +447,7 @@ typedef struct bench_pass { // a render and its backward, with what they need
     gsf_camera camera;
     gsf_splats splats, sums; // the sums hold the gradients
     gsf_splat_grads grads;
+    gsf_render_desc desc;
     gsf_render_output out;
     float* d_color;
     size_t values;           // of a picture
@@ -454,6 +456,7 @@ typedef struct bench_pass { // a render and its backward, with what they need
 static void bench_open_pass(gsf_context* ctx, bench_pass* p, size_t count, double size, int width, int height, double zoom) {
     memset(p, 0, sizeof *p);
     bench_make_splats(ctx, count, size, &p->splats);
+    bench_require(ctx, gsf_splat_sort(ctx, &p->splats));
     bench_require(ctx, gsf_splat_make(ctx, count, 3, &p->sums));
     p->camera = bench_camera(width, height);
     p->camera.fx *= zoom;
@@ -483,9 +486,10 @@ static void bench_close_pass(gsf_context* ctx, bench_pass* p) {
 static void bench_run_pass(gsf_context* ctx, bench_pass* p, double wall[2], double cpu[2]) {
     memset(p->sums.owned, 0, p->splats.count * (3 + 3 + 4 + 1 + 48) * sizeof(float));
     const double t0 = bench_now(), c0 = bench_cpu();
-    bench_require(ctx, gsf_splat_render(ctx, p->r, &p->splats, &p->camera, NULL, &p->out));
+    bench_require(ctx, gsf_splat_render(ctx, p->r, &p->splats, &p->camera, &p->desc, &p->out));
     const double t1 = bench_now(), c1 = bench_cpu();
-    bench_require(ctx, gsf_splat_render_backward(ctx, p->r, &p->splats, &p->camera, NULL, p->d_color, NULL, NULL, &p->grads));
+    bench_require(ctx, gsf_splat_render_backward(ctx, p->r, &p->splats, &p->camera, &p->desc, p->d_color, NULL, NULL,
+                                                 &p->grads));
     wall[0] = t1 - t0;
     wall[1] = bench_now() - t1;
     cpu[0] = c1 - c0;
@@ -560,20 +564,62 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     bench_close_pass(&ctx, &p);
 }
 
-// ---- lazy Adam --------------------------------------------------------------------
+// ---- what can be left out -----------------------------------------------------------
 
-static int bench_compare_place(const void* a, const void* b) { // by cells of 1/16, then along z
-    const float *p = (const float*)a, *q = (const float*)b;
-    for (int k = 0; k < 2; k++) {
-        const double x = floor(16.0 * (double)p[k]), y = floor(16.0 * (double)q[k]);
-        if (x != y) return x < y ? -1 : 1;
+// Render and backward with and without a skip, in turns; the error is that of the picture against the first variant's.
+static void bench_skips(const bench_options* o, const char* name, size_t count, double size, int width, int height,
+                        int threads) {
+    enum { FULL, OFFICIAL, SHUFFLED, VARIANTS, MOST = 9 };
+    static const char* const labels[VARIANTS] = {"default", "footprint: official tiles only", "order: shuffled"};
+    char label[96];
+    snprintf(label, sizeof label, "skip: render and backward %s", name);
+    if (o->filter && !strstr(label, o->filter)) return;
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.threads = threads;
+    bench_require(&ctx, gsf_init_context(&ctx));
+    bench_pass passes[VARIANTS];
+    for (int k = 0; k < VARIANTS; k++) bench_open_pass(&ctx, &passes[k], count, size, width, height, 1.0);
+    passes[OFFICIAL].desc.footprint = GSF_FOOTPRINT_OFFICIAL;
+    gsf_splat_destroy(&ctx, &passes[SHUFFLED].splats);
+    bench_make_splats(&ctx, count, size, &passes[SHUFFLED].splats);
+    double seconds[VARIANTS][MOST], cpu[VARIANTS] = {0.0};
+    const int rounds = o->quick ? 3 : MOST;
+    for (int i = -1; i < rounds; i++)
+        for (int k = 0; k < VARIANTS; k++) {
+            double wall[2], used[2];
+            bench_run_pass(&ctx, &passes[k], wall, used);
+            if (i < 0) continue;
+            seconds[k][i] = wall[0] + wall[1];
+            cpu[k] += (used[0] + used[1]) / rounds;
+        }
+    for (int k = 0; k < VARIANTS; k++) {
+        bench_row row = bench_make_row(label, ctx.cpu_level, threads, bench_median(seconds[k], (size_t)rounds), cpu[k],
+                                       bench_pairs(&ctx, passes[k].r), "pairs");
+        row.variant = labels[k];
+        const float *full = (const float*)passes[FULL].out.color.data, *other = (const float*)passes[k].out.color.data;
+        double difference = 0.0, total = 0.0;
+        for (size_t i = 0; i < passes[k].values && k != FULL; i++) {
+            const double d = (double)other[i] - (double)full[i];
+            row.error_max = fmax(row.error_max, fabs(d));
+            difference += d * d;
+            total += (double)full[i] * (double)full[i];
+        }
+        if (k != FULL) {
+            row.error_rel_l2 = sqrt(difference / total);
+            row.reference = "default";
+        }
+        bench_print(o, &row);
     }
-    return (p[2] > q[2]) - (p[2] < q[2]);
+    for (int k = 0; k < VARIANTS; k++) bench_close_pass(&ctx, &passes[k]);
 }
 
+// ---- lazy Adam --------------------------------------------------------------------
+
 // Training steps with dense and with lazy Adam in turns, on five views that see different parts of the splats where `zoom`
-// is above 1. The splats lie in memory by their place, or at random. What lazy Adam catches up with counts in the step, not in its Adam stage. The error is that of the SH against
-// the dense trainer's after all steps, relative to at least 0.2 and in L2.
+// is above 1. The splats lie in memory by their place, or at random. What lazy Adam catches up with counts in the step, not
+// in its Adam stage. The error is that of the SH against the dense trainer's after all steps, relative to at least 0.2 and in
+// L2.
 static void bench_lazy(const bench_options* o, const char* size_name, size_t count, double size, int width, int height,
                        double zoom, int in_order, int rounds, int threads) {
     if (o->filter && !strstr("lazy: adam step", o->filter)) return;
@@ -584,7 +630,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
     bench_require(&ctx, gsf_init_context(&ctx));
     gsf_splats splats;
     bench_make_splats(&ctx, count, size, &splats);
-    if (in_order) qsort(splats.means, count, 3 * sizeof(float), bench_compare_place);
+    if (in_order) bench_require(&ctx, gsf_splat_sort(&ctx, &splats));
     gsf_train_view views[VIEWS];
     memset(views, 0, sizeof views);
     for (uint64_t v = 0; v < VIEWS; v++) {
@@ -874,6 +920,8 @@ int main(int argc, char** argv) {
         }
     for (int threads = 1; threads <= 2; threads++) {
         if (o.threads && threads != o.threads) continue;
+        bench_skips(&o, "10k 264x480", 10000, 0.03, 264, 480, threads);
+        if (!o.quick) bench_skips(&o, "1M 1920x1080", 1000000, 0.005, 1920, 1080, threads);
         bench_lazy(&o, "10k 264x480", 10000, 0.03, 264, 480, 1.0, 0, o.quick ? 20 : 100, threads);
         for (int in_order = 1; in_order >= 0 && !o.quick; in_order--)
             bench_lazy(&o, "1M 960x540", 1000000, 0.005, 960, 540, 2.0, in_order, 10, threads);

@@ -194,18 +194,23 @@ def write_markdown(path, rows, stress, has_growth):
     table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M/s", "FMA peak", "bandwidth"],
           [[r["case"], r["isa"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]), "%.3g" % (1e3 * r["cpu_seconds"]),
             "%.3g %s" % (1e-6 * r["rate"], r["work_unit"]), percent(r, "peak_share"), percent(r, "bandwidth_share")]
-           for r in rows if ": " in r["case"] and not r["case"].startswith(("machine", "visibility", "growth", "lazy"))])
-    lazy = [r for r in rows if r["case"].startswith("lazy: ")]
-    if lazy:
-        lines += ["## Lazy Adam", "",
-                  "SH of blocks of splats that no picture of the step shows rest, and catch up when one is drawn again (on by "
-                  "default; `dense_adam` turns it off). Steps in turns on five views; catching up is part of the step, not "
-                  "of its Adam stage. The difference is that of the SH from the dense run's, rounding fed back through all "
-                  "steps: the largest relative to at least 0.2, and in L2.", ""]
+           for r in rows if ": " in r["case"] and not r["case"].startswith(("machine", "visibility", "growth", "lazy", "skip"))])
+    skips = [r for r in rows if r["case"].startswith(("skip: ", "lazy: "))]
+    if skips:
+        lines += ["## What is left out, and what it saves and costs", "",
+                  "Renders with their backward: the default; splats drawn only in the tiles of their 3-sigma square, as the "
+                  "official rasterizer does (to compare with it; nothing uses it); splats in no spatial order (the trainer and `gsf_splat_sort` "
+                  "keep Morton order). The difference is that of the picture from the default's.", "",
+                  "Lazy Adam: the SH of blocks of splats that no picture of the step shows rest, and catch up when one is "
+                  "drawn again (on by default; `dense_adam` turns it off). Steps in turns on five views; catching up is part "
+                  "of the step, not of its Adam stage. The difference is that of the SH from the dense run's, rounding fed "
+                  "back through all steps: the largest relative to at least 0.2, and in L2. Prescribed gradients leave "
+                  "4.7e-7 after 1,000 steps (`tests/test_trainer.c`).", "",
+                  "Windows that need no restoring, and the three values of `--quality`: see QUALITY.md.", ""]
         table(lines, ["", "", "threads", "ms", "CPU ms", "largest difference", "relative L2"],
               [[r["case"][6:], r["variant"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]),
                 "%.3g" % (1e3 * r["cpu_seconds"]), "%.1e" % r["error_max"] if "error_max" in r else "",
-                "%.1e" % r["error_rel_l2"] if "error_rel_l2" in r else ""] for r in lazy])
+                "%.1e" % r["error_rel_l2"] if "error_rel_l2" in r else ""] for r in skips])
     if has_growth:
         lines += ["## How cost grows", "", "![Seconds by splats, by pixels and by magnification](growth.svg)", "",
                   "Splats shrink as their number grows, so that about as many lie over a pixel; magnified, less of the "

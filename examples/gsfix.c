@@ -52,7 +52,7 @@ static const option_spec option_specs[] = {
      "initial points: those that a training view sees by ray, by track, or by either (both, the default below 6 photos);\n"
      "all points; those of both and, more densely, where the training photos agree by stereo (dense, the default from 6\n"
      "photos on); random ones (the default where the scene has no points)"},
-    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix render",
+    {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix",
      "approximations allowed (default balanced; exact: none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix",
      "DIR/VIEW.png per test view, white where the figures \"seen\" are to be taken (gsfix masks makes them)"},
@@ -562,7 +562,6 @@ static gsf_result render_all(gsfix_app* app) {
     size_t count = 0;
     double seconds = 0.0;
     gsf_render_desc desc = {0};
-    desc.footprint = gsfix_find_quality(app->o.quality)->footprint;
     gsf_result result = gsf_splat_load(ctx, app->o.inputs[0], &splats);
     desc.antialiased = splats.antialiased;
     if (result == GSF_OK && app->o.scene) result = gsfix_load_scene(app, app->o.scene, &scene);

@@ -13,10 +13,10 @@ enum { DENSE_FROM = 6 }; // photos from which --init dense is the default: see b
 static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
 
-static const gsfix_quality qualities[] = { // footprint OFFICIAL loses what lies beyond 3 sigma
-    {"exact", GSF_FOOTPRINT_FULL, 0.0f, 0},
-    {"balanced", GSF_FOOTPRINT_FULL, 45.0f, 0},
-    {"fast", GSF_FOOTPRINT_OFFICIAL, 36.0f, 320 * 240},
+static const gsfix_quality qualities[] = { // what each saves and costs: bench/QUALITY.md
+    {"exact", 1, 0.0f, 0},
+    {"balanced", 0, 45.0f, 0},
+    {"fast", 0, 36.0f, 320 * 240},
 };
 
 const gsfix_quality* gsfix_find_quality(const char* name) {
@@ -125,7 +125,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     gsf_train_desc* train = &setup->fix.train;
     train->iterations = app->o.iterations ? app->o.iterations : DEFAULT_ITERATIONS;
     train->seed = app->o.seed;
-    train->render.footprint = quality->footprint;
+    train->dense_adam = quality->dense_adam;
     if (!app->o.regularize || strcmp(app->o.regularize, "on") == 0) {
         train->dropout = few_view_regularizers.dropout;
         train->opacity_decay = few_view_regularizers.opacity_decay;
@@ -449,7 +449,6 @@ static void write_switches(fix_run* run) {
     gsfix_json_text(ctx, t, "trajectory", kinds[used.fix.trajectory]);
     gsfix_json_text(ctx, t, "init", used.init);
     gsfix_json_text(ctx, t, "quality", gsfix_find_quality(o->quality)->name);
-    gsfix_json_text(ctx, t, "footprint", train->render.footprint == GSF_FOOTPRINT_FULL ? "full" : "official");
     gsfix_json_text(ctx, t, "gradient", train->render.gradient == GSF_GRADIENT_TRUE ? "true" : "official");
     for (int i = 0; i < SETTING_COUNT; i++) {
         const void* field = (const char*)&used + settings[i].offset;

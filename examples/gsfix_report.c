@@ -405,7 +405,7 @@ static void put_switch(page* p, const gsf_json* json, const gsf_json_value* v, c
     static const char* const meanings[][3] = {
         {"init", "both", "tracks and rays"}, {"init", "embree", "rays"}, {"init", "all", "every point"},
         {"trajectory", "reference", "photo to photo"}, {"trajectory", "interpolate", "spline"},
-        {"footprint", "full", "down to alpha 1/255"}, {"footprint", "official", "3 sigma"},
+        {"init", "dense", "tracks, rays and stereo"},
     };
     put_raw(p, v->type == GSF_JSON_ARRAY && v->count > 3 ? "<div class=broad><dt>" : "<div><dt>");
     put_escaped(p, v->key);
