@@ -7915,6 +7915,11 @@ GSF__TARGET_AVX2 static inline __m256 gsf__sum8_avx2(__m256 a, __m256 b, __m256 
     return _mm256_add_ps(_mm256_permute2f128_ps(abcd, efgh, 0x20), _mm256_permute2f128_ps(abcd, efgh, 0x31));
 }
 
+GSF__TARGET_AVX2 static inline __m128 gsf__sum4_avx2(__m256 a, __m256 b, __m256 c, __m256 d) {
+    const __m256 abcd = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
+    return _mm_add_ps(_mm256_castps256_ps128(abcd), _mm256_extractf128_ps(abcd, 1));
+}
+
 GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
                                              size_t step_count, gsf__tile_gradient* gradient, float* slots,
                                              uint8_t* slot_used, int with_depth, int straight_through, int with_abs) {
@@ -7974,9 +7979,8 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
         const size_t slot = tile->pairs[entry].slot;
         float* to = slots + GSF__SLOT_FLOATS * slot;
         const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
-        const __m256 rest = gsf__sum8_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say, sp, sp, sp, sp);
         _mm256_storeu_ps(to, first); // all of an entry's steps are in one bucket
-        _mm_storeu_ps(to + 8, _mm256_castps256_ps128(rest));
+        _mm_storeu_ps(to + 8, gsf__sum4_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say));
         slot_used[slot] = 1;
     }
 }
