@@ -503,8 +503,8 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #if !defined(GSF_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
 #define GSF__X86 1
 #include <immintrin.h>
-#define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c")))
-#define GSF__INLINE_AVX2 __attribute__((target("avx2,fma,f16c"), always_inline)) static inline
+#define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c,bmi")))
+#define GSF__INLINE_AVX2 __attribute__((target("avx2,fma,f16c,bmi"), always_inline)) static inline
 #else
 #define GSF__X86 0
 #endif
@@ -818,7 +818,8 @@ GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level) {
 static gsf_cpu_level gsf__detect_cpu_level(void) {
 #if GSF__X86
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return GSF_CPU_AVX2;
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi"))
+        return GSF_CPU_AVX2;
 #endif
     return GSF_CPU_SCALAR;
 }
