@@ -393,7 +393,7 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
                                    // splats where the cameras coincide
     float lambda_ssim;             // 0.2; negative = no SSIM term
     float background[3];
-    int32_t densify_from, densify_until; // 500 s, 15000 s; densify_until < 0 = never, nor opacity resets
+    int32_t densify_from, densify_until; // 500 s, 15000 s (mcmc: 25000 s); densify_until < 0 = never, nor opacity resets
     int32_t densify_interval;      // 100, whatever s is
     float densify_grad;            // 2e-4
     int32_t densify_absolute;      // 0; 1: gradients whose pixels cannot cancel (AbsGS; densify_grad is then 4e-4 to 8e-4)
@@ -401,14 +401,20 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     float prune_opacity;           // 0.005
     float prune_scale;             // 0.1 of extent, after the first opacity reset
     int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
-    size_t max_splats;             // densification stops growing here; 0 = 2 million
+    size_t max_splats;             // densification stops growing here; 0 = 2 million (mcmc: 1 million)
+    int32_t mcmc;                  // 0; 1: densification as "3DGS as Markov Chain Monte Carlo" has it: splats of less than
+                                   // prune_opacity move onto others, up to 5 % a time join them until there are max_splats,
+                                   // and means are shaken in every step; nothing is pruned, no opacity is reset, and the
+                                   // other densify_ and prune_ fields have no effect
+    float mcmc_noise;              // 5e5; negative = means are not shaken
     gsf_render_desc render;        // footprint, gradient kind, antialiasing, near plane (0 = the smaller of 0.2 and 0.01
                                    // extent); background is taken from above; hidden, sh_bands, opacity_scale stay zero
     // regularisers for few views; zero = off
     float dropout;                 // share of splats hidden in a step, growing linearly from 0 to this; the others'
                                    // opacities are divided by 1 - share (DropGaussian)
     float opacity_decay;           // every opacity loses this share per iteration (applied every 10; Binocular3DGS: 0.005)
-    float scale_penalty;           // weight of mean(exp(log_scale)) / extent
+    float scale_penalty;           // weight of mean(exp(log_scale)) / extent; with mcmc zero = 0.01, negative = off
+    float opacity_penalty;         // weight of mean(opacity); with mcmc zero = 0.01, negative = off
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
     int32_t dense_adam;            // 0: the SH of splats that are not drawn catch up later with the same result but for
                                    // rounding (1e-6); 1: all move in every step
@@ -9755,7 +9761,7 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
 // Adaptive density control of 3DGS: where the mean screen-space gradient is large, small splats are cloned and large ones
 // are split in two (scales / 1.6, means drawn from the splat itself); then transparent and oversized splats go.
 // Row order as in the official code: kept originals, clones, first halves, second halves. Its test of screen size never
-// fires there (the radii are zeroed before it) and does not exist here.
+// fires there (the radii are zeroed before it) and does not exist here. MCMC instead of all that: see there.
 
 typedef enum gsf__densify_action { GSF__KEEP = 0, GSF__CLONE, GSF__SPLIT } gsf__densify_action;
 
@@ -9827,14 +9833,21 @@ static void gsf__densify_select(const gsf__model* model, const gsf__densify_rule
     }
 }
 
+static void gsf__model_clear_moments(gsf__model* model, size_t i) {
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        gsf__group* group = &model->groups[g];
+        memset(group->m + i * group->width, 0, group->width * sizeof(float));
+        memset(group->v + i * group->width, 0, group->width * sizeof(float));
+    }
+}
+
 static void gsf__model_copy_row(gsf__model* model, size_t from, size_t to) { // a new splat: moments zero, a new id
     for (int g = 0; g < GSF__GROUPS; g++) {
         gsf__group* group = &model->groups[g];
         const size_t width = group->width;
         memcpy(group->value + to * width, group->value + from * width, width * sizeof(float));
-        memset(group->m + to * width, 0, width * sizeof(float));
-        memset(group->v + to * width, 0, width * sizeof(float));
     }
+    gsf__model_clear_moments(model, to);
     model->action[to] = GSF__KEEP;
     model->ids[to] = model->next_id++;
 }
@@ -9848,6 +9861,11 @@ static void gsf__densify_rotation(const float* q, double r[9]) {
     r[0] = 1.0 - 2.0 * (y * y + z * z), r[1] = 2.0 * (x * y - w * z), r[2] = 2.0 * (x * z + w * y);
     r[3] = 2.0 * (x * y + w * z), r[4] = 1.0 - 2.0 * (x * x + z * z), r[5] = 2.0 * (y * z - w * x);
     r[6] = 2.0 * (x * z - w * y), r[7] = 2.0 * (y * z + w * x), r[8] = 1.0 - 2.0 * (x * x + y * y);
+}
+
+static void gsf__densify_clear(gsf__model* model) { // the statistics
+    for (int k = 0; k < 2; k++) memset(model->grad_sum[k], 0, model->count * sizeof(float));
+    for (int k = 0; k < 2; k++) memset(model->visits[k], 0, model->count * sizeof(uint32_t));
 }
 
 static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, const double normal[3]) {
@@ -9887,8 +9905,7 @@ static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rul
         kept++;
     }
     model->count = kept;
-    for (int k = 0; k < 2; k++) memset(model->grad_sum[k], 0, kept * sizeof(float));
-    for (int k = 0; k < 2; k++) memset(model->visits[k], 0, kept * sizeof(uint32_t));
+    gsf__densify_clear(model);
 }
 
 // Carries out what gsf__densify_select decided. There must be room for count + clones + 2 splits.
@@ -9910,6 +9927,94 @@ static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule,
     }
     model->count = count + clones + 2 * splits;
     gsf__densify_compact(model, rule);
+}
+
+/* 3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024). Splats that are all but transparent, and new ones up to a
+   budget, become copies of others, drawn with probability proportional to opacity. A splat of opacity o that N now stand
+   for: each copy gets o' = 1 - (1 - o)^(1/N), so that in the middle all together are as opaque as before, and scales times
+       o / sum_{i=1..N} sum_{k=0..i-1} C(i-1,k) (-1)^k o'^(k+1) / sqrt(k+1),
+   so that a ray along which they blend to 1 - (1 - o' g)^N collects what it did from o g. The inner coefficients of a k add
+   up to C(N,k+1): with j = k + 1 one sum of (-1)^(j+1) C(N,j) o'^j / sqrt(j) is left. */
+enum { GSF__MCMC_MOST = 51 }; // copies that the correction counts, as the official code does
+
+// transparency: 1 - o. Returns the factor of the scales. In double the alternating sum is good to 1e-8 at 51 copies.
+static double gsf__mcmc_share(double transparency, uint32_t copies, double* opacity) {
+    double term = 1.0, sum = 0.0;
+    *opacity = -expm1(log(transparency) / (double)copies);
+    for (uint32_t j = 1; j <= copies; j++) {
+        term *= -*opacity * (double)(copies - j + 1) / (double)j;
+        sum -= term / sqrt((double)j);
+    }
+    return (1.0 - transparency) / sum;
+}
+
+// Draws `draws` of the splats above `logit`, into visits[1]; how often each was drawn is in visits[0], sums of opacities
+// are in screen[0], which all are free. Returns the draws made: none where there is no such splat.
+static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t index) {
+    double *sums = (double*)(void*)model->screen[0], total = 0.0; // two floats a splat
+    memset(model->visits[0], 0, model->count * sizeof(uint32_t));
+    for (size_t i = 0; i < model->count; i++) {
+        const float x = model->groups[GSF__OPACITY].value[i];
+        if (x > logit) total += (double)gsf__sigmoid(x);
+        sums[i] = total;
+    }
+    if (!(total > 0.0)) return 0;
+    for (size_t k = 0; k < draws; k++) {
+        const double at = total * gsf_random_uniform(rule->seed, rule->stream, index + k); // < total
+        size_t low = 0, high = model->count - 1;
+        while (low < high) { // the first sum above
+            const size_t middle = low + (high - low) / 2;
+            if (sums[middle] > at) high = middle;
+            else low = middle + 1;
+        }
+        model->visits[1][k] = (uint32_t)low;
+        model->visits[0][low]++;
+    }
+    return draws;
+}
+
+// Shares what every drawn splat is among it and its copies to be. Copies are not made so faint that they were next to move.
+static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
+    for (size_t i = 0; i < model->count; i++) {
+        if (model->visits[0][i] == 0) continue;
+        float *logit = model->groups[GSF__OPACITY].value + i, *scale = model->groups[GSF__SCALES].value + 3 * i;
+        const uint32_t copies = model->visits[0][i] < GSF__MCMC_MOST ? model->visits[0][i] + 1 : GSF__MCMC_MOST;
+        const double clear = 1.0 / (1.0 + exp((double)*logit));
+        double opacity;
+        const float grown = (float)log(gsf__mcmc_share(clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON, copies,
+                                                       &opacity));
+        if (opacity < least_opacity) opacity = least_opacity;
+        *logit = (float)log(opacity / (1.0 - opacity));
+        for (int a = 0; a < 3; a++) scale[a] += grown;
+        gsf__model_clear_moments(model, i);
+    }
+}
+
+static size_t gsf__mcmc_growth(size_t count, size_t budget) { // splats to be added
+    const size_t room = budget > count ? budget - count : 0;
+    return count / 20 < room ? count / 20 : room;
+}
+
+// `draws` copies; they take the rows from `first` on that are at or below `logit`, or behind the last one.
+static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t first) {
+    const float* logits = model->groups[GSF__OPACITY].value;
+    const size_t count = model->count, drawn = gsf__mcmc_draw(model, rule, logit, draws, first);
+    gsf__mcmc_correct(model, rule->prune_opacity);
+    for (size_t k = 0, to = first; k < drawn; to++)
+        if (to >= count || (logits[to] <= logit && model->visits[0][to] == 0))
+            gsf__model_copy_row(model, model->visits[1][k++], to);
+    return drawn;
+}
+
+// There must be room for the growth.
+static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) {
+    const float logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
+    const size_t count = model->count;
+    size_t dead = 0;
+    for (size_t i = 0; i < count; i++) dead += model->groups[GSF__OPACITY].value[i] <= logit;
+    (void)gsf__mcmc_copy(model, rule, logit, dead, 0);
+    model->count += gsf__mcmc_copy(model, rule, logit, gsf__mcmc_growth(count, rule->max_splats), count);
+    gsf__densify_clear(model);
 }
 
 // Morton order: new splats were appended. Between steps the gradients and statistics are zero, and serve as scratch.
@@ -9949,7 +10054,8 @@ static void gsf__reset_opacity(gsf__model* model, double limit) {
 // A step that fails (memory, cancel) leaves the trainer as it was.
 
 enum { // streams of random numbers; the iteration or epoch is added
-    GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED
+    GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED,
+    GSF__STREAM_NOISE
 };
 
 enum { GSF__DECAY_INTERVAL = 10 }; // iterations from one opacity decay to the next
@@ -10106,7 +10212,7 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     if (d.iterations == 0) d.iterations = 30000;
     d.sh_interval = gsf__scaled_interval(d.sh_interval, 1000, d.iterations, 1);
     d.densify_from = gsf__scaled_interval(d.densify_from, 500, d.iterations, 1);
-    d.densify_until = gsf__scaled_interval(d.densify_until, 15000, d.iterations, 1);
+    d.densify_until = gsf__scaled_interval(d.densify_until, d.mcmc ? 25000 : 15000, d.iterations, 1);
     if (d.densify_interval == 0) d.densify_interval = 100;
     d.opacity_reset_interval = gsf__scaled_interval(d.opacity_reset_interval, 3000, d.iterations, 1000);
     d.lr_means = gsf__or_default(d.lr_means, 1.6e-4f);
@@ -10121,7 +10227,13 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     d.densify_scale = gsf__or_default(d.densify_scale, 0.01f);
     d.prune_opacity = gsf__or_default(d.prune_opacity, 0.005f);
     d.prune_scale = gsf__or_default(d.prune_scale, 0.1f);
-    if (d.max_splats == 0) d.max_splats = 2000000;
+    if (d.max_splats == 0) d.max_splats = d.mcmc ? 1000000 : 2000000;
+    if (d.mcmc) { // as the official code of MCMC has them
+        d.opacity_reset_interval = -1;
+        d.mcmc_noise = d.mcmc_noise < 0.0f ? 0.0f : gsf__or_default(d.mcmc_noise, 5e5f);
+        d.scale_penalty = d.scale_penalty < 0.0f ? 0.0f : gsf__or_default(d.scale_penalty, 0.01f);
+        d.opacity_penalty = d.opacity_penalty < 0.0f ? 0.0f : gsf__or_default(d.opacity_penalty, 0.01f);
+    }
     memcpy(d.render.background, d.background, sizeof d.background);
     return d;
 }
@@ -10152,10 +10264,13 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"densify_scale", (double)d->densify_scale, 0, 1e30},
         {"prune_opacity", (double)d->prune_opacity, 0, 0.99},
         {"prune_scale", (double)d->prune_scale, 0, 1e30},
+        {"mcmc", (double)d->mcmc, 0, 1},
+        {"mcmc_noise", (double)d->mcmc_noise, 0, 1e12},
         {"render.near_plane", (double)d->render.near_plane, 0, 1e30},
         {"dropout", (double)d->dropout, 0, 0.9},
         {"opacity_decay", (double)d->opacity_decay, 0, 0.5},
         {"scale_penalty", (double)d->scale_penalty, 0, 1e6},
+        {"opacity_penalty", (double)d->opacity_penalty, 0, 1e6},
         {"depth_smoothness", (double)d->depth_smoothness, 0, 1e6},
         {"dense_adam", (double)d->dense_adam, 0, 1},
     };
@@ -10407,20 +10522,58 @@ static float gsf__exp_poly(float x) {
     return p * power;
 }
 
-// Gradient of weight * mean(exp(log_scale)) / extent.
-typedef struct gsf__scale_job {
+// Gradients of weight * mean(exp(log_scale)) / extent and of weight * mean(opacity).
+typedef struct gsf__penalty_job {
     gsf__model* model;
-    float factor; // weight / (3 count extent)
-} gsf__scale_job;
+    float scale;   // weight / (3 count extent); 0 = none
+    float opacity; // weight / count; 0 = none
+} gsf__penalty_job;
 
-static void gsf__scale_chunk(void* arg, size_t chunk, int worker) {
-    const gsf__scale_job* job = (const gsf__scale_job*)arg;
-    const gsf__group* group = &job->model->groups[GSF__SCALES];
+static void gsf__penalty_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__penalty_job* job = (const gsf__penalty_job*)arg;
+    const gsf__group *scales = &job->model->groups[GSF__SCALES], *logits = &job->model->groups[GSF__OPACITY];
     (void)worker;
-    const size_t count = job->model->count;
-    const size_t end = gsf__model_chunk_end(count, chunk);
-    for (size_t i = 3 * chunk * GSF__MODEL_CHUNK; i < 3 * end; i++)
-        group->grad[i] += job->factor * gsf__exp_poly(group->value[i] < 80.0f ? group->value[i] : 80.0f);
+    const size_t begin = chunk * GSF__MODEL_CHUNK, end = gsf__model_chunk_end(job->model->count, chunk);
+    for (size_t i = 3 * begin; job->scale > 0.0f && i < 3 * end; i++)
+        scales->grad[i] += job->scale * gsf__exp_poly(scales->value[i] < 80.0f ? scales->value[i] : 80.0f);
+    for (size_t i = begin; job->opacity > 0.0f && i < end; i++)
+        logits->grad[i] += job->opacity * gsf__sigmoid(logits->value[i]) * gsf__sigmoid(-logits->value[i]);
+}
+
+/* MCMC shakes the means: by covariance * normal noise * rate, next to nothing where a splat is opaque. The official rate is
+   noise * lr_means * extent, which depends on the unit of length; divided by extent^2 it is what it is for scenes of extent
+   1, to which gsplat scales all. */
+typedef struct gsf__noise_job {
+    gsf__model* model;
+    uint64_t seed, stream;
+    double rate;
+} gsf__noise_job;
+
+static void gsf__noise_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__noise_job* job = (const gsf__noise_job*)arg;
+    const gsf__model* model = job->model;
+    (void)worker;
+    const size_t end = gsf__model_chunk_end(model->count, chunk);
+    for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
+        const float steep = 100.0f * (0.005f - gsf__sigmoid(model->groups[GSF__OPACITY].value[i]));
+        if (steep < -30.0f) continue; // opacities above 0.305: a factor below 1e-13
+        float* mean = model->groups[GSF__MEANS].value + 3 * i;
+        const float* scale = model->groups[GSF__SCALES].value + 3 * i;
+        double r[9], normal[3], axis[3];
+        gsf__densify_rotation(model->groups[GSF__QUATS].value + 4 * i, r);
+        for (size_t a = 0; a < 3; a++)
+            normal[a] = gsf_random_normal(job->seed, job->stream, (uint64_t)model->ids[i] * 3 + a);
+        for (int a = 0; a < 3; a++) {
+            const double variance = (double)gsf__exp_poly(scale[a] < 40.0f ? 2.0f * scale[a] : 80.0f);
+            axis[a] = variance * (r[a] * normal[0] + r[3 + a] * normal[1] + r[6 + a] * normal[2]);
+        }
+        const double amount = job->rate * (double)gsf__sigmoid(steep);
+        for (int a = 0; a < 3; a++) {
+            const double moved = (double)mean[a] +
+                                 amount * (r[3 * a] * axis[0] + r[3 * a + 1] * axis[1] + r[3 * a + 2] * axis[2]);
+            if (fabs(moved) <= (double)FLT_MAX) mean[a] = (float)moved;
+        }
+    }
 }
 
 // Multiplies every opacity by `factor`, on the logits: with e = exp(-logit), log(f / (1 + e - f)).
@@ -10441,7 +10594,7 @@ static void gsf__decay_chunk(void* arg, size_t chunk, int worker) {
 }
 
 static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are statistics needed?
-    return iteration < trainer->desc.densify_until;
+    return !trainer->desc.mcmc && iteration < trainer->desc.densify_until;
 }
 
 /* The splats with all SH caught up, for everyone but the trainer. That must not change the state, or a run would depend (in
@@ -10571,11 +10724,12 @@ static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t 
     const gsf_train_desc* d = &trainer->desc;
     gsf__model* model = &trainer->model;
     const size_t chunks = gsf__model_chunks(model->count);
-    if (d->scale_penalty > 0.0f) {
-        gsf__scale_job job;
+    if (d->scale_penalty > 0.0f || d->opacity_penalty > 0.0f) {
+        gsf__penalty_job job;
         job.model = model;
-        job.factor = (float)((double)d->scale_penalty / (3.0 * (double)model->count * (double)d->extent));
-        gsf__parallel_for(ctx, chunks, gsf__scale_chunk, &job);
+        job.scale = (float)((double)d->scale_penalty / (3.0 * (double)model->count * (double)d->extent));
+        job.opacity = (float)((double)d->opacity_penalty / (double)model->count);
+        gsf__parallel_for(ctx, chunks, gsf__penalty_chunk, &job);
     }
     const gsf__adam_rates rates = gsf__trainer_rates(trainer, iteration);
     trainer->rejected += gsf__adam_step(ctx, model, &rates, iteration, gsf__trainer_bands(trainer, iteration));
@@ -10584,6 +10738,14 @@ static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t 
         job.model = model;
         job.factor = pow(1.0 - (double)d->opacity_decay, GSF__DECAY_INTERVAL);
         gsf__parallel_for(ctx, chunks, gsf__decay_chunk, &job);
+    }
+    if (d->mcmc && d->mcmc_noise > 0.0f) {
+        gsf__noise_job job;
+        job.model = model;
+        job.seed = d->seed;
+        job.stream = gsf__stream(GSF__STREAM_NOISE, (uint64_t)iteration);
+        job.rate = (double)d->mcmc_noise * rates.means / ((double)d->extent * (double)d->extent);
+        gsf__parallel_for(ctx, chunks, gsf__noise_chunk, &job);
     }
 }
 
@@ -10602,12 +10764,14 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
     gsf__visit_job visits;
     memset(&visits, 0, sizeof visits);
     visits.model = model;
-    const int densify = gsf__trainer_densifies(trainer, iteration) && iteration > d->densify_from &&
+    const int densify = iteration < d->densify_until && iteration > d->densify_from &&
                         iteration % d->densify_interval == 0;
     gsf_result result = gsf__trainer_gradients(ctx, trainer, iteration, &visits, &local);
     if (result == GSF_OK && densify) { // room for the worst case now, so that nothing can fail after Adam
         const size_t room = d->max_splats > model->count ? d->max_splats - model->count : 0;
-        result = gsf__model_reserve(ctx, model, model->count + 2 * (room < model->count ? room : model->count));
+        const size_t grown = d->mcmc ? gsf__mcmc_growth(model->count, d->max_splats)
+                                     : 2 * (room < model->count ? room : model->count);
+        result = gsf__model_reserve(ctx, model, model->count + grown);
         gsf__trainer_refresh_view(trainer);
     }
     if (result != GSF_OK) {
@@ -10620,9 +10784,13 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
     if (densify) {
         if (model->lazy) gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__lazy_all_chunk, model->lazy);
         const gsf__densify_rule rule = gsf__trainer_rule(trainer, iteration);
-        size_t clones, splits;
-        gsf__densify_select(model, &rule, &clones, &splits);
-        gsf__densify_apply(model, &rule, clones, splits);
+        if (d->mcmc) {
+            gsf__mcmc_densify(model, &rule);
+        } else {
+            size_t clones, splits;
+            gsf__densify_select(model, &rule, &clones, &splits);
+            gsf__densify_apply(model, &rule, clones, splits);
+        }
         gsf__model_sort(model);
     }
     if (gsf__trainer_densifies(trainer, iteration) && d->opacity_reset_interval > 0 &&
@@ -10662,7 +10830,8 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
         (double)d->render.footprint, (double)d->render.gradient, (double)d->render.antialiased,
         (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
         (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
-        (double)d->densify_absolute, (double)d->dense_adam, (double)trainer->photos.count};
+        (double)d->densify_absolute, (double)d->dense_adam, (double)d->mcmc, (double)d->mcmc_noise,
+        (double)d->opacity_penalty, (double)trainer->photos.count};
     uint64_t hash = 0;
     for (size_t i = 0; i < GSF__COUNT(values); i++) {
         uint64_t bits;

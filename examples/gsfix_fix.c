@@ -34,7 +34,7 @@ typedef struct fix_setup { // everything that decides what the run computes
     char init[16]; // method, resolved
 } fix_setup;
 
-enum { SET_WHOLE, SET_REAL, SET_SWITCH }; // int32_t, float, int32_t of 0 (off) or 1 (on)
+enum { SET_WHOLE, SET_REAL, SET_SWITCH, SET_COUNT }; // int32_t, float, int32_t of 0 (off) or 1 (on), size_t
 typedef struct setting { const char* name; int kind; size_t offset; } setting;
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
@@ -45,6 +45,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"dropout", SET_REAL, TRAIN_AT(dropout)},
     {"opacity_decay", SET_REAL, TRAIN_AT(opacity_decay)},
     {"scale_penalty", SET_REAL, TRAIN_AT(scale_penalty)},
+    {"opacity_penalty", SET_REAL, TRAIN_AT(opacity_penalty)},
     {"depth_smoothness", SET_REAL, TRAIN_AT(depth_smoothness)},
     {"sh_interval", SET_WHOLE, TRAIN_AT(sh_interval)},
     {"lr_means", SET_REAL, TRAIN_AT(lr_means)},
@@ -64,6 +65,9 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"prune_opacity", SET_REAL, TRAIN_AT(prune_opacity)},
     {"prune_scale", SET_REAL, TRAIN_AT(prune_scale)},
     {"opacity_reset_interval", SET_WHOLE, TRAIN_AT(opacity_reset_interval)},
+    {"max_splats", SET_COUNT, TRAIN_AT(max_splats)},
+    {"mcmc", SET_SWITCH, TRAIN_AT(mcmc)},
+    {"mcmc_noise", SET_REAL, TRAIN_AT(mcmc_noise)},
     {"dense_adam", SET_SWITCH, TRAIN_AT(dense_adam)},
     {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased)},
     {"rounds", SET_WHOLE, FIX_AT(rounds)},
@@ -109,7 +113,9 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
         if (end == value || *end || !(fabs(x) <= 1e9) || (kind != SET_REAL && x != (double)(int32_t)x))
             return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, kind == SET_REAL ? "number" : "whole number");
         if (kind == SET_SWITCH && x != 0.0 && x != 1.0) return gsfix_misused(app, "--set %.*s: expected 0 or 1", (int)n, p);
+        if (kind == SET_COUNT && x < 0.0) return gsfix_misused(app, "--set %.*s: expected 0 or more", (int)n, p);
         if (kind == SET_REAL) *(float*)(void*)field = (float)x;
+        else if (kind == SET_COUNT) *(size_t*)(void*)field = (size_t)x;
         else *(int32_t*)(void*)field = (int32_t)x;
         p += n + (p[n] == ',');
     }
@@ -454,12 +460,13 @@ static void write_switches(fix_run* run) {
         const void* field = (const char*)&used + settings[i].offset;
         if (strcmp(settings[i].name, "random_points") == 0 && strcmp(used.init, "random") != 0) continue;
         if (strncmp(settings[i].name, "dense_", 6) == 0 && strcmp(used.init, "dense") != 0) continue;
-        const int32_t whole = settings[i].kind == SET_REAL ? 0 : *(const int32_t*)field;
-        if (settings[i].kind == SET_REAL) gsfix_json_number(ctx, t, settings[i].name, as_written(*(const float*)field));
-        else if (settings[i].kind == SET_WHOLE) gsfix_json_number(ctx, t, settings[i].name, whole);
+        const int kind = settings[i].kind;
+        const int32_t whole = kind == SET_WHOLE || kind == SET_SWITCH ? *(const int32_t*)field : 0;
+        if (kind == SET_COUNT) gsfix_json_number(ctx, t, settings[i].name, (double)*(const size_t*)field);
+        else if (kind == SET_REAL) gsfix_json_number(ctx, t, settings[i].name, as_written(*(const float*)field));
+        else if (kind == SET_WHOLE) gsfix_json_number(ctx, t, settings[i].name, whole);
         else gsfix_json_text(ctx, t, settings[i].name, whole ? "on" : "off");
     }
-    gsfix_json_number(ctx, t, "max_splats", (double)train->max_splats);
     gsfix_json_number(ctx, t, "extent", as_written(train->extent));
     gsfix_json_number(ctx, t, "near_plane", as_written(train->render.near_plane));
     gsfix_json_begin(ctx, t, "background", '[');

@@ -352,14 +352,18 @@ static void test_regularisers(gsf_context* ctx) {
     CHECK(gsf__exp_poly(-1000.0f) == 0.0f);
 
     gsf__model model = make_model(ctx, 700, 0);
-    gsf__scale_job penalty = {&model, 0.25f};
-    gsf__parallel_for(ctx, gsf__model_chunks(model.count), gsf__scale_chunk, &penalty);
+    gsf__penalty_job penalty = {&model, 0.25f, 0.5f};
+    gsf__parallel_for(ctx, gsf__model_chunks(model.count), gsf__penalty_chunk, &penalty);
     for (size_t i = 0; i < 3 * model.count; i += 17) { // derivative of 0.25 exp(s)
         const double s = (double)model.groups[GSF__SCALES].value[i];
         CHECK_NEAR(model.groups[GSF__SCALES].grad[i], 0.25 * (exp(s + 1e-4) - exp(s - 1e-4)) / 2e-4, 1e-6 * exp(s));
     }
-    gsf__decay_job decay = {&model, 0.9};
     float* logits = model.groups[GSF__OPACITY].value;
+    for (size_t i = 0; i < model.count; i += 17) { // derivative of 0.5 opacity
+        const double x = (double)logits[i], low = 1.0 / (1.0 + exp(1e-4 - x)), high = 1.0 / (1.0 + exp(-1e-4 - x));
+        CHECK_NEAR(model.groups[GSF__OPACITY].grad[i], 0.5 * (high - low) / 2e-4, 1e-6);
+    }
+    gsf__decay_job decay = {&model, 0.9};
     logits[0] = 80.0f;
     logits[1] = -90.0f;
     double before[700];
@@ -400,6 +404,117 @@ static void test_cap(gsf_context* ctx) { // near the largest number of splats th
     rule.max_splats = 50;
     gsf__densify_select(&model, &rule, &clones, &splits);
     CHECK(clones + splits == 0);
+    gsf__model_destroy(ctx, &model);
+}
+
+// ---- MCMC on a bare model --------------------------------------------------------
+
+// The copies together: as opaque in the middle, and as much along a ray through it, as the one splat was.
+static void test_mcmc_share(void) {
+    static const double opacities[] = {0.006, 0.3, 0.9, 0.9999};
+    static const uint32_t numbers[] = {1, 2, 3, 10, 51};
+    for (size_t c = 0; c < 4; c++)
+        for (size_t k = 0; k < 5; k++) {
+            const double o = opacities[c];
+            const uint32_t n = numbers[k];
+            double each, sum = 0.0, ray = 0.0;
+            const double factor = gsf__mcmc_share(1.0 - o, n, &each);
+            CHECK_NEAR(1.0 - pow(1.0 - each, n), o, 1e-12);
+            for (uint32_t i = 1; i <= n; i++) { // the formula of the paper as it stands
+                double binomial = 1.0;
+                for (uint32_t j = 0; j < i; j++) {
+                    sum += binomial * (j % 2 ? -1.0 : 1.0) * pow(each, j + 1) / sqrt(j + 1.0);
+                    binomial *= (double)(i - 1 - j) / (double)(j + 1);
+                }
+            }
+            CHECK_NEAR(factor, o / sum, 1e-7);
+            for (int x = -900; x <= 900; x++) // in hundredths of the copies' sigma
+                ray += 0.01 * (1.0 - pow(1.0 - each * exp(-0.5e-4 * x * x), n));
+            CHECK_NEAR(factor * ray / (o * 2.5066282746), 1.0, 1e-6);
+        }
+}
+
+// Faint splats become copies of others, new ones come up to the budget, and what lies at a place stays as opaque.
+static void test_mcmc_densify(gsf_context* ctx) {
+    enum { COUNT = 400, DEAD = 90, BUDGET = 415 };
+    gsf__model model = make_model(ctx, COUNT, 1);
+    float* logits = model.groups[GSF__OPACITY].value;
+    double before[COUNT];
+    for (size_t i = 0; i < COUNT; i++) {
+        if (i % 4 == 0 && i < 4 * DEAD) logits[i] = -6.0f - (float)i;
+        model.groups[GSF__MEANS].value[3 * i] = (float)i; // says where a copy came from
+        before[i] = 1.0 / (1.0 + exp(-(double)logits[i]));
+        for (int g = 0; g < GSF__GROUPS; g++)
+            for (size_t k = 0; k < model.groups[g].width; k++)
+                model.groups[g].m[i * model.groups[g].width + k] = model.groups[g].v[i * model.groups[g].width + k] = 1.0f;
+    }
+    gsf__densify_rule rule;
+    memset(&rule, 0, sizeof rule);
+    rule.prune_opacity = 0.005;
+    rule.max_splats = BUDGET;
+    rule.seed = 8;
+    CHECK(gsf__mcmc_growth(COUNT, BUDGET) == 15 && gsf__mcmc_growth(COUNT, 10) == 0);
+    CHECK(gsf__mcmc_growth(COUNT, 1000) == 20);
+    CHECK_OK(ctx, gsf__model_reserve(ctx, &model, BUDGET));
+    gsf__mcmc_densify(&model, &rule);
+    logits = model.groups[GSF__OPACITY].value;
+    CHECK(model.count == BUDGET && model.next_id == COUNT + DEAD + 15);
+    double clear[COUNT];
+    int copies[COUNT] = {0}, opaque = 0, faint = 0;
+    for (size_t i = 0; i < COUNT; i++) clear[i] = 1.0;
+    for (size_t i = 0; i < BUDGET; i++) {
+        const size_t at = (size_t)model.groups[GSF__MEANS].value[3 * i];
+        clear[at] *= 1.0 / (1.0 + exp((double)logits[i]));
+        copies[at]++;
+        CHECK(logits[i] > -5.3f && model.visits[0][i] == 0 && model.visits[1][i] == 0);
+    }
+    for (size_t i = 0; i < BUDGET; i++) { // only what was neither copied nor a copy keeps its moments
+        const size_t at = (size_t)model.groups[GSF__MEANS].value[3 * i];
+        for (int g = 0; g < GSF__GROUPS; g++) {
+            const float expected = copies[at] > 1 ? 0.0f : 1.0f;
+            CHECK(model.groups[g].m[i * model.groups[g].width] == expected);
+            CHECK(model.groups[g].v[(i + 1) * model.groups[g].width - 1] == expected);
+        }
+        CHECK((model.ids[i] >= COUNT) == (i >= COUNT || (i % 4 == 0 && i < 4 * DEAD)));
+    }
+    for (size_t i = 0; i < COUNT; i++) {
+        const int dead = i % 4 == 0 && i < 4 * DEAD;
+        CHECK(dead == (copies[i] == 0));
+        if (!dead) CHECK_NEAR(1.0 - clear[i], before[i], 1e-6);
+        if (!dead && before[i] > 0.7) opaque += copies[i] - 1;
+        if (!dead && before[i] < 0.3) faint += copies[i] - 1;
+    }
+    CHECK(opaque > 2 * faint && opaque + faint > 50); // about 0.8 to 0.2
+
+    for (size_t i = 0; i < BUDGET; i++) logits[i] = -9.0f; // nothing to copy
+    gsf__mcmc_densify(&model, &rule);
+    CHECK(model.count == BUDGET && model.next_id == COUNT + DEAD + 15 && logits[0] == -9.0f);
+    gsf__model_destroy(ctx, &model);
+}
+
+// The spread of the noise is the covariance times the rate, and faint splats have all of it, opaque ones none.
+static void test_mcmc_noise(gsf_context* ctx) {
+    enum { COUNT = 4000 };
+    gsf__model model = make_model(ctx, COUNT, 0);
+    double square[3] = {0, 0, 0};
+    for (size_t i = 0; i < COUNT; i++) {
+        const float quat[4] = {0.5f, 0.5f, 0.5f, 0.5f}; // axis k of the splat is axis k + 1 of the world
+        memcpy(model.groups[GSF__QUATS].value + 4 * i, quat, sizeof quat);
+        for (int a = 0; a < 3; a++) model.groups[GSF__SCALES].value[3 * i + (size_t)a] = 0.3f * (float)a;
+        memset(model.groups[GSF__MEANS].value + 3 * i, 0, 3 * sizeof(float));
+        model.groups[GSF__OPACITY].value[i] = i % 2 ? -20.0f : 0.0f;
+    }
+    gsf__noise_job job = {&model, 3, gsf__stream(GSF__STREAM_NOISE, 7), 0.1};
+    gsf__parallel_for(ctx, gsf__model_chunks(COUNT), gsf__noise_chunk, &job);
+    for (size_t i = 0; i < 3 * COUNT; i++) {
+        const double moved = (double)model.groups[GSF__MEANS].value[i];
+        if (i / 3 % 2 == 0) CHECK(moved == 0.0);
+        square[i % 3] += moved * moved / (COUNT / 2);
+    }
+    for (int a = 0; a < 3; a++) {
+        const double sigma = exp(0.3 * a), factor = 1.0 / (1.0 + exp(-0.5));
+        CHECK_NEAR(sqrt(square[(a + 1) % 3]) / (0.1 * factor * sigma * sigma), 1.0, 0.06);
+    }
     gsf__model_destroy(ctx, &model);
 }
 
@@ -507,8 +622,16 @@ static gsf_train_desc busy_desc(void) {
     return desc;
 }
 
-static gsf_trainer* make_busy(gsf_context* ctx, const scene* s) {
+static gsf_train_desc busy_mcmc_desc(void) { // moves, grows to its budget and shakes
     gsf_train_desc desc = busy_desc();
+    desc.mcmc = 1;
+    desc.max_splats = SPLATS + 8;
+    desc.prune_opacity = 0.3f;
+    return desc;
+}
+
+static gsf_trainer* make_busy(gsf_context* ctx, const scene* s, int mcmc) {
+    gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
     gsf_trainer* trainer = NULL;
     if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer))) exit(2);
     CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
@@ -583,6 +706,43 @@ static void test_learns(gsf_context* ctx, const scene* s) {
           memcmp(copy.ids, s->start.ids, copy.count * sizeof(uint32_t)) == 0);
     gsf_splat_destroy(ctx, &copy);
     gsf_splat_destroy_trainer(ctx, trainer);
+}
+
+// A third of the splats starts where nothing is to be seen, too faint to learn.
+static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
+    enum { BUDGET = SPLATS + 11 };
+    gsf_train_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.iterations = 300;
+    desc.mcmc = 1;
+    desc.max_splats = BUDGET;
+    desc.densify_interval = 20;
+    gsf_splats start;
+    if (!CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, &start))) return;
+    memcpy(start.means, s->start.means, SPLATS * (3 + 3 + 4 + 1 + 12) * sizeof(float)); // one block, see gsf_splat_make
+    for (size_t i = 0; i < SPLATS; i += 3) start.opacity_logits[i] = -12.0f;
+    gsf_trainer* trainer;
+    if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &start, &trainer))) return;
+    const double before = mean_square_error(ctx, trainer, s);
+    double first = 0.0, last = 0.0;
+    for (int i = 0; i < 300; i++) {
+        gsf_train_stats stats;
+        if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+        CHECK(stats.splats >= SPLATS && stats.splats <= BUDGET && stats.rejected == 0);
+        if (i < VIEWS) first += stats.loss;
+        if (i >= 300 - VIEWS) last += stats.loss;
+    }
+    const double after = mean_square_error(ctx, trainer, s);
+    const gsf_splats* end = gsf_splat_trainer_splats(trainer);
+    size_t faint = 0;
+    for (size_t i = 0; i < end->count; i++) faint += end->opacity_logits[i] < -5.0f;
+    printf("MCMC (%s): loss %.4f -> %.4f, %.2f -> %.2f dB, %zu faint\n", gsf_cpu_level_name(ctx->cpu_level),
+           first / VIEWS, last / VIEWS, -10.0 * log10(before), -10.0 * log10(after), faint);
+    CHECK(end->count == BUDGET && faint < SPLATS / 12);
+    CHECK(last < 0.35 * first);
+    CHECK(after < before * 0.1);
+    gsf_splat_destroy_trainer(ctx, trainer);
+    gsf_splat_destroy(ctx, &start);
 }
 
 // Every photo once in each round; each render counts as one visit.
@@ -707,7 +867,19 @@ static void test_settings(gsf_context* ctx, const scene* s) {
     CHECK(trainer->desc.opacity_reset_interval == 1000 && trainer->desc.densify_interval == 100);
     CHECK(trainer->desc.render.near_plane == 0.7f);
     CHECK_NEAR(trainer->desc.extent, 4.0, 0.4);
+    CHECK(trainer->desc.mcmc_noise == 0.0f && trainer->desc.opacity_penalty == 0.0f);
     gsf_splat_destroy_trainer(ctx, trainer);
+
+    desc.mcmc = 1;
+    desc.scale_penalty = -1.0f;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
+    CHECK(trainer->desc.densify_until == 2500 && trainer->desc.opacity_reset_interval < 0);
+    CHECK(trainer->desc.mcmc_noise == 5e5f && trainer->desc.max_splats == 1000000);
+    CHECK(trainer->desc.opacity_penalty == 0.01f && trainer->desc.scale_penalty == 0.0f);
+    gsf_splat_destroy_trainer(ctx, trainer);
+    desc.mcmc = 0;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer), GSF_ERROR_INVALID_ARGUMENT);
+    desc.scale_penalty = 0.0f;
 
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
     CHECK(trainer->first_bands == 2 && gsf__trainer_bands(trainer, 1) == 2); // bands in use stay on
@@ -721,7 +893,7 @@ static void test_settings(gsf_context* ctx, const scene* s) {
 
 // ---- determinism ---------------------------------------------------------------------
 
-static void test_workers(const scene* s, gsf_cpu_level level) {
+static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
     gsf_text states[3];
     for (int run = 0; run < 3; run++) {
         gsf_context ctx;
@@ -736,11 +908,16 @@ static void test_workers(const scene* s, gsf_cpu_level level) {
             ctx.threads = 1;
         }
         CHECK_OK(&ctx, gsf_init_context(&ctx));
-        gsf_trainer* trainer = make_busy(&ctx, s);
+        gsf_trainer* trainer = make_busy(&ctx, s, mcmc);
         take_steps(&ctx, trainer, 60);
         states[run] = save_state(&ctx, trainer);
-        if (run == 0) printf("busy run (%s): %zu splats\n", gsf_cpu_level_name(ctx.cpu_level), trainer->model.count);
-        if (run == 0) CHECK(trainer->model.count > SPLATS + 10);
+        if (run == 0) printf("busy run (%s): %zu splats, %u ids\n", gsf_cpu_level_name(ctx.cpu_level),
+                             trainer->model.count, (unsigned)trainer->model.next_id);
+        if (run == 0 && !mcmc) CHECK(trainer->model.count > SPLATS + 10);
+        if (run == 0 && mcmc) { // all of the budget; more ids than splats came from moves
+            CHECK(trainer->model.count == SPLATS + 8);
+            CHECK(trainer->model.next_id > 1000 + 3 * (SPLATS - 1) + 1 + 8);
+        }
         gsf_splat_destroy_trainer(&ctx, trainer);
     }
     CHECK(same_text(&states[0], &states[1]));
@@ -753,19 +930,19 @@ static void test_workers(const scene* s, gsf_cpu_level level) {
 
 // ---- checkpoints -----------------------------------------------------------------------
 
-static void test_resume(gsf_context* ctx, const scene* s) {
+static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
     static const int stops[] = {0, 1, 9, 10, 11, 25, 37, 50, 60};
-    gsf_trainer* trainer = make_busy(ctx, s);
+    gsf_trainer* trainer = make_busy(ctx, s, mcmc);
     take_steps(ctx, trainer, 60);
     gsf_text whole = save_state(ctx, trainer);
     gsf_splat_destroy_trainer(ctx, trainer);
     for (size_t k = 0; k < sizeof stops / sizeof *stops; k++) {
-        trainer = make_busy(ctx, s);
+        trainer = make_busy(ctx, s, mcmc);
         take_steps(ctx, trainer, stops[k]);
         gsf_text state = save_state(ctx, trainer);
         gsf_splat_destroy_trainer(ctx, trainer);
         // the caller gives views and settings again, some before and some after
-        gsf_train_desc desc = busy_desc();
+        gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
         if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->truth, &trainer))) exit(2);
         if (k % 2) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
         CHECK_OK(ctx, gsf_splat_trainer_restore(ctx, trainer, "state", state.data, state.size));
@@ -1038,7 +1215,8 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     }
     float* floats[] = {&desc.lr_means, &desc.lr_opacity, &desc.extent, &desc.background[2], &desc.densify_grad,
                        &desc.prune_opacity, &desc.dropout, &desc.opacity_decay, &desc.scale_penalty,
-                       &desc.depth_smoothness, &desc.render.near_plane, &desc.lambda_ssim};
+                       &desc.depth_smoothness, &desc.render.near_plane, &desc.lambda_ssim, &desc.opacity_penalty,
+                       &desc.mcmc_noise};
     for (size_t i = 0; i < sizeof floats / sizeof *floats; i++) {
         *floats[i] = NAN;
         CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 1, &s->start, &trainer),
@@ -1140,7 +1318,7 @@ static void failing_free(void* user, void* memory) {
 }
 
 // A small run in which allocation `fail_at` fails. A failed step is taken again: it must have changed nothing.
-static gsf_result run_failing(const scene* s, failing* f, gsf_text* end) {
+static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_text* end) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     ctx.allocator.alloc_fn = failing_alloc;
@@ -1148,7 +1326,7 @@ static gsf_result run_failing(const scene* s, failing* f, gsf_text* end) {
     ctx.allocator.user = f;
     ctx.threads = 1;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    gsf_train_desc desc = busy_desc();
+    gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
     gsf_trainer* trainer;
     gsf_text chunks;
     memset(&chunks, 0, sizeof chunks);
@@ -1181,16 +1359,16 @@ static gsf_result run_failing(const scene* s, failing* f, gsf_text* end) {
     return worst;
 }
 
-static void test_out_of_memory(const scene* s) {
+static void test_out_of_memory(const scene* s, int mcmc) {
     gsf_text end;
     memset(&end, 0, sizeof end);
     failing f = {0, 0, 0};
-    CHECK(run_failing(s, &f, &end) == GSF_OK);
+    CHECK(run_failing(s, &f, mcmc, &end) == GSF_OK);
     const size_t calls = f.calls;
     size_t noticed = 0;
     for (size_t k = 1; k <= calls; k++) {
         failing g = {0, 0, k};
-        const gsf_result result = run_failing(s, &g, &end);
+        const gsf_result result = run_failing(s, &g, mcmc, &end);
         noticed += result == GSF_ERROR_OUT_OF_MEMORY;
         CHECK(result == GSF_ERROR_OUT_OF_MEMORY || result == GSF_OK);
     }
@@ -1294,18 +1472,22 @@ int main(void) {
     }
     test_regularisers(&ctx);
     test_cap(&ctx);
+    test_mcmc_share();
+    test_mcmc_densify(&ctx);
+    test_mcmc_noise(&ctx);
     test_learns(&ctx, &s);
+    test_mcmc_learns(&ctx, &s);
     test_order_and_visits(&ctx, &s);
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
     test_settings(&ctx, &s);
-    test_workers(&s, ctx.cpu_level);
+    for (int mcmc = 0; mcmc < 2; mcmc++) test_workers(&s, ctx.cpu_level, mcmc);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_lazy_training(&s, (gsf_cpu_level)level);
-    test_resume(&ctx, &s);
+    for (int mcmc = 0; mcmc < 2; mcmc++) test_resume(&ctx, &s, mcmc);
     test_damaged_checkpoints(&ctx, &s);
     test_bad_input(&ctx, &s);
     test_degenerate(&ctx, &s);
-    test_out_of_memory(&s);
+    for (int mcmc = 0; mcmc < 2; mcmc++) test_out_of_memory(&s, mcmc);
     test_steady(&s);
     destroy_scene(&ctx, &s);
     return test_report();
