@@ -9978,7 +9978,7 @@ static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
     for (size_t i = 0; i < model->count; i++) {
         if (model->visits[0][i] == 0) continue;
         float *logit = model->groups[GSF__OPACITY].value + i, *scale = model->groups[GSF__SCALES].value + 3 * i;
-        const uint32_t copies = model->visits[0][i] < GSF__MCMC_MOST ? model->visits[0][i] + 1 : GSF__MCMC_MOST;
+        const uint32_t most = GSF__MCMC_MOST, copies = model->visits[0][i] < most ? model->visits[0][i] + 1 : most;
         const double clear = 1.0 / (1.0 + exp((double)*logit));
         double opacity;
         const float grown = (float)log(gsf__mcmc_share(clear > (double)FLT_EPSILON ? clear : (double)FLT_EPSILON, copies,
