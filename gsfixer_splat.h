@@ -402,11 +402,11 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     float prune_scale;             // 0.1 of extent, after the first opacity reset
     int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
     size_t max_splats;             // densification stops growing here; 0 = 2 million (mcmc: 1 million)
-    int32_t mcmc;                  // 0; 1: densification as "3DGS as Markov Chain Monte Carlo" has it: splats of less than
+    int32_t mcmc;                  // 0; 1: densification as "3DGS as Markov Chain Monte Carlo" has it: splats of at most
                                    // prune_opacity move onto others, up to 5 % a time join them until there are max_splats,
-                                   // and means are shaken in every step; nothing is pruned, no opacity is reset, and the
-                                   // other densify_ and prune_ fields have no effect
-    float mcmc_noise;              // 5e5; negative = means are not shaken
+                                   // and means are shaken in every step. Nothing is pruned, no opacity is reset;
+                                   // densify_grad, densify_absolute, densify_scale and prune_scale have no effect
+    float mcmc_noise;              // 5e5 with mcmc, negative = means are not shaken
     gsf_render_desc render;        // footprint, gradient kind, antialiasing, near plane (0 = the smaller of 0.2 and 0.01
                                    // extent); background is taken from above; hidden, sh_bands, opacity_scale stay zero
     // regularisers for few views; zero = off
@@ -9937,7 +9937,7 @@ static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule,
    up to C(N,k+1): with j = k + 1 one sum of (-1)^(j+1) C(N,j) o'^j / sqrt(j) is left. */
 enum { GSF__MCMC_MOST = 51 }; // copies that the correction counts, as the official code does
 
-// transparency: 1 - o. Returns the factor of the scales. In double the alternating sum is good to 1e-8 at 51 copies.
+// transparency: 1 - o. Returns the factor of the scales. The sum alternates; in double it is good to 1e-12.
 static double gsf__mcmc_share(double transparency, uint32_t copies, double* opacity) {
     double term = 1.0, sum = 0.0;
     *opacity = -expm1(log(transparency) / (double)copies);
