@@ -56,7 +56,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make(gsf_context* ctx, size_t count, 
 GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 
 // Morton order of the means: neighbours in space become neighbours in memory, which at a million splats saves a sixth of a
-// training step. Renders stay the same but for the order of splats of equal depth. The trainer does it whenever it densifies.
+// training step (before a trainer is made of them; it keeps the order and appends). Renders stay the same but for the order
+// of splats of equal depth.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats);
 
 // The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Splats with a non-finite
@@ -651,29 +652,14 @@ static uint64_t gsf__spread_bits(uint64_t v) {
     return (v | v << 2) & 0x09249249;
 }
 
-// Keys (code << 32 | index) in Morton order of the means: 1024 cells along each side of the box of those within 3 standard
-// deviations, the others in the cells of its faces. keys, spare: room for `count`; returns the one that holds the result.
-static uint64_t* gsf__morton_order(const float* means, size_t count, uint64_t* keys, uint64_t* spare) {
-    double low[3], scale[3];
-    for (size_t c = 0; c < 3; c++) {
-        double sum = 0.0, sum2 = 0.0;
-        size_t n = 0;
-        for (size_t i = 0; i < count; i++) {
-            const double x = (double)means[3 * i + c];
-            if (!(fabs(x) <= 1e30)) continue;
-            sum += x;
-            sum2 += x * x;
-            n++;
-        }
-        const double mean = n ? sum / (double)n : 0.0, variance = n ? sum2 / (double)n - mean * mean : 0.0;
-        const double reach = variance > 0.0 ? 3.0 * sqrt(variance) : 0.0;
-        low[c] = mean - reach;
-        scale[c] = reach > 0.0 ? 1024.0 / (2.0 * reach) : 0.0;
-    }
+// Keys (code << 32 | index) in Morton order of the means: 1024 cells along each side of the box center +- reach, what lies
+// outside in the cells of its faces. keys, spare: room for `count`; returns the one that holds the result.
+static uint64_t* gsf__morton_order(const float* means, size_t count, const double center[3], const double reach[3],
+                                   uint64_t* keys, uint64_t* spare) {
     for (size_t i = 0; i < count; i++) {
         uint64_t code = 0;
         for (size_t c = 0; c < 3; c++) {
-            const double cell = ((double)means[3 * i + c] - low[c]) * scale[c];
+            const double cell = reach[c] > 0.0 ? 512.0 + 512.0 * ((double)means[3 * i + c] - center[c]) / reach[c] : 0.0;
             code |= gsf__spread_bits(cell > 0.0 ? (cell < 1023.0 ? (uint64_t)cell : 1023) : 0) << c; // NaN: 0
         }
         keys[i] = code << 32 | i;
@@ -695,7 +681,21 @@ GSF_API gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats) {
     void* spare = gsf_alloc(ctx, count ? count : 1, sh_row > 16 ? sh_row : 16);
     const gsf_result result = keys && spare ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK && count) {
-        const uint64_t* order = gsf__morton_order(splats->means, count, keys, keys + count);
+        double center[3], reach[3]; // three standard deviations
+        for (size_t c = 0; c < 3; c++) {
+            double sum = 0.0, sum2 = 0.0, n = 0.0;
+            for (size_t i = 0; i < count; i++) {
+                const double x = (double)splats->means[3 * i + c];
+                if (!(fabs(x) <= 1e30)) continue;
+                sum += x;
+                sum2 += x * x;
+                n += 1.0;
+            }
+            center[c] = n > 0.0 ? sum / n : 0.0;
+            const double variance = n > 0.0 ? sum2 / n - center[c] * center[c] : 0.0;
+            reach[c] = variance > 0.0 ? 3.0 * sqrt(variance) : 0.0;
+        }
+        const uint64_t* order = gsf__morton_order(splats->means, count, center, reach, keys, keys + count);
         gsf__reorder(splats->means, 3 * sizeof(float), order, count, spare);
         gsf__reorder(splats->log_scales, 3 * sizeof(float), order, count, spare);
         gsf__reorder(splats->quats, 4 * sizeof(float), order, count, spare);
@@ -10017,25 +10017,6 @@ static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) 
     gsf__densify_clear(model);
 }
 
-// Morton order: new splats were appended. Between steps the gradients and statistics are zero, and serve as scratch.
-static void gsf__model_sort(gsf__model* model) {
-    const size_t n = model->count;
-    uint64_t* keys[2];
-    for (int k = 0; k < 2; k++) keys[k] = (uint64_t*)(void*)model->screen[k]; // two floats a splat each
-    const uint64_t* order = gsf__morton_order(model->groups[GSF__MEANS].value, n, keys[0], keys[1]);
-    for (int g = 0; g < GSF__GROUPS; g++) {
-        gsf__group* group = &model->groups[g];
-        const size_t row = group->width * sizeof(float);
-        gsf__reorder(group->value, row, order, n, group->grad);
-        gsf__reorder(group->m, row, order, n, group->grad);
-        gsf__reorder(group->v, row, order, n, group->grad);
-        memset(group->grad, 0, n * row);
-    }
-    gsf__reorder(model->ids, sizeof(uint32_t), order, n, model->grad_sum[0]);
-    memset(model->grad_sum[0], 0, n * sizeof(float));
-    for (int k = 0; k < 2; k++) memset(model->screen[k], 0, 2 * n * sizeof(float));
-}
-
 // Opacities above `limit` fall to it; the moments of all opacities are zeroed.
 static void gsf__reset_opacity(gsf__model* model, double limit) {
     const float logit = (float)log(limit / (1.0 - limit));
@@ -10791,7 +10772,6 @@ GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, 
             gsf__densify_select(model, &rule, &clones, &splits);
             gsf__densify_apply(model, &rule, clones, splits);
         }
-        gsf__model_sort(model);
     }
     if (gsf__trainer_densifies(trainer, iteration) && d->opacity_reset_interval > 0 &&
         iteration % d->opacity_reset_interval == 0)

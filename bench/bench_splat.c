@@ -289,7 +289,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     if (!bench_context(&ctx, level, threads)) return;
     gsf_splats splats;
     bench_make_splats(&ctx, count, size, &splats);
-    bench_require(&ctx, gsf_splat_sort(&ctx, &splats)); // as the trainer has them
+    bench_require(&ctx, gsf_splat_sort(&ctx, &splats));
     const gsf_camera camera = bench_camera(width, height);
     const size_t pixels = (size_t)width * (size_t)height;
     gsf_render_output out;

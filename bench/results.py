@@ -199,8 +199,8 @@ def write_markdown(path, rows, stress, has_growth):
     if skips:
         lines += ["## What is left out, and what it saves and costs", "",
                   "Renders with their backward: the default; splats drawn only in the tiles of their 3-sigma square, as the "
-                  "official rasterizer does (to compare with it; nothing uses it); splats in no spatial order (the trainer and `gsf_splat_sort` "
-                  "keep Morton order). The difference is that of the picture from the default's.", "",
+                  "official rasterizer does (to compare with it; nothing uses it); splats in no spatial order (all other rows "
+                  "have the Morton order of `gsf_splat_sort`). The difference is that of the picture from the default's.", "",
                   "Lazy Adam: the SH of blocks of splats that no picture of the step shows rest, and catch up when one is "
                   "drawn again (on by default; `dense_adam` turns it off). Steps in turns on five views; catching up is part "
                   "of the step, not of its Adam stage. The difference is that of the SH from the dense run's, rounding fed "
