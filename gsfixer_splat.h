@@ -417,8 +417,8 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     float scale_penalty;           // weight of mean(exp(log_scale)) / extent; with mcmc zero = 0.01, negative = off
     float opacity_penalty;         // weight of mean(opacity); with mcmc zero = 0.01, negative = off
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
-    int32_t dense_adam;            // 0: the SH of splats that are not drawn catch up later with the same result but for
-                                   // rounding (1e-6); 1: all move in every step
+    int32_t lazy_adam;             // 0; 1: the SH of splats that are not drawn catch up when they are, to the same values but
+                                   // for rounding (5e-7 after 1000 steps); pays where views see little of the scene
     uint32_t _end_canary;
 } gsf_train_desc;
 
@@ -652,14 +652,29 @@ static uint64_t gsf__spread_bits(uint64_t v) {
     return (v | v << 2) & 0x09249249;
 }
 
-// Keys (code << 32 | index) in Morton order of the means: 1024 cells along each side of the box center +- reach, what lies
-// outside in the cells of its faces. keys, spare: room for `count`; returns the one that holds the result.
-static uint64_t* gsf__morton_order(const float* means, size_t count, const double center[3], const double reach[3],
-                                   uint64_t* keys, uint64_t* spare) {
+// Keys (code << 32 | index) in Morton order of the means: 1024 cells along each side of the box of three standard deviations
+// around their mean, what lies outside in the cells of its faces. keys, spare: room for `count`; returns the one that holds
+// the result.
+static uint64_t* gsf__morton_order(const float* means, size_t count, uint64_t* keys, uint64_t* spare) {
+    double low[3], scale[3];
+    for (size_t c = 0; c < 3; c++) {
+        double sum = 0.0, sum2 = 0.0, n = 0.0;
+        for (size_t i = 0; i < count; i++) {
+            const double x = (double)means[3 * i + c];
+            if (!(fabs(x) <= 1e30)) continue;
+            sum += x;
+            sum2 += x * x;
+            n += 1.0;
+        }
+        const double mean = n > 0.0 ? sum / n : 0.0, variance = n > 0.0 ? sum2 / n - mean * mean : 0.0;
+        const double reach = variance > 0.0 ? 3.0 * sqrt(variance) : 0.0;
+        low[c] = mean - reach;
+        scale[c] = reach > 0.0 ? 512.0 / reach : 0.0;
+    }
     for (size_t i = 0; i < count; i++) {
         uint64_t code = 0;
         for (size_t c = 0; c < 3; c++) {
-            const double cell = reach[c] > 0.0 ? 512.0 + 512.0 * ((double)means[3 * i + c] - center[c]) / reach[c] : 0.0;
+            const double cell = ((double)means[3 * i + c] - low[c]) * scale[c];
             code |= gsf__spread_bits(cell > 0.0 ? (cell < 1023.0 ? (uint64_t)cell : 1023) : 0) << c; // NaN: 0
         }
         keys[i] = code << 32 | i;
@@ -681,21 +696,7 @@ GSF_API gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats) {
     void* spare = gsf_alloc(ctx, count ? count : 1, sh_row > 16 ? sh_row : 16);
     const gsf_result result = keys && spare ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK && count) {
-        double center[3], reach[3]; // three standard deviations
-        for (size_t c = 0; c < 3; c++) {
-            double sum = 0.0, sum2 = 0.0, n = 0.0;
-            for (size_t i = 0; i < count; i++) {
-                const double x = (double)splats->means[3 * i + c];
-                if (!(fabs(x) <= 1e30)) continue;
-                sum += x;
-                sum2 += x * x;
-                n += 1.0;
-            }
-            center[c] = n > 0.0 ? sum / n : 0.0;
-            const double variance = n > 0.0 ? sum2 / n - center[c] * center[c] : 0.0;
-            reach[c] = variance > 0.0 ? 3.0 * sqrt(variance) : 0.0;
-        }
-        const uint64_t* order = gsf__morton_order(splats->means, count, center, reach, keys, keys + count);
+        const uint64_t* order = gsf__morton_order(splats->means, count, keys, keys + count);
         gsf__reorder(splats->means, 3 * sizeof(float), order, count, spare);
         gsf__reorder(splats->log_scales, 3 * sizeof(float), order, count, spare);
         gsf__reorder(splats->quats, 4 * sizeof(float), order, count, spare);
@@ -9267,7 +9268,7 @@ static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* s
 // view touched moves on by its momentum, as in the official code. One pass reads parameters, moments and gradients, writes
 // the first two and zeroes the gradients for the next step.
 //
-// The SH coefficients, 48 of 59 parameters, are lazy: those of a block of splats none of which is drawn rest, and when one
+// The SH coefficients, 48 of 59 parameters, can be lazy: those of a block of splats none of which is drawn rest, and when one
 // is drawn again (or the block has rested for GSF__REST_MOST steps, or all are needed) they catch up with the steps in
 // between, whose gradients were zero, at once. All that decides what is drawn stays dense. In blocks, because rows here and
 // there cost as much memory traffic as all of them.
@@ -10064,7 +10065,7 @@ struct gsf_trainer {
     float *color, *d_color, *depth, *d_depth; // packed images of the step
     size_t color_capacity, d_color_capacity, depth_capacity, d_depth_capacity;
     gsf_splats view;         // the model as splats; SH of resting splats are behind
-    gsf__lazy lazy;          // where the model points, unless desc.dense_adam
+    gsf__lazy lazy;          // where the model points, if desc.lazy_adam
     gsf_splats shown;        // the view with all SH caught up, if shows
     int shows;
     int32_t iteration;       // steps done
@@ -10253,7 +10254,7 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"scale_penalty", (double)d->scale_penalty, 0, 1e6},
         {"opacity_penalty", (double)d->opacity_penalty, 0, 1e6},
         {"depth_smoothness", (double)d->depth_smoothness, 0, 1e6},
-        {"dense_adam", (double)d->dense_adam, 0, 1},
+        {"lazy_adam", (double)d->lazy_adam, 0, 1},
     };
     for (size_t i = 0; i < GSF__COUNT(fields); i++)
         if (!(fields[i].value >= fields[i].low && fields[i].value <= fields[i].high))
@@ -10445,7 +10446,7 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     GSF__TRY(gsf__trainer_reserve_images(ctx, trainer, &trainer->photos));
     gsf__trainer_refresh_view(trainer);
     gsf__trainer_prepare_lazy(ctx, trainer);
-    if (!trainer->desc.dense_adam) trainer->model.lazy = &trainer->lazy;
+    if (trainer->desc.lazy_adam) trainer->model.lazy = &trainer->lazy;
     return gsf_splat_make_rasterizer(ctx, &trainer->rasterizer);
 }
 
@@ -10810,7 +10811,7 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
         (double)d->render.footprint, (double)d->render.gradient, (double)d->render.antialiased,
         (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
         (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
-        (double)d->densify_absolute, (double)d->dense_adam, (double)d->mcmc, (double)d->mcmc_noise,
+        (double)d->densify_absolute, (double)d->lazy_adam, (double)d->mcmc, (double)d->mcmc_noise,
         (double)d->opacity_penalty, (double)trainer->photos.count};
     uint64_t hash = 0;
     for (size_t i = 0; i < GSF__COUNT(values); i++) {

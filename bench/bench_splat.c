@@ -593,24 +593,20 @@ static void bench_skips(const bench_options* o, const char* name, size_t count, 
             seconds[k][i] = wall[0] + wall[1];
             cpu[k] += (used[0] + used[1]) / rounds;
         }
+    double* full = (double*)malloc(passes[FULL].values * sizeof(double));
+    if (!full) exit(1);
+    for (size_t i = 0; i < passes[FULL].values; i++) full[i] = (double)((const float*)passes[FULL].out.color.data)[i];
     for (int k = 0; k < VARIANTS; k++) {
         bench_row row = bench_make_row(label, ctx.cpu_level, threads, bench_median(seconds[k], (size_t)rounds), cpu[k],
                                        bench_pairs(&ctx, passes[k].r), "pairs");
         row.variant = labels[k];
-        const float *full = (const float*)passes[FULL].out.color.data, *other = (const float*)passes[k].out.color.data;
-        double difference = 0.0, total = 0.0;
-        for (size_t i = 0; i < passes[k].values && k != FULL; i++) {
-            const double d = (double)other[i] - (double)full[i];
-            row.error_max = fmax(row.error_max, fabs(d));
-            difference += d * d;
-            total += (double)full[i] * (double)full[i];
-        }
         if (k != FULL) {
-            row.error_rel_l2 = sqrt(difference / total);
+            bench_error((const float*)passes[k].out.color.data, full, NULL, passes[k].values, 1, &row);
             row.reference = "default";
         }
         bench_print(o, &row);
     }
+    free(full);
     for (int k = 0; k < VARIANTS; k++) bench_close_pass(&ctx, &passes[k]);
 }
 
@@ -649,7 +645,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
         memset(&desc, 0, sizeof desc);
         desc.densify_until = -1;
         desc.sh_interval = 1;
-        desc.dense_adam = !k;
+        desc.lazy_adam = k;
         bench_require(&ctx, gsf_splat_make_trainer(&ctx, &desc, views, VIEWS, &splats, &trainers[k]));
     }
     double adam[2][MOST], step[2][MOST], cpu[2][2] = {{0.0, 0.0}, {0.0, 0.0}}, drawn = 0.0;

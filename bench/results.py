@@ -202,7 +202,7 @@ def write_markdown(path, rows, stress, has_growth):
                   "official rasterizer does (to compare with it; nothing uses it); splats in no spatial order (all other rows "
                   "have the Morton order of `gsf_splat_sort`). The difference is that of the picture from the default's.", "",
                   "Lazy Adam: the SH of blocks of splats that no picture of the step shows rest, and catch up when one is "
-                  "drawn again (on by default; `dense_adam` turns it off). Steps in turns on five views; catching up is part "
+                  "drawn again (off by default; `lazy_adam` and `--quality fast` turn it on). Steps in turns on five views; catching up is part "
                   "of the step, not of its Adam stage. The difference is that of the SH from the dense run's, rounding fed "
                   "back through all steps: the largest relative to at least 0.2, and in L2. Prescribed gradients leave "
                   "4.7e-7 after 1,000 steps (`tests/test_trainer.c`).", "",

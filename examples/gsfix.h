@@ -112,7 +112,7 @@ float gsfix_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
 
 typedef struct gsfix_quality { // --quality is one of these rows
     const char* name;
-    int32_t dense_adam; // of gsf_train_desc
+    int32_t lazy_adam;  // of gsf_train_desc
     float skip_psnr;    // dB from which a window counts as needing no restoring; 0 = all are restored
     int32_t max_pixels; // of a frame that is restored; 0 = photo size
 } gsfix_quality;

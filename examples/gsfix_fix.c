@@ -14,9 +14,9 @@ static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothn
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
 
 static const gsfix_quality qualities[] = { // what each saves and costs: bench/QUALITY.md
-    {"exact", 1, 0.0f, 0},
+    {"exact", 0, 0.0f, 0},
     {"balanced", 0, 45.0f, 0},
-    {"fast", 0, 36.0f, 320 * 240},
+    {"fast", 1, 36.0f, 320 * 240},
 };
 
 const gsfix_quality* gsfix_find_quality(const char* name) {
@@ -68,7 +68,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"max_splats", SET_COUNT, TRAIN_AT(max_splats)},
     {"mcmc", SET_SWITCH, TRAIN_AT(mcmc)},
     {"mcmc_noise", SET_REAL, TRAIN_AT(mcmc_noise)},
-    {"dense_adam", SET_SWITCH, TRAIN_AT(dense_adam)},
+    {"lazy_adam", SET_SWITCH, TRAIN_AT(lazy_adam)},
     {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased)},
     {"rounds", SET_WHOLE, FIX_AT(rounds)},
     {"first_round", SET_WHOLE, FIX_AT(first_round)},
@@ -131,7 +131,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     gsf_train_desc* train = &setup->fix.train;
     train->iterations = app->o.iterations ? app->o.iterations : DEFAULT_ITERATIONS;
     train->seed = app->o.seed;
-    train->dense_adam = quality->dense_adam;
+    train->lazy_adam = quality->lazy_adam;
     if (!app->o.regularize || strcmp(app->o.regularize, "on") == 0) {
         train->dropout = few_view_regularizers.dropout;
         train->opacity_decay = few_view_regularizers.opacity_decay;

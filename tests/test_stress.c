@@ -1209,7 +1209,6 @@ static void test_invisible(void) {
             gsf_train_desc desc = busy_desc();
             desc.render.footprint = official ? GSF_FOOTPRINT_OFFICIAL : GSF_FOOTPRINT_FULL;
             desc.prune_scale = 1e6f; // far splats put in may be large
-            desc.dense_adam = 1; // lazy rows catch up by blocks: what else is in a block decides how their sums round
             gsf_trainer *a = trainer_make(ctx, &desc, &t, &t.start), *b = trainer_make(ctx, &desc, &t, &more);
             size_t put_in = 0, wrong = 0;
             for (int i = 1; i <= desc.iterations; i++) {

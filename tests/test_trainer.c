@@ -12,6 +12,21 @@ static void for_backwards(void* user, size_t chunk_count, gsf_chunk_fn body, voi
     for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)((i * 7 + 3) % (size_t)workers));
 }
 
+// One thread; or, with workers, chunks in reverse order and dealt to them.
+static gsf_context open_context(gsf_cpu_level level, int* workers) {
+    gsf_context ctx;
+    memset(&ctx, 0, sizeof ctx);
+    ctx.cpu_level = level;
+    ctx.threads = 1;
+    if (workers) {
+        ctx.parallel.for_fn = for_backwards;
+        ctx.parallel.worker_count = *workers;
+        ctx.parallel.user = workers;
+    }
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    return ctx;
+}
+
 // ---- loss ----------------------------------------------------------------------
 
 typedef struct loss_case {
@@ -124,17 +139,7 @@ static void test_loss_accuracy(gsf_cpu_level level) {
     static float render[N], photo[N], d[N], other[N];
     static double exact[N];
     int workers = 3;
-    gsf_context plain, shuffled;
-    memset(&plain, 0, sizeof plain);
-    plain.cpu_level = level;
-    plain.threads = 1;
-    CHECK_OK(&plain, gsf_init_context(&plain));
-    memset(&shuffled, 0, sizeof shuffled);
-    shuffled.cpu_level = level;
-    shuffled.parallel.for_fn = for_backwards;
-    shuffled.parallel.worker_count = workers;
-    shuffled.parallel.user = &workers;
-    CHECK_OK(&shuffled, gsf_init_context(&shuffled));
+    gsf_context plain = open_context(level, NULL), shuffled = open_context(level, &workers);
     gsf__loss_scratch scratch, another;
     memset(&scratch, 0, sizeof scratch);
     memset(&another, 0, sizeof another);
@@ -932,18 +937,8 @@ static void test_settings(gsf_context* ctx, const scene* s) {
 static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
     gsf_text states[3];
     for (int run = 0; run < 3; run++) {
-        gsf_context ctx;
         int workers = run == 1 ? 2 : 5;
-        memset(&ctx, 0, sizeof ctx);
-        ctx.cpu_level = level;
-        if (run) {
-            ctx.parallel.for_fn = for_backwards;
-            ctx.parallel.worker_count = workers;
-            ctx.parallel.user = &workers;
-        } else {
-            ctx.threads = 1;
-        }
-        CHECK_OK(&ctx, gsf_init_context(&ctx));
+        gsf_context ctx = open_context(level, run ? &workers : NULL);
         gsf_trainer* trainer = make_busy(&ctx, s, mcmc);
         take_steps(&ctx, trainer, 60);
         states[run] = save_state(&ctx, trainer);
@@ -1063,7 +1058,7 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
 
 // Views so narrow that each sees a part of the splats, which lie in the order of their place.
 enum { LAZY_STEPS = 300, LAZY_SPLATS = 700 };
-static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int dense_adam) {
+static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int lazy) {
     gsf_train_view views[VIEWS + 2];
     for (int v = 0; v < VIEWS + 2; v++) {
         views[v] = s->views[v];
@@ -1079,7 +1074,7 @@ static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int dense_adam
     desc.densify_interval = 50;
     desc.max_splats = LAZY_SPLATS + 100;
     desc.dropout = 0.1f;
-    desc.dense_adam = dense_adam;
+    desc.lazy_adam = lazy;
     gsf_splats many;
     uint64_t state = 23;
     CHECK_OK(ctx, gsf_splat_make(ctx, LAZY_SPLATS, 1, &many));
@@ -1114,20 +1109,9 @@ static float* export_sh(gsf_context* ctx, const gsf_trainer* trainer, size_t* co
 // Lazy training gives what dense training gives; with any workers, when it is looked at, and when it is continued from a
 // checkpoint, it gives the same bits.
 static void test_lazy_training(const scene* s, gsf_cpu_level level) {
-    gsf_context ctx, other;
     int workers = 5;
-    memset(&ctx, 0, sizeof ctx);
-    ctx.threads = 1;
-    ctx.cpu_level = level;
-    CHECK_OK(&ctx, gsf_init_context(&ctx));
-    memset(&other, 0, sizeof other);
-    other.cpu_level = level;
-    other.parallel.for_fn = for_backwards;
-    other.parallel.worker_count = workers;
-    other.parallel.user = &workers;
-    CHECK_OK(&other, gsf_init_context(&other));
-
-    gsf_trainer *dense = make_narrow(&ctx, s, 1), *lazy = make_narrow(&ctx, s, 0), *watched = make_narrow(&other, s, 0);
+    gsf_context ctx = open_context(level, NULL), other = open_context(level, &workers);
+    gsf_trainer *dense = make_narrow(&ctx, s, 0), *lazy = make_narrow(&ctx, s, 1), *watched = make_narrow(&other, s, 1);
     size_t rests = 0, longest = 0, drawn = 0, n, dense_n;
     gsf_text middle;
     memset(&middle, 0, sizeof middle);
@@ -1171,11 +1155,11 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
     printf("lazy training (%s): %zu splats, %.0f %% of the blocks at rest in a step, for up to %zu steps; SH differ by %.2g\n",
            gsf_cpu_level_name(level), lazy->model.count, 100.0 * (double)rests / (double)(rests + drawn), longest,
            sqrt(sum / total));
-    CHECK(rests > drawn / 8 && longest > 100 && sqrt(sum / total) < 1e-3);
+    CHECK(rests > drawn / 4 && longest > 100 && sqrt(sum / total) < 1e-3);
 
     gsf_text end = save_state(&ctx, lazy), seen = save_state(&other, watched), resumed, again;
     CHECK(same_text(&end, &seen));
-    gsf_trainer* late = make_narrow(&ctx, s, 0);
+    gsf_trainer* late = make_narrow(&ctx, s, 1);
     (void)gsf_splat_trainer_splats(late); // shown, then replaced
     CHECK_OK(&ctx, gsf_splat_trainer_restore(&ctx, late, "middle", middle.data, middle.size));
     again = save_state(&ctx, late);
@@ -1185,7 +1169,7 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
     CHECK(same_text(&end, &resumed));
     gsf_splat_destroy_trainer(&ctx, late);
 
-    late = make_narrow(&ctx, s, 1); // a dense run takes over
+    late = make_narrow(&ctx, s, 0); // a dense run takes over
     CHECK_OK(&ctx, gsf_splat_trainer_restore(&ctx, late, "end", end.data, end.size));
     free(a);
     a = export_sh(&ctx, late, &dense_n);
