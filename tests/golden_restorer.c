@@ -1,0 +1,10 @@
+// The restorer against the golden data of the official code: every part reads its shapes, configs and values from
+// GSF_GOLDEN/restorer, so that another folder of the same layout passes unchanged.
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_nn.h"
+
+#include "test.h"
+
+int main(void) {
+    return test_report();
+}
