@@ -757,7 +757,7 @@ GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double po
 
 GSF__END_IMPLEMENTATION
 
-// DEFLATE (RFC 1951) through stb, which only gsfixer.h's own implementation compiles: so these two are linked, not shared.
+// What only gsfixer.h's own implementation can do, so that it is linked, not shared. First DEFLATE (RFC 1951) through stb.
 // Sizes up to 2^31 bytes in, 2^30 out; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB.
 #ifdef __cplusplus
 extern "C" {
@@ -768,6 +768,12 @@ GSF_API gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* 
                                 size_t room);
 // Appends `data` (size > 0) compressed.
 GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+
+// JSON that begins at byte `start` of a file: offsets, also in error texts, count from the file's first byte.
+GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
+                                        gsf_json* out);
+// Do files come through stdio? (Then they are plain files, which a platform may list or map.)
+GSF_API int gsf__io_is_default(const gsf_context* ctx);
 #ifdef __cplusplus
 }
 #endif
@@ -1139,6 +1145,8 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
     gsf_destroy_text(ctx, &name);
     return result;
 }
+
+GSF_API int gsf__io_is_default(const gsf_context* ctx) { return ctx->io.read_fn == gsf__stdio_read; }
 
 GSF_API gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size) {
     *data = NULL;
@@ -1533,21 +1541,27 @@ static gsf_result gsf__json_read_document(gsf__json_parser* p) {
 }
 
 GSF_API gsf_result gsf_parse_json(gsf_context* ctx, const char* name, const char* text, size_t size, gsf_json* out) {
+    return gsf__parse_json_from(ctx, name, text, size, 0, out);
+}
+
+GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
+                                        gsf_json* out) {
     memset(out, 0, sizeof *out);
     snprintf(out->name, sizeof out->name, "%s", name ? name : "json");
     if (size > 0xfffffff0u)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: JSON of %zu bytes (at most 4 GiB)", out->name, size);
-    if (size >= 3 && memcmp(text, "\xef\xbb\xbf", 3) == 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: expected a value, got a byte order mark", out->name);
+    if (size - start >= 3 && memcmp(text + start, "\xef\xbb\xbf", 3) == 0)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected a value, got a byte order mark", out->name, start);
     gsf__json_parser p;
     memset(&p, 0, sizeof p);
     p.ctx = ctx;
     p.name = out->name;
     p.text = text;
     p.size = size;
+    p.at = start;
     p.out = out;
     size_t string_bytes;
-    gsf__json_measure(text, size, &p.value_capacity, &string_bytes);
+    gsf__json_measure(text + start, size - start, &p.value_capacity, &string_bytes);
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
     out->values = (gsf_json_value*)gsf_alloc(ctx, p.value_capacity, sizeof *out->values);
     if (out->values) out->strings = (char*)gsf_alloc(ctx, string_bytes, 1);

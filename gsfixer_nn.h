@@ -258,6 +258,902 @@ GSF_API void gsf_nn_destroy_workspace(gsf_context* ctx, gsf_nn_workspace* worksp
 
 // ---- >>nn files -----------------------------------------------------------------
 
+/* A safetensors file:
+       u64 n (little-endian) | n bytes of JSON, padded with spaces | data
+       {"__metadata__": {"key": "text", ...}, "name": {"dtype": "BF16", "shape": [2, 3], "data_offsets": [begin, end]}, ...}
+   Offsets count from the data's first byte. As the official reader does, this one demands that the tensors cover the data
+   without hole, overlap or rest. (github.com/huggingface/safetensors, README and safetensors/src/tensor.rs) */
+
+enum { GSF__NN_FILE_HEAD = 8, GSF__NN_HEADER_MAX = 100000000 }; // bytes; the limit is the official reader's
+
+typedef enum gsf__nn_holder { GSF__NN_BORROWED, GSF__NN_READ, GSF__NN_MAPPED } gsf__nn_holder;
+
+typedef struct gsf__nn_file {
+    const unsigned char* data;
+    size_t size;
+    gsf__nn_holder holder;
+    char* names; // of its tensors, one after the other
+    size_t names_size;
+} gsf__nn_file;
+
+typedef struct gsf__nn_files {
+    gsf__nn_file* files;
+    size_t count, capacity, tensor_capacity;
+} gsf__nn_files;
+
+// ---- platform: what a path leads to, what a folder holds, mapping a file
+
+typedef enum gsf__nn_path_kind { GSF__NN_UNKNOWN, GSF__NN_IS_FILE, GSF__NN_IS_FOLDER } gsf__nn_path_kind;
+
+// Name of the one file of `folder` that ends in `suffix`; its size is 0 where there is none. More than one is an error.
+typedef struct gsf__nn_listing {
+    const char *folder, *suffix;
+    gsf_text found;
+} gsf__nn_listing;
+
+static int gsf__nn_ends_in(const char* text, const char* suffix) {
+    const size_t size = strlen(text), end = strlen(suffix);
+    return size >= end && memcmp(text + size - end, suffix, end) == 0;
+}
+
+#if defined(__unix__) || defined(__APPLE__)
+#include <dirent.h>
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) {
+    struct stat info;
+    if (stat(path, &info) != 0) return GSF__NN_UNKNOWN;
+    return S_ISDIR(info.st_mode) ? GSF__NN_IS_FOLDER : GSF__NN_IS_FILE;
+}
+
+static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
+    DIR* folder = opendir(listing->folder);
+    if (!folder) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", listing->folder, strerror(errno));
+    gsf_result result = GSF_OK;
+    for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
+        if (entry->d_name[0] == '.' || !gsf__nn_ends_in(entry->d_name, listing->suffix)) continue;
+        if (listing->found.size) {
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: holds %s and %s: name one by its prefix",
+                              listing->folder, listing->found.data, entry->d_name);
+        } else {
+            gsf_text_append(ctx, &listing->found, entry->d_name, strlen(entry->d_name));
+            if (listing->found.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+        }
+    }
+    closedir(folder);
+    return result;
+}
+
+// *data is NULL where the file cannot be mapped, but may be readable.
+static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned char** data, size_t* size) {
+    struct stat info;
+    *data = NULL;
+    *size = 0;
+    const int file = open(path, O_RDONLY);
+    if (file < 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
+    if (fstat(file, &info) == 0 && S_ISREG(info.st_mode) && info.st_size > 0 &&
+        (uint64_t)info.st_size <= SIZE_MAX / 2) {
+        void* mapping = mmap(NULL, (size_t)info.st_size, PROT_READ, MAP_PRIVATE, file, 0);
+        if (mapping != MAP_FAILED) {
+            *data = (const unsigned char*)mapping;
+            *size = (size_t)info.st_size;
+        }
+    }
+    close(file);
+    return GSF_OK;
+}
+
+static void gsf__nn_unmap(const unsigned char* data, size_t size) { munmap((void*)(uintptr_t)data, size); }
+#else
+static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) { (void)path; return GSF__NN_UNKNOWN; }
+
+static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
+    (void)ctx;
+    (void)listing;
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned char** data, size_t* size) {
+    (void)ctx;
+    (void)path;
+    *data = NULL;
+    *size = 0;
+    return GSF_OK;
+}
+
+static void gsf__nn_unmap(const unsigned char* data, size_t size) {
+    (void)data;
+    (void)size;
+}
+#endif
+
+// ---- reading the header
+
+// A name for one line of text: ASCII, and not too long.
+typedef struct gsf__nn_shown { char text[100]; } gsf__nn_shown;
+
+static gsf__nn_shown gsf__nn_show(const char* name) {
+    gsf__nn_shown shown;
+    snprintf(shown.text, sizeof shown.text, "%s", name);
+    for (char* c = shown.text; *c; c++)
+        if (*c < 0x20 || *c > 0x7e) *c = '?';
+    return shown;
+}
+
+// The end of a path that a document's name (gsf_json) can hold.
+static const char* gsf__nn_path_end(const char* path) {
+    const size_t size = strlen(path), room = sizeof ((gsf_json*)0)->name - 1;
+    return size > room ? path + (size - room) : path;
+}
+
+// A whole number as it stands in the text, without sign, fraction or exponent, up to 2^63 - 1. 0 where it is none.
+static int gsf__nn_read_size(const char* text, const gsf_json_value* value, uint64_t* out) {
+    *out = 0;
+    if (value->type != GSF_JSON_NUMBER) return 0;
+    const char* p = text + value->offset; // what follows it in a checked document is no digit
+    if (*p == '-') return 0;
+    for (; *p >= '0' && *p <= '9'; p++) {
+        if (*out > ((uint64_t)INT64_MAX - (uint64_t)(*p - '0')) / 10) return 0;
+        *out = *out * 10 + (uint64_t)(*p - '0');
+    }
+    return *p != '.' && *p != 'e' && *p != 'E';
+}
+
+typedef struct gsf__nn_header { // one file's header while it is read
+    gsf_context* ctx;
+    const char* name;
+    const char* text;       // the whole file's first byte
+    const char* data;       // the first byte behind the header
+    uint64_t data_size;
+    gsf_json json;
+} gsf__nn_header;
+
+static gsf_result gsf__nn_entry_fail(const gsf__nn_header* h, const gsf_json_value* at, const gsf_json_value* entry,
+                                     gsf_result result, const char* text) {
+    return gsf_fail(h->ctx, result, "%s:%u: tensor %s: %s", h->name, (unsigned)at->offset, gsf__nn_show(entry->key).text,
+                    text);
+}
+
+static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
+    const gsf_json_value* value = gsf_json_member(&h->json, entry, "dtype");
+    if (!value || value->type != GSF_JSON_STRING)
+        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"dtype\" is not given as text");
+    for (int i = GSF_NN_F32; i <= GSF_NN_I64; i++) {
+        out->dtype = (gsf_nn_dtype)i;
+        if (strcmp(value->string, gsf_nn_dtype_name(out->dtype)) == 0) return GSF_OK;
+    }
+    out->dtype = GSF_NN_U8;
+    if (strcmp(value->string, "BOOL") == 0) return GSF_OK;
+    char text[140];
+    snprintf(text, sizeof text, "dtype %.30s is not supported", gsf__nn_show(value->string).text);
+    return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_UNSUPPORTED, text);
+}
+
+static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
+    const gsf_json_value* value = gsf_json_member(&h->json, entry, "shape");
+    if (!value || value->type != GSF_JSON_ARRAY)
+        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"shape\" is not given as a list");
+    if (value->count > GSF_NN_MAX_RANK)
+        return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_UNSUPPORTED, "more than 8 dimensions");
+    uint64_t count = 1, size;
+    for (uint32_t i = value->child; i; i = h->json.values[i].next) {
+        if (!gsf__nn_read_size(h->text, &h->json.values[i], &size))
+            return gsf__nn_entry_fail(h, &h->json.values[i], entry, GSF_ERROR_FORMAT, "a dimension is no whole number");
+        if (size != 0 && count > (uint64_t)INT64_MAX / size)
+            return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, "the shape overflows");
+        count *= size;
+        out->shape[out->rank++] = (int64_t)size;
+    }
+    out->count = (int64_t)count;
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
+    const gsf_json_value* value = gsf_json_member(&h->json, entry, "data_offsets");
+    uint64_t begin, end;
+    if (!value || value->type != GSF_JSON_ARRAY || value->count != 2 ||
+        !gsf__nn_read_size(h->text, gsf_json_element(&h->json, value, 0), &begin) ||
+        !gsf__nn_read_size(h->text, gsf_json_element(&h->json, value, 1), &end))
+        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT,
+                                  "\"data_offsets\" are not two whole numbers");
+    char text[160];
+    if (begin > end || end > h->data_size) {
+        snprintf(text, sizeof text, "bytes %llu to %llu do not lie in the %llu bytes of data", (unsigned long long)begin,
+                 (unsigned long long)end, (unsigned long long)h->data_size);
+        return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, text);
+    }
+    const uint64_t size = gsf_nn_dtype_size(out->dtype), count = (uint64_t)out->count;
+    if (count > UINT64_MAX / size || count * size != end - begin) {
+        snprintf(text, sizeof text, "%llu bytes for %llu values of %s", (unsigned long long)(end - begin),
+                 (unsigned long long)count, gsf_nn_dtype_name(out->dtype));
+        return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, text);
+    }
+    out->data = h->data + begin;
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_read_entry(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
+    memset(out, 0, sizeof *out);
+    if (entry->type != GSF_JSON_OBJECT) return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "no object");
+    if (strlen(entry->key) != entry->key_size)
+        return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "a zero byte in its name");
+    GSF__TRY(gsf__nn_read_dtype(h, entry, out));
+    GSF__TRY(gsf__nn_read_shape(h, entry, out));
+    return gsf__nn_read_place(h, entry, out);
+}
+
+static gsf_result gsf__nn_check_metadata(const gsf__nn_header* h, const gsf_json_value* metadata) {
+    int ok = metadata->type == GSF_JSON_OBJECT;
+    for (uint32_t i = metadata->child; ok && i; i = h->json.values[i].next)
+        ok = h->json.values[i].type == GSF_JSON_STRING;
+    return ok ? GSF_OK : gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%u: __metadata__ does not map names to texts", h->name,
+                                  (unsigned)metadata->offset);
+}
+
+static uint64_t gsf__nn_bytes(const gsf_tensor* tensor) {
+    return (uint64_t)tensor->count * gsf_nn_dtype_size(tensor->dtype);
+}
+
+static int gsf__nn_compare_places(const void* a, const void* b) { // an empty tensor before what begins where it stands
+    const gsf_tensor *x = (const gsf_tensor*)a, *y = (const gsf_tensor*)b;
+    if (x->data != y->data) return (const char*)x->data < (const char*)y->data ? -1 : 1;
+    return gsf__nn_bytes(x) < gsf__nn_bytes(y) ? -1 : gsf__nn_bytes(x) > gsf__nn_bytes(y);
+}
+
+static int gsf__nn_compare_names(const void* a, const void* b) {
+    return strcmp(((const gsf_tensor*)a)->name, ((const gsf_tensor*)b)->name);
+}
+
+static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_tensor* tensors, size_t count) {
+    const char* next = h->data;
+    const char* const end = h->data + h->data_size;
+    if (count) qsort(tensors, count, sizeof *tensors, gsf__nn_compare_places);
+    for (size_t i = 0; i < count; i++) {
+        const char* begin = (const char*)tensors[i].data;
+        if (begin != next)
+            return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%zu: tensor %s %s", h->name, (size_t)(begin - h->text),
+                            gsf__nn_show(tensors[i].name).text,
+                            begin < next ? "overlaps the one before it" : "follows bytes of no tensor");
+        next = begin + gsf__nn_bytes(&tensors[i]);
+    }
+    if (next != end)
+        return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes belong to no tensor", h->name, (size_t)(next - h->text),
+                        (size_t)(end - next));
+    return GSF_OK;
+}
+
+// Adds the tensors of a parsed header. Their names are copied to the file's block.
+static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weights, gsf__nn_file* file) {
+    gsf__nn_files* files = (gsf__nn_files*)weights->files;
+    const gsf_json_value* root = &h->json.values[0];
+    const size_t first = weights->tensor_count;
+    size_t names = 1; // so that there always is a block
+    if (root->type != GSF_JSON_OBJECT)
+        return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%d: the header is no object", h->name, (int)GSF__NN_FILE_HEAD);
+    for (uint32_t i = root->child; i; i = h->json.values[i].next) names += h->json.values[i].key_size + 1;
+    file->names = (char*)gsf_alloc(h->ctx, names, 1);
+    if (!file->names) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__reserve(h->ctx, (void**)&weights->tensors, &files->tensor_capacity, first, first + root->count,
+                          sizeof *weights->tensors));
+    for (uint32_t i = root->child; i; i = h->json.values[i].next) {
+        const gsf_json_value* entry = &h->json.values[i];
+        if (entry->key_size == 12 && memcmp(entry->key, "__metadata__", 12) == 0) {
+            GSF__TRY(gsf__nn_check_metadata(h, entry));
+            continue;
+        }
+        gsf_tensor* tensor = &weights->tensors[weights->tensor_count];
+        GSF__TRY(gsf__nn_read_entry(h, entry, tensor));
+        tensor->name = file->names + file->names_size;
+        memcpy(file->names + file->names_size, entry->key, entry->key_size + 1);
+        file->names_size += entry->key_size + 1;
+        weights->tensor_count++;
+    }
+    return gsf__nn_check_cover(h, weights->tensors + first, weights->tensor_count - first);
+}
+
+static gsf_result gsf__nn_read_header(gsf_context* ctx, const char* name, gsf_nn_weights* weights, gsf__nn_file* file) {
+    gsf__nn_header h;
+    memset(&h, 0, sizeof h);
+    h.ctx = ctx;
+    h.name = gsf__nn_path_end(name);
+    h.text = (const char*)file->data;
+    if (file->size < GSF__NN_FILE_HEAD)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: %zu bytes are no safetensors file", h.name, file->size);
+    const uint64_t size = gsf__load_le(file->data, GSF__NN_FILE_HEAD);
+    if (size > GSF__NN_HEADER_MAX || size > file->size - GSF__NN_FILE_HEAD)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: a header of %llu bytes in a file of %zu (at most %d)", h.name,
+                        (unsigned long long)size, file->size, (int)GSF__NN_HEADER_MAX);
+    const size_t end = GSF__NN_FILE_HEAD + (size_t)size;
+    if (size == 0 || file->data[GSF__NN_FILE_HEAD] != '{')
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%d: the header does not begin with '{'", h.name,
+                        (int)GSF__NN_FILE_HEAD);
+    h.data = h.text + end;
+    h.data_size = file->size - end;
+    GSF__TRY(gsf__parse_json_from(ctx, h.name, h.text, end, GSF__NN_FILE_HEAD, &h.json));
+    const gsf_result result = gsf__nn_read_entries(&h, weights, file);
+    gsf_destroy_json(ctx, &h.json);
+    return result;
+}
+
+// ---- files and folders
+
+static void gsf__nn_release(gsf_context* ctx, const unsigned char* data, size_t size, gsf__nn_holder holder) {
+    if (holder == GSF__NN_READ) gsf_free(ctx, (void*)(uintptr_t)data);
+    if (holder == GSF__NN_MAPPED) gsf__nn_unmap(data, size);
+}
+
+// Takes over the bytes, also on failure.
+static gsf_result gsf__nn_add_bytes(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
+                                    gsf__nn_holder holder, gsf_nn_weights* weights) {
+    gsf__nn_files* files = (gsf__nn_files*)weights->files;
+    const gsf_result result = gsf__reserve(ctx, (void**)&files->files, &files->capacity, files->count, files->count + 1,
+                                           sizeof *files->files);
+    if (result != GSF_OK) {
+        gsf__nn_release(ctx, data, size, holder);
+        return result;
+    }
+    gsf__nn_file* file = &files->files[files->count++];
+    memset(file, 0, sizeof *file);
+    file->data = data;
+    file->size = size;
+    file->holder = holder;
+    if (holder == GSF__NN_MAPPED) weights->mapped_bytes += size;
+    if (holder == GSF__NN_READ) weights->read_bytes += size;
+    return gsf__nn_read_header(ctx, name, weights, file);
+}
+
+static gsf_result gsf__nn_add_file(gsf_context* ctx, const char* path, gsf_nn_weights* weights) {
+    const unsigned char* mapping = NULL;
+    void* data = NULL;
+    size_t size = 0;
+    if (gsf__io_is_default(ctx)) GSF__TRY(gsf__nn_map(ctx, path, &mapping, &size));
+    if (mapping) return gsf__nn_add_bytes(ctx, path, mapping, size, GSF__NN_MAPPED, weights);
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    return gsf__nn_add_bytes(ctx, path, (const unsigned char*)data, size, GSF__NN_READ, weights);
+}
+
+// A shard's name must stay inside the index's folder.
+static int gsf__nn_is_plain_name(const gsf_json_value* value) {
+    return value->type == GSF_JSON_STRING && value->string_size > 0 && strlen(value->string) == value->string_size &&
+           !strpbrk(value->string, "/\\:") && value->string[0] != '.';
+}
+
+typedef struct gsf__nn_index { // weight_map of a sharded model while it is read
+    gsf_context* ctx;
+    const char* name;
+    size_t folder_size;       // the shards' names follow this many bytes of `path`
+    gsf_text path;
+    gsf_json json;
+    const gsf_json_value* map;
+    const char** shards;      // names of the opened files, in the order of gsf__nn_files
+    size_t shard_capacity;
+} gsf__nn_index;
+
+static gsf_result gsf__nn_open_shards(gsf__nn_index* index, gsf_nn_weights* weights) {
+    const gsf__nn_files* files = (const gsf__nn_files*)weights->files;
+    for (uint32_t i = index->map->child; i; i = index->json.values[i].next) {
+        const gsf_json_value* value = &index->json.values[i];
+        if (!gsf__nn_is_plain_name(value))
+            return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s: no plain file name", index->name,
+                            (unsigned)value->offset, gsf__nn_show(value->key).text);
+        size_t k = files->count; // from the latest: mostly that one
+        while (k > 0 && strcmp(index->shards[k - 1], value->string) != 0) k--;
+        if (k > 0) continue;
+        GSF__TRY(gsf__reserve(index->ctx, (void**)&index->shards, &index->shard_capacity, files->count, files->count + 1,
+                              sizeof *index->shards));
+        index->shards[files->count] = value->string;
+        index->path.size = index->folder_size;
+        gsf_text_append(index->ctx, &index->path, value->string, value->string_size);
+        if (index->path.failed) return GSF_ERROR_OUT_OF_MEMORY;
+        GSF__TRY(gsf__nn_add_file(index->ctx, index->path.data, weights));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_sort_names(gsf_context* ctx, gsf_nn_weights* weights) {
+    if (weights->tensor_count)
+        qsort(weights->tensors, weights->tensor_count, sizeof *weights->tensors, gsf__nn_compare_names);
+    for (size_t i = 1; i < weights->tensor_count; i++)
+        if (strcmp(weights->tensors[i - 1].name, weights->tensors[i].name) == 0)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s stands in two shards", weights->name,
+                            gsf__nn_show(weights->tensors[i].name).text);
+    return GSF_OK;
+}
+
+// Every tensor of the map must have come from the file that the map says.
+static gsf_result gsf__nn_check_index(const gsf__nn_index* index, const gsf_nn_weights* weights) {
+    const gsf__nn_files* files = (const gsf__nn_files*)weights->files;
+    for (uint32_t i = index->map->child; i; i = index->json.values[i].next) {
+        const gsf_json_value* value = &index->json.values[i];
+        const gsf_tensor* tensor = gsf_nn_find_tensor(weights, value->key);
+        if (!tensor || strlen(value->key) != value->key_size)
+            return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s is not in %s", index->name,
+                            (unsigned)value->offset, gsf__nn_show(value->key).text, gsf__nn_show(value->string).text);
+        size_t k = 0;
+        while ((uintptr_t)tensor->name - (uintptr_t)files->files[k].names >= files->files[k].names_size) k++;
+        if (strcmp(index->shards[k], value->string) != 0)
+            return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s is in %s, not in %s", index->name,
+                            (unsigned)value->offset, gsf__nn_show(value->key).text, gsf__nn_show(index->shards[k]).text,
+                            gsf__nn_show(value->string).text);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_read_index(gsf_context* ctx, const char* path, const void* data, size_t size,
+                                     gsf_nn_weights* weights) {
+    gsf__nn_index index;
+    memset(&index, 0, sizeof index);
+    index.ctx = ctx;
+    index.name = gsf__nn_path_end(path);
+    gsf_result result = gsf_parse_json(ctx, index.name, (const char*)data, size, &index.json);
+    if (result != GSF_OK) return result;
+    index.map = gsf_json_member(&index.json, &index.json.values[0], "weight_map");
+    if (!index.map || index.map->type != GSF_JSON_OBJECT) {
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: no \"weight_map\" object", index.name);
+    } else {
+        const char* slash = strrchr(path, '/');
+        index.folder_size = slash ? (size_t)(slash - path) + 1 : 0;
+        gsf_text_append(ctx, &index.path, path, index.folder_size);
+        result = gsf__nn_open_shards(&index, weights);
+        if (result == GSF_OK) result = gsf__nn_sort_names(ctx, weights);
+        if (result == GSF_OK) result = gsf__nn_check_index(&index, weights);
+    }
+    gsf_free(ctx, (void*)index.shards);
+    gsf_destroy_text(ctx, &index.path);
+    gsf_destroy_json(ctx, &index.json);
+    return result;
+}
+
+// Ends a stretch without the log hook, in which a file was allowed to be absent.
+static gsf_result gsf__nn_end_quiet(gsf_context* ctx, const gsf_logger* logger, gsf_result result) {
+    ctx->logger = *logger;
+    if (result != GSF_OK && result != GSF_ERROR_IO) gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
+    return result;
+}
+
+// Opens <path>.index.json, else <path>. *found 0: neither is there, which is an error unless `may_lack`.
+static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_lack, int* found, gsf_nn_weights* weights) {
+    const gsf_logger logger = ctx->logger;
+    const size_t plain = path->size;
+    void* data = NULL;
+    size_t size;
+    gsf_text_append(ctx, path, ".index.json", 11);
+    if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    memset(&ctx->logger, 0, sizeof ctx->logger);
+    gsf_result result = gsf__nn_end_quiet(ctx, &logger, gsf_read_file(ctx, path->data, &data, &size));
+    *found = result == GSF_OK;
+    if (*found) {
+        result = gsf__nn_read_index(ctx, path->data, data, size, weights);
+        gsf_free(ctx, data);
+        return result;
+    }
+    if (result != GSF_ERROR_IO) return result;
+    path->data[plain] = 0;
+    if (may_lack) memset(&ctx->logger, 0, sizeof ctx->logger);
+    result = gsf__nn_add_file(ctx, path->data, weights);
+    if (may_lack) (void)gsf__nn_end_quiet(ctx, &logger, result);
+    *found = result == GSF_OK;
+    if (result == GSF_OK) return gsf__nn_sort_names(ctx, weights);
+    return may_lack && result == GSF_ERROR_IO ? GSF_OK : result;
+}
+
+static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const char* name, int may_lack, int* found,
+                                     gsf_nn_weights* weights) {
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s%s%s.safetensors", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
+    const gsf_result result =
+        path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_open_either(ctx, &path, may_lack, found, weights);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
+// Without a prefix: the folder's only index, else its only file; where folders cannot be listed, the usual names.
+static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_nn_weights* weights) {
+    static const char* const suffixes[] = {".safetensors.index.json", ".safetensors"};
+    static const char* const usual[] = {"diffusion_pytorch_model", "model"};
+    gsf_result result = GSF_OK;
+    int found = 0;
+    if (!gsf__io_is_default(ctx) || gsf__nn_look_at_path(folder) == GSF__NN_UNKNOWN) {
+        for (size_t i = 0; i < GSF__COUNT(usual) && result == GSF_OK && !found; i++)
+            result = gsf__nn_open_named(ctx, folder, usual[i], 1, &found, weights);
+    }
+    for (size_t i = 0; i < GSF__COUNT(suffixes) && result == GSF_OK && !found; i++) {
+        if (!gsf__io_is_default(ctx)) break;
+        gsf__nn_listing listing;
+        memset(&listing, 0, sizeof listing);
+        listing.folder = folder;
+        listing.suffix = suffixes[i];
+        result = gsf__nn_list_folder(ctx, &listing);
+        if (result == GSF_OK && listing.found.size) {
+            listing.found.data[listing.found.size - strlen(suffixes[i])] = 0;
+            result = gsf__nn_open_named(ctx, folder, listing.found.data, 0, &found, weights);
+        }
+        gsf_destroy_text(ctx, &listing.found);
+    }
+    if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_IO, "%s: no .safetensors file in it", folder);
+    return result;
+}
+
+static gsf_result gsf__nn_begin_weights(gsf_context* ctx, const char* name, gsf_nn_weights* out) {
+    memset(out, 0, sizeof *out);
+    const size_t size = strlen(name), room = sizeof out->name - 1;
+    snprintf(out->name, sizeof out->name, "%s", size > room ? name + (size - room) : name);
+    out->files = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__nn_files));
+    return out->files ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static gsf_result gsf__nn_open_index_file(gsf_context* ctx, const char* path, gsf_nn_weights* out) {
+    void* data;
+    size_t size;
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    const gsf_result result = gsf__nn_read_index(ctx, path, data, size, out);
+    gsf_free(ctx, data);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_open_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
+    gsf_result result = gsf__nn_begin_weights(ctx, path, out);
+    if (result != GSF_OK) return result;
+    const gsf__nn_path_kind kind = gsf__io_is_default(ctx) ? gsf__nn_look_at_path(path) : GSF__NN_UNKNOWN;
+    int found;
+    if (kind != GSF__NN_IS_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
+        result = gsf__nn_open_index_file(ctx, path, out);
+    } else if (kind == GSF__NN_IS_FILE || (kind == GSF__NN_UNKNOWN && gsf__nn_ends_in(path, ".safetensors"))) {
+        result = gsf__nn_add_file(ctx, path, out);
+        if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
+    } else if (prefix) {
+        result = gsf__nn_open_named(ctx, path, prefix, 0, &found, out);
+    } else {
+        result = gsf__nn_open_folder(ctx, path, out);
+    }
+    if (result != GSF_OK) gsf_nn_close_weights(ctx, out);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_open_weights_memory(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                              gsf_nn_weights* out) {
+    gsf_result result = gsf__nn_begin_weights(ctx, name, out);
+    if (result == GSF_OK) result = gsf__nn_add_bytes(ctx, name, (const unsigned char*)data, size, GSF__NN_BORROWED, out);
+    if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
+    if (result != GSF_OK) gsf_nn_close_weights(ctx, out);
+    return result;
+}
+
+GSF_API void gsf_nn_close_weights(gsf_context* ctx, gsf_nn_weights* weights) {
+    gsf__nn_files* files = (gsf__nn_files*)weights->files;
+    for (size_t i = 0; files && i < files->count; i++) {
+        gsf__nn_release(ctx, files->files[i].data, files->files[i].size, files->files[i].holder);
+        gsf_free(ctx, files->files[i].names);
+    }
+    if (files) gsf_free(ctx, files->files);
+    gsf_free(ctx, files);
+    gsf_free(ctx, weights->tensors);
+    memset(weights, 0, sizeof *weights);
+}
+
+GSF_API const gsf_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name) {
+    size_t low = 0, high = weights->tensor_count;
+    while (low < high) {
+        const size_t middle = low + (high - low) / 2;
+        const int order = strcmp(weights->tensors[middle].name, name);
+        if (order == 0) return &weights->tensors[middle];
+        if (order < 0) low = middle + 1;
+        else high = middle;
+    }
+    return NULL;
+}
+
+// ---- writing
+
+static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_tensor* tensor) {
+    const char* name = tensor->name ? tensor->name : "";
+    size_t left = strlen(name);
+    int64_t count = 1;
+    for (const char* p = name; left;) {
+        const size_t step = gsf__utf8_size(p, left);
+        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name is no UTF-8", gsf__nn_show(name).text);
+        p += step;
+        left -= step;
+    }
+    int ok = tensor->name && strcmp(name, "__metadata__") != 0 && gsf_nn_dtype_size(tensor->dtype) != 0 &&
+             tensor->rank >= 0 && tensor->rank <= GSF_NN_MAX_RANK;
+    for (int32_t i = 0; ok && i < tensor->rank; i++) {
+        ok = tensor->shape[i] >= 0 && (tensor->shape[i] == 0 || count <= INT64_MAX / tensor->shape[i]);
+        if (ok) count *= tensor->shape[i];
+    }
+    ok = ok && count == tensor->count && (count == 0 || tensor->data) &&
+         (uint64_t)count <= SIZE_MAX / 2 / gsf_nn_dtype_size(tensor->dtype);
+    return ok ? GSF_OK : gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name, dtype, shape, count and data do not fit",
+                                  gsf__nn_show(name).text);
+}
+
+static int gsf__nn_compare_saved(const void* a, const void* b) { // wide types first, so that all stay aligned
+    const gsf_tensor *x = *(const gsf_tensor* const*)a, *y = *(const gsf_tensor* const*)b;
+    const size_t p = gsf_nn_dtype_size(x->dtype), q = gsf_nn_dtype_size(y->dtype);
+    return p != q ? (p > q ? -1 : 1) : strcmp(x->name, y->name);
+}
+
+static int gsf__nn_compare_saved_names(const void* a, const void* b) {
+    return strcmp((*(const gsf_tensor* const*)a)->name, (*(const gsf_tensor* const*)b)->name);
+}
+
+static gsf_result gsf__nn_format_header(gsf_context* ctx, const gsf_tensor* const* order, size_t count, gsf_text* out) {
+    size_t begin = 0;
+    gsf_text_append(ctx, out, "        {", 9); // the length goes where the spaces are
+    for (size_t i = 0; i < count; i++) {
+        const gsf_tensor* t = order[i];
+        const size_t bytes = (size_t)gsf__nn_bytes(t);
+        if (bytes > SIZE_MAX / 2 - begin) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "the tensors' sizes overflow");
+        if (i) gsf_text_append(ctx, out, ",", 1);
+        gsf_text_json_string(ctx, out, t->name);
+        gsf_text_printf(ctx, out, ":{\"dtype\":\"%s\",\"shape\":[", gsf_nn_dtype_name(t->dtype));
+        for (int32_t k = 0; k < t->rank; k++) gsf_text_printf(ctx, out, "%s%lld", k ? "," : "", (long long)t->shape[k]);
+        gsf_text_printf(ctx, out, "],\"data_offsets\":[%zu,%zu]}", begin, begin + bytes);
+        begin += bytes;
+    }
+    gsf_text_append(ctx, out, "}", 1);
+    gsf_text_append(ctx, out, "       ", (8 - out->size % 8) % 8);
+    if (out->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__store_le(out->data, out->size - GSF__NN_FILE_HEAD, GSF__NN_FILE_HEAD);
+    return gsf__reserve(ctx, (void**)&out->data, &out->capacity, out->size, out->size + begin + 1, 1);
+}
+
+GSF_API gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const gsf_tensor* tensors, size_t count) {
+    gsf_text out;
+    memset(&out, 0, sizeof out);
+    for (size_t i = 0; i < count; i++) GSF__TRY(gsf__nn_check_saved(ctx, &tensors[i]));
+    const gsf_tensor** order = (const gsf_tensor**)gsf_alloc(ctx, count, sizeof *order);
+    if (!order) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < count; i++) order[i] = &tensors[i];
+    if (count) qsort((void*)order, count, sizeof *order, gsf__nn_compare_saved_names);
+    for (size_t i = 1; i < count && result == GSF_OK; i++)
+        if (strcmp(order[i - 1]->name, order[i]->name) == 0)
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: tensor %s given twice", path,
+                              gsf__nn_show(order[i]->name).text);
+    if (count) qsort((void*)order, count, sizeof *order, gsf__nn_compare_saved);
+    if (result == GSF_OK) result = gsf__nn_format_header(ctx, order, count, &out);
+    for (size_t i = 0; i < count && result == GSF_OK; i++)
+        gsf_text_append(ctx, &out, (const char*)order[i]->data, (size_t)gsf__nn_bytes(order[i]));
+    if (result == GSF_OK) result = out.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, out.data, out.size);
+    gsf_destroy_text(ctx, &out);
+    gsf_free(ctx, (void*)order);
+    return result;
+}
+
+// ---- for the networks: taking tensors one by one, and noticing what is left over
+
+typedef struct gsf__nn_loader {
+    gsf_context* ctx;
+    const gsf_nn_weights* weights;
+    unsigned char* taken; // per tensor
+} gsf__nn_loader;
+
+GSF__SHARED gsf_result gsf__nn_begin_loading(gsf_context* ctx, const gsf_nn_weights* weights, gsf__nn_loader* out) {
+    out->ctx = ctx;
+    out->weights = weights;
+    out->taken = (unsigned char*)gsf_alloc_zeroed(ctx, weights->tensor_count, 1);
+    return out->taken ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+// "[2, 3, 64]"; a negative size, which stands for any, prints as "?".
+static void gsf__nn_print_shape(int32_t rank, const int64_t* shape, char* out, size_t room) {
+    size_t at = (size_t)snprintf(out, room, "[");
+    for (int32_t i = 0; i < rank && at < room; i++) {
+        const char* comma = i ? ", " : "";
+        at += (size_t)(shape[i] < 0 ? snprintf(out + at, room - at, "%s?", comma)
+                                    : snprintf(out + at, room - at, "%s%lld", comma, (long long)shape[i]));
+    }
+    if (at < room) snprintf(out + at, room - at, "]");
+}
+
+static gsf_result gsf__nn_check_taken(const gsf__nn_loader* loader, const gsf_tensor* t, int32_t rank,
+                                      const int64_t* shape) {
+    char found[200], wanted[200];
+    int ok = t->rank == rank;
+    for (int32_t i = 0; ok && i < rank; i++) ok = shape[i] < 0 || t->shape[i] == shape[i];
+    if (!ok) {
+        gsf__nn_print_shape(t->rank, t->shape, found, sizeof found);
+        gsf__nn_print_shape(rank, shape, wanted, sizeof wanted);
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s has shape %s, not %s", loader->weights->name,
+                        gsf__nn_show(t->name).text, found, wanted);
+    }
+    if (t->dtype != GSF_NN_F32 && t->dtype != GSF_NN_BF16 && t->dtype != GSF_NN_F16)
+        return gsf_fail(loader->ctx, GSF_ERROR_UNSUPPORTED, "%s: tensor %s is %s, not F32, BF16 or F16",
+                        loader->weights->name, gsf__nn_show(t->name).text, gsf_nn_dtype_name(t->dtype));
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, int optional, const gsf_tensor** out,
+                               int32_t rank, const int64_t* shape) {
+    *out = NULL;
+    const gsf_tensor* found = gsf_nn_find_tensor(loader->weights, name);
+    if (!found && optional) return GSF_OK;
+    if (!found)
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s is missing", loader->weights->name,
+                        gsf__nn_show(name).text);
+    loader->taken[found - loader->weights->tensors] = 1;
+    GSF__TRY(gsf__nn_check_taken(loader, found, rank, shape));
+    *out = found;
+    return GSF_OK;
+}
+
+// Finds the tensor of that name (printf style), which must be F32, BF16 or F16 and have exactly this shape; a negative
+// size means any.
+GSF_PRINTF(5, 6)
+GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_tensor** out, int32_t rank, const int64_t* shape,
+                                    const char* format, ...) {
+    char name[256];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(name, sizeof name, format, args);
+    va_end(args);
+    return gsf__nn_take(loader, name, 0, out, rank, shape);
+}
+
+// The same for a tensor that may be absent: *out is NULL then.
+GSF_PRINTF(5, 6)
+GSF__SHARED gsf_result gsf__nn_want(gsf__nn_loader* loader, const gsf_tensor** out, int32_t rank, const int64_t* shape,
+                                    const char* format, ...) {
+    char name[256];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(name, sizeof name, format, args);
+    va_end(args);
+    return gsf__nn_take(loader, name, 1, out, rank, shape);
+}
+
+// Counts all tensors whose names begin so as taken: parts of a file that the caller has no use for.
+GSF__SHARED void gsf__nn_ignore(gsf__nn_loader* loader, const char* prefix) {
+    for (size_t i = 0; i < loader->weights->tensor_count; i++)
+        if (strncmp(loader->weights->tensors[i].name, prefix, strlen(prefix)) == 0) loader->taken[i] = 1;
+}
+
+// Frees the loader. If `result` is GSF_OK but tensors were left over, the error names the first few; else returns it.
+GSF__SHARED gsf_result gsf__nn_end_loading(gsf__nn_loader* loader, gsf_result result) {
+    enum { NAMED = 3 };
+    gsf__nn_shown names[NAMED];
+    size_t left = 0;
+    memset(names, 0, sizeof names);
+    for (size_t i = 0; result == GSF_OK && i < loader->weights->tensor_count; i++)
+        if (!loader->taken[i] && left++ < NAMED) names[left - 1] = gsf__nn_show(loader->weights->tensors[i].name);
+    gsf_free(loader->ctx, loader->taken);
+    loader->taken = NULL;
+    if (left == 0) return result;
+    return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: %zu tensors that this model does not have: %s%s%s%s%s%s",
+                    loader->weights->name, left, names[0].text, left > 1 ? ", " : "", names[1].text, left > 2 ? ", " : "",
+                    names[2].text, left > NAMED ? ", ..." : "");
+}
+
+// ---- for the networks: config.json. A key that is null counts as absent, as diffusers writes it.
+
+typedef struct gsf__nn_config {
+    gsf_context* ctx;
+    gsf_json json;
+} gsf__nn_config;
+
+static gsf_result gsf__nn_check_config(gsf__nn_config* config) {
+    if (config->json.values[0].type == GSF_JSON_OBJECT) return GSF_OK;
+    const gsf_result result = gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s:0: no object", config->json.name);
+    gsf_destroy_json(config->ctx, &config->json);
+    return result;
+}
+
+GSF__SHARED gsf_result gsf__nn_parse_config(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                            gsf__nn_config* out) {
+    memset(out, 0, sizeof *out);
+    out->ctx = ctx;
+    GSF__TRY(gsf_parse_json(ctx, gsf__nn_path_end(name), text, size, &out->json));
+    return gsf__nn_check_config(out);
+}
+
+GSF__SHARED gsf_result gsf__nn_load_config(gsf_context* ctx, const char* path, gsf__nn_config* out) {
+    void* data;
+    size_t size;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
+    const gsf_result result = gsf__nn_parse_config(ctx, path, (const char*)data, size, out);
+    gsf_free(ctx, data);
+    return result;
+}
+
+GSF__SHARED void gsf__nn_close_config(gsf__nn_config* config) { gsf_destroy_json(config->ctx, &config->json); }
+
+static const gsf_json_value* gsf__nn_config_find(const gsf__nn_config* config, const char* key) {
+    const gsf_json_value* value = gsf_json_member(&config->json, &config->json.values[0], key);
+    return value && value->type != GSF_JSON_NULL ? value : NULL;
+}
+
+static gsf_result gsf__nn_config_fail(const gsf__nn_config* config, const gsf_json_value* value, const char* key,
+                                      const char* wanted) {
+    if (!value) return gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s: %s is missing", config->json.name, key);
+    return gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s:%u: %s is not %s", config->json.name, (unsigned)value->offset, key,
+                    wanted);
+}
+
+static gsf_result gsf__nn_config_whole(const gsf__nn_config* config, const gsf_json_value* value, const char* key,
+                                       int64_t low, int64_t high, int64_t* out) {
+    char wanted[80];
+    if (value && value->type == GSF_JSON_NUMBER && value->number >= (double)low && value->number <= (double)high &&
+        floor(value->number) == value->number) {
+        *out = (int64_t)value->number;
+        return GSF_OK;
+    }
+    snprintf(wanted, sizeof wanted, "a whole number from %lld to %lld", (long long)low, (long long)high);
+    return gsf__nn_config_fail(config, value, key, wanted);
+}
+
+// Whole numbers, |low| and |high| up to 2^53. Here and below the function with `fallback` takes a key that may be absent.
+GSF__SHARED gsf_result gsf__nn_config_int(const gsf__nn_config* config, const char* key, int64_t low, int64_t high,
+                                          int64_t* out) {
+    return gsf__nn_config_whole(config, gsf__nn_config_find(config, key), key, low, high, out);
+}
+
+GSF__SHARED gsf_result gsf__nn_config_int_or(const gsf__nn_config* config, const char* key, int64_t fallback, int64_t low,
+                                             int64_t high, int64_t* out) {
+    const gsf_json_value* value = gsf__nn_config_find(config, key);
+    *out = fallback;
+    return value ? gsf__nn_config_whole(config, value, key, low, high, out) : GSF_OK;
+}
+
+GSF__SHARED gsf_result gsf__nn_config_number(const gsf__nn_config* config, const char* key, double low, double high,
+                                             double* out) {
+    char wanted[80];
+    const gsf_json_value* value = gsf__nn_config_find(config, key);
+    if (value && value->type == GSF_JSON_NUMBER && value->number >= low && value->number <= high) {
+        *out = value->number;
+        return GSF_OK;
+    }
+    snprintf(wanted, sizeof wanted, "a number from %g to %g", low, high);
+    return gsf__nn_config_fail(config, value, key, wanted);
+}
+
+GSF__SHARED gsf_result gsf__nn_config_number_or(const gsf__nn_config* config, const char* key, double fallback, double low,
+                                                double high, double* out) {
+    *out = fallback;
+    return gsf__nn_config_find(config, key) ? gsf__nn_config_number(config, key, low, high, out) : GSF_OK;
+}
+
+GSF__SHARED gsf_result gsf__nn_config_bool_or(const gsf__nn_config* config, const char* key, int fallback, int* out) {
+    const gsf_json_value* value = gsf__nn_config_find(config, key);
+    *out = fallback;
+    if (!value) return GSF_OK;
+    if (value->type != GSF_JSON_TRUE && value->type != GSF_JSON_FALSE)
+        return gsf__nn_config_fail(config, value, key, "true or false");
+    *out = value->type == GSF_JSON_TRUE;
+    return GSF_OK;
+}
+
+// *out points into the config, or to the fallback; NULL as fallback: the key must be there.
+GSF__SHARED gsf_result gsf__nn_config_string(const gsf__nn_config* config, const char* key, const char* fallback,
+                                             const char** out) {
+    const gsf_json_value* value = gsf__nn_config_find(config, key);
+    *out = fallback;
+    if (!value && fallback) return GSF_OK;
+    if (!value || value->type != GSF_JSON_STRING) return gsf__nn_config_fail(config, value, key, "a text");
+    *out = value->string;
+    return GSF_OK;
+}
+
+// Between 1 and `room` whole numbers.
+GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const char* key, int64_t low, int64_t high,
+                                           size_t room, int64_t* out, size_t* count) {
+    const gsf_json_value* value = gsf__nn_config_find(config, key);
+    char wanted[80];
+    *count = 0;
+    if (!value || value->type != GSF_JSON_ARRAY || value->count < 1 || value->count > room) {
+        snprintf(wanted, sizeof wanted, "a list of 1 to %zu whole numbers", room);
+        return gsf__nn_config_fail(config, value, key, wanted);
+    }
+    for (uint32_t i = value->child; i; i = config->json.values[i].next)
+        GSF__TRY(gsf__nn_config_whole(config, &config->json.values[i], key, low, high, &out[(*count)++]));
+    return GSF_OK;
+}
+
 // ---- >>nn vector: exp and friends, eight at a time --------------------------------
 
 // ---- >>nn activations -----------------------------------------------------------
