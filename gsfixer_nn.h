@@ -149,6 +149,75 @@ GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, con
 // Rows of (rows, columns) to softmax(scale * row); y may be x.
 GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale, float* y);
 
+// ---- the restorer's transformer ----------------------------------------------------
+// CogVideoX 5B I2V with a cross-attention to reference tokens in every block (GSFixer, sec. 3.2). Every size comes from
+// the folder's config.json.
+
+typedef struct gsf_nn_transformer { // an open model; its weights stay in the mapped files
+    int32_t heads, head_dim, layers;                        // width = heads * head_dim
+    int32_t in_channels, out_channels;                      // of the latents: noisy and control together, velocity
+    int32_t text_channels, text_tokens, time_channels;
+    int32_t dino_channels, vggt_channels;                   // of the two kinds of reference token
+    int32_t patch;                                          // side of the square of latents that makes a token
+    int32_t sample_width, sample_height, sample_frames;     // latents across and down, video frames: what it was made for
+    int32_t temporal_ratio;                                 // video frames per latent frame
+    int32_t attention_bias, learned_positions, rotary_positions;
+    double spatial_scale, temporal_scale;                   // of the sine-cosine positions
+    double norm_eps;
+    gsf_nn_weights weights;
+    void* nets;                                             // private
+} gsf_nn_transformer;
+
+// Opens FOLDER/config.json and FOLDER/diffusion_pytorch_model*.safetensors. Missing, misshaped and surplus tensors are
+// named in the error.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out);
+GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer);
+
+// Reference tokens for the cross-attention: the sum of both projections. dino (tokens, dino_channels), vggt (tokens,
+// vggt_channels), either NULL: left out (the paper's ablation). out: (tokens, width).
+GSF_API GSF_NODISCARD gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer, int64_t tokens,
+                                                           const float* dino, const float* vggt, float* out);
+
+typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_input; zero it, set threshold, destroy when done
+    float threshold; // a step whose first block changes less than this (relative L1) reuses what the others did; 0: never
+    float *first, *before, *rest; // private: what the first block, and all others, added
+    size_t size;
+    int64_t hits, calls;
+} gsf_nn_block_cache;
+
+GSF_API void gsf_nn_destroy_block_cache(gsf_context* ctx, gsf_nn_block_cache* cache);
+
+typedef struct gsf_nn_transformer_input {
+    int32_t batch, frames, height, width; // of the latents
+    const float* hidden;                  // (batch, frames, in_channels, height, width)
+    const float* text;                    // (batch, text tokens, text_channels)
+    int32_t text_tokens;                  // 0: as configured
+    const double* timesteps;              // (batch), 0 .. 999
+    const float* references;              // (reference_batch, reference_tokens, width); NULL: no cross-attention
+    int64_t reference_tokens;
+    int32_t reference_batch;              // batch, or 1: all rows of the batch share them
+    int no_rotary;                        // leave the rotation out even if the configuration has it
+    gsf_nn_block_cache* cache;            // NULL: every block runs
+    float* reference_kv;                  // gsf_nn_reference_kv_size floats that hold the references' keys and values
+    int reference_kv_ready;               // from an earlier call; NULL: computed anew in every call
+    // Shown every named intermediate: data (rows, columns) of batch row `row`. NULL in normal use; costs a copy.
+    void (*tap_fn)(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_transformer_input;
+
+// Predicted velocity: out (batch, frames, out_channels, height, width). A NaN or infinity is reported with the block
+// where it first appears (GSF_ERROR_NUMERIC). Other sizes than the configured ones: GSF_ERROR_UNSUPPORTED where the
+// position table is learned; other frame counts compute theirs, as the official code does.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                            const gsf_nn_transformer_input* input, float* out);
+
+// Bytes of memory (beside the mapped weights) and floating-point operations of one such call.
+GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
+                                     double* bytes, double* flops);
+// Floats of reference_kv: every block's keys and values of all reference tokens.
+GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
+                                        int32_t reference_batch);
+
 #ifdef __cplusplus
 }
 #endif
@@ -1487,6 +1556,914 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 // ---- >>nn scheduler -------------------------------------------------------------
 
 // ---- >>nn transformer -----------------------------------------------------------
+
+typedef struct gsf__dit_attention { // one attention layer's tensors
+    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
+    const gsf_tensor *norm_q_weight, *norm_q_bias, *norm_k_weight, *norm_k_bias;
+} gsf__dit_attention;
+
+typedef struct gsf__dit_norm { // LayerNorm whose scale, shift and gates come from the time step
+    const gsf_tensor *linear_weight, *linear_bias, *weight, *bias;
+} gsf__dit_norm;
+
+typedef struct gsf__dit_block {
+    gsf__dit_norm norm1, norm2;
+    gsf__dit_attention self, cross;
+    const gsf_tensor *norm_cross_weight, *norm_cross_bias;
+    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias; // feed-forward
+} gsf__dit_block;
+
+typedef struct gsf__dit_projector {
+    const gsf_tensor *weight, *bias, *norm_weight, *norm_bias;
+} gsf__dit_projector;
+
+typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
+    gsf__dit_block* blocks;
+    gsf__dit_projector dino, vggt;
+    gsf__dit_norm norm_out;
+    const gsf_tensor *patch_weight, *patch_bias, *text_weight, *text_bias, *positions;
+    const gsf_tensor *time1_weight, *time1_bias, *time2_weight, *time2_bias;
+    const gsf_tensor *norm_final_weight, *norm_final_bias, *out_weight, *out_bias;
+} gsf__dit_nets;
+
+static int64_t gsf__dit_width(const gsf_nn_transformer* c) { return (int64_t)c->heads * c->head_dim; }
+
+// ---- opening: which tensor goes where, and its shape
+
+// Shapes as letters: one dimension each.
+//   d width  h head_dim  f 4 width  t time channels  x text channels  m 6 width  n 2 width  p patch tokens' outputs
+//   i in_channels  k patch  r any (the reference tokens' channels)  1 one  s text and video tokens of the table
+typedef struct gsf__dit_entry {
+    const char* name;
+    const char* shape;
+    size_t offset; // of the pointer in its struct
+    int kind;      // see GSF__DIT_*
+} gsf__dit_entry;
+
+enum { GSF__DIT_ALWAYS = 0, GSF__DIT_ATTENTION_BIAS, GSF__DIT_LEARNED };
+
+#define GSF__DIT_ATTENTION(prefix, member)                                                                          \
+    {prefix ".to_q.weight", "dd", offsetof(gsf__dit_block, member.q_weight), GSF__DIT_ALWAYS},                      \
+    {prefix ".to_k.weight", "dd", offsetof(gsf__dit_block, member.k_weight), GSF__DIT_ALWAYS},                      \
+    {prefix ".to_v.weight", "dd", offsetof(gsf__dit_block, member.v_weight), GSF__DIT_ALWAYS},                      \
+    {prefix ".to_q.bias", "d", offsetof(gsf__dit_block, member.q_bias), GSF__DIT_ATTENTION_BIAS},                   \
+    {prefix ".to_k.bias", "d", offsetof(gsf__dit_block, member.k_bias), GSF__DIT_ATTENTION_BIAS},                   \
+    {prefix ".to_v.bias", "d", offsetof(gsf__dit_block, member.v_bias), GSF__DIT_ATTENTION_BIAS},                   \
+    {prefix ".to_out.0.weight", "dd", offsetof(gsf__dit_block, member.out_weight), GSF__DIT_ALWAYS},                \
+    {prefix ".to_out.0.bias", "d", offsetof(gsf__dit_block, member.out_bias), GSF__DIT_ALWAYS},                     \
+    {prefix ".norm_q.weight", "h", offsetof(gsf__dit_block, member.norm_q_weight), GSF__DIT_ALWAYS},                \
+    {prefix ".norm_q.bias", "h", offsetof(gsf__dit_block, member.norm_q_bias), GSF__DIT_ALWAYS},                    \
+    {prefix ".norm_k.weight", "h", offsetof(gsf__dit_block, member.norm_k_weight), GSF__DIT_ALWAYS},                \
+    {prefix ".norm_k.bias", "h", offsetof(gsf__dit_block, member.norm_k_bias), GSF__DIT_ALWAYS}
+
+#define GSF__DIT_NORM(prefix, member, shape)                                                                        \
+    {prefix ".linear.weight", shape "t", offsetof(gsf__dit_block, member.linear_weight), GSF__DIT_ALWAYS},          \
+    {prefix ".linear.bias", shape, offsetof(gsf__dit_block, member.linear_bias), GSF__DIT_ALWAYS},                  \
+    {prefix ".norm.weight", "d", offsetof(gsf__dit_block, member.weight), GSF__DIT_ALWAYS},                         \
+    {prefix ".norm.bias", "d", offsetof(gsf__dit_block, member.bias), GSF__DIT_ALWAYS}
+
+static const gsf__dit_entry gsf__dit_block_entries[] = { // below transformer_blocks.N.
+    GSF__DIT_NORM("norm1", norm1, "m"),
+    GSF__DIT_NORM("norm2", norm2, "m"),
+    GSF__DIT_ATTENTION("attn1", self),
+    GSF__DIT_ATTENTION("attn_cross", cross),
+    {"norm_cross.weight", "d", offsetof(gsf__dit_block, norm_cross_weight), GSF__DIT_ALWAYS},
+    {"norm_cross.bias", "d", offsetof(gsf__dit_block, norm_cross_bias), GSF__DIT_ALWAYS},
+    {"ff.net.0.proj.weight", "fd", offsetof(gsf__dit_block, up_weight), GSF__DIT_ALWAYS},
+    {"ff.net.0.proj.bias", "f", offsetof(gsf__dit_block, up_bias), GSF__DIT_ALWAYS},
+    {"ff.net.2.weight", "df", offsetof(gsf__dit_block, down_weight), GSF__DIT_ALWAYS},
+    {"ff.net.2.bias", "d", offsetof(gsf__dit_block, down_bias), GSF__DIT_ALWAYS},
+};
+
+#define GSF__DIT_AT(member) offsetof(gsf__dit_nets, member), GSF__DIT_ALWAYS
+static const gsf__dit_entry gsf__dit_entries[] = {
+    {"patch_embed.proj.weight", "dikk", GSF__DIT_AT(patch_weight)},
+    {"patch_embed.proj.bias", "d", GSF__DIT_AT(patch_bias)},
+    {"patch_embed.text_proj.weight", "dx", GSF__DIT_AT(text_weight)},
+    {"patch_embed.text_proj.bias", "d", GSF__DIT_AT(text_bias)},
+    {"patch_embed.pos_embedding", "1sd", offsetof(gsf__dit_nets, positions), GSF__DIT_LEARNED},
+    {"time_embedding.linear_1.weight", "td", GSF__DIT_AT(time1_weight)},
+    {"time_embedding.linear_1.bias", "t", GSF__DIT_AT(time1_bias)},
+    {"time_embedding.linear_2.weight", "tt", GSF__DIT_AT(time2_weight)},
+    {"time_embedding.linear_2.bias", "t", GSF__DIT_AT(time2_bias)},
+    {"projector_dino.proj.weight", "dr", GSF__DIT_AT(dino.weight)},
+    {"projector_dino.proj.bias", "d", GSF__DIT_AT(dino.bias)},
+    {"projector_dino.norm.weight", "d", GSF__DIT_AT(dino.norm_weight)},
+    {"projector_dino.norm.bias", "d", GSF__DIT_AT(dino.norm_bias)},
+    {"projector_vggt.proj.weight", "dr", GSF__DIT_AT(vggt.weight)},
+    {"projector_vggt.proj.bias", "d", GSF__DIT_AT(vggt.bias)},
+    {"projector_vggt.norm.weight", "d", GSF__DIT_AT(vggt.norm_weight)},
+    {"projector_vggt.norm.bias", "d", GSF__DIT_AT(vggt.norm_bias)},
+    {"norm_final.weight", "d", GSF__DIT_AT(norm_final_weight)},
+    {"norm_final.bias", "d", GSF__DIT_AT(norm_final_bias)},
+    {"norm_out.linear.weight", "nt", GSF__DIT_AT(norm_out.linear_weight)},
+    {"norm_out.linear.bias", "n", GSF__DIT_AT(norm_out.linear_bias)},
+    {"norm_out.norm.weight", "d", GSF__DIT_AT(norm_out.weight)},
+    {"norm_out.norm.bias", "d", GSF__DIT_AT(norm_out.bias)},
+    {"proj_out.weight", "pd", GSF__DIT_AT(out_weight)},
+    {"proj_out.bias", "p", GSF__DIT_AT(out_bias)},
+};
+#undef GSF__DIT_AT
+#undef GSF__DIT_NORM
+#undef GSF__DIT_ATTENTION
+
+static int64_t gsf__dit_dimension(const gsf_nn_transformer* c, char letter) {
+    const int64_t d = gsf__dit_width(c);
+    switch (letter) {
+        case 'd': return d;
+        case 'h': return c->head_dim;
+        case 'f': return 4 * d;
+        case 't': return c->time_channels;
+        case 'x': return c->text_channels;
+        case 'm': return 6 * d;
+        case 'n': return 2 * d;
+        case 'p': return (int64_t)c->out_channels * c->patch * c->patch;
+        case 'i': return c->in_channels;
+        case 'k': return c->patch;
+        case '1': return 1;
+        case 's':
+            return c->text_tokens + (int64_t)((c->sample_frames - 1) / c->temporal_ratio + 1) *
+                                        (c->sample_height / c->patch) * (c->sample_width / c->patch);
+        default: return -1; // any
+    }
+}
+
+static gsf_result gsf__dit_bind(gsf__nn_loader* loader, const gsf_nn_transformer* c, const gsf__dit_entry* entries,
+                                size_t count, const char* prefix, void* where) {
+    for (size_t i = 0; i < count; i++) {
+        const gsf__dit_entry* e = &entries[i];
+        if (e->kind == GSF__DIT_ATTENTION_BIAS && !c->attention_bias) continue;
+        if (e->kind == GSF__DIT_LEARNED && !c->learned_positions) continue;
+        int64_t shape[GSF_NN_MAX_RANK];
+        int rank = 0;
+        for (const char* s = e->shape; *s; s++) shape[rank++] = gsf__dit_dimension(c, *s);
+        const gsf_tensor* tensor;
+        GSF__TRY(gsf__nn_need(loader, &tensor, rank, shape, "%s%s", prefix, e->name));
+        memcpy((char*)where + e->offset, &tensor, sizeof tensor);
+    }
+    return GSF_OK;
+}
+
+// What this code computes in one way only must not be configured otherwise.
+static gsf_result gsf__dit_check_fixed(const gsf__nn_config* file) {
+    static const struct { const char *key, *value; } texts[] = {
+        {"activation_fn", "gelu-approximate"}, {"timestep_activation_fn", "silu"}};
+    static const struct { const char* key; int value; } flags[] = {
+        {"flip_sin_to_cos", 1}, {"norm_elementwise_affine", 1}, {"patch_bias", 1}};
+    static const char* const absent[] = {"ofs_embed_dim", "patch_size_t"};
+    double shift;
+    for (size_t i = 0; i < GSF__COUNT(texts); i++) {
+        const char* text;
+        GSF__TRY(gsf__nn_config_string(file, texts[i].key, texts[i].value, &text));
+        if (strcmp(text, texts[i].value) != 0)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
+                            texts[i].value);
+    }
+    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
+        int flag;
+        GSF__TRY(gsf__nn_config_bool_or(file, flags[i].key, flags[i].value, &flag));
+        if (flag != flags[i].value)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i].key);
+    }
+    for (size_t i = 0; i < GSF__COUNT(absent); i++)
+        if (gsf__nn_config_find(file, absent[i]))
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not null", file->json.name, absent[i]);
+    GSF__TRY(gsf__nn_config_number_or(file, "freq_shift", 0.0, -1e3, 1e3, &shift));
+    if (shift != 0.0) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: freq_shift is not 0", file->json.name);
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
+    const struct { const char* key; int32_t* to; int64_t low, high; } sizes[] = {
+        {"num_attention_heads", &c->heads, 1, 1024}, {"attention_head_dim", &c->head_dim, 8, 1024},
+        {"num_layers", &c->layers, 1, 1024}, {"in_channels", &c->in_channels, 1, 65536},
+        {"out_channels", &c->out_channels, 1, 65536}, {"text_embed_dim", &c->text_channels, 1, 1 << 20},
+        {"max_text_seq_length", &c->text_tokens, 1, 1 << 20}, {"time_embed_dim", &c->time_channels, 1, 1 << 20},
+        {"patch_size", &c->patch, 1, 64}, {"sample_width", &c->sample_width, 1, 1 << 16},
+        {"sample_height", &c->sample_height, 1, 1 << 16}, {"sample_frames", &c->sample_frames, 1, 1 << 16},
+        {"temporal_compression_ratio", &c->temporal_ratio, 1, 64}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+        int64_t value;
+        GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
+        *sizes[i].to = (int32_t)value;
+    }
+    int flag;
+    GSF__TRY(gsf__nn_config_bool_or(file, "attention_bias", 1, &flag));
+    c->attention_bias = flag;
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_learned_positional_embeddings", 0, &flag));
+    c->learned_positions = flag;
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_rotary_positional_embeddings", 0, &flag));
+    c->rotary_positions = flag;
+    GSF__TRY(gsf__nn_config_number_or(file, "norm_eps", 1e-5, 1e-12, 1.0, &c->norm_eps));
+    GSF__TRY(gsf__nn_config_number_or(file, "spatial_interpolation_scale", 1.875, 1e-3, 1e3, &c->spatial_scale));
+    GSF__TRY(gsf__nn_config_number_or(file, "temporal_interpolation_scale", 1.0, 1e-3, 1e3, &c->temporal_scale));
+    if (c->head_dim % 16 || c->sample_width % c->patch || c->sample_height % c->patch)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
+                        "%s: attention_head_dim %d is no multiple of 16, or the sample no multiple of the patch",
+                        file->json.name, (int)c->head_dim);
+    return gsf__dit_check_fixed(file);
+}
+
+static gsf_result gsf__dit_bind_all(gsf_context* ctx, gsf_nn_transformer* net) {
+    gsf__nn_loader loader;
+    gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+    net->nets = nets;
+    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->blocks = (gsf__dit_block*)gsf_alloc_zeroed(ctx, (size_t)net->layers, sizeof(gsf__dit_block));
+    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
+    gsf_result result = gsf__dit_bind(&loader, net, gsf__dit_entries, GSF__COUNT(gsf__dit_entries), "", nets);
+    for (int32_t i = 0; i < net->layers && !result; i++) {
+        char prefix[48];
+        snprintf(prefix, sizeof prefix, "transformer_blocks.%d.", (int)i);
+        result = gsf__dit_bind(&loader, net, gsf__dit_block_entries, GSF__COUNT(gsf__dit_block_entries), prefix,
+                               &nets->blocks[i]);
+    }
+    if (!net->learned_positions) gsf__nn_ignore(&loader, "patch_embed.pos_embedding"); // computed
+    GSF__TRY(gsf__nn_end_loading(&loader, result));
+    net->dino_channels = (int32_t)nets->dino.weight->shape[1];
+    net->vggt_channels = (int32_t)nets->vggt.weight->shape[1];
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer) {
+    gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
+    if (nets) gsf_free(ctx, nets->blocks);
+    gsf_free(ctx, nets);
+    gsf_nn_close_weights(ctx, &transformer->weights);
+    memset(transformer, 0, sizeof *transformer);
+}
+
+GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
+    gsf__nn_config file;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    memset(out, 0, sizeof *out);
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
+    gsf_destroy_text(ctx, &path);
+    if (!result) {
+        result = gsf__dit_read_config(&file, out);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
+    if (!result) result = gsf__dit_bind_all(ctx, out);
+    if (result) gsf_nn_destroy_transformer(ctx, out);
+    return result;
+}
+
+// ---- one forward pass
+
+typedef struct gsf__dit_run {
+    gsf_context* ctx;
+    const gsf_nn_transformer* net;
+    const gsf__dit_nets* nets;
+    gsf_nn_workspace workspace;
+    const gsf_nn_transformer_input* in;
+    int64_t width, text, video, tokens; // tokens = text + video: rows of a sample
+    float* x;       // (batch, tokens, width): the residual stream, text first
+    float* normed;  // (tokens, width)
+    float* qkv;     // 3 x (rows, width), rows the larger of tokens and reference tokens; the feed-forward's hidden rows
+    int64_t qkv_rows;
+    float* time;    // (batch, time_channels): SiLU of the time embedding
+    float* modulation; // (6 width)
+    float* vectors; // biases and norm weights of the block at work, widened
+    size_t vectors_used, vectors_size;
+    float *cos, *sin; // (video, head_dim) or NULL
+    float* probe;   // (tokens, width): what a gated layer adds; only with a tap
+    char label[48]; // of the block at work, for taps and errors
+} gsf__dit_run;
+
+static void gsf__dit_tap(const gsf__dit_run* run, const char* name, int32_t row, const float* data, int64_t rows,
+                         int64_t columns) {
+    if (!run->in->tap_fn || !data) return;
+    char whole[96];
+    snprintf(whole, sizeof whole, "%s%s", run->label, name);
+    run->in->tap_fn(run->in->tap_user, whole, row, data, rows, columns);
+}
+
+// A small tensor as floats; valid until the next block begins.
+static const float* gsf__dit_vector(gsf__dit_run* run, const gsf_tensor* tensor) {
+    if (!tensor) return NULL;
+    float* out = run->vectors + run->vectors_used;
+    GSF_ASSERT(run->vectors_used + (size_t)tensor->count <= run->vectors_size);
+    run->vectors_used += (size_t)tensor->count;
+    gsf_nn_read_tensor(tensor, 0, tensor->count, out);
+    return out;
+}
+
+static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
+                                  const gsf_tensor* bias, gsf_nn_activation activation, float* y) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = rows;
+    d.weight = weight;
+    d.bias = bias;
+    d.activation = activation;
+    d.y = y;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+// x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
+static gsf_result gsf__dit_add(gsf__dit_run* run, const float* h, int64_t rows, const gsf_tensor* weight,
+                               const gsf_tensor* bias, const float* gate, float* x, float* probe) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = h;
+    d.rows = rows;
+    d.weight = weight;
+    d.bias = bias;
+    d.gate = gate;
+    d.accumulate = 1;
+    d.y = x;
+    if (probe) GSF__TRY(gsf__dit_linear(run, h, rows, weight, bias, GSF_NN_LINEAR, probe));
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+// Both streams of a sample through LN(x) (1 + scale) + shift with their own shift and scale. The six parts of the
+// modulation: shift, scale, gate of the video, then of the text.
+static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t row, const gsf__dit_norm* norm) {
+    const int64_t d = run->width;
+    const float* x = run->x + row * run->tokens * d;
+    float* m = run->modulation;
+    GSF__TRY(gsf__dit_linear(run, run->time + row * run->net->time_channels, 1, norm->linear_weight,
+                             norm->linear_bias, GSF_NN_LINEAR, m));
+    const float *w = gsf__dit_vector(run, norm->weight), *b = gsf__dit_vector(run, norm->bias);
+    const float eps = (float)run->net->norm_eps;
+    float* video = run->normed + run->text * d;
+    gsf_nn_layer_norm_modulated(run->ctx, x, run->text, d, w, b, eps, m + 4 * d, m + 3 * d, run->normed);
+    gsf_nn_layer_norm_modulated(run->ctx, x + run->text * d, run->video, d, w, b, eps, m + d, m, video);
+    if (run->in->tap_fn) {
+        char part[32];
+        snprintf(part, sizeof part, "%s.0", name);
+        gsf__dit_tap(run, part, row, video, run->video, d);
+        snprintf(part, sizeof part, "%s.1", name);
+        gsf__dit_tap(run, part, row, run->normed, run->text, d);
+        snprintf(part, sizeof part, "%s.2", name);
+        gsf__dit_tap(run, part, row, m + 2 * d, 1, d);
+        snprintf(part, sizeof part, "%s.3", name);
+        gsf__dit_tap(run, part, row, m + 5 * d, 1, d);
+    }
+    return GSF_OK;
+}
+
+enum { GSF__DIT_TEXT_GATE = 5, GSF__DIT_VIDEO_GATE = 2 }; // places in the modulation
+static const float gsf__dit_head_eps = 1e-6f;              // of the norms of q and k (fixed in the official code)
+
+// x += gate * attention over text and video together.
+static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const gsf__dit_attention* a) {
+    const gsf_nn_transformer* c = run->net;
+    const int64_t d = run->width, n = run->tokens;
+    float *q = run->qkv, *k = q + run->qkv_rows * d, *v = k + run->qkv_rows * d;
+    float* x = run->x + row * n * d;
+    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
+    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->k_weight, a->k_bias, GSF_NN_LINEAR, k));
+    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->v_weight, a->v_bias, GSF_NN_LINEAR, v));
+    gsf_nn_head_norm_rope(run->ctx, q, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
+                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
+    gsf_nn_head_norm_rope(run->ctx, k, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
+                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
+    gsf_nn_attention_desc attention;
+    memset(&attention, 0, sizeof attention);
+    attention.queries = attention.keys = n;
+    attention.heads = c->heads;
+    attention.head_dim = c->head_dim;
+    attention.q = q;
+    attention.k = k;
+    attention.v = v;
+    attention.out = run->normed;
+    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
+    float* video_probe = run->probe ? run->probe + run->text * d : NULL;
+    GSF__TRY(gsf__dit_add(run, run->normed, run->text, a->out_weight, a->out_bias,
+                          run->modulation + GSF__DIT_TEXT_GATE * d, x, run->probe));
+    GSF__TRY(gsf__dit_add(run, run->normed + run->text * d, run->video, a->out_weight, a->out_bias,
+                          run->modulation + GSF__DIT_VIDEO_GATE * d, x + run->text * d, video_probe));
+    gsf__dit_tap(run, "attn1.0", row, video_probe, run->video, d);
+    gsf__dit_tap(run, "attn1.1", row, run->probe, run->text, d);
+    return GSF_OK;
+}
+
+// Keys and values of the references for one block: (2, reference tokens, width).
+static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attention* a, const float* references, float* kv) {
+    const gsf_nn_transformer* c = run->net;
+    const int64_t r = run->in->reference_tokens, d = run->width;
+    GSF__TRY(gsf__dit_linear(run, references, r, a->k_weight, a->k_bias, GSF_NN_LINEAR, kv));
+    GSF__TRY(gsf__dit_linear(run, references, r, a->v_weight, a->v_bias, GSF_NN_LINEAR, kv + r * d));
+    gsf_nn_head_norm_rope(run->ctx, kv, r, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
+                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, NULL, NULL, 0);
+    return GSF_OK;
+}
+
+// The video's tokens look at the references: x += attention(norm(x), references), no gate, no rotation.
+static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32_t index, const gsf__dit_block* block) {
+    const gsf_nn_transformer* c = run->net;
+    const gsf__dit_attention* a = &block->cross;
+    const int64_t d = run->width, r = run->in->reference_tokens;
+    float* x = run->x + (row * run->tokens + run->text) * d;
+    float *q = run->qkv, *normed = run->normed, *kv = run->qkv + run->qkv_rows * d;
+    const int32_t source = run->in->reference_batch == 1 ? 0 : row;
+    int ready = source < row; // row 0 has computed what all rows share
+    if (run->in->reference_kv) {
+        kv = run->in->reference_kv + ((int64_t)index * run->in->reference_batch + source) * 2 * r * d;
+        ready = ready || run->in->reference_kv_ready;
+    }
+    if (!ready) GSF__TRY(gsf__dit_reference_kv(run, a, run->in->references + source * r * d, kv));
+    gsf_nn_layer_norm(run->ctx, x, run->video, d, gsf__dit_vector(run, block->norm_cross_weight),
+                      gsf__dit_vector(run, block->norm_cross_bias), (float)c->norm_eps, normed);
+    gsf__dit_tap(run, "norm_cross", row, normed, run->video, d);
+    GSF__TRY(gsf__dit_linear(run, normed, run->video, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
+    gsf_nn_head_norm_rope(run->ctx, q, run->video, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
+                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, NULL, NULL, 0);
+    gsf_nn_attention_desc attention;
+    memset(&attention, 0, sizeof attention);
+    attention.queries = run->video;
+    attention.keys = r;
+    attention.heads = c->heads;
+    attention.head_dim = c->head_dim;
+    attention.q = q;
+    attention.k = kv;
+    attention.v = kv + r * d;
+    attention.out = normed;
+    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
+    GSF__TRY(gsf__dit_add(run, normed, run->video, a->out_weight, a->out_bias, NULL, x, run->probe));
+    gsf__dit_tap(run, "attn_cross", row, run->probe, run->video, d);
+    return GSF_OK;
+}
+
+// x += gate * down(gelu(up(normed))), in row chunks whose hidden layer fits the room of q, k and v.
+static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gsf__dit_block* block) {
+    const int64_t d = run->width, most = run->qkv_rows * 3 / 4;
+    float* x = run->x + row * run->tokens * d;
+    for (int stream = 0; stream < 2; stream++) {
+        const int64_t first = stream ? run->text : 0, end = stream ? run->tokens : run->text;
+        const float* gate = run->modulation + (stream ? GSF__DIT_VIDEO_GATE : GSF__DIT_TEXT_GATE) * d;
+        for (int64_t r = first; r < end; r += most) {
+            const int64_t rows = end - r < most ? end - r : most;
+            GSF__TRY(gsf__dit_linear(run, run->normed + r * d, rows, block->up_weight, block->up_bias, GSF_NN_GELU_TANH,
+                                     run->qkv));
+            GSF__TRY(gsf__dit_add(run, run->qkv, rows, block->down_weight, block->down_bias, gate, x + r * d,
+                                  run->probe ? run->probe + r * d : NULL));
+        }
+    }
+    gsf__dit_tap(run, "ff", row, run->probe, run->tokens, d);
+    return GSF_OK;
+}
+
+// One block for all samples, layer by layer so that they share the keys and values of the references.
+static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
+    const gsf__dit_block* block = &run->nets->blocks[index];
+    const int32_t batch = run->in->batch;
+    snprintf(run->label, sizeof run->label, "block%d.", (int)index);
+    for (int32_t b = 0; b < batch; b++) {
+        run->vectors_used = 0;
+        GSF__TRY(gsf__dit_modulate(run, "norm1", b, &block->norm1));
+        GSF__TRY(gsf__dit_self_attention(run, b, &block->self));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+    }
+    for (int32_t b = 0; b < batch && run->in->references; b++) {
+        run->vectors_used = 0;
+        GSF__TRY(gsf__dit_cross_attention(run, b, index, block));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+    }
+    for (int32_t b = 0; b < batch; b++) {
+        run->vectors_used = 0;
+        GSF__TRY(gsf__dit_modulate(run, "norm2", b, &block->norm2));
+        GSF__TRY(gsf__dit_feed_forward(run, b, block));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+    }
+    for (int32_t b = 0; b < batch; b++) {
+        const float* x = run->x + b * run->tokens * run->width;
+        gsf__dit_tap(run, "0", b, x + run->text * run->width, run->video, run->width);
+        gsf__dit_tap(run, "1", b, x, run->text, run->width);
+    }
+    run->label[0] = 0;
+    return GSF_OK;
+}
+
+// ---- a value that is not finite, and where it comes from
+
+typedef struct gsf__finite_job {
+    const float* x;
+    int64_t count;
+    int64_t* first; // per chunk, -1: none
+} gsf__finite_job;
+
+static void gsf__finite_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__finite_job* job = (const gsf__finite_job*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK;
+    const int64_t end = begin + GSF__NN_CHUNK < job->count ? begin + GSF__NN_CHUNK : job->count;
+    (void)worker;
+    job->first[chunk] = -1;
+    for (int64_t i = begin; i < end; i++) {
+        uint32_t bits;
+        memcpy(&bits, job->x + i, sizeof bits);
+        if ((bits & 0x7f800000u) != 0x7f800000u) continue;
+        job->first[chunk] = i;
+        return;
+    }
+}
+
+// Index of the first value that is NaN or infinite, -1 when there is none, -2 when out of memory.
+static int64_t gsf__nn_find_not_finite(gsf_context* ctx, const float* x, int64_t count) {
+    const size_t chunks = (size_t)((count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK);
+    gsf__finite_job job;
+    int64_t found = -1;
+    job.x = x;
+    job.count = count;
+    job.first = (int64_t*)gsf_alloc(ctx, chunks, sizeof(int64_t));
+    if (!job.first) return -2;
+    gsf__parallel_for(ctx, chunks, gsf__finite_chunk, &job);
+    for (size_t i = 0; i < chunks && found < 0; i++) found = job.first[i];
+    gsf_free(ctx, job.first);
+    return found;
+}
+
+static int gsf__dit_tensor_is_finite(gsf_context* ctx, const gsf_tensor* tensor) {
+    float part[1024];
+    for (int64_t i = 0; i < tensor->count; i += 1024) {
+        const int64_t n = tensor->count - i < 1024 ? tensor->count - i : 1024;
+        gsf_nn_read_tensor(tensor, i, n, part);
+        if (gsf__nn_find_not_finite(ctx, part, n) >= 0) return 0;
+    }
+    return 1;
+}
+
+// Says which stage made it, and which weights are to blame if one of theirs is not finite.
+static gsf_result gsf__dit_check(gsf__dit_run* run, const char* stage, const char* prefix, const float* x, int64_t count) {
+    const int64_t at = gsf__nn_find_not_finite(run->ctx, x, count);
+    if (at == -1) return GSF_OK;
+    if (at == -2) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_nn_weights* w = &run->net->weights;
+    for (size_t i = 0; i < w->tensor_count; i++)
+        if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 &&
+            !gsf__dit_tensor_is_finite(run->ctx, &w->tensors[i]))
+            return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
+                            w->tensors[i].name);
+    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "transformer: %s gives %g (value %lld of %lld)", stage, (double)x[at],
+                    (long long)at, (long long)count);
+}
+
+// ---- first and last layers
+
+// SiLU of the embedding of each sample's time step.
+static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
+    const gsf_nn_transformer* net = run->net;
+    const int64_t d = run->width, t = net->time_channels;
+    for (int32_t b = 0; b < run->in->batch; b++) {
+        float *wave = run->qkv, *hidden = wave + d, *out = run->time + b * t;
+        gsf_nn_timestep_embedding(run->in->timesteps[b], (int32_t)d, wave);
+        gsf__dit_tap(run, "time_proj", b, wave, 1, d);
+        GSF__TRY(gsf__dit_linear(run, wave, 1, run->nets->time1_weight, run->nets->time1_bias, GSF_NN_SILU, hidden));
+        GSF__TRY(gsf__dit_linear(run, hidden, 1, run->nets->time2_weight, run->nets->time2_bias, GSF_NN_LINEAR, out));
+        gsf__dit_tap(run, "time_embedding", b, out, 1, t);
+        gsf_nn_activate(run->ctx, GSF_NN_SILU, out, t, out);
+    }
+    return GSF_OK;
+}
+
+typedef struct gsf__patch_job { // patches of the latents as rows, or the other way round
+    const float* from;
+    float* to;
+    int32_t channels, height, width, patch;
+} gsf__patch_job;
+
+// (channels, height, width) of one frame to rows of (channels, patch, patch), tokens down and across.
+static void gsf__patch_frame(void* arg, size_t frame, int worker) {
+    const gsf__patch_job* job = (const gsf__patch_job*)arg;
+    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
+    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
+    const float* from = job->from + (int64_t)frame * job->channels * plane;
+    float* to = job->to + (int64_t)frame * across * down * row;
+    (void)worker;
+    for (int64_t ty = 0; ty < down; ty++)
+        for (int64_t tx = 0; tx < across; tx++)
+            for (int64_t c = 0; c < job->channels; c++)
+                for (int64_t y = 0; y < p; y++)
+                    for (int64_t x = 0; x < p; x++)
+                        *to++ = from[c * plane + (ty * p + y) * job->width + tx * p + x];
+}
+
+static void gsf__unpatch_frame(void* arg, size_t frame, int worker) {
+    const gsf__patch_job* job = (const gsf__patch_job*)arg;
+    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
+    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
+    const float* from = job->from + (int64_t)frame * across * down * row;
+    float* to = job->to + (int64_t)frame * job->channels * plane;
+    (void)worker;
+    for (int64_t ty = 0; ty < down; ty++)
+        for (int64_t tx = 0; tx < across; tx++)
+            for (int64_t c = 0; c < job->channels; c++)
+                for (int64_t y = 0; y < p; y++)
+                    for (int64_t x = 0; x < p; x++)
+                        to[c * plane + (ty * p + y) * job->width + tx * p + x] = *from++;
+}
+
+// Adds the position table to text and video: the stored one for the configured frame count, else sines and cosines (video
+// only), as the official code does.
+static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
+    const gsf_nn_transformer* c = run->net;
+    const gsf_nn_transformer_input* in = run->in;
+    if (!c->learned_positions && c->rotary_positions) return GSF_OK;
+    const int64_t d = run->width;
+    const int same_frames = (in->frames - 1) * c->temporal_ratio + 1 == c->sample_frames;
+    if (c->learned_positions && same_frames && run->text == c->text_tokens) {
+        for (int64_t r = 0; r < run->tokens; r++) { // a row at a time: the table may be bf16
+            gsf_nn_read_tensor(run->nets->positions, r * d, d, run->qkv);
+            for (int32_t b = 0; b < in->batch; b++)
+                for (int64_t i = 0; i < d; i++) run->x[(b * run->tokens + r) * d + i] += run->qkv[i];
+        }
+        return GSF_OK;
+    }
+    GSF__TRY(gsf_nn_sincos_positions(run->ctx, (int32_t)d, in->frames, in->height / c->patch, in->width / c->patch,
+                                     c->spatial_scale, c->temporal_scale, run->qkv));
+    for (int32_t b = 0; b < in->batch; b++)
+        for (int64_t i = 0; i < run->video * d; i++) run->x[(b * run->tokens + run->text) * d + i] += run->qkv[i];
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_embed(gsf__dit_run* run) {
+    const gsf_nn_transformer* net = run->net;
+    const gsf_nn_transformer* c = net;
+    const gsf_nn_transformer_input* in = run->in;
+    const int64_t d = run->width, sample = (int64_t)in->frames * c->in_channels * in->height * in->width;
+    for (int32_t b = 0; b < in->batch; b++) {
+        float* x = run->x + b * run->tokens * d;
+        GSF__TRY(gsf__dit_linear(run, in->text + b * run->text * c->text_channels, run->text, run->nets->text_weight,
+                                 run->nets->text_bias, GSF_NN_LINEAR, x));
+        gsf__patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch};
+        gsf__parallel_for(run->ctx, (size_t)in->frames, gsf__patch_frame, &job);
+        GSF__TRY(gsf__dit_linear(run, run->qkv, run->video, run->nets->patch_weight, run->nets->patch_bias, GSF_NN_LINEAR,
+                                 x + run->text * d));
+    }
+    GSF__TRY(gsf__dit_add_positions(run));
+    for (int32_t b = 0; b < in->batch; b++)
+        gsf__dit_tap(run, "patch_embed", b, run->x + b * run->tokens * d, run->tokens, d);
+    return GSF_OK;
+}
+
+// Video tokens to velocities: two layer norms in a row, the second modulated, then the output projection.
+static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
+    const gsf_nn_transformer* net = run->net;
+    const gsf_nn_transformer* c = net;
+    const int64_t d = run->width;
+    const float eps = (float)c->norm_eps;
+    float *m = run->modulation, *normed = run->normed;
+    run->vectors_used = 0;
+    gsf_nn_layer_norm(run->ctx, run->x + (row * run->tokens + run->text) * d, run->video, d,
+                      gsf__dit_vector(run, run->nets->norm_final_weight), gsf__dit_vector(run, run->nets->norm_final_bias), eps, normed);
+    gsf__dit_tap(run, "norm_final", row, normed, run->video, d);
+    GSF__TRY(gsf__dit_linear(run, run->time + row * c->time_channels, 1, run->nets->norm_out.linear_weight,
+                             run->nets->norm_out.linear_bias, GSF_NN_LINEAR, m));
+    gsf_nn_layer_norm_modulated(run->ctx, normed, run->video, d, gsf__dit_vector(run, run->nets->norm_out.weight),
+                                gsf__dit_vector(run, run->nets->norm_out.bias), eps, m + d, m, normed);
+    gsf__dit_tap(run, "norm_out", row, normed, run->video, d);
+    GSF__TRY(gsf__dit_linear(run, normed, run->video, run->nets->out_weight, run->nets->out_bias, GSF_NN_LINEAR, run->qkv));
+    gsf__dit_tap(run, "proj_out", row, run->qkv, run->video, (int64_t)c->out_channels * c->patch * c->patch);
+    gsf__patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch};
+    gsf__parallel_for(run->ctx, (size_t)run->in->frames, gsf__unpatch_frame, &job);
+    return GSF_OK;
+}
+
+// ---- blocks, and the skip of those whose work would repeat the last step's
+
+GSF_API void gsf_nn_destroy_block_cache(gsf_context* ctx, gsf_nn_block_cache* cache) {
+    gsf_free(ctx, cache->first);
+    memset(cache, 0, sizeof *cache);
+}
+
+enum { GSF__DIT_CACHE_ROWS = 8 }; // the change is measured on every 8th row
+
+static gsf_result gsf__dit_open_cache(gsf__dit_run* run, gsf_nn_block_cache* cache) {
+    const size_t rows = (size_t)run->in->batch * (size_t)run->tokens, width = (size_t)run->width;
+    const size_t sampled = (rows + GSF__DIT_CACHE_ROWS - 1) / GSF__DIT_CACHE_ROWS * width;
+    if (cache->size == rows * width) return GSF_OK;
+    const float threshold = cache->threshold;
+    gsf_nn_destroy_block_cache(run->ctx, cache);
+    cache->threshold = threshold;
+    cache->first = (float*)gsf_alloc_zeroed(run->ctx, rows * width + 2 * sampled, sizeof(float));
+    if (!cache->first) return GSF_ERROR_OUT_OF_MEMORY;
+    cache->before = cache->first + sampled;
+    cache->rest = cache->before + sampled;
+    cache->size = rows * width;
+    return GSF_OK;
+}
+
+static void gsf__dit_note_before(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
+    const int64_t rows = run->in->batch * run->tokens, d = run->width;
+    float* to = cache->before;
+    for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, to += d) memcpy(to, run->x + r * d, (size_t)d * sizeof(float));
+}
+
+// 1 if what the first block added is close enough to what it added last time (relative L1); notes it for the next time.
+static int gsf__dit_is_similar(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
+    const int64_t rows = run->in->batch * run->tokens, d = run->width;
+    double change = 0.0, size = 0.0;
+    const float* before = cache->before;
+    float* first = cache->first;
+    for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, before += d, first += d)
+        for (int64_t i = 0; i < d; i++) {
+            const float added = run->x[r * d + i] - before[i];
+            change += fabs((double)(added - first[i]));
+            size += fabs((double)first[i]);
+            first[i] = added;
+        }
+    return cache->calls > 0 && change < (double)cache->threshold * size;
+}
+
+static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
+    const gsf_nn_transformer* c = run->net;
+    gsf_nn_block_cache* cache = run->in->cache && run->in->cache->threshold > 0.0f ? run->in->cache : NULL;
+    const int64_t count = run->in->batch * run->tokens * run->width;
+    if (cache) {
+        GSF__TRY(gsf__dit_open_cache(run, cache));
+        gsf__dit_note_before(run, cache);
+    }
+    for (int32_t i = 0; i < c->layers; i++) {
+        char name[48];
+        GSF__TRY(gsf__dit_block_forward(run, i));
+        snprintf(name, sizeof name, "transformer_blocks.%d.", (int)i);
+        GSF__TRY(gsf__dit_check(run, name, name, run->x, count));
+        gsf__progress(run->ctx, "transformer", i + 1, c->layers);
+        if (!cache || i > 0) continue;
+        const int similar = gsf__dit_is_similar(run, cache);
+        cache->calls++;
+        if (similar) { // what the other blocks added last time
+            cache->hits++;
+            for (int64_t j = 0; j < count; j++) run->x[j] += cache->rest[j];
+            return GSF_OK;
+        }
+        memcpy(cache->rest, run->x, (size_t)count * sizeof(float));
+    }
+    for (int64_t j = 0; cache && j < count; j++) cache->rest[j] = run->x[j] - cache->rest[j];
+    return GSF_OK;
+}
+
+// ---- the pass as a whole
+
+static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in) {
+    const gsf_nn_transformer* c = net;
+    if (!in->hidden || !in->text || !in->timesteps || in->batch < 1 || in->frames < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: latents, text or time steps are missing");
+    if (in->height < c->patch || in->width < c->patch || in->height % c->patch || in->width % c->patch)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d x %d latents are no multiple of the patch %d",
+                        (int)in->width, (int)in->height, (int)c->patch);
+    if (c->learned_positions && (in->height != c->sample_height || in->width != c->sample_width))
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "transformer: latents of %d x %d; its learned positions are for %d x %d (the official code refuses "
+                        "other sizes as well)", (int)in->width, (int)in->height, (int)c->sample_width, (int)c->sample_height);
+    if (in->text_tokens < 0 || (c->learned_positions && in->text_tokens && in->text_tokens != c->text_tokens))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d text tokens, not %d", (int)in->text_tokens,
+                        (int)c->text_tokens);
+    if (in->references && (in->reference_tokens < 1 || (in->reference_batch != 1 && in->reference_batch != in->batch)))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %lld reference tokens for %d of %d samples",
+                        (long long)in->reference_tokens, (int)in->reference_batch, (int)in->batch);
+    for (int32_t b = 0; b < in->batch; b++)
+        if (!(in->timesteps[b] >= 0.0 && in->timesteps[b] < 1e6))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: time step %g", in->timesteps[b]);
+    return GSF_OK;
+}
+
+static void gsf__dit_sizes(gsf__dit_run* run, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in) {
+    const gsf_nn_transformer* c = net;
+    run->in = in;
+    run->width = gsf__dit_width(c);
+    run->text = in->text_tokens ? in->text_tokens : c->text_tokens;
+    run->video = (int64_t)in->frames * (in->height / c->patch) * (in->width / c->patch);
+    run->tokens = run->text + run->video;
+    run->qkv_rows = in->references && in->reference_tokens > run->tokens ? in->reference_tokens : run->tokens;
+    if (run->qkv_rows < 4) run->qkv_rows = 4; // a chunk of the feed-forward is 3/4 of them
+    // per block and layer: norm weights and biases, those of q and k; the head takes four
+    run->vectors_size = (size_t)(4 * run->width + 4 * c->head_dim);
+}
+
+// Floats of every buffer; their sum is what gsf_nn_transformer_cost tells.
+typedef struct gsf__dit_layout { size_t x, normed, qkv, time, modulation, vectors, rotary, probe; } gsf__dit_layout;
+
+static gsf__dit_layout gsf__dit_plan(const gsf__dit_run* run, const gsf_nn_transformer* c) {
+    const size_t d = (size_t)run->width, rows = (size_t)run->tokens;
+    gsf__dit_layout l;
+    const size_t patch_row = (size_t)c->patch * (size_t)c->patch *
+                             (size_t)(c->in_channels > c->out_channels ? c->in_channels : c->out_channels);
+    l.x = (size_t)run->in->batch * rows * d;
+    l.normed = rows * d;
+    l.qkv = 3 * (size_t)run->qkv_rows * d;
+    if (l.qkv < (size_t)run->video * patch_row) l.qkv = (size_t)run->video * patch_row;
+    if (l.qkv < d + (size_t)c->time_channels) l.qkv = d + (size_t)c->time_channels;
+    l.time = (size_t)run->in->batch * (size_t)c->time_channels;
+    l.modulation = 6 * d;
+    l.vectors = run->vectors_size;
+    l.rotary = c->rotary_positions && !run->in->no_rotary ? 2 * (size_t)run->video * (size_t)c->head_dim : 0;
+    l.probe = run->in->tap_fn ? rows * d : 0;
+    return l;
+}
+
+static size_t gsf__dit_total(const gsf__dit_layout* l) {
+    return l->x + l->normed + l->qkv + l->time + l->modulation + l->vectors + l->rotary + l->probe;
+}
+
+static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
+    const gsf_nn_transformer* c = run->net;
+    const gsf_nn_transformer_input* in = run->in;
+    if (run->cos)
+        GSF__TRY(gsf_nn_rotary_positions(run->ctx, c->head_dim, in->frames, in->height / c->patch, in->width / c->patch,
+                                         c->sample_height / c->patch, c->sample_width / c->patch, run->cos, run->sin));
+    GSF__TRY(gsf__dit_embed_time(run));
+    GSF__TRY(gsf__dit_embed(run));
+    GSF__TRY(gsf__dit_check(run, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * run->width));
+    if (in->references)
+        for (int32_t b = 0; b < in->reference_batch; b++)
+            gsf__dit_tap(run, "cross_hidden_states", b, in->references + b * in->reference_tokens * run->width,
+                         in->reference_tokens, run->width);
+    GSF__TRY(gsf__dit_blocks(run));
+    const int64_t sample = (int64_t)in->frames * c->out_channels * in->height * in->width;
+    for (int32_t b = 0; b < in->batch; b++) GSF__TRY(gsf__dit_head(run, b, out + b * sample));
+    return gsf__dit_check(run, "the output layer", "proj_out.", out, in->batch * sample);
+}
+
+GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                              const gsf_nn_transformer_input* input, float* out) {
+    gsf__dit_run run;
+    memset(&run, 0, sizeof run);
+    GSF__TRY(gsf__dit_check_input(ctx, transformer, input));
+    run.ctx = ctx;
+    run.net = transformer;
+    run.nets = (const gsf__dit_nets*)transformer->nets;
+    gsf__dit_sizes(&run, transformer, input);
+    const gsf__dit_layout l = gsf__dit_plan(&run, transformer);
+    float* memory = (float*)gsf_alloc(ctx, gsf__dit_total(&l), sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    float* next = memory;
+    run.x = next, next += l.x;
+    run.normed = next, next += l.normed;
+    run.qkv = next, next += l.qkv;
+    run.time = next, next += l.time;
+    run.modulation = next, next += l.modulation;
+    run.vectors = next, next += l.vectors;
+    if (l.rotary) run.cos = next, run.sin = next + l.rotary / 2, next += l.rotary;
+    if (l.probe) run.probe = next;
+    const gsf_result result = gsf__dit_forward(&run, out);
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
+                                        int32_t reference_batch) {
+    return (size_t)transformer->layers * (size_t)reference_batch * 2 * (size_t)reference_tokens *
+           (size_t)gsf__dit_width(transformer);
+}
+
+GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
+                                     double* bytes, double* flops) {
+    const gsf_nn_transformer* c = transformer;
+    gsf__dit_run run;
+    memset(&run, 0, sizeof run);
+    gsf__dit_sizes(&run, transformer, input);
+    const gsf__dit_layout l = gsf__dit_plan(&run, c);
+    const double d = (double)run.width, n = (double)run.tokens, v = (double)run.video;
+    const double r = input->references ? (double)input->reference_tokens : 0.0;
+    const double self = 2.0 * n * d * d * 4.0 + 4.0 * n * n * d, ff = 2.0 * n * d * 4.0 * d * 2.0;
+    const double cross = r > 0.0 ? 2.0 * v * d * d * 2.0 + 4.0 * v * r * d : 0.0, kv = 2.0 * r * d * d * 2.0;
+    const double patch = (double)c->patch * c->patch;
+    const double ends = 2.0 * v * patch * c->in_channels * d + 2.0 * v * patch * c->out_channels * d +
+                        2.0 * (double)run.text * c->text_channels * d;
+    const double kv_batch = input->reference_kv_ready ? 0.0 : (double)input->reference_batch;
+    *bytes = (double)gsf__dit_total(&l) * sizeof(float);
+    *flops = c->layers * (input->batch * (self + ff + cross) + kv_batch * kv) + input->batch * ends;
+}
+
+GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer, int64_t tokens,
+                                             const float* dino, const float* vggt, float* out) {
+    const int64_t d = gsf__dit_width(transformer);
+    const gsf__dit_nets* nets = (const gsf__dit_nets*)transformer->nets;
+    const gsf__dit_projector* projectors[2] = {&nets->dino, &nets->vggt};
+    const float* inputs[2] = {dino, vggt};
+    gsf__dit_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.net = transformer;
+    run.nets = nets;
+    run.vectors_size = (size_t)(4 * d);
+    if (tokens < 1 || (!dino && !vggt))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no tokens to project");
+    float* memory = (float*)gsf_alloc(ctx, (size_t)tokens + 4, (size_t)d * sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    run.vectors = memory + tokens * d;
+    gsf_result result = GSF_OK;
+    for (int i = 0; i < 2 && !result; i++) {
+        float* to = i && dino ? memory : out; // the second is added to the first
+        if (!inputs[i]) continue;
+        result = gsf__dit_linear(&run, inputs[i], tokens, projectors[i]->weight, projectors[i]->bias, GSF_NN_LINEAR, to);
+        if (result) break;
+        gsf_nn_layer_norm(ctx, to, tokens, d, gsf__dit_vector(&run, projectors[i]->norm_weight),
+                          gsf__dit_vector(&run, projectors[i]->norm_bias), 1e-5f, to); // torch's default eps
+        for (int64_t j = 0; to == memory && j < tokens * d; j++) out[j] += memory[j];
+    }
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
 
 // ---- >>nn vae -------------------------------------------------------------------
 

@@ -3,8 +3,9 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
-#include "test.h"
+#include "restorer_transformer.h"
 
 int main(void) {
+    check_transformer();
     return test_report();
 }
