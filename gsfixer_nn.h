@@ -1225,6 +1225,91 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
 
 // ---- >>nn vector: exp and friends, eight at a time --------------------------------
 
+static int64_t gsf__nn_min(int64_t a, int64_t b) { return a < b ? a : b; }
+
+#if GSF__X86
+
+// Lanes below `left` (at most 8 count) as a mask for _mm256_maskload_ps and _mm256_maskstore_ps.
+GSF__INLINE_AVX2 __m256i gsf__nn_mask8(int64_t left) {
+    return _mm256_cmpgt_epi32(_mm256_set1_epi32(left < 8 ? (int)left : 8), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+}
+
+GSF__INLINE_AVX2 float gsf__nn_sum8(__m256 v) {
+    __m128 s = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    s = _mm_add_ps(s, _mm_movehl_ps(s, s));
+    return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
+}
+
+GSF__INLINE_AVX2 double gsf__nn_sum4(__m256d v) {
+    const __m128d s = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd(v, 1));
+    return _mm_cvtsd_f64(_mm_add_sd(s, _mm_unpackhi_pd(s, s)));
+}
+
+GSF__INLINE_AVX2 float gsf__nn_max8(__m256 v) {
+    __m128 s = _mm_max_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    s = _mm_max_ps(s, _mm_movehl_ps(s, s));
+    return _mm_cvtss_f32(_mm_max_ss(s, _mm_movehdup_ps(s)));
+}
+
+GSF__INLINE_AVX2 void gsf__nn_transpose8(__m256 m[8]) {
+    __m256 a[8], b[8];
+    for (int i = 0; i < 8; i += 2) {
+        a[i] = _mm256_unpacklo_ps(m[i], m[i + 1]);
+        a[i + 1] = _mm256_unpackhi_ps(m[i], m[i + 1]);
+    }
+    for (int i = 0; i < 8; i += 4) {
+        b[i] = _mm256_shuffle_ps(a[i], a[i + 2], 0x44);
+        b[i + 1] = _mm256_shuffle_ps(a[i], a[i + 2], 0xee);
+        b[i + 2] = _mm256_shuffle_ps(a[i + 1], a[i + 3], 0x44);
+        b[i + 3] = _mm256_shuffle_ps(a[i + 1], a[i + 3], 0xee);
+    }
+    for (int i = 0; i < 4; i++) {
+        m[i] = _mm256_permute2f128_ps(b[i], b[i + 4], 0x20);
+        m[i + 4] = _mm256_permute2f128_ps(b[i], b[i + 4], 0x31);
+    }
+}
+
+// Added to a number of [-126, 129], it leaves the nearest integer n in the low bits as n + 126, which shifted by 23 are
+// the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial therefore gives 2 * 2^f, and all finite powers
+// come out of one multiplication.
+#define GSF__NN_ROUNDER 12583038.0f
+
+// 2^(n + f) for rounded = n + GSF__NN_ROUNDER, |f| <= 1/2. The polynomial is that of Cephes' exp2f.
+GSF__INLINE_AVX2 __m256 gsf__nn_power8(__m256 rounded, __m256 f) {
+    __m256 p = _mm256_set1_ps(2.0f * 1.535336188319500e-4f);
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 1.339887440266574e-3f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 9.618437357674640e-3f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 5.550332471162809e-2f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 2.402264791363012e-1f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 6.931472028550421e-1f));
+    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f));
+    return p * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_castps_si256(rounded), 23));
+}
+
+// 2^x for x <= 129 or NaN: relative error below 2e-7, 2^0 = 1, results below 2^-125.5 (1.7e-38) are 0, a NaN stays.
+GSF__INLINE_AVX2 __m256 gsf__nn_exp2_low8(__m256 x) {
+    const __m256 rounder = _mm256_set1_ps(GSF__NN_ROUNDER);
+    x = _mm256_max_ps(_mm256_set1_ps(-126.0f), x); // a NaN is the second operand, which max returns then
+    const __m256 rounded = x + rounder;
+    return gsf__nn_power8(rounded, x - (rounded - rounder));
+}
+
+// 2^x, as above, for all x; inf above 128.
+GSF__INLINE_AVX2 __m256 gsf__nn_exp2_8(__m256 x) {
+    return gsf__nn_exp2_low8(_mm256_min_ps(_mm256_set1_ps(129.0f), x));
+}
+
+// e^x for all x: relative error below 2e-7, results below 1.7e-38 are 0, inf above the largest float, a NaN stays.
+GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) {
+    const __m256 rounder = _mm256_set1_ps(GSF__NN_ROUNDER), log2_e = _mm256_set1_ps(1.44269504f);
+    x = _mm256_min_ps(_mm256_set1_ps(89.4f), _mm256_max_ps(_mm256_set1_ps(-87.4f), x)); // -126.1 and 129 in powers of 2
+    const __m256 rounded = _mm256_fmadd_ps(x, log2_e, rounder), n = rounded - rounder;
+    const __m256 f = _mm256_fmadd_ps(x, _mm256_set1_ps(1.92596299e-8f), _mm256_fmsub_ps(x, log2_e, n)); // log2 e, low part
+    return gsf__nn_power8(rounded, f);
+}
+
+#endif // GSF__X86
+
 // ---- >>nn activations -----------------------------------------------------------
 
 static float gsf__nn_activation_ref(gsf_nn_activation activation, float x) {
@@ -1240,50 +1325,173 @@ static float gsf__nn_activation_ref(gsf_nn_activation activation, float x) {
     return x;
 }
 
+#if GSF__X86
+
+// As gsf__nn_activation_ref; at -inf the limit -0, a NaN stays. `activation` had better be a constant.
+GSF__INLINE_AVX2 __m256 gsf__nn_activate8(gsf_nn_activation activation, __m256 x) {
+    const __m256 one = _mm256_set1_ps(1.0f);
+    if (activation == GSF_NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
+        x = _mm256_max_ps(_mm256_set1_ps(-12.0f), x); // from where on the power is inf
+        const __m256 slope = _mm256_fmadd_ps(x * x, _mm256_set1_ps(-0.10294324f), _mm256_set1_ps(-2.30220819f));
+        return x / (one + gsf__nn_exp2_8(x * slope));
+    }
+    if (activation == GSF_NN_SILU) {
+        x = _mm256_max_ps(_mm256_set1_ps(-100.0f), x);
+        return x / (one + gsf__nn_exp8(_mm256_sub_ps(_mm256_setzero_ps(), x)));
+    }
+    return x;
+}
+
+#endif // GSF__X86
+
+typedef struct gsf__activation_kernels { // y may be x in both
+    void (*activate)(gsf_nn_activation activation, const float* x, int64_t count, float* y);
+    void (*softmax)(const float* x, int64_t count, float scale, float* y);
+} gsf__activation_kernels;
+
+static void gsf__activate_scalar(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i++) y[i] = gsf__nn_activation_ref(activation, x[i]);
+}
+
+static void gsf__softmax_scalar(const float* x, int64_t count, float scale, float* y) {
+    float top = -FLT_MAX;
+    double sum = 0.0;
+    for (int64_t i = 0; i < count; i++)
+        if (scale * x[i] > top) top = scale * x[i];
+    for (int64_t i = 0; i < count; i++) sum += (double)(y[i] = expf(scale * x[i] - top));
+    const float inverse = (float)(1.0 / sum);
+    for (int64_t i = 0; i < count; i++) y[i] *= inverse;
+}
+
+#if GSF__X86
+
+GSF__INLINE_AVX2 void gsf__activate_avx2_body(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8) _mm256_storeu_ps(y + i, gsf__nn_activate8(activation, _mm256_loadu_ps(x + i)));
+    if (i == count) return;
+    const __m256i mask = gsf__nn_mask8(count - i);
+    _mm256_maskstore_ps(y + i, mask, gsf__nn_activate8(activation, _mm256_maskload_ps(x + i, mask)));
+}
+
+GSF__TARGET_AVX2 static void gsf__activate_avx2(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+    switch (activation) {
+        case GSF_NN_LINEAR: gsf__activate_avx2_body(GSF_NN_LINEAR, x, count, y); break;
+        case GSF_NN_GELU_TANH: gsf__activate_avx2_body(GSF_NN_GELU_TANH, x, count, y); break;
+        case GSF_NN_SILU: gsf__activate_avx2_body(GSF_NN_SILU, x, count, y); break;
+    }
+}
+
+// The largest factor * x[i], at least -FLT_MAX; NaNs are passed over.
+GSF__INLINE_AVX2 float gsf__nn_top(const float* x, int64_t count, float factor) {
+    const __m256 f = _mm256_set1_ps(factor), lowest = _mm256_set1_ps(-FLT_MAX);
+    __m256 top0 = lowest, top1 = lowest;
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16) { // max returns its second operand where the first is NaN
+        top0 = _mm256_max_ps(f * _mm256_loadu_ps(x + i), top0);
+        top1 = _mm256_max_ps(f * _mm256_loadu_ps(x + i + 8), top1);
+    }
+    for (; i < count; i += 8) {
+        const __m256i mask = gsf__nn_mask8(count - i);
+        const __m256 v = f * _mm256_maskload_ps(x + i, mask);
+        top0 = _mm256_max_ps(_mm256_blendv_ps(lowest, v, _mm256_castsi256_ps(mask)), top0);
+    }
+    return gsf__nn_max8(_mm256_max_ps(top0, top1));
+}
+
+GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, float scale, float* y) {
+    const float factor = scale * 1.44269504f; // powers of 2 instead of e
+    const float top = gsf__nn_top(x, count, factor);
+    const __m256 f = _mm256_set1_ps(factor), t = _mm256_set1_ps(top);
+    double sum = 0.0;
+    int64_t i = 0;
+    while (i + 8 <= count) { // float sums of short stretches
+        const int64_t end = gsf__nn_min(i + 512, count);
+        __m256 part = _mm256_setzero_ps();
+        for (; i + 8 <= end; i += 8) {
+            const __m256 p = gsf__nn_exp2_low8(_mm256_fmsub_ps(_mm256_loadu_ps(x + i), f, t));
+            _mm256_storeu_ps(y + i, p);
+            part = part + p;
+        }
+        sum += (double)gsf__nn_sum8(part);
+    }
+    const __m256i mask = gsf__nn_mask8(count - i);
+    if (i < count) {
+        const __m256 p = gsf__nn_exp2_low8(_mm256_fmsub_ps(_mm256_maskload_ps(x + i, mask), f, t));
+        _mm256_maskstore_ps(y + i, mask, p);
+        sum += (double)gsf__nn_sum8(_mm256_and_ps(p, _mm256_castsi256_ps(mask)));
+    }
+    const __m256 inverse = _mm256_set1_ps((float)(1.0 / sum));
+    for (i = 0; i + 8 <= count; i += 8) _mm256_storeu_ps(y + i, inverse * _mm256_loadu_ps(y + i));
+    if (i < count) _mm256_maskstore_ps(y + i, mask, inverse * _mm256_maskload_ps(y + i, mask));
+}
+
+#endif // GSF__X86
+
+static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level level) {
+    static const gsf__activation_kernels scalar = {gsf__activate_scalar, gsf__softmax_scalar};
+#if GSF__X86
+    static const gsf__activation_kernels avx2 = {gsf__activate_avx2, gsf__softmax_avx2};
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
+enum { GSF__NN_CHUNK = 1 << 15 }; // values per chunk of elementwise work
+
+// Rows of `dim` values in a chunk of elementwise work, and the number of such chunks: sizes alone decide.
+static int64_t gsf__nn_chunk_rows(int64_t dim) { return dim < GSF__NN_CHUNK ? GSF__NN_CHUNK / (dim > 0 ? dim : 1) : 1; }
+static size_t gsf__nn_chunks(int64_t count, int64_t per_chunk) {
+    return count > 0 ? (size_t)((count - 1) / per_chunk + 1) : 0;
+}
+
 typedef struct gsf__activate_job {
+    const gsf__activation_kernels* kernels;
     gsf_nn_activation activation;
     const float* x;
     float* y;
-    int64_t count;
+    int64_t rows, columns, chunk_rows;
+    float scale;
 } gsf__activate_job;
-
-enum { GSF__NN_CHUNK = 1 << 16 }; // values per chunk of elementwise work
 
 static void gsf__activate_chunk(void* arg, size_t chunk, int worker) {
     const gsf__activate_job* job = (const gsf__activate_job*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK;
-    const int64_t end = begin + GSF__NN_CHUNK < job->count ? begin + GSF__NN_CHUNK : job->count;
-    for (int64_t i = begin; i < end; i++) job->y[i] = gsf__nn_activation_ref(job->activation, job->x[i]);
+    job->kernels->activate(job->activation, job->x + begin, gsf__nn_min(GSF__NN_CHUNK, job->columns - begin),
+                           job->y + begin);
 }
 
 GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, const float* x, int64_t count, float* y) {
-    gsf__activate_job job = {activation, x, y, count};
-    gsf__parallel_for(ctx, (size_t)((count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK), gsf__activate_chunk, &job);
+    gsf__activate_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__activation_kernels_of(ctx->cpu_level);
+    job.activation = activation;
+    job.x = x;
+    job.y = y;
+    job.columns = count;
+    gsf__parallel_for(ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__activate_chunk, &job);
 }
 
-typedef struct gsf__softmax_job {
-    const float* x;
-    float* y;
-    int64_t columns;
-    float scale;
-} gsf__softmax_job;
-
-static void gsf__softmax_row(void* arg, size_t row, int worker) {
-    const gsf__softmax_job* job = (const gsf__softmax_job*)arg;
+static void gsf__softmax_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__activate_job* job = (const gsf__activate_job*)arg;
     (void)worker;
-    const float* x = job->x + (int64_t)row * job->columns;
-    float* y = job->y + (int64_t)row * job->columns;
-    float top = -FLT_MAX, sum = 0.0f;
-    for (int64_t i = 0; i < job->columns; i++)
-        if (job->scale * x[i] > top) top = job->scale * x[i];
-    for (int64_t i = 0; i < job->columns; i++) sum += y[i] = expf(job->scale * x[i] - top);
-    for (int64_t i = 0; i < job->columns; i++) y[i] /= sum;
+    const int64_t begin = (int64_t)chunk * job->chunk_rows, n = job->columns;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++)
+        job->kernels->softmax(job->x + r * n, n, job->scale, job->y + r * n);
 }
 
 GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale, float* y) {
-    gsf__softmax_job job = {x, y, columns, scale};
-    gsf__parallel_for(ctx, (size_t)rows, gsf__softmax_row, &job);
+    gsf__activate_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__activation_kernels_of(ctx->cpu_level);
+    job.x = x;
+    job.y = y;
+    job.rows = rows;
+    job.columns = columns;
+    job.chunk_rows = gsf__nn_chunk_rows(columns);
+    job.scale = scale;
+    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__softmax_chunk, &job);
 }
 
 // ---- >>nn linear ----------------------------------------------------------------
@@ -1345,27 +1553,48 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
 
 // ---- >>nn norms -----------------------------------------------------------------
 
-typedef struct gsf__norm_job {
+typedef struct gsf__moments { double mean, square; } gsf__moments; // square: sum of (x - mean)^2
+
+typedef struct gsf__norm_job gsf__norm_job;
+typedef struct gsf__norm_kernels {
+    gsf__moments (*moments)(const float* x, int64_t count, int centre); // centre 0: mean is taken as 0
+    void (*row)(const gsf__norm_job* job, const float* x, float* y);
+    void (*head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin); // cos NULL: no rotation
+    // y = weight (x - mean) inverse + bias; y may be x
+    void (*affine)(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias, float* y);
+} gsf__norm_kernels;
+
+struct gsf__norm_job {
+    const gsf__norm_kernels* kernels;
     const float *x, *weight, *bias, *scale, *shift, *cos, *sin;
     float* y;
-    int64_t rows, dim, stride, groups, rope_first;
+    int64_t rows, dim, stride, chunk_rows, rope_first;
+    int64_t group_size, part_size, parts; // group norm: values of a group, of a part of it, parts of a group
+    gsf__moments* part_moments;
     int32_t heads;
     float eps;
     int centre; // 0: root mean square only
-} gsf__norm_job;
+};
 
-enum { GSF__NORM_ROWS = 16 }; // rows per chunk
+static float gsf__norm_inverse(gsf__moments m, int64_t count, float eps) {
+    return (float)(1.0 / sqrt(m.square / (double)count + (double)eps));
+}
 
-static void gsf__norm_row(const gsf__norm_job* job, const float* x, float* y) {
-    double mean = 0.0, square = 0.0;
-    if (job->centre) {
-        for (int64_t i = 0; i < job->dim; i++) mean += (double)x[i];
-        mean /= (double)job->dim;
+static gsf__moments gsf__moments_scalar(const float* x, int64_t count, int centre) {
+    gsf__moments m = {0.0, 0.0};
+    if (centre) {
+        for (int64_t i = 0; i < count; i++) m.mean += (double)x[i];
+        m.mean /= (double)count;
     }
-    for (int64_t i = 0; i < job->dim; i++) square += ((double)x[i] - mean) * ((double)x[i] - mean);
-    const double inverse = 1.0 / sqrt(square / (double)job->dim + (double)job->eps);
+    for (int64_t i = 0; i < count; i++) m.square += ((double)x[i] - m.mean) * ((double)x[i] - m.mean);
+    return m;
+}
+
+static void gsf__norm_row_scalar(const gsf__norm_job* job, const float* x, float* y) {
+    const gsf__moments m = gsf__moments_scalar(x, job->dim, job->centre);
+    const float inverse = gsf__norm_inverse(m, job->dim, job->eps);
     for (int64_t i = 0; i < job->dim; i++) {
-        float v = (float)(((double)x[i] - mean) * inverse);
+        float v = (float)((double)x[i] - m.mean) * inverse;
         if (job->weight) v *= job->weight[i];
         if (job->bias) v += job->bias[i];
         if (job->scale) v = v * (1.0f + job->scale[i]) + job->shift[i];
@@ -1373,16 +1602,163 @@ static void gsf__norm_row(const gsf__norm_job* job, const float* x, float* y) {
     }
 }
 
+static void gsf__norm_head_scalar(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    gsf__norm_row_scalar(job, x, x);
+    for (int64_t i = 0; cos && i + 1 < job->dim; i += 2) {
+        const float a = x[i], b = x[i + 1];
+        x[i] = a * cos[i] - b * sin[i];
+        x[i + 1] = b * cos[i + 1] + a * sin[i + 1];
+    }
+}
+
+static void gsf__norm_affine_scalar(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias,
+                                    float* y) {
+    for (int64_t i = 0; i < count; i++) y[i] = (float)((double)x[i] - m.mean) * inverse * weight + bias;
+}
+
+#if GSF__X86
+
+// Sums in double, so that neither a large mean nor a long row costs a digit; the arithmetic hides behind the memory.
+GSF__INLINE_AVX2 gsf__moments gsf__moments_avx2_body(const float* x, int64_t count, int centre) {
+    gsf__moments m = {0.0, 0.0};
+    __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0;
+    int64_t i = 0;
+    if (centre) {
+        for (; i + 16 <= count; i += 16) {
+            s0 = s0 + _mm256_cvtps_pd(_mm_loadu_ps(x + i));
+            s1 = s1 + _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4));
+            s2 = s2 + _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8));
+            s3 = s3 + _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12));
+        }
+        for (; i + 4 <= count; i += 4) s0 = s0 + _mm256_cvtps_pd(_mm_loadu_ps(x + i));
+        m.mean = gsf__nn_sum4((s0 + s1) + (s2 + s3));
+        for (; i < count; i++) m.mean += (double)x[i];
+        m.mean /= (double)count;
+    }
+    const __m256d mean = _mm256_set1_pd(m.mean);
+    s0 = s1 = s2 = s3 = _mm256_setzero_pd();
+    for (i = 0; i + 16 <= count; i += 16) {
+        const __m256d d0 = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - mean;
+        const __m256d d1 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4)) - mean;
+        const __m256d d2 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8)) - mean;
+        const __m256d d3 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12)) - mean;
+        s0 = _mm256_fmadd_pd(d0, d0, s0);
+        s1 = _mm256_fmadd_pd(d1, d1, s1);
+        s2 = _mm256_fmadd_pd(d2, d2, s2);
+        s3 = _mm256_fmadd_pd(d3, d3, s3);
+    }
+    for (; i + 4 <= count; i += 4) {
+        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - mean;
+        s0 = _mm256_fmadd_pd(d, d, s0);
+    }
+    m.square = gsf__nn_sum4((s0 + s1) + (s2 + s3));
+    for (; i < count; i++) m.square += ((double)x[i] - m.mean) * ((double)x[i] - m.mean);
+    return m;
+}
+
+GSF__TARGET_AVX2 static gsf__moments gsf__moments_avx2(const float* x, int64_t count, int centre) {
+    return gsf__moments_avx2_body(x, count, centre);
+}
+
+typedef struct gsf__norm8 { __m256 mean, low, inverse; } gsf__norm8; // mean + low: the mean in two floats
+
+GSF__INLINE_AVX2 gsf__norm8 gsf__norm8_of(gsf__moments m, float inverse) {
+    gsf__norm8 n;
+    const float mean = (float)m.mean;
+    n.mean = _mm256_set1_ps(mean);
+    n.low = _mm256_set1_ps((float)(m.mean - (double)mean));
+    n.inverse = _mm256_set1_ps(inverse);
+    return n;
+}
+
+// (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
+GSF__INLINE_AVX2 __m256 gsf__norm8_apply(const gsf__norm8* n, __m256 x) { return ((x - n->mean) - n->low) * n->inverse; }
+
+GSF__INLINE_AVX2 __m256 gsf__norm_value8(const gsf__norm_job* job, const gsf__norm8* n, __m256 x, int64_t i, __m256i mask,
+                                         int whole) {
+#define GSF_X(p) (whole ? _mm256_loadu_ps((p) + i) : _mm256_maskload_ps((p) + i, mask))
+    __m256 v = gsf__norm8_apply(n, x);
+    if (job->weight) v = v * GSF_X(job->weight);
+    if (job->bias) v = v + GSF_X(job->bias);
+    if (job->scale) v = _mm256_fmadd_ps(v, _mm256_set1_ps(1.0f) + GSF_X(job->scale), GSF_X(job->shift));
+    return v;
+#undef GSF_X
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_row_avx2(const gsf__norm_job* job, const float* x, float* y) {
+    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
+    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const __m256i all = _mm256_set1_epi32(-1);
+    int64_t i = 0;
+    for (; i + 8 <= job->dim; i += 8)
+        _mm256_storeu_ps(y + i, gsf__norm_value8(job, &n, _mm256_loadu_ps(x + i), i, all, 1));
+    if (i == job->dim) return;
+    const __m256i mask = gsf__nn_mask8(job->dim - i);
+    _mm256_maskstore_ps(y + i, mask, gsf__norm_value8(job, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0));
+}
+
+GSF__INLINE_AVX2 __m256 gsf__rotate8(__m256 v, __m256 cos, __m256 sin) { // (a c - b s, b c + a s) of each pair
+    return _mm256_fmaddsub_ps(v, cos, _mm256_permute_ps(v, 0xb1) * sin);
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_head_avx2(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
+    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const __m256i all = _mm256_set1_epi32(-1);
+    int64_t i = 0;
+    for (; i + 8 <= job->dim; i += 8) {
+        __m256 v = gsf__norm_value8(job, &n, _mm256_loadu_ps(x + i), i, all, 1);
+        if (cos) v = gsf__rotate8(v, _mm256_loadu_ps(cos + i), _mm256_loadu_ps(sin + i));
+        _mm256_storeu_ps(x + i, v);
+    }
+    if (i == job->dim) return;
+    const __m256i mask = gsf__nn_mask8(job->dim - i);
+    __m256 v = gsf__norm_value8(job, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0);
+    const __m256 plain = v;
+    if (cos) v = gsf__rotate8(v, _mm256_maskload_ps(cos + i, mask), _mm256_maskload_ps(sin + i, mask));
+    _mm256_maskstore_ps(x + i, mask, v);
+    if (job->dim % 2) _mm256_maskstore_ps(x + i, _mm256_andnot_si256(gsf__nn_mask8(job->dim - i - 1), mask), plain);
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_affine_avx2(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                   float weight, float bias, float* y) {
+    const gsf__norm8 n = gsf__norm8_of(m, inverse);
+    const __m256 w = _mm256_set1_ps(weight), b = _mm256_set1_ps(bias);
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8)
+        _mm256_storeu_ps(y + i, _mm256_fmadd_ps(gsf__norm8_apply(&n, _mm256_loadu_ps(x + i)), w, b));
+    if (i == count) return;
+    const __m256i mask = gsf__nn_mask8(count - i);
+    const __m256 v = gsf__norm8_apply(&n, _mm256_maskload_ps(x + i, mask));
+    _mm256_maskstore_ps(y + i, mask, _mm256_fmadd_ps(v, w, b));
+}
+
+#endif // GSF__X86
+
+static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
+    static const gsf__norm_kernels scalar = {gsf__moments_scalar, gsf__norm_row_scalar, gsf__norm_head_scalar,
+                                             gsf__norm_affine_scalar};
+#if GSF__X86
+    static const gsf__norm_kernels avx2 = {gsf__moments_avx2, gsf__norm_row_avx2, gsf__norm_head_avx2,
+                                           gsf__norm_affine_avx2};
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
 static void gsf__norm_chunk(void* arg, size_t chunk, int worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
-    const int64_t begin = (int64_t)chunk * GSF__NORM_ROWS;
-    for (int64_t r = begin; r < begin + GSF__NORM_ROWS && r < job->rows; r++)
-        gsf__norm_row(job, job->x + r * job->dim, job->y + r * job->dim);
+    const int64_t begin = (int64_t)chunk * job->chunk_rows;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++)
+        job->kernels->row(job, job->x + r * job->dim, job->y + r * job->dim);
 }
 
 static void gsf__norm_rows(gsf_context* ctx, gsf__norm_job* job) {
-    gsf__parallel_for(ctx, (size_t)((job->rows + GSF__NORM_ROWS - 1) / GSF__NORM_ROWS), gsf__norm_chunk, job);
+    job->kernels = gsf__norm_kernels_of(ctx->cpu_level);
+    job->chunk_rows = gsf__nn_chunk_rows(job->dim);
+    gsf__parallel_for(ctx, gsf__nn_chunks(job->rows, job->chunk_rows), gsf__norm_chunk, job);
 }
 
 GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
@@ -1420,55 +1796,96 @@ GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int
     gsf__norm_rows(ctx, &job);
 }
 
-static void gsf__group_norm_group(void* arg, size_t group, int worker) {
-    const gsf__norm_job* job = (const gsf__norm_job*)arg; // rows: channels; dim: values of a channel
-    (void)worker;
-    const int64_t per = job->rows / job->groups, count = per * job->dim;
-    const float* x = job->x + (int64_t)group * count;
-    float* y = job->y + (int64_t)group * count;
-    double mean = 0.0, square = 0.0;
-    for (int64_t i = 0; i < count; i++) mean += (double)x[i];
-    mean /= (double)count;
-    for (int64_t i = 0; i < count; i++) square += ((double)x[i] - mean) * ((double)x[i] - mean);
-    const double inverse = 1.0 / sqrt(square / (double)count + (double)job->eps);
-    for (int64_t i = 0; i < count; i++) {
-        const int64_t channel = (int64_t)group * per + i / job->dim;
-        float v = (float)(((double)x[i] - mean) * inverse);
-        if (job->weight) v *= job->weight[channel];
-        if (job->bias) v += job->bias[channel];
-        y[i] = v;
+// Groups are cut into parts that fit a core's cache, so that each is read from memory once for both moments, and few
+// large groups still employ all workers. The moments of parts are put together in order (Chan et al. 1979).
+enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; most parts in all
+
+static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
+    const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: within the group
+    const int64_t end = gsf__nn_min(begin + job->part_size, job->group_size);
+    for (int64_t i = begin; i < end;) { // by channel
+        const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
+        const int64_t count = gsf__nn_min(next, end) - i;
+        job->kernels->affine(job->x + first + i, count, m, inverse, job->weight ? job->weight[channel] : 1.0f,
+                             job->bias ? job->bias[channel] : 0.0f, job->y + first + i);
+        i += count;
     }
+}
+
+static gsf__moments gsf__norm_part(const gsf__norm_job* job, int64_t group, int64_t part, int64_t* count) {
+    *count = gsf__nn_min(job->part_size, job->group_size - part * job->part_size);
+    return job->kernels->moments(job->x + group * job->group_size + part * job->part_size, *count, 1);
+}
+
+static void gsf__norm_whole_group(void* arg, size_t group, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    int64_t count;
+    const gsf__moments m = gsf__norm_part(job, (int64_t)group, 0, &count);
+    gsf__norm_group_values(job, (int64_t)group, 0, m, gsf__norm_inverse(m, count, job->eps));
+}
+
+static void gsf__norm_part_moments(void* arg, size_t chunk, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    int64_t count;
+    job->part_moments[chunk] = gsf__norm_part(job, (int64_t)chunk / job->parts, (int64_t)chunk % job->parts, &count);
+}
+
+static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    const int64_t group = (int64_t)chunk / job->parts;
+    const gsf__moments* of = job->part_moments + group * job->parts;
+    gsf__moments m = of[0];
+    for (int64_t p = 1; p < job->parts; p++) {
+        const double before = (double)(p * job->part_size), delta = of[p].mean - m.mean;
+        const double after = (double)gsf__nn_min((p + 1) * job->part_size, job->group_size);
+        const double share = (after - before) / after;
+        m.mean += delta * share;
+        m.square += of[p].square + delta * delta * before * share;
+    }
+    gsf__norm_group_values(job, group, (int64_t)chunk % job->parts, m, gsf__norm_inverse(m, job->group_size, job->eps));
 }
 
 GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
                                const float* weight, const float* bias, float eps, float* y) {
+    gsf__moments part_moments[GSF__NORM_PARTS];
     gsf__norm_job job;
     memset(&job, 0, sizeof job);
+    if (channels < 1 || count < 1 || groups < 1) return;
+    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
     job.x = x;
     job.y = y;
     job.rows = channels;
     job.dim = count;
-    job.groups = groups;
     job.weight = weight;
     job.bias = bias;
     job.eps = eps;
-    gsf__parallel_for(ctx, (size_t)groups, gsf__group_norm_group, &job);
+    job.group_size = channels / groups * count;
+    job.parts = (int64_t)gsf__nn_chunks(job.group_size, GSF__NORM_PART);
+    if (job.parts > GSF__NORM_PARTS / groups) job.parts = GSF__NORM_PARTS / groups;
+    if (job.parts < 1) job.parts = 1;
+    job.part_size = (job.group_size - 1) / job.parts + 1;
+    job.parts = (int64_t)gsf__nn_chunks(job.group_size, job.part_size); // rounding up may leave the last ones empty
+    if (job.parts == 1) {
+        gsf__parallel_for(ctx, (size_t)groups, gsf__norm_whole_group, &job);
+        return;
+    }
+    job.part_moments = part_moments;
+    gsf__parallel_for(ctx, (size_t)(groups * job.parts), gsf__norm_part_moments, &job);
+    gsf__parallel_for(ctx, (size_t)(groups * job.parts), gsf__norm_part_values, &job);
 }
 
-static void gsf__head_norm_rope_row(void* arg, size_t row, int worker) {
+static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
-    const int64_t token = (int64_t)row - job->rope_first;
-    for (int32_t h = 0; h < job->heads; h++) {
-        float* x = job->y + (int64_t)row * job->stride + h * job->dim;
-        gsf__norm_row(job, x, x);
-        if (!job->cos || token < 0) continue;
-        const float *c = job->cos + token * job->dim, *s = job->sin + token * job->dim;
-        for (int64_t i = 0; i + 1 < job->dim; i += 2) {
-            const float a = x[i], b = x[i + 1];
-            x[i] = a * c[i] - b * s[i];
-            x[i + 1] = b * c[i + 1] + a * s[i + 1];
-        }
+    const int64_t begin = (int64_t)chunk * job->chunk_rows;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
+        const int64_t at = (r - job->rope_first) * job->dim;
+        const int turn = job->cos && at >= 0;
+        const float *cos = turn ? job->cos + at : NULL, *sin = turn ? job->sin + at : NULL;
+        for (int32_t h = 0; h < job->heads; h++) job->kernels->head(job, job->y + r * job->stride + h * job->dim, cos, sin);
     }
 }
 
@@ -1477,6 +1894,7 @@ GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
                                    int64_t rope_first) {
     gsf__norm_job job;
     memset(&job, 0, sizeof job);
+    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
     job.y = x;
     job.rows = rows;
     job.stride = ldx ? ldx : (int64_t)heads * head_dim;
@@ -1489,20 +1907,49 @@ GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
     job.cos = cos;
     job.sin = sin;
     job.rope_first = rope_first;
-    gsf__parallel_for(ctx, (size_t)rows, gsf__head_norm_rope_row, &job);
+    job.chunk_rows = gsf__nn_chunk_rows((int64_t)heads * head_dim);
+    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__head_norm_rope_chunk, &job);
 }
 
 // ---- >>nn attention -------------------------------------------------------------
 
+/* Online softmax over blocks of keys, as FlashAttention. A chunk of work is a head and a range of its queries. Its queries
+   are packed once; then for every block of keys: pack them, and for every few groups of queries
+       logits   p = q k^T             (log2 e and the scale are in the packed queries)
+       weights  p = 2^(p - top)       with the largest logit so far; what stood before is scaled by 2^(top before - top)
+       values   out = out * that + p v
+   Packed queries, sums and one block of keys stay in cache however many keys there are.
+       q    [group][dim][6]           out  [group][panel][6][16]      panel: 16 columns of v, padded with zeros
+       k    [panel of 16 keys][dim][16]    v    [panel][key][16]      p    [query][key] */
+enum {
+    GSF__ATT_GROUP = 6,       // queries of a register tile: 6 x 16 sums, two of keys and a broadcast are 15 registers
+    GSF__ATT_PANEL = 16,
+    GSF__ATT_KEYS = 256,      // keys of a block
+    GSF__ATT_GROUPS = 8,      // groups of queries whose weights are held at a time
+    GSF__ATT_TILE = GSF__ATT_GROUP * GSF__ATT_PANEL,
+    GSF__ATT_QUERIES = GSF__ATT_GROUP * GSF__ATT_GROUPS,
+    GSF__ATT_RANGE = 1536,    // most queries of a chunk: more hide the packing better, but leave the cache
+    GSF__ATT_LEAST_RANGE = 384,
+    GSF__ATT_CHUNKS = 64,     // so many chunks employ the workers evenly
+};
+
 typedef struct gsf__attention_job {
     gsf_nn_attention_desc desc;
-    float* scratch; // per worker: one row of logits
+    float* scratch;             // of all workers
+    size_t scratch_floats;      // of one
+    int64_t ranges, range_size; // of the queries
+    int64_t panels;             // of 16 columns of v
 } gsf__attention_job;
+
+typedef struct gsf__attention_kernels {
+    void (*chunk)(void* arg, size_t chunk, int worker);
+    int packed; // chunks are ranges of a head, and scratch is laid out as gsf__attention_scratch; else single queries
+} gsf__attention_kernels;
 
 static void gsf__attention_row(void* arg, size_t row, int worker) {
     const gsf__attention_job* job = (const gsf__attention_job*)arg;
     const gsf_nn_attention_desc* d = &job->desc;
-    float *p = job->scratch + worker * (d->keys + d->head_dim), *sum = p + d->keys;
+    float *p = job->scratch + (size_t)worker * job->scratch_floats, *sum = p + d->keys;
     for (int32_t h = 0; h < d->heads; h++) {
         const float* q = d->q + (int64_t)row * d->ldq + (int64_t)h * d->head_dim;
         const unsigned char* mask = d->mask ? d->mask + (h * d->queries + (int64_t)row) * d->keys : NULL;
@@ -1527,10 +1974,257 @@ static void gsf__attention_row(void* arg, size_t row, int worker) {
     }
 }
 
+#if GSF__X86
+
+typedef struct gsf__attention_scratch { // of one worker
+    float *q, *out, *k, *v, *p;
+    float* top; // [query] largest logit so far
+    float* sum; // [query][8] sum of the weights so far, by lane
+} gsf__attention_scratch;
+
+static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job* job, int worker) {
+    const int64_t groups = (job->range_size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, dim = job->desc.head_dim;
+    gsf__attention_scratch s;
+    s.p = job->scratch + (size_t)worker * job->scratch_floats;
+    s.k = s.p + GSF__ATT_QUERIES * GSF__ATT_KEYS;
+    s.v = s.k + GSF__ATT_KEYS * dim;
+    s.out = s.v + GSF__ATT_KEYS * GSF__ATT_PANEL * job->panels;
+    s.sum = s.out + groups * GSF__ATT_TILE * job->panels;
+    s.q = s.sum + groups * GSF__ATT_GROUP * 8;
+    s.top = s.q + groups * GSF__ATT_GROUP * dim;
+    return s;
+}
+
+static void gsf__attention_pack_queries(const gsf__attention_job* job, const float* q, int64_t queries, float* packed) {
+    const gsf_nn_attention_desc* d = &job->desc;
+    const float factor = d->scale * 1.44269504f; // powers of 2 instead of e
+    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += GSF__ATT_GROUP * d->head_dim)
+        for (int r = 0; r < GSF__ATT_GROUP; r++) {
+            const float* row = q + (first + r) * d->ldq;
+            for (int32_t i = 0; i < d->head_dim; i++)
+                packed[i * GSF__ATT_GROUP + r] = first + r < queries ? row[i] * factor : 0.0f;
+        }
+}
+
+// Keys of `from` to panels of 16, the last one filled up with zeros.
+GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* job, const float* from, int64_t keys,
+                                                      float* packed) {
+    const int64_t ld = job->desc.ldk, dim = job->desc.head_dim;
+    for (int64_t j = 0; j < keys; j += 8) {
+        float* to = packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * dim + j % GSF__ATT_PANEL;
+        const float* row = from + j * ld;
+        int64_t i = 0;
+        for (; j + 8 <= keys && i + 8 <= dim; i += 8) {
+            __m256 m[8];
+            for (int r = 0; r < 8; r++) m[r] = _mm256_loadu_ps(row + r * ld + i);
+            gsf__nn_transpose8(m);
+            for (int r = 0; r < 8; r++) _mm256_storeu_ps(to + (i + r) * GSF__ATT_PANEL, m[r]);
+        }
+        for (; i < dim; i++)
+            for (int r = 0; r < 8; r++) to[i * GSF__ATT_PANEL + r] = j + r < keys ? row[r * ld + i] : 0.0f;
+    }
+    if ((keys - 1) % GSF__ATT_PANEL < 8) // the last panel's second half
+        for (int64_t i = 0; i < dim; i++)
+            _mm256_storeu_ps(packed + ((keys - 1) / GSF__ATT_PANEL * dim + i) * GSF__ATT_PANEL + 8, _mm256_setzero_ps());
+}
+
+GSF__TARGET_AVX2 static void gsf__attention_pack_values(const gsf__attention_job* job, const float* from, int64_t keys,
+                                                        float* packed) {
+    const int64_t ld = job->desc.ldv, dim = job->desc.head_dim;
+    for (int64_t j = 0; j < keys; j++, from += ld)
+        for (int64_t i = 0; i < job->panels * GSF__ATT_PANEL; i += 8) {
+            float* to = packed + (i / GSF__ATT_PANEL * GSF__ATT_KEYS + j) * GSF__ATT_PANEL + i % GSF__ATT_PANEL;
+            const __m256i mask = gsf__nn_mask8(dim - i);
+            _mm256_storeu_ps(to, i + 8 <= dim ? _mm256_loadu_ps(from + i) : _mm256_maskload_ps(from + i, mask));
+        }
+}
+
+// c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...], for 6 rows r.
+GSF__INLINE_AVX2 void gsf__attention_tile(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
+                                          __m256 c[12]) {
+    __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
+    __m256 c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
+    for (int64_t k = 0; k < count; k++, a += a_step, b += GSF__ATT_PANEL) {
+        const __m256 b0 = _mm256_loadu_ps(b), b1 = _mm256_loadu_ps(b + 8);
+        __m256 x;
+#define GSF_X(r)                              \
+    x = _mm256_broadcast_ss(a + (r) * a_row); \
+    c##r##0 = _mm256_fmadd_ps(x, b0, c##r##0); \
+    c##r##1 = _mm256_fmadd_ps(x, b1, c##r##1);
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+#undef GSF_X
+    }
+    c[0] = c00; c[1] = c01; c[2] = c10; c[3] = c11; c[4] = c20; c[5] = c21;
+    c[6] = c30; c[7] = c31; c[8] = c40; c[9] = c41; c[10] = c50; c[11] = c51;
+}
+
+// p of `groups` groups of queries against `panels` panels of keys.
+GSF__TARGET_AVX2 static void gsf__attention_logits(const float* q, int64_t groups, const float* k, int64_t panels,
+                                                   int64_t dim, float* p) {
+    for (int64_t panel = 0; panel < panels; panel++, k += GSF__ATT_PANEL * dim)
+        for (int64_t g = 0; g < groups; g++) {
+            __m256 c[12];
+            float* to = p + g * GSF__ATT_GROUP * GSF__ATT_KEYS + panel * GSF__ATT_PANEL;
+            gsf__attention_tile(q + g * GSF__ATT_GROUP * dim, 1, GSF__ATT_GROUP, k, dim, c);
+            for (int r = 0; r < GSF__ATT_GROUP; r++) {
+                _mm256_storeu_ps(to + r * GSF__ATT_KEYS, c[2 * r]);
+                _mm256_storeu_ps(to + r * GSF__ATT_KEYS + 8, c[2 * r + 1]);
+            }
+        }
+}
+
+// Logits that do not count become -inf: those of masked keys and of the columns `keys` to `columns`, past the last key.
+static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, int64_t queries, int64_t keys,
+                                int64_t columns, float* p) {
+    for (int64_t r = 0; r < GSF__ATT_QUERIES; r++, p += GSF__ATT_KEYS) {
+        for (int64_t j = 0; mask && r < queries && j < keys; j++)
+            if (!mask[r * mask_stride + j]) p[j] = -INFINITY;
+        for (int64_t j = keys; j < columns; j++) p[j] = -INFINITY;
+    }
+}
+
+// Logits of `queries` rows to weights; raises `top`, updates `sum`, and gives in `fade` what earlier values are to be
+// multiplied with. A NaN does not become the top, but its weight and with it sum and output are NaN.
+GSF__TARGET_AVX2 static void gsf__attention_weights(float* p, int64_t queries, int64_t columns, float* top, float* sum,
+                                                    float fade[GSF__ATT_QUERIES]) {
+    for (int64_t r = 0; r < queries; r++) {
+        const float* row = p + r * GSF__ATT_KEYS;
+        __m256 top0 = _mm256_set1_ps(top[r]), top1 = top0;
+        for (int64_t j = 0; j < columns; j += 16) { // max returns its second operand where the first is NaN
+            top0 = _mm256_max_ps(_mm256_loadu_ps(row + j), top0);
+            top1 = _mm256_max_ps(_mm256_loadu_ps(row + j + 8), top1);
+        }
+        const float raised = gsf__nn_max8(_mm256_max_ps(top0, top1));
+        fade[r] = top[r] - raised;
+        top[r] = raised;
+    }
+    for (int64_t r = 0; r < queries; r += 8) {
+        const __m256i mask = gsf__nn_mask8(queries - r);
+        _mm256_maskstore_ps(fade + r, mask, gsf__nn_exp2_low8(_mm256_maskload_ps(fade + r, mask)));
+    }
+    for (int64_t r = 0; r < queries; r++) {
+        float* row = p + r * GSF__ATT_KEYS;
+        const __m256 t = _mm256_set1_ps(top[r]);
+        __m256 sum0 = _mm256_set1_ps(fade[r]) * _mm256_loadu_ps(sum + 8 * r), sum1 = _mm256_setzero_ps();
+        for (int64_t j = 0; j < columns; j += 16) {
+            const __m256 p0 = gsf__nn_exp2_low8(_mm256_loadu_ps(row + j) - t);
+            const __m256 p1 = gsf__nn_exp2_low8(_mm256_loadu_ps(row + j + 8) - t);
+            _mm256_storeu_ps(row + j, p0);
+            _mm256_storeu_ps(row + j + 8, p1);
+            sum0 = sum0 + p0;
+            sum1 = sum1 + p1;
+        }
+        _mm256_storeu_ps(sum + 8 * r, sum0 + sum1);
+    }
+}
+
+// out = out * fade + p v
+GSF__TARGET_AVX2 static void gsf__attention_values(const float* p, int64_t groups, const float* v, int64_t keys,
+                                                   int64_t panels, const float* fade, float* out) {
+    for (int64_t panel = 0; panel < panels; panel++, v += GSF__ATT_KEYS * GSF__ATT_PANEL)
+        for (int64_t g = 0; g < groups; g++) {
+            __m256 c[12];
+            float* to = out + (g * panels + panel) * GSF__ATT_TILE;
+            gsf__attention_tile(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, keys, c);
+            for (int r = 0; r < GSF__ATT_GROUP; r++, to += GSF__ATT_PANEL) {
+                const __m256 f = _mm256_broadcast_ss(fade + g * GSF__ATT_GROUP + r);
+                _mm256_storeu_ps(to, _mm256_fmadd_ps(f, _mm256_loadu_ps(to), c[2 * r]));
+                _mm256_storeu_ps(to + 8, _mm256_fmadd_ps(f, _mm256_loadu_ps(to + 8), c[2 * r + 1]));
+            }
+        }
+}
+
+GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job, const gsf__attention_scratch* s,
+                                                   int64_t queries, float* out) {
+    const int64_t dim = job->desc.head_dim;
+    for (int64_t r = 0; r < queries; r++, out += job->desc.ldo) {
+        const float total = gsf__nn_sum8(_mm256_loadu_ps(s->sum + 8 * r));
+        const float* from = s->out + r / GSF__ATT_GROUP * job->panels * GSF__ATT_TILE + r % GSF__ATT_GROUP * GSF__ATT_PANEL;
+        const __m256 divisor = _mm256_set1_ps(total);
+        for (int64_t i = 0; i < dim; i += 8) {
+            const __m256 value = _mm256_loadu_ps(from + i / GSF__ATT_PANEL * GSF__ATT_TILE + i % GSF__ATT_PANEL) / divisor;
+            _mm256_maskstore_ps(out + i, gsf__nn_mask8(dim - i), total == 0.0f ? _mm256_setzero_ps() : value);
+        }
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, int worker) {
+    const gsf__attention_job* job = (const gsf__attention_job*)arg;
+    const gsf_nn_attention_desc* d = &job->desc;
+    const gsf__attention_scratch s = gsf__attention_scratch_of(job, worker);
+    const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
+    const int64_t rows = gsf__nn_min(job->range_size, d->queries - first);
+    const int64_t groups = (rows + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, column = head * d->head_dim;
+    float fade[GSF__ATT_QUERIES];
+    gsf__attention_pack_queries(job, d->q + first * d->ldq + column, rows, s.q);
+    memset(s.out, 0, (size_t)(groups * job->panels * GSF__ATT_TILE) * sizeof(float));
+    memset(s.sum, 0, (size_t)(groups * GSF__ATT_GROUP * 8) * sizeof(float));
+    for (int64_t r = 0; r < groups * GSF__ATT_GROUP; r++) s.top[r] = -FLT_MAX;
+    for (int64_t key = 0; key < d->keys; key += GSF__ATT_KEYS) {
+        const int64_t keys = gsf__nn_min(GSF__ATT_KEYS, d->keys - key);
+        const int64_t key_panels = (keys + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL, columns = key_panels * GSF__ATT_PANEL;
+        gsf__attention_pack_keys(job, d->k + key * d->ldk + column, keys, s.k);
+        gsf__attention_pack_values(job, d->v + key * d->ldv + column, keys, s.v);
+        for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
+            const int64_t count = gsf__nn_min(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
+            gsf__attention_logits(s.q + r * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
+            const unsigned char* mask = d->mask ? d->mask + (head * d->queries + first + r) * d->keys + key : NULL;
+            if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
+            gsf__attention_weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
+            gsf__attention_values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
+        }
+    }
+    gsf__attention_finish(job, &s, rows, d->out + first * d->ldo + column);
+}
+
+#endif // GSF__X86
+
+static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level level) {
+    static const gsf__attention_kernels scalar = {gsf__attention_row, 0};
+#if GSF__X86
+    static const gsf__attention_kernels avx2 = {gsf__attention_chunk_avx2, 1};
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
+// Chooses the ranges of queries, from sizes alone; returns the number of chunks.
+static size_t gsf__attention_plan(gsf__attention_job* job, int packed) {
+    const gsf_nn_attention_desc* d = &job->desc;
+    if (!packed) return (size_t)d->queries;
+    const int64_t wanted = (GSF__ATT_CHUNKS - 1) / d->heads + 1, most = d->queries / GSF__ATT_LEAST_RANGE;
+    job->ranges = (d->queries + GSF__ATT_RANGE - 1) / GSF__ATT_RANGE;
+    if (job->ranges < wanted) job->ranges = wanted < most ? wanted : most > job->ranges ? most : job->ranges;
+    if (job->ranges < 1) return 0;
+    const int64_t size = (d->queries - 1) / job->ranges + 1;
+    job->range_size = (size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP * GSF__ATT_GROUP;
+    job->ranges = (d->queries - 1) / job->range_size + 1; // rounding up may leave the last ones empty
+    return (size_t)(d->heads * job->ranges);
+}
+
+// Floats that one worker needs, a multiple of 16; 0 on overflow.
+static size_t gsf__attention_floats(const gsf__attention_job* job, int packed) {
+    const gsf_nn_attention_desc* d = &job->desc;
+    const size_t dim = (size_t)d->head_dim, padded = (size_t)job->panels * GSF__ATT_PANEL;
+    size_t total;
+    if (packed) { // p, k, v; then a query's share of out, sum, q and top
+        if (!gsf__mul_size((size_t)job->range_size, padded + 8 + dim + 1, &total)) return 0;
+        total += GSF__ATT_QUERIES * GSF__ATT_KEYS + GSF__ATT_KEYS * (dim + padded);
+    } else {
+        if ((uint64_t)d->keys > SIZE_MAX / 8) return 0;
+        total = (size_t)d->keys + dim;
+    }
+    return total < SIZE_MAX / 8 ? (total + 15) / 16 * 16 : 0;
+}
+
 GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_attention_desc* desc) {
+    const gsf__attention_kernels* kernels = gsf__attention_kernels_of(ctx->cpu_level);
     gsf_nn_workspace own;
     gsf__attention_job job;
+    size_t size;
     memset(&own, 0, sizeof own);
+    memset(&job, 0, sizeof job);
     job.desc = *desc;
     gsf_nn_attention_desc* d = &job.desc;
     if (!d->q || !d->k || !d->v || !d->out || d->queries < 0 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
@@ -1541,10 +2235,15 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
     if (!d->ldv) d->ldv = width;
     if (!d->ldo) d->ldo = width;
     if (d->scale == 0.0f) d->scale = 1.0f / sqrtf((float)d->head_dim);
-    job.scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own,
-                                          (size_t)ctx->parallel.worker_count * (size_t)(d->keys + d->head_dim) * sizeof(float));
+    job.panels = ((int64_t)d->head_dim + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL;
+    const size_t chunks = gsf__attention_plan(&job, kernels->packed);
+    job.scratch_floats = gsf__attention_floats(&job, kernels->packed);
+    if (!job.scratch_floats || !gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &size) ||
+        !gsf__mul_size(size, sizeof(float), &size))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld keys are too many", (long long)d->keys);
+    job.scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own, size);
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__parallel_for(ctx, (size_t)d->queries, gsf__attention_row, &job);
+    gsf__parallel_for(ctx, chunks, kernels->chunk, &job);
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }
