@@ -5,6 +5,9 @@
 
 #include "test.h"
 
+#include "restorer_linear.h"
+
 int main(void) {
+    check_linear();
     return test_report();
 }
