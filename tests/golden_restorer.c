@@ -3,9 +3,11 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
+#include "restorer_linear.h"
 #include "restorer_transformer.h"
 
 int main(void) {
+    check_linear();
     check_transformer();
     return test_report();
 }

@@ -20,7 +20,7 @@ static void counted_free(void* user, void* memory) {
 
 static char warning[1024]; // last one logged
 static int warnings;
-static void keep_warning(void* user, gsf_log_level level, const char* text) {
+static inline void keep_warning(void* user, gsf_log_level level, const char* text) {
     (void)user;
     if (level != GSF_LOG_WARNING) return;
     snprintf(warning, sizeof warning, "%s", text);

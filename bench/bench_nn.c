@@ -1,0 +1,422 @@
+// bench_nn.c - seconds beside error of the network kernels.
+// By hand: cc -O2 -fopenmp -I. bench/bench_nn.c -o bench_nn -lm
+//
+//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N]
+//
+// First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
+// released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
+// together that the first rows show. Errors are against sums in double, for large shapes of some rows; relative ones of up to
+// 4 rows are to be read beside those of a plain float sum. bench/peers_nn.py runs PyTorch on the same cases, which it reads
+// from their names.
+// Seconds are the median, seconds_min the least, cpu_seconds the process' CPU time of a round.
+#define GSFIXER_IMPLEMENTATION
+#define GSF_ASSERT(x) ((void)0)
+#include "../gsfixer_nn.h"
+
+#include <time.h>
+
+typedef struct bench_options {
+    int json, quick, threads;
+    const char* filter;
+} bench_options;
+
+typedef struct bench_row {
+    const char *name, *variant, *isa, *work_unit, *reference;
+    int threads;
+    double seconds, seconds_min, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
+    double flops, bytes; // of the whole, as the definition needs them; 0: not the bound to look at
+} bench_row;
+
+typedef struct bench_peak { double flops, bytes; } bench_peak; // per second
+static bench_peak bench_peaks[2][3]; // by instruction set (scalar, AVX2) and threads (1, 2)
+
+static double bench_now(void) {
+    struct timespec t;
+    timespec_get(&t, TIME_UTC);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static double bench_cpu(void) { return (double)clock() / CLOCKS_PER_SEC; }
+
+static int bench_compare(const void* a, const void* b) {
+    const double x = *(const double*)a, y = *(const double*)b;
+    return (x > y) - (x < y);
+}
+
+static void bench_require(gsf_context* ctx, gsf_result result) {
+    if (result == GSF_OK) return;
+    fprintf(stderr, "bench_nn: %s (%s)\n", ctx->error, gsf_describe_result(result));
+    exit(1);
+}
+
+static int bench_context(gsf_context* ctx, gsf_cpu_level level, int threads) { // 0: the machine lacks the instructions
+    memset(ctx, 0, sizeof *ctx);
+    ctx->cpu_level = level;
+    ctx->threads = threads;
+    bench_require(ctx, gsf_init_context(ctx));
+    return ctx->cpu_level == level;
+}
+
+static void* bench_alloc(gsf_context* ctx, size_t count, size_t size) {
+    void* memory = gsf_alloc(ctx, count, size);
+    if (!memory) bench_require(ctx, GSF_ERROR_OUT_OF_MEMORY);
+    return memory;
+}
+
+static int bench_wanted(const bench_options* o, const char* name, int threads) {
+    return (!o->filter || strstr(name, o->filter)) && (!o->threads || o->threads == threads);
+}
+
+static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threads, double work, const char* work_unit) {
+    bench_row row;
+    memset(&row, 0, sizeof row);
+    row.name = name;
+    row.variant = "default";
+    row.isa = gsf_cpu_level_name(level);
+    row.threads = threads;
+    row.work = work;
+    row.work_unit = work_unit;
+    row.reference = "none";
+    row.error_max = row.error_rel_l2 = -1.0;
+    return row;
+}
+
+static void bench_print(const bench_options* o, const bench_row* row) {
+    const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
+    const bench_peak* peak = &bench_peaks[strcmp(row->isa, "scalar") != 0][row->threads < 2 ? 1 : 2];
+    const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
+    const double byte_share = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
+    if (o->json) {
+        printf("{\"bench\":\"nn\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
+               "\"seconds_min\":%.6g,\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
+               row->name, row->variant, row->isa, row->threads, row->seconds, row->seconds_min, row->cpu_seconds, row->work,
+               row->work_unit, rate, row->reference);
+        if (row->flops > 0.0) printf(",\"peak_share\":%.4g", flop_share);
+        if (row->bytes > 0.0) printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g", row->bytes, byte_share);
+        if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
+        printf("}\n");
+    } else {
+        printf("%-44s %-8s %-6s %d thr %9.3f ms (least %9.3f, cpu %9.3f) %8.4g G%s/s", row->name, row->variant, row->isa,
+               row->threads, 1e3 * row->seconds, 1e3 * row->seconds_min, 1e3 * row->cpu_seconds, 1e-9 * rate, row->work_unit);
+        if (row->flops > 0.0) printf("  %.1f%% of the FMA peak", 100.0 * flop_share);
+        if (row->bytes > 0.0) printf("  %.1f%% of the bandwidth", 100.0 * byte_share);
+        if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
+        printf("\n");
+    }
+    fflush(stdout);
+}
+
+// ---- time ------------------------------------------------------------------------
+
+typedef void (*bench_body)(gsf_context* ctx, void* arg);
+
+// One round to warm up, then rounds for about a second (quick: 0.2), at least three. Each does `repeats` units of the row.
+static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg, double repeats) {
+    enum { MOST = 101 };
+    double seconds[MOST], budget = o->quick ? 0.2 : 1.0;
+    int rounds = 0;
+    body(ctx, arg);
+    const double cpu = bench_cpu(), start = bench_now();
+    while (rounds < MOST && (rounds < 3 || bench_now() - start < budget)) {
+        const double t = bench_now();
+        body(ctx, arg);
+        seconds[rounds++] = (bench_now() - t) / repeats;
+    }
+    row->cpu_seconds = (bench_cpu() - cpu) / rounds / repeats;
+    qsort(seconds, (size_t)rounds, sizeof *seconds, bench_compare);
+    row->seconds = seconds[rounds / 2];
+    row->seconds_min = seconds[0];
+}
+
+// ---- what the machine can do ----------------------------------------------------
+
+enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 22 };
+
+static float bench_sink; // keeps the compiler from dropping the loops
+
+#define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would lie in memory at -O2
+
+static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
+    (void)worker;
+#define BENCH_SCALAR(k) float v##k = (float)k;
+    BENCH_TEN(BENCH_SCALAR)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_SCALAR_STEP(k) v##k = v##k * 0.999f + 0.001f;
+        BENCH_TEN(BENCH_SCALAR_STEP)
+    }
+    ((float*)arg)[16 * chunk] = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
+}
+
+enum { READ_CHUNK = 1 << 18 }; // bytes
+
+typedef struct bench_read {
+    const char* memory;
+    float* sums; // 16 of each chunk
+} bench_read;
+
+static void bench_read_scalar(void* arg, size_t chunk, int worker) {
+    const bench_read* job = (const bench_read*)arg;
+    const char* p = job->memory + chunk * READ_CHUNK;
+    uint64_t a = 0, b = 0;
+    (void)worker;
+    for (int i = 0; i < READ_CHUNK; i += 16) {
+        uint64_t v[2];
+        memcpy(v, p + i, sizeof v);
+        a ^= v[0];
+        b ^= v[1];
+    }
+    job->sums[16 * chunk] = (float)(a ^ b);
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker) {
+    const __m256 a = _mm256_set1_ps(0.999f), b = _mm256_set1_ps(0.001f);
+    (void)worker;
+#define BENCH_VECTOR(k) __m256 v##k = _mm256_set1_ps((float)k);
+    BENCH_TEN(BENCH_VECTOR)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_VECTOR_STEP(k) v##k = _mm256_fmadd_ps(v##k, a, b);
+        BENCH_TEN(BENCH_VECTOR_STEP)
+    }
+    _mm256_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
+}
+
+GSF__TARGET_AVX2 static void bench_read_avx2(void* arg, size_t chunk, int worker) {
+    const bench_read* job = (const bench_read*)arg;
+    const float* p = (const float*)(const void*)(job->memory + chunk * READ_CHUNK);
+    __m256 a = _mm256_setzero_ps(), b = a, c = a, d = a;
+    (void)worker;
+    for (int i = 0; i < READ_CHUNK / 4; i += 32) {
+        a = _mm256_xor_ps(a, _mm256_load_ps(p + i));
+        b = _mm256_xor_ps(b, _mm256_load_ps(p + i + 8));
+        c = _mm256_xor_ps(c, _mm256_load_ps(p + i + 16));
+        d = _mm256_xor_ps(d, _mm256_load_ps(p + i + 24));
+    }
+    _mm256_storeu_ps(job->sums + 16 * chunk, _mm256_xor_ps(_mm256_xor_ps(a, b), _mm256_xor_ps(c, d)));
+}
+#endif
+
+static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads, const char* memory, size_t size) {
+    gsf_context ctx;
+    if (!bench_context(&ctx, level, threads)) return;
+    bench_read read;
+    read.memory = memory;
+    read.sums = (float*)bench_alloc(&ctx, size / READ_CHUNK + 16, 16 * sizeof(float));
+    gsf_chunk_fn fma = bench_fma_scalar, reader = bench_read_scalar;
+    double lanes = 1.0;
+#if GSF__X86
+    if (level >= GSF_CPU_AVX2) {
+        fma = bench_fma_avx2;
+        reader = bench_read_avx2;
+        lanes = 8.0;
+    }
+#endif
+    double best[2] = {1e30, 1e30};
+    for (int i = 0; i < 5; i++) {
+        const double t0 = bench_now();
+        gsf__parallel_for(&ctx, 4 * (size_t)threads, fma, read.sums);
+        const double t1 = bench_now();
+        gsf__parallel_for(&ctx, size / READ_CHUNK, reader, &read);
+        const double t2 = bench_now();
+        if (t1 - t0 < best[0]) best[0] = t1 - t0;
+        if (t2 - t1 < best[1]) best[1] = t2 - t1;
+        bench_sink += read.sums[0];
+    }
+    const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 4.0 * threads;
+    bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
+    peak->flops = flops / best[0];
+    peak->bytes = (double)size / best[1];
+    bench_row row = bench_make_row("machine: multiply-add", level, threads, flops, "flop");
+    row.seconds = row.seconds_min = best[0];
+    row.cpu_seconds = best[0] * threads;
+    bench_print(o, &row);
+    row = bench_make_row("machine: read memory", level, threads, (double)size, "B");
+    row.seconds = row.seconds_min = best[1];
+    row.cpu_seconds = best[1] * threads;
+    bench_print(o, &row);
+    gsf_free(&ctx, read.sums);
+}
+
+// ---- made-up values ---------------------------------------------------------------
+
+static uint64_t bench_random(uint64_t* state) { // xorshift64
+    uint64_t x = *state;
+    x ^= x << 13;
+    x ^= x >> 7;
+    x ^= x << 17;
+    return *state = x;
+}
+
+// Values of either sign with sizes in [1/4, 1/2). Bits of one value stand in each 16 or 32 bits.
+static void bench_fill(void* memory, size_t bytes, gsf_nn_dtype dtype, uint64_t seed) {
+    const uint64_t keep = dtype == GSF_NN_F32 ? 0x807fffff807fffffu : dtype == GSF_NN_BF16 ? 0x807f807f807f807fu : 0x83ff83ff83ff83ffu;
+    const uint64_t set = dtype == GSF_NN_F32 ? 0x3e8000003e800000u : dtype == GSF_NN_BF16 ? 0x3e803e803e803e80u : 0x3400340034003400u;
+    uint64_t state = seed * 0x9e3779b97f4a7c15u + 1;
+    for (size_t i = 0; i < bytes; i += 8) {
+        const uint64_t bits = (bench_random(&state) & keep) | set;
+        memcpy((char*)memory + i, &bits, bytes - i < 8 ? bytes - i : 8);
+    }
+}
+
+// ---- linear layers ----------------------------------------------------------------
+
+typedef struct bench_linear {
+    gsf_nn_linear_desc desc;
+    gsf_tensor weight, bias;
+    gsf_nn_workspace workspace;
+    int64_t in, out, copies; // of the weights, one after another: a round uses each once
+} bench_linear;
+
+static void bench_run_linear(gsf_context* ctx, void* arg) {
+    bench_linear* l = (bench_linear*)arg;
+    const char* first = (const char*)l->weight.data;
+    for (int64_t i = 0; i < l->copies; i++) {
+        l->weight.data = first + (size_t)i * (size_t)l->weight.count * gsf_nn_dtype_size(l->weight.dtype);
+        bench_require(ctx, gsf_nn_linear(ctx, &l->workspace, &l->desc));
+    }
+    l->weight.data = first;
+}
+
+static double bench_activation(gsf_nn_activation activation, double x) {
+    if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
+}
+
+// Against sums in double, over at most 4 rows: the last, the first and some between. y must hold one call's results.
+static void bench_linear_error(const bench_linear* l, const float* w, const float* bias, bench_row* row) {
+    const gsf_nn_linear_desc* d = &l->desc;
+    double worst = 0.0, difference = 0.0, square = 0.0;
+    const int64_t looks = d->rows < 4 ? d->rows : 4;
+    for (int64_t i = 0; i < looks; i++) {
+        const int64_t m = looks == 1 ? 0 : i * (d->rows - 1) / (looks - 1);
+        for (int64_t n = 0; n < l->out; n++) {
+            double sum = bias ? (double)bias[n] : 0.0;
+            for (int64_t k = 0; k < l->in; k++) sum += (double)d->x[m * l->in + k] * (double)w[n * l->in + k];
+            const double value = bench_activation(d->activation, sum), error = fabs((double)d->y[m * l->out + n] - value);
+            if (!(error <= worst)) worst = error;
+            difference += error * error;
+            square += value * value;
+        }
+    }
+    row->error_max = worst;
+    row->error_rel_l2 = sqrt(difference / square);
+    row->reference = "float64";
+}
+
+// `memory` holds `size` bytes for the weights; few rows cycle through all of it.
+static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int threads, gsf_nn_dtype dtype, int64_t rows,
+                             int64_t out, int64_t in, gsf_nn_activation activation, char* memory, size_t size) {
+    static const char* const dtypes[] = {"f32", "bf16", "f16"};
+    static const char* const activations[] = {"", " gelu", " silu"};
+    char name[96];
+    snprintf(name, sizeof name, "linear %s M=%lld N=%lld K=%lld%s", dtypes[dtype], (long long)rows, (long long)out,
+             (long long)in, activations[activation]);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, level, threads)) return;
+    bench_linear l;
+    memset(&l, 0, sizeof l);
+    l.in = in;
+    l.out = out;
+    const size_t bytes = (size_t)in * (size_t)out * gsf_nn_dtype_size(dtype);
+    l.copies = rows <= GSF__FEW_ROWS ? (int64_t)(size / bytes) : 1;
+    bench_fill(memory, l.copies > 1 ? size : bytes, dtype, 1);
+    l.weight.name = "weight";
+    l.weight.data = memory;
+    l.weight.dtype = dtype;
+    l.weight.rank = 2;
+    l.weight.shape[0] = out;
+    l.weight.shape[1] = in;
+    l.weight.count = in * out;
+    float* x = (float*)bench_alloc(&ctx, (size_t)(rows * in), sizeof(float));
+    float* y = (float*)bench_alloc(&ctx, (size_t)(rows * out), sizeof(float));
+    float* bias = (float*)bench_alloc(&ctx, (size_t)out, sizeof(float));
+    bench_fill(x, (size_t)(rows * in) * sizeof(float), GSF_NN_F32, 2);
+    bench_fill(bias, (size_t)out * sizeof(float), GSF_NN_F32, 3);
+    l.bias = gsf_nn_wrap_tensor("bias", bias, 1, &out);
+    l.desc.x = x;
+    l.desc.rows = rows;
+    l.desc.weight = &l.weight;
+    l.desc.bias = &l.bias;
+    l.desc.activation = activation;
+    l.desc.y = y;
+    const double flops = 2.0 * (double)rows * (double)in * (double)out;
+    const int few = rows <= GSF__FEW_ROWS;
+    bench_row row = bench_make_row(name, level, threads, few ? (double)bytes : flops, few ? "B" : "flop");
+    if (few) row.bytes = (double)bytes;
+    else row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_linear, &l, (double)l.copies);
+    l.copies = 1;
+    bench_run_linear(&ctx, &l);
+    float* wide = (float*)bench_alloc(&ctx, (size_t)(in * out), sizeof(float));
+    gsf_nn_read_tensor(&l.weight, 0, in * out, wide);
+    bench_linear_error(&l, wide, bias, &row);
+    bench_print(o, &row);
+    gsf_free(&ctx, wide);
+    gsf_free(&ctx, bias);
+    gsf_free(&ctx, y);
+    gsf_free(&ctx, x);
+    gsf_nn_destroy_workspace(&ctx, &l.workspace);
+}
+
+typedef struct bench_shape {
+    int64_t rows, out, in;
+    gsf_nn_activation activation;
+    int quick; // is also measured by --quick
+} bench_shape;
+
+static void bench_linears(const bench_options* o, char* memory, size_t size) {
+    static const bench_shape shapes[] = {
+        {1, 3072, 3072, GSF_NN_LINEAR, 1},     {4, 3072, 3072, GSF_NN_LINEAR, 1},
+        {226, 3072, 3072, GSF_NN_LINEAR, 1},   {2048, 3072, 3072, GSF_NN_LINEAR, 1},
+        {2048, 12288, 3072, GSF_NN_GELU_TANH, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0},
+        {17776, 3072, 3072, GSF_NN_LINEAR, 0},
+    };
+    static const gsf_nn_dtype dtypes[] = {GSF_NN_F32, GSF_NN_BF16, GSF_NN_F16};
+    for (int threads = 1; threads <= 2; threads++)
+        for (size_t t = 0; t < GSF__COUNT(dtypes); t++) {
+            bench_one_linear(o, GSF_CPU_SCALAR, threads, dtypes[t], 64, 256, 256, GSF_NN_LINEAR, memory, size);
+            bench_one_linear(o, GSF_CPU_AVX2, threads, dtypes[t], 64, 256, 256, GSF_NN_LINEAR, memory, size);
+            for (size_t i = 0; i < GSF__COUNT(shapes); i++) {
+                const bench_shape* s = &shapes[i];
+                if (o->quick && !s->quick) continue;
+                bench_one_linear(o, GSF_CPU_AVX2, threads, dtypes[t], s->rows, s->out, s->in, s->activation, memory, size);
+            }
+        }
+}
+
+// ---- attention ----------------------------------------------------------------------
+
+// ---- norms and activations ----------------------------------------------------------
+
+// ---- convolutions -------------------------------------------------------------------
+
+// ---- a whole transformer block ------------------------------------------------------
+
+int main(int argc, char** argv) {
+    bench_options o;
+    memset(&o, 0, sizeof o);
+    for (int i = 1; i < argc; i++) {
+        const char* value = i + 1 < argc ? argv[i + 1] : NULL;
+        if (strcmp(argv[i], "--json") == 0) o.json = 1;
+        else if (strcmp(argv[i], "--quick") == 0) o.quick = 1;
+        else if (value && strcmp(argv[i], "--filter") == 0) o.filter = argv[++i];
+        else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
+        else {
+            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N]\n");
+            return 2;
+        }
+    }
+    gsf_context ctx;
+    (void)bench_context(&ctx, GSF_CPU_AUTO, 1);
+    const size_t size = (size_t)1 << (o.quick ? 28 : 30); // more than any cache
+    char* memory = (char*)bench_alloc(&ctx, size, 1);
+    bench_fill(memory, size, GSF_NN_F32, 1);
+    for (int threads = 1; threads <= 2; threads++) {
+        if (o.threads && o.threads != threads) continue;
+        bench_machine(&o, GSF_CPU_SCALAR, threads, memory, size);
+        bench_machine(&o, GSF_CPU_AVX2, threads, memory, size);
+    }
+    bench_linears(&o, memory, size);
+    gsf_free(&ctx, memory);
+    return 0;
+}
