@@ -3,6 +3,7 @@
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
+#include "restorer_golden.h"
 #include "restorer_linear.h"
 #include "restorer_transformer.h"
 
