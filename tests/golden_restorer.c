@@ -4,7 +4,9 @@
 #include "gsfixer_nn.h"
 
 #include "test.h"
+#include "restorer_vae.h"
 
 int main(void) {
+    check_vae();
     return test_report();
 }
