@@ -6,9 +6,11 @@
 #include "restorer_golden.h"
 #include "restorer_linear.h"
 #include "restorer_transformer.h"
+#include "restorer_vae.h"
 
 int main(void) {
     check_linear();
+    check_vae();
     check_transformer();
     return test_report();
 }
