@@ -664,8 +664,8 @@ static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_tensor* tenso
         next = begin + gsf__nn_bytes(&tensors[i]);
     }
     if (next != end)
-        return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes belong to no tensor", h->name, (size_t)(next - h->text),
-                        (size_t)(end - next));
+        return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes belong to no tensor", h->name,
+                        (size_t)(next - h->text), (size_t)(end - next));
     return GSF_OK;
 }
 
@@ -680,8 +680,8 @@ static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weight
     for (uint32_t i = root->child; i; i = h->json.values[i].next) names += h->json.values[i].key_size + 1;
     file->names = (char*)gsf_alloc(h->ctx, names, 1);
     if (!file->names) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__reserve(h->ctx, (void**)&weights->tensors, &files->tensor_capacity, first, first + root->count,
-                          sizeof *weights->tensors));
+    GSF__TRY(gsf__reserve(h->ctx, (void**)&weights->tensors, &files->tensor_capacity, first, first + root->count + 1,
+                          sizeof *weights->tensors)); // + 1: there always is an array
     for (uint32_t i = root->child; i; i = h->json.values[i].next) {
         const gsf_json_value* entry = &h->json.values[i];
         if (entry->key_size == 12 && memcmp(entry->key, "__metadata__", 12) == 0) {
@@ -1011,8 +1011,9 @@ static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_tensor* tensor
     }
     ok = ok && count == tensor->count && (count == 0 || tensor->data) &&
          (uint64_t)count <= SIZE_MAX / 2 / gsf_nn_dtype_size(tensor->dtype);
-    return ok ? GSF_OK : gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name, dtype, shape, count and data do not fit",
-                                  gsf__nn_show(name).text);
+    if (ok) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name, dtype, shape, count and data do not fit",
+                    gsf__nn_show(name).text);
 }
 
 static int gsf__nn_compare_saved(const void* a, const void* b) { // wide types first, so that all stay aligned
