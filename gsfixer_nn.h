@@ -293,6 +293,66 @@ GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, cons
 GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
                                         int32_t reference_batch);
 
+// ---- sampling: from artifact-ridden frames to restored ones --------------------------
+
+typedef struct gsf_nn_sample_desc {
+    uint32_t _start_canary;
+    int32_t frames, height, width;  // of the video; frames 1, 9, 17, ... so that the VAE gives back as many
+    const float* control;           // (3, frames, height, width) in [-1,1]: what is to be restored
+    const float* text;              // (2, text tokens, text channels): negative prompt, prompt
+    const float* references;        // (reference_tokens, width) from gsf_nn_project_references; NULL: none
+    int64_t reference_tokens;
+    int32_t steps;                  // default 50
+    gsf_nn_solver solver;           // default DDIM
+    float guidance;                 // classifier-free guidance; default 6, 1: none (half the work)
+    float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; both 0: all
+    int dynamic_guidance;           // the official code's cosine ramp of the guidance
+    float strength;                 // (0,1]: how much of the noise schedule is run; default 1: from pure noise
+    float block_cache;              // gsf_nn_block_cache.threshold; default 0: off
+    int no_reference_cache;         // project the references' keys and values anew in every step, to save memory
+    uint64_t seed;
+    const float* noise;             // (latent frames, latent channels, height/8, width/8) or NULL: from the seed
+    const char* checkpoint;         // file written after every step and resumed from when it fits; NULL: none
+    // After every step: the latents and what the network predicted (guided); NULL in normal use.
+    void (*step_fn)(void* user, int32_t step, const float* latents, const float* prediction, int64_t count);
+    void* step_user;
+    uint32_t _end_canary;
+} gsf_nn_sample_desc;
+
+typedef struct gsf_nn_sample_stats {
+    int32_t steps, resumed_from;    // steps run in this call; first step of it
+    int32_t network_rows;           // samples that went through the transformer: 2 for a guided step
+    int64_t cached_steps;           // steps whose blocks the cache skipped
+} gsf_nn_sample_stats;
+
+// The restored video (3, frames, height, width), not clamped, about [-1,1]. stats may be NULL.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                               const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
+                                               gsf_nn_sample_stats* stats);
+
+typedef struct gsf_nn_cost { double bytes, flops; } gsf_nn_cost; // anonymous memory at the peak; operations
+
+// What gsf_nn_sample will take, before it runs; refuses what it would refuse.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                    const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc, gsf_nn_cost* out);
+
+// ---- the restorer `dit` ---------------------------------------------------------------
+
+typedef enum gsf_nn_condition { GSF_NN_BOTH = 0, GSF_NN_2D, GSF_NN_3D, GSF_NN_NONE } gsf_nn_condition;
+
+typedef struct gsf_nn_dit_desc {
+    const char* model;       // folder in the diffusers layout: transformer/, vae/, scheduler/
+    const char* features;    // safetensors: dino_latents (images, tokens, channels), vggt_latents likewise,
+                             // prompt_embeds (2, text tokens, text channels): negative, positive
+    gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
+    gsf_nn_sample_desc sample;  // steps, solver, guidance ...; sizes, pointers and seed are filled in for each window
+} gsf_nn_dit_desc;
+
+// The paper's restorer behind the interface of gsfixer.h. Weights stay mapped until it is destroyed. `desc`'s texts are
+// copied.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
+GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
+
 #ifdef __cplusplus
 }
 #endif
@@ -3480,7 +3540,7 @@ static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transf
         {"sample_height", &c->sample_height, 1, 1 << 16}, {"sample_frames", &c->sample_frames, 1, 1 << 16},
         {"temporal_compression_ratio", &c->temporal_ratio, 1, 64}};
     for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
-        int64_t value;
+        int64_t value = 0;
         GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
         *sizes[i].to = (int32_t)value;
     }
@@ -3849,7 +3909,7 @@ static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
     const int64_t d = run->width, t = net->time_channels;
     for (int32_t b = 0; b < run->in->batch; b++) {
         float *wave = run->qkv, *hidden = wave + d, *out = run->time + b * t;
-        gsf_nn_timestep_embedding(run->in->timesteps[b], (int32_t)d, wave);
+        gsf_nn_embed_timestep(run->in->timesteps[b], (int32_t)d, wave);
         gsf__dit_tap(run, "time_proj", b, wave, 1, d);
         GSF__TRY(gsf__dit_linear(run, wave, 1, run->nets->time1_weight, run->nets->time1_bias, GSF_NN_SILU, hidden));
         GSF__TRY(gsf__dit_linear(run, hidden, 1, run->nets->time2_weight, run->nets->time2_bias, GSF_NN_LINEAR, out));
@@ -3912,8 +3972,8 @@ static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
         }
         return GSF_OK;
     }
-    GSF__TRY(gsf_nn_sincos_positions(run->ctx, (int32_t)d, in->frames, in->height / c->patch, in->width / c->patch,
-                                     c->spatial_scale, c->temporal_scale, run->qkv));
+    GSF__TRY(gsf_nn_make_sincos(run->ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
+                                c->spatial_scale, c->temporal_scale, run->qkv));
     for (int32_t b = 0; b < in->batch; b++)
         for (int64_t i = 0; i < run->video * d; i++) run->x[(b * run->tokens + run->text) * d + i] += run->qkv[i];
     return GSF_OK;
@@ -4102,9 +4162,17 @@ static size_t gsf__dit_total(const gsf__dit_layout* l) {
 static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
     const gsf_nn_transformer* c = run->net;
     const gsf_nn_transformer_input* in = run->in;
-    if (run->cos)
-        GSF__TRY(gsf_nn_rotary_positions(run->ctx, c->head_dim, in->frames, in->height / c->patch, in->width / c->patch,
-                                         c->sample_height / c->patch, c->sample_width / c->patch, run->cos, run->sin));
+    if (run->cos) {
+        gsf_nn_rope_desc rope;
+        memset(&rope, 0, sizeof rope);
+        rope.frames = in->frames;
+        rope.height = in->height / c->patch;
+        rope.width = in->width / c->patch;
+        rope.base_height = c->sample_height / c->patch;
+        rope.base_width = c->sample_width / c->patch;
+        rope.head_dim = c->head_dim;
+        GSF__TRY(gsf_nn_make_rope(run->ctx, &rope, run->cos, run->sin));
+    }
     GSF__TRY(gsf__dit_embed_time(run));
     GSF__TRY(gsf__dit_embed(run));
     GSF__TRY(gsf__dit_check(run, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * run->width));
@@ -5266,7 +5334,585 @@ GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, co
 
 // ---- >>nn sampling --------------------------------------------------------------
 
+enum { GSF__SAMPLE_STREAM = 0x6e6f6973 }; // of the random numbers: the initial noise
+
+typedef struct gsf__sample_run {
+    gsf_context* ctx;
+    const gsf_nn_transformer* net;
+    const gsf_nn_vae* vae;
+    const gsf_nn_schedule* schedule;
+    gsf_nn_sample_desc desc;       // defaults filled in
+    gsf_nn_sample_stats stats;
+    int32_t frames, height, width; // of the latents
+    int32_t channels;              // of the latents
+    int64_t count;                 // values of the latents
+    float *latents, *control;      // (frames, channels, height, width), control scaled as the network takes it
+    float *input, *prediction;     // (2, frames, 2 channels, height, width), (2, frames, channels, height, width)
+    float* reference_kv;
+    int reference_kv_ready;
+    gsf_nn_block_cache cache;
+    gsf_nn_sampler sampler;
+    uint32_t job; // checksum of everything that the result depends on
+} gsf__sample_run;
+
+static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) {
+    if (d->_start_canary != 0 || d->_end_canary != 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: the desc was not zeroed");
+    if (!d->steps) d->steps = 50;
+    if (d->guidance == 0.0f) d->guidance = 6.0f;
+    if (d->guidance_begin == 0.0f && d->guidance_end == 0.0f) d->guidance_end = 1.0f;
+    if (d->strength == 0.0f) d->strength = 1.0f;
+    if (d->steps < 1 || d->steps > 1000)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: %d steps, not 1 to 1000", (int)d->steps);
+    if (!(d->strength > 0.0f && d->strength <= 1.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: strength %g is not in (0, 1]", (double)d->strength);
+    if (!(d->guidance >= 1.0f && d->guidance < 1e4f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: guidance %g is below 1", (double)d->guidance);
+    if (!(d->guidance_begin >= 0.0f && d->guidance_begin <= d->guidance_end && d->guidance_end <= 1.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: guidance from %g to %g of the steps",
+                        (double)d->guidance_begin, (double)d->guidance_end);
+    if (!(d->block_cache >= 0.0f && d->block_cache < 1e4f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: block cache threshold %g", (double)d->block_cache);
+    return GSF_OK;
+}
+
+// Frames that the VAE gives back as many: 1, 9, 17, ... at the usual compression of 4.
+static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
+                                         const gsf_nn_sample_desc* d) {
+    const int32_t step = 2 * v->temporal_ratio, square = v->spatial_ratio * t->patch;
+    if (t->temporal_ratio != v->temporal_ratio || t->in_channels != 2 * v->latent_channels ||
+        t->out_channels != v->latent_channels)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent channels) do not fit",
+                        (int)t->in_channels, (int)t->out_channels, (int)v->latent_channels);
+    if (d->frames < 1 || (d->frames - 1) % step)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: %d frames; it takes 1, %d, %d, ...", (int)d->frames,
+                        (int)(1 + step), (int)(1 + 2 * step));
+    if (d->height < square || d->width < square || d->height % square || d->width % square)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are no multiple of %d", (int)d->width,
+                        (int)d->height, (int)square);
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_check(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
+                                    gsf_nn_sample_desc* d) {
+    GSF__TRY(gsf__sample_defaults(ctx, d));
+    GSF__TRY(gsf__sample_check_size(ctx, t, v, d));
+    if (!d->control || !d->text)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: control frames or text embeddings are missing");
+    return GSF_OK;
+}
+
+// Between (channels, frames, plane) and (frames, channels, plane), times a factor.
+static void gsf__swap_frames(const float* from, int64_t outer, int64_t inner, int64_t plane, float factor, float* to) {
+    for (int64_t i = 0; i < inner; i++)
+        for (int64_t o = 0; o < outer; o++, to += plane) {
+            const float* source = from + (o * inner + i) * plane;
+            for (int64_t p = 0; p < plane; p++) to[p] = source[p] * factor;
+        }
+}
+
+static gsf_result gsf__sample_encode(gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    GSF__TRY(gsf_nn_vae_encode(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, run->prediction, NULL));
+    gsf__swap_frames(run->prediction, run->channels, run->frames, (int64_t)run->height * run->width,
+                     (float)run->vae->scaling_factor, run->control);
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_decode(gsf__sample_run* run, float* out) {
+    gsf__swap_frames(run->latents, run->frames, run->channels, (int64_t)run->height * run->width,
+                     (float)(1.0 / run->vae->scaling_factor), run->prediction);
+    return gsf_nn_vae_decode(run->ctx, run->vae, NULL, run->prediction, run->frames, run->height, run->width, out);
+}
+
+// Pure noise, or at strength < 1 the control latents with the noise of the first step.
+static void gsf__sample_begin(gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    for (int64_t i = 0; i < run->count; i++)
+        run->latents[i] = d->noise ? d->noise[i] : (float)gsf_random_normal(d->seed, GSF__SAMPLE_STREAM, (uint64_t)i);
+    if (run->sampler.count < d->steps)
+        gsf_nn_add_noise(run->ctx, run->schedule, run->sampler.timesteps[0], run->control, run->latents,
+                         (size_t)run->count, run->latents);
+}
+
+// ---- checkpoint: what identifies the job, the step, the latents and what the solver remembers
+
+static uint32_t gsf__sample_job(const gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const gsf_nn_transformer* t = run->net;
+    const int32_t whole[] = {d->frames, d->height, d->width, d->steps, (int32_t)d->solver, d->dynamic_guidance,
+                             t->layers, t->heads, d->noise != NULL, (int32_t)d->reference_tokens, d->references != NULL};
+    const float real[] = {d->guidance, d->guidance_begin, d->guidance_end, d->strength, d->block_cache};
+    const size_t text = 2 * (size_t)t->text_tokens * (size_t)t->text_channels;
+    uint32_t crc = gsf__crc32(0, whole, sizeof whole);
+    crc = gsf__crc32(crc, real, sizeof real);
+    crc = gsf__crc32(crc, &d->seed, sizeof d->seed);
+    crc = gsf__crc32(crc, run->control, (size_t)run->count * sizeof(float));
+    crc = gsf__crc32(crc, d->text, text * sizeof(float));
+    if (d->noise) crc = gsf__crc32(crc, d->noise, (size_t)run->count * sizeof(float));
+    if (d->references)
+        crc = gsf__crc32(crc, d->references, (size_t)d->reference_tokens * (size_t)gsf__dit_width(t) * sizeof(float));
+    return crc;
+}
+
+static gsf_result gsf__sample_save(gsf__sample_run* run) {
+    if (!run->desc.checkpoint) return GSF_OK;
+    gsf_text file;
+    char head[8];
+    memset(&file, 0, sizeof file);
+    gsf__store_le(head, run->job, 4);
+    gsf__store_le(head + 4, (uint64_t)run->sampler.index, 4);
+    gsf_chunks_add(run->ctx, &file, "SAMP", head, sizeof head);
+    gsf_chunks_add(run->ctx, &file, "LATE", run->latents, (size_t)run->count * sizeof(float));
+    gsf_chunks_add(run->ctx, &file, "MEMO", run->sampler.memory, run->sampler.memory_count * sizeof(float));
+    gsf_chunks_end(run->ctx, &file);
+    const gsf_result result =
+        file.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(run->ctx, run->desc.checkpoint, file.data, file.size);
+    gsf_destroy_text(run->ctx, &file);
+    return result;
+}
+
+static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size) {
+    gsf_chunk head, latents, memory;
+    if (!gsf_chunks_find(data, size, "SAMP", &head) || !gsf_chunks_find(data, size, "LATE", &latents) ||
+        !gsf_chunks_find(data, size, "MEMO", &memory))
+        return;
+    if (head.size != 8 || latents.size != (size_t)run->count * sizeof(float) ||
+        memory.size != run->sampler.memory_count * sizeof(float) || gsf__load_le(head.data, 4) != run->job)
+        return;
+    const int64_t index = (int64_t)gsf__load_le((const char*)head.data + 4, 4);
+    if (index < 1 || index > run->sampler.count) return;
+    memcpy(run->latents, latents.data, latents.size);
+    if (memory.size) memcpy(run->sampler.memory, memory.data, memory.size);
+    run->sampler.index = (int32_t)index;
+}
+
+// Goes on from the checkpoint if there is one of this very job; one of another job is overwritten after the first step.
+static void gsf__sample_resume(gsf__sample_run* run) {
+    void* data;
+    size_t size;
+    char error[sizeof run->ctx->error];
+    if (!run->desc.checkpoint) return;
+    memcpy(error, run->ctx->error, sizeof error); // a file that is not there is no error
+    const gsf_logger logger = run->ctx->logger;
+    memset(&run->ctx->logger, 0, sizeof run->ctx->logger);
+    if (gsf_read_file(run->ctx, run->desc.checkpoint, &data, &size) == GSF_OK) {
+        if (gsf_chunks_check(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
+        gsf_free(run->ctx, data);
+    }
+    run->ctx->logger = logger;
+    memcpy(run->ctx->error, error, sizeof error);
+    run->stats.resumed_from = run->sampler.index;
+}
+
+// ---- the steps
+
+// Guidance of step `index`; 1: the prompt alone.
+static float gsf__sample_guidance(const gsf__sample_run* run, int32_t index) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const float at = ((float)index + 0.5f) / (float)run->sampler.count;
+    if (at < d->guidance_begin || at > d->guidance_end) return 1.0f;
+    if (!d->dynamic_guidance) return d->guidance;
+    // The official code mixes units: the time step counts to 1000, n is the number of steps.
+    const double n = d->steps, t = run->sampler.timesteps[index];
+    return (float)(1.0 + (double)d->guidance * (1.0 - cos(3.14159265358979323846 * pow((n - t) / n, 5.0))) / 2.0);
+}
+
+// Noisy latents and control side by side, for each of `rows` samples.
+static void gsf__sample_fill_input(gsf__sample_run* run, int32_t rows) {
+    const size_t frame = (size_t)run->channels * (size_t)run->height * (size_t)run->width;
+    float* to = run->input;
+    for (int32_t b = 0; b < rows; b++)
+        for (size_t f = 0; f < (size_t)run->frames; f++, to += 2 * frame) {
+            memcpy(to, run->latents + f * frame, frame * sizeof(float));
+            memcpy(to + frame, run->control + f * frame, frame * sizeof(float));
+        }
+}
+
+static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const gsf_nn_transformer* t = run->net;
+    const int32_t rows = guidance == 1.0f ? 1 : 2;
+    const double step = run->sampler.timesteps[run->sampler.index], steps[2] = {step, step};
+    gsf_nn_transformer_input in;
+    memset(&in, 0, sizeof in);
+    in.batch = rows;
+    in.frames = run->frames;
+    in.height = run->height;
+    in.width = run->width;
+    in.hidden = run->input;
+    in.text = rows == 2 ? d->text : d->text + (int64_t)t->text_tokens * t->text_channels; // negative prompt, prompt
+    in.timesteps = steps;
+    in.references = d->references;
+    in.reference_tokens = d->reference_tokens;
+    in.reference_batch = 1;
+    in.reference_kv = run->reference_kv;
+    in.reference_kv_ready = run->reference_kv_ready;
+    in.cache = &run->cache;
+    const int64_t hits = run->cache.hits;
+    gsf__sample_fill_input(run, rows);
+    GSF__TRY(gsf_nn_transformer_forward(run->ctx, t, &in, run->prediction));
+    // A step that the cache cut short after the first block has not filled the other blocks' keys and values.
+    if (run->cache.hits == hits) run->reference_kv_ready = 1;
+    run->stats.network_rows += rows;
+    run->stats.cached_steps += run->cache.hits - hits;
+    for (int64_t i = 0; rows == 2 && i < run->count; i++) {
+        const float u = run->prediction[i], c = run->prediction[run->count + i];
+        run->prediction[i] = u + guidance * (c - u);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_steps(gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    while (run->sampler.index < run->sampler.count) {
+        const int32_t index = run->sampler.index;
+        GSF__TRY(gsf__check_cancel(run->ctx));
+        gsf__progress(run->ctx, "restore", index, run->sampler.count);
+        GSF__TRY(gsf__sample_predict(run, gsf__sample_guidance(run, index)));
+        GSF__TRY(gsf_nn_step_sampler(run->ctx, &run->sampler, run->prediction, run->latents, NULL));
+        if (d->step_fn) d->step_fn(d->step_user, index, run->latents, run->prediction, run->count);
+        run->stats.steps++;
+        GSF__TRY(gsf__sample_save(run));
+    }
+    gsf__progress(run->ctx, "restore", run->sampler.count, run->sampler.count);
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_run_all(gsf__sample_run* run, float* out) {
+    gsf_nn_sampler_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.solver = run->desc.solver;
+    desc.steps = run->desc.steps;
+    desc.strength = (double)run->desc.strength;
+    desc.value_count = (size_t)run->count;
+    GSF__TRY(gsf_nn_make_sampler(run->ctx, run->schedule, &desc, &run->sampler));
+    GSF__TRY(gsf__sample_encode(run));
+    gsf__sample_begin(run);
+    run->job = gsf__sample_job(run);
+    gsf__sample_resume(run);
+    run->cache.threshold = run->desc.block_cache;
+    GSF__TRY(gsf__sample_steps(run));
+    return gsf__sample_decode(run, out);
+}
+
+static void gsf__sample_sizes(gsf__sample_run* run, const gsf_nn_sample_desc* d) {
+    run->frames = (d->frames - 1) / run->vae->temporal_ratio + 1;
+    run->height = d->height / run->vae->spatial_ratio;
+    run->width = d->width / run->vae->spatial_ratio;
+    run->channels = run->vae->latent_channels;
+    run->count = (int64_t)run->frames * run->channels * run->height * run->width;
+}
+
+static size_t gsf__sample_kv_size(const gsf__sample_run* run) {
+    if (!run->desc.references || run->desc.no_reference_cache) return 0;
+    return gsf_nn_reference_kv_size(run->net, run->desc.reference_tokens, 1);
+}
+
+enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents, control, input 2 x 2, prediction 2
+
+GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                 const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
+                                 gsf_nn_sample_stats* stats) {
+    gsf__sample_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.net = transformer;
+    run.vae = vae;
+    run.schedule = schedule;
+    run.desc = *desc;
+    GSF__TRY(gsf__sample_check(ctx, transformer, vae, &run.desc));
+    gsf__sample_sizes(&run, &run.desc);
+    const size_t count = (size_t)run.count, kv = gsf__sample_kv_size(&run);
+    float* memory = (float*)gsf_alloc(ctx, GSF__SAMPLE_BUFFERS * count + kv, sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    run.latents = memory;
+    run.control = memory + count;
+    run.input = memory + 2 * count;
+    run.prediction = memory + 6 * count;
+    run.reference_kv = kv ? memory + GSF__SAMPLE_BUFFERS * count : NULL;
+    const gsf_result result = gsf__sample_run_all(&run, out);
+    if (stats) *stats = run.stats;
+    gsf_nn_destroy_block_cache(ctx, &run.cache);
+    gsf_nn_destroy_sampler(ctx, &run.sampler);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                      const gsf_nn_sample_desc* desc, gsf_nn_cost* out) {
+    gsf__sample_run run;
+    gsf_nn_vae_info encode, decode;
+    memset(&run, 0, sizeof run);
+    memset(out, 0, sizeof *out);
+    run.net = transformer;
+    run.vae = vae;
+    run.desc = *desc;
+    GSF__TRY(gsf__sample_defaults(ctx, &run.desc));
+    GSF__TRY(gsf__sample_check_size(ctx, transformer, vae, &run.desc));
+    gsf__sample_sizes(&run, &run.desc);
+    GSF__TRY(gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_ENCODE, NULL, desc->frames, desc->height, desc->width, &encode));
+    GSF__TRY(gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_DECODE, NULL, run.frames, run.height, run.width, &decode));
+    const int32_t steps = (int32_t)((double)run.desc.steps * (double)run.desc.strength);
+    double bytes = 0.0;
+    out->flops = encode.flops + decode.flops;
+    for (int32_t i = 0; i < steps; i++) {
+        const float at = ((float)i + 0.5f) / (float)steps;
+        const int guided = run.desc.guidance != 1.0f && at >= run.desc.guidance_begin && at <= run.desc.guidance_end;
+        gsf_nn_transformer_input in;
+        double step_bytes, step_flops;
+        memset(&in, 0, sizeof in);
+        in.batch = guided ? 2 : 1;
+        in.frames = run.frames;
+        in.height = run.height;
+        in.width = run.width;
+        in.references = desc->references;
+        in.reference_tokens = desc->reference_tokens;
+        in.reference_batch = 1;
+        in.reference_kv_ready = i > 0 && !desc->no_reference_cache;
+        gsf_nn_transformer_cost(transformer, &in, &step_bytes, &step_flops);
+        out->flops += step_flops;
+        if (step_bytes > bytes) bytes = step_bytes;
+    }
+    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // what the last step's blocks added, beside the stream itself
+    if (encode.bytes > bytes) bytes = encode.bytes;
+    if (decode.bytes > bytes) bytes = decode.bytes;
+    const double own = (double)GSF__SAMPLE_BUFFERS * (double)run.count + (double)gsf__sample_kv_size(&run);
+    out->bytes = bytes + own * sizeof(float);
+    return GSF_OK;
+}
+
 // ---- >>nn restorer --------------------------------------------------------------
+
+typedef struct gsf__dit_restorer {
+    gsf_nn_dit_desc desc;      // texts point into `texts`
+    char* texts;
+    gsf_nn_transformer transformer;
+    gsf_nn_vae vae;
+    gsf_nn_schedule schedule;
+    gsf_nn_weights features;   // open while the restorer lives
+    float *text, *references;  // (2, text tokens, text channels); (reference_tokens, width) or NULL
+    int64_t reference_tokens;
+    const gsf_reference* photos; // between begin and end
+    int32_t photo_count;
+} gsf__dit_restorer;
+
+static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
+                                 gsf_restorer_limits* out) {
+    const gsf__dit_restorer* r = (const gsf__dit_restorer*)user;
+    const gsf_nn_transformer* t = &r->transformer;
+    const gsf_nn_vae* v = &r->vae;
+    const int32_t square = v->spatial_ratio * t->patch, step = 2 * v->temporal_ratio;
+    memset(out, 0, sizeof *out);
+    out->frame_count_min = 1 + step;
+    out->frame_count_step = step;
+    out->frame_count_max = t->sample_frames > out->frame_count_min ? t->sample_frames : out->frame_count_min;
+    out->width_multiple = out->height_multiple = square;
+    if (t->learned_positions) { // one size only
+        out->width_multiple = out->width_max = t->sample_width * v->spatial_ratio;
+        out->height_multiple = out->height_max = t->sample_height * v->spatial_ratio;
+    }
+    gsf_nn_sample_desc d = r->desc.sample;
+    d.frames = frame_count;
+    d.width = width;
+    d.height = height;
+    d.references = r->references;
+    d.reference_tokens = r->reference_tokens;
+    gsf_nn_cost cost;
+    if ((frame_count - 1) % step == 0 && frame_count > 0 && width % out->width_multiple == 0 &&
+        height % out->height_multiple == 0 && gsf_nn_sample_cost(ctx, &r->transformer, &r->vae, &d, &cost) == GSF_OK) {
+        out->bytes = cost.bytes;
+        out->flops = cost.flops;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count) {
+    gsf__dit_restorer* r = (gsf__dit_restorer*)user;
+    (void)ctx;
+    r->photos = references;
+    r->photo_count = reference_count;
+    return GSF_OK;
+}
+
+static void gsf__dit_end(void* user, gsf_context* ctx) {
+    gsf__dit_restorer* r = (gsf__dit_restorer*)user;
+    (void)ctx;
+    r->photos = NULL;
+    r->photo_count = 0;
+}
+
+// Frames to (3, frames, height, width) in [-1,1]. A frame that is a reference's view is that photo, as in the paper's
+// benchmark; a NaN is black.
+static void gsf__dit_fill_control(const gsf__dit_restorer* r, const gsf_restore_window* window, float* control) {
+    const int64_t width = window->color[0].width, height = window->color[0].height, plane = width * height;
+    for (int32_t f = 0; f < window->frame_count; f++) {
+        const gsf_image* image = &window->color[f];
+        const int32_t photo = window->reference_index ? window->reference_index[f] : -1;
+        if (photo >= 0 && photo < r->photo_count && r->photos[photo].color.data && r->photos[photo].color.width == width &&
+            r->photos[photo].color.height == height)
+            image = &r->photos[photo].color;
+        for (int64_t y = 0; y < height; y++)
+            for (int64_t x = 0; x < width; x++)
+                for (int64_t c = 0; c < 3; c++) {
+                    float v;
+                    memcpy(&v, (const char*)image->data + y * image->stride_y + x * image->stride_x + c * image->stride_c,
+                           sizeof v);
+                    control[(c * window->frame_count + f) * plane + y * width + x] =
+                        v >= 1.0f ? 1.0f : v > 0.0f ? 2.0f * v - 1.0f : -1.0f;
+                }
+    }
+}
+
+static void gsf__dit_store_frames(const gsf_restore_window* window, const float* video) {
+    const int64_t width = window->color[0].width, height = window->color[0].height, plane = width * height;
+    for (int32_t f = 0; f < window->frame_count; f++) {
+        const gsf_image *color = &window->out_color[f], *confidence = &window->out_confidence[f];
+        for (int64_t y = 0; y < height; y++)
+            for (int64_t x = 0; x < width; x++) {
+                const float one = 1.0f;
+                for (int64_t c = 0; c < 3; c++) {
+                    const float v = video[(c * window->frame_count + f) * plane + y * width + x] * 0.5f + 0.5f;
+                    const float clamped = v >= 1.0f ? 1.0f : v > 0.0f ? v : 0.0f;
+                    memcpy((char*)color->data + y * color->stride_y + x * color->stride_x + c * color->stride_c, &clamped,
+                           sizeof clamped);
+                }
+                memcpy((char*)confidence->data + y * confidence->stride_y + x * confidence->stride_x, &one, sizeof one);
+            }
+    }
+}
+
+static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    gsf__dit_restorer* r = (gsf__dit_restorer*)user;
+    gsf_nn_sample_desc d = r->desc.sample;
+    d.frames = window->frame_count;
+    d.width = (int32_t)window->color[0].width;
+    d.height = (int32_t)window->color[0].height;
+    d.text = r->text;
+    d.references = r->references;
+    d.reference_tokens = r->reference_tokens;
+    d.seed = window->seed;
+    const size_t values = (size_t)3 * (size_t)d.frames * (size_t)d.width * (size_t)d.height;
+    float* video = (float*)gsf_alloc(ctx, values, 2 * sizeof(float));
+    if (!video) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__dit_fill_control(r, window, video);
+    d.control = video;
+    const gsf_result result = gsf_nn_sample(ctx, &r->transformer, &r->vae, &r->schedule, &d, video + values, NULL);
+    if (!result) gsf__dit_store_frames(window, video + values);
+    gsf_free(ctx, video);
+    return result;
+}
+
+// The reference tokens and prompt embeddings of a features file, checked against the transformer.
+static gsf_result gsf__dit_feature(gsf_context* ctx, gsf__dit_restorer* r, const char* name, int32_t rank,
+                                   const int64_t* shape, float** out, int64_t* rows) {
+    const gsf_tensor* t = gsf_nn_find_tensor(&r->features, name);
+    *out = NULL;
+    if (!t)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is missing (this version has no encoders to make it)",
+                        r->features.name, name);
+    int ok = t->rank == rank && t->count > 0;
+    for (int32_t i = 0; ok && i < rank; i++) ok = shape[i] < 0 || t->shape[i] == shape[i];
+    if (!ok)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", r->features.name, name,
+                        (long long)shape[rank - 1]);
+    *out = (float*)gsf_alloc(ctx, (size_t)t->count, sizeof(float));
+    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_nn_read_tensor(t, 0, t->count, *out);
+    *rows = t->count / shape[rank - 1];
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_load_features(gsf_context* ctx, gsf__dit_restorer* r) {
+    const gsf_nn_transformer* c = &r->transformer;
+    const gsf_nn_condition condition = r->desc.condition;
+    const int64_t text[3] = {2, c->text_tokens, c->text_channels};
+    const int64_t dino[3] = {-1, -1, c->dino_channels}, vggt[3] = {-1, -1, c->vggt_channels};
+    float *tokens2 = NULL, *tokens3 = NULL;
+    int64_t rows, rows2 = 0, rows3 = 0;
+    GSF__TRY(gsf_nn_open_weights(ctx, r->desc.features, NULL, &r->features));
+    GSF__TRY(gsf__dit_feature(ctx, r, "prompt_embeds", 3, text, &r->text, &rows));
+    if (condition == GSF_NN_NONE) return GSF_OK;
+    gsf_result result = GSF_OK;
+    if (condition != GSF_NN_3D) result = gsf__dit_feature(ctx, r, "dino_latents", 3, dino, &tokens2, &rows2);
+    if (!result && condition != GSF_NN_2D) result = gsf__dit_feature(ctx, r, "vggt_latents", 3, vggt, &tokens3, &rows3);
+    if (!result && tokens2 && tokens3 && rows2 != rows3)
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld rows of dino_latents, but %lld of vggt_latents",
+                          r->features.name, (long long)rows2, (long long)rows3);
+    r->reference_tokens = rows2 ? rows2 : rows3;
+    if (!result) {
+        r->references = (float*)gsf_alloc(ctx, (size_t)r->reference_tokens, (size_t)c->heads * (size_t)c->head_dim * sizeof(float));
+        result = r->references ? gsf_nn_project_references(ctx, &r->transformer, r->reference_tokens, tokens2, tokens3, r->references)
+                               : GSF_ERROR_OUT_OF_MEMORY;
+    }
+    gsf_free(ctx, tokens2);
+    gsf_free(ctx, tokens3);
+    return result;
+}
+
+static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/transformer", r->desc.model);
+    if (path.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = gsf_nn_make_transformer(ctx, path.data, &r->transformer);
+    path.size = 0;
+    gsf_text_printf(ctx, &path, "%s/vae", r->desc.model);
+    if (!result) result = gsf_nn_make_vae(ctx, path.data, &r->vae);
+    path.size = 0;
+    gsf_text_printf(ctx, &path, "%s/scheduler/scheduler_config.json", r->desc.model);
+    if (!result) result = gsf_nn_load_schedule(ctx, path.data, GSF_NN_TABLE_DDIM, &r->schedule);
+    gsf_destroy_text(ctx, &path);
+    return result ? result : gsf__dit_load_features(ctx, r);
+}
+
+GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
+    gsf__dit_restorer* r = (gsf__dit_restorer*)restorer->user;
+    memset(restorer, 0, sizeof *restorer);
+    if (!r) return;
+    gsf_nn_destroy_transformer(ctx, &r->transformer);
+    gsf_nn_destroy_vae(ctx, &r->vae);
+    gsf_nn_destroy_schedule(ctx, &r->schedule);
+    gsf_nn_close_weights(ctx, &r->features);
+    gsf_free(ctx, r->text);
+    gsf_free(ctx, r->references);
+    gsf_free(ctx, r->texts);
+    gsf_free(ctx, r);
+}
+
+GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out) {
+    memset(out, 0, sizeof *out);
+    if (!desc || !desc->model)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no model folder is given");
+    if (!desc->features)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "dit: no file of reference features and prompt embeddings is given (this version has no encoders)");
+    gsf__dit_restorer* r = (gsf__dit_restorer*)gsf_alloc_zeroed(ctx, 1, sizeof *r);
+    if (!r) return GSF_ERROR_OUT_OF_MEMORY;
+    const char* checkpoint = desc->sample.checkpoint ? desc->sample.checkpoint : "";
+    const size_t sizes[3] = {strlen(desc->model) + 1, strlen(desc->features) + 1, strlen(checkpoint) + 1};
+    r->desc = *desc;
+    r->texts = (char*)gsf_alloc(ctx, sizes[0] + sizes[1] + sizes[2], 1);
+    gsf_result result = r->texts ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (!result) {
+        memcpy(r->texts, desc->model, sizes[0]);
+        memcpy(r->texts + sizes[0], desc->features, sizes[1]);
+        memcpy(r->texts + sizes[0] + sizes[1], checkpoint, sizes[2]);
+        r->desc.model = r->texts;
+        r->desc.features = r->texts + sizes[0];
+        r->desc.sample.checkpoint = desc->sample.checkpoint ? r->texts + sizes[0] + sizes[1] : NULL;
+        result = gsf__dit_open(ctx, r);
+    }
+    out->struct_size = sizeof *out;
+    out->name = "dit";
+    out->user = r;
+    out->query_fn = gsf__dit_query;
+    out->begin_fn = gsf__dit_begin;
+    out->restore_fn = gsf__dit_restore;
+    out->end_fn = gsf__dit_end;
+    if (result) gsf_nn_destroy_dit(ctx, out);
+    return result;
+}
 
 GSF__END_IMPLEMENTATION
 

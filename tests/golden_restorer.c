@@ -5,6 +5,7 @@
 
 #include "restorer_golden.h"
 #include "restorer_linear.h"
+#include "restorer_pipeline.h"
 #include "restorer_transformer.h"
 #include "restorer_vae.h"
 
@@ -12,5 +13,6 @@ int main(void) {
     check_linear();
     check_vae();
     check_transformer();
+    check_pipeline();
     return test_report();
 }

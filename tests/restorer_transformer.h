@@ -70,10 +70,10 @@ static void check_output(transformer_case* c, const gsf_nn_transformer* net, con
 }
 
 // The same weights rounded to bf16, in one file.
-static gsf_nn_transformer open_rounded(transformer_case* c, const char* folder) {
+static gsf_nn_transformer open_rounded(gsf_context* ctx, const char* folder) {
     gsf_nn_weights weights;
     gsf_nn_transformer net;
-    CHECK_OK(&c->ctx, gsf_nn_open_weights(&c->ctx, folder, "diffusion_pytorch_model", &weights));
+    CHECK_OK(ctx, gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &weights));
     gsf_tensor* rounded = (gsf_tensor*)malloc(weights.tensor_count * sizeof(gsf_tensor));
     for (size_t i = 0; i < weights.tensor_count; i++) {
         rounded[i] = weights.tensors[i];
@@ -85,18 +85,18 @@ static gsf_nn_transformer open_rounded(transformer_case* c, const char* folder) 
         rounded[i].data = narrow;
         free(wide);
     }
-    CHECK_OK(&c->ctx, gsf_nn_save_tensors(&c->ctx, test_scratch("diffusion_pytorch_model.safetensors"), rounded,
+    CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("diffusion_pytorch_model.safetensors"), rounded,
                                           weights.tensor_count));
     for (size_t i = 0; i < weights.tensor_count; i++) free((void*)(uintptr_t)rounded[i].data);
     free(rounded);
-    gsf_nn_close_weights(&c->ctx, &weights);
+    gsf_nn_close_weights(ctx, &weights);
     char path[1200];
     snprintf(path, sizeof path, "%s/config.json", folder);
     size_t size;
     char* config = test_read_file(path, &size);
-    CHECK_OK(&c->ctx, gsf_write_file(&c->ctx, test_scratch("config.json"), config, size));
+    CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("config.json"), config, size));
     free(config);
-    CHECK_OK(&c->ctx, gsf_nn_make_transformer(&c->ctx, test_scratch("."), &net));
+    CHECK_OK(ctx, gsf_nn_make_transformer(ctx, test_scratch("."), &net));
     return net;
 }
 
@@ -140,7 +140,7 @@ static void check_transformer(void) {
     in.references = references;
     in.reference_tokens = all / batch;
     in.reference_batch = batch;
-    gsf_nn_transformer rounded = open_rounded(&c, folder);
+    gsf_nn_transformer rounded = open_rounded(&c.ctx, folder);
     static const int times[] = {999, 479};
     for (int i = 0; i < 2; i++) {
         char name[32];
