@@ -5,6 +5,11 @@
 
 #include "test.h"
 
+#include "restorer_scheduler.h"
+#include "restorer_tables.h"
+
 int main(void) {
+    check_scheduler();
+    check_tables();
     return test_report();
 }
