@@ -149,6 +149,118 @@ GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, con
 // Rows of (rows, columns) to softmax(scale * row); y may be x.
 GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale, float* y);
 
+// ---- positions ------------------------------------------------------------------
+// Tables of the video transformer. Tokens stand in the order frame, row, column.
+
+typedef struct gsf_nn_rope_desc {
+    int32_t frames, height, width;   // of the grid of tokens: latent frames, latent height and width / patch size
+    int32_t base_height, base_width; // the grid the model was trained with: sample_height, sample_width / patch size
+    int32_t head_dim;                // a multiple of 16: time has head_dim/4 of it, rows and columns 3*head_dim/8 each
+    double theta;                    // 0: 10000
+} gsf_nn_rope_desc;
+
+// Rotary table: cos, sin (frames*height*width, head_dim), every value twice, for interleaved pairs. Pair i of an axis of
+// d values turns by position * theta^(-2i/d). Positions: frames 0, 1, ...; rows linspace(top, bottom*(h-1)/h, h) where
+// the grid, resized to fit into the base grid with its aspect ratio kept, lies from top to bottom in it; columns alike.
+// Angles are float32 products in the order of the reference, so they match its tables, not the exact ones.
+// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_rope(gsf_context* ctx, const gsf_nn_rope_desc* desc, float* cos, float* sin);
+
+// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is time dim/4 | columns 3*dim/8 | rows
+// 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. scales: 0 = 1.
+// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width,
+                                                    int32_t dim, double spatial_scale, double temporal_scale, float* out);
+
+// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)), an odd last
+// value 0. Angles in float32 as the reference has them. (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
+GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out);
+
+// ---- noise schedule and solvers -------------------------------------------------
+// x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) noise. The model predicts v = sqrt(abar) noise - sqrt(1 - abar) x0, so that
+// x0 = sqrt(abar) x - sqrt(1 - abar) v. Coefficients are double, latents float32.
+
+typedef enum gsf_nn_alpha_table {
+    GSF_NN_TABLE_DDIM = 0, // float32, in the order of diffusers' DDIMScheduler, which the official pipeline runs
+    GSF_NN_TABLE_COGX,     // float64, diffusers' CogVideoXDDIMScheduler; differs by 5e-7
+} gsf_nn_alpha_table;
+
+typedef enum gsf_nn_spacing { GSF_NN_TRAILING = 0, GSF_NN_LEADING, GSF_NN_LINSPACE } gsf_nn_spacing;
+
+typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
+    int32_t train_steps;           // 0: 1000
+    double beta_start, beta_end;   // 0: 0.00085, 0.012
+    int linear_betas;              // else linear in sqrt(beta) ("scaled_linear")
+    int no_zero_snr;               // else the table is stretched so that abar ends at 0
+    int no_alpha_one;              // else the last step goes to abar = 1, not to abar of time step 0
+    gsf_nn_spacing spacing;
+    int32_t steps_offset;          // added to the time steps of GSF_NN_LEADING
+    double snr_shift_scale;        // 0: 1; of GSF_NN_TABLE_COGX only, as DDIMScheduler knows no such thing
+    gsf_nn_alpha_table table;
+} gsf_nn_schedule_desc;
+
+typedef struct gsf_nn_schedule {
+    gsf_nn_schedule_desc desc; // with the defaults filled in
+    double* alpha_bar;         // (train_steps), owned
+    double final_alpha_bar;
+} gsf_nn_schedule;
+
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc,
+                                                      gsf_nn_schedule* out);
+// From a scheduler_config.json; keys that are missing have the defaults of diffusers' DDIMScheduler. The class it names
+// is not looked at, as the official pipeline does not either. What is not v-prediction or clips is unsupported.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                                       gsf_nn_alpha_table table, gsf_nn_schedule* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_alpha_table table,
+                                                      gsf_nn_schedule* out);
+GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule);
+
+// Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
+// (int)(steps * strength) of them, for latents that start as the noised render. out: room for `steps`.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
+                                                       double strength, int32_t* out, int32_t* count);
+
+// Elementwise over `count` values; out may be an input. timestep: 0..train_steps-1.
+GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                              const float* noise, size_t count, float* out);
+GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                                  const float* noise, size_t count, float* out);
+GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
+                               const float* v, size_t count, float* out);
+
+typedef enum gsf_nn_solver {
+    GSF_NN_DDIM = 0,   // first order; the next time is t - train_steps/steps (whole division), as diffusers has it
+    GSF_NN_DPMPP_2M,   // DPM-Solver++(2M): second order, remembers one prediction (Lu et al. 2022b)
+    GSF_NN_UNIPC,      // UniPC, B2, order 2: that and a corrector which needs no further model call (Zhao et al. 2023)
+} gsf_nn_solver;
+
+typedef struct gsf_nn_sampler_desc {
+    gsf_nn_solver solver;
+    int32_t steps;      // 0: 50
+    double strength;    // 0: 1
+    size_t value_count; // of the latents
+} gsf_nn_sampler_desc;
+
+// A run of a solver. `index` and `memory` are all that a checkpoint must keep beside the latents: make the sampler anew
+// with the same desc and fill them in.
+typedef struct gsf_nn_sampler {
+    gsf_nn_sampler_desc desc;
+    const gsf_nn_schedule* schedule; // borrowed
+    int32_t* timesteps;              // (count)
+    int32_t count, index;            // the next model call is for timesteps[index]
+    float* memory;                   // (memory_count): earlier predictions
+    size_t memory_count;             // 0, 1 or 3 times value_count
+} gsf_nn_sampler;
+
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule,
+                                                     const gsf_nn_sampler_desc* desc, gsf_nn_sampler* out);
+GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler);
+// One step: x (value_count), the latents at timesteps[index], becomes those at the next one; v is the model's output for
+// x. x0 (NULL allowed) gets the predicted clean latents. eta is 0: nothing is random. A latent that is NaN or infinite
+// afterwards gives GSF_ERROR_NUMERIC, which names the step.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x,
+                                                     float* x0);
+
 // ---- convolution ----------------------------------------------------------------
 // Activations of convolutions are channels-last: (frames, height, width, channels).
 
@@ -3350,7 +3462,589 @@ GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace
 
 // ---- >>nn positions -------------------------------------------------------------
 
+// torch.linspace in float32: from both ends towards the middle.
+static float gsf__nn_linspace(float start, float end, int32_t count, int32_t i) {
+    if (count == 1) return start;
+    const float step = (end - start) / (float)(count - 1);
+    return i < count / 2 ? start + step * (float)i : end - step * (float)(count - 1 - i);
+}
+
+// Where a grid of height x width lies in the base grid when it is resized to fit: first[0], last[0] rows, [1] columns,
+// last exclusive. Rounding is Python's, half to even, which rint is in the default rounding mode.
+static void gsf__nn_fit_grid(const gsf_nn_rope_desc* desc, double first[2], double last[2]) {
+    const double th = desc->base_height, tw = desc->base_width, h = desc->height, w = desc->width;
+    const int tall = h / w > th / tw;
+    const double rows = tall ? th : rint(tw / w * h), columns = tall ? rint(th / h * w) : tw;
+    first[0] = rint((th - rows) / 2.0);
+    first[1] = rint((tw - columns) / 2.0);
+    last[0] = first[0] + rows;
+    last[1] = first[1] + columns;
+}
+
+// cosine, sine (count, dim) of one axis at positions linspace(start, end).
+static void gsf__nn_rope_axis(float start, float end, int32_t count, int32_t dim, double theta, float* cosine,
+                              float* sine) {
+    for (int32_t k = 0; k < dim; k += 2) {
+        const float exponent = (float)k / (float)dim;
+        const float frequency = 1.0f / (float)pow(theta, (double)exponent);
+        for (int32_t i = 0; i < count; i++) {
+            const float angle = gsf__nn_linspace(start, end, count, i) * frequency;
+            const float c = (float)cos((double)angle), s = (float)sin((double)angle);
+            const int64_t at = (int64_t)i * dim + k;
+            cosine[at] = cosine[at + 1] = c;
+            sine[at] = sine[at + 1] = s;
+        }
+    }
+}
+
+static gsf_result gsf__nn_check_grid(gsf_context* ctx, const char* what, int32_t frames, int32_t height, int32_t width,
+                                     int32_t dim) {
+    if (frames < 1 || height < 1 || width < 1 || (int64_t)frames * height > INT32_MAX / width)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: a grid of %d frames, %d x %d tokens", what, (int)frames,
+                        (int)height, (int)width);
+    if (dim < 16 || dim % 16 != 0)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: dimension %d is no multiple of 16", what, (int)dim);
+    return GSF_OK;
+}
+
+// Joins the rows of three axis tables: out row (t, h, w) = [a row t | b row ... | c row ...], where b belongs to rows and
+// c to columns of the grid, or the other way round.
+typedef struct gsf__nn_axes {
+    int32_t frames, height, width, dim;
+    int columns_first;
+} gsf__nn_axes;
+
+static void gsf__nn_join_axes(const gsf__nn_axes* axes, size_t row, int32_t part, int64_t* at, int32_t* size) {
+    const int64_t w = (int64_t)row % axes->width, h = (int64_t)row / axes->width % axes->height;
+    const int64_t t = (int64_t)row / axes->width / axes->height;
+    const int32_t time = axes->dim / 4, space = axes->dim / 8 * 3;
+    *size = part == 0 ? time : space;
+    *at = part == 0 ? t * time : ((part == 1) != axes->columns_first ? h : w) * space;
+}
+
+GSF_API gsf_result gsf_nn_make_rope(gsf_context* ctx, const gsf_nn_rope_desc* desc, float* cosine, float* sine) {
+    GSF__TRY(gsf__nn_check_grid(ctx, "rope", desc->frames, desc->height, desc->width, desc->head_dim));
+    if (desc->base_height < 1 || desc->base_width < 1 || !(desc->theta >= 0.0) || desc->theta > 1e30)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "rope: a base grid of %d x %d, theta %g", (int)desc->base_height,
+                        (int)desc->base_width, desc->theta);
+    const gsf__nn_axes axes = {desc->frames, desc->height, desc->width, desc->head_dim, 0};
+    const int32_t counts[3] = {desc->frames, desc->height, desc->width};
+    const double theta = desc->theta != 0.0 ? desc->theta : 10000.0;
+    double first[3] = {0.0, 0.0, 0.0}, last[3] = {(double)desc->frames, 0.0, 0.0};
+    float* table[3]; // of each axis the cosines, then the sines
+    gsf__nn_fit_grid(desc, first + 1, last + 1);
+    const size_t width = (size_t)desc->head_dim;
+    float* block = (float*)gsf_alloc(ctx, (size_t)desc->frames + (size_t)desc->height + (size_t)desc->width,
+                                     2 * width * sizeof(float));
+    if (!block) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int axis = 0; axis < 3; axis++) {
+        const int32_t n = counts[axis], dim = axis == 0 ? desc->head_dim / 4 : desc->head_dim / 8 * 3;
+        table[axis] = axis == 0 ? block : table[axis - 1] + 2 * (size_t)counts[axis - 1] * width;
+        gsf__nn_rope_axis((float)first[axis], (float)(last[axis] * (n - 1) / n), n, dim, theta, table[axis],
+                          table[axis] + (size_t)n * width);
+    }
+    const size_t rows = (size_t)counts[0] * (size_t)counts[1] * (size_t)counts[2];
+    for (size_t row = 0; row < rows; row++)
+        for (int32_t part = 0; part < 3; part++) {
+            int64_t at;
+            int32_t size;
+            gsf__nn_join_axes(&axes, row, part, &at, &size);
+            memcpy(cosine, table[part] + at, (size_t)size * sizeof(float));
+            memcpy(sine, table[part] + (size_t)counts[part] * width + at, (size_t)size * sizeof(float));
+            cosine += size;
+            sine += size;
+        }
+    gsf_free(ctx, block);
+    return GSF_OK;
+}
+
+// (count, dim) of one axis: [sin | cos]. The positions are float32, as numpy's there.
+static void gsf__nn_sincos_axis(int32_t count, int32_t dim, double scale, double* out) {
+    const int32_t half = dim / 2;
+    for (int32_t k = 0; k < half; k++) {
+        const double frequency = 1.0 / pow(10000.0, (double)k / (dim / 2.0));
+        for (int32_t i = 0; i < count; i++) {
+            const double angle = (double)((float)i / (float)scale) * frequency;
+            out[(int64_t)i * dim + k] = sin(angle);
+            out[(int64_t)i * dim + half + k] = cos(angle);
+        }
+    }
+}
+
+// To `wide` or `narrow`, whichever is not NULL.
+static gsf_result gsf__nn_sincos(gsf_context* ctx, const gsf__nn_axes* axes, double spatial_scale, double temporal_scale,
+                                 double* wide, float* narrow) {
+    GSF__TRY(gsf__nn_check_grid(ctx, "sincos", axes->frames, axes->height, axes->width, axes->dim));
+    if (!(spatial_scale > 0.0) || !(temporal_scale > 0.0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sincos: scales %g, %g", spatial_scale, temporal_scale);
+    const size_t width = (size_t)axes->dim;
+    double* time = (double*)gsf_alloc(ctx, (size_t)axes->frames + (size_t)axes->height + (size_t)axes->width,
+                                      width * sizeof(double));
+    if (!time) return GSF_ERROR_OUT_OF_MEMORY;
+    double *columns = time + (size_t)axes->frames * width, *down = columns + (size_t)axes->width * width;
+    const double* table[3] = {time, columns, down};
+    gsf__nn_sincos_axis(axes->frames, axes->dim / 4, temporal_scale, time);
+    gsf__nn_sincos_axis(axes->width, axes->dim / 8 * 3, spatial_scale, columns);
+    gsf__nn_sincos_axis(axes->height, axes->dim / 8 * 3, spatial_scale, down);
+    const size_t rows = (size_t)axes->frames * (size_t)axes->height * (size_t)axes->width;
+    for (size_t row = 0, o = 0; row < rows; row++)
+        for (int32_t part = 0; part < 3; part++) {
+            int64_t at;
+            int32_t size;
+            gsf__nn_join_axes(axes, row, part, &at, &size);
+            for (int32_t k = 0; k < size; k++, o++) {
+                if (wide) wide[o] = table[part][at + k];
+                if (narrow) narrow[o] = (float)table[part][at + k];
+            }
+        }
+    gsf_free(ctx, time);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width, int32_t dim,
+                                      double spatial_scale, double temporal_scale, float* out) {
+    const gsf__nn_axes axes = {frames, height, width, dim, 1};
+    return gsf__nn_sincos(ctx, &axes, spatial_scale != 0.0 ? spatial_scale : 1.0,
+                          temporal_scale != 0.0 ? temporal_scale : 1.0, NULL, out);
+}
+
+GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
+    const int32_t half = dim / 2;
+    if (dim % 2 != 0) out[dim - 1] = 0.0f;
+    for (int32_t i = 0; i < half; i++) {
+        const float exponent = -9.210340371976184f * (float)i / (float)half; // -ln(10000) i / half
+        const float angle = (float)timestep * (float)exp((double)exponent);
+        out[i] = (float)cos((double)angle);
+        out[half + i] = (float)sin((double)angle);
+    }
+}
+
 // ---- >>nn scheduler -------------------------------------------------------------
+
+// torch.linspace in double, which is float32's formula.
+static double gsf__nn_linspace64(double start, double end, int32_t count, int32_t i) {
+    const double step = (end - start) / (count - 1);
+    return i < count / 2 ? start + step * i : end - step * (count - 1 - i);
+}
+
+// Beta as float32, and as float64.
+static float gsf__nn_beta32(const gsf_nn_schedule_desc* d, int32_t i) {
+    if (d->linear_betas) return gsf__nn_linspace((float)d->beta_start, (float)d->beta_end, d->train_steps, i);
+    const float root = gsf__nn_linspace((float)sqrt(d->beta_start), (float)sqrt(d->beta_end), d->train_steps, i);
+    return root * root;
+}
+
+static double gsf__nn_beta64(const gsf_nn_schedule_desc* d, int32_t i) {
+    if (d->linear_betas) return gsf__nn_linspace64(d->beta_start, d->beta_end, d->train_steps, i);
+    const double root = gsf__nn_linspace64(sqrt(d->beta_start), sqrt(d->beta_end), d->train_steps, i);
+    return root * root;
+}
+
+// Every value is rounded to float32 where torch stores a tensor; cumprod alone accumulates in double, as torch does on a
+// CPU. Zero SNR: Lin et al. 2024, algorithm 1: sqrt(abar) is shifted and scaled to end at 0, then turned back into betas.
+// (diffusers 0.32.1 scheduling_ddim.py rescale_zero_terminal_snr and __init__)
+static void gsf__nn_fill_ddim(const gsf_nn_schedule_desc* d, double* alpha_bar) {
+    const int32_t n = d->train_steps;
+    double product = 1.0;
+    for (int32_t i = 0; i < n; i++) {
+        product *= (double)(1.0f - gsf__nn_beta32(d, i));
+        alpha_bar[i] = (double)(float)product;
+    }
+    if (d->no_zero_snr) return;
+    const float first = sqrtf((float)alpha_bar[0]), last = sqrtf((float)alpha_bar[n - 1]), scale = first / (first - last);
+    float before = 1.0f;
+    product = 1.0;
+    for (int32_t i = 0; i < n; i++) {
+        const float root = (sqrtf((float)alpha_bar[i]) - last) * scale, bar = root * root;
+        const float beta = 1.0f - bar / before;
+        before = bar;
+        product *= (double)(1.0f - beta);
+        alpha_bar[i] = (double)(float)product;
+    }
+}
+
+// (diffusers 0.32.1 scheduling_ddim_cogvideox.py)
+static void gsf__nn_fill_cogx(const gsf_nn_schedule_desc* d, double* alpha_bar) {
+    const int32_t n = d->train_steps;
+    double product = 1.0;
+    for (int32_t i = 0; i < n; i++) {
+        product *= 1.0 - gsf__nn_beta64(d, i);
+        alpha_bar[i] = product / (d->snr_shift_scale + (1.0 - d->snr_shift_scale) * product);
+    }
+    if (d->no_zero_snr) return;
+    const double first = sqrt(alpha_bar[0]), last = sqrt(alpha_bar[n - 1]), scale = first / (first - last);
+    for (int32_t i = 0; i < n; i++) {
+        const double root = (sqrt(alpha_bar[i]) - last) * scale;
+        alpha_bar[i] = root * root;
+    }
+}
+
+static gsf_nn_schedule_desc gsf__nn_schedule_defaults(const gsf_nn_schedule_desc* desc) {
+    gsf_nn_schedule_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.train_steps == 0) d.train_steps = 1000;
+    if (d.beta_start == 0.0) d.beta_start = 0.00085;
+    if (d.beta_end == 0.0) d.beta_end = 0.012;
+    if (d.snr_shift_scale == 0.0) d.snr_shift_scale = 1.0;
+    return d;
+}
+
+static gsf_result gsf__nn_check_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* d) {
+    if (d->train_steps < 2 || d->train_steps > 1000000)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: %d training steps", (int)d->train_steps);
+    if (!(d->beta_start > 0.0 && d->beta_start <= d->beta_end && d->beta_end < 1.0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: betas from %g to %g", d->beta_start, d->beta_end);
+    if (!(d->snr_shift_scale > 0.0 && d->snr_shift_scale <= 1e6))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: snr_shift_scale %g", d->snr_shift_scale);
+    if ((int)d->spacing < 0 || d->spacing > GSF_NN_LINSPACE || (int)d->table < 0 || d->table > GSF_NN_TABLE_COGX ||
+        d->steps_offset < 0 || d->steps_offset >= d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: spacing %d, table %d, steps_offset %d", (int)d->spacing,
+                        (int)d->table, (int)d->steps_offset);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc, gsf_nn_schedule* out) {
+    memset(out, 0, sizeof *out);
+    const gsf_nn_schedule_desc d = gsf__nn_schedule_defaults(desc);
+    GSF__TRY(gsf__nn_check_schedule(ctx, &d));
+    double* table = (double*)gsf_alloc(ctx, (size_t)d.train_steps, sizeof(double));
+    if (!table) return GSF_ERROR_OUT_OF_MEMORY;
+    if (d.table == GSF_NN_TABLE_COGX) gsf__nn_fill_cogx(&d, table);
+    else gsf__nn_fill_ddim(&d, table);
+    int falls = table[0] < 1.0 && table[d.train_steps - 1] >= 0.0; // a NaN fails
+    for (int32_t i = 1; falls && i < d.train_steps; i++) falls = table[i] <= table[i - 1];
+    if (!falls) {
+        gsf_free(ctx, table);
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "schedule: betas from %g to %g over %d steps do not take 1 down to 0",
+                        d.beta_start, d.beta_end, (int)d.train_steps);
+    }
+    out->desc = d;
+    out->alpha_bar = table;
+    out->final_alpha_bar = d.no_alpha_one ? table[0] : 1.0;
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule) {
+    gsf_free(ctx, schedule->alpha_bar);
+    memset(schedule, 0, sizeof *schedule);
+}
+
+// The word of `words` (ended by NULL) that the key holds; others are unsupported.
+static gsf_result gsf__nn_config_word(const gsf__nn_config* config, const char* key, const char* fallback,
+                                      const char* const* words, int* out) {
+    const char* text;
+    GSF__TRY(gsf__nn_config_string(config, key, fallback, &text));
+    for (*out = 0; words[*out]; ++*out)
+        if (strcmp(text, words[*out]) == 0) return GSF_OK;
+    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s \"%s\" is not supported", config->json.name, key,
+                    gsf__nn_show(text).text);
+}
+
+static gsf_result gsf__nn_config_refuse(const gsf__nn_config* config, const char* key, int fallback) {
+    int flag;
+    GSF__TRY(gsf__nn_config_bool_or(config, key, fallback, &flag));
+    return flag ? gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not supported", config->json.name, key) : GSF_OK;
+}
+
+static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_schedule_desc* d) {
+    static const char* const schedules[] = {"scaled_linear", "linear", NULL};
+    static const char* const spacings[] = {"trailing", "leading", "linspace", NULL};
+    static const char* const predictions[] = {"v_prediction", NULL};
+    int64_t whole;
+    int flag;
+    GSF__TRY(gsf__nn_config_word(config, "prediction_type", "epsilon", predictions, &flag));
+    GSF__TRY(gsf__nn_config_refuse(config, "clip_sample", 1));
+    GSF__TRY(gsf__nn_config_refuse(config, "thresholding", 0));
+    if (gsf__nn_config_find(config, "trained_betas"))
+        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: trained_betas is not supported", config->json.name);
+    GSF__TRY(gsf__nn_config_int_or(config, "num_train_timesteps", 1000, 2, 1000000, &whole));
+    d->train_steps = (int32_t)whole;
+    GSF__TRY(gsf__nn_config_int_or(config, "steps_offset", 0, 0, whole - 1, &whole));
+    d->steps_offset = (int32_t)whole;
+    GSF__TRY(gsf__nn_config_number_or(config, "beta_start", 0.0001, 1e-12, 0.999, &d->beta_start));
+    GSF__TRY(gsf__nn_config_number_or(config, "beta_end", 0.02, d->beta_start, 0.999, &d->beta_end));
+    GSF__TRY(gsf__nn_config_number_or(config, "snr_shift_scale", 1.0, 1e-3, 1e6, &d->snr_shift_scale));
+    GSF__TRY(gsf__nn_config_word(config, "beta_schedule", "linear", schedules, &d->linear_betas));
+    GSF__TRY(gsf__nn_config_bool_or(config, "rescale_betas_zero_snr", 0, &flag));
+    d->no_zero_snr = !flag;
+    GSF__TRY(gsf__nn_config_bool_or(config, "set_alpha_to_one", 1, &flag));
+    d->no_alpha_one = !flag;
+    GSF__TRY(gsf__nn_config_word(config, "timestep_spacing", "leading", spacings, &flag));
+    d->spacing = (gsf_nn_spacing)flag;
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_alpha_table table,
+                                        gsf_nn_schedule* out) {
+    gsf_nn_schedule_desc d;
+    memset(&d, 0, sizeof d);
+    d.table = table;
+    gsf_result result = gsf__nn_read_schedule(config, &d);
+    if (result == GSF_OK) result = gsf_nn_make_schedule(ctx, &d, out);
+    gsf__nn_close_config(config);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                         gsf_nn_alpha_table table, gsf_nn_schedule* out) {
+    gsf__nn_config config;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__nn_parse_config(ctx, name, text, size, &config));
+    return gsf__nn_schedule_from(ctx, &config, table, out);
+}
+
+GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_alpha_table table,
+                                        gsf_nn_schedule* out) {
+    gsf__nn_config config;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__nn_load_config(ctx, path, &config));
+    return gsf__nn_schedule_from(ctx, &config, table, out);
+}
+
+// One of the `steps` times before the cut by strength; numpy's arithmetic, half to even.
+static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, int32_t i) {
+    const double n = d->train_steps;
+    switch (d->spacing) {
+        case GSF_NN_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange adds multiples of its first difference
+            const double difference = (n - n / steps) - n;
+            return (int32_t)rint(n + i * difference) - 1;
+        }
+        case GSF_NN_LEADING: return (steps - 1 - i) * (d->train_steps / steps) + d->steps_offset;
+        case GSF_NN_LINSPACE: { // round(linspace(0, n - 1, steps)) reversed
+            if (steps == 1) return 0;
+            return i == 0 ? d->train_steps - 1 : (int32_t)rint((steps - 1 - i) * ((n - 1.0) / (steps - 1)));
+        }
+    }
+    return 0;
+}
+
+GSF_API gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
+                                         double strength, int32_t* out, int32_t* count) {
+    const gsf_nn_schedule_desc* d = &schedule->desc;
+    *count = 0;
+    if (steps < 1 || steps > d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%d steps, not 1 to %d", (int)steps, (int)d->train_steps);
+    if (strength == 0.0) strength = 1.0;
+    if (!(strength > 0.0 && strength <= 1.0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "strength %g is not in (0, 1]", strength);
+    const int32_t kept = (int32_t)(steps * strength);
+    if (kept < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "strength %g of %d steps leaves none", strength, (int)steps);
+    if (gsf__nn_timestep(d, steps, 0) >= d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "steps_offset %d takes %d steps past the table",
+                        (int)d->steps_offset, (int)steps);
+    for (int32_t i = steps - kept; i < steps; i++) out[(*count)++] = gsf__nn_timestep(d, steps, i);
+    return GSF_OK;
+}
+
+// ---- elementwise work
+
+typedef struct gsf__nn_step { // m: predicted clean latents; m0, m1: those of the last two steps; last: corrected latents
+    double m_x, m_v;                        // m = m_x x + m_v v
+    double c_last, c_m, c_m0, c_m1;         // x = c_last last + c_m m + c_m0 m0 + c_m1 m1, if `correct`
+    double p_x, p_m, p_m0;                  // next x = p_x x + p_m m + p_m0 m0
+    int correct;
+    size_t count;
+    const float *x_in, *v;
+    float *x, *x0, *m0, *m1, *last;         // all but x may be NULL
+} gsf__nn_step;
+
+static void gsf__nn_step_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__nn_step* s = (const gsf__nn_step*)arg;
+    (void)worker;
+    const size_t begin = chunk * GSF__NN_CHUNK;
+    const size_t end = begin + GSF__NN_CHUNK < s->count ? begin + GSF__NN_CHUNK : s->count;
+    for (size_t i = begin; i < end; i++) {
+        const double m0 = s->m0 ? (double)s->m0[i] : 0.0;
+        double x = (double)s->x_in[i];
+        const double m = s->m_x * x + s->m_v * (double)s->v[i];
+        if (s->correct) x = s->c_last * (double)s->last[i] + s->c_m * m + s->c_m0 * m0 + s->c_m1 * (double)s->m1[i];
+        s->x[i] = (float)(s->p_x * x + s->p_m * m + s->p_m0 * m0);
+        if (s->x0) s->x0[i] = (float)m;
+        if (s->last) s->last[i] = (float)x;
+        if (s->m1) s->m1[i] = (float)m0;
+        if (s->m0) s->m0[i] = (float)m;
+    }
+}
+
+// out = a * x + b * y
+static void gsf__nn_mix(gsf_context* ctx, double a, const float* x, double b, const float* y, size_t count, float* out) {
+    gsf__nn_step job;
+    memset(&job, 0, sizeof job);
+    job.m_x = a;
+    job.m_v = b;
+    job.p_m = 1.0;
+    job.count = count;
+    job.x_in = x;
+    job.v = y;
+    job.x = out;
+    gsf__parallel_for(ctx, (count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &job);
+}
+
+GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                              const float* noise, size_t count, float* out) {
+    const double bar = schedule->alpha_bar[timestep];
+    gsf__nn_mix(ctx, sqrt(bar), x0, sqrt(1.0 - bar), noise, count, out);
+}
+
+GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                                  const float* noise, size_t count, float* out) {
+    const double bar = schedule->alpha_bar[timestep];
+    gsf__nn_mix(ctx, -sqrt(1.0 - bar), x0, sqrt(bar), noise, count, out);
+}
+
+GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
+                               const float* v, size_t count, float* out) {
+    const double bar = schedule->alpha_bar[timestep];
+    gsf__nn_mix(ctx, sqrt(bar), x, -sqrt(1.0 - bar), v, count, out);
+}
+
+// ---- solvers
+/* With a = sqrt(abar), s = sqrt(1 - abar) and D(x) the predicted clean latents, the probability flow is
+       d(x/s) = D du,  u = a/s = exp(lambda).
+   DDIM holds D fixed over a step; DPM-Solver++(2M) and UniPC take it as linear (the corrector: as quadratic) in lambda. At
+   zero SNR u is 0 and lambda -infinity. From there the first step is exact for constant D; a linear D is then taken in u,
+   not in lambda, by the one step that would need that point. The last step ends at s = 0, where x is D. */
+
+typedef struct gsf__nn_point { double a, s; } gsf__nn_point;
+
+static gsf__nn_point gsf__nn_point_at(double alpha_bar) {
+    gsf__nn_point p;
+    p.a = sqrt(alpha_bar);
+    p.s = sqrt(1.0 - alpha_bar);
+    return p;
+}
+
+static gsf__nn_point gsf__nn_sampler_point(const gsf_nn_sampler* sampler, int32_t index) {
+    return gsf__nn_point_at(sampler->schedule->alpha_bar[sampler->timesteps[index]]);
+}
+
+// Where the step from `index` leads.
+static gsf__nn_point gsf__nn_sampler_target(const gsf_nn_sampler* sampler, int32_t index) {
+    const gsf_nn_schedule* schedule = sampler->schedule;
+    const int32_t next = sampler->desc.solver == GSF_NN_DDIM
+                             ? sampler->timesteps[index] - schedule->desc.train_steps / sampler->desc.steps
+                             : index + 1 < sampler->count ? sampler->timesteps[index + 1] : -1;
+    return gsf__nn_point_at(next >= 0 ? schedule->alpha_bar[next] : schedule->final_alpha_bar);
+}
+
+// lambda(q) - lambda(p), both finite.
+static double gsf__nn_lambda(gsf__nn_point p, gsf__nn_point q) { return log(q.a * p.s / (q.s * p.a)); }
+
+// Predictor from p to t; q is the point before p, if second order is wanted.
+static void gsf__nn_predictor(gsf__nn_step* step, gsf__nn_point p, gsf__nn_point t, const gsf__nn_point* q) {
+    step->p_x = t.s / p.s;
+    step->p_m = t.a - p.a * step->p_x; // t.a (1 - exp(-h))
+    step->p_m0 = 0.0;
+    if (!q || t.s == 0.0 || p.a == 0.0) return;
+    double weight; // of m - m0
+    if (q->a == 0.0) {
+        const double u = p.a / p.s, rise = t.a / t.s - u;
+        weight = t.s * rise * rise / (2.0 * u);
+    } else {
+        const double before = gsf__nn_lambda(*q, p);
+        weight = before != 0.0 ? 0.5 * step->p_m * gsf__nn_lambda(p, t) / before : 0.0;
+    }
+    step->p_m += weight;
+    step->p_m0 = -weight;
+}
+
+// UniC-2 with B(h) = exp(-h) - 1 at p, the step's own point, which was reached from m0's point o (before it m1's point n,
+// NULL in the second step, where the corrector has first order): n -> o -> p.
+static void gsf__nn_corrector(gsf__nn_step* step, const gsf__nn_point* n, gsf__nn_point o, gsf__nn_point p) {
+    const double rise = p.a - o.a * p.s / o.s; // p.a (1 - exp(-h))
+    double weight = 0.5, earlier = 0.0;        // of m - m0 and of m1 - m0
+    if (n) {
+        const double h = gsf__nn_lambda(o, p), phi = expm1(-h);
+        const double phi2 = phi / -h - 1.0, phi3 = phi2 / -h - 0.5; // h_phi_2, h_phi_3 of UniPC's code
+        weight = phi2 / phi;
+        if (n->a != 0.0) {
+            const double ratio = -gsf__nn_lambda(*n, o) / h, rho = (2.0 * phi3 / phi - weight) / (ratio - 1.0);
+            earlier = rho / ratio;
+            weight -= rho;
+        }
+    }
+    step->correct = 1;
+    step->c_last = p.s / o.s;
+    step->c_m = rise * weight;
+    step->c_m1 = rise * earlier;
+    step->c_m0 = rise * (1.0 - weight - earlier);
+}
+
+GSF_API gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule, const gsf_nn_sampler_desc* desc,
+                                       gsf_nn_sampler* out) {
+    static const size_t kept[] = {0, 1, 3}; // blocks of memory for each solver
+    gsf_nn_sampler sampler;
+    memset(out, 0, sizeof *out);
+    memset(&sampler, 0, sizeof sampler);
+    sampler.desc = *desc;
+    sampler.schedule = schedule;
+    if (!sampler.desc.steps) sampler.desc.steps = 50;
+    if ((int)desc->solver < 0 || desc->solver > GSF_NN_UNIPC || sampler.desc.steps < 1 ||
+        sampler.desc.steps > schedule->desc.train_steps || !gsf__mul_size(desc->value_count, 3, &sampler.memory_count))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: solver %d, %d steps, %zu values", (int)desc->solver,
+                        (int)sampler.desc.steps, desc->value_count);
+    sampler.memory_count = kept[desc->solver] * desc->value_count;
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    sampler.timesteps = (int32_t*)gsf_alloc(ctx, (size_t)sampler.desc.steps, sizeof(int32_t));
+    if (sampler.timesteps) sampler.memory = (float*)gsf_alloc_zeroed(ctx, sampler.memory_count, sizeof(float));
+    if (sampler.memory)
+        result = gsf_nn_make_timesteps(ctx, schedule, sampler.desc.steps, desc->strength, sampler.timesteps,
+                                       &sampler.count);
+    if (result != GSF_OK) gsf_nn_destroy_sampler(ctx, &sampler);
+    *out = sampler;
+    return result;
+}
+
+GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler) {
+    gsf_free(ctx, sampler->timesteps);
+    gsf_free(ctx, sampler->memory);
+    memset(sampler, 0, sizeof *sampler);
+}
+
+// A schedule that is no longer stretched to zero SNR, or a start below it, never meets a = 0.
+static void gsf__nn_plan_step(const gsf_nn_sampler* sampler, gsf__nn_step* step) {
+    const int32_t i = sampler->index;
+    const size_t n = sampler->desc.value_count;
+    const gsf__nn_point p = gsf__nn_sampler_point(sampler, i), t = gsf__nn_sampler_target(sampler, i);
+    gsf__nn_point before[2]; // one and two steps earlier
+    memset(before, 0, sizeof before);
+    if (i > 0) before[0] = gsf__nn_sampler_point(sampler, i - 1);
+    if (i > 1) before[1] = gsf__nn_sampler_point(sampler, i - 2);
+    step->m_x = p.a;
+    step->m_v = -p.s;
+    const int second = sampler->desc.solver != GSF_NN_DDIM && i > 0 && i + 1 < sampler->count;
+    gsf__nn_predictor(step, p, t, second ? &before[0] : NULL);
+    if (sampler->desc.solver == GSF_NN_DDIM) return;
+    step->m0 = sampler->memory;
+    if (sampler->desc.solver != GSF_NN_UNIPC) return;
+    step->m1 = sampler->memory + n;
+    step->last = sampler->memory + 2 * n;
+    if (i > 0) gsf__nn_corrector(step, i > 1 ? &before[1] : NULL, before[0], p);
+}
+
+GSF_API gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x, float* x0) {
+    gsf__nn_step step;
+    memset(&step, 0, sizeof step);
+    if (sampler->index < 0 || sampler->index >= sampler->count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: step %d of %d", (int)sampler->index,
+                        (int)sampler->count);
+    gsf__nn_plan_step(sampler, &step);
+    step.count = sampler->desc.value_count;
+    step.x_in = x;
+    step.v = v;
+    step.x = x;
+    step.x0 = x0;
+    gsf__parallel_for(ctx, (step.count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &step);
+    size_t bad = 0;
+    for (size_t i = 0; i < step.count; i++) bad += !(fabsf(x[i]) <= FLT_MAX);
+    if (bad)
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "step %d (time %d): %zu of %zu latents are NaN or infinite",
+                        (int)sampler->index, (int)sampler->timesteps[sampler->index], bad, step.count);
+    sampler->index++;
+    return GSF_OK;
+}
 
 // ---- >>nn transformer -----------------------------------------------------------
 

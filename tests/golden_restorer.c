@@ -1,16 +1,20 @@
 // The restorer against the golden data of the official code: every part reads its shapes, configs and values from
-// GSF_GOLDEN/restorer, so that another folder of the same layout passes unchanged.
+// GSF_GOLDEN/restorer, so that another folder of the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every error.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "restorer_golden.h"
 #include "restorer_linear.h"
 #include "restorer_pipeline.h"
+#include "restorer_scheduler.h"
+#include "restorer_tables.h"
 #include "restorer_transformer.h"
 #include "restorer_vae.h"
 
 int main(void) {
     check_linear();
+    check_scheduler();
+    check_tables();
     check_vae();
     check_transformer();
     check_pipeline();
