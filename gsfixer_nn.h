@@ -417,7 +417,7 @@ typedef struct gsf_nn_sample_desc {
     int32_t steps;                  // default 50
     gsf_nn_solver solver;           // default DDIM
     float guidance;                 // classifier-free guidance; default 6, 1: none (half the work)
-    float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; both 0: all
+    float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; default 0 to 1
     int dynamic_guidance;           // the official code's cosine ramp of the guidance
     float strength;                 // (0,1]: how much of the noise schedule is run; default 1: from pure noise
     float block_cache;              // gsf_nn_block_cache.threshold; default 0: off
@@ -430,6 +430,9 @@ typedef struct gsf_nn_sample_desc {
     void* step_user;
     uint32_t _end_canary;
 } gsf_nn_sample_desc;
+
+// A desc with its defaults filled in.
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc);
 
 typedef struct gsf_nn_sample_stats {
     int32_t steps, resumed_from;    // steps run in this call; first step of it
@@ -6049,13 +6052,19 @@ typedef struct gsf__sample_run {
     uint32_t job; // checksum of everything that the result depends on
 } gsf__sample_run;
 
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc) {
+    gsf_nn_sample_desc d = *desc;
+    if (!d.steps) d.steps = 50;
+    if (d.guidance == 0.0f) d.guidance = 6.0f;
+    if (d.guidance_end == 0.0f) d.guidance_end = 1.0f;
+    if (d.strength == 0.0f) d.strength = 1.0f;
+    return d;
+}
+
 static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) {
     if (d->_start_canary != 0 || d->_end_canary != 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: the desc was not zeroed");
-    if (!d->steps) d->steps = 50;
-    if (d->guidance == 0.0f) d->guidance = 6.0f;
-    if (d->guidance_begin == 0.0f && d->guidance_end == 0.0f) d->guidance_end = 1.0f;
-    if (d->strength == 0.0f) d->strength = 1.0f;
+    *d = gsf_nn_resolve_sample(d);
     if (d->steps < 1 || d->steps > 1000)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: %d steps, not 1 to 1000", (int)d->steps);
     if (!(d->strength > 0.0f && d->strength <= 1.0f))
