@@ -1582,8 +1582,16 @@ typedef struct gsf__conv_kernels {
 
 static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c) {
     for (int64_t m = 0; m < count; m++)
-        for (int64_t i = 0; i < k; i++)
-            for (int n = 0; n < GSF__CONV_N; n++) c[m * GSF__CONV_N + n] += a[m * lda + i] * b[i * GSF__CONV_N + n];
+        for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
+            const float* w = b + n0;
+            float* y = c + m * GSF__CONV_N + n0;
+            float y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
+            for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
+                const float x = a[m * lda + i];
+                y0 += x * w[0], y1 += x * w[1], y2 += x * w[2], y3 += x * w[3];
+            }
+            y[0] = y0, y[1] = y1, y[2] = y2, y[3] = y3;
+        }
 }
 
 static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo,
@@ -2479,8 +2487,9 @@ static void gsf__vae_add_sums(gsf__vae_run* run, int slot) {
 }
 
 static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out) {
+    if (run->dry) return GSF_OK;
     const double* sums = gsf__vae_sums(run, out->slot);
-    for (int64_t i = 0; !run->dry && i < gsf__vae_groups(run, layer->out) * 2; i++)
+    for (int64_t i = 0; i < gsf__vae_groups(run, layer->out) * 2; i++)
         if (!(fabs(sums[i]) <= DBL_MAX)) return gsf__vae_fail_nan(run, layer->weight);
     return GSF_OK;
 }
