@@ -2287,6 +2287,14 @@ typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
     int64_t frames, height, width, channels;
 } gsf__vae_map;
 
+// For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
+// `weight` names the layer.
+typedef struct gsf__vae_watch {
+    void (*fn)(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+               const float* data);
+    void* user;
+} gsf__vae_watch;
+
 typedef struct gsf__vae_run {
     gsf_context* ctx;
     const gsf__vae_net* net;
@@ -2299,6 +2307,7 @@ typedef struct gsf__vae_run {
     gsf__vae_map z;          // the chunk's latents (decoder)
     int64_t chunk, chunks, done, total; // done, total: chunks of all tiles
     const char* stage;
+    gsf__vae_watch watch;
 } gsf__vae_run;
 
 static gsf_result gsf__vae_grow(gsf__vae_run* run, gsf__vae_buffer* buffer, int64_t count) {
@@ -2457,6 +2466,7 @@ static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gs
         }
     }
     gsf__conv_fill_frame(run->ctx, &fill);
+    if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
 }
 
 // Room for a layer's result in slot out->slot, its weights and its sums; starts the job.
@@ -2491,6 +2501,8 @@ static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* laye
     const double* sums = gsf__vae_sums(run, out->slot);
     for (int64_t i = 0; i < gsf__vae_groups(run, layer->out) * 2; i++)
         if (!(fabs(sums[i]) <= DBL_MAX)) return gsf__vae_fail_nan(run, layer->weight);
+    if (run->watch.fn)
+        run->watch.fn(run->watch.user, layer->weight, run->chunk, out, -1, run->slots[out->slot].data);
     return GSF_OK;
 }
 
@@ -2937,6 +2949,7 @@ typedef struct gsf__vae_task {
     int64_t frames, height, width;
     gsf__vae_buffer moments; // encoder: (2 latent_channels, ...)
     gsf__vae_buffer* tiles;
+    gsf__vae_watch watch;
 } gsf__vae_task;
 
 static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const float* in, float* out) {
@@ -2970,6 +2983,7 @@ static gsf_result gsf__vae_execute(gsf_context* ctx, gsf__vae_task* task, const 
     run.dry = !in;
     run.total = gsf__vae_chunk_count(task->frames, task->decoder) * task->plan.rows * task->plan.columns;
     run.stage = task->decoder ? "vae decode" : "vae encode";
+    run.watch = task->watch;
     const gsf_result result = gsf__vae_walk(&run, task, in, out);
     *flops = run.flops;
     *bytes = (double)run.peak;
