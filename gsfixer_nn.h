@@ -3060,8 +3060,16 @@ typedef struct gsf__conv_kernels {
 
 static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c) {
     for (int64_t m = 0; m < count; m++)
-        for (int64_t i = 0; i < k; i++)
-            for (int n = 0; n < GSF__CONV_N; n++) c[m * GSF__CONV_N + n] += a[m * lda + i] * b[i * GSF__CONV_N + n];
+        for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
+            const float* w = b + n0;
+            float* y = c + m * GSF__CONV_N + n0;
+            float y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
+            for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
+                const float x = a[m * lda + i];
+                y0 += x * w[0], y1 += x * w[1], y2 += x * w[2], y3 += x * w[3];
+            }
+            y[0] = y0, y[1] = y1, y[2] = y2, y[3] = y3;
+        }
 }
 
 static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo,
@@ -5255,6 +5263,14 @@ typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
     int64_t frames, height, width, channels;
 } gsf__vae_map;
 
+// For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
+// `weight` names the layer.
+typedef struct gsf__vae_watch {
+    void (*fn)(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+               const float* data);
+    void* user;
+} gsf__vae_watch;
+
 typedef struct gsf__vae_run {
     gsf_context* ctx;
     const gsf__vae_net* net;
@@ -5267,6 +5283,7 @@ typedef struct gsf__vae_run {
     gsf__vae_map z;          // the chunk's latents (decoder)
     int64_t chunk, chunks, done, total; // done, total: chunks of all tiles
     const char* stage;
+    gsf__vae_watch watch;
 } gsf__vae_run;
 
 static gsf_result gsf__vae_grow(gsf__vae_run* run, gsf__vae_buffer* buffer, int64_t count) {
@@ -5425,6 +5442,7 @@ static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gs
         }
     }
     gsf__conv_fill_frame(run->ctx, &fill);
+    if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
 }
 
 // Room for a layer's result in slot out->slot, its weights and its sums; starts the job.
@@ -5455,9 +5473,12 @@ static void gsf__vae_add_sums(gsf__vae_run* run, int slot) {
 }
 
 static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out) {
+    if (run->dry) return GSF_OK;
     const double* sums = gsf__vae_sums(run, out->slot);
-    for (int64_t i = 0; !run->dry && i < gsf__vae_groups(run, layer->out) * 2; i++)
+    for (int64_t i = 0; i < gsf__vae_groups(run, layer->out) * 2; i++)
         if (!(fabs(sums[i]) <= DBL_MAX)) return gsf__vae_fail_nan(run, layer->weight);
+    if (run->watch.fn)
+        run->watch.fn(run->watch.user, layer->weight, run->chunk, out, -1, run->slots[out->slot].data);
     return GSF_OK;
 }
 
@@ -5904,6 +5925,7 @@ typedef struct gsf__vae_task {
     int64_t frames, height, width;
     gsf__vae_buffer moments; // encoder: (2 latent_channels, ...)
     gsf__vae_buffer* tiles;
+    gsf__vae_watch watch;
 } gsf__vae_task;
 
 static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const float* in, float* out) {
@@ -5937,6 +5959,7 @@ static gsf_result gsf__vae_execute(gsf_context* ctx, gsf__vae_task* task, const 
     run.dry = !in;
     run.total = gsf__vae_chunk_count(task->frames, task->decoder) * task->plan.rows * task->plan.columns;
     run.stage = task->decoder ? "vae decode" : "vae encode";
+    run.watch = task->watch;
     const gsf_result result = gsf__vae_walk(&run, task, in, out);
     *flops = run.flops;
     *bytes = (double)run.peak;
