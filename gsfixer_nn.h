@@ -3473,11 +3473,11 @@ GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace
 
 // ---- >>nn positions -------------------------------------------------------------
 
-// torch.linspace in float32: from both ends towards the middle.
+// torch.linspace in float32: from both ends towards the middle, multiplied and added with one rounding.
 static float gsf__nn_linspace(float start, float end, int32_t count, int32_t i) {
     if (count == 1) return start;
     const float step = (end - start) / (float)(count - 1);
-    return i < count / 2 ? start + step * (float)i : end - step * (float)(count - 1 - i);
+    return i < count / 2 ? fmaf(step, (float)i, start) : fmaf(-step, (float)(count - 1 - i), end);
 }
 
 // Where a grid of height x width lies in the base grid when it is resized to fit: first[0], last[0] rows, [1] columns,
