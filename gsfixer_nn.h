@@ -1502,22 +1502,27 @@ GSF__INLINE_AVX2 float gsf__nn_max8(__m256 v) {
     return _mm_cvtss_f32(_mm_max_ss(s, _mm_movehdup_ps(s)));
 }
 
-GSF__INLINE_AVX2 void gsf__nn_transpose8(__m256 m[8]) {
-    __m256 a[8], b[8];
-    for (int i = 0; i < 8; i += 2) {
-        a[i] = _mm256_unpacklo_ps(m[i], m[i + 1]);
-        a[i + 1] = _mm256_unpackhi_ps(m[i], m[i + 1]);
-    }
-    for (int i = 0; i < 8; i += 4) {
-        b[i] = _mm256_shuffle_ps(a[i], a[i + 2], 0x44);
-        b[i + 1] = _mm256_shuffle_ps(a[i], a[i + 2], 0xee);
-        b[i + 2] = _mm256_shuffle_ps(a[i + 1], a[i + 3], 0x44);
-        b[i + 3] = _mm256_shuffle_ps(a[i + 1], a[i + 3], 0xee);
-    }
-    for (int i = 0; i < 4; i++) {
-        m[i] = _mm256_permute2f128_ps(b[i], b[i + 4], 0x20);
-        m[i + 4] = _mm256_permute2f128_ps(b[i], b[i + 4], 0x31);
-    }
+// to[j to_ld + i] = from[i ld + j] for i, j < 8
+GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, float* to, int64_t to_ld) {
+    const __m256 r0 = _mm256_loadu_ps(from), r1 = _mm256_loadu_ps(from + ld), r2 = _mm256_loadu_ps(from + 2 * ld);
+    const __m256 r3 = _mm256_loadu_ps(from + 3 * ld), r4 = _mm256_loadu_ps(from + 4 * ld);
+    const __m256 r5 = _mm256_loadu_ps(from + 5 * ld), r6 = _mm256_loadu_ps(from + 6 * ld);
+    const __m256 r7 = _mm256_loadu_ps(from + 7 * ld);
+    const __m256 a0 = _mm256_unpacklo_ps(r0, r1), a1 = _mm256_unpackhi_ps(r0, r1), a2 = _mm256_unpacklo_ps(r2, r3);
+    const __m256 a3 = _mm256_unpackhi_ps(r2, r3), a4 = _mm256_unpacklo_ps(r4, r5), a5 = _mm256_unpackhi_ps(r4, r5);
+    const __m256 a6 = _mm256_unpacklo_ps(r6, r7), a7 = _mm256_unpackhi_ps(r6, r7);
+    const __m256 b0 = _mm256_shuffle_ps(a0, a2, 0x44), b4 = _mm256_shuffle_ps(a4, a6, 0x44);
+    const __m256 b1 = _mm256_shuffle_ps(a0, a2, 0xee), b5 = _mm256_shuffle_ps(a4, a6, 0xee);
+    const __m256 b2 = _mm256_shuffle_ps(a1, a3, 0x44), b6 = _mm256_shuffle_ps(a5, a7, 0x44);
+    const __m256 b3 = _mm256_shuffle_ps(a1, a3, 0xee), b7 = _mm256_shuffle_ps(a5, a7, 0xee);
+    _mm256_storeu_ps(to, _mm256_permute2f128_ps(b0, b4, 0x20));
+    _mm256_storeu_ps(to + to_ld, _mm256_permute2f128_ps(b1, b5, 0x20));
+    _mm256_storeu_ps(to + 2 * to_ld, _mm256_permute2f128_ps(b2, b6, 0x20));
+    _mm256_storeu_ps(to + 3 * to_ld, _mm256_permute2f128_ps(b3, b7, 0x20));
+    _mm256_storeu_ps(to + 4 * to_ld, _mm256_permute2f128_ps(b0, b4, 0x31));
+    _mm256_storeu_ps(to + 5 * to_ld, _mm256_permute2f128_ps(b1, b5, 0x31));
+    _mm256_storeu_ps(to + 6 * to_ld, _mm256_permute2f128_ps(b2, b6, 0x31));
+    _mm256_storeu_ps(to + 7 * to_ld, _mm256_permute2f128_ps(b3, b7, 0x31));
 }
 
 // Added to a number of [-126, 129], it leaves the nearest integer n in the low bits as n + 126, which shifted by 23 are
@@ -2715,6 +2720,7 @@ enum {
     GSF__ATT_QUERIES = GSF__ATT_GROUP * GSF__ATT_GROUPS,
     GSF__ATT_RANGE = 1536,    // most queries of a chunk: more hide the packing better, but leave the cache
     GSF__ATT_LEAST_RANGE = 384,
+    GSF__ATT_AHEAD = 16,      // rows to ask for ahead of use
     GSF__ATT_CHUNKS = 64,     // so many chunks employ the workers evenly
 };
 
@@ -2780,12 +2786,19 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
     return s;
 }
 
-static void gsf__attention_pack_queries(const gsf__attention_job* job, const float* q, int64_t queries, float* packed) {
+// A head's rows are a few lines each, far apart, which no hardware foresees: asks for one of them ahead of its use.
+GSF__INLINE_AVX2 void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
+    for (int64_t i = 0; row < rows && i < dim; i += 16) _mm_prefetch((const char*)(from + row * ld + i), _MM_HINT_T0);
+}
+
+GSF__TARGET_AVX2 static void gsf__attention_pack_queries(const gsf__attention_job* job, const float* q, int64_t queries,
+                                                         float* packed) {
     const gsf_nn_attention_desc* d = &job->desc;
     const float factor = d->scale * 1.44269504f; // powers of 2 instead of e
     for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += GSF__ATT_GROUP * d->head_dim)
         for (int r = 0; r < GSF__ATT_GROUP; r++) {
             const float* row = q + (first + r) * d->ldq;
+            gsf__attention_fetch(q, first + r + GSF__ATT_AHEAD, queries, d->ldq, d->head_dim);
             for (int32_t i = 0; i < d->head_dim; i++)
                 packed[i * GSF__ATT_GROUP + r] = first + r < queries ? row[i] * factor : 0.0f;
         }
@@ -2799,12 +2812,9 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* 
         float* to = packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * dim + j % GSF__ATT_PANEL;
         const float* row = from + j * ld;
         int64_t i = 0;
-        for (; j + 8 <= keys && i + 8 <= dim; i += 8) {
-            __m256 m[8];
-            for (int r = 0; r < 8; r++) m[r] = _mm256_loadu_ps(row + r * ld + i);
-            gsf__nn_transpose8(m);
-            for (int r = 0; r < 8; r++) _mm256_storeu_ps(to + (i + r) * GSF__ATT_PANEL, m[r]);
-        }
+        for (int64_t r = j; r < j + 8; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, keys, ld, dim);
+        for (; j + 8 <= keys && i + 8 <= dim; i += 8)
+            gsf__nn_transpose8(row + i, ld, to + i * GSF__ATT_PANEL, GSF__ATT_PANEL);
         for (; i < dim; i++)
             for (int r = 0; r < 8; r++) to[i * GSF__ATT_PANEL + r] = j + r < keys ? row[r * ld + i] : 0.0f;
     }
@@ -2816,12 +2826,15 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* 
 GSF__TARGET_AVX2 static void gsf__attention_pack_values(const gsf__attention_job* job, const float* from, int64_t keys,
                                                         float* packed) {
     const int64_t ld = job->desc.ldv, dim = job->desc.head_dim;
-    for (int64_t j = 0; j < keys; j++, from += ld)
+    for (int64_t j = 0; j < keys; j++) {
+        const float* row = from + j * ld;
+        gsf__attention_fetch(from, j + GSF__ATT_AHEAD, keys, ld, dim);
         for (int64_t i = 0; i < job->panels * GSF__ATT_PANEL; i += 8) {
             float* to = packed + (i / GSF__ATT_PANEL * GSF__ATT_KEYS + j) * GSF__ATT_PANEL + i % GSF__ATT_PANEL;
             const __m256i mask = gsf__nn_mask8(dim - i);
-            _mm256_storeu_ps(to, i + 8 <= dim ? _mm256_loadu_ps(from + i) : _mm256_maskload_ps(from + i, mask));
+            _mm256_storeu_ps(to, i + 8 <= dim ? _mm256_loadu_ps(row + i) : _mm256_maskload_ps(row + i, mask));
         }
+    }
 }
 
 // c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...], for 6 rows r.
@@ -2829,16 +2842,22 @@ GSF__INLINE_AVX2 void gsf__attention_tile(const float* a, int64_t a_row, int64_t
                                           __m256 c[12]) {
     __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
     __m256 c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
-    for (int64_t k = 0; k < count; k++, a += a_step, b += GSF__ATT_PANEL) {
-        const __m256 b0 = _mm256_loadu_ps(b), b1 = _mm256_loadu_ps(b + 8);
-        __m256 x;
-#define GSF_X(r)                              \
-    x = _mm256_broadcast_ss(a + (r) * a_row); \
-    c##r##0 = _mm256_fmadd_ps(x, b0, c##r##0); \
+    __m256 x, b0, b1;
+#define GSF_X(r, k)                                          \
+    x = _mm256_broadcast_ss(a + (r) * a_row + (k) * a_step); \
+    c##r##0 = _mm256_fmadd_ps(x, b0, c##r##0);               \
     c##r##1 = _mm256_fmadd_ps(x, b1, c##r##1);
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
-#undef GSF_X
+#define GSF_STEP(k)                                  \
+    b0 = _mm256_loadu_ps(b + (k) * GSF__ATT_PANEL);     \
+    b1 = _mm256_loadu_ps(b + (k) * GSF__ATT_PANEL + 8); \
+    GSF_X(0, k) GSF_X(1, k) GSF_X(2, k) GSF_X(3, k) GSF_X(4, k) GSF_X(5, k)
+    int64_t k = 0;
+    for (; k + 4 <= count; k += 4, a += 4 * a_step, b += 4 * GSF__ATT_PANEL) {
+        GSF_STEP(0) GSF_STEP(1) GSF_STEP(2) GSF_STEP(3)
     }
+    for (; k < count; k++, a += a_step, b += GSF__ATT_PANEL) { GSF_STEP(0) }
+#undef GSF_STEP
+#undef GSF_X
     c[0] = c00; c[1] = c01; c[2] = c10; c[3] = c11; c[4] = c20; c[5] = c21;
     c[6] = c30; c[7] = c31; c[8] = c40; c[9] = c41; c[10] = c50; c[11] = c51;
 }
@@ -2921,14 +2940,15 @@ GSF__TARGET_AVX2 static void gsf__attention_values(const float* p, int64_t group
 
 GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job, const gsf__attention_scratch* s,
                                                    int64_t queries, float* out) {
-    const int64_t dim = job->desc.head_dim;
-    for (int64_t r = 0; r < queries; r++, out += job->desc.ldo) {
+    const int64_t dim = job->desc.head_dim, ld = job->desc.ldo;
+    for (int64_t r = 0; r < queries; r++) {
+        gsf__attention_fetch(out, r + GSF__ATT_AHEAD, queries, ld, dim);
         const float total = gsf__nn_sum8(_mm256_loadu_ps(s->sum + 8 * r));
         const float* from = s->out + r / GSF__ATT_GROUP * job->panels * GSF__ATT_TILE + r % GSF__ATT_GROUP * GSF__ATT_PANEL;
         const __m256 divisor = _mm256_set1_ps(total);
         for (int64_t i = 0; i < dim; i += 8) {
             const __m256 value = _mm256_loadu_ps(from + i / GSF__ATT_PANEL * GSF__ATT_TILE + i % GSF__ATT_PANEL) / divisor;
-            _mm256_maskstore_ps(out + i, gsf__nn_mask8(dim - i), total == 0.0f ? _mm256_setzero_ps() : value);
+            _mm256_maskstore_ps(out + r * ld + i, gsf__nn_mask8(dim - i), total == 0.0f ? _mm256_setzero_ps() : value);
         }
     }
 }

@@ -5,6 +5,7 @@
 
 #include "restorer_golden.h"
 #include "restorer_linear.h"
+#include "restorer_numerics.h"
 #include "restorer_pipeline.h"
 #include "restorer_scheduler.h"
 #include "restorer_tables.h"
@@ -13,6 +14,7 @@
 
 int main(void) {
     check_linear();
+    check_numerics();
     check_scheduler();
     check_tables();
     check_vae();

@@ -157,8 +157,9 @@ static void norm_of(const float* x, size_t n, int centre, double eps, double* y)
 typedef struct norm_case { int64_t rows, dim; double lo, hi; } norm_case;
 
 static void check_row_norms(void) {
-    static const norm_case cases[] = {{1, 1, -1, 1},       {3, 5, -1, 1},     {70, 64, -2, 3},         {5, 37, 9999.0, 10001.0},
-                                      {2, 3072, -1, 1},    {33, 1921, 99, 100}, {3, 40001, -1e15, 1e15}, {4, 19, 1.0, 1.000001}};
+    static const norm_case cases[] = {{1, 1, -1, 1},       {3, 5, -1, 1},          {70, 64, -2, 3},
+                                      {2, 3072, -1, 1},    {5, 37, 9999, 10001},   {33, 1921, 99, 100},
+                                      {3, 40001, -1e15, 1e15}, {4, 19, 1.0, 1.000001}};
     for (size_t c = 0; c < sizeof cases / sizeof cases[0]; c++)
         for (int way = 0; way < 6; way++) { // plain, weight, weight and bias, modulated, all, root mean square
             const size_t rows = (size_t)cases[c].rows, dim = (size_t)cases[c].dim, n = rows * dim;
