@@ -267,36 +267,54 @@ static void model_list_features(model_list* list, const model_size* s) {
 
 // ---- values ----------------------------------------------------------------------
 
-enum { MODEL_CHUNK = 1 << 15, MODEL_BLOCK = 1 << 20 }; // values made at once by a worker; by all. Multiples of 4
+GSF__BEGIN_IMPLEMENTATION // gcc inlines the library's functions only where its rounding mode holds, too
+
+// Values made in one go; by one worker; by all. Each is a multiple of the one before.
+enum { MODEL_BATCH = 256, MODEL_CHUNK = 1 << 15, MODEL_BLOCK = 1 << 20 };
 
 typedef struct model_fill {
     const model_tensor* tensor;
     uint64_t seed;
     gsf_nn_dtype dtype;
-    int64_t first, count; // values of the tensor; first is a multiple of 4
+    int64_t first, count; // values of the tensor
     unsigned char* out;
 } model_fill;
 
-// Four values from each random word.
+// Four values from each random word; a batch at a time, in loops that compilers turn into vectors.
+static void model_fill_batch(const model_fill* f, int64_t first, unsigned char out[4 * MODEL_BATCH]) {
+    const float middle = (float)f->tensor->middle, step = (float)(f->tensor->spread / 32768.0);
+    uint64_t words[MODEL_BATCH / 4];
+    uint16_t bits[MODEL_BATCH], narrow[MODEL_BATCH];
+    float values[MODEL_BATCH];
+    for (int i = 0; i < MODEL_BATCH / 4; i++)
+        words[i] = gsf_random_bits(f->seed, f->tensor->stream, (uint64_t)first / 4 + (uint64_t)i);
+    memcpy(bits, words, sizeof bits);
+    for (int i = 0; i < MODEL_BATCH; i++) values[i] = middle + step * ((float)(int32_t)bits[i] - 32767.5f);
+    if (f->dtype == GSF_NN_F32) {
+        memcpy(out, values, sizeof values);
+        return;
+    }
+    if (f->dtype == GSF_NN_BF16)
+        for (int i = 0; i < MODEL_BATCH; i++) narrow[i] = gsf__float_to_bf16(values[i]);
+    else
+        for (int i = 0; i < MODEL_BATCH; i++) narrow[i] = gsf__float_to_half(values[i]);
+    memcpy(out, narrow, sizeof narrow);
+}
+
 static void model_fill_chunk(void* arg, size_t chunk, int worker) {
     const model_fill* f = (const model_fill*)arg;
     const int64_t begin = (int64_t)chunk * MODEL_CHUNK;
     const int64_t end = begin + MODEL_CHUNK < f->count ? begin + MODEL_CHUNK : f->count;
-    const float middle = (float)f->tensor->middle, step = (float)(f->tensor->spread / 32768.0);
+    const size_t size = gsf_nn_dtype_size(f->dtype);
+    unsigned char batch[4 * MODEL_BATCH];
     (void)worker;
-    for (int64_t i = begin; i < end; i += 4) {
-        uint64_t bits = gsf_random_bits(f->seed, f->tensor->stream, (uint64_t)(f->first + i) / 4);
-        for (int64_t k = i; k < end && k < i + 4; k++, bits >>= 16) {
-            const float value = middle + step * ((float)(int32_t)(bits & 0xffffu) - 32767.5f);
-            if (f->dtype == GSF_NN_F32) {
-                memcpy(f->out + 4 * k, &value, sizeof value);
-            } else {
-                const uint16_t narrow = f->dtype == GSF_NN_F16 ? gsf__float_to_half(value) : gsf__float_to_bf16(value);
-                memcpy(f->out + 2 * k, &narrow, sizeof narrow);
-            }
-        }
+    for (int64_t i = begin; i < end; i += MODEL_BATCH) {
+        model_fill_batch(f, f->first + i, batch);
+        memcpy(f->out + (size_t)i * size, batch, (size_t)(end - i < MODEL_BATCH ? end - i : MODEL_BATCH) * size);
     }
 }
+
+GSF__END_IMPLEMENTATION
 
 // ---- files -----------------------------------------------------------------------
 
@@ -753,7 +771,7 @@ int main(int argc, char** argv) {
     signal(SIGTERM, model_interrupt);
     if (result == GSF_OK) result = model_make(&ctx, &o, reports);
     if (result != GSF_OK) {
-        fprintf(stderr, "make_model: %s (%s)\n", ctx.error, gsf_describe_result(result));
+        fprintf(stderr, "make_model: %s\n", ctx.error[0] ? ctx.error : gsf_describe_result(result));
         return 1;
     }
     for (int i = 0; i < MODEL_PARTS; i++)
