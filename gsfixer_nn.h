@@ -417,7 +417,7 @@ typedef struct gsf_nn_sample_desc {
     int32_t steps;                  // default 50
     gsf_nn_solver solver;           // default DDIM
     float guidance;                 // classifier-free guidance; default 6, 1: none (half the work)
-    float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; both 0: all
+    float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; default 0 to 1
     int dynamic_guidance;           // the official code's cosine ramp of the guidance
     float strength;                 // (0,1]: how much of the noise schedule is run; default 1: from pure noise
     float block_cache;              // gsf_nn_block_cache.threshold; default 0: off
@@ -430,6 +430,9 @@ typedef struct gsf_nn_sample_desc {
     void* step_user;
     uint32_t _end_canary;
 } gsf_nn_sample_desc;
+
+// A desc with its defaults filled in.
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc);
 
 typedef struct gsf_nn_sample_stats {
     int32_t steps, resumed_from;    // steps run in this call; first step of it
@@ -3057,8 +3060,16 @@ typedef struct gsf__conv_kernels {
 
 static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c) {
     for (int64_t m = 0; m < count; m++)
-        for (int64_t i = 0; i < k; i++)
-            for (int n = 0; n < GSF__CONV_N; n++) c[m * GSF__CONV_N + n] += a[m * lda + i] * b[i * GSF__CONV_N + n];
+        for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
+            const float* w = b + n0;
+            float* y = c + m * GSF__CONV_N + n0;
+            float y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
+            for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
+                const float x = a[m * lda + i];
+                y0 += x * w[0], y1 += x * w[1], y2 += x * w[2], y3 += x * w[3];
+            }
+            y[0] = y0, y[1] = y1, y[2] = y2, y[3] = y3;
+        }
 }
 
 static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo,
@@ -3462,11 +3473,11 @@ GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace
 
 // ---- >>nn positions -------------------------------------------------------------
 
-// torch.linspace in float32: from both ends towards the middle.
+// torch.linspace in float32: from both ends towards the middle, multiplied and added with one rounding.
 static float gsf__nn_linspace(float start, float end, int32_t count, int32_t i) {
     if (count == 1) return start;
     const float step = (end - start) / (float)(count - 1);
-    return i < count / 2 ? start + step * (float)i : end - step * (float)(count - 1 - i);
+    return i < count / 2 ? fmaf(step, (float)i, start) : fmaf(-step, (float)(count - 1 - i), end);
 }
 
 // Where a grid of height x width lies in the base grid when it is resized to fit: first[0], last[0] rows, [1] columns,
@@ -5252,6 +5263,14 @@ typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
     int64_t frames, height, width, channels;
 } gsf__vae_map;
 
+// For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
+// `weight` names the layer.
+typedef struct gsf__vae_watch {
+    void (*fn)(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+               const float* data);
+    void* user;
+} gsf__vae_watch;
+
 typedef struct gsf__vae_run {
     gsf_context* ctx;
     const gsf__vae_net* net;
@@ -5264,6 +5283,7 @@ typedef struct gsf__vae_run {
     gsf__vae_map z;          // the chunk's latents (decoder)
     int64_t chunk, chunks, done, total; // done, total: chunks of all tiles
     const char* stage;
+    gsf__vae_watch watch;
 } gsf__vae_run;
 
 static gsf_result gsf__vae_grow(gsf__vae_run* run, gsf__vae_buffer* buffer, int64_t count) {
@@ -5422,6 +5442,7 @@ static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gs
         }
     }
     gsf__conv_fill_frame(run->ctx, &fill);
+    if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
 }
 
 // Room for a layer's result in slot out->slot, its weights and its sums; starts the job.
@@ -5452,9 +5473,12 @@ static void gsf__vae_add_sums(gsf__vae_run* run, int slot) {
 }
 
 static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out) {
+    if (run->dry) return GSF_OK;
     const double* sums = gsf__vae_sums(run, out->slot);
-    for (int64_t i = 0; !run->dry && i < gsf__vae_groups(run, layer->out) * 2; i++)
+    for (int64_t i = 0; i < gsf__vae_groups(run, layer->out) * 2; i++)
         if (!(fabs(sums[i]) <= DBL_MAX)) return gsf__vae_fail_nan(run, layer->weight);
+    if (run->watch.fn)
+        run->watch.fn(run->watch.user, layer->weight, run->chunk, out, -1, run->slots[out->slot].data);
     return GSF_OK;
 }
 
@@ -5901,6 +5925,7 @@ typedef struct gsf__vae_task {
     int64_t frames, height, width;
     gsf__vae_buffer moments; // encoder: (2 latent_channels, ...)
     gsf__vae_buffer* tiles;
+    gsf__vae_watch watch;
 } gsf__vae_task;
 
 static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const float* in, float* out) {
@@ -5934,6 +5959,7 @@ static gsf_result gsf__vae_execute(gsf_context* ctx, gsf__vae_task* task, const 
     run.dry = !in;
     run.total = gsf__vae_chunk_count(task->frames, task->decoder) * task->plan.rows * task->plan.columns;
     run.stage = task->decoder ? "vae decode" : "vae encode";
+    run.watch = task->watch;
     const gsf_result result = gsf__vae_walk(&run, task, in, out);
     *flops = run.flops;
     *bytes = (double)run.peak;
@@ -6049,13 +6075,19 @@ typedef struct gsf__sample_run {
     uint32_t job; // checksum of everything that the result depends on
 } gsf__sample_run;
 
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc) {
+    gsf_nn_sample_desc d = *desc;
+    if (!d.steps) d.steps = 50;
+    if (d.guidance == 0.0f) d.guidance = 6.0f;
+    if (d.guidance_end == 0.0f) d.guidance_end = 1.0f;
+    if (d.strength == 0.0f) d.strength = 1.0f;
+    return d;
+}
+
 static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) {
     if (d->_start_canary != 0 || d->_end_canary != 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: the desc was not zeroed");
-    if (!d->steps) d->steps = 50;
-    if (d->guidance == 0.0f) d->guidance = 6.0f;
-    if (d->guidance_begin == 0.0f && d->guidance_end == 0.0f) d->guidance_end = 1.0f;
-    if (d->strength == 0.0f) d->strength = 1.0f;
+    *d = gsf_nn_resolve_sample(d);
     if (d->steps < 1 || d->steps > 1000)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: %d steps, not 1 to 1000", (int)d->steps);
     if (!(d->strength > 0.0f && d->strength <= 1.0f))

@@ -42,7 +42,21 @@ static const option_spec option_specs[] = {
      "called as COMMAND JOBDIR"},
     {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore",
      "a COMMAND that takes longer for a window is stopped and the run fails (default 3600)"},
-    {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix", "what guides the restorer dit:"},
+    {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
+     "which features of the photos guide the restorer dit: (default both: 2D semantic, 3D geometric)"},
+    {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "fix restore",
+     "encoded photos and prompt for the restorer dit:, as safetensors: dino_latents, vggt_latents, prompt_embeds"},
+    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: steps from noise to frames (default 50; fast 10)"},
+    {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore",
+     "dit: how they are taken (default ddim, as published; fast unipc)"},
+    {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore",
+     "dit: weight of the prompt against the negative one (default 6; 1 leaves that out, for half the work)"},
+    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "PART", "fix restore",
+     "dit: only the first PART of the steps is guided (default 1)"},
+    {"--strength", REAL, AT(strength), 0.001, 1, "PART", "fix restore",
+     "dit: start from the noised frames and run only the last PART of the steps (default 1: from pure noise)"},
+    {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore",
+     "dit: a step whose first block changes less than this (0.1, say) reuses what the others did (default 0: never)"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
      "regularisers for few views (default on); off is plain 3DGS"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
@@ -78,7 +92,6 @@ static const option_spec option_specs[] = {
     {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "clips that the frames are divided into (default 1)"},
     {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
      "the photos that guide the repair (default FRAMES_DIR/refs/)"},
-    {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "restore", "encoded photos, for the restorer dit:"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage (default psnr,ssim_3dgs)"},
     {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "networks, for metrics that need one"},
@@ -362,15 +375,64 @@ gsf_traj_kind gsfix_path_kind(const char* name) {
 
 int gsfix_check_restorer(gsfix_app* app) {
     const char* r = app->o.restorer;
-    if (app->o.condition) return gsfix_misused(app, "--condition is for the restorer dit:, which is not in this version");
-    if (app->o.ref_features)
-        return gsfix_misused(app, "--ref-features is for the restorer dit:, which is not in this version");
+    const gsfix_options* o = &app->o;
+    if (r && strncmp(r, "dit:", 4) == 0 && r[4]) {
+        if (!o->ref_features)
+            return gsfix_misused(app, "--restorer dit: needs --ref-features FILE (this version has no encoders to make it)");
+        return 0;
+    }
+    const char* alone = o->condition                ? "--condition"
+                        : o->ref_features           ? "--ref-features"
+                        : o->steps                  ? "--steps"
+                        : o->solver                 ? "--solver"
+                        : o->guidance > 0.0         ? "--guidance"
+                        : o->guidance_until > 0.0   ? "--guidance-until"
+                        : o->strength > 0.0         ? "--strength"
+                        : o->block_cache > 0.0      ? "--block-cache"
+                                                    : NULL;
+    if (alone) return gsfix_misused(app, "%s is for the restorer dit:MODEL_DIR", alone);
     if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
-    if (strncmp(r, "dit:", 4) == 0 || strcmp(r, "dit") == 0)
-        return gsfix_misused(app, "the restorer dit: is not in this version");
     if (strncmp(r, "exec:", 5) == 0 && r[5]) return 0;
-    return gsfix_misused(app, "--restorer %s: choose from none|warp|exec:COMMAND", r);
+    return gsfix_misused(app, "--restorer %s: choose from none|warp|dit:MODEL_DIR|exec:COMMAND", r);
 }
+
+gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
+    const gsfix_options* o = &app->o;
+    const gsfix_quality* quality = gsfix_find_quality(o->quality);
+    static const char* const conditions[] = {"both", "2d", "3d", "none"}; // in the order of gsf_nn_condition
+    static const char* const solvers[] = {"ddim", "dpmpp", "unipc"};      // of gsf_nn_solver
+    gsf_nn_dit_desc d;
+    memset(&d, 0, sizeof d);
+    d.model = o->restorer + 4;
+    d.features = o->ref_features;
+    for (int i = 0; i < 4; i++)
+        if (o->condition && strcmp(o->condition, conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
+    d.sample.solver = quality->solver;
+    for (int i = 0; i < 3; i++)
+        if (o->solver && strcmp(o->solver, solvers[i]) == 0) d.sample.solver = (gsf_nn_solver)i;
+    d.sample.steps = o->steps ? o->steps : quality->steps;
+    d.sample.guidance = (float)o->guidance;
+    d.sample.guidance_end = (float)o->guidance_until;
+    d.sample.strength = (float)o->strength;
+    d.sample.block_cache = (float)o->block_cache;
+    return d;
+}
+
+// Steps of one clip: a bar where the clip is all there is to do, else a line whenever half a minute has passed.
+static void show_dit_steps(void* user, const char* stage, double done, double total) {
+    gsfix_app* app = (gsfix_app*)user;
+    if (strcmp(stage, "restore") != 0) return;
+    if (strcmp(app->command, "restore") == 0) {
+        gsfix_progress(app, done, total, "step %.0f of %.0f", done, total);
+    } else if (done == 0.0) {
+        app->clip_line = gsfix_now();
+    } else if (gsfix_now() - app->clip_line >= 30.0) {
+        gsfix_note(app, "restoring: step %.0f of %.0f", done, total);
+        app->clip_line = gsfix_now();
+    }
+}
+
+static gsfix_path dit_checkpoint(const gsfix_app* app) { return gsfix_pathf("%s/dit.checkpoint", app->o.out); }
 
 gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present) {
     const char* r = app->o.restorer;
@@ -378,12 +440,25 @@ gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* ou
     *present = r && strcmp(r, "none") != 0;
     if (!*present) return GSF_OK;
     if (strcmp(r, "warp") == 0) return gsf_splat_make_warp(&app->ctx, out);
+    if (strncmp(r, "dit:", 4) == 0) {
+        gsf_nn_dit_desc desc = gsfix_dit_desc(app);
+        const gsfix_path checkpoint = dit_checkpoint(app);
+        desc.sample.checkpoint = checkpoint.s;
+        app->ctx.progress.progress_fn = show_dit_steps;
+        app->ctx.progress.user = app;
+        return gsf_nn_make_dit(&app->ctx, &desc, out);
+    }
     return gsfix_make_exec(&app->ctx, r + 5, job, app->o.restorer_timeout > 0.0 ? app->o.restorer_timeout : 3600.0, out);
+}
+
+void gsfix_drop_dit_checkpoint(const gsfix_app* app) {
+    if (app->o.restorer && strncmp(app->o.restorer, "dit:", 4) == 0) remove(dit_checkpoint(app).s);
 }
 
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
     if (!restorer->user) return;
     if (strcmp(app->o.restorer, "warp") == 0) gsf_splat_destroy_warp(&app->ctx, restorer);
+    else if (strncmp(app->o.restorer, "dit:", 4) == 0) gsf_nn_destroy_dit(&app->ctx, restorer);
     else gsfix_destroy_exec(&app->ctx, restorer);
 }
 
@@ -1040,6 +1115,7 @@ static gsf_result restore_folder(gsfix_app* app) {
             result = gsf_save_image(ctx, gsfix_pathf("%s/confidence/%s.png", app->o.out, name.s).s, c.out_confidence + i);
     }
     if (result == GSF_OK) {
+        gsfix_drop_dit_checkpoint(app);
         gsfix_json_text(ctx, &app->json, "restorer", app->o.restorer);
         gsfix_json_number(ctx, &app->json, "frames", (double)c.frames);
         gsfix_json_number(ctx, &app->json, "references", (double)c.refs);

@@ -7,6 +7,7 @@
 #define _XOPEN_SOURCE 700 // POSIX 2008 with realpath
 #endif
 
+#include "gsfixer_nn.h"
 #include "gsfixer_splat.h"
 
 #include <stdio.h>
@@ -15,10 +16,10 @@
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
-    const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *model;
+    const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *model, *solver;
     int json, help, resume, depth, alpha;
-    int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows;
-    double restorer_timeout;
+    int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
+    double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
     const char** inputs;
     int input_count;
@@ -35,6 +36,7 @@ typedef struct gsfix_app {
     int bar_shown;      // a progress bar stands on the terminal's last line
     double bar_time;
     int line_share;     // tenth of the work that the last plain progress line told
+    double clip_line;   // gsfix_now() of the last line about the clip that is being restored
 } gsfix_app;
 
 // ---- gsfix_util.c --------------------------------------------------------------
@@ -103,6 +105,8 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
 int gsfix_check_restorer(gsfix_app* app);
 gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present);
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
+gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app);      // as the options have it, for --restorer dit:MODEL_DIR
+void gsfix_drop_dit_checkpoint(const gsfix_app* app);      // of the clip that was at work, when the whole is done
 gsf_traj_kind gsfix_path_kind(const char* name);
 // Near plane for renders of a scene with these cameras (`stride` bytes apart): 0.01 times their extent, at most the official
 // 0.2. fix and render share the rule, so that splats look the same in both.
@@ -115,6 +119,8 @@ typedef struct gsfix_quality { // --quality is one of these rows
     int32_t lazy_adam;  // of gsf_train_desc
     float skip_psnr;    // dB from which a window counts as needing no restoring; 0 = all are restored
     int32_t max_pixels; // of a frame that is restored; 0 = photo size
+    int32_t steps;      // of the restorer dit:
+    gsf_nn_solver solver;
 } gsfix_quality;
 const gsfix_quality* gsfix_find_quality(const char* name); // NULL: the default
 

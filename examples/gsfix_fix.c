@@ -14,9 +14,9 @@ static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothn
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
 
 static const gsfix_quality qualities[] = { // what each saves and costs: bench/QUALITY.md
-    {"exact", 0, 0.0f, 0},
-    {"balanced", 0, 45.0f, 0},
-    {"fast", 1, 36.0f, 320 * 240},
+    {"exact", 0, 0.0f, 0, 50, GSF_NN_DDIM},
+    {"balanced", 0, 45.0f, 0, 50, GSF_NN_DDIM},
+    {"fast", 1, 36.0f, 320 * 240, 10, GSF_NN_UNIPC},
 };
 
 const gsfix_quality* gsfix_find_quality(const char* name) {
@@ -437,6 +437,23 @@ static double as_written(float value) { // the shortest decimal that reads back 
 }
 
 // What the run computes, by name and with every default filled in: printed in metrics.json, and what --resume insists on.
+static void write_dit_switches(fix_run* run) {
+    static const char* const conditions[] = {"both", "2d", "3d", "none"}; // gsf_nn_condition
+    static const char* const solvers[] = {"ddim", "dpmpp", "unipc"};      // gsf_nn_solver
+    const gsf_nn_dit_desc dit = gsfix_dit_desc(run->app);
+    const gsf_nn_sample_desc d = gsf_nn_resolve_sample(&dit.sample);
+    gsf_context* ctx = run->ctx;
+    gsf_text* t = &run->switches;
+    gsfix_json_text(ctx, t, "condition", conditions[dit.condition]);
+    gsfix_json_text(ctx, t, "ref_features", dit.features);
+    gsfix_json_number(ctx, t, "steps", d.steps);
+    gsfix_json_text(ctx, t, "solver", solvers[d.solver]);
+    gsfix_json_number(ctx, t, "guidance", as_written(d.guidance));
+    gsfix_json_number(ctx, t, "guidance_until", as_written(d.guidance_end));
+    gsfix_json_number(ctx, t, "strength", as_written(d.strength));
+    gsfix_json_number(ctx, t, "block_cache", as_written(d.block_cache));
+}
+
 static void write_switches(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_text* t = &run->switches;
@@ -451,6 +468,7 @@ static void write_switches(fix_run* run) {
     gsfix_json_number(ctx, t, "iterations", train->iterations);
     gsfix_json_number(ctx, t, "seed", (double)train->seed);
     gsfix_json_text(ctx, t, "restorer", o->restorer ? o->restorer : "none");
+    if (o->restorer && strncmp(o->restorer, "dit:", 4) == 0) write_dit_switches(run);
     gsfix_json_text(ctx, t, "regularize", o->regularize ? o->regularize : "on");
     gsfix_json_text(ctx, t, "trajectory", kinds[used.fix.trajectory]);
     gsfix_json_text(ctx, t, "init", used.init);
@@ -1088,6 +1106,7 @@ int gsfix_run_fix(gsfix_app* app) {
     run.history.seconds[GSFIX_INIT] += gsfix_now() - app->started;
     if (result == GSF_OK) result = run_loop(&run);
     if (result == GSF_OK) result = finish(&run);
+    if (result == GSF_OK) gsfix_drop_dit_checkpoint(app);
     free_run(&run);
     return result == GSF_OK ? 0 : gsfix_failed(app);
 }

@@ -151,6 +151,107 @@ static void vae_check_tiled(gsf_context* ctx, const gsf_nn_vae* vae, const vae_f
     test_free_tensor(&latent);
 }
 
+// ---- intermediates: "dec.up0.chunk1" is what up block 0 of the decoder made of the second chunk
+
+typedef struct vae_watcher {
+    const test_tensors* file;
+    const gsf_nn_vae* vae;
+    int decoder, seen;
+} vae_watcher;
+
+// The layer whose result is the intermediate `part`, as the weight file calls it.
+static void vae_layer_name(const vae_watcher* w, const char* part, char* out, size_t room) {
+    const char* side = w->decoder ? "decoder" : "encoder";
+    const int level = atoi(part + strcspn(part, "0123456789")), last = w->vae->layers_per_block - 1;
+    if (strncmp(part, "conv_in", 7) == 0) snprintf(out, room, "%s.conv_in.conv.weight", side);
+    else if (strcmp(part, "mid") == 0) snprintf(out, room, "%s.mid_block.resnets.1.conv2.conv.weight", side);
+    else if (strcmp(part, "norm_out") == 0)
+        snprintf(out, room, w->decoder ? "%s.norm_out.norm_layer.weight" : "%s.norm_out.weight", side);
+    else if (strcmp(part, "mid.resnet0.norm1") == 0)
+        snprintf(out, room, "%s.mid_block.resnets.0.norm1%s.weight", side, w->decoder ? ".norm_layer" : "");
+    else if (level < w->vae->levels - 1)
+        snprintf(out, room, "%s.%s_blocks.%d.%ssamplers.0.conv.weight", side, w->decoder ? "up" : "down", level,
+                 w->decoder ? "up" : "down");
+    else
+        snprintf(out, room, "%s.%s_blocks.%d.resnets.%d.conv2.conv.weight", side, w->decoder ? "up" : "down", level,
+                 last + w->decoder);
+}
+
+// (frames, height, width, channels), or one bordered frame of it, against (channels, frames, height, width).
+static void vae_compare_map(vae_watcher* w, const char* what, const gsf__vae_map* map, int64_t frame, const float* data) {
+    test_tensor expected = test_get_tensor(w->file, what);
+    const int64_t plane = map->height * map->width, border = frame < 0 ? 0 : 1;
+    const int64_t first = frame < 0 ? 0 : frame, frames = frame < 0 ? map->frames : 1;
+    const int64_t count = frames * plane * map->channels;
+    if (!CHECK((int64_t)expected.count == map->frames * plane * map->channels)) return;
+    float* planes = (float*)malloc((size_t)count * sizeof(float));
+    double* part = (double*)malloc((size_t)count * sizeof(double));
+    int64_t n = 0;
+    for (int64_t c = 0; c < map->channels; c++)
+        for (int64_t t = 0; t < frames; t++)
+            for (int64_t i = 0; i < plane; i++, n++) {
+                const int64_t row = i / map->width, column = i % map->width + border;
+                const double e = expected.v[(c * map->frames + first + t) * plane + i];
+                planes[n] = data[((t * map->height + row) * (map->width + 2 * border) + column) * map->channels + c];
+                part[n] = frame < 0 ? e : e / (1.0 + exp(-e)); // the file has norms before SiLU
+            }
+    test_tensor picked = expected;
+    picked.v = part;
+    picked.count = (size_t)count;
+    vae_compare("clip17", what, planes, &picked);
+    free(planes);
+    free(part);
+    test_free_tensor(&expected);
+    w->seen++;
+}
+
+static void vae_watch(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+                      const float* data) {
+    static const char* const parts[] = {"conv_in", "mid", "mid.resnet0.norm1", "norm_out", "up0", "up1", "up2", "up3",
+                                        "down0", "down1", "down2", "down3"};
+    vae_watcher* w = (vae_watcher*)user;
+    for (size_t i = 0; i < sizeof parts / sizeof *parts; i++) {
+        char what[80], layer[120], key[96];
+        vae_layer_name(w, parts[i], layer, sizeof layer);
+        if (strcmp(layer, weight->name) != 0) continue;
+        snprintf(what, sizeof what, "%s.%s.chunk%d", w->decoder ? "dec" : "enc", parts[i], (int)chunk);
+        snprintf(key, sizeof key, "\"%s\"", what);
+        if (strstr(w->file->data + 8, key)) vae_compare_map(w, what, map, frame, data);
+    }
+}
+
+static void vae_check_intermediates(gsf_context* ctx, const gsf_nn_vae* vae, const vae_files* files) {
+    test_tensors file = test_open_tensors(test_golden("restorer/vae/intermediates_f32.safetensors"));
+    test_tensor frames = test_get_tensor(&files->inputs, "clip17.frames_u8");
+    test_tensor mean = test_get_tensor(&files->f32, "clip17.mean");
+    float *in[2], *out = NULL, *moments = (float*)malloc(mean.count * 2 * sizeof(float));
+    in[0] = vae_video(&frames);
+    in[1] = test_tensor_floats(&mean);
+    for (int decoder = 0; decoder < 2; decoder++) {
+        gsf__vae_task task;
+        gsf_nn_vae_info info;
+        double flops, bytes;
+        vae_watcher watcher = {&file, vae, decoder, 0};
+        const size_t* size = decoder ? mean.dim + 2 : frames.dim;
+        const int64_t f = (int64_t)size[0], h = (int64_t)size[1], w = (int64_t)size[2];
+        CHECK_OK(ctx, gsf__vae_make_task(ctx, vae, decoder, NULL, f, h, w, &task, &info));
+        task.watch.fn = vae_watch;
+        task.watch.user = &watcher;
+        out = (float*)malloc((size_t)(vae->out_channels * info.frames * info.height * info.width) * sizeof(float));
+        CHECK_OK(ctx, gsf__vae_execute(ctx, &task, in[decoder], out, moments, NULL, &flops, &bytes));
+        CHECK(watcher.seen > 4);
+        CHECK_NEAR(flops, info.flops, 0.0);
+        CHECK_NEAR(bytes, info.bytes, 0.0);
+        free(out);
+    }
+    free(in[0]);
+    free(in[1]);
+    free(moments);
+    test_free_tensor(&frames);
+    test_free_tensor(&mean);
+    test_close_tensors(&file);
+}
+
 // Every tensor `clipN.frames_u8` of the inputs.
 static void vae_check_clips(gsf_context* ctx, const gsf_nn_vae* vae, const vae_files* files) {
     int clips = 0;
@@ -177,6 +278,7 @@ static void check_vae(void) {
     if (CHECK_OK(&ctx, gsf_nn_make_vae(&ctx, test_golden("restorer/model/vae"), &vae))) {
         vae_check_clips(&ctx, &vae, &files);
         vae_check_tiled(&ctx, &vae, &files);
+        vae_check_intermediates(&ctx, &vae, &files);
         gsf_nn_destroy_vae(&ctx, &vae);
     }
     test_close_tensors(&files.inputs);
