@@ -1,0 +1,380 @@
+// bench/make_model.c, which makes restorer models of random weights: the same bytes however they are made, the official
+// models' lists of tensors, and values that run.
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_nn.h"
+
+#define main make_model_main
+#include "../bench/make_model.c"
+#undef main
+
+#include "test.h"
+
+typedef struct folder { char path[1000]; } folder;
+
+static folder scratch(const char* name) {
+    folder f;
+    snprintf(f.path, sizeof f.path, "%s", test_scratch(name));
+    return f;
+}
+
+static const char* inside(const folder* f, const char* name) { // static buffers, the last 4 stay valid
+    static char paths[4][1100];
+    static int turn;
+    char* path = paths[turn++ & 3];
+    snprintf(path, sizeof paths[0], "%s/%s", f->path, name);
+    return path;
+}
+
+static model_options options(const folder* out, const char* size) {
+    model_options o;
+    memset(&o, 0, sizeof o);
+    o.out = out->path;
+    for (size_t i = 0; i < GSF__COUNT(model_sizes); i++)
+        if (strcmp(model_sizes[i].name, size) == 0) o.size = &model_sizes[i];
+    o.dtype = GSF_NN_BF16;
+    o.seed = 7;
+    o.shards = 1;
+    o.parts = MODEL_ALL;
+    return o;
+}
+
+static void backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
+    (void)user;
+    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)(i % 3));
+}
+
+static int same_file(const folder* a, const folder* b, const char* name) {
+    size_t size_a, size_b;
+    char *data_a = test_read_file(inside(a, name), &size_a), *data_b = test_read_file(inside(b, name), &size_b);
+    const int same = size_a == size_b && memcmp(data_a, data_b, size_a) == 0;
+    free(data_a);
+    free(data_b);
+    return same;
+}
+
+static int exists(const folder* f, const char* name) {
+    FILE* file = fopen(inside(f, name), "rb");
+    if (file) fclose(file);
+    return file != NULL;
+}
+
+// How many values of b are those of a, of all tensors; -1 if names or shapes differ. `narrow`: a's rounded to bf16.
+static double same_values(gsf_context* ctx, const folder* a, const folder* b, const char* name, int narrow) {
+    gsf_nn_weights x, y;
+    double same = 0.0, count = 0.0;
+    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(a, name), MODEL_STEM, &x))) return -1.0;
+    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(b, name), MODEL_STEM, &y))) return -1.0;
+    int ok = x.tensor_count == y.tensor_count && x.tensor_count > 0;
+    for (size_t i = 0; ok && i < x.tensor_count; i++) {
+        const gsf_tensor *s = &x.tensors[i], *t = &y.tensors[i];
+        ok = strcmp(s->name, t->name) == 0 && s->rank == t->rank && memcmp(s->shape, t->shape, sizeof s->shape) == 0;
+        for (int64_t k = 0; ok && k < s->count; k++) {
+            float u, v;
+            gsf_nn_read_tensor(s, k, 1, &u);
+            gsf_nn_read_tensor(t, k, 1, &v);
+            if (narrow) u = gsf__bf16_to_float(gsf__float_to_bf16(u));
+            same += u == v;
+        }
+        count += (double)s->count;
+    }
+    gsf_nn_close_weights(ctx, &x);
+    gsf_nn_close_weights(ctx, &y);
+    return ok ? same / count : -1.0;
+}
+
+// ---- the same bytes ----------------------------------------------------------------
+
+static void check_same(gsf_context* ctx) {
+    static const char* const files[] = {"transformer/config.json", "transformer/" MODEL_SINGLE, "vae/config.json",
+                                        "vae/" MODEL_SINGLE, "scheduler/scheduler_config.json", "model_index.json",
+                                        "features.safetensors"};
+    const folder first = scratch("first"), again = scratch("again"), other = scratch("other"), sharded = scratch("sharded");
+    const folder wide = scratch("wide");
+    model_report reports[MODEL_PARTS];
+    model_options o = options(&first, "tiny");
+    CHECK_OK(ctx, model_make(ctx, &o, reports));
+
+    gsf_context three;
+    memset(&three, 0, sizeof three);
+    three.parallel.for_fn = backwards;
+    three.parallel.worker_count = 3;
+    CHECK_OK(&three, gsf_init_context(&three));
+    o.out = again.path;
+    o.shards = 3; // and then one: the index must go
+    CHECK_OK(&three, model_make(&three, &o, reports));
+    CHECK(exists(&again, "transformer/" MODEL_INDEX));
+    o.shards = 1;
+    CHECK_OK(&three, model_make(&three, &o, reports));
+    CHECK(!exists(&again, "transformer/" MODEL_INDEX));
+    for (size_t i = 0; i < GSF__COUNT(files); i++) CHECK(same_file(&first, &again, files[i]));
+    CHECK(!exists(&first, "transformer/" MODEL_SINGLE ".tmp"));
+
+    o.out = sharded.path;
+    o.shards = 3;
+    CHECK_OK(ctx, model_make(ctx, &o, reports));
+    CHECK(!exists(&sharded, "transformer/" MODEL_SINGLE));
+    CHECK(exists(&sharded, "transformer/diffusion_pytorch_model-00003-of-00003.safetensors"));
+    CHECK(same_values(ctx, &first, &sharded, "transformer", 0) == 1.0);
+    CHECK(same_file(&first, &sharded, "vae/" MODEL_SINGLE));
+
+    o.out = wide.path;
+    o.shards = 1;
+    o.dtype = GSF_NN_F32;
+    o.parts = MODEL_VAE; // by itself
+    CHECK_OK(ctx, model_make(ctx, &o, reports));
+    CHECK(!exists(&wide, "features.safetensors"));
+    CHECK(same_values(ctx, &wide, &first, "vae", 1) == 1.0);
+
+    o.out = other.path;
+    o.dtype = GSF_NN_F16;
+    o.seed = 8;
+    CHECK_OK(ctx, model_make(ctx, &o, reports));
+    CHECK(same_values(ctx, &first, &other, "vae", 0) < 0.01);
+}
+
+// ---- lists of tensors ----------------------------------------------------------------
+
+static double list_values(const model_list* list) {
+    double values = 0.0;
+    for (size_t i = 0; i < list->count; i++) values += (double)list->tensors[i].count;
+    return values;
+}
+
+// Counted with the official classes.
+static void check_full(gsf_context* ctx) {
+    const folder none = scratch("none");
+    const model_options o = options(&none, "full");
+    gsf__nn_config config;
+    gsf_text text;
+    gsf_nn_transformer net;
+    gsf_nn_vae vae;
+    model_list list = model_begin_list(ctx, MODEL_TRANSFORMER);
+    memset(&text, 0, sizeof text);
+    memset(&net, 0, sizeof net);
+    memset(&vae, 0, sizeof vae);
+    model_print_transformer(ctx, o.size, &text);
+    CHECK_OK(ctx, gsf__nn_parse_config(ctx, "config.json", text.data, text.size, &config));
+    CHECK_OK(ctx, gsf__dit_read_config(&config, &net));
+    gsf__nn_close_config(&config);
+    net.dino_channels = MODEL_DINO_CHANNELS;
+    net.vggt_channels = MODEL_VGGT_CHANNELS;
+    model_list_transformer(&list, &net);
+    CHECK_OK(ctx, list.result);
+    CHECK(list.count == 1621);
+    CHECK_NEAR(list_values(&list), 7166167104.0 + 54607872.0, 0.0);
+    gsf_free(ctx, list.tensors);
+
+    list = model_begin_list(ctx, MODEL_VAE);
+    text.size = 0;
+    model_print_vae(ctx, o.size, &text);
+    CHECK_OK(ctx, gsf__nn_parse_config(ctx, "config.json", text.data, text.size, &config));
+    CHECK_OK(ctx, gsf__vae_take_config(&config, &vae));
+    gsf__nn_close_config(&config);
+    model_list_vae(&list, &vae);
+    CHECK_OK(ctx, list.result);
+    CHECK(list.count == 436);
+    CHECK_NEAR(list_values(&list), 215583907.0, 0.0);
+    gsf_free(ctx, list.tensors);
+    gsf_destroy_text(ctx, &text);
+}
+
+static void check_list(model_list* list, const gsf_nn_weights* weights) {
+    CHECK_OK(list->ctx, list->result);
+    CHECK(list->count == weights->tensor_count);
+    for (size_t i = 0; i < list->count; i++) {
+        const gsf_tensor* t = gsf_nn_find_tensor(weights, list->tensors[i].name);
+        const int ok = t && t->rank == list->tensors[i].rank &&
+                       memcmp(t->shape, list->tensors[i].shape, (size_t)t->rank * sizeof t->shape[0]) == 0;
+        if (!CHECK(ok)) fprintf(stderr, "    %s\n", list->tensors[i].name);
+    }
+}
+
+// Names and shapes of the models that the official code wrote.
+static void check_golden(gsf_context* ctx) {
+    gsf_nn_transformer net;
+    gsf_nn_vae vae;
+    model_list list = model_begin_list(ctx, MODEL_TRANSFORMER);
+    if (CHECK_OK(ctx, gsf_nn_make_transformer(ctx, test_golden("restorer/model/transformer"), &net))) {
+        model_list_transformer(&list, &net);
+        check_list(&list, &net.weights);
+        gsf_nn_destroy_transformer(ctx, &net);
+    }
+    gsf_free(ctx, list.tensors);
+    list = model_begin_list(ctx, MODEL_VAE);
+    if (CHECK_OK(ctx, gsf_nn_make_vae(ctx, test_golden("restorer/model/vae"), &vae))) {
+        model_list_vae(&list, &vae);
+        check_list(&list, &vae.weights);
+        gsf_nn_destroy_vae(ctx, &vae);
+    }
+    gsf_free(ctx, list.tensors);
+}
+
+// ---- values that run -----------------------------------------------------------------
+
+static double rms(const float* x, size_t count) { // NaN or infinite if a value is
+    double sum = 0.0;
+    for (size_t i = 0; i < count; i++) sum += (double)x[i] * (double)x[i];
+    return sqrt(sum / (double)count);
+}
+
+static void check_rms(const char* what, const float* x, size_t count, double low, double high) {
+    const double r = rms(x, count);
+    if (getenv("GSF_TEST_VERBOSE")) printf("%-40s %.3g\n", what, r);
+    if (!CHECK(r >= low && r <= high)) fprintf(stderr, "    rms of %s is %g, not %g to %g\n", what, r, low, high);
+}
+
+static float* made_noise(uint64_t seed, size_t count) {
+    float* x = (float*)malloc(count * sizeof(float));
+    for (size_t i = 0; i < count; i++) x[i] = (float)gsf_random_normal(seed, 0, i);
+    return x;
+}
+
+static int gates; // seen
+static void see_tap(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns) {
+    (void)user;
+    (void)row;
+    const char* part = strchr(name, '.');
+    if (strncmp(name, "block", 5) != 0 || !part) return;
+    if (strcmp(part, ".norm1.2") == 0 || strcmp(part, ".norm1.3") == 0) {
+        check_rms(name, data, (size_t)(rows * columns), 0.1, 0.4);
+        gates++;
+    } else if (strcmp(part, ".0") == 0) {
+        check_rms(name, data, (size_t)(rows * columns), 0.5, 3.0);
+    }
+}
+
+static void check_transformer(gsf_context* ctx, const folder* model) {
+    gsf_nn_transformer net;
+    gsf_nn_weights features;
+    if (!CHECK_OK(ctx, gsf_nn_make_transformer(ctx, inside(model, "transformer"), &net))) return;
+    CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(model, "features.safetensors"), NULL, &features));
+    const gsf_tensor* dino = gsf_nn_find_tensor(&features, "dino_latents");
+    const gsf_tensor* vggt = gsf_nn_find_tensor(&features, "vggt_latents");
+    const gsf_tensor* text = gsf_nn_find_tensor(&features, "prompt_embeds");
+    if (CHECK(dino && vggt && text)) {
+        const int64_t tokens = dino->shape[0] * dino->shape[1], width = (int64_t)net.heads * net.head_dim;
+        const int32_t frames = (net.sample_frames - 1) / net.temporal_ratio + 1;
+        const size_t plane = (size_t)net.sample_height * (size_t)net.sample_width * (size_t)frames;
+        const double steps[1] = {479.0};
+        float* dino_values = (float*)malloc((size_t)dino->count * sizeof(float));
+        float* vggt_values = (float*)malloc((size_t)vggt->count * sizeof(float));
+        float* text_values = (float*)malloc((size_t)text->count * sizeof(float));
+        float* references = (float*)malloc((size_t)(tokens * width) * sizeof(float));
+        float* out = (float*)malloc(plane * (size_t)net.out_channels * sizeof(float));
+        float* hidden = made_noise(5, plane * (size_t)net.in_channels);
+        gsf_nn_read_tensor(dino, 0, dino->count, dino_values);
+        gsf_nn_read_tensor(vggt, 0, vggt->count, vggt_values);
+        gsf_nn_read_tensor(text, 0, text->count, text_values);
+        CHECK_OK(ctx, gsf_nn_project_references(ctx, &net, tokens, dino_values, vggt_values, references));
+        gsf_nn_transformer_input in;
+        memset(&in, 0, sizeof in);
+        in.batch = in.reference_batch = 1;
+        in.frames = frames;
+        in.height = net.sample_height;
+        in.width = net.sample_width;
+        in.hidden = hidden;
+        in.text = text_values;
+        in.timesteps = steps;
+        in.references = references;
+        in.reference_tokens = tokens;
+        in.tap_fn = see_tap;
+        CHECK_OK(ctx, gsf_nn_transformer_forward(ctx, &net, &in, out));
+        check_rms("velocity", out, plane * (size_t)net.out_channels, 0.5, 2.0);
+        CHECK(gates == 2 * net.layers);
+        free(dino_values);
+        free(vggt_values);
+        free(text_values);
+        free(references);
+        free(out);
+        free(hidden);
+    }
+    gsf_nn_close_weights(ctx, &features);
+    gsf_nn_destroy_transformer(ctx, &net);
+}
+
+static void check_vae(gsf_context* ctx, const folder* model) {
+    gsf_nn_vae vae;
+    gsf_nn_vae_info info, back;
+    const int64_t frames = 9, height = 48, width = 40;
+    if (!CHECK_OK(ctx, gsf_nn_make_vae(ctx, inside(model, "vae"), &vae))) return;
+    CHECK_OK(ctx, gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_ENCODE, NULL, frames, height, width, &info));
+    CHECK_OK(ctx, gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_DECODE, NULL, info.frames, info.height, info.width, &back));
+    const size_t count = (size_t)(vae.latent_channels * info.frames * info.height * info.width);
+    const size_t pixels = (size_t)(vae.out_channels * back.frames * back.height * back.width);
+    float* video = made_noise(6, (size_t)(vae.in_channels * frames * height * width));
+    float *mean = (float*)malloc(count * sizeof(float)), *decoded = (float*)malloc(pixels * sizeof(float));
+    CHECK_OK(ctx, gsf_nn_vae_encode(ctx, &vae, NULL, video, frames, height, width, mean, NULL));
+    check_rms("latents", mean, count, 0.2, 2.0);
+    CHECK_OK(ctx, gsf_nn_vae_decode(ctx, &vae, NULL, mean, info.frames, info.height, info.width, decoded));
+    check_rms("decoded", decoded, pixels, 0.2, 2.0);
+    free(video);
+    free(mean);
+    free(decoded);
+    gsf_nn_destroy_vae(ctx, &vae);
+}
+
+static void check_runs(gsf_context* ctx) {
+    const folder model = scratch("first");
+    gsf_nn_dit_desc desc;
+    gsf_restorer restorer;
+    char path[2][1100];
+    check_transformer(ctx, &model);
+    check_vae(ctx, &model);
+    memset(&desc, 0, sizeof desc);
+    snprintf(path[0], sizeof path[0], "%s", model.path);
+    snprintf(path[1], sizeof path[1], "%s", inside(&model, "features.safetensors"));
+    desc.model = path[0];
+    desc.features = path[1];
+    if (CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &restorer))) gsf_nn_destroy_dit(ctx, &restorer);
+}
+
+// ---- errors ----------------------------------------------------------------------------
+
+static int run(const char* a, const char* b, const char* c) {
+    char text[4][1100];
+    char* argv[5];
+    const char* words[4] = {"make_model", a, b, c};
+    int argc = 0;
+    for (int i = 0; i < 4 && words[i]; i++) {
+        snprintf(text[i], sizeof text[i], "%s", words[i]);
+        argv[argc++] = text[i];
+    }
+    argv[argc] = NULL;
+    return make_model_main(argc, argv);
+}
+
+static void check_errors(gsf_context* ctx) {
+    const folder file = scratch("file"), program = scratch("program");
+    model_report reports[MODEL_PARTS];
+    model_options o = options(&file, "tiny");
+    CHECK_OK(ctx, gsf_write_file(ctx, file.path, "x", 1));
+    CHECK_RESULT(ctx, model_make(ctx, &o, reports), GSF_ERROR_IO);
+    o.out = program.path;
+    o.shards = 999;
+    CHECK_RESULT(ctx, model_make(ctx, &o, reports), GSF_ERROR_INVALID_ARGUMENT);
+    o.shards = 1;
+    gsf_request_cancel(ctx);
+    CHECK_RESULT(ctx, model_make(ctx, &o, reports), GSF_ERROR_CANCELLED);
+    gsf_clear_cancel(ctx);
+    CHECK(!exists(&program, "transformer/" MODEL_SINGLE) && !exists(&program, "transformer/" MODEL_SINGLE ".tmp"));
+
+    CHECK(run(NULL, NULL, NULL) == 2);
+    CHECK(run(program.path, "--size", "huge") == 2);
+    CHECK(run(program.path, "--seed", "-1") == 2);
+    CHECK(run(program.path, "--parts", "vae,") == 2);
+    CHECK(run(program.path, "--shards", "0") == 2);
+    CHECK(run(program.path, "--dtype", NULL) == 2);
+    CHECK(run(file.path, "--size", "tiny") == 1);
+    CHECK(run(program.path, "--size", "tiny") == 0);
+}
+
+int main(void) {
+    gsf_context ctx;
+    test_context_init(&ctx);
+    check_same(&ctx);
+    check_full(&ctx);
+    check_golden(&ctx);
+    check_runs(&ctx);
+    check_errors(&ctx);
+    return test_report();
+}
