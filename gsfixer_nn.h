@@ -362,8 +362,9 @@ GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* tr
 
 // Reference tokens for the cross-attention: the sum of both projections. dino (tokens, dino_channels), vggt (tokens,
 // vggt_channels), either NULL: left out (the paper's ablation). out: (tokens, width).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer, int64_t tokens,
-                                                           const float* dino, const float* vggt, float* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                           int64_t tokens, const float* dino, const float* vggt,
+                                                           float* out);
 
 typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_input; zero it, set threshold, destroy when done
     float threshold; // a step whose first block changes less than this (relative L1) reuses what the others did; 0: never
@@ -441,15 +442,16 @@ typedef struct gsf_nn_sample_stats {
 } gsf_nn_sample_stats;
 
 // The restored video (3, frames, height, width), not clamped, about [-1,1]. stats may be NULL.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
-                                               const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
-                                               gsf_nn_sample_stats* stats);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                               const gsf_nn_vae* vae, const gsf_nn_schedule* schedule,
+                                               const gsf_nn_sample_desc* desc, float* out, gsf_nn_sample_stats* stats);
 
 typedef struct gsf_nn_cost { double bytes, flops; } gsf_nn_cost; // anonymous memory at the peak; operations
 
 // What gsf_nn_sample will take, before it runs; refuses what it would refuse.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer,
-                                                    const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc, gsf_nn_cost* out);
+                                                    const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
+                                                    gsf_nn_cost* out);
 
 // ---- the restorer `dit` ---------------------------------------------------------------
 
@@ -4467,7 +4469,8 @@ static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const 
 }
 
 // Keys and values of the references for one block: (2, reference tokens, width).
-static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attention* a, const float* references, float* kv) {
+static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attention* a, const float* references,
+                                        float* kv) {
     const gsf_nn_transformer* c = run->net;
     const int64_t r = run->in->reference_tokens, d = run->width;
     GSF__TRY(gsf__dit_linear(run, references, r, a->k_weight, a->k_bias, GSF_NN_LINEAR, kv));
@@ -4732,8 +4735,9 @@ static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
     const float eps = (float)c->norm_eps;
     float *m = run->modulation, *normed = run->normed;
     run->vectors_used = 0;
-    gsf_nn_layer_norm(run->ctx, run->x + (row * run->tokens + run->text) * d, run->video, d,
-                      gsf__dit_vector(run, run->nets->norm_final_weight), gsf__dit_vector(run, run->nets->norm_final_bias), eps, normed);
+    const float* weight = gsf__dit_vector(run, run->nets->norm_final_weight);
+    const float* bias = gsf__dit_vector(run, run->nets->norm_final_bias);
+    gsf_nn_layer_norm(run->ctx, run->x + (row * run->tokens + run->text) * d, run->video, d, weight, bias, eps, normed);
     gsf__dit_tap(run, "norm_final", row, normed, run->video, d);
     GSF__TRY(gsf__dit_linear(run, run->time + row * c->time_channels, 1, run->nets->norm_out.linear_weight,
                              run->nets->norm_out.linear_bias, GSF_NN_LINEAR, m));
@@ -4823,17 +4827,21 @@ static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
 
 // ---- the pass as a whole
 
-static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in) {
-    const gsf_nn_transformer* c = net;
-    if (!in->hidden || !in->text || !in->timesteps || in->batch < 1 || in->frames < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: latents, text or time steps are missing");
-    if (in->height < c->patch || in->width < c->patch || in->height % c->patch || in->width % c->patch)
+static gsf_result gsf__dit_check_size(gsf_context* ctx, const gsf_nn_transformer* c, int32_t height, int32_t width) {
+    if (height < c->patch || width < c->patch || height % c->patch || width % c->patch)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d x %d latents are no multiple of the patch %d",
-                        (int)in->width, (int)in->height, (int)c->patch);
-    if (c->learned_positions && (in->height != c->sample_height || in->width != c->sample_width))
+                        (int)width, (int)height, (int)c->patch);
+    if (c->learned_positions && (height != c->sample_height || width != c->sample_width))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
                         "transformer: latents of %d x %d; its learned positions are for %d x %d (the official code refuses "
-                        "other sizes as well)", (int)in->width, (int)in->height, (int)c->sample_width, (int)c->sample_height);
+                        "other sizes as well)", (int)width, (int)height, (int)c->sample_width, (int)c->sample_height);
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* c, const gsf_nn_transformer_input* in) {
+    if (!in->hidden || !in->text || !in->timesteps || in->batch < 1 || in->frames < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: latents, text or time steps are missing");
+    GSF__TRY(gsf__dit_check_size(ctx, c, in->height, in->width));
     if (in->text_tokens < 0 || (c->learned_positions && in->text_tokens && in->text_tokens != c->text_tokens))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d text tokens, not %d", (int)in->text_tokens,
                         (int)c->text_tokens);
@@ -6128,7 +6136,7 @@ static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transfor
     const int32_t step = 2 * v->temporal_ratio, square = v->spatial_ratio * t->patch;
     if (t->temporal_ratio != v->temporal_ratio || t->in_channels != 2 * v->latent_channels ||
         t->out_channels != v->latent_channels)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent channels) do not fit",
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent) do not fit",
                         (int)t->in_channels, (int)t->out_channels, (int)v->latent_channels);
     if (d->frames < 1 || (d->frames - 1) % step)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: %d frames; it takes 1, %d, %d, ...", (int)d->frames,
@@ -6136,7 +6144,7 @@ static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transfor
     if (d->height < square || d->width < square || d->height % square || d->width % square)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are no multiple of %d", (int)d->width,
                         (int)d->height, (int)square);
-    return GSF_OK;
+    return gsf__dit_check_size(ctx, t, d->height / v->spatial_ratio, d->width / v->spatial_ratio);
 }
 
 static gsf_result gsf__sample_check(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
@@ -6159,8 +6167,9 @@ static void gsf__swap_frames(const float* from, int64_t outer, int64_t inner, in
 
 static gsf_result gsf__sample_encode(gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
-    GSF__TRY(gsf_nn_vae_encode(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, run->prediction, NULL));
-    gsf__swap_frames(run->prediction, run->channels, run->frames, (int64_t)run->height * run->width,
+    float* mean = run->prediction;
+    GSF__TRY(gsf_nn_vae_encode(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, mean, NULL));
+    gsf__swap_frames(mean, run->channels, run->frames, (int64_t)run->height * run->width,
                      (float)run->vae->scaling_factor, run->control);
     return GSF_OK;
 }
@@ -6587,8 +6596,8 @@ static gsf_result gsf__dit_load_features(gsf_context* ctx, gsf__dit_restorer* r)
                           r->features.name, (long long)rows2, (long long)rows3);
     r->reference_tokens = rows2 ? rows2 : rows3;
     if (!result) {
-        r->references = (float*)gsf_alloc(ctx, (size_t)r->reference_tokens, (size_t)c->heads * (size_t)c->head_dim * sizeof(float));
-        result = r->references ? gsf_nn_project_references(ctx, &r->transformer, r->reference_tokens, tokens2, tokens3, r->references)
+        r->references = (float*)gsf_alloc(ctx, (size_t)r->reference_tokens, (size_t)gsf__dit_width(c) * sizeof(float));
+        result = r->references ? gsf_nn_project_references(ctx, c, r->reference_tokens, tokens2, tokens3, r->references)
                                : GSF_ERROR_OUT_OF_MEMORY;
     }
     gsf_free(ctx, tokens2);

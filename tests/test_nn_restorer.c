@@ -23,7 +23,8 @@ static const char* write_features(gsf_context* ctx, const char* name, const char
     gsf_nn_weights inputs, expected;
     CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden("restorer/pipeline/inputs.safetensors"), NULL, &inputs));
     CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden("restorer/pipeline/expected.safetensors"), NULL, &expected));
-    const gsf_tensor* const all[] = {gsf_nn_find_tensor(&inputs, "dino_latents"), gsf_nn_find_tensor(&inputs, "vggt_latents"),
+    const gsf_tensor* const all[] = {gsf_nn_find_tensor(&inputs, "dino_latents"),
+                                     gsf_nn_find_tensor(&inputs, "vggt_latents"),
                                      gsf_nn_find_tensor(&expected, "prompt_embeds")};
     gsf_tensor tensors[3];
     size_t count = 0;
@@ -329,7 +330,8 @@ static void test_resume(gsf_context* ctx, sample_case* s) {
         stopper stop = {ctx, 3};
         ctx->progress.progress_fn = stop_at;
         ctx->progress.user = &stop;
-        CHECK_RESULT(ctx, gsf_nn_sample(ctx, &s->net, &s->vae, &s->schedule, &s->desc, s->video, NULL), GSF_ERROR_CANCELLED);
+        CHECK_RESULT(ctx, gsf_nn_sample(ctx, &s->net, &s->vae, &s->schedule, &s->desc, s->video, NULL),
+                     GSF_ERROR_CANCELLED);
         memset(&ctx->progress, 0, sizeof ctx->progress);
         gsf_clear_cancel(ctx);
         gsf_nn_sample_stats stats = run_sample(ctx, s, s->video);
@@ -370,7 +372,7 @@ static void test_workers(const char* features, clip* c) {
     CHECK(sums[0] == sums[1]);
 }
 
-static void test_memory(const char* features, clip* c) { // allocations that fail, every one of them up to the tenth, then some
+static void test_memory(const char* features, clip* c) { // each of the first ten allocations fails, then some later ones
     counter count;
     memset(&count, 0, sizeof count);
     gsf_context ctx;
