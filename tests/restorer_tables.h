@@ -20,7 +20,8 @@ static void tables_check_rope_exact(const gsf_nn_rope_desc* d, const float* c, c
     int bad = 0;
     for (int64_t row = 0; row < (int64_t)d->frames * d->height * d->width; row++) {
         const double h = (double)(row / d->width % d->height), w = (double)(row % d->width);
-        const double bottom = (top + rows) * (d->height - 1) / d->height, right = (left + columns) * (d->width - 1) / d->width;
+        const double bottom = (top + rows) * (d->height - 1) / d->height;
+        const double right = (left + columns) * (d->width - 1) / d->width;
         const double p[3] = {(double)(row / d->width / d->height),
                              d->height > 1 ? top + h * (bottom - top) / (d->height - 1) : top,
                              d->width > 1 ? left + w * (right - left) / (d->width - 1) : left};

@@ -89,7 +89,7 @@ static lambda_point lambda_at(double bar) {
     return p;
 }
 
-// multistep_dpm_solver_second_order_update (dpmsolver++, midpoint); p[0] is where x is, p[1] before it; order 1 has no p[1].
+// multistep_dpm_solver_second_order_update (dpmsolver++, midpoint); p[0] is where x is, p[1] before it (order 2).
 static double plain_predictor(int order, lambda_point t, const lambda_point p[2], double x, const double m[2]) {
     const double h = t.l - p[0].l, r0 = order > 1 ? (p[0].l - p[1].l) / h : 1.0;
     const double d1 = order > 1 ? (m[0] - m[1]) / r0 : 0.0;

@@ -1,0 +1,112 @@
+// fuzz_safetensors.c - safetensors files and the index of a sharded model. Build line: fuzz.h, without
+//   -DGSFIXER_IMPLEMENTATION. The input is taken twice: as a file; and, split at its first zero byte, as an index.json
+//   and the bytes of every shard that it names. What was accepted is written and read again.
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_nn.h"
+
+#include "fuzz.h"
+
+typedef struct bytes { const uint8_t* data; size_t size; } bytes;
+typedef struct fuzz_files { bytes index, shard, written; int reads; } fuzz_files;
+
+enum { FOLDER = 16 }; // files that the folder of shards holds: whichever are asked for first
+
+static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
+    fuzz_files* files = (fuzz_files*)user;
+    const bytes* from = files->reads == 0 ? &files->index : &files->shard;
+    if (files->reads++ == FOLDER) return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+    *data = gsf_alloc(ctx, from->size, 1);
+    FUZZ_CHECK(*data);
+    if (from->size) memcpy(*data, from->data, from->size);
+    *size = from->size;
+    return GSF_OK;
+}
+
+static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
+    fuzz_files* files = (fuzz_files*)user;
+    uint8_t* copy = (uint8_t*)malloc(size);
+    (void)ctx, (void)path;
+    FUZZ_CHECK(copy);
+    memcpy(copy, data, size);
+    files->written.data = copy;
+    files->written.size = size;
+    return GSF_OK;
+}
+
+static uint64_t bytes_of(const gsf_tensor* t) { return (uint64_t)t->count * gsf_nn_dtype_size(t->dtype); }
+
+// Sorted names, shapes that fit, and data inside [begin, end) where that is known.
+static void check_tensors(const gsf_nn_weights* w, const uint8_t* begin, const uint8_t* end) {
+    for (size_t i = 0; i < w->tensor_count; i++) {
+        const gsf_tensor* t = &w->tensors[i];
+        int64_t count = 1;
+        float value;
+        FUZZ_CHECK(i == 0 || strcmp(w->tensors[i - 1].name, t->name) < 0);
+        FUZZ_CHECK(gsf_nn_find_tensor(w, t->name) == t);
+        for (int32_t k = 0; k < t->rank; k++) count *= t->shape[k];
+        FUZZ_CHECK(count == t->count && count >= 0 && t->rank <= GSF_NN_MAX_RANK);
+        const uint8_t* data = (const uint8_t*)t->data;
+        FUZZ_CHECK(!begin || (data >= begin && data <= end && (uint64_t)(end - data) >= bytes_of(t)));
+        if (count == 0) continue;
+        gsf_nn_read_tensor(t, 0, 1, &value);
+        gsf_nn_read_tensor(t, count - 1, 1, &value);
+    }
+}
+
+static void check_again(gsf_context* ctx, fuzz_files* files, const gsf_nn_weights* w) {
+    gsf_nn_weights again;
+    FUZZ_CHECK(gsf_nn_save_tensors(ctx, "again", w->tensors, w->tensor_count) == GSF_OK);
+    const bytes written = files->written;
+    FUZZ_CHECK(gsf_nn_open_weights_memory(ctx, "again", written.data, written.size, &again) == GSF_OK);
+    FUZZ_CHECK(again.tensor_count == w->tensor_count);
+    for (size_t i = 0; i < w->tensor_count; i++) {
+        const gsf_tensor *a = &w->tensors[i], *b = &again.tensors[i];
+        FUZZ_CHECK(strcmp(a->name, b->name) == 0 && a->dtype == b->dtype && a->rank == b->rank);
+        FUZZ_CHECK(memcmp(a->shape, b->shape, sizeof a->shape) == 0);
+        FUZZ_CHECK(memcmp(a->data, b->data, (size_t)bytes_of(a)) == 0);
+    }
+    gsf_nn_close_weights(ctx, &again);
+    free((void*)(uintptr_t)written.data);
+}
+
+static void check_refused(const gsf_context* ctx, const gsf_nn_weights* w, gsf_result result) {
+    FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED || result == GSF_ERROR_IO);
+    FUZZ_CHECK(w->tensors == NULL && w->files == NULL && strchr(ctx->error, ':') != NULL);
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
+    gsf_context ctx = fuzz_context(size);
+    gsf_nn_weights w;
+    fuzz_files files;
+    static const uint8_t none = 0;
+    memset(&files, 0, sizeof files);
+    ctx.io.read_fn = read_fn;
+    ctx.io.write_fn = write_fn;
+    ctx.io.user = &files;
+    if (!data) data = &none;
+    gsf_result result = gsf_nn_open_weights_memory(&ctx, "fuzz", data, size, &w);
+    if (result == GSF_OK) {
+        check_tensors(&w, data, data + size);
+        check_again(&ctx, &files, &w);
+    } else {
+        check_refused(&ctx, &w, result);
+        FUZZ_CHECK(result != GSF_ERROR_IO && strncmp(ctx.error, "fuzz:", 5) == 0);
+    }
+    gsf_nn_close_weights(&ctx, &w);
+
+    const uint8_t* zero = size ? (const uint8_t*)memchr(data, 0, size) : NULL;
+    if (zero) {
+        files.index.data = data;
+        files.index.size = (size_t)(zero - data);
+        files.shard.data = zero + 1;
+        files.shard.size = size - files.index.size - 1;
+        fuzz_limit = 64 * files.index.size + (64 + 6 * FOLDER) * files.shard.size + ((size_t)1 << 20);
+        result = gsf_nn_open_weights(&ctx, "fuzz.index.json", NULL, &w);
+        if (result == GSF_OK) check_tensors(&w, NULL, NULL);
+        else check_refused(&ctx, &w, result);
+        gsf_nn_close_weights(&ctx, &w);
+    }
+    FUZZ_CHECK(fuzz_live == 0);
+    return 0;
+}
