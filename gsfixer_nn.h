@@ -1561,11 +1561,11 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 // together, so for each kernel row (kt, ky) a row of output pixels is A (pixels, 3C), whose rows overlap by 2C, times
 // B (3C, outputs). Frames get a column of zeros at either side for that; rows above and below the frame are skipped.
 // Work is cut into segments of 4 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
-// packed as (kernel row, 3C, 16), cut into panels of up to 192 values x 16 (12 KiB, first level cache), and each panel is
+// packed as (kernel row, 3C, 16), cut into panels of up to 256 values x 16 (16 KiB, first level cache), and each panel is
 // multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers.
 
 enum {
-    GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 192, // pixels, outputs, values of a product
+    GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
     GSF__CONV_ROWS = 4, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of CONV_M
     GSF__CONV_TAPS = 27,
 };
