@@ -1982,12 +1982,13 @@ GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace
         fill.x = t < 0 ? desc->before + (size_t)(t + 2) * plane : desc->x + (size_t)t * plane;
         fill.out = memory + (size_t)((t + 3) % 3) * frame;
         gsf__conv_fill_frame(ctx, &fill);
+        if (t < 0) continue;
         for (int64_t i = 0; i < layer.kt; i++) { // frames before the first one repeat it
             const int64_t source = t - layer.kt + 1 + i;
             job.in[i] = memory + (size_t)(source < 0 && !desc->before ? 0 : (source + 3) % 3) * frame;
         }
         job.out = desc->y + t * job.height * job.width * layer.out;
-        if (t >= 0) gsf__conv_frame(ctx, &job, NULL);
+        gsf__conv_frame(ctx, &job, NULL);
     }
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;
