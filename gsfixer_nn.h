@@ -3061,11 +3061,11 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 // together, so for each kernel row (kt, ky) a row of output pixels is A (pixels, 3C), whose rows overlap by 2C, times
 // B (3C, outputs). Frames get a column of zeros at either side for that; rows above and below the frame are skipped.
 // Work is cut into segments of 4 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
-// packed as (kernel row, 3C, 16), cut into panels of up to 192 values x 16 (12 KiB, first level cache), and each panel is
+// packed as (kernel row, 3C, 16), cut into panels of up to 256 values x 16 (16 KiB, first level cache), and each panel is
 // multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers.
 
 enum {
-    GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 192, // pixels, outputs, values of a product
+    GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
     GSF__CONV_ROWS = 4, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of CONV_M
     GSF__CONV_TAPS = 27,
 };
@@ -3274,6 +3274,43 @@ static void gsf__conv_pack(gsf_context* ctx, const gsf__conv_layer* layer, float
     gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), gsf__conv_pack_block, &job);
 }
 
+// A 3 x 3 convolution of a frame doubled by nearest resize is four 2 x 2 convolutions of the frame itself, one for each
+// parity (py, px) of the output pixel: kernel rows that fall on the same input row are added. The two rows take the
+// kernel's rows {0} and {1, 2} at parity 0, {0, 1} and {2} at parity 1. 4/9 of the products.
+static gsf__conv_layer gsf__conv_quarter(const gsf__conv_layer* layer) { // what one parity computes
+    gsf__conv_layer quarter = *layer;
+    quarter.kernel = 2;
+    return quarter;
+}
+
+static void gsf__conv_pack_quarter(void* arg, size_t chunk, int worker) { // chunk: parity and 16 outputs
+    const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
+    const gsf__conv_layer* layer = job->layer;
+    const gsf__conv_layer quarter = gsf__conv_quarter(layer);
+    const int64_t blocks = gsf__conv_blocks(layer), parity = (int64_t)chunk / blocks, in = layer->in;
+    const int64_t first = (int64_t)chunk % blocks * GSF__CONV_N, n_end = gsf__conv_min(layer->out - first, GSF__CONV_N);
+    float* panel = job->out + (int64_t)chunk * gsf__conv_panel(&quarter);
+    (void)worker;
+    memset(panel, 0, (size_t)gsf__conv_panel(&quarter) * sizeof(float));
+    if (layer->bias) gsf_nn_read_tensor(layer->bias, first, n_end, panel);
+    for (int64_t c = 0; c < in; c++)
+        for (int64_t n = 0; n < n_end; n++) {
+            float values[9];
+            gsf_nn_read_tensor(layer->weight, ((first + n) * in + c) * 9, 9, values);
+            for (int64_t y = 0; y < 3; y++)
+                for (int64_t x = 0; x < 3; x++) {
+                    const int64_t row = y > parity / 2, column = x > parity % 2;
+                    panel[GSF__CONV_N * (1 + (row * 2 + column) * in + c) + n] += values[y * 3 + x];
+                }
+        }
+}
+
+// (parities, blocks, panel of a quarter)
+static void gsf__conv_pack_quarters(gsf_context* ctx, const gsf__conv_layer* layer, float* out) {
+    gsf__conv_pack_job job = {layer, out};
+    gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer) * 4, gsf__conv_pack_quarter, &job);
+}
+
 typedef struct gsf__conv_job { // one frame of output
     const gsf__conv_kernels* kernels;
     const float* in[3];              // kt input frames, oldest first
@@ -3283,8 +3320,9 @@ typedef struct gsf__conv_job { // one frame of output
     int64_t stride, pad;             // of rows
     const float* packed;
     int64_t panel;
-    int64_t height, width, outputs, ldo;
-    float* out;                      // (height, width, ldo)
+    int64_t height, width, outputs;
+    float* out;                      // pixels ldo apart, rows out_row
+    int64_t ldo, out_row;
     int accumulate;
     int64_t groups;                  // of outputs
     double* partial;                 // (segments, groups, 2): sums and sums of squares, or NULL
@@ -3334,7 +3372,7 @@ static void gsf__conv_segment(void* arg, size_t segment, int worker) {
         gsf__conv_sum(job, y0, rows, x0, columns, b + GSF__CONV_N, tile);
         for (int64_t r = 0; r < rows; r++)
             job->kernels->store(tile + r * GSF__CONV_COLUMNS * GSF__CONV_N, columns, n, job->accumulate,
-                                job->out + ((y0 + r) * job->width + x0) * job->ldo + n0, job->ldo, sums);
+                                job->out + (y0 + r) * job->out_row + x0 * job->ldo + n0, job->ldo, sums);
         for (int64_t i = 0; partial && i < n; i++) {
             const int64_t group = (n0 + i) / (job->outputs / job->groups);
             partial[2 * group] += sums[i];
@@ -3356,7 +3394,6 @@ static void gsf__conv_frame(gsf_context* ctx, gsf__conv_job* job, double* sums) 
 typedef struct gsf__conv_fill { // one frame, made ready to be convolved
     const gsf__conv_kernels* kernels;
     const float *x, *x2;             // (height, width, channels); x2: averaged with x, or NULL
-    int doubled;                     // x is (height/2, width/2, channels), each pixel taken for 2 x 2
     int64_t height, width, channels;
     const float *mean, *table;       // mean NULL: values as they are. table: scale and offset of each pixel of a coarser
     int64_t table_width;             //   frame (.., table_width, 2, channels), or of all pixels where that is 0
@@ -3379,8 +3416,6 @@ static void gsf__conv_fill_row(const gsf__conv_fill* job, int64_t y) {
             const float* scale = job->table + at * 2 * c;
             job->kernels->norm_silu(job->x + (y * w + x) * c, c, job->mean, scale, scale + c, out + x * c);
         }
-    } else if (job->doubled) {
-        for (int64_t x = 0; x < w; x++) memcpy(out + x * c, job->x + (y / 2 * (w / 2) + x / 2) * c, pixel);
     } else if (job->x2) {
         const float *a = job->x + y * w * c, *b = job->x2 + y * w * c;
         for (int64_t i = 0; i < w * c; i++) out[i] = (a[i] + b[i]) * 0.5f;
@@ -3425,6 +3460,7 @@ static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* la
     job.height = halve ? in_height / 2 : in_height;
     job.width = halve ? in_width / 2 : in_width;
     job.outputs = job.ldo = layer->out;
+    job.out_row = job.width * job.ldo;
     job.groups = 1;
     return job;
 }
@@ -3482,12 +3518,13 @@ GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace
         fill.x = t < 0 ? desc->before + (size_t)(t + 2) * plane : desc->x + (size_t)t * plane;
         fill.out = memory + (size_t)((t + 3) % 3) * frame;
         gsf__conv_fill_frame(ctx, &fill);
+        if (t < 0) continue;
         for (int64_t i = 0; i < layer.kt; i++) { // frames before the first one repeat it
             const int64_t source = t - layer.kt + 1 + i;
             job.in[i] = memory + (size_t)(source < 0 && !desc->before ? 0 : (source + 3) % 3) * frame;
         }
         job.out = desc->y + t * job.height * job.width * layer.out;
-        if (t >= 0) gsf__conv_frame(ctx, &job, NULL);
+        gsf__conv_frame(ctx, &job, NULL);
     }
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;
@@ -5348,14 +5385,14 @@ static void gsf__vae_end(gsf__vae_run* run) {
     gsf__vae_release(run->ctx, &run->sums);
 }
 
-static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots and one frame, groups, 2) doubles
+static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots, one frame and its part; groups, 2) doubles
     run->caches = (gsf__vae_cache*)gsf_alloc_zeroed(run->ctx, (size_t)run->net->causal_count, sizeof *run->caches);
     if (!run->caches) return GSF_ERROR_OUT_OF_MEMORY;
-    return gsf__vae_grow(run, &run->sums, (GSF__VAE_SLOTS + 1) * run->net->groups * 2 * 2);
+    return gsf__vae_grow(run, &run->sums, (GSF__VAE_SLOTS + 2) * run->net->groups * 2 * 2);
 }
 
 static int64_t gsf__vae_plane(const gsf__vae_map* map) { return map->height * map->width * map->channels; }
-static double* gsf__vae_sums(const gsf__vae_run* run, int slot) { // slot GSF__VAE_SLOTS: of one frame
+static double* gsf__vae_sums(const gsf__vae_run* run, int slot) { // slot GSF__VAE_SLOTS: of one frame, + 1: a part of it
     return (double*)(void*)run->sums.data + slot * run->net->groups * 2;
 }
 static int64_t gsf__vae_groups(const gsf__vae_run* run, int64_t channels) {
@@ -5414,6 +5451,7 @@ static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const
         job.origin = 0;
         job.out = table + i * c;
         job.ldo = 2 * c;
+        job.out_row = run->z.width * job.ldo;
         gsf__conv_frame(run->ctx, &job, NULL);
     }
     gsf__parallel_for(run->ctx, (size_t)(run->z.frames * run->z.height), gsf__vae_blend_row, &blend);
@@ -5473,7 +5511,7 @@ static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gs
     if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
 }
 
-// Room for a layer's result in slot out->slot, its weights and its sums; starts the job.
+// Room for a layer's result in slot out->slot, its weights and its sums; starts the job. The weights are not packed yet.
 static gsf_result gsf__vae_start(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in, int halve,
                                  gsf__vae_map* out, gsf__conv_job* job) {
     GSF__TRY(gsf__check_cancel(run->ctx));
@@ -5483,9 +5521,7 @@ static gsf_result gsf__vae_start(gsf__vae_run* run, const gsf__conv_layer* layer
     job->groups = gsf__vae_groups(run, layer->out);
     GSF__TRY(gsf__vae_grow(run, &run->partial, gsf__conv_segments(job) * job->groups * 2 * 2));
     job->partial = (double*)(void*)run->partial.data;
-    if (run->dry) return GSF_OK;
-    gsf__conv_pack(run->ctx, layer, run->packed.data);
-    memset(gsf__vae_sums(run, out->slot), 0, (size_t)run->net->groups * 2 * sizeof(double));
+    if (!run->dry) memset(gsf__vae_sums(run, out->slot), 0, (size_t)run->net->groups * 2 * sizeof(double));
     return GSF_OK;
 }
 
@@ -5541,6 +5577,7 @@ static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* laye
     GSF__TRY(gsf__vae_start(run, layer, in, 0, out, &job));
     gsf__vae_count(run, layer, out, out->frames);
     if (run->dry) return GSF_OK;
+    gsf__conv_pack(run->ctx, layer, run->packed.data);
     float* const ring[3] = {cache->frames[0].data, cache->frames[1].data, run->spare.data};
     int before = cache->last[0], last = cache->last[1];
     job.accumulate = accumulate;
@@ -5576,6 +5613,7 @@ static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* la
     GSF__TRY(gsf__vae_start(run, layer, in, 0, out, &job));
     gsf__vae_count(run, layer, out, out->frames);
     if (run->dry) return GSF_OK;
+    gsf__conv_pack(run->ctx, layer, run->packed.data);
     job.in_stride = in->width * in->channels;
     job.origin = 0;
     job.partial = NULL; // conv2 will be added
@@ -5607,38 +5645,51 @@ static int64_t gsf__vae_double_source(int64_t t, int64_t frames, int time) {
     return !time || frames == 1 ? t : frames % 2 ? (t + 1) / 2 : t / 2;
 }
 
+// One frame of gsf__vae_double: `job` for parity (0, 0) of a `width` wide input, packed weights of all four.
+static void gsf__vae_double_frame(gsf__vae_run* run, const gsf__conv_layer* quarter, const gsf__conv_job* job, float* out) {
+    double* sums = gsf__vae_sums(run, GSF__VAE_SLOTS);
+    double* part = gsf__vae_sums(run, GSF__VAE_SLOTS + 1);
+    memset(sums, 0, (size_t)run->net->groups * 2 * sizeof(double));
+    for (int64_t parity = 0; parity < 4; parity++) {
+        const int64_t py = parity / 2, px = parity % 2;
+        gsf__conv_job one = *job;
+        one.pad = 1 - py;
+        one.origin = px * quarter->in;
+        one.packed += parity * gsf__conv_packed(quarter);
+        one.ldo = 2 * quarter->out;
+        one.out_row = 2 * job->width * one.ldo;
+        one.out = out + py * job->width * one.ldo + px * quarter->out;
+        gsf__conv_frame(run->ctx, &one, part);
+        for (int64_t i = 0; i < run->net->groups * 2; i++) sums[i] += part[i];
+    }
+}
+
 // Nearest resize to twice the size and, with `time`, twice the frames, then a 2D convolution, once for frames that are
 // alike.
 static gsf_result gsf__vae_double(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
+    const gsf__conv_layer quarter = gsf__conv_quarter(&block->sampler);
     gsf__conv_job job;
-    gsf__conv_fill fill;
-    gsf__vae_map in = *x, out = *x;
-    in.height *= 2;
-    in.width *= 2;
-    out = in;
+    gsf__vae_map out = *x;
+    out.height *= 2;
+    out.width *= 2;
     out.slot = gsf__vae_free_slot(x->slot, -1);
     if (block->time && x->frames > 1) out.frames = 2 * x->frames - x->frames % 2;
     const int64_t plane = gsf__vae_plane(&out);
-    GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(in.height, in.width, in.channels)));
-    GSF__TRY(gsf__vae_start(run, &block->sampler, &in, 0, &out, &job));
-    gsf__vae_count(run, &block->sampler, &out, x->frames);
-    memset(&fill, 0, sizeof fill);
-    fill.doubled = 1;
-    fill.height = in.height;
-    fill.width = in.width;
-    fill.channels = in.channels;
-    fill.out = run->spare.data;
+    GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(x->height, x->width, x->channels)));
+    GSF__TRY(gsf__vae_grow(run, &run->packed, 4 * gsf__conv_packed(&quarter)));
+    GSF__TRY(gsf__vae_start(run, &quarter, x, 0, &out, &job));
+    gsf__vae_count(run, &quarter, &out, x->frames);
+    if (!run->dry) gsf__conv_pack_quarters(run->ctx, &block->sampler, run->packed.data);
     job.in[0] = run->spare.data;
     for (int64_t t = 0; !run->dry && t < out.frames; t++) {
         const int64_t source = gsf__vae_double_source(t, x->frames, block->time);
-        job.out = run->slots[out.slot].data + t * plane;
+        float* y = run->slots[out.slot].data + t * plane;
         if (t > 0 && source == gsf__vae_double_source(t - 1, x->frames, block->time)) {
-            memcpy(job.out, job.out - plane, (size_t)plane * sizeof(float));
+            memcpy(y, y - plane, (size_t)plane * sizeof(float));
         } else {
             GSF__TRY(gsf__check_cancel(run->ctx));
-            fill.x = run->slots[x->slot].data + source * gsf__vae_plane(x);
-            gsf__conv_fill_frame(run->ctx, &fill);
-            gsf__conv_frame(run->ctx, &job, gsf__vae_sums(run, GSF__VAE_SLOTS));
+            gsf__vae_fill(run, NULL, x, source, run->spare.data);
+            gsf__vae_double_frame(run, &quarter, &job, y);
         }
         gsf__vae_add_sums(run, out.slot);
     }
@@ -5659,6 +5710,7 @@ static gsf_result gsf__vae_halve(gsf__vae_run* run, const gsf__vae_block* block,
     GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(x->height, x->width, x->channels)));
     GSF__TRY(gsf__vae_start(run, &block->sampler, x, 1, &out, &job));
     gsf__vae_count(run, &block->sampler, &out, out.frames);
+    if (!run->dry) gsf__conv_pack(run->ctx, &block->sampler, run->packed.data);
     memset(&fill, 0, sizeof fill);
     fill.height = x->height;
     fill.width = x->width;
