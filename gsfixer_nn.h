@@ -4929,6 +4929,18 @@ static size_t gsf__dit_total(const gsf__dit_layout* l) {
     return l->x + l->normed + l->qkv + l->time + l->modulation + l->vectors + l->rotary + l->probe;
 }
 
+static void gsf__dit_share_out(gsf__dit_run* run, const gsf__dit_layout* l, float* memory) {
+    float* next = memory;
+    run->x = next, next += l->x;
+    run->normed = next, next += l->normed;
+    run->qkv = next, next += l->qkv;
+    run->time = next, next += l->time;
+    run->modulation = next, next += l->modulation;
+    run->vectors = next, next += l->vectors;
+    if (l->rotary) run->cos = next, run->sin = next + l->rotary / 2, next += l->rotary;
+    if (l->probe) run->probe = next;
+}
+
 static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
     const gsf_nn_transformer* c = run->net;
     const gsf_nn_transformer_input* in = run->in;
@@ -4968,15 +4980,7 @@ GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_tra
     const gsf__dit_layout l = gsf__dit_plan(&run, transformer);
     float* memory = (float*)gsf_alloc(ctx, gsf__dit_total(&l), sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    float* next = memory;
-    run.x = next, next += l.x;
-    run.normed = next, next += l.normed;
-    run.qkv = next, next += l.qkv;
-    run.time = next, next += l.time;
-    run.modulation = next, next += l.modulation;
-    run.vectors = next, next += l.vectors;
-    if (l.rotary) run.cos = next, run.sin = next + l.rotary / 2, next += l.rotary;
-    if (l.probe) run.probe = next;
+    gsf__dit_share_out(&run, &l, memory);
     const gsf_result result = gsf__dit_forward(&run, out);
     gsf_nn_destroy_workspace(ctx, &run.workspace);
     gsf_free(ctx, memory);

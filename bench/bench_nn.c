@@ -392,6 +392,118 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
 
 // ---- a whole transformer block ------------------------------------------------------
 
+typedef struct bench_block {
+    gsf_nn_transformer net;
+    gsf__dit_nets nets;
+    gsf__dit_block block;
+    gsf_nn_transformer_input in;
+    gsf__dit_run run;
+    gsf_tensor tensors[GSF__COUNT(gsf__dit_block_entries)];
+    float* first; // the residual stream before the block
+} bench_block;
+
+enum { BENCH_BLOCK_TEXT = 226 };
+
+// The release's sizes; `tokens` in all, text among them.
+static void bench_block_sizes(bench_block* b, int64_t tokens, int64_t references) {
+    b->net.heads = 48;
+    b->net.head_dim = 64;
+    b->net.layers = 1;
+    b->net.in_channels = 32;
+    b->net.out_channels = 16;
+    b->net.text_tokens = BENCH_BLOCK_TEXT;
+    b->net.text_channels = 4096;
+    b->net.time_channels = 512;
+    b->net.patch = 1;
+    b->net.attention_bias = b->net.rotary_positions = 1;
+    b->net.norm_eps = 1e-5;
+    b->in.batch = b->in.reference_batch = b->in.frames = b->in.height = 1;
+    b->in.width = (int32_t)(tokens - BENCH_BLOCK_TEXT);
+    b->in.reference_tokens = references;
+}
+
+// Weights of the block, one after another in `memory`, of a size that keeps the stream's.
+static size_t bench_block_weights(bench_block* b, gsf_nn_dtype dtype, char* memory) {
+    size_t used = 0;
+    for (size_t i = 0; i < GSF__COUNT(gsf__dit_block_entries); i++) {
+        const gsf__dit_entry* e = &gsf__dit_block_entries[i];
+        gsf_tensor* t = &b->tensors[i];
+        memset(t, 0, sizeof *t);
+        t->name = e->name;
+        t->dtype = dtype;
+        t->count = 1;
+        for (const char* c = e->shape; *c; c++) t->count *= t->shape[t->rank++] = gsf__dit_dimension(&b->net, *c);
+        t->data = memory + used;
+        const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(dtype);
+        if (memory) {
+            // values of [1/4, 1/2) in a vector; of a matrix all bits but the exponent's, which makes them 1/128 and less
+            bench_fill(memory + used, bytes, dtype, i + 1);
+            for (size_t k = 1; t->rank > 1 && k < bytes; k += 2)
+                if (dtype == GSF_NN_BF16 || k % 4 == 3) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
+        }
+        used += (bytes + 63) / 64 * 64;
+        const gsf_tensor* pointer = t;
+        memcpy((char*)&b->block + e->offset, &pointer, sizeof pointer);
+    }
+    return used;
+}
+
+static void bench_run_block(gsf_context* ctx, void* arg) {
+    bench_block* b = (bench_block*)arg;
+    memcpy(b->run.x, b->first, (size_t)(b->run.tokens * b->run.width) * sizeof(float));
+    bench_require(ctx, gsf__dit_block_forward(&b->run, 0));
+}
+
+// `references`: tokens of the cross-attention, 0: none, which is what diffusers' CogVideoXBlock computes.
+static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dtype, int64_t tokens, int64_t references) {
+    char name[96];
+    snprintf(name, sizeof name, "block %s S=%lld R=%lld", dtype == GSF_NN_F32 ? "f32" : "bf16", (long long)tokens,
+             (long long)references);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    bench_block b;
+    memset(&b, 0, sizeof b);
+    bench_block_sizes(&b, tokens, references);
+    b.in.references = references ? (float*)bench_alloc(&ctx, (size_t)references * 3072, sizeof(float)) : NULL;
+    if (references) bench_fill((void*)(uintptr_t)b.in.references, (size_t)references * 3072 * sizeof(float), GSF_NN_F32, 5);
+    char* weights = (char*)bench_alloc(&ctx, bench_block_weights(&b, dtype, NULL), 1);
+    bench_block_weights(&b, dtype, weights);
+    b.nets.blocks = &b.block;
+    b.net.nets = &b.nets;
+    b.run.ctx = &ctx;
+    b.run.net = &b.net;
+    b.run.nets = &b.nets;
+    gsf__dit_sizes(&b.run, &b.net, &b.in);
+    const gsf__dit_layout l = gsf__dit_plan(&b.run, &b.net);
+    float* memory = (float*)bench_alloc(&ctx, gsf__dit_total(&l) + l.x, sizeof(float));
+    gsf__dit_share_out(&b.run, &l, memory);
+    b.first = memory + gsf__dit_total(&l);
+    bench_fill(memory, (gsf__dit_total(&l) + l.x) * sizeof(float), GSF_NN_F32, 6); // also the rotation
+    double bytes, flops;
+    gsf_nn_transformer_cost(&b.net, &b.in, &bytes, &flops);
+    flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, flops, "flop");
+    row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_block, &b, 1.0);
+    bench_print(o, &row);
+    gsf_nn_destroy_workspace(&ctx, &b.run.workspace);
+    gsf_free(&ctx, memory);
+    gsf_free(&ctx, weights);
+    gsf_free(&ctx, (void*)(uintptr_t)b.in.references);
+}
+
+static void bench_blocks(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        if (o->quick) {
+            bench_one_block(o, threads, GSF_NN_F32, 512, 0);
+            continue;
+        }
+        bench_one_block(o, threads, GSF_NN_F32, 4096, 0);
+        bench_one_block(o, threads, GSF_NN_BF16, 4096, 0);
+        bench_one_block(o, threads, GSF_NN_BF16, 4096, 1850);
+    }
+}
+
 int main(int argc, char** argv) {
     bench_options o;
     memset(&o, 0, sizeof o);
@@ -418,5 +530,6 @@ int main(int argc, char** argv) {
     }
     bench_linears(&o, memory, size);
     gsf_free(&ctx, memory);
+    bench_blocks(&o);
     return 0;
 }
