@@ -19,6 +19,20 @@
        video           VAE: (channels, frames, height, width); transformer and latents: (frames, channels, height, width)
        pixels          [-1, 1] at the VAE's border, [0, 1] at the restorer's
 
+   STEP BY STEP (a clip restored by the paper's model; gsf_nn_make_dit puts the same behind gsfixer.h's interface)
+       gsf_nn_transformer transformer;
+       gsf_nn_vae vae;
+       gsf_nn_schedule schedule;
+       gsf_nn_make_transformer(&ctx, "MODEL/transformer", &transformer);
+       gsf_nn_make_vae(&ctx, "MODEL/vae", &vae);
+       gsf_nn_load_schedule(&ctx, "MODEL/scheduler/scheduler_config.json", GSF_NN_TABLE_DDIM, &schedule);
+       gsf_nn_project_references(&ctx, &transformer, tokens, dino, vggt, references);
+       gsf_nn_sample_desc desc;
+       memset(&desc, 0, sizeof desc);                     // zero is the default everywhere
+       desc.frames = 49; desc.height = 480; desc.width = 720;
+       desc.control = rendered; desc.text = embeddings; desc.references = references; desc.reference_tokens = tokens;
+       gsf_nn_sample(&ctx, &transformer, &vae, &schedule, &desc, restored, NULL);   // check every result
+
    MEMORY      Weight files are mapped where the platform can (else read whole) and used in place; what no layer touches
                never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
