@@ -85,7 +85,9 @@ typedef struct gsf_nn_weights { // an open file or folder of safetensors; tensor
 
 // Opens one .safetensors file, or a folder: its *.safetensors.index.json with all shards, else its only .safetensors
 // file. `prefix` (may be NULL) is the file name's start when a folder holds several ("diffusion_pytorch_model").
-// Every length, offset, shape and dtype is checked: malformed files give GSF_ERROR_FORMAT with file and byte offset.
+// Every length, offset, shape and dtype is checked: malformed files give GSF_ERROR_FORMAT with file and byte offset. The
+// tensors of a file must cover its data exactly. BOOL reads as U8; other dtypes are unsupported. With the default io hook
+// files are mapped where the platform can: nobody may shorten them while they are open.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_open_weights(gsf_context* ctx, const char* path, const char* prefix,
                                                      gsf_nn_weights* out);
 // The same over one file's bytes, which the caller keeps until the weights are closed.
