@@ -441,6 +441,7 @@ typedef struct gsf_nn_sample_desc {
     int no_reference_cache;         // project the references' keys and values anew in every step, to save memory
     uint64_t seed;
     const float* noise;             // (latent frames, latent channels, height/8, width/8) or NULL: from the seed
+    double max_bytes;               // refuse before starting what needs more memory (GSF_ERROR_OUT_OF_MEMORY); 0: no limit
     const char* checkpoint;         // file written after every step and resumed from when it fits; NULL: none
     // After every step: the latents and what the network predicted (guided); NULL in normal use.
     void (*step_fn)(void* user, int32_t step, const float* latents, const float* prediction, int64_t count);
@@ -6438,34 +6439,6 @@ static size_t gsf__sample_kv_size(const gsf__sample_run* run) {
 
 enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents, control, input 2 x 2, prediction 2
 
-GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
-                                 const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
-                                 gsf_nn_sample_stats* stats) {
-    gsf__sample_run run;
-    memset(&run, 0, sizeof run);
-    run.ctx = ctx;
-    run.net = transformer;
-    run.vae = vae;
-    run.schedule = schedule;
-    run.desc = *desc;
-    GSF__TRY(gsf__sample_check(ctx, transformer, vae, &run.desc));
-    gsf__sample_sizes(&run, &run.desc);
-    const size_t count = (size_t)run.count, kv = gsf__sample_kv_size(&run);
-    float* memory = (float*)gsf_alloc(ctx, GSF__SAMPLE_BUFFERS * count + kv, sizeof(float));
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    run.latents = memory;
-    run.control = memory + count;
-    run.input = memory + 2 * count;
-    run.prediction = memory + 6 * count;
-    run.reference_kv = kv ? memory + GSF__SAMPLE_BUFFERS * count : NULL;
-    const gsf_result result = gsf__sample_run_all(&run, out);
-    if (stats) *stats = run.stats;
-    gsf_nn_destroy_block_cache(ctx, &run.cache);
-    gsf_nn_destroy_sampler(ctx, &run.sampler);
-    gsf_free(ctx, memory);
-    return result;
-}
-
 GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
                                       const gsf_nn_sample_desc* desc, gsf_nn_cost* out) {
     gsf__sample_run run;
@@ -6507,6 +6480,45 @@ GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer
     const double own = (double)GSF__SAMPLE_BUFFERS * (double)run.count + (double)gsf__sample_kv_size(&run);
     out->bytes = bytes + own * sizeof(float);
     return GSF_OK;
+}
+
+static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
+                                           const gsf_nn_sample_desc* d) {
+    gsf_nn_cost cost;
+    if (!(d->max_bytes > 0.0)) return GSF_OK;
+    GSF__TRY(gsf_nn_sample_cost(ctx, t, v, d, &cost));
+    if (cost.bytes <= d->max_bytes) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are "
+                    "allowed", (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
+}
+
+GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                 const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
+                                 gsf_nn_sample_stats* stats) {
+    gsf__sample_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.net = transformer;
+    run.vae = vae;
+    run.schedule = schedule;
+    run.desc = *desc;
+    GSF__TRY(gsf__sample_check(ctx, transformer, vae, &run.desc));
+    GSF__TRY(gsf__sample_check_memory(ctx, transformer, vae, &run.desc));
+    gsf__sample_sizes(&run, &run.desc);
+    const size_t count = (size_t)run.count, kv = gsf__sample_kv_size(&run);
+    float* memory = (float*)gsf_alloc(ctx, GSF__SAMPLE_BUFFERS * count + kv, sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    run.latents = memory;
+    run.control = memory + count;
+    run.input = memory + 2 * count;
+    run.prediction = memory + 6 * count;
+    run.reference_kv = kv ? memory + GSF__SAMPLE_BUFFERS * count : NULL;
+    const gsf_result result = gsf__sample_run_all(&run, out);
+    if (stats) *stats = run.stats;
+    gsf_nn_destroy_block_cache(ctx, &run.cache);
+    gsf_nn_destroy_sampler(ctx, &run.sampler);
+    gsf_free(ctx, memory);
+    return result;
 }
 
 // ---- >>nn restorer --------------------------------------------------------------

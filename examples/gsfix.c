@@ -415,6 +415,7 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     d.sample.guidance_end = (float)o->guidance_until;
     d.sample.strength = (float)o->strength;
     d.sample.block_cache = (float)o->block_cache;
+    d.sample.max_bytes = gsfix_physical_memory();
     return d;
 }
 

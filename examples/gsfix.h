@@ -46,6 +46,7 @@ typedef struct gsfix_names { char** names; size_t count; } gsfix_names;
 
 double gsfix_now(void); // seconds, monotonic
 uint64_t gsfix_peak_memory(void);
+double gsfix_physical_memory(void); // bytes that the machine has; 0: unknown
 gsfix_path gsfix_pathf(const char* format, ...) GSF_PRINTF(1, 2);
 int gsfix_exists(const char* path);
 int gsfix_is_folder(const char* path);

@@ -279,6 +279,7 @@ static void test_bad_sample(gsf_context* ctx, sample_case* s) {
     s->desc.steps = -1; EXPECT(GSF_ERROR_INVALID_ARGUMENT, "steps");
     s->desc.strength = 1.5f; EXPECT(GSF_ERROR_INVALID_ARGUMENT, "strength");
     s->desc.guidance = 0.5f; EXPECT(GSF_ERROR_INVALID_ARGUMENT, "guidance");
+    s->desc.max_bytes = 1e4; EXPECT(GSF_ERROR_OUT_OF_MEMORY, "need 0.0");
     s->desc._end_canary = 3; EXPECT(GSF_ERROR_INVALID_ARGUMENT, "zeroed");
     s->desc.checkpoint = test_scratch("no/such/folder"); EXPECT(GSF_ERROR_IO, "no/such/folder");
 #undef EXPECT
