@@ -1544,43 +1544,62 @@ GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, float* t
     _mm256_storeu_ps(to + 7 * to_ld, _mm256_permute2f128_ps(b3, b7, 0x31));
 }
 
-// Added to a number of [-126, 129], it leaves the nearest integer n in the low bits as n + 126, which shifted by 23 are
-// the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial therefore gives 2 * 2^f, and all finite powers
-// come out of one multiplication.
-#define GSF__NN_ROUNDER 12583038.0f
+// Constants of 2^x. Loops that hold them in registers, where they would rather be read again and again, pin them.
+typedef struct gsf__nn_exp2 { __m256 lowest, rounder, c0, c1, c2, c3, c4, c5, c6; } gsf__nn_exp2;
 
-// 2^(n + f) for rounded = n + GSF__NN_ROUNDER, |f| <= 1/2. The polynomial is that of Cephes' exp2f.
-GSF__INLINE_AVX2 __m256 gsf__nn_power8(__m256 rounded, __m256 f) {
-    __m256 p = _mm256_set1_ps(2.0f * 1.535336188319500e-4f);
-    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 1.339887440266574e-3f));
-    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 9.618437357674640e-3f));
-    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 5.550332471162809e-2f));
-    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 2.402264791363012e-1f));
-    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f * 6.931472028550421e-1f));
-    p = _mm256_fmadd_ps(p, f, _mm256_set1_ps(2.0f));
+// The rounder, added to a number of [-126, 129], leaves the nearest integer n in the low bits as n + 126, which shifted by
+// 23 are the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial (that of Cephes' exp2f) therefore gives
+// 2 * 2^f, and all finite powers come out of one multiplication.
+GSF__INLINE_AVX2 gsf__nn_exp2 gsf__nn_exp2_constants(int pinned) {
+    gsf__nn_exp2 c;
+    c.lowest = _mm256_set1_ps(-126.0f);
+    c.rounder = _mm256_set1_ps(12583038.0f);
+    c.c0 = _mm256_set1_ps(2.0f);
+    c.c1 = _mm256_set1_ps(2.0f * 6.931472028550421e-1f);
+    c.c2 = _mm256_set1_ps(2.0f * 2.402264791363012e-1f);
+    c.c3 = _mm256_set1_ps(2.0f * 5.550332471162809e-2f);
+    c.c4 = _mm256_set1_ps(2.0f * 9.618437357674640e-3f);
+    c.c5 = _mm256_set1_ps(2.0f * 1.339887440266574e-3f);
+    c.c6 = _mm256_set1_ps(2.0f * 1.535336188319500e-4f);
+    if (pinned) {
+        __asm__("" : "+x"(c.lowest), "+x"(c.rounder), "+x"(c.c0), "+x"(c.c1), "+x"(c.c2));
+        __asm__("" : "+x"(c.c3), "+x"(c.c4), "+x"(c.c5), "+x"(c.c6));
+    }
+    return c;
+}
+
+// 2^(n + f) for rounded = n + rounder, |f| <= 1/2.
+GSF__INLINE_AVX2 __m256 gsf__nn_power8(const gsf__nn_exp2* c, __m256 rounded, __m256 f) {
+    __m256 p = _mm256_fmadd_ps(c->c6, f, c->c5);
+    p = _mm256_fmadd_ps(p, f, c->c4);
+    p = _mm256_fmadd_ps(p, f, c->c3);
+    p = _mm256_fmadd_ps(p, f, c->c2);
+    p = _mm256_fmadd_ps(p, f, c->c1);
+    p = _mm256_fmadd_ps(p, f, c->c0);
     return p * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_castps_si256(rounded), 23));
 }
 
 // 2^x for x <= 129 or NaN: relative error below 2e-7, 2^0 = 1, results below 2^-125.5 (1.7e-38) are 0, a NaN stays.
-GSF__INLINE_AVX2 __m256 gsf__nn_exp2_low8(__m256 x) {
-    const __m256 rounder = _mm256_set1_ps(GSF__NN_ROUNDER);
-    x = _mm256_max_ps(_mm256_set1_ps(-126.0f), x); // a NaN is the second operand, which max returns then
-    const __m256 rounded = x + rounder;
-    return gsf__nn_power8(rounded, x - (rounded - rounder));
+GSF__INLINE_AVX2 __m256 gsf__nn_exp2_low8(const gsf__nn_exp2* c, __m256 x) {
+    x = _mm256_max_ps(c->lowest, x); // a NaN is the second operand, which max returns then
+    const __m256 rounded = x + c->rounder;
+    return gsf__nn_power8(c, rounded, x - (rounded - c->rounder));
 }
 
 // 2^x, as above, for all x; inf above 128.
 GSF__INLINE_AVX2 __m256 gsf__nn_exp2_8(__m256 x) {
-    return gsf__nn_exp2_low8(_mm256_min_ps(_mm256_set1_ps(129.0f), x));
+    const gsf__nn_exp2 c = gsf__nn_exp2_constants(0);
+    return gsf__nn_exp2_low8(&c, _mm256_min_ps(_mm256_set1_ps(129.0f), x));
 }
 
 // e^x for all x: relative error below 2e-7, results below 1.7e-38 are 0, inf above the largest float, a NaN stays.
 GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) {
-    const __m256 rounder = _mm256_set1_ps(GSF__NN_ROUNDER), log2_e = _mm256_set1_ps(1.44269504f);
+    const gsf__nn_exp2 c = gsf__nn_exp2_constants(0);
+    const __m256 log2_e = _mm256_set1_ps(1.44269504f);
     x = _mm256_min_ps(_mm256_set1_ps(89.4f), _mm256_max_ps(_mm256_set1_ps(-87.4f), x)); // -126.1 and 129 in powers of 2
-    const __m256 rounded = _mm256_fmadd_ps(x, log2_e, rounder), n = rounded - rounder;
+    const __m256 rounded = _mm256_fmadd_ps(x, log2_e, c.rounder), n = rounded - c.rounder;
     const __m256 f = _mm256_fmadd_ps(x, _mm256_set1_ps(1.92596299e-8f), _mm256_fmsub_ps(x, log2_e, n)); // log2 e, low part
-    return gsf__nn_power8(rounded, f);
+    return gsf__nn_power8(&c, rounded, f);
 }
 
 #endif // GSF__X86
@@ -1677,13 +1696,14 @@ GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, fl
     const float factor = scale * 1.44269504f; // powers of 2 instead of e
     const float top = gsf__nn_top(x, count, factor);
     const __m256 f = _mm256_set1_ps(factor), t = _mm256_set1_ps(top);
+    const gsf__nn_exp2 c = gsf__nn_exp2_constants(1);
     double sum = 0.0;
     int64_t i = 0;
     while (i + 8 <= count) { // float sums of short stretches
         const int64_t end = gsf__nn_min(i + 512, count);
         __m256 part = _mm256_setzero_ps();
         for (; i + 8 <= end; i += 8) {
-            const __m256 p = gsf__nn_exp2_low8(_mm256_fmsub_ps(_mm256_loadu_ps(x + i), f, t));
+            const __m256 p = gsf__nn_exp2_low8(&c, _mm256_fmsub_ps(_mm256_loadu_ps(x + i), f, t));
             _mm256_storeu_ps(y + i, p);
             part = part + p;
         }
@@ -1691,7 +1711,7 @@ GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, fl
     }
     const __m256i mask = gsf__nn_mask8(count - i);
     if (i < count) {
-        const __m256 p = gsf__nn_exp2_low8(_mm256_fmsub_ps(_mm256_maskload_ps(x + i, mask), f, t));
+        const __m256 p = gsf__nn_exp2_low8(&c, _mm256_fmsub_ps(_mm256_maskload_ps(x + i, mask), f, t));
         _mm256_maskstore_ps(y + i, mask, p);
         sum += (double)gsf__nn_sum8(_mm256_and_ps(p, _mm256_castsi256_ps(mask)));
     }
@@ -2728,7 +2748,7 @@ GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
        weights  p = 2^(p - top)       with the largest logit so far; what stood before is scaled by 2^(top before - top)
        values   out = out * that + p v
    Packed queries, sums and one block of keys stay in cache however many keys there are.
-       q    [group][dim][6]           out  [group][panel][6][16]      panel: 16 columns of v, padded with zeros
+       q    [group][dim][8], 6 used    out  [group][panel][6][16]      panel: 16 columns of v, padded with zeros
        k    [panel of 16 keys][dim][16]    v    [panel][key][16]      p    [query][key] */
 enum {
     GSF__ATT_GROUP = 6,       // queries of a register tile: 6 x 16 sums, two of keys and a broadcast are 15 registers
@@ -2801,7 +2821,7 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
     s.out = s.v + GSF__ATT_KEYS * GSF__ATT_PANEL * job->panels;
     s.sum = s.out + groups * GSF__ATT_TILE * job->panels;
     s.q = s.sum + groups * GSF__ATT_GROUP * 8;
-    s.top = s.q + groups * GSF__ATT_GROUP * dim;
+    s.top = s.q + groups * 8 * dim;
     return s;
 }
 
@@ -2810,17 +2830,19 @@ GSF__INLINE_AVX2 void gsf__attention_fetch(const float* from, int64_t row, int64
     for (int64_t i = 0; row < rows && i < dim; i += 16) _mm_prefetch((const char*)(from + row * ld + i), _MM_HINT_T0);
 }
 
-GSF__TARGET_AVX2 static void gsf__attention_pack_queries(const gsf__attention_job* job, const float* q, int64_t queries,
+GSF__TARGET_AVX2 static void gsf__attention_pack_queries(const gsf__attention_job* job, const float* from, int64_t queries,
                                                          float* packed) {
-    const gsf_nn_attention_desc* d = &job->desc;
-    const float factor = d->scale * 1.44269504f; // powers of 2 instead of e
-    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += GSF__ATT_GROUP * d->head_dim)
-        for (int r = 0; r < GSF__ATT_GROUP; r++) {
-            const float* row = q + (first + r) * d->ldq;
-            gsf__attention_fetch(q, first + r + GSF__ATT_AHEAD, queries, d->ldq, d->head_dim);
-            for (int32_t i = 0; i < d->head_dim; i++)
-                packed[i * GSF__ATT_GROUP + r] = first + r < queries ? row[i] * factor : 0.0f;
-        }
+    const int64_t ld = job->desc.ldq, dim = job->desc.head_dim;
+    const __m256 factor = _mm256_set1_ps(job->desc.scale * 1.44269504f); // powers of 2 instead of e
+    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 8 * dim) {
+        const float* row = from + first * ld;
+        int64_t i = 0;
+        for (int64_t r = first; r < first + GSF__ATT_GROUP; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
+        for (; first + 8 <= queries && i + 8 <= dim; i += 8) gsf__nn_transpose8(row + i, ld, packed + 8 * i, 8);
+        for (; i < dim; i++)
+            for (int64_t r = 0; r < 8; r++) packed[8 * i + r] = first + r < queries ? row[r * ld + i] : 0.0f;
+        for (i = 0; i < dim; i++) _mm256_storeu_ps(packed + 8 * i, factor * _mm256_loadu_ps(packed + 8 * i));
+    }
 }
 
 // Keys of `from` to panels of 16, the last one filled up with zeros.
@@ -2888,7 +2910,7 @@ GSF__TARGET_AVX2 static void gsf__attention_logits(const float* q, int64_t group
         for (int64_t g = 0; g < groups; g++) {
             __m256 c[12];
             float* to = p + g * GSF__ATT_GROUP * GSF__ATT_KEYS + panel * GSF__ATT_PANEL;
-            gsf__attention_tile(q + g * GSF__ATT_GROUP * dim, 1, GSF__ATT_GROUP, k, dim, c);
+            gsf__attention_tile(q + g * 8 * dim, 1, 8, k, dim, c);
             for (int r = 0; r < GSF__ATT_GROUP; r++) {
                 _mm256_storeu_ps(to + r * GSF__ATT_KEYS, c[2 * r]);
                 _mm256_storeu_ps(to + r * GSF__ATT_KEYS + 8, c[2 * r + 1]);
@@ -2910,6 +2932,7 @@ static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, 
 // multiplied with. A NaN does not become the top, but its weight and with it sum and output are NaN.
 GSF__TARGET_AVX2 static void gsf__attention_weights(float* p, int64_t queries, int64_t columns, float* top, float* sum,
                                                     float fade[GSF__ATT_QUERIES]) {
+    const gsf__nn_exp2 c = gsf__nn_exp2_constants(1);
     for (int64_t r = 0; r < queries; r++) {
         const float* row = p + r * GSF__ATT_KEYS;
         __m256 top0 = _mm256_set1_ps(top[r]), top1 = top0;
@@ -2923,21 +2946,18 @@ GSF__TARGET_AVX2 static void gsf__attention_weights(float* p, int64_t queries, i
     }
     for (int64_t r = 0; r < queries; r += 8) {
         const __m256i mask = gsf__nn_mask8(queries - r);
-        _mm256_maskstore_ps(fade + r, mask, gsf__nn_exp2_low8(_mm256_maskload_ps(fade + r, mask)));
+        _mm256_maskstore_ps(fade + r, mask, gsf__nn_exp2_low8(&c, _mm256_maskload_ps(fade + r, mask)));
     }
     for (int64_t r = 0; r < queries; r++) {
         float* row = p + r * GSF__ATT_KEYS;
         const __m256 t = _mm256_set1_ps(top[r]);
-        __m256 sum0 = _mm256_set1_ps(fade[r]) * _mm256_loadu_ps(sum + 8 * r), sum1 = _mm256_setzero_ps();
-        for (int64_t j = 0; j < columns; j += 16) {
-            const __m256 p0 = gsf__nn_exp2_low8(_mm256_loadu_ps(row + j) - t);
-            const __m256 p1 = gsf__nn_exp2_low8(_mm256_loadu_ps(row + j + 8) - t);
-            _mm256_storeu_ps(row + j, p0);
-            _mm256_storeu_ps(row + j + 8, p1);
-            sum0 = sum0 + p0;
-            sum1 = sum1 + p1;
+        __m256 total = _mm256_set1_ps(fade[r]) * _mm256_loadu_ps(sum + 8 * r);
+        for (int64_t j = 0; j < columns; j += 8) {
+            const __m256 weight = gsf__nn_exp2_low8(&c, _mm256_loadu_ps(row + j) - t);
+            _mm256_storeu_ps(row + j, weight);
+            total = total + weight;
         }
-        _mm256_storeu_ps(sum + 8 * r, sum0 + sum1);
+        _mm256_storeu_ps(sum + 8 * r, total);
     }
 }
 
@@ -2948,6 +2968,7 @@ GSF__TARGET_AVX2 static void gsf__attention_values(const float* p, int64_t group
         for (int64_t g = 0; g < groups; g++) {
             __m256 c[12];
             float* to = out + (g * panels + panel) * GSF__ATT_TILE;
+            for (int i = 0; i < GSF__ATT_TILE; i += 16) _mm_prefetch((const char*)(to + i), _MM_HINT_T0);
             gsf__attention_tile(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, keys, c);
             for (int r = 0; r < GSF__ATT_GROUP; r++, to += GSF__ATT_PANEL) {
                 const __m256 f = _mm256_broadcast_ss(fade + g * GSF__ATT_GROUP + r);
@@ -2991,7 +3012,7 @@ GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, 
         gsf__attention_pack_values(job, d->v + key * d->ldv + column, keys, s.v);
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__nn_min(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
-            gsf__attention_logits(s.q + r * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
+            gsf__attention_logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
             const unsigned char* mask = d->mask ? d->mask + (head * d->queries + first + r) * d->keys + key : NULL;
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
             gsf__attention_weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
@@ -3032,8 +3053,8 @@ static size_t gsf__attention_floats(const gsf__attention_job* job, int packed) {
     const gsf_nn_attention_desc* d = &job->desc;
     const size_t dim = (size_t)d->head_dim, padded = (size_t)job->panels * GSF__ATT_PANEL;
     size_t total;
-    if (packed) { // p, k, v; then a query's share of out, sum, q and top
-        if (!gsf__mul_size((size_t)job->range_size, padded + 8 + dim + 1, &total)) return 0;
+    if (packed) { // p, k, v; then a query's share of out, sum, q (8 places for 6) and top
+        if (!gsf__mul_size((size_t)job->range_size, padded + 8 + dim + (dim + 2) / 3 + 1, &total)) return 0;
         total += GSF__ATT_QUERIES * GSF__ATT_KEYS + GSF__ATT_KEYS * (dim + padded);
     } else {
         if ((uint64_t)d->keys > SIZE_MAX / 8) return 0;
