@@ -502,6 +502,8 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 #ifndef GSF_NN_IMPLEMENTED
 #define GSF_NN_IMPLEMENTED
 
+#include "gsfixer.h" // again: its internals, if all was included before without an implementation macro
+
 GSF__BEGIN_IMPLEMENTATION
 
 // ---- >>nn numbers ---------------------------------------------------------------
