@@ -2839,7 +2839,8 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_queries(const gsf__attention_jo
     for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 8 * dim) {
         const float* row = from + first * ld;
         int64_t i = 0;
-        for (int64_t r = first; r < first + GSF__ATT_GROUP; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
+        for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
+            gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
         for (; first + 8 <= queries && i + 8 <= dim; i += 8) gsf__nn_transpose8(row + i, ld, packed + 8 * i, 8);
         for (; i < dim; i++)
             for (int64_t r = 0; r < 8; r++) packed[8 * i + r] = first + r < queries ? row[r * ld + i] : 0.0f;

@@ -386,7 +386,194 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
 
 // ---- attention ----------------------------------------------------------------------
 
+typedef struct bench_attention {
+    gsf_nn_attention_desc desc;
+    gsf_nn_workspace workspace;
+} bench_attention;
+
+static void bench_run_attention(gsf_context* ctx, void* arg) {
+    bench_attention* a = (bench_attention*)arg;
+    bench_require(ctx, gsf_nn_attention(ctx, &a->workspace, &a->desc));
+}
+
+static void bench_add_error(bench_row* row, double value, double expected, double* square) { // rel_l2: squares so far
+    const double error = fabs(value - expected);
+    if (!(error <= row->error_max)) row->error_max = error;
+    row->error_rel_l2 += error * error;
+    *square += expected * expected;
+}
+
+// Against sums in double: three queries of the first and of the last head.
+static void bench_attention_error(gsf_context* ctx, const gsf_nn_attention_desc* d, bench_row* row) {
+    double *p = (double*)bench_alloc(ctx, (size_t)d->keys, sizeof(double)), square = 0.0;
+    const int64_t dim = d->head_dim, width = d->heads * dim;
+    row->error_max = row->error_rel_l2 = 0.0;
+    for (int look = 0; look < 6; look++) {
+        const int64_t r = look % 3 * (d->queries - 1) / 2, column = look < 3 ? 0 : width - dim;
+        double top = -INFINITY, sum = 0.0;
+        for (int64_t j = 0; j < d->keys; j++) {
+            p[j] = 0.0;
+            for (int64_t i = 0; i < dim; i++)
+                p[j] += (double)d->q[r * width + column + i] * (double)d->k[j * width + column + i] / sqrt((double)dim);
+            top = fmax(top, p[j]);
+        }
+        for (int64_t j = 0; j < d->keys; j++) sum += p[j] = exp(p[j] - top);
+        for (int64_t i = 0; i < dim; i++) {
+            double value = 0.0;
+            for (int64_t j = 0; j < d->keys; j++) value += p[j] * (double)d->v[j * width + column + i];
+            bench_add_error(row, (double)d->out[r * width + column + i], value / sum, &square);
+        }
+    }
+    row->error_rel_l2 = sqrt(row->error_rel_l2 / square);
+    row->reference = "float64";
+    gsf_free(ctx, p);
+}
+
+static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int threads, int32_t heads, int64_t queries,
+                                int64_t keys) {
+    char name[96];
+    snprintf(name, sizeof name, "attention f32 H=%d D=64 Q=%lld K=%lld", (int)heads, (long long)queries, (long long)keys);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, level, threads)) return;
+    const size_t q_size = (size_t)queries * (size_t)heads * 64, k_size = (size_t)keys * (size_t)heads * 64;
+    float* memory = (float*)bench_alloc(&ctx, 2 * q_size + 2 * k_size, sizeof(float));
+    bench_fill(memory, (2 * q_size + 2 * k_size) * sizeof(float), GSF_NN_F32, 4);
+    for (size_t i = 0; i < q_size + k_size; i++) memory[i] *= 4.0f; // as after a norm: logits of a few
+    bench_attention a;
+    memset(&a, 0, sizeof a);
+    a.desc.queries = queries;
+    a.desc.keys = keys;
+    a.desc.heads = heads;
+    a.desc.head_dim = 64;
+    a.desc.q = memory;
+    a.desc.k = memory + q_size;
+    a.desc.v = memory + q_size + k_size;
+    a.desc.out = memory + q_size + 2 * k_size;
+    const double flops = 4.0 * (double)queries * (double)keys * (double)heads * 64.0;
+    bench_row row = bench_make_row(name, level, threads, flops, "flop");
+    row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_attention, &a, 1.0);
+    bench_attention_error(&ctx, &a.desc, &row);
+    bench_print(o, &row);
+    gsf_nn_destroy_workspace(&ctx, &a.workspace);
+    gsf_free(&ctx, memory);
+}
+
+static void bench_attentions(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        bench_one_attention(o, GSF_CPU_SCALAR, threads, 4, 64, 256);
+        bench_one_attention(o, GSF_CPU_AVX2, threads, 4, 64, 256);
+        bench_one_attention(o, GSF_CPU_AVX2, threads, 48, 1024, 1024);
+        if (o->quick) continue;
+        bench_one_attention(o, GSF_CPU_AVX2, threads, 48, 4096, 4096);
+        bench_one_attention(o, GSF_CPU_AVX2, threads, 48, 17550, 1850);
+    }
+}
+
 // ---- norms and activations ----------------------------------------------------------
+
+typedef enum bench_kind { LAYER_NORM, MODULATED, RMS_NORM, HEAD_NORM, GROUP_NORM, SOFTMAX, GELU, SILU, KINDS } bench_kind;
+
+typedef struct bench_rows {
+    bench_kind kind;
+    int64_t rows, dim; // group norm: channels and their values
+    const float *x, *vector, *table; // vector: weight, bias, scale and shift alike; table: cosines and sines
+    float* y;
+} bench_rows;
+
+enum { BENCH_GROUPS = 32, BENCH_HEAD = 64 };
+
+static void bench_run_rows(gsf_context* ctx, void* arg) {
+    const bench_rows* b = (const bench_rows*)arg;
+    const float* v = b->vector;
+    switch (b->kind) {
+        case LAYER_NORM: gsf_nn_layer_norm(ctx, b->x, b->rows, b->dim, v, v, 1e-6f, b->y); break;
+        case MODULATED: gsf_nn_layer_norm_modulated(ctx, b->x, b->rows, b->dim, v, v, 1e-6f, v, v, b->y); break;
+        case RMS_NORM: gsf_nn_rms_norm(ctx, b->x, b->rows, b->dim, v, 1e-6f, b->y); break;
+        case HEAD_NORM:
+            gsf_nn_head_norm_rope(ctx, b->y, b->rows, b->dim, (int32_t)(b->dim / BENCH_HEAD), BENCH_HEAD, v, v, 1e-6f,
+                                  b->table, b->table, 0);
+            break;
+        case GROUP_NORM: gsf_nn_group_norm(ctx, b->x, b->rows, b->dim, BENCH_GROUPS, v, v, 1e-6f, b->y); break;
+        case SOFTMAX: gsf_nn_softmax(ctx, b->x, b->rows, b->dim, 1.0f, b->y); break;
+        case GELU: gsf_nn_activate(ctx, GSF_NN_GELU_TANH, b->x, b->rows * b->dim, b->y); break;
+        default: gsf_nn_activate(ctx, GSF_NN_SILU, b->x, b->rows * b->dim, b->y); break;
+    }
+}
+
+// The first `n` values of the result in double: a row, a group, or a head.
+static void bench_expect_rows(const bench_rows* b, int64_t n, double* out) {
+    double mean = 0.0, square = 0.0, sum = 0.0;
+    for (int64_t i = 0; i < n; i++) mean += (double)b->x[i] / (double)n;
+    if (b->kind == RMS_NORM) mean = 0.0;
+    for (int64_t i = 0; i < n; i++) square += ((double)b->x[i] - mean) * ((double)b->x[i] - mean) / (double)n;
+    for (int64_t i = 0; i < n; i++) sum += exp((double)b->x[i]);
+    for (int64_t i = 0; i < n; i++) {
+        const double w = (double)b->vector[b->kind == GROUP_NORM ? i / b->dim : i], x = (double)b->x[i];
+        out[i] = (x - mean) / sqrt(square + 1e-6) * w + (b->kind == RMS_NORM ? 0.0 : w);
+        if (b->kind == MODULATED) out[i] = out[i] * (1.0 + w) + w;
+        if (b->kind == SOFTMAX) out[i] = exp(x) / sum;
+        if (b->kind >= GELU) out[i] = bench_activation(b->kind == GELU ? GSF_NN_GELU_TANH : GSF_NN_SILU, x);
+    }
+    for (int64_t i = 0; b->kind == HEAD_NORM && i < n; i += 2) {
+        const double first = out[i], second = out[i + 1];
+        out[i] = first * (double)b->table[i] - second * (double)b->table[i];
+        out[i + 1] = second * (double)b->table[i + 1] + first * (double)b->table[i + 1];
+    }
+}
+
+static void bench_one_rows(const bench_options* o, gsf_cpu_level level, int threads, bench_kind kind, int64_t rows,
+                           int64_t dim) {
+    static const char* const names[KINDS] = {"layer_norm", "layer_norm_modulated", "rms_norm", "head_norm_rope",
+                                             "group_norm", "softmax",              "gelu",     "silu"};
+    char name[96];
+    snprintf(name, sizeof name, "%s f32 %lldx%lld", names[kind], (long long)rows, (long long)dim);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, level, threads)) return;
+    const size_t count = (size_t)rows * (size_t)dim, vectors = (size_t)(kind == GROUP_NORM ? rows : dim);
+    const size_t tables = kind == HEAD_NORM ? (size_t)rows * BENCH_HEAD : 0;
+    float* memory = (float*)bench_alloc(&ctx, 2 * count + vectors + tables, sizeof(float));
+    bench_fill(memory, (2 * count + vectors + tables) * sizeof(float), GSF_NN_F32, 5);
+    for (size_t i = 0; i < count; i++) memory[i] *= 4.0f;
+    bench_rows b;
+    b.kind = kind;
+    b.rows = rows;
+    b.dim = dim;
+    b.x = memory;
+    b.y = memory + count;
+    b.vector = memory + 2 * count;
+    b.table = memory + 2 * count + vectors;
+    const int64_t looks = kind == GROUP_NORM ? rows / BENCH_GROUPS * dim : kind == HEAD_NORM ? BENCH_HEAD : dim;
+    double *expected = (double*)bench_alloc(&ctx, (size_t)looks, sizeof(double)), square = 0.0;
+    const double bytes = 2.0 * (double)count * sizeof(float); // read once, written once
+    bench_row row = bench_make_row(name, level, threads, bytes, "B");
+    if (count > 1 << 22) row.bytes = bytes; // else the caches hold them
+    memcpy(b.y, b.x, count * sizeof(float)); // head norm works in place
+    bench_run_rows(&ctx, &b);
+    bench_expect_rows(&b, looks, expected);
+    row.error_max = row.error_rel_l2 = 0.0;
+    for (int64_t i = 0; i < looks; i++) bench_add_error(&row, (double)b.y[i], expected[i], &square);
+    row.error_rel_l2 = sqrt(row.error_rel_l2 / square);
+    row.reference = "float64";
+    bench_time(o, &ctx, &row, bench_run_rows, &b, 1.0);
+    bench_print(o, &row);
+    gsf_free(&ctx, expected);
+    gsf_free(&ctx, memory);
+}
+
+static void bench_norms(const bench_options* o) {
+    const int64_t tokens = o->quick ? 2048 : 17776;
+    for (int threads = 1; threads <= 2; threads++)
+        for (int kind = 0; kind < KINDS; kind++) {
+            int64_t rows = tokens, dim = 3072;
+            if (kind == GROUP_NORM) { rows = 128; dim = o->quick ? 57600 : 345600; }
+            if (kind == SOFTMAX) { rows = o->quick ? 512 : 4096; dim = 17776; }
+            if (kind == GELU || kind == SILU) dim = 12288;
+            bench_one_rows(o, GSF_CPU_SCALAR, threads, (bench_kind)kind, 64, 256);
+            bench_one_rows(o, GSF_CPU_AVX2, threads, (bench_kind)kind, 64, 256);
+            bench_one_rows(o, GSF_CPU_AVX2, threads, (bench_kind)kind, rows, dim);
+        }
+}
 
 // ---- convolutions -------------------------------------------------------------------
 
@@ -530,6 +717,8 @@ int main(int argc, char** argv) {
     }
     bench_linears(&o, memory, size);
     gsf_free(&ctx, memory);
+    bench_attentions(&o);
+    bench_norms(&o);
     bench_blocks(&o);
     return 0;
 }
