@@ -38,9 +38,9 @@
    THREADS     As gsfixer.h: the same bits for any number of workers.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
-   SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn norms
-               >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae >>nn sampling
-               >>nn restorer
+   SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
+               >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
+               >>nn sampling >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -128,6 +128,25 @@ typedef struct gsf_nn_linear_desc {
 // A linear layer with its activation and residual. `workspace` NULL: scratch for this call only.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace,
                                                const gsf_nn_linear_desc* desc);
+
+typedef struct gsf_nn_quantized { // a weight in 8 bits; owns its memory: destroy it
+    int64_t out, in;
+    int32_t block;             // values that the rotation mixes: a power of two up to 256; 1: none
+    int8_t* data;              // private: whole tiles, [out/16][in/4][16][4]
+    float* scales;             // private: of each output
+    size_t bytes;              // of both: about out*in
+} gsf_nn_quantized;
+
+// Symmetric 8-bit integers per output from (out, in) weights in f32, bf16 or f16, after a Hadamard rotation of blocks of
+// inputs (the largest power of two up to 256 that divides `in`), which spreads outliers. `no_rotation` leaves it out. A NaN
+// or infinity gives GSF_ERROR_NUMERIC, and the tensor's name.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* weight, int no_rotation,
+                                                        gsf_nn_quantized* out);
+GSF_API void gsf_nn_destroy_quantized(gsf_context* ctx, gsf_nn_quantized* weight);
+// gsf_nn_linear with such a weight; desc->weight is not looked at. Each row of x is rotated and rounded to 8 bits by a
+// scale of its own; sums are exact. Relative L2 error for gaussian values: 1.2e-2. A row with a NaN or infinity gives NaNs.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* workspace,
+                                                    const gsf_nn_linear_desc* desc, const gsf_nn_quantized* weight);
 
 typedef struct gsf_nn_attention_desc {
     int64_t queries, keys;     // rows of q and out; of k and v
@@ -2378,6 +2397,481 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
     job.few_pitch = gsf__round_up(job.in, 16);
     job.packed = job.few = job.bias + gsf__round_up(job.out + 16, 16);
     gsf__run_linear(ctx, &job);
+    gsf_nn_destroy_workspace(ctx, &own);
+    return GSF_OK;
+}
+
+// ---- >>nn int8 ------------------------------------------------------------------
+//
+// Linear layers in 8-bit integers: y[m][n] = sx[m] sw[n] sum_k qx[m][k] qw[n][k], q = round(value / s), s = the row's
+// largest size / 127. One large value makes s large and all others inexact, so both operands are first rotated by blocks:
+// with H the Hadamard matrix of n x n signs, (H x) . (H w) = n x . w, and an outlier is spread over its block (QuaRot,
+// Ashkboos et al. 2024). H is applied without its 1/sqrt(n); sw holds the 1/n, a power of two, so that nothing is rounded
+// for it.
+//
+//     qw [panel of 16 outputs][k/4][16][4] int8         qx [group of 6 rows][k/4][6][4] int16
+//
+// Fours are what dot-product instructions (VNNI) take. AVX2 has none, and its products of bytes add pairs in 16 bits, which
+// 2 * 127 * 127 fills: signs moved to one operand, multiply, widen, add are 4 instructions for 32 products. With both
+// operands widened to 16 bits, a panel once per block, it is 2 multiplications (vpmaddwd) and 2 additions, also 4, of which
+// nothing but the 12 sums needs a register; alone in L1 that gave 146 against 115 Gop/s a core. Either way two
+// multiplications per cycle bound it to twice the multiply-adds of float; more needs the dot-product instructions.
+// Sums are integers: the same bits for any cut, instruction set and number of workers.
+
+enum {
+    GSF__INT8_BLOCK = 256,    // longest rotation
+    GSF__INT8_DEPTH = 512,    // of a step through the inner dimension: a widened panel is 16 KiB
+    GSF__INT8_ROWS = 192,     // of a block; times depth: 192 KiB
+    GSF__INT8_COLUMNS = 384,  // its sums: 288 KiB
+    GSF__INT8_LONGEST = 131072 // 127 * 127 * this stays below 2^31
+};
+
+#ifndef GSF__INT8_HELD // a test makes it small
+#define GSF__INT8_HELD ((int64_t)1 << 24) // most 8-bit activations held at a time, 2 bytes each
+#endif
+
+typedef struct gsf__int8_kernels { // one set per instruction set
+    // Rotates blocks of `block` of the `count` values in place; their largest size then, or inf where one is NaN or inf
+    float (*rotate)(float* x, int64_t count, int64_t block);
+    // Fours of round(x * factor), `pitch` apart; count is a multiple of 4
+    void (*quantize)(const float* x, int64_t count, float factor, int16_t* out, int64_t pitch);
+    // w [k/4][16][4] to out [2][k/4][8][4]
+    void (*widen)(const int8_t* w, int64_t count, int16_t* out);
+    // sums[6][16] = a [k/4][6][4] times b [2][k/4][8][4], or += with `add`
+    void (*tile)(const int16_t* a, const int16_t* b, int64_t count, int add, int32_t* sums);
+    // out[6][16] = sums * rows[6] * columns[16]
+    void (*scale)(const int32_t* sums, const float* rows, const float* columns, float* out);
+} gsf__int8_kernels;
+
+typedef struct gsf__int8_job {
+    gsf__linear_job linear;      // desc and bias, for the end of a tile
+    const gsf__int8_kernels* kernels;
+    const gsf_nn_quantized* weight;
+    int64_t padded;              // in, up to a multiple of 4
+    int64_t depth, block_rows, block_columns, row_blocks;
+    int64_t held, first, rows;   // rows of x quantised at a time; those in work
+    int16_t* x;
+    float* scales;               // of the rows in work
+    char* workers;
+    size_t per_worker;           // bytes
+} gsf__int8_job;
+
+// ---- int8: scalar kernels
+
+static void gsf__int8_butterflies(float* x, int64_t block, int64_t half) { // one of the log2(block) steps
+    for (int64_t i = 0; i < block; i += 2 * half)
+        for (int64_t j = i; j < i + half; j++) {
+            const float a = x[j], b = x[j + half];
+            x[j] = a + b;
+            x[j + half] = a - b;
+        }
+}
+
+static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // bits of sizes are ordered, NaN and inf last
+    for (int64_t i = 0; i < count; i++) {
+        uint32_t bits;
+        memcpy(&bits, x + i, sizeof bits);
+        bits &= 0x7fffffffu;
+        if (bits > top) top = bits;
+    }
+    return top;
+}
+
+static float gsf__int8_size(uint32_t top) {
+    float size;
+    if (top > 0x7f800000u) top = 0x7f800000u;
+    memcpy(&size, &top, sizeof size);
+    return size;
+}
+
+static float gsf__int8_rotate_scalar(float* x, int64_t count, int64_t block) {
+    for (int64_t i = 0; block > 1 && i < count; i += block)
+        for (int64_t half = 1; half < block; half *= 2) gsf__int8_butterflies(x + i, block, half);
+    return gsf__int8_size(gsf__int8_top(x, count, 0));
+}
+
+static void gsf__int8_quantize_scalar(const float* x, int64_t count, float factor, int16_t* out, int64_t pitch) {
+    const float rounder = 12582912.0f; // 1.5 * 2^23: its sums are whole numbers, ties to even
+    for (int64_t k = 0; k < count; k++) out[(k >> 2) * pitch + (k & 3)] = (int16_t)((x[k] * factor + rounder) - rounder);
+}
+
+static void gsf__int8_widen_scalar(const int8_t* w, int64_t count, int16_t* out) {
+    for (int64_t k = 0; k < count; k++)
+        for (int64_t c = 0; c < GSF__TILE_COLUMNS; c++)
+            out[(c >> 3) * 8 * count + (k >> 2) * 32 + (c & 7) * 4 + (k & 3)] = w[(k >> 2) * 64 + c * 4 + (k & 3)];
+}
+
+static void gsf__int8_tile_scalar(const int16_t* a, const int16_t* b, int64_t count, int add, int32_t* sums) {
+    if (!add) memset(sums, 0, GSF__TILE_SUMS * sizeof *sums);
+    for (int64_t k = 0; k < count; k += 4, a += 4 * GSF__TILE_ROWS)
+        for (int64_t i = 0; i < GSF__TILE_ROWS; i++)
+            for (int64_t j = 0; j < GSF__TILE_COLUMNS; j++) {
+                const int16_t *p = a + 4 * i, *q = b + (j >> 3) * 8 * count + 8 * k + 4 * (j & 7);
+                sums[i * GSF__TILE_COLUMNS + j] += p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
+            }
+}
+
+static void gsf__int8_scale_scalar(const int32_t* sums, const float* rows, const float* columns, float* out) {
+    for (int i = 0; i < GSF__TILE_SUMS; i++)
+        out[i] = (float)sums[i] * rows[i / GSF__TILE_COLUMNS] * columns[i % GSF__TILE_COLUMNS];
+}
+
+static const gsf__int8_kernels gsf__int8_scalar = {gsf__int8_rotate_scalar, gsf__int8_quantize_scalar,
+                                                   gsf__int8_widen_scalar, gsf__int8_tile_scalar, gsf__int8_scale_scalar};
+
+// ---- int8: AVX2 kernels
+
+#if GSF__X86
+
+// Steps of 1, 2 and 4: each value gets its partner, plus itself or (the upper one) minus itself. The FMAs are exact there,
+// so these are the bits of the scalar kernel.
+GSF__INLINE_AVX2 __m256 gsf__int8_rotate8(__m256 v) {
+    v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, -1, 1, -1, 1, -1, 1, -1), _mm256_permute_ps(v, 0xb1));
+    v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, -1, -1, 1, 1, -1, -1), _mm256_permute_ps(v, 0x4e));
+    return _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, 1, 1, -1, -1, -1, -1), _mm256_permute2f128_ps(v, v, 1));
+}
+
+// Two steps, of `half` and twice that; half is a multiple of 8.
+GSF__INLINE_AVX2 void gsf__int8_two_steps(float* x, int64_t block, int64_t half) {
+    for (int64_t i = 0; i < block; i += 4 * half)
+        for (int64_t j = i; j < i + half; j += 8) {
+            const __m256 a = _mm256_loadu_ps(x + j), b = _mm256_loadu_ps(x + j + half);
+            const __m256 c = _mm256_loadu_ps(x + j + 2 * half), d = _mm256_loadu_ps(x + j + 3 * half);
+            const __m256 ab = _mm256_add_ps(a, b), cd = _mm256_add_ps(c, d);
+            const __m256 a_b = _mm256_sub_ps(a, b), c_d = _mm256_sub_ps(c, d);
+            _mm256_storeu_ps(x + j, _mm256_add_ps(ab, cd));
+            _mm256_storeu_ps(x + j + half, _mm256_add_ps(a_b, c_d));
+            _mm256_storeu_ps(x + j + 2 * half, _mm256_sub_ps(ab, cd));
+            _mm256_storeu_ps(x + j + 3 * half, _mm256_sub_ps(a_b, c_d));
+        }
+}
+
+GSF__INLINE_AVX2 void gsf__int8_one_step(float* x, int64_t block, int64_t half) {
+    for (int64_t i = 0; i < block; i += 2 * half)
+        for (int64_t j = i; j < i + half; j += 8) {
+            const __m256 a = _mm256_loadu_ps(x + j), b = _mm256_loadu_ps(x + j + half);
+            _mm256_storeu_ps(x + j, _mm256_add_ps(a, b));
+            _mm256_storeu_ps(x + j + half, _mm256_sub_ps(a, b));
+        }
+}
+
+GSF__TARGET_AVX2 static float gsf__int8_rotate_avx2(float* x, int64_t count, int64_t block) {
+    const __m256i size = _mm256_set1_epi32(0x7fffffff);
+    __m256i top = _mm256_setzero_si256();
+    uint32_t tops[8];
+    int64_t k = 0;
+    if (block < 8) return gsf__int8_rotate_scalar(x, count, block); // sizes of no model
+    for (int64_t i = 0; i < count; i += block) {
+        float* p = x + i;
+        int64_t half = 8;
+        for (int64_t j = 0; j < block; j += 8) _mm256_storeu_ps(p + j, gsf__int8_rotate8(_mm256_loadu_ps(p + j)));
+        for (; 4 * half <= block; half *= 4) gsf__int8_two_steps(p, block, half);
+        if (half < block) gsf__int8_one_step(p, block, half);
+    }
+    for (; k + 8 <= count; k += 8)
+        top = _mm256_max_epi32(top, _mm256_and_si256(size, _mm256_loadu_si256((const __m256i*)(const void*)(x + k))));
+    _mm256_storeu_si256((__m256i*)(void*)tops, top);
+    for (int i = 1; i < 8; i++)
+        if (tops[i] > tops[0]) tops[0] = tops[i];
+    return gsf__int8_size(tops[0]);
+}
+
+GSF__TARGET_AVX2 static void gsf__int8_quantize_avx2(const float* x, int64_t count, float factor, int16_t* out,
+                                                     int64_t pitch) {
+    const __m256 f = _mm256_set1_ps(factor);
+    int64_t k = 0;
+    for (; k + 8 <= count; k += 8, out += 2 * pitch) {
+        const __m256i v = _mm256_cvtps_epi32(_mm256_mul_ps(_mm256_loadu_ps(x + k), f));
+        const __m128i q = _mm_packs_epi32(_mm256_castsi256_si128(v), _mm256_extracti128_si256(v, 1));
+        _mm_storel_epi64((__m128i*)(void*)out, q);
+        _mm_storel_epi64((__m128i*)(void*)(out + pitch), _mm_unpackhi_epi64(q, q));
+    }
+    if (k < count) gsf__int8_quantize_scalar(x + k, count - k, factor, out, pitch);
+}
+
+GSF__TARGET_AVX2 static void gsf__int8_widen_avx2(const int8_t* w, int64_t count, int16_t* out) {
+    for (int64_t k = 0; k < count; k += 4, w += 64, out += 32)
+        for (int i = 0; i < 4; i++) {
+            const __m256i v = _mm256_cvtepi8_epi16(_mm_loadu_si128((const __m128i*)(const void*)(w + 16 * i)));
+            _mm256_storeu_si256((__m256i*)(void*)(out + (i >> 1) * 8 * count + 16 * (i & 1)), v);
+        }
+}
+
+GSF__INLINE_AVX2 __m256i gsf__int8_broadcast4(const int16_t* p) {
+    int64_t four;
+    memcpy(&four, p, sizeof four);
+    return _mm256_set1_epi64x(four);
+}
+
+// Without this gcc reorders the additions and runs out of registers.
+#define GSF__INT8_ADD(sum, product)              \
+    sum = _mm256_add_epi32(sum, product);        \
+    __asm__("" : "+x"(sum));
+
+GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const int16_t* a, const int16_t* b, int64_t count, int add,
+                                                 int32_t* sums) {
+    for (int half = 0; half < 2; half++, b += 8 * count, sums += 8) {
+        const int16_t *p = a, *q = b;
+        // 12 registers of sums, each of 4 columns by 2 pairs; 2 of b, 1 of a
+        __m256i c00 = _mm256_setzero_si256(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
+        __m256i c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
+        for (int64_t k = 0; k < count; k += 4, p += 24, q += 32) {
+            const __m256i b0 = _mm256_loadu_si256((const __m256i*)(const void*)q);
+            const __m256i b1 = _mm256_loadu_si256((const __m256i*)(const void*)(q + 16));
+            __m256i v;
+#define GSF_X(i)                                            \
+            v = gsf__int8_broadcast4(p + 4 * i);            \
+            GSF__INT8_ADD(c##i##0, _mm256_madd_epi16(v, b0)) \
+            GSF__INT8_ADD(c##i##1, _mm256_madd_epi16(v, b1))
+            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+#undef GSF_X
+        }
+#define GSF_X(i)                                                                                                        \
+        {                                                                                                               \
+            __m256i* to = (__m256i*)(void*)(sums + GSF__TILE_COLUMNS * i);                                              \
+            const __m256i v = _mm256_permute4x64_epi64(_mm256_hadd_epi32(c##i##0, c##i##1), 0xd8);                      \
+            _mm256_storeu_si256(to, add ? _mm256_add_epi32(_mm256_loadu_si256(to), v) : v);                             \
+        }
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+#undef GSF_X
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const float* rows, const float* columns,
+                                                  float* out) {
+    for (int i = 0; i < GSF__TILE_SUMS; i += 8) {
+        const __m256 v = _mm256_cvtepi32_ps(_mm256_loadu_si256((const __m256i*)(const void*)(sums + i)));
+        const __m256 row = _mm256_set1_ps(rows[i / GSF__TILE_COLUMNS]);
+        _mm256_storeu_ps(out + i, _mm256_mul_ps(_mm256_mul_ps(v, row), _mm256_loadu_ps(columns + i % GSF__TILE_COLUMNS)));
+    }
+}
+
+static const gsf__int8_kernels gsf__int8_avx2 = {gsf__int8_rotate_avx2, gsf__int8_quantize_avx2, gsf__int8_widen_avx2,
+                                                 gsf__int8_tile_avx2, gsf__int8_scale_avx2};
+
+#endif
+
+static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level) {
+#if GSF__X86
+    if (level >= GSF_CPU_AVX2) return &gsf__int8_avx2;
+#endif
+    (void)level;
+    return &gsf__int8_scalar;
+}
+
+// ---- int8: the parts put together
+
+// Rotates and rounds a row (`in` values, which it changes, then room up to `padded`) to fours `pitch` apart. Returns the
+// scale: NaN, and zeros, for a row with a NaN or infinity; 0 for one below 1e-30, as 127 / size would leave float's range.
+static float gsf__int8_row(const gsf__int8_kernels* kernels, float* x, int64_t in, int64_t padded, int64_t block,
+                           int16_t* out, int64_t pitch) {
+    const float top = kernels->rotate(x, in, block);
+    const int there = top >= 1e-30f && top <= FLT_MAX;
+    for (int64_t k = in; k < padded; k++) x[k] = 0.0f;
+    if (!there) memset(x, 0, (size_t)padded * sizeof *x);
+    kernels->quantize(x, padded, there ? 127.0f / top : 1.0f, out, pitch);
+    return there ? top / 127.0f : top <= FLT_MAX ? 0.0f : NAN;
+}
+
+typedef struct gsf__quantize_job {
+    const gsf__int8_kernels* kernels;
+    const gsf_tensor* tensor;
+    gsf_nn_quantized* weight;
+    int64_t padded;
+    float* workers; // (padded) floats, then as many 16-bit integers
+    size_t per_worker;
+} gsf__quantize_job;
+
+static void gsf__quantize_panel(void* arg, size_t panel, int worker) {
+    const gsf__quantize_job* job = (const gsf__quantize_job*)arg;
+    const gsf_nn_quantized* w = job->weight;
+    float* x = job->workers + (size_t)worker * job->per_worker;
+    int16_t* q = (int16_t*)(void*)(x + job->padded);
+    int8_t* to = w->data + panel * (size_t)job->padded * GSF__TILE_COLUMNS;
+    for (int64_t c = 0; c < GSF__TILE_COLUMNS; c++) {
+        const int64_t row = (int64_t)panel * GSF__TILE_COLUMNS + c;
+        float scale = 0.0f;
+        if (row < w->out) {
+            gsf_nn_read_tensor(job->tensor, row * w->in, w->in, x);
+            scale = gsf__int8_row(job->kernels, x, w->in, job->padded, w->block, q, 4) / (float)w->block;
+        } else {
+            memset(q, 0, (size_t)job->padded * sizeof *q);
+        }
+        w->scales[row] = scale;
+        for (int64_t k = 0; k < job->padded; k++) to[(k >> 2) * 64 + c * 4 + (k & 3)] = (int8_t)q[k];
+    }
+}
+
+static gsf_result gsf__check_quantize(gsf_context* ctx, const gsf_tensor* w) {
+    if (!w || !w->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: the weight is missing");
+    const char* name = w->name ? w->name : "weight";
+    if (w->rank < 2 || w->shape[0] < 1 || w->count / w->shape[0] < 1 || w->count % w->shape[0])
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: %s is no matrix", name);
+    if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "int8: %s is %s", name, gsf_nn_dtype_name(w->dtype));
+    if (w->count / w->shape[0] > GSF__INT8_LONGEST)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "int8: %s has %lld inputs, at most %d fit 32-bit sums", name,
+                        (long long)(w->count / w->shape[0]), GSF__INT8_LONGEST);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* weight, int no_rotation,
+                                          gsf_nn_quantized* out) {
+    gsf__quantize_job job;
+    gsf_nn_quantized made;
+    memset(out, 0, sizeof *out);
+    memset(&job, 0, sizeof job);
+    memset(&made, 0, sizeof made);
+    GSF__TRY(gsf__check_quantize(ctx, weight));
+    made.out = weight->shape[0];
+    made.in = weight->count / made.out;
+    made.block = 1;
+    while (!no_rotation && made.block < GSF__INT8_BLOCK && made.in % (2 * made.block) == 0) made.block *= 2;
+    job.padded = gsf__round_up(made.in, 4);
+    job.per_worker = (size_t)gsf__round_up(job.padded + job.padded / 2, 16);
+    size_t values, scratch;
+    const size_t columns = ((size_t)made.out + GSF__TILE_COLUMNS - 1) / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
+    if (!gsf__mul_size(columns, (size_t)job.padded, &values) || columns > (SIZE_MAX - values) / sizeof(float) ||
+        !gsf__mul_size(job.per_worker, (size_t)ctx->parallel.worker_count, &scratch))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "int8: %lld x %lld", (long long)made.out, (long long)made.in);
+    made.bytes = values + columns * sizeof(float);
+    made.data = (int8_t*)gsf_alloc(ctx, made.bytes, 1); // the scales stand behind: values is a multiple of 64
+    if (!made.data) return GSF_ERROR_OUT_OF_MEMORY;
+    made.scales = (float*)(void*)(made.data + values);
+    job.workers = (float*)gsf_alloc(ctx, scratch, sizeof(float));
+    if (!job.workers) {
+        gsf_nn_destroy_quantized(ctx, &made);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
+    job.tensor = weight;
+    job.weight = &made;
+    gsf__parallel_for(ctx, columns / GSF__TILE_COLUMNS, gsf__quantize_panel, &job);
+    gsf_free(ctx, job.workers);
+    for (int64_t n = 0; n < made.out; n++)
+        if (!(made.scales[n] <= FLT_MAX)) {
+            gsf_nn_destroy_quantized(ctx, &made);
+            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "int8: %s has a NaN or infinity in row %lld",
+                            weight->name ? weight->name : "weight", (long long)n);
+        }
+    *out = made;
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_quantized(gsf_context* ctx, gsf_nn_quantized* weight) {
+    gsf_free(ctx, weight->data);
+    memset(weight, 0, sizeof *weight);
+}
+
+static void gsf__int8_quantize_rows(void* arg, size_t group, int worker) { // six rows of x
+    const gsf__int8_job* job = (const gsf__int8_job*)arg;
+    const gsf_nn_linear_desc* d = &job->linear.desc;
+    const int64_t at = (int64_t)group * GSF__TILE_ROWS, in = job->weight->in;
+    float* x = (float*)(void*)(job->workers + (size_t)worker * job->per_worker);
+    int16_t* out = job->x + at * job->padded;
+    for (int64_t r = 0; r < GSF__TILE_ROWS; r++) {
+        if (at + r < job->rows) memcpy(x, d->x + (job->first + at + r) * d->ldx, (size_t)in * sizeof *x);
+        else memset(x, 0, (size_t)in * sizeof *x);
+        job->scales[at + r] = gsf__int8_row(job->kernels, x, in, job->padded, job->weight->block, out + 4 * r,
+                                            4 * GSF__TILE_ROWS);
+    }
+}
+
+static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of rows and outputs
+    const gsf__int8_job* job = (const gsf__int8_job*)arg;
+    const int64_t row = (int64_t)index % job->row_blocks * job->block_rows; // of those in work
+    const int64_t column = (int64_t)index / job->row_blocks * job->block_columns;
+    const int64_t rows = gsf__least(job->rows - row, job->block_rows);
+    const int64_t columns = gsf__least(job->weight->out - column, job->block_columns);
+    const int64_t tiles = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
+    float* tile = (float*)(void*)(sums + job->block_rows * job->block_columns);
+    int16_t* panel = (int16_t*)(void*)(tile + GSF__TILE_SUMS);
+    for (int64_t k = 0; k < job->padded; k += job->depth) {
+        const int64_t count = gsf__least(job->padded - k, job->depth);
+        const int last = k + count == job->padded;
+        int32_t* s = sums;
+        for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS) {
+            const int64_t width = gsf__least(columns - c, GSF__TILE_COLUMNS);
+            job->kernels->widen(job->weight->data + (column + c) * job->padded + k * GSF__TILE_COLUMNS, count, panel);
+            for (int64_t t = 0; t < tiles; t++, s += GSF__TILE_SUMS) {
+                const int64_t r = row + t * GSF__TILE_ROWS;
+                job->kernels->tile(job->x + r * job->padded + k * GSF__TILE_ROWS, panel, count, k > 0, s);
+                if (!last) continue;
+                job->kernels->scale(s, job->scales + r, job->weight->scales + column + c, tile);
+                job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, job->first + r,
+                                            gsf__least(row + rows - r, GSF__TILE_ROWS), column + c, width);
+            }
+        }
+    }
+}
+
+// Cuts the work by its sizes; bytes of scratch for `workers`, or 0 where they cannot be counted.
+static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
+    const int64_t out = job->weight->out;
+    size_t x, bytes;
+    if (rows > INT64_MAX / 256 || out > INT64_MAX / 256) return 0;
+    job->depth = gsf__even_piece(job->padded, GSF__INT8_DEPTH, 4);
+    const int64_t most = gsf__round_up(GSF__INT8_HELD / job->padded + 1, GSF__INT8_ROWS);
+    job->held = gsf__even_piece(rows, most, GSF__TILE_ROWS);
+    job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, GSF__TILE_ROWS);
+    job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__TILE_COLUMNS);
+    const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__TILE_COLUMNS;
+    const int64_t row = 4 * job->padded; // the two kinds of work do not overlap
+    job->per_worker = (size_t)gsf__round_up(block > row ? block : row, 64);
+    if (!gsf__mul_size(job->per_worker, workers, &bytes)) return 0;
+    if (!gsf__mul_size((size_t)job->held, 2 * (size_t)job->padded + sizeof(float), &x)) return 0;
+    x += 64 + ((size_t)out + 16) * sizeof(float);
+    return bytes > SIZE_MAX - x ? 0 : bytes + x;
+}
+
+static gsf_result gsf__check_int8(gsf_context* ctx, const gsf_nn_linear_desc* desc, const gsf_nn_quantized* w) {
+    if (!desc->x || !desc->y || !w || !w->data || desc->rows < 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: x, y or weight is missing");
+    if (desc->bias && (desc->bias->count != w->out || !desc->bias->data))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: %s has %lld values, not %lld",
+                        desc->bias->name ? desc->bias->name : "bias", (long long)desc->bias->count, (long long)w->out);
+    if ((desc->ldx && desc->ldx < w->in) || (desc->ldy && desc->ldy < w->out))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "int8: rows of %lld and %lld values, but the weight is %lld x %lld", (long long)desc->ldx,
+                        (long long)desc->ldy, (long long)w->out, (long long)w->in);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_linear_desc* desc,
+                                      const gsf_nn_quantized* weight) {
+    gsf_nn_workspace own;
+    gsf__int8_job job;
+    memset(&own, 0, sizeof own);
+    memset(&job, 0, sizeof job);
+    GSF__TRY(gsf__check_int8(ctx, desc, weight));
+    if (desc->rows == 0) return GSF_OK;
+    gsf__linear_job* linear = &job.linear;
+    linear->desc = *desc;
+    if (!linear->desc.ldx) linear->desc.ldx = weight->in;
+    if (!linear->desc.ldy) linear->desc.ldy = weight->out;
+    job.weight = weight;
+    job.padded = gsf__round_up(weight->in, 4);
+    const size_t bytes = gsf__int8_plan(&job, desc->rows, (size_t)ctx->parallel.worker_count);
+    if (!bytes)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "int8: %lld rows x %lld x %lld", (long long)desc->rows,
+                        (long long)weight->in, (long long)weight->out);
+    job.workers = (char*)gsf__nn_scratch(ctx, workspace ? workspace : &own, bytes);
+    if (!job.workers) return GSF_ERROR_OUT_OF_MEMORY;
+    job.x = (int16_t*)(void*)(job.workers + job.per_worker * (size_t)ctx->parallel.worker_count);
+    job.scales = (float*)(void*)(job.x + job.held * job.padded);
+    linear->bias = job.scales + job.held;
+    memset(linear->bias, 0, (size_t)(weight->out + 16) * sizeof(float));
+    if (desc->bias) gsf_nn_read_tensor(desc->bias, 0, weight->out, linear->bias);
+    linear->kernels = gsf__linear_kernels_of(ctx->cpu_level);
+    job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
+    const int64_t column_blocks = gsf__ceil_div(weight->out, job.block_columns);
+    for (job.first = 0; job.first < desc->rows; job.first += job.held) {
+        job.rows = gsf__least(desc->rows - job.first, job.held);
+        job.row_blocks = gsf__ceil_div(job.rows, job.block_rows);
+        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.rows, GSF__TILE_ROWS), gsf__int8_quantize_rows, &job);
+        gsf__parallel_for(ctx, (size_t)(job.row_blocks * column_blocks), gsf__int8_block, &job);
+    }
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }

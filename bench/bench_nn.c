@@ -384,6 +384,84 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
         }
 }
 
+// ---- linear layers in 8-bit integers ------------------------------------------------
+
+typedef struct bench_int8 {
+    bench_linear linear;
+    gsf_nn_quantized weight;
+} bench_int8;
+
+static void bench_run_int8(gsf_context* ctx, void* arg) {
+    bench_int8* l = (bench_int8*)arg;
+    bench_require(ctx, gsf_nn_linear_int8(ctx, &l->linear.workspace, &l->linear.desc, &l->weight));
+}
+
+static void bench_run_quantize(gsf_context* ctx, void* arg) {
+    bench_int8* l = (bench_int8*)arg;
+    gsf_nn_destroy_quantized(ctx, &l->weight);
+    bench_require(ctx, gsf_nn_quantize_weight(ctx, &l->linear.weight, 0, &l->weight));
+}
+
+// Floats in; rotation, rounding, product, scales and bias counted. Its share is of the float FMA peak: AVX2 without VNNI ends
+// at 200% (16-bit multiply-adds, two per cycle), and errors are those of the rounding, not of sums.
+static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int threads, int64_t rows, int64_t out, int64_t in,
+                           char* memory) {
+    char name[96];
+    snprintf(name, sizeof name, "linear int8 M=%lld N=%lld K=%lld", (long long)rows, (long long)out, (long long)in);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, level, threads)) return;
+    bench_int8 l;
+    memset(&l, 0, sizeof l);
+    const int64_t shape[2] = {out, in};
+    l.linear.in = in;
+    l.linear.out = out;
+    float* w = (float*)(void*)memory;
+    bench_fill(w, (size_t)(in * out) * sizeof(float), GSF_NN_F32, 1);
+    l.linear.weight = gsf_nn_wrap_tensor("weight", w, 2, shape);
+    float* x = (float*)bench_alloc(&ctx, (size_t)(rows * in), sizeof(float));
+    float* y = (float*)bench_alloc(&ctx, (size_t)(rows * out), sizeof(float));
+    float* bias = (float*)bench_alloc(&ctx, (size_t)out, sizeof(float));
+    bench_fill(x, (size_t)(rows * in) * sizeof(float), GSF_NN_F32, 2);
+    bench_fill(bias, (size_t)out * sizeof(float), GSF_NN_F32, 3);
+    l.linear.bias = gsf_nn_wrap_tensor("bias", bias, 1, &out);
+    l.linear.desc.x = x;
+    l.linear.desc.rows = rows;
+    l.linear.desc.bias = &l.linear.bias;
+    l.linear.desc.y = y;
+    bench_run_quantize(&ctx, &l);
+    bench_row row = bench_make_row(name, level, threads, 2.0 * (double)rows * (double)in * (double)out, "op");
+    row.flops = row.work;
+    bench_time(o, &ctx, &row, bench_run_int8, &l, 1.0);
+    bench_linear_error(&l.linear, w, bias, &row);
+    bench_print(o, &row);
+    if (rows == 2048) {
+        snprintf(name, sizeof name, "linear int8 weights N=%lld K=%lld", (long long)out, (long long)in);
+        row = bench_make_row(name, level, threads, (double)in * (double)out, "weight");
+        row.bytes = (double)in * (double)out * sizeof(float) + (double)l.weight.bytes;
+        bench_time(o, &ctx, &row, bench_run_quantize, &l, 1.0);
+        bench_print(o, &row);
+    }
+    gsf_free(&ctx, bias);
+    gsf_free(&ctx, y);
+    gsf_free(&ctx, x);
+    gsf_nn_destroy_quantized(&ctx, &l.weight);
+    gsf_nn_destroy_workspace(&ctx, &l.linear.workspace);
+}
+
+static void bench_int8s(const bench_options* o, char* memory) {
+    static const bench_shape shapes[] = {
+        {1, 3072, 3072, GSF_NN_LINEAR, 0},    {226, 3072, 3072, GSF_NN_LINEAR, 0},  {2048, 3072, 3072, GSF_NN_LINEAR, 1},
+        {2048, 12288, 3072, GSF_NN_LINEAR, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0}, {17776, 3072, 3072, GSF_NN_LINEAR, 0},
+    };
+    for (int threads = 1; threads <= 2; threads++) {
+        bench_one_int8(o, GSF_CPU_SCALAR, threads, 64, 256, 256, memory);
+        bench_one_int8(o, GSF_CPU_AVX2, threads, 64, 256, 256, memory);
+        for (size_t i = 0; i < GSF__COUNT(shapes); i++)
+            if (!o->quick || shapes[i].quick)
+                bench_one_int8(o, GSF_CPU_AVX2, threads, shapes[i].rows, shapes[i].out, shapes[i].in, memory);
+    }
+}
+
 // ---- attention ----------------------------------------------------------------------
 
 typedef struct bench_attention {
@@ -716,6 +794,7 @@ int main(int argc, char** argv) {
         bench_machine(&o, GSF_CPU_AVX2, threads, memory, size);
     }
     bench_linears(&o, memory, size);
+    bench_int8s(&o, memory);
     gsf_free(&ctx, memory);
     bench_attentions(&o);
     bench_norms(&o);
