@@ -395,6 +395,11 @@ typedef struct gsf_nn_transformer { // an open model; its weights stay in the ma
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out);
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer);
 
+// From now on the blocks' linear layers work in 8-bit integers (gsf_nn_linear_int8). Takes about a byte for each of their
+// weights, 7.1 GB at the release's size, which *bytes (NULL allowed) tells; the mapped ones are not touched any more.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer,
+                                                             size_t* bytes);
+
 // Reference tokens for the cross-attention: the sum of both projections. dino (tokens, dino_channels), vggt (tokens,
 // vggt_channels), either NULL: left out (the paper's ablation). out: (tokens, width).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer,
@@ -498,6 +503,7 @@ typedef struct gsf_nn_dit_desc {
     const char* features;    // safetensors: dino_latents (images, tokens, channels), vggt_latents likewise,
                              // prompt_embeds (2, text tokens, text channels): negative, positive
     gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
+    int int8;                // gsf_nn_quantize_transformer
     gsf_nn_sample_desc sample;  // steps, solver, guidance ...; sizes, pointers and seed are filled in for each window
 } gsf_nn_dit_desc;
 
@@ -4675,6 +4681,7 @@ typedef struct gsf__dit_projector {
 
 typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
     gsf__dit_block* blocks;
+    gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
     gsf__dit_projector dino, vggt;
     gsf__dit_norm norm_out;
     const gsf_tensor *patch_weight, *patch_bias, *text_weight, *text_bias, *positions;
@@ -4884,10 +4891,39 @@ static gsf_result gsf__dit_bind_all(gsf_context* ctx, gsf_nn_transformer* net) {
 
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer) {
     gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
-    if (nets) gsf_free(ctx, nets->blocks);
+    if (nets) {
+        for (size_t i = 0; nets->quantized && i < transformer->weights.tensor_count; i++)
+            gsf_nn_destroy_quantized(ctx, &nets->quantized[i]);
+        gsf_free(ctx, nets->quantized);
+        gsf_free(ctx, nets->blocks);
+    }
     gsf_free(ctx, nets);
     gsf_nn_close_weights(ctx, &transformer->weights);
     memset(transformer, 0, sizeof *transformer);
+}
+
+GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer, size_t* bytes) {
+    gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
+    const gsf_nn_weights* w = &transformer->weights;
+    size_t total = 0;
+    if (!nets->quantized)
+        nets->quantized = (gsf_nn_quantized*)gsf_alloc_zeroed(ctx, w->tensor_count, sizeof *nets->quantized);
+    if (!nets->quantized) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < transformer->layers; i++) {
+        const gsf__dit_block* b = &nets->blocks[i];
+        const gsf_tensor* const layers[] = {
+            b->self.q_weight, b->self.k_weight, b->self.v_weight, b->self.out_weight, b->cross.q_weight,
+            b->cross.k_weight, b->cross.v_weight, b->cross.out_weight, b->up_weight, b->down_weight};
+        for (size_t k = 0; k < GSF__COUNT(layers); k++) {
+            gsf_nn_quantized* q = &nets->quantized[layers[k] - w->tensors];
+            if (!q->data) GSF__TRY(gsf_nn_quantize_weight(ctx, layers[k], 0, q));
+            total += q->bytes;
+        }
+        GSF__TRY(gsf__check_cancel(ctx));
+        gsf__progress(ctx, "quantize", i + 1, transformer->layers);
+    }
+    if (bytes) *bytes = total;
+    return GSF_OK;
 }
 
 GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
@@ -4948,6 +4984,13 @@ static const float* gsf__dit_vector(gsf__dit_run* run, const gsf_tensor* tensor)
     return out;
 }
 
+static gsf_result gsf__dit_apply(gsf__dit_run* run, const gsf_nn_linear_desc* desc) {
+    const gsf_nn_quantized* q = run->nets->quantized;
+    if (q) q += desc->weight - run->net->weights.tensors;
+    if (q && q->data) return gsf_nn_linear_int8(run->ctx, &run->workspace, desc, q);
+    return gsf_nn_linear(run->ctx, &run->workspace, desc);
+}
+
 static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
                                   const gsf_tensor* bias, gsf_nn_activation activation, float* y) {
     gsf_nn_linear_desc d;
@@ -4958,7 +5001,7 @@ static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t row
     d.bias = bias;
     d.activation = activation;
     d.y = y;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+    return gsf__dit_apply(run, &d);
 }
 
 // x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
@@ -4974,7 +5017,7 @@ static gsf_result gsf__dit_add(gsf__dit_run* run, const float* h, int64_t rows, 
     d.accumulate = 1;
     d.y = x;
     if (probe) GSF__TRY(gsf__dit_linear(run, h, rows, weight, bias, GSF_NN_LINEAR, probe));
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+    return gsf__dit_apply(run, &d);
 }
 
 // Both streams of a sample through LN(x) (1 + scale) + shift with their own shift and scale. The six parts of the
@@ -7006,8 +7049,8 @@ static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transf
     if (!(d->max_bytes > 0.0)) return GSF_OK;
     GSF__TRY(gsf_nn_sample_cost(ctx, t, v, d, &cost));
     if (cost.bytes <= d->max_bytes) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are "
-                    "allowed", (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
+    return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY,
+                    "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed", (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
 }
 
 GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
@@ -7220,6 +7263,7 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
     gsf_text_printf(ctx, &path, "%s/scheduler/scheduler_config.json", r->desc.model);
     if (!result) result = gsf_nn_load_schedule(ctx, path.data, GSF_NN_TABLE_DDIM, &r->schedule);
     gsf_destroy_text(ctx, &path);
+    if (!result && r->desc.int8) result = gsf_nn_quantize_transformer(ctx, &r->transformer, NULL);
     return result ? result : gsf__dit_load_features(ctx, r);
 }
 

@@ -57,6 +57,8 @@ static const option_spec option_specs[] = {
      "dit: start from the noised frames and run only the last PART of the steps (default 1: from pure noise)"},
     {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore",
      "dit: a step whose first block changes less than this (0.1, say) reuses what the others did (default 0: never)"},
+    {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore",
+     "dit: most of the transformer in 8-bit integers; takes a byte of memory for each of its weights"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
      "regularisers for few views (default on); off is plain 3DGS"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
@@ -389,6 +391,7 @@ int gsfix_check_restorer(gsfix_app* app) {
                         : o->guidance_until > 0.0   ? "--guidance-until"
                         : o->strength > 0.0         ? "--strength"
                         : o->block_cache > 0.0      ? "--block-cache"
+                        : o->int8                   ? "--int8"
                                                     : NULL;
     if (alone) return gsfix_misused(app, "%s is for the restorer dit:MODEL_DIR", alone);
     if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
@@ -407,6 +410,7 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     d.features = o->ref_features;
     for (int i = 0; i < 4; i++)
         if (o->condition && strcmp(o->condition, conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
+    d.int8 = o->int8;
     d.sample.solver = quality->solver;
     for (int i = 0; i < 3; i++)
         if (o->solver && strcmp(o->solver, solvers[i]) == 0) d.sample.solver = (gsf_nn_solver)i;

@@ -452,6 +452,7 @@ static void write_dit_switches(fix_run* run) {
     gsfix_json_number(ctx, t, "guidance_until", as_written(d.guidance_end));
     gsfix_json_number(ctx, t, "strength", as_written(d.strength));
     gsfix_json_number(ctx, t, "block_cache", as_written(d.block_cache));
+    gsfix_json_text(ctx, t, "int8", dit.int8 ? "on" : "off");
 }
 
 static void write_switches(fix_run* run) {

@@ -6,6 +6,7 @@
 
 static const double transformer_bar = 1e-5;    // relative L2 against float64
 static const double intermediate_bar = 1e-5;   // against the float32 run
+static const double int8_bar = 5e-2;           // the blocks' linear layers in 8 bits
 static const double bf16_bar = 2.0 * 8.8e-3;   // against float64, weights rounded to bf16; twice the official bf16 run's
 
 typedef struct transformer_case {
@@ -59,8 +60,8 @@ static void check_projectors(transformer_case* c, const float* dino, const float
 }
 
 // bars: of the float32 path; the same run with other weights (net) takes its own.
-static void check_output(transformer_case* c, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in, const char* name,
-                         double bar) {
+static void check_output(transformer_case* c, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in,
+                         const char* name, double bar) {
     test_tensor t = test_get_tensor(&c->f64, name);
     float* out = (float*)malloc(t.count * sizeof(float));
     CHECK_OK(&c->ctx, gsf_nn_transformer_forward(&c->ctx, net, in, out));
@@ -152,6 +153,10 @@ static void check_transformer(void) {
         in.tap_fn = NULL;
         check_output(&c, &rounded, &in, name, bf16_bar);
     }
+    size_t bytes = 0;
+    CHECK_OK(&c.ctx, gsf_nn_quantize_transformer(&c.ctx, &rounded, &bytes));
+    CHECK(bytes > (size_t)(16 * width * width * rounded.layers) && bytes < (size_t)(17 * width * width * rounded.layers));
+    check_output(&c, &rounded, &in, "out_t479", int8_bar);
     for (size_t i = 0; i < c.names.tensor_count; i++)
         if (!CHECK(c.seen[i])) fprintf(stderr, "    no intermediate is called %s\n", c.names.tensors[i].name);
 
