@@ -159,7 +159,8 @@ typedef struct gsf_nn_attention_desc {
     int64_t ldo;
 } gsf_nn_attention_desc;
 
-// softmax(scale q k^T) v for every head, without the matrix of logits.
+// softmax(scale q k^T) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may reach
+// queries that the mask keeps from it.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace,
                                                   const gsf_nn_attention_desc* desc);
 
