@@ -3597,7 +3597,8 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 // B (3C, outputs). Frames get a column of zeros at either side for that; rows above and below the frame are skipped.
 // Work is cut into segments of 4 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
 // packed as (kernel row, 3C, 16), cut into panels of up to 256 values x 16 (16 KiB, first level cache), and each panel is
-// multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers.
+// multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers. Sums of panels are added up one by one, so
+// that rounding errors grow with 256 + the number of panels, not with their product.
 
 enum {
     GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
@@ -3620,12 +3621,12 @@ static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, c
         for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
             const float* w = b + n0;
             float* y = c + m * GSF__CONV_N + n0;
-            float y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
+            float y0 = 0.0f, y1 = 0.0f, y2 = 0.0f, y3 = 0.0f;
             for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
                 const float x = a[m * lda + i];
                 y0 += x * w[0], y1 += x * w[1], y2 += x * w[2], y3 += x * w[3];
             }
-            y[0] = y0, y[1] = y1, y[2] = y2, y[3] = y3;
+            y[0] += y0, y[1] += y1, y[2] += y2, y[3] += y3;
         }
 }
 
@@ -3647,6 +3648,8 @@ static void gsf__conv_norm_silu_ref(const float* x, int64_t count, const float* 
 }
 
 #if GSF__X86
+GSF__INLINE_AVX2 void gsf__conv_add8(float* c, __m256 v) { _mm256_storeu_ps(c, _mm256_add_ps(_mm256_loadu_ps(c), v)); }
+
 // Six pixels at a time; a missing one reads the last one's values.
 GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda, int64_t count, const float* b, int64_t k,
                                                      float* c) {
@@ -3655,10 +3658,8 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
         const float *a0 = a, *a1 = a + (last < 1 ? last : 1) * lda, *a2 = a + (last < 2 ? last : 2) * lda,
                     *a3 = a + (last < 3 ? last : 3) * lda, *a4 = a + (last < 4 ? last : 4) * lda,
                     *a5 = a + (last < 5 ? last : 5) * lda, *w = b;
-        __m256 c00 = _mm256_loadu_ps(c), c01 = _mm256_loadu_ps(c + 8), c10 = _mm256_loadu_ps(c + 16),
-               c11 = _mm256_loadu_ps(c + 24), c20 = _mm256_loadu_ps(c + 32), c21 = _mm256_loadu_ps(c + 40),
-               c30 = _mm256_loadu_ps(c + 48), c31 = _mm256_loadu_ps(c + 56), c40 = _mm256_loadu_ps(c + 64),
-               c41 = _mm256_loadu_ps(c + 72), c50 = _mm256_loadu_ps(c + 80), c51 = _mm256_loadu_ps(c + 88);
+        __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00, c30 = c00, c31 = c00,
+               c40 = c00, c41 = c00, c50 = c00, c51 = c00;
         for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
             const __m256 w0 = _mm256_loadu_ps(w), w1 = _mm256_loadu_ps(w + 8);
             __m256 v = _mm256_broadcast_ss(a0 + i);
@@ -3680,10 +3681,12 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
             c50 = _mm256_fmadd_ps(v, w0, c50);
             c51 = _mm256_fmadd_ps(v, w1, c51);
         }
-        _mm256_storeu_ps(c, c00), _mm256_storeu_ps(c + 8, c01), _mm256_storeu_ps(c + 16, c10);
-        _mm256_storeu_ps(c + 24, c11), _mm256_storeu_ps(c + 32, c20), _mm256_storeu_ps(c + 40, c21);
-        _mm256_storeu_ps(c + 48, c30), _mm256_storeu_ps(c + 56, c31), _mm256_storeu_ps(c + 64, c40);
-        _mm256_storeu_ps(c + 72, c41), _mm256_storeu_ps(c + 80, c50), _mm256_storeu_ps(c + 88, c51);
+        gsf__conv_add8(c, c00), gsf__conv_add8(c + 8, c01);
+        gsf__conv_add8(c + 16, c10), gsf__conv_add8(c + 24, c11);
+        gsf__conv_add8(c + 32, c20), gsf__conv_add8(c + 40, c21);
+        gsf__conv_add8(c + 48, c30), gsf__conv_add8(c + 56, c31);
+        gsf__conv_add8(c + 64, c40), gsf__conv_add8(c + 72, c41);
+        gsf__conv_add8(c + 80, c50), gsf__conv_add8(c + 88, c51);
     }
 }
 
