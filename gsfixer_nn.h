@@ -3604,7 +3604,8 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 // B (3C, outputs). Frames get a column of zeros at either side for that; rows above and below the frame are skipped.
 // Work is cut into segments of 4 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
 // packed as (kernel row, 3C, 16), cut into panels of up to 256 values x 16 (16 KiB, first level cache), and each panel is
-// multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers.
+// multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers. Sums of panels are added up one by one, so
+// that rounding errors grow with 256 + the number of panels, not with their product.
 
 enum {
     GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
@@ -3627,12 +3628,12 @@ static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, c
         for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
             const float* w = b + n0;
             float* y = c + m * GSF__CONV_N + n0;
-            float y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
+            float y0 = 0.0f, y1 = 0.0f, y2 = 0.0f, y3 = 0.0f;
             for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
                 const float x = a[m * lda + i];
                 y0 += x * w[0], y1 += x * w[1], y2 += x * w[2], y3 += x * w[3];
             }
-            y[0] = y0, y[1] = y1, y[2] = y2, y[3] = y3;
+            y[0] += y0, y[1] += y1, y[2] += y2, y[3] += y3;
         }
 }
 
@@ -3654,6 +3655,8 @@ static void gsf__conv_norm_silu_ref(const float* x, int64_t count, const float* 
 }
 
 #if GSF__X86
+GSF__INLINE_AVX2 void gsf__conv_add8(float* c, __m256 v) { _mm256_storeu_ps(c, _mm256_add_ps(_mm256_loadu_ps(c), v)); }
+
 // Six pixels at a time; a missing one reads the last one's values.
 GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda, int64_t count, const float* b, int64_t k,
                                                      float* c) {
@@ -3662,10 +3665,8 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
         const float *a0 = a, *a1 = a + (last < 1 ? last : 1) * lda, *a2 = a + (last < 2 ? last : 2) * lda,
                     *a3 = a + (last < 3 ? last : 3) * lda, *a4 = a + (last < 4 ? last : 4) * lda,
                     *a5 = a + (last < 5 ? last : 5) * lda, *w = b;
-        __m256 c00 = _mm256_loadu_ps(c), c01 = _mm256_loadu_ps(c + 8), c10 = _mm256_loadu_ps(c + 16),
-               c11 = _mm256_loadu_ps(c + 24), c20 = _mm256_loadu_ps(c + 32), c21 = _mm256_loadu_ps(c + 40),
-               c30 = _mm256_loadu_ps(c + 48), c31 = _mm256_loadu_ps(c + 56), c40 = _mm256_loadu_ps(c + 64),
-               c41 = _mm256_loadu_ps(c + 72), c50 = _mm256_loadu_ps(c + 80), c51 = _mm256_loadu_ps(c + 88);
+        __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00, c30 = c00, c31 = c00,
+               c40 = c00, c41 = c00, c50 = c00, c51 = c00;
         for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
             const __m256 w0 = _mm256_loadu_ps(w), w1 = _mm256_loadu_ps(w + 8);
             __m256 v = _mm256_broadcast_ss(a0 + i);
@@ -3687,10 +3688,12 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
             c50 = _mm256_fmadd_ps(v, w0, c50);
             c51 = _mm256_fmadd_ps(v, w1, c51);
         }
-        _mm256_storeu_ps(c, c00), _mm256_storeu_ps(c + 8, c01), _mm256_storeu_ps(c + 16, c10);
-        _mm256_storeu_ps(c + 24, c11), _mm256_storeu_ps(c + 32, c20), _mm256_storeu_ps(c + 40, c21);
-        _mm256_storeu_ps(c + 48, c30), _mm256_storeu_ps(c + 56, c31), _mm256_storeu_ps(c + 64, c40);
-        _mm256_storeu_ps(c + 72, c41), _mm256_storeu_ps(c + 80, c50), _mm256_storeu_ps(c + 88, c51);
+        gsf__conv_add8(c, c00), gsf__conv_add8(c + 8, c01);
+        gsf__conv_add8(c + 16, c10), gsf__conv_add8(c + 24, c11);
+        gsf__conv_add8(c + 32, c20), gsf__conv_add8(c + 40, c21);
+        gsf__conv_add8(c + 48, c30), gsf__conv_add8(c + 56, c31);
+        gsf__conv_add8(c + 64, c40), gsf__conv_add8(c + 72, c41);
+        gsf__conv_add8(c + 80, c50), gsf__conv_add8(c + 88, c51);
     }
 }
 
@@ -3722,33 +3725,13 @@ GSF__TARGET_AVX2 static void gsf__conv_store_avx2(const float* c, int64_t count,
     if (i < n) gsf__conv_store_ref(c + i, count, n - i, accumulate, out + i, ldo, sums + i);
 }
 
-// e^x for x in [-87, 88], clamped to it; relative error below 2e-7. NaN stays.
-GSF__INLINE_AVX2 __m256 gsf__conv_exp8(__m256 x) {
-    x = _mm256_min_ps(_mm256_set1_ps(88.0f), _mm256_max_ps(_mm256_set1_ps(-87.0f), x)); // a NaN is the second operand
-    const __m256 k = _mm256_round_ps(_mm256_mul_ps(x, _mm256_set1_ps(1.44269504f)),
-                                     _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    __m256 r = _mm256_fnmadd_ps(k, _mm256_set1_ps(0.693359375f), x); // ln 2 in two parts, the first exact
-    r = _mm256_fnmadd_ps(k, _mm256_set1_ps(-2.12194440e-4f), r);
-    __m256 p = _mm256_set1_ps(1.0f / 5040.0f);
-    p = _mm256_fmadd_ps(p, r, _mm256_set1_ps(1.0f / 720.0f));
-    p = _mm256_fmadd_ps(p, r, _mm256_set1_ps(1.0f / 120.0f));
-    p = _mm256_fmadd_ps(p, r, _mm256_set1_ps(1.0f / 24.0f));
-    p = _mm256_fmadd_ps(p, r, _mm256_set1_ps(1.0f / 6.0f));
-    p = _mm256_fmadd_ps(p, r, _mm256_set1_ps(0.5f));
-    p = _mm256_add_ps(_mm256_fmadd_ps(_mm256_mul_ps(p, r), r, r), _mm256_set1_ps(1.0f));
-    const __m256i scale = _mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(k), _mm256_set1_epi32(127)), 23);
-    return _mm256_mul_ps(p, _mm256_castsi256_ps(scale));
-}
-
 GSF__TARGET_AVX2 static void gsf__conv_norm_silu_avx2(const float* x, int64_t count, const float* mean, const float* scale,
                                                       const float* offset, float* y) {
-    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f);
     int64_t i = 0;
     for (; i + 8 <= count; i += 8) {
         const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(x + i), _mm256_loadu_ps(mean + i));
         const __m256 v = _mm256_fmadd_ps(d, _mm256_loadu_ps(scale + i), _mm256_loadu_ps(offset + i));
-        const __m256 e = gsf__conv_exp8(_mm256_sub_ps(zero, v));
-        _mm256_storeu_ps(y + i, _mm256_div_ps(v, _mm256_add_ps(one, e)));
+        _mm256_storeu_ps(y + i, gsf__nn_activate8(GSF_NN_SILU, v));
     }
     gsf__conv_norm_silu_ref(x + i, count - i, mean + i, scale + i, offset + i, y + i);
 }
@@ -3763,8 +3746,6 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
     (void)level;
     return &scalar;
 }
-
-static int64_t gsf__conv_min(int64_t a, int64_t b) { return a < b ? a : b; }
 
 typedef struct gsf__conv_layer { // weight: (out, in, kt, kernel, kernel), or without kt
     const gsf_tensor *weight, *bias;
@@ -3793,7 +3774,7 @@ static void gsf__conv_pack_block(void* arg, size_t block, int worker) {
     const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
     const gsf__conv_layer* layer = job->layer;
     const int64_t taps = gsf__conv_taps(layer), first = (int64_t)block * GSF__CONV_N;
-    const int64_t n_end = gsf__conv_min(layer->out - first, GSF__CONV_N);
+    const int64_t n_end = gsf__nn_min(layer->out - first, GSF__CONV_N);
     float* panel = job->out + (int64_t)block * gsf__conv_panel(layer);
     float* weights = panel + GSF__CONV_N;
     float values[CHANNELS * GSF__CONV_TAPS];
@@ -3801,7 +3782,7 @@ static void gsf__conv_pack_block(void* arg, size_t block, int worker) {
     if (n_end < GSF__CONV_N || !layer->bias) memset(panel, 0, (size_t)gsf__conv_panel(layer) * sizeof(float));
     if (layer->bias) gsf_nn_read_tensor(layer->bias, first, n_end, panel);
     for (int64_t c0 = 0; c0 < layer->in; c0 += CHANNELS) {
-        const int64_t channels = gsf__conv_min(layer->in - c0, CHANNELS);
+        const int64_t channels = gsf__nn_min(layer->in - c0, CHANNELS);
         for (int64_t n = 0; n < n_end; n++) {
             gsf_nn_read_tensor(layer->weight, ((first + n) * layer->in + c0) * taps, channels * taps, values);
             for (int64_t t = 0; t < taps; t++)
@@ -3830,7 +3811,7 @@ static void gsf__conv_pack_quarter(void* arg, size_t chunk, int worker) { // chu
     const gsf__conv_layer* layer = job->layer;
     const gsf__conv_layer quarter = gsf__conv_quarter(layer);
     const int64_t blocks = gsf__conv_blocks(layer), parity = (int64_t)chunk / blocks, in = layer->in;
-    const int64_t first = (int64_t)chunk % blocks * GSF__CONV_N, n_end = gsf__conv_min(layer->out - first, GSF__CONV_N);
+    const int64_t first = (int64_t)chunk % blocks * GSF__CONV_N, n_end = gsf__nn_min(layer->out - first, GSF__CONV_N);
     float* panel = job->out + (int64_t)chunk * gsf__conv_panel(&quarter);
     (void)worker;
     memset(panel, 0, (size_t)gsf__conv_panel(&quarter) * sizeof(float));
@@ -3883,7 +3864,7 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
     for (int64_t kt = 0; kt < job->kt; kt++)
         for (int64_t kh = 0; kh < job->kh; kh++)
             for (int64_t k0 = 0; k0 < job->k; k0 += GSF__CONV_K) {
-                const int64_t k = gsf__conv_min(job->k - k0, GSF__CONV_K);
+                const int64_t k = gsf__nn_min(job->k - k0, GSF__CONV_K);
                 for (int64_t r = 0; r < rows; r++) {
                     const int64_t y = (y0 + r) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
@@ -3898,14 +3879,14 @@ static void gsf__conv_segment(void* arg, size_t segment, int worker) {
     const gsf__conv_job* job = (const gsf__conv_job*)arg;
     const int64_t across = gsf__conv_columns(job);
     const int64_t y0 = (int64_t)segment / across * GSF__CONV_ROWS, x0 = (int64_t)segment % across * GSF__CONV_COLUMNS;
-    const int64_t rows = gsf__conv_min(job->height - y0, GSF__CONV_ROWS);
-    const int64_t columns = gsf__conv_min(job->width - x0, GSF__CONV_COLUMNS);
+    const int64_t rows = gsf__nn_min(job->height - y0, GSF__CONV_ROWS);
+    const int64_t columns = gsf__nn_min(job->width - x0, GSF__CONV_COLUMNS);
     double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
     float tile[GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N];
     (void)worker;
     if (partial) memset(partial, 0, (size_t)job->groups * 2 * sizeof(double));
     for (int64_t n0 = 0; n0 < job->outputs; n0 += GSF__CONV_N) {
-        const int64_t n = gsf__conv_min(job->outputs - n0, GSF__CONV_N);
+        const int64_t n = gsf__nn_min(job->outputs - n0, GSF__CONV_N);
         const float* b = job->packed + n0 / GSF__CONV_N * job->panel;
         double sums[2 * GSF__CONV_N];
         memset(sums, 0, sizeof sums);

@@ -655,6 +655,156 @@ static void bench_norms(const bench_options* o) {
 
 // ---- convolutions -------------------------------------------------------------------
 
+typedef struct bench_conv {
+    gsf_nn_conv_desc desc;
+    gsf_tensor weight;
+    gsf_nn_workspace workspace;
+    int64_t channels;
+} bench_conv;
+
+static void bench_run_conv(gsf_context* ctx, void* arg) {
+    bench_conv* c = (bench_conv*)arg;
+    bench_require(ctx, gsf_nn_convolve(ctx, &c->workspace, &c->desc));
+}
+
+// Output n of pixel (t, y, x): the plain sum in double.
+static double bench_conv_value(const bench_conv* c, const float* w, int64_t t, int64_t y, int64_t x, int64_t n) {
+    const gsf_nn_conv_desc* d = &c->desc;
+    double sum = 0.0;
+    for (int64_t tap = 0; tap < 27; tap++) {
+        const int64_t from = t - 2 + tap / 9, row = y - 1 + tap / 3 % 3, column = x - 1 + tap % 3;
+        if (row < 0 || column < 0 || row >= d->height || column >= d->width) continue;
+        const float* in = d->x + (((from < 0 ? 0 : from) * d->height + row) * d->width + column) * c->channels;
+        for (int64_t i = 0; i < c->channels; i++) sum += (double)in[i] * (double)w[(n * c->channels + i) * 27 + tap];
+    }
+    return sum;
+}
+
+static void bench_conv_error(const bench_conv* c, const float* w, bench_row* row) {
+    enum { LOOKS = 64 };
+    const gsf_nn_conv_desc* d = &c->desc;
+    const int64_t count = d->frames * d->height * d->width * c->channels;
+    double worst = 0.0, difference = 0.0, square = 0.0;
+    for (int64_t i = 0; i < LOOKS; i++) { // first and last value among them
+        const int64_t at = i * (count - 1) / (LOOKS - 1), pixel = at / c->channels;
+        const double value = bench_conv_value(c, w, pixel / d->width / d->height, pixel / d->width % d->height,
+                                              pixel % d->width, at % c->channels);
+        const double error = fabs((double)d->y[at] - value);
+        if (!(error <= worst)) worst = error;
+        difference += error * error;
+        square += value * value;
+    }
+    row->error_max = worst;
+    row->error_rel_l2 = sqrt(difference / square);
+    row->reference = "float64";
+}
+
+// Causal 3 x 3 x 3 over `frames` of height x width with as many outputs as inputs, channels last.
+static void bench_one_conv(const bench_options* o, gsf_cpu_level level, int threads, int64_t channels, int64_t frames,
+                           int64_t height, int64_t width) {
+    char name[96];
+    snprintf(name, sizeof name, "conv3d f32 C=%lld T=%lld H=%lld W=%lld", (long long)channels, (long long)frames,
+             (long long)height, (long long)width);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, level, threads)) return;
+    bench_conv c;
+    memset(&c, 0, sizeof c);
+    const size_t values = (size_t)(frames * height * width * channels), weights = (size_t)(channels * channels * 27);
+    const int64_t shape[5] = {channels, channels, 3, 3, 3};
+    float* x = (float*)bench_alloc(&ctx, values, sizeof(float));
+    float* y = (float*)bench_alloc(&ctx, values, sizeof(float));
+    float* w = (float*)bench_alloc(&ctx, weights, sizeof(float));
+    bench_fill(x, values * sizeof(float), GSF_NN_F32, 1);
+    bench_fill(w, weights * sizeof(float), GSF_NN_F32, 2);
+    c.channels = channels;
+    c.weight = gsf_nn_wrap_tensor("weight", w, 5, shape);
+    c.desc.x = x;
+    c.desc.y = y;
+    c.desc.frames = frames;
+    c.desc.height = height;
+    c.desc.width = width;
+    c.desc.weight = &c.weight;
+    bench_row row = bench_make_row(name, level, threads, 54.0 * (double)values * (double)channels, "flop");
+    row.flops = row.work;
+    bench_time(o, &ctx, &row, bench_run_conv, &c, 1.0);
+    bench_conv_error(&c, w, &row);
+    bench_print(o, &row);
+    gsf_free(&ctx, w);
+    gsf_free(&ctx, y);
+    gsf_free(&ctx, x);
+    gsf_nn_destroy_workspace(&ctx, &c.workspace);
+}
+
+// ---- the autoencoder's resnet: two convolutions; group norms and SiLU are done on their way in
+
+typedef struct bench_resnet {
+    gsf__vae_net net;
+    gsf__vae_resnet resnet;
+    gsf__vae_run run;
+    gsf__vae_map x;
+    gsf_tensor weight, ones;
+} bench_resnet;
+
+static void bench_run_resnet(gsf_context* ctx, void* arg) {
+    bench_resnet* r = (bench_resnet*)arg;
+    gsf__vae_map x = r->x;
+    r->run.ctx = ctx;
+    bench_require(ctx, gsf__vae_resnet_run(&r->run, &r->resnet, &x));
+}
+
+static void bench_one_resnet(const bench_options* o, int threads, int64_t channels, int64_t frames, int64_t height,
+                             int64_t width) {
+    char name[96];
+    snprintf(name, sizeof name, "vae resnet C=%lld T=%lld H=%lld W=%lld", (long long)channels, (long long)frames,
+             (long long)height, (long long)width);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    bench_resnet r;
+    memset(&r, 0, sizeof r);
+    const int64_t shape[5] = {channels, channels, 3, 3, 3};
+    const size_t values = (size_t)(frames * height * width * channels), weights = (size_t)(channels * channels * 27);
+    float* w = (float*)bench_alloc(&ctx, weights + (size_t)channels, sizeof(float));
+    bench_fill(w, weights * sizeof(float), GSF_NN_F32, 2);
+    for (int64_t i = 0; i < channels; i++) w[weights + (size_t)i] = 1.0f;
+    for (size_t i = 0; i < weights; i++) w[i] *= 2.0f / sqrtf((float)channels * 27.0f);
+    r.weight = gsf_nn_wrap_tensor("weight", w, 5, shape);
+    r.ones = gsf_nn_wrap_tensor("ones", w + weights, 1, shape);
+    const gsf__conv_layer conv = {&r.weight, &r.ones, channels, channels, 3, 3};
+    r.resnet.conv1 = r.resnet.conv2 = conv;
+    r.resnet.norm1.weight = r.resnet.norm1.bias = r.resnet.norm2.weight = r.resnet.norm2.bias = &r.ones;
+    r.resnet.norm1.eps = r.resnet.norm2.eps = 1e-6;
+    r.net.groups = 32;
+    r.net.causal_count = 2;
+    r.run.ctx = &ctx;
+    r.run.net = &r.net;
+    r.run.chunks = 1;
+    r.x.frames = frames;
+    r.x.height = height;
+    r.x.width = width;
+    r.x.channels = channels;
+    bench_require(&ctx, gsf__vae_begin(&r.run));
+    bench_require(&ctx, gsf__vae_grow(&r.run, &r.run.slots[0], (int64_t)values));
+    bench_fill(r.run.slots[0].data, values * sizeof(float), GSF_NN_F32, 1);
+    for (int64_t g = 0; g < 2 * r.net.groups; g++) // what filling it would have summed up: mean 0, deviation 3/8
+        gsf__vae_sums(&r.run, 0)[g] = g % 2 ? 0.140625 * (double)values / 32.0 : 0.0;
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 2.0 * 54.0 * (double)values * (double)channels, "flop");
+    row.flops = row.work;
+    bench_time(o, &ctx, &row, bench_run_resnet, &r, 1.0);
+    bench_print(o, &row);
+    gsf__vae_end(&r.run);
+    gsf_free(&ctx, w);
+}
+
+static void bench_convs(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        bench_one_conv(o, GSF_CPU_SCALAR, threads, 32, 4, 20, 30);
+        bench_one_conv(o, GSF_CPU_AVX2, threads, 32, 4, 20, 30);
+        if (!o->quick) bench_one_conv(o, GSF_CPU_AVX2, threads, 512, 4, 60, 90);
+        bench_one_conv(o, GSF_CPU_AVX2, threads, 128, o->quick ? 1 : 4, o->quick ? 60 : 240, o->quick ? 90 : 360);
+        bench_one_resnet(o, threads, 128, o->quick ? 1 : 4, o->quick ? 60 : 240, o->quick ? 90 : 360);
+    }
+}
+
 // ---- a whole transformer block ------------------------------------------------------
 
 typedef struct bench_block {
@@ -798,6 +948,7 @@ int main(int argc, char** argv) {
     gsf_free(&ctx, memory);
     bench_attentions(&o);
     bench_norms(&o);
+    bench_convs(&o);
     bench_blocks(&o);
     return 0;
 }
