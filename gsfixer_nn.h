@@ -1825,7 +1825,7 @@ GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int6
 //     x [group of 6 rows][k][6]        w [panel of 16 outputs][k][16]        sums [panel][group][6][16]
 //
 // A block of some hundred rows and outputs is one unit of parallel work. It goes through the inner dimension in steps of
-// `depth`: that much of its rows lies in the L2 cache, of one panel in L1, and each tile of 6 x 16 sums is held in registers.
+// `depth`: that much of its rows lies in the L2 cache, of one panel in L1, each tile of 6 x 16 sums is held in registers.
 // After the last step a tile goes through bias, activation, gate and residual into y while it is hot. The weights are
 // packed once per call for all blocks, or, where one block has all rows, by the worker that needs them. Up to 4 rows are a
 // matter of reading the weights once: they are not packed but multiplied as they lie in the file.
@@ -1842,7 +1842,8 @@ enum {
     GSF__LINEAR_LONE_COLUMNS = 192,
     GSF__FEW_ROWS = 4,                // up to here weights are not packed
     GSF__FEW_BYTES = 1 << 17,         // of weights in one unit of work
-    GSF__FEW_COLUMNS = 1024           // and its most outputs
+    GSF__FEW_COLUMNS = 1024,          // and its most outputs
+    GSF__FEW_DEPTH = 2048             // bytes of a row of weights that meet four rows of x at a time
 };
 
 #ifndef GSF__LINEAR_PACKED // a test makes it small
@@ -1856,12 +1857,13 @@ typedef struct gsf__linear_kernels { // one set per instruction set
     void (*pack_weights)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
     // out[k][6]: `rows` rows of x as columns, zeros beyond them; may write two floats more
     void (*pack_rows)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
-    // sums[6][16] = a[k][6]^T b[k][16], or += with `add`
-    void (*tile)(const float* a, const float* b, int64_t count, int add, float* sums);
+    // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; meanwhile fetches `ahead_count` floats that are needed next
+    void (*tile)(const float* a, const float* b, int64_t count, int add, float* sums, const float* ahead,
+                 int64_t ahead_count);
     // Sums (row stride `pitch`, readable to the next multiple of 8 columns) to outputs row ..., column ... of y
     void (*finish)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows, int64_t column,
                    int64_t columns);
-    // sums[m*pitch + c] = row m of job->few times row column + c of the weights
+    // sums[m*pitch + c] = row m of x (AVX2: of job->few) times row column + c of the weights; room for 4 (2 pitch + 1)
     void (*few)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
 } gsf__linear_kernels;
 
@@ -1879,7 +1881,6 @@ struct gsf__linear_job {
     const gsf__linear_kernels* kernels;
     int64_t in, out;
     int64_t first, columns;       // the group of outputs in work
-    int64_t few_pitch;
     float *bias, *packed, *few;   // bias: zeros where there is none, 16 more than `out`
     float* workers;
 };
@@ -1926,8 +1927,11 @@ static void gsf__pack_rows_scalar(const float* x, int64_t ldx, int64_t rows, int
         for (int64_t k = 0; k < count; k++) out[k * GSF__TILE_ROWS + r] = r < rows ? x[r * ldx + k] : 0.0f;
 }
 
-static void gsf__tile_scalar(const float* a, const float* b, int64_t count, int add, float* sums) {
+static void gsf__tile_scalar(const float* a, const float* b, int64_t count, int add, float* sums, const float* ahead,
+                             int64_t ahead_count) {
     float c[GSF__TILE_SUMS];
+    (void)ahead;
+    (void)ahead_count;
     memset(c, 0, sizeof c);
     for (int64_t k = 0; k < count; k++, a += GSF__TILE_ROWS, b += GSF__TILE_COLUMNS)
         for (int i = 0; i < GSF__TILE_ROWS; i++)
@@ -1955,7 +1959,7 @@ static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t 
             const char* w = (const char*)d->weight->data + (size_t)(column + c) * (size_t)job->in * size;
             float sum = 0.0f;
             for (int64_t k = 0; k < job->in; k++, w += size)
-                sum += job->few[m * job->few_pitch + k] * gsf__nn_load(w, d->weight->dtype);
+                sum += d->x[m * d->ldx + k] * gsf__nn_load(w, d->weight->dtype);
             sums[m * pitch + c] = sum;
         }
 }
@@ -2061,7 +2065,10 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
 }
 
-GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int64_t count, int add, float* sums) {
+GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int64_t count, int add, float* sums,
+                                            const float* ahead, int64_t ahead_count) {
+    for (int i = 0; i < GSF__TILE_SUMS; i += 16) _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);
+    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
     // 12 registers of sums, 2 of b, 1 or 2 of a; named, as gcc would keep an array in memory
     __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
     __m256 c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
@@ -2092,15 +2099,6 @@ GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int6
 #undef GSF_ROW
 }
 
-// Eight activations at a time.
-GSF__INLINE_AVX2 __m256 gsf__linear_activate8(gsf_nn_activation activation, __m256 x) {
-    float v[8];
-    if (activation == GSF_NN_LINEAR) return x;
-    _mm256_storeu_ps(v, x);
-    for (int i = 0; i < 8; i++) v[i] = gsf__nn_activation_ref(activation, v[i]);
-    return _mm256_loadu_ps(v);
-}
-
 GSF__TARGET_AVX2 static void gsf__finish_avx2(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
                                               int64_t rows, int64_t column, int64_t columns) {
     static const int32_t lanes[16] = {-1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0, 0, 0, 0};
@@ -2113,7 +2111,7 @@ GSF__TARGET_AVX2 static void gsf__finish_avx2(const gsf__linear_job* job, const 
         for (int64_t r = 0; r < rows; r++) {
             float* y = d->y + (row + r) * d->ldy + column + c;
             __m256 v = _mm256_add_ps(_mm256_loadu_ps(sums + r * pitch + c), bias);
-            v = gsf__linear_activate8(d->activation, v);
+            v = gsf__nn_activate8(d->activation, v);
             if (d->gate || d->accumulate) v = _mm256_fmadd_ps(gate, v, _mm256_maskload_ps(y, mask));
             if (n == 8) _mm256_storeu_ps(y, v);
             else _mm256_maskstore_ps(y, mask, v);
@@ -2139,85 +2137,97 @@ GSF__INLINE_AVX2 float gsf__sum8(__m256 v) {
     return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
 }
 
-// Two rows of weights times one row of x (padded with zeros to a multiple of 16).
-GSF__INLINE_AVX2 void gsf__few_one(const char* w0, const char* w1, gsf_nn_dtype dtype, const float* x, int64_t count,
-                                   __m256* sums) {
-    __m256 s00 = sums[0], s01 = sums[1], s10 = sums[2], s11 = sums[3], a, b;
+// A row of weights times one row of x; `count` is a multiple of 16. One row of weights after another, so that memory is
+// read in a line, which the hardware foresees: two rows side by side reach two thirds of the bandwidth.
+GSF__INLINE_AVX2 float gsf__few_one(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
+    __m256 s0 = _mm256_setzero_ps(), s1 = s0, s2 = s0, s3 = s0, a, b;
     const size_t step = dtype == GSF_NN_F32 ? 64 : 32;
-    for (; count > 0; count -= 16, x += 16, w0 += step, w1 += step) {
-        const __m256 x0 = _mm256_load_ps(x), x1 = _mm256_load_ps(x + 8);
-        gsf__load16(w0, dtype, &a, &b);
-        s00 = _mm256_fmadd_ps(a, x0, s00);
-        s01 = _mm256_fmadd_ps(b, x1, s01);
-        gsf__load16(w1, dtype, &a, &b);
-        s10 = _mm256_fmadd_ps(a, x0, s10);
-        s11 = _mm256_fmadd_ps(b, x1, s11);
+    for (; count >= 32; count -= 32, x += 32, w += 2 * step) {
+        gsf__load16(w, dtype, &a, &b);
+        s0 = _mm256_fmadd_ps(a, _mm256_load_ps(x), s0);
+        s1 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 8), s1);
+        gsf__load16(w + step, dtype, &a, &b);
+        s2 = _mm256_fmadd_ps(a, _mm256_load_ps(x + 16), s2);
+        s3 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 24), s3);
     }
-    sums[0] = s00;
-    sums[1] = s01;
-    sums[2] = s10;
-    sums[3] = s11;
+    if (count > 0) {
+        gsf__load16(w, dtype, &a, &b);
+        s0 = _mm256_fmadd_ps(a, _mm256_load_ps(x), s0);
+        s1 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 8), s1);
+    }
+    return gsf__sum8(_mm256_add_ps(_mm256_add_ps(s0, s1), _mm256_add_ps(s2, s3)));
 }
 
-// Two rows of weights times four rows of x.
-GSF__INLINE_AVX2 void gsf__few_four(const char* w0, const char* w1, gsf_nn_dtype dtype, const float* x, int64_t pitch,
-                                    int64_t count, __m256* sums) {
-    __m256 s00 = sums[0], s01 = sums[1], s02 = sums[2], s03 = sums[3];
-    __m256 s10 = sums[4], s11 = sums[5], s12 = sums[6], s13 = sums[7], a0, b0, a1, b1, v;
+GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { // the sums of four
+    const __m256 v = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
+    return _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+}
+
+// Two rows of weights times four rows of x, laid out as [k / 8][4][8], added to sums[2][4]. Here the arithmetic leaves the
+// hardware no time to look ahead, so the same place of the next two rows, `ahead` bytes away, is asked for.
+GSF__INLINE_AVX2 void gsf__few_four(const char* w0, const char* w1, gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                    int64_t count, float* sums) {
+    __m256 s00 = _mm256_setzero_ps(), s01 = s00, s02 = s00, s03 = s00, s10 = s00, s11 = s00, s12 = s00, s13 = s00;
     const size_t step = dtype == GSF_NN_F32 ? 64 : 32;
-    for (; count > 0; count -= 16, x += 16, w0 += step, w1 += step) {
+    for (; count > 0; count -= 16, x += 64, w0 += step, w1 += step) {
+        __m256 a0, b0, a1, b1, v;
+        _mm_prefetch(w0 + ahead, _MM_HINT_T1);
+        _mm_prefetch(w1 + ahead, _MM_HINT_T1);
         gsf__load16(w0, dtype, &a0, &b0);
         gsf__load16(w1, dtype, &a1, &b1);
-#define GSF_X(m)                                                \
-        v = _mm256_load_ps(x + (m) * pitch);                    \
-        s0##m = _mm256_fmadd_ps(a0, v, s0##m);                  \
-        s1##m = _mm256_fmadd_ps(a1, v, s1##m);                  \
-        v = _mm256_load_ps(x + (m) * pitch + 8);                \
-        s0##m = _mm256_fmadd_ps(b0, v, s0##m);                  \
-        s1##m = _mm256_fmadd_ps(b1, v, s1##m);
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#define GSF_X(m, w, at)                         \
+        v = _mm256_load_ps(x + (at));           \
+        s0##m = _mm256_fmadd_ps(w##0, v, s0##m); \
+        s1##m = _mm256_fmadd_ps(w##1, v, s1##m);
+        GSF_X(0, a, 0) GSF_X(1, a, 8) GSF_X(2, a, 16) GSF_X(3, a, 24)
+        GSF_X(0, b, 32) GSF_X(1, b, 40) GSF_X(2, b, 48) GSF_X(3, b, 56)
 #undef GSF_X
     }
-    sums[0] = s00;
-    sums[1] = s01;
-    sums[2] = s02;
-    sums[3] = s03;
-    sums[4] = s10;
-    sums[5] = s11;
-    sums[6] = s12;
-    sums[7] = s13;
+    _mm_storeu_ps(sums, _mm_add_ps(_mm_loadu_ps(sums), gsf__sum8x4(s00, s01, s02, s03)));
+    _mm_storeu_ps(sums + 4, _mm_add_ps(_mm_loadu_ps(sums + 4), gsf__sum8x4(s10, s11, s12, s13)));
 }
 
-GSF__INLINE_AVX2 void gsf__few8(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t column, int64_t columns,
-                                float* sums, int64_t pitch) {
-    const char* w = (const char*)job->desc.weight->data + (size_t)column * (size_t)job->in * size;
-    const int64_t whole = job->in & ~(int64_t)15, rest = job->in - whole;
-    const float* x = job->few;
-    for (int64_t c = 0; c < columns; c += 2) {
-        const char* w0 = w + (size_t)c * (size_t)job->in * size;
-        const char* w1 = c + 1 < columns ? w0 + (size_t)job->in * size : w0;
-        char tail[2][64]; // what is left of the two rows, then zeros
-        __m256 s[8];
-        for (int i = 0; i < 8; i++) s[i] = _mm256_setzero_ps();
-        if (rest) {
-            memset(tail, 0, sizeof tail);
-            memcpy(tail[0], w0 + (size_t)whole * size, (size_t)rest * size);
-            memcpy(tail[1], w1 + (size_t)whole * size, (size_t)rest * size);
+// The last weights of a row, fewer than 16, with zeros behind.
+GSF__INLINE_AVX2 void gsf__few_tail(const char* w, size_t bytes, char* tail) {
+    memset(tail, 0, 64);
+    memcpy(tail, w, bytes);
+}
+
+GSF__INLINE_AVX2 void gsf__few8(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t column,
+                                int64_t columns, float* sums, int64_t pitch) {
+    const size_t bytes = (size_t)job->in * size;
+    const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
+    const int64_t whole = job->in & ~(int64_t)15;
+    const size_t at = (size_t)whole * size;
+    float* fours = sums + GSF__FEW_ROWS * pitch; // [column][4]
+    char tail[2][64];
+    if (job->desc.rows == 1) {
+        for (int64_t c = 0; c < columns; c++) {
+            const char* w = first + (size_t)c * bytes;
+            sums[c] = gsf__few_one(w, dtype, job->few, whole);
+            if (at == bytes) continue;
+            gsf__few_tail(w + at, bytes - at, tail[0]);
+            sums[c] += gsf__few_one(tail[0], dtype, job->few + whole, 16);
         }
-        if (job->desc.rows == 1) {
-            gsf__few_one(w0, w1, dtype, x, whole, s);
-            if (rest) gsf__few_one(tail[0], tail[1], dtype, x + whole, 16, s);
-            sums[c] = gsf__sum8(_mm256_add_ps(s[0], s[1]));
-            if (c + 1 < columns) sums[c + 1] = gsf__sum8(_mm256_add_ps(s[2], s[3]));
-        } else {
-            gsf__few_four(w0, w1, dtype, x, job->few_pitch, whole, s);
-            if (rest) gsf__few_four(tail[0], tail[1], dtype, x + whole, job->few_pitch, 16, s);
-            for (int64_t m = 0; m < job->desc.rows; m++) {
-                sums[m * pitch + c] = gsf__sum8(s[m]);
-                if (c + 1 < columns) sums[m * pitch + c + 1] = gsf__sum8(s[4 + m]);
-            }
+        return;
+    }
+    memset(fours, 0, (size_t)(4 * (columns + 1)) * sizeof(float));
+    for (int64_t k = 0; k < job->in; k += GSF__FEW_DEPTH / (int64_t)size) { // so much of x stays in the L1 cache
+        const int64_t end = gsf__least(k + GSF__FEW_DEPTH / (int64_t)size, whole);
+        for (int64_t c = 0; c < columns; c += 2) {
+            const char *w0 = first + (size_t)c * bytes, *w1 = c + 1 < columns ? w0 + bytes : w0;
+            gsf__few_four(w0 + (size_t)k * size, w1 + (size_t)k * size, dtype, 2 * bytes, job->few + 4 * k, end - k,
+                          fours + 4 * c);
         }
     }
+    for (int64_t c = 0; c < columns && at < bytes; c += 2) {
+        const char *w0 = first + (size_t)c * bytes, *w1 = c + 1 < columns ? w0 + bytes : w0;
+        gsf__few_tail(w0 + at, bytes - at, tail[0]);
+        gsf__few_tail(w1 + at, bytes - at, tail[1]);
+        gsf__few_four(tail[0], tail[1], dtype, 0, job->few + 4 * whole, 16, fours + 4 * c);
+    }
+    for (int64_t m = 0; m < job->desc.rows; m++)
+        for (int64_t c = 0; c < columns; c++) sums[m * pitch + c] = fours[4 * c + m];
 }
 
 GSF__TARGET_AVX2 static void gsf__few_avx2(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
@@ -2243,23 +2253,36 @@ static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level) {
 
 // ---- linear: the parts put together
 
+// The panel from output `at` of the group on, at step k: panels of one step follow one another.
+static float* gsf__packed_panel(const gsf__linear_job* job, int64_t at, int64_t k, int64_t count) {
+    return job->packed + k * gsf__round_up(job->columns, GSF__TILE_COLUMNS) + at * count;
+}
+
 static void gsf__linear_pack_panel(void* arg, size_t panel, int worker) { // of the group in work, all of its depth
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const gsf_tensor* w = job->desc.weight;
-    const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS, left = job->columns - at;
-    const size_t pitch = (size_t)job->in * gsf_nn_dtype_size(w->dtype);
+    const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS, width = gsf__least(job->columns - at, GSF__TILE_COLUMNS);
+    const size_t size = gsf_nn_dtype_size(w->dtype), pitch = (size_t)job->in * size;
+    const char* from = (const char*)w->data + (size_t)(job->first + at) * pitch;
     (void)worker;
-    job->kernels->pack_weights((const char*)w->data + (size_t)(job->first + at) * pitch, w->dtype, pitch,
-                               gsf__least(left, GSF__TILE_COLUMNS), job->in, job->packed + at * job->in);
+    for (int64_t k = 0; k < job->in; k += job->plan.depth) {
+        const int64_t count = gsf__least(job->in - k, job->plan.depth);
+        float* to = gsf__packed_panel(job, at, k, count);
+        job->kernels->pack_weights(from + (size_t)k * size, w->dtype, pitch, width, count, to);
+    }
 }
 
 // All tiles of one panel at one step.
 static void gsf__linear_panel(const gsf__linear_job* job, const float* x, const float* w, float* sums, int64_t k,
                               int64_t count, int64_t row, int64_t rows, int64_t column, int64_t columns) {
-    for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS, sums += GSF__TILE_SUMS) {
-        job->kernels->tile(x + r * count, w, count, k > 0, sums);
-        if (k + count == job->in)
-            job->kernels->finish(job, sums, GSF__TILE_COLUMNS, row + r, gsf__least(rows - r, GSF__TILE_ROWS), column, columns);
+    const float* ahead = w + count * GSF__TILE_COLUMNS; // the next panel, as a rule
+    const int64_t each = gsf__ceil_div(count * GSF__TILE_COLUMNS, gsf__ceil_div(rows, GSF__TILE_ROWS));
+    const int64_t share = job->plan.lone ? 0 : gsf__round_up(each, 16);
+    for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS, sums += GSF__TILE_SUMS, ahead += share) {
+        job->kernels->tile(x + r * count, w, count, k > 0, sums, ahead, share);
+        if (k + count < job->in) continue;
+        const int64_t height = gsf__least(rows - r, GSF__TILE_ROWS);
+        job->kernels->finish(job, sums, GSF__TILE_COLUMNS, row + r, height, column, columns);
     }
 }
 
@@ -2284,7 +2307,7 @@ static void gsf__linear_block(void* arg, size_t index, int worker) { // a block 
         for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS) {
             const int64_t width = gsf__least(columns - c, GSF__TILE_COLUMNS);
             const int64_t column = job->first + at + c;
-            const float* w = plan->lone ? panel : job->packed + (at + c) * job->in + k * GSF__TILE_COLUMNS;
+            const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, count);
             if (plan->lone)
                 job->kernels->pack_weights((const char*)d->weight->data + (size_t)column * pitch + (size_t)k * size,
                                            d->weight->dtype, pitch, width, count, panel);
@@ -2303,13 +2326,16 @@ static void gsf__linear_few(void* arg, size_t index, int worker) { // some outpu
     job->kernels->finish(job, sums, job->plan.block_columns, 0, job->desc.rows, at, columns);
 }
 
-// x to rows of a multiple of 16, zeros behind; for the bf16 kernel the even ones of each 16 first.
+// x as the kernels of few rows want it: one row, or [k / 8][4][8]; zeros up to a multiple of 16 and for rows that are not
+// there; for bf16 with AVX2 the even ones of each 16 first.
 static void gsf__few_order(gsf__linear_job* job, int even_first) {
-    for (int64_t m = 0; m < GSF__FEW_ROWS; m++)
-        for (int64_t k = 0; k < job->few_pitch; k++) {
+    const gsf_nn_linear_desc* d = &job->desc;
+    const int64_t rows = d->rows == 1 ? 1 : GSF__FEW_ROWS, padded = gsf__round_up(job->in, 16);
+    for (int64_t m = 0; m < rows; m++)
+        for (int64_t k = 0; k < padded; k++) {
             const int64_t from = even_first ? (k & ~(int64_t)15) + 2 * (k & 7) + (k >> 3 & 1) : k;
-            const int there = m < job->desc.rows && from < job->in;
-            job->few[m * job->few_pitch + k] = there ? job->desc.x[m * job->desc.ldx + from] : 0.0f;
+            const float value = m < d->rows && from < job->in ? d->x[m * d->ldx + from] : 0.0f;
+            job->few[(k >> 3) * 8 * rows + 8 * m + (k & 7)] = value;
         }
 }
 
@@ -2322,7 +2348,7 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
         const int64_t fit = GSF__FEW_BYTES / (in * (int64_t)weight_size);
         plan->few = 1;
         plan->block_columns = gsf__round_up(gsf__least(fit < 1 ? 1 : fit, GSF__FEW_COLUMNS), 16);
-        plan->per_worker = (size_t)(plan->block_columns * GSF__FEW_ROWS);
+        plan->per_worker = (size_t)(2 * plan->block_columns + 1) * GSF__FEW_ROWS;
         shared = (size_t)gsf__round_up(in, 16) * GSF__FEW_ROWS;
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
@@ -2334,8 +2360,9 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
         plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__TILE_COLUMNS);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
+        const int64_t packed = gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS);
         if (plan->lone) plan->per_worker += (size_t)(plan->depth * GSF__TILE_COLUMNS);
-        else if (!gsf__mul_size((size_t)gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS), (size_t)in, &shared)) return 0;
+        else if (!gsf__mul_size((size_t)packed, (size_t)in, &shared)) return 0;
     }
     plan->per_worker = (size_t)gsf__round_up((int64_t)plan->per_worker, 16); // workers begin on cache lines
     plan->shared = shared + (size_t)gsf__round_up(out + 16, 16);
@@ -2401,7 +2428,6 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
     job.kernels = gsf__linear_kernels_of(ctx->cpu_level);
     job.workers = scratch;
     job.bias = scratch + floats;
-    job.few_pitch = gsf__round_up(job.in, 16);
     job.packed = job.few = job.bias + gsf__round_up(job.out + 16, 16);
     gsf__run_linear(ctx, &job);
     gsf_nn_destroy_workspace(ctx, &own);

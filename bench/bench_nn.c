@@ -5,10 +5,10 @@
 //
 // First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
 // released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
-// together that the first rows show. Errors are against sums in double, for large shapes of some rows; relative ones of up to
-// 4 rows are to be read beside those of a plain float sum. bench/peers_nn.py runs PyTorch on the same cases, which it reads
-// from their names.
-// Seconds are the median, seconds_min the least, cpu_seconds the process' CPU time of a round.
+// together that the first rows show. Errors are against sums in double, for large shapes of some rows. bench/peers_nn.py
+// runs PyTorch on the same cases, which it reads from their names.
+// Seconds are the median; cpu_seconds, the process' CPU time of all threads, is the least of the rounds. Peaks are by CPU
+// time, too: on a machine that does other things as well, cpu_peak_share is the figure to look at.
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_nn.h"
@@ -23,7 +23,7 @@ typedef struct bench_options {
 typedef struct bench_row {
     const char *name, *variant, *isa, *work_unit, *reference;
     int threads;
-    double seconds, seconds_min, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
+    double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
     double flops, bytes; // of the whole, as the definition needs them; 0: not the bound to look at
 } bench_row;
 
@@ -86,20 +86,23 @@ static void bench_print(const bench_options* o, const bench_row* row) {
     const bench_peak* peak = &bench_peaks[strcmp(row->isa, "scalar") != 0][row->threads < 2 ? 1 : 2];
     const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
     const double byte_share = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
+    const double cpu = row->seconds * row->threads / row->cpu_seconds; // makes rates by CPU time of rates by the clock
     if (o->json) {
         printf("{\"bench\":\"nn\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
-               "\"seconds_min\":%.6g,\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
-               row->name, row->variant, row->isa, row->threads, row->seconds, row->seconds_min, row->cpu_seconds, row->work,
-               row->work_unit, rate, row->reference);
-        if (row->flops > 0.0) printf(",\"peak_share\":%.4g", flop_share);
-        if (row->bytes > 0.0) printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g", row->bytes, byte_share);
+               "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
+               row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
+               rate, row->reference);
+        if (row->flops > 0.0) printf(",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", flop_share, cpu * flop_share);
+        if (row->bytes > 0.0)
+            printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g,\"cpu_bandwidth_share\":%.4g", row->bytes, byte_share,
+                   cpu * byte_share);
         if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
         printf("}\n");
     } else {
-        printf("%-44s %-8s %-6s %d thr %9.3f ms (least %9.3f, cpu %9.3f) %8.4g G%s/s", row->name, row->variant, row->isa,
-               row->threads, 1e3 * row->seconds, 1e3 * row->seconds_min, 1e3 * row->cpu_seconds, 1e-9 * rate, row->work_unit);
-        if (row->flops > 0.0) printf("  %.1f%% of the FMA peak", 100.0 * flop_share);
-        if (row->bytes > 0.0) printf("  %.1f%% of the bandwidth", 100.0 * byte_share);
+        printf("%-44s %-8s %-6s %d thr %9.3f ms %9.3f ms cpu %8.4g G%s/s", row->name, row->variant, row->isa,
+               row->threads, 1e3 * row->seconds, 1e3 * row->cpu_seconds, 1e-9 * rate, row->work_unit);
+        if (row->flops > 0.0) printf("  %.1f%% (cpu %.1f%%) of the FMA peak", 100.0 * flop_share, 100.0 * cpu * flop_share);
+        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * byte_share, 100.0 * cpu * byte_share);
         if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
         printf("\n");
     }
@@ -111,21 +114,25 @@ static void bench_print(const bench_options* o, const bench_row* row) {
 typedef void (*bench_body)(gsf_context* ctx, void* arg);
 
 // One round to warm up, then rounds for about a second (quick: 0.2), at least three. Each does `repeats` units of the row.
-static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg, double repeats) {
+static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
+                       double repeats) {
     enum { MOST = 101 };
-    double seconds[MOST], budget = o->quick ? 0.2 : 1.0;
-    int rounds = 0;
-    body(ctx, arg);
-    const double cpu = bench_cpu(), start = bench_now();
+    double wall[MOST], cpu[MOST];
+    const double start = bench_now(), budget = o->quick ? 0.3 : 1.5;
+    int rounds = -1;
     while (rounds < MOST && (rounds < 3 || bench_now() - start < budget)) {
-        const double t = bench_now();
+        const double t = bench_now(), c = bench_cpu();
         body(ctx, arg);
-        seconds[rounds++] = (bench_now() - t) / repeats;
+        if (rounds >= 0) {
+            wall[rounds] = (bench_now() - t) / repeats;
+            cpu[rounds] = (bench_cpu() - c) / repeats;
+        }
+        rounds++;
     }
-    row->cpu_seconds = (bench_cpu() - cpu) / rounds / repeats;
-    qsort(seconds, (size_t)rounds, sizeof *seconds, bench_compare);
-    row->seconds = seconds[rounds / 2];
-    row->seconds_min = seconds[0];
+    qsort(wall, (size_t)rounds, sizeof *wall, bench_compare);
+    qsort(cpu, (size_t)rounds, sizeof *cpu, bench_compare);
+    row->seconds = wall[rounds / 2];
+    row->cpu_seconds = cpu[0];
 }
 
 // ---- what the machine can do ----------------------------------------------------
@@ -211,28 +218,28 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
         lanes = 8.0;
     }
 #endif
-    double best[2] = {1e30, 1e30};
-    for (int i = 0; i < 5; i++) {
-        const double t0 = bench_now();
+    double best[2] = {1e30, 1e30}; // CPU seconds
+    for (int i = 0; i < 9; i++) {
+        const double t0 = bench_cpu();
         gsf__parallel_for(&ctx, 4 * (size_t)threads, fma, read.sums);
-        const double t1 = bench_now();
+        const double t1 = bench_cpu();
         gsf__parallel_for(&ctx, size / READ_CHUNK, reader, &read);
-        const double t2 = bench_now();
+        const double t2 = bench_cpu();
         if (t1 - t0 < best[0]) best[0] = t1 - t0;
         if (t2 - t1 < best[1]) best[1] = t2 - t1;
         bench_sink += read.sums[0];
     }
     const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 4.0 * threads;
     bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
-    peak->flops = flops / best[0];
-    peak->bytes = (double)size / best[1];
+    peak->flops = flops * threads / best[0];
+    peak->bytes = (double)size * threads / best[1];
     bench_row row = bench_make_row("machine: multiply-add", level, threads, flops, "flop");
-    row.seconds = row.seconds_min = best[0];
-    row.cpu_seconds = best[0] * threads;
+    row.seconds = best[0] / threads;
+    row.cpu_seconds = best[0];
     bench_print(o, &row);
     row = bench_make_row("machine: read memory", level, threads, (double)size, "B");
-    row.seconds = row.seconds_min = best[1];
-    row.cpu_seconds = best[1] * threads;
+    row.seconds = best[1] / threads;
+    row.cpu_seconds = best[1];
     bench_print(o, &row);
     gsf_free(&ctx, read.sums);
 }
@@ -249,8 +256,9 @@ static uint64_t bench_random(uint64_t* state) { // xorshift64
 
 // Values of either sign with sizes in [1/4, 1/2). Bits of one value stand in each 16 or 32 bits.
 static void bench_fill(void* memory, size_t bytes, gsf_nn_dtype dtype, uint64_t seed) {
-    const uint64_t keep = dtype == GSF_NN_F32 ? 0x807fffff807fffffu : dtype == GSF_NN_BF16 ? 0x807f807f807f807fu : 0x83ff83ff83ff83ffu;
-    const uint64_t set = dtype == GSF_NN_F32 ? 0x3e8000003e800000u : dtype == GSF_NN_BF16 ? 0x3e803e803e803e80u : 0x3400340034003400u;
+    static const uint64_t keeps[] = {0x807fffff807fffffu, 0x807f807f807f807fu, 0x83ff83ff83ff83ffu}; // f32, bf16, f16
+    static const uint64_t sets[] = {0x3e8000003e800000u, 0x3e803e803e803e80u, 0x3400340034003400u};
+    const uint64_t keep = keeps[dtype], set = sets[dtype];
     uint64_t state = seed * 0x9e3779b97f4a7c15u + 1;
     for (size_t i = 0; i < bytes; i += 8) {
         const uint64_t bits = (bench_random(&state) & keep) | set;

@@ -27,8 +27,11 @@ static char* make_values(gsf_nn_dtype dtype, int64_t count, size_t offset, doubl
     for (int64_t i = 0; i < count; i++) {
         const float value = (float)test_random_in(&seed, -1.0, 1.0);
         const uint16_t half = gsf__float_to_half(value), brain = gsf__float_to_bf16(value);
-        (*wide)[i] = dtype == GSF_NN_F32 ? (double)value : dtype == GSF_NN_F16 ? test_half(half) : (double)gsf__bf16_to_float(brain);
-        memcpy(block + offset + (size_t)i * size, dtype == GSF_NN_F32 ? (const void*)&value : dtype == GSF_NN_F16 ? (const void*)&half : (const void*)&brain, size);
+        const void* bits = dtype == GSF_NN_F16 ? (const void*)&half : (const void*)&brain;
+        if (dtype == GSF_NN_F32) bits = &value;
+        memcpy(block + offset + (size_t)i * size, bits, size);
+        (*wide)[i] = dtype == GSF_NN_F32 ? (double)value : (double)gsf__bf16_to_float(brain);
+        if (dtype == GSF_NN_F16) (*wide)[i] = test_half(half);
     }
     memset(tensor, 0, sizeof *tensor);
     tensor->name = "made";
@@ -146,7 +149,8 @@ static void test_shapes(gsf_context* ctx) {
 
 // Sizes at which the work is cut: several blocks of rows, groups of outputs, blocks of outputs.
 static void test_blocks(gsf_context* ctx) {
-    static const int64_t sizes[][3] = {{320, 40, 400}, {321, 70, 300}, {400, 300, 90}, {650, 13, 1600}, {330, 2100, 20}, {4, 40, 2500}};
+    static const int64_t sizes[][3] = {{320, 40, 400}, {321, 70, 300}, {400, 300, 90}, {650, 13, 1600},
+                                       {330, 2100, 20}, {4, 2100, 250}, {1, 2100, 250}, {2, 1040, 33}};
     for (size_t i = 0; i < GSF__COUNT(sizes); i++)
         for (int t = 0; t < 3; t++) {
             layer l = make_layer(sizes[i][0], sizes[i][1], sizes[i][2], dtypes[t], (size_t)t, t == 1);
