@@ -7058,8 +7058,8 @@ static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transf
     GSF__TRY(gsf_nn_sample_cost(ctx, t, v, d, &cost));
     if (cost.bytes <= d->max_bytes) return GSF_OK;
     return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY,
-                    "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed", (int)d->frames, (int)d->width,
-                    (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
+                    "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed",
+                    (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
 }
 
 GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
