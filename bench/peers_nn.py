@@ -55,8 +55,94 @@ def linear(match, quick):
     return run, copies
 
 
+def attention(match, quick):
+    heads, dim, q, k = (int(match.group(i)) for i in (1, 2, 3, 4))
+    a = torch.rand(1, q, heads, dim).sub_(0.5).mul_(3).transpose(1, 2)
+    b, c = (torch.rand(1, k, heads, dim).sub_(0.5).mul_(3).transpose(1, 2) for _ in range(2))
+    return lambda: torch.nn.functional.scaled_dot_product_attention(a, b, c), 1
+
+
+def rows(match, quick):
+    kind, n, dim = match.group(1), int(match.group(2)), int(match.group(3))
+    f = torch.nn.functional
+    x, w = torch.rand(n, dim).sub_(0.5), torch.rand(n if kind == "group_norm" else dim)
+
+    def rope():  # as diffusers: norm of each head, then the rotation of pairs
+        y = f.layer_norm(x.view(n, -1, 64), (64,), w[:64], w[:64], 1e-6)
+        turned = y.reshape(n, -1, 32, 2)
+        turned = torch.stack([-turned[..., 1], turned[..., 0]], -1).flatten(2)
+        return y * table + turned * table
+    table = torch.rand(n, 1, 64) if kind == "head_norm_rope" else None
+    return {"layer_norm": lambda: f.layer_norm(x, (dim,), w, w, 1e-6),
+            "layer_norm_modulated": lambda: f.layer_norm(x, (dim,), w, w, 1e-6) * (1 + w) + w,
+            "rms_norm": lambda: f.rms_norm(x, (dim,), w, 1e-6), "head_norm_rope": rope,
+            "group_norm": lambda: f.group_norm(x.view(1, n, dim), 32, w, w, 1e-6),
+            "softmax": lambda: f.softmax(x, -1), "gelu": lambda: f.gelu(x, approximate="tanh"),
+            "silu": lambda: f.silu(x)}[kind], 1
+
+
+def conv3d(match, quick):
+    """Causal: three frames of the input before each one of the output. The better of both memory layouts counts."""
+    c, t, h, w = (int(match.group(i)) for i in (1, 2, 3, 4))
+    x, weight = torch.rand(1, c, t + 2, h, w).sub_(0.5), torch.rand(c, c, 3, 3, 3).sub_(0.5)
+    bias = torch.rand(c)
+    inputs = [(x, weight), (x.to(memory_format=torch.channels_last_3d), weight.to(memory_format=torch.channels_last_3d))]
+    runs = [lambda pair=pair: torch.nn.functional.conv3d(pair[0], pair[1], bias, padding=(0, 1, 1)) for pair in inputs]
+    seconds = []
+    for run in runs:
+        run()
+        start = time.perf_counter()
+        run()
+        seconds.append(time.perf_counter() - start)
+    return runs[seconds.index(min(seconds))], 1
+
+
+def block(match, quick):
+    """The layers of diffusers' CogVideoXBlock at the release's size, one sample; no cross-attention (R=0 only)."""
+    f, d, heads, text = torch.nn.functional, 3072, 48, 226
+    n = int(match.group(2))
+    x, embedding = torch.rand(1, n, d).sub_(0.5), torch.rand(1, 512).sub_(0.5)
+    table = torch.rand(n - text, 64)
+    linear = lambda out, fan: (torch.rand(out, fan).sub_(0.5).mul_(0.03), torch.rand(out).sub_(0.5))
+    modulation = [linear(6 * d, 512) for _ in range(2)]
+    q, k, v, out = (linear(d, d) for _ in range(4))
+    up, down = linear(4 * d, d), linear(d, 4 * d)
+    ones, small = torch.ones(d), torch.ones(64)
+
+    def modulate(y, layer):
+        shift, scale, gate, text_shift, text_scale, text_gate = f.linear(f.silu(embedding), *layer).chunk(6, 1)
+        y = f.layer_norm(y, (d,), ones, ones, 1e-5)
+        video = y[:, text:] * (1 + scale)[:, None] + shift[:, None]
+        words = y[:, :text] * (1 + text_scale)[:, None] + text_shift[:, None]
+        return torch.cat([words, video], 1), gate[:, None], text_gate[:, None]
+
+    def turned(y):  # norm of each head, then the rotation of pairs of the video's
+        y = f.layer_norm(y.view(1, n, heads, 64).transpose(1, 2), (64,), small, small, 1e-6)
+        video = y[:, :, text:]
+        pairs = video.reshape(1, heads, n - text, 32, 2)
+        pairs = torch.stack([-pairs[..., 1], pairs[..., 0]], -1).flatten(3)
+        y[:, :, text:] = video * table + pairs * table
+        return y
+
+    def run():
+        y, gate, text_gate = modulate(x, modulation[0])
+        a = f.scaled_dot_product_attention(turned(f.linear(y, *q)), turned(f.linear(y, *k)),
+                                           f.linear(y, *v).view(1, n, heads, 64).transpose(1, 2))
+        a = f.linear(a.transpose(1, 2).reshape(1, n, d), *out)
+        z = torch.cat([x[:, :text] + text_gate * a[:, :text], x[:, text:] + gate * a[:, text:]], 1)
+        y, gate, text_gate = modulate(z, modulation[1])
+        y = f.linear(f.gelu(f.linear(y, *up), approximate="tanh"), *down)
+        return torch.cat([z[:, :text] + text_gate * y[:, :text], z[:, text:] + gate * y[:, text:]], 1)
+    return run, 1
+
+
 CASES = [ # name of a case, what makes (function, units)
     (re.compile(r"linear (f32|bf16|f16) M=(\d+) N=(\d+) K=(\d+)(?: (gelu|silu))?$"), linear),
+    (re.compile(r"attention f32 H=(\d+) D=(\d+) Q=(\d+) K=(\d+)$"), attention),
+    (re.compile(r"(layer_norm|layer_norm_modulated|rms_norm|head_norm_rope|group_norm|softmax|gelu|silu) f32 (\d+)x(\d+)$"),
+     rows),
+    (re.compile(r"conv3d f32 C=(\d+) T=(\d+) H=(\d+) W=(\d+)$"), conv3d),
+    (re.compile(r"block (f32) S=(\d+) R=0$"), block),
 ]
 
 
