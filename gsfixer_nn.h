@@ -2810,6 +2810,14 @@ static void gsf__int8_quantize_rows(void* arg, size_t group, int worker) { // si
     }
 }
 
+static void gsf__int8_fetch(const int8_t* p, int64_t count) { // panels come from far: without this, widening waits
+#if defined(__GNUC__) || defined(__clang__)
+    for (int64_t i = 0; i < count; i += 64) __builtin_prefetch(p + i, 0, 2);
+#endif
+    (void)p;
+    (void)count;
+}
+
 static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of rows and outputs
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
     const int64_t row = (int64_t)index % job->row_blocks * job->block_rows; // of those in work
@@ -2823,12 +2831,16 @@ static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of
     for (int64_t k = 0; k < job->padded; k += job->depth) {
         const int64_t count = gsf__least(job->padded - k, job->depth);
         const int last = k + count == job->padded;
+        const int64_t share = count * GSF__TILE_COLUMNS / tiles; // of the next panel, fetched beside each tile
         int32_t* s = sums;
         for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS) {
             const int64_t width = gsf__least(columns - c, GSF__TILE_COLUMNS);
-            job->kernels->widen(job->weight->data + (column + c) * job->padded + k * GSF__TILE_COLUMNS, count, panel);
+            const int8_t* w = job->weight->data + (column + c) * job->padded + k * GSF__TILE_COLUMNS;
+            const int8_t* ahead = c + GSF__TILE_COLUMNS < columns ? w + job->padded * GSF__TILE_COLUMNS : NULL;
+            job->kernels->widen(w, count, panel);
             for (int64_t t = 0; t < tiles; t++, s += GSF__TILE_SUMS) {
                 const int64_t r = row + t * GSF__TILE_ROWS;
+                if (ahead) gsf__int8_fetch(ahead + t * share, share);
                 job->kernels->tile(job->x + r * job->padded + k * GSF__TILE_ROWS, panel, count, k > 0, s);
                 if (!last) continue;
                 job->kernels->scale(s, job->scales + r, job->weight->scales + column + c, tile);

@@ -140,7 +140,8 @@ static void test_definition(gsf_context* ctx) {
         }
         CHECK(worst <= 1.0);
         if (!(worst <= 1.0))
-            fprintf(stderr, "    %lld x %lld x %lld: %g of what is allowed\n", (long long)m, (long long)in, (long long)out, worst);
+            fprintf(stderr, "    %lld x %lld x %lld: %g of what is allowed\n", (long long)m, (long long)in, (long long)out,
+                    worst);
         int touched = 0;
         for (int64_t r = 0; r + 1 < m; r++)
             for (int64_t n = out; n < ldy; n++) touched += l.y[r * ldy + n] != l.before[r * ldy + n];
