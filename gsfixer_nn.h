@@ -440,7 +440,8 @@ typedef struct gsf_nn_transformer_input {
 GSF_API GSF_NODISCARD gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                             const gsf_nn_transformer_input* input, float* out);
 
-// Bytes of memory (beside the mapped weights) and floating-point operations of one such call.
+// Bytes of memory (beside the mapped weights and some 70 MB of the kernels' scratch) and floating-point operations of one
+// such call.
 GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
                                      double* bytes, double* flops);
 // Floats of reference_kv: every block's keys and values of all reference tokens.
