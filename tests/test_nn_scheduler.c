@@ -1,10 +1,11 @@
 // Noise schedule, time steps and solvers of gsfixer_nn.h: against a case with a closed solution, against the multistep
 // formulas written out, checkpoints, other orders of work, bad input. (The official tables: golden_restorer.)
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "test.h"
 #include "test_hooks.h"
+
+#define COUNT_OF(array) (sizeof(array) / sizeof((array)[0]))
 
 // ---- clean latents that are Gaussian, mean MEAN and deviation s: what the best model predicts, and where the flow goes
 
@@ -165,14 +166,14 @@ static void test_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     // halves, where numpy's way of counting decides (np.round(np.arange(1000, 0, -1000/48)) - 1)
     static const int32_t by_48[] = {999, 978, 957, 936, 916, 895, 874, 853};
     CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 48, 0.0, t, &count));
-    for (size_t i = 0; i < GSF__COUNT(by_48); i++) CHECK(t[i] == by_48[i]);
+    for (size_t i = 0; i < COUNT_OF(by_48); i++) CHECK(t[i] == by_48[i]);
     CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, 1.0, all, &count));
     CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, 0.6, t, &count)); // diffusers' get_timesteps: int(50 * 0.6)
     CHECK(count == 30 && memcmp(t, all + 20, 30 * sizeof *t) == 0);
     CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, 0.39, t, &count));
     CHECK(count == 19 && t[0] == all[31] && t[18] == 19);
     static const double bad[] = {-0.1, 1.1, 0.01, NAN, INFINITY};
-    for (size_t i = 0; i < GSF__COUNT(bad); i++)
+    for (size_t i = 0; i < COUNT_OF(bad); i++)
         CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, bad[i], t, &count), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, schedule, 0, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, schedule, 1001, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
@@ -224,7 +225,7 @@ static void test_configs(gsf_context* ctx) {
         {"[]", GSF_ERROR_FORMAT, "no object"},
         {"{", GSF_ERROR_FORMAT, "sched.json:1"},
     };
-    for (size_t i = 0; i < GSF__COUNT(cases); i++) {
+    for (size_t i = 0; i < COUNT_OF(cases); i++) {
         gsf_nn_schedule schedule;
         CHECK_RESULT(ctx, gsf_nn_parse_schedule(ctx, "sched.json", cases[i].text, strlen(cases[i].text),
                                                 GSF_NN_TABLE_DDIM, &schedule), cases[i].result);
@@ -268,7 +269,7 @@ static void backward_for(void* user, size_t chunks, gsf_chunk_fn body, void* arg
 
 // The same bits in another order of work, and when a run is taken up again from what a checkpoint keeps.
 static void test_repeatable(gsf_context* ctx, const gsf_nn_schedule* schedule) {
-    enum { COUNT = 2 * GSF__NN_CHUNK + 77, STEPS = 7, STOP = 4 };
+    enum { COUNT = 2 * 65536 + 77, STEPS = 7, STOP = 4 };
     float* x[3];
     float* v = (float*)malloc(COUNT * sizeof(float));
     gsf_context other;
@@ -371,8 +372,8 @@ static void test_positions(gsf_context* ctx) {
     d.theta = 10000.0;
     CHECK_OK(ctx, gsf_nn_make_rope(ctx, &d, same, out));
     CHECK(memcmp(c, same, sizeof c) == 0 && memcmp(s, out, sizeof s) == 0);
-    for (size_t i = 0; i < GSF__COUNT(c); i += 2) CHECK(c[i] == c[i + 1] && s[i] == s[i + 1]);
-    for (size_t i = 0; i < GSF__COUNT(c); i++) CHECK_NEAR(c[i] * c[i] + s[i] * s[i], 1.0f, 1e-6);
+    for (size_t i = 0; i < COUNT_OF(c); i += 2) CHECK(c[i] == c[i + 1] && s[i] == s[i + 1]);
+    for (size_t i = 0; i < COUNT_OF(c); i++) CHECK_NEAR(c[i] * c[i] + s[i] * s[i], 1.0f, 1e-6);
     const size_t row = ((1 * 3 + 2) * 4 + 3) * 16; // frame 1, row 2, column 3
     CHECK_NEAR(s[row], sin(1.0), 1e-7);
     CHECK_NEAR(s[row + 4], sin(2.0), 1e-7);
