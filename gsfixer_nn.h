@@ -535,6 +535,10 @@ GSF__BEGIN_IMPLEMENTATION
 
 // ---- >>nn numbers ---------------------------------------------------------------
 
+static int64_t gsf__least(int64_t a, int64_t b) { return a < b ? a : b; }
+static int64_t gsf__ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
+static int64_t gsf__round_up(int64_t a, int64_t b) { return gsf__ceil_div(a, b) * b; }
+
 static float gsf__bf16_to_float(uint16_t value) {
     const uint32_t bits = (uint32_t)value << 16;
     float out;
@@ -1081,6 +1085,19 @@ static gsf_result gsf__nn_end_quiet(gsf_context* ctx, const gsf_logger* logger, 
     return result;
 }
 
+// A file that may be absent: *data is NULL then, and neither log nor ctx->error tell of it.
+static gsf_result gsf__nn_read_if_there(gsf_context* ctx, const char* path, void** data, size_t* size) {
+    const gsf_logger logger = ctx->logger;
+    char error[sizeof ctx->error];
+    memcpy(error, ctx->error, sizeof error);
+    memset(&ctx->logger, 0, sizeof ctx->logger);
+    *data = NULL;
+    const gsf_result result = gsf__nn_end_quiet(ctx, &logger, gsf_read_file(ctx, path, data, size));
+    if (result != GSF_ERROR_IO) return result;
+    memcpy(ctx->error, error, sizeof error);
+    return GSF_OK;
+}
+
 // Opens <path>.index.json, else <path>. *found 0: neither is there, which is an error unless `may_lack`.
 static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_lack, int* found, gsf_nn_weights* weights) {
     const gsf_logger logger = ctx->logger;
@@ -1089,15 +1106,13 @@ static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_
     size_t size;
     gsf_text_append(ctx, path, ".index.json", 11);
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
-    memset(&ctx->logger, 0, sizeof ctx->logger);
-    gsf_result result = gsf__nn_end_quiet(ctx, &logger, gsf_read_file(ctx, path->data, &data, &size));
-    *found = result == GSF_OK;
+    gsf_result result = gsf__nn_read_if_there(ctx, path->data, &data, &size);
+    *found = data != NULL;
     if (*found) {
         result = gsf__nn_read_index(ctx, path->data, data, size, weights);
         gsf_free(ctx, data);
-        return result;
     }
-    if (result != GSF_ERROR_IO) return result;
+    if (*found || result) return result;
     path->data[plain] = 0;
     if (may_lack) memset(&ctx->logger, 0, sizeof ctx->logger);
     result = gsf__nn_add_file(ctx, path->data, weights);
@@ -1336,11 +1351,10 @@ static gsf_result gsf__nn_check_taken(const gsf__nn_loader* loader, const gsf_te
     return GSF_OK;
 }
 
-static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, int optional, const gsf_tensor** out,
-                               int32_t rank, const int64_t* shape) {
+static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, const gsf_tensor** out, int32_t rank,
+                               const int64_t* shape) {
     *out = NULL;
     const gsf_tensor* found = gsf_nn_find_tensor(loader->weights, name);
-    if (!found && optional) return GSF_OK;
     if (!found)
         return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s is missing", loader->weights->name,
                         gsf__nn_show(name).text);
@@ -1360,19 +1374,7 @@ GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_tensor** o
     va_start(args, format);
     vsnprintf(name, sizeof name, format, args);
     va_end(args);
-    return gsf__nn_take(loader, name, 0, out, rank, shape);
-}
-
-// The same for a tensor that may be absent: *out is NULL then.
-GSF_PRINTF(5, 6)
-GSF__SHARED gsf_result gsf__nn_want(gsf__nn_loader* loader, const gsf_tensor** out, int32_t rank, const int64_t* shape,
-                                    const char* format, ...) {
-    char name[256];
-    va_list args;
-    va_start(args, format);
-    vsnprintf(name, sizeof name, format, args);
-    va_end(args);
-    return gsf__nn_take(loader, name, 1, out, rank, shape);
+    return gsf__nn_take(loader, name, out, rank, shape);
 }
 
 // Counts all tensors whose names begin so as taken: parts of a file that the caller has no use for.
@@ -1523,8 +1525,6 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
 }
 
 // ---- >>nn vector: exp and friends, eight at a time --------------------------------
-
-static int64_t gsf__nn_min(int64_t a, int64_t b) { return a < b ? a : b; }
 
 #if GSF__X86
 
@@ -1729,7 +1729,7 @@ GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, fl
     double sum = 0.0;
     int64_t i = 0;
     while (i + 8 <= count) { // float sums of short stretches
-        const int64_t end = gsf__nn_min(i + 512, count);
+        const int64_t end = gsf__least(i + 512, count);
         __m256 part = _mm256_setzero_ps();
         for (; i + 8 <= end; i += 8) {
             const __m256 p = gsf__nn_exp2_low8(&c, _mm256_fmsub_ps(_mm256_loadu_ps(x + i), f, t));
@@ -1765,8 +1765,38 @@ enum { GSF__NN_CHUNK = 1 << 15 }; // values per chunk of elementwise work
 
 // Rows of `dim` values in a chunk of elementwise work, and the number of such chunks: sizes alone decide.
 static int64_t gsf__nn_chunk_rows(int64_t dim) { return dim < GSF__NN_CHUNK ? GSF__NN_CHUNK / (dim > 0 ? dim : 1) : 1; }
-static size_t gsf__nn_chunks(int64_t count, int64_t per_chunk) {
-    return count > 0 ? (size_t)((count - 1) / per_chunk + 1) : 0;
+static size_t gsf__nn_chunks(int64_t count, int64_t per_chunk) { return (size_t)gsf__ceil_div(count, per_chunk); }
+
+typedef struct gsf__finite_job {
+    const float* x;
+    int64_t count, part;
+    int64_t first[64]; // per part, -1: none
+} gsf__finite_job;
+
+static void gsf__finite_part(void* arg, size_t index, int worker) {
+    gsf__finite_job* job = (gsf__finite_job*)arg;
+    const int64_t begin = (int64_t)index * job->part, end = gsf__least(begin + job->part, job->count);
+    (void)worker;
+    job->first[index] = -1;
+    for (int64_t i = begin; i < end; i++) {
+        if (fabsf(job->x[i]) <= FLT_MAX) continue;
+        job->first[index] = i;
+        return;
+    }
+}
+
+// Index of the first value that is NaN or infinite, -1 when there is none.
+static int64_t gsf__nn_find_not_finite(gsf_context* ctx, const float* x, int64_t count) {
+    gsf__finite_job job;
+    job.x = x;
+    job.count = count;
+    job.part = gsf__ceil_div(count, (int64_t)GSF__COUNT(job.first));
+    if (job.part < GSF__NN_CHUNK) job.part = GSF__NN_CHUNK;
+    const size_t parts = gsf__nn_chunks(count, job.part);
+    gsf__parallel_for(ctx, parts, gsf__finite_part, &job);
+    for (size_t i = 0; i < parts; i++)
+        if (job.first[i] >= 0) return job.first[i];
+    return -1;
 }
 
 typedef struct gsf__activate_job {
@@ -1782,7 +1812,7 @@ static void gsf__activate_chunk(void* arg, size_t chunk, int worker) {
     const gsf__activate_job* job = (const gsf__activate_job*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK;
-    job->kernels->activate(job->activation, job->x + begin, gsf__nn_min(GSF__NN_CHUNK, job->columns - begin),
+    job->kernels->activate(job->activation, job->x + begin, gsf__least(GSF__NN_CHUNK, job->columns - begin),
                            job->y + begin);
 }
 
@@ -1886,9 +1916,6 @@ struct gsf__linear_job {
     float* workers;
 };
 
-static int64_t gsf__least(int64_t a, int64_t b) { return a < b ? a : b; }
-static int64_t gsf__ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
-static int64_t gsf__round_up(int64_t a, int64_t b) { return gsf__ceil_div(a, b) * b; }
 
 // `total` in equal pieces of at most `most`, rounded up to a multiple of `unit`.
 static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
@@ -2132,12 +2159,6 @@ GSF__INLINE_AVX2 void gsf__load16(const char* p, gsf_nn_dtype dtype, __m256* low
     }
 }
 
-GSF__INLINE_AVX2 float gsf__sum8(__m256 v) {
-    __m128 s = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
-    s = _mm_add_ps(s, _mm_movehl_ps(s, s));
-    return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
-}
-
 // A row of weights times one row of x; `count` is a multiple of 16. One row of weights after another, so that memory is
 // read in a line, which the hardware foresees: two rows side by side reach two thirds of the bandwidth.
 GSF__INLINE_AVX2 float gsf__few_one(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
@@ -2156,7 +2177,7 @@ GSF__INLINE_AVX2 float gsf__few_one(const char* w, gsf_nn_dtype dtype, const flo
         s0 = _mm256_fmadd_ps(a, _mm256_load_ps(x), s0);
         s1 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 8), s1);
     }
-    return gsf__sum8(_mm256_add_ps(_mm256_add_ps(s0, s1), _mm256_add_ps(s2, s3)));
+    return gsf__nn_sum8(_mm256_add_ps(_mm256_add_ps(s0, s1), _mm256_add_ps(s2, s3)));
 }
 
 GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { // the sums of four
@@ -3173,10 +3194,10 @@ enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; 
 
 static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
     const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: within the group
-    const int64_t end = gsf__nn_min(begin + job->part_size, job->group_size);
+    const int64_t end = gsf__least(begin + job->part_size, job->group_size);
     for (int64_t i = begin; i < end;) { // by channel
         const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
-        const int64_t count = gsf__nn_min(next, end) - i;
+        const int64_t count = gsf__least(next, end) - i;
         job->kernels->affine(job->x + first + i, count, m, inverse, job->weight ? job->weight[channel] : 1.0f,
                              job->bias ? job->bias[channel] : 0.0f, job->y + first + i);
         i += count;
@@ -3184,7 +3205,7 @@ static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int6
 }
 
 static gsf__moments gsf__norm_part(const gsf__norm_job* job, int64_t group, int64_t part, int64_t* count) {
-    *count = gsf__nn_min(job->part_size, job->group_size - part * job->part_size);
+    *count = gsf__least(job->part_size, job->group_size - part * job->part_size);
     return job->kernels->moments(job->x + group * job->group_size + part * job->part_size, *count, 1);
 }
 
@@ -3211,7 +3232,7 @@ static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
     gsf__moments m = of[0];
     for (int64_t p = 1; p < job->parts; p++) {
         const double before = (double)(p * job->part_size), delta = of[p].mean - m.mean;
-        const double after = (double)gsf__nn_min((p + 1) * job->part_size, job->group_size);
+        const double after = (double)gsf__least((p + 1) * job->part_size, job->group_size);
         const double share = (after - before) / after;
         m.mean += delta * share;
         m.square += of[p].square + delta * delta * before * share;
@@ -3541,7 +3562,7 @@ GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, 
     const gsf_nn_attention_desc* d = &job->desc;
     const gsf__attention_scratch s = gsf__attention_scratch_of(job, worker);
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
-    const int64_t rows = gsf__nn_min(job->range_size, d->queries - first);
+    const int64_t rows = gsf__least(job->range_size, d->queries - first);
     const int64_t groups = (rows + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, column = head * d->head_dim;
     float fade[GSF__ATT_QUERIES];
     gsf__attention_pack_queries(job, d->q + first * d->ldq + column, rows, s.q);
@@ -3549,12 +3570,12 @@ GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, 
     memset(s.sum, 0, (size_t)(groups * GSF__ATT_GROUP * 8) * sizeof(float));
     for (int64_t r = 0; r < groups * GSF__ATT_GROUP; r++) s.top[r] = -FLT_MAX;
     for (int64_t key = 0; key < d->keys; key += GSF__ATT_KEYS) {
-        const int64_t keys = gsf__nn_min(GSF__ATT_KEYS, d->keys - key);
+        const int64_t keys = gsf__least(GSF__ATT_KEYS, d->keys - key);
         const int64_t key_panels = (keys + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL, columns = key_panels * GSF__ATT_PANEL;
         gsf__attention_pack_keys(job, d->k + key * d->ldk + column, keys, s.k);
         gsf__attention_pack_values(job, d->v + key * d->ldv + column, keys, s.v);
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
-            const int64_t count = gsf__nn_min(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
+            const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
             gsf__attention_logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
             const unsigned char* mask = d->mask ? d->mask + (head * d->queries + first + r) * d->keys + key : NULL;
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
@@ -3813,7 +3834,7 @@ static void gsf__conv_pack_block(void* arg, size_t block, int worker) {
     const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
     const gsf__conv_layer* layer = job->layer;
     const int64_t taps = gsf__conv_taps(layer), first = (int64_t)block * GSF__CONV_N;
-    const int64_t n_end = gsf__nn_min(layer->out - first, GSF__CONV_N);
+    const int64_t n_end = gsf__least(layer->out - first, GSF__CONV_N);
     float* panel = job->out + (int64_t)block * gsf__conv_panel(layer);
     float* weights = panel + GSF__CONV_N;
     float values[CHANNELS * GSF__CONV_TAPS];
@@ -3821,7 +3842,7 @@ static void gsf__conv_pack_block(void* arg, size_t block, int worker) {
     if (n_end < GSF__CONV_N || !layer->bias) memset(panel, 0, (size_t)gsf__conv_panel(layer) * sizeof(float));
     if (layer->bias) gsf_nn_read_tensor(layer->bias, first, n_end, panel);
     for (int64_t c0 = 0; c0 < layer->in; c0 += CHANNELS) {
-        const int64_t channels = gsf__nn_min(layer->in - c0, CHANNELS);
+        const int64_t channels = gsf__least(layer->in - c0, CHANNELS);
         for (int64_t n = 0; n < n_end; n++) {
             gsf_nn_read_tensor(layer->weight, ((first + n) * layer->in + c0) * taps, channels * taps, values);
             for (int64_t t = 0; t < taps; t++)
@@ -3850,7 +3871,7 @@ static void gsf__conv_pack_quarter(void* arg, size_t chunk, int worker) { // chu
     const gsf__conv_layer* layer = job->layer;
     const gsf__conv_layer quarter = gsf__conv_quarter(layer);
     const int64_t blocks = gsf__conv_blocks(layer), parity = (int64_t)chunk / blocks, in = layer->in;
-    const int64_t first = (int64_t)chunk % blocks * GSF__CONV_N, n_end = gsf__nn_min(layer->out - first, GSF__CONV_N);
+    const int64_t first = (int64_t)chunk % blocks * GSF__CONV_N, n_end = gsf__least(layer->out - first, GSF__CONV_N);
     float* panel = job->out + (int64_t)chunk * gsf__conv_panel(&quarter);
     (void)worker;
     memset(panel, 0, (size_t)gsf__conv_panel(&quarter) * sizeof(float));
@@ -3903,7 +3924,7 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
     for (int64_t kt = 0; kt < job->kt; kt++)
         for (int64_t kh = 0; kh < job->kh; kh++)
             for (int64_t k0 = 0; k0 < job->k; k0 += GSF__CONV_K) {
-                const int64_t k = gsf__nn_min(job->k - k0, GSF__CONV_K);
+                const int64_t k = gsf__least(job->k - k0, GSF__CONV_K);
                 for (int64_t r = 0; r < rows; r++) {
                     const int64_t y = (y0 + r) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
@@ -3918,14 +3939,14 @@ static void gsf__conv_segment(void* arg, size_t segment, int worker) {
     const gsf__conv_job* job = (const gsf__conv_job*)arg;
     const int64_t across = gsf__conv_columns(job);
     const int64_t y0 = (int64_t)segment / across * GSF__CONV_ROWS, x0 = (int64_t)segment % across * GSF__CONV_COLUMNS;
-    const int64_t rows = gsf__nn_min(job->height - y0, GSF__CONV_ROWS);
-    const int64_t columns = gsf__nn_min(job->width - x0, GSF__CONV_COLUMNS);
+    const int64_t rows = gsf__least(job->height - y0, GSF__CONV_ROWS);
+    const int64_t columns = gsf__least(job->width - x0, GSF__CONV_COLUMNS);
     double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
     float tile[GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N];
     (void)worker;
     if (partial) memset(partial, 0, (size_t)job->groups * 2 * sizeof(double));
     for (int64_t n0 = 0; n0 < job->outputs; n0 += GSF__CONV_N) {
-        const int64_t n = gsf__nn_min(job->outputs - n0, GSF__CONV_N);
+        const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N);
         const float* b = job->packed + n0 / GSF__CONV_N * job->panel;
         double sums[2 * GSF__CONV_N];
         memset(sums, 0, sizeof sums);
@@ -4669,11 +4690,10 @@ GSF_API gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler
     step.x = x;
     step.x0 = x0;
     gsf__parallel_for(ctx, (step.count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &step);
-    size_t bad = 0;
-    for (size_t i = 0; i < step.count; i++) bad += !(fabsf(x[i]) <= FLT_MAX);
-    if (bad)
-        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "step %d (time %d): %zu of %zu latents are NaN or infinite",
-                        (int)sampler->index, (int)sampler->timesteps[sampler->index], bad, step.count);
+    const int64_t at = gsf__nn_find_not_finite(ctx, x, (int64_t)step.count);
+    if (at >= 0)
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "step %d (time %d): latent %lld of %zu is NaN or infinite",
+                        (int)sampler->index, (int)sampler->timesteps[sampler->index], (long long)at, step.count);
     sampler->index++;
     return GSF_OK;
 }
@@ -5204,48 +5224,13 @@ static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
 
 // ---- a value that is not finite, and where it comes from
 
-typedef struct gsf__finite_job {
-    const float* x;
-    int64_t count;
-    int64_t* first; // per chunk, -1: none
-} gsf__finite_job;
-
-static void gsf__finite_chunk(void* arg, size_t chunk, int worker) {
-    const gsf__finite_job* job = (const gsf__finite_job*)arg;
-    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK;
-    const int64_t end = begin + GSF__NN_CHUNK < job->count ? begin + GSF__NN_CHUNK : job->count;
-    (void)worker;
-    job->first[chunk] = -1;
-    for (int64_t i = begin; i < end; i++) {
-        uint32_t bits;
-        memcpy(&bits, job->x + i, sizeof bits);
-        if ((bits & 0x7f800000u) != 0x7f800000u) continue;
-        job->first[chunk] = i;
-        return;
-    }
-}
-
-// Index of the first value that is NaN or infinite, -1 when there is none, -2 when out of memory.
-static int64_t gsf__nn_find_not_finite(gsf_context* ctx, const float* x, int64_t count) {
-    const size_t chunks = (size_t)((count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK);
-    gsf__finite_job job;
-    int64_t found = -1;
-    job.x = x;
-    job.count = count;
-    job.first = (int64_t*)gsf_alloc(ctx, chunks, sizeof(int64_t));
-    if (!job.first) return -2;
-    gsf__parallel_for(ctx, chunks, gsf__finite_chunk, &job);
-    for (size_t i = 0; i < chunks && found < 0; i++) found = job.first[i];
-    gsf_free(ctx, job.first);
-    return found;
-}
-
-static int gsf__dit_tensor_is_finite(gsf_context* ctx, const gsf_tensor* tensor) {
+static int gsf__dit_tensor_is_finite(const gsf_tensor* tensor) {
     float part[1024];
     for (int64_t i = 0; i < tensor->count; i += 1024) {
         const int64_t n = tensor->count - i < 1024 ? tensor->count - i : 1024;
         gsf_nn_read_tensor(tensor, i, n, part);
-        if (gsf__nn_find_not_finite(ctx, part, n) >= 0) return 0;
+        for (int64_t k = 0; k < n; k++)
+            if (!(fabsf(part[k]) <= FLT_MAX)) return 0;
     }
     return 1;
 }
@@ -5253,12 +5238,11 @@ static int gsf__dit_tensor_is_finite(gsf_context* ctx, const gsf_tensor* tensor)
 // Says which stage made it, and which weights are to blame if one of theirs is not finite.
 static gsf_result gsf__dit_check(gsf__dit_run* run, const char* stage, const char* prefix, const float* x, int64_t count) {
     const int64_t at = gsf__nn_find_not_finite(run->ctx, x, count);
-    if (at == -1) return GSF_OK;
-    if (at == -2) return GSF_ERROR_OUT_OF_MEMORY;
+    if (at < 0) return GSF_OK;
     const gsf_nn_weights* w = &run->net->weights;
     for (size_t i = 0; i < w->tensor_count; i++)
         if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 &&
-            !gsf__dit_tensor_is_finite(run->ctx, &w->tensors[i]))
+            !gsf__dit_tensor_is_finite(&w->tensors[i]))
             return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
                             w->tensors[i].name);
     return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "transformer: %s gives %g (value %lld of %lld)", stage, (double)x[at],
@@ -6690,14 +6674,11 @@ GSF_API gsf_result gsf_nn_query_vae(gsf_context* ctx, const gsf_nn_vae* vae, gsf
 
 static gsf_result gsf__vae_check_finite(gsf_context* ctx, const char* what, const float* x, int64_t channels,
                                         int64_t frames, int64_t height, int64_t width) {
-    const int64_t count = channels * frames * height * width;
-    for (int64_t i = 0; i < count; i++)
-        if (!(fabsf(x[i]) <= FLT_MAX))
-            return gsf_fail(ctx, GSF_ERROR_NUMERIC,
-                            "%s: NaN or infinity in channel %lld, frame %lld, row %lld, column %lld", what,
-                            (long long)(i / (frames * height * width)), (long long)(i / (height * width) % frames),
-                            (long long)(i / width % height), (long long)(i % width));
-    return GSF_OK;
+    const int64_t at = gsf__nn_find_not_finite(ctx, x, channels * frames * height * width);
+    if (at < 0) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: NaN or infinity in channel %lld, frame %lld, row %lld, column %lld", what,
+                    (long long)(at / (frames * height * width)), (long long)(at / (height * width) % frames),
+                    (long long)(at / width % height), (long long)(at % width));
 }
 
 static gsf_result gsf__vae_apply(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
@@ -6897,22 +6878,18 @@ static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size
     run->sampler.index = (int32_t)index;
 }
 
-// Goes on from the checkpoint if there is one of this very job; one of another job is overwritten after the first step.
-static void gsf__sample_resume(gsf__sample_run* run) {
+// Goes on from the checkpoint if there is one of this very job; one of another job, or a broken one, is overwritten after
+// the first step.
+static gsf_result gsf__sample_resume(gsf__sample_run* run) {
     void* data;
     size_t size;
-    char error[sizeof run->ctx->error];
-    if (!run->desc.checkpoint) return;
-    memcpy(error, run->ctx->error, sizeof error); // a file that is not there is no error
-    const gsf_logger logger = run->ctx->logger;
-    memset(&run->ctx->logger, 0, sizeof run->ctx->logger);
-    if (gsf_read_file(run->ctx, run->desc.checkpoint, &data, &size) == GSF_OK) {
-        if (gsf_chunks_check(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
-        gsf_free(run->ctx, data);
-    }
-    run->ctx->logger = logger;
-    memcpy(run->ctx->error, error, sizeof error);
+    if (!run->desc.checkpoint) return GSF_OK;
+    GSF__TRY(gsf__nn_read_if_there(run->ctx, run->desc.checkpoint, &data, &size));
+    if (!data) return GSF_OK;
+    if (gsf_chunks_check(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
+    gsf_free(run->ctx, data);
     run->stats.resumed_from = run->sampler.index;
+    return GSF_OK;
 }
 
 // ---- the steps
@@ -7000,7 +6977,7 @@ static gsf_result gsf__sample_run_all(gsf__sample_run* run, float* out) {
     GSF__TRY(gsf__sample_encode(run));
     gsf__sample_begin(run);
     run->job = gsf__sample_job(run);
-    gsf__sample_resume(run);
+    GSF__TRY(gsf__sample_resume(run));
     run->cache.threshold = run->desc.block_cache;
     GSF__TRY(gsf__sample_steps(run));
     return gsf__sample_decode(run, out);

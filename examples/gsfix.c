@@ -399,21 +399,22 @@ int gsfix_check_restorer(gsfix_app* app) {
     return gsfix_misused(app, "--restorer %s: choose from none|warp|dit:MODEL_DIR|exec:COMMAND", r);
 }
 
+const char* const gsfix_conditions[4] = {"both", "2d", "3d", "none"};
+const char* const gsfix_solvers[3] = {"ddim", "dpmpp", "unipc"};
+
 gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     const gsfix_options* o = &app->o;
     const gsfix_quality* quality = gsfix_find_quality(o->quality);
-    static const char* const conditions[] = {"both", "2d", "3d", "none"}; // in the order of gsf_nn_condition
-    static const char* const solvers[] = {"ddim", "dpmpp", "unipc"};      // of gsf_nn_solver
     gsf_nn_dit_desc d;
     memset(&d, 0, sizeof d);
     d.model = o->restorer + 4;
     d.features = o->ref_features;
     for (int i = 0; i < 4; i++)
-        if (o->condition && strcmp(o->condition, conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
+        if (o->condition && strcmp(o->condition, gsfix_conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
     d.int8 = o->int8;
     d.sample.solver = quality->solver;
     for (int i = 0; i < 3; i++)
-        if (o->solver && strcmp(o->solver, solvers[i]) == 0) d.sample.solver = (gsf_nn_solver)i;
+        if (o->solver && strcmp(o->solver, gsfix_solvers[i]) == 0) d.sample.solver = (gsf_nn_solver)i;
     d.sample.steps = o->steps ? o->steps : quality->steps;
     d.sample.guidance = (float)o->guidance;
     d.sample.guidance_end = (float)o->guidance_until;

@@ -106,6 +106,8 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
 int gsfix_check_restorer(gsfix_app* app);
 gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present);
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
+extern const char* const gsfix_conditions[4]; // how --condition spells gsf_nn_condition
+extern const char* const gsfix_solvers[3];    // and --solver gsf_nn_solver
 gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app);      // as the options have it, for --restorer dit:MODEL_DIR
 void gsfix_drop_dit_checkpoint(const gsfix_app* app);      // of the clip that was at work, when the whole is done
 gsf_traj_kind gsfix_path_kind(const char* name);

@@ -438,16 +438,14 @@ static double as_written(float value) { // the shortest decimal that reads back 
 
 // What the run computes, by name and with every default filled in: printed in metrics.json, and what --resume insists on.
 static void write_dit_switches(fix_run* run) {
-    static const char* const conditions[] = {"both", "2d", "3d", "none"}; // gsf_nn_condition
-    static const char* const solvers[] = {"ddim", "dpmpp", "unipc"};      // gsf_nn_solver
     const gsf_nn_dit_desc dit = gsfix_dit_desc(run->app);
     const gsf_nn_sample_desc d = gsf_nn_resolve_sample(&dit.sample);
     gsf_context* ctx = run->ctx;
     gsf_text* t = &run->switches;
-    gsfix_json_text(ctx, t, "condition", conditions[dit.condition]);
+    gsfix_json_text(ctx, t, "condition", gsfix_conditions[dit.condition]);
     gsfix_json_text(ctx, t, "ref_features", dit.features);
     gsfix_json_number(ctx, t, "steps", d.steps);
-    gsfix_json_text(ctx, t, "solver", solvers[d.solver]);
+    gsfix_json_text(ctx, t, "solver", gsfix_solvers[d.solver]);
     gsfix_json_number(ctx, t, "guidance", as_written(d.guidance));
     gsfix_json_number(ctx, t, "guidance_until", as_written(d.guidance_end));
     gsfix_json_number(ctx, t, "strength", as_written(d.strength));
