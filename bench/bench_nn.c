@@ -13,100 +13,16 @@
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_nn.h"
 
-#include <time.h>
+#define BENCH_NAME "nn"
+#include "bench.h"
 
 typedef struct bench_options {
     int json, quick, threads;
     const char* filter;
 } bench_options;
 
-typedef struct bench_row {
-    const char *name, *variant, *isa, *work_unit, *reference;
-    int threads;
-    double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
-    double flops, bytes; // of the whole, as the definition needs them; 0: not the bound to look at
-} bench_row;
-
-typedef struct bench_peak { double flops, bytes; } bench_peak; // per second
-static bench_peak bench_peaks[2][3]; // by instruction set (scalar, AVX2) and threads (1, 2)
-
-static double bench_now(void) {
-    struct timespec t;
-    timespec_get(&t, TIME_UTC);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
-static double bench_cpu(void) { return (double)clock() / CLOCKS_PER_SEC; }
-
-static int bench_compare(const void* a, const void* b) {
-    const double x = *(const double*)a, y = *(const double*)b;
-    return (x > y) - (x < y);
-}
-
-static void bench_require(gsf_context* ctx, gsf_result result) {
-    if (result == GSF_OK) return;
-    fprintf(stderr, "bench_nn: %s (%s)\n", ctx->error, gsf_describe_result(result));
-    exit(1);
-}
-
-static int bench_context(gsf_context* ctx, gsf_cpu_level level, int threads) { // 0: the machine lacks the instructions
-    memset(ctx, 0, sizeof *ctx);
-    ctx->cpu_level = level;
-    ctx->threads = threads;
-    bench_require(ctx, gsf_init_context(ctx));
-    return ctx->cpu_level == level;
-}
-
-static void* bench_alloc(gsf_context* ctx, size_t count, size_t size) {
-    void* memory = gsf_alloc(ctx, count, size);
-    if (!memory) bench_require(ctx, GSF_ERROR_OUT_OF_MEMORY);
-    return memory;
-}
-
 static int bench_wanted(const bench_options* o, const char* name, int threads) {
     return (!o->filter || strstr(name, o->filter)) && (!o->threads || o->threads == threads);
-}
-
-static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threads, double work, const char* work_unit) {
-    bench_row row;
-    memset(&row, 0, sizeof row);
-    row.name = name;
-    row.variant = "default";
-    row.isa = gsf_cpu_level_name(level);
-    row.threads = threads;
-    row.work = work;
-    row.work_unit = work_unit;
-    row.reference = "none";
-    row.error_max = row.error_rel_l2 = -1.0;
-    return row;
-}
-
-static void bench_print(const bench_options* o, const bench_row* row) {
-    const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
-    const bench_peak* peak = &bench_peaks[strcmp(row->isa, "scalar") != 0][row->threads < 2 ? 1 : 2];
-    const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
-    const double byte_share = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
-    const double cpu = row->seconds * row->threads / row->cpu_seconds; // makes rates by CPU time of rates by the clock
-    if (o->json) {
-        printf("{\"bench\":\"nn\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
-               "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
-               row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
-               rate, row->reference);
-        if (row->flops > 0.0) printf(",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", flop_share, cpu * flop_share);
-        if (row->bytes > 0.0)
-            printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g,\"cpu_bandwidth_share\":%.4g", row->bytes, byte_share,
-                   cpu * byte_share);
-        if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
-        printf("}\n");
-    } else {
-        printf("%-44s %-8s %-6s %d thr %9.3f ms %9.3f ms cpu %8.4g G%s/s", row->name, row->variant, row->isa,
-               row->threads, 1e3 * row->seconds, 1e3 * row->cpu_seconds, 1e-9 * rate, row->work_unit);
-        if (row->flops > 0.0) printf("  %.1f%% (cpu %.1f%%) of the FMA peak", 100.0 * flop_share, 100.0 * cpu * flop_share);
-        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * byte_share, 100.0 * cpu * byte_share);
-        if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
-        printf("\n");
-    }
-    fflush(stdout);
 }
 
 // ---- time ------------------------------------------------------------------------
@@ -129,30 +45,12 @@ static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row,
         }
         rounds++;
     }
-    qsort(wall, (size_t)rounds, sizeof *wall, bench_compare);
+    row->seconds = bench_median(wall, (size_t)rounds);
     qsort(cpu, (size_t)rounds, sizeof *cpu, bench_compare);
-    row->seconds = wall[rounds / 2];
     row->cpu_seconds = cpu[0];
 }
 
 // ---- what the machine can do ----------------------------------------------------
-
-enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 22 };
-
-static float bench_sink; // keeps the compiler from dropping the loops
-
-#define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would lie in memory at -O2
-
-static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
-    (void)worker;
-#define BENCH_SCALAR(k) float v##k = (float)k;
-    BENCH_TEN(BENCH_SCALAR)
-    for (int i = 0; i < FMA_ROUNDS; i++) {
-#define BENCH_SCALAR_STEP(k) v##k = v##k * 0.999f + 0.001f;
-        BENCH_TEN(BENCH_SCALAR_STEP)
-    }
-    ((float*)arg)[16 * chunk] = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
-}
 
 enum { READ_CHUNK = 1 << 18 }; // bytes
 
@@ -176,18 +74,6 @@ static void bench_read_scalar(void* arg, size_t chunk, int worker) {
 }
 
 #if GSF__X86
-GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker) {
-    const __m256 a = _mm256_set1_ps(0.999f), b = _mm256_set1_ps(0.001f);
-    (void)worker;
-#define BENCH_VECTOR(k) __m256 v##k = _mm256_set1_ps((float)k);
-    BENCH_TEN(BENCH_VECTOR)
-    for (int i = 0; i < FMA_ROUNDS; i++) {
-#define BENCH_VECTOR_STEP(k) v##k = _mm256_fmadd_ps(v##k, a, b);
-        BENCH_TEN(BENCH_VECTOR_STEP)
-    }
-    _mm256_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
-}
-
 GSF__TARGET_AVX2 static void bench_read_avx2(void* arg, size_t chunk, int worker) {
     const bench_read* job = (const bench_read*)arg;
     const float* p = (const float*)(const void*)(job->memory + chunk * READ_CHUNK);
@@ -209,14 +95,11 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     bench_read read;
     read.memory = memory;
     read.sums = (float*)bench_alloc(&ctx, size / READ_CHUNK + 16, 16 * sizeof(float));
-    gsf_chunk_fn fma = bench_fma_scalar, reader = bench_read_scalar;
-    double lanes = 1.0;
+    double lanes;
+    const gsf_chunk_fn fma = bench_fma_of(level, &lanes);
+    gsf_chunk_fn reader = bench_read_scalar;
 #if GSF__X86
-    if (level >= GSF_CPU_AVX2) {
-        fma = bench_fma_avx2;
-        reader = bench_read_avx2;
-        lanes = 8.0;
-    }
+    if (level >= GSF_CPU_AVX2) reader = bench_read_avx2;
 #endif
     double best[2] = {1e30, 1e30}; // CPU seconds
     for (int i = 0; i < 9; i++) {
@@ -233,14 +116,10 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
     peak->flops = flops * threads / best[0];
     peak->bytes = (double)size * threads / best[1];
-    bench_row row = bench_make_row("machine: multiply-add", level, threads, flops, "flop");
-    row.seconds = best[0] / threads;
-    row.cpu_seconds = best[0];
-    bench_print(o, &row);
-    row = bench_make_row("machine: read memory", level, threads, (double)size, "B");
-    row.seconds = best[1] / threads;
-    row.cpu_seconds = best[1];
-    bench_print(o, &row);
+    bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0] / threads, best[0], flops, "flop");
+    bench_print(o->json, &row);
+    row = bench_make_row("machine: read memory", level, threads, best[1] / threads, best[1], (double)size, "B");
+    bench_print(o->json, &row);
     gsf_free(&ctx, read.sums);
 }
 
@@ -349,7 +228,7 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     l.desc.y = y;
     const double flops = 2.0 * (double)rows * (double)in * (double)out;
     const int few = rows <= GSF__FEW_ROWS;
-    bench_row row = bench_make_row(name, level, threads, few ? (double)bytes : flops, few ? "B" : "flop");
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? (double)bytes : flops, few ? "B" : "flop");
     if (few) row.bytes = (double)bytes;
     else row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_linear, &l, (double)l.copies);
@@ -358,7 +237,7 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     float* wide = (float*)bench_alloc(&ctx, (size_t)(in * out), sizeof(float));
     gsf_nn_read_tensor(&l.weight, 0, in * out, wide);
     bench_linear_error(&l, wide, bias, &row);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     gsf_free(&ctx, wide);
     gsf_free(&ctx, bias);
     gsf_free(&ctx, y);
@@ -437,17 +316,17 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
     l.linear.desc.bias = &l.linear.bias;
     l.linear.desc.y = y;
     bench_run_quantize(&ctx, &l);
-    bench_row row = bench_make_row(name, level, threads, 2.0 * (double)rows * (double)in * (double)out, "op");
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, 2.0 * (double)rows * (double)in * (double)out, "op");
     row.flops = row.work;
     bench_time(o, &ctx, &row, bench_run_int8, &l, 1.0);
     bench_linear_error(&l.linear, w, bias, &row);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     if (rows == 2048) {
         snprintf(name, sizeof name, "linear int8 weights N=%lld K=%lld", (long long)out, (long long)in);
-        row = bench_make_row(name, level, threads, (double)in * (double)out, "weight");
+        row = bench_make_row(name, level, threads, 0.0, 0.0, (double)in * (double)out, "weight");
         row.bytes = (double)in * (double)out * sizeof(float) + (double)l.weight.bytes;
         bench_time(o, &ctx, &row, bench_run_quantize, &l, 1.0);
-        bench_print(o, &row);
+        bench_print(o->json, &row);
     }
     gsf_free(&ctx, bias);
     gsf_free(&ctx, y);
@@ -536,11 +415,11 @@ static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int
     a.desc.v = memory + q_size + k_size;
     a.desc.out = memory + q_size + 2 * k_size;
     const double flops = 4.0 * (double)queries * (double)keys * (double)heads * 64.0;
-    bench_row row = bench_make_row(name, level, threads, flops, "flop");
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_attention, &a, 1.0);
     bench_attention_error(&ctx, &a.desc, &row);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     gsf_nn_destroy_workspace(&ctx, &a.workspace);
     gsf_free(&ctx, memory);
 }
@@ -632,7 +511,7 @@ static void bench_one_rows(const bench_options* o, gsf_cpu_level level, int thre
     const int64_t looks = kind == GROUP_NORM ? rows / BENCH_GROUPS * dim : kind == HEAD_NORM ? BENCH_HEAD : dim;
     double *expected = (double*)bench_alloc(&ctx, (size_t)looks, sizeof(double)), square = 0.0;
     const double bytes = 2.0 * (double)count * sizeof(float); // read once, written once
-    bench_row row = bench_make_row(name, level, threads, bytes, "B");
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, bytes, "B");
     if (count > 1 << 22) row.bytes = bytes; // else the caches hold them
     memcpy(b.y, b.x, count * sizeof(float)); // head norm works in place
     bench_run_rows(&ctx, &b);
@@ -642,7 +521,7 @@ static void bench_one_rows(const bench_options* o, gsf_cpu_level level, int thre
     row.error_rel_l2 = sqrt(row.error_rel_l2 / square);
     row.reference = "float64";
     bench_time(o, &ctx, &row, bench_run_rows, &b, 1.0);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     gsf_free(&ctx, expected);
     gsf_free(&ctx, memory);
 }
@@ -732,11 +611,11 @@ static void bench_one_conv(const bench_options* o, gsf_cpu_level level, int thre
     c.desc.height = height;
     c.desc.width = width;
     c.desc.weight = &c.weight;
-    bench_row row = bench_make_row(name, level, threads, 54.0 * (double)values * (double)channels, "flop");
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, 54.0 * (double)values * (double)channels, "flop");
     row.flops = row.work;
     bench_time(o, &ctx, &row, bench_run_conv, &c, 1.0);
     bench_conv_error(&c, w, &row);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     gsf_free(&ctx, w);
     gsf_free(&ctx, y);
     gsf_free(&ctx, x);
@@ -795,10 +674,10 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
     bench_fill(r.run.slots[0].data, values * sizeof(float), GSF_NN_F32, 1);
     for (int64_t g = 0; g < 2 * r.net.groups; g++) // what filling it would have summed up: mean 0, deviation 3/8
         gsf__vae_sums(&r.run, 0)[g] = g % 2 ? 0.140625 * (double)values / 32.0 : 0.0;
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 2.0 * 54.0 * (double)values * (double)channels, "flop");
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, 2.0 * 54.0 * (double)values * (double)channels, "flop");
     row.flops = row.work;
     bench_time(o, &ctx, &row, bench_run_resnet, &r, 1.0);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     gsf__vae_end(&r.run);
     gsf_free(&ctx, w);
 }
@@ -905,10 +784,10 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     double bytes, flops;
     gsf_nn_transformer_cost(&b.net, &b.in, &bytes, &flops);
     flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, flops, "flop");
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_block, &b, 1.0);
-    bench_print(o, &row);
+    bench_print(o->json, &row);
     gsf_nn_destroy_workspace(&ctx, &b.run.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);

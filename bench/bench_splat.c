@@ -18,138 +18,21 @@
 #include "../gsfixer_splat.h"
 #include "../tests/reference_splat.h"
 
+#define BENCH_NAME "splat"
+#include "bench.h"
+
 #include <sys/resource.h>
-#include <time.h>
 
 typedef struct bench_options {
     int json, quick, growth, threads, steps;
     const char *filter, *scene, *views, *start;
 } bench_options;
 
-typedef struct bench_row {
-    const char *name, *variant, *isa, *work_unit, *reference;
-    int threads;
-    double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
-    double flops, bytes; // of the whole, by the counts below; 0: not counted
-    double peak_rss;     // bytes; 0: not measured
-} bench_row;
-
-typedef struct bench_peak { double flops, bytes; } bench_peak; // per second
-static bench_peak bench_peaks[2][3]; // by instruction set (scalar, AVX2) and threads (1, 2)
-
-static const bench_peak* bench_peak_of(const char* isa, int threads) {
-    return &bench_peaks[strcmp(isa, "scalar") != 0][threads < 2 ? 1 : 2];
-}
-
-static double bench_now(void) {
-    struct timespec t;
-    timespec_get(&t, TIME_UTC);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
-static double bench_cpu(void) { return (double)clock() / CLOCKS_PER_SEC; }
-
-static int bench_compare(const void* a, const void* b) {
-    const double x = *(const double*)a, y = *(const double*)b;
-    return (x > y) - (x < y);
-}
-
-static double bench_median(double* values, size_t count) {
-    qsort(values, count, sizeof *values, bench_compare);
-    return count ? values[count / 2] : 0.0;
-}
-
-static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threads, double seconds, double cpu_seconds,
-                                double work, const char* work_unit) {
-    bench_row row;
-    memset(&row, 0, sizeof row);
-    row.name = name;
-    row.variant = "default";
-    row.isa = gsf_cpu_level_name(level);
-    row.threads = threads;
-    row.seconds = seconds;
-    row.cpu_seconds = cpu_seconds;
-    row.work = work;
-    row.work_unit = work_unit;
-    row.reference = "none";
-    row.error_max = row.error_rel_l2 = -1.0;
-    return row;
-}
-
-static void bench_print(const bench_options* o, const bench_row* row) {
-    if (o->filter && !strstr(row->name, o->filter)) return;
-    const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
-    const bench_peak* peak = bench_peak_of(row->isa, row->threads);
-    const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
-    const double byte_share = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
-    if (o->json) {
-        printf("{\"bench\":\"splat\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
-               "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
-               row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
-               rate, row->reference);
-        if (row->flops > 0.0) printf(",\"peak_share\":%.4g", flop_share);
-        if (row->bytes > 0.0) printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g", row->bytes, byte_share);
-        if (row->peak_rss > 0.0) printf(",\"peak_rss_bytes\":%.0f", row->peak_rss);
-        if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
-        printf("}\n");
-    } else {
-        printf("%-28s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->isa, row->threads, 1e3 * row->seconds,
-               1e3 * row->cpu_seconds, rate, row->work_unit);
-        if (row->flops > 0.0) printf("  %.0f%% of the FMA peak", 100.0 * flop_share);
-        if (row->bytes > 0.0) printf("  %.0f%% of the bandwidth", 100.0 * byte_share);
-        if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
-        if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
-        printf("\n");
-    }
-    fflush(stdout);
-}
-
-static void bench_require(gsf_context* ctx, gsf_result result) {
-    if (result == GSF_OK) return;
-    fprintf(stderr, "bench_splat: %s (%s)\n", ctx->error, gsf_describe_result(result));
-    exit(1);
-}
-
-static int bench_context(gsf_context* ctx, gsf_cpu_level level, int threads) { // 0: the machine lacks the instructions
-    memset(ctx, 0, sizeof *ctx);
-    ctx->cpu_level = level;
-    ctx->threads = threads;
-    bench_require(ctx, gsf_init_context(ctx));
-    return ctx->cpu_level == level;
+static void bench_show(const bench_options* o, const bench_row* row) {
+    if (!o->filter || strstr(row->name, o->filter)) bench_print(o->json, row);
 }
 
 // ---- what the machine can do ----------------------------------------------------
-
-enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 22 };
-
-static float bench_sink; // keeps the compiler from dropping the loops
-
-#define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would lie in memory at -O2
-
-static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
-    (void)worker;
-#define BENCH_SCALAR(k) float v##k = (float)k;
-    BENCH_TEN(BENCH_SCALAR)
-    for (int i = 0; i < FMA_ROUNDS; i++) {
-#define BENCH_SCALAR_STEP(k) v##k = v##k * 0.999f + 0.001f;
-        BENCH_TEN(BENCH_SCALAR_STEP)
-    }
-    ((float*)arg)[16 * chunk] = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
-}
-
-#if GSF__X86
-GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker) {
-    const __m256 a = _mm256_set1_ps(0.999f), b = _mm256_set1_ps(0.001f);
-    (void)worker;
-#define BENCH_VECTOR(k) __m256 v##k = _mm256_set1_ps((float)k);
-    BENCH_TEN(BENCH_VECTOR)
-    for (int i = 0; i < FMA_ROUNDS; i++) {
-#define BENCH_VECTOR_STEP(k) v##k = _mm256_fmadd_ps(v##k, a, b);
-        BENCH_TEN(BENCH_VECTOR_STEP)
-    }
-    _mm256_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
-}
-#endif
 
 enum { TRIAD_CHUNKS = 32, TRIAD_FLOATS = 1 << 18 }; // 3 arrays of 32 MiB
 
@@ -163,16 +46,11 @@ static void bench_triad(void* arg, size_t chunk, int worker) {
 static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads) {
     gsf_context ctx;
     if (!bench_context(&ctx, level, threads)) return;
-    float* memory = (float*)gsf_alloc_zeroed(&ctx, 3 * (size_t)TRIAD_CHUNKS * TRIAD_FLOATS, sizeof(float));
-    if (!memory) exit(1);
-    gsf_chunk_fn fma = bench_fma_scalar;
-    double lanes = 1.0;
-#if GSF__X86
-    if (level >= GSF_CPU_AVX2) {
-        fma = bench_fma_avx2;
-        lanes = 8.0;
-    }
-#endif
+    const size_t floats = 3 * (size_t)TRIAD_CHUNKS * TRIAD_FLOATS;
+    float* memory = (float*)bench_alloc(&ctx, floats, sizeof(float));
+    memset(memory, 0, floats * sizeof(float));
+    double lanes;
+    const gsf_chunk_fn fma = bench_fma_of(level, &lanes);
     double best[2] = {1e30, 1e30};
     for (int i = 0; i < 5; i++) {
         const double t0 = bench_now();
@@ -190,9 +68,9 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     peak->flops = flops / best[0];
     peak->bytes = bytes / best[1];
     bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0], best[0] * threads, flops, "flop");
-    bench_print(o, &row);
+    bench_show(o, &row);
     row = bench_make_row("machine: memory", level, threads, best[1], best[1] * threads, bytes, "B");
-    bench_print(o, &row);
+    bench_show(o, &row);
     gsf_free(&ctx, memory);
 }
 
@@ -425,11 +303,11 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
                                        by_pair ? pairs : by_pixel ? p : n, by_pair ? "pairs" : by_pixel ? "pixels" : "splats");
         row.bytes = bytes[k];
         row.flops = k == STAGE_BLEND ? pairs * BENCH_FORWARD_FLOPS : k == STAGE_REVERSE ? pairs * BENCH_BACKWARD_FLOPS : 0.0;
-        bench_print(o, &row);
+        bench_show(o, &row);
     }
     snprintf(label, sizeof label, "%s: step", name);
     const bench_row row = bench_make_row(label, level, threads, bench_median(step, (size_t)rounds), step_cpu, n, "splats");
-    bench_print(o, &row);
+    bench_show(o, &row);
     gsf__loss_destroy_scratch(&ctx, &scratch);
     gsf__model_destroy(&ctx, &model);
     gsf_splat_destroy_rasterizer(&ctx, r);
@@ -560,7 +438,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         ref_destroy_image(&image);
         ref_destroy_splats(&exact);
     }
-    for (int k = 0; k < 2; k++) bench_print(o, &rows[k]);
+    for (int k = 0; k < 2; k++) bench_show(o, &rows[k]);
     bench_close_pass(&ctx, &p);
 }
 
@@ -604,7 +482,7 @@ static void bench_skips(const bench_options* o, const char* name, size_t count, 
             bench_error((const float*)passes[k].out.color.data, full, NULL, passes[k].values, 1, &row);
             row.reference = "default";
         }
-        bench_print(o, &row);
+        bench_show(o, &row);
     }
     free(full);
     for (int k = 0; k < VARIANTS; k++) bench_close_pass(&ctx, &passes[k]);
@@ -691,7 +569,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
                 row.error_max = worst;
                 row.error_rel_l2 = sqrt(difference / total);
             }
-            bench_print(o, &row);
+            bench_show(o, &row);
         }
     for (int k = 0; k < 2; k++) gsf_splat_destroy_trainer(&ctx, trainers[k]);
     for (int v = 0; v < VIEWS; v++) gsf_destroy_image(&ctx, &views[v].image);
@@ -723,7 +601,7 @@ static void bench_growth_row(const bench_options* o, const char* by, double amou
     snprintf(label, sizeof label, "growth: %s %g", by, amount);
     bench_row row = bench_make_row(label, ctx.cpu_level, ctx.parallel.worker_count, bench_median(seconds, ROUNDS), cpu,
                                    amount, by);
-    bench_print(o, &row);
+    bench_show(o, &row);
     bench_close_pass(&ctx, &p);
 }
 
@@ -792,12 +670,12 @@ static void bench_visibility(const bench_options* o, const char* name, size_t co
     snprintf(label, sizeof label, "%s: normals", name);
     bench_row row = bench_make_row(label, ctx.cpu_level, threads, stats.seconds_normals, cpu_seconds, (double)count, "points");
     row.variant = by;
-    bench_print(o, &row);
+    bench_show(o, &row);
     snprintf(label, sizeof label, "%s: build and rays", name);
     row = bench_make_row(label, ctx.cpu_level, threads, stats.seconds_build + stats.seconds_rays, cpu_seconds,
                          (double)count * (double)view_count, "point views");
     row.variant = by;
-    bench_print(o, &row);
+    bench_show(o, &row);
     if (!o->json) printf("%s: by %s, %.1f %% of the points kept, %.3g rays, %.2f s to build\n", name, by,
                          100.0 * (double)stats.kept / (double)count, (double)stats.rays, stats.seconds_build);
     gsf_free(&ctx, keep);
@@ -863,7 +741,7 @@ static void bench_training(const bench_options* o) {
                                    bench_median(seconds, (size_t)o->steps), step_cpu, (double)start.count, "splats");
     struct rusage usage;
     if (getrusage(RUSAGE_SELF, &usage) == 0) row.peak_rss = 1024.0 * (double)usage.ru_maxrss; // KiB on Linux
-    bench_print(o, &row);
+    bench_show(o, &row);
     gsf_free(&ctx, seconds);
     gsf_splat_destroy_trainer(&ctx, trainer);
     gsf_splat_destroy(&ctx, &start);
