@@ -1,7 +1,7 @@
 // bench_nn.c - seconds beside error of the network kernels.
 // By hand: cc -O2 -fopenmp -I. bench/bench_nn.c -o bench_nn -lm
 //
-//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N]
+//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--model FOLDER]
 //
 // First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
 // released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
@@ -9,16 +9,21 @@
 // runs PyTorch on the same cases, which it reads from their names.
 // Seconds are the median; cpu_seconds, the process' CPU time of all threads, is the least of the rounds. Peaks are by CPU
 // time, too: on a machine that does other things as well, cpu_peak_share is the figure to look at.
+// --model runs a model's VAE and one forward pass of its transformer once, at the configured size, instead: seconds,
+// operations and the peak of anonymous memory (make_model writes such a folder; the released size takes hours here).
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_nn.h"
+
+#include <pthread.h>
+#include <stdatomic.h>
 
 #define BENCH_NAME "nn"
 #include "bench.h"
 
 typedef struct bench_options {
     int json, quick, threads;
-    const char* filter;
+    const char *filter, *model;
 } bench_options;
 
 static int bench_wanted(const bench_options* o, const char* name, int threads) {
@@ -806,6 +811,169 @@ static void bench_blocks(const bench_options* o) {
     }
 }
 
+// ---- a whole model from its folder ---------------------------------------------------
+
+typedef struct bench_memory { // resident bytes of this process, watched from a thread of its own
+    pthread_t thread;
+    atomic_int stop;
+    double anonymous, file; // peaks
+} bench_memory;
+
+static void* bench_watch(void* arg) {
+    bench_memory* m = (bench_memory*)arg;
+    while (!atomic_load(&m->stop)) {
+        char line[128];
+        double kib;
+        FILE* f = fopen("/proc/self/status", "r");
+        while (f && fgets(line, sizeof line, f)) {
+            if (sscanf(line, "RssAnon: %lf", &kib) == 1 && kib * 1024.0 > m->anonymous) m->anonymous = kib * 1024.0;
+            if (sscanf(line, "RssFile: %lf", &kib) == 1 && kib * 1024.0 > m->file) m->file = kib * 1024.0;
+        }
+        if (f) fclose(f);
+        const struct timespec wait = {0, 50000000};
+        nanosleep(&wait, NULL);
+    }
+    return NULL;
+}
+
+typedef struct bench_steps { // clock at every step that is reported
+    double* seconds;
+    size_t count, limit;
+} bench_steps;
+
+static void bench_step(void* user, const char* stage, double done, double total) {
+    bench_steps* s = (bench_steps*)user;
+    if (s->count < s->limit) s->seconds[s->count++] = bench_now();
+    fprintf(stderr, "%s %.0f of %.0f\n", stage, done, total);
+}
+
+typedef struct bench_model {
+    const char* folder;
+    gsf_nn_transformer transformer;
+    gsf_nn_transformer_input in;
+    gsf_nn_vae vae;
+    int64_t frames, height, width; // of the latents
+    float *x, *y;
+} bench_model;
+
+static void bench_run_forward(gsf_context* ctx, void* arg) {
+    bench_model* m = (bench_model*)arg;
+    bench_require(ctx, gsf_nn_transformer_forward(ctx, &m->transformer, &m->in, m->y));
+}
+
+static void bench_run_decode(gsf_context* ctx, void* arg) {
+    bench_model* m = (bench_model*)arg;
+    bench_require(ctx, gsf_nn_vae_decode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y));
+}
+
+static void bench_run_encode(gsf_context* ctx, void* arg) {
+    bench_model* m = (bench_model*)arg;
+    bench_require(ctx, gsf_nn_vae_encode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y, NULL));
+}
+
+// Once: these take minutes. Memory is the process', less what it held before.
+static void bench_once(const bench_options* o, gsf_context* ctx, const char* name, bench_model* m, bench_body body,
+                       double flops, double bytes) {
+    double times[256]; // more steps than that are not looked at
+    bench_steps steps = {times, 0, 256};
+    bench_memory memory;
+    memset(&memory, 0, sizeof memory);
+    ctx->progress.progress_fn = bench_step;
+    ctx->progress.user = &steps;
+    if (pthread_create(&memory.thread, NULL, bench_watch, &memory) != 0) bench_require(ctx, GSF_ERROR_OUT_OF_MEMORY);
+    bench_row row = bench_make_row(name, ctx->cpu_level, ctx->threads, 0.0, 0.0, flops, "flop");
+    const double wall = bench_now(), cpu = bench_cpu();
+    body(ctx, m);
+    row.seconds = bench_now() - wall;
+    row.cpu_seconds = bench_cpu() - cpu;
+    row.flops = flops;
+    atomic_store(&memory.stop, 1);
+    pthread_join(memory.thread, NULL);
+    row.peak_rss = memory.anonymous;
+    bench_print(o->json, &row);
+    for (size_t i = steps.count; i-- > 1;) times[i] -= times[i - 1];
+    fprintf(stderr, "%s: %.2f GiB anonymous (%.2f announced), %.2f GiB of files; median of %d steps %.2f s\n", name,
+            memory.anonymous / (1 << 30), bytes / (1 << 30), memory.file / (1 << 30), (int)steps.count,
+            steps.count > 1 ? bench_median(times + 1, steps.count - 1) : 0.0);
+    ctx->progress.progress_fn = NULL;
+}
+
+static void bench_fill_floats(gsf_context* ctx, float** to, size_t count, uint64_t seed) {
+    *to = (float*)bench_alloc(ctx, count, sizeof(float));
+    bench_fill(*to, count * sizeof(float), GSF_NN_F32, seed);
+}
+
+// One forward pass of one sample at the configured size, with the reference tokens of two photos.
+static void bench_forward(const bench_options* o, gsf_context* ctx, bench_model* m) {
+    char path[1024];
+    snprintf(path, sizeof path, "%s/transformer", m->folder);
+    gsf_nn_transformer* t = &m->transformer;
+    bench_require(ctx, gsf_nn_make_transformer(ctx, path, t));
+    const int32_t frames = (t->sample_frames - 1) / t->temporal_ratio + 1;
+    const size_t pixels = (size_t)frames * (size_t)t->sample_height * (size_t)t->sample_width;
+    const double timestep = 500.0;
+    float *hidden, *text, *dino, *vggt, *references, *kv;
+    memset(&m->in, 0, sizeof m->in);
+    m->in.reference_tokens = 1850;
+    m->in.batch = m->in.reference_batch = 1;
+    m->in.frames = frames;
+    m->in.height = t->sample_height;
+    m->in.width = t->sample_width;
+    m->in.timesteps = &timestep;
+    const size_t tokens = (size_t)m->in.reference_tokens;
+    bench_fill_floats(ctx, &hidden, pixels * (size_t)t->in_channels, 1);
+    bench_fill_floats(ctx, &text, (size_t)t->text_tokens * (size_t)t->text_channels, 2);
+    bench_fill_floats(ctx, &dino, tokens * (size_t)t->dino_channels, 3);
+    bench_fill_floats(ctx, &vggt, tokens * (size_t)t->vggt_channels, 4);
+    bench_fill_floats(ctx, &references, tokens * (size_t)(t->heads * t->head_dim), 5);
+    bench_fill_floats(ctx, &m->y, pixels * (size_t)t->out_channels, 6);
+    kv = (float*)bench_alloc(ctx, gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1), sizeof(float));
+    bench_require(ctx, gsf_nn_project_references(ctx, t, m->in.reference_tokens, dino, vggt, references));
+    m->in.hidden = hidden;
+    m->in.text = text;
+    m->in.references = references;
+    m->in.reference_kv = kv;
+    double bytes, flops;
+    gsf_nn_transformer_cost(t, &m->in, &bytes, &flops);
+    bench_once(o, ctx, "model: transformer forward", m, bench_run_forward, flops, bytes);
+    float* all[] = {hidden, text, dino, vggt, references, m->y, kv};
+    for (size_t i = 0; i < GSF__COUNT(all); i++) gsf_free(ctx, all[i]);
+    gsf_nn_destroy_transformer(ctx, t);
+}
+
+static void bench_vae(const bench_options* o, gsf_context* ctx, bench_model* m, gsf_nn_vae_way way) {
+    char path[1024];
+    snprintf(path, sizeof path, "%s/vae", m->folder);
+    gsf_nn_vae* v = &m->vae;
+    bench_require(ctx, gsf_nn_make_vae(ctx, path, v));
+    const int encode = way == GSF_NN_VAE_ENCODE;
+    const int64_t frames = 49; // of the paper's clips
+    m->frames = encode ? frames : (frames - 1) / v->temporal_ratio + 1;
+    m->height = v->sample_height / (encode ? 1 : v->spatial_ratio);
+    m->width = v->sample_width / (encode ? 1 : v->spatial_ratio);
+    gsf_nn_vae_info info;
+    bench_require(ctx, gsf_nn_query_vae(ctx, v, way, NULL, m->frames, m->height, m->width, &info));
+    const int64_t in = encode ? v->in_channels : v->latent_channels, out = encode ? v->latent_channels : v->out_channels;
+    bench_fill_floats(ctx, &m->x, (size_t)(in * m->frames * m->height * m->width), 1);
+    m->y = (float*)bench_alloc(ctx, (size_t)(out * info.frames * info.height * info.width), sizeof(float));
+    bench_once(o, ctx, encode ? "model: vae encode" : "model: vae decode", m, encode ? bench_run_encode : bench_run_decode,
+               info.flops, info.bytes);
+    gsf_free(ctx, m->x);
+    gsf_free(ctx, m->y);
+    gsf_nn_destroy_vae(ctx, v);
+}
+
+static void bench_whole_model(const bench_options* o) {
+    gsf_context ctx;
+    bench_model m;
+    (void)bench_context(&ctx, GSF_CPU_AUTO, o->threads ? o->threads : 2);
+    memset(&m, 0, sizeof m);
+    m.folder = o->model;
+    if (bench_wanted(o, "model: vae decode", ctx.threads)) bench_vae(o, &ctx, &m, GSF_NN_VAE_DECODE);
+    if (bench_wanted(o, "model: transformer forward", ctx.threads)) bench_forward(o, &ctx, &m);
+    if (bench_wanted(o, "model: vae encode", ctx.threads)) bench_vae(o, &ctx, &m, GSF_NN_VAE_ENCODE);
+}
+
 int main(int argc, char** argv) {
     bench_options o;
     memset(&o, 0, sizeof o);
@@ -815,8 +983,9 @@ int main(int argc, char** argv) {
         else if (strcmp(argv[i], "--quick") == 0) o.quick = 1;
         else if (value && strcmp(argv[i], "--filter") == 0) o.filter = argv[++i];
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
+        else if (value && strcmp(argv[i], "--model") == 0) o.model = argv[++i];
         else {
-            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N]\n");
+            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--model FOLDER]\n");
             return 2;
         }
     }
@@ -829,6 +998,11 @@ int main(int argc, char** argv) {
         if (o.threads && o.threads != threads) continue;
         bench_machine(&o, GSF_CPU_SCALAR, threads, memory, size);
         bench_machine(&o, GSF_CPU_AVX2, threads, memory, size);
+    }
+    if (o.model) {
+        gsf_free(&ctx, memory);
+        bench_whole_model(&o);
+        return 0;
     }
     bench_linears(&o, memory, size);
     bench_int8s(&o, memory);
