@@ -317,7 +317,7 @@ static void test_bad_samplers(gsf_context* ctx, const gsf_nn_schedule* schedule)
     CHECK_OK(ctx, gsf_nn_step_sampler(ctx, &s, v, x, NULL));
     v[1] = NAN;
     CHECK_RESULT(ctx, gsf_nn_step_sampler(ctx, &s, v, x, NULL), GSF_ERROR_NUMERIC);
-    CHECK(strstr(ctx->error, "step 1 (time 799): 1 of 3 latents") != NULL && s.index == 1);
+    CHECK(strstr(ctx->error, "step 1 (time 799): latent 1 of 3") != NULL && s.index == 1);
     v[1] = INFINITY;
     CHECK_RESULT(ctx, gsf_nn_step_sampler(ctx, &s, v, x, NULL), GSF_ERROR_NUMERIC);
     gsf_nn_destroy_sampler(ctx, &s);
