@@ -7422,7 +7422,7 @@ static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, gsf__vit* 
         {"hidden_size", &vit->sizes.width, 768, 1, 65536}, {"num_attention_heads", &heads, 12, 1, 1024},
         {"num_hidden_layers", &vit->layers, 12, 1, 1024}, {"num_channels", &vit->channels, 3, 1, 1024},
         {"patch_size", &vit->patch, 16, 1, 1024}, {"image_size", &image, 224, 1, 1 << 15},
-        {"num_register_tokens", &vit->registers, 4, 1, 1 << 16}};
+        {"num_register_tokens", &vit->registers, 4, 0, 1 << 16}};
     for (size_t i = 0; i < GSF__COUNT(sizes); i++)
         GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, sizes[i].to));
     GSF__TRY(gsf__nn_config_number_or(file, "mlp_ratio", 4.0, 1e-3, 1024.0, &ratio));
