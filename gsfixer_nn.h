@@ -154,12 +154,13 @@ typedef struct gsf_nn_attention_desc {
     const float *q, *k, *v;
     int64_t ldq, ldk, ldv;     // row strides, 0: heads*head_dim
     const unsigned char* mask; // (heads, queries, keys), 1 = may attend; NULL = all. A row of zeros gives 0.
+    const float* bias;         // (heads, queries, keys), added to the logits, unscaled; NULL = none
     float scale;               // of the logits, 0: 1/sqrt(head_dim)
     float* out;                // (queries, heads*head_dim), row stride ldo; may be q
     int64_t ldo;
 } gsf_nn_attention_desc;
 
-// softmax(scale q k^T) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may reach
+// softmax(scale q k^T + bias) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may reach
 // queries that the mask keeps from it.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace,
                                                   const gsf_nn_attention_desc* desc);
@@ -3345,13 +3346,14 @@ static void gsf__attention_row(void* arg, size_t row, int worker) {
     float *p = job->scratch + (size_t)worker * job->scratch_floats, *sum = p + d->keys;
     for (int32_t h = 0; h < d->heads; h++) {
         const float* q = d->q + (int64_t)row * d->ldq + (int64_t)h * d->head_dim;
-        const unsigned char* mask = d->mask ? d->mask + (h * d->queries + (int64_t)row) * d->keys : NULL;
+        const int64_t at = (h * d->queries + (int64_t)row) * d->keys; // in mask and bias
+        const unsigned char* mask = d->mask ? d->mask + at : NULL;
         float top = -FLT_MAX, total = 0.0f;
         for (int64_t j = 0; j < d->keys; j++) {
             const float* k = d->k + j * d->ldk + (int64_t)h * d->head_dim;
             float dot = 0.0f;
             for (int32_t i = 0; i < d->head_dim; i++) dot += q[i] * k[i];
-            p[j] = dot * d->scale;
+            p[j] = d->bias ? dot * d->scale + d->bias[at + j] : dot * d->scale;
             if ((!mask || mask[j]) && p[j] > top) top = p[j];
         }
         for (int32_t i = 0; i < d->head_dim; i++) sum[i] = 0.0f;
@@ -3482,6 +3484,17 @@ GSF__TARGET_AVX2 static void gsf__attention_logits(const float* q, int64_t group
         }
 }
 
+// Adds the bias to the logits of `queries` rows and `keys` columns, as powers of 2.
+GSF__TARGET_AVX2 static void gsf__attention_bias(const float* bias, int64_t bias_stride, int64_t queries, int64_t keys,
+                                                 float* p) {
+    const __m256 factor = _mm256_set1_ps(1.44269504f);
+    for (int64_t r = 0; r < gsf__least(queries, GSF__ATT_QUERIES); r++, p += GSF__ATT_KEYS, bias += bias_stride)
+        for (int64_t j = 0; j < keys; j += 8) {
+            const __m256 b = j + 8 <= keys ? _mm256_loadu_ps(bias + j) : _mm256_maskload_ps(bias + j, gsf__nn_mask8(keys - j));
+            _mm256_storeu_ps(p + j, _mm256_fmadd_ps(b, factor, _mm256_loadu_ps(p + j)));
+        }
+}
+
 // Logits that do not count become -inf: those of masked keys and of the columns `keys` to `columns`, past the last key.
 static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, int64_t queries, int64_t keys,
                                 int64_t columns, float* p) {
@@ -3577,7 +3590,9 @@ GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, 
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
             gsf__attention_logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
-            const unsigned char* mask = d->mask ? d->mask + (head * d->queries + first + r) * d->keys + key : NULL;
+            const int64_t at = (head * d->queries + first + r) * d->keys + key; // in mask and bias
+            const unsigned char* mask = d->mask ? d->mask + at : NULL;
+            if (d->bias) gsf__attention_bias(d->bias + at, d->keys, rows - r, keys, s.p);
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
             gsf__attention_weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
             gsf__attention_values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
