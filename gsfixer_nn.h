@@ -473,7 +473,7 @@ GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokeni
 // `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
 // the first room - 1 and end_id where there are more, filled up with pad_id where there are fewer. The official room is
 // 226. *count (NULL allowed): how many there are, end_id included, had there been room. ids NULL and room 0 only count.
-// Time and memory are in proportion to the text: some 16 bytes for each of its own. Fails only for want of memory, and with
+// Time and memory are in proportion to the text: some 20 bytes for each of its own. Fails only for want of memory, and with
 // GSF_ERROR_INVALID_ARGUMENT for texts that are 2 GiB normalised.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text,
                                                  size_t size, int32_t* ids, size_t room, size_t* count);
@@ -7091,8 +7091,8 @@ static gsf_result gsf__sp_read_trainer(gsf__pb in, gsf__sp_model* m) {
 
 /* u32 bytes of the trie | its units, each u32 | texts, each ending in a zero
    A unit of the double array: label in bits 0-7 and 31 (a byte, or 1 << 31 for a value), 8: a value is among the children,
-   offset in bits 10-30, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b, if its label is b;
-   the value is in bits 0-30 of the child for 0. (github.com/s-yata/darts-clone) */
+   offset in bits 10-31, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b, if that one's
+   label is b; the value is in bits 0-30 of the child for 0. (github.com/s-yata/darts-clone) */
 static uint32_t gsf__sp_offset(uint32_t unit) { return unit >> 10 << ((unit & 512u) >> 6); }
 
 // Checks every unit, so that no walk leaves the array: children of a unit lie in one block of 256.
@@ -7648,11 +7648,13 @@ GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tok
     run.m = (const gsf__sp_model*)tokenizer->model;
     const gsf_result result = gsf__sp_encode_all(&run, text, size);
     const int32_t end = tokenizer->end_id;
-    if (result == GSF_OK && count) *count = run.count + !(run.count && run.ids[run.count - 1] == end);
+    // where there is an end already, the official code adds none
+    const size_t all = run.count + !(run.count && run.ids[run.count - 1] == end);
+    if (result == GSF_OK && count) *count = all;
     if (result == GSF_OK && room) {
-        size_t n = run.count < room ? run.count : room - 1;
+        size_t n = all <= room ? run.count : room - 1;
         for (size_t i = 0; i < n; i++) ids[i] = run.ids[i];
-        if (!(n && ids[n - 1] == end)) ids[n++] = end; // where there is one already, the official code adds none
+        if (!(n && ids[n - 1] == end)) ids[n++] = end;
         for (; n < room; n++) ids[n] = tokenizer->pad_id;
     }
     gsf_free(ctx, run.normal);
