@@ -40,7 +40,7 @@
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
-               >>nn image encoders >>nn sampling >>nn restorer
+               >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -157,13 +157,14 @@ typedef struct gsf_nn_attention_desc {
     const float *q, *k, *v;
     int64_t ldq, ldk, ldv;     // row strides, 0: heads*head_dim
     const unsigned char* mask; // (heads, queries, keys), 1 = may attend; NULL = all. A row of zeros gives 0.
+    const float* bias;         // (heads, queries, keys), added to the logits, unscaled; NULL = none
     float scale;               // of the logits, 0: 1/sqrt(head_dim)
     float* out;                // (queries, heads*head_dim), row stride ldo; may be q
     int64_t ldo;
 } gsf_nn_attention_desc;
 
-// softmax(scale q k^T) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may reach
-// queries that the mask keeps from it.
+// softmax(scale q k^T + bias) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may
+// reach queries that the mask keeps from it.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace,
                                                   const gsf_nn_attention_desc* desc);
 
@@ -444,6 +445,68 @@ GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, cons
 GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
                                         int32_t reference_batch);
 
+// ---- text: tokenizer ------------------------------------------------------------------
+// SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
+// sentencepiece 0.2. Ids are those, exactly.
+
+typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
+    int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
+    int32_t id_count;                   // all ids, those of added tokens as well, are smaller
+    int32_t unknown_id, end_id, pad_id; // of <unk>, </s>, <pad>
+    void* model;                        // private
+} gsf_nn_tokenizer;
+
+// Opens FOLDER/spiece.model, with the added tokens (<extra_id_0> ...) of FOLDER/tokenizer_config.json or, where that lists
+// none, FOLDER/added_tokens.json; without either file T5's 100. Every length and offset is checked: a malformed file gives
+// GSF_ERROR_FORMAT with its name and byte offset, another model than a unigram GSF_ERROR_UNSUPPORTED.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
+// The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model,
+                                                              size_t model_size, const char* config, size_t config_size,
+                                                              gsf_nn_tokenizer* out);
+GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer);
+
+// `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
+// the first room - 1 and end_id where there are more, filled up with pad_id where there are fewer. The official room is
+// 226. *count (NULL allowed): how many there are, end_id included, had there been room. ids NULL and room 0 only count.
+// Time and memory are in proportion to the text: some 20 bytes for each of its own. Fails only for want of memory, and with
+// GSF_ERROR_INVALID_ARGUMENT for texts that are 2 GiB normalised.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text,
+                                                 size_t size, int32_t* ids, size_t room, size_t* count);
+
+// ---- text: T5 encoder -------------------------------------------------------------------
+// The encoder of T5 v1.1 (Raffel et al. 2020; transformers 4.51.3 T5EncoderModel). As the official pipeline runs it, there
+// is no attention mask: padding is looked at like any other token. Every size comes from the folder's config.json.
+
+typedef struct gsf_nn_t5 { // an open model; its weights stay in the mapped files. Threads may share it
+    int32_t width, heads, head_dim, hidden, layers; // hidden: of the feed-forward
+    int32_t vocabulary;                             // ids are smaller
+    int32_t buckets, max_distance;                  // of the relative positions
+    double norm_eps;
+    gsf_nn_weights weights;
+    void* nets;                                     // private
+} gsf_nn_t5;
+
+// Opens FOLDER/config.json and FOLDER/model*.safetensors. Missing, misshaped and surplus tensors are named in the error.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out);
+GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5);
+
+typedef struct gsf_nn_t5_input {
+    const int32_t* ids;    // (batch, tokens), from gsf_nn_tokenize
+    int32_t batch, tokens; // prompts of a batch share each layer's way from disk through the cache
+    // Shown every named intermediate: data (rows, columns) of prompt `row`. NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_t5_input;
+
+// The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so that of the mapped weights only one
+// layer's need be in memory at a time. An id that the vocabulary lacks: GSF_ERROR_INVALID_ARGUMENT. A NaN or infinity is
+// reported with the block where it first appears (GSF_ERROR_NUMERIC). Cancelled between layers; progress "text".
+GSF_API GSF_NODISCARD gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input,
+                                                  float* out);
+// Bytes of memory at the peak (beside out, the mapped weights and some 50 MB of the kernels' scratch) and floating-point
+// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 8.4e12 operations.
+GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops);
 // ---- image encoders: what the references show -----------------------------------
 // DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
 
@@ -3466,13 +3529,14 @@ static void gsf__attention_row(void* arg, size_t row, int worker) {
     float *p = job->scratch + (size_t)worker * job->scratch_floats, *sum = p + d->keys;
     for (int32_t h = 0; h < d->heads; h++) {
         const float* q = d->q + (int64_t)row * d->ldq + (int64_t)h * d->head_dim;
-        const unsigned char* mask = d->mask ? d->mask + (h * d->queries + (int64_t)row) * d->keys : NULL;
+        const int64_t at = (h * d->queries + (int64_t)row) * d->keys; // in mask and bias
+        const unsigned char* mask = d->mask ? d->mask + at : NULL;
         float top = -FLT_MAX, total = 0.0f;
         for (int64_t j = 0; j < d->keys; j++) {
             const float* k = d->k + j * d->ldk + (int64_t)h * d->head_dim;
             float dot = 0.0f;
             for (int32_t i = 0; i < d->head_dim; i++) dot += q[i] * k[i];
-            p[j] = dot * d->scale;
+            p[j] = d->bias ? dot * d->scale + d->bias[at + j] : dot * d->scale;
             if ((!mask || mask[j]) && p[j] > top) top = p[j];
         }
         for (int32_t i = 0; i < d->head_dim; i++) sum[i] = 0.0f;
@@ -3603,6 +3667,18 @@ GSF__TARGET_AVX2 static void gsf__attention_logits(const float* q, int64_t group
         }
 }
 
+// Adds the bias to the logits of `queries` rows and `keys` columns, as powers of 2.
+GSF__TARGET_AVX2 static void gsf__attention_bias(const float* bias, int64_t bias_stride, int64_t queries, int64_t keys,
+                                                 float* p) {
+    const __m256 factor = _mm256_set1_ps(1.44269504f);
+    for (int64_t r = 0; r < gsf__least(queries, GSF__ATT_QUERIES); r++, p += GSF__ATT_KEYS, bias += bias_stride)
+        for (int64_t j = 0; j < keys; j += 8) {
+            const __m256i mask = gsf__nn_mask8(keys - j);
+            const __m256 b = j + 8 <= keys ? _mm256_loadu_ps(bias + j) : _mm256_maskload_ps(bias + j, mask);
+            _mm256_storeu_ps(p + j, _mm256_fmadd_ps(b, factor, _mm256_loadu_ps(p + j)));
+        }
+}
+
 // Logits that do not count become -inf: those of masked keys and of the columns `keys` to `columns`, past the last key.
 static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, int64_t queries, int64_t keys,
                                 int64_t columns, float* p) {
@@ -3698,7 +3774,9 @@ GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, 
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
             gsf__attention_logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
-            const unsigned char* mask = d->mask ? d->mask + (head * d->queries + first + r) * d->keys + key : NULL;
+            const int64_t at = (head * d->queries + first + r) * d->keys + key; // in mask and bias
+            const unsigned char* mask = d->mask ? d->mask + at : NULL;
+            if (d->bias) gsf__attention_bias(d->bias + at, d->keys, rows - r, keys, s.p);
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
             gsf__attention_weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
             gsf__attention_values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
@@ -6792,6 +6870,1189 @@ GSF_API gsf_result gsf_nn_vae_encode(gsf_context* ctx, const gsf_nn_vae* vae, co
 GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
                                      const float* latents, int64_t frames, int64_t height, int64_t width, float* video) {
     return gsf__vae_apply(ctx, vae, 1, desc, latents, frames, height, width, video, NULL, NULL);
+}
+
+// ---- >>nn tokenizer -------------------------------------------------------------
+
+/* spiece.model is a protobuf message: fields, each a varint (field number << 3 | wire type) and its value. Of those read
+       1 piece, repeated   1 text, 2 score (float), 3 type: 1 normal, 2 unknown, 3 control, 4 user-defined, 5 unused, 6 byte
+       2 trainer           3 kind of model: 1 unigram; 24 spaces go behind words; 35 unknown characters become bytes
+       3 normaliser        2 character map, 3 dummy prefix, 4 remove extra spaces, 5 escape spaces; the three default to 1
+   Encoding a text: added tokens are cut out of it; what stands between is normalised, and of all ways to spell that with
+   pieces the one with the largest sum of scores is taken. A character that is no piece costs the lowest score - 10.
+   (github.com/google/sentencepiece: src/sentencepiece_model.proto, normalizer.cc, unigram_model.cc EncodeOptimized,
+   sentencepiece_processor.cc; transformers 4.51.3: tokenization_utils.py, tokenization_t5.py) */
+enum {
+    GSF__SP_NORMAL = 1, GSF__SP_UNKNOWN, GSF__SP_CONTROL, GSF__SP_USER, GSF__SP_UNUSED, GSF__SP_BYTE, GSF__SP_TYPES,
+    GSF__SP_PIECE = 1024,       // most bytes of a piece, of an added token,
+    GSF__SP_REPLACEMENT = 255,  //   of what the character map puts in
+    GSF__SP_MATCH = 256,        //   and looks at: bounds the time per byte of text whatever a file may hold
+    GSF__SP_EXTRA = 100,        // <extra_id_...> of T5
+};
+
+static const char gsf__sp_space[] = "\xe2\x96\x81"; // U+2581 stands for a space
+
+// ---- protobuf
+
+typedef struct gsf__pb {
+    gsf_context* ctx;
+    const char* name; // for errors
+    const unsigned char* data;
+    size_t at, end;
+} gsf__pb;
+
+typedef struct gsf__pb_field {
+    uint64_t number, value; // value: of all wire types but 2
+    int wire;               // 0 varint, 1 eight bytes, 2 a length and as many bytes, 5 four bytes
+    size_t at, size;        // of those bytes
+} gsf__pb_field;
+
+static gsf_result gsf__pb_varint(gsf__pb* in, uint64_t* out) {
+    const size_t begin = in->at;
+    *out = 0;
+    for (int shift = 0; shift < 70; shift += 7) {
+        if (in->at == in->end)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number is cut off", in->name, begin);
+        const unsigned char byte = in->data[in->at++];
+        if (shift < 64) *out |= (uint64_t)(byte & 127u) << shift;
+        if (!(byte & 128u)) return GSF_OK;
+    }
+    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number of more than ten bytes", in->name, begin);
+}
+
+static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // in->at < in->end
+    const size_t begin = in->at;
+    uint64_t key, size = 0;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__pb_varint(in, &key));
+    out->number = key >> 3;
+    out->wire = (int)(key & 7);
+    if (out->number < 1 || out->number >= 1u << 29)
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: no field has the number %llu", in->name, begin,
+                        (unsigned long long)out->number);
+    if (out->wire == 0) return gsf__pb_varint(in, &out->value);
+    if (out->wire == 1) size = 8;
+    else if (out->wire == 5) size = 4;
+    else if (out->wire == 2) GSF__TRY(gsf__pb_varint(in, &size));
+    else return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: wire type %d", in->name, begin, out->wire);
+    if (size > in->end - in->at)
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: field %d has %llu bytes, but %zu are left", in->name, begin,
+                        (int)out->number, (unsigned long long)size, in->end - in->at);
+    out->at = in->at;
+    out->size = (size_t)size;
+    if (out->wire != 2) out->value = gsf__load_le(in->data + in->at, (int)size);
+    in->at += out->size;
+    return GSF_OK;
+}
+
+static gsf_result gsf__pb_expect(const gsf__pb* in, const gsf__pb_field* field, int wire) {
+    if (field->wire == wire) return GSF_OK;
+    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: field %d has wire type %d, not %d", in->name, in->at,
+                    (int)field->number, field->wire, wire);
+}
+
+static gsf__pb gsf__pb_inside(const gsf__pb* in, const gsf__pb_field* field) { // the message that a field holds
+    gsf__pb out = *in;
+    out.at = field->at;
+    out.end = field->at + field->size;
+    return out;
+}
+
+// ---- a trie over texts
+
+typedef struct gsf__sp_key {
+    const char* text;
+    uint32_t size;
+    int32_t id;
+} gsf__sp_key;
+
+typedef struct gsf__sp_node { // children stand one after another, sorted by byte
+    uint32_t first;
+    int32_t id; // of the text that ends here; -1: none
+    uint16_t count;
+    unsigned char byte;
+} gsf__sp_node;
+
+typedef struct gsf__sp_range { uint32_t begin, end, depth; } gsf__sp_range; // of sorted keys, below a node
+
+static int gsf__sp_compare(const void* a, const void* b) { // by bytes, then by id
+    const gsf__sp_key *x = (const gsf__sp_key*)a, *y = (const gsf__sp_key*)b;
+    const int order = memcmp(x->text, y->text, x->size < y->size ? x->size : y->size);
+    if (order) return order;
+    if (x->size != y->size) return x->size < y->size ? -1 : 1;
+    return x->id < y->id ? -1 : x->id > y->id;
+}
+
+static uint32_t gsf__sp_shared(const gsf__sp_key* a, const gsf__sp_key* b) { // bytes that both begin with
+    uint32_t n = 0;
+    while (n < a->size && n < b->size && a->text[n] == b->text[n]) n++;
+    return n;
+}
+
+// From sorted keys of different, nonempty texts. *out is freed by the caller.
+static gsf_result gsf__sp_build_trie(gsf_context* ctx, const gsf__sp_key* keys, size_t count, gsf__sp_node** out) {
+    size_t total = 1, made = 1;
+    for (size_t i = 0; i < count; i++) total += keys[i].size - (i ? gsf__sp_shared(&keys[i - 1], &keys[i]) : 0);
+    if (total > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "tokenizer: %zu pieces are too many", count);
+    gsf__sp_node* nodes = (gsf__sp_node*)gsf_alloc_zeroed(ctx, total, sizeof *nodes);
+    gsf__sp_range* ranges = (gsf__sp_range*)gsf_alloc_zeroed(ctx, total, sizeof *ranges);
+    *out = nodes;
+    if (!nodes || !ranges) {
+        gsf_free(ctx, ranges);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    ranges[0].end = (uint32_t)count;
+    for (size_t n = 0; n < total; n++) {
+        const gsf__sp_range r = ranges[n];
+        uint32_t at = r.begin;
+        nodes[n].id = -1;
+        if (at < r.end && keys[at].size == r.depth) nodes[n].id = keys[at++].id;
+        nodes[n].first = (uint32_t)made;
+        while (at < r.end) {
+            const uint32_t begin = at;
+            const char byte = keys[at].text[r.depth];
+            while (at < r.end && keys[at].text[r.depth] == byte) at++;
+            nodes[made].byte = (unsigned char)byte;
+            ranges[made].begin = begin;
+            ranges[made].end = at;
+            ranges[made++].depth = r.depth + 1;
+            nodes[n].count++;
+        }
+    }
+    GSF_ASSERT(made == total);
+    gsf_free(ctx, ranges);
+    return GSF_OK;
+}
+
+static const gsf__sp_node* gsf__sp_child(const gsf__sp_node* nodes, const gsf__sp_node* node, unsigned char byte) {
+    uint32_t low = node->first, high = low + node->count;
+    const uint32_t end = high;
+    while (low < high) {
+        const uint32_t mid = low + (high - low) / 2;
+        if (nodes[mid].byte < byte) low = mid + 1;
+        else high = mid;
+    }
+    return low < end && nodes[low].byte == byte ? &nodes[low] : NULL;
+}
+
+static int32_t gsf__sp_find(const gsf__sp_node* nodes, const char* text, size_t size) { // the id of a text, or -1
+    const gsf__sp_node* node = nodes;
+    for (size_t i = 0; node && i < size; i++) node = gsf__sp_child(nodes, node, (unsigned char)text[i]);
+    return node ? node->id : -1;
+}
+
+// ---- the model
+
+typedef struct gsf__sp_added { // a text that is an id of its own
+    size_t at, size;           // in gsf__sp_model.texts, while opening
+    int32_t id;
+    int trim_left, trim_right; // takes white space beside it along
+} gsf__sp_added;
+
+typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
+    gsf__sp_node *pieces, *added; // ids of `added` are places in added_list
+    gsf__sp_added* added_list;
+    gsf_text texts;
+    size_t added_count, added_capacity;
+    float* scores;                // of each piece
+    unsigned char* types;
+    size_t count, scores_capacity, types_capacity;
+    float unknown_score, top_score;
+    int32_t unknown_id, bytes[256];
+    uint32_t* units;              // character map: a double-array trie, 0 units: none
+    size_t unit_count;
+    char* replacements;           // its values are places in here, each a zero-terminated text
+    size_t replacements_size;
+    int prefix, trim, escape, suffix, byte_fallback, has_user_pieces;
+} gsf__sp_model;
+
+static void gsf__sp_destroy(gsf_context* ctx, gsf__sp_model* m) {
+    if (!m) return;
+    gsf_free(ctx, m->pieces);
+    gsf_free(ctx, m->added);
+    gsf_free(ctx, m->added_list);
+    gsf_destroy_text(ctx, &m->texts);
+    gsf_free(ctx, m->scores);
+    gsf_free(ctx, m->types);
+    gsf_free(ctx, m->units);
+    gsf_free(ctx, m->replacements);
+    gsf_free(ctx, m);
+}
+
+GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer) {
+    gsf__sp_destroy(ctx, (gsf__sp_model*)tokenizer->model);
+    memset(tokenizer, 0, sizeof *tokenizer);
+}
+
+// ---- opening: pieces
+
+static int gsf__sp_is_text(const char* text, size_t size) { // UTF-8 without zeros
+    for (size_t at = 0, step; at < size; at += step) {
+        step = text[at] ? gsf__utf8_size(text + at, size - at) : 0;
+        if (!step) return 0;
+    }
+    return 1;
+}
+
+static gsf_result gsf__sp_read_piece(gsf__pb in, gsf__sp_key* key, float* score, unsigned char* type) {
+    const size_t begin = in.at;
+    uint64_t kind = GSF__SP_NORMAL;
+    gsf__pb_field field;
+    *score = 0.0f;
+    while (in.at < in.end) {
+        GSF__TRY(gsf__pb_next(&in, &field));
+        if (field.number == 1) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 2));
+            if (field.size > GSF__SP_PIECE || !gsf__sp_is_text((const char*)in.data + field.at, field.size))
+                return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d is no UTF-8, or longer than %d bytes",
+                                in.name, field.at, (int)key->id, (int)GSF__SP_PIECE);
+            key->text = (const char*)in.data + field.at;
+            key->size = (uint32_t)field.size;
+        } else if (field.number == 2) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 5));
+            const uint32_t bits = (uint32_t)field.value;
+            memcpy(score, &bits, sizeof bits);
+        } else if (field.number == 3) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 0));
+            kind = field.value;
+        }
+    }
+    if (key->size == 0 || !(fabsf(*score) <= 1e30f) || kind < GSF__SP_NORMAL || kind >= GSF__SP_TYPES)
+        return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d has %u bytes, score %g and type %llu", in.name, begin,
+                        (int)key->id, (unsigned)key->size, (double)*score, (unsigned long long)kind);
+    *type = (unsigned char)kind;
+    return GSF_OK;
+}
+
+// "<0x1F>" to 31; -1: not of that form
+static int gsf__sp_byte_of(const gsf__sp_key* key) {
+    static const char digits[] = "0123456789ABCDEF";
+    if (key->size != 6 || memcmp(key->text, "<0x", 3) != 0 || key->text[5] != '>') return -1;
+    const char *high = strchr(digits, key->text[3]), *low = strchr(digits, key->text[4]);
+    return high && low ? (int)(high - digits) * 16 + (int)(low - digits) : -1;
+}
+
+static gsf_result gsf__sp_note_piece(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_key* key) {
+    const int type = m->types[key->id];
+    if (type == GSF__SP_UNKNOWN) {
+        if (m->unknown_id >= 0)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d are both the unknown one", in->name,
+                            (int)m->unknown_id, (int)key->id);
+        m->unknown_id = key->id;
+    } else if (type == GSF__SP_BYTE) {
+        const int byte = gsf__sp_byte_of(key);
+        if (byte < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: piece %d is no byte", in->name, (int)key->id);
+        m->bytes[byte] = key->id;
+    } else if (type == GSF__SP_USER) {
+        m->has_user_pieces = 1;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_read_trainer(gsf__pb in, gsf__sp_model* m) {
+    gsf__pb_field field;
+    while (in.at < in.end) {
+        GSF__TRY(gsf__pb_next(&in, &field));
+        if (field.number != 3 && field.number != 24 && field.number != 35) continue;
+        GSF__TRY(gsf__pb_expect(&in, &field, 0));
+        if (field.number == 24) m->suffix = field.value != 0;
+        else if (field.number == 35) m->byte_fallback = field.value != 0;
+        else if (field.value != 1)
+            return gsf_fail(in.ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: a model of kind %llu, not a unigram", in.name, in.at,
+                            (unsigned long long)field.value);
+    }
+    return GSF_OK;
+}
+
+// ---- opening: the character map
+
+/* u32 bytes of the trie | its units, each u32 | texts, each ending in a zero
+   A unit of the double array: label in bits 0-7 and 31 (a byte, or 1 << 31 for a value), 8: a value is among the children,
+   offset in bits 10-31, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b, if that one's
+   label is b; the value is in bits 0-30 of the child for 0. (github.com/s-yata/darts-clone) */
+static uint32_t gsf__sp_offset(uint32_t unit) { return unit >> 10 << ((unit & 512u) >> 6); }
+
+// Checks every unit, so that no walk leaves the array: children of a unit lie in one block of 256.
+static gsf_result gsf__sp_check_units(const gsf__pb* in, size_t at, const gsf__sp_model* m) {
+    for (size_t i = 0; i < m->unit_count; i++) {
+        const uint32_t unit = m->units[i];
+        if (unit >> 31 && i > 0) continue; // a value
+        const size_t base = i ^ gsf__sp_offset(unit);
+        const uint32_t value = base < m->unit_count ? m->units[base] & 0x7fffffffu : 0;
+        int ok = !(unit >> 31) && base < m->unit_count;
+        if (ok && unit >> 8 & 1u) {
+            const size_t left = value < m->replacements_size ? m->replacements_size - value : 0;
+            const size_t most = left <= GSF__SP_REPLACEMENT ? left : GSF__SP_REPLACEMENT + 1;
+            ok = most && memchr(m->replacements + value, 0, most) != NULL;
+        }
+        if (!ok)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: unit %zu of the character map leads nowhere", in->name,
+                            at + 4 * i, i);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_read_map(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m) {
+    const unsigned char* data = in->data + field->at;
+    gsf_free(in->ctx, m->units); // of an earlier field
+    gsf_free(in->ctx, m->replacements);
+    m->units = NULL;
+    m->replacements = NULL;
+    m->unit_count = m->replacements_size = 0;
+    if (field->size == 0) return GSF_OK;
+    const size_t bytes = field->size >= 4 ? (size_t)gsf__load_le(data, 4) : 0;
+    if (field->size < 5 || bytes > field->size - 5 || bytes == 0 || bytes % 1024 || data[field->size - 1] != 0)
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a character map of %zu bytes with %zu of trie", in->name,
+                        field->at, field->size, bytes);
+    m->unit_count = bytes / 4;
+    m->replacements_size = field->size - 4 - bytes;
+    m->units = (uint32_t*)gsf_alloc(in->ctx, m->unit_count, sizeof *m->units);
+    m->replacements = (char*)gsf_alloc(in->ctx, m->replacements_size, 1);
+    if (!m->units || !m->replacements) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < m->unit_count; i++) m->units[i] = (uint32_t)gsf__load_le(data + 4 + 4 * i, 4);
+    memcpy(m->replacements, data + 4 + bytes, m->replacements_size);
+    return gsf__sp_check_units(in, field->at + 4, m);
+}
+
+static gsf_result gsf__sp_read_normalizer(gsf__pb in, gsf__sp_model* m) {
+    gsf__pb_field field;
+    while (in.at < in.end) {
+        GSF__TRY(gsf__pb_next(&in, &field));
+        if (field.number == 2) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 2));
+            GSF__TRY(gsf__sp_read_map(&in, &field, m));
+        } else if (field.number >= 3 && field.number <= 5) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 0));
+            *(field.number == 3 ? &m->prefix : field.number == 4 ? &m->trim : &m->escape) = field.value != 0;
+        }
+    }
+    return GSF_OK;
+}
+
+// ---- opening: the file as a whole
+
+typedef struct gsf__sp_keys { // texts of the pieces, in the caller's bytes
+    gsf__sp_key* keys;
+    size_t count, capacity;
+} gsf__sp_keys;
+
+static gsf_result gsf__sp_add_piece(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m, gsf__sp_keys* all) {
+    const size_t n = all->count;
+    if (n >= INT32_MAX) return gsf_fail(in->ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", in->name);
+    GSF__TRY(gsf__reserve(in->ctx, (void**)&all->keys, &all->capacity, n, n + 1, sizeof *all->keys));
+    GSF__TRY(gsf__reserve(in->ctx, (void**)&m->scores, &m->scores_capacity, n, n + 1, sizeof *m->scores));
+    GSF__TRY(gsf__reserve(in->ctx, (void**)&m->types, &m->types_capacity, n, n + 1, 1));
+    memset(&all->keys[n], 0, sizeof all->keys[n]);
+    all->keys[n].id = (int32_t)n;
+    GSF__TRY(gsf__sp_read_piece(gsf__pb_inside(in, field), &all->keys[n], &m->scores[n], &m->types[n]));
+    GSF__TRY(gsf__sp_note_piece(in, m, &all->keys[n]));
+    all->count = m->count = n + 1;
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_check_pieces(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_keys* all) {
+    float low = FLT_MAX, high = FLT_MIN; // FLT_MIN is the reference's slip; user-defined pieces are scored by it
+    for (size_t i = 0; i < m->count; i++) {
+        if (m->types[i] != GSF__SP_NORMAL) continue;
+        if (m->scores[i] < low) low = m->scores[i];
+        if (m->scores[i] > high) high = m->scores[i];
+    }
+    m->unknown_score = low - 10.0f;
+    m->top_score = high;
+    if (m->unknown_id < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece is the unknown one", in->name);
+    for (int i = 0; m->byte_fallback && i < 256; i++)
+        if (m->bytes[i] < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece for the byte %d", in->name, i);
+    qsort(all->keys, all->count, sizeof *all->keys, gsf__sp_compare);
+    for (size_t i = 1; i < all->count; i++) {
+        const gsf__sp_key *a = &all->keys[i - 1], *b = &all->keys[i];
+        if (a->size == b->size && memcmp(a->text, b->text, a->size) == 0)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d have the same text", in->name, (int)a->id,
+                            (int)b->id);
+    }
+    return gsf__sp_build_trie(in->ctx, all->keys, all->count, &m->pieces);
+}
+
+static gsf_result gsf__sp_read_model(gsf__pb in, gsf__sp_model* m) {
+    gsf__sp_keys all;
+    gsf__pb_field field;
+    gsf_result result = GSF_OK;
+    memset(&all, 0, sizeof all);
+    m->unknown_id = -1;
+    for (int i = 0; i < 256; i++) m->bytes[i] = -1;
+    m->prefix = m->trim = m->escape = 1;
+    while (in.at < in.end && result == GSF_OK) {
+        result = gsf__pb_next(&in, &field);
+        if (result || field.number > 3) continue;
+        result = gsf__pb_expect(&in, &field, 2);
+        if (result) break;
+        if (field.number == 1) result = gsf__sp_add_piece(&in, &field, m, &all);
+        else if (field.number == 2) result = gsf__sp_read_trainer(gsf__pb_inside(&in, &field), m);
+        else result = gsf__sp_read_normalizer(gsf__pb_inside(&in, &field), m);
+    }
+    if (result == GSF_OK) result = gsf__sp_check_pieces(&in, m, &all);
+    gsf_free(in.ctx, all.keys);
+    return result;
+}
+
+// ---- opening: added tokens
+
+static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* text, size_t size, int64_t id, int trim_left,
+                              int trim_right) {
+    const size_t n = m->added_count;
+    if (size == 0) return GSF_OK;
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->added_list, &m->added_capacity, n, n + 1, sizeof *m->added_list));
+    gsf__sp_added* a = &m->added_list[n];
+    a->at = m->texts.size;
+    a->size = size;
+    a->id = (int32_t)id;
+    a->trim_left = trim_left;
+    a->trim_right = trim_right;
+    gsf_text_append(ctx, &m->texts, text, size);
+    m->added_count++;
+    return m->texts.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
+static gsf_result gsf__sp_fail_added(const gsf__nn_config* file, const gsf_json_value* value) {
+    return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no added token", file->json.name, (unsigned)value->offset);
+}
+
+// {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
+static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json_value* all, gsf__sp_model* m) {
+    const gsf_json* json = &file->json;
+    for (uint32_t i = all->child; i; i = json->values[i].next) {
+        const gsf_json_value* entry = &json->values[i];
+        const gsf_json_value* content = gsf_json_member(json, entry, "content");
+        const gsf_json_value* left = gsf_json_member(json, entry, "lstrip");
+        const gsf_json_value* right = gsf_json_member(json, entry, "rstrip");
+        const gsf_json_value* single = gsf_json_member(json, entry, "single_word");
+        int64_t id = 0;
+        int ok = entry->key_size > 0 && entry->key_size < 10 && content && content->type == GSF_JSON_STRING &&
+                 content->string_size <= GSF__SP_PIECE;
+        for (uint32_t k = 0; ok && k < entry->key_size; k++) {
+            ok = entry->key[k] >= '0' && entry->key[k] <= '9';
+            id = 10 * id + (entry->key[k] - '0');
+        }
+        if (!ok) return gsf__sp_fail_added(file, entry);
+        if (single && single->type == GSF_JSON_TRUE)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: an added token that is a single word", json->name,
+                            (unsigned)entry->offset);
+        GSF__TRY(gsf__sp_add(file->ctx, m, content->string, content->string_size, id, left && left->type == GSF_JSON_TRUE,
+                             right && right->type == GSF_JSON_TRUE));
+    }
+    return GSF_OK;
+}
+
+// added_tokens.json: {"<extra_id_0>": 32099, ...}
+static gsf_result gsf__sp_add_list(const gsf__nn_config* file, gsf__sp_model* m) {
+    for (uint32_t i = file->json.values[0].child; i; i = file->json.values[i].next) {
+        const gsf_json_value* entry = &file->json.values[i];
+        if (entry->type != GSF_JSON_NUMBER || !(entry->number >= 0 && entry->number < 1e9) ||
+            floor(entry->number) != entry->number || entry->key_size > GSF__SP_PIECE)
+            return gsf__sp_fail_added(file, entry);
+        GSF__TRY(gsf__sp_add(file->ctx, m, entry->key, entry->key_size, (int64_t)entry->number, 0, 0));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_add_extra(gsf_context* ctx, gsf__sp_model* m, int64_t extra) {
+    for (int64_t i = 0; i < extra; i++) {
+        char text[32];
+        const int size = snprintf(text, sizeof text, "<extra_id_%d>", (int)i); // extra_id_0 is the last one
+        GSF__TRY(gsf__sp_add(ctx, m, text, (size_t)size, (int64_t)m->count - 1 + extra - i, 1, 1));
+    }
+    return GSF_OK;
+}
+
+// Sorts the added tokens' texts into a trie; of those with the same text the one added last counts.
+static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
+    size_t kept = 0;
+    gsf__sp_key* keys = (gsf__sp_key*)gsf_alloc(ctx, m->added_count, sizeof *keys);
+    if (!keys) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < m->added_count; i++) {
+        keys[i].text = m->texts.data + m->added_list[i].at;
+        keys[i].size = (uint32_t)m->added_list[i].size;
+        keys[i].id = (int32_t)i;
+    }
+    if (m->added_count) qsort(keys, m->added_count, sizeof *keys, gsf__sp_compare);
+    for (size_t i = 0; i < m->added_count; i++) {
+        const int again = kept && keys[kept - 1].size == keys[i].size &&
+                          memcmp(keys[kept - 1].text, keys[i].text, keys[i].size) == 0;
+        keys[again ? kept - 1 : kept++] = keys[i];
+    }
+    const gsf_result result = gsf__sp_build_trie(ctx, keys, kept, &m->added);
+    gsf_free(ctx, keys);
+    gsf_destroy_text(ctx, &m->texts);
+    return result;
+}
+
+// "eos_token": "</s>", or an object with that as its "content"
+static const char* gsf__sp_token_text(const gsf__nn_config* file, const char* key, const char* fallback) {
+    const gsf_json_value* value = file ? gsf__nn_config_find(file, key) : NULL;
+    if (value && value->type == GSF_JSON_OBJECT) value = gsf_json_member(&file->json, value, "content");
+    return value && value->type == GSF_JSON_STRING ? value->string : fallback;
+}
+
+// config, added: NULL where there is no such file
+static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf__nn_config* config,
+                                  const gsf__nn_config* added, gsf__sp_model* m, gsf_nn_tokenizer* out) {
+    static const char* const names[][2] = {{"unk_token", "<unk>"}, {"eos_token", "</s>"}, {"pad_token", "<pad>"}};
+    int32_t* const ids[] = {NULL, &out->end_id, &out->pad_id};
+    int64_t extra = GSF__SP_EXTRA;
+    const gsf_json_value* decoder = config ? gsf__nn_config_find(config, "added_tokens_decoder") : NULL;
+    for (size_t i = 0; i < GSF__COUNT(names); i++) {
+        const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
+        const int32_t id = strlen(text) <= GSF__SP_PIECE ? gsf__sp_find(m->pieces, text, strlen(text)) : -1;
+        if (id >= 0) GSF__TRY(gsf__sp_add(ctx, m, text, strlen(text), id, 0, 0));
+    }
+    if (config) GSF__TRY(gsf__nn_config_int_or(config, "extra_ids", extra, 0, 100000, &extra));
+    if ((int64_t)m->count > INT32_MAX - extra) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", name);
+    GSF__TRY(gsf__sp_add_extra(ctx, m, extra));
+    if (decoder && decoder->type == GSF_JSON_OBJECT) GSF__TRY(gsf__sp_add_decoder(config, decoder, m));
+    else if (added) GSF__TRY(gsf__sp_add_list(added, m));
+    GSF__TRY(gsf__sp_sort_added(ctx, m));
+    out->id_count = (int32_t)m->count;
+    for (size_t i = 0; i < m->added_count; i++)
+        if (m->added_list[i].id >= out->id_count) out->id_count = m->added_list[i].id + 1;
+    for (size_t i = 1; i < GSF__COUNT(names); i++) {
+        const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
+        const int32_t place = gsf__sp_find(m->added, text, strlen(text));
+        if (place < 0)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: there is no %s %s", name, names[i][0], gsf__nn_show(text).text);
+        *ids[i] = m->added_list[place].id;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_make(gsf_context* ctx, const char* name, const void* data, size_t size,
+                               const gsf__nn_config* config, const gsf__nn_config* added, gsf_nn_tokenizer* out) {
+    const gsf__pb in = {ctx, gsf__nn_path_end(name), (const unsigned char*)data, 0, size};
+    gsf__sp_model* m = (gsf__sp_model*)gsf_alloc_zeroed(ctx, 1, sizeof *m);
+    out->model = m;
+    if (!m) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__sp_read_model(in, m));
+    out->piece_count = (int32_t)m->count;
+    out->unknown_id = m->unknown_id;
+    return gsf__sp_add_all(ctx, in.name, config, added, m, out);
+}
+
+GSF_API gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model, size_t model_size,
+                                                const char* config, size_t config_size, gsf_nn_tokenizer* out) {
+    gsf__nn_config file;
+    memset(out, 0, sizeof *out);
+    if (config) GSF__TRY(gsf__nn_parse_config(ctx, "tokenizer_config.json", config, config_size, &file));
+    const gsf_result result = gsf__sp_make(ctx, name, model, model_size, config ? &file : NULL, NULL, out);
+    if (config) gsf__nn_close_config(&file);
+    if (result) gsf_nn_destroy_tokenizer(ctx, out);
+    return result;
+}
+
+// A JSON file of the folder that may be absent: *found 0.
+static gsf_result gsf__sp_load_json(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* out,
+                                    int* found) {
+    gsf_text path;
+    void* data = NULL;
+    size_t size = 0;
+    memset(&path, 0, sizeof path);
+    *found = 0;
+    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &data, &size);
+    gsf_destroy_text(ctx, &path);
+    if (data) result = gsf__nn_parse_config(ctx, name, (const char*)data, size, out);
+    *found = data && result == GSF_OK;
+    gsf_free(ctx, data);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out) {
+    static const char* const names[2] = {"tokenizer_config.json", "added_tokens.json"};
+    gsf__nn_config files[2];
+    int found[2] = {0, 0};
+    void* data = NULL;
+    size_t size = 0;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    memset(out, 0, sizeof *out);
+    gsf_text_printf(ctx, &path, "%s/spiece.model", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_read_file(ctx, path.data, &data, &size);
+    for (int i = 0; i < 2 && !result; i++) result = gsf__sp_load_json(ctx, folder, names[i], &files[i], &found[i]);
+    if (!result)
+        result = gsf__sp_make(ctx, path.data, data, size, found[0] ? &files[0] : NULL, found[1] ? &files[1] : NULL, out);
+    for (int i = 0; i < 2; i++)
+        if (found[i]) gsf__nn_close_config(&files[i]);
+    gsf_free(ctx, data);
+    gsf_destroy_text(ctx, &path);
+    if (result) gsf_nn_destroy_tokenizer(ctx, out);
+    return result;
+}
+
+// ---- normalising
+
+typedef struct gsf__sp_step { // what stands for the next `used` bytes
+    const char* text;
+    size_t size, used;
+} gsf__sp_step;
+
+// Length of the longest entry of the character map that the text begins with, 0: none.
+static size_t gsf__sp_match(const gsf__sp_model* m, const char* text, size_t left, uint32_t* value) {
+    size_t length = 0;
+    if (left > GSF__SP_MATCH) left = GSF__SP_MATCH;
+    uint32_t at = gsf__sp_offset(m->units[0]);
+    for (size_t i = 0; i < left; i++) {
+        const unsigned char byte = (unsigned char)text[i];
+        at ^= byte;
+        const uint32_t unit = m->units[at];
+        if ((unit & 0x800000ffu) != byte) break;
+        at ^= gsf__sp_offset(unit);
+        if (unit >> 8 & 1u) {
+            length = i + 1;
+            *value = m->units[at] & 0x7fffffffu;
+        }
+    }
+    return length;
+}
+
+static size_t gsf__sp_match_user(const gsf__sp_model* m, const char* text, size_t left) { // pieces that stay as they are
+    size_t length = 0;
+    const gsf__sp_node* node = m->pieces;
+    for (size_t i = 0; i < left && (node = gsf__sp_child(m->pieces, node, (unsigned char)text[i])) != NULL; i++)
+        if (node->id >= 0 && m->types[node->id] == GSF__SP_USER) length = i + 1;
+    return length;
+}
+
+static gsf__sp_step gsf__sp_next(const gsf__sp_model* m, const char* text, size_t left) {
+    gsf__sp_step step = {text, 0, 0};
+    uint32_t value = 0;
+    step.used = m->has_user_pieces ? gsf__sp_match_user(m, text, left) : 0;
+    if (!step.used && m->unit_count) {
+        step.used = gsf__sp_match(m, text, left, &value);
+        if (step.used) {
+            step.text = m->replacements + value;
+            step.size = strlen(step.text);
+            return step;
+        }
+    }
+    if (!step.used) step.used = gsf__utf8_size(text, left);
+    step.size = step.used;
+    if (step.used) return step;
+    step.text = "\xef\xbf\xbd"; // U+FFFD for a malformed byte
+    step.size = 3;
+    step.used = 1;
+    return step;
+}
+
+typedef struct gsf__sp_best { // the best spelling of all bytes before this one
+    float score;
+    int32_t id;     // its last piece; -1: there is none so far
+    uint32_t start; // where that begins
+    uint32_t next;  // on the way back: where the piece that begins here ends
+} gsf__sp_best;
+
+typedef struct gsf__sp_run {
+    gsf_context* ctx;
+    const gsf__sp_model* m;
+    char* normal;
+    size_t size, capacity;
+    gsf__sp_best* best;
+    size_t best_capacity;
+    int32_t* ids;
+    size_t count, ids_capacity;
+} gsf__sp_run;
+
+static gsf_result gsf__sp_put(gsf__sp_run* run, const char* text, size_t size) { // spaces escaped
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->normal, &run->capacity, run->size, run->size + 3 * size, 1));
+    for (size_t i = 0; i < size; i++) {
+        if (text[i] == ' ' && run->m->escape) {
+            memcpy(run->normal + run->size, gsf__sp_space, 3);
+            run->size += 3;
+        } else {
+            run->normal[run->size++] = text[i];
+        }
+    }
+    return run->size < INT32_MAX ? GSF_OK
+                                 : gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "tokenizer: the text is too long");
+}
+
+static gsf_result gsf__sp_normalize(gsf__sp_run* run, const char* text, size_t left) {
+    const gsf__sp_model* m = run->m;
+    const char* space = m->escape ? gsf__sp_space : " ";
+    const size_t space_size = strlen(space);
+    int after_space = m->trim;
+    run->size = 0;
+    while (m->trim && left) { // leading spaces
+        const gsf__sp_step s = gsf__sp_next(m, text, left);
+        if (s.size != 1 || s.text[0] != ' ') break;
+        text += s.used;
+        left -= s.used;
+    }
+    if (!left) return GSF_OK;
+    if (m->prefix && !m->suffix) GSF__TRY(gsf__sp_put(run, " ", 1));
+    while (left) {
+        gsf__sp_step s = gsf__sp_next(m, text, left);
+        for (; after_space && s.size && s.text[0] == ' '; s.size--) s.text++;
+        GSF__TRY(gsf__sp_put(run, s.text, s.size));
+        if (s.size) after_space = m->trim && s.text[s.size - 1] == ' ';
+        text += s.used;
+        left -= s.used;
+    }
+    while (m->trim && run->size >= space_size &&
+           memcmp(run->normal + run->size - space_size, space, space_size) == 0)
+        run->size -= space_size;
+    return m->prefix && m->suffix ? gsf__sp_put(run, " ", 1) : GSF_OK;
+}
+
+// ---- spelling
+
+static void gsf__sp_offer(gsf__sp_best* best, double score, uint32_t start, int32_t id) {
+    if (best->id >= 0 && !(score > (double)best->score)) return; // the first of equals stays
+    best->score = (float)score;
+    best->start = start;
+    best->id = id;
+}
+
+// Viterbi over the bytes of run->normal. Scores are added in double, and rounded to float only once they are the best, as
+// in the reference, which decides between equals.
+static void gsf__sp_spell(gsf__sp_run* run) {
+    static const unsigned char widths[17] = "\1\1\1\1\1\1\1\1\1\1\1\1\2\2\3\4"; // of a character, by its upper four bits
+    const gsf__sp_model* m = run->m;
+    const unsigned char* text = (const unsigned char*)run->normal;
+    const size_t n = run->size;
+    for (size_t i = 0; i <= n; i++) run->best[i].id = -1;
+    run->best[0].score = 0.0f;
+    for (size_t at = 0, width; at < n; at += width) {
+        const float here = run->best[at].score;
+        const gsf__sp_node* node = m->pieces;
+        int known = 0; // this character alone is a piece
+        width = widths[text[at] >> 4];
+        if (width > n - at) width = n - at;
+        for (size_t k = at; k < n && (node = gsf__sp_child(m->pieces, node, text[k])) != NULL; k++) {
+            const int type = node->id < 0 ? 0 : m->types[node->id];
+            const size_t length = k + 1 - at;
+            if (type != GSF__SP_NORMAL && type != GSF__SP_USER) continue;
+            const double score = type == GSF__SP_USER ? (double)((float)length * m->top_score) - 0.1
+                                                      : (double)m->scores[node->id];
+            gsf__sp_offer(&run->best[k + 1], score + (double)here, (uint32_t)at, node->id);
+            known |= length == width;
+        }
+        if (!known) {
+            const float score = m->unknown_score + here;
+            gsf__sp_offer(&run->best[at + width], (double)score, (uint32_t)at, m->unknown_id);
+        }
+    }
+    for (size_t end = n; end > 0; end = run->best[end].start) run->best[run->best[end].start].next = (uint32_t)end;
+}
+
+static gsf_result gsf__sp_emit(gsf__sp_run* run, int32_t id) {
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->ids_capacity, run->count, run->count + 1, sizeof *run->ids));
+    run->ids[run->count++] = id;
+    return GSF_OK;
+}
+
+// The ids of a stretch of text without added tokens.
+static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size) {
+    const gsf__sp_model* m = run->m;
+    GSF__TRY(gsf__sp_normalize(run, text, size));
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->best, &run->best_capacity, 0, run->size + 1, sizeof *run->best));
+    gsf__sp_spell(run);
+    for (size_t at = 0, end; at < run->size; at = end) {
+        end = run->best[at].next;
+        int32_t id = run->best[end].id;
+        if (id == m->unknown_id && m->byte_fallback) {
+            for (size_t i = at; i < end; i++) GSF__TRY(gsf__sp_emit(run, m->bytes[(unsigned char)run->normal[i]]));
+            continue;
+        }
+        if (id == m->unknown_id) { // a run of them is one; its text may be that of a piece which no spelling uses
+            while (end < run->size && run->best[run->best[end].next].id == id) end = run->best[end].next;
+            id = gsf__sp_find(m->pieces, run->normal + at, end - at);
+            if (id < 0) id = m->unknown_id;
+        }
+        GSF__TRY(gsf__sp_emit(run, id));
+    }
+    return GSF_OK;
+}
+
+// ---- added tokens within a text
+
+// Bytes of the white space character that the text begins with, as Python's str.isspace has it; 0: none.
+static size_t gsf__sp_white(const char* text, size_t left) {
+    const unsigned char* p = (const unsigned char*)text;
+    const size_t size = gsf__utf8_size(p, left);
+    if (size == 1) return (p[0] >= 9 && p[0] <= 13) || (p[0] >= 28 && p[0] <= 32);
+    if (size == 2) return p[0] == 0xc2 && (p[1] == 0x85 || p[1] == 0xa0) ? 2 : 0;
+    if (size != 3) return 0;
+    const unsigned c = (p[0] & 15u) << 12 | (p[1] & 63u) << 6 | (p[2] & 63u);
+    return c == 0x1680 || (c >= 0x2000 && c <= 0x200a) || c == 0x2028 || c == 0x2029 || c == 0x202f || c == 0x205f ||
+           c == 0x3000 ? 3 : 0;
+}
+
+static size_t gsf__sp_white_before(const char* text, size_t end) { // of the one that the text ends with
+    for (size_t size = 1; size <= 3 && size <= end; size++)
+        if (gsf__sp_white(text + end - size, size) == size) return size;
+    return 0;
+}
+
+// The longest added token that the text begins with, or NULL.
+static const gsf__sp_added* gsf__sp_match_added(const gsf__sp_model* m, const char* text, size_t left) {
+    const gsf__sp_added* found = NULL;
+    const gsf__sp_node* node = m->added;
+    for (size_t i = 0; i < left && (node = gsf__sp_child(m->added, node, (unsigned char)text[i])) != NULL; i++)
+        if (node->id >= 0) found = &m->added_list[node->id];
+    return found;
+}
+
+static gsf_result gsf__sp_encode_all(gsf__sp_run* run, const char* text, size_t size) {
+    size_t from = 0; // of the stretch since the last added token
+    for (size_t at = 0; at <= size; at++) {
+        const gsf__sp_added* found = at < size ? gsf__sp_match_added(run->m, text + at, size - at) : NULL;
+        size_t end = at, white;
+        if (at < size && !found) continue;
+        while (found && found->trim_left && end > from && (white = gsf__sp_white_before(text + from, end - from)) != 0)
+            end -= white;
+        if (end > from) GSF__TRY(gsf__sp_encode(run, text + from, end - from));
+        if (!found) break;
+        GSF__TRY(gsf__sp_emit(run, found->id));
+        from = at + found->size;
+        while (found->trim_right && (white = gsf__sp_white(text + from, size - from)) != 0) from += white;
+        at = from - 1;
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text, size_t size,
+                                   int32_t* ids, size_t room, size_t* count) {
+    gsf__sp_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.m = (const gsf__sp_model*)tokenizer->model;
+    const gsf_result result = gsf__sp_encode_all(&run, text, size);
+    const int32_t end = tokenizer->end_id;
+    // where there is an end already, the official code adds none
+    const size_t all = run.count + !(run.count && run.ids[run.count - 1] == end);
+    if (result == GSF_OK && count) *count = all;
+    if (result == GSF_OK && room) {
+        size_t n = all <= room ? run.count : room - 1;
+        for (size_t i = 0; i < n; i++) ids[i] = run.ids[i];
+        if (!(n && ids[n - 1] == end)) ids[n++] = end;
+        for (; n < room; n++) ids[n] = tokenizer->pad_id;
+    }
+    gsf_free(ctx, run.normal);
+    gsf_free(ctx, run.best);
+    gsf_free(ctx, run.ids);
+    return result;
+}
+
+// ---- >>nn t5 --------------------------------------------------------------------
+
+typedef struct gsf__t5_block {
+    const gsf_tensor *attention_norm, *q, *k, *v, *out, *ff_norm, *gate, *up, *down;
+} gsf__t5_block;
+
+typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
+    gsf__t5_block* blocks;
+    const gsf_tensor *embedding, *positions, *final_norm; // positions: (buckets, heads), for all blocks
+} gsf__t5_nets;
+
+static gsf_result gsf__t5_bind_block(gsf__nn_loader* loader, const gsf_nn_t5* c, int32_t index, gsf__t5_block* b) {
+    const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
+    const struct { const char* name; const gsf_tensor** to; int32_t rank; int64_t shape[2]; } parts[] = {
+        {"0.layer_norm", &b->attention_norm, 1, {d, 0}},  {"0.SelfAttention.q", &b->q, 2, {inner, d}},
+        {"0.SelfAttention.k", &b->k, 2, {inner, d}},      {"0.SelfAttention.v", &b->v, 2, {inner, d}},
+        {"0.SelfAttention.o", &b->out, 2, {d, inner}},    {"1.layer_norm", &b->ff_norm, 1, {d, 0}},
+        {"1.DenseReluDense.wi_0", &b->gate, 2, {h, d}},   {"1.DenseReluDense.wi_1", &b->up, 2, {h, d}},
+        {"1.DenseReluDense.wo", &b->down, 2, {d, h}}};
+    for (size_t i = 0; i < GSF__COUNT(parts); i++)
+        GSF__TRY(gsf__nn_need(loader, parts[i].to, parts[i].rank, parts[i].shape, "encoder.block.%d.layer.%s.weight",
+                              (int)index, parts[i].name));
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_bind_all(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__t5_nets* nets) {
+    const int64_t table[2] = {c->vocabulary, c->width}, positions[2] = {c->buckets, c->heads};
+    GSF__TRY(gsf__nn_need(loader, &nets->embedding, 2, table, "shared.weight"));
+    GSF__TRY(gsf__nn_need(loader, &nets->positions, 2, positions,
+                          "encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight"));
+    GSF__TRY(gsf__nn_need(loader, &nets->final_norm, 1, table + 1, "encoder.final_layer_norm.weight"));
+    gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
+    for (int32_t i = 0; i < c->layers; i++) GSF__TRY(gsf__t5_bind_block(loader, c, i, &nets->blocks[i]));
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) {
+    const struct { const char* key; int32_t* to; int64_t fallback, low, high; } sizes[] = { // fallback 0: needed
+        {"d_model", &c->width, 0, 1, 1 << 20}, {"d_kv", &c->head_dim, 0, 1, 1024}, {"num_heads", &c->heads, 0, 1, 1024},
+        {"d_ff", &c->hidden, 0, 1, 1 << 20}, {"num_layers", &c->layers, 0, 1, 1024},
+        {"vocab_size", &c->vocabulary, 0, 1, INT32_MAX}, {"relative_attention_num_buckets", &c->buckets, 32, 4, 1 << 16},
+        {"relative_attention_max_distance", &c->max_distance, 128, 1, 1 << 24}};
+    static const struct { const char *key, *value; } texts[] = {
+        {"feed_forward_proj", "gated-gelu"}, {"dense_act_fn", "gelu_new"}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+        int64_t value = 0;
+        if (sizes[i].fallback)
+            GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, &value));
+        else
+            GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
+        *sizes[i].to = (int32_t)value;
+    }
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_epsilon", 1e-6, 1e-12, 1.0, &c->norm_eps));
+    for (size_t i = 0; i < GSF__COUNT(texts); i++) { // T5 v1.0 has relu and no gate
+        const char* text;
+        GSF__TRY(gsf__nn_config_string(file, texts[i].key, i ? texts[i].value : NULL, &text));
+        if (strcmp(text, texts[i].value) != 0)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
+                            texts[i].value);
+    }
+    if (c->buckets % 4 || c->max_distance <= c->buckets / 4)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %d buckets for relative positions up to %d",
+                        file->json.name, (int)c->buckets, (int)c->max_distance);
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_open(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
+    gsf__nn_config file;
+    gsf__nn_loader loader;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
+    gsf_destroy_text(ctx, &path);
+    if (result) return result;
+    result = gsf__t5_read_config(&file, out);
+    gsf__nn_close_config(&file);
+    if (result) return result;
+    GSF__TRY(gsf_nn_open_weights(ctx, folder, "model", &out->weights));
+    gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+    out->nets = nets;
+    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->blocks = (gsf__t5_block*)gsf_alloc_zeroed(ctx, (size_t)out->layers, sizeof *nets->blocks);
+    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
+    return gsf__nn_end_loading(&loader, gsf__t5_bind_all(&loader, out, nets));
+}
+
+GSF_API gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
+    memset(out, 0, sizeof *out);
+    const gsf_result result = gsf__t5_open(ctx, folder, out);
+    if (result) gsf_nn_destroy_t5(ctx, out);
+    return result;
+}
+
+GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5) {
+    gsf__t5_nets* nets = (gsf__t5_nets*)t5->nets;
+    if (nets) gsf_free(ctx, nets->blocks);
+    gsf_free(ctx, nets);
+    gsf_nn_close_weights(ctx, &t5->weights);
+    memset(t5, 0, sizeof *t5);
+}
+
+// ---- relative positions
+
+// The bucket of key - query: half of them for keys behind the query. Of a side's, the lower half are distances, the rest
+// their logarithm up to max_distance. In float, as the reference rounds it. (modeling_t5.py _relative_position_bucket)
+static int32_t gsf__t5_bucket(const gsf_nn_t5* c, int64_t offset) {
+    const int32_t side = c->buckets / 2, exact = side / 2;
+    const int64_t distance = offset < 0 ? -offset : offset;
+    int64_t bucket = distance;
+    if (distance >= exact) {
+        const float spread = (float)log((double)c->max_distance / exact);
+        bucket = exact + (int64_t)(logf((float)distance / (float)exact) / spread * (float)(side - exact));
+        if (bucket > side - 1) bucket = side - 1;
+    }
+    return (int32_t)bucket + (offset > 0 ? side : 0);
+}
+
+// bias (heads, tokens, tokens), the same for every block; scratch: 2 tokens + buckets * heads floats.
+static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_tensor* positions, int64_t tokens, float* scratch,
+                              float* bias) {
+    float *line = scratch, *table = scratch + 2 * tokens; // line: by key - query, from 1 - tokens up
+    gsf_nn_read_tensor(positions, 0, positions->count, table);
+    for (int64_t h = 0; h < c->heads; h++) {
+        for (int64_t i = 0; i < 2 * tokens - 1; i++) line[i] = table[gsf__t5_bucket(c, i + 1 - tokens) * c->heads + h];
+        for (int64_t q = 0; q < tokens; q++, bias += tokens)
+            memcpy(bias, line + tokens - 1 - q, (size_t)tokens * sizeof(float));
+    }
+}
+
+// ---- one pass
+
+typedef struct gsf__t5_run {
+    gsf_context* ctx;
+    const gsf_nn_t5* net;
+    const gsf_nn_t5_input* in;
+    gsf_nn_workspace workspace;
+    int64_t rows;  // batch * tokens
+    float* x;      // (rows, width): the residual stream
+    float* normed; // (rows, width)
+    float* wide;   // q, k, v (rows, heads * head_dim) each; or both parts of the feed-forward's hidden layer
+    float* bias;   // (heads, tokens, tokens)
+    float* norm;   // (width): weights of the norm at work
+} gsf__t5_run;
+
+typedef struct gsf__t5_layout { double x, wide, bias, total; } gsf__t5_layout; // floats
+
+static gsf__t5_layout gsf__t5_plan(const gsf_nn_t5* c, const gsf_nn_t5_input* in) {
+    const double rows = (double)in->batch * in->tokens, n = in->tokens;
+    const double qkv = 3.0 * rows * c->heads * c->head_dim, ff = 2.0 * rows * c->hidden;
+    const double scratch = 2.0 * n + (double)c->buckets * c->heads; // of gsf__t5_fill_bias
+    gsf__t5_layout l;
+    l.x = rows * c->width;
+    l.wide = qkv > ff ? qkv : ff;
+    if (l.wide < scratch) l.wide = scratch;
+    l.bias = n * n * c->heads;
+    l.total = 2.0 * l.x + l.wide + l.bias + c->width;
+    return l;
+}
+
+GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops) {
+    const double rows = (double)input->batch * input->tokens, d = t5->width, inner = (double)t5->heads * t5->head_dim;
+    *bytes = gsf__t5_plan(t5, input).total * sizeof(float);
+    *flops = t5->layers * rows * (2.0 * d * (4.0 * inner + 3.0 * t5->hidden) + 4.0 * inner * input->tokens);
+}
+
+static void gsf__t5_tap(const gsf__t5_run* run, int32_t layer, const char* name, const float* x) {
+    const gsf_nn_t5_input* in = run->in;
+    char whole[64];
+    if (!in->tap_fn) return;
+    if (layer < 0) snprintf(whole, sizeof whole, "%s", name);
+    else snprintf(whole, sizeof whole, "block%d.%s", (int)layer, name);
+    for (int32_t b = 0; b < in->batch; b++)
+        in->tap_fn(in->tap_user, whole, b, x + (int64_t)b * in->tokens * run->net->width, in->tokens, run->net->width);
+}
+
+static void gsf__t5_norm(gsf__t5_run* run, const gsf_tensor* weight, float* out) {
+    gsf_nn_read_tensor(weight, 0, weight->count, run->norm);
+    gsf_nn_rms_norm(run->ctx, run->x, run->rows, run->net->width, run->norm, (float)run->net->norm_eps, out);
+}
+
+// y = activation(x w^T), or x += that where `add`.
+static gsf_result gsf__t5_linear(gsf__t5_run* run, const float* x, const gsf_tensor* weight, gsf_nn_activation activation,
+                                 int add, float* y) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = run->rows;
+    d.weight = weight;
+    d.activation = activation;
+    d.accumulate = add;
+    d.y = y;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+// x += attention(norm(x)): logits are not scaled, and their bias is by relative position.
+static gsf_result gsf__t5_attention(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
+    const gsf_nn_t5* c = run->net;
+    const int64_t n = run->in->tokens, inner = (int64_t)c->heads * c->head_dim;
+    float *q = run->wide, *k = q + run->rows * inner, *v = k + run->rows * inner;
+    gsf__t5_norm(run, block->attention_norm, run->normed);
+    gsf__t5_tap(run, layer, "attn_norm", run->normed);
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->q, GSF_NN_LINEAR, 0, q));
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->k, GSF_NN_LINEAR, 0, k));
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->v, GSF_NN_LINEAR, 0, v));
+    gsf_nn_attention_desc d;
+    memset(&d, 0, sizeof d);
+    d.queries = d.keys = n;
+    d.heads = c->heads;
+    d.head_dim = c->head_dim;
+    d.bias = run->bias;
+    d.scale = 1.0f;
+    for (int64_t b = 0; b < run->in->batch; b++) {
+        d.q = q + b * n * inner;
+        d.k = k + b * n * inner;
+        d.v = v + b * n * inner;
+        d.out = q + b * n * inner;
+        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &d));
+    }
+    GSF__TRY(gsf__t5_linear(run, q, block->out, GSF_NN_LINEAR, 1, run->x));
+    gsf__t5_tap(run, layer, "after_attn", run->x);
+    return GSF_OK;
+}
+
+typedef struct gsf__t5_product {
+    float* a;
+    const float* b;
+    int64_t count;
+} gsf__t5_product;
+
+static void gsf__t5_multiply(void* arg, size_t chunk, int worker) { // a *= b
+    const gsf__t5_product* job = (const gsf__t5_product*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
+    (void)worker;
+    for (int64_t i = begin; i < end; i++) job->a[i] *= job->b[i];
+}
+
+// x += down(gelu(gate(norm(x))) * up(norm(x)))
+static gsf_result gsf__t5_feed_forward(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
+    float *gate = run->wide, *up = gate + run->rows * run->net->hidden;
+    gsf__t5_norm(run, block->ff_norm, run->normed);
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->gate, GSF_NN_GELU_TANH, 0, gate));
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->up, GSF_NN_LINEAR, 0, up));
+    gsf__t5_product job = {gate, up, run->rows * run->net->hidden};
+    gsf__parallel_for(run->ctx, gsf__nn_chunks(job.count, GSF__NN_CHUNK), gsf__t5_multiply, &job);
+    GSF__TRY(gsf__t5_linear(run, gate, block->down, GSF_NN_LINEAR, 1, run->x));
+    gsf__t5_tap(run, layer, "out", run->x);
+    return GSF_OK;
+}
+
+// Says which stage made a value that is not finite, and which weights are to blame if one of theirs is not.
+static gsf_result gsf__t5_check(const gsf__t5_run* run, const char* stage, const char* prefix, const float* x) {
+    const int64_t count = run->rows * run->net->width, at = gsf__nn_find_not_finite(run->ctx, x, count);
+    const gsf_nn_weights* w = &run->net->weights;
+    if (at < 0) return GSF_OK;
+    for (size_t i = 0; i < w->tensor_count; i++)
+        if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 && !gsf__dit_tensor_is_finite(&w->tensors[i]))
+            return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
+                            w->tensors[i].name);
+    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "t5: %s gives %g (value %lld of %lld)", stage, (double)x[at],
+                    (long long)at, (long long)count);
+}
+
+static gsf_result gsf__t5_forward(gsf__t5_run* run, float* out) {
+    const gsf_nn_t5* c = run->net;
+    const gsf__t5_nets* nets = (const gsf__t5_nets*)c->nets;
+    for (int64_t r = 0; r < run->rows; r++)
+        gsf_nn_read_tensor(nets->embedding, (int64_t)run->in->ids[r] * c->width, c->width, run->x + r * c->width);
+    GSF__TRY(gsf__t5_check(run, "the embedding", "shared.", run->x));
+    gsf__t5_tap(run, -1, "embed", run->x);
+    gsf__t5_fill_bias(c, nets->positions, run->in->tokens, run->wide, run->bias);
+    for (int32_t i = 0; i < c->layers; i++) {
+        char name[48];
+        GSF__TRY(gsf__t5_attention(run, i, &nets->blocks[i]));
+        GSF__TRY(gsf__t5_feed_forward(run, i, &nets->blocks[i]));
+        snprintf(name, sizeof name, "encoder.block.%d.", (int)i);
+        GSF__TRY(gsf__t5_check(run, name, name, run->x));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+        gsf__progress(run->ctx, "text", i + 1, c->layers);
+    }
+    gsf__t5_norm(run, nets->final_norm, out);
+    return gsf__t5_check(run, "the last norm", "encoder.final", out);
+}
+
+GSF_API gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input, float* out) {
+    gsf__t5_run run;
+    memset(&run, 0, sizeof run);
+    if (!input->ids || input->batch < 1 || input->tokens < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: no tokens");
+    run.ctx = ctx;
+    run.net = t5;
+    run.in = input;
+    run.rows = (int64_t)input->batch * input->tokens;
+    for (int64_t i = 0; i < run.rows; i++)
+        if (input->ids[i] < 0 || input->ids[i] >= t5->vocabulary)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: id %d; the vocabulary has %d", (int)input->ids[i],
+                            (int)t5->vocabulary);
+    const gsf__t5_layout l = gsf__t5_plan(t5, input);
+    if (l.total > (double)(SIZE_MAX / 16))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "t5: %d tokens of %d prompts are too many", (int)input->tokens,
+                        (int)input->batch);
+    run.x = (float*)gsf_alloc(ctx, (size_t)l.total, sizeof(float));
+    if (!run.x) return GSF_ERROR_OUT_OF_MEMORY;
+    run.normed = run.x + (size_t)l.x;
+    run.wide = run.normed + (size_t)l.x;
+    run.bias = run.wide + (size_t)l.wide;
+    run.norm = run.bias + (size_t)l.bias;
+    const gsf_result result = gsf__t5_forward(&run, out);
+    if (result) memset(out, 0, (size_t)l.x * sizeof(float));
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, run.x);
+    return result;
 }
 
 // ---- >>nn image encoders --------------------------------------------------------

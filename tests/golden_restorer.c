@@ -8,7 +8,9 @@
 #include "restorer_numerics.h"
 #include "restorer_pipeline.h"
 #include "restorer_scheduler.h"
+#include "restorer_t5.h"
 #include "restorer_tables.h"
+#include "restorer_tokenizer.h"
 #include "restorer_transformer.h"
 #include "restorer_vae.h"
 
@@ -18,6 +20,8 @@ int main(void) {
     check_scheduler();
     check_tables();
     check_vae();
+    check_tokenizer();
+    check_t5();
     check_transformer();
     check_pipeline();
     return test_report();

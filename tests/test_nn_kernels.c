@@ -284,11 +284,12 @@ typedef struct attention_case {
     int64_t extra; // columns between rows
     int masked;
     float scale, range; // of q and k
+    float bias;         // range of what is added to the logits; 0: nothing
 } attention_case;
 
 typedef struct attention_data {
     gsf_nn_attention_desc desc;
-    float *q, *k, *v, *out;
+    float *q, *k, *v, *bias, *out;
     unsigned char* mask;
     size_t q_count, k_count;
 } attention_data;
@@ -310,6 +311,7 @@ static attention_data make_attention(const attention_case* c) {
         for (int64_t j = 0; j < c->keys; j++) a.mask[j] = 0; // the first query sees nothing
         for (int64_t j = 0; j < c->keys; j++) a.mask[(c->queries - 1) * c->keys + j] = j == c->keys - 1;
     }
+    if (c->bias != 0.0f) a.bias = make_floats((size_t)(c->heads * c->queries * c->keys), -c->bias, c->bias);
     gsf_nn_attention_desc* d = &a.desc;
     d->queries = c->queries;
     d->keys = c->keys;
@@ -320,13 +322,14 @@ static attention_data make_attention(const attention_case* c) {
     d->v = a.v;
     d->out = a.out;
     d->mask = a.mask;
+    d->bias = a.bias;
     d->scale = c->scale;
     if (c->extra) d->ldq = d->ldk = d->ldv = d->ldo = ld;
     return a;
 }
 
 static void free_attention(attention_data* a) {
-    free(a->q); free(a->k); free(a->v); free(a->out); free(a->mask);
+    free(a->q); free(a->k); free(a->v); free(a->out); free(a->bias); free(a->mask);
 }
 
 static void attention_of(const attention_case* c, const attention_data* a, double* out) { // (queries, heads * dim)
@@ -341,6 +344,7 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
                 for (int64_t i = 0; i < dim; i++)
                     p[j] += (double)a->q[r * ld + h * dim + i] * (double)a->k[j * ld + h * dim + i];
                 p[j] *= scale;
+                if (a->bias) p[j] += (double)a->bias[(h * c->queries + r) * c->keys + j];
                 if (a->mask && !a->mask[(h * c->queries + r) * c->keys + j]) p[j] = -INFINITY;
                 top = fmax(top, p[j]);
             }
@@ -364,10 +368,11 @@ static float* dense_rows(const attention_case* c, const float* x) { // without t
 
 static void check_attention(void) {
     static const attention_case cases[] = {
-        {1, 1, 1, 1, 0, 0, 0, 1},     {7, 5, 2, 3, 0, 0, 0, 1},     {13, 300, 1, 64, 0, 0, 0, 1},
-        {6, 16, 1, 8, 0, 0, -1, 1},   {49, 513, 2, 72, 1, 0, 0, 1}, {50, 257, 3, 40, 5, 0, 0.3f, 1},
-        {803, 70, 3, 16, 0, 0, 0, 1}, {30, 33, 2, 24, 2, 1, 0, 1},  {9, 600, 1, 20, 0, 1, 0, 1},
-        {5, 700, 1, 64, 0, 0, 0, 30}, {1541, 20, 1, 4, 0, 0, 0, 1}, {48, 256, 1, 128, 0, 0, 0, 1}};
+        {1, 1, 1, 1, 0, 0, 0, 1, 0},     {7, 5, 2, 3, 0, 0, 0, 1, 0},     {13, 300, 1, 64, 0, 0, 0, 1, 0},
+        {6, 16, 1, 8, 0, 0, -1, 1, 0},   {49, 513, 2, 72, 1, 0, 0, 1, 0}, {50, 257, 3, 40, 5, 0, 0.3f, 1, 0},
+        {803, 70, 3, 16, 0, 0, 0, 1, 0}, {30, 33, 2, 24, 2, 1, 0, 1, 0},  {9, 600, 1, 20, 0, 1, 0, 1, 0},
+        {5, 700, 1, 64, 0, 0, 0, 30, 0}, {1541, 20, 1, 4, 0, 0, 0, 1, 0}, {48, 256, 1, 128, 0, 0, 0, 1, 0},
+        {57, 300, 2, 24, 1, 0, 1, 1, 3}, {9, 270, 3, 20, 0, 1, 0, 1, 2},  {803, 33, 2, 8, 0, 0, 0, 1, 9}};
     for (size_t n = 0; n < sizeof cases / sizeof cases[0]; n++) {
         const attention_case* c = &cases[n];
         const size_t values = (size_t)(c->queries * c->heads * c->dim);
@@ -405,7 +410,7 @@ static int none_nan(const float* x, size_t count) {
 }
 
 static void check_attention_values(void) {
-    const attention_case c = {20, 300, 2, 24, 0, 0, 0, 1};
+    const attention_case c = {20, 300, 2, 24, 0, 0, 0, 1, 0};
     const size_t width = 48;
     for (int key = 0; key < 300; key += 299) { // in the first and in the last block
         attention_data a = make_attention(&c);
@@ -436,8 +441,28 @@ static void check_attention_values(void) {
     }
 }
 
+// -inf in the bias hides a key as the mask does; a query that sees none gives 0.
+static void check_attention_bias(void) {
+    const attention_case c = {20, 300, 2, 24, 0, 0, 0, 1, 1};
+    const size_t width = 48;
+    attention_data a = make_attention(&c);
+    for (size_t j = 0; j < 300; j++) {
+        a.bias[j] = -INFINITY;                              // query 0 of head 0
+        a.bias[(20 + 7) * 300 + j] = j == 299 ? -5e3f : -INFINITY; // query 7 of head 1
+    }
+    CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+    for (size_t i = 0; i < 24; i++) {
+        CHECK(a.out[i] == 0.0f);
+        CHECK_NEAR(a.out[7 * width + 24 + i], a.v[299 * width + 24 + i], 1e-6);
+    }
+    a.bias[3 * 300 + 299] = NAN;
+    CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+    CHECK(all_nan(a.out + 3 * width, 24) && none_nan(a.out + 3 * width + 24, 16 * width));
+    free_attention(&a);
+}
+
 static void check_attention_errors(void) {
-    const attention_case c = {20, 30, 2, 8, 0, 0, 0, 1};
+    const attention_case c = {20, 30, 2, 8, 0, 0, 0, 1, 0};
     attention_data a = make_attention(&c);
     counter memory;
     memset(&memory, 0, sizeof memory);
@@ -489,6 +514,7 @@ int main(void) {
         check_head_norm_rope();
         check_attention();
         check_attention_values();
+        check_attention_bias();
         check_attention_errors();
     }
     return test_report();
