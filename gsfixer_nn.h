@@ -643,16 +643,23 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_
 typedef enum gsf_nn_condition { GSF_NN_BOTH = 0, GSF_NN_2D, GSF_NN_3D, GSF_NN_NONE } gsf_nn_condition;
 
 typedef struct gsf_nn_dit_desc {
-    const char* model;       // folder in the diffusers layout: transformer/, vae/, scheduler/
-    const char* features;    // safetensors: dino_latents (images, tokens, channels), vggt_latents likewise,
-                             // prompt_embeds (2, text tokens, text channels): negative, positive
+    const char* model;       // folder as released: transformer/, vae/, scheduler/; and, for what `features` does not hold,
+                             //   dinov2/ and vggt/ (reference tokens), tokenizer/ and text_encoder/ (prompts)
+    const char* features;    // NULL, or safetensors with any of dino_latents (images, tokens, channels), vggt_latents
+                             //   likewise, prompt_embeds (2, text tokens, text channels): negative prompt, prompt
+    const char* caption;     // what all clips show; NULL: the window's, else blip2/ describes the first frame
+    const char* save_features; // file that gets the features of every clip, the last one's in the end; NULL: none
     gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
     int int8;                // gsf_nn_quantize_transformer
     gsf_nn_sample_desc sample;  // steps, solver, guidance ...; sizes, pointers and seed are filled in for each window
 } gsf_nn_dit_desc;
 
-// The paper's restorer behind the interface of gsfixer.h. Weights stay mapped until it is destroyed. `desc`'s texts are
-// copied.
+// The paper's restorer behind the interface of gsfixer.h. `desc`'s texts are copied. A clip's references are the two photos
+// nearest to its first and its last camera; without cameras, all photos. What `features` lacks is encoded before a clip is
+// restored, where photos or caption differ from the last clip's: captioner, text encoder, DINOv2 and VGGT are opened one
+// after another, run and closed. A folder that will be needed and is absent is named now, with what does without it.
+// Progress: "clip" (0 of 1: it begins), then behind each unit of its work "caption", "text", "dinov2", "vggt", "vae encode",
+// "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -9180,7 +9187,14 @@ GSF_API gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov
         if (!result) result = gsf_nn_vggt_encode(ctx, vggt, &in, f->vggt);
     }
     gsf_free(ctx, pixels);
-    if (result) gsf_nn_destroy_features(ctx, f);
+    if (result && dinov2) {
+        gsf_free(ctx, f->dino);
+        f->dino = NULL;
+    }
+    if (result && vggt) {
+        gsf_free(ctx, f->vggt);
+        f->vggt = NULL;
+    }
     return result;
 }
 
@@ -9578,9 +9592,13 @@ typedef struct gsf__dit_restorer {
     gsf_nn_transformer transformer;
     gsf_nn_vae vae;
     gsf_nn_schedule schedule;
-    gsf_nn_weights features;   // open while the restorer lives
+    int has_dino, has_vggt, has_text; // in the file of features
+    gsf_nn_features features;  // of the file, or of the photos `pair`
+    int32_t pair[2];           // -1: none yet
     float *text, *references;  // (2, text tokens, text channels); (reference_tokens, width) or NULL
+    gsf_text caption;          // that `text` was made of
     int64_t reference_tokens;
+    double encoder_bytes, encoder_flops; // at the configured size: at the peak; of all
     const gsf_reference* photos; // between begin and end
     int32_t photo_count;
 } gsf__dit_restorer;
@@ -9609,8 +9627,8 @@ static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_cou
     gsf_nn_cost cost;
     if ((frame_count - 1) % step == 0 && frame_count > 0 && width % out->width_multiple == 0 &&
         height % out->height_multiple == 0 && gsf_nn_sample_cost(ctx, &r->transformer, &r->vae, &d, &cost) == GSF_OK) {
-        out->bytes = cost.bytes;
-        out->flops = cost.flops;
+        out->bytes = cost.bytes > r->encoder_bytes ? cost.bytes : r->encoder_bytes;
+        out->flops = cost.flops + r->encoder_flops;
     }
     return GSF_OK;
 }
@@ -9620,6 +9638,7 @@ static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_referen
     (void)ctx;
     r->photos = references;
     r->photo_count = reference_count;
+    r->pair[0] = r->pair[1] = -1; // tokens of earlier photos
     return GSF_OK;
 }
 
@@ -9630,16 +9649,20 @@ static void gsf__dit_end(void* user, gsf_context* ctx) {
     r->photo_count = 0;
 }
 
-// Frames to (3, frames, height, width) in [-1,1]. A frame that is a reference's view is that photo, as in the paper's
-// benchmark; a NaN is black.
+// A frame that is a reference's view is that photo, as in the paper's benchmark.
+static const gsf_image* gsf__dit_frame(const gsf__dit_restorer* r, const gsf_restore_window* window, int32_t frame) {
+    const gsf_image* image = &window->color[frame];
+    const int32_t photo = window->reference_index ? window->reference_index[frame] : -1;
+    if (photo < 0 || photo >= r->photo_count) return image;
+    const gsf_image* color = &r->photos[photo].color;
+    return color->data && color->width == image->width && color->height == image->height ? color : image;
+}
+
+// Frames to (3, frames, height, width) in [-1,1]; a NaN is black.
 static void gsf__dit_fill_control(const gsf__dit_restorer* r, const gsf_restore_window* window, float* control) {
     const int64_t width = window->color[0].width, height = window->color[0].height, plane = width * height;
     for (int32_t f = 0; f < window->frame_count; f++) {
-        const gsf_image* image = &window->color[f];
-        const int32_t photo = window->reference_index ? window->reference_index[f] : -1;
-        if (photo >= 0 && photo < r->photo_count && r->photos[photo].color.data && r->photos[photo].color.width == width &&
-            r->photos[photo].color.height == height)
-            image = &r->photos[photo].color;
+        const gsf_image* image = gsf__dit_frame(r, window, f);
         for (int64_t y = 0; y < height; y++)
             for (int64_t x = 0; x < width; x++)
                 for (int64_t c = 0; c < 3; c++) {
@@ -9670,8 +9693,281 @@ static void gsf__dit_store_frames(const gsf_restore_window* window, const float*
     }
 }
 
+// ---- restorer: conditions of a clip
+
+// As trained: behind a caption, and against it.
+static const char gsf__dit_praise[] = ". The video is of high quality, and the view is very clear. High quality, "
+                                      "masterpiece, best quality, highres, ultra-detailed, fantastic.";
+static const char gsf__dit_negative[] = "The video is not of a high quality, it has a low resolution. Watermark present in "
+                                        "each frame. The background is solid. Strange body and strange trajectory. "
+                                        "Distortion. ";
+
+enum { GSF__DIT_CAPTION_TOKENS = 20, GSF__DIT_CAPTION_BYTES = 1024 };
+
+typedef struct gsf__dit_part { // an encoder: `photos` NULL only opens it, checks that it fits and counts its cost
+    gsf_context* ctx;
+    gsf__dit_restorer* r;
+    const gsf_image* photos;
+    int32_t count;
+} gsf__dit_part;
+
+static gsf_result gsf__dit_folder(const gsf__dit_part* p, const char* name, gsf_text* out) {
+    memset(out, 0, sizeof *out);
+    gsf_text_printf(p->ctx, out, "%s/%s", p->r->desc.model, name);
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
+// To the error of a folder that is not there: what it is for, and what does without it.
+static gsf_result gsf__dit_absent(gsf_context* ctx, gsf_result result, const char* makes, const char* instead) {
+    char before[sizeof ctx->error];
+    if (result != GSF_ERROR_IO) return result;
+    memcpy(before, ctx->error, sizeof before);
+    return gsf_fail(ctx, result, "%.300s (which makes %s; %s does without it)", before, makes, instead);
+}
+
+static gsf_result gsf__dit_misfit(const gsf__dit_part* p, const char* part, int64_t channels, int64_t expected) {
+    if (channels == expected) return GSF_OK;
+    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s/%s: gives %lld channels, but the transformer takes %lld",
+                    p->r->desc.model, part, (long long)channels, (long long)expected);
+}
+
+static void gsf__dit_add_cost(gsf__dit_restorer* r, double bytes, double flops) {
+    if (bytes > r->encoder_bytes) r->encoder_bytes = bytes;
+    r->encoder_flops += flops;
+}
+
+// Two photos of the aspect that the transformer was made for, prepared.
+static gsf_nn_encoder_input gsf__dit_usual_references(const gsf__dit_restorer* r) {
+    const gsf_nn_transformer* t = &r->transformer;
+    gsf_nn_encoder_input in;
+    memset(&in, 0, sizeof in);
+    const double patches = rint((double)GSF__REFERENCE_SIDE * t->sample_height / t->sample_width / GSF__REFERENCE_PATCH);
+    in.images = 2;
+    in.width = GSF__REFERENCE_SIDE;
+    in.height = (int32_t)patches < 1 ? GSF__REFERENCE_PATCH : (int32_t)patches * GSF__REFERENCE_PATCH;
+    return in;
+}
+
+static gsf_result gsf__dit_dinov2(const gsf__dit_part* p) {
+    gsf_text folder;
+    gsf_nn_dinov2 model;
+    double bytes, flops;
+    const gsf_nn_encoder_input usual = gsf__dit_usual_references(p->r);
+    GSF__TRY(gsf__dit_folder(p, "dinov2", &folder));
+    gsf_result result = gsf_nn_make_dinov2(p->ctx, folder.data, &model);
+    gsf_destroy_text(p->ctx, &folder);
+    if (result)
+        return gsf__dit_absent(p->ctx, result, "the 2D reference tokens",
+                               "dino_latents in the features file, or condition 3d or none,");
+    result = gsf__dit_misfit(p, "dinov2", model.width, p->r->transformer.dino_channels);
+    gsf_nn_dinov2_cost(&model, &usual, &bytes, &flops);
+    if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
+    else if (!result) result = gsf_nn_encode_references(p->ctx, &model, NULL, p->photos, p->count, &p->r->features);
+    gsf_nn_destroy_dinov2(p->ctx, &model);
+    return result;
+}
+
+static gsf_result gsf__dit_vggt(const gsf__dit_part* p) {
+    gsf_text folder;
+    gsf_nn_vggt model;
+    double bytes, flops;
+    const gsf_nn_encoder_input usual = gsf__dit_usual_references(p->r);
+    GSF__TRY(gsf__dit_folder(p, "vggt", &folder));
+    gsf_result result = gsf_nn_make_vggt(p->ctx, folder.data, &model);
+    gsf_destroy_text(p->ctx, &folder);
+    if (result)
+        return gsf__dit_absent(p->ctx, result, "the 3D reference tokens",
+                               "vggt_latents in the features file, or condition 2d or none,");
+    result = gsf__dit_misfit(p, "vggt", 2 * (int64_t)model.width, p->r->transformer.vggt_channels);
+    gsf_nn_vggt_cost(&model, &usual, &bytes, &flops);
+    if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
+    else if (!result) result = gsf_nn_encode_references(p->ctx, NULL, &model, p->photos, p->count, &p->r->features);
+    gsf_nn_destroy_vggt(p->ctx, &model);
+    return result;
+}
+
+// Ids of both prompts; caption NULL: only opens the tokenizer.
+static gsf_result gsf__dit_tokenize(const gsf__dit_part* p, const char* caption, int32_t* ids) {
+    gsf_text text;
+    gsf_nn_tokenizer model;
+    const size_t room = (size_t)p->r->transformer.text_tokens;
+    GSF__TRY(gsf__dit_folder(p, "tokenizer", &text));
+    gsf_result result = gsf_nn_make_tokenizer(p->ctx, text.data, &model);
+    if (!result && caption) {
+        text.size = 0;
+        gsf_text_printf(p->ctx, &text, "%s%s", caption, gsf__dit_praise);
+        if (text.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+        if (!result)
+            result = gsf_nn_tokenize(p->ctx, &model, gsf__dit_negative, sizeof gsf__dit_negative - 1, ids, room, NULL);
+        if (!result) result = gsf_nn_tokenize(p->ctx, &model, text.data, text.size, ids + room, room, NULL);
+    }
+    gsf_nn_destroy_tokenizer(p->ctx, &model);
+    gsf_destroy_text(p->ctx, &text);
+    return result;
+}
+
+static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids) { // NULL: only opens the encoder
+    gsf_text folder;
+    gsf_nn_t5 model;
+    gsf_nn_t5_input in;
+    double bytes, flops;
+    memset(&in, 0, sizeof in);
+    in.ids = ids;
+    in.batch = 2;
+    in.tokens = p->r->transformer.text_tokens;
+    GSF__TRY(gsf__dit_folder(p, "text_encoder", &folder));
+    gsf_result result = gsf_nn_make_t5(p->ctx, folder.data, &model);
+    gsf_destroy_text(p->ctx, &folder);
+    if (result) return result;
+    result = gsf__dit_misfit(p, "text_encoder", model.width, p->r->transformer.text_channels);
+    gsf_nn_t5_cost(&model, &in, &bytes, &flops);
+    if (!ids) gsf__dit_add_cost(p->r, bytes, flops);
+    else if (!result) result = gsf_nn_t5_encode(p->ctx, &model, &in, p->r->text);
+    gsf_nn_destroy_t5(p->ctx, &model);
+    return result;
+}
+
+static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
+    gsf__dit_restorer* r = p->r;
+    const size_t tokens = (size_t)r->transformer.text_tokens;
+    int32_t* ids = NULL;
+    if (caption) {
+        if (r->text && r->caption.data && strcmp(r->caption.data, caption) == 0) return GSF_OK;
+        if (!r->text) r->text = (float*)gsf_alloc(p->ctx, 2 * tokens * sizeof(float), (size_t)r->transformer.text_channels);
+        ids = (int32_t*)gsf_alloc(p->ctx, 2 * tokens, sizeof *ids);
+        gsf_destroy_text(p->ctx, &r->caption);
+        if (!ids || !r->text) {
+            gsf_free(p->ctx, ids);
+            return GSF_ERROR_OUT_OF_MEMORY;
+        }
+    }
+    gsf_result result = gsf__dit_tokenize(p, caption, ids);
+    if (!result) result = gsf__dit_encode_ids(p, ids);
+    gsf_free(p->ctx, ids);
+    if (!result && caption) gsf_text_printf(p->ctx, &r->caption, "%s", caption);
+    return gsf__dit_absent(p->ctx, result, "the prompts' embeddings", "prompt_embeds in the features file");
+}
+
+// What the photo shows, as `out` (GSF__DIT_CAPTION_BYTES); without a photo the captioner is only opened.
+static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
+    gsf_text folder;
+    gsf_nn_captioner model;
+    double bytes, flops;
+    GSF__TRY(gsf__dit_folder(p, "blip2", &folder));
+    gsf_result result = gsf_nn_make_captioner(p->ctx, folder.data, &model);
+    gsf_destroy_text(p->ctx, &folder);
+    if (result) return gsf__dit_absent(p->ctx, result, "the caption", "a caption, or prompt_embeds in the features file,");
+    gsf_nn_captioner_cost(&model, NULL, GSF__DIT_CAPTION_TOKENS, &bytes, &flops);
+    if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
+    else result = gsf_nn_caption(p->ctx, &model, p->photos, NULL, GSF__DIT_CAPTION_TOKENS, out, GSF__DIT_CAPTION_BYTES);
+    gsf_nn_destroy_captioner(p->ctx, &model);
+    return result;
+}
+
+// The photo nearest to a camera, by distance and half of 1 - the cosine between the views (GSFixer's reference choice).
+static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* camera) {
+    int32_t best = 0;
+    double least = 1e300;
+    double center[3], other[3];
+    gsf_camera_center(camera, center);
+    for (int32_t i = 0; i < r->photo_count; i++) {
+        const gsf_camera* c = &r->photos[i].camera;
+        double square = 0.0, cosine = 0.0;
+        gsf_camera_center(c, other);
+        for (int k = 0; k < 3; k++) {
+            square += (center[k] - other[k]) * (center[k] - other[k]);
+            cosine += camera->w2c[4 * k + 2] * c->w2c[4 * k + 2]; // third row: forward
+        }
+        const double score = sqrt(square) + 0.5 * (1.0 - cosine);
+        if (score < least) {
+            least = score;
+            best = i;
+        }
+    }
+    return best;
+}
+
+// Reference tokens from what the features hold, through the transformer's projectors.
+static gsf_result gsf__dit_project(gsf_context* ctx, gsf__dit_restorer* r) {
+    const gsf_nn_condition condition = r->desc.condition;
+    const gsf_nn_features* f = &r->features;
+    r->reference_tokens = f->images * f->tokens;
+    gsf_free(ctx, r->references);
+    r->references = (float*)gsf_alloc(ctx, (size_t)r->reference_tokens,
+                                      (size_t)gsf__dit_width(&r->transformer) * sizeof(float));
+    if (!r->references) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf_nn_project_references(ctx, &r->transformer, r->reference_tokens, condition != GSF_NN_3D ? f->dino : NULL,
+                                     condition != GSF_NN_2D ? f->vggt : NULL, r->references);
+}
+
+static int gsf__dit_needs_dinov2(const gsf__dit_restorer* r) {
+    return !r->has_dino && (r->desc.condition == GSF_NN_BOTH || r->desc.condition == GSF_NN_2D);
+}
+
+static int gsf__dit_needs_vggt(const gsf__dit_restorer* r) {
+    return !r->has_vggt && (r->desc.condition == GSF_NN_BOTH || r->desc.condition == GSF_NN_3D);
+}
+
+// Tokens of `count` photos; what the file gave stays.
+static gsf_result gsf__dit_encode_photos(gsf_context* ctx, gsf__dit_restorer* r, const gsf_image* photos, int32_t count) {
+    const gsf__dit_part part = {ctx, r, photos, count};
+    gsf_nn_features* f = &r->features;
+    if (!r->has_dino) {
+        gsf_free(ctx, f->dino);
+        f->dino = NULL;
+    }
+    if (!r->has_vggt) {
+        gsf_free(ctx, f->vggt);
+        f->vggt = NULL;
+    }
+    if (gsf__dit_needs_dinov2(r)) GSF__TRY(gsf__dit_dinov2(&part));
+    if (gsf__dit_needs_vggt(r)) GSF__TRY(gsf__dit_vggt(&part));
+    return gsf__dit_project(ctx, r);
+}
+
+static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
+    if (!gsf__dit_needs_dinov2(r) && !gsf__dit_needs_vggt(r)) return GSF_OK; // none, or all from the file
+    if (r->photo_count < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no reference photos (condition none does without them)");
+    const int all = !window->cameras; // nobody knows which are near
+    int32_t pair[2] = {0, 0};
+    for (int k = 0; k < 2 && !all; k++) pair[k] = gsf__dit_nearest(r, &window->cameras[k ? window->frame_count - 1 : 0]);
+    if (r->pair[0] == pair[0] && r->pair[1] == pair[1]) return GSF_OK;
+    const int32_t count = all ? r->photo_count : 2;
+    gsf_image* photos = (gsf_image*)gsf_alloc(ctx, (size_t)count, sizeof *photos);
+    if (!photos) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < count; i++) photos[i] = r->photos[all ? i : pair[i]].color;
+    const gsf_result result = gsf__dit_encode_photos(ctx, r, photos, count);
+    gsf_free(ctx, photos);
+    for (int k = 0; k < 2; k++) r->pair[k] = result ? -1 : pair[k];
+    return result;
+}
+
+static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
+    char described[GSF__DIT_CAPTION_BYTES];
+    const char* caption = r->desc.caption ? r->desc.caption : window->caption;
+    const gsf__dit_part part = {ctx, r, gsf__dit_frame(r, window, 0), 1};
+    if (r->has_text) return GSF_OK;
+    if (!caption) {
+        GSF__TRY(gsf__dit_describe(&part, described));
+        caption = described;
+    }
+    return gsf__dit_text(&part, caption);
+}
+
+static gsf_result gsf__dit_save(gsf_context* ctx, const gsf__dit_restorer* r) {
+    const gsf_nn_transformer* t = &r->transformer;
+    const int64_t shape[3] = {2, t->text_tokens, t->text_channels};
+    const gsf_tensor text = gsf_nn_wrap_tensor("prompt_embeds", r->text, 3, shape);
+    return gsf_nn_save_features(ctx, r->desc.save_features, &r->features, &text);
+}
+
 static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
+    gsf__progress(ctx, "clip", 0.0, 1.0);
+    GSF__TRY(gsf__dit_prompt(ctx, r, window));
+    GSF__TRY(gsf__dit_refer(ctx, r, window));
+    if (r->desc.save_features) GSF__TRY(gsf__dit_save(ctx, r));
     gsf_nn_sample_desc d = r->desc.sample;
     d.frames = window->frame_count;
     d.width = (int32_t)window->color[0].width;
@@ -9691,51 +9987,62 @@ static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_resto
     return result;
 }
 
-// The reference tokens and prompt embeddings of a features file, checked against the transformer.
-static gsf_result gsf__dit_feature(gsf_context* ctx, gsf__dit_restorer* r, const char* name, int32_t rank,
-                                   const int64_t* shape, float** out, int64_t* rows) {
-    const gsf_tensor* t = gsf_nn_find_tensor(&r->features, name);
-    *out = NULL;
-    if (!t)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is missing (this version has no encoders to make it)",
-                        r->features.name, name);
-    int ok = t->rank == rank && t->count > 0;
-    for (int32_t i = 0; ok && i < rank; i++) ok = shape[i] < 0 || t->shape[i] == shape[i];
-    if (!ok)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", r->features.name, name,
-                        (long long)shape[rank - 1]);
+// ---- restorer: opening
+
+// A tensor (images, tokens, channels) of the features file, as floats; *found = 0 where there is none.
+static gsf_result gsf__dit_feature(gsf_context* ctx, const gsf_nn_weights* file, const char* name, int64_t images,
+                                   int64_t tokens, int64_t channels, float** out, const gsf_tensor** found) {
+    const gsf_tensor* t = gsf_nn_find_tensor(file, name);
+    *found = t;
+    if (!t) return GSF_OK;
+    if (t->rank != 3 || t->count < 1 || (images && t->shape[0] != images) || (tokens && t->shape[1] != tokens) ||
+        t->shape[2] != channels)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", file->name, name,
+                        (long long)channels);
     *out = (float*)gsf_alloc(ctx, (size_t)t->count, sizeof(float));
     if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_nn_read_tensor(t, 0, t->count, *out);
-    *rows = t->count / shape[rank - 1];
     return GSF_OK;
 }
 
-static gsf_result gsf__dit_load_features(gsf_context* ctx, gsf__dit_restorer* r) {
+static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const gsf_nn_weights* file) {
     const gsf_nn_transformer* c = &r->transformer;
-    const gsf_nn_condition condition = r->desc.condition;
-    const int64_t text[3] = {2, c->text_tokens, c->text_channels};
-    const int64_t dino[3] = {-1, -1, c->dino_channels}, vggt[3] = {-1, -1, c->vggt_channels};
-    float *tokens2 = NULL, *tokens3 = NULL;
-    int64_t rows, rows2 = 0, rows3 = 0;
-    GSF__TRY(gsf_nn_open_weights(ctx, r->desc.features, NULL, &r->features));
-    GSF__TRY(gsf__dit_feature(ctx, r, "prompt_embeds", 3, text, &r->text, &rows));
-    if (condition == GSF_NN_NONE) return GSF_OK;
-    gsf_result result = GSF_OK;
-    if (condition != GSF_NN_3D) result = gsf__dit_feature(ctx, r, "dino_latents", 3, dino, &tokens2, &rows2);
-    if (!result && condition != GSF_NN_2D) result = gsf__dit_feature(ctx, r, "vggt_latents", 3, vggt, &tokens3, &rows3);
-    if (!result && tokens2 && tokens3 && rows2 != rows3)
-        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld rows of dino_latents, but %lld of vggt_latents",
-                          r->features.name, (long long)rows2, (long long)rows3);
-    r->reference_tokens = rows2 ? rows2 : rows3;
-    if (!result) {
-        r->references = (float*)gsf_alloc(ctx, (size_t)r->reference_tokens, (size_t)gsf__dit_width(c) * sizeof(float));
-        result = r->references ? gsf_nn_project_references(ctx, c, r->reference_tokens, tokens2, tokens3, r->references)
-                               : GSF_ERROR_OUT_OF_MEMORY;
+    gsf_nn_features* f = &r->features;
+    const gsf_tensor *text, *dino, *vggt;
+    GSF__TRY(gsf__dit_feature(ctx, file, "prompt_embeds", 2, c->text_tokens, c->text_channels, &r->text, &text));
+    GSF__TRY(gsf__dit_feature(ctx, file, "dino_latents", 0, 0, c->dino_channels, &f->dino, &dino));
+    GSF__TRY(gsf__dit_feature(ctx, file, "vggt_latents", 0, 0, c->vggt_channels, &f->vggt, &vggt));
+    if (dino && vggt && (dino->shape[0] != vggt->shape[0] || dino->shape[1] != vggt->shape[1]))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld rows of dino_latents, but %lld x %lld of vggt_latents",
+                        file->name, (long long)dino->shape[0], (long long)dino->shape[1], (long long)vggt->shape[0],
+                        (long long)vggt->shape[1]);
+    const gsf_tensor* tokens = dino ? dino : vggt;
+    f->images = tokens ? tokens->shape[0] : 0;
+    f->tokens = tokens ? tokens->shape[1] : 0;
+    f->dino_channels = dino ? c->dino_channels : 0;
+    f->vggt_channels = vggt ? c->vggt_channels : 0;
+    r->has_text = text != NULL;
+    r->has_dino = dino != NULL;
+    r->has_vggt = vggt != NULL;
+    return GSF_OK;
+}
+
+// The features file, and a look at every folder that clips will need for what it lacks.
+static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* r) {
+    const gsf__dit_part part = {ctx, r, NULL, 0};
+    if (r->desc.features) {
+        gsf_nn_weights file;
+        GSF__TRY(gsf_nn_open_weights(ctx, r->desc.features, NULL, &file));
+        const gsf_result result = gsf__dit_read_features(ctx, r, &file);
+        gsf_nn_close_weights(ctx, &file);
+        GSF__TRY(result);
     }
-    gsf_free(ctx, tokens2);
-    gsf_free(ctx, tokens3);
-    return result;
+    if (!r->has_text) GSF__TRY(gsf__dit_text(&part, NULL));
+    if (!r->has_text && !r->desc.caption) GSF__TRY(gsf__dit_describe(&part, NULL));
+    const int dinov2 = gsf__dit_needs_dinov2(r), vggt = gsf__dit_needs_vggt(r);
+    if (dinov2) GSF__TRY(gsf__dit_dinov2(&part));
+    if (vggt) GSF__TRY(gsf__dit_vggt(&part));
+    return dinov2 || vggt || r->desc.condition == GSF_NN_NONE ? GSF_OK : gsf__dit_project(ctx, r);
 }
 
 static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
@@ -9751,8 +10058,8 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
     gsf_text_printf(ctx, &path, "%s/scheduler/scheduler_config.json", r->desc.model);
     if (!result) result = gsf_nn_load_schedule(ctx, path.data, &r->schedule);
     gsf_destroy_text(ctx, &path);
-    if (!result && r->desc.int8) result = gsf_nn_quantize_transformer(ctx, &r->transformer, NULL);
-    return result ? result : gsf__dit_load_features(ctx, r);
+    if (!result) result = gsf__dit_open_conditions(ctx, r);
+    return !result && r->desc.int8 ? gsf_nn_quantize_transformer(ctx, &r->transformer, NULL) : result;
 }
 
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
@@ -9762,36 +10069,43 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
     gsf_nn_destroy_transformer(ctx, &r->transformer);
     gsf_nn_destroy_vae(ctx, &r->vae);
     gsf_nn_destroy_schedule(ctx, &r->schedule);
-    gsf_nn_close_weights(ctx, &r->features);
+    gsf_nn_destroy_features(ctx, &r->features);
+    gsf_destroy_text(ctx, &r->caption);
     gsf_free(ctx, r->text);
     gsf_free(ctx, r->references);
     gsf_free(ctx, r->texts);
     gsf_free(ctx, r);
 }
 
+// The desc's texts, one after another in memory of the restorer's own.
+static gsf_result gsf__dit_copy_desc(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf__dit_restorer* r) {
+    r->desc = *desc;
+    const char** const texts[] = {&r->desc.model, &r->desc.features, &r->desc.caption, &r->desc.save_features,
+                                  &r->desc.sample.checkpoint};
+    size_t size = 0;
+    for (size_t i = 0; i < GSF__COUNT(texts); i++) size += *texts[i] ? strlen(*texts[i]) + 1 : 0;
+    r->texts = (char*)gsf_alloc(ctx, size, 1);
+    if (!r->texts) return GSF_ERROR_OUT_OF_MEMORY;
+    char* at = r->texts;
+    for (size_t i = 0; i < GSF__COUNT(texts); i++) {
+        if (!*texts[i]) continue;
+        const size_t bytes = strlen(*texts[i]) + 1;
+        memcpy(at, *texts[i], bytes);
+        *texts[i] = at;
+        at += bytes;
+    }
+    return GSF_OK;
+}
+
 GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out) {
     memset(out, 0, sizeof *out);
     if (!desc || !desc->model)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no model folder is given");
-    if (!desc->features)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "dit: no file of reference features and prompt embeddings is given (this version has no encoders)");
     gsf__dit_restorer* r = (gsf__dit_restorer*)gsf_alloc_zeroed(ctx, 1, sizeof *r);
     if (!r) return GSF_ERROR_OUT_OF_MEMORY;
-    const char* checkpoint = desc->sample.checkpoint ? desc->sample.checkpoint : "";
-    const size_t sizes[3] = {strlen(desc->model) + 1, strlen(desc->features) + 1, strlen(checkpoint) + 1};
-    r->desc = *desc;
-    r->texts = (char*)gsf_alloc(ctx, sizes[0] + sizes[1] + sizes[2], 1);
-    gsf_result result = r->texts ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    if (!result) {
-        memcpy(r->texts, desc->model, sizes[0]);
-        memcpy(r->texts + sizes[0], desc->features, sizes[1]);
-        memcpy(r->texts + sizes[0] + sizes[1], checkpoint, sizes[2]);
-        r->desc.model = r->texts;
-        r->desc.features = r->texts + sizes[0];
-        r->desc.sample.checkpoint = desc->sample.checkpoint ? r->texts + sizes[0] + sizes[1] : NULL;
-        result = gsf__dit_open(ctx, r);
-    }
+    gsf_result result = gsf__dit_copy_desc(ctx, desc, r);
+    if (!result) result = gsf__dit_open(ctx, r);
+    r->pair[0] = r->pair[1] = -1;
     out->struct_size = sizeof *out;
     out->name = "dit";
     out->user = r;

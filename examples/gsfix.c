@@ -45,7 +45,12 @@ static const option_spec option_specs[] = {
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
      "which features of the photos guide the restorer dit: (default both: 2D semantic, 3D geometric)"},
     {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "fix restore",
-     "encoded photos and prompt for the restorer dit:, as safetensors: dino_latents, vggt_latents, prompt_embeds"},
+     "dit: encoded photos and prompts, as safetensors with any of dino_latents, vggt_latents, prompt_embeds; the\n"
+     "model's encoders make what is not there"},
+    {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
+     "dit: write the encoded photos and prompts of the last clip, for --ref-features"},
+    {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore",
+     "dit: what the scene is (default: the model's captioner looks at each clip's first frame)"},
     {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: steps from noise to frames (default 50; fast 10)"},
     {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore",
      "dit: how they are taken (default ddim, as published; fast unipc)"},
@@ -379,12 +384,12 @@ int gsfix_check_restorer(gsfix_app* app) {
     const char* r = app->o.restorer;
     const gsfix_options* o = &app->o;
     if (r && strncmp(r, "dit:", 4) == 0 && r[4]) {
-        if (!o->ref_features)
-            return gsfix_misused(app, "--restorer dit: needs --ref-features FILE (this version has no encoders to make it)");
         return 0;
     }
     const char* alone = o->condition                ? "--condition"
                         : o->ref_features           ? "--ref-features"
+                        : o->save_features          ? "--save-features"
+                        : o->caption                ? "--caption"
                         : o->steps                  ? "--steps"
                         : o->solver                 ? "--solver"
                         : o->guidance > 0.0         ? "--guidance"
@@ -409,6 +414,8 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     memset(&d, 0, sizeof d);
     d.model = o->restorer + 4;
     d.features = o->ref_features;
+    d.save_features = o->save_features;
+    d.caption = o->caption;
     for (int i = 0; i < 4; i++)
         if (o->condition && strcmp(o->condition, gsfix_conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
     d.int8 = o->int8;
@@ -424,9 +431,47 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     return d;
 }
 
+// The time since the last unit of work is this stage's.
+static void note_dit_stage(gsfix_app* app, const char* stage) {
+    const double begin = app->stage_begin, memory = gsfix_anonymous_memory();
+    int i = 0;
+    app->stage_begin = gsfix_now();
+    if (strcmp(stage, "clip") == 0) return;
+    while (i < app->stage_count && strcmp(app->stages[i].name, stage) != 0) i++;
+    if (i == GSFIX_CLIP_STAGES) return;
+    gsfix_clip_stage* s = &app->stages[i];
+    if (i == app->stage_count) {
+        snprintf(s->name, sizeof s->name, "%s", stage);
+        app->stage_count++;
+    }
+    s->seconds += app->stage_begin - begin;
+    if (memory > s->memory) s->memory = memory;
+}
+
+void gsfix_json_stages(gsfix_app* app, gsf_text* text) {
+    gsf_context* ctx = &app->ctx;
+    if (!app->stage_count) return;
+    gsfix_json_begin(ctx, text, "restorer_stages", '[');
+    for (int i = 0; i < app->stage_count; i++) {
+        gsfix_json_begin(ctx, text, NULL, '{');
+        gsfix_json_text(ctx, text, "name", app->stages[i].name);
+        gsfix_json_number(ctx, text, "seconds", app->stages[i].seconds);
+        gsfix_json_number(ctx, text, "memory_bytes", app->stages[i].memory);
+        gsfix_json_end(ctx, text, '}');
+    }
+    gsfix_json_end(ctx, text, ']');
+}
+
+void gsfix_print_stages(gsfix_app* app) {
+    for (int i = 0; i < app->stage_count; i++)
+        gsfix_print(app, "  %-12s %8.2f s  %6.0f MiB", app->stages[i].name, app->stages[i].seconds,
+                    app->stages[i].memory / (1 << 20));
+}
+
 // Steps of one clip: a bar where the clip is all there is to do, else a line whenever half a minute has passed.
 static void show_dit_steps(void* user, const char* stage, double done, double total) {
     gsfix_app* app = (gsfix_app*)user;
+    note_dit_stage(app, stage);
     if (strcmp(stage, "restore") != 0) return;
     if (strcmp(app->command, "restore") == 0) {
         gsfix_progress(app, done, total, "step %.0f of %.0f", done, total);
@@ -1126,8 +1171,10 @@ static gsf_result restore_folder(gsfix_app* app) {
         gsfix_json_number(ctx, &app->json, "frames", (double)c.frames);
         gsfix_json_number(ctx, &app->json, "references", (double)c.refs);
         gsfix_json_number(ctx, &app->json, "seconds", gsfix_now() - begin);
+        gsfix_json_stages(app, &app->json);
         gsfix_print(app, "%zu frames restored by %s from %zu photos in %.2f s -> %s", c.frames, app->o.restorer, c.refs,
                     gsfix_now() - begin, app->o.out);
+        gsfix_print_stages(app);
     }
     gsfix_destroy_restorer(app, &restorer);
     free_clip(app, &c);

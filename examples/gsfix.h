@@ -16,7 +16,8 @@
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
-    const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *model, *solver;
+    const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *save_features;
+    const char *caption, *model, *solver;
     int json, help, resume, depth, alpha, int8;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
@@ -24,6 +25,13 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char** inputs;
     int input_count;
 } gsfix_options;
+
+enum { GSFIX_CLIP_STAGES = 12 };
+
+typedef struct gsfix_clip_stage { // what the restorer dit: did in all clips
+    char name[16];
+    double seconds, memory;  // memory: anonymous bytes that were resident behind its units, at most
+} gsfix_clip_stage;
 
 typedef struct gsfix_app {
     gsf_context ctx;
@@ -37,6 +45,9 @@ typedef struct gsfix_app {
     double bar_time;
     int line_share;     // tenth of the work that the last plain progress line told
     double clip_line;   // gsfix_now() of the last line about the clip that is being restored
+    double stage_begin; // of the unit of the restorer's work that is being done
+    gsfix_clip_stage stages[GSFIX_CLIP_STAGES];
+    int stage_count;
 } gsfix_app;
 
 // ---- gsfix_util.c --------------------------------------------------------------
@@ -46,6 +57,7 @@ typedef struct gsfix_names { char** names; size_t count; } gsfix_names;
 
 double gsfix_now(void); // seconds, monotonic
 uint64_t gsfix_peak_memory(void);
+double gsfix_anonymous_memory(void); // resident bytes that are no file's, now; 0: unknown
 double gsfix_physical_memory(void); // bytes that the machine has; 0: unknown
 gsfix_path gsfix_pathf(const char* format, ...) GSF_PRINTF(1, 2);
 int gsfix_exists(const char* path);
@@ -106,6 +118,8 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
 int gsfix_check_restorer(gsfix_app* app);
 gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present);
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
+void gsfix_json_stages(gsfix_app* app, gsf_text* text); // "restorer_stages": [...], where there were any
+void gsfix_print_stages(gsfix_app* app);
 extern const char* const gsfix_conditions[4]; // how --condition spells gsf_nn_condition
 extern const char* const gsfix_solvers[3];    // and --solver gsf_nn_solver
 gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app);      // as the options have it, for --restorer dit:MODEL_DIR

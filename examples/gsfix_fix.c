@@ -444,6 +444,7 @@ static void write_dit_switches(fix_run* run) {
     gsf_text* t = &run->switches;
     gsfix_json_text(ctx, t, "condition", gsfix_conditions[dit.condition]);
     gsfix_json_text(ctx, t, "ref_features", dit.features);
+    gsfix_json_text(ctx, t, "caption", dit.caption);
     gsfix_json_number(ctx, t, "steps", d.steps);
     gsfix_json_text(ctx, t, "solver", gsfix_solvers[d.solver]);
     gsfix_json_number(ctx, t, "guidance", as_written(d.guidance));
@@ -980,6 +981,7 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsfix_json_number(ctx, t, "total", h->seconds_total);
     for (int i = 0; i < GSFIX_STAGES; i++) gsfix_json_number(ctx, t, gsfix_stage_names[i], h->seconds[i]);
     gsfix_json_end(ctx, t, '}');
+    gsfix_json_stages(run->app, t);
     gsfix_json_number(ctx, t, "iterations", r->iterations);
     gsfix_json_number(ctx, t, "splats", (double)r->splats->count);
     gsfix_json_number(ctx, t, "peak_rss_bytes", (double)gsfix_peak_memory());

@@ -38,6 +38,18 @@ uint64_t gsfix_peak_memory(void) {
 #endif
 }
 
+double gsfix_anonymous_memory(void) {
+    double bytes = 0.0;
+#ifdef __linux__
+    unsigned long resident, shared;
+    FILE* file = fopen("/proc/self/statm", "r");
+    if (file && fscanf(file, "%*u %lu %lu", &resident, &shared) == 2)
+        bytes = (double)(resident - shared) * (double)sysconf(_SC_PAGESIZE);
+    if (file) fclose(file);
+#endif
+    return bytes;
+}
+
 gsfix_path gsfix_pathf(const char* format, ...) { // too long a path is cut, and then not found
     gsfix_path path;
     va_list args;
