@@ -40,7 +40,7 @@
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
-               >>nn sampling >>nn restorer
+               >>nn sampling >>nn bpe >>nn captioner >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -495,6 +495,31 @@ typedef struct gsf_nn_cost { double bytes, flops; } gsf_nn_cost; // anonymous me
 GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                     const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
                                                     gsf_nn_cost* out);
+
+// ---- tokens: byte-level pair encoding -----------------------------------------------
+// What GPT-2 and OPT read, as transformers 4.51.3 does it (GPT2Tokenizer).
+
+typedef struct gsf_nn_bpe {     // an open tokenizer
+    int32_t bos, eos, unk, pad; // ids, -1: none
+    int32_t highest_id;
+    int add_bos;                // texts begin with `bos`
+    void* tables;               // private
+} gsf_nn_bpe;
+
+// Opens FOLDER/vocab.json and merges.txt and, where they are there, tokenizer_config.json, special_tokens_map.json and
+// added_tokens.json. What is malformed, or names a token that there is not, gives GSF_ERROR_FORMAT with file and place.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
+GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe);
+
+// Ids of a text of `size` bytes, which must be UTF-8; *ids is freed with gsf_free. `no_bos` leaves the first token out even
+// where add_bos says otherwise. Time n log n whatever the text. Any number of threads, each with its context, may use one
+// tokenizer.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
+                                                   int no_bos, int32_t** ids, size_t* count);
+// Appends the text of `count` ids to `out`, which may come to hold zero bytes; bytes that are no UTF-8 become U+FFFD.
+// Ids that no token has are left out, with `skip_special` the special tokens (bos, eos, pad, <image> ...) as well.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
+                                                   size_t count, int skip_special, gsf_text* out);
 
 // ---- the restorer `dit` ---------------------------------------------------------------
 
@@ -7079,6 +7104,949 @@ GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* tra
     gsf_nn_destroy_sampler(ctx, &run.sampler);
     gsf_free(ctx, memory);
     return result;
+}
+
+// ---- >>nn bpe -------------------------------------------------------------------
+
+/* Byte-level byte-pair encoding (Sennrich et al. 2016; Radford et al. 2019) as transformers 4.51.3 runs it in
+   models/gpt2/tokenization_gpt2.py and tokenization_utils.py:
+       text | added tokens are cut out | words, by a pattern | bytes | neighbours merged, lowest rank first | ids
+   The files spell a byte as a character: printable Latin-1 as itself, the other 68 bytes as U+0100 and on, in order.
+       vocab.json    {"token": id, ...}
+       merges.txt    a comment line, then lines "left right", the lowest rank first
+   A word's merges are done rank by rank, all places of a rank from left to right, with a heap of places, so that a word of
+   a megabyte takes n log n steps. Merges lie sorted by left token, then by right one. */
+
+enum { GSF__BPE_OTHER, GSF__BPE_LETTER, GSF__BPE_NUMBER, GSF__BPE_SPACE }; // kinds of characters in the pattern
+
+// Kinds of all characters as runs from U+0000 on, 4 * length + kind; behind the last all are GSF__BPE_OTHER. A tokenizer
+// unpacks these 3.3 KB to 2 bits for each character. Made with the `regex` package, which the official tokenizer asks
+// (2026.11.15, Unicode 18; for characters that unicodedata knows, its categories L* and N* and White_Space):
+//     import regex
+//     kind = [next((k for k, p in ((1, r"\p{L}"), (2, r"\p{N}"), (3, r"\s")) if regex.match(p, chr(c))), 0)
+//             for c in range(0x110000)]
+//     start = 0
+//     for c in range(1, 0x110000):
+//         if kind[c] != kind[start] or c - start == 16383:
+//             print(4 * (c - start) + kind[start], end=",")
+//             start = c
+static const uint16_t gsf__bpe_kinds[] = {
+    36,23,72,7,60,42,28,105,24,105,40,7,104,7,36,5,28,10,4,5,12,6,5,4,14,4,93,4,125,4,1833,16,49,56,21,28,5,4,5,516,
+    21,4,9,8,17,4,5,24,5,4,13,4,5,4,81,4,333,4,557,32,665,4,153,4,9,24,165,8,9,268,109,16,17,180,173,84,42,16,9,4,397,
+    4,5,60,9,28,9,42,13,8,5,64,5,4,121,116,357,44,5,56,42,133,36,9,16,5,20,89,16,5,36,5,12,5,92,101,28,45,20,97,4,29,
+    64,169,232,217,12,5,72,5,28,41,16,42,4,65,16,33,8,9,8,89,4,29,4,5,12,17,12,5,64,5,52,9,4,13,16,42,9,8,26,8,5,32,
+    25,16,9,8,89,4,29,4,9,4,9,4,9,124,17,4,5,28,42,8,13,64,37,4,13,4,89,4,29,4,9,4,21,12,5,72,5,60,9,16,42,36,5,44,33,
+    8,9,8,89,4,29,4,9,4,21,12,5,120,9,4,13,16,42,4,5,26,44,5,4,25,12,13,4,17,12,9,4,5,4,9,12,9,12,13,12,49,88,5,84,54,
+    72,33,4,13,4,93,4,65,12,5,104,13,4,9,8,9,16,42,32,30,4,5,16,33,4,13,4,93,4,41,4,21,12,5,120,13,4,9,16,42,4,9,68,
+    37,4,13,4,165,8,5,64,5,20,13,4,30,13,16,78,4,25,20,73,12,97,4,37,4,5,8,29,124,42,68,193,4,9,48,29,36,42,156,9,4,5,
+    4,21,4,97,4,5,4,41,4,9,36,5,8,21,4,5,36,42,8,17,128,5,124,82,48,33,4,145,108,21,460,173,80,5,42,24,25,16,17,12,5,
+    12,9,28,13,16,53,48,5,4,42,24,153,4,5,20,5,8,173,4,1333,4,17,8,29,4,5,4,17,8,165,4,17,8,133,4,17,8,29,4,5,4,17,8,
+    61,4,229,4,17,8,269,56,82,12,65,64,345,8,25,12,2481,8,69,7,105,20,301,12,14,33,28,73,52,77,56,73,56,53,4,13,60,
+    209,140,5,16,5,12,42,24,42,88,42,24,357,28,21,8,137,4,5,20,281,40,125,156,42,121,8,21,44,177,16,105,24,46,148,93,
+    36,213,172,42,24,42,52,5,372,189,68,33,12,42,164,121,52,9,42,177,104,145,112,42,12,13,42,145,8,45,20,173,8,13,164,
+    17,4,25,4,9,12,5,20,769,256,1113,8,25,8,153,8,25,8,33,4,5,4,5,4,5,4,125,8,213,4,29,4,5,12,13,4,29,12,17,8,25,16,
+    53,20,13,4,29,12,47,116,11,20,7,188,7,64,6,5,8,26,20,5,42,20,69,392,5,16,5,8,41,4,5,12,21,24,5,4,5,4,5,4,17,4,45,
+    8,17,20,21,16,5,4,206,9,22,2904,242,312,90,2520,122,4528,917,24,17,12,9,36,6,8,153,4,5,20,5,8,225,28,5,64,93,36,
+    29,4,29,4,29,4,29,4,29,4,29,4,29,4,29,320,5,1856,7,16,9,6,100,38,28,21,8,14,9,16,345,24,13,4,361,4,17,20,173,4,
+    377,12,18,40,129,192,65,128,42,120,34,4,62,128,42,156,62,1280,26369,256,65533,23097,268,185,8,1077,12,65,42,9,80,
+    189,64,125,8,281,42,156,37,8,413,8,333,16,5,56,69,4,13,4,17,4,93,52,26,40,209,56,201,112,42,96,25,12,5,4,9,4,42,
+    113,40,93,100,117,28,189,112,5,42,24,21,4,41,42,21,4,165,92,13,4,33,16,42,24,93,12,5,12,201,4,5,12,9,8,21,8,5,4,5,
+    96,13,8,45,28,13,48,25,8,25,8,25,36,29,4,29,4,173,4,57,8,9,8,461,52,42,24,44689,48,93,16,197,33808,1465,8,425,152,
+    29,48,21,20,5,4,41,4,53,4,21,4,5,4,9,4,9,4,433,132,1453,72,257,8,217,160,49,464,21,4,541,76,42,28,105,24,105,44,
+    357,12,25,8,25,8,25,8,13,140,49,4,105,4,77,4,9,4,61,8,57,136,493,48,182,48,230,68,10,976,117,12,197,64,110,16,129,
+    18,36,81,6,33,6,20,153,40,121,8,145,16,33,4,22,168,633,8,42,24,145,16,145,16,161,32,209,48,45,4,61,4,29,4,9,4,45,
+    4,61,4,29,4,9,12,209,48,1245,36,89,40,33,96,25,4,169,4,57,256,25,8,5,4,177,4,9,12,5,8,93,8,34,93,8,30,125,32,38,
+    192,77,4,9,20,22,89,26,16,105,24,105,152,225,16,10,9,66,8,186,5,60,17,4,13,4,117,40,38,92,117,10,4,117,14,128,33,
+    4,113,24,22,64,217,40,89,8,34,77,20,34,73,92,30,320,293,220,205,52,205,28,26,145,48,42,24,42,113,36,93,872,126,4,
+    169,24,9,64,25,68,89,68,117,42,5,32,89,44,18,108,73,184,85,30,80,93,48,213,104,122,4,9,8,5,52,181,128,101,28,42,
+    36,145,60,42,16,5,8,5,32,141,12,5,48,193,56,17,44,42,5,4,5,16,82,44,73,4,101,76,9,252,29,4,5,4,17,4,61,4,41,28,
+    189,68,42,44,33,8,9,8,89,4,29,4,9,4,21,12,5,72,5,48,21,120,41,4,5,8,5,4,153,4,5,100,5,4,5,176,213,72,17,20,42,20,
+    13,120,193,80,9,4,5,32,42,664,189,164,17,144,193,80,5,44,42,152,173,52,5,28,42,24,82,112,109,84,50,16,29,740,177,
+    464,257,78,48,33,8,5,8,33,4,9,4,97,60,5,4,5,56,42,280,33,8,157,64,5,4,5,112,5,40,161,28,5,84,5,44,185,76,5,72,293,
+    68,5,724,133,60,42,24,37,4,149,68,5,60,118,20,121,448,29,4,9,4,153,84,5,36,42,24,25,4,9,4,129,56,5,28,42,24,177,
+    16,42,28,5,952,77,60,5,4,53,4,137,112,42,344,5,60,86,172,3689,408,450,20,46,785,48,1246,9252,389,60,4289,68,25,
+    100,15981,20,2333,27364,121,72,42,6936,2277,28,125,4,42,24,317,4,42,24,121,72,193,64,17,48,42,4,30,4,85,20,77,
+    1728,181,12,42,792,257,94,36,101,8,101,176,301,20,5,264,53,256,9,4,5,56,9,14,36,29549,144,137,380,461,52,3657,56,
+    205,30836,17,4,29,4,9,4,1189,36,5,116,13,8,5,56,21,28,1585,9232,429,20,53,12,37,28,41,16728,42,5912,82,48,82,432,
+    102,540,341,4,285,4,9,8,5,8,9,8,17,4,49,4,5,4,29,4,261,4,17,8,33,4,29,4,113,4,17,4,21,4,5,12,29,4,1365,4,101,4,
+    101,4,125,4,101,4,125,4,101,4,125,4,101,4,125,4,101,4,33,8,202,7168,521,56,29,216,205,192,249,584,181,40,29,8,42,
+    16,5,1284,121,72,177,16,42,1880,113,16,42,856,121,8,5,42,788,125,4,13,4,9,4,29,8,21,36,9,896,29,4,17,4,9,4,61,4,
+    789,8,38,192,273,28,5,16,42,3164,238,4,14,4,18,304,182,4,62,776,17,4,109,4,9,4,5,8,5,4,41,4,17,4,5,4,5,24,5,16,5,
+    4,5,4,5,4,13,4,9,4,5,8,5,4,5,4,5,4,5,4,5,4,9,4,5,8,17,4,29,4,17,4,17,4,5,4,41,4,69,20,13,4,21,4,69,2320,54,11148,
+    42,4120,65533,65533,39817,128,17533,4,23097,8,29893,60,2489,9864,2169,6024,19757,20,33961,65532,65532,28192,45313
+};
+
+enum { GSF__BPE_CHARACTERS = 0x40000 }; // those behind are all GSF__BPE_OTHER
+
+enum { // flags of tokens
+    GSF__BPE_ADDED = 1,   // cut out of texts, and spelt as it is
+    GSF__BPE_SPECIAL = 2, // may be left out when decoding
+    GSF__BPE_LSTRIP = 4,  // takes the white space before, behind it along
+    GSF__BPE_RSTRIP = 8,
+    GSF__BPE_APART = 16,  // stands between spaces in decoded text
+    GSF__BPE_OBJECT = 32  // was given as an object
+};
+
+enum { GSF__BPE_ADDED_MAX = 4096 };
+
+typedef struct gsf__bpe_token {
+    const char* text; // as the files spell it
+    size_t size;
+    int32_t id, flags;
+} gsf__bpe_token;
+
+typedef struct gsf__bpe_merge {
+    int32_t left, right, result; // indices of vocabulary tokens
+    int32_t rank;
+} gsf__bpe_merge;
+
+typedef struct gsf__bpe_tables { // behind gsf_nn_bpe.tables
+    gsf_json config, special_map, added_tokens; // hold the texts of added tokens
+    char* strings;           // those of the vocabulary
+    gsf__bpe_token* tokens;  // (vocabulary) sorted by text
+    gsf__bpe_token* added;   // (added_count) sorted by text
+    gsf__bpe_token* by_id;   // (by_id_count) all of them
+    gsf__bpe_merge* merges;  // (first[vocabulary]) by left, then right
+    int32_t* first;          // merges of the left token t: first[t] ... first[t + 1] - 1
+    unsigned char* kinds;    // 2 bits for each character
+    size_t added_capacity;
+    int32_t vocabulary, added_count, by_id_count;
+    int32_t bytes[256];      // tokens of single bytes, -1: none
+    int prefix_space, clean_up, split_special;
+} gsf__bpe_tables;
+
+// ---- bytes and characters
+
+static uint32_t gsf__bpe_character(unsigned byte) { // that spells the byte
+    if (byte <= 32) return 256 + byte;
+    if (byte >= 127 && byte <= 160) return 289 + byte - 127;
+    return byte == 173 ? 323 : byte;
+}
+
+static int gsf__bpe_byte(uint32_t character) { // -1: spells none
+    if (character >= 256 && character <= 288) return (int)character - 256;
+    if (character >= 289 && character <= 322) return (int)character - 289 + 127;
+    if (character == 323) return 173;
+    return character > 255 || character != gsf__bpe_character(character) ? -1 : (int)character;
+}
+
+static size_t gsf__bpe_store_character(uint32_t character, char* out) { // below U+0800
+    if (character < 0x80) {
+        out[0] = (char)character;
+        return 1;
+    }
+    out[0] = (char)(0xc0 | character >> 6);
+    out[1] = (char)(0x80 | (character & 0x3f));
+    return 2;
+}
+
+static uint32_t gsf__bpe_load_character(const char* text, size_t size) { // a well-formed character of `size` bytes
+    static const unsigned char first[] = {0, 0x7f, 0x1f, 0x0f, 0x07};
+    uint32_t character = (unsigned char)text[0] & first[size];
+    for (size_t i = 1; i < size; i++) character = character << 6 | ((unsigned char)text[i] & 0x3f);
+    return character;
+}
+
+static int gsf__bpe_kind(const gsf__bpe_tables* t, const char* text, size_t left, size_t* size) {
+    *size = gsf__utf8_size(text, left);
+    const uint32_t character = gsf__bpe_load_character(text, *size);
+    return character < GSF__BPE_CHARACTERS ? t->kinds[character >> 2] >> 2 * (character & 3) & 3 : GSF__BPE_OTHER;
+}
+
+// White space to Python's str.strip: that of the pattern and four control characters.
+static int gsf__bpe_strips(const gsf__bpe_tables* t, const char* text, size_t left, size_t* size) {
+    return gsf__bpe_kind(t, text, left, size) == GSF__BPE_SPACE || (text[0] >= 0x1c && text[0] <= 0x1f);
+}
+
+// [*begin, *end) of well-formed UTF-8 without the white space at its left and right ends.
+static void gsf__bpe_strip(const gsf__bpe_tables* t, const char* text, int left, int right, size_t* begin, size_t* end) {
+    size_t size;
+    while (left && *begin < *end && gsf__bpe_strips(t, text + *begin, *end - *begin, &size)) *begin += size;
+    while (right && *begin < *end) {
+        size_t at = *end - 1;
+        while (((unsigned char)text[at] & 0xc0) == 0x80) at--;
+        if (!gsf__bpe_strips(t, text + at, *end - at, &size)) return;
+        *end = at;
+    }
+}
+
+static gsf_result gsf__bpe_unpack_kinds(gsf_context* ctx, gsf__bpe_tables* t) {
+    uint32_t character = 0;
+    t->kinds = (unsigned char*)gsf_alloc_zeroed(ctx, GSF__BPE_CHARACTERS / 4, 1);
+    if (!t->kinds) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < GSF__COUNT(gsf__bpe_kinds); i++)
+        for (uint32_t end = character + gsf__bpe_kinds[i] / 4; character < end; character++)
+            t->kinds[character >> 2] |= (unsigned char)((gsf__bpe_kinds[i] & 3u) << 2 * (character & 3));
+    return GSF_OK;
+}
+
+// ---- loading
+
+typedef struct gsf__bpe_loader {
+    gsf_context* ctx;
+    const char* folder;
+    gsf__bpe_tables* t;
+    const gsf_json_value* decoder; // "added_tokens_decoder" of tokenizer_config.json, or NULL
+    gsf_text path, scratch;
+} gsf__bpe_loader;
+
+static int gsf__bpe_compare(const char* a, size_t a_size, const char* b, size_t b_size) {
+    const int order = memcmp(a, b, a_size < b_size ? a_size : b_size);
+    return order ? order : a_size < b_size ? -1 : a_size > b_size;
+}
+
+static int gsf__bpe_compare_texts(const void* a, const void* b) {
+    const gsf__bpe_token *x = (const gsf__bpe_token*)a, *y = (const gsf__bpe_token*)b;
+    return gsf__bpe_compare(x->text, x->size, y->text, y->size);
+}
+
+static int gsf__bpe_compare_ids(const void* a, const void* b) { // an added token before one of the vocabulary
+    const gsf__bpe_token *x = (const gsf__bpe_token*)a, *y = (const gsf__bpe_token*)b;
+    if (x->id != y->id) return x->id < y->id ? -1 : 1;
+    if ((x->flags & GSF__BPE_ADDED) != (y->flags & GSF__BPE_ADDED)) return x->flags & GSF__BPE_ADDED ? -1 : 1;
+    return gsf__bpe_compare_texts(a, b);
+}
+
+static int gsf__bpe_compare_merges(const void* a, const void* b) {
+    const gsf__bpe_merge *x = (const gsf__bpe_merge*)a, *y = (const gsf__bpe_merge*)b;
+    if (x->left != y->left) return x->left < y->left ? -1 : 1;
+    if (x->right != y->right) return x->right < y->right ? -1 : 1;
+    return x->rank < y->rank ? -1 : x->rank > y->rank;
+}
+
+// Index of a vocabulary token, -1 where there is none.
+static int32_t gsf__bpe_find(const gsf__bpe_tables* t, const char* text, size_t size) {
+    int32_t low = 0, high = t->vocabulary;
+    while (low < high) {
+        const int32_t middle = low + (high - low) / 2;
+        const int order = gsf__bpe_compare(t->tokens[middle].text, t->tokens[middle].size, text, size);
+        if (order == 0) return middle;
+        if (order < 0) low = middle + 1;
+        else high = middle;
+    }
+    return -1;
+}
+
+static int32_t gsf__bpe_find_added(const gsf__bpe_tables* t, const char* text, size_t size) { // while they are unsorted
+    for (int32_t i = 0; i < t->added_count; i++)
+        if (t->added[i].size == size && memcmp(t->added[i].text, text, size) == 0) return i;
+    return -1;
+}
+
+// First token of a sorted list whose id is not below `id`.
+static int32_t gsf__bpe_find_id(const gsf__bpe_tables* t, int32_t id) {
+    int32_t low = 0, high = t->by_id_count;
+    while (low < high) {
+        const int32_t middle = low + (high - low) / 2;
+        if (t->by_id[middle].id < id) low = middle + 1;
+        else high = middle;
+    }
+    return low;
+}
+
+// *data NULL: the file may be absent, and is.
+static gsf_result gsf__bpe_read(gsf__bpe_loader* l, const char* name, int must, void** data, size_t* size) {
+    l->path.size = 0;
+    gsf_text_printf(l->ctx, &l->path, "%s%s%s", l->folder, gsf__nn_ends_in(l->folder, "/") ? "" : "/", name);
+    if (l->path.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    return must ? gsf_read_file(l->ctx, l->path.data, data, size)
+                : gsf__nn_read_if_there(l->ctx, l->path.data, data, size);
+}
+
+static gsf_result gsf__bpe_open_json(gsf__bpe_loader* l, const char* name, int must, gsf_json* out) {
+    void* data = NULL;
+    size_t size;
+    GSF__TRY(gsf__bpe_read(l, name, must, &data, &size));
+    if (!data) return GSF_OK;
+    const gsf_result result = gsf_parse_json(l->ctx, name, (const char*)data, size, out);
+    gsf_free(l->ctx, data);
+    if (result != GSF_OK || out->values[0].type == GSF_JSON_OBJECT) return result;
+    return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:0: no object", name);
+}
+
+// Member of a document that may be absent; null counts as absent.
+static const gsf_json_value* gsf__bpe_member(const gsf_json* json, const char* key) {
+    const gsf_json_value* value = json->values ? gsf_json_member(json, json->values, key) : NULL;
+    return value && value->type != GSF_JSON_NULL ? value : NULL;
+}
+
+static gsf_result gsf__bpe_copy_tokens(gsf__bpe_loader* l, const gsf_json* json) {
+    const gsf_json_value* root = json->values;
+    size_t bytes = 0;
+    for (uint32_t i = root->child; i; i = json->values[i].next) bytes += json->values[i].key_size + 1;
+    if (root->count < 1 || root->count > INT32_MAX / 2)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:0: %u tokens", json->name, (unsigned)root->count);
+    l->t->strings = (char*)gsf_alloc(l->ctx, bytes, 1);
+    l->t->tokens = (gsf__bpe_token*)gsf_alloc(l->ctx, root->count, sizeof *l->t->tokens);
+    if (!l->t->strings || !l->t->tokens) return GSF_ERROR_OUT_OF_MEMORY;
+    char* text = l->t->strings;
+    for (uint32_t i = root->child; i; i = json->values[i].next) {
+        const gsf_json_value* value = &json->values[i];
+        if (value->type != GSF_JSON_NUMBER || !(value->number >= 0.0) || value->number > (double)INT32_MAX ||
+            floor(value->number) != value->number)
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the id of %s is no whole number from 0 to %d", json->name,
+                            (unsigned)value->offset, gsf__nn_show(value->key).text, (int)INT32_MAX);
+        if (value->key_size == 0)
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: an empty token", json->name, (unsigned)value->offset);
+        gsf__bpe_token* token = &l->t->tokens[l->t->vocabulary++];
+        token->text = text;
+        token->size = value->key_size;
+        token->id = (int32_t)value->number;
+        token->flags = 0;
+        memcpy(text, value->key, value->key_size + 1);
+        text += value->key_size + 1;
+    }
+    qsort(l->t->tokens, (size_t)l->t->vocabulary, sizeof *l->t->tokens, gsf__bpe_compare_texts);
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_read_vocabulary(gsf__bpe_loader* l) {
+    gsf_json json;
+    memset(&json, 0, sizeof json);
+    gsf_result result = gsf__bpe_open_json(l, "vocab.json", 1, &json);
+    if (!result) result = gsf__bpe_copy_tokens(l, &json);
+    gsf_destroy_json(l->ctx, &json);
+    for (unsigned byte = 0; byte < 256 && !result; byte++) {
+        char text[2];
+        l->t->bytes[byte] = gsf__bpe_find(l->t, text, gsf__bpe_store_character(gsf__bpe_character(byte), text));
+    }
+    return result;
+}
+
+static gsf_result gsf__bpe_need_token(gsf__bpe_loader* l, int32_t line, const char* text, size_t size, int32_t* out) {
+    *out = gsf__bpe_find(l->t, text, size);
+    if (*out >= 0) return GSF_OK;
+    char shown[64];
+    snprintf(shown, sizeof shown, "%.*s", size < 60 ? (int)size : 60, text);
+    return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "merges.txt:%d: %s is not in vocab.json", (int)line,
+                    gsf__nn_show(shown).text);
+}
+
+static int gsf__bpe_is_blank(char c) { return c == ' ' || c == '\t' || c == '\v' || c == '\f'; }
+
+// One line, numbered from 1. A blank one is nothing.
+static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size_t size, int32_t number,
+                                      gsf__bpe_merge* out, int* found) {
+    const char* parts[2] = {NULL, NULL};
+    size_t sizes[2] = {0, 0}, count = 0;
+    for (size_t i = 0; i < size;) {
+        if (gsf__bpe_is_blank(line[i])) {
+            i++;
+            continue;
+        }
+        const size_t start = i;
+        while (i < size && !gsf__bpe_is_blank(line[i])) i++;
+        if (count < 2) {
+            parts[count] = line + start;
+            sizes[count] = i - start;
+        }
+        count++;
+    }
+    *found = count == 2;
+    if (count == 0) return GSF_OK;
+    if (count != 2)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "merges.txt:%d: %zu tokens, not two", (int)number, count);
+    out->rank = number;
+    GSF__TRY(gsf__bpe_need_token(l, number, parts[0], sizes[0], &out->left));
+    GSF__TRY(gsf__bpe_need_token(l, number, parts[1], sizes[1], &out->right));
+    l->scratch.size = 0;
+    gsf_text_append(l->ctx, &l->scratch, parts[0], sizes[0]);
+    gsf_text_append(l->ctx, &l->scratch, parts[1], sizes[1]);
+    if (l->scratch.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf__bpe_need_token(l, number, l->scratch.data, l->scratch.size, &out->result);
+}
+
+// Lines end in \n, \r\n or \r. As in the official code the first one is a comment whatever it holds, what stands behind
+// the last line's end does not count, and of two equal merges the later one holds.
+static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, size_t size) {
+    gsf__bpe_tables* t = l->t;
+    size_t lines = 0, count = 0, kept = 0;
+    for (size_t i = 0; i < size; i++) lines += text[i] == '\n' || text[i] == '\r';
+    if (lines > INT32_MAX / 2) return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "merges.txt: %zu lines", lines);
+    t->merges = (gsf__bpe_merge*)gsf_alloc(l->ctx, lines + 1, sizeof *t->merges);
+    t->first = (int32_t*)gsf_alloc_zeroed(l->ctx, (size_t)t->vocabulary + 1, sizeof *t->first);
+    if (!t->merges || !t->first) return GSF_ERROR_OUT_OF_MEMORY;
+    int32_t number = 1;
+    for (size_t i = 0, start = 0; i < size; i++) {
+        if (text[i] != '\n' && text[i] != '\r') continue;
+        int found = 0;
+        if (number > 1) GSF__TRY(gsf__bpe_read_merge(l, text + start, i - start, number, &t->merges[count], &found));
+        count += (size_t)found;
+        number++;
+        if (text[i] == '\r' && i + 1 < size && text[i + 1] == '\n') i++;
+        start = i + 1;
+    }
+    if (count) qsort(t->merges, count, sizeof *t->merges, gsf__bpe_compare_merges);
+    for (size_t i = 0; i < count; i++) {
+        const gsf__bpe_merge* m = &t->merges[i];
+        if (i + 1 < count && m[1].left == m->left && m[1].right == m->right) continue;
+        t->first[m->left + 1]++;
+        t->merges[kept++] = *m;
+    }
+    for (int32_t i = 0; i < t->vocabulary; i++) t->first[i + 1] += t->first[i];
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_read_merges(gsf__bpe_loader* l) {
+    void* data;
+    size_t size;
+    GSF__TRY(gsf__bpe_read(l, "merges.txt", 1, &data, &size));
+    const gsf_result result = gsf__bpe_parse_merges(l, (const char*)data, size);
+    gsf_free(l->ctx, data);
+    return result;
+}
+
+// ---- loading: added and special tokens
+
+static gsf_result gsf__bpe_flag(gsf__bpe_loader* l, const gsf_json* json, const gsf_json_value* object, const char* key,
+                                int fallback, int* out) {
+    const gsf_json_value* value = gsf_json_member(json, object, key);
+    *out = fallback;
+    if (!value || value->type == GSF_JSON_NULL) return GSF_OK;
+    if (value->type != GSF_JSON_TRUE && value->type != GSF_JSON_FALSE)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: %s is not true or false", json->name, (unsigned)value->offset,
+                        key);
+    *out = value->type == GSF_JSON_TRUE;
+    return GSF_OK;
+}
+
+// A token as text, or as an object with its text in "content" and flags. Its id stays open.
+static gsf_result gsf__bpe_read_token(gsf__bpe_loader* l, const gsf_json* json, const gsf_json_value* value,
+                                      gsf__bpe_token* out) {
+    static const struct { const char* key; int flag; } keys[] = {
+        {"lstrip", GSF__BPE_LSTRIP}, {"rstrip", GSF__BPE_RSTRIP}, {"special", GSF__BPE_SPECIAL}, {"single_word", 0}};
+    const gsf_json_value* text = value->type == GSF_JSON_OBJECT ? gsf_json_member(json, value, "content") : value;
+    memset(out, 0, sizeof *out);
+    if (!text || text->type != GSF_JSON_STRING || text->string_size == 0)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: no token, as text or with its \"content\"", json->name,
+                        (unsigned)value->offset);
+    out->text = text->string;
+    out->size = text->string_size;
+    out->id = -1;
+    out->flags = GSF__BPE_ADDED | (value->type == GSF_JSON_OBJECT ? GSF__BPE_OBJECT : 0);
+    for (size_t i = 0; i < GSF__COUNT(keys) && value->type == GSF_JSON_OBJECT; i++) {
+        int flag;
+        GSF__TRY(gsf__bpe_flag(l, json, value, keys[i].key, 0, &flag));
+        if (flag && !keys[i].flag)
+            return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s of token %s", json->name, (unsigned)value->offset,
+                            keys[i].key, gsf__nn_show(out->text).text);
+        if (flag) out->flags |= keys[i].flag;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) {
+    gsf__bpe_tables* t = l->t;
+    const size_t count = (size_t)t->added_count;
+    if (count == GSF__BPE_ADDED_MAX)
+        return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s: more than %d added tokens", l->folder, (int)count);
+    if (gsf__bpe_find_added(t, token->text, token->size) >= 0)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s: token %s is added twice", l->folder,
+                        gsf__nn_show(token->text).text);
+    GSF__TRY(gsf__reserve(l->ctx, (void**)&t->added, &t->added_capacity, count, count + 1, sizeof *t->added));
+    t->added[t->added_count++] = *token;
+    return GSF_OK;
+}
+
+// "added_tokens_decoder" of tokenizer_config.json: {"id": token, ...}; else added_tokens.json: {"token": id, ...}.
+static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
+    gsf__bpe_tables* t = l->t;
+    const gsf_json* json = l->decoder ? &t->config : &t->added_tokens;
+    const gsf_json_value* map = l->decoder ? l->decoder : json->values;
+    if (!map) return GSF_OK;
+    if (map->type != GSF_JSON_OBJECT)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are no object", json->name,
+                        (unsigned)map->offset);
+    for (uint32_t i = map->child; i; i = json->values[i].next) {
+        const gsf_json_value* value = &json->values[i];
+        gsf__bpe_token token;
+        double id = value->number;
+        if (l->decoder) {
+            GSF__TRY(gsf__bpe_read_token(l, json, value, &token));
+            id = value->key_size > 0 && value->key_size <= 10 ? 0.0 : -1.0;
+            for (uint32_t k = 0; k < value->key_size && id >= 0.0; k++)
+                id = value->key[k] >= '0' && value->key[k] <= '9' ? 10.0 * id + (value->key[k] - '0') : -1.0;
+        } else {
+            memset(&token, 0, sizeof token);
+            token.text = value->key;
+            token.size = value->key_size;
+            token.flags = GSF__BPE_ADDED;
+            if (value->type != GSF_JSON_NUMBER || floor(id) != id || token.size == 0) id = -1.0;
+        }
+        if (!(id >= 0.0) || id > (double)INT32_MAX)
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: no token with an id from 0 to %d", json->name,
+                            (unsigned)value->offset, (int)INT32_MAX);
+        token.id = (int32_t)id;
+        token.flags |= GSF__BPE_APART;
+        GSF__TRY(gsf__bpe_add(l, &token));
+    }
+    return GSF_OK;
+}
+
+// Marks a token as special; one that is neither added nor in the vocabulary yet gets the id *next. `more`: it is one of
+// additional_special_tokens. What an object says of white space holds; for the other ones the decoder has the last word.
+static gsf_result gsf__bpe_add_special(gsf__bpe_loader* l, const gsf__bpe_token* token, int more, int32_t* next,
+                                       int32_t* id) {
+    gsf__bpe_tables* t = l->t;
+    int32_t i = gsf__bpe_find_added(t, token->text, token->size);
+    if (i < 0) {
+        gsf__bpe_token fresh = *token;
+        const int32_t old = gsf__bpe_find(t, token->text, token->size);
+        fresh.id = old >= 0 ? t->tokens[old].id : (*next)++;
+        GSF__TRY(gsf__bpe_add(l, &fresh));
+        i = t->added_count - 1;
+    }
+    const int strips = GSF__BPE_LSTRIP | GSF__BPE_RSTRIP;
+    int flags = (t->added[i].flags & ~GSF__BPE_APART) | GSF__BPE_SPECIAL;
+    if (token->flags & GSF__BPE_OBJECT && (more || !l->decoder)) flags = (flags & ~strips) | (token->flags & strips);
+    *id = t->added[i].id;
+    t->added[i].flags = flags | (more && *id >= t->vocabulary ? GSF__BPE_APART : 0);
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf_json* json, int32_t* next) {
+    const gsf_json_value* list = gsf__bpe_member(json, "additional_special_tokens");
+    if (!list) return GSF_OK;
+    if (list->type != GSF_JSON_ARRAY)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: additional_special_tokens is no list", json->name,
+                        (unsigned)list->offset);
+    for (uint32_t i = list->child; i; i = json->values[i].next) {
+        gsf__bpe_token token;
+        int32_t id;
+        GSF__TRY(gsf__bpe_read_token(l, json, &json->values[i], &token));
+        GSF__TRY(gsf__bpe_add_special(l, &token, 1, next, &id));
+    }
+    return GSF_OK;
+}
+
+// As the official loader: tokenizer_config.json alone where it lists the added tokens, else special_tokens_map.json goes
+// before it.
+static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    static const char* const keys[] = {"bos_token", "eos_token", "unk_token", "sep_token", "pad_token", "cls_token",
+                                       "mask_token"};
+    gsf__bpe_tables* t = l->t;
+    int32_t other, *const ids[GSF__COUNT(keys)] = {&out->bos, &out->eos, &out->unk, &other, &out->pad, &other, &other};
+    l->decoder = gsf__bpe_member(&t->config, "added_tokens_decoder");
+    GSF__TRY(gsf__bpe_read_added(l));
+    int32_t next = t->vocabulary;
+    for (int32_t i = 0; i < t->added_count; i++)
+        next += gsf__bpe_find(t, t->added[i].text, t->added[i].size) < 0;
+    for (size_t i = 0; i < GSF__COUNT(keys); i++) {
+        const gsf_json* json = !l->decoder && gsf__bpe_member(&t->special_map, keys[i]) ? &t->special_map : &t->config;
+        const gsf_json_value* value = gsf__bpe_member(json, keys[i]);
+        const int given = t->config.values && gsf_json_member(&t->config, t->config.values, keys[i]) != NULL;
+        gsf__bpe_token token;
+        *ids[i] = -1;
+        if (value) {
+            GSF__TRY(gsf__bpe_read_token(l, json, value, &token));
+        } else if (i < 3 && !given) { // GPT2Tokenizer's own
+            memset(&token, 0, sizeof token);
+            token.text = "<|endoftext|>";
+            token.size = strlen(token.text);
+            token.flags = GSF__BPE_ADDED;
+        } else {
+            continue;
+        }
+        GSF__TRY(gsf__bpe_add_special(l, &token, 0, &next, ids[i]));
+    }
+    GSF__TRY(gsf__bpe_add_more_special(l, &t->config, &next));
+    if (!l->decoder) GSF__TRY(gsf__bpe_add_more_special(l, &t->special_map, &next));
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_read_switches(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    gsf__bpe_tables* t = l->t;
+    const gsf_json_value* root = t->config.values;
+    const gsf_json_value* errors = gsf__bpe_member(&t->config, "errors");
+    if (errors && (errors->type != GSF_JSON_STRING || strcmp(errors->string, "replace") != 0))
+        return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: errors is not \"replace\"", t->config.name,
+                        (unsigned)errors->offset);
+    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "add_bos_token", 0, &out->add_bos));
+    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "add_prefix_space", 0, &t->prefix_space));
+    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "clean_up_tokenization_spaces", 0, &t->clean_up));
+    return gsf__bpe_flag(l, &t->config, root, "split_special_tokens", 0, &t->split_special);
+}
+
+static gsf_result gsf__bpe_sort_ids(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    gsf__bpe_tables* t = l->t;
+    const size_t vocabulary = (size_t)t->vocabulary, added = (size_t)t->added_count, count = vocabulary + added;
+    if (added) qsort(t->added, added, sizeof *t->added, gsf__bpe_compare_texts);
+    t->by_id = (gsf__bpe_token*)gsf_alloc(l->ctx, count, sizeof *t->by_id);
+    if (!t->by_id) return GSF_ERROR_OUT_OF_MEMORY;
+    memcpy(t->by_id, t->tokens, vocabulary * sizeof *t->tokens);
+    if (added) memcpy(t->by_id + vocabulary, t->added, added * sizeof *t->added);
+    qsort(t->by_id, count, sizeof *t->by_id, gsf__bpe_compare_ids);
+    t->by_id_count = (int32_t)count;
+    for (size_t i = 1; i < count; i++) {
+        const gsf__bpe_token *a = &t->by_id[i - 1], *b = &t->by_id[i];
+        if (a->id == b->id && (a->flags & GSF__BPE_ADDED) == (b->flags & GSF__BPE_ADDED))
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s: tokens %s and %s both have the id %d", l->folder,
+                            gsf__nn_show(a->text).text, gsf__nn_show(b->text).text, (int)a->id);
+    }
+    out->highest_id = t->by_id[count - 1].id;
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_load(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    GSF__TRY(gsf__bpe_unpack_kinds(l->ctx, l->t));
+    GSF__TRY(gsf__bpe_open_json(l, "tokenizer_config.json", 0, &l->t->config));
+    GSF__TRY(gsf__bpe_open_json(l, "special_tokens_map.json", 0, &l->t->special_map));
+    GSF__TRY(gsf__bpe_open_json(l, "added_tokens.json", 0, &l->t->added_tokens));
+    GSF__TRY(gsf__bpe_read_switches(l, out));
+    GSF__TRY(gsf__bpe_read_vocabulary(l));
+    GSF__TRY(gsf__bpe_read_merges(l));
+    GSF__TRY(gsf__bpe_read_special(l, out));
+    GSF__TRY(gsf__bpe_sort_ids(l, out));
+    if (out->add_bos && out->bos < 0)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s: add_bos_token is true, but there is no bos_token", l->folder);
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe) {
+    gsf__bpe_tables* t = (gsf__bpe_tables*)bpe->tables;
+    if (t) {
+        gsf_destroy_json(ctx, &t->config);
+        gsf_destroy_json(ctx, &t->special_map);
+        gsf_destroy_json(ctx, &t->added_tokens);
+        gsf_free(ctx, t->strings);
+        gsf_free(ctx, t->tokens);
+        gsf_free(ctx, t->added);
+        gsf_free(ctx, t->by_id);
+        gsf_free(ctx, t->merges);
+        gsf_free(ctx, t->first);
+        gsf_free(ctx, t->kinds);
+    }
+    gsf_free(ctx, t);
+    memset(bpe, 0, sizeof *bpe);
+}
+
+GSF_API gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out) {
+    gsf__bpe_loader l;
+    memset(&l, 0, sizeof l);
+    memset(out, 0, sizeof *out);
+    l.ctx = ctx;
+    l.folder = folder;
+    l.t = (gsf__bpe_tables*)gsf_alloc_zeroed(ctx, 1, sizeof *l.t);
+    out->tables = l.t;
+    const gsf_result result = l.t ? gsf__bpe_load(&l, out) : GSF_ERROR_OUT_OF_MEMORY;
+    gsf_destroy_text(ctx, &l.path);
+    gsf_destroy_text(ctx, &l.scratch);
+    if (result) gsf_nn_destroy_bpe(ctx, out);
+    return result;
+}
+
+// ---- encoding
+
+typedef struct gsf__bpe_run {
+    gsf_context* ctx;
+    const gsf__bpe_tables* t;
+    int32_t unk;
+    int32_t* ids;       // the result
+    size_t count, capacity;
+    void* scratch;      // of a word; see gsf__bpe_place
+    size_t word_capacity;
+    int32_t *symbols, *before, *after, *found, *batch; // per byte of a word
+    uint64_t* heap;     // rank << 32 | place
+    size_t heap_size;
+} gsf__bpe_run;
+
+static gsf_result gsf__bpe_emit(gsf__bpe_run* run, int32_t id) {
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->capacity, run->count, run->count + 1, sizeof *run->ids));
+    run->ids[run->count++] = id;
+    return GSF_OK;
+}
+
+static void gsf__bpe_sift(uint64_t* heap, size_t size, size_t at) { // down to its place in a heap with the least on top
+    const uint64_t value = heap[at];
+    for (size_t child; (child = 2 * at + 1) < size; at = child) {
+        if (child + 1 < size && heap[child + 1] < heap[child]) child++;
+        if (value <= heap[child]) break;
+        heap[at] = heap[child];
+    }
+    heap[at] = value;
+}
+
+static void gsf__bpe_push(gsf__bpe_run* run, uint64_t value) {
+    size_t at = run->heap_size++;
+    for (; at > 0 && value < run->heap[(at - 1) / 2]; at = (at - 1) / 2) run->heap[at] = run->heap[(at - 1) / 2];
+    run->heap[at] = value;
+}
+
+// Looks up how the symbol at `place` merges with the one after it; 1 when it does.
+static int gsf__bpe_look(gsf__bpe_run* run, int32_t place) {
+    const gsf__bpe_tables* t = run->t;
+    const int32_t left = run->symbols[place], next = run->after[place];
+    run->found[place] = -1;
+    if (next < 0 || left < 0 || run->symbols[next] < 0) return 0;
+    int32_t low = t->first[left], high = t->first[left + 1];
+    while (low < high) {
+        const int32_t middle = low + (high - low) / 2;
+        if (t->merges[middle].right < run->symbols[next]) low = middle + 1;
+        else high = middle;
+    }
+    if (low == t->first[left + 1] || t->merges[low].right != run->symbols[next]) return 0;
+    run->found[place] = low;
+    return 1;
+}
+
+static uint64_t gsf__bpe_key(const gsf__bpe_run* run, int32_t place) {
+    return (uint64_t)run->t->merges[run->found[place]].rank << 32 | (uint32_t)place;
+}
+
+static void gsf__bpe_merge_at(gsf__bpe_run* run, int32_t place) {
+    const int32_t gone = run->after[place], after = run->after[gone], before = run->before[place];
+    run->symbols[place] = run->t->merges[run->found[place]].result;
+    run->found[gone] = -1;
+    run->after[place] = after;
+    if (after >= 0) run->before[after] = place;
+    if (gsf__bpe_look(run, place)) gsf__bpe_push(run, gsf__bpe_key(run, place));
+    if (before >= 0 && gsf__bpe_look(run, before)) gsf__bpe_push(run, gsf__bpe_key(run, before));
+}
+
+// Per byte of a word: 5 numbers of 32 bits and two places in the heap, as a merge takes one entry and adds two at most.
+static gsf_result gsf__bpe_place(gsf__bpe_run* run, size_t size) {
+    if (size <= run->word_capacity) return GSF_OK;
+    size = size < 64 ? 64 : size;
+    gsf_free(run->ctx, run->scratch);
+    run->word_capacity = 0;
+    run->scratch = gsf_alloc(run->ctx, size, 2 * sizeof(uint64_t) + 5 * sizeof(int32_t));
+    if (!run->scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    run->word_capacity = size;
+    run->heap = (uint64_t*)run->scratch;
+    run->symbols = (int32_t*)(void*)(run->heap + 2 * size);
+    run->before = run->symbols + size;
+    run->after = run->before + size;
+    run->found = run->after + size;
+    run->batch = run->found + size;
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size) {
+    const int32_t n = (int32_t)size;
+    GSF__TRY(gsf__bpe_place(run, size));
+    run->heap_size = 0;
+    for (int32_t i = 0; i < n; i++) {
+        run->symbols[i] = run->t->bytes[(unsigned char)word[i]];
+        run->before[i] = i - 1;
+        run->after[i] = i + 1 < n ? i + 1 : -1;
+    }
+    for (int32_t i = 0; i < n; i++)
+        if (gsf__bpe_look(run, i)) run->heap[run->heap_size++] = gsf__bpe_key(run, i);
+    for (size_t i = run->heap_size / 2; i-- > 0;) gsf__bpe_sift(run->heap, run->heap_size, i);
+    while (run->heap_size) {
+        const int32_t rank = (int32_t)(run->heap[0] >> 32);
+        int32_t places = 0;
+        while (run->heap_size && (int32_t)(run->heap[0] >> 32) == rank) { // they come from left to right
+            run->batch[places++] = (int32_t)(run->heap[0] & 0x7fffffffu);
+            run->heap[0] = run->heap[--run->heap_size];
+            if (run->heap_size) gsf__bpe_sift(run->heap, run->heap_size, 0);
+        }
+        for (int32_t i = 0; i < places; i++) { // unless another merge has changed the pair meanwhile
+            const int32_t found = run->found[run->batch[i]];
+            if (found >= 0 && run->t->merges[found].rank == rank) gsf__bpe_merge_at(run, run->batch[i]);
+        }
+    }
+    for (int32_t i = 0; i >= 0; i = run->after[i]) {
+        const int32_t symbol = run->symbols[i];
+        if (symbol < 0 && run->unk < 0)
+            return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "byte 0x%02x of the text is no token of this vocabulary",
+                            (unsigned)(unsigned char)word[i]);
+        GSF__TRY(gsf__bpe_emit(run, symbol < 0 ? run->unk : run->t->tokens[symbol].id));
+    }
+    return GSF_OK;
+}
+
+// Bytes of the first word:  's|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+
+static size_t gsf__bpe_next_word(const gsf__bpe_tables* t, const char* text, size_t size) {
+    static const char* const endings[] = {"s", "t", "re", "ve", "m", "ll", "d"};
+    size_t step, last = 0;
+    for (size_t i = 0; text[0] == '\'' && i < GSF__COUNT(endings); i++) {
+        const size_t length = strlen(endings[i]);
+        if (size > length && memcmp(text + 1, endings[i], length) == 0) return 1 + length;
+    }
+    size_t at = text[0] == ' ' && size > 1;
+    const int kind = gsf__bpe_kind(t, text + at, size - at, &step);
+    if (kind == GSF__BPE_SPACE) at = 0;
+    while (at < size && gsf__bpe_kind(t, text + at, size - at, &step) == kind) {
+        last = at;
+        at += step;
+    }
+    // Of white space before a word the last one is left, for it may belong to the word.
+    return kind == GSF__BPE_SPACE && at < size && last > 0 ? last : at;
+}
+
+static gsf_result gsf__bpe_piece(gsf__bpe_run* run, const char* text, size_t size) { // without added tokens
+    while (size) {
+        const size_t word = gsf__bpe_next_word(run->t, text, size);
+        GSF__TRY(gsf__bpe_word(run, text, word));
+        text += word;
+        size -= word;
+    }
+    return GSF_OK;
+}
+
+// The longest added token that `text` begins with, or NULL. They are sorted: those that begin with the bytes seen so far
+// stand side by side, the shortest first.
+static const gsf__bpe_token* gsf__bpe_match(const gsf__bpe_tables* t, const char* text, size_t left) {
+    const gsf__bpe_token* best = NULL;
+    int32_t low = 0, high = t->added_count;
+    for (size_t d = 0; low < high; d++) {
+        if (t->added[low].size == d) best = &t->added[low++];
+        if (d == left) break;
+        for (int side = 0; side < 2; side++) { // to those with text[d] next
+            int32_t a = low, b = high;
+            while (a < b) {
+                const int32_t middle = a + (b - a) / 2;
+                const int order = (unsigned char)t->added[middle].text[d] - (unsigned char)text[d];
+                if (order < 0 || (side && order == 0)) a = middle + 1;
+                else b = middle;
+            }
+            if (side) high = a;
+            else low = a;
+        }
+    }
+    return best;
+}
+
+static gsf_result gsf__bpe_text(gsf__bpe_run* run, const char* text, size_t size) {
+    const gsf__bpe_tables* t = run->t;
+    size_t start = 0;
+    int strip = 0; // the token before takes white space along
+    for (size_t at = 0; at <= size; at++) {
+        const gsf__bpe_token* token = at < size && !t->split_special ? gsf__bpe_match(t, text + at, size - at) : NULL;
+        if (!token && at < size) continue;
+        size_t end = at;
+        gsf__bpe_strip(t, text, strip, token && token->flags & GSF__BPE_LSTRIP, &start, &end);
+        GSF__TRY(gsf__bpe_piece(run, text + start, end - start));
+        if (!token) break;
+        GSF__TRY(gsf__bpe_emit(run, token->id));
+        start = at + token->size;
+        at = start - 1;
+        strip = token->flags & GSF__BPE_RSTRIP;
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size, int no_bos,
+                                     int32_t** ids, size_t* count) {
+    gsf__bpe_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.t = (const gsf__bpe_tables*)bpe->tables;
+    run.unk = bpe->unk;
+    *ids = NULL;
+    *count = 0;
+    if (size > INT32_MAX / 2) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "a text of %zu bytes", size);
+    if (!size) text = "";
+    for (size_t i = 0, step; i < size; i += step) {
+        step = gsf__utf8_size(text + i, size - i);
+        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "text:%zu: byte 0x%02x is no UTF-8", i,
+                                   (unsigned)(unsigned char)text[i]);
+    }
+    gsf_result result = gsf__reserve(ctx, (void**)&run.ids, &run.capacity, 0, 16, sizeof *run.ids);
+    if (!result && bpe->add_bos && !no_bos) result = gsf__bpe_emit(&run, bpe->bos);
+    if (!result && run.t->prefix_space) {
+        gsf_text spaced;
+        memset(&spaced, 0, sizeof spaced);
+        gsf_text_append(ctx, &spaced, " ", 1);
+        gsf_text_append(ctx, &spaced, text, size);
+        result = spaced.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__bpe_text(&run, spaced.data, spaced.size);
+        gsf_destroy_text(ctx, &spaced);
+    } else if (!result) {
+        result = gsf__bpe_text(&run, text, size);
+    }
+    gsf_free(ctx, run.scratch);
+    if (result) gsf_free(ctx, run.ids);
+    else {
+        *ids = run.ids;
+        *count = run.count;
+    }
+    return result;
+}
+
+// ---- decoding
+
+// Appends bytes as UTF-8. What is none becomes U+FFFD, one for each longest beginning of a character, as in Python.
+static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_text* out, const char* text, size_t size) {
+    const unsigned char* p = (const unsigned char*)text;
+    for (size_t i = 0; i < size;) {
+        size_t step, good = i;
+        while (good < size && (step = gsf__utf8_size(text + good, size - good)) != 0) good += step;
+        if (good > i) gsf_text_append(ctx, out, text + i, good - i);
+        i = good;
+        if (i == size) break;
+        const unsigned c = p[i++];
+        const unsigned low = c == 0xe0 ? 0xa0 : c == 0xf0 ? 0x90 : 0x80, high = c == 0xed ? 0x9f : c == 0xf4 ? 0x8f : 0xbf;
+        const size_t more = c >= 0xf0 && c <= 0xf4 ? 2 : c >= 0xe0 && c <= 0xef; // bytes before the last that may be there
+        for (size_t k = 0; k < more && i < size; k++, i++)
+            if (k == 0 ? p[i] < low || p[i] > high : (p[i] & 0xc0) != 0x80) break;
+        gsf_text_append(ctx, out, "\xef\xbf\xbd", 3);
+    }
+}
+
+// The bytes that a token of the vocabulary spells.
+static void gsf__bpe_append_bytes(gsf_context* ctx, gsf_text* out, const gsf__bpe_token* token) {
+    for (size_t i = 0, step; i < token->size; i += step) {
+        step = gsf__utf8_size(token->text + i, token->size - i);
+        const int byte = gsf__bpe_byte(gsf__bpe_load_character(token->text + i, step));
+        const char c = (char)byte;
+        gsf_text_append(ctx, out, byte < 0 ? token->text + i : &c, byte < 0 ? step : 1);
+    }
+}
+
+// Replaces all `from` by the shorter `to` behind `start`.
+static void gsf__bpe_replace(gsf_text* text, size_t start, const char* from, const char* to) {
+    const size_t from_size = strlen(from), to_size = strlen(to);
+    size_t end = start;
+    for (size_t i = start; i < text->size;) {
+        if (text->size - i >= from_size && memcmp(text->data + i, from, from_size) == 0) {
+            memcpy(text->data + end, to, to_size);
+            end += to_size;
+            i += from_size;
+        } else {
+            text->data[end++] = text->data[i++];
+        }
+    }
+    text->size = end;
+    if (text->data) text->data[end] = 0;
+}
+
+static void gsf__bpe_flush(gsf_context* ctx, gsf_text* bytes, gsf_text* out, int* parts) {
+    if (!bytes->size) return;
+    if ((*parts)++) gsf_text_append(ctx, out, " ", 1);
+    gsf__bpe_append_replaced(ctx, out, bytes->data, bytes->size);
+    bytes->size = 0;
+}
+
+GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids, size_t count,
+                                     int skip_special, gsf_text* out) {
+    static const char* const tidy[][2] = {{" .", "."}, {" ?", "?"}, {" !", "!"}, {" ,", ","}, {" ' ", "'"},
+                                          {" n't", "n't"}, {" 'm", "'m"}, {" 's", "'s"}, {" 've", "'ve"}, {" 're", "'re"}};
+    const gsf__bpe_tables* t = (const gsf__bpe_tables*)bpe->tables;
+    const size_t start = out->size;
+    gsf_text bytes;
+    int parts = 0;
+    memset(&bytes, 0, sizeof bytes);
+    gsf_text_append(ctx, out, "", 0);
+    for (size_t i = 0; i < count; i++) {
+        const int32_t at = gsf__bpe_find_id(t, ids[i]);
+        if (at == t->by_id_count || t->by_id[at].id != ids[i]) continue;
+        const gsf__bpe_token* token = &t->by_id[at];
+        if (skip_special && token->flags & GSF__BPE_SPECIAL) continue;
+        if (token->flags & GSF__BPE_APART) {
+            gsf__bpe_flush(ctx, &bytes, out, &parts);
+            if (parts++) gsf_text_append(ctx, out, " ", 1);
+            gsf_text_append(ctx, out, token->text, token->size);
+        } else {
+            gsf__bpe_append_bytes(ctx, &bytes, token);
+        }
+    }
+    gsf__bpe_flush(ctx, &bytes, out, &parts);
+    const int failed = bytes.failed || out->failed;
+    gsf_destroy_text(ctx, &bytes);
+    if (failed) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; t->clean_up && i < GSF__COUNT(tidy); i++) gsf__bpe_replace(out, start, tidy[i][0], tidy[i][1]);
+    return GSF_OK;
 }
 
 // ---- >>nn restorer --------------------------------------------------------------
