@@ -40,7 +40,7 @@
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
-               >>nn sampling >>nn bpe >>nn captioner >>nn restorer
+               >>nn image encoders >>nn sampling >>nn bpe >>nn captioner >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -111,7 +111,10 @@ typedef struct gsf_nn_workspace { // scratch memory of kernels; zero to begin wi
 
 GSF_API void gsf_nn_destroy_workspace(gsf_context* ctx, gsf_nn_workspace* workspace);
 
-typedef enum gsf_nn_activation { GSF_NN_LINEAR = 0, GSF_NN_GELU_TANH, GSF_NN_SILU } gsf_nn_activation;
+// GELU is x/2 (1 + erf(x / sqrt 2)) with a relative error below 1e-6 for all x, GELU_TANH the usual approximation of it.
+typedef enum gsf_nn_activation {
+    GSF_NN_LINEAR = 0, GSF_NN_GELU_TANH, GSF_NN_SILU, GSF_NN_GELU, GSF_NN_RELU,
+} gsf_nn_activation;
 
 typedef struct gsf_nn_linear_desc {
     const float* x;            // (rows, in), row stride ldx
@@ -447,6 +450,89 @@ GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, cons
 // Floats of reference_kv: every block's keys and values of all reference tokens.
 GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
                                         int32_t reference_batch);
+
+// ---- image encoders: what the references show -----------------------------------
+// DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
+
+// The official preprocessing of a reference: transparency over white, 518 pixels wide with PIL's bicubic filter, the
+// height rounded to a multiple of 14 (half to even), and cut around its middle where it is above 518. Photos with 1, 3 or
+// 4 channels; float ones are rounded to 8 bits first. out: u8, 3 channels; destroy it.
+// (GSFixer, vggt/utils/load_fn.py load_and_preprocess_images, mode "crop")
+GSF_API GSF_NODISCARD gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out);
+
+typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped files
+    int32_t width, heads, layers, mlp_width;
+    int32_t channels, patch;     // of the images; side of the square that makes a token
+    int32_t special;             // tokens before the patches': the class token and the registers
+    int32_t grid;                // squares along a side of the images that it was trained with
+    double norm_eps;
+    gsf_nn_weights weights;
+    void* nets;                  // private
+} gsf_nn_dinov2;
+
+// Opens a Hugging Face folder of Dinov2WithRegistersModel: config.json and model*.safetensors. Missing, misshaped and
+// surplus tensors are named. Its SwiGLU variant (use_swiglu_ffn) is unsupported.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out);
+GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2);
+
+typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapped files
+    int32_t width, heads, layers, mlp_width; // of its blocks; layers: pairs of a frame and a global block
+    int32_t patch, embed_layers; // side of the square that makes a token; blocks of the DINOv2 that embeds the images
+    int32_t special;             // patch_start_idx: a camera token and registers stand before the patches' tokens
+    int32_t grid;                // squares along a side of the images that the embedding was trained with
+    double rope_base;            // of the rotation of q and k, 0: none
+    gsf_nn_weights weights;
+    void* nets;                  // private
+} gsf_nn_vggt;
+
+// Opens a folder with model*.safetensors, or one .safetensors file: the tensors aggregator.* under their released names,
+// all others are passed over. Sizes come from the tensors' shapes. The folder's config.json, where there is one, may tell
+// num_heads (default: width / head size of the q norms, width / 64 where there are none), depth, rope_freq (100) and
+// qk_norm, and must agree with the tensors.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
+GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
+
+typedef struct gsf_nn_encoder_input {
+    const float* pixels;           // (images, 3, height, width) in [0,1]
+    int32_t images, height, width; // sides in pixels, multiples of the patch
+    int all_tokens;                // the special tokens, too; else those of the patches alone
+    // Shown every named intermediate of image `image`: data (rows, columns). NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_encoder_input;
+
+// The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, and `special`
+// before them with all_tokens. Images are taken as they are. Positions are interpolated from the square grid as PyTorch
+// does it (bicubic, antialiased, align_corners=False). A NaN or infinity gives GSF_ERROR_NUMERIC and the layer's name. On
+// error `out` is zeroed. The context is asked for cancelling and told of progress after every block.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
+                                                      const gsf_nn_encoder_input* input, float* out);
+// The last pair's outputs: out (images, tokens, 2 width), frame block | global block, for all images together, which see
+// one another. ImageNet's mean and deviation are taken out here. Otherwise as above.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt,
+                                                    const gsf_nn_encoder_input* input, float* out);
+// Bytes of memory (beside input, output, mapped weights and some 70 MB of the kernels' scratch) at the peak, and floating-
+// point operations, of such a call; either may be NULL. Reads the input's sizes only.
+GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
+                                double* flops);
+GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops);
+
+typedef struct gsf_nn_features { // of reference photos; zero to begin with, destroy it
+    int64_t images, tokens;               // tokens of each image
+    int64_t dino_channels, vggt_channels; // 0: not computed
+    float *dino, *vggt;                   // (images, tokens, channels)
+} gsf_nn_features;
+
+// Prepares the photos and encodes them with the models that are given. A later call with the other model (of which only one
+// need then be open at a time) adds its tokens. All photos must come out in one size.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
+                                                          const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
+                                                          gsf_nn_features* features);
+GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features);
+// Writes the file that gsf_nn_dit_desc.features names: dino_latents, vggt_latents (what was computed) and, unless NULL,
+// prompt_embeds (2, text tokens, text channels): negative prompt, prompt.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, const gsf_nn_features* features,
+                                                      const gsf_tensor* prompt_embeds);
 
 // ---- sampling: from artifact-ridden frames to restored ones --------------------------
 
@@ -1660,6 +1746,27 @@ GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) {
 
 // ---- >>nn activations -----------------------------------------------------------
 
+// GELU is x for x > 0, else 0, minus z q with z = |x| and q = exp(-z^2/2) R(z), the normal distribution's tail beyond z.
+// R, which falls slowly, is t P(t - 1/2) with t = 3.5 / (z + 3.5): least-squares coefficients, refitted until the relative
+// errors for z up to 13.25 were level, 4e-8. Beyond 13.19 the power of 2 is below float's range, so q is 0.
+static const float gsf__nn_gelu_tail[10] = {0.212690309f, 0.323178142f, 0.360485673f, 0.2652632f, 0.0795778036f,
+                                            -0.0593477674f, -0.0581759363f, 0.0180590637f, 0.0315735899f, -0.016954517f};
+
+static float gsf__nn_gelu_ref(float x) {
+    const float z = fabsf(x) > 13.2f ? 13.2f : fabsf(x), t = 3.5f / (z + 3.5f), s = t - 0.5f;
+    const double u = -0.7213475204444817 * (double)z * (double)z, n = (u + 6755399441055744.0) - 6755399441055744.0;
+    if (n < -125.5) return x > 0.0f ? x : 0.0f;
+    const float f = (float)(u - n);
+    float tail = gsf__nn_gelu_tail[9];
+    for (int i = 8; i >= 0; i--) tail = tail * s + gsf__nn_gelu_tail[i];
+    const float power = ((((((1.535336188319500e-4f * f + 1.339887440266574e-3f) * f + 9.618437357674640e-3f) * f +
+                            5.550332471162809e-2f) * f + 2.402264791363012e-1f) * f + 6.931472028550421e-1f) * f + 1.0f);
+    const uint32_t bits = (uint32_t)((x == x ? (int)n : 0) + 127) << 23;
+    float two_n;
+    memcpy(&two_n, &bits, sizeof two_n);
+    return (x < 0.0f ? 0.0f : x) - z * (power * two_n * t * tail);
+}
+
 static float gsf__nn_activation_ref(gsf_nn_activation activation, float x) {
     switch (activation) {
         case GSF_NN_LINEAR: return x;
@@ -1669,11 +1776,28 @@ static float gsf__nn_activation_ref(gsf_nn_activation activation, float x) {
             return x / (1.0f + expf(-2.0f * u));
         }
         case GSF_NN_SILU: return x < -104.0f ? -0.0f : x / (1.0f + expf(-x));
+        case GSF_NN_GELU: return gsf__nn_gelu_ref(x);
+        case GSF_NN_RELU: return x < 0.0f ? 0.0f : x;
     }
     return x;
 }
 
 #if GSF__X86
+
+GSF__INLINE_AVX2 __m256 gsf__nn_gelu8(__m256 x) { // gsf__nn_gelu_ref
+    const gsf__nn_exp2 c = gsf__nn_exp2_constants(0);
+    const __m256 sign = _mm256_set1_ps(-0.0f), half_log2_e = _mm256_set1_ps(-0.72134752f), k = _mm256_set1_ps(3.5f);
+    const __m256 z = _mm256_min_ps(_mm256_set1_ps(13.2f), _mm256_andnot_ps(sign, x)); // a NaN stays, as below
+    const __m256 t = k / (z + k), s = t - _mm256_set1_ps(0.5f), square = z * z;
+    const __m256 rounded = _mm256_fmadd_ps(square, half_log2_e, c.rounder), n = rounded - c.rounder;
+    // what rounding took from the square and from the factor
+    const __m256 lost = _mm256_fmsub_ps(z, z, square) * half_log2_e;
+    const __m256 low = _mm256_fmadd_ps(square, _mm256_set1_ps(-9.62981495e-9f), lost);
+    const __m256 power = gsf__nn_power8(&c, rounded, _mm256_fmsub_ps(square, half_log2_e, n) + low);
+    __m256 tail = _mm256_set1_ps(gsf__nn_gelu_tail[9]);
+    for (int i = 8; i >= 0; i--) tail = _mm256_fmadd_ps(tail, s, _mm256_set1_ps(gsf__nn_gelu_tail[i]));
+    return _mm256_fnmadd_ps(z, power * (t * tail), _mm256_max_ps(_mm256_setzero_ps(), x));
+}
 
 // As gsf__nn_activation_ref; at -inf the limit -0, a NaN stays. `activation` had better be a constant.
 GSF__INLINE_AVX2 __m256 gsf__nn_activate8(gsf_nn_activation activation, __m256 x) {
@@ -1687,6 +1811,8 @@ GSF__INLINE_AVX2 __m256 gsf__nn_activate8(gsf_nn_activation activation, __m256 x
         x = _mm256_max_ps(_mm256_set1_ps(-100.0f), x);
         return x / (one + gsf__nn_exp8(_mm256_sub_ps(_mm256_setzero_ps(), x)));
     }
+    if (activation == GSF_NN_GELU) return gsf__nn_gelu8(x);
+    if (activation == GSF_NN_RELU) return _mm256_max_ps(_mm256_setzero_ps(), x); // of a NaN the second operand
     return x;
 }
 
@@ -1726,6 +1852,8 @@ GSF__TARGET_AVX2 static void gsf__activate_avx2(gsf_nn_activation activation, co
         case GSF_NN_LINEAR: gsf__activate_avx2_body(GSF_NN_LINEAR, x, count, y); break;
         case GSF_NN_GELU_TANH: gsf__activate_avx2_body(GSF_NN_GELU_TANH, x, count, y); break;
         case GSF_NN_SILU: gsf__activate_avx2_body(GSF_NN_SILU, x, count, y); break;
+        case GSF_NN_GELU: gsf__activate_avx2_body(GSF_NN_GELU, x, count, y); break;
+        case GSF_NN_RELU: gsf__activate_avx2_body(GSF_NN_RELU, x, count, y); break;
     }
 }
 
@@ -6739,6 +6867,1156 @@ GSF_API gsf_result gsf_nn_vae_encode(gsf_context* ctx, const gsf_nn_vae* vae, co
 GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
                                      const float* latents, int64_t frames, int64_t height, int64_t width, float* video) {
     return gsf__vae_apply(ctx, vae, 1, desc, latents, frames, height, width, video, NULL, NULL);
+}
+
+// ---- >>nn image encoders --------------------------------------------------------
+//
+// DINOv2 with registers (Oquab et al. 2023; Darcet et al. 2023) and the aggregator of VGGT (Wang et al. 2025): a DINOv2
+// embeds each image, then blocks that look within an image take turns with blocks that look at all images together. All
+// are vision transformers of one kind of block, with LayerNorm before attention and MLP. The facts are those of
+// transformers 4.51.3 (modeling_dinov2_with_registers.py) and of VGGT's aggregator.py, block.py, attention.py and rope.py.
+
+typedef struct gsf__vit_sizes { // of a block
+    int64_t width, mlp;         // of a token, of the MLP's hidden layer
+    int32_t heads, head_dim;
+    float eps, head_eps;        // of the LayerNorms, of those of q and k
+    gsf_nn_activation activation;
+    int qkv_bias, head_norm;    // there is a bias of q, k, v; q and k have LayerNorms over each head
+} gsf__vit_sizes;
+
+typedef struct gsf__vit_block {
+    const gsf_tensor *norm1_weight, *norm1_bias, *norm2_weight, *norm2_bias;
+    const gsf_tensor *qkv_weight, *qkv_bias;                                    // (3 width, width); NULL: these
+    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias;
+    const gsf_tensor *q_norm_weight, *q_norm_bias, *k_norm_weight, *k_norm_bias; // (head_dim) or NULL
+    const gsf_tensor *out_weight, *out_bias, *up_weight, *up_bias, *down_weight, *down_bias;
+    const gsf_tensor *scale1, *scale2;                                          // LayerScale or NULL
+} gsf__vit_block;
+
+typedef struct gsf__vit_run { // buffers of a run of blocks
+    gsf_context* ctx;
+    const char* name;              // of the network, for errors and progress
+    const gsf_nn_weights* weights; // where a NaN may come from
+    const gsf__vit_sizes* sizes;
+    gsf_nn_workspace workspace;
+    float* normed;                 // (rows, width)
+    float* wide;                   // (rows, 3 width): q | k | v of each row; hidden rows of the MLP
+    int64_t wide_count;            // floats there
+    float* vectors;                // norm weights and the like of the block at work, widened
+    size_t vectors_used, vectors_size;
+    const float *cos, *sin;        // (positions, head_dim / 4) for positions 1, 2, ...; NULL: no rotation
+    int64_t image_tokens, special, across; // the rotation's grid: tokens of an image, those without place, of a row
+    double done, steps;            // progress, in blocks
+} gsf__vit_run;
+
+// ---- image encoders: a block
+
+// A small tensor as floats; valid until the next block begins.
+static const float* gsf__vit_vector(gsf__vit_run* run, const gsf_tensor* tensor) {
+    if (!tensor) return NULL;
+    float* out = run->vectors + run->vectors_used;
+    GSF_ASSERT(run->vectors_used + (size_t)tensor->count <= run->vectors_size);
+    run->vectors_used += (size_t)tensor->count;
+    gsf_nn_read_tensor(tensor, 0, tensor->count, out);
+    return out;
+}
+
+// y (rows of ldy, 0: dense) = activation(x w^T + b)
+static gsf_result gsf__vit_linear(gsf__vit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
+                                  const gsf_tensor* bias, gsf_nn_activation activation, float* y, int64_t ldy) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = rows;
+    d.weight = weight;
+    d.bias = bias;
+    d.activation = activation;
+    d.y = y;
+    d.ldy = ldy;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+// y += gate * (x w^T + b), or without a gate.
+static gsf_result gsf__vit_add(gsf__vit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
+                               const gsf_tensor* bias, const float* gate, float* y) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = rows;
+    d.weight = weight;
+    d.bias = bias;
+    d.gate = gate;
+    d.accumulate = 1;
+    d.y = y;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+// Pairs (x[i], x[i + count]) turned by the angles of cos and sin (count).
+typedef void (*gsf__vit_turn_fn)(float* x, int64_t count, const float* cos, const float* sin);
+
+static void gsf__vit_turn_scalar(float* x, int64_t count, const float* cos, const float* sin) {
+    for (int64_t i = 0; i < count; i++) {
+        const float a = x[i], b = x[i + count];
+        x[i] = a * cos[i] - b * sin[i];
+        x[i + count] = b * cos[i] + a * sin[i];
+    }
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static void gsf__vit_turn_avx2(float* x, int64_t count, const float* cos, const float* sin) {
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8) {
+        const __m256 a = _mm256_loadu_ps(x + i), b = _mm256_loadu_ps(x + i + count);
+        const __m256 c = _mm256_loadu_ps(cos + i), s = _mm256_loadu_ps(sin + i);
+        _mm256_storeu_ps(x + i, _mm256_fmsub_ps(a, c, b * s));
+        _mm256_storeu_ps(x + i + count, _mm256_fmadd_ps(b, c, a * s));
+    }
+    if (i == count) return;
+    const __m256i mask = gsf__nn_mask8(count - i);
+    const __m256 a = _mm256_maskload_ps(x + i, mask), b = _mm256_maskload_ps(x + i + count, mask);
+    const __m256 c = _mm256_maskload_ps(cos + i, mask), s = _mm256_maskload_ps(sin + i, mask);
+    _mm256_maskstore_ps(x + i, mask, _mm256_fmsub_ps(a, c, b * s));
+    _mm256_maskstore_ps(x + i + count, mask, _mm256_fmadd_ps(b, c, a * s));
+}
+#endif
+
+static gsf__vit_turn_fn gsf__vit_turn_of(gsf_cpu_level level) {
+#if GSF__X86
+    if (level >= GSF_CPU_AVX2) return gsf__vit_turn_avx2;
+#endif
+    (void)level;
+    return gsf__vit_turn_scalar;
+}
+
+enum { GSF__VIT_TURN_ROWS = 32 }; // in a chunk
+
+typedef struct gsf__vit_turn_job {
+    const gsf__vit_run* run;
+    gsf__vit_turn_fn turn;
+    float* x;       // q | k in rows of `stride`
+    int64_t rows, stride;
+} gsf__vit_turn_job;
+
+// The first half of every head turns with the row of the patch, counted from 1, the second half with its column. Tokens
+// without a place stand at 0, where nothing turns.
+static void gsf__vit_turn_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__vit_turn_job* job = (const gsf__vit_turn_job*)arg;
+    const gsf__vit_run* run = job->run;
+    const int64_t dim = run->sizes->head_dim, quarter = dim / 4, heads = 2 * (int64_t)run->sizes->heads; // of q and k
+    const int64_t begin = (int64_t)chunk * GSF__VIT_TURN_ROWS, end = gsf__least(begin + GSF__VIT_TURN_ROWS, job->rows);
+    (void)worker;
+    for (int64_t r = begin; r < end; r++) {
+        const int64_t at = r % run->image_tokens - run->special;
+        if (at < 0) continue;
+        const int64_t row = at / run->across * quarter, column = at % run->across * quarter;
+        for (int64_t h = 0; h < heads; h++) {
+            float* x = job->x + r * job->stride + h * dim;
+            job->turn(x, quarter, run->cos + row, run->sin + row);
+            job->turn(x + dim / 2, quarter, run->cos + column, run->sin + column);
+        }
+    }
+}
+
+// q, k and v of (rows, width) side by side in run->wide, q and k normed and turned.
+static gsf_result gsf__vit_project(gsf__vit_run* run, const gsf__vit_block* b, const float* x, int64_t rows) {
+    const gsf__vit_sizes* s = run->sizes;
+    const int64_t d = s->width, ld = 3 * d;
+    if (b->qkv_weight) {
+        GSF__TRY(gsf__vit_linear(run, x, rows, b->qkv_weight, b->qkv_bias, GSF_NN_LINEAR, run->wide, ld));
+    } else {
+        GSF__TRY(gsf__vit_linear(run, x, rows, b->q_weight, b->q_bias, GSF_NN_LINEAR, run->wide, ld));
+        GSF__TRY(gsf__vit_linear(run, x, rows, b->k_weight, b->k_bias, GSF_NN_LINEAR, run->wide + d, ld));
+        GSF__TRY(gsf__vit_linear(run, x, rows, b->v_weight, b->v_bias, GSF_NN_LINEAR, run->wide + 2 * d, ld));
+    }
+    if (b->q_norm_weight)
+        gsf_nn_head_norm_rope(run->ctx, run->wide, rows, ld, s->heads, s->head_dim, gsf__vit_vector(run, b->q_norm_weight),
+                              gsf__vit_vector(run, b->q_norm_bias), s->head_eps, NULL, NULL, 0);
+    if (b->k_norm_weight)
+        gsf_nn_head_norm_rope(run->ctx, run->wide + d, rows, ld, s->heads, s->head_dim,
+                              gsf__vit_vector(run, b->k_norm_weight), gsf__vit_vector(run, b->k_norm_bias), s->head_eps,
+                              NULL, NULL, 0);
+    if (!run->cos) return GSF_OK;
+    gsf__vit_turn_job job = {run, gsf__vit_turn_of(run->ctx->cpu_level), run->wide, rows, ld};
+    gsf__parallel_for(run->ctx, gsf__nn_chunks(rows, GSF__VIT_TURN_ROWS), gsf__vit_turn_chunk, &job);
+    return GSF_OK;
+}
+
+// x += scale * down(activation(up(normed))), in runs of rows whose hidden layer fits run->wide.
+static gsf_result gsf__vit_feed_forward(gsf__vit_run* run, const gsf__vit_block* b, const float* scale, float* x,
+                                        int64_t rows) {
+    const gsf__vit_sizes* s = run->sizes;
+    const int64_t runs = gsf__ceil_div(rows, run->wide_count / s->mlp), most = gsf__ceil_div(rows, runs);
+    for (int64_t r = 0; r < rows; r += most) {
+        const int64_t n = gsf__least(rows - r, most);
+        const float* from = run->normed + r * s->width;
+        GSF__TRY(gsf__vit_linear(run, from, n, b->up_weight, b->up_bias, s->activation, run->wide, 0));
+        GSF__TRY(gsf__vit_add(run, run->wide, n, b->down_weight, b->down_bias, scale, x + r * s->width));
+    }
+    return GSF_OK;
+}
+
+// One block on x (samples, tokens, width), in place; tokens of a sample see each other.
+static gsf_result gsf__vit_block_forward(gsf__vit_run* run, const gsf__vit_block* b, float* x, int64_t samples,
+                                         int64_t tokens) {
+    const gsf__vit_sizes* s = run->sizes;
+    const int64_t d = s->width, rows = samples * tokens;
+    run->vectors_used = 0;
+    gsf_nn_layer_norm(run->ctx, x, rows, d, gsf__vit_vector(run, b->norm1_weight), gsf__vit_vector(run, b->norm1_bias),
+                      s->eps, run->normed);
+    GSF__TRY(gsf__vit_project(run, b, run->normed, rows));
+    gsf_nn_attention_desc a;
+    memset(&a, 0, sizeof a);
+    a.queries = a.keys = tokens;
+    a.heads = s->heads;
+    a.head_dim = s->head_dim;
+    a.ldq = a.ldk = a.ldv = 3 * d;
+    for (int64_t i = 0; i < samples; i++) {
+        a.q = run->wide + i * tokens * 3 * d;
+        a.k = a.q + d;
+        a.v = a.k + d;
+        a.out = run->normed + i * tokens * d;
+        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &a));
+    }
+    GSF__TRY(gsf__vit_add(run, run->normed, rows, b->out_weight, b->out_bias, gsf__vit_vector(run, b->scale1), x));
+    GSF__TRY(gsf__check_cancel(run->ctx));
+    gsf_nn_layer_norm(run->ctx, x, rows, d, gsf__vit_vector(run, b->norm2_weight), gsf__vit_vector(run, b->norm2_bias),
+                      s->eps, run->normed);
+    return gsf__vit_feed_forward(run, b, gsf__vit_vector(run, b->scale2), x, rows);
+}
+
+// After a stage: a value that is not finite ends the run, with the tensor to blame if one below `prefix` is not finite.
+static gsf_result gsf__vit_check(gsf__vit_run* run, const char* prefix, const float* x, int64_t count) {
+    const int64_t at = gsf__nn_find_not_finite(run->ctx, x, count);
+    if (at < 0) return GSF_OK;
+    const gsf_nn_weights* w = run->weights;
+    for (size_t i = 0; i < w->tensor_count; i++)
+        if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 && !gsf__dit_tensor_is_finite(&w->tensors[i]))
+            return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
+                            w->tensors[i].name);
+    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: %s gives %g (value %lld of %lld)", run->name, prefix, (double)x[at],
+                    (long long)at, (long long)count);
+}
+
+// Block `index` of those called `names` and what follows it: check, cancel, progress.
+static gsf_result gsf__vit_step(gsf__vit_run* run, const gsf__vit_block* blocks, const char* names, int64_t index, float* x,
+                                int64_t samples, int64_t tokens) {
+    char prefix[96];
+    GSF__TRY(gsf__vit_block_forward(run, &blocks[index], x, samples, tokens));
+    snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)index);
+    GSF__TRY(gsf__vit_check(run, prefix, x, samples * tokens * run->sizes->width));
+    gsf__progress(run->ctx, run->name, ++run->done, run->steps);
+    return gsf__check_cancel(run->ctx);
+}
+
+static void gsf__vit_tap(const gsf_nn_encoder_input* in, const char* names, int64_t index, int64_t image, const float* data,
+                         int64_t rows, int64_t columns) {
+    char name[64];
+    if (!in->tap_fn) return;
+    if (index < 0) snprintf(name, sizeof name, "%s", names);
+    else snprintf(name, sizeof name, "%s%lld", names, (long long)index);
+    in->tap_fn(in->tap_user, name, (int32_t)image, data, rows, columns);
+}
+
+// ---- image encoders: from pixels to tokens, a DINOv2
+
+typedef struct gsf__vit {
+    gsf__vit_sizes sizes;
+    int64_t channels, patch, registers, grid, layers;
+    const char *block_names, *prefix; // of its tensors; of those before and after the blocks
+    const gsf_tensor *class_token, *register_tokens, *positions, *patch_weight, *patch_bias, *norm_weight, *norm_bias;
+    gsf__vit_block* blocks;
+} gsf__vit;
+
+typedef struct gsf__vit_patch_job {
+    const float* pixels; // (channels, height, width)
+    float* rows;         // (patches, channels, patch, patch)
+    int64_t channels, height, width, patch;
+    const float *mean, *deviation; // of each channel, taken out; NULL: neither
+} gsf__vit_patch_job;
+
+static void gsf__vit_patch_row(void* arg, size_t index, int worker) { // the patches of one row of them
+    const gsf__vit_patch_job* job = (const gsf__vit_patch_job*)arg;
+    const int64_t p = job->patch, across = job->width / p, row = (int64_t)index;
+    float* to = job->rows + row * across * job->channels * p * p;
+    (void)worker;
+    for (int64_t column = 0; column < across; column++)
+        for (int64_t c = 0; c < job->channels; c++) {
+            const float* from = job->pixels + (c * job->height + row * p) * job->width + column * p;
+            const float mean = job->mean ? job->mean[c] : 0.0f, deviation = job->mean ? job->deviation[c] : 1.0f;
+            for (int64_t y = 0; y < p; y++, from += job->width)
+                for (int64_t x = 0; x < p; x++) *to++ = (from[x] - mean) / deviation;
+        }
+}
+
+// Positions of the class token and of (down, across) patches, interpolated from the square grid: out (1 + patches, width).
+// The weights are PyTorch's for bicubic, antialias, align_corners=False, which are Pillow's.
+static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int64_t down, int64_t across, float* out) {
+    const int64_t d = vit->sizes.width, grid = vit->grid;
+    if (down == grid && across == grid) {
+        gsf_nn_read_tensor(vit->positions, 0, vit->positions->count, out);
+        return GSF_OK;
+    }
+    float* square = (float*)gsf_alloc(ctx, (size_t)(grid * grid * d), sizeof(float));
+    if (!square) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_nn_read_tensor(vit->positions, 0, d, out);
+    gsf_nn_read_tensor(vit->positions, d, grid * grid * d, square);
+    const gsf_image from = gsf_wrap_image(square, GSF_F32, grid, grid, (int32_t)d);
+    const gsf_image to = gsf_wrap_image(out + d, GSF_F32, across, down, (int32_t)d);
+    const gsf_result result = gsf_resize_image(ctx, &from, GSF_RESIZE_PIL_BICUBIC, &to);
+    gsf_free(ctx, square);
+    return result;
+}
+
+static const float gsf__imagenet_mean[3] = {0.485f, 0.456f, 0.406f}, gsf__imagenet_deviation[3] = {0.229f, 0.224f, 0.225f};
+
+// Tokens of image `image` before the blocks: class, registers, patches.
+static gsf_result gsf__vit_embed(gsf__vit_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t image,
+                                 int normalize, const float* positions, float* x) {
+    const int64_t d = vit->sizes.width, p = vit->patch, down = in->height / p, across = in->width / p;
+    float* patches = x + (1 + vit->registers) * d;
+    gsf__vit_patch_job job;
+    job.pixels = in->pixels + image * vit->channels * in->height * in->width;
+    job.rows = run->wide;
+    job.channels = vit->channels;
+    job.height = in->height;
+    job.width = in->width;
+    job.patch = p;
+    job.mean = normalize ? gsf__imagenet_mean : NULL;
+    job.deviation = gsf__imagenet_deviation;
+    gsf__parallel_for(run->ctx, (size_t)down, gsf__vit_patch_row, &job);
+    gsf_nn_read_tensor(vit->class_token, 0, d, x);
+    for (int64_t i = 0; i < d; i++) x[i] += positions[i];
+    gsf_nn_read_tensor(vit->register_tokens, 0, vit->registers * d, x + d);
+    memcpy(patches, positions + d, (size_t)(down * across * d) * sizeof(float));
+    GSF__TRY(gsf__vit_add(run, run->wide, down * across, vit->patch_weight, vit->patch_bias, NULL, patches));
+    gsf__vit_tap(in, "embeddings", -1, image, x, 1 + vit->registers + down * across, d);
+    return gsf__vit_check(run, vit->prefix, x, (1 + vit->registers + down * across) * d);
+}
+
+// Images first ... through embedding and blocks: x (count, tokens, width), before the last norm.
+static gsf_result gsf__vit_forward(gsf__vit_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t first,
+                                   int64_t count, int normalize, const float* positions, float* x) {
+    const int64_t d = vit->sizes.width;
+    const int64_t tokens = 1 + vit->registers + in->height / vit->patch * (in->width / vit->patch);
+    run->sizes = &vit->sizes;
+    for (int64_t i = 0; i < count; i++)
+        GSF__TRY(gsf__vit_embed(run, vit, in, first + i, normalize, positions, x + i * tokens * d));
+    for (int64_t layer = 0; layer < vit->layers; layer++) {
+        GSF__TRY(gsf__vit_step(run, vit->blocks, vit->block_names, layer, x, count, tokens));
+        for (int64_t i = 0; i < count; i++)
+            gsf__vit_tap(in, "layer", layer, first + i, x + i * tokens * d, tokens, d);
+    }
+    run->vectors_used = 0; // what follows may use them
+    return GSF_OK;
+}
+
+// ---- image encoders: memory
+
+enum { GSF__VIT_GROUP_ROWS = 4096, GSF__VIT_MLP_ROWS = 2048 }; // tokens of images that go together; hidden rows held
+
+typedef struct gsf__vit_plan { // in floats, but for counts
+    int64_t patches, tokens;   // of an image; tokens of the embedding DINOv2
+    int64_t group;             // images that it takes together
+    size_t x, normed, wide, vectors, positions, stream, rotation; // stream: the aggregator's
+    size_t square;             // held only while positions are interpolated
+} gsf__vit_plan;
+
+// Products of sizes; a run that would overflow gets SIZE_MAX, which no allocator gives.
+static size_t gsf__vit_product(size_t a, size_t b) { return b != 0 && a > SIZE_MAX / b ? SIZE_MAX : a * b; }
+static size_t gsf__vit_larger(size_t a, size_t b) { return a > b ? a : b; }
+
+static size_t gsf__vit_wide(const gsf__vit_sizes* s, int64_t rows) {
+    const size_t hidden = gsf__vit_product((size_t)gsf__least(rows, GSF__VIT_MLP_ROWS), (size_t)s->mlp);
+    return gsf__vit_larger(hidden, gsf__vit_product(3 * (size_t)rows, (size_t)s->width));
+}
+
+static gsf__vit_plan gsf__vit_plan_of(const gsf__vit* vit, const gsf_nn_encoder_input* in) {
+    gsf__vit_plan p;
+    memset(&p, 0, sizeof p);
+    const size_t d = (size_t)vit->sizes.width;
+    p.patches = in->height / vit->patch * (in->width / vit->patch);
+    p.tokens = 1 + vit->registers + p.patches;
+    p.group = gsf__least(in->images, p.tokens < GSF__VIT_GROUP_ROWS ? GSF__VIT_GROUP_ROWS / p.tokens : 1);
+    p.x = p.normed = gsf__vit_product((size_t)(p.group * p.tokens), d);
+    p.wide = gsf__vit_larger(gsf__vit_wide(&vit->sizes, p.group * p.tokens),
+                             (size_t)p.patches * (size_t)(vit->channels * vit->patch * vit->patch));
+    p.vectors = 6 * d + 4 * (size_t)vit->sizes.head_dim;
+    p.positions = gsf__vit_product((size_t)p.patches + 1, d);
+    p.square = in->height / vit->patch == vit->grid && in->width / vit->patch == vit->grid
+                   ? 0
+                   : (size_t)(vit->grid * (vit->grid + in->width / vit->patch)) * d;
+    return p;
+}
+
+static size_t gsf__vit_total(const gsf__vit_plan* p) { // SIZE_MAX: too many to count
+    const size_t parts[] = {p->x, p->normed, p->wide, p->vectors, p->positions, p->stream, p->rotation};
+    size_t total = 0;
+    for (size_t i = 0; i < GSF__COUNT(parts); i++) total = parts[i] > SIZE_MAX - total ? SIZE_MAX : total + parts[i];
+    return total;
+}
+
+static double gsf__vit_bytes(const gsf__vit_plan* p) {
+    return 4.0 * ((double)gsf__vit_total(p) + (double)p->square);
+}
+
+static double gsf__vit_block_flops(const gsf__vit_sizes* s, double samples, double tokens) {
+    const double d = (double)s->width, rows = samples * tokens;
+    return 2.0 * rows * d * (4.0 * d + 2.0 * (double)s->mlp) + 4.0 * samples * tokens * tokens * d;
+}
+
+static double gsf__vit_flops(const gsf__vit* vit, const gsf__vit_plan* p, double images) {
+    const double patch = (double)(vit->channels * vit->patch * vit->patch) * (double)vit->sizes.width;
+    return images * ((double)vit->layers * gsf__vit_block_flops(&vit->sizes, 1.0, (double)p->tokens) +
+                     2.0 * (double)p->patches * patch);
+}
+
+static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64_t channels, int64_t patch,
+                                       const gsf_nn_encoder_input* in, const float* out) {
+    enum { MOST = 1 << 15 }; // pixels along a side
+    if (!in->pixels || !out || in->images < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: images are missing", name);
+    if (in->height < patch || in->width < patch || in->height % patch || in->width % patch || in->height > MOST ||
+        in->width > MOST)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: sides of %d x %d are no multiples of %lld up to %d", name,
+                        (int)in->width, (int)in->height, (long long)patch, MOST);
+    const int64_t count = in->images * channels * in->height * in->width;
+    const int64_t at = gsf__nn_find_not_finite(ctx, in->pixels, count);
+    if (at >= 0)
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: value %lld of %lld of the images is %g", name, (long long)at,
+                        (long long)count, (double)in->pixels[at]);
+    return GSF_OK;
+}
+
+// Memory for a run, shared out; *memory is to be freed. The positions are in it already.
+static gsf_result gsf__vit_open_run(gsf_context* ctx, const gsf__vit* vit, const gsf_nn_encoder_input* in,
+                                    const gsf__vit_plan* p, gsf__vit_run* run, float** memory) {
+    const size_t total = gsf__vit_total(p);
+    *memory = (float*)gsf_alloc(ctx, total, sizeof(float));
+    if (!*memory) return GSF_ERROR_OUT_OF_MEMORY;
+    run->ctx = ctx;
+    run->normed = *memory + p->positions + p->x;
+    run->wide = run->normed + p->normed;
+    run->wide_count = (int64_t)p->wide;
+    run->vectors = run->wide + p->wide;
+    run->vectors_size = p->vectors;
+    GSF__TRY(gsf__vit_positions(ctx, vit, in->height / vit->patch, in->width / vit->patch, *memory));
+    gsf__vit_tap(in, "positions", -1, 0, *memory, p->patches + 1, vit->sizes.width);
+    return GSF_OK;
+}
+
+// ---- image encoders: opening, which tensor goes where
+
+// Shapes as letters: d width, m MLP, t 3 width, h head_dim, c channels, p patch, r registers,
+// n positions, 1 one.
+typedef struct gsf__vit_entry {
+    const char *name, *shape;
+    size_t offset; // of the pointer in its struct
+    int kind;
+} gsf__vit_entry;
+
+enum { GSF__VIT_ALWAYS = 0, GSF__VIT_QKV_BIAS, GSF__VIT_HEAD_NORM };
+
+#define GSF__VIT_AT(member) offsetof(gsf__vit_block, member)
+#define GSF__VIT_COMMON                                                                 \
+    {"norm1.weight", "d", GSF__VIT_AT(norm1_weight), GSF__VIT_ALWAYS},                  \
+    {"norm1.bias", "d", GSF__VIT_AT(norm1_bias), GSF__VIT_ALWAYS},                      \
+    {"norm2.weight", "d", GSF__VIT_AT(norm2_weight), GSF__VIT_ALWAYS},                  \
+    {"norm2.bias", "d", GSF__VIT_AT(norm2_bias), GSF__VIT_ALWAYS},                      \
+    {"mlp.fc1.weight", "md", GSF__VIT_AT(up_weight), GSF__VIT_ALWAYS},                  \
+    {"mlp.fc1.bias", "m", GSF__VIT_AT(up_bias), GSF__VIT_ALWAYS},                       \
+    {"mlp.fc2.weight", "dm", GSF__VIT_AT(down_weight), GSF__VIT_ALWAYS},                \
+    {"mlp.fc2.bias", "d", GSF__VIT_AT(down_bias), GSF__VIT_ALWAYS}
+
+static const gsf__vit_entry gsf__dinov2_block_entries[] = { // below encoder.layer.N.
+    GSF__VIT_COMMON,
+    {"attention.attention.query.weight", "dd", GSF__VIT_AT(q_weight), GSF__VIT_ALWAYS},
+    {"attention.attention.query.bias", "d", GSF__VIT_AT(q_bias), GSF__VIT_QKV_BIAS},
+    {"attention.attention.key.weight", "dd", GSF__VIT_AT(k_weight), GSF__VIT_ALWAYS},
+    {"attention.attention.key.bias", "d", GSF__VIT_AT(k_bias), GSF__VIT_QKV_BIAS},
+    {"attention.attention.value.weight", "dd", GSF__VIT_AT(v_weight), GSF__VIT_ALWAYS},
+    {"attention.attention.value.bias", "d", GSF__VIT_AT(v_bias), GSF__VIT_QKV_BIAS},
+    {"attention.output.dense.weight", "dd", GSF__VIT_AT(out_weight), GSF__VIT_ALWAYS},
+    {"attention.output.dense.bias", "d", GSF__VIT_AT(out_bias), GSF__VIT_ALWAYS},
+    {"layer_scale1.lambda1", "d", GSF__VIT_AT(scale1), GSF__VIT_ALWAYS},
+    {"layer_scale2.lambda1", "d", GSF__VIT_AT(scale2), GSF__VIT_ALWAYS},
+};
+
+static const gsf__vit_entry gsf__vggt_block_entries[] = { // below aggregator.patch_embed.blocks.N. and the like
+    GSF__VIT_COMMON,
+    {"attn.qkv.weight", "td", GSF__VIT_AT(qkv_weight), GSF__VIT_ALWAYS},
+    {"attn.qkv.bias", "t", GSF__VIT_AT(qkv_bias), GSF__VIT_QKV_BIAS},
+    {"attn.q_norm.weight", "h", GSF__VIT_AT(q_norm_weight), GSF__VIT_HEAD_NORM},
+    {"attn.q_norm.bias", "h", GSF__VIT_AT(q_norm_bias), GSF__VIT_HEAD_NORM},
+    {"attn.k_norm.weight", "h", GSF__VIT_AT(k_norm_weight), GSF__VIT_HEAD_NORM},
+    {"attn.k_norm.bias", "h", GSF__VIT_AT(k_norm_bias), GSF__VIT_HEAD_NORM},
+    {"attn.proj.weight", "dd", GSF__VIT_AT(out_weight), GSF__VIT_ALWAYS},
+    {"attn.proj.bias", "d", GSF__VIT_AT(out_bias), GSF__VIT_ALWAYS},
+    {"ls1.gamma", "d", GSF__VIT_AT(scale1), GSF__VIT_ALWAYS},
+    {"ls2.gamma", "d", GSF__VIT_AT(scale2), GSF__VIT_ALWAYS},
+};
+#undef GSF__VIT_COMMON
+#undef GSF__VIT_AT
+
+#define GSF__VIT_AT(member) offsetof(gsf__vit, member), GSF__VIT_ALWAYS
+static const gsf__vit_entry gsf__dinov2_entries[] = {
+    {"embeddings.cls_token", "11d", GSF__VIT_AT(class_token)},
+    {"embeddings.register_tokens", "1rd", GSF__VIT_AT(register_tokens)},
+    {"embeddings.position_embeddings", "1nd", GSF__VIT_AT(positions)},
+    {"embeddings.patch_embeddings.projection.weight", "dcpp", GSF__VIT_AT(patch_weight)},
+    {"embeddings.patch_embeddings.projection.bias", "d", GSF__VIT_AT(patch_bias)},
+    {"layernorm.weight", "d", GSF__VIT_AT(norm_weight)},
+    {"layernorm.bias", "d", GSF__VIT_AT(norm_bias)},
+};
+
+static const gsf__vit_entry gsf__vggt_entries[] = {
+    {"aggregator.patch_embed.cls_token", "11d", GSF__VIT_AT(class_token)},
+    {"aggregator.patch_embed.register_tokens", "1rd", GSF__VIT_AT(register_tokens)},
+    {"aggregator.patch_embed.pos_embed", "1nd", GSF__VIT_AT(positions)},
+    {"aggregator.patch_embed.patch_embed.proj.weight", "dcpp", GSF__VIT_AT(patch_weight)},
+    {"aggregator.patch_embed.patch_embed.proj.bias", "d", GSF__VIT_AT(patch_bias)},
+    {"aggregator.patch_embed.norm.weight", "d", GSF__VIT_AT(norm_weight)},
+    {"aggregator.patch_embed.norm.bias", "d", GSF__VIT_AT(norm_bias)},
+};
+#undef GSF__VIT_AT
+
+// `vit` may be NULL for entries of blocks.
+static int64_t gsf__vit_dimension(const gsf__vit_sizes* s, const gsf__vit* vit, char letter) {
+    switch (letter) {
+        case 'd': return s->width;
+        case 'm': return s->mlp;
+        case 't': return 3 * s->width;
+        case 'h': return s->head_dim;
+        case '1': return 1;
+        default: break;
+    }
+    if (!vit) return -1;
+    return letter == 'c' ? vit->channels : letter == 'p' ? vit->patch : letter == 'r' ? vit->registers
+                                                                                     : vit->grid * vit->grid + 1;
+}
+
+static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__vit_sizes* s, const gsf__vit* vit,
+                                const gsf__vit_entry* entries, size_t count, const char* prefix, void* where) {
+    for (size_t i = 0; i < count; i++) {
+        const gsf__vit_entry* e = &entries[i];
+        if ((e->kind == GSF__VIT_QKV_BIAS && !s->qkv_bias) || (e->kind == GSF__VIT_HEAD_NORM && !s->head_norm)) continue;
+        int64_t shape[GSF_NN_MAX_RANK];
+        int rank = 0;
+        for (const char* c = e->shape; *c; c++) shape[rank++] = gsf__vit_dimension(s, vit, *c);
+        const gsf_tensor* tensor;
+        GSF__TRY(gsf__nn_need(loader, &tensor, rank, shape, "%s%s", prefix, e->name));
+        memcpy((char*)where + e->offset, &tensor, sizeof tensor);
+    }
+    return GSF_OK;
+}
+
+// `count` blocks called names0, names1, ...; *out is to be freed, also on error.
+static gsf_result gsf__vit_bind_blocks(gsf__nn_loader* loader, const gsf__vit_sizes* s, const gsf__vit_entry* entries,
+                                       size_t entry_count, const char* names, int64_t count, gsf__vit_block** out) {
+    *out = (gsf__vit_block*)gsf_alloc_zeroed(loader->ctx, (size_t)count, sizeof(gsf__vit_block));
+    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t i = 0; i < count; i++) {
+        char prefix[96];
+        snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
+        GSF__TRY(gsf__vit_bind(loader, s, NULL, entries, entry_count, prefix, &(*out)[i]));
+    }
+    return GSF_OK;
+}
+
+// ---- image encoders: DINOv2
+
+static gsf_result gsf__dinov2_read_activation(const gsf__nn_config* file, gsf_nn_activation* out) {
+    static const struct { const char* name; gsf_nn_activation activation; } known[] = {
+        {"gelu", GSF_NN_GELU}, {"gelu_new", GSF_NN_GELU_TANH}, {"gelu_pytorch_tanh", GSF_NN_GELU_TANH},
+        {"relu", GSF_NN_RELU}, {"silu", GSF_NN_SILU}, {"swish", GSF_NN_SILU}};
+    const char* text;
+    GSF__TRY(gsf__nn_config_string(file, "hidden_act", "gelu", &text));
+    for (size_t i = 0; i < GSF__COUNT(known); i++)
+        if (strcmp(known[i].name, text) == 0) {
+            *out = known[i].activation;
+            return GSF_OK;
+        }
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: hidden_act is %.60s", file->json.name, text);
+}
+
+// Keys that are missing have the defaults of transformers' Dinov2WithRegistersConfig.
+static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, gsf__vit* vit) {
+    int64_t heads = 0, image = 0;
+    double ratio, eps;
+    int flag;
+    const struct { const char* key; int64_t* to; int64_t fallback, low, high; } sizes[] = {
+        {"hidden_size", &vit->sizes.width, 768, 1, 65536}, {"num_attention_heads", &heads, 12, 1, 1024},
+        {"num_hidden_layers", &vit->layers, 12, 1, 1024}, {"num_channels", &vit->channels, 3, 1, 1024},
+        {"patch_size", &vit->patch, 16, 1, 1024}, {"image_size", &image, 224, 1, 1 << 15},
+        {"num_register_tokens", &vit->registers, 4, 1, 1 << 16}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++)
+        GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, sizes[i].to));
+    GSF__TRY(gsf__nn_config_number_or(file, "mlp_ratio", 4.0, 1e-3, 1024.0, &ratio));
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-6, 1e-12, 1.0, &eps));
+    GSF__TRY(gsf__nn_config_bool_or(file, "qkv_bias", 1, &vit->sizes.qkv_bias));
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_swiglu_ffn", 0, &flag));
+    if (flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: use_swiglu_ffn is true", file->json.name);
+    GSF__TRY(gsf__dinov2_read_activation(file, &vit->sizes.activation));
+    if (vit->sizes.width % heads || image < vit->patch || (double)vit->sizes.width * ratio < 1.0)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
+                        "%s: hidden_size %lld is no multiple of %lld heads, or image_size %lld below a patch",
+                        file->json.name, (long long)vit->sizes.width, (long long)heads, (long long)image);
+    vit->sizes.heads = (int32_t)heads;
+    vit->sizes.head_dim = (int32_t)(vit->sizes.width / heads);
+    vit->sizes.mlp = (int64_t)((double)vit->sizes.width * ratio);
+    vit->sizes.eps = (float)eps;
+    vit->grid = image / vit->patch;
+    vit->block_names = "encoder.layer.";
+    vit->prefix = "embeddings.";
+    return GSF_OK;
+}
+
+static gsf_result gsf__dinov2_bind(gsf_context* ctx, gsf_nn_dinov2* out, gsf__vit* vit) {
+    gsf__nn_loader loader;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
+    gsf_result result = gsf__vit_bind(&loader, &vit->sizes, vit, gsf__dinov2_entries, GSF__COUNT(gsf__dinov2_entries), "",
+                                      vit);
+    if (!result)
+        result = gsf__vit_bind_blocks(&loader, &vit->sizes, gsf__dinov2_block_entries,
+                                      GSF__COUNT(gsf__dinov2_block_entries), vit->block_names, vit->layers, &vit->blocks);
+    gsf__nn_ignore(&loader, "embeddings.mask_token"); // for training
+    return gsf__nn_end_loading(&loader, result);
+}
+
+GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2) {
+    gsf__vit* vit = (gsf__vit*)dinov2->nets;
+    if (vit) gsf_free(ctx, vit->blocks);
+    gsf_free(ctx, vit);
+    gsf_nn_close_weights(ctx, &dinov2->weights);
+    memset(dinov2, 0, sizeof *dinov2);
+}
+
+GSF_API gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out) {
+    gsf__nn_config file;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    memset(out, 0, sizeof *out);
+    gsf__vit* vit = (gsf__vit*)gsf_alloc_zeroed(ctx, 1, sizeof *vit);
+    if (!vit) return GSF_ERROR_OUT_OF_MEMORY;
+    out->nets = vit;
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
+    gsf_destroy_text(ctx, &path);
+    if (!result) {
+        result = gsf__dinov2_read_config(&file, vit);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) result = gsf_nn_open_weights(ctx, folder, "model", &out->weights);
+    if (!result) result = gsf__dinov2_bind(ctx, out, vit);
+    out->width = (int32_t)vit->sizes.width;
+    out->heads = vit->sizes.heads;
+    out->layers = (int32_t)vit->layers;
+    out->mlp_width = (int32_t)vit->sizes.mlp;
+    out->channels = (int32_t)vit->channels;
+    out->patch = (int32_t)vit->patch;
+    out->special = (int32_t)vit->registers + 1;
+    out->grid = (int32_t)vit->grid;
+    out->norm_eps = (double)vit->sizes.eps;
+    if (result) gsf_nn_destroy_dinov2(ctx, out);
+    return result;
+}
+
+GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
+                                double* flops) {
+    const gsf__vit* vit = (const gsf__vit*)dinov2->nets;
+    const gsf__vit_plan plan = gsf__vit_plan_of(vit, input);
+    if (bytes) *bytes = gsf__vit_bytes(&plan);
+    if (flops) *flops = gsf__vit_flops(vit, &plan, (double)input->images);
+}
+
+static gsf_result gsf__dinov2_run(gsf__vit_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in,
+                                  const gsf__vit_plan* plan, const float* memory, float* x, float* out) {
+    const int64_t d = vit->sizes.width, skip = in->all_tokens ? 0 : vit->registers + 1, kept = plan->tokens - skip;
+    run->steps = (double)(gsf__ceil_div(in->images, plan->group) * vit->layers);
+    for (int64_t first = 0; first < in->images; first += plan->group) {
+        const int64_t count = gsf__least(in->images - first, plan->group);
+        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 0, memory, x));
+        const float *weight = gsf__vit_vector(run, vit->norm_weight), *bias = gsf__vit_vector(run, vit->norm_bias);
+        for (int64_t i = 0; i < count; i++) {
+            const float* tokens = x + i * plan->tokens * d;
+            gsf_nn_layer_norm(run->ctx, tokens + skip * d, kept, d, weight, bias, vit->sizes.eps,
+                              out + (first + i) * kept * d);
+            if (!in->tap_fn) continue;
+            gsf_nn_layer_norm(run->ctx, tokens, plan->tokens, d, weight, bias, vit->sizes.eps, run->normed);
+            gsf__vit_tap(in, "last_hidden_state", -1, first + i, run->normed, plan->tokens, d);
+        }
+    }
+    return gsf__vit_check(run, "layernorm.", out, in->images * kept * d);
+}
+
+GSF_API gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input,
+                                        float* out) {
+    const gsf__vit* vit = (const gsf__vit*)dinov2->nets;
+    gsf__vit_run run;
+    float* memory = NULL;
+    memset(&run, 0, sizeof run);
+    GSF__TRY(gsf__vit_check_input(ctx, "dinov2", vit->channels, vit->patch, input, out));
+    const gsf__vit_plan plan = gsf__vit_plan_of(vit, input);
+    run.name = "dinov2";
+    run.weights = &dinov2->weights;
+    gsf_result result = gsf__vit_open_run(ctx, vit, input, &plan, &run, &memory);
+    if (!result) result = gsf__dinov2_run(&run, vit, input, &plan, memory, memory + plan.positions, out);
+    if (result) {
+        const int64_t kept = plan.tokens - (input->all_tokens ? 0 : vit->registers + 1);
+        memset(out, 0, (size_t)(input->images * kept * vit->sizes.width) * sizeof(float));
+    }
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// ---- image encoders: VGGT's aggregator
+
+typedef struct gsf__vggt {
+    gsf__vit embed;
+    gsf__vit_sizes sizes; // of the blocks
+    int64_t registers, layers;
+    gsf__vit_block *frame, *global; // (layers)
+    const gsf_tensor *camera_token, *register_token; // (1, 2, count, width): of the first image, of all others
+} gsf__vggt;
+
+static const char gsf__vggt_frame_names[] = "aggregator.frame_blocks.";
+static const char gsf__vggt_global_names[] = "aggregator.global_blocks.";
+
+// Blocks called names0, names1, ... that have a norm1.
+static int64_t gsf__vggt_count_blocks(const gsf_nn_weights* weights, const char* names) {
+    for (int64_t i = 0;; i++) {
+        char name[128];
+        snprintf(name, sizeof name, "%s%lld.norm1.weight", names, (long long)i);
+        if (!gsf_nn_find_tensor(weights, name)) return i;
+    }
+}
+
+// Sizes from the shapes of the tensors that have them all.
+static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) {
+    const gsf_nn_weights* w = loader->weights;
+    const int64_t any[4] = {-1, -1, -1, -1};
+    const gsf_tensor *patch, *positions, *up, *registers, *embed_up, *embed_registers;
+    gsf__vit* vit = &net->embed;
+    GSF__TRY(gsf__nn_need(loader, &patch, 4, any, "aggregator.patch_embed.patch_embed.proj.weight"));
+    GSF__TRY(gsf__nn_need(loader, &positions, 3, any, "aggregator.patch_embed.pos_embed"));
+    GSF__TRY(gsf__nn_need(loader, &embed_registers, 3, any, "aggregator.patch_embed.register_tokens"));
+    GSF__TRY(gsf__nn_need(loader, &embed_up, 2, any, "aggregator.patch_embed.blocks.0.mlp.fc1.weight"));
+    GSF__TRY(gsf__nn_need(loader, &up, 2, any, "aggregator.frame_blocks.0.mlp.fc1.weight"));
+    GSF__TRY(gsf__nn_need(loader, &registers, 4, any, "aggregator.register_token"));
+    net->sizes.width = vit->sizes.width = patch->shape[0];
+    net->sizes.mlp = up->shape[0];
+    net->registers = registers->shape[2];
+    net->layers = gsf__vggt_count_blocks(w, gsf__vggt_frame_names);
+    vit->sizes.mlp = embed_up->shape[0];
+    vit->channels = patch->shape[1];
+    vit->patch = patch->shape[2];
+    vit->registers = embed_registers->shape[1];
+    vit->layers = gsf__vggt_count_blocks(w, "aggregator.patch_embed.blocks.");
+    vit->block_names = "aggregator.patch_embed.blocks.";
+    vit->prefix = "aggregator.patch_embed.";
+    while ((vit->grid + 1) * (vit->grid + 1) < positions->shape[1]) vit->grid++;
+    vit->sizes.activation = net->sizes.activation = GSF_NN_GELU;
+    vit->sizes.qkv_bias = net->sizes.qkv_bias = 1;
+    vit->sizes.eps = 1e-6f;
+    net->sizes.eps = net->sizes.head_eps = 1e-5f;
+    const gsf_tensor* norm = gsf_nn_find_tensor(w, "aggregator.frame_blocks.0.attn.q_norm.weight");
+    net->sizes.head_norm = norm != NULL;
+    const int64_t dim = norm ? norm->count : 64, width = net->sizes.width;
+    if (dim < 1 || width < 1 || width > 65536 || patch->count < 1 || net->sizes.mlp < 1 || vit->sizes.mlp < 1 ||
+        vit->channels != 3 || vit->patch > 1024 || net->registers > 65536 || vit->registers > 65536 || vit->grid < 1 ||
+        vit->grid > 32768)
+        return gsf_fail(loader->ctx, GSF_ERROR_UNSUPPORTED, "%s: a width of %lld, %lld channels or a patch of %lld",
+                        w->name, (long long)width, (long long)vit->channels, (long long)vit->patch);
+    net->sizes.heads = (int32_t)(width / dim);
+    return GSF_OK;
+}
+
+// What shapes do not tell, and a check of what they do.
+static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* net, double* rope_base) {
+    int64_t heads, given, count = 0;
+    int flag;
+    const struct { const char* key; int64_t value; } told[] = {
+        {"embed_dim", net->sizes.width}, {"patch_size", net->embed.patch}, {"depth", net->layers},
+        {"num_register_tokens", net->registers}};
+    for (size_t i = 0; i < GSF__COUNT(told); i++) {
+        GSF__TRY(gsf__nn_config_int_or(file, told[i].key, told[i].value, 1, 1 << 20, &given));
+        if (given != told[i].value)
+            return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s: %s is %lld, but the tensors have %lld", file->json.name,
+                            told[i].key, (long long)given, (long long)told[i].value);
+    }
+    GSF__TRY(gsf__nn_config_int_or(file, "num_heads", net->sizes.heads, 1, 1024, &heads));
+    net->sizes.heads = (int32_t)heads;
+    GSF__TRY(gsf__nn_config_number_or(file, "rope_freq", *rope_base, -1e9, 1e9, rope_base));
+    GSF__TRY(gsf__nn_config_bool_or(file, "qk_norm", net->sizes.head_norm, &flag));
+    net->sizes.head_norm = flag;
+    GSF__TRY(gsf__nn_config_int_or(file, "aa_block_size", 1, 1, 1 << 20, &given));
+    const gsf_json_value* order = gsf__nn_config_find(file, "aa_order");
+    int ok = given == 1 && (!order || (order->type == GSF_JSON_ARRAY && order->count == 2));
+    for (uint32_t i = ok && order ? order->child : 0; i; i = file->json.values[i].next, count++) {
+        const gsf_json_value* v = &file->json.values[i];
+        ok = ok && v->type == GSF_JSON_STRING && strcmp(v->string, count ? "global" : "frame") == 0;
+    }
+    if (!ok)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: aa_order is not frame, global, or aa_block_size not 1",
+                        file->json.name);
+    return GSF_OK;
+}
+
+// FOLDER/config.json, which may be absent.
+static gsf_result gsf__vggt_load_config(gsf_context* ctx, const char* folder, gsf__vggt* net, double* rope_base) {
+    gsf__nn_config file;
+    gsf_text path;
+    void* data = NULL;
+    size_t size = 0;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &data, &size);
+    if (!result && data) {
+        result = gsf__nn_parse_config(ctx, path.data, (const char*)data, size, &file);
+        if (!result) {
+            result = gsf__vggt_read_config(&file, net, rope_base);
+            gsf__nn_close_config(&file);
+        }
+    }
+    gsf_free(ctx, data);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
+static gsf_result gsf__vggt_check_heads(gsf_context* ctx, const gsf_nn_weights* w, gsf__vggt* net, double rope_base) {
+    const int32_t heads = net->sizes.heads;
+    if (heads < 1 || net->sizes.width % heads || (rope_base > 0.0 && net->sizes.width / heads % 4))
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %d heads of a width of %lld", w->name, (int)heads,
+                        (long long)net->sizes.width);
+    net->sizes.head_dim = (int32_t)(net->sizes.width / heads);
+    net->embed.sizes.heads = heads;
+    net->embed.sizes.head_dim = net->sizes.head_dim;
+    return GSF_OK;
+}
+
+static gsf_result gsf__vggt_bind(gsf__nn_loader* loader, gsf__vggt* net) {
+    gsf__vit* vit = &net->embed;
+    const gsf__vit_entry* entries = gsf__vggt_block_entries;
+    const size_t count = GSF__COUNT(gsf__vggt_block_entries);
+    const int64_t camera[4] = {1, 2, 1, net->sizes.width}, registers[4] = {1, 2, net->registers, net->sizes.width};
+    GSF__TRY(gsf__vit_bind(loader, &vit->sizes, vit, gsf__vggt_entries, GSF__COUNT(gsf__vggt_entries), "", vit));
+    GSF__TRY(gsf__vit_bind_blocks(loader, &vit->sizes, entries, count, vit->block_names, vit->layers, &vit->blocks));
+    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, count, gsf__vggt_frame_names, net->layers, &net->frame));
+    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, count, gsf__vggt_global_names, net->layers, &net->global));
+    GSF__TRY(gsf__nn_need(loader, &net->camera_token, 4, camera, "aggregator.camera_token"));
+    return gsf__nn_need(loader, &net->register_token, 4, registers, "aggregator.register_token");
+}
+
+static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt* out, gsf__vggt* net) {
+    gsf__nn_loader loader;
+    GSF__TRY(gsf_nn_open_weights(ctx, path, "model", &out->weights));
+    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
+    for (size_t i = 0; i < out->weights.tensor_count; i++) // heads for cameras, depths, points and tracks
+        if (strncmp(out->weights.tensors[i].name, "aggregator.", 11) != 0) loader.taken[i] = 1;
+    gsf__nn_ignore(&loader, "aggregator.patch_embed.mask_token"); // for training
+    gsf_result result = gsf__vggt_read_shapes(&loader, net);
+    out->rope_base = 100.0;
+    if (!result && !gsf__nn_ends_in(path, ".safetensors"))
+        result = gsf__vggt_load_config(ctx, path, net, &out->rope_base);
+    if (!result) result = gsf__vggt_check_heads(ctx, &out->weights, net, out->rope_base);
+    if (!result) result = gsf__vggt_bind(&loader, net);
+    return gsf__nn_end_loading(&loader, result);
+}
+
+GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt) {
+    gsf__vggt* net = (gsf__vggt*)vggt->nets;
+    if (net) {
+        gsf_free(ctx, net->embed.blocks);
+        gsf_free(ctx, net->frame);
+        gsf_free(ctx, net->global);
+    }
+    gsf_free(ctx, net);
+    gsf_nn_close_weights(ctx, &vggt->weights);
+    memset(vggt, 0, sizeof *vggt);
+}
+
+GSF_API gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out) {
+    memset(out, 0, sizeof *out);
+    gsf__vggt* net = (gsf__vggt*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
+    if (!net) return GSF_ERROR_OUT_OF_MEMORY;
+    out->nets = net;
+    const gsf_result result = gsf__vggt_open(ctx, path, out, net);
+    out->width = (int32_t)net->sizes.width;
+    out->heads = net->sizes.heads;
+    out->layers = (int32_t)net->layers;
+    out->mlp_width = (int32_t)net->sizes.mlp;
+    out->patch = (int32_t)net->embed.patch;
+    out->embed_layers = (int32_t)net->embed.layers;
+    out->special = (int32_t)net->registers + 1;
+    out->grid = (int32_t)net->embed.grid;
+    if (result) gsf_nn_destroy_vggt(ctx, out);
+    return result;
+}
+
+static gsf__vit_plan gsf__vggt_plan(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* in) {
+    const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
+    const size_t d = (size_t)net->sizes.width;
+    gsf__vit_plan p = gsf__vit_plan_of(&net->embed, in);
+    const int64_t rows = in->images * (1 + net->registers + p.patches);
+    const int64_t longer = in->height > in->width ? in->height : in->width;
+    p.stream = gsf__vit_product((size_t)rows, d);
+    p.normed = gsf__vit_larger(p.normed, p.stream);
+    p.wide = gsf__vit_larger(p.wide, gsf__vit_wide(&net->sizes, rows));
+    p.rotation = vggt->rope_base > 0.0 ? 2 * (size_t)(longer / net->embed.patch) * (size_t)(net->sizes.head_dim / 4) : 0;
+    return p;
+}
+
+GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops) {
+    const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
+    const gsf__vit_plan plan = gsf__vggt_plan(vggt, input);
+    const double images = (double)input->images, tokens = (double)(1 + net->registers + plan.patches);
+    if (bytes) *bytes = gsf__vit_bytes(&plan);
+    if (!flops) return;
+    *flops = gsf__vit_flops(&net->embed, &plan, images) +
+             (double)net->layers * (gsf__vit_block_flops(&net->sizes, images, tokens) +
+                                    gsf__vit_block_flops(&net->sizes, 1.0, images * tokens));
+}
+
+// Angles position * base^(-i / count) of positions 1, 2, ...: cos, sin (positions, count).
+static void gsf__vggt_make_rotation(double base, int64_t positions, int64_t count, float* cosine, float* sine) {
+    for (int64_t p = 0; p < positions; p++)
+        for (int64_t i = 0; i < count; i++) {
+            const double angle = (double)(p + 1) * pow(base, -(double)i / (double)count);
+            cosine[p * count + i] = (float)cos(angle);
+            sine[p * count + i] = (float)sin(angle);
+        }
+}
+
+// The stream (images, tokens, width): camera token, registers and the embedded patches of each image.
+static gsf_result gsf__vggt_embed(gsf__vit_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
+                                  const gsf__vit_plan* plan, const float* positions, float* x, float* stream) {
+    const gsf__vit* vit = &net->embed;
+    const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches;
+    for (int64_t first = 0; first < in->images; first += plan->group) {
+        const int64_t count = gsf__least(in->images - first, plan->group);
+        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 1, positions, x));
+        const float *weight = gsf__vit_vector(run, vit->norm_weight), *bias = gsf__vit_vector(run, vit->norm_bias);
+        for (int64_t i = 0; i < count; i++) {
+            float* to = stream + (first + i) * tokens * d;
+            const int64_t other = first + i > 0;
+            gsf_nn_read_tensor(net->camera_token, other * d, d, to);
+            gsf_nn_read_tensor(net->register_token, other * net->registers * d, net->registers * d, to + d);
+            gsf_nn_layer_norm(run->ctx, x + (i * plan->tokens + 1 + vit->registers) * d, plan->patches, d, weight, bias,
+                              vit->sizes.eps, to + special * d);
+            gsf__vit_tap(in, "patch_tokens", -1, first + i, to + special * d, plan->patches, d);
+        }
+    }
+    return gsf__vit_check(run, "aggregator.", stream, in->images * tokens * d);
+}
+
+// One half of the output: rows of the stream to every other `width` floats.
+static void gsf__vggt_store(const gsf__vit_plan* plan, const float* stream, int64_t images, int64_t special, int64_t skip,
+                            int64_t d, float* out) {
+    const int64_t tokens = special + plan->patches;
+    for (int64_t i = 0; i < images; i++)
+        for (int64_t t = skip; t < tokens; t++, out += 2 * d)
+            memcpy(out, stream + (i * tokens + t) * d, (size_t)d * sizeof(float));
+}
+
+static gsf_result gsf__vggt_run(gsf__vit_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
+                                const gsf__vit_plan* plan, float* memory, double rope_base, float* out) {
+    const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches;
+    const int64_t skip = in->all_tokens ? 0 : special, down = in->height / net->embed.patch;
+    float *x = memory + plan->positions, *stream = run->vectors + plan->vectors, *rotation = stream + plan->stream;
+    run->steps = (double)(gsf__ceil_div(in->images, plan->group) * net->embed.layers + 2 * net->layers);
+    GSF__TRY(gsf__vggt_embed(run, net, in, plan, memory, x, stream));
+    run->sizes = &net->sizes;
+    run->image_tokens = tokens;
+    run->special = special;
+    run->across = in->width / net->embed.patch;
+    if (plan->rotation) {
+        const int64_t longer = down > run->across ? down : run->across;
+        run->cos = rotation;
+        run->sin = rotation + plan->rotation / 2;
+        gsf__vggt_make_rotation(rope_base, longer, net->sizes.head_dim / 4, rotation, rotation + plan->rotation / 2);
+    }
+    for (int64_t layer = 0; layer < net->layers; layer++) {
+        GSF__TRY(gsf__vit_step(run, net->frame, gsf__vggt_frame_names, layer, stream, in->images, tokens));
+        for (int64_t i = 0; i < in->images; i++) gsf__vit_tap(in, "frame", layer, i, stream + i * tokens * d, tokens, d);
+        if (layer + 1 == net->layers) gsf__vggt_store(plan, stream, in->images, special, skip, d, out);
+        GSF__TRY(gsf__vit_step(run, net->global, gsf__vggt_global_names, layer, stream, 1, in->images * tokens));
+        for (int64_t i = 0; i < in->images; i++) gsf__vit_tap(in, "global", layer, i, stream + i * tokens * d, tokens, d);
+    }
+    gsf__vggt_store(plan, stream, in->images, special, skip, d, out + d);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input,
+                                      float* out) {
+    const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
+    gsf__vit_run run;
+    float* memory = NULL;
+    memset(&run, 0, sizeof run);
+    GSF__TRY(gsf__vit_check_input(ctx, "vggt", net->embed.channels, net->embed.patch, input, out));
+    const gsf__vit_plan plan = gsf__vggt_plan(vggt, input);
+    run.name = "vggt";
+    run.weights = &vggt->weights;
+    gsf_result result = gsf__vit_open_run(ctx, &net->embed, input, &plan, &run, &memory);
+    if (!result) result = gsf__vggt_run(&run, net, input, &plan, memory, vggt->rope_base, out);
+    if (result) {
+        const int64_t kept = plan.patches + (input->all_tokens ? 1 + net->registers : 0);
+        memset(out, 0, (size_t)(input->images * kept * 2 * net->sizes.width) * sizeof(float));
+    }
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// ---- image encoders: from photos to a file of features
+
+enum { GSF__REFERENCE_SIDE = 518, GSF__REFERENCE_PATCH = 14 };
+
+// One channel of Pillow's Image.alpha_composite over opaque white (AlphaComposite.c: 7 bits below the point).
+static uint8_t gsf__over_white(uint32_t value, uint32_t alpha) {
+    const uint32_t weighted = (value * alpha + 255u * (255u - alpha)) * 128u + (0x80u << 7);
+    return (uint8_t)(((weighted >> 8) + weighted) >> 8 >> 7);
+}
+
+// The photo as u8 with 3 channels, at its size.
+static gsf_result gsf__reference_rgb(gsf_context* ctx, const gsf_image* photo, gsf_image* out) {
+    gsf_image bytes;
+    memset(&bytes, 0, sizeof bytes);
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, out));
+    if (photo->channels != 4) return gsf_convert_image(ctx, photo, out);
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 4, &bytes));
+    const gsf_result result = gsf_convert_image(ctx, photo, &bytes);
+    const uint8_t* from = (const uint8_t*)bytes.data;
+    uint8_t* to = (uint8_t*)out->data;
+    for (int64_t i = 0; i < photo->width * photo->height; i++, from += 4, to += 3)
+        for (int c = 0; c < 3; c++) to[c] = gsf__over_white(from[c], from[3]);
+    gsf_destroy_image(ctx, &bytes);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out) {
+    gsf_image rgb, whole;
+    memset(&rgb, 0, sizeof rgb);
+    memset(&whole, 0, sizeof whole);
+    memset(out, 0, sizeof *out);
+    if (!photo->data || photo->width < 1 || photo->height < 1 ||
+        (photo->channels != 1 && photo->channels != 3 && photo->channels != 4))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "reference: a photo of %lld x %lld with %d channels",
+                        (long long)photo->width, (long long)photo->height, (int)photo->channels);
+    const double side = GSF__REFERENCE_SIDE, patch = GSF__REFERENCE_PATCH;
+    const double patches = rint((double)photo->height * (side / (double)photo->width) / patch);
+    if (patches < 1.0 || patches > 4096.0)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "reference: a photo of %lld x %lld would become %g pixels high",
+                        (long long)photo->width, (long long)photo->height, patches * patch);
+    const int64_t height = (int64_t)patches * GSF__REFERENCE_PATCH;
+    const int64_t kept = gsf__least(height, GSF__REFERENCE_SIDE), top = (height - kept) / 2;
+    gsf_result result = gsf__reference_rgb(ctx, photo, &rgb);
+    if (!result) result = gsf_make_image(ctx, GSF_U8, GSF__REFERENCE_SIDE, height, 3, &whole);
+    if (!result) result = gsf_resize_image(ctx, &rgb, GSF_RESIZE_PIL_BICUBIC, &whole);
+    if (!result) result = gsf_make_image(ctx, GSF_U8, GSF__REFERENCE_SIDE, kept, 3, out);
+    if (!result)
+        memcpy(out->data, (const uint8_t*)whole.data + top * whole.stride_y, (size_t)(kept * out->stride_y));
+    gsf_destroy_image(ctx, &rgb);
+    gsf_destroy_image(ctx, &whole);
+    if (result) gsf_destroy_image(ctx, out);
+    return result;
+}
+
+// The photos prepared, as (count, 3, height, width) in [0,1]; *pixels is to be freed.
+static gsf_result gsf__load_references(gsf_context* ctx, const gsf_image* photos, int32_t count, float** pixels,
+                                       gsf_nn_encoder_input* in) {
+    size_t floats = 0, plane = 0;
+    for (int32_t i = 0; i < count; i++) {
+        gsf_image image, planar;
+        GSF__TRY(gsf_nn_prepare_reference(ctx, &photos[i], &image));
+        gsf_result result = GSF_OK;
+        if (i == 0) {
+            plane = (size_t)(image.width * image.height);
+            in->height = (int32_t)image.height;
+            in->width = (int32_t)image.width;
+            if (!gsf__mul_size(3 * plane, (size_t)count, &floats)) result = GSF_ERROR_OUT_OF_MEMORY;
+            else if ((*pixels = (float*)gsf_alloc(ctx, floats, sizeof(float))) == NULL) result = GSF_ERROR_OUT_OF_MEMORY;
+        } else if (image.height != in->height) {
+            result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "references: photo %d becomes %lld pixels high, the first %d",
+                              (int)i, (long long)image.height, (int)in->height);
+        }
+        if (!result) {
+            planar = gsf_wrap_image(*pixels + (size_t)i * 3 * plane, GSF_F32, image.width, image.height, 3);
+            planar.stride_x = sizeof(float);
+            planar.stride_y = image.width * (int64_t)sizeof(float);
+            planar.stride_c = (int64_t)(plane * sizeof(float));
+            result = gsf_convert_image(ctx, &image, &planar);
+        }
+        gsf_destroy_image(ctx, &image);
+        if (result) return result;
+    }
+    in->pixels = *pixels;
+    in->images = count;
+    return GSF_OK;
+}
+
+// Room for (images, tokens, channels) in the features, which earlier calls must have left alike.
+static gsf_result gsf__room_for_features(gsf_context* ctx, gsf_nn_features* f, const gsf_nn_encoder_input* in,
+                                         int64_t patch, int64_t channels, float** values, int64_t* of) {
+    size_t count;
+    if (in->height % patch || in->width % patch)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "references: %d x %d pixels are no multiple of a patch of %lld",
+                        (int)in->width, (int)in->height, (long long)patch);
+    const int64_t tokens = in->height / patch * (in->width / patch);
+    if ((f->dino || f->vggt) && (f->images != in->images || f->tokens != tokens))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: %lld images of %lld tokens before, now %d of %lld",
+                        (long long)f->images, (long long)f->tokens, (int)in->images, (long long)tokens);
+    gsf_free(ctx, *values);
+    *values = NULL;
+    *of = 0;
+    if (!gsf__mul_size((size_t)in->images * (size_t)tokens, (size_t)channels, &count)) return GSF_ERROR_OUT_OF_MEMORY;
+    *values = (float*)gsf_alloc(ctx, count, sizeof(float));
+    if (!*values) return GSF_ERROR_OUT_OF_MEMORY;
+    f->images = in->images;
+    f->tokens = tokens;
+    *of = channels;
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_vggt* vggt,
+                                            const gsf_image* photos, int32_t count, gsf_nn_features* features) {
+    gsf_nn_features* f = features;
+    gsf_nn_encoder_input in;
+    float* pixels = NULL;
+    memset(&in, 0, sizeof in);
+    if (!photos || count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no photos are given");
+    gsf_result result = gsf__load_references(ctx, photos, count, &pixels, &in);
+    if (!result && dinov2) {
+        result = gsf__room_for_features(ctx, f, &in, dinov2->patch, dinov2->width, &f->dino, &f->dino_channels);
+        if (!result) result = gsf_nn_dinov2_encode(ctx, dinov2, &in, f->dino);
+    }
+    if (!result && vggt) {
+        result = gsf__room_for_features(ctx, f, &in, vggt->patch, 2 * (int64_t)vggt->width, &f->vggt, &f->vggt_channels);
+        if (!result) result = gsf_nn_vggt_encode(ctx, vggt, &in, f->vggt);
+    }
+    gsf_free(ctx, pixels);
+    if (result) gsf_nn_destroy_features(ctx, f);
+    return result;
+}
+
+GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features) {
+    gsf_free(ctx, features->dino);
+    gsf_free(ctx, features->vggt);
+    memset(features, 0, sizeof *features);
+}
+
+GSF_API gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, const gsf_nn_features* features,
+                                        const gsf_tensor* prompt_embeds) {
+    gsf_tensor tensors[3];
+    size_t count = 0;
+    const int64_t dino[3] = {features->images, features->tokens, features->dino_channels};
+    const int64_t vggt[3] = {features->images, features->tokens, features->vggt_channels};
+    if (features->dino) tensors[count++] = gsf_nn_wrap_tensor("dino_latents", features->dino, 3, dino);
+    if (features->vggt) tensors[count++] = gsf_nn_wrap_tensor("vggt_latents", features->vggt, 3, vggt);
+    if (prompt_embeds) {
+        tensors[count] = *prompt_embeds;
+        tensors[count++].name = "prompt_embeds";
+    }
+    return gsf_nn_save_tensors(ctx, path, tensors, count);
 }
 
 // ---- >>nn sampling --------------------------------------------------------------

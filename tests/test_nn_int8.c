@@ -71,6 +71,8 @@ static void quantize(gsf_context* ctx, layer* l, int no_rotation, gsf_nn_quantiz
 
 static double activation_of(gsf_nn_activation activation, double x) {
     if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    if (activation == GSF_NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
+    if (activation == GSF_NN_RELU) return x < 0.0 ? 0.0 : x;
     return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
@@ -109,7 +111,7 @@ static void test_definition(gsf_context* ctx) {
         while (i % 4 != 3 && block < 256 && in % (2 * block) == 0) block *= 2;
         CHECK(q.block == block && q.in == in && q.out == out);
         CHECK(q.bytes == (size_t)(gsf__round_up(out, 16) * (gsf__round_up(in, 4) + 4)));
-        l.desc.activation = (gsf_nn_activation)(i % 3);
+        l.desc.activation = (gsf_nn_activation)(i / 5 % 5);
         l.desc.bias = i % 2 ? &l.bias : NULL;
         l.desc.gate = i % 7 < 2 ? l.gate : NULL;
         l.desc.accumulate = i % 3 == 0;

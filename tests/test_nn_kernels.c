@@ -85,14 +85,32 @@ static void check_exp(void) {
 static double activation_of(gsf_nn_activation activation, double x) {
     if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
     if (activation == GSF_NN_SILU) return x / (1.0 + exp(-x));
-    return x;
+    if (activation == GSF_NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
+    return activation == GSF_NN_RELU && x < 0.0 ? 0.0 : x;
+}
+
+// GELU's relative error, from where results become too small for it to where they are x.
+static void check_gelu(void) {
+    enum { COUNT = 400000 };
+    float *x = make_floats(COUNT, -14.0, 7.0), *y = make_floats(COUNT, 0, 1);
+    double worst = 0.0;
+    for (size_t i = 0; i < COUNT / 8; i++) x[i] *= 0.001f;
+    gsf_nn_activate(&one, GSF_NN_GELU, x, COUNT, y);
+    for (size_t i = 0; i < COUNT; i++) {
+        const double expected = activation_of(GSF_NN_GELU, (double)x[i]), size = fabs(expected);
+        if (size > 1e-36) worst = fmax(worst, fabs((double)y[i] - expected) / size);
+        else CHECK(fabs((double)y[i] - expected) <= 1e-36);
+    }
+    test_check_near(worst, 0.0, 1e-6, "relative error of GELU", __FILE__, __LINE__);
+    if (getenv("TEST_VERBOSE")) printf("gelu %g\n", worst);
+    free(x); free(y);
 }
 
 static void check_activate(void) {
     static const size_t sizes[] = {0, 1, 7, 8, 9, 31, 70003};
-    static const gsf_nn_activation kinds[] = {GSF_NN_LINEAR, GSF_NN_GELU_TANH, GSF_NN_SILU};
+    static const gsf_nn_activation kinds[] = {GSF_NN_LINEAR, GSF_NN_GELU_TANH, GSF_NN_SILU, GSF_NN_GELU, GSF_NN_RELU};
     for (size_t s = 0; s < sizeof sizes / sizeof sizes[0]; s++)
-        for (int k = 0; k < 3; k++) {
+        for (int k = 0; k < 5; k++) {
             const size_t n = sizes[s];
             float *x = make_floats(n, -15.0, 15.0), *y = make_floats(n + 1, 0, 1), *z = copy_floats(x, n);
             double* expected = make_doubles(n);
@@ -105,7 +123,7 @@ static void check_activate(void) {
             free(x); free(y); free(z); free(expected);
         }
     const float x[9] = {INFINITY, -INFINITY, NAN, FLT_MAX, -FLT_MAX, 1e3f, -1e3f, 0.0f, NAN};
-    for (int k = 1; k < 3; k++) {
+    for (int k = 1; k < 5; k++) {
         float y[9];
         gsf_nn_activate(&one, kinds[k], x, 9, y);
         CHECK(y[0] == INFINITY && y[1] == 0.0f && y[2] != y[2] && y[3] == FLT_MAX && y[4] == 0.0f);
@@ -464,6 +482,7 @@ int main(void) {
         if (level >= GSF_CPU_AVX2) check_exp();
 #endif
         check_activate();
+        check_gelu();
         check_softmax();
         check_row_norms();
         check_group_norm();

@@ -89,6 +89,8 @@ static void run(gsf_context* ctx, gsf_nn_workspace* workspace, layer* l) {
 
 static double activation_of(gsf_nn_activation activation, double x) {
     if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    if (activation == GSF_NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
+    if (activation == GSF_NN_RELU) return x < 0.0 ? 0.0 : x;
     return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
@@ -136,7 +138,7 @@ static void test_shapes(gsf_context* ctx) {
         const int64_t in = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         const int64_t out = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         layer l = make_layer(m, in, out, dtypes[i / 3 % 3], i % 4 == 3 ? 1 + (size_t)(i % 7) : 0, i % 5 == 4 ? 3 : 0);
-        l.desc.activation = (gsf_nn_activation)(i % 3);
+        l.desc.activation = (gsf_nn_activation)(i / 5 % 5);
         l.desc.bias = test_random_bits(&seed) % 3 ? &l.bias : NULL;
         l.desc.gate = test_random_bits(&seed) % 3 ? NULL : l.gate;
         l.desc.accumulate = test_random_bits(&seed) % 3 == 0;

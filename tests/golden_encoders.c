@@ -1,0 +1,16 @@
+// The encoders of references against the golden data of the official code: every part reads its shapes, configs and values
+// from GSF_GOLDEN/encoders, so that another folder of the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every
+// error.
+#include "gsfixer_nn.h"
+
+#include "encoders_golden.h"
+#include "encoders_dinov2.h"
+#include "encoders_preprocess.h"
+#include "encoders_vggt.h"
+
+int main(void) {
+    check_preprocess();
+    check_dinov2();
+    check_vggt();
+    return test_report();
+}
