@@ -607,6 +607,56 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_n
 GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
                                                    size_t count, int skip_special, gsf_text* out);
 
+// ---- captions ------------------------------------------------------------------------
+// BLIP-2 with OPT, which says in a few words what an image shows (transformers 4.51.3, Blip2ForConditionalGeneration). The
+// restorer's prompt begins with such a caption.
+
+typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
+    int32_t image_size;           // side of the square that images are resized to, whatever their shape
+    int32_t query_tokens;         // words that stand for the image
+    int32_t vocabulary, positions; // of the language model: words, and the most tokens of image, prompt and caption
+    int32_t bos, eos;             // begins a caption without prompt; ends every caption
+    int32_t image_token;          // "image_token_index"; -1: an older folder without it, whose default length is less
+    gsf_nn_bpe tokenizer;
+    gsf_nn_weights weights;
+    void* nets;                   // private
+} gsf_nn_captioner;
+
+// Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_make_bpe) and
+// model*.safetensors in f32, bf16 or f16, which are computed with in float32. Keys that are absent have the defaults of
+// transformers. Missing, misshaped and surplus tensors are named (GSF_ERROR_FORMAT), as is what this code does not do
+// (GSF_ERROR_UNSUPPORTED): another language model than OPT, norms behind the layers (do_layer_norm_before false).
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
+GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner);
+
+// The caption of an image (1, 3 or 4 channels, any dtype; alpha is left out) as zero-terminated UTF-8 without white space
+// at its ends. With a prompt, it goes on from there, and the prompt is not repeated; NULL: none. At most `max_new_tokens`
+// tokens, 0: 20 (older folders: 17, or 19 less two for each token of the prompt), the most likely one each time. The
+// text is cut behind a whole character where it does not fit `size` bytes; a zero byte in it becomes U+FFFD.
+// A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the tensor's or layer's name. Progress and
+// cancel after every layer. Any number of threads, each with its context, may use one captioner.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
+                                                const char* prompt, int32_t max_new_tokens, char* out, size_t size);
+
+typedef struct gsf_nn_caption_desc {
+    const gsf_image* image;
+    const char* prompt;     // NULL: none
+    int32_t max_new_tokens; // 0: as gsf_nn_caption
+    // Shown every intermediate: "pixel_values" (3, pixels), "vision" (tokens, width), "qformer", "projection", "logits" of
+    // the prompt (tokens, words). NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_caption_desc;
+
+// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
+                                                    const gsf_nn_caption_desc* desc, int32_t** ids, size_t* count);
+
+// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
+// `text_tokens` tokens of prompt (0: none).
+GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
+                                 double* bytes, double* flops);
+
 // ---- the restorer `dit` ---------------------------------------------------------------
 
 typedef enum gsf_nn_condition { GSF_NN_BOTH = 0, GSF_NN_2D, GSF_NN_3D, GSF_NN_NONE } gsf_nn_condition;
@@ -9325,6 +9375,882 @@ GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
     if (failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; t->clean_up && i < GSF__COUNT(tidy); i++) gsf__bpe_replace(out, start, tidy[i][0], tidy[i][1]);
     return GSF_OK;
+}
+
+// ---- >>nn captioner -------------------------------------------------------------
+//
+// BLIP-2 (Li et al. 2023) with OPT (Zhang et al. 2022): a vision transformer, learned queries that look at its tokens
+// (Q-Former), a projection of what they found to words of the language model, and that model, which goes on from there.
+// As transformers 4.51.3 has it: models/blip_2/modeling_blip_2.py, models/opt/modeling_opt.py, image_processing_blip.py.
+
+typedef struct gsf__qformer_attention {
+    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
+    const gsf_tensor *norm_weight, *norm_bias;
+} gsf__qformer_attention;
+
+typedef struct gsf__qformer_layer {
+    gsf__qformer_attention self, cross; // cross.q_weight NULL: this layer has none
+    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias, *norm_weight, *norm_bias;
+} gsf__qformer_layer;
+
+typedef struct gsf__qformer {
+    int64_t queries, width, mlp, layers, cross_every; // every so many layers look at the image
+    int32_t heads;
+    float eps;
+    gsf_nn_activation activation;
+    int text_input;                                   // the file holds tensors for texts, which nobody needs here
+    const gsf_tensor *tokens, *norm_weight, *norm_bias;
+    gsf__qformer_layer* all;
+} gsf__qformer;
+
+typedef struct gsf__opt {
+    gsf__vit_sizes sizes;
+    int64_t layers, vocabulary, positions;
+    int own_head, no_final_norm;
+    const gsf_tensor *tokens, *places, *norm_weight, *norm_bias, *head;
+    gsf__vit_block* blocks;
+} gsf__opt;
+
+typedef struct gsf__blip { // behind gsf_nn_captioner.nets
+    int64_t image_size;
+    gsf_resize_filter filter;
+    double rescale;
+    float mean[3], deviation[3];
+    gsf__vit vision;
+    gsf__qformer qformer;
+    gsf__opt text;
+    const gsf_tensor *projection_weight, *projection_bias;
+} gsf__blip;
+
+enum { GSF__OPT_OFFSET = 2, GSF__CAPTION_TOKENS = 20 }; // rows of OPT's position table before position 0; new tokens
+static const float gsf__opt_eps = 1e-5f;                // PyTorch's, which no file of OPT's can change
+
+// ---- captioner: configuration
+
+static gsf_result gsf__blip_read_activation(const gsf__nn_config* file, const char* key, const char* fallback,
+                                            gsf_nn_activation* out) {
+    static const struct { const char* name; gsf_nn_activation activation; } known[] = {
+        {"gelu", GSF_NN_GELU}, {"gelu_new", GSF_NN_GELU_TANH}, {"gelu_pytorch_tanh", GSF_NN_GELU_TANH},
+        {"relu", GSF_NN_RELU}, {"silu", GSF_NN_SILU}, {"swish", GSF_NN_SILU}};
+    const char* text;
+    GSF__TRY(gsf__nn_config_string(file, key, fallback, &text));
+    for (size_t i = 0; i < GSF__COUNT(known); i++)
+        if (strcmp(known[i].name, text) == 0) {
+            *out = known[i].activation;
+            return GSF_OK;
+        }
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is %.60s", file->json.name, key, text);
+}
+
+typedef struct gsf__blip_size { const char* key; int64_t* to; int64_t fallback, low, high; } gsf__blip_size;
+
+static gsf_result gsf__blip_read_sizes(const gsf__nn_config* file, const gsf__blip_size* sizes, size_t count) {
+    for (size_t i = 0; i < count; i++)
+        GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, sizes[i].to));
+    return GSF_OK;
+}
+
+static gsf_result gsf__blip_split_heads(const gsf__nn_config* file, int64_t width, int64_t heads, int32_t* out) {
+    *out = (int32_t)heads;
+    if (width % heads == 0) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld heads do not divide hidden_size %lld", file->json.name,
+                    (long long)heads, (long long)width);
+}
+
+static gsf_result gsf__blip_read_vision(const gsf__nn_config* file, gsf__blip* net) {
+    gsf__vit* vit = &net->vision;
+    int64_t heads = 0;
+    double eps;
+    const gsf__blip_size sizes[] = {
+        {"hidden_size", &vit->sizes.width, 1408, 1, 65536}, {"intermediate_size", &vit->sizes.mlp, 6144, 1, 1 << 20},
+        {"num_hidden_layers", &vit->layers, 39, 1, 1024}, {"num_attention_heads", &heads, 16, 1, 1024},
+        {"image_size", &net->image_size, 224, 1, 1 << 14}, {"patch_size", &vit->patch, 14, 1, 1024}};
+    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-6, 1e-15, 1.0, &eps));
+    GSF__TRY(gsf__nn_config_bool_or(file, "qkv_bias", 1, &vit->sizes.qkv_bias));
+    GSF__TRY(gsf__blip_read_activation(file, "hidden_act", "gelu", &vit->sizes.activation));
+    GSF__TRY(gsf__blip_split_heads(file, vit->sizes.width, heads, &vit->sizes.heads));
+    if (net->image_size < vit->patch)
+        return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s: patch_size %lld is above image_size %lld", file->json.name,
+                        (long long)vit->patch, (long long)net->image_size);
+    vit->sizes.head_dim = (int32_t)(vit->sizes.width / heads);
+    vit->sizes.eps = (float)eps;
+    vit->channels = 3;
+    vit->grid = net->image_size / vit->patch;
+    vit->block_names = "vision_model.encoder.layers.";
+    vit->prefix = "vision_model.embeddings.";
+    return GSF_OK;
+}
+
+static gsf_result gsf__blip_read_qformer(const gsf__nn_config* file, gsf__blip* net) {
+    gsf__qformer* q = &net->qformer;
+    int64_t heads = 0;
+    double eps;
+    const char* positions;
+    const gsf__blip_size sizes[] = {
+        {"hidden_size", &q->width, 768, 1, 65536}, {"intermediate_size", &q->mlp, 3072, 1, 1 << 20},
+        {"num_hidden_layers", &q->layers, 12, 1, 1024}, {"num_attention_heads", &heads, 12, 1, 1024},
+        {"cross_attention_frequency", &q->cross_every, 2, 1, 1024}};
+    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-12, 1e-15, 1.0, &eps));
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_qformer_text_input", 0, &q->text_input));
+    GSF__TRY(gsf__blip_read_activation(file, "hidden_act", "gelu", &q->activation));
+    GSF__TRY(gsf__blip_split_heads(file, q->width, heads, &q->heads));
+    GSF__TRY(gsf__nn_config_string(file, "position_embedding_type", "absolute", &positions));
+    if (strcmp(positions, "absolute") != 0)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: position_embedding_type is %.60s", file->json.name,
+                        positions);
+    q->eps = (float)eps;
+    return GSF_OK;
+}
+
+// What this code computes in one way only must not be configured otherwise.
+static gsf_result gsf__blip_check_text(const gsf__nn_config* file, int64_t width) {
+    static const char* const flags[] = {"do_layer_norm_before", "enable_bias", "layer_norm_elementwise_affine"};
+    const char* type;
+    int64_t words;
+    GSF__TRY(gsf__nn_config_string(file, "model_type", "opt", &type));
+    if (strcmp(type, "opt") != 0)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: model_type of text_config is %.60s, not opt",
+                        file->json.name, type);
+    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
+        int flag;
+        GSF__TRY(gsf__nn_config_bool_or(file, flags[i], 1, &flag));
+        if (!flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i]);
+    }
+    GSF__TRY(gsf__nn_config_int_or(file, "word_embed_proj_dim", width, 1, 65536, &words));
+    if (words == width) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: word_embed_proj_dim %lld is not hidden_size %lld",
+                    file->json.name, (long long)words, (long long)width);
+}
+
+static gsf_result gsf__blip_read_text(const gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
+    gsf__opt* opt = &net->text;
+    int64_t heads = 0, bos = 0, eos = 0;
+    int tied;
+    const gsf__blip_size sizes[] = {
+        {"hidden_size", &opt->sizes.width, 768, 1, 65536}, {"ffn_dim", &opt->sizes.mlp, 3072, 1, 1 << 20},
+        {"num_hidden_layers", &opt->layers, 12, 1, 1024}, {"num_attention_heads", &heads, 12, 1, 1024},
+        {"vocab_size", &opt->vocabulary, 50272, 1, 1 << 24},
+        {"max_position_embeddings", &opt->positions, 2048, 1, 1 << 20}};
+    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
+    GSF__TRY(gsf__nn_config_int_or(file, "bos_token_id", 2, 0, opt->vocabulary - 1, &bos));
+    GSF__TRY(gsf__nn_config_int_or(file, "eos_token_id", 2, 0, INT32_MAX, &eos));
+    GSF__TRY(gsf__nn_config_bool_or(file, "tie_word_embeddings", 1, &tied));
+    GSF__TRY(gsf__nn_config_bool_or(file, "_remove_final_layer_norm", 0, &opt->no_final_norm));
+    GSF__TRY(gsf__blip_read_activation(file, "activation_function", "relu", &opt->sizes.activation));
+    GSF__TRY(gsf__blip_split_heads(file, opt->sizes.width, heads, &opt->sizes.heads));
+    opt->sizes.head_dim = (int32_t)(opt->sizes.width / heads);
+    opt->sizes.eps = gsf__opt_eps;
+    opt->sizes.qkv_bias = 1;
+    opt->own_head = !tied;
+    out->bos = (int32_t)bos;
+    out->eos = (int32_t)eos;
+    return gsf__blip_check_text(file, opt->sizes.width);
+}
+
+// Runs `read` on the part of config.json called `key` as if it were the document; without it all keys are absent.
+#define GSF__BLIP_PART(file, key, read)                                                                             \
+    do {                                                                                                            \
+        const gsf_json_value whole = (file)->json.values[0];                                                        \
+        const gsf_json_value* part = gsf__nn_config_find((file), (key));                                            \
+        if (part && part->type != GSF_JSON_OBJECT) return gsf__nn_config_fail((file), part, (key), "an object");   \
+        if (part) (file)->json.values[0] = *part;                                                                   \
+        else (file)->json.values[0].child = (file)->json.values[0].count = 0;                                       \
+        const gsf_result read_result = (read);                                                                      \
+        (file)->json.values[0] = whole;                                                                             \
+        if (read_result) return read_result;                                                                        \
+    } while (0)
+
+static gsf_result gsf__blip_read_config(gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
+    int64_t image_token;
+    GSF__TRY(gsf__nn_config_int_or(file, "num_query_tokens", 32, 1, 1 << 16, &net->qformer.queries));
+    GSF__TRY(gsf__nn_config_int_or(file, "image_token_index", -1, 0, INT32_MAX, &image_token));
+    out->image_token = (int32_t)image_token;
+    GSF__BLIP_PART(file, "vision_config", gsf__blip_read_vision(file, net));
+    GSF__BLIP_PART(file, "qformer_config", gsf__blip_read_qformer(file, net));
+    GSF__BLIP_PART(file, "text_config", gsf__blip_read_text(file, net, out));
+    return GSF_OK;
+}
+#undef GSF__BLIP_PART
+
+// Three numbers, or one for all.
+static gsf_result gsf__blip_read_colour(const gsf__nn_config* file, const char* key, const float fallback[3], double low,
+                                        float out[3]) {
+    const gsf_json_value* value = gsf__nn_config_find(file, key);
+    for (size_t i = 0; i < 3; i++) {
+        const gsf_json_value* number =
+            value && value->type == GSF_JSON_ARRAY && value->count == 3 ? gsf_json_element(&file->json, value, i) : value;
+        out[i] = fallback[i];
+        if (!number) continue;
+        if (number->type != GSF_JSON_NUMBER || !(number->number >= low) || !(number->number <= 1e6))
+            return gsf__nn_config_fail(file, value, key, "a number or three");
+        out[i] = (float)number->number;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__blip_read_processor(const gsf__nn_config* file, gsf__blip* net) {
+    static const char* const steps[] = {"do_resize", "do_rescale", "do_normalize", "do_convert_rgb"};
+    static const float mean[3] = {0.48145466f, 0.4578275f, 0.40821073f};
+    static const float deviation[3] = {0.26862954f, 0.26130258f, 0.27577711f};
+    static const gsf_resize_filter filters[] = {GSF_RESIZE_PIL_LANCZOS, GSF_RESIZE_PIL_BILINEAR, GSF_RESIZE_PIL_BICUBIC};
+    int64_t filter;
+    for (size_t i = 0; i < GSF__COUNT(steps); i++) {
+        int flag;
+        GSF__TRY(gsf__nn_config_bool_or(file, steps[i], 1, &flag));
+        if (!flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, steps[i]);
+    }
+    GSF__TRY(gsf__nn_config_int_or(file, "resample", 3, 1, 3, &filter)); // PIL's numbers
+    net->filter = filters[filter - 1];
+    GSF__TRY(gsf__nn_config_number_or(file, "rescale_factor", 1.0 / 255.0, 1e-9, 1e9, &net->rescale));
+    GSF__TRY(gsf__blip_read_colour(file, "image_mean", mean, -1e6, net->mean));
+    GSF__TRY(gsf__blip_read_colour(file, "image_std", deviation, 1e-6, net->deviation));
+    const gsf_json_value* size = gsf__nn_config_find(file, "size");
+    double sides[2] = {384.0, 384.0};
+    for (int i = 0; i < 2 && size; i++) {
+        const gsf_json_value* side =
+            size->type == GSF_JSON_OBJECT ? gsf_json_member(&file->json, size, i ? "width" : "height") : size;
+        if (!side || side->type != GSF_JSON_NUMBER)
+            return gsf__nn_config_fail(file, size, "size", "a number, or an object with height and width");
+        sides[i] = side->number;
+    }
+    if (sides[0] == (double)net->image_size && sides[1] == sides[0]) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: images of %g x %g for a model of %lld x %lld", file->json.name,
+                    sides[1], sides[0], (long long)net->image_size, (long long)net->image_size);
+}
+
+// ---- captioner: opening, which tensor goes where
+
+#define GSF__BLIP_AT(member) offsetof(gsf__vit_block, member), GSF__VIT_ALWAYS
+static const gsf__vit_entry gsf__blip_block_entries[] = { // below vision_model.encoder.layers.N.
+    {"layer_norm1.weight", "d", GSF__BLIP_AT(norm1_weight)},
+    {"layer_norm1.bias", "d", GSF__BLIP_AT(norm1_bias)},
+    {"self_attn.qkv.weight", "td", GSF__BLIP_AT(qkv_weight)},
+    {"self_attn.qkv.bias", "t", offsetof(gsf__vit_block, qkv_bias), GSF__VIT_QKV_BIAS},
+    {"self_attn.projection.weight", "dd", GSF__BLIP_AT(out_weight)},
+    {"self_attn.projection.bias", "d", GSF__BLIP_AT(out_bias)},
+    {"layer_norm2.weight", "d", GSF__BLIP_AT(norm2_weight)},
+    {"layer_norm2.bias", "d", GSF__BLIP_AT(norm2_bias)},
+    {"mlp.fc1.weight", "md", GSF__BLIP_AT(up_weight)},
+    {"mlp.fc1.bias", "m", GSF__BLIP_AT(up_bias)},
+    {"mlp.fc2.weight", "dm", GSF__BLIP_AT(down_weight)},
+    {"mlp.fc2.bias", "d", GSF__BLIP_AT(down_bias)},
+};
+
+static const gsf__vit_entry gsf__opt_block_entries[] = { // below language_model.model.decoder.layers.N.
+    {"self_attn_layer_norm.weight", "d", GSF__BLIP_AT(norm1_weight)},
+    {"self_attn_layer_norm.bias", "d", GSF__BLIP_AT(norm1_bias)},
+    {"self_attn.q_proj.weight", "dd", GSF__BLIP_AT(q_weight)},
+    {"self_attn.q_proj.bias", "d", GSF__BLIP_AT(q_bias)},
+    {"self_attn.k_proj.weight", "dd", GSF__BLIP_AT(k_weight)},
+    {"self_attn.k_proj.bias", "d", GSF__BLIP_AT(k_bias)},
+    {"self_attn.v_proj.weight", "dd", GSF__BLIP_AT(v_weight)},
+    {"self_attn.v_proj.bias", "d", GSF__BLIP_AT(v_bias)},
+    {"self_attn.out_proj.weight", "dd", GSF__BLIP_AT(out_weight)},
+    {"self_attn.out_proj.bias", "d", GSF__BLIP_AT(out_bias)},
+    {"final_layer_norm.weight", "d", GSF__BLIP_AT(norm2_weight)},
+    {"final_layer_norm.bias", "d", GSF__BLIP_AT(norm2_bias)},
+    {"fc1.weight", "md", GSF__BLIP_AT(up_weight)},
+    {"fc1.bias", "m", GSF__BLIP_AT(up_bias)},
+    {"fc2.weight", "dm", GSF__BLIP_AT(down_weight)},
+    {"fc2.bias", "d", GSF__BLIP_AT(down_bias)},
+};
+#undef GSF__BLIP_AT
+
+#define GSF__BLIP_AT(member) offsetof(gsf__vit, member), GSF__VIT_ALWAYS
+static const gsf__vit_entry gsf__blip_entries[] = { // below vision_model.
+    {"embeddings.class_embedding", "11d", GSF__BLIP_AT(class_token)},
+    {"embeddings.position_embedding", "1nd", GSF__BLIP_AT(positions)},
+    {"embeddings.patch_embedding.weight", "dcpp", GSF__BLIP_AT(patch_weight)},
+    {"embeddings.patch_embedding.bias", "d", GSF__BLIP_AT(patch_bias)},
+    {"post_layernorm.weight", "d", GSF__BLIP_AT(norm_weight)},
+    {"post_layernorm.bias", "d", GSF__BLIP_AT(norm_bias)},
+};
+#undef GSF__BLIP_AT
+
+// PREFIX.weight (out, in), or (out) with in = 0, and PREFIX.bias (out).
+static gsf_result gsf__blip_bind_pair(gsf__nn_loader* loader, const char* prefix, const char* name, int64_t out, int64_t in,
+                                      const gsf_tensor** weight, const gsf_tensor** bias) {
+    const int64_t shape[2] = {out, in};
+    GSF__TRY(gsf__nn_need(loader, weight, in ? 2 : 1, shape, "%s%s.weight", prefix, name));
+    return gsf__nn_need(loader, bias, 1, shape, "%s%s.bias", prefix, name);
+}
+
+static gsf_result gsf__qformer_bind_attention(gsf__nn_loader* loader, const char* layer, const char* name, int64_t width,
+                                              int64_t source, gsf__qformer_attention* a) {
+    char prefix[112];
+    snprintf(prefix, sizeof prefix, "%s%s.", layer, name);
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.query", width, width, &a->q_weight, &a->q_bias));
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.key", width, source, &a->k_weight, &a->k_bias));
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.value", width, source, &a->v_weight, &a->v_bias));
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output.dense", width, width, &a->out_weight, &a->out_bias));
+    return gsf__blip_bind_pair(loader, prefix, "output.LayerNorm", width, 0, &a->norm_weight, &a->norm_bias);
+}
+
+static gsf_result gsf__qformer_bind(gsf__nn_loader* loader, gsf__qformer* q, int64_t source) {
+    const int64_t d = q->width, tokens[3] = {1, q->queries, d};
+    GSF__TRY(gsf__nn_need(loader, &q->tokens, 3, tokens, "query_tokens"));
+    GSF__TRY(gsf__blip_bind_pair(loader, "qformer.", "layernorm", d, 0, &q->norm_weight, &q->norm_bias));
+    q->all = (gsf__qformer_layer*)gsf_alloc_zeroed(loader->ctx, (size_t)q->layers, sizeof *q->all);
+    if (!q->all) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t i = 0; i < q->layers; i++) {
+        gsf__qformer_layer* l = &q->all[i];
+        char prefix[64], unused[96];
+        snprintf(prefix, sizeof prefix, "qformer.encoder.layer.%lld.", (long long)i);
+        GSF__TRY(gsf__qformer_bind_attention(loader, prefix, "attention", d, d, &l->self));
+        if (i % q->cross_every == 0)
+            GSF__TRY(gsf__qformer_bind_attention(loader, prefix, "crossattention", d, source, &l->cross));
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "intermediate_query.dense", q->mlp, d, &l->up_weight, &l->up_bias));
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output_query.dense", d, q->mlp, &l->down_weight, &l->down_bias));
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output_query.LayerNorm", d, 0, &l->norm_weight, &l->norm_bias));
+        for (int k = 0; k < 2 && q->text_input; k++) {
+            snprintf(unused, sizeof unused, "%s%s", prefix, k ? "output." : "intermediate.");
+            gsf__nn_ignore(loader, unused);
+        }
+    }
+    if (q->text_input) gsf__nn_ignore(loader, "embeddings.");
+    return GSF_OK;
+}
+
+static gsf_result gsf__opt_bind(gsf__nn_loader* loader, gsf__opt* opt) {
+    const int64_t d = opt->sizes.width, words[2] = {opt->vocabulary, d}, places[2] = {opt->positions + GSF__OPT_OFFSET, d};
+    static const char prefix[] = "language_model.model.decoder.";
+    GSF__TRY(gsf__nn_need(loader, &opt->tokens, 2, words, "%sembed_tokens.weight", prefix));
+    GSF__TRY(gsf__nn_need(loader, &opt->places, 2, places, "%sembed_positions.weight", prefix));
+    if (!opt->no_final_norm)
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "final_layer_norm", d, 0, &opt->norm_weight, &opt->norm_bias));
+    opt->head = opt->tokens;
+    if (opt->own_head) GSF__TRY(gsf__nn_need(loader, &opt->head, 2, words, "language_model.lm_head.weight"));
+    else gsf__nn_ignore(loader, "language_model.lm_head."); // the words again
+    return gsf__vit_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, GSF__COUNT(gsf__opt_block_entries),
+                                "language_model.model.decoder.layers.", opt->layers, &opt->blocks);
+}
+
+static gsf_result gsf__blip_bind(gsf_context* ctx, gsf_nn_captioner* out, gsf__blip* net) {
+    gsf__nn_loader loader;
+    gsf__vit* vit = &net->vision;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
+    gsf_result result = gsf__vit_bind(&loader, &vit->sizes, vit, gsf__blip_entries, GSF__COUNT(gsf__blip_entries),
+                                      "vision_model.", vit);
+    vit->register_tokens = vit->class_token; // there are none
+    if (!result)
+        result = gsf__vit_bind_blocks(&loader, &vit->sizes, gsf__blip_block_entries, GSF__COUNT(gsf__blip_block_entries),
+                                      vit->block_names, vit->layers, &vit->blocks);
+    if (!result) result = gsf__qformer_bind(&loader, &net->qformer, vit->sizes.width);
+    if (!result)
+        result = gsf__blip_bind_pair(&loader, "", "language_projection", net->text.sizes.width, net->qformer.width,
+                                     &net->projection_weight, &net->projection_bias);
+    if (!result) result = gsf__opt_bind(&loader, &net->text);
+    return gsf__nn_end_loading(&loader, result);
+}
+
+GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner) {
+    gsf__blip* net = (gsf__blip*)captioner->nets;
+    if (net) {
+        gsf_free(ctx, net->vision.blocks);
+        gsf_free(ctx, net->qformer.all);
+        gsf_free(ctx, net->text.blocks);
+    }
+    gsf_free(ctx, net);
+    gsf_nn_destroy_bpe(ctx, &captioner->tokenizer);
+    gsf_nn_close_weights(ctx, &captioner->weights);
+    memset(captioner, 0, sizeof *captioner);
+}
+
+static gsf_result gsf__blip_load_config(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* file) {
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
+    const gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, file);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out) {
+    gsf__nn_config file;
+    memset(out, 0, sizeof *out);
+    gsf__blip* net = (gsf__blip*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
+    if (!net) return GSF_ERROR_OUT_OF_MEMORY;
+    out->nets = net;
+    gsf_result result = gsf__blip_load_config(ctx, folder, "config.json", &file);
+    if (!result) {
+        result = gsf__blip_read_config(&file, net, out);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) {
+        result = gsf__blip_load_config(ctx, folder, "preprocessor_config.json", &file);
+        if (!result) result = gsf__blip_read_processor(&file, net);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) result = gsf_nn_make_bpe(ctx, folder, &out->tokenizer);
+    if (!result) result = gsf_nn_open_weights(ctx, folder, "model", &out->weights);
+    if (!result) result = gsf__blip_bind(ctx, out, net);
+    out->image_size = (int32_t)net->image_size;
+    out->query_tokens = (int32_t)net->qformer.queries;
+    out->vocabulary = (int32_t)net->text.vocabulary;
+    out->positions = (int32_t)net->text.positions;
+    if (result) gsf_nn_destroy_captioner(ctx, out);
+    return result;
+}
+
+// ---- captioner: from the image to the queries' words
+
+typedef struct gsf__caption_run {
+    gsf__vit_run vit;  // scratch, progress
+    const gsf_nn_captioner* captioner;
+    const gsf__blip* net;
+    const gsf_nn_caption_desc* desc;
+} gsf__caption_run;
+
+static void gsf__caption_tap(const gsf__caption_run* run, const char* name, const float* data, int64_t rows,
+                             int64_t columns) {
+    if (run->desc->tap_fn) run->desc->tap_fn(run->desc->tap_user, name, data, rows, columns);
+}
+
+// After a layer: a value that is not finite is named with the tensors below `prefix`; cancel, progress.
+static gsf_result gsf__caption_step(gsf__caption_run* run, const char* prefix, int64_t index, const float* x,
+                                    int64_t count) {
+    char name[96];
+    snprintf(name, sizeof name, "%s%lld.", prefix, (long long)index);
+    GSF__TRY(gsf__vit_check(&run->vit, name, x, count));
+    gsf__progress(run->vit.ctx, run->vit.name, ++run->vit.done, run->vit.steps);
+    return gsf__check_cancel(run->vit.ctx);
+}
+
+// The image, resized as PIL does it, as normalised floats (3, image_size, image_size).
+static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const gsf_image* image, float* out) {
+    const int64_t side = net->image_size;
+    gsf_image coloured, small;
+    memset(&coloured, 0, sizeof coloured);
+    memset(&small, 0, sizeof small);
+    const int ready = image->dtype == GSF_U8 && image->channels == 3;
+    gsf_result result = gsf_make_image(ctx, GSF_U8, side, side, 3, &small);
+    if (!result && !ready) result = gsf_make_image(ctx, GSF_U8, image->width, image->height, 3, &coloured);
+    if (!result && !ready) result = gsf_convert_image(ctx, image, &coloured);
+    if (!result) result = gsf_resize_image(ctx, ready ? image : &coloured, net->filter, &small);
+    for (int64_t y = 0; y < side && !result; y++)
+        for (int64_t x = 0; x < side; x++)
+            for (int64_t c = 0; c < 3; c++) {
+                const uint8_t v = ((const uint8_t*)small.data)[(y * side + x) * 3 + c];
+                out[(c * side + y) * side + x] = ((float)((double)v * net->rescale) - net->mean[c]) / net->deviation[c];
+            }
+    gsf_destroy_image(ctx, &coloured);
+    gsf_destroy_image(ctx, &small);
+    return result;
+}
+
+// Tokens of the image: out (1 + patches, width), after the last norm.
+static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, float* out) {
+    const gsf__vit* vit = &run->net->vision;
+    gsf_context* ctx = run->vit.ctx;
+    const int64_t d = vit->sizes.width;
+    gsf_nn_encoder_input in;
+    float* memory = NULL;
+    memset(&in, 0, sizeof in);
+    in.pixels = pixels;
+    in.images = 1;
+    in.height = in.width = (int32_t)run->net->image_size;
+    const gsf__vit_plan plan = gsf__vit_plan_of(vit, &in);
+    gsf_result result = gsf__vit_open_run(ctx, vit, &in, &plan, &run->vit, &memory);
+    float* x = memory + plan.positions;
+    if (!result) result = gsf__vit_forward(&run->vit, vit, &in, 0, 1, 0, memory, x);
+    if (!result) {
+        gsf_nn_layer_norm(ctx, x, plan.tokens, d, gsf__vit_vector(&run->vit, vit->norm_weight),
+                          gsf__vit_vector(&run->vit, vit->norm_bias), vit->sizes.eps, out);
+        result = gsf__vit_check(&run->vit, "vision_model.post_layernorm.", out, plan.tokens * d);
+    }
+    if (!result) gsf__caption_tap(run, "vision", out, plan.tokens, d);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// x (queries, width) = norm(x + dense(h)), in place.
+static gsf_result gsf__qformer_add(gsf__caption_run* run, const float* h, const gsf_tensor* weight, const gsf_tensor* bias,
+                                   const gsf_tensor* norm_weight, const gsf_tensor* norm_bias, float* x) {
+    const gsf__qformer* q = &run->net->qformer;
+    GSF__TRY(gsf__vit_add(&run->vit, h, q->queries, weight, bias, NULL, x));
+    run->vit.vectors_used = 0;
+    gsf_nn_layer_norm(run->vit.ctx, x, q->queries, q->width, gsf__vit_vector(&run->vit, norm_weight),
+                      gsf__vit_vector(&run->vit, norm_bias), q->eps, x);
+    return GSF_OK;
+}
+
+// The queries x look at `rows` rows of `from`. scratch: q (queries, width), then k and v (rows, width).
+static gsf_result gsf__qformer_attend(gsf__caption_run* run, const gsf__qformer_attention* a, const float* from,
+                                      int64_t rows, float* scratch, float* x) {
+    const gsf__qformer* q = &run->net->qformer;
+    const int64_t d = q->width;
+    float *k = scratch + q->queries * d, *v = k + rows * d;
+    GSF__TRY(gsf__vit_linear(&run->vit, x, q->queries, a->q_weight, a->q_bias, GSF_NN_LINEAR, scratch, 0));
+    GSF__TRY(gsf__vit_linear(&run->vit, from, rows, a->k_weight, a->k_bias, GSF_NN_LINEAR, k, 0));
+    GSF__TRY(gsf__vit_linear(&run->vit, from, rows, a->v_weight, a->v_bias, GSF_NN_LINEAR, v, 0));
+    gsf_nn_attention_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.queries = q->queries;
+    desc.keys = rows;
+    desc.heads = q->heads;
+    desc.head_dim = (int32_t)(d / q->heads);
+    desc.q = desc.out = scratch;
+    desc.k = k;
+    desc.v = v;
+    GSF__TRY(gsf_nn_attention(run->vit.ctx, &run->vit.workspace, &desc));
+    return gsf__qformer_add(run, scratch, a->out_weight, a->out_bias, a->norm_weight, a->norm_bias, x);
+}
+
+static size_t gsf__qformer_floats(const gsf__blip* net) { // x; scratch; two vectors
+    const gsf__qformer* q = &net->qformer;
+    const size_t d = (size_t)q->width, n = (size_t)q->queries, seen = (size_t)(net->vision.grid * net->vision.grid + 1);
+    const size_t attention = n * d + 2 * (seen > n ? seen : n) * d, hidden = n * (size_t)q->mlp;
+    return n * d + (attention > hidden ? attention : hidden) + 2 * d;
+}
+
+// What the queries find in the image's tokens, as words of the language model: out (queries, text width).
+static gsf_result gsf__qformer_ask(gsf__caption_run* run, const float* image, float* out) {
+    const gsf__qformer* q = &run->net->qformer;
+    gsf_context* ctx = run->vit.ctx;
+    const int64_t d = q->width, seen = run->net->vision.grid * run->net->vision.grid + 1;
+    const size_t floats = gsf__qformer_floats(run->net);
+    float* x = (float*)gsf_alloc(ctx, floats, sizeof(float));
+    if (!x) return GSF_ERROR_OUT_OF_MEMORY;
+    float* scratch = x + q->queries * d;
+    run->vit.vectors_size = (size_t)(2 * d);
+    run->vit.vectors = x + floats - run->vit.vectors_size;
+    run->vit.vectors_used = 0;
+    gsf_nn_read_tensor(q->tokens, 0, q->queries * d, x);
+    gsf_nn_layer_norm(ctx, x, q->queries, d, gsf__vit_vector(&run->vit, q->norm_weight),
+                      gsf__vit_vector(&run->vit, q->norm_bias), q->eps, x);
+    gsf_result result = gsf__vit_check(&run->vit, "query_tokens", x, q->queries * d);
+    for (int64_t i = 0; i < q->layers && !result; i++) {
+        const gsf__qformer_layer* l = &q->all[i];
+        result = gsf__qformer_attend(run, &l->self, x, q->queries, scratch, x);
+        if (!result && l->cross.q_weight) result = gsf__qformer_attend(run, &l->cross, image, seen, scratch, x);
+        if (!result)
+            result = gsf__vit_linear(&run->vit, x, q->queries, l->up_weight, l->up_bias, q->activation, scratch, 0);
+        if (!result)
+            result = gsf__qformer_add(run, scratch, l->down_weight, l->down_bias, l->norm_weight, l->norm_bias, x);
+        if (!result) result = gsf__caption_step(run, "qformer.encoder.layer.", i, x, q->queries * d);
+    }
+    if (!result) gsf__caption_tap(run, "qformer", x, q->queries, d);
+    if (!result)
+        result = gsf__vit_linear(&run->vit, x, q->queries, run->net->projection_weight, run->net->projection_bias,
+                                 GSF_NN_LINEAR, out, 0);
+    if (!result)
+        result = gsf__vit_check(&run->vit, "language_projection.", out, q->queries * run->net->text.sizes.width);
+    if (!result) gsf__caption_tap(run, "projection", out, q->queries, run->net->text.sizes.width);
+    gsf_free(ctx, x);
+    return result;
+}
+
+// ---- captioner: the language model
+
+typedef struct gsf__opt_run {
+    int64_t capacity, past; // rows of the cache; of these in use
+    float *keys, *values;   // (layers, capacity, width)
+    float *x, *logits;      // (rows, width); (vocabulary), or with a tap (rows, vocabulary)
+    unsigned char* mask;    // (heads, rows, rows): a token sees itself and those before
+} gsf__opt_run;
+
+typedef struct gsf__opt_plan { // floats, but for `mask`
+    size_t cache, x, normed, wide, vectors, logits, mask;
+} gsf__opt_plan;
+
+static gsf__opt_plan gsf__opt_plan_of(const gsf__opt* opt, int64_t rows, int64_t capacity, int64_t logits) {
+    gsf__opt_plan p;
+    const size_t d = (size_t)opt->sizes.width, n = (size_t)rows;
+    p.cache = (size_t)opt->layers * (size_t)capacity * d;
+    p.x = p.normed = n * d;
+    p.wide = gsf__vit_wide(&opt->sizes, rows);
+    p.vectors = 4 * d;
+    p.logits = (size_t)logits * (size_t)opt->vocabulary;
+    p.mask = (size_t)opt->sizes.heads * n * n;
+    return p;
+}
+
+static size_t gsf__opt_floats(const gsf__opt_plan* p) {
+    return 2 * p->cache + p->x + p->normed + p->wide + p->vectors + p->logits + (p->mask + 3) / 4;
+}
+
+// x (count, width): words, those of `ids` unless it is NULL and they are there, at the places from `place` on.
+static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t count, int64_t place, float* scratch,
+                           float* x) {
+    const int64_t d = opt->sizes.width;
+    for (int64_t i = 0; i < count; i++) {
+        if (ids) gsf_nn_read_tensor(opt->tokens, ids[i] * d, d, x + i * d);
+        gsf_nn_read_tensor(opt->places, (place + i + GSF__OPT_OFFSET) * d, d, scratch);
+        for (int64_t k = 0; k < d; k++) x[i * d + k] += scratch[k];
+    }
+}
+
+// One layer on the rows of x, which follow the `past` ones whose keys and values are in the cache.
+static gsf_result gsf__opt_block(gsf__caption_run* run, gsf__opt_run* o, int64_t layer, int64_t rows) {
+    const gsf__opt* opt = &run->net->text;
+    const gsf__vit_block* b = &opt->blocks[layer];
+    gsf__vit_run* v = &run->vit;
+    const int64_t d = opt->sizes.width, at = layer * o->capacity * d, fresh = at + o->past * d;
+    v->vectors_used = 0;
+    gsf_nn_layer_norm(v->ctx, o->x, rows, d, gsf__vit_vector(v, b->norm1_weight), gsf__vit_vector(v, b->norm1_bias),
+                      opt->sizes.eps, v->normed);
+    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->q_weight, b->q_bias, GSF_NN_LINEAR, v->wide, 0));
+    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->k_weight, b->k_bias, GSF_NN_LINEAR, o->keys + fresh, 0));
+    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->v_weight, b->v_bias, GSF_NN_LINEAR, o->values + fresh, 0));
+    gsf_nn_attention_desc a;
+    memset(&a, 0, sizeof a);
+    a.queries = rows;
+    a.keys = o->past + rows;
+    a.heads = opt->sizes.heads;
+    a.head_dim = opt->sizes.head_dim;
+    a.q = a.out = v->wide;
+    a.k = o->keys + at;
+    a.v = o->values + at;
+    a.mask = rows > 1 ? o->mask : NULL;
+    GSF__TRY(gsf_nn_attention(v->ctx, &v->workspace, &a));
+    GSF__TRY(gsf__vit_add(v, v->wide, rows, b->out_weight, b->out_bias, NULL, o->x));
+    gsf_nn_layer_norm(v->ctx, o->x, rows, d, gsf__vit_vector(v, b->norm2_weight), gsf__vit_vector(v, b->norm2_bias),
+                      opt->sizes.eps, v->normed);
+    return gsf__vit_feed_forward(v, b, NULL, o->x, rows);
+}
+
+// All layers on the rows of x; then o->logits has those of the last row, with a tap and several rows those of all.
+static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64_t rows) {
+    const gsf__opt* opt = &run->net->text;
+    gsf__vit_run* v = &run->vit;
+    const int64_t d = opt->sizes.width, shown = run->desc->tap_fn && rows > 1 ? rows : 1;
+    for (int64_t layer = 0; layer < opt->layers; layer++) {
+        GSF__TRY(gsf__opt_block(run, o, layer, rows));
+        GSF__TRY(gsf__caption_step(run, "language_model.model.decoder.layers.", layer, o->x, rows * d));
+    }
+    o->past += rows;
+    const float* last = o->x + (rows - shown) * d;
+    v->vectors_used = 0;
+    if (!opt->no_final_norm) {
+        gsf_nn_layer_norm(v->ctx, last, shown, d, gsf__vit_vector(v, opt->norm_weight), gsf__vit_vector(v, opt->norm_bias),
+                          opt->sizes.eps, v->normed);
+        last = v->normed;
+    }
+    GSF__TRY(gsf__vit_linear(v, last, shown, opt->head, NULL, GSF_NN_LINEAR, o->logits, 0));
+    GSF__TRY(gsf__vit_check(v, "language_model.", o->logits, shown * opt->vocabulary));
+    if (rows > 1) gsf__caption_tap(run, "logits", o->logits, shown, opt->vocabulary);
+    if (shown > 1) memmove(o->logits, o->logits + (shown - 1) * opt->vocabulary, (size_t)opt->vocabulary * sizeof(float));
+    return GSF_OK;
+}
+
+// Greedy continuation of the queries' words and the text's ids, which x holds already without places.
+static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int64_t rows, int32_t most, int32_t* ids,
+                                    size_t* count) {
+    const gsf__opt* opt = &run->net->text;
+    for (int64_t h = 0; h < opt->sizes.heads; h++)
+        for (int64_t r = 0; r < rows; r++)
+            for (int64_t k = 0; k < rows; k++) o->mask[(h * rows + r) * rows + k] = k <= r;
+    gsf__opt_embed(opt, NULL, rows, 0, run->vit.normed, o->x);
+    GSF__TRY(gsf__opt_forward(run, o, rows));
+    for (;;) {
+        int32_t best = 0;
+        for (int64_t i = 1; i < opt->vocabulary; i++)
+            if (o->logits[i] > o->logits[best]) best = (int32_t)i;
+        ids[(*count)++] = best;
+        if (best == run->captioner->eos || *count == (size_t)most) break;
+        gsf__opt_embed(opt, &best, 1, o->past, run->vit.normed, o->x);
+        GSF__TRY(gsf__opt_forward(run, o, 1));
+    }
+    gsf__progress(run->vit.ctx, run->vit.name, run->vit.steps, run->vit.steps);
+    return GSF_OK;
+}
+
+// `words` (queries, width) and the text's ids are given; *count of at most `most` new ids go to `ids`.
+static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, const int32_t* text, size_t text_count,
+                                 int32_t most, int32_t* ids, size_t* count) {
+    const gsf__opt* opt = &run->net->text;
+    gsf_context* ctx = run->vit.ctx;
+    const int64_t d = opt->sizes.width, queries = run->net->qformer.queries, rows = queries + (int64_t)text_count;
+    gsf__opt_run o;
+    memset(&o, 0, sizeof o);
+    o.capacity = rows + most - 1;
+    const gsf__opt_plan p = gsf__opt_plan_of(opt, rows, o.capacity, run->desc->tap_fn ? rows : 1);
+    float* memory = (float*)gsf_alloc(ctx, gsf__opt_floats(&p), sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    o.keys = memory;
+    o.values = o.keys + p.cache;
+    o.x = o.values + p.cache;
+    o.logits = o.x + p.x;
+    run->vit.sizes = &opt->sizes;
+    run->vit.normed = o.logits + p.logits;
+    run->vit.wide = run->vit.normed + p.normed;
+    run->vit.wide_count = (int64_t)p.wide;
+    run->vit.vectors = run->vit.wide + p.wide;
+    run->vit.vectors_size = p.vectors;
+    o.mask = (unsigned char*)(run->vit.vectors + p.vectors);
+    memcpy(o.x, words, (size_t)(queries * d) * sizeof(float));
+    for (int64_t i = 0; i < (int64_t)text_count; i++)
+        gsf_nn_read_tensor(opt->tokens, text[i] * d, d, o.x + (queries + i) * d);
+    const gsf_result result = gsf__opt_continue(run, &o, rows, most, ids, count);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// ---- captioner: all of it
+
+// Ids of the text behind the queries' words: bos alone, or what the tokenizer makes of the prompt.
+static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* captioner, const char* prompt, int32_t** ids,
+                                    size_t* count) {
+    *ids = NULL;
+    *count = 0;
+    if (!prompt) {
+        *ids = (int32_t*)gsf_alloc(ctx, 1, sizeof **ids);
+        if (!*ids) return GSF_ERROR_OUT_OF_MEMORY;
+        (*ids)[(*count)++] = captioner->bos;
+        return GSF_OK;
+    }
+    GSF__TRY(gsf_nn_encode_bpe(ctx, &captioner->tokenizer, prompt, strlen(prompt), 0, ids, count));
+    gsf_result result = GSF_OK;
+    if (!*count) result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt has no token");
+    for (size_t i = 0; i < *count && !result; i++) {
+        if ((*ids)[i] >= captioner->vocabulary)
+            result = gsf_fail(ctx, GSF_ERROR_FORMAT, "caption: the tokenizer gives id %d, but the model has %d words",
+                              (int)(*ids)[i], (int)captioner->vocabulary);
+        else if ((*ids)[i] == captioner->image_token)
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt holds the image's token");
+    }
+    if (!result) return GSF_OK;
+    gsf_free(ctx, *ids);
+    *ids = NULL;
+    *count = 0;
+    return result;
+}
+
+// New tokens at most. The default of a folder without image_token_index is what the official code makes of its limit of 20
+// tokens in all: the text counts twice.
+static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t wanted) {
+    if (wanted > 0) return wanted;
+    return captioner->image_token >= 0 ? GSF__CAPTION_TOKENS : GSF__CAPTION_TOKENS - 1 - 2 * text_tokens;
+}
+
+static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
+                                     int64_t text_tokens, int64_t* most) {
+    if (!desc->image || !desc->image->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: no image");
+    *most = gsf__caption_most(captioner, text_tokens, desc->max_new_tokens);
+    if (*most < 1 || desc->max_new_tokens < 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "caption: max_new_tokens is %d, and %lld tokens of text leave no room for new ones",
+                        (int)desc->max_new_tokens, (long long)text_tokens);
+    const int64_t places = captioner->query_tokens + text_tokens + *most - 1;
+    if (places > captioner->positions)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: %lld tokens, but the model has %d positions",
+                        (long long)places, (int)captioner->positions);
+    return GSF_OK;
+}
+
+static gsf_result gsf__caption_write(gsf__caption_run* run, const int32_t* text, size_t text_count, int64_t most,
+                                     int32_t* ids, size_t* count) {
+    const gsf__blip* net = run->net;
+    gsf_context* ctx = run->vit.ctx;
+    const size_t pixels = (size_t)(3 * net->image_size * net->image_size);
+    const size_t seen = (size_t)((net->vision.grid * net->vision.grid + 1) * net->vision.sizes.width);
+    float* words = (float*)gsf_alloc(ctx, (size_t)(net->qformer.queries * net->text.sizes.width), sizeof(float));
+    float* image = (float*)gsf_alloc(ctx, pixels + seen, sizeof(float));
+    gsf_result result = words && image ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    run->vit.steps = (double)(net->vision.layers + net->qformer.layers + net->text.layers * most);
+    if (!result) result = gsf__blip_pixels(ctx, net, run->desc->image, image);
+    if (!result) gsf__caption_tap(run, "pixel_values", image, 3, net->image_size * net->image_size);
+    if (!result) result = gsf__blip_look(run, image, image + pixels);
+    if (!result) result = gsf__qformer_ask(run, image + pixels, words);
+    gsf_free(ctx, image);
+    if (!result) result = gsf__opt_write(run, words, text, text_count, (int32_t)most, ids, count);
+    gsf_free(ctx, words);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
+                                      int32_t** ids, size_t* count) {
+    gsf__caption_run run;
+    int32_t* text;
+    size_t text_count;
+    int64_t most = 0;
+    *ids = NULL;
+    *count = 0;
+    memset(&run, 0, sizeof run);
+    run.vit.ctx = ctx;
+    run.vit.name = "caption";
+    run.vit.weights = &captioner->weights;
+    run.captioner = captioner;
+    run.net = (const gsf__blip*)captioner->nets;
+    run.desc = desc;
+    GSF__TRY(gsf__caption_text(ctx, captioner, desc->prompt, &text, &text_count));
+    gsf_result result = gsf__caption_check(ctx, captioner, desc, (int64_t)text_count, &most);
+    if (!result) {
+        *ids = (int32_t*)gsf_alloc(ctx, (size_t)most, sizeof **ids);
+        result = *ids ? gsf__caption_write(&run, text, text_count, most, *ids, count) : GSF_ERROR_OUT_OF_MEMORY;
+    }
+    gsf_nn_destroy_workspace(ctx, &run.vit.workspace);
+    gsf_free(ctx, text);
+    if (!result) return GSF_OK;
+    gsf_free(ctx, *ids);
+    *ids = NULL;
+    *count = 0;
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
+                                  const char* prompt, int32_t max_new_tokens, char* out, size_t size) {
+    gsf_nn_caption_desc desc;
+    gsf_text text;
+    int32_t* ids;
+    size_t count, begin = 0;
+    if (!out || !size) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: no room for the text");
+    out[0] = 0;
+    memset(&desc, 0, sizeof desc);
+    memset(&text, 0, sizeof text);
+    desc.image = image;
+    desc.prompt = prompt;
+    desc.max_new_tokens = max_new_tokens;
+    GSF__TRY(gsf_nn_caption_ids(ctx, captioner, &desc, &ids, &count));
+    const gsf_result result = gsf_nn_decode_bpe(ctx, &captioner->tokenizer, ids, count, 1, &text);
+    size_t end = text.size, used = 0;
+    if (!result) gsf__bpe_strip((const gsf__bpe_tables*)captioner->tokenizer.tables, text.data, 1, 1, &begin, &end);
+    for (size_t step; !result && begin < end; begin += step) { // whole characters; U+FFFD for a zero byte
+        step = gsf__utf8_size(text.data + begin, end - begin);
+        const int zero = text.data[begin] == 0;
+        if (used + (zero ? 3 : step) >= size) break;
+        memcpy(out + used, zero ? "\xef\xbf\xbd" : text.data + begin, zero ? 3 : step);
+        used += zero ? 3 : step;
+    }
+    out[used] = 0;
+    gsf_destroy_text(ctx, &text);
+    gsf_free(ctx, ids);
+    return result;
+}
+
+GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
+                                 double* bytes, double* flops) {
+    const gsf__blip* net = (const gsf__blip*)captioner->nets;
+    const gsf__qformer* q = &net->qformer;
+    const gsf__opt* opt = &net->text;
+    gsf_nn_encoder_input in;
+    memset(&in, 0, sizeof in);
+    in.images = 1;
+    in.height = in.width = (int32_t)net->image_size;
+    if (text_tokens < 1) text_tokens = 1;
+    int64_t most = gsf__caption_most(captioner, text_tokens, max_new_tokens);
+    if (most < 1) most = 1;
+    const gsf__vit_plan vision = gsf__vit_plan_of(&net->vision, &in);
+    const int64_t rows = q->queries + text_tokens;
+    const gsf__opt_plan text = gsf__opt_plan_of(opt, rows, rows + most - 1, 1);
+    const double words = 4.0 * (double)q->queries * (double)opt->sizes.width;
+    const double image = 12.0 * (double)net->image_size * (double)net->image_size +
+                         4.0 * (double)vision.tokens * (double)net->vision.sizes.width;
+    const double look = image + gsf__vit_bytes(&vision), ask = image + 4.0 * (double)gsf__qformer_floats(net);
+    const double write = 4.0 * (double)gsf__opt_floats(&text), first = look > ask ? look : ask;
+    if (bytes) *bytes = words + (first > write ? first : write);
+    const double d = (double)q->width, n = (double)q->queries, seen = (double)vision.tokens;
+    const double crossing = (double)gsf__ceil_div(q->layers, q->cross_every);
+    const double self = 8.0 * n * d * d + 4.0 * n * n * d + 4.0 * n * d * (double)q->mlp;
+    const double cross = 4.0 * n * d * d + 4.0 * seen * d * (double)net->vision.sizes.width + 4.0 * n * seen * d;
+    const double w = (double)opt->sizes.width, all = (double)(rows + most - 1);
+    const double row = 2.0 * w * (4.0 * w + 2.0 * (double)opt->sizes.mlp), layers = (double)opt->layers;
+    if (flops)
+        *flops = gsf__vit_flops(&net->vision, &vision, 1.0) + (double)q->layers * self + crossing * cross +
+                 2.0 * n * d * w + layers * (all * row + 2.0 * all * all * w) +
+                 2.0 * (double)most * w * (double)opt->vocabulary;
 }
 
 // ---- >>nn restorer --------------------------------------------------------------
