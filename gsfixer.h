@@ -2271,7 +2271,8 @@ GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_
 // ---- >>resize ------------------------------------------------------------------
 // What PIL.Image.resize does (Pillow's Resample.c): the filter is widened by the shrink factor and sampled at pixel
 // centres, weights are normalised in double, then rounded to 22-bit fixed point for u8; first along x,
-// rounded to u8 again, then along y. An axis whose size stays is left alone.
+// rounded to u8 again, then along y, or, as Pillow 13 does it, the other way round where the height shrinks by more than
+// twice the pixels that the width does. An axis whose size stays is left alone.
 
 enum { GSF__PIL_BITS = 32 - 8 - 2, GSF__RESIZE_RUN = 256 };
 
@@ -2437,7 +2438,7 @@ static gsf_result gsf__resize_pil(gsf_context* ctx, const gsf_image* src, gsf_re
                                   const gsf_image* dst) {
     gsf__resize_axis ax, ay;
     memset(&ay, 0, sizeof ay);
-    gsf_image middle; // src at the new width
+    gsf_image middle; // src at the new width or height
     memset(&middle, 0, sizeof middle);
     gsf_result result = gsf__make_pil_axis(ctx, filter, src->width, dst->width, &ax);
     if (result == GSF_OK) result = gsf__make_pil_axis(ctx, filter, src->height, dst->height, &ay);
@@ -2449,10 +2450,13 @@ static gsf_result gsf__resize_pil(gsf_context* ctx, const gsf_image* src, gsf_re
     } else if (!ax.owned) {
         gsf__resize_pass(ctx, gsf__resize_rows_y, src, dst, &ay);
     } else {
-        result = gsf_make_image(ctx, src->dtype, dst->width, src->height, src->channels, &middle);
+        const int64_t less = src->height - dst->height;
+        const int y_first = less > 0 && less > 2 * (src->width - dst->width);
+        result = gsf_make_image(ctx, src->dtype, y_first ? src->width : dst->width, y_first ? dst->height : src->height,
+                                src->channels, &middle);
         if (result != GSF_OK) goto cleanup;
-        gsf__resize_pass(ctx, gsf__resize_rows_x, src, &middle, &ax);
-        gsf__resize_pass(ctx, gsf__resize_rows_y, &middle, dst, &ay);
+        gsf__resize_pass(ctx, y_first ? gsf__resize_rows_y : gsf__resize_rows_x, src, &middle, y_first ? &ay : &ax);
+        gsf__resize_pass(ctx, y_first ? gsf__resize_rows_x : gsf__resize_rows_y, &middle, dst, y_first ? &ax : &ay);
     }
 cleanup:
     gsf_destroy_image(ctx, &middle);

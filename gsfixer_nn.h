@@ -40,7 +40,7 @@
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
-               >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn restorer
+               >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn bpe >>nn captioner >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -637,6 +637,81 @@ typedef struct gsf_nn_cost { double bytes, flops; } gsf_nn_cost; // anonymous me
 GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                     const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
                                                     gsf_nn_cost* out);
+
+// ---- tokens: byte-level pair encoding -----------------------------------------------
+// What GPT-2 and OPT read, as transformers 4.51.3 does it (GPT2Tokenizer).
+
+typedef struct gsf_nn_bpe {     // an open tokenizer
+    int32_t bos, eos, unk, pad; // ids, -1: none
+    int32_t highest_id;
+    int add_bos;                // texts begin with `bos`
+    void* tables;               // private
+} gsf_nn_bpe;
+
+// Opens FOLDER/vocab.json and merges.txt and, where they are there, tokenizer_config.json, special_tokens_map.json and
+// added_tokens.json. What is malformed, or names a token that there is not, gives GSF_ERROR_FORMAT with file and place.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
+GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe);
+
+// Ids of a text of `size` bytes, which must be UTF-8; *ids is freed with gsf_free. `no_bos` leaves the first token out even
+// where add_bos says otherwise. Time n log n whatever the text. Any number of threads, each with its context, may use one
+// tokenizer.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
+                                                   int no_bos, int32_t** ids, size_t* count);
+// Appends the text of `count` ids to `out`, which may come to hold zero bytes; bytes that are no UTF-8 become U+FFFD.
+// Ids that no token has are left out, with `skip_special` the special tokens (bos, eos, pad, <image> ...) as well.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
+                                                   size_t count, int skip_special, gsf_text* out);
+
+// ---- captions ------------------------------------------------------------------------
+// BLIP-2 with OPT, which says in a few words what an image shows (transformers 4.51.3, Blip2ForConditionalGeneration). The
+// restorer's prompt begins with such a caption.
+
+typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
+    int32_t image_size;           // side of the square that images are resized to, whatever their shape
+    int32_t query_tokens;         // words that stand for the image
+    int32_t vocabulary, positions; // of the language model: words, and the most tokens of image, prompt and caption
+    int32_t bos, eos;             // begins a caption without prompt; ends every caption
+    int32_t image_token;          // "image_token_index"; -1: an older folder without it, whose default length is less
+    gsf_nn_bpe tokenizer;
+    gsf_nn_weights weights;
+    void* nets;                   // private
+} gsf_nn_captioner;
+
+// Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_make_bpe) and
+// model*.safetensors in f32, bf16 or f16, which are computed with in float32. Keys that are absent have the defaults of
+// transformers. Missing, misshaped and surplus tensors are named (GSF_ERROR_FORMAT), as is what this code does not do
+// (GSF_ERROR_UNSUPPORTED): another language model than OPT, norms behind the layers (do_layer_norm_before false).
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
+GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner);
+
+// The caption of an image (1, 3 or 4 channels, any dtype; alpha is left out) as zero-terminated UTF-8 without white space
+// at its ends. With a prompt, it goes on from there, and the prompt is not repeated; NULL: none. At most `max_new_tokens`
+// tokens, 0: 20 (older folders: 17, or 19 less two for each token of the prompt), the most likely one each time. The
+// text is cut behind a whole character where it does not fit `size` bytes; a zero byte in it becomes U+FFFD.
+// A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the tensor's or layer's name. Progress and
+// cancel after every layer. Any number of threads, each with its context, may use one captioner.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
+                                                const char* prompt, int32_t max_new_tokens, char* out, size_t size);
+
+typedef struct gsf_nn_caption_desc {
+    const gsf_image* image;
+    const char* prompt;     // NULL: none
+    int32_t max_new_tokens; // 0: as gsf_nn_caption
+    // Shown every intermediate: "pixel_values" (3, pixels), "vision" (tokens, width), "qformer", "projection", "logits" of
+    // the prompt (tokens, words). NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_caption_desc;
+
+// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
+                                                    const gsf_nn_caption_desc* desc, int32_t** ids, size_t* count);
+
+// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
+// `text_tokens` tokens of prompt (0: none).
+GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
+                                 double* bytes, double* flops);
 
 // ---- the restorer `dit` ---------------------------------------------------------------
 
@@ -9584,6 +9659,1825 @@ GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* tra
     return result;
 }
 
+// ---- >>nn bpe -------------------------------------------------------------------
+
+/* Byte-level byte-pair encoding (Sennrich et al. 2016; Radford et al. 2019) as transformers 4.51.3 runs it in
+   models/gpt2/tokenization_gpt2.py and tokenization_utils.py:
+       text | added tokens are cut out | words, by a pattern | bytes | neighbours merged, lowest rank first | ids
+   The files spell a byte as a character: printable Latin-1 as itself, the other 68 bytes as U+0100 and on, in order.
+       vocab.json    {"token": id, ...}
+       merges.txt    a comment line, then lines "left right", the lowest rank first
+   A word's merges are done rank by rank, all places of a rank from left to right, with a heap of places, so that a word of
+   a megabyte takes n log n steps. Merges lie sorted by left token, then by right one. */
+
+enum { GSF__BPE_OTHER, GSF__BPE_LETTER, GSF__BPE_NUMBER, GSF__BPE_SPACE }; // kinds of characters in the pattern
+
+// Kinds of all characters as runs from U+0000 on, 4 * length + kind; behind the last all are GSF__BPE_OTHER. A tokenizer
+// unpacks these 3.3 KB to 2 bits for each character. Made with the `regex` package, which the official tokenizer asks
+// (2026.11.15, Unicode 18; for characters that unicodedata knows, its categories L* and N* and White_Space):
+//     import regex
+//     kind = [next((k for k, p in ((1, r"\p{L}"), (2, r"\p{N}"), (3, r"\s")) if regex.match(p, chr(c))), 0)
+//             for c in range(0x110000)]
+//     start = 0
+//     for c in range(1, 0x110000):
+//         if kind[c] != kind[start] or c - start == 16383:
+//             print(4 * (c - start) + kind[start], end=",")
+//             start = c
+static const uint16_t gsf__bpe_kinds[] = {
+    36,23,72,7,60,42,28,105,24,105,40,7,104,7,36,5,28,10,4,5,12,6,5,4,14,4,93,4,125,4,1833,16,49,56,21,28,5,4,5,516,
+    21,4,9,8,17,4,5,24,5,4,13,4,5,4,81,4,333,4,557,32,665,4,153,4,9,24,165,8,9,268,109,16,17,180,173,84,42,16,9,4,397,
+    4,5,60,9,28,9,42,13,8,5,64,5,4,121,116,357,44,5,56,42,133,36,9,16,5,20,89,16,5,36,5,12,5,92,101,28,45,20,97,4,29,
+    64,169,232,217,12,5,72,5,28,41,16,42,4,65,16,33,8,9,8,89,4,29,4,5,12,17,12,5,64,5,52,9,4,13,16,42,9,8,26,8,5,32,
+    25,16,9,8,89,4,29,4,9,4,9,4,9,124,17,4,5,28,42,8,13,64,37,4,13,4,89,4,29,4,9,4,21,12,5,72,5,60,9,16,42,36,5,44,33,
+    8,9,8,89,4,29,4,9,4,21,12,5,120,9,4,13,16,42,4,5,26,44,5,4,25,12,13,4,17,12,9,4,5,4,9,12,9,12,13,12,49,88,5,84,54,
+    72,33,4,13,4,93,4,65,12,5,104,13,4,9,8,9,16,42,32,30,4,5,16,33,4,13,4,93,4,41,4,21,12,5,120,13,4,9,16,42,4,9,68,
+    37,4,13,4,165,8,5,64,5,20,13,4,30,13,16,78,4,25,20,73,12,97,4,37,4,5,8,29,124,42,68,193,4,9,48,29,36,42,156,9,4,5,
+    4,21,4,97,4,5,4,41,4,9,36,5,8,21,4,5,36,42,8,17,128,5,124,82,48,33,4,145,108,21,460,173,80,5,42,24,25,16,17,12,5,
+    12,9,28,13,16,53,48,5,4,42,24,153,4,5,20,5,8,173,4,1333,4,17,8,29,4,5,4,17,8,165,4,17,8,133,4,17,8,29,4,5,4,17,8,
+    61,4,229,4,17,8,269,56,82,12,65,64,345,8,25,12,2481,8,69,7,105,20,301,12,14,33,28,73,52,77,56,73,56,53,4,13,60,
+    209,140,5,16,5,12,42,24,42,88,42,24,357,28,21,8,137,4,5,20,281,40,125,156,42,121,8,21,44,177,16,105,24,46,148,93,
+    36,213,172,42,24,42,52,5,372,189,68,33,12,42,164,121,52,9,42,177,104,145,112,42,12,13,42,145,8,45,20,173,8,13,164,
+    17,4,25,4,9,12,5,20,769,256,1113,8,25,8,153,8,25,8,33,4,5,4,5,4,5,4,125,8,213,4,29,4,5,12,13,4,29,12,17,8,25,16,
+    53,20,13,4,29,12,47,116,11,20,7,188,7,64,6,5,8,26,20,5,42,20,69,392,5,16,5,8,41,4,5,12,21,24,5,4,5,4,5,4,17,4,45,
+    8,17,20,21,16,5,4,206,9,22,2904,242,312,90,2520,122,4528,917,24,17,12,9,36,6,8,153,4,5,20,5,8,225,28,5,64,93,36,
+    29,4,29,4,29,4,29,4,29,4,29,4,29,4,29,320,5,1856,7,16,9,6,100,38,28,21,8,14,9,16,345,24,13,4,361,4,17,20,173,4,
+    377,12,18,40,129,192,65,128,42,120,34,4,62,128,42,156,62,1280,26369,256,65533,23097,268,185,8,1077,12,65,42,9,80,
+    189,64,125,8,281,42,156,37,8,413,8,333,16,5,56,69,4,13,4,17,4,93,52,26,40,209,56,201,112,42,96,25,12,5,4,9,4,42,
+    113,40,93,100,117,28,189,112,5,42,24,21,4,41,42,21,4,165,92,13,4,33,16,42,24,93,12,5,12,201,4,5,12,9,8,21,8,5,4,5,
+    96,13,8,45,28,13,48,25,8,25,8,25,36,29,4,29,4,173,4,57,8,9,8,461,52,42,24,44689,48,93,16,197,33808,1465,8,425,152,
+    29,48,21,20,5,4,41,4,53,4,21,4,5,4,9,4,9,4,433,132,1453,72,257,8,217,160,49,464,21,4,541,76,42,28,105,24,105,44,
+    357,12,25,8,25,8,25,8,13,140,49,4,105,4,77,4,9,4,61,8,57,136,493,48,182,48,230,68,10,976,117,12,197,64,110,16,129,
+    18,36,81,6,33,6,20,153,40,121,8,145,16,33,4,22,168,633,8,42,24,145,16,145,16,161,32,209,48,45,4,61,4,29,4,9,4,45,
+    4,61,4,29,4,9,12,209,48,1245,36,89,40,33,96,25,4,169,4,57,256,25,8,5,4,177,4,9,12,5,8,93,8,34,93,8,30,125,32,38,
+    192,77,4,9,20,22,89,26,16,105,24,105,152,225,16,10,9,66,8,186,5,60,17,4,13,4,117,40,38,92,117,10,4,117,14,128,33,
+    4,113,24,22,64,217,40,89,8,34,77,20,34,73,92,30,320,293,220,205,52,205,28,26,145,48,42,24,42,113,36,93,872,126,4,
+    169,24,9,64,25,68,89,68,117,42,5,32,89,44,18,108,73,184,85,30,80,93,48,213,104,122,4,9,8,5,52,181,128,101,28,42,
+    36,145,60,42,16,5,8,5,32,141,12,5,48,193,56,17,44,42,5,4,5,16,82,44,73,4,101,76,9,252,29,4,5,4,17,4,61,4,41,28,
+    189,68,42,44,33,8,9,8,89,4,29,4,9,4,21,12,5,72,5,48,21,120,41,4,5,8,5,4,153,4,5,100,5,4,5,176,213,72,17,20,42,20,
+    13,120,193,80,9,4,5,32,42,664,189,164,17,144,193,80,5,44,42,152,173,52,5,28,42,24,82,112,109,84,50,16,29,740,177,
+    464,257,78,48,33,8,5,8,33,4,9,4,97,60,5,4,5,56,42,280,33,8,157,64,5,4,5,112,5,40,161,28,5,84,5,44,185,76,5,72,293,
+    68,5,724,133,60,42,24,37,4,149,68,5,60,118,20,121,448,29,4,9,4,153,84,5,36,42,24,25,4,9,4,129,56,5,28,42,24,177,
+    16,42,28,5,952,77,60,5,4,53,4,137,112,42,344,5,60,86,172,3689,408,450,20,46,785,48,1246,9252,389,60,4289,68,25,
+    100,15981,20,2333,27364,121,72,42,6936,2277,28,125,4,42,24,317,4,42,24,121,72,193,64,17,48,42,4,30,4,85,20,77,
+    1728,181,12,42,792,257,94,36,101,8,101,176,301,20,5,264,53,256,9,4,5,56,9,14,36,29549,144,137,380,461,52,3657,56,
+    205,30836,17,4,29,4,9,4,1189,36,5,116,13,8,5,56,21,28,1585,9232,429,20,53,12,37,28,41,16728,42,5912,82,48,82,432,
+    102,540,341,4,285,4,9,8,5,8,9,8,17,4,49,4,5,4,29,4,261,4,17,8,33,4,29,4,113,4,17,4,21,4,5,12,29,4,1365,4,101,4,
+    101,4,125,4,101,4,125,4,101,4,125,4,101,4,125,4,101,4,33,8,202,7168,521,56,29,216,205,192,249,584,181,40,29,8,42,
+    16,5,1284,121,72,177,16,42,1880,113,16,42,856,121,8,5,42,788,125,4,13,4,9,4,29,8,21,36,9,896,29,4,17,4,9,4,61,4,
+    789,8,38,192,273,28,5,16,42,3164,238,4,14,4,18,304,182,4,62,776,17,4,109,4,9,4,5,8,5,4,41,4,17,4,5,4,5,24,5,16,5,
+    4,5,4,5,4,13,4,9,4,5,8,5,4,5,4,5,4,5,4,5,4,9,4,5,8,17,4,29,4,17,4,17,4,5,4,41,4,69,20,13,4,21,4,69,2320,54,11148,
+    42,4120,65533,65533,39817,128,17533,4,23097,8,29893,60,2489,9864,2169,6024,19757,20,33961,65532,65532,28192,45313
+};
+
+enum { GSF__BPE_CHARACTERS = 0x40000 }; // those behind are all GSF__BPE_OTHER
+
+enum { // flags of tokens
+    GSF__BPE_ADDED = 1,   // cut out of texts, and spelt as it is
+    GSF__BPE_SPECIAL = 2, // may be left out when decoding
+    GSF__BPE_LSTRIP = 4,  // takes the white space before, behind it along
+    GSF__BPE_RSTRIP = 8,
+    GSF__BPE_APART = 16,  // stands between spaces in decoded text
+    GSF__BPE_OBJECT = 32  // was given as an object
+};
+
+enum { GSF__BPE_ADDED_MAX = 4096 };
+
+typedef struct gsf__bpe_token {
+    const char* text; // as the files spell it
+    size_t size;
+    int32_t id, flags;
+} gsf__bpe_token;
+
+typedef struct gsf__bpe_merge {
+    int32_t left, right, result; // indices of vocabulary tokens
+    int32_t rank;
+} gsf__bpe_merge;
+
+typedef struct gsf__bpe_tables { // behind gsf_nn_bpe.tables
+    gsf_json config, special_map, added_tokens; // hold the texts of added tokens
+    char* strings;           // those of the vocabulary
+    gsf__bpe_token* tokens;  // (vocabulary) sorted by text
+    gsf__bpe_token* added;   // (added_count) sorted by text
+    gsf__bpe_token* by_id;   // (by_id_count) all of them
+    gsf__bpe_merge* merges;  // (first[vocabulary]) by left, then right
+    int32_t* first;          // merges of the left token t: first[t] ... first[t + 1] - 1
+    unsigned char* kinds;    // 2 bits for each character
+    size_t added_capacity;
+    int32_t vocabulary, added_count, by_id_count;
+    int32_t bytes[256];      // tokens of single bytes, -1: none
+    int prefix_space, clean_up, split_special;
+} gsf__bpe_tables;
+
+// ---- bytes and characters
+
+static uint32_t gsf__bpe_character(unsigned byte) { // that spells the byte
+    if (byte <= 32) return 256 + byte;
+    if (byte >= 127 && byte <= 160) return 289 + byte - 127;
+    return byte == 173 ? 323 : byte;
+}
+
+static int gsf__bpe_byte(uint32_t character) { // -1: spells none
+    if (character >= 256 && character <= 288) return (int)character - 256;
+    if (character >= 289 && character <= 322) return (int)character - 289 + 127;
+    if (character == 323) return 173;
+    return character > 255 || character != gsf__bpe_character(character) ? -1 : (int)character;
+}
+
+static size_t gsf__bpe_store_character(uint32_t character, char* out) { // below U+0800
+    if (character < 0x80) {
+        out[0] = (char)character;
+        return 1;
+    }
+    out[0] = (char)(0xc0 | character >> 6);
+    out[1] = (char)(0x80 | (character & 0x3f));
+    return 2;
+}
+
+static uint32_t gsf__bpe_load_character(const char* text, size_t size) { // a well-formed character of `size` bytes
+    static const unsigned char first[] = {0, 0x7f, 0x1f, 0x0f, 0x07};
+    uint32_t character = (unsigned char)text[0] & first[size];
+    for (size_t i = 1; i < size; i++) character = character << 6 | ((unsigned char)text[i] & 0x3f);
+    return character;
+}
+
+static int gsf__bpe_kind(const gsf__bpe_tables* t, const char* text, size_t left, size_t* size) {
+    *size = gsf__utf8_size(text, left);
+    const uint32_t character = gsf__bpe_load_character(text, *size);
+    return character < GSF__BPE_CHARACTERS ? t->kinds[character >> 2] >> 2 * (character & 3) & 3 : GSF__BPE_OTHER;
+}
+
+// White space to Python's str.strip: that of the pattern and four control characters.
+static int gsf__bpe_strips(const gsf__bpe_tables* t, const char* text, size_t left, size_t* size) {
+    return gsf__bpe_kind(t, text, left, size) == GSF__BPE_SPACE || (text[0] >= 0x1c && text[0] <= 0x1f);
+}
+
+// [*begin, *end) of well-formed UTF-8 without the white space at its left and right ends.
+static void gsf__bpe_strip(const gsf__bpe_tables* t, const char* text, int left, int right, size_t* begin, size_t* end) {
+    size_t size;
+    while (left && *begin < *end && gsf__bpe_strips(t, text + *begin, *end - *begin, &size)) *begin += size;
+    while (right && *begin < *end) {
+        size_t at = *end - 1;
+        while (((unsigned char)text[at] & 0xc0) == 0x80) at--;
+        if (!gsf__bpe_strips(t, text + at, *end - at, &size)) return;
+        *end = at;
+    }
+}
+
+static gsf_result gsf__bpe_unpack_kinds(gsf_context* ctx, gsf__bpe_tables* t) {
+    uint32_t character = 0;
+    t->kinds = (unsigned char*)gsf_alloc_zeroed(ctx, GSF__BPE_CHARACTERS / 4, 1);
+    if (!t->kinds) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < GSF__COUNT(gsf__bpe_kinds); i++)
+        for (uint32_t end = character + gsf__bpe_kinds[i] / 4; character < end; character++)
+            t->kinds[character >> 2] |= (unsigned char)((gsf__bpe_kinds[i] & 3u) << 2 * (character & 3));
+    return GSF_OK;
+}
+
+// ---- loading
+
+typedef struct gsf__bpe_loader {
+    gsf_context* ctx;
+    const char* folder;
+    gsf__bpe_tables* t;
+    const gsf_json_value* decoder; // "added_tokens_decoder" of tokenizer_config.json, or NULL
+    gsf_text path, scratch;
+} gsf__bpe_loader;
+
+static int gsf__bpe_compare(const char* a, size_t a_size, const char* b, size_t b_size) {
+    const int order = memcmp(a, b, a_size < b_size ? a_size : b_size);
+    return order ? order : a_size < b_size ? -1 : a_size > b_size;
+}
+
+static int gsf__bpe_compare_texts(const void* a, const void* b) {
+    const gsf__bpe_token *x = (const gsf__bpe_token*)a, *y = (const gsf__bpe_token*)b;
+    return gsf__bpe_compare(x->text, x->size, y->text, y->size);
+}
+
+static int gsf__bpe_compare_ids(const void* a, const void* b) { // an added token before one of the vocabulary
+    const gsf__bpe_token *x = (const gsf__bpe_token*)a, *y = (const gsf__bpe_token*)b;
+    if (x->id != y->id) return x->id < y->id ? -1 : 1;
+    if ((x->flags & GSF__BPE_ADDED) != (y->flags & GSF__BPE_ADDED)) return x->flags & GSF__BPE_ADDED ? -1 : 1;
+    return gsf__bpe_compare_texts(a, b);
+}
+
+static int gsf__bpe_compare_merges(const void* a, const void* b) {
+    const gsf__bpe_merge *x = (const gsf__bpe_merge*)a, *y = (const gsf__bpe_merge*)b;
+    if (x->left != y->left) return x->left < y->left ? -1 : 1;
+    if (x->right != y->right) return x->right < y->right ? -1 : 1;
+    return x->rank < y->rank ? -1 : x->rank > y->rank;
+}
+
+// Index of a vocabulary token, -1 where there is none.
+static int32_t gsf__bpe_find(const gsf__bpe_tables* t, const char* text, size_t size) {
+    int32_t low = 0, high = t->vocabulary;
+    while (low < high) {
+        const int32_t middle = low + (high - low) / 2;
+        const int order = gsf__bpe_compare(t->tokens[middle].text, t->tokens[middle].size, text, size);
+        if (order == 0) return middle;
+        if (order < 0) low = middle + 1;
+        else high = middle;
+    }
+    return -1;
+}
+
+static int32_t gsf__bpe_find_added(const gsf__bpe_tables* t, const char* text, size_t size) { // while they are unsorted
+    for (int32_t i = 0; i < t->added_count; i++)
+        if (t->added[i].size == size && memcmp(t->added[i].text, text, size) == 0) return i;
+    return -1;
+}
+
+// First token of a sorted list whose id is not below `id`.
+static int32_t gsf__bpe_find_id(const gsf__bpe_tables* t, int32_t id) {
+    int32_t low = 0, high = t->by_id_count;
+    while (low < high) {
+        const int32_t middle = low + (high - low) / 2;
+        if (t->by_id[middle].id < id) low = middle + 1;
+        else high = middle;
+    }
+    return low;
+}
+
+// *data NULL: the file may be absent, and is.
+static gsf_result gsf__bpe_read(gsf__bpe_loader* l, const char* name, int must, void** data, size_t* size) {
+    l->path.size = 0;
+    gsf_text_printf(l->ctx, &l->path, "%s%s%s", l->folder, gsf__nn_ends_in(l->folder, "/") ? "" : "/", name);
+    if (l->path.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    return must ? gsf_read_file(l->ctx, l->path.data, data, size)
+                : gsf__nn_read_if_there(l->ctx, l->path.data, data, size);
+}
+
+static gsf_result gsf__bpe_open_json(gsf__bpe_loader* l, const char* name, int must, gsf_json* out) {
+    void* data = NULL;
+    size_t size;
+    GSF__TRY(gsf__bpe_read(l, name, must, &data, &size));
+    if (!data) return GSF_OK;
+    const gsf_result result = gsf_parse_json(l->ctx, name, (const char*)data, size, out);
+    gsf_free(l->ctx, data);
+    if (result != GSF_OK || out->values[0].type == GSF_JSON_OBJECT) return result;
+    return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:0: no object", name);
+}
+
+// Member of a document that may be absent; null counts as absent.
+static const gsf_json_value* gsf__bpe_member(const gsf_json* json, const char* key) {
+    const gsf_json_value* value = json->values ? gsf_json_member(json, json->values, key) : NULL;
+    return value && value->type != GSF_JSON_NULL ? value : NULL;
+}
+
+static gsf_result gsf__bpe_copy_tokens(gsf__bpe_loader* l, const gsf_json* json) {
+    const gsf_json_value* root = json->values;
+    size_t bytes = 0;
+    for (uint32_t i = root->child; i; i = json->values[i].next) bytes += json->values[i].key_size + 1;
+    if (root->count < 1 || root->count > INT32_MAX / 2)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:0: %u tokens", json->name, (unsigned)root->count);
+    l->t->strings = (char*)gsf_alloc(l->ctx, bytes, 1);
+    l->t->tokens = (gsf__bpe_token*)gsf_alloc(l->ctx, root->count, sizeof *l->t->tokens);
+    if (!l->t->strings || !l->t->tokens) return GSF_ERROR_OUT_OF_MEMORY;
+    char* text = l->t->strings;
+    for (uint32_t i = root->child; i; i = json->values[i].next) {
+        const gsf_json_value* value = &json->values[i];
+        if (value->type != GSF_JSON_NUMBER || !(value->number >= 0.0) || value->number > (double)INT32_MAX ||
+            floor(value->number) != value->number)
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the id of %s is no whole number from 0 to %d", json->name,
+                            (unsigned)value->offset, gsf__nn_show(value->key).text, (int)INT32_MAX);
+        if (value->key_size == 0)
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: an empty token", json->name, (unsigned)value->offset);
+        gsf__bpe_token* token = &l->t->tokens[l->t->vocabulary++];
+        token->text = text;
+        token->size = value->key_size;
+        token->id = (int32_t)value->number;
+        token->flags = 0;
+        memcpy(text, value->key, value->key_size + 1);
+        text += value->key_size + 1;
+    }
+    qsort(l->t->tokens, (size_t)l->t->vocabulary, sizeof *l->t->tokens, gsf__bpe_compare_texts);
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_read_vocabulary(gsf__bpe_loader* l) {
+    gsf_json json;
+    memset(&json, 0, sizeof json);
+    gsf_result result = gsf__bpe_open_json(l, "vocab.json", 1, &json);
+    if (!result) result = gsf__bpe_copy_tokens(l, &json);
+    gsf_destroy_json(l->ctx, &json);
+    for (unsigned byte = 0; byte < 256 && !result; byte++) {
+        char text[2];
+        l->t->bytes[byte] = gsf__bpe_find(l->t, text, gsf__bpe_store_character(gsf__bpe_character(byte), text));
+    }
+    return result;
+}
+
+static gsf_result gsf__bpe_need_token(gsf__bpe_loader* l, int32_t line, const char* text, size_t size, int32_t* out) {
+    *out = gsf__bpe_find(l->t, text, size);
+    if (*out >= 0) return GSF_OK;
+    char shown[64];
+    snprintf(shown, sizeof shown, "%.*s", size < 60 ? (int)size : 60, text);
+    return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "merges.txt:%d: %s is not in vocab.json", (int)line,
+                    gsf__nn_show(shown).text);
+}
+
+static int gsf__bpe_is_blank(char c) { return c == ' ' || c == '\t' || c == '\v' || c == '\f'; }
+
+// One line, numbered from 1. A blank one is nothing.
+static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size_t size, int32_t number,
+                                      gsf__bpe_merge* out, int* found) {
+    const char* parts[2] = {NULL, NULL};
+    size_t sizes[2] = {0, 0}, count = 0;
+    for (size_t i = 0; i < size;) {
+        if (gsf__bpe_is_blank(line[i])) {
+            i++;
+            continue;
+        }
+        const size_t start = i;
+        while (i < size && !gsf__bpe_is_blank(line[i])) i++;
+        if (count < 2) {
+            parts[count] = line + start;
+            sizes[count] = i - start;
+        }
+        count++;
+    }
+    *found = count == 2;
+    if (count == 0) return GSF_OK;
+    if (count != 2)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "merges.txt:%d: %zu tokens, not two", (int)number, count);
+    out->rank = number;
+    GSF__TRY(gsf__bpe_need_token(l, number, parts[0], sizes[0], &out->left));
+    GSF__TRY(gsf__bpe_need_token(l, number, parts[1], sizes[1], &out->right));
+    l->scratch.size = 0;
+    gsf_text_append(l->ctx, &l->scratch, parts[0], sizes[0]);
+    gsf_text_append(l->ctx, &l->scratch, parts[1], sizes[1]);
+    if (l->scratch.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf__bpe_need_token(l, number, l->scratch.data, l->scratch.size, &out->result);
+}
+
+// Lines end in \n, \r\n or \r. As in the official code the first one is a comment whatever it holds, what stands behind
+// the last line's end does not count, and of two equal merges the later one holds.
+static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, size_t size) {
+    gsf__bpe_tables* t = l->t;
+    size_t lines = 0, count = 0, kept = 0;
+    for (size_t i = 0; i < size; i++) lines += text[i] == '\n' || text[i] == '\r';
+    if (lines > INT32_MAX / 2) return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "merges.txt: %zu lines", lines);
+    t->merges = (gsf__bpe_merge*)gsf_alloc(l->ctx, lines + 1, sizeof *t->merges);
+    t->first = (int32_t*)gsf_alloc_zeroed(l->ctx, (size_t)t->vocabulary + 1, sizeof *t->first);
+    if (!t->merges || !t->first) return GSF_ERROR_OUT_OF_MEMORY;
+    int32_t number = 1;
+    for (size_t i = 0, start = 0; i < size; i++) {
+        if (text[i] != '\n' && text[i] != '\r') continue;
+        int found = 0;
+        if (number > 1) GSF__TRY(gsf__bpe_read_merge(l, text + start, i - start, number, &t->merges[count], &found));
+        count += (size_t)found;
+        number++;
+        if (text[i] == '\r' && i + 1 < size && text[i + 1] == '\n') i++;
+        start = i + 1;
+    }
+    if (count) qsort(t->merges, count, sizeof *t->merges, gsf__bpe_compare_merges);
+    for (size_t i = 0; i < count; i++) {
+        const gsf__bpe_merge* m = &t->merges[i];
+        if (i + 1 < count && m[1].left == m->left && m[1].right == m->right) continue;
+        t->first[m->left + 1]++;
+        t->merges[kept++] = *m;
+    }
+    for (int32_t i = 0; i < t->vocabulary; i++) t->first[i + 1] += t->first[i];
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_read_merges(gsf__bpe_loader* l) {
+    void* data;
+    size_t size;
+    GSF__TRY(gsf__bpe_read(l, "merges.txt", 1, &data, &size));
+    const gsf_result result = gsf__bpe_parse_merges(l, (const char*)data, size);
+    gsf_free(l->ctx, data);
+    return result;
+}
+
+// ---- loading: added and special tokens
+
+static gsf_result gsf__bpe_flag(gsf__bpe_loader* l, const gsf_json* json, const gsf_json_value* object, const char* key,
+                                int fallback, int* out) {
+    const gsf_json_value* value = gsf_json_member(json, object, key);
+    *out = fallback;
+    if (!value || value->type == GSF_JSON_NULL) return GSF_OK;
+    if (value->type != GSF_JSON_TRUE && value->type != GSF_JSON_FALSE)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: %s is not true or false", json->name, (unsigned)value->offset,
+                        key);
+    *out = value->type == GSF_JSON_TRUE;
+    return GSF_OK;
+}
+
+// A token as text, or as an object with its text in "content" and flags. Its id stays open.
+static gsf_result gsf__bpe_read_token(gsf__bpe_loader* l, const gsf_json* json, const gsf_json_value* value,
+                                      gsf__bpe_token* out) {
+    static const struct { const char* key; int flag; } keys[] = {
+        {"lstrip", GSF__BPE_LSTRIP}, {"rstrip", GSF__BPE_RSTRIP}, {"special", GSF__BPE_SPECIAL}, {"single_word", 0}};
+    const gsf_json_value* text = value->type == GSF_JSON_OBJECT ? gsf_json_member(json, value, "content") : value;
+    memset(out, 0, sizeof *out);
+    if (!text || text->type != GSF_JSON_STRING || text->string_size == 0)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: no token, as text or with its \"content\"", json->name,
+                        (unsigned)value->offset);
+    out->text = text->string;
+    out->size = text->string_size;
+    out->id = -1;
+    out->flags = GSF__BPE_ADDED | (value->type == GSF_JSON_OBJECT ? GSF__BPE_OBJECT : 0);
+    for (size_t i = 0; i < GSF__COUNT(keys) && value->type == GSF_JSON_OBJECT; i++) {
+        int flag;
+        GSF__TRY(gsf__bpe_flag(l, json, value, keys[i].key, 0, &flag));
+        if (flag && !keys[i].flag)
+            return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s of token %s", json->name, (unsigned)value->offset,
+                            keys[i].key, gsf__nn_show(out->text).text);
+        if (flag) out->flags |= keys[i].flag;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) {
+    gsf__bpe_tables* t = l->t;
+    const size_t count = (size_t)t->added_count;
+    if (count == GSF__BPE_ADDED_MAX)
+        return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s: more than %d added tokens", l->folder, (int)count);
+    if (gsf__bpe_find_added(t, token->text, token->size) >= 0)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s: token %s is added twice", l->folder,
+                        gsf__nn_show(token->text).text);
+    GSF__TRY(gsf__reserve(l->ctx, (void**)&t->added, &t->added_capacity, count, count + 1, sizeof *t->added));
+    t->added[t->added_count++] = *token;
+    return GSF_OK;
+}
+
+// "added_tokens_decoder" of tokenizer_config.json: {"id": token, ...}; else added_tokens.json: {"token": id, ...}.
+static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
+    gsf__bpe_tables* t = l->t;
+    const gsf_json* json = l->decoder ? &t->config : &t->added_tokens;
+    const gsf_json_value* map = l->decoder ? l->decoder : json->values;
+    if (!map) return GSF_OK;
+    if (map->type != GSF_JSON_OBJECT)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are no object", json->name,
+                        (unsigned)map->offset);
+    for (uint32_t i = map->child; i; i = json->values[i].next) {
+        const gsf_json_value* value = &json->values[i];
+        gsf__bpe_token token;
+        double id = value->number;
+        if (l->decoder) {
+            GSF__TRY(gsf__bpe_read_token(l, json, value, &token));
+            id = value->key_size > 0 && value->key_size <= 10 ? 0.0 : -1.0;
+            for (uint32_t k = 0; k < value->key_size && id >= 0.0; k++)
+                id = value->key[k] >= '0' && value->key[k] <= '9' ? 10.0 * id + (value->key[k] - '0') : -1.0;
+        } else {
+            memset(&token, 0, sizeof token);
+            token.text = value->key;
+            token.size = value->key_size;
+            token.flags = GSF__BPE_ADDED;
+            if (value->type != GSF_JSON_NUMBER || floor(id) != id || token.size == 0) id = -1.0;
+        }
+        if (!(id >= 0.0) || id > (double)INT32_MAX)
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: no token with an id from 0 to %d", json->name,
+                            (unsigned)value->offset, (int)INT32_MAX);
+        token.id = (int32_t)id;
+        token.flags |= GSF__BPE_APART;
+        GSF__TRY(gsf__bpe_add(l, &token));
+    }
+    return GSF_OK;
+}
+
+// Marks a token as special; one that is neither added nor in the vocabulary yet gets the id *next. `more`: it is one of
+// additional_special_tokens. What an object says of white space holds; for the other ones the decoder has the last word.
+static gsf_result gsf__bpe_add_special(gsf__bpe_loader* l, const gsf__bpe_token* token, int more, int32_t* next,
+                                       int32_t* id) {
+    gsf__bpe_tables* t = l->t;
+    int32_t i = gsf__bpe_find_added(t, token->text, token->size);
+    if (i < 0) {
+        gsf__bpe_token fresh = *token;
+        const int32_t old = gsf__bpe_find(t, token->text, token->size);
+        fresh.id = old >= 0 ? t->tokens[old].id : (*next)++;
+        GSF__TRY(gsf__bpe_add(l, &fresh));
+        i = t->added_count - 1;
+    }
+    const int strips = GSF__BPE_LSTRIP | GSF__BPE_RSTRIP;
+    int flags = (t->added[i].flags & ~GSF__BPE_APART) | GSF__BPE_SPECIAL;
+    if (token->flags & GSF__BPE_OBJECT && (more || !l->decoder)) flags = (flags & ~strips) | (token->flags & strips);
+    *id = t->added[i].id;
+    t->added[i].flags = flags | (more && *id >= t->vocabulary ? GSF__BPE_APART : 0);
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf_json* json, int32_t* next) {
+    const gsf_json_value* list = gsf__bpe_member(json, "additional_special_tokens");
+    if (!list) return GSF_OK;
+    if (list->type != GSF_JSON_ARRAY)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: additional_special_tokens is no list", json->name,
+                        (unsigned)list->offset);
+    for (uint32_t i = list->child; i; i = json->values[i].next) {
+        gsf__bpe_token token;
+        int32_t id;
+        GSF__TRY(gsf__bpe_read_token(l, json, &json->values[i], &token));
+        GSF__TRY(gsf__bpe_add_special(l, &token, 1, next, &id));
+    }
+    return GSF_OK;
+}
+
+// As the official loader: tokenizer_config.json alone where it lists the added tokens, else special_tokens_map.json goes
+// before it.
+static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    static const char* const keys[] = {"bos_token", "eos_token", "unk_token", "sep_token", "pad_token", "cls_token",
+                                       "mask_token"};
+    gsf__bpe_tables* t = l->t;
+    int32_t other, *const ids[GSF__COUNT(keys)] = {&out->bos, &out->eos, &out->unk, &other, &out->pad, &other, &other};
+    l->decoder = gsf__bpe_member(&t->config, "added_tokens_decoder");
+    GSF__TRY(gsf__bpe_read_added(l));
+    int32_t next = t->vocabulary;
+    for (int32_t i = 0; i < t->added_count; i++)
+        next += gsf__bpe_find(t, t->added[i].text, t->added[i].size) < 0;
+    for (size_t i = 0; i < GSF__COUNT(keys); i++) {
+        const gsf_json* json = !l->decoder && gsf__bpe_member(&t->special_map, keys[i]) ? &t->special_map : &t->config;
+        const gsf_json_value* value = gsf__bpe_member(json, keys[i]);
+        const int given = t->config.values && gsf_json_member(&t->config, t->config.values, keys[i]) != NULL;
+        gsf__bpe_token token;
+        *ids[i] = -1;
+        if (value) {
+            GSF__TRY(gsf__bpe_read_token(l, json, value, &token));
+        } else if (i < 3 && !given) { // GPT2Tokenizer's own
+            memset(&token, 0, sizeof token);
+            token.text = "<|endoftext|>";
+            token.size = strlen(token.text);
+            token.flags = GSF__BPE_ADDED;
+        } else {
+            continue;
+        }
+        GSF__TRY(gsf__bpe_add_special(l, &token, 0, &next, ids[i]));
+    }
+    GSF__TRY(gsf__bpe_add_more_special(l, &t->config, &next));
+    if (!l->decoder) GSF__TRY(gsf__bpe_add_more_special(l, &t->special_map, &next));
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_read_switches(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    gsf__bpe_tables* t = l->t;
+    const gsf_json_value* root = t->config.values;
+    const gsf_json_value* errors = gsf__bpe_member(&t->config, "errors");
+    if (errors && (errors->type != GSF_JSON_STRING || strcmp(errors->string, "replace") != 0))
+        return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: errors is not \"replace\"", t->config.name,
+                        (unsigned)errors->offset);
+    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "add_bos_token", 0, &out->add_bos));
+    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "add_prefix_space", 0, &t->prefix_space));
+    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "clean_up_tokenization_spaces", 0, &t->clean_up));
+    return gsf__bpe_flag(l, &t->config, root, "split_special_tokens", 0, &t->split_special);
+}
+
+static gsf_result gsf__bpe_sort_ids(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    gsf__bpe_tables* t = l->t;
+    const size_t vocabulary = (size_t)t->vocabulary, added = (size_t)t->added_count, count = vocabulary + added;
+    if (added) qsort(t->added, added, sizeof *t->added, gsf__bpe_compare_texts);
+    t->by_id = (gsf__bpe_token*)gsf_alloc(l->ctx, count, sizeof *t->by_id);
+    if (!t->by_id) return GSF_ERROR_OUT_OF_MEMORY;
+    memcpy(t->by_id, t->tokens, vocabulary * sizeof *t->tokens);
+    if (added) memcpy(t->by_id + vocabulary, t->added, added * sizeof *t->added);
+    qsort(t->by_id, count, sizeof *t->by_id, gsf__bpe_compare_ids);
+    t->by_id_count = (int32_t)count;
+    for (size_t i = 1; i < count; i++) {
+        const gsf__bpe_token *a = &t->by_id[i - 1], *b = &t->by_id[i];
+        if (a->id == b->id && (a->flags & GSF__BPE_ADDED) == (b->flags & GSF__BPE_ADDED))
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s: tokens %s and %s both have the id %d", l->folder,
+                            gsf__nn_show(a->text).text, gsf__nn_show(b->text).text, (int)a->id);
+    }
+    out->highest_id = t->by_id[count - 1].id;
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_load(gsf__bpe_loader* l, gsf_nn_bpe* out) {
+    GSF__TRY(gsf__bpe_unpack_kinds(l->ctx, l->t));
+    GSF__TRY(gsf__bpe_open_json(l, "tokenizer_config.json", 0, &l->t->config));
+    GSF__TRY(gsf__bpe_open_json(l, "special_tokens_map.json", 0, &l->t->special_map));
+    GSF__TRY(gsf__bpe_open_json(l, "added_tokens.json", 0, &l->t->added_tokens));
+    GSF__TRY(gsf__bpe_read_switches(l, out));
+    GSF__TRY(gsf__bpe_read_vocabulary(l));
+    GSF__TRY(gsf__bpe_read_merges(l));
+    GSF__TRY(gsf__bpe_read_special(l, out));
+    GSF__TRY(gsf__bpe_sort_ids(l, out));
+    if (out->add_bos && out->bos < 0)
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s: add_bos_token is true, but there is no bos_token", l->folder);
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe) {
+    gsf__bpe_tables* t = (gsf__bpe_tables*)bpe->tables;
+    if (t) {
+        gsf_destroy_json(ctx, &t->config);
+        gsf_destroy_json(ctx, &t->special_map);
+        gsf_destroy_json(ctx, &t->added_tokens);
+        gsf_free(ctx, t->strings);
+        gsf_free(ctx, t->tokens);
+        gsf_free(ctx, t->added);
+        gsf_free(ctx, t->by_id);
+        gsf_free(ctx, t->merges);
+        gsf_free(ctx, t->first);
+        gsf_free(ctx, t->kinds);
+    }
+    gsf_free(ctx, t);
+    memset(bpe, 0, sizeof *bpe);
+}
+
+GSF_API gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out) {
+    gsf__bpe_loader l;
+    memset(&l, 0, sizeof l);
+    memset(out, 0, sizeof *out);
+    l.ctx = ctx;
+    l.folder = folder;
+    l.t = (gsf__bpe_tables*)gsf_alloc_zeroed(ctx, 1, sizeof *l.t);
+    out->tables = l.t;
+    const gsf_result result = l.t ? gsf__bpe_load(&l, out) : GSF_ERROR_OUT_OF_MEMORY;
+    gsf_destroy_text(ctx, &l.path);
+    gsf_destroy_text(ctx, &l.scratch);
+    if (result) gsf_nn_destroy_bpe(ctx, out);
+    return result;
+}
+
+// ---- encoding
+
+typedef struct gsf__bpe_run {
+    gsf_context* ctx;
+    const gsf__bpe_tables* t;
+    int32_t unk;
+    int32_t* ids;       // the result
+    size_t count, capacity;
+    void* scratch;      // of a word; see gsf__bpe_place
+    size_t word_capacity;
+    int32_t *symbols, *before, *after, *found, *batch; // per byte of a word
+    uint64_t* heap;     // rank << 32 | place
+    size_t heap_size;
+} gsf__bpe_run;
+
+static gsf_result gsf__bpe_emit(gsf__bpe_run* run, int32_t id) {
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->capacity, run->count, run->count + 1, sizeof *run->ids));
+    run->ids[run->count++] = id;
+    return GSF_OK;
+}
+
+static void gsf__bpe_sift(uint64_t* heap, size_t size, size_t at) { // down to its place in a heap with the least on top
+    const uint64_t value = heap[at];
+    for (size_t child; (child = 2 * at + 1) < size; at = child) {
+        if (child + 1 < size && heap[child + 1] < heap[child]) child++;
+        if (value <= heap[child]) break;
+        heap[at] = heap[child];
+    }
+    heap[at] = value;
+}
+
+static void gsf__bpe_push(gsf__bpe_run* run, uint64_t value) {
+    size_t at = run->heap_size++;
+    for (; at > 0 && value < run->heap[(at - 1) / 2]; at = (at - 1) / 2) run->heap[at] = run->heap[(at - 1) / 2];
+    run->heap[at] = value;
+}
+
+// Looks up how the symbol at `place` merges with the one after it; 1 when it does.
+static int gsf__bpe_look(gsf__bpe_run* run, int32_t place) {
+    const gsf__bpe_tables* t = run->t;
+    const int32_t left = run->symbols[place], next = run->after[place];
+    run->found[place] = -1;
+    if (next < 0 || left < 0 || run->symbols[next] < 0) return 0;
+    int32_t low = t->first[left], high = t->first[left + 1];
+    while (low < high) {
+        const int32_t middle = low + (high - low) / 2;
+        if (t->merges[middle].right < run->symbols[next]) low = middle + 1;
+        else high = middle;
+    }
+    if (low == t->first[left + 1] || t->merges[low].right != run->symbols[next]) return 0;
+    run->found[place] = low;
+    return 1;
+}
+
+static uint64_t gsf__bpe_key(const gsf__bpe_run* run, int32_t place) {
+    return (uint64_t)run->t->merges[run->found[place]].rank << 32 | (uint32_t)place;
+}
+
+static void gsf__bpe_merge_at(gsf__bpe_run* run, int32_t place) {
+    const int32_t gone = run->after[place], after = run->after[gone], before = run->before[place];
+    run->symbols[place] = run->t->merges[run->found[place]].result;
+    run->found[gone] = -1;
+    run->after[place] = after;
+    if (after >= 0) run->before[after] = place;
+    if (gsf__bpe_look(run, place)) gsf__bpe_push(run, gsf__bpe_key(run, place));
+    if (before >= 0 && gsf__bpe_look(run, before)) gsf__bpe_push(run, gsf__bpe_key(run, before));
+}
+
+// Per byte of a word: 5 numbers of 32 bits and two places in the heap, as a merge takes one entry and adds two at most.
+static gsf_result gsf__bpe_place(gsf__bpe_run* run, size_t size) {
+    if (size <= run->word_capacity) return GSF_OK;
+    size = size < 64 ? 64 : size;
+    gsf_free(run->ctx, run->scratch);
+    run->word_capacity = 0;
+    run->scratch = gsf_alloc(run->ctx, size, 2 * sizeof(uint64_t) + 5 * sizeof(int32_t));
+    if (!run->scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    run->word_capacity = size;
+    run->heap = (uint64_t*)run->scratch;
+    run->symbols = (int32_t*)(void*)(run->heap + 2 * size);
+    run->before = run->symbols + size;
+    run->after = run->before + size;
+    run->found = run->after + size;
+    run->batch = run->found + size;
+    return GSF_OK;
+}
+
+static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size) {
+    const int32_t n = (int32_t)size;
+    GSF__TRY(gsf__bpe_place(run, size));
+    run->heap_size = 0;
+    for (int32_t i = 0; i < n; i++) {
+        run->symbols[i] = run->t->bytes[(unsigned char)word[i]];
+        run->before[i] = i - 1;
+        run->after[i] = i + 1 < n ? i + 1 : -1;
+    }
+    for (int32_t i = 0; i < n; i++)
+        if (gsf__bpe_look(run, i)) run->heap[run->heap_size++] = gsf__bpe_key(run, i);
+    for (size_t i = run->heap_size / 2; i-- > 0;) gsf__bpe_sift(run->heap, run->heap_size, i);
+    while (run->heap_size) {
+        const int32_t rank = (int32_t)(run->heap[0] >> 32);
+        int32_t places = 0;
+        while (run->heap_size && (int32_t)(run->heap[0] >> 32) == rank) { // they come from left to right
+            run->batch[places++] = (int32_t)(run->heap[0] & 0x7fffffffu);
+            run->heap[0] = run->heap[--run->heap_size];
+            if (run->heap_size) gsf__bpe_sift(run->heap, run->heap_size, 0);
+        }
+        for (int32_t i = 0; i < places; i++) { // unless another merge has changed the pair meanwhile
+            const int32_t found = run->found[run->batch[i]];
+            if (found >= 0 && run->t->merges[found].rank == rank) gsf__bpe_merge_at(run, run->batch[i]);
+        }
+    }
+    for (int32_t i = 0; i >= 0; i = run->after[i]) {
+        const int32_t symbol = run->symbols[i];
+        if (symbol < 0 && run->unk < 0)
+            return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "byte 0x%02x of the text is no token of this vocabulary",
+                            (unsigned)(unsigned char)word[i]);
+        GSF__TRY(gsf__bpe_emit(run, symbol < 0 ? run->unk : run->t->tokens[symbol].id));
+    }
+    return GSF_OK;
+}
+
+// Bytes of the first word:  's|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+
+static size_t gsf__bpe_next_word(const gsf__bpe_tables* t, const char* text, size_t size) {
+    static const char* const endings[] = {"s", "t", "re", "ve", "m", "ll", "d"};
+    size_t step, last = 0;
+    for (size_t i = 0; text[0] == '\'' && i < GSF__COUNT(endings); i++) {
+        const size_t length = strlen(endings[i]);
+        if (size > length && memcmp(text + 1, endings[i], length) == 0) return 1 + length;
+    }
+    size_t at = text[0] == ' ' && size > 1;
+    const int kind = gsf__bpe_kind(t, text + at, size - at, &step);
+    if (kind == GSF__BPE_SPACE) at = 0;
+    while (at < size && gsf__bpe_kind(t, text + at, size - at, &step) == kind) {
+        last = at;
+        at += step;
+    }
+    // Of white space before a word the last one is left, for it may belong to the word.
+    return kind == GSF__BPE_SPACE && at < size && last > 0 ? last : at;
+}
+
+static gsf_result gsf__bpe_piece(gsf__bpe_run* run, const char* text, size_t size) { // without added tokens
+    while (size) {
+        const size_t word = gsf__bpe_next_word(run->t, text, size);
+        GSF__TRY(gsf__bpe_word(run, text, word));
+        text += word;
+        size -= word;
+    }
+    return GSF_OK;
+}
+
+// The longest added token that `text` begins with, or NULL. They are sorted: those that begin with the bytes seen so far
+// stand side by side, the shortest first.
+static const gsf__bpe_token* gsf__bpe_match(const gsf__bpe_tables* t, const char* text, size_t left) {
+    const gsf__bpe_token* best = NULL;
+    int32_t low = 0, high = t->added_count;
+    for (size_t d = 0; low < high; d++) {
+        if (t->added[low].size == d) best = &t->added[low++];
+        if (d == left) break;
+        for (int side = 0; side < 2; side++) { // to those with text[d] next
+            int32_t a = low, b = high;
+            while (a < b) {
+                const int32_t middle = a + (b - a) / 2;
+                const int order = (unsigned char)t->added[middle].text[d] - (unsigned char)text[d];
+                if (order < 0 || (side && order == 0)) a = middle + 1;
+                else b = middle;
+            }
+            if (side) high = a;
+            else low = a;
+        }
+    }
+    return best;
+}
+
+static gsf_result gsf__bpe_text(gsf__bpe_run* run, const char* text, size_t size) {
+    const gsf__bpe_tables* t = run->t;
+    size_t start = 0;
+    int strip = 0; // the token before takes white space along
+    for (size_t at = 0; at <= size; at++) {
+        const gsf__bpe_token* token = at < size && !t->split_special ? gsf__bpe_match(t, text + at, size - at) : NULL;
+        if (!token && at < size) continue;
+        size_t end = at;
+        gsf__bpe_strip(t, text, strip, token && token->flags & GSF__BPE_LSTRIP, &start, &end);
+        GSF__TRY(gsf__bpe_piece(run, text + start, end - start));
+        if (!token) break;
+        GSF__TRY(gsf__bpe_emit(run, token->id));
+        start = at + token->size;
+        at = start - 1;
+        strip = token->flags & GSF__BPE_RSTRIP;
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size, int no_bos,
+                                     int32_t** ids, size_t* count) {
+    gsf__bpe_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.t = (const gsf__bpe_tables*)bpe->tables;
+    run.unk = bpe->unk;
+    *ids = NULL;
+    *count = 0;
+    if (size > INT32_MAX / 2) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "a text of %zu bytes", size);
+    if (!size) text = "";
+    for (size_t i = 0, step; i < size; i += step) {
+        step = gsf__utf8_size(text + i, size - i);
+        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "text:%zu: byte 0x%02x is no UTF-8", i,
+                                   (unsigned)(unsigned char)text[i]);
+    }
+    gsf_result result = gsf__reserve(ctx, (void**)&run.ids, &run.capacity, 0, 16, sizeof *run.ids);
+    if (!result && bpe->add_bos && !no_bos) result = gsf__bpe_emit(&run, bpe->bos);
+    if (!result && run.t->prefix_space) {
+        gsf_text spaced;
+        memset(&spaced, 0, sizeof spaced);
+        gsf_text_append(ctx, &spaced, " ", 1);
+        gsf_text_append(ctx, &spaced, text, size);
+        result = spaced.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__bpe_text(&run, spaced.data, spaced.size);
+        gsf_destroy_text(ctx, &spaced);
+    } else if (!result) {
+        result = gsf__bpe_text(&run, text, size);
+    }
+    gsf_free(ctx, run.scratch);
+    if (result) gsf_free(ctx, run.ids);
+    else {
+        *ids = run.ids;
+        *count = run.count;
+    }
+    return result;
+}
+
+// ---- decoding
+
+// Appends bytes as UTF-8. What is none becomes U+FFFD, one for each longest beginning of a character, as in Python.
+static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_text* out, const char* text, size_t size) {
+    const unsigned char* p = (const unsigned char*)text;
+    for (size_t i = 0; i < size;) {
+        size_t step, good = i;
+        while (good < size && (step = gsf__utf8_size(text + good, size - good)) != 0) good += step;
+        if (good > i) gsf_text_append(ctx, out, text + i, good - i);
+        i = good;
+        if (i == size) break;
+        const unsigned c = p[i++];
+        const unsigned low = c == 0xe0 ? 0xa0 : c == 0xf0 ? 0x90 : 0x80, high = c == 0xed ? 0x9f : c == 0xf4 ? 0x8f : 0xbf;
+        const size_t more = c >= 0xf0 && c <= 0xf4 ? 2 : c >= 0xe0 && c <= 0xef; // bytes before the last that may be there
+        for (size_t k = 0; k < more && i < size; k++, i++)
+            if (k == 0 ? p[i] < low || p[i] > high : (p[i] & 0xc0) != 0x80) break;
+        gsf_text_append(ctx, out, "\xef\xbf\xbd", 3);
+    }
+}
+
+// The bytes that a token of the vocabulary spells.
+static void gsf__bpe_append_bytes(gsf_context* ctx, gsf_text* out, const gsf__bpe_token* token) {
+    for (size_t i = 0, step; i < token->size; i += step) {
+        step = gsf__utf8_size(token->text + i, token->size - i);
+        const int byte = gsf__bpe_byte(gsf__bpe_load_character(token->text + i, step));
+        const char c = (char)byte;
+        gsf_text_append(ctx, out, byte < 0 ? token->text + i : &c, byte < 0 ? step : 1);
+    }
+}
+
+// Replaces all `from` by the shorter `to` behind `start`.
+static void gsf__bpe_replace(gsf_text* text, size_t start, const char* from, const char* to) {
+    const size_t from_size = strlen(from), to_size = strlen(to);
+    size_t end = start;
+    for (size_t i = start; i < text->size;) {
+        if (text->size - i >= from_size && memcmp(text->data + i, from, from_size) == 0) {
+            memcpy(text->data + end, to, to_size);
+            end += to_size;
+            i += from_size;
+        } else {
+            text->data[end++] = text->data[i++];
+        }
+    }
+    text->size = end;
+    if (text->data) text->data[end] = 0;
+}
+
+static void gsf__bpe_flush(gsf_context* ctx, gsf_text* bytes, gsf_text* out, int* parts) {
+    if (!bytes->size) return;
+    if ((*parts)++) gsf_text_append(ctx, out, " ", 1);
+    gsf__bpe_append_replaced(ctx, out, bytes->data, bytes->size);
+    bytes->size = 0;
+}
+
+GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids, size_t count,
+                                     int skip_special, gsf_text* out) {
+    static const char* const tidy[][2] = {{" .", "."}, {" ?", "?"}, {" !", "!"}, {" ,", ","}, {" ' ", "'"},
+                                          {" n't", "n't"}, {" 'm", "'m"}, {" 's", "'s"}, {" 've", "'ve"}, {" 're", "'re"}};
+    const gsf__bpe_tables* t = (const gsf__bpe_tables*)bpe->tables;
+    const size_t start = out->size;
+    gsf_text bytes;
+    int parts = 0;
+    memset(&bytes, 0, sizeof bytes);
+    gsf_text_append(ctx, out, "", 0);
+    for (size_t i = 0; i < count; i++) {
+        const int32_t at = gsf__bpe_find_id(t, ids[i]);
+        if (at == t->by_id_count || t->by_id[at].id != ids[i]) continue;
+        const gsf__bpe_token* token = &t->by_id[at];
+        if (skip_special && token->flags & GSF__BPE_SPECIAL) continue;
+        if (token->flags & GSF__BPE_APART) {
+            gsf__bpe_flush(ctx, &bytes, out, &parts);
+            if (parts++) gsf_text_append(ctx, out, " ", 1);
+            gsf_text_append(ctx, out, token->text, token->size);
+        } else {
+            gsf__bpe_append_bytes(ctx, &bytes, token);
+        }
+    }
+    gsf__bpe_flush(ctx, &bytes, out, &parts);
+    const int failed = bytes.failed || out->failed;
+    gsf_destroy_text(ctx, &bytes);
+    if (failed) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; t->clean_up && i < GSF__COUNT(tidy); i++) gsf__bpe_replace(out, start, tidy[i][0], tidy[i][1]);
+    return GSF_OK;
+}
+
+// ---- >>nn captioner -------------------------------------------------------------
+//
+// BLIP-2 (Li et al. 2023) with OPT (Zhang et al. 2022): a vision transformer, learned queries that look at its tokens
+// (Q-Former), a projection of what they found to words of the language model, and that model, which goes on from there.
+// As transformers 4.51.3 has it: models/blip_2/modeling_blip_2.py, models/opt/modeling_opt.py, image_processing_blip.py.
+
+typedef struct gsf__qformer_attention {
+    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
+    const gsf_tensor *norm_weight, *norm_bias;
+} gsf__qformer_attention;
+
+typedef struct gsf__qformer_layer {
+    gsf__qformer_attention self, cross; // cross.q_weight NULL: this layer has none
+    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias, *norm_weight, *norm_bias;
+} gsf__qformer_layer;
+
+typedef struct gsf__qformer {
+    int64_t queries, width, mlp, layers, cross_every; // every so many layers look at the image
+    int32_t heads;
+    float eps;
+    gsf_nn_activation activation;
+    int text_input;                                   // the file holds tensors for texts, which nobody needs here
+    const gsf_tensor *tokens, *norm_weight, *norm_bias;
+    gsf__qformer_layer* all;
+} gsf__qformer;
+
+typedef struct gsf__opt {
+    gsf__vit_sizes sizes;
+    int64_t layers, vocabulary, positions;
+    int own_head, no_final_norm;
+    const gsf_tensor *tokens, *places, *norm_weight, *norm_bias, *head;
+    gsf__vit_block* blocks;
+} gsf__opt;
+
+typedef struct gsf__blip { // behind gsf_nn_captioner.nets
+    int64_t image_size;
+    gsf_resize_filter filter;
+    double rescale;
+    float mean[3], deviation[3];
+    gsf__vit vision;
+    gsf__qformer qformer;
+    gsf__opt text;
+    const gsf_tensor *projection_weight, *projection_bias;
+} gsf__blip;
+
+enum { GSF__OPT_OFFSET = 2, GSF__CAPTION_TOKENS = 20 }; // rows of OPT's position table before position 0; new tokens
+static const float gsf__opt_eps = 1e-5f;                // PyTorch's, which no file of OPT's can change
+
+// ---- captioner: configuration
+
+static gsf_result gsf__blip_read_activation(const gsf__nn_config* file, const char* key, const char* fallback,
+                                            gsf_nn_activation* out) {
+    static const struct { const char* name; gsf_nn_activation activation; } known[] = {
+        {"gelu", GSF_NN_GELU}, {"gelu_new", GSF_NN_GELU_TANH}, {"gelu_pytorch_tanh", GSF_NN_GELU_TANH},
+        {"relu", GSF_NN_RELU}, {"silu", GSF_NN_SILU}, {"swish", GSF_NN_SILU}};
+    const char* text;
+    GSF__TRY(gsf__nn_config_string(file, key, fallback, &text));
+    for (size_t i = 0; i < GSF__COUNT(known); i++)
+        if (strcmp(known[i].name, text) == 0) {
+            *out = known[i].activation;
+            return GSF_OK;
+        }
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is %.60s", file->json.name, key, text);
+}
+
+typedef struct gsf__blip_size { const char* key; int64_t* to; int64_t fallback, low, high; } gsf__blip_size;
+
+static gsf_result gsf__blip_read_sizes(const gsf__nn_config* file, const gsf__blip_size* sizes, size_t count) {
+    for (size_t i = 0; i < count; i++)
+        GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, sizes[i].to));
+    return GSF_OK;
+}
+
+static gsf_result gsf__blip_split_heads(const gsf__nn_config* file, int64_t width, int64_t heads, int32_t* out) {
+    *out = (int32_t)heads;
+    if (width % heads == 0) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld heads do not divide hidden_size %lld", file->json.name,
+                    (long long)heads, (long long)width);
+}
+
+static gsf_result gsf__blip_read_vision(const gsf__nn_config* file, gsf__blip* net) {
+    gsf__vit* vit = &net->vision;
+    int64_t heads = 0;
+    double eps;
+    const gsf__blip_size sizes[] = {
+        {"hidden_size", &vit->sizes.width, 1408, 1, 65536}, {"intermediate_size", &vit->sizes.mlp, 6144, 1, 1 << 20},
+        {"num_hidden_layers", &vit->layers, 39, 1, 1024}, {"num_attention_heads", &heads, 16, 1, 1024},
+        {"image_size", &net->image_size, 224, 1, 1 << 14}, {"patch_size", &vit->patch, 14, 1, 1024}};
+    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-6, 1e-15, 1.0, &eps));
+    GSF__TRY(gsf__nn_config_bool_or(file, "qkv_bias", 1, &vit->sizes.qkv_bias));
+    GSF__TRY(gsf__blip_read_activation(file, "hidden_act", "gelu", &vit->sizes.activation));
+    GSF__TRY(gsf__blip_split_heads(file, vit->sizes.width, heads, &vit->sizes.heads));
+    if (net->image_size < vit->patch)
+        return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s: patch_size %lld is above image_size %lld", file->json.name,
+                        (long long)vit->patch, (long long)net->image_size);
+    vit->sizes.head_dim = (int32_t)(vit->sizes.width / heads);
+    vit->sizes.eps = (float)eps;
+    vit->channels = 3;
+    vit->grid = net->image_size / vit->patch;
+    vit->block_names = "vision_model.encoder.layers.";
+    vit->prefix = "vision_model.embeddings.";
+    return GSF_OK;
+}
+
+static gsf_result gsf__blip_read_qformer(const gsf__nn_config* file, gsf__blip* net) {
+    gsf__qformer* q = &net->qformer;
+    int64_t heads = 0;
+    double eps;
+    const char* positions;
+    const gsf__blip_size sizes[] = {
+        {"hidden_size", &q->width, 768, 1, 65536}, {"intermediate_size", &q->mlp, 3072, 1, 1 << 20},
+        {"num_hidden_layers", &q->layers, 12, 1, 1024}, {"num_attention_heads", &heads, 12, 1, 1024},
+        {"cross_attention_frequency", &q->cross_every, 2, 1, 1024}};
+    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-12, 1e-15, 1.0, &eps));
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_qformer_text_input", 0, &q->text_input));
+    GSF__TRY(gsf__blip_read_activation(file, "hidden_act", "gelu", &q->activation));
+    GSF__TRY(gsf__blip_split_heads(file, q->width, heads, &q->heads));
+    GSF__TRY(gsf__nn_config_string(file, "position_embedding_type", "absolute", &positions));
+    if (strcmp(positions, "absolute") != 0)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: position_embedding_type is %.60s", file->json.name,
+                        positions);
+    q->eps = (float)eps;
+    return GSF_OK;
+}
+
+// What this code computes in one way only must not be configured otherwise.
+static gsf_result gsf__blip_check_text(const gsf__nn_config* file, int64_t width) {
+    static const char* const flags[] = {"do_layer_norm_before", "enable_bias", "layer_norm_elementwise_affine"};
+    const char* type;
+    int64_t words;
+    GSF__TRY(gsf__nn_config_string(file, "model_type", "opt", &type));
+    if (strcmp(type, "opt") != 0)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: model_type of text_config is %.60s, not opt",
+                        file->json.name, type);
+    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
+        int flag;
+        GSF__TRY(gsf__nn_config_bool_or(file, flags[i], 1, &flag));
+        if (!flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i]);
+    }
+    GSF__TRY(gsf__nn_config_int_or(file, "word_embed_proj_dim", width, 1, 65536, &words));
+    if (words == width) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: word_embed_proj_dim %lld is not hidden_size %lld",
+                    file->json.name, (long long)words, (long long)width);
+}
+
+static gsf_result gsf__blip_read_text(const gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
+    gsf__opt* opt = &net->text;
+    int64_t heads = 0, bos = 0, eos = 0;
+    int tied;
+    const gsf__blip_size sizes[] = {
+        {"hidden_size", &opt->sizes.width, 768, 1, 65536}, {"ffn_dim", &opt->sizes.mlp, 3072, 1, 1 << 20},
+        {"num_hidden_layers", &opt->layers, 12, 1, 1024}, {"num_attention_heads", &heads, 12, 1, 1024},
+        {"vocab_size", &opt->vocabulary, 50272, 1, 1 << 24},
+        {"max_position_embeddings", &opt->positions, 2048, 1, 1 << 20}};
+    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
+    GSF__TRY(gsf__nn_config_int_or(file, "bos_token_id", 2, 0, opt->vocabulary - 1, &bos));
+    GSF__TRY(gsf__nn_config_int_or(file, "eos_token_id", 2, 0, INT32_MAX, &eos));
+    GSF__TRY(gsf__nn_config_bool_or(file, "tie_word_embeddings", 1, &tied));
+    GSF__TRY(gsf__nn_config_bool_or(file, "_remove_final_layer_norm", 0, &opt->no_final_norm));
+    GSF__TRY(gsf__blip_read_activation(file, "activation_function", "relu", &opt->sizes.activation));
+    GSF__TRY(gsf__blip_split_heads(file, opt->sizes.width, heads, &opt->sizes.heads));
+    opt->sizes.head_dim = (int32_t)(opt->sizes.width / heads);
+    opt->sizes.eps = gsf__opt_eps;
+    opt->sizes.qkv_bias = 1;
+    opt->own_head = !tied;
+    out->bos = (int32_t)bos;
+    out->eos = (int32_t)eos;
+    return gsf__blip_check_text(file, opt->sizes.width);
+}
+
+// Runs `read` on the part of config.json called `key` as if it were the document; without it all keys are absent.
+#define GSF__BLIP_PART(file, key, read)                                                                             \
+    do {                                                                                                            \
+        const gsf_json_value whole = (file)->json.values[0];                                                        \
+        const gsf_json_value* part = gsf__nn_config_find((file), (key));                                            \
+        if (part && part->type != GSF_JSON_OBJECT) return gsf__nn_config_fail((file), part, (key), "an object");   \
+        if (part) (file)->json.values[0] = *part;                                                                   \
+        else (file)->json.values[0].child = (file)->json.values[0].count = 0;                                       \
+        const gsf_result read_result = (read);                                                                      \
+        (file)->json.values[0] = whole;                                                                             \
+        if (read_result) return read_result;                                                                        \
+    } while (0)
+
+static gsf_result gsf__blip_read_config(gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
+    int64_t image_token;
+    GSF__TRY(gsf__nn_config_int_or(file, "num_query_tokens", 32, 1, 1 << 16, &net->qformer.queries));
+    GSF__TRY(gsf__nn_config_int_or(file, "image_token_index", -1, 0, INT32_MAX, &image_token));
+    out->image_token = (int32_t)image_token;
+    GSF__BLIP_PART(file, "vision_config", gsf__blip_read_vision(file, net));
+    GSF__BLIP_PART(file, "qformer_config", gsf__blip_read_qformer(file, net));
+    GSF__BLIP_PART(file, "text_config", gsf__blip_read_text(file, net, out));
+    return GSF_OK;
+}
+#undef GSF__BLIP_PART
+
+// Three numbers, or one for all.
+static gsf_result gsf__blip_read_colour(const gsf__nn_config* file, const char* key, const float fallback[3], double low,
+                                        float out[3]) {
+    const gsf_json_value* value = gsf__nn_config_find(file, key);
+    for (size_t i = 0; i < 3; i++) {
+        const gsf_json_value* number =
+            value && value->type == GSF_JSON_ARRAY && value->count == 3 ? gsf_json_element(&file->json, value, i) : value;
+        out[i] = fallback[i];
+        if (!number) continue;
+        if (number->type != GSF_JSON_NUMBER || !(number->number >= low) || !(number->number <= 1e6))
+            return gsf__nn_config_fail(file, value, key, "a number or three");
+        out[i] = (float)number->number;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__blip_read_processor(const gsf__nn_config* file, gsf__blip* net) {
+    static const char* const steps[] = {"do_resize", "do_rescale", "do_normalize", "do_convert_rgb"};
+    static const float mean[3] = {0.48145466f, 0.4578275f, 0.40821073f};
+    static const float deviation[3] = {0.26862954f, 0.26130258f, 0.27577711f};
+    static const gsf_resize_filter filters[] = {GSF_RESIZE_PIL_LANCZOS, GSF_RESIZE_PIL_BILINEAR, GSF_RESIZE_PIL_BICUBIC};
+    int64_t filter;
+    for (size_t i = 0; i < GSF__COUNT(steps); i++) {
+        int flag;
+        GSF__TRY(gsf__nn_config_bool_or(file, steps[i], 1, &flag));
+        if (!flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, steps[i]);
+    }
+    GSF__TRY(gsf__nn_config_int_or(file, "resample", 3, 1, 3, &filter)); // PIL's numbers
+    net->filter = filters[filter - 1];
+    GSF__TRY(gsf__nn_config_number_or(file, "rescale_factor", 1.0 / 255.0, 1e-9, 1e9, &net->rescale));
+    GSF__TRY(gsf__blip_read_colour(file, "image_mean", mean, -1e6, net->mean));
+    GSF__TRY(gsf__blip_read_colour(file, "image_std", deviation, 1e-6, net->deviation));
+    const gsf_json_value* size = gsf__nn_config_find(file, "size");
+    double sides[2] = {384.0, 384.0};
+    for (int i = 0; i < 2 && size; i++) {
+        const gsf_json_value* side =
+            size->type == GSF_JSON_OBJECT ? gsf_json_member(&file->json, size, i ? "width" : "height") : size;
+        if (!side || side->type != GSF_JSON_NUMBER)
+            return gsf__nn_config_fail(file, size, "size", "a number, or an object with height and width");
+        sides[i] = side->number;
+    }
+    if (sides[0] == (double)net->image_size && sides[1] == sides[0]) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: images of %g x %g for a model of %lld x %lld", file->json.name,
+                    sides[1], sides[0], (long long)net->image_size, (long long)net->image_size);
+}
+
+// ---- captioner: opening, which tensor goes where
+
+#define GSF__BLIP_AT(member) offsetof(gsf__vit_block, member), GSF__VIT_ALWAYS
+static const gsf__vit_entry gsf__blip_block_entries[] = { // below vision_model.encoder.layers.N.
+    {"layer_norm1.weight", "d", GSF__BLIP_AT(norm1_weight)},
+    {"layer_norm1.bias", "d", GSF__BLIP_AT(norm1_bias)},
+    {"self_attn.qkv.weight", "td", GSF__BLIP_AT(qkv_weight)},
+    {"self_attn.qkv.bias", "t", offsetof(gsf__vit_block, qkv_bias), GSF__VIT_QKV_BIAS},
+    {"self_attn.projection.weight", "dd", GSF__BLIP_AT(out_weight)},
+    {"self_attn.projection.bias", "d", GSF__BLIP_AT(out_bias)},
+    {"layer_norm2.weight", "d", GSF__BLIP_AT(norm2_weight)},
+    {"layer_norm2.bias", "d", GSF__BLIP_AT(norm2_bias)},
+    {"mlp.fc1.weight", "md", GSF__BLIP_AT(up_weight)},
+    {"mlp.fc1.bias", "m", GSF__BLIP_AT(up_bias)},
+    {"mlp.fc2.weight", "dm", GSF__BLIP_AT(down_weight)},
+    {"mlp.fc2.bias", "d", GSF__BLIP_AT(down_bias)},
+};
+
+static const gsf__vit_entry gsf__opt_block_entries[] = { // below language_model.model.decoder.layers.N.
+    {"self_attn_layer_norm.weight", "d", GSF__BLIP_AT(norm1_weight)},
+    {"self_attn_layer_norm.bias", "d", GSF__BLIP_AT(norm1_bias)},
+    {"self_attn.q_proj.weight", "dd", GSF__BLIP_AT(q_weight)},
+    {"self_attn.q_proj.bias", "d", GSF__BLIP_AT(q_bias)},
+    {"self_attn.k_proj.weight", "dd", GSF__BLIP_AT(k_weight)},
+    {"self_attn.k_proj.bias", "d", GSF__BLIP_AT(k_bias)},
+    {"self_attn.v_proj.weight", "dd", GSF__BLIP_AT(v_weight)},
+    {"self_attn.v_proj.bias", "d", GSF__BLIP_AT(v_bias)},
+    {"self_attn.out_proj.weight", "dd", GSF__BLIP_AT(out_weight)},
+    {"self_attn.out_proj.bias", "d", GSF__BLIP_AT(out_bias)},
+    {"final_layer_norm.weight", "d", GSF__BLIP_AT(norm2_weight)},
+    {"final_layer_norm.bias", "d", GSF__BLIP_AT(norm2_bias)},
+    {"fc1.weight", "md", GSF__BLIP_AT(up_weight)},
+    {"fc1.bias", "m", GSF__BLIP_AT(up_bias)},
+    {"fc2.weight", "dm", GSF__BLIP_AT(down_weight)},
+    {"fc2.bias", "d", GSF__BLIP_AT(down_bias)},
+};
+#undef GSF__BLIP_AT
+
+#define GSF__BLIP_AT(member) offsetof(gsf__vit, member), GSF__VIT_ALWAYS
+static const gsf__vit_entry gsf__blip_entries[] = { // below vision_model.
+    {"embeddings.class_embedding", "11d", GSF__BLIP_AT(class_token)},
+    {"embeddings.position_embedding", "1nd", GSF__BLIP_AT(positions)},
+    {"embeddings.patch_embedding.weight", "dcpp", GSF__BLIP_AT(patch_weight)},
+    {"embeddings.patch_embedding.bias", "d", GSF__BLIP_AT(patch_bias)},
+    {"post_layernorm.weight", "d", GSF__BLIP_AT(norm_weight)},
+    {"post_layernorm.bias", "d", GSF__BLIP_AT(norm_bias)},
+};
+#undef GSF__BLIP_AT
+
+// PREFIX.weight (out, in), or (out) with in = 0, and PREFIX.bias (out).
+static gsf_result gsf__blip_bind_pair(gsf__nn_loader* loader, const char* prefix, const char* name, int64_t out, int64_t in,
+                                      const gsf_tensor** weight, const gsf_tensor** bias) {
+    const int64_t shape[2] = {out, in};
+    GSF__TRY(gsf__nn_need(loader, weight, in ? 2 : 1, shape, "%s%s.weight", prefix, name));
+    return gsf__nn_need(loader, bias, 1, shape, "%s%s.bias", prefix, name);
+}
+
+static gsf_result gsf__qformer_bind_attention(gsf__nn_loader* loader, const char* layer, const char* name, int64_t width,
+                                              int64_t source, gsf__qformer_attention* a) {
+    char prefix[112];
+    snprintf(prefix, sizeof prefix, "%s%s.", layer, name);
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.query", width, width, &a->q_weight, &a->q_bias));
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.key", width, source, &a->k_weight, &a->k_bias));
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.value", width, source, &a->v_weight, &a->v_bias));
+    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output.dense", width, width, &a->out_weight, &a->out_bias));
+    return gsf__blip_bind_pair(loader, prefix, "output.LayerNorm", width, 0, &a->norm_weight, &a->norm_bias);
+}
+
+static gsf_result gsf__qformer_bind(gsf__nn_loader* loader, gsf__qformer* q, int64_t source) {
+    const int64_t d = q->width, tokens[3] = {1, q->queries, d};
+    GSF__TRY(gsf__nn_need(loader, &q->tokens, 3, tokens, "query_tokens"));
+    GSF__TRY(gsf__blip_bind_pair(loader, "qformer.", "layernorm", d, 0, &q->norm_weight, &q->norm_bias));
+    q->all = (gsf__qformer_layer*)gsf_alloc_zeroed(loader->ctx, (size_t)q->layers, sizeof *q->all);
+    if (!q->all) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t i = 0; i < q->layers; i++) {
+        gsf__qformer_layer* l = &q->all[i];
+        char prefix[64], unused[96];
+        snprintf(prefix, sizeof prefix, "qformer.encoder.layer.%lld.", (long long)i);
+        GSF__TRY(gsf__qformer_bind_attention(loader, prefix, "attention", d, d, &l->self));
+        if (i % q->cross_every == 0)
+            GSF__TRY(gsf__qformer_bind_attention(loader, prefix, "crossattention", d, source, &l->cross));
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "intermediate_query.dense", q->mlp, d, &l->up_weight, &l->up_bias));
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output_query.dense", d, q->mlp, &l->down_weight, &l->down_bias));
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output_query.LayerNorm", d, 0, &l->norm_weight, &l->norm_bias));
+        for (int k = 0; k < 2 && q->text_input; k++) {
+            snprintf(unused, sizeof unused, "%s%s", prefix, k ? "output." : "intermediate.");
+            gsf__nn_ignore(loader, unused);
+        }
+    }
+    if (q->text_input) gsf__nn_ignore(loader, "embeddings.");
+    return GSF_OK;
+}
+
+static gsf_result gsf__opt_bind(gsf__nn_loader* loader, gsf__opt* opt) {
+    const int64_t d = opt->sizes.width, words[2] = {opt->vocabulary, d}, places[2] = {opt->positions + GSF__OPT_OFFSET, d};
+    static const char prefix[] = "language_model.model.decoder.";
+    GSF__TRY(gsf__nn_need(loader, &opt->tokens, 2, words, "%sembed_tokens.weight", prefix));
+    GSF__TRY(gsf__nn_need(loader, &opt->places, 2, places, "%sembed_positions.weight", prefix));
+    if (!opt->no_final_norm)
+        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "final_layer_norm", d, 0, &opt->norm_weight, &opt->norm_bias));
+    opt->head = opt->tokens;
+    if (opt->own_head) GSF__TRY(gsf__nn_need(loader, &opt->head, 2, words, "language_model.lm_head.weight"));
+    else gsf__nn_ignore(loader, "language_model.lm_head."); // the words again
+    return gsf__vit_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, GSF__COUNT(gsf__opt_block_entries),
+                                "language_model.model.decoder.layers.", opt->layers, &opt->blocks);
+}
+
+static gsf_result gsf__blip_bind(gsf_context* ctx, gsf_nn_captioner* out, gsf__blip* net) {
+    gsf__nn_loader loader;
+    gsf__vit* vit = &net->vision;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
+    gsf_result result = gsf__vit_bind(&loader, &vit->sizes, vit, gsf__blip_entries, GSF__COUNT(gsf__blip_entries),
+                                      "vision_model.", vit);
+    vit->register_tokens = vit->class_token; // there are none
+    if (!result)
+        result = gsf__vit_bind_blocks(&loader, &vit->sizes, gsf__blip_block_entries, GSF__COUNT(gsf__blip_block_entries),
+                                      vit->block_names, vit->layers, &vit->blocks);
+    if (!result) result = gsf__qformer_bind(&loader, &net->qformer, vit->sizes.width);
+    if (!result)
+        result = gsf__blip_bind_pair(&loader, "", "language_projection", net->text.sizes.width, net->qformer.width,
+                                     &net->projection_weight, &net->projection_bias);
+    if (!result) result = gsf__opt_bind(&loader, &net->text);
+    return gsf__nn_end_loading(&loader, result);
+}
+
+GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner) {
+    gsf__blip* net = (gsf__blip*)captioner->nets;
+    if (net) {
+        gsf_free(ctx, net->vision.blocks);
+        gsf_free(ctx, net->qformer.all);
+        gsf_free(ctx, net->text.blocks);
+    }
+    gsf_free(ctx, net);
+    gsf_nn_destroy_bpe(ctx, &captioner->tokenizer);
+    gsf_nn_close_weights(ctx, &captioner->weights);
+    memset(captioner, 0, sizeof *captioner);
+}
+
+static gsf_result gsf__blip_load_config(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* file) {
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
+    const gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, file);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out) {
+    gsf__nn_config file;
+    memset(out, 0, sizeof *out);
+    gsf__blip* net = (gsf__blip*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
+    if (!net) return GSF_ERROR_OUT_OF_MEMORY;
+    out->nets = net;
+    gsf_result result = gsf__blip_load_config(ctx, folder, "config.json", &file);
+    if (!result) {
+        result = gsf__blip_read_config(&file, net, out);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) {
+        result = gsf__blip_load_config(ctx, folder, "preprocessor_config.json", &file);
+        if (!result) result = gsf__blip_read_processor(&file, net);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) result = gsf_nn_make_bpe(ctx, folder, &out->tokenizer);
+    if (!result) result = gsf_nn_open_weights(ctx, folder, "model", &out->weights);
+    if (!result) result = gsf__blip_bind(ctx, out, net);
+    out->image_size = (int32_t)net->image_size;
+    out->query_tokens = (int32_t)net->qformer.queries;
+    out->vocabulary = (int32_t)net->text.vocabulary;
+    out->positions = (int32_t)net->text.positions;
+    if (result) gsf_nn_destroy_captioner(ctx, out);
+    return result;
+}
+
+// ---- captioner: from the image to the queries' words
+
+typedef struct gsf__caption_run {
+    gsf__vit_run vit;  // scratch, progress
+    const gsf_nn_captioner* captioner;
+    const gsf__blip* net;
+    const gsf_nn_caption_desc* desc;
+} gsf__caption_run;
+
+static void gsf__caption_tap(const gsf__caption_run* run, const char* name, const float* data, int64_t rows,
+                             int64_t columns) {
+    if (run->desc->tap_fn) run->desc->tap_fn(run->desc->tap_user, name, data, rows, columns);
+}
+
+// After a layer: a value that is not finite is named with the tensors below `prefix`; cancel, progress.
+static gsf_result gsf__caption_step(gsf__caption_run* run, const char* prefix, int64_t index, const float* x,
+                                    int64_t count) {
+    char name[96];
+    snprintf(name, sizeof name, "%s%lld.", prefix, (long long)index);
+    GSF__TRY(gsf__vit_check(&run->vit, name, x, count));
+    gsf__progress(run->vit.ctx, run->vit.name, ++run->vit.done, run->vit.steps);
+    return gsf__check_cancel(run->vit.ctx);
+}
+
+// The image, resized as PIL does it, as normalised floats (3, image_size, image_size).
+static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const gsf_image* image, float* out) {
+    const int64_t side = net->image_size;
+    gsf_image coloured, small;
+    memset(&coloured, 0, sizeof coloured);
+    memset(&small, 0, sizeof small);
+    const int ready = image->dtype == GSF_U8 && image->channels == 3;
+    gsf_result result = gsf_make_image(ctx, GSF_U8, side, side, 3, &small);
+    if (!result && !ready) result = gsf_make_image(ctx, GSF_U8, image->width, image->height, 3, &coloured);
+    if (!result && !ready) result = gsf_convert_image(ctx, image, &coloured);
+    if (!result) result = gsf_resize_image(ctx, ready ? image : &coloured, net->filter, &small);
+    for (int64_t y = 0; y < side && !result; y++)
+        for (int64_t x = 0; x < side; x++)
+            for (int64_t c = 0; c < 3; c++) {
+                const uint8_t v = ((const uint8_t*)small.data)[(y * side + x) * 3 + c];
+                out[(c * side + y) * side + x] = ((float)((double)v * net->rescale) - net->mean[c]) / net->deviation[c];
+            }
+    gsf_destroy_image(ctx, &coloured);
+    gsf_destroy_image(ctx, &small);
+    return result;
+}
+
+// Tokens of the image: out (1 + patches, width), after the last norm.
+static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, float* out) {
+    const gsf__vit* vit = &run->net->vision;
+    gsf_context* ctx = run->vit.ctx;
+    const int64_t d = vit->sizes.width;
+    gsf_nn_encoder_input in;
+    float* memory = NULL;
+    memset(&in, 0, sizeof in);
+    in.pixels = pixels;
+    in.images = 1;
+    in.height = in.width = (int32_t)run->net->image_size;
+    const gsf__vit_plan plan = gsf__vit_plan_of(vit, &in);
+    gsf_result result = gsf__vit_open_run(ctx, vit, &in, &plan, &run->vit, &memory);
+    float* x = memory + plan.positions;
+    if (!result) result = gsf__vit_forward(&run->vit, vit, &in, 0, 1, 0, memory, x);
+    if (!result) {
+        gsf_nn_layer_norm(ctx, x, plan.tokens, d, gsf__vit_vector(&run->vit, vit->norm_weight),
+                          gsf__vit_vector(&run->vit, vit->norm_bias), vit->sizes.eps, out);
+        result = gsf__vit_check(&run->vit, "vision_model.post_layernorm.", out, plan.tokens * d);
+    }
+    if (!result) gsf__caption_tap(run, "vision", out, plan.tokens, d);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// x (queries, width) = norm(x + dense(h)), in place.
+static gsf_result gsf__qformer_add(gsf__caption_run* run, const float* h, const gsf_tensor* weight, const gsf_tensor* bias,
+                                   const gsf_tensor* norm_weight, const gsf_tensor* norm_bias, float* x) {
+    const gsf__qformer* q = &run->net->qformer;
+    GSF__TRY(gsf__vit_add(&run->vit, h, q->queries, weight, bias, NULL, x));
+    run->vit.vectors_used = 0;
+    gsf_nn_layer_norm(run->vit.ctx, x, q->queries, q->width, gsf__vit_vector(&run->vit, norm_weight),
+                      gsf__vit_vector(&run->vit, norm_bias), q->eps, x);
+    return GSF_OK;
+}
+
+// The queries x look at `rows` rows of `from`. scratch: q (queries, width), then k and v (rows, width).
+static gsf_result gsf__qformer_attend(gsf__caption_run* run, const gsf__qformer_attention* a, const float* from,
+                                      int64_t rows, float* scratch, float* x) {
+    const gsf__qformer* q = &run->net->qformer;
+    const int64_t d = q->width;
+    float *k = scratch + q->queries * d, *v = k + rows * d;
+    GSF__TRY(gsf__vit_linear(&run->vit, x, q->queries, a->q_weight, a->q_bias, GSF_NN_LINEAR, scratch, 0));
+    GSF__TRY(gsf__vit_linear(&run->vit, from, rows, a->k_weight, a->k_bias, GSF_NN_LINEAR, k, 0));
+    GSF__TRY(gsf__vit_linear(&run->vit, from, rows, a->v_weight, a->v_bias, GSF_NN_LINEAR, v, 0));
+    gsf_nn_attention_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.queries = q->queries;
+    desc.keys = rows;
+    desc.heads = q->heads;
+    desc.head_dim = (int32_t)(d / q->heads);
+    desc.q = desc.out = scratch;
+    desc.k = k;
+    desc.v = v;
+    GSF__TRY(gsf_nn_attention(run->vit.ctx, &run->vit.workspace, &desc));
+    return gsf__qformer_add(run, scratch, a->out_weight, a->out_bias, a->norm_weight, a->norm_bias, x);
+}
+
+static size_t gsf__qformer_floats(const gsf__blip* net) { // x; scratch; two vectors
+    const gsf__qformer* q = &net->qformer;
+    const size_t d = (size_t)q->width, n = (size_t)q->queries, seen = (size_t)(net->vision.grid * net->vision.grid + 1);
+    const size_t attention = n * d + 2 * (seen > n ? seen : n) * d, hidden = n * (size_t)q->mlp;
+    return n * d + (attention > hidden ? attention : hidden) + 2 * d;
+}
+
+// What the queries find in the image's tokens, as words of the language model: out (queries, text width).
+static gsf_result gsf__qformer_ask(gsf__caption_run* run, const float* image, float* out) {
+    const gsf__qformer* q = &run->net->qformer;
+    gsf_context* ctx = run->vit.ctx;
+    const int64_t d = q->width, seen = run->net->vision.grid * run->net->vision.grid + 1;
+    const size_t floats = gsf__qformer_floats(run->net);
+    float* x = (float*)gsf_alloc(ctx, floats, sizeof(float));
+    if (!x) return GSF_ERROR_OUT_OF_MEMORY;
+    float* scratch = x + q->queries * d;
+    run->vit.vectors_size = (size_t)(2 * d);
+    run->vit.vectors = x + floats - run->vit.vectors_size;
+    run->vit.vectors_used = 0;
+    gsf_nn_read_tensor(q->tokens, 0, q->queries * d, x);
+    gsf_nn_layer_norm(ctx, x, q->queries, d, gsf__vit_vector(&run->vit, q->norm_weight),
+                      gsf__vit_vector(&run->vit, q->norm_bias), q->eps, x);
+    gsf_result result = gsf__vit_check(&run->vit, "query_tokens", x, q->queries * d);
+    for (int64_t i = 0; i < q->layers && !result; i++) {
+        const gsf__qformer_layer* l = &q->all[i];
+        result = gsf__qformer_attend(run, &l->self, x, q->queries, scratch, x);
+        if (!result && l->cross.q_weight) result = gsf__qformer_attend(run, &l->cross, image, seen, scratch, x);
+        if (!result)
+            result = gsf__vit_linear(&run->vit, x, q->queries, l->up_weight, l->up_bias, q->activation, scratch, 0);
+        if (!result)
+            result = gsf__qformer_add(run, scratch, l->down_weight, l->down_bias, l->norm_weight, l->norm_bias, x);
+        if (!result) result = gsf__caption_step(run, "qformer.encoder.layer.", i, x, q->queries * d);
+    }
+    if (!result) gsf__caption_tap(run, "qformer", x, q->queries, d);
+    if (!result)
+        result = gsf__vit_linear(&run->vit, x, q->queries, run->net->projection_weight, run->net->projection_bias,
+                                 GSF_NN_LINEAR, out, 0);
+    if (!result)
+        result = gsf__vit_check(&run->vit, "language_projection.", out, q->queries * run->net->text.sizes.width);
+    if (!result) gsf__caption_tap(run, "projection", out, q->queries, run->net->text.sizes.width);
+    gsf_free(ctx, x);
+    return result;
+}
+
+// ---- captioner: the language model
+
+typedef struct gsf__opt_run {
+    int64_t capacity, past; // rows of the cache; of these in use
+    float *keys, *values;   // (layers, capacity, width)
+    float *x, *logits;      // (rows, width); (vocabulary), or with a tap (rows, vocabulary)
+    unsigned char* mask;    // (heads, rows, rows): a token sees itself and those before
+} gsf__opt_run;
+
+typedef struct gsf__opt_plan { // floats, but for `mask`
+    size_t cache, x, normed, wide, vectors, logits, mask;
+} gsf__opt_plan;
+
+static gsf__opt_plan gsf__opt_plan_of(const gsf__opt* opt, int64_t rows, int64_t capacity, int64_t logits) {
+    gsf__opt_plan p;
+    const size_t d = (size_t)opt->sizes.width, n = (size_t)rows;
+    p.cache = (size_t)opt->layers * (size_t)capacity * d;
+    p.x = p.normed = n * d;
+    p.wide = gsf__vit_wide(&opt->sizes, rows);
+    p.vectors = 4 * d;
+    p.logits = (size_t)logits * (size_t)opt->vocabulary;
+    p.mask = (size_t)opt->sizes.heads * n * n;
+    return p;
+}
+
+static size_t gsf__opt_floats(const gsf__opt_plan* p) {
+    return 2 * p->cache + p->x + p->normed + p->wide + p->vectors + p->logits + (p->mask + 3) / 4;
+}
+
+// x (count, width): words, those of `ids` unless it is NULL and they are there, at the places from `place` on.
+static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t count, int64_t place, float* scratch,
+                           float* x) {
+    const int64_t d = opt->sizes.width;
+    for (int64_t i = 0; i < count; i++) {
+        if (ids) gsf_nn_read_tensor(opt->tokens, ids[i] * d, d, x + i * d);
+        gsf_nn_read_tensor(opt->places, (place + i + GSF__OPT_OFFSET) * d, d, scratch);
+        for (int64_t k = 0; k < d; k++) x[i * d + k] += scratch[k];
+    }
+}
+
+// One layer on the rows of x, which follow the `past` ones whose keys and values are in the cache.
+static gsf_result gsf__opt_block(gsf__caption_run* run, gsf__opt_run* o, int64_t layer, int64_t rows) {
+    const gsf__opt* opt = &run->net->text;
+    const gsf__vit_block* b = &opt->blocks[layer];
+    gsf__vit_run* v = &run->vit;
+    const int64_t d = opt->sizes.width, at = layer * o->capacity * d, fresh = at + o->past * d;
+    v->vectors_used = 0;
+    gsf_nn_layer_norm(v->ctx, o->x, rows, d, gsf__vit_vector(v, b->norm1_weight), gsf__vit_vector(v, b->norm1_bias),
+                      opt->sizes.eps, v->normed);
+    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->q_weight, b->q_bias, GSF_NN_LINEAR, v->wide, 0));
+    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->k_weight, b->k_bias, GSF_NN_LINEAR, o->keys + fresh, 0));
+    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->v_weight, b->v_bias, GSF_NN_LINEAR, o->values + fresh, 0));
+    gsf_nn_attention_desc a;
+    memset(&a, 0, sizeof a);
+    a.queries = rows;
+    a.keys = o->past + rows;
+    a.heads = opt->sizes.heads;
+    a.head_dim = opt->sizes.head_dim;
+    a.q = a.out = v->wide;
+    a.k = o->keys + at;
+    a.v = o->values + at;
+    a.mask = rows > 1 ? o->mask : NULL;
+    GSF__TRY(gsf_nn_attention(v->ctx, &v->workspace, &a));
+    GSF__TRY(gsf__vit_add(v, v->wide, rows, b->out_weight, b->out_bias, NULL, o->x));
+    gsf_nn_layer_norm(v->ctx, o->x, rows, d, gsf__vit_vector(v, b->norm2_weight), gsf__vit_vector(v, b->norm2_bias),
+                      opt->sizes.eps, v->normed);
+    return gsf__vit_feed_forward(v, b, NULL, o->x, rows);
+}
+
+// All layers on the rows of x; then o->logits has those of the last row, with a tap and several rows those of all.
+static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64_t rows) {
+    const gsf__opt* opt = &run->net->text;
+    gsf__vit_run* v = &run->vit;
+    const int64_t d = opt->sizes.width, shown = run->desc->tap_fn && rows > 1 ? rows : 1;
+    for (int64_t layer = 0; layer < opt->layers; layer++) {
+        GSF__TRY(gsf__opt_block(run, o, layer, rows));
+        GSF__TRY(gsf__caption_step(run, "language_model.model.decoder.layers.", layer, o->x, rows * d));
+    }
+    o->past += rows;
+    const float* last = o->x + (rows - shown) * d;
+    v->vectors_used = 0;
+    if (!opt->no_final_norm) {
+        gsf_nn_layer_norm(v->ctx, last, shown, d, gsf__vit_vector(v, opt->norm_weight), gsf__vit_vector(v, opt->norm_bias),
+                          opt->sizes.eps, v->normed);
+        last = v->normed;
+    }
+    GSF__TRY(gsf__vit_linear(v, last, shown, opt->head, NULL, GSF_NN_LINEAR, o->logits, 0));
+    GSF__TRY(gsf__vit_check(v, "language_model.", o->logits, shown * opt->vocabulary));
+    if (rows > 1) gsf__caption_tap(run, "logits", o->logits, shown, opt->vocabulary);
+    if (shown > 1) memmove(o->logits, o->logits + (shown - 1) * opt->vocabulary, (size_t)opt->vocabulary * sizeof(float));
+    return GSF_OK;
+}
+
+// Greedy continuation of the queries' words and the text's ids, which x holds already without places.
+static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int64_t rows, int32_t most, int32_t* ids,
+                                    size_t* count) {
+    const gsf__opt* opt = &run->net->text;
+    for (int64_t h = 0; h < opt->sizes.heads; h++)
+        for (int64_t r = 0; r < rows; r++)
+            for (int64_t k = 0; k < rows; k++) o->mask[(h * rows + r) * rows + k] = k <= r;
+    gsf__opt_embed(opt, NULL, rows, 0, run->vit.normed, o->x);
+    GSF__TRY(gsf__opt_forward(run, o, rows));
+    for (;;) {
+        int32_t best = 0;
+        for (int64_t i = 1; i < opt->vocabulary; i++)
+            if (o->logits[i] > o->logits[best]) best = (int32_t)i;
+        ids[(*count)++] = best;
+        if (best == run->captioner->eos || *count == (size_t)most) break;
+        gsf__opt_embed(opt, &best, 1, o->past, run->vit.normed, o->x);
+        GSF__TRY(gsf__opt_forward(run, o, 1));
+    }
+    gsf__progress(run->vit.ctx, run->vit.name, run->vit.steps, run->vit.steps);
+    return GSF_OK;
+}
+
+// `words` (queries, width) and the text's ids are given; *count of at most `most` new ids go to `ids`.
+static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, const int32_t* text, size_t text_count,
+                                 int32_t most, int32_t* ids, size_t* count) {
+    const gsf__opt* opt = &run->net->text;
+    gsf_context* ctx = run->vit.ctx;
+    const int64_t d = opt->sizes.width, queries = run->net->qformer.queries, rows = queries + (int64_t)text_count;
+    gsf__opt_run o;
+    memset(&o, 0, sizeof o);
+    o.capacity = rows + most - 1;
+    const gsf__opt_plan p = gsf__opt_plan_of(opt, rows, o.capacity, run->desc->tap_fn ? rows : 1);
+    float* memory = (float*)gsf_alloc(ctx, gsf__opt_floats(&p), sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    o.keys = memory;
+    o.values = o.keys + p.cache;
+    o.x = o.values + p.cache;
+    o.logits = o.x + p.x;
+    run->vit.sizes = &opt->sizes;
+    run->vit.normed = o.logits + p.logits;
+    run->vit.wide = run->vit.normed + p.normed;
+    run->vit.wide_count = (int64_t)p.wide;
+    run->vit.vectors = run->vit.wide + p.wide;
+    run->vit.vectors_size = p.vectors;
+    o.mask = (unsigned char*)(run->vit.vectors + p.vectors);
+    memcpy(o.x, words, (size_t)(queries * d) * sizeof(float));
+    for (int64_t i = 0; i < (int64_t)text_count; i++)
+        gsf_nn_read_tensor(opt->tokens, text[i] * d, d, o.x + (queries + i) * d);
+    const gsf_result result = gsf__opt_continue(run, &o, rows, most, ids, count);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// ---- captioner: all of it
+
+// Ids of the text behind the queries' words: bos alone, or what the tokenizer makes of the prompt.
+static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* captioner, const char* prompt, int32_t** ids,
+                                    size_t* count) {
+    *ids = NULL;
+    *count = 0;
+    if (!prompt) {
+        *ids = (int32_t*)gsf_alloc(ctx, 1, sizeof **ids);
+        if (!*ids) return GSF_ERROR_OUT_OF_MEMORY;
+        (*ids)[(*count)++] = captioner->bos;
+        return GSF_OK;
+    }
+    GSF__TRY(gsf_nn_encode_bpe(ctx, &captioner->tokenizer, prompt, strlen(prompt), 0, ids, count));
+    gsf_result result = GSF_OK;
+    if (!*count) result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt has no token");
+    for (size_t i = 0; i < *count && !result; i++) {
+        if ((*ids)[i] >= captioner->vocabulary)
+            result = gsf_fail(ctx, GSF_ERROR_FORMAT, "caption: the tokenizer gives id %d, but the model has %d words",
+                              (int)(*ids)[i], (int)captioner->vocabulary);
+        else if ((*ids)[i] == captioner->image_token)
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt holds the image's token");
+    }
+    if (!result) return GSF_OK;
+    gsf_free(ctx, *ids);
+    *ids = NULL;
+    *count = 0;
+    return result;
+}
+
+// New tokens at most. The default of a folder without image_token_index is what the official code makes of its limit of 20
+// tokens in all: the text counts twice.
+static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t wanted) {
+    if (wanted > 0) return wanted;
+    return captioner->image_token >= 0 ? GSF__CAPTION_TOKENS : GSF__CAPTION_TOKENS - 1 - 2 * text_tokens;
+}
+
+static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
+                                     int64_t text_tokens, int64_t* most) {
+    if (!desc->image || !desc->image->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: no image");
+    *most = gsf__caption_most(captioner, text_tokens, desc->max_new_tokens);
+    if (*most < 1 || desc->max_new_tokens < 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "caption: max_new_tokens is %d, and %lld tokens of text leave no room for new ones",
+                        (int)desc->max_new_tokens, (long long)text_tokens);
+    const int64_t places = captioner->query_tokens + text_tokens + *most - 1;
+    if (places > captioner->positions)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: %lld tokens, but the model has %d positions",
+                        (long long)places, (int)captioner->positions);
+    return GSF_OK;
+}
+
+static gsf_result gsf__caption_write(gsf__caption_run* run, const int32_t* text, size_t text_count, int64_t most,
+                                     int32_t* ids, size_t* count) {
+    const gsf__blip* net = run->net;
+    gsf_context* ctx = run->vit.ctx;
+    const size_t pixels = (size_t)(3 * net->image_size * net->image_size);
+    const size_t seen = (size_t)((net->vision.grid * net->vision.grid + 1) * net->vision.sizes.width);
+    float* words = (float*)gsf_alloc(ctx, (size_t)(net->qformer.queries * net->text.sizes.width), sizeof(float));
+    float* image = (float*)gsf_alloc(ctx, pixels + seen, sizeof(float));
+    gsf_result result = words && image ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    run->vit.steps = (double)(net->vision.layers + net->qformer.layers + net->text.layers * most);
+    if (!result) result = gsf__blip_pixels(ctx, net, run->desc->image, image);
+    if (!result) gsf__caption_tap(run, "pixel_values", image, 3, net->image_size * net->image_size);
+    if (!result) result = gsf__blip_look(run, image, image + pixels);
+    if (!result) result = gsf__qformer_ask(run, image + pixels, words);
+    gsf_free(ctx, image);
+    if (!result) result = gsf__opt_write(run, words, text, text_count, (int32_t)most, ids, count);
+    gsf_free(ctx, words);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
+                                      int32_t** ids, size_t* count) {
+    gsf__caption_run run;
+    int32_t* text;
+    size_t text_count;
+    int64_t most = 0;
+    *ids = NULL;
+    *count = 0;
+    memset(&run, 0, sizeof run);
+    run.vit.ctx = ctx;
+    run.vit.name = "caption";
+    run.vit.weights = &captioner->weights;
+    run.captioner = captioner;
+    run.net = (const gsf__blip*)captioner->nets;
+    run.desc = desc;
+    GSF__TRY(gsf__caption_text(ctx, captioner, desc->prompt, &text, &text_count));
+    gsf_result result = gsf__caption_check(ctx, captioner, desc, (int64_t)text_count, &most);
+    if (!result) {
+        *ids = (int32_t*)gsf_alloc(ctx, (size_t)most, sizeof **ids);
+        result = *ids ? gsf__caption_write(&run, text, text_count, most, *ids, count) : GSF_ERROR_OUT_OF_MEMORY;
+    }
+    gsf_nn_destroy_workspace(ctx, &run.vit.workspace);
+    gsf_free(ctx, text);
+    if (!result) return GSF_OK;
+    gsf_free(ctx, *ids);
+    *ids = NULL;
+    *count = 0;
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
+                                  const char* prompt, int32_t max_new_tokens, char* out, size_t size) {
+    gsf_nn_caption_desc desc;
+    gsf_text text;
+    int32_t* ids;
+    size_t count, begin = 0;
+    if (!out || !size) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: no room for the text");
+    out[0] = 0;
+    memset(&desc, 0, sizeof desc);
+    memset(&text, 0, sizeof text);
+    desc.image = image;
+    desc.prompt = prompt;
+    desc.max_new_tokens = max_new_tokens;
+    GSF__TRY(gsf_nn_caption_ids(ctx, captioner, &desc, &ids, &count));
+    const gsf_result result = gsf_nn_decode_bpe(ctx, &captioner->tokenizer, ids, count, 1, &text);
+    size_t end = text.size, used = 0;
+    if (!result) gsf__bpe_strip((const gsf__bpe_tables*)captioner->tokenizer.tables, text.data, 1, 1, &begin, &end);
+    for (size_t step; !result && begin < end; begin += step) { // whole characters; U+FFFD for a zero byte
+        step = gsf__utf8_size(text.data + begin, end - begin);
+        const int zero = text.data[begin] == 0;
+        if (used + (zero ? 3 : step) >= size) break;
+        memcpy(out + used, zero ? "\xef\xbf\xbd" : text.data + begin, zero ? 3 : step);
+        used += zero ? 3 : step;
+    }
+    out[used] = 0;
+    gsf_destroy_text(ctx, &text);
+    gsf_free(ctx, ids);
+    return result;
+}
+
+GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
+                                 double* bytes, double* flops) {
+    const gsf__blip* net = (const gsf__blip*)captioner->nets;
+    const gsf__qformer* q = &net->qformer;
+    const gsf__opt* opt = &net->text;
+    gsf_nn_encoder_input in;
+    memset(&in, 0, sizeof in);
+    in.images = 1;
+    in.height = in.width = (int32_t)net->image_size;
+    if (text_tokens < 1) text_tokens = 1;
+    int64_t most = gsf__caption_most(captioner, text_tokens, max_new_tokens);
+    if (most < 1) most = 1;
+    const gsf__vit_plan vision = gsf__vit_plan_of(&net->vision, &in);
+    const int64_t rows = q->queries + text_tokens;
+    const gsf__opt_plan text = gsf__opt_plan_of(opt, rows, rows + most - 1, 1);
+    const double words = 4.0 * (double)q->queries * (double)opt->sizes.width;
+    const double image = 12.0 * (double)net->image_size * (double)net->image_size +
+                         4.0 * (double)vision.tokens * (double)net->vision.sizes.width;
+    const double look = image + gsf__vit_bytes(&vision), ask = image + 4.0 * (double)gsf__qformer_floats(net);
+    const double write = 4.0 * (double)gsf__opt_floats(&text), first = look > ask ? look : ask;
+    if (bytes) *bytes = words + (first > write ? first : write);
+    const double d = (double)q->width, n = (double)q->queries, seen = (double)vision.tokens;
+    const double crossing = (double)gsf__ceil_div(q->layers, q->cross_every);
+    const double self = 8.0 * n * d * d + 4.0 * n * n * d + 4.0 * n * d * (double)q->mlp;
+    const double cross = 4.0 * n * d * d + 4.0 * seen * d * (double)net->vision.sizes.width + 4.0 * n * seen * d;
+    const double w = (double)opt->sizes.width, all = (double)(rows + most - 1);
+    const double row = 2.0 * w * (4.0 * w + 2.0 * (double)opt->sizes.mlp), layers = (double)opt->layers;
+    if (flops)
+        *flops = gsf__vit_flops(&net->vision, &vision, 1.0) + (double)q->layers * self + crossing * cross +
+                 2.0 * n * d * w + layers * (all * row + 2.0 * all * all * w) +
+                 2.0 * (double)most * w * (double)opt->vocabulary;
+}
+
 // ---- >>nn restorer --------------------------------------------------------------
 
 typedef struct gsf__dit_restorer {
@@ -9702,7 +11596,7 @@ static const char gsf__dit_negative[] = "The video is not of a high quality, it 
                                         "each frame. The background is solid. Strange body and strange trajectory. "
                                         "Distortion. ";
 
-enum { GSF__DIT_CAPTION_TOKENS = 20, GSF__DIT_CAPTION_BYTES = 1024 };
+enum { GSF__DIT_CAPTION_BYTES = 1024 };
 
 typedef struct gsf__dit_part { // an encoder: `photos` NULL only opens it, checks that it fits and counts its cost
     gsf_context* ctx;
@@ -9857,9 +11751,9 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     gsf_result result = gsf_nn_make_captioner(p->ctx, folder.data, &model);
     gsf_destroy_text(p->ctx, &folder);
     if (result) return gsf__dit_absent(p->ctx, result, "the caption", "a caption, or prompt_embeds in the features file,");
-    gsf_nn_captioner_cost(&model, NULL, GSF__DIT_CAPTION_TOKENS, &bytes, &flops);
+    gsf_nn_caption_cost(&model, 0, 0, &bytes, &flops);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
-    else result = gsf_nn_caption(p->ctx, &model, p->photos, NULL, GSF__DIT_CAPTION_TOKENS, out, GSF__DIT_CAPTION_BYTES);
+    else result = gsf_nn_caption(p->ctx, &model, p->photos, NULL, 0, out, GSF__DIT_CAPTION_BYTES);
     gsf_nn_destroy_captioner(p->ctx, &model);
     return result;
 }

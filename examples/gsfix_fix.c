@@ -1021,6 +1021,7 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
+    gsfix_print_stages(app);
     const char* also = app->o.also ? app->o.also : "";
     gsfix_print(app, "wrote      %s/report.html  splats.ply%s%s  metrics.json  test/%s", app->o.out,
                 strstr(also, "splat") ? "  splats.splat" : "", strstr(also, "spz") ? "  splats.spz" : "",

@@ -4,6 +4,7 @@
 #include "gsfixer_nn.h"
 
 #include "encoders_golden.h"
+#include "encoders_blip2.h"
 #include "encoders_dinov2.h"
 #include "encoders_preprocess.h"
 #include "encoders_vggt.h"
@@ -12,5 +13,6 @@ int main(void) {
     check_preprocess();
     check_dinov2();
     check_vggt();
+    check_blip2();
     return test_report();
 }
