@@ -11635,7 +11635,8 @@ static gsf_nn_encoder_input gsf__dit_usual_references(const gsf__dit_restorer* r
     const gsf_nn_transformer* t = &r->transformer;
     gsf_nn_encoder_input in;
     memset(&in, 0, sizeof in);
-    const double side = GSF__REFERENCE_SIDE, patches = rint(side * t->sample_height / t->sample_width / GSF__REFERENCE_PATCH);
+    const double side = GSF__REFERENCE_SIDE, patch = GSF__REFERENCE_PATCH;
+    const double patches = rint(side * t->sample_height / t->sample_width / patch);
     in.images = 2;
     in.width = GSF__REFERENCE_SIDE;
     in.height = GSF__REFERENCE_PATCH * (patches < 1.0 ? 1 : (int32_t)patches);
