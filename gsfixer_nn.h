@@ -1121,14 +1121,12 @@ static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_tensor* tenso
     return GSF_OK;
 }
 
-// Adds the tensors of a parsed header. Their names are copied to the file's block.
+// Adds the tensors of a parsed header, which begins with '{' and so is an object. Their names go to the file's block.
 static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weights, gsf__nn_file* file) {
     gsf__nn_files* files = (gsf__nn_files*)weights->files;
     const gsf_json_value* root = &h->json.values[0];
     const size_t first = weights->tensor_count;
     size_t names = 1; // so that there always is a block
-    if (root->type != GSF_JSON_OBJECT)
-        return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%d: the header is no object", h->name, (int)GSF__NN_FILE_HEAD);
     for (uint32_t i = root->child; i; i = h->json.values[i].next) names += h->json.values[i].key_size + 1;
     file->names = (char*)gsf_alloc(h->ctx, names, 1);
     if (!file->names) return GSF_ERROR_OUT_OF_MEMORY;
