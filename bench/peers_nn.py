@@ -6,8 +6,8 @@
 BENCH_NN is the built program; its rows are passed through. Every case that PyTorch can do, too, is read from its name and
 timed on as many threads right after; that row has variant "PyTorch" and "ratio": PyTorch's seconds divided by ours (above 1:
 we are faster), "cpu_ratio" the same of CPU seconds, for machines that do other things as well. --rounds repeats the two in
-turns; the median counts. Needs PyTorch (pip install torch; for the block diffusers, for the encoders transformers); without PyTorch only our
-rows are printed and the exit code is 77.
+turns; the median counts. Needs PyTorch (pip install torch), for the transformer's block diffusers and for DINOv2
+transformers, too; without PyTorch only our rows are printed and the exit code is 77.
 """
 import argparse
 import json
@@ -176,7 +176,11 @@ def peer_row(ours, quick):
             continue
         torch.set_num_threads(ours["threads"])
         with torch.inference_mode():
-            run, units = make(match, quick)
+            try:
+                run, units = make(match, quick)
+            except ImportError as missing:
+                print("peers_nn.py: %s: %s" % (ours["case"], missing), file=sys.stderr)
+                return None
             seconds, cpu = measure(run, units, quick)
         row = {key: ours[key] for key in ("bench", "case", "isa", "threads", "work", "work_unit")}
         row.update(variant="PyTorch", seconds=seconds, cpu_seconds=cpu, rate=ours["work"] / seconds, reference="none",
