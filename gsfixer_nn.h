@@ -581,7 +581,8 @@ typedef struct gsf_nn_features { // of reference photos; zero to begin with, des
 } gsf_nn_features;
 
 // Prepares the photos and encodes them with the models that are given. A later call with the other model (of which only one
-// need then be open at a time) adds its tokens. All photos must come out in one size.
+// need then be open at a time) adds its tokens. All photos must come out in one size. On error the tokens that were to be
+// made are NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
                                                           const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
                                                           gsf_nn_features* features);
