@@ -37,7 +37,8 @@
                never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
-               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
+               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece (Kudo
+               and Richardson 2018), T5 (Raffel et al. 2020).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
                >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn bpe >>nn captioner >>nn restorer
