@@ -107,7 +107,11 @@ static void test_bad_vggt(gsf_context* ctx) {
         {{0, "aggregator.camera_token", 0, 0, 0, 0, 0}, GSF_ERROR_FORMAT, "aggregator.camera_token has shape"},
         {{0, "aggregator.patch_embed.patch_embed.proj.weight", 0, 0, 0, 0, 0}, GSF_ERROR_FORMAT, "proj.weight has shape"},
         {{0, 0, "aggregator.surplus", 0, 0, 0, 0}, GSF_ERROR_FORMAT, "aggregator.surplus"},
-        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": 1", 0}, GSF_ERROR_FORMAT, "depth"},
+        {{"aggregator.frame_blocks.1.norm1.weight", 0, 0, 0, 0, 0, 0}, GSF_ERROR_FORMAT, "1.norm1.weight is missing"},
+        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": 1", 0}, GSF_ERROR_FORMAT, "is missing"},
+        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": 1, \"was\": ", 0}, GSF_ERROR_FORMAT, "frame_blocks.1."},
+        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": -", 0}, GSF_ERROR_FORMAT, "depth"},
+        {{0, 0, 0, 0, "\"embed_dim\": ", "\"embed_dim\": 1", 0}, GSF_ERROR_UNSUPPORTED, "heads"},
         {{0, 0, 0, 0, "\"num_heads\": ", "\"num_heads\": 7", 0}, GSF_ERROR_UNSUPPORTED, "heads"},
         {{0, 0, 0, 0, "\"frame\",", "\"global\",", 0}, GSF_ERROR_UNSUPPORTED, "aa_order"},
         {{0, 0, 0, 0, "\"qk_norm\": true", "\"qk_norm\": false", 0}, GSF_ERROR_FORMAT, "_norm."}};
