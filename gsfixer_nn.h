@@ -7583,6 +7583,9 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     GSF__TRY(gsf__nn_need(loader, &embed_up, 2, any, "aggregator.patch_embed.blocks.0.mlp.fc1.weight"));
     GSF__TRY(gsf__nn_need(loader, &up, 2, any, "aggregator.frame_blocks.0.mlp.fc1.weight"));
     GSF__TRY(gsf__nn_need(loader, &registers, 4, any, "aggregator.register_token"));
+    if (patch->count < 1 || patch->shape[2] > 1024)
+        return gsf_fail(loader->ctx, GSF_ERROR_UNSUPPORTED, "%s: a patch of %lld x %lld", w->name,
+                        (long long)patch->shape[2], (long long)patch->shape[3]);
     net->sizes.width = vit->sizes.width = patch->shape[0];
     net->sizes.mlp = up->shape[0];
     net->registers = registers->shape[2];
