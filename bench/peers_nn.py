@@ -202,6 +202,7 @@ CASES = [ # name of a case, what makes (function, units)
      rows),
     (re.compile(r"conv3d f32 C=(\d+) T=(\d+) H=(\d+) W=(\d+)$"), conv3d),
     (re.compile(r"block (f32) S=(\d+) R=0$"), block),
+    (re.compile(r"t5 layer (f32|bf16) S=(\d+)$"), t5_layer),
     (re.compile(r"dinov2 f32 (\d+)x(\d+) L=(\d+)$"), dinov2),
     (re.compile(r"vggt pair f32 (\d+)x(\d+) N=(\d+)$"), pair),
 ]
