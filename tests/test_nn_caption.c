@@ -205,7 +205,7 @@ static void check_round_trip(gsf_context* ctx, const gsf_nn_bpe* bpe, const char
     CHECK_OK(ctx, gsf_nn_encode_bpe(ctx, bpe, text, size, 1, &ids, &count));
     CHECK(count <= size);
     CHECK_OK(ctx, gsf_nn_decode_bpe(ctx, bpe, ids, count, 0, &back));
-    if (!CHECK(back.size == size && memcmp(back.data, text, size) == 0))
+    if (!CHECK(back.size == size && (!size || memcmp(back.data, text, size) == 0)))
         fprintf(stderr, "    %.40s\n", text);
     gsf_destroy_text(ctx, &back);
     gsf_free(ctx, ids);
