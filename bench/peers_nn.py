@@ -6,7 +6,8 @@
 BENCH_NN is the built program; its rows are passed through. Every case that PyTorch can do, too, is read from its name and
 timed on as many threads right after; that row has variant "PyTorch" and "ratio": PyTorch's seconds divided by ours (above 1:
 we are faster), "cpu_ratio" the same of CPU seconds, for machines that do other things as well. --rounds repeats the two in
-turns; the median counts. Needs PyTorch (pip install torch); without it only our rows are printed and the exit code is 77.
+turns; the median counts. Needs PyTorch (pip install torch), for the image encoder transformers, too; without PyTorch only our
+rows are printed and the exit code is 77.
 """
 import argparse
 import json
@@ -136,6 +137,55 @@ def block(match, quick):
     return run, 1
 
 
+def dinov2(match, quick):
+    """transformers' model at DINOv2-L's sizes; all layers are one and the same, as in bench_nn."""
+    import transformers
+    height, width, layers = (int(match.group(i)) for i in (1, 2, 3))
+    config = transformers.Dinov2WithRegistersConfig(hidden_size=1024, num_hidden_layers=1, num_attention_heads=16,
+                                                    image_size=518, patch_size=14, attn_implementation="sdpa")
+    model = transformers.Dinov2WithRegistersModel(config).eval()
+    model.encoder.layer = torch.nn.ModuleList([model.encoder.layer[0]] * layers)
+    model.config.num_hidden_layers = layers
+    x = torch.rand(1, 3, height, width)
+    return lambda: model(x).last_hidden_state[:, 5:], 1
+
+
+def pair(match, quick):
+    """A frame and a global block as VGGT's own code computes them: norms of q and k, two rotations, fused attention."""
+    f, d, heads = torch.nn.functional, 1024, 16
+    down, across, images = int(match.group(1)) // 14, int(match.group(2)) // 14, int(match.group(3))
+    linear = lambda out, fan: (torch.rand(out, fan).sub_(0.5).mul_(0.03), torch.rand(out).sub_(0.5))
+    qkv, out, up, low = linear(3 * d, d), linear(d, d), linear(4 * d, d), linear(d, 4 * d)
+    ones, small = torch.ones(d), torch.ones(64)
+    tokens = 5 + down * across
+    x = torch.rand(images, tokens, d).sub_(0.5)
+    places = torch.cartesian_prod(torch.arange(down), torch.arange(across)) + 1
+    places = torch.cat([torch.zeros(5, 2, dtype=places.dtype), places])
+    angles = torch.arange(max(down, across) + 1).float()[:, None] * 100.0 ** (-torch.arange(0, 32, 2).float() / 32)
+    cos, sin = torch.cat([angles, angles], -1).cos(), torch.cat([angles, angles], -1).sin()
+
+    def turned(y, where):  # halves of each head by row and column; pairs half of it apart
+        parts = []
+        for axis, part in enumerate(y.chunk(2, -1)):
+            a, b = part.chunk(2, -1)
+            parts.append(part * f.embedding(where[:, axis], cos) + torch.cat([-b, a], -1) * f.embedding(where[:, axis], sin))
+        return torch.cat(parts, -1)
+
+    def block(y, where):
+        samples, n, _ = y.shape
+        z = f.linear(f.layer_norm(y, (d,), ones, ones, 1e-5), *qkv)
+        q, k, v = z.reshape(samples, n, 3, heads, 64).permute(2, 0, 3, 1, 4).unbind(0)
+        q, k = f.layer_norm(q, (64,), small, small, 1e-5), f.layer_norm(k, (64,), small, small, 1e-5)
+        a = f.scaled_dot_product_attention(turned(q, where), turned(k, where), v)
+        y = y + f.linear(a.transpose(1, 2).reshape(samples, n, d), *out) * ones
+        return y + f.linear(f.gelu(f.linear(f.layer_norm(y, (d,), ones, ones, 1e-5), *up)), *low) * ones
+
+    def run():
+        y = block(x, places)
+        return block(y.view(1, images * tokens, d), places.repeat(images, 1))
+    return run, 1
+
+
 CASES = [ # name of a case, what makes (function, units)
     (re.compile(r"linear (f32|bf16|f16) M=(\d+) N=(\d+) K=(\d+)(?: (gelu|silu))?$"), linear),
     (re.compile(r"attention f32 H=(\d+) D=(\d+) Q=(\d+) K=(\d+)$"), attention),
@@ -143,6 +193,8 @@ CASES = [ # name of a case, what makes (function, units)
      rows),
     (re.compile(r"conv3d f32 C=(\d+) T=(\d+) H=(\d+) W=(\d+)$"), conv3d),
     (re.compile(r"block (f32) S=(\d+) R=0$"), block),
+    (re.compile(r"dinov2 f32 (\d+)x(\d+) L=(\d+)$"), dinov2),
+    (re.compile(r"vggt pair f32 (\d+)x(\d+) N=(\d+)$"), pair),
 ]
 
 
