@@ -1401,6 +1401,108 @@ static void bench_t5s(const bench_options* o) {
     }
 }
 
+// ---- the captioner's language model ----------------------------------------------------
+
+enum { BENCH_OPT_WIDTH = 2560, BENCH_OPT_HEADS = 32, BENCH_OPT_ROWS = 33, BENCH_OPT_CACHE = 64 }; // OPT-2.7b
+
+typedef struct bench_opt {
+    gsf__blip net;
+    gsf__vit_block block;
+    gsf_tensor tensors[GSF__COUNT(gsf__opt_block_entries)];
+    gsf__caption_run run;
+    gsf__opt_run state;
+    int64_t rows, past;
+    const float* first; // the stream before the layer
+} bench_opt;
+
+static void bench_run_opt(gsf_context* ctx, void* arg) {
+    bench_opt* b = (bench_opt*)arg;
+    b->state.past = b->past;
+    memcpy(b->state.x, b->first, (size_t)(b->rows * BENCH_OPT_WIDTH) * sizeof(float));
+    bench_require(ctx, gsf__opt_block(&b->run, &b->state, 0, b->rows));
+}
+
+// The layer's tensors in half precision, one after another; returns their bytes.
+static size_t bench_opt_weights(bench_opt* b, char* memory) {
+    size_t used = 0;
+    for (size_t i = 0; i < GSF__COUNT(gsf__opt_block_entries); i++) {
+        const gsf__vit_entry* e = &gsf__opt_block_entries[i];
+        gsf_tensor* t = &b->tensors[i];
+        memset(t, 0, sizeof *t);
+        t->name = e->name;
+        t->dtype = GSF_NN_F16;
+        t->count = 1;
+        for (const char* c = e->shape; *c; c++)
+            t->count *= t->shape[t->rank++] = gsf__vit_dimension(&b->net.text.sizes, NULL, *c);
+        t->data = memory + used;
+        if (memory) bench_fill(memory + used, (size_t)t->count * 2, GSF_NN_F16, i + 1);
+        memcpy((char*)&b->block + e->offset, &t, sizeof t);
+        used += (size_t)gsf__round_up(t->count * 2, 64);
+    }
+    return used;
+}
+
+// One layer of OPT-2.7b: all rows of an image's queries and bos at once, or one token behind them, which is a matter of
+// reading the weights.
+static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
+    char name[96];
+    snprintf(name, sizeof name, "opt layer f16 D=%d rows=%lld", BENCH_OPT_WIDTH, (long long)rows);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    bench_opt* b = (bench_opt*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
+    gsf__opt* opt = &b->net.text;
+    opt->sizes.width = BENCH_OPT_WIDTH;
+    opt->sizes.mlp = 4 * BENCH_OPT_WIDTH;
+    opt->sizes.heads = BENCH_OPT_HEADS;
+    opt->sizes.head_dim = BENCH_OPT_WIDTH / BENCH_OPT_HEADS;
+    opt->sizes.eps = 1e-5f;
+    opt->sizes.activation = GSF_NN_RELU;
+    opt->layers = opt->vocabulary = 1;
+    opt->blocks = &b->block;
+    const size_t bytes = bench_opt_weights(b, NULL);
+    char* weights = (char*)bench_alloc(&ctx, bytes, 1);
+    bench_opt_weights(b, weights);
+    const gsf__opt_plan p = gsf__opt_plan_of(opt, rows, BENCH_OPT_CACHE, 1);
+    float* memory = (float*)bench_alloc(&ctx, gsf__opt_floats(&p) + p.x, sizeof(float));
+    bench_fill(memory, (2 * p.cache + p.x) * sizeof(float), GSF_NN_F32, 6);
+    b->rows = rows;
+    b->past = rows > 1 ? 0 : BENCH_OPT_ROWS;
+    b->first = memory + 2 * p.cache;
+    b->state.capacity = BENCH_OPT_CACHE;
+    b->state.keys = memory;
+    b->state.values = memory + p.cache;
+    b->state.x = memory + 2 * p.cache + p.x;
+    b->run.net = &b->net;
+    b->run.vit.ctx = &ctx;
+    b->run.vit.sizes = &opt->sizes;
+    b->run.vit.normed = b->state.x + p.x;
+    b->run.vit.wide = b->run.vit.normed + p.normed;
+    b->run.vit.wide_count = (int64_t)p.wide;
+    b->run.vit.vectors = b->run.vit.wide + p.wide;
+    b->run.vit.vectors_size = p.vectors;
+    b->state.mask = (unsigned char*)(b->run.vit.vectors + p.vectors);
+    for (size_t i = 0; i < p.mask; i++) b->state.mask[i] = (int64_t)i % rows <= (int64_t)i / rows % rows;
+    const double d = BENCH_OPT_WIDTH, n = (double)rows;
+    const double flops = 24.0 * n * d * d + 4.0 * n * (n + (double)b->past) * d;
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, rows > 1 ? flops : (double)bytes,
+                                   rows > 1 ? "flop" : "B");
+    if (rows > 1) row.flops = flops;
+    else row.bytes = (double)bytes;
+    bench_time(o, &ctx, &row, bench_run_opt, b, 1.0);
+    bench_print(o->json, &row);
+    gsf_nn_destroy_workspace(&ctx, &b->run.vit.workspace);
+    gsf_free(&ctx, memory);
+    gsf_free(&ctx, weights);
+    gsf_free(&ctx, b);
+}
+
+static void bench_captions(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        bench_one_opt(o, threads, 1);
+        bench_one_opt(o, threads, BENCH_OPT_ROWS);
+    }
+}
+
 int main(int argc, char** argv) {
     bench_options o;
     memset(&o, 0, sizeof o);
@@ -1440,6 +1542,7 @@ int main(int argc, char** argv) {
     bench_norms(&o);
     bench_convs(&o);
     bench_blocks(&o);
+    bench_captions(&o);
     bench_t5s(&o);
     bench_encoders(&o);
     return 0;

@@ -4,7 +4,8 @@
     pip install transformers==4.51.3 regex tokenizers
     python3 tests/compare_bpe.py build/tests/test_nn_caption [--folder GOLDEN/encoders/blip2] [--count 10000] [--seed 1]
 
-Runs on the folder's vocabulary and on a larger one that is trained here on this repository's sources. Exit code 0: all equal.
+Runs on the folder's vocabulary and on a larger one that is trained here on this repository's sources. Exit code 0: all
+equal.
 """
 import argparse, json, os, random, struct, subprocess, sys, tempfile
 
@@ -49,7 +50,8 @@ def random_texts(count, seed):
     spaces = [" ", "  ", "   ", "\t", "\n", "\r\n", "\u00a0", "\u2003", "\u3000", "\x1c", "\x85", "", " \n ", "\u200b"]
     ranges = [(0, 0x7f), (0, 0x1f), (0x20, 0x2fff), (0, 0xd7ff), (0xe000, 0xffff), (0x10000, 0x10ffff), (0x1f300, 0x1faff),
               (0x300, 0x36f), (0x4e00, 0x9fff), (0x80, 0x17f)]
-    texts = ["", " ", "  ", "\n", "a" * 100000, " " * 100000, "ab" * 50000, "é" * 30000, "👩‍👩‍👧‍👦" * 2000, "'s" * 20000, "\0" * 1000]
+    texts = ["", " ", "  ", "\n", "a" * 100000, " " * 100000, "ab" * 50000, "é" * 30000, "👩‍👩‍👧‍👦" * 2000, "'s" * 20000,
+             "\0" * 1000]
     while len(texts) < count:
         text = ""
         for _ in range(rng.randint(0, 12)):
@@ -74,7 +76,8 @@ def compare(program, folder, texts):
             data = text.encode("utf-8")
             file.write(struct.pack("<I", len(data)) + data)
         file.flush()
-        lines = subprocess.run([program, "encode", folder, file.name], check=True, stdout=subprocess.PIPE).stdout.split(b"\n")
+        run = subprocess.run([program, "encode", folder, file.name], check=True, stdout=subprocess.PIPE)
+    lines = run.stdout.split(b"\n")
     wrong = 0
     for text, line in zip(texts, lines):
         ids, whole, plain = line.split(b"|")

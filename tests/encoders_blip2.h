@@ -4,10 +4,10 @@
 
 #include "encoders_golden.h"
 
-// Largest errors allowed; reached: 0, 2e-6, 2e-6, 1e-6, 2e-6 for values of about 1.
+// Largest errors allowed; reached: 0, 2e-6, 2e-6, 5e-6, 5e-6 for values of about 1.
 static const struct { const char *tap, *expected; double bar; } blip2_stages[] = {
-    {"pixel_values", "pixel_values", 0.0}, {"vision", "vision_last", 2e-5}, {"qformer", "qformer_last", 2e-5},
-    {"projection", "language_projection", 2e-5}, {"logits", "logits_prompt", 2e-5}};
+    {"pixel_values", "pixel_values", 0.0}, {"vision", "vision_last", 4e-5}, {"qformer", "qformer_last", 4e-5},
+    {"projection", "language_projection", 4e-5}, {"logits", "logits_prompt", 4e-5}};
 
 typedef struct blip2_case {
     gsf_context* ctx;

@@ -1,0 +1,92 @@
+// fuzz_bpe.c - the byte-level tokenizer. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION. The input is split at its
+// zero bytes: vocab.json, merges.txt, tokenizer_config.json, special_tokens_map.json, added_tokens.json and, whatever it
+// holds, the text, which is also taken as ids. What is encoded must decode, and at most to what the ids can spell.
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_nn.h"
+
+#include "fuzz.h"
+
+enum { FILES = 5 };
+
+typedef struct bytes { const uint8_t* data; size_t size; } bytes;
+
+static const char* const names[FILES] = {"vocab.json", "merges.txt", "tokenizer_config.json", "special_tokens_map.json",
+                                         "added_tokens.json"};
+
+static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
+    const bytes* files = (const bytes*)user;
+    for (size_t i = 0; i < FILES; i++) {
+        if (strcmp(strrchr(path, '/') + 1, names[i]) != 0) continue;
+        if (i > 1 && files[i].size == 0) break;
+        *data = gsf_alloc(ctx, files[i].size, 1);
+        FUZZ_CHECK(*data);
+        if (files[i].size) memcpy(*data, files[i].data, files[i].size);
+        *size = files[i].size;
+        return GSF_OK;
+    }
+    return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+}
+
+static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
+    (void)user, (void)data, (void)size;
+    return gsf_fail(ctx, GSF_ERROR_IO, "%s", path);
+}
+
+static void check_utf8(const gsf_text* text) {
+    for (size_t i = 0, step; i < text->size; i += step) {
+        step = gsf__utf8_size(text->data + i, text->size - i);
+        FUZZ_CHECK(step);
+    }
+}
+
+static void check_decoded(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids, size_t count) {
+    for (int skip = 0; skip < 2; skip++) {
+        gsf_text text;
+        memset(&text, 0, sizeof text);
+        FUZZ_CHECK(gsf_nn_decode_bpe(ctx, bpe, ids, count, skip, &text) == GSF_OK);
+        check_utf8(&text);
+        gsf_destroy_text(ctx, &text);
+    }
+}
+
+static void use_tokenizer(gsf_context* ctx, const gsf_nn_bpe* bpe, bytes text) {
+    int32_t* ids;
+    size_t count;
+    const gsf_result result = gsf_nn_encode_bpe(ctx, bpe, (const char*)text.data, text.size, 0, &ids, &count);
+    if (result == GSF_OK) {
+        FUZZ_CHECK(count <= text.size + 2); // a first token, a space before
+        for (size_t i = 0; i < count; i++) FUZZ_CHECK(ids[i] >= 0 && ids[i] <= bpe->highest_id);
+        check_decoded(ctx, bpe, ids, count);
+    } else {
+        FUZZ_CHECK(result == GSF_ERROR_INVALID_ARGUMENT && ids == NULL && count == 0);
+    }
+    gsf_free(ctx, ids);
+    int32_t any[64];
+    const size_t some = text.size / 2 < 64 ? text.size / 2 : 64;
+    for (size_t i = 0; i < some; i++) any[i] = (int16_t)(text.data[2 * i] | text.data[2 * i + 1] << 8);
+    check_decoded(ctx, bpe, any, some);
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
+    gsf_context ctx = fuzz_context(size);
+    bytes parts[FILES + 1];
+    gsf_nn_bpe bpe;
+    memset(parts, 0, sizeof parts);
+    for (size_t i = 0; i <= FILES; i++) {
+        const uint8_t* zero = i < FILES && size ? (const uint8_t*)memchr(data, 0, size) : NULL;
+        parts[i].data = data;
+        parts[i].size = zero ? (size_t)(zero - data) : size;
+        data += zero ? parts[i].size + 1 : parts[i].size;
+        size -= zero ? parts[i].size + 1 : parts[i].size;
+    }
+    ctx.io.read_fn = read_fn;
+    ctx.io.write_fn = write_fn;
+    ctx.io.user = parts;
+    const gsf_result result = gsf_nn_make_bpe(&ctx, "fuzz", &bpe);
+    if (result == GSF_OK) use_tokenizer(&ctx, &bpe, parts[FILES]);
+    else FUZZ_CHECK((result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED) && ctx.error[0] && !bpe.tables);
+    gsf_nn_destroy_bpe(&ctx, &bpe);
+    FUZZ_CHECK(fuzz_live == 0);
+    return 0;
+}
