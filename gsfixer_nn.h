@@ -1924,7 +1924,7 @@ static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
     return gsf__round_up(gsf__ceil_div(total, gsf__ceil_div(total, most)), unit);
 }
 
-static int64_t gsf__few_rows(int64_t rows) { return rows < 3 ? rows : GSF__FEW_ROWS; } // that there are kernels for
+static int64_t gsf__few_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__FEW_ROWS; } // that there are kernels for
 
 static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f32, bf16 or f16 at any address
     float value;
@@ -2153,7 +2153,7 @@ GSF__TARGET_AVX2 static void gsf__finish_avx2(const gsf__linear_job* job, const 
 
 // Few rows. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so the more of them
 // go to x, so several rows of weights share what is loaded of it, and weights are asked for early. The processor drops such
-// requests when too many wait, hence each is made twice, `ahead` bytes (the rows of one tile) and twice that before its use.
+// requests when too many wait, hence each is made twice, `ahead` bytes (the rows of a tile) and twice that before its use.
 GSF__INLINE_AVX2 void gsf__few_fetch(const char* p, size_t ahead) {
     _mm_prefetch(p + ahead, _MM_HINT_T1);
     _mm_prefetch(p + 2 * ahead, _MM_HINT_T1);
@@ -2168,8 +2168,8 @@ GSF__INLINE_AVX2 void gsf__few_add(float* sums, __m256 a, __m256 b, __m256 c, __
     _mm_storeu_ps(sums, _mm_add_ps(_mm_loadu_ps(sums), gsf__sum8x4(a, b, c, d)));
 }
 
-// Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows]. `count` is a multiple
-// of 32, `line` the weights of a cache line.
+// Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows] (one row of x: also
+// two numbers behind them). `count` is a multiple of 32, `line` the weights of a cache line.
 GSF__INLINE_AVX2 void gsf__few_six(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
                                    int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
