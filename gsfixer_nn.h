@@ -2139,9 +2139,11 @@ enum {
     GSF__LINEAR_LONE_ROWS = 320,      // up to here one block has all rows
     GSF__LINEAR_LONE_COLUMNS = 192,
     GSF__FEW_ROWS = 4,                // up to here weights are not packed
-    GSF__FEW_BYTES = 1 << 17,         // of weights in one unit of work
-    GSF__FEW_COLUMNS = 1024,          // and its most outputs
-    GSF__FEW_DEPTH = 2048             // bytes of a row of weights that meet four rows of x at a time
+    GSF__FEW_CHUNKS = 32,             // so many units of work, as reading starts slowly in each,
+    GSF__FEW_BYTES = 1 << 16,         // but not of less weights than this
+    GSF__FEW_COLUMNS = 1008,          // nor of more outputs; both a multiple of 6 and 16
+    GSF__FEW_UNIT = 48,
+    GSF__FEW_PAD = 32                 // values of x are padded to a multiple of this
 };
 
 #ifndef GSF__LINEAR_PACKED // a test makes it small
@@ -2161,7 +2163,7 @@ typedef struct gsf__linear_kernels { // one set per instruction set
     // Sums (row stride `pitch`, readable to the next multiple of 8 columns) to outputs row ..., column ... of y
     void (*finish)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows, int64_t column,
                    int64_t columns);
-    // sums[m*pitch + c] = row m of x (AVX2: of job->few) times row column + c of the weights; room for 4 (2 pitch + 1)
+    // sums[m*pitch + c] = row m of x (AVX2: of job->few) times row column + c of the weights
     void (*few)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
 } gsf__linear_kernels;
 
@@ -2188,6 +2190,8 @@ struct gsf__linear_job {
 static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
     return gsf__round_up(gsf__ceil_div(total, gsf__ceil_div(total, most)), unit);
 }
+
+static int64_t gsf__few_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__FEW_ROWS; } // that there are kernels for
 
 static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f32, bf16 or f16 at any address
     float value;
@@ -2414,37 +2418,12 @@ GSF__TARGET_AVX2 static void gsf__finish_avx2(const gsf__linear_job* job, const 
     }
 }
 
-// Sixteen weights in two registers, in the order in which gsf__few_order put x.
-GSF__INLINE_AVX2 void gsf__load16(const char* p, gsf_nn_dtype dtype, __m256* low, __m256* high) {
-    if (dtype == GSF_NN_BF16) { // a float's upper half: even ones by a shift, odd ones by a mask
-        const __m256i bits = _mm256_loadu_si256((const __m256i*)(const void*)p);
-        *low = _mm256_castsi256_ps(_mm256_slli_epi32(bits, 16));
-        *high = _mm256_castsi256_ps(_mm256_and_si256(bits, _mm256_set1_epi32((int)0xffff0000u)));
-    } else {
-        *low = gsf__load8(p, dtype);
-        *high = gsf__load8(p + 8 * (dtype == GSF_NN_F32 ? 4 : 2), dtype);
-    }
-}
-
-// A row of weights times one row of x; `count` is a multiple of 16. One row of weights after another, so that memory is
-// read in a line, which the hardware foresees: two rows side by side reach two thirds of the bandwidth.
-GSF__INLINE_AVX2 float gsf__few_one(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
-    __m256 s0 = _mm256_setzero_ps(), s1 = s0, s2 = s0, s3 = s0, a, b;
-    const size_t step = dtype == GSF_NN_F32 ? 64 : 32;
-    for (; count >= 32; count -= 32, x += 32, w += 2 * step) {
-        gsf__load16(w, dtype, &a, &b);
-        s0 = _mm256_fmadd_ps(a, _mm256_load_ps(x), s0);
-        s1 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 8), s1);
-        gsf__load16(w + step, dtype, &a, &b);
-        s2 = _mm256_fmadd_ps(a, _mm256_load_ps(x + 16), s2);
-        s3 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 24), s3);
-    }
-    if (count > 0) {
-        gsf__load16(w, dtype, &a, &b);
-        s0 = _mm256_fmadd_ps(a, _mm256_load_ps(x), s0);
-        s1 = _mm256_fmadd_ps(b, _mm256_load_ps(x + 8), s1);
-    }
-    return gsf__nn_sum8(_mm256_add_ps(_mm256_add_ps(s0, s1), _mm256_add_ps(s2, s3)));
+// Few rows. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so the more of them
+// go to x, so several rows of weights share what is loaded of it, and weights are asked for early. The processor drops such
+// requests when too many wait, hence each is made twice, `ahead` bytes (the rows of a tile) and twice that before its use.
+GSF__INLINE_AVX2 void gsf__few_fetch(const char* p, size_t ahead) {
+    _mm_prefetch(p + ahead, _MM_HINT_T1);
+    _mm_prefetch(p + 2 * ahead, _MM_HINT_T1);
 }
 
 GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { // the sums of four
@@ -2452,71 +2431,103 @@ GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { //
     return _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
 }
 
-// Two rows of weights times four rows of x, laid out as [k / 8][4][8], added to sums[2][4]. Here the arithmetic leaves the
-// hardware no time to look ahead, so the same place of the next two rows, `ahead` bytes away, is asked for.
-GSF__INLINE_AVX2 void gsf__few_four(const char* w0, const char* w1, gsf_nn_dtype dtype, size_t ahead, const float* x,
-                                    int64_t count, float* sums) {
-    __m256 s00 = _mm256_setzero_ps(), s01 = s00, s02 = s00, s03 = s00, s10 = s00, s11 = s00, s12 = s00, s13 = s00;
-    const size_t step = dtype == GSF_NN_F32 ? 64 : 32;
-    for (; count > 0; count -= 16, x += 64, w0 += step, w1 += step) {
-        __m256 a0, b0, a1, b1, v;
-        _mm_prefetch(w0 + ahead, _MM_HINT_T1);
-        _mm_prefetch(w1 + ahead, _MM_HINT_T1);
-        gsf__load16(w0, dtype, &a0, &b0);
-        gsf__load16(w1, dtype, &a1, &b1);
-#define GSF_X(m, w, at)                         \
-        v = _mm256_load_ps(x + (at));           \
-        s0##m = _mm256_fmadd_ps(w##0, v, s0##m); \
-        s1##m = _mm256_fmadd_ps(w##1, v, s1##m);
-        GSF_X(0, a, 0) GSF_X(1, a, 8) GSF_X(2, a, 16) GSF_X(3, a, 24)
-        GSF_X(0, b, 32) GSF_X(1, b, 40) GSF_X(2, b, 48) GSF_X(3, b, 56)
-#undef GSF_X
-    }
-    _mm_storeu_ps(sums, _mm_add_ps(_mm_loadu_ps(sums), gsf__sum8x4(s00, s01, s02, s03)));
-    _mm_storeu_ps(sums + 4, _mm_add_ps(_mm_loadu_ps(sums + 4), gsf__sum8x4(s10, s11, s12, s13)));
+GSF__INLINE_AVX2 void gsf__few_add(float* sums, __m256 a, __m256 b, __m256 c, __m256 d) {
+    _mm_storeu_ps(sums, _mm_add_ps(_mm_loadu_ps(sums), gsf__sum8x4(a, b, c, d)));
 }
 
-// The last weights of a row, fewer than 16, with zeros behind.
-GSF__INLINE_AVX2 void gsf__few_tail(const char* w, size_t bytes, char* tail) {
-    memset(tail, 0, 64);
-    memcpy(tail, w, bytes);
+// Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows] (one row of x: also
+// two numbers behind them). `count` is a multiple of 32, `line` the weights of a cache line.
+GSF__INLINE_AVX2 void gsf__few_six(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
+                                   int64_t count, float* sums) {
+    const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
+    const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 32 : 16; // weights; bytes
+    __m256 s00 = _mm256_setzero_ps(), s10 = s00, s20 = s00, s30 = s00, s40 = s00, s50 = s00;
+    __m256 s01 = s00, s11 = s00, s21 = s00, s31 = s00, s41 = s00, s51 = s00;
+    for (int64_t at = 0; count > 0; count -= line) {
+        gsf__few_fetch(w0 + at, ahead);
+        gsf__few_fetch(w1 + at, ahead);
+        gsf__few_fetch(w2 + at, ahead);
+        gsf__few_fetch(w3 + at, ahead);
+        gsf__few_fetch(w4 + at, ahead);
+        gsf__few_fetch(w5 + at, ahead);
+        for (int64_t i = 0; i < line; i += 8, at += vector, x += 8 * rows) {
+            const __m256 x0 = _mm256_load_ps(x), x1 = rows > 1 ? _mm256_load_ps(x + 8) : x0;
+            __m256 v;
+#define GSF_X(r)                                           \
+            v = gsf__load8(w##r + at, dtype);              \
+            s##r##0 = _mm256_fmadd_ps(v, x0, s##r##0);     \
+            if (rows > 1) s##r##1 = _mm256_fmadd_ps(v, x1, s##r##1);
+            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+#undef GSF_X
+        }
+    }
+    if (rows == 1) {
+        gsf__few_add(sums, s00, s10, s20, s30);
+        gsf__few_add(sums + 4, s40, s50, s01, s11);
+        return;
+    }
+    gsf__few_add(sums, s00, s01, s10, s11);
+    gsf__few_add(sums + 4, s20, s21, s30, s31);
+    gsf__few_add(sums + 8, s40, s41, s50, s51);
+}
+
+// Three rows of weights times four rows of x, as above.
+GSF__INLINE_AVX2 void gsf__few_three(const char* const w[3], gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                     int64_t count, float* sums) {
+    const char *w0 = w[0], *w1 = w[1], *w2 = w[2];
+    const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 32 : 16;
+    __m256 s00 = _mm256_setzero_ps(), s01 = s00, s02 = s00, s03 = s00, s10 = s00, s11 = s00;
+    __m256 s12 = s00, s13 = s00, s20 = s00, s21 = s00, s22 = s00, s23 = s00;
+    for (int64_t at = 0; count > 0; count -= line) {
+        gsf__few_fetch(w0 + at, ahead);
+        gsf__few_fetch(w1 + at, ahead);
+        gsf__few_fetch(w2 + at, ahead);
+        for (int64_t i = 0; i < line; i += 8, at += vector, x += 32) {
+            const __m256 a = gsf__load8(w0 + at, dtype), b = gsf__load8(w1 + at, dtype), c = gsf__load8(w2 + at, dtype);
+            __m256 v;
+#define GSF_X(m)                                        \
+            v = _mm256_load_ps(x + 8 * (m));            \
+            s0##m = _mm256_fmadd_ps(a, v, s0##m);       \
+            s1##m = _mm256_fmadd_ps(b, v, s1##m);       \
+            s2##m = _mm256_fmadd_ps(c, v, s2##m);
+            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+        }
+    }
+    gsf__few_add(sums, s00, s01, s02, s03);
+    gsf__few_add(sums + 4, s10, s11, s12, s13);
+    gsf__few_add(sums + 8, s20, s21, s22, s23);
+}
+
+GSF__INLINE_AVX2 void gsf__few_tile(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
+                                    int64_t count, float* sums) {
+    if (rows == 1) gsf__few_six(w, dtype, ahead, x, 1, count, sums);
+    else if (rows == 2) gsf__few_six(w, dtype, ahead, x, 2, count, sums);
+    else gsf__few_three(w, dtype, ahead, x, count, sums);
 }
 
 GSF__INLINE_AVX2 void gsf__few8(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t column,
                                 int64_t columns, float* sums, int64_t pitch) {
     const size_t bytes = (size_t)job->in * size;
     const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
-    const int64_t whole = job->in & ~(int64_t)15;
-    const size_t at = (size_t)whole * size;
-    float* fours = sums + GSF__FEW_ROWS * pitch; // [column][4]
-    char tail[2][64];
-    if (job->desc.rows == 1) {
-        for (int64_t c = 0; c < columns; c++) {
-            const char* w = first + (size_t)c * bytes;
-            sums[c] = gsf__few_one(w, dtype, job->few, whole);
-            if (at == bytes) continue;
-            gsf__few_tail(w + at, bytes - at, tail[0]);
-            sums[c] += gsf__few_one(tail[0], dtype, job->few + whole, 16);
+    const int64_t rows = gsf__few_rows(job->desc.rows), height = rows > 2 ? 3 : 6; // of x, of weights
+    const int64_t whole = job->in / GSF__FEW_PAD * GSF__FEW_PAD;
+    const size_t left = (size_t)(job->in - whole) * size;
+    const char* w[6];
+    char tails[6][4 * GSF__FEW_PAD];
+    memset(tails, 0, sizeof tails);
+    for (int64_t c = 0; c < columns; c += height) {
+        float tile[12] = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0}; // [weights][x]
+        for (int64_t r = 0; r < height; r++) w[r] = first + (size_t)gsf__least(c + r, columns - 1) * bytes;
+        gsf__few_tile(w, dtype, (size_t)height * bytes, job->few, rows, whole, tile);
+        for (int64_t r = 0; left > 0 && r < height; r++) {
+            memcpy(tails[r], w[r] + (size_t)whole * size, left);
+            w[r] = tails[r];
         }
-        return;
+        if (left > 0) gsf__few_tile(w, dtype, 0, job->few + whole * rows, rows, GSF__FEW_PAD, tile);
+        for (int64_t r = 0; r < gsf__least(height, columns - c); r++)
+            for (int64_t m = 0; m < job->desc.rows; m++) sums[m * pitch + c + r] = tile[r * rows + m];
     }
-    memset(fours, 0, (size_t)(4 * (columns + 1)) * sizeof(float));
-    for (int64_t k = 0; k < job->in; k += GSF__FEW_DEPTH / (int64_t)size) { // so much of x stays in the L1 cache
-        const int64_t end = gsf__least(k + GSF__FEW_DEPTH / (int64_t)size, whole);
-        for (int64_t c = 0; c < columns; c += 2) {
-            const char *w0 = first + (size_t)c * bytes, *w1 = c + 1 < columns ? w0 + bytes : w0;
-            gsf__few_four(w0 + (size_t)k * size, w1 + (size_t)k * size, dtype, 2 * bytes, job->few + 4 * k, end - k,
-                          fours + 4 * c);
-        }
-    }
-    for (int64_t c = 0; c < columns && at < bytes; c += 2) {
-        const char *w0 = first + (size_t)c * bytes, *w1 = c + 1 < columns ? w0 + bytes : w0;
-        gsf__few_tail(w0 + at, bytes - at, tail[0]);
-        gsf__few_tail(w1 + at, bytes - at, tail[1]);
-        gsf__few_four(tail[0], tail[1], dtype, 0, job->few + 4 * whole, 16, fours + 4 * c);
-    }
-    for (int64_t m = 0; m < job->desc.rows; m++)
-        for (int64_t c = 0; c < columns; c++) sums[m * pitch + c] = fours[4 * c + m];
 }
 
 GSF__TARGET_AVX2 static void gsf__few_avx2(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
@@ -2615,17 +2626,13 @@ static void gsf__linear_few(void* arg, size_t index, int worker) { // some outpu
     job->kernels->finish(job, sums, job->plan.block_columns, 0, job->desc.rows, at, columns);
 }
 
-// x as the kernels of few rows want it: one row, or [k / 8][4][8]; zeros up to a multiple of 16 and for rows that are not
-// there; for bf16 with AVX2 the even ones of each 16 first.
-static void gsf__few_order(gsf__linear_job* job, int even_first) {
+// x as the kernels of few rows want it, [k / 8][rows][8], with zeros behind.
+static void gsf__few_order(gsf__linear_job* job) {
     const gsf_nn_linear_desc* d = &job->desc;
-    const int64_t rows = d->rows == 1 ? 1 : GSF__FEW_ROWS, padded = gsf__round_up(job->in, 16);
+    const int64_t rows = gsf__few_rows(d->rows), padded = gsf__round_up(job->in, GSF__FEW_PAD);
     for (int64_t m = 0; m < rows; m++)
-        for (int64_t k = 0; k < padded; k++) {
-            const int64_t from = even_first ? (k & ~(int64_t)15) + 2 * (k & 7) + (k >> 3 & 1) : k;
-            const float value = m < d->rows && from < job->in ? d->x[m * d->ldx + from] : 0.0f;
-            job->few[(k >> 3) * 8 * rows + 8 * m + (k & 7)] = value;
-        }
+        for (int64_t k = 0; k < padded; k++)
+            job->few[(k >> 3) * 8 * rows + 8 * m + (k & 7)] = m < d->rows && k < job->in ? d->x[m * d->ldx + k] : 0.0f;
 }
 
 // Cuts (rows, in) x (out, in)^T; 0 where the scratch would not be addressable.
@@ -2634,11 +2641,11 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
     if (in > INT64_MAX / 256 || out > INT64_MAX / 256 || rows > INT64_MAX / 256) return 0;
     size_t shared = 0;
     if (rows <= GSF__FEW_ROWS) {
-        const int64_t fit = GSF__FEW_BYTES / (in * (int64_t)weight_size);
+        const int64_t least = GSF__FEW_BYTES / (in * (int64_t)weight_size) + 1, share = gsf__ceil_div(out, GSF__FEW_CHUNKS);
         plan->few = 1;
-        plan->block_columns = gsf__round_up(gsf__least(fit < 1 ? 1 : fit, GSF__FEW_COLUMNS), 16);
-        plan->per_worker = (size_t)(2 * plan->block_columns + 1) * GSF__FEW_ROWS;
-        shared = (size_t)gsf__round_up(in, 16) * GSF__FEW_ROWS;
+        plan->block_columns = gsf__round_up(gsf__least(share < least ? least : share, GSF__FEW_COLUMNS), GSF__FEW_UNIT);
+        plan->per_worker = (size_t)(plan->block_columns * GSF__FEW_ROWS);
+        shared = (size_t)gsf__round_up(in, GSF__FEW_PAD) * GSF__FEW_ROWS;
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
         plan->depth = gsf__even_piece(in, GSF__LINEAR_DEPTH, 8);
@@ -2683,7 +2690,7 @@ static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch
     memset(job->bias, 0, (size_t)(job->out + 16) * sizeof(float));
     if (job->desc.bias) gsf_nn_read_tensor(job->desc.bias, 0, job->out, job->bias);
     if (plan->few) {
-        gsf__few_order(job, job->desc.weight->dtype == GSF_NN_BF16 && job->kernels != &gsf__linear_scalar);
+        gsf__few_order(job);
         gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->out, plan->block_columns), gsf__linear_few, job);
         return;
     }
@@ -2733,6 +2740,7 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
 //
 //     qw [panel of 16 outputs][k/4][16][4] int8         qx [group of 6 rows][k/4][6][4] int16
 //
+// Up to 4 rows, in groups of 2 then, meet the 8-bit weights as they are read, one panel after another.
 // Fours are what dot-product instructions (VNNI) take. AVX2 has none, and its products of bytes add pairs in 16 bits, which
 // 2 * 127 * 127 fills: signs moved to one operand, multiply, widen, add are 4 instructions for 32 products. With both
 // operands widened to 16 bits, a panel once per block, it is 2 multiplications (vpmaddwd) and 2 additions, also 4, of which
@@ -2745,6 +2753,7 @@ enum {
     GSF__INT8_DEPTH = 512,    // of a step through the inner dimension: a widened panel is 16 KiB
     GSF__INT8_ROWS = 192,     // of a block; times depth: 192 KiB
     GSF__INT8_COLUMNS = 384,  // its sums: 288 KiB
+    GSF__INT8_AHEAD = 4096,   // bytes ahead of which weights are asked for
     GSF__INT8_LONGEST = 131072 // 127 * 127 * this stays below 2^31
 };
 
@@ -2761,6 +2770,8 @@ typedef struct gsf__int8_kernels { // one set per instruction set
     void (*widen)(const int8_t* w, int64_t count, int16_t* out);
     // sums[6][16] = a [k/4][6][4] times b [2][k/4][8][4], or += with `add`
     void (*tile)(const int16_t* a, const int16_t* b, int64_t count, int add, int32_t* sums);
+    // sums[rows][16] = a [k/4][rows][4], 1 or 2 rows, times w [k/4][16][4]
+    void (*few)(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums);
     // out[6][16] = sums * rows[6] * columns[16]
     void (*scale)(const int32_t* sums, const float* rows, const float* columns, float* out);
 } gsf__int8_kernels;
@@ -2833,13 +2844,25 @@ static void gsf__int8_tile_scalar(const int16_t* a, const int16_t* b, int64_t co
             }
 }
 
+static void gsf__int8_few_scalar(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+    memset(sums, 0, (size_t)(rows * GSF__TILE_COLUMNS) * sizeof *sums);
+    for (int64_t k = 0; k < count; k += 4, a += 4 * rows, w += 4 * GSF__TILE_COLUMNS)
+        for (int64_t i = 0; i < rows; i++)
+            for (int64_t j = 0; j < GSF__TILE_COLUMNS; j++) {
+                const int16_t* p = a + 4 * i;
+                const int8_t* q = w + 4 * j;
+                sums[i * GSF__TILE_COLUMNS + j] += p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
+            }
+}
+
 static void gsf__int8_scale_scalar(const int32_t* sums, const float* rows, const float* columns, float* out) {
     for (int i = 0; i < GSF__TILE_SUMS; i++)
         out[i] = (float)sums[i] * rows[i / GSF__TILE_COLUMNS] * columns[i % GSF__TILE_COLUMNS];
 }
 
 static const gsf__int8_kernels gsf__int8_scalar = {gsf__int8_rotate_scalar, gsf__int8_quantize_scalar,
-                                                   gsf__int8_widen_scalar, gsf__int8_tile_scalar, gsf__int8_scale_scalar};
+                                                   gsf__int8_widen_scalar, gsf__int8_tile_scalar, gsf__int8_few_scalar,
+                                                   gsf__int8_scale_scalar};
 
 // ---- int8: AVX2 kernels
 
@@ -2959,6 +2982,38 @@ GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const int16_t* a, const int16_t
     }
 }
 
+GSF__INLINE_AVX2 void gsf__int8_few_sums(__m256i a, __m256i b, int32_t* to) { // of 8 columns by 2 pairs
+    const __m256i v = _mm256_permute4x64_epi64(_mm256_hadd_epi32(a, b), 0xd8);
+    _mm256_storeu_si256((__m256i*)(void*)to, v);
+}
+
+GSF__INLINE_AVX2 void gsf__int8_few8(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+    __m256i c00 = _mm256_setzero_si256(), c01 = c00, c02 = c00, c03 = c00, c10 = c00, c11 = c00, c12 = c00, c13 = c00;
+    for (int64_t k = 0; k < count; k += 4, a += 4 * rows, w += 64) {
+        const __m256i a0 = gsf__int8_broadcast4(a), a1 = rows > 1 ? gsf__int8_broadcast4(a + 4) : a0;
+        __m256i v;
+        _mm_prefetch((const char*)w + GSF__INT8_AHEAD, _MM_HINT_T1); // twice: see gsf__few_fetch
+        _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T1);
+#define GSF_X(i)                                                                                \
+        v = _mm256_cvtepi8_epi16(_mm_loadu_si128((const __m128i*)(const void*)(w + 16 * i)));   \
+        GSF__INT8_ADD(c0##i, _mm256_madd_epi16(v, a0))                                          \
+        if (rows > 1) { GSF__INT8_ADD(c1##i, _mm256_madd_epi16(v, a1)) }
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+#undef GSF_X
+    }
+    gsf__int8_few_sums(c00, c01, sums);
+    gsf__int8_few_sums(c02, c03, sums + 8);
+    if (rows == 1) return;
+    gsf__int8_few_sums(c10, c11, sums + 16);
+    gsf__int8_few_sums(c12, c13, sums + 24);
+}
+
+GSF__TARGET_AVX2 static void gsf__int8_few_avx2(const int16_t* a, int64_t rows, const int8_t* w, int64_t count,
+                                                int32_t* sums) {
+    if (rows == 1) gsf__int8_few8(a, 1, w, count, sums);
+    else gsf__int8_few8(a, 2, w, count, sums);
+}
+
 GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const float* rows, const float* columns,
                                                   float* out) {
     for (int i = 0; i < GSF__TILE_SUMS; i += 8) {
@@ -2969,7 +3024,7 @@ GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const flo
 }
 
 static const gsf__int8_kernels gsf__int8_avx2 = {gsf__int8_rotate_avx2, gsf__int8_quantize_avx2, gsf__int8_widen_avx2,
-                                                 gsf__int8_tile_avx2, gsf__int8_scale_avx2};
+                                                 gsf__int8_tile_avx2, gsf__int8_few_avx2, gsf__int8_scale_avx2};
 
 #endif
 
@@ -3140,6 +3195,37 @@ static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of
     }
 }
 
+static void gsf__int8_few(void* arg, size_t index, int worker) { // some panels of outputs of all rows
+    const gsf__int8_job* job = (const gsf__int8_job*)arg;
+    const int64_t rows = job->rows, first = (int64_t)index * job->block_columns;
+    const int64_t end = gsf__least(first + job->block_columns, job->weight->out);
+    int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
+    float* tile = (float*)(void*)(sums + GSF__TILE_SUMS);
+    memset(sums, 0, GSF__TILE_SUMS * sizeof *sums); // also of rows that are not there
+    for (int64_t column = first; column < end; column += GSF__TILE_COLUMNS) {
+        for (int64_t r = 0; r < rows; r += 2)
+            job->kernels->few(job->x + r * job->padded, gsf__least(rows - r, 2), job->weight->data + column * job->padded,
+                              job->padded, sums + r * GSF__TILE_COLUMNS);
+        job->kernels->scale(sums, job->scales, job->weight->scales + column, tile);
+        job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, 0, rows, column,
+                                    gsf__least(end - column, GSF__TILE_COLUMNS));
+    }
+}
+
+static void gsf__int8_run_few(gsf_context* ctx, gsf__int8_job* job) {
+    const gsf_nn_linear_desc* d = &job->linear.desc;
+    float* x = (float*)(void*)job->workers;
+    job->rows = d->rows;
+    memset(job->scales, 0, GSF__TILE_ROWS * sizeof *job->scales);
+    for (int64_t r = 0; r < d->rows; r++) {
+        const int64_t pair = r & ~(int64_t)1, width = gsf__least(d->rows - pair, 2);
+        memcpy(x, d->x + r * d->ldx, (size_t)job->weight->in * sizeof *x);
+        job->scales[r] = gsf__int8_row(job->kernels, x, job->weight->in, job->padded, job->weight->block,
+                                       job->x + pair * job->padded + 4 * (r - pair), 4 * width);
+    }
+    gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->weight->out, job->block_columns), gsf__int8_few, job);
+}
+
 // Cuts the work by its sizes; bytes of scratch for `workers`, or 0 where they cannot be counted.
 static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     const int64_t out = job->weight->out;
@@ -3150,6 +3236,10 @@ static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     job->held = gsf__even_piece(rows, most, GSF__TILE_ROWS);
     job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, GSF__TILE_ROWS);
     job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__TILE_COLUMNS);
+    if (rows <= GSF__FEW_ROWS) { // all at once; outputs in GSF__FEW_CHUNKS parts
+        const int64_t least = GSF__FEW_BYTES / job->padded + 1, share = gsf__ceil_div(out, GSF__FEW_CHUNKS);
+        job->block_columns = gsf__round_up(gsf__least(share < least ? least : share, out), GSF__TILE_COLUMNS);
+    }
     const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__TILE_COLUMNS;
     const int64_t row = 4 * job->padded; // the two kinds of work do not overlap
     job->per_worker = (size_t)gsf__round_up(block > row ? block : row, 64);
@@ -3200,7 +3290,8 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
     linear->kernels = gsf__linear_kernels_of(ctx->cpu_level);
     job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
     const int64_t column_blocks = gsf__ceil_div(weight->out, job.block_columns);
-    for (job.first = 0; job.first < desc->rows; job.first += job.held) {
+    if (desc->rows <= GSF__FEW_ROWS) gsf__int8_run_few(ctx, &job);
+    for (; job.first < desc->rows && desc->rows > GSF__FEW_ROWS; job.first += job.held) {
         job.rows = gsf__least(desc->rows - job.first, job.held);
         job.row_blocks = gsf__ceil_div(job.rows, job.block_rows);
         gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.rows, GSF__TILE_ROWS), gsf__int8_quantize_rows, &job);

@@ -10,6 +10,7 @@ typedef struct bench_row {
     int threads;
     double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
     double flops, bytes; // of the whole; 0: not counted, or not the bound to look at
+    double bandwidth, cpu_bandwidth; // shares of what reading the same memory between the rounds gave; 0: not measured
     double peak_rss;     // bytes; 0: not measured
 } bench_row;
 
@@ -61,8 +62,10 @@ static void bench_print(int json, const bench_row* row) {
     const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
     const bench_peak* peak = bench_peak_of(row->isa, row->threads);
     const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
-    const double byte_share = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
+    const double of_peak = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
     const double cpu = row->cpu_seconds > 0.0 ? row->seconds * row->threads / row->cpu_seconds : 0.0;
+    const double byte_share = row->bandwidth > 0.0 ? row->bandwidth : of_peak;
+    const double cpu_byte_share = row->bandwidth > 0.0 ? row->cpu_bandwidth : cpu * of_peak;
     if (json) {
         printf("{\"bench\":\"" BENCH_NAME "\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
                "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
@@ -71,7 +74,7 @@ static void bench_print(int json, const bench_row* row) {
         if (row->flops > 0.0) printf(",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", flop_share, cpu * flop_share);
         if (row->bytes > 0.0)
             printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g,\"cpu_bandwidth_share\":%.4g", row->bytes, byte_share,
-                   cpu * byte_share);
+                   cpu_byte_share);
         if (row->peak_rss > 0.0) printf(",\"peak_rss_bytes\":%.0f", row->peak_rss);
         if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
         printf("}\n");
@@ -79,7 +82,7 @@ static void bench_print(int json, const bench_row* row) {
         printf("%-44s %-8s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->variant, row->isa, row->threads,
                1e3 * row->seconds, 1e3 * row->cpu_seconds, rate, row->work_unit);
         if (row->flops > 0.0) printf("  %.1f%% (cpu %.1f%%) of the FMA peak", 100.0 * flop_share, 100.0 * cpu * flop_share);
-        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * byte_share, 100.0 * cpu * byte_share);
+        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * byte_share, 100.0 * cpu_byte_share);
         if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
         if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
         printf("\n");

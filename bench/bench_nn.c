@@ -33,37 +33,13 @@ static int bench_wanted(const bench_options* o, const char* name, int threads) {
     return (!o->filter || strstr(name, o->filter)) && (!o->threads || o->threads == threads);
 }
 
-// ---- time ------------------------------------------------------------------------
-
-typedef void (*bench_body)(gsf_context* ctx, void* arg);
-
-// One round to warm up, then rounds for about a second (quick: 0.2), at least three. Each does `repeats` units of the row.
-static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
-                       double repeats) {
-    enum { MOST = 101 };
-    double wall[MOST], cpu[MOST];
-    const double start = bench_now(), budget = o->quick ? 0.3 : 1.5;
-    int rounds = -1;
-    while (rounds < MOST && (rounds < 3 || bench_now() - start < budget)) {
-        const double t = bench_now(), c = bench_cpu();
-        body(ctx, arg);
-        if (rounds >= 0) {
-            wall[rounds] = (bench_now() - t) / repeats;
-            cpu[rounds] = (bench_cpu() - c) / repeats;
-        }
-        rounds++;
-    }
-    row->seconds = bench_median(wall, (size_t)rounds);
-    qsort(cpu, (size_t)rounds, sizeof *cpu, bench_compare);
-    row->cpu_seconds = cpu[0];
-}
-
 // ---- what the machine can do ----------------------------------------------------
 
 enum { READ_CHUNK = 1 << 18 }; // bytes
 
 typedef struct bench_read {
     const char* memory;
+    size_t size; // a multiple of READ_CHUNK
     float* sums; // 16 of each chunk
 } bench_read;
 
@@ -97,28 +73,39 @@ GSF__TARGET_AVX2 static void bench_read_avx2(void* arg, size_t chunk, int worker
 }
 #endif
 
+static void bench_read_all(gsf_context* ctx, bench_read* job) {
+    gsf_chunk_fn reader = bench_read_scalar;
+#if GSF__X86
+    if (ctx->cpu_level >= GSF_CPU_AVX2) reader = bench_read_avx2;
+#endif
+    gsf__parallel_for(ctx, job->size / READ_CHUNK, reader, job);
+    bench_sink += job->sums[0];
+}
+
+// `memory` of `size` bytes; free `sums`.
+static bench_read bench_make_read(gsf_context* ctx, const char* memory, size_t size) {
+    bench_read read;
+    read.memory = memory;
+    read.size = size / READ_CHUNK * READ_CHUNK;
+    read.sums = (float*)bench_alloc(ctx, size / READ_CHUNK + 16, 16 * sizeof(float));
+    return read;
+}
+
 static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads, const char* memory, size_t size) {
     gsf_context ctx;
     if (!bench_context(&ctx, level, threads)) return;
-    bench_read read;
-    read.memory = memory;
-    read.sums = (float*)bench_alloc(&ctx, size / READ_CHUNK + 16, 16 * sizeof(float));
+    bench_read read = bench_make_read(&ctx, memory, size);
     double lanes;
     const gsf_chunk_fn fma = bench_fma_of(level, &lanes);
-    gsf_chunk_fn reader = bench_read_scalar;
-#if GSF__X86
-    if (level >= GSF_CPU_AVX2) reader = bench_read_avx2;
-#endif
     double best[2] = {1e30, 1e30}; // CPU seconds
     for (int i = 0; i < 9; i++) {
         const double t0 = bench_cpu();
         gsf__parallel_for(&ctx, 4 * (size_t)threads, fma, read.sums);
         const double t1 = bench_cpu();
-        gsf__parallel_for(&ctx, size / READ_CHUNK, reader, &read);
+        bench_read_all(&ctx, &read);
         const double t2 = bench_cpu();
         if (t1 - t0 < best[0]) best[0] = t1 - t0;
         if (t2 - t1 < best[1]) best[1] = t2 - t1;
-        bench_sink += read.sums[0];
     }
     const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 4.0 * threads;
     bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
@@ -129,6 +116,45 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     row = bench_make_row("machine: read memory", level, threads, best[1] / threads, best[1], (double)size, "B");
     bench_print(o->json, &row);
     gsf_free(&ctx, read.sums);
+}
+
+// ---- time ------------------------------------------------------------------------
+
+typedef void (*bench_body)(gsf_context* ctx, void* arg);
+
+// One round to warm up, then rounds for about a second (quick: 0.2), at least three. Each does `repeats` units of the row.
+// With `read`, that memory is read before each round, and the row's bandwidth is its share of what that gave: other tenants
+// of the machine's memory come and go, and meet both alike.
+static void bench_time_beside(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
+                              double repeats, bench_read* read) {
+    enum { MOST = 101 };
+    double wall[MOST], cpu[MOST], share[MOST], cpu_share[MOST];
+    const double start = bench_now(), budget = o->quick ? 0.3 : read ? 3.0 : 1.5;
+    int rounds = -1;
+    while (rounds < MOST && (rounds < 3 || bench_now() - start < budget)) {
+        const double before = bench_now(), cpu_before = bench_cpu();
+        if (read) bench_read_all(ctx, read);
+        const double t = bench_now(), c = bench_cpu();
+        body(ctx, arg);
+        if (rounds >= 0) {
+            wall[rounds] = (bench_now() - t) / repeats;
+            cpu[rounds] = (bench_cpu() - c) / repeats;
+            share[rounds] = (t - before) / repeats / wall[rounds];
+            cpu_share[rounds] = (c - cpu_before) / repeats / cpu[rounds];
+        }
+        rounds++;
+    }
+    row->seconds = bench_median(wall, (size_t)rounds);
+    const double part = read ? row->bytes * repeats / (double)read->size : 0.0;
+    row->bandwidth = part * bench_median(share, (size_t)rounds);
+    row->cpu_bandwidth = part * bench_median(cpu_share, (size_t)rounds);
+    qsort(cpu, (size_t)rounds, sizeof *cpu, bench_compare);
+    row->cpu_seconds = cpu[0];
+}
+
+static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
+                       double repeats) {
+    bench_time_beside(o, ctx, row, body, arg, repeats, NULL);
 }
 
 // ---- made-up values ---------------------------------------------------------------
@@ -239,7 +265,9 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? (double)bytes : flops, few ? "B" : "flop");
     if (few) row.bytes = (double)bytes;
     else row.flops = flops;
-    bench_time(o, &ctx, &row, bench_run_linear, &l, (double)l.copies);
+    bench_read read = bench_make_read(&ctx, memory, (size_t)l.copies * bytes);
+    bench_time_beside(o, &ctx, &row, bench_run_linear, &l, (double)l.copies, few ? &read : NULL);
+    gsf_free(&ctx, read.sums);
     l.copies = 1;
     bench_run_linear(&ctx, &l);
     float* wide = (float*)bench_alloc(&ctx, (size_t)(in * out), sizeof(float));
@@ -261,7 +289,8 @@ typedef struct bench_shape {
 
 static void bench_linears(const bench_options* o, char* memory, size_t size) {
     static const bench_shape shapes[] = {
-        {1, 3072, 3072, GSF_NN_LINEAR, 1},     {4, 3072, 3072, GSF_NN_LINEAR, 1},
+        {1, 3072, 3072, GSF_NN_LINEAR, 1},     {2, 3072, 3072, GSF_NN_LINEAR, 0},
+        {4, 3072, 3072, GSF_NN_LINEAR, 1},     {2, 18432, 512, GSF_NN_LINEAR, 0},
         {226, 3072, 3072, GSF_NN_LINEAR, 1},   {2048, 3072, 3072, GSF_NN_LINEAR, 1},
         {2048, 12288, 3072, GSF_NN_GELU_TANH, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0},
         {17776, 3072, 3072, GSF_NN_LINEAR, 0},
@@ -282,13 +311,17 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
 // ---- linear layers in 8-bit integers ------------------------------------------------
 
 typedef struct bench_int8 {
-    bench_linear linear;
+    bench_linear linear; // copies: of the quantised weights
     gsf_nn_quantized weight;
 } bench_int8;
 
 static void bench_run_int8(gsf_context* ctx, void* arg) {
     bench_int8* l = (bench_int8*)arg;
-    bench_require(ctx, gsf_nn_linear_int8(ctx, &l->linear.workspace, &l->linear.desc, &l->weight));
+    gsf_nn_quantized weight = l->weight;
+    for (int64_t i = 0; i < l->linear.copies; i++) {
+        bench_require(ctx, gsf_nn_linear_int8(ctx, &l->linear.workspace, &l->linear.desc, &weight));
+        weight.data += weight.bytes;
+    }
 }
 
 static void bench_run_quantize(gsf_context* ctx, void* arg) {
@@ -300,7 +333,7 @@ static void bench_run_quantize(gsf_context* ctx, void* arg) {
 // Floats in; rotation, rounding, product, scales and bias counted. Its share is of the float FMA peak: AVX2 without VNNI ends
 // at 200% (16-bit multiply-adds, two per cycle), and errors are those of the rounding, not of sums.
 static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int threads, int64_t rows, int64_t out, int64_t in,
-                           char* memory) {
+                           char* memory, size_t size) {
     char name[96];
     snprintf(name, sizeof name, "linear int8 M=%lld N=%lld K=%lld", (long long)rows, (long long)out, (long long)in);
     gsf_context ctx;
@@ -323,11 +356,27 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
     l.linear.desc.rows = rows;
     l.linear.desc.bias = &l.linear.bias;
     l.linear.desc.y = y;
+    l.linear.copies = 1;
     bench_run_quantize(&ctx, &l);
-    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, 2.0 * (double)rows * (double)in * (double)out, "op");
-    row.flops = row.work;
-    bench_time(o, &ctx, &row, bench_run_int8, &l, 1.0);
+    bench_run_int8(&ctx, &l);
+    const int few = rows <= GSF__FEW_ROWS;
+    const double ops = 2.0 * (double)rows * (double)in * (double)out, bytes = (double)l.weight.bytes;
+    bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? bytes : ops, few ? "B" : "op");
     bench_linear_error(&l.linear, w, bias, &row);
+    if (few) {
+        bench_int8 many = l; // copies of the weights fill the memory
+        many.weight.data = (int8_t*)(void*)memory;
+        many.linear.copies = (int64_t)(size / l.weight.bytes);
+        for (int64_t i = 0; i < many.linear.copies; i++)
+            memcpy(memory + (size_t)i * l.weight.bytes, l.weight.data, l.weight.bytes);
+        bench_read read = bench_make_read(&ctx, memory, (size_t)many.linear.copies * l.weight.bytes);
+        row.bytes = bytes;
+        bench_time_beside(o, &ctx, &row, bench_run_int8, &many, (double)many.linear.copies, &read);
+        gsf_free(&ctx, read.sums);
+    } else {
+        row.flops = ops;
+        bench_time(o, &ctx, &row, bench_run_int8, &l, 1.0);
+    }
     bench_print(o->json, &row);
     if (rows == 2048) {
         snprintf(name, sizeof name, "linear int8 weights N=%lld K=%lld", (long long)out, (long long)in);
@@ -343,17 +392,19 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
     gsf_nn_destroy_workspace(&ctx, &l.linear.workspace);
 }
 
-static void bench_int8s(const bench_options* o, char* memory) {
+static void bench_int8s(const bench_options* o, char* memory, size_t size) {
     static const bench_shape shapes[] = {
-        {1, 3072, 3072, GSF_NN_LINEAR, 0},    {226, 3072, 3072, GSF_NN_LINEAR, 0},  {2048, 3072, 3072, GSF_NN_LINEAR, 1},
+        {1, 3072, 3072, GSF_NN_LINEAR, 1},    {2, 3072, 3072, GSF_NN_LINEAR, 0},    {4, 3072, 3072, GSF_NN_LINEAR, 1},
+        {226, 3072, 3072, GSF_NN_LINEAR, 0},  {2048, 3072, 3072, GSF_NN_LINEAR, 1},
         {2048, 12288, 3072, GSF_NN_LINEAR, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0}, {17776, 3072, 3072, GSF_NN_LINEAR, 0},
     };
     for (int threads = 1; threads <= 2; threads++) {
-        bench_one_int8(o, GSF_CPU_SCALAR, threads, 64, 256, 256, memory);
-        bench_one_int8(o, GSF_CPU_AVX2, threads, 64, 256, 256, memory);
+        bench_one_int8(o, GSF_CPU_SCALAR, threads, 64, 256, 256, memory, size);
+        bench_one_int8(o, GSF_CPU_AVX2, threads, 64, 256, 256, memory, size);
         for (size_t i = 0; i < GSF__COUNT(shapes); i++)
             if (!o->quick || shapes[i].quick)
-                bench_one_int8(o, GSF_CPU_AVX2, threads, shapes[i].rows, shapes[i].out, shapes[i].in, memory);
+                bench_one_int8(o, GSF_CPU_AVX2, threads, shapes[i].rows, shapes[i].out, shapes[i].in, memory,
+                               size);
     }
 }
 
@@ -1536,7 +1587,7 @@ int main(int argc, char** argv) {
         return 0;
     }
     bench_linears(&o, memory, size);
-    bench_int8s(&o, memory);
+    bench_int8s(&o, memory, size);
     gsf_free(&ctx, memory);
     bench_attentions(&o);
     bench_norms(&o);
