@@ -38,7 +38,8 @@ else
     "$build/bench_nn" --json ${quick[@]+"${quick[@]}"} | tee -a "$rows"
 fi
 for dtype in f32 bf16; do
-    "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" --parts transformer,vae,scheduler,features > /dev/null
+    "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" \
+        --parts transformer,vae,scheduler,features > /dev/null
 done
 "$build/bench_nn" --json --filter pipeline ${quick[@]+"${quick[@]}"} --pipeline "$temporary/f32" --pipeline "$temporary/bf16" |
     tee -a "$rows"

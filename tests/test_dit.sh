@@ -9,7 +9,8 @@ mkdir -p "$scratch"
 export OMP_WAIT_POLICY=passive
 log=$scratch/log
 fail() { echo "$0: $*"; tail -n 5 "$log"; exit 1; }
-"$make_model" "$scratch/model" --size tiny --parts transformer,vae,scheduler,features > "$log" 2>&1 || fail "make_model failed"
+"$make_model" "$scratch/model" --size tiny --parts transformer,vae,scheduler,features > "$log" 2>&1 ||
+    fail "make_model failed"
 dit=(--restorer "dit:$scratch/model" --ref-features "$scratch/model/features.safetensors")
 options=(--views 3 --iterations 60 --checkpoint-every 5 --max-size 64 --seed 7 --steps 6 "${dit[@]}"
     --set "rounds=1,windows=2,window_frames=9,first_round=20,last_round=40")
