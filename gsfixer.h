@@ -170,6 +170,7 @@ GSF_API int gsf_is_cancelled(const gsf_context* ctx);
 GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.
+// One line: what a file's text may bring of line ends and other control characters prints as '?'.
 GSF_API gsf_result gsf_fail(gsf_context* ctx, gsf_result result, const char* format, ...) GSF_PRINTF(3, 4);
 GSF_API void gsf_log(gsf_context* ctx, gsf_log_level level, const char* format, ...) GSF_PRINTF(3, 4);
 
@@ -846,6 +847,8 @@ GSF_API gsf_result gsf_fail(gsf_context* ctx, gsf_result result, const char* for
     va_start(args, format);
     vsnprintf(text, sizeof text, format, args);
     va_end(args);
+    for (char* c = text; *c; c++)
+        if ((unsigned char)*c < 0x20 || *c == 0x7f) *c = '?';
     memcpy(ctx->error, text, sizeof text);
     if (ctx->logger.log_fn) ctx->logger.log_fn(ctx->logger.user, GSF_LOG_ERROR, ctx->error);
     return result;

@@ -447,7 +447,8 @@ GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, i
 
 // ---- text: tokenizer ------------------------------------------------------------------
 // SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
-// sentencepiece 0.2. Ids are those, exactly.
+// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two spellings
+// of equal score.
 
 typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
     int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
@@ -580,7 +581,8 @@ typedef struct gsf_nn_features { // of reference photos; zero to begin with, des
 } gsf_nn_features;
 
 // Prepares the photos and encodes them with the models that are given. A later call with the other model (of which only one
-// need then be open at a time) adds its tokens. All photos must come out in one size.
+// need then be open at a time) adds its tokens. All photos must come out in one size. On error the tokens that were to be
+// made are NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
                                                           const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
                                                           gsf_nn_features* features);
@@ -1120,14 +1122,12 @@ static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_tensor* tenso
     return GSF_OK;
 }
 
-// Adds the tensors of a parsed header. Their names are copied to the file's block.
+// Adds the tensors of a parsed header, which begins with '{' and so is an object. Their names go to the file's block.
 static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weights, gsf__nn_file* file) {
     gsf__nn_files* files = (gsf__nn_files*)weights->files;
     const gsf_json_value* root = &h->json.values[0];
     const size_t first = weights->tensor_count;
     size_t names = 1; // so that there always is a block
-    if (root->type != GSF_JSON_OBJECT)
-        return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%d: the header is no object", h->name, (int)GSF__NN_FILE_HEAD);
     for (uint32_t i = root->child; i; i = h->json.values[i].next) names += h->json.values[i].key_size + 1;
     file->names = (char*)gsf_alloc(h->ctx, names, 1);
     if (!file->names) return GSF_ERROR_OUT_OF_MEMORY;
@@ -7139,7 +7139,7 @@ typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
     float* scores;                // of each piece
     unsigned char* types;
     size_t count, scores_capacity, types_capacity;
-    float unknown_score, top_score;
+    float unknown_score;
     int32_t unknown_id, bytes[256];
     uint32_t* units;              // character map: a double-array trie, 0 units: none
     size_t unit_count;
@@ -7333,14 +7333,10 @@ static gsf_result gsf__sp_add_piece(const gsf__pb* in, const gsf__pb_field* fiel
 }
 
 static gsf_result gsf__sp_check_pieces(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_keys* all) {
-    float low = FLT_MAX, high = FLT_MIN; // FLT_MIN is the reference's slip; user-defined pieces are scored by it
-    for (size_t i = 0; i < m->count; i++) {
-        if (m->types[i] != GSF__SP_NORMAL) continue;
-        if (m->scores[i] < low) low = m->scores[i];
-        if (m->scores[i] > high) high = m->scores[i];
-    }
+    float low = FLT_MAX;
+    for (size_t i = 0; i < m->count; i++)
+        if (m->types[i] == GSF__SP_NORMAL && m->scores[i] < low) low = m->scores[i];
     m->unknown_score = low - 10.0f;
-    m->top_score = high;
     if (m->unknown_id < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece is the unknown one", in->name);
     for (int i = 0; m->byte_fallback && i < 256; i++)
         if (m->bytes[i] < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece for the byte %d", in->name, i);
@@ -7684,15 +7680,22 @@ static gsf_result gsf__sp_normalize(gsf__sp_run* run, const char* text, size_t l
 
 // ---- spelling
 
-static void gsf__sp_offer(gsf__sp_best* best, double score, uint32_t start, int32_t id) {
-    if (best->id >= 0 && !(score > (double)best->score)) return; // the first of equals stays
-    best->score = (float)score;
+static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32_t id) {
+    if (best->id >= 0 && !(score > best->score)) return; // the first of equals stays
+    best->score = score;
     best->start = start;
     best->id = id;
 }
 
-// Viterbi over the bytes of run->normal. Scores are added in double, and rounded to float only once they are the best, as
-// in the reference, which decides between equals.
+// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of digits.
+static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
+    const float base = run->best[at].score;
+    for (size_t i = at; i <= reached; i++)
+        if (i == at || run->best[i].id >= 0) run->best[i].score -= base;
+}
+
+// Viterbi over the bytes of run->normal. Sums are floats that are rebased where sentencepiece 0.2.3 does it, since their
+// rounding decides between spellings of nearly equal score.
 static void gsf__sp_spell(gsf__sp_run* run) {
     static const unsigned char widths[17] = "\1\1\1\1\1\1\1\1\1\1\1\1\2\2\3\4"; // of a character, by its upper four bits
     const gsf__sp_model* m = run->m;
@@ -7700,7 +7703,9 @@ static void gsf__sp_spell(gsf__sp_run* run) {
     const size_t n = run->size;
     for (size_t i = 0; i <= n; i++) run->best[i].id = -1;
     run->best[0].score = 0.0f;
+    size_t reached = 0;
     for (size_t at = 0, width; at < n; at += width) {
+        if (fabsf(run->best[at].score) > 100000.0f) gsf__sp_rebase(run, at, reached);
         const float here = run->best[at].score;
         const gsf__sp_node* node = m->pieces;
         int known = 0; // this character alone is a piece
@@ -7710,14 +7715,14 @@ static void gsf__sp_spell(gsf__sp_run* run) {
             const int type = node->id < 0 ? 0 : m->types[node->id];
             const size_t length = k + 1 - at;
             if (type != GSF__SP_NORMAL && type != GSF__SP_USER) continue;
-            const double score = type == GSF__SP_USER ? (double)((float)length * m->top_score) - 0.1
-                                                      : (double)m->scores[node->id];
-            gsf__sp_offer(&run->best[k + 1], score + (double)here, (uint32_t)at, node->id);
+            const float score = type == GSF__SP_USER ? (float)(0.1 * (double)(length - 1)) : m->scores[node->id];
+            if (reached < k + 1) reached = k + 1;
+            gsf__sp_offer(&run->best[k + 1], score + here, (uint32_t)at, node->id);
             known |= length == width;
         }
         if (!known) {
-            const float score = m->unknown_score + here;
-            gsf__sp_offer(&run->best[at + width], (double)score, (uint32_t)at, m->unknown_id);
+            if (reached < at + width) reached = at + width;
+            gsf__sp_offer(&run->best[at + width], m->unknown_score + here, (uint32_t)at, m->unknown_id);
         }
     }
     for (size_t end = n; end > 0; end = run->best[end].start) run->best[run->best[end].start].next = (uint32_t)end;

@@ -814,6 +814,168 @@ static void bench_blocks(const bench_options* o) {
     }
 }
 
+// ---- image encoders -------------------------------------------------------------------
+
+enum { BENCH_VIT_WIDTH = 1024, BENCH_VIT_HEADS = 16, BENCH_VIT_ROWS = 25, BENCH_VIT_ACROSS = 37 }; // patches of 350 x 518
+
+typedef struct bench_vit {
+    gsf_nn_dinov2 net;
+    gsf__vit vit;
+    gsf__vit_block blocks[24]; // all on one block's weights, which no cache holds
+    gsf_tensor tensors[64];
+    gsf_nn_encoder_input in;
+    gsf__vit_run run;
+    float *first, *x, *out;    // the stream before a block; at work; the encoder's output
+} bench_vit;
+
+// Tensors of `entries` one after another in `memory`; matrices of small values.
+static size_t bench_vit_weights(bench_vit* b, const gsf__vit_entry* entries, size_t count, gsf_tensor* tensors, void* where,
+                                char* memory) {
+    size_t used = 0;
+    for (size_t i = 0; i < count; i++) {
+        const gsf__vit_entry* e = &entries[i];
+        gsf_tensor* t = &tensors[i];
+        memset(t, 0, sizeof *t);
+        t->name = e->name;
+        t->count = 1;
+        for (const char* c = e->shape; *c; c++)
+            t->count *= t->shape[t->rank++] = gsf__vit_dimension(&b->vit.sizes, &b->vit, *c);
+        t->data = memory + used;
+        const size_t bytes = (size_t)t->count * sizeof(float);
+        if (memory) {
+            bench_fill(memory + used, bytes, GSF_NN_F32, i + 1);
+            for (size_t k = 3; t->rank > 1 && k < bytes; k += 4) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
+            const gsf_tensor* pointer = t;
+            memcpy((char*)where + e->offset, &pointer, sizeof pointer);
+        }
+        used += (bytes + 63) / 64 * 64;
+    }
+    return used;
+}
+
+static void bench_vit_sizes(bench_vit* b, int64_t layers) {
+    gsf__vit* v = &b->vit;
+    v->sizes.width = BENCH_VIT_WIDTH;
+    v->sizes.mlp = 4 * BENCH_VIT_WIDTH;
+    v->sizes.heads = BENCH_VIT_HEADS;
+    v->sizes.head_dim = BENCH_VIT_WIDTH / BENCH_VIT_HEADS;
+    v->sizes.eps = v->sizes.head_eps = 1e-6f;
+    v->sizes.activation = GSF_NN_GELU;
+    v->sizes.qkv_bias = v->sizes.head_norm = 1;
+    v->channels = 3;
+    v->patch = 14;
+    v->registers = 4;
+    v->grid = 37;
+    v->layers = layers;
+    v->block_names = v->prefix = "none";
+    v->blocks = b->blocks;
+    b->net.nets = v;
+    b->in.images = 1;
+    b->in.height = BENCH_VIT_ROWS * 14;
+    b->in.width = BENCH_VIT_ACROSS * 14;
+}
+
+static void bench_run_dinov2(gsf_context* ctx, void* arg) {
+    bench_vit* b = (bench_vit*)arg;
+    bench_require(ctx, gsf_nn_dinov2_encode(ctx, &b->net, &b->in, b->out));
+}
+
+// The whole of DINOv2-L with registers, from pixels to the last norm.
+static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers) {
+    char name[96];
+    snprintf(name, sizeof name, "dinov2 f32 %dx%d L=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)layers);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    const gsf__vit_entry* entries = gsf__dinov2_block_entries;
+    const size_t count = GSF__COUNT(gsf__dinov2_block_entries), others = GSF__COUNT(gsf__dinov2_entries);
+    bench_vit* b = (bench_vit*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
+    bench_vit_sizes(b, layers);
+    const size_t block = bench_vit_weights(b, entries, count, b->tensors, b->blocks, NULL);
+    const size_t rest = bench_vit_weights(b, gsf__dinov2_entries, others, b->tensors + count, &b->vit, NULL);
+    char* weights = (char*)bench_alloc(&ctx, block + rest, 1);
+    bench_vit_weights(b, entries, count, b->tensors, b->blocks, weights);
+    bench_vit_weights(b, gsf__dinov2_entries, others, b->tensors + count, &b->vit, weights + block);
+    for (int64_t i = 1; i < layers; i++) b->blocks[i] = b->blocks[0];
+    const size_t pixels = 3 * (size_t)b->in.height * (size_t)b->in.width;
+    float* memory = (float*)bench_alloc(&ctx, pixels + BENCH_VIT_ROWS * BENCH_VIT_ACROSS * BENCH_VIT_WIDTH, sizeof(float));
+    bench_fill(memory, pixels * sizeof(float), GSF_NN_F32, 6);
+    b->in.pixels = memory;
+    b->out = memory + pixels;
+    double flops;
+    gsf_nn_dinov2_cost(&b->net, &b->in, NULL, &flops);
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_dinov2, b, 1.0);
+    bench_print(o->json, &row);
+    gsf_free(&ctx, memory);
+    gsf_free(&ctx, weights);
+    gsf_free(&ctx, b);
+}
+
+static void bench_run_pair(gsf_context* ctx, void* arg) {
+    bench_vit* b = (bench_vit*)arg;
+    const int64_t images = b->in.images, tokens = b->run.image_tokens;
+    memcpy(b->x, b->first, (size_t)(images * tokens * BENCH_VIT_WIDTH) * sizeof(float));
+    bench_require(ctx, gsf__vit_block_forward(&b->run, &b->blocks[0], b->x, images, tokens));
+    bench_require(ctx, gsf__vit_block_forward(&b->run, &b->blocks[0], b->x, 1, images * tokens));
+}
+
+// A frame and a global block of VGGT.
+static void bench_one_pair(const bench_options* o, int threads, int32_t images) {
+    char name[96];
+    snprintf(name, sizeof name, "vggt pair f32 %dx%d N=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)images);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    const gsf__vit_entry* entries = gsf__vggt_block_entries;
+    const size_t count = GSF__COUNT(gsf__vggt_block_entries);
+    bench_vit* b = (bench_vit*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
+    bench_vit_sizes(b, 1);
+    char* weights = (char*)bench_alloc(&ctx, bench_vit_weights(b, entries, count, b->tensors, b->blocks, NULL), 1);
+    bench_vit_weights(b, entries, count, b->tensors, b->blocks, weights);
+    gsf__vit_run* run = &b->run;
+    const int64_t quarter = b->vit.sizes.head_dim / 4;
+    b->in.images = images;
+    run->ctx = &ctx;
+    run->sizes = &b->vit.sizes;
+    run->special = 5;
+    run->across = BENCH_VIT_ACROSS;
+    run->image_tokens = 5 + BENCH_VIT_ROWS * BENCH_VIT_ACROSS;
+    const int64_t rows = images * run->image_tokens;
+    const size_t values = (size_t)(rows * BENCH_VIT_WIDTH), rotation = (size_t)(BENCH_VIT_ACROSS * quarter);
+    run->vectors_size = 6 * BENCH_VIT_WIDTH + 4 * (size_t)b->vit.sizes.head_dim;
+    run->wide_count = (int64_t)gsf__vit_wide(run->sizes, rows);
+    float* memory = (float*)bench_alloc(&ctx, 3 * values + (size_t)run->wide_count + run->vectors_size + 2 * rotation,
+                                        sizeof(float));
+    b->first = memory;
+    b->x = memory + values;
+    run->normed = b->x + values;
+    run->wide = run->normed + values;
+    run->vectors = run->wide + run->wide_count;
+    float* table = run->vectors + run->vectors_size;
+    run->cos = table;
+    run->sin = table + rotation;
+    bench_fill(memory, values * sizeof(float), GSF_NN_F32, 6);
+    gsf__vggt_make_rotation(100.0, BENCH_VIT_ACROSS, quarter, table, table + rotation);
+    const double flops = gsf__vit_block_flops(run->sizes, images, (double)run->image_tokens) +
+                         gsf__vit_block_flops(run->sizes, 1.0, (double)rows);
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_pair, b, 1.0);
+    bench_print(o->json, &row);
+    gsf_nn_destroy_workspace(&ctx, &run->workspace);
+    gsf_free(&ctx, memory);
+    gsf_free(&ctx, weights);
+    gsf_free(&ctx, b);
+}
+
+static void bench_encoders(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        bench_one_dinov2(o, threads, 2);
+        if (!o->quick && threads == 2) bench_one_dinov2(o, threads, 24); // half a minute
+        bench_one_pair(o, threads, 2);
+    }
+}
+
 // ---- a whole model from its folder ---------------------------------------------------
 
 typedef struct bench_memory { // resident bytes of this process, watched from a thread of its own
@@ -1182,5 +1344,6 @@ int main(int argc, char** argv) {
     bench_norms(&o);
     bench_convs(&o);
     bench_blocks(&o);
+    bench_encoders(&o);
     return 0;
 }

@@ -6,7 +6,8 @@
 BENCH_NN is the built program; its rows are passed through. Every case that PyTorch can do, too, is read from its name and
 timed on as many threads right after; that row has variant "PyTorch" and "ratio": PyTorch's seconds divided by ours (above 1:
 we are faster), "cpu_ratio" the same of CPU seconds, for machines that do other things as well. --rounds repeats the two in
-turns; the median counts. Needs PyTorch (pip install torch); without it only our rows are printed and the exit code is 77.
+turns; the median counts. Needs PyTorch (pip install torch), for the transformer's block diffusers and for DINOv2
+transformers, too; without PyTorch only our rows are printed and the exit code is 77.
 """
 import argparse
 import json
@@ -98,41 +99,61 @@ def conv3d(match, quick):
 
 
 def block(match, quick):
-    """The layers of diffusers' CogVideoXBlock at the release's size, one sample; no cross-attention (R=0 only)."""
-    f, d, heads, text = torch.nn.functional, 3072, 48, 226
-    n = int(match.group(2))
-    x, embedding = torch.rand(1, n, d).sub_(0.5), torch.rand(1, 512).sub_(0.5)
-    table = torch.rand(n - text, 64)
+    """diffusers' CogVideoXBlock at the release's size, one sample; it has no cross-attention (R=0 only)."""
+    from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXBlock
+    tokens, text = int(match.group(2)), 226
+    layer = CogVideoXBlock(3072, 48, 64, 512, attention_bias=True).eval()
+    video, words, embedding = torch.rand(1, tokens - text, 3072), torch.rand(1, text, 3072), torch.rand(1, 512)
+    table = torch.rand(tokens - text, 64), torch.rand(tokens - text, 64)
+    return lambda: layer(video, words, embedding, image_rotary_emb=table), 1
+
+
+def dinov2(match, quick):
+    """transformers' model at DINOv2-L's sizes; all layers are one and the same, as in bench_nn."""
+    import transformers
+    height, width, layers = (int(match.group(i)) for i in (1, 2, 3))
+    config = transformers.Dinov2WithRegistersConfig(hidden_size=1024, num_hidden_layers=1, num_attention_heads=16,
+                                                    image_size=518, patch_size=14, attn_implementation="sdpa")
+    model = transformers.Dinov2WithRegistersModel(config).eval()
+    model.encoder.layer = torch.nn.ModuleList([model.encoder.layer[0]] * layers)
+    model.config.num_hidden_layers = layers
+    x = torch.rand(1, 3, height, width)
+    return lambda: model(x).last_hidden_state[:, 5:], 1
+
+
+def pair(match, quick):
+    """A frame and a global block as VGGT's own code computes them: norms of q and k, two rotations, fused attention."""
+    f, d, heads = torch.nn.functional, 1024, 16
+    down, across, images = int(match.group(1)) // 14, int(match.group(2)) // 14, int(match.group(3))
     linear = lambda out, fan: (torch.rand(out, fan).sub_(0.5).mul_(0.03), torch.rand(out).sub_(0.5))
-    modulation = [linear(6 * d, 512) for _ in range(2)]
-    q, k, v, out = (linear(d, d) for _ in range(4))
-    up, down = linear(4 * d, d), linear(d, 4 * d)
+    qkv, out, up, low = linear(3 * d, d), linear(d, d), linear(4 * d, d), linear(d, 4 * d)
     ones, small = torch.ones(d), torch.ones(64)
+    tokens = 5 + down * across
+    x = torch.rand(images, tokens, d).sub_(0.5)
+    places = torch.cartesian_prod(torch.arange(down), torch.arange(across)) + 1
+    places = torch.cat([torch.zeros(5, 2, dtype=places.dtype), places])
+    angles = torch.arange(max(down, across) + 1).float()[:, None] * 100.0 ** (-torch.arange(0, 32, 2).float() / 32)
+    cos, sin = torch.cat([angles, angles], -1).cos(), torch.cat([angles, angles], -1).sin()
 
-    def modulate(y, layer):
-        shift, scale, gate, text_shift, text_scale, text_gate = f.linear(f.silu(embedding), *layer).chunk(6, 1)
-        y = f.layer_norm(y, (d,), ones, ones, 1e-5)
-        video = y[:, text:] * (1 + scale)[:, None] + shift[:, None]
-        words = y[:, :text] * (1 + text_scale)[:, None] + text_shift[:, None]
-        return torch.cat([words, video], 1), gate[:, None], text_gate[:, None]
+    def turned(y, where):  # halves of each head by row and column; pairs half of it apart
+        parts = []
+        for axis, part in enumerate(y.chunk(2, -1)):
+            a, b = part.chunk(2, -1)
+            parts.append(part * f.embedding(where[:, axis], cos) + torch.cat([-b, a], -1) * f.embedding(where[:, axis], sin))
+        return torch.cat(parts, -1)
 
-    def turned(y):  # norm of each head, then the rotation of pairs of the video's
-        y = f.layer_norm(y.view(1, n, heads, 64).transpose(1, 2), (64,), small, small, 1e-6)
-        video = y[:, :, text:]
-        pairs = video.reshape(1, heads, n - text, 32, 2)
-        pairs = torch.stack([-pairs[..., 1], pairs[..., 0]], -1).flatten(3)
-        y[:, :, text:] = video * table + pairs * table
-        return y
+    def block(y, where):
+        samples, n, _ = y.shape
+        z = f.linear(f.layer_norm(y, (d,), ones, ones, 1e-5), *qkv)
+        q, k, v = z.reshape(samples, n, 3, heads, 64).permute(2, 0, 3, 1, 4).unbind(0)
+        q, k = f.layer_norm(q, (64,), small, small, 1e-5), f.layer_norm(k, (64,), small, small, 1e-5)
+        a = f.scaled_dot_product_attention(turned(q, where), turned(k, where), v)
+        y = y + f.linear(a.transpose(1, 2).reshape(samples, n, d), *out) * ones
+        return y + f.linear(f.gelu(f.linear(f.layer_norm(y, (d,), ones, ones, 1e-5), *up)), *low) * ones
 
     def run():
-        y, gate, text_gate = modulate(x, modulation[0])
-        a = f.scaled_dot_product_attention(turned(f.linear(y, *q)), turned(f.linear(y, *k)),
-                                           f.linear(y, *v).view(1, n, heads, 64).transpose(1, 2))
-        a = f.linear(a.transpose(1, 2).reshape(1, n, d), *out)
-        z = torch.cat([x[:, :text] + text_gate * a[:, :text], x[:, text:] + gate * a[:, text:]], 1)
-        y, gate, text_gate = modulate(z, modulation[1])
-        y = f.linear(f.gelu(f.linear(y, *up), approximate="tanh"), *down)
-        return torch.cat([z[:, :text] + text_gate * y[:, :text], z[:, text:] + gate * y[:, text:]], 1)
+        y = block(x, places)
+        return block(y.view(1, images * tokens, d), places.repeat(images, 1))
     return run, 1
 
 
@@ -143,6 +164,8 @@ CASES = [ # name of a case, what makes (function, units)
      rows),
     (re.compile(r"conv3d f32 C=(\d+) T=(\d+) H=(\d+) W=(\d+)$"), conv3d),
     (re.compile(r"block (f32) S=(\d+) R=0$"), block),
+    (re.compile(r"dinov2 f32 (\d+)x(\d+) L=(\d+)$"), dinov2),
+    (re.compile(r"vggt pair f32 (\d+)x(\d+) N=(\d+)$"), pair),
 ]
 
 
@@ -153,7 +176,11 @@ def peer_row(ours, quick):
             continue
         torch.set_num_threads(ours["threads"])
         with torch.inference_mode():
-            run, units = make(match, quick)
+            try:
+                run, units = make(match, quick)
+            except ImportError as missing:
+                print("peers_nn.py: %s: %s" % (ours["case"], missing), file=sys.stderr)
+                return None
             seconds, cpu = measure(run, units, quick)
         row = {key: ours[key] for key in ("bench", "case", "isa", "threads", "work", "work_unit")}
         row.update(variant="PyTorch", seconds=seconds, cpu_seconds=cpu, rate=ours["work"] / seconds, reference="none",

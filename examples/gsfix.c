@@ -437,6 +437,7 @@ static void note_dit_stage(gsfix_app* app, const char* stage) {
     int i = 0;
     app->stage_begin = gsfix_now();
     if (strcmp(stage, "clip") == 0) return;
+    if (strcmp(stage, "restore") == 0) stage = "solver"; // what a step does beside the transformer
     while (i < app->stage_count && strcmp(app->stages[i].name, stage) != 0) i++;
     if (i == GSFIX_CLIP_STAGES) return;
     gsfix_clip_stage* s = &app->stages[i];

@@ -102,12 +102,12 @@ def train(where):
     lines = [line for path in sorted(ROOT.glob("*.h")) + sorted(ROOT.glob("*/*.[ch]")) + sorted(ROOT.glob("*/*.md"))
              for line in path.read_text(errors="replace").splitlines() if 8 < len(line) < 400]
     rng = random.Random(1)
-    lines += ["".join(character(rng, RANGES) for _ in range(40)) for _ in range(3000)]
+    lines += ["".join(character(rng, RANGES) for _ in range(40)) for _ in range(500)]
     lines = rng.sample(lines, min(20000, len(lines)))
     kinds = {
-        "large": {"vocab_size": 8000},
+        "large": {"vocab_size": 16000},
         "user": {"vocab_size": 2000, "user_defined_symbols": ["<sep>", "ab", "th", "  ", "\u4e2d\u6587", "then"]},
-        "bytes": {"vocab_size": 2000, "byte_fallback": True, "character_coverage": 0.98},
+        "bytes": {"vocab_size": 2000, "byte_fallback": True},
         "spaces": {"vocab_size": 2000, "remove_extra_whitespaces": False, "add_dummy_prefix": False,
                    "allow_whitespace_only_pieces": True, "normalization_rule_name": "identity"},
         "suffix": {"vocab_size": 2000, "treat_whitespace_as_suffix": True, "normalization_rule_name": "nfkc_cf"},
@@ -117,7 +117,7 @@ def train(where):
         folder.mkdir()
         sentencepiece.SentencePieceTrainer.train(
             sentence_iterator=iter(lines), model_prefix=str(folder / "spiece"), model_type="unigram", pad_id=0, eos_id=1,
-            unk_id=2, bos_id=-1, hard_vocab_limit=False, minloglevel=2, num_threads=2, **options)
+            unk_id=2, bos_id=-1, hard_vocab_limit=False, character_coverage=0.99, minloglevel=2, num_threads=2, **options)
         yield str(folder)
 
 

@@ -1,8 +1,7 @@
 // fuzz.h - what the fuzz targets share: a context whose allocator traps when a reader asks for more memory than its
 // input justifies (64 times its size and 1 MiB, all live blocks together), and checks of what a reader hands out.
 // By hand: clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all
-//     -DGSFIXER_IMPLEMENTATION -I. -Itests
-//          tests/fuzz_X.c -lm
+//          -DGSFIXER_STATIC -DGSFIXER_IMPLEMENTATION -I. -Itests tests/fuzz_X.c -lm
 //          ./a.out -max_len=8192 tests/corpus/X
 #ifndef FUZZ_H
 #define FUZZ_H

@@ -1,19 +1,19 @@
-// fuzz_safetensors.c - safetensors files and the index of a sharded model. Build line: fuzz.h, without
-//   -DGSFIXER_IMPLEMENTATION. The input is taken twice: as a file; and, split at its first zero byte, as an index.json
-//   and the bytes of every shard that it names. What was accepted is written and read again.
-#define GSFIXER_IMPLEMENTATION
+// fuzz_safetensors.c - safetensors files and the index of a sharded model. Build line: fuzz.h. The input is taken twice:
+//   as a file; and, split at its first zero byte, as an index.json and its shards: a u16 (little-endian) tells the size of
+//   the one that is asked for first, what follows that one is each of the others. The index is opened by its name and as
+//   a folder's. What was accepted is written and read again.
 #include "gsfixer_nn.h"
 
 #include "fuzz.h"
 
 typedef struct bytes { const uint8_t* data; size_t size; } bytes;
-typedef struct fuzz_files { bytes index, shard, written; int reads; } fuzz_files;
+typedef struct fuzz_files { bytes index, first, others, written; int reads; } fuzz_files;
 
 enum { FOLDER = 16 }; // files that the folder of shards holds: whichever are asked for first
 
 static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     fuzz_files* files = (fuzz_files*)user;
-    const bytes* from = files->reads == 0 ? &files->index : &files->shard;
+    const bytes* from = files->reads == 0 ? &files->index : files->reads == 1 ? &files->first : &files->others;
     if (files->reads++ == FOLDER) return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
     *data = gsf_alloc(ctx, from->size, 1);
     FUZZ_CHECK(*data);
@@ -35,21 +35,19 @@ static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const
 
 static uint64_t bytes_of(const gsf_tensor* t) { return (uint64_t)t->count * gsf_nn_dtype_size(t->dtype); }
 
-// Sorted names, shapes that fit, and data inside [begin, end) where that is known.
+// Sorted names, shapes that fit, and data inside [begin, end) where that is known. Every value is read.
 static void check_tensors(const gsf_nn_weights* w, const uint8_t* begin, const uint8_t* end) {
     for (size_t i = 0; i < w->tensor_count; i++) {
         const gsf_tensor* t = &w->tensors[i];
         int64_t count = 1;
-        float value;
+        float values[64];
         FUZZ_CHECK(i == 0 || strcmp(w->tensors[i - 1].name, t->name) < 0);
         FUZZ_CHECK(gsf_nn_find_tensor(w, t->name) == t);
         for (int32_t k = 0; k < t->rank; k++) count *= t->shape[k];
         FUZZ_CHECK(count == t->count && count >= 0 && t->rank <= GSF_NN_MAX_RANK);
         const uint8_t* data = (const uint8_t*)t->data;
         FUZZ_CHECK(!begin || (data >= begin && data <= end && (uint64_t)(end - data) >= bytes_of(t)));
-        if (count == 0) continue;
-        gsf_nn_read_tensor(t, 0, 1, &value);
-        gsf_nn_read_tensor(t, count - 1, 1, &value);
+        for (int64_t k = 0; k < count; k += 64) gsf_nn_read_tensor(t, k, count - k < 64 ? count - k : 64, values);
     }
 }
 
@@ -72,6 +70,20 @@ static void check_again(gsf_context* ctx, fuzz_files* files, const gsf_nn_weight
 static void check_refused(const gsf_context* ctx, const gsf_nn_weights* w, gsf_result result) {
     FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED || result == GSF_ERROR_IO);
     FUZZ_CHECK(w->tensors == NULL && w->files == NULL && strchr(ctx->error, ':') != NULL);
+    for (const char* c = ctx->error; *c; c++) FUZZ_CHECK((unsigned char)*c >= 0x20); // one line
+}
+
+// The index and its shards, opened by `path`. Returns the number of tensors, or the result.
+static int64_t open_shards(gsf_context* ctx, fuzz_files* files, const char* path) {
+    gsf_nn_weights w;
+    files->reads = 0;
+    const gsf_result result = gsf_nn_open_weights(ctx, path, NULL, &w);
+    const int64_t count = result == GSF_OK ? (int64_t)w.tensor_count : -(int64_t)result;
+    if (result == GSF_OK) check_tensors(&w, NULL, NULL);
+    else check_refused(ctx, &w, result);
+    if (result == GSF_OK) check_again(ctx, files, &w);
+    gsf_nn_close_weights(ctx, &w);
+    return count;
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
@@ -95,17 +107,18 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     }
     gsf_nn_close_weights(&ctx, &w);
 
-    const uint8_t* zero = size ? (const uint8_t*)memchr(data, 0, size) : NULL;
+    const uint8_t* zero = size > 2 ? (const uint8_t*)memchr(data, 0, size - 2) : NULL;
     if (zero) {
+        const size_t head = (size_t)(zero - data), rest = size - head - 3, wanted = zero[1] + (size_t)zero[2] * 256;
         files.index.data = data;
-        files.index.size = (size_t)(zero - data);
-        files.shard.data = zero + 1;
-        files.shard.size = size - files.index.size - 1;
-        fuzz_limit = 64 * files.index.size + (64 + 6 * FOLDER) * files.shard.size + ((size_t)1 << 20);
-        result = gsf_nn_open_weights(&ctx, "fuzz.index.json", NULL, &w);
-        if (result == GSF_OK) check_tensors(&w, NULL, NULL);
-        else check_refused(&ctx, &w, result);
-        gsf_nn_close_weights(&ctx, &w);
+        files.index.size = head;
+        files.first.data = zero + 3;
+        files.first.size = wanted < rest ? wanted : rest;
+        files.others.data = files.first.data + files.first.size;
+        files.others.size = rest - files.first.size;
+        fuzz_limit = 64 * head + (64 + 6 * FOLDER) * rest + ((size_t)1 << 20);
+        const int64_t by_name = open_shards(&ctx, &files, "fuzz.index.json");
+        FUZZ_CHECK(open_shards(&ctx, &files, "fuzz") == by_name);
     }
     FUZZ_CHECK(fuzz_live == 0);
     return 0;

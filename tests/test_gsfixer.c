@@ -297,6 +297,9 @@ static void test_json_conformance(gsf_context* ctx) {
     // the offset points at what is wrong
     CHECK_RESULT(ctx, parse(ctx, "{\"abc\": tru}", 12), GSF_ERROR_FORMAT);
     CHECK(strncmp(ctx->error, "text:8:", 7) == 0);
+    gsf_json json; // more than offsets can count: refused before a byte is read
+    CHECK_RESULT(ctx, gsf_parse_json(ctx, "text", "1", (size_t)0xfffffff1u, &json), GSF_ERROR_UNSUPPORTED);
+    CHECK(json.values == NULL && strncmp(ctx->error, "text: JSON of", 13) == 0);
     // every cut of a whole document is refused
     static const char whole[] = "{\"name\":\"\\u00e9\xc3\xa9\",\"list\":[1,-2.5e3,true,null,{\"k\":\"v\"}]}";
     CHECK_OK(ctx, parse(ctx, whole, sizeof whole - 1));

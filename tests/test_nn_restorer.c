@@ -166,8 +166,35 @@ static void test_conditions(gsf_context* ctx, const char* features, clip* c) {
     CHECK(restore(ctx, &desc, c, GSF_OK) == sums[GSF_NN_2D]); // what is not asked for need not be there
     gsf_restorer r;
     desc.condition = GSF_NN_BOTH;
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_FORMAT);
-    CHECK(strstr(ctx->error, "vggt_latents") != NULL && r.user == NULL);
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO); // the folder has no encoder, either
+    CHECK(strstr(ctx->error, "/vggt/") != NULL && strstr(ctx->error, "vggt_latents") != NULL && r.user == NULL);
+}
+
+// Prompts by the folder's tokenizer and text encoder; what is saved of them does without both.
+static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
+    char saved[1100];
+    gsf_nn_dit_desc desc = small_desc(write_features(ctx, "no_text.safetensors", "prompt_embeds"), 2);
+    gsf_restorer r;
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO); // no caption, and no captioner
+    CHECK(strstr(ctx->error, "/blip2/") != NULL && strstr(ctx->error, "a caption") != NULL && r.user == NULL);
+    snprintf(saved, sizeof saved, "%s", test_scratch("saved.safetensors"));
+    desc.caption = "a wall";
+    desc.save_features = saved;
+    const uint32_t wall = restore(ctx, &desc, c, GSF_OK);
+    const gsf_nn_dit_desc again = small_desc(saved, 2);
+    CHECK(restore(ctx, &again, c, GSF_OK) == wall);
+    desc.caption = "a view of trees";
+    CHECK(restore(ctx, &desc, c, GSF_OK) != wall);
+    desc.features = features; // prompts from the file count more than a caption
+    const gsf_nn_dit_desc plain = small_desc(features, 2);
+    CHECK(restore(ctx, &desc, c, GSF_OK) == restore(ctx, &plain, c, GSF_OK));
+    desc.features = NULL;
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO);
+    CHECK(strstr(ctx->error, "/dinov2/") != NULL && strstr(ctx->error, "dino_latents") != NULL);
+    desc.condition = GSF_NN_NONE;
+    CHECK(restore(ctx, &desc, c, GSF_OK) != 0);
+    desc.model = test_golden("restorer/model/transformer"); // names the part that is missing first
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO);
 }
 
 typedef struct sample_case {
@@ -408,6 +435,7 @@ int main(void) {
     make_clip(&ctx, &c, 9, s.desc.width, s.desc.height);
     test_limits(&ctx, features, &c);
     test_references(&ctx, features, &c);
+    test_prompts(&ctx, features, &c);
     test_conditions(&ctx, features, &c);
     test_workers(features, &c);
     test_memory(features, &c);

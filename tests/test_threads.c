@@ -3,32 +3,9 @@
 #define JOB_SYSTEM_ONLY
 #include "../examples/job_system.c"
 #include "test.h"
+#include "worker_runs.h"
 
 enum { WIDTH = 96, HEIGHT = 72, VIEWS = 3, SPLATS = 600, POINTS = 3000 };
-
-typedef struct stage_output { // bytes of one stage, all outputs one after another
-    const char* stage;
-    char* data;
-    size_t size, capacity;
-} stage_output;
-
-enum { STAGES_MAX = 16 };
-typedef struct run_output { stage_output stages[STAGES_MAX]; int count; } run_output;
-
-static stage_output* begin_stage(run_output* run, const char* stage) {
-    stage_output* out = &run->stages[run->count++];
-    out->stage = stage;
-    return out;
-}
-
-static void add(stage_output* out, const void* data, size_t size) {
-    if (out->size + size > out->capacity) {
-        out->capacity = 2 * (out->size + size);
-        out->data = (char*)realloc(out->data, out->capacity);
-    }
-    memcpy(out->data + out->size, data, size);
-    out->size += size;
-}
 
 static void add_splats(stage_output* out, const gsf_splats* s) {
     add(out, &s->count, sizeof s->count);
@@ -328,46 +305,15 @@ static void run_repair(gsf_context* ctx, run_output* run) {
     free(pixels);
 }
 
-static void run_all(int workers, run_output* run) {
-    job_system jobs;
-    memset(run, 0, sizeof *run);
-    if (!CHECK(job_start(&jobs, workers))) return;
-    gsf_context ctx;
-    test_context_zero(&ctx);
-    ctx.parallel.for_fn = job_for;
-    ctx.parallel.user = &jobs;
-    ctx.parallel.worker_count = workers;
-    if (CHECK_OK(&ctx, gsf_init_context(&ctx))) {
-        run_images(&ctx, run);
-        run_points(&ctx, run);
-        run_render(&ctx, run);
-        run_training(&ctx, run);
-        run_repair(&ctx, run);
-    }
-    job_stop(&jobs);
-}
-
-static void free_run(run_output* run) {
-    for (int i = 0; i < run->count; i++) free(run->stages[i].data);
+static void run_all(gsf_context* ctx, run_output* run) {
+    run_images(ctx, run);
+    run_points(ctx, run);
+    run_render(ctx, run);
+    run_training(ctx, run);
+    run_repair(ctx, run);
 }
 
 int main(void) {
-    run_output one, more;
-    run_all(1, &one);
-    CHECK(one.count > 0);
-    for (int workers = 2; workers <= 3; workers++) {
-        run_all(workers, &more);
-        CHECK(more.count == one.count);
-        for (int i = 0; i < one.count && i < more.count; i++) {
-            const stage_output *a = &one.stages[i], *b = &more.stages[i];
-            CHECK(a->size > 0);
-            size_t same = 0;
-            while (same < a->size && same < b->size && a->data[same] == b->data[same]) same++;
-            if (!CHECK(a->size == b->size && same == a->size))
-                fprintf(stderr, "%s: %d workers differ from 1 at byte %zu of %zu\n", a->stage, workers, same, a->size);
-        }
-        free_run(&more);
-    }
-    free_run(&one);
+    compare_runs(run_all);
     return test_report();
 }
