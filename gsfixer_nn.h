@@ -37,7 +37,8 @@
                never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
-               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022).
+               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece (Kudo
+               and Richardson 2018), T5 (Raffel et al. 2020).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
                >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn bpe >>nn captioner >>nn restorer
@@ -543,9 +544,9 @@ typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapp
 } gsf_nn_vggt;
 
 // Opens a folder with model*.safetensors, or one .safetensors file: the tensors aggregator.* under their released names,
-// all others are passed over. Sizes come from the tensors' shapes. The folder's config.json, where there is one, may tell
-// num_heads (default: width / head size of the q norms, width / 64 where there are none), depth, rope_freq (100) and
-// qk_norm, and must agree with the tensors.
+// all others are passed over. Where the folder has a config.json, VGGT's own keys in it count, which are embed_dim, depth,
+// num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq; what it does not tell comes from
+// the shapes of tensors, but for num_heads (width / 64 where q and k have no norms) and rope_freq (100).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
 GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
 
@@ -8855,16 +8856,21 @@ typedef struct gsf__vggt {
 static const char gsf__vggt_frame_names[] = "aggregator.frame_blocks.";
 static const char gsf__vggt_global_names[] = "aggregator.global_blocks.";
 
-// Blocks called names0, names1, ... that have a norm1.
+// One more than the highest number that follows `names` in a tensor's name.
 static int64_t gsf__vggt_count_blocks(const gsf_nn_weights* weights, const char* names) {
-    for (int64_t i = 0;; i++) {
-        char name[128];
-        snprintf(name, sizeof name, "%s%lld.norm1.weight", names, (long long)i);
-        if (!gsf_nn_find_tensor(weights, name)) return i;
+    const size_t size = strlen(names);
+    int64_t count = 0;
+    for (size_t i = 0; i < weights->tensor_count; i++) {
+        const char* p = weights->tensors[i].name;
+        int64_t number = 0;
+        if (strncmp(p, names, size) != 0) continue;
+        for (p += size; *p >= '0' && *p <= '9' && number < 1 << 20; p++) number = 10 * number + (*p - '0');
+        if (*p == '.' && number >= count) count = number + 1;
     }
+    return count;
 }
 
-// Sizes from the shapes of the tensors that have them all.
+// Sizes from the shapes of some tensors; config.json may say otherwise, then all tensors are checked.
 static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) {
     const gsf_nn_weights* w = loader->weights;
     const int64_t any[4] = {-1, -1, -1, -1};
@@ -8876,6 +8882,9 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     GSF__TRY(gsf__nn_need(loader, &embed_up, 2, any, "aggregator.patch_embed.blocks.0.mlp.fc1.weight"));
     GSF__TRY(gsf__nn_need(loader, &up, 2, any, "aggregator.frame_blocks.0.mlp.fc1.weight"));
     GSF__TRY(gsf__nn_need(loader, &registers, 4, any, "aggregator.register_token"));
+    if (patch->count < 1 || patch->shape[2] > 1024)
+        return gsf_fail(loader->ctx, GSF_ERROR_UNSUPPORTED, "%s: a patch of %lld x %lld", w->name,
+                        (long long)patch->shape[2], (long long)patch->shape[3]);
     net->sizes.width = vit->sizes.width = patch->shape[0];
     net->sizes.mlp = up->shape[0];
     net->registers = registers->shape[2];
@@ -8887,37 +8896,35 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     vit->layers = gsf__vggt_count_blocks(w, "aggregator.patch_embed.blocks.");
     vit->block_names = "aggregator.patch_embed.blocks.";
     vit->prefix = "aggregator.patch_embed.";
-    while ((vit->grid + 1) * (vit->grid + 1) < positions->shape[1]) vit->grid++;
+    while (vit->grid < 1 << 15 && (vit->grid + 1) * (vit->grid + 1) < positions->shape[1]) vit->grid++;
     vit->sizes.activation = net->sizes.activation = GSF_NN_GELU;
     vit->sizes.qkv_bias = net->sizes.qkv_bias = 1;
     vit->sizes.eps = 1e-6f;
     net->sizes.eps = net->sizes.head_eps = 1e-5f;
     const gsf_tensor* norm = gsf_nn_find_tensor(w, "aggregator.frame_blocks.0.attn.q_norm.weight");
+    const int64_t dim = norm && norm->count > 0 ? norm->count : 64;
     net->sizes.head_norm = norm != NULL;
-    const int64_t dim = norm ? norm->count : 64, width = net->sizes.width;
-    if (dim < 1 || width < 1 || width > 65536 || patch->count < 1 || net->sizes.mlp < 1 || vit->sizes.mlp < 1 ||
-        vit->channels != 3 || vit->patch > 1024 || net->registers > 65536 || vit->registers > 65536 || vit->grid < 1 ||
-        vit->grid > 32768)
-        return gsf_fail(loader->ctx, GSF_ERROR_UNSUPPORTED, "%s: a width of %lld, %lld channels or a patch of %lld",
-                        w->name, (long long)width, (long long)vit->channels, (long long)vit->patch);
-    net->sizes.heads = (int32_t)(width / dim);
+    net->sizes.heads = net->sizes.width / dim < 1024 ? (int32_t)(net->sizes.width / dim) : 0;
     return GSF_OK;
 }
 
-// What shapes do not tell, and a check of what they do.
+// What config.json tells.
 static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* net, double* rope_base) {
-    int64_t heads, given, count = 0;
+    gsf__vit* vit = &net->embed;
+    int64_t heads = net->sizes.heads, image = vit->grid * vit->patch, given, count = 0;
+    double ratio;
     int flag;
-    const struct { const char* key; int64_t value; } told[] = {
-        {"embed_dim", net->sizes.width}, {"patch_size", net->embed.patch}, {"depth", net->layers},
-        {"num_register_tokens", net->registers}};
-    for (size_t i = 0; i < GSF__COUNT(told); i++) {
-        GSF__TRY(gsf__nn_config_int_or(file, told[i].key, told[i].value, 1, 1 << 20, &given));
-        if (given != told[i].value)
-            return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s: %s is %lld, but the tensors have %lld", file->json.name,
-                            told[i].key, (long long)given, (long long)told[i].value);
-    }
-    GSF__TRY(gsf__nn_config_int_or(file, "num_heads", net->sizes.heads, 1, 1024, &heads));
+    const struct { const char* key; int64_t* value; int64_t low; } sizes[] = {
+        {"embed_dim", &net->sizes.width, 1}, {"patch_size", &vit->patch, 1}, {"img_size", &image, 1},
+        {"depth", &net->layers, 1}, {"num_register_tokens", &net->registers, 0}, {"num_heads", &heads, 1}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++)
+        if (gsf__nn_config_find(file, sizes[i].key))
+            GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, 1 << 16, sizes[i].value));
+    GSF__TRY(gsf__nn_config_number_or(file, "mlp_ratio", 0.0, 0.0, 1024.0, &ratio));
+    if (ratio > 0.0) net->sizes.mlp = (int64_t)((double)net->sizes.width * ratio);
+    if (gsf__nn_config_find(file, "num_register_tokens")) vit->registers = net->registers;
+    vit->sizes.width = net->sizes.width;
+    vit->grid = image / vit->patch;
     net->sizes.heads = (int32_t)heads;
     GSF__TRY(gsf__nn_config_number_or(file, "rope_freq", *rope_base, -1e9, 1e9, rope_base));
     GSF__TRY(gsf__nn_config_bool_or(file, "qk_norm", net->sizes.head_norm, &flag));
@@ -8956,8 +8963,19 @@ static gsf_result gsf__vggt_load_config(gsf_context* ctx, const char* folder, gs
     return result;
 }
 
-static gsf_result gsf__vggt_check_heads(gsf_context* ctx, const gsf_nn_weights* w, gsf__vggt* net, double rope_base) {
+static gsf_result gsf__vggt_check_sizes(gsf_context* ctx, const gsf_nn_weights* w, gsf__vggt* net, double rope_base) {
+    const gsf__vit* vit = &net->embed;
     const int32_t heads = net->sizes.heads;
+    const struct { const char* what; int64_t value, low, high; } sizes[] = {
+        {"width", net->sizes.width, 1, 65536}, {"hidden layer", net->sizes.mlp, 1, 1 << 20},
+        {"hidden layer", vit->sizes.mlp, 1, 1 << 20}, {"number of blocks", net->layers, 1, 1024},
+        {"number of blocks", vit->layers, 1, 1024}, {"number of registers", net->registers, 0, 65536},
+        {"number of registers", vit->registers, 0, 65536}, {"number of channels", vit->channels, 3, 3},
+        {"patch", vit->patch, 1, 1024}, {"grid of positions", vit->grid, 1, 1 << 15}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++)
+        if (sizes[i].value < sizes[i].low || sizes[i].value > sizes[i].high)
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: a %s of %lld", w->name, sizes[i].what,
+                            (long long)sizes[i].value);
     if (heads < 1 || net->sizes.width % heads || (rope_base > 0.0 && net->sizes.width / heads % 4))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %d heads of a width of %lld", w->name, (int)heads,
                         (long long)net->sizes.width);
@@ -8991,7 +9009,7 @@ static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt
     out->rope_base = 100.0;
     if (!result && !gsf__nn_ends_in(path, ".safetensors"))
         result = gsf__vggt_load_config(ctx, path, net, &out->rope_base);
-    if (!result) result = gsf__vggt_check_heads(ctx, &out->weights, net, out->rope_base);
+    if (!result) result = gsf__vggt_check_sizes(ctx, &out->weights, net, out->rope_base);
     if (!result) result = gsf__vggt_bind(&loader, net);
     return gsf__nn_end_loading(&loader, result);
 }

@@ -1305,6 +1305,102 @@ static void bench_pipelines(const bench_options* o) {
     }
 }
 
+// ---- a layer of the text encoder at T5-XXL's size ---------------------------------------
+
+typedef struct bench_t5 {
+    gsf__t5_run run;
+    gsf_nn_t5 net;
+    gsf_nn_t5_input in;
+    gsf__t5_block block;
+    gsf_tensor tensors[9];
+    float* first; // the layer's input
+} bench_t5;
+
+// Weights one after another in `memory` (NULL: only their size), norms f32; matrices of sizes up to 2^-7, as in a block.
+static size_t bench_t5_weights(bench_t5* b, gsf_nn_dtype dtype, char* memory) {
+    const int64_t d = b->net.width, h = b->net.hidden;
+    const struct { const gsf_tensor** to; int64_t out, in; } parts[] = {
+        {&b->block.attention_norm, d, 1}, {&b->block.q, d, d}, {&b->block.k, d, d}, {&b->block.v, d, d},
+        {&b->block.out, d, d}, {&b->block.ff_norm, d, 1}, {&b->block.gate, h, d}, {&b->block.up, h, d}, {&b->block.down, d, h}};
+    size_t used = 0;
+    for (size_t i = 0; i < GSF__COUNT(parts); i++) {
+        gsf_tensor* t = &b->tensors[i];
+        const int is_matrix = parts[i].in > 1;
+        memset(t, 0, sizeof *t);
+        t->dtype = is_matrix ? dtype : GSF_NN_F32;
+        t->rank = is_matrix ? 2 : 1;
+        t->shape[0] = parts[i].out;
+        t->shape[1] = parts[i].in;
+        t->count = parts[i].out * parts[i].in;
+        t->data = memory + used;
+        *parts[i].to = t;
+        const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(t->dtype);
+        if (memory) {
+            bench_fill(memory + used, bytes, t->dtype, i + 1);
+            for (size_t k = 1; is_matrix && k < bytes; k += 2)
+                if (dtype == GSF_NN_BF16 || k % 4 == 3) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
+        }
+        used += (bytes + 63) / 64 * 64;
+    }
+    return used;
+}
+
+static void bench_run_t5(gsf_context* ctx, void* arg) {
+    bench_t5* b = (bench_t5*)arg;
+    memcpy(b->run.x, b->first, (size_t)(b->run.rows * b->net.width) * sizeof(float));
+    bench_require(ctx, gsf__t5_attention(&b->run, 0, &b->block));
+    bench_require(ctx, gsf__t5_feed_forward(&b->run, 0, &b->block));
+}
+
+static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype, int32_t tokens) {
+    char name[96];
+    snprintf(name, sizeof name, "t5 layer %s S=%d", dtype == GSF_NN_F32 ? "f32" : "bf16", (int)tokens);
+    gsf_context ctx;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    bench_t5 b;
+    memset(&b, 0, sizeof b);
+    b.net.width = 4096;
+    b.net.heads = b.net.head_dim = 64;
+    b.net.hidden = 10240;
+    b.net.layers = 1;
+    b.net.buckets = 32;
+    b.net.max_distance = 128;
+    b.net.norm_eps = 1e-6;
+    b.in.batch = 1;
+    b.in.tokens = tokens;
+    char* weights = (char*)bench_alloc(&ctx, bench_t5_weights(&b, dtype, NULL), 1);
+    bench_t5_weights(&b, dtype, weights);
+    const gsf__t5_layout l = gsf__t5_plan(&b.net, &b.in);
+    float* memory = (float*)bench_alloc(&ctx, (size_t)(l.total + l.x), sizeof(float));
+    bench_fill(memory, (size_t)(l.total + l.x) * sizeof(float), GSF_NN_F32, 6); // also the bias
+    b.run.ctx = &ctx;
+    b.run.net = &b.net;
+    b.run.in = &b.in;
+    b.run.rows = tokens;
+    b.run.x = memory;
+    b.run.normed = b.run.x + (size_t)l.x;
+    b.run.wide = b.run.normed + (size_t)l.x;
+    b.run.bias = b.run.wide + (size_t)l.wide;
+    b.run.norm = b.run.bias + (size_t)l.bias;
+    b.first = memory + (size_t)l.total;
+    double bytes, flops;
+    gsf_nn_t5_cost(&b.net, &b.in, &bytes, &flops);
+    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    row.flops = flops;
+    bench_time(o, &ctx, &row, bench_run_t5, &b, 1.0);
+    bench_print(o->json, &row);
+    gsf_nn_destroy_workspace(&ctx, &b.run.workspace);
+    gsf_free(&ctx, memory);
+    gsf_free(&ctx, weights);
+}
+
+static void bench_t5s(const bench_options* o) {
+    for (int threads = 1; threads <= 2; threads++) {
+        bench_one_t5(o, threads, GSF_NN_F32, o->quick ? 64 : 226);
+        bench_one_t5(o, threads, GSF_NN_BF16, o->quick ? 64 : 226);
+    }
+}
+
 int main(int argc, char** argv) {
     bench_options o;
     memset(&o, 0, sizeof o);
@@ -1344,6 +1440,7 @@ int main(int argc, char** argv) {
     bench_norms(&o);
     bench_convs(&o);
     bench_blocks(&o);
+    bench_t5s(&o);
     bench_encoders(&o);
     return 0;
 }

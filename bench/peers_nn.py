@@ -157,6 +157,44 @@ def pair(match, quick):
     return run, 1
 
 
+def t5_layer(match, quick):
+    """The layers of transformers' T5Block (v1.1) at T5-XXL's size, one prompt; bf16: activations are bf16, too."""
+    f, d, heads, hidden = torch.nn.functional, 4096, 64, 10240
+    dtype = torch.float32 if match.group(1) == "f32" else torch.bfloat16
+    n = int(match.group(2))
+    x = torch.rand(1, n, d).sub_(0.5).to(dtype)
+    q, k, v, out = (torch.rand(d, d).sub_(0.5).mul_(0.03).to(dtype) for _ in range(4))
+    gate, up, down = (torch.rand(*s).sub_(0.5).mul_(0.03).to(dtype) for s in ((hidden, d), (hidden, d), (d, hidden)))
+    ones, bias = torch.ones(d, dtype=dtype), torch.rand(1, heads, n, n).to(dtype)
+
+    def norm(y):
+        wide = y.float()
+        return ones * (wide * torch.rsqrt(wide.pow(2).mean(-1, keepdim=True) + 1e-6)).to(dtype)
+
+    def split(y):
+        return y.view(1, n, heads, 64).transpose(1, 2)
+
+    def run():  # attention as T5Attention has it; the better of that and the fused one counts
+        y = norm(x)
+        a, b, c = split(f.linear(y, q)), split(f.linear(y, k)), split(f.linear(y, v))
+        if fused:
+            a = f.scaled_dot_product_attention(a, b, c, attn_mask=bias, scale=1.0)
+        else:
+            a = f.softmax((a @ b.transpose(2, 3) + bias).float(), -1).to(dtype) @ c
+        z = x + f.linear(a.transpose(1, 2).reshape(1, n, d), out)
+        y = norm(z)
+        return z + f.linear(f.gelu(f.linear(y, gate), approximate="tanh") * f.linear(y, up), down)
+
+    seconds = {}
+    for fused in (False, True):
+        run()
+        start = time.perf_counter()
+        run()
+        seconds[fused] = time.perf_counter() - start
+    fused = min(seconds, key=seconds.get)
+    return run, 1
+
+
 CASES = [ # name of a case, what makes (function, units)
     (re.compile(r"linear (f32|bf16|f16) M=(\d+) N=(\d+) K=(\d+)(?: (gelu|silu))?$"), linear),
     (re.compile(r"attention f32 H=(\d+) D=(\d+) Q=(\d+) K=(\d+)$"), attention),
@@ -164,6 +202,7 @@ CASES = [ # name of a case, what makes (function, units)
      rows),
     (re.compile(r"conv3d f32 C=(\d+) T=(\d+) H=(\d+) W=(\d+)$"), conv3d),
     (re.compile(r"block (f32) S=(\d+) R=0$"), block),
+    (re.compile(r"t5 layer (f32|bf16) S=(\d+)$"), t5_layer),
     (re.compile(r"dinov2 f32 (\d+)x(\d+) L=(\d+)$"), dinov2),
     (re.compile(r"vggt pair f32 (\d+)x(\d+) N=(\d+)$"), pair),
 ]

@@ -107,7 +107,11 @@ static void test_bad_vggt(gsf_context* ctx) {
         {{0, "aggregator.camera_token", 0, 0, 0, 0, 0}, GSF_ERROR_FORMAT, "aggregator.camera_token has shape"},
         {{0, "aggregator.patch_embed.patch_embed.proj.weight", 0, 0, 0, 0, 0}, GSF_ERROR_FORMAT, "proj.weight has shape"},
         {{0, 0, "aggregator.surplus", 0, 0, 0, 0}, GSF_ERROR_FORMAT, "aggregator.surplus"},
-        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": 1", 0}, GSF_ERROR_FORMAT, "depth"},
+        {{"aggregator.frame_blocks.1.norm1.weight", 0, 0, 0, 0, 0, 0}, GSF_ERROR_FORMAT, "1.norm1.weight is missing"},
+        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": 1", 0}, GSF_ERROR_FORMAT, "is missing"},
+        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": 1, \"was\": ", 0}, GSF_ERROR_FORMAT, "frame_blocks.1."},
+        {{0, 0, 0, 0, "\"depth\": ", "\"depth\": -", 0}, GSF_ERROR_FORMAT, "depth"},
+        {{0, 0, 0, 0, "\"embed_dim\": ", "\"embed_dim\": 1", 0}, GSF_ERROR_UNSUPPORTED, "heads"},
         {{0, 0, 0, 0, "\"num_heads\": ", "\"num_heads\": 7", 0}, GSF_ERROR_UNSUPPORTED, "heads"},
         {{0, 0, 0, 0, "\"frame\",", "\"global\",", 0}, GSF_ERROR_UNSUPPORTED, "aa_order"},
         {{0, 0, 0, 0, "\"qk_norm\": true", "\"qk_norm\": false", 0}, GSF_ERROR_FORMAT, "_norm."}};
@@ -195,8 +199,8 @@ static void muddled_for(void* user, size_t count, gsf_chunk_fn body, void* arg) 
     for (size_t i = count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
 }
 
+// `expected` is left with VGGT's tokens of the small images.
 static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, float* expected, float* out) {
-    const gsf_nn_encoder_input in = small_input();
     gsf_context three;
     test_context_zero(&three);
     three.parallel.for_fn = muddled_for;
@@ -206,13 +210,27 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
     test_context_zero(&one);
     one.threads = 1;
     if (gsf_init_context(&one) != GSF_OK) exit(2);
-    const size_t tokens = (size_t)(IMAGES * (HEIGHT / dino->patch) * (WIDTH / dino->patch));
-    CHECK_OK(&one, gsf_nn_dinov2_encode(&one, dino, &in, expected));
-    CHECK_OK(&three, gsf_nn_dinov2_encode(&three, dino, &in, out));
-    CHECK(memcmp(out, expected, tokens * (size_t)dino->width * sizeof(float)) == 0);
-    CHECK_OK(&one, gsf_nn_vggt_encode(&one, vggt, &in, expected));
-    CHECK_OK(&three, gsf_nn_vggt_encode(&three, vggt, &in, out));
-    CHECK(memcmp(out, expected, tokens * 2 * (size_t)vggt->width * sizeof(float)) == 0);
+    enum { MORE = 5, HIGH = 98, WIDE = 182 }; // rows enough for several blocks of the linear layers, and the small images
+    float* more = (float*)malloc(MORE * 3 * HIGH * WIDE * sizeof(float));
+    for (size_t i = 0; i < MORE * 3 * HIGH * WIDE; i++) more[i] = pixels[i * 7 % (sizeof pixels / sizeof pixels[0])];
+    for (int small = 0; small < 2; small++) {
+        gsf_nn_encoder_input in = small_input();
+        if (!small) {
+            in.pixels = more;
+            in.images = MORE;
+            in.height = HIGH;
+            in.width = WIDE;
+        }
+        const size_t tokens = (size_t)(in.images * (in.height / dino->patch) * (in.width / dino->patch));
+        CHECK(tokens * 2 * (size_t)vggt->width <= ROOM);
+        CHECK_OK(&one, gsf_nn_dinov2_encode(&one, dino, &in, expected));
+        CHECK_OK(&three, gsf_nn_dinov2_encode(&three, dino, &in, out));
+        CHECK(memcmp(out, expected, tokens * (size_t)dino->width * sizeof(float)) == 0);
+        CHECK_OK(&one, gsf_nn_vggt_encode(&one, vggt, &in, expected));
+        CHECK_OK(&three, gsf_nn_vggt_encode(&three, vggt, &in, out));
+        CHECK(memcmp(out, expected, tokens * 2 * (size_t)vggt->width * sizeof(float)) == 0);
+    }
+    free(more);
 }
 
 // More images than go together: each as it is alone.

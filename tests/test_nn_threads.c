@@ -134,7 +134,7 @@ static void close_model(gsf_context* ctx, model* m) {
     gsf_nn_destroy_schedule(ctx, &m->schedule);
 }
 
-// Encoder, a step of the transformer in float and one in 8 bits, decoder.
+// Encoder, a step of the transformer, decoder; and the transformer alone in 8 bits.
 static void run_sampling(gsf_context* ctx, run_output* run, model* m) {
     enum { TOKENS = 12 };
     const gsf_nn_transformer* t = &m->transformer;
@@ -160,11 +160,24 @@ static void run_sampling(gsf_context* ctx, run_output* run, model* m) {
     out = begin_stage(run, "sampling");
     CHECK_OK(ctx, gsf_nn_sample(ctx, t, &m->vae, &m->schedule, &d, video, NULL));
     add_floats(out, video, values);
-    out = begin_stage(run, "sampling, int8");
-    d.solver = GSF_NN_DPMPP_2M;
+    const double timestep = 500.0;
+    gsf_nn_transformer_input in;
+    memset(&in, 0, sizeof in);
+    in.batch = in.reference_batch = 1;
+    in.frames = (t->sample_frames - 1) / t->temporal_ratio + 1;
+    in.height = t->sample_height;
+    in.width = t->sample_width;
+    in.hidden = control; // of many more values
+    in.text = text;
+    in.timesteps = &timestep;
+    in.references = references;
+    in.reference_tokens = TOKENS;
+    out = begin_stage(run, "int8");
+    const int64_t latents = (int64_t)in.frames * in.height * in.width;
+    CHECK(latents * t->in_channels <= values && latents * t->out_channels <= values);
     CHECK_OK(ctx, gsf_nn_quantize_transformer(ctx, &m->transformer, NULL));
-    CHECK_OK(ctx, gsf_nn_sample(ctx, t, &m->vae, &m->schedule, &d, video, NULL));
-    add_floats(out, video, values);
+    CHECK_OK(ctx, gsf_nn_transformer_forward(ctx, t, &in, video));
+    add_floats(out, video, latents * t->out_channels);
     free(control);
     free(text);
     free(dino);
@@ -174,7 +187,7 @@ static void run_sampling(gsf_context* ctx, run_output* run, model* m) {
 }
 
 static void run_tiles(gsf_context* ctx, run_output* run, const gsf_nn_vae* vae) { // blended across their edges
-    const int64_t h = 8, w = 10;
+    const int64_t h = 8, w = 6; // rows of two tiles
     float* latents = make_floats(vae->latent_channels * 3 * h * w, 18);
     gsf_nn_vae_desc d;
     gsf_nn_vae_info info;
