@@ -3,15 +3,20 @@
 // By hand: cc -O2 -fopenmp -I. bench/make_model.c -o make_model -lm
 //
 //     make_model OUT [--size tiny|small|full] [--dtype f32|bf16|f16] [--seed S] [--shards N] [--threads N]
-//                    [--parts transformer,vae,scheduler,features]
+//                    [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]
 //
-// Defaults: small, bf16, seed 0, one file, all parts. `full` has the release's configuration: 14.9 GB as bf16, of which
-// never more than one block of values is in memory. OUT gets
+// Defaults: small, bf16, seed 0, one file, all parts. `full` has the release's configuration: 34.3 GB as bf16 (14.9 GB of
+// them transformer and VAE), of which never more than one block of values is in memory. OUT gets
 //     transformer/{config.json, diffusion_pytorch_model*.safetensors}      with N > 1 shards and their index
 //     vae/{config.json, diffusion_pytorch_model.safetensors}
 //     scheduler/scheduler_config.json, model_index.json
 //     features.safetensors    dino_latents (2, tokens, 1024), vggt_latents (2, tokens, 2048): two reference images;
 //                             prompt_embeds (2, text tokens, text channels): negative and positive
+//     dinov2/, vggt/          {config.json, model.safetensors}             encoders of reference images
+//     text_encoder/{config.json, model*.safetensors}                       T5, in shards, too
+//     tokenizer/{spiece.model, ...}                                        its pieces: ASCII and some words of captions
+//     blip2/{config.json, model*.safetensors, vocab.json, merges.txt, preprocessor_config.json, ...}    in shards, too
+// The encoders of tiny and small have one layer, and the vocabularies are the same few hundred texts at all sizes.
 // A value depends on seed, tensor and place only: not on shards, threads or other parts, and a narrow type's are those of
 // f32 rounded. Each file is written beside its place and renamed.
 #define GSFIXER_IMPLEMENTATION
@@ -30,22 +35,35 @@
 
 // ---- sizes and configurations ----------------------------------------------------
 
+typedef struct model_blocks { int width, heads, hidden, layers; } model_blocks; // hidden: of the feed-forward
+
 typedef struct model_size {
     const char* name;
-    int heads, layers, time_channels, text_channels, text_tokens; // heads of 64
-    int sample_height, sample_width, frames;                      // latents; video frames
-    int reference_tokens;                                         // of one image
+    int heads, layers, time_channels, text_tokens; // heads of 64
+    int sample_height, sample_width, frames;       // latents; video frames
+    int reference_tokens;                          // of one image
     int channels[4], vae_layers, vae_groups;
     int vae_height, vae_width; // pixels; multiples of 96 and 80, so that tiles overlap by whole latents
+    model_blocks text;         // T5; heads of 64
+    int text_words;            // its vocabulary
+    model_blocks eyes;         // DINOv2, and each of VGGT's three stacks
+    int eyes_grid;             // patches along a side of the images that they were made for
+    model_blocks see, ask, tell; // BLIP-2: vision, queries, language
+    int see_side, queries, tell_words, tell_tokens; // pixels; vocabulary; longest text
 } model_size;
 
 static const model_size model_sizes[] = {
-    {"tiny", 2, 2, 64, 64, 26, 8, 12, 9, 8, {8, 16, 16, 24}, 1, 4, 96, 80},
-    {"small", 8, 6, 256, 512, 64, 16, 24, 17, 70, {32, 64, 64, 128}, 2, 8, 192, 240},
-    {"full", 48, 42, 512, 4096, 226, 60, 90, 49, 925, {128, 256, 256, 512}, 3, 32, 480, 720},
+    {"tiny", 2, 2, 64, 26, 8, 12, 9, 8, {8, 16, 16, 24}, 1, 4, 96, 80,
+     {64, 2, 160, 1}, 320, {1024, 16, 1024, 1}, 5, {128, 2, 256, 1}, {64, 1, 128, 1}, {192, 3, 256, 1}, 56, 4, 640, 64},
+    {"small", 8, 6, 256, 64, 16, 24, 17, 70, {32, 64, 64, 128}, 2, 8, 192, 240,
+     {512, 8, 1024, 1}, 320, {1024, 16, 4096, 1}, 37, {256, 4, 512, 1}, {128, 2, 256, 1}, {256, 4, 512, 1}, 112, 8, 640,
+     128},
+    {"full", 48, 42, 512, 226, 60, 90, 49, 925, {128, 256, 256, 512}, 3, 32, 480, 720,
+     {4096, 64, 10240, 24}, 32128, {1024, 16, 4096, 24}, 37, {1408, 16, 6144, 39}, {768, 12, 3072, 12},
+     {2560, 32, 10240, 32}, 224, 32, 50304, 2048},
 };
 
-enum { MODEL_DINO_CHANNELS = 1024, MODEL_VGGT_CHANNELS = 2048 };
+enum { MODEL_PATCH = 14, MODEL_REGISTERS = 4 }; // of the encoders of images
 
 static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_text* out) {
     gsf_text_printf(ctx, out,
@@ -63,7 +81,7 @@ static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_t
                     "  \"temporal_interpolation_scale\": 1.0,\n  \"text_embed_dim\": %d,\n  \"time_embed_dim\": %d,\n"
                     "  \"timestep_activation_fn\": \"silu\",\n  \"use_learned_positional_embeddings\": true,\n"
                     "  \"use_rotary_positional_embeddings\": true\n}\n",
-                    s->frames, s->sample_height, s->sample_width, s->text_channels, s->time_channels);
+                    s->frames, s->sample_height, s->sample_width, s->text.width, s->time_channels);
 }
 
 static void model_print_vae(gsf_context* ctx, const model_size* s, gsf_text* out) {
@@ -89,21 +107,280 @@ static void model_print_vae(gsf_context* ctx, const model_size* s, gsf_text* out
     gsf_text_printf(ctx, out, "  \"use_post_quant_conv\": false,\n  \"use_quant_conv\": false\n}\n");
 }
 
-static const char model_scheduler[] =
-    "{\n  \"_class_name\": \"CogVideoXDDIMScheduler\",\n  \"_diffusers_version\": \"0.32.1\",\n  \"beta_end\": 0.012,\n"
-    "  \"beta_schedule\": \"scaled_linear\",\n  \"beta_start\": 0.00085,\n  \"clip_sample\": false,\n"
-    "  \"clip_sample_range\": 1.0,\n  \"num_train_timesteps\": 1000,\n  \"prediction_type\": \"v_prediction\",\n"
-    "  \"rescale_betas_zero_snr\": true,\n  \"sample_max_value\": 1.0,\n  \"set_alpha_to_one\": true,\n"
-    "  \"snr_shift_scale\": 1.0,\n  \"steps_offset\": 0,\n  \"timestep_spacing\": \"trailing\",\n"
-    "  \"trained_betas\": null\n}\n";
+static void model_print_scheduler(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    (void)s;
+    gsf_text_printf(ctx, out,
+                    "{\n  \"_class_name\": \"CogVideoXDDIMScheduler\",\n  \"_diffusers_version\": \"0.32.1\",\n"
+                    "  \"beta_end\": 0.012,\n  \"beta_schedule\": \"scaled_linear\",\n  \"beta_start\": 0.00085,\n"
+                    "  \"clip_sample\": false,\n  \"clip_sample_range\": 1.0,\n  \"num_train_timesteps\": 1000,\n"
+                    "  \"prediction_type\": \"v_prediction\",\n  \"rescale_betas_zero_snr\": true,\n"
+                    "  \"sample_max_value\": 1.0,\n  \"set_alpha_to_one\": true,\n  \"snr_shift_scale\": 1.0,\n"
+                    "  \"steps_offset\": 0,\n  \"timestep_spacing\": \"trailing\",\n  \"trained_betas\": null\n}\n");
+}
 
-// Text encoder and tokenizer are left out, which diffusers writes as two nulls: features.safetensors has the embeddings.
-static const char model_index[] =
-    "{\n  \"_class_name\": \"CogVideoXImageToVideoPipeline\",\n  \"_diffusers_version\": \"0.32.1\",\n"
-    "  \"scheduler\": [\n    \"diffusers\",\n    \"CogVideoXDDIMScheduler\"\n  ],\n"
-    "  \"text_encoder\": [\n    null,\n    null\n  ],\n  \"tokenizer\": [\n    null,\n    null\n  ],\n"
-    "  \"transformer\": [\n    \"diffusers\",\n    \"CogVideoXTransformer3DModel\"\n  ],\n"
-    "  \"vae\": [\n    \"diffusers\",\n    \"AutoencoderKLCogVideoX\"\n  ]\n}\n";
+// A text encoder that is not there is two nulls, as diffusers has it: features.safetensors has the embeddings.
+static void model_print_pipeline(gsf_context* ctx, int has_text, gsf_text* out) {
+    static const char* const classes[][2] = {{"text_encoder", "T5EncoderModel"}, {"tokenizer", "T5Tokenizer"}};
+    gsf_text_printf(ctx, out,
+                    "{\n  \"_class_name\": \"CogVideoXImageToVideoPipeline\",\n  \"_diffusers_version\": \"0.32.1\",\n"
+                    "  \"scheduler\": [\n    \"diffusers\",\n    \"CogVideoXDDIMScheduler\"\n  ],\n");
+    for (int i = 0; i < 2; i++) {
+        if (has_text)
+            gsf_text_printf(ctx, out, "  \"%s\": [\n    \"transformers\",\n    \"%s\"\n  ],\n", classes[i][0],
+                            classes[i][1]);
+        else gsf_text_printf(ctx, out, "  \"%s\": [\n    null,\n    null\n  ],\n", classes[i][0]);
+    }
+    gsf_text_printf(ctx, out,
+                    "  \"transformer\": [\n    \"diffusers\",\n    \"CogVideoXTransformer3DModel\"\n  ],\n"
+                    "  \"vae\": [\n    \"diffusers\",\n    \"AutoencoderKLCogVideoX\"\n  ]\n}\n");
+}
+
+static void model_print_dinov2(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out,
+                    "{\n  \"architectures\": [\n    \"Dinov2WithRegistersModel\"\n  ],\n  \"hidden_act\": \"gelu\",\n"
+                    "  \"hidden_size\": %d,\n  \"image_size\": %d,\n  \"layer_norm_eps\": 1e-06,\n  \"mlp_ratio\": %d,\n"
+                    "  \"model_type\": \"dinov2_with_registers\",\n  \"num_attention_heads\": %d,\n"
+                    "  \"num_channels\": 3,\n  \"num_hidden_layers\": %d,\n  \"num_register_tokens\": %d,\n"
+                    "  \"patch_size\": %d,\n  \"qkv_bias\": true,\n  \"transformers_version\": \"4.51.3\",\n"
+                    "  \"use_swiglu_ffn\": false\n}\n",
+                    s->eyes.width, s->eyes_grid * MODEL_PATCH, s->eyes.hidden / s->eyes.width, s->eyes.heads,
+                    s->eyes.layers, (int)MODEL_REGISTERS, (int)MODEL_PATCH);
+}
+
+static void model_print_vggt(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out, "{\n  \"embed_dim\": %d,\n  \"img_size\": %d,\n  \"patch_size\": %d\n}\n", s->eyes.width,
+                    s->eyes_grid * MODEL_PATCH, (int)MODEL_PATCH);
+}
+
+static void model_print_t5(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out,
+                    "{\n  \"architectures\": [\n    \"T5EncoderModel\"\n  ],\n  \"d_ff\": %d,\n  \"d_kv\": 64,\n"
+                    "  \"d_model\": %d,\n  \"decoder_start_token_id\": 0,\n  \"dense_act_fn\": \"gelu_new\",\n"
+                    "  \"dropout_rate\": 0.1,\n  \"eos_token_id\": 1,\n  \"feed_forward_proj\": \"gated-gelu\",\n"
+                    "  \"is_encoder_decoder\": true,\n  \"is_gated_act\": true,\n  \"layer_norm_epsilon\": 1e-06,\n"
+                    "  \"model_type\": \"t5\",\n  \"num_decoder_layers\": %d,\n  \"num_heads\": %d,\n",
+                    s->text.hidden, s->text.width, s->text.layers, s->text.heads);
+    gsf_text_printf(ctx, out,
+                    "  \"num_layers\": %d,\n  \"pad_token_id\": 0,\n  \"relative_attention_max_distance\": 128,\n"
+                    "  \"relative_attention_num_buckets\": 32,\n  \"tie_word_embeddings\": false,\n"
+                    "  \"transformers_version\": \"4.51.3\",\n  \"use_cache\": true,\n  \"vocab_size\": %d\n}\n",
+                    s->text.layers, s->text_words);
+}
+
+// Ids of BLIP-2's vocabulary: four special tokens, the 256 bytes, the words and their beginnings, last of all <image>.
+enum { MODEL_BYTE_0 = 4, MODEL_CAPTION_END = MODEL_BYTE_0 + '\n', MODEL_WORD_0 = MODEL_BYTE_0 + 256 };
+
+static void model_print_blocks(gsf_context* ctx, const model_blocks* b, const char* hidden, gsf_text* out) {
+    gsf_text_printf(ctx, out,
+                    "    \"hidden_size\": %d,\n    \"%s\": %d,\n    \"num_attention_heads\": %d,\n"
+                    "    \"num_hidden_layers\": %d,\n",
+                    b->width, hidden, b->hidden, b->heads, b->layers);
+}
+
+static void model_print_blip2(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out,
+                    "{\n  \"architectures\": [\n    \"Blip2ForConditionalGeneration\"\n  ],\n"
+                    "  \"image_text_hidden_size\": 256,\n  \"image_token_index\": %d,\n  \"model_type\": \"blip-2\",\n"
+                    "  \"num_query_tokens\": %d,\n  \"qformer_config\": {\n    \"cross_attention_frequency\": 2,\n"
+                    "    \"encoder_hidden_size\": %d,\n    \"hidden_act\": \"gelu\",\n",
+                    s->tell_words - 1, s->queries, s->see.width);
+    model_print_blocks(ctx, &s->ask, "intermediate_size", out);
+    gsf_text_printf(ctx, out,
+                    "    \"layer_norm_eps\": 1e-12,\n    \"model_type\": \"blip_2_qformer\",\n"
+                    "    \"position_embedding_type\": \"absolute\",\n    \"use_qformer_text_input\": false\n  },\n"
+                    "  \"text_config\": {\n    \"activation_function\": \"relu\",\n    \"bos_token_id\": 2,\n"
+                    "    \"do_layer_norm_before\": true,\n    \"eos_token_id\": %d,\n",
+                    (int)MODEL_CAPTION_END);
+    model_print_blocks(ctx, &s->tell, "ffn_dim", out);
+    gsf_text_printf(ctx, out,
+                    "    \"max_position_embeddings\": %d,\n    \"model_type\": \"opt\",\n    \"vocab_size\": %d,\n"
+                    "    \"word_embed_proj_dim\": %d\n  },\n  \"transformers_version\": \"4.51.3\",\n"
+                    "  \"use_decoder_only_language_model\": true,\n  \"vision_config\": {\n    \"hidden_act\": \"gelu\",\n",
+                    s->tell_tokens, s->tell_words, s->tell.width);
+    model_print_blocks(ctx, &s->see, "intermediate_size", out);
+    gsf_text_printf(ctx, out,
+                    "    \"image_size\": %d,\n    \"layer_norm_eps\": 1e-06,\n"
+                    "    \"model_type\": \"blip_2_vision_model\",\n    \"patch_size\": %d,\n    \"qkv_bias\": true\n"
+                    "  }\n}\n",
+                    s->see_side, (int)MODEL_PATCH);
+}
+
+static void model_print_blip2_images(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out,
+                    "{\n  \"do_convert_rgb\": true,\n  \"do_normalize\": true,\n  \"do_rescale\": true,\n"
+                    "  \"do_resize\": true,\n  \"image_mean\": [\n    0.48145466,\n    0.4578275,\n    0.40821073\n  ],\n"
+                    "  \"image_processor_type\": \"BlipImageProcessor\",\n"
+                    "  \"image_std\": [\n    0.26862954,\n    0.26130258,\n    0.27577711\n  ],\n"
+                    "  \"processor_class\": \"Blip2Processor\",\n  \"resample\": 3,\n"
+                    "  \"rescale_factor\": 0.00392156862745098,\n"
+                    "  \"size\": {\n    \"height\": %d,\n    \"width\": %d\n  }\n}\n",
+                    s->see_side, s->see_side);
+}
+
+static void model_print_blip2_processor(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out, "{\n  \"num_query_tokens\": %d,\n  \"processor_class\": \"Blip2Processor\"\n}\n", s->queries);
+}
+
+static void model_print_blip2_generation(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    (void)s;
+    gsf_text_printf(ctx, out,
+                    "{\n  \"_from_model_config\": true,\n  \"bos_token_id\": 2,\n  \"eos_token_id\": %d,\n"
+                    "  \"pad_token_id\": 1,\n  \"transformers_version\": \"4.51.3\"\n}\n",
+                    (int)MODEL_CAPTION_END);
+}
+
+// ---- the vocabularies ------------------------------------------------------------
+
+static const char* const model_words[] = { // of captions; sorted, which model_print_words relies on
+    "a", "above", "an", "and", "are", "art", "at", "background", "beach", "behind", "beside", "black", "blue", "boat",
+    "book", "bridge", "brown", "building", "by", "camera", "car", "chair", "city", "cloud", "clouds", "dark", "day",
+    "dog", "door", "field", "floor", "flower", "flowers", "fox", "front", "garden", "glass", "grass", "gray", "green",
+    "ground", "hill", "horse", "house", "image", "in", "is", "kitchen", "lake", "large", "leaf", "leaves", "light",
+    "man", "mountain", "near", "next", "night", "of", "old", "on", "open", "orange", "park", "path", "people",
+    "photo", "picture", "plant", "plants", "quality", "red", "river", "road", "rock", "rocks", "roof", "room", "sand",
+    "sea", "shelf", "side", "sitting", "sky", "small", "snow", "standing", "stone", "street", "sun", "sunny", "table",
+    "that", "the", "there", "this", "to", "top", "tower", "town", "tree", "trees", "truck", "two", "video", "view",
+    "walking", "wall", "water", "white", "window", "with", "woman", "wood", "wooden", "yellow"
+};
+
+static void model_print_token(gsf_context* ctx, gsf_text* out, int id, const char* text, int strip) { // an added one
+    const char* flag = strip ? "true" : "false";
+    gsf_text_printf(ctx, out,
+                    "    \"%d\": {\"content\": \"%s\", \"lstrip\": %s, \"normalized\": false, \"rstrip\": %s, "
+                    "\"single_word\": false, \"special\": true}",
+                    id, text, flag, flag);
+}
+
+// ---- T5's: a unigram model. gsfixer_nn.h draws its messages at >>nn tokenizer; these are all shorter than 128 bytes
+
+enum { MODEL_PIECES = 4 + (int)GSF__COUNT(model_words) + '~' - '!' + 1 }; // <pad>, </s>, <unk>, space, words, ASCII
+
+static void model_put_piece(gsf_context* ctx, gsf_text* out, const char* before, const char* text, double score, int type) {
+    const float value = (float)score;
+    const size_t first = strlen(before), size = first + strlen(text);
+    const unsigned char head[4] = {1 << 3 | 2, (unsigned char)(size + 9), 1 << 3 | 2, (unsigned char)size};
+    unsigned char tail[7] = {2 << 3 | 5, 0, 0, 0, 0, 3 << 3, (unsigned char)type};
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    gsf__store_le(tail + 1, bits, 4);
+    gsf_text_append(ctx, out, (const char*)head, sizeof head);
+    gsf_text_append(ctx, out, before, first);
+    gsf_text_append(ctx, out, text, size - first);
+    gsf_text_append(ctx, out, (const char*)tail, sizeof tail);
+}
+
+// A word scores more than its characters together.
+static void model_print_pieces(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    static const char ends[] = "\x12\x02\x18\x01"                 // trainer: kind 1, a unigram
+                               "\x1a\x0a\x0a\x08" "identity"; // normaliser: its name; characters stay as they are
+    (void)s;
+    model_put_piece(ctx, out, "", "<pad>", 0.0, GSF__SP_CONTROL);
+    model_put_piece(ctx, out, "", "</s>", 0.0, GSF__SP_CONTROL);
+    model_put_piece(ctx, out, "", "<unk>", 0.0, GSF__SP_UNKNOWN);
+    model_put_piece(ctx, out, gsf__sp_space, "", -3.0, GSF__SP_NORMAL);
+    for (size_t i = 0; i < GSF__COUNT(model_words); i++)
+        model_put_piece(ctx, out, gsf__sp_space, model_words[i], -5.0 - 0.01 * (double)i, GSF__SP_NORMAL);
+    for (char c = '!'; c <= '~'; c++) {
+        const char text[2] = {c, 0};
+        model_put_piece(ctx, out, "", text, -8.0 - 0.01 * (c - '!'), GSF__SP_NORMAL);
+    }
+    gsf_text_append(ctx, out, ends, sizeof ends - 1);
+}
+
+static void model_print_t5_added(gsf_context* ctx, const model_size* s, gsf_text* out) { // <extra_id_0> is the last one
+    (void)s;
+    for (int i = 0; i < GSF__SP_EXTRA; i++)
+        gsf_text_printf(ctx, out, "%s  \"<extra_id_%d>\": %d", i ? ",\n" : "{\n", i, MODEL_PIECES + GSF__SP_EXTRA - 1 - i);
+    gsf_text_printf(ctx, out, "\n}\n");
+}
+
+static void model_print_t5_tokenizer(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    static const char* const special[] = {"<pad>", "</s>", "<unk>"};
+    char name[32];
+    gsf_text_printf(ctx, out, "{\n  \"added_tokens_decoder\": {\n");
+    for (int i = 0; i < 3; i++) {
+        model_print_token(ctx, out, i, special[i], 0);
+        gsf_text_printf(ctx, out, ",\n");
+    }
+    for (int i = GSF__SP_EXTRA; i-- > 0;) {
+        snprintf(name, sizeof name, "<extra_id_%d>", i);
+        model_print_token(ctx, out, MODEL_PIECES + GSF__SP_EXTRA - 1 - i, name, 1);
+        gsf_text_printf(ctx, out, "%s\n", i ? "," : "");
+    }
+    gsf_text_printf(ctx, out,
+                    "  },\n  \"eos_token\": \"</s>\",\n  \"extra_ids\": %d,\n  \"legacy\": true,\n"
+                    "  \"model_max_length\": %d,\n  \"pad_token\": \"<pad>\",\n"
+                    "  \"tokenizer_class\": \"T5Tokenizer\",\n  \"unk_token\": \"<unk>\"\n}\n",
+                    (int)GSF__SP_EXTRA, s->text_tokens);
+}
+
+// ---- BLIP-2's: pairs of bytes
+
+static void model_print_entry(gsf_context* ctx, gsf_text* out, const char* text, int id) {
+    gsf_text_printf(ctx, out, "%s  ", id ? ",\n" : "{\n");
+    gsf_text_json_string(ctx, out, text);
+    gsf_text_printf(ctx, out, ": %d", id);
+}
+
+// Every beginning of a word, with the space before it, is a token: one character more than another. As entries of the
+// vocabulary, or as merges.
+static void model_print_words(gsf_context* ctx, int merges, gsf_text* out) {
+    char text[48];
+    const size_t space = gsf__bpe_store_character(gsf__bpe_character(' '), text);
+    int id = MODEL_WORD_0;
+    for (size_t i = 0; i < GSF__COUNT(model_words); i++) {
+        const char* word = model_words[i];
+        size_t n = 0; // characters that the word before begins with, too
+        while (i && word[n] && word[n] == model_words[i - 1][n]) n++;
+        for (; word[n]; n++) {
+            snprintf(text + space, sizeof text - space, "%.*s", (int)n + !merges, word);
+            if (merges) gsf_text_printf(ctx, out, "%s %c\n", text, word[n]);
+            else model_print_entry(ctx, out, text, id++);
+        }
+    }
+}
+
+static void model_print_vocabulary(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    static const char* const special[MODEL_BYTE_0] = {"<s>", "<pad>", "</s>", "<unk>"};
+    char text[4];
+    (void)s;
+    for (int i = 0; i < MODEL_BYTE_0; i++) model_print_entry(ctx, out, special[i], i);
+    for (int i = 0; i < 256; i++) {
+        text[gsf__bpe_store_character(gsf__bpe_character((unsigned)i), text)] = 0;
+        model_print_entry(ctx, out, text, MODEL_BYTE_0 + i);
+    }
+    model_print_words(ctx, 0, out);
+    gsf_text_printf(ctx, out, "\n}\n");
+}
+
+static void model_print_merges(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    (void)s;
+    gsf_text_printf(ctx, out, "#version: 0.2\n");
+    model_print_words(ctx, 1, out);
+}
+
+static void model_print_blip2_added(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out, "{\n  \"<image>\": %d\n}\n", s->tell_words - 1);
+}
+
+#define MODEL_BLIP2_SPECIAL \
+    "  \"additional_special_tokens\": [\"<image>\"],\n  \"bos_token\": \"</s>\",\n  \"eos_token\": \"</s>\",\n" \
+    "  \"pad_token\": \"<pad>\",\n  \"unk_token\": \"</s>\"\n}\n"
+
+static void model_print_blip2_special(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    (void)s;
+    gsf_text_printf(ctx, out, "{\n" MODEL_BLIP2_SPECIAL);
+}
+
+static void model_print_blip2_tokenizer(gsf_context* ctx, const model_size* s, gsf_text* out) {
+    gsf_text_printf(ctx, out, "{\n  \"add_bos_token\": true,\n  \"added_tokens_decoder\": {\n");
+    model_print_token(ctx, out, 1, "<pad>", 0);
+    gsf_text_printf(ctx, out, ",\n");
+    model_print_token(ctx, out, 2, "</s>", 0);
+    gsf_text_printf(ctx, out, ",\n");
+    model_print_token(ctx, out, s->tell_words - 1, "<image>", 0);
+    gsf_text_printf(ctx, out, "\n  },\n  \"tokenizer_class\": \"GPT2Tokenizer\",\n" MODEL_BLIP2_SPECIAL);
+}
 
 // ---- the lists of tensors --------------------------------------------------------
 
@@ -123,7 +400,10 @@ typedef struct model_list {
     gsf_result result;
 } model_list;
 
-enum { MODEL_TRANSFORMER = 1, MODEL_VAE = 2, MODEL_SCHEDULER = 4, MODEL_FEATURES = 8, MODEL_ALL = 15 };
+enum {
+    MODEL_TRANSFORMER = 1, MODEL_VAE = 2, MODEL_SCHEDULER = 4, MODEL_FEATURES = 8, MODEL_DINOV2 = 16, MODEL_VGGT = 32,
+    MODEL_TEXT = 64, MODEL_BLIP2 = 128, MODEL_ALL = 255
+};
 
 static model_list model_begin_list(gsf_context* ctx, unsigned part) {
     model_list list;
@@ -138,16 +418,34 @@ static int model_ends_in(const char* text, const char* end) {
     return size >= tail && strcmp(text + size - tail, end) == 0;
 }
 
+typedef struct model_range { const char* end; double middle, spread, factor; } model_range;
+
+// Of tensors whose names end so: values are uniform in middle - spread .. middle + spread; or factor, with no spread, times
+// those of any other. The first that fits holds.
+static const model_range model_ranges[] = {
+    {".conv_y.conv.bias", 1.0, 0.05, 0.0}, {".conv_y.conv.weight", 0.0, 0.0, 0.25}, // makes a factor, too
+    {".pos_embedding", 0.0, 0.05, 0.0}, // is added to the transformer's tokens
+    {"_latents", 0.0, 1.7320508075688772, 0.0}, {"_embeds", 0.0, 1.7320508075688772, 0.0}, // variance 1
+    {".lambda1", 1.0, 0.1, 0.0}, {".gamma", 1.0, 0.1, 0.0}, // LayerScale
+    {"SelfAttention.q.weight", 0.0, 0.0, 0.125},            // T5 does not scale the logits of its heads of 64
+    {"shared.weight", 0.0, 1.7320508075688772, 0.0},
+    {"embed_positions.weight", 0.0, 1.0, 0.0}, {"_token", 0.0, 1.0, 0.0}, {"_tokens", 0.0, 1.0, 0.0},
+    {"_embedding", 0.0, 1.0, 0.0}, {"_embeddings", 0.0, 1.0, 0.0}, {".pos_embed", 0.0, 1.0, 0.0},
+};
+
 // Every layer keeps the size of what goes through it: weights of variance 1 / fan-in, norms near 1. So the modulations and
 // gates of the transformer's blocks come out about 0.2 in size, from the time embedding's own size.
 static void model_choose_range(model_tensor* t) {
-    const int64_t fan_in = t->count / t->shape[0];
     const int norm = t->rank == 1 && model_ends_in(t->name, ".weight");
-    t->middle = norm || model_ends_in(t->name, ".conv_y.conv.bias") ? 1.0 : 0.0; // conv_y: a factor, too
-    t->spread = norm ? 0.1 : t->rank == 1 ? 0.05 : sqrt(3.0 / (double)fan_in);
-    if (model_ends_in(t->name, ".conv_y.conv.weight")) t->spread *= 0.25;
-    if (model_ends_in(t->name, ".pos_embedding")) t->spread = 0.05;
-    if (model_ends_in(t->name, "_latents") || model_ends_in(t->name, "_embeds")) t->spread = sqrt(3.0);
+    t->middle = norm ? 1.0 : 0.0;
+    t->spread = norm ? 0.1 : t->rank == 1 ? 0.05 : sqrt(3.0 / (double)(t->count / t->shape[0]));
+    for (size_t i = 0; i < GSF__COUNT(model_ranges); i++) {
+        const model_range* r = &model_ranges[i];
+        if (!model_ends_in(t->name, r->end)) continue;
+        t->middle = r->middle;
+        t->spread = r->spread > 0.0 ? r->spread : r->factor * t->spread;
+        break;
+    }
 }
 
 static void model_add(model_list* list, int32_t rank, const int64_t* shape, const char* prefix, const char* name) {
@@ -186,7 +484,7 @@ static void model_add_entries(model_list* list, const gsf_nn_transformer* c, con
     }
 }
 
-static void model_list_transformer(model_list* list, const gsf_nn_transformer* c) {
+static void model_add_transformer(model_list* list, const gsf_nn_transformer* c) {
     char prefix[48];
     model_add_entries(list, c, gsf__dit_entries, GSF__COUNT(gsf__dit_entries), "");
     for (int32_t i = 0; i < c->layers; i++) {
@@ -251,18 +549,197 @@ static void model_add_coder(model_list* list, const gsf_nn_vae* vae, int decoder
     model_add_conv(list, side, ".conv_out.conv", in, decoder ? vae->out_channels : 2 * vae->latent_channels, 3, 3);
 }
 
-static void model_list_vae(model_list* list, const gsf_nn_vae* vae) {
+static void model_add_vae(model_list* list, const gsf_nn_vae* vae) {
     model_add_coder(list, vae, 0);
     model_add_coder(list, vae, 1);
 }
 
-static void model_list_features(model_list* list, const model_size* s) {
-    const int64_t dino[3] = {2, s->reference_tokens, MODEL_DINO_CHANNELS};
-    const int64_t vggt[3] = {2, s->reference_tokens, MODEL_VGGT_CHANNELS};
-    const int64_t text[3] = {2, s->text_tokens, s->text_channels};
+// The encoders of images are opened by tables, too. vit: NULL for entries of blocks.
+static void model_add_vit(model_list* list, const gsf__vit_sizes* sizes, const gsf__vit* vit, const gsf__vit_entry* entries,
+                          size_t count, const char* prefix) {
+    for (size_t i = 0; i < count; i++) {
+        int64_t shape[5];
+        int32_t rank = 0;
+        for (const char* s = entries[i].shape; *s && rank < 5; s++) shape[rank++] = gsf__vit_dimension(sizes, vit, *s);
+        if (entries[i].kind == GSF__VIT_QKV_BIAS && !sizes->qkv_bias) continue;
+        if (entries[i].kind == GSF__VIT_HEAD_NORM && !sizes->head_norm) continue;
+        model_add(list, rank, shape, prefix, entries[i].name);
+    }
+}
+
+static void model_add_vit_blocks(model_list* list, const gsf__vit_sizes* sizes, const gsf__vit_entry* entries, size_t count,
+                                 const char* names, int64_t layers) {
+    char prefix[64];
+    for (int64_t i = 0; i < layers; i++) {
+        snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
+        model_add_vit(list, sizes, NULL, entries, count, prefix);
+    }
+}
+
+static void model_add_dinov2(model_list* list, const gsf__vit* vit) {
+    const int64_t mask[2] = {1, vit->sizes.width};
+    model_add_vit(list, &vit->sizes, vit, gsf__dinov2_entries, GSF__COUNT(gsf__dinov2_entries), "");
+    model_add(list, 2, mask, "", "embeddings.mask_token"); // for training
+    model_add_vit_blocks(list, &vit->sizes, gsf__dinov2_block_entries, GSF__COUNT(gsf__dinov2_block_entries),
+                         vit->block_names, vit->layers);
+}
+
+static void model_add_vggt(model_list* list, const gsf__vggt* net) {
+    const gsf__vit* vit = &net->embed;
+    const gsf__vit_entry* entries = gsf__vggt_block_entries;
+    const size_t count = GSF__COUNT(gsf__vggt_block_entries);
+    const int64_t camera[4] = {1, 2, 1, net->sizes.width}, registers[4] = {1, 2, net->registers, net->sizes.width};
+    model_add(list, 4, camera, "aggregator.", "camera_token");
+    model_add(list, 4, registers, "aggregator.", "register_token");
+    model_add_vit(list, &vit->sizes, vit, gsf__vggt_entries, GSF__COUNT(gsf__vggt_entries), "");
+    model_add(list, 2, camera + 2, vit->prefix, "mask_token");
+    model_add_vit_blocks(list, &vit->sizes, entries, count, vit->block_names, vit->layers);
+    model_add_vit_blocks(list, &net->sizes, entries, count, gsf__vggt_frame_names, net->layers);
+    model_add_vit_blocks(list, &net->sizes, entries, count, gsf__vggt_global_names, net->layers);
+}
+
+// Walks again, as the readers have them.
+static void model_add_t5(model_list* list, const gsf_nn_t5* c) {
+    const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
+    const struct { const char* name; int32_t rank; int64_t shape[2]; } parts[] = {
+        {"0.layer_norm.weight", 1, {d, 0}},           {"0.SelfAttention.q.weight", 2, {inner, d}},
+        {"0.SelfAttention.k.weight", 2, {inner, d}},  {"0.SelfAttention.v.weight", 2, {inner, d}},
+        {"0.SelfAttention.o.weight", 2, {d, inner}},  {"1.layer_norm.weight", 1, {d, 0}},
+        {"1.DenseReluDense.wi_0.weight", 2, {h, d}},  {"1.DenseReluDense.wi_1.weight", 2, {h, d}},
+        {"1.DenseReluDense.wo.weight", 2, {d, h}}};
+    const int64_t words[2] = {c->vocabulary, d}, positions[2] = {c->buckets, c->heads};
+    char prefix[48];
+    model_add(list, 2, words, "", "shared.weight");
+    model_add(list, 2, positions, "", "encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight");
+    model_add(list, 1, &d, "", "encoder.final_layer_norm.weight");
+    for (int32_t i = 0; i < c->layers; i++) {
+        snprintf(prefix, sizeof prefix, "encoder.block.%d.layer.", (int)i);
+        for (size_t k = 0; k < GSF__COUNT(parts); k++)
+            model_add(list, parts[k].rank, parts[k].shape, prefix, parts[k].name);
+    }
+}
+
+// PREFIX.weight (out, in), or (out) with in = 0, and PREFIX.bias (out).
+static void model_add_linear(model_list* list, const char* prefix, const char* name, int64_t out, int64_t in) {
+    const int64_t shape[2] = {out, in};
+    char full[96];
+    snprintf(full, sizeof full, "%s%s", prefix, name);
+    model_add(list, in ? 2 : 1, shape, full, ".weight");
+    model_add(list, 1, shape, full, ".bias");
+}
+
+static void model_add_qformer(model_list* list, const gsf__qformer* q, int64_t source) {
+    static const char* const kinds[] = {"attention", "crossattention"};
+    const int64_t d = q->width, tokens[3] = {1, q->queries, d};
+    char layer[48], prefix[80];
+    model_add(list, 3, tokens, "", "query_tokens");
+    model_add_linear(list, "qformer.", "layernorm", d, 0);
+    for (int64_t i = 0; i < q->layers; i++) {
+        snprintf(layer, sizeof layer, "qformer.encoder.layer.%lld.", (long long)i);
+        for (int cross = 0; cross < (i % q->cross_every == 0 ? 2 : 1); cross++) {
+            snprintf(prefix, sizeof prefix, "%s%s.", layer, kinds[cross]);
+            model_add_linear(list, prefix, "attention.query", d, d);
+            model_add_linear(list, prefix, "attention.key", d, cross ? source : d);
+            model_add_linear(list, prefix, "attention.value", d, cross ? source : d);
+            model_add_linear(list, prefix, "output.dense", d, d);
+            model_add_linear(list, prefix, "output.LayerNorm", d, 0);
+        }
+        model_add_linear(list, layer, "intermediate_query.dense", q->mlp, d);
+        model_add_linear(list, layer, "output_query.dense", d, q->mlp);
+        model_add_linear(list, layer, "output_query.LayerNorm", d, 0);
+    }
+}
+
+static void model_add_blip2(model_list* list, const gsf__blip* net) {
+    static const char decoder[] = "language_model.model.decoder.";
+    const gsf__vit* vit = &net->vision;
+    const gsf__opt* opt = &net->text;
+    const int64_t d = opt->sizes.width, words[2] = {opt->vocabulary, d}, places[2] = {opt->positions + GSF__OPT_OFFSET, d};
+    model_add_vit(list, &vit->sizes, vit, gsf__blip_entries, GSF__COUNT(gsf__blip_entries), "vision_model.");
+    model_add_vit_blocks(list, &vit->sizes, gsf__blip_block_entries, GSF__COUNT(gsf__blip_block_entries), vit->block_names,
+                         vit->layers);
+    model_add_qformer(list, &net->qformer, vit->sizes.width);
+    model_add_linear(list, "", "language_projection", d, net->qformer.width);
+    model_add(list, 2, words, decoder, "embed_tokens.weight"); // and head
+    model_add(list, 2, places, decoder, "embed_positions.weight");
+    model_add_linear(list, decoder, "final_layer_norm", d, 0);
+    model_add_vit_blocks(list, &opt->sizes, gsf__opt_block_entries, GSF__COUNT(gsf__opt_block_entries),
+                         "language_model.model.decoder.layers.", opt->layers);
+}
+
+// ---- the list of a part: sizes come out of the text that goes into its config.json
+
+static void model_list_transformer(model_list* list, const model_size* s, gsf__nn_config* config) {
+    gsf_nn_transformer net;
+    memset(&net, 0, sizeof net);
+    list->result = gsf__dit_read_config(config, &net);
+    net.dino_channels = s->eyes.width;
+    net.vggt_channels = 2 * s->eyes.width;
+    model_add_transformer(list, &net);
+}
+
+static void model_list_vae(model_list* list, const model_size* s, gsf__nn_config* config) {
+    gsf_nn_vae vae;
+    (void)s;
+    memset(&vae, 0, sizeof vae);
+    list->result = gsf__vae_take_config(config, &vae);
+    model_add_vae(list, &vae);
+}
+
+static void model_list_features(model_list* list, const model_size* s, gsf__nn_config* config) {
+    const int64_t dino[3] = {2, s->reference_tokens, s->eyes.width}, vggt[3] = {2, dino[1], 2 * dino[2]};
+    const int64_t text[3] = {2, s->text_tokens, s->text.width};
+    (void)config;
     model_add(list, 3, dino, "", "dino_latents");
     model_add(list, 3, vggt, "", "vggt_latents");
     model_add(list, 3, text, "", "prompt_embeds");
+}
+
+static void model_list_dinov2(model_list* list, const model_size* s, gsf__nn_config* config) {
+    gsf__vit vit;
+    (void)s;
+    memset(&vit, 0, sizeof vit);
+    list->result = gsf__dinov2_read_config(config, &vit);
+    model_add_dinov2(list, &vit);
+}
+
+// Its reader has most sizes from the tensors.
+static void model_list_vggt(model_list* list, const model_size* s, gsf__nn_config* config) {
+    gsf__vggt net;
+    (void)config;
+    memset(&net, 0, sizeof net);
+    net.sizes.width = s->eyes.width;
+    net.sizes.mlp = s->eyes.hidden;
+    net.sizes.head_dim = s->eyes.width / s->eyes.heads;
+    net.sizes.qkv_bias = 1;
+    net.embed.sizes = net.sizes;
+    net.embed.channels = 3;
+    net.embed.patch = MODEL_PATCH;
+    net.embed.grid = s->eyes_grid;
+    net.embed.registers = net.registers = MODEL_REGISTERS;
+    net.embed.layers = net.layers = s->eyes.layers;
+    net.embed.prefix = "aggregator.patch_embed.";
+    net.embed.block_names = "aggregator.patch_embed.blocks.";
+    net.sizes.head_norm = 1;
+    model_add_vggt(list, &net);
+}
+
+static void model_list_t5(model_list* list, const model_size* s, gsf__nn_config* config) {
+    gsf_nn_t5 t5;
+    (void)s;
+    memset(&t5, 0, sizeof t5);
+    list->result = gsf__t5_read_config(config, &t5);
+    model_add_t5(list, &t5);
+}
+
+static void model_list_blip2(model_list* list, const model_size* s, gsf__nn_config* config) {
+    gsf__blip net;
+    gsf_nn_captioner captioner;
+    (void)s;
+    memset(&net, 0, sizeof net);
+    memset(&captioner, 0, sizeof captioner);
+    list->result = gsf__blip_read_config(config, &net, &captioner);
+    model_add_blip2(list, &net);
 }
 
 // ---- values ----------------------------------------------------------------------
@@ -327,14 +804,12 @@ typedef struct model_options {
     unsigned parts;
 } model_options;
 
-#define MODEL_STEM "diffusion_pytorch_model" // of the files of weights
-#define MODEL_SINGLE MODEL_STEM ".safetensors"
-#define MODEL_INDEX MODEL_SINGLE ".index.json"
-
 typedef struct model_writer {
     gsf_context* ctx;
     const model_options* options;
     const char* part;     // for the progress
+    const char *folder, *stem; // of the files, called STEM.safetensors or STEM-00001-of-00002.safetensors
+    int shards;
     unsigned char* block; // MODEL_BLOCK values
     double done, total;   // bytes
 } model_writer;
@@ -427,19 +902,20 @@ static gsf_result model_write_file(model_writer* w, const char* path, const mode
 }
 
 // Consecutive tensors with about the same bytes in each shard, and no shard without a tensor.
-static void model_deal(const model_writer* w, model_list* list, int shards) {
+static void model_deal(const model_writer* w, model_list* list) {
     double before = 0.0;
     int shard = 0;
     for (size_t i = 0; i < list->count; i++) {
-        const int left = shards - 1 - shard; // still to begin
-        if (i && left > 0 && (before * shards >= w->total * (shard + 1) || list->count - i == (size_t)left)) shard++;
+        const int left = w->shards - 1 - shard; // still to begin
+        if (i && left > 0 && (before * w->shards >= w->total * (shard + 1) || list->count - i == (size_t)left)) shard++;
         list->tensors[i].shard = shard;
         before += model_bytes(w, &list->tensors[i]);
     }
 }
 
-static void model_print_shard(gsf_context* ctx, gsf_text* out, int shard, int shards) {
-    gsf_text_printf(ctx, out, MODEL_STEM "-%05d-of-%05d.safetensors", shard + 1, shards);
+static void model_print_file(const model_writer* w, int shard, gsf_text* out) {
+    if (w->shards > 1) gsf_text_printf(w->ctx, out, "%s-%05d-of-%05d.safetensors", w->stem, shard + 1, w->shards);
+    else gsf_text_printf(w->ctx, out, "%s.safetensors", w->stem);
 }
 
 static gsf_result model_write_text(gsf_context* ctx, const char* folder, const char* name, const char* data, size_t size) {
@@ -451,54 +927,58 @@ static gsf_result model_write_text(gsf_context* ctx, const char* folder, const c
     return result;
 }
 
-static gsf_result model_write_index(const model_writer* w, const char* folder, const model_tensor** sorted, size_t count,
-                                    int shards) {
-    gsf_text out;
-    memset(&out, 0, sizeof out);
-    gsf_text_printf(w->ctx, &out, "{\n  \"metadata\": {\n    \"total_size\": %.0f\n  },\n  \"weight_map\": {\n", w->total);
-    for (size_t i = 0; i < count; i++) {
-        gsf_text_printf(w->ctx, &out, "    \"%s\": \"", sorted[i]->name);
-        model_print_shard(w->ctx, &out, sorted[i]->shard, shards);
-        gsf_text_printf(w->ctx, &out, "\"%s\n", i + 1 < count ? "," : "");
-    }
-    gsf_text_printf(w->ctx, &out, "  }\n}\n");
+// The same of a text that goes with it.
+static gsf_result model_end_text(gsf_context* ctx, const char* folder, const char* name, gsf_text* text) {
     const gsf_result result =
-        out.failed ? GSF_ERROR_OUT_OF_MEMORY : model_write_text(w->ctx, folder, MODEL_INDEX, out.data, out.size);
-    gsf_destroy_text(w->ctx, &out);
+        text->failed ? GSF_ERROR_OUT_OF_MEMORY : model_write_text(ctx, folder, name, text->data, text->size);
+    gsf_destroy_text(ctx, text);
     return result;
 }
 
-static void model_remove(gsf_context* ctx, const char* folder, const char* name) {
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
-    if (!path.failed) remove(path.data);
-    gsf_destroy_text(ctx, &path);
+static gsf_result model_write_index(const model_writer* w, const model_tensor** sorted, size_t count) {
+    gsf_text out;
+    char name[64];
+    memset(&out, 0, sizeof out);
+    snprintf(name, sizeof name, "%s.safetensors.index.json", w->stem);
+    gsf_text_printf(w->ctx, &out, "{\n  \"metadata\": {\n    \"total_size\": %.0f\n  },\n  \"weight_map\": {\n", w->total);
+    for (size_t i = 0; i < count; i++) {
+        gsf_text_printf(w->ctx, &out, "    \"%s\": \"", sorted[i]->name);
+        model_print_file(w, sorted[i]->shard, &out);
+        gsf_text_printf(w->ctx, &out, "\"%s\n", i + 1 < count ? "," : "");
+    }
+    gsf_text_printf(w->ctx, &out, "  }\n}\n");
+    return model_end_text(w->ctx, w->folder, name, &out);
 }
 
-// The files of a list: one called `single`, or shards with their index. What would be opened before them goes.
-static gsf_result model_write_shards(model_writer* w, const char* folder, const char* single, model_list* list,
-                                     int shards) {
+static void model_remove(const model_writer* w, const char* end) {
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(w->ctx, &path, "%s/%s%s", w->folder, w->stem, end);
+    if (!path.failed) remove(path.data);
+    gsf_destroy_text(w->ctx, &path);
+}
+
+// The files of a list: a single one, or shards with their index. What would be opened before them goes.
+static gsf_result model_write_shards(model_writer* w, model_list* list) {
     const model_tensor** picked = (const model_tensor**)gsf_alloc(w->ctx, list->count, sizeof *picked);
     gsf_result result = picked ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    for (int shard = 0; shard < shards && result == GSF_OK; shard++) {
+    for (int shard = 0; shard < w->shards && result == GSF_OK; shard++) {
         gsf_text path;
         size_t count = 0;
         memset(&path, 0, sizeof path);
-        gsf_text_printf(w->ctx, &path, "%s/", folder);
-        if (shards > 1) model_print_shard(w->ctx, &path, shard, shards);
-        else gsf_text_printf(w->ctx, &path, "%s", single);
+        gsf_text_printf(w->ctx, &path, "%s/", w->folder);
+        model_print_file(w, shard, &path);
         for (size_t i = 0; i < list->count; i++)
             if (list->tensors[i].shard == shard) picked[count++] = &list->tensors[i];
         result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : model_write_file(w, path.data, picked, count);
         gsf_destroy_text(w->ctx, &path);
     }
-    if (result == GSF_OK && shards > 1) {
+    if (result == GSF_OK && w->shards > 1) {
         for (size_t i = 0; i < list->count; i++) picked[i] = &list->tensors[i];
         qsort((void*)picked, list->count, sizeof *picked, model_compare_names);
-        result = model_write_index(w, folder, picked, list->count, shards);
+        result = model_write_index(w, picked, list->count);
     }
-    if (result == GSF_OK) model_remove(w->ctx, folder, shards > 1 ? single : MODEL_INDEX);
+    if (result == GSF_OK) model_remove(w, w->shards > 1 ? ".safetensors" : ".safetensors.index.json");
     gsf_free(w->ctx, (void*)picked);
     return result;
 }
@@ -522,25 +1002,102 @@ typedef struct model_report { // of one part
     double values, bytes, seconds; // bytes of the values alone
 } model_report;
 
-static gsf_result model_write_list(gsf_context* ctx, const model_options* o, const char* folder, const char* single,
-                                   model_list* list, int shards, model_report* report) {
+typedef struct model_file {
+    const char* name;
+    void (*print_fn)(gsf_context* ctx, const model_size* s, gsf_text* out);
+} model_file;
+
+typedef struct model_part {
+    const char *name, *folder;
+    unsigned bit;
+    const char* stem; // of its files of weights; NULL: none
+    int sharded;
+    void (*list_fn)(model_list* list, const model_size* s, gsf__nn_config* config);
+    gsf_result (*open_fn)(gsf_context* ctx, const char* folder); // the library's reader
+    model_file files[9];                                         // the first is what list_fn reads
+} model_part;
+
+// Opening what was written compares names and shapes.
+#define MODEL_OPENS(net)                                                            \
+    static gsf_result model_open_##net(gsf_context* ctx, const char* folder) {      \
+        gsf_nn_##net net;                                                           \
+        GSF__TRY(gsf_nn_make_##net(ctx, folder, &net));                             \
+        gsf_nn_destroy_##net(ctx, &net);                                            \
+        return GSF_OK;                                                              \
+    }
+MODEL_OPENS(transformer)
+MODEL_OPENS(vae)
+MODEL_OPENS(dinov2)
+MODEL_OPENS(vggt)
+MODEL_OPENS(t5)
+MODEL_OPENS(tokenizer)
+MODEL_OPENS(captioner)
+#undef MODEL_OPENS
+
+enum { MODEL_PARTS = 9 };
+static const model_part model_parts[MODEL_PARTS] = {
+    {"transformer", "/transformer", MODEL_TRANSFORMER, "diffusion_pytorch_model", 1, model_list_transformer,
+     model_open_transformer, {{"config.json", model_print_transformer}}},
+    {"vae", "/vae", MODEL_VAE, "diffusion_pytorch_model", 0, model_list_vae, model_open_vae,
+     {{"config.json", model_print_vae}}},
+    {"scheduler", "/scheduler", MODEL_SCHEDULER, NULL, 0, NULL, NULL, {{"scheduler_config.json", model_print_scheduler}}},
+    {"features", "", MODEL_FEATURES, "features", 0, model_list_features, NULL, {{NULL, NULL}}},
+    {"dinov2", "/dinov2", MODEL_DINOV2, "model", 0, model_list_dinov2, model_open_dinov2,
+     {{"config.json", model_print_dinov2}}},
+    {"vggt", "/vggt", MODEL_VGGT, "model", 0, model_list_vggt, model_open_vggt, {{"config.json", model_print_vggt}}},
+    {"text", "/text_encoder", MODEL_TEXT, "model", 1, model_list_t5, model_open_t5, {{"config.json", model_print_t5}}},
+    {"text", "/tokenizer", MODEL_TEXT, NULL, 0, NULL, model_open_tokenizer,
+     {{"tokenizer_config.json", model_print_t5_tokenizer}, {"added_tokens.json", model_print_t5_added},
+      {"spiece.model", model_print_pieces}}},
+    {"blip2", "/blip2", MODEL_BLIP2, "model", 1, model_list_blip2, model_open_captioner,
+     {{"config.json", model_print_blip2}, {"preprocessor_config.json", model_print_blip2_images},
+      {"processor_config.json", model_print_blip2_processor}, {"generation_config.json", model_print_blip2_generation},
+      {"vocab.json", model_print_vocabulary}, {"merges.txt", model_print_merges},
+      {"tokenizer_config.json", model_print_blip2_tokenizer}, {"special_tokens_map.json", model_print_blip2_special},
+      {"added_tokens.json", model_print_blip2_added}}},
+};
+
+// The tensors of a part, which nothing is written for; list->tensors is freed by the caller.
+static gsf_result model_list_part(gsf_context* ctx, const model_part* part, const model_size* size, model_list* list) {
+    gsf_text text;
+    gsf__nn_config config;
+    *list = model_begin_list(ctx, part->bit);
+    memset(&text, 0, sizeof text);
+    memset(&config, 0, sizeof config);
+    if (part->files[0].print_fn) {
+        part->files[0].print_fn(ctx, size, &text);
+        list->result = text.failed ? GSF_ERROR_OUT_OF_MEMORY
+                                   : gsf__nn_parse_config(ctx, part->files[0].name, text.data, text.size, &config);
+    }
+    if (list->result == GSF_OK) {
+        part->list_fn(list, size, &config);
+        gsf_destroy_json(ctx, &config.json);
+    }
+    gsf_destroy_text(ctx, &text);
+    return list->result;
+}
+
+static gsf_result model_write_list(gsf_context* ctx, const model_options* o, const model_part* part, const char* folder,
+                                   model_list* list, model_report* report) {
     model_writer w;
     const double start = model_now();
     memset(&w, 0, sizeof w);
     w.ctx = ctx;
     w.options = o;
-    w.part = report->part;
-    GSF__TRY(list->result);
-    if ((size_t)shards > list->count)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%d shards for %zu tensors", shards, list->count);
+    w.part = part->name;
+    w.folder = folder;
+    w.stem = part->stem;
+    w.shards = part->sharded ? o->shards : 1;
+    if ((size_t)w.shards > list->count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %d shards for %zu tensors", w.part, w.shards, list->count);
     for (size_t i = 0; i < list->count; i++) {
         w.total += model_bytes(&w, &list->tensors[i]);
         report->values += (double)list->tensors[i].count;
     }
-    model_deal(&w, list, shards);
+    model_deal(&w, list);
     w.block = (unsigned char*)gsf_alloc(ctx, MODEL_BLOCK, gsf_nn_dtype_size(o->dtype));
     if (!w.block) return GSF_ERROR_OUT_OF_MEMORY;
-    const gsf_result result = model_write_shards(&w, folder, single, list, shards);
+    const gsf_result result = model_write_shards(&w, list);
     gsf_free(ctx, w.block);
     report->tensors = list->count;
     report->bytes = w.total;
@@ -548,96 +1105,40 @@ static gsf_result model_write_list(gsf_context* ctx, const model_options* o, con
     return result;
 }
 
-// Its sizes come out of the text that goes into config.json; at the end the folder is opened.
-static gsf_result model_make_transformer(gsf_context* ctx, const model_options* o, const char* folder,
-                                         model_report* report) {
-    gsf_text text;
-    gsf__nn_config config;
-    gsf_nn_transformer net;
-    model_list list = model_begin_list(ctx, MODEL_TRANSFORMER);
+static gsf_result model_make_part(gsf_context* ctx, const model_options* o, const model_part* part, const char* folder,
+                                  model_report* report) {
+    gsf_result result = model_make_folder(ctx, folder);
+    report->part = part->name;
+    if (result == GSF_OK && part->list_fn) {
+        model_list list;
+        result = model_list_part(ctx, part, o->size, &list);
+        if (result == GSF_OK) result = model_write_list(ctx, o, part, folder, &list, report);
+        gsf_free(ctx, list.tensors);
+    }
+    for (size_t i = 0; i < GSF__COUNT(part->files) && part->files[i].name && result == GSF_OK; i++) {
+        gsf_text text;
+        memset(&text, 0, sizeof text);
+        part->files[i].print_fn(ctx, o->size, &text);
+        result = model_end_text(ctx, folder, part->files[i].name, &text);
+    }
+    return result == GSF_OK && part->open_fn ? part->open_fn(ctx, folder) : result;
+}
+
+static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
+    gsf_text path, text;
+    void* encoder = NULL; // its configuration, where the folder has one
+    size_t size;
+    memset(&path, 0, sizeof path);
     memset(&text, 0, sizeof text);
-    memset(&net, 0, sizeof net);
-    GSF__TRY(model_make_folder(ctx, folder));
-    model_print_transformer(ctx, o->size, &text);
-    gsf_result result = text.failed ? GSF_ERROR_OUT_OF_MEMORY
-                                    : gsf__nn_parse_config(ctx, "config.json", text.data, text.size, &config);
-    if (result == GSF_OK) {
-        result = gsf__dit_read_config(&config, &net);
-        gsf__nn_close_config(&config);
-    }
-    net.dino_channels = MODEL_DINO_CHANNELS;
-    net.vggt_channels = MODEL_VGGT_CHANNELS;
-    if (result == GSF_OK) {
-        model_list_transformer(&list, &net);
-        result = model_write_list(ctx, o, folder, MODEL_SINGLE, &list, o->shards, report);
-    }
-    if (result == GSF_OK) result = model_write_text(ctx, folder, "config.json", text.data, text.size);
-    if (result == GSF_OK) {
-        result = gsf_nn_make_transformer(ctx, folder, &net);
-        if (result == GSF_OK) gsf_nn_destroy_transformer(ctx, &net);
-    }
-    gsf_free(ctx, list.tensors);
-    gsf_destroy_text(ctx, &text);
-    return result;
+    gsf_text_printf(ctx, &path, "%s/text_encoder/config.json", out);
+    const gsf_result result =
+        path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &encoder, &size);
+    gsf_destroy_text(ctx, &path);
+    if (result != GSF_OK) return result;
+    model_print_pipeline(ctx, encoder != NULL, &text);
+    gsf_free(ctx, encoder);
+    return model_end_text(ctx, out, "model_index.json", &text);
 }
-
-static gsf_result model_make_vae(gsf_context* ctx, const model_options* o, const char* folder, model_report* report) {
-    gsf_text text;
-    gsf__nn_config config;
-    gsf_nn_vae vae;
-    model_list list = model_begin_list(ctx, MODEL_VAE);
-    memset(&text, 0, sizeof text);
-    memset(&vae, 0, sizeof vae);
-    GSF__TRY(model_make_folder(ctx, folder));
-    model_print_vae(ctx, o->size, &text);
-    gsf_result result = text.failed ? GSF_ERROR_OUT_OF_MEMORY
-                                    : gsf__nn_parse_config(ctx, "config.json", text.data, text.size, &config);
-    if (result == GSF_OK) {
-        result = gsf__vae_take_config(&config, &vae);
-        gsf__nn_close_config(&config);
-    }
-    if (result == GSF_OK) {
-        model_list_vae(&list, &vae);
-        result = model_write_list(ctx, o, folder, MODEL_SINGLE, &list, 1, report);
-    }
-    if (result == GSF_OK) result = model_write_text(ctx, folder, "config.json", text.data, text.size);
-    if (result == GSF_OK) {
-        result = gsf_nn_make_vae(ctx, folder, &vae);
-        if (result == GSF_OK) gsf_nn_destroy_vae(ctx, &vae);
-    }
-    gsf_free(ctx, list.tensors);
-    gsf_destroy_text(ctx, &text);
-    return result;
-}
-
-static gsf_result model_make_features(gsf_context* ctx, const model_options* o, const char* folder,
-                                      model_report* report) {
-    model_list list = model_begin_list(ctx, MODEL_FEATURES);
-    model_list_features(&list, o->size);
-    const gsf_result result = model_write_list(ctx, o, folder, "features.safetensors", &list, 1, report);
-    gsf_free(ctx, list.tensors);
-    return result;
-}
-
-static gsf_result model_make_scheduler(gsf_context* ctx, const model_options* o, const char* folder,
-                                       model_report* report) {
-    (void)o;
-    (void)report;
-    GSF__TRY(model_make_folder(ctx, folder));
-    return model_write_text(ctx, folder, "scheduler_config.json", model_scheduler, sizeof model_scheduler - 1);
-}
-
-enum { MODEL_PARTS = 4 };
-static const struct model_part {
-    const char *name, *folder;
-    unsigned bit;
-    gsf_result (*make_fn)(gsf_context* ctx, const model_options* o, const char* folder, model_report* report);
-} model_parts[MODEL_PARTS] = {
-    {"transformer", "/transformer", MODEL_TRANSFORMER, model_make_transformer},
-    {"vae", "/vae", MODEL_VAE, model_make_vae},
-    {"scheduler", "/scheduler", MODEL_SCHEDULER, model_make_scheduler},
-    {"features", "", MODEL_FEATURES, model_make_features},
-};
 
 // reports: MODEL_PARTS of them; a part that was not asked for has no name.
 static gsf_result model_make(gsf_context* ctx, const model_options* o, model_report* reports) {
@@ -648,20 +1149,19 @@ static gsf_result model_make(gsf_context* ctx, const model_options* o, model_rep
         gsf_text folder;
         memset(&folder, 0, sizeof folder);
         gsf_text_printf(ctx, &folder, "%s%s", o->out, model_parts[i].folder);
-        reports[i].part = model_parts[i].name;
-        const gsf_result result =
-            folder.failed ? GSF_ERROR_OUT_OF_MEMORY : model_parts[i].make_fn(ctx, o, folder.data, &reports[i]);
+        const gsf_result result = folder.failed ? GSF_ERROR_OUT_OF_MEMORY
+                                                : model_make_part(ctx, o, &model_parts[i], folder.data, &reports[i]);
         gsf_destroy_text(ctx, &folder);
         if (result != GSF_OK) return result;
     }
-    return model_write_text(ctx, o->out, "model_index.json", model_index, sizeof model_index - 1);
+    return model_write_pipeline(ctx, o->out);
 }
 
 // ---- the program -----------------------------------------------------------------
 
 static const char model_usage[] =
     "usage: make_model OUT [--size tiny|small|full] [--dtype f32|bf16|f16] [--seed S] [--shards N] [--threads N]\n"
-    "                      [--parts transformer,vae,scheduler,features]\n";
+    "                      [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]\n";
 
 static gsf_context* model_context; // for the signal
 static void model_interrupt(int number) {

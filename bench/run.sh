@@ -5,7 +5,7 @@
 #   OPENSPLAT=/path/opensplat and the same steps by OpenSplat in turns with ours, with the ratio (needs SCENE)
 #   ROUNDS=5 STEPS=200        of that comparison
 #   TORCH=python3             and the networks' kernels by this Python's PyTorch, with the ratio
-#   MODEL=FOLDER              and one pass of a whole model (make_model --size full): about an hour and a half
+#   MODEL=FOLDER              and one pass of it: about an hour and a half (make_model --size full --parts transformer,vae)
 # About twenty minutes; --quick is a look at it in two. The machine should do nothing else.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -37,7 +37,10 @@ if [ -n "${TORCH:-}" ]; then
 else
     "$build/bench_nn" --json ${quick[@]+"${quick[@]}"} | tee -a "$rows"
 fi
-for dtype in f32 bf16; do "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" > /dev/null; done
+for dtype in f32 bf16; do
+    "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" \
+        --parts transformer,vae,scheduler,features > /dev/null
+done
 "$build/bench_nn" --json --filter pipeline ${quick[@]+"${quick[@]}"} --pipeline "$temporary/f32" --pipeline "$temporary/bf16" |
     tee -a "$rows"
 [ -z "${MODEL:-}" ] || "$build/bench_nn" --json --filter model --threads 2 --model "$MODEL" | tee -a "$rows"

@@ -1,5 +1,5 @@
 // bench/make_model.c, which makes restorer models of random weights: the same bytes however they are made, the official
-// models' lists of tensors, and values that run.
+// models' lists of tensors, values that run, and vocabularies that spell what they should.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
@@ -8,6 +8,10 @@
 #undef main
 
 #include "test.h"
+
+#define SINGLE "/diffusion_pytorch_model.safetensors" // of the diffusion model's parts; the encoders'
+#define INDEX SINGLE ".index.json"
+#define ENCODER "/model.safetensors"
 
 typedef struct folder { char path[1000]; } folder;
 
@@ -62,8 +66,8 @@ static int exists(const folder* f, const char* name) {
 static double same_values(gsf_context* ctx, const folder* a, const folder* b, const char* name, int narrow) {
     gsf_nn_weights x, y;
     double same = 0.0, count = 0.0;
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(a, name), MODEL_STEM, &x))) return -1.0;
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(b, name), MODEL_STEM, &y))) return -1.0;
+    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(a, name), NULL, &x))) return -1.0;
+    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(b, name), NULL, &y))) return -1.0;
     int ok = x.tensor_count == y.tensor_count && x.tensor_count > 0;
     for (size_t i = 0; ok && i < x.tensor_count; i++) {
         const gsf_tensor *s = &x.tensors[i], *t = &y.tensors[i];
@@ -84,10 +88,23 @@ static double same_values(gsf_context* ctx, const folder* a, const folder* b, co
 
 // ---- the same bytes ----------------------------------------------------------------
 
+// Every file that the table of parts promises, and its weights in one file.
+static void check_same_parts(const folder* a, const folder* b) {
+    for (size_t i = 0; i < MODEL_PARTS; i++) {
+        const model_part* part = &model_parts[i];
+        char name[200];
+        for (size_t k = 0; k < GSF__COUNT(part->files) && part->files[k].name; k++) {
+            snprintf(name, sizeof name, "%s/%s", part->folder, part->files[k].name);
+            if (!CHECK(same_file(a, b, name))) fprintf(stderr, "    %s\n", name);
+        }
+        snprintf(name, sizeof name, "%s/%s.safetensors", part->folder, part->stem ? part->stem : "");
+        if (part->stem && !CHECK(same_file(a, b, name))) fprintf(stderr, "    %s\n", name);
+    }
+    CHECK(same_file(a, b, "model_index.json"));
+}
+
 static void check_same(gsf_context* ctx) {
-    static const char* const files[] = {"transformer/config.json", "transformer/" MODEL_SINGLE, "vae/config.json",
-                                        "vae/" MODEL_SINGLE, "scheduler/scheduler_config.json", "model_index.json",
-                                        "features.safetensors"};
+    static const char* const sharded_parts[] = {"transformer", "text_encoder", "blip2"};
     const folder first = scratch("first"), again = scratch("again"), other = scratch("other"), sharded = scratch("sharded");
     const folder wide = scratch("wide");
     model_report reports[MODEL_PARTS];
@@ -101,28 +118,33 @@ static void check_same(gsf_context* ctx) {
     CHECK_OK(&three, gsf_init_context(&three));
     o.out = again.path;
     o.shards = 3; // and then one: the index must go
+    o.parts = MODEL_TRANSFORMER | MODEL_TEXT | MODEL_BLIP2;
     CHECK_OK(&three, model_make(&three, &o, reports));
-    CHECK(exists(&again, "transformer/" MODEL_INDEX));
+    CHECK(exists(&again, "transformer" INDEX) && exists(&again, "blip2" ENCODER ".index.json"));
     o.shards = 1;
+    o.parts = MODEL_ALL;
     CHECK_OK(&three, model_make(&three, &o, reports));
-    CHECK(!exists(&again, "transformer/" MODEL_INDEX));
-    for (size_t i = 0; i < GSF__COUNT(files); i++) CHECK(same_file(&first, &again, files[i]));
-    CHECK(!exists(&first, "transformer/" MODEL_SINGLE ".tmp"));
+    CHECK(!exists(&again, "transformer" INDEX) && !exists(&again, "blip2" ENCODER ".index.json"));
+    check_same_parts(&first, &again);
+    CHECK(!exists(&first, "transformer" SINGLE ".tmp"));
 
     o.out = sharded.path;
     o.shards = 3;
+    o.parts = MODEL_TRANSFORMER | MODEL_VAE | MODEL_TEXT | MODEL_BLIP2;
     CHECK_OK(ctx, model_make(ctx, &o, reports));
-    CHECK(!exists(&sharded, "transformer/" MODEL_SINGLE));
+    CHECK(!exists(&sharded, "transformer" SINGLE) && !exists(&sharded, "text_encoder" ENCODER));
     CHECK(exists(&sharded, "transformer/diffusion_pytorch_model-00003-of-00003.safetensors"));
-    CHECK(same_values(ctx, &first, &sharded, "transformer", 0) == 1.0);
-    CHECK(same_file(&first, &sharded, "vae/" MODEL_SINGLE));
+    for (size_t i = 0; i < GSF__COUNT(sharded_parts); i++)
+        CHECK(same_values(ctx, &first, &sharded, sharded_parts[i], 0) == 1.0);
+    CHECK(same_file(&first, &sharded, "vae" SINGLE));
 
     o.out = wide.path;
     o.shards = 1;
     o.dtype = GSF_NN_F32;
     o.parts = MODEL_VAE; // by itself
     CHECK_OK(ctx, model_make(ctx, &o, reports));
-    CHECK(!exists(&wide, "features.safetensors"));
+    CHECK(!exists(&wide, "features.safetensors") && !exists(&wide, "text_encoder/config.json"));
+    CHECK(!same_file(&first, &wide, "model_index.json")); // has no text encoder
     CHECK(same_values(ctx, &wide, &first, "vae", 1) == 1.0);
 
     o.out = other.path;
@@ -142,40 +164,19 @@ static double list_values(const model_list* list) {
 
 // Counted with the official classes.
 static void check_full(gsf_context* ctx) {
+    static const struct { size_t tensors; double values; } known[MODEL_PARTS] = {
+        {1621, 7166167104.0 + 54607872.0}, {436, 215583907.0}, {0, 0.0}, {0, 0.0}, {440, 304372736.0}, {1210, 909112320.0},
+        {219, 4762310656.0}, {0, 0.0}, {1247, 3744761856.0}};
     const folder none = scratch("none");
     const model_options o = options(&none, "full");
-    gsf__nn_config config;
-    gsf_text text;
-    gsf_nn_transformer net;
-    gsf_nn_vae vae;
-    model_list list = model_begin_list(ctx, MODEL_TRANSFORMER);
-    memset(&text, 0, sizeof text);
-    memset(&net, 0, sizeof net);
-    memset(&vae, 0, sizeof vae);
-    model_print_transformer(ctx, o.size, &text);
-    CHECK_OK(ctx, gsf__nn_parse_config(ctx, "config.json", text.data, text.size, &config));
-    CHECK_OK(ctx, gsf__dit_read_config(&config, &net));
-    gsf__nn_close_config(&config);
-    net.dino_channels = MODEL_DINO_CHANNELS;
-    net.vggt_channels = MODEL_VGGT_CHANNELS;
-    model_list_transformer(&list, &net);
-    CHECK_OK(ctx, list.result);
-    CHECK(list.count == 1621);
-    CHECK_NEAR(list_values(&list), 7166167104.0 + 54607872.0, 0.0);
-    gsf_free(ctx, list.tensors);
-
-    list = model_begin_list(ctx, MODEL_VAE);
-    text.size = 0;
-    model_print_vae(ctx, o.size, &text);
-    CHECK_OK(ctx, gsf__nn_parse_config(ctx, "config.json", text.data, text.size, &config));
-    CHECK_OK(ctx, gsf__vae_take_config(&config, &vae));
-    gsf__nn_close_config(&config);
-    model_list_vae(&list, &vae);
-    CHECK_OK(ctx, list.result);
-    CHECK(list.count == 436);
-    CHECK_NEAR(list_values(&list), 215583907.0, 0.0);
-    gsf_free(ctx, list.tensors);
-    gsf_destroy_text(ctx, &text);
+    for (size_t i = 0; i < MODEL_PARTS; i++) {
+        model_list list;
+        if (!known[i].tensors) continue;
+        CHECK_OK(ctx, model_list_part(ctx, &model_parts[i], o.size, &list));
+        if (!CHECK(list.count == known[i].tensors && list_values(&list) == known[i].values))
+            fprintf(stderr, "    %s: %zu tensors, %.0f values\n", model_parts[i].folder, list.count, list_values(&list));
+        gsf_free(ctx, list.tensors);
+    }
 }
 
 static void check_list(model_list* list, const gsf_nn_weights* weights) {
@@ -190,23 +191,25 @@ static void check_list(model_list* list, const gsf_nn_weights* weights) {
 }
 
 // Names and shapes of the models that the official code wrote.
+#define CHECK_GOLDEN(net, path, add, source)                               \
+    do {                                                                   \
+        gsf_nn_##net net;                                                  \
+        model_list list = model_begin_list(ctx, MODEL_ALL);                \
+        if (CHECK_OK(ctx, gsf_nn_make_##net(ctx, test_golden(path), &net))) { \
+            add(&list, source);                                            \
+            check_list(&list, &net.weights);                               \
+            gsf_nn_destroy_##net(ctx, &net);                               \
+        }                                                                  \
+        gsf_free(ctx, list.tensors);                                       \
+    } while (0)
+
 static void check_golden(gsf_context* ctx) {
-    gsf_nn_transformer net;
-    gsf_nn_vae vae;
-    model_list list = model_begin_list(ctx, MODEL_TRANSFORMER);
-    if (CHECK_OK(ctx, gsf_nn_make_transformer(ctx, test_golden("restorer/model/transformer"), &net))) {
-        model_list_transformer(&list, &net);
-        check_list(&list, &net.weights);
-        gsf_nn_destroy_transformer(ctx, &net);
-    }
-    gsf_free(ctx, list.tensors);
-    list = model_begin_list(ctx, MODEL_VAE);
-    if (CHECK_OK(ctx, gsf_nn_make_vae(ctx, test_golden("restorer/model/vae"), &vae))) {
-        model_list_vae(&list, &vae);
-        check_list(&list, &vae.weights);
-        gsf_nn_destroy_vae(ctx, &vae);
-    }
-    gsf_free(ctx, list.tensors);
+    CHECK_GOLDEN(transformer, "restorer/model/transformer", model_add_transformer, &transformer);
+    CHECK_GOLDEN(vae, "restorer/model/vae", model_add_vae, &vae);
+    CHECK_GOLDEN(t5, "restorer/model/text_encoder", model_add_t5, &t5);
+    CHECK_GOLDEN(dinov2, "encoders/dinov2_reg", model_add_dinov2, (const gsf__vit*)dinov2.nets);
+    CHECK_GOLDEN(vggt, "encoders/vggt", model_add_vggt, (const gsf__vggt*)vggt.nets);
+    CHECK_GOLDEN(captioner, "encoders/blip2", model_add_blip2, (const gsf__blip*)captioner.nets);
 }
 
 // ---- values that run -----------------------------------------------------------------
@@ -313,6 +316,104 @@ static void check_vae(gsf_context* ctx, const folder* model) {
     gsf_nn_destroy_vae(ctx, &vae);
 }
 
+// Not constant: rows of what an encoder gives differ from each other.
+static void check_rows(const char* what, const float* x, int64_t rows, int64_t columns) {
+    double change = 0.0;
+    check_rms(what, x, (size_t)(rows * columns), 0.5, 3.0);
+    for (int64_t i = columns; i < rows * columns; i++) change += fabs((double)x[i] - (double)x[i - columns]);
+    CHECK(change / (double)((rows - 1) * columns) > 0.1);
+}
+
+static void check_images(gsf_context* ctx, const folder* model) {
+    enum { IMAGES = 2, TOKENS = 6, SIDE = 28, LONG_SIDE = 42, PIXELS = IMAGES * 3 * SIDE * LONG_SIDE };
+    gsf_nn_dinov2 dinov2;
+    gsf_nn_vggt vggt;
+    gsf_nn_encoder_input in;
+    float* pixels = (float*)malloc(PIXELS * sizeof(float));
+    for (size_t i = 0; i < PIXELS; i++) pixels[i] = (float)gsf_random_uniform(9, 0, i);
+    memset(&in, 0, sizeof in);
+    in.pixels = pixels;
+    in.images = IMAGES;
+    in.height = SIDE;
+    in.width = LONG_SIDE;
+    if (CHECK_OK(ctx, gsf_nn_make_dinov2(ctx, inside(model, "dinov2"), &dinov2))) {
+        float* out = (float*)malloc((size_t)(IMAGES * TOKENS * dinov2.width) * sizeof(float));
+        CHECK(dinov2.width == 1024 && dinov2.layers == 1);
+        CHECK_OK(ctx, gsf_nn_dinov2_encode(ctx, &dinov2, &in, out));
+        check_rows("dinov2", out, IMAGES * TOKENS, dinov2.width);
+        gsf_nn_destroy_dinov2(ctx, &dinov2);
+        free(out);
+    }
+    if (CHECK_OK(ctx, gsf_nn_make_vggt(ctx, inside(model, "vggt"), &vggt))) {
+        float* out = (float*)malloc((size_t)(IMAGES * TOKENS * 2 * vggt.width) * sizeof(float));
+        CHECK(vggt.width == 1024 && vggt.layers == 1);
+        CHECK_OK(ctx, gsf_nn_vggt_encode(ctx, &vggt, &in, out));
+        check_rows("vggt", out, IMAGES * TOKENS, 2 * vggt.width);
+        gsf_nn_destroy_vggt(ctx, &vggt);
+        free(out);
+    }
+    free(pixels);
+}
+
+// A word of the list is one piece, other text goes by characters, and all of ASCII is known.
+static void check_text(gsf_context* ctx, const folder* model) {
+    static const char sentence[] = "A red house by the river: 12% \"x\" <extra_id_0>";
+    static const char* const pieces[] = {"", "A", " red", " house", " by", " the", " river", ":"};
+    gsf_nn_tokenizer tokenizer;
+    gsf_nn_t5 t5;
+    gsf_nn_t5_input in;
+    int32_t ids[26];
+    size_t count = 0;
+    if (!CHECK_OK(ctx, gsf_nn_make_tokenizer(ctx, inside(model, "tokenizer"), &tokenizer))) return;
+    CHECK(tokenizer.piece_count == MODEL_PIECES && tokenizer.id_count == MODEL_PIECES + 100);
+    CHECK_OK(ctx, gsf_nn_tokenize(ctx, &tokenizer, sentence, strlen(sentence), ids, GSF__COUNT(ids), &count));
+    CHECK(count == GSF__COUNT(pieces) + 10 && ids[count - 1] == 1 && ids[count - 2] == tokenizer.id_count - 1);
+    CHECK(ids[0] == 3 && ids[1] == MODEL_PIECES - '~' - 1 + 'A'); // a space, and characters
+    for (size_t i = 2; i < 7; i++) {
+        size_t word = 0;
+        while (word < GSF__COUNT(model_words) && strcmp(model_words[word], pieces[i] + 1) != 0) word++;
+        CHECK(ids[i] == 4 + (int32_t)word);
+    }
+    for (size_t i = 0; i < count; i++) CHECK(ids[i] != tokenizer.unknown_id);
+    memset(&in, 0, sizeof in);
+    in.ids = ids;
+    in.batch = 1;
+    in.tokens = (int32_t)count;
+    if (CHECK_OK(ctx, gsf_nn_make_t5(ctx, inside(model, "text_encoder"), &t5))) {
+        float* out = (float*)malloc(count * (size_t)t5.width * sizeof(float));
+        CHECK(tokenizer.id_count <= t5.vocabulary);
+        CHECK_OK(ctx, gsf_nn_t5_encode(ctx, &t5, &in, out));
+        check_rows("text", out, (int64_t)count, t5.width);
+        gsf_nn_destroy_t5(ctx, &t5);
+        free(out);
+    }
+    gsf_nn_destroy_tokenizer(ctx, &tokenizer);
+}
+
+static void check_captions(gsf_context* ctx, const folder* model) {
+    static const char sentence[] = "a red house";
+    gsf_nn_captioner captioner;
+    int32_t* ids = NULL;
+    size_t count = 0;
+    char captions[2][400];
+    if (!CHECK_OK(ctx, gsf_nn_make_captioner(ctx, inside(model, "blip2"), &captioner))) return;
+    CHECK(captioner.image_token == captioner.vocabulary - 1 && captioner.tokenizer.highest_id == captioner.image_token);
+    CHECK_OK(ctx, gsf_nn_encode_bpe(ctx, &captioner.tokenizer, sentence, strlen(sentence), 1, &ids, &count));
+    CHECK(count == 3 && ids[0] == MODEL_BYTE_0 + 'a' && ids[1] > MODEL_WORD_0); // "a", " red", " house"
+    gsf_free(ctx, ids);
+    for (int i = 0; i < 2; i++) {
+        const char* path = test_golden(i ? "encoders/blip2/image1.png" : "encoders/blip2/image0.png");
+        gsf_image image;
+        captions[i][0] = 0;
+        if (!CHECK_OK(ctx, gsf_load_image(ctx, path, 3, &image))) continue;
+        CHECK_OK(ctx, gsf_nn_caption(ctx, &captioner, &image, NULL, 0, captions[i], sizeof captions[i]));
+        if (getenv("GSF_TEST_VERBOSE")) printf("caption: %s\n", captions[i]);
+        gsf_destroy_image(ctx, &image);
+    }
+    CHECK(strlen(captions[0]) > 20 && strcmp(captions[0], captions[1]) != 0);
+    gsf_nn_destroy_captioner(ctx, &captioner);
+}
+
 static void check_runs(gsf_context* ctx) {
     const folder model = scratch("first");
     gsf_nn_dit_desc desc;
@@ -320,12 +421,15 @@ static void check_runs(gsf_context* ctx) {
     char path[2][1100];
     check_transformer(ctx, &model);
     check_vae(ctx, &model);
+    check_images(ctx, &model);
+    check_text(ctx, &model);
+    check_captions(ctx, &model);
     memset(&desc, 0, sizeof desc);
     snprintf(path[0], sizeof path[0], "%s", model.path);
     snprintf(path[1], sizeof path[1], "%s", inside(&model, "features.safetensors"));
     desc.model = path[0];
-    desc.features = path[1];
-    if (CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &restorer))) gsf_nn_destroy_dit(ctx, &restorer);
+    for (int i = 0; i < 2; i++, desc.features = path[1]) // with the encoders; with their features
+        if (CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &restorer))) gsf_nn_destroy_dit(ctx, &restorer);
 }
 
 // ---- errors ----------------------------------------------------------------------------
@@ -354,12 +458,12 @@ static void check_errors(gsf_context* ctx) {
     CHECK_RESULT(ctx, model_make(ctx, &o, reports), GSF_ERROR_INVALID_ARGUMENT);
     o.shards = 1;
     char left[1200]; // by an earlier run of this test
-    snprintf(left, sizeof left, "%s/transformer/%s", program.path, MODEL_SINGLE);
+    snprintf(left, sizeof left, "%s/transformer" SINGLE, program.path);
     remove(left);
     gsf_request_cancel(ctx);
     CHECK_RESULT(ctx, model_make(ctx, &o, reports), GSF_ERROR_CANCELLED);
     gsf_clear_cancel(ctx);
-    CHECK(!exists(&program, "transformer/" MODEL_SINGLE) && !exists(&program, "transformer/" MODEL_SINGLE ".tmp"));
+    CHECK(!exists(&program, "transformer" SINGLE) && !exists(&program, "transformer" SINGLE ".tmp"));
 
     CHECK(run(NULL, NULL, NULL) == 2);
     CHECK(run(program.path, "--size", "huge") == 2);
@@ -368,7 +472,7 @@ static void check_errors(gsf_context* ctx) {
     CHECK(run(program.path, "--shards", "0") == 2);
     CHECK(run(program.path, "--dtype", NULL) == 2);
     CHECK(run(file.path, "--size", "tiny") == 1);
-    CHECK(run(program.path, "--size", "tiny") == 0);
+    CHECK(run(program.path, "--parts", "text,features") == 0);
 }
 
 int main(void) {
