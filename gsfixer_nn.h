@@ -11461,7 +11461,8 @@ static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* ca
 // tokens in all: the text counts twice.
 static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t wanted) {
     if (wanted > 0) return wanted;
-    return captioner->image_token >= 0 ? GSF__CAPTION_TOKENS : GSF__CAPTION_TOKENS - 1 - 2 * text_tokens;
+    const int64_t most = GSF__CAPTION_TOKENS;
+    return captioner->image_token >= 0 ? most : most - 1 - 2 * text_tokens;
 }
 
 static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
