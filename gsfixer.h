@@ -410,6 +410,7 @@ typedef struct gsf_restorer {
     void* user;
     gsf_result (*query_fn)(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                            gsf_restorer_limits* out);
+    // References are borrowed for the call: what later windows need of them is copied.
     gsf_result (*begin_fn)(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count);
     gsf_result (*restore_fn)(void* user, gsf_context* ctx, const gsf_restore_window* window);
     void (*end_fn)(void* user, gsf_context* ctx); // releases what begin took; called once per successful begin

@@ -37,8 +37,8 @@
                never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
-               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece (Kudo
-               and Richardson 2018), T5 (Raffel et al. 2020).
+               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
+               (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
                >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn bpe >>nn captioner >>nn restorer
@@ -448,8 +448,8 @@ GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, i
 
 // ---- text: tokenizer ------------------------------------------------------------------
 // SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
-// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two spellings
-// of equal score.
+// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two
+// spellings of equal score.
 
 typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
     int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
@@ -736,8 +736,8 @@ typedef struct gsf_nn_dit_desc {
 // nearest to its first and its last camera; without cameras, all photos. What `features` lacks is encoded before a clip is
 // restored, where photos or caption differ from the last clip's: captioner, text encoder, DINOv2 and VGGT are opened one
 // after another, run and closed. A folder that will be needed and is absent is named now, with what does without it.
-// Progress: "clip" (0 of 1: it begins), then behind each unit of its work "caption", "text", "dinov2", "vggt", "vae encode",
-// "transformer", "restore" (steps), "vae decode".
+// Progress: "clip" (0 of 1: it begins), then behind each unit of its work "caption", "text", "dinov2", "vggt",
+// "vae encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -2191,7 +2191,8 @@ static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
     return gsf__round_up(gsf__ceil_div(total, gsf__ceil_div(total, most)), unit);
 }
 
-static int64_t gsf__few_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__FEW_ROWS; } // that there are kernels for
+// That there are kernels for.
+static int64_t gsf__few_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__FEW_ROWS; }
 
 static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f32, bf16 or f16 at any address
     float value;
@@ -7779,7 +7780,8 @@ static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32
     best->id = id;
 }
 
-// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of digits.
+// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of
+// digits.
 static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
     const float base = run->best[at].score;
     for (size_t i = at; i <= reached; i++)
@@ -11608,7 +11610,7 @@ typedef struct gsf__dit_restorer {
     gsf_text caption;          // that `text` was made of
     int64_t reference_tokens;
     double encoder_bytes, encoder_flops; // at the configured size: at the peak; of all
-    const gsf_reference* photos; // between begin and end
+    gsf_reference* photos;     // colours and cameras, between begin and end
     int32_t photo_count;
 } gsf__dit_restorer;
 
@@ -11642,45 +11644,110 @@ static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_cou
     return GSF_OK;
 }
 
-static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count) {
-    gsf__dit_restorer* r = (gsf__dit_restorer*)user;
-    (void)ctx;
-    r->photos = references;
-    r->photo_count = reference_count;
-    r->pair[0] = r->pair[1] = -1; // tokens of earlier photos
-    return GSF_OK;
-}
-
 static void gsf__dit_end(void* user, gsf_context* ctx) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
-    (void)ctx;
+    for (int32_t i = 0; i < r->photo_count; i++) gsf_destroy_image(ctx, &r->photos[i].color);
+    gsf_free(ctx, r->photos);
     r->photos = NULL;
     r->photo_count = 0;
 }
 
-// A frame that is a reference's view is that photo, as in the paper's benchmark.
-static const gsf_image* gsf__dit_frame(const gsf__dit_restorer* r, const gsf_restore_window* window, int32_t frame) {
-    const gsf_image* image = &window->color[frame];
-    const int32_t photo = window->reference_index ? window->reference_index[frame] : -1;
-    if (photo < 0 || photo >= r->photo_count) return image;
-    const gsf_image* color = &r->photos[photo].color;
-    return color->data && color->width == image->width && color->height == image->height ? color : image;
+static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count) {
+    gsf__dit_restorer* r = (gsf__dit_restorer*)user;
+    gsf_result result = GSF_OK;
+    r->pair[0] = r->pair[1] = -1; // tokens of earlier photos
+    if (reference_count < 1) return GSF_OK;
+    r->photos = (gsf_reference*)gsf_alloc_zeroed(ctx, (size_t)reference_count, sizeof *r->photos);
+    if (!r->photos) return GSF_ERROR_OUT_OF_MEMORY;
+    r->photo_count = reference_count;
+    for (int32_t i = 0; i < reference_count && !result; i++) {
+        const gsf_image* color = &references[i].color;
+        r->photos[i].camera = references[i].camera;
+        if (!color->data) continue;
+        result = gsf_make_image(ctx, GSF_F32, color->width, color->height, 3, &r->photos[i].color);
+        if (!result) result = gsf_convert_image(ctx, color, &r->photos[i].color);
+    }
+    if (result) gsf__dit_end(user, ctx);
+    return result;
 }
 
-// Frames to (3, frames, height, width) in [-1,1]; a NaN is black.
-static void gsf__dit_fill_control(const gsf__dit_restorer* r, const gsf_restore_window* window, float* control) {
-    const int64_t width = window->color[0].width, height = window->color[0].height, plane = width * height;
+// The photo whose view a frame is, or NULL.
+static const gsf_reference* gsf__dit_photo(const gsf__dit_restorer* r, const gsf_restore_window* window, int32_t frame) {
+    const int32_t photo = window->reference_index ? window->reference_index[frame] : -1;
+    return photo >= 0 && photo < r->photo_count && r->photos[photo].color.data ? &r->photos[photo] : NULL;
+}
+
+typedef struct gsf__dit_control { // one frame of the video that is to be restored
+    const gsf_image* image;
+    const gsf_image* photo;      // what stands before the image where it reaches, or NULL
+    double at[2], step[2];       // photo's pixel of the frame's first one, and from one to the next
+    float* out;                  // (3, frames, height, width), at this frame
+    int64_t plane;               // from channel to channel
+} gsf__dit_control;
+
+static float gsf__dit_channel(const gsf_image* image, int64_t x, int64_t y, int64_t c) {
+    float v;
+    memcpy(&v, (const char*)image->data + y * image->stride_y + x * image->stride_x + c * image->stride_c, sizeof v);
+    return v;
+}
+
+static int64_t gsf__dit_clamp(double v, int64_t count) { return v <= 0.0 ? 0 : gsf__least((int64_t)v, count - 1); }
+
+// Bilinear, as the official code resizes photos to the model's size; 0 outside the photo.
+static int gsf__dit_sample(const gsf__dit_control* control, int64_t x, int64_t y, float out[3]) {
+    const gsf_image* p = control->photo;
+    const double u = control->at[0] + control->step[0] * (double)x, v = control->at[1] + control->step[1] * (double)y;
+    if (!(u >= -0.5 && v >= -0.5 && u <= (double)p->width - 0.5 && v <= (double)p->height - 0.5)) return 0;
+    const int64_t x0 = gsf__dit_clamp(floor(u), p->width), x1 = gsf__dit_clamp(floor(u) + 1.0, p->width);
+    const int64_t y0 = gsf__dit_clamp(floor(v), p->height), y1 = gsf__dit_clamp(floor(v) + 1.0, p->height);
+    const float s = (float)(u - floor(u)), t = (float)(v - floor(v));
+    for (int c = 0; c < 3; c++) {
+        const float upper = gsf__dit_channel(p, x0, y0, c) * (1.0f - s) + gsf__dit_channel(p, x1, y0, c) * s;
+        const float lower = gsf__dit_channel(p, x0, y1, c) * (1.0f - s) + gsf__dit_channel(p, x1, y1, c) * s;
+        out[c] = upper * (1.0f - t) + lower * t;
+    }
+    return 1;
+}
+
+static void gsf__dit_control_row(void* arg, size_t row, int worker) { // to [-1,1]; a NaN is black
+    const gsf__dit_control* control = (const gsf__dit_control*)arg;
+    const gsf_image* image = control->image;
+    const int64_t y = (int64_t)row;
+    (void)worker;
+    for (int64_t x = 0; x < image->width; x++) {
+        float rgb[3];
+        if (!control->photo || !gsf__dit_sample(control, x, y, rgb))
+            for (int c = 0; c < 3; c++) rgb[c] = gsf__dit_channel(image, x, y, c);
+        for (int c = 0; c < 3; c++)
+            control->out[c * control->plane + y * image->width + x] =
+                rgb[c] >= 1.0f ? 1.0f : rgb[c] > 0.0f ? 2.0f * rgb[c] - 1.0f : -1.0f;
+    }
+}
+
+// The frames as (3, frames, height, width). A frame that is a reference's view is that photo, as in the paper's benchmark:
+// through the frame's camera, which may be scaled and cropped; without cameras, a photo of the frames' size.
+static void gsf__dit_fill_control(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
+                                  float* out) {
     for (int32_t f = 0; f < window->frame_count; f++) {
-        const gsf_image* image = gsf__dit_frame(r, window, f);
-        for (int64_t y = 0; y < height; y++)
-            for (int64_t x = 0; x < width; x++)
-                for (int64_t c = 0; c < 3; c++) {
-                    float v;
-                    memcpy(&v, (const char*)image->data + y * image->stride_y + x * image->stride_x + c * image->stride_c,
-                           sizeof v);
-                    control[(c * window->frame_count + f) * plane + y * width + x] =
-                        v >= 1.0f ? 1.0f : v > 0.0f ? 2.0f * v - 1.0f : -1.0f;
-                }
+        gsf__dit_control control;
+        const gsf_reference* photo = gsf__dit_photo(r, window, f);
+        memset(&control, 0, sizeof control);
+        control.image = &window->color[f];
+        const int64_t area = control.image->width * control.image->height;
+        control.plane = window->frame_count * area;
+        control.out = out + f * area;
+        control.step[0] = control.step[1] = 1.0;
+        if (photo && window->cameras && photo->camera.fx > 0.0) {
+            const gsf_camera *from = &photo->camera, *to = &window->cameras[f];
+            control.photo = &photo->color;
+            control.step[0] = from->fx / to->fx;
+            control.step[1] = from->fy / to->fy;
+            control.at[0] = (0.5 - to->cx) * control.step[0] + from->cx - 0.5;
+            control.at[1] = (0.5 - to->cy) * control.step[1] + from->cy - 0.5;
+        } else if (photo && photo->color.width == control.image->width && photo->color.height == control.image->height) {
+            control.photo = &photo->color;
+        }
+        gsf__parallel_for(ctx, (size_t)control.image->height, gsf__dit_control_row, &control);
     }
 }
 
@@ -11956,7 +12023,8 @@ static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const g
 static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
     char described[GSF__DIT_CAPTION_BYTES];
     const char* caption = r->desc.caption ? r->desc.caption : window->caption;
-    const gsf__dit_part part = {ctx, r, gsf__dit_frame(r, window, 0), 1};
+    const gsf_reference* photo = gsf__dit_photo(r, window, 0);
+    const gsf__dit_part part = {ctx, r, photo ? &photo->color : &window->color[0], 1};
     if (r->has_text) return GSF_OK;
     if (!caption) {
         GSF__TRY(gsf__dit_describe(&part, described));
@@ -11989,7 +12057,7 @@ static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_resto
     const size_t values = (size_t)3 * (size_t)d.frames * (size_t)d.width * (size_t)d.height;
     float* video = (float*)gsf_alloc(ctx, values, 2 * sizeof(float));
     if (!video) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__dit_fill_control(r, window, video);
+    gsf__dit_fill_control(ctx, r, window, video);
     d.control = video;
     const gsf_result result = gsf_nn_sample(ctx, &r->transformer, &r->vae, &r->schedule, &d, video + values, NULL);
     if (!result) gsf__dit_store_frames(window, video + values);
@@ -12076,6 +12144,7 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)restorer->user;
     memset(restorer, 0, sizeof *restorer);
     if (!r) return;
+    gsf__dit_end(r, ctx);
     gsf_nn_destroy_transformer(ctx, &r->transformer);
     gsf_nn_destroy_vae(ctx, &r->vae);
     gsf_nn_destroy_schedule(ctx, &r->schedule);

@@ -27,16 +27,21 @@ fix "$scratch/one" --threads 1 || fail "the run with one worker failed"
 cmp "$scratch/whole/splats.ply" "$scratch/one/splats.ply" || fail "one and two workers differ"
 
 kills=0
-while [ "$kills" -lt 3 ]; do # as soon as a clip is at work
-    rm -f "$scratch/killed/dit.checkpoint"
-    "$gsfix" fix "$scene" --out "$scratch/killed" "${options[@]}" --resume > "$log" 2>&1 &
-    pid=$!
-    while kill -0 "$pid" 2> /dev/null && [ ! -e "$scratch/killed/dit.checkpoint" ]; do sleep 0.01; done
-    kill -9 "$pid" 2> /dev/null || true
-    wait "$pid" 2> /dev/null && break # it was done before
-    kills=$((kills + 1))
-done
-fix "$scratch/killed" --resume || fail "the last run failed after $kills kills"
+kill_clips() { # OUT TIMES OPTION...: kill -9 as soon as a clip is at work, then a last run to the end
+    local out=$1 left=$2 pid
+    shift 2
+    while [ "$left" -gt 0 ]; do
+        rm -f "$out/dit.checkpoint"
+        "$gsfix" fix "$scene" --out "$out" "${options[@]}" "$@" --resume > "$log" 2>&1 &
+        pid=$!
+        while kill -0 "$pid" 2> /dev/null && [ ! -e "$out/dit.checkpoint" ]; do sleep 0.01; done
+        kill -9 "$pid" 2> /dev/null || true
+        wait "$pid" 2> /dev/null && break # it was done before
+        kills=$((kills + 1)) left=$((left - 1))
+    done
+    fix "$out" "$@" --resume || fail "the last run failed after $kills kills"
+}
+kill_clips "$scratch/killed" 3
 cmp "$scratch/whole/splats.ply" "$scratch/killed/splats.ply" || fail "differs after $kills kills"
 
 # One clip: the frames that the first window of the scene gave.
@@ -75,4 +80,18 @@ expect 1 "config.json" "$gsfix" restore "$scratch/clip" --out "$scratch/x" "${di
 head -c 1000 "$scratch/model/features.safetensors" > "$scratch/cut.safetensors"
 expect 1 "cut.safetensors" "$gsfix" restore "$scratch/clip" --out "$scratch/x" "${dit[@]}" \
     --ref-features "$scratch/cut.safetensors"
+
+# From photos alone: caption, prompts and reference tokens by the model's own encoders.
+"$make_model" "$scratch/all" --size tiny > "$log" 2>&1 || fail "make_model failed"
+alone=(--restorer "dit:$scratch/all" --set "rounds=1,windows=1,window_frames=9,first_round=20,last_round=40")
+options=(--views 3 --iterations 60 --checkpoint-every 5 --max-size 64 --seed 7 --steps 4)
+fix "$scratch/photos" "${alone[@]}" --save-features "$scratch/saved.safetensors" || fail "the run from photos alone failed"
+for stage in caption text dinov2 vggt "vae encode" transformer "vae decode"; do
+    grep -q "\"name\": *\"$stage\"" "$scratch/photos/metrics.json" || fail "metrics.json does not tell of the stage $stage"
+done
+kill_clips "$scratch/photos_killed" 1 "${alone[@]}"
+cmp "$scratch/photos/splats.ply" "$scratch/photos_killed/splats.ply" || fail "from photos alone: differs after a kill"
+fix "$scratch/saved" "${alone[@]}" --ref-features "$scratch/saved.safetensors" || fail "the saved features do not do"
+cmp "$scratch/photos/splats.ply" "$scratch/saved/splats.ply" || fail "saved features give something else"
+! grep -q '"name": *"caption"' "$scratch/saved/metrics.json" || fail "the captioner ran although prompts were given"
 echo "$kills kills"

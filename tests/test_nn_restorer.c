@@ -149,6 +149,53 @@ static void test_references(gsf_context* ctx, const char* features, clip* c) {
     gsf_nn_destroy_dit(ctx, &r);
 }
 
+// A photo of twice the size, of which the frame's camera sees all but 8 columns, and as many beyond its other side.
+static void test_cropped_reference(gsf_context* ctx, const char* features, clip* c) {
+    const gsf_nn_dit_desc desc = small_desc(features, 1);
+    gsf_restorer r;
+    gsf_reference photo;
+    gsf_camera cameras[MAX_FRAMES];
+    const gsf_image frame = c->color[0];
+    gsf_image seen;
+    memset(&photo, 0, sizeof photo);
+    memset(cameras, 0, sizeof cameras);
+    CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, 2 * c->width, 2 * c->height, 3, &photo.color));
+    CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, c->width, c->height, 3, &seen));
+    float *large = (float*)photo.color.data, *small = (float*)seen.data;
+    for (int64_t y = 0; y < 2 * c->height; y++)
+        for (int64_t x = 0; x < 6 * c->width; x++)
+            large[y * 6 * c->width + x] = ((const float*)c->color[3].data)[y / 2 * 3 * c->width + x / 6 * 3 + x % 3];
+    for (int64_t y = 0; y < c->height; y++)
+        for (int64_t x = 0; x < 3 * c->width; x++) {
+            const float* from = (const float*)(x >= 3 * (c->width - 8) ? frame.data : c->color[3].data);
+            small[y * 3 * c->width + x] = from[y * 3 * c->width + (x >= 3 * (c->width - 8) ? x : x + 24)];
+        }
+    photo.camera.fx = photo.camera.fy = 200.0;
+    photo.camera.cx = c->width;
+    photo.camera.cy = c->height;
+    for (int32_t i = 0; i < c->frames; i++) {
+        cameras[i].fx = cameras[i].fy = 100.0;
+        cameras[i].cx = 0.5 * c->width - 8.0;
+        cameras[i].cy = 0.5 * c->height;
+    }
+    if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
+    c->window.cameras = cameras;
+    c->reference_index[0] = 0;
+    CHECK_OK(ctx, r.begin_fn(r.user, ctx, &photo, 1));
+    gsf_destroy_image(ctx, &photo.color); // only borrowed
+    CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
+    r.end_fn(r.user, ctx);
+    const uint32_t with_photo = checksum(c);
+    c->window.cameras = NULL;
+    c->reference_index[0] = -1;
+    c->color[0] = seen;
+    CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
+    CHECK(checksum(c) == with_photo);
+    c->color[0] = frame;
+    gsf_destroy_image(ctx, &seen);
+    gsf_nn_destroy_dit(ctx, &r);
+}
+
 // Every condition gives something else; leaving the cache of the references' keys out changes no bit.
 static void test_conditions(gsf_context* ctx, const char* features, clip* c) {
     uint32_t sums[4];
@@ -435,6 +482,7 @@ int main(void) {
     make_clip(&ctx, &c, 9, s.desc.width, s.desc.height);
     test_limits(&ctx, features, &c);
     test_references(&ctx, features, &c);
+    test_cropped_reference(&ctx, features, &c);
     test_prompts(&ctx, features, &c);
     test_conditions(&ctx, features, &c);
     test_workers(features, &c);
