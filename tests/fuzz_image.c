@@ -1,8 +1,10 @@
 // Fuzz target for the image decoders behind gsf_load_image_memory.
-//   clang -g -O1 -fsanitize=fuzzer,address,undefined -I. tests/fuzz_image.c -o fuzz_image -lm
+//   clang -g -O1 -fsanitize=fuzzer,address,undefined -DGSFIXER_IMPLEMENTATION -I. tests/fuzz_image.c -o fuzz_image -lm
 //   ./fuzz_image tests/corpus/image
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
+
+#include <stdlib.h>
+#include <string.h>
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {

@@ -1,8 +1,7 @@
 // Dense points by PatchMatch stereo: planes of known depth, a ray-traced scene, and what must not happen.
-// gcc -O2 -std=c11 -fopenmp -I. -Itests -DGSF_USE_EMBREE tests/test_stereo.c -lembree3 -lm
+// gcc -O2 -std=c11 -fopenmp -I. -Itests -DGSF_USE_EMBREE -DGSFIXER_IMPLEMENTATION tests/test_stereo.c -lembree3 -lm
 #define _XOPEN_SOURCE 700 // mkdir
 #define _POSIX_C_SOURCE 200809L
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 
 #include "test.h"
