@@ -5,7 +5,8 @@
 //
 // First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
 // released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
-// together that the first rows show. Errors are against sums in double, for large shapes of some rows. bench/peers_nn.py
+// together that the first rows show; those of layers of few rows, which cycle through 1 GiB of weights, of reading the same
+// memory between their rounds. Errors are against sums in double, for large shapes of some rows. bench/peers_nn.py
 // runs PyTorch on the same cases, which it reads from their names.
 // Seconds are the median; cpu_seconds, the process' CPU time of all threads, is the least of the rounds. Peaks are by CPU
 // time, too: on a machine that does other things as well, cpu_peak_share is the figure to look at.
