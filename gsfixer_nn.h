@@ -9943,9 +9943,14 @@ static gsf_result gsf__bpe_unpack_kinds(gsf_context* ctx, gsf__bpe_tables* t) {
     uint32_t character = 0;
     t->kinds = (unsigned char*)gsf_alloc_zeroed(ctx, GSF__BPE_CHARACTERS / 4, 1);
     if (!t->kinds) return GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < GSF__COUNT(gsf__bpe_kinds); i++)
-        for (uint32_t end = character + gsf__bpe_kinds[i] / 4; character < end; character++)
-            t->kinds[character >> 2] |= (unsigned char)((gsf__bpe_kinds[i] & 3u) << 2 * (character & 3));
+    for (size_t i = 0; i < GSF__COUNT(gsf__bpe_kinds); i++) {
+        const uint32_t kind = gsf__bpe_kinds[i] & 3u, end = character + gsf__bpe_kinds[i] / 4;
+        while (character < end) { // four at a time where they share a byte
+            const int four = character % 4 == 0 && end - character >= 4;
+            t->kinds[character >> 2] |= (unsigned char)(four ? 0x55 * kind : kind << 2 * (character & 3));
+            character += four ? 4 : 1;
+        }
+    }
     return GSF_OK;
 }
 
@@ -11194,10 +11199,9 @@ static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, flo
     in.height = in.width = (int32_t)run->net->image_size;
     const gsf__vit_plan plan = gsf__vit_plan_of(vit, &in);
     gsf_result result = gsf__vit_open_run(ctx, vit, &in, &plan, &run->vit, &memory);
-    float* x = memory + plan.positions;
-    if (!result) result = gsf__vit_forward(&run->vit, vit, &in, 0, 1, 0, memory, x);
+    if (!result) result = gsf__vit_forward(&run->vit, vit, &in, 0, 1, 0, memory, memory + plan.positions);
     if (!result) {
-        gsf_nn_layer_norm(ctx, x, plan.tokens, d, gsf__vit_vector(&run->vit, vit->norm_weight),
+        gsf_nn_layer_norm(ctx, memory + plan.positions, plan.tokens, d, gsf__vit_vector(&run->vit, vit->norm_weight),
                           gsf__vit_vector(&run->vit, vit->norm_bias), vit->sizes.eps, out);
         result = gsf__vit_check(&run->vit, "vision_model.post_layernorm.", out, plan.tokens * d);
     }
@@ -11462,9 +11466,9 @@ static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* ca
 // New tokens at most. The default of a folder without image_token_index is what the official code makes of its limit of 20
 // tokens in all: the text counts twice.
 static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t wanted) {
+    const int64_t usual = GSF__CAPTION_TOKENS;
     if (wanted > 0) return wanted;
-    const int64_t most = GSF__CAPTION_TOKENS;
-    return captioner->image_token >= 0 ? most : most - 1 - 2 * text_tokens;
+    return captioner->image_token >= 0 ? usual : usual - 1 - 2 * text_tokens;
 }
 
 static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
