@@ -247,8 +247,8 @@ static void test_odd_texts(void) {
     gsf_nn_destroy_bpe(&ctx, &bpe);
 }
 
-// Bytes that are no UTF-8, as Python's bytes.decode(errors="replace") has them ('?'), with a vocabulary where a byte's id is
-// the byte.
+// Bytes that are no UTF-8, as Python's bytes.decode(errors="replace") has them ('?'), with a vocabulary where a byte's id
+// is the byte.
 static void test_broken_bytes(void) {
     static const struct { const char *bytes, *text; } cases[] = {
         {"\x80", "?"}, {"\xc3", "?"}, {"a\xe3\x81z", "a?z"}, {"\xe3\xc3\xa9", "?\xc3\xa9"}, {"\xf0\x9f\x98", "?"},
@@ -560,13 +560,13 @@ static void test_memory(const gsf_image* photo) {
 
 // ---- for compare_bpe.py: records of a size (32 bits) and as many bytes ---------------------
 
-static int encode_file(const char* folder, const char* path) {
+static int encode_file(const char* from, const char* path) {
     gsf_context ctx;
     gsf_nn_bpe bpe;
     size_t size, count;
     char* data = test_read_file(path, &size);
     test_context_init(&ctx);
-    if (gsf_nn_make_bpe(&ctx, folder, &bpe) != GSF_OK) {
+    if (gsf_nn_make_bpe(&ctx, from, &bpe) != GSF_OK) {
         fprintf(stderr, "%s\n", ctx.error);
         return 1;
     }
