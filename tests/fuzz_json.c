@@ -76,7 +76,7 @@ static void check_parser(gsf_context* ctx, const char* data, size_t size) {
 
 static void check_schedule(gsf_context* ctx, const char* data, size_t size) {
     gsf_nn_schedule schedule;
-    const gsf_result result = gsf_nn_parse_schedule(ctx, "fuzz", data, size, GSF_NN_TABLE_COGX, &schedule);
+    const gsf_result result = gsf_nn_parse_schedule(ctx, "fuzz", data, size, &schedule);
     if (result == GSF_OK) {
         const gsf_nn_schedule_desc* d = &schedule.desc;
         int32_t steps[3], count;

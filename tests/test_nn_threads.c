@@ -125,7 +125,7 @@ static int open_model(gsf_context* ctx, model* m) {
     return CHECK_OK(ctx, gsf_nn_make_transformer(ctx, test_golden("restorer/model/transformer"), &m->transformer)) &&
            CHECK_OK(ctx, gsf_nn_make_vae(ctx, test_golden("restorer/model/vae"), &m->vae)) &&
            CHECK_OK(ctx, gsf_nn_load_schedule(ctx, test_golden("restorer/model/scheduler/scheduler_config.json"),
-                                              GSF_NN_TABLE_COGX, &m->schedule));
+                                              &m->schedule));
 }
 
 static void close_model(gsf_context* ctx, model* m) {
