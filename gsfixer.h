@@ -1616,6 +1616,9 @@ GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_j
 #pragma GCC diagnostic ignored "-Wshadow"
 #pragma GCC diagnostic ignored "-Wpedantic"
 #pragma GCC diagnostic ignored "-Wmissing-field-initializers"
+#if !defined(__clang__)
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
+#endif
 #endif
 #if defined(__clang__) // stb shifts bits out of signed integers on purpose
 #pragma clang attribute push(__attribute__((no_sanitize("shift"))), apply_to = function)
@@ -2637,7 +2640,7 @@ GSF_API gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_imag
     job.sums = (gsf__metric_sum*)gsf_alloc(ctx, chunks, sizeof *job.sums);
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__parallel_for(ctx, chunks, gsf__psnr_rows, &job);
-    double mse;
+    double mse = 0.0;
     const gsf_result result = gsf__metric_mean(ctx, "psnr", job.sums, chunks, &mse);
     gsf_free(ctx, job.sums);
     if (result == GSF_OK) *out = mse > 0.0 ? -10.0 * log10(mse) : (double)INFINITY;
