@@ -37,8 +37,8 @@
                never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
-               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece (Kudo
-               and Richardson 2018), T5 (Raffel et al. 2020).
+               al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
+               (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
    SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
                >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
                >>nn tokenizer >>nn t5 >>nn sampling >>nn restorer
@@ -452,8 +452,8 @@ GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, i
 
 // ---- text: tokenizer ------------------------------------------------------------------
 // SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
-// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two spellings
-// of equal score.
+// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two
+// spellings of equal score.
 
 typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
     int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
@@ -7530,7 +7530,8 @@ static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32
     best->id = id;
 }
 
-// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of digits.
+// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of
+// digits.
 static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
     const float base = run->best[at].score;
     for (size_t i = at; i <= reached; i++)
