@@ -4,9 +4,9 @@
     tests/compare_tokenizer.py TEST_NN_TEXT [--model FOLDER ...] [--train] [--count N] [--seed S]
 
 TEST_NN_TEXT is the built test program, which is run with --tokenize. FOLDER (default: the golden one) holds spiece.model
-and what else the tokenizer has. --train makes more models with sentencepiece, of other normalisers, flags and kinds of piece,
-from the texts of this checkout, and compares on those, too. Needs pip install sentencepiece transformers==4.51.3; without
-them the exit code is 77. Exits 1 where any id differs.
+and what else the tokenizer has. --train makes more models with sentencepiece, of other normalisers, flags and kinds of
+piece, from the texts of this checkout, and compares on those, too. Needs pip install sentencepiece==0.2.3
+transformers==4.51.3; without them the exit code is 77. Exits 1 where any id differs.
 """
 import argparse
 import pathlib
