@@ -506,8 +506,8 @@ typedef struct gsf_nn_t5_input {
 // reported with the block where it first appears (GSF_ERROR_NUMERIC). Cancelled between layers; progress "text".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input,
                                                   float* out);
-// Bytes of memory at the peak (beside out, the mapped weights and some 50 MB of the kernels' scratch) and floating-point
-// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 8.4e12 operations.
+// Bytes of memory at the peak (beside out, the mapped weights and some 70 MB of the kernels' scratch) and floating-point
+// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 4.2e12 operations.
 GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops);
 // ---- image encoders: what the references show -----------------------------------
 // DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.

@@ -3,10 +3,10 @@
 
     tests/compare_tokenizer.py TEST_NN_TEXT [--model FOLDER ...] [--train] [--count N] [--seed S]
 
-TEST_NN_TEXT is the built test program, which is run with --tokenize. FOLDER (default: the golden one) holds spiece.model and
-what else the tokenizer has. --train makes more models with sentencepiece, of other normalisers, flags and kinds of piece,
-from the texts of this checkout, and compares on those, too. Needs pip install sentencepiece transformers==4.51.3; without
-them the exit code is 77. Exits 1 where any id differs.
+TEST_NN_TEXT is the built test program, which is run with --tokenize. FOLDER (default: the golden one) holds spiece.model
+and what else the tokenizer has. --train makes more models with sentencepiece, of other normalisers, flags and kinds of
+piece, from the texts of this checkout, and compares on those, too. Needs pip install sentencepiece==0.2.3
+transformers==4.51.3; without them the exit code is 77. Exits 1 where any id differs.
 """
 import argparse
 import pathlib
@@ -61,7 +61,8 @@ def text(rng, pieces, longest):
     if kind == 9:
         return rng.choice(pieces)[:3] * size
     if kind == 10:
-        return "".join(rng.choice([" ", "  ", "\t", "\n", "\u3000", "\u200b", "a", "b", ".", "\u2581"]) for _ in range(size))
+        few = [" ", "  ", "\t", "\n", "\u3000", "\u200b", "a", "b", ".", "\u2581"]
+        return "".join(rng.choice(few) for _ in range(size))
     return "".join(rng.choice(SPECIAL + [" ", "\u00a0", "\x1c", "a b", " x"]) for _ in range(size // 5))
 
 
