@@ -25,7 +25,7 @@
        gsf_nn_schedule schedule;
        gsf_nn_make_transformer(&ctx, "MODEL/transformer", &transformer);
        gsf_nn_make_vae(&ctx, "MODEL/vae", &vae);
-       gsf_nn_load_schedule(&ctx, "MODEL/scheduler/scheduler_config.json", GSF_NN_TABLE_DDIM, &schedule);
+       gsf_nn_load_schedule(&ctx, "MODEL/scheduler/scheduler_config.json", &schedule);
        gsf_nn_project_references(&ctx, &transformer, tokens, dino, vggt, references);
        gsf_nn_sample_desc desc;
        memset(&desc, 0, sizeof desc);                     // zero is the default everywhere
@@ -219,11 +219,6 @@ GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out);
 // x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) noise. The model predicts v = sqrt(abar) noise - sqrt(1 - abar) x0, so that
 // x0 = sqrt(abar) x - sqrt(1 - abar) v. Coefficients are double, latents float32.
 
-typedef enum gsf_nn_alpha_table {
-    GSF_NN_TABLE_DDIM = 0, // float32, in the order of diffusers' DDIMScheduler, which the official pipeline runs
-    GSF_NN_TABLE_COGX,     // float64, diffusers' CogVideoXDDIMScheduler; differs by 5e-7
-} gsf_nn_alpha_table;
-
 typedef enum gsf_nn_spacing { GSF_NN_TRAILING = 0, GSF_NN_LEADING, GSF_NN_LINSPACE } gsf_nn_spacing;
 
 typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
@@ -234,8 +229,7 @@ typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
     int no_alpha_one;              // else the last step goes to abar = 1, not to abar of time step 0
     gsf_nn_spacing spacing;
     int32_t steps_offset;          // added to the time steps of GSF_NN_LEADING
-    double snr_shift_scale;        // 0: 1; of GSF_NN_TABLE_COGX only, as DDIMScheduler knows no such thing
-    gsf_nn_alpha_table table;
+    double snr_shift_scale;        // 0: 1; CogVideoX-2B was trained with 3
 } gsf_nn_schedule_desc;
 
 typedef struct gsf_nn_schedule {
@@ -249,9 +243,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gs
 // From a scheduler_config.json; keys that are missing have the defaults of diffusers' DDIMScheduler. The class it names
 // is not looked at, as the official pipeline does not either. What is not v-prediction or clips is unsupported.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
-                                                       gsf_nn_alpha_table table, gsf_nn_schedule* out);
-GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_alpha_table table,
-                                                      gsf_nn_schedule* out);
+                                                       gsf_nn_schedule* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out);
 GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule);
 
 // Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
@@ -4477,54 +4470,16 @@ GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
 
 // ---- >>nn scheduler -------------------------------------------------------------
 
-// torch.linspace in double, which is float32's formula.
-static double gsf__nn_linspace64(double start, double end, int32_t count, int32_t i) {
-    const double step = (end - start) / (count - 1);
-    return i < count / 2 ? start + step * i : end - step * (count - 1 - i);
-}
-
-// Beta as float32, and as float64.
-static float gsf__nn_beta32(const gsf_nn_schedule_desc* d, int32_t i) {
-    if (d->linear_betas) return gsf__nn_linspace((float)d->beta_start, (float)d->beta_end, d->train_steps, i);
-    const float root = gsf__nn_linspace((float)sqrt(d->beta_start), (float)sqrt(d->beta_end), d->train_steps, i);
-    return root * root;
-}
-
-static double gsf__nn_beta64(const gsf_nn_schedule_desc* d, int32_t i) {
-    if (d->linear_betas) return gsf__nn_linspace64(d->beta_start, d->beta_end, d->train_steps, i);
-    const double root = gsf__nn_linspace64(sqrt(d->beta_start), sqrt(d->beta_end), d->train_steps, i);
-    return root * root;
-}
-
-// Every value is rounded to float32 where torch stores a tensor; cumprod alone accumulates in double, as torch does on a
-// CPU. Zero SNR: Lin et al. 2024, algorithm 1: sqrt(abar) is shifted and scaled to end at 0, then turned back into betas.
-// (diffusers 0.32.1 scheduling_ddim.py rescale_zero_terminal_snr and __init__)
-static void gsf__nn_fill_ddim(const gsf_nn_schedule_desc* d, double* alpha_bar) {
+// Zero SNR: sqrt(abar) is shifted and scaled to end at 0 (Lin et al. 2024, algorithm 1). diffusers' DDIMScheduler, which
+// the official pipeline runs, does this in float32 and is up to 5e-7 away; its CogVideoXDDIMScheduler does it in double.
+static void gsf__nn_fill_table(const gsf_nn_schedule_desc* d, double* alpha_bar) {
     const int32_t n = d->train_steps;
+    const double begin = d->linear_betas ? d->beta_start : sqrt(d->beta_start);
+    const double end = d->linear_betas ? d->beta_end : sqrt(d->beta_end);
     double product = 1.0;
     for (int32_t i = 0; i < n; i++) {
-        product *= (double)(1.0f - gsf__nn_beta32(d, i));
-        alpha_bar[i] = (double)(float)product;
-    }
-    if (d->no_zero_snr) return;
-    const float first = sqrtf((float)alpha_bar[0]), last = sqrtf((float)alpha_bar[n - 1]), scale = first / (first - last);
-    float before = 1.0f;
-    product = 1.0;
-    for (int32_t i = 0; i < n; i++) {
-        const float root = (sqrtf((float)alpha_bar[i]) - last) * scale, bar = root * root;
-        const float beta = 1.0f - bar / before;
-        before = bar;
-        product *= (double)(1.0f - beta);
-        alpha_bar[i] = (double)(float)product;
-    }
-}
-
-// (diffusers 0.32.1 scheduling_ddim_cogvideox.py)
-static void gsf__nn_fill_cogx(const gsf_nn_schedule_desc* d, double* alpha_bar) {
-    const int32_t n = d->train_steps;
-    double product = 1.0;
-    for (int32_t i = 0; i < n; i++) {
-        product *= 1.0 - gsf__nn_beta64(d, i);
+        const double value = begin + (end - begin) / (n - 1) * i;
+        product *= 1.0 - (d->linear_betas ? value : value * value);
         alpha_bar[i] = product / (d->snr_shift_scale + (1.0 - d->snr_shift_scale) * product);
     }
     if (d->no_zero_snr) return;
@@ -4553,10 +4508,10 @@ static gsf_result gsf__nn_check_schedule(gsf_context* ctx, const gsf_nn_schedule
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: betas from %g to %g", d->beta_start, d->beta_end);
     if (!(d->snr_shift_scale > 0.0 && d->snr_shift_scale <= 1e6))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: snr_shift_scale %g", d->snr_shift_scale);
-    if ((int)d->spacing < 0 || d->spacing > GSF_NN_LINSPACE || (int)d->table < 0 || d->table > GSF_NN_TABLE_COGX ||
-        d->steps_offset < 0 || d->steps_offset >= d->train_steps)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: spacing %d, table %d, steps_offset %d", (int)d->spacing,
-                        (int)d->table, (int)d->steps_offset);
+    if ((int)d->spacing < 0 || d->spacing > GSF_NN_LINSPACE || d->steps_offset < 0 ||
+        d->steps_offset >= d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: spacing %d, steps_offset %d", (int)d->spacing,
+                        (int)d->steps_offset);
     return GSF_OK;
 }
 
@@ -4566,8 +4521,7 @@ GSF_API gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_
     GSF__TRY(gsf__nn_check_schedule(ctx, &d));
     double* table = (double*)gsf_alloc(ctx, (size_t)d.train_steps, sizeof(double));
     if (!table) return GSF_ERROR_OUT_OF_MEMORY;
-    if (d.table == GSF_NN_TABLE_COGX) gsf__nn_fill_cogx(&d, table);
-    else gsf__nn_fill_ddim(&d, table);
+    gsf__nn_fill_table(&d, table);
     int falls = table[0] < 1.0 && table[d.train_steps - 1] >= 0.0; // a NaN fails
     for (int32_t i = 1; falls && i < d.train_steps; i++) falls = table[i] <= table[i - 1];
     if (!falls) {
@@ -4620,7 +4574,6 @@ static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_sch
     d->steps_offset = (int32_t)whole;
     GSF__TRY(gsf__nn_config_number_or(config, "beta_start", 0.0001, 1e-12, 0.999, &d->beta_start));
     GSF__TRY(gsf__nn_config_number_or(config, "beta_end", 0.02, d->beta_start, 0.999, &d->beta_end));
-    GSF__TRY(gsf__nn_config_number_or(config, "snr_shift_scale", 1.0, 1e-3, 1e6, &d->snr_shift_scale));
     GSF__TRY(gsf__nn_config_word(config, "beta_schedule", "linear", schedules, &d->linear_betas));
     GSF__TRY(gsf__nn_config_bool_or(config, "rescale_betas_zero_snr", 0, &flag));
     d->no_zero_snr = !flag;
@@ -4631,11 +4584,9 @@ static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_sch
     return GSF_OK;
 }
 
-static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_alpha_table table,
-                                        gsf_nn_schedule* out) {
+static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_schedule* out) {
     gsf_nn_schedule_desc d;
     memset(&d, 0, sizeof d);
-    d.table = table;
     gsf_result result = gsf__nn_read_schedule(config, &d);
     if (result == GSF_OK) result = gsf_nn_make_schedule(ctx, &d, out);
     gsf__nn_close_config(config);
@@ -4643,19 +4594,18 @@ static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config
 }
 
 GSF_API gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
-                                         gsf_nn_alpha_table table, gsf_nn_schedule* out) {
+                                         gsf_nn_schedule* out) {
     gsf__nn_config config;
     memset(out, 0, sizeof *out);
     GSF__TRY(gsf__nn_parse_config(ctx, name, text, size, &config));
-    return gsf__nn_schedule_from(ctx, &config, table, out);
+    return gsf__nn_schedule_from(ctx, &config, out);
 }
 
-GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_alpha_table table,
-                                        gsf_nn_schedule* out) {
+GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out) {
     gsf__nn_config config;
     memset(out, 0, sizeof *out);
     GSF__TRY(gsf__nn_load_config(ctx, path, &config));
-    return gsf__nn_schedule_from(ctx, &config, table, out);
+    return gsf__nn_schedule_from(ctx, &config, out);
 }
 
 // One of the `steps` times before the cut by strength; numpy's arithmetic, half to even.
@@ -10454,7 +10404,7 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
     if (!result) result = gsf_nn_make_vae(ctx, path.data, &r->vae);
     path.size = 0;
     gsf_text_printf(ctx, &path, "%s/scheduler/scheduler_config.json", r->desc.model);
-    if (!result) result = gsf_nn_load_schedule(ctx, path.data, GSF_NN_TABLE_DDIM, &r->schedule);
+    if (!result) result = gsf_nn_load_schedule(ctx, path.data, &r->schedule);
     gsf_destroy_text(ctx, &path);
     if (!result && r->desc.int8) result = gsf_nn_quantize_transformer(ctx, &r->transformer, NULL);
     return result ? result : gsf__dit_load_features(ctx, r);

@@ -1,7 +1,7 @@
 // bench_nn.c - seconds beside error of the network kernels.
 // By hand: cc -O2 -fopenmp -I. bench/bench_nn.c -o bench_nn -lm
 //
-//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N]
+//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--model FOLDER | --pipeline FOLDER...]
 //
 // First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
 // released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
@@ -9,16 +9,24 @@
 // runs PyTorch on the same cases, which it reads from their names.
 // Seconds are the median; cpu_seconds, the process' CPU time of all threads, is the least of the rounds. Peaks are by CPU
 // time, too: on a machine that does other things as well, cpu_peak_share is the figure to look at.
+// --model runs a model's VAE and one forward pass of its transformer once, at the configured size, instead: seconds,
+// operations and the peak of anonymous memory (make_model writes such a folder; the released size takes hours here).
+// --pipeline restores a clip with a small model by every solver, with fewer steps, and with what can be left out: seconds
+// beside error of the frames. Further folders hold the same weights in other types.
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_nn.h"
+
+#include <pthread.h>
+#include <stdatomic.h>
 
 #define BENCH_NAME "nn"
 #include "bench.h"
 
 typedef struct bench_options {
     int json, quick, threads;
-    const char* filter;
+    const char *filter, *model, *pipelines[4];
+    int pipeline_count;
 } bench_options;
 
 static int bench_wanted(const bench_options* o, const char* name, int threads) {
@@ -1070,6 +1078,335 @@ static void bench_captions(const bench_options* o) {
     }
 }
 
+// ---- a whole model from its folder ---------------------------------------------------
+
+typedef struct bench_memory { // resident bytes of this process, watched from a thread of its own
+    pthread_t thread;
+    atomic_int stop;
+    double anonymous, file; // peaks
+} bench_memory;
+
+static void* bench_watch(void* arg) {
+    bench_memory* m = (bench_memory*)arg;
+    while (!atomic_load(&m->stop)) {
+        char line[128];
+        double kib;
+        FILE* f = fopen("/proc/self/status", "r");
+        while (f && fgets(line, sizeof line, f)) {
+            if (sscanf(line, "RssAnon: %lf", &kib) == 1 && kib * 1024.0 > m->anonymous) m->anonymous = kib * 1024.0;
+            if (sscanf(line, "RssFile: %lf", &kib) == 1 && kib * 1024.0 > m->file) m->file = kib * 1024.0;
+        }
+        if (f) fclose(f);
+        const struct timespec wait = {0, 50000000};
+        nanosleep(&wait, NULL);
+    }
+    return NULL;
+}
+
+typedef struct bench_steps { // clock at every step that is reported
+    double* seconds;
+    size_t count, limit;
+} bench_steps;
+
+static void bench_step(void* user, const char* stage, double done, double total) {
+    bench_steps* s = (bench_steps*)user;
+    if (s->count < s->limit) s->seconds[s->count++] = bench_now();
+    fprintf(stderr, "%s %.0f of %.0f\n", stage, done, total);
+}
+
+typedef struct bench_model {
+    const char* folder;
+    gsf_nn_transformer transformer;
+    gsf_nn_transformer_input in;
+    gsf_nn_vae vae;
+    int64_t frames, height, width; // of the latents
+    float *x, *y;
+} bench_model;
+
+static void bench_run_forward(gsf_context* ctx, void* arg) {
+    bench_model* m = (bench_model*)arg;
+    bench_require(ctx, gsf_nn_transformer_forward(ctx, &m->transformer, &m->in, m->y));
+}
+
+static void bench_run_decode(gsf_context* ctx, void* arg) {
+    bench_model* m = (bench_model*)arg;
+    bench_require(ctx, gsf_nn_vae_decode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y));
+}
+
+static void bench_run_encode(gsf_context* ctx, void* arg) {
+    bench_model* m = (bench_model*)arg;
+    bench_require(ctx, gsf_nn_vae_encode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y, NULL));
+}
+
+// Once: these take minutes. Memory is the process', less what it held before.
+static void bench_once(const bench_options* o, gsf_context* ctx, const char* name, bench_model* m, bench_body body,
+                       double flops, double bytes) {
+    double times[256]; // more steps than that are not looked at
+    bench_steps steps = {times, 0, 256};
+    bench_memory memory;
+    memset(&memory, 0, sizeof memory);
+    ctx->progress.progress_fn = bench_step;
+    ctx->progress.user = &steps;
+    if (pthread_create(&memory.thread, NULL, bench_watch, &memory) != 0) bench_require(ctx, GSF_ERROR_OUT_OF_MEMORY);
+    bench_row row = bench_make_row(name, ctx->cpu_level, ctx->threads, 0.0, 0.0, flops, "flop");
+    const double wall = bench_now(), cpu = bench_cpu();
+    body(ctx, m);
+    row.seconds = bench_now() - wall;
+    row.cpu_seconds = bench_cpu() - cpu;
+    row.flops = flops;
+    atomic_store(&memory.stop, 1);
+    pthread_join(memory.thread, NULL);
+    row.peak_rss = memory.anonymous;
+    bench_print(o->json, &row);
+    for (size_t i = steps.count; i-- > 1;) times[i] -= times[i - 1];
+    fprintf(stderr, "%s: %.2f GiB anonymous (%.2f announced), %.2f GiB of files; median of %d steps %.2f s\n", name,
+            memory.anonymous / (1 << 30), bytes / (1 << 30), memory.file / (1 << 30), (int)steps.count,
+            steps.count > 1 ? bench_median(times + 1, steps.count - 1) : 0.0);
+    ctx->progress.progress_fn = NULL;
+}
+
+static void bench_fill_floats(gsf_context* ctx, float** to, size_t count, uint64_t seed) {
+    *to = (float*)bench_alloc(ctx, count, sizeof(float));
+    bench_fill(*to, count * sizeof(float), GSF_NN_F32, seed);
+}
+
+// One forward pass of one sample at the configured size, with the reference tokens of two photos.
+static void bench_forward(const bench_options* o, gsf_context* ctx, bench_model* m) {
+    char path[1024];
+    snprintf(path, sizeof path, "%s/transformer", m->folder);
+    gsf_nn_transformer* t = &m->transformer;
+    bench_require(ctx, gsf_nn_make_transformer(ctx, path, t));
+    const int32_t frames = (t->sample_frames - 1) / t->temporal_ratio + 1;
+    const size_t pixels = (size_t)frames * (size_t)t->sample_height * (size_t)t->sample_width;
+    const double timestep = 500.0;
+    float *hidden, *text, *dino, *vggt, *references, *kv;
+    memset(&m->in, 0, sizeof m->in);
+    m->in.reference_tokens = 1850;
+    m->in.batch = m->in.reference_batch = 1;
+    m->in.frames = frames;
+    m->in.height = t->sample_height;
+    m->in.width = t->sample_width;
+    m->in.timesteps = &timestep;
+    const size_t tokens = (size_t)m->in.reference_tokens;
+    bench_fill_floats(ctx, &hidden, pixels * (size_t)t->in_channels, 1);
+    bench_fill_floats(ctx, &text, (size_t)t->text_tokens * (size_t)t->text_channels, 2);
+    bench_fill_floats(ctx, &dino, tokens * (size_t)t->dino_channels, 3);
+    bench_fill_floats(ctx, &vggt, tokens * (size_t)t->vggt_channels, 4);
+    bench_fill_floats(ctx, &references, tokens * (size_t)(t->heads * t->head_dim), 5);
+    bench_fill_floats(ctx, &m->y, pixels * (size_t)t->out_channels, 6);
+    kv = (float*)bench_alloc(ctx, gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1), sizeof(float));
+    bench_require(ctx, gsf_nn_project_references(ctx, t, m->in.reference_tokens, dino, vggt, references));
+    m->in.hidden = hidden;
+    m->in.text = text;
+    m->in.references = references;
+    m->in.reference_kv = kv;
+    double bytes, flops;
+    gsf_nn_transformer_cost(t, &m->in, &bytes, &flops);
+    bench_once(o, ctx, "model: transformer forward", m, bench_run_forward, flops, bytes);
+    float* all[] = {hidden, text, dino, vggt, references, m->y, kv};
+    for (size_t i = 0; i < GSF__COUNT(all); i++) gsf_free(ctx, all[i]);
+    gsf_nn_destroy_transformer(ctx, t);
+}
+
+static void bench_vae(const bench_options* o, gsf_context* ctx, bench_model* m, gsf_nn_vae_way way) {
+    char path[1024];
+    snprintf(path, sizeof path, "%s/vae", m->folder);
+    gsf_nn_vae* v = &m->vae;
+    bench_require(ctx, gsf_nn_make_vae(ctx, path, v));
+    const int encode = way == GSF_NN_VAE_ENCODE;
+    const int64_t frames = 49; // of the paper's clips
+    m->frames = encode ? frames : (frames - 1) / v->temporal_ratio + 1;
+    m->height = v->sample_height / (encode ? 1 : v->spatial_ratio);
+    m->width = v->sample_width / (encode ? 1 : v->spatial_ratio);
+    gsf_nn_vae_info info;
+    bench_require(ctx, gsf_nn_query_vae(ctx, v, way, NULL, m->frames, m->height, m->width, &info));
+    const int64_t in = encode ? v->in_channels : v->latent_channels, out = encode ? v->latent_channels : v->out_channels;
+    bench_fill_floats(ctx, &m->x, (size_t)(in * m->frames * m->height * m->width), 1);
+    m->y = (float*)bench_alloc(ctx, (size_t)(out * info.frames * info.height * info.width), sizeof(float));
+    bench_once(o, ctx, encode ? "model: vae encode" : "model: vae decode", m, encode ? bench_run_encode : bench_run_decode,
+               info.flops, info.bytes);
+    gsf_free(ctx, m->x);
+    gsf_free(ctx, m->y);
+    gsf_nn_destroy_vae(ctx, v);
+}
+
+static void bench_whole_model(const bench_options* o) {
+    gsf_context ctx;
+    bench_model m;
+    (void)bench_context(&ctx, GSF_CPU_AUTO, o->threads ? o->threads : 2);
+    memset(&m, 0, sizeof m);
+    m.folder = o->model;
+    if (bench_wanted(o, "model: vae decode", ctx.threads)) bench_vae(o, &ctx, &m, GSF_NN_VAE_DECODE);
+    if (bench_wanted(o, "model: transformer forward", ctx.threads)) bench_forward(o, &ctx, &m);
+    if (bench_wanted(o, "model: vae encode", ctx.threads)) bench_vae(o, &ctx, &m, GSF_NN_VAE_ENCODE);
+}
+
+// ---- the pipeline: run time beside error of the final frames, on a small model ------------
+
+typedef struct bench_pipeline {
+    const bench_options* options;
+    gsf_context ctx;
+    gsf_nn_transformer transformer;
+    gsf_nn_vae vae;
+    gsf_nn_schedule schedule;
+    gsf_nn_sample_desc desc;   // as the official code runs: 50 steps of DDIM, guidance 6
+    char dtype[8];             // of the weights
+    float* out;
+    size_t count;
+} bench_pipeline;
+
+static void bench_open_pipeline(bench_pipeline* p, const char* folder) {
+    gsf_context* ctx = &p->ctx;
+    char path[1024];
+    memset(p, 0, sizeof *p);
+    (void)bench_context(ctx, GSF_CPU_AUTO, 2);
+    snprintf(path, sizeof path, "%s/transformer", folder);
+    bench_require(ctx, gsf_nn_make_transformer(ctx, path, &p->transformer));
+    snprintf(path, sizeof path, "%s/vae", folder);
+    bench_require(ctx, gsf_nn_make_vae(ctx, path, &p->vae));
+    snprintf(path, sizeof path, "%s/scheduler/scheduler_config.json", folder);
+    bench_require(ctx, gsf_nn_load_schedule(ctx, path, &p->schedule));
+    const gsf_nn_transformer* t = &p->transformer;
+    snprintf(p->dtype, sizeof p->dtype, "%s", gsf_nn_dtype_name(t->weights.tensors[0].dtype));
+    gsf_nn_sample_desc* d = &p->desc;
+    d->frames = 9;
+    d->height = t->sample_height * p->vae.spatial_ratio;
+    d->width = t->sample_width * p->vae.spatial_ratio;
+    d->reference_tokens = 2 * t->sample_height / 2 * t->sample_width / 2; // two photos
+    const size_t tokens = (size_t)d->reference_tokens;
+    float *control, *text, *dino, *vggt, *references;
+    p->count = 3 * (size_t)d->frames * (size_t)d->height * (size_t)d->width;
+    bench_fill_floats(ctx, &control, p->count, 1);
+    bench_fill_floats(ctx, &text, 2 * (size_t)t->text_tokens * (size_t)t->text_channels, 2);
+    bench_fill_floats(ctx, &dino, tokens * (size_t)t->dino_channels, 3);
+    bench_fill_floats(ctx, &vggt, tokens * (size_t)t->vggt_channels, 4);
+    bench_fill_floats(ctx, &references, tokens * (size_t)(t->heads * t->head_dim), 5);
+    bench_require(ctx, gsf_nn_project_references(ctx, t, d->reference_tokens, dino, vggt, references));
+    const size_t row = (size_t)d->width, area = row * (size_t)d->height;
+    for (size_t i = 0; i < p->count; i++) // a soft pattern that moves sideways
+        control[i] = 0.8f * sinf(0.05f * (float)(i % row) + 0.1f * (float)(i / area)) * cosf(0.07f * (float)(i % area / row));
+    gsf_free(ctx, dino);
+    gsf_free(ctx, vggt);
+    d->control = control;
+    d->text = text;
+    d->references = references;
+    p->out = (float*)bench_alloc(ctx, p->count, sizeof(float));
+}
+
+static void bench_close_pipeline(bench_pipeline* p) {
+    gsf_context* ctx = &p->ctx;
+    gsf_free(ctx, (void*)(uintptr_t)p->desc.control);
+    gsf_free(ctx, (void*)(uintptr_t)p->desc.text);
+    gsf_free(ctx, (void*)(uintptr_t)p->desc.references);
+    gsf_free(ctx, p->out);
+    gsf_nn_destroy_schedule(ctx, &p->schedule);
+    gsf_nn_destroy_vae(ctx, &p->vae);
+    gsf_nn_destroy_transformer(ctx, &p->transformer);
+}
+
+// Once: a row's rounding repeats are not worth their minutes. Error of the frames against `reference`'s, if any.
+static void bench_restore(bench_pipeline* p, const gsf_nn_sample_desc* desc, const char* series, const char* variant,
+                          const float* expected, const char* reference) {
+    char name[96];
+    snprintf(name, sizeof name, "pipeline: %s %dx%dx%d", series, (int)desc->frames, (int)desc->height, (int)desc->width);
+    if (!bench_wanted(p->options, name, p->ctx.threads)) return;
+    gsf_nn_sample_stats stats;
+    bench_row row = bench_make_row(name, p->ctx.cpu_level, p->ctx.threads, 0.0, 0.0, (double)desc->frames, "frames");
+    const double wall = bench_now(), cpu = bench_cpu();
+    bench_require(&p->ctx, gsf_nn_sample(&p->ctx, &p->transformer, &p->vae, &p->schedule, desc, p->out, &stats));
+    row.seconds = bench_now() - wall;
+    row.cpu_seconds = bench_cpu() - cpu;
+    row.variant = variant;
+    if (expected) {
+        double worst = 0.0, difference = 0.0, square = 0.0;
+        for (size_t i = 0; i < p->count; i++) {
+            const double error = fabs((double)p->out[i] - (double)expected[i]);
+            if (!(error <= worst)) worst = error;
+            difference += error * error;
+            square += (double)expected[i] * (double)expected[i];
+        }
+        row.error_max = worst;
+        row.error_rel_l2 = sqrt(difference / square);
+        row.reference = reference;
+    }
+    bench_print(p->options->json, &row);
+}
+
+static float* bench_keep(bench_pipeline* p) { // the frames of the last run
+    float* kept = (float*)bench_alloc(&p->ctx, p->count, sizeof(float));
+    memcpy(kept, p->out, p->count * sizeof(float));
+    return kept;
+}
+
+// Fewer steps and other solvers, against the path that all of them approximate.
+static void bench_solvers(bench_pipeline* p, const float* converged) {
+    static const char* const names[] = {"ddim", "dpmpp", "unipc"};
+    static const int32_t steps[] = {5, 8, 12, 20, 50};
+    for (int solver = 0; solver < 3; solver++)
+        for (size_t i = 0; i < GSF__COUNT(steps); i++) {
+            char variant[32];
+            gsf_nn_sample_desc d = p->desc;
+            d.solver = (gsf_nn_solver)solver;
+            d.steps = p->options->quick ? 2 + (int32_t)i : steps[i];
+            snprintf(variant, sizeof variant, "%s %d", names[solver], (int)d.steps);
+            bench_restore(p, &d, "steps", variant, converged, "unipc, 150 steps");
+        }
+}
+
+// What leaves work out of each step, against the same steps with all of it.
+static void bench_skips(bench_pipeline* p, const float* expected) {
+    static const struct {
+        const char* name;
+        float guidance, guidance_end, strength, cache;
+        int no_kv;
+    } skips[] = {
+        {"no reference cache", 0.0f, 0.0f, 0.0f, 0.0f, 1},    {"guidance until 80 %", 0.0f, 0.8f, 0.0f, 0.0f, 0},
+        {"guidance until 60 %", 0.0f, 0.6f, 0.0f, 0.0f, 0},   {"guidance until 40 %", 0.0f, 0.4f, 0.0f, 0.0f, 0},
+        {"no guidance", 1.0f, 0.0f, 0.0f, 0.0f, 0},           {"strength 0.9", 0.0f, 0.0f, 0.9f, 0.0f, 0},
+        {"strength 0.7", 0.0f, 0.0f, 0.7f, 0.0f, 0},          {"strength 0.5", 0.0f, 0.0f, 0.5f, 0.0f, 0},
+        {"block cache 0.02", 0.0f, 0.0f, 0.0f, 0.02f, 0},     {"block cache 0.05", 0.0f, 0.0f, 0.0f, 0.05f, 0},
+        {"block cache 0.1", 0.0f, 0.0f, 0.0f, 0.1f, 0},       {"block cache 0.2", 0.0f, 0.0f, 0.0f, 0.2f, 0},
+    };
+    for (size_t i = 0; i < GSF__COUNT(skips); i++) {
+        gsf_nn_sample_desc d = p->desc;
+        d.guidance = skips[i].guidance;
+        d.guidance_end = skips[i].guidance_end;
+        d.strength = skips[i].strength;
+        d.block_cache = skips[i].cache;
+        d.no_reference_cache = skips[i].no_kv;
+        bench_restore(p, &d, "skips", skips[i].name, expected, "all of it");
+    }
+}
+
+// The first model's frames are the reference of the others, which have its weights in another type.
+static void bench_pipelines(const bench_options* o) {
+    bench_pipeline p;
+    float *converged, *expected = NULL;
+    for (int i = 0; i < o->pipeline_count; i++) {
+        bench_open_pipeline(&p, o->pipelines[i]);
+        p.options = o;
+        p.desc.steps = o->quick ? 4 : 50;
+        if (i == 0) {
+            gsf_nn_sample_desc d = p.desc;
+            d.solver = GSF_NN_UNIPC;
+            d.steps = o->quick ? 12 : 150;
+            bench_restore(&p, &d, "steps", "unipc, converged", NULL, "none");
+            converged = bench_keep(&p);
+            bench_solvers(&p, converged);
+            gsf_free(&p.ctx, converged);
+        }
+        bench_restore(&p, &p.desc, "skips", i ? p.dtype : "all of it", expected, "all of it");
+        if (i == 0) {
+            expected = bench_keep(&p);
+            bench_skips(&p, expected);
+            bench_require(&p.ctx, gsf_nn_quantize_transformer(&p.ctx, &p.transformer, NULL));
+            bench_restore(&p, &p.desc, "skips", "int8", expected, "all of it");
+        }
+        if (i + 1 == o->pipeline_count) gsf_free(&p.ctx, expected);
+        bench_close_pipeline(&p);
+    }
+}
+
 int main(int argc, char** argv) {
     bench_options o;
     memset(&o, 0, sizeof o);
@@ -1079,8 +1416,10 @@ int main(int argc, char** argv) {
         else if (strcmp(argv[i], "--quick") == 0) o.quick = 1;
         else if (value && strcmp(argv[i], "--filter") == 0) o.filter = argv[++i];
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
+        else if (value && strcmp(argv[i], "--model") == 0) o.model = argv[++i];
+        else if (value && strcmp(argv[i], "--pipeline") == 0 && o.pipeline_count < 4) o.pipelines[o.pipeline_count++] = argv[++i];
         else {
-            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N]\n");
+            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--model FOLDER] [--pipeline FOLDER]...\n");
             return 2;
         }
     }
@@ -1093,6 +1432,12 @@ int main(int argc, char** argv) {
         if (o.threads && o.threads != threads) continue;
         bench_machine(&o, GSF_CPU_SCALAR, threads, memory, size);
         bench_machine(&o, GSF_CPU_AVX2, threads, memory, size);
+    }
+    if (o.model || o.pipeline_count) {
+        gsf_free(&ctx, memory);
+        if (o.model) bench_whole_model(&o);
+        else bench_pipelines(&o);
+        return 0;
     }
     bench_linears(&o, memory, size);
     bench_int8s(&o, memory);

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Turns rows of bench_splat --json into tables and charts.
+"""Turns rows of bench_splat --json and bench_nn --json into tables and charts.
 
     bench/results.py ROWS.jsonl DIR
 
 Writes DIR/results.csv (every row), DIR/stages.svg (where a training step's time goes, by size), DIR/growth.svg (how cost
-grows) and DIR/RESULTS.md. Several rows of the same case, instruction set and thread count are rounds: the median counts.
-Rows of test_stress --json are the table of worst errors. Only the standard library is needed.
+grows), DIR/pipeline.svg (the video model's run time beside its error) and DIR/RESULTS.md. Several rows of the same case,
+instruction set and thread count are rounds: the median counts. Rows of test_stress --json are the table of worst errors,
+those of peers_nn.py with variant PyTorch the ratios. Only the standard library is needed.
 """
 import collections
 import csv
@@ -16,9 +17,17 @@ import statistics
 import sys
 
 COLUMNS = ["bench", "case", "variant", "isa", "threads", "seconds", "cpu_seconds", "work", "work_unit", "rate",
-           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes"]
+           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes", "ratio", "cpu_ratio"]
 STAGES = ["project", "bin", "sort", "blend", "loss", "reverse", "gather", "adam"]
 COLORS = ["#8896ab", "#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "#bbbbbb"]
+
+
+def short(value):  # three digits, but never 1.14e+03
+    return "%.3g" % value if value < 999.5 else "%.0f" % value
+
+
+def ms(seconds):
+    return short(1e3 * seconds)
 
 
 def machine():
@@ -33,11 +42,11 @@ def machine():
 def medians(rows):
     groups = collections.OrderedDict()
     for row in rows:
-        groups.setdefault((row["case"], row["variant"], row["isa"], row["threads"]), []).append(row)
+        groups.setdefault((row["bench"], row["case"], row["variant"], row["isa"], row["threads"]), []).append(row)
     result = []
     for group in groups.values():
         row = dict(group[0])
-        for key in ("seconds", "cpu_seconds", "rate", "peak_share", "bandwidth_share"):
+        for key in ("seconds", "cpu_seconds", "rate", "peak_share", "bandwidth_share", "ratio", "cpu_ratio"):
             if key in row:
                 row[key] = statistics.median(r[key] for r in group)
         row["rounds"] = len(group)
@@ -84,7 +93,7 @@ def write_stages(path, rows):
             w = width * stages[stage]["seconds"] / total
             out.append('<rect x="%.1f" y="%d" width="%.1f" height="%d" fill="%s"/>' % (x, y, w, bar, color))
             x += w
-        out.append('<text x="%d" y="%d">%.3g ms</text>' % (left + width + 8, y + 13, 1e3 * total))
+        out.append('<text x="%d" y="%d">%s ms</text>' % (left + width + 8, y + 13, ms(total)))
     out.append("</svg>")
     with open(path, "w") as file:
         file.write("\n".join(out) + "\n")
@@ -139,6 +148,60 @@ def write_growth(path, rows):  # one panel each: both axes by decades, of the sa
     return True
 
 
+def pipeline_of(rows, series):  # [(name, seconds, error)]
+    return [(r["variant"], r["seconds"], r.get("error_rel_l2", 0.0)) for r in rows
+            if r["bench"] == "nn" and r["case"].startswith("pipeline: " + series) and "converged" not in r["variant"]]
+
+
+FAMILIES = [("ddim", COLORS[5]), ("dpmpp", COLORS[1]), ("unipc", COLORS[3]), ("guidance", COLORS[1]),
+            ("no guidance", COLORS[1]), ("strength", COLORS[5]), ("block cache", COLORS[3]), ("", COLORS[6])]
+
+
+def write_pipeline(path, rows):  # seconds to the right, error upwards by decades; one panel for steps, one for skips
+    panels = [("Solvers and steps: error against the converged path", pipeline_of(rows, "steps")),
+              ("Left out of 50 steps: error against all of it", pipeline_of(rows, "skips"))]
+    if not all(points for _, points in panels):
+        return False
+    errors = [e for _, points in panels for _, _, e in points if e > 0.0]
+    low, high = math.floor(math.log10(min(errors))), math.ceil(math.log10(max(errors)))
+    longest = max(s for _, points in panels for _, s, _ in points)
+    unit = 10.0 ** math.floor(math.log10(longest))
+    unit *= 1 if longest / unit > 4 else 0.5
+    decade, width, top, x0 = 110, 430, 50, 60
+    bottom = top + decade * (high - low)
+    scale = width / (math.ceil(longest / unit) * unit)
+    out = []
+    for title, points in panels:
+        for e in range(low, high + 1):
+            y = top + decade * (high - e)
+            out.append('<line x1="%d" y1="%d" x2="%d" y2="%d" stroke="#ddd"/>' % (x0, y, x0 + width, y))
+            out.append('<text x="%d" y="%d" text-anchor="end">%g</text>' % (x0 - 5, y + 4, 10.0 ** e))
+        for k in range(int(math.ceil(longest / unit)) + 1):
+            x = x0 + scale * k * unit
+            out.append('<line x1="%.1f" y1="%d" x2="%.1f" y2="%d" stroke="#ddd"/>' % (x, top, x, bottom))
+            out.append('<text x="%.1f" y="%d" text-anchor="middle">%g s</text>' % (x, bottom + 16, k * unit))
+        out.append('<text x="%d" y="%d">%s</text>' % (x0, top - 12, title))
+        lines = collections.OrderedDict()
+        for name, seconds, error in points:
+            family, color = next(f for f in FAMILIES if name.startswith(f[0]))
+            x, y = x0 + scale * seconds, top + decade * (high - math.log10(error)) if error > 0.0 else bottom
+            if family:
+                lines.setdefault((family.split()[-1], color), []).append((x, y))
+            out.append('<circle cx="%.1f" cy="%.1f" r="3.5" fill="%s"/>' % (x, y, color))
+            out.append('<text x="%.1f" y="%.1f" font-size="10" fill="%s">%s%s</text>'
+                       % (x + 5, y - 5, color, name, "" if error > 0.0 else " (0)"))
+        for (_, color), line in lines.items():
+            out.append('<polyline points="%s" fill="none" stroke="%s" stroke-opacity="0.5"/>'
+                       % (" ".join("%.1f,%.1f" % p for p in line), color))
+        x0 += width + 150
+    head = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
+            % (x0 - 20, bottom + 30), '<rect width="100%" height="100%" fill="white"/>',
+            '<text x="10" y="18" font-size="14">Relative L2 error of the restored frames beside seconds</text>']
+    with open(path, "w") as file:
+        file.write("\n".join(head + out + ["</svg>"]) + "\n")
+    return True
+
+
 def stress_rows(rows):  # the worst of each test
     tests = collections.OrderedDict()
     for row in rows:
@@ -172,10 +235,7 @@ def percent(row, key):
     return "%.0f %%" % (100.0 * row[key]) if key in row else ""
 
 
-def write_markdown(path, rows, stress, has_growth):
-    lines = ["# Speed beside error", "",
-             "Written by `bench/run.sh` on %s, which may have run other work: compare rows of one run, not of two."
-             % machine(), ""]
+def splat_sections(lines, rows, stress, has_growth):
     peaks = [r for r in rows if r["case"].startswith("machine: ")]
     lines += ["## The machine", "",
               "What the bench itself reaches: chained multiply-adds, and a sum of two arrays into a third.", ""]
@@ -185,15 +245,15 @@ def write_markdown(path, rows, stress, has_growth):
               "A pair is a splat and a pixel that the reference blends it into. Errors are those of the picture (forward; where "
               "no yes/no decision of the pixel is within 1e-4 of its threshold) and of the gradient of the means (backward).", ""]
     table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M pairs/s", "largest error", "relative L2"],
-          [[r["case"], r["isa"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]), "%.3g" % (1e3 * r["cpu_seconds"]),
+          [[r["case"], r["isa"], str(r["threads"]), ms(r["seconds"]), ms(r["cpu_seconds"]),
             "%.0f" % (1e-6 * r["rate"]), "%.2g" % r["error_max"], "%.2g" % r["error_rel_l2"]]
            for r in rows if r["case"].startswith(("forward", "backward"))])
     lines += ["## Stages of a training step", "", "![Share of each stage](stages.svg)", "",
               "Shares are of what the machine reaches above with as many threads: floating-point operations as the kernels' "
               "source has them, bytes as each stage must move at least were its caches cold.", ""]
     table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M/s", "FMA peak", "bandwidth"],
-          [[r["case"], r["isa"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]), "%.3g" % (1e3 * r["cpu_seconds"]),
-            "%.3g %s" % (1e-6 * r["rate"], r["work_unit"]), percent(r, "peak_share"), percent(r, "bandwidth_share")]
+          [[r["case"], r["isa"], str(r["threads"]), ms(r["seconds"]), ms(r["cpu_seconds"]),
+            "%s %s" % (short(1e-6 * r["rate"]), r["work_unit"]), percent(r, "peak_share"), percent(r, "bandwidth_share")]
            for r in rows if ": " in r["case"] and not r["case"].startswith(("machine", "visibility", "growth", "lazy", "skip"))])
     skips = [r for r in rows if r["case"].startswith(("skip: ", "lazy: "))]
     if skips:
@@ -208,8 +268,8 @@ def write_markdown(path, rows, stress, has_growth):
                   "4.7e-7 after 1,000 steps (`tests/test_trainer.c`).", "",
                   "Windows that need no restoring, and the three values of `--quality`: see QUALITY.md.", ""]
         table(lines, ["", "", "threads", "ms", "CPU ms", "largest difference", "relative L2"],
-              [[r["case"][6:], r["variant"], str(r["threads"]), "%.3g" % (1e3 * r["seconds"]),
-                "%.3g" % (1e3 * r["cpu_seconds"]), "%.1e" % r["error_max"] if "error_max" in r else "",
+              [[r["case"][6:], r["variant"], str(r["threads"]), ms(r["seconds"]),
+                ms(r["cpu_seconds"]), "%.1e" % r["error_max"] if "error_max" in r else "",
                 "%.1e" % r["error_rel_l2"] if "error_rel_l2" in r else ""] for r in skips])
     if has_growth:
         lines += ["## How cost grows", "", "![Seconds by splats, by pixels and by magnification](growth.svg)", "",
@@ -219,8 +279,8 @@ def write_markdown(path, rows, stress, has_growth):
     if filters:
         lines += ["## Visible-point filter", ""]
         table(lines, ["", "by", "threads", "seconds", "M/s"],
-              [[r["case"][11:], r["variant"], str(r["threads"]), "%.3g" % r["seconds"],
-                "%.3g %s" % (1e-6 * r["rate"], r["work_unit"])] for r in filters])
+              [[r["case"][11:], r["variant"], str(r["threads"]), short(r["seconds"]),
+                "%s %s" % (short(1e-6 * r["rate"]), r["work_unit"])] for r in filters])
     steps = [r for r in rows if r["case"] == "train step"]
     if steps:
         lines += ["## Training steps on photos", "",
@@ -246,6 +306,51 @@ def write_markdown(path, rows, stress, has_growth):
         table(lines, ["", "cases", "pixels", "unclear", "largest error, clear", "unclear", "depth, relative", "gradient",
                       "other"],
               stress_rows(stress))
+
+
+def errors(row):
+    return ["%.1e" % row[key] if key in row else "" for key in ("error_max", "error_rel_l2")]
+
+
+def nn_sections(lines, rows, has_pipeline):
+    ratios = {(r["case"], r["threads"]): "%.2f" % r["ratio"] for r in rows if "ratio" in r}
+    kernels = [r for r in rows if "ratio" not in r and not r["case"].startswith(("machine: ", "pipeline: ", "model: "))]
+    lines += ["## Kernels of the video model and its encoders", "",
+              "At the released model's sizes. Shares are of the multiply-adds and of the bytes per second that the same run "
+              "reaches without any kernel; errors are against sums in double. The last column is PyTorch's seconds divided by "
+              "ours, timed in turns in the same run (`bench/peers_nn.py`).", ""]
+    table(lines, ["", "", "instructions", "threads", "ms", "CPU ms", "FMA peak", "bandwidth", "largest error", "relative L2",
+                  "PyTorch / ours"],
+          [[r["case"], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), ms(r["seconds"]),
+            ms(r["cpu_seconds"]), percent(r, "peak_share"), percent(r, "bandwidth_share")] + errors(r)
+           + [ratios.get((r["case"], r["threads"]), "") if r["isa"] != "scalar" and r["variant"] == "default" else ""]
+           for r in kernels])
+    if has_pipeline:
+        lines += ["## A whole restoration: run time beside error", "", "![Error beside seconds](pipeline.svg)", "",
+                  "A clip of 9 frames by a model of random weights (`make_model --size small`), encoder and decoder included. "
+                  "Such a model's field of velocities is no trained one's: the figures show what each choice costs and how "
+                  "errors rank, not how restored frames look. With strength below 1 the clip starts from the noised render "
+                  "instead of pure noise, which is another answer and not an error of the same one.", ""]
+        table(lines, ["", "", "seconds", "CPU seconds", "largest error", "relative L2", "against"],
+              [[r["case"][10:], r["variant"], short(r["seconds"]), short(r["cpu_seconds"])] + errors(r)
+               + [r["reference"] if "error_max" in r else ""] for r in rows if r["case"].startswith("pipeline: ")])
+    models = [r for r in rows if r["case"].startswith("model: ")]
+    if models:
+        lines += ["## The released size", "",
+                  "Random weights in the official layout (`make_model --size full`), 49 frames of 720 x 480: 17,550 video and "
+                  "226 text tokens, 1,850 reference tokens. Memory is anonymous; the weights stay in the mapped files.", ""]
+        table(lines, ["", "threads", "seconds", "CPU seconds", "TFLOP", "FMA peak", "memory at most"],
+              [[r["case"][7:], str(r["threads"]), short(r["seconds"]), short(r["cpu_seconds"]), short(1e-12 * r["work"]),
+                percent(r, "peak_share"), "%.2f GiB" % (r["peak_rss_bytes"] / 2**30)] for r in models])
+
+
+def write_markdown(path, rows, stress, has_growth, has_pipeline):
+    lines = ["# Speed beside error", "",
+             "Written by `bench/run.sh` on %s, which may have run other work: compare rows of one run, not of two."
+             % machine(), ""]
+    splat_sections(lines, [r for r in rows if r["bench"] != "nn"], stress, has_growth)
+    if any(r["bench"] == "nn" for r in rows):
+        nn_sections(lines, [r for r in rows if r["bench"] == "nn"], has_pipeline)
     with open(path, "w") as file:
         file.write("\n".join(lines).rstrip() + "\n")
 
@@ -261,7 +366,9 @@ def main():
     write_csv(os.path.join(sys.argv[2], "results.csv"), rows)
     write_stages(os.path.join(sys.argv[2], "stages.svg"), rows)
     has_growth = write_growth(os.path.join(sys.argv[2], "growth.svg"), rows)
-    write_markdown(os.path.join(sys.argv[2], "RESULTS.md"), rows, [row for row in all_rows if "test" in row], has_growth)
+    has_pipeline = write_pipeline(os.path.join(sys.argv[2], "pipeline.svg"), rows)
+    write_markdown(os.path.join(sys.argv[2], "RESULTS.md"), rows, [row for row in all_rows if "test" in row], has_growth,
+                   has_pipeline)
 
 
 if __name__ == "__main__":

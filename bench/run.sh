@@ -4,7 +4,9 @@
 #   START=PLY                 from these splats instead of the scene's points
 #   OPENSPLAT=/path/opensplat and the same steps by OpenSplat in turns with ours, with the ratio (needs SCENE)
 #   ROUNDS=5 STEPS=200        of that comparison
-# About ten minutes; --quick is a look at it in one. The machine should do nothing else.
+#   TORCH=python3             and the networks' kernels by this Python's PyTorch, with the ratio
+#   MODEL=FOLDER              and one pass of a whole model (make_model --size full): about an hour and a half
+# About twenty minutes; --quick is a look at it in two. The machine should do nothing else.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 build=${GSF_BUILD:-build}
@@ -14,9 +16,10 @@ export OMP_WAIT_POLICY=passive # two workers that spin while they wait take each
 
 cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release > "$build.cmake.log" 2>&1 || { cat "$build.cmake.log" >&2; exit 1; }
 rm -f "$build.cmake.log"
-cmake --build "$build" -j "$(nproc)" --target bench_splat test_stress > /dev/null
-rows=$(mktemp)
-trap 'rm -f "$rows"' EXIT
+cmake --build "$build" -j "$(nproc)" --target bench_splat bench_nn make_model test_stress > /dev/null
+temporary=$(mktemp -d)
+trap 'rm -rf "$temporary"' EXIT
+rows=$temporary/rows
 "$build/bench_splat" --json ${quick[@]+"${quick[@]}"} | tee "$rows"
 "$build/bench_splat" --json --growth | tee -a "$rows"
 [ ${#quick[@]} -gt 0 ] || "$build/bench_splat" --json --filter "visibility 5M" | tee -a "$rows"
@@ -29,4 +32,13 @@ if [ -n "${SCENE:-}" ]; then
             tee -a "$rows"
     done
 fi
+if [ -n "${TORCH:-}" ]; then
+    "$TORCH" bench/peers_nn.py "$build/bench_nn" ${quick[@]+"${quick[@]}"} | tee -a "$rows"
+else
+    "$build/bench_nn" --json ${quick[@]+"${quick[@]}"} | tee -a "$rows"
+fi
+for dtype in f32 bf16; do "$build/make_model" "$temporary/$dtype" --size small --dtype "$dtype" > /dev/null; done
+"$build/bench_nn" --json --filter pipeline ${quick[@]+"${quick[@]}"} --pipeline "$temporary/f32" --pipeline "$temporary/bf16" |
+    tee -a "$rows"
+[ -z "${MODEL:-}" ] || "$build/bench_nn" --json --filter model --threads 2 --model "$MODEL" | tee -a "$rows"
 python3 bench/results.py "$rows" bench

@@ -124,7 +124,7 @@ static void check_pipeline(void) {
     if (!CHECK_OK(&c.ctx, gsf_nn_make_transformer(&c.ctx, test_golden("restorer/model/transformer"), &c.net)) ||
         !CHECK_OK(&c.ctx, gsf_nn_make_vae(&c.ctx, test_golden("restorer/model/vae"), &c.vae)) ||
         !CHECK_OK(&c.ctx, gsf_nn_load_schedule(&c.ctx, test_golden("restorer/model/scheduler/scheduler_config.json"),
-                                               GSF_NN_TABLE_DDIM, &c.schedule)))
+                                               &c.schedule)))
         return;
     c.inputs = test_open_tensors(test_golden("restorer/pipeline/inputs.safetensors"));
     c.expected = test_open_tensors(test_golden("restorer/pipeline/expected.safetensors"));

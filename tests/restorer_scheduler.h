@@ -1,5 +1,6 @@
 // The noise schedule and DDIM against diffusers': time steps exact, the float64 table 1e-12, the float32 one 1e-6,
-// trajectories and noise 4e-6 of float32's size (the reference's own float32 runs differ from float64 by up to 1.2e-6).
+// trajectories 4e-6 of float32's size (the reference's own float32 runs differ from float64 by up to 1.2e-6), noise by the
+// float32 table 2e-6.
 #ifndef RESTORER_SCHEDULER_H
 #define RESTORER_SCHEDULER_H
 
@@ -59,10 +60,9 @@ static void scheduler_check_table(const test_tensors* file, const char* name, co
     test_free_tensor(&t);
 }
 
-// The formula once more in long double: the float64 table is that, rounded; the float32 one is away from it by the
-// roundings of a thousand float32 factors.
-static void scheduler_check_exact(const gsf_nn_schedule* ddim, const gsf_nn_schedule* cogx) {
-    const gsf_nn_schedule_desc* d = &cogx->desc;
+// The formula once more in long double: within one float32 ulp.
+static void scheduler_check_exact(const gsf_nn_schedule* schedule) {
+    const gsf_nn_schedule_desc* d = &schedule->desc;
     const int n = d->train_steps;
     if (d->linear_betas || d->no_zero_snr || d->snr_shift_scale != 1.0) return;
     long double* root = (long double*)malloc((size_t)n * sizeof *root);
@@ -73,16 +73,12 @@ static void scheduler_check_exact(const gsf_nn_schedule* ddim, const gsf_nn_sche
         root[i] = sqrtl(product);
     }
     int bad = 0;
-    double worst = 0.0;
     for (int i = 0; i < n; i++) {
         const long double r = (root[i] - root[n - 1]) * root[0] / (root[0] - root[n - 1]);
         const float exact = (float)(r * r);
-        const double ulp = (double)(nextafterf(exact, INFINITY) - exact);
-        bad += fabs((double)((float)cogx->alpha_bar[i] - exact)) > ulp;
-        worst = fmax(worst, fabs(ddim->alpha_bar[i] - (double)(r * r)));
+        bad += fabs((double)((float)schedule->alpha_bar[i] - exact)) > (double)(nextafterf(exact, INFINITY) - exact);
     }
     CHECK(bad == 0);
-    CHECK_NEAR(worst, 0.0, 1e-6);
     free(root);
 }
 
@@ -98,8 +94,8 @@ static void scheduler_check_noise(gsf_context* ctx, const test_tensors* file, co
         gsf_nn_add_noise(ctx, schedule, time, x + i * row, e + i * row, row, out);
         gsf_nn_make_velocity(ctx, schedule, time, x + i * row, e + i * row, row, out + row);
         gsf_nn_predict_x0(ctx, schedule, time, out, out + row, row, out + 2 * row);
-        CHECK_NEAR(scheduler_worst(out, &noisy, i * row, row), 0.0, 4e-7);
-        CHECK_NEAR(scheduler_worst(out + row, &velocity, i * row, row), 0.0, 4e-7);
+        CHECK_NEAR(scheduler_worst(out, &noisy, i * row, row), 0.0, 2e-6);
+        CHECK_NEAR(scheduler_worst(out + row, &velocity, i * row, row), 0.0, 2e-6);
         CHECK_NEAR(scheduler_worst(out + 2 * row, &x0, i * row, row), 0.0, 4e-7);
     }
     free(out);
@@ -114,23 +110,22 @@ static void scheduler_check_noise(gsf_context* ctx, const test_tensors* file, co
 
 static void check_scheduler(void) {
     gsf_context ctx;
-    gsf_nn_schedule ddim, cogx, shifted;
+    gsf_nn_schedule schedule, shifted;
     gsf_nn_weights names;
     test_context_init(&ctx);
     const char* config = test_golden("restorer/model/scheduler/scheduler_config.json");
     const char* path = test_golden("restorer/scheduler/scheduler.safetensors");
-    CHECK_OK(&ctx, gsf_nn_load_schedule(&ctx, config, GSF_NN_TABLE_DDIM, &ddim));
-    CHECK_OK(&ctx, gsf_nn_load_schedule(&ctx, config, GSF_NN_TABLE_COGX, &cogx));
-    gsf_nn_schedule_desc desc = cogx.desc;
+    CHECK_OK(&ctx, gsf_nn_load_schedule(&ctx, config, &schedule));
+    gsf_nn_schedule_desc desc = schedule.desc;
     desc.snr_shift_scale = 3.0;
     CHECK_OK(&ctx, gsf_nn_make_schedule(&ctx, &desc, &shifted));
-    if (!ddim.alpha_bar || !cogx.alpha_bar || !shifted.alpha_bar) return;
+    if (!schedule.alpha_bar || !shifted.alpha_bar) return;
     test_tensors file = test_open_tensors(path);
-    scheduler_check_table(&file, "ddim.alphas_cumprod", &ddim, 1e-6);
-    scheduler_check_table(&file, "cogx_ddim.alphas_cumprod", &cogx, 1e-12);
+    scheduler_check_table(&file, "ddim.alphas_cumprod", &schedule, 1e-6);
+    scheduler_check_table(&file, "cogx_ddim.alphas_cumprod", &schedule, 1e-12);
     scheduler_check_table(&file, "cogx_ddim_shift3.alphas_cumprod", &shifted, 1e-12);
-    scheduler_check_exact(&ddim, &cogx);
-    scheduler_check_noise(&ctx, &file, &ddim);
+    scheduler_check_exact(&schedule);
+    scheduler_check_noise(&ctx, &file, &schedule);
     int lists = 0, trajectories = 0;
     CHECK_OK(&ctx, gsf_nn_open_weights(&ctx, path, NULL, &names));
     for (size_t i = 0; i < names.tensor_count; i++) {
@@ -139,7 +134,7 @@ static void check_scheduler(void) {
         if (sscanf(name, "timesteps%d%n", &steps, &end) == 1 && name[end] == 0) {
             test_tensor t = test_get_tensor(&file, name);
             int32_t* times = (int32_t*)malloc((size_t)steps * sizeof *times), count;
-            if (CHECK_OK(&ctx, gsf_nn_make_timesteps(&ctx, &ddim, steps, 1.0, times, &count)) &&
+            if (CHECK_OK(&ctx, gsf_nn_make_timesteps(&ctx, &schedule, steps, 1.0, times, &count)) &&
                 CHECK((size_t)count == t.count))
                 for (size_t k = 0; k < t.count; k++) CHECK((double)times[k] == t.v[k]);
             free(times);
@@ -148,16 +143,15 @@ static void check_scheduler(void) {
         }
         end = 0;
         if (sscanf(name, "traj%d.x_init%n", &steps, &end) == 1 && end > 0) {
-            scheduler_check_trajectory(&ctx, &file, steps, "ddim", &ddim);
-            scheduler_check_trajectory(&ctx, &file, steps, "cogx_ddim", &cogx);
+            scheduler_check_trajectory(&ctx, &file, steps, "ddim", &schedule);
+            scheduler_check_trajectory(&ctx, &file, steps, "cogx_ddim", &schedule);
             trajectories++;
         }
     }
     CHECK(lists > 0 && trajectories > 0);
     gsf_nn_close_weights(&ctx, &names);
     test_close_tensors(&file);
-    gsf_nn_destroy_schedule(&ctx, &ddim);
-    gsf_nn_destroy_schedule(&ctx, &cogx);
+    gsf_nn_destroy_schedule(&ctx, &schedule);
     gsf_nn_destroy_schedule(&ctx, &shifted);
 }
 

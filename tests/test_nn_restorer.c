@@ -187,7 +187,7 @@ static void open_sample(gsf_context* ctx, sample_case* s) {
     snprintf(path, sizeof path, "%s/vae", model_folder());
     CHECK_OK(ctx, gsf_nn_make_vae(ctx, path, &s->vae));
     snprintf(path, sizeof path, "%s/scheduler/scheduler_config.json", model_folder());
-    CHECK_OK(ctx, gsf_nn_load_schedule(ctx, path, GSF_NN_TABLE_DDIM, &s->schedule));
+    CHECK_OK(ctx, gsf_nn_load_schedule(ctx, path, &s->schedule));
     s->desc.frames = 9;
     s->desc.height = s->net.sample_height * s->vae.spatial_ratio;
     s->desc.width = s->net.sample_width * s->vae.spatial_ratio;
