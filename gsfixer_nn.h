@@ -2066,6 +2066,32 @@ static int64_t gsf__nn_find_not_finite(gsf_context* ctx, const float* x, int64_t
     return -1;
 }
 
+static int gsf__nn_tensor_is_finite(const gsf_tensor* tensor) {
+    float part[1024];
+    for (int64_t i = 0; i < tensor->count; i += 1024) {
+        const int64_t n = tensor->count - i < 1024 ? tensor->count - i : 1024;
+        gsf_nn_read_tensor(tensor, i, n, part);
+        for (int64_t k = 0; k < n; k++)
+            if (!(fabsf(part[k]) <= FLT_MAX)) return 0;
+    }
+    return 1;
+}
+
+// After a stage of the network `name`: a value that is not finite ends the run. A tensor whose name begins with `prefix`
+// and that is not finite itself is to blame, else the stage.
+static gsf_result gsf__nn_check_finite(gsf_context* ctx, const gsf_nn_weights* weights, const char* name,
+                                       const char* prefix, const char* stage, const float* x, int64_t count) {
+    const int64_t at = gsf__nn_find_not_finite(ctx, x, count);
+    if (at < 0) return GSF_OK;
+    for (size_t i = 0; i < weights->tensor_count; i++) {
+        const gsf_tensor* t = &weights->tensors[i];
+        if (strncmp(t->name, prefix, strlen(prefix)) == 0 && !gsf__nn_tensor_is_finite(t))
+            return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", weights->name, t->name);
+    }
+    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: %s gives %g (value %lld of %lld)", name, stage, (double)x[at],
+                    (long long)at, (long long)count);
+}
+
 typedef struct gsf__activate_job {
     const gsf__activation_kernels* kernels;
     gsf_nn_activation activation;
@@ -5555,29 +5581,8 @@ static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
 
 // ---- a value that is not finite, and where it comes from
 
-static int gsf__dit_tensor_is_finite(const gsf_tensor* tensor) {
-    float part[1024];
-    for (int64_t i = 0; i < tensor->count; i += 1024) {
-        const int64_t n = tensor->count - i < 1024 ? tensor->count - i : 1024;
-        gsf_nn_read_tensor(tensor, i, n, part);
-        for (int64_t k = 0; k < n; k++)
-            if (!(fabsf(part[k]) <= FLT_MAX)) return 0;
-    }
-    return 1;
-}
-
-// Says which stage made it, and which weights are to blame if one of theirs is not finite.
 static gsf_result gsf__dit_check(gsf__dit_run* run, const char* stage, const char* prefix, const float* x, int64_t count) {
-    const int64_t at = gsf__nn_find_not_finite(run->ctx, x, count);
-    if (at < 0) return GSF_OK;
-    const gsf_nn_weights* w = &run->net->weights;
-    for (size_t i = 0; i < w->tensor_count; i++)
-        if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 &&
-            !gsf__dit_tensor_is_finite(&w->tensors[i]))
-            return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
-                            w->tensors[i].name);
-    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "transformer: %s gives %g (value %lld of %lld)", stage, (double)x[at],
-                    (long long)at, (long long)count);
+    return gsf__nn_check_finite(run->ctx, &run->net->weights, "transformer", prefix, stage, x, count);
 }
 
 // ---- first and last layers
@@ -8172,17 +8177,8 @@ static gsf_result gsf__t5_feed_forward(gsf__t5_run* run, int32_t layer, const gs
     return GSF_OK;
 }
 
-// Says which stage made a value that is not finite, and which weights are to blame if one of theirs is not.
 static gsf_result gsf__t5_check(const gsf__t5_run* run, const char* stage, const char* prefix, const float* x) {
-    const int64_t count = run->rows * run->net->width, at = gsf__nn_find_not_finite(run->ctx, x, count);
-    const gsf_nn_weights* w = &run->net->weights;
-    if (at < 0) return GSF_OK;
-    for (size_t i = 0; i < w->tensor_count; i++)
-        if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 && !gsf__dit_tensor_is_finite(&w->tensors[i]))
-            return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
-                            w->tensors[i].name);
-    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "t5: %s gives %g (value %lld of %lld)", stage, (double)x[at],
-                    (long long)at, (long long)count);
+    return gsf__nn_check_finite(run->ctx, &run->net->weights, "t5", prefix, stage, x, run->rows * run->net->width);
 }
 
 static gsf_result gsf__t5_forward(gsf__t5_run* run, float* out) {
@@ -8451,17 +8447,8 @@ static gsf_result gsf__vit_block_forward(gsf__vit_run* run, const gsf__vit_block
     return gsf__vit_feed_forward(run, b, gsf__vit_vector(run, b->scale2), x, rows);
 }
 
-// After a stage: a value that is not finite ends the run, with the tensor to blame if one below `prefix` is not finite.
 static gsf_result gsf__vit_check(gsf__vit_run* run, const char* prefix, const float* x, int64_t count) {
-    const int64_t at = gsf__nn_find_not_finite(run->ctx, x, count);
-    if (at < 0) return GSF_OK;
-    const gsf_nn_weights* w = run->weights;
-    for (size_t i = 0; i < w->tensor_count; i++)
-        if (strncmp(w->tensors[i].name, prefix, strlen(prefix)) == 0 && !gsf__dit_tensor_is_finite(&w->tensors[i]))
-            return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", w->name,
-                            w->tensors[i].name);
-    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: %s gives %g (value %lld of %lld)", run->name, prefix, (double)x[at],
-                    (long long)at, (long long)count);
+    return gsf__nn_check_finite(run->ctx, run->weights, run->name, prefix, prefix, x, count);
 }
 
 // Block `index` of those called `names` and what follows it: check, cancel, progress.
