@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The byte-level tokenizer beside transformers' GPT2Tokenizer on seeded random texts: ids and decoded texts must be equal.
 
-    pip install transformers==4.51.3 regex tokenizers
+    pip install transformers==4.51.3 regex tokenizers        # compare_tokenizers.sh does both
     python3 tests/compare_bpe.py build/tests/test_nn_caption [--folder GOLDEN/encoders/blip2] [--count 10000] [--seed 1]
 
 Runs on the folder's vocabulary and on a larger one that is trained here on this repository's sources. Exit code 0: all
