@@ -431,12 +431,13 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     return d;
 }
 
-// The time since the last unit of work is this stage's.
+// The time since the last unit of work is this stage's. Before the first clip others may report theirs.
 static void note_dit_stage(gsfix_app* app, const char* stage) {
     const double begin = app->stage_begin, memory = gsfix_anonymous_memory();
+    const int is_clip = strcmp(stage, "clip") == 0;
     int i = 0;
-    app->stage_begin = gsfix_now();
-    if (strcmp(stage, "clip") == 0) return;
+    if (is_clip || begin > 0.0) app->stage_begin = gsfix_now();
+    if (is_clip || begin == 0.0) return;
     if (strcmp(stage, "restore") == 0) stage = "solver"; // what a step does beside the transformer
     while (i < app->stage_count && strcmp(app->stages[i].name, stage) != 0) i++;
     if (i == GSFIX_CLIP_STAGES) return;

@@ -733,6 +733,8 @@ static gsf_result prepare(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &run->scene);
     if (result == GSF_OK) result = gsfix_split_scene(app, &run->scene, &run->split);
+    if (result == GSF_OK) // before the work that a missing model would waste
+        result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &run->restorer, &run->has_restorer);
     if (result == GSF_OK)
         run->setup.fix.train.render.near_plane =
             gsfix_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
@@ -741,8 +743,6 @@ static gsf_result prepare(fix_run* run) {
             result = gsf_splat_load_view_image(ctx, &run->scene, k ? run->split.test[i] : run->split.train[i]);
     if (result == GSF_OK && app->o.masks) result = load_masks(run);
     if (result == GSF_OK) result = make_initial(run);
-    if (result == GSF_OK)
-        result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &run->restorer, &run->has_restorer);
     if (result == GSF_OK) result = start_fixer(run);
     if (result != GSF_OK) return result;
     run->history.view_count = run->split.test_count;

@@ -27,7 +27,7 @@ expect 2 "$gsfix" bogus
 expect 2 "$gsfix" dataset "$scene"
 expect 2 "$gsfix" evaluate
 expect 2 "$gsfix" fix "$scene"
-expect 2 "$gsfix" fix "$scene" --out x --restorer dit:models
+expect 1 "$gsfix" fix "$scene" --out x --restorer dit:models
 expect 2 "$gsfix" fix "$scene" --out x --restorer nonsense
 expect 2 "$gsfix" fix "$scene" --out x --condition 3d
 expect 2 "$gsfix" fix "$scene" --out x --init nonsense
