@@ -1314,8 +1314,8 @@ static void bench_skips(bench_pipeline* p, const float* expected) {
         {"guidance until 60 %", 0.0f, 0.6f, 0.0f, 0.0f, 0},   {"guidance until 40 %", 0.0f, 0.4f, 0.0f, 0.0f, 0},
         {"no guidance", 1.0f, 0.0f, 0.0f, 0.0f, 0},           {"strength 0.9", 0.0f, 0.0f, 0.9f, 0.0f, 0},
         {"strength 0.7", 0.0f, 0.0f, 0.7f, 0.0f, 0},          {"strength 0.5", 0.0f, 0.0f, 0.5f, 0.0f, 0},
-        {"block cache 0.02", 0.0f, 0.0f, 0.0f, 0.02f, 0},     {"block cache 0.05", 0.0f, 0.0f, 0.0f, 0.05f, 0},
         {"block cache 0.1", 0.0f, 0.0f, 0.0f, 0.1f, 0},       {"block cache 0.2", 0.0f, 0.0f, 0.0f, 0.2f, 0},
+        {"block cache 0.4", 0.0f, 0.0f, 0.0f, 0.4f, 0},       {"block cache 0.8", 0.0f, 0.0f, 0.0f, 0.8f, 0},
     };
     for (size_t i = 0; i < GSF__COUNT(skips); i++) {
         gsf_nn_sample_desc d = p->desc;

@@ -167,7 +167,7 @@ def write_pipeline(path, rows):  # seconds to the right, error upwards by decade
     longest = max(s for _, points in panels for _, s, _ in points)
     unit = 10.0 ** math.floor(math.log10(longest))
     unit *= 1 if longest / unit > 4 else 0.5
-    decade, width, top, x0 = 110, 430, 50, 60
+    decade, width, top, x0 = 380 // (high - low), 430, 60, 60
     bottom = top + decade * (high - low)
     scale = width / (math.ceil(longest / unit) * unit)
     out = []
@@ -181,21 +181,30 @@ def write_pipeline(path, rows):  # seconds to the right, error upwards by decade
             out.append('<line x1="%.1f" y1="%d" x2="%.1f" y2="%d" stroke="#ddd"/>' % (x, top, x, bottom))
             out.append('<text x="%.1f" y="%d" text-anchor="middle">%g s</text>' % (x, bottom + 16, k * unit))
         out.append('<text x="%d" y="%d">%s</text>' % (x0, top - 12, title))
-        lines = collections.OrderedDict()
+        lines, exact = collections.OrderedDict(), []
         for name, seconds, error in points:
+            if error <= 0.0:
+                exact.append("%s %s s" % (name, short(seconds)))
+                continue
             family, color = next(f for f in FAMILIES if name.startswith(f[0]))
-            x, y = x0 + scale * seconds, top + decade * (high - math.log10(error)) if error > 0.0 else bottom
-            if family:
-                lines.setdefault((family.split()[-1], color), []).append((x, y))
-            out.append('<circle cx="%.1f" cy="%.1f" r="3.5" fill="%s"/>' % (x, y, color))
-            out.append('<text x="%.1f" y="%.1f" font-size="10" fill="%s">%s%s</text>'
-                       % (x + 5, y - 5, color, name, "" if error > 0.0 else " (0)"))
-        for (_, color), line in lines.items():
+            lines.setdefault((family or name, color), []).append(
+                (x0 + scale * seconds, top + decade * (high - math.log10(error)), name[len(family):].strip() or name))
+        for k, ((family, color), line) in enumerate(lines.items()):
             out.append('<polyline points="%s" fill="none" stroke="%s" stroke-opacity="0.5"/>'
-                       % (" ".join("%.1f,%.1f" % p for p in line), color))
+                       % (" ".join("%.1f,%.1f" % p[:2] for p in line), color))
+            below = k % 2  # labels of neighbouring lines keep apart
+            for x, y, label in line:
+                out.append('<circle cx="%.1f" cy="%.1f" r="3.5" fill="%s"/>' % (x, y, color))
+                out.append('<text x="%.1f" y="%.1f" font-size="10" text-anchor="%s" fill="%s">%s</text>'
+                           % (x + (-6 if below else 6), y + (12 if below else -5), "end" if below else "start", color, label))
+            out.append('<rect x="%d" y="%d" width="10" height="10" fill="%s"/><text x="%d" y="%d">%s</text>'
+                       % (x0 + width - 110, top + 8 + 16 * k, color, x0 + width - 96, top + 17 + 16 * k, family))
+        for k in range(0, len(exact), 3):
+            out.append('<text x="%d" y="%d" font-size="11">%s%s</text>'
+                       % (x0, bottom + 36 + 14 * (k // 3), "" if k else "no error: ", ", ".join(exact[k:k + 3])))
         x0 += width + 150
     head = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
-            % (x0 - 20, bottom + 30), '<rect width="100%" height="100%" fill="white"/>',
+            % (x0 - 100, bottom + 70), '<rect width="100%" height="100%" fill="white"/>',
             '<text x="10" y="18" font-size="14">Relative L2 error of the restored frames beside seconds</text>']
     with open(path, "w") as file:
         file.write("\n".join(head + out + ["</svg>"]) + "\n")

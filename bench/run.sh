@@ -6,7 +6,7 @@
 #   ROUNDS=5 STEPS=200        of that comparison
 #   TORCH=python3             and the networks' kernels by this Python's PyTorch, with the ratio
 #   MODEL=FOLDER              and one pass of it: about an hour and a half (make_model --size full --parts transformer,vae)
-# About twenty minutes; --quick is a look at it in two. The machine should do nothing else.
+# About forty minutes; --quick is a look at it in two. The machine should do nothing else.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 build=${GSF_BUILD:-build}
