@@ -58,13 +58,13 @@ static void use_tokenizer(gsf_context* ctx, const gsf_nn_bpe* bpe, bytes text) {
     if (result == GSF_OK) {
         FUZZ_CHECK(count <= text.size + 2); // a first token, a space before
         for (size_t i = 0; i < count; i++) FUZZ_CHECK(ids[i] >= 0 && ids[i] <= bpe->highest_id);
-        check_decoded(ctx, bpe, ids, count);
+        check_decoded(ctx, bpe, ids, count < 64 ? count : 64); // each may be a token as long as the input
     } else {
         FUZZ_CHECK(result == GSF_ERROR_INVALID_ARGUMENT && ids == NULL && count == 0);
     }
     gsf_free(ctx, ids);
-    int32_t any[64];
-    const size_t some = text.size / 2 < 64 ? text.size / 2 : 64;
+    int32_t any[8];
+    const size_t some = text.size / 2 < 8 ? text.size / 2 : 8;
     for (size_t i = 0; i < some; i++) any[i] = (int16_t)(text.data[2 * i] | text.data[2 * i + 1] << 8);
     check_decoded(ctx, bpe, any, some);
 }
