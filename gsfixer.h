@@ -106,7 +106,10 @@ typedef struct gsf_context gsf_context;
 typedef enum gsf_cpu_level { // instruction sets a kernel may use; AUTO picks the best one of the machine
     GSF_CPU_AUTO = 0,
     GSF_CPU_SCALAR = 1,
-    GSF_CPU_AVX2 = 2, // with FMA
+    GSF_CPU_AVX2 = 2,        // with FMA and F16C
+    GSF_CPU_AVX512 = 3,      // F, BW, DQ and VL
+    GSF_CPU_AVX512_VNNI = 4, // dot products of bytes
+    GSF_CPU_AVX512_BF16 = 5, // and of bfloat16
 } gsf_cpu_level;
 
 typedef enum gsf_log_level { GSF_LOG_ERROR = 0, GSF_LOG_WARNING = 1, GSF_LOG_INFO = 2 } gsf_log_level;
@@ -507,6 +510,10 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #include <immintrin.h>
 #define GSF__TARGET_AVX2 __attribute__((target("avx2,fma,f16c,bmi")))
 #define GSF__INLINE_AVX2 __attribute__((target("avx2,fma,f16c,bmi"), always_inline)) static inline
+#define GSF__AVX512 "avx2,fma,f16c,bmi,avx512f,avx512bw,avx512dq,avx512vl"
+#define GSF__TARGET_AVX512 __attribute__((target(GSF__AVX512)))
+#define GSF__INLINE_AVX512 __attribute__((target(GSF__AVX512), always_inline)) static inline
+#define GSF__TARGET_VNNI __attribute__((target(GSF__AVX512 ",avx512vnni")))
 #else
 #define GSF__X86 0
 #endif
@@ -819,6 +826,9 @@ GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level) {
         case GSF_CPU_AUTO: return "auto";
         case GSF_CPU_SCALAR: return "scalar";
         case GSF_CPU_AVX2: return "avx2";
+        case GSF_CPU_AVX512: return "avx512";
+        case GSF_CPU_AVX512_VNNI: return "avx512_vnni";
+        case GSF_CPU_AVX512_BF16: return "avx512_bf16";
     }
     return "unknown";
 }
@@ -826,10 +836,16 @@ GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level) {
 static gsf_cpu_level gsf__detect_cpu_level(void) {
 #if GSF__X86
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi"))
+    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !__builtin_cpu_supports("bmi"))
+        return GSF_CPU_SCALAR;
+    if (!__builtin_cpu_supports("avx512f") || !__builtin_cpu_supports("avx512bw") ||
+        !__builtin_cpu_supports("avx512dq") || !__builtin_cpu_supports("avx512vl"))
         return GSF_CPU_AVX2;
-#endif
+    if (!__builtin_cpu_supports("avx512vnni")) return GSF_CPU_AVX512;
+    return __builtin_cpu_supports("avx512bf16") ? GSF_CPU_AVX512_BF16 : GSF_CPU_AVX512_VNNI;
+#else
     return GSF_CPU_SCALAR;
+#endif
 }
 
 GSF_API void gsf_log(gsf_context* ctx, gsf_log_level level, const char* format, ...) {

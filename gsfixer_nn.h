@@ -1856,6 +1856,46 @@ GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) {
     return gsf__nn_power8(&c, rounded, f);
 }
 
+// The same, sixteen at a time.
+
+GSF__INLINE_AVX512 __mmask16 gsf__nn_mask16(int64_t left) { // lanes below `left`
+    return (__mmask16)(left < 16 ? (1u << left) - 1u : 0xffffu);
+}
+
+GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
+
+GSF__INLINE_AVX512 float gsf__nn_sum16(__m512 v) { return gsf__nn_sum8(gsf__nn_fold16(v)); }
+
+GSF__INLINE_AVX512 float gsf__nn_max16(__m512 v) {
+    return gsf__nn_max8(_mm256_max_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps(v, 1)));
+}
+
+GSF__INLINE_AVX512 __m512 gsf__nn_rounder16(void) { return _mm512_set1_ps(12583038.0f); }
+
+GSF__INLINE_AVX512 __m512 gsf__nn_power16(__m512 rounded, __m512 f) { // gsf__nn_power8
+    __m512 p = _mm512_fmadd_ps(_mm512_set1_ps(2.0f * 1.535336188319500e-4f), f, _mm512_set1_ps(2.0f * 1.339887440266574e-3f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 9.618437357674640e-3f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 5.550332471162809e-2f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 2.402264791363012e-1f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 6.931472028550421e-1f));
+    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f));
+    return p * _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_castps_si512(rounded), 23));
+}
+
+GSF__INLINE_AVX512 __m512 gsf__nn_exp2_low16(__m512 x) { // 2^x for x <= 129 or NaN
+    x = _mm512_max_ps(_mm512_set1_ps(-126.0f), x);
+    const __m512 rounded = x + gsf__nn_rounder16();
+    return gsf__nn_power16(rounded, x - (rounded - gsf__nn_rounder16()));
+}
+
+GSF__INLINE_AVX512 __m512 gsf__nn_exp16(__m512 x) { // gsf__nn_exp8
+    const __m512 log2_e = _mm512_set1_ps(1.44269504f);
+    x = _mm512_min_ps(_mm512_set1_ps(89.4f), _mm512_max_ps(_mm512_set1_ps(-87.4f), x));
+    const __m512 rounded = _mm512_fmadd_ps(x, log2_e, gsf__nn_rounder16()), n = rounded - gsf__nn_rounder16();
+    const __m512 f = _mm512_fmadd_ps(x, _mm512_set1_ps(1.92596299e-8f), _mm512_fmsub_ps(x, log2_e, n));
+    return gsf__nn_power16(rounded, f);
+}
+
 #endif // GSF__X86
 
 // ---- >>nn activations -----------------------------------------------------------
@@ -1927,6 +1967,35 @@ GSF__INLINE_AVX2 __m256 gsf__nn_activate8(gsf_nn_activation activation, __m256 x
     }
     if (activation == GSF_NN_GELU) return gsf__nn_gelu8(x);
     if (activation == GSF_NN_RELU) return _mm256_max_ps(_mm256_setzero_ps(), x); // of a NaN the second operand
+    return x;
+}
+
+GSF__INLINE_AVX512 __m512 gsf__nn_gelu16(__m512 x) { // gsf__nn_gelu8
+    const __m512 half_log2_e = _mm512_set1_ps(-0.72134752f), k = _mm512_set1_ps(3.5f);
+    const __m512 z = _mm512_min_ps(_mm512_set1_ps(13.2f), _mm512_abs_ps(x));
+    const __m512 t = k / (z + k), s = t - _mm512_set1_ps(0.5f), square = z * z;
+    const __m512 rounded = _mm512_fmadd_ps(square, half_log2_e, gsf__nn_rounder16()), n = rounded - gsf__nn_rounder16();
+    const __m512 lost = _mm512_fmsub_ps(z, z, square) * half_log2_e;
+    const __m512 low = _mm512_fmadd_ps(square, _mm512_set1_ps(-9.62981495e-9f), lost);
+    const __m512 power = gsf__nn_power16(rounded, _mm512_fmsub_ps(square, half_log2_e, n) + low);
+    __m512 tail = _mm512_set1_ps(gsf__nn_gelu_tail[9]);
+    for (int i = 8; i >= 0; i--) tail = _mm512_fmadd_ps(tail, s, _mm512_set1_ps(gsf__nn_gelu_tail[i]));
+    return _mm512_fnmadd_ps(z, power * (t * tail), _mm512_max_ps(_mm512_setzero_ps(), x));
+}
+
+GSF__INLINE_AVX512 __m512 gsf__nn_activate16(gsf_nn_activation activation, __m512 x) { // gsf__nn_activate8
+    const __m512 one = _mm512_set1_ps(1.0f);
+    if (activation == GSF_NN_GELU_TANH) {
+        x = _mm512_max_ps(_mm512_set1_ps(-12.0f), x);
+        const __m512 slope = _mm512_fmadd_ps(x * x, _mm512_set1_ps(-0.10294324f), _mm512_set1_ps(-2.30220819f));
+        return x / (one + gsf__nn_exp2_low16(_mm512_min_ps(_mm512_set1_ps(129.0f), x * slope)));
+    }
+    if (activation == GSF_NN_SILU) {
+        x = _mm512_max_ps(_mm512_set1_ps(-100.0f), x);
+        return x / (one + gsf__nn_exp16(_mm512_sub_ps(_mm512_setzero_ps(), x)));
+    }
+    if (activation == GSF_NN_GELU) return gsf__nn_gelu16(x);
+    if (activation == GSF_NN_RELU) return _mm512_max_ps(_mm512_setzero_ps(), x);
     return x;
 }
 
@@ -2016,12 +2085,60 @@ GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, fl
     if (i < count) _mm256_maskstore_ps(y + i, mask, inverse * _mm256_maskload_ps(y + i, mask));
 }
 
+GSF__INLINE_AVX512 void gsf__activate_avx512_body(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+    for (int64_t i = 0; i < count; i += 16) {
+        const __mmask16 mask = gsf__nn_mask16(count - i);
+        _mm512_mask_storeu_ps(y + i, mask, gsf__nn_activate16(activation, _mm512_maskz_loadu_ps(mask, x + i)));
+    }
+}
+
+GSF__TARGET_AVX512 static void gsf__activate_avx512(gsf_nn_activation activation, const float* x, int64_t count,
+                                                    float* y) {
+    switch (activation) {
+        case GSF_NN_LINEAR: gsf__activate_avx512_body(GSF_NN_LINEAR, x, count, y); break;
+        case GSF_NN_GELU_TANH: gsf__activate_avx512_body(GSF_NN_GELU_TANH, x, count, y); break;
+        case GSF_NN_SILU: gsf__activate_avx512_body(GSF_NN_SILU, x, count, y); break;
+        case GSF_NN_GELU: gsf__activate_avx512_body(GSF_NN_GELU, x, count, y); break;
+        case GSF_NN_RELU: gsf__activate_avx512_body(GSF_NN_RELU, x, count, y); break;
+    }
+}
+
+GSF__TARGET_AVX512 static void gsf__softmax_avx512(const float* x, int64_t count, float scale, float* y) {
+    const float factor = scale * 1.44269504f; // powers of 2 instead of e
+    const __m512 f = _mm512_set1_ps(factor), lowest = _mm512_set1_ps(-FLT_MAX);
+    __m512 top = lowest;
+    double sum = 0.0;
+    for (int64_t i = 0; i < count; i += 16) { // max returns its second operand where the first is NaN
+        const __mmask16 mask = gsf__nn_mask16(count - i);
+        top = _mm512_mask_max_ps(top, mask, f * _mm512_maskz_loadu_ps(mask, x + i), top);
+    }
+    const __m512 t = _mm512_set1_ps(gsf__nn_max16(top));
+    for (int64_t first = 0; first < count; first += 1024) { // float sums of short stretches
+        const int64_t end = gsf__least(first + 1024, count);
+        __m512 part = _mm512_setzero_ps();
+        for (int64_t i = first; i < end; i += 16) {
+            const __mmask16 mask = gsf__nn_mask16(end - i);
+            const __m512 p = gsf__nn_exp2_low16(_mm512_fmsub_ps(_mm512_maskz_loadu_ps(mask, x + i), f, t));
+            _mm512_mask_storeu_ps(y + i, mask, p);
+            part = _mm512_mask_add_ps(part, mask, part, p);
+        }
+        sum += (double)gsf__nn_sum16(part);
+    }
+    const __m512 inverse = _mm512_set1_ps((float)(1.0 / sum));
+    for (int64_t i = 0; i < count; i += 16) {
+        const __mmask16 mask = gsf__nn_mask16(count - i);
+        _mm512_mask_storeu_ps(y + i, mask, inverse * _mm512_maskz_loadu_ps(mask, y + i));
+    }
+}
+
 #endif // GSF__X86
 
 static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level level) {
     static const gsf__activation_kernels scalar = {gsf__activate_scalar, gsf__softmax_scalar};
 #if GSF__X86
     static const gsf__activation_kernels avx2 = {gsf__activate_avx2, gsf__softmax_avx2};
+    static const gsf__activation_kernels avx512 = {gsf__activate_avx512, gsf__softmax_avx512};
+    if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -2159,8 +2276,9 @@ enum {
     GSF__TILE_ROWS = 6,
     GSF__TILE_COLUMNS = 16,
     GSF__TILE_SUMS = GSF__TILE_ROWS * GSF__TILE_COLUMNS,
+    GSF__LINEAR_PAIR = 2 * GSF__TILE_COLUMNS, // panels are gone through in pairs
     GSF__LINEAR_DEPTH = 256,          // a panel of it is 16 KiB: half of an L1 cache
-    GSF__LINEAR_ROWS = 192,           // of a block; times depth: 192 KiB
+    GSF__LINEAR_ROWS = 192,           // of a block, two groups or more; times depth: 192 KiB
     GSF__LINEAR_COLUMNS = 768,
     GSF__LINEAR_LONE_ROWS = 320,      // up to here one block has all rows
     GSF__LINEAR_LONE_COLUMNS = 192,
@@ -2186,11 +2304,15 @@ typedef struct gsf__linear_kernels { // one set per instruction set
     // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; meanwhile fetches `ahead_count` floats that are needed next
     void (*tile)(const float* a, const float* b, int64_t count, int add, float* sums, const float* ahead,
                  int64_t ahead_count);
+    // As much for two groups, which follow one another, and two panels, whose sums are `next` floats apart; or NULL
+    void (*four_tiles)(const float* a, const float* b, int64_t count, int add, float* sums, int64_t next,
+                       const float* ahead, int64_t ahead_count);
     // Sums (row stride `pitch`, readable to the next multiple of 8 columns) to outputs row ..., column ... of y
     void (*finish)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows, int64_t column,
                    int64_t columns);
-    // sums[m*pitch + c] = row m of x (AVX2: of job->few) times row column + c of the weights
+    // sums[m*pitch + c] = row m of x times row column + c of the weights
     void (*few)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
+    int64_t few_lanes; // `few` reads x from job->few, [k / lanes][rows][lanes]; 0: from the description
 } gsf__linear_kernels;
 
 typedef struct gsf__linear_plan { // how a product is cut; depends on its sizes only
@@ -2291,7 +2413,7 @@ static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t 
 }
 
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
-                                                       gsf__finish_scalar, gsf__few_scalar};
+                                                       NULL, gsf__finish_scalar, gsf__few_scalar, 0};
 
 // ---- linear: AVX2 kernels
 
@@ -2566,12 +2688,159 @@ GSF__TARGET_AVX2 static void gsf__few_avx2(const gsf__linear_job* job, int64_t c
 }
 
 static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
-                                                     gsf__finish_avx2, gsf__few_avx2};
+                                                     NULL, gsf__finish_avx2, gsf__few_avx2, 8};
+
+// ---- linear: AVX-512 kernels
+
+// 24 registers of sums, 2 of b, 1 or 2 of a. Each sum takes its products in the order of gsf__tile_avx2: the same bits.
+GSF__TARGET_AVX512 static void gsf__four_tiles_avx512(const float* a, const float* b, int64_t count, int add, float* sums,
+                                                      int64_t next, const float* ahead, int64_t ahead_count) {
+    const float *a1 = a + GSF__TILE_ROWS * count, *b1 = b + GSF__TILE_COLUMNS * count;
+    float* right = sums + next;
+    for (int i = 0; i < 2 * GSF__TILE_SUMS; i += 16) {
+        _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);
+        _mm_prefetch((const char*)(right + i), _MM_HINT_T0);
+    }
+    const int64_t share = gsf__ceil_div(ahead_count, count); // one request a step: of a burst the processor drops most
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF_X(i) __m512 c##i = _mm512_setzero_ps(), d##i = c##i, e##i = c##i, f##i = c##i;
+    GSF_ROWS(GSF_X) // c, d: the first group by both panels; e, f: the second
+#undef GSF_X
+    for (; count > 0; count--, a += GSF__TILE_ROWS, a1 += GSF__TILE_ROWS, b += GSF__TILE_COLUMNS, b1 += GSF__TILE_COLUMNS) {
+        const __m512 w0 = _mm512_load_ps(b), w1 = _mm512_load_ps(b1);
+        __m512 v;
+        _mm_prefetch((const char*)ahead, _MM_HINT_T1);
+        ahead += share;
+#define GSF_X(i)                                                                         \
+        v = _mm512_set1_ps(a[i]);                                                        \
+        c##i = _mm512_fmadd_ps(v, w0, c##i);                                             \
+        d##i = _mm512_fmadd_ps(v, w1, d##i);                                             \
+        v = _mm512_set1_ps(a1[i]);                                                       \
+        e##i = _mm512_fmadd_ps(v, w0, e##i);                                             \
+        f##i = _mm512_fmadd_ps(v, w1, f##i);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+#define GSF_PUT(to, v) _mm512_store_ps(to, add ? _mm512_add_ps(_mm512_load_ps(to), v) : v);
+#define GSF_X(i)                                                                         \
+    GSF_PUT(sums + 16 * (i), c##i) GSF_PUT(right + 16 * (i), d##i)                       \
+    GSF_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+#undef GSF_PUT
+#undef GSF_ROWS
+}
+
+GSF__TARGET_AVX512 static void gsf__finish_avx512(const gsf__linear_job* job, const float* sums, int64_t pitch,
+                                                  int64_t row, int64_t rows, int64_t column, int64_t columns) {
+    const gsf_nn_linear_desc* d = &job->desc;
+    for (int64_t c = 0; c < columns; c += 16) {
+        const __mmask16 mask = gsf__nn_mask16(columns - c);
+        const __m512 bias = _mm512_maskz_loadu_ps(mask, job->bias + column + c);
+        const __m512 gate = d->gate ? _mm512_maskz_loadu_ps(mask, d->gate + column + c) : _mm512_set1_ps(1.0f);
+        for (int64_t r = 0; r < rows; r++) {
+            float* y = d->y + (row + r) * d->ldy + column + c;
+            __m512 v = _mm512_maskz_loadu_ps(mask, sums + r * pitch + c) + bias;
+            v = gsf__nn_activate16(d->activation, v);
+            if (d->gate || d->accumulate) v = _mm512_fmadd_ps(gate, v, _mm512_maskz_loadu_ps(mask, y));
+            _mm512_mask_storeu_ps(y, mask, v);
+        }
+    }
+}
+
+GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // sixteen weights, widened
+    if (dtype == GSF_NN_F32) return _mm512_loadu_ps((const float*)(const void*)p);
+    const __m256i bits = _mm256_loadu_si256((const __m256i*)(const void*)p);
+    if (dtype == GSF_NN_F16) return _mm512_cvtph_ps(bits);
+    return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(bits), 16));
+}
+
+// Six rows of weights times 1, 2 or 4 rows of x, laid out as [k / 16][rows][16], added to sums[6][rows]. `count` is a
+// multiple of 32.
+GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                       int64_t rows, int64_t count, float* sums) {
+    const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
+    const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 64 : 32; // weights; bytes
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF_X(r) __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, s##r##2 = s##r##0, s##r##3 = s##r##0;
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+    for (int64_t at = 0; count > 0; count -= line) {
+#define GSF_X(r) gsf__few_fetch(w##r + at, ahead);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+        for (int64_t i = 0; i < line; i += 16, at += vector, x += 16 * rows) {
+            const __m512 x0 = _mm512_load_ps(x), x1 = rows > 1 ? _mm512_load_ps(x + 16) : x0;
+            const __m512 x2 = rows > 2 ? _mm512_load_ps(x + 32) : x0, x3 = rows > 2 ? _mm512_load_ps(x + 48) : x0;
+            __m512 v;
+#define GSF_X(r)                                                     \
+            v = gsf__load16(w##r + at, dtype);                       \
+            s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);               \
+            if (rows > 1) s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1); \
+            if (rows > 2) s##r##2 = _mm512_fmadd_ps(v, x2, s##r##2); \
+            if (rows > 2) s##r##3 = _mm512_fmadd_ps(v, x3, s##r##3);
+            GSF_ROWS(GSF_X)
+#undef GSF_X
+        }
+    }
+#define GSF_X(r)                                                     \
+    sums[r * rows] += gsf__nn_sum16(s##r##0);                        \
+    if (rows > 1) sums[r * rows + 1] += gsf__nn_sum16(s##r##1);      \
+    if (rows > 2) sums[r * rows + 2] += gsf__nn_sum16(s##r##2);      \
+    if (rows > 2) sums[r * rows + 3] += gsf__nn_sum16(s##r##3);
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+#undef GSF_ROWS
+}
+
+GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
+                                   int64_t column, int64_t columns, float* sums, int64_t pitch) {
+    const size_t bytes = (size_t)job->in * size;
+    const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
+    const int64_t whole = job->in / GSF__FEW_PAD * GSF__FEW_PAD;
+    const size_t left = (size_t)(job->in - whole) * size;
+    const char* w[6];
+    char tails[6][4 * GSF__FEW_PAD];
+    memset(tails, 0, sizeof tails);
+    for (int64_t c = 0; c < columns; c += 6) {
+        float tile[6 * GSF__FEW_ROWS]; // [weights][x]
+        memset(tile, 0, sizeof tile);
+        for (int64_t r = 0; r < 6; r++) w[r] = first + (size_t)gsf__least(c + r, columns - 1) * bytes;
+        gsf__few_six16(w, dtype, 6 * bytes, job->few, rows, whole, tile);
+        for (int64_t r = 0; left > 0 && r < 6; r++) {
+            memcpy(tails[r], w[r] + (size_t)whole * size, left);
+            w[r] = tails[r];
+        }
+        if (left > 0) gsf__few_six16(w, dtype, 0, job->few + whole * rows, rows, GSF__FEW_PAD, tile);
+        for (int64_t r = 0; r < gsf__least(6, columns - c); r++)
+            for (int64_t m = 0; m < job->desc.rows; m++) sums[m * pitch + c + r] = tile[r * rows + m];
+    }
+}
+
+GSF__TARGET_AVX512 static void gsf__few_avx512(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
+                                               int64_t pitch) {
+    const int64_t rows = gsf__few_rows(job->desc.rows);
+#define GSF_X(dtype, size)                                                                      \
+    if (rows == 1) gsf__few16(job, dtype, size, 1, column, columns, sums, pitch);               \
+    else if (rows == 2) gsf__few16(job, dtype, size, 2, column, columns, sums, pitch);          \
+    else gsf__few16(job, dtype, size, GSF__FEW_ROWS, column, columns, sums, pitch);
+    switch (job->desc.weight->dtype) {
+        case GSF_NN_F32: GSF_X(GSF_NN_F32, 4) break;
+        case GSF_NN_BF16: GSF_X(GSF_NN_BF16, 2) break;
+        default: GSF_X(GSF_NN_F16, 2) break;
+    }
+#undef GSF_X
+}
+
+static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
+                                                       gsf__four_tiles_avx512, gsf__finish_avx512, gsf__few_avx512,
+                                                       16};
 
 #endif
 
 static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level) {
 #if GSF__X86
+    if (level >= GSF_CPU_AVX512) return &gsf__linear_avx512;
     if (level >= GSF_CPU_AVX2) return &gsf__linear_avx2;
 #endif
     (void)level;
@@ -2599,17 +2868,27 @@ static void gsf__linear_pack_panel(void* arg, size_t panel, int worker) { // of 
     }
 }
 
-// All tiles of one panel at one step.
-static void gsf__linear_panel(const gsf__linear_job* job, const float* x, const float* w, float* sums, int64_t k,
-                              int64_t count, int64_t row, int64_t rows, int64_t column, int64_t columns) {
-    const float* ahead = w + count * GSF__TILE_COLUMNS; // the next panel, as a rule
-    const int64_t each = gsf__ceil_div(count * GSF__TILE_COLUMNS, gsf__ceil_div(rows, GSF__TILE_ROWS));
-    const int64_t share = job->plan.lone ? 0 : gsf__round_up(each, 16);
-    for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS, sums += GSF__TILE_SUMS, ahead += share) {
-        job->kernels->tile(x + r * count, w, count, k > 0, sums, ahead, share);
+// All tiles of one or two panels at one step; `next`: between the sums of the two.
+static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const float* w, float* sums, int64_t next,
+                               int64_t k, int64_t count, int64_t row, int64_t rows, int64_t column, int64_t columns) {
+    const gsf__linear_kernels* kernels = job->kernels;
+    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    const float* ahead = w + panels * count * GSF__TILE_COLUMNS; // the panels after these, as a rule
+    const int64_t share = job->plan.lone ? 0 : gsf__round_up(gsf__ceil_div(panels * count * GSF__TILE_COLUMNS, groups), 16);
+    for (int64_t g = 0, step; g < groups; g += step) {
+        const float* a = x + g * GSF__TILE_ROWS * count;
+        float* s = sums + g * GSF__TILE_SUMS;
+        step = kernels->four_tiles && panels == 2 && g + 2 <= groups ? 2 : 1;
+        if (step == 2) kernels->four_tiles(a, w, count, k > 0, s, next, ahead + g * share, 2 * share);
+        for (int64_t p = 0; step == 1 && p < panels; p++)
+            kernels->tile(a, w + p * count * GSF__TILE_COLUMNS, count, k > 0, s + p * next, ahead + g * share,
+                          p == 0 ? share : 0);
         if (k + count < job->in) continue;
-        const int64_t height = gsf__least(rows - r, GSF__TILE_ROWS);
-        job->kernels->finish(job, sums, GSF__TILE_COLUMNS, row + r, height, column, columns);
+        for (int64_t t = 0; t < step * panels; t++) {
+            const int64_t p = t / step, r = (g + t % step) * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
+            kernels->finish(job, sums + p * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS, row + r,
+                            gsf__least(rows - r, GSF__TILE_ROWS), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS));
+        }
     }
 }
 
@@ -2621,25 +2900,25 @@ static void gsf__linear_block(void* arg, size_t index, int worker) { // a block 
     const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // in the group
     const int64_t rows = gsf__least(d->rows - row, plan->block_rows);
     const int64_t columns = gsf__least(job->columns - at, plan->block_columns);
-    const int64_t tiles = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    const int64_t groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
     const size_t size = gsf_nn_dtype_size(d->weight->dtype), pitch = (size_t)job->in * size;
     float* sums = job->workers + (size_t)worker * plan->per_worker;
     float* panel = sums + plan->block_rows * plan->block_columns; // both whole tiles
-    float* x = panel + (plan->lone ? plan->depth * GSF__TILE_COLUMNS : 0);
+    float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
     for (int64_t k = 0; k < job->in; k += plan->depth) {
         const int64_t count = job->in - k < plan->depth ? job->in - k : plan->depth;
         for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS)
             job->kernels->pack_rows(d->x + (row + r) * d->ldx + k, d->ldx, gsf__least(rows - r, GSF__TILE_ROWS), count,
                                     x + r * count);
-        for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS) {
-            const int64_t width = gsf__least(columns - c, GSF__TILE_COLUMNS);
+        for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
+            const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR), next = groups * GSF__TILE_SUMS;
             const int64_t column = job->first + at + c;
             const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, count);
-            if (plan->lone)
-                job->kernels->pack_weights((const char*)d->weight->data + (size_t)column * pitch + (size_t)k * size,
-                                           d->weight->dtype, pitch, width, count, panel);
-            gsf__linear_panel(job, x, w, sums + c / GSF__TILE_COLUMNS * tiles * GSF__TILE_SUMS, k, count, row, rows, column,
-                              width);
+            for (int64_t p = 0; plan->lone && p < width; p += GSF__TILE_COLUMNS)
+                job->kernels->pack_weights((const char*)d->weight->data + (size_t)(column + p) * pitch + (size_t)k * size,
+                                           d->weight->dtype, pitch, gsf__least(width - p, GSF__TILE_COLUMNS), count,
+                                           panel + p * count);
+            gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, k, count, row, rows, column, width);
         }
     }
 }
@@ -2653,13 +2932,16 @@ static void gsf__linear_few(void* arg, size_t index, int worker) { // some outpu
     job->kernels->finish(job, sums, job->plan.block_columns, 0, job->desc.rows, at, columns);
 }
 
-// x as the kernels of few rows want it, [k / 8][rows][8], with zeros behind.
+// x as the kernels of few rows want it, with zeros behind.
 static void gsf__few_order(gsf__linear_job* job) {
     const gsf_nn_linear_desc* d = &job->desc;
-    const int64_t rows = gsf__few_rows(d->rows), padded = gsf__round_up(job->in, GSF__FEW_PAD);
-    for (int64_t m = 0; m < rows; m++)
-        for (int64_t k = 0; k < padded; k++)
-            job->few[(k >> 3) * 8 * rows + 8 * m + (k & 7)] = m < d->rows && k < job->in ? d->x[m * d->ldx + k] : 0.0f;
+    const int64_t rows = gsf__few_rows(d->rows), lanes = job->kernels->few_lanes;
+    float* to = job->few;
+    for (int64_t first = 0; lanes > 0 && first < job->in; first += lanes)
+        for (int64_t m = 0; m < rows; m++)
+            for (int64_t k = first; k < first + lanes; k++) *to++ = m < d->rows && k < job->in ? d->x[m * d->ldx + k] : 0.0f;
+    float* end = job->few + gsf__round_up(job->in, GSF__FEW_PAD) * rows;
+    while (lanes > 0 && to < end) *to++ = 0.0f;
 }
 
 // Cuts (rows, in) x (out, in)^T; 0 where the scratch would not be addressable.
@@ -2676,15 +2958,15 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
         plan->depth = gsf__even_piece(in, GSF__LINEAR_DEPTH, 8);
-        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : GSF__LINEAR_ROWS, GSF__TILE_ROWS);
+        plan->block_rows = gsf__even_piece(rows, plan->lone ? GSF__LINEAR_LONE_ROWS : GSF__LINEAR_ROWS, 2 * GSF__TILE_ROWS);
         plan->row_blocks = gsf__ceil_div(rows, plan->block_rows);
         const int64_t most = GSF__LINEAR_PACKED / in / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
         const int64_t widest = plan->lone ? GSF__LINEAR_LONE_COLUMNS : GSF__LINEAR_COLUMNS;
         plan->group_columns = plan->lone ? out : gsf__even_piece(out, most < 16 ? 16 : most, GSF__TILE_COLUMNS);
-        plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__TILE_COLUMNS);
+        plan->block_columns = gsf__even_piece(plan->group_columns, widest, GSF__LINEAR_PAIR);
         plan->per_worker = (size_t)(plan->block_rows * (plan->block_columns + plan->depth) + GSF__TILE_COLUMNS);
         const int64_t packed = gsf__round_up(plan->group_columns, GSF__TILE_COLUMNS);
-        if (plan->lone) plan->per_worker += (size_t)(plan->depth * GSF__TILE_COLUMNS);
+        if (plan->lone) plan->per_worker += (size_t)(plan->depth * GSF__LINEAR_PAIR);
         else if (!gsf__mul_size((size_t)packed, (size_t)in, &shared)) return 0;
     }
     plan->per_worker = (size_t)gsf__round_up((int64_t)plan->per_worker, 16); // workers begin on cache lines

@@ -9,16 +9,24 @@ typedef struct bench_row {
     const char *name, *variant, *isa, *work_unit, *reference;
     int threads;
     double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
-    double flops, bytes; // of the whole; 0: not counted, or not the bound to look at
+    double flops, ops, bytes; // of the whole; ops: with integers; 0: not counted, or not the bound to look at
     double bandwidth, cpu_bandwidth; // shares of what reading the same memory between the rounds gave; 0: not measured
     double peak_rss;     // bytes; 0: not measured
 } bench_row;
 
-typedef struct bench_peak { double flops, bytes; } bench_peak; // per second
-static bench_peak bench_peaks[2][3]; // by instruction set (scalar, AVX2) and threads (1, 2)
+enum { BENCH_LEVELS = GSF_CPU_AVX512_BF16 + 1 };
+
+typedef struct bench_peak { double flops, ops, bytes; } bench_peak; // per second
+static bench_peak bench_peaks[BENCH_LEVELS][3]; // by instruction set and threads (1, 2)
+
+static gsf_cpu_level bench_level_of(const char* isa) { // AUTO: there is no such set
+    int level = GSF_CPU_SCALAR;
+    while (level < BENCH_LEVELS && strcmp(isa, gsf_cpu_level_name((gsf_cpu_level)level)) != 0) level++;
+    return level < BENCH_LEVELS ? (gsf_cpu_level)level : GSF_CPU_AUTO;
+}
 
 static const bench_peak* bench_peak_of(const char* isa, int threads) {
-    return &bench_peaks[strcmp(isa, "scalar") != 0][threads < 2 ? 1 : 2];
+    return &bench_peaks[bench_level_of(isa)][threads < 2 ? 1 : 2];
 }
 
 static double bench_now(void) {
@@ -61,7 +69,8 @@ static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threa
 static void bench_print(int json, const bench_row* row) {
     const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
     const bench_peak* peak = bench_peak_of(row->isa, row->threads);
-    const double flop_share = peak->flops > 0.0 ? row->flops / row->seconds / peak->flops : 0.0;
+    const double flop_peak = row->ops > 0.0 ? peak->ops : peak->flops, work = row->ops > 0.0 ? row->ops : row->flops;
+    const double flop_share = flop_peak > 0.0 ? work / row->seconds / flop_peak : 0.0;
     const double of_peak = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
     const double cpu = row->cpu_seconds > 0.0 ? row->seconds * row->threads / row->cpu_seconds : 0.0;
     const double byte_share = row->bandwidth > 0.0 ? row->bandwidth : of_peak;
@@ -71,7 +80,7 @@ static void bench_print(int json, const bench_row* row) {
                "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
                row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
                rate, row->reference);
-        if (row->flops > 0.0) printf(",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", flop_share, cpu * flop_share);
+        if (work > 0.0) printf(",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", flop_share, cpu * flop_share);
         if (row->bytes > 0.0)
             printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g,\"cpu_bandwidth_share\":%.4g", row->bytes, byte_share,
                    cpu_byte_share);
@@ -81,7 +90,9 @@ static void bench_print(int json, const bench_row* row) {
     } else {
         printf("%-44s %-8s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->variant, row->isa, row->threads,
                1e3 * row->seconds, 1e3 * row->cpu_seconds, rate, row->work_unit);
-        if (row->flops > 0.0) printf("  %.1f%% (cpu %.1f%%) of the FMA peak", 100.0 * flop_share, 100.0 * cpu * flop_share);
+        if (work > 0.0)
+            printf("  %.1f%% (cpu %.1f%%) of the %s peak", 100.0 * flop_share, 100.0 * cpu * flop_share,
+                   row->ops > 0.0 ? "integer" : "FMA");
         if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * byte_share, 100.0 * cpu_byte_share);
         if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
         if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
@@ -141,11 +152,27 @@ GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker)
     }
     _mm256_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
 }
+
+GSF__TARGET_AVX512 static void bench_fma_avx512(void* arg, size_t chunk, int worker) {
+    const __m512 a = _mm512_set1_ps(0.999f), b = _mm512_set1_ps(0.001f);
+    (void)worker;
+#define BENCH_WIDE(k) __m512 v##k = _mm512_set1_ps((float)k);
+    BENCH_TEN(BENCH_WIDE)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_WIDE_STEP(k) v##k = _mm512_fmadd_ps(v##k, a, b);
+        BENCH_TEN(BENCH_WIDE_STEP)
+    }
+    _mm512_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
+}
 #endif
 
 static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* lanes) {
     *lanes = 1.0;
 #if GSF__X86
+    if (level >= GSF_CPU_AVX512) {
+        *lanes = 16.0;
+        return bench_fma_avx512;
+    }
     if (level >= GSF_CPU_AVX2) {
         *lanes = 8.0;
         return bench_fma_avx2;

@@ -1,7 +1,7 @@
 // bench_nn.c - seconds beside error of the network kernels.
 // By hand: cc -O2 -fopenmp -I. bench/bench_nn.c -o bench_nn -lm
 //
-//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--model FOLDER | --pipeline FOLDER...]
+//     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] [--model FOLDER | --pipeline FOLDER...]
 //
 // First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
 // released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
@@ -26,9 +26,15 @@
 
 typedef struct bench_options {
     int json, quick, threads;
+    gsf_cpu_level level; // of all but the smallest cases, which are run at every level
     const char *filter, *model, *pipelines[4];
     int pipeline_count;
 } bench_options;
+
+// Every instruction set of the machine; bench_context leaves those out that it lacks.
+#define BENCH_EACH(level) \
+    for (gsf_cpu_level level = GSF_CPU_SCALAR; level <= bench_best_level; level = (gsf_cpu_level)(level + 1))
+static gsf_cpu_level bench_best_level;
 
 static int bench_wanted(const bench_options* o, const char* name, int threads) {
     return (!o->filter || strstr(name, o->filter)) && (!o->threads || o->threads == threads);
@@ -72,12 +78,27 @@ GSF__TARGET_AVX2 static void bench_read_avx2(void* arg, size_t chunk, int worker
     }
     _mm256_storeu_ps(job->sums + 16 * chunk, _mm256_xor_ps(_mm256_xor_ps(a, b), _mm256_xor_ps(c, d)));
 }
+
+GSF__TARGET_AVX512 static void bench_read_avx512(void* arg, size_t chunk, int worker) {
+    const bench_read* job = (const bench_read*)arg;
+    const float* p = (const float*)(const void*)(job->memory + chunk * READ_CHUNK);
+    __m512 a = _mm512_setzero_ps(), b = a, c = a, d = a;
+    (void)worker;
+    for (int i = 0; i < READ_CHUNK / 4; i += 64) {
+        a = _mm512_xor_ps(a, _mm512_load_ps(p + i));
+        b = _mm512_xor_ps(b, _mm512_load_ps(p + i + 16));
+        c = _mm512_xor_ps(c, _mm512_load_ps(p + i + 32));
+        d = _mm512_xor_ps(d, _mm512_load_ps(p + i + 48));
+    }
+    _mm512_storeu_ps(job->sums + 16 * chunk, _mm512_xor_ps(_mm512_xor_ps(a, b), _mm512_xor_ps(c, d)));
+}
 #endif
 
 static void bench_read_all(gsf_context* ctx, bench_read* job) {
     gsf_chunk_fn reader = bench_read_scalar;
 #if GSF__X86
     if (ctx->cpu_level >= GSF_CPU_AVX2) reader = bench_read_avx2;
+    if (ctx->cpu_level >= GSF_CPU_AVX512) reader = bench_read_avx512;
 #endif
     gsf__parallel_for(ctx, job->size / READ_CHUNK, reader, job);
     bench_sink += job->sums[0];
@@ -92,13 +113,72 @@ static bench_read bench_make_read(gsf_context* ctx, const char* memory, size_t s
     return read;
 }
 
+// Integers: a dot product per step in each 32-bit lane, of four bytes where there are instructions for it, else of pairs.
+
+#if GSF__X86
+#define BENCH_DOT_STEP(k) v##k = BENCH_DOT(v##k); __asm__("" : "+v"(v##k)); // no equal products, computed once
+GSF__TARGET_AVX2 static void bench_dot_avx2(void* arg, size_t chunk, int worker) {
+    const __m256i a = _mm256_set1_epi32(0x10001);
+    (void)worker;
+#define BENCH_INTEGERS(k) __m256i v##k = _mm256_set1_epi32(k);
+    BENCH_TEN(BENCH_INTEGERS)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_DOT(v) _mm256_madd_epi16(v, a)
+        BENCH_TEN(BENCH_DOT_STEP)
+#undef BENCH_DOT
+    }
+    const __m256i sum = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
+    _mm256_storeu_si256((__m256i*)(void*)((float*)arg + 16 * chunk), sum);
+}
+
+#define BENCH_WIDE_INTEGERS(k) __m512i v##k = _mm512_set1_epi32(k);
+#define BENCH_STORE_INTEGERS                                                                \
+    const __m512i sum = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;                    \
+    _mm512_storeu_si512((float*)arg + 16 * chunk, sum);
+GSF__TARGET_AVX512 static void bench_dot_avx512(void* arg, size_t chunk, int worker) {
+    const __m512i a = _mm512_set1_epi32(0x10001);
+    (void)worker;
+    BENCH_TEN(BENCH_WIDE_INTEGERS)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_DOT(v) _mm512_madd_epi16(v, a)
+        BENCH_TEN(BENCH_DOT_STEP)
+#undef BENCH_DOT
+    }
+    BENCH_STORE_INTEGERS
+}
+
+GSF__TARGET_VNNI static void bench_dot_vnni(void* arg, size_t chunk, int worker) {
+    const __m512i a = _mm512_set1_epi32(0x1010101);
+    (void)worker;
+    BENCH_TEN(BENCH_WIDE_INTEGERS)
+    for (int i = 0; i < FMA_ROUNDS; i++) {
+#define BENCH_DOT(v) _mm512_dpbusd_epi32(v, a, a)
+        BENCH_TEN(BENCH_DOT_STEP)
+#undef BENCH_DOT
+    }
+    BENCH_STORE_INTEGERS
+}
+#endif
+
+static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* products) { // multiplications per step; NULL: none
+#if GSF__X86
+    *products = level >= GSF_CPU_AVX512_VNNI ? 64.0 : level >= GSF_CPU_AVX512 ? 32.0 : 16.0;
+    if (level >= GSF_CPU_AVX512_VNNI) return bench_dot_vnni;
+    if (level >= GSF_CPU_AVX512) return bench_dot_avx512;
+    if (level >= GSF_CPU_AVX2) return bench_dot_avx2;
+#endif
+    (void)level;
+    *products = 0.0;
+    return NULL;
+}
+
 static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads, const char* memory, size_t size) {
     gsf_context ctx;
     if (!bench_context(&ctx, level, threads)) return;
     bench_read read = bench_make_read(&ctx, memory, size);
-    double lanes;
-    const gsf_chunk_fn fma = bench_fma_of(level, &lanes);
-    double best[2] = {1e30, 1e30}; // CPU seconds
+    double lanes, products;
+    const gsf_chunk_fn fma = bench_fma_of(level, &lanes), dot = bench_dot_of(level, &products);
+    double best[3] = {1e30, 1e30, 1e30}; // CPU seconds
     for (int i = 0; i < 9; i++) {
         const double t0 = bench_cpu();
         gsf__parallel_for(&ctx, 4 * (size_t)threads, fma, read.sums);
@@ -107,13 +187,23 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
         const double t2 = bench_cpu();
         if (t1 - t0 < best[0]) best[0] = t1 - t0;
         if (t2 - t1 < best[1]) best[1] = t2 - t1;
+        if (!dot) continue;
+        gsf__parallel_for(&ctx, 4 * (size_t)threads, dot, read.sums);
+        const double t3 = bench_cpu();
+        if (t3 - t2 < best[2]) best[2] = t3 - t2;
     }
-    const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 4.0 * threads;
-    bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
+    const double steps = FMA_CHAINS * (double)FMA_ROUNDS * 4.0 * threads, flops = 2.0 * lanes * steps;
+    bench_peak* peak = &bench_peaks[level][threads];
     peak->flops = flops * threads / best[0];
+    peak->ops = dot ? 2.0 * products * steps * threads / best[2] : 0.0;
     peak->bytes = (double)size * threads / best[1];
     bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0] / threads, best[0], flops, "flop");
     bench_print(o->json, &row);
+    if (dot) {
+        row = bench_make_row("machine: integer dot products", level, threads, best[2] / threads, best[2],
+                             2.0 * products * steps, "op");
+        bench_print(o->json, &row);
+    }
     row = bench_make_row("machine: read memory", level, threads, best[1] / threads, best[1], (double)size, "B");
     bench_print(o->json, &row);
     gsf_free(&ctx, read.sums);
@@ -299,12 +389,11 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
     static const gsf_nn_dtype dtypes[] = {GSF_NN_F32, GSF_NN_BF16, GSF_NN_F16};
     for (int threads = 1; threads <= 2; threads++)
         for (size_t t = 0; t < GSF__COUNT(dtypes); t++) {
-            bench_one_linear(o, GSF_CPU_SCALAR, threads, dtypes[t], 64, 256, 256, GSF_NN_LINEAR, memory, size);
-            bench_one_linear(o, GSF_CPU_AVX2, threads, dtypes[t], 64, 256, 256, GSF_NN_LINEAR, memory, size);
+            BENCH_EACH(level) bench_one_linear(o, level, threads, dtypes[t], 64, 256, 256, GSF_NN_LINEAR, memory, size);
             for (size_t i = 0; i < GSF__COUNT(shapes); i++) {
                 const bench_shape* s = &shapes[i];
                 if (o->quick && !s->quick) continue;
-                bench_one_linear(o, GSF_CPU_AVX2, threads, dtypes[t], s->rows, s->out, s->in, s->activation, memory, size);
+                bench_one_linear(o, o->level, threads, dtypes[t], s->rows, s->out, s->in, s->activation, memory, size);
             }
         }
 }
@@ -331,8 +420,7 @@ static void bench_run_quantize(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_quantize_weight(ctx, &l->linear.weight, 0, &l->weight));
 }
 
-// Floats in; rotation, rounding, product, scales and bias counted. Its share is of the float FMA peak: AVX2 without VNNI ends
-// at 200% (16-bit multiply-adds, two per cycle), and errors are those of the rounding, not of sums.
+// Floats in; rotation, rounding, product, scales and bias counted. Errors are those of the rounding, not of sums.
 static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int threads, int64_t rows, int64_t out, int64_t in,
                            char* memory, size_t size) {
     char name[96];
@@ -375,7 +463,7 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
         bench_time_beside(o, &ctx, &row, bench_run_int8, &many, (double)many.linear.copies, &read);
         gsf_free(&ctx, read.sums);
     } else {
-        row.flops = ops;
+        row.ops = ops;
         bench_time(o, &ctx, &row, bench_run_int8, &l, 1.0);
     }
     bench_print(o->json, &row);
@@ -400,11 +488,10 @@ static void bench_int8s(const bench_options* o, char* memory, size_t size) {
         {2048, 12288, 3072, GSF_NN_LINEAR, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0}, {17776, 3072, 3072, GSF_NN_LINEAR, 0},
     };
     for (int threads = 1; threads <= 2; threads++) {
-        bench_one_int8(o, GSF_CPU_SCALAR, threads, 64, 256, 256, memory, size);
-        bench_one_int8(o, GSF_CPU_AVX2, threads, 64, 256, 256, memory, size);
+        BENCH_EACH(level) bench_one_int8(o, level, threads, 64, 256, 256, memory, size);
         for (size_t i = 0; i < GSF__COUNT(shapes); i++)
             if (!o->quick || shapes[i].quick)
-                bench_one_int8(o, GSF_CPU_AVX2, threads, shapes[i].rows, shapes[i].out, shapes[i].in, memory,
+                bench_one_int8(o, o->level, threads, shapes[i].rows, shapes[i].out, shapes[i].in, memory,
                                size);
     }
 }
@@ -486,12 +573,11 @@ static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int
 
 static void bench_attentions(const bench_options* o) {
     for (int threads = 1; threads <= 2; threads++) {
-        bench_one_attention(o, GSF_CPU_SCALAR, threads, 4, 64, 256);
-        bench_one_attention(o, GSF_CPU_AVX2, threads, 4, 64, 256);
-        bench_one_attention(o, GSF_CPU_AVX2, threads, 48, 1024, 1024);
+        BENCH_EACH(level) bench_one_attention(o, level, threads, 4, 64, 256);
+        bench_one_attention(o, o->level, threads, 48, 1024, 1024);
         if (o->quick) continue;
-        bench_one_attention(o, GSF_CPU_AVX2, threads, 48, 4096, 4096);
-        bench_one_attention(o, GSF_CPU_AVX2, threads, 48, 17550, 1850);
+        bench_one_attention(o, o->level, threads, 48, 4096, 4096);
+        bench_one_attention(o, o->level, threads, 48, 17550, 1850);
     }
 }
 
@@ -594,9 +680,8 @@ static void bench_norms(const bench_options* o) {
             if (kind == GROUP_NORM) { rows = 128; dim = o->quick ? 57600 : 345600; }
             if (kind == SOFTMAX) { rows = o->quick ? 512 : 4096; dim = 17776; }
             if (kind == GELU || kind == SILU) dim = 12288;
-            bench_one_rows(o, GSF_CPU_SCALAR, threads, (bench_kind)kind, 64, 256);
-            bench_one_rows(o, GSF_CPU_AVX2, threads, (bench_kind)kind, 64, 256);
-            bench_one_rows(o, GSF_CPU_AVX2, threads, (bench_kind)kind, rows, dim);
+            BENCH_EACH(level) bench_one_rows(o, level, threads, (bench_kind)kind, 64, 256);
+            bench_one_rows(o, o->level, threads, (bench_kind)kind, rows, dim);
         }
 }
 
@@ -705,7 +790,7 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
     snprintf(name, sizeof name, "vae resnet C=%lld T=%lld H=%lld W=%lld", (long long)channels, (long long)frames,
              (long long)height, (long long)width);
     gsf_context ctx;
-    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
     bench_resnet r;
     memset(&r, 0, sizeof r);
     const int64_t shape[5] = {channels, channels, 3, 3, 3};
@@ -734,7 +819,7 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
     bench_fill(r.run.slots[0].data, values * sizeof(float), GSF_NN_F32, 1);
     for (int64_t g = 0; g < 2 * r.net.groups; g++) // what filling it would have summed up: mean 0, deviation 3/8
         gsf__vae_sums(&r.run, 0)[g] = g % 2 ? 0.140625 * (double)values / 32.0 : 0.0;
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, 2.0 * 54.0 * (double)values * (double)channels, "flop");
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, 2.0 * 54.0 * (double)values * (double)channels, "flop");
     row.flops = row.work;
     bench_time(o, &ctx, &row, bench_run_resnet, &r, 1.0);
     bench_print(o->json, &row);
@@ -744,10 +829,9 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
 
 static void bench_convs(const bench_options* o) {
     for (int threads = 1; threads <= 2; threads++) {
-        bench_one_conv(o, GSF_CPU_SCALAR, threads, 32, 4, 20, 30);
-        bench_one_conv(o, GSF_CPU_AVX2, threads, 32, 4, 20, 30);
-        if (!o->quick) bench_one_conv(o, GSF_CPU_AVX2, threads, 512, 4, 60, 90);
-        bench_one_conv(o, GSF_CPU_AVX2, threads, 128, o->quick ? 1 : 4, o->quick ? 60 : 240, o->quick ? 90 : 360);
+        BENCH_EACH(level) bench_one_conv(o, level, threads, 32, 4, 20, 30);
+        if (!o->quick) bench_one_conv(o, o->level, threads, 512, 4, 60, 90);
+        bench_one_conv(o, o->level, threads, 128, o->quick ? 1 : 4, o->quick ? 60 : 240, o->quick ? 90 : 360);
         bench_one_resnet(o, threads, 128, o->quick ? 1 : 4, o->quick ? 60 : 240, o->quick ? 90 : 360);
     }
 }
@@ -822,7 +906,7 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     snprintf(name, sizeof name, "block %s S=%lld R=%lld", dtype == GSF_NN_F32 ? "f32" : "bf16", (long long)tokens,
              (long long)references);
     gsf_context ctx;
-    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
     bench_block b;
     memset(&b, 0, sizeof b);
     bench_block_sizes(&b, tokens, references);
@@ -844,7 +928,7 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     double bytes, flops;
     gsf_nn_transformer_cost(&b.net, &b.in, &bytes, &flops);
     flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_block, &b, 1.0);
     bench_print(o->json, &row);
@@ -937,7 +1021,7 @@ static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers
     char name[96];
     snprintf(name, sizeof name, "dinov2 f32 %dx%d L=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)layers);
     gsf_context ctx;
-    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
     const gsf__vit_entry* entries = gsf__dinov2_block_entries;
     const size_t count = GSF__COUNT(gsf__dinov2_block_entries), others = GSF__COUNT(gsf__dinov2_entries);
     bench_vit* b = (bench_vit*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
@@ -955,7 +1039,7 @@ static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers
     b->out = memory + pixels;
     double flops;
     gsf_nn_dinov2_cost(&b->net, &b->in, NULL, &flops);
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_dinov2, b, 1.0);
     bench_print(o->json, &row);
@@ -977,7 +1061,7 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
     char name[96];
     snprintf(name, sizeof name, "vggt pair f32 %dx%d N=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)images);
     gsf_context ctx;
-    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
     const gsf__vit_entry* entries = gsf__vggt_block_entries;
     const size_t count = GSF__COUNT(gsf__vggt_block_entries);
     bench_vit* b = (bench_vit*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
@@ -1010,7 +1094,7 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
     gsf__vggt_make_rotation(100.0, BENCH_VIT_ACROSS, quarter, table, table + rotation);
     const double flops = gsf__vit_block_flops(run->sizes, images, (double)run->image_tokens) +
                          gsf__vit_block_flops(run->sizes, 1.0, (double)rows);
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_pair, b, 1.0);
     bench_print(o->json, &row);
@@ -1408,7 +1492,7 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
     char name[96];
     snprintf(name, sizeof name, "t5 layer %s S=%d", dtype == GSF_NN_F32 ? "f32" : "bf16", (int)tokens);
     gsf_context ctx;
-    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
     bench_t5 b;
     memset(&b, 0, sizeof b);
     b.net.width = 4096;
@@ -1437,7 +1521,7 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
     b.first = memory + (size_t)l.total;
     double bytes, flops;
     gsf_nn_t5_cost(&b.net, &b.in, &bytes, &flops);
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, flops, "flop");
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_t5, &b, 1.0);
     bench_print(o->json, &row);
@@ -1500,7 +1584,7 @@ static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     char name[96];
     snprintf(name, sizeof name, "opt layer f16 D=%d rows=%lld", BENCH_OPT_WIDTH, (long long)rows);
     gsf_context ctx;
-    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, GSF_CPU_AVX2, threads)) return;
+    if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
     bench_opt* b = (bench_opt*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
     gsf__opt* opt = &b->net.text;
     opt->sizes.width = BENCH_OPT_WIDTH;
@@ -1536,7 +1620,7 @@ static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     for (size_t i = 0; i < p.mask; i++) b->state.mask[i] = (int64_t)i % rows <= (int64_t)i / rows % rows;
     const double d = BENCH_OPT_WIDTH, n = (double)rows;
     const double flops = 24.0 * n * d * d + 4.0 * n * (n + (double)b->past) * d;
-    bench_row row = bench_make_row(name, GSF_CPU_AVX2, threads, 0.0, 0.0, rows > 1 ? flops : (double)bytes,
+    bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, rows > 1 ? flops : (double)bytes,
                                    rows > 1 ? "flop" : "B");
     if (rows > 1) row.flops = flops;
     else row.bytes = (double)bytes;
@@ -1564,22 +1648,25 @@ int main(int argc, char** argv) {
         else if (strcmp(argv[i], "--quick") == 0) o.quick = 1;
         else if (value && strcmp(argv[i], "--filter") == 0) o.filter = argv[++i];
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
+        else if (value && strcmp(argv[i], "--isa") == 0) o.level = bench_level_of(argv[++i]);
         else if (value && strcmp(argv[i], "--model") == 0) o.model = argv[++i];
         else if (value && strcmp(argv[i], "--pipeline") == 0 && o.pipeline_count < 4) o.pipelines[o.pipeline_count++] = argv[++i];
         else {
-            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--model FOLDER] [--pipeline FOLDER]...\n");
+            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] [--model FOLDER] [--pipeline FOLDER]...\n");
             return 2;
         }
     }
     gsf_context ctx;
     (void)bench_context(&ctx, GSF_CPU_AUTO, 1);
+    bench_best_level = ctx.cpu_level;
+    (void)bench_context(&ctx, o.level, 1);
+    o.level = ctx.cpu_level; // what the machine has of it
     const size_t size = (size_t)1 << (o.quick ? 28 : 30); // more than any cache
     char* memory = (char*)bench_alloc(&ctx, size, 1);
     bench_fill(memory, size, GSF_NN_F32, 1);
     for (int threads = 1; threads <= 2; threads++) {
         if (o.threads && o.threads != threads) continue;
-        bench_machine(&o, GSF_CPU_SCALAR, threads, memory, size);
-        bench_machine(&o, GSF_CPU_AVX2, threads, memory, size);
+        BENCH_EACH(level) bench_machine(&o, level, threads, memory, size);
     }
     if (o.model || o.pipeline_count) {
         gsf_free(&ctx, memory);

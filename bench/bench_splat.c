@@ -64,7 +64,7 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     }
     const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 2.0 * threads;
     const double bytes = 3.0 * (double)TRIAD_CHUNKS * TRIAD_FLOATS * sizeof(float);
-    bench_peak* peak = &bench_peaks[level > GSF_CPU_SCALAR][threads];
+    bench_peak* peak = &bench_peaks[level][threads];
     peak->flops = flops / best[0];
     peak->bytes = bytes / best[1];
     bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0], best[0] * threads, flops, "flop");
