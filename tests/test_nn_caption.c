@@ -402,11 +402,6 @@ static void see_tap(void* user, const char* name, const float* data, int64_t row
     s->stages++;
 }
 
-static void muddled_for(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
-
 typedef struct watcher { gsf_context* ctx; double stop_at, last, total; int calls; } watcher;
 
 static void watch_progress(void* user, const char* stage, double done, double total) {
@@ -430,10 +425,7 @@ static void test_runs(const gsf_image* photo) {
         int32_t* ids;
         size_t count;
         test_context_zero(&ctx);
-        if (k) {
-            ctx.parallel.for_fn = muddled_for;
-            ctx.parallel.worker_count = 3;
-        }
+        if (k) work_backwards(&ctx);
         memset(&w, 0, sizeof w);
         w.ctx = &ctx;
         ctx.progress.progress_fn = watch_progress;
@@ -470,9 +462,7 @@ static void test_memory(const gsf_image* photo) {
         gsf_nn_captioner net;
         char caption[256];
         test_context_zero(&ctx);
-        ctx.allocator.alloc_fn = counted_alloc;
-        ctx.allocator.free_fn = counted_free;
-        ctx.allocator.user = &c;
+        count_memory(&ctx, &c);
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         c.fail_at = fail;
         gsf_result result = gsf_nn_make_captioner(&ctx, blip2_golden(), &net);

@@ -364,9 +364,7 @@ static void test_memory(void) {
         memset(&c, 0, sizeof c);
         memset(&sampler, 0, sizeof sampler);
         test_context_zero(&ctx);
-        ctx.allocator.alloc_fn = counted_alloc;
-        ctx.allocator.free_fn = counted_free;
-        ctx.allocator.user = &c;
+        count_memory(&ctx, &c);
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         c.fail_at = k;
         gsf_result r = gsf_nn_make_schedule(&ctx, NULL, &schedule);
