@@ -2,6 +2,7 @@
 #ifndef ENCODERS_BLIP2_H
 #define ENCODERS_BLIP2_H
 
+#include "blip2_folder.h"
 #include "encoders_golden.h"
 
 // Largest errors allowed; reached: 0, 2e-6, 2e-6, 5e-6, 5e-6 for values of about 1.
@@ -106,44 +107,19 @@ static void check_blip2_run(blip2_case* c, const gsf_nn_captioner* net, const gs
     if (CHECK(text && text->type == GSF_JSON_STRING)) check_blip2_text(text, caption);
 }
 
-// The folder once more without image_token_index, through an io hook: its default is three tokens less.
-typedef struct blip2_legacy { gsf_context plain; } blip2_legacy;
-
-static gsf_result blip2_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
-    static const char key[] = "\"image_token_index\"";
-    blip2_legacy* legacy = (blip2_legacy*)user;
-    void* bytes;
-    gsf_result result = gsf_read_file(&legacy->plain, path, &bytes, size);
-    if (result) return gsf_fail(ctx, result, "%s", legacy->plain.error);
-    *data = gsf_alloc(ctx, *size + 1, 1);
-    memcpy(*data, bytes, *size);
-    ((char*)*data)[*size] = 0;
-    char* found = strstr(path, "config.json") ? strstr((char*)*data, key) : NULL;
-    if (found) found[1] = '_';
-    gsf_free(&legacy->plain, bytes);
-    return GSF_OK;
-}
-
-static gsf_result blip2_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
-    (void)user, (void)data, (void)size;
-    return gsf_fail(ctx, GSF_ERROR_IO, "%s", path);
-}
-
+// The folder once more without image_token_index: its default is three tokens less.
 static void check_blip2_legacy(const gsf_image* image, const gsf_json* json, const gsf_json_value* expected,
                                size_t queries) {
-    blip2_legacy legacy;
+    blip2_folder folder;
     gsf_context ctx;
     gsf_nn_captioner net;
     gsf_nn_caption_desc d;
     int32_t* ids;
     size_t count;
-    test_context_init(&legacy.plain);
-    test_context_zero(&ctx);
-    ctx.io.read_fn = blip2_read;
-    ctx.io.write_fn = blip2_write;
-    ctx.io.user = &legacy;
-    CHECK_OK(&ctx, gsf_init_context(&ctx));
-    if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, test_golden("encoders/blip2"), &net))) return;
+    blip2_open(&folder, &ctx);
+    char* config = blip2_edit("config.json", "\"image_token_index\"", "\"unused\"");
+    blip2_put(&folder, "config.json", config, 0);
+    if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) return;
     CHECK(net.image_token == -1);
     memset(&d, 0, sizeof d);
     d.image = image;
@@ -156,6 +132,7 @@ static void check_blip2_legacy(const gsf_image* image, const gsf_json* json, con
     gsf_free(&ctx, ids);
     CHECK(count > 0 && net.query_tokens == (int32_t)queries);
     gsf_nn_destroy_captioner(&ctx, &net);
+    free(config);
 }
 
 static void check_blip2_tokens(gsf_context* ctx, const gsf_nn_bpe* bpe, const gsf_json* json) {
@@ -188,7 +165,7 @@ static void check_blip2(void) {
     blip2_case c;
     size_t size, index = 0;
     test_context_init(&ctx);
-    if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, test_golden("encoders/blip2"), &net))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) return;
     char* text = test_read_file(test_golden("encoders/blip2/expected.json"), &size);
     if (!CHECK_OK(&ctx, gsf_parse_json(&ctx, "expected.json", text, size, &json))) return;
     check_blip2_tokens(&ctx, &net.tokenizer, &json);

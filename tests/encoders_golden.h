@@ -18,18 +18,72 @@ static inline void check_rows(const char* what, const float* actual, int64_t row
         fprintf(stderr, "    largest error %.3g, allowed %.3g\n", worst, bar);
 }
 
-// The images of one case as an encoder takes them; a leading dimension of 1 is passed over.
-static inline float* golden_images(const test_tensors* file, const char* name, gsf_nn_encoder_input* in) { // to be freed
-    test_tensor t = test_get_tensor(file, name);
-    float* pixels = test_tensor_floats(&t);
-    const size_t* dim = t.dim + (t.rank - 4);
+// Images as an encoder takes them; a leading dimension of 1 is passed over.
+static inline float* golden_images(const test_tensor* t, gsf_nn_encoder_input* in) { // to be freed
+    float* pixels = test_tensor_floats(t);
+    const size_t* dim = t->dim + (t->rank - 4);
     memset(in, 0, sizeof *in);
     in->pixels = pixels;
     in->images = (int32_t)dim[0];
     in->height = (int32_t)dim[2];
     in->width = (int32_t)dim[3];
-    test_free_tensor(&t);
     return pixels;
+}
+
+// An encoder of images, and where its cases stand: caseN.INPUT gives caseN.OUTPUT.
+typedef struct golden_encoder {
+    const void* net;
+    const char *input, *output;
+    int64_t patch, special, width; // width: channels of a token
+    double bar;
+    gsf_result (*encode)(gsf_context* ctx, const void* net, const gsf_nn_encoder_input* in, float* out);
+    void (*see_tap)(void* encoder, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
+    test_tensors expected;
+    int index, images, seen; // of the case at work: number, images, intermediates compared
+} golden_encoder;
+
+static inline test_tensor golden_case(const golden_encoder* e, const char* name) { // .v NULL when absent
+    char whole[96];
+    snprintf(whole, sizeof whole, "case%d.%s", e->index, name);
+    return test_find_tensor(&e->expected, whole);
+}
+
+static inline void check_encoder_case(gsf_context* ctx, golden_encoder* e, gsf_nn_encoder_input in) {
+    const int64_t d = e->width, tokens = in.height / e->patch * (in.width / e->patch), all = tokens + e->special;
+    const size_t count = (size_t)(in.images * all * d);
+    float* out = (float*)malloc(count * sizeof(float));
+    test_tensor last = golden_case(e, e->output);
+    if (CHECK(last.count == count)) {
+        in.tap_fn = e->see_tap;
+        in.tap_user = e;
+        e->images = in.images;
+        e->seen = 0;
+        CHECK_OK(ctx, e->encode(ctx, e->net, &in, out));
+        CHECK(e->seen >= in.images);
+        for (int64_t i = 0; i < in.images; i++)
+            check_rows("patches", out + i * tokens * d, tokens, d, d, last.v + (i * all + e->special) * d, d, e->bar);
+        in.all_tokens = 1;
+        in.tap_fn = NULL;
+        CHECK_OK(ctx, e->encode(ctx, e->net, &in, out));
+        check_rows("all tokens", out, in.images * all, d, d, last.v, d, e->bar);
+    }
+    test_free_tensor(&last);
+    free(out);
+}
+
+// All cases of a file; leaves it open, and their count in e->index.
+static inline void check_encoder(gsf_context* ctx, golden_encoder* e, const char* file) {
+    e->expected = test_open_tensors(test_golden(file));
+    for (e->index = 0;; e->index++) {
+        test_tensor input = golden_case(e, e->input);
+        if (!input.v) break;
+        gsf_nn_encoder_input in;
+        float* pixels = golden_images(&input, &in);
+        check_encoder_case(ctx, e, in);
+        free(pixels);
+        test_free_tensor(&input);
+    }
+    CHECK(e->index > 0);
 }
 
 #endif

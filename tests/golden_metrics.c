@@ -1,6 +1,7 @@
 // PSNR and SSIM against golden/metrics (float64 runs of the references) and against plain double loops.
 #include "gsfixer.h"
 #include "test.h"
+#include "test_hooks.h"
 
 typedef struct pair { // planar u8 views of the golden tensors, and packed f32 copies (value / 255)
     uint8_t *a8, *b8;
@@ -216,12 +217,6 @@ static void check_masks(gsf_context* ctx, const pair* p) {
     free(bytes);
 }
 
-// Chunks backwards on three workers in turn: what a host's job system may do.
-static void reversed_for(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i % 3));
-}
-
 // Same bits for any worker count and instruction set; noise of a size that takes several chunks.
 static void check_determinism(gsf_context* ctx) {
     enum { W = 211, H = 173 };
@@ -234,8 +229,7 @@ static void check_determinism(gsf_context* ctx) {
     const gsf_image x = gsf_wrap_image(a, GSF_F32, W, H, 3), y = gsf_wrap_image(b, GSF_F32, W, H, 3);
     gsf_context other;
     test_context_zero(&other);
-    other.parallel.for_fn = reversed_for;
-    other.parallel.worker_count = 3;
+    work_backwards(&other);
     CHECK_OK(&other, gsf_init_context(&other));
     gsf_context scalar;
     memset(&scalar, 0, sizeof scalar);

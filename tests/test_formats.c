@@ -11,23 +11,13 @@
 #define TESTS "tests"
 #endif
 
-static void backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) { // as no serial loop would run them
-    (void)user;
-    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)(i % 3));
-}
-
 static gsf_context make_context(counter* c, int odd) {
     gsf_context ctx;
     test_context_zero(&ctx);
     memset(c, 0, sizeof *c);
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = c;
+    count_memory(&ctx, c);
     ctx.logger.log_fn = keep_warning;
-    if (odd) {
-        ctx.parallel.for_fn = backwards;
-        ctx.parallel.worker_count = 3;
-    }
+    if (odd) work_backwards(&ctx);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     warnings = 0;
     warning[0] = 0;

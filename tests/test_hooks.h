@@ -1,11 +1,11 @@
-// test_hooks.h - hooks of tests that look at memory and warnings: an allocator that counts, and fails when told; a log that
-// keeps the last warning.
+// test_hooks.h - hooks of tests that look at memory, warnings and workers: an allocator that counts, and fails when told;
+// a log that keeps the last warning; workers that take the chunks in another order.
 #ifndef TEST_HOOKS_H
 #define TEST_HOOKS_H
 
 typedef struct counter { size_t live, calls, fail_at, asked; } counter; // fail_at: 1 = the first call; 0 = never
 
-static void* counted_alloc(void* user, size_t size) {
+static inline void* counted_alloc(void* user, size_t size) {
     counter* c = (counter*)user;
     if (++c->calls == c->fail_at) return NULL;
     c->asked += size;
@@ -13,9 +13,14 @@ static void* counted_alloc(void* user, size_t size) {
     if (p) c->live++;
     return p;
 }
-static void counted_free(void* user, void* memory) {
+static inline void counted_free(void* user, void* memory) {
     if (memory) ((counter*)user)->live--;
     free(memory);
+}
+static inline void count_memory(gsf_context* ctx, counter* c) {
+    ctx->allocator.alloc_fn = counted_alloc;
+    ctx->allocator.free_fn = counted_free;
+    ctx->allocator.user = c;
 }
 
 static char warning[1024]; // last one logged
@@ -25,6 +30,16 @@ static inline void keep_warning(void* user, gsf_log_level level, const char* tex
     if (level != GSF_LOG_WARNING) return;
     snprintf(warning, sizeof warning, "%s", text);
     warnings++;
+}
+
+// Backwards, and the workers in turn, so that scratch left by other chunks is met again.
+static inline void backwards(void* user, size_t count, gsf_chunk_fn body, void* arg) {
+    (void)user;
+    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i % 3));
+}
+static inline void work_backwards(gsf_context* ctx) {
+    ctx->parallel.for_fn = backwards;
+    ctx->parallel.worker_count = 3;
 }
 
 #endif

@@ -8,6 +8,7 @@
 #undef main
 
 #include "test.h"
+#include "test_hooks.h"
 
 #define SINGLE "/diffusion_pytorch_model.safetensors" // of the diffusion model's parts; the encoders'
 #define INDEX SINGLE ".index.json"
@@ -40,11 +41,6 @@ static model_options options(const folder* out, const char* size) {
     o.shards = 1;
     o.parts = MODEL_ALL;
     return o;
-}
-
-static void backwards(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)(i % 3));
 }
 
 static int same_file(const folder* a, const folder* b, const char* name) {
@@ -113,8 +109,7 @@ static void check_same(gsf_context* ctx) {
 
     gsf_context three;
     memset(&three, 0, sizeof three);
-    three.parallel.for_fn = backwards;
-    three.parallel.worker_count = 3;
+    work_backwards(&three);
     CHECK_OK(&three, gsf_init_context(&three));
     o.out = again.path;
     o.shards = 3; // and then one: the index must go

@@ -3,78 +3,8 @@
 //     test_nn_caption encode FOLDER FILE    prints the tokens of texts for compare_bpe.py
 #include "gsfixer_nn.h"
 
-#include "test.h"
+#include "blip2_folder.h"
 #include "test_hooks.h"
-
-// ---- the golden folder with some files replaced, through the io hook -----------------
-
-typedef struct file { const char* name; const char* text; size_t size; } file; // size 0: a string; text NULL: not there
-
-typedef struct folder {
-    gsf_context plain;
-    file files[6];
-    size_t count;
-} folder;
-
-static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
-    folder* f = (folder*)user;
-    const char* name = strrchr(path, '/') + 1;
-    for (size_t i = 0; i < f->count; i++) {
-        if (strcmp(f->files[i].name, name) != 0) continue;
-        if (!f->files[i].text) return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
-        *size = f->files[i].size ? f->files[i].size : strlen(f->files[i].text);
-        *data = gsf_alloc(ctx, *size, 1);
-        if (!*data) return GSF_ERROR_OUT_OF_MEMORY;
-        memcpy(*data, f->files[i].text, *size);
-        return GSF_OK;
-    }
-    void* read;
-    const gsf_result result = gsf_read_file(&f->plain, path, &read, size);
-    if (result) return gsf_fail(ctx, result, "%s", f->plain.error);
-    *data = gsf_alloc(ctx, *size, 1);
-    if (*data) memcpy(*data, read, *size);
-    gsf_free(&f->plain, read);
-    return *data ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-}
-
-static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
-    (void)user, (void)data, (void)size;
-    return gsf_fail(ctx, GSF_ERROR_IO, "%s", path);
-}
-
-static const char* golden_folder(void) { return test_golden("encoders/blip2"); }
-
-static void init_folder(folder* f, gsf_context* ctx) {
-    memset(f, 0, sizeof *f);
-    test_context_init(&f->plain);
-    test_context_zero(ctx);
-    ctx->io.read_fn = read_fn;
-    ctx->io.write_fn = write_fn;
-    ctx->io.user = f;
-    CHECK_OK(ctx, gsf_init_context(ctx));
-}
-
-static void put_file(folder* f, const char* name, const char* text, size_t size) {
-    f->files[f->count].name = name;
-    f->files[f->count].text = text;
-    f->files[f->count++].size = size;
-}
-
-// The golden file with `from` replaced by `to`; to be freed.
-static char* edit_file(const char* name, const char* from, const char* to) {
-    char path[256];
-    size_t size;
-    snprintf(path, sizeof path, "encoders/blip2/%s", name);
-    char* text = test_read_file(test_golden(path), &size);
-    char* at = strstr(text, from);
-    char* out = (char*)malloc(size + strlen(to) + 1);
-    if (!CHECK(at != NULL)) at = text;
-    memcpy(out, text, (size_t)(at - text));
-    strcpy(out + (at - text), to);
-    strcat(out, at + strlen(from));
-    free(text);
-    return out;
-}
 
 // ---- the tokenizer -----------------------------------------------------------------
 
@@ -83,13 +13,14 @@ static const char small_vocabulary[] =
     "\"<unk>\": 9, \".\": 10}";
 static const char small_config[] = "{\"unk_token\": \"<unk>\", \"bos_token\": null, \"eos_token\": null}";
 
-static void small_folder(folder* f, gsf_context* ctx, const char* vocabulary, const char* merges, const char* config) {
-    init_folder(f, ctx);
-    put_file(f, "vocab.json", vocabulary, 0);
-    put_file(f, "merges.txt", merges, 0);
-    put_file(f, "tokenizer_config.json", config, 0);
-    put_file(f, "special_tokens_map.json", NULL, 0);
-    put_file(f, "added_tokens.json", NULL, 0);
+static void small_folder(blip2_folder* f, gsf_context* ctx, const char* vocabulary, const char* merges,
+                         const char* config) {
+    blip2_open(f, ctx);
+    blip2_put(f, "vocab.json", vocabulary, 0);
+    blip2_put(f, "merges.txt", merges, 0);
+    blip2_put(f, "tokenizer_config.json", config, 0);
+    blip2_put(f, "special_tokens_map.json", NULL, 0);
+    blip2_put(f, "added_tokens.json", NULL, 0);
 }
 
 static void test_bad_tokenizers(void) {
@@ -131,11 +62,11 @@ static void test_bad_tokenizers(void) {
         {small_vocabulary, merges, "{\"added_tokens_decoder\": {\"20\": \"x\", \"020\": \"y\"}}", GSF_ERROR_FORMAT,
          "both have the id 20"}};
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
-        folder f;
+        blip2_folder f;
         gsf_context ctx;
         gsf_nn_bpe bpe;
         small_folder(&f, &ctx, cases[i].vocabulary, cases[i].merges, cases[i].config);
-        CHECK_RESULT(&ctx, gsf_nn_make_bpe(&ctx, golden_folder(), &bpe), cases[i].wanted);
+        CHECK_RESULT(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe), cases[i].wanted);
         if (!CHECK(strstr(ctx.error, cases[i].named) != NULL)) fprintf(stderr, "    %zu: %s\n", i, ctx.error);
         CHECK(bpe.tables == NULL);
     }
@@ -160,13 +91,13 @@ static int same_ids(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, c
 // Ranks that a trained file would not have: a merge's result is in one of a lower rank. As GPT2Tokenizer, all places of a
 // rank come before whatever they make possible. Expected ids are GPT2Tokenizer's.
 static void test_small_tokenizer(void) {
-    folder f;
+    blip2_folder f;
     gsf_context ctx;
     gsf_nn_bpe bpe;
     int32_t* ids;
     size_t count;
     small_folder(&f, &ctx, small_vocabulary, "ignored\nab a\nab c\na b\nb c\nb c\n", small_config);
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, golden_folder(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
     CHECK(bpe.bos == -1 && bpe.eos == -1 && bpe.unk == 9 && bpe.highest_id == 10);
     CHECK_IDS("abab", 2, 2);
     CHECK_IDS("aba", 8);
@@ -179,7 +110,7 @@ static void test_small_tokenizer(void) {
                  "{\"unk_token\": null, \"bos_token\": {\"content\": \"new\", \"lstrip\": true, \"rstrip\": true}, "
                  "\"eos_token\": \"<end>\", \"add_bos_token\": true, \"add_prefix_space\": true, "
                  "\"clean_up_tokenization_spaces\": true}");
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, golden_folder(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
     CHECK(bpe.bos == 11 && bpe.eos == 12 && bpe.unk == -1 && bpe.pad == -1 && bpe.highest_id == 12);
     CHECK_IDS("a", 11, 4);
     CHECK_IDS("abc", 11, 3, 2, 5);
@@ -224,7 +155,7 @@ static void test_odd_texts(void) {
     gsf_context ctx;
     gsf_nn_bpe bpe;
     test_context_init(&ctx);
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, golden_folder(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
     for (size_t i = 0; i < sizeof texts / sizeof *texts; i++) check_round_trip(&ctx, &bpe, texts[i].text, texts[i].size);
     check_round_trip(&ctx, &bpe, NULL, 0);
     const size_t most = 1 << 20;
@@ -263,11 +194,11 @@ static void test_broken_bytes(void) {
                 (unsigned)b);
     }
     strcat(vocabulary, "}");
-    folder f;
+    blip2_folder f;
     gsf_context ctx;
     gsf_nn_bpe bpe;
     small_folder(&f, &ctx, vocabulary, "", "{\"unk_token\": null, \"bos_token\": null, \"eos_token\": null}");
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, golden_folder(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
     CHECK_IDS("a \xc3\xad\n", 'a', ' ', 0xc3, 0xad, '\n');
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
         int32_t ids[8];
@@ -319,13 +250,13 @@ static void test_bad_configs(void) {
         {"vocab.json", NULL, NULL, GSF_ERROR_IO, "vocab.json"},
         {"model.safetensors", NULL, NULL, GSF_ERROR_IO, "model.safetensors"}};
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
-        folder f;
+        blip2_folder f;
         gsf_context ctx;
         gsf_nn_captioner net;
-        char* text = cases[i].from ? edit_file(cases[i].file, cases[i].from, cases[i].to) : NULL;
-        init_folder(&f, &ctx);
-        put_file(&f, cases[i].file, text, 0);
-        CHECK_RESULT(&ctx, gsf_nn_make_captioner(&ctx, golden_folder(), &net), cases[i].wanted);
+        char* text = cases[i].from ? blip2_edit(cases[i].file, cases[i].from, cases[i].to) : NULL;
+        blip2_open(&f, &ctx);
+        blip2_put(&f, cases[i].file, text, 0);
+        CHECK_RESULT(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net), cases[i].wanted);
         if (!CHECK(strstr(ctx.error, cases[i].named) != NULL)) fprintf(stderr, "    %zu: %s\n", i, ctx.error);
         CHECK(net.nets == NULL && net.weights.tensors == NULL);
         free(text);
@@ -352,13 +283,13 @@ static void test_bad_weights(void) {
     static const float ones[2] = {1.0f, 1.0f};
     static const int64_t two[1] = {2};
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
-        folder f;
+        blip2_folder f;
         gsf_context ctx;
         gsf_nn_weights w;
         gsf_nn_captioner net;
         size_t count = 0, size;
-        init_folder(&f, &ctx);
-        CHECK_OK(&f.plain, gsf_nn_open_weights(&f.plain, golden_folder(), "model", &w));
+        blip2_open(&f, &ctx);
+        CHECK_OK(&f.plain, gsf_nn_open_weights(&f.plain, blip2_golden(), "model", &w));
         gsf_tensor* tensors = (gsf_tensor*)malloc((w.tensor_count + 1) * sizeof *tensors);
         float* poisoned = NULL;
         for (size_t k = 0; k < w.tensor_count; k++) {
@@ -376,10 +307,10 @@ static void test_bad_weights(void) {
         CHECK_OK(&f.plain, gsf_nn_save_tensors(&f.plain, test_scratch("edited.safetensors"), tensors, count));
         gsf_nn_close_weights(&f.plain, &w);
         char* bytes = test_read_file(test_scratch("edited.safetensors"), &size);
-        put_file(&f, "model.safetensors.index.json", NULL, 0);
-        put_file(&f, "model.safetensors", bytes, size);
+        blip2_put(&f, "model.safetensors.index.json", NULL, 0);
+        blip2_put(&f, "model.safetensors", bytes, size);
         const gsf_result wanted = cases[i].kind == 2 ? GSF_OK : GSF_ERROR_FORMAT;
-        CHECK_RESULT(&ctx, gsf_nn_make_captioner(&ctx, golden_folder(), &net), wanted);
+        CHECK_RESULT(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net), wanted);
         if (cases[i].kind == 2) {
             gsf_image photo = make_photo(&ctx);
             char caption[64] = "before";
@@ -471,11 +402,6 @@ static void see_tap(void* user, const char* name, const float* data, int64_t row
     s->stages++;
 }
 
-static void muddled_for(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
-
 typedef struct watcher { gsf_context* ctx; double stop_at, last, total; int calls; } watcher;
 
 static void watch_progress(void* user, const char* stage, double done, double total) {
@@ -499,16 +425,13 @@ static void test_runs(const gsf_image* photo) {
         int32_t* ids;
         size_t count;
         test_context_zero(&ctx);
-        if (k) {
-            ctx.parallel.for_fn = muddled_for;
-            ctx.parallel.worker_count = 3;
-        }
+        if (k) work_backwards(&ctx);
         memset(&w, 0, sizeof w);
         w.ctx = &ctx;
         ctx.progress.progress_fn = watch_progress;
         ctx.progress.user = &w;
         CHECK_OK(&ctx, gsf_init_context(&ctx));
-        if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, golden_folder(), &net))) return;
+        if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) return;
         memset(&d, 0, sizeof d);
         d.image = photo;
         d.max_new_tokens = 3;
@@ -539,12 +462,10 @@ static void test_memory(const gsf_image* photo) {
         gsf_nn_captioner net;
         char caption[256];
         test_context_zero(&ctx);
-        ctx.allocator.alloc_fn = counted_alloc;
-        ctx.allocator.free_fn = counted_free;
-        ctx.allocator.user = &c;
+        count_memory(&ctx, &c);
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         c.fail_at = fail;
-        gsf_result result = gsf_nn_make_captioner(&ctx, golden_folder(), &net);
+        gsf_result result = gsf_nn_make_captioner(&ctx, blip2_golden(), &net);
         if (!result) {
             result = gsf_nn_caption(&ctx, &net, photo, "a", 2, caption, sizeof caption);
             gsf_nn_destroy_captioner(&ctx, &net);
@@ -604,7 +525,7 @@ int main(int argc, char** argv) {
     test_broken_bytes();
     test_bad_configs();
     test_bad_weights();
-    if (CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, golden_folder(), &net))) {
+    if (CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) {
         gsf_image photo = make_photo(&ctx);
         test_arguments(&ctx, &net, &photo);
         test_image_kinds(&ctx, &net, &photo);

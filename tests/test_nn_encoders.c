@@ -194,17 +194,11 @@ static void test_bad_inputs(gsf_context* ctx, const gsf_nn_dinov2* dino, const g
 
 // ---- workers, groups, memory, cancelling --------------------------------------------
 
-static void muddled_for(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
-
 // `expected` is left with VGGT's tokens of the small images.
 static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, float* expected, float* out) {
     gsf_context three;
     test_context_zero(&three);
-    three.parallel.for_fn = muddled_for;
-    three.parallel.worker_count = 3;
+    work_backwards(&three);
     if (gsf_init_context(&three) != GSF_OK) exit(2);
     gsf_context one;
     test_context_zero(&one);
@@ -265,9 +259,7 @@ static void test_memory(float* out) {
     test_context_zero(&ctx);
     memset(&count, 0, sizeof count);
     ctx.threads = 1;
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = &count;
+    count_memory(&ctx, &count);
     if (gsf_init_context(&ctx) != GSF_OK) exit(2);
     for (int kind = 0; kind < 2; kind++)
         for (size_t k = 1;; k++) {

@@ -446,9 +446,7 @@ static void test_memory(gsf_context* plain) {
             memset(&c, 0, sizeof c);
             memset(&w, 0, sizeof w);
             test_context_zero(&ctx);
-            ctx.allocator.alloc_fn = counted_alloc;
-            ctx.allocator.free_fn = counted_free;
-            ctx.allocator.user = &c;
+            count_memory(&ctx, &c);
             CHECK_OK(&ctx, gsf_init_context(&ctx));
             c.fail_at = k;
             const char* out = test_scratch("oom.safetensors");

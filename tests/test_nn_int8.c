@@ -218,12 +218,6 @@ static void test_types(gsf_context* ctx) {
         }
 }
 
-// Three workers that take chunks from the back.
-static void backwards(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
-
 // All levels, with one worker and with three, give the same weights and the same bits. Sizes: several blocks of rows and
 // outputs, several steps of depth, several groups of rows held. Linear epilogues only, as activations differ by rounding.
 static void test_same_bits(gsf_cpu_level best) {
@@ -242,10 +236,7 @@ static void test_same_bits(gsf_cpu_level best) {
                 memset(&ctx, 0, sizeof ctx);
                 ctx.cpu_level = (gsf_cpu_level)level;
                 ctx.threads = 1;
-                if (workers == 3) {
-                    ctx.parallel.for_fn = backwards;
-                    ctx.parallel.worker_count = 3;
-                }
+                if (workers == 3) work_backwards(&ctx);
                 CHECK_OK(&ctx, gsf_init_context(&ctx));
                 quantize(&ctx, &l, 0, &q);
                 run(&ctx, NULL, &l, &q);
@@ -374,9 +365,7 @@ static void test_memory(void) {
     gsf_context ctx;
     memset(&count, 0, sizeof count);
     test_context_zero(&ctx);
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = &count;
+    count_memory(&ctx, &count);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     layer l = make_layer(20, 50, 60, 0);
     size_t failed = 0;

@@ -9,20 +9,13 @@
 static gsf_context one, three; // one worker; three, whose chunks come in a muddled order
 static uint64_t seed = 5;
 
-// Backwards, and the workers in turn, so that scratch left by other chunks is met again.
-static void muddled_for(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
-
 static int open_contexts(gsf_cpu_level level) { // 0: the machine lacks the level
     test_context_zero(&one);
     if (one.cpu_level != GSF_CPU_AUTO && one.cpu_level != level) return 0;
     one.cpu_level = level;
     one.threads = 1;
     three = one;
-    three.parallel.for_fn = muddled_for;
-    three.parallel.worker_count = 3;
+    work_backwards(&three);
     CHECK(gsf_init_context(&one) == GSF_OK && gsf_init_context(&three) == GSF_OK);
     return one.cpu_level == level;
 }
@@ -467,9 +460,7 @@ static void check_attention_errors(void) {
     counter memory;
     memset(&memory, 0, sizeof memory);
     gsf_context ctx = three;
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = &memory;
+    count_memory(&ctx, &memory);
     gsf_nn_workspace workspace;
     memset(&workspace, 0, sizeof workspace);
     memory.fail_at = 1;

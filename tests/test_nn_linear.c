@@ -165,12 +165,6 @@ static void test_blocks(gsf_context* ctx) {
         }
 }
 
-// Three workers that take chunks from the back.
-static void backwards(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
-
 static void test_workers(gsf_cpu_level level) {
     static const int64_t sizes[][3] = {{1, 300, 2000}, {3, 70, 5000}, {50, 100, 700}, {400, 130, 500}};
     gsf_context one, three;
@@ -178,8 +172,7 @@ static void test_workers(gsf_cpu_level level) {
     memset(&three, 0, sizeof three);
     one.threads = 1;
     one.cpu_level = three.cpu_level = level;
-    three.parallel.for_fn = backwards;
-    three.parallel.worker_count = 3;
+    work_backwards(&three);
     CHECK_OK(&one, gsf_init_context(&one));
     CHECK_OK(&three, gsf_init_context(&three));
     for (size_t i = 0; i < GSF__COUNT(sizes); i++)
@@ -265,9 +258,7 @@ static void test_memory(void) {
     memset(&count, 0, sizeof count);
     gsf_context ctx;
     test_context_zero(&ctx);
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = &count;
+    count_memory(&ctx, &count);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     static const int64_t rows[] = {2, 20, 350};
     for (int i = 0; i < 3; i++) {

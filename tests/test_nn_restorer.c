@@ -428,18 +428,13 @@ static void test_resume(gsf_context* ctx, sample_case* s) {
     free(reference);
 }
 
-static void shuffled_for(void* user, size_t count, gsf_chunk_fn body, void* arg) { // chunks in turns on three workers
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i % 3));
-}
-
 static void test_workers(const char* features, clip* c) {
     uint32_t sums[2];
     for (int k = 0; k < 2; k++) {
         gsf_context ctx;
         test_context_zero(&ctx);
         ctx.threads = 1;
-        if (k) ctx.parallel.for_fn = shuffled_for, ctx.parallel.worker_count = 3;
+        if (k) work_backwards(&ctx);
         if (gsf_init_context(&ctx) != GSF_OK) exit(2);
         const gsf_nn_dit_desc desc = small_desc(features, 2);
         sums[k] = restore(&ctx, &desc, c, GSF_OK);
@@ -453,9 +448,7 @@ static void test_memory(const char* features, clip* c) { // each of the first te
     gsf_context ctx;
     test_context_zero(&ctx);
     ctx.threads = 1;
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = &count;
+    count_memory(&ctx, &count);
     if (gsf_init_context(&ctx) != GSF_OK) exit(2);
     const gsf_nn_dit_desc desc = small_desc(features, 1);
     for (size_t k = 1;; k += k < 10 ? 1 : k / 3) {

@@ -258,6 +258,21 @@ static void test_configs(gsf_context* ctx) {
     CHECK_RESULT(ctx, gsf_nn_load_schedule(ctx, test_scratch("absent.json"), &schedule), GSF_ERROR_IO);
 }
 
+// Betas so large that abar is 0 long before the last of the steps.
+static void test_steep_config(gsf_context* ctx) {
+    static const char text[] = "{\"prediction_type\":\"v_prediction\",\"clip_sample\":false,\"beta_start\":0.9,"
+                               "\"beta_end\":0.99,\"rescale_betas_zero_snr\":true}";
+    gsf_nn_schedule schedule;
+    if (!CHECK_OK(ctx, gsf_nn_parse_schedule(ctx, "sched.json", text, strlen(text), &schedule))) return;
+    const double* bar = schedule.alpha_bar;
+    CHECK_NEAR(bar[0], 0.1, 1e-15);
+    CHECK_NEAR(bar[1], 0.1 * (0.1 - 0.09 / 999.0), 1e-16);
+    const int32_t last = schedule.desc.train_steps - 1;
+    for (int32_t i = 1; i <= last; i++) CHECK(bar[i] < bar[i - 1] || (bar[i] == 0.0 && bar[i - 1] == 0.0));
+    CHECK(bar[last] == 0.0);
+    gsf_nn_destroy_schedule(ctx, &schedule);
+}
+
 // ---- samplers
 
 static void fill_noise(float* x, size_t count, uint64_t stream) {
@@ -349,9 +364,7 @@ static void test_memory(void) {
         memset(&c, 0, sizeof c);
         memset(&sampler, 0, sizeof sampler);
         test_context_zero(&ctx);
-        ctx.allocator.alloc_fn = counted_alloc;
-        ctx.allocator.free_fn = counted_free;
-        ctx.allocator.user = &c;
+        count_memory(&ctx, &c);
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         c.fail_at = k;
         gsf_result r = gsf_nn_make_schedule(&ctx, NULL, &schedule);
@@ -415,6 +428,7 @@ int main(void) {
     test_formulas(&ctx);
     test_timesteps(&ctx, &schedule);
     test_configs(&ctx);
+    test_steep_config(&ctx);
     test_repeatable(&ctx, &schedule);
     test_bad_samplers(&ctx, &schedule);
     test_memory();

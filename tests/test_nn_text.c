@@ -162,9 +162,7 @@ static void test_long_texts(const char* folder) {
         size_t count = 0;
         memset(&memory, 0, sizeof memory);
         test_context_zero(&counted);
-        counted.allocator.alloc_fn = counted_alloc;
-        counted.allocator.free_fn = counted_free;
-        counted.allocator.user = &memory;
+        count_memory(&counted, &memory);
         CHECK_OK(&counted, gsf_init_context(&counted));
         if (!CHECK_OK(&counted, gsf_nn_make_tokenizer(&counted, folder, &t))) break;
         memory.asked = 0;
@@ -341,9 +339,7 @@ static void test_tokenizer_memory(void) { // every allocation fails once
         memset(&memory, 0, sizeof memory);
         memory.fail_at = k;
         test_context_zero(&failing);
-        failing.allocator.alloc_fn = counted_alloc;
-        failing.allocator.free_fn = counted_free;
-        failing.allocator.user = &memory;
+        count_memory(&failing, &memory);
         CHECK_OK(&failing, gsf_init_context(&failing));
         gsf_result result = open_made(&failing, 0, &t);
         if (result == GSF_OK) result = gsf_nn_tokenize(&failing, &t, "ab cd <pad>", 11, ids, 8, NULL);
@@ -357,11 +353,6 @@ static void test_tokenizer_memory(void) { // every allocation fails once
 // ---- T5 -----------------------------------------------------------------------------
 
 static const char* t5_folder(void) { return test_golden("restorer/model/text_encoder"); }
-
-static void muddled_for(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) { // backwards, workers in turn
-    (void)user;
-    for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)(i * 7 % 3));
-}
 
 static int all_zero(const float* x, size_t count) {
     for (size_t i = 0; i < count; i++)
@@ -390,8 +381,7 @@ static void test_t5_runs(void) {
     make_input(&net, ids, &in);
     CHECK_OK(&ctx, gsf_nn_t5_encode(&ctx, &net, &in, one));
     test_context_zero(&three);
-    three.parallel.for_fn = muddled_for;
-    three.parallel.worker_count = 3;
+    work_backwards(&three);
     CHECK_OK(&three, gsf_init_context(&three));
     CHECK_OK(&three, gsf_nn_t5_encode(&three, &net, &in, other));
     CHECK(memcmp(one, other, values * sizeof(float)) == 0);

@@ -22,12 +22,6 @@ static double rel_l2(const float* a, const float* b, size_t count) {
     return sqrt(difference / square);
 }
 
-// Chunks in reverse order, on several workers by turns.
-static void run_backwards(void* user, size_t count, gsf_chunk_fn body, void* arg) {
-    (void)user;
-    for (size_t i = count; i-- > 0;) body(arg, i, (int)(i % 3));
-}
-
 // ---- convolution
 
 typedef struct conv_case {
@@ -335,8 +329,7 @@ static void test_levels_and_workers(void) {
         CHECK_OK(&scalar, gsf_init_context(&scalar));
         test_context_init(&best);
         test_context_zero(&shuffled);
-        shuffled.parallel.for_fn = run_backwards;
-        shuffled.parallel.worker_count = 3;
+        work_backwards(&shuffled);
         CHECK_OK(&shuffled, gsf_init_context(&shuffled));
         save_model(&best, &shapes[i], file);
         vae_result a = both_ways(&scalar, NULL, sizes[i][0], sizes[i][1], sizes[i][2]);
@@ -609,9 +602,7 @@ static gsf_result run_short_of_memory(counter* c) {
     desc.overlap_height = desc.overlap_width = 0.2;
     for (size_t i = 0; i < GSF__COUNT(latents); i++) latents[i] = (float)(i % 7) - 3.0f;
     test_context_zero(&ctx);
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = c;
+    count_memory(&ctx, c);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     gsf_result result = gsf_nn_make_vae(&ctx, model_folder(), &vae);
     if (result == GSF_OK) result = gsf_nn_vae_decode(&ctx, &vae, &desc, latents, 4, 6, 2, video);

@@ -10,9 +10,7 @@ static gsf_context make_context(counter* c) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     memset(c, 0, sizeof *c);
-    ctx.allocator.alloc_fn = counted_alloc;
-    ctx.allocator.free_fn = counted_free;
-    ctx.allocator.user = c;
+    count_memory(&ctx, c);
     ctx.logger.log_fn = keep_warning;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     warnings = 0;

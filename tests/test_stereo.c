@@ -5,6 +5,7 @@
 #include "gsfixer_splat.h"
 
 #include "test.h"
+#include "test_hooks.h"
 #include "made_scene.h"
 
 #include <unistd.h>
@@ -28,11 +29,6 @@ static void heap_free(void* user, void* memory) {
     size_t* block = (size_t*)memory - 2;
     ((heap*)user)->live -= (int64_t)block[0];
     free(block);
-}
-
-static void backwards(void* user, size_t count, gsf_chunk_fn body, void* arg) { // last chunk first, three workers in turn
-    (void)user;
-    while (count-- > 0) body(arg, count, (int)(count % 3));
 }
 
 // ---- a textured plane ----------------------------------------------------------
@@ -253,8 +249,7 @@ static void test_same_bits(void) {
     gsf_context other[4]; // as given, one worker, backwards, scalar
     memset(other, 0, sizeof other);
     other[1].threads = 1;
-    other[2].parallel.for_fn = backwards;
-    other[2].parallel.worker_count = 3;
+    work_backwards(&other[2]);
     other[3].cpu_level = GSF_CPU_SCALAR;
     CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &first, NULL));
     CHECK(first.count > 100);
