@@ -138,7 +138,8 @@ typedef struct gsf_nn_quantized { // a weight in 8 bits; owns its memory: destro
     int32_t block;             // values that the rotation mixes: a power of two up to 256; 1: none
     int8_t* data;              // private: whole tiles, [out/16][in/4][16][4]
     float* scales;             // private: of each output
-    size_t bytes;              // of both: about out*in
+    int32_t* offsets;          // private: 128 times the sum of each output's weights
+    size_t bytes;              // of all three: about out*in
 } gsf_nn_quantized;
 
 // Symmetric 8-bit integers per output from (out, in) weights in f32, bf16 or f16, after a Hadamard rotation of blocks of
@@ -2287,7 +2288,8 @@ enum {
     GSF__FEW_BYTES = 1 << 16,         // but not of less weights than this
     GSF__FEW_COLUMNS = 1008,          // nor of more outputs; both a multiple of 6 and 16
     GSF__FEW_UNIT = 48,
-    GSF__FEW_PAD = 32                 // values of x are padded to a multiple of this
+    GSF__FEW_PAD = 32,                // values of x are padded to a multiple of this
+    GSF__FEW_STEP = 1024              // AVX-512: values of several rows of x that are gone through at a time
 };
 
 #ifndef GSF__LINEAR_PACKED // a test makes it small
@@ -2755,8 +2757,25 @@ GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // si
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(bits), 16));
 }
 
-// Six rows of weights times 1, 2 or 4 rows of x, laid out as [k / 16][rows][16], added to sums[6][rows]. `count` is a
-// multiple of 32.
+// One row of weights times one row of x: read in order, as the processor foresees best. `count` is a multiple of 32.
+GSF__INLINE_AVX512 float gsf__few_one16(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
+    const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
+    __m512 s0 = _mm512_setzero_ps(), s1 = s0, s2 = s0, s3 = s0;
+    for (; count >= 64; count -= 64, x += 64, w += 4 * vector) {
+        s0 = _mm512_fmadd_ps(gsf__load16(w, dtype), _mm512_load_ps(x), s0);
+        s1 = _mm512_fmadd_ps(gsf__load16(w + vector, dtype), _mm512_load_ps(x + 16), s1);
+        s2 = _mm512_fmadd_ps(gsf__load16(w + 2 * vector, dtype), _mm512_load_ps(x + 32), s2);
+        s3 = _mm512_fmadd_ps(gsf__load16(w + 3 * vector, dtype), _mm512_load_ps(x + 48), s3);
+    }
+    if (count > 0) {
+        s0 = _mm512_fmadd_ps(gsf__load16(w, dtype), _mm512_load_ps(x), s0);
+        s1 = _mm512_fmadd_ps(gsf__load16(w + vector, dtype), _mm512_load_ps(x + 16), s1);
+    }
+    return gsf__nn_sum16((s0 + s1) + (s2 + s3));
+}
+
+// Six rows of weights times 2 or 4 rows of x, laid out as [k / 16][rows][16], added to sums[6][rows]. `count` is a multiple
+// of 32. What lies `ahead` bytes on, the next rows, is asked for.
 GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x,
                                        int64_t rows, int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
@@ -2766,17 +2785,17 @@ GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtyp
     GSF_ROWS(GSF_X)
 #undef GSF_X
     for (int64_t at = 0; count > 0; count -= line) {
-#define GSF_X(r) gsf__few_fetch(w##r + at, ahead);
+#define GSF_X(r) _mm_prefetch(w##r + at + ahead, _MM_HINT_T1);
         GSF_ROWS(GSF_X)
 #undef GSF_X
         for (int64_t i = 0; i < line; i += 16, at += vector, x += 16 * rows) {
-            const __m512 x0 = _mm512_load_ps(x), x1 = rows > 1 ? _mm512_load_ps(x + 16) : x0;
+            const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16);
             const __m512 x2 = rows > 2 ? _mm512_load_ps(x + 32) : x0, x3 = rows > 2 ? _mm512_load_ps(x + 48) : x0;
             __m512 v;
 #define GSF_X(r)                                                     \
             v = gsf__load16(w##r + at, dtype);                       \
             s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);               \
-            if (rows > 1) s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1); \
+            s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);               \
             if (rows > 2) s##r##2 = _mm512_fmadd_ps(v, x2, s##r##2); \
             if (rows > 2) s##r##3 = _mm512_fmadd_ps(v, x3, s##r##3);
             GSF_ROWS(GSF_X)
@@ -2785,7 +2804,7 @@ GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtyp
     }
 #define GSF_X(r)                                                     \
     sums[r * rows] += gsf__nn_sum16(s##r##0);                        \
-    if (rows > 1) sums[r * rows + 1] += gsf__nn_sum16(s##r##1);      \
+    sums[r * rows + 1] += gsf__nn_sum16(s##r##1);                    \
     if (rows > 2) sums[r * rows + 2] += gsf__nn_sum16(s##r##2);      \
     if (rows > 2) sums[r * rows + 3] += gsf__nn_sum16(s##r##3);
     GSF_ROWS(GSF_X)
@@ -2793,12 +2812,14 @@ GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtyp
 #undef GSF_ROWS
 }
 
+// `count` weights from k on of all columns; added to the sums. x stays in the first level cache meanwhile.
 GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
-                                   int64_t column, int64_t columns, float* sums, int64_t pitch) {
+                                   int64_t column, int64_t columns, int64_t k, int64_t count, float* sums, int64_t pitch) {
     const size_t bytes = (size_t)job->in * size;
-    const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
-    const int64_t whole = job->in / GSF__FEW_PAD * GSF__FEW_PAD;
-    const size_t left = (size_t)(job->in - whole) * size;
+    const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes + (size_t)k * size;
+    const float* x = job->few + k * rows;
+    const int64_t whole = count / GSF__FEW_PAD * GSF__FEW_PAD;
+    const size_t left = (size_t)(count - whole) * size;
     const char* w[6];
     char tails[6][4 * GSF__FEW_PAD];
     memset(tails, 0, sizeof tails);
@@ -2806,30 +2827,37 @@ GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtyp
         float tile[6 * GSF__FEW_ROWS]; // [weights][x]
         memset(tile, 0, sizeof tile);
         for (int64_t r = 0; r < 6; r++) w[r] = first + (size_t)gsf__least(c + r, columns - 1) * bytes;
-        gsf__few_six16(w, dtype, 6 * bytes, job->few, rows, whole, tile);
+        if (rows > 1) gsf__few_six16(w, dtype, 6 * bytes, x, rows, whole, tile);
+        for (int64_t r = 0; rows == 1 && r < gsf__least(6, columns - c); r++)
+            tile[r] = gsf__few_one16(w[r], dtype, x, whole);
         for (int64_t r = 0; left > 0 && r < 6; r++) {
             memcpy(tails[r], w[r] + (size_t)whole * size, left);
             w[r] = tails[r];
+            if (rows == 1) tile[r] += gsf__few_one16(w[r], dtype, x + whole, GSF__FEW_PAD);
         }
-        if (left > 0) gsf__few_six16(w, dtype, 0, job->few + whole * rows, rows, GSF__FEW_PAD, tile);
+        if (left > 0 && rows > 1) gsf__few_six16(w, dtype, 0, x + whole * rows, rows, GSF__FEW_PAD, tile);
         for (int64_t r = 0; r < gsf__least(6, columns - c); r++)
-            for (int64_t m = 0; m < job->desc.rows; m++) sums[m * pitch + c + r] = tile[r * rows + m];
+            for (int64_t m = 0; m < job->desc.rows; m++) sums[m * pitch + c + r] += tile[r * rows + m];
     }
 }
 
 GSF__TARGET_AVX512 static void gsf__few_avx512(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
                                                int64_t pitch) {
-    const int64_t rows = gsf__few_rows(job->desc.rows);
-#define GSF_X(dtype, size)                                                                      \
-    if (rows == 1) gsf__few16(job, dtype, size, 1, column, columns, sums, pitch);               \
-    else if (rows == 2) gsf__few16(job, dtype, size, 2, column, columns, sums, pitch);          \
-    else gsf__few16(job, dtype, size, GSF__FEW_ROWS, column, columns, sums, pitch);
-    switch (job->desc.weight->dtype) {
-        case GSF_NN_F32: GSF_X(GSF_NN_F32, 4) break;
-        case GSF_NN_BF16: GSF_X(GSF_NN_BF16, 2) break;
-        default: GSF_X(GSF_NN_F16, 2) break;
-    }
+    const int64_t rows = gsf__few_rows(job->desc.rows), step = rows == 1 ? job->in : (int64_t)GSF__FEW_STEP;
+    for (int64_t m = 0; m < job->desc.rows; m++) memset(sums + m * pitch, 0, (size_t)columns * sizeof(float));
+    for (int64_t k = 0; k < job->in; k += step) {
+        const int64_t n = gsf__least(job->in - k, step);
+#define GSF_X(dtype, size)                                                                            \
+        if (rows == 1) gsf__few16(job, dtype, size, 1, column, columns, k, n, sums, pitch);           \
+        else if (rows == 2) gsf__few16(job, dtype, size, 2, column, columns, k, n, sums, pitch);      \
+        else gsf__few16(job, dtype, size, GSF__FEW_ROWS, column, columns, k, n, sums, pitch);
+        switch (job->desc.weight->dtype) {
+            case GSF_NN_F32: GSF_X(GSF_NN_F32, 4) break;
+            case GSF_NN_BF16: GSF_X(GSF_NN_BF16, 2) break;
+            default: GSF_X(GSF_NN_F16, 2) break;
+        }
 #undef GSF_X
+    }
 }
 
 static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
@@ -3047,10 +3075,12 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
 // Ashkboos et al. 2024). H is applied without its 1/sqrt(n); sw holds the 1/n, a power of two, so that nothing is rounded
 // for it.
 //
-//     qw [panel of 16 outputs][k/4][16][4] int8         qx [group of 6 rows][k/4][6][4] int16
+//     qw [panel of 16 outputs][k/4][16][4] int8         qx [group of 6 rows][k/4][6][4] int16, or uint8
 //
-// Up to 4 rows, in groups of 2 then, meet the 8-bit weights as they are read, one panel after another.
-// Fours are what dot-product instructions (VNNI) take. AVX2 has none, and its products of bytes add pairs in 16 bits, which
+// Up to 4 rows, in groups of 2 or 4 then, meet the 8-bit weights as they are read, one panel after another.
+// Fours are what dot-product instructions (VNNI) take, of unsigned by signed bytes: qx is stored as qx + 128 for them, and
+// 128 sum_k qw is taken off the sums, which may wrap around on the way. As with floats two groups meet two panels.
+// AVX2 has no such instruction, and its products of bytes add pairs in 16 bits, which
 // 2 * 127 * 127 fills: signs moved to one operand, multiply, widen, add are 4 instructions for 32 products. With both
 // operands widened to 16 bits, a panel once per block, it is 2 multiplications (vpmaddwd) and 2 additions, also 4, of which
 // nothing but the 12 sums needs a register; alone in L1 that gave 146 against 115 Gop/s a core. Either way two
@@ -3059,7 +3089,7 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
 
 enum {
     GSF__INT8_BLOCK = 256,    // longest rotation
-    GSF__INT8_DEPTH = 512,    // of a step through the inner dimension: a widened panel is 16 KiB
+    GSF__INT8_DEPTH = 512,    // of a step through the inner dimension: a widened panel is 16 KiB; else it is twice as long
     GSF__INT8_ROWS = 192,     // of a block; times depth: 192 KiB
     GSF__INT8_COLUMNS = 384,  // its sums: 288 KiB
     GSF__INT8_AHEAD = 4096,   // bytes ahead of which weights are asked for
@@ -3073,16 +3103,24 @@ enum {
 typedef struct gsf__int8_kernels { // one set per instruction set
     // Rotates blocks of `block` of the `count` values in place; their largest size then, or inf where one is NaN or inf
     float (*rotate)(float* x, int64_t count, int64_t block);
-    // Fours of round(x * factor), `pitch` apart; count is a multiple of 4
-    void (*quantize)(const float* x, int64_t count, float factor, int16_t* out, int64_t pitch);
-    // w [k/4][16][4] to out [2][k/4][8][4]
+    // Fours of round(x * factor), `pitch` apart, as int16; count is a multiple of 4
+    void (*quantize)(const float* x, int64_t count, float factor, void* out, int64_t pitch);
+    // The same in the type that the products want of x, x_size bytes of each value
+    void (*quantize_x)(const float* x, int64_t count, float factor, void* out, int64_t pitch);
+    size_t x_size;
+    // w [k/4][16][4] to out [2][k/4][8][4]; NULL: `tile` takes w as it is
     void (*widen)(const int8_t* w, int64_t count, int16_t* out);
-    // sums[6][16] = a [k/4][6][4] times b [2][k/4][8][4], or += with `add`
-    void (*tile)(const int16_t* a, const int16_t* b, int64_t count, int add, int32_t* sums);
-    // sums[rows][16] = a [k/4][rows][4], 1 or 2 rows, times w [k/4][16][4]
-    void (*few)(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums);
-    // out[6][16] = sums * rows[6] * columns[16]
-    void (*scale)(const int32_t* sums, const float* rows, const float* columns, float* out);
+    // sums[6][16] = a [k/4][6][4] times b, or += with `add`
+    void (*tile)(const void* a, const void* b, int64_t count, int add, int32_t* sums);
+    // As much for two groups, `a_next` bytes apart, and two panels, `b_next` bytes apart, their sums `next`; or NULL.
+    // Meanwhile fetches `ahead_count` bytes that are needed next.
+    void (*four_tiles)(const void* a, int64_t a_next, const int8_t* b, int64_t b_next, int64_t count, int add, int32_t* sums,
+                       int64_t next, const int8_t* ahead, int64_t ahead_count);
+    // sums[rows][16] = a [k/4][rows][4], up to few_rows rows, times w [k/4][16][4]
+    void (*few)(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums);
+    int64_t few_rows;
+    // out[6][16] = (sums - offsets[16], where qx is unsigned) * rows[6] * columns[16]
+    void (*scale)(const int32_t* sums, const int32_t* offsets, const float* rows, const float* columns, float* out);
 } gsf__int8_kernels;
 
 typedef struct gsf__int8_job {
@@ -3092,7 +3130,7 @@ typedef struct gsf__int8_job {
     int64_t padded;              // in, up to a multiple of 4
     int64_t depth, block_rows, block_columns, row_blocks;
     int64_t held, first, rows;   // rows of x quantised at a time; those in work
-    int16_t* x;
+    char* x;
     float* scales;               // of the rows in work
     char* workers;
     size_t per_worker;           // bytes
@@ -3132,9 +3170,10 @@ static float gsf__int8_rotate_scalar(float* x, int64_t count, int64_t block) {
     return gsf__int8_size(gsf__int8_top(x, count, 0));
 }
 
-static void gsf__int8_quantize_scalar(const float* x, int64_t count, float factor, int16_t* out, int64_t pitch) {
+static void gsf__int8_quantize_scalar(const float* x, int64_t count, float factor, void* out, int64_t pitch) {
     const float rounder = 12582912.0f; // 1.5 * 2^23: its sums are whole numbers, ties to even
-    for (int64_t k = 0; k < count; k++) out[(k >> 2) * pitch + (k & 3)] = (int16_t)((x[k] * factor + rounder) - rounder);
+    int16_t* to = (int16_t*)out;
+    for (int64_t k = 0; k < count; k++) to[(k >> 2) * pitch + (k & 3)] = (int16_t)((x[k] * factor + rounder) - rounder);
 }
 
 static void gsf__int8_widen_scalar(const int8_t* w, int64_t count, int16_t* out) {
@@ -3143,35 +3182,39 @@ static void gsf__int8_widen_scalar(const int8_t* w, int64_t count, int16_t* out)
             out[(c >> 3) * 8 * count + (k >> 2) * 32 + (c & 7) * 4 + (k & 3)] = w[(k >> 2) * 64 + c * 4 + (k & 3)];
 }
 
-static void gsf__int8_tile_scalar(const int16_t* a, const int16_t* b, int64_t count, int add, int32_t* sums) {
+static void gsf__int8_tile_scalar(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
+    const int16_t *rows = (const int16_t*)a, *panel = (const int16_t*)b;
     if (!add) memset(sums, 0, GSF__TILE_SUMS * sizeof *sums);
-    for (int64_t k = 0; k < count; k += 4, a += 4 * GSF__TILE_ROWS)
+    for (int64_t k = 0; k < count; k += 4, rows += 4 * GSF__TILE_ROWS)
         for (int64_t i = 0; i < GSF__TILE_ROWS; i++)
             for (int64_t j = 0; j < GSF__TILE_COLUMNS; j++) {
-                const int16_t *p = a + 4 * i, *q = b + (j >> 3) * 8 * count + 8 * k + 4 * (j & 7);
+                const int16_t *p = rows + 4 * i, *q = panel + (j >> 3) * 8 * count + 8 * k + 4 * (j & 7);
                 sums[i * GSF__TILE_COLUMNS + j] += p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
             }
 }
 
-static void gsf__int8_few_scalar(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+static void gsf__int8_few_scalar(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+    const int16_t* x = (const int16_t*)a;
     memset(sums, 0, (size_t)(rows * GSF__TILE_COLUMNS) * sizeof *sums);
-    for (int64_t k = 0; k < count; k += 4, a += 4 * rows, w += 4 * GSF__TILE_COLUMNS)
+    for (int64_t k = 0; k < count; k += 4, x += 4 * rows, w += 4 * GSF__TILE_COLUMNS)
         for (int64_t i = 0; i < rows; i++)
             for (int64_t j = 0; j < GSF__TILE_COLUMNS; j++) {
-                const int16_t* p = a + 4 * i;
+                const int16_t* p = x + 4 * i;
                 const int8_t* q = w + 4 * j;
                 sums[i * GSF__TILE_COLUMNS + j] += p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
             }
 }
 
-static void gsf__int8_scale_scalar(const int32_t* sums, const float* rows, const float* columns, float* out) {
+static void gsf__int8_scale_scalar(const int32_t* sums, const int32_t* offsets, const float* rows, const float* columns,
+                                   float* out) {
+    (void)offsets;
     for (int i = 0; i < GSF__TILE_SUMS; i++)
         out[i] = (float)sums[i] * rows[i / GSF__TILE_COLUMNS] * columns[i % GSF__TILE_COLUMNS];
 }
 
-static const gsf__int8_kernels gsf__int8_scalar = {gsf__int8_rotate_scalar, gsf__int8_quantize_scalar,
-                                                   gsf__int8_widen_scalar, gsf__int8_tile_scalar, gsf__int8_few_scalar,
-                                                   gsf__int8_scale_scalar};
+static const gsf__int8_kernels gsf__int8_scalar = {
+    gsf__int8_rotate_scalar, gsf__int8_quantize_scalar, gsf__int8_quantize_scalar, sizeof(int16_t), gsf__int8_widen_scalar,
+    gsf__int8_tile_scalar, NULL, gsf__int8_few_scalar, 2, gsf__int8_scale_scalar};
 
 // ---- int8: AVX2 kernels
 
@@ -3230,17 +3273,17 @@ GSF__TARGET_AVX2 static float gsf__int8_rotate_avx2(float* x, int64_t count, int
     return gsf__int8_size(tops[0]);
 }
 
-GSF__TARGET_AVX2 static void gsf__int8_quantize_avx2(const float* x, int64_t count, float factor, int16_t* out,
-                                                     int64_t pitch) {
+GSF__TARGET_AVX2 static void gsf__int8_quantize_avx2(const float* x, int64_t count, float factor, void* out, int64_t pitch) {
     const __m256 f = _mm256_set1_ps(factor);
+    int16_t* to = (int16_t*)out;
     int64_t k = 0;
-    for (; k + 8 <= count; k += 8, out += 2 * pitch) {
+    for (; k + 8 <= count; k += 8, to += 2 * pitch) {
         const __m256i v = _mm256_cvtps_epi32(_mm256_mul_ps(_mm256_loadu_ps(x + k), f));
         const __m128i q = _mm_packs_epi32(_mm256_castsi256_si128(v), _mm256_extracti128_si256(v, 1));
-        _mm_storel_epi64((__m128i*)(void*)out, q);
-        _mm_storel_epi64((__m128i*)(void*)(out + pitch), _mm_unpackhi_epi64(q, q));
+        _mm_storel_epi64((__m128i*)(void*)to, q);
+        _mm_storel_epi64((__m128i*)(void*)(to + pitch), _mm_unpackhi_epi64(q, q));
     }
-    if (k < count) gsf__int8_quantize_scalar(x + k, count - k, factor, out, pitch);
+    if (k < count) gsf__int8_quantize_scalar(x + k, count - k, factor, to, pitch);
 }
 
 GSF__TARGET_AVX2 static void gsf__int8_widen_avx2(const int8_t* w, int64_t count, int16_t* out) {
@@ -3262,10 +3305,9 @@ GSF__INLINE_AVX2 __m256i gsf__int8_broadcast4(const int16_t* p) {
     sum = _mm256_add_epi32(sum, product);        \
     __asm__("" : "+x"(sum));
 
-GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const int16_t* a, const int16_t* b, int64_t count, int add,
-                                                 int32_t* sums) {
-    for (int half = 0; half < 2; half++, b += 8 * count, sums += 8) {
-        const int16_t *p = a, *q = b;
+GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
+    for (int half = 0; half < 2; half++, sums += 8) {
+        const int16_t *p = (const int16_t*)a, *q = (const int16_t*)b + half * 8 * count;
         // 12 registers of sums, each of 4 columns by 2 pairs; 2 of b, 1 of a
         __m256i c00 = _mm256_setzero_si256(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
         __m256i c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
@@ -3317,14 +3359,15 @@ GSF__INLINE_AVX2 void gsf__int8_few8(const int16_t* a, int64_t rows, const int8_
     gsf__int8_few_sums(c12, c13, sums + 24);
 }
 
-GSF__TARGET_AVX2 static void gsf__int8_few_avx2(const int16_t* a, int64_t rows, const int8_t* w, int64_t count,
+GSF__TARGET_AVX2 static void gsf__int8_few_avx2(const void* a, int64_t rows, const int8_t* w, int64_t count,
                                                 int32_t* sums) {
-    if (rows == 1) gsf__int8_few8(a, 1, w, count, sums);
-    else gsf__int8_few8(a, 2, w, count, sums);
+    if (rows == 1) gsf__int8_few8((const int16_t*)a, 1, w, count, sums);
+    else gsf__int8_few8((const int16_t*)a, 2, w, count, sums);
 }
 
-GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const float* rows, const float* columns,
-                                                  float* out) {
+GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const int32_t* offsets, const float* rows,
+                                                  const float* columns, float* out) {
+    (void)offsets;
     for (int i = 0; i < GSF__TILE_SUMS; i += 8) {
         const __m256 v = _mm256_cvtepi32_ps(_mm256_loadu_si256((const __m256i*)(const void*)(sums + i)));
         const __m256 row = _mm256_set1_ps(rows[i / GSF__TILE_COLUMNS]);
@@ -3332,13 +3375,168 @@ GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const flo
     }
 }
 
-static const gsf__int8_kernels gsf__int8_avx2 = {gsf__int8_rotate_avx2, gsf__int8_quantize_avx2, gsf__int8_widen_avx2,
-                                                 gsf__int8_tile_avx2, gsf__int8_few_avx2, gsf__int8_scale_avx2};
+static const gsf__int8_kernels gsf__int8_avx2 = {
+    gsf__int8_rotate_avx2, gsf__int8_quantize_avx2, gsf__int8_quantize_avx2, sizeof(int16_t), gsf__int8_widen_avx2,
+    gsf__int8_tile_avx2, NULL, gsf__int8_few_avx2, 2, gsf__int8_scale_avx2};
+
+// ---- int8: AVX-512 kernels with dot products of bytes
+
+GSF__INLINE_AVX512 __m512 gsf__int8_rotate16(__m512 v) { // gsf__int8_rotate8, and the step of 8
+    const __m512 one = _mm512_set1_ps(1.0f), less = _mm512_set1_ps(-1.0f);
+    v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xaaaa, one, less), _mm512_permute_ps(v, 0xb1));
+    v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xcccc, one, less), _mm512_permute_ps(v, 0x4e));
+    v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xf0f0, one, less), _mm512_shuffle_f32x4(v, v, 0xb1));
+    return _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xff00, one, less), _mm512_shuffle_f32x4(v, v, 0x4e));
+}
+
+GSF__TARGET_AVX512 static float gsf__int8_rotate_avx512(float* x, int64_t count, int64_t block) {
+    const __m512i size = _mm512_set1_epi32(0x7fffffff);
+    __m512i top = _mm512_setzero_si512();
+    if (block < 64) return gsf__int8_rotate_avx2(x, count, block);
+    for (int64_t i = 0; i < count; i += block) {
+        float* p = x + i;
+        int64_t half = 16;
+        for (int64_t j = 0; j < block; j += 16) _mm512_storeu_ps(p + j, gsf__int8_rotate16(_mm512_loadu_ps(p + j)));
+        for (; 4 * half <= block; half *= 4) // two steps at a time
+            for (int64_t g = 0; g < block; g += 4 * half)
+                for (int64_t j = g; j < g + half; j += 16) {
+                    const __m512 a = _mm512_loadu_ps(p + j), b = _mm512_loadu_ps(p + j + half);
+                    const __m512 c = _mm512_loadu_ps(p + j + 2 * half), d = _mm512_loadu_ps(p + j + 3 * half);
+                    const __m512 ab = a + b, cd = c + d, a_b = a - b, c_d = c - d;
+                    _mm512_storeu_ps(p + j, ab + cd);
+                    _mm512_storeu_ps(p + j + half, a_b + c_d);
+                    _mm512_storeu_ps(p + j + 2 * half, ab - cd);
+                    _mm512_storeu_ps(p + j + 3 * half, a_b - c_d);
+                }
+        if (half < block) gsf__int8_one_step(p, block, half);
+    }
+    for (int64_t k = 0; k < count; k += 16) // count is a multiple of the block
+        top = _mm512_max_epi32(top, _mm512_and_si512(size, _mm512_loadu_si512(x + k)));
+    const __m256i half = _mm256_max_epi32(_mm512_castsi512_si256(top), _mm512_extracti32x8_epi32(top, 1));
+    uint32_t tops[8];
+    _mm256_storeu_si256((__m256i*)(void*)tops, half);
+    for (int i = 1; i < 8; i++)
+        if (tops[i] > tops[0]) tops[0] = tops[i];
+    return gsf__int8_size(tops[0]);
+}
+
+GSF__TARGET_AVX512 static void gsf__int8_quantize_x_vnni(const float* x, int64_t count, float factor, void* out,
+                                                         int64_t pitch) {
+    const __m512 f = _mm512_set1_ps(factor);
+    const __m512i offset = _mm512_set1_epi32(128);
+    uint8_t* to = (uint8_t*)out;
+    for (int64_t k = 0; k < count; k += 16) {
+        const __m512 v = _mm512_maskz_loadu_ps(gsf__nn_mask16(count - k), x + k);
+        const __m128i q = _mm512_cvtepi32_epi8(_mm512_add_epi32(_mm512_cvtps_epi32(_mm512_mul_ps(v, f)), offset));
+        uint32_t fours[4];
+        _mm_storeu_si128((__m128i*)(void*)fours, q);
+        for (int64_t i = 0; i < 4 && k + 4 * i < count; i++, to += pitch) memcpy(to, &fours[i], sizeof fours[i]);
+    }
+}
+
+GSF__INLINE_AVX512 __m512i gsf__int8_four(const uint8_t* p) {
+    int32_t four;
+    memcpy(&four, p, sizeof four);
+    return _mm512_set1_epi32(four);
+}
+
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF_PUT(to, v) _mm512_storeu_si512(to, add ? _mm512_add_epi32(_mm512_loadu_si512(to), v) : v);
+
+GSF__TARGET_VNNI static void gsf__int8_tile_vnni(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
+    const uint8_t* x = (const uint8_t*)a;
+    const int8_t* w = (const int8_t*)b;
+#define GSF_X(i) __m512i c##i = _mm512_setzero_si512();
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+    for (; count > 0; count -= 4, x += 4 * GSF__TILE_ROWS, w += 4 * GSF__TILE_COLUMNS) {
+        const __m512i v = _mm512_loadu_si512(w);
+#define GSF_X(i) c##i = _mm512_dpbusd_epi32(c##i, gsf__int8_four(x + 4 * (i)), v);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+#define GSF_X(i) GSF_PUT(sums + GSF__TILE_COLUMNS * (i), c##i)
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+}
+
+GSF__TARGET_VNNI static void gsf__int8_four_tiles_vnni(const void* a, int64_t a_next, const int8_t* b, int64_t b_next,
+                                                       int64_t count, int add, int32_t* sums, int64_t next,
+                                                       const int8_t* ahead, int64_t ahead_count) {
+    const uint8_t *x0 = (const uint8_t*)a, *x1 = x0 + a_next;
+    const int64_t share = gsf__ceil_div(4 * ahead_count, count);
+    int32_t* right = sums + next;
+#define GSF_X(i) __m512i c##i = _mm512_setzero_si512(), d##i = c##i, e##i = c##i, f##i = c##i;
+    GSF_ROWS(GSF_X) // as in gsf__four_tiles_avx512
+#undef GSF_X
+    for (; count > 0; count -= 4, x0 += 4 * GSF__TILE_ROWS, x1 += 4 * GSF__TILE_ROWS, b += 4 * GSF__TILE_COLUMNS) {
+        const __m512i w0 = _mm512_loadu_si512(b), w1 = _mm512_loadu_si512(b + b_next);
+        __m512i v;
+        _mm_prefetch((const char*)ahead, _MM_HINT_T1);
+        ahead += share;
+#define GSF_X(i)                                                                         \
+        v = gsf__int8_four(x0 + 4 * (i));                                                \
+        c##i = _mm512_dpbusd_epi32(c##i, v, w0);                                         \
+        d##i = _mm512_dpbusd_epi32(d##i, v, w1);                                         \
+        v = gsf__int8_four(x1 + 4 * (i));                                                \
+        e##i = _mm512_dpbusd_epi32(e##i, v, w0);                                         \
+        f##i = _mm512_dpbusd_epi32(f##i, v, w1);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+#define GSF_X(i)                                                                         \
+    GSF_PUT(sums + 16 * (i), c##i) GSF_PUT(right + 16 * (i), d##i)                       \
+    GSF_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+}
+#undef GSF_PUT
+#undef GSF_ROWS
+
+// Two sums of each row, taken in turns: one would wait for itself.
+GSF__TARGET_VNNI static void gsf__int8_few_vnni(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+    const uint8_t* x = (const uint8_t*)a;
+    __m512i even[GSF__FEW_ROWS], odd[GSF__FEW_ROWS];
+    for (int r = 0; r < GSF__FEW_ROWS; r++) even[r] = odd[r] = _mm512_setzero_si512();
+#define GSF_X(r)                                                                                                \
+    if (rows > r) {                                                                                             \
+        even[r] = _mm512_dpbusd_epi32(even[r], gsf__int8_four(x + 4 * (r)), v);                                 \
+        if (u) odd[r] = _mm512_dpbusd_epi32(odd[r], gsf__int8_four(x + 4 * (rows + (r))), u_v);                 \
+    }
+    for (; count >= 8; count -= 8, x += 8 * rows, w += 8 * GSF__TILE_COLUMNS) {
+        const __m512i v = _mm512_loadu_si512(w), u_v = _mm512_loadu_si512(w + 4 * GSF__TILE_COLUMNS);
+        const int u = 1;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+    }
+    if (count > 0) {
+        const __m512i v = _mm512_loadu_si512(w), u_v = v;
+        const int u = 0;
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+    }
+#undef GSF_X
+    for (int64_t r = 0; r < rows; r++)
+        _mm512_storeu_si512(sums + r * GSF__TILE_COLUMNS, _mm512_add_epi32(even[r], odd[r]));
+}
+
+GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const int32_t* offsets, const float* rows,
+                                                    const float* columns, float* out) {
+    const __m512i offset = _mm512_loadu_si512(offsets);
+    const __m512 scale = _mm512_loadu_ps(columns);
+    for (int i = 0; i < GSF__TILE_ROWS; i++) {
+        const __m512i v = _mm512_sub_epi32(_mm512_loadu_si512(sums + i * GSF__TILE_COLUMNS), offset);
+        _mm512_storeu_ps(out + i * GSF__TILE_COLUMNS, _mm512_cvtepi32_ps(v) * _mm512_set1_ps(rows[i]) * scale);
+    }
+}
+
+static const gsf__int8_kernels gsf__int8_vnni = {
+    gsf__int8_rotate_avx512, gsf__int8_quantize_avx2, gsf__int8_quantize_x_vnni, sizeof(uint8_t), NULL,
+    gsf__int8_tile_vnni, gsf__int8_four_tiles_vnni, gsf__int8_few_vnni, GSF__FEW_ROWS, gsf__int8_scale_vnni};
 
 #endif
 
 static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level) {
 #if GSF__X86
+    if (level >= GSF_CPU_AVX512_VNNI) return &gsf__int8_vnni;
     if (level >= GSF_CPU_AVX2) return &gsf__int8_avx2;
 #endif
     (void)level;
@@ -3347,15 +3545,16 @@ static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level) {
 
 // ---- int8: the parts put together
 
-// Rotates and rounds a row (`in` values, which it changes, then room up to `padded`) to fours `pitch` apart. Returns the
-// scale: NaN, and zeros, for a row with a NaN or infinity; 0 for one below 1e-30, as 127 / size would leave float's range.
-static float gsf__int8_row(const gsf__int8_kernels* kernels, float* x, int64_t in, int64_t padded, int64_t block,
-                           int16_t* out, int64_t pitch) {
+// Rotates and rounds a row (`in` values, which it changes, then room up to `padded`) to fours `pitch` apart, as int16 for a
+// weight. Returns the scale: NaN, and zeros, for a row with a NaN or infinity; 0 for one below 1e-30, as 127 / size would
+// leave float's range.
+static float gsf__int8_row(const gsf__int8_kernels* kernels, int weight, float* x, int64_t in, int64_t padded, int64_t block,
+                           void* out, int64_t pitch) {
     const float top = kernels->rotate(x, in, block);
     const int there = top >= 1e-30f && top <= FLT_MAX;
     for (int64_t k = in; k < padded; k++) x[k] = 0.0f;
     if (!there) memset(x, 0, (size_t)padded * sizeof *x);
-    kernels->quantize(x, padded, there ? 127.0f / top : 1.0f, out, pitch);
+    (weight ? kernels->quantize : kernels->quantize_x)(x, padded, there ? 127.0f / top : 1.0f, out, pitch);
     return there ? top / 127.0f : top <= FLT_MAX ? 0.0f : NAN;
 }
 
@@ -3377,14 +3576,19 @@ static void gsf__quantize_panel(void* arg, size_t panel, int worker) {
     for (int64_t c = 0; c < GSF__TILE_COLUMNS; c++) {
         const int64_t row = (int64_t)panel * GSF__TILE_COLUMNS + c;
         float scale = 0.0f;
+        int32_t sum = 0;
         if (row < w->out) {
             gsf_nn_read_tensor(job->tensor, row * w->in, w->in, x);
-            scale = gsf__int8_row(job->kernels, x, w->in, job->padded, w->block, q, 4) / (float)w->block;
+            scale = gsf__int8_row(job->kernels, 1, x, w->in, job->padded, w->block, q, 4) / (float)w->block;
         } else {
             memset(q, 0, (size_t)job->padded * sizeof *q);
         }
         w->scales[row] = scale;
-        for (int64_t k = 0; k < job->padded; k++) to[(k >> 2) * 64 + c * 4 + (k & 3)] = (int8_t)q[k];
+        for (int64_t k = 0; k < job->padded; k++) {
+            to[(k >> 2) * 64 + c * 4 + (k & 3)] = (int8_t)q[k];
+            sum += q[k];
+        }
+        w->offsets[row] = 128 * sum;
     }
 }
 
@@ -3417,13 +3621,13 @@ GSF_API gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* we
     job.per_worker = (size_t)gsf__round_up(job.padded + job.padded / 2, 16);
     size_t values, scratch;
     const size_t columns = ((size_t)made.out + GSF__TILE_COLUMNS - 1) / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
-    if (!gsf__mul_size(columns, (size_t)job.padded, &values) || columns > (SIZE_MAX - values) / sizeof(float) ||
-        !gsf__mul_size(job.per_worker, (size_t)ctx->parallel.worker_count, &scratch))
+    if (!gsf__mul_size(columns, (size_t)job.padded, &values) || columns > (SIZE_MAX - values) / 8 || !gsf__mul_size(job.per_worker, (size_t)ctx->parallel.worker_count, &scratch))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "int8: %lld x %lld", (long long)made.out, (long long)made.in);
-    made.bytes = values + columns * sizeof(float);
-    made.data = (int8_t*)gsf_alloc(ctx, made.bytes, 1); // the scales stand behind: values is a multiple of 64
+    made.bytes = values + columns * (sizeof(float) + sizeof(int32_t));
+    made.data = (int8_t*)gsf_alloc(ctx, made.bytes, 1); // scales and offsets stand behind: values is a multiple of 64
     if (!made.data) return GSF_ERROR_OUT_OF_MEMORY;
     made.scales = (float*)(void*)(made.data + values);
+    made.offsets = (int32_t*)(void*)(made.scales + columns);
     job.workers = (float*)gsf_alloc(ctx, scratch, sizeof(float));
     if (!job.workers) {
         gsf_nn_destroy_quantized(ctx, &made);
@@ -3454,12 +3658,13 @@ static void gsf__int8_quantize_rows(void* arg, size_t group, int worker) { // si
     const gsf_nn_linear_desc* d = &job->linear.desc;
     const int64_t at = (int64_t)group * GSF__TILE_ROWS, in = job->weight->in;
     float* x = (float*)(void*)(job->workers + (size_t)worker * job->per_worker);
-    int16_t* out = job->x + at * job->padded;
+    const size_t size = job->kernels->x_size;
+    char* out = job->x + (size_t)(at * job->padded) * size;
     for (int64_t r = 0; r < GSF__TILE_ROWS; r++) {
         if (at + r < job->rows) memcpy(x, d->x + (job->first + at + r) * d->ldx, (size_t)in * sizeof *x);
         else memset(x, 0, (size_t)in * sizeof *x);
-        job->scales[at + r] = gsf__int8_row(job->kernels, x, in, job->padded, job->weight->block, out + 4 * r,
-                                            4 * GSF__TILE_ROWS);
+        job->scales[at + r] = gsf__int8_row(job->kernels, 0, x, in, job->padded, job->weight->block,
+                                            out + 4 * (size_t)r * size, 4 * GSF__TILE_ROWS);
     }
 }
 
@@ -3471,53 +3676,83 @@ static void gsf__int8_fetch(const int8_t* p, int64_t count) { // panels come fro
     (void)count;
 }
 
+// The end of a tile: its sums to y.
+static void gsf__int8_finish(const gsf__int8_job* job, const int32_t* sums, int64_t row, int64_t rows, int64_t column,
+                             int64_t columns, float* tile) {
+    const gsf_nn_quantized* w = job->weight;
+    job->kernels->scale(sums, w->offsets + column, job->scales + row, w->scales + column, tile);
+    job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, job->first + row, rows, column, columns);
+}
+
+// All tiles of one or two panels at one step, as gsf__linear_panels.
+static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows, int64_t column, int64_t columns, int64_t k,
+                             int64_t count, int32_t* sums, int64_t next, int16_t* panel, float* tile) {
+    const gsf__int8_kernels* kernels = job->kernels;
+    const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    const int64_t panel_size = job->padded * GSF__TILE_COLUMNS, group_size = job->padded * GSF__TILE_ROWS;
+    const int8_t* w = job->weight->data + column * job->padded + k * GSF__TILE_COLUMNS;
+    const int64_t share = count * GSF__TILE_COLUMNS / groups; // of a panel needed next, fetched beside each tile
+    const int8_t* ahead = column + 2 * columns <= job->weight->out ? w + panels * panel_size : w;
+    for (int64_t g = 0, step; g < groups; g += step) {
+        const int64_t r = row + g * GSF__TILE_ROWS;
+        const char* x = job->x + (size_t)(r * job->padded + k * GSF__TILE_ROWS) * kernels->x_size;
+        int32_t* s = sums + g * GSF__TILE_SUMS;
+        step = kernels->four_tiles && panels == 2 && g + 2 <= groups ? 2 : 1;
+        // two groups fetch one after the other the two panels
+        const int8_t* wanted = g < groups / 2 ? ahead + 2 * g * share : ahead + panel_size + (2 * g - groups) * share;
+        if (step == 2)
+            kernels->four_tiles(x, group_size * (int64_t)kernels->x_size, w, panel_size, count, k > 0, s, next, wanted,
+                                4 * share);
+        for (int64_t p = 0; step == 1 && p < panels; p++) {
+            const void* b = kernels->widen ? (const void*)(panel + p * count * GSF__TILE_COLUMNS) : w + p * panel_size;
+            if (kernels->widen) gsf__int8_fetch(ahead + p * panel_size + g * share, share);
+            kernels->tile(x, b, count, k > 0, s + p * next);
+        }
+        if (k + count < job->padded) continue;
+        for (int64_t t = 0; t < step * panels; t++) {
+            const int64_t p = t / step, down = t % step * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
+            gsf__int8_finish(job, s + p * next + t % step * GSF__TILE_SUMS, r + down,
+                             gsf__least(row + rows - r - down, GSF__TILE_ROWS), column + c,
+                             gsf__least(columns - c, GSF__TILE_COLUMNS), tile);
+        }
+    }
+}
+
 static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of rows and outputs
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
     const int64_t row = (int64_t)index % job->row_blocks * job->block_rows; // of those in work
     const int64_t column = (int64_t)index / job->row_blocks * job->block_columns;
     const int64_t rows = gsf__least(job->rows - row, job->block_rows);
     const int64_t columns = gsf__least(job->weight->out - column, job->block_columns);
-    const int64_t tiles = gsf__ceil_div(rows, GSF__TILE_ROWS);
+    const int64_t next = gsf__ceil_div(rows, GSF__TILE_ROWS) * GSF__TILE_SUMS; // from panel to panel
     int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
     float* tile = (float*)(void*)(sums + job->block_rows * job->block_columns);
     int16_t* panel = (int16_t*)(void*)(tile + GSF__TILE_SUMS);
     for (int64_t k = 0; k < job->padded; k += job->depth) {
         const int64_t count = gsf__least(job->padded - k, job->depth);
-        const int last = k + count == job->padded;
-        const int64_t share = count * GSF__TILE_COLUMNS / tiles; // of the next panel, fetched beside each tile
-        int32_t* s = sums;
-        for (int64_t c = 0; c < columns; c += GSF__TILE_COLUMNS) {
-            const int64_t width = gsf__least(columns - c, GSF__TILE_COLUMNS);
-            const int8_t* w = job->weight->data + (column + c) * job->padded + k * GSF__TILE_COLUMNS;
-            const int8_t* ahead = c + GSF__TILE_COLUMNS < columns ? w + job->padded * GSF__TILE_COLUMNS : NULL;
-            job->kernels->widen(w, count, panel);
-            for (int64_t t = 0; t < tiles; t++, s += GSF__TILE_SUMS) {
-                const int64_t r = row + t * GSF__TILE_ROWS;
-                if (ahead) gsf__int8_fetch(ahead + t * share, share);
-                job->kernels->tile(job->x + r * job->padded + k * GSF__TILE_ROWS, panel, count, k > 0, s);
-                if (!last) continue;
-                job->kernels->scale(s, job->scales + r, job->weight->scales + column + c, tile);
-                job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, job->first + r,
-                                            gsf__least(row + rows - r, GSF__TILE_ROWS), column + c, width);
-            }
+        for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
+            const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR);
+            for (int64_t p = 0; job->kernels->widen && p < width; p += GSF__TILE_COLUMNS)
+                job->kernels->widen(job->weight->data + (column + c + p) * job->padded + k * GSF__TILE_COLUMNS, count,
+                                    panel + p * count);
+            gsf__int8_panels(job, row, rows, column + c, width, k, count, sums + c / GSF__TILE_COLUMNS * next, next, panel,
+                             tile);
         }
     }
 }
 
 static void gsf__int8_few(void* arg, size_t index, int worker) { // some panels of outputs of all rows
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
-    const int64_t rows = job->rows, first = (int64_t)index * job->block_columns;
+    const int64_t rows = job->rows, few = job->kernels->few_rows, first = (int64_t)index * job->block_columns;
     const int64_t end = gsf__least(first + job->block_columns, job->weight->out);
     int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
     float* tile = (float*)(void*)(sums + GSF__TILE_SUMS);
     memset(sums, 0, GSF__TILE_SUMS * sizeof *sums); // also of rows that are not there
     for (int64_t column = first; column < end; column += GSF__TILE_COLUMNS) {
-        for (int64_t r = 0; r < rows; r += 2)
-            job->kernels->few(job->x + r * job->padded, gsf__least(rows - r, 2), job->weight->data + column * job->padded,
-                              job->padded, sums + r * GSF__TILE_COLUMNS);
-        job->kernels->scale(sums, job->scales, job->weight->scales + column, tile);
-        job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, 0, rows, column,
-                                    gsf__least(end - column, GSF__TILE_COLUMNS));
+        for (int64_t r = 0; r < rows; r += few)
+            job->kernels->few(job->x + (size_t)(r * job->padded) * job->kernels->x_size, gsf__least(rows - r, few),
+                              job->weight->data + column * job->padded, job->padded, sums + r * GSF__TILE_COLUMNS);
+        gsf__int8_finish(job, sums, 0, rows, column, gsf__least(end - column, GSF__TILE_COLUMNS), tile);
     }
 }
 
@@ -3527,10 +3762,11 @@ static void gsf__int8_run_few(gsf_context* ctx, gsf__int8_job* job) {
     job->rows = d->rows;
     memset(job->scales, 0, GSF__TILE_ROWS * sizeof *job->scales);
     for (int64_t r = 0; r < d->rows; r++) {
-        const int64_t pair = r & ~(int64_t)1, width = gsf__least(d->rows - pair, 2);
+        const int64_t first = r - r % job->kernels->few_rows, width = gsf__least(d->rows - first, job->kernels->few_rows);
         memcpy(x, d->x + r * d->ldx, (size_t)job->weight->in * sizeof *x);
-        job->scales[r] = gsf__int8_row(job->kernels, x, job->weight->in, job->padded, job->weight->block,
-                                       job->x + pair * job->padded + 4 * (r - pair), 4 * width);
+        job->scales[r] = gsf__int8_row(job->kernels, 0, x, job->weight->in, job->padded, job->weight->block,
+                                       job->x + (size_t)(first * job->padded + 4 * (r - first)) * job->kernels->x_size,
+                                       4 * width);
     }
     gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->weight->out, job->block_columns), gsf__int8_few, job);
 }
@@ -3540,16 +3776,16 @@ static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     const int64_t out = job->weight->out;
     size_t x, bytes;
     if (rows > INT64_MAX / 256 || out > INT64_MAX / 256) return 0;
-    job->depth = gsf__even_piece(job->padded, GSF__INT8_DEPTH, 4);
+    job->depth = gsf__even_piece(job->padded, job->kernels->widen ? GSF__INT8_DEPTH : 2 * GSF__INT8_DEPTH, 4);
     const int64_t most = gsf__round_up(GSF__INT8_HELD / job->padded + 1, GSF__INT8_ROWS);
     job->held = gsf__even_piece(rows, most, GSF__TILE_ROWS);
-    job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, GSF__TILE_ROWS);
-    job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__TILE_COLUMNS);
+    job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, 2 * GSF__TILE_ROWS);
+    job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__LINEAR_PAIR);
     if (rows <= GSF__FEW_ROWS) { // all at once; outputs in GSF__FEW_CHUNKS parts
         const int64_t least = GSF__FEW_BYTES / job->padded + 1, share = gsf__ceil_div(out, GSF__FEW_CHUNKS);
         job->block_columns = gsf__round_up(gsf__least(share < least ? least : share, out), GSF__TILE_COLUMNS);
     }
-    const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__TILE_COLUMNS;
+    const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__LINEAR_PAIR;
     const int64_t row = 4 * job->padded; // the two kinds of work do not overlap
     job->per_worker = (size_t)gsf__round_up(block > row ? block : row, 64);
     if (!gsf__mul_size(job->per_worker, workers, &bytes)) return 0;
@@ -3584,6 +3820,7 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
     if (!linear->desc.ldx) linear->desc.ldx = weight->in;
     if (!linear->desc.ldy) linear->desc.ldy = weight->out;
     job.weight = weight;
+    job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
     job.padded = gsf__round_up(weight->in, 4);
     const size_t bytes = gsf__int8_plan(&job, desc->rows, (size_t)ctx->parallel.worker_count);
     if (!bytes)
@@ -3591,13 +3828,12 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
                         (long long)weight->in, (long long)weight->out);
     job.workers = (char*)gsf__nn_scratch(ctx, workspace ? workspace : &own, bytes);
     if (!job.workers) return GSF_ERROR_OUT_OF_MEMORY;
-    job.x = (int16_t*)(void*)(job.workers + job.per_worker * (size_t)ctx->parallel.worker_count);
-    job.scales = (float*)(void*)(job.x + job.held * job.padded);
+    job.x = job.workers + job.per_worker * (size_t)ctx->parallel.worker_count;
+    job.scales = (float*)(void*)(job.x + (size_t)(job.held * job.padded) * sizeof(int16_t));
     linear->bias = job.scales + job.held;
     memset(linear->bias, 0, (size_t)(weight->out + 16) * sizeof(float));
     if (desc->bias) gsf_nn_read_tensor(desc->bias, 0, weight->out, linear->bias);
     linear->kernels = gsf__linear_kernels_of(ctx->cpu_level);
-    job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
     const int64_t column_blocks = gsf__ceil_div(weight->out, job.block_columns);
     if (desc->rows <= GSF__FEW_ROWS) gsf__int8_run_few(ctx, &job);
     for (; job.first < desc->rows && desc->rows > GSF__FEW_ROWS; job.first += job.held) {

@@ -255,25 +255,49 @@ static void test_same_bits(gsf_cpu_level best) {
     }
 }
 
-// The kernels themselves on the largest sums that there are.
+// The kernels themselves on the largest sums that there are, which those of unsigned bytes leave wrapped around.
 static void test_extremes(gsf_cpu_level best) {
-    enum { COUNT = 1028 };
+    enum { COUNT = 1028, FEW = 2 };
     static int8_t w[16 * COUNT];
     static int16_t a[6 * COUNT], b[16 * COUNT];
     int32_t sums[GSF__TILE_SUMS];
     for (int level = GSF_CPU_SCALAR; level <= (int)best; level++) {
         const gsf__int8_kernels* kernels = gsf__int8_kernels_of((gsf_cpu_level)level);
+        const int is_unsigned = kernels->x_size == 1;
         for (int sign = -1; sign <= 1; sign += 2) {
+            const uint32_t once = (uint32_t)(sign * 127 * (is_unsigned ? 255 : 127) * COUNT);
             memset(w, sign * 127, sizeof w);
             for (int i = 0; i < 6 * COUNT; i++) a[i] = 127;
-            kernels->widen(w, COUNT, b);
-            kernels->tile(a, b, COUNT, 0, sums);
-            kernels->tile(a, b, COUNT, 1, sums);
+            if (is_unsigned) memset(a, 255, sizeof a);
+            if (kernels->widen) kernels->widen(w, COUNT, b);
+            const void* panel = kernels->widen ? (const void*)b : w;
+            kernels->tile(a, panel, COUNT, 0, sums);
+            kernels->tile(a, panel, COUNT, 1, sums);
             int wrong = 0;
-            for (int i = 0; i < GSF__TILE_SUMS; i++) wrong += sums[i] != sign * 2 * 127 * 127 * COUNT;
-            kernels->few(a, 2, w, COUNT, sums);
-            for (int i = 0; i < 32; i++) wrong += sums[i] != sign * 127 * 127 * COUNT;
+            for (int i = 0; i < GSF__TILE_SUMS; i++) wrong += (uint32_t)sums[i] != 2 * once;
+            kernels->few(a, FEW, w, COUNT, sums);
+            for (int i = 0; i < FEW * GSF__TILE_COLUMNS; i++) wrong += (uint32_t)sums[i] != once;
             CHECK(wrong == 0);
+        }
+    }
+}
+
+// Four tiles at once are what each gives by itself.
+static void test_four_tiles(gsf_cpu_level best) {
+    enum { COUNT = 52, GROUP = 6 * COUNT, PANEL = 16 * COUNT };
+    uint8_t a[2 * GROUP];
+    int8_t w[2 * PANEL];
+    int32_t sums[4 * GSF__TILE_SUMS], alone[GSF__TILE_SUMS];
+    for (int level = GSF_CPU_SCALAR; level <= (int)best; level++) {
+        const gsf__int8_kernels* kernels = gsf__int8_kernels_of((gsf_cpu_level)level);
+        if (!kernels->four_tiles) continue;
+        for (size_t i = 0; i < sizeof a; i++) a[i] = (uint8_t)(test_random_bits(&seed) >> 56);
+        for (size_t i = 0; i < sizeof w; i++) w[i] = (int8_t)(test_random_bits(&seed) >> 56);
+        for (int add = 0; add < 2; add++)
+            kernels->four_tiles(a, GROUP, w, PANEL, COUNT, add, sums, 2 * GSF__TILE_SUMS, w, sizeof w);
+        for (int t = 0; t < 4; t++) { // panel t / 2, group t % 2
+            for (int add = 0; add < 2; add++) kernels->tile(a + t % 2 * GROUP, w + t / 2 * PANEL, COUNT, add, alone);
+            CHECK(memcmp(alone, sums + t * GSF__TILE_SUMS, sizeof alone) == 0);
         }
     }
 }
@@ -416,6 +440,7 @@ int main(void) {
     }
     test_same_bits(best);
     test_extremes(best);
+    test_four_tiles(best);
     test_memory();
     return test_report();
 }
