@@ -3506,6 +3506,10 @@ GSF__TARGET_VNNI static void gsf__int8_few_vnni(const void* a, int64_t rows, con
     for (; count >= 8; count -= 8, x += 8 * rows, w += 8 * GSF__TILE_COLUMNS) {
         const __m512i v = _mm512_loadu_si512(w), u_v = _mm512_loadu_si512(w + 4 * GSF__TILE_COLUMNS);
         const int u = 1;
+        if (rows > 2) { // for fewer the processor itself is soon enough
+            _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T1);
+            _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD + 64, _MM_HINT_T1);
+        }
         GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
     }
     if (count > 0) {
@@ -4279,6 +4283,17 @@ typedef struct gsf__attention_scratch { // of one worker
     float* sum; // [query][8] sum of the weights so far, by lane
 } gsf__attention_scratch;
 
+typedef struct gsf__attention_parts { // what instruction sets do differently
+    // p of `groups` groups of queries against `panels` panels of keys
+    void (*logits)(const float* q, int64_t groups, const float* k, int64_t panels, int64_t dim, float* p);
+    // Logits of `queries` rows to weights; raises `top`, updates `sum`, and gives in `fade` what earlier values are to be
+    // multiplied with. A NaN does not become the top, but its weight and with it sum and output are NaN.
+    void (*weights)(float* p, int64_t queries, int64_t columns, float* top, float* sum, float fade[GSF__ATT_QUERIES]);
+    // out = out * fade + p v
+    void (*values)(const float* p, int64_t groups, const float* v, int64_t keys, int64_t panels, const float* fade,
+                   float* out);
+} gsf__attention_parts;
+
 static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job* job, int worker) {
     const int64_t groups = (job->range_size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, dim = job->desc.head_dim;
     gsf__attention_scratch s;
@@ -4371,9 +4386,8 @@ GSF__INLINE_AVX2 void gsf__attention_tile(const float* a, int64_t a_row, int64_t
     c[6] = c30; c[7] = c31; c[8] = c40; c[9] = c41; c[10] = c50; c[11] = c51;
 }
 
-// p of `groups` groups of queries against `panels` panels of keys.
-GSF__TARGET_AVX2 static void gsf__attention_logits(const float* q, int64_t groups, const float* k, int64_t panels,
-                                                   int64_t dim, float* p) {
+GSF__TARGET_AVX2 static void gsf__attention_logits_avx2(const float* q, int64_t groups, const float* k, int64_t panels,
+                                                        int64_t dim, float* p) {
     for (int64_t panel = 0; panel < panels; panel++, k += GSF__ATT_PANEL * dim)
         for (int64_t g = 0; g < groups; g++) {
             __m256 c[12];
@@ -4384,6 +4398,48 @@ GSF__TARGET_AVX2 static void gsf__attention_logits(const float* q, int64_t group
                 _mm256_storeu_ps(to + r * GSF__ATT_KEYS + 8, c[2 * r + 1]);
             }
         }
+}
+
+// a and b as in gsf__attention_tile, with a second group `a_next` and a second panel `b_next` behind them. Sums are added to
+// c, d (first group, by panel) and e, f; each takes its products in the same order as there.
+#define GSF__ATT_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF__ATT_FOUR_TILES(a, a_row, a_step, a_next, b, b_next, count)                                                  \
+    for (int64_t k_ = 0; k_ < (count); k_++, a += a_step, b += GSF__ATT_PANEL) {                                        \
+        const __m512 w0 = _mm512_loadu_ps(b), w1 = _mm512_loadu_ps(b + (b_next));                                       \
+        __m512 x;                                                                                                       \
+        GSF__ATT_STEP(0, a_row, a_next) GSF__ATT_STEP(1, a_row, a_next) GSF__ATT_STEP(2, a_row, a_next)                 \
+        GSF__ATT_STEP(3, a_row, a_next) GSF__ATT_STEP(4, a_row, a_next) GSF__ATT_STEP(5, a_row, a_next)                 \
+    }
+#define GSF__ATT_STEP(r, a_row, a_next)                     \
+    x = _mm512_set1_ps(a[(r) * (a_row)]);                   \
+    c##r = _mm512_fmadd_ps(x, w0, c##r);                    \
+    d##r = _mm512_fmadd_ps(x, w1, d##r);                    \
+    x = _mm512_set1_ps(a[(a_next) + (r) * (a_row)]);        \
+    e##r = _mm512_fmadd_ps(x, w0, e##r);                    \
+    f##r = _mm512_fmadd_ps(x, w1, f##r);
+#define GSF__ATT_ZEROS(r) __m512 c##r = _mm512_setzero_ps(), d##r = c##r, e##r = c##r, f##r = c##r;
+
+// Pairs of panels by pairs of groups; an odd one that is left is done by halves.
+GSF__TARGET_AVX512 static void gsf__attention_logits_avx512(const float* q, int64_t groups, const float* k, int64_t panels,
+                                                            int64_t dim, float* p) {
+    const int64_t even = groups & ~(int64_t)1, odd = groups - even, height = GSF__ATT_GROUP * GSF__ATT_KEYS;
+    for (int64_t panel = 0; panel + 2 <= panels; panel += 2, k += 2 * GSF__ATT_PANEL * dim) {
+        float* to = p + panel * GSF__ATT_PANEL;
+        for (int64_t g = 0; g < even; g += 2, to += 2 * height) {
+            const float *a = q + g * 8 * dim, *b = k;
+            GSF__ATT_ROWS(GSF__ATT_ZEROS)
+            GSF__ATT_FOUR_TILES(a, 1, 8, 8 * dim, b, GSF__ATT_PANEL * dim, dim)
+#define GSF_X(r)                                                                         \
+            _mm512_storeu_ps(to + r * GSF__ATT_KEYS, c##r);                              \
+            _mm512_storeu_ps(to + r * GSF__ATT_KEYS + GSF__ATT_PANEL, d##r);             \
+            _mm512_storeu_ps(to + height + r * GSF__ATT_KEYS, e##r);                     \
+            _mm512_storeu_ps(to + height + r * GSF__ATT_KEYS + GSF__ATT_PANEL, f##r);
+            GSF__ATT_ROWS(GSF_X)
+#undef GSF_X
+        }
+        if (odd) gsf__attention_logits_avx2(q + even * 8 * dim, 1, k, 2, dim, to);
+    }
+    if (panels % 2) gsf__attention_logits_avx2(q, groups, k, 1, dim, p + (panels - 1) * GSF__ATT_PANEL);
 }
 
 // Adds the bias to the logits of `queries` rows and `keys` columns, as powers of 2.
@@ -4408,10 +4464,8 @@ static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, 
     }
 }
 
-// Logits of `queries` rows to weights; raises `top`, updates `sum`, and gives in `fade` what earlier values are to be
-// multiplied with. A NaN does not become the top, but its weight and with it sum and output are NaN.
-GSF__TARGET_AVX2 static void gsf__attention_weights(float* p, int64_t queries, int64_t columns, float* top, float* sum,
-                                                    float fade[GSF__ATT_QUERIES]) {
+GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queries, int64_t columns, float* top, float* sum,
+                                                         float fade[GSF__ATT_QUERIES]) {
     const gsf__nn_exp2 c = gsf__nn_exp2_constants(1);
     for (int64_t r = 0; r < queries; r++) {
         const float* row = p + r * GSF__ATT_KEYS;
@@ -4441,9 +4495,36 @@ GSF__TARGET_AVX2 static void gsf__attention_weights(float* p, int64_t queries, i
     }
 }
 
-// out = out * fade + p v
-GSF__TARGET_AVX2 static void gsf__attention_values(const float* p, int64_t groups, const float* v, int64_t keys,
-                                                   int64_t panels, const float* fade, float* out) {
+GSF__TARGET_AVX512 static void gsf__attention_weights_avx512(float* p, int64_t queries, int64_t columns, float* top,
+                                                             float* sum, float fade[GSF__ATT_QUERIES]) {
+    for (int64_t r = 0; r < queries; r++) {
+        const float* row = p + r * GSF__ATT_KEYS;
+        __m512 highest = _mm512_set1_ps(top[r]);
+        for (int64_t j = 0; j < columns; j += 16) highest = _mm512_max_ps(_mm512_loadu_ps(row + j), highest);
+        const float raised = gsf__nn_max16(highest);
+        fade[r] = top[r] - raised;
+        top[r] = raised;
+    }
+    for (int64_t r = 0; r < queries; r += 16) {
+        const __mmask16 mask = gsf__nn_mask16(queries - r);
+        _mm512_mask_storeu_ps(fade + r, mask, gsf__nn_exp2_low16(_mm512_maskz_loadu_ps(mask, fade + r)));
+    }
+    for (int64_t r = 0; r < queries; r++) {
+        float* row = p + r * GSF__ATT_KEYS;
+        const __m512 t = _mm512_set1_ps(top[r]);
+        __m512 total = _mm512_setzero_ps();
+        for (int64_t j = 0; j < columns; j += 16) {
+            const __m512 weight = gsf__nn_exp2_low16(_mm512_loadu_ps(row + j) - t);
+            _mm512_storeu_ps(row + j, weight);
+            total = total + weight;
+        }
+        const __m256 before = _mm256_set1_ps(fade[r]) * _mm256_loadu_ps(sum + 8 * r);
+        _mm256_storeu_ps(sum + 8 * r, before + gsf__nn_fold16(total));
+    }
+}
+
+GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t groups, const float* v, int64_t keys,
+                                                        int64_t panels, const float* fade, float* out) {
     for (int64_t panel = 0; panel < panels; panel++, v += GSF__ATT_KEYS * GSF__ATT_PANEL)
         for (int64_t g = 0; g < groups; g++) {
             __m256 c[12];
@@ -4456,6 +4537,44 @@ GSF__TARGET_AVX2 static void gsf__attention_values(const float* p, int64_t group
                 _mm256_storeu_ps(to + 8, _mm256_fmadd_ps(f, _mm256_loadu_ps(to + 8), c[2 * r + 1]));
             }
         }
+}
+
+// Pairs of panels by pairs of groups; the rest by AVX2, one panel of all groups or one group of all panels.
+GSF__TARGET_AVX512 static void gsf__attention_values_avx512(const float* p, int64_t groups, const float* v, int64_t keys,
+                                                            int64_t panels, const float* fade, float* out) {
+    if (panels % 2) { // sizes of no model
+        gsf__attention_values_avx2(p, groups, v, keys, panels, fade, out);
+        return;
+    }
+    const int64_t height = GSF__ATT_GROUP * GSF__ATT_KEYS, width = panels * GSF__ATT_TILE, even = groups & ~(int64_t)1;
+    for (int64_t panel = 0; panel < panels; panel += 2)
+        for (int64_t g = 0; g < even; g += 2) {
+            const float *a = p + g * height, *b = v + panel * GSF__ATT_KEYS * GSF__ATT_PANEL;
+            float* to = out + (g * panels + panel) * GSF__ATT_TILE;
+            for (int i = 0; i < 2 * GSF__ATT_TILE; i += 16) {
+                _mm_prefetch((const char*)(to + i), _MM_HINT_T0);
+                _mm_prefetch((const char*)(to + width + i), _MM_HINT_T0);
+            }
+            GSF__ATT_ROWS(GSF__ATT_ZEROS)
+            GSF__ATT_FOUR_TILES(a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, keys)
+#define GSF_ADD(at, group, v_)                                                                                  \
+            _mm512_storeu_ps(at, _mm512_fmadd_ps(_mm512_set1_ps(fade[(group) * GSF__ATT_GROUP + row]),          \
+                                                 _mm512_loadu_ps(at), v_));
+#define GSF_X(r)                                                                         \
+            {                                                                            \
+                const int row = r;                                                       \
+                float* at = to + row * GSF__ATT_PANEL;                                   \
+                GSF_ADD(at, g, c##r)                                                     \
+                GSF_ADD(at + GSF__ATT_TILE, g, d##r)                                     \
+                GSF_ADD(at + width, g + 1, e##r)                                         \
+                GSF_ADD(at + width + GSF__ATT_TILE, g + 1, f##r)                         \
+            }
+            GSF__ATT_ROWS(GSF_X)
+#undef GSF_X
+#undef GSF_ADD
+        }
+    if (even < groups)
+        gsf__attention_values_avx2(p + even * height, 1, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
 }
 
 GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job, const gsf__attention_scratch* s,
@@ -4473,8 +4592,7 @@ GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job
     }
 }
 
-GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, int worker) {
-    const gsf__attention_job* job = (const gsf__attention_job*)arg;
+static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__attention_parts* parts, size_t chunk, int worker) {
     const gsf_nn_attention_desc* d = &job->desc;
     const gsf__attention_scratch s = gsf__attention_scratch_of(job, worker);
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
@@ -4492,16 +4610,28 @@ GSF__TARGET_AVX2 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, 
         gsf__attention_pack_values(job, d->v + key * d->ldv + column, keys, s.v);
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
-            gsf__attention_logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
+            parts->logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
             const int64_t at = (head * d->queries + first + r) * d->keys + key; // in mask and bias
             const unsigned char* mask = d->mask ? d->mask + at : NULL;
             if (d->bias) gsf__attention_bias(d->bias + at, d->keys, rows - r, keys, s.p);
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
-            gsf__attention_weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
-            gsf__attention_values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
+            parts->weights(s.p, count * GSF__ATT_GROUP, columns, s.top + r, s.sum + 8 * r, fade);
+            parts->values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
         }
     }
     gsf__attention_finish(job, &s, rows, d->out + first * d->ldo + column);
+}
+
+static void gsf__attention_chunk_avx2(void* arg, size_t chunk, int worker) {
+    static const gsf__attention_parts parts = {gsf__attention_logits_avx2, gsf__attention_weights_avx2,
+                                               gsf__attention_values_avx2};
+    gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
+}
+
+static void gsf__attention_chunk_avx512(void* arg, size_t chunk, int worker) {
+    static const gsf__attention_parts parts = {gsf__attention_logits_avx512, gsf__attention_weights_avx512,
+                                               gsf__attention_values_avx512};
+    gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
 }
 
 #endif // GSF__X86
@@ -4510,6 +4640,8 @@ static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level lev
     static const gsf__attention_kernels scalar = {gsf__attention_row, 0};
 #if GSF__X86
     static const gsf__attention_kernels avx2 = {gsf__attention_chunk_avx2, 1};
+    static const gsf__attention_kernels avx512 = {gsf__attention_chunk_avx512, 1};
+    if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -4587,7 +4719,8 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 
 enum {
     GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
-    GSF__CONV_ROWS = 4, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of CONV_M
+    GSF__CONV_M10 = 10,                                   // pixels of a product with two panels
+    GSF__CONV_ROWS = 4, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of both
     GSF__CONV_TAPS = 27,
 };
 
@@ -4595,6 +4728,9 @@ typedef struct gsf__conv_kernels {
     // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last rows
     // repeat the last pixel.
     void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c);
+    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart, count up to CONV_COLUMNS; or NULL
+    void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
+                         int64_t c_next);
     // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and their squares.
     void (*store)(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo, double* sums);
     // y = silu((x - mean) * scale + offset)
@@ -4675,6 +4811,39 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
     }
 }
 
+// Ten pixels by two panels: 20 registers of sums. A missing pixel reads the last one's values.
+GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int64_t lda, int64_t count, const float* b,
+                                                             int64_t b_next, int64_t k, float* c, int64_t c_next) {
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5) X(6) X(7) X(8) X(9)
+    for (int64_t m = 0; m < count; m += GSF__CONV_M10, a += GSF__CONV_M10 * lda, c += GSF__CONV_M10 * GSF__CONV_N) {
+        const int64_t last = count - m - 1;
+        const float* w = b;
+#define GSF_X(r) const float* a##r = a + (last < r ? last : r) * lda;
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+#define GSF_X(r) __m512 c##r = _mm512_setzero_ps(), d##r = c##r;
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+        for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
+            const __m512 w0 = _mm512_loadu_ps(w), w1 = _mm512_loadu_ps(w + b_next);
+            __m512 v;
+#define GSF_X(r)                                     \
+            v = _mm512_set1_ps(a##r[i]);             \
+            c##r = _mm512_fmadd_ps(v, w0, c##r);     \
+            d##r = _mm512_fmadd_ps(v, w1, d##r);
+            GSF_ROWS(GSF_X)
+#undef GSF_X
+        }
+        float* next = c + c_next;
+#define GSF_X(r)                                                                                                        \
+        _mm512_storeu_ps(c + (r) * GSF__CONV_N, _mm512_loadu_ps(c + (r) * GSF__CONV_N) + c##r);                         \
+        _mm512_storeu_ps(next + (r) * GSF__CONV_N, _mm512_loadu_ps(next + (r) * GSF__CONV_N) + d##r);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+#undef GSF_ROWS
+}
+
 GSF__INLINE_AVX2 void gsf__conv_add_squares(__m256d v, __m256d* sum, __m256d* square) {
     *sum = _mm256_add_pd(*sum, v);
     *square = _mm256_fmadd_pd(v, v, *square);
@@ -4713,12 +4882,25 @@ GSF__TARGET_AVX2 static void gsf__conv_norm_silu_avx2(const float* x, int64_t co
     }
     gsf__conv_norm_silu_ref(x + i, count - i, mean + i, scale + i, offset + i, y + i);
 }
+
+GSF__TARGET_AVX512 static void gsf__conv_norm_silu_avx512(const float* x, int64_t count, const float* mean,
+                                                          const float* scale, const float* offset, float* y) {
+    for (int64_t i = 0; i < count; i += 16) {
+        const __mmask16 mask = gsf__nn_mask16(count - i);
+        const __m512 d = _mm512_maskz_loadu_ps(mask, x + i) - _mm512_maskz_loadu_ps(mask, mean + i);
+        const __m512 v = _mm512_fmadd_ps(d, _mm512_maskz_loadu_ps(mask, scale + i), _mm512_maskz_loadu_ps(mask, offset + i));
+        _mm512_mask_storeu_ps(y + i, mask, gsf__nn_activate16(GSF_NN_SILU, v));
+    }
+}
 #endif
 
 static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
-    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, gsf__conv_store_ref, gsf__conv_norm_silu_ref};
+    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, NULL, gsf__conv_store_ref, gsf__conv_norm_silu_ref};
 #if GSF__X86
-    static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, gsf__conv_store_avx2, gsf__conv_norm_silu_avx2};
+    static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, NULL, gsf__conv_store_avx2, gsf__conv_norm_silu_avx2};
+    static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx2, gsf__conv_multiply_two_avx512, gsf__conv_store_avx2,
+                                             gsf__conv_norm_silu_avx512};
+    if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -4836,9 +5018,11 @@ static int64_t gsf__conv_segments(const gsf__conv_job* job) {
     return (job->height + GSF__CONV_ROWS - 1) / GSF__CONV_ROWS * gsf__conv_columns(job);
 }
 
-// tile (rows, 30, 16) += all kernel rows of 16 outputs.
-static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, int64_t x0, int64_t columns, const float* b,
-                          float* tile) {
+enum { GSF__CONV_TILE = GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N };
+
+// tiles (panels, rows, 30, 16) += all kernel rows of one or two panels of outputs.
+static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, int64_t x0, int64_t columns, int64_t panels,
+                          const float* b, float* tile) {
     for (int64_t kt = 0; kt < job->kt; kt++)
         for (int64_t kh = 0; kh < job->kh; kh++)
             for (int64_t k0 = 0; k0 < job->k; k0 += GSF__CONV_K) {
@@ -4847,10 +5031,29 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
                     const int64_t y = (y0 + r) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
                     const float* a = job->in[kt] + y * job->in_stride + job->origin + x0 * job->step + k0;
-                    job->kernels->multiply(a, job->step, columns, b, k, tile + r * GSF__CONV_COLUMNS * GSF__CONV_N);
+                    float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
+                    if (panels == 2)
+                        job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE);
+                    else job->kernels->multiply(a, job->step, columns, b, k, c);
                 }
                 b += k * GSF__CONV_N;
             }
+}
+
+// A tile to outputs n0 ... of its pixels; sums of its values and their squares to `partial`, unless NULL.
+static void gsf__conv_store(const gsf__conv_job* job, const float* tile, int64_t y0, int64_t rows, int64_t x0,
+                            int64_t columns, int64_t n0, double* partial) {
+    const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N);
+    double sums[2 * GSF__CONV_N];
+    memset(sums, 0, sizeof sums);
+    for (int64_t r = 0; r < rows; r++)
+        job->kernels->store(tile + r * GSF__CONV_COLUMNS * GSF__CONV_N, columns, n, job->accumulate,
+                            job->out + (y0 + r) * job->out_row + x0 * job->ldo + n0, job->ldo, sums);
+    for (int64_t i = 0; partial && i < n; i++) {
+        const int64_t group = (n0 + i) / (job->outputs / job->groups);
+        partial[2 * group] += sums[i];
+        partial[2 * group + 1] += sums[GSF__CONV_N + i];
+    }
 }
 
 static void gsf__conv_segment(void* arg, size_t segment, int worker) {
@@ -4860,25 +5063,18 @@ static void gsf__conv_segment(void* arg, size_t segment, int worker) {
     const int64_t rows = gsf__least(job->height - y0, GSF__CONV_ROWS);
     const int64_t columns = gsf__least(job->width - x0, GSF__CONV_COLUMNS);
     double* partial = job->partial ? job->partial + (int64_t)segment * job->groups * 2 : NULL;
-    float tile[GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N];
+    float tiles[2 * GSF__CONV_TILE];
     (void)worker;
     if (partial) memset(partial, 0, (size_t)job->groups * 2 * sizeof(double));
-    for (int64_t n0 = 0; n0 < job->outputs; n0 += GSF__CONV_N) {
-        const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N);
-        const float* b = job->packed + n0 / GSF__CONV_N * job->panel;
-        double sums[2 * GSF__CONV_N];
-        memset(sums, 0, sizeof sums);
-        for (int64_t i = 0; i < rows * GSF__CONV_COLUMNS; i++)
-            memcpy(tile + i * GSF__CONV_N, b, GSF__CONV_N * sizeof(float));
-        gsf__conv_sum(job, y0, rows, x0, columns, b + GSF__CONV_N, tile);
-        for (int64_t r = 0; r < rows; r++)
-            job->kernels->store(tile + r * GSF__CONV_COLUMNS * GSF__CONV_N, columns, n, job->accumulate,
-                                job->out + (y0 + r) * job->out_row + x0 * job->ldo + n0, job->ldo, sums);
-        for (int64_t i = 0; partial && i < n; i++) {
-            const int64_t group = (n0 + i) / (job->outputs / job->groups);
-            partial[2 * group] += sums[i];
-            partial[2 * group + 1] += sums[GSF__CONV_N + i];
-        }
+    for (int64_t n0 = 0, panels; n0 < job->outputs; n0 += panels * GSF__CONV_N) {
+        const float* b = job->packed + n0 / GSF__CONV_N * job->panel; // bias, then weights
+        panels = job->kernels->multiply_two && job->outputs - n0 > GSF__CONV_N ? 2 : 1;
+        for (int64_t p = 0; p < panels; p++)
+            for (int64_t i = 0; i < rows * GSF__CONV_COLUMNS; i++)
+                memcpy(tiles + p * GSF__CONV_TILE + i * GSF__CONV_N, b + p * job->panel, GSF__CONV_N * sizeof(float));
+        gsf__conv_sum(job, y0, rows, x0, columns, panels, b + GSF__CONV_N, tiles);
+        for (int64_t p = 0; p < panels; p++)
+            gsf__conv_store(job, tiles + p * GSF__CONV_TILE, y0, rows, x0, columns, n0 + p * GSF__CONV_N, partial);
     }
 }
 

@@ -492,7 +492,7 @@ static void check_attention_errors(void) {
 }
 
 int main(void) {
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX2; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
         if (!open_contexts((gsf_cpu_level)level)) continue;
 #if GSF__X86
         if (level >= GSF_CPU_AVX2) check_exp();

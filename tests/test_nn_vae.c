@@ -127,7 +127,7 @@ static void test_convolve(void) {
     };
     gsf_context ctx;
     uint64_t seed = 1;
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX2; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
         test_context_zero(&ctx);
         ctx.cpu_level = (gsf_cpu_level)level;
         CHECK_OK(&ctx, gsf_init_context(&ctx));

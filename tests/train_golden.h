@@ -351,7 +351,7 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
 
 // Everything, with every instruction set of this machine.
 static inline void train_golden_checks(void) {
-    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX2; level++) {
+    for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
         gsf_context ctx;
         memset(&ctx, 0, sizeof ctx);
         ctx.cpu_level = (gsf_cpu_level)level;
