@@ -127,6 +127,8 @@ typedef struct gsf_nn_linear_desc {
     int accumulate;            // y += activation(x w^T + b) instead of y = ...
     float* y;                  // (rows, out), row stride ldy
     int64_t ldy;               // 0: out
+    int bf16;                  // bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: x is rounded to bf16, too, and products
+                               //   are summed in pairs. Relative L2 error 1.7e-3. Else nothing changes.
 } gsf_nn_linear_desc;
 
 // A linear layer with its activation and residual. `workspace` NULL: scratch for this call only.
@@ -163,6 +165,7 @@ typedef struct gsf_nn_attention_desc {
     float scale;               // of the logits, 0: 1/sqrt(head_dim)
     float* out;                // (queries, heads*head_dim), row stride ldo; may be q
     int64_t ldo;
+    int bf16;                  // GSF_CPU_AVX512_BF16, even head_dim: q, k, v and the weights are rounded to bf16
 } gsf_nn_attention_desc;
 
 // softmax(scale q k^T + bias) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may
@@ -387,6 +390,8 @@ typedef struct gsf_nn_transformer { // an open model; its weights stay in the ma
     double spatial_scale, temporal_scale;                   // of the sine-cosine positions
     double norm_eps;
     gsf_nn_weights weights;
+    int bf16;                                               // set it at any time: linear layers and attention by the
+                                                            //   members `bf16` of their descriptions
     void* nets;                                             // private
 } gsf_nn_transformer;
 
@@ -730,6 +735,7 @@ typedef struct gsf_nn_dit_desc {
     const char* save_features; // file that gets the features of every clip, the last one's in the end; NULL: none
     gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
     int int8;                // gsf_nn_quantize_transformer
+    int bf16;                // gsf_nn_transformer.bf16
     gsf_nn_sample_desc sample;  // steps, solver, guidance ...; sizes, pointers and seed are filled in for each window
 } gsf_nn_dit_desc;
 
@@ -1897,6 +1903,14 @@ GSF__INLINE_AVX512 __m512 gsf__nn_exp16(__m512 x) { // gsf__nn_exp8
     return gsf__nn_power16(rounded, f);
 }
 
+// Pairs of bfloat16 lie in the lanes of floats.
+
+GSF__INLINE_BF16 __m512 gsf__nn_add_pairs(__m512 sum, __m512 a, __m512 b) { // sum + a[0] b[0] + a[1] b[1]
+    return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_castps_si512(a), (__m512bh)_mm512_castps_si512(b));
+}
+
+GSF__INLINE_BF16 __m256i gsf__nn_round_bf16(__m512 v) { return (__m256i)_mm512_cvtneps_pbh(v); }
+
 #endif // GSF__X86
 
 // ---- >>nn activations -----------------------------------------------------------
@@ -2315,6 +2329,7 @@ typedef struct gsf__linear_kernels { // one set per instruction set
     // sums[m*pitch + c] = row m of x times row column + c of the weights
     void (*few)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
     int64_t few_lanes; // `few` reads x from job->few, [k / lanes][rows][lanes]; 0: from the description
+    int64_t unit;      // values in a packed float: 1, or 2 in bf16; counts of packed values are of units
 } gsf__linear_kernels;
 
 typedef struct gsf__linear_plan { // how a product is cut; depends on its sizes only
@@ -2330,6 +2345,7 @@ struct gsf__linear_job {
     gsf__linear_plan plan;
     const gsf__linear_kernels* kernels;
     int64_t in, out;
+    int64_t length;               // units of `in` values
     int64_t first, columns;       // the group of outputs in work
     float *bias, *packed, *few;   // bias: zeros where there is none, 16 more than `out`
     float* workers;
@@ -2415,7 +2431,7 @@ static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t 
 }
 
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
-                                                       NULL, gsf__finish_scalar, gsf__few_scalar, 0};
+                                                       NULL, gsf__finish_scalar, gsf__few_scalar, 0, 1};
 
 // ---- linear: AVX2 kernels
 
@@ -2690,47 +2706,51 @@ GSF__TARGET_AVX2 static void gsf__few_avx2(const gsf__linear_job* job, int64_t c
 }
 
 static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
-                                                     NULL, gsf__finish_avx2, gsf__few_avx2, 8};
+                                                     NULL, gsf__finish_avx2, gsf__few_avx2, 8, 1};
 
 // ---- linear: AVX-512 kernels
 
-// 24 registers of sums, 2 of b, 1 or 2 of a. Each sum takes its products in the order of gsf__tile_avx2: the same bits.
+// 24 registers of sums, 2 of b, 1 or 2 of a; multiply(sum, a, b) adds the products to a sum.
+#define GSF__FOUR_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF__FOUR_ZEROS(i) __m512 c##i = _mm512_setzero_ps(), d##i = c##i, e##i = c##i, f##i = c##i;
+#define GSF__FOUR_PUT(to, v) _mm512_store_ps(to, add ? _mm512_add_ps(_mm512_load_ps(to), v) : v);
+#define GSF__FOUR_STORE(i)                                                                                              \
+    GSF__FOUR_PUT(sums + 16 * (i), c##i) GSF__FOUR_PUT(right + 16 * (i), d##i)                                          \
+    GSF__FOUR_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF__FOUR_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
+#define GSF__FOUR_STEP(i, multiply)                                                                                     \
+    v = _mm512_set1_ps(a[i]);                                                                                           \
+    c##i = multiply(c##i, v, w0);                                                                                       \
+    d##i = multiply(d##i, v, w1);                                                                                       \
+    v = _mm512_set1_ps(a1[i]);                                                                                          \
+    e##i = multiply(e##i, v, w0);                                                                                       \
+    f##i = multiply(f##i, v, w1);
+#define GSF__FOUR_TILES(multiply)                                                                                       \
+    const float *a1 = a + GSF__TILE_ROWS * count, *b1 = b + GSF__TILE_COLUMNS * count;                                  \
+    const int64_t share = gsf__ceil_div(ahead_count, count); /* a request a step: the processor drops most of a burst */ \
+    float* right = sums + next;                                                                                         \
+    for (int i = 0; i < 2 * GSF__TILE_SUMS; i += 16) {                                                                  \
+        _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);                                                             \
+        _mm_prefetch((const char*)(right + i), _MM_HINT_T0);                                                            \
+    }                                                                                                                   \
+    GSF__FOUR_ROWS(GSF__FOUR_ZEROS) /* c, d: the first group by both panels; e, f: the second */                        \
+    for (; count > 0; count--, b += GSF__TILE_COLUMNS, b1 += GSF__TILE_COLUMNS) {                                       \
+        const __m512 w0 = _mm512_load_ps(b), w1 = _mm512_load_ps(b1);                                                   \
+        __m512 v;                                                                                                       \
+        _mm_prefetch((const char*)ahead, _MM_HINT_T1);                                                                  \
+        ahead += share;                                                                                                 \
+        GSF__FOUR_STEP(0, multiply) GSF__FOUR_STEP(1, multiply) GSF__FOUR_STEP(2, multiply)                             \
+        GSF__FOUR_STEP(3, multiply) GSF__FOUR_STEP(4, multiply) GSF__FOUR_STEP(5, multiply)                             \
+        a += GSF__TILE_ROWS;                                                                                            \
+        a1 += GSF__TILE_ROWS;                                                                                           \
+    }                                                                                                                   \
+    GSF__FOUR_ROWS(GSF__FOUR_STORE)
+
+GSF__INLINE_AVX512 __m512 gsf__nn_add_product(__m512 sum, __m512 a, __m512 b) { return _mm512_fmadd_ps(a, b, sum); }
+
+// Each sum takes its products in the order of gsf__tile_avx2: the same bits.
 GSF__TARGET_AVX512 static void gsf__four_tiles_avx512(const float* a, const float* b, int64_t count, int add, float* sums,
                                                       int64_t next, const float* ahead, int64_t ahead_count) {
-    const float *a1 = a + GSF__TILE_ROWS * count, *b1 = b + GSF__TILE_COLUMNS * count;
-    float* right = sums + next;
-    for (int i = 0; i < 2 * GSF__TILE_SUMS; i += 16) {
-        _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);
-        _mm_prefetch((const char*)(right + i), _MM_HINT_T0);
-    }
-    const int64_t share = gsf__ceil_div(ahead_count, count); // one request a step: of a burst the processor drops most
-#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
-#define GSF_X(i) __m512 c##i = _mm512_setzero_ps(), d##i = c##i, e##i = c##i, f##i = c##i;
-    GSF_ROWS(GSF_X) // c, d: the first group by both panels; e, f: the second
-#undef GSF_X
-    for (; count > 0; count--, a += GSF__TILE_ROWS, a1 += GSF__TILE_ROWS, b += GSF__TILE_COLUMNS, b1 += GSF__TILE_COLUMNS) {
-        const __m512 w0 = _mm512_load_ps(b), w1 = _mm512_load_ps(b1);
-        __m512 v;
-        _mm_prefetch((const char*)ahead, _MM_HINT_T1);
-        ahead += share;
-#define GSF_X(i)                                                                         \
-        v = _mm512_set1_ps(a[i]);                                                        \
-        c##i = _mm512_fmadd_ps(v, w0, c##i);                                             \
-        d##i = _mm512_fmadd_ps(v, w1, d##i);                                             \
-        v = _mm512_set1_ps(a1[i]);                                                       \
-        e##i = _mm512_fmadd_ps(v, w0, e##i);                                             \
-        f##i = _mm512_fmadd_ps(v, w1, f##i);
-        GSF_ROWS(GSF_X)
-#undef GSF_X
-    }
-#define GSF_PUT(to, v) _mm512_store_ps(to, add ? _mm512_add_ps(_mm512_load_ps(to), v) : v);
-#define GSF_X(i)                                                                         \
-    GSF_PUT(sums + 16 * (i), c##i) GSF_PUT(right + 16 * (i), d##i)                       \
-    GSF_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
-    GSF_ROWS(GSF_X)
-#undef GSF_X
-#undef GSF_PUT
-#undef GSF_ROWS
+    GSF__FOUR_TILES(gsf__nn_add_product)
 }
 
 GSF__TARGET_AVX512 static void gsf__finish_avx512(const gsf__linear_job* job, const float* sums, int64_t pitch,
@@ -2862,16 +2882,81 @@ GSF__TARGET_AVX512 static void gsf__few_avx512(const gsf__linear_job* job, int64
 
 static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
                                                        gsf__four_tiles_avx512, gsf__finish_avx512, gsf__few_avx512,
-                                                       16};
+                                                       16, 1};
+
+// ---- linear: kernels for pairs of bf16
+
+// The pairs stand in the file as they are needed.
+static void gsf__pack_weights_bf16(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count,
+                                   float* out) {
+    (void)dtype;
+    gsf__pack_weights_avx2(w, GSF_NN_F32, pitch, columns, count, out);
+}
+
+// Eight units of a row of `values` values from first on, zeros beyond.
+GSF__INLINE_BF16 __m256 gsf__bf16_units(const float* row, int64_t first, int64_t values) {
+    const __m512 v = _mm512_maskz_loadu_ps(gsf__nn_mask16(values > first ? values - first : 0), row + first);
+    return _mm256_castsi256_ps(gsf__nn_round_bf16(v));
+}
+
+GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
+    float tile[8 * GSF__TILE_ROWS + 2];
+    for (int64_t k = 0; k < count; k += 8, out += 8 * GSF__TILE_ROWS) {
+#define GSF_X(i) __m256 r##i = gsf__bf16_units(x + (i) * ldx, 2 * k, i < rows ? 2 * count : 0);
+        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+#undef GSF_X
+        __m256 r6 = _mm256_setzero_ps(), r7 = r6;
+        float* to = k + 8 <= count ? out : tile;
+        GSF__TRANSPOSE8(r)
+        _mm256_storeu_ps(to, r0); // each writes two floats too many, which the next one takes back
+        _mm256_storeu_ps(to + 6, r1);
+        _mm256_storeu_ps(to + 12, r2);
+        _mm256_storeu_ps(to + 18, r3);
+        _mm256_storeu_ps(to + 24, r4);
+        _mm256_storeu_ps(to + 30, r5);
+        _mm256_storeu_ps(to + 36, r6);
+        _mm256_storeu_ps(to + 42, r7);
+        if (to == tile) memcpy(out, tile, (size_t)((count - k) * GSF__TILE_ROWS) * sizeof(float));
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__tile_bf16(const float* a, const float* b, int64_t count, int add, float* sums,
+                                            const float* ahead, int64_t ahead_count) {
+    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
+#define GSF_X(i) __m512 c##i = _mm512_setzero_ps();
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+    for (; count > 0; count--, a += GSF__TILE_ROWS, b += GSF__TILE_COLUMNS) {
+        const __m512 w = _mm512_load_ps(b);
+#define GSF_X(i) c##i = gsf__nn_add_pairs(c##i, _mm512_set1_ps(a[i]), w);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+#define GSF_X(i) _mm512_store_ps(sums + 16 * (i), add ? _mm512_add_ps(_mm512_load_ps(sums + 16 * (i)), c##i) : c##i);
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+#undef GSF_ROWS
+}
+
+GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b, int64_t count, int add, float* sums,
+                                                  int64_t next, const float* ahead, int64_t ahead_count) {
+    GSF__FOUR_TILES(gsf__nn_add_pairs)
+}
+
+static const gsf__linear_kernels gsf__linear_bf16 = {gsf__pack_weights_bf16, gsf__pack_rows_bf16, gsf__tile_bf16,
+                                                     gsf__four_tiles_bf16, gsf__finish_avx512, gsf__few_avx512, 16, 2};
 
 #endif
 
-static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level) {
+static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level, int pairs) { // pairs: of bf16, if there are
 #if GSF__X86
+    if (level >= GSF_CPU_AVX512_BF16 && pairs) return &gsf__linear_bf16;
     if (level >= GSF_CPU_AVX512) return &gsf__linear_avx512;
     if (level >= GSF_CPU_AVX2) return &gsf__linear_avx2;
 #endif
     (void)level;
+    (void)pairs;
     return &gsf__linear_scalar;
 }
 
@@ -2889,10 +2974,10 @@ static void gsf__linear_pack_panel(void* arg, size_t panel, int worker) { // of 
     const size_t size = gsf_nn_dtype_size(w->dtype), pitch = (size_t)job->in * size;
     const char* from = (const char*)w->data + (size_t)(job->first + at) * pitch;
     (void)worker;
-    for (int64_t k = 0; k < job->in; k += job->plan.depth) {
-        const int64_t count = gsf__least(job->in - k, job->plan.depth);
+    for (int64_t k = 0; k < job->length; k += job->plan.depth) {
+        const int64_t count = gsf__least(job->length - k, job->plan.depth);
         float* to = gsf__packed_panel(job, at, k, count);
-        job->kernels->pack_weights(from + (size_t)k * size, w->dtype, pitch, width, count, to);
+        job->kernels->pack_weights(from + (size_t)(k * job->kernels->unit) * size, w->dtype, pitch, width, count, to);
     }
 }
 
@@ -2911,7 +2996,7 @@ static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const
         for (int64_t p = 0; step == 1 && p < panels; p++)
             kernels->tile(a, w + p * count * GSF__TILE_COLUMNS, count, k > 0, s + p * next, ahead + g * share,
                           p == 0 ? share : 0);
-        if (k + count < job->in) continue;
+        if (k + count < job->length) continue;
         for (int64_t t = 0; t < step * panels; t++) {
             const int64_t p = t / step, r = (g + t % step) * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
             kernels->finish(job, sums + p * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS, row + r,
@@ -2933,17 +3018,17 @@ static void gsf__linear_block(void* arg, size_t index, int worker) { // a block 
     float* sums = job->workers + (size_t)worker * plan->per_worker;
     float* panel = sums + plan->block_rows * plan->block_columns; // both whole tiles
     float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
-    for (int64_t k = 0; k < job->in; k += plan->depth) {
-        const int64_t count = job->in - k < plan->depth ? job->in - k : plan->depth;
+    for (int64_t k = 0; k < job->length; k += plan->depth) {
+        const int64_t count = gsf__least(job->length - k, plan->depth), value = k * job->kernels->unit;
         for (int64_t r = 0; r < rows; r += GSF__TILE_ROWS)
-            job->kernels->pack_rows(d->x + (row + r) * d->ldx + k, d->ldx, gsf__least(rows - r, GSF__TILE_ROWS), count,
+            job->kernels->pack_rows(d->x + (row + r) * d->ldx + value, d->ldx, gsf__least(rows - r, GSF__TILE_ROWS), count,
                                     x + r * count);
         for (int64_t c = 0; c < columns; c += GSF__LINEAR_PAIR) {
             const int64_t width = gsf__least(columns - c, GSF__LINEAR_PAIR), next = groups * GSF__TILE_SUMS;
             const int64_t column = job->first + at + c;
             const float* w = plan->lone ? panel : gsf__packed_panel(job, at + c, k, count);
             for (int64_t p = 0; plan->lone && p < width; p += GSF__TILE_COLUMNS)
-                job->kernels->pack_weights((const char*)d->weight->data + (size_t)(column + p) * pitch + (size_t)k * size,
+                job->kernels->pack_weights((const char*)d->weight->data + (size_t)(column + p) * pitch + (size_t)value * size,
                                            d->weight->dtype, pitch, gsf__least(width - p, GSF__TILE_COLUMNS), count,
                                            panel + p * count);
             gsf__linear_panels(job, x, w, sums + c / GSF__TILE_COLUMNS * next, next, k, count, row, rows, column, width);
@@ -3051,14 +3136,16 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
     job.desc = *desc;
     if (!job.desc.ldx) job.desc.ldx = job.in;
     if (!job.desc.ldy) job.desc.ldy = job.out;
-    if (!gsf__plan_linear(desc->rows, job.in, job.out, gsf_nn_dtype_size(desc->weight->dtype), &job.plan) ||
+    const int few = desc->rows <= GSF__FEW_ROWS, pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0;
+    job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !few);
+    job.length = job.in / job.kernels->unit;
+    if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_dtype_size(desc->weight->dtype), &job.plan) ||
         !gsf__mul_size(job.plan.per_worker, (size_t)ctx->parallel.worker_count, &floats) ||
         floats > SIZE_MAX - job.plan.shared || !gsf__mul_size(floats + job.plan.shared, sizeof(float), &bytes))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows x %lld x %lld", (long long)desc->rows,
                         (long long)job.in, (long long)job.out);
     float* scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own, bytes);
     if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    job.kernels = gsf__linear_kernels_of(ctx->cpu_level);
     job.workers = scratch;
     job.bias = scratch + floats;
     job.packed = job.few = job.bias + gsf__round_up(job.out + 16, 16);
@@ -3837,7 +3924,7 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
     linear->bias = job.scales + job.held;
     memset(linear->bias, 0, (size_t)(weight->out + 16) * sizeof(float));
     if (desc->bias) gsf_nn_read_tensor(desc->bias, 0, weight->out, linear->bias);
-    linear->kernels = gsf__linear_kernels_of(ctx->cpu_level);
+    linear->kernels = gsf__linear_kernels_of(ctx->cpu_level, 0);
     const int64_t column_blocks = gsf__ceil_div(weight->out, job.block_columns);
     if (desc->rows <= GSF__FEW_ROWS) gsf__int8_run_few(ctx, &job);
     for (; job.first < desc->rows && desc->rows > GSF__FEW_ROWS; job.first += job.held) {
@@ -4283,7 +4370,11 @@ typedef struct gsf__attention_scratch { // of one worker
     float* sum; // [query][8] sum of the weights so far, by lane
 } gsf__attention_scratch;
 
-typedef struct gsf__attention_parts { // what instruction sets do differently
+typedef struct gsf__attention_parts { // what instruction sets do differently; in bf16 pairs lie in the places of floats
+    void (*pack_queries)(const gsf__attention_job* job, const float* from, int64_t queries, float* packed);
+    void (*pack_keys)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
+    void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
+    int64_t unit; // values in a place along head_dim: 1, or 2 in bf16
     // p of `groups` groups of queries against `panels` panels of keys
     void (*logits)(const float* q, int64_t groups, const float* k, int64_t panels, int64_t dim, float* p);
     // Logits of `queries` rows to weights; raises `top`, updates `sum`, and gives in `fade` what earlier values are to be
@@ -4402,44 +4493,45 @@ GSF__TARGET_AVX2 static void gsf__attention_logits_avx2(const float* q, int64_t 
 
 // a and b as in gsf__attention_tile, with a second group `a_next` and a second panel `b_next` behind them. Sums are added to
 // c, d (first group, by panel) and e, f; each takes its products in the same order as there.
-#define GSF__ATT_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
-#define GSF__ATT_FOUR_TILES(a, a_row, a_step, a_next, b, b_next, count)                                                  \
+#define GSF__ATT_FOUR_TILES(multiply, a, a_row, a_step, a_next, b, b_next, count)                                        \
     for (int64_t k_ = 0; k_ < (count); k_++, a += a_step, b += GSF__ATT_PANEL) {                                        \
         const __m512 w0 = _mm512_loadu_ps(b), w1 = _mm512_loadu_ps(b + (b_next));                                       \
         __m512 x;                                                                                                       \
-        GSF__ATT_STEP(0, a_row, a_next) GSF__ATT_STEP(1, a_row, a_next) GSF__ATT_STEP(2, a_row, a_next)                 \
-        GSF__ATT_STEP(3, a_row, a_next) GSF__ATT_STEP(4, a_row, a_next) GSF__ATT_STEP(5, a_row, a_next)                 \
+        GSF__ATT_STEP(0, multiply, a_row, a_next) GSF__ATT_STEP(1, multiply, a_row, a_next)                             \
+        GSF__ATT_STEP(2, multiply, a_row, a_next) GSF__ATT_STEP(3, multiply, a_row, a_next)                             \
+        GSF__ATT_STEP(4, multiply, a_row, a_next) GSF__ATT_STEP(5, multiply, a_row, a_next)                             \
     }
-#define GSF__ATT_STEP(r, a_row, a_next)                     \
+#define GSF__ATT_STEP(r, multiply, a_row, a_next)           \
     x = _mm512_set1_ps(a[(r) * (a_row)]);                   \
-    c##r = _mm512_fmadd_ps(x, w0, c##r);                    \
-    d##r = _mm512_fmadd_ps(x, w1, d##r);                    \
+    c##r = multiply(c##r, x, w0);                           \
+    d##r = multiply(d##r, x, w1);                           \
     x = _mm512_set1_ps(a[(a_next) + (r) * (a_row)]);        \
-    e##r = _mm512_fmadd_ps(x, w0, e##r);                    \
-    f##r = _mm512_fmadd_ps(x, w1, f##r);
-#define GSF__ATT_ZEROS(r) __m512 c##r = _mm512_setzero_ps(), d##r = c##r, e##r = c##r, f##r = c##r;
+    e##r = multiply(e##r, x, w0);                           \
+    f##r = multiply(f##r, x, w1);
 
-// Pairs of panels by pairs of groups; an odd one that is left is done by halves.
+// Pairs of panels by pairs of groups; an odd one that is left is done by `rest`, a function for any number of both.
+#define GSF__ATT_LOGITS(multiply, rest)                                                                                 \
+    const int64_t even = groups & ~(int64_t)1, height = GSF__ATT_GROUP * GSF__ATT_KEYS;                                 \
+    for (int64_t panel = 0; panel + 2 <= panels; panel += 2, k += 2 * GSF__ATT_PANEL * dim) {                           \
+        float* to = p + panel * GSF__ATT_PANEL;                                                                         \
+        for (int64_t g = 0; g < even; g += 2, to += 2 * height) {                                                       \
+            const float *a = q + g * 8 * dim, *b = k;                                                                   \
+            GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                             \
+            GSF__ATT_FOUR_TILES(multiply, a, 1, 8, 8 * dim, b, GSF__ATT_PANEL * dim, dim)                               \
+            GSF__FOUR_ROWS(GSF__ATT_STORE)                                                                              \
+        }                                                                                                               \
+        if (even < groups) rest(q + even * 8 * dim, 1, k, 2, dim, to);                                                  \
+    }                                                                                                                   \
+    if (panels % 2) rest(q, groups, k, 1, dim, p + (panels - 1) * GSF__ATT_PANEL);
+#define GSF__ATT_STORE(r)                                                                                               \
+    _mm512_storeu_ps(to + r * GSF__ATT_KEYS, c##r);                                                                     \
+    _mm512_storeu_ps(to + r * GSF__ATT_KEYS + GSF__ATT_PANEL, d##r);                                                    \
+    _mm512_storeu_ps(to + height + r * GSF__ATT_KEYS, e##r);                                                            \
+    _mm512_storeu_ps(to + height + r * GSF__ATT_KEYS + GSF__ATT_PANEL, f##r);
+
 GSF__TARGET_AVX512 static void gsf__attention_logits_avx512(const float* q, int64_t groups, const float* k, int64_t panels,
                                                             int64_t dim, float* p) {
-    const int64_t even = groups & ~(int64_t)1, odd = groups - even, height = GSF__ATT_GROUP * GSF__ATT_KEYS;
-    for (int64_t panel = 0; panel + 2 <= panels; panel += 2, k += 2 * GSF__ATT_PANEL * dim) {
-        float* to = p + panel * GSF__ATT_PANEL;
-        for (int64_t g = 0; g < even; g += 2, to += 2 * height) {
-            const float *a = q + g * 8 * dim, *b = k;
-            GSF__ATT_ROWS(GSF__ATT_ZEROS)
-            GSF__ATT_FOUR_TILES(a, 1, 8, 8 * dim, b, GSF__ATT_PANEL * dim, dim)
-#define GSF_X(r)                                                                         \
-            _mm512_storeu_ps(to + r * GSF__ATT_KEYS, c##r);                              \
-            _mm512_storeu_ps(to + r * GSF__ATT_KEYS + GSF__ATT_PANEL, d##r);             \
-            _mm512_storeu_ps(to + height + r * GSF__ATT_KEYS, e##r);                     \
-            _mm512_storeu_ps(to + height + r * GSF__ATT_KEYS + GSF__ATT_PANEL, f##r);
-            GSF__ATT_ROWS(GSF_X)
-#undef GSF_X
-        }
-        if (odd) gsf__attention_logits_avx2(q + even * 8 * dim, 1, k, 2, dim, to);
-    }
-    if (panels % 2) gsf__attention_logits_avx2(q, groups, k, 1, dim, p + (panels - 1) * GSF__ATT_PANEL);
+    GSF__ATT_LOGITS(gsf__nn_add_product, gsf__attention_logits_avx2)
 }
 
 // Adds the bias to the logits of `queries` rows and `keys` columns, as powers of 2.
@@ -4495,12 +4587,13 @@ GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queri
     }
 }
 
-GSF__TARGET_AVX512 static void gsf__attention_weights_avx512(float* p, int64_t queries, int64_t columns, float* top,
-                                                             float* sum, float fade[GSF__ATT_QUERIES]) {
+// Raises `top` to the largest logit of each row; fade = 2^(top before - top).
+GSF__INLINE_AVX512 void gsf__attention_tops_avx512(const float* p, int64_t queries, int64_t columns, float* top,
+                                                   float fade[GSF__ATT_QUERIES]) {
     for (int64_t r = 0; r < queries; r++) {
-        const float* row = p + r * GSF__ATT_KEYS;
         __m512 highest = _mm512_set1_ps(top[r]);
-        for (int64_t j = 0; j < columns; j += 16) highest = _mm512_max_ps(_mm512_loadu_ps(row + j), highest);
+        for (int64_t j = 0; j < columns; j += 16)
+            highest = _mm512_max_ps(_mm512_loadu_ps(p + r * GSF__ATT_KEYS + j), highest);
         const float raised = gsf__nn_max16(highest);
         fade[r] = top[r] - raised;
         top[r] = raised;
@@ -4509,6 +4602,15 @@ GSF__TARGET_AVX512 static void gsf__attention_weights_avx512(float* p, int64_t q
         const __mmask16 mask = gsf__nn_mask16(queries - r);
         _mm512_mask_storeu_ps(fade + r, mask, gsf__nn_exp2_low16(_mm512_maskz_loadu_ps(mask, fade + r)));
     }
+}
+
+GSF__INLINE_AVX512 void gsf__attention_add_total(__m512 total, float fade, float sum[8]) {
+    _mm256_storeu_ps(sum, _mm256_set1_ps(fade) * _mm256_loadu_ps(sum) + gsf__nn_fold16(total));
+}
+
+GSF__TARGET_AVX512 static void gsf__attention_weights_avx512(float* p, int64_t queries, int64_t columns, float* top,
+                                                             float* sum, float fade[GSF__ATT_QUERIES]) {
+    gsf__attention_tops_avx512(p, queries, columns, top, fade);
     for (int64_t r = 0; r < queries; r++) {
         float* row = p + r * GSF__ATT_KEYS;
         const __m512 t = _mm512_set1_ps(top[r]);
@@ -4518,8 +4620,7 @@ GSF__TARGET_AVX512 static void gsf__attention_weights_avx512(float* p, int64_t q
             _mm512_storeu_ps(row + j, weight);
             total = total + weight;
         }
-        const __m256 before = _mm256_set1_ps(fade[r]) * _mm256_loadu_ps(sum + 8 * r);
-        _mm256_storeu_ps(sum + 8 * r, before + gsf__nn_fold16(total));
+        gsf__attention_add_total(total, fade[r], sum + 8 * r);
     }
 }
 
@@ -4539,42 +4640,156 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
         }
 }
 
-// Pairs of panels by pairs of groups; the rest by AVX2, one panel of all groups or one group of all panels.
+// Pairs of panels by pairs of groups; what is left by `rest`. `places`: of the keys, in a row of p.
+#define GSF__ATT_VALUES(multiply, rest, places)                                                                         \
+    const int64_t height = GSF__ATT_GROUP * GSF__ATT_KEYS, width = panels * GSF__ATT_TILE;                              \
+    const int64_t even = panels % 2 ? 0 : groups & ~(int64_t)1; /* odd panels: sizes of no model */                     \
+    for (int64_t panel = 0; panel < panels; panel += 2)                                                                 \
+        for (int64_t g = 0; g < even; g += 2) {                                                                         \
+            const float *a = p + g * height, *b = v + panel * GSF__ATT_KEYS * GSF__ATT_PANEL;                           \
+            const float* fades = fade + g * GSF__ATT_GROUP;                                                             \
+            float* to = out + (g * panels + panel) * GSF__ATT_TILE;                                                     \
+            for (int i = 0; i < 2 * GSF__ATT_TILE; i += 16) {                                                           \
+                _mm_prefetch((const char*)(to + i), _MM_HINT_T0);                                                       \
+                _mm_prefetch((const char*)(to + width + i), _MM_HINT_T0);                                               \
+            }                                                                                                           \
+            GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                             \
+            GSF__ATT_FOUR_TILES(multiply, a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, places)       \
+            GSF__FOUR_ROWS(GSF__ATT_FADE)                                                                               \
+        }                                                                                                               \
+    if (even < groups) rest(p + even * height, groups - even, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
+#define GSF__ATT_FADE(r)                                                                                                \
+    GSF__ATT_FADE_ONE(to + (r) * GSF__ATT_PANEL, fades[r], c##r)                                                        \
+    GSF__ATT_FADE_ONE(to + GSF__ATT_TILE + (r) * GSF__ATT_PANEL, fades[r], d##r)                                        \
+    GSF__ATT_FADE_ONE(to + width + (r) * GSF__ATT_PANEL, fades[GSF__ATT_GROUP + (r)], e##r)                             \
+    GSF__ATT_FADE_ONE(to + width + GSF__ATT_TILE + (r) * GSF__ATT_PANEL, fades[GSF__ATT_GROUP + (r)], f##r)
+#define GSF__ATT_FADE_ONE(at, fade_, sum) \
+    _mm512_storeu_ps(at, _mm512_fmadd_ps(_mm512_set1_ps(fade_), _mm512_loadu_ps(at), sum));
+
 GSF__TARGET_AVX512 static void gsf__attention_values_avx512(const float* p, int64_t groups, const float* v, int64_t keys,
                                                             int64_t panels, const float* fade, float* out) {
-    if (panels % 2) { // sizes of no model
-        gsf__attention_values_avx2(p, groups, v, keys, panels, fade, out);
-        return;
-    }
-    const int64_t height = GSF__ATT_GROUP * GSF__ATT_KEYS, width = panels * GSF__ATT_TILE, even = groups & ~(int64_t)1;
-    for (int64_t panel = 0; panel < panels; panel += 2)
-        for (int64_t g = 0; g < even; g += 2) {
-            const float *a = p + g * height, *b = v + panel * GSF__ATT_KEYS * GSF__ATT_PANEL;
-            float* to = out + (g * panels + panel) * GSF__ATT_TILE;
-            for (int i = 0; i < 2 * GSF__ATT_TILE; i += 16) {
-                _mm_prefetch((const char*)(to + i), _MM_HINT_T0);
-                _mm_prefetch((const char*)(to + width + i), _MM_HINT_T0);
-            }
-            GSF__ATT_ROWS(GSF__ATT_ZEROS)
-            GSF__ATT_FOUR_TILES(a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, keys)
-#define GSF_ADD(at, group, v_)                                                                                  \
-            _mm512_storeu_ps(at, _mm512_fmadd_ps(_mm512_set1_ps(fade[(group) * GSF__ATT_GROUP + row]),          \
-                                                 _mm512_loadu_ps(at), v_));
-#define GSF_X(r)                                                                         \
-            {                                                                            \
-                const int row = r;                                                       \
-                float* at = to + row * GSF__ATT_PANEL;                                   \
-                GSF_ADD(at, g, c##r)                                                     \
-                GSF_ADD(at + GSF__ATT_TILE, g, d##r)                                     \
-                GSF_ADD(at + width, g + 1, e##r)                                         \
-                GSF_ADD(at + width + GSF__ATT_TILE, g + 1, f##r)                         \
-            }
-            GSF__ATT_ROWS(GSF_X)
-#undef GSF_X
-#undef GSF_ADD
+    GSF__ATT_VALUES(gsf__nn_add_product, gsf__attention_values_avx2, keys)
+}
+
+// ---- attention in bf16: q and k are packed in pairs along head_dim, v and the weights along the keys
+
+// Units of eight rows from `row` on, of which `rows` are there, times `factor`: to[i to_ld + r].
+GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* row, int64_t rows, int64_t ld, int64_t dim, float factor,
+                                                       float* to, int64_t to_ld) {
+    const __m512 f = _mm512_set1_ps(factor);
+    for (int64_t i = 0; i < dim; i += 16) {
+        const __mmask16 mask = gsf__nn_mask16(dim - i);
+        float units[8][8];
+        for (int r = 0; r < 8; r++) {
+            const __mmask16 there = r < rows ? mask : (__mmask16)0;
+            const __m512 v = f * _mm512_maskz_loadu_ps(there, row + r * ld + i);
+            _mm256_storeu_ps(units[r], _mm256_castsi256_ps(gsf__nn_round_bf16(v)));
         }
-    if (even < groups)
-        gsf__attention_values_avx2(p + even * height, 1, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
+        if (dim - i >= 16) gsf__nn_transpose8(units[0], 8, to + i / 2 * to_ld, to_ld);
+        else
+            for (int64_t u = 0; u < (dim - i) / 2; u++)
+                for (int r = 0; r < 8; r++) to[(i / 2 + u) * to_ld + r] = units[r][u];
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__attention_pack_queries_bf16(const gsf__attention_job* job, const float* from,
+                                                              int64_t queries, float* packed) {
+    const int64_t ld = job->desc.ldq, dim = job->desc.head_dim;
+    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 4 * dim) {
+        for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
+            gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
+        gsf__attention_pack_pairs(from + first * ld, gsf__least(queries - first, GSF__ATT_GROUP), ld, dim,
+                                  job->desc.scale * 1.44269504f, packed, 8);
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__attention_pack_keys_bf16(const gsf__attention_job* job, const float* from, int64_t keys,
+                                                           float* packed) {
+    const int64_t ld = job->desc.ldk, dim = job->desc.head_dim;
+    for (int64_t j = 0; j < gsf__round_up(keys, GSF__ATT_PANEL); j += 8) {
+        for (int64_t r = j; r < j + 8; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, keys, ld, dim);
+        gsf__attention_pack_pairs(from + j * ld, keys - j, ld, dim, 1.0f,
+                                  packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * (dim / 2) + j % GSF__ATT_PANEL,
+                                  GSF__ATT_PANEL);
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__attention_pack_values_bf16(const gsf__attention_job* job, const float* from, int64_t keys,
+                                                             float* packed) {
+    const int64_t ld = job->desc.ldv, dim = job->desc.head_dim;
+    for (int64_t j = 0; j < keys; j += 2) {
+        gsf__attention_fetch(from, j + GSF__ATT_AHEAD, keys, ld, dim);
+        gsf__attention_fetch(from, j + 1 + GSF__ATT_AHEAD, keys, ld, dim);
+        for (int64_t i = 0; i < job->panels * GSF__ATT_PANEL; i += GSF__ATT_PANEL) {
+            const __mmask16 mask = gsf__nn_mask16(dim - i), second = j + 1 < keys ? mask : (__mmask16)0;
+            const __m256i low = gsf__nn_round_bf16(_mm512_maskz_loadu_ps(mask, from + j * ld + i));
+            const __m256i high = gsf__nn_round_bf16(_mm512_maskz_loadu_ps(second, from + (j + 1) * ld + i));
+            const __m512i pair = _mm512_or_si512(_mm512_cvtepu16_epi32(low), _mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16));
+            _mm512_storeu_si512(packed + (i * GSF__ATT_KEYS / GSF__ATT_PANEL + j / 2) * GSF__ATT_PANEL, pair);
+        }
+    }
+}
+
+GSF__INLINE_BF16 void gsf__attention_tile_bf16(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
+                                               __m512 c[GSF__ATT_GROUP]) {
+    __m512 c0 = _mm512_setzero_ps(), c1 = c0, c2 = c0, c3 = c0, c4 = c0, c5 = c0;
+    for (; count > 0; count--, a += a_step, b += GSF__ATT_PANEL) {
+        const __m512 w = _mm512_loadu_ps(b);
+#define GSF_X(r) c##r = gsf__nn_add_pairs(c##r, _mm512_set1_ps(a[(r) * a_row]), w);
+        GSF__FOUR_ROWS(GSF_X)
+#undef GSF_X
+    }
+    c[0] = c0; c[1] = c1; c[2] = c2; c[3] = c3; c[4] = c4; c[5] = c5;
+}
+
+GSF__TARGET_BF16 static void gsf__attention_logits_one_bf16(const float* q, int64_t groups, const float* k, int64_t panels,
+                                                            int64_t dim, float* p) {
+    for (int64_t panel = 0; panel < panels; panel++, k += GSF__ATT_PANEL * dim)
+        for (int64_t g = 0; g < groups; g++) {
+            __m512 c[GSF__ATT_GROUP];
+            float* to = p + g * GSF__ATT_GROUP * GSF__ATT_KEYS + panel * GSF__ATT_PANEL;
+            gsf__attention_tile_bf16(q + g * 8 * dim, 1, 8, k, dim, c);
+            for (int r = 0; r < GSF__ATT_GROUP; r++) _mm512_storeu_ps(to + r * GSF__ATT_KEYS, c[r]);
+        }
+}
+
+GSF__TARGET_BF16 static void gsf__attention_logits_bf16(const float* q, int64_t groups, const float* k, int64_t panels,
+                                                        int64_t dim, float* p) {
+    GSF__ATT_LOGITS(gsf__nn_add_pairs, gsf__attention_logits_one_bf16)
+}
+
+// The weights are written as bf16 over the logits, those of 16 keys in 8 places; sums are of what was written.
+GSF__TARGET_BF16 static void gsf__attention_weights_bf16(float* p, int64_t queries, int64_t columns, float* top, float* sum,
+                                                         float fade[GSF__ATT_QUERIES]) {
+    gsf__attention_tops_avx512(p, queries, columns, top, fade);
+    for (int64_t r = 0; r < queries; r++) {
+        float* row = p + r * GSF__ATT_KEYS;
+        const __m512 t = _mm512_set1_ps(top[r]);
+        __m512 total = _mm512_setzero_ps();
+        for (int64_t j = 0; j < columns; j += 16) {
+            const __m256i weight = gsf__nn_round_bf16(gsf__nn_exp2_low16(_mm512_loadu_ps(row + j) - t));
+            _mm256_storeu_si256((__m256i*)(void*)(row + j / 2), weight);
+            total = total + _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(weight), 16));
+        }
+        gsf__attention_add_total(total, fade[r], sum + 8 * r);
+    }
+}
+
+GSF__TARGET_BF16 static void gsf__attention_values_one_bf16(const float* p, int64_t groups, const float* v, int64_t keys,
+                                                            int64_t panels, const float* fade, float* out) {
+    for (int64_t panel = 0; panel < panels; panel++, v += GSF__ATT_KEYS * GSF__ATT_PANEL)
+        for (int64_t g = 0; g < groups; g++) {
+            __m512 c[GSF__ATT_GROUP];
+            float* to = out + (g * panels + panel) * GSF__ATT_TILE;
+            gsf__attention_tile_bf16(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, (keys + 1) / 2, c);
+            for (int r = 0; r < GSF__ATT_GROUP; r++, to += GSF__ATT_PANEL)
+                GSF__ATT_FADE_ONE(to, fade[g * GSF__ATT_GROUP + r], c[r])
+        }
+}
+
+GSF__TARGET_BF16 static void gsf__attention_values_bf16(const float* p, int64_t groups, const float* v, int64_t keys,
+                                                        int64_t panels, const float* fade, float* out) {
+    GSF__ATT_VALUES(gsf__nn_add_pairs, gsf__attention_values_one_bf16, (keys + 1) / 2)
 }
 
 GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job, const gsf__attention_scratch* s,
@@ -4598,19 +4813,20 @@ static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__atten
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
     const int64_t rows = gsf__least(job->range_size, d->queries - first);
     const int64_t groups = (rows + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, column = head * d->head_dim;
+    const int64_t length = d->head_dim / parts->unit; // places of a query or key
     float fade[GSF__ATT_QUERIES];
-    gsf__attention_pack_queries(job, d->q + first * d->ldq + column, rows, s.q);
+    parts->pack_queries(job, d->q + first * d->ldq + column, rows, s.q);
     memset(s.out, 0, (size_t)(groups * job->panels * GSF__ATT_TILE) * sizeof(float));
     memset(s.sum, 0, (size_t)(groups * GSF__ATT_GROUP * 8) * sizeof(float));
     for (int64_t r = 0; r < groups * GSF__ATT_GROUP; r++) s.top[r] = -FLT_MAX;
     for (int64_t key = 0; key < d->keys; key += GSF__ATT_KEYS) {
         const int64_t keys = gsf__least(GSF__ATT_KEYS, d->keys - key);
         const int64_t key_panels = (keys + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL, columns = key_panels * GSF__ATT_PANEL;
-        gsf__attention_pack_keys(job, d->k + key * d->ldk + column, keys, s.k);
-        gsf__attention_pack_values(job, d->v + key * d->ldv + column, keys, s.v);
+        parts->pack_keys(job, d->k + key * d->ldk + column, keys, s.k);
+        parts->pack_values(job, d->v + key * d->ldv + column, keys, s.v);
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
-            parts->logits(s.q + g * 8 * d->head_dim, count, s.k, key_panels, d->head_dim, s.p);
+            parts->logits(s.q + g * 8 * length, count, s.k, key_panels, length, s.p);
             const int64_t at = (head * d->queries + first + r) * d->keys + key; // in mask and bias
             const unsigned char* mask = d->mask ? d->mask + at : NULL;
             if (d->bias) gsf__attention_bias(d->bias + at, d->keys, rows - r, keys, s.p);
@@ -4623,27 +4839,39 @@ static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__atten
 }
 
 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, int worker) {
-    static const gsf__attention_parts parts = {gsf__attention_logits_avx2, gsf__attention_weights_avx2,
-                                               gsf__attention_values_avx2};
+    static const gsf__attention_parts parts = {
+        gsf__attention_pack_queries, gsf__attention_pack_keys,    gsf__attention_pack_values, 1,
+        gsf__attention_logits_avx2,  gsf__attention_weights_avx2, gsf__attention_values_avx2};
     gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
 }
 
 static void gsf__attention_chunk_avx512(void* arg, size_t chunk, int worker) {
-    static const gsf__attention_parts parts = {gsf__attention_logits_avx512, gsf__attention_weights_avx512,
-                                               gsf__attention_values_avx512};
+    static const gsf__attention_parts parts = {
+        gsf__attention_pack_queries,  gsf__attention_pack_keys,      gsf__attention_pack_values, 1,
+        gsf__attention_logits_avx512, gsf__attention_weights_avx512, gsf__attention_values_avx512};
+    gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
+}
+
+static void gsf__attention_chunk_bf16(void* arg, size_t chunk, int worker) {
+    static const gsf__attention_parts parts = {
+        gsf__attention_pack_queries_bf16, gsf__attention_pack_keys_bf16, gsf__attention_pack_values_bf16, 2,
+        gsf__attention_logits_bf16,       gsf__attention_weights_bf16,   gsf__attention_values_bf16};
     gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
 }
 
 #endif // GSF__X86
 
-static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level level) {
+static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level level, int pairs) { // pairs: of bf16
     static const gsf__attention_kernels scalar = {gsf__attention_row, 0};
 #if GSF__X86
     static const gsf__attention_kernels avx2 = {gsf__attention_chunk_avx2, 1};
     static const gsf__attention_kernels avx512 = {gsf__attention_chunk_avx512, 1};
+    static const gsf__attention_kernels bf16 = {gsf__attention_chunk_bf16, 1};
+    if (level >= GSF_CPU_AVX512_BF16 && pairs) return &bf16;
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
+    (void)pairs;
     (void)level;
     return &scalar;
 }
@@ -4678,7 +4906,8 @@ static size_t gsf__attention_floats(const gsf__attention_job* job, int packed) {
 }
 
 GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_attention_desc* desc) {
-    const gsf__attention_kernels* kernels = gsf__attention_kernels_of(ctx->cpu_level);
+    const int pairs = desc->bf16 && desc->head_dim % 2 == 0;
+    const gsf__attention_kernels* kernels = gsf__attention_kernels_of(ctx->cpu_level, pairs);
     gsf_nn_workspace own;
     gsf__attention_job job;
     size_t size;
@@ -6100,7 +6329,9 @@ static gsf_result gsf__dit_apply(gsf__dit_run* run, const gsf_nn_linear_desc* de
     const gsf_nn_quantized* q = run->nets->quantized;
     if (q) q += desc->weight - run->net->weights.tensors;
     if (q && q->data) return gsf_nn_linear_int8(run->ctx, &run->workspace, desc, q);
-    return gsf_nn_linear(run->ctx, &run->workspace, desc);
+    gsf_nn_linear_desc d = *desc;
+    d.bf16 = run->net->bf16;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
 }
 
 static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
@@ -6184,6 +6415,7 @@ static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const 
     attention.k = k;
     attention.v = v;
     attention.out = run->normed;
+    attention.bf16 = run->net->bf16;
     GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
     float* video_probe = run->probe ? run->probe + run->text * d : NULL;
     GSF__TRY(gsf__dit_add(run, run->normed, run->text, a->out_weight, a->out_bias,
@@ -6237,6 +6469,7 @@ static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32
     attention.k = kv;
     attention.v = kv + r * d;
     attention.out = normed;
+    attention.bf16 = run->net->bf16;
     GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
     GSF__TRY(gsf__dit_add(run, normed, run->video, a->out_weight, a->out_bias, NULL, x, run->probe));
     gsf__dit_tap(run, "attn_cross", row, run->probe, run->video, d);
