@@ -13075,6 +13075,7 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
     if (!result) result = gsf_nn_load_schedule(ctx, path.data, &r->schedule);
     gsf_destroy_text(ctx, &path);
     if (!result) result = gsf__dit_open_conditions(ctx, r);
+    r->transformer.bf16 = r->desc.bf16;
     return !result && r->desc.int8 ? gsf_nn_quantize_transformer(ctx, &r->transformer, NULL) : result;
 }
 

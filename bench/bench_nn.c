@@ -315,9 +315,16 @@ static void bench_linear_error(const bench_linear* l, const float* w, const floa
     row->reference = "float64";
 }
 
+// Products of bf16 pairs are a variant of their own where the processor has instructions for them.
+#define BENCH_BF16 "bf16 products"
+static int bench_has_bf16(const bench_options* o, gsf_nn_dtype weights) {
+    return o->level >= GSF_CPU_AVX512_BF16 && weights == GSF_NN_BF16;
+}
+
 // `memory` holds `size` bytes for the weights; few rows cycle through all of it.
-static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int threads, gsf_nn_dtype dtype, int64_t rows,
-                             int64_t out, int64_t in, gsf_nn_activation activation, char* memory, size_t size) {
+static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int threads, gsf_nn_dtype dtype, int bf16,
+                             int64_t rows, int64_t out, int64_t in, gsf_nn_activation activation, char* memory,
+                             size_t size) {
     static const char* const dtypes[] = {"f32", "bf16", "f16"};
     static const char* const activations[] = {"", " gelu", " silu"};
     char name[96];
@@ -351,11 +358,13 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     l.desc.bias = &l.bias;
     l.desc.activation = activation;
     l.desc.y = y;
+    l.desc.bf16 = bf16;
     const double flops = 2.0 * (double)rows * (double)in * (double)out;
     const int few = rows <= GSF__FEW_ROWS;
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? (double)bytes : flops, few ? "B" : "flop");
     if (few) row.bytes = (double)bytes;
     else row.flops = flops;
+    if (bf16) row.variant = BENCH_BF16;
     bench_read read = bench_make_read(&ctx, memory, (size_t)l.copies * bytes);
     bench_time_beside(o, &ctx, &row, bench_run_linear, &l, (double)l.copies, few ? &read : NULL);
     gsf_free(&ctx, read.sums);
@@ -389,11 +398,13 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
     static const gsf_nn_dtype dtypes[] = {GSF_NN_F32, GSF_NN_BF16, GSF_NN_F16};
     for (int threads = 1; threads <= 2; threads++)
         for (size_t t = 0; t < GSF__COUNT(dtypes); t++) {
-            BENCH_EACH(level) bench_one_linear(o, level, threads, dtypes[t], 64, 256, 256, GSF_NN_LINEAR, memory, size);
+            BENCH_EACH(level) bench_one_linear(o, level, threads, dtypes[t], 0, 64, 256, 256, GSF_NN_LINEAR, memory, size);
             for (size_t i = 0; i < GSF__COUNT(shapes); i++) {
                 const bench_shape* s = &shapes[i];
                 if (o->quick && !s->quick) continue;
-                bench_one_linear(o, o->level, threads, dtypes[t], s->rows, s->out, s->in, s->activation, memory, size);
+                for (int bf16 = 0; bf16 <= bench_has_bf16(o, dtypes[t]) && (!bf16 || s->rows > GSF__FEW_ROWS); bf16++)
+                    bench_one_linear(o, o->level, threads, dtypes[t], bf16, s->rows, s->out, s->in, s->activation, memory,
+                                     size);
             }
         }
 }
@@ -541,8 +552,8 @@ static void bench_attention_error(gsf_context* ctx, const gsf_nn_attention_desc*
     gsf_free(ctx, p);
 }
 
-static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int threads, int32_t heads, int64_t queries,
-                                int64_t keys) {
+static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int threads, int bf16, int32_t heads,
+                                int64_t queries, int64_t keys) {
     char name[96];
     snprintf(name, sizeof name, "attention f32 H=%d D=64 Q=%lld K=%lld", (int)heads, (long long)queries, (long long)keys);
     gsf_context ctx;
@@ -561,9 +572,11 @@ static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int
     a.desc.k = memory + q_size;
     a.desc.v = memory + q_size + k_size;
     a.desc.out = memory + q_size + 2 * k_size;
+    a.desc.bf16 = bf16;
     const double flops = 4.0 * (double)queries * (double)keys * (double)heads * 64.0;
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
+    if (bf16) row.variant = BENCH_BF16;
     bench_time(o, &ctx, &row, bench_run_attention, &a, 1.0);
     bench_attention_error(&ctx, &a.desc, &row);
     bench_print(o->json, &row);
@@ -573,11 +586,13 @@ static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int
 
 static void bench_attentions(const bench_options* o) {
     for (int threads = 1; threads <= 2; threads++) {
-        BENCH_EACH(level) bench_one_attention(o, level, threads, 4, 64, 256);
-        bench_one_attention(o, o->level, threads, 48, 1024, 1024);
-        if (o->quick) continue;
-        bench_one_attention(o, o->level, threads, 48, 4096, 4096);
-        bench_one_attention(o, o->level, threads, 48, 17550, 1850);
+        BENCH_EACH(level) bench_one_attention(o, level, threads, 0, 4, 64, 256);
+        for (int bf16 = 0; bf16 <= bench_has_bf16(o, GSF_NN_BF16); bf16++) {
+            bench_one_attention(o, o->level, threads, bf16, 48, 1024, 1024);
+            if (o->quick) continue;
+            bench_one_attention(o, o->level, threads, bf16, 48, 4096, 4096);
+            bench_one_attention(o, o->level, threads, bf16, 48, 17550, 1850);
+        }
     }
 }
 
@@ -901,7 +916,8 @@ static void bench_run_block(gsf_context* ctx, void* arg) {
 }
 
 // `references`: tokens of the cross-attention, 0: none, which is what diffusers' CogVideoXBlock computes.
-static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dtype, int64_t tokens, int64_t references) {
+static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dtype, int bf16, int64_t tokens,
+                            int64_t references) {
     char name[96];
     snprintf(name, sizeof name, "block %s S=%lld R=%lld", dtype == GSF_NN_F32 ? "f32" : "bf16", (long long)tokens,
              (long long)references);
@@ -916,6 +932,7 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     bench_block_weights(&b, dtype, weights);
     b.nets.blocks = &b.block;
     b.net.nets = &b.nets;
+    b.net.bf16 = bf16;
     b.run.ctx = &ctx;
     b.run.net = &b.net;
     b.run.nets = &b.nets;
@@ -930,6 +947,7 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
+    if (bf16) row.variant = BENCH_BF16;
     bench_time(o, &ctx, &row, bench_run_block, &b, 1.0);
     bench_print(o->json, &row);
     gsf_nn_destroy_workspace(&ctx, &b.run.workspace);
@@ -941,12 +959,14 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
 static void bench_blocks(const bench_options* o) {
     for (int threads = 1; threads <= 2; threads++) {
         if (o->quick) {
-            bench_one_block(o, threads, GSF_NN_F32, 512, 0);
+            bench_one_block(o, threads, GSF_NN_F32, 0, 512, 0);
             continue;
         }
-        bench_one_block(o, threads, GSF_NN_F32, 4096, 0);
-        bench_one_block(o, threads, GSF_NN_BF16, 4096, 0);
-        bench_one_block(o, threads, GSF_NN_BF16, 4096, 1850);
+        bench_one_block(o, threads, GSF_NN_F32, 0, 4096, 0);
+        for (int bf16 = 0; bf16 <= bench_has_bf16(o, GSF_NN_BF16); bf16++) {
+            bench_one_block(o, threads, GSF_NN_BF16, bf16, 4096, 0);
+            bench_one_block(o, threads, GSF_NN_BF16, bf16, 4096, 1850);
+        }
     }
 }
 
@@ -1172,9 +1192,9 @@ static void bench_run_encode(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_vae_encode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y, NULL));
 }
 
-// Once: these take minutes. Memory is the process', less what it held before.
-static void bench_once(const bench_options* o, gsf_context* ctx, const char* name, bench_model* m, bench_body body,
-                       double flops, double bytes) {
+// Once: these take minutes. Memory is all that the process holds, inputs and outputs included.
+static void bench_once(const bench_options* o, gsf_context* ctx, const char* name, const char* variant, bench_model* m,
+                       bench_body body, double flops, double bytes) {
     double times[256]; // more steps than that are not looked at
     bench_steps steps = {times, 0, 256};
     bench_memory memory;
@@ -1191,6 +1211,7 @@ static void bench_once(const bench_options* o, gsf_context* ctx, const char* nam
     atomic_store(&memory.stop, 1);
     pthread_join(memory.thread, NULL);
     row.peak_rss = memory.anonymous;
+    row.variant = variant;
     bench_print(o->json, &row);
     for (size_t i = steps.count; i-- > 1;) times[i] -= times[i - 1];
     fprintf(stderr, "%s: %.2f GiB anonymous (%.2f announced), %.2f GiB of files; median of %d steps %.2f s\n", name,
@@ -1236,7 +1257,12 @@ static void bench_forward(const bench_options* o, gsf_context* ctx, bench_model*
     m->in.reference_kv = kv;
     double bytes, flops;
     gsf_nn_transformer_cost(t, &m->in, &bytes, &flops);
-    bench_once(o, ctx, "model: transformer forward", m, bench_run_forward, flops, bytes);
+    bytes += (double)gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1) * sizeof(float); // the caller's, filled here
+    bench_once(o, ctx, "model: transformer forward", "default", m, bench_run_forward, flops, bytes);
+    m->transformer.bf16 = 1;
+    m->in.reference_kv_ready = 0;
+    if (bench_has_bf16(o, GSF_NN_BF16)) // with weights of another type only attention is
+        bench_once(o, ctx, "model: transformer forward", BENCH_BF16, m, bench_run_forward, flops, bytes);
     float* all[] = {hidden, text, dino, vggt, references, m->y, kv};
     for (size_t i = 0; i < GSF__COUNT(all); i++) gsf_free(ctx, all[i]);
     gsf_nn_destroy_transformer(ctx, t);
@@ -1257,8 +1283,8 @@ static void bench_vae(const bench_options* o, gsf_context* ctx, bench_model* m, 
     const int64_t in = encode ? v->in_channels : v->latent_channels, out = encode ? v->latent_channels : v->out_channels;
     bench_fill_floats(ctx, &m->x, (size_t)(in * m->frames * m->height * m->width), 1);
     m->y = (float*)bench_alloc(ctx, (size_t)(out * info.frames * info.height * info.width), sizeof(float));
-    bench_once(o, ctx, encode ? "model: vae encode" : "model: vae decode", m, encode ? bench_run_encode : bench_run_decode,
-               info.flops, info.bytes);
+    bench_once(o, ctx, encode ? "model: vae encode" : "model: vae decode", "default", m,
+               encode ? bench_run_encode : bench_run_decode, info.flops, info.bytes);
     gsf_free(ctx, m->x);
     gsf_free(ctx, m->y);
     gsf_nn_destroy_vae(ctx, v);
@@ -1267,7 +1293,7 @@ static void bench_vae(const bench_options* o, gsf_context* ctx, bench_model* m, 
 static void bench_whole_model(const bench_options* o) {
     gsf_context ctx;
     bench_model m;
-    (void)bench_context(&ctx, GSF_CPU_AUTO, o->threads ? o->threads : 2);
+    (void)bench_context(&ctx, o->level, o->threads ? o->threads : 2);
     memset(&m, 0, sizeof m);
     m.folder = o->model;
     if (bench_wanted(o, "model: vae decode", ctx.threads)) bench_vae(o, &ctx, &m, GSF_NN_VAE_DECODE);
@@ -1430,11 +1456,20 @@ static void bench_pipelines(const bench_options* o) {
             gsf_free(&p.ctx, converged);
         }
         bench_restore(&p, &p.desc, "skips", i ? p.dtype : "all of it", expected, "all of it");
+        if (bench_has_bf16(o, GSF_NN_BF16)) {
+            const char* const names[] = {"bf16 attention", "bf16 weights and products"}; // f32 weights keep float32 products
+            if (i == 0) expected = bench_keep(&p);
+            p.transformer.bf16 = 1;
+            bench_restore(&p, &p.desc, "skips", names[i != 0], expected, "all of it");
+            p.transformer.bf16 = 0;
+        }
         if (i == 0) {
-            expected = bench_keep(&p);
+            if (!expected) expected = bench_keep(&p);
             bench_skips(&p, expected);
             bench_require(&p.ctx, gsf_nn_quantize_transformer(&p.ctx, &p.transformer, NULL));
             bench_restore(&p, &p.desc, "skips", "int8", expected, "all of it");
+            p.transformer.bf16 = bench_has_bf16(o, GSF_NN_BF16);
+            if (p.transformer.bf16) bench_restore(&p, &p.desc, "skips", "int8, bf16 attention", expected, "all of it");
         }
         if (i + 1 == o->pipeline_count) gsf_free(&p.ctx, expected);
         bench_close_pipeline(&p);

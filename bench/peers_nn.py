@@ -4,7 +4,7 @@
     bench/peers_nn.py BENCH_NN [--quick] [--filter TEXT] [--threads N] [--rounds N]
 
 BENCH_NN is the built program; its rows are passed through. Every case that PyTorch can do, too, is read from its name and
-timed on as many threads right after; that row has variant "PyTorch" and "ratio": PyTorch's seconds divided by ours (above 1:
+timed on as many threads right after; that row has variant "PyTorch" (beside our products of bf16 "PyTorch bf16") and "ratio": PyTorch's seconds divided by ours (above 1:
 we are faster), "cpu_ratio" the same of CPU seconds, for machines that do other things as well. --rounds repeats the two in
 turns; the median counts. Needs PyTorch (pip install torch), for the transformer's block diffusers and for DINOv2
 transformers, too; without PyTorch only our rows are printed and the exit code is 77.
@@ -38,7 +38,7 @@ def measure(function, units, quick):
     return statistics.median(wall), min(cpu)
 
 
-def linear(match, quick):
+def linear(match, quick, low=False):
     dtype = {"f32": torch.float32, "bf16": torch.bfloat16, "f16": torch.float16}[match.group(1)]
     m, n, k = (int(match.group(i)) for i in (2, 3, 4))
     size = n * k * torch.tensor([], dtype=dtype).element_size()
@@ -56,10 +56,10 @@ def linear(match, quick):
     return run, copies
 
 
-def attention(match, quick):
+def attention(match, quick, low=False):
     heads, dim, q, k = (int(match.group(i)) for i in (1, 2, 3, 4))
-    a = torch.rand(1, q, heads, dim).sub_(0.5).mul_(3).transpose(1, 2)
-    b, c = (torch.rand(1, k, heads, dim).sub_(0.5).mul_(3).transpose(1, 2) for _ in range(2))
+    a, b, c = (torch.rand(1, n, heads, dim).sub_(0.5).mul_(3).to(torch.bfloat16 if low else torch.float32).transpose(1, 2)
+               for n in (q, k, k))
     return lambda: torch.nn.functional.scaled_dot_product_attention(a, b, c), 1
 
 
@@ -98,12 +98,14 @@ def conv3d(match, quick):
     return runs[seconds.index(min(seconds))], 1
 
 
-def block(match, quick):
+def block(match, quick, low=False):
     """diffusers' CogVideoXBlock at the release's size, one sample; it has no cross-attention (R=0 only)."""
     from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXBlock
     tokens, text = int(match.group(2)), 226
-    layer = CogVideoXBlock(3072, 48, 64, 512, attention_bias=True).eval()
-    video, words, embedding = torch.rand(1, tokens - text, 3072), torch.rand(1, text, 3072), torch.rand(1, 512)
+    dtype = torch.bfloat16 if low else torch.float32
+    layer = CogVideoXBlock(3072, 48, 64, 512, attention_bias=True).eval().to(dtype)
+    video, words = (torch.rand(1, n, 3072, dtype=dtype) for n in (tokens - text, text))
+    embedding = torch.rand(1, 512, dtype=dtype)
     table = torch.rand(tokens - text, 64), torch.rand(tokens - text, 64)
     return lambda: layer(video, words, embedding, image_rotary_emb=table), 1
 
@@ -195,13 +197,15 @@ def t5_layer(match, quick):
     return run, 1
 
 
+LOW = "bf16 products"  # a variant of ours; PyTorch's side is computed in bf16 then
+
 CASES = [ # name of a case, what makes (function, units)
     (re.compile(r"linear (f32|bf16|f16) M=(\d+) N=(\d+) K=(\d+)(?: (gelu|silu))?$"), linear),
     (re.compile(r"attention f32 H=(\d+) D=(\d+) Q=(\d+) K=(\d+)$"), attention),
     (re.compile(r"(layer_norm|layer_norm_modulated|rms_norm|head_norm_rope|group_norm|softmax|gelu|silu) f32 (\d+)x(\d+)$"),
      rows),
     (re.compile(r"conv3d f32 C=(\d+) T=(\d+) H=(\d+) W=(\d+)$"), conv3d),
-    (re.compile(r"block (f32) S=(\d+) R=0$"), block),
+    (re.compile(r"block (f32|bf16) S=(\d+) R=0$"), block),
     (re.compile(r"t5 layer (f32|bf16) S=(\d+)$"), t5_layer),
     (re.compile(r"dinov2 f32 (\d+)x(\d+) L=(\d+)$"), dinov2),
     (re.compile(r"vggt pair f32 (\d+)x(\d+) N=(\d+)$"), pair),
@@ -211,18 +215,23 @@ CASES = [ # name of a case, what makes (function, units)
 def peer_row(ours, quick):
     for pattern, make in CASES:
         match = pattern.match(ours["case"])
+        low = ours["variant"] == LOW
         if not match:
+            continue
+        # PyTorch multiplies bf16 weights with bf16 only: where it has instructions for it, our float32 has no counterpart
+        bf16, few = match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
+        if low != bf16 and (make is block or (make is linear and not few and ours["isa"] == "avx512_bf16")):
             continue
         torch.set_num_threads(ours["threads"])
         with torch.inference_mode():
             try:
-                run, units = make(match, quick)
+                run, units = make(match, quick, True) if low else make(match, quick)
             except ImportError as missing:
                 print("peers_nn.py: %s: %s" % (ours["case"], missing), file=sys.stderr)
                 return None
             seconds, cpu = measure(run, units, quick)
         row = {key: ours[key] for key in ("bench", "case", "isa", "threads", "work", "work_unit")}
-        row.update(variant="PyTorch", seconds=seconds, cpu_seconds=cpu, rate=ours["work"] / seconds, reference="none",
+        row.update(variant="PyTorch bf16" if low else "PyTorch", seconds=seconds, cpu_seconds=cpu, rate=ours["work"] / seconds, reference="none",
                    peer=torch.__version__)
         if "peak_share" in ours:  # by the same peak
             row["peak_share"] = ours["peak_share"] * ours["seconds"] / seconds
@@ -241,16 +250,18 @@ def main():
     command = [options.bench, "--json"] + ["--quick"] * options.quick
     command += ["--filter", options.filter] if options.filter else []
     command += ["--threads", str(options.threads)] if options.threads else []
-    pairs = {}
+    pairs, best = {}, None
     for _ in range(options.rounds):
         for line in subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines():
             ours = json.loads(line)
             print(line, flush=True)
-            if torch is None or ours["variant"] != "default" or ours["isa"] == "scalar":
+            if ours["case"].startswith("machine"):
+                best = ours["isa"]  # the last ones are of the best instruction set
+            if torch is None or ours["variant"] not in ("default", LOW) or ours["isa"] != best:
                 continue
             theirs = peer_row(ours, options.quick)
             if theirs:
-                pairs.setdefault((ours["case"], ours["threads"]), []).append((ours, theirs))
+                pairs.setdefault((ours["case"], ours["variant"], ours["threads"]), []).append((ours, theirs))
     for rows in pairs.values():
         row = dict(rows[-1][1])
         row["ratio"] = round(statistics.median(t["seconds"] / o["seconds"] for o, t in rows), 3)

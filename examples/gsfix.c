@@ -64,6 +64,8 @@ static const option_spec option_specs[] = {
      "dit: a step whose first block changes less than this (0.1, say) reuses what the others did (default 0: never)"},
     {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore",
      "dit: most of the transformer in 8-bit integers; takes a byte of memory for each of its weights"},
+    {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore",
+     "dit: the transformer's products in bfloat16 where the processor has them (AVX512_BF16); --quality fast has it"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
      "regularisers for few views (default on); off is plain 3DGS"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
@@ -397,6 +399,7 @@ int gsfix_check_restorer(gsfix_app* app) {
                         : o->strength > 0.0         ? "--strength"
                         : o->block_cache > 0.0      ? "--block-cache"
                         : o->int8                   ? "--int8"
+                        : o->bf16                   ? "--bf16"
                                                     : NULL;
     if (alone) return gsfix_misused(app, "%s is for the restorer dit:MODEL_DIR", alone);
     if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
@@ -419,6 +422,7 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     for (int i = 0; i < 4; i++)
         if (o->condition && strcmp(o->condition, gsfix_conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
     d.int8 = o->int8;
+    d.bf16 = o->bf16 || quality->bf16;
     d.sample.solver = quality->solver;
     for (int i = 0; i < 3; i++)
         if (o->solver && strcmp(o->solver, gsfix_solvers[i]) == 0) d.sample.solver = (gsf_nn_solver)i;

@@ -18,7 +18,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *save_features;
     const char *caption, *model, *solver;
-    int json, help, resume, depth, alpha, int8;
+    int json, help, resume, depth, alpha, int8, bf16;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
@@ -138,6 +138,7 @@ typedef struct gsfix_quality { // --quality is one of these rows
     int32_t max_pixels; // of a frame that is restored; 0 = photo size
     int32_t steps;      // of the restorer dit:
     gsf_nn_solver solver;
+    int bf16;
 } gsfix_quality;
 const gsfix_quality* gsfix_find_quality(const char* name); // NULL: the default
 

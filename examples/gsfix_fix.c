@@ -14,9 +14,9 @@ static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothn
     0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
 
 static const gsfix_quality qualities[] = { // what each saves and costs: bench/QUALITY.md
-    {"exact", 0, 0.0f, 0, 50, GSF_NN_DDIM},
-    {"balanced", 0, 45.0f, 0, 50, GSF_NN_DDIM},
-    {"fast", 1, 36.0f, 320 * 240, 10, GSF_NN_UNIPC},
+    {"exact", 0, 0.0f, 0, 50, GSF_NN_DDIM, 0},
+    {"balanced", 0, 45.0f, 0, 50, GSF_NN_DDIM, 0},
+    {"fast", 1, 36.0f, 320 * 240, 10, GSF_NN_UNIPC, 1},
 };
 
 const gsfix_quality* gsfix_find_quality(const char* name) {
@@ -452,6 +452,7 @@ static void write_dit_switches(fix_run* run) {
     gsfix_json_number(ctx, t, "strength", as_written(d.strength));
     gsfix_json_number(ctx, t, "block_cache", as_written(d.block_cache));
     gsfix_json_text(ctx, t, "int8", dit.int8 ? "on" : "off");
+    gsfix_json_text(ctx, t, "bf16", dit.bf16 ? "on" : "off");
 }
 
 static void write_switches(fix_run* run) {

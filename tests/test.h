@@ -45,13 +45,13 @@ static inline int test_check_result(gsf_context* ctx, int actual, int expected, 
     return actual == expected;
 }
 
-// Zeroes and initialises a context; GSF_TEST_CPU=scalar|avx2 (environment) forces a cpu level. For hooks of your own
+// Zeroes and initialises a context; GSF_TEST_CPU=scalar|avx2|... (environment) forces a cpu level. For hooks of your own
 // call test_context_zero, fill them in and call gsf_init_context.
 static inline void test_context_zero(gsf_context* ctx) {
     memset(ctx, 0, sizeof *ctx);
     const char* level = getenv("GSF_TEST_CPU");
-    if (level && strcmp(level, "scalar") == 0) ctx->cpu_level = GSF_CPU_SCALAR;
-    if (level && strcmp(level, "avx2") == 0) ctx->cpu_level = GSF_CPU_AVX2;
+    for (int known = GSF_CPU_SCALAR; level && known <= GSF_CPU_AVX512_BF16; known++)
+        if (strcmp(level, gsf_cpu_level_name((gsf_cpu_level)known)) == 0) ctx->cpu_level = (gsf_cpu_level)known;
 }
 static inline void test_context_init(gsf_context* ctx) {
     test_context_zero(ctx);

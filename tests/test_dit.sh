@@ -64,7 +64,7 @@ for condition in none 2d 3d; do
     restore "$scratch/$condition" --condition "$condition" || fail "--condition $condition failed"
     ! cmp -s "$scratch/$condition/$(basename "$frame")" "$frame" || fail "--condition $condition changes nothing"
 done
-restore "$scratch/fast" --steps 8 --solver unipc --guidance-until 0.5 --strength 0.5 --block-cache 0.1 --int8 ||
+restore "$scratch/fast" --steps 8 --solver unipc --guidance-until 0.5 --strength 0.5 --block-cache 0.1 --int8 --bf16 ||
     fail "the options that save steps failed"
 
 expect() { # STATUS TEXT COMMAND...

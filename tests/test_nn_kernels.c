@@ -325,9 +325,18 @@ static void free_attention(attention_data* a) {
     free(a->q); free(a->k); free(a->v); free(a->out); free(a->bias); free(a->mask);
 }
 
+static int attention_rounds(const attention_data* a) { // operands to bfloat16
+    return a->desc.bf16 && one.cpu_level >= GSF_CPU_AVX512_BF16 && a->desc.head_dim % 2 == 0;
+}
+
+static double attention_operand(const attention_data* a, float value, float factor) {
+    return attention_rounds(a) ? (double)gsf__bf16_to_float(gsf__float_to_bf16(value * factor)) / (double)factor : (double)value;
+}
+
 static void attention_of(const attention_case* c, const attention_data* a, double* out) { // (queries, heads * dim)
     const int64_t dim = c->dim, width = c->heads * dim, ld = width + c->extra;
     const double scale = c->scale != 0.0f ? (double)c->scale : 1.0 / sqrt((double)dim);
+    const float factor = (float)scale * 1.44269504f; // what queries are multiplied with before they are rounded
     double* p = make_doubles((size_t)c->keys);
     for (int64_t h = 0; h < c->heads; h++)
         for (int64_t r = 0; r < c->queries; r++) {
@@ -335,7 +344,8 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
             for (int64_t j = 0; j < c->keys; j++) {
                 p[j] = 0.0;
                 for (int64_t i = 0; i < dim; i++)
-                    p[j] += (double)a->q[r * ld + h * dim + i] * (double)a->k[j * ld + h * dim + i];
+                    p[j] += attention_operand(a, a->q[r * ld + h * dim + i], factor) *
+                            attention_operand(a, a->k[j * ld + h * dim + i], 1.0f);
                 p[j] *= scale;
                 if (a->bias) p[j] += (double)a->bias[(h * c->queries + r) * c->keys + j];
                 if (a->mask && !a->mask[(h * c->queries + r) * c->keys + j]) p[j] = -INFINITY;
@@ -344,7 +354,7 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
             for (int64_t j = 0; j < c->keys; j++) sum += p[j] = top == -INFINITY ? 0.0 : exp(p[j] - top);
             for (int64_t i = 0; i < dim; i++) {
                 double value = 0.0;
-                for (int64_t j = 0; j < c->keys; j++) value += p[j] * (double)a->v[j * ld + h * dim + i];
+                for (int64_t j = 0; j < c->keys; j++) value += p[j] * attention_operand(a, a->v[j * ld + h * dim + i], 1.0f);
                 out[r * width + h * dim + i] = sum > 0.0 ? value / sum : 0.0;
             }
         }
@@ -366,10 +376,13 @@ static void check_attention(void) {
         {803, 70, 3, 16, 0, 0, 0, 1, 0}, {30, 33, 2, 24, 2, 1, 0, 1, 0},  {9, 600, 1, 20, 0, 1, 0, 1, 0},
         {5, 700, 1, 64, 0, 0, 0, 30, 0}, {1541, 20, 1, 4, 0, 0, 0, 1, 0}, {48, 256, 1, 128, 0, 0, 0, 1, 0},
         {57, 300, 2, 24, 1, 0, 1, 1, 3}, {9, 270, 3, 20, 0, 1, 0, 1, 2},  {803, 33, 2, 8, 0, 0, 0, 1, 9}};
-    for (size_t n = 0; n < sizeof cases / sizeof cases[0]; n++) {
-        const attention_case* c = &cases[n];
+    for (size_t n = 0; n < 2 * GSF__COUNT(cases); n++) {
+        const attention_case* c = &cases[n / 2];
         const size_t values = (size_t)(c->queries * c->heads * c->dim);
         attention_data a = make_attention(c);
+        a.desc.bf16 = n % 2;
+        // the weights are rounded, too: 2^-9 of each, of numerator and denominator; values differ by up to 3
+        const double rounding = attention_rounds(&a) ? 3.0 / 256 : 0.0;
         double* expected = make_doubles(values);
         gsf_nn_workspace workspace;
         memset(&workspace, 0, sizeof workspace);
@@ -377,8 +390,13 @@ static void check_attention(void) {
         CHECK_OK(&one, gsf_nn_attention(&one, &workspace, &a.desc));
         float* dense = dense_rows(c, a.out);
         char what[80];
-        snprintf(what, sizeof what, "attention case %zu", n);
-        test_compare_floats(what, dense, expected, values, c->range > 10 ? 3e-4 : 3e-6); // logits up to 1500
+        snprintf(what, sizeof what, "attention case %zu%s", n / 2, n % 2 ? " bf16" : "");
+        test_compare_floats(what, dense, expected, values, rounding + (c->range > 10 ? 3e-4 : 3e-6)); // logits up to 1500
+        if (rounding > 0.0 && c->keys > 200 && !c->masked && c->range < 10) { // it was rounded, but averages are better
+            double square = 0.0;
+            for (size_t i = 0; i < values; i++) square += ((double)dense[i] - expected[i]) * ((double)dense[i] - expected[i]);
+            CHECK(square > 1e-12 * (double)values && square < 1e-6 * (double)values);
+        }
         for (int64_t r = 0; c->extra && r < c->queries; r++) // gaps keep what stood there
             CHECK(a.out[r * (c->heads * c->dim + c->extra) + c->heads * c->dim] >= 7.0f);
         a.desc.out = a.q; // in place, other workers, scratch for this call only
@@ -402,11 +420,12 @@ static int none_nan(const float* x, size_t count) {
     return 1;
 }
 
-static void check_attention_values(void) {
+static void check_attention_values(int bf16) {
     const attention_case c = {20, 300, 2, 24, 0, 0, 0, 1, 0};
     const size_t width = 48;
     for (int key = 0; key < 300; key += 299) { // in the first and in the last block
         attention_data a = make_attention(&c);
+        a.desc.bf16 = bf16;
         a.q[3 * width + 5] = NAN; // query 3 of head 0
         CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
         CHECK(all_nan(a.out + 3 * width, 24) && none_nan(a.out + 3 * width + 24, 24) && none_nan(a.out, 3 * width));
@@ -504,7 +523,8 @@ int main(void) {
         check_group_norm();
         check_head_norm_rope();
         check_attention();
-        check_attention_values();
+        check_attention_values(0);
+        check_attention_values(1);
         check_attention_bias();
         check_attention_errors();
     }

@@ -133,7 +133,7 @@ static void test_shapes(gsf_context* ctx) {
     static const int64_t sizes[] = {1, 2, 3, 7, 8, 9, 15, 16, 17, 31, 33, 64, 100, 193, 255, 257, 512, 513};
     gsf_nn_workspace workspace;
     memset(&workspace, 0, sizeof workspace);
-    for (int i = 0; i < 150; i++) {
+    for (int i = 0; i < 300; i++) {
         const int64_t m = rows[i % (int)GSF__COUNT(rows)];
         const int64_t in = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         const int64_t out = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
@@ -142,11 +142,39 @@ static void test_shapes(gsf_context* ctx) {
         l.desc.bias = test_random_bits(&seed) % 3 ? &l.bias : NULL;
         l.desc.gate = test_random_bits(&seed) % 3 ? NULL : l.gate;
         l.desc.accumulate = test_random_bits(&seed) % 3 == 0;
+        if (i >= 150) { // values that rounding to bf16 leaves as they are
+            const size_t count = (size_t)((m - 1) * (l.desc.ldx ? l.desc.ldx : in) + in);
+            l.desc.bf16 = 1;
+            for (size_t k = 0; k < count; k++) l.x[k] = gsf__bf16_to_float(gsf__float_to_bf16(l.x[k]));
+        }
         run(ctx, i % 2 ? &workspace : NULL, &l);
         check_layer(&l, 25);
         free_layer(&l);
     }
     gsf_nn_destroy_workspace(ctx, &workspace);
+}
+
+// What rounding x to bf16 costs where it is rounded, and that it is not elsewhere.
+static void test_bf16(gsf_context* ctx) {
+    for (int dtype = GSF_NN_F32; dtype <= GSF_NN_F16; dtype++)
+        for (int64_t rows = 4; rows <= 40; rows += 36) {
+            layer l = make_layer(rows, 512, 100, (gsf_nn_dtype)dtype, 0, 0);
+            const int rounds = ctx->cpu_level >= GSF_CPU_AVX512_BF16 && dtype == GSF_NN_BF16 && rows > 4;
+            float* exact = (float*)malloc(l.y_count * sizeof(float));
+            double error = 0.0, size = 0.0;
+            run(ctx, NULL, &l);
+            memcpy(exact, l.y, l.y_count * sizeof(float));
+            l.desc.bf16 = 1;
+            run(ctx, NULL, &l);
+            for (size_t i = 0; i < l.y_count; i++) {
+                error += ((double)l.y[i] - (double)exact[i]) * ((double)l.y[i] - (double)exact[i]);
+                size += (double)exact[i] * (double)exact[i];
+            }
+            const double relative = sqrt(error / size);
+            CHECK(rounds ? relative > 1e-4 && relative < 2e-3 : relative == 0.0);
+            free(exact);
+            free_layer(&l);
+        }
 }
 
 // Sizes at which the work is cut: several blocks of rows, groups of outputs, blocks of outputs.
@@ -180,6 +208,7 @@ static void test_workers(gsf_cpu_level level) {
             layer l = make_layer(sizes[i][0], sizes[i][1], sizes[i][2], dtypes[t], 0, 0);
             l.desc.bias = &l.bias;
             l.desc.activation = GSF_NN_SILU;
+            l.desc.bf16 = 1;
             run(&one, NULL, &l);
             float* first = (float*)malloc(l.y_count * sizeof(float));
             memcpy(first, l.y, l.y_count * sizeof(float));
@@ -295,6 +324,7 @@ int main(void) {
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         if ((int)ctx.cpu_level != level) continue;
         test_shapes(&ctx);
+        test_bf16(&ctx);
         test_blocks(&ctx);
         test_workers(ctx.cpu_level);
         test_special(&ctx);
