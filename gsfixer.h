@@ -169,7 +169,7 @@ GSF_API void gsf_request_cancel(gsf_context* ctx);
 GSF_API void gsf_clear_cancel(gsf_context* ctx);
 GSF_API int gsf_is_cancelled(const gsf_context* ctx);
 
-// Name of an instruction set level ("scalar", "avx2").
+// Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16").
 GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.

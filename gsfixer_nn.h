@@ -36,6 +36,9 @@
    MEMORY      Weight files are mapped where the platform can (else read whole) and used in place; what no layer touches
                never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
+   PROCESSORS  Every kernel is there in scalar C and for AVX2, those that count for AVX-512; 8-bit layers use its dot
+               products of bytes (VNNI), layers and attention those of bfloat16 where a descriptor's member `bf16` asks for
+               them. gsf_context.cpu_level chooses; results differ between levels by the rounding of float32 sums.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
@@ -2282,6 +2285,7 @@ GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int6
 //
 // A block of some hundred rows and outputs is one unit of parallel work. It goes through the inner dimension in steps of
 // `depth`: that much of its rows lies in the L2 cache, of one panel in L1, each tile of 6 x 16 sums is held in registers.
+// AVX-512 takes two groups by two panels at a time, 12 x 32 sums, and pairs of bf16 where floats stand if it is asked to.
 // After the last step a tile goes through bias, activation, gate and residual into y while it is hot. The weights are
 // packed once per call for all blocks, or, where one block has all rows, by the worker that needs them. Up to 4 rows are a
 // matter of reading the weights once: they are not packed but multiplied as they lie in the file.
@@ -3167,11 +3171,11 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
 // Up to 4 rows, in groups of 2 or 4 then, meet the 8-bit weights as they are read, one panel after another.
 // Fours are what dot-product instructions (VNNI) take, of unsigned by signed bytes: qx is stored as qx + 128 for them, and
 // 128 sum_k qw is taken off the sums, which may wrap around on the way. As with floats two groups meet two panels.
-// AVX2 has no such instruction, and its products of bytes add pairs in 16 bits, which
-// 2 * 127 * 127 fills: signs moved to one operand, multiply, widen, add are 4 instructions for 32 products. With both
-// operands widened to 16 bits, a panel once per block, it is 2 multiplications (vpmaddwd) and 2 additions, also 4, of which
-// nothing but the 12 sums needs a register; alone in L1 that gave 146 against 115 Gop/s a core. Either way two
-// multiplications per cycle bound it to twice the multiply-adds of float; more needs the dot-product instructions.
+// AVX2 has no such instruction, and its products of bytes add pairs in 16 bits, which 2 * 127 * 127 fills: signs moved to
+// one operand, multiply, widen, add are 4 instructions for 32 products. With both operands widened to 16 bits, a panel once
+// per block, it is 2 multiplications (vpmaddwd) and 2 additions, also 4, of which nothing but the 12 sums needs a register;
+// alone in L1 that gave 146 against 115 Gop/s a core. Either way two multiplications per cycle bound it to twice the
+// multiply-adds of float; more needs the dot-product instructions.
 // Sums are integers: the same bits for any cut, instruction set and number of workers.
 
 enum {
