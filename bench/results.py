@@ -322,17 +322,26 @@ def errors(row):
 
 
 def nn_sections(lines, rows, has_pipeline):
-    ratios = {(r["case"], r["threads"]): "%.2f" % r["ratio"] for r in rows if "ratio" in r}
+    def peer(row):  # what a row and its peer have in common
+        return row["case"], row["isa"], row["threads"], row["variant"] in ("bf16 products", "PyTorch bf16")
+
+    ratios = {peer(r): "%.2f" % r["ratio"] for r in rows if "ratio" in r}
+    peaks = [r for r in rows if r["case"].startswith("machine: ")]
     kernels = [r for r in rows if "ratio" not in r and not r["case"].startswith(("machine: ", "pipeline: ", "model: "))]
     lines += ["## Kernels of the video model and its encoders", "",
-              "At the released model's sizes. Shares are of the multiply-adds and of the bytes per second that the same run "
-              "reaches without any kernel; errors are against sums in double. The last column is PyTorch's seconds divided by "
-              "ours, timed in turns in the same run (`bench/peers_nn.py`).", ""]
-    table(lines, ["", "", "instructions", "threads", "ms", "CPU ms", "FMA peak", "bandwidth", "largest error", "relative L2",
+              "What the same run reaches without any kernel: chained multiply-adds, dot products of integers (of bytes where "
+              "there are instructions for that, else of 16 bits), reading.", ""]
+    table(lines, ["", "instructions", "threads", "per second"],
+          [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
+    lines += ["At the released model's sizes, the smallest cases at every level of instructions. Shares are of the peaks "
+              "above: 8-bit layers' of the integers, all others' of the multiply-adds, which products of bf16 can exceed. "
+              "Errors are against sums in double. The last column is PyTorch's seconds divided by ours, timed in turns in "
+              "the same run (`bench/peers_nn.py`): in float32, beside our products of bf16 in bf16.", ""]
+    table(lines, ["", "", "instructions", "threads", "ms", "CPU ms", "peak", "bandwidth", "largest error", "relative L2",
                   "PyTorch / ours"],
           [[r["case"], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), ms(r["seconds"]),
             ms(r["cpu_seconds"]), percent(r, "peak_share"), percent(r, "bandwidth_share")] + errors(r)
-           + [ratios.get((r["case"], r["threads"]), "") if r["isa"] != "scalar" and r["variant"] == "default" else ""]
+           + [ratios.get(peer(r), "")]
            for r in kernels])
     if has_pipeline:
         lines += ["## A whole restoration: run time beside error", "", "![Error beside seconds](pipeline.svg)", "",
@@ -348,8 +357,8 @@ def nn_sections(lines, rows, has_pipeline):
         lines += ["## The released size", "",
                   "Random weights in the official layout (`make_model --size full`), 49 frames of 720 x 480: 17,550 video and "
                   "226 text tokens, 1,850 reference tokens. Memory is anonymous; the weights stay in the mapped files.", ""]
-        table(lines, ["", "threads", "seconds", "CPU seconds", "TFLOP", "FMA peak", "memory at most"],
-              [[r["case"][7:], str(r["threads"]), short(r["seconds"]), short(r["cpu_seconds"]), short(1e-12 * r["work"]),
+        table(lines, ["", "", "instructions", "threads", "seconds", "CPU seconds", "TFLOP", "FMA peak", "memory at most"],
+              [[r["case"][7:], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), short(r["seconds"]), short(r["cpu_seconds"]), short(1e-12 * r["work"]),
                 percent(r, "peak_share"), "%.2f GiB" % (r["peak_rss_bytes"] / 2**30)] for r in models])
 
 
