@@ -514,6 +514,7 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #define GSF__TARGET_AVX512 __attribute__((target(GSF__AVX512)))
 #define GSF__INLINE_AVX512 __attribute__((target(GSF__AVX512), always_inline)) static inline
 #define GSF__TARGET_VNNI __attribute__((target(GSF__AVX512 ",avx512vnni")))
+#define GSF__INLINE_VNNI __attribute__((target(GSF__AVX512 ",avx512vnni"), always_inline)) static inline
 #define GSF__TARGET_BF16 __attribute__((target(GSF__AVX512 ",avx512bf16")))
 #define GSF__INLINE_BF16 __attribute__((target(GSF__AVX512 ",avx512bf16"), always_inline)) static inline
 #else

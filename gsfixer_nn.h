@@ -3584,33 +3584,41 @@ GSF__TARGET_VNNI static void gsf__int8_four_tiles_vnni(const void* a, int64_t a_
 #undef GSF_PUT
 #undef GSF_ROWS
 
-// Two sums of each row, taken in turns: one would wait for itself.
-GSF__TARGET_VNNI static void gsf__int8_few_vnni(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
-    const uint8_t* x = (const uint8_t*)a;
-    __m512i even[GSF__FEW_ROWS], odd[GSF__FEW_ROWS];
-    for (int r = 0; r < GSF__FEW_ROWS; r++) even[r] = odd[r] = _mm512_setzero_si512();
-#define GSF_X(r)                                                                                                \
-    if (rows > r) {                                                                                             \
-        even[r] = _mm512_dpbusd_epi32(even[r], gsf__int8_four(x + 4 * (r)), v);                                 \
-        if (u) odd[r] = _mm512_dpbusd_epi32(odd[r], gsf__int8_four(x + 4 * (rows + (r))), u_v);                 \
-    }
+// Two sums of each row, taken in turns: one would wait for itself. `rows` had better be a constant.
+GSF__INLINE_VNNI void gsf__int8_few_rows(const uint8_t* x, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+    __m512i even0 = _mm512_setzero_si512(), even1 = even0, even2 = even0, even3 = even0;
+    __m512i odd0 = even0, odd1 = even0, odd2 = even0, odd3 = even0, v;
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3)
+#define GSF_EVEN(r) if (rows > r) even##r = _mm512_dpbusd_epi32(even##r, gsf__int8_four(x + 4 * (r)), v);
+#define GSF_ODD(r) if (rows > r) odd##r = _mm512_dpbusd_epi32(odd##r, gsf__int8_four(x + 4 * (rows + (r))), v);
     for (; count >= 8; count -= 8, x += 8 * rows, w += 8 * GSF__TILE_COLUMNS) {
-        const __m512i v = _mm512_loadu_si512(w), u_v = _mm512_loadu_si512(w + 4 * GSF__TILE_COLUMNS);
-        const int u = 1;
         if (rows > 2) { // for fewer the processor itself is soon enough
             _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T1);
             _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD + 64, _MM_HINT_T1);
         }
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+        v = _mm512_loadu_si512(w);
+        GSF_ROWS(GSF_EVEN)
+        v = _mm512_loadu_si512(w + 4 * GSF__TILE_COLUMNS);
+        GSF_ROWS(GSF_ODD)
     }
     if (count > 0) {
-        const __m512i v = _mm512_loadu_si512(w), u_v = v;
-        const int u = 0;
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
+        v = _mm512_loadu_si512(w);
+        GSF_ROWS(GSF_EVEN)
     }
-#undef GSF_X
-    for (int64_t r = 0; r < rows; r++)
-        _mm512_storeu_si512(sums + r * GSF__TILE_COLUMNS, _mm512_add_epi32(even[r], odd[r]));
+#define GSF_PUT(r) if (rows > r) _mm512_storeu_si512(sums + (r) * GSF__TILE_COLUMNS, _mm512_add_epi32(even##r, odd##r));
+    GSF_ROWS(GSF_PUT)
+#undef GSF_PUT
+#undef GSF_ODD
+#undef GSF_EVEN
+#undef GSF_ROWS
+}
+
+GSF__TARGET_VNNI static void gsf__int8_few_vnni(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+    const uint8_t* x = (const uint8_t*)a;
+    if (rows == 1) gsf__int8_few_rows(x, 1, w, count, sums);
+    else if (rows == 2) gsf__int8_few_rows(x, 2, w, count, sums);
+    else if (rows == 3) gsf__int8_few_rows(x, 3, w, count, sums);
+    else gsf__int8_few_rows(x, 4, w, count, sums);
 }
 
 GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const int32_t* offsets, const float* rows,
