@@ -4318,7 +4318,9 @@ GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
        values   out = out * that + p v
    Packed queries, sums and one block of keys stay in cache however many keys there are.
        q    [group][dim][8], 6 used    out  [group][panel][6][16]      panel: 16 columns of v, padded with zeros
-       k    [panel of 16 keys][dim][16]    v    [panel][key][16]      p    [query][key] */
+       k    [panel of 16 keys][dim][16]    v    [panel][key][16]      p    [query][key]
+   AVX-512 takes two groups by two panels at a time. In bf16 the places of q and k hold pairs along dim, those of v and of the
+   weights pairs along the keys, so that there are half as many. */
 enum {
     GSF__ATT_GROUP = 6,       // queries of a register tile: 6 x 16 sums, two of keys and a broadcast are 15 registers
     GSF__ATT_PANEL = 16,
@@ -4969,9 +4971,10 @@ typedef struct gsf__conv_kernels {
     // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last rows
     // repeat the last pixel.
     void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c);
-    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart, count up to CONV_COLUMNS; or NULL
+    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart; or NULL. Meanwhile fetches 4k floats
+    // from `ahead` on, and as many of the second panel.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
-                         int64_t c_next);
+                         int64_t c_next, const float* ahead);
     // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and their squares.
     void (*store)(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo, double* sums);
     // y = silu((x - mean) * scale + offset)
@@ -5054,10 +5057,11 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
 
 // Ten pixels by two panels: 20 registers of sums. A missing pixel reads the last one's values.
 GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int64_t lda, int64_t count, const float* b,
-                                                             int64_t b_next, int64_t k, float* c, int64_t c_next) {
+                                                             int64_t b_next, int64_t k, float* c, int64_t c_next,
+                                                             const float* ahead) {
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5) X(6) X(7) X(8) X(9)
     for (int64_t m = 0; m < count; m += GSF__CONV_M10, a += GSF__CONV_M10 * lda, c += GSF__CONV_M10 * GSF__CONV_N) {
-        const int64_t last = count - m - 1;
+        const int64_t last = count - m - 1, share = m == 0 ? 4 : 0;
         const float* w = b;
 #define GSF_X(r) const float* a##r = a + (last < r ? last : r) * lda;
         GSF_ROWS(GSF_X)
@@ -5068,6 +5072,9 @@ GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int
         for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
             const __m512 w0 = _mm512_loadu_ps(w), w1 = _mm512_loadu_ps(w + b_next);
             __m512 v;
+            _mm_prefetch((const char*)ahead, _MM_HINT_T1);
+            _mm_prefetch((const char*)(ahead + b_next), _MM_HINT_T1);
+            ahead += share;
 #define GSF_X(r)                                     \
             v = _mm512_set1_ps(a##r[i]);             \
             c##r = _mm512_fmadd_ps(v, w0, c##r);     \
@@ -5273,8 +5280,9 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
                     if (y < 0 || y >= job->in_height) continue;
                     const float* a = job->in[kt] + y * job->in_stride + job->origin + x0 * job->step + k0;
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
-                    if (panels == 2)
-                        job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE);
+                    if (panels == 2) // each row fetches a fourth of the next values of the panels
+                        job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE,
+                                                   b + k * GSF__CONV_N + r * 4 * k);
                     else job->kernels->multiply(a, job->step, columns, b, k, c);
                 }
                 b += k * GSF__CONV_N;
