@@ -152,6 +152,9 @@ static void check_transformer(void) {
         check_output(&c, &c.net, &in, name, transformer_bar);
         in.tap_fn = NULL;
         check_output(&c, &rounded, &in, name, bf16_bar);
+        rounded.bf16 = 1; // products of bf16 as well, where the processor has them
+        check_output(&c, &rounded, &in, name, bf16_bar);
+        rounded.bf16 = 0;
     }
     size_t bytes = 0;
     CHECK_OK(&c.ctx, gsf_nn_quantize_transformer(&c.ctx, &rounded, &bytes));
