@@ -222,6 +222,8 @@ def peer_row(ours, quick):
         bf16, few = match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
         if low != bf16 and (make is block or (make is linear and not few and ours["isa"] == "avx512_bf16")):
             continue
+        if make is linear and match.group(1) == "f16" and not few:
+            continue  # takes PyTorch minutes on processors without products of f16
         torch.set_num_threads(ours["threads"])
         with torch.inference_mode():
             try:
