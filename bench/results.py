@@ -187,24 +187,27 @@ def write_pipeline(path, rows):  # seconds to the right, error upwards by decade
                 exact.append("%s %s s" % (name, short(seconds)))
                 continue
             family, color = next(f for f in FAMILIES if name.startswith(f[0]))
-            lines.setdefault((family or name, color), []).append(
+            lines.setdefault((family, color), []).append(
                 (x0 + scale * seconds, top + decade * (high - math.log10(error)), name[len(family):].strip() or name))
         for k, ((family, color), line) in enumerate(lines.items()):
-            out.append('<polyline points="%s" fill="none" stroke="%s" stroke-opacity="0.5"/>'
-                       % (" ".join("%.1f,%.1f" % p[:2] for p in line), color))
-            below = k % 2  # labels of neighbouring lines keep apart
-            for x, y, label in line:
+            if family:
+                out.append('<polyline points="%s" fill="none" stroke="%s" stroke-opacity="0.5"/>'
+                           % (" ".join("%.1f,%.1f" % p[:2] for p in line), color))
+            for n, (x, y, label) in enumerate(line):
+                # labels of neighbouring lines, and of points that are no line, keep apart; none leaves the panel
+                below = (k if family else n) % 2 or x + 6 + 6 * len(label) > x0 + width + 12
                 out.append('<circle cx="%.1f" cy="%.1f" r="3.5" fill="%s"/>' % (x, y, color))
                 out.append('<text x="%.1f" y="%.1f" font-size="10" text-anchor="%s" fill="%s">%s</text>'
                            % (x + (-6 if below else 6), y + (12 if below else -5), "end" if below else "start", color, label))
             out.append('<rect x="%d" y="%d" width="10" height="10" fill="%s"/><text x="%d" y="%d">%s</text>'
-                       % (x0 + width - 110, top + 8 + 16 * k, color, x0 + width - 96, top + 17 + 16 * k, family))
+                       % (x0 + width + 12, top + 8 + 16 * k, color, x0 + width + 26, top + 17 + 16 * k,
+                          family or "number formats"))
         for k in range(0, len(exact), 3):
             out.append('<text x="%d" y="%d" font-size="11">%s%s</text>'
                        % (x0, bottom + 36 + 14 * (k // 3), "" if k else "no error: ", ", ".join(exact[k:k + 3])))
-        x0 += width + 150
+        x0 += width + 190
     head = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
-            % (x0 - 100, bottom + 70), '<rect width="100%" height="100%" fill="white"/>',
+            % (x0 - 50, bottom + 70), '<rect width="100%" height="100%" fill="white"/>',
             '<text x="10" y="18" font-size="14">Relative L2 error of the restored frames beside seconds</text>']
     with open(path, "w") as file:
         file.write("\n".join(head + out + ["</svg>"]) + "\n")
