@@ -2506,6 +2506,13 @@ GSF__TARGET_AVX2 static void gsf__pack_weights_avx2(const char* w, gsf_nn_dtype 
     else gsf__pack_weights8(w, GSF_NN_F16, 2, pitch, columns, count, out);
 }
 
+// Eight steps of six rows from r0 ... r7; each writes two floats too many, which the next one takes back.
+#define GSF__STORE_STEPS(to, r)                                                \
+    _mm256_storeu_ps(to, r##0), _mm256_storeu_ps(to + 6, r##1);                \
+    _mm256_storeu_ps(to + 12, r##2), _mm256_storeu_ps(to + 18, r##3);          \
+    _mm256_storeu_ps(to + 24, r##4), _mm256_storeu_ps(to + 30, r##5);          \
+    _mm256_storeu_ps(to + 36, r##6), _mm256_storeu_ps(to + 42, r##7);
+
 GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
     static const float zeros[8] = {0, 0, 0, 0, 0, 0, 0, 0};
     const float* p[GSF__TILE_ROWS];
@@ -2522,14 +2529,7 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
         __m256 r4 = _mm256_loadu_ps(p[4] + (k & step[4])), r5 = _mm256_loadu_ps(p[5] + (k & step[5]));
         __m256 r6 = _mm256_setzero_ps(), r7 = r6;
         GSF__TRANSPOSE8(r)
-        _mm256_storeu_ps(to, r0); // each writes two floats too many, which the next one takes back
-        _mm256_storeu_ps(to + 6, r1);
-        _mm256_storeu_ps(to + 12, r2);
-        _mm256_storeu_ps(to + 18, r3);
-        _mm256_storeu_ps(to + 24, r4);
-        _mm256_storeu_ps(to + 30, r5);
-        _mm256_storeu_ps(to + 36, r6);
-        _mm256_storeu_ps(to + 42, r7);
+        GSF__STORE_STEPS(to, r)
     }
     for (int64_t k = whole; k < count; k++)
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
@@ -2912,14 +2912,7 @@ GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, in
         __m256 r6 = _mm256_setzero_ps(), r7 = r6;
         float* to = k + 8 <= count ? out : tile;
         GSF__TRANSPOSE8(r)
-        _mm256_storeu_ps(to, r0); // each writes two floats too many, which the next one takes back
-        _mm256_storeu_ps(to + 6, r1);
-        _mm256_storeu_ps(to + 12, r2);
-        _mm256_storeu_ps(to + 18, r3);
-        _mm256_storeu_ps(to + 24, r4);
-        _mm256_storeu_ps(to + 30, r5);
-        _mm256_storeu_ps(to + 36, r6);
-        _mm256_storeu_ps(to + 42, r7);
+        GSF__STORE_STEPS(to, r)
         if (to == tile) memcpy(out, tile, (size_t)((count - k) * GSF__TILE_ROWS) * sizeof(float));
     }
 }

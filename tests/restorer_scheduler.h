@@ -117,7 +117,7 @@ static void scheduler_check_noise(gsf_context* ctx, const test_tensors* file, co
         for (size_t k = 0, at = i * row; k < row; k++, at++) {
             scheduler_check_mix(out[k], noisy.v[at], &ours, &theirs, x0.v[at], eps.v[at]);
             scheduler_check_mix(v[k], velocity.v[at], &ours, &theirs, eps.v[at], x0.v[at]);
-            scheduler_check_mix(back[k], x0.v[at], &ours, &ours, out[k], v[k]);
+            CHECK_NEAR(back[k], x0.v[at], 4e-7 * fmax(1.0, fabs(x0.v[at]))); // no table of theirs in it
         }
     }
     free(out);
