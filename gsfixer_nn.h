@@ -2307,7 +2307,8 @@ enum {
     GSF__FEW_COLUMNS = 1008,          // nor of more outputs; both a multiple of 6 and 16
     GSF__FEW_UNIT = 48,
     GSF__FEW_PAD = 32,                // values of x are padded to a multiple of this
-    GSF__FEW_STEP = 1024              // AVX-512: values of several rows of x that are gone through at a time
+    GSF__FEW_AHEAD = 2048,            // AVX-512: bytes ahead that each row of weights is asked for;
+    GSF__FEW_STEP = 1024              // so many values of several rows of x are gone through at a time
 };
 
 #ifndef GSF__LINEAR_PACKED // a test makes it small
@@ -2798,10 +2799,42 @@ GSF__INLINE_AVX512 float gsf__few_one16(const char* w, gsf_nn_dtype dtype, const
     return gsf__nn_sum16((s0 + s1) + (s2 + s3));
 }
 
-// Six rows of weights times 2 or 4 rows of x, laid out as [k / 16][rows][16], added to sums[6][rows]. `count` is a multiple
-// of 32. What lies `ahead` bytes on, the next rows, is asked for.
-GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x,
-                                       int64_t rows, int64_t count, float* sums) {
+// Two rows of x, laid out as [k / 16][2][16], times four rows of weights, added to sums[4][2]. `count` is a multiple of 32.
+// The more there is to multiply, the less far ahead the processor looks by itself: what lies GSF__FEW_AHEAD on is asked for.
+GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtype, const float* x, int64_t count, float* sums) {
+    const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3];
+    const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
+#define GSF_ROWS(X) X(0) X(1) X(2) X(3)
+#define GSF_X(r) __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, t##r##0 = s##r##0, t##r##1 = s##r##0;
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+    for (int64_t at = 0; count > 0; count -= 32, at += 2 * vector, x += 64) {
+        const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16);
+        const __m512 y0 = _mm512_load_ps(x + 32), y1 = _mm512_load_ps(x + 48);
+        __m512 v;
+#define GSF_X(r)                                                                         \
+        _mm_prefetch(w##r + at + GSF__FEW_AHEAD, _MM_HINT_T0);                           \
+        v = gsf__load16(w##r + at, dtype);                                               \
+        s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);                                       \
+        s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);                                       \
+        if (vector == 64) _mm_prefetch(w##r + at + GSF__FEW_AHEAD + 64, _MM_HINT_T0);    \
+        v = gsf__load16(w##r + at + vector, dtype);                                      \
+        t##r##0 = _mm512_fmadd_ps(v, y0, t##r##0);                                       \
+        t##r##1 = _mm512_fmadd_ps(v, y1, t##r##1);
+        GSF_ROWS(GSF_X)
+#undef GSF_X
+    }
+#define GSF_X(r)                                           \
+    sums[2 * r] += gsf__nn_sum16(s##r##0 + t##r##0);       \
+    sums[2 * r + 1] += gsf__nn_sum16(s##r##1 + t##r##1);
+    GSF_ROWS(GSF_X)
+#undef GSF_X
+#undef GSF_ROWS
+}
+
+// Four rows of x, as [k / 16][4][16], times six rows of weights, added to sums[6][4]. What lies `ahead` bytes on is asked for.
+GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t count,
+                                       float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
     const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 64 : 32; // weights; bytes
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
@@ -2809,79 +2842,86 @@ GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtyp
     GSF_ROWS(GSF_X)
 #undef GSF_X
     for (int64_t at = 0; count > 0; count -= line) {
-#define GSF_X(r) _mm_prefetch(w##r + at + ahead, _MM_HINT_T1);
+#define GSF_X(r) _mm_prefetch(w##r + at + ahead, _MM_HINT_T0);
         GSF_ROWS(GSF_X)
 #undef GSF_X
-        for (int64_t i = 0; i < line; i += 16, at += vector, x += 16 * rows) {
+        for (int64_t i = 0; i < line; i += 16, at += vector, x += 64) {
             const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16);
-            const __m512 x2 = rows > 2 ? _mm512_load_ps(x + 32) : x0, x3 = rows > 2 ? _mm512_load_ps(x + 48) : x0;
+            const __m512 x2 = _mm512_load_ps(x + 32), x3 = _mm512_load_ps(x + 48);
             __m512 v;
-#define GSF_X(r)                                                     \
-            v = gsf__load16(w##r + at, dtype);                       \
-            s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);               \
-            s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);               \
-            if (rows > 2) s##r##2 = _mm512_fmadd_ps(v, x2, s##r##2); \
-            if (rows > 2) s##r##3 = _mm512_fmadd_ps(v, x3, s##r##3);
+#define GSF_X(r)                                           \
+            v = gsf__load16(w##r + at, dtype);             \
+            s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);     \
+            s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);     \
+            s##r##2 = _mm512_fmadd_ps(v, x2, s##r##2);     \
+            s##r##3 = _mm512_fmadd_ps(v, x3, s##r##3);
             GSF_ROWS(GSF_X)
 #undef GSF_X
         }
     }
-#define GSF_X(r)                                                     \
-    sums[r * rows] += gsf__nn_sum16(s##r##0);                        \
-    sums[r * rows + 1] += gsf__nn_sum16(s##r##1);                    \
-    if (rows > 2) sums[r * rows + 2] += gsf__nn_sum16(s##r##2);      \
-    if (rows > 2) sums[r * rows + 3] += gsf__nn_sum16(s##r##3);
+#define GSF_X(r)                                  \
+    sums[4 * r] += gsf__nn_sum16(s##r##0);        \
+    sums[4 * r + 1] += gsf__nn_sum16(s##r##1);    \
+    sums[4 * r + 2] += gsf__nn_sum16(s##r##2);    \
+    sums[4 * r + 3] += gsf__nn_sum16(s##r##3);
     GSF_ROWS(GSF_X)
 #undef GSF_X
 #undef GSF_ROWS
 }
 
-// `count` weights from k on of all columns; added to the sums. x stays in the first level cache meanwhile.
+// Weights are read fastest as long streams: the columns are cut into as many parts as are taken at once, and each part is
+// read from end to end. Only where x, far larger than the weights beside it, would not stay in the first level cache
+// (four rows and 16 bits) is it gone through in steps, with neighbours at once and the next ones asked for.
 GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
-                                   int64_t column, int64_t columns, int64_t k, int64_t count, float* sums, int64_t pitch) {
-    const size_t bytes = (size_t)job->in * size;
-    const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes + (size_t)k * size;
-    const float* x = job->few + k * rows;
-    const int64_t whole = count / GSF__FEW_PAD * GSF__FEW_PAD;
-    const size_t left = (size_t)(count - whole) * size;
-    const char* w[6];
+                                   int64_t column, int64_t columns, float* sums, int64_t pitch) {
+    const int64_t taken = rows == 1 ? 1 : rows == 2 ? 4 : 6, turns = gsf__ceil_div(columns, taken);
+    const int streams = rows <= 2 || size == 4;
+    const int64_t apart = streams ? turns : 1, next = streams ? 1 : taken, step = streams ? job->in : (int64_t)GSF__FEW_STEP;
+    const size_t bytes = (size_t)job->in * size, ahead = streams ? (size_t)GSF__FEW_AHEAD : (size_t)taken * bytes;
+    const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
     char tails[6][4 * GSF__FEW_PAD];
     memset(tails, 0, sizeof tails);
-    for (int64_t c = 0; c < columns; c += 6) {
-        float tile[6 * GSF__FEW_ROWS]; // [weights][x]
-        memset(tile, 0, sizeof tile);
-        for (int64_t r = 0; r < 6; r++) w[r] = first + (size_t)gsf__least(c + r, columns - 1) * bytes;
-        if (rows > 1) gsf__few_six16(w, dtype, 6 * bytes, x, rows, whole, tile);
-        for (int64_t r = 0; rows == 1 && r < gsf__least(6, columns - c); r++)
-            tile[r] = gsf__few_one16(w[r], dtype, x, whole);
-        for (int64_t r = 0; left > 0 && r < 6; r++) {
-            memcpy(tails[r], w[r] + (size_t)whole * size, left);
-            w[r] = tails[r];
-            if (rows == 1) tile[r] += gsf__few_one16(w[r], dtype, x + whole, GSF__FEW_PAD);
+    for (int64_t m = 0; m < job->desc.rows; m++) memset(sums + m * pitch, 0, (size_t)columns * sizeof(float));
+    for (int64_t k = 0; k < job->in; k += step) {
+        const int64_t count = gsf__least(step, job->in - k), whole = count / GSF__FEW_PAD * GSF__FEW_PAD;
+        const size_t left = (size_t)(count - whole) * size;
+        for (int64_t turn = 0; turn < turns; turn++) {
+            float tile[6 * GSF__FEW_ROWS]; // [weights][x]
+            const char* w[6];
+            memset(tile, 0, sizeof tile);
+            for (int64_t r = 0; r < taken; r++)
+                w[r] = first + (size_t)gsf__least(turn * next + r * apart, columns - 1) * bytes + (size_t)k * size;
+            for (int part = 0; part < (left ? 2 : 1); part++) { // the second: what is left, and zeros
+                const float* x = job->few + (k + part * whole) * rows;
+                const int64_t n = part ? (int64_t)GSF__FEW_PAD : whole;
+                for (int64_t r = 0; part && r < taken; r++) {
+                    memcpy(tails[r], w[r] + (size_t)whole * size, left);
+                    w[r] = tails[r];
+                }
+                if (rows == 1) tile[0] += gsf__few_one16(w[0], dtype, x, n);
+                else if (rows == 2) gsf__few_two16(w, dtype, x, n, tile);
+                else gsf__few_six16(w, dtype, ahead, x, n, tile);
+            }
+            for (int64_t r = 0; r < taken && turn * next + r * apart < columns; r++)
+                for (int64_t m = 0; m < job->desc.rows; m++)
+                    sums[m * pitch + turn * next + r * apart] += tile[r * rows + m];
         }
-        if (left > 0 && rows > 1) gsf__few_six16(w, dtype, 0, x + whole * rows, rows, GSF__FEW_PAD, tile);
-        for (int64_t r = 0; r < gsf__least(6, columns - c); r++)
-            for (int64_t m = 0; m < job->desc.rows; m++) sums[m * pitch + c + r] += tile[r * rows + m];
     }
 }
 
 GSF__TARGET_AVX512 static void gsf__few_avx512(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
                                                int64_t pitch) {
-    const int64_t rows = gsf__few_rows(job->desc.rows), step = rows == 1 ? job->in : (int64_t)GSF__FEW_STEP;
-    for (int64_t m = 0; m < job->desc.rows; m++) memset(sums + m * pitch, 0, (size_t)columns * sizeof(float));
-    for (int64_t k = 0; k < job->in; k += step) {
-        const int64_t n = gsf__least(job->in - k, step);
-#define GSF_X(dtype, size)                                                                            \
-        if (rows == 1) gsf__few16(job, dtype, size, 1, column, columns, k, n, sums, pitch);           \
-        else if (rows == 2) gsf__few16(job, dtype, size, 2, column, columns, k, n, sums, pitch);      \
-        else gsf__few16(job, dtype, size, GSF__FEW_ROWS, column, columns, k, n, sums, pitch);
-        switch (job->desc.weight->dtype) {
-            case GSF_NN_F32: GSF_X(GSF_NN_F32, 4) break;
-            case GSF_NN_BF16: GSF_X(GSF_NN_BF16, 2) break;
-            default: GSF_X(GSF_NN_F16, 2) break;
-        }
-#undef GSF_X
+    const int64_t rows = gsf__few_rows(job->desc.rows);
+#define GSF_X(dtype, size)                                                                 \
+    if (rows == 1) gsf__few16(job, dtype, size, 1, column, columns, sums, pitch);          \
+    else if (rows == 2) gsf__few16(job, dtype, size, 2, column, columns, sums, pitch);     \
+    else gsf__few16(job, dtype, size, GSF__FEW_ROWS, column, columns, sums, pitch);
+    switch (job->desc.weight->dtype) {
+        case GSF_NN_F32: GSF_X(GSF_NN_F32, 4) break;
+        case GSF_NN_BF16: GSF_X(GSF_NN_BF16, 2) break;
+        default: GSF_X(GSF_NN_F16, 2) break;
     }
+#undef GSF_X
 }
 
 static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
@@ -3585,9 +3625,9 @@ GSF__INLINE_VNNI void gsf__int8_few_rows(const uint8_t* x, int64_t rows, const i
 #define GSF_EVEN(r) if (rows > r) even##r = _mm512_dpbusd_epi32(even##r, gsf__int8_four(x + 4 * (r)), v);
 #define GSF_ODD(r) if (rows > r) odd##r = _mm512_dpbusd_epi32(odd##r, gsf__int8_four(x + 4 * (rows + (r))), v);
     for (; count >= 8; count -= 8, x += 8 * rows, w += 8 * GSF__TILE_COLUMNS) {
-        if (rows > 2) { // for fewer the processor itself is soon enough
-            _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T1);
-            _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD + 64, _MM_HINT_T1);
+        if (rows > 1) { // for one the processor itself is soon enough
+            _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T0);
+            _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD + 64, _MM_HINT_T0);
         }
         v = _mm512_loadu_si512(w);
         GSF_ROWS(GSF_EVEN)
