@@ -4988,7 +4988,7 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 // Channels-last, a convolution of 3 x 3 (x 3) is 3 (9) matrix products: the 3C values left of, at and right of a pixel lie
 // together, so for each kernel row (kt, ky) a row of output pixels is A (pixels, 3C), whose rows overlap by 2C, times
 // B (3C, outputs). Frames get a column of zeros at either side for that; rows above and below the frame are skipped.
-// Work is cut into segments of 4 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
+// Work is cut into segments of 8 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
 // packed as (kernel row, 3C, 16), cut into panels of up to 256 values x 16 (16 KiB, first level cache), and each panel is
 // multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers. Sums of panels are added up one by one, so
 // that rounding errors grow with 256 + the number of panels, not with their product.
@@ -4996,7 +4996,8 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 enum {
     GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
     GSF__CONV_M10 = 10,                                   // pixels of a product with two panels
-    GSF__CONV_ROWS = 4, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of both
+    GSF__CONV_ROWS = 8, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of both
+    GSF__CONV_SHARE = GSF__CONV_N / GSF__CONV_ROWS,       // floats of the next panel to fetch a step
     GSF__CONV_TAPS = 27,
 };
 
@@ -5004,8 +5005,8 @@ typedef struct gsf__conv_kernels {
     // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last rows
     // repeat the last pixel.
     void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c);
-    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart; or NULL. Meanwhile fetches 4k floats
-    // from `ahead` on, and as many of the second panel.
+    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart; or NULL. Meanwhile fetches
+    // GSF__CONV_SHARE k floats from `ahead` on, and as many of the second panel.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
                          int64_t c_next, const float* ahead);
     // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and their squares.
@@ -5088,37 +5089,46 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
     }
 }
 
-// Ten pixels by two panels: 20 registers of sums. A missing pixel reads the last one's values.
+// Ten pixels by two panels: 20 registers of sums. There are none for ten pointers, so three reach all pixels. The last ten
+// of a row may overlap others, whose sums are left alone.
 GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int64_t lda, int64_t count, const float* b,
                                                              int64_t b_next, int64_t k, float* c, int64_t c_next,
                                                              const float* ahead) {
-#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5) X(6) X(7) X(8) X(9)
-    for (int64_t m = 0; m < count; m += GSF__CONV_M10, a += GSF__CONV_M10 * lda, c += GSF__CONV_M10 * GSF__CONV_N) {
-        const int64_t last = count - m - 1, share = m == 0 ? 4 : 0;
+#define GSF_ROWS(X)                                                                   \
+    X(0, a0, 0) X(1, a1, 0) X(2, a1, 1) X(3, a1, 2) X(4, a0, 4) X(5, a1, 4)           \
+    X(6, a5, 1) X(7, a5, 2) X(8, a0, 8) X(9, a1, 8)
+    const int64_t pitch = lda * (int64_t)sizeof(float);
+    if (count < GSF__CONV_M10) {
+        gsf__conv_multiply_avx2(a, lda, count, b, k, c);
+        gsf__conv_multiply_avx2(a, lda, count, b + b_next, k, c + c_next);
+        return;
+    }
+    for (int64_t m = 0; m < count; m += GSF__CONV_M10) {
+        const int64_t done = m + GSF__CONV_M10 > count ? m + GSF__CONV_M10 - count : 0, share = m == 0 ? GSF__CONV_SHARE : 0;
+        const char *a0 = (const char*)(a + (m - done) * lda), *a1 = a0 + pitch, *a5 = a0 + 5 * pitch;
         const float* w = b;
-#define GSF_X(r) const float* a##r = a + (last < r ? last : r) * lda;
+#define GSF_X(r, base, times) __m512 c##r = _mm512_setzero_ps(), d##r = c##r;
         GSF_ROWS(GSF_X)
 #undef GSF_X
-#define GSF_X(r) __m512 c##r = _mm512_setzero_ps(), d##r = c##r;
-        GSF_ROWS(GSF_X)
-#undef GSF_X
-        for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
+        for (int64_t i = 0; i < k; i++, w += GSF__CONV_N, a0 += 4, a1 += 4, a5 += 4) {
             const __m512 w0 = _mm512_loadu_ps(w), w1 = _mm512_loadu_ps(w + b_next);
             __m512 v;
             _mm_prefetch((const char*)ahead, _MM_HINT_T1);
             _mm_prefetch((const char*)(ahead + b_next), _MM_HINT_T1);
             ahead += share;
-#define GSF_X(r)                                     \
-            v = _mm512_set1_ps(a##r[i]);             \
-            c##r = _mm512_fmadd_ps(v, w0, c##r);     \
+#define GSF_X(r, base, times)                                                             \
+            v = _mm512_set1_ps(*(const float*)(const void*)(base + times * pitch));       \
+            c##r = _mm512_fmadd_ps(v, w0, c##r);                                          \
             d##r = _mm512_fmadd_ps(v, w1, d##r);
             GSF_ROWS(GSF_X)
 #undef GSF_X
         }
-        float* next = c + c_next;
-#define GSF_X(r)                                                                                                        \
-        _mm512_storeu_ps(c + (r) * GSF__CONV_N, _mm512_loadu_ps(c + (r) * GSF__CONV_N) + c##r);                         \
-        _mm512_storeu_ps(next + (r) * GSF__CONV_N, _mm512_loadu_ps(next + (r) * GSF__CONV_N) + d##r);
+        float *to = c + (m - done) * GSF__CONV_N, *next = to + c_next;
+#define GSF_X(r, base, times)                                                                              \
+        if (r >= done) {                                                                                   \
+            _mm512_storeu_ps(to + r * GSF__CONV_N, _mm512_loadu_ps(to + r * GSF__CONV_N) + c##r);          \
+            _mm512_storeu_ps(next + r * GSF__CONV_N, _mm512_loadu_ps(next + r * GSF__CONV_N) + d##r);      \
+        }
         GSF_ROWS(GSF_X)
 #undef GSF_X
     }
@@ -5315,7 +5325,7 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
                     if (panels == 2) // each row fetches a fourth of the next values of the panels
                         job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE,
-                                                   b + k * GSF__CONV_N + r * 4 * k);
+                                                   b + k * GSF__CONV_N + r * GSF__CONV_SHARE * k);
                     else job->kernels->multiply(a, job->step, columns, b, k, c);
                 }
                 b += k * GSF__CONV_N;
