@@ -2307,8 +2307,9 @@ enum {
     GSF__FEW_COLUMNS = 1008,          // nor of more outputs; both a multiple of 6 and 16
     GSF__FEW_UNIT = 48,
     GSF__FEW_PAD = 32,                // values of x are padded to a multiple of this
-    GSF__FEW_AHEAD = 2048,            // AVX-512: bytes ahead that each row of weights is asked for;
-    GSF__FEW_STEP = 1024              // so many values of several rows of x are gone through at a time
+    GSF__FEW_AHEAD = 1280,            // AVX-512: bytes ahead that each row of weights is asked for,
+    GSF__FEW_AHEAD16 = 2048,          // where they have 16 bits;
+    GSF__FEW_STEP = 1024              // so many values of four rows of x are gone through at a time
 };
 
 #ifndef GSF__LINEAR_PACKED // a test makes it small
@@ -2800,8 +2801,9 @@ GSF__INLINE_AVX512 float gsf__few_one16(const char* w, gsf_nn_dtype dtype, const
 }
 
 // Two rows of x, laid out as [k / 16][2][16], times four rows of weights, added to sums[4][2]. `count` is a multiple of 32.
-// The more there is to multiply, the less far ahead the processor looks by itself: what lies GSF__FEW_AHEAD on is asked for.
-GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtype, const float* x, int64_t count, float* sums) {
+// The more there is to multiply, the less far ahead the processor looks by itself: what lies `ahead` bytes on is asked for.
+GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t count,
+                                       float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3];
     const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3)
@@ -2812,14 +2814,14 @@ GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtyp
         const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16);
         const __m512 y0 = _mm512_load_ps(x + 32), y1 = _mm512_load_ps(x + 48);
         __m512 v;
-#define GSF_X(r)                                                                         \
-        _mm_prefetch(w##r + at + GSF__FEW_AHEAD, _MM_HINT_T0);                           \
-        v = gsf__load16(w##r + at, dtype);                                               \
-        s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);                                       \
-        s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);                                       \
-        if (vector == 64) _mm_prefetch(w##r + at + GSF__FEW_AHEAD + 64, _MM_HINT_T0);    \
-        v = gsf__load16(w##r + at + vector, dtype);                                      \
-        t##r##0 = _mm512_fmadd_ps(v, y0, t##r##0);                                       \
+#define GSF_X(r)                                                                \
+        _mm_prefetch(w##r + at + ahead, _MM_HINT_T0);                           \
+        v = gsf__load16(w##r + at, dtype);                                      \
+        s##r##0 = _mm512_fmadd_ps(v, x0, s##r##0);                              \
+        s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);                              \
+        if (vector == 64) _mm_prefetch(w##r + at + ahead + 64, _MM_HINT_T0);    \
+        v = gsf__load16(w##r + at + vector, dtype);                             \
+        t##r##0 = _mm512_fmadd_ps(v, y0, t##r##0);                              \
         t##r##1 = _mm512_fmadd_ps(v, y1, t##r##1);
         GSF_ROWS(GSF_X)
 #undef GSF_X
@@ -2877,7 +2879,8 @@ GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtyp
     const int64_t taken = rows == 1 ? 1 : rows == 2 ? 4 : 6, turns = gsf__ceil_div(columns, taken);
     const int streams = rows <= 2 || size == 4;
     const int64_t apart = streams ? turns : 1, next = streams ? 1 : taken, step = streams ? job->in : (int64_t)GSF__FEW_STEP;
-    const size_t bytes = (size_t)job->in * size, ahead = streams ? (size_t)GSF__FEW_AHEAD : (size_t)taken * bytes;
+    const size_t bytes = (size_t)job->in * size;
+    const size_t ahead = !streams ? (size_t)taken * bytes : size == 4 ? (size_t)GSF__FEW_AHEAD : (size_t)GSF__FEW_AHEAD16;
     const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
     char tails[6][4 * GSF__FEW_PAD];
     memset(tails, 0, sizeof tails);
@@ -2899,7 +2902,7 @@ GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtyp
                     w[r] = tails[r];
                 }
                 if (rows == 1) tile[0] += gsf__few_one16(w[0], dtype, x, n);
-                else if (rows == 2) gsf__few_two16(w, dtype, x, n, tile);
+                else if (rows == 2) gsf__few_two16(w, dtype, ahead, x, n, tile);
                 else gsf__few_six16(w, dtype, ahead, x, n, tile);
             }
             for (int64_t r = 0; r < taken && turn * next + r * apart < columns; r++)
