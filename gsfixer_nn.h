@@ -5006,10 +5006,9 @@ enum {
 
 typedef struct gsf__conv_kernels {
     // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last rows
-    // repeat the last pixel.
-    void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c);
-    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart; or NULL. Meanwhile fetches
-    // GSF__CONV_SHARE k floats from `ahead` on, and as many of the second panel.
+    // repeat the last pixel. Meanwhile fetches GSF__CONV_SHARE k floats from `ahead` on.
+    void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
+    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart; or NULL.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
                          int64_t c_next, const float* ahead);
     // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and their squares.
@@ -5018,7 +5017,9 @@ typedef struct gsf__conv_kernels {
     void (*norm_silu)(const float* x, int64_t count, const float* mean, const float* scale, const float* offset, float* y);
 } gsf__conv_kernels;
 
-static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c) {
+static void gsf__conv_multiply_ref(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c,
+                                   const float* ahead) {
+    (void)ahead;
     for (int64_t m = 0; m < count; m++)
         for (int n0 = 0; n0 < GSF__CONV_N; n0 += 4) {
             const float* w = b + n0;
@@ -5054,9 +5055,9 @@ GSF__INLINE_AVX2 void gsf__conv_add8(float* c, __m256 v) { _mm256_storeu_ps(c, _
 
 // Six pixels at a time; a missing one reads the last one's values.
 GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda, int64_t count, const float* b, int64_t k,
-                                                     float* c) {
+                                                     float* c, const float* ahead) {
     for (int64_t m = 0; m < count; m += GSF__CONV_M, a += GSF__CONV_M * lda, c += GSF__CONV_M * GSF__CONV_N) {
-        const int64_t last = count - m - 1;
+        const int64_t last = count - m - 1, share = m == 0 ? GSF__CONV_SHARE : 0;
         const float *a0 = a, *a1 = a + (last < 1 ? last : 1) * lda, *a2 = a + (last < 2 ? last : 2) * lda,
                     *a3 = a + (last < 3 ? last : 3) * lda, *a4 = a + (last < 4 ? last : 4) * lda,
                     *a5 = a + (last < 5 ? last : 5) * lda, *w = b;
@@ -5064,6 +5065,8 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
                c40 = c00, c41 = c00, c50 = c00, c51 = c00;
         for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
             const __m256 w0 = _mm256_loadu_ps(w), w1 = _mm256_loadu_ps(w + 8);
+            _mm_prefetch((const char*)ahead, _MM_HINT_T1);
+            ahead += share;
             __m256 v = _mm256_broadcast_ss(a0 + i);
             c00 = _mm256_fmadd_ps(v, w0, c00);
             c01 = _mm256_fmadd_ps(v, w1, c01);
@@ -5102,8 +5105,8 @@ GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int
     X(6, a5, 1) X(7, a5, 2) X(8, a0, 8) X(9, a1, 8)
     const int64_t pitch = lda * (int64_t)sizeof(float);
     if (count < GSF__CONV_M10) {
-        gsf__conv_multiply_avx2(a, lda, count, b, k, c);
-        gsf__conv_multiply_avx2(a, lda, count, b + b_next, k, c + c_next);
+        gsf__conv_multiply_avx2(a, lda, count, b, k, c, ahead);
+        gsf__conv_multiply_avx2(a, lda, count, b + b_next, k, c + c_next, ahead + b_next);
         return;
     }
     for (int64_t m = 0; m < count; m += GSF__CONV_M10) {
@@ -5325,11 +5328,11 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
                     const int64_t y = (y0 + r) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
                     const float* a = job->in[kt] + y * job->in_stride + job->origin + x0 * job->step + k0;
+                    const float* ahead = b + (GSF__CONV_N + r * GSF__CONV_SHARE) * k; // the rows share what comes next
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
-                    if (panels == 2) // each row fetches a fourth of the next values of the panels
-                        job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE,
-                                                   b + k * GSF__CONV_N + r * GSF__CONV_SHARE * k);
-                    else job->kernels->multiply(a, job->step, columns, b, k, c);
+                    if (panels == 2)
+                        job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE, ahead);
+                    else job->kernels->multiply(a, job->step, columns, b, k, c, ahead);
                 }
                 b += k * GSF__CONV_N;
             }
