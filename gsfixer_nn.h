@@ -4999,7 +4999,7 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
 enum {
     GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
     GSF__CONV_M10 = 10,                                   // pixels of a product with two panels
-    GSF__CONV_ROWS = 8, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of both
+    GSF__CONV_ROWS = 8, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of M
     GSF__CONV_SHARE = GSF__CONV_N / GSF__CONV_ROWS,       // floats of the next panel to fetch a step
     GSF__CONV_TAPS = 27,
 };
