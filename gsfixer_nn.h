@@ -176,8 +176,8 @@ typedef struct gsf_nn_attention_desc {
 GSF_API GSF_NODISCARD gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace,
                                                   const gsf_nn_attention_desc* desc);
 
-// Normalisations over the last dimension of (rows, dim); y may be x; weight, bias (dim) or NULL. Variances are biased
-// and two-pass.
+// Normalisations over the last dimension of (rows, dim); y may be x; weight, bias (dim) or NULL. Variances are biased,
+// sums are in double.
 GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
                                const float* bias, float eps, float* y);
 GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight, float eps,
@@ -1872,6 +1872,13 @@ GSF__INLINE_AVX512 __mmask16 gsf__nn_mask16(int64_t left) { // lanes below `left
     return (__mmask16)(left < 16 ? (1u << left) - 1u : 0xffffu);
 }
 
+enum { GSF__NN_WHOLE16 = 0xffff }; // every lane
+
+GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { // a masked store takes several times as long
+    if (mask == GSF__NN_WHOLE16) _mm512_storeu_ps(y, v);
+    else _mm512_mask_storeu_ps(y, mask, v);
+}
+
 GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
 
 GSF__INLINE_AVX512 float gsf__nn_sum16(__m512 v) { return gsf__nn_sum8(gsf__nn_fold16(v)); }
@@ -2019,12 +2026,20 @@ GSF__INLINE_AVX512 __m512 gsf__nn_activate16(gsf_nn_activation activation, __m51
 
 #endif // GSF__X86
 
+// Results that no cache can hold bypass them all (`stream`): lines that are written whole need not be read before.
+enum { GSF__NN_STREAM = 1 << 23 }; // values
+
+static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_t row) { // pieces are multiples of `row`
+    return x != y && count >= GSF__NN_STREAM && row % 16 == 0 && (uintptr_t)y % 64 == 0;
+}
+
 typedef struct gsf__activation_kernels { // y may be x in both
-    void (*activate)(gsf_nn_activation activation, const float* x, int64_t count, float* y);
+    void (*activate)(gsf_nn_activation activation, const float* x, int64_t count, float* y, int stream);
     void (*softmax)(const float* x, int64_t count, float scale, float* y);
 } gsf__activation_kernels;
 
-static void gsf__activate_scalar(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+static void gsf__activate_scalar(gsf_nn_activation activation, const float* x, int64_t count, float* y, int stream) {
+    (void)stream;
     for (int64_t i = 0; i < count; i++) y[i] = gsf__nn_activation_ref(activation, x[i]);
 }
 
@@ -2040,22 +2055,43 @@ static void gsf__softmax_scalar(const float* x, int64_t count, float scale, floa
 
 #if GSF__X86
 
-GSF__INLINE_AVX2 void gsf__activate_avx2_body(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+static void gsf__nn_end_stream(int stream) { // before other threads may read what was written
+    if (stream) _mm_sfence();
+}
+
+GSF__INLINE_AVX2 void gsf__nn_put8(float* y, __m256 v, int stream) {
+    if (stream) _mm256_stream_ps(y, v);
+    else _mm256_storeu_ps(y, v);
+}
+
+GSF__INLINE_AVX2 void gsf__activate_avx2_body(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+                                              int stream) {
     int64_t i = 0;
-    for (; i + 8 <= count; i += 8) _mm256_storeu_ps(y + i, gsf__nn_activate8(activation, _mm256_loadu_ps(x + i)));
+    for (; i + 8 <= count; i += 8) gsf__nn_put8(y + i, gsf__nn_activate8(activation, _mm256_loadu_ps(x + i)), stream);
     if (i == count) return;
     const __m256i mask = gsf__nn_mask8(count - i);
     _mm256_maskstore_ps(y + i, mask, gsf__nn_activate8(activation, _mm256_maskload_ps(x + i, mask)));
 }
 
-GSF__TARGET_AVX2 static void gsf__activate_avx2(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
-    switch (activation) {
-        case GSF_NN_LINEAR: gsf__activate_avx2_body(GSF_NN_LINEAR, x, count, y); break;
-        case GSF_NN_GELU_TANH: gsf__activate_avx2_body(GSF_NN_GELU_TANH, x, count, y); break;
-        case GSF_NN_SILU: gsf__activate_avx2_body(GSF_NN_SILU, x, count, y); break;
-        case GSF_NN_GELU: gsf__activate_avx2_body(GSF_NN_GELU, x, count, y); break;
-        case GSF_NN_RELU: gsf__activate_avx2_body(GSF_NN_RELU, x, count, y); break;
-    }
+#define GSF__ACTIVATE(body, kind)                     \
+    case kind:                                        \
+        if (stream) body(kind, x, count, y, 1);       \
+        else body(kind, x, count, y, 0);              \
+        break;
+
+#define GSF__ACTIVATE_ANY(body)                       \
+    switch (activation) {                             \
+        GSF__ACTIVATE(body, GSF_NN_LINEAR)            \
+        GSF__ACTIVATE(body, GSF_NN_GELU_TANH)         \
+        GSF__ACTIVATE(body, GSF_NN_SILU)              \
+        GSF__ACTIVATE(body, GSF_NN_GELU)              \
+        GSF__ACTIVATE(body, GSF_NN_RELU)              \
+    }                                                 \
+    gsf__nn_end_stream(stream);
+
+GSF__TARGET_AVX2 static void gsf__activate_avx2(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+                                                int stream) {
+    GSF__ACTIVATE_ANY(gsf__activate_avx2_body)
 }
 
 // The largest factor * x[i], at least -FLT_MAX; NaNs are passed over.
@@ -2103,50 +2139,49 @@ GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, fl
     if (i < count) _mm256_maskstore_ps(y + i, mask, inverse * _mm256_maskload_ps(y + i, mask));
 }
 
-GSF__INLINE_AVX512 void gsf__activate_avx512_body(gsf_nn_activation activation, const float* x, int64_t count, float* y) {
-    for (int64_t i = 0; i < count; i += 16) {
-        const __mmask16 mask = gsf__nn_mask16(count - i);
-        _mm512_mask_storeu_ps(y + i, mask, gsf__nn_activate16(activation, _mm512_maskz_loadu_ps(mask, x + i)));
-    }
+GSF__INLINE_AVX512 void gsf__nn_put16(float* y, __m512 v, int stream) {
+    if (stream) _mm512_stream_ps(y, v);
+    else _mm512_storeu_ps(y, v);
 }
 
-GSF__TARGET_AVX512 static void gsf__activate_avx512(gsf_nn_activation activation, const float* x, int64_t count,
-                                                    float* y) {
-    switch (activation) {
-        case GSF_NN_LINEAR: gsf__activate_avx512_body(GSF_NN_LINEAR, x, count, y); break;
-        case GSF_NN_GELU_TANH: gsf__activate_avx512_body(GSF_NN_GELU_TANH, x, count, y); break;
-        case GSF_NN_SILU: gsf__activate_avx512_body(GSF_NN_SILU, x, count, y); break;
-        case GSF_NN_GELU: gsf__activate_avx512_body(GSF_NN_GELU, x, count, y); break;
-        case GSF_NN_RELU: gsf__activate_avx512_body(GSF_NN_RELU, x, count, y); break;
-    }
+GSF__INLINE_AVX512 void gsf__activate_avx512_body(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+                                                  int stream) {
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16) gsf__nn_put16(y + i, gsf__nn_activate16(activation, _mm512_loadu_ps(x + i)), stream);
+    if (i == count) return;
+    const __mmask16 mask = gsf__nn_mask16(count - i);
+    _mm512_mask_storeu_ps(y + i, mask, gsf__nn_activate16(activation, _mm512_maskz_loadu_ps(mask, x + i)));
+}
+
+GSF__TARGET_AVX512 static void gsf__activate_avx512(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+                                                    int stream) {
+    GSF__ACTIVATE_ANY(gsf__activate_avx512_body)
 }
 
 GSF__TARGET_AVX512 static void gsf__softmax_avx512(const float* x, int64_t count, float scale, float* y) {
     const float factor = scale * 1.44269504f; // powers of 2 instead of e
     const __m512 f = _mm512_set1_ps(factor), lowest = _mm512_set1_ps(-FLT_MAX);
-    __m512 top = lowest;
-    double sum = 0.0;
-    for (int64_t i = 0; i < count; i += 16) { // max returns its second operand where the first is NaN
-        const __mmask16 mask = gsf__nn_mask16(count - i);
-        top = _mm512_mask_max_ps(top, mask, f * _mm512_maskz_loadu_ps(mask, x + i), top);
-    }
+    const int64_t whole = count / 16 * 16;
+    const __mmask16 mask = gsf__nn_mask16(count - whole); // of the rest
+    const __m512 rest = _mm512_maskz_loadu_ps(mask, x + whole);
+    __m512 top = _mm512_mask_max_ps(lowest, mask, f * rest, lowest); // the second operand where the first is NaN
+    for (int64_t i = 0; i < whole; i += 16) top = _mm512_max_ps(f * _mm512_loadu_ps(x + i), top);
     const __m512 t = _mm512_set1_ps(gsf__nn_max16(top));
-    for (int64_t first = 0; first < count; first += 1024) { // float sums of short stretches
-        const int64_t end = gsf__least(first + 1024, count);
+    const __m512 last = _mm512_maskz_mov_ps(mask, gsf__nn_exp2_low16(_mm512_fmsub_ps(rest, f, t)));
+    double sum = (double)gsf__nn_sum16(last);
+    for (int64_t first = 0; first < whole; first += 1024) { // float sums of short stretches
+        const int64_t end = gsf__least(first + 1024, whole);
         __m512 part = _mm512_setzero_ps();
         for (int64_t i = first; i < end; i += 16) {
-            const __mmask16 mask = gsf__nn_mask16(end - i);
-            const __m512 p = gsf__nn_exp2_low16(_mm512_fmsub_ps(_mm512_maskz_loadu_ps(mask, x + i), f, t));
-            _mm512_mask_storeu_ps(y + i, mask, p);
-            part = _mm512_mask_add_ps(part, mask, part, p);
+            const __m512 p = gsf__nn_exp2_low16(_mm512_fmsub_ps(_mm512_loadu_ps(x + i), f, t));
+            _mm512_storeu_ps(y + i, p);
+            part = part + p;
         }
         sum += (double)gsf__nn_sum16(part);
     }
     const __m512 inverse = _mm512_set1_ps((float)(1.0 / sum));
-    for (int64_t i = 0; i < count; i += 16) {
-        const __mmask16 mask = gsf__nn_mask16(count - i);
-        _mm512_mask_storeu_ps(y + i, mask, inverse * _mm512_maskz_loadu_ps(mask, y + i));
-    }
+    for (int64_t i = 0; i < whole; i += 16) _mm512_storeu_ps(y + i, inverse * _mm512_loadu_ps(y + i));
+    if (mask) _mm512_mask_storeu_ps(y + whole, mask, inverse * last);
 }
 
 #endif // GSF__X86
@@ -2234,6 +2269,7 @@ typedef struct gsf__activate_job {
     float* y;
     int64_t rows, columns, chunk_rows;
     float scale;
+    int stream;
 } gsf__activate_job;
 
 static void gsf__activate_chunk(void* arg, size_t chunk, int worker) {
@@ -2241,7 +2277,7 @@ static void gsf__activate_chunk(void* arg, size_t chunk, int worker) {
     (void)worker;
     const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK;
     job->kernels->activate(job->activation, job->x + begin, gsf__least(GSF__NN_CHUNK, job->columns - begin),
-                           job->y + begin);
+                           job->y + begin, job->stream);
 }
 
 GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, const float* x, int64_t count, float* y) {
@@ -2252,6 +2288,7 @@ GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, con
     job.x = x;
     job.y = y;
     job.columns = count;
+    job.stream = gsf__nn_streams(x, y, count, GSF__NN_CHUNK);
     gsf__parallel_for(ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__activate_chunk, &job);
 }
 
@@ -2759,21 +2796,25 @@ GSF__TARGET_AVX512 static void gsf__four_tiles_avx512(const float* a, const floa
     GSF__FOUR_TILES(gsf__nn_add_product)
 }
 
+GSF__INLINE_AVX512 void gsf__finish16(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
+                                      int64_t rows, int64_t column, __mmask16 mask) {
+    const gsf_nn_linear_desc* d = &job->desc;
+    const __m512 bias = _mm512_maskz_loadu_ps(mask, job->bias + column);
+    const __m512 gate = d->gate ? _mm512_maskz_loadu_ps(mask, d->gate + column) : _mm512_set1_ps(1.0f);
+    for (int64_t r = 0; r < rows; r++) {
+        float* y = d->y + (row + r) * d->ldy + column;
+        __m512 v = _mm512_maskz_loadu_ps(mask, sums + r * pitch) + bias;
+        v = gsf__nn_activate16(d->activation, v);
+        if (d->gate || d->accumulate) v = _mm512_fmadd_ps(gate, v, _mm512_maskz_loadu_ps(mask, y));
+        gsf__nn_store16(y, mask, v);
+    }
+}
+
 GSF__TARGET_AVX512 static void gsf__finish_avx512(const gsf__linear_job* job, const float* sums, int64_t pitch,
                                                   int64_t row, int64_t rows, int64_t column, int64_t columns) {
-    const gsf_nn_linear_desc* d = &job->desc;
-    for (int64_t c = 0; c < columns; c += 16) {
-        const __mmask16 mask = gsf__nn_mask16(columns - c);
-        const __m512 bias = _mm512_maskz_loadu_ps(mask, job->bias + column + c);
-        const __m512 gate = d->gate ? _mm512_maskz_loadu_ps(mask, d->gate + column + c) : _mm512_set1_ps(1.0f);
-        for (int64_t r = 0; r < rows; r++) {
-            float* y = d->y + (row + r) * d->ldy + column + c;
-            __m512 v = _mm512_maskz_loadu_ps(mask, sums + r * pitch + c) + bias;
-            v = gsf__nn_activate16(d->activation, v);
-            if (d->gate || d->accumulate) v = _mm512_fmadd_ps(gate, v, _mm512_maskz_loadu_ps(mask, y));
-            _mm512_mask_storeu_ps(y, mask, v);
-        }
-    }
+    int64_t c = 0;
+    for (; c + 16 <= columns; c += 16) gsf__finish16(job, sums + c, pitch, row, rows, column + c, GSF__NN_WHOLE16);
+    if (c < columns) gsf__finish16(job, sums + c, pitch, row, rows, column + c, gsf__nn_mask16(columns - c));
 }
 
 GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // sixteen weights, widened
@@ -3995,7 +4036,8 @@ typedef struct gsf__norm_kernels {
     void (*row)(const gsf__norm_job* job, const float* x, float* y);
     void (*head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin); // cos NULL: no rotation
     // y = weight (x - mean) inverse + bias; y may be x
-    void (*affine)(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias, float* y);
+    void (*affine)(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias, float* y,
+                   int stream);
 } gsf__norm_kernels;
 
 struct gsf__norm_job {
@@ -4003,11 +4045,12 @@ struct gsf__norm_job {
     const float *x, *weight, *bias, *scale, *shift, *cos, *sin;
     float* y;
     int64_t rows, dim, stride, chunk_rows, rope_first;
-    int64_t group_size, part_size, parts; // group norm: values of a group, of a part of it, parts of a group
+    int64_t group_size, part_size, parts, first_group; // group norm: values of a group, of a part of it, parts of a group
     gsf__moments* part_moments;
     int32_t heads;
     float eps;
     int centre; // 0: root mean square only
+    int stream;
 };
 
 static float gsf__norm_inverse(gsf__moments m, int64_t count, float eps) {
@@ -4046,48 +4089,47 @@ static void gsf__norm_head_scalar(const gsf__norm_job* job, float* x, const floa
 }
 
 static void gsf__norm_affine_scalar(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias,
-                                    float* y) {
+                                    float* y, int stream) {
+    (void)stream;
     for (int64_t i = 0; i < count; i++) y[i] = (float)((double)x[i] - m.mean) * inverse * weight + bias;
 }
 
 #if GSF__X86
 
-// Sums in double, so that neither a large mean nor a long row costs a digit; the arithmetic hides behind the memory.
+// One pass, in double. Values are taken relative to one of them, so (mean - pivot)^2 is at most `count` times the variance,
+// and subtracting it costs no more than log2(count) of the 53 bits.
+static gsf__moments gsf__moments_of(double pivot, double sum, double square, int64_t count, int centre) {
+    gsf__moments m = {0.0, square};
+    if (!centre) return m;
+    m.mean = pivot + sum / (double)count;
+    m.square = square - sum * sum / (double)count;
+    if (m.square < 0.0) m.square = 0.0;
+    return m;
+}
+
 GSF__INLINE_AVX2 gsf__moments gsf__moments_avx2_body(const float* x, int64_t count, int centre) {
-    gsf__moments m = {0.0, 0.0};
-    __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0;
+    const double pivot = centre ? (double)x[0] : 0.0;
+    const __m256d p = _mm256_set1_pd(pivot);
+    __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0, q0 = s0, q1 = s0, q2 = s0, q3 = s0;
     int64_t i = 0;
-    if (centre) {
-        for (; i + 16 <= count; i += 16) {
-            s0 = s0 + _mm256_cvtps_pd(_mm_loadu_ps(x + i));
-            s1 = s1 + _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4));
-            s2 = s2 + _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8));
-            s3 = s3 + _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12));
-        }
-        for (; i + 4 <= count; i += 4) s0 = s0 + _mm256_cvtps_pd(_mm_loadu_ps(x + i));
-        m.mean = gsf__nn_sum4((s0 + s1) + (s2 + s3));
-        for (; i < count; i++) m.mean += (double)x[i];
-        m.mean /= (double)count;
-    }
-    const __m256d mean = _mm256_set1_pd(m.mean);
-    s0 = s1 = s2 = s3 = _mm256_setzero_pd();
-    for (i = 0; i + 16 <= count; i += 16) {
-        const __m256d d0 = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - mean;
-        const __m256d d1 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4)) - mean;
-        const __m256d d2 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8)) - mean;
-        const __m256d d3 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12)) - mean;
-        s0 = _mm256_fmadd_pd(d0, d0, s0);
-        s1 = _mm256_fmadd_pd(d1, d1, s1);
-        s2 = _mm256_fmadd_pd(d2, d2, s2);
-        s3 = _mm256_fmadd_pd(d3, d3, s3);
+    for (; i + 16 <= count; i += 16) {
+        const __m256d d0 = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p, d1 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4)) - p;
+        const __m256d d2 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8)) - p, d3 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12)) - p;
+        s0 = s0 + d0, s1 = s1 + d1, s2 = s2 + d2, s3 = s3 + d3;
+        q0 = _mm256_fmadd_pd(d0, d0, q0), q1 = _mm256_fmadd_pd(d1, d1, q1);
+        q2 = _mm256_fmadd_pd(d2, d2, q2), q3 = _mm256_fmadd_pd(d3, d3, q3);
     }
     for (; i + 4 <= count; i += 4) {
-        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - mean;
-        s0 = _mm256_fmadd_pd(d, d, s0);
+        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p;
+        s0 = s0 + d, q0 = _mm256_fmadd_pd(d, d, q0);
     }
-    m.square = gsf__nn_sum4((s0 + s1) + (s2 + s3));
-    for (; i < count; i++) m.square += ((double)x[i] - m.mean) * ((double)x[i] - m.mean);
-    return m;
+    double sum = gsf__nn_sum4((s0 + s1) + (s2 + s3)), square = gsf__nn_sum4((q0 + q1) + (q2 + q3));
+    for (; i < count; i++) {
+        const double d = (double)x[i] - pivot;
+        sum += d;
+        square += d * d;
+    }
+    return gsf__moments_of(pivot, sum, square, count, centre);
 }
 
 GSF__TARGET_AVX2 static gsf__moments gsf__moments_avx2(const float* x, int64_t count, int centre) {
@@ -4108,27 +4150,44 @@ GSF__INLINE_AVX2 gsf__norm8 gsf__norm8_of(gsf__moments m, float inverse) {
 // (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
 GSF__INLINE_AVX2 __m256 gsf__norm8_apply(const gsf__norm8* n, __m256 x) { return ((x - n->mean) - n->low) * n->inverse; }
 
-GSF__INLINE_AVX2 __m256 gsf__norm_value8(const gsf__norm_job* job, const gsf__norm8* n, __m256 x, int64_t i, __m256i mask,
+typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
+
+static gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
+    const gsf__norm_vectors v = {job->weight, job->bias, job->scale, job->shift};
+    return v;
+}
+
+GSF__INLINE_AVX2 __m256 gsf__norm_value8(gsf__norm_vectors by, const gsf__norm8* n, __m256 x, int64_t i, __m256i mask,
                                          int whole) {
 #define GSF_X(p) (whole ? _mm256_loadu_ps((p) + i) : _mm256_maskload_ps((p) + i, mask))
     __m256 v = gsf__norm8_apply(n, x);
-    if (job->weight) v = v * GSF_X(job->weight);
-    if (job->bias) v = v + GSF_X(job->bias);
-    if (job->scale) v = _mm256_fmadd_ps(v, _mm256_set1_ps(1.0f) + GSF_X(job->scale), GSF_X(job->shift));
+    if (by.weight) v = v * GSF_X(by.weight);
+    if (by.bias) v = v + GSF_X(by.bias);
+    if (by.scale) v = _mm256_fmadd_ps(v, _mm256_set1_ps(1.0f) + GSF_X(by.scale), GSF_X(by.shift));
     return v;
 #undef GSF_X
 }
 
-GSF__TARGET_AVX2 static void gsf__norm_row_avx2(const gsf__norm_job* job, const float* x, float* y) {
+GSF__INLINE_AVX2 void gsf__norm_row_avx2_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
     const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
     const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
     const __m256i all = _mm256_set1_epi32(-1);
+    const int64_t dim = job->dim;
     int64_t i = 0;
-    for (; i + 8 <= job->dim; i += 8)
-        _mm256_storeu_ps(y + i, gsf__norm_value8(job, &n, _mm256_loadu_ps(x + i), i, all, 1));
+    for (; i + 8 <= dim; i += 8) {
+        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
+        gsf__nn_put8(y + i, gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1), stream);
+    }
     if (i == job->dim) return;
     const __m256i mask = gsf__nn_mask8(job->dim - i);
-    _mm256_maskstore_ps(y + i, mask, gsf__norm_value8(job, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0));
+    _mm256_maskstore_ps(y + i, mask, gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0));
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_row_avx2(const gsf__norm_job* job, const float* x, float* y) {
+    if (job->stream) gsf__norm_row_avx2_body(job, x, y, 1);
+    else gsf__norm_row_avx2_body(job, x, y, 0);
+    gsf__nn_end_stream(job->stream);
 }
 
 GSF__INLINE_AVX2 __m256 gsf__rotate8(__m256 v, __m256 cos, __m256 sin) { // (a c - b s, b c + a s) of each pair
@@ -4138,33 +4197,153 @@ GSF__INLINE_AVX2 __m256 gsf__rotate8(__m256 v, __m256 cos, __m256 sin) { // (a c
 GSF__TARGET_AVX2 static void gsf__norm_head_avx2(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
     const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
     const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
     const __m256i all = _mm256_set1_epi32(-1);
+    const int64_t dim = job->dim;
     int64_t i = 0;
-    for (; i + 8 <= job->dim; i += 8) {
-        __m256 v = gsf__norm_value8(job, &n, _mm256_loadu_ps(x + i), i, all, 1);
+    for (; i + 8 <= dim; i += 8) {
+        __m256 v = gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1);
         if (cos) v = gsf__rotate8(v, _mm256_loadu_ps(cos + i), _mm256_loadu_ps(sin + i));
         _mm256_storeu_ps(x + i, v);
     }
     if (i == job->dim) return;
     const __m256i mask = gsf__nn_mask8(job->dim - i);
-    __m256 v = gsf__norm_value8(job, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0);
+    __m256 v = gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0);
     const __m256 plain = v;
     if (cos) v = gsf__rotate8(v, _mm256_maskload_ps(cos + i, mask), _mm256_maskload_ps(sin + i, mask));
     _mm256_maskstore_ps(x + i, mask, v);
     if (job->dim % 2) _mm256_maskstore_ps(x + i, _mm256_andnot_si256(gsf__nn_mask8(job->dim - i - 1), mask), plain);
 }
 
-GSF__TARGET_AVX2 static void gsf__norm_affine_avx2(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                   float weight, float bias, float* y) {
+GSF__INLINE_AVX2 void gsf__norm_affine_avx2_body(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                 float weight, float bias, float* y, int stream) {
     const gsf__norm8 n = gsf__norm8_of(m, inverse);
     const __m256 w = _mm256_set1_ps(weight), b = _mm256_set1_ps(bias);
     int64_t i = 0;
     for (; i + 8 <= count; i += 8)
-        _mm256_storeu_ps(y + i, _mm256_fmadd_ps(gsf__norm8_apply(&n, _mm256_loadu_ps(x + i)), w, b));
+        gsf__nn_put8(y + i, _mm256_fmadd_ps(gsf__norm8_apply(&n, _mm256_loadu_ps(x + i)), w, b), stream);
     if (i == count) return;
     const __m256i mask = gsf__nn_mask8(count - i);
     const __m256 v = gsf__norm8_apply(&n, _mm256_maskload_ps(x + i, mask));
     _mm256_maskstore_ps(y + i, mask, _mm256_fmadd_ps(v, w, b));
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_affine_avx2(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                   float weight, float bias, float* y, int stream) {
+    if (stream) gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 1);
+    else gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 0);
+    gsf__nn_end_stream(stream);
+}
+
+// The same, sixteen at a time.
+
+typedef struct gsf__moments16 { __m512d sum[2], square[2]; } gsf__moments16;
+
+GSF__INLINE_AVX512 void gsf__moments_add16(gsf__moments16* m, const float* x, __mmask16 mask, __m512d pivot) {
+    for (int h = 0; h < 2; h++) {
+        const __mmask8 half = (__mmask8)(mask >> 8 * h);
+        const __m512d d = _mm512_maskz_sub_pd(half, _mm512_cvtps_pd(_mm256_maskz_loadu_ps(half, x + 8 * h)), pivot);
+        m->sum[h] = m->sum[h] + d;
+        m->square[h] = _mm512_fmadd_pd(d, d, m->square[h]);
+    }
+}
+
+GSF__INLINE_AVX512 gsf__moments gsf__moments_avx512_body(const float* x, int64_t count, int centre) {
+    const double pivot = centre ? (double)x[0] : 0.0;
+    gsf__moments16 m = {{_mm512_setzero_pd(), _mm512_setzero_pd()}, {_mm512_setzero_pd(), _mm512_setzero_pd()}};
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16) gsf__moments_add16(&m, x + i, GSF__NN_WHOLE16, _mm512_set1_pd(pivot));
+    if (i < count) gsf__moments_add16(&m, x + i, gsf__nn_mask16(count - i), _mm512_set1_pd(pivot));
+    return gsf__moments_of(pivot, _mm512_reduce_add_pd(m.sum[0] + m.sum[1]),
+                           _mm512_reduce_add_pd(m.square[0] + m.square[1]), count, centre);
+}
+
+GSF__TARGET_AVX512 static gsf__moments gsf__moments_avx512(const float* x, int64_t count, int centre) {
+    return gsf__moments_avx512_body(x, count, centre);
+}
+
+typedef struct gsf__norm16 { __m512 mean, low, inverse; } gsf__norm16;
+
+GSF__INLINE_AVX512 gsf__norm16 gsf__norm16_of(gsf__moments m, float inverse) {
+    gsf__norm16 n;
+    const float mean = (float)m.mean;
+    n.mean = _mm512_set1_ps(mean);
+    n.low = _mm512_set1_ps((float)(m.mean - (double)mean));
+    n.inverse = _mm512_set1_ps(inverse);
+    return n;
+}
+
+GSF__INLINE_AVX512 __m512 gsf__norm16_apply(const gsf__norm16* n, __m512 x) { return ((x - n->mean) - n->low) * n->inverse; }
+
+GSF__INLINE_AVX512 __m512 gsf__norm_value16(gsf__norm_vectors by, const gsf__norm16* n, const float* x, int64_t i,
+                                            __mmask16 mask) {
+    __m512 v = gsf__norm16_apply(n, _mm512_maskz_loadu_ps(mask, x + i));
+    if (by.weight) v = v * _mm512_maskz_loadu_ps(mask, by.weight + i);
+    if (by.bias) v = v + _mm512_maskz_loadu_ps(mask, by.bias + i);
+    if (by.scale)
+        v = _mm512_fmadd_ps(v, _mm512_set1_ps(1.0f) + _mm512_maskz_loadu_ps(mask, by.scale + i),
+                            _mm512_maskz_loadu_ps(mask, by.shift + i));
+    return v;
+}
+
+GSF__INLINE_AVX512 void gsf__norm_row_avx512_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
+    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
+    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const int64_t dim = job->dim;
+    int64_t i = 0;
+    for (; i + 16 <= dim; i += 16) {
+        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
+        gsf__nn_put16(y + i, gsf__norm_value16(by, &n, x, i, GSF__NN_WHOLE16), stream);
+    }
+    if (i == dim) return;
+    const __mmask16 mask = gsf__nn_mask16(dim - i);
+    _mm512_mask_storeu_ps(y + i, mask, gsf__norm_value16(by, &n, x, i, mask));
+}
+
+GSF__TARGET_AVX512 static void gsf__norm_row_avx512(const gsf__norm_job* job, const float* x, float* y) {
+    if (job->stream) gsf__norm_row_avx512_body(job, x, y, 1);
+    else gsf__norm_row_avx512_body(job, x, y, 0);
+    gsf__nn_end_stream(job->stream);
+}
+
+GSF__INLINE_AVX512 void gsf__norm_head16(gsf__norm_vectors by, const gsf__norm16* n, float* x, const float* cos,
+                                         const float* sin, int64_t i, __mmask16 turned, __mmask16 mask) {
+    __m512 v = gsf__norm_value16(by, n, x, i, mask);
+    if (cos)
+        v = _mm512_mask_fmaddsub_ps(v, turned, _mm512_maskz_loadu_ps(mask, cos + i),
+                                    _mm512_permute_ps(v, 0xb1) * _mm512_maskz_loadu_ps(mask, sin + i));
+    gsf__nn_store16(x + i, mask, v);
+}
+
+GSF__TARGET_AVX512 static void gsf__norm_head_avx512(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
+    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const int64_t dim = job->dim;
+    int64_t i = 0;
+    for (; i + 16 <= dim; i += 16) gsf__norm_head16(by, &n, x, cos, sin, i, GSF__NN_WHOLE16, GSF__NN_WHOLE16);
+    if (i < dim) gsf__norm_head16(by, &n, x, cos, sin, i, gsf__nn_mask16((dim - i) / 2 * 2), gsf__nn_mask16(dim - i));
+}
+
+GSF__INLINE_AVX512 void gsf__norm_affine_avx512_body(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                     float weight, float bias, float* y, int stream) {
+    const gsf__norm16 n = gsf__norm16_of(m, inverse);
+    const __m512 w = _mm512_set1_ps(weight), b = _mm512_set1_ps(bias);
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16)
+        gsf__nn_put16(y + i, _mm512_fmadd_ps(gsf__norm16_apply(&n, _mm512_loadu_ps(x + i)), w, b), stream);
+    if (i == count) return;
+    const __mmask16 mask = gsf__nn_mask16(count - i);
+    const __m512 v = gsf__norm16_apply(&n, _mm512_maskz_loadu_ps(mask, x + i));
+    _mm512_mask_storeu_ps(y + i, mask, _mm512_fmadd_ps(v, w, b));
+}
+
+GSF__TARGET_AVX512 static void gsf__norm_affine_avx512(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                       float weight, float bias, float* y, int stream) {
+    if (stream) gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 1);
+    else gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 0);
+    gsf__nn_end_stream(stream);
 }
 
 #endif // GSF__X86
@@ -4175,6 +4354,9 @@ static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
 #if GSF__X86
     static const gsf__norm_kernels avx2 = {gsf__moments_avx2, gsf__norm_row_avx2, gsf__norm_head_avx2,
                                            gsf__norm_affine_avx2};
+    static const gsf__norm_kernels avx512 = {gsf__moments_avx512, gsf__norm_row_avx512, gsf__norm_head_avx512,
+                                             gsf__norm_affine_avx512};
+    if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)level;
@@ -4192,6 +4374,7 @@ static void gsf__norm_chunk(void* arg, size_t chunk, int worker) {
 static void gsf__norm_rows(gsf_context* ctx, gsf__norm_job* job) {
     job->kernels = gsf__norm_kernels_of(ctx->cpu_level);
     job->chunk_rows = gsf__nn_chunk_rows(job->dim);
+    job->stream = gsf__nn_streams(job->x, job->y, job->rows * job->dim, job->dim);
     gsf__parallel_for(ctx, gsf__nn_chunks(job->rows, job->chunk_rows), gsf__norm_chunk, job);
 }
 
@@ -4230,9 +4413,11 @@ GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int
     gsf__norm_rows(ctx, &job);
 }
 
-// Groups are cut into parts that fit a core's cache, so that each is read from memory once for both moments, and few
-// large groups still employ all workers. The moments of parts are put together in order (Chan et al. 1979).
-enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; most parts in all
+// Groups are cut into parts that fit a core's cache, so that each is read once for both moments, and few large groups still
+// employ all workers. The moments of parts are put together in order (Chan et al. 1979). As many groups as a shared cache
+// holds are normalised before the next ones are read.
+enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; most parts of a group
+enum { GSF__NORM_BATCH = 1 << 21 };                        // values of the groups of a batch
 
 static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
     const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: within the group
@@ -4241,7 +4426,7 @@ static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int6
         const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
         const int64_t count = gsf__least(next, end) - i;
         job->kernels->affine(job->x + first + i, count, m, inverse, job->weight ? job->weight[channel] : 1.0f,
-                             job->bias ? job->bias[channel] : 0.0f, job->y + first + i);
+                             job->bias ? job->bias[channel] : 0.0f, job->y + first + i, job->stream);
         i += count;
     }
 }
@@ -4263,7 +4448,8 @@ static void gsf__norm_part_moments(void* arg, size_t chunk, int worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
     int64_t count;
-    job->part_moments[chunk] = gsf__norm_part(job, (int64_t)chunk / job->parts, (int64_t)chunk % job->parts, &count);
+    const int64_t group = job->first_group + (int64_t)chunk / job->parts;
+    job->part_moments[chunk] = gsf__norm_part(job, group, (int64_t)chunk % job->parts, &count);
 }
 
 static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
@@ -4279,7 +4465,8 @@ static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
         m.mean += delta * share;
         m.square += of[p].square + delta * delta * before * share;
     }
-    gsf__norm_group_values(job, group, (int64_t)chunk % job->parts, m, gsf__norm_inverse(m, job->group_size, job->eps));
+    gsf__norm_group_values(job, job->first_group + group, (int64_t)chunk % job->parts, m,
+                           gsf__norm_inverse(m, job->group_size, job->eps));
 }
 
 GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
@@ -4296,19 +4483,24 @@ GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channel
     job.weight = weight;
     job.bias = bias;
     job.eps = eps;
+    job.stream = gsf__nn_streams(x, y, channels * count, count);
     job.group_size = channels / groups * count;
-    job.parts = (int64_t)gsf__nn_chunks(job.group_size, GSF__NORM_PART);
-    if (job.parts > GSF__NORM_PARTS / groups) job.parts = GSF__NORM_PARTS / groups;
-    if (job.parts < 1) job.parts = 1;
-    job.part_size = (job.group_size - 1) / job.parts + 1;
-    job.parts = (int64_t)gsf__nn_chunks(job.group_size, job.part_size); // rounding up may leave the last ones empty
+    job.part_size = gsf__ceil_div(job.group_size, gsf__least((int64_t)gsf__nn_chunks(job.group_size, GSF__NORM_PART),
+                                                             GSF__NORM_PARTS));
+    job.part_size = gsf__round_up(job.part_size, 16);
+    job.parts = gsf__ceil_div(job.group_size, job.part_size);
     if (job.parts == 1) {
         gsf__parallel_for(ctx, (size_t)groups, gsf__norm_whole_group, &job);
         return;
     }
     job.part_moments = part_moments;
-    gsf__parallel_for(ctx, (size_t)(groups * job.parts), gsf__norm_part_moments, &job);
-    gsf__parallel_for(ctx, (size_t)(groups * job.parts), gsf__norm_part_values, &job);
+    int64_t batch = gsf__least(GSF__NORM_BATCH / job.group_size, GSF__NORM_PARTS / job.parts);
+    if (batch < 1) batch = 1;
+    for (; job.first_group < groups; job.first_group += batch) {
+        const size_t parts = (size_t)(gsf__least(batch, groups - job.first_group) * job.parts);
+        gsf__parallel_for(ctx, parts, gsf__norm_part_moments, &job);
+        gsf__parallel_for(ctx, parts, gsf__norm_part_values, &job);
+    }
 }
 
 static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int worker) {
@@ -4650,7 +4842,7 @@ GSF__INLINE_AVX512 void gsf__attention_tops_avx512(const float* p, int64_t queri
     }
     for (int64_t r = 0; r < queries; r += 16) {
         const __mmask16 mask = gsf__nn_mask16(queries - r);
-        _mm512_mask_storeu_ps(fade + r, mask, gsf__nn_exp2_low16(_mm512_maskz_loadu_ps(mask, fade + r)));
+        gsf__nn_store16(fade + r, mask, gsf__nn_exp2_low16(_mm512_maskz_loadu_ps(mask, fade + r)));
     }
 }
 
@@ -5180,14 +5372,18 @@ GSF__TARGET_AVX2 static void gsf__conv_norm_silu_avx2(const float* x, int64_t co
     gsf__conv_norm_silu_ref(x + i, count - i, mean + i, scale + i, offset + i, y + i);
 }
 
+GSF__INLINE_AVX512 void gsf__conv_norm_silu16(const float* x, __mmask16 mask, const float* mean, const float* scale,
+                                              const float* offset, float* y) {
+    const __m512 d = _mm512_maskz_loadu_ps(mask, x) - _mm512_maskz_loadu_ps(mask, mean);
+    const __m512 v = _mm512_fmadd_ps(d, _mm512_maskz_loadu_ps(mask, scale), _mm512_maskz_loadu_ps(mask, offset));
+    gsf__nn_store16(y, mask, gsf__nn_activate16(GSF_NN_SILU, v));
+}
+
 GSF__TARGET_AVX512 static void gsf__conv_norm_silu_avx512(const float* x, int64_t count, const float* mean,
                                                           const float* scale, const float* offset, float* y) {
-    for (int64_t i = 0; i < count; i += 16) {
-        const __mmask16 mask = gsf__nn_mask16(count - i);
-        const __m512 d = _mm512_maskz_loadu_ps(mask, x + i) - _mm512_maskz_loadu_ps(mask, mean + i);
-        const __m512 v = _mm512_fmadd_ps(d, _mm512_maskz_loadu_ps(mask, scale + i), _mm512_maskz_loadu_ps(mask, offset + i));
-        _mm512_mask_storeu_ps(y + i, mask, gsf__nn_activate16(GSF_NN_SILU, v));
-    }
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16) gsf__conv_norm_silu16(x + i, GSF__NN_WHOLE16, mean + i, scale + i, offset + i, y + i);
+    if (i < count) gsf__conv_norm_silu16(x + i, gsf__nn_mask16(count - i), mean + i, scale + i, offset + i, y + i);
 }
 #endif
 

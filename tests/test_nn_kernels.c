@@ -210,7 +210,8 @@ static void check_row_norms(void) {
 
 static void check_group_norm(void) {
     static const int64_t cases[][3] = { // channels, values of each, groups
-        {1, 1, 1}, {6, 35, 3}, {8, 1, 4}, {4, 9, 4}, {32, 1000, 32}, {12, 9001, 2}, {1, 300007, 1}};
+        {1, 1, 1}, {6, 35, 3}, {8, 1, 4}, {4, 9, 4}, {32, 1000, 32}, {12, 9001, 2}, {1, 300007, 1},
+        {6, 600001, 3}};
     for (size_t c = 0; c < sizeof cases / sizeof cases[0]; c++)
         for (int way = 0; way < 2; way++) {
             const size_t channels = (size_t)cases[c][0], count = (size_t)cases[c][1], groups = (size_t)cases[c][2];
@@ -233,6 +234,34 @@ static void check_group_norm(void) {
             CHECK(groups == 1 || y[per] == y[per]);
             free(x); free(y); free(z); free(w); free(b); free(expected);
         }
+}
+
+enum { LARGE_CHANNELS = 8, LARGE_COUNT = GSF__NN_STREAM / LARGE_CHANNELS + 96, LARGE_DIM = 256 };
+enum { LARGE = LARGE_CHANNELS * LARGE_COUNT };
+
+static void run_large(gsf_context* ctx, int kind, const float* x, const float* w, float* y) {
+    if (kind == 0) gsf_nn_layer_norm(ctx, x, LARGE / LARGE_DIM, LARGE_DIM, w, w, 1e-6f, y);
+    if (kind == 1) gsf_nn_group_norm(ctx, x, LARGE_CHANNELS, LARGE_COUNT, 2, w, w, 1e-6f, y);
+    if (kind == 2) gsf_nn_activate(ctx, GSF_NN_GELU, x, LARGE, y);
+}
+
+// Results larger than any cache bypass it, if they are aligned: the same bits as of those that do not.
+static void check_streams(void) {
+    float *x = make_floats(LARGE, -3, 3), *w = make_floats(LARGE_DIM, 0.5, 2), *memory = make_floats(LARGE + 32, 0, 1);
+    float* aligned = memory + (64 - (uintptr_t)memory % 64) % 64 / sizeof(float);
+    CHECK(gsf__nn_streams(x, aligned, LARGE, LARGE_DIM) && !gsf__nn_streams(x, aligned + 1, LARGE, LARGE_DIM));
+    for (int kind = 0; kind < 3; kind++) {
+        float* in_place = copy_floats(x, LARGE);
+        run_large(&one, kind, in_place, w, in_place);
+        run_large(&three, kind, x, w, aligned);
+        CHECK(same_bits(aligned, in_place, LARGE));
+        run_large(&one, kind, x, w, aligned + 1);
+        CHECK(same_bits(aligned + 1, in_place, LARGE));
+        free(in_place);
+    }
+    free(x);
+    free(w);
+    free(memory);
 }
 
 static void check_head_norm_rope(void) {
@@ -521,6 +550,7 @@ int main(void) {
         check_softmax();
         check_row_norms();
         check_group_norm();
+        check_streams();
         check_head_norm_rope();
         check_attention();
         check_attention_values(0);
