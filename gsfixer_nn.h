@@ -4108,7 +4108,7 @@ static gsf__moments gsf__moments_of(double pivot, double sum, double square, int
 }
 
 GSF__INLINE_AVX2 gsf__moments gsf__moments_avx2_body(const float* x, int64_t count, int centre) {
-    const double pivot = centre ? (double)x[0] : 0.0;
+    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
     const __m256d p = _mm256_set1_pd(pivot);
     __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0, q0 = s0, q1 = s0, q2 = s0, q3 = s0;
     int64_t i = 0;
@@ -4249,7 +4249,7 @@ GSF__INLINE_AVX512 void gsf__moments_add16(gsf__moments16* m, const float* x, __
 }
 
 GSF__INLINE_AVX512 gsf__moments gsf__moments_avx512_body(const float* x, int64_t count, int centre) {
-    const double pivot = centre ? (double)x[0] : 0.0;
+    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
     gsf__moments16 m = {{_mm512_setzero_pd(), _mm512_setzero_pd()}, {_mm512_setzero_pd(), _mm512_setzero_pd()}};
     int64_t i = 0;
     for (; i + 16 <= count; i += 16) gsf__moments_add16(&m, x + i, GSF__NN_WHOLE16, _mm512_set1_pd(pivot));

@@ -339,7 +339,8 @@ def nn_sections(lines, rows, has_pipeline):
     lines += ["At the released model's sizes, the smallest cases at every level of instructions. Shares are of the peaks "
               "above: 8-bit layers' of the integers, all others' of the multiply-adds, which products of bf16 can exceed. "
               "Errors are against sums in double. The last column is PyTorch's seconds divided by ours, timed in turns in "
-              "the same run (`bench/peers_nn.py`): in float32, beside our products of bf16 in bf16.", ""]
+              "the same run (`bench/peers_nn.py`): in float32, beside our products of bf16 in bf16. It keeps the memory of "
+              "its results there; getting new pages for every large one takes it up to five times as long.", ""]
     table(lines, ["", "", "instructions", "threads", "ms", "CPU ms", "peak", "bandwidth", "largest error", "relative L2",
                   "PyTorch / ours"],
           [[r["case"], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), ms(r["seconds"]),
