@@ -2026,7 +2026,7 @@ GSF__INLINE_AVX512 __m512 gsf__nn_activate16(gsf_nn_activation activation, __m51
 
 #endif // GSF__X86
 
-// Results that no cache can hold bypass them all (`stream`): lines that are written whole need not be read before.
+// Results of 32 MiB and more bypass the caches (`stream`): lines that are written whole need not be read before.
 enum { GSF__NN_STREAM = 1 << 23 }; // values
 
 static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_t row) { // pieces are multiples of `row`

@@ -4,10 +4,11 @@
     bench/peers_nn.py BENCH_NN [--quick] [--filter TEXT] [--threads N] [--rounds N]
 
 BENCH_NN is the built program; its rows are passed through. Every case that PyTorch can do, too, is read from its name and
-timed on as many threads right after; that row has variant "PyTorch" (beside our products of bf16 "PyTorch bf16") and "ratio": PyTorch's seconds divided by ours (above 1:
-we are faster), "cpu_ratio" the same of CPU seconds, for machines that do other things as well. --rounds repeats the two in
-turns; the median counts. Needs PyTorch (pip install torch), for the transformer's and the autoencoder's block diffusers and
-for DINOv2 transformers, too; without PyTorch only our rows are printed and the exit code is 77.
+timed on as many threads right after; that row has variant "PyTorch" (beside our products of bf16 "PyTorch bf16") and
+"ratio": PyTorch's seconds divided by ours (above 1: we are faster), "cpu_ratio" the same of CPU seconds, for machines that
+do other things as well. --rounds repeats the two in turns; the median counts. Needs PyTorch (pip install torch), for the
+transformer's and the autoencoder's block diffusers and for DINOv2 transformers, too; without PyTorch only our rows are
+printed and the exit code is 77.
 
 PyTorch makes a new tensor for every result. So that its time is that of the kernel and not of the pages that Linux fills with
 zeros for a large one, up to four fifths of it, the C library is told to keep memory that was freed.
@@ -109,7 +110,7 @@ def conv3d(match, quick):
     x, weight = torch.rand(1, c, t + 2, h, w).sub_(0.5), torch.rand(c, c, 3, 3, 3).sub_(0.5)
     bias = torch.rand(c)
     inputs = [(x, weight), (x.to(memory_format=torch.channels_last_3d), weight.to(memory_format=torch.channels_last_3d))]
-    return better([lambda pair=pair: torch.nn.functional.conv3d(pair[0], pair[1], bias, padding=(0, 1, 1)) for pair in inputs]), 1
+    return better([lambda pair=pair: torch.nn.functional.conv3d(*pair, bias, padding=(0, 1, 1)) for pair in inputs]), 1
 
 
 def resnet(match, quick):
