@@ -10910,13 +10910,15 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     const uint64_t iteration = gsf__load_le(state + 4, 4), sh_degree = gsf__load_le(state + 8, 4);
     const uint32_t next_id = (uint32_t)gsf__load_le(state + 12, 4), weight = (uint32_t)gsf__load_le(state + 20, 4);
     const uint64_t first_bands = gsf__load_le(state + 16, 4), count = gsf__load_le(state + 24, 8);
+    const uint64_t restored_steps = gsf__load_le(state + 32, 8);
     float restored_weight;
     memcpy(&restored_weight, &weight, 4);
     if (iteration > (uint64_t)trainer->desc.iterations || sh_degree != (uint64_t)model->sh_degree || first_bands < 1 ||
-        first_bands > 4 || count > size || !(fabsf(restored_weight) <= FLT_MAX))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: iteration %llu of %d, SH degree %llu (here %d), %llu splats", name,
-                        (unsigned long long)iteration, (int)trainer->desc.iterations, (unsigned long long)sh_degree,
-                        (int)model->sh_degree, (unsigned long long)count);
+        first_bands > 4 || count > size || restored_steps > iteration || !(fabsf(restored_weight) <= FLT_MAX))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT,
+                        "%s: iteration %llu of %d, %llu with restored views, SH degree %llu (here %d), %llu splats", name,
+                        (unsigned long long)iteration, (int)trainer->desc.iterations, (unsigned long long)restored_steps,
+                        (unsigned long long)sh_degree, (int)model->sh_degree, (unsigned long long)count);
     double origin[3];
     for (int a = 0; a < 3; a++) {
         const uint64_t bits = gsf__load_le(state + 56 + 8 * a, 8);
@@ -10952,7 +10954,7 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     trainer->iteration = (int32_t)iteration;
     trainer->first_bands = (int32_t)first_bands;
     trainer->restored_weight = restored_weight;
-    trainer->restored_steps = gsf__load_le(state + 32, 8);
+    trainer->restored_steps = restored_steps;
     trainer->rejected = (size_t)gsf__load_le(state + 40, 8);
     gsf__trainer_refresh_view(trainer);
     gsf__trainer_prepare_lazy(ctx, trainer);
@@ -10992,17 +10994,25 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
 
 GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer) { return trainer->desc; }
 
+// Replacing the restored views in two steps: all that can fail, and the exchange.
+static gsf_result gsf__restored_make(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views, size_t count,
+                                     gsf__photo_set* out) {
+    GSF__TRY(gsf__photo_set_make(ctx, views, count, "restored view", out));
+    const gsf_result result = gsf__trainer_reserve_images(ctx, trainer, out);
+    if (result != GSF_OK) gsf__photo_set_destroy(ctx, out);
+    return result;
+}
+
+static void gsf__restored_take(gsf_context* ctx, gsf_trainer* trainer, const gsf__photo_set* set) {
+    gsf__photo_set_destroy(ctx, &trainer->restored);
+    trainer->restored = *set;
+}
+
 GSF_API gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views,
                                                 size_t count) {
     gsf__photo_set set;
-    GSF__TRY(gsf__photo_set_make(ctx, views, count, "restored view", &set));
-    const gsf_result result = gsf__trainer_reserve_images(ctx, trainer, &set);
-    if (result != GSF_OK) {
-        gsf__photo_set_destroy(ctx, &set);
-        return result;
-    }
-    gsf__photo_set_destroy(ctx, &trainer->restored);
-    trainer->restored = set;
+    GSF__TRY(gsf__restored_make(ctx, trainer, views, count, &set));
+    gsf__restored_take(ctx, trainer, &set);
     return GSF_OK;
 }
 
@@ -11601,8 +11611,9 @@ struct gsf_fixer {
     size_t view_count;
     gsf_camera* cameras;
     gsf_image* photos;              // f32 copies
-    int32_t iteration, round, skipped;
+    int32_t round, skipped;
     int restoring;                  // a round is under way
+    int planned;                    // its path and buffers are there; a restored checkpoint's are not yet
     int32_t window;                 // next one of this round
     int32_t frames;                 // per window
     gsf_camera* path;               // windows x frames
@@ -11743,7 +11754,7 @@ static int32_t gsf__round_iteration(const gsf_fix_desc* d, int32_t round) {
 // official code's half sine falls again).
 static float gsf__restored_weight(const gsf_fixer* f) {
     const float span = (float)(f->desc.train.iterations - f->desc.first_round);
-    const float t = span > 0.0f ? (float)(f->iteration - f->desc.first_round) / span : 1.0f;
+    const float t = span > 0.0f ? (float)(f->trainer->iteration - f->desc.first_round) / span : 1.0f;
     return t <= 0.0f ? 0.0f : f->desc.lambda * (t < 1.0f ? t * (2.0f - t) : 1.0f);
 }
 
@@ -11801,6 +11812,7 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
 // Path of this round, its frames' sizes and buffers.
 static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     const gsf_camera* first = f->cameras;
+    f->planned = 0;
     gsf__drop_window(ctx, f);
     memset(&f->limits, 0, sizeof f->limits);
     GSF__TRY(f->restorer->query_fn(f->restorer->user, ctx, f->desc.window_frames, first->width, first->height, &f->limits));
@@ -11820,6 +11832,7 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
         *sets[s] = (gsf_image*)gsf_alloc_zeroed(ctx, (size_t)f->frames, sizeof(gsf_image));
         if (!*sets[s]) return GSF_ERROR_OUT_OF_MEMORY;
     }
+    f->planned = 1;
     return GSF_OK;
 }
 
@@ -11908,7 +11921,9 @@ static gsf_result gsf__keep_frame(gsf_context* ctx, gsf_fixer* f, const gsf_came
     return GSF_OK;
 }
 
-static gsf_result gsf__install_frames(gsf_context* ctx, gsf_fixer* f, const gsf__kept_frames* list) {
+// The frames as what the trainer takes in place of its restored views.
+static gsf_result gsf__frames_to_photos(gsf_context* ctx, gsf_fixer* f, const gsf__kept_frames* list,
+                                        gsf__photo_set* out) {
     size_t total = 0;
     for (size_t i = 0; i < list->count; i++)
         total += (size_t)list->frames[i].camera.width * (size_t)list->frames[i].camera.height;
@@ -11927,7 +11942,7 @@ static gsf_result gsf__install_frames(gsf_context* ctx, gsf_fixer* f, const gsf_
         result = gsf_convert_image(ctx, &bytes, &views[i].weight);
         next += pixels;
     }
-    if (result == GSF_OK) result = gsf_splat_set_restored_views(ctx, f->trainer, views, list->count);
+    if (result == GSF_OK) result = gsf__restored_make(ctx, f->trainer, views, list->count, out);
     gsf_free(ctx, weights);
     gsf_free(ctx, views);
     return result;
@@ -11993,7 +12008,9 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
 }
 
 static gsf_result gsf__finish_round(gsf_context* ctx, gsf_fixer* f) {
-    GSF__TRY(gsf__install_frames(ctx, f, &f->pending));
+    gsf__photo_set photos;
+    GSF__TRY(gsf__frames_to_photos(ctx, f, &f->pending, &photos));
+    gsf__restored_take(ctx, f->trainer, &photos);
     gsf__close_references(ctx, f);
     gsf__drop_frames(ctx, &f->active);
     f->active = f->pending;
@@ -12015,28 +12032,28 @@ GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
     if (f->restoring && f->window >= f->desc.windows) GSF__TRY(gsf__finish_round(ctx, f));
     if (f->restoring) {
         stats->stage = GSF_FIX_RESTORE;
+        if (!f->planned) GSF__TRY(gsf__plan_round(ctx, f));
         GSF__TRY(gsf__restore_window(ctx, f, stats));
-    } else if (f->round < f->desc.rounds && f->iteration >= gsf__round_iteration(&f->desc, f->round)) {
+    } else if (f->round < f->desc.rounds && f->trainer->iteration >= gsf__round_iteration(&f->desc, f->round)) {
         stats->stage = GSF_FIX_PLAN;
         GSF__TRY(gsf__plan_round(ctx, f));
         f->restoring = 1;
         f->window = 0;
-    } else if (f->iteration >= f->desc.train.iterations) {
+    } else if (f->trainer->iteration >= f->desc.train.iterations) {
         stats->stage = GSF_FIX_DONE;
     } else {
         stats->stage = GSF_FIX_TRAIN;
         stats->lambda = f->active.count ? gsf__restored_weight(f) : 0.0f;
         gsf_splat_set_restored_weight(f->trainer, stats->lambda);
         GSF__TRY(gsf_splat_train_step(ctx, f->trainer, &stats->train));
-        f->iteration = stats->train.iteration;
     }
     stats->skipped = f->skipped;
     return GSF_OK;
 }
 
-/* Checkpoint: the trainer's chunks, "FIXR" (7 x i32: version, iteration, round, restoring, window, windows, skipped) and
-   two lists of frames "FIXA" (active), "FIXP" (pending): u64 count, then per frame 20 doubles (w2c, fx, fy, cx, cy),
-   2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
+/* Checkpoint: the trainer's chunks, "FIXR" (7 x i32: version, iteration, which is the trainer's, round, restoring, window,
+   windows, skipped) and two lists of frames "FIXA" (active), "FIXP" (pending): u64 count, then per frame 20 doubles (w2c,
+   fx, fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
 static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag, const gsf__kept_frames* list) {
@@ -12121,7 +12138,7 @@ static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const voi
 
 GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* f, gsf_text* chunks) {
     gsf_splat_trainer_save(ctx, f->trainer, chunks);
-    const int32_t numbers[7] = {1, f->iteration, f->round, f->restoring, f->window, f->desc.windows, f->skipped};
+    const int32_t numbers[7] = {1, f->trainer->iteration, f->round, f->restoring, f->window, f->desc.windows, f->skipped};
     char body[28];
     for (int k = 0; k < 7; k++) gsf__store_le(body + 4 * k, (uint32_t)numbers[k], 4);
     gsf_chunks_add(ctx, chunks, "FIXR", body, sizeof body);
@@ -12140,29 +12157,34 @@ GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const
     if (numbers[0] != 1)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: repair loop state version %d", name, (int)numbers[0]);
     if (numbers[5] != f->desc.windows || numbers[2] < 0 || numbers[2] > f->desc.rounds || numbers[4] < 0 ||
-        numbers[4] > numbers[5] || (numbers[3] && numbers[2] >= f->desc.rounds))
+        numbers[4] > numbers[5] || (numbers[3] && numbers[2] >= f->desc.rounds) || numbers[6] < 0 ||
+        numbers[6] > (int64_t)numbers[2] * numbers[5] + numbers[4])
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: made with other rounds or windows", name);
     gsf__kept_frames active, pending;
     GSF__TRY(gsf__load_frames(ctx, name, data, size, "FIXA", &active));
+    gsf__photo_set photos;
+    memset(&photos, 0, sizeof photos);
     gsf_result result = gsf__load_frames(ctx, name, data, size, "FIXP", &pending);
+    if (result == GSF_OK) result = gsf__frames_to_photos(ctx, f, &active, &photos);
     if (result == GSF_OK) result = gsf_splat_trainer_restore(ctx, f->trainer, name, data, size);
-    if (result == GSF_OK) result = gsf__install_frames(ctx, f, &active);
-    if (result != GSF_OK) {
+    if (result != GSF_OK) { // nothing has changed
+        gsf__photo_set_destroy(ctx, &photos);
         gsf__drop_frames(ctx, &active);
         gsf__drop_frames(ctx, &pending);
         return result;
     }
+    gsf__restored_take(ctx, f->trainer, &photos);
     gsf__close_references(ctx, f);
     gsf__drop_frames(ctx, &f->active);
     gsf__drop_frames(ctx, &f->pending);
     f->active = active;
     f->pending = pending;
-    f->iteration = numbers[1];
     f->round = numbers[2];
     f->restoring = numbers[3] != 0;
     f->window = numbers[4];
     f->skipped = numbers[6];
-    return f->restoring ? gsf__plan_round(ctx, f) : GSF_OK; // the path is a function of views, round and seed
+    f->planned = 0; // the path is a function of views, round and seed
+    return GSF_OK;
 }
 
 GSF__END_IMPLEMENTATION

@@ -1,5 +1,8 @@
 // fuzz.h - what the fuzz targets share: a context whose allocator traps when a reader asks for more memory than its
-// input justifies (64 times its size and 1 MiB, all live blocks together), and checks of what a reader hands out.
+// input justifies (64 times its size and 1 MiB, all live blocks together), and checks of what a reader hands out. Where
+// few bytes may rightly stand for many, fuzz_room says from where on the machine is taken to have no more: the reader must
+// answer with GSF_ERROR_OUT_OF_MEMORY, and no input takes long.
+// tests/fuzz.sh builds and runs all of them.
 // By hand: clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all
 //          -DGSFIXER_STATIC -DGSFIXER_IMPLEMENTATION -I. -Itests tests/fuzz_X.c -lm
 //          ./a.out -max_len=8192 tests/corpus/X
@@ -14,11 +17,12 @@
 
 #define FUZZ_CHECK(condition) ((condition) ? (void)0 : abort())
 
-static size_t fuzz_live, fuzz_limit;
+static size_t fuzz_live, fuzz_limit, fuzz_room;
 
 static void* fuzz_alloc(void* user, size_t size) {
     (void)user;
     FUZZ_CHECK(size <= fuzz_limit && fuzz_live <= fuzz_limit - size);
+    if (fuzz_live + size > fuzz_room) return NULL;
     size_t* block = (size_t*)malloc(size + 2 * sizeof(size_t));
     FUZZ_CHECK(block);
     block[0] = size;
@@ -39,8 +43,67 @@ static inline gsf_context fuzz_context(size_t input_size) {
     ctx.allocator.free_fn = fuzz_free;
     ctx.threads = 1;
     fuzz_limit = 64 * input_size + (1 << 20);
+    fuzz_room = SIZE_MAX;
     FUZZ_CHECK(gsf_init_context(&ctx) == GSF_OK && fuzz_live == 0);
     return ctx;
+}
+
+static inline uint64_t fuzz_number(const uint8_t* p, int bytes) { // little-endian
+    uint64_t value = 0;
+    for (int i = bytes; i-- > 0;) value = value << 8 | p[i];
+    return value;
+}
+
+// A checkpoint with the right checksums, which no mutation would hit: what of `data` is chunks, then the rest as it is.
+static inline void fuzz_sum_chunks(gsf_context* ctx, const uint8_t* data, size_t size, gsf_text* out) {
+    size_t at = 12;
+    while (at <= size && size - at >= 16) {
+        const uint64_t bytes = fuzz_number(data + at + 4, 8);
+        if (bytes > size - at - 16) break;
+        gsf_chunks_add(ctx, out, (const char*)data + at, data + at + 12, (size_t)bytes);
+        at += 16 + (size_t)bytes;
+    }
+    if (at < size) gsf_text_append(ctx, out, (const char*)data + at, size - at);
+    FUZZ_CHECK(!out->failed);
+}
+
+static inline void fuzz_check_error(const gsf_context* ctx, const char* name) { // one line that names the file
+    FUZZ_CHECK(strncmp(ctx->error, name, strlen(name)) == 0);
+    for (const char* c = ctx->error; *c; c++) FUZZ_CHECK((unsigned char)*c >= 0x20);
+}
+
+// File hooks for targets whose reader opens files by name: `user` is a list of files, ended by a NULL name; what a path
+// ends in names the file. What is written becomes the first file, in memory that the target frees.
+typedef struct fuzz_file { const char* name; const void* data; size_t size; } fuzz_file;
+
+static inline gsf_result fuzz_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
+    const size_t length = strlen(path);
+    for (const fuzz_file* file = (const fuzz_file*)user; file->name; file++) {
+        const size_t end = strlen(file->name);
+        if (end > length || strcmp(path + length - end, file->name) != 0) continue;
+        *data = gsf_alloc(ctx, file->size + 1, 1);
+        if (!*data) return GSF_ERROR_OUT_OF_MEMORY;
+        if (file->size) memcpy(*data, file->data, file->size);
+        ((char*)*data)[file->size] = 0;
+        *size = file->size;
+        return GSF_OK;
+    }
+    return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+}
+static inline gsf_result fuzz_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
+    fuzz_file* file = (fuzz_file*)user;
+    void* copy = malloc(size ? size : 1);
+    (void)ctx, (void)path;
+    FUZZ_CHECK(copy);
+    if (size) memcpy(copy, data, size);
+    file->data = copy;
+    file->size = size;
+    return GSF_OK;
+}
+static inline void fuzz_hook_files(gsf_context* ctx, fuzz_file* files) {
+    ctx->io.read_fn = fuzz_read;
+    ctx->io.write_fn = fuzz_write;
+    ctx->io.user = files;
 }
 
 // A scene that was accepted must be usable: cameras checked, tracks in range and ascending, images made.

@@ -2,6 +2,7 @@
 // failing restorers, cancel, and checkpoints that continue bit for bit.
 #include "gsfixer_splat.h"
 #include "test.h"
+#include "test_hooks.h"
 
 // ---- warp ----------------------------------------------------------------------
 
@@ -233,7 +234,7 @@ typedef struct repair {
     float photos[VIEWS][3 * PIXELS];
     gsf_restorer restorer;          // renders the truth
     int32_t multiple, frames_step;  // the restorer's limits
-    int begun, ended, windows, fail_at, checked, restored;
+    int begun, ended, windows, fail_at, checked, restored, fail_query;
 } repair;
 
 static gsf_camera around(double angle, double height) { // on a circle of radius 4, looking at the middle
@@ -252,6 +253,7 @@ static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int
     (void)ctx; (void)frames; (void)width; (void)height;
     memset(out, 0, sizeof *out);
     out->frame_count_min = 1;
+    if (r->fail_query) return gsf_fail(ctx, GSF_ERROR_RESTORER, "not yet");
     out->frame_count_step = r->frames_step;
     out->width_multiple = out->height_multiple = r->multiple;
     out->needs_depth = out->needs_alpha = 1;
@@ -539,6 +541,65 @@ static void test_trouble(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
+static int saves_as(gsf_context* ctx, const gsf_fixer* fixer, const gsf_text* expected) {
+    gsf_text chunks;
+    memset(&chunks, 0, sizeof chunks);
+    gsf_splat_fixer_save(ctx, fixer, &chunks);
+    gsf_chunks_end(ctx, &chunks);
+    const int same = chunks.size == expected->size && memcmp(chunks.data, expected->data, chunks.size) == 0;
+    gsf_destroy_text(ctx, &chunks);
+    return same;
+}
+
+// A checkpoint that cannot be restored for want of memory leaves the loop as it was; a round that cannot be planned after
+// one was restored is planned by the next step.
+static void test_failed_restore(void) {
+    static repair r;
+    gsf_context ctx;
+    counter memory = {0};
+    memset(&ctx, 0, sizeof ctx);
+    count_memory(&ctx, &memory);
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    repair_setup(&ctx, &r);
+    const gsf_fix_desc desc = repair_desc();
+    gsf_fixer *whole, *first, *second;
+    gsf_fix_stats stats;
+    gsf_text untouched = {0}, chunks = {0};
+    CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &whole));
+    CHECK(run_steps(&ctx, whole, 1000, NULL));
+    CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &first));
+    for (int round = 0; round < 2;) { // frames of the first round are trained on, the second is being restored
+        CHECK_OK(&ctx, gsf_splat_fix_step(&ctx, first, &stats));
+        round = stats.stage == GSF_FIX_RESTORE ? stats.round : 0;
+    }
+    gsf_splat_fixer_save(&ctx, first, &chunks);
+    gsf_chunks_end(&ctx, &chunks);
+    gsf_splat_destroy_fixer(&ctx, first);
+    CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &second));
+    gsf_splat_fixer_save(&ctx, second, &untouched);
+    gsf_chunks_end(&ctx, &untouched);
+    CHECK(!chunks.failed && !untouched.failed);
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    size_t failures = 0;
+    for (; result == GSF_ERROR_OUT_OF_MEMORY && failures < 1000; failures++) {
+        memory.fail_at = memory.calls + 1 + failures;
+        result = gsf_splat_fixer_restore(&ctx, second, "checkpoint", chunks.data, chunks.size);
+        memory.fail_at = 0;
+        if (result != GSF_OK && !CHECK(saves_as(&ctx, second, &untouched))) break;
+    }
+    CHECK(result == GSF_OK && failures > 10 && saves_as(&ctx, second, &chunks));
+    r.fail_query = 1;
+    CHECK_RESULT(&ctx, gsf_splat_fix_step(&ctx, second, &stats), GSF_ERROR_RESTORER);
+    r.fail_query = 0;
+    CHECK(run_steps(&ctx, second, 1000, NULL) && same_splats(whole, second));
+    gsf_splat_destroy_fixer(&ctx, second);
+    gsf_splat_destroy_fixer(&ctx, whole);
+    gsf_destroy_text(&ctx, &untouched);
+    gsf_destroy_text(&ctx, &chunks);
+    repair_teardown(&ctx, &r);
+    CHECK(memory.live == 0);
+}
+
 // The start is the truth, so what photos 0 and 1 show is what is rendered there. Photos 2 and 3 show something else,
 // each its own: the references do not explain what lies between them.
 static void mixed_setup(gsf_context* ctx, repair* r) {
@@ -661,5 +722,6 @@ int main(void) {
     test_mixed_windows(&ctx);
     test_loop(&ctx);
     test_trouble(&ctx);
+    test_failed_restore();
     return test_report();
 }

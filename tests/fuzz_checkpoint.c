@@ -1,0 +1,177 @@
+// fuzz_checkpoint.c - checkpoints of the repair loop. Build line: fuzz.h. Input: a byte, the steps after which a small loop
+// is saved, then patches to that checkpoint, each u8 chunk, u8 kind, u16 at (little-endian), u8 size and so many bytes; or
+// a byte from 128 on and a whole file. Checksums are made right. What is refused leaves the loop as it was; what is accepted
+// is saved and restored as the same bytes, and the loop goes on from there.
+#include "fuzz.h"
+
+enum { SIDE = 8, VIEWS = 3, SPLATS = 5, STEPS = 16 };
+
+static gsf_result query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
+                        gsf_restorer_limits* limits) {
+    (void)user, (void)ctx, (void)frames, (void)width, (void)height, (void)limits;
+    return GSF_OK; // takes everything
+}
+static gsf_result begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    (void)user, (void)ctx, (void)references, (void)count;
+    return GSF_OK;
+}
+static gsf_result restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    (void)user, (void)ctx;
+    for (int32_t i = 0; i < window->frame_count; i++) {
+        const gsf_image *color = &window->out_color[i], *confidence = &window->out_confidence[i];
+        memset(color->data, 0, (size_t)(color->stride_y * color->height));
+        memset(confidence->data, 0, (size_t)(confidence->stride_y * confidence->height));
+    }
+    return GSF_OK;
+}
+static void end(void* user, gsf_context* ctx) { (void)user, (void)ctx; }
+
+static gsf_restorer black; // paints everything black
+
+static gsf_fixer* make_loop(gsf_context* ctx) {
+    gsf_train_view views[VIEWS];
+    gsf_fix_desc desc;
+    gsf_splats start;
+    gsf_fixer* loop;
+    static uint8_t photo[SIDE * SIDE * 3];
+    memset(&desc, 0, sizeof desc);
+    memset(views, 0, sizeof views);
+    for (size_t i = 0; i < sizeof photo; i++) photo[i] = (uint8_t)(37 * i);
+    for (int v = 0; v < VIEWS; v++) {
+        gsf_camera* camera = &views[v].camera;
+        const double angle = 0.2 * (v - 1);
+        camera->w2c[0] = camera->w2c[10] = cos(angle);
+        camera->w2c[8] = sin(angle), camera->w2c[2] = -sin(angle);
+        camera->w2c[5] = camera->w2c[15] = 1.0, camera->w2c[14] = 4.0;
+        camera->fx = camera->fy = 1.2 * SIDE;
+        camera->cx = camera->cy = 0.5 * SIDE;
+        camera->width = camera->height = SIDE;
+        views[v].image = gsf_wrap_image(photo, GSF_U8, SIDE, SIDE, 3);
+    }
+    FUZZ_CHECK(gsf_splat_make(ctx, SPLATS, 1, &start) == GSF_OK);
+    for (size_t i = 0; i < SPLATS; i++) {
+        start.means[3 * i] = 0.3f * (float)i - 0.6f;
+        start.quats[4 * i] = 1.0f;
+        start.log_scales[3 * i] = start.log_scales[3 * i + 1] = start.log_scales[3 * i + 2] = -1.0f;
+    }
+    desc.train.iterations = 8;
+    desc.train.densify_from = 2;
+    desc.train.densify_interval = 3;
+    desc.rounds = 1;
+    desc.first_round = 4;
+    desc.windows = 2;
+    desc.window_frames = 3;
+    black.struct_size = sizeof black;
+    black.query_fn = query, black.begin_fn = begin, black.restore_fn = restore, black.end_fn = end;
+    FUZZ_CHECK(gsf_splat_make_fixer(ctx, &desc, views, VIEWS, &start, &black, &loop) == GSF_OK);
+    gsf_splat_destroy(ctx, &start);
+    return loop;
+}
+
+static void run(gsf_context* ctx, gsf_fixer* loop, int steps) {
+    gsf_fix_stats now;
+    memset(&now, 0, sizeof now);
+    for (int i = 0; i < steps && now.stage != GSF_FIX_DONE; i++)
+        if (gsf_splat_fix_step(ctx, loop, &now) != GSF_OK) FUZZ_CHECK(ctx->error[0] != 0);
+}
+
+static gsf_text save(gsf_context* ctx, const gsf_fixer* loop) {
+    gsf_text text;
+    memset(&text, 0, sizeof text);
+    gsf_splat_fixer_save(ctx, loop, &text);
+    gsf_chunks_end(ctx, &text);
+    FUZZ_CHECK(!text.failed);
+    return text;
+}
+
+// The checkpoint after `steps` steps, made once.
+static const gsf_text* saved_at(gsf_context* ctx, size_t steps) {
+    static gsf_text all[STEPS];
+    if (!all[steps].data) {
+        gsf_fixer* loop = make_loop(ctx);
+        run(ctx, loop, (int)steps);
+        gsf_text text = save(ctx, loop);
+        all[steps] = text;
+        all[steps].data = (char*)malloc(text.size);
+        FUZZ_CHECK(all[steps].data);
+        memcpy(all[steps].data, text.data, text.size);
+        gsf_destroy_text(ctx, &text);
+        gsf_splat_destroy_fixer(ctx, loop);
+    }
+    return &all[steps];
+}
+
+// One chunk of the saved checkpoint with the patches that are for it.
+static void patch(gsf_context* ctx, const uint8_t* head, size_t bytes, unsigned index, const uint8_t* p, size_t size,
+                  gsf_text* out) {
+    gsf_text body;
+    char tag[4];
+    memset(&body, 0, sizeof body);
+    memcpy(tag, head, 4);
+    gsf_text_append(ctx, &body, (const char*)head + 12, bytes);
+    int repeat = 1;
+    for (size_t at = 0; size - at >= 5; at += p[at + 4] < size - at - 5 ? 5 + (size_t)p[at + 4] : size - at) {
+        const size_t room = size - at - 5, n = p[at + 4] < room ? p[at + 4] : room, where = fuzz_number(p + at + 2, 2);
+        const char* data = (const char*)p + at + 5;
+        if (p[at] != index) continue;
+        if (p[at + 1] % 5 == 0 && where < body.size) memcpy(body.data + where, data, n < body.size - where ? n : body.size - where);
+        if (p[at + 1] % 5 == 1 && where < body.size) body.size = where;
+        if (p[at + 1] % 5 == 2) gsf_text_append(ctx, &body, data, n);
+        if (p[at + 1] % 5 == 3 && n >= 4) memcpy(tag, data, 4);
+        if (p[at + 1] % 5 == 4) repeat = (int)(where % 3);
+    }
+    while (repeat-- > 0) gsf_chunks_add(ctx, out, tag, body.size ? body.data : "", body.size);
+    gsf_destroy_text(ctx, &body);
+}
+
+static gsf_text make_file(gsf_context* ctx, const uint8_t* data, size_t size) {
+    gsf_text file;
+    memset(&file, 0, sizeof file);
+    if (data[0] >= 128) {
+        fuzz_sum_chunks(ctx, data + 1, size - 1, &file);
+    } else {
+        const gsf_text* base = saved_at(ctx, data[0] % STEPS);
+        const uint8_t* p = (const uint8_t*)base->data;
+        unsigned index = 0;
+        for (size_t at = 12; at < base->size; index++) {
+            const size_t bytes = (size_t)fuzz_number(p + at + 4, 8);
+            patch(ctx, p + at, bytes, index, data + 1, size - 1, &file);
+            at += 16 + bytes;
+        }
+    }
+    return file;
+}
+
+static void check_same(const gsf_text* a, const gsf_text* b) {
+    FUZZ_CHECK(a->size == b->size && memcmp(a->data, b->data, a->size) == 0);
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
+    if (size == 0) return 0;
+    gsf_context ctx = fuzz_context(size);
+    fuzz_limit += (size_t)4 << 20; // the loop's own
+    gsf_text file = make_file(&ctx, data, size);
+    gsf_fixer* loop = make_loop(&ctx);
+    gsf_text before = save(&ctx, loop);
+    const gsf_result result = gsf_splat_fixer_restore(&ctx, loop, "fuzz", file.data, file.size);
+    gsf_text after = save(&ctx, loop);
+    if (result != GSF_OK) {
+        FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED);
+        fuzz_check_error(&ctx, "fuzz:");
+        check_same(&before, &after);
+        FUZZ_CHECK(size > 1 || data[0] >= 128); // no patch: it is what the loop saved
+    } else {
+        FUZZ_CHECK(gsf_splat_fixer_restore(&ctx, loop, "again", after.data, after.size) == GSF_OK);
+        gsf_text again = save(&ctx, loop);
+        check_same(&after, &again);
+        gsf_destroy_text(&ctx, &again);
+        run(&ctx, loop, STEPS);
+    }
+    gsf_destroy_text(&ctx, &after);
+    gsf_destroy_text(&ctx, &before);
+    gsf_destroy_text(&ctx, &file);
+    gsf_splat_destroy_fixer(&ctx, loop);
+    FUZZ_CHECK(fuzz_live == 0);
+    return 0;
+}
