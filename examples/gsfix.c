@@ -77,7 +77,7 @@ static const option_spec option_specs[] = {
      "photos on); random ones (the default where the scene has no points)"},
     {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix",
      "approximations allowed (default balanced; exact: none)"},
-    {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix",
+    {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
      "DIR/VIEW.png per test view, white where the figures \"seen\" are to be taken (gsfix masks makes them)"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "go on from OUT/checkpoint if there is one"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
@@ -849,18 +849,90 @@ static int run_path(gsfix_app* app) {
 static const char* const metric_names[] = {"psnr", "ssim_3dgs", "ssim_torchmetrics", "ssim_skimage"};
 enum { METRIC_COUNT = 4 };
 
-static gsf_result measure(gsf_context* ctx, int metric, const gsf_image* a, const gsf_image* b, double* out) {
-    if (metric == 0) return gsf_psnr(ctx, a, b, NULL, out);
+static gsf_result measure(gsf_context* ctx, int metric, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                          double* out) {
+    if (metric == 0) return gsf_psnr(ctx, a, b, mask, out);
     static const gsf_ssim_kind kinds[] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
-    return gsf_ssim(ctx, kinds[metric - 1], a, b, NULL, out);
+    return gsf_ssim(ctx, kinds[metric - 1], a, b, mask, out);
+}
+
+typedef struct metric_sums { // [0]: over all pixels, [1]: over those of the masks
+    double sums[2][METRIC_COUNT];
+    size_t pairs[2];
+} metric_sums;
+
+static const char* metric_name(int metric, int seen, gsfix_path* name) {
+    *name = gsfix_pathf("%s%s", metric_names[metric], seen ? "_seen" : "");
+    return name->s;
+}
+
+// The mask of a picture, if --masks names a folder that has one with a white pixel; else no data.
+static gsf_result load_pair_mask(gsfix_app* app, const char* stem, gsf_image* mask) {
+    const gsfix_path path = gsfix_pathf("%s/%s.png", app->o.masks ? app->o.masks : "", stem);
+    if (!app->o.masks || !gsfix_exists(path.s)) return GSF_OK;
+    const gsf_result result = gsf_load_image(&app->ctx, path.s, 1, mask);
+    if (result == GSF_OK && !gsfix_counts_any(mask)) gsf_destroy_image(&app->ctx, mask);
+    return result;
+}
+
+static gsf_result compare_pair(gsfix_app* app, const int* wanted, const char* stem, const char* left, const char* right,
+                               metric_sums* total) {
+    gsf_context* ctx = &app->ctx;
+    gsf_image x = {0}, y = {0}, mask = {0};
+    char line[256] = "";
+    gsf_result result = gsf_load_image(ctx, left, 3, &x);
+    if (result == GSF_OK) result = gsf_load_image(ctx, right, 3, &y);
+    if (result == GSF_OK && (x.width != y.width || x.height != y.height))
+        result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %lld x %lld in %s, %lld x %lld in %s", stem,
+                          (long long)x.width, (long long)x.height, app->o.inputs[0], (long long)y.width,
+                          (long long)y.height, app->o.inputs[1]);
+    if (result == GSF_OK) result = load_pair_mask(app, stem, &mask);
+    if (result == GSF_OK) {
+        gsfix_json_begin(ctx, &app->json, NULL, '{');
+        gsfix_json_text(ctx, &app->json, "name", stem);
+    }
+    for (int seen = 0; seen <= (mask.data != NULL) && result == GSF_OK; seen++) {
+        for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
+            double value = 0.0;
+            gsfix_path name;
+            if (!wanted[m]) continue;
+            result = measure(ctx, m, &x, &y, seen ? &mask : NULL, &value);
+            if (result != GSF_OK) break;
+            total->sums[seen][m] += value;
+            gsfix_json_number(ctx, &app->json, metric_name(m, seen, &name), value);
+            snprintf(line + strlen(line), sizeof line - strlen(line), m ? "  %.5f" : "  %.3f", value);
+        }
+        if (result == GSF_OK) total->pairs[seen]++;
+    }
+    if (result == GSF_OK) {
+        gsfix_json_end(ctx, &app->json, '}');
+        gsfix_print(app, "%-24s%s", stem, line);
+    }
+    gsf_destroy_image(ctx, &x);
+    gsf_destroy_image(ctx, &y);
+    gsf_destroy_image(ctx, &mask);
+    return result;
+}
+
+static void print_means(gsfix_app* app, const int* wanted, const metric_sums* total) {
+    for (int seen = 0; seen < 2; seen++) {
+        if (!total->pairs[seen]) continue;
+        gsfix_print(app, "means of %zu pairs%s:", total->pairs[seen], seen ? ", where the masks are white" : "");
+        for (int m = 0; m < METRIC_COUNT; m++) {
+            const double mean = total->sums[seen][m] / (double)total->pairs[seen];
+            gsfix_path name;
+            if (!wanted[m]) continue;
+            gsfix_json_number(&app->ctx, &app->json, metric_name(m, seen, &name), mean);
+            gsfix_print(app, "  %-22s %.5f", name.s, mean);
+        }
+    }
 }
 
 static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
     gsf_context* ctx = &app->ctx;
     const char *a = app->o.inputs[0], *b = app->o.inputs[1];
     gsfix_names left = {0}, right = {0};
-    double sums[METRIC_COUNT] = {0};
-    size_t pairs = 0;
+    metric_sums total = {0};
     gsf_result result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
     if (result == GSF_OK) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
     gsfix_json_begin(ctx, &app->json, "per_image", '[');
@@ -868,49 +940,19 @@ static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
         const gsfix_path stem = gsfix_stem(left.names[i]);
         size_t k = 0;
         while (k < right.count && strcmp(gsfix_stem(right.names[k]).s, stem.s) != 0) k++;
-        if (k == right.count) continue;
-        gsf_image x = {0}, y = {0};
-        result = gsf_load_image(ctx, gsfix_pathf("%s/%s", a, left.names[i]).s, 3, &x);
-        if (result == GSF_OK) result = gsf_load_image(ctx, gsfix_pathf("%s/%s", b, right.names[k]).s, 3, &y);
-        if (result == GSF_OK && (x.width != y.width || x.height != y.height))
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %lld x %lld in %s, %lld x %lld in %s", stem.s,
-                              (long long)x.width, (long long)x.height, a, (long long)y.width, (long long)y.height, b);
-        if (result == GSF_OK) {
-            gsfix_json_begin(ctx, &app->json, NULL, '{');
-            gsfix_json_text(ctx, &app->json, "name", stem.s);
-        }
-        char line[256] = "";
-        for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
-            double value = 0.0;
-            if (!wanted[m]) continue;
-            result = measure(ctx, m, &x, &y, &value);
-            if (result != GSF_OK) break;
-            sums[m] += value;
-            gsfix_json_number(ctx, &app->json, metric_names[m], value);
-            snprintf(line + strlen(line), sizeof line - strlen(line), m ? "  %.5f" : "  %.3f", value);
-        }
-        if (result == GSF_OK) {
-            gsfix_json_end(ctx, &app->json, '}');
-            gsfix_print(app, "%-24s%s", stem.s, line);
-            pairs++;
-        }
-        gsf_destroy_image(ctx, &x);
-        gsf_destroy_image(ctx, &y);
+        if (k < right.count)
+            result = compare_pair(app, wanted, stem.s, gsfix_pathf("%s/%s", a, left.names[i]).s,
+                                  gsfix_pathf("%s/%s", b, right.names[k]).s, &total);
     }
     gsfix_json_end(ctx, &app->json, ']');
+    const size_t pairs = total.pairs[0], unpaired = left.count + right.count - 2 * pairs;
     if (result == GSF_OK && !pairs)
         result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s and %s have no picture of the same name", a, b);
     if (result == GSF_OK) {
         gsfix_json_number(ctx, &app->json, "pairs", (double)pairs);
-        gsfix_json_number(ctx, &app->json, "unpaired", (double)(left.count + right.count - 2 * pairs));
-        gsfix_print(app, "means of %zu pairs:", pairs);
-        for (int m = 0; m < METRIC_COUNT; m++)
-            if (wanted[m]) {
-                gsfix_json_number(ctx, &app->json, metric_names[m], sums[m] / (double)pairs);
-                gsfix_print(app, "  %-18s %.5f", metric_names[m], sums[m] / (double)pairs);
-            }
-        if (left.count + right.count != 2 * pairs)
-            gsfix_note(app, "note: %zu pictures have no partner", left.count + right.count - 2 * pairs);
+        gsfix_json_number(ctx, &app->json, "unpaired", (double)unpaired);
+        print_means(app, wanted, &total);
+        if (unpaired) gsfix_note(app, "note: %zu pictures have no partner", unpaired);
     }
     gsfix_free_names(ctx, &left);
     gsfix_free_names(ctx, &right);

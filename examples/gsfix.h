@@ -78,6 +78,7 @@ gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out);
 // gsf_save_image for each, all at once: encoding a PNG takes longer than rendering it.
 gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gsf_image* images, size_t count);
 void gsfix_clamp(gsf_image* image); // packed f32 to [0,1], NaN to 0
+int gsfix_counts_any(const gsf_image* mask); // a u8 mask of one channel has a pixel that counts
 // Picture of packed f32 values: t = (value - low) / (high - low) through a perceptual map (warm: black to yellow).
 gsf_result gsfix_color_map(gsf_context* ctx, const gsf_image* values, double low, double high, gsf_image* out);
 // Depth as people like to see it: near is bright, scaled to the depths that are there; black where nothing is.

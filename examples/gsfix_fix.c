@@ -342,16 +342,9 @@ static gsf_result render_view(fix_run* run, size_t i, gsf_image* color) { // tes
     return result;
 }
 
-static int counts_any(const gsf_image* mask) {
-    const uint8_t* p = (const uint8_t*)mask->data;
-    for (size_t i = 0; i < (size_t)mask->width * (size_t)mask->height; i++)
-        if (p[i]) return 1;
-    return 0;
-}
-
 static gsf_result score_view(fix_run* run, size_t i, const gsf_image* color, int with_ssim, gsfix_score* out) {
     const gsf_image* photo = &run->scene.views[run->split.test[i]].image;
-    const gsf_image* mask = run->masks && counts_any(&run->masks[i]) ? &run->masks[i] : NULL;
+    const gsf_image* mask = run->masks && gsfix_counts_any(&run->masks[i]) ? &run->masks[i] : NULL;
     out->ssim = out->psnr_seen = out->ssim_seen = NAN;
     gsf_result result = gsf_psnr(run->ctx, color, photo, NULL, &out->psnr);
     if (result == GSF_OK && with_ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, NULL, &out->ssim);

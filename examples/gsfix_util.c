@@ -281,6 +281,13 @@ void gsfix_clamp(gsf_image* image) {
     for (size_t i = 0; i < value_count(image); i++) p[i] = p[i] > 0.0f ? p[i] < 1.0f ? p[i] : 1.0f : 0.0f;
 }
 
+int gsfix_counts_any(const gsf_image* mask) {
+    const uint8_t* p = (const uint8_t*)mask->data;
+    for (size_t i = 0; i < (size_t)mask->width * (size_t)mask->height; i++)
+        if (p[i]) return 1;
+    return 0;
+}
+
 void gsfix_map_color(double t, uint8_t rgb[3]) { // matplotlib's inferno, as a polynomial (M. Zucker's fit, CC0)
     static const double c[3][7] = {
         {0.00021894, 0.10651342, 11.60249308, -41.70399613, 77.16293570, -71.31942824, 25.13112622},

@@ -112,6 +112,17 @@ is_json stdout
 expect 0 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 48 --masks masks --json
 holds '"psnr_seen":' stdout
 expect 1 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 40 --masks masks
+# metrics over the same masks says of the pictures that fix left what fix said (they are rounded to 8 bits)
+expect 0 "$gsfix" masks "$scene" --views 3 --model a/splats.ply --out masks_full
+expect 0 "$gsfix" fix "$scene" --out full --views 3 --iterations 5 --masks masks_full
+expect 0 "$gsfix" metrics full/test "$scene/images" --masks masks_full --json
+numbers() { grep -o "\"$1\":[-+.0-9e]*" "$2" | cut -d : -f 2; } # of a file, in its order
+for key in psnr psnr_seen; do # the mean is the last that metrics prints, the first in metrics.json
+    says=$(numbers $key stdout | tail -n 1) said=$(numbers $key full/metrics.json | head -n 1)
+    awk -v a="$says" -v b="$said" 'BEGIN { exit !(a != "" && b != "" && a - b < 0.02 && b - a < 0.02) }' ||
+        fail "metrics: $key is $says, fix said $said"
+done
+[ "$(numbers psnr stdout | tail -n 1)" != "$(numbers psnr_seen stdout | tail -n 1)" ] || fail "metrics: the masks change nothing"
 expect 0 "$gsfix" info a/splats.ply
 splats=$(grep '^splats' stdout)
 for file in splats.splat splats.spz; do # as many splats
