@@ -1,4 +1,4 @@
-// bench.h - what the benches share: clocks, contexts, rows of output, the processor's multiply-adds. Included behind the
+// bench.h - what the benches share: clocks, contexts, rows of output, what the machine can do at most. Included behind the
 // implementation; BENCH_NAME ("splat") goes into every row.
 #ifndef BENCH_H
 #define BENCH_H
@@ -10,14 +10,19 @@ typedef struct bench_row {
     int threads;
     double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
     double flops, ops, bytes; // of the whole; ops: with integers; 0: not counted, or not the bound to look at
-    double bandwidth, cpu_bandwidth; // shares of what reading the same memory between the rounds gave; 0: not measured
+    double bandwidth, cpu_bandwidth; // shares of what reading the same memory between the rounds gave; 0: of a sweep's
     double peak_rss;     // bytes; 0: not measured
 } bench_row;
 
 enum { BENCH_LEVELS = GSF_CPU_AVX512_BF16 + 1 };
+static void bench_print(int json, const bench_row* row);
 
-typedef struct bench_peak { double flops, ops, bytes; } bench_peak; // per second
-static bench_peak bench_peaks[BENCH_LEVELS][3]; // by instruction set and threads (1, 2)
+// What the machine can do, per second, by instruction set and threads (1, 2): multiply-adds in float32, dot products of
+// integers and of bf16. 0: not measured, or no instructions for it.
+typedef struct bench_peak { double flops, ops, bf16; } bench_peak;
+static bench_peak bench_peaks[BENCH_LEVELS][3];
+
+#define BENCH_BF16 "bf16 products" // variant whose shares are of the bf16 peak
 
 static gsf_cpu_level bench_level_of(const char* isa) { // AUTO: there is no such set
     int level = GSF_CPU_SCALAR;
@@ -64,43 +69,6 @@ static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threa
     return row;
 }
 
-// Shares are of the peaks by the clock; cpu_... ones make rates by CPU time of rates by the clock, for machines that do other
-// things as well.
-static void bench_print(int json, const bench_row* row) {
-    const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
-    const bench_peak* peak = bench_peak_of(row->isa, row->threads);
-    const double flop_peak = row->ops > 0.0 ? peak->ops : peak->flops, work = row->ops > 0.0 ? row->ops : row->flops;
-    const double flop_share = flop_peak > 0.0 ? work / row->seconds / flop_peak : 0.0;
-    const double of_peak = peak->bytes > 0.0 ? row->bytes / row->seconds / peak->bytes : 0.0;
-    const double cpu = row->cpu_seconds > 0.0 ? row->seconds * row->threads / row->cpu_seconds : 0.0;
-    const double byte_share = row->bandwidth > 0.0 ? row->bandwidth : of_peak;
-    const double cpu_byte_share = row->bandwidth > 0.0 ? row->cpu_bandwidth : cpu * of_peak;
-    if (json) {
-        printf("{\"bench\":\"" BENCH_NAME "\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
-               "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
-               row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
-               rate, row->reference);
-        if (work > 0.0) printf(",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", flop_share, cpu * flop_share);
-        if (row->bytes > 0.0)
-            printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g,\"cpu_bandwidth_share\":%.4g", row->bytes, byte_share,
-                   cpu_byte_share);
-        if (row->peak_rss > 0.0) printf(",\"peak_rss_bytes\":%.0f", row->peak_rss);
-        if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
-        printf("}\n");
-    } else {
-        printf("%-44s %-8s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->variant, row->isa, row->threads,
-               1e3 * row->seconds, 1e3 * row->cpu_seconds, rate, row->work_unit);
-        if (work > 0.0)
-            printf("  %.1f%% (cpu %.1f%%) of the %s peak", 100.0 * flop_share, 100.0 * cpu * flop_share,
-                   row->ops > 0.0 ? "integer" : "FMA");
-        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * byte_share, 100.0 * cpu_byte_share);
-        if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
-        if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
-        printf("\n");
-    }
-    fflush(stdout);
-}
-
 static void bench_require(gsf_context* ctx, gsf_result result) {
     if (result == GSF_OK) return;
     fprintf(stderr, "bench_" BENCH_NAME ": %s (%s)\n", ctx->error, gsf_describe_result(result));
@@ -129,15 +97,20 @@ static float bench_sink; // keeps the compiler from dropping the loops
 
 #define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would lie in memory at -O2
 
+// Scalar code, too, is vectorized by the compiler, with what every processor of the architecture has (SSE2, Neon).
+typedef float bench_baseline __attribute__((vector_size(16)));
+
 static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
+    const bench_baseline a = {0.999f, 0.999f, 0.999f, 0.999f}, b = {0.001f, 0.001f, 0.001f, 0.001f};
     (void)worker;
-#define BENCH_SCALAR(k) float v##k = (float)k;
+#define BENCH_SCALAR(k) bench_baseline v##k = {(float)k, (float)k, (float)k, (float)k};
     BENCH_TEN(BENCH_SCALAR)
     for (int i = 0; i < FMA_ROUNDS; i++) {
-#define BENCH_SCALAR_STEP(k) v##k = v##k * 0.999f + 0.001f;
+#define BENCH_SCALAR_STEP(k) v##k = v##k * a + b;
         BENCH_TEN(BENCH_SCALAR_STEP)
     }
-    ((float*)arg)[16 * chunk] = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
+    const bench_baseline sum = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
+    memcpy((float*)arg + 16 * chunk, &sum, sizeof sum);
 }
 
 #if GSF__X86
@@ -166,20 +139,213 @@ GSF__TARGET_AVX512 static void bench_fma_avx512(void* arg, size_t chunk, int wor
 }
 #endif
 
-static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* lanes) {
-    *lanes = 1.0;
+static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* flops) { // flops: of a step
 #if GSF__X86
-    if (level >= GSF_CPU_AVX512) {
-        *lanes = 16.0;
-        return bench_fma_avx512;
-    }
-    if (level >= GSF_CPU_AVX2) {
-        *lanes = 8.0;
-        return bench_fma_avx2;
-    }
+    *flops = level >= GSF_CPU_AVX512 ? 32.0 : level >= GSF_CPU_AVX2 ? 16.0 : 8.0;
+    if (level >= GSF_CPU_AVX512) return bench_fma_avx512;
+    if (level >= GSF_CPU_AVX2) return bench_fma_avx2;
 #endif
     (void)level;
+    *flops = 8.0;
     return bench_fma_scalar;
+}
+
+// The fastest of nine rounds, `chunks` for each thread, by the clock or by CPU time: whichever was disturbed less.
+static double bench_fastest(gsf_context* ctx, size_t chunks, gsf_chunk_fn body, void* arg) {
+    double best = 1e30;
+    for (int i = 0; i < 9; i++) {
+        const double wall = bench_now(), cpu = bench_cpu();
+        gsf__parallel_for(ctx, chunks * (size_t)ctx->threads, body, arg);
+        const double by_wall = bench_now() - wall, by_cpu = (bench_cpu() - cpu) / ctx->threads;
+        best = fmin(best, by_cpu > 0.0 ? fmin(by_wall, by_cpu) : by_wall);
+    }
+    return best;
+}
+
+// Runs a loop of FMA_CHAINS * FMA_ROUNDS steps of `work` each, shows the row and returns the rate.
+static double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_chunk_fn body, double work, const char* unit) {
+    float sums[4 * 2 * 16];
+    const double seconds = bench_fastest(ctx, 4, body, sums), all = work * FMA_CHAINS * (double)FMA_ROUNDS * 4.0 * ctx->threads;
+    const bench_row row = bench_make_row(name, ctx->cpu_level, ctx->threads, seconds, seconds * ctx->threads, all, unit);
+    bench_sink += sums[0];
+    bench_print(json, &row);
+    return all / seconds;
+}
+
+// ---- memory: a sweep over so many bytes, each thread over its part -------------------
+
+typedef enum bench_sweep_kind { SWEEP_READ, SWEEP_UPDATE, SWEEP_COPY, SWEEP_STREAM, SWEEP_KINDS } bench_sweep_kind;
+
+typedef struct bench_sweep {
+    char* memory;    // 64-byte aligned
+    size_t part;     // bytes of a thread, a multiple of 512
+    int passes;      // over the part, without anything between
+    bench_sweep_kind kind; // read; read and write in place; the first half into the second, through the caches or past them
+    float sums[2 * 16];
+} bench_sweep;
+
+// BODY(load, store, stream) for one instruction set: V, WIDTH and XOR say how.
+#define BENCH_SWEEP_BODY(V, LOAD, STORE, STREAM, XOR, ZERO)                                                              \
+    bench_sweep* job = (bench_sweep*)arg;                                                                                \
+    char* p = job->memory + chunk * job->part;                                                                           \
+    const size_t half = job->part / 2;                                                                                   \
+    V a = ZERO, b = ZERO, c = ZERO, d = ZERO;                                                                            \
+    (void)worker;                                                                                                        \
+    for (int pass = 0; pass < job->passes; pass++) {                                                                     \
+        if (job->kind == SWEEP_READ)                                                                                     \
+            for (size_t i = 0; i < job->part; i += 4 * sizeof(V)) {                                                      \
+                a = XOR(a, LOAD(p + i));                                                                                 \
+                b = XOR(b, LOAD(p + i + sizeof(V)));                                                                     \
+                c = XOR(c, LOAD(p + i + 2 * sizeof(V)));                                                                 \
+                d = XOR(d, LOAD(p + i + 3 * sizeof(V)));                                                                 \
+            }                                                                                                            \
+        else if (job->kind == SWEEP_UPDATE)                                                                              \
+            for (size_t i = 0; i < job->part; i += 2 * sizeof(V)) {                                                      \
+                STORE(p + i, XOR(a, LOAD(p + i)));                                                                       \
+                STORE(p + i + sizeof(V), XOR(a, LOAD(p + i + sizeof(V))));                                               \
+            }                                                                                                            \
+        else if (job->kind == SWEEP_COPY)                                                                                \
+            for (size_t i = 0; i < half; i += sizeof(V)) STORE(p + half + i, LOAD(p + i));                               \
+        else                                                                                                             \
+            for (size_t i = 0; i < half; i += sizeof(V)) STREAM(p + half + i, LOAD(p + i));                              \
+        __asm__ volatile("" ::: "memory"); /* no pass is left out */                                                     \
+    }                                                                                                                    \
+    const V sum = XOR(XOR(a, b), XOR(c, d));                                                                             \
+    memcpy(job->sums + 16 * chunk, &sum, sizeof(float));
+
+typedef uint32_t bench_bits __attribute__((vector_size(16)));
+
+static void bench_sweep_scalar(void* arg, size_t chunk, int worker) {
+#define BENCH_LOAD(q) (*(const bench_bits*)(const void*)(q))
+#define BENCH_STORE(q, v) (*(bench_bits*)(void*)(q) = (v))
+#define BENCH_XOR(x, y) ((x) ^ (y))
+    const bench_bits zero = {0, 0, 0, 0};
+    BENCH_SWEEP_BODY(bench_bits, BENCH_LOAD, BENCH_STORE, BENCH_STORE, BENCH_XOR, zero)
+#undef BENCH_LOAD
+#undef BENCH_STORE
+#undef BENCH_XOR
+}
+
+#if GSF__X86
+GSF__TARGET_AVX2 static void bench_sweep_avx2(void* arg, size_t chunk, int worker) {
+#define BENCH_LOAD(q) _mm256_load_ps((const float*)(const void*)(q))
+#define BENCH_STORE(q, v) _mm256_store_ps((float*)(void*)(q), v)
+#define BENCH_STREAM(q, v) _mm256_stream_ps((float*)(void*)(q), v)
+    BENCH_SWEEP_BODY(__m256, BENCH_LOAD, BENCH_STORE, BENCH_STREAM, _mm256_xor_ps, _mm256_setzero_ps())
+#undef BENCH_LOAD
+#undef BENCH_STORE
+#undef BENCH_STREAM
+}
+
+GSF__TARGET_AVX512 static void bench_sweep_avx512(void* arg, size_t chunk, int worker) {
+#define BENCH_LOAD(q) _mm512_load_ps((const float*)(const void*)(q))
+#define BENCH_STORE(q, v) _mm512_store_ps((float*)(void*)(q), v)
+#define BENCH_STREAM(q, v) _mm512_stream_ps((float*)(void*)(q), v)
+    BENCH_SWEEP_BODY(__m512, BENCH_LOAD, BENCH_STORE, BENCH_STREAM, _mm512_xor_ps, _mm512_setzero_ps())
+#undef BENCH_LOAD
+#undef BENCH_STORE
+#undef BENCH_STREAM
+}
+#endif
+
+static gsf_chunk_fn bench_sweep_of(gsf_cpu_level level) {
+#if GSF__X86
+    if (level >= GSF_CPU_AVX512) return bench_sweep_avx512;
+    if (level >= GSF_CPU_AVX2) return bench_sweep_avx2;
+#endif
+    (void)level;
+    return bench_sweep_scalar;
+}
+
+enum { SWEEP_SMALLEST = 16, SWEEP_LARGEST = 28 }; // log2 of bytes
+static double bench_sweep_rates[BENCH_LEVELS][3][SWEEP_LARGEST + 1];
+
+// Bytes per second of the fastest kind of sweep over 2^size bytes: the limit of a case that goes over at least as many. A
+// write counts once, also where the cache line was read before.
+static double bench_sweep_rate(int json, gsf_cpu_level level, int threads, int size) {
+    double* rate = &bench_sweep_rates[level][threads][size];
+    gsf_context ctx;
+    if (*rate > 0.0 || !bench_context(&ctx, level, threads)) return *rate;
+    const size_t bytes = (size_t)1 << size;
+    char* block = (char*)bench_alloc(&ctx, bytes + 64, 1);
+    memset(block, 1, bytes + 64);
+    bench_sweep sweep;
+    memset(&sweep, 0, sizeof sweep);
+    sweep.memory = block + (64 - (uintptr_t)block % 64) % 64;
+    sweep.part = bytes / (size_t)threads;
+    sweep.passes = bytes < (1 << 24) ? (int)((1 << 24) / bytes) : 1;
+    for (int kind = 0; kind < SWEEP_KINDS; kind++) {
+        sweep.kind = (bench_sweep_kind)kind;
+        const double moved = (kind == SWEEP_UPDATE ? 2.0 : 1.0) * (double)bytes * sweep.passes;
+        *rate = fmax(*rate, moved / bench_fastest(&ctx, 1, bench_sweep_of(level), &sweep));
+    }
+    bench_sink += sweep.sums[0];
+    gsf_free(&ctx, block);
+    char name[64];
+    snprintf(name, sizeof name, "machine: sweep over %g %s", size < 20 ? bytes / 1024.0 : bytes / 1048576.0, size < 20 ? "KiB" : "MiB");
+    const double seconds = (double)bytes / *rate;
+    const bench_row row = bench_make_row(name, level, threads, seconds, seconds * threads, (double)bytes, "B");
+    bench_print(json, &row);
+    return *rate;
+}
+
+// The limit of a case that moves `bytes`: it goes over half of them at least (each read and written), and what is larger
+// lies no nearer.
+static double bench_bandwidth(int json, gsf_cpu_level level, int threads, double bytes) {
+    int size = SWEEP_SMALLEST;
+    while (size < SWEEP_LARGEST && (double)((size_t)2 << size) <= 0.5 * bytes) size++;
+    return bench_sweep_rate(json, level, threads, size);
+}
+
+// ---- rows ----------------------------------------------------------------------------
+
+// Shares are of the limits by the clock; cpu_... ones make rates by CPU time of rates by the clock, for machines that do
+// other things as well. What has no limit has no share.
+typedef struct bench_shares { double peak, bandwidth, cpu_bandwidth; const char* of; } bench_shares;
+
+static bench_shares bench_shares_of(int json, const bench_row* row, double cpu) {
+    bench_shares s = {0.0, row->bandwidth, row->cpu_bandwidth, "FMA"};
+    const bench_peak* peak = bench_peak_of(row->isa, row->threads);
+    const int bf16 = strcmp(row->variant, BENCH_BF16) == 0;
+    const double limit = row->ops > 0.0 ? peak->ops : bf16 ? peak->bf16 : peak->flops;
+    if (row->ops > 0.0) s.of = "integer";
+    else if (bf16) s.of = "bf16";
+    if (limit > 0.0) s.peak = (row->ops > 0.0 ? row->ops : row->flops) / row->seconds / limit;
+    if (row->bytes > 0.0 && s.bandwidth <= 0.0) {
+        s.bandwidth = row->bytes / row->seconds / bench_bandwidth(json, bench_level_of(row->isa), row->threads, row->bytes);
+        s.cpu_bandwidth = cpu * s.bandwidth;
+    }
+    return s;
+}
+
+static void bench_print(int json, const bench_row* row) {
+    const double rate = row->seconds > 0.0 ? row->work / row->seconds : 0.0;
+    const double cpu = row->cpu_seconds > 0.0 ? row->seconds * row->threads / row->cpu_seconds : 0.0;
+    const bench_shares share = bench_shares_of(json, row, cpu);
+    if (json) {
+        printf("{\"bench\":\"" BENCH_NAME "\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
+               "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
+               row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
+               rate, row->reference);
+        if (share.peak > 0.0)
+            printf(",\"peak\":\"%s\",\"peak_share\":%.4g,\"cpu_peak_share\":%.4g", share.of, share.peak, cpu * share.peak);
+        if (row->bytes > 0.0)
+            printf(",\"bytes\":%.6g,\"bandwidth_share\":%.4g,\"cpu_bandwidth_share\":%.4g", row->bytes, share.bandwidth,
+                   share.cpu_bandwidth);
+        if (row->peak_rss > 0.0) printf(",\"peak_rss_bytes\":%.0f", row->peak_rss);
+        if (row->error_max >= 0.0) printf(",\"error_max\":%.3g,\"error_rel_l2\":%.3g", row->error_max, row->error_rel_l2);
+        printf("}\n");
+    } else {
+        printf("%-44s %-8s %-6s %d thr %9.3f ms %9.3f ms cpu %9.4g %s/s", row->name, row->variant, row->isa, row->threads,
+               1e3 * row->seconds, 1e3 * row->cpu_seconds, rate, row->work_unit);
+        if (share.peak > 0.0)
+            printf("  %.1f%% (cpu %.1f%%) of the %s peak", 100.0 * share.peak, 100.0 * cpu * share.peak, share.of);
+        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * share.bandwidth, 100.0 * share.cpu_bandwidth);
+        if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
+        if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
+        printf("\n");
+    }
+    fflush(stdout);
 }
 
 #endif

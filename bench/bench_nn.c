@@ -3,10 +3,11 @@
 //
 //     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] [--model FOLDER | --pipeline FOLDER...]
 //
-// First what the machine can do (multiply-adds per second, bytes read per second), then every kernel at the sizes of the
-// released model and at a small one, for each instruction set, one and two threads. Shares are of the rates of all threads
-// together that the first rows show; those of layers of few rows, which cycle through 1 GiB of weights, of reading the same
-// memory between their rounds. Errors are against sums in double, for large shapes of some rows. bench/peers_nn.py
+// First what the machine can do (multiply-adds, dot products of integers and of bf16 per second; bytes per second of a sweep
+// over so many, measured where first needed), then every kernel at the sizes of the released model and at a small one, for
+// each instruction set, one and two threads. Shares are of what the same instructions and threads reach at most, in memory as
+// large as the case's; those of layers of few rows, which cycle through 1 GiB of weights, of reading the same memory between
+// their rounds. Errors are against sums in double, for large shapes of some rows. bench/peers_nn.py
 // runs PyTorch on the same cases, which it reads from their names.
 // Seconds are the median; cpu_seconds, the process' CPU time of all threads, is the least of the rounds. Peaks are by CPU
 // time, too: on a machine that does other things as well, cpu_peak_share is the figure to look at.
@@ -42,75 +43,19 @@ static int bench_wanted(const bench_options* o, const char* name, int threads) {
 
 // ---- what the machine can do ----------------------------------------------------
 
-enum { READ_CHUNK = 1 << 18 }; // bytes
-
-typedef struct bench_read {
-    const char* memory;
-    size_t size; // a multiple of READ_CHUNK
-    float* sums; // 16 of each chunk
-} bench_read;
-
-static void bench_read_scalar(void* arg, size_t chunk, int worker) {
-    const bench_read* job = (const bench_read*)arg;
-    const char* p = job->memory + chunk * READ_CHUNK;
-    uint64_t a = 0, b = 0;
-    (void)worker;
-    for (int i = 0; i < READ_CHUNK; i += 16) {
-        uint64_t v[2];
-        memcpy(v, p + i, sizeof v);
-        a ^= v[0];
-        b ^= v[1];
-    }
-    job->sums[16 * chunk] = (float)(a ^ b);
-}
-
-#if GSF__X86
-GSF__TARGET_AVX2 static void bench_read_avx2(void* arg, size_t chunk, int worker) {
-    const bench_read* job = (const bench_read*)arg;
-    const float* p = (const float*)(const void*)(job->memory + chunk * READ_CHUNK);
-    __m256 a = _mm256_setzero_ps(), b = a, c = a, d = a;
-    (void)worker;
-    for (int i = 0; i < READ_CHUNK / 4; i += 32) {
-        a = _mm256_xor_ps(a, _mm256_load_ps(p + i));
-        b = _mm256_xor_ps(b, _mm256_load_ps(p + i + 8));
-        c = _mm256_xor_ps(c, _mm256_load_ps(p + i + 16));
-        d = _mm256_xor_ps(d, _mm256_load_ps(p + i + 24));
-    }
-    _mm256_storeu_ps(job->sums + 16 * chunk, _mm256_xor_ps(_mm256_xor_ps(a, b), _mm256_xor_ps(c, d)));
-}
-
-GSF__TARGET_AVX512 static void bench_read_avx512(void* arg, size_t chunk, int worker) {
-    const bench_read* job = (const bench_read*)arg;
-    const float* p = (const float*)(const void*)(job->memory + chunk * READ_CHUNK);
-    __m512 a = _mm512_setzero_ps(), b = a, c = a, d = a;
-    (void)worker;
-    for (int i = 0; i < READ_CHUNK / 4; i += 64) {
-        a = _mm512_xor_ps(a, _mm512_load_ps(p + i));
-        b = _mm512_xor_ps(b, _mm512_load_ps(p + i + 16));
-        c = _mm512_xor_ps(c, _mm512_load_ps(p + i + 32));
-        d = _mm512_xor_ps(d, _mm512_load_ps(p + i + 48));
-    }
-    _mm512_storeu_ps(job->sums + 16 * chunk, _mm512_xor_ps(_mm512_xor_ps(a, b), _mm512_xor_ps(c, d)));
-}
-#endif
-
-static void bench_read_all(gsf_context* ctx, bench_read* job) {
-    gsf_chunk_fn reader = bench_read_scalar;
-#if GSF__X86
-    if (ctx->cpu_level >= GSF_CPU_AVX2) reader = bench_read_avx2;
-    if (ctx->cpu_level >= GSF_CPU_AVX512) reader = bench_read_avx512;
-#endif
-    gsf__parallel_for(ctx, job->size / READ_CHUNK, reader, job);
-    bench_sink += job->sums[0];
-}
-
-// `memory` of `size` bytes; free `sums`.
-static bench_read bench_make_read(gsf_context* ctx, const char* memory, size_t size) {
-    bench_read read;
+// Reading `size` bytes of `memory` once.
+static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t size) {
+    bench_sweep read;
+    memset(&read, 0, sizeof read);
     read.memory = memory;
-    read.size = size / READ_CHUNK * READ_CHUNK;
-    read.sums = (float*)bench_alloc(ctx, size / READ_CHUNK + 16, 16 * sizeof(float));
+    read.part = size / (size_t)ctx->threads / 512 * 512;
+    read.passes = 1;
     return read;
+}
+
+static void bench_read_all(gsf_context* ctx, bench_sweep* read) {
+    gsf__parallel_for(ctx, (size_t)ctx->threads, bench_sweep_of(ctx->cpu_level), read);
+    bench_sink += read->sums[0];
 }
 
 // Integers: a dot product per step in each 32-bit lane, of four bytes where there are instructions for it, else of pairs.
@@ -158,55 +103,46 @@ GSF__TARGET_VNNI static void bench_dot_vnni(void* arg, size_t chunk, int worker)
     }
     BENCH_STORE_INTEGERS
 }
+
+GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int worker) { // of pairs, in each 32-bit lane
+    const __m512bh a = (__m512bh)_mm512_set1_epi16(0x3f80);
+    (void)worker;
+#define BENCH_WIDE_PAIRS(k) __m512 v##k = _mm512_set1_ps((float)k), w##k = _mm512_set1_ps((float)k + 32.0f);
+    BENCH_TEN(BENCH_WIDE_PAIRS)
+    for (int i = 0; i < FMA_ROUNDS / 2; i++) { // latency is longer than that of multiply-adds: twice the chains
+#define BENCH_PAIRS_STEP(k) v##k = _mm512_dpbf16_ps(v##k, a, a); w##k = _mm512_dpbf16_ps(w##k, a, a);
+        BENCH_TEN(BENCH_PAIRS_STEP)
+    }
+    v0 = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;
+    _mm512_storeu_ps((float*)arg + 16 * chunk, v0 + w0 + w1 + w2 + w3 + w4 + w5 + w6 + w7 + w8 + w9);
+}
 #endif
 
-static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* products) { // multiplications per step; NULL: none
+static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* ops) { // ops: of a step; NULL: no instructions
 #if GSF__X86
-    *products = level >= GSF_CPU_AVX512_VNNI ? 64.0 : level >= GSF_CPU_AVX512 ? 32.0 : 16.0;
+    *ops = level >= GSF_CPU_AVX512_VNNI ? 128.0 : level >= GSF_CPU_AVX512 ? 64.0 : 32.0;
     if (level >= GSF_CPU_AVX512_VNNI) return bench_dot_vnni;
     if (level >= GSF_CPU_AVX512) return bench_dot_avx512;
     if (level >= GSF_CPU_AVX2) return bench_dot_avx2;
 #endif
     (void)level;
-    *products = 0.0;
+    *ops = 0.0;
     return NULL;
 }
 
-static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads, const char* memory, size_t size) {
+static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads) {
     gsf_context ctx;
+    double work;
     if (!bench_context(&ctx, level, threads)) return;
-    bench_read read = bench_make_read(&ctx, memory, size);
-    double lanes, products;
-    const gsf_chunk_fn fma = bench_fma_of(level, &lanes), dot = bench_dot_of(level, &products);
-    double best[3] = {1e30, 1e30, 1e30}; // CPU seconds
-    for (int i = 0; i < 9; i++) {
-        const double t0 = bench_cpu();
-        gsf__parallel_for(&ctx, 4 * (size_t)threads, fma, read.sums);
-        const double t1 = bench_cpu();
-        bench_read_all(&ctx, &read);
-        const double t2 = bench_cpu();
-        if (t1 - t0 < best[0]) best[0] = t1 - t0;
-        if (t2 - t1 < best[1]) best[1] = t2 - t1;
-        if (!dot) continue;
-        gsf__parallel_for(&ctx, 4 * (size_t)threads, dot, read.sums);
-        const double t3 = bench_cpu();
-        if (t3 - t2 < best[2]) best[2] = t3 - t2;
-    }
-    const double steps = FMA_CHAINS * (double)FMA_ROUNDS * 4.0 * threads, flops = 2.0 * lanes * steps;
     bench_peak* peak = &bench_peaks[level][threads];
-    peak->flops = flops * threads / best[0];
-    peak->ops = dot ? 2.0 * products * steps * threads / best[2] : 0.0;
-    peak->bytes = (double)size * threads / best[1];
-    bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0] / threads, best[0], flops, "flop");
-    bench_print(o->json, &row);
-    if (dot) {
-        row = bench_make_row("machine: integer dot products", level, threads, best[2] / threads, best[2],
-                             2.0 * products * steps, "op");
-        bench_print(o->json, &row);
-    }
-    row = bench_make_row("machine: read memory", level, threads, best[1] / threads, best[1], (double)size, "B");
-    bench_print(o->json, &row);
-    gsf_free(&ctx, read.sums);
+    const gsf_chunk_fn fma = bench_fma_of(level, &work);
+    peak->flops = bench_peak_rate(o->json, &ctx, "machine: multiply-add", fma, work, "flop");
+    const gsf_chunk_fn dot = bench_dot_of(level, &work);
+    if (dot) peak->ops = bench_peak_rate(o->json, &ctx, "machine: integer dot products", dot, work, "op");
+#if GSF__X86
+    if (level >= GSF_CPU_AVX512_BF16)
+        peak->bf16 = bench_peak_rate(o->json, &ctx, "machine: bf16 dot products", bench_dot_bf16, 64.0, "flop");
+#endif
 }
 
 // ---- time ------------------------------------------------------------------------
@@ -217,7 +153,7 @@ typedef void (*bench_body)(gsf_context* ctx, void* arg);
 // With `read`, that memory is read before each round, and the row's bandwidth is its share of what that gave: other tenants
 // of the machine's memory come and go, and meet both alike.
 static void bench_time_beside(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
-                              double repeats, bench_read* read) {
+                              double repeats, bench_sweep* read) {
     enum { MOST = 101 };
     double wall[MOST], cpu[MOST], share[MOST], cpu_share[MOST];
     const double start = bench_now(), budget = o->quick ? 0.3 : read ? 3.0 : 1.5;
@@ -236,7 +172,7 @@ static void bench_time_beside(const bench_options* o, gsf_context* ctx, bench_ro
         rounds++;
     }
     row->seconds = bench_median(wall, (size_t)rounds);
-    const double part = read ? row->bytes * repeats / (double)read->size : 0.0;
+    const double part = read ? row->bytes * repeats / ((double)read->part * ctx->threads) : 0.0;
     row->bandwidth = part * bench_median(share, (size_t)rounds);
     row->cpu_bandwidth = part * bench_median(cpu_share, (size_t)rounds);
     qsort(cpu, (size_t)rounds, sizeof *cpu, bench_compare);
@@ -316,7 +252,6 @@ static void bench_linear_error(const bench_linear* l, const float* w, const floa
 }
 
 // Products of bf16 pairs are a variant of their own where the processor has instructions for them.
-#define BENCH_BF16 "bf16 products"
 static int bench_has_bf16(const bench_options* o, gsf_nn_dtype weights) {
     return o->level >= GSF_CPU_AVX512_BF16 && weights == GSF_NN_BF16;
 }
@@ -365,9 +300,8 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     if (few) row.bytes = (double)bytes;
     else row.flops = flops;
     if (bf16) row.variant = BENCH_BF16;
-    bench_read read = bench_make_read(&ctx, memory, (size_t)l.copies * bytes);
+    bench_sweep read = bench_make_read(&ctx, memory, (size_t)l.copies * bytes);
     bench_time_beside(o, &ctx, &row, bench_run_linear, &l, (double)l.copies, few ? &read : NULL);
-    gsf_free(&ctx, read.sums);
     l.copies = 1;
     bench_run_linear(&ctx, &l);
     float* wide = (float*)bench_alloc(&ctx, (size_t)(in * out), sizeof(float));
@@ -469,10 +403,9 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
         many.linear.copies = (int64_t)(size / l.weight.bytes);
         for (int64_t i = 0; i < many.linear.copies; i++)
             memcpy(memory + (size_t)i * l.weight.bytes, l.weight.data, l.weight.bytes);
-        bench_read read = bench_make_read(&ctx, memory, (size_t)many.linear.copies * l.weight.bytes);
+        bench_sweep read = bench_make_read(&ctx, memory, (size_t)many.linear.copies * l.weight.bytes);
         row.bytes = bytes;
         bench_time_beside(o, &ctx, &row, bench_run_int8, &many, (double)many.linear.copies, &read);
-        gsf_free(&ctx, read.sums);
     } else {
         row.ops = ops;
         bench_time(o, &ctx, &row, bench_run_int8, &l, 1.0);
@@ -673,7 +606,7 @@ static void bench_one_rows(const bench_options* o, gsf_cpu_level level, int thre
     double *expected = (double*)bench_alloc(&ctx, (size_t)looks, sizeof(double)), square = 0.0;
     const double bytes = 2.0 * (double)count * sizeof(float); // read once, written once
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, bytes, "B");
-    if (count > 1 << 22) row.bytes = bytes; // else the caches hold them
+    row.bytes = bytes;
     memcpy(b.y, b.x, count * sizeof(float)); // head norm works in place
     bench_run_rows(&ctx, &b);
     bench_expect_rows(&b, looks, expected);
@@ -1701,7 +1634,7 @@ int main(int argc, char** argv) {
     bench_fill(memory, size, GSF_NN_F32, 1);
     for (int threads = 1; threads <= 2; threads++) {
         if (o.threads && o.threads != threads) continue;
-        BENCH_EACH(level) bench_machine(&o, level, threads, memory, size);
+        BENCH_EACH(level) bench_machine(&o, level, threads);
     }
     if (o.model || o.pipeline_count) {
         gsf_free(&ctx, memory);

@@ -4,10 +4,11 @@
 //     bench_splat [--json] [--quick] [--filter TEXT] [--threads N] [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]
 //     bench_splat --growth [--json]
 //
-// Without a scene: what the machine can do (multiply-adds per second, bytes per second), then for made-up splats at several
-// sizes, each instruction set and one and two threads: every stage of a training step by itself, and render and backward
-// whole, against the double-precision reference of tests/reference_splat.h where that is affordable. A pair is a splat and a
-// pixel that it is blended into. Shares are of the rates of all threads together that the first rows show.
+// Without a scene: what the machine can do (multiply-adds per second; bytes per second of a sweep over so many, measured
+// where first needed), then for made-up splats at several sizes, each instruction set and one and two threads: every stage
+// of a training step by itself, and render and backward whole, against the double-precision reference of
+// tests/reference_splat.h where that is affordable. A pair is a splat and a pixel that it is blended into. Shares are of
+// what the same instructions and threads reach at most, in memory as large as the case's.
 // With a scene: whole training steps (render, loss, backward, Adam; density control off) on its photos. --views names a
 // text file of image names, one per line; --start a PLY to begin with instead of the scene's points. The first 5 steps
 // warm up; the median, and the process' CPU seconds per step, are over the rest.
@@ -34,44 +35,12 @@ static void bench_show(const bench_options* o, const bench_row* row) {
 
 // ---- what the machine can do ----------------------------------------------------
 
-enum { TRIAD_CHUNKS = 32, TRIAD_FLOATS = 1 << 18 }; // 3 arrays of 32 MiB
-
-static void bench_triad(void* arg, size_t chunk, int worker) {
-    float *a = (float*)arg + chunk * TRIAD_FLOATS, *b = a + (size_t)TRIAD_CHUNKS * TRIAD_FLOATS;
-    const float* c = b + (size_t)TRIAD_CHUNKS * TRIAD_FLOATS;
-    (void)worker;
-    for (size_t i = 0; i < TRIAD_FLOATS; i++) a[i] = b[i] + 0.5f * c[i];
-}
-
 static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads) {
     gsf_context ctx;
+    double flops;
     if (!bench_context(&ctx, level, threads)) return;
-    const size_t floats = 3 * (size_t)TRIAD_CHUNKS * TRIAD_FLOATS;
-    float* memory = (float*)bench_alloc(&ctx, floats, sizeof(float));
-    memset(memory, 0, floats * sizeof(float));
-    double lanes;
-    const gsf_chunk_fn fma = bench_fma_of(level, &lanes);
-    double best[2] = {1e30, 1e30};
-    for (int i = 0; i < 5; i++) {
-        const double t0 = bench_now();
-        gsf__parallel_for(&ctx, 2 * (size_t)threads, fma, memory);
-        const double t1 = bench_now();
-        gsf__parallel_for(&ctx, TRIAD_CHUNKS, bench_triad, memory);
-        const double t2 = bench_now();
-        if (t1 - t0 < best[0]) best[0] = t1 - t0;
-        if (t2 - t1 < best[1]) best[1] = t2 - t1;
-        bench_sink += memory[0];
-    }
-    const double flops = 2.0 * lanes * FMA_CHAINS * FMA_ROUNDS * 2.0 * threads;
-    const double bytes = 3.0 * (double)TRIAD_CHUNKS * TRIAD_FLOATS * sizeof(float);
-    bench_peak* peak = &bench_peaks[level][threads];
-    peak->flops = flops / best[0];
-    peak->bytes = bytes / best[1];
-    bench_row row = bench_make_row("machine: multiply-add", level, threads, best[0], best[0] * threads, flops, "flop");
-    bench_show(o, &row);
-    row = bench_make_row("machine: memory", level, threads, best[1], best[1] * threads, bytes, "B");
-    bench_show(o, &row);
-    gsf_free(&ctx, memory);
+    const gsf_chunk_fn fma = bench_fma_of(level, &flops);
+    bench_peaks[level][threads].flops = bench_peak_rate(o->json, &ctx, "machine: multiply-add", fma, flops, "flop");
 }
 
 // ---- made-up splats -------------------------------------------------------------

@@ -250,7 +250,8 @@ def percent(row, key):
 def splat_sections(lines, rows, stress, has_growth):
     peaks = [r for r in rows if r["case"].startswith("machine: ")]
     lines += ["## The machine", "",
-              "What the bench itself reaches: chained multiply-adds, and a sum of two arrays into a third.", ""]
+              "What the bench itself reaches: chained multiply-adds, and the fastest of four sweeps over so much memory "
+              "(reading; reading and writing in place; copying through the caches or past them).", ""]
     table(lines, ["", "instructions", "threads", "per second"],
           [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
     lines += ["## Whole renders against double precision", "",
@@ -261,8 +262,9 @@ def splat_sections(lines, rows, stress, has_growth):
             "%.0f" % (1e-6 * r["rate"]), "%.2g" % r["error_max"], "%.2g" % r["error_rel_l2"]]
            for r in rows if r["case"].startswith(("forward", "backward"))])
     lines += ["## Stages of a training step", "", "![Share of each stage](stages.svg)", "",
-              "Shares are of what the machine reaches above with as many threads: floating-point operations as the kernels' "
-              "source has them, bytes as each stage must move at least were its caches cold.", ""]
+              "Shares are of what the machine reaches above with the same instructions and threads: floating-point operations "
+              "as the kernels' source has them; bytes as each stage must move at least were its caches cold, beside a sweep "
+              "over as much memory as it must touch, or less.", ""]
     table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M/s", "FMA peak", "bandwidth"],
           [[r["case"], r["isa"], str(r["threads"]), ms(r["seconds"]), ms(r["cpu_seconds"]),
             "%s %s" % (short(1e-6 * r["rate"]), r["work_unit"]), percent(r, "peak_share"), percent(r, "bandwidth_share")]
@@ -333,11 +335,12 @@ def nn_sections(lines, rows, has_pipeline):
     kernels = [r for r in rows if "ratio" not in r and not r["case"].startswith(("machine: ", "pipeline: ", "model: "))]
     lines += ["## Kernels of the video model and its encoders", "",
               "What the same run reaches without any kernel: chained multiply-adds, dot products of integers (of bytes where "
-              "there are instructions for that, else of 16 bits), reading.", ""]
+              "there are instructions for that, else of 16 bits) and of bf16, sweeps over memory as above.", ""]
     table(lines, ["", "instructions", "threads", "per second"],
           [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
     lines += ["At the released model's sizes, the smallest cases at every level of instructions. Shares are of the peaks "
-              "above: 8-bit layers' of the integers, all others' of the multiply-adds, which products of bf16 can exceed. "
+              "above: 8-bit layers' of the integers', products of bf16 of theirs, all others' of the multiply-adds'; bandwidth "
+              "of a sweep over as much memory, or, where few rows cycle through 1 GiB of weights, of reading it between rounds. "
               "Errors are against sums in double. The last column is PyTorch's seconds divided by ours, timed in turns in "
               "the same run (`bench/peers_nn.py`): in float32, beside our products of bf16 in bf16. It keeps the memory of "
               "its results there; getting new pages for every large one takes it up to five times as long.", ""]
@@ -391,6 +394,10 @@ def main():
     has_pipeline = write_pipeline(os.path.join(sys.argv[2], "pipeline.svg"), rows)
     write_markdown(os.path.join(sys.argv[2], "RESULTS.md"), rows, [row for row in all_rows if "test" in row], has_growth,
                    has_pipeline)
+    above = ["%s, %s, %s, %d threads: %.0f %% of the %s" % (r["case"], r["variant"], r["isa"], r["threads"], 100.0 * r[key], what)
+             for r in rows for key, what in (("peak_share", "peak"), ("bandwidth_share", "bandwidth")) if r.get(key, 0.0) > 1.02]
+    if above:
+        sys.exit("results: a limit that is exceeded is none:\n  " + "\n  ".join(above))
 
 
 if __name__ == "__main__":
