@@ -1,14 +1,29 @@
 #!/usr/bin/env python3
-"""Held-out quality of `gsfix fix`: arms x view counts x seeds, paired.
+"""Held-out quality of `gsfix fix`: starts x view counts x arms x seeds, paired by seed.
 
-    bench/quality.py --gsfix build/gsfix --scene SCENE --out DIR [--views 3,6,9] [--seeds 5] [--jobs 2]
-                     [--model SPLATS.ply] [--arm NAME="ARGS" ...] [--common "ARGS"] [--size "ARGS"]
+    bench/quality.py --gsfix build/gsfix --scene SCENE --out DIR [--starts tracks,default] [--views 3,6,9] [--seeds 5]
+                     [--iterations 1200] [--jobs 1] [--opensplat PROGRAM] [--model SPLATS.ply] [--arm NAME="ARGS" ...]
+                     [--common "ARGS"] [--size "ARGS"] [--tables]
 
-Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`; runs that DIR already holds are not repeated. --model
-is a model of all views (made first if not given): it fixes which pixels of each test view count as seen. --size is what
-masks and runs have in common, as "--max-size 240". Writes DIR/quality.csv and DIR/quality.md: means per arm, and the mean
-differences to the arm before and to the first one, with their standard errors over the seeds. Only the standard library
-is needed.
+Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`. The starts:
+
+    tracks    the points that a training photo tracks, as the papers have it (--init tracks)
+    default   what gsfix fix does unless told otherwise: below 6 photos also the points that a ray from a training photo
+              meets, from 6 on those and stereo between the training photos. Rays keep points that only held-out photos
+              tracked: where all photos made the model, that is a leak in a comparison and a gift in practice.
+
+In both, poses and the points' places come from the model that SCENE holds. --opensplat adds OpenSplat's command line
+program (1.2.0) as a peer: it gets a COLMAP folder of the training photos alone with the start's points (of the default
+those by track or ray), as many steps, one thread, and the same black background; `gsfix render` and `gsfix metrics` measure
+its splats on the same pixels. Its random numbers have a fixed seed, hence one run. `OpenSplat` has its own schedule: from
+half of the steps on it moves splats only every 32nd, then every 64th step. `OpenSplat+` moves them at every step,
+densifies every 100 and adds a band of SH every 300 steps, which a run as short as these gains from.
+
+--model is a model of all views (made first if not given): it fixes which pixels of each test view count as seen. --size is
+what masks and runs have in common, as "--max-size 240" (not with a peer). Each run leaves result.json and is not repeated;
+a call that was stopped goes on, and K = 3 comes first. DIR/quality.csv has a row for every run, DIR/quality.md the means and
+the paired differences with their standard errors; --tables writes them of what there is and runs nothing. CPU seconds are
+those of the whole program. Only the standard library is needed.
 """
 import argparse
 import concurrent.futures
@@ -17,6 +32,8 @@ import json
 import math
 import os
 import shlex
+import shutil
+import struct
 import subprocess
 import sys
 
@@ -25,15 +42,39 @@ DEFAULT_ARMS = [
     ("none", "--restorer none --regularize on"),
     ("warp", "--restorer warp --regularize on"),
 ]
+STARTS = {"tracks": ("--init tracks", "tracks"), "default": ("", "both")}  # of fix; of filter, for the peer
+PEER_ARMS = [("OpenSplat", ""),
+             ("OpenSplat+", "--densify-from 100 --densify-until {steps} --refine-every 100 --sh-degree-interval 300")]
 FIGURES = ("psnr", "ssim", "psnr_seen", "ssim_seen")
 
 
-def run(command):
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    if done.returncode != 0:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        sys.exit("failed (%d): %s\n  %s" % (done.returncode, " ".join(command), last))
-    return done.stdout
+def run(command, environment=None):
+    """Standard output and CPU seconds."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        errors = pool.submit(process.stderr.read)
+        text = process.stdout.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        errors = errors.result()
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if status != 0:
+        sys.exit("failed (%d): %s\n  %s" % (process.returncode, " ".join(command),
+                                            (errors.strip().splitlines() or ["no message"])[-1]))
+    return text, usage.ru_utime + usage.ru_stime
+
+
+def read_json(path):
+    try:
+        with open(path) as file:
+            return json.load(file)
+    except OSError:
+        return None
+
+
+def write_json(path, value):
+    with open(path + ".part", "w") as file:
+        json.dump(value, file)
+    os.rename(file.name, path)
 
 
 def mean_and_error(values):
@@ -44,15 +85,179 @@ def mean_and_error(values):
     return mean, math.sqrt(sum((v - mean) ** 2 for v in values) / (n - 1) / n)
 
 
-def fix(options, views, seed, arm, extra):
-    out = os.path.join(options.out, "K%s" % views, arm, "seed%d" % seed)
-    metrics = os.path.join(out, "metrics.json")
-    if not os.path.exists(metrics):
-        command = [options.gsfix, "fix", options.scene, "--out", out, "--views", str(views), "--seed", str(seed),
-                   "--threads", "1", "--masks", os.path.join(options.out, "masks_K%s" % views)]
-        run(command + shlex.split(options.size) + shlex.split(options.common) + shlex.split(extra))
-    with open(metrics) as file:
-        return json.load(file)
+def mean_of(rows, figure):
+    values = [row[figure] for row in rows if row.get(figure) is not None]
+    return sum(values) / len(values) if values else float("nan")
+
+
+# ---- the runs ------------------------------------------------------------------------
+
+def folder_of(options, job):
+    start, views, arm, seed = job
+    return os.path.join(options.out, start, "K%s" % views, arm, "seed%d" % seed)
+
+
+def masks_of(options, views):
+    return os.path.join(options.out, "masks_K%s" % views)
+
+
+def result_of(options, job):
+    return read_json(os.path.join(folder_of(options, job), "result.json"))
+
+
+def fix(options, job, extra):
+    start, views, _, seed = job
+    out = folder_of(options, job)
+    command = [options.gsfix, "fix", options.scene, "--out", out, "--views", views, "--seed", str(seed), "--threads", "1",
+               "--iterations", str(options.iterations), "--masks", masks_of(options, views)]
+    command += shlex.split(STARTS[start][0]) + shlex.split(options.size) + shlex.split(options.common) + shlex.split(extra)
+    _, cpu = run(command)
+    metrics = read_json(os.path.join(out, "metrics.json"))
+    row = {figure: metrics.get(figure) for figure in FIGURES}
+    row.update(points=metrics["switches"]["initial_splats"],
+               splats=metrics["splats"], cpu_seconds=cpu)
+    return row
+
+
+def training_scene(options, start, views, out):
+    """A COLMAP folder with the training photos alone and the start's points; the number of points."""
+    text, _ = run([options.gsfix, "filter", options.scene, "--views", views, "--method", STARTS[start][1], "--out", out,
+                   "--json"])
+    kept = json.loads(text)["kept"]
+    path = os.path.join(out, "sparse", "0", "images.bin")
+    with open(path, "rb") as file:
+        data = file.read()
+    train = set(split_of(options, views)["train"])
+    at, records = 8, []
+    for _ in range(struct.unpack_from("<Q", data)[0]):  # id, pose, camera; name; number of 2D points; those: x, y, id
+        end = data.index(b"\0", at + 64) + 1
+        points = struct.unpack_from("<Q", data, end)[0]
+        name = data[at + 64:end - 1].decode()
+        if name in train:
+            records.append(data[at:end] + struct.pack("<Q", 0))
+            link = os.path.join(out, "images", name)
+            os.makedirs(os.path.dirname(link), exist_ok=True)
+            os.symlink(os.path.abspath(os.path.join(options.scene, "images", name)), link)
+        at = end + 8 + 24 * points
+    if len(records) != len(train):
+        sys.exit("%s: %d of %d training photos" % (path, len(records), len(train)))
+    with open(path, "wb") as file:
+        file.write(struct.pack("<Q", len(records)) + b"".join(records))
+    return kept
+
+
+def split_of(options, views):
+    return json.loads(run([options.gsfix, "info", options.scene, "--views", views, "--json"])[0])
+
+
+def train_peer(options, job, extra, out, ply):
+    start, views, _, _ = job
+    shutil.rmtree(os.path.join(out, "scene"), ignore_errors=True)
+    points = training_scene(options, start, views, os.path.join(out, "scene"))
+    command = [options.opensplat, os.path.join(out, "scene"), "-n", str(options.iterations), "-o", ply]
+    _, cpu = run(command + shlex.split(extra.format(steps=options.iterations)), dict(os.environ, OMP_NUM_THREADS="1"))
+    return {"points": points, "cpu_seconds": cpu}
+
+
+def peer(options, job, extra):
+    views, out = job[1], folder_of(options, job)
+    ply, renders, trained = (os.path.join(out, name) for name in ("splats.ply", "renders", "trained.json"))
+    if not read_json(trained):
+        write_json(trained, train_peer(options, job, extra, out, ply))
+    shutil.rmtree(renders, ignore_errors=True)
+    run([options.gsfix, "render", ply, "--scene", options.scene, "--out", renders, "--threads", "1"])
+    text, _ = run([options.gsfix, "metrics", renders, os.path.join(options.scene, "images"), "--masks",
+                   masks_of(options, views), "--json"])
+    test = {os.path.splitext(name)[0] for name in split_of(options, views)["test"]}
+    rows = [image for image in json.loads(text)["per_image"] if image["name"] in test]
+    if len(rows) != len(test):
+        sys.exit("%s: %d of %d held-out views" % (renders, len(rows), len(test)))
+    info, _ = run([options.gsfix, "info", ply, "--json"])
+    return dict(read_json(trained), psnr=mean_of(rows, "psnr"), ssim=mean_of(rows, "ssim_3dgs"),
+                psnr_seen=mean_of(rows, "psnr_seen"), ssim_seen=mean_of(rows, "ssim_3dgs_seen"),
+                splats=json.loads(info)["splats"])
+
+
+def work(options, job, body, extra):
+    out = folder_of(options, job)
+    if result_of(options, job) is None:
+        if body is fix:
+            shutil.rmtree(out, ignore_errors=True)  # what a stopped call left
+        os.makedirs(out, exist_ok=True)
+        write_json(os.path.join(out, "result.json"), body(options, job, extra))
+    return result_of(options, job)
+
+
+def prepare(options):
+    model = options.model or os.path.join(options.out, "all", "splats.ply")
+    if not os.path.exists(model):
+        shutil.rmtree(os.path.dirname(model), ignore_errors=True)
+        run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--views", "all", "--restorer", "none",
+             "--regularize", "off", "--seed", "1", "--iterations", str(options.iterations), "--threads", str(options.jobs)])
+    for views in options.views:
+        masks = masks_of(options, views)
+        if not os.path.isdir(masks):
+            shutil.rmtree(masks + ".part", ignore_errors=True)
+            run([options.gsfix, "masks", options.scene, "--views", views, "--model", model, "--out", masks + ".part"] +
+                shlex.split(options.size))
+            os.rename(masks + ".part", masks)
+
+
+# ---- the tables ----------------------------------------------------------------------
+
+def start_tables(options, start, arms, lines):
+    rows = {}  # (views, arm): {seed: result}
+    for views in options.views:
+        for arm, _, seeds in arms:
+            found = {seed: result_of(options, (start, views, arm, seed)) for seed in seeds}
+            rows[views, arm] = {seed: row for seed, row in found.items() if row}
+    if not any(rows.values()):
+        return rows
+    lines += ["### Start: %s" % start, "",
+              "| K | start | arm | points | PSNR | SSIM | PSNR seen | SSIM seen | splats | CPU seconds | runs |",
+              "|---|---|---|---|---|---|---|---|---|---|---|"]
+    for views in options.views:
+        for arm, _, _ in arms:
+            done = list(rows[views, arm].values())
+            if done:
+                lines.append("| %s | %s | %s | %d | %s | %.0f | %.0f | %d |" % (
+                    views, start, arm, mean_of(done, "points"), " | ".join("%.3f" % mean_of(done, f) for f in FIGURES),
+                    mean_of(done, "splats"), mean_of(done, "cpu_seconds"), len(done)))
+    names = [arm for arm, _, seeds in arms if len(seeds) > 1]
+    pairs = list(zip(names[1:], names)) + [(name, names[0]) for name in names[2:]]
+    differences = []
+    for views in options.views:
+        for better, worse in pairs:
+            a, b = rows[views, better], rows[views, worse]
+            both = sorted(set(a) & set(b))
+            if len(both) < 2:
+                continue
+            cells = []
+            for figure in ("psnr", "psnr_seen", "ssim_seen"):
+                values = [a[s][figure] - b[s][figure] for s in both if None not in (a[s][figure], b[s][figure])]
+                cells.append("%+.3f +- %.3f" % mean_and_error(values) if len(values) > 1 else "-")
+            differences.append("| %s | %s | %s - %s | %s | %d |" % (views, start, better, worse, " | ".join(cells), len(both)))
+    if differences:
+        lines += ["", "Paired by seed, mean +- standard error:", "",
+                  "| K | start | difference | PSNR | PSNR seen | SSIM seen | pairs |", "|---|---|---|---|---|---|---|"]
+    lines += differences + [""]
+    return rows
+
+
+def write_tables(options, arms):
+    lines = []
+    with open(os.path.join(options.out, "quality.csv"), "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(("start", "views", "arm", "seed") + FIGURES + ("points", "splats", "cpu_seconds"))
+        for start in options.starts:
+            for (views, arm), found in start_tables(options, start, arms, lines).items():
+                for seed, row in found.items():
+                    table.writerow([start, views, arm, seed] +
+                                   [row.get(f) for f in FIGURES + ("points", "splats", "cpu_seconds")])
+    text = "\n".join(lines)
+    with open(os.path.join(options.out, "quality.md"), "w") as file:
+        file.write(text)
+    return text
 
 
 def main():
@@ -60,72 +265,43 @@ def main():
     parser.add_argument("--gsfix", default="build/gsfix")
     parser.add_argument("--scene", required=True)
     parser.add_argument("--out", required=True)
+    parser.add_argument("--starts", default="tracks,default")
     parser.add_argument("--views", default="3,6,9")
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--iterations", type=int, default=1200)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--opensplat")
     parser.add_argument("--model")
     parser.add_argument("--common", default="")
     parser.add_argument("--size", default="")
     parser.add_argument("--arm", action="append", default=[])
+    parser.add_argument("--tables", action="store_true")
     options = parser.parse_args()
-    arms = [tuple(text.split("=", 1)) for text in options.arm] or DEFAULT_ARMS
-    os.makedirs(options.out, exist_ok=True)
-
-    model = options.model or os.path.join(options.out, "all", "splats.ply")
-    if not os.path.exists(model):
-        run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--views", "all", "--restorer", "none",
-             "--regularize", "off", "--seed", "1"])
-    for views in options.views.split(","):
-        masks = os.path.join(options.out, "masks_K%s" % views)
-        if not os.path.isdir(masks):
-            run([options.gsfix, "masks", options.scene, "--views", views, "--model", model, "--out", masks] +
-                shlex.split(options.size))
-
-    jobs = [(views, seed, name, extra) for seed in range(1, options.seeds + 1)
-            for views in options.views.split(",") for name, extra in arms]
-    results = {}
-    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        futures = {pool.submit(fix, options, *job): job for job in jobs}
-        for future in concurrent.futures.as_completed(futures):
-            views, seed, name, _ = futures[future]
-            results[views, name, seed] = metrics = future.result()
-            print("K=%s %-10s seed %d: psnr %.3f seen %.3f  %.1f s" % (
-                views, name, seed, metrics["psnr"], metrics.get("psnr_seen") or float("nan"),
-                metrics["seconds"]["total"]), flush=True)
-
+    options.starts, options.views = options.starts.split(","), options.views.split(",")
+    unknown = [start for start in options.starts if start not in STARTS]
+    if unknown or (options.opensplat and options.size):
+        parser.error("no start " + unknown[0] if unknown else "--size and --opensplat exclude each other")
     seeds = range(1, options.seeds + 1)
-    lines = ["| K | arm | PSNR | SSIM | PSNR seen | SSIM seen | splats | CPU seconds |", "|---|---|---|---|---|---|---|---|"]
-    with open(os.path.join(options.out, "quality.csv"), "w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(("views", "arm", "seed") + FIGURES + ("splats", "seconds"))
-        for views in options.views.split(","):
-            for name, _ in arms:
-                rows = [results[views, name, seed] for seed in seeds]
-                for seed, row in zip(seeds, rows):
-                    table.writerow([views, name, seed] + [row.get(f) for f in FIGURES] +
-                                   [row["splats"], row["seconds"]["total"]])
-                cells = ["%.3f" % mean_and_error([r.get(f) or float("nan") for r in rows])[0] for f in FIGURES]
-                lines.append("| %s | %s | %s | %d | %.1f |" % (
-                    views, name, " | ".join(cells), sum(r["splats"] for r in rows) / len(rows),
-                    sum(r["seconds"]["total"] for r in rows) / len(rows)))
-    lines += ["", "Paired differences (mean +- standard error over %d seeds):" % options.seeds, "",
-              "| K | difference | PSNR | PSNR seen | SSIM seen |", "|---|---|---|---|---|"]
-    names = [name for name, _ in arms]
-    pairs = list(zip(names[1:], names)) + [(name, names[0]) for name in names[2:]]
-    for views in options.views.split(","):
-        for better, worse in pairs:
-            cells = []
-            for figure in ("psnr", "psnr_seen", "ssim_seen"):
-                both = [(results[views, better, s].get(figure), results[views, worse, s].get(figure)) for s in seeds]
-                if any(a is None or b is None for a, b in both):
-                    cells.append("-")
-                    continue
-                cells.append("%+.3f +- %.3f" % mean_and_error([a - b for a, b in both]))
-            lines.append("| %s | %s - %s | %s |" % (views, better, worse, " | ".join(cells)))
-    text = "\n".join(lines) + "\n"
-    with open(os.path.join(options.out, "quality.md"), "w") as file:
-        file.write(text)
-    print(text)
+    arms = [(name, extra, seeds) for name, extra in
+            ([tuple(text.split("=", 1)) for text in options.arm] or DEFAULT_ARMS)]
+    bodies = {name: fix for name, _, _ in arms}
+    if options.opensplat:
+        arms += [(name, extra, range(1, 2)) for name, extra in PEER_ARMS]
+        bodies.update((name, peer) for name, _ in PEER_ARMS)
+    os.makedirs(options.out, exist_ok=True)
+    if not options.tables:
+        prepare(options)
+        jobs = [((start, views, name, seed), extra) for views in options.views for seed in range(1, max(2, options.seeds + 1))
+                for start in options.starts for name, extra, its in arms if seed in its]
+        with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
+            futures = {pool.submit(work, options, job, bodies[job[2]], extra): job for job, extra in jobs}
+            for future in concurrent.futures.as_completed(futures):
+                start, views, name, seed = futures[future]
+                row = future.result()
+                print("%-8s K=%s %-10s seed %d: psnr %.3f seen %.3f, %.0f CPU s" % (
+                    start, views, name, seed, row["psnr"], row["psnr_seen"] or float("nan"), row["cpu_seconds"]), flush=True)
+                write_tables(options, arms)
+    print(write_tables(options, arms))
 
 
 if __name__ == "__main__":
