@@ -139,6 +139,8 @@ typedef struct gsf_io { // both or neither (neither: stdio; writes go to a tempo
     gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size);
     gsf_result (*write_fn)(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
     void* user;
+    int plain_files; // 1: what read_fn reads are the platform's own files (it logs or counts reads, say), which the library
+                     // may then also list, map and read in part; set where the hooks are stdio's
 } gsf_io;
 
 typedef struct gsf_progress { // called from the calling thread, at most a few times a second's worth of work
@@ -784,8 +786,8 @@ GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* 
 // JSON that begins at byte `start` of a file: offsets, also in error texts, count from the file's first byte.
 GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
                                         gsf_json* out);
-// Do files come through stdio? (Then they are plain files, which a platform may list or map.)
-GSF_API int gsf__io_is_default(const gsf_context* ctx);
+// Are files those of the platform, which may list or map them?
+GSF_API int gsf__io_is_plain(const gsf_context* ctx);
 #ifdef __cplusplus
 }
 #endif
@@ -947,6 +949,7 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
     if (!ctx->io.read_fn) {
         ctx->io.read_fn = gsf__stdio_read;
         ctx->io.write_fn = gsf__stdio_write;
+        ctx->io.plain_files = 1;
     }
     if (!ctx->parallel.for_fn) {
 #ifdef _OPENMP
@@ -1169,7 +1172,7 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
     return result;
 }
 
-GSF_API int gsf__io_is_default(const gsf_context* ctx) { return ctx->io.read_fn == gsf__stdio_read; }
+GSF_API int gsf__io_is_plain(const gsf_context* ctx) { return ctx->io.plain_files; }
 
 GSF_API gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size) {
     *data = NULL;
@@ -2193,7 +2196,7 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
     *width = *height = 0;
     *channels = 0;
 #ifndef GSF_NO_STB
-    if (ctx->io.read_fn == gsf__stdio_read) { // only as many bytes as the header has
+    if (gsf__io_is_plain(ctx)) { // only as many bytes as the header has
         gsf__stb_source source = gsf__stb_memory(NULL, 0);
         source.file = fopen(path, "rb");
         if (!source.file) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));

@@ -1215,7 +1215,7 @@ static gsf_result gsf__nn_add_file(gsf_context* ctx, const char* path, gsf_nn_we
     const unsigned char* mapping = NULL;
     void* data = NULL;
     size_t size = 0;
-    if (gsf__io_is_default(ctx)) GSF__TRY(gsf__nn_map(ctx, path, &mapping, &size));
+    if (gsf__io_is_plain(ctx)) GSF__TRY(gsf__nn_map(ctx, path, &mapping, &size));
     if (mapping) return gsf__nn_add_bytes(ctx, path, mapping, size, GSF__NN_MAPPED, weights);
     GSF__TRY(gsf_read_file(ctx, path, &data, &size));
     return gsf__nn_add_bytes(ctx, path, (const unsigned char*)data, size, GSF__NN_READ, weights);
@@ -1374,12 +1374,12 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
     static const char* const usual[] = {"diffusion_pytorch_model", "model"};
     gsf_result result = GSF_OK;
     int found = 0;
-    if (!gsf__io_is_default(ctx) || gsf__nn_look_at_path(folder) == GSF__NN_UNKNOWN) {
+    if (!gsf__io_is_plain(ctx) || gsf__nn_look_at_path(folder) == GSF__NN_UNKNOWN) {
         for (size_t i = 0; i < GSF__COUNT(usual) && result == GSF_OK && !found; i++)
             result = gsf__nn_open_named(ctx, folder, usual[i], 1, &found, weights);
     }
     for (size_t i = 0; i < GSF__COUNT(suffixes) && result == GSF_OK && !found; i++) {
-        if (!gsf__io_is_default(ctx)) break;
+        if (!gsf__io_is_plain(ctx)) break;
         gsf__nn_listing listing;
         memset(&listing, 0, sizeof listing);
         listing.folder = folder;
@@ -1415,7 +1415,7 @@ static gsf_result gsf__nn_open_index_file(gsf_context* ctx, const char* path, gs
 GSF_API gsf_result gsf_nn_open_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
     gsf_result result = gsf__nn_begin_weights(ctx, path, out);
     if (result != GSF_OK) return result;
-    const gsf__nn_path_kind kind = gsf__io_is_default(ctx) ? gsf__nn_look_at_path(path) : GSF__NN_UNKNOWN;
+    const gsf__nn_path_kind kind = gsf__io_is_plain(ctx) ? gsf__nn_look_at_path(path) : GSF__NN_UNKNOWN;
     int found;
     if (kind != GSF__NN_IS_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
         result = gsf__nn_open_index_file(ctx, path, out);

@@ -164,6 +164,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is
                                                         gsf_scene* out);
 // In-memory twin for transforms.json; w and h must stand in it. No points.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out);
+// File of a view's photo, with the path to the scene; valid as long as the scene. NULL for scenes that came from memory.
+GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view);
 // Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already there). Pixel rows
 // of the undistortion run in parallel. Only for scenes that were loaded from files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view);
@@ -3657,6 +3659,12 @@ GSF_API gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, 
     gsf_destroy_image(ctx, out);
     *out = rgb;
     return GSF_OK;
+}
+
+GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view) {
+    const gsf__scene_state* state = (const gsf__scene_state*)scene->state;
+    if (view >= scene->view_count || state->sources[view].path == SIZE_MAX) return NULL;
+    return state->paths.data + state->sources[view].path;
 }
 
 GSF_API gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view) {

@@ -44,6 +44,6 @@ rm -rf "$out/scene"
 
 export OMP_WAIT_POLICY=passive # workers that wait do not take the cores from others
 say "training on 6 of 40 photos, repairing, training on"
-"$out/tree/gsfix" fix "$out/scene" --out "$out" --views 6 --restorer warp --iterations 900
+"$out/tree/gsfix" fix "$out/scene" --out "$out" --restart --views 6 --restorer warp --iterations 900
 
 say "$((SECONDS - started)) s in all; open $out/report.html"

@@ -28,7 +28,7 @@ typedef struct option_spec {
 #define AT(field) offsetof(gsfix_options, field)
 #define ALL "info fix render filter path restore metrics masks"
 static const option_spec option_specs[] = {
-    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks", "where the results go"},
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks", "where the results go: a folder (path: a new file) that is no input. Only what gsfix wrote there is ever replaced"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
      "training views: so many of those that are not test views, all of them (default), or a file of names, one per line"},
     {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
@@ -48,7 +48,7 @@ static const option_spec option_specs[] = {
      "dit: encoded photos and prompts, as safetensors with any of dino_latents, vggt_latents, prompt_embeds; the\n"
      "model's encoders make what is not there"},
     {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
-     "dit: write the encoded photos and prompts of the last clip, for --ref-features"},
+     "dit: write the encoded photos and prompts of the last clip, for --ref-features, into a new file"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore",
      "dit: what the scene is (default: the model's captioner looks at each clip's first frame)"},
     {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: steps from noise to frames (default 50; fast 10)"},
@@ -80,6 +80,7 @@ static const option_spec option_specs[] = {
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
      "DIR/VIEW.png per test view, white where the figures \"seen\" are to be taken (gsfix masks makes them)"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "go on from OUT/checkpoint if there is one"},
+    {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix", "begin anew although OUT holds a checkpoint, which is then lost"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
      "measure the held-out views every N steps (default: a tenth of the iterations)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
@@ -103,7 +104,6 @@ static const option_spec option_specs[] = {
      "the photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage (default psnr,ssim_3dgs)"},
-    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "networks, for metrics that need one"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, say one of all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
      "workers (default: all cores); results are the same bits for any number"},
@@ -234,6 +234,13 @@ static int set_option(gsfix_app* app, const option_spec* o, const char* value) {
     return 2;
 }
 
+static int read_number(const char* text, long* out) {
+    char* end = NULL;
+    errno = 0;
+    *out = strtol(text, &end, 10);
+    return !errno && end != text && !*end;
+}
+
 static int parse_options(gsfix_app* app, const command_spec* command, int argc, char** argv) {
     for (int i = 2; i < argc; i++) {
         if (argv[i][0] != '-' || !argv[i][1]) {
@@ -258,6 +265,10 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
     if (has_word("fix render filter path restore masks", command->name) && !app->o.out)
         return gsfix_misused(app, "--out is missing");
     if (app->o.factor && app->o.max_size) return gsfix_misused(app, "--factor and --max-size exclude each other");
+    if (app->o.resume && app->o.restart) return gsfix_misused(app, "--resume and --restart exclude each other");
+    long wanted = 1;
+    if (app->o.views && read_number(app->o.views, &wanted) && wanted < 1)
+        return gsfix_misused(app, "--views %s: at least one is needed", app->o.views);
     return 0;
 }
 
@@ -267,14 +278,11 @@ gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out) {
     gsf_scene_desc desc = {0};
     desc.factor = app->o.factor;
     desc.max_size = app->o.max_size;
-    return gsf_splat_load_scene(&app->ctx, path, &desc, out);
-}
-
-static int read_number(const char* text, long* out) {
-    char* end = NULL;
-    errno = 0;
-    *out = strtol(text, &end, 10);
-    return !errno && end != text && !*end;
+    gsf_result result = gsf_splat_load_scene(&app->ctx, path, &desc, out);
+    if (result != GSF_OK) return result;
+    result = gsfix_add_scene_inputs(app, out);
+    if (result != GSF_OK) gsf_splat_destroy_scene(&app->ctx, out);
+    return result;
 }
 
 // Training views by name; test views are the usual ones as far as they are not trained on.
@@ -287,7 +295,8 @@ static gsf_result split_by_file(gsfix_app* app, const gsf_scene* scene, const ch
     uint8_t* chosen = (uint8_t*)gsf_alloc_zeroed(&app->ctx, scene->view_count + 1, 1);
     if (!chosen) result = GSF_ERROR_OUT_OF_MEMORY;
     const char* text = (const char*)data;
-    for (size_t at = 0; at < size && result == GSF_OK;) {
+    const size_t mark = size >= 3 && memcmp(text, "\xef\xbb\xbf", 3) == 0 ? 3 : 0; // of UTF-8, as some editors set it
+    for (size_t at = mark; at < size && result == GSF_OK;) {
         const size_t line = at;
         size_t end = at;
         while (end < size && text[end] != '\n') end++;
@@ -328,9 +337,7 @@ gsf_result gsfix_split_scene(gsfix_app* app, const gsf_scene* scene, gsfix_split
     if (result == GSF_OK && (strcmp(views, "all") == 0 || read_number(views, &wanted))) {
         size_t most = 0;
         gsf_splat_split_views(scene->view_count, test_every, 0, NULL, &most, NULL, NULL);
-        if (wanted < 0 || (wanted == 0 && strcmp(views, "all") != 0))
-            result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: at least one is needed", views);
-        else if ((size_t)wanted > most)
+        if ((size_t)wanted > most)
             result = gsf_fail(&app->ctx, GSF_ERROR_INVALID_ARGUMENT, "--views %s: only %zu views are not test views",
                               views, most);
         else
@@ -489,9 +496,7 @@ static void show_dit_steps(void* user, const char* stage, double done, double to
     }
 }
 
-static gsfix_path dit_checkpoint(const gsfix_app* app) { return gsfix_pathf("%s/dit.checkpoint", app->o.out); }
-
-gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present) {
+gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present) {
     const char* r = app->o.restorer;
     memset(out, 0, sizeof *out);
     *present = r && strcmp(r, "none") != 0;
@@ -499,18 +504,16 @@ gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* ou
     if (strcmp(r, "warp") == 0) return gsf_splat_make_warp(&app->ctx, out);
     if (strncmp(r, "dit:", 4) == 0) {
         gsf_nn_dit_desc desc = gsfix_dit_desc(app);
-        const gsfix_path checkpoint = dit_checkpoint(app);
+        const gsfix_path checkpoint = gsfix_pathf("%s/dit.checkpoint", app->o.out);
         desc.sample.checkpoint = checkpoint.s;
         app->ctx.progress.progress_fn = show_dit_steps;
         app->ctx.progress.user = app;
         return gsf_nn_make_dit(&app->ctx, &desc, out);
     }
-    return gsfix_make_exec(&app->ctx, r + 5, job, app->o.restorer_timeout > 0.0 ? app->o.restorer_timeout : 3600.0, out);
+    return gsfix_make_exec(app, r + 5, app->o.restorer_timeout > 0.0 ? app->o.restorer_timeout : 3600.0, out);
 }
 
-void gsfix_drop_dit_checkpoint(const gsfix_app* app) {
-    if (app->o.restorer && strncmp(app->o.restorer, "dit:", 4) == 0) remove(dit_checkpoint(app).s);
-}
+gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { return gsfix_remove_output(app, "dit.checkpoint"); }
 
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
     if (!restorer->user) return;
@@ -685,6 +688,23 @@ static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const g
     return result;
 }
 
+static gsfix_path frame_name(const gsf_scene* scene, size_t i) { // scene NULL: of a path
+    return scene ? gsfix_view_stem(scene, i) : gsfix_pathf("%05zu", i);
+}
+
+static gsf_result open_render_out(gsfix_app* app, const gsf_scene* scene, size_t count) {
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < count && result == GSF_OK; i++) {
+        const gsfix_path name = frame_name(scene, i);
+        result = gsfix_claim(app, "%s.png", name.s);
+        if (result == GSF_OK && app->o.depth) result = gsfix_claim(app, "depth/%s.npy", name.s);
+        if (result == GSF_OK && app->o.depth) result = gsfix_claim(app, "depth/%s.png", name.s);
+        if (result == GSF_OK && app->o.alpha) result = gsfix_claim(app, "alpha/%s.png", name.s);
+    }
+    if (result == GSF_OK) result = gsfix_open_out(app);
+    return result == GSF_OK ? gsfix_remove_stale(app) : result;
+}
+
 static gsf_result render_all(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
     gsf_scene scene = {0};
@@ -702,13 +722,11 @@ static gsf_result render_all(gsfix_app* app) {
     if (result == GSF_OK && count)
         desc.near_plane = app->o.scene ? gsfix_near_plane(&scene.views[0].camera, sizeof scene.views[0], count)
                                        : gsfix_near_plane(path, sizeof *path, count);
+    if (result == GSF_OK) result = open_render_out(app, app->o.scene ? &scene : NULL, count);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
-    if (result == GSF_OK) result = gsfix_make_folder(ctx, app->o.out);
-    if (result == GSF_OK && app->o.depth) result = gsfix_make_folder(ctx, gsfix_pathf("%s/depth", app->o.out).s);
-    if (result == GSF_OK && app->o.alpha) result = gsfix_make_folder(ctx, gsfix_pathf("%s/alpha", app->o.out).s);
     gsfix_json_begin(ctx, &app->json, "frames", '[');
     for (size_t i = 0; i < count && result == GSF_OK; i++) {
-        const gsfix_path name = app->o.scene ? gsfix_view_stem(&scene, i) : gsfix_pathf("%05zu", i);
+        const gsfix_path name = frame_name(app->o.scene ? &scene : NULL, i);
         const double begin = gsfix_now();
         result = gsf_is_cancelled(ctx) ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped after %zu of %zu frames", i, count)
                                        : render_one(app, rasterizer, &splats,
@@ -742,6 +760,7 @@ static gsf_result filter_scene(gsfix_app* app) {
     gsfix_split split = {0};
     gsf_visibility_stats stats = {0};
     gsf_visibility_desc desc = {0};
+    static const char* const files[3] = {"cameras", "images", "points3D"}; // as gsf_splat_save_colmap calls them
     const char* method = app->o.method ? app->o.method : "both";
     desc.method = strcmp(method, "embree") == 0   ? GSF_VISIBILITY_RAYS
                   : strcmp(method, "tracks") == 0 ? GSF_VISIBILITY_TRACKS
@@ -754,10 +773,11 @@ static gsf_result filter_scene(gsfix_app* app) {
     if (result == GSF_OK && scene.point_count == 0)
         result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points", app->o.inputs[0]);
     if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
+    for (int k = 0; k < 3 && result == GSF_OK; k++) result = gsfix_claim(app, "sparse/0/%s.bin", files[k]);
+    if (result == GSF_OK) result = gsfix_open_out(app);
     if (result == GSF_OK)
         result = gsf_splat_visible_points(ctx, &scene, split.train, split.train_count, &desc, keep, &stats);
     const double seconds = gsfix_now() - begin;
-    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/sparse/0", app->o.out).s);
     if (result == GSF_OK) result = gsf_splat_save_colmap(ctx, &scene, keep, app->o.out);
     if (result == GSF_OK) {
         const char* rays = desc.method == GSF_VISIBILITY_TRACKS ? "none" : stats.used_embree ? "embree" : "z-buffer";
@@ -795,7 +815,8 @@ static gsf_result write_path(gsfix_app* app, int frames, int windows) {
     gsf_traj_path_layout layout = {0};
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
     if (result != GSF_OK) return result;
-    result = gsfix_split_scene(app, &scene, &split);
+    result = gsfix_claim_file(app, app->o.out);
+    if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
     if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &cameras);
     desc.kind = gsfix_path_kind(app->o.kind);
     desc.window_length = frames / windows;
@@ -962,7 +983,6 @@ static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
 static int run_metrics(gsfix_app* app) {
     int wanted[METRIC_COUNT] = {0};
     const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
-    if (app->o.models) return gsfix_misused(app, "metrics that need a model are not in this version");
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
         int m = 0;
@@ -989,7 +1009,10 @@ static gsf_result write_masks(gsfix_app* app) {
     result = gsf_splat_load(ctx, app->o.model, &splats);
     if (result == GSF_OK) result = gsfix_split_scene(app, &scene, &split);
     if (result == GSF_OK) result = gsfix_camera_list(app, &scene, split.train, split.train_count, &train);
-    if (result == GSF_OK) result = gsfix_make_folder(ctx, app->o.out);
+    for (size_t i = 0; i < split.test_count && result == GSF_OK; i++)
+        result = gsfix_claim(app, "%s.png", gsfix_view_stem(&scene, split.test[i]).s);
+    if (result == GSF_OK) result = gsfix_open_out(app);
+    if (result == GSF_OK) result = gsfix_remove_stale(app);
     gsfix_json_begin(ctx, &app->json, "per_view", '[');
     for (size_t i = 0; i < split.test_count && result == GSF_OK; i++) {
         const gsf_scene_view* view = &scene.views[split.test[i]];
@@ -1082,6 +1105,10 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     for (size_t i = 0; i < n && result == GSF_OK; i++) {
         const gsfix_path stem = gsfix_stem(c->frame_names.names[i]);
         c->reference_index[i] = -1;
+        for (size_t k = 0; k < i; k++) // a.jpg and a.png would be written as one
+            if (strcmp(gsfix_stem(c->frame_names.names[k]).s, stem.s) == 0)
+                return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %s and %s differ in nothing but their ending", at,
+                                c->frame_names.names[k], c->frame_names.names[i]);
         result = load_float(ctx, gsfix_pathf("%s/%s", at, c->frame_names.names[i]).s, 3, c->color + i);
         const int64_t width = c->color[i].width, height = c->color[i].height;
         if (result == GSF_OK && (width != c->color[0].width || height != c->color[0].height))
@@ -1194,6 +1221,18 @@ static void free_clip(gsfix_app* app, clip* c) {
     gsfix_free_names(ctx, &c->ref_names);
 }
 
+static gsf_result open_restore_out(gsfix_app* app, const clip* c) {
+    gsf_result result = gsfix_claim(app, "dit.checkpoint");
+    for (size_t i = 0; i < c->frames && result == GSF_OK; i++) {
+        const gsfix_path name = gsfix_stem(c->frame_names.names[i]);
+        result = gsfix_claim(app, "%s.png", name.s);
+        if (result == GSF_OK) result = gsfix_claim(app, "confidence/%s.png", name.s);
+    }
+    if (result == GSF_OK) result = gsfix_open_out(app);
+    if (result == GSF_OK) result = gsfix_claim_file(app, app->o.save_features);
+    return result == GSF_OK ? gsfix_remove_stale(app) : result;
+}
+
 static gsf_result restore_folder(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
     clip c = {0};
@@ -1203,8 +1242,8 @@ static gsf_result restore_folder(gsfix_app* app) {
     gsf_result result = load_clip_frames(app, &c);
     if (result == GSF_OK) result = load_clip_refs(app, &c);
     if (result == GSF_OK && strcmp(app->o.restorer, "warp") == 0) result = check_warp_clip(app, &c);
-    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/confidence", app->o.out).s);
-    if (result == GSF_OK) result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &restorer, &present);
+    if (result == GSF_OK) result = open_restore_out(app, &c);
+    if (result == GSF_OK) result = gsfix_make_restorer(app, &restorer, &present);
     if (result == GSF_OK && present) result = restore_clip(app, &c, &restorer);
     for (size_t i = 0; i < c.frames && result == GSF_OK; i++) {
         const gsfix_path name = gsfix_stem(c.frame_names.names[i]);
@@ -1213,8 +1252,8 @@ static gsf_result restore_folder(gsfix_app* app) {
         if (result == GSF_OK && present)
             result = gsf_save_image(ctx, gsfix_pathf("%s/confidence/%s.png", app->o.out, name.s).s, c.out_confidence + i);
     }
+    if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
     if (result == GSF_OK) {
-        gsfix_drop_dit_checkpoint(app);
         gsfix_json_text(ctx, &app->json, "restorer", app->o.restorer);
         gsfix_json_number(ctx, &app->json, "frames", (double)c.frames);
         gsfix_json_number(ctx, &app->json, "references", (double)c.refs);
@@ -1276,13 +1315,18 @@ static void catch_interrupts(gsfix_app* app) { // the first one asks to stop, a 
     interrupted_context = &app->ctx;
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
+#ifdef SIGXFSZ
+    signal(SIGXFSZ, SIG_IGN); // a file above the limit is then a write that fails, as on a full disk
+#endif
 }
 
 static int run_command(gsfix_app* app, const command_spec* command, int argc, char** argv) {
     app->ctx.threads = app->o.threads;
     app->ctx.logger.log_fn = on_log;
     app->ctx.logger.user = app;
-    if (gsf_init_context(&app->ctx) != GSF_OK || quote_command(app, argc, argv) != GSF_OK) return gsfix_failed(app);
+    if (gsf_init_context(&app->ctx) != GSF_OK || quote_command(app, argc, argv) != GSF_OK ||
+        gsfix_begin_files(app) != GSF_OK)
+        return gsfix_failed(app);
     catch_interrupts(app);
     gsfix_json_begin(&app->ctx, &app->json, NULL, '{');
     int code = command->run(app);
@@ -1295,6 +1339,7 @@ static int run_command(gsfix_app* app, const command_spec* command, int argc, ch
         code = 1;
     }
     interrupted_context = NULL;
+    gsfix_end_files(app);
     gsf_destroy_text(&app->ctx, &app->json);
     gsf_free(&app->ctx, app->command_line);
     return code;
@@ -1327,6 +1372,7 @@ int main(int argc, char** argv) {
 #ifdef GSFIX_ONE_FILE // one compiler call for the whole program
 #include "gsfix_exec.c"
 #include "gsfix_fix.c"
+#include "gsfix_out.c"
 #include "gsfix_report.c"
 #include "gsfix_util.c"
 #endif

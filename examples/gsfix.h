@@ -16,9 +16,9 @@
 
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
-    const char *scene, *path, *method, *kind, *refs, *which, *models, *ref_features, *save_features;
+    const char *scene, *path, *method, *kind, *refs, *which, *ref_features, *save_features;
     const char *caption, *model, *solver;
-    int json, help, resume, depth, alpha, int8, bf16;
+    int json, help, resume, restart, depth, alpha, int8, bf16;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
@@ -33,9 +33,12 @@ typedef struct gsfix_clip_stage { // what the restorer dit: did in all clips
     double seconds, memory;  // memory: anonymous bytes that were resident behind its units, at most
 } gsfix_clip_stage;
 
+typedef struct gsfix_out gsfix_out; // gsfix_out.c
+
 typedef struct gsfix_app {
     gsf_context ctx;
     gsfix_options o;
+    gsfix_out* out;
     const char* command;
     char* command_line; // as typed, quoted for a shell
     double started;     // gsfix_now() at the start
@@ -63,8 +66,6 @@ gsfix_path gsfix_pathf(const char* format, ...) GSF_PRINTF(1, 2);
 int gsfix_exists(const char* path);
 int gsfix_is_folder(const char* path);
 gsf_result gsfix_make_folder(gsf_context* ctx, const char* path); // with its parents
-// Removes a folder's *.png (and, deep, everything below it); nothing happens where there is no folder.
-gsf_result gsfix_clear_folder(gsf_context* ctx, const char* path, int deep);
 // Sorted file names of a folder that end in one of the extensions (".png.jpg", lower case).
 gsf_result gsfix_list(gsf_context* ctx, const char* folder, const char* extensions, gsfix_names* out);
 void gsfix_free_names(gsf_context* ctx, gsfix_names* names);
@@ -75,7 +76,7 @@ gsfix_path gsfix_stem(const char* path);
 gsfix_path gsfix_view_stem(const gsf_scene* scene, size_t view);
 gsf_result gsfix_save_npy(gsf_context* ctx, const char* path, const gsf_image* image); // f32, one channel
 gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out);
-// gsf_save_image for each, all at once: encoding a PNG takes longer than rendering it.
+// gsf_save_image for each; they are encoded all at once, which takes longer than rendering.
 gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gsf_image* images, size_t count);
 void gsfix_clamp(gsf_image* image); // packed f32 to [0,1], NaN to 0
 int gsfix_counts_any(const gsf_image* mask); // a u8 mask of one channel has a pixel that counts
@@ -100,10 +101,40 @@ void gsfix_json_text(gsf_context* ctx, gsf_text* text, const char* key, const ch
 void gsfix_json_number(gsf_context* ctx, gsf_text* text, const char* key, double value);
 void gsfix_json_bool(gsf_context* ctx, gsf_text* text, const char* key, int value);
 
+// ---- gsfix_out.c: whose file is whose -------------------------------------------
+
+typedef struct gsfix_read_file { char* path; uint64_t size, digest; } gsfix_read_file;
+
+gsf_result gsfix_begin_files(gsfix_app* app); // from here on files are read and written through the hooks of gsfix_out.c
+void gsfix_end_files(gsfix_app* app);
+// A file or folder that outputs must keep away from. What is read or named on the command line is known without this.
+gsf_result gsfix_add_input(gsfix_app* app, const char* path);
+gsf_result gsfix_add_scene_inputs(gsfix_app* app, const gsf_scene* scene); // its photos, read or not
+gsf_result gsfix_digest_input(gsfix_app* app, const char* path); // of a file that is mapped, not read; NULL: nothing
+// What was read so far, in that order, with XXH64 digests; what is read from now on is no input.
+const gsfix_read_file* gsfix_end_inputs(gsfix_app* app, size_t* count);
+
+// A command claims each name below OUT that it may write ('*': any text without '/'), then opens OUT: fails with one line
+// where a file in the way was not written by gsfix, or OUT cannot be used. Nothing is changed so far.
+gsf_result gsfix_claim(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);
+gsf_result gsfix_open_out(gsfix_app* app);
+gsf_result gsfix_claim_file(gsfix_app* app, const char* path); // a file elsewhere that must be new; after gsfix_open_out
+// Removes what an earlier run of the same command wrote and this one will not write again.
+gsf_result gsfix_remove_stale(gsfix_app* app);
+gsf_result gsfix_remove_output(gsfix_app* app, const char* name); // if it is there and ours
+int gsfix_has_output(gsfix_app* app, const char* name);           // is it?
+gsfix_path gsfix_absolute(const char* path); // without links on the way; empty: there is no such folder
+
+// A fresh folder in OUT for a restorer. Only what lies in it is ever emptied or removed.
+gsf_result gsfix_make_job(gsfix_app* app, const char** path);
+gsf_result gsfix_empty_job(gsfix_app* app, const char* name); // its subfolder: made, or emptied
+gsf_result gsfix_check_job(gsfix_app* app, const char* name); // fails where the subfolder has become something else
+void gsfix_leave_job(gsfix_app* app, int remove);
+
 // ---- gsfix_exec.c --------------------------------------------------------------
 
-// Restorer that runs `COMMAND JOBDIR` for each window; `job` is the folder to use. Freed by gsfix_destroy_exec.
-gsf_result gsfix_make_exec(gsf_context* ctx, const char* command, const char* job, double timeout, gsf_restorer* out);
+// Restorer that runs `COMMAND JOBDIR` for each window. Freed by gsfix_destroy_exec.
+gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, gsf_restorer* out);
 void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- gsfix.c: what several commands need -----------------------------------------
@@ -117,14 +148,14 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
                              gsf_camera** out); // freed with gsf_free
 // 0 = fine; else the exit code, with its line printed.
 int gsfix_check_restorer(gsfix_app* app);
-gsf_result gsfix_make_restorer(gsfix_app* app, const char* job, gsf_restorer* out, int* present);
+gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present);
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
 void gsfix_json_stages(gsfix_app* app, gsf_text* text); // "restorer_stages": [...], where there were any
 void gsfix_print_stages(gsfix_app* app);
 extern const char* const gsfix_conditions[4]; // how --condition spells gsf_nn_condition
 extern const char* const gsfix_solvers[3];    // and --solver gsf_nn_solver
 gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app);      // as the options have it, for --restorer dit:MODEL_DIR
-void gsfix_drop_dit_checkpoint(const gsfix_app* app);      // of the clip that was at work, when the whole is done
+gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app);      // of the clip that was at work, when the whole is done
 gsf_traj_kind gsfix_path_kind(const char* name);
 // Near plane for renders of a scene with these cameras (`stride` bytes apart): 0.01 times their extent, at most the official
 // 0.2. fix and render share the rule, so that splats look the same in both.

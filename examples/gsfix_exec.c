@@ -3,11 +3,14 @@
 #include "gsfix.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <signal.h>
-#include <sys/stat.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
+#ifdef __linux__
+#include <sys/prctl.h>
+#endif
 
 /* JOBDIR, before the call:
        frames/%05d.png    rendered frames
@@ -19,12 +22,18 @@
    and what COMMAND leaves there with exit status 0:
        out/%05d.png         as many and as large as frames/
        confidence/%05d.png  optional, for all frames or for none: white = trust the pixel (none: all are trusted)
-   COMMAND goes through the shell; what it prints goes to stderr. */
+   COMMAND goes through the shell; what it prints goes to stderr.
+   JOBDIR is fresh for each round and removed after it, with all that lies in it; after a failure it stays.
+   COMMAND and what it starts form one process group with a watcher. The watcher waits at a pipe whose other end only gsfix
+   holds: when gsfix ends, however that comes (kill -9), the pipe ends and the watcher ends the group. */
 typedef struct exec_state {
+    gsfix_app* app;
     char* command;
-    char* job;
+    const char* job;
     double timeout;
     int failed;
+    pid_t group; // the watcher's process, too; 0: none
+    int life;    // write end of the pipe
 } exec_state;
 
 static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -37,10 +46,9 @@ static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, 
 }
 
 static gsf_result exec_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
-    const exec_state* e = (const exec_state*)user;
-    gsf_result result = gsfix_clear_folder(ctx, e->job, 1);
-    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/refs/render", e->job).s);
-    if (result == GSF_OK) result = gsfix_make_folder(ctx, gsfix_pathf("%s/refs/depth", e->job).s);
+    exec_state* e = (exec_state*)user;
+    gsf_result result = gsfix_make_job(e->app, &e->job);
+    e->failed = 0;
     gsf_camera* cameras = (gsf_camera*)gsf_alloc(ctx, (size_t)count + 1, sizeof *cameras);
     if (!cameras) return GSF_ERROR_OUT_OF_MEMORY;
     int known = count > 0;
@@ -56,12 +64,14 @@ static gsf_result exec_begin(void* user, gsf_context* ctx, const gsf_reference* 
     if (result == GSF_OK && known)
         result = gsf_save_cameras(ctx, gsfix_pathf("%s/refs/cameras.json", e->job).s, cameras, NULL, (size_t)count);
     gsf_free(ctx, cameras);
+    if (result != GSF_OK) gsfix_leave_job(e->app, 1);
     return result;
 }
 
 static void exec_end(void* user, gsf_context* ctx) { // after a failure the job stays, for whoever looks for the cause
     const exec_state* e = (const exec_state*)user;
-    if (!e->failed && gsfix_clear_folder(ctx, e->job, 1) == GSF_OK) rmdir(e->job);
+    (void)ctx;
+    gsfix_leave_job(e->app, !e->failed);
 }
 
 static gsf_result write_cameras(gsf_context* ctx, const exec_state* e, const gsf_restore_window* w) {
@@ -81,14 +91,11 @@ static gsf_result write_cameras(gsf_context* ctx, const exec_state* e, const gsf
     return result;
 }
 
-static gsf_result write_job(gsf_context* ctx, const exec_state* e, const gsf_restore_window* w) {
+static gsf_result write_job(gsf_context* ctx, exec_state* e, const gsf_restore_window* w) {
     static const char* const folders[] = {"frames", "depth", "alpha", "out", "confidence"};
     gsf_result result = GSF_OK;
-    for (size_t k = 0; k < sizeof folders / sizeof *folders && result == GSF_OK; k++) {
-        const gsfix_path folder = gsfix_pathf("%s/%s", e->job, folders[k]);
-        result = gsfix_clear_folder(ctx, folder.s, 1);
-        if (result == GSF_OK) result = gsfix_make_folder(ctx, folder.s);
-    }
+    for (size_t k = 0; k < sizeof folders / sizeof *folders && result == GSF_OK; k++)
+        result = gsfix_empty_job(e->app, folders[k]);
     for (int32_t i = 0; i < w->frame_count && result == GSF_OK; i++) {
         result = gsf_save_image(ctx, gsfix_pathf("%s/frames/%05d.png", e->job, (int)i).s, w->color + i);
         if (result == GSF_OK && w->depth)
@@ -99,35 +106,90 @@ static gsf_result write_job(gsf_context* ctx, const exec_state* e, const gsf_res
     return result == GSF_OK && w->cameras ? write_cameras(ctx, e, w) : result;
 }
 
-static void stop_group(pid_t group) { // it has a second to leave
-    kill(-group, SIGTERM);
+static void watch(int life) { // in a process of its own; only what may be called after a fork
+    static const int ignored[] = {SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGPIPE};
+    const long most = sysconf(_SC_OPEN_MAX);
+    char byte;
+    ssize_t n;
+    for (size_t i = 0; i < sizeof ignored / sizeof *ignored; i++) signal(ignored[i], SIG_IGN);
+    for (int fd = 0; fd < (most > 0 && most < 65536 ? most : 65536); fd++)
+        if (fd != life) close(fd); // above all the lock of OUT
+    while ((n = read(life, &byte, 1)) < 0 && errno == EINTR) {}
+    kill(0, SIGKILL);
+    _exit(0);
+}
+
+static gsf_result start_watcher(gsf_context* ctx, exec_state* e) {
+    int ends[2];
+    if (e->group) return GSF_OK;
+    if (pipe(ends) != 0) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no pipe: %s", strerror(errno));
+    fcntl(ends[0], F_SETFD, FD_CLOEXEC);
+    fcntl(ends[1], F_SETFD, FD_CLOEXEC);
+    const pid_t watcher = fork();
+    if (watcher == 0) {
+        setpgid(0, 0);
+        watch(ends[0]);
+    }
+    close(ends[0]);
+    if (watcher < 0) {
+        close(ends[1]);
+        return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
+    }
+    setpgid(watcher, watcher); // whoever comes first
+    e->group = watcher;
+    e->life = ends[1];
+    return GSF_OK;
+}
+
+static void end_group(exec_state* e) {
+    if (!e->group) return;
+    kill(-e->group, SIGKILL);
+    while (waitpid(e->group, NULL, 0) < 0 && errno == EINTR) {}
+    close(e->life);
+    e->group = 0;
+}
+
+static void stop_program(exec_state* e, pid_t child) { // it has a second to leave
+    kill(-e->group, SIGTERM);
     for (int i = 0; i < 50; i++) {
         const struct timespec pause = {0, 20000000};
-        if (waitpid(group, NULL, WNOHANG) == group) {
-            kill(-group, SIGKILL); // what it may have started and left behind
+        if (waitpid(child, NULL, WNOHANG) == child) {
+            end_group(e);
             return;
         }
         nanosleep(&pause, NULL);
     }
-    kill(-group, SIGKILL);
-    waitpid(group, NULL, 0);
+    kill(-e->group, SIGKILL);
+    waitpid(child, NULL, 0);
+    end_group(e);
 }
 
-static gsf_result run_program(gsf_context* ctx, const exec_state* e) {
-    const gsfix_path script = gsfix_pathf("%s \"$@\"", e->command);
-    if (strlen(script.s) + 1 >= sizeof script.s) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: the command is too long");
+static void become_program(const exec_state* e, const char* script, pid_t parent) { // after the fork
+    setpgid(0, e->group); // so that all of it can be stopped at once
+#ifdef __linux__
+    prctl(PR_SET_PDEATHSIG, SIGKILL);
+#endif
+    if (getppid() != parent) _exit(127); // it ended meanwhile
+    signal(SIGINT, SIG_DFL);
+    signal(SIGTERM, SIG_DFL);
+    signal(SIGXFSZ, SIG_DFL);
+    dup2(2, 1); // stdout is for --json
+    execl("/bin/sh", "sh", "-c", script, "sh", e->job, (char*)NULL);
+    _exit(127);
+}
+
+static gsf_result run_program(gsf_context* ctx, exec_state* e) {
+    gsf_text script = {0};
+    gsf_text_printf(ctx, &script, "%s \"$@\"", e->command);
+    if (script.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_result watched = start_watcher(ctx, e);
     fflush(NULL);
-    const pid_t child = fork();
+    const pid_t parent = getpid(), child = watched == GSF_OK ? fork() : -1;
+    if (child == 0) become_program(e, script.data, parent);
+    gsf_destroy_text(ctx, &script);
+    if (watched != GSF_OK) return watched;
     if (child < 0) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
-    if (child == 0) {
-        setpgid(0, 0); // so that all of it can be stopped at once
-        signal(SIGINT, SIG_DFL);
-        signal(SIGTERM, SIG_DFL);
-        dup2(2, 1); // stdout is for --json
-        execl("/bin/sh", "sh", "-c", script.s, "sh", e->job, (char*)NULL);
-        _exit(127);
-    }
-    setpgid(child, child); // whoever comes first
+    setpgid(child, e->group); // whoever comes first
     const double begin = gsfix_now();
     for (;;) {
         int status = 0;
@@ -142,7 +204,7 @@ static gsf_result run_program(gsf_context* ctx, const exec_state* e) {
         }
         const int cancelled = gsf_is_cancelled(ctx);
         if (cancelled || gsfix_now() - begin > e->timeout) {
-            stop_group(child);
+            stop_program(e, child);
             return cancelled ? gsf_fail(ctx, GSF_ERROR_CANCELLED, "cancelled")
                              : gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s took longer than %g s and was stopped",
                                         e->command, e->timeout);
@@ -172,10 +234,11 @@ static void fill_ones(gsf_image* image) {
             *(float*)(void*)((char*)image->data + y * image->stride_y + x * image->stride_x) = 1.0f;
 }
 
-static gsf_result exec_restore(void* user, gsf_context* ctx, const gsf_restore_window* w) {
-    exec_state* e = (exec_state*)user;
+static gsf_result run_job(exec_state* e, gsf_context* ctx, const gsf_restore_window* w) {
     gsf_result result = write_job(ctx, e, w);
     if (result == GSF_OK) result = run_program(ctx, e);
+    if (result == GSF_OK) result = gsfix_check_job(e->app, "out");
+    if (result == GSF_OK) result = gsfix_check_job(e->app, "confidence");
     int confidences = 0;
     for (int32_t i = 0; i < w->frame_count; i++)
         confidences += gsfix_exists(gsfix_pathf("%s/confidence/%05d.png", e->job, (int)i).s);
@@ -187,19 +250,27 @@ static gsf_result exec_restore(void* user, gsf_context* ctx, const gsf_restore_w
                 read_result(ctx, gsfix_pathf("%s/confidence/%05d.png", e->job, (int)i).s, 1, w->out_confidence + i);
         else fill_ones(w->out_confidence + i);
     }
-    e->failed = result != GSF_OK && result != GSF_ERROR_CANCELLED;
     return result;
 }
 
-gsf_result gsfix_make_exec(gsf_context* ctx, const char* command, const char* job, double timeout, gsf_restorer* out) {
+static gsf_result exec_restore(void* user, gsf_context* ctx, const gsf_restore_window* w) {
+    exec_state* e = (exec_state*)user;
+    const gsf_result result = run_job(e, ctx, w);
+    if (result == GSF_OK || result == GSF_ERROR_CANCELLED) return result;
+    char why[sizeof ctx->error];
+    memcpy(why, ctx->error, sizeof why);
+    e->failed = 1;
+    return gsf_fail(ctx, result, "%.300s (kept: %s)", why, e->job);
+}
+
+gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, gsf_restorer* out) {
+    gsf_context* ctx = &app->ctx;
     memset(out, 0, sizeof *out);
     exec_state* e = (exec_state*)gsf_alloc_zeroed(ctx, 1, sizeof *e);
     if (!e) return GSF_ERROR_OUT_OF_MEMORY;
+    e->app = app;
     e->command = gsfix_copy_text(ctx, command, strlen(command));
     e->timeout = timeout;
-    char* absolute = gsfix_make_folder(ctx, job) == GSF_OK ? realpath(job, NULL) : NULL; // COMMAND may change its folder
-    if (absolute) e->job = gsfix_copy_text(ctx, absolute, strlen(absolute));
-    free(absolute);
     out->struct_size = sizeof *out;
     out->name = "exec";
     out->user = e;
@@ -207,16 +278,16 @@ gsf_result gsfix_make_exec(gsf_context* ctx, const char* command, const char* jo
     out->begin_fn = exec_begin;
     out->restore_fn = exec_restore;
     out->end_fn = exec_end;
-    if (e->command && e->job) return GSF_OK;
+    if (e->command) return GSF_OK;
     gsfix_destroy_exec(ctx, out);
-    return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: %s: folder cannot be used", job);
+    return GSF_ERROR_OUT_OF_MEMORY;
 }
 
 void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer) {
     exec_state* e = (exec_state*)restorer->user;
     if (!e) return;
+    end_group(e);
     gsf_free(ctx, e->command);
-    gsf_free(ctx, e->job);
     gsf_free(ctx, e);
     memset(restorer, 0, sizeof *restorer);
 }

@@ -35,57 +35,58 @@ typedef struct fix_setup { // everything that decides what the run computes
 } fix_setup;
 
 enum { SET_WHOLE, SET_REAL, SET_SWITCH, SET_COUNT }; // int32_t, float, int32_t of 0 (off) or 1 (on), size_t
-typedef struct setting { const char* name; int kind; size_t offset; } setting;
+typedef struct setting { const char* name; int kind; size_t offset; double least, most; } setting;
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
 #define DENSE_AT(field) offsetof(fix_setup, dense.field)
-static const setting settings[] = { // zero: the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc
-    {"sh_degree", SET_WHOLE, offsetof(fix_setup, sh_degree)},
-    {"random_points", SET_WHOLE, offsetof(fix_setup, random_points)},
-    {"dropout", SET_REAL, TRAIN_AT(dropout)},
-    {"opacity_decay", SET_REAL, TRAIN_AT(opacity_decay)},
-    {"scale_penalty", SET_REAL, TRAIN_AT(scale_penalty)},
-    {"opacity_penalty", SET_REAL, TRAIN_AT(opacity_penalty)},
-    {"depth_smoothness", SET_REAL, TRAIN_AT(depth_smoothness)},
-    {"sh_interval", SET_WHOLE, TRAIN_AT(sh_interval)},
-    {"lr_means", SET_REAL, TRAIN_AT(lr_means)},
-    {"lr_means_final", SET_REAL, TRAIN_AT(lr_means_final)},
-    {"lr_sh_dc", SET_REAL, TRAIN_AT(lr_sh_dc)},
-    {"lr_sh_rest", SET_REAL, TRAIN_AT(lr_sh_rest)},
-    {"lr_opacity", SET_REAL, TRAIN_AT(lr_opacity)},
-    {"lr_scales", SET_REAL, TRAIN_AT(lr_scales)},
-    {"lr_quats", SET_REAL, TRAIN_AT(lr_quats)},
-    {"lambda_ssim", SET_REAL, TRAIN_AT(lambda_ssim)},
-    {"densify_from", SET_WHOLE, TRAIN_AT(densify_from)},
-    {"densify_until", SET_WHOLE, TRAIN_AT(densify_until)},
-    {"densify_interval", SET_WHOLE, TRAIN_AT(densify_interval)},
-    {"densify_grad", SET_REAL, TRAIN_AT(densify_grad)},
-    {"densify_absolute", SET_SWITCH, TRAIN_AT(densify_absolute)},
-    {"densify_scale", SET_REAL, TRAIN_AT(densify_scale)},
-    {"prune_opacity", SET_REAL, TRAIN_AT(prune_opacity)},
-    {"prune_scale", SET_REAL, TRAIN_AT(prune_scale)},
-    {"opacity_reset_interval", SET_WHOLE, TRAIN_AT(opacity_reset_interval)},
-    {"max_splats", SET_COUNT, TRAIN_AT(max_splats)},
-    {"mcmc", SET_SWITCH, TRAIN_AT(mcmc)},
-    {"mcmc_noise", SET_REAL, TRAIN_AT(mcmc_noise)},
-    {"lazy_adam", SET_SWITCH, TRAIN_AT(lazy_adam)},
-    {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased)},
-    {"rounds", SET_WHOLE, FIX_AT(rounds)},
-    {"first_round", SET_WHOLE, FIX_AT(first_round)},
-    {"last_round", SET_WHOLE, FIX_AT(last_round)},
-    {"windows", SET_WHOLE, FIX_AT(windows)},
-    {"window_frames", SET_WHOLE, FIX_AT(window_frames)},
-    {"lambda", SET_REAL, FIX_AT(lambda)},
-    {"skip_psnr", SET_REAL, FIX_AT(skip_psnr)},
-    {"max_pixels", SET_WHOLE, FIX_AT(max_pixels)},
-    {"dense_points", SET_WHOLE, offsetof(fix_setup, dense_points)},
-    {"dense_spacing", SET_WHOLE, DENSE_AT(spacing)},
-    {"dense_max_cost", SET_REAL, DENSE_AT(max_cost)},
-    {"dense_max_reprojection", SET_REAL, DENSE_AT(max_reprojection)},
-    {"dense_max_depth_error", SET_REAL, DENSE_AT(max_depth_error)},
-    {"dense_max_normal_angle", SET_REAL, DENSE_AT(max_normal_angle)},
-    {"dense_min_consistent", SET_WHOLE, DENSE_AT(min_consistent)},
-    {"dense_max_cost_many", SET_REAL, DENSE_AT(max_cost_many)},
+static const setting settings[] = { // zero: the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc;
+    // -1 where those have a meaning for negative values
+    {"sh_degree", SET_WHOLE, offsetof(fix_setup, sh_degree), 0, 3},
+    {"random_points", SET_WHOLE, offsetof(fix_setup, random_points), 1, 1e8},
+    {"dropout", SET_REAL, TRAIN_AT(dropout), 0, 0.99},
+    {"opacity_decay", SET_REAL, TRAIN_AT(opacity_decay), 0, 1},
+    {"scale_penalty", SET_REAL, TRAIN_AT(scale_penalty), -1, 1000},
+    {"opacity_penalty", SET_REAL, TRAIN_AT(opacity_penalty), -1, 1000},
+    {"depth_smoothness", SET_REAL, TRAIN_AT(depth_smoothness), 0, 1000},
+    {"sh_interval", SET_WHOLE, TRAIN_AT(sh_interval), 0, 1e9},
+    {"lr_means", SET_REAL, TRAIN_AT(lr_means), 0, 1},
+    {"lr_means_final", SET_REAL, TRAIN_AT(lr_means_final), 0, 1},
+    {"lr_sh_dc", SET_REAL, TRAIN_AT(lr_sh_dc), 0, 1},
+    {"lr_sh_rest", SET_REAL, TRAIN_AT(lr_sh_rest), 0, 1},
+    {"lr_opacity", SET_REAL, TRAIN_AT(lr_opacity), 0, 1},
+    {"lr_scales", SET_REAL, TRAIN_AT(lr_scales), 0, 1},
+    {"lr_quats", SET_REAL, TRAIN_AT(lr_quats), 0, 1},
+    {"lambda_ssim", SET_REAL, TRAIN_AT(lambda_ssim), -1, 1},
+    {"densify_from", SET_WHOLE, TRAIN_AT(densify_from), 0, 1e9},
+    {"densify_until", SET_WHOLE, TRAIN_AT(densify_until), -1, 1e9},
+    {"densify_interval", SET_WHOLE, TRAIN_AT(densify_interval), 0, 1e9},
+    {"densify_grad", SET_REAL, TRAIN_AT(densify_grad), 0, 1000},
+    {"densify_absolute", SET_SWITCH, TRAIN_AT(densify_absolute), 0, 1},
+    {"densify_scale", SET_REAL, TRAIN_AT(densify_scale), 0, 1000},
+    {"prune_opacity", SET_REAL, TRAIN_AT(prune_opacity), 0, 1},
+    {"prune_scale", SET_REAL, TRAIN_AT(prune_scale), 0, 1e6},
+    {"opacity_reset_interval", SET_WHOLE, TRAIN_AT(opacity_reset_interval), -1, 1e9},
+    {"max_splats", SET_COUNT, TRAIN_AT(max_splats), 0, 1e9},
+    {"mcmc", SET_SWITCH, TRAIN_AT(mcmc), 0, 1},
+    {"mcmc_noise", SET_REAL, TRAIN_AT(mcmc_noise), -1, 1e9},
+    {"lazy_adam", SET_SWITCH, TRAIN_AT(lazy_adam), 0, 1},
+    {"antialiased", SET_SWITCH, TRAIN_AT(render.antialiased), 0, 1},
+    {"rounds", SET_WHOLE, FIX_AT(rounds), -1, 1000},
+    {"first_round", SET_WHOLE, FIX_AT(first_round), 0, 1e9},
+    {"last_round", SET_WHOLE, FIX_AT(last_round), 0, 1e9},
+    {"windows", SET_WHOLE, FIX_AT(windows), 0, 1000},
+    {"window_frames", SET_WHOLE, FIX_AT(window_frames), 0, 1000},
+    {"lambda", SET_REAL, FIX_AT(lambda), 0, 1000},
+    {"skip_psnr", SET_REAL, FIX_AT(skip_psnr), 0, 1000},
+    {"max_pixels", SET_WHOLE, FIX_AT(max_pixels), 0, 1e9},
+    {"dense_points", SET_WHOLE, offsetof(fix_setup, dense_points), 1, 1e8},
+    {"dense_spacing", SET_WHOLE, DENSE_AT(spacing), 0, 10000},
+    {"dense_max_cost", SET_REAL, DENSE_AT(max_cost), 0, 2},
+    {"dense_max_reprojection", SET_REAL, DENSE_AT(max_reprojection), 0, 1000},
+    {"dense_max_depth_error", SET_REAL, DENSE_AT(max_depth_error), 0, 1},
+    {"dense_max_normal_angle", SET_REAL, DENSE_AT(max_normal_angle), 0, 180},
+    {"dense_min_consistent", SET_WHOLE, DENSE_AT(min_consistent), 0, 8},
+    {"dense_max_cost_many", SET_REAL, DENSE_AT(max_cost_many), 0, 2},
 };
 enum { SETTING_COUNT = sizeof settings / sizeof settings[0] };
 
@@ -105,15 +106,15 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
         int i = 0;
         while (i < SETTING_COUNT && !(strlen(settings[i].name) == name && strncmp(settings[i].name, p, name) == 0)) i++;
         if (name >= n || i == SETTING_COUNT) return gsfix_misused(app, "--set: no setting \"%.*s\"", (int)n, p);
-        char value[64], *end = value;
-        snprintf(value, sizeof value, "%.*s", (int)(n - name - 1), p + name + 1);
+        const gsfix_path value_text = gsfix_pathf("%.*s", (int)(n - name - 1), p + name + 1);
+        const char* value = value_text.s;
+        char* end;
         char* field = (char*)setup + settings[i].offset;
         const double x = strtod(value, &end);
         const int kind = settings[i].kind;
-        if (end == value || *end || !(fabs(x) <= 1e9) || (kind != SET_REAL && x != (double)(int32_t)x))
-            return gsfix_misused(app, "--set %.*s: not a %s", (int)n, p, kind == SET_REAL ? "number" : "whole number");
-        if (kind == SET_SWITCH && x != 0.0 && x != 1.0) return gsfix_misused(app, "--set %.*s: expected 0 or 1", (int)n, p);
-        if (kind == SET_COUNT && x < 0.0) return gsfix_misused(app, "--set %.*s: expected 0 or more", (int)n, p);
+        if (end == value || *end || !(x >= settings[i].least && x <= settings[i].most) || (kind != SET_REAL && x != floor(x)))
+            return gsfix_misused(app, "--set %.*s: expected a %s from %g to %g", (int)n, p,
+                                 kind == SET_REAL ? "number" : "whole number", settings[i].least, settings[i].most);
         if (kind == SET_REAL) *(float*)(void*)field = (float)x;
         else if (kind == SET_COUNT) *(size_t*)(void*)field = (size_t)x;
         else *(int32_t*)(void*)field = (int32_t)x;
@@ -142,11 +143,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     setup->fix.skip_psnr = quality->skip_psnr;
     setup->fix.max_pixels = quality->max_pixels;
     const int code = apply_settings(app, setup);
-    if (code) return code;
-    if (setup->sh_degree < 0 || setup->sh_degree > 3) return gsfix_misused(app, "--set sh_degree: expected 0 to 3");
-    if (setup->random_points < 1) return gsfix_misused(app, "--set random_points: expected 1 or more");
-    if (setup->dense_points < 1) return gsfix_misused(app, "--set dense_points: expected 1 or more");
-    return gsfix_check_restorer(app);
+    return code ? code : gsfix_check_restorer(app);
 }
 
 // ---- a run -----------------------------------------------------------------------
@@ -166,6 +163,10 @@ typedef struct fix_run {
     int has_restorer;
     gsf_fixer* fixer;
     gsf_text switches; // JSON object
+    const gsfix_read_file* inputs;
+    size_t input_count;
+    int resuming;
+    int checkpoint_failed; // the last one could not be written
     const char* rays; // what traced them
     gsfix_history history;
     double total_before; // seconds of earlier runs that this one continues
@@ -504,6 +505,10 @@ static void write_list(gsf_context* ctx, gsf_text* t, const char* key, const dou
     gsfix_json_end(ctx, t, ']');
 }
 
+static gsfix_path input_digest(const gsfix_read_file* file) {
+    return gsfix_pathf("%016llx %llu", (unsigned long long)file->digest, (unsigned long long)file->size);
+}
+
 // History as JSON: lists of numbers, so that reading back is one loop per list.
 static void write_history(fix_run* run, gsf_text* t) {
     gsf_context* ctx = run->ctx;
@@ -512,6 +517,14 @@ static void write_history(fix_run* run, gsf_text* t) {
     gsfix_json_begin(ctx, t, "switches", '{');
     t->size--; // the object itself follows
     gsf_text_append(ctx, t, run->switches.data, run->switches.size);
+    gsfix_json_begin(ctx, t, "inputs", '[');
+    for (size_t i = 0; i < run->input_count; i++) {
+        gsfix_json_begin(ctx, t, NULL, '[');
+        gsfix_json_text(ctx, t, NULL, run->inputs[i].path);
+        gsfix_json_text(ctx, t, NULL, input_digest(run->inputs + i).s);
+        gsfix_json_end(ctx, t, ']');
+    }
+    gsfix_json_end(ctx, t, ']');
     write_list(ctx, t, "seconds", h->seconds, GSFIX_STAGES);
     gsfix_json_number(ctx, t, "seconds_total", run->total_before + gsfix_now() - run->app->started);
     gsfix_json_number(ctx, t, "iteration", run->iteration);
@@ -611,98 +624,173 @@ static gsf_result compare_switches(fix_run* run, const char* name, const gsf_jso
     return result;
 }
 
-// The rows of a list, at most `columns` numbers each; null is NaN.
-static size_t read_rows(const gsf_json* json, const gsf_json_value* root, const char* key, size_t columns, double** rows,
-                        gsf_context* ctx) {
-    const gsf_json_value* list = gsf_json_member(json, root, key);
-    *rows = NULL;
-    if (!list || list->type != GSF_JSON_ARRAY || !list->count) return 0;
-    *rows = (double*)gsf_alloc_zeroed(ctx, list->count, columns * sizeof(double));
-    if (!*rows) return 0;
-    size_t row = 0;
-    for (uint32_t i = list->child; i; i = json->values[i].next, row++) {
-        size_t column = 0;
-        for (uint32_t k = json->values[i].child; k && column < columns; k = json->values[k].next, column++)
-            (*rows)[row * columns + column] = json->values[k].type == GSF_JSON_NUMBER ? json->values[k].number : NAN;
+// Every file that was read then and now has the bytes that it had; where they lie does not matter.
+static gsf_result compare_inputs(fix_run* run, const char* name, const gsf_json* old, const gsf_json_value* was) {
+    if (!was || was->type != GSF_JSON_ARRAY)
+        return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: does not say what it was made from (--restart begins anew)", name);
+    for (size_t i = 0; i < was->count || i < run->input_count; i++) {
+        const gsf_json_value* row = i < was->count ? gsf_json_element(old, was, i) : NULL;
+        const gsf_json_value *path = row ? gsf_json_element(old, row, 0) : NULL, *digest = row ? gsf_json_element(old, row, 1) : NULL;
+        const int valid = path && digest && path->type == GSF_JSON_STRING && digest->type == GSF_JSON_STRING;
+        if (row && !valid) return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: broken list of inputs", name);
+        if (row && i < run->input_count && strcmp(digest->string, input_digest(run->inputs + i).s) == 0) continue;
+        return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: made with another %s (--restart begins anew)", name,
+                        i < run->input_count ? run->inputs[i].path : path->string);
     }
-    return row;
+    return GSF_OK;
 }
 
-static gsf_result read_history(fix_run* run, const gsf_json* json) {
+static const gsf_json_value* whole_member(const gsf_json* json, const char* key, double most) { // NULL: not there, not such
+    const gsf_json_value* v = gsf_json_member(json, &json->values[0], key);
+    return v && v->type == GSF_JSON_NUMBER && v->number >= 0.0 && v->number <= most && v->number == floor(v->number) ? v : NULL;
+}
+
+// The rows of a list of the history. kinds: what each column holds: w = 0 to 1e9, i = the same or -1, c = a count up to
+// 2^53 (all whole), f = a finite number, n = that or null, which is NaN.
+static gsf_result read_rows(fix_run* run, const char* name, const gsf_json* json, const char* key, const char* kinds,
+                            double** rows, size_t* count) {
+    gsf_context* ctx = run->ctx;
+    const gsf_json_value* list = gsf_json_member(json, &json->values[0], key);
+    const size_t columns = strlen(kinds);
+    *rows = NULL;
+    *count = 0;
+    int valid = list && list->type == GSF_JSON_ARRAY;
+    if (valid && !list->count) return GSF_OK;
+    double* values = valid ? (double*)gsf_alloc(ctx, list->count, columns * sizeof *values) : NULL;
+    if (valid && !values) return GSF_ERROR_OUT_OF_MEMORY;
+    for (uint32_t i = valid ? list->child : 0; i && valid; i = json->values[i].next, ++*count) {
+        size_t k = 0;
+        valid = json->values[i].type == GSF_JSON_ARRAY && json->values[i].count == columns;
+        for (uint32_t at = valid ? json->values[i].child : 0; at && valid; at = json->values[at].next, k++) {
+            const int is_number = json->values[at].type == GSF_JSON_NUMBER;
+            const double x = is_number ? json->values[at].number : NAN;
+            const double least = kinds[k] == 'i' ? -1.0 : 0.0, most = kinds[k] == 'c' ? 9007199254740992.0 : 1e9;
+            if (kinds[k] == 'n' || kinds[k] == 'f') valid = isfinite(x) || (!is_number && kinds[k] == 'n');
+            else valid = x >= least && x <= most && x == floor(x);
+            values[*count * columns + k] = x;
+        }
+    }
+    *rows = values;
+    return valid ? GSF_OK : gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: \"%s\" holds what no run writes there", name, key);
+}
+
+static gsf_result take_row(fix_run* run, int list, const double* x) {
     gsf_context* ctx = run->ctx;
     gsfix_history* h = &run->history;
-    const gsf_json_value* root = &json->values[0];
-    const gsf_json_value* seconds = gsf_json_member(json, root, "seconds");
-    const gsf_json_value* total = gsf_json_member(json, root, "seconds_total");
-    const gsf_json_value* resumed = gsf_json_member(json, root, "resumed");
+    gsf_result result = GSF_OK;
+    if (list == 0) {
+        const gsfix_curve_point p = {(int32_t)x[0], (uint64_t)x[1], x[2], x[3]};
+        if ((result = GROW(ctx, h, curve, curve)) == GSF_OK) h->curve[h->curve_count++] = p;
+    } else if (list == 1) {
+        const gsfix_round p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], (int32_t)x[3], (int32_t)x[4], x[5]};
+        if ((result = GROW(ctx, h, rounds, round)) == GSF_OK) h->rounds[h->round_count++] = p;
+    } else if (list == 2) {
+        const gsfix_flown p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], {x[3], x[4], x[5]}, {x[6], x[7], x[8]}};
+        if ((result = GROW(ctx, h, path, path)) == GSF_OK) h->path[h->path_count++] = p;
+    } else {
+        const gsfix_sample p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2]};
+        if ((result = GROW(ctx, h, samples, sample)) == GSF_OK) h->samples[h->sample_count++] = p;
+    }
+    return result;
+}
+
+static gsf_result read_history(fix_run* run, const char* name, const gsf_json* json) {
+    static const struct { const char *key, *kinds; } lists[] = {
+        {"curve", "wcnn"}, {"rounds", "wwwwwf"}, {"path", "wwiffffff"}, {"samples", "www"}};
+    gsf_context* ctx = run->ctx;
+    gsfix_history* h = &run->history;
+    const gsf_json_value* seconds = gsf_json_member(json, &json->values[0], "seconds");
+    const gsf_json_value* total = gsf_json_member(json, &json->values[0], "seconds_total");
+    const gsf_json_value* resumed = whole_member(json, "resumed", 1e9 - 1);
+    const gsf_json_value* iteration = whole_member(json, "iteration", run->iterations);
+    double* r = NULL;
+    size_t n = 0;
+    if (!resumed || !iteration) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid number of steps or of earlier runs", name);
+    h->resumed = (int32_t)resumed->number + 1;
+    run->iteration = (int32_t)iteration->number;
     for (size_t i = 0; i < GSFIX_STAGES; i++) {
         const gsf_json_value* s = gsf_json_element(json, seconds, i);
-        if (s) h->seconds[i] += s->number;
+        if (s && s->type == GSF_JSON_NUMBER && isfinite(s->number)) h->seconds[i] += s->number;
     }
-    if (total) run->total_before = total->number;
-    h->resumed = resumed ? (int32_t)resumed->number + 1 : 1;
-    gsf_result result = GSF_OK;
-    double* r = NULL;
-    size_t n = read_rows(json, root, "before", 4, &r, ctx);
-    for (size_t i = 0; i < n && n == h->view_count; i++) memcpy(&h->before[i].psnr, r + 4 * i, 4 * sizeof(double));
-    h->has_before = n > 0 && n == h->view_count;
+    if (total && total->type == GSF_JSON_NUMBER && isfinite(total->number)) run->total_before = total->number;
+    gsf_result result = read_rows(run, name, json, "before", "nnnn", &r, &n);
+    if (result == GSF_OK && n && n != h->view_count)
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: \"before\" has %zu views, the scene %zu", name, n, h->view_count);
+    for (size_t i = 0; i < n && result == GSF_OK; i++) memcpy(&h->before[i].psnr, r + 4 * i, 4 * sizeof *r);
+    h->has_before = n > 0 && result == GSF_OK;
     gsf_free(ctx, r);
-    n = read_rows(json, root, "curve", 4, &r, ctx);
-    for (size_t i = 0; i < n && (result = GROW(ctx, h, curve, curve)) == GSF_OK; i++) {
-        const double* x = r + 4 * i;
-        const gsfix_curve_point p = {(int32_t)x[0], (uint64_t)x[1], x[2], x[3]};
-        h->curve[h->curve_count++] = p;
+    for (int list = 0; list < 4 && result == GSF_OK; list++) {
+        result = read_rows(run, name, json, lists[list].key, lists[list].kinds, &r, &n);
+        for (size_t i = 0; i < n && result == GSF_OK; i++) result = take_row(run, list, r + i * strlen(lists[list].kinds));
+        gsf_free(ctx, r);
     }
-    gsf_free(ctx, r);
-    n = read_rows(json, root, "rounds", 6, &r, ctx);
-    for (size_t i = 0; i < n && result == GSF_OK && (result = GROW(ctx, h, rounds, round)) == GSF_OK; i++) {
-        const double* x = r + 6 * i;
-        const gsfix_round p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], (int32_t)x[3], (int32_t)x[4], x[5]};
-        h->rounds[h->round_count++] = p;
-    }
-    gsf_free(ctx, r);
-    n = read_rows(json, root, "path", 9, &r, ctx);
-    for (size_t i = 0; i < n && result == GSF_OK && (result = GROW(ctx, h, path, path)) == GSF_OK; i++) {
-        const double* x = r + 9 * i;
-        const gsfix_flown p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], {x[3], x[4], x[5]}, {x[6], x[7], x[8]}};
-        h->path[h->path_count++] = p;
-    }
-    gsf_free(ctx, r);
-    n = read_rows(json, root, "samples", 3, &r, ctx);
-    for (size_t i = 0; i < n && result == GSF_OK && (result = GROW(ctx, h, samples, sample)) == GSF_OK; i++) {
-        const double* x = r + 3 * i;
-        const gsfix_sample p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2]};
-        h->samples[h->sample_count++] = p;
-    }
-    gsf_free(ctx, r);
+    return result;
+}
+
+// The checkpoint's bytes and its JSON; both are the caller's to free, also after a failure.
+static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, size_t* size, gsf_json* json) {
+    gsf_context* ctx = run->ctx;
+    gsf_chunk chunk;
+    gsf_result result = gsf_read_file(ctx, name, data, size);
+    if (result == GSF_OK) result = gsf_chunks_check(ctx, name, *data, *size);
+    if (result == GSF_OK && !gsf_chunks_find(*data, *size, "GFIX", &chunk))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: not a checkpoint of gsfix fix", name);
+    if (result == GSF_OK) result = gsf_parse_json(ctx, name, (const char*)chunk.data, chunk.size, json);
     return result;
 }
 
 static gsf_result resume(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const gsfix_path path = gsfix_pathf("%s/checkpoint", run->app->o.out);
-    void* data;
-    size_t size;
-    gsf_chunk chunk;
+    void* data = NULL;
+    size_t size = 0;
     gsf_json json = {0};
-    gsf_result result = gsf_read_file(ctx, path.s, &data, &size);
-    if (result != GSF_OK) return result;
-    result = gsf_chunks_check(ctx, path.s, data, size);
-    if (result == GSF_OK && !gsf_chunks_find(data, size, "GFIX", &chunk))
-        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: not a checkpoint of gsfix fix", path.s);
-    if (result == GSF_OK) result = gsf_parse_json(ctx, path.s, (const char*)chunk.data, chunk.size, &json);
+    gsf_result result = open_checkpoint(run, path.s, &data, &size, &json);
     if (result == GSF_OK)
         result = compare_switches(run, path.s, &json, gsf_json_member(&json, &json.values[0], "switches"));
+    if (result == GSF_OK) result = compare_inputs(run, path.s, &json, gsf_json_member(&json, &json.values[0], "inputs"));
+    if (result == GSF_OK) result = read_history(run, path.s, &json);
     if (result == GSF_OK) result = gsf_splat_fixer_restore(ctx, run->fixer, path.s, data, size);
-    if (result == GSF_OK) result = read_history(run, &json);
-    const gsf_json_value* iteration = result == GSF_OK ? gsf_json_member(&json, &json.values[0], "iteration") : NULL;
-    if (iteration) run->iteration = (int32_t)iteration->number;
     gsf_destroy_json(ctx, &json);
     gsf_free(ctx, data);
     return result;
 }
 
+// A checkpoint that is there is gone on from, or given up by name; never just replaced.
+static gsf_result meet_checkpoint(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    const gsfix_options* o = &run->app->o;
+    const gsfix_path path = gsfix_pathf("%s/checkpoint", o->out);
+    void* data = NULL;
+    size_t size = 0;
+    gsf_json json = {0};
+    if (!gsfix_has_output(run->app, "checkpoint") || o->restart) return GSF_OK;
+    run->resuming = o->resume;
+    if (o->resume) return GSF_OK;
+    const gsf_result result = open_checkpoint(run, path.s, &data, &size, &json);
+    const gsf_json_value* now = result == GSF_OK ? whole_member(&json, "iteration", 1e9) : NULL;
+    const gsf_json_value* switches = now ? gsf_json_member(&json, &json.values[0], "switches") : NULL;
+    const gsf_json_value* all = switches ? gsf_json_member(&json, switches, "iterations") : NULL;
+    char step[64] = "";
+    if (all && all->type == GSF_JSON_NUMBER) snprintf(step, sizeof step, " at step %.0f of %.0f", now->number, all->number);
+    gsf_destroy_json(ctx, &json);
+    gsf_free(ctx, data);
+    return gsf_fail(ctx, GSF_ERROR_IO, "%s holds the checkpoint of a run%s: --resume goes on, --restart begins anew", o->out, step);
+}
+
+// A training that could finish goes on without one; the last good one stays where it is.
+static void keep_checkpoint(fix_run* run) {
+    const gsf_result result = save_checkpoint(run);
+    if (result != GSF_OK && !run->checkpoint_failed)
+        gsfix_note(run->app, "warning: no checkpoint at step %d, going on without: %s", (int)run->iteration,
+                   result == GSF_ERROR_OUT_OF_MEMORY ? "out of memory" : run->ctx->error);
+    run->checkpoint_failed = result != GSF_OK;
+    run->ctx->error[0] = 0;
+}
+
 // ---- the loop --------------------------------------------------------------------
+
+static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
 
 static gsf_result start_fixer(fix_run* run) {
     gsf_context* ctx = run->ctx;
@@ -722,37 +810,63 @@ static gsf_result start_fixer(fix_run* run) {
     return result;
 }
 
+// Every name that this run may write. What is missing here cannot be written.
+static gsf_result open_fix_out(fix_run* run) {
+    gsfix_app* app = run->app;
+    static const char* const always[] = {"checkpoint", "dit.checkpoint", "splats.ply", "metrics.json", "report.html"};
+    static const char* const repair[] = {"fixed/round*_window*_*.png", "report/round*_window*_*.png"};
+    const char* also = app->o.also ? app->o.also : "";
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < sizeof always / sizeof *always && result == GSF_OK; i++) result = gsfix_claim(app, "%s", always[i]);
+    if (result == GSF_OK && strstr(also, "splat")) result = gsfix_claim(app, "splats.splat");
+    if (result == GSF_OK && strstr(also, "spz")) result = gsfix_claim(app, "splats.spz");
+    for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
+        const gsfix_path stem = gsfix_view_stem(&run->scene, run->split.test[i]);
+        result = gsfix_claim(app, "test/%s.png", stem.s);
+        if (result == GSF_OK && has_restorer(app)) result = gsfix_claim(app, "report/before/%s.png", stem.s);
+    }
+    for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app); i++)
+        result = gsfix_claim(app, "%s", repair[i]);
+    if (result == GSF_OK) result = gsfix_open_out(app);
+    return result == GSF_OK ? gsfix_claim_file(app, app->o.save_features) : result;
+}
+
+static gsf_result load_photos(fix_run* run) {
+    gsf_result result = GSF_OK;
+    for (int k = 0; k < 2; k++)
+        for (size_t i = 0; i < (k ? run->split.test_count : run->split.train_count) && result == GSF_OK; i++)
+            result = gsf_splat_load_view_image(run->ctx, &run->scene, k ? run->split.test[i] : run->split.train[i]);
+    return result;
+}
+
 static gsf_result prepare(fix_run* run) {
     gsfix_app* app = run->app;
     gsf_context* ctx = run->ctx;
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &run->scene);
     if (result == GSF_OK) result = gsfix_split_scene(app, &run->scene, &run->split);
-    if (result == GSF_OK) // before the work that a missing model would waste
-        result = gsfix_make_restorer(app, gsfix_pathf("%s/job", app->o.out).s, &run->restorer, &run->has_restorer);
+    if (result == GSF_OK) result = open_fix_out(run); // before the work that would be wasted
+    if (result == GSF_OK) result = meet_checkpoint(run);
+    if (result == GSF_OK) result = gsfix_make_restorer(app, &run->restorer, &run->has_restorer);
     if (result == GSF_OK)
         run->setup.fix.train.render.near_plane =
             gsfix_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
-    for (int k = 0; k < 2; k++)
-        for (size_t i = 0; i < (k ? run->split.test_count : run->split.train_count) && result == GSF_OK; i++)
-            result = gsf_splat_load_view_image(ctx, &run->scene, k ? run->split.test[i] : run->split.train[i]);
+    if (result == GSF_OK) result = load_photos(run);
     if (result == GSF_OK && app->o.masks) result = load_masks(run);
+    if (result == GSF_OK) result = gsfix_digest_input(app, app->o.ref_features);
     if (result == GSF_OK) result = make_initial(run);
     if (result == GSF_OK) result = start_fixer(run);
     if (result != GSF_OK) return result;
+    run->inputs = gsfix_end_inputs(app, &run->input_count);
     run->history.view_count = run->split.test_count;
     run->history.before = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *run->history.before);
     write_switches(run);
     if (!run->history.before || run->switches.failed) return GSF_ERROR_OUT_OF_MEMORY;
-    const char* const folders[] = {"test", "fixed", "report", "report/before"};
-    const int resuming = app->o.resume && gsfix_exists(gsfix_pathf("%s/checkpoint", app->o.out).s);
-    for (size_t i = 0; i < sizeof folders / sizeof *folders && result == GSF_OK; i++) {
-        const gsfix_path folder = gsfix_pathf("%s/%s", app->o.out, folders[i]);
-        result = gsfix_make_folder(ctx, folder.s);
-        if (result == GSF_OK && !resuming) result = gsfix_clear_folder(ctx, folder.s, 0);
-    }
-    if (result == GSF_OK && resuming) result = resume(run);
-    gsfix_note(app, "%zu training views, %zu held out; %zu initial splats%s", run->split.train_count, run->split.test_count,
-               run->initial.count, resuming && result == GSF_OK ? "; going on from the checkpoint" : "");
+    if (run->resuming) result = resume(run);
+    else result = gsfix_remove_output(app, "checkpoint");
+    if (result == GSF_OK && !run->resuming) result = gsfix_remove_stale(app);
+    if (result == GSF_OK)
+        gsfix_note(app, "%zu training views, %zu held out; %zu initial splats%s", run->split.train_count,
+                   run->split.test_count, run->initial.count, run->resuming ? "; going on from the checkpoint" : "");
     return result;
 }
 
@@ -856,7 +970,7 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
     add_seconds(run, GSFIX_SAVE, clock);
     if (stats->stage == GSF_FIX_TRAIN && run->iteration == run->iterations) due = 1;
     else if (due && !run->app->o.checkpoint_every) due = checkpoint_pays(run);
-    if (result == GSF_OK && due) result = save_checkpoint(run);
+    if (result == GSF_OK && due) keep_checkpoint(run);
     add_seconds(run, GSFIX_CHECKPOINT, clock);
     return result;
 }
@@ -896,7 +1010,11 @@ static gsf_result run_loop(fix_run* run) {
     if (result != GSF_ERROR_CANCELLED) return result;
     gsf_clear_cancel(ctx);
     result = save_checkpoint(run);
-    if (result != GSF_OK) return result;
+    char why[sizeof ctx->error] = "out of memory";
+    if (result != GSF_ERROR_OUT_OF_MEMORY) memcpy(why, ctx->error, sizeof why);
+    if (result != GSF_OK)
+        return gsf_fail(ctx, result, "stopped at step %d of %d without a checkpoint%s: %.300s", (int)run->iteration,
+                        (int)run->iterations, gsfix_has_output(run->app, "checkpoint") ? " (an older one stays)" : "", why);
     return gsf_fail(ctx, GSF_ERROR_CANCELLED, "stopped at step %d of %d; --resume goes on from %s/checkpoint",
                     (int)run->iteration, (int)run->iterations, run->app->o.out);
 }
@@ -1102,7 +1220,7 @@ int gsfix_run_fix(gsfix_app* app) {
     run.history.seconds[GSFIX_INIT] += gsfix_now() - app->started;
     if (result == GSF_OK) result = run_loop(&run);
     if (result == GSF_OK) result = finish(&run);
-    if (result == GSF_OK) gsfix_drop_dit_checkpoint(app);
+    if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
     free_run(&run);
     return result == GSF_OK ? 0 : gsfix_failed(app);
 }

@@ -459,18 +459,20 @@ static gsf_result put_switches(page* p, const char* command) {
 
 typedef struct frame3 { double center[3], axes[3][3], scale; } frame3; // world -> integers, y up, cameras within +-1000
 
+static int to_whole(double x) { return isnan(x) ? 0 : (int)(x > 1e6 ? 1e6 : x < -1e6 ? -1e6 : floor(x + 0.5)); }
+
 static void to_view(const frame3* f, const double world[3], int out[3]) {
     for (int a = 0; a < 3; a++) {
         double sum = 0.0;
         for (int k = 0; k < 3; k++) sum += f->axes[a][k] * (world[k] - f->center[k]);
         sum *= f->scale;
-        out[a] = (int)(sum > 1e6 ? 1e6 : sum < -1e6 ? -1e6 : floor(sum + 0.5));
+        out[a] = to_whole(sum);
     }
 }
 
 static void turn_only(const frame3* f, const double direction[3], double length, int out[3]) {
     for (int a = 0; a < 3; a++)
-        out[a] = (int)floor(length * (f->axes[a][0] * direction[0] + f->axes[a][1] * direction[1] + f->axes[a][2] * direction[2]) + 0.5);
+        out[a] = to_whole(length * (f->axes[a][0] * direction[0] + f->axes[a][1] * direction[1] + f->axes[a][2] * direction[2]));
 }
 
 static void normalize(double v[3]) {

@@ -50,12 +50,13 @@ double gsfix_anonymous_memory(void) {
     return bytes;
 }
 
-gsfix_path gsfix_pathf(const char* format, ...) { // too long a path is cut, and then not found
+gsfix_path gsfix_pathf(const char* format, ...) { // too long a path is empty, and then not found
     gsfix_path path;
     va_list args;
     va_start(args, format);
-    if (vsnprintf(path.s, sizeof path.s, format, args) < 0) path.s[0] = 0;
+    const int n = vsnprintf(path.s, sizeof path.s, format, args);
     va_end(args);
+    if (n < 0 || (size_t)n >= sizeof path.s) path.s[0] = 0;
     return path;
 }
 
@@ -75,35 +76,12 @@ gsf_result gsfix_make_folder(gsf_context* ctx, const char* path) {
         if (*p != '/' && *p != 0) continue;
         const char end = *p;
         *p = 0;
-        if (mkdir(part.s, 0777) != 0 && !gsfix_is_folder(part.s))
-            return gsf_fail(ctx, GSF_ERROR_IO, "%s: folder cannot be made: %s", part.s, strerror(errno));
+        const int reason = mkdir(part.s, 0777) == 0 ? 0 : errno;
+        if (reason && !gsfix_is_folder(part.s)) // EEXIST is also a file, or a link to nothing
+            return gsf_fail(ctx, GSF_ERROR_IO, "%s: folder cannot be made: %s", part.s, strerror(reason));
         *p = end;
         if (!end) return GSF_OK;
     }
-}
-
-gsf_result gsfix_clear_folder(gsf_context* ctx, const char* path, int deep) {
-    DIR* folder = opendir(path);
-    if (!folder) return GSF_OK;
-    gsf_result result = GSF_OK;
-    for (struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
-        if (strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0) continue;
-        const gsfix_path child = gsfix_pathf("%s/%s", path, entry->d_name);
-        const size_t length = strlen(entry->d_name);
-        struct stat s;
-        if (lstat(child.s, &s) != 0) continue;
-        if (S_ISDIR(s.st_mode)) {
-            if (!deep) continue;
-            result = gsfix_clear_folder(ctx, child.s, 1);
-            if (result == GSF_OK && rmdir(child.s) != 0)
-                result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be removed: %s", child.s, strerror(errno));
-        } else if (deep || (length > 4 && strcmp(entry->d_name + length - 4, ".png") == 0)) {
-            if (unlink(child.s) != 0)
-                result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be removed: %s", child.s, strerror(errno));
-        }
-    }
-    closedir(folder);
-    return result;
 }
 
 char* gsfix_copy_text(gsf_context* ctx, const char* text, size_t size) {
@@ -168,21 +146,26 @@ gsfix_path gsfix_stem(const char* path) {
     return stem;
 }
 
-static gsfix_path flat_name(const char* name, int with_extension) {
-    gsfix_path flat = gsfix_pathf("%s", name);
-    for (char* p = flat.s; *p; p++)
-        if (*p == '/' || *p == '\\') *p = '_';
-    if (with_extension) return flat;
-    char* dot = strrchr(flat.s, '.');
+// Short: without extension, folders joined by '_'. Else whole, and different for every name.
+static gsfix_path flat_name(const char* name, int is_short) {
+    gsfix_path flat = {""};
+    size_t n = 0;
+    for (; *name && n + 4 < sizeof flat.s; name++) {
+        const int is_slash = *name == '/' || *name == '\\';
+        if (is_short || (!is_slash && *name != '%')) flat.s[n++] = is_slash ? '_' : *name;
+        else n += (size_t)snprintf(flat.s + n, sizeof flat.s - n, "%%%02X", (unsigned)(unsigned char)*name);
+    }
+    char* dot = is_short ? strrchr(flat.s, '.') : NULL;
     if (dot && dot != flat.s) *dot = 0;
     return flat;
 }
 
 gsfix_path gsfix_view_stem(const gsf_scene* scene, size_t view) {
-    const gsfix_path mine = flat_name(scene->views[view].name, 0);
-    for (size_t i = 0; i < scene->view_count; i++)
-        if (i != view && strcmp(flat_name(scene->views[i].name, 0).s, mine.s) == 0)
-            return flat_name(scene->views[view].name, 1); // a.jpg and a.png
+    const gsfix_path mine = flat_name(scene->views[view].name, 1);
+    for (size_t i = 0; i < scene->view_count; i++) // a.jpg and a.png, a/b.png and a_b.png
+        if (i != view && (strcmp(flat_name(scene->views[i].name, 1).s, mine.s) == 0 ||
+                          strcmp(flat_name(scene->views[i].name, 0).s, mine.s) == 0))
+            return flat_name(scene->views[view].name, 0);
     return mine;
 }
 
@@ -242,35 +225,39 @@ static size_t value_count(const gsf_image* image) {
     return (size_t)image->width * (size_t)image->height * (size_t)image->channels;
 }
 
-typedef struct save_job {
+typedef struct encode_job {
     const gsf_context* ctx;
-    const gsfix_path* paths;
     const gsf_image* images;
+    gsf_text* files;
     gsf_result* results;
     char (*errors)[sizeof((gsf_context*)0)->error];
-} save_job;
+} encode_job;
 
-static void save_one(void* arg, size_t i, int worker) {
-    const save_job* job = (const save_job*)arg;
+static void encode_one(void* arg, size_t i, int worker) {
+    const encode_job* job = (const encode_job*)arg;
     gsf_context own = *job->ctx; // a context serves one thread; this one starts no further work and says nothing
     (void)worker;
     own.parallel.worker_count = 1;
     memset(&own.logger, 0, sizeof own.logger);
     own.error[0] = 0;
-    job->results[i] = gsf_save_image(&own, job->paths[i].s, &job->images[i]);
+    job->results[i] = gsf_encode_image(&own, &job->images[i], ".png", &job->files[i]);
     memcpy(job->errors[i], own.error, sizeof own.error);
 }
 
 gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gsf_image* images, size_t count) {
-    save_job job = {ctx, paths, images, NULL, NULL};
+    encode_job job = {ctx, images, NULL, NULL, NULL};
     gsf_result result = GSF_OK;
     if (!count) return GSF_OK;
+    job.files = (gsf_text*)gsf_alloc_zeroed(ctx, count, sizeof *job.files);
     job.results = (gsf_result*)gsf_alloc_zeroed(ctx, count, sizeof *job.results);
     job.errors = gsf_alloc_zeroed(ctx, count, sizeof *job.errors);
-    if (!job.results || !job.errors) result = GSF_ERROR_OUT_OF_MEMORY;
-    if (result == GSF_OK) ctx->parallel.for_fn(ctx->parallel.user, count, save_one, &job);
+    if (!job.files || !job.results || !job.errors) result = GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) ctx->parallel.for_fn(ctx->parallel.user, count, encode_one, &job);
     for (size_t i = 0; i < count && result == GSF_OK; i++)
-        if (job.results[i] != GSF_OK) result = gsf_fail(ctx, job.results[i], "%s", job.errors[i]);
+        result = job.results[i] != GSF_OK ? gsf_fail(ctx, job.results[i], "%s: %s", paths[i].s, job.errors[i])
+                                          : gsf_write_file(ctx, paths[i].s, job.files[i].data, job.files[i].size);
+    for (size_t i = 0; job.files && i < count; i++) gsf_destroy_text(ctx, &job.files[i]);
+    gsf_free(ctx, job.files);
     gsf_free(ctx, job.results);
     gsf_free(ctx, job.errors);
     return result;

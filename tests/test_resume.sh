@@ -22,19 +22,18 @@ whole_ms=$(( ($(date +%s%N) - begin) / 1000000 ))
 fix "$scratch/one" --threads 1 || fail "the run with one worker failed"
 cmp "$scratch/whole/splats.ply" "$scratch/one/splats.ply" || fail "one and two workers differ"
 
-# Kills fall anywhere in what a run takes; every second one waits for a checkpoint being written, as its temporary file
+# Kills fall anywhere in what a run takes; every second one waits for a file being written, as the temporary one
 # shows (and has mostly been renamed when the kill arrives: the count of those that were not is printed).
 done_kills=0 finished_early=0 while_writing=0
 RANDOM=${SEED:-12345}
 while [ "$done_kills" -lt "$kills" ]; do
     [ "$finished_early" -lt $((5 * kills)) ] || fail "runs end before they can be killed"
-    rm -f "$scratch/killed/checkpoint.tmp"
     "$gsfix" fix "$scene" --out "$scratch/killed" "${options[@]}" --resume --threads $((1 + RANDOM % 2)) > "$scratch/log" 2>&1 &
     pid=$!
     ms=$(( RANDOM * (whole_ms * 6 / 10 + 50) / 32768 + 20 ))
     sleep "$(printf '%d.%03d' $((ms / 1000)) $((ms % 1000)))"
     if [ $((done_kills % 2)) = 1 ]; then
-        for (( i = 0; i < 200000; i++ )); do [ ! -e "$scratch/killed/checkpoint.tmp" ] || break; done
+        for (( i = 0; i < 200000; i++ )); do [ ! -e "$scratch/killed/.gsfix/new" ] || break; done
     fi
     kill -9 "$pid" 2> /dev/null || true
     status=0
@@ -45,7 +44,7 @@ while [ "$done_kills" -lt "$kills" ]; do
         rm -rf "$scratch/killed"
     elif [ "$status" = 137 ]; then
         done_kills=$((done_kills + 1))
-        [ ! -e "$scratch/killed/checkpoint.tmp" ] || while_writing=$((while_writing + 1))
+        [ ! -e "$scratch/killed/.gsfix/new" ] || while_writing=$((while_writing + 1))
     else
         fail "a resumed run ended with status $status after $done_kills kills"
     fi
@@ -68,4 +67,4 @@ mv "$scratch/cut" "$scratch/killed/checkpoint"
 status=0
 fix "$scratch/killed" --resume || status=$?
 [ "$status" = 1 ] && [ "$(grep -c '^gsfix fix: ' "$scratch/log")" = 1 ] || fail "a cut checkpoint was not refused (status $status)"
-echo "same bytes after $kills kills ($while_writing while a checkpoint was written), with 1 and 2 workers; a run takes $whole_ms ms"
+echo "same bytes after $kills kills ($while_writing while a file was written), with 1 and 2 workers; a run takes $whole_ms ms"
