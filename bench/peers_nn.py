@@ -1,19 +1,28 @@
 #!/usr/bin/env python3
-"""Runs bench_nn and then PyTorch on the same cases, and prints the ratio of the two.
+"""Runs bench_nn and then its peers on the same cases, and prints the ratios.
 
     bench/peers_nn.py BENCH_NN [--quick] [--filter TEXT] [--threads N] [--rounds N]
 
-BENCH_NN is the built program; its rows are passed through. Every case that PyTorch can do, too, is read from its name and
-timed on as many threads right after; that row has variant "PyTorch" (beside our products of bf16 "PyTorch bf16") and
-"ratio": PyTorch's seconds divided by ours (above 1: we are faster), "cpu_ratio" the same of CPU seconds, for machines that
-do other things as well. --rounds repeats the two in turns; the median counts. Needs PyTorch (pip install torch), for the
-transformer's and the autoencoder's block diffusers and for DINOv2 transformers, too; without PyTorch only our rows are
-printed and the exit code is 77.
+BENCH_NN is the built program; its rows are passed through. Every case that a peer can do, too, is read from its name and
+timed on as many threads right after; that row has the peer as variant (" bf16" behind it beside our products of bf16) and
+"ratio": the peer's seconds divided by ours (above 1: we are faster), "cpu_ratio" the same of CPU seconds, for machines that
+do other things as well. --rounds repeats them in turns; the median counts. The peers:
+
+    PyTorch    as it comes. Its float32 products are MKL's, which leave AVX-512 unused on AMD; 8-bit layers are FBGEMM's
+    oneDNN     PyTorch with each linear layer by oneDNN on weights packed beforehand, activations fused where the layer is
+               the case; 8-bit layers by its engine onednn
+    OpenBLAS   numpy's, float32 products and the bias (needs threadpoolctl)
+    oneDNN's product alone    8-bit layers without quantizing what comes in and what goes out, which ours do
+
+Needs PyTorch and numpy (pip install torch numpy threadpoolctl), for the transformer's and the autoencoder's block diffusers
+and for DINOv2 transformers, too; without PyTorch only our rows are printed and the exit code is 77.
 
 PyTorch makes a new tensor for every result. So that its time is that of the kernel and not of the pages that Linux fills with
-zeros for a large one, up to four fifths of it, the C library is told to keep memory that was freed.
+zeros for a large one, up to four fifths of it, the C library is told to keep memory that was freed. Each library chooses its
+kernels by the processor: environment variables that tell OpenBLAS otherwise are removed.
 """
 import argparse
+import contextlib
 import json
 import os
 import re
@@ -27,6 +36,11 @@ try:
     import torch
 except ImportError:
     torch = None
+try:
+    import numpy
+    import threadpoolctl
+except ImportError:
+    numpy = None
 
 KEEP_MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": "2000000000"}  # glibc reads them as a program starts
 CYCLE_BYTES = 1 << 30  # up to 4 rows: over this much of distinct weights, as bench_nn does (a quarter with --quick)
@@ -49,22 +63,86 @@ def measure(function, units, quick):
     return statistics.median(wall), min(cpu)
 
 
+@contextlib.contextmanager
+def onednn_linears():
+    """torch.nn.functional.linear by oneDNN, on weights packed when they are first seen."""
+    plain, packed = torch.nn.functional.linear, {}
+
+    def linear(x, w, bias=None):
+        rows = x.numel() // x.shape[-1]
+        if (id(w), rows) not in packed:  # w is kept, so that its id stays its own
+            packed[id(w), rows] = torch.ops.mkldnn._reorder_linear_weight(w.detach(), rows), w
+        return torch.ops.mkldnn._linear_pointwise(x, packed[id(w), rows][0], bias, "none", [], "")
+    torch.nn.functional.linear = linear
+    try:
+        yield
+    finally:
+        torch.nn.functional.linear = plain
+
+
+def linear_copies(m, size, quick):
+    return max(1, (CYCLE_BYTES >> (2 if quick else 0)) // size) if m <= 4 else 1
+
+
 def linear(match, quick, low=False):
+    """The layer by each peer that has it."""
     dtype = {"f32": torch.float32, "bf16": torch.bfloat16, "f16": torch.float16}[match.group(1)]
     m, n, k = (int(match.group(i)) for i in (2, 3, 4))
-    size = n * k * torch.tensor([], dtype=dtype).element_size()
-    copies = max(1, (CYCLE_BYTES >> (2 if quick else 0)) // size) if m <= 4 else 1
+    copies = linear_copies(m, n * k * torch.tensor([], dtype=dtype).element_size(), quick)
     weights = [torch.rand(n, k).sub_(0.5).to(dtype) for _ in range(copies)]
     x, bias = torch.rand(m, k).sub_(0.5).to(dtype), torch.rand(n).to(dtype)
+    kind = match.group(5) or ""
     after = {"": None, "gelu": lambda y: torch.nn.functional.gelu(y, approximate="tanh"),
-             "silu": torch.nn.functional.silu}[match.group(5) or ""]
+             "silu": torch.nn.functional.silu}[kind]
 
-    def run():
+    def pytorch():
         for w in weights:
             y = torch.nn.functional.linear(x, w, bias)
             if after:
                 after(y)
-    return run, copies
+    yield "PyTorch", pytorch, copies
+    if dtype == torch.float16:
+        return  # oneDNN's takes minutes on processors without products of f16
+    fused = {"": ("none", ""), "gelu": ("gelu", "tanh"), "silu": ("swish", "")}[kind]
+    packed = [torch.ops.mkldnn._reorder_linear_weight(w, m) for w in weights]
+
+    def onednn():
+        for w in packed:
+            torch.ops.mkldnn._linear_pointwise(x, w, bias, fused[0], [], fused[1])
+    yield "oneDNN", onednn, copies
+    if numpy is None or dtype != torch.float32 or kind:
+        return
+    del packed
+    rows, shift, columns = x.numpy(), bias.numpy(), [w.numpy().T for w in weights]
+    out = numpy.empty((m, n), numpy.float32)
+
+    def openblas():
+        for w in columns:
+            numpy.matmul(rows, w, out=out)
+            numpy.add(out, shift, out=out)
+    with threadpoolctl.threadpool_limits(torch.get_num_threads(), user_api="blas"):
+        yield "OpenBLAS", openblas, copies
+
+
+def int8_linear(match, quick):
+    """float32 in and out, the activations quantized on the way as ours are; and the bare product."""
+    m, n, k = (int(match.group(i)) for i in (1, 2, 3))
+    copies, bias = linear_copies(m, n * k, quick), torch.rand(n)
+    x, w = torch.rand(m, k).sub_(0.5), torch.rand(n, k).sub_(0.5)
+    steps = torch.full((n,), 0.5 / 127.0), torch.zeros(n, dtype=torch.long)
+    for name, engine in (("PyTorch", "x86"), ("oneDNN", "onednn")):
+        torch.backends.quantized.engine = engine
+        layers = [torch.ao.nn.quantized.dynamic.Linear(k, n) for _ in range(copies)]
+        for layer in layers:
+            layer.set_weight_bias(torch.quantize_per_channel(w, *steps, 0, torch.qint8), bias)
+
+        def run(layers=layers):
+            for layer in layers:
+                layer(x)
+        yield name, run, copies
+    if m > 4:
+        a, b = (torch.randint(-127, 127, shape, dtype=torch.int8) for shape in ((m, k), (n, k)))
+        yield "oneDNN's product alone", lambda: torch._int_mm(a, b.t()), 1
 
 
 def attention(match, quick, low=False):
@@ -228,6 +306,7 @@ LOW = "bf16 products"  # a variant of ours; PyTorch's side is computed in bf16 t
 
 CASES = [ # name of a case, what makes (function, units)
     (re.compile(r"linear (f32|bf16|f16) M=(\d+) N=(\d+) K=(\d+)(?: (gelu|silu))?$"), linear),
+    (re.compile(r"linear int8 M=(\d+) N=(\d+) K=(\d+)$"), int8_linear),
     (re.compile(r"attention f32 H=(\d+) D=(\d+) Q=(\d+) K=(\d+)$"), attention),
     (re.compile(r"(layer_norm|layer_norm_modulated|rms_norm|head_norm_rope|group_norm|softmax|gelu|silu) f32 (\d+)x(\d+)$"),
      rows),
@@ -238,35 +317,56 @@ CASES = [ # name of a case, what makes (function, units)
     (re.compile(r"dinov2 f32 (\d+)x(\d+) L=(\d+)$"), dinov2),
     (re.compile(r"vggt pair f32 (\d+)x(\d+) N=(\d+)$"), pair),
 ]
+WITH_LINEARS = (block, t5_layer, dinov2, pair)
 
 
-def peer_row(ours, quick):
+def peers_of(ours, match, make, quick):
+    """(name, function, units) of each peer that has the case; what one needs lives while it is the current one."""
+    low = ours["variant"] == LOW
+    if make in (linear, int8_linear):
+        yield from make(match, quick)
+        return
+    arguments = (match, quick, True) if low else (match, quick)
+    yield ("PyTorch",) + make(*arguments)
+    if make in WITH_LINEARS:
+        with onednn_linears():
+            yield ("oneDNN",) + make(*arguments)
+
+
+def compute_in_bf16(ours, match):
+    return ours["variant"] == LOW or match.group(1) == "bf16"
+
+
+def comparable(ours, match, make):
+    low, bf16, few = ours["variant"] == LOW, match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
+    # PyTorch multiplies bf16 weights with bf16 only: where it has instructions for it, our float32 has no counterpart
+    if low != bf16 and (make is block or (make is linear and not few and ours["isa"] == "avx512_bf16")):
+        return False
+    return not (make is linear and match.group(1) == "f16" and not few)  # takes PyTorch minutes
+
+
+def peer_rows(ours, quick, limits):
     for pattern, make in CASES:
         match = pattern.match(ours["case"])
-        low = ours["variant"] == LOW
-        if not match:
+        if not match or not comparable(ours, match, make):
             continue
-        # PyTorch multiplies bf16 weights with bf16 only: where it has instructions for it, our float32 has no counterpart
-        bf16, few = match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
-        if low != bf16 and (make is block or (make is linear and not few and ours["isa"] == "avx512_bf16")):
-            continue
-        if make is linear and match.group(1) == "f16" and not few:
-            continue  # takes PyTorch minutes on processors without products of f16
         torch.set_num_threads(ours["threads"])
         with torch.inference_mode():
             try:
-                run, units = make(match, quick, True) if low else make(match, quick)
-            except ImportError as missing:
-                print("peers_nn.py: %s: %s" % (ours["case"], missing), file=sys.stderr)
-                return None
-            seconds, cpu = measure(run, units, quick)
-        row = {key: ours[key] for key in ("bench", "case", "isa", "threads", "work", "work_unit")}
-        row.update(variant="PyTorch bf16" if low else "PyTorch", seconds=seconds, cpu_seconds=cpu, rate=ours["work"] / seconds, reference="none",
-                   peer=torch.__version__)
-        if "peak_share" in ours:  # by the same peak
-            row["peak_share"] = ours["peak_share"] * ours["seconds"] / seconds
-        return row
-    return None
+                for name, run, units in peers_of(ours, match, make, quick):
+                    seconds, cpu = measure(run, units, quick)
+                    row = {key: ours[key] for key in ("bench", "case", "isa", "threads", "work", "work_unit")}
+                    row.update(variant=name + " bf16" * (ours["variant"] == LOW), seconds=seconds, cpu_seconds=cpu,
+                               rate=ours["work"] / seconds, reference="none",
+                               peer=numpy.__version__ if name == "OpenBLAS" else torch.__version__)
+                    limit = limits.get((ours["threads"], "bf16 dot products" if compute_in_bf16(ours, match) else
+                                        "integer dot products" if make is int8_linear else "multiply-add"))
+                    if "peak_share" in ours and limit:
+                        row["peak_share"] = row["rate"] / limit
+                    yield row
+            except (ImportError, NotImplementedError, RuntimeError) as missing:
+                print("peers_nn.py: %s: %s" % (ours["case"], str(missing).splitlines()[0]), file=sys.stderr)
+        return
 
 
 def main():
@@ -277,32 +377,34 @@ def main():
     parser.add_argument("--threads", type=int)
     parser.add_argument("--rounds", type=int, default=1)
     options = parser.parse_args()
-    if not KEEP_MEMORY.items() <= os.environ.items():
-        os.execve(sys.executable, [sys.executable] + sys.argv, {**os.environ, **KEEP_MEMORY})
+    wanted = {**{key: value for key, value in os.environ.items() if not key.startswith("OPENBLAS_")}, **KEEP_MEMORY}
+    if wanted != dict(os.environ):
+        os.execve(sys.executable, [sys.executable] + sys.argv, wanted)
     command = [options.bench, "--json"] + ["--quick"] * options.quick
     command += ["--filter", options.filter] if options.filter else []
     command += ["--threads", str(options.threads)] if options.threads else []
-    pairs, best = {}, None
+    pairs, limits, best = {}, {}, None
     for _ in range(options.rounds):
         for line in subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines():
             ours = json.loads(line)
             print(line, flush=True)
-            if ours["case"].startswith("machine"):
-                best = ours["isa"]  # the last ones are of the best instruction set
+            if ours["case"].startswith("machine: "):
+                if not ours["case"].startswith("machine: sweep"):  # the last ones are of the best instruction set
+                    best, limits[ours["threads"], ours["case"][9:]] = ours["isa"], ours["rate"]
+                continue
             if torch is None or ours["variant"] not in ("default", LOW) or ours["isa"] != best:
                 continue
-            theirs = peer_row(ours, options.quick)
-            if theirs:
-                pairs.setdefault((ours["case"], ours["variant"], ours["threads"]), []).append((ours, theirs))
+            for theirs in peer_rows(ours, options.quick, limits):
+                pairs.setdefault((ours["case"], theirs["variant"], ours["threads"]), []).append((ours, theirs))
     for rows in pairs.values():
         row = dict(rows[-1][1])
         row["ratio"] = round(statistics.median(t["seconds"] / o["seconds"] for o, t in rows), 3)
         row["cpu_ratio"] = round(statistics.median(t["cpu_seconds"] / o["cpu_seconds"] for o, t in rows), 3)
         print(json.dumps(row))
-    if torch is None:
-        print("peers_nn.py: PyTorch is not installed", file=sys.stderr)
-        return 77
-    return 0
+    for name, package in (("PyTorch", torch), ("numpy and threadpoolctl", numpy)):
+        if package is None:
+            print("peers_nn.py: no %s here" % name, file=sys.stderr)
+    return 0 if torch else 77
 
 
 if __name__ == "__main__":

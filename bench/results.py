@@ -6,7 +6,7 @@
 Writes DIR/results.csv (every row), DIR/stages.svg (where a training step's time goes, by size), DIR/growth.svg (how cost
 grows), DIR/pipeline.svg (the video model's run time beside its error) and DIR/RESULTS.md. Several rows of the same case,
 instruction set and thread count are rounds: the median counts. Rows of test_stress --json are the table of worst errors,
-those of peers_nn.py with variant PyTorch the ratios. Only the standard library is needed.
+those of peers_nn.py with a peer as variant the ratios. Only the standard library is needed.
 """
 import collections
 import csv
@@ -327,10 +327,12 @@ def errors(row):
 
 
 def nn_sections(lines, rows, has_pipeline):
-    def peer(row):  # what a row and its peer have in common
-        return row["case"], row["isa"], row["threads"], row["variant"] in ("bf16 products", "PyTorch bf16")
+    def peer(row):  # what a row and its peers have in common
+        return row["case"], row["isa"], row["threads"], row["variant"].replace(" products", "").endswith("bf16")
 
-    ratios = {peer(r): "%.2f" % r["ratio"] for r in rows if "ratio" in r}
+    ratios = collections.defaultdict(list)
+    for r in sorted((r for r in rows if "ratio" in r), key=lambda r: r["ratio"]):
+        ratios[peer(r)].append("%.2f %s" % (r["ratio"], r["variant"].replace(" bf16", "")))
     peaks = [r for r in rows if r["case"].startswith("machine: ")]
     kernels = [r for r in rows if "ratio" not in r and not r["case"].startswith(("machine: ", "pipeline: ", "model: "))]
     lines += ["## Kernels of the video model and its encoders", "",
@@ -341,14 +343,16 @@ def nn_sections(lines, rows, has_pipeline):
     lines += ["At the released model's sizes, the smallest cases at every level of instructions. Shares are of the peaks "
               "above: 8-bit layers' of the integers', products of bf16 of theirs, all others' of the multiply-adds'; bandwidth "
               "of a sweep over as much memory, or, where few rows cycle through 1 GiB of weights, of reading it between rounds. "
-              "Errors are against sums in double. The last column is PyTorch's seconds divided by ours, timed in turns in "
-              "the same run (`bench/peers_nn.py`): in float32, beside our products of bf16 in bf16. It keeps the memory of "
-              "its results there; getting new pages for every large one takes it up to five times as long.", ""]
+              "Errors are against sums in double. The last column is the peers' seconds divided by ours, timed in turns in "
+              "the same run (`bench/peers_nn.py`), the fastest first: PyTorch as it comes, with oneDNN's linear layers on "
+              "weights packed beforehand, and OpenBLAS; in float32, beside our products of bf16 in bf16. 8-bit layers "
+              "quantize what comes in, but for oneDNN's product alone. PyTorch keeps the memory of its results there; "
+              "getting new pages for every large one takes it up to five times as long.", ""]
     table(lines, ["", "", "instructions", "threads", "ms", "CPU ms", "peak", "bandwidth", "largest error", "relative L2",
-                  "PyTorch / ours"],
+                  "peers / ours"],
           [[r["case"], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), ms(r["seconds"]),
             ms(r["cpu_seconds"]), percent(r, "peak_share"), percent(r, "bandwidth_share")] + errors(r)
-           + [ratios.get(peer(r), "")]
+           + [", ".join(ratios[peer(r)])]
            for r in kernels])
     if has_pipeline:
         lines += ["## A whole restoration: run time beside error", "", "![Error beside seconds](pipeline.svg)", "",

@@ -4,7 +4,7 @@
 #   START=PLY                 from these splats instead of the scene's points
 #   OPENSPLAT=/path/opensplat and the same steps by OpenSplat in turns with ours, with the ratio (needs SCENE)
 #   ROUNDS=5 STEPS=200        of that comparison
-#   TORCH=python3             and the networks' kernels by this Python's PyTorch, with the ratio
+#   TORCH=python3             and the networks' kernels by the peers that this Python has (PyTorch, oneDNN, OpenBLAS), with the ratios
 #   MODEL=FOLDER              and one pass of it: about an hour and a half (make_model --size full --parts transformer,vae)
 # About forty minutes; --quick is a look at it in two. The machine should do nothing else.
 set -euo pipefail
