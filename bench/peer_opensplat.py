@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""Time per training step of OpenSplat on the CPU, as a row of bench_splat --json.
+"""Time per training step of OpenSplat 1.2.0 on the CPU, as a row of bench_splat --json.
 
-    bench/peer_opensplat.py OPENSPLAT SCENE [START.ply] [--steps 200]
+    bench/peer_opensplat.py OPENSPLAT SCENE [START.ply] [--steps 200] [--threads 2]
 
 OpenSplat prints a line per step, after backward and before Adam, so that the time between two lines is one whole step.
-Density control is off (a warm-up longer than the run), all SH bands are in from the first step, no downscaling. Its
-START.ply must be one that it wrote itself. Wall and CPU seconds are medians and means over the steps after the first.
+Density control is off (it would begin after the run), all SH bands are in from the first step, no downscaling. Left to
+itself it takes Adam's step only every 32nd or 64th time in the second half of a run; here it is told that this half never
+comes, since ours moves every splat at every step (it still moves the bands of SH above the first every 16th step only).
+Its START.ply must be one that it wrote itself. Wall seconds are the median over the steps after the first, CPU seconds
+their mean.
 """
 import argparse
 import json
@@ -18,19 +21,30 @@ import tempfile
 import time
 
 
+def first_step(ply):
+    """The step that OpenSplat resumes after, as its PLY's header has it."""
+    with open(ply, "rb") as file:
+        found = re.search(rb"at iteration (\d+)", file.read(1000))
+    if not found:
+        sys.exit("peer_opensplat: %s is no file of OpenSplat's" % ply)
+    return int(found.group(1))
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("opensplat")
     parser.add_argument("scene")
     parser.add_argument("start", nargs="?")
     parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        command = [options.opensplat, options.scene, "-n", str(options.steps + 1), "--num-downscales", "0", "--keep-crs",
-                   "--sh-degree-interval", "1", "--warmup-length", "1000000", "-o", os.path.join(folder, "out.ply")]
+        last = options.steps + 1 + (first_step(options.start) if options.start else 0)
+        command = [options.opensplat, options.scene, "-n", str(last), "--sh-degree-interval", "1", "--densify-from", "1000000",
+                   "--densify-until", "1000000", "-o", os.path.join(folder, "out.ply")]
         if options.start:
             command += ["--resume", options.start]
-        environment = dict(os.environ, OMP_NUM_THREADS="2")
+        environment = dict(os.environ, OMP_NUM_THREADS=str(options.threads))
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, bufsize=0)
         clock = ((~process.pid) << 3) | 2  # the CPU clock of another process, as clock_getcpuclockid makes it
         stamps, rest = [], b""
@@ -50,7 +64,7 @@ def main():
         sys.exit("peer_opensplat: no timings (exit status %d, %d steps)" % (status, len(stamps)))
     wall = [b[0] - a[0] for a, b in zip(stamps, stamps[1:])]
     print(json.dumps({
-        "bench": "splat", "case": "train step", "variant": "OpenSplat", "isa": "host", "threads": 2,
+        "bench": "splat", "case": "train step", "variant": "OpenSplat", "isa": "host", "threads": options.threads,
         "seconds": statistics.median(wall), "cpu_seconds": (stamps[-1][1] - stamps[0][1]) / len(wall),
         "work": len(wall), "work_unit": "steps", "rate": 1.0 / statistics.median(wall), "reference": "none",
         "peak_rss_bytes": usage.ru_maxrss * 1024,
