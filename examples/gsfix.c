@@ -1347,6 +1347,7 @@ static int run_command(gsfix_app* app, const command_spec* command, int argc, ch
 
 int main(int argc, char** argv) {
     static gsfix_app app;
+    memset(&app, 0, sizeof app); // tests call this more than once
     if (argc < 2) return print_overview(stderr);
     if (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0 || strcmp(argv[1], "help") == 0)
         return print_overview(stdout);
