@@ -273,7 +273,7 @@ new "render twice"; works "$gsfix" render "$splats" --scene S --out OUT --depth 
 new "render into a run's folder"; cp -r ../made OUT; works "$gsfix" render ../made/splats.ply --scene S --out OUT; [ -s "OUT/test/$view" ] && [ -s OUT/splats.ply ] || fail "removed what fix wrote"
 new "filter twice"; works "$gsfix" filter S --views 3 --out S2; ln -s ../S/images S2/images; works "$gsfix" filter S --views 4 --out S2; works "$gsfix" info S2
 new "masks twice"; works "$gsfix" masks S --views 3 --model "$splats" --out M; works "$gsfix" masks S --views 4 --model "$splats" --out M
-new "a path to stdout"; "$gsfix" path S --views 3 --frames 4 --out /dev/stdout 2> ../stderr | grep -q '"w2c"\|"frames"' || fail "no path"
+new "a path to stdout"; "$gsfix" path S --views 3 --frames 4 --out /dev/stdout 2> ../stderr | cat > ../path && grep -q '"w2c"\|"frames"' ../path || fail "no path"
 new "a path nowhere"; works "$gsfix" path S --views 3 --out /dev/null
 new "a refused run leaves nothing"; run fix S --out OUT --masks nothing; [ "$status" = 1 ] && [ ! -e OUT ] || fail "OUT is there: $(ls -A OUT)"
 new "views of almost one name"; transforms a; mv T/a/frame_001.png T/a/b.png; mv T/a/frame_002.png T/a_b.png; mv T/a/frame_003.png T/a_b.jpg.png
