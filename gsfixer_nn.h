@@ -10756,6 +10756,15 @@ static gsf_result gsf__sample_save(gsf__sample_run* run) {
     return result;
 }
 
+static int gsf__sample_is_finite(const gsf_chunk* floats) {
+    for (size_t i = 0; i + sizeof(float) <= floats->size; i += sizeof(float)) {
+        float value;
+        memcpy(&value, (const char*)floats->data + i, sizeof value);
+        if (!(fabsf(value) <= FLT_MAX)) return 0;
+    }
+    return 1;
+}
+
 static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size) {
     gsf_chunk head, latents, memory;
     if (!gsf_chunks_find(data, size, "SAMP", &head) || !gsf_chunks_find(data, size, "LATE", &latents) ||
@@ -10766,6 +10775,7 @@ static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size
         return;
     const int64_t index = (int64_t)gsf__load_le((const char*)head.data + 4, 4);
     if (index < 1 || index > run->sampler.count) return;
+    if (!gsf__sample_is_finite(&latents) || !gsf__sample_is_finite(&memory)) return; // it would fail the same way each time
     memcpy(run->latents, latents.data, latents.size);
     if (memory.size) memcpy(run->sampler.memory, memory.data, memory.size);
     run->sampler.index = (int32_t)index;

@@ -67,6 +67,44 @@ static inline void fuzz_sum_chunks(gsf_context* ctx, const uint8_t* data, size_t
     FUZZ_CHECK(!out->failed);
 }
 
+// One chunk as patches change it: u8 index of the chunk, u8 kind (0 overwrite, 1 cut, 2 append, 3 another tag, 4 left out or
+// doubled), u16 at (little-endian), u8 size and so many bytes.
+static inline void fuzz_patch_chunk(gsf_context* ctx, const uint8_t* chunk, size_t bytes, unsigned index, const uint8_t* p,
+                                    size_t size, gsf_text* out) {
+    gsf_text body;
+    char tag[4];
+    size_t repeat = 1;
+    memset(&body, 0, sizeof body);
+    memcpy(tag, chunk, 4);
+    gsf_text_append(ctx, &body, (const char*)chunk + 12, bytes);
+    for (size_t at = 0, n; size - at >= 5; at += 5 + n) {
+        const size_t where = (size_t)fuzz_number(p + at + 2, 2);
+        const char* data = (const char*)p + at + 5;
+        const int kind = p[at + 1] % 5;
+        n = p[at + 4] < size - at - 5 ? p[at + 4] : size - at - 5;
+        if (p[at] != index) continue;
+        if (kind == 0 && where < body.size) memcpy(body.data + where, data, n < body.size - where ? n : body.size - where);
+        if (kind == 1 && where < body.size) body.size = where;
+        if (kind == 2) gsf_text_append(ctx, &body, data, n);
+        if (kind == 3 && n >= 4) memcpy(tag, data, 4);
+        if (kind == 4) repeat = where % 3;
+    }
+    while (repeat-- > 0) gsf_chunks_add(ctx, out, tag, body.size ? body.data : "", body.size);
+    gsf_destroy_text(ctx, &body);
+}
+
+// A checkpoint with the patches that `p` holds.
+static inline void fuzz_patch_chunks(gsf_context* ctx, const uint8_t* file, size_t file_size, const uint8_t* p, size_t size,
+                                     gsf_text* out) {
+    unsigned index = 0;
+    for (size_t at = 12; at < file_size; index++) {
+        const size_t bytes = (size_t)fuzz_number(file + at + 4, 8);
+        fuzz_patch_chunk(ctx, file + at, bytes, index, p, size, out);
+        at += 16 + bytes;
+    }
+    FUZZ_CHECK(!out->failed);
+}
+
 static inline void fuzz_check_error(const gsf_context* ctx, const char* name) { // one line that names the file
     FUZZ_CHECK(strncmp(ctx->error, name, strlen(name)) == 0);
     for (const char* c = ctx->error; *c; c++) FUZZ_CHECK((unsigned char)*c >= 0x20);

@@ -1,6 +1,6 @@
 // fuzz_checkpoint.c - checkpoints of the repair loop. Build line: fuzz.h. Input: a byte, the steps after which a small loop
-// is saved, then patches to that checkpoint, each u8 chunk, u8 kind, u16 at (little-endian), u8 size and so many bytes; or
-// a byte from 128 on and a whole file. Checksums are made right. What is refused leaves the loop as it was; what is accepted
+// is saved, then patches to that checkpoint (fuzz_patch_chunks); or a byte from 128 on and a whole file. Checksums are made
+// right. What is refused leaves the loop as it was; what is accepted
 // is saved and restored as the same bytes, and the loop goes on from there.
 #include "fuzz.h"
 
@@ -101,29 +101,6 @@ static const gsf_text* saved_at(gsf_context* ctx, size_t steps) {
     return &all[steps];
 }
 
-// One chunk of the saved checkpoint with the patches that are for it.
-static void patch(gsf_context* ctx, const uint8_t* head, size_t bytes, unsigned index, const uint8_t* p, size_t size,
-                  gsf_text* out) {
-    gsf_text body;
-    char tag[4];
-    memset(&body, 0, sizeof body);
-    memcpy(tag, head, 4);
-    gsf_text_append(ctx, &body, (const char*)head + 12, bytes);
-    int repeat = 1;
-    for (size_t at = 0; size - at >= 5; at += p[at + 4] < size - at - 5 ? 5 + (size_t)p[at + 4] : size - at) {
-        const size_t room = size - at - 5, n = p[at + 4] < room ? p[at + 4] : room, where = fuzz_number(p + at + 2, 2);
-        const char* data = (const char*)p + at + 5;
-        if (p[at] != index) continue;
-        if (p[at + 1] % 5 == 0 && where < body.size) memcpy(body.data + where, data, n < body.size - where ? n : body.size - where);
-        if (p[at + 1] % 5 == 1 && where < body.size) body.size = where;
-        if (p[at + 1] % 5 == 2) gsf_text_append(ctx, &body, data, n);
-        if (p[at + 1] % 5 == 3 && n >= 4) memcpy(tag, data, 4);
-        if (p[at + 1] % 5 == 4) repeat = (int)(where % 3);
-    }
-    while (repeat-- > 0) gsf_chunks_add(ctx, out, tag, body.size ? body.data : "", body.size);
-    gsf_destroy_text(ctx, &body);
-}
-
 static gsf_text make_file(gsf_context* ctx, const uint8_t* data, size_t size) {
     gsf_text file;
     memset(&file, 0, sizeof file);
@@ -131,13 +108,7 @@ static gsf_text make_file(gsf_context* ctx, const uint8_t* data, size_t size) {
         fuzz_sum_chunks(ctx, data + 1, size - 1, &file);
     } else {
         const gsf_text* base = saved_at(ctx, data[0] % STEPS);
-        const uint8_t* p = (const uint8_t*)base->data;
-        unsigned index = 0;
-        for (size_t at = 12; at < base->size; index++) {
-            const size_t bytes = (size_t)fuzz_number(p + at + 4, 8);
-            patch(ctx, p + at, bytes, index, data + 1, size - 1, &file);
-            at += 16 + bytes;
-        }
+        fuzz_patch_chunks(ctx, (const uint8_t*)base->data, base->size, data + 1, size - 1, &file);
     }
     return file;
 }
