@@ -140,7 +140,7 @@ typedef struct gsf_io { // both or neither (neither: stdio; writes go to a tempo
     gsf_result (*write_fn)(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
     void* user;
     int plain_files; // 1: what read_fn reads are the platform's own files (it logs or counts reads, say), which the library
-                     // may then also list, map and read in part; set where the hooks are stdio's
+                     // may then also list, map and read in part, as it does with stdio's
 } gsf_io;
 
 typedef struct gsf_progress { // called from the calling thread, at most a few times a second's worth of work
@@ -949,7 +949,6 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
     if (!ctx->io.read_fn) {
         ctx->io.read_fn = gsf__stdio_read;
         ctx->io.write_fn = gsf__stdio_write;
-        ctx->io.plain_files = 1;
     }
     if (!ctx->parallel.for_fn) {
 #ifdef _OPENMP
@@ -1172,7 +1171,9 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
     return result;
 }
 
-GSF_API int gsf__io_is_plain(const gsf_context* ctx) { return ctx->io.plain_files; }
+GSF_API int gsf__io_is_plain(const gsf_context* ctx) {
+    return ctx->io.read_fn == gsf__stdio_read || ctx->io.plain_files;
+}
 
 GSF_API gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size) {
     *data = NULL;

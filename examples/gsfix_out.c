@@ -903,6 +903,7 @@ gsf_result gsfix_begin_files(gsfix_app* app) {
     ctx->io.read_fn = read_hook;
     ctx->io.write_fn = write_hook;
     ctx->io.user = app;
+    ctx->io.plain_files = 1;
     return GSF_OK;
 }
 
