@@ -701,12 +701,12 @@ static gsf_result read_history(fix_run* run, const char* name, const gsf_json* j
     gsfix_history* h = &run->history;
     const gsf_json_value* seconds = gsf_json_member(json, &json->values[0], "seconds");
     const gsf_json_value* total = gsf_json_member(json, &json->values[0], "seconds_total");
-    const gsf_json_value* resumed = whole_member(json, "resumed", 1e9 - 1);
+    const gsf_json_value* resumed = whole_member(json, "resumed", 1e9);
     const gsf_json_value* iteration = whole_member(json, "iteration", run->iterations);
     double* r = NULL;
     size_t n = 0;
     if (!resumed || !iteration) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid number of steps or of earlier runs", name);
-    h->resumed = (int32_t)resumed->number + 1;
+    h->resumed = (int32_t)resumed->number + (resumed->number < 1e9); // no further than is read again
     run->iteration = (int32_t)iteration->number;
     for (size_t i = 0; i < GSFIX_STAGES; i++) {
         const gsf_json_value* s = gsf_json_element(json, seconds, i);
