@@ -42,7 +42,7 @@
    THREADS     One thread at a time per context. Work is split through the parallel hook on a chunk grid that depends
                on sizes only, so results do not depend on the number of workers.
    SECTIONS    >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>images >>resize >>metrics
-               >>cameras >>glm >>oiio
+               >>cameras >>clips >>glm >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
 #define GSF_BASE_INCLUDED
@@ -380,11 +380,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_load_cameras(gsf_context* ctx, const char* 
 // gsfixer_nn.h).
 
 typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
+    uint32_t struct_size;           // set by the caller, who zeroes the rest: nothing is written beyond it
     int32_t frame_count_min, frame_count_max;
     int32_t frame_count_step;       // legal counts: min, min + step, ... up to max
     int32_t width_multiple, height_multiple;
     int32_t width_max, height_max;
     int32_t needs_depth, needs_alpha, needs_caption;
+    int32_t frame_count, width, height; // what it was made for, and so the default; 0: nothing in particular
+    int32_t squash;                 // it was made for frames that are the whole picture at `width` x `height` (or at another
+                                    //   legal size), each axis scaled by itself; else pixels stay square
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
 } gsf_restorer_limits;
 
@@ -407,6 +411,8 @@ typedef struct gsf_restore_window { // one clip; all pointers are borrowed for t
     uint64_t seed;
     gsf_image* out_color;             // f32, 3 channels, same size; written by the restorer
     gsf_image* out_confidence;        // f32, 1 channel, [0,1]; weight of each restored pixel in training
+    int32_t clip;                     // number of the clip in its run, from 0: the loop's windows, round after round
+    int32_t part;                     // of a clip that is restored in several parts: which, from 0
 } gsf_restore_window;
 
 typedef struct gsf_restorer {
@@ -420,6 +426,21 @@ typedef struct gsf_restorer {
     gsf_result (*restore_fn)(void* user, gsf_context* ctx, const gsf_restore_window* window);
     void (*end_fn)(void* user, gsf_context* ctx); // releases what begin took; called once per successful begin
 } gsf_restorer;
+
+/* Restores a clip of any size and length, between begin_fn and end_fn, where restore_fn takes only what its limits allow.
+   out_color and out_confidence get the caller's frames, in the caller's size.
+       size    Frames are resized to what the restorer was made for (limits.squash) or to the nearest size that it takes, and
+               back, each axis by itself, with PIL's bicubic filter (depth: the nearest pixel). A restorer of square pixels
+               whose sizes are all of another aspect refuses (GSF_ERROR_UNSUPPORTED).
+       length  A clip too short, or of a count between two legal ones, is stretched to the next legal count: each frame that
+               the restorer sees is the clip's nearest in time, and so is each frame that the clip gets back. One too long is
+               restored in parts of the count that the restorer was made for, spread evenly, neighbours overlapping by a
+               sixth of their frames or more; there they are blended, each weighing less towards its end. Part p has the
+               seed window->seed + p, and window->clip for all.
+   Frames that need neither are passed as they are. (The official code has no way for clips of other lengths: its benchmark
+   thins clips out to 49 frames and skips shorter ones, so that other frames are not restored at all.) */
+GSF_API GSF_NODISCARD gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restorer,
+                                                  const gsf_restore_window* window);
 
 #ifdef __cplusplus
 }
@@ -767,6 +788,21 @@ GSF__SHARED uint16_t gsf__float_to_half(float value) {
 GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double point[3], double out[3]) {
     const double* m = camera->w2c;
     for (int r = 0; r < 3; r++) out[r] = m[r] * point[0] + m[4 + r] * point[1] + m[8 + r] * point[2] + m[12 + r];
+}
+
+// The nearest of least, least + step, ... up to `most` (0: any).
+GSF__SHARED int32_t gsf__legal_count(int32_t wanted, int32_t least, int32_t most, int32_t step) {
+    if (step < 1) step = 1;
+    if (most > 0 && wanted > most) wanted = most;
+    int32_t legal = wanted <= least ? least : least + (wanted - least + step / 2) / step * step;
+    if (most > 0 && legal > most) legal -= step;
+    return legal < least ? least : legal;
+}
+
+// Likewise a side of an image.
+GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t most) {
+    if (multiple < 1) multiple = 1;
+    return gsf__legal_count((int32_t)(wanted + 0.5), multiple, most, multiple);
 }
 
 GSF__END_IMPLEMENTATION
@@ -3056,6 +3092,221 @@ GSF_API gsf_result gsf_load_cameras(gsf_context* ctx, const char* path, gsf_came
         gsf_free(ctx, out);
     }
     gsf_destroy_json(ctx, &json);
+    return result;
+}
+
+// ---- >>clips -------------------------------------------------------------------
+
+typedef struct gsf__clip { // a clip on its way through a restorer
+    const gsf_restorer* restorer;
+    const gsf_restore_window* window;
+    gsf_restorer_limits limits;
+    int32_t taken, shown;       // the clip's frames in a part; frames that the restorer sees of them
+    int32_t parts, width, height;
+    gsf_image *color, *depth, *alpha, *out_color, *out_confidence; // (shown)
+    gsf_camera* cameras;
+    int32_t* reference_index;
+    float* weight;              // of what each frame of the clip has got so far
+} gsf__clip;
+
+static int32_t gsf__clip_spread(int64_t i, int64_t from, int64_t to) { // place i of `from` places among `to`, rounded
+    return from > 1 ? (int32_t)((2 * i * (to - 1) + (from - 1)) / (2 * (from - 1))) : 0;
+}
+
+static void gsf__clip_plan_length(gsf__clip* c) {
+    const gsf_restorer_limits* l = &c->limits;
+    const int32_t frames = c->window->frame_count, most = l->frame_count_max;
+    const int32_t least = l->frame_count_min > 0 ? l->frame_count_min : 1;
+    const int32_t step = l->frame_count_step > 1 ? l->frame_count_step : 1;
+    c->taken = frames;
+    c->shown = frames <= least ? least : least + (frames - least + step - 1) / step * step; // this many or the next above
+    c->parts = 1;
+    if (most <= 0 || c->shown <= most) return;
+    c->taken = c->shown = gsf__legal_count(l->frame_count > 0 ? l->frame_count : most, least, most, step);
+    const int32_t overlap = c->taken > 5 ? c->taken / 6 : c->taken > 1;
+    if (frames > c->taken) c->parts = 1 + (frames - overlap - 1) / (c->taken - overlap);
+    else c->taken = frames; // its limits allow no more
+}
+
+static gsf_result gsf__clip_plan_size(gsf_context* ctx, gsf__clip* c) {
+    const gsf_restorer_limits* l = &c->limits;
+    const gsf_image* first = &c->window->color[0];
+    const double width = (double)first->width, height = (double)first->height;
+    if (first->width > 65536 || first->height > 65536)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "clip: frames of %lld x %lld", (long long)first->width,
+                        (long long)first->height);
+    if (l->squash) {
+        c->width = gsf__legal_side(l->width, l->width_multiple, l->width_max);
+        c->height = gsf__legal_side(l->height, l->height_multiple, l->height_max);
+        return GSF_OK;
+    }
+    double scale = 1.0;
+    if (l->width_max > 0 && width > l->width_max) scale = l->width_max / width;
+    if (l->height_max > 0 && height * scale > l->height_max) scale = l->height_max / height;
+    c->width = gsf__legal_side(width * scale, l->width_multiple, l->width_max);
+    c->height = gsf__legal_side(height * scale, l->height_multiple, l->height_max);
+    if (fabs(c->width - width * scale) <= 0.5 + 0.5 * l->width_multiple &&
+        fabs(c->height - height * scale) <= 0.5 + 0.5 * l->height_multiple)
+        return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "clip: frames of %g x %g; the restorer keeps pixels square and takes %d x %d",
+                    width, height, (int)c->width, (int)c->height);
+}
+
+// Nearest pixels, which are all that a depth may become.
+static void gsf__clip_pick(const gsf_image* from, const gsf_image* to) {
+    for (int64_t y = 0; y < to->height; y++)
+        for (int64_t x = 0; x < to->width; x++) {
+            const char* p = (const char*)from->data + (2 * y + 1) * from->height / (2 * to->height) * from->stride_y +
+                            (2 * x + 1) * from->width / (2 * to->width) * from->stride_x;
+            memcpy((char*)to->data + y * to->stride_y + x * to->stride_x, p, sizeof(float));
+        }
+}
+
+enum { GSF__CLIP_FLOATS, GSF__CLIP_BYTES, GSF__CLIP_NEAREST }; // how to resize: BYTES as pictures in files are
+
+// *to becomes `from` in this size: itself, or an image of its own.
+static gsf_result gsf__clip_fit(gsf_context* ctx, const gsf_image* from, int64_t width, int64_t height, int how,
+                                gsf_image* to) {
+    gsf_image bytes[2];
+    memset(bytes, 0, sizeof bytes);
+    if (from->width == width && from->height == height) {
+        *to = *from;
+        to->owned = NULL;
+        return GSF_OK;
+    }
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, width, height, from->channels, to));
+    if (how == GSF__CLIP_NEAREST) {
+        gsf__clip_pick(from, to);
+        return GSF_OK;
+    }
+    if (how == GSF__CLIP_BYTES) {
+        gsf_result result = gsf_make_image(ctx, GSF_U8, from->width, from->height, from->channels, &bytes[0]);
+        if (result == GSF_OK) result = gsf_convert_image(ctx, from, &bytes[0]);
+        if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, width, height, from->channels, &bytes[1]);
+        if (result == GSF_OK) result = gsf_resize_image(ctx, &bytes[0], GSF_RESIZE_PIL_BICUBIC, &bytes[1]);
+        if (result == GSF_OK) result = gsf_convert_image(ctx, &bytes[1], to);
+        for (int i = 0; i < 2; i++) gsf_destroy_image(ctx, &bytes[i]);
+        return result;
+    }
+    GSF__TRY(gsf_resize_image(ctx, from, GSF_RESIZE_PIL_BICUBIC, to));
+    float* v = (float*)to->data; // at edges the filter goes beyond what is there
+    for (int64_t i = 0; i < width * height * from->channels; i++) v[i] = v[i] >= 1.0f ? 1.0f : v[i] > 0.0f ? v[i] : 0.0f;
+    return GSF_OK;
+}
+
+static void gsf__clip_drop_frames(gsf_context* ctx, gsf__clip* c) {
+    gsf_image* const sets[] = {c->color, c->depth, c->alpha, c->out_color, c->out_confidence};
+    for (size_t s = 0; s < GSF__COUNT(sets); s++)
+        for (int32_t i = 0; sets[s] && i < c->shown; i++) {
+            if (sets[s][i].owned) gsf_destroy_image(ctx, &sets[s][i]);
+            memset(&sets[s][i], 0, sizeof sets[s][i]);
+        }
+}
+
+// The part's frames as the restorer takes them; the clip's frame `begin` is its first.
+static gsf_result gsf__clip_take(gsf_context* ctx, gsf__clip* c, int32_t begin) {
+    const gsf_restore_window* w = c->window;
+    for (int32_t i = 0; i < c->shown; i++) {
+        const int32_t at = begin + gsf__clip_spread(i, c->shown, c->taken);
+        GSF__TRY(gsf__clip_fit(ctx, &w->color[at], c->width, c->height, GSF__CLIP_BYTES, &c->color[i]));
+        if (w->depth) GSF__TRY(gsf__clip_fit(ctx, &w->depth[at], c->width, c->height, GSF__CLIP_NEAREST, &c->depth[i]));
+        if (w->alpha) GSF__TRY(gsf__clip_fit(ctx, &w->alpha[at], c->width, c->height, GSF__CLIP_FLOATS, &c->alpha[i]));
+        if (w->cameras) c->cameras[i] = gsf_camera_resized(&w->cameras[at], c->width, c->height);
+        c->reference_index[i] = w->reference_index ? w->reference_index[at] : -1;
+        GSF__TRY(gsf_make_image(ctx, GSF_F32, c->width, c->height, 3, &c->out_color[i]));
+        GSF__TRY(gsf_make_image(ctx, GSF_F32, c->width, c->height, 1, &c->out_confidence[i]));
+    }
+    return GSF_OK;
+}
+
+// *to of weight `before` and *from of weight `weight` become their mean in *to.
+static void gsf__clip_blend(const gsf_image* from, float weight, float before, const gsf_image* to) {
+    for (int64_t y = 0; y < to->height; y++)
+        for (int64_t x = 0; x < to->width; x++)
+            for (int64_t k = 0; k < to->channels; k++) {
+                char* out = (char*)to->data + y * to->stride_y + x * to->stride_x + k * to->stride_c;
+                float a, b;
+                memcpy(&b, (const char*)from->data + y * from->stride_y + x * from->stride_x + k * from->stride_c, sizeof b);
+                memcpy(&a, out, sizeof a);
+                if (before > 0.0f) b = (a * before + b * weight) / (before + weight);
+                memcpy(out, &b, sizeof b);
+            }
+}
+
+// What came back, into the clip's frames.
+static gsf_result gsf__clip_give(gsf_context* ctx, gsf__clip* c, int32_t begin) {
+    for (int32_t i = 0; i < c->taken; i++) {
+        const int32_t at = begin + i, shown = gsf__clip_spread(i, c->taken, c->shown);
+        const float weight = (float)(i + 1 < c->taken - i ? i + 1 : c->taken - i);
+        const gsf_image* const to[2] = {&c->window->out_color[at], &c->window->out_confidence[at]};
+        const gsf_image* const from[2] = {&c->out_color[shown], &c->out_confidence[shown]};
+        for (int k = 0; k < 2; k++) {
+            gsf_image fitted;
+            memset(&fitted, 0, sizeof fitted);
+            const gsf_result result = gsf__clip_fit(ctx, from[k], to[k]->width, to[k]->height, GSF__CLIP_FLOATS, &fitted);
+            if (result == GSF_OK) gsf__clip_blend(&fitted, weight, c->weight[at], to[k]);
+            if (fitted.owned) gsf_destroy_image(ctx, &fitted);
+            GSF__TRY(result);
+        }
+        c->weight[at] += weight;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__clip_part(gsf_context* ctx, gsf__clip* c, int32_t part) {
+    gsf_restore_window w = *c->window;
+    const int32_t begin = gsf__clip_spread(part, c->parts, c->window->frame_count - c->taken + 1);
+    GSF__TRY(gsf__clip_take(ctx, c, begin));
+    w.frame_count = c->shown;
+    w.color = c->color;
+    w.depth = w.depth ? c->depth : NULL;
+    w.alpha = w.alpha ? c->alpha : NULL;
+    w.cameras = w.cameras ? c->cameras : NULL;
+    w.reference_index = c->reference_index;
+    w.seed += (uint64_t)part;
+    w.part = part;
+    w.out_color = c->out_color;
+    w.out_confidence = c->out_confidence;
+    GSF__TRY(c->restorer->restore_fn(c->restorer->user, ctx, &w));
+    return gsf__clip_give(ctx, c, begin);
+}
+
+GSF_API gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restorer, const gsf_restore_window* window) {
+    gsf__clip c;
+    if (window->struct_size < sizeof *window || window->frame_count < 1 || !window->color || !window->out_color ||
+        !window->out_confidence)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "clip: no frames, or struct_size is missing");
+    memset(&c, 0, sizeof c);
+    c.restorer = restorer;
+    c.window = window;
+    c.limits.struct_size = sizeof c.limits;
+    GSF__TRY(restorer->query_fn(restorer->user, ctx, window->frame_count, (int32_t)window->color[0].width,
+                                (int32_t)window->color[0].height, &c.limits));
+    gsf__clip_plan_length(&c);
+    GSF__TRY(gsf__clip_plan_size(ctx, &c));
+    if (c.parts == 1 && c.shown == window->frame_count && c.width == window->color[0].width &&
+        c.height == window->color[0].height)
+        return restorer->restore_fn(restorer->user, ctx, window);
+    const size_t shown = (size_t)c.shown;
+    c.color = (gsf_image*)gsf_alloc_zeroed(ctx, 5 * shown, sizeof *c.color);
+    c.cameras = (gsf_camera*)gsf_alloc_zeroed(ctx, shown, sizeof *c.cameras);
+    c.reference_index = (int32_t*)gsf_alloc_zeroed(ctx, shown, sizeof *c.reference_index);
+    c.weight = (float*)gsf_alloc_zeroed(ctx, (size_t)window->frame_count, sizeof *c.weight);
+    gsf_result result = c.color && c.cameras && c.reference_index && c.weight ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (c.color) {
+        c.depth = c.color + shown;
+        c.alpha = c.depth + shown;
+        c.out_color = c.alpha + shown;
+        c.out_confidence = c.out_color + shown;
+    }
+    for (int32_t part = 0; part < c.parts && result == GSF_OK; part++) {
+        result = gsf__clip_part(ctx, &c, part);
+        gsf__clip_drop_frames(ctx, &c);
+    }
+    gsf_free(ctx, c.color);
+    gsf_free(ctx, c.cameras);
+    gsf_free(ctx, c.reference_index);
+    gsf_free(ctx, c.weight);
     return result;
 }
 

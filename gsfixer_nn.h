@@ -443,7 +443,8 @@ typedef struct gsf_nn_transformer_input {
 
 // Predicted velocity: out (batch, frames, out_channels, height, width). A NaN or infinity is reported with the block
 // where it first appears (GSF_ERROR_NUMERIC). Other sizes than the configured ones: GSF_ERROR_UNSUPPORTED where the
-// position table is learned; other frame counts compute theirs, as the official code does.
+// position table is learned. For other frame counts (or text tokens) sines and cosines stand in for that table, as the
+// official code has it: positions that the model was not trained with, which gsf_nn_sample_desc.any_frames asks for.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                             const gsf_nn_transformer_input* input, float* out);
 
@@ -607,6 +608,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_save_features(gsf_context* ctx, const ch
 typedef struct gsf_nn_sample_desc {
     uint32_t _start_canary;
     int32_t frames, height, width;  // of the video; frames 1, 9, 17, ... so that the VAE gives back as many
+    int any_frames;                 // take other counts than the trained one where positions are learned: see
+                                    //   gsf_nn_transformer_forward
     const float* control;           // (3, frames, height, width) in [-1,1]: what is to be restored
     const float* text;              // (2, text tokens, text channels): negative prompt, prompt
     const float* references;        // (reference_tokens, width) from gsf_nn_project_references; NULL: none
@@ -622,7 +625,8 @@ typedef struct gsf_nn_sample_desc {
     uint64_t seed;
     const float* noise;             // (latent frames, latent channels, height/8, width/8) or NULL: from the seed
     double max_bytes;               // refuse before starting what needs more memory (GSF_ERROR_OUT_OF_MEMORY); 0: no limit
-    const char* checkpoint;         // file written after every step and resumed from when it fits; NULL: none
+    const char* checkpoint;         // file written after every step and resumed from when model, precision, settings and
+                                    //   inputs are the same; NULL: none
     // After every step: the latents and what the network predicted (guided); NULL in normal use.
     void (*step_fn)(void* user, int32_t step, const float* latents, const float* prediction, int64_t count);
     void* step_user;
@@ -732,20 +736,36 @@ typedef enum gsf_nn_condition { GSF_NN_BOTH = 0, GSF_NN_2D, GSF_NN_3D, GSF_NN_NO
 typedef struct gsf_nn_dit_desc {
     const char* model;       // folder as released: transformer/, vae/, scheduler/; and, for what `features` does not hold,
                              //   dinov2/ and vggt/ (reference tokens), tokenizer/ and text_encoder/ (prompts)
-    const char* features;    // NULL, or safetensors with any of dino_latents (images, tokens, channels), vggt_latents
-                             //   likewise, prompt_embeds (2, text tokens, text channels): negative prompt, prompt
+    const char* features;    // NULL, or safetensors of what was encoded before: see FEATURES below
     const char* caption;     // what all clips show; NULL: the window's, else blip2/ describes the first frame
-    const char* save_features; // file that gets the features of every clip, the last one's in the end; NULL: none
+    const char* save_features; // file that gets the features of all photos and clips, as `features` takes them; NULL: none
+    int keep_saved;          // what it holds already is kept and used: a run goes on. Else it is replaced
     gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
     int int8;                // gsf_nn_quantize_transformer
     int bf16;                // gsf_nn_transformer.bf16
-    gsf_nn_sample_desc sample;  // steps, solver, guidance ...; sizes, pointers and seed are filled in for each window
+    gsf_nn_sample_desc sample;  // steps, solver, guidance, any_frames ...; sizes, pointers and seed are filled in for each
+                                //   window
 } gsf_nn_dit_desc;
 
-// The paper's restorer behind the interface of gsfixer.h. `desc`'s texts are copied. A clip's references are the two photos
-// nearest to its first and its last camera; without cameras, all photos. What `features` lacks is encoded before a clip is
-// restored, where photos or caption differ from the last clip's: captioner, text encoder, DINOv2 and VGGT are opened one
-// after another, run and closed. A folder that will be needed and is absent is named now, with what does without it.
+/* The paper's restorer behind the interface of gsfixer.h. `desc`'s texts are copied.
+
+   FRAMES      It asks for what the model was trained on: as many frames, of that size, into which the whole photo is
+               squashed (limits.frame_count, width, height, squash; 49 of 720 x 480 at the release). A frame that is a
+               photo's view is replaced by the photo, resized likewise with PIL's bicubic filter. sample.any_frames allows 9,
+               17, ... frames: then sines stand in for the learned positions. That is no small change. On a model of
+               random weights, whose table has the released one's spread, 17 frames of sines differ from the same with the
+               table by as much as the table itself is worth; what it does to the released model nobody has measured here.
+   REFERENCES  A clip's references are the photos whose view its first and last frame are, or those nearest to their cameras
+               in units of the photos' own median distance to what they look at; without cameras, all photos. They are
+               squashed to the model's size before they are encoded: 925 tokens each at the release, whatever their aspect.
+   FEATURES    What files lack is encoded before a clip is restored: captioner, text encoder, DINOv2 and VGGT are opened one
+               after another, run and closed. In a file, features go by photo and clip, both counted from 0:
+                   dino_latents.photo4     (1, tokens, channels)
+                   vggt_latents.photo4,7   (2, tokens, channels): these two together, first and last
+                   prompt_embeds.clip12    (2, text tokens, text channels): negative prompt, prompt
+               A file of a single clip may have dino_latents, vggt_latents (images, tokens, channels) and prompt_embeds:
+               they count for clip 0 alone. A folder that will be needed and is absent is named when the restorer is made,
+               or, where a file has features but not those of a clip, with their name when it comes to that clip. */
 // Progress: "clip" (0 of 1: it begins), then behind each unit of its work "caption", "text", "dinov2", "vggt",
 // "vae encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
@@ -10629,7 +10649,7 @@ typedef struct gsf__sample_run {
     int reference_kv_ready;
     gsf_nn_block_cache cache;
     gsf_nn_sampler sampler;
-    uint32_t job; // checksum of everything that the result depends on
+    uint32_t settings, clip; // checksums of everything that the result depends on; with a checkpoint
 } gsf__sample_run;
 
 GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc) {
@@ -10673,6 +10693,10 @@ static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transfor
     if (d->height < square || d->width < square || d->height % square || d->width % square)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are no multiple of %d", (int)d->width,
                         (int)d->height, (int)square);
+    if (t->learned_positions && d->frames != t->sample_frames && !d->any_frames)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "sample: %d frames; the model's positions are learned for %d (any_frames puts sines in their place)",
+                        (int)d->frames, (int)t->sample_frames);
     return gsf__dit_check_size(ctx, t, d->height / v->spatial_ratio, d->width / v->spatial_ratio);
 }
 
@@ -10721,15 +10745,48 @@ static void gsf__sample_begin(gsf__sample_run* run) {
 
 // ---- checkpoint: what identifies the job, the step, the latents and what the solver remembers
 
-static uint32_t gsf__sample_job(const gsf__sample_run* run) {
+// Tells weights apart without reading all of them: every tensor's name, type and shape, and 64 bytes from its beginning,
+// middle and end.
+static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weights) {
+    for (size_t i = 0; i < weights->tensor_count; i++) {
+        const gsf_tensor* t = &weights->tensors[i];
+        const size_t size = (size_t)t->count * gsf_nn_dtype_size(t->dtype), part = size < 64 ? size : 64;
+        const size_t at[3] = {0, (size - part) / 2, size - part};
+        crc = gsf__crc32(crc, t->name, strlen(t->name) + 1);
+        crc = gsf__crc32(crc, &t->dtype, sizeof t->dtype);
+        crc = gsf__crc32(crc, t->shape, (size_t)t->rank * sizeof t->shape[0]);
+        for (int k = 0; k < 3; k++) crc = gsf__crc32(crc, (const char*)t->data + at[k], part);
+    }
+    return crc;
+}
+
+// What every clip of a run has in common: model, precision, schedule and settings.
+static uint32_t gsf__sample_sum_settings(const gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     const gsf_nn_transformer* t = run->net;
-    const int32_t whole[] = {d->frames, d->height, d->width, d->steps, (int32_t)d->solver, d->dynamic_guidance,
-                             t->layers, t->heads, d->noise != NULL, (int32_t)d->reference_tokens, d->references != NULL};
+    const int int8 = ((const gsf__dit_nets*)t->nets)->quantized != NULL;
+    const int32_t whole[] = {d->steps, (int32_t)d->solver, d->dynamic_guidance, t->layers, t->heads, t->bf16 != 0, int8,
+                             run->schedule->desc.train_steps, (int32_t)run->schedule->desc.spacing,
+                             run->schedule->desc.steps_offset};
     const float real[] = {d->guidance, d->guidance_begin, d->guidance_end, d->strength, d->block_cache};
-    const size_t text = 2 * (size_t)t->text_tokens * (size_t)t->text_channels;
+    const size_t steps = (size_t)run->schedule->desc.train_steps;
     uint32_t crc = gsf__crc32(0, whole, sizeof whole);
     crc = gsf__crc32(crc, real, sizeof real);
+    crc = gsf__crc32(crc, run->schedule->alpha_bar, steps * sizeof *run->schedule->alpha_bar);
+    crc = gsf__crc32(crc, &run->schedule->final_alpha_bar, sizeof run->schedule->final_alpha_bar);
+    crc = gsf__crc32(crc, run->sampler.timesteps, (size_t)run->sampler.count * sizeof *run->sampler.timesteps);
+    crc = gsf__sample_sum_weights(crc, &t->weights);
+    return gsf__sample_sum_weights(crc, &run->vae->weights);
+}
+
+// What this clip is made of.
+static uint32_t gsf__sample_sum_clip(const gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const gsf_nn_transformer* t = run->net;
+    const int32_t whole[] = {d->frames, d->height, d->width, d->noise != NULL, (int32_t)d->reference_tokens,
+                             d->references != NULL};
+    const size_t text = 2 * (size_t)t->text_tokens * (size_t)t->text_channels;
+    uint32_t crc = gsf__crc32(0, whole, sizeof whole);
     crc = gsf__crc32(crc, &d->seed, sizeof d->seed);
     crc = gsf__crc32(crc, run->control, (size_t)run->count * sizeof(float));
     crc = gsf__crc32(crc, d->text, text * sizeof(float));
@@ -10742,10 +10799,11 @@ static uint32_t gsf__sample_job(const gsf__sample_run* run) {
 static gsf_result gsf__sample_save(gsf__sample_run* run) {
     if (!run->desc.checkpoint) return GSF_OK;
     gsf_text file;
-    char head[8];
+    char head[12];
     memset(&file, 0, sizeof file);
-    gsf__store_le(head, run->job, 4);
+    gsf__store_le(head, run->clip, 4);
     gsf__store_le(head + 4, (uint64_t)run->sampler.index, 4);
+    gsf__store_le(head + 8, run->settings, 4);
     gsf_chunks_add(run->ctx, &file, "SAMP", head, sizeof head);
     gsf_chunks_add(run->ctx, &file, "LATE", run->latents, (size_t)run->count * sizeof(float));
     gsf_chunks_add(run->ctx, &file, "MEMO", run->sampler.memory, run->sampler.memory_count * sizeof(float));
@@ -10770,9 +10828,14 @@ static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size
     if (!gsf_chunks_find(data, size, "SAMP", &head) || !gsf_chunks_find(data, size, "LATE", &latents) ||
         !gsf_chunks_find(data, size, "MEMO", &memory))
         return;
-    if (head.size != 8 || latents.size != (size_t)run->count * sizeof(float) ||
-        memory.size != run->sampler.memory_count * sizeof(float) || gsf__load_le(head.data, 4) != run->job)
+    if (head.size != 12 || gsf__load_le((const char*)head.data + 8, 4) != run->settings) {
+        gsf_log(run->ctx, GSF_LOG_WARNING, "%s: made with another model, precision or other settings: the clip starts anew",
+                run->desc.checkpoint);
         return;
+    }
+    if (latents.size != (size_t)run->count * sizeof(float) ||
+        memory.size != run->sampler.memory_count * sizeof(float) || gsf__load_le(head.data, 4) != run->clip)
+        return; // of the clip before this
     const int64_t index = (int64_t)gsf__load_le((const char*)head.data + 4, 4);
     if (index < 1 || index > run->sampler.count) return;
     if (!gsf__sample_is_finite(&latents) || !gsf__sample_is_finite(&memory)) return; // it would fail the same way each time
@@ -10879,7 +10942,10 @@ static gsf_result gsf__sample_run_all(gsf__sample_run* run, float* out) {
     GSF__TRY(gsf_nn_make_sampler(run->ctx, run->schedule, &desc, &run->sampler));
     GSF__TRY(gsf__sample_encode(run));
     gsf__sample_begin(run);
-    run->job = gsf__sample_job(run);
+    if (run->desc.checkpoint) {
+        run->settings = gsf__sample_sum_settings(run);
+        run->clip = gsf__sample_sum_clip(run);
+    }
     GSF__TRY(gsf__sample_resume(run));
     run->cache.threshold = run->desc.block_cache;
     GSF__TRY(gsf__sample_steps(run));
@@ -12810,21 +12876,31 @@ GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text
 
 // ---- >>nn restorer --------------------------------------------------------------
 
+typedef struct gsf__dit_kept { // features under the name that they have in a file
+    char* name;
+    float* values;
+    int64_t shape[3];
+    int encoded;               // here, from the photos at hand; else they came from a file
+} gsf__dit_kept;
+
 typedef struct gsf__dit_restorer {
     gsf_nn_dit_desc desc;      // texts point into `texts`
     char* texts;
     gsf_nn_transformer transformer;
     gsf_nn_vae vae;
     gsf_nn_schedule schedule;
-    int has_dino, has_vggt, has_text; // in the file of features
-    gsf_nn_features features;  // of the file, or of the photos `pair`
-    int32_t pair[2];           // -1: none yet
-    float *text, *references;  // (2, text tokens, text channels); (reference_tokens, width) or NULL
-    gsf_text caption;          // that `text` was made of
+    gsf__dit_kept* kept;
+    size_t kept_count, kept_capacity;
+    int unsaved;               // something was kept that the file of saved features lacks
+    float *prompt, *references; // (2, text tokens, text channels); (reference_tokens, width) or NULL
+    gsf_text caption;          // that `prompt` was made of
+    gsf_text shown;            // which photos `references` were made of
     int64_t reference_tokens;
     double encoder_bytes, encoder_flops; // at the configured size: at the peak; of all
-    gsf_reference* photos;     // colours and cameras, between begin and end
+    gsf_reference* photos;     // colours (u8) and cameras, between begin and end
     int32_t photo_count;
+    uint32_t photo_sum;        // of their pixels
+    double length;             // that tells near cameras from far ones
 } gsf__dit_restorer;
 
 static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -12833,14 +12909,19 @@ static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_cou
     const gsf_nn_transformer* t = &r->transformer;
     const gsf_nn_vae* v = &r->vae;
     const int32_t square = v->spatial_ratio * t->patch, step = 2 * v->temporal_ratio;
-    memset(out, 0, sizeof *out);
-    out->frame_count_min = 1 + step;
+    out->squash = 1;
+    out->width = t->sample_width * v->spatial_ratio;
+    out->height = t->sample_height * v->spatial_ratio;
+    out->frame_count = out->frame_count_min = out->frame_count_max = t->sample_frames;
     out->frame_count_step = step;
-    out->frame_count_max = t->sample_frames > out->frame_count_min ? t->sample_frames : out->frame_count_min;
+    if (r->desc.sample.any_frames) {
+        out->frame_count_min = 1 + step;
+        if (t->sample_frames < out->frame_count_min) out->frame_count_max = out->frame_count_min;
+    }
     out->width_multiple = out->height_multiple = square;
     if (t->learned_positions) { // one size only
-        out->width_multiple = out->width_max = t->sample_width * v->spatial_ratio;
-        out->height_multiple = out->height_max = t->sample_height * v->spatial_ratio;
+        out->width_multiple = out->width_max = out->width;
+        out->height_multiple = out->height_max = out->height;
     }
     gsf_nn_sample_desc d = r->desc.sample;
     d.frames = frame_count;
@@ -12849,8 +12930,9 @@ static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_cou
     d.references = r->references;
     d.reference_tokens = r->reference_tokens;
     gsf_nn_cost cost;
-    if ((frame_count - 1) % step == 0 && frame_count > 0 && width % out->width_multiple == 0 &&
-        height % out->height_multiple == 0 && gsf_nn_sample_cost(ctx, &r->transformer, &r->vae, &d, &cost) == GSF_OK) {
+    if (frame_count >= out->frame_count_min && frame_count <= out->frame_count_max && (frame_count - 1) % step == 0 &&
+        width % out->width_multiple == 0 && height % out->height_multiple == 0 &&
+        gsf_nn_sample_cost(ctx, &r->transformer, &r->vae, &d, &cost) == GSF_OK) {
         out->bytes = cost.bytes > r->encoder_bytes ? cost.bytes : r->encoder_bytes;
         out->flops = cost.flops + r->encoder_flops;
     }
@@ -12865,23 +12947,71 @@ static void gsf__dit_end(void* user, gsf_context* ctx) {
     r->photo_count = 0;
 }
 
+static int gsf__dit_compare(const void* a, const void* b) {
+    const double x = *(const double*)a, y = *(const double*)b;
+    return (x > y) - (x < y);
+}
+
+// The median distance of the photos' cameras to the middle of what they look at, which the official code makes 1 before it
+// chooses references: there, a camera that far away counts as much as one turned by 180 degrees. The middle is the mean of
+// the points where the optical axes come closest to the mean camera.
+static gsf_result gsf__dit_measure(gsf_context* ctx, gsf__dit_restorer* r) {
+    const int32_t n = r->photo_count;
+    double mean[3] = {0.0, 0.0, 0.0}, focus[3] = {0.0, 0.0, 0.0}, center[3];
+    double* distances = (double*)gsf_alloc(ctx, (size_t)n, sizeof *distances);
+    if (!distances) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < n; i++) {
+        gsf_camera_center(&r->photos[i].camera, center);
+        for (int k = 0; k < 3; k++) mean[k] += center[k] / n;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        const double* m = r->photos[i].camera.w2c;
+        double along = 0.0;
+        gsf_camera_center(&r->photos[i].camera, center);
+        for (int k = 0; k < 3; k++) along += m[4 * k + 2] * (mean[k] - center[k]); // third row: forward
+        for (int k = 0; k < 3; k++) focus[k] += (center[k] + along * m[4 * k + 2]) / n;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        double square = 0.0;
+        gsf_camera_center(&r->photos[i].camera, center);
+        for (int k = 0; k < 3; k++) square += (center[k] - focus[k]) * (center[k] - focus[k]);
+        distances[i] = sqrt(square);
+    }
+    qsort(distances, (size_t)n, sizeof *distances, gsf__dit_compare);
+    r->length = 0.5 * (distances[n / 2] + distances[(n - 1) / 2]);
+    if (!(r->length > 0.0)) r->length = 1.0; // all in one place: only directions tell them apart
+    gsf_free(ctx, distances);
+    return GSF_OK;
+}
+
+static void gsf__dit_forget_photos(gsf_context* ctx, gsf__dit_restorer* r);
+
 static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
     gsf_result result = GSF_OK;
-    r->pair[0] = r->pair[1] = -1; // tokens of earlier photos
-    if (reference_count < 1) return GSF_OK;
-    r->photos = (gsf_reference*)gsf_alloc_zeroed(ctx, (size_t)reference_count, sizeof *r->photos);
-    if (!r->photos) return GSF_ERROR_OUT_OF_MEMORY;
-    r->photo_count = reference_count;
+    uint32_t sum = gsf__crc32(0, &reference_count, sizeof reference_count);
+    if (reference_count > 0) {
+        r->photos = (gsf_reference*)gsf_alloc_zeroed(ctx, (size_t)reference_count, sizeof *r->photos);
+        if (!r->photos) return GSF_ERROR_OUT_OF_MEMORY;
+        r->photo_count = reference_count;
+        for (int32_t i = 0; i < reference_count; i++) r->photos[i].camera = references[i].camera;
+        result = gsf__dit_measure(ctx, r);
+    }
     for (int32_t i = 0; i < reference_count && !result; i++) {
         const gsf_image* color = &references[i].color;
-        r->photos[i].camera = references[i].camera;
         if (!color->data) continue;
-        result = gsf_make_image(ctx, GSF_F32, color->width, color->height, 3, &r->photos[i].color);
+        result = gsf_make_image(ctx, GSF_U8, color->width, color->height, 3, &r->photos[i].color);
         if (!result) result = gsf_convert_image(ctx, color, &r->photos[i].color);
+        if (!result) sum = gsf__crc32(sum, &color->width, sizeof color->width);
+        if (!result) sum = gsf__crc32(sum, r->photos[i].color.data, (size_t)(3 * color->width * color->height));
     }
-    if (result) gsf__dit_end(user, ctx);
-    return result;
+    if (result) {
+        gsf__dit_end(user, ctx);
+        return result;
+    }
+    if (sum != r->photo_sum) gsf__dit_forget_photos(ctx, r);
+    r->photo_sum = sum;
+    return GSF_OK;
 }
 
 // The photo whose view a frame is, or NULL.
@@ -12906,7 +13036,7 @@ static float gsf__dit_channel(const gsf_image* image, int64_t x, int64_t y, int6
 
 static int64_t gsf__dit_clamp(double v, int64_t count) { return v <= 0.0 ? 0 : gsf__least((int64_t)v, count - 1); }
 
-// Bilinear, as the official code resizes photos to the model's size; 0 outside the photo.
+// Bilinear; 0 outside the photo.
 static int gsf__dit_sample(const gsf__dit_control* control, int64_t x, int64_t y, float out[3]) {
     const gsf_image* p = control->photo;
     const double u = control->at[0] + control->step[0] * (double)x, v = control->at[1] + control->step[1] * (double)y;
@@ -12937,31 +13067,62 @@ static void gsf__dit_control_row(void* arg, size_t row, int worker) { // to [-1,
     }
 }
 
-// The frames as (3, frames, height, width). A frame that is a reference's view is that photo, as in the paper's benchmark:
-// through the frame's camera, which may be scaled and cropped; without cameras, a photo of the frames' size.
-static void gsf__dit_fill_control(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
-                                  float* out) {
+// The photo as floats at the size at which the frame's camera sees it, by the filter of the official code, and where in it
+// the frame's pixels lie. Without cameras the frame shows all of the photo.
+static gsf_result gsf__dit_fit_photo(gsf_context* ctx, const gsf_reference* photo, const gsf_camera* to, gsf_image* fitted,
+                                     gsf__dit_control* control) {
+    const gsf_camera* from = &photo->camera;
+    const gsf_image* color = &photo->color;
+    const double sides[2] = {(double)color->width, (double)color->height};
+    const double frame[2] = {(double)control->image->width, (double)control->image->height};
+    double step[2] = {sides[0] / frame[0], sides[1] / frame[1]}, first[2] = {0.5 * step[0], 0.5 * step[1]};
+    if (to && from->fx > 0.0 && from->fy > 0.0 && to->fx > 0.0 && to->fy > 0.0) {
+        step[0] = from->fx / to->fx;
+        step[1] = from->fy / to->fy;
+        first[0] = (0.5 - to->cx) * step[0] + from->cx;
+        first[1] = (0.5 - to->cy) * step[1] + from->cy;
+    }
+    int64_t size[2];
+    for (int k = 0; k < 2; k++) {
+        const double wanted = rint(sides[k] / step[k]);
+        if (!(wanted < 65536.0)) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dit: a frame shows a photo %g-fold", 1.0 / step[k]);
+        size[k] = wanted < 1.0 ? 1 : (int64_t)wanted;
+        const double scale = (double)size[k] / sides[k];
+        control->step[k] = step[k] * scale;
+        control->at[k] = first[k] * scale - 0.5;
+    }
+    gsf_image bytes;
+    memset(&bytes, 0, sizeof bytes);
+    gsf_result result = gsf_make_image(ctx, GSF_U8, size[0], size[1], 3, &bytes);
+    if (!result) result = gsf_resize_image(ctx, color, GSF_RESIZE_PIL_BICUBIC, &bytes);
+    if (!result) result = gsf_make_image(ctx, GSF_F32, size[0], size[1], 3, fitted);
+    if (!result) result = gsf_convert_image(ctx, &bytes, fitted);
+    gsf_destroy_image(ctx, &bytes);
+    control->photo = fitted;
+    return result;
+}
+
+// The frames as (3, frames, height, width). A frame that is a reference's view is that photo, as in the paper's benchmark,
+// through the frame's camera, which scales each axis by itself and may crop.
+static gsf_result gsf__dit_fill_control(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
+                                        float* out) {
     for (int32_t f = 0; f < window->frame_count; f++) {
         gsf__dit_control control;
+        gsf_image fitted;
         const gsf_reference* photo = gsf__dit_photo(r, window, f);
+        gsf_result result = GSF_OK;
         memset(&control, 0, sizeof control);
+        memset(&fitted, 0, sizeof fitted);
         control.image = &window->color[f];
         const int64_t area = control.image->width * control.image->height;
         control.plane = window->frame_count * area;
         control.out = out + f * area;
-        control.step[0] = control.step[1] = 1.0;
-        if (photo && window->cameras && photo->camera.fx > 0.0) {
-            const gsf_camera *from = &photo->camera, *to = &window->cameras[f];
-            control.photo = &photo->color;
-            control.step[0] = from->fx / to->fx;
-            control.step[1] = from->fy / to->fy;
-            control.at[0] = (0.5 - to->cx) * control.step[0] + from->cx - 0.5;
-            control.at[1] = (0.5 - to->cy) * control.step[1] + from->cy - 0.5;
-        } else if (photo && photo->color.width == control.image->width && photo->color.height == control.image->height) {
-            control.photo = &photo->color;
-        }
-        gsf__parallel_for(ctx, (size_t)control.image->height, gsf__dit_control_row, &control);
+        if (photo) result = gsf__dit_fit_photo(ctx, photo, window->cameras ? &window->cameras[f] : NULL, &fitted, &control);
+        if (!result) gsf__parallel_for(ctx, (size_t)control.image->height, gsf__dit_control_row, &control);
+        gsf_destroy_image(ctx, &fitted);
+        GSF__TRY(result);
     }
+    return GSF_OK;
 }
 
 static void gsf__dit_store_frames(const gsf_restore_window* window, const float* video) {
@@ -12996,8 +13157,10 @@ enum { GSF__DIT_CAPTION_BYTES = 1024 };
 typedef struct gsf__dit_part { // an encoder: `photos` NULL only opens it, checks that it fits and counts its cost
     gsf_context* ctx;
     gsf__dit_restorer* r;
+    const char* name;          // of what it makes in a features file
     const gsf_image* photos;
     int32_t count;
+    gsf_nn_features* out;
 } gsf__dit_part;
 
 static gsf_result gsf__dit_folder(const gsf__dit_part* p, const char* name, gsf_text* out) {
@@ -13007,11 +13170,12 @@ static gsf_result gsf__dit_folder(const gsf__dit_part* p, const char* name, gsf_
 }
 
 // To the error of a folder that is not there: what it is for, and what does without it.
-static gsf_result gsf__dit_absent(gsf_context* ctx, gsf_result result, const char* makes, const char* instead) {
-    char before[sizeof ctx->error];
+static gsf_result gsf__dit_absent(const gsf__dit_part* p, gsf_result result, const char* makes, const char* instead) {
+    char before[sizeof p->ctx->error];
     if (result != GSF_ERROR_IO) return result;
-    memcpy(before, ctx->error, sizeof before);
-    return gsf_fail(ctx, result, "%.300s (which makes %s; %s does without it)", before, makes, instead);
+    memcpy(before, p->ctx->error, sizeof before);
+    return gsf_fail(p->ctx, result, "%.250s (which makes %s; %.100s in the features file%s does without it)", before, makes,
+                    p->name, instead);
 }
 
 static gsf_result gsf__dit_misfit(const gsf__dit_part* p, const char* part, int64_t channels, int64_t expected) {
@@ -13047,12 +13211,11 @@ static gsf_result gsf__dit_dinov2(const gsf__dit_part* p) {
     gsf_result result = gsf_nn_make_dinov2(p->ctx, folder.data, &model);
     gsf_destroy_text(p->ctx, &folder);
     if (result)
-        return gsf__dit_absent(p->ctx, result, "the 2D reference tokens",
-                               "dino_latents in the features file, or condition 3d or none,");
+        return gsf__dit_absent(p, result, "the 2D reference tokens", ", or condition 3d or none,");
     result = gsf__dit_misfit(p, "dinov2", model.width, p->r->transformer.dino_channels);
     gsf_nn_dinov2_cost(&model, &usual, &bytes, &flops);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
-    else if (!result) result = gsf_nn_encode_references(p->ctx, &model, NULL, p->photos, p->count, &p->r->features);
+    else if (!result) result = gsf_nn_encode_references(p->ctx, &model, NULL, p->photos, p->count, p->out);
     gsf_nn_destroy_dinov2(p->ctx, &model);
     return result;
 }
@@ -13066,12 +13229,11 @@ static gsf_result gsf__dit_vggt(const gsf__dit_part* p) {
     gsf_result result = gsf_nn_make_vggt(p->ctx, folder.data, &model);
     gsf_destroy_text(p->ctx, &folder);
     if (result)
-        return gsf__dit_absent(p->ctx, result, "the 3D reference tokens",
-                               "vggt_latents in the features file, or condition 2d or none,");
+        return gsf__dit_absent(p, result, "the 3D reference tokens", ", or condition 2d or none,");
     result = gsf__dit_misfit(p, "vggt", 2 * (int64_t)model.width, p->r->transformer.vggt_channels);
     gsf_nn_vggt_cost(&model, &usual, &bytes, &flops);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
-    else if (!result) result = gsf_nn_encode_references(p->ctx, NULL, &model, p->photos, p->count, &p->r->features);
+    else if (!result) result = gsf_nn_encode_references(p->ctx, NULL, &model, p->photos, p->count, p->out);
     gsf_nn_destroy_vggt(p->ctx, &model);
     return result;
 }
@@ -13112,7 +13274,7 @@ static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids
     result = gsf__dit_misfit(p, "text_encoder", model.width, p->r->transformer.text_channels);
     gsf_nn_t5_cost(&model, &in, &bytes, &flops);
     if (!ids) gsf__dit_add_cost(p->r, bytes, flops);
-    else if (!result) result = gsf_nn_t5_encode(p->ctx, &model, &in, p->r->text);
+    else if (!result) result = gsf_nn_t5_encode(p->ctx, &model, &in, p->r->prompt);
     gsf_nn_destroy_t5(p->ctx, &model);
     return result;
 }
@@ -13122,11 +13284,12 @@ static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
     const size_t tokens = (size_t)r->transformer.text_tokens;
     int32_t* ids = NULL;
     if (caption) {
-        if (r->text && r->caption.data && strcmp(r->caption.data, caption) == 0) return GSF_OK;
-        if (!r->text) r->text = (float*)gsf_alloc(p->ctx, 2 * tokens * sizeof(float), (size_t)r->transformer.text_channels);
+        if (r->prompt && r->caption.data && strcmp(r->caption.data, caption) == 0) return GSF_OK;
+        if (!r->prompt)
+            r->prompt = (float*)gsf_alloc(p->ctx, 2 * tokens * sizeof(float), (size_t)r->transformer.text_channels);
         ids = (int32_t*)gsf_alloc(p->ctx, 2 * tokens, sizeof *ids);
         gsf_destroy_text(p->ctx, &r->caption);
-        if (!ids || !r->text) {
+        if (!ids || !r->prompt) {
             gsf_free(p->ctx, ids);
             return GSF_ERROR_OUT_OF_MEMORY;
         }
@@ -13135,7 +13298,7 @@ static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
     if (!result) result = gsf__dit_encode_ids(p, ids);
     gsf_free(p->ctx, ids);
     if (!result && caption) gsf_text_printf(p->ctx, &r->caption, "%s", caption);
-    return gsf__dit_absent(p->ctx, result, "the prompts' embeddings", "prompt_embeds in the features file");
+    return gsf__dit_absent(p, result, "the prompts' embeddings", "");
 }
 
 // What the photo shows, as `out` (GSF__DIT_CAPTION_BYTES); without a photo the captioner is only opened.
@@ -13146,7 +13309,7 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     GSF__TRY(gsf__dit_folder(p, "blip2", &folder));
     gsf_result result = gsf_nn_make_captioner(p->ctx, folder.data, &model);
     gsf_destroy_text(p->ctx, &folder);
-    if (result) return gsf__dit_absent(p->ctx, result, "the caption", "a caption, or prompt_embeds in the features file,");
+    if (result) return gsf__dit_absent(p, result, "the caption", ", or a caption,");
     gsf_nn_caption_cost(&model, 0, 0, &bytes, &flops);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
     else result = gsf_nn_caption(p->ctx, &model, p->photos, NULL, 0, out, GSF__DIT_CAPTION_BYTES);
@@ -13154,11 +13317,11 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     return result;
 }
 
-// The photo nearest to a camera, by distance and half of 1 - the cosine between the views (GSFixer's reference choice).
+// The photo nearest to a camera (GSFixer's reference choice): by distance, in lengths that do not depend on the scene's unit
+// (gsf__dit_measure), and half of 1 - the cosine between the views. Of equal ones the first.
 static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* camera) {
     int32_t best = 0;
-    double least = 1e300;
-    double center[3], other[3];
+    double least = 0.0, center[3], other[3];
     gsf_camera_center(camera, center);
     for (int32_t i = 0; i < r->photo_count; i++) {
         const gsf_camera* c = &r->photos[i].camera;
@@ -13168,8 +13331,8 @@ static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* ca
             square += (center[k] - other[k]) * (center[k] - other[k]);
             cosine += camera->w2c[4 * k + 2] * c->w2c[4 * k + 2]; // third row: forward
         }
-        const double score = sqrt(square) + 0.5 * (1.0 - cosine);
-        if (score < least) {
+        const double score = sqrt(square) / r->length + 0.5 * (1.0 - cosine);
+        if (i == 0 || score < least - 1e-9) {
             least = score;
             best = i;
         }
@@ -13177,163 +13340,426 @@ static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* ca
     return best;
 }
 
-// Reference tokens from what the features hold, through the transformer's projectors.
-static gsf_result gsf__dit_project(gsf_context* ctx, gsf__dit_restorer* r) {
-    const gsf_nn_condition condition = r->desc.condition;
-    const gsf_nn_features* f = &r->features;
+// The photos that a clip's tokens are of, at most `photo_count` or 2: whose view its ends are, or those nearest to them;
+// without cameras nobody knows, and all of them count.
+static int32_t gsf__dit_choose(const gsf__dit_restorer* r, const gsf_restore_window* window, int32_t* chosen) {
+    const int32_t ends[2] = {0, window->frame_count - 1};
+    if (r->photo_count < 1) return 0;
+    for (int32_t i = 0; i < r->photo_count && !window->cameras; i++) chosen[i] = i;
+    if (!window->cameras) return r->photo_count;
+    for (int k = 0; k < 2; k++) {
+        const gsf_reference* photo = gsf__dit_photo(r, window, ends[k]);
+        chosen[k] = photo ? (int32_t)(photo - r->photos) : gsf__dit_nearest(r, &window->cameras[ends[k]]);
+    }
+    return 2;
+}
+
+// Photos squashed to the model's size first, as the official loop feeds them: whatever their aspect, each gives as many
+// tokens as a frame would.
+static gsf_result gsf__dit_encode(const gsf__dit_part* part, const int32_t* chosen, int32_t count,
+                                  gsf_result (*encode)(const gsf__dit_part* part)) {
+    gsf__dit_restorer* r = part->r;
+    gsf_context* ctx = part->ctx;
+    gsf__dit_part p = *part;
+    gsf_result result = GSF_OK;
+    gsf_image* photos = (gsf_image*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof *photos);
+    if (!photos) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < count && !result; i++) {
+        const gsf_image* color = &r->photos[chosen[i]].color;
+        if (!color->data)
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: reference %d has no photo", (int)chosen[i]);
+        if (!result)
+            result = gsf_make_image(ctx, GSF_U8, r->transformer.sample_width * r->vae.spatial_ratio,
+                                    r->transformer.sample_height * r->vae.spatial_ratio, 3, &photos[i]);
+        if (!result) result = gsf_resize_image(ctx, color, GSF_RESIZE_PIL_BICUBIC, &photos[i]);
+    }
+    p.photos = photos;
+    p.count = count;
+    if (!result) result = encode(&p);
+    for (int32_t i = 0; i < count; i++) gsf_destroy_image(ctx, &photos[i]);
+    gsf_free(ctx, photos);
+    return result;
+}
+
+// ---- restorer: what was encoded, by name
+/* Features of a whole run, in memory and in a file of safetensors, each under the name of what it depends on:
+       dino_latents.photo4       (1, tokens, channels): of photo 4, from 0 in the order of the references
+       vggt_latents.photo4,7     (2, tokens, channels): of photos 4 and 7 together, which see one another
+       prompt_embeds.clip12      (2, text tokens, text channels): negative prompt and prompt of clip 12, from 0
+   A file of a single clip may say dino_latents, vggt_latents (images, tokens, channels) and prompt_embeds instead: these
+   count for clip 0 and for no other. */
+
+static const gsf__dit_kept* gsf__dit_find(const gsf__dit_restorer* r, const char* name) {
+    for (size_t i = 0; i < r->kept_count; i++)
+        if (strcmp(r->kept[i].name, name) == 0) return &r->kept[i];
+    return NULL;
+}
+
+// What goes by its own name, or for the first clip by the bare one.
+static const gsf__dit_kept* gsf__dit_find_own(const gsf__dit_restorer* r, const char* bare, const char* name, int32_t clip) {
+    const gsf__dit_kept* own = gsf__dit_find(r, name);
+    return own || clip ? own : gsf__dit_find(r, bare);
+}
+
+static void gsf__dit_drop(gsf_context* ctx, gsf__dit_restorer* r, size_t index) {
+    gsf_free(ctx, r->kept[index].name);
+    gsf_free(ctx, r->kept[index].values);
+    r->kept[index] = r->kept[--r->kept_count];
+}
+
+// Drops what was encoded here and whose name begins so.
+static void gsf__dit_drop_encoded(gsf_context* ctx, gsf__dit_restorer* r, const char* begin) {
+    for (size_t i = r->kept_count; i-- > 0;)
+        if (r->kept[i].encoded && strncmp(r->kept[i].name, begin, strlen(begin)) == 0) gsf__dit_drop(ctx, r, i);
+}
+
+static void gsf__dit_forget_photos(gsf_context* ctx, gsf__dit_restorer* r) {
+    gsf__dit_drop_encoded(ctx, r, "");
+    r->shown.size = 0;
+}
+
+// Room for a feature in place of any of that name; its values are to be filled in.
+static gsf_result gsf__dit_keep(gsf_context* ctx, gsf__dit_restorer* r, const char* name, int64_t a, int64_t b, int64_t c,
+                                int encoded, float** values) {
+    for (size_t i = r->kept_count; i-- > 0;)
+        if (strcmp(r->kept[i].name, name) == 0) gsf__dit_drop(ctx, r, i);
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->kept, &r->kept_capacity, r->kept_count, r->kept_count + 1, sizeof *r->kept));
+    gsf__dit_kept* k = &r->kept[r->kept_count];
+    k->name = (char*)gsf_alloc(ctx, strlen(name) + 1, 1);
+    k->values = (float*)gsf_alloc(ctx, (size_t)(a * b), (size_t)c * sizeof(float));
+    if (!k->name || !k->values) {
+        gsf_free(ctx, k->name);
+        gsf_free(ctx, k->values);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    memcpy(k->name, name, strlen(name) + 1);
+    k->shape[0] = a;
+    k->shape[1] = b;
+    k->shape[2] = c;
+    k->encoded = encoded;
+    *values = k->values;
+    r->kept_count++;
+    r->unsaved = 1;
+    return GSF_OK;
+}
+
+static int gsf__dit_compare_names(const void* a, const void* b) {
+    return strcmp(((const gsf__dit_kept*)a)->name, ((const gsf__dit_kept*)b)->name);
+}
+
+static gsf_result gsf__dit_save(gsf_context* ctx, gsf__dit_restorer* r) {
+    if (!r->desc.save_features || !r->unsaved) return GSF_OK;
+    if (r->kept_count) qsort(r->kept, r->kept_count, sizeof *r->kept, gsf__dit_compare_names); // in whatever order they came
+    gsf_tensor* tensors = (gsf_tensor*)gsf_alloc(ctx, r->kept_count + 1, sizeof *tensors);
+    if (!tensors) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < r->kept_count; i++)
+        tensors[i] = gsf_nn_wrap_tensor(r->kept[i].name, r->kept[i].values, 3, r->kept[i].shape);
+    const gsf_result result = gsf_nn_save_tensors(ctx, r->desc.save_features, tensors, r->kept_count);
+    gsf_free(ctx, tensors);
+    if (!result) r->unsaved = 0;
+    return result;
+}
+
+// "dino_latents.photo4,7"
+static gsf_result gsf__dit_name_photos(gsf_context* ctx, const char* bare, const int32_t* photos, int32_t count,
+                                       gsf_text* out) {
+    out->size = 0;
+    gsf_text_printf(ctx, out, "%s.photo", bare);
+    for (int32_t i = 0; i < count; i++) gsf_text_printf(ctx, out, i ? ",%d" : "%d", (int)photos[i]);
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
+// ---- restorer: conditions of a clip, from what is kept or anew
+
+typedef struct gsf__dit_clip { // whose features are wanted
+    gsf_context* ctx;
+    gsf__dit_restorer* r;
+    int32_t clip;
+    int32_t* chosen;           // photos
+    int32_t count;
+    gsf_text name;             // scratch
+    gsf_nn_features features;
+} gsf__dit_clip;
+
+static gsf_result gsf__dit_need_photos(const gsf__dit_clip* c) {
+    if (c->count > 0) return GSF_OK;
+    return gsf_fail(c->ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no reference photos (condition none does without them)");
+}
+
+// Rows of `kept` behind those of earlier photos.
+static gsf_result gsf__dit_append(gsf__dit_clip* c, const gsf__dit_kept* kept, int64_t images, float** values) {
+    const size_t each = (size_t)(kept->shape[0] * kept->shape[1] * kept->shape[2]);
+    if (!*values) {
+        *values = (float*)gsf_alloc(c->ctx, (size_t)(images * kept->shape[1]), (size_t)kept->shape[2] * sizeof(float));
+        if (!*values) return GSF_ERROR_OUT_OF_MEMORY;
+        if (!c->features.tokens) c->features.tokens = kept->shape[1];
+    }
+    if (kept->shape[1] != c->features.tokens)
+        return gsf_fail(c->ctx, GSF_ERROR_FORMAT, "dit: %lld tokens of an image in %s, but %lld in other features",
+                        (long long)kept->shape[1], kept->name, (long long)c->features.tokens);
+    memcpy(*values + (size_t)c->features.images * each, kept->values, each * sizeof(float));
+    c->features.images += kept->shape[0];
+    return GSF_OK;
+}
+
+// Encodes those of the clip's photos of which nothing is kept, all in one go, and keeps them one by one.
+static gsf_result gsf__dit_encode_dino(gsf__dit_clip* c) {
+    gsf_nn_features made;
+    gsf_result result = GSF_OK;
+    int32_t missing = 0;
+    memset(&made, 0, sizeof made);
+    int32_t* list = (int32_t*)gsf_alloc(c->ctx, (size_t)c->count, sizeof *list);
+    if (!list) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < c->count && !result; i++) {
+        int known = 0;
+        for (int32_t k = 0; k < missing; k++) known |= list[k] == c->chosen[i];
+        result = gsf__dit_name_photos(c->ctx, "dino_latents", &c->chosen[i], 1, &c->name);
+        if (!result && !known && !gsf__dit_find(c->r, c->name.data)) list[missing++] = c->chosen[i];
+    }
+    if (!result && missing) {
+        result = gsf__dit_name_photos(c->ctx, "dino_latents", list, 1, &c->name);
+        const gsf__dit_part part = {c->ctx, c->r, c->name.data, NULL, 0, &made};
+        if (!result) result = gsf__dit_encode(&part, list, missing, gsf__dit_dinov2);
+    }
+    for (int32_t i = 0; i < missing && !result; i++) {
+        float* values;
+        const int64_t each = made.tokens * made.dino_channels;
+        result = gsf__dit_name_photos(c->ctx, "dino_latents", &list[i], 1, &c->name);
+        if (!result) result = gsf__dit_keep(c->ctx, c->r, c->name.data, 1, made.tokens, made.dino_channels, 1, &values);
+        if (!result) memcpy(values, made.dino + i * each, (size_t)each * sizeof(float));
+    }
+    gsf_nn_destroy_features(c->ctx, &made);
+    gsf_free(c->ctx, list);
+    return result;
+}
+
+static gsf_result gsf__dit_gather_dino(gsf__dit_clip* c) {
+    const gsf__dit_kept* bare = c->clip ? NULL : gsf__dit_find(c->r, "dino_latents");
+    int own = c->count > 0;
+    for (int32_t i = 0; i < c->count; i++) {
+        GSF__TRY(gsf__dit_name_photos(c->ctx, "dino_latents", &c->chosen[i], 1, &c->name));
+        own &= gsf__dit_find(c->r, c->name.data) != NULL;
+    }
+    c->features.images = 0;
+    c->features.dino_channels = c->r->transformer.dino_channels;
+    if (!own && bare) return gsf__dit_append(c, bare, bare->shape[0], &c->features.dino);
+    GSF__TRY(gsf__dit_need_photos(c));
+    if (!own) GSF__TRY(gsf__dit_encode_dino(c));
+    for (int32_t i = 0; i < c->count; i++) {
+        GSF__TRY(gsf__dit_name_photos(c->ctx, "dino_latents", &c->chosen[i], 1, &c->name));
+        GSF__TRY(gsf__dit_append(c, gsf__dit_find(c->r, c->name.data), c->count, &c->features.dino));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_encode_vggt(gsf__dit_clip* c) {
+    gsf_nn_features made;
+    float* values;
+    memset(&made, 0, sizeof made);
+    const gsf__dit_part part = {c->ctx, c->r, c->name.data, NULL, 0, &made};
+    if (!c->r->desc.save_features) gsf__dit_drop_encoded(c->ctx, c->r, "vggt_latents."); // of pairs there may be many
+    gsf_result result = gsf__dit_encode(&part, c->chosen, c->count, gsf__dit_vggt);
+    if (!result)
+        result = gsf__dit_keep(c->ctx, c->r, c->name.data, made.images, made.tokens, made.vggt_channels, 1, &values);
+    if (!result)
+        memcpy(values, made.vggt, (size_t)(made.images * made.tokens * made.vggt_channels) * sizeof(float));
+    gsf_nn_destroy_features(c->ctx, &made);
+    return result;
+}
+
+static gsf_result gsf__dit_gather_vggt(gsf__dit_clip* c) {
+    GSF__TRY(gsf__dit_name_photos(c->ctx, "vggt_latents", c->chosen, c->count, &c->name));
+    const gsf__dit_kept* kept = gsf__dit_find_own(c->r, "vggt_latents", c->name.data, c->clip);
+    if (!kept) {
+        GSF__TRY(gsf__dit_need_photos(c));
+        GSF__TRY(gsf__dit_encode_vggt(c));
+        kept = gsf__dit_find(c->r, c->name.data);
+    }
+    const int64_t before = c->features.images;
+    c->features.images = 0;
+    c->features.vggt_channels = c->r->transformer.vggt_channels;
+    GSF__TRY(gsf__dit_append(c, kept, kept->shape[0], &c->features.vggt));
+    if (c->features.dino && before != c->features.images)
+        return gsf_fail(c->ctx, GSF_ERROR_FORMAT, "dit: 2D features of %lld images, but 3D features of %lld",
+                        (long long)before, (long long)c->features.images);
+    return GSF_OK;
+}
+
+// Reference tokens from the clip's features, through the transformer's projectors.
+static gsf_result gsf__dit_project(gsf_context* ctx, gsf__dit_restorer* r, const gsf_nn_features* f) {
     r->reference_tokens = f->images * f->tokens;
     gsf_free(ctx, r->references);
     r->references = (float*)gsf_alloc(ctx, (size_t)r->reference_tokens,
                                       (size_t)gsf__dit_width(&r->transformer) * sizeof(float));
     if (!r->references) return GSF_ERROR_OUT_OF_MEMORY;
-    return gsf_nn_project_references(ctx, &r->transformer, r->reference_tokens, condition != GSF_NN_3D ? f->dino : NULL,
-                                     condition != GSF_NN_2D ? f->vggt : NULL, r->references);
+    return gsf_nn_project_references(ctx, &r->transformer, r->reference_tokens, f->dino, f->vggt, r->references);
 }
 
-static int gsf__dit_needs_dinov2(const gsf__dit_restorer* r) {
-    return !r->has_dino && (r->desc.condition == GSF_NN_BOTH || r->desc.condition == GSF_NN_2D);
-}
-
-static int gsf__dit_needs_vggt(const gsf__dit_restorer* r) {
-    return !r->has_vggt && (r->desc.condition == GSF_NN_BOTH || r->desc.condition == GSF_NN_3D);
-}
-
-// Tokens of `count` photos; what the file gave stays.
-static gsf_result gsf__dit_encode_photos(gsf_context* ctx, gsf__dit_restorer* r, const gsf_image* photos, int32_t count) {
-    const gsf__dit_part part = {ctx, r, photos, count};
-    gsf_nn_features* f = &r->features;
-    if (!r->has_dino) {
-        gsf_free(ctx, f->dino);
-        f->dino = NULL;
-    }
-    if (!r->has_vggt) {
-        gsf_free(ctx, f->vggt);
-        f->vggt = NULL;
-    }
-    if (gsf__dit_needs_dinov2(r)) GSF__TRY(gsf__dit_dinov2(&part));
-    if (gsf__dit_needs_vggt(r)) GSF__TRY(gsf__dit_vggt(&part));
-    return gsf__dit_project(ctx, r);
+static int32_t gsf__dit_clip_number(const gsf_restore_window* window) { // 0 where the host knows no such members
+    return window->struct_size >= sizeof *window ? window->clip : 0;
 }
 
 static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
-    if (!gsf__dit_needs_dinov2(r) && !gsf__dit_needs_vggt(r)) return GSF_OK; // none, or all from the file
-    if (r->photo_count < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no reference photos (condition none does without them)");
-    const int all = !window->cameras; // nobody knows which are near
-    int32_t pair[2] = {0, 0};
-    for (int k = 0; k < 2 && !all; k++) pair[k] = gsf__dit_nearest(r, &window->cameras[k ? window->frame_count - 1 : 0]);
-    if (r->pair[0] == pair[0] && r->pair[1] == pair[1]) return GSF_OK;
-    const int32_t count = all ? r->photo_count : 2;
-    gsf_image* photos = (gsf_image*)gsf_alloc(ctx, (size_t)count, sizeof *photos);
-    if (!photos) return GSF_ERROR_OUT_OF_MEMORY;
-    for (int32_t i = 0; i < count; i++) photos[i] = r->photos[all ? i : pair[i]].color;
-    const gsf_result result = gsf__dit_encode_photos(ctx, r, photos, count);
-    gsf_free(ctx, photos);
-    for (int k = 0; k < 2; k++) r->pair[k] = result ? -1 : pair[k];
+    gsf__dit_clip c;
+    gsf_text shown;
+    if (r->desc.condition == GSF_NN_NONE) return GSF_OK;
+    memset(&c, 0, sizeof c);
+    memset(&shown, 0, sizeof shown);
+    c.ctx = ctx;
+    c.r = r;
+    c.clip = gsf__dit_clip_number(window);
+    c.chosen = (int32_t*)gsf_alloc(ctx, (size_t)r->photo_count + 2, sizeof *c.chosen);
+    if (!c.chosen) return GSF_ERROR_OUT_OF_MEMORY;
+    c.count = gsf__dit_choose(r, window, c.chosen);
+    gsf_result result = gsf__dit_name_photos(ctx, c.clip ? "references" : "first", c.chosen, c.count, &shown);
+    if (!result && (!r->shown.size || strcmp(r->shown.data, shown.data) != 0)) {
+        r->shown.size = 0;
+        if (r->desc.condition != GSF_NN_3D) result = gsf__dit_gather_dino(&c);
+        if (!result && r->desc.condition != GSF_NN_2D) result = gsf__dit_gather_vggt(&c);
+        if (!result) result = gsf__dit_project(ctx, r, &c.features);
+        if (!result) gsf_text_printf(ctx, &r->shown, "%s", shown.data);
+        if (r->shown.failed) result = GSF_ERROR_OUT_OF_MEMORY;
+    }
+    gsf_nn_destroy_features(ctx, &c.features);
+    gsf_destroy_text(ctx, &c.name);
+    gsf_destroy_text(ctx, &shown);
+    gsf_free(ctx, c.chosen);
     return result;
 }
 
-static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
-    char described[GSF__DIT_CAPTION_BYTES];
+// Negative prompt and prompt of the clip, as kept or encoded.
+static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window,
+                                  const float** text) {
+    char described[GSF__DIT_CAPTION_BYTES], name[40];
+    const gsf_nn_transformer* t = &r->transformer;
     const char* caption = r->desc.caption ? r->desc.caption : window->caption;
     const gsf_reference* photo = gsf__dit_photo(r, window, 0);
-    const gsf__dit_part part = {ctx, r, photo ? &photo->color : &window->color[0], 1};
-    if (r->has_text) return GSF_OK;
+    const int32_t clip = gsf__dit_clip_number(window);
+    snprintf(name, sizeof name, "prompt_embeds.clip%d", (int)clip);
+    const gsf__dit_part part = {ctx, r, name, photo ? &photo->color : &window->color[0], 1, NULL};
+    const gsf__dit_kept* kept = gsf__dit_find_own(r, "prompt_embeds", name, clip);
+    if (kept && !kept->encoded) { // else it is of a clip that only had the same number
+        *text = kept->values;
+        return GSF_OK;
+    }
     if (!caption) {
         GSF__TRY(gsf__dit_describe(&part, described));
         caption = described;
     }
-    return gsf__dit_text(&part, caption);
+    GSF__TRY(gsf__dit_text(&part, caption));
+    *text = r->prompt;
+    if (!r->desc.save_features) return GSF_OK;
+    float* values;
+    GSF__TRY(gsf__dit_keep(ctx, r, name, 2, t->text_tokens, t->text_channels, 1, &values));
+    memcpy(values, r->prompt, 2 * (size_t)t->text_tokens * (size_t)t->text_channels * sizeof(float));
+    return GSF_OK;
 }
 
-static gsf_result gsf__dit_save(gsf_context* ctx, const gsf__dit_restorer* r) {
-    const gsf_nn_transformer* t = &r->transformer;
-    const int64_t shape[3] = {2, t->text_tokens, t->text_channels};
-    const gsf_tensor text = gsf_nn_wrap_tensor("prompt_embeds", r->text, 3, shape);
-    return gsf_nn_save_features(ctx, r->desc.save_features, &r->features, &text);
+// File of the part's steps: each part of a clip has its own, so that those that are done need not be done again.
+static gsf_result gsf__dit_checkpoint(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
+                                      gsf_text* path, gsf_nn_sample_desc* d) {
+    if (!d->checkpoint || window->struct_size < sizeof *window || !window->part) return GSF_OK;
+    gsf_text_printf(ctx, path, "%s.%d", r->desc.sample.checkpoint, (int)window->part);
+    d->checkpoint = path->data;
+    return path->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
 
 static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
-    gsf__progress(ctx, "clip", 0.0, 1.0);
-    GSF__TRY(gsf__dit_prompt(ctx, r, window));
-    GSF__TRY(gsf__dit_refer(ctx, r, window));
-    if (r->desc.save_features) GSF__TRY(gsf__dit_save(ctx, r));
     gsf_nn_sample_desc d = r->desc.sample;
+    gsf_text checkpoint;
+    memset(&checkpoint, 0, sizeof checkpoint);
+    gsf__progress(ctx, "clip", 0.0, 1.0);
+    GSF__TRY(gsf__dit_prompt(ctx, r, window, &d.text));
+    GSF__TRY(gsf__dit_refer(ctx, r, window));
+    GSF__TRY(gsf__dit_save(ctx, r));
     d.frames = window->frame_count;
     d.width = (int32_t)window->color[0].width;
     d.height = (int32_t)window->color[0].height;
-    d.text = r->text;
     d.references = r->references;
     d.reference_tokens = r->reference_tokens;
     d.seed = window->seed;
     const size_t values = (size_t)3 * (size_t)d.frames * (size_t)d.width * (size_t)d.height;
     float* video = (float*)gsf_alloc(ctx, values, 2 * sizeof(float));
     if (!video) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__dit_fill_control(ctx, r, window, video);
+    gsf_result result = gsf__dit_fill_control(ctx, r, window, video);
+    if (!result) result = gsf__dit_checkpoint(ctx, r, window, &checkpoint, &d);
     d.control = video;
-    const gsf_result result = gsf_nn_sample(ctx, &r->transformer, &r->vae, &r->schedule, &d, video + values, NULL);
+    if (!result) result = gsf_nn_sample(ctx, &r->transformer, &r->vae, &r->schedule, &d, video + values, NULL);
     if (!result) gsf__dit_store_frames(window, video + values);
+    gsf_destroy_text(ctx, &checkpoint);
     gsf_free(ctx, video);
     return result;
 }
 
 // ---- restorer: opening
 
-// A tensor (images, tokens, channels) of the features file, as floats; *found = 0 where there is none.
-static gsf_result gsf__dit_feature(gsf_context* ctx, const gsf_nn_weights* file, const char* name, int64_t images,
-                                   int64_t tokens, int64_t channels, float** out, const gsf_tensor** found) {
-    const gsf_tensor* t = gsf_nn_find_tensor(file, name);
-    *found = t;
-    if (!t) return GSF_OK;
-    if (t->rank != 3 || t->count < 1 || (images && t->shape[0] != images) || (tokens && t->shape[1] != tokens) ||
-        t->shape[2] != channels)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", file->name, name,
-                        (long long)channels);
-    *out = (float*)gsf_alloc(ctx, (size_t)t->count, sizeof(float));
-    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf_nn_read_tensor(t, 0, t->count, *out);
-    return GSF_OK;
+// Is this the bare name, or that of one photo, group of photos or clip?
+static int gsf__dit_is_name(const char* name, const char* bare, const char* of) {
+    const size_t length = strlen(bare);
+    if (strncmp(name, bare, length) != 0) return 0;
+    return !name[length] || (name[length] == '.' && strncmp(name + length + 1, of, strlen(of)) == 0);
 }
 
-static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const gsf_nn_weights* file) {
+// Is anything kept under that name or behind it?
+static int gsf__dit_has(const gsf__dit_restorer* r, const char* bare, const char* of) {
+    for (size_t i = 0; i < r->kept_count; i++)
+        if (gsf__dit_is_name(r->kept[i].name, bare, of)) return 1;
+    return 0;
+}
+
+static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, const char* file, const gsf_tensor* t) {
     const gsf_nn_transformer* c = &r->transformer;
-    gsf_nn_features* f = &r->features;
-    const gsf_tensor *text, *dino, *vggt;
-    GSF__TRY(gsf__dit_feature(ctx, file, "prompt_embeds", 2, c->text_tokens, c->text_channels, &r->text, &text));
-    GSF__TRY(gsf__dit_feature(ctx, file, "dino_latents", 0, 0, c->dino_channels, &f->dino, &dino));
-    GSF__TRY(gsf__dit_feature(ctx, file, "vggt_latents", 0, 0, c->vggt_channels, &f->vggt, &vggt));
-    if (dino && vggt && (dino->shape[0] != vggt->shape[0] || dino->shape[1] != vggt->shape[1]))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld rows of dino_latents, but %lld x %lld of vggt_latents",
-                        file->name, (long long)dino->shape[0], (long long)dino->shape[1], (long long)vggt->shape[0],
-                        (long long)vggt->shape[1]);
-    const gsf_tensor* tokens = dino ? dino : vggt;
-    f->images = tokens ? tokens->shape[0] : 0;
-    f->tokens = tokens ? tokens->shape[1] : 0;
-    f->dino_channels = dino ? c->dino_channels : 0;
-    f->vggt_channels = vggt ? c->vggt_channels : 0;
-    r->has_text = text != NULL;
-    r->has_dino = dino != NULL;
-    r->has_vggt = vggt != NULL;
+    const int prompt = gsf__dit_is_name(t->name, "prompt_embeds", "clip"), dino = gsf__dit_is_name(t->name, "dino_latents", "photo");
+    const int64_t channels = prompt ? c->text_channels : dino ? c->dino_channels : c->vggt_channels;
+    float* values;
+    if (!prompt && !dino && !gsf__dit_is_name(t->name, "vggt_latents", "photo")) return GSF_OK;
+    if (t->rank != 3 || t->count < 1 || t->shape[2] != channels ||
+        (prompt && (t->shape[0] != 2 || t->shape[1] != c->text_tokens)))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", file, t->name,
+                        (long long)channels);
+    GSF__TRY(gsf__dit_keep(ctx, r, t->name, t->shape[0], t->shape[1], t->shape[2], 0, &values));
+    gsf_nn_read_tensor(t, 0, t->count, values);
     return GSF_OK;
 }
 
-// The features file, and a look at every folder that clips will need for what it lacks.
+static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const char* path) {
+    gsf_nn_weights file;
+    gsf_result result = gsf_nn_open_weights(ctx, path, NULL, &file);
+    for (size_t i = 0; i < file.tensor_count && !result; i++)
+        result = gsf__dit_read_feature(ctx, r, file.name, &file.tensors[i]);
+    const gsf__dit_kept *dino = gsf__dit_find(r, "dino_latents"), *vggt = gsf__dit_find(r, "vggt_latents");
+    if (!result && dino && vggt && (dino->shape[0] != vggt->shape[0] || dino->shape[1] != vggt->shape[1]))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld rows of dino_latents, but %lld x %lld of vggt_latents",
+                          file.name, (long long)dino->shape[0], (long long)dino->shape[1], (long long)vggt->shape[0],
+                          (long long)vggt->shape[1]);
+    gsf_nn_close_weights(ctx, &file);
+    return result;
+}
+
+// The files of features, and a look at every folder that clips will need for what they do not hold at all.
 static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* r) {
-    const gsf__dit_part part = {ctx, r, NULL, 0};
-    if (r->desc.features) {
-        gsf_nn_weights file;
-        GSF__TRY(gsf_nn_open_weights(ctx, r->desc.features, NULL, &file));
-        const gsf_result result = gsf__dit_read_features(ctx, r, &file);
-        gsf_nn_close_weights(ctx, &file);
-        GSF__TRY(result);
+    const gsf_nn_condition condition = r->desc.condition;
+    const gsf__dit_part prompt = {ctx, r, "prompt_embeds", NULL, 0, NULL}, dino = {ctx, r, "dino_latents", NULL, 0, NULL};
+    const gsf__dit_part vggt = {ctx, r, "vggt_latents", NULL, 0, NULL};
+    void* saved = NULL;
+    size_t size;
+    if (r->desc.keep_saved && r->desc.save_features)
+        GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
+    const int there = saved != NULL;
+    gsf_free(ctx, saved);
+    if (there) GSF__TRY(gsf__dit_read_features(ctx, r, r->desc.save_features));
+    if (r->desc.features) GSF__TRY(gsf__dit_read_features(ctx, r, r->desc.features));
+    r->unsaved = 1;
+    if (!gsf__dit_has(r, "prompt_embeds", "clip")) {
+        GSF__TRY(gsf__dit_text(&prompt, NULL));
+        if (!r->desc.caption) GSF__TRY(gsf__dit_describe(&prompt, NULL));
     }
-    if (!r->has_text) GSF__TRY(gsf__dit_text(&part, NULL));
-    if (!r->has_text && !r->desc.caption) GSF__TRY(gsf__dit_describe(&part, NULL));
-    const int dinov2 = gsf__dit_needs_dinov2(r), vggt = gsf__dit_needs_vggt(r);
-    if (dinov2) GSF__TRY(gsf__dit_dinov2(&part));
-    if (vggt) GSF__TRY(gsf__dit_vggt(&part));
-    return dinov2 || vggt || r->desc.condition == GSF_NN_NONE ? GSF_OK : gsf__dit_project(ctx, r);
+    if (condition != GSF_NN_NONE && condition != GSF_NN_3D && !gsf__dit_has(r, "dino_latents", "photo"))
+        GSF__TRY(gsf__dit_dinov2(&dino));
+    if (condition != GSF_NN_NONE && condition != GSF_NN_2D && !gsf__dit_has(r, "vggt_latents", "photo"))
+        GSF__TRY(gsf__dit_vggt(&vggt));
+    return GSF_OK;
 }
 
 static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
@@ -13362,9 +13788,11 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
     gsf_nn_destroy_transformer(ctx, &r->transformer);
     gsf_nn_destroy_vae(ctx, &r->vae);
     gsf_nn_destroy_schedule(ctx, &r->schedule);
-    gsf_nn_destroy_features(ctx, &r->features);
+    while (r->kept_count) gsf__dit_drop(ctx, r, r->kept_count - 1);
+    gsf_free(ctx, r->kept);
     gsf_destroy_text(ctx, &r->caption);
-    gsf_free(ctx, r->text);
+    gsf_destroy_text(ctx, &r->shown);
+    gsf_free(ctx, r->prompt);
     gsf_free(ctx, r->references);
     gsf_free(ctx, r->texts);
     gsf_free(ctx, r);
@@ -13398,7 +13826,6 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
     if (!r) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = gsf__dit_copy_desc(ctx, desc, r);
     if (!result) result = gsf__dit_open(ctx, r);
-    r->pair[0] = r->pair[1] = -1;
     out->struct_size = sizeof *out;
     out->name = "dit";
     out->user = r;

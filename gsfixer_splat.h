@@ -479,7 +479,10 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 // ---- the repair loop -----------------------------------------------------------
 /* Trains, and at set iterations runs a round: sample a path, render it window by window, have the restorer fix the frames,
    and train on with the fixed frames beside the photos: L = L_recon + lambda * L_gen. A new round's frames replace the
-   old ones. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at any time.
+   old ones. A frame shows all that a photo's field of view holds. Where the restorer asks for that (limits.squash), it is
+   rendered at the restorer's own size with fx and fy scaled by themselves, and trained on through that camera; else pixels
+   stay square, the frame may lack or add a margin, and what lies beyond the photo's field of view is not trained on. The
+   loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at any time.
        gsf_splat_make_fixer -> gsf_splat_fix_step until stats.stage is GSF_FIX_DONE -> gsf_splat_trainer_export */
 
 typedef struct gsf_fix_desc {
@@ -493,11 +496,12 @@ typedef struct gsf_fix_desc {
                                   // before a densification
     int32_t last_round;           // the others are spread evenly up to this iteration; 0 = about 5/6, likewise
     int32_t windows;              // per round; 0 = one per training view, at least 2
-    int32_t window_frames;        // 0 = 17, moved to the nearest count the restorer takes
+    int32_t window_frames;        // 0 = what the restorer was made for, else 17; moved to the nearest count that it takes
     float lambda;                 // weight of the restored views at the end of training, default 1
     float skip_psnr;              // a window is not restored when its render agrees with the references' warp to this many
                                   // dB over the pixels that they explain; 0 = never skip
-    int32_t max_pixels;           // longer frames are rendered smaller for the restorer; 0 = photo size
+    int32_t max_pixels;           // frames of more are rendered smaller for the restorer, with the same field of view, where
+                                  //   it takes smaller ones; 0 = its own size, or the photos'
     uint32_t _end_canary;
 } gsf_fix_desc;
 
@@ -524,8 +528,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gs
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
                                                       gsf_fixer** out);
 GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* fixer);
-// Likewise what the loop runs by, train as gsf_splat_trainer_desc has it (rounds is 0 without a restorer). window_frames is
-// what the restorer will be asked for; stats.frame_count is what it takes.
+// Likewise what the loop runs by, train as gsf_splat_trainer_desc has it (rounds is 0 without a restorer).
 GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer);
 // One training iteration, or the planning of a round, or one window. After an error (or cancel) the fixer stays usable.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
@@ -11104,7 +11107,6 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
                                   gsf_restorer_limits* out) {
     const gsf__warp* warp = (const gsf__warp*)user;
     (void)ctx;
-    memset(out, 0, sizeof *out);
     out->needs_depth = 1;
     const int32_t count = warp->count > 0 ? warp->count : 3, drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
     out->bytes = (double)width * height * (8 * count + drawn) * sizeof(float);
@@ -11623,7 +11625,7 @@ struct gsf_fixer {
     int restoring;                  // a round is under way
     int planned;                    // its path and buffers are there; a restored checkpoint's are not yet
     int32_t window;                 // next one of this round
-    int32_t frames;                 // per window
+    int32_t frames;                 // per window: desc.window_frames
     gsf_camera* path;               // windows x frames
     int32_t* reference_index;
     int references_open;
@@ -11682,6 +11684,7 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     if (d.train.iterations == 0) d.train.iterations = 30000;
     if (d.rounds == 0) d.rounds = 3;
     if (d.rounds < 0 || !has_restorer) d.rounds = 0;
+    if (d.rounds == 0 && d.window_frames == 0) d.window_frames = 17; // else the restorer is asked
     if (d.first_round == 0) d.first_round = gsf__calm_iteration(&d.train, d.train.iterations / 3);
     if (d.last_round == 0) d.last_round = gsf__calm_iteration(&d.train, (int32_t)((int64_t)d.train.iterations * 5 / 6));
     if (d.last_round <= d.first_round) { // a short run has no two calm iterations
@@ -11689,7 +11692,6 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
         d.last_round = desc->last_round == 0 && late > d.first_round ? late : d.first_round;
     }
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
-    if (d.window_frames == 0) d.window_frames = 17;
     if (d.lambda == 0.0f) d.lambda = 1.0f;
     return d;
 }
@@ -11698,7 +11700,7 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (d->first_round < 0 || d->first_round > d->train.iterations || d->last_round > d->train.iterations)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: rounds at %d..%d of %d iterations", (int)d->first_round,
                         (int)d->last_round, (int)d->train.iterations);
-    if (d->windows < 1 || d->windows > 4096 || d->window_frames < 3 || d->window_frames > 4096)
+    if (d->windows < 1 || d->windows > 4096 || (d->window_frames && (d->window_frames < 3 || d->window_frames > 4096)))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: %d windows of %d frames", (int)d->windows,
                         (int)d->window_frames);
     if (!(d->lambda >= 0.0f && d->lambda <= 1e6f) || !(d->skip_psnr >= 0.0f) || d->max_pixels < 0)
@@ -11708,6 +11710,70 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
                      !restorer->restore_fn || !restorer->end_fn))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer lacks struct_size or a function");
     return GSF_OK;
+}
+
+// What the restorer takes, and so how long windows are.
+static gsf_result gsf__ask_restorer(gsf_context* ctx, gsf_fixer* f) {
+    const gsf_camera* first = f->cameras;
+    gsf_restorer_limits* limits = &f->limits;
+    memset(limits, 0, sizeof *limits);
+    limits->struct_size = sizeof *limits;
+    const int32_t usual = f->desc.window_frames > 0 ? f->desc.window_frames : 17;
+    GSF__TRY(f->restorer->query_fn(f->restorer->user, ctx, usual, first->width, first->height, limits));
+    if (limits->squash && (limits->width < 1 || limits->height < 1 || limits->width > 65536 || limits->height > 65536))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer wants frames squashed to %d x %d",
+                        (int)limits->width, (int)limits->height);
+    const int32_t wanted = f->desc.window_frames == 0 && limits->frame_count > 0 ? limits->frame_count : usual;
+    f->frames = gsf__legal_count(wanted, limits->frame_count_min > 0 ? limits->frame_count_min : 1, limits->frame_count_max,
+                                 limits->frame_count_step);
+    if (f->frames < 3 || f->frames > 4096)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer takes windows of %d frames", (int)f->frames);
+    if (f->desc.window_frames && f->desc.window_frames != f->frames)
+        gsf_log(ctx, GSF_LOG_WARNING, "windows of %d frames: the restorer takes %d instead", (int)f->desc.window_frames,
+                (int)f->frames);
+    f->desc.window_frames = f->frames;
+    return GSF_OK;
+}
+
+// All of the path camera's field of view, each axis scaled to the restorer's own size, or to a smaller one.
+static gsf_camera gsf__squashed_camera(const gsf_fixer* f, const gsf_camera* camera) {
+    const gsf_restorer_limits* limits = &f->limits;
+    const double pixels = (double)limits->width * limits->height, most = f->desc.max_pixels;
+    const double scale = most > 0.0 && pixels > most ? sqrt(most / pixels) : 1.0;
+    return gsf_camera_resized(camera, gsf__legal_side(limits->width * scale, limits->width_multiple, limits->width_max),
+                              gsf__legal_side(limits->height * scale, limits->height_multiple, limits->height_max));
+}
+
+// Size of a frame with square pixels for a view of width x height, and the scale of both axes. Where the smallest legal
+// size is larger than what was wanted, the view fills it as far as it can.
+static double gsf__square_size(const gsf_fixer* f, int32_t width, int32_t height, int32_t* frame_width,
+                               int32_t* frame_height) {
+    const gsf_restorer_limits* limits = &f->limits;
+    double scale = 1.0;
+    if (limits->width_max > 0 && width > limits->width_max) scale = (double)limits->width_max / width;
+    if (limits->height_max > 0 && height * scale > limits->height_max) scale = (double)limits->height_max / height;
+    if (f->desc.max_pixels > 0 && width * scale * height * scale > f->desc.max_pixels)
+        scale = sqrt((double)f->desc.max_pixels / ((double)width * height));
+    *frame_width = gsf__legal_side(width * scale, limits->width_multiple, limits->width_max);
+    *frame_height = gsf__legal_side(height * scale, limits->height_multiple, limits->height_max);
+    if (limits->width_multiple > 1 || limits->height_multiple > 1)
+        scale = fmax(scale, fmin((double)*frame_width / width, (double)*frame_height / height));
+    return scale;
+}
+
+// The path camera with one scale for both axes, then a little more or less field of view on each side.
+static gsf_camera gsf__square_camera(const gsf_fixer* f, const gsf_camera* camera) {
+    gsf_camera out = *camera;
+    const double scale = gsf__square_size(f, camera->width, camera->height, &out.width, &out.height);
+    out.fx *= scale;
+    out.fy *= scale;
+    out.cx = camera->cx * scale + 0.5 * (out.width - camera->width * scale);
+    out.cy = camera->cy * scale + 0.5 * (out.height - camera->height * scale);
+    return out;
+}
+
+static gsf_camera gsf__frame_camera(const gsf_fixer* f, const gsf_camera* camera) {
+    return f->limits.squash ? gsf__squashed_camera(f, camera) : gsf__square_camera(f, camera);
 }
 
 GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc, const gsf_train_view* views,
@@ -11737,6 +11803,7 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
         result = gsf_make_image(ctx, GSF_F32, image->width, image->height, 3, f->photos + i);
         if (result == GSF_OK) result = gsf_convert_image(ctx, image, f->photos + i);
     }
+    if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f) result = gsf_splat_make_warp(ctx, &f->explain);
 cleanup:
     if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
@@ -11766,36 +11833,6 @@ static float gsf__restored_weight(const gsf_fixer* f) {
     return t <= 0.0f ? 0.0f : f->desc.lambda * (t < 1.0f ? t * (2.0f - t) : 1.0f);
 }
 
-static int32_t gsf__legal(int32_t wanted, int32_t least, int32_t most, int32_t step) { // nearest of least, least+step, ...
-    if (step < 1) step = 1;
-    if (most > 0 && wanted > most) wanted = most;
-    int32_t legal = wanted <= least ? least : least + (wanted - least + step / 2) / step * step;
-    if (most > 0 && legal > most) legal -= step;
-    return legal < least ? least : legal;
-}
-
-// The path camera at a size that the restorer takes: one scale for both axes, then a little more or less field of view
-// on each side, so that nothing is squashed.
-static gsf_camera gsf__frame_camera(const gsf_fixer* f, const gsf_camera* camera) {
-    const gsf_restorer_limits* limits = &f->limits;
-    double scale = 1.0;
-    if (limits->width_max > 0 && camera->width > limits->width_max) scale = (double)limits->width_max / camera->width;
-    if (limits->height_max > 0 && camera->height * scale > limits->height_max)
-        scale = (double)limits->height_max / camera->height;
-    if (f->desc.max_pixels > 0 && camera->width * scale * camera->height * scale > f->desc.max_pixels)
-        scale = sqrt((double)f->desc.max_pixels / ((double)camera->width * camera->height));
-    const int32_t wm = limits->width_multiple > 1 ? limits->width_multiple : 1;
-    const int32_t hm = limits->height_multiple > 1 ? limits->height_multiple : 1;
-    gsf_camera out = *camera;
-    out.width = gsf__legal((int32_t)(camera->width * scale + 0.5), wm, limits->width_max, wm);
-    out.height = gsf__legal((int32_t)(camera->height * scale + 0.5), hm, limits->height_max, hm);
-    out.fx *= scale;
-    out.fy *= scale;
-    out.cx = camera->cx * scale + 0.5 * (out.width - camera->width * scale);
-    out.cy = camera->cy * scale + 0.5 * (out.height - camera->height * scale);
-    return out;
-}
-
 static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
     gsf_traj_path_desc desc;
     gsf_traj_path_layout layout;
@@ -11819,13 +11856,8 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
 
 // Path of this round, its frames' sizes and buffers.
 static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
-    const gsf_camera* first = f->cameras;
     f->planned = 0;
     gsf__drop_window(ctx, f);
-    memset(&f->limits, 0, sizeof f->limits);
-    GSF__TRY(f->restorer->query_fn(f->restorer->user, ctx, f->desc.window_frames, first->width, first->height, &f->limits));
-    f->frames = gsf__legal(f->desc.window_frames, f->limits.frame_count_min > 0 ? f->limits.frame_count_min : 1,
-                           f->limits.frame_count_max, f->limits.frame_count_step);
     const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
     gsf_free(ctx, f->path);
     gsf_free(ctx, f->reference_index);
@@ -11956,6 +11988,19 @@ static gsf_result gsf__frames_to_photos(gsf_context* ctx, gsf_fixer* f, const gs
     return result;
 }
 
+// No confidence in what a frame shows beyond the field of view that the path's cameras have, the photos'.
+static void gsf__distrust_margin(const gsf_fixer* f, gsf_image* confidence) {
+    const gsf_camera* view = f->cameras; // of its size are all on the path
+    int32_t width, height;
+    if (f->limits.squash) return;
+    const double scale = gsf__square_size(f, view->width, view->height, &width, &height);
+    const double reach_x = 0.5 * view->width * scale, reach_y = 0.5 * view->height * scale;
+    for (int32_t y = 0; y < height; y++)
+        for (int32_t x = 0; x < width; x++)
+            if (fabs(x + 0.5 - 0.5 * width) > reach_x || fabs(y + 0.5 - 0.5 * height) > reach_y)
+                ((float*)confidence->data)[(size_t)y * (size_t)width + (size_t)x] = 0.0f;
+}
+
 static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
     const size_t begin = (size_t)f->window * (size_t)f->frames;
     GSF__TRY(gsf__open_references(ctx, f));
@@ -11966,6 +12011,7 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
     window.cameras = f->path + begin;
     window.reference_index = f->reference_index + begin;
     window.seed = gsf_random_bits(f->desc.train.seed, 0x77696e64u, (uint64_t)f->round * 4096u + (uint64_t)f->window);
+    window.clip = f->round * f->desc.windows + f->window;
     for (int32_t i = 0; i < f->frames; i++) {
         GSF__TRY(gsf__check_cancel(ctx));
         const gsf_camera* camera = window.cameras + i;
@@ -11995,6 +12041,7 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
     if (!skip) {
         const int done = f->explain.user && f->restorer->restore_fn == gsf__warp_restore; // the test was the restoration
         if (!done) GSF__TRY(f->restorer->restore_fn(f->restorer->user, ctx, &window));
+        for (int32_t i = 0; i < f->frames; i++) gsf__distrust_margin(f, f->confidence + i);
         const size_t before = f->pending.count;
         for (int32_t i = 0; i < f->frames; i++) {
             if (window.reference_index[i] >= 0) continue; // the photo itself is trained on anyway

@@ -1263,6 +1263,7 @@ static void bench_open_pipeline(bench_pipeline* p, const char* folder) {
     snprintf(p->dtype, sizeof p->dtype, "%s", gsf_nn_dtype_name(t->weights.tensors[0].dtype));
     gsf_nn_sample_desc* d = &p->desc;
     d->frames = 9;
+    d->any_frames = 1;
     d->height = t->sample_height * p->vae.spatial_ratio;
     d->width = t->sample_width * p->vae.spatial_ratio;
     d->reference_tokens = 2 * t->sample_height / 2 * t->sample_width / 2; // two photos

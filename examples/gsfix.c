@@ -45,10 +45,11 @@ static const option_spec option_specs[] = {
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
      "which features of the photos guide the restorer dit: (default both: 2D semantic, 3D geometric)"},
     {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "fix restore",
-     "dit: encoded photos and prompts, as safetensors with any of dino_latents, vggt_latents, prompt_embeds; the\n"
-     "model's encoders make what is not there"},
+     "dit: encoded photos and prompts, as safetensors with any of dino_latents.photoI, vggt_latents.photoI,J and\n"
+     "prompt_embeds.clipK, counted from 0 (or, for one clip alone, dino_latents, vggt_latents, prompt_embeds); the model's\n"
+     "encoders make what is not there"},
     {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
-     "dit: write the encoded photos and prompts of the last clip, for --ref-features, into a new file"},
+     "dit: write the encoded photos and the prompts of all clips, for --ref-features, into a new file"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore",
      "dit: what the scene is (default: the model's captioner looks at each clip's first frame)"},
     {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: steps from noise to frames (default 50; fast 10)"},
@@ -66,6 +67,9 @@ static const option_spec option_specs[] = {
      "dit: most of the transformer in 8-bit integers; takes a byte of memory for each of its weights"},
     {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore",
      "dit: the transformer's products in bfloat16 where the processor has them (AVX512_BF16); --quality fast has it"},
+    {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore",
+     "dit: take other numbers of frames than the one that the model was trained on (49). Sines then stand in for its learned\n"
+     "positions, which it has never seen"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
      "regularisers for few views (default on); off is plain 3DGS"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
@@ -407,6 +411,7 @@ int gsfix_check_restorer(gsfix_app* app) {
                         : o->block_cache > 0.0      ? "--block-cache"
                         : o->int8                   ? "--int8"
                         : o->bf16                   ? "--bf16"
+                        : o->any_frames             ? "--any-frames"
                                                     : NULL;
     if (alone) return gsfix_misused(app, "%s is for the restorer dit:MODEL_DIR", alone);
     if (!r || strcmp(r, "none") == 0 || strcmp(r, "warp") == 0) return 0;
@@ -425,6 +430,8 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     d.model = o->restorer + 4;
     d.features = o->ref_features;
     d.save_features = o->save_features;
+    d.keep_saved = o->resume;
+    d.sample.any_frames = o->any_frames;
     d.caption = o->caption;
     for (int i = 0; i < 4; i++)
         if (o->condition && strcmp(o->condition, gsfix_conditions[i]) == 0) d.condition = (gsf_nn_condition)i;
@@ -513,7 +520,12 @@ gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present) 
     return gsfix_make_exec(app, r + 5, app->o.restorer_timeout > 0.0 ? app->o.restorer_timeout : 3600.0, out);
 }
 
-gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { return gsfix_remove_output(app, "dit.checkpoint"); }
+gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { // and those of a clip's further parts
+    gsf_result result = gsfix_remove_output(app, "dit.checkpoint");
+    for (int part = 1; result == GSF_OK && gsfix_has_output(app, gsfix_pathf("dit.checkpoint.%d", part).s); part++)
+        result = gsfix_remove_output(app, gsfix_pathf("dit.checkpoint.%d", part).s);
+    return result;
+}
 
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer) {
     if (!restorer->user) return;
@@ -1199,7 +1211,7 @@ static gsf_result restore_clip(gsfix_app* app, clip* c, gsf_restorer* restorer) 
     window.out_confidence = c->out_confidence;
     gsf_result result = restorer->begin_fn(restorer->user, ctx, c->references, (int32_t)c->refs);
     if (result != GSF_OK) return result;
-    result = restorer->restore_fn(restorer->user, ctx, &window);
+    result = gsf_restore_clip(ctx, restorer, &window);
     restorer->end_fn(restorer->user, ctx);
     return result;
 }
@@ -1223,6 +1235,7 @@ static void free_clip(gsfix_app* app, clip* c) {
 
 static gsf_result open_restore_out(gsfix_app* app, const clip* c) {
     gsf_result result = gsfix_claim(app, "dit.checkpoint");
+    if (result == GSF_OK) result = gsfix_claim(app, "dit.checkpoint.*");
     for (size_t i = 0; i < c->frames && result == GSF_OK; i++) {
         const gsfix_path name = gsfix_stem(c->frame_names.names[i]);
         result = gsfix_claim(app, "%s.png", name.s);

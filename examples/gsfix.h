@@ -18,7 +18,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *ref_features, *save_features;
     const char *caption, *model, *solver;
-    int json, help, resume, restart, depth, alpha, int8, bf16;
+    int json, help, resume, restart, depth, alpha, int8, bf16, any_frames;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;

@@ -39,7 +39,6 @@ typedef struct exec_state {
 static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                              gsf_restorer_limits* out) {
     (void)user, (void)ctx, (void)frame_count, (void)width, (void)height;
-    memset(out, 0, sizeof *out);
     out->needs_depth = 1;
     out->needs_alpha = 1;
     return GSF_OK;

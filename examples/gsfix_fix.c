@@ -447,6 +447,7 @@ static void write_dit_switches(fix_run* run) {
     gsfix_json_number(ctx, t, "block_cache", as_written(d.block_cache));
     gsfix_json_text(ctx, t, "int8", dit.int8 ? "on" : "off");
     gsfix_json_text(ctx, t, "bf16", dit.bf16 ? "on" : "off");
+    gsfix_json_text(ctx, t, "any_frames", dit.sample.any_frames ? "on" : "off");
 }
 
 static void write_switches(fix_run* run) {

@@ -131,6 +131,7 @@ static void check_pipeline(void) {
     char* run = test_read_file(test_golden("restorer/pipeline/run.json"), NULL);
     test_tensor tokens;
     c.desc.frames = (int32_t)run_number(run, "num_frames", 0);
+    c.desc.any_frames = 1; // as the official code
     c.desc.height = (int32_t)run_number(run, "height", 0);
     c.desc.width = (int32_t)run_number(run, "width", 0);
     c.desc.steps = (int32_t)run_number(run, "num_inference_steps", 0);

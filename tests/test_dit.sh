@@ -9,22 +9,32 @@ mkdir -p "$scratch"
 export OMP_WAIT_POLICY=passive
 log=$scratch/log
 fail() { echo "$0: $*"; tail -n 5 "$log"; exit 1; }
-"$make_model" "$scratch/model" --size tiny --parts transformer,vae,scheduler,features > "$log" 2>&1 ||
-    fail "make_model failed"
-dit=(--restorer "dit:$scratch/model" --ref-features "$scratch/model/features.safetensors")
-options=(--views 3 --iterations 60 --checkpoint-every 5 --max-size 64 --seed 7 --steps 6 "${dit[@]}"
-    --set "rounds=1,windows=2,window_frames=9,first_round=20,last_round=40")
+"$make_model" "$scratch/all" --size tiny > "$log" 2>&1 || fail "make_model failed"
+mkdir "$scratch/model" # the same without encoders
+for part in transformer vae scheduler; do ln -s "../all/$part" "$scratch/model/$part"; done
+from_photos=(--restorer "dit:$scratch/all")
+saved=$scratch/saved.safetensors
+dit=(--restorer "dit:$scratch/model" --ref-features "$saved")
+options=(--views 3 --iterations 60 --checkpoint-every 5 --max-size 64 --seed 7 --steps 4
+    --set "rounds=1,windows=3,first_round=20,last_round=40")
 fix() { # OUT OPTION...
     local out=$1
     shift
     "$gsfix" fix "$scene" --out "$out" "${options[@]}" "$@" > "$log" 2>&1
 }
 
-fix "$scratch/whole" --threads 2 || fail "the undisturbed run failed"
+# Three clips, each with a caption and photos of its own, by the model's encoders; then without encoders from what they gave.
+fix "$scratch/whole" "${from_photos[@]}" --save-features "$saved" --threads 2 || fail "the run from photos failed"
 [ ! -e "$scratch/whole/dit.checkpoint" ] || fail "the clip's checkpoint is left behind"
 grep -q '"solver": *"ddim"' "$scratch/whole/metrics.json" || fail "metrics.json does not tell the solver"
-fix "$scratch/one" --threads 1 || fail "the run with one worker failed"
-cmp "$scratch/whole/splats.ply" "$scratch/one/splats.ply" || fail "one and two workers differ"
+grep -q '"window_frames": *9' "$scratch/whole/metrics.json" || fail "windows are not as long as the model was trained on"
+for stage in caption text dinov2 vggt "vae encode" transformer "vae decode"; do
+    grep -q "\"name\": *\"$stage\"" "$scratch/whole/metrics.json" || fail "metrics.json does not tell of the stage $stage"
+done
+for clip in 0 1 2; do grep -q "prompt_embeds.clip$clip" "$saved" || fail "the prompt of clip $clip is not saved"; done
+fix "$scratch/one" "${dit[@]}" --threads 1 || fail "the saved features do not do"
+cmp "$scratch/whole/splats.ply" "$scratch/one/splats.ply" || fail "saved features, or one worker, give something else"
+! grep -q '"name": *"caption"' "$scratch/one/metrics.json" || fail "the captioner ran although prompts were given"
 
 kills=0
 kill_clips() { # OUT TIMES OPTION...: kill -9 as soon as a clip is at work, then a last run to the end
@@ -41,10 +51,15 @@ kill_clips() { # OUT TIMES OPTION...: kill -9 as soon as a clip is at work, then
     done
     fix "$out" "$@" --resume || fail "the last run failed after $kills kills"
 }
-kill_clips "$scratch/killed" 3
+kill_clips "$scratch/killed" 3 "${dit[@]}"
 cmp "$scratch/whole/splats.ply" "$scratch/killed/splats.ply" || fail "differs after $kills kills"
+kill_clips "$scratch/photos_killed" 1 "${from_photos[@]}" --save-features "$scratch/again.safetensors"
+cmp "$scratch/whole/splats.ply" "$scratch/photos_killed/splats.ply" || fail "from photos: differs after a kill"
+cmp "$saved" "$scratch/again.safetensors" || fail "other features are saved after a kill"
 
-# One clip: the frames that the first window of the scene gave.
+# One clip: the frames that the first window of the scene gave, as they come out of a folder of pictures. A file of features
+# for that clip alone.
+dit=(--restorer "dit:$scratch/model" --ref-features "$scratch/all/features.safetensors")
 mkdir -p "$scratch/clip"
 for frame in "$scratch"/whole/fixed/*window1*.png; do cp "$frame" "$scratch/clip/"; done
 restore() { # OUT OPTION...
@@ -77,21 +92,37 @@ expect() { # STATUS TEXT COMMAND...
 expect 1 "does without it" "$gsfix" restore "$scratch/clip" --out "$scratch/x" --restorer "dit:$scratch/model"
 expect 2 "--solver" "$gsfix" restore "$scratch/clip" --out "$scratch/x" --restorer warp --solver ddim
 expect 1 "config.json" "$gsfix" restore "$scratch/clip" --out "$scratch/x" "${dit[@]}" --restorer "dit:$scratch/none"
-head -c 1000 "$scratch/model/features.safetensors" > "$scratch/cut.safetensors"
+head -c 1000 "$scratch/all/features.safetensors" > "$scratch/cut.safetensors"
 expect 1 "cut.safetensors" "$gsfix" restore "$scratch/clip" --out "$scratch/x" "${dit[@]}" \
     --ref-features "$scratch/cut.safetensors"
 
-# From photos alone: caption, prompts and reference tokens by the model's own encoders.
-"$make_model" "$scratch/all" --size tiny > "$log" 2>&1 || fail "make_model failed"
-alone=(--restorer "dit:$scratch/all" --set "rounds=1,windows=1,window_frames=9,first_round=20,last_round=40")
-options=(--views 3 --iterations 60 --checkpoint-every 5 --max-size 64 --seed 7 --steps 4)
-fix "$scratch/photos" "${alone[@]}" --save-features "$scratch/saved.safetensors" || fail "the run from photos alone failed"
-for stage in caption text dinov2 vggt "vae encode" transformer "vae decode"; do
-    grep -q "\"name\": *\"$stage\"" "$scratch/photos/metrics.json" || fail "metrics.json does not tell of the stage $stage"
+
+# Frames of any number and size: more and fewer than the 9 of 96 x 64 that the model was made for.
+size() { od -An -tx1 -j16 -N8 "$1"; } # of a PNG
+expect 0 "" "$gsfix" render "$scratch/whole/splats.ply" --scene "$scene" --max-size 50 --out "$scratch/views"
+views=("$scratch"/views/*.png)
+for count in 1 5 21; do
+    mkdir -p "$scratch/clip$count"
+    for i in $(seq -w "$count"); do cp "${views[10#$i % ${#views[@]}]}" "$scratch/clip$count/$i.png"; done
+    expect 0 "restored by" "$gsfix" restore "$scratch/clip$count" --out "$scratch/back$count" "${dit[@]}" --steps 2
+    [ "$(ls "$scratch/back$count"/*.png | wc -l)" = "$count" ] || fail "not $count frames came back"
+    [ ! -e "$scratch/back$count/dit.checkpoint" ] && [ ! -e "$scratch/back$count/dit.checkpoint.1" ] ||
+        fail "checkpoints are left behind"
 done
-kill_clips "$scratch/photos_killed" 1 "${alone[@]}"
-cmp "$scratch/photos/splats.ply" "$scratch/photos_killed/splats.ply" || fail "from photos alone: differs after a kill"
-fix "$scratch/saved" "${alone[@]}" --ref-features "$scratch/saved.safetensors" || fail "the saved features do not do"
-cmp "$scratch/photos/splats.ply" "$scratch/saved/splats.ply" || fail "saved features give something else"
-! grep -q '"name": *"caption"' "$scratch/saved/metrics.json" || fail "the captioner ran although prompts were given"
+[ "$(size "$scratch/back5/1.png")" = "$(size "$scratch/clip5/1.png")" ] || fail "frames of another size came back"
+# Stopped in the last part of a long clip: those that were done are not sampled again.
+"$gsfix" restore "$scratch/clip21" --out "$scratch/long" "${dit[@]}" --steps 2 > "$log" 2>&1 &
+pid=$!
+while kill -0 "$pid" 2> /dev/null && [ ! -e "$scratch/long/dit.checkpoint.2" ]; do sleep 0.01; done
+kill -9 "$pid" 2> /dev/null || true
+wait "$pid" 2> /dev/null || true
+expect 0 "restored by" "$gsfix" restore "$scratch/clip21" --out "$scratch/long" "${dit[@]}" --steps 2
+for frame in "$scratch"/back21/*.png; do cmp "$frame" "${frame/back21/long}" || fail "a long clip differs after a kill"; done
+
+# Features of a clip that the file does not have are named; other counts than the trained one are to be asked for.
+expect 1 "prompt_embeds.clip3" "$gsfix" fix "$scene" --out "$scratch/x" "${options[@]}" --ref-features "$saved" \
+    --restorer "dit:$scratch/model" --set "rounds=2,windows=3,first_round=20,last_round=40"
+expect 1 "prompt_embeds.clip1" "$gsfix" fix "$scene" --out "$scratch/x" "${options[@]}" "${dit[@]}"
+expect 0 "the restorer takes 9 instead" "$gsfix" fix "$scene" --out "$scratch/y" "${options[@]}" "${from_photos[@]}" \
+    --condition none --caption "a wall" --steps 1 --set "rounds=1,windows=1,window_frames=17,first_round=20,last_round=40"
 echo "$kills kills"

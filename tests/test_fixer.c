@@ -234,7 +234,8 @@ typedef struct repair {
     float photos[VIEWS][3 * PIXELS];
     gsf_restorer restorer;          // renders the truth
     int32_t multiple, frames_step;  // the restorer's limits
-    int begun, ended, windows, fail_at, checked, restored, fail_query;
+    gsf_restorer_limits also;       // further ones: what it was made for
+    int begun, ended, windows, fail_at, checked, restored;
 } repair;
 
 static gsf_camera around(double angle, double height) { // on a circle of radius 4, looking at the middle
@@ -251,11 +252,17 @@ static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int
                                gsf_restorer_limits* out) {
     const repair* r = (const repair*)user;
     (void)ctx; (void)frames; (void)width; (void)height;
-    memset(out, 0, sizeof *out);
+    CHECK(out->struct_size == sizeof *out);
     out->frame_count_min = 1;
-    if (r->fail_query) return gsf_fail(ctx, GSF_ERROR_RESTORER, "not yet");
     out->frame_count_step = r->frames_step;
     out->width_multiple = out->height_multiple = r->multiple;
+    out->frame_count = r->also.frame_count;
+    out->frame_count_max = r->also.frame_count_max;
+    out->width = r->also.width;
+    out->height = r->also.height;
+    out->width_max = r->also.width_max;
+    out->height_max = r->also.height_max;
+    out->squash = r->also.squash;
     out->needs_depth = out->needs_alpha = 1;
     return GSF_OK;
 }
@@ -269,6 +276,22 @@ static gsf_result repair_begin(void* user, gsf_context* ctx, const gsf_reference
     return GSF_OK;
 }
 
+// All of the photo's field of view is in the frame, and nothing else where it is squashed to the frame's size.
+static void check_view(const repair* r, const gsf_camera* camera) {
+    const gsf_camera* photo = &r->views[0].camera;
+    const double left = camera->cx - photo->cx / photo->fx * camera->fx, top = camera->cy - photo->cy / photo->fy * camera->fy;
+    const double right = left + photo->width / photo->fx * camera->fx, bottom = top + photo->height / photo->fy * camera->fy;
+    if (r->also.squash) {
+        CHECK_NEAR(left, 0.0, 1e-9);
+        CHECK_NEAR(top, 0.0, 1e-9);
+        CHECK_NEAR(right, camera->width, 1e-9);
+        CHECK_NEAR(bottom, camera->height, 1e-9);
+    } else if (r->also.width_max) { // square pixels in a frame of one size: as large as it goes
+        CHECK(left > -1e-9 && top > -1e-9 && right < camera->width + 1e-9 && bottom < camera->height + 1e-9);
+        CHECK(left < 1e-9 || top < 1e-9);
+    }
+}
+
 static gsf_result repair_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
     repair* r = (repair*)user;
     if (r->fail_at && ++r->windows == r->fail_at) return gsf_fail(ctx, GSF_ERROR_RESTORER, "out of ideas");
@@ -277,7 +300,8 @@ static gsf_result repair_restore(void* user, gsf_context* ctx, const gsf_restore
     for (int32_t i = 0; i < window->frame_count; i++) {
         const gsf_camera* camera = window->cameras + i;
         CHECK(camera->width % r->multiple == 0 && camera->height % r->multiple == 0);
-        CHECK_NEAR(camera->fx / camera->fy, 1.0, 1e-9); // nothing is squashed
+        if (!r->also.squash) CHECK_NEAR(camera->fx / camera->fy, 1.0, 1e-9); // nothing is squashed
+        check_view(r, camera);
         gsf_render_output out;
         memset(&out, 0, sizeof out);
         out.color = window->out_color[i];
@@ -488,6 +512,56 @@ static void test_loop(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
+// A restorer that was made for 13 frames of 96 x 40, for which the photos' 48 x 40 are squashed; at --quality fast's kind of
+// limit a smaller size with the same view; and one that keeps pixels square in frames of that one size, of which a half is
+// margin that is not to be trained on.
+static void test_native_frames(gsf_context* ctx) {
+    static repair r;
+    gsf_fixer* fixer;
+    gsf_fix_stats stats;
+    for (int kind = 0; kind < 4; kind++) {
+        repair_setup(ctx, &r);
+        gsf_fix_desc desc = repair_desc();
+        desc.window_frames = 0;
+        desc.train.iterations = 90;
+        desc.rounds = 1;
+        r.multiple = kind == 3 ? 1 : 8;
+        r.also.frame_count = r.also.frame_count_max = 13;
+        r.also.width = 96;
+        r.also.height = 40;
+        r.also.squash = kind < 2;
+        if (kind == 1) desc.max_pixels = 1100; // an exact fit would be 51 x 21
+        if (kind >= 2) r.also.width_max = 96, r.also.height_max = 40;
+        if (kind == 2) r.multiple = 40, r.also.width_max = 120, desc.max_pixels = 100; // as if to shrink photos to a corner
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer));
+        CHECK(gsf_splat_fixer_desc(fixer).window_frames == 13);
+        int windows = 0, wrong = 0;
+        for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE;) {
+            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) break;
+            if (stats.stage != GSF_FIX_RESTORE) continue;
+            windows++;
+            CHECK(stats.frame_count == 13);
+            const gsf_camera* c = stats.cameras;
+            if (kind == 0) CHECK(c->width == 96 && c->height == 40);
+            if (kind == 1) CHECK(c->width == 48 && c->height == 24);
+            if (kind == 2) CHECK(c->width == 40 && c->height == 40);
+            if (kind == 3) CHECK(c->width == 48 && c->height == 40 && c->fx == r.views[0].camera.fx);
+            const float reach = 0.5f * (float)WIDTH * (float)(c->fx / r.views[0].camera.fx);
+            const float rise = 0.5f * (float)HEIGHT * (float)(c->fy / r.views[0].camera.fy);
+            for (int y = 0; y < c->height; y++)
+                for (int x = 0; x < c->width; x++) {
+                    const float confidence = ((const float*)stats.confidence[1].data)[y * c->width + x];
+                    const int inside = fabsf((float)x + 0.5f - 0.5f * (float)c->width) <= reach + 1e-3f &&
+                                       fabsf((float)y + 0.5f - 0.5f * (float)c->height) <= rise + 1e-3f;
+                    wrong += confidence != (inside ? 0.8f : 0.0f);
+                }
+        }
+        CHECK(windows == 2 && wrong == 0);
+        gsf_splat_destroy_fixer(ctx, fixer);
+        repair_teardown(ctx, &r);
+    }
+}
+
 static void test_trouble(gsf_context* ctx) {
     static repair r;
     repair_setup(ctx, &r);
@@ -588,9 +662,9 @@ static void test_failed_restore(void) {
         if (result != GSF_OK && !CHECK(saves_as(&ctx, second, &untouched))) break;
     }
     CHECK(result == GSF_OK && failures > 10 && saves_as(&ctx, second, &chunks));
-    r.fail_query = 1;
-    CHECK_RESULT(&ctx, gsf_splat_fix_step(&ctx, second, &stats), GSF_ERROR_RESTORER);
-    r.fail_query = 0;
+    memory.fail_at = memory.calls + 1;
+    CHECK_RESULT(&ctx, gsf_splat_fix_step(&ctx, second, &stats), GSF_ERROR_OUT_OF_MEMORY);
+    memory.fail_at = 0;
     CHECK(run_steps(&ctx, second, 1000, NULL) && same_splats(whole, second));
     gsf_splat_destroy_fixer(&ctx, second);
     gsf_splat_destroy_fixer(&ctx, whole);
@@ -721,6 +795,7 @@ int main(void) {
     test_desc(&ctx);
     test_mixed_windows(&ctx);
     test_loop(&ctx);
+    test_native_frames(&ctx);
     test_trouble(&ctx);
     test_failed_restore();
     return test_report();

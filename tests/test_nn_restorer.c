@@ -46,7 +46,7 @@ static void make_clip(gsf_context* ctx, clip* c, int32_t frames, int32_t width, 
         CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, width, height, 3, &c->out[f]));
         CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, width, height, 1, &c->confidence[f]));
         float* v = (float*)c->color[f].data;
-        for (int32_t i = 0; i < 3 * width * height; i++) v[i] = (float)test_random(&state);
+        for (int32_t i = 0; i < 3 * width * height; i++) v[i] = (float)(floor(255.999 * test_random(&state)) / 255.0);
         c->reference_index[f] = -1;
     }
     c->window.struct_size = sizeof c->window;
@@ -98,12 +98,16 @@ static void test_limits(gsf_context* ctx, const char* features, clip* c) {
     const gsf_nn_dit_desc desc = small_desc(features, 2);
     gsf_restorer r;
     gsf_restorer_limits limits;
+    memset(&limits, 0, sizeof limits);
+    limits.struct_size = sizeof limits;
     if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
     CHECK(r.struct_size == sizeof r && strcmp(r.name, "dit") == 0);
     CHECK_OK(ctx, r.query_fn(r.user, ctx, c->frames, c->width, c->height, &limits));
-    CHECK(limits.frame_count_min == 9 && limits.frame_count_step == 8 && limits.frame_count_max >= 9);
+    CHECK(limits.frame_count_min == 9 && limits.frame_count_max == 9 && limits.frame_count == 9); // as it was trained
+    CHECK(limits.squash && limits.width == c->width && limits.height == c->height);
     CHECK(limits.width_multiple == c->width && limits.height_multiple == c->height); // learned positions: one size
     CHECK(limits.bytes > 0.0 && limits.flops > 0.0 && !limits.needs_depth && !limits.needs_alpha);
+    limits.bytes = 0.0;
     CHECK_OK(ctx, r.query_fn(r.user, ctx, 10, c->width + 1, c->height, &limits)); // not legal: no cost, but limits
     CHECK(limits.bytes == 0.0 && limits.frame_count_min == 9);
     CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
@@ -149,49 +153,68 @@ static void test_references(gsf_context* ctx, const char* features, clip* c) {
     gsf_nn_destroy_dit(ctx, &r);
 }
 
-// A photo of twice the size, of which the frame's camera sees all but 8 columns, and as many beyond its other side.
-static void test_cropped_reference(gsf_context* ctx, const char* features, clip* c) {
-    const gsf_nn_dit_desc desc = small_desc(features, 1);
-    gsf_restorer r;
-    gsf_reference photo;
+// What the restorer makes of a clip whose first frame is the view of `photo`, seen by `camera` (NULL: all of it), and what
+// of one whose first frame is `seen`.
+static void check_photo_frame(gsf_context* ctx, gsf_restorer* r, clip* c, const gsf_reference* photo,
+                              const gsf_camera* camera, const gsf_image* seen) {
     gsf_camera cameras[MAX_FRAMES];
     const gsf_image frame = c->color[0];
-    gsf_image seen;
-    memset(&photo, 0, sizeof photo);
-    memset(cameras, 0, sizeof cameras);
-    CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, 2 * c->width, 2 * c->height, 3, &photo.color));
-    CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, c->width, c->height, 3, &seen));
-    float *large = (float*)photo.color.data, *small = (float*)seen.data;
-    for (int64_t y = 0; y < 2 * c->height; y++)
-        for (int64_t x = 0; x < 6 * c->width; x++)
-            large[y * 6 * c->width + x] = ((const float*)c->color[3].data)[y / 2 * 3 * c->width + x / 6 * 3 + x % 3];
-    for (int64_t y = 0; y < c->height; y++)
-        for (int64_t x = 0; x < 3 * c->width; x++) {
-            const float* from = (const float*)(x >= 3 * (c->width - 8) ? frame.data : c->color[3].data);
-            small[y * 3 * c->width + x] = from[y * 3 * c->width + (x >= 3 * (c->width - 8) ? x : x + 24)];
-        }
-    photo.camera.fx = photo.camera.fy = 200.0;
-    photo.camera.cx = c->width;
-    photo.camera.cy = c->height;
-    for (int32_t i = 0; i < c->frames; i++) {
-        cameras[i].fx = cameras[i].fy = 100.0;
-        cameras[i].cx = 0.5 * c->width - 8.0;
-        cameras[i].cy = 0.5 * c->height;
-    }
-    if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
-    c->window.cameras = cameras;
+    for (int32_t i = 0; i < c->frames && camera; i++) cameras[i] = *camera;
+    c->window.cameras = camera ? cameras : NULL;
     c->reference_index[0] = 0;
-    CHECK_OK(ctx, r.begin_fn(r.user, ctx, &photo, 1));
-    gsf_destroy_image(ctx, &photo.color); // only borrowed
-    CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
-    r.end_fn(r.user, ctx);
+    gsf_reference lent = *photo;
+    CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, photo->color.width, photo->color.height, 3, &lent.color));
+    CHECK_OK(ctx, gsf_convert_image(ctx, &photo->color, &lent.color));
+    CHECK_OK(ctx, r->begin_fn(r->user, ctx, &lent, 1));
+    gsf_destroy_image(ctx, &lent.color); // only borrowed
+    CHECK_OK(ctx, r->restore_fn(r->user, ctx, &c->window));
+    r->end_fn(r->user, ctx);
     const uint32_t with_photo = checksum(c);
     c->window.cameras = NULL;
     c->reference_index[0] = -1;
-    c->color[0] = seen;
-    CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
+    c->color[0] = *seen;
+    CHECK_OK(ctx, r->restore_fn(r->user, ctx, &c->window));
     CHECK(checksum(c) == with_photo);
     c->color[0] = frame;
+}
+
+// A photo of another size and aspect becomes a frame as PIL resizes it: all of it, squashed, or what a camera sees of it,
+// which is all but 8 columns, and as many beyond its other side.
+static void test_photo_frames(gsf_context* ctx, const char* features, clip* c) {
+    const gsf_nn_dit_desc desc = small_desc(features, 1);
+    gsf_restorer r;
+    gsf_reference photo;
+    gsf_image bytes, seen;
+    const int32_t width = 2 * c->width, height = 3 * c->height;
+    memset(&photo, 0, sizeof photo);
+    CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, width, height, 3, &photo.color));
+    CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, c->width, c->height, 3, &bytes));
+    CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, c->width, c->height, 3, &seen));
+    for (int64_t i = 0; i < 3 * (int64_t)width * height; i++) ((uint8_t*)photo.color.data)[i] = (uint8_t)(i * 2654435761u >> 24);
+    CHECK_OK(ctx, gsf_resize_image(ctx, &photo.color, GSF_RESIZE_PIL_BICUBIC, &bytes));
+    CHECK_OK(ctx, gsf_convert_image(ctx, &bytes, &seen));
+    if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
+    check_photo_frame(ctx, &r, c, &photo, NULL, &seen);
+    memset(&photo.camera, 0, sizeof photo.camera);
+    for (int k = 0; k < 4; k++) photo.camera.w2c[5 * k] = 1.0;
+    photo.camera.width = width;
+    photo.camera.height = height;
+    photo.camera.fx = photo.camera.fy = 200.0;
+    photo.camera.cx = 0.5 * width;
+    photo.camera.cy = 0.5 * height;
+    gsf_camera camera = gsf_camera_resized(&photo.camera, c->width, c->height);
+    check_photo_frame(ctx, &r, c, &photo, &camera, &seen);
+    camera.cx -= 8.0;
+    float* v = (float*)seen.data;
+    for (int64_t y = 0; y < c->height; y++) {
+        float* row = v + 3 * y * c->width;
+        const size_t kept = 3 * (size_t)(c->width - 8);
+        memmove(row, row + 24, kept * sizeof(float));
+        memcpy(row + kept, (const float*)c->color[0].data + 3 * y * c->width + (int64_t)kept, 24 * sizeof(float));
+    }
+    check_photo_frame(ctx, &r, c, &photo, &camera, &seen);
+    gsf_destroy_image(ctx, &photo.color);
+    gsf_destroy_image(ctx, &bytes);
     gsf_destroy_image(ctx, &seen);
     gsf_nn_destroy_dit(ctx, &r);
 }
@@ -242,6 +265,212 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     CHECK(restore(ctx, &desc, c, GSF_OK) != 0);
     desc.model = test_golden("restorer/model/transformer"); // names the part that is missing first
     CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO);
+}
+
+// ---- features of several photos and clips
+
+enum { PHOTOS = 6, CLIPS = 3, PHOTO_TOKENS = 5 };
+
+// Cameras of six photos: on a circle about the middle, all but the last, which stands in the first one's place and looks
+// away. Scaled, turned about z and moved as a whole.
+static void place_photos(gsf_camera* cameras, double scale, double turn, double shift) {
+    for (int i = 0; i < PHOTOS; i++) {
+        const double a = i == PHOTOS - 1 ? 0.0 : 0.4 * i, view = i == PHOTOS - 1 ? 2.2 : a; // looks along +z at a = 0
+        const double c2w[16] = {cos(view), 0, -sin(view), 0, 0, 1, 0, 0, sin(view), 0, cos(view), 0,
+                                -3.0 * sin(a), 0.1 * i, -3.0 * cos(a), 1};
+        const double c = cos(turn), s = sin(turn);
+        double moved[16];
+        for (int k = 0; k < 4; k++) {
+            const double x = c2w[4 * k], y = c2w[4 * k + 1], size = k == 3 ? scale : 1.0;
+            moved[4 * k] = size * (c * x - s * y) + (k == 3 ? shift : 0.0);
+            moved[4 * k + 1] = size * (s * x + c * y) - (k == 3 ? 2.0 * shift : 0.0);
+            moved[4 * k + 2] = size * c2w[4 * k + 2];
+            moved[4 * k + 3] = c2w[4 * k + 3];
+        }
+        memset(&cameras[i], 0, sizeof cameras[i]);
+        gsf_camera_set_c2w(&cameras[i], moved);
+        cameras[i].fx = cameras[i].fy = 20.0;
+        cameras[i].cx = cameras[i].cy = 8.0;
+        cameras[i].width = cameras[i].height = 16;
+    }
+}
+
+static void lend_photos(gsf_context* ctx, gsf_restorer* r, const gsf_camera* cameras) {
+    static uint8_t pixels[PHOTOS][3 * 16 * 16];
+    gsf_reference photos[PHOTOS];
+    memset(photos, 0, sizeof photos);
+    for (int i = 0; i < PHOTOS; i++) {
+        memset(pixels[i], 30 * i, sizeof pixels[i]);
+        photos[i].color = gsf_wrap_image(pixels[i], GSF_U8, 16, 16, 3);
+        photos[i].camera = cameras[i];
+    }
+    CHECK_OK(ctx, r->begin_fn(r->user, ctx, photos, PHOTOS));
+}
+
+static void save_random(gsf_context* ctx, const char* path, char (*names)[40], const int64_t (*shapes)[3], size_t count,
+                        uint64_t seed) {
+    gsf_tensor tensors[16];
+    memset(tensors, 0, sizeof tensors);
+    for (size_t i = 0; i < count; i++) {
+        const int64_t values = shapes[i][0] * shapes[i][1] * shapes[i][2];
+        float* v = (float*)malloc((size_t)values * sizeof(float));
+        uint64_t state = seed + i;
+        for (int64_t k = 0; k < values; k++) v[k] = (float)test_random_in(&state, -1.0, 1.0);
+        tensors[i] = gsf_nn_wrap_tensor(names[i], v, 3, shapes[i]);
+    }
+    CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, count));
+    for (size_t i = 0; i < count; i++) free((void*)tensors[i].data);
+}
+
+// The photo that a clip between two cameras is short of first, told by what is missing in a file with but one photo's tokens;
+// -1: none.
+static int missing_photo(gsf_context* ctx, gsf_restorer* r, clip* c, const gsf_camera* from, const gsf_camera* to) {
+    gsf_camera cameras[MAX_FRAMES];
+    int photo = -1;
+    for (int32_t i = 0; i < c->frames; i++) cameras[i] = i < c->frames / 2 ? *from : *to;
+    c->window.cameras = cameras;
+    c->window.clip = 1;
+    CHECK_RESULT(ctx, r->restore_fn(r->user, ctx, &c->window), GSF_ERROR_IO);
+    const char* at = strstr(ctx->error, "dino_latents.photo");
+    if (CHECK(at != NULL)) photo = atoi(at + strlen("dino_latents.photo"));
+    c->window.clip = 0;
+    c->window.cameras = NULL;
+    return photo;
+}
+
+// Which photos are near does not depend on the unit of length, nor on how the world is turned, nor on where it lies.
+static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* net) {
+    char names[2][40] = {"dino_latents.photo63", "prompt_embeds.clip1"};
+    const int64_t shapes[2][3] = {{1, PHOTO_TOKENS, net->dino_channels}, {2, net->text_tokens, net->text_channels}};
+    const struct { double scale, turn, shift; } worlds[] = {{1, 0, 0}, {0.01, 0, 0}, {100, 0, 0}, {1, 0.7, 0}, {1, 2.5, 40},
+                                                            {100, -1.1, 300}, {0.01, 1.9, -0.2}};
+    int wanted[32], seen[PHOTOS] = {0};
+    gsf_restorer r;
+    char path[1100];
+    snprintf(path, sizeof path, "%s", test_scratch("one_photo.safetensors"));
+    save_random(ctx, path, names, shapes, 2, 9);
+    gsf_nn_dit_desc desc = small_desc(path, 1);
+    desc.condition = GSF_NN_2D;
+    if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
+    for (size_t w = 0; w < sizeof worlds / sizeof *worlds; w++) {
+        gsf_camera photos[PHOTOS];
+        place_photos(photos, worlds[w].scale, worlds[w].turn, worlds[w].shift);
+        lend_photos(ctx, &r, photos);
+        uint64_t state = 3;
+        for (int k = 0; k < 32; k++) { // the place of one photo, drawn towards another's, with the direction of a third
+            const gsf_camera* a = &photos[(size_t)(test_random(&state) * PHOTOS)];
+            const gsf_camera* b = &photos[(size_t)(test_random(&state) * PHOTOS)];
+            gsf_camera camera = photos[(size_t)(test_random(&state) * PHOTOS)];
+            const double t = 0.6 * test_random(&state);
+            double c2w[16], first[3], second[3];
+            gsf_camera_c2w(&camera, c2w);
+            gsf_camera_center(a, first);
+            gsf_camera_center(b, second);
+            for (int i = 0; i < 3; i++) c2w[12 + i] = first[i] + t * (second[i] - first[i]);
+            gsf_camera_set_c2w(&camera, c2w);
+            const int chosen = missing_photo(ctx, &r, c, &camera, &camera);
+            if (w == 0) seen[wanted[k] = chosen]++;
+            CHECK(chosen == wanted[k]);
+        }
+        r.end_fn(r.user, ctx);
+    }
+    for (int i = 0; i < PHOTOS; i++) CHECK(seen[i] > 0);
+    gsf_nn_destroy_dit(ctx, &r);
+}
+
+// Frames of a restorer of this desc for three clips, each between other photos; zero where `wanted` is an error.
+static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c, uint32_t sums[CLIPS]) {
+    gsf_restorer r;
+    gsf_camera photos[PHOTOS], cameras[MAX_FRAMES];
+    if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, desc, &r))) return;
+    place_photos(photos, 1.0, 0.0, 0.0);
+    lend_photos(ctx, &r, photos);
+    c->window.cameras = cameras;
+    for (int k = 0; k < CLIPS; k++) {
+        for (int32_t i = 0; i < c->frames; i++) cameras[i] = photos[i < c->frames / 2 ? k : k + 1];
+        c->window.clip = k;
+        CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
+        sums[k] = checksum(c);
+    }
+    c->window.clip = CLIPS; // of this one the file has nothing
+    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK(strstr(ctx->error, "prompt_embeds.clip3") != NULL);
+    c->window.clip = 1; // of these photos together neither
+    cameras[0] = photos[4];
+    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK(strstr(ctx->error, "dino_latents.photo4") != NULL);
+    cameras[0] = photos[0];
+    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK(strstr(ctx->error, "vggt_latents.photo0,3") != NULL);
+    r.end_fn(r.user, ctx);
+    gsf_nn_destroy_dit(ctx, &r);
+    c->window.cameras = NULL;
+    c->window.clip = 0;
+}
+
+// What the numbered file holds of clip k, under bare names.
+static void write_bare(gsf_context* ctx, const char* all, const char* path, int k, const gsf_nn_transformer* net) {
+    gsf_nn_weights file;
+    char name[40];
+    gsf_tensor tensors[3];
+    CHECK_OK(ctx, gsf_nn_open_weights(ctx, all, NULL, &file));
+    const int64_t each = (int64_t)PHOTO_TOKENS * net->dino_channels, shape[3] = {2, PHOTO_TOKENS, net->dino_channels};
+    float* dino = (float*)malloc(2 * (size_t)each * sizeof(float));
+    for (int i = 0; i < 2; i++) {
+        snprintf(name, sizeof name, "dino_latents.photo%d", k + i);
+        gsf_nn_read_tensor(gsf_nn_find_tensor(&file, name), 0, each, dino + i * each);
+    }
+    tensors[0] = gsf_nn_wrap_tensor("dino_latents", dino, 3, shape);
+    snprintf(name, sizeof name, "vggt_latents.photo%d,%d", k, k + 1);
+    tensors[1] = *gsf_nn_find_tensor(&file, name);
+    tensors[1].name = "vggt_latents";
+    snprintf(name, sizeof name, "prompt_embeds.clip%d", k);
+    tensors[2] = *gsf_nn_find_tensor(&file, name);
+    tensors[2].name = "prompt_embeds";
+    CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 3));
+    gsf_nn_close_weights(ctx, &file);
+    free(dino);
+}
+
+// Three clips, each between other photos and with prompts of its own: from one file, from what was saved of that, and from
+// a file for each clip alone.
+static void test_clips(gsf_context* ctx, clip* c, const gsf_nn_transformer* net) {
+    char names[10][40], path[1100], saved[1100], bare[1100];
+    int64_t shapes[10][3];
+    size_t count = 0;
+    for (int i = 0; i < 10; i++) {
+        const int k = i < 4 ? i : (i - 4) % 3;
+        const char* format = i < 4 ? "dino_latents.photo%d" : i < 7 ? "vggt_latents.photo%d,%d" : "prompt_embeds.clip%d";
+        snprintf(names[count], sizeof names[0], format, k, k + 1);
+        shapes[count][0] = i < 4 ? 1 : 2;
+        shapes[count][1] = i < 7 ? PHOTO_TOKENS : net->text_tokens;
+        shapes[count++][2] = i < 4 ? net->dino_channels : i < 7 ? net->vggt_channels : net->text_channels;
+    }
+    snprintf(path, sizeof path, "%s", test_scratch("clips.safetensors"));
+    snprintf(saved, sizeof saved, "%s", test_scratch("clips_saved.safetensors"));
+    snprintf(bare, sizeof bare, "%s", test_scratch("clips_bare.safetensors"));
+    save_random(ctx, path, names, (const int64_t(*)[3])shapes, count, 21);
+    gsf_nn_dit_desc desc = small_desc(path, 1);
+    uint32_t sums[CLIPS] = {0}, again[CLIPS] = {0};
+    desc.save_features = saved;
+    restore_clips(ctx, &desc, c, sums);
+    CHECK(sums[0] != sums[1] && sums[1] != sums[2] && sums[0] != sums[2]);
+    desc.features = saved;
+    desc.save_features = NULL;
+    restore_clips(ctx, &desc, c, again);
+    CHECK(memcmp(sums, again, sizeof sums) == 0);
+    for (int k = 0; k < CLIPS; k++) {
+        gsf_restorer r;
+        write_bare(ctx, path, bare, k, net);
+        desc.features = bare;
+        CHECK(restore(ctx, &desc, c, GSF_OK) == sums[k]);
+        if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) continue;
+        c->window.clip = 1; // a bare name is no other clip's
+        CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+        CHECK(strstr(ctx->error, "prompt_embeds.clip1") != NULL);
+        c->window.clip = 0;
+        gsf_nn_destroy_dit(ctx, &r);
+    }
 }
 
 typedef struct sample_case {
@@ -428,6 +657,63 @@ static void test_resume(gsf_context* ctx, sample_case* s) {
     free(reference);
 }
 
+static char last_warning[600];
+static void hear(void* user, gsf_log_level level, const char* text) {
+    (void)user;
+    if (level == GSF_LOG_WARNING) snprintf(last_warning, sizeof last_warning, "%s", text);
+}
+
+// A checkpoint of another precision, schedule or weight is not gone on from, and a line tells.
+static void test_other_models(gsf_context* ctx, sample_case* s) {
+    const char* path = test_scratch("models.checkpoint");
+    sample_case other;
+    const gsf_logger logger = ctx->logger;
+    ctx->logger.log_fn = hear;
+    ctx->logger.user = NULL;
+    for (int kind = 0; kind < 6; kind++) {
+        open_sample(ctx, &other);
+        other.desc.steps = s->desc.steps = 2;
+        other.desc.checkpoint = s->desc.checkpoint = path;
+        remove(path);
+        run_sample(ctx, s, s->video);
+        gsf_nn_sample_stats stats = run_sample(ctx, &other, other.video);
+        CHECK(stats.resumed_from == 2 && stats.steps == 0);
+        gsf_nn_weights* weights = kind == 2 ? &other.vae.weights : &other.net.weights;
+        gsf_tensor* tensor = &weights->tensors[weights->tensor_count / 2];
+        const size_t bytes = (size_t)tensor->count * gsf_nn_dtype_size(tensor->dtype);
+        char* copy = (char*)malloc(bytes);
+        memcpy(copy, tensor->data, bytes);
+        copy[bytes - 2] ^= 1;
+        if (kind == 0) other.net.bf16 = 1;
+        if (kind == 1 || kind == 2) tensor->data = copy;
+        if (kind == 3) other.schedule.alpha_bar[500] *= 1.001;
+        if (kind == 4) other.desc.guidance = 3.0f;
+        if (kind == 5) CHECK_OK(ctx, gsf_nn_quantize_transformer(ctx, &other.net, NULL));
+        last_warning[0] = 0;
+        stats = run_sample(ctx, &other, other.video);
+        CHECK(stats.resumed_from == 0 && stats.steps == 2);
+        if (!CHECK(strstr(last_warning, "starts anew") != NULL)) fprintf(stderr, "  case %d: %s\n", kind, last_warning);
+        close_sample(ctx, &other);
+        free(copy);
+    }
+    ctx->logger = logger;
+    s->desc.checkpoint = NULL;
+    s->desc.steps = 0;
+}
+
+// Frame counts that it was not trained on are to be asked for.
+static void test_any_frames(gsf_context* ctx, sample_case* s) {
+    s->desc.frames = 1;
+    s->desc.steps = 1;
+    CHECK_RESULT(ctx, gsf_nn_sample(ctx, &s->net, &s->vae, &s->schedule, &s->desc, s->video, NULL), GSF_ERROR_UNSUPPORTED);
+    CHECK(strstr(ctx->error, "any_frames") != NULL);
+    s->desc.any_frames = 1;
+    CHECK(run_sample(ctx, s, s->video).steps == 1);
+    s->desc.any_frames = 0;
+    s->desc.frames = 9;
+    s->desc.steps = 0;
+}
+
 static void test_workers(const char* features, clip* c) {
     uint32_t sums[2];
     for (int k = 0; k < 2; k++) {
@@ -475,7 +761,7 @@ int main(void) {
     make_clip(&ctx, &c, 9, s.desc.width, s.desc.height);
     test_limits(&ctx, features, &c);
     test_references(&ctx, features, &c);
-    test_cropped_reference(&ctx, features, &c);
+    test_photo_frames(&ctx, features, &c);
     test_prompts(&ctx, features, &c);
     test_conditions(&ctx, features, &c);
     test_workers(features, &c);
@@ -484,6 +770,10 @@ int main(void) {
     test_bad_sample(&ctx, &s);
     test_bad_weight(&ctx, &s);
     test_resume(&ctx, &s);
+    test_other_models(&ctx, &s);
+    test_any_frames(&ctx, &s);
+    test_nearest(&ctx, &c, &s.net);
+    test_clips(&ctx, &c, &s.net);
     close_sample(&ctx, &s);
     free_clip(&ctx, &c);
     return test_report();
