@@ -13744,11 +13744,6 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
     const gsf__dit_part vggt = {ctx, r, "vggt_latents", NULL, 0, NULL};
     void* saved = NULL;
     size_t size;
-    if (r->desc.keep_saved && r->desc.save_features)
-        GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
-    const int there = saved != NULL;
-    gsf_free(ctx, saved);
-    if (there) GSF__TRY(gsf__dit_read_features(ctx, r, r->desc.save_features));
     if (r->desc.features) GSF__TRY(gsf__dit_read_features(ctx, r, r->desc.features));
     r->unsaved = 1;
     if (!gsf__dit_has(r, "prompt_embeds", "clip")) {
@@ -13759,7 +13754,11 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
         GSF__TRY(gsf__dit_dinov2(&dino));
     if (condition != GSF_NN_NONE && condition != GSF_NN_2D && !gsf__dit_has(r, "vggt_latents", "photo"))
         GSF__TRY(gsf__dit_vggt(&vggt));
-    return GSF_OK;
+    if (r->desc.keep_saved && r->desc.save_features) // last, so that a run that goes on looks where it did before
+        GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
+    const int there = saved != NULL;
+    gsf_free(ctx, saved);
+    return there ? gsf__dit_read_features(ctx, r, r->desc.save_features) : GSF_OK;
 }
 
 static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {

@@ -226,6 +226,8 @@ static gsf_result read_hook(void* user, gsf_context* ctx, const char* path, void
     gsfix_out* o = app->out;
     gsf_result result = o->plain.read_fn(o->plain.user, ctx, path, data, size);
     if (result != GSF_OK || o->reads_ended) return result;
+    for (size_t i = 0; i < o->file_count; i++)
+        if (strcmp(o->files[i], path) == 0) return GSF_OK; // an output of this run, from before it was interrupted
     result = gsfix_add_input(app, path);
     if (result == GSF_OK) result = add_read(app, path, *size, digest_bytes(*data, *size));
     if (result != GSF_OK) gsf_free(ctx, *data);

@@ -122,7 +122,7 @@ for frame in "$scratch"/back21/*.png; do cmp "$frame" "${frame/back21/long}" || 
 # Features of a clip that the file does not have are named; other counts than the trained one are to be asked for.
 expect 1 "prompt_embeds.clip3" "$gsfix" fix "$scene" --out "$scratch/x" "${options[@]}" --ref-features "$saved" \
     --restorer "dit:$scratch/model" --set "rounds=2,windows=3,first_round=20,last_round=40"
-expect 1 "prompt_embeds.clip1" "$gsfix" fix "$scene" --out "$scratch/x" "${options[@]}" "${dit[@]}"
+expect 1 "prompt_embeds.clip1" "$gsfix" fix "$scene" --out "$scratch/bare" "${options[@]}" "${dit[@]}"
 expect 0 "the restorer takes 9 instead" "$gsfix" fix "$scene" --out "$scratch/y" "${options[@]}" "${from_photos[@]}" \
     --condition none --caption "a wall" --steps 1 --set "rounds=1,windows=1,window_frames=17,first_round=20,last_round=40"
 echo "$kills kills"
