@@ -1165,6 +1165,18 @@ static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to
 static int gsf__is_device(const char* path) { (void)path; return 0; }
 #endif
 
+// A new file beside `path`, whose name goes to `name`: a file or link that is there already is someone's, and stays.
+static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_text* name) {
+    for (int i = 0; i < 100; i++) {
+        name->size = 0;
+        gsf_text_printf(ctx, name, i ? "%s.tmp%d" : "%s.tmp", path, i);
+        errno = 0;
+        FILE* file = name->failed ? NULL : fopen(name->data, "wbx");
+        if (file || name->failed || errno != EEXIST) return file;
+    }
+    return NULL;
+}
+
 // Writes <path>.tmp and renames it, so that path always holds a whole file, also after a kill (not after a power cut:
 // the data is not forced to the disk).
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
@@ -1172,16 +1184,12 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
     const int device = gsf__is_device(path);
     gsf_text name;
     memset(&name, 0, sizeof name);
-    gsf_text_append(ctx, &name, path, strlen(path));
-    if (!device) gsf_text_append(ctx, &name, ".tmp", 4);
-    if (name.failed) {
-        gsf_destroy_text(ctx, &name);
-        return GSF_ERROR_OUT_OF_MEMORY;
-    }
     gsf_result result = GSF_OK;
-    FILE* file = fopen(name.data, "wb");
-    if (!file) {
-        result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", name.data, strerror(errno));
+    FILE* file = device ? fopen(path, "wb") : gsf__open_new(ctx, path, &name);
+    if (name.failed) {
+        result = GSF_ERROR_OUT_OF_MEMORY;
+    } else if (!file) {
+        result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(errno));
     } else {
         errno = 0;
         int ok = (size == 0 || fwrite(data, 1, size, file) == size) && fflush(file) == 0;

@@ -108,7 +108,7 @@ def result_of(options, job):
 def fix(options, job, extra):
     start, views, _, seed = job
     out = folder_of(options, job)
-    command = [options.gsfix, "fix", options.scene, "--out", out, "--views", views, "--seed", str(seed), "--threads", "1",
+    command = [options.gsfix, "fix", options.scene, "--out", out, "--restart", "--views", views, "--seed", str(seed), "--threads", "1",
                "--iterations", str(options.iterations), "--masks", masks_of(options, views)]
     command += shlex.split(STARTS[start][0]) + shlex.split(options.size) + shlex.split(options.common) + shlex.split(extra)
     _, cpu = run(command)
@@ -192,7 +192,7 @@ def prepare(options):
     model = options.model or os.path.join(options.out, "all", "splats.ply")
     if not os.path.exists(model):
         shutil.rmtree(os.path.dirname(model), ignore_errors=True)
-        run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--views", "all", "--restorer", "none",
+        run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--restart", "--views", "all", "--restorer", "none",
              "--regularize", "off", "--seed", "1", "--iterations", str(options.iterations), "--threads", str(options.jobs)])
     for views in options.views:
         masks = masks_of(options, views)

@@ -58,6 +58,7 @@ struct gsfix_out {
     gsfix_path job_path;
     char job_name[16];
     unsigned count; // of temporaries elsewhere
+    int unsaved;    // the clip's checkpoint could not be written
 };
 
 static gsf_result out_grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size) {
@@ -230,7 +231,10 @@ static gsf_result read_hook(void* user, gsf_context* ctx, const char* path, void
         if (strcmp(o->files[i], path) == 0) return GSF_OK; // an output of this run, from before it was interrupted
     result = gsfix_add_input(app, path);
     if (result == GSF_OK) result = add_read(app, path, *size, digest_bytes(*data, *size));
-    if (result != GSF_OK) gsf_free(ctx, *data);
+    if (result == GSF_OK) return GSF_OK;
+    gsf_free(ctx, *data);
+    *data = NULL;
+    *size = 0;
     return result;
 }
 
@@ -797,7 +801,14 @@ static gsf_result write_hook(void* user, gsf_context* ctx, const char* path, con
     gsfix_out* o = app->out;
     const char* name;
     if (o->job >= 0 && (name = below(path, o->job_path.s)) != NULL) return write_job_file(app, ctx, path, name, data, size);
-    if (o->root >= 0 && (name = below(path, app->o.out)) != NULL) return write_output(app, ctx, path, name, data, size);
+    if (o->root >= 0 && (name = below(path, app->o.out)) != NULL) {
+        const gsf_result result = write_output(app, ctx, path, name, data, size);
+        if (result != GSF_ERROR_IO || strcmp(name, "dit.checkpoint") != 0) return result;
+        if (!o->unsaved) gsf_log(ctx, GSF_LOG_WARNING, "going on without the clip's checkpoint: %s", ctx->error);
+        o->unsaved = 1;
+        ctx->error[0] = 0;
+        return GSF_OK; // it saves time after a stop, nothing that the run leaves depends on it
+    }
     for (size_t i = 0; i < o->file_count; i++)
         if (strcmp(o->files[i], path) == 0) return write_file(app, ctx, path, data, size);
     return gsf_fail(ctx, GSF_ERROR_IO, "%s: the command did not claim this name", path);

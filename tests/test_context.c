@@ -1,6 +1,8 @@
 // Context, memory, random numbers, text, files and chunks of gsfixer.h.
 #ifdef __linux__
-#define _POSIX_C_SOURCE 200809L
+#define _XOPEN_SOURCE 700
+#include <signal.h>
+#include <sys/resource.h>
 #include <unistd.h>
 #endif
 #include "gsfixer.h"
@@ -96,19 +98,33 @@ static void test_files(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_read_file(ctx, path, &data, &size));
     CHECK(data != NULL && size == 0);
     gsf_free(ctx, data);
-#ifdef __linux__ // a full disk, met through a temporary file that leads to /dev/full: the previous file survives
+#ifdef __linux__ // a full disk, here a limit on the size of files: the previous file survives, the temporary one does not
     path = test_scratch("kept.bin");
     CHECK_OK(ctx, gsf_write_file(ctx, path, "old", 3));
+    struct rlimit was, small;
+    CHECK(getrlimit(RLIMIT_FSIZE, &was) == 0);
+    small = was;
+    small.rlim_cur = 8;
+    signal(SIGXFSZ, SIG_IGN);
+    CHECK(setrlimit(RLIMIT_FSIZE, &small) == 0);
+    CHECK_RESULT(ctx, gsf_write_file(ctx, path, "new content", 11), GSF_ERROR_IO);
+    CHECK(setrlimit(RLIMIT_FSIZE, &was) == 0);
+    CHECK(strstr(ctx->error, "kept.bin") != NULL);
+    CHECK_OK(ctx, gsf_read_file(ctx, path, &data, &size));
+    CHECK(size == 3 && memcmp(data, "old", 3) == 0);
+    gsf_free(ctx, data);
+    // A file under the temporary's name is someone's, and so is what a link of that name leads to.
     const char* temporary = test_scratch("kept.bin.tmp");
+    const char* mine = test_scratch("mine.bin");
     remove(temporary);
-    if (symlink("/dev/full", temporary) == 0) {
-        CHECK_RESULT(ctx, gsf_write_file(ctx, path, "new content", 11), GSF_ERROR_IO);
-        CHECK(strstr(ctx->error, "kept.bin") != NULL);
-        CHECK_OK(ctx, gsf_read_file(ctx, path, &data, &size));
-        CHECK(size == 3 && memcmp(data, "old", 3) == 0);
-        gsf_free(ctx, data);
-        remove(temporary);
-    }
+    CHECK_OK(ctx, gsf_write_file(ctx, mine, "mine", 4));
+    CHECK(symlink(mine, temporary) == 0);
+    CHECK_OK(ctx, gsf_write_file(ctx, path, "new", 3));
+    CHECK_OK(ctx, gsf_read_file(ctx, mine, &data, &size));
+    CHECK(size == 4 && memcmp(data, "mine", 4) == 0);
+    gsf_free(ctx, data);
+    CHECK(remove(temporary) == 0);
+    CHECK(access(test_scratch("kept.bin.tmp1"), F_OK) != 0);
 #endif
 }
 

@@ -643,13 +643,9 @@ static void test_write_failures(gsf_context* ctx) {
     CHECK_OK(&refusing, gsf_init_context(&refusing));
     check_survives(&refusing, path);
 #ifdef __linux__
-    CHECK(mkdir(temporary, 0700) == 0); // the temporary cannot be opened
-    check_survives(ctx, path);
-    rmdir(temporary);
-    if (symlink("/dev/full", temporary) == 0) { // the disk is full while it is written
-        check_survives(ctx, path);
-        remove(temporary);
-    }
+    CHECK(mkdir(temporary, 0700) == 0); // in the way: another name is taken
+    CHECK_OK(ctx, gsf_write_file(ctx, path, "old", 3));
+    CHECK(rmdir(temporary) == 0);
     CHECK_RESULT(ctx, gsf_write_file(ctx, "/dev/full", "x", 1), GSF_ERROR_IO);
     CHECK(strstr(ctx->error, "/dev/full") != NULL);
     CHECK_OK(ctx, gsf_write_file(ctx, "/dev/null", "x", 1)); // a device is written to, not replaced
