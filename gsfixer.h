@@ -1703,9 +1703,23 @@ GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_j
 #define STBI_ONLY_PNM
 #define STBI_NO_GIF
 #define STBI_NO_STDIO
+#define STBI_ASSERT(x) ((void)0) // damaged files reach some of them
+// Memory that a damaged file leaves unwritten (a scan's tables, the end of a row) is zero, not what was there before.
+#define STBI_MALLOC(size) calloc(1, size)
+#define STBI_REALLOC_SIZED(p, old_size, size) gsf__stb_grow(p, old_size, size)
+#define STBI_FREE(p) free(p)
+static void* gsf__stb_grow(void* block, size_t old_size, size_t size) {
+    char* grown = (char*)realloc(block, size);
+    if (grown && size > old_size) memset(grown + old_size, 0, size - old_size);
+    return grown;
+}
 #define stbi__unpremultiply_on_load_thread stbi_set_unpremultiply_on_load_thread // declared, but misnamed in 2.27
 #include GSF_STB_IMAGE_INCLUDE
 #undef stbi__unpremultiply_on_load_thread
+#undef STBI_MALLOC
+#undef STBI_REALLOC_SIZED
+#undef STBI_FREE
+#undef STBI_ASSERT
 #undef STB_IMAGE_IMPLEMENTATION
 #endif
 #ifndef INCLUDE_STB_IMAGE_WRITE_H
@@ -1962,39 +1976,13 @@ static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const cha
 
 #ifndef GSF_NO_STB
 
-// Huffman tables of a JPEG: stb writes past its arrays when one claims more than 256 symbols. Walks the markers as stb
-// does; a file that ends early is left to the decoder's own detection.
-static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsigned char* data, size_t size) {
-    for (size_t at = 2; at + 4 <= size;) {
-        const unsigned marker = data[at + 1];
-        if (data[at] != 0xff || marker == 0xff || marker == 0 || (marker >= 0xd0 && marker <= 0xd7)) {
-            at++; // padding, image data
-            continue;
-        }
-        if (marker == 0xd9) return GSF_OK; // end of image
-        const size_t bytes = (size_t)data[at + 2] << 8 | data[at + 3], end = at + 2 + bytes;
-        if (bytes < 2) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG segment of %zu bytes", name, at, bytes);
-        if (marker == 0xc4)
-            for (size_t table = at + 4; table < end;) {
-                size_t symbols = 0;
-                if (size < 17 || table > size - 17)
-                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is cut", name, size);
-                for (size_t i = 1; i <= 16; i++) symbols += data[table + i];
-                if (symbols > 256 || table + 17 + symbols > end)
-                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG table of %zu symbols", name, table, symbols);
-                table += 17 + symbols;
-            }
-        at = end;
-    }
-    return GSF_OK;
-}
-
 // Bytes for stb, from memory or a stdio file. `overrun` tells that it wanted more than there is: stb itself goes on
 // with zeros, which would turn a cut photo into a half grey one.
 typedef struct gsf__stb_source {
     const char* data;
     size_t size, at;
-    FILE* file; // instead of data
+    FILE* file;         // instead of data
+    const char* buffer; // stb's own, which may be filled in part; what it reads elsewhere it needs whole, but does not check
     int overrun;
 } gsf__stb_source;
 
@@ -2008,7 +1996,8 @@ static int gsf__stb_read(void* user, char* out, int size) {
         memcpy(out, s->data + s->at, got);
     }
     s->at += got;
-    if (got == 0) s->overrun = 1;
+    if (!s->buffer) s->buffer = out; // the first that stb fills
+    if (got == 0 || (got < (size_t)size && out != s->buffer)) s->overrun = 1;
     return (int)got;
 }
 
@@ -2066,8 +2055,69 @@ static int gsf__source_u16(gsf__stb_source* source) { // big-endian
     return high < 0 || low < 0 ? -1 : high << 8 | low;
 }
 
-// Size of a JPEG from its frame header, behind the two bytes of the start marker. stb would parse tables on the way
-// there.
+static void gsf__source_rewind(gsf__stb_source* source) {
+    if (source->file) rewind(source->file);
+    source->at = 0;
+    source->buffer = NULL;
+    source->overrun = 0;
+}
+
+typedef enum gsf__image_kind {
+    GSF__IMAGE_OTHER = 0, GSF__IMAGE_PNG, GSF__IMAGE_BMP, GSF__IMAGE_JPEG, GSF__IMAGE_PNM, GSF__IMAGE_TGA
+} gsf__image_kind;
+
+// What stb's own tests would take the file for, decided by as many bytes as tell the formats apart; the source is left
+// behind them. A JPEG's start marker may stand behind any number of fill bytes. What else a host's copy of stb reads
+// (GIF, PSD, PIC, HDR) is never handed to it: none of them has a second byte below two, as every TGA.
+static gsf__image_kind gsf__image_kind_of(gsf__stb_source* source) {
+    const int first = gsf__source_byte(source);
+    int second = gsf__source_byte(source);
+    if (first == 0xff && second == 0xff)
+        while (second == 0xff) second = gsf__source_byte(source);
+    else if (second == 0 || second == 1)
+        return GSF__IMAGE_TGA;
+    switch (first) {
+        case 0xff: return second == 0xd8 ? GSF__IMAGE_JPEG : GSF__IMAGE_OTHER;
+        case 0x89: return second == 'P' ? GSF__IMAGE_PNG : GSF__IMAGE_OTHER;
+        case 'B': return second == 'M' ? GSF__IMAGE_BMP : GSF__IMAGE_OTHER;
+        case 'P': return second == '5' || second == '6' ? GSF__IMAGE_PNM : GSF__IMAGE_OTHER;
+    }
+    return GSF__IMAGE_OTHER;
+}
+
+// Tables and number of scans of a JPEG, from the byte behind its start marker: stb writes past its arrays when a table
+// claims more than 256 symbols, and goes over the whole image for each scan. Visits every place where stb may see a
+// marker; a file that ends early is left to the decoder's own detection.
+static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsigned char* data, size_t size, size_t at) {
+    enum { MOST_SCANS = 500 }; // encoders write about ten
+    int scans = 0;
+    while (at + 4 <= size) {
+        const unsigned marker = data[at + 1];
+        if (data[at] != 0xff || marker == 0xff || marker == 0 || (marker >= 0xd0 && marker <= 0xd7)) {
+            at++; // padding, image data
+            continue;
+        }
+        if (marker == 0xd9) return GSF_OK; // end of image
+        const size_t bytes = (size_t)data[at + 2] << 8 | data[at + 3], end = at + 2 + bytes;
+        if (bytes < 2) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG segment of %zu bytes", name, at, bytes);
+        if (marker == 0xda && ++scans > MOST_SCANS)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG of more than %d scans", name, at, (int)MOST_SCANS);
+        if (marker == 0xc4)
+            for (size_t table = at + 4; table < end;) {
+                size_t symbols = 0;
+                if (size < 17 || table > size - 17)
+                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is cut", name, size);
+                for (size_t i = 1; i <= 16; i++) symbols += data[table + i];
+                if (symbols > 256 || table + 17 + symbols > end)
+                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG table of %zu symbols", name, table, symbols);
+                table += 17 + symbols;
+            }
+        at = end;
+    }
+    return GSF_OK;
+}
+
+// Size of a JPEG from its frame header, behind its start marker. stb would parse tables on the way there.
 static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
                                   int64_t* height, int32_t* channels) {
     for (;;) {
@@ -2094,12 +2144,53 @@ static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_s
     }
 }
 
+// Width, height and largest value of a binary PNM, behind its two letters; 0 where they are no numbers of at most nine
+// digits (stb counts on in an int).
+static int gsf__pnm_head(gsf__stb_source* source, int32_t head[3]) {
+    int c = gsf__source_byte(source);
+    for (int i = 0; i < 3; i++) {
+        while (c == ' ' || (c >= '\t' && c <= '\r') || c == '#') {
+            if (c == '#') // a comment up to the line's end
+                while (c >= 0 && c != '\n' && c != '\r') c = gsf__source_byte(source);
+            else
+                c = gsf__source_byte(source);
+        }
+        int digits = 0;
+        for (head[i] = 0; c >= '0' && c <= '9' && digits < 9; digits++) {
+            head[i] = head[i] * 10 + (c - '0');
+            c = gsf__source_byte(source);
+        }
+        if (!digits || c < 0 || (c >= '0' && c <= '9')) return 0;
+    }
+    return 1;
+}
+
+static gsf_result gsf__pnm_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
+                                 int64_t* height, int32_t* channels) {
+    int32_t head[3];
+    gsf__source_rewind(source);
+    const int color = gsf__source_u16(source) == ('P' << 8 | '6');
+    if (!gsf__pnm_head(source, head))
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNM header is %s", name, source->at,
+                        source->overrun ? "cut" : "malformed");
+    if (head[2] > 255) // stb 2.27 mixes the sizes up
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: PNM of 16 bits", name);
+    *width = head[0];
+    *height = head[1];
+    *channels = color ? 3 : 1;
+    return GSF_OK;
+}
+
 static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
                                  int64_t* height, int32_t* channels) {
-    if (gsf__source_u16(source) == 0xffd8) return gsf__jpeg_query(ctx, name, source, width, height, channels);
-    if (source->file) rewind(source->file);
-    source->at = 0;
-    source->overrun = 0;
+    const gsf__image_kind kind = gsf__image_kind_of(source);
+    if (kind == GSF__IMAGE_JPEG) return gsf__jpeg_query(ctx, name, source, width, height, channels);
+    if (kind == GSF__IMAGE_PNM) return gsf__pnm_query(ctx, name, source, width, height, channels);
+    if (kind == GSF__IMAGE_OTHER && source->file && ferror(source->file))
+        return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", name, strerror(errno));
+    if (kind == GSF__IMAGE_OTHER)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not an image that this build reads", name);
+    gsf__source_rewind(source);
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
     int w, h, c;
     if (!stbi_info_from_callbacks(&callbacks, source, &w, &h, &c)) return gsf__stb_fail(ctx, name, source);
@@ -2119,13 +2210,11 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     GSF__TRY(gsf__stb_query(ctx, name, &source, &width, &height, &file_channels));
     GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
     if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
-    const unsigned char* bytes = (const unsigned char*)data;
-    if (size > 2 && bytes[0] == 0xff && bytes[1] == 0xd8) GSF__TRY(gsf__check_jpeg(ctx, name, bytes, size));
+    gsf__source_rewind(&source);
+    if (gsf__image_kind_of(&source) == GSF__IMAGE_JPEG)
+        GSF__TRY(gsf__check_jpeg(ctx, name, (const unsigned char*)data, size, source.at));
+    gsf__source_rewind(&source);
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
-    source = gsf__stb_memory(data, size);
-    if (bytes[0] == 'P' && stbi_is_16_bit_from_callbacks(&callbacks, &source)) // stb 2.27 mixes the sizes up
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: PNM of 16 bits", name);
-    source = gsf__stb_memory(data, size);
     int w, h, c;
     stbi_uc* pixels = stbi_load_from_callbacks(&callbacks, &source, &w, &h, &c, channels);
     gsf_result result = pixels && !source.overrun ? GSF_OK : gsf__stb_fail(ctx, name, &source);
@@ -2134,6 +2223,23 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     stbi_image_free(pixels);
     return result;
 }
+
+#ifdef GSF_USE_OIIO
+// Files of eight bits, which then give the same pixels in all builds.
+static int gsf__stb_reads(const void* data, size_t size) {
+    gsf__stb_source source = gsf__stb_memory(data, size);
+    const stbi_io_callbacks callbacks = gsf__stb_callbacks();
+    const gsf__image_kind kind = gsf__image_kind_of(&source);
+    int32_t head[3];
+    int w, h, c;
+    if (kind == GSF__IMAGE_JPEG || kind == GSF__IMAGE_OTHER) return kind == GSF__IMAGE_JPEG;
+    if (kind == GSF__IMAGE_PNM) return gsf__pnm_head(&source, head) && head[2] <= 255;
+    gsf__source_rewind(&source);
+    if (!stbi_info_from_callbacks(&callbacks, &source, &w, &h, &c)) return 0;
+    gsf__source_rewind(&source);
+    return !stbi_is_16_bit_from_callbacks(&callbacks, &source);
+}
+#endif
 
 static void gsf__stb_write(void* user, void* data, int size) {
     void** both = (void**)user; // context, text
@@ -2206,16 +2312,7 @@ GSF_API gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, con
 #ifdef GSF_NO_STB
     return gsf__oiio_load(ctx, name, data, size, channels, out);
 #else
-    gsf__stb_source source = gsf__stb_memory(data, size);
-    const stbi_io_callbacks callbacks = gsf__stb_callbacks();
-    int w, h, c;
-    const unsigned char* bytes = (const unsigned char*)data;
-    const int jpeg = size > 2 && bytes[0] == 0xff && bytes[1] == 0xd8;
-    const int stb_reads = jpeg || stbi_info_from_callbacks(&callbacks, &source, &w, &h, &c);
-    source = gsf__stb_memory(data, size);
-    if (!stb_reads ||
-        (!jpeg && stbi_is_16_bit_from_callbacks(&callbacks, &source)))  // eight-bit files: the same in all builds
-        return gsf__oiio_load(ctx, name, data, size, channels, out);
+    if (!gsf__stb_reads(data, size)) return gsf__oiio_load(ctx, name, data, size, channels, out);
 #endif
 #endif
 #ifndef GSF_NO_STB

@@ -615,6 +615,60 @@ static void test_damaged_images(gsf_context* ctx, heap* h) {
     CHECK(strstr(ctx->error, "cannot hold") != NULL);
 }
 
+// The guards run for whatever stb would parse: fill bytes before a JPEG's start, pixels that end within a row's last read
+// (every cut, so that reads of every length are met), sizes that do not fit an int. A size comes without any table parsed.
+static void test_image_guards(gsf_context* ctx) {
+    gsf_image image = noise_image(ctx, 19, 17, 3), out;
+    gsf_text file;
+    memset(&file, 0, sizeof file);
+    for (int i = 0; i < 300; i++) gsf_text_append(ctx, &file, "\xff", 1);
+    CHECK_OK(ctx, gsf_encode_image(ctx, &image, ".jpg", &file));
+    for (size_t fill = 0; fill <= 300; fill += fill < 4 ? 1 : 37) {
+        const char* path = test_scratch("fill.jpg");
+        int64_t w = 0, h = 0;
+        int32_t c = 0;
+        CHECK_OK(ctx, gsf_load_image_memory(ctx, "fill", file.data + 300 - fill, file.size - 300 + fill, 3, &out));
+        CHECK(out.width == 19 && out.height == 17);
+        gsf_destroy_image(ctx, &out);
+        CHECK_OK(ctx, gsf_write_file(ctx, path, file.data + 300 - fill, file.size - 300 + fill));
+        CHECK_OK(ctx, gsf_query_image(ctx, path, &w, &h, &c));
+        CHECK(w == 19 && h == 17 && c == 3);
+    }
+    char bad[] = "\xff\xff\xd8\xff\xc4\x0b\x13\x00\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff";
+    char* table = (char*)calloc(1, 3000);
+    memcpy(table, bad, sizeof bad - 1);
+    for (int fill = 0; fill < 2; fill++) { // by stb alone a write past its arrays
+        CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "table", table + fill, (size_t)(3000 - fill), 3, &out),
+                     GSF_ERROR_FORMAT);
+        memcpy(table + 2836, "\xff\xc0\0\x0b\x08\0\1\0\1\1\1\x11\0", 13); // with a frame header behind it
+        CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "table", table + fill, (size_t)(3000 - fill), 3, &out),
+                     GSF_ERROR_FORMAT);
+        memset(table + 2836, 0, 13);
+    }
+    free(table);
+    gsf_destroy_text(ctx, &file);
+    gsf_destroy_image(ctx, &image);
+
+    for (size_t n = 0; n < 600; n++) {
+        char* pgm = (char*)malloc(13 + n);
+        memcpy(pgm, "P5\n30 20\n255\n", 13);
+        memset(pgm + 13, 77, n);
+        CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "cut.pgm", pgm, 13 + n, 0, &out), GSF_ERROR_FORMAT);
+        free(pgm);
+        char* tga = (char*)malloc(18 + n);
+        memset(tga, 0, 18 + n);
+        tga[2] = 3;
+        tga[12] = 30;
+        tga[14] = 20;
+        tga[16] = 8;
+        CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "cut.tga", tga, 18 + n, 0, &out), GSF_ERROR_FORMAT);
+        free(tga);
+    }
+    static const char wide[] = "P5\n99999999999 1\n255\nxxxxxxxxxxxxxxxx";
+    CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "wide.pgm", wide, sizeof wide - 1, 0, &out), GSF_ERROR_FORMAT);
+    CHECK(strstr(ctx->error, "PNM header") != NULL);
+}
+
 // ---- files ---------------------------------------------------------------------
 
 static void check_survives(gsf_context* ctx, const char* path) {
@@ -848,6 +902,7 @@ int main(void) {
     test_conversions(&ctx);
     test_image_files(&ctx);
     test_damaged_images(&ctx, &h);
+    test_image_guards(&ctx);
     test_write_failures(&ctx);
     test_long_files(&ctx);
     test_random_statistics();
