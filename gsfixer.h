@@ -21,7 +21,7 @@
        paths, text     UTF-8
 
    CONFIGURATION (define before the implementation)
-       GSF_NO_STB              no image files through stb (host decodes images itself), and no .spz files
+       GSF_NO_STB              no image files through stb (the host decodes images itself; PNG is written), no .spz files read
        GSF_STB_IMAGE_INCLUDE / GSF_STB_IMAGE_WRITE_INCLUDE   where stb lies (default <stb/stb_image.h>, ...)
        GSF_USE_OIIO            C++ only: EXR, TIFF, 16-bit files through OpenImageIO
        GSF_USE_GLM             C++ only: adapters to glm matrices (declared as soon as it is defined)
@@ -41,7 +41,7 @@
    MEMORY      All memory comes from the context's allocator. Who made an object destroys it with the same context.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a chunk grid that depends
                on sizes only, so results do not depend on the number of workers.
-   SECTIONS    >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>images >>resize >>metrics
+   SECTIONS    >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images >>resize >>metrics
                >>cameras >>clips >>glm >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
@@ -807,8 +807,8 @@ GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t mos
 
 GSF__END_IMPLEMENTATION
 
-// What only gsfixer.h's own implementation can do, so that it is linked, not shared. First DEFLATE (RFC 1951) through stb.
-// Sizes up to 2^31 bytes in, 2^30 out; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB.
+// What only gsfixer.h's own implementation can do, so that it is linked, not shared. First DEFLATE (RFC 1951): in through
+// stb (2^31 bytes; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB), out by the same bytes on every machine (2^30).
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -1666,6 +1666,287 @@ GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_j
     return &json->values[i];
 }
 
+// ---- >>deflate -----------------------------------------------------------------
+// DEFLATE (RFC 1951) with memory that is asked for once and checked. Each block has Huffman codes of its own.
+
+enum {
+    GSF__LZ_WINDOW = 1 << 15, GSF__LZ_SHORTEST = 3, GSF__LZ_LONGEST = 258, GSF__LZ_GOOD = 32, GSF__LZ_TRIES = 16,
+    GSF__LZ_TOKENS = 1 << 15,
+    GSF__LITERALS = 286, GSF__DISTANCES = 30, GSF__LENGTH_CODES = 19, GSF__BLOCK_END = 256
+};
+
+typedef struct gsf__deflater {
+    gsf_context* ctx;
+    gsf_text* out;
+    uint64_t bits; // not yet in `buffer`
+    int bit_count;
+    size_t used;
+    unsigned char buffer[4096]; // not yet in `out`
+    const unsigned char* data;
+    size_t size;
+    int32_t head[GSF__LZ_WINDOW];     // last position of a hash of three bytes, -1 = none
+    int32_t previous[GSF__LZ_WINDOW]; // by position modulo the window: the one before it with the same hash
+    uint32_t tokens[GSF__LZ_TOKENS];  // literal, or length << 16 | distance
+    size_t token_count;
+    size_t block_begin; // first byte of the tokens
+    uint32_t literal_counts[GSF__LITERALS], distance_counts[GSF__DISTANCES];
+} gsf__deflater;
+
+static void gsf__put_bits(gsf__deflater* d, uint32_t value, int count) {
+    d->bits |= (uint64_t)value << d->bit_count;
+    for (d->bit_count += count; d->bit_count >= 8; d->bit_count -= 8, d->bits >>= 8) {
+        d->buffer[d->used++] = (unsigned char)(d->bits & 255u);
+        if (d->used < sizeof d->buffer) continue;
+        gsf_text_append(d->ctx, d->out, (const char*)d->buffer, d->used);
+        d->used = 0;
+    }
+}
+
+// The classes of lengths and distances: code, number of extra bits and their value.
+typedef struct gsf__lz_class { uint32_t code, extra; int extra_bits; } gsf__lz_class;
+
+static gsf__lz_class gsf__lz_class_of(uint32_t value, int fraction_bits) {
+    gsf__lz_class c;
+    for (c.extra_bits = 0; value >> c.extra_bits >> (fraction_bits + 1);) c.extra_bits++;
+    c.code = ((uint32_t)c.extra_bits << fraction_bits) + (value >> c.extra_bits);
+    c.extra = value & ((1u << c.extra_bits) - 1u);
+    return c;
+}
+
+static gsf__lz_class gsf__length_class(uint32_t length) {
+    gsf__lz_class c = gsf__lz_class_of(length - GSF__LZ_SHORTEST, 2);
+    if (length == GSF__LZ_LONGEST) { // has a code of its own
+        c.code = 28;
+        c.extra = 0;
+        c.extra_bits = 0;
+    }
+    c.code += GSF__BLOCK_END + 1;
+    return c;
+}
+
+static gsf__lz_class gsf__distance_class(uint32_t distance) { return gsf__lz_class_of(distance - 1, 1); }
+
+// Lengths of Huffman codes of at most `limit` bits. Two symbols at least get one, since some readers refuse a lone code.
+// Counts grow coarser until the longest code fits; with equal ones it has nine bits.
+static void gsf__huffman_lengths(uint32_t* counts, int symbols, int limit, uint8_t* lengths) {
+    int32_t order[GSF__LITERALS], parent[2 * GSF__LITERALS];
+    uint32_t weight[2 * GSF__LITERALS];
+    uint8_t depth[2 * GSF__LITERALS];
+    int used = 0;
+    for (int s = 0; s < symbols; s++) used += counts[s] != 0;
+    for (int s = 0; used < 2; s++)
+        if (!counts[s]) counts[s] = 1, used++;
+    for (int coarse = 0;; coarse++) {
+        int n = 0;
+        for (int s = 0; s < symbols; s++) { // sorted by insertion
+            if (!counts[s]) continue;
+            const uint32_t w = ((counts[s] - 1) >> coarse) + 1;
+            int at = n++;
+            for (; at > 0 && weight[at - 1] > w; at--) weight[at] = weight[at - 1], order[at] = order[at - 1];
+            weight[at] = w;
+            order[at] = s;
+        }
+        for (int node = n, leaf = 0, inner = n; node < 2 * n - 1; node++) { // both queues are sorted
+            weight[node] = 0;
+            for (int child = 0; child < 2; child++) {
+                const int taken = leaf < n && (inner >= node || weight[leaf] <= weight[inner]) ? leaf++ : inner++;
+                weight[node] += weight[taken];
+                parent[taken] = node;
+            }
+        }
+        depth[2 * n - 2] = 0;
+        for (int node = 2 * n - 3; node >= 0; node--) depth[node] = (uint8_t)(depth[parent[node]] + 1);
+        if (depth[0] > limit) continue;
+        memset(lengths, 0, (size_t)symbols);
+        for (int i = 0; i < n; i++) lengths[order[i]] = depth[i];
+        return;
+    }
+}
+
+// Canonical codes, their first bit lowest, as they are written.
+static void gsf__huffman_codes(const uint8_t* lengths, int symbols, uint16_t* codes) {
+    uint32_t code = 0;
+    for (int bits = 1; bits < 16; bits++, code <<= 1)
+        for (int s = 0; s < symbols; s++) {
+            if (lengths[s] != bits) continue;
+            uint32_t turned = 0;
+            for (int b = 0; b < bits; b++) turned |= (code >> b & 1u) << (bits - 1 - b);
+            codes[s] = (uint16_t)turned;
+            code++;
+        }
+}
+
+// The code lengths of a block: repeats as symbols 16 (of the last), 17 and 18 (of zero), Huffman coded in their turn.
+// Returns their bits, and writes them where `write` says so.
+static size_t gsf__put_lengths(gsf__deflater* d, const uint8_t* lengths, int count, int write) {
+    static const uint8_t sent[GSF__LENGTH_CODES] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
+    uint8_t symbols[GSF__LITERALS + GSF__DISTANCES], repeats[GSF__LITERALS + GSF__DISTANCES];
+    uint8_t bits[GSF__LENGTH_CODES];
+    uint16_t codes[GSF__LENGTH_CODES];
+    uint32_t counts[GSF__LENGTH_CODES];
+    int n = 0;
+    memset(counts, 0, sizeof counts);
+    for (int i = 0; i < count;) {
+        int run = 1;
+        while (i + run < count && lengths[i + run] == lengths[i] && run < 138) run++;
+        const int again = i > 0 && lengths[i] == lengths[i - 1];
+        int symbol = lengths[i];
+        if (symbol == 0 && run >= 3) symbol = run < 11 ? 17 : 18;
+        else if (again && run >= 3) symbol = 16;
+        if (symbol == 16 && run > 6) run = 6;
+        if (symbol < 16) run = 1;
+        repeats[n] = (uint8_t)(run - (symbol == 18 ? 11 : symbol >= 16 ? 3 : 1));
+        symbols[n++] = (uint8_t)symbol;
+        counts[symbol]++;
+        i += run;
+    }
+    gsf__huffman_lengths(counts, GSF__LENGTH_CODES, 7, bits);
+    gsf__huffman_codes(bits, GSF__LENGTH_CODES, codes);
+    size_t total = 3 * GSF__LENGTH_CODES;
+    for (int i = 0; write && i < GSF__LENGTH_CODES; i++) gsf__put_bits(d, bits[sent[i]], 3);
+    for (int i = 0; i < n; i++) {
+        const int extra = symbols[i] < 16 ? 0 : symbols[i] == 16 ? 2 : symbols[i] == 17 ? 3 : 7;
+        total += (size_t)(bits[symbols[i]] + extra);
+        if (!write) continue;
+        gsf__put_bits(d, codes[symbols[i]], bits[symbols[i]]);
+        gsf__put_bits(d, repeats[i], extra);
+    }
+    return total;
+}
+
+// Bits of a block's tokens, and of their end.
+static size_t gsf__token_bits(const gsf__deflater* d, const uint8_t* bits, const uint8_t* distance_bits) {
+    size_t total = 0;
+    for (int i = 0; i < GSF__LITERALS; i++) total += (size_t)d->literal_counts[i] * bits[i];
+    for (int i = 0; i < GSF__DISTANCES; i++) total += (size_t)d->distance_counts[i] * distance_bits[i];
+    for (size_t i = 0; i < d->token_count; i++) {
+        const uint32_t length = d->tokens[i] >> 16;
+        if (!length) continue;
+        total += (size_t)gsf__length_class(length).extra_bits;
+        total += (size_t)gsf__distance_class(d->tokens[i] & 0xffffu).extra_bits;
+    }
+    return total;
+}
+
+static void gsf__put_stored(gsf__deflater* d, int last, size_t size) {
+    gsf__put_bits(d, (uint32_t)last, 3);
+    gsf__put_bits(d, 0, (8 - d->bit_count) % 8);
+    gsf__put_bits(d, (uint32_t)size, 16);
+    gsf__put_bits(d, (uint32_t)size ^ 0xffffu, 16);
+    for (size_t i = 0; i < size; i++) gsf__put_bits(d, d->data[d->block_begin + i], 8);
+}
+
+static void gsf__put_packed(gsf__deflater* d, int last, const uint8_t* bits) {
+    const uint8_t* distance_bits = bits + GSF__LITERALS;
+    uint16_t codes[GSF__LITERALS], distance_codes[GSF__DISTANCES];
+    gsf__huffman_codes(bits, GSF__LITERALS, codes);
+    gsf__huffman_codes(distance_bits, GSF__DISTANCES, distance_codes);
+    gsf__put_bits(d, (uint32_t)last | 2u << 1, 3); // codes of its own
+    gsf__put_bits(d, GSF__LITERALS - 257, 5);
+    gsf__put_bits(d, GSF__DISTANCES - 1, 5);
+    gsf__put_bits(d, GSF__LENGTH_CODES - 4, 4);
+    (void)gsf__put_lengths(d, bits, GSF__LITERALS + GSF__DISTANCES, 1);
+    for (size_t i = 0; i < d->token_count; i++) {
+        const uint32_t length = d->tokens[i] >> 16, low = d->tokens[i] & 0xffffu;
+        if (!length) {
+            gsf__put_bits(d, codes[low], bits[low]);
+            continue;
+        }
+        const gsf__lz_class l = gsf__length_class(length), far = gsf__distance_class(low);
+        gsf__put_bits(d, codes[l.code], bits[l.code]);
+        gsf__put_bits(d, l.extra, l.extra_bits);
+        gsf__put_bits(d, distance_codes[far.code], distance_bits[far.code]);
+        gsf__put_bits(d, far.extra, far.extra_bits);
+    }
+    gsf__put_bits(d, codes[GSF__BLOCK_END], bits[GSF__BLOCK_END]);
+}
+
+// Writes the tokens up to `end`, as they are where packing gains nothing.
+static void gsf__put_block(gsf__deflater* d, int last, size_t end) {
+    enum { PACKED_HEAD = 17, STORED_HEAD = 3 + 7 + 32, STORED_MOST = 65535 };
+    uint8_t bits[GSF__LITERALS + GSF__DISTANCES], *distance_bits = bits + GSF__LITERALS;
+    const size_t size = end - d->block_begin;
+    d->literal_counts[GSF__BLOCK_END] = 1;
+    gsf__huffman_lengths(d->literal_counts, GSF__LITERALS, 15, bits);
+    gsf__huffman_lengths(d->distance_counts, GSF__DISTANCES, 15, distance_bits);
+    const size_t packed = PACKED_HEAD + gsf__put_lengths(d, bits, GSF__LITERALS + GSF__DISTANCES, 0) +
+                          gsf__token_bits(d, bits, distance_bits);
+    if (size <= STORED_MOST && STORED_HEAD + 8 * size < packed) gsf__put_stored(d, last, size);
+    else gsf__put_packed(d, last, bits);
+    d->block_begin = end;
+    memset(d->literal_counts, 0, sizeof d->literal_counts);
+    memset(d->distance_counts, 0, sizeof d->distance_counts);
+    d->token_count = 0;
+}
+
+static void gsf__put_token(gsf__deflater* d, size_t at, uint32_t length, uint32_t low) {
+    if (d->token_count == GSF__LZ_TOKENS) gsf__put_block(d, 0, at);
+    d->tokens[d->token_count++] = length << 16 | low;
+    d->literal_counts[length ? gsf__length_class(length).code : low]++;
+    if (length) d->distance_counts[gsf__distance_class(low).code]++;
+}
+
+static int32_t* gsf__lz_head(gsf__deflater* d, size_t at) {
+    const unsigned char* p = d->data + at;
+    const uint32_t three = (uint32_t)p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16;
+    return &d->head[(three * 0x9e3779b1u) >> 17];
+}
+
+static void gsf__lz_remember(gsf__deflater* d, size_t at) {
+    if (d->size - at < GSF__LZ_SHORTEST) return;
+    int32_t* head = gsf__lz_head(d, at);
+    d->previous[at % GSF__LZ_WINDOW] = *head;
+    *head = (int32_t)at;
+}
+
+// Length of the longest of the last matches before `at`, 0 where there is none longer than `best`.
+static size_t gsf__lz_match(gsf__deflater* d, size_t at, size_t best, uint32_t* distance) {
+    const size_t most = d->size - at < GSF__LZ_LONGEST ? d->size - at : GSF__LZ_LONGEST;
+    size_t found = 0;
+    if (best >= most || most < GSF__LZ_SHORTEST) return 0;
+    int32_t from = *gsf__lz_head(d, at);
+    for (int tries = GSF__LZ_TRIES; tries > 0 && from >= 0 && at - (size_t)from < GSF__LZ_WINDOW; tries--) {
+        const unsigned char *a = d->data + from, *b = d->data + at;
+        if (a[best] == b[best]) {
+            size_t n = 0;
+            while (n < most && a[n] == b[n]) n++;
+            if (n > best) {
+                best = found = n;
+                *distance = (uint32_t)(at - (size_t)from);
+                if (n == most) break;
+            }
+        }
+        from = d->previous[(size_t)from % GSF__LZ_WINDOW];
+    }
+    return found;
+}
+
+GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+    if (size > (size_t)1 << 30)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, at most 2^30 are", name, size);
+    gsf__deflater* d = (gsf__deflater*)gsf_alloc_zeroed(ctx, 1, sizeof *d);
+    if (!d) return GSF_ERROR_OUT_OF_MEMORY;
+    d->ctx = ctx;
+    d->out = out;
+    d->data = (const unsigned char*)data;
+    d->size = size;
+    memset(d->head, 255, sizeof d->head);
+    for (size_t at = 0; at < size && !out->failed;) {
+        uint32_t distance = 0, ignored = 0;
+        size_t length = gsf__lz_match(d, at, GSF__LZ_SHORTEST - 1, &distance);
+        gsf__lz_remember(d, at);
+        if (length && length < GSF__LZ_GOOD && gsf__lz_match(d, at + 1, length, &ignored)) length = 0; // better next
+        gsf__put_token(d, at, (uint32_t)length, length ? distance : d->data[at]);
+        for (size_t i = 1; i < length; i++) gsf__lz_remember(d, at + i);
+        at += length ? length : 1;
+    }
+    gsf__put_block(d, 1, size);
+    gsf__put_bits(d, 0, 7); // the last byte's rest
+    gsf_text_append(ctx, out, (const char*)d->buffer, d->used);
+    gsf_free(ctx, d);
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
 // ---- >>images ------------------------------------------------------------------
 
 #ifndef GSF_NO_STB
@@ -1728,15 +2009,6 @@ static void* gsf__stb_grow(void* block, size_t old_size, size_t size) {
 #define STBIWDEF GSF__SHARED
 #include GSF_STB_IMAGE_WRITE_INCLUDE
 #undef STB_IMAGE_WRITE_IMPLEMENTATION
-#else
-STBIWDEF unsigned char* stbi_zlib_compress(unsigned char*, int, int*, int); // which its header does not declare
-#endif
-#ifdef STBIW_MALLOC
-#define GSF__STBIW_MALLOC(size) STBIW_MALLOC(size)
-#define GSF__STBIW_FREE(p) STBIW_FREE(p)
-#else // the host's copy lies in another file
-#define GSF__STBIW_MALLOC(size) malloc(size)
-#define GSF__STBIW_FREE(p) free(p)
 #endif
 #if defined(__clang__)
 #pragma clang attribute pop
@@ -2268,31 +2540,6 @@ GSF_API gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* 
 #endif
 }
 
-GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
-#ifdef GSF_NO_STB
-    (void)data, (void)size, (void)out;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no compressed files (GSF_NO_STB)", name);
-#else
-    enum { QUALITY = 8, HEAD = 2, TAIL = 4 }; // HEAD, TAIL: what zlib has around the data
-    const size_t most = SIZE_MAX / 8 < (size_t)1 << 30 ? SIZE_MAX / 8 : (size_t)1 << 30; // stb counts its room in int
-    if (size > most)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, at most %zu are", name, size, most);
-    // stb asserts that its memory is there: room for its output, while that grows, and for its tables is tried first
-    volatile char* probe = (volatile char*)GSF__STBIW_MALLOC(4 * size + ((size_t)8 << 20));
-    int packed_size = 0;
-    unsigned char* packed = NULL;
-    if (probe) {
-        *probe = 0; // or a compiler leaves both calls out
-        GSF__STBIW_FREE((void*)probe);
-        packed = stbi_zlib_compress((unsigned char*)(uintptr_t)data, (int)size, &packed_size, QUALITY);
-    }
-    if (!packed) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory: %zu bytes to compress", name, size);
-    gsf_text_append(ctx, out, (const char*)packed + HEAD, (size_t)(packed_size - HEAD - TAIL));
-    GSF__STBIW_FREE(packed);
-    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
-#endif
-}
-
 // The last ".xyz" of a path in lower case, "" if there is none or it is long.
 static void gsf__path_extension(const char* path, char out[8]) {
     const char* dot = strrchr(path, '.');
@@ -2370,14 +2617,122 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
     return result;
 }
 
+// ---- PNG, eight bits a channel
+
+static int gsf__paeth(int left, int up, int corner) {
+    const int estimate = left + up - corner;
+    const int l = abs(estimate - left), u = abs(estimate - up), c = abs(estimate - corner);
+    return l <= u && l <= c ? left : u <= c ? up : corner;
+}
+
+// One row by one of PNG's five filters (`step` bytes a pixel; `up`: the row above, zeros above the first). Returns the sum
+// of magnitudes: the least compresses best, as a rule.
+static uint64_t gsf__png_filter(int filter, const unsigned char* row, const unsigned char* up, size_t size, size_t step,
+                                unsigned char* out) {
+    uint64_t sum = 0;
+    for (size_t i = 0; i < size; i++) {
+        const int left = i >= step ? row[i - step] : 0, corner = i >= step ? up[i - step] : 0;
+        const int guess = filter == 0   ? 0
+                          : filter == 1 ? left
+                          : filter == 2 ? up[i]
+                          : filter == 3 ? (left + up[i]) / 2
+                                        : gsf__paeth(left, up[i], corner);
+        out[i] = (unsigned char)(row[i] - guess);
+        sum += out[i] < 128 ? out[i] : 256u - out[i];
+    }
+    return sum;
+}
+
+// All rows, each behind the number of its filter. `room`: two rows.
+static void gsf__png_filter_rows(const gsf_image* image, unsigned char* room, unsigned char* out) {
+    const size_t size = (size_t)image->stride_y, step = (size_t)image->channels;
+    unsigned char *zeros = room, *tried = room + size;
+    memset(zeros, 0, size);
+    for (int64_t y = 0; y < image->height; y++, out += size + 1) {
+        const unsigned char* row = (const unsigned char*)image->data + y * image->stride_y;
+        uint64_t best = UINT64_MAX;
+        for (int filter = 0; filter < 5; filter++) {
+            const uint64_t sum = gsf__png_filter(filter, row, y ? row - image->stride_y : zeros, size, step, tried);
+            if (sum >= best) continue;
+            best = sum;
+            out[0] = (unsigned char)filter;
+            memcpy(out + 1, tried, size);
+        }
+    }
+}
+
+static void gsf__store_be32(void* out, uint32_t value) {
+    for (int i = 0; i < 4; i++) ((unsigned char*)out)[i] = (unsigned char)(value >> (24 - 8 * i) & 255u);
+}
+
+static uint32_t gsf__adler32(const unsigned char* data, size_t size) {
+    uint32_t a = 1, b = 0;
+    for (size_t i = 0; i < size;) {
+        const size_t end = size - i < 5552 ? size : i + 5552; // as many as fit 32 bits
+        for (; i < end; i++) b += a += data[i];
+        a %= 65521u;
+        b %= 65521u;
+    }
+    return b << 16 | a;
+}
+
+// Fills in the length of the chunk that began at `begin` and appends its checksum.
+static void gsf__png_close(gsf_context* ctx, gsf_text* out, size_t begin) {
+    char sum[4];
+    if (out->failed) return;
+    gsf__store_be32(out->data + begin, (uint32_t)(out->size - begin - 8));
+    gsf__store_be32(sum, gsf__crc32(0, out->data + begin + 4, out->size - begin - 4));
+    gsf_text_append(ctx, out, sum, sizeof sum);
+}
+
+// `image`: packed, of 1 to 4 channels.
+static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_text* out) {
+    static const char kinds[5] = {0, 0, 4, 2, 6}; // by channels
+    char head[33] = "\x89PNG\r\n\x1a\n\0\0\0\0IHDR", sum[4];
+    const size_t row = (size_t)image->stride_y, filtered_size = (row + 1) * (size_t)image->height;
+    unsigned char* filtered = (unsigned char*)gsf_alloc(ctx, filtered_size + 2 * row, 1);
+    if (!filtered) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__png_filter_rows(image, filtered + filtered_size, filtered);
+    size_t begin = out->size + 8;
+    gsf__store_be32(head + 16, (uint32_t)image->width);
+    gsf__store_be32(head + 20, (uint32_t)image->height);
+    head[24] = 8;
+    head[25] = kinds[image->channels];
+    gsf_text_append(ctx, out, head, 8 + 8 + 13);
+    gsf__png_close(ctx, out, begin);
+    begin = out->size;
+    gsf_text_append(ctx, out, "\0\0\0\0IDAT\x78\x5e", 10); // zlib: a window of 32 KiB
+    gsf_result result = gsf__deflate(ctx, name, filtered, filtered_size, out);
+    gsf__store_be32(sum, gsf__adler32(filtered, filtered_size));
+    gsf_text_append(ctx, out, sum, sizeof sum);
+    gsf__png_close(ctx, out, begin);
+    begin = out->size;
+    gsf_text_append(ctx, out, "\0\0\0\0IEND", 8);
+    gsf__png_close(ctx, out, begin);
+    gsf_free(ctx, filtered);
+    return result == GSF_OK && out->failed ? GSF_ERROR_OUT_OF_MEMORY : result;
+}
+
+static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_text* out) {
+#ifdef GSF_NO_STB
+    (void)image, (void)out;
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no JPEG (GSF_NO_STB)", name);
+#else
+    void* user[2]; // stb asks for no memory here
+    user[0] = ctx;
+    user[1] = out;
+    if (!stbi_write_jpg_to_func(gsf__stb_write, user, (int)image->width, (int)image->height, image->channels, image->data,
+                                GSF__JPEG_QUALITY) ||
+        out->failed)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory while encoding", name);
+    return GSF_OK;
+#endif
+}
+
 // Appends the encoded file to `out`, or leaves it as it was.
 static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gsf_image* image, const char* extension,
                                     gsf_text* out) {
     GSF__TRY(gsf__check_image(ctx, name, image));
-#ifdef GSF_NO_STB
-    (void)out;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no %s (GSF_NO_STB)", name, extension);
-#else
     const int png = strcmp(extension, ".png") == 0;
     if (!png && strcmp(extension, ".jpg") != 0 && strcmp(extension, ".jpeg") != 0)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes .png and .jpg, not \"%s\"", name, extension);
@@ -2389,26 +2744,15 @@ static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gs
     if (image->width > longest || image->height > longest || image->width * image->height > (1 << 30) / (channels + 1))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld x %lld pixels are too many for %s", name,
                         (long long)image->width, (long long)image->height, extension);
+    const size_t before = out->size;
     gsf_image packed;
     GSF__TRY(gsf_make_image(ctx, GSF_U8, image->width, image->height, channels, &packed));
     gsf_result result = gsf_convert_image(ctx, image, &packed);
-    if (result == GSF_OK) {
-        const size_t before = out->size;
-        void* user[2];
-        user[0] = ctx;
-        user[1] = out;
-        const int w = (int)image->width, h = (int)image->height;
-        const int ok =
-            png ? stbi_write_png_to_func(gsf__stb_write, user, w, h, channels, packed.data, w * channels)
-                : stbi_write_jpg_to_func(gsf__stb_write, user, w, h, channels, packed.data, GSF__JPEG_QUALITY);
-        if (!ok || out->failed) {
-            out->size = before;
-            result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory while encoding", name);
-        }
-    }
+    if (result == GSF_OK)
+        result = png ? gsf__png_append(ctx, name, &packed, out) : gsf__jpeg_append(ctx, name, &packed, out);
+    if (result != GSF_OK) out->size = before;
     gsf_destroy_image(ctx, &packed);
     return result;
-#endif
 }
 
 GSF_API gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension, gsf_text* out) {

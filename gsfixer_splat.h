@@ -77,20 +77,18 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_format_ply(gsf_context* ctx, const gs
    in any case); a file of another name is known by its content if it is PLY or SPZ (a .splat has no mark).
        .splat  32 bytes a splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0 are
                lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
-       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes a splat. A scene of 56115 splats of degree 3 takes 22.6
-               each, 18.6 from the official writer: it has zlib, this has stb, which writes fixed codes only (stb's hook
-               STBIW_ZLIB_COMPRESS puts another compressor there). Versions 1 to 3 are read, 2 and 3 written. Errors:
+       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes a splat. Versions 1 to 3 are read, 2 and 3 written. Errors:
                positions half a step (2^-12, finer where the median scale is below 2^-7, coarser where a coordinate passes
                2047), log-scales 1/32 within -10..5.94, opacity 0.5/255, colour 0.5/255/0.15 as coefficient, SH 4.5/128
                (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15, where w is
                small). Axes are converted to and from SPZ's (y and z turned around), as the official library does.
                Extensions and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than
-               2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read; .spz at all under GSF_NO_STB.
+               2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under GSF_NO_STB.
    Neither file has an origin: world positions are written, and steps that are coarse beside the splats (more than a quarter
    of the median scale) or cannot be held at all are a warning or an error; `local` writes means without the origin instead.
    Rows keep their order, ids are lost. Splats with a NaN or infinite value are left out, when writing as when reading, and
    counted in a warning. An opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory in
-   proportion to the content, while stb compresses not from the context; a file that claims more than DEFLATE can hold (1032
+   proportion to the content; a file that claims more than DEFLATE can hold (1032
    times its size) is refused before it is believed. */
 typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ } gsf_splat_type;
 

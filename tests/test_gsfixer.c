@@ -669,6 +669,89 @@ static void test_image_guards(gsf_context* ctx) {
     CHECK(strstr(ctx->error, "PNM header") != NULL);
 }
 
+// What the PNG writer has of its own: filters and compression. Runs, noise, repeats from just within the window and beyond
+// it, few values: the reader is stb's, which shares nothing with it.
+static void test_png_writing(gsf_context* ctx) {
+    static const int64_t sizes[][2] = {{1, 1}, {700, 3}, {1, 700}, {211, 190}};
+    for (int pattern = 0; pattern < 6; pattern++)
+        for (int k = 0; k < 4; k++)
+            for (int32_t channels = 1; channels <= 4; channels++) {
+                gsf_image image, back;
+                CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, sizes[k][0], sizes[k][1], channels, &image));
+                uint8_t* p = (uint8_t*)image.data;
+                const size_t n = (size_t)(image.stride_y * image.height);
+                for (size_t i = 0; i < n; i++) {
+                    const uint8_t noise = (uint8_t)gsf_random_bits(5, 0, i);
+                    p[i] = pattern == 0   ? 200
+                           : pattern == 1 ? noise
+                           : pattern == 2 ? (i < 32700 ? noise : p[i - 32700])
+                           : pattern == 3 ? (i < 33000 ? noise : p[i - 33000])
+                           : pattern == 4 ? (uint8_t)(noise % 3 ? 0 : noise)
+                                          : (uint8_t)(i / 5 + i % 7 * (noise & 1));
+                }
+                gsf_text file;
+                memset(&file, 0, sizeof file);
+                CHECK_OK(ctx, gsf_encode_image(ctx, &image, ".png", &file));
+                const size_t rows = (size_t)image.height; // a byte each for the filter
+                CHECK(file.size < n + rows + n / 100 + 300 && (pattern || file.size < 300 + n / 100 + rows));
+                CHECK_OK(ctx, gsf_load_image_memory(ctx, "back", file.data, file.size, 0, &back));
+                CHECK(back.channels == channels && back.width == image.width && memcmp(back.data, p, n) == 0);
+                gsf_destroy_image(ctx, &back);
+                gsf_destroy_text(ctx, &file);
+                gsf_destroy_image(ctx, &image);
+            }
+}
+
+#if defined(__linux__) && !defined(__SANITIZE_ADDRESS__)
+#if defined(__has_feature)
+#if __has_feature(address_sanitizer)
+#define HAVE_NO_LIMIT // its shadow is larger than any limit
+#endif
+#endif
+#ifndef HAVE_NO_LIMIT
+#include <sys/resource.h>
+#include <sys/wait.h>
+// A process with `spare` bytes left to ask for encodes an image, or says that memory is out.
+static int encode_in(size_t spare, const char* extension) {
+    const pid_t child = fork();
+    if (child == 0) {
+        gsf_context ctx;
+        gsf_image image;
+        gsf_text file;
+        unsigned long pages = 0;
+        memset(&ctx, 0, sizeof ctx);
+        memset(&file, 0, sizeof file);
+        ctx.threads = 1;
+        FILE* statm = fopen("/proc/self/statm", "r");
+        if (gsf_init_context(&ctx) != GSF_OK || gsf_make_image(&ctx, GSF_U8, 1280, 720, 3, &image) != GSF_OK || !statm ||
+            fscanf(statm, "%lu", &pages) != 1)
+            _exit(3);
+        for (size_t i = 0; i < 1280 * 720 * 3; i++) ((uint8_t*)image.data)[i] = (uint8_t)(gsf_random_bits(1, 2, i) & 63);
+        struct rlimit limit;
+        limit.rlim_cur = limit.rlim_max = (rlim_t)pages * (rlim_t)sysconf(_SC_PAGESIZE) + spare;
+        if (setrlimit(RLIMIT_AS, &limit) != 0) _exit(3);
+        const gsf_result result = gsf_encode_image(&ctx, &image, extension, &file);
+        _exit(result == GSF_OK ? 0 : result == GSF_ERROR_OUT_OF_MEMORY && strstr(ctx.error, "memory") ? 1 : 2);
+    }
+    int status = 0;
+    if (!CHECK(child > 0 && waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) < 2))
+        fprintf(stderr, "%s with %zu bytes: status %x\n", extension, spare, status);
+    return WEXITSTATUS(status);
+}
+
+static void test_encoding_without_memory(void) {
+    size_t refused = 0, spare = 0;
+    for (; spare < (size_t)64 << 20 && encode_in(spare, ".png") == 1; spare += (size_t)1 << 19) refused++;
+    CHECK(refused > 3 && spare < (size_t)64 << 20);
+    for (spare = 0; spare < (size_t)16 << 20; spare += (size_t)1 << 20) (void)encode_in(spare, ".jpg");
+}
+#else
+static void test_encoding_without_memory(void) {}
+#endif
+#else
+static void test_encoding_without_memory(void) {}
+#endif
+
 // ---- files ---------------------------------------------------------------------
 
 static void check_survives(gsf_context* ctx, const char* path) {
@@ -903,6 +986,8 @@ int main(void) {
     test_image_files(&ctx);
     test_damaged_images(&ctx, &h);
     test_image_guards(&ctx);
+    test_png_writing(&ctx);
+    test_encoding_without_memory();
     test_write_failures(&ctx);
     test_long_files(&ctx);
     test_random_statistics();
