@@ -1901,7 +1901,7 @@ static void gsf__lz_remember(gsf__deflater* d, size_t at) {
 
 // Length of the longest of the last matches before `at`, 0 where there is none longer than `best`.
 static size_t gsf__lz_match(gsf__deflater* d, size_t at, size_t best, uint32_t* distance) {
-    const size_t most = d->size - at < GSF__LZ_LONGEST ? d->size - at : GSF__LZ_LONGEST;
+    const size_t most = d->size - at < GSF__LZ_LONGEST ? d->size - at : (size_t)GSF__LZ_LONGEST;
     size_t found = 0;
     if (best >= most || most < GSF__LZ_SHORTEST) return 0;
     int32_t from = *gsf__lz_head(d, at);
