@@ -3299,10 +3299,11 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int worker) {
 
 GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
                             const gsf_image* mask, double* out) {
-    // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5: rounded to float32 as the 3DGS code has it, and in double as
-    // torchmetrics has it for double images
-    static const double gauss[2][6] = {{0.26601171493530273, 0.21300552785396576, 0.10936068743467331,
-                                        0.036000773310661316, 0.0075987582094967365, 0.001028380123898387},
+    // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5. The 3DGS code rounds these to float32 and their products once more, so that
+    // its window sums up to 1 - 6.94e-8, which adds as much of mu^2 to its variances: here the rounded taps, scaled to that
+    // sum. The others in double as torchmetrics has them for double images.
+    static const double gauss[2][6] = {{0.2660117139984044, 0.21300552710375625, 0.1093606870495029, 0.03600077318386591,
+                                        0.007598758182733767, 0.0010283801202764127},
                                        {0.26601172486179436, 0.21300553771125369, 0.10936068950970002,
                                         0.036000772128430829, 0.007598758135239185, 0.0010283800844791101}};
     GSF__TRY(gsf__check_image_pair(ctx, "ssim", a, b, mask));

@@ -375,7 +375,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf
 
 typedef struct gsf_train_view {
     gsf_camera camera;
-    gsf_image image;   // u8 or f32 RGB, same size as the camera; copied
+    gsf_image image;   // u8 or f32 RGB, same size as the camera; copied. Values beyond 0..1 count as 0 and 1 in the loss
     gsf_image weight;  // f32, 1 channel: per-pixel weight of the loss (a restorer's confidence); data NULL = 1; copied.
                        // The loss is sum(weight * term) / (3 W H): weight 0 counts as already right
 } gsf_train_view;
@@ -8742,22 +8742,25 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 }
 
 // ---- >>loss --------------------------------------------------------------------
-// L = (1 - lambda) mean(w |x - t|) + lambda mean(w (1 - SSIM(x, t))),  x = clamp(render, 0, 1), t the photo, w a weight
-// per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts as already right.
+// L = (1 - lambda) mean(w |x - t|) + lambda mean(w (1 - SSIM(x, t))), x the render and t the photo, both clamped to 0..1, w
+// a weight per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts as already right.
 // SSIM as in the 3DGS code: 11x11 Gaussian window, sigma 1.5, zeros outside the image, variances not clamped.
 //
-// SSIM needs the sum of both variances only. With u = x - h, v = t - h (h = 1/2, which makes the squares small: a variance
-// is a difference of them) and window sums U = G*u, V = G*v, E = G*(u^2 + v^2), F = G*(u v):
-//     m = a1 a2 / (b1 b2),  mu = U + h,  mu_t = V + h,  a1 = 2 mu mu_t + C1,  a2 = 2 (F - U V) + C2,
-//     b1 = mu^2 + mu_t^2 + C1,  b2 = E - U^2 - V^2 + C2
-//     dm/dE = -m / b2,  1/2 dm/dF = a1 / (b1 b2)
-//     1/2 dm/dU = mu_t a2 / (b1 b2) - mu m / b1 - U dm/dE - V 1/2 dm/dF
-// and the pixel p collects 1/2 dm/dx(p) = G*(1/2 dm/dU) + u(p) G*(dm/dE) + v(p) G*(1/2 dm/dF).
+// A variance is a difference of squares, and SSIM holds it against C2 = 9e-4: floats do only if the squares are small. So
+// everything is taken from the sum and the difference of the images, s = x + t - b and d = x - t, squares of d about c, with
+// b and c near the middle of them. With window sums S = G*s, D = G*d, P = G*s^2, Q = G*(d - c)^2:
+//     z = S + b = mu + mu_t,  vs = P - S^2 + k z^2,  vd = Q - (D - c)^2 + k D^2
+//     B1 = z^2 + D^2 + 2 C1,  B2 = vs + vd + 2 C2,  p = 2 D^2 / B1,  q = 2 vd / B2,  1 - SSIM = p + q - p q
+// where p and q are small with D and d, however bright the images are. k = 6.94e-8: the window of the 3DGS code is rounded
+// to float32 and sums up to 1 - k, which adds k mu^2 to its variances; more than 1e-6 of the mean SSIM of bright noise.
+//     e = (1 - p) / B2,  e_s = e q / 2,  e_d = e - e_s
+//     a = (1 - q) (D - p mu) / B1 + (S - k z) e_s - (D - c - k D) e_d
+// and the pixel i collects 1/4 d(1 - SSIM)/dx(i) = G*a + (d(i) - c) G*e_d - s(i) G*e_s.
 //
 // Images stay interleaved: a row is 3W floats, padded to a multiple of 8, and horizontal taps lie 3 floats apart. Rows go
 // in groups of four, which share the loads of their vertical sums. A band of rows goes through rings of a worker:
-//     images   u, v, u^2 + v^2, u v                         5 groups, from row first - 10 of the band on
-//     slopes   w/2 dm/dU, w dm/dE, w/2 dm/dF                4 groups, from row first - 5 on
+//     images   s, d, s^2, (d - c)^2                         5 groups, from row first - 10 of the band on
+//     slopes   w a, w e_d, w e_s                            4 groups, from row first - 5 on
 // so that images g .. g + 3 give slopes g, and slopes g .. g + 3 the gradient of rows first + 4 g .. first + 4 g + 3.
 // Bands overlap: 20 rows are loaded and 10 mapped twice.
 
@@ -8765,13 +8768,13 @@ enum {
     GSF__LOSS_RADIUS = 5, GSF__LOSS_MARGIN = 16, GSF__LOSS_GROUP = 4,
     GSF__LOSS_IMAGES = 5 * GSF__LOSS_GROUP, GSF__LOSS_SLOPES = 4 * GSF__LOSS_GROUP, // rows of a ring
     GSF__LOSS_BAND = 64,                                                            // rows of a band at most
-    // of a worker: rings, sums of four planes, of one plane, weights
-    GSF__LOSS_WORKER_ROWS = 4 * GSF__LOSS_IMAGES + 3 * GSF__LOSS_SLOPES + (4 + 1) * GSF__LOSS_GROUP + 1
+    // of a worker: rings, sums of four planes, of one plane, four planes outside, b and c, weights
+    GSF__LOSS_WORKER_ROWS = 4 * GSF__LOSS_IMAGES + 3 * GSF__LOSS_SLOPES + (4 + 1) * GSF__LOSS_GROUP + 4 + 2 + 1
 };
 
 #define GSF__SSIM_C1 0.0001f // (0.01 * 1)^2
 #define GSF__SSIM_C2 0.0009f // (0.03 * 1)^2
-#define GSF__LOSS_SHIFT 0.5f // h
+#define GSF__SSIM_LACK 6.94426e-8f // k: what the window of the 3DGS code lacks of 1
 
 // exp(-k^2 / (2 * 1.5^2)) / sum over k = -5..5
 static const float gsf__loss_window[GSF__LOSS_RADIUS + 1] = {0.2660117249f,  0.2130055377f,   0.1093606895f,
@@ -8794,30 +8797,34 @@ typedef struct gsf__loss_value { double total, l1, ssim; } gsf__loss_value; // t
 
 // n: padded row length, valid: 3W, or 0 outside the image; planes lie `step` floats apart.
 typedef struct gsf__loss_kernels {
-    // u, v, u^2 + v^2 and u v of clamp(render), where NaN becomes 0, and the photo; from valid to n of zeros.
-    void (*load)(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n, float* images,
-                 size_t step);
+    // s, d, s^2 and (d - c)^2 of the render, where NaN becomes 0, and the photo; from valid to n of zeros.
+    void (*load)(const float* render, const float* f32, const uint8_t* u8, const float* b, const float* c, size_t valid,
+                 size_t n, float* images, size_t step);
     // Vertical sums of a group of rows from four groups; the first is centred on the sixth row. Rows are `stride` apart.
     void (*down)(const float* const v[4], size_t stride, size_t n, float* sums);
     // Horizontal sums of a row, which begins at a cache line and has margins.
     void (*across)(const float* v, size_t n, float* sums);
-    // From window sums the SSIM map: its three slopes, sums of w |x - t| and w (1 - m). weight: 0 from valid to n.
-    void (*map)(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight, size_t n,
-                float* slopes, size_t step, double totals[2]);
+    // From window sums the SSIM map: its three slopes, sums of w |d| and w/2 (1 - SSIM). weight: 0 from valid to n.
+    void (*map)(const float* sums, size_t sums_step, const float* d, const float* b, const float* c, const float* weight,
+                size_t n, float* slopes, size_t step, double totals[2]);
     // From window sums of the slopes the gradient of the render.
-    void (*gradient)(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight,
-                     const float* render, float l1_scale, float ssim_scale, size_t valid, float* d_render);
+    void (*gradient)(const float* sums, size_t sums_step, const float* s, const float* d, const float* c,
+                     const float* weight, const float* render, float l1_scale, float ssim_scale, size_t valid,
+                     float* d_render);
 } gsf__loss_kernels;
 
-static void gsf__loss_load_ref(const float* render, const float* f32, const uint8_t* u8, size_t valid, size_t n,
-                               float* images, size_t step) {
+static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) : 0.0f; } // NaN: 0
+
+static void gsf__loss_load_ref(const float* render, const float* f32, const uint8_t* u8, const float* b, const float* c,
+                               size_t valid, size_t n, float* images, size_t step) {
     for (size_t i = 0; i < n; i++) {
-        const float r = i < valid ? render[i] : 0.0f, t = i >= valid ? 0.0f : u8 ? (float)u8[i] / 255.0f : f32[i];
-        const float u = (r > 0.0f ? (r < 1.0f ? r : 1.0f) : 0.0f) - GSF__LOSS_SHIFT, v = t - GSF__LOSS_SHIFT;
-        images[i] = u;
-        images[step + i] = v;
-        images[2 * step + i] = u * u + v * v;
-        images[3 * step + i] = u * v;
+        const float x = i < valid ? gsf__loss_clamp(render[i]) : 0.0f;
+        const float t = i >= valid ? 0.0f : u8 ? (float)u8[i] / 255.0f : gsf__loss_clamp(f32[i]);
+        const float s = (x - b[i]) + t, d = x - t;
+        images[i] = s;
+        images[step + i] = d;
+        images[2 * step + i] = s * s;
+        images[3 * step + i] = (d - c[i]) * (d - c[i]);
     }
 }
 
@@ -8840,30 +8847,31 @@ static void gsf__loss_across_ref(const float* v, size_t n, float* sums) {
     }
 }
 
-static void gsf__loss_map_ref(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight,
-                              size_t n, float* slopes, size_t step, double totals[2]) {
+static void gsf__loss_map_ref(const float* sums, size_t sums_step, const float* d, const float* b, const float* c,
+                              const float* weight, size_t n, float* slopes, size_t step, double totals[2]) {
     for (size_t i = 0; i < n; i++) {
-        const float U = sums[i], V = sums[sums_step + i], E = sums[2 * sums_step + i], F = sums[3 * sums_step + i];
-        const float mu = U + GSF__LOSS_SHIFT, mu_t = V + GSF__LOSS_SHIFT;
-        const float a1 = 2.0f * mu * mu_t + GSF__SSIM_C1, a2 = 2.0f * (F - U * V) + GSF__SSIM_C2;
-        const float b1 = mu * mu + mu_t * mu_t + GSF__SSIM_C1, b2 = E - U * U - V * V + GSF__SSIM_C2;
-        const float r = 1.0f / (b1 * b2), f = a1 * r, m = f * a2, e = m * (b1 * r);
-        slopes[i] = weight[i] * (mu_t * (a2 * r) - mu * m * (b2 * r) + U * e - V * f);
-        slopes[step + i] = -weight[i] * e;
-        slopes[2 * step + i] = weight[i] * f;
-        totals[0] += (double)(weight[i] * fabsf(u[i] - v[i]));
-        totals[1] += (double)(weight[i] * (1.0f - m));
+        const float S = sums[i], D = sums[sums_step + i], z = S + b[i], Dc = D - c[i], w = weight[i];
+        const float vs = sums[2 * sums_step + i] - S * S + GSF__SSIM_LACK * (z * z);
+        const float vd = sums[3 * sums_step + i] - Dc * Dc + GSF__SSIM_LACK * (D * D);
+        const float B1 = z * z + D * D + 2.0f * GSF__SSIM_C1, B2 = vs + vd + 2.0f * GSF__SSIM_C2;
+        const float r = 1.0f / (B1 * B2), r1 = B2 * r, r2 = B1 * r, p = D * D * r1, q = vd * r2; // halves of p and q
+        const float like = 1.0f - 2.0f * p, con = 1.0f - 2.0f * q, e = w * (like * r2), es = e * q, ed = e - es;
+        slopes[i] = w * (con * r1) * (D - p * (z + D)) + (S - GSF__SSIM_LACK * z) * es - (Dc - GSF__SSIM_LACK * D) * ed;
+        slopes[step + i] = ed;
+        slopes[2 * step + i] = es;
+        totals[0] += (double)(w * fabsf(d[i]));
+        totals[1] += (double)(w * (p + q * like));
     }
 }
 
-static void gsf__loss_gradient_ref(const float* sums, size_t sums_step, const float* u, const float* v, const float* weight,
-                                   const float* render, float l1_scale, float ssim_scale, size_t valid,
-                                   float* d_render) {
+static void gsf__loss_gradient_ref(const float* sums, size_t sums_step, const float* s, const float* d, const float* c,
+                                   const float* weight, const float* render, float l1_scale, float ssim_scale,
+                                   size_t valid, float* d_render) {
     for (size_t i = 0; i < valid; i++) {
-        const float half = sums[i] + u[i] * sums[sums_step + i] + v[i] * sums[2 * sums_step + i], diff = u[i] - v[i];
-        const float sign = diff > 0.0f ? 1.0f : diff < 0.0f ? -1.0f : 0.0f;
-        const float d = l1_scale * weight[i] * sign - 2.0f * ssim_scale * half;
-        d_render[i] = render[i] >= 0.0f && render[i] <= 1.0f ? d : 0.0f; // d clamp(r)/dr; 0 for NaN
+        const float quarter = sums[i] + (d[i] - c[i]) * sums[sums_step + i] - s[i] * sums[2 * sums_step + i];
+        const float sign = d[i] > 0.0f ? 1.0f : d[i] < 0.0f ? -1.0f : 0.0f;
+        const float slope = l1_scale * weight[i] * sign + 4.0f * ssim_scale * quarter;
+        d_render[i] = render[i] >= 0.0f && render[i] <= 1.0f ? slope : 0.0f; // d clamp(r)/dr; 0 for NaN
     }
 }
 
@@ -8884,29 +8892,44 @@ GSF__TARGET_AVX2 static inline double gsf__avx2_sum_pd(__m256d v) { // ((0 + 2) 
     return _mm_cvtsd_f64(_mm_add_sd(pair, _mm_unpackhi_pd(pair, pair)));
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_load_avx2(const float* render, const float* f32, const uint8_t* u8, size_t valid,
-                                                 size_t n, float* images, size_t step) {
-    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
-    const __m256 shift = _mm256_set1_ps(GSF__LOSS_SHIFT);
-    for (size_t i = 0; i < n; i += 8) {
+GSF__TARGET_AVX2 static inline __m256 gsf__loss_clamp_avx2(__m256 v) { // max(NaN, 0) is 0
+    return _mm256_min_ps(_mm256_max_ps(v, _mm256_setzero_ps()), _mm256_set1_ps(1.0f));
+}
+
+GSF__TARGET_AVX2 static inline __m256 gsf__loss_bytes_avx2(const uint8_t* p, size_t count) { // the first `count`, of 255
+    const __m256 high = _mm256_set1_ps(1.0f / 255.0f), low = _mm256_set1_ps((float)(1.0 / 255.0 - (double)(1.0f / 255.0f)));
+    uint64_t bytes = 0;
+    if (count >= 8) memcpy(&bytes, p, 8);
+    else memcpy(&bytes, p, count);
+    const __m256 v = _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes)));
+    return _mm256_fmadd_ps(v, high, _mm256_mul_ps(v, low)); // all 256 as v / 255 gives them
+}
+
+GSF__TARGET_AVX2 static inline void gsf__loss_store_avx2(__m256 x, __m256 t, const float* b, const float* c, float* images,
+                                                         size_t step) {
+    const __m256 s = _mm256_add_ps(_mm256_sub_ps(x, _mm256_loadu_ps(b)), t), d = _mm256_sub_ps(x, t);
+    const __m256 e = _mm256_sub_ps(d, _mm256_loadu_ps(c));
+    _mm256_storeu_ps(images, s);
+    _mm256_storeu_ps(images + step, d);
+    _mm256_storeu_ps(images + 2 * step, _mm256_mul_ps(s, s));
+    _mm256_storeu_ps(images + 3 * step, _mm256_mul_ps(e, e));
+}
+
+GSF__TARGET_AVX2 static void gsf__loss_load_avx2(const float* render, const float* f32, const uint8_t* u8, const float* b,
+                                                 const float* c, size_t valid, size_t n, float* images, size_t step) {
+    size_t i = 0;
+    for (; u8 && i + 8 <= valid; i += 8)
+        gsf__loss_store_avx2(gsf__loss_clamp_avx2(_mm256_loadu_ps(render + i)), gsf__loss_bytes_avx2(u8 + i, 8), b + i, c + i,
+                             images + i, step);
+    for (; i + 8 <= valid; i += 8)
+        gsf__loss_store_avx2(gsf__loss_clamp_avx2(_mm256_loadu_ps(render + i)),
+                             gsf__loss_clamp_avx2(_mm256_loadu_ps(f32 + i)), b + i, c + i, images + i, step);
+    for (; i < n; i += 8) {
         const size_t left = i < valid ? valid - i : 0;
-        __m256 x = zero, t = zero;
-        if (left) {
-            x = _mm256_min_ps(_mm256_max_ps(gsf__loss_first_avx2(render + i, left), zero), one); // max(NaN, 0) is 0
-            if (!u8) {
-                t = gsf__loss_first_avx2(f32 + i, left);
-            } else {
-                uint64_t bytes = 0;
-                if (left >= 8) memcpy(&bytes, u8 + i, 8);
-                else memcpy(&bytes, u8 + i, left);
-                t = _mm256_div_ps(_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes))), scale);
-            }
-        }
-        const __m256 u = _mm256_sub_ps(x, shift), v = _mm256_sub_ps(t, shift);
-        _mm256_storeu_ps(images + i, u);
-        _mm256_storeu_ps(images + step + i, v);
-        _mm256_storeu_ps(images + 2 * step + i, _mm256_fmadd_ps(u, u, _mm256_mul_ps(v, v)));
-        _mm256_storeu_ps(images + 3 * step + i, _mm256_mul_ps(u, v));
+        __m256 x = _mm256_setzero_ps(), t = x;
+        if (left) x = gsf__loss_clamp_avx2(gsf__loss_first_avx2(render + i, left));
+        if (left) t = u8 ? gsf__loss_bytes_avx2(u8 + i, left) : gsf__loss_clamp_avx2(gsf__loss_first_avx2(f32 + i, left));
+        gsf__loss_store_avx2(x, t, b + i, c + i, images + i, step);
     }
 }
 
@@ -8972,50 +8995,54 @@ GSF__TARGET_AVX2 static inline __m256d gsf__loss_add_avx2(__m256d sum, __m256 v)
     return _mm256_add_pd(sum, _mm256_cvtps_pd(_mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1))));
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_map_avx2(const float* sums, size_t sums_step, const float* u, const float* v,
-                                                const float* weight, size_t n, float* slopes, size_t step,
+GSF__TARGET_AVX2 static void gsf__loss_map_avx2(const float* sums, size_t sums_step, const float* d, const float* b,
+                                                const float* c, const float* weight, size_t n, float* slopes, size_t step,
                                                 double totals[2]) {
-    const __m256 c1 = _mm256_set1_ps(GSF__SSIM_C1), c2 = _mm256_set1_ps(GSF__SSIM_C2), one = _mm256_set1_ps(1.0f);
-    const __m256 sign = _mm256_set1_ps(-0.0f), shift = _mm256_set1_ps(GSF__LOSS_SHIFT);
+    const __m256 c1 = _mm256_set1_ps(2.0f * GSF__SSIM_C1), c2 = _mm256_set1_ps(2.0f * GSF__SSIM_C2);
+    const __m256 one = _mm256_set1_ps(1.0f), lack = _mm256_set1_ps(GSF__SSIM_LACK), sign = _mm256_set1_ps(-0.0f);
     __m256d l1 = _mm256_setzero_pd(), dssim = l1;
+    __m256 l1_part = _mm256_setzero_ps(), dssim_part = l1_part;
     for (size_t i = 0; i < n; i += 8) {
-        const __m256 U = _mm256_loadu_ps(sums + i), V = _mm256_loadu_ps(sums + sums_step + i);
-        const __m256 E = _mm256_loadu_ps(sums + 2 * sums_step + i), F = _mm256_loadu_ps(sums + 3 * sums_step + i);
-        const __m256 mu = _mm256_add_ps(U, shift), mu_t = _mm256_add_ps(V, shift), cov = _mm256_fnmadd_ps(U, V, F);
-        const __m256 a1 = _mm256_fmadd_ps(_mm256_add_ps(mu, mu), mu_t, c1), a2 = _mm256_add_ps(_mm256_add_ps(cov, cov), c2);
-        const __m256 b1 = _mm256_fmadd_ps(mu, mu, _mm256_fmadd_ps(mu_t, mu_t, c1));
-        const __m256 b2 = _mm256_add_ps(_mm256_fnmadd_ps(U, U, _mm256_fnmadd_ps(V, V, E)), c2);
-        const __m256 r = _mm256_div_ps(one, _mm256_mul_ps(b1, b2));
-        const __m256 f = _mm256_mul_ps(a1, r), m = _mm256_mul_ps(f, a2), w = _mm256_loadu_ps(weight + i);
-        const __m256 b1r = _mm256_mul_ps(b1, r);
-        __m256 d = _mm256_fmsub_ps(mu_t, _mm256_mul_ps(a2, r), _mm256_mul_ps(V, f));
-        d = _mm256_fmadd_ps(m, _mm256_fmsub_ps(U, b1r, _mm256_mul_ps(mu, _mm256_mul_ps(b2, r))), d);
-        _mm256_storeu_ps(slopes + i, _mm256_mul_ps(w, d));
-        _mm256_storeu_ps(slopes + step + i, _mm256_mul_ps(_mm256_xor_ps(sign, w), _mm256_mul_ps(m, b1r)));
-        _mm256_storeu_ps(slopes + 2 * step + i, _mm256_mul_ps(w, f));
-        const __m256 diff = _mm256_sub_ps(_mm256_loadu_ps(u + i), _mm256_loadu_ps(v + i));
-        l1 = gsf__loss_add_avx2(l1, _mm256_mul_ps(w, _mm256_andnot_ps(sign, diff)));
-        dssim = gsf__loss_add_avx2(dssim, _mm256_mul_ps(w, _mm256_sub_ps(one, m)));
+        const __m256 S = _mm256_loadu_ps(sums + i), D = _mm256_loadu_ps(sums + sums_step + i);
+        const __m256 P = _mm256_loadu_ps(sums + 2 * sums_step + i), Q = _mm256_loadu_ps(sums + 3 * sums_step + i);
+        const __m256 z = _mm256_add_ps(S, _mm256_loadu_ps(b + i)), Dc = _mm256_sub_ps(D, _mm256_loadu_ps(c + i));
+        const __m256 zz = _mm256_fmadd_ps(z, z, c1), DD = _mm256_mul_ps(D, D), B1 = _mm256_add_ps(zz, DD);
+        const __m256 vs = _mm256_fnmadd_ps(S, S, P), vd = _mm256_fmadd_ps(lack, DD, _mm256_fnmadd_ps(Dc, Dc, Q));
+        const __m256 B2 = _mm256_add_ps(_mm256_add_ps(vs, vd), _mm256_fmadd_ps(lack, zz, c2));
+        const __m256 r = _mm256_div_ps(one, _mm256_mul_ps(B1, B2)), r1 = _mm256_mul_ps(B2, r), r2 = _mm256_mul_ps(B1, r);
+        const __m256 p = _mm256_mul_ps(DD, r1), q = _mm256_mul_ps(vd, r2), w = _mm256_loadu_ps(weight + i);
+        const __m256 like = _mm256_sub_ps(one, _mm256_add_ps(p, p)), con = _mm256_sub_ps(one, _mm256_add_ps(q, q));
+        const __m256 e = _mm256_mul_ps(w, _mm256_mul_ps(like, r2)), es = _mm256_mul_ps(e, q), ed = _mm256_sub_ps(e, es);
+        __m256 a = _mm256_mul_ps(_mm256_mul_ps(w, _mm256_mul_ps(con, r1)), _mm256_fnmadd_ps(p, _mm256_add_ps(z, D), D));
+        a = _mm256_fnmadd_ps(_mm256_fnmadd_ps(lack, D, Dc), ed, _mm256_fmadd_ps(_mm256_fnmadd_ps(lack, z, S), es, a));
+        _mm256_storeu_ps(slopes + i, a);
+        _mm256_storeu_ps(slopes + step + i, ed);
+        _mm256_storeu_ps(slopes + 2 * step + i, es);
+        l1_part = _mm256_fmadd_ps(w, _mm256_andnot_ps(sign, _mm256_loadu_ps(d + i)), l1_part);
+        dssim_part = _mm256_fmadd_ps(w, _mm256_fmadd_ps(q, like, p), dssim_part);
+        if ((i & 56) != 56 && i + 8 < n) continue;
+        l1 = gsf__loss_add_avx2(l1, l1_part), dssim = gsf__loss_add_avx2(dssim, dssim_part);
+        l1_part = dssim_part = _mm256_setzero_ps();
     }
     totals[0] += gsf__avx2_sum_pd(l1);
     totals[1] += gsf__avx2_sum_pd(dssim);
 }
 
-GSF__TARGET_AVX2 static void gsf__loss_gradient_avx2(const float* sums, size_t sums_step, const float* u, const float* v,
-                                                     const float* weight, const float* render, float l1_scale,
-                                                     float ssim_scale, size_t valid, float* d_render) {
+GSF__TARGET_AVX2 static void gsf__loss_gradient_avx2(const float* sums, size_t sums_step, const float* s, const float* d,
+                                                     const float* c, const float* weight, const float* render,
+                                                     float l1_scale, float ssim_scale, size_t valid, float* d_render) {
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), minus = _mm256_set1_ps(-0.0f);
-    const __m256 l1 = _mm256_set1_ps(l1_scale), ssim = _mm256_set1_ps(-2.0f * ssim_scale);
+    const __m256 l1 = _mm256_set1_ps(l1_scale), ssim = _mm256_set1_ps(4.0f * ssim_scale);
     for (size_t i = 0; i < valid; i += 8) {
-        const __m256 ui = _mm256_loadu_ps(u + i), vi = _mm256_loadu_ps(v + i), diff = _mm256_sub_ps(ui, vi);
-        __m256 half = _mm256_fmadd_ps(ui, _mm256_loadu_ps(sums + sums_step + i), _mm256_loadu_ps(sums + i));
-        half = _mm256_fmadd_ps(vi, _mm256_loadu_ps(sums + 2 * sums_step + i), half);
+        const __m256 diff = _mm256_loadu_ps(d + i), e = _mm256_sub_ps(diff, _mm256_loadu_ps(c + i));
+        __m256 quarter = _mm256_fmadd_ps(e, _mm256_loadu_ps(sums + sums_step + i), _mm256_loadu_ps(sums + i));
+        quarter = _mm256_fnmadd_ps(_mm256_loadu_ps(s + i), _mm256_loadu_ps(sums + 2 * sums_step + i), quarter);
         const __m256 w = _mm256_mul_ps(l1, _mm256_loadu_ps(weight + i));
         const __m256 signed_w = _mm256_xor_ps(w, _mm256_and_ps(diff, minus));
-        const __m256 d = _mm256_fmadd_ps(ssim, half, _mm256_and_ps(signed_w, _mm256_cmp_ps(diff, zero, _CMP_NEQ_OQ)));
+        const __m256 slope = _mm256_fmadd_ps(ssim, quarter, _mm256_and_ps(signed_w, _mm256_cmp_ps(diff, zero, _CMP_NEQ_OQ)));
         const __m256 r = gsf__loss_first_avx2(render + i, valid - i);
         const __m256 inside = _mm256_and_ps(_mm256_cmp_ps(r, zero, _CMP_GE_OQ), _mm256_cmp_ps(r, one, _CMP_LE_OQ));
-        const __m256 out = _mm256_and_ps(d, inside);
+        const __m256 out = _mm256_and_ps(slope, inside);
         if (valid - i >= 8) _mm256_storeu_ps(d_render + i, out); // masked stores are slow
         else _mm256_maskstore_ps(d_render + i, gsf__avx2_lanes(valid - i), out);
     }
@@ -9052,6 +9079,7 @@ typedef struct gsf__loss_job {
 
 typedef struct gsf__loss_buffers { // of a worker at a band; they point to column 0 of row 0
     float *images, *slopes, *sums, *vertical, *weight; // vertical: sums of one plane, not yet horizontal
+    float *middle[2], *outside;                        // b and c of each float; the images' planes beyond the image
     int32_t first, end;                                // rows of the band
 } gsf__loss_buffers;
 
@@ -9079,17 +9107,58 @@ static const float* gsf__loss_weights(const gsf__loss_job* job, int32_t y, float
     return out;
 }
 
-// Window sums of the group of rows in the middle of groups g .. g + 3 of a ring, whose planes are outside[] beyond the
-// image's sides.
+// b and c of each float of a row and its margins: medians over a grid of the band's pixels, by channel. Any values would be
+// right; these leave nothing of flat images or a flat background. Where every window reaches far over the border, zeros are
+// near enough.
+static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buffers* b) {
+    enum { GRID = 4 };
+    const gsf__target* target = job->target;
+    const size_t margin = GSF__LOSS_MARGIN, across = (size_t)(target->width - 1) / GRID + 1;
+    const int32_t down = (b->end - b->first - 1) / GRID + 1;
+    float sorted[6][GRID * GRID];
+    size_t count = 0;
+    for (int32_t y = b->first; y < b->end; y += down)
+        for (size_t x = 0; x < (size_t)target->width; x += across, count++)
+            for (size_t k = 0; k < 3; k++) {
+                const size_t at = (size_t)y * job->valid + 3 * x + k;
+                const float r = gsf__loss_clamp(job->render[at]);
+                const float t = target->u8 ? (float)target->u8[at] / 255.0f : gsf__loss_clamp(target->f32[at]);
+                for (size_t p = 0; p < 2; p++) {
+                    const float value = p ? r - t : r + t;
+                    float* list = sorted[3 * p + k];
+                    size_t to = count;
+                    for (; to > 0 && list[to - 1] > value; to--) list[to] = list[to - 1];
+                    list[to] = value;
+                }
+            }
+    const int wide = target->width > GSF__LOSS_RADIUS && target->height > GSF__LOSS_RADIUS;
+    for (size_t p = 0; p < 2; p++) {
+        float* row = b->middle[p] - margin; // begins with channel 2: 3 floats to a pixel, 16 of margin
+        for (size_t i = 0; i < 3; i++) row[i] = wide ? sorted[3 * p + (i + 2) % 3][count / 2] : 0.0f;
+        for (size_t i = 3; i < job->n + 2 * margin; i++) row[i] = row[i - 3];
+    }
+    job->k.load(NULL, NULL, NULL, b->middle[0] - margin, b->middle[1] - margin, 0, job->n + 2 * margin, b->outside - margin,
+                job->row);
+}
+
+// Window sums of the group of rows in the middle of groups g .. g + 3 of a ring. outside: the planes' rows beyond the image,
+// NULL = zeros.
 static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b, const float* ring, size_t ring_rows,
                            size_t g, size_t planes, const float* outside) {
+    const size_t margin = GSF__LOSS_MARGIN * sizeof(float);
     for (size_t p = 0; p < planes; p++) {
         const float* v[4];
         for (size_t k = 0; k < 4; k++) v[k] = ring + (p * ring_rows + (g + k) * GSF__LOSS_GROUP % ring_rows) * job->row;
         job->k.down(v, job->row, job->n, b->vertical);
         for (size_t j = 0; j < GSF__LOSS_GROUP; j++) {
             float* sums = b->vertical + j * job->row;
-            for (size_t i = 0; i < GSF__LOSS_MARGIN; i++) sums[job->n + i] = *(sums - GSF__LOSS_MARGIN + i) = outside[p];
+            if (outside) {
+                memcpy(sums - GSF__LOSS_MARGIN, outside + p * job->row - GSF__LOSS_MARGIN, margin);
+                memcpy(sums + job->n, outside + p * job->row + job->n, margin);
+            } else {
+                memset(sums - GSF__LOSS_MARGIN, 0, margin);
+                memset(sums + job->n, 0, margin);
+            }
             job->k.across(sums, job->n, b->sums + (p * GSF__LOSS_GROUP + j) * job->row);
         }
     }
@@ -9103,24 +9172,22 @@ static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffe
         const int inside = y >= 0 && y < target->height;
         const size_t from = inside ? (size_t)y * job->valid : 0;
         job->k.load(job->render + from, target->f32 ? target->f32 + from : NULL, target->u8 ? target->u8 + from : NULL,
-                    inside ? job->valid : 0, job->n, b->images + (size_t)(at % GSF__LOSS_IMAGES) * job->row,
-                    GSF__LOSS_IMAGES * job->row);
+                    b->middle[0], b->middle[1], inside ? job->valid : 0, job->n,
+                    b->images + (size_t)(at % GSF__LOSS_IMAGES) * job->row, GSF__LOSS_IMAGES * job->row);
     }
 }
 
 // Group g of the slopes, zeros outside the image; rows of the band are counted.
 static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g, double* totals) {
-    static const float outside[4] = {-GSF__LOSS_SHIFT, -GSF__LOSS_SHIFT, 2.0f * GSF__LOSS_SHIFT * GSF__LOSS_SHIFT,
-                                     GSF__LOSS_SHIFT * GSF__LOSS_SHIFT};
-    gsf__loss_blur(job, b, b->images, GSF__LOSS_IMAGES, (size_t)g, 4, outside);
+    gsf__loss_blur(job, b, b->images, GSF__LOSS_IMAGES, (size_t)g, 4, b->outside);
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP; at++) {
         const int32_t y = b->first - GSF__LOSS_RADIUS + at;
         const float* sums = b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row;
-        const float* u = b->images + (size_t)((at + GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
+        const float* s = b->images + (size_t)((at + GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
         float* slopes = b->slopes + (size_t)(at % GSF__LOSS_SLOPES) * job->row;
         double other[2] = {0.0, 0.0};
         if (y >= 0 && y < job->target->height)
-            job->k.map(sums, GSF__LOSS_GROUP * job->row, u, u + GSF__LOSS_IMAGES * job->row,
+            job->k.map(sums, GSF__LOSS_GROUP * job->row, s + GSF__LOSS_IMAGES * job->row, b->middle[0], b->middle[1],
                        gsf__loss_weights(job, y, b->weight), job->n, slopes, GSF__LOSS_SLOPES * job->row,
                        y >= b->first && y < b->end ? totals : other);
         else
@@ -9130,13 +9197,12 @@ static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffer
 
 // Group g of the band's rows.
 static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g) {
-    static const float outside[3] = {0.0f, 0.0f, 0.0f};
-    gsf__loss_blur(job, b, b->slopes, GSF__LOSS_SLOPES, (size_t)g, 3, outside);
+    gsf__loss_blur(job, b, b->slopes, GSF__LOSS_SLOPES, (size_t)g, 3, NULL);
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP && b->first + at < b->end; at++) {
         const size_t packed = (size_t)(b->first + at) * job->valid;
-        const float* u = b->images + (size_t)((at + 2 * GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
-        job->k.gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, u,
-                        u + GSF__LOSS_IMAGES * job->row, gsf__loss_weights(job, b->first + at, b->weight),
+        const float* s = b->images + (size_t)((at + 2 * GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
+        job->k.gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, s,
+                        s + GSF__LOSS_IMAGES * job->row, b->middle[1], gsf__loss_weights(job, b->first + at, b->weight),
                         job->render + packed, job->l1_scale, job->ssim_scale, job->valid, job->d_render + packed);
     }
 }
@@ -9151,8 +9217,12 @@ static void gsf__loss_band(void* arg, size_t band, int worker) {
     b.slopes = b.images + 4 * GSF__LOSS_IMAGES * job->row;
     b.sums = b.slopes + 3 * GSF__LOSS_SLOPES * job->row;
     b.vertical = b.sums + 4 * GSF__LOSS_GROUP * job->row;
-    b.weight = b.vertical + GSF__LOSS_GROUP * job->row;
+    b.outside = b.vertical + GSF__LOSS_GROUP * job->row;
+    b.middle[0] = b.outside + 4 * job->row;
+    b.middle[1] = b.middle[0] + job->row;
+    b.weight = b.middle[1] + job->row;
     for (size_t i = 0; i < job->n; i++) b.weight[i] = i < job->valid ? 1.0f : 0.0f;
+    gsf__loss_fill_middle(job, &b);
     double* totals = job->sums + 2 * band;
     totals[0] = totals[1] = 0.0;
     for (int32_t g = 0; g < 3; g++) gsf__loss_load_group(job, &b, g);
@@ -9204,8 +9274,9 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const 
         dssim += scratch->sums[2 * i + 1];
     }
     out->l1 = l1 / n;
-    out->ssim = 1.0 - dssim / n;
-    out->total = (1.0 - (double)lambda) * out->l1 + (double)lambda * (1.0 - out->ssim);
+    dssim *= 2.0 / n; // sums are of halves
+    out->ssim = 1.0 - dssim;
+    out->total = (1.0 - (double)lambda) * out->l1 + (double)lambda * dssim;
     return GSF_OK;
 }
 
