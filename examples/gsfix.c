@@ -79,6 +79,8 @@ static const option_spec option_specs[] = {
      "initial points: those that a training view sees by ray, by track, or by either (both, the default below 6 photos);\n"
      "all points; those of both and, more densely, where the training photos agree by stereo (dense, the default from 6\n"
      "photos on); random ones (the default where the scene has no points)"},
+    {"--compare", FLAG, AT(compare), 0, 0, NULL, "fix",
+     "also train as many steps from the same start and seed without repair, and report both: what the repair alone gives"},
     {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix",
      "approximations allowed (default balanced; exact: none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",

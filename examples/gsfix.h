@@ -18,7 +18,7 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *ref_features, *save_features;
     const char *caption, *model, *solver;
-    int json, help, resume, restart, depth, alpha, int8, bf16, any_frames;
+    int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
     uint64_t seed;
@@ -180,21 +180,23 @@ typedef struct gsfix_round { int32_t round, iteration, windows, skipped, frames;
 typedef struct gsfix_flown { int32_t round, window, reference; double center[3], forward[3]; } gsfix_flown; // path frame
 typedef struct gsfix_sample { int32_t round, window, frame; } gsfix_sample; // pictures of it lie in DIR/report
 
-enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_CHECKPOINT, GSFIX_SAVE, GSFIX_STAGES };
+enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_CHECKPOINT, GSFIX_SAVE, GSFIX_COMPARE,
+       GSFIX_STAGES };
 extern const char* const gsfix_stage_names[GSFIX_STAGES];
 
 typedef struct gsfix_history { // what a run remembers beside the fixer's state; part of the checkpoint
     double seconds[GSFIX_STAGES], seconds_total;
     int32_t resumed;
-    int32_t has_before;
-    gsfix_score* before; // one per test view, once has_before; before the first restoration
+    int32_t has_without;
+    gsfix_score* without; // one per test view, once has_without: after as many steps without repair (--compare)
+    gsfix_curve_point* without_curve;
     size_t view_count;
     gsfix_curve_point* curve;
     gsfix_round* rounds;
     gsfix_flown* path;
     gsfix_sample* samples;
-    size_t curve_count, round_count, path_count, sample_count;
-    size_t curve_room, round_room, path_room, sample_room;
+    size_t curve_count, without_count, round_count, path_count, sample_count;
+    size_t curve_room, without_room, round_room, path_room, sample_room;
 } gsfix_history;
 
 typedef struct gsfix_result { // of a finished run, for metrics.json and the report
@@ -203,7 +205,7 @@ typedef struct gsfix_result { // of a finished run, for metrics.json and the rep
     const gsfix_history* history;
     const char* out;
     const char* switches;    // JSON object
-    gsfix_score mean, before;
+    gsfix_score mean, without;
     const gsfix_score* views; // one per test view
     const gsf_image* masks;   // per test view; NULL = none given
     const gsf_splats* splats;

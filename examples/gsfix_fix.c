@@ -123,6 +123,8 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
     return 0;
 }
 
+static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
+
 static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit code
     const gsfix_quality* quality = gsfix_find_quality(app->o.quality);
     memset(setup, 0, sizeof *setup);
@@ -143,13 +145,15 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     setup->fix.skip_psnr = quality->skip_psnr;
     setup->fix.max_pixels = quality->max_pixels;
     const int code = apply_settings(app, setup);
-    return code ? code : gsfix_check_restorer(app);
+    if (code) return code;
+    if (app->o.compare && !has_restorer(app)) return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
+    return gsfix_check_restorer(app);
 }
 
 // ---- a run -----------------------------------------------------------------------
 
 const char* const gsfix_stage_names[GSFIX_STAGES] = {"init", "train", "render", "restore", "distill",
-                                                         "checkpoint", "save"};
+                                                         "checkpoint", "save", "compare"};
 
 typedef struct fix_run {
     gsfix_app* app;
@@ -161,6 +165,7 @@ typedef struct fix_run {
     gsf_splats initial;
     gsf_restorer restorer;
     int has_restorer;
+    int comparing; // now training without repair, for --compare; that comes first
     gsf_fixer* fixer;
     gsf_text switches; // JSON object
     const gsfix_read_file* inputs;
@@ -177,6 +182,7 @@ typedef struct fix_run {
 
 static void add_seconds(fix_run* run, int stage, double* since) {
     const double now = gsfix_now();
+    if (run->comparing && stage != GSFIX_CHECKPOINT) stage = GSFIX_COMPARE;
     run->history.seconds[stage] += now - *since;
     *since = now;
 }
@@ -466,6 +472,7 @@ static void write_switches(fix_run* run) {
     gsfix_json_text(ctx, t, "restorer", o->restorer ? o->restorer : "none");
     if (o->restorer && strncmp(o->restorer, "dit:", 4) == 0) write_dit_switches(run);
     gsfix_json_text(ctx, t, "regularize", o->regularize ? o->regularize : "on");
+    gsfix_json_text(ctx, t, "compare", o->compare ? "on" : "off");
     gsfix_json_text(ctx, t, "trajectory", kinds[used.fix.trajectory]);
     gsfix_json_text(ctx, t, "init", used.init);
     gsfix_json_text(ctx, t, "quality", gsfix_find_quality(o->quality)->name);
@@ -510,6 +517,15 @@ static gsfix_path input_digest(const gsfix_read_file* file) {
     return gsfix_pathf("%016llx %llu", (unsigned long long)file->digest, (unsigned long long)file->size);
 }
 
+static void write_curve_rows(gsf_context* ctx, gsf_text* t, const char* key, const gsfix_curve_point* points, size_t count) {
+    gsfix_json_begin(ctx, t, key, '[');
+    for (size_t i = 0; i < count; i++) {
+        const double row[4] = {points[i].iteration, (double)points[i].splats, points[i].psnr, points[i].psnr_seen};
+        write_list(ctx, t, NULL, row, 4);
+    }
+    gsfix_json_end(ctx, t, ']');
+}
+
 // History as JSON: lists of numbers, so that reading back is one loop per list.
 static void write_history(fix_run* run, gsf_text* t) {
     gsf_context* ctx = run->ctx;
@@ -530,15 +546,12 @@ static void write_history(fix_run* run, gsf_text* t) {
     gsfix_json_number(ctx, t, "seconds_total", run->total_before + gsfix_now() - run->app->started);
     gsfix_json_number(ctx, t, "iteration", run->iteration);
     gsfix_json_number(ctx, t, "resumed", h->resumed);
-    gsfix_json_begin(ctx, t, "before", '[');
-    for (size_t i = 0; h->has_before && i < h->view_count; i++) write_list(ctx, t, NULL, &h->before[i].psnr, 4);
+    gsfix_json_number(ctx, t, "comparing", run->comparing);
+    gsfix_json_begin(ctx, t, "without", '[');
+    for (size_t i = 0; h->has_without && i < h->view_count; i++) write_list(ctx, t, NULL, &h->without[i].psnr, 4);
     gsfix_json_end(ctx, t, ']');
-    gsfix_json_begin(ctx, t, "curve", '[');
-    for (size_t i = 0; i < h->curve_count; i++) {
-        const double row[4] = {h->curve[i].iteration, (double)h->curve[i].splats, h->curve[i].psnr, h->curve[i].psnr_seen};
-        write_list(ctx, t, NULL, row, 4);
-    }
-    gsfix_json_end(ctx, t, ']');
+    write_curve_rows(ctx, t, "without_curve", h->without_curve, h->without_count);
+    write_curve_rows(ctx, t, "curve", h->curve, h->curve_count);
     gsfix_json_begin(ctx, t, "rounds", '[');
     for (size_t i = 0; i < h->round_count; i++) {
         const gsfix_round* r = &h->rounds[i];
@@ -688,6 +701,9 @@ static gsf_result take_row(fix_run* run, int list, const double* x) {
     } else if (list == 2) {
         const gsfix_flown p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2], {x[3], x[4], x[5]}, {x[6], x[7], x[8]}};
         if ((result = GROW(ctx, h, path, path)) == GSF_OK) h->path[h->path_count++] = p;
+    } else if (list == 3) {
+        const gsfix_curve_point p = {(int32_t)x[0], (uint64_t)x[1], x[2], x[3]};
+        if ((result = GROW(ctx, h, without_curve, without)) == GSF_OK) h->without_curve[h->without_count++] = p;
     } else {
         const gsfix_sample p = {(int32_t)x[0], (int32_t)x[1], (int32_t)x[2]};
         if ((result = GROW(ctx, h, samples, sample)) == GSF_OK) h->samples[h->sample_count++] = p;
@@ -697,30 +713,36 @@ static gsf_result take_row(fix_run* run, int list, const double* x) {
 
 static gsf_result read_history(fix_run* run, const char* name, const gsf_json* json) {
     static const struct { const char *key, *kinds; } lists[] = {
-        {"curve", "wcnn"}, {"rounds", "wwwwwf"}, {"path", "wwiffffff"}, {"samples", "www"}};
+        {"curve", "wcnn"}, {"rounds", "wwwwwf"}, {"path", "wwiffffff"}, {"without_curve", "wcnn"},
+        {"samples", "www"}};
     gsf_context* ctx = run->ctx;
     gsfix_history* h = &run->history;
     const gsf_json_value* seconds = gsf_json_member(json, &json->values[0], "seconds");
     const gsf_json_value* total = gsf_json_member(json, &json->values[0], "seconds_total");
     const gsf_json_value* resumed = whole_member(json, "resumed", 1e9);
     const gsf_json_value* iteration = whole_member(json, "iteration", run->iterations);
+    const gsf_json_value* comparing = whole_member(json, "comparing", run->app->o.compare);
     double* r = NULL;
     size_t n = 0;
-    if (!resumed || !iteration) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid number of steps or of earlier runs", name);
+    if (!resumed || !iteration || !comparing)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid number of steps or of earlier runs", name);
     h->resumed = (int32_t)resumed->number + (resumed->number < 1e9); // no further than is read again
     run->iteration = (int32_t)iteration->number;
+    run->comparing = (int)comparing->number;
     for (size_t i = 0; i < GSFIX_STAGES; i++) {
         const gsf_json_value* s = gsf_json_element(json, seconds, i);
         if (s && s->type == GSF_JSON_NUMBER && isfinite(s->number)) h->seconds[i] += s->number;
     }
     if (total && total->type == GSF_JSON_NUMBER && isfinite(total->number)) run->total_before = total->number;
-    gsf_result result = read_rows(run, name, json, "before", "nnnn", &r, &n);
+    gsf_result result = read_rows(run, name, json, "without", "nnnn", &r, &n);
     if (result == GSF_OK && n && n != h->view_count)
-        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: \"before\" has %zu views, the scene %zu", name, n, h->view_count);
-    for (size_t i = 0; i < n && result == GSF_OK; i++) memcpy(&h->before[i].psnr, r + 4 * i, 4 * sizeof *r);
-    h->has_before = n > 0 && result == GSF_OK;
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: \"without\" has %zu views, the scene %zu", name, n, h->view_count);
+    for (size_t i = 0; i < n && result == GSF_OK; i++) memcpy(&h->without[i].psnr, r + 4 * i, 4 * sizeof *r);
+    h->has_without = n > 0 && result == GSF_OK;
+    if (result == GSF_OK && run->app->o.compare && run->comparing == h->has_without)
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: neither with nor without the figures to compare to", name);
     gsf_free(ctx, r);
-    for (int list = 0; list < 4 && result == GSF_OK; list++) {
+    for (int list = 0; list < 5 && result == GSF_OK; list++) {
         result = read_rows(run, name, json, lists[list].key, lists[list].kinds, &r, &n);
         for (size_t i = 0; i < n && result == GSF_OK; i++) result = take_row(run, list, r + i * strlen(lists[list].kinds));
         gsf_free(ctx, r);
@@ -740,6 +762,27 @@ static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, s
     return result;
 }
 
+// A new one, in the place of what there was: with the restorer unless the run is comparing.
+static gsf_result start_fixer(fix_run* run) {
+    gsf_context* ctx = run->ctx;
+    gsf_splat_destroy_fixer(ctx, run->fixer);
+    run->fixer = NULL;
+    const size_t n = run->split.train_count;
+    gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, n, sizeof *views);
+    if (!views) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < n; i++) {
+        views[i].camera = run->scene.views[run->split.train[i]].camera;
+        views[i].image = run->scene.views[run->split.train[i]].image;
+    }
+    gsf_fix_desc desc = run->setup.fix;
+    desc.points = run->scene.points; // they keep the path upright
+    desc.point_count = run->scene.point_count;
+    const gsf_result result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
+                                                   run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
+    gsf_free(ctx, views);
+    return result;
+}
+
 static gsf_result resume(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const gsfix_path path = gsfix_pathf("%s/checkpoint", run->app->o.out);
@@ -751,6 +794,7 @@ static gsf_result resume(fix_run* run) {
         result = compare_switches(run, path.s, &json, gsf_json_member(&json, &json.values[0], "switches"));
     if (result == GSF_OK) result = compare_inputs(run, path.s, &json, gsf_json_member(&json, &json.values[0], "inputs"));
     if (result == GSF_OK) result = read_history(run, path.s, &json);
+    if (result == GSF_OK) result = start_fixer(run); // without the restorer if it was comparing
     if (result == GSF_OK) result = gsf_splat_fixer_restore(ctx, run->fixer, path.s, data, size);
     gsf_destroy_json(ctx, &json);
     gsf_free(ctx, data);
@@ -791,26 +835,6 @@ static void keep_checkpoint(fix_run* run) {
 
 // ---- the loop --------------------------------------------------------------------
 
-static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
-
-static gsf_result start_fixer(fix_run* run) {
-    gsf_context* ctx = run->ctx;
-    const size_t n = run->split.train_count;
-    gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, n, sizeof *views);
-    if (!views) return GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < n; i++) {
-        views[i].camera = run->scene.views[run->split.train[i]].camera;
-        views[i].image = run->scene.views[run->split.train[i]].image;
-    }
-    gsf_fix_desc desc = run->setup.fix;
-    desc.points = run->scene.points; // they keep the path upright
-    desc.point_count = run->scene.point_count;
-    const gsf_result result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
-                                                   run->has_restorer ? &run->restorer : NULL, &run->fixer);
-    gsf_free(ctx, views);
-    return result;
-}
-
 // Every name that this run may write. What is missing here cannot be written.
 static gsf_result open_fix_out(fix_run* run) {
     gsfix_app* app = run->app;
@@ -824,7 +848,7 @@ static gsf_result open_fix_out(fix_run* run) {
     for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
         const gsfix_path stem = gsfix_view_stem(&run->scene, run->split.test[i]);
         result = gsfix_claim(app, "test/%s.png", stem.s);
-        if (result == GSF_OK && has_restorer(app)) result = gsfix_claim(app, "report/before/%s.png", stem.s);
+        if (result == GSF_OK && app->o.compare) result = gsfix_claim(app, "report/without/%s.png", stem.s);
     }
     for (size_t i = 0; i < sizeof repair / sizeof *repair && result == GSF_OK && has_restorer(app); i++)
         result = gsfix_claim(app, "%s", repair[i]);
@@ -845,6 +869,8 @@ static gsf_result prepare(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &run->scene);
     if (result == GSF_OK) result = gsfix_split_scene(app, &run->scene, &run->split);
+    if (result == GSF_OK && app->o.compare && !run->split.test_count)
+        result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "--compare: the scene has no held-out view to compare on");
     if (result == GSF_OK) result = open_fix_out(run); // before the work that would be wasted
     if (result == GSF_OK) result = meet_checkpoint(run);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &run->restorer, &run->has_restorer);
@@ -859,11 +885,13 @@ static gsf_result prepare(fix_run* run) {
     if (result != GSF_OK) return result;
     run->inputs = gsfix_end_inputs(app, &run->input_count);
     run->history.view_count = run->split.test_count;
-    run->history.before = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *run->history.before);
-    write_switches(run);
-    if (!run->history.before || run->switches.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    run->history.without = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *run->history.without);
+    write_switches(run); // of the fixer with the restorer, if there is one
+    if (!run->history.without || run->switches.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    run->comparing = app->o.compare;
     if (run->resuming) result = resume(run);
     else result = gsfix_remove_output(app, "checkpoint");
+    if (result == GSF_OK && !run->resuming && run->comparing) result = start_fixer(run);
     if (result == GSF_OK && !run->resuming) result = gsfix_remove_stale(app);
     if (result == GSF_OK)
         gsfix_note(app, "%zu training views, %zu held out; %zu initial splats%s", run->split.train_count,
@@ -941,13 +969,6 @@ static gsf_result after_window(fix_run* run, const gsf_fix_stats* stats) {
     return result;
 }
 
-static gsf_result capture_before(fix_run* run) {
-    if (run->history.has_before || !run->split.test_count) return GSF_OK;
-    const gsf_result result = evaluate(run, gsfix_pathf("%s/report/before", run->app->o.out).s, 1, run->history.before);
-    run->history.has_before = result == GSF_OK;
-    return result;
-}
-
 // What is due after a step: pictures, held-out figures, checkpoint. The step itself is done and stays done.
 static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* clock) {
     gsf_result result = GSF_OK;
@@ -960,8 +981,7 @@ static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* 
         due = run->iteration % run->checkpoint_every == 0;
     } else if (stats->stage == GSF_FIX_PLAN || stats->stage == GSF_FIX_RESTORE) {
         add_seconds(run, GSFIX_RESTORE, clock);
-        if (stats->round == 1) result = capture_before(run);
-        if (result == GSF_OK) result = add_curve_point(run);
+        result = add_curve_point(run);
         add_seconds(run, GSFIX_RENDER, clock);
         if (result == GSF_OK && stats->stage == GSF_FIX_RESTORE) {
             result = after_window(run, stats);
@@ -981,11 +1001,13 @@ static void show_step(fix_run* run, const gsf_fix_stats* stats) {
     const double psnr = h->curve_count ? h->curve[h->curve_count - 1].psnr : NAN;
     char held_out[48] = "";
     if (!isnan(psnr)) snprintf(held_out, sizeof held_out, "  held-out %.2f dB", psnr);
+    const double trainings = run->app->o.compare ? 2.0 : 1.0, all = trainings * run->iterations;
+    const double done = run->iteration + (run->comparing ? 0.0 : all - run->iterations);
     if (stats->stage == GSF_FIX_TRAIN)
-        gsfix_progress(run->app, run->iteration, run->iterations, "step %d of %d  loss %.4f  %zu splats%s",
+        gsfix_progress(run->app, done, all, "%sstep %d of %d  loss %.4f  %zu splats%s", run->comparing ? "without repair: " : "",
                        (int)run->iteration, (int)run->iterations, stats->train.loss, stats->train.splats, held_out);
     else if (stats->stage == GSF_FIX_RESTORE && run->app->terminal)
-        gsfix_progress(run->app, run->iteration, run->iterations, "round %d of %d: window %d of %d %s",
+        gsfix_progress(run->app, done, all, "round %d of %d: window %d of %d %s",
                        (int)stats->round, (int)stats->rounds, (int)stats->window, (int)stats->windows,
                        stats->restored ? "repaired" : "skipped");
     else if (stats->stage == GSF_FIX_RESTORE && stats->window == stats->windows)
@@ -1020,6 +1042,33 @@ static gsf_result run_loop(fix_run* run) {
                     (int)run->iteration, (int)run->iterations, run->app->o.out);
 }
 
+// The training without repair is over: its figures and pictures are kept, its splats are not.
+static gsf_result end_comparison(fix_run* run) {
+    gsfix_history* h = &run->history;
+    double clock = gsfix_now();
+    gsf_result result = evaluate(run, gsfix_pathf("%s/report/without", run->app->o.out).s, 1, h->without);
+    if (result != GSF_OK) return result;
+    add_seconds(run, GSFIX_COMPARE, &clock);
+    h->has_without = 1;
+    h->without_curve = h->curve;
+    h->without_count = h->curve_count;
+    h->without_room = h->curve_room;
+    h->curve = NULL;
+    h->curve_count = h->curve_room = 0;
+    run->comparing = 0;
+    run->iteration = 0;
+    return start_fixer(run);
+}
+
+static gsf_result run_trainings(fix_run* run) {
+    if (run->comparing) {
+        gsf_result result = run_loop(run);
+        if (result == GSF_OK) result = end_comparison(run);
+        if (result != GSF_OK) return result;
+    }
+    return run_loop(run);
+}
+
 // ---- results ---------------------------------------------------------------------
 
 static void write_scores(gsf_context* ctx, gsf_text* t, const char* suffix, const gsfix_score* s) {
@@ -1037,7 +1086,7 @@ static void write_views(fix_run* run, const gsfix_result* r, gsf_text* t) {
         gsfix_json_text(ctx, t, "name", run->scene.views[run->split.test[i]].name);
         gsfix_json_text(ctx, t, "file", gsfix_pathf("test/%s.png", gsfix_view_stem(&run->scene, run->split.test[i]).s).s);
         write_scores(ctx, t, "", r->views + i);
-        if (run->history.has_before) write_scores(ctx, t, "_before", run->history.before + i);
+        if (run->history.has_without) write_scores(ctx, t, "_without_repair", run->history.without + i);
         gsfix_json_end(ctx, t, '}');
     }
     gsfix_json_end(ctx, t, ']');
@@ -1049,7 +1098,20 @@ static int window_frames(const gsfix_history* h, int32_t round) { // of each win
     return count;
 }
 
-static void write_course(fix_run* run, gsf_text* t) { // rounds and curve
+static void write_curve(gsf_context* ctx, gsf_text* t, const char* key, const gsfix_curve_point* points, size_t count) {
+    gsfix_json_begin(ctx, t, key, '[');
+    for (size_t i = 0; i < count; i++) {
+        gsfix_json_begin(ctx, t, NULL, '{');
+        gsfix_json_number(ctx, t, "iteration", points[i].iteration);
+        gsfix_json_number(ctx, t, "splats", (double)points[i].splats);
+        gsfix_json_number(ctx, t, "psnr", points[i].psnr);
+        gsfix_json_number(ctx, t, "psnr_seen", points[i].psnr_seen);
+        gsfix_json_end(ctx, t, '}');
+    }
+    gsfix_json_end(ctx, t, ']');
+}
+
+static void write_course(fix_run* run, gsf_text* t) { // rounds and curves
     gsf_context* ctx = run->ctx;
     const gsfix_history* h = &run->history;
     gsfix_json_begin(ctx, t, "rounds", '[');
@@ -1066,16 +1128,8 @@ static void write_course(fix_run* run, gsf_text* t) { // rounds and curve
         gsfix_json_end(ctx, t, '}');
     }
     gsfix_json_end(ctx, t, ']');
-    gsfix_json_begin(ctx, t, "curve", '[');
-    for (size_t i = 0; i < h->curve_count; i++) {
-        gsfix_json_begin(ctx, t, NULL, '{');
-        gsfix_json_number(ctx, t, "iteration", h->curve[i].iteration);
-        gsfix_json_number(ctx, t, "splats", (double)h->curve[i].splats);
-        gsfix_json_number(ctx, t, "psnr", h->curve[i].psnr);
-        gsfix_json_number(ctx, t, "psnr_seen", h->curve[i].psnr_seen);
-        gsfix_json_end(ctx, t, '}');
-    }
-    gsfix_json_end(ctx, t, ']');
+    write_curve(ctx, t, "curve", h->curve, h->curve_count);
+    if (h->has_without) write_curve(ctx, t, "curve_without_repair", h->without_curve, h->without_count);
 }
 
 // The members of metrics.json into app->json (whose opening brace stands already).
@@ -1087,7 +1141,7 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsfix_json_text(ctx, t, "command", run->app->command_line);
     gsfix_json_text(ctx, t, "scene", run->scene.folder);
     write_scores(ctx, t, "", &r->mean);
-    if (h->has_before) write_scores(ctx, t, "_before", &r->before);
+    if (h->has_without) write_scores(ctx, t, "_without_repair", &r->without);
     gsfix_json_text(ctx, t, "measured", "float32 render clamped to [0,1] against the 8-bit photo; ssim as ssim_3dgs");
     write_views(run, r, t);
     gsfix_json_begin(ctx, t, "seconds", '{');
@@ -1128,9 +1182,9 @@ static void print_results(fix_run* run, const gsfix_result* r) {
         gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim,
                     run->split.test_count);
         if (run->masks) gsfix_print(app, "seen       PSNR %.3f dB  SSIM %.4f", r->mean.psnr_seen, r->mean.ssim_seen);
-        if (h->has_before)
-            gsfix_print(app, "unrepaired PSNR %.3f dB  SSIM %.4f  (before the first round)", r->before.psnr,
-                        r->before.ssim);
+        if (h->has_without)
+            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (as many steps; by the repair alone %+.3f dB)", r->without.psnr,
+                        r->without.ssim, r->mean.psnr - r->without.psnr);
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,
                 h->seconds_total, (double)gsfix_peak_memory() / 1e6);
@@ -1176,7 +1230,7 @@ static gsf_result finish(fix_run* run) {
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
     add_seconds(run, GSFIX_RENDER, &clock);
     r.mean = mean_score(views, run->split.test_count);
-    r.before = mean_score(h->before, h->has_before ? run->split.test_count : 0);
+    r.without = mean_score(h->without, h->has_without ? run->split.test_count : 0);
     h->seconds_total = run->total_before + gsfix_now() - run->app->started;
     if (result == GSF_OK) {
         write_metrics(run, &r);
@@ -1198,7 +1252,8 @@ static void free_run(fix_run* run) {
     gsfix_free_split(run->app, &run->split);
     gsf_splat_destroy_scene(ctx, &run->scene);
     gsf_destroy_text(ctx, &run->switches);
-    gsf_free(ctx, run->history.before);
+    gsf_free(ctx, run->history.without);
+    gsf_free(ctx, run->history.without_curve);
     gsf_free(ctx, run->history.curve);
     gsf_free(ctx, run->history.rounds);
     gsf_free(ctx, run->history.path);
@@ -1219,7 +1274,7 @@ int gsfix_run_fix(gsfix_app* app) {
                                                      : 1;
     gsf_result result = prepare(&run);
     run.history.seconds[GSFIX_INIT] += gsfix_now() - app->started;
-    if (result == GSF_OK) result = run_loop(&run);
+    if (result == GSF_OK) result = run_trainings(&run);
     if (result == GSF_OK) result = finish(&run);
     if (result == GSF_OK) result = gsfix_drop_dit_checkpoint(app);
     free_run(&run);

@@ -103,39 +103,39 @@ static gsf_result put_pane(page* p, const char* key, const char* side, const cha
     return result;
 }
 
-static void put_change(page* p, const char* name, double before, double after, int digits, const char* unit) {
-    if (isnan(after)) return;
+static void put_change(page* p, const char* name, double without, double with, int digits, const char* unit) {
+    if (isnan(with)) return;
     put(p, "<span>%s ", name);
-    if (!isnan(before)) put(p, "%.*f &rarr; ", digits, before);
-    put(p, "<b>%.*f</b>%s</span>", digits, after, unit);
+    if (!isnan(without)) put(p, "%.*f &rarr; ", digits, without);
+    put(p, "<b>%.*f</b>%s</span>", digits, with, unit);
 }
 
 static gsf_result put_view(page* p, size_t i) {
     const gsfix_result* r = p->r;
     const gsf_scene_view* view = &r->scene->views[r->split->test[i]];
-    const int has_before = r->history->has_before;
+    const int has_without = r->history->has_without;
     const gsfix_path stem = gsfix_view_stem(r->scene, r->split->test[i]);
-    gsf_image before = {0}, after = {0};
-    gsf_result result = gsf_load_image(p->ctx, gsfix_pathf("%s/test/%s.png", r->out, stem.s).s, 3, &after);
-    if (result == GSF_OK && has_before)
-        result = gsf_load_image(p->ctx, gsfix_pathf("%s/report/before/%s.png", r->out, stem.s).s, 3, &before);
-    put(p, "<figure class=card><div class=cmp style=\"aspect-ratio:%d/%d\">", (int)after.width, (int)after.height);
-    if (result == GSF_OK) result = put_pane(p, "photo", has_before ? "" : "left", "photo", &view->image, NULL);
-    if (result == GSF_OK && has_before) result = put_pane(p, "before", "left", "before", &before, NULL);
-    if (result == GSF_OK) result = put_pane(p, "after", "right", has_before ? "after" : "result", &after, NULL);
-    if (result == GSF_OK && has_before) result = put_pane(p, "error-before", "", "error before", &before, &view->image);
-    if (result == GSF_OK) result = put_pane(p, "error", "", has_before ? "error after" : "error", &after, &view->image);
+    gsf_image without = {0}, with = {0};
+    gsf_result result = gsf_load_image(p->ctx, gsfix_pathf("%s/test/%s.png", r->out, stem.s).s, 3, &with);
+    if (result == GSF_OK && has_without)
+        result = gsf_load_image(p->ctx, gsfix_pathf("%s/report/without/%s.png", r->out, stem.s).s, 3, &without);
+    put(p, "<figure class=card><div class=cmp style=\"aspect-ratio:%d/%d\">", (int)with.width, (int)with.height);
+    if (result == GSF_OK) result = put_pane(p, "photo", has_without ? "" : "left", "photo", &view->image, NULL);
+    if (result == GSF_OK && has_without) result = put_pane(p, "without", "left", "without repair", &without, NULL);
+    if (result == GSF_OK) result = put_pane(p, "with", "right", has_without ? "with repair" : "result", &with, NULL);
+    if (result == GSF_OK && has_without) result = put_pane(p, "error-without", "", "error without", &without, &view->image);
+    if (result == GSF_OK) result = put_pane(p, "error", "", has_without ? "error with" : "error", &with, &view->image);
     put_raw(p, "<i class=bar></i><input type=range min=0 max=1000 value=500 aria-label=\"divider between the two pictures\"></div>"
                "<figcaption><strong>");
     put_escaped(p, view->name);
     put_raw(p, "</strong>");
-    const gsfix_score* was = has_before ? &r->history->before[i] : NULL;
+    const gsfix_score* was = has_without ? &r->history->without[i] : NULL;
     put_change(p, "PSNR", was ? was->psnr : NAN, r->views[i].psnr, 2, " dB");
     put_change(p, "seen", was ? was->psnr_seen : NAN, r->views[i].psnr_seen, 2, " dB");
     put_change(p, "SSIM", was ? was->ssim : NAN, r->views[i].ssim, 3, "");
     put_raw(p, "</figcaption></figure>\n");
-    gsf_destroy_image(p->ctx, &before);
-    gsf_destroy_image(p->ctx, &after);
+    gsf_destroy_image(p->ctx, &without);
+    gsf_destroy_image(p->ctx, &with);
     return result;
 }
 
@@ -155,17 +155,17 @@ static gsf_result put_views(page* p) {
     const size_t count = r->split->test_count;
     if (!count) return GSF_OK;
     put_raw(p, "<section><h2>Held-out views</h2><p>Photos that training never saw. Drag the divider in a picture.");
-    if (r->history->has_before)
-        put(p, " <em>Before</em> is the model at step %d, just before the first repair round; <em>after</em> is the finished one, "
-               "so what lies between is the repair and the remaining steps.",
-            r->history->round_count ? (int)r->history->rounds[0].iteration : 0);
+    if (r->history->has_without)
+        put(p, " <em>Without repair</em> is a second training from the same start and seed with as many steps (%d), but no repair: "
+               "what differs is what the repair alone gave, %+.2f dB in the mean.",
+            (int)r->iterations, r->mean.psnr - r->without.psnr);
     put_raw(p, "</p>\n<div class=choice role=group aria-label=\"pictures to compare\">");
-    if (r->history->has_before)
-        put_raw(p, "<button data-l=before data-r=after class=on>before | after</button><button data-l=photo data-r=after>photo | after"
-                   "</button><button data-l=photo data-r=before>photo | before</button>"
-                   "<button data-l=error-before data-r=error>error before | after</button>");
+    if (r->history->has_without)
+        put_raw(p, "<button data-l=without data-r=with class=on>without | with repair</button><button data-l=photo data-r=with>photo | "
+                   "with repair</button><button data-l=photo data-r=without>photo | without repair</button>"
+                   "<button data-l=error-without data-r=error>error without | with repair</button>");
     else
-        put_raw(p, "<button data-l=photo data-r=after class=on>photo | result</button><button data-l=after data-r=error>result | error"
+        put_raw(p, "<button data-l=photo data-r=with class=on>photo | result</button><button data-l=with data-r=error>result | error"
                    "</button>");
     put_raw(p, "</div>\n");
     put_legend(p);
@@ -231,22 +231,22 @@ static void put_count(page* p, double x) { // 12345 as 12,345
     for (int i = 0; i < n; i++) put(p, "%c%s", digits[i], (n - 1 - i) % 3 == 0 && i + 1 < n && digits[i] != '-' ? "," : "");
 }
 
-static void put_tile(page* p, const char* name, double value, double before, int digits, const char* unit) {
+static void put_tile(page* p, const char* name, double value, double without, int digits, const char* unit) {
     if (isnan(value)) return;
     put(p, "<div class=tile><dt>%s</dt><dd>%.*f<small>%s</small></dd>", name, digits, value, unit);
-    if (!isnan(before))
-        put(p, "<p class=%s>%+.*f%s since the first repair</p>", value >= before ? "up" : "down", digits, value - before, unit);
+    if (!isnan(without))
+        put(p, "<p class=%s>%+.*f%s by the repair alone</p>", value >= without ? "up" : "down", digits, value - without, unit);
     put_raw(p, "</div>\n");
 }
 
 static void put_tiles(page* p) {
     const gsfix_result* r = p->r;
     const double seconds = r->history->seconds_total;
-    const int has_before = r->history->has_before;
+    const int has_without = r->history->has_without;
     put_raw(p, "<dl class=tiles>\n");
-    put_tile(p, "PSNR, held-out", r->mean.psnr, has_before ? r->before.psnr : NAN, 2, " dB");
-    put_tile(p, "PSNR, seen pixels", r->mean.psnr_seen, has_before ? r->before.psnr_seen : NAN, 2, " dB");
-    put_tile(p, "SSIM, held-out", r->mean.ssim, has_before ? r->before.ssim : NAN, 3, "");
+    put_tile(p, "PSNR, held-out", r->mean.psnr, has_without ? r->without.psnr : NAN, 2, " dB");
+    put_tile(p, "PSNR, seen pixels", r->mean.psnr_seen, has_without ? r->without.psnr_seen : NAN, 2, " dB");
+    put_tile(p, "SSIM, held-out", r->mean.ssim, has_without ? r->without.ssim : NAN, 3, "");
     put(p, "<div class=tile><dt>photos used</dt><dd>%zu<small> of %zu</small></dd></div>\n", r->split->train_count, r->scene->view_count);
     put_raw(p, "<div class=tile><dt>splats</dt><dd>");
     put_count(p, (double)r->splats->count);
@@ -264,35 +264,42 @@ static double nice_step(double range, int wanted) {
 
 typedef struct plot { double x0, y0, sx, sy; } plot; // iteration, dB -> SVG units
 
-static void put_line(page* p, const plot* f, int seen, const char* name) {
-    const gsfix_history* h = p->r->history;
-    put(p, "<polyline class=\"%s\" points=\"", seen ? "seen" : "all");
-    for (size_t i = 0; i < h->curve_count; i++) {
-        const double y = seen ? h->curve[i].psnr_seen : h->curve[i].psnr;
-        if (!isnan(y)) put(p, "%.1f,%.1f ", f->x0 + f->sx * h->curve[i].iteration, f->y0 - f->sy * y);
+static void put_line(page* p, const plot* f, const gsfix_curve_point* points, size_t count, int seen, const char* kind,
+                     const char* name) {
+    put(p, "<polyline class=\"%s\" points=\"", kind);
+    for (size_t i = 0; i < count; i++) {
+        const double y = seen ? points[i].psnr_seen : points[i].psnr;
+        if (!isnan(y)) put(p, "%.1f,%.1f ", f->x0 + f->sx * points[i].iteration, f->y0 - f->sy * y);
     }
     put_raw(p, "\"/>");
-    for (size_t i = 0; i < h->curve_count; i++) {
-        const double y = seen ? h->curve[i].psnr_seen : h->curve[i].psnr;
+    for (size_t i = 0; i < count; i++) {
+        const double y = seen ? points[i].psnr_seen : points[i].psnr;
         if (!isnan(y))
-            put(p, "<circle class=\"%s\" cx=%.1f cy=%.1f r=3.2><title>step %d: %.2f dB (%s), %llu splats</title></circle>",
-                seen ? "seen" : "all", f->x0 + f->sx * h->curve[i].iteration, f->y0 - f->sy * y, (int)h->curve[i].iteration, y,
-                name, (unsigned long long)h->curve[i].splats);
+            put(p, "<circle class=\"%s\" cx=%.1f cy=%.1f r=3.2><title>step %d: %.2f dB (%s), %llu splats</title></circle>", kind,
+                f->x0 + f->sx * points[i].iteration, f->y0 - f->sy * y, (int)points[i].iteration, y, name,
+                (unsigned long long)points[i].splats);
     }
+}
+
+// The PSNR that a curve shows, widened to low..high; whether any is of seen pixels.
+static int curve_range(const gsfix_curve_point* points, size_t count, double* low, double* high) {
+    int has_seen = 0;
+    for (size_t i = 0; i < count; i++)
+        for (int k = 0; k < 2; k++) {
+            const double y = k ? points[i].psnr_seen : points[i].psnr;
+            if (!isfinite(y)) continue;
+            *low = y < *low ? y : *low;
+            *high = y > *high ? y : *high;
+            has_seen |= k;
+        }
+    return has_seen;
 }
 
 static void put_curve(page* p) {
     const gsfix_history* h = p->r->history;
     double low = 1e9, high = -1e9;
-    int has_seen = 0;
-    for (size_t i = 0; i < h->curve_count; i++)
-        for (int k = 0; k < 2; k++) {
-            const double y = k ? h->curve[i].psnr_seen : h->curve[i].psnr;
-            if (!isfinite(y)) continue;
-            low = y < low ? y : low;
-            high = y > high ? y : high;
-            has_seen |= k;
-        }
+    const int has_seen = curve_range(h->curve, h->curve_count, &low, &high);
+    (void)curve_range(h->without_curve, h->without_count, &low, &high);
     if (low > high) return;
     const double step = nice_step(high - low > 0.5 ? high - low : 0.5, 5), last = p->r->iterations;
     low = step * floor(low / step - 0.1);
@@ -318,10 +325,17 @@ static void put_curve(page* p) {
         put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>round %d</text>", x, x, TOP - 18, BOTTOM,
             x + 5.0, TOP - 9, (int)h->rounds[i].round);
     }
-    if (has_seen) put_line(p, &f, 1, "seen pixels");
-    put_line(p, &f, 0, "all pixels");
+    if (has_seen && h->without_count) put_line(p, &f, h->without_curve, h->without_count, 1, "seen without", "seen pixels, without repair");
+    if (h->without_count) put_line(p, &f, h->without_curve, h->without_count, 0, "all without", "all pixels, without repair");
+    if (has_seen) put_line(p, &f, h->curve, h->curve_count, 1, "seen", "seen pixels");
+    put_line(p, &f, h->curve, h->curve_count, 0, "all", "all pixels");
     put_raw(p, "</svg>\n");
-    if (has_seen) put_raw(p, "<p class=keys><span><i class=all></i>all pixels</span><span><i class=seen></i>pixels that a training view sees</span></p>");
+    if (has_seen || h->without_count) {
+        put_raw(p, "<p class=keys><span><i class=all></i>all pixels</span>");
+        if (has_seen) put_raw(p, "<span><i class=seen></i>pixels that a training view sees</span>");
+        if (h->without_count) put_raw(p, "<span><i class=\"all without\"></i>paler: as many steps without repair</span>");
+        put_raw(p, "</p>");
+    }
     put_raw(p, "</section>\n");
 }
 
@@ -329,7 +343,7 @@ static void put_seconds(page* p) {
     static const char* const what[GSFIX_STAGES] = {"loading, visible points, initial splats", "training before the first round",
                                                    "rendering and measuring held-out views", "rendering and repairing path frames",
                                                    "training with repaired frames", "checkpoints, from which --resume goes on",
-                                                   "files: pictures, splats"};
+                                                   "files: pictures, splats", "training as many steps without repair, to compare"};
     const gsfix_history* h = p->r->history;
     double sum = 0.0;
     for (int i = 0; i < GSFIX_STAGES; i++) sum += h->seconds[i];
@@ -352,25 +366,25 @@ static void put_cell(page* p, double value, int digits) {
 
 static void put_table(page* p) {
     const gsfix_result* r = p->r;
-    const int has_before = r->history->has_before, has_seen = r->masks != NULL;
+    const int has_without = r->history->has_without, has_seen = r->masks != NULL;
     if (!r->split->test_count) return;
     put_raw(p, "<section><h2>Figures per view</h2><div class=scroll><table><thead><tr><th>view");
-    if (has_before) put_raw(p, "<th>PSNR before, dB");
-    put_raw(p, has_before ? "<th>after, dB" : "<th>PSNR, dB");
-    if (has_seen) put_raw(p, has_before ? "<th>after, seen pixels, dB" : "<th>seen pixels, dB");
-    if (has_before) put_raw(p, "<th>SSIM before");
-    put_raw(p, has_before ? "<th>after" : "<th>SSIM");
+    if (has_without) put_raw(p, "<th>PSNR without repair, dB");
+    put_raw(p, has_without ? "<th>with, dB" : "<th>PSNR, dB");
+    if (has_seen) put_raw(p, has_without ? "<th>with, seen pixels, dB" : "<th>seen pixels, dB");
+    if (has_without) put_raw(p, "<th>SSIM without");
+    put_raw(p, has_without ? "<th>with" : "<th>SSIM");
     put_raw(p, "</tr></thead><tbody>");
     for (size_t i = 0; i <= r->split->test_count; i++) {
         const int mean = i == r->split->test_count;
         const gsfix_score* now = mean ? &r->mean : &r->views[i];
-        const gsfix_score* was = mean ? &r->before : &r->history->before[i];
+        const gsfix_score* was = mean ? &r->without : &r->history->without[i];
         put_raw(p, mean ? "<tr class=mean><td>mean" : "<tr><td>");
         if (!mean) put_escaped(p, r->scene->views[r->split->test[i]].name);
-        if (has_before) put_cell(p, was->psnr, 2);
+        if (has_without) put_cell(p, was->psnr, 2);
         put_cell(p, now->psnr, 2);
         if (has_seen) put_cell(p, now->psnr_seen, 2);
-        if (has_before) put_cell(p, was->ssim, 4);
+        if (has_without) put_cell(p, was->ssim, 4);
         put_cell(p, now->ssim, 4);
         put_raw(p, "</tr>");
     }
@@ -386,7 +400,7 @@ static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"regularize", "Regularisers for few views", NULL, ""}, {"dropout", "Regularisers for few views", "off", ""},
     {"opacity_decay", "Regularisers for few views", "off", " per step"},
     {"scale_penalty", "Regularisers for few views", "off", ""},
-    {"depth_smoothness", "Regularisers for few views", "off", ""}, {"restorer", "Repair", NULL, ""},
+    {"depth_smoothness", "Regularisers for few views", "off", ""}, {"restorer", "Repair", NULL, ""}, {"compare", "Repair", NULL, ""},
     {"trajectory", "Repair", NULL, ""}, {"rounds", "Repair", "none", ""}, {"first_round", "Repair", NULL, "<step "},
     {"last_round", "Repair", NULL, "<step "}, {"windows", "Repair", NULL, " per round"},
     {"window_frames", "Repair", NULL, ""}, {"lambda", "Repair", NULL, " at the end"},
@@ -632,13 +646,14 @@ static const char* const style[] = { // in pieces, since C only promises strings
     ".chart .round{stroke:var(--soft);stroke-dasharray:4 4}.chart text.round{stroke:none}",
     ".chart polyline{fill:none;stroke-width:2.4;stroke:var(--accent)}.chart circle{fill:var(--accent)}",
     ".chart polyline.seen{stroke:var(--warm);stroke-dasharray:6 4}.chart circle.seen{fill:var(--warm)}",
+    ".chart .without,.keys i.without{opacity:0.45}",
     ".keys{display:flex;flex-wrap:wrap;gap:4px 18px;font-size:14px}.keys i{display:inline-block;width:18px;height:4px;border-radius:2px;",
     "vertical-align:middle;margin-right:6px;background:var(--accent)}.keys i.seen{background:var(--warm)}.keys i.k-train{background:#2dd4bf}.keys i.k-test{background:#fb923c}",
     ".stage3{position:relative;background:var(--card);border:1px solid var(--line);border-radius:10px;overflow:hidden}",
     "canvas{display:block;background:#17181c;width:100%;height:min(60vh,480px);cursor:grab;touch-action:pan-y}.zoom{position:absolute;right:10px;top:10px;display:flex;gap:6px}",
     ".zoom button{width:34px;height:34px;padding:0;font-size:18px}",
     ".stages{display:flex;height:26px;border-radius:6px;overflow:hidden;gap:1px;margin:12px 0}.stages i{min-width:2px;flex-basis:0}",
-    ".s0{background:#8b93a5}.s1{background:#0d7a6f}.s2{background:#4f83cc}.s3{background:#c2570c}.s4{background:#6aa84f}.s5{background:#c9a227}.s6{background:#a3788f}",
+    ".s0{background:#8b93a5}.s1{background:#0d7a6f}.s2{background:#4f83cc}.s3{background:#c2570c}.s4{background:#6aa84f}.s5{background:#c9a227}.s6{background:#a3788f}.s7{background:#5a6b8c}",
     ".dot{display:inline-block;width:11px;height:11px;border-radius:3px;margin-right:8px}",
     "table{border-collapse:collapse;font-size:14.5px;font-variant-numeric:tabular-nums}td,th{padding:4px 16px 4px 0;text-align:left;vertical-align:top}",
     "th{font-weight:600;color:var(--soft);border-bottom:1px solid var(--line)}th+th,td.num{text-align:right}.mean td{border-top:1px solid var(--line);font-weight:650}",

@@ -12,14 +12,14 @@ static void begin(fix_run* run, gsfix_app* app) {
     run->ctx = &app->ctx;
     run->iterations = ITERATIONS;
     run->history.view_count = VIEWS;
-    run->history.before = (gsfix_score*)gsf_alloc_zeroed(run->ctx, VIEWS, sizeof(gsfix_score));
-    FUZZ_CHECK(run->history.before);
+    run->history.without = (gsfix_score*)gsf_alloc_zeroed(run->ctx, VIEWS, sizeof(gsfix_score));
+    FUZZ_CHECK(run->history.without);
     gsf_text_printf(run->ctx, &run->switches, "{}");
 }
 
 static void end(fix_run* run) {
     gsfix_history* h = &run->history;
-    void* const lists[] = {h->before, h->curve, h->rounds, h->path, h->samples};
+    void* const lists[] = {h->without, h->without_curve, h->curve, h->rounds, h->path, h->samples};
     for (size_t i = 0; i < sizeof lists / sizeof *lists; i++) gsf_free(run->ctx, lists[i]);
     gsf_destroy_text(run->ctx, &run->switches);
 }
@@ -36,8 +36,8 @@ static gsf_result read_back(fix_run* run, const char* text, size_t size) {
 }
 
 static void check_same(const gsfix_history* a, const gsfix_history* b) {
-    FUZZ_CHECK(a->curve_count == b->curve_count && a->round_count == b->round_count);
-    FUZZ_CHECK(a->path_count == b->path_count && a->sample_count == b->sample_count && a->has_before == b->has_before);
+    FUZZ_CHECK(a->curve_count == b->curve_count && a->without_count == b->without_count && a->round_count == b->round_count);
+    FUZZ_CHECK(a->path_count == b->path_count && a->sample_count == b->sample_count && a->has_without == b->has_without);
     for (size_t i = 0; i < a->curve_count; i++)
         FUZZ_CHECK(a->curve[i].iteration == b->curve[i].iteration && a->curve[i].splats == b->curve[i].splats);
     for (size_t i = 0; i < a->path_count; i++) FUZZ_CHECK(memcmp(a->path + i, b->path + i, 12) == 0);
@@ -49,6 +49,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     fix_run run, again;
     memset(&app, 0, sizeof app);
     app.ctx = fuzz_context(size);
+    app.o.compare = 1;
     fuzz_limit += 128 * size; // its lists, what they print as, and their values
     begin(&run, &app);
     const gsf_result result = read_back(&run, size ? (const char*)data : "", size);

@@ -16,7 +16,7 @@ static const char* const out = TEST_TMP "/out";
 static int resume(const char* option) { // exit status of the program; its lines go to TEST_TMP/stderr
     const char* arguments[] = {"gsfix", "fix", scene_folder, "--out", out, "--views", "2", "--iterations", "4", "--threads", "1",
                                "--restorer", "warp", "--set", "rounds=1,windows=1,window_frames=3,first_round=2,last_round=2",
-                               "--json", option};
+                               "--compare", "--json", option};
     char* copies[sizeof arguments / sizeof *arguments + 1] = {NULL};
     const int count = (int)(sizeof arguments / sizeof *arguments);
     for (int i = 0; i < count; i++) copies[i] = (char*)(uintptr_t)arguments[i];
@@ -121,8 +121,10 @@ static void test_forged(gsf_context* ctx) {
         forge_list(ctx, data, size, json.data, json.size, "\"iteration\"", "w");
         forge_list(ctx, data, size, json.data, json.size, "\"resumed\"", "w");
         forge_list(ctx, data, size, json.data, json.size, "\"seconds_total\"", "f");
-        forge_list(ctx, data, size, json.data, json.size, "\"seconds\"", "fffffff");
-        forge_list(ctx, data, size, json.data, json.size, "\"before\"", "nnnn");
+        forge_list(ctx, data, size, json.data, json.size, "\"seconds\"", "ffffffff");
+        forge_list(ctx, data, size, json.data, json.size, "\"comparing\"", "w");
+        forge_list(ctx, data, size, json.data, json.size, "\"without\"", "nnnn");
+        forge_list(ctx, data, size, json.data, json.size, "\"without_curve\"", "wcnn");
         forge_list(ctx, data, size, json.data, json.size, "\"curve\"", "wcnn");
         forge_list(ctx, data, size, json.data, json.size, "\"rounds\":[[", "wwwwwf");
         forge_list(ctx, data, size, json.data, json.size, "\"path\"", "wwwffffff");

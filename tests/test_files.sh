@@ -48,7 +48,7 @@ works() { # COMMAND...
 }
 same() { cmp -s "$1" "$2" || fail "$1 and $2 differ"; }
 quick=(--views 3 --iterations 4 --max-size 48 --checkpoint-every 2)
-repair=(--restorer warp --set rounds=1,windows=1,window_frames=4,first_round=1,last_round=3)
+repair=(--compare --restorer warp --set rounds=1,windows=1,window_frames=4,first_round=1,last_round=3)
 fix() { "$gsfix" fix "$@" "${quick[@]}"; }
 
 # ---- what others are made from: splats, an output folder of a run with repair, a path
@@ -76,7 +76,7 @@ transforms() { # FOLDER: photos of S/images there, listed by a transforms.json i
     printf ']}' >> T/transforms.json
 }
 new "photos in OUT/test";          transforms test; refused 1 "^gsfix fix: T" fix T --out T
-new "photos in OUT/report/before"; transforms report/before; refused 1 "^gsfix fix: T" fix T --out T "${repair[@]}"
+new "photos in OUT/report/without"; transforms report/without; refused 1 "^gsfix fix: T" fix T --out T "${repair[@]}"
 new "photos in OUT/test, the scene elsewhere"; transforms test; mkdir U; mv T/transforms.json U; sed -i 's,"test/,"../T/test/,g' U/transforms.json
 refused 1 "" fix U --out T
 new "photos in OUT/test, an absolute path to the file"; transforms test; refused 1 "T" fix "$PWD/T/transforms.json" --out ./T/../T
@@ -99,7 +99,7 @@ for name in splats.ply metrics.json report.html checkpoint dit.checkpoint "test/
     refused 1 "OUT/$name" fix S --out OUT --restart
     refused 1 "OUT/$name" fix S --out OUT --resume
 done
-for name in fixed/round1_window1_00002.png report/round7_window1_render.png "report/before/$view"; do
+for name in fixed/round1_window1_00002.png report/round7_window1_render.png "report/without/$view"; do
     new "a file at $name"; mkdir -p "OUT/$(dirname "$name")"; echo mine > "OUT/$name"; refused 1 "OUT/$name" fix S --out OUT "${repair[@]}"
 done
 new "a file at splats.spz";  mkdir OUT; echo mine > OUT/splats.spz; refused 1 "OUT/splats.spz" fix S --out OUT --also spz
@@ -123,7 +123,7 @@ new "features over a file";  echo mine > f.safetensors; refused 1 "f.safetensors
 new "features over weights"; echo mine > S/f; refused 1 "S/f" "$gsfix" restore S/images --out OUT --restorer dit:none --save-features S/f
 
 # ---- links and files where folders are needed
-for name in test fixed report report/before; do
+for name in test fixed report report/without; do
     new "a link at OUT/$name"; mkdir -p OUT docs; [ $name = test ] && rm -r docs && cp -r S/images docs; echo mine > docs/mine
     mkdir -p "$(dirname OUT/$name)"; ln -s "$PWD/docs" OUT/$name
     refused 1 "OUT/$name" fix S --out OUT "${repair[@]}"
@@ -258,7 +258,7 @@ works fix S --out OUT "${repair[@]}" --also spz --restart
 for file in splats.ply splats.spz "test/$view" fixed/round1_window1_00001.png; do same OUT/$file ../made/$file; done
 [ "$(cat OUT/notes.txt OUT/test/notes.txt OUT/fixed/mine.png | sort -u)" = mine ] && [ -d OUT/report/mine ] || fail "lost"
 works fix S --out OUT --restart # without repair: the earlier run's frames and splats.spz are stale
-[ "$(find OUT/fixed -type f)" = OUT/fixed/mine.png ] && [ ! -e OUT/splats.spz ] && [ ! -e "OUT/report/before/$view" ] || fail "stale files stay"
+[ "$(find OUT/fixed -type f)" = OUT/fixed/mine.png ] && [ ! -e OUT/splats.spz ] && [ ! -e "OUT/report/without/$view" ] || fail "stale files stay"
 [ "$(cat OUT/notes.txt)" = mine ] || fail "lost"
 new "resume"; cp -r ../made OUT; rm OUT/splats.ply; works fix S --out OUT "${repair[@]}" --also spz --resume; same OUT/splats.ply ../made/splats.ply
 new "resume where the scene has moved"; cp -r ../made OUT; mv S elsewhere; works fix elsewhere --out OUT "${repair[@]}" --also spz --resume

@@ -43,6 +43,8 @@ expect 2 "$gsfix" fix "$scene" --out x --views=-3
 expect 2 "$gsfix" fix "$scene" --out x --resume --restart
 expect 2 "$gsfix" fix "$scene" --out x --factor 2 --max-size 99
 expect 2 "$gsfix" fix "$scene" "$scene" --out x
+expect 2 "$gsfix" fix "$scene" --out x --compare
+expect 2 "$gsfix" fix "$scene" --out x --compare --restorer none
 expect 2 "$gsfix" render x.ply --out x
 expect 2 "$gsfix" metrics a b --which lpips
 expect 2 "$gsfix" metrics a b --models m
@@ -117,6 +119,26 @@ expect 0 "$gsfix" fix "$scene" --out e --views 3 --iterations 5 --max-size 48 --
 # names with a byte order mark, as some editors write it
 printf '\xef\xbb\xbfframe_002.png\r\nframe_003.png\nframe_004.png\n' > names
 expect 0 "$gsfix" fix "$scene" --out marked --views names --iterations 2 --max-size 48
+
+# --compare: the figures without repair are those of a run without repair, the others of one without --compare
+expect 0 "$gsfix" fix "$scene" --out compared "${small[@]}" --restorer warp --compare --seed 3
+holds "by the repair alone" stdout
+expect 0 "$gsfix" fix "$scene" --out repaired "${small[@]}" --restorer warp --seed 3
+expect 0 "$gsfix" fix "$scene" --out unrepaired "${small[@]}" --restorer none --seed 3
+cmp compared/splats.ply repaired/splats.ply || fail "--compare changes the splats"
+for picture in unrepaired/test/*.png; do
+    cmp "$picture" "compared/report/without/${picture##*/}" || fail "--compare: another picture without repair"
+done
+first() { grep -o "\"$1\":[^,]*" "$2" | head -n 1 | cut -d : -f 2; }
+for key in psnr ssim; do
+    [ "$(first ${key}_without_repair compared/metrics.json)" = "$(first $key unrepaired/metrics.json)" ] ||
+        fail "--compare: another $key without repair"
+    [ "$(first $key compared/metrics.json)" = "$(first $key repaired/metrics.json)" ] || fail "--compare: another $key"
+done
+[ "$(first psnr_without_repair compared/metrics.json)" != "$(first psnr compared/metrics.json)" ] || fail "the repair changed nothing"
+holds '"curve_without_repair":' compared/metrics.json
+holds "without repair | with repair\|without | with repair" compared/report.html
+if grep -q "without repair" repaired/report.html; then fail "a report without --compare speaks of it"; fi
 
 # the smaller commands
 expect 0 "$gsfix" masks "$scene" --views 3 --model a/splats.ply --out masks --max-size 48 --json

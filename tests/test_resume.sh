@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# test_resume.sh GSFIX SCENE SCRATCH [KILLS]: a run that is killed at random moments and resumed leaves the same bytes
-# as an undisturbed one; so do one and two workers. Exit status 1 and a line on the first difference.
+# test_resume.sh GSFIX SCENE SCRATCH [KILLS]: a run that is killed at random moments and resumed, with and without repair
+# for --compare, leaves the same bytes as an undisturbed one; so do one and two workers. Exit status 1 and a line on the first difference.
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3 kills=${4:-5}
 [ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no program or no scene"; exit 77; }
 rm -rf "$scratch"
 mkdir -p "$scratch"
 export OMP_WAIT_POLICY=passive
-options=(--views 3 --restorer warp --iterations 90 --checkpoint-every 5 --max-size 64 --seed 7
+options=(--views 3 --restorer warp --compare --iterations 90 --checkpoint-every 5 --max-size 64 --seed 7
     --set "rounds=2,windows=2,window_frames=5,densify_from=10,densify_until=80,densify_interval=10,densify_grad=0.00002")
 fix() { # OUT OPTION...
     local out=$1
@@ -51,9 +51,13 @@ while [ "$done_kills" -lt "$kills" ]; do
 done
 fix "$scratch/killed" --resume || fail "the last run failed after $kills kills"
 cmp "$scratch/whole/splats.ply" "$scratch/killed/splats.ply" || fail "differs after $kills kills"
-for view in "$scratch/whole/test/"*.png "$scratch/whole/fixed/"*.png; do
+for view in "$scratch/whole/test/"*.png "$scratch/whole/fixed/"*.png "$scratch/whole/report/without/"*.png; do
     cmp "$view" "${view/whole/killed}" || fail "pictures differ after $kills kills"
 done
+figures() { # of metrics.json, without what the clock says
+    grep -o '"\(psnr\|ssim\|iteration\|splats\)[a-z_]*":[^,}]*' "$1/metrics.json"
+}
+[ "$(figures "$scratch/whole")" = "$(figures "$scratch/killed")" ] || fail "figures differ after $kills kills"
 
 # A finished run resumes to the same bytes; other switches are refused by name; a broken checkpoint is refused.
 rm "$scratch/killed/splats.ply"
