@@ -53,7 +53,7 @@ struct gsfix_out {
     int root, own, lock, manifest, job;   // descriptors; -1: none
     uint64_t manifest_size;
     int is_new;                           // no manifest was there
-    int made_root;
+    size_t existed;                       // so much of OUT's path was there
     out_place root_place, job_place;
     gsfix_path job_path;
     char job_name[16];
@@ -645,11 +645,29 @@ static gsf_result check_own(gsfix_app* app) { // is a .gsfix without a manifest 
     return result;
 }
 
+static size_t existing_part(const char* path) { // its length
+    gsfix_path part = gsfix_pathf("%s", path);
+    struct stat s;
+    while (part.s[0] && lstat(part.s, &s) != 0) {
+        char* slash = strrchr(part.s, '/');
+        part.s[slash ? slash - part.s : 0] = 0;
+    }
+    return strlen(part.s);
+}
+
+static void remove_made(const gsfix_out* o, const char* path) { // of OUT's folders those that were made and are empty
+    for (gsfix_path part = gsfix_pathf("%s", path); strlen(part.s) > o->existed;) {
+        char* slash = strrchr(part.s, '/');
+        rmdir(part.s);
+        part.s[slash ? slash - part.s : 0] = 0;
+    }
+}
+
 static gsf_result open_root(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
     struct stat s;
-    o->made_root = lstat(app->o.out, &s) != 0 && errno == ENOENT;
+    o->existed = existing_part(app->o.out);
     gsf_result result = gsfix_make_folder(ctx, app->o.out);
     if (result != GSF_OK) return result;
     o->root = open(app->o.out, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
@@ -911,6 +929,7 @@ gsf_result gsfix_begin_files(gsfix_app* app) {
     gsfix_out* o = (gsfix_out*)gsf_alloc_zeroed(ctx, 1, sizeof *o);
     if (!o) return GSF_ERROR_OUT_OF_MEMORY;
     o->root = o->own = o->lock = o->manifest = o->job = -1;
+    o->existed = SIZE_MAX; // OUT was not opened
     o->plain = ctx->io;
     app->out = o;
     ctx->io.read_fn = read_hook;
@@ -928,8 +947,9 @@ void gsfix_end_files(gsfix_app* app) {
     if (o->lock >= 0 && o->is_new && !o->line_count) { // a run that wrote nothing leaves nothing
         unlinkat(o->own, "manifest", 0);
         unlinkat(o->own, "lock", 0);
-        if (unlinkat(o->root, ".gsfix", AT_REMOVEDIR) == 0 && o->made_root) rmdir(app->o.out);
+        unlinkat(o->root, ".gsfix", AT_REMOVEDIR);
     }
+    if (o->existed != SIZE_MAX) remove_made(o, app->o.out);
     const int open_ones[] = {o->manifest, o->own, o->root, o->lock};
     for (int i = 0; i < 4; i++)
         if (open_ones[i] >= 0) close(open_ones[i]);

@@ -276,6 +276,7 @@ new "masks twice"; works "$gsfix" masks S --views 3 --model "$splats" --out M; w
 new "a path to stdout"; "$gsfix" path S --views 3 --frames 4 --out /dev/stdout 2> ../stderr | cat > ../path && grep -q '"w2c"\|"frames"' ../path || fail "no path"
 new "a path nowhere"; works "$gsfix" path S --views 3 --out /dev/null
 new "a refused run leaves nothing"; run fix S --out OUT --masks nothing; [ "$status" = 1 ] && [ ! -e OUT ] || fail "OUT is there: $(ls -A OUT)"
+run fix S --out a/b/c/ --masks nothing; [ "$status" = 1 ] && [ ! -e a ] || fail "a is there"
 new "views of almost one name"; transforms a; mv T/a/frame_001.png T/a/b.png; mv T/a/frame_002.png T/a_b.png; mv T/a/frame_003.png T/a_b.jpg.png
 cp T/a_b.png T/a_b.jpg; sed -i 's,a/frame_001.png,a/b.png,;s,a/frame_002.png,a_b.png,;s,a/frame_003.png,a_b.jpg.png,;s,a/frame_004.png,a_b.jpg,' T/transforms.json
 works "$gsfix" render "$splats" --scene T --out OUT; [ "$(ls OUT/*.png | wc -l)" = "$(grep -o file_path T/transforms.json | wc -l)" ] || fail "views share a picture: $(ls OUT)"
