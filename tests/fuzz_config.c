@@ -106,13 +106,18 @@ static gsf_result use_schedule(gsf_context* ctx) {
     memset(&desc, 0, sizeof desc);
     const gsf_result result = gsf_nn_load_schedule(ctx, "fuzz/scheduler_config.json", &schedule);
     if (result != GSF_OK) return result;
+    const double* table = schedule.alpha_bar;
+    const int32_t most = schedule.desc.train_steps;
+    FUZZ_CHECK(most >= 2 && isfinite(schedule.final_alpha_bar) && isfinite(table[0]) && isfinite(table[most - 1]));
     desc.steps = 4;
     desc.value_count = 3;
     for (int solver = 0; solver < 3; solver++) {
         desc.solver = (gsf_nn_solver)solver;
         float x[3] = {0.5f, -1.0f, 0.0f};
-        if (gsf_nn_make_sampler(ctx, &schedule, &desc, &sampler) == GSF_OK)
+        if (gsf_nn_make_sampler(ctx, &schedule, &desc, &sampler) == GSF_OK) {
+            for (int32_t i = 0; i < sampler.count; i++) FUZZ_CHECK(sampler.timesteps[i] >= 0 && sampler.timesteps[i] < most);
             while (sampler.index < sampler.count && gsf_nn_step_sampler(ctx, &sampler, values, x, NULL) == GSF_OK) {}
+        }
         gsf_nn_destroy_sampler(ctx, &sampler);
     }
     gsf_nn_destroy_schedule(ctx, &schedule);
