@@ -84,7 +84,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     packs = size > 0 && gsf__crc32(0, data, size) % 8 == 0;
     gsf_context ctx = fuzz_context(size);
     fuzz_limit = (size_t)(16 * GSF__DEFLATE_RATIO) * size + ((size_t)4 << 20); // as much as DEFLATE can hold, unpacked
-    fuzz_room = 16 * size + ((size_t)1 << 18);
+    fuzz_room = 16 * size + ((size_t)1 << 18) + sizeof(gsf__deflater);
     parse(&ctx, data, size);
 
     if (size > 0 && packs) check_gzip(&ctx, data, size);
