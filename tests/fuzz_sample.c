@@ -19,7 +19,8 @@ static void begin(gsf_context* ctx, const gsf_nn_schedule* schedule, int solver,
     run->desc.checkpoint = "fuzz";
     run->latents = latents;
     run->count = VALUES;
-    run->job = 0x12345678u;
+    run->settings = 0x12345678u;
+    run->clip = 0x9abcdef0u;
     for (int i = 0; i < VALUES; i++) latents[i] = 0.5f * (float)i - 1.0f;
     FUZZ_CHECK(gsf_nn_make_sampler(ctx, schedule, &desc, &run->sampler) == GSF_OK);
 }
