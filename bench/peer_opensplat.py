@@ -67,6 +67,7 @@ def main():
         "bench": "splat", "case": "train step", "variant": "OpenSplat", "isa": "host", "threads": options.threads,
         "seconds": statistics.median(wall), "cpu_seconds": (stamps[-1][1] - stamps[0][1]) / len(wall),
         "work": len(wall), "work_unit": "steps", "rate": 1.0 / statistics.median(wall), "reference": "none",
+        "peer": subprocess.run([options.opensplat, "--version"], stdout=subprocess.PIPE, text=True).stdout.strip(),
         "peak_rss_bytes": usage.ru_maxrss * 1024,
     }))
 

@@ -17,7 +17,7 @@ import statistics
 import sys
 
 COLUMNS = ["bench", "case", "variant", "isa", "threads", "seconds", "cpu_seconds", "work", "work_unit", "rate",
-           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes", "ratio", "cpu_ratio"]
+           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes", "ratio", "cpu_ratio", "peer"]
 STAGES = ["project", "bin", "sort", "blend", "loss", "reverse", "gather", "adam"]
 COLORS = ["#8896ab", "#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "#bbbbbb"]
 

@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg and bench/RESULTS.md.
+# bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg, bench/RESULTS.md and (not
+# --quick) README's figures of speed.
 #   SCENE=COLMAP_FOLDER       training steps on its photos as well
 #   START=PLY                 from these splats instead of the scene's points
 #   OPENSPLAT=/path/opensplat and the same steps by OpenSplat in turns with ours, with the ratio (needs SCENE)
 #   ROUNDS=5 STEPS=200        of that comparison
-#   TORCH=python3             and the networks' kernels by the peers that this Python has (PyTorch, oneDNN, OpenBLAS), with the ratios
+#   TORCH=python3             and the networks' kernels by the peers that this Python has, with the ratios (peers_nn.py)
 #   MODEL=FOLDER              and one pass of it: about an hour and a half (make_model --size full --parts transformer,vae)
-# About forty minutes; --quick is a look at it in two. The machine should do nothing else.
+# About an hour with all peers, forty minutes without (and without MODEL); --quick is a look at it in two. The machine should do nothing else.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 build=${GSF_BUILD:-build}
@@ -44,4 +45,7 @@ done
 "$build/bench_nn" --json --filter pipeline ${quick[@]+"${quick[@]}"} --pipeline "$temporary/f32" --pipeline "$temporary/bf16" |
     tee -a "$rows"
 [ -z "${MODEL:-}" ] || "$build/bench_nn" --json --filter model --threads 2 --model "$MODEL" | tee -a "$rows"
-python3 bench/results.py "$rows" bench
+status=0
+python3 bench/results.py "$rows" bench || status=$?
+[ ${#quick[@]} -gt 0 ] || python3 bench/readme.py
+exit "$status"
