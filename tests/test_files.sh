@@ -49,7 +49,7 @@ works() { # COMMAND...
 same() { cmp -s "$1" "$2" || fail "$1 and $2 differ"; }
 quick=(--views 3 --iterations 4 --max-size 48 --checkpoint-every 2)
 repair=(--compare --restorer warp --set rounds=1,windows=1,window_frames=4,first_round=1,last_round=3)
-fix() { "$gsfix" fix "$@" "${quick[@]}"; }
+fix() { timeout -k 5 120 "$gsfix" fix "$@" "${quick[@]}"; }
 
 # ---- what others are made from: splats, an output folder of a run with repair, a path
 cp -r "$scene" S
