@@ -3,8 +3,9 @@
 // By hand: cc -O2 -fopenmp -I. bench/make_model.c -o make_model -lm
 //
 //     make_model OUT [--size tiny|small|full] [--dtype f32|bf16|f16] [--seed S] [--shards N] [--threads N]
-//                    [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]
+//                    [--layers N] [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]
 //
+// --layers N: so many in every network but the autoencoder, for the widths of `full` without its depth.
 // Defaults: small, bf16, seed 0, one file, all parts. `full` has the release's configuration: 34.3 GB as bf16 (14.9 GB of
 // them transformer and VAE), of which never more than one block of values is in memory. OUT gets
 //     transformer/{config.json, diffusion_pytorch_model*.safetensors}      with N > 1 shards and their index
@@ -800,7 +801,7 @@ typedef struct model_options {
     const model_size* size;
     gsf_nn_dtype dtype;
     uint64_t seed;
-    int shards;
+    int shards, layers; // layers 0: the size's own
     unsigned parts;
 } model_options;
 
@@ -1161,7 +1162,7 @@ static gsf_result model_make(gsf_context* ctx, const model_options* o, model_rep
 
 static const char model_usage[] =
     "usage: make_model OUT [--size tiny|small|full] [--dtype f32|bf16|f16] [--seed S] [--shards N] [--threads N]\n"
-    "                      [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]\n";
+    "                      [--layers N] [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]\n";
 
 static gsf_context* model_context; // for the signal
 static void model_interrupt(int number) {
@@ -1208,6 +1209,11 @@ static int model_read_option(const char* name, const char* value, model_options*
     if (strcmp(name, "--shards") == 0) {
         const int ok = model_read_number(value, 999, &number) && number >= 1;
         if (ok) o->shards = (int)number;
+        return ok;
+    }
+    if (strcmp(name, "--layers") == 0) {
+        const int ok = model_read_number(value, 64, &number) && number >= 1;
+        if (ok) o->layers = (int)number;
         return ok;
     }
     if (strcmp(name, "--threads") == 0) {
@@ -1260,6 +1266,12 @@ int main(int argc, char** argv) {
     if (!model_read_options(argc, argv, &o, &threads)) {
         fputs(model_usage, stderr);
         return 2;
+    }
+    model_size shallow = *o.size;
+    if (o.layers) {
+        shallow.layers = o.layers;
+        shallow.text.layers = shallow.eyes.layers = shallow.see.layers = shallow.ask.layers = shallow.tell.layers = o.layers;
+        o.size = &shallow;
     }
     memset(&ctx, 0, sizeof ctx);
     ctx.threads = threads;
