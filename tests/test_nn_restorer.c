@@ -709,6 +709,18 @@ static void test_any_frames(gsf_context* ctx, sample_case* s) {
     CHECK(strstr(ctx->error, "any_frames") != NULL);
     s->desc.any_frames = 1;
     CHECK(run_sample(ctx, s, s->video).steps == 1);
+    s->desc.frames = 9; // the same clip, once as if 9 were another count
+    s->desc.guidance = 1.0f;
+    run_sample(ctx, s, s->video);
+    float* sines = (float*)malloc(s->values * sizeof(float));
+    s->net.sample_frames = 17;
+    run_sample(ctx, s, sines);
+    s->net.sample_frames = 9;
+    const double apart = difference(sines, s->video, s->values);
+    printf("sines in place of the learned positions: relative L2 %.3g of the frames\n", apart);
+    CHECK(apart > 1e-3);
+    free(sines);
+    s->desc.guidance = 0.0f;
     s->desc.any_frames = 0;
     s->desc.frames = 9;
     s->desc.steps = 0;
