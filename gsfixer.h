@@ -205,7 +205,8 @@ GSF_API void gsf_text_json_string(gsf_context* ctx, gsf_text* text, const char* 
 GSF_API void gsf_text_json_number(gsf_context* ctx, gsf_text* text, double value);       // NaN, inf become null
 GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text);
 
-// Whole-file input and output through the io hook. `*data` is freed with gsf_free.
+// Whole-file input and output through the io hook. `*data` is freed with gsf_free. Only regular files are read: a pipe or
+// a device is refused, not waited for.
 // gsf_write_file replaces the file only once everything is written: on a full disk the previous file survives.
 GSF_API GSF_NODISCARD gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size);
 GSF_API GSF_NODISCARD gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void* data, size_t size);
@@ -824,6 +825,8 @@ GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, cons
                                         gsf_json* out);
 // Are files those of the platform, which may list or map them?
 GSF_API int gsf__io_is_plain(const gsf_context* ctx);
+// After GSF_ERROR_IO: is there no such file? Of plain files the platform is asked; a host's hook is taken to mean that.
+GSF_API int gsf__is_absent(const gsf_context* ctx, const char* path);
 #ifdef __cplusplus
 }
 #endif
@@ -1115,11 +1118,49 @@ GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text) {
 
 // ---- >>files -------------------------------------------------------------------
 
-// Reads a first piece before it believes the size that the file claims: a directory claims 2^63 bytes.
+#if defined(__unix__) || defined(__APPLE__)
+#include <sys/stat.h>
+static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to rename onto
+    struct stat info;
+    return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
+}
+
+// NULL, or why `path` is not read: a pipe would wait for its writer, a device never end.
+static const char* gsf__why_unreadable(const char* path) {
+    struct stat info;
+    if (stat(path, &info) != 0) return strerror(errno);
+    return S_ISREG(info.st_mode) ? NULL : S_ISDIR(info.st_mode) ? "is a folder" : "is not a regular file";
+}
+
+static int gsf__is_nothing(const char* path) {
+    struct stat info;
+    return stat(path, &info) != 0 && (errno == ENOENT || errno == ENOTDIR);
+}
+#else
+static int gsf__is_device(const char* path) { (void)path; return 0; }
+static const char* gsf__why_unreadable(const char* path) { (void)path; return NULL; }
+static int gsf__is_nothing(const char* path) {
+    errno = 0;
+    FILE* file = fopen(path, "rb");
+    const int reason = errno;
+    if (file) fclose(file);
+    return !file && reason == ENOENT;
+}
+#endif
+
+// For reading; NULL and ctx->error where that cannot be.
+static FILE* gsf__open_file(gsf_context* ctx, const char* path) {
+    const char* reason = gsf__why_unreadable(path);
+    FILE* file = reason ? NULL : fopen(path, "rb");
+    if (!file) (void)gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, reason ? reason : strerror(errno));
+    return file;
+}
+
+// Reads a first piece before it believes the size that the file claims.
 static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     (void)user;
-    FILE* file = fopen(path, "rb");
-    if (!file) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
+    FILE* file = gsf__open_file(ctx, path);
+    if (!file) return GSF_ERROR_IO;
     gsf_text buffer;
     memset(&buffer, 0, sizeof buffer);
     gsf_result result = GSF_OK;
@@ -1134,7 +1175,7 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
             if (ferror(file)) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
             break;
         }
-        if (first && fseek(file, 0, SEEK_END) == 0) { // the rest at once where the file can tell; pipes simply grow
+        if (first && fseek(file, 0, SEEK_END) == 0) { // the rest at once where the file can tell
             const long end = ftell(file);
             if (end >= 0 && (unsigned long)end >= buffer.size)
                 step = (size_t)end - buffer.size + 1;  // + 1: sees the end
@@ -1154,16 +1195,6 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
     *size = buffer.size;
     return GSF_OK;
 }
-
-#if defined(__unix__) || defined(__APPLE__)
-#include <sys/stat.h>
-static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to rename onto
-    struct stat info;
-    return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
-}
-#else
-static int gsf__is_device(const char* path) { (void)path; return 0; }
-#endif
 
 // A new file beside `path`, whose name goes to `name`: a file or link that is there already is someone's, and stays.
 static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_text* name) {
@@ -1217,6 +1248,10 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
 
 GSF_API int gsf__io_is_plain(const gsf_context* ctx) {
     return ctx->io.read_fn == gsf__stdio_read || ctx->io.plain_files;
+}
+
+GSF_API int gsf__is_absent(const gsf_context* ctx, const char* path) {
+    return !gsf__io_is_plain(ctx) || gsf__is_nothing(path);
 }
 
 GSF_API gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size) {
@@ -2587,8 +2622,8 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
 #ifndef GSF_NO_STB
     if (gsf__io_is_plain(ctx)) { // only as many bytes as the header has
         gsf__stb_source source = gsf__stb_memory(NULL, 0);
-        source.file = fopen(path, "rb");
-        if (!source.file) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
+        source.file = gsf__open_file(ctx, path);
+        if (!source.file) return GSF_ERROR_IO;
         const gsf_result result = gsf__stb_query(ctx, path, &source, width, height, channels);
         fclose(source.file);
 #ifdef GSF_USE_OIIO

@@ -960,7 +960,7 @@ static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned
     struct stat info;
     *data = NULL;
     *size = 0;
-    const int file = open(path, O_RDONLY);
+    const int file = open(path, O_RDONLY | O_NONBLOCK); // a pipe is not waited for
     if (file < 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
     if (fstat(file, &info) == 0 && S_ISREG(info.st_mode) && info.st_size > 0 &&
         (uint64_t)info.st_size <= SIZE_MAX / 2) {
@@ -1349,6 +1349,7 @@ static gsf_result gsf__nn_read_if_there(gsf_context* ctx, const char* path, void
     *data = NULL;
     const gsf_result result = gsf__nn_end_quiet(ctx, &logger, gsf_read_file(ctx, path, data, size));
     if (result != GSF_ERROR_IO) return result;
+    if (!gsf__is_absent(ctx, path)) return gsf_fail(ctx, result, "%s", ctx->error);
     memcpy(ctx->error, error, sizeof error);
     return GSF_OK;
 }
@@ -1374,7 +1375,8 @@ static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_
     if (may_lack) (void)gsf__nn_end_quiet(ctx, &logger, result);
     *found = result == GSF_OK;
     if (result == GSF_OK) return gsf__nn_sort_names(ctx, weights);
-    return may_lack && result == GSF_ERROR_IO ? GSF_OK : result;
+    if (!may_lack || result != GSF_ERROR_IO) return result;
+    return gsf__is_absent(ctx, path->data) ? GSF_OK : gsf_fail(ctx, result, "%s", ctx->error);
 }
 
 static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const char* name, int may_lack, int* found,

@@ -128,6 +128,7 @@ typedef struct gsf_scene {
     size_t* track_begin;    // (point_count+1) into track_views; all zero when the scene has no tracks
     uint32_t* track_views;  // indices into views, ascending within a point, without repeats
     double origin[3];       // for splats made from this scene: mean camera centre
+    size_t missing_count;   // photos that the model names and that are not there: their views are left out
     char* folder;           // as given to the loader
     void* state;            // private: source cameras and sizes for gsf_splat_load_view_image
 } gsf_scene;
@@ -140,7 +141,8 @@ typedef struct gsf_scene_desc {
 // Reads a COLMAP folder (images/ or images_<factor>/, sparse/0/ or sparse/ with {cameras,images,points3D}.{bin,txt}) or
 // a nerfstudio / instant-ngp transforms.json (its folder or the file itself; points from its ply_file_path, else none).
 // Images are not read; their headers are, since a COLMAP camera is rescaled to the actual image size as the official
-// parser does. Views whose photo is missing are left out with a warning; photos are never enlarged. All COLMAP camera
+// parser does. Views whose photo is missing are left out with a warning and counted; a photo that is there and cannot be
+// read is an error; photos are never enlarged. All COLMAP camera
 // models up to THIN_PRISM_FISHEYE are read. Distorted ones become pinhole cameras: perspective models by OpenCV's
 // getOptimalNewCameraMatrix (alpha 0) and crop, as the official parser; fisheye and FOV models by the smallest zoom, at
 // most 75 degrees off axis, that shows no pixel from outside the photo. Tracks that name unknown images lose those
@@ -3143,8 +3145,9 @@ static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
     const gsf_result result = gsf_read_file(ctx, path->data, data, size);
-    gsf__hush_end(ctx, &hush, result == GSF_OK || result == GSF_ERROR_IO);
-    return result == GSF_ERROR_IO ? GSF_OK : result;
+    const int absent = result == GSF_ERROR_IO && gsf__is_absent(ctx, path->data);
+    gsf__hush_end(ctx, &hush, result == GSF_OK || absent);
+    return absent ? GSF_OK : result;
 }
 
 // Names come from files, so they must not lead out of the folder: relative, no "..", no drive.
@@ -3175,9 +3178,10 @@ static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_text* path, int64
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
     const gsf_result result = gsf_query_image(ctx, path->data, width, height, &channels);
-    gsf__hush_end(ctx, &hush, result == GSF_OK || result == GSF_ERROR_IO);
-    if (result == GSF_ERROR_IO) *width = *height = 0;
-    return result == GSF_ERROR_IO ? GSF_OK : result;
+    const int absent = result == GSF_ERROR_IO && gsf__is_absent(ctx, path->data);
+    gsf__hush_end(ctx, &hush, result == GSF_OK || absent);
+    if (absent) *width = *height = 0;
+    return absent ? GSF_OK : result;
 }
 
 // Finds a view's photo. With a factor first in <first folder>_<factor>/, under its own name or with another extension
@@ -3352,6 +3356,7 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
         }
         if (result == GSF_OK && present) scene->view_count++;
     }
+    scene->missing_count = missing;
     if (missing > 1)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu photos are missing", photos->folder, missing, m->image_count);
     if (result == GSF_OK && scene->view_count == 0)

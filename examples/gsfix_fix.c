@@ -1149,6 +1149,7 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     for (int i = 0; i < GSFIX_STAGES; i++) gsfix_json_number(ctx, t, gsfix_stage_names[i], h->seconds[i]);
     gsfix_json_end(ctx, t, '}');
     gsfix_json_stages(run->app, t);
+    gsfix_json_number(ctx, t, "photos_missing", (double)run->scene.missing_count);
     gsfix_json_number(ctx, t, "iterations", r->iterations);
     gsfix_json_number(ctx, t, "splats", (double)r->splats->count);
     gsfix_json_number(ctx, t, "peak_rss_bytes", (double)gsfix_peak_memory());
@@ -1178,6 +1179,10 @@ static gsf_result save_metrics(fix_run* run) {
 static void print_results(fix_run* run, const gsfix_result* r) {
     gsfix_app* app = run->app;
     const gsfix_history* h = &run->history;
+    const size_t missing = run->scene.missing_count;
+    if (missing)
+        gsfix_print(app, "missing    %zu of %zu photos: the views, and which of them are held out, are not the whole scene's",
+                    missing, missing + run->scene.view_count);
     if (run->split.test_count) {
         gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim,
                     run->split.test_count);

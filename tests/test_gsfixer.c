@@ -764,6 +764,34 @@ static void check_survives(gsf_context* ctx, const char* path) {
     gsf_free(ctx, data);
 }
 
+// Only regular files are read, at once: a pipe that nobody writes to, a folder, a device, a link to itself.
+static void test_unreadable_files(gsf_context* ctx) {
+#ifdef __linux__
+    static const char* const says[4] = {"not a regular file", "is a folder", "not a regular file", "symbolic links"};
+    char paths[4][1000];
+    snprintf(paths[0], sizeof paths[0], "%s", test_scratch("pipe.png"));
+    snprintf(paths[1], sizeof paths[1], "%s", test_scratch("folder.png"));
+    snprintf(paths[2], sizeof paths[2], "/dev/zero");
+    snprintf(paths[3], sizeof paths[3], "%s", test_scratch("loop.png"));
+    CHECK(mkfifo(paths[0], 0600) == 0 && mkdir(paths[1], 0700) == 0 && symlink("loop.png", paths[3]) == 0);
+    for (int i = 0; i < 4; i++) {
+        void* data = NULL;
+        size_t size = 0;
+        int64_t w = 0, h = 0;
+        int32_t c = 0;
+        CHECK_RESULT(ctx, gsf_read_file(ctx, paths[i], &data, &size), GSF_ERROR_IO);
+        CHECK(!data && strstr(ctx->error, paths[i]) && strstr(ctx->error, says[i]));
+        CHECK_RESULT(ctx, gsf_query_image(ctx, paths[i], &w, &h, &c), GSF_ERROR_IO);
+        CHECK(strstr(ctx->error, paths[i]) && strstr(ctx->error, says[i]));
+    }
+    remove(paths[0]);
+    rmdir(paths[1]);
+    remove(paths[3]);
+#else
+    (void)ctx;
+#endif
+}
+
 static void test_write_failures(gsf_context* ctx) {
     char path[1000], temporary[1010];
     snprintf(path, sizeof path, "%s", test_scratch("survivor"));
@@ -988,6 +1016,7 @@ int main(void) {
     test_image_guards(&ctx);
     test_png_writing(&ctx);
     test_encoding_without_memory();
+    test_unreadable_files(&ctx);
     test_write_failures(&ctx);
     test_long_files(&ctx);
     test_random_statistics();

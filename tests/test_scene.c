@@ -1,7 +1,10 @@
 // test_scene.c - splat files, COLMAP models, transforms.json, undistortion, view images: golden data, round trips,
 // every truncation, flipped bytes, failing allocations. GSF_FOX may name a folder with the fox photos (see the last
 // test).
+#define _DEFAULT_SOURCE // symlink, mkfifo
 #define GSFIXER_IMPLEMENTATION
+#include <sys/stat.h>
+#include <unistd.h>
 #include "gsfixer_splat.h"
 #include "test.h"
 #include "test_hooks.h"
@@ -779,6 +782,51 @@ static void check_view(gsf_context* ctx, gsf_scene* scene, size_t v, int width, 
               scene->views[v].image.channels == 3 && scene->views[v].image.dtype == GSF_U8);
 }
 
+// Of the platform's files only those that are not there are missing; what is there and cannot be read is an error, since
+// the views that are left, and the split, would be others.
+static void test_unreadable_photos(void) {
+#ifdef __linux__
+    counter count;
+    gsf_context ctx = make_context(&count);
+    char folder[500], path[2000];
+    gsf_image image;
+    snprintf(folder, sizeof folder, "%s", test_scratch("unreadable"));
+    snprintf(path, sizeof path, "rm -rf '%s' && mkdir -p '%s/sparse' '%s/images'", folder, folder, folder);
+    CHECK(system(path) == 0);
+    static const char* const texts[3][2] = {
+        {"cameras", "1 PINHOLE 8 6 5 5 4 3\n"},
+        {"images", "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n3 1 0 0 0 1 0 0 1 c.png\n\n"},
+        {"points3D", "3 0 0 5 1 2 3 0 1 0 2 0\n"}};
+    for (int i = 0; i < 3; i++) {
+        snprintf(path, sizeof path, "%s/sparse/%s.txt", folder, texts[i][0]);
+        CHECK_OK(&ctx, gsf_write_file(&ctx, path, texts[i][1], strlen(texts[i][1])));
+    }
+    CHECK_OK(&ctx, gsf_make_image(&ctx, GSF_U8, 8, 6, 3, &image));
+    for (int i = 0; i < 2; i++) {
+        snprintf(path, sizeof path, "%s/images/%c.png", folder, 'a' + i);
+        CHECK_OK(&ctx, gsf_save_image(&ctx, path, &image));
+    }
+    gsf_destroy_image(&ctx, &image);
+    snprintf(path, sizeof path, "%s/images/c.png", folder);
+    gsf_scene scene = load_folder(&ctx, folder, 0, 0, GSF_OK);
+    CHECK(scene.view_count == 2 && scene.missing_count == 1);
+    gsf_splat_destroy_scene(&ctx, &scene);
+    for (int way = 0; way < 3; way++) {
+        if (way == 0) CHECK(mkfifo(path, 0600) == 0);
+        if (way == 1) CHECK(mkdir(path, 0700) == 0);
+        if (way == 2) CHECK(symlink("c.png", path) == 0);
+        scene = load_folder(&ctx, folder, 0, 0, GSF_ERROR_IO);
+        CHECK(strstr(ctx.error, path) && !scene.views);
+        CHECK(remove(path) == 0);
+    }
+    CHECK(symlink("elsewhere.png", path) == 0); // a link to nothing
+    scene = load_folder(&ctx, folder, 0, 0, GSF_OK);
+    CHECK(scene.missing_count == 1);
+    gsf_splat_destroy_scene(&ctx, &scene);
+    CHECK(count.live == 0);
+#endif
+}
+
 static void test_image_folders(void) {
     static memory_disk disk;
     counter count;
@@ -795,6 +843,7 @@ static void test_image_folders(void) {
     gsf_context ctx = make_disk_context(&count, &disk);
     gsf_scene scene = load_folder(&ctx, "s", 0, 0, GSF_OK);
     CHECK(scene.view_count == 3 && warnings == 1 && strstr(warning, "s/images/d.png")); // d.png is missing
+    CHECK(scene.missing_count == 1);
     if (scene.view_count == 3) {
         CHECK(strcmp(scene.views[0].name, "b.png") == 0 && strcmp(scene.views[2].name, "sub/a.jpg") == 0);
         CHECK(scene.track_begin[1] == 3); // of images 1 9 5 2 without 1
@@ -1085,6 +1134,7 @@ int main(void) {
     test_colmap_text();
     test_lenses();
     test_save_load();
+    test_unreadable_photos();
     test_image_folders();
     test_transforms();
     test_split();
