@@ -2358,8 +2358,8 @@ static gsf_result gsf__colmap_cameras_bin(gsf_context* ctx, gsf__cursor* c, gsf_
         if (!p) return GSF_ERROR_FORMAT;
         const uint32_t id = (uint32_t)gsf__load_le(p, 4), model = (uint32_t)gsf__load_le(p + 4, 4);
         if (model >= GSF__COUNT(gsf__lens_models))
-            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %u: unknown camera model %d", c->name, at + 4,
-                            (unsigned)id, (int)model);
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %u: unknown camera model %d (colmap "
+                            "image_undistorter makes pinhole cameras of it)", c->name, at + 4, (unsigned)id, (int)model);
         const unsigned char* values =
             gsf__take(ctx, c, 8u * gsf__lens_models[model].param_count, "a camera's parameters");
         if (!values) return GSF_ERROR_FORMAT;
@@ -2476,8 +2476,8 @@ static gsf_result gsf__colmap_cameras_txt(gsf_context* ctx, gsf__line* l, gsf__s
         while (model < (int)GSF__COUNT(gsf__lens_models) && !gsf__word_is(word, length, gsf__lens_models[model].name))
             model++;
         if (model == (int)GSF__COUNT(gsf__lens_models))
-            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %llu: unknown camera model \"%.*s\"", l->name,
-                            l->number, (unsigned long long)id, (int)(length < 40 ? length : 40), word);
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %llu: unknown camera model \"%.*s\" (colmap "
+                            "image_undistorter makes pinhole cameras of it)", l->name, l->number, (unsigned long long)id, (int)(length < 40 ? length : 40), word);
         GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a width", &width));
         GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a height", &height));
         double params[GSF__LENS_PARAMS_MAX];

@@ -461,7 +461,7 @@ static void test_colmap_bad(void) {
         {"03_camera_count_huge", GSF_ERROR_FORMAT, "cameras.bin:0: 1152921504606846976 cameras"},
         {"04_name_unterminated", GSF_ERROR_FORMAT, "images.bin:"},
         {"05_points2d_count_huge", GSF_ERROR_FORMAT, "images.bin:"},
-        {"06_unknown_camera_model", GSF_ERROR_UNSUPPORTED, "camera model 77"},
+        {"06_unknown_camera_model", GSF_ERROR_UNSUPPORTED, "camera model 77 (colmap image_undistorter"},
         {"07_image_refers_missing_camera", GSF_ERROR_FORMAT, "camera 9 does not exist"},
         {"08_nan_pose", GSF_ERROR_NUMERIC, "images.bin:8:"},
         {"09_track_len_huge", GSF_ERROR_FORMAT, "track entries"},
