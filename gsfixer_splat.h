@@ -2477,7 +2477,8 @@ static gsf_result gsf__colmap_cameras_txt(gsf_context* ctx, gsf__line* l, gsf__s
             model++;
         if (model == (int)GSF__COUNT(gsf__lens_models))
             return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: camera %llu: unknown camera model \"%.*s\" (colmap "
-                            "image_undistorter makes pinhole cameras of it)", l->name, l->number, (unsigned long long)id, (int)(length < 40 ? length : 40), word);
+                            "image_undistorter makes pinhole cameras of it)", l->name, l->number, (unsigned long long)id,
+                            (int)(length < 40 ? length : 40), word);
         GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a width", &width));
         GSF__TRY(gsf__take_u64(ctx, l, UINT64_MAX, "a height", &height));
         double params[GSF__LENS_PARAMS_MAX];
