@@ -489,7 +489,7 @@ typedef struct gsf_fix_desc {
     uint32_t _start_canary;
     gsf_train_desc train;         // the whole run; train.iterations counts all steps
     gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
-    const double* points;         // (point_count,3) world points for the path's principal axes; NULL = cameras only.
+    const double* points;         // (point_count,3) world points for the path's axes and depth; NULL = cameras only.
     size_t point_count;           //   Borrowed until the fixer is destroyed
     int32_t rounds;               // restoration rounds, default 3; < 0: none
     int32_t first_round;          // iteration after which the first round runs; 0 = about 1/3 of the iterations, shortly
@@ -523,6 +523,7 @@ typedef struct gsf_fix_stats { // what the last step did
 typedef struct gsf_fixer gsf_fixer;
 
 // Views and splats are copied; the restorer (NULL: plain training) is borrowed until the fixer is destroyed.
+// The path of every round is sampled once: cameras among which none can be flown are GSF_ERROR_DEGENERATE before any training.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc,
                                                       const gsf_train_view* views, size_t view_count,
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
@@ -11851,6 +11852,42 @@ static gsf_camera gsf__frame_camera(const gsf_fixer* f, const gsf_camera* camera
     return f->limits.squash ? gsf__squashed_camera(f, camera) : gsf__square_camera(f, camera);
 }
 
+static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
+    gsf_traj_path_desc desc;
+    gsf_traj_path_layout layout;
+    memset(&desc, 0, sizeof desc);
+    desc.kind = f->desc.trajectory;
+    desc.window_length = f->frames;
+    desc.window_count = f->desc.windows;
+    desc.round = f->round;
+    desc.seed = f->desc.train.seed;
+    desc.points = f->desc.points;
+    desc.point_count = f->desc.point_count;
+    GSF__TRY(gsf_traj_query_path(ctx, f->view_count, &desc, &layout));
+    GSF_ASSERT(layout.frame_count == (size_t)f->desc.windows * (size_t)f->frames);
+    void* scratch = gsf_alloc(ctx, layout.scratch_bytes, 1);
+    if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_result result =
+        gsf_traj_sample_path(ctx, f->cameras, f->view_count, &desc, scratch, f->path, f->reference_index);
+    gsf_free(ctx, scratch);
+    return result;
+}
+
+// A path that cannot be flown is found out before anything is trained: every round's is sampled once.
+static gsf_result gsf__check_paths(gsf_context* ctx, gsf_fixer* f) {
+    const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
+    f->path = (gsf_camera*)gsf_alloc(ctx, total, sizeof(gsf_camera));
+    f->reference_index = (int32_t*)gsf_alloc(ctx, total, sizeof(int32_t));
+    gsf_result result = f->path && f->reference_index ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (f->round = 0; result == GSF_OK && f->round < f->desc.rounds; f->round++) result = gsf__sample_path(ctx, f);
+    gsf_free(ctx, f->path);
+    gsf_free(ctx, f->reference_index);
+    f->path = NULL;
+    f->reference_index = NULL;
+    f->round = 0;
+    return result;
+}
+
 GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc, const gsf_train_view* views,
                                         size_t view_count, const gsf_splats* initial, const gsf_restorer* restorer,
                                         gsf_fixer** out) {
@@ -11879,6 +11916,7 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
         if (result == GSF_OK) result = gsf_convert_image(ctx, image, f->photos + i);
     }
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
+    if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f) result = gsf_splat_make_warp(ctx, &f->explain);
 cleanup:
     if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
@@ -11906,27 +11944,6 @@ static float gsf__restored_weight(const gsf_fixer* f) {
     const float span = (float)(f->desc.train.iterations - f->desc.first_round);
     const float t = span > 0.0f ? (float)(f->trainer->iteration - f->desc.first_round) / span : 1.0f;
     return t <= 0.0f ? 0.0f : f->desc.lambda * (t < 1.0f ? t * (2.0f - t) : 1.0f);
-}
-
-static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
-    gsf_traj_path_desc desc;
-    gsf_traj_path_layout layout;
-    memset(&desc, 0, sizeof desc);
-    desc.kind = f->desc.trajectory;
-    desc.window_length = f->frames;
-    desc.window_count = f->desc.windows;
-    desc.round = f->round;
-    desc.seed = f->desc.train.seed;
-    desc.points = f->desc.points;
-    desc.point_count = f->desc.point_count;
-    GSF__TRY(gsf_traj_query_path(ctx, f->view_count, &desc, &layout));
-    GSF_ASSERT(layout.frame_count == (size_t)f->desc.windows * (size_t)f->frames);
-    void* scratch = gsf_alloc(ctx, layout.scratch_bytes, 1);
-    if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    const gsf_result result =
-        gsf_traj_sample_path(ctx, f->cameras, f->view_count, &desc, scratch, f->path, f->reference_index);
-    gsf_free(ctx, scratch);
-    return result;
 }
 
 // Path of this round, its frames' sizes and buffers.
