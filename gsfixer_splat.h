@@ -142,12 +142,13 @@ typedef struct gsf_scene_desc {
 // a nerfstudio / instant-ngp transforms.json (its folder or the file itself; points from its ply_file_path, else none).
 // Images are not read; their headers are, since a COLMAP camera is rescaled to the actual image size as the official
 // parser does. Views whose photo is missing are left out with a warning and counted; a photo that is there and cannot be
-// read is an error; photos are never enlarged. All COLMAP camera
-// models up to THIN_PRISM_FISHEYE are read. Distorted ones become pinhole cameras: perspective models by OpenCV's
-// getOptimalNewCameraMatrix (alpha 0) and crop, as the official parser; fisheye and FOV models by the smallest zoom, at
-// most 75 degrees off axis, that shows no pixel from outside the photo. Tracks that name unknown images lose those
-// entries; points that are not finite are dropped; both with a warning. Image names that lead out of the folder ("..",
-// absolute) are refused. Memory and time in proportion to the files.
+// read is an error; photos are never enlarged. All of COLMAP's camera models are read (up to EUCM, of version 4.1) but
+// EQUIRECTANGULAR, whose panoramas no pinhole camera shows. Distorted ones become pinhole cameras: RADIAL and OPENCV
+// models by OpenCV's getOptimalNewCameraMatrix (alpha 0) and crop, as the official parser; fisheye, FOV, DIVISION and
+// EUCM models by the smallest zoom, at most 75 degrees off axis, that shows no pixel from outside the photo. The rigs
+// and frames that COLMAP writes beside the model since 3.12 are not needed: its images have their own poses. Tracks that
+// name unknown images lose those entries; points that are not finite are dropped; both with a warning. Image names that
+// lead out of the folder ("..", absolute) are refused. Memory and time in proportion to the files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
                                                       gsf_scene* out);
 typedef struct gsf_bytes {
@@ -2088,13 +2089,24 @@ GSF_API gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_
                                    u64 m, m x { f64 x y, u64 point } }
        points3D.bin  u64 n | n x { u64 id, f64 x y z, u8 r g b, f64 error, u64 m, m x { u32 image, u32 index } } */
 
-typedef enum gsf__lens_kind { GSF__LENS_PINHOLE, GSF__LENS_RATIONAL, GSF__LENS_FISHEYE, GSF__LENS_FOV } gsf__lens_kind;
+typedef enum gsf__lens_kind {
+    GSF__LENS_PINHOLE,
+    GSF__LENS_RATIONAL,
+    GSF__LENS_FISHEYE,
+    GSF__LENS_FOV,
+    GSF__LENS_FISHEYE624, // as Project Aria calls it: 6 radial, 2 tangential, 4 thin prism coefficients
+    GSF__LENS_DIVISION,
+    GSF__LENS_EUCM,
+    GSF__LENS_PANORAMA    // has no pinhole image: no gsf__lens is of this kind
+} gsf__lens_kind;
 
-typedef struct gsf__lens { // any COLMAP camera, brought to one of four kinds; formulas in gsf__lens_distort
+typedef struct gsf__lens { // any COLMAP camera, brought to one of a few kinds; formulas in gsf__lens_distort
     gsf__lens_kind kind;
     int32_t width, height;
     double fx, fy, cx, cy;
-    double k[8]; // RATIONAL k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order); FISHEYE k1 k2 p1 p2 k3 k4 sx1 sy1; FOV omega
+    // RATIONAL k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order); FISHEYE k1 k2 p1 p2 k3 k4 sx1 sy1; FOV omega;
+    // FISHEYE624 k0..k5 p0 p1 s0..s3; DIVISION k; EUCM alpha beta
+    double k[12];
 } gsf__lens;
 
 typedef struct gsf__sfm_camera {
@@ -2139,28 +2151,67 @@ static void gsf__sfm_destroy(gsf_context* ctx, gsf__sfm* m) {
     memset(m, 0, sizeof *m);
 }
 
-enum { GSF__LENS_PARAMS_MAX = 12, GSF__LENS_SIZE_MAX = 1000000 };
+enum { GSF__LENS_PARAMS_MAX = 16, GSF__LENS_SIZE_MAX = 1000000 };
 
 typedef struct gsf__lens_model { // COLMAP's camera models by id
     const char* name;
     unsigned char param_count, focal_count;
     gsf__lens_kind kind;
-    signed char slot[8]; // where each parameter after the principal point goes in gsf__lens.k
+    signed char slot[12]; // where each parameter after the principal point goes in gsf__lens.k
 } gsf__lens_model;
 
-static const gsf__lens_model gsf__lens_models[11] = {
-    {"SIMPLE_PINHOLE", 3, 1, GSF__LENS_PINHOLE, {0, 0, 0, 0, 0, 0, 0, 0}},
-    {"PINHOLE", 4, 2, GSF__LENS_PINHOLE, {0, 0, 0, 0, 0, 0, 0, 0}},
-    {"SIMPLE_RADIAL", 4, 1, GSF__LENS_RATIONAL, {0, 0, 0, 0, 0, 0, 0, 0}},
-    {"RADIAL", 5, 1, GSF__LENS_RATIONAL, {0, 1, 0, 0, 0, 0, 0, 0}},
-    {"OPENCV", 8, 2, GSF__LENS_RATIONAL, {0, 1, 2, 3, 0, 0, 0, 0}},
-    {"OPENCV_FISHEYE", 8, 2, GSF__LENS_FISHEYE, {0, 1, 4, 5, 0, 0, 0, 0}},
+static const gsf__lens_model gsf__lens_models[18] = { // COLMAP 3.12 writes the first 12, 4.1 all of them
+    {"SIMPLE_PINHOLE", 3, 1, GSF__LENS_PINHOLE, {0}},
+    {"PINHOLE", 4, 2, GSF__LENS_PINHOLE, {0}},
+    {"SIMPLE_RADIAL", 4, 1, GSF__LENS_RATIONAL, {0}},
+    {"RADIAL", 5, 1, GSF__LENS_RATIONAL, {0, 1}},
+    {"OPENCV", 8, 2, GSF__LENS_RATIONAL, {0, 1, 2, 3}},
+    {"OPENCV_FISHEYE", 8, 2, GSF__LENS_FISHEYE, {0, 1, 4, 5}},
     {"FULL_OPENCV", 12, 2, GSF__LENS_RATIONAL, {0, 1, 2, 3, 4, 5, 6, 7}},
-    {"FOV", 5, 2, GSF__LENS_FOV, {0, 0, 0, 0, 0, 0, 0, 0}},
-    {"SIMPLE_RADIAL_FISHEYE", 4, 1, GSF__LENS_FISHEYE, {0, 0, 0, 0, 0, 0, 0, 0}},
-    {"RADIAL_FISHEYE", 5, 1, GSF__LENS_FISHEYE, {0, 1, 0, 0, 0, 0, 0, 0}},
+    {"FOV", 5, 2, GSF__LENS_FOV, {0}},
+    {"SIMPLE_RADIAL_FISHEYE", 4, 1, GSF__LENS_FISHEYE, {0}},
+    {"RADIAL_FISHEYE", 5, 1, GSF__LENS_FISHEYE, {0, 1}},
     {"THIN_PRISM_FISHEYE", 12, 2, GSF__LENS_FISHEYE, {0, 1, 2, 3, 4, 5, 6, 7}},
+    {"RAD_TAN_THIN_PRISM_FISHEYE", 16, 2, GSF__LENS_FISHEYE624, {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11}},
+    {"SIMPLE_DIVISION", 4, 1, GSF__LENS_DIVISION, {0}},
+    {"DIVISION", 5, 2, GSF__LENS_DIVISION, {0}},
+    {"SIMPLE_FISHEYE", 3, 1, GSF__LENS_FISHEYE, {0}},
+    {"FISHEYE", 4, 2, GSF__LENS_FISHEYE, {0}},
+    {"EUCM", 6, 2, GSF__LENS_EUCM, {0, 1}},
+    {"EQUIRECTANGULAR", 2, 0, GSF__LENS_PANORAMA, {0}},
 };
+
+// What makes the lens of a camera meaningless, as the end of a sentence; NULL if nothing does.
+static const char* gsf__lens_fault(const gsf__lens* lens) {
+    const double* k = lens->k;
+    if (!(lens->fx > 0.0 && lens->fy > 0.0)) return "a focal length is not above 0";
+    if (lens->kind == GSF__LENS_FOV && !(fabs(k[0]) < 3.1)) return "omega is not below pi";
+    if (lens->kind == GSF__LENS_EUCM && !(k[0] >= 0.0 && k[0] <= 1.0)) return "alpha is not in 0..1";
+    if (lens->kind == GSF__LENS_EUCM && !(k[1] > 0.0)) return "beta is not above 0";
+    return NULL;
+}
+
+// The lens of a model with its parameters. What bends no ray becomes a pinhole, whose photos are used as they are.
+static gsf__lens gsf__lens_from_params(const gsf__lens_model* info, int32_t width, int32_t height,
+                                       const double* params) {
+    gsf__lens lens;
+    memset(&lens, 0, sizeof lens);
+    lens.kind = info->kind;
+    lens.width = width;
+    lens.height = height;
+    lens.fx = params[0];
+    lens.fy = params[info->focal_count - 1];
+    lens.cx = params[info->focal_count];
+    lens.cy = params[info->focal_count + 1];
+    int zero = 1;
+    for (int i = info->focal_count + 2; i < info->param_count; i++) {
+        lens.k[info->slot[i - info->focal_count - 2]] = params[i];
+        zero = zero && params[i] == 0.0;
+    }
+    const int fisheye = lens.kind == GSF__LENS_FISHEYE || lens.kind == GSF__LENS_FISHEYE624;
+    if (lens.kind == GSF__LENS_EUCM ? lens.k[0] == 0.0 : zero && !fisheye) lens.kind = GSF__LENS_PINHOLE;
+    return lens;
+}
 
 // Checks a camera and adds it. name, at: where it stands, for error texts. params: as many as the model has.
 static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
@@ -2168,8 +2219,11 @@ static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char*
     const gsf__lens_model* info = &gsf__lens_models[model];
     gsf__sfm_camera camera;
     memset(&camera, 0, sizeof camera);
-    gsf__lens* lens = &camera.lens;
     camera.id = id;
+    if (info->kind == GSF__LENS_PANORAMA)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "%s:%zu: camera %u: %s photos are panoramas; cut perspective ones of them first (COLMAP's "
+                        "panorama_sfm.py does)", name, at, (unsigned)id, info->name);
     for (int i = 0; i < info->param_count; i++)
         if (!isfinite(params[i]))
             return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s:%zu: camera %u: parameter %d is not finite", name, at,
@@ -2177,25 +2231,10 @@ static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char*
     if (width < 1 || height < 1 || width > GSF__LENS_SIZE_MAX || height > GSF__LENS_SIZE_MAX)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: image size %llu x %llu", name, at, (unsigned)id,
                         (unsigned long long)width, (unsigned long long)height);
-    lens->kind = info->kind;
-    lens->width = (int32_t)width;
-    lens->height = (int32_t)height;
-    lens->fx = params[0];
-    lens->fy = params[info->focal_count - 1];
-    lens->cx = params[info->focal_count];
-    lens->cy = params[info->focal_count + 1];
-    int zero = 1;
-    for (int i = info->focal_count + 2; i < info->param_count; i++) {
-        lens->k[info->slot[i - info->focal_count - 2]] = params[i];
-        zero = zero && params[i] == 0.0;
-    }
-    if (zero && lens->kind != GSF__LENS_FISHEYE) lens->kind = GSF__LENS_PINHOLE;
-    if (!(lens->fx > 0.0 && lens->fy > 0.0))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: focal length %g, %g", name, at, (unsigned)id,
-                        lens->fx, lens->fy);
-    if (lens->kind == GSF__LENS_FOV && !(fabs(lens->k[0]) < 3.1))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: FOV omega %g is not below pi", name, at,
-                        (unsigned)id, lens->k[0]);
+    camera.lens = gsf__lens_from_params(info, (int32_t)width, (int32_t)height, params);
+    const char* fault = gsf__lens_fault(&camera.lens);
+    if (fault)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %u: %s: %s", name, at, (unsigned)id, info->name, fault);
     GSF__TRY(gsf__reserve(ctx, (void**)&m->cameras, &m->camera_room, m->camera_count, m->camera_count + 1,
                           sizeof *m->cameras));
     m->cameras[m->camera_count++] = camera;
@@ -2352,7 +2391,7 @@ static gsf_result gsf__cursor_end(gsf_context* ctx, const gsf__cursor* c) {
 
 static gsf_result gsf__colmap_cameras_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
     size_t count;
-    GSF__TRY(gsf__take_count(ctx, c, 24 + 3 * 8, "cameras", &count));
+    GSF__TRY(gsf__take_count(ctx, c, 24 + 2 * 8, "cameras", &count));
     for (size_t i = 0; i < count; i++) {
         const size_t at = c->at;
         const unsigned char* p = gsf__take(ctx, c, 24, "a camera");
@@ -2831,16 +2870,15 @@ static double gsf__atan_ratio(double t) {
 }
 
 // Undistorted ray (x, y, 1) to the distorted normalised image point; pixels are then fx u + cx, fy v + cy. The formulas
-// of COLMAP's sensor/models.h, whose RATIONAL is OpenCV's. Difference: no Taylor branches near zero in FOV.
+// of COLMAP's sensor/models.h, whose RATIONAL is OpenCV's. Difference: no Taylor branches near zero in FOV. NaN where
+// the lens shows no such ray.
 static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double* u, double* v) {
     const double* k = lens->k;
     const double r2 = x * x + y * y;
     double scale;
     switch (lens->kind) {
         case GSF__LENS_PINHOLE:
-            *u = x;
-            *v = y;
-            return;
+        case GSF__LENS_PANORAMA: break;
         case GSF__LENS_RATIONAL:
             scale = (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])));
             *u = x * scale + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x);
@@ -2856,6 +2894,25 @@ static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double*
         }
         case GSF__LENS_FOV: // k[1] = 2 tan(omega/2), k[2] = k[1]/omega, set by gsf__rectify_make
             scale = k[2] * gsf__atan_ratio(k[1] * sqrt(r2));
+            *u = x * scale;
+            *v = y * scale;
+            return;
+        case GSF__LENS_FISHEYE624: { // unlike in FISHEYE, the radial distortion is part of what the others bend
+            scale = gsf__atan_ratio(sqrt(r2));
+            const double t2 = r2 * scale * scale;
+            scale *= 1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * (k[3] + t2 * (k[4] + t2 * k[5])))));
+            const double a = x * scale, b = y * scale, q = a * a + b * b;
+            *u = a + 2.0 * k[7] * a * b + k[6] * (q + 2.0 * a * a) + q * (k[8] + q * k[9]);
+            *v = b + 2.0 * k[6] * a * b + k[7] * (q + 2.0 * b * b) + q * (k[10] + q * k[11]);
+            return;
+        }
+        case GSF__LENS_DIVISION:
+            scale = 2.0 / (1.0 + sqrt(1.0 - 4.0 * k[0] * r2));
+            *u = x * scale;
+            *v = y * scale;
+            return;
+        case GSF__LENS_EUCM:
+            scale = 1.0 / (1.0 - k[0] + k[0] * sqrt(1.0 + k[1] * r2));
             *u = x * scale;
             *v = y * scale;
             return;
@@ -2992,7 +3049,7 @@ static double gsf__lens_radius_max(const gsf__lens* lens) {
     return limit;
 }
 
-// For lenses the official parser has no sound way for (fisheye, FOV) and where OpenCV's rectangle fails: same size,
+// For lenses the official parser has no sound way for (all but RATIONAL) and where OpenCV's rectangle fails: same size,
 // principal point and pixel aspect as the photo, the smallest zoom at which no pixel falls outside of it. Exact pixel
 // centres. 0 when nothing is left.
 static int gsf__rectify_by_zoom(gsf__rectify* r) {
