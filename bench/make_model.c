@@ -19,7 +19,8 @@
 //     blip2/{config.json, model*.safetensors, vocab.json, merges.txt, preprocessor_config.json, ...}    in shards, too
 // The encoders of tiny and small have one layer, and the vocabularies are the same few hundred texts at all sizes.
 // A value depends on seed, tensor and place only: not on shards, threads or other parts, and a narrow type's are those of
-// f32 rounded. Each file is written beside its place and renamed.
+// f32 rounded. Each file is written beside its place and renamed. OUT is a new folder or one that make_model made, as its
+// make_model.txt says: a folder of real weights is left alone.
 #define GSFIXER_IMPLEMENTATION
 #include "../gsfixer_nn.h"
 
@@ -1142,9 +1143,27 @@ static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
 }
 
 // reports: MODEL_PARTS of them; a part that was not asked for has no name.
+// The folder itself, with what says that it may be written into again.
+static gsf_result model_make_out(gsf_context* ctx, const char* out) {
+    static const char note[] = "Random weights, written by make_model: what they restore is noise.\n";
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/make_model.txt", out);
+    if (path.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = GSF_OK;
+    FILE* file = NULL;
+    if (model_mkdir(out) == 0) result = gsf_write_file(ctx, path.data, note, sizeof note - 1);
+    else if (errno != EEXIST) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", out, strerror(errno));
+    else if ((file = fopen(path.data, "rb")) == NULL)
+        result = gsf_fail(ctx, GSF_ERROR_IO, "%s: is there already, and not of make_model's making (choose a new folder)", out);
+    if (file) fclose(file);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
 static gsf_result model_make(gsf_context* ctx, const model_options* o, model_report* reports) {
     memset(reports, 0, MODEL_PARTS * sizeof *reports);
-    GSF__TRY(model_make_folder(ctx, o->out));
+    GSF__TRY(model_make_out(ctx, o->out));
     for (int i = 0; i < MODEL_PARTS; i++) {
         if (!(o->parts & model_parts[i].bit)) continue;
         gsf_text folder;

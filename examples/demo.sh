@@ -40,7 +40,6 @@ quietly cmake -S . -B "$out/tree" -DCMAKE_BUILD_TYPE=Release -DGSFIXER_TESTS=OFF
 quietly cmake --build "$out/tree" --parallel 2 --target gsfix --target make_scene
 
 say "ray-tracing a scene"
-rm -rf "$out/scene"
 "$out/tree/make_scene" "$out/scene" --views 40 --width 320 --height 240
 
 export OMP_WAIT_POLICY=passive # workers that wait do not take the cores from others

@@ -10,12 +10,14 @@
                                                     triangulated from noisy pixels, seen in only part of the views that
                                                     could see them, a few of them wrong
        OUT/truth/depth_001.npy ...                  float32 (height,width) camera depth at pixel centres, 0 = sky
-       OUT/truth/visibility.bin                     see write_truth */
+       OUT/truth/visibility.bin                     see write_truth
+   OUT is a new or an empty folder, or one that make_scene wrote: nobody else's files are replaced. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L // mkdir
 #endif
 #include "gsfixer_splat.h"
 
+#include <dirent.h>
 #include <errno.h>
 #include <math.h>
 #include <stdio.h>
@@ -1154,6 +1156,22 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
 
 #ifndef MAKE_SCENE_NO_MAIN
 
+// May the folder be written into: is it not there, empty, or of make_scene's own making, as its truth shows?
+static int may_write(const char* folder) {
+    char path[2048], magic[8] = "";
+    DIR* list = opendir(folder);
+    if (!list) return errno == ENOENT;
+    int empty = 1;
+    for (struct dirent* entry; (entry = readdir(list)) != NULL;)
+        empty &= strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0;
+    closedir(list);
+    snprintf(path, sizeof path, "%s/truth/visibility.bin", folder);
+    FILE* truth = empty ? NULL : fopen(path, "rb");
+    const int ours = truth && fread(magic, 1, sizeof magic, truth) == sizeof magic && memcmp(magic, "GSFTRUTH", 8) == 0;
+    if (truth) fclose(truth);
+    return empty || ours;
+}
+
 static int usage(FILE* to) {
     fprintf(
         to,
@@ -1188,6 +1206,10 @@ int main(int argc, char** argv) {
     if (!folder || o.views < 2 || o.views > 999 || o.width < 16 || o.height < 16 || o.width > 8192 || o.height > 8192 ||
         o.points < 1 || o.arc > 360.0)
         return usage(stderr);
+    if (!may_write(folder)) {
+        fprintf(stderr, "make_scene: %s: is there already, and not of make_scene's making (choose a new folder)\n", folder);
+        return 1;
+    }
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     if (gsf_init_context(&ctx) != GSF_OK) {

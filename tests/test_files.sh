@@ -281,5 +281,15 @@ new "views of almost one name"; transforms a; mv T/a/frame_001.png T/a/b.png; mv
 cp T/a_b.png T/a_b.jpg; sed -i 's,a/frame_001.png,a/b.png,;s,a/frame_002.png,a_b.png,;s,a/frame_003.png,a_b.jpg.png,;s,a/frame_004.png,a_b.jpg,' T/transforms.json
 works "$gsfix" render "$splats" --scene T --out OUT; [ "$(ls OUT/*.png | wc -l)" = "$(grep -o file_path T/transforms.json | wc -l)" ] || fail "views share a picture: $(ls OUT)"
 
+# ---- the makers of scenes and models
+folder=$(dirname "$gsfix")
+new "a scene over a scene"; rm -r S/truth; refused 1 "not of make_scene's making" "$folder/make_scene" S --views 4 --width 32 --height 32
+mkdir E; works "$folder/make_scene" E --views 4 --width 32 --height 32 --points 40; works "$folder/make_scene" E --views 5 --width 32 --height 32 --points 40
+if [ -x "$folder/make_model" ]; then
+    new "a model over a model"; mkdir -p M/scheduler; echo mine > M/scheduler/scheduler_config.json
+    refused 1 "not of make_model's making" "$folder/make_model" M --size tiny --parts scheduler
+    works "$folder/make_model" N --size tiny --parts scheduler; works "$folder/make_model" N --size tiny --parts scheduler
+fi
+
 [ "$failures" = 0 ] || { echo "$failures failures in $cases cases"; exit 1; }
 echo "$cases cases, $SECONDS s: every foreign file as it was"
