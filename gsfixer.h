@@ -394,7 +394,7 @@ typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
 } gsf_restorer_limits;
 
 typedef struct gsf_reference { // a photo the scene was trained on
-    gsf_image color;  // f32, 3 channels
+    gsf_image color;  // f32, 3 channels; the splats' render where the photo has pixels that do not count, and no depth
     gsf_image render; // f32, 3 channels: what the splats show there; data NULL unless needs_depth
     gsf_image depth;  // f32 camera depth rendered from the splats, 0 = nothing there; data NULL unless needs_depth
     gsf_camera camera;

@@ -116,6 +116,8 @@ typedef struct gsf_scene_view {
     uint32_t image_id;  // COLMAP's
     gsf_camera camera;  // pinhole, already at the size of `image` (undistorted, scaled)
     gsf_image image;    // u8 RGB; data is NULL until gsf_splat_load_view_image
+    gsf_image weight;   // u8, 1 channel, of the image's size: how much each pixel counts, 255 fully and 0 not at all (the
+                        // photo's alpha times its mask); data is NULL where all do
 } gsf_scene_view;
 
 typedef struct gsf_scene {
@@ -136,6 +138,7 @@ typedef struct gsf_scene {
 typedef struct gsf_scene_desc {
     int32_t factor;    // images are 1/factor of the model's size: images_<factor>/ if present, else resized; 0 = 1
     int32_t max_size;  // shrink so that the longer side is at most this many pixels; 0 = no limit; not with factor
+    int32_t no_masks;  // all pixels count: masks/ and the photos' alpha are not looked at
 } gsf_scene_desc;
 
 // Reads a COLMAP folder (images/ or images_<factor>/, sparse/0/ or sparse/ with {cameras,images,points3D}.{bin,txt}) or
@@ -169,10 +172,14 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_transforms(gsf_context* ctx, co
 GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view);
 // Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already there). Pixel rows
 // of the undistortion run in parallel. Only for scenes that were loaded from files.
+// view->weight comes from the photo's alpha and from its mask, masks/NAME.png or (COLMAP's way) masks/NAME.EXT.png for the
+// photo images/NAME.EXT: any image in the shape of the photo, of any size, black where the photo does not count. Colours
+// stay as they are stored (alpha is taken to be straight); where photos are resized or undistorted each pixel counts with
+// its weight, so that no colour of a pixel that does not count gets into the others.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view);
-// The same for a photo that the host has decoded: any dtype and layout, 1, 3 or 4 channels, distorted as the camera
-// took it, of any size (it is resized to the camera's). The photo is borrowed for the call; an image already there is
-// replaced.
+// The same for a photo that the host has decoded: any dtype and layout, 1 to 4 channels, the second of two or the fourth
+// its alpha (and so the place for a mask), distorted as the camera took it, of any size (it is resized to the camera's). The
+// photo is borrowed for the call; image and weight already there are replaced.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view,
                                                           const gsf_image* photo);
 // Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are the views' PINHOLE
@@ -294,7 +301,8 @@ typedef struct gsf_dense {
     gsf_dense_map* maps;     // NULL unless wanted
 } gsf_dense;
 
-// Views are indices into scene->views, whose images must be loaded; repeated ones count once. keep: NULL or one byte per
+// Views are indices into scene->views, whose images must be loaded (pixels of a weight below 128 make no points and confirm
+// none); repeated ones count once. keep: NULL or one byte per
 // sparse point, zero = not to be used; the points only guide the search. With fewer than two different views, or none that
 // overlap, the result is GSF_OK and no points. stats may be NULL. Same bits for any number of workers and instruction set.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
@@ -379,8 +387,10 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf
 typedef struct gsf_train_view {
     gsf_camera camera;
     gsf_image image;   // u8 or f32 RGB, same size as the camera; copied. Values beyond 0..1 count as 0 and 1 in the loss
-    gsf_image weight;  // f32, 1 channel: per-pixel weight of the loss (a restorer's confidence); data NULL = 1; copied.
-                       // The loss is sum(weight * term) / (3 W H): weight 0 counts as already right
+    gsf_image weight;  // 1 channel, u8 (255 = 1) or f32: per-pixel weight of the loss (a photo's mask or alpha, a restorer's
+                       // confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A pixel of weight 0 is
+                       // one outside the image: it counts as already right, and its colour is looked at by nobody, nor is
+                       // what is rendered there. Colours are not multiplied by alpha
 } gsf_train_view;
 
 typedef struct gsf_train_desc { // zero = the official 3DGS value given beside each field; s = iterations / 30000
@@ -3095,8 +3105,9 @@ static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
 
 typedef struct gsf__rectify_job {
     const gsf__rectify* r;
-    const uint8_t* src; // packed u8 RGB of the lens's size
-    uint8_t* dst;       // packed u8 RGB of the rectangle's size
+    const uint8_t* src; // packed u8 of the lens's size
+    uint8_t* dst;       // packed u8 of the rectangle's size
+    int32_t channels;
 } gsf__rectify_job;
 
 enum { GSF__RECTIFY_ROWS = 16 };
@@ -3106,7 +3117,7 @@ enum { GSF__RECTIFY_ROWS = 16 };
 static void gsf__rectify_rows(void* arg, size_t chunk, int worker) {
     const gsf__rectify_job* job = (const gsf__rectify_job*)arg;
     const gsf__rectify* r = job->r;
-    const int32_t w = r->lens.width, h = r->lens.height;
+    const int32_t w = r->lens.width, h = r->lens.height, channels = job->channels;
     const int32_t first = (int32_t)chunk * GSF__RECTIFY_ROWS;
     const int32_t last = first + GSF__RECTIFY_ROWS < r->height ? first + GSF__RECTIFY_ROWS : r->height;
     (void)worker;
@@ -3120,23 +3131,24 @@ static void gsf__rectify_rows(void* arg, size_t chunk, int worker) {
             const uint32_t ax = (uint32_t)(tx & 31), ay = (uint32_t)(ty & 31);
             const int64_t x0 = tx >> 5, y0 = ty >> 5;
             const int64_t x1 = x0 + 1 < w ? x0 + 1 : w - 1, y1 = y0 + 1 < h ? y0 + 1 : h - 1;
-            const uint8_t *row0 = job->src + 3 * y0 * w, *row1 = job->src + 3 * y1 * w;
-            uint8_t* out = job->dst + 3 * ((int64_t)j * r->width + i);
-            for (int c = 0; c < 3; c++) {
-                const uint32_t top = row0[3 * x0 + c] * (32 - ax) + row0[3 * x1 + c] * ax;
-                const uint32_t bottom = row1[3 * x0 + c] * (32 - ax) + row1[3 * x1 + c] * ax;
+            const uint8_t *row0 = job->src + channels * y0 * w, *row1 = job->src + channels * y1 * w;
+            uint8_t* out = job->dst + channels * ((int64_t)j * r->width + i);
+            for (int32_t c = 0; c < channels; c++) {
+                const uint32_t top = row0[channels * x0 + c] * (32 - ax) + row0[channels * x1 + c] * ax;
+                const uint32_t bottom = row1[channels * x0 + c] * (32 - ax) + row1[channels * x1 + c] * ax;
                 out[c] = (uint8_t)((top * (32 - ay) + bottom * ay + 512) >> 10);
             }
         }
 }
 
-// photo: packed u8 RGB of the lens's size. out: new image of the rectangle's size.
+// photo: packed u8 of the lens's size. out: new image of the rectangle's size.
 static gsf_result gsf__rectify_image(gsf_context* ctx, const gsf__rectify* r, const gsf_image* photo, gsf_image* out) {
-    GSF__TRY(gsf_make_image(ctx, GSF_U8, r->width, r->height, 3, out));
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, r->width, r->height, photo->channels, out));
     gsf__rectify_job job;
     job.r = r;
     job.src = (const uint8_t*)photo->data;
     job.dst = (uint8_t*)out->data;
+    job.channels = photo->channels;
     gsf__parallel_for(ctx, ((size_t)r->height + GSF__RECTIFY_ROWS - 1) / GSF__RECTIFY_ROWS, gsf__rectify_rows, &job);
     return GSF_OK;
 }
@@ -3145,19 +3157,23 @@ static gsf_result gsf__rectify_image(gsf_context* ctx, const gsf__rectify* r, co
 
 typedef struct gsf__view_source { // what gsf_splat_load_view_image needs of a view
     gsf__rectify rectify;    // lens: of the photo at the size at which it is undistorted
-    size_t path;             // offset in paths; SIZE_MAX: parsed from memory
+    size_t path, mask;       // offsets in paths, of the mask as it is called without .png; SIZE_MAX: parsed from memory
     int64_t file_width, file_height;
 } gsf__view_source;
 
 typedef struct gsf__scene_state {
     gsf__view_source* sources; // per view
     char* names;               // what the views' names point to
-    gsf_text paths;            // of the photos, each terminated
+    gsf_text paths;            // of photos and masks, each terminated
+    int32_t no_masks;
 } gsf__scene_state;
 
 GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene) {
     gsf__scene_state* state = (gsf__scene_state*)scene->state;
-    for (size_t i = 0; i < scene->view_count; i++) gsf_destroy_image(ctx, &scene->views[i].image);
+    for (size_t i = 0; i < scene->view_count; i++) {
+        gsf_destroy_image(ctx, &scene->views[i].image);
+        gsf_destroy_image(ctx, &scene->views[i].weight);
+    }
     if (state) {
         gsf_free(ctx, state->sources);
         gsf_free(ctx, state->names);
@@ -3227,7 +3243,7 @@ static gsf_result gsf__check_relative(gsf_context* ctx, const char* where, size_
 typedef struct gsf__photos { // where the photos of a model lie; NULL instead: nowhere (parsed from memory)
     const char* folder;   // with a separator at its end, or empty
     const char* prefix;   // "images/" (COLMAP) or "" (transforms.json, whose paths hold the folder)
-    int32_t factor, max_size;
+    int32_t factor, max_size, no_masks;
 } gsf__photos;
 
 // Is there an image at `path`? Its size then; *width 0 otherwise.
@@ -3407,10 +3423,14 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
             memset(view, 0, sizeof *view);
         }
         image->camera = present ? scene->view_count : UINT32_MAX;
-        source->path = SIZE_MAX;
+        source->path = source->mask = SIZE_MAX;
         if (result == GSF_OK && present && photos) {
+            const char* slash = photos->prefix[0] ? NULL : strchr(view->name, '/');
             source->path = state->paths.size;
             gsf_text_append(ctx, &state->paths, path.data, path.size + 1);
+            source->mask = state->paths.size; // the folder masks takes the place of the photos' own
+            gsf_text_printf(ctx, &state->paths, "%smasks/%s", photos->folder, slash ? slash + 1 : view->name);
+            gsf_text_append(ctx, &state->paths, "", 1);
             if (state->paths.failed) result = GSF_ERROR_OUT_OF_MEMORY;
         }
         if (result == GSF_OK && present) scene->view_count++;
@@ -3512,6 +3532,7 @@ static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__pho
     memset(scene, 0, sizeof *scene);
     scene->state = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__scene_state));
     gsf_result result = scene->state ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (scene->state && photos) ((gsf__scene_state*)scene->state)->no_masks = photos->no_masks;
     if (result == GSF_OK) result = gsf__scene_make_views(ctx, m, photos, scene);
     if (result == GSF_OK) result = gsf__scene_map_tracks(ctx, m);
     if (result == GSF_OK) {
@@ -3679,6 +3700,7 @@ GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, cons
     memset(out, 0, sizeof *out);
     photos.factor = desc && desc->factor ? desc->factor : 1;
     photos.max_size = desc ? desc->max_size : 0;
+    photos.no_masks = desc ? desc->no_masks : 0;
     if (photos.factor < 1 || photos.max_size < 0 || (photos.factor > 1 && photos.max_size > 0))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "scene: factor %d, max_size %d (not negative, not both)",
                         (int)photos.factor, (int)photos.max_size);
@@ -3695,35 +3717,199 @@ GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, cons
     return result;
 }
 
+// ---- photos and their masks ----
+
+static gsf_image gsf__channels_of(const gsf_image* image, int32_t first, int32_t count) {
+    gsf_image view = *image;
+    view.data = (char*)image->data + first * image->stride_c;
+    view.channels = count;
+    view.owned = NULL;
+    return view;
+}
+
+// Alpha times mask (either may be missing), of the photo's size; data NULL where all pixels count.
+static gsf_result gsf__view_weight(gsf_context* ctx, const gsf_image* photo, const gsf_image* mask, gsf_image* out) {
+    memset(out, 0, sizeof *out);
+    const int has_alpha = photo->channels == 2 || photo->channels == 4;
+    if (!has_alpha && !mask) return GSF_OK;
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 1, out));
+    uint8_t* w = (uint8_t*)out->data;
+    const size_t pixels = (size_t)photo->width * (size_t)photo->height;
+    gsf_result result = GSF_OK;
+    if (has_alpha) {
+        const gsf_image alpha = gsf__channels_of(photo, photo->channels - 1, 1);
+        result = gsf_convert_image(ctx, &alpha, out);
+    } else {
+        memset(w, 255, pixels);
+    }
+    for (size_t i = 0; result == GSF_OK && mask && i < pixels; i++)
+        w[i] = (uint8_t)((w[i] * ((const uint8_t*)mask->data)[i] + 127) / 255);
+    size_t full = 0;
+    while (full < pixels && w[full] == 255) full++;
+    if (result != GSF_OK || full == pixels) gsf_destroy_image(ctx, out);
+    return result;
+}
+
+// Colours and weights in one image, colours times weights, so that neighbours mix in proportion.
+static gsf_result gsf__join_weight(gsf_context* ctx, const gsf_image* rgb, const gsf_image* weight, gsf_image* out) {
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, rgb->width, rgb->height, 4, out));
+    const uint8_t *c = (const uint8_t*)rgb->data, *w = (const uint8_t*)weight->data;
+    float* to = (float*)out->data;
+    for (size_t i = 0; i < (size_t)rgb->width * (size_t)rgb->height; i++) {
+        for (size_t k = 0; k < 3; k++) to[4 * i + k] = (float)(c[3 * i + k] * w[i]) / 255.0f;
+        to[4 * i + 3] = (float)w[i];
+    }
+    return GSF_OK;
+}
+
+static uint8_t gsf__byte_of(float v) { return (uint8_t)(v > 0.0f ? v < 255.0f ? v + 0.5f : 255.0f : 0.0f); }
+
+// To bytes. A bicubic filter overshoots: a weight that is cut to 255 takes its colours along.
+static gsf_result gsf__joint_bytes(gsf_context* ctx, gsf_image* joint) {
+    gsf_image bytes;
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, joint->width, joint->height, 4, &bytes));
+    const float* from = (const float*)joint->data;
+    for (size_t i = 0; i < 4 * (size_t)joint->width * (size_t)joint->height; i += 4)
+        for (size_t k = 0; k < 4; k++)
+            ((uint8_t*)bytes.data)[i + k] = gsf__byte_of(from[i + 3] > 255.0f ? from[i + k] * (255.0f / from[i + 3]) : from[i + k]);
+    gsf_destroy_image(ctx, joint);
+    *joint = bytes;
+    return GSF_OK;
+}
+
+static gsf_result gsf__part_weight(gsf_context* ctx, const gsf_image* joint, gsf_image* rgb, gsf_image* weight) {
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, joint->width, joint->height, 3, rgb));
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, joint->width, joint->height, 1, weight));
+    const uint8_t* from = (const uint8_t*)joint->data;
+    for (size_t i = 0; i < (size_t)joint->width * (size_t)joint->height; i++) {
+        const uint8_t w = from[4 * i + 3];
+        for (size_t k = 0; k < 3 && w > 0; k++)
+            ((uint8_t*)rgb->data)[3 * i + k] = gsf__byte_of(255.0f * from[4 * i + k] / w);
+        ((uint8_t*)weight->data)[i] = w;
+    }
+    return GSF_OK;
+}
+
+// To the size at which the camera was read.
+static gsf_result gsf__size_photo(gsf_context* ctx, const gsf__rectify* r, gsf_image* image) {
+    gsf_image sized;
+    if (image->width == r->lens.width && image->height == r->lens.height) return GSF_OK;
+    GSF__TRY(gsf_make_image(ctx, image->dtype, r->lens.width, r->lens.height, image->channels, &sized));
+    const gsf_result result = gsf_resize_image(ctx, image, GSF_RESIZE_PIL_BICUBIC, &sized);
+    gsf_destroy_image(ctx, image);
+    *image = sized;
+    return result;
+}
+
+// Then without distortion. *image: u8.
+static gsf_result gsf__straighten_photo(gsf_context* ctx, const gsf__rectify* r, gsf_image* image) {
+    gsf_image straight;
+    if (r->lens.kind == GSF__LENS_PINHOLE) return GSF_OK;
+    GSF__TRY(gsf__rectify_image(ctx, r, image, &straight));
+    gsf_destroy_image(ctx, image);
+    *image = straight;
+    return GSF_OK;
+}
+
+// mask: u8, one channel, packed, of the photo's size, or NULL.
+static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view, const gsf_image* photo,
+                                const gsf_image* mask) {
+    const gsf__scene_state* state = (const gsf__scene_state*)scene->state;
+    const gsf__rectify* r = &state->sources[view].rectify;
+    const gsf_image colors = gsf__channels_of(photo, 0, photo->channels < 3 ? 1 : 3);
+    gsf_image rgb, weight, joint;
+    memset(&rgb, 0, sizeof rgb);
+    memset(&weight, 0, sizeof weight);
+    memset(&joint, 0, sizeof joint);
+    gsf_result result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, &rgb);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, &colors, &rgb);
+    if (result == GSF_OK && !state->no_masks) result = gsf__view_weight(ctx, photo, mask, &weight);
+    const int fits = photo->width == r->lens.width && photo->height == r->lens.height && r->lens.kind == GSF__LENS_PINHOLE;
+    if (result == GSF_OK && !weight.data) {
+        result = gsf__size_photo(ctx, r, &rgb);
+        if (result == GSF_OK) result = gsf__straighten_photo(ctx, r, &rgb);
+    }
+    if (result == GSF_OK && !fits && weight.data) {
+        result = gsf__join_weight(ctx, &rgb, &weight, &joint);
+        gsf_destroy_image(ctx, &rgb);
+        gsf_destroy_image(ctx, &weight);
+        if (result == GSF_OK) result = gsf__size_photo(ctx, r, &joint);
+        if (result == GSF_OK) result = gsf__joint_bytes(ctx, &joint);
+        if (result == GSF_OK) result = gsf__straighten_photo(ctx, r, &joint);
+        if (result == GSF_OK) result = gsf__part_weight(ctx, &joint, &rgb, &weight);
+        gsf_destroy_image(ctx, &joint);
+    }
+    gsf_image* const old[2] = {&scene->views[view].image, &scene->views[view].weight};
+    gsf_image made[2] = {rgb, weight};
+    for (int k = 0; k < 2; k++) {
+        gsf_destroy_image(ctx, result == GSF_OK ? old[k] : &made[k]);
+        if (result == GSF_OK) *old[k] = made[k];
+    }
+    return result;
+}
+
+// Reads NAME.png or NAME.EXT.png, `name` being NAME.EXT with its path; *data NULL where there is neither. *path: which.
+static gsf_result gsf__read_mask(gsf_context* ctx, const char* name, gsf_text* path, void** data, size_t* size) {
+    const char *dot = strrchr(name, '.'), *slash = strrchr(name, '/');
+    const size_t length = strlen(name), stem = dot && (!slash || dot > slash) ? (size_t)(dot - name) : length;
+    gsf_text wanted;
+    gsf_result result = GSF_OK;
+    memset(&wanted, 0, sizeof wanted);
+    for (int k = 0; k < 2 && !*data && result == GSF_OK; k++) {
+        wanted.size = 0;
+        gsf_text_append(ctx, &wanted, name, k ? length : stem);
+        gsf_text_append(ctx, &wanted, ".png", 5);
+        result = wanted.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__read_if_there(ctx, "", wanted.data, path, data, size);
+    }
+    gsf_destroy_text(ctx, &wanted);
+    return result;
+}
+
+// But for the rounding of a size to whole pixels.
+static int gsf__same_shape(const gsf_image* a, const gsf_image* b) {
+    const int64_t bent = llabs(a->width * b->height - a->height * b->width);
+    return bent <= a->width || bent <= a->height || bent <= b->width || bent <= b->height;
+}
+
+// The mask of the photo that the folder of masks calls `name`, at the photo's size; *out without data: it has none.
+static gsf_result gsf__load_mask(gsf_context* ctx, const char* name, const gsf_image* photo, gsf_image* out) {
+    gsf_text path;
+    void* data = NULL;
+    size_t size = 0;
+    gsf_image file, bytes;
+    memset(&path, 0, sizeof path);
+    memset(&file, 0, sizeof file);
+    memset(&bytes, 0, sizeof bytes);
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf__read_mask(ctx, name, &path, &data, &size);
+    if (result != GSF_OK || !data) goto cleanup;
+    result = gsf_load_image_memory(ctx, path.data, data, size, 1, &file);
+    if (result != GSF_OK) goto cleanup;
+    if (!gsf__same_shape(&file, photo)) {
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld pixels have not the shape of the photo's, %lld x %lld",
+                          path.data, (long long)file.width, (long long)file.height, (long long)photo->width,
+                          (long long)photo->height);
+        goto cleanup;
+    }
+    result = gsf_make_image(ctx, GSF_U8, file.width, file.height, 1, &bytes);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, &file, &bytes);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 1, out);
+    if (result == GSF_OK) result = gsf_resize_image(ctx, &bytes, GSF_RESIZE_PIL_BILINEAR, out);
+    if (result != GSF_OK) gsf_destroy_image(ctx, out);
+cleanup:
+    gsf_destroy_image(ctx, &file);
+    gsf_destroy_image(ctx, &bytes);
+    gsf_free(ctx, data);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
 GSF_API gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view, const gsf_image* photo) {
     if (view >= scene->view_count)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "scene: view %zu of %zu", view, scene->view_count);
-    const gsf__rectify* r = &((const gsf__scene_state*)scene->state)->sources[view].rectify;
-    gsf_image* out = &scene->views[view].image;
-    gsf_image rgb, sized;
-    memset(&rgb, 0, sizeof rgb);
-    memset(&sized, 0, sizeof sized);
-    // u8 RGB, then the size at which the camera was read, then without distortion; the last stage's result is kept
-    gsf_result result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, &rgb);
-    if (result == GSF_OK) result = gsf_convert_image(ctx, photo, &rgb);
-    if (result == GSF_OK && (rgb.width != r->lens.width || rgb.height != r->lens.height)) {
-        result = gsf_make_image(ctx, GSF_U8, r->lens.width, r->lens.height, 3, &sized);
-        if (result == GSF_OK) result = gsf_resize_image(ctx, &rgb, GSF_RESIZE_PIL_BICUBIC, &sized);
-        gsf_destroy_image(ctx, &rgb);
-        rgb = sized;
-    }
-    if (result == GSF_OK && r->lens.kind != GSF__LENS_PINHOLE) {
-        result = gsf__rectify_image(ctx, r, &rgb, &sized);
-        gsf_destroy_image(ctx, &rgb);
-        rgb = sized;
-    }
-    if (result != GSF_OK) {
-        gsf_destroy_image(ctx, &rgb);
-        return result;
-    }
-    gsf_destroy_image(ctx, out);
-    *out = rgb;
-    return GSF_OK;
+    if (photo->channels < 1 || photo->channels > 4)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "scene: a photo of %d channels", (int)photo->channels);
+    return gsf__set_view(ctx, scene, view, photo, NULL);
 }
 
 GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view) {
@@ -3742,15 +3928,19 @@ GSF_API gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene,
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "\"%s\": the scene came from memory; give its photo to %s",
                         scene->views[view].name, "gsf_splat_set_view_image");
     const char* path = state->paths.data + source->path;
-    gsf_image photo;
-    GSF__TRY(gsf_load_image(ctx, path, 3, &photo));
+    gsf_image photo, mask;
+    memset(&mask, 0, sizeof mask);
+    GSF__TRY(gsf_load_image(ctx, path, state->no_masks ? 3 : 0, &photo));
     gsf_result result = GSF_OK;
     if (photo.width != source->file_width || photo.height != source->file_height)
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld pixels, %lld x %lld when the scene was loaded", path,
                           (long long)photo.width, (long long)photo.height, (long long)source->file_width,
                           (long long)source->file_height);
-    if (result == GSF_OK) result = gsf_splat_set_view_image(ctx, scene, view, &photo);
+    if (result == GSF_OK && !state->no_masks)
+        result = gsf__load_mask(ctx, state->paths.data + source->mask, &photo, &mask);
+    if (result == GSF_OK) result = gsf__set_view(ctx, scene, view, &photo, mask.data ? &mask : NULL);
     gsf_destroy_image(ctx, &photo);
+    gsf_destroy_image(ctx, &mask);
     return result;
 }
 
@@ -5239,6 +5429,7 @@ typedef struct gsf__dense_view {
     gsf_camera camera;
     float fx, fy, cx, cy;    // its, pixel centres at integers
     gsf_image color;         // u8 RGB
+    gsf_image weight;        // u8; data NULL where all pixels count
     size_t first;            // pixel of the level's arrays
     int32_t source_count;
     gsf__dense_source sources[GSF__DENSE_SOURCES];
@@ -5355,6 +5546,11 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u: photo %lld x %lld, camera %d x %d",
                             (unsigned)views[i], (long long)view->image.width, (long long)view->image.height,
                             (int)view->camera.width, (int)view->camera.height);
+        const gsf_image* weight = &view->weight;
+        if (weight->data && (weight->dtype != GSF_U8 || weight->channels != 1 || weight->width != view->image.width ||
+                             weight->height != view->image.height))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u: weight must be u8, one channel, %d x %d",
+                            (unsigned)views[i], (int)view->camera.width, (int)view->camera.height);
     }
     return GSF_OK;
 }
@@ -6000,7 +6196,10 @@ static void gsf__dense_relate(const gsf_camera* from, const gsf_camera* to, floa
 // ---- levels
 
 static void gsf__dense_free_level(gsf__dense_job* job) {
-    for (size_t i = 0; i < job->view_count; i++) gsf_destroy_image(job->ctx, &job->views[i].color);
+    for (size_t i = 0; i < job->view_count; i++) {
+        gsf_destroy_image(job->ctx, &job->views[i].color);
+        gsf_destroy_image(job->ctx, &job->views[i].weight);
+    }
     gsf_free(job->ctx, job->texels);
     gsf_free(job->ctx, job->planes);
     gsf_free(job->ctx, job->others);
@@ -6036,21 +6235,36 @@ static void gsf__dense_size(const gsf_camera* camera, int32_t max_size, int32_t 
     if (*height < 1) *height = 1;
 }
 
-// Photo of a view at its working size: u8 RGB.
+static gsf_result gsf__dense_resize(gsf_context* ctx, const gsf__dense_view* view, gsf_image* image) {
+    gsf_image sized;
+    if (image->width == view->width && image->height == view->height) return GSF_OK;
+    GSF__TRY(gsf_make_image(ctx, image->dtype, view->width, view->height, image->channels, &sized));
+    const gsf_result result = gsf_resize_image(ctx, image, GSF_RESIZE_PIL_BILINEAR, &sized);
+    gsf_destroy_image(ctx, image);
+    *image = sized;
+    return result;
+}
+
+// Photo of a view at its working size: u8 RGB, black where it does not count.
 static gsf_result gsf__dense_load_color(gsf__dense_job* job, gsf__dense_view* view) {
-    const gsf_image* photo = &job->scene->views[view->index].image;
-    gsf_image full;
-    GSF__TRY(gsf_make_image(job->ctx, GSF_U8, photo->width, photo->height, 3, &full));
-    gsf_result result = gsf_convert_image(job->ctx, photo, &full);
-    if (result == GSF_OK && (photo->width != view->width || photo->height != view->height)) {
-        result = gsf_make_image(job->ctx, GSF_U8, view->width, view->height, 3, &view->color);
-        if (result == GSF_OK) result = gsf_resize_image(job->ctx, &full, GSF_RESIZE_PIL_BILINEAR, &view->color);
-        gsf_destroy_image(job->ctx, &full);
-    } else if (result == GSF_OK) {
-        view->color = full;
-    } else {
-        gsf_destroy_image(job->ctx, &full);
-    }
+    gsf_context* ctx = job->ctx;
+    const gsf_scene_view* from = &job->scene->views[view->index];
+    const int weighted = from->weight.data != NULL;
+    gsf_image weight, joint;
+    memset(&weight, 0, sizeof weight);
+    memset(&joint, 0, sizeof joint);
+    GSF__TRY(gsf_make_image(ctx, GSF_U8, from->image.width, from->image.height, 3, &view->color));
+    GSF__TRY(gsf_convert_image(ctx, &from->image, &view->color));
+    if (!weighted) return gsf__dense_resize(ctx, view, &view->color);
+    gsf_result result = gsf_make_image(ctx, GSF_U8, from->weight.width, from->weight.height, 1, &weight);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, &from->weight, &weight);
+    if (result == GSF_OK) result = gsf__join_weight(ctx, &view->color, &weight, &joint);
+    if (result == GSF_OK) result = gsf__dense_resize(ctx, view, &joint);
+    if (result == GSF_OK) result = gsf__joint_bytes(ctx, &joint);
+    gsf_destroy_image(ctx, &view->color);
+    if (result == GSF_OK) result = gsf__part_weight(ctx, &joint, &view->color, &view->weight);
+    gsf_destroy_image(ctx, &joint);
+    gsf_destroy_image(ctx, &weight);
     return result;
 }
 
@@ -6385,6 +6599,16 @@ static gsf_result gsf__dense_make_maps(const gsf__dense_job* job, gsf_dense* out
     return GSF_OK;
 }
 
+// Pixels that count for less than half have no depth: neither to give nor to confirm.
+static void gsf__dense_hide(gsf__dense_job* job) {
+    for (size_t i = 0; i < job->view_count; i++) {
+        const gsf__dense_view* view = job->views + i;
+        const uint8_t* weight = (const uint8_t*)view->weight.data;
+        for (size_t k = 0; weight && k < (size_t)view->width * (size_t)view->height; k++)
+            if (weight[k] < 128) job->planes[view->first + k].cost = GSF__DENSE_BAD;
+    }
+}
+
 static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense_stats* stats) {
     enum { BINS = 64 };
     gsf_context* ctx = job->ctx;
@@ -6395,6 +6619,7 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     job->links = (uint8_t*)gsf_alloc(ctx, job->pixel_count, 1);
     if (!job->links) goto cleanup;
     job->min_normal_dot = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
+    gsf__dense_hide(job);
     gsf__parallel_for(ctx, job->block_count, gsf__dense_link_chunk, job);
     memset(starts, 0, sizeof starts);
     for (size_t i = 0; i < job->pixel_count; i++) {
@@ -8808,6 +9033,8 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 // ---- >>loss --------------------------------------------------------------------
 // L = (1 - lambda) mean(w |x - t|) + lambda mean(w (1 - SSIM(x, t))), x the render and t the photo, both clamped to 0..1, w
 // a weight per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts as already right.
+// Such a pixel is one outside the image: black in x and t, as the 3DGS code has it, so that neither what it shows nor what
+// is rendered there enters its neighbours' windows. Hence its gradient is 0.
 // SSIM as in the 3DGS code: 11x11 Gaussian window, sigma 1.5, zeros outside the image, variances not clamped.
 //
 // A variance is a difference of squares, and SSIM holds it against C2 = 9e-4: floats do only if the squares are small. So
@@ -8832,8 +9059,8 @@ enum {
     GSF__LOSS_RADIUS = 5, GSF__LOSS_MARGIN = 16, GSF__LOSS_GROUP = 4,
     GSF__LOSS_IMAGES = 5 * GSF__LOSS_GROUP, GSF__LOSS_SLOPES = 4 * GSF__LOSS_GROUP, // rows of a ring
     GSF__LOSS_BAND = 64,                                                            // rows of a band at most
-    // of a worker: rings, sums of four planes, of one plane, four planes outside, b and c, weights
-    GSF__LOSS_WORKER_ROWS = 4 * GSF__LOSS_IMAGES + 3 * GSF__LOSS_SLOPES + (4 + 1) * GSF__LOSS_GROUP + 4 + 2 + 1
+    // of a worker: rings, sums of four planes, of one plane, four planes outside, b and c, weights, the render
+    GSF__LOSS_WORKER_ROWS = 4 * GSF__LOSS_IMAGES + 3 * GSF__LOSS_SLOPES + (4 + 1) * GSF__LOSS_GROUP + 4 + 2 + 1 + 1
 };
 
 #define GSF__SSIM_C1 0.0001f // (0.01 * 1)^2
@@ -8848,7 +9075,7 @@ typedef struct gsf__target { // a photo to be matched
     int32_t width, height;
     const uint8_t* u8;       // (H,W,3) packed, or NULL
     const float* f32;        // (H,W,3) packed where u8 is NULL
-    const float* weight;     // (H,W), NULL = 1
+    const float* weight;     // (H,W), NULL = 1; where it is 0 the photo is black
 } gsf__target;
 
 typedef struct gsf__loss_scratch { // grows to the largest photo, then stays
@@ -9143,7 +9370,7 @@ typedef struct gsf__loss_job {
 
 typedef struct gsf__loss_buffers { // of a worker at a band; they point to column 0 of row 0
     float *images, *slopes, *sums, *vertical, *weight; // vertical: sums of one plane, not yet horizontal
-    float *middle[2], *outside;                        // b and c of each float; the images' planes beyond the image
+    float *middle[2], *outside, *render;               // b and c of each float; the images' planes beyond the image
     int32_t first, end;                                // rows of the band
 } gsf__loss_buffers;
 
@@ -9171,6 +9398,17 @@ static const float* gsf__loss_weights(const gsf__loss_job* job, int32_t y, float
     return out;
 }
 
+// Row y of the render, NaN where the weight is 0: the kernels take it as black and without a gradient.
+static const float* gsf__loss_render(const gsf__loss_job* job, int32_t y, float* out) {
+    const size_t width = (size_t)job->target->width;
+    const float* render = job->render + (size_t)y * job->valid;
+    if (!job->target->weight) return render;
+    const float* weight = job->target->weight + (size_t)y * width;
+    for (size_t i = 0; i < width; i++)
+        for (size_t k = 0; k < 3; k++) out[3 * i + k] = weight[i] > 0.0f ? render[3 * i + k] : NAN;
+    return out;
+}
+
 // b and c of each float of a row and its margins: medians over a grid of the band's pixels, by channel. Any values would be
 // right; these leave nothing of flat images or a flat background. Where every window reaches far over the border, zeros are
 // near enough.
@@ -9182,7 +9420,8 @@ static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buff
     float sorted[6][GRID * GRID];
     size_t count = 0;
     for (int32_t y = b->first; y < b->end; y += down)
-        for (size_t x = 0; x < (size_t)target->width; x += across, count++)
+        for (size_t x = 0; x < (size_t)target->width; x += across) {
+            if (target->weight && !(target->weight[(size_t)y * (size_t)target->width + x] > 0.0f)) continue;
             for (size_t k = 0; k < 3; k++) {
                 const size_t at = (size_t)y * job->valid + 3 * x + k;
                 const float r = gsf__loss_clamp(job->render[at]);
@@ -9195,7 +9434,9 @@ static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buff
                     list[to] = value;
                 }
             }
-    const int wide = target->width > GSF__LOSS_RADIUS && target->height > GSF__LOSS_RADIUS;
+            count++;
+        }
+    const int wide = count > 0 && target->width > GSF__LOSS_RADIUS && target->height > GSF__LOSS_RADIUS;
     for (size_t p = 0; p < 2; p++) {
         float* row = b->middle[p] - margin; // begins with channel 2: 3 floats to a pixel, 16 of margin
         for (size_t i = 0; i < 3; i++) row[i] = wide ? sorted[3 * p + (i + 2) % 3][count / 2] : 0.0f;
@@ -9235,8 +9476,8 @@ static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffe
         const int32_t y = b->first - 2 * GSF__LOSS_RADIUS + at;
         const int inside = y >= 0 && y < target->height;
         const size_t from = inside ? (size_t)y * job->valid : 0;
-        job->k.load(job->render + from, target->f32 ? target->f32 + from : NULL, target->u8 ? target->u8 + from : NULL,
-                    b->middle[0], b->middle[1], inside ? job->valid : 0, job->n,
+        job->k.load(inside ? gsf__loss_render(job, y, b->render) : NULL, target->f32 ? target->f32 + from : NULL,
+                    target->u8 ? target->u8 + from : NULL, b->middle[0], b->middle[1], inside ? job->valid : 0, job->n,
                     b->images + (size_t)(at % GSF__LOSS_IMAGES) * job->row, GSF__LOSS_IMAGES * job->row);
     }
 }
@@ -9267,7 +9508,8 @@ static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_b
         const float* s = b->images + (size_t)((at + 2 * GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
         job->k.gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, s,
                         s + GSF__LOSS_IMAGES * job->row, b->middle[1], gsf__loss_weights(job, b->first + at, b->weight),
-                        job->render + packed, job->l1_scale, job->ssim_scale, job->valid, job->d_render + packed);
+                        gsf__loss_render(job, b->first + at, b->render), job->l1_scale, job->ssim_scale, job->valid,
+                        job->d_render + packed);
     }
 }
 
@@ -9285,6 +9527,7 @@ static void gsf__loss_band(void* arg, size_t band, int worker) {
     b.middle[0] = b.outside + 4 * job->row;
     b.middle[1] = b.middle[0] + job->row;
     b.weight = b.middle[1] + job->row;
+    b.render = b.weight + job->row;
     for (size_t i = 0; i < job->n; i++) b.weight[i] = i < job->valid ? 1.0f : 0.0f;
     gsf__loss_fill_middle(job, &b);
     double* totals = job->sums + 2 * band;
@@ -10255,6 +10498,25 @@ static gsf_result gsf__photo_copy(gsf_context* ctx, const gsf_image* image, cons
     return GSF_OK;
 }
 
+// The weights of a photo whose pixels are copied; where one is 0 they become black.
+static gsf_result gsf__photo_weigh(gsf_context* ctx, const gsf_image* weight, size_t index, gsf__photo* photo) {
+    const size_t pixels = (size_t)weight->width * (size_t)weight->height;
+    const size_t bytes = 3 * gsf_dtype_size(photo->target.u8 ? GSF_U8 : GSF_F32);
+    float* out = (float*)gsf_alloc(ctx, pixels, sizeof(float));
+    if (!out) return GSF_ERROR_OUT_OF_MEMORY;
+    photo->weight = out;
+    photo->target.weight = out;
+    if (weight->dtype == GSF_U8) {
+        const gsf_image floats = gsf_wrap_image(out, GSF_F32, weight->width, weight->height, 1);
+        GSF__TRY(gsf_convert_image(ctx, weight, &floats));
+    } else {
+        GSF__TRY(gsf__photo_copy(ctx, weight, "weight of view", index, 0.0f, 1e6f, out));
+    }
+    for (size_t i = 0; i < pixels; i++)
+        if (!(out[i] > 0.0f)) memset((char*)photo->pixels + i * bytes, 0, bytes);
+    return GSF_OK;
+}
+
 static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, const char* what, size_t index,
                                   gsf__photo* out) {
     const gsf_camera* camera = &view->camera;
@@ -10266,9 +10528,9 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s %zu: image must be u8 or f32 RGB of %d x %d", what, index,
                         (int)camera->width, (int)camera->height);
     if (weight->data && (weight->width != camera->width || weight->height != camera->height ||
-                         weight->channels != 1 || weight->dtype != GSF_F32))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s %zu: weight must be f32, one channel, %d x %d", what, index,
-                        (int)camera->width, (int)camera->height);
+                         weight->channels != 1 || (weight->dtype != GSF_F32 && weight->dtype != GSF_U8)))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s %zu: weight must be u8 or f32, one channel, %d x %d", what,
+                        index, (int)camera->width, (int)camera->height);
     const size_t pixels = (size_t)camera->width * (size_t)camera->height;
     out->camera = *camera;
     out->target.width = camera->width;
@@ -10278,11 +10540,7 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
     if (image->dtype == GSF_U8) out->target.u8 = (const uint8_t*)out->pixels;
     else out->target.f32 = (const float*)out->pixels;
-    if (!weight->data) return GSF_OK;
-    out->weight = gsf_alloc(ctx, pixels, sizeof(float));
-    if (!out->weight) return GSF_ERROR_OUT_OF_MEMORY;
-    out->target.weight = (const float*)out->weight;
-    return gsf__photo_copy(ctx, weight, "weight of view", index, 0.0f, 1e6f, out->weight);
+    return weight->data ? gsf__photo_weigh(ctx, weight, index, out) : GSF_OK;
 }
 
 // Memory: 3 bytes (u8) or 12 (f32) per pixel, and 4 with a weight.
@@ -12025,6 +12283,46 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
+// A reference shows the splats' render in place of a photo's pixels that do not count, in proportion, and no depth where
+// those are the most: nothing is carried from there.
+static gsf_result gsf__patch_reference(gsf_context* ctx, const float* weight, const gsf_image* render, gsf_reference* to) {
+    gsf_image patched;
+    const size_t pixels = (size_t)render->width * (size_t)render->height;
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, render->width, render->height, 3, &patched));
+    float *out = (float*)patched.data, *depth = (float*)to->depth.data;
+    const float *photo = (const float*)to->color.data, *shown = (const float*)render->data;
+    for (size_t i = 0; i < pixels; i++) {
+        const float w = weight[i] < 1.0f ? weight[i] : 1.0f;
+        for (size_t k = 3 * i; k < 3 * i + 3; k++) out[k] = w * photo[k] + (1.0f - w) * shown[k];
+        if (depth && w < 0.5f) depth[i] = 0.0f;
+    }
+    to->color = patched;
+    return GSF_OK;
+}
+
+// The photo of view i, and what the splats show there if that is asked for.
+static gsf_result gsf__make_reference(gsf_context* ctx, gsf_fixer* f, size_t i, int needs_depth, gsf_reference* out) {
+    const gsf_camera* camera = f->cameras + i;
+    const float* weight = f->trainer->photos.photos[i].target.weight;
+    out->camera = *camera;
+    out->color = f->photos[i];
+    out->color.owned = NULL; // the fixer's
+    if (!needs_depth && !weight) return GSF_OK;
+    gsf_render_output shown;
+    memset(&shown, 0, sizeof shown);
+    gsf_result result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &shown.color);
+    if (result == GSF_OK && needs_depth)
+        result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &out->depth);
+    if (result == GSF_OK) {
+        shown.depth = out->depth;
+        result = gsf_splat_trainer_render(ctx, f->trainer, camera, &shown);
+    }
+    if (result == GSF_OK && weight) result = gsf__patch_reference(ctx, weight, &shown.color, out);
+    if (needs_depth) out->render = shown.color;
+    else gsf_destroy_image(ctx, &shown.color);
+    return result;
+}
+
 // Hands the photos, and what the splats show at their cameras, to the restorer.
 static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     if (f->references_open) return GSF_OK;
@@ -12032,20 +12330,8 @@ static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     if (!references) return GSF_ERROR_OUT_OF_MEMORY;
     const int needs_depth = f->limits.needs_depth || f->explain.user;
     gsf_result result = GSF_OK;
-    for (size_t i = 0; i < f->view_count && result == GSF_OK; i++) {
-        references[i].camera = f->cameras[i];
-        references[i].color = f->photos[i];
-        if (!needs_depth) continue;
-        result = gsf_make_image(ctx, GSF_F32, f->cameras[i].width, f->cameras[i].height, 1, &references[i].depth);
-        if (result == GSF_OK)
-            result = gsf_make_image(ctx, GSF_F32, f->cameras[i].width, f->cameras[i].height, 3, &references[i].render);
-        if (result != GSF_OK) break;
-        gsf_render_output out;
-        memset(&out, 0, sizeof out);
-        out.color = references[i].render;
-        out.depth = references[i].depth;
-        result = gsf_splat_trainer_render(ctx, f->trainer, f->cameras + i, &out);
-    }
+    for (size_t i = 0; i < f->view_count && result == GSF_OK; i++)
+        result = gsf__make_reference(ctx, f, i, needs_depth, references + i);
     if (result == GSF_OK)
         result = f->restorer->begin_fn(f->restorer->user, ctx, references, (int32_t)f->view_count);
     if (result == GSF_OK && f->explain.user) {
@@ -12054,6 +12340,7 @@ static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     }
     if (result == GSF_OK) f->references_open = 1;
     for (size_t i = 0; i < f->view_count; i++) {
+        gsf_destroy_image(ctx, &references[i].color);
         gsf_destroy_image(ctx, &references[i].render);
         gsf_destroy_image(ctx, &references[i].depth);
     }
@@ -12113,26 +12400,17 @@ static gsf_result gsf__keep_frame(gsf_context* ctx, gsf_fixer* f, const gsf_came
 // The frames as what the trainer takes in place of its restored views.
 static gsf_result gsf__frames_to_photos(gsf_context* ctx, gsf_fixer* f, const gsf__kept_frames* list,
                                         gsf__photo_set* out) {
-    size_t total = 0;
-    for (size_t i = 0; i < list->count; i++)
-        total += (size_t)list->frames[i].camera.width * (size_t)list->frames[i].camera.height;
     gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, list->count + 1, sizeof(gsf_train_view));
-    float* weights = (float*)gsf_alloc(ctx, total + 1, sizeof(float));
-    gsf_result result = views && weights ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    float* next = weights;
-    for (size_t i = 0; i < list->count && result == GSF_OK; i++) {
+    if (!views) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < list->count; i++) {
         const gsf_camera* camera = &list->frames[i].camera;
-        const size_t pixels = (size_t)camera->width * (size_t)camera->height;
-        const gsf_image bytes =
-            gsf_wrap_image(list->frames[i].pixels + 3 * pixels, GSF_U8, camera->width, camera->height, 1);
+        uint8_t* pixels = list->frames[i].pixels;
+        const size_t count = (size_t)camera->width * (size_t)camera->height;
         views[i].camera = *camera;
-        views[i].image = gsf_wrap_image(list->frames[i].pixels, GSF_U8, camera->width, camera->height, 3);
-        views[i].weight = gsf_wrap_image(next, GSF_F32, camera->width, camera->height, 1);
-        result = gsf_convert_image(ctx, &bytes, &views[i].weight);
-        next += pixels;
+        views[i].image = gsf_wrap_image(pixels, GSF_U8, camera->width, camera->height, 3);
+        views[i].weight = gsf_wrap_image(pixels + 3 * count, GSF_U8, camera->width, camera->height, 1);
     }
-    if (result == GSF_OK) result = gsf__restored_make(ctx, f->trainer, views, list->count, out);
-    gsf_free(ctx, weights);
+    const gsf_result result = gsf__restored_make(ctx, f->trainer, views, list->count, out);
     gsf_free(ctx, views);
     return result;
 }

@@ -388,6 +388,78 @@ static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]
     return 0;
 }
 
+typedef struct masked { // references as a restorer is given them
+    repair* r;
+    int32_t needs_depth, begun;
+} masked;
+
+static gsf_result masked_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
+                               gsf_restorer_limits* out) {
+    (void)ctx; (void)frames; (void)width; (void)height;
+    out->frame_count_min = out->frame_count_step = 1;
+    out->needs_depth = ((masked*)user)->needs_depth;
+    return GSF_OK;
+}
+
+static gsf_result masked_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    masked* m = (masked*)user;
+    int green = 0, other = 0, deep = 0;
+    (void)ctx;
+    m->begun++;
+    CHECK(count == VIEWS && (references[1].depth.data != NULL) == m->needs_depth);
+    for (int i = 0; i < count; i++)
+        for (int k = 0; k < PIXELS; k++) {
+            const float* color = (const float*)references[i].color.data + 3 * k;
+            const float* render = (const float*)references[i].render.data;
+            const int hidden = i == 1 && k % WIDTH < WIDTH / 2;
+            green += color[0] == 0.0f && color[1] == 1.0f && color[2] == 0.0f;
+            other += !hidden && memcmp(color, m->r->photos[i] + 3 * k, 3 * sizeof(float)) != 0;
+            if (!m->needs_depth || !hidden) continue;
+            other += memcmp(color, render + 3 * k, 3 * sizeof(float)) != 0;
+            deep += ((const float*)references[i].depth.data)[k] != 0.0f;
+        }
+    CHECK(green == 0 && other == 0 && deep == 0);
+    return GSF_OK;
+}
+
+static gsf_result masked_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    (void)user; (void)ctx; (void)window;
+    return GSF_OK;
+}
+
+static void masked_end(void* user, gsf_context* ctx) { (void)user; (void)ctx; }
+
+// A photo's pixels that do not count are the splats' render in what restorers get, and have no depth there.
+static void test_masked_references(gsf_context* ctx) {
+    static repair r;
+    static uint8_t weight[PIXELS];
+    gsf_fix_desc desc = repair_desc();
+    repair_setup(ctx, &r);
+    for (int k = 0; k < PIXELS; k++) {
+        weight[k] = k % WIDTH < WIDTH / 2 ? 0 : 255;
+        for (int c = 0; c < 3 && !weight[k]; c++) r.photos[1][3 * k + c] = (float)(c == 1);
+    }
+    r.views[1].weight = gsf_wrap_image(weight, GSF_U8, WIDTH, HEIGHT, 1);
+    for (int needs = 0; needs < 2; needs++) {
+        masked m = {&r, needs, 0};
+        gsf_restorer restorer = r.restorer;
+        gsf_fixer* fixer;
+        restorer.user = &m;
+        restorer.query_fn = masked_query;
+        restorer.begin_fn = masked_begin;
+        restorer.end_fn = masked_end;
+        restorer.restore_fn = masked_restore;
+        desc.rounds = 1;
+        desc.first_round = 2;
+        if (!CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &restorer, &fixer))) break;
+        gsf_fix_stats stats;
+        for (int i = 0; i < 8 && !m.begun; i++) CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats));
+        CHECK(m.begun == 1);
+        gsf_splat_destroy_fixer(ctx, fixer);
+    }
+    repair_teardown(ctx, &r);
+}
+
 static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     static repair r;
     gsf_fix_desc given, used;
@@ -827,6 +899,7 @@ int main(void) {
     test_warp_refutes(&ctx);
     test_seen_mask(&ctx);
     test_desc(&ctx);
+    test_masked_references(&ctx);
     test_mixed_windows(&ctx);
     test_loop(&ctx);
     test_rigs(&ctx);

@@ -497,7 +497,7 @@ static void test_colmap_bad(void) {
     CHECK(strstr(ctx.error, "points3D.bin") != NULL);
     CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, "no/such/folder", NULL, &scene), GSF_ERROR_IO);
     CHECK(strstr(ctx.error, "no/such/folder: no scene") != NULL);
-    const gsf_scene_desc both = {2, 100};
+    const gsf_scene_desc both = {2, 100, 0};
     CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, "x", &both, &scene), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(count.live == 0);
 }
@@ -886,6 +886,84 @@ static gsf_scene load_folder(gsf_context* ctx, const char* path, int factor, int
     return scene;
 }
 
+// An object with a soft edge before what is transparent and green, as RGBA. In pixels.
+static void draw_object(int width, int height, uint8_t* rgba) {
+    static const uint8_t object[3] = {200, 60, 120};
+    for (int i = 0; i < width * height; i++) {
+        const double x = (i % width + 0.5) / width - 0.5, y = (i / width + 0.5) / height - 0.5;
+        const double cover = (0.3 - sqrt(x * x + y * y)) * width / 3.0 + 0.5;
+        rgba[4 * i + 3] = (uint8_t)(255.0 * (cover > 0.0 ? cover < 1.0 ? cover : 1.0 : 0.0) + 0.5);
+        for (int k = 0; k < 3; k++) rgba[4 * i + k] = rgba[4 * i + 3] ? object[k] : (uint8_t)(k == 1 ? 255 : 0);
+    }
+}
+
+// Every pixel that counts shows the object (colours of small weight are coarse); some count in part, and `share` of them
+// fully.
+static void check_object(const gsf_scene_view* view, double share, double tolerance) {
+    const uint8_t *c = (const uint8_t*)view->image.data, *w = (const uint8_t*)view->weight.data;
+    const size_t pixels = (size_t)(view->camera.width * view->camera.height);
+    size_t full = 0, part = 0;
+    int wrong = 0;
+    if (!CHECK(c && w && view->weight.width == view->camera.width && view->weight.height == view->camera.height &&
+               view->weight.channels == 1 && view->weight.dtype == GSF_U8)) return;
+    for (size_t i = 0; i < pixels; i++) {
+        const int most = w[i] ? 2 + 256 / w[i] : 0;
+        full += w[i] == 255;
+        part += w[i] > 0 && w[i] < 255;
+        if (w[i]) wrong += abs(c[3 * i] - 200) > most || abs(c[3 * i + 1] - 60) > most || abs(c[3 * i + 2] - 120) > most;
+    }
+    CHECK(wrong == 0 && part > 0);
+    CHECK_NEAR((double)full / (double)pixels, share, tolerance);
+}
+
+static void test_photo_alpha(void) {
+    static const char* const models[3] = {"1 PINHOLE 60 40 50 50 30 20\n", "1 PINHOLE 30 20 25 25 15 10\n",
+                                          "1 OPENCV 30 20 25 25 15 10 -0.2 0.05 0.001 0.002\n"};
+    static uint8_t rgba[4 * 60 * 40], grey[2 * 60 * 40], rgb[3 * 60 * 40];
+    counter count;
+    gsf_context ctx = make_context(&count);
+    draw_object(60, 40, rgba);
+    for (int i = 0; i < 60 * 40; i++) {
+        grey[2 * i] = rgba[4 * i];
+        grey[2 * i + 1] = rgba[4 * i + 3];
+        memcpy(rgb + 3 * i, rgba + 4 * i, 3);
+    }
+    for (int m = 0; m < 3; m++) {
+        const char* images = "1 1 0 0 0 0 0 0 1 a.png\n\n";
+        const gsf_bytes files[2] = {{models[m], strlen(models[m]), NULL}, {images, strlen(images), NULL}};
+        gsf_scene scene;
+        if (!CHECK_OK(&ctx, gsf_splat_parse_colmap(&ctx, 1, &files[0], &files[1], NULL, &scene))) return;
+        gsf_scene_view* view = &scene.views[0];
+        gsf_image photo = gsf_wrap_image(rgba, GSF_U8, 60, 40, 4);
+        CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo));
+        check_object(view, m < 2 ? 0.25 : 0.18, 0.06);
+        if (m == 0) CHECK(((const uint8_t*)view->image.data)[1] == 255); // colours stay as they are stored
+        photo = gsf_wrap_image(grey, GSF_U8, 60, 40, 2);
+        CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo));
+        CHECK(view->weight.data != NULL);
+        // opaque: the same pixels as without alpha, and no weights
+        const size_t bytes = 3 * (size_t)(view->camera.width * view->camera.height);
+        uint8_t* kept = (uint8_t*)malloc(bytes);
+        photo = gsf_wrap_image(rgb, GSF_U8, 60, 40, 3);
+        CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo));
+        CHECK(view->weight.data == NULL);
+        memcpy(kept, view->image.data, bytes);
+        uint8_t* opaque = (uint8_t*)malloc(sizeof rgba);
+        memcpy(opaque, rgba, sizeof rgba);
+        for (int i = 0; i < 60 * 40; i++) opaque[4 * i + 3] = 255;
+        photo = gsf_wrap_image(opaque, GSF_U8, 60, 40, 4);
+        CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo));
+        CHECK(view->weight.data == NULL && memcmp(kept, view->image.data, bytes) == 0);
+        photo.channels = 5;
+        CHECK_RESULT(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo), GSF_ERROR_INVALID_ARGUMENT);
+        CHECK(memcmp(kept, view->image.data, bytes) == 0);
+        free(kept);
+        free(opaque);
+        gsf_splat_destroy_scene(&ctx, &scene);
+        CHECK(count.live == 0);
+    }
+}
+
 static void check_view(gsf_context* ctx, gsf_scene* scene, size_t v, int width, int height, double fx, double cx,
                        double cy) {
     if (!CHECK(v < scene->view_count)) return;
@@ -897,6 +975,80 @@ static void check_view(gsf_context* ctx, gsf_scene* scene, size_t v, int width, 
     if (CHECK_OK(ctx, gsf_splat_load_view_image(ctx, scene, v)))
         CHECK(scene->views[v].image.width == width && scene->views[v].image.height == height &&
               scene->views[v].image.channels == 3 && scene->views[v].image.dtype == GSF_U8);
+}
+
+static void save_picture(gsf_context* ctx, const char* folder, const char* name, void* pixels, int width, int height,
+                         int channels) {
+    char path[1000];
+    const gsf_image image = gsf_wrap_image(pixels, GSF_U8, width, height, channels);
+    snprintf(path, sizeof path, "%s/%s", folder, name);
+    CHECK_OK(ctx, gsf_save_image(ctx, path, &image));
+}
+
+// masks/a.png (twice the photo's size) and masks/b.jpg.png as COLMAP has it; c.png has alpha and a mask, d.png no mask. One
+// of another shape is an error that names it, as is one that is no image.
+static void test_photo_masks(void) {
+#ifdef __linux__
+    static uint8_t rgba[4 * 60 * 40], rgb[3 * 60 * 40], half[60 * 40], large[120 * 80];
+    counter count;
+    gsf_context ctx = make_context(&count);
+    char folder[500], path[4000];
+    snprintf(folder, sizeof folder, "%s", test_scratch("masks"));
+    snprintf(path, sizeof path, "rm -rf '%s' && mkdir -p '%s/sparse' '%s/images' '%s/masks'", folder, folder, folder, folder);
+    CHECK(system(path) == 0);
+    static const char* const texts[3][2] = {
+        {"sparse/cameras.txt", "1 PINHOLE 60 40 50 50 30 20\n"},
+        {"sparse/images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.jpg\n\n3 1 0 0 0 1 0 0 1 c.png\n\n"
+                              "4 1 0 0 0 1 0 0 1 d.png\n\n"},
+        {"sparse/points3D.txt", "3 0 0 5 1 2 3 0 1 0 2 0\n"}};
+    for (int i = 0; i < 3; i++) {
+        snprintf(path, sizeof path, "%s/%s", folder, texts[i][0]);
+        CHECK_OK(&ctx, gsf_write_file(&ctx, path, texts[i][1], strlen(texts[i][1])));
+    }
+    draw_object(60, 40, rgba);
+    for (int i = 0; i < 60 * 40; i++) {
+        memcpy(rgb + 3 * i, rgba + 4 * i, 3);
+        half[i] = i % 60 < 30 ? 255 : 0;
+    }
+    for (int i = 0; i < 120 * 80; i++) large[i] = i % 120 < 60 ? 255 : 0;
+    save_picture(&ctx, folder, "images/a.png", rgb, 60, 40, 3);
+    save_picture(&ctx, folder, "images/b.jpg", rgb, 60, 40, 3);
+    save_picture(&ctx, folder, "images/c.png", rgba, 60, 40, 4);
+    save_picture(&ctx, folder, "images/d.png", rgb, 60, 40, 3);
+    save_picture(&ctx, folder, "masks/a.png", large, 120, 80, 1);
+    save_picture(&ctx, folder, "masks/b.jpg.png", half, 60, 40, 1);
+    save_picture(&ctx, folder, "masks/c.png", half, 60, 40, 1);
+    gsf_scene scene;
+    for (int off = 0; off < 2; off++) {
+        gsf_scene_desc desc = {0};
+        desc.no_masks = off;
+        if (!CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, &desc, &scene))) return;
+        for (size_t v = 0; v < 4; v++) {
+            CHECK_OK(&ctx, gsf_splat_load_view_image(&ctx, &scene, v));
+            const uint8_t* w = (const uint8_t*)scene.views[v].weight.data;
+            CHECK((w != NULL) == (!off && v < 3));
+            int wrong = 0;
+            for (int i = 0; w && i < 60 * 40; i++) {
+                const int wanted = half[i] ? v == 2 ? rgba[4 * i + 3] : 255 : 0;
+                wrong += w[i] != wanted && !(v == 0 && (i % 60 == 29 || i % 60 == 30)); // where it is shrunk, it is soft
+            }
+            CHECK(wrong == 0);
+        }
+        gsf_splat_destroy_scene(&ctx, &scene);
+    }
+    save_picture(&ctx, folder, "masks/d.png", half, 40, 60, 1);
+    CHECK_OK(&ctx, gsf_splat_load_scene(&ctx, folder, NULL, &scene));
+    CHECK_RESULT(&ctx, gsf_splat_load_view_image(&ctx, &scene, 3), GSF_ERROR_FORMAT);
+    CHECK(strstr(ctx.error, "masks/d.png") != NULL && scene.views[3].image.data == NULL);
+    snprintf(path, sizeof path, "%s/masks/d.png", folder);
+    CHECK_OK(&ctx, gsf_write_file(&ctx, path, "none", 4));
+    CHECK_RESULT(&ctx, gsf_splat_load_view_image(&ctx, &scene, 3), GSF_ERROR_FORMAT);
+    snprintf(path, sizeof path, "cd '%s/masks' && rm d.png && mkdir d.png", folder);
+    CHECK(system(path) == 0); // what is there and cannot be read is no missing mask
+    CHECK_RESULT(&ctx, gsf_splat_load_view_image(&ctx, &scene, 3), GSF_ERROR_IO);
+    gsf_splat_destroy_scene(&ctx, &scene);
+    CHECK(count.live == 0);
+#endif
 }
 
 // Of the platform's files only those that are not there are missing; what is there and cannot be read is an error, since
@@ -1255,6 +1407,8 @@ int main(void) {
     test_panorama();
     test_rigs();
     test_save_load();
+    test_photo_alpha();
+    test_photo_masks();
     test_unreadable_photos();
     test_image_folders();
     test_transforms();

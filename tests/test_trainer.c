@@ -56,7 +56,11 @@ static void test_loss_derivative(gsf_context* ctx) {
             if (fabsf(render[i] - t) < 0.03f) render[i] = t + 0.04f; // away from the kinks
             if (fabsf(render[i]) < 0.02f || fabsf(render[i] - 1.0f) < 0.02f) render[i] = -0.1f;
         }
-        for (size_t i = 0; i < pixels; i++) weight[i] = i % 5 ? (float)test_random(&state) : 0.0f;
+        for (size_t i = 0; i < pixels; i++) {
+            weight[i] = i % 5 ? (float)test_random(&state) : 0.0f;
+            for (size_t k = 0; k < 3 && weight[i] == 0.0f && cases[c].weighted; k++)
+                photo[3 * i + k] = 0.0f, bytes[3 * i + k] = 0;
+        }
         gsf__target target;
         memset(&target, 0, sizeof target);
         target.width = cases[c].width;
@@ -93,9 +97,9 @@ static void test_loss_derivative(gsf_context* ctx) {
     gsf__loss_destroy_scratch(ctx, &scratch);
 }
 
-// Mean SSIM and the gradient of 1 - SSIM in double precision, as the formula has them, with the window of the 3DGS code:
-// taps and their products rounded to float32.
-static double exact_ssim(int width, int height, const float* x, const float* t, double* gradient) {
+// Mean of 1 - weight (1 - SSIM) and the gradient of the mean of weight (1 - SSIM) in double precision, as the formula has
+// them, with the window of the 3DGS code: taps and their products rounded to float32. weight: (height,width), NULL = 1.
+static double exact_ssim(int width, int height, const float* x, const float* t, const float* weight, double* gradient) {
     const size_t n = 3 * (size_t)width * (size_t)height;
     double ssim = 0.0, *slopes = (double*)calloc(3 * n, sizeof(double));
     float window[11];
@@ -119,10 +123,11 @@ static double exact_ssim(int width, int height, const float* x, const float* t, 
             const double a1 = 2.0 * s[0] * s[1] + 1e-4, a2 = 2.0 * (s[4] - s[0] * s[1]) + 9e-4;
             const double b1 = s[0] * s[0] + s[1] * s[1] + 1e-4, b2 = s[2] - s[0] * s[0] + s[3] - s[1] * s[1] + 9e-4;
             const double m = a1 * a2 / (b1 * b2), e = -m / b2, f = 2.0 * a1 / (b1 * b2);
-            slopes[i] = 2.0 * s[1] * a2 / (b1 * b2) - 2.0 * s[0] * m / b1 - 2.0 * s[0] * e - s[1] * f;
-            slopes[n + i] = e;
-            slopes[2 * n + i] = f;
-            ssim += m / (double)n;
+            const double share = weight ? weight[i / 3] : 1.0;
+            slopes[i] = share * (2.0 * s[1] * a2 / (b1 * b2) - 2.0 * s[0] * m / b1 - 2.0 * s[0] * e - s[1] * f);
+            slopes[n + i] = share * e;
+            slopes[2 * n + i] = share * f;
+            ssim += (1.0 - share * (1.0 - m)) / (double)n;
         }
     free(slopes);
     return ssim;
@@ -179,7 +184,7 @@ static void test_loss_accuracy(gsf_cpu_level level) {
                 other[i] = fminf(fmaxf(render[i], 0.0f), 1.0f);
                 photo[i] = fminf(fmaxf(photo[i], 0.0f), 1.0f);
             }
-            const double ssim = exact_ssim(W, H, other, photo, exact);
+            const double ssim = exact_ssim(W, H, other, photo, NULL, exact);
             for (int i = 0; i < n; i++) exact[i] = render[i] >= 0.0f && render[i] <= 1.0f ? exact[i] : 0.0;
             CHECK_NEAR(value.ssim, ssim, 3e-7);
             CHECK_NEAR(value.total, 1.0 - ssim, 3e-7);
@@ -187,6 +192,51 @@ static void test_loss_accuracy(gsf_cpu_level level) {
         }
     gsf__loss_destroy_scratch(&plain, &scratch);
     gsf__loss_destroy_scratch(&shuffled, &another);
+}
+
+// The same with weights, a third of which is 0: black in both images of the reference, whatever is rendered there, and
+// without a gradient. What is rendered there changes no bit.
+static void test_loss_weights(gsf_cpu_level level) {
+    enum { W = 37, H = 141, PIXELS = W * H, N = 3 * PIXELS };
+    static float render[N], photo[N], d[N], other[N], weight[PIXELS];
+    static double exact[N];
+    gsf_context ctx = open_context(level, NULL);
+    gsf__loss_scratch scratch;
+    memset(&scratch, 0, sizeof scratch);
+    gsf__target target;
+    memset(&target, 0, sizeof target);
+    target.width = W;
+    target.height = H;
+    target.f32 = photo;
+    target.weight = weight;
+    uint64_t state = 12;
+    for (int kind = 0; kind < LOSS_CASES; kind++) {
+        for (int i = 0; i < N; i++) loss_values(kind, W, i, &state, &photo[i], &render[i]);
+        for (int i = 0; i < PIXELS; i++) { // blocks, scattered pixels and a column of bands of zeros
+            weight[i] = i / 40 % 3 == 0 || i % 17 == 0 || i % W < 9 ? 0.0f : (float)test_random_in(&state, 0.1, 1);
+            for (int k = 3 * i; k < 3 * i + 3; k++) {
+                photo[k] = weight[i] > 0.0f ? fminf(fmaxf(photo[k], 0.0f), 1.0f) : 0.0f;
+                other[k] = weight[i] > 0.0f ? fminf(fmaxf(render[k], 0.0f), 1.0f) : 0.0f;
+            }
+        }
+        gsf__loss_value value, again;
+        CHECK_OK(&ctx, gsf__loss(&ctx, &scratch, &target, render, 1.0f, 1.0f, d, &value));
+        const double ssim = exact_ssim(W, H, other, photo, weight, exact);
+        double l1 = 0.0;
+        for (int i = 0; i < N; i++) {
+            const float w = weight[i / 3];
+            l1 += (double)w * fabs((double)other[i] - (double)photo[i]) / N;
+            if (w == 0.0f || !(render[i] >= 0.0f && render[i] <= 1.0f)) exact[i] = 0.0;
+        }
+        CHECK_NEAR(value.ssim, ssim, 3e-7);
+        CHECK_NEAR(value.l1, l1, 1e-6);
+        test_compare_floats(loss_names[kind], d, exact, N, 1e-4 * test_max_abs(exact, N) + 1e-12);
+        for (int i = 0; i < N; i++)
+            if (weight[i / 3] == 0.0f) render[i] = i % 2 ? (float)test_random_in(&state, -1, 2) : NAN;
+        CHECK_OK(&ctx, gsf__loss(&ctx, &scratch, &target, render, 1.0f, 1.0f, other, &again));
+        CHECK(memcmp(d, other, sizeof d) == 0 && memcmp(&value, &again, sizeof value) == 0);
+    }
+    gsf__loss_destroy_scratch(&ctx, &scratch);
 }
 
 static void test_smoothness_derivative(gsf_context* ctx) {
@@ -653,6 +703,50 @@ static scene make_scene(gsf_context* ctx) {
         if (v >= VIEWS) view->weight = gsf_wrap_image(s.weights, GSF_F32, 40, view->camera.height, 1);
     }
     return s;
+}
+
+// The pixels left of the middle are garbage and weigh nothing: which garbage changes no bit, and the rest is learnt as if the
+// photos were smaller. Weights in bytes are those in floats.
+static void test_masked_training(gsf_context* ctx, const scene* s) {
+    enum { PIXELS = WIDTH * HEIGHT };
+    static float photos[VIEWS][3 * PIXELS], shown[3 * PIXELS], weight[PIXELS];
+    static uint8_t bytes[PIXELS];
+    gsf_train_view views[VIEWS];
+    gsf_splats made[3];
+    double error[3] = {0.0};
+    for (int i = 0; i < PIXELS; i++) weight[i] = (float)(bytes[i] = i % WIDTH < WIDTH / 2 ? 0 : i % 7 ? 255 : 51) / 255.0f;
+    for (int run = 0; run < 3; run++) { // green, noise with weights in floats, green without weights
+        uint64_t state = 3;
+        for (int v = 0; v < VIEWS; v++) {
+            views[v] = s->views[v];
+            for (int i = 0; i < 3 * PIXELS; i++)
+                photos[v][i] = i / 3 % WIDTH >= WIDTH / 2 ? s->pixels[v][i]
+                               : run == 1                 ? (float)test_random(&state)
+                                                          : (float)(i % 3 == 1);
+            views[v].image = gsf_wrap_image(photos[v], GSF_F32, WIDTH, HEIGHT, 3);
+            if (run == 1) views[v].weight = gsf_wrap_image(weight, GSF_F32, WIDTH, HEIGHT, 1);
+            if (run == 0) views[v].weight = gsf_wrap_image(bytes, GSF_U8, WIDTH, HEIGHT, 1);
+        }
+        gsf_train_desc desc = {0};
+        desc.iterations = 150;
+        desc.depth_smoothness = 0.01f;
+        gsf_trainer* trainer;
+        if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, VIEWS, &s->start, &trainer))) return;
+        for (int i = 0; i < desc.iterations; i++) CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, NULL));
+        CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &made[run]));
+        gsf_splat_destroy_trainer(ctx, trainer);
+        render_to(ctx, &made[run], &views[0].camera, shown);
+        for (int i = 0; i < 3 * PIXELS; i++)
+            if (i / 3 % WIDTH >= WIDTH / 2) error[run] += fabs((double)shown[i] - (double)s->pixels[0][i]) / (1.5 * PIXELS);
+    }
+    CHECK(made[0].count == made[1].count && made[0].count > 0);
+    if (made[0].count == made[1].count) {
+        CHECK(memcmp(made[0].means, made[1].means, 3 * made[0].count * sizeof(float)) == 0);
+        CHECK(memcmp(made[0].sh, made[1].sh, 12 * made[0].count * sizeof(float)) == 0);
+    }
+    CHECK(error[0] < 0.02 && error[0] < error[2]);
+    printf("masked training: error %.4f, %.4f without masks\n", error[0], error[2]);
+    for (int run = 0; run < 3; run++) gsf_splat_destroy(ctx, &made[run]);
 }
 
 static void destroy_scene(gsf_context* ctx, scene* s) {
@@ -1233,7 +1327,7 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     bad.image.data = NULL;
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
     bad = s->views[VIEWS];
-    bad.weight.dtype = GSF_U8;
+    bad.weight.dtype = GSF_U16;
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &bad, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
     s->weights[7] = -1.0f;
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &desc, &s->views[VIEWS], 1, &s->start, &trainer), GSF_ERROR_NUMERIC);
@@ -1500,6 +1594,7 @@ int main(void) {
     test_loss_derivative(&ctx);
     test_loss_accuracy(GSF_CPU_SCALAR);
     if (ctx.cpu_level > GSF_CPU_SCALAR) test_loss_accuracy(ctx.cpu_level);
+    for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_loss_weights((gsf_cpu_level)level);
     test_smoothness_derivative(&ctx);
     test_adam_rejects(&ctx);
     test_adam_bands(&ctx);
@@ -1518,6 +1613,7 @@ int main(void) {
     test_mcmc_render(&ctx);
     test_learns(&ctx, &s);
     test_mcmc_learns(&ctx, &s);
+    test_masked_training(&ctx, &s);
     test_order_and_visits(&ctx, &s);
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
