@@ -4588,6 +4588,7 @@ typedef struct gsf__attention_job {
     gsf_nn_attention_desc desc;
     float* scratch;             // of all workers
     size_t scratch_floats;      // of one
+    float* center;              // (heads, head_dim): what is taken off every key
     int64_t ranges, range_size; // of the queries
     int64_t panels;             // of 16 columns of v
 } gsf__attention_job;
@@ -4597,19 +4598,38 @@ typedef struct gsf__attention_kernels {
     int packed; // chunks are ranges of a head, and scratch is laid out as gsf__attention_scratch; else single queries
 } gsf__attention_kernels;
 
+// Softmax is blind to what all keys have in common, which adds the same to each logit of a query, but their rounding is not.
+// So keys count from a value in their midst: the middle one of the means of three times five keys, which one wild key does
+// not move, where it is finite.
+static void gsf__attention_center(const gsf__attention_job* job) {
+    const gsf_nn_attention_desc* d = &job->desc;
+    const int64_t width = (int64_t)d->heads * d->head_dim;
+    for (int64_t i = 0; i < width; i++) {
+        float mean[3];
+        for (int64_t g = 0; g < 3; g++) {
+            mean[g] = 0.0f;
+            for (int64_t n = g; n < 15; n += 3) mean[g] += d->k[n * d->keys / 15 * d->ldk + i];
+            mean[g] /= 5.0f;
+        }
+        const float low = mean[0] < mean[1] ? mean[0] : mean[1], high = mean[0] < mean[1] ? mean[1] : mean[0];
+        const float middle = mean[2] < low ? low : mean[2] > high ? high : mean[2];
+        job->center[i] = isfinite(middle) ? middle : 0.0f;
+    }
+}
+
 static void gsf__attention_row(void* arg, size_t row, int worker) {
     const gsf__attention_job* job = (const gsf__attention_job*)arg;
     const gsf_nn_attention_desc* d = &job->desc;
     float *p = job->scratch + (size_t)worker * job->scratch_floats, *sum = p + d->keys;
     for (int32_t h = 0; h < d->heads; h++) {
-        const float* q = d->q + (int64_t)row * d->ldq + (int64_t)h * d->head_dim;
+        const float *q = d->q + (int64_t)row * d->ldq + (int64_t)h * d->head_dim, *center = job->center + (int64_t)h * d->head_dim;
         const int64_t at = (h * d->queries + (int64_t)row) * d->keys; // in mask and bias
         const unsigned char* mask = d->mask ? d->mask + at : NULL;
         float top = -FLT_MAX, total = 0.0f;
         for (int64_t j = 0; j < d->keys; j++) {
             const float* k = d->k + j * d->ldk + (int64_t)h * d->head_dim;
             float dot = 0.0f;
-            for (int32_t i = 0; i < d->head_dim; i++) dot += q[i] * k[i];
+            for (int32_t i = 0; i < d->head_dim; i++) dot += q[i] * (k[i] - center[i]);
             p[j] = d->bias ? dot * d->scale + d->bias[at + j] : dot * d->scale;
             if ((!mask || mask[j]) && p[j] > top) top = p[j];
         }
@@ -4636,7 +4656,7 @@ typedef struct gsf__attention_scratch { // of one worker
 
 typedef struct gsf__attention_parts { // what instruction sets do differently; in bf16 pairs lie in the places of floats
     void (*pack_queries)(const gsf__attention_job* job, const float* from, int64_t queries, float* packed);
-    void (*pack_keys)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
+    void (*pack_keys)(const gsf__attention_job* job, const float* from, const float* center, int64_t keys, float* packed);
     void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
     int64_t unit; // values in a place along head_dim: 1, or 2 in bf16
     // p of `groups` groups of queries against `panels` panels of keys
@@ -4683,9 +4703,9 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_queries(const gsf__attention_jo
     }
 }
 
-// Keys of `from` to panels of 16, the last one filled up with zeros.
-GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* job, const float* from, int64_t keys,
-                                                      float* packed) {
+// Keys of `from`, less `center`, to panels of 16, the last one filled up.
+GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* job, const float* from, const float* center,
+                                                      int64_t keys, float* packed) {
     const int64_t ld = job->desc.ldk, dim = job->desc.head_dim;
     for (int64_t j = 0; j < keys; j += 8) {
         float* to = packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * dim + j % GSF__ATT_PANEL;
@@ -4696,6 +4716,10 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* 
             gsf__nn_transpose8(row + i, ld, to + i * GSF__ATT_PANEL, GSF__ATT_PANEL);
         for (; i < dim; i++)
             for (int r = 0; r < 8; r++) to[i * GSF__ATT_PANEL + r] = j + r < keys ? row[r * ld + i] : 0.0f;
+        for (i = 0; i < dim; i++) {
+            float* at = to + i * GSF__ATT_PANEL;
+            _mm256_storeu_ps(at, _mm256_loadu_ps(at) - _mm256_set1_ps(center[i]));
+        }
     }
     if ((keys - 1) % GSF__ATT_PANEL < 8) // the last panel's second half
         for (int64_t i = 0; i < dim; i++)
@@ -4937,16 +4961,18 @@ GSF__TARGET_AVX512 static void gsf__attention_values_avx512(const float* p, int6
 
 // ---- attention in bf16: q and k are packed in pairs along head_dim, v and the weights along the keys
 
-// Units of eight rows from `row` on, of which `rows` are there, times `factor`: to[i to_ld + r].
-GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* row, int64_t rows, int64_t ld, int64_t dim, float factor,
-                                                       float* to, int64_t to_ld) {
+// Units of eight rows from `row` on, of which `rows` are there, less `center` (NULL: nothing) and times `factor`:
+// to[i to_ld + r].
+GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* row, const float* center, int64_t rows, int64_t ld,
+                                                       int64_t dim, float factor, float* to, int64_t to_ld) {
     const __m512 f = _mm512_set1_ps(factor);
     for (int64_t i = 0; i < dim; i += 16) {
         const __mmask16 mask = gsf__nn_mask16(dim - i);
+        const __m512 c = center ? _mm512_maskz_loadu_ps(mask, center + i) : _mm512_setzero_ps();
         float units[8][8];
         for (int r = 0; r < 8; r++) {
             const __mmask16 there = r < rows ? mask : (__mmask16)0;
-            const __m512 v = f * _mm512_maskz_loadu_ps(there, row + r * ld + i);
+            const __m512 v = f * (_mm512_maskz_loadu_ps(there, row + r * ld + i) - c);
             _mm256_storeu_ps(units[r], _mm256_castsi256_ps(gsf__nn_round_bf16(v)));
         }
         if (dim - i >= 16) gsf__nn_transpose8(units[0], 8, to + i / 2 * to_ld, to_ld);
@@ -4962,17 +4988,17 @@ GSF__TARGET_BF16 static void gsf__attention_pack_queries_bf16(const gsf__attenti
     for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 4 * dim) {
         for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
             gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
-        gsf__attention_pack_pairs(from + first * ld, gsf__least(queries - first, GSF__ATT_GROUP), ld, dim,
+        gsf__attention_pack_pairs(from + first * ld, NULL, gsf__least(queries - first, GSF__ATT_GROUP), ld, dim,
                                   job->desc.scale * 1.44269504f, packed, 8);
     }
 }
 
-GSF__TARGET_BF16 static void gsf__attention_pack_keys_bf16(const gsf__attention_job* job, const float* from, int64_t keys,
-                                                           float* packed) {
+GSF__TARGET_BF16 static void gsf__attention_pack_keys_bf16(const gsf__attention_job* job, const float* from,
+                                                           const float* center, int64_t keys, float* packed) {
     const int64_t ld = job->desc.ldk, dim = job->desc.head_dim;
     for (int64_t j = 0; j < gsf__round_up(keys, GSF__ATT_PANEL); j += 8) {
         for (int64_t r = j; r < j + 8; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, keys, ld, dim);
-        gsf__attention_pack_pairs(from + j * ld, keys - j, ld, dim, 1.0f,
+        gsf__attention_pack_pairs(from + j * ld, center, keys - j, ld, dim, 1.0f,
                                   packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * (dim / 2) + j % GSF__ATT_PANEL,
                                   GSF__ATT_PANEL);
     }
@@ -5086,7 +5112,7 @@ static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__atten
     for (int64_t key = 0; key < d->keys; key += GSF__ATT_KEYS) {
         const int64_t keys = gsf__least(GSF__ATT_KEYS, d->keys - key);
         const int64_t key_panels = (keys + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL, columns = key_panels * GSF__ATT_PANEL;
-        parts->pack_keys(job, d->k + key * d->ldk + column, keys, s.k);
+        parts->pack_keys(job, d->k + key * d->ldk + column, job->center + column, keys, s.k);
         parts->pack_values(job, d->v + key * d->ldv + column, keys, s.v);
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
@@ -5191,10 +5217,12 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
     const size_t chunks = gsf__attention_plan(&job, kernels->packed);
     job.scratch_floats = gsf__attention_floats(&job, kernels->packed);
     if (!job.scratch_floats || !gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &size) ||
-        !gsf__mul_size(size, sizeof(float), &size))
+        size > SIZE_MAX - (size_t)width || !gsf__mul_size(size + (size_t)width, sizeof(float), &size))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld keys are too many", (long long)d->keys);
     job.scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own, size);
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    job.center = job.scratch + job.scratch_floats * (size_t)ctx->parallel.worker_count;
+    gsf__attention_center(&job);
     gsf__parallel_for(ctx, chunks, kernels->chunk, &job);
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;

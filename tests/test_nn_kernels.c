@@ -369,6 +369,13 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
     const double scale = c->scale != 0.0f ? (double)c->scale : 1.0 / sqrt((double)dim);
     const float factor = (float)scale * 1.44269504f; // what queries are multiplied with before they are rounded
     double* p = make_doubles((size_t)c->keys);
+    float* center = (float*)calloc((size_t)width, sizeof(float)); // keys are rounded as what they differ from this
+    for (int64_t i = 0; i < width && attention_rounds(a); i++) {
+        float mean[3] = {0.0f, 0.0f, 0.0f};
+        for (int64_t n = 0; n < 15; n++) mean[n % 3] += a->k[n * c->keys / 15 * ld + i];
+        for (int g = 0; g < 3; g++) mean[g] /= 5.0f;
+        center[i] = fmaxf(fminf(mean[0], mean[1]), fminf(fmaxf(mean[0], mean[1]), mean[2]));
+    }
     for (int64_t h = 0; h < c->heads; h++)
         for (int64_t r = 0; r < c->queries; r++) {
             double top = -INFINITY, sum = 0.0;
@@ -376,7 +383,7 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
                 p[j] = 0.0;
                 for (int64_t i = 0; i < dim; i++)
                     p[j] += attention_operand(a, a->q[r * ld + h * dim + i], factor) *
-                            attention_operand(a, a->k[j * ld + h * dim + i], 1.0f);
+                            attention_operand(a, a->k[j * ld + h * dim + i] - center[h * dim + i], 1.0f);
                 p[j] *= scale;
                 if (a->bias) p[j] += (double)a->bias[(h * c->queries + r) * c->keys + j];
                 if (a->mask && !a->mask[(h * c->queries + r) * c->keys + j]) p[j] = -INFINITY;
@@ -390,6 +397,7 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
             }
         }
     free(p);
+    free(center);
 }
 
 static float* dense_rows(const attention_case* c, const float* x) { // without the columns between rows
@@ -449,6 +457,29 @@ static int none_nan(const float* x, size_t count) {
     for (size_t i = 0; i < count; i++)
         if (x[i] != x[i]) return 0;
     return 1;
+}
+
+// What all keys have in common is no concern of softmax: within a few times what they are off without it, in bf16 too.
+static void check_attention_offset(void) {
+    static const attention_case cases[] = {{9, 13, 2, 64, 0, 0, 0, 1, 0}, {49, 513, 2, 72, 1, 0, 0, 1, 0},
+                                           {7, 5, 2, 3, 0, 0, 0, 1, 0},   {30, 33, 2, 24, 2, 1, 0, 1, 0}};
+    static const float offsets[] = {50.0f, -1000.0f};
+    for (size_t n = 0; n < 4 * GSF__COUNT(cases); n++) {
+        const attention_case* c = &cases[n / 4];
+        const size_t values = (size_t)(c->queries * c->heads * c->dim);
+        attention_data a = make_attention(c);
+        a.desc.bf16 = n % 2;
+        for (size_t i = 0; i < a.k_count; i++) a.k[i] += offsets[n / 2 % 2];
+        double* expected = make_doubles(values);
+        attention_of(c, &a, expected);
+        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        float* dense = dense_rows(c, a.out);
+        char what[80];
+        snprintf(what, sizeof what, "attention case %zu, keys at %g%s", n / 4, (double)offsets[n / 2 % 2], n % 2 ? " bf16" : "");
+        test_compare_floats(what, dense, expected, values, attention_rounds(&a) ? 3.0 / 256 : 2e-6);
+        free(dense); free(expected);
+        free_attention(&a);
+    }
 }
 
 static void check_attention_values(int bf16) {
@@ -555,6 +586,7 @@ int main(void) {
         check_streams();
         check_head_norm_rope();
         check_attention();
+    check_attention_offset();
         check_attention_values(0);
         check_attention_values(1);
         check_attention_bias();
