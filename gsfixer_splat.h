@@ -406,7 +406,8 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     float extent;                  // 1.1 * largest distance of a training camera from their mean; median depth of the
                                    // splats where the cameras coincide
     float lambda_ssim;             // 0.2; negative = no SSIM term
-    float background[3];
+    float background[3];           // what lies behind the splats
+    int32_t background_random;     // 0; 1: any colour, another in each step, in place of `background`
     int32_t densify_from, densify_until; // 500 s, 15000 s (mcmc: 25000 s); densify_until < 0 = never, nor opacity resets
     int32_t densify_interval;      // 100, whatever s is
     float densify_grad;            // 2e-4
@@ -10424,7 +10425,7 @@ static void gsf__reset_opacity(gsf__model* model, double limit) {
 
 enum { // streams of random numbers; the iteration or epoch is added
     GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED,
-    GSF__STREAM_NOISE
+    GSF__STREAM_NOISE, GSF__STREAM_BACKGROUND
 };
 
 enum { GSF__DECAY_INTERVAL = 10 }; // iterations from one opacity decay to the next
@@ -10644,6 +10645,7 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"background[0]", (double)d->background[0], -1e3, 1e3},
         {"background[1]", (double)d->background[1], -1e3, 1e3},
         {"background[2]", (double)d->background[2], -1e3, 1e3},
+        {"background_random", (double)d->background_random, 0, 1},
         {"densify_grad", (double)d->densify_grad, 0, 1e30},
         {"densify_scale", (double)d->densify_scale, 0, 1e30},
         {"prune_opacity", (double)d->prune_opacity, 0, 0.99},
@@ -11021,6 +11023,9 @@ static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf_
         render.hidden = model->hidden;
         render.opacity_scale = (float)(1.0 / (1.0 - share));
     }
+    for (uint64_t c = 0; c < 3 && d->background_random; c++)
+        render.background[c] = (float)gsf_random_uniform(d->seed, gsf__stream(GSF__STREAM_BACKGROUND, (uint64_t)iteration),
+                                                         3 * (uint64_t)which + c);
     const int32_t width = photo->camera.width, height = photo->camera.height;
     gsf_render_output out;
     memset(&out, 0, sizeof out);
@@ -11214,7 +11219,7 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
         (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
         (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
         (double)d->densify_absolute, (double)d->lazy_adam, (double)d->mcmc, (double)d->mcmc_noise,
-        (double)d->opacity_penalty, (double)trainer->photos.count};
+        (double)d->opacity_penalty, (double)trainer->photos.count, (double)d->background_random};
     uint64_t hash = 0;
     for (size_t i = 0; i < GSF__COUNT(values); i++) {
         uint64_t bits;

@@ -85,6 +85,11 @@ static const option_spec option_specs[] = {
      "approximations allowed (default balanced; exact: none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
      "DIR/VIEW.png per test view, white where the figures \"seen\" are to be taken (gsfix masks makes them)"},
+    {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix",
+     "the photos' alpha and SCENE/masks/NAME.png (or NAME.EXT.png) say which pixels are trained on and measured: black ones\n"
+     "are not, grey ones in part (default on)"},
+    {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
+     "what lies behind the splats: black (default), white, R,G,B from 0 to 1, or (fix) random, another in each step"},
     {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "go on from OUT/checkpoint if there is one"},
     {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix", "begin anew although OUT holds a checkpoint, which is then lost"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
@@ -280,10 +285,28 @@ static int parse_options(gsfix_app* app, const command_spec* command, int argc, 
 
 // ---- scenes and restorers --------------------------------------------------------
 
+int gsfix_background(gsfix_app* app, float out[3], int32_t* random) {
+    const char* text = app->o.background ? app->o.background : "black";
+    const float grey = strcmp(text, "white") == 0 ? 1.0f : 0.0f;
+    *random = strcmp(text, "random") == 0;
+    for (int c = 0; c < 3; c++) out[c] = grey;
+    if (grey > 0.0f || *random || strcmp(text, "black") == 0) return 0;
+    const char* p = text;
+    for (int c = 0; c < 3; c++) {
+        char* end;
+        out[c] = strtof(p, &end);
+        if (end == p || !(out[c] >= 0.0f && out[c] <= 1.0f) || *end != (c < 2 ? ',' : 0))
+            return gsfix_misused(app, "--background %s: not black, white, random or R,G,B from 0 to 1", text);
+        p = end + 1;
+    }
+    return 0;
+}
+
 gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out) {
     gsf_scene_desc desc = {0};
     desc.factor = app->o.factor;
     desc.max_size = app->o.max_size;
+    desc.no_masks = app->o.photo_masks && strcmp(app->o.photo_masks, "off") == 0;
     gsf_result result = gsf_splat_load_scene(&app->ctx, path, &desc, out);
     if (result != GSF_OK) return result;
     result = gsfix_add_scene_inputs(app, out);
@@ -719,7 +742,7 @@ static gsf_result open_render_out(gsfix_app* app, const gsf_scene* scene, size_t
     return result == GSF_OK ? gsfix_remove_stale(app) : result;
 }
 
-static gsf_result render_all(gsfix_app* app) {
+static gsf_result render_all(gsfix_app* app, const float background[3]) {
     gsf_context* ctx = &app->ctx;
     gsf_scene scene = {0};
     gsf_splats splats = {0};
@@ -730,6 +753,7 @@ static gsf_result render_all(gsfix_app* app) {
     gsf_render_desc desc = {0};
     gsf_result result = gsf_splat_load(ctx, app->o.inputs[0], &splats);
     desc.antialiased = splats.antialiased;
+    memcpy(desc.background, background, sizeof desc.background);
     if (result == GSF_OK && app->o.scene) result = gsfix_load_scene(app, app->o.scene, &scene);
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
     if (result == GSF_OK && app->o.scene) count = scene.view_count;
@@ -763,7 +787,12 @@ static gsf_result render_all(gsfix_app* app) {
 
 static int run_render(gsfix_app* app) {
     if (!app->o.scene == !app->o.path) return gsfix_misused(app, "one of --scene and --path is needed");
-    return render_all(app) == GSF_OK ? 0 : gsfix_failed(app);
+    float background[3];
+    int32_t random;
+    const int code = gsfix_background(app, background, &random);
+    if (code) return code;
+    if (random) return gsfix_misused(app, "--background random: for training only");
+    return render_all(app, background) == GSF_OK ? 0 : gsfix_failed(app);
 }
 
 // ---- filter ----------------------------------------------------------------------

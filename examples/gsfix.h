@@ -17,7 +17,7 @@
 typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsfix.c
     const char *out, *views, *restorer, *condition, *regularize, *trajectory, *init, *quality, *masks, *settings, *also;
     const char *scene, *path, *method, *kind, *refs, *which, *ref_features, *save_features;
-    const char *caption, *model, *solver;
+    const char *caption, *model, *solver, *photo_masks, *background;
     int json, help, resume, restart, compare, depth, alpha, int8, bf16, any_frames;
     int threads, test_every, factor, max_size, iterations, eval_every, checkpoint_every, frames, windows, steps;
     double restorer_timeout, guidance, guidance_until, strength, block_cache;
@@ -92,6 +92,7 @@ void gsfix_note(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);   // 
 void gsfix_print(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);  // on stdout, unless --json
 void gsfix_hide_bar(gsfix_app* app);
 int gsfix_misused(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3); // one line on stderr; returns 2
+int gsfix_background(gsfix_app* app, float out[3], int32_t* random); // of --background; 0, or an exit code
 int gsfix_failed(gsfix_app* app);                                            // likewise from ctx.error; returns 1
 
 // A JSON object grows member by member in a gsf_text.

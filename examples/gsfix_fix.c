@@ -144,7 +144,8 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
     setup->fix.skip_psnr = quality->skip_psnr;
     setup->fix.max_pixels = quality->max_pixels;
-    const int code = apply_settings(app, setup);
+    int code = apply_settings(app, setup);
+    if (!code) code = gsfix_background(app, train->background, &train->background_random);
     if (code) return code;
     if (app->o.compare && !has_restorer(app)) return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     return gsfix_check_restorer(app);
@@ -234,7 +235,10 @@ static gsf_result random_points(fix_run* run, double** points, uint8_t** colors,
             (*points)[3 * i + (size_t)k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
         const char* pixel =
             (const char*)view->image.data + (int64_t)v * view->image.stride_y + (int64_t)u * view->image.stride_x;
-        for (int k = 0; k < 3; k++) (*colors)[3 * i + (size_t)k] = (uint8_t)pixel[k * view->image.stride_c];
+        const gsf_image* w = &view->weight; // no colour is known where the photo does not count
+        const int counts = !w->data || ((const uint8_t*)w->data)[(int64_t)v * w->stride_y + (int64_t)u * w->stride_x] >= 128;
+        for (int k = 0; k < 3; k++)
+            (*colors)[3 * i + (size_t)k] = counts ? (uint8_t)pixel[k * view->image.stride_c] : 128;
     }
     gsf_free(ctx, poses);
     return GSF_OK;
@@ -349,15 +353,63 @@ static gsf_result render_view(fix_run* run, size_t i, gsf_image* color) { // tes
     return result;
 }
 
+// Over the pixels of a mask (NULL: all). No figures where it has none.
+static gsf_result score_pixels(fix_run* run, const gsf_image* color, const gsf_image* photo, const gsf_image* mask,
+                               double* psnr, double* ssim) {
+    *psnr = NAN;
+    if (ssim) *ssim = NAN;
+    if (mask && !gsfix_counts_any(mask)) return GSF_OK;
+    gsf_result result = gsf_psnr(run->ctx, color, photo, mask, psnr);
+    if (result == GSF_OK && ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, ssim);
+    return result;
+}
+
+// What of a test view is measured where its photo has pixels that do not count: render and photo, black there, so that the
+// windows of SSIM hold nothing of them; which count; and which of these are seen, if that is asked for.
+typedef struct cut_view { gsf_image color, photo, counts, seen; } cut_view;
+
+static gsf_result cut_to_photo(gsf_context* ctx, const gsf_scene_view* view, const gsf_image* color, const gsf_image* seen,
+                               cut_view* out) {
+    const gsf_image *photo = &view->image, *weight = &view->weight;
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf_make_image(ctx, GSF_F32, photo->width, photo->height, 3, &out->color);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, color, &out->color);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, &out->photo);
+    if (result == GSF_OK) result = gsf_convert_image(ctx, photo, &out->photo);
+    if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 1, &out->counts);
+    if (result == GSF_OK && seen) result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 1, &out->seen);
+    for (size_t i = 0; result == GSF_OK && i < (size_t)photo->width * (size_t)photo->height; i++) {
+        const int counts = ((const uint8_t*)weight->data)[i] >= 128;
+        ((uint8_t*)out->counts.data)[i] = (uint8_t)counts;
+        if (seen) ((uint8_t*)out->seen.data)[i] = counts && ((const uint8_t*)seen->data)[i];
+        for (size_t k = 3 * i; k < 3 * i + 3 && !counts; k++) {
+            ((float*)out->color.data)[k] = 0.0f;
+            ((uint8_t*)out->photo.data)[k] = 0;
+        }
+    }
+    return result;
+}
+
 static gsf_result score_view(fix_run* run, size_t i, const gsf_image* color, int with_ssim, gsfix_score* out) {
-    const gsf_image* photo = &run->scene.views[run->split.test[i]].image;
-    const gsf_image* mask = run->masks && gsfix_counts_any(&run->masks[i]) ? &run->masks[i] : NULL;
+    const gsf_scene_view* view = &run->scene.views[run->split.test[i]];
+    const gsf_image *photo = &view->image, *counts = NULL, *seen = run->masks ? &run->masks[i] : NULL;
+    cut_view cut = {0};
+    gsf_result result = GSF_OK;
     out->ssim = out->psnr_seen = out->ssim_seen = NAN;
-    gsf_result result = gsf_psnr(run->ctx, color, photo, NULL, &out->psnr);
-    if (result == GSF_OK && with_ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, NULL, &out->ssim);
-    if (result == GSF_OK && mask) result = gsf_psnr(run->ctx, color, photo, mask, &out->psnr_seen);
-    if (result == GSF_OK && mask && with_ssim)
-        result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, &out->ssim_seen);
+    if (view->weight.data) {
+        result = cut_to_photo(run->ctx, view, color, seen, &cut);
+        color = &cut.color;
+        photo = &cut.photo;
+        counts = &cut.counts;
+        if (seen) seen = &cut.seen;
+    }
+    if (result == GSF_OK) result = score_pixels(run, color, photo, counts, &out->psnr, with_ssim ? &out->ssim : NULL);
+    if (result == GSF_OK && seen)
+        result = score_pixels(run, color, photo, seen, &out->psnr_seen, with_ssim ? &out->ssim_seen : NULL);
+    gsf_destroy_image(run->ctx, &cut.color);
+    gsf_destroy_image(run->ctx, &cut.photo);
+    gsf_destroy_image(run->ctx, &cut.counts);
+    gsf_destroy_image(run->ctx, &cut.seen);
     return result;
 }
 
@@ -436,6 +488,12 @@ static double as_written(float value) { // the shortest decimal that reads back 
     return strtod(text, NULL);
 }
 
+static size_t masked_photos(const fix_run* run) { // of those that are trained on or measured
+    size_t count = 0;
+    for (size_t i = 0; i < run->scene.view_count; i++) count += run->scene.views[i].weight.data != NULL;
+    return count;
+}
+
 // What the run computes, by name and with every default filled in: printed in metrics.json, and what --resume insists on.
 static void write_dit_switches(fix_run* run) {
     const gsf_nn_dit_desc dit = gsfix_dit_desc(run->app);
@@ -493,6 +551,9 @@ static void write_switches(fix_run* run) {
     gsfix_json_begin(ctx, t, "background", '[');
     for (int c = 0; c < 3; c++) gsfix_json_number(ctx, t, NULL, as_written(train->background[c]));
     gsfix_json_end(ctx, t, ']');
+    gsfix_json_text(ctx, t, "background_random", train->background_random ? "on" : "off");
+    gsfix_json_text(ctx, t, "photo_masks", o->photo_masks ? o->photo_masks : "on");
+    gsfix_json_number(ctx, t, "photos_masked", (double)masked_photos(run));
     gsfix_json_text(ctx, t, "views", o->views ? o->views : "all");
     gsfix_json_number(ctx, t, "test_every", o->test_every ? o->test_every : 8);
     gsfix_json_number(ctx, t, "factor", o->factor ? o->factor : 1);
@@ -773,6 +834,7 @@ static gsf_result start_fixer(fix_run* run) {
     for (size_t i = 0; i < n; i++) {
         views[i].camera = run->scene.views[run->split.train[i]].camera;
         views[i].image = run->scene.views[run->split.train[i]].image;
+        views[i].weight = run->scene.views[run->split.train[i]].weight;
     }
     gsf_fix_desc desc = run->setup.fix;
     desc.points = run->scene.points; // they keep the path upright
@@ -1142,7 +1204,10 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsfix_json_text(ctx, t, "scene", run->scene.folder);
     write_scores(ctx, t, "", &r->mean);
     if (h->has_without) write_scores(ctx, t, "_without_repair", &r->without);
-    gsfix_json_text(ctx, t, "measured", "float32 render clamped to [0,1] against the 8-bit photo; ssim as ssim_3dgs");
+    gsfix_json_text(ctx, t, "measured",
+                    masked_photos(run) ? "float32 render clamped to [0,1] against the 8-bit photo, over the pixels that count "
+                                         "at least half (alpha, masks), the others black in both; ssim as ssim_3dgs"
+                                       : "float32 render clamped to [0,1] against the 8-bit photo; ssim as ssim_3dgs");
     write_views(run, r, t);
     gsfix_json_begin(ctx, t, "seconds", '{');
     gsfix_json_number(ctx, t, "total", h->seconds_total);

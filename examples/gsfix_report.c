@@ -394,7 +394,8 @@ static void put_table(page* p) {
 // How a switch of metrics.json is shown: under which heading, what zero (or less) means, and the unit ("<x": before it).
 static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"views", "Photos", NULL, ""}, {"test_every", "Photos", "none held out", ""}, {"factor", "Photos", NULL, ""},
-    {"max_size", "Photos", "no limit", " pixels"}, {"width", "Photos", NULL, " pixels"}, {"height", "Photos", NULL, " pixels"},
+    {"max_size", "Photos", "no limit", " pixels"}, {"photo_masks", "Photos", NULL, ""}, {"photos_masked", "Photos", "none", ""},
+    {"width", "Photos", NULL, " pixels"}, {"height", "Photos", NULL, " pixels"},
     {"train_views", "Photos", NULL, ""}, {"init", "Start", NULL, ""}, {"initial_splats", "Start", NULL, ""},
     {"random_points", "Start", NULL, ""}, {"extent", "Start", NULL, ""}, {"near_plane", "Start", NULL, ""},
     {"regularize", "Regularisers for few views", NULL, ""}, {"dropout", "Regularisers for few views", "off", ""},

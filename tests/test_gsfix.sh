@@ -45,7 +45,10 @@ expect 2 "$gsfix" fix "$scene" --out x --factor 2 --max-size 99
 expect 2 "$gsfix" fix "$scene" "$scene" --out x
 expect 2 "$gsfix" fix "$scene" --out x --compare
 expect 2 "$gsfix" fix "$scene" --out x --compare --restorer none
+for color in red 1,1 0,0,2 1,1,1,1 nan,0,0 ,0,0; do expect 2 "$gsfix" fix "$scene" --out x --background=$color; done
+expect 2 "$gsfix" fix "$scene" --out x --photo-masks maybe
 expect 2 "$gsfix" render x.ply --out x
+expect 2 "$gsfix" render x.ply --scene "$scene" --out x --background random
 expect 2 "$gsfix" metrics a b --which lpips
 expect 2 "$gsfix" metrics a b --models m
 expect 2 "$gsfix" path "$scene" --out x.json --frames 10 --windows 3
@@ -119,6 +122,35 @@ expect 0 "$gsfix" fix "$scene" --out e --views 3 --iterations 5 --max-size 48 --
 # names with a byte order mark, as some editors write it
 printf '\xef\xbb\xbfframe_002.png\r\nframe_003.png\nframe_004.png\n' > names
 expect 0 "$gsfix" fix "$scene" --out marked --views names --iterations 2 --max-size 48
+
+# masks change splats and figures, are inputs as photos are, and --photo-masks off does not look at them.
+# Here the folder masks holds the photos themselves, so that dark pixels hardly count.
+mkdir -p cut/images cut/masks
+cp -r "$scene/sparse" cut/
+cp "$scene"/images/* cut/images/
+for name in "$scene"/images/*; do cp "$name" "cut/masks/$(basename "${name%.*}").png"; done
+plain=(--views 3 --iterations 10 --max-size 48)
+expect 0 "$gsfix" fix cut --out cut_on "${plain[@]}" --json
+holds '"photo_masks":"on","photos_masked":[1-9]' stdout
+holds 'pixels that count' stdout
+expect 0 "$gsfix" fix cut --out cut_off "${plain[@]}" --photo-masks off --json
+holds '"photo_masks":"off","photos_masked":0' stdout
+expect 0 "$gsfix" fix "$scene" --out uncut "${plain[@]}"
+cmp cut_off/splats.ply uncut/splats.ply || fail "--photo-masks off looks at masks"
+if cmp -s cut_on/splats.ply uncut/splats.ply; then fail "masks change nothing"; fi
+cp "$scene/images/frame_002.png" cut/masks/frame_001.png
+expect 1 "$gsfix" fix cut --out cut_on "${plain[@]}" --resume
+holds "masks/frame_001.png" stderr
+printf x > cut/masks/frame_001.png
+expect 1 "$gsfix" fix cut --out cut_on --restart "${plain[@]}"
+holds "masks/frame_001.png" stderr
+for color in white random 0.25,0.5,1; do
+    expect 0 "$gsfix" fix "$scene" --out colored --restart "${plain[@]}" --background $color --json
+done
+holds '"background":\[0.25,0.5,1\]' stdout
+expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_white --background white
+expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_black
+if cmp -s on_white/frame_001.png on_black/frame_001.png; then fail "the background changes nothing"; fi
 
 # --compare: the figures without repair are those of a run without repair, the others of one without --compare
 expect 0 "$gsfix" fix "$scene" --out compared "${small[@]}" --restorer warp --compare --seed 3
