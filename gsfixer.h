@@ -419,10 +419,12 @@ typedef struct gsf_restore_window { // one clip; all pointers are borrowed for t
 typedef struct gsf_restorer {
     uint32_t struct_size; // sizeof(gsf_restorer) of the caller, so that fields can be added
     const char* name;
+// One restorer serves one loop at a time: what begin took is one run's, and ends with it.
     void* user;
     gsf_result (*query_fn)(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                            gsf_restorer_limits* out);
-    // References are borrowed for the call: what later windows need of them is copied.
+    // References are borrowed for the call: what later windows need of them is copied. The toolkit's restorers refuse a
+    // second begin before end.
     gsf_result (*begin_fn)(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count);
     gsf_result (*restore_fn)(void* user, gsf_context* ctx, const gsf_restore_window* window);
     void (*end_fn)(void* user, gsf_context* ctx); // releases what begin took; called once per successful begin

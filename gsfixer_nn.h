@@ -13018,6 +13018,7 @@ static void gsf__dit_forget_photos(gsf_context* ctx, gsf__dit_restorer* r);
 
 static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
+    if (r->photos) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: begun, and not yet ended, by another run");
     gsf_result result = GSF_OK;
     uint32_t sum = gsf__crc32(0, &reference_count, sizeof reference_count);
     if (reference_count > 0) {

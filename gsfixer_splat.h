@@ -11590,6 +11590,7 @@ static void gsf__warp_find_focus(gsf__warp_reference* ref) { // its middle pixel
 static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
     gsf__warp* warp = (gsf__warp*)user;
     if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
+    if (warp->references) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: begun, and not yet ended, by another run");
     warp->references = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__warp_reference));
     if (!warp->references) return GSF_ERROR_OUT_OF_MEMORY;
     warp->count = count;

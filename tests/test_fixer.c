@@ -113,6 +113,11 @@ static void test_warp(gsf_context* ctx) {
     for (int i = 0; i < N; i += 7) CHECK_NEAR(out_color[3 * i], color[1][3 * i], 1e-6);
     warp.end_fn(warp.user, ctx);
     CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 0), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
+    CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 1), GSF_ERROR_INVALID_ARGUMENT); // another run's
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window)); // still has its two
+    CHECK_NEAR(out_color[0], color[1][0], 1e-6);
+    warp.end_fn(warp.user, ctx);
     references[1].depth.data = NULL;
     CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 2), GSF_ERROR_INVALID_ARGUMENT);
     gsf_splat_destroy_warp(ctx, &warp);

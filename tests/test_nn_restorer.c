@@ -305,6 +305,7 @@ static void lend_photos(gsf_context* ctx, gsf_restorer* r, const gsf_camera* cam
         photos[i].camera = cameras[i];
     }
     CHECK_OK(ctx, r->begin_fn(r->user, ctx, photos, PHOTOS));
+    CHECK_RESULT(ctx, r->begin_fn(r->user, ctx, photos, 1), GSF_ERROR_INVALID_ARGUMENT); // another run's
 }
 
 static void save_random(gsf_context* ctx, const char* path, char (*names)[40], const int64_t (*shapes)[3], size_t count,
