@@ -88,7 +88,8 @@ extern "C" {
     X(GSF_ERROR_CANCELLED, "cancelled")                                    \
     X(GSF_ERROR_DEGENERATE, "geometry is degenerate")                      \
     X(GSF_ERROR_NUMERIC, "a value is NaN or infinite")                     \
-    X(GSF_ERROR_RESTORER, "the restorer failed")
+    X(GSF_ERROR_RESTORER, "the restorer failed")                           \
+    X(GSF_ERROR_NOT_FOUND, "no such file")
 
 typedef enum gsf_result {
 #define GSF_X(name, text) name,
@@ -135,7 +136,9 @@ typedef struct gsf_parallel { // run body for chunks 0..chunk_count-1, return wh
 } gsf_parallel;
 
 typedef struct gsf_io { // both or neither (neither: stdio; writes go to a temporary that is then renamed)
-    // Reads a whole file. *data comes from ctx->allocator via gsf_alloc and is freed by the library.
+    // Reads a whole file. *data comes from ctx->allocator via gsf_alloc and is freed by the library. GSF_ERROR_NOT_FOUND
+    // where there is no such file, and for nothing else: such files are gone without where they may lack (a photo, one of
+    // two formats), while every other result ends the work, since a file that is there was asked for.
     gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size);
     gsf_result (*write_fn)(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
     void* user;
@@ -416,10 +419,10 @@ typedef struct gsf_restore_window { // one clip; all pointers are borrowed for t
     int32_t part;                     // of a clip that is restored in several parts: which, from 0
 } gsf_restore_window;
 
+// One restorer serves one loop at a time: what begin took is one run's, and ends with it.
 typedef struct gsf_restorer {
     uint32_t struct_size; // sizeof(gsf_restorer) of the caller, so that fields can be added
     const char* name;
-// One restorer serves one loop at a time: what begin took is one run's, and ends with it.
     void* user;
     gsf_result (*query_fn)(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                            gsf_restorer_limits* out);
@@ -808,6 +811,11 @@ GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t mos
     return gsf__legal_count((int32_t)(wanted + 0.5), multiple, most, multiple);
 }
 
+// What the platform says of a file that it does not open. What lies below a file (ENOTDIR) is not there, either.
+GSF__SHARED gsf_result gsf__open_result(int reason) {
+    return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
+}
+
 GSF__END_IMPLEMENTATION
 
 // What only gsfixer.h's own implementation can do, so that it is linked, not shared. First DEFLATE (RFC 1951): in through
@@ -827,8 +835,6 @@ GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, cons
                                         gsf_json* out);
 // Are files those of the platform, which may list or map them?
 GSF_API int gsf__io_is_plain(const gsf_context* ctx);
-// After GSF_ERROR_IO: is there no such file? Of plain files the platform is asked; a host's hook is taken to mean that.
-GSF_API int gsf__is_absent(const gsf_context* ctx, const char* path);
 #ifdef __cplusplus
 }
 #endif
@@ -1127,42 +1133,31 @@ static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to
     return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
 }
 
-// NULL, or why `path` is not read: a pipe would wait for its writer, a device never end.
+// NULL, or why `path` is not read although it is there: a pipe would wait for its writer, a device never end.
 static const char* gsf__why_unreadable(const char* path) {
     struct stat info;
-    if (stat(path, &info) != 0) return strerror(errno);
-    return S_ISREG(info.st_mode) ? NULL : S_ISDIR(info.st_mode) ? "is a folder" : "is not a regular file";
-}
-
-static int gsf__is_nothing(const char* path) {
-    struct stat info;
-    return stat(path, &info) != 0 && (errno == ENOENT || errno == ENOTDIR);
+    if (stat(path, &info) != 0 || S_ISREG(info.st_mode)) return NULL;
+    return S_ISDIR(info.st_mode) ? "is a folder" : "is not a regular file";
 }
 #else
 static int gsf__is_device(const char* path) { (void)path; return 0; }
 static const char* gsf__why_unreadable(const char* path) { (void)path; return NULL; }
-static int gsf__is_nothing(const char* path) {
-    errno = 0;
-    FILE* file = fopen(path, "rb");
-    const int reason = errno;
-    if (file) fclose(file);
-    return !file && reason == ENOENT;
-}
 #endif
 
-// For reading; NULL and ctx->error where that cannot be.
-static FILE* gsf__open_file(gsf_context* ctx, const char* path) {
+// For reading; *out is NULL on failure.
+static gsf_result gsf__open_file(gsf_context* ctx, const char* path, FILE** out) {
     const char* reason = gsf__why_unreadable(path);
-    FILE* file = reason ? NULL : fopen(path, "rb");
-    if (!file) (void)gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, reason ? reason : strerror(errno));
-    return file;
+    errno = 0;
+    *out = reason ? NULL : fopen(path, "rb");
+    if (*out) return GSF_OK;
+    return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, reason ? reason : strerror(errno));
 }
 
 // Reads a first piece before it believes the size that the file claims.
 static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     (void)user;
-    FILE* file = gsf__open_file(ctx, path);
-    if (!file) return GSF_ERROR_IO;
+    FILE* file;
+    GSF__TRY(gsf__open_file(ctx, path, &file));
     gsf_text buffer;
     memset(&buffer, 0, sizeof buffer);
     gsf_result result = GSF_OK;
@@ -1250,10 +1245,6 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
 
 GSF_API int gsf__io_is_plain(const gsf_context* ctx) {
     return ctx->io.read_fn == gsf__stdio_read || ctx->io.plain_files;
-}
-
-GSF_API int gsf__is_absent(const gsf_context* ctx, const char* path) {
-    return !gsf__io_is_plain(ctx) || gsf__is_nothing(path);
 }
 
 GSF_API gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size) {
@@ -2624,8 +2615,7 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
 #ifndef GSF_NO_STB
     if (gsf__io_is_plain(ctx)) { // only as many bytes as the header has
         gsf__stb_source source = gsf__stb_memory(NULL, 0);
-        source.file = gsf__open_file(ctx, path);
-        if (!source.file) return GSF_ERROR_IO;
+        GSF__TRY(gsf__open_file(ctx, path, &source.file));
         const gsf_result result = gsf__stb_query(ctx, path, &source, width, height, channels);
         fclose(source.file);
 #ifdef GSF_USE_OIIO

@@ -939,7 +939,7 @@ static gsf__nn_path_kind gsf__nn_look_at_path(const char* path) {
 
 static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing) {
     DIR* folder = opendir(listing->folder);
-    if (!folder) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", listing->folder, strerror(errno));
+    if (!folder) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", listing->folder, strerror(errno));
     gsf_result result = GSF_OK;
     for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
         if (entry->d_name[0] == '.' || !gsf__nn_ends_in(entry->d_name, listing->suffix)) continue;
@@ -961,7 +961,7 @@ static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned
     *data = NULL;
     *size = 0;
     const int file = open(path, O_RDONLY | O_NONBLOCK); // a pipe is not waited for
-    if (file < 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
+    if (file < 0) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, strerror(errno));
     if (fstat(file, &info) == 0 && S_ISREG(info.st_mode) && info.st_size > 0 &&
         (uint64_t)info.st_size <= SIZE_MAX / 2) {
         void* mapping = mmap(NULL, (size_t)info.st_size, PROT_READ, MAP_PRIVATE, file, 0);
@@ -1336,7 +1336,7 @@ static gsf_result gsf__nn_read_index(gsf_context* ctx, const char* path, const v
 // Ends a stretch without the log hook, in which a file was allowed to be absent.
 static gsf_result gsf__nn_end_quiet(gsf_context* ctx, const gsf_logger* logger, gsf_result result) {
     ctx->logger = *logger;
-    if (result != GSF_OK && result != GSF_ERROR_IO) gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
+    if (result != GSF_OK && result != GSF_ERROR_NOT_FOUND) gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
     return result;
 }
 
@@ -1348,8 +1348,7 @@ static gsf_result gsf__nn_read_if_there(gsf_context* ctx, const char* path, void
     memset(&ctx->logger, 0, sizeof ctx->logger);
     *data = NULL;
     const gsf_result result = gsf__nn_end_quiet(ctx, &logger, gsf_read_file(ctx, path, data, size));
-    if (result != GSF_ERROR_IO) return result;
-    if (!gsf__is_absent(ctx, path)) return gsf_fail(ctx, result, "%s", ctx->error);
+    if (result != GSF_ERROR_NOT_FOUND) return result;
     memcpy(ctx->error, error, sizeof error);
     return GSF_OK;
 }
@@ -1375,8 +1374,7 @@ static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_
     if (may_lack) (void)gsf__nn_end_quiet(ctx, &logger, result);
     *found = result == GSF_OK;
     if (result == GSF_OK) return gsf__nn_sort_names(ctx, weights);
-    if (!may_lack || result != GSF_ERROR_IO) return result;
-    return gsf__is_absent(ctx, path->data) ? GSF_OK : gsf_fail(ctx, result, "%s", ctx->error);
+    return may_lack && result == GSF_ERROR_NOT_FOUND ? GSF_OK : result;
 }
 
 static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const char* name, int may_lack, int* found,
@@ -1413,7 +1411,7 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
         }
         gsf_destroy_text(ctx, &listing.found);
     }
-    if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_IO, "%s: no .safetensors file in it", folder);
+    if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: no .safetensors file in it", folder);
     return result;
 }
 
@@ -13018,9 +13016,9 @@ static void gsf__dit_forget_photos(gsf_context* ctx, gsf__dit_restorer* r);
 
 static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
-    if (r->photos) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: begun, and not yet ended, by another run");
     gsf_result result = GSF_OK;
     uint32_t sum = gsf__crc32(0, &reference_count, sizeof reference_count);
+    if (r->photos) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: begun, and not yet ended, by another run");
     if (reference_count > 0) {
         r->photos = (gsf_reference*)gsf_alloc_zeroed(ctx, (size_t)reference_count, sizeof *r->photos);
         if (!r->photos) return GSF_ERROR_OUT_OF_MEMORY;
@@ -13203,7 +13201,7 @@ static gsf_result gsf__dit_folder(const gsf__dit_part* p, const char* name, gsf_
 // To the error of a folder that is not there: what it is for, and what does without it.
 static gsf_result gsf__dit_absent(const gsf__dit_part* p, gsf_result result, const char* makes, const char* instead) {
     char before[sizeof p->ctx->error];
-    if (result != GSF_ERROR_IO) return result;
+    if (result != GSF_ERROR_NOT_FOUND) return result;
     memcpy(before, p->ctx->error, sizeof before);
     return gsf_fail(p->ctx, result, "%.250s (which makes %s; %.100s in the features file%s does without it)", before, makes,
                     p->name, instead);

@@ -3221,7 +3221,7 @@ static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
     const gsf_result result = gsf_read_file(ctx, path->data, data, size);
-    const int absent = result == GSF_ERROR_IO && gsf__is_absent(ctx, path->data);
+    const int absent = result == GSF_ERROR_NOT_FOUND;
     gsf__hush_end(ctx, &hush, result == GSF_OK || absent);
     return absent ? GSF_OK : result;
 }
@@ -3254,7 +3254,7 @@ static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_text* path, int64
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
     const gsf_result result = gsf_query_image(ctx, path->data, width, height, &channels);
-    const int absent = result == GSF_ERROR_IO && gsf__is_absent(ctx, path->data);
+    const int absent = result == GSF_ERROR_NOT_FOUND;
     gsf__hush_end(ctx, &hush, result == GSF_OK || absent);
     if (absent) *width = *height = 0;
     return absent ? GSF_OK : result;
@@ -3440,7 +3440,7 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
     if (missing > 1)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu photos are missing", photos->folder, missing, m->image_count);
     if (result == GSF_OK && scene->view_count == 0)
-        result = gsf_fail(ctx, GSF_ERROR_IO, "%s%s: none of the %zu photos is there", photos->folder, photos->prefix,
+        result = gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s%s: none of the %zu photos is there", photos->folder, photos->prefix,
                           m->image_count);
     gsf_destroy_text(ctx, &path);
     return result;
@@ -3680,8 +3680,8 @@ static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__ph
         if (found) return GSF_OK;
         GSF__TRY(gsf__read_if_there(ctx, folder->data, "transforms.json", scratch, json, &size));
         if (!*json)
-            return gsf_fail(ctx, GSF_ERROR_IO, "%s: no scene: neither sparse/0/cameras.bin or .txt nor transforms.json",
-                            path);
+            return gsf_fail(ctx, GSF_ERROR_NOT_FOUND,
+                            "%s: no scene: neither sparse/0/cameras.bin or .txt nor transforms.json", path);
         path = "transforms.json";
     } else {
         GSF__TRY(gsf_read_file(ctx, path, json, &size));

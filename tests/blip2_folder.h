@@ -17,7 +17,7 @@ static gsf_result blip2_read(void* user, gsf_context* ctx, const char* path, voi
     const char* name = strrchr(path, '/') + 1;
     for (size_t i = 0; i < f->count; i++) {
         if (strcmp(f->files[i].name, name) != 0) continue;
-        if (!f->files[i].text) return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+        if (!f->files[i].text) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: not there", path);
         *size = f->files[i].size ? f->files[i].size : strlen(f->files[i].text);
         *data = gsf_alloc(ctx, *size, 1);
         if (!*data) return GSF_ERROR_OUT_OF_MEMORY;

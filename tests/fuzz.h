@@ -126,7 +126,7 @@ static inline gsf_result fuzz_read(void* user, gsf_context* ctx, const char* pat
         *size = file->size;
         return GSF_OK;
     }
-    return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+    return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: not there", path);
 }
 static inline gsf_result fuzz_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     fuzz_file* file = (fuzz_file*)user;

@@ -23,7 +23,7 @@ static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void**
         *size = files[i].size;
         return GSF_OK;
     }
-    return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+    return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: not there", path);
 }
 
 static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {

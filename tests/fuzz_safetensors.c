@@ -14,7 +14,7 @@ enum { FOLDER = 16 }; // files that the folder of shards holds: whichever are as
 static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     fuzz_files* files = (fuzz_files*)user;
     const bytes* from = files->reads == 0 ? &files->index : files->reads == 1 ? &files->first : &files->others;
-    if (files->reads++ == FOLDER) return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+    if (files->reads++ == FOLDER) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: not there", path);
     *data = gsf_alloc(ctx, from->size, 1);
     FUZZ_CHECK(*data);
     if (from->size) memcpy(*data, from->data, from->size);
@@ -68,7 +68,7 @@ static void check_again(gsf_context* ctx, fuzz_files* files, const gsf_nn_weight
 }
 
 static void check_refused(const gsf_context* ctx, const gsf_nn_weights* w, gsf_result result) {
-    FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED || result == GSF_ERROR_IO);
+    FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED || result == GSF_ERROR_NOT_FOUND);
     FUZZ_CHECK(w->tensors == NULL && w->files == NULL && strchr(ctx->error, ':') != NULL);
     for (const char* c = ctx->error; *c; c++) FUZZ_CHECK((unsigned char)*c >= 0x20); // one line
 }
@@ -103,7 +103,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
         check_again(&ctx, &files, &w);
     } else {
         check_refused(&ctx, &w, result);
-        FUZZ_CHECK(result != GSF_ERROR_IO && strncmp(ctx.error, "fuzz:", 5) == 0);
+        FUZZ_CHECK(result != GSF_ERROR_NOT_FOUND && strncmp(ctx.error, "fuzz:", 5) == 0);
     }
     gsf_nn_close_weights(&ctx, &w);
 

@@ -487,7 +487,7 @@ static void test_types(void) {
         gsf_destroy_text(&ctx, &text);
     }
     CHECK_RESULT(&ctx, gsf_splat_save(&ctx, test_scratch("x.obj"), &s, NULL), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(&ctx, gsf_splat_load(&ctx, "no/such/file.spz", &again), GSF_ERROR_IO);
+    CHECK_RESULT(&ctx, gsf_splat_load(&ctx, "no/such/file.spz", &again), GSF_ERROR_NOT_FOUND);
     CHECK_RESULT(&ctx, gsf_splat_parse(&ctx, "x", "", 0, &again), GSF_ERROR_FORMAT);
     CHECK_RESULT(&ctx, gsf_splat_parse(&ctx, "x", "NGSP\4\0\0\0", 8, &again), GSF_ERROR_UNSUPPORTED);
     CHECK(strstr(ctx.error, "version 4") && strstr(ctx.error, "zstd"));

@@ -562,7 +562,7 @@ static void test_image_files(gsf_context* ctx) {
     static const char claim[] = "P5\n16000 16000\n255\n0123456789";
     CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "claim.pgm", claim, sizeof claim - 1, 0, &out), GSF_ERROR_FORMAT);
     CHECK(strstr(ctx->error, "cannot hold") != NULL);
-    CHECK_RESULT(ctx, gsf_load_image(ctx, test_scratch("absent.png"), 0, &out), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_load_image(ctx, test_scratch("absent.png"), 0, &out), GSF_ERROR_NOT_FOUND);
     CHECK_RESULT(ctx, gsf_load_image(ctx, test_scratch(""), 0, &out), GSF_ERROR_IO); // a folder
     gsf_image image = noise_image(ctx, 8, 8, 3);
     CHECK_RESULT(ctx, gsf_save_image(ctx, test_scratch("image.xyz"), &image), GSF_ERROR_UNSUPPORTED);

@@ -3,11 +3,12 @@
 #ifndef TEST_HOOKS_H
 #define TEST_HOOKS_H
 
-typedef struct counter { size_t live, calls, fail_at, asked; } counter; // fail_at: 1 = the first call; 0 = never
+typedef struct counter { size_t live, calls, fail_at, asked; int stays; } counter; // fail_at: 1 = the first call; 0 = never;
+                                                                        // stays: and so do all that follow
 
 static inline void* counted_alloc(void* user, size_t size) {
     counter* c = (counter*)user;
-    if (++c->calls == c->fail_at) return NULL;
+    if (++c->calls == c->fail_at || (c->stays && c->fail_at && c->calls > c->fail_at)) return NULL;
     c->asked += size;
     void* p = malloc(size);
     if (p) c->live++;

@@ -66,7 +66,7 @@ static void check_same(const gsf_nn_weights* w, const gsf_tensor* expected, size
 static gsf_result hooked_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     FILE* file = fopen(path, "rb");
     ++*(int*)user;
-    if (!file) return gsf_fail(ctx, GSF_ERROR_IO, "%s: not there", path);
+    if (!file) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: not there", path);
     fseek(file, 0, SEEK_END);
     *size = (size_t)ftell(file);
     rewind(file);
@@ -261,10 +261,10 @@ static void test_broken(gsf_context* ctx) {
     CHECK(strstr(ctx->error, "levels deep") != NULL);
     gsf_destroy_text(ctx, &deep);
     free(m.data);
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent.safetensors"), NULL, &w), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent.safetensors"), NULL, &w), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "absent.safetensors") != NULL);
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent"), NULL, &w), GSF_ERROR_IO);
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent"), "model", &w), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent"), NULL, &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent"), "model", &w), GSF_ERROR_NOT_FOUND);
     CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("empty.safetensors"), "", 0));
     CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("empty.safetensors"), NULL, &w), GSF_ERROR_FORMAT);
 }
@@ -354,7 +354,7 @@ static void test_shards(gsf_context* ctx) {
         {"{\"weight_map\":{\"f32\":\"\"}}", 0, GSF_ERROR_FORMAT, "no plain file name"},
         {"{\"weight_map\":{\"f32\":\"s-1.safetensors\\u0000\"}}", 0, GSF_ERROR_FORMAT, "no plain file name"},
         {"{\"weight_map\":{\"f32\":7}}", 0, GSF_ERROR_FORMAT, "no plain file name"},
-        {"{\"weight_map\":{\"f32\":\"s-3.safetensors\"}}", 0, GSF_ERROR_IO, "s-3.safetensors"},
+        {"{\"weight_map\":{\"f32\":\"s-3.safetensors\"}}", 0, GSF_ERROR_NOT_FOUND, "s-3.safetensors"},
         {"{\"weight_map\":{\"f32\":\"s-1.safetensors\",\"f16\":\"s-4.safetensors\"}}", 0, GSF_ERROR_FORMAT,
          "tensor f32 stands in two"},
         {"{\"weight_map\":[]}", 0, GSF_ERROR_FORMAT, "weight_map"},
@@ -404,14 +404,14 @@ static void test_folders(gsf_context* ctx) { // without a prefix
         snprintf(path, sizeof path, "%s/%s", folder, names[i]);
         remove(path);
     }
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, folder, NULL, &w), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "no .safetensors file") != NULL);
-    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, NULL, &w), GSF_ERROR_IO);
+    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
     snprintf(path, sizeof path, "%s/%s", folder, names[0]);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 3));
     check_opens(ctx, folder, tensors, 3);
     check_opens(&hooked, folder, tensors, 3);
-    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, "absent", &w), GSF_ERROR_IO);
+    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, "absent", &w), GSF_ERROR_NOT_FOUND);
     snprintf(path, sizeof path, "%s/%s", folder, names[1]);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 2));
     CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, folder, NULL, &w), GSF_ERROR_INVALID_ARGUMENT);
@@ -621,7 +621,7 @@ static void test_config(gsf_context* ctx) {
     CHECK_RESULT(ctx, gsf__nn_config_ints(&c, "heads", 1, 15, 3, list, &count), GSF_ERROR_FORMAT);
     gsf__nn_close_config(&c);
     CHECK_RESULT(ctx, gsf__nn_parse_config(ctx, "config.json", "[]", 2, &c), GSF_ERROR_FORMAT);
-    CHECK_RESULT(ctx, gsf__nn_load_config(ctx, test_scratch("absent.json"), &c), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf__nn_load_config(ctx, test_scratch("absent.json"), &c), GSF_ERROR_NOT_FOUND);
     if (CHECK_OK(ctx, gsf__nn_load_config(ctx, test_golden("restorer/model/transformer/config.json"), &c)))
         CHECK_OK(ctx, gsf__nn_config_int(&c, "num_layers", 1, 1000, &n));
     gsf__nn_close_config(&c);

@@ -236,7 +236,7 @@ static void test_conditions(gsf_context* ctx, const char* features, clip* c) {
     CHECK(restore(ctx, &desc, c, GSF_OK) == sums[GSF_NN_2D]); // what is not asked for need not be there
     gsf_restorer r;
     desc.condition = GSF_NN_BOTH;
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO); // the folder has no encoder, either
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND); // the folder has no encoder, either
     CHECK(strstr(ctx->error, "/vggt/") != NULL && strstr(ctx->error, "vggt_latents") != NULL && r.user == NULL);
 }
 
@@ -245,7 +245,7 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     char saved[1100];
     gsf_nn_dit_desc desc = small_desc(write_features(ctx, "no_text.safetensors", "prompt_embeds"), 2);
     gsf_restorer r;
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO); // no caption, and no captioner
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND); // no caption, and no captioner
     CHECK(strstr(ctx->error, "/blip2/") != NULL && strstr(ctx->error, "a caption") != NULL && r.user == NULL);
     snprintf(saved, sizeof saved, "%s", test_scratch("saved.safetensors"));
     desc.caption = "a wall";
@@ -259,12 +259,12 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     const gsf_nn_dit_desc plain = small_desc(features, 2);
     CHECK(restore(ctx, &desc, c, GSF_OK) == restore(ctx, &plain, c, GSF_OK));
     desc.features = NULL;
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "/dinov2/") != NULL && strstr(ctx->error, "dino_latents") != NULL);
     desc.condition = GSF_NN_NONE;
     CHECK(restore(ctx, &desc, c, GSF_OK) != 0);
     desc.model = test_golden("restorer/model/transformer"); // names the part that is missing first
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND);
 }
 
 // ---- features of several photos and clips
@@ -331,7 +331,7 @@ static int missing_photo(gsf_context* ctx, gsf_restorer* r, clip* c, const gsf_c
     for (int32_t i = 0; i < c->frames; i++) cameras[i] = i < c->frames / 2 ? *from : *to;
     c->window.cameras = cameras;
     c->window.clip = 1;
-    CHECK_RESULT(ctx, r->restore_fn(r->user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, r->restore_fn(r->user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     const char* at = strstr(ctx->error, "dino_latents.photo");
     if (CHECK(at != NULL)) photo = atoi(at + strlen("dino_latents.photo"));
     c->window.clip = 0;
@@ -394,14 +394,14 @@ static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c
         sums[k] = checksum(c);
     }
     c->window.clip = CLIPS; // of this one the file has nothing
-    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "prompt_embeds.clip3") != NULL);
     c->window.clip = 1; // of these photos together neither
     cameras[0] = photos[4];
-    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "dino_latents.photo4") != NULL);
     cameras[0] = photos[0];
-    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "vggt_latents.photo0,3") != NULL);
     r.end_fn(r.user, ctx);
     gsf_nn_destroy_dit(ctx, &r);
@@ -467,7 +467,7 @@ static void test_clips(gsf_context* ctx, clip* c, const gsf_nn_transformer* net)
         CHECK(restore(ctx, &desc, c, GSF_OK) == sums[k]);
         if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) continue;
         c->window.clip = 1; // a bare name is no other clip's
-        CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_IO);
+        CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
         CHECK(strstr(ctx->error, "prompt_embeds.clip1") != NULL);
         c->window.clip = 0;
         gsf_nn_destroy_dit(ctx, &r);

@@ -255,7 +255,7 @@ static void test_configs(gsf_context* ctx) {
     still.beta_start = still.beta_end = 1e-20;
     CHECK_RESULT(ctx, gsf_nn_make_schedule(ctx, &still, &schedule), GSF_ERROR_DEGENERATE);
     CHECK(strstr(ctx->error, "betas from 1e-20") != NULL && schedule.alpha_bar == NULL);
-    CHECK_RESULT(ctx, gsf_nn_load_schedule(ctx, test_scratch("absent.json"), &schedule), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_nn_load_schedule(ctx, test_scratch("absent.json"), &schedule), GSF_ERROR_NOT_FOUND);
 }
 
 // Betas so large that abar is 0 long before the last of the steps.

@@ -326,7 +326,7 @@ static void test_configs(void) {
     static const char single[] = "{\"added_tokens_decoder\": {\"1\": {\"content\": \"y\", \"single_word\": true}}}";
     CHECK_RESULT(&ctx, gsf_nn_make_tokenizer_memory(&ctx, "m", m.data, m.size, single, sizeof single - 1, &t),
                  GSF_ERROR_UNSUPPORTED);
-    CHECK_RESULT(&ctx, gsf_nn_make_tokenizer(&ctx, test_scratch("nowhere"), &t), GSF_ERROR_IO);
+    CHECK_RESULT(&ctx, gsf_nn_make_tokenizer(&ctx, test_scratch("nowhere"), &t), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx.error, "spiece.model") != NULL);
 }
 
@@ -577,7 +577,7 @@ static void test_t5_configs(void) {
         CHECK_RESULT(&ctx, gsf_nn_make_t5(&ctx, test_scratch("."), &net), configs[i].wanted);
         CHECK(net.nets == NULL && net.weights.tensors == NULL);
     }
-    CHECK_RESULT(&ctx, gsf_nn_make_t5(&ctx, test_scratch("nowhere"), &net), GSF_ERROR_IO);
+    CHECK_RESULT(&ctx, gsf_nn_make_t5(&ctx, test_scratch("nowhere"), &net), GSF_ERROR_NOT_FOUND);
 }
 
 // ---- as a program for compare_tokenizer.py --------------------------------------------

@@ -106,7 +106,7 @@ static void check_damage(gsf_context* ctx) {
     }
     gsf_image out;
     CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "nonsense", "no image at all", 15, 0, &out), GSF_ERROR_FORMAT);
-    CHECK_RESULT(ctx, gsf_load_image(ctx, test_scratch("absent.exr"), 0, &out), GSF_ERROR_IO);
+    CHECK_RESULT(ctx, gsf_load_image(ctx, test_scratch("absent.exr"), 0, &out), GSF_ERROR_NOT_FOUND);
     gsf_image image = make_test_image(ctx, GSF_F32, 3);
     CHECK_RESULT(ctx, gsf_save_image(ctx, "no/such/folder/x.exr", &image), GSF_ERROR_IO);
     CHECK_RESULT(ctx, gsf_save_image(ctx, test_scratch("x.xyz"), &image), GSF_ERROR_UNSUPPORTED);

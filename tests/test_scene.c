@@ -119,7 +119,7 @@ static void test_ply_bad(void) {
     CHECK_OK(&ctx, gsf_splat_load_ply(&ctx, test_golden("splat/bad/ply/11_huge_header.ply"), &s));
     CHECK(s.count == 31);
     gsf_splat_destroy(&ctx, &s);
-    CHECK_RESULT(&ctx, gsf_splat_load_ply(&ctx, "no/such/file.ply", &s), GSF_ERROR_IO);
+    CHECK_RESULT(&ctx, gsf_splat_load_ply(&ctx, "no/such/file.ply", &s), GSF_ERROR_NOT_FOUND);
     CHECK(count.live == 0);
 }
 
@@ -247,7 +247,7 @@ static void test_ply_variants(void) { // elements before and after, carriage ret
 // ---- files in memory, through the io hook ---------------------------------------
 
 typedef struct memory_file { char path[160]; char* data; size_t size; } memory_file;
-typedef struct memory_disk { memory_file files[64]; int count; } memory_disk;
+typedef struct memory_disk { memory_file files[64]; int count; const char* unreadable; } memory_disk;
 
 static memory_file* disk_find(memory_disk* disk, const char* path) {
     for (int i = 0; i < disk->count; i++)
@@ -270,8 +270,10 @@ static gsf_result disk_write(void* user, gsf_context* ctx, const char* path, con
     return GSF_OK;
 }
 static gsf_result disk_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
-    memory_file* file = disk_find((memory_disk*)user, path);
-    if (!file) return gsf_fail(ctx, GSF_ERROR_IO, "%s: no such file", path);
+    const memory_disk* disk = (const memory_disk*)user;
+    const memory_file* file = disk_find((memory_disk*)user, path);
+    if (disk->unreadable && strcmp(disk->unreadable, path) == 0) return gsf_fail(ctx, GSF_ERROR_IO, "%s: a bad sector", path);
+    if (!file) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: no such file", path);
     *data = gsf_alloc(ctx, file->size + 1, 1);
     if (!*data) return GSF_ERROR_OUT_OF_MEMORY;
     memcpy(*data, file->data, file->size);
@@ -491,9 +493,9 @@ static void test_colmap_bad(void) {
     }
     // as a folder the missing points are an error
     CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, test_golden("splat/bad/colmap/13_points_missing"), NULL, &scene),
-                 GSF_ERROR_IO);
+                 GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx.error, "points3D.bin") != NULL);
-    CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, "no/such/folder", NULL, &scene), GSF_ERROR_IO);
+    CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, "no/such/folder", NULL, &scene), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx.error, "no/such/folder: no scene") != NULL);
     const gsf_scene_desc both = {2, 100, 0};
     CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, "x", &both, &scene), GSF_ERROR_INVALID_ARGUMENT);
@@ -1084,6 +1086,20 @@ static void test_unreadable_photos(void) {
         CHECK(strstr(ctx.error, path) && !scene.views);
         CHECK(remove(path) == 0);
     }
+    // another user's: as root the process becomes one, and where that cannot be nothing is refused
+    CHECK_OK(&ctx, gsf_write_file(&ctx, path, "x", 1));
+    CHECK(chmod(path, 0) == 0);
+    const int root = geteuid() == 0;
+    if (!root || seteuid(65534) == 0) {
+        FILE* open = fopen(path, "rb");
+        if (open) fclose(open);
+        else if (errno == EACCES) {
+            scene = load_folder(&ctx, folder, 0, 0, GSF_ERROR_IO);
+            CHECK(strstr(ctx.error, "c.png") && strstr(ctx.error, "denied") && !scene.views);
+        }
+        CHECK(!root || seteuid(0) == 0);
+    }
+    CHECK(remove(path) == 0);
     CHECK(symlink("elsewhere.png", path) == 0); // a link to nothing
     scene = load_folder(&ctx, folder, 0, 0, GSF_OK);
     CHECK(scene.missing_count == 1);
@@ -1132,11 +1148,19 @@ static void test_image_folders(void) {
     check_view(&ctx, &scene, 0, 41, 30, 35, 20, 15);
     check_view(&ctx, &scene, 2, 41, 30, 35, 20, 15); // not enlarged
     gsf_splat_destroy_scene(&ctx, &scene);
+    // the host's, too: a file that is there and cannot be read is not taken for one that is not there
+    static const char* const unreadable[] = {"s/images/b.png", "s/sparse/points3D.txt", "s/sparse/0/cameras.bin"};
+    for (int i = 0; i < 3; i++) {
+        disk.unreadable = unreadable[i];
+        scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_IO);
+        CHECK(strstr(ctx.error, unreadable[i]) && scene.views == NULL && scene.missing_count == 0);
+    }
+    disk.unreadable = NULL;
     disk_put(&disk, "s/images/b.png", "no image at all");
     scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_FORMAT);
     CHECK(strstr(ctx.error, "s/images/b.png") != NULL);
     disk_put(&disk, "s/sparse/images.txt", "5 1 0 0 0 0 0 0 1 nothing.jpg\n");
-    scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_IO);
+    scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx.error, "none of the 1 photos") != NULL);
     disk_put(&disk, "s/sparse/images.txt", "5 1 0 0 0 0 0 0 1 x/../../b.png\n");
     scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_FORMAT);
@@ -1246,7 +1270,7 @@ static void test_transforms(void) {
     scene = load_folder(&ctx, "n", 0, 0, GSF_ERROR_FORMAT);
     disk_put(&disk, "n/transforms.json",
              "{\"fl_x\":9,\"ply_file_path\":\"x.ply\",\"frames\":[{\"file_path\":\"images/b.png\"," POSE "}]}");
-    scene = load_folder(&ctx, "n", 0, 0, GSF_ERROR_IO);
+    scene = load_folder(&ctx, "n", 0, 0, GSF_ERROR_NOT_FOUND);
     for (size_t size = 0; size < sizeof nerfstudio - 1; size++) { // every truncation
         char* cut = exact_copy(nerfstudio, size);
         CHECK(parse_json_scene(&ctx, cut, size, &scene) == GSF_ERROR_FORMAT);
