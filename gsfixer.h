@@ -2242,8 +2242,10 @@ static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int
     return GSF_OK;
 }
 
-// Lengths and checksums of all chunks of a PNG (stb checks neither the sums nor that the file is whole; libpng prints).
-static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char* data, size_t size) {
+// Lengths and checksums of all chunks of a PNG (stb checks neither the sums nor that the file is whole; libpng prints), and
+// that no more than `most` bytes of them are image data.
+static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char* data, size_t size, uint64_t most) {
+    uint64_t packed = 0;
     for (size_t at = 8;;) {
         if (size - at < 12) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is cut (no IEND)", name, at);
         const unsigned char* head = (const unsigned char*)data + at;
@@ -2256,6 +2258,9 @@ static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char*
             ((uint32_t)sum[0] << 24 | (uint32_t)sum[1] << 16 | (uint32_t)sum[2] << 8 | sum[3]))
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG checksum mismatch", name, at);
         if (memcmp(head + 4, "IEND", 4) == 0) return GSF_OK;
+        if (memcmp(head + 4, "IDAT", 4) == 0) packed += bytes;
+        if (packed > most)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG with more data than its pixels take", name, at);
         at += 12 + bytes;
     }
 }
@@ -2500,6 +2505,51 @@ static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_so
     return GSF_OK;
 }
 
+// stb looks up colours in 256 entries of which it fills as many as the file has; the others are whatever was there before.
+// So it gets the file with a whole palette, black behind its end.
+static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t size, gsf_text* out) {
+    enum { FULL = 768 };
+    static const char zeros[FULL] = {0}, head[8] = {0, 0, FULL >> 8, FULL & 255, 'P', 'L', 'T', 'E'};
+    for (size_t at = 8; at + 12 <= size;) { // lengths are checked
+        const unsigned char* p = (const unsigned char*)data + at;
+        const size_t bytes = (size_t)p[0] << 24 | (size_t)p[1] << 16 | (size_t)p[2] << 8 | p[3];
+        if (memcmp(p + 4, "IDAT", 4) == 0) return;
+        if (memcmp(p + 4, "PLTE", 4) == 0) {
+            if (bytes >= FULL || bytes % 3) return; // stb refuses others
+            gsf_text_append(ctx, out, data, at);
+            gsf_text_append(ctx, out, head, sizeof head);
+            gsf_text_append(ctx, out, data + at + 8, bytes);
+            gsf_text_append(ctx, out, zeros, FULL - bytes);
+            gsf_text_append(ctx, out, data + at + 8 + bytes, size - at - 8 - bytes); // stb skips the sum
+            return;
+        }
+        at += 12 + bytes;
+    }
+}
+
+// The same for a BMP. Of the old header (12 bytes) stb counts four colours less than there are, as if it had 24.
+static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, const char* data, size_t size, gsf_text* out) {
+    static const char zeros[1024 + 12] = {0};
+    if (size < 32) return GSF_OK; // stb says that it is cut
+    const unsigned char* p = (const unsigned char*)data;
+    const uint64_t offset = gsf__load_le(data + 10, 4), header = gsf__load_le(data + 14, 4), entry = header == 12 ? 3 : 4;
+    const unsigned bits = header == 12 ? p[24] | (unsigned)p[25] << 8 : p[28] | (unsigned)p[29] << 8;
+    if (bits >= 16 || header > 124) return GSF_OK;
+    const uint64_t begin = 14 + header, colors = offset > begin ? (offset - begin) / entry : 0;
+    if (colors < 1 || colors > 256 || offset > size)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:10: BMP of %u bits whose pixels begin at byte %llu, not behind a palette", name,
+                        bits, (unsigned long long)offset);
+    const size_t old = header == 12 ? 12 : 0, full = (size_t)entry * 256, used = (size_t)(colors * entry);
+    const uint64_t moved = begin + full + old;
+    const char place[4] = {(char)(moved & 255), (char)(moved >> 8), 0, 0};
+    gsf_text_append(ctx, out, data, 10);
+    gsf_text_append(ctx, out, place, 4);
+    gsf_text_append(ctx, out, data + 14, (size_t)header + used);
+    gsf_text_append(ctx, out, zeros, full - used + old);
+    gsf_text_append(ctx, out, data + (size_t)offset, size - (size_t)offset);
+    return GSF_OK;
+}
+
 // stb's own scratch memory and the decoded pixels come from malloc (it has no hook with a context) and are gone on
 // return.
 static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
@@ -2509,11 +2559,19 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     int32_t file_channels = 0;
     GSF__TRY(gsf__stb_query(ctx, name, &source, &width, &height, &file_channels));
     GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
-    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
+    // stb inflates all data before it counts rows: not more than twice what four channels of 16 bits would take unpacked
+    const uint64_t most = 65536 + 2 * (uint64_t)height * (8 * (uint64_t)width + 1);
+    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, most));
     gsf__source_rewind(&source);
-    if (gsf__image_kind_of(&source) == GSF__IMAGE_JPEG)
-        GSF__TRY(gsf__check_jpeg(ctx, name, (const unsigned char*)data, size, source.at));
+    const gsf__image_kind kind = gsf__image_kind_of(&source);
+    if (kind == GSF__IMAGE_JPEG) GSF__TRY(gsf__check_jpeg(ctx, name, (const unsigned char*)data, size, source.at));
     gsf__source_rewind(&source);
+    gsf_text whole;
+    memset(&whole, 0, sizeof whole);
+    if (kind == GSF__IMAGE_BMP) GSF__TRY(gsf__bmp_full_palette(ctx, name, (const char*)data, size, &whole));
+    if (kind == GSF__IMAGE_PNG) gsf__png_full_palette(ctx, (const char*)data, size, &whole);
+    if (whole.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    if (whole.data) source = gsf__stb_memory(whole.data, whole.size);
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
     int w, h, c;
     stbi_uc* pixels = stbi_load_from_callbacks(&callbacks, &source, &w, &h, &c, channels);
@@ -2521,6 +2579,7 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, w, h, channels ? channels : c, out);
     if (result == GSF_OK) memcpy(out->data, pixels, (size_t)out->stride_y * (size_t)h);
     stbi_image_free(pixels);
+    gsf_destroy_text(ctx, &whole);
     return result;
 }
 
@@ -3817,7 +3876,7 @@ static const char* gsf__oiio_format(const void* data, size_t size) {
 static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void* data, size_t size,
                                  OIIO::Filesystem::IOMemReader* memory, std::unique_ptr<OIIO::ImageInput>* out) {
     const char* format = gsf__oiio_format(data, size);
-    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size));
+    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, UINT64_MAX));
     std::unique_ptr<OIIO::ImageInput> input =
         format ? OIIO::ImageInput::create(format) : OIIO::ImageInput::open(name, nullptr, memory);
     if (!input)

@@ -752,6 +752,94 @@ static void test_encoding_without_memory(void) {}
 static void test_encoding_without_memory(void) {}
 #endif
 
+// ---- palettes ------------------------------------------------------------------
+
+static size_t put_little(uint8_t* at, uint32_t value, size_t bytes) {
+    for (size_t i = 0; i < bytes; i++) at[i] = (uint8_t)(value >> 8 * i);
+    return bytes;
+}
+
+// A picture of 4 x 1 pixels in a BMP with a header of 12 or 40 bytes; colour i is (i, 2 i, 3 i).
+static size_t make_bmp(uint8_t* file, size_t header, size_t colors, uint32_t offset, const uint8_t pixels[4]) {
+    size_t at = 2;
+    memset(file, 0, 14 + header);
+    memcpy(file, "BM", 2);
+    put_little(file + 10, offset, 4);
+    put_little(file + 14, (uint32_t)header, 4);
+    at = 18;
+    at += put_little(file + at, 4, header == 12 ? 2 : 4);
+    at += put_little(file + at, 1, header == 12 ? 2 : 4);
+    at += put_little(file + at, 1, 2);
+    put_little(file + at, 8, 2);
+    at = 14 + header;
+    for (size_t i = 0; i < colors; i++) {
+        const uint8_t bgr[4] = {(uint8_t)(3 * i), (uint8_t)(2 * i), (uint8_t)i, 0};
+        memcpy(file + at, bgr, 4);
+        at += header == 12 ? 3 : 4;
+    }
+    memcpy(file + at, pixels, 4);
+    return at + 4;
+}
+
+static size_t put_png_chunk(uint8_t* at, const char* tag, const uint8_t* data, size_t size) {
+    uint32_t crc = 0xffffffffu;
+    for (int i = 0; i < 4; i++) at[i] = (uint8_t)(size >> (24 - 8 * i));
+    memcpy(at + 4, tag, 4);
+    if (size) memcpy(at + 8, data, size);
+    for (size_t i = 4; i < 8 + size; i++) {
+        crc ^= at[i];
+        for (int bit = 0; bit < 8; bit++) crc = crc >> 1 ^ (crc & 1 ? 0xedb88320u : 0);
+    }
+    for (int i = 0; i < 4; i++) at[8 + size + (size_t)i] = (uint8_t)(~crc >> (24 - 8 * i));
+    return size + 12;
+}
+
+// The same as PNG, with so many bytes of image data, of which 16 hold the picture (one stored block).
+static size_t make_palette_png(uint8_t* file, size_t colors, const uint8_t pixels[4], size_t bytes) {
+    static const uint8_t header[13] = {0, 0, 0, 4, 0, 0, 0, 1, 8, 3, 0, 0, 0};
+    static uint8_t data[70000];
+    uint8_t palette[768];
+    size_t at = 8;
+    for (size_t i = 0; i < 3 * colors; i++) palette[i] = (uint8_t)(i / 3 * (i % 3 + 1));
+    memcpy(file, "\x89PNG\r\n\x1a\n", 8);
+    at += put_png_chunk(file + at, "IHDR", header, sizeof header);
+    at += put_png_chunk(file + at, "PLTE", palette, 3 * colors);
+    memset(data, 0, sizeof data);
+    data[0] = 0x78;
+    data[1] = data[2] = 1;
+    put_little(data + 3, 5, 2);
+    put_little(data + 5, ~5u, 2);
+    memcpy(data + 8, pixels, 4); // behind the row's filter, 0
+    at += put_png_chunk(file + at, "IDAT", data, bytes);
+    return at + put_png_chunk(file + at, "IEND", NULL, 0);
+}
+
+// Pixels beyond the palette's end are black, whatever stood in memory; a palette of no size or less is refused.
+static void test_palettes(gsf_context* ctx) {
+    static uint8_t file[80000];
+    static const uint8_t pixels[4] = {0, 1, 2, 200}, whole[4] = {0, 1, 254, 255};
+    gsf_image out;
+    for (int way = 0; way < 6; way++) { // BMP with either header, PNG; each with three colours, then all
+        const size_t colors = way % 2 ? 256 : 3, head = way < 2 ? 12 : 40;
+        const uint32_t offset = (uint32_t)(14 + head + colors * (head == 12 ? 3 : 4));
+        const uint8_t* used = way % 2 ? whole : pixels;
+        const size_t size = way < 4 ? make_bmp(file, head, colors, offset, used) : make_palette_png(file, colors, used, 16);
+        if (!CHECK_OK(ctx, gsf_load_image_memory(ctx, "palette", file, size, 3, &out))) continue;
+        for (size_t i = 0; i < 4; i++)
+            for (size_t c = 0; c < 3; c++)
+                CHECK(((uint8_t*)out.data)[3 * i + c] == (used[i] < colors ? (uint8_t)(used[i] * (c + 1)) : 0));
+        gsf_destroy_image(ctx, &out);
+    }
+    for (uint32_t offset = 0; offset < 58; offset++) {
+        const size_t size = make_bmp(file, 40, 3, offset, pixels);
+        CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "palette", file, size, 3, &out), GSF_ERROR_FORMAT);
+        if (!CHECK(out.owned == NULL)) gsf_destroy_image(ctx, &out);
+    }
+    const size_t size = make_palette_png(file, 3, pixels, 70000);
+    CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "palette", file, size, 3, &out), GSF_ERROR_FORMAT);
+    CHECK(strstr(ctx->error, "more data") != NULL);
+}
+
 // ---- files ---------------------------------------------------------------------
 
 static void check_survives(gsf_context* ctx, const char* path) {
@@ -1014,6 +1102,7 @@ int main(void) {
     test_image_files(&ctx);
     test_damaged_images(&ctx, &h);
     test_image_guards(&ctx);
+    test_palettes(&ctx);
     test_png_writing(&ctx);
     test_encoding_without_memory();
     test_unreadable_files(&ctx);
