@@ -229,7 +229,7 @@ typedef struct gsf_visibility_stats {
     size_t points, kept, by_tracks, by_rays;  // by_rays: kept by rays; no ray goes to what tracks keep
     size_t rays, culled;                      // rays shot; (point, view) pairs rejected without one
     double seconds_normals, seconds_build, seconds_rays;
-    int32_t used_embree;
+    int32_t used_embree; // 0 also where Embree has too little memory: with a warning the discs are projected instead
 } gsf_visibility_stats;
 
 // keep[i] = 1 where some of the given views sees point i. stats may be NULL.
@@ -4973,7 +4973,7 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
 }
 
 #ifdef GSF_USE_EMBREE
-static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double* build_seconds);
+static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_visibility_stats* stats);
 #endif
 
 static void gsf__vis_by_tracks(const gsf_scene* scene, const uint8_t* chosen, uint8_t* keep) {
@@ -5050,12 +5050,9 @@ static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, con
     const double start = gsf__vis_seconds();
     gsf_result result = gsf__vis_begin(ctx, scene, views, view_count, desc, keep, &job, stats);
 #ifdef GSF_USE_EMBREE
-    if (result == GSF_OK && !desc->use_zbuffer) {
-        stats->used_embree = 1;
-        result = gsf__vis_by_embree(ctx, &job, &stats->seconds_build);
-    } else
+    if (result == GSF_OK && !desc->use_zbuffer) result = gsf__vis_by_embree(ctx, &job, stats);
 #endif
-    if (result == GSF_OK) result = gsf__vis_by_cells(ctx, &job);
+    if (result == GSF_OK && !stats->used_embree) result = gsf__vis_by_cells(ctx, &job);
     if (result == GSF_OK) {
         stats->seconds_rays = gsf__vis_seconds() - start - stats->seconds_normals - stats->seconds_build;
         for (size_t i = 0; i * GSF__VIS_CHUNK < job.discs.count; i++) {
@@ -5344,17 +5341,28 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int worker) {
     if (query.ray_count) gsf__embree_group(&query, counts);
 }
 
-static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double* build_seconds) {
-    const double start = gsf__vis_seconds();
-    gsf_result result = GSF_OK;
-    RTCScene scene = NULL;
-    RTCGeometry geometry = NULL;
-    RTCDevice device = rtcNewDevice("threads=1,set_affinity=0"); // builds on the calling thread; rays run on the host's
-    if (!device)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "Embree: no device (error %d)", (int)rtcGetDeviceError(NULL));
-    geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_ORIENTED_DISC_POINT);
-    scene = rtcNewScene(device);
-    if (geometry && scene) {
+// Where memory ends inside Embree or the TBB below it, not every way out is an error code: a C++ exception that meets a
+// destructor or an error handler ends the program. So Embree is refused memory as long as this much is left for those.
+enum { GSF__EMBREE_MARGIN = 16 << 20 };
+
+// Could so much be allocated? By malloc, not the context's allocator: Embree does not use that either.
+static int gsf__embree_has_room(size_t bytes) {
+    void* volatile probe = malloc(bytes); // volatile: else the compiler may take the answer to be yes
+    const int room = probe != NULL;
+    free(probe);
+    return room;
+}
+
+// Embree asks before it allocates and tells when it frees. On the calling thread, as the device has no other.
+static bool gsf__embree_may_allocate(void* refused, ssize_t bytes, bool post) {
+    if (bytes <= 0 || gsf__embree_has_room((post ? 0 : (size_t)bytes) + GSF__EMBREE_MARGIN)) return true;
+    *(int*)refused = 1;
+    return false;
+}
+
+static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const gsf__vis_job* job) {
+    RTCGeometry geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_ORIENTED_DISC_POINT);
+    if (geometry) {
         rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT4, job->discs.spheres, 0,
                                    4 * sizeof(float), job->discs.count);
         rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_NORMAL, 0, RTC_FORMAT_FLOAT3, job->discs.normals, 0,
@@ -5362,28 +5370,54 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, double
         rtcSetGeometryOccludedFilterFunction(geometry, gsf__embree_filter);
         rtcCommitGeometry(geometry);
         rtcAttachGeometry(scene, geometry);
+        rtcReleaseGeometry(geometry); // the scene holds it
         rtcCommitScene(scene);
     }
-    const enum RTCError error = rtcGetDeviceError(device);
-    if (error != RTC_ERROR_NONE) {
-        result = gsf_fail(ctx, error == RTC_ERROR_OUT_OF_MEMORY ? GSF_ERROR_OUT_OF_MEMORY : GSF_ERROR_UNSUPPORTED,
-                          "Embree: error %d while %zu discs are built", (int)error, job->discs.count);
-    } else {
-        *build_seconds = gsf__vis_seconds() - start;
-        job->embree_scene = scene;
-        job->hide8 = gsf__hide8_scalar;
+    return rtcGetDeviceError(device);
+}
+
+static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
+    gsf_result result = GSF_OK;
+    job->hide8 = gsf__hide8_scalar;
 #if GSF__X86
-        if (ctx->cpu_level >= GSF_CPU_AVX2) job->hide8 = gsf__hide8_avx2;
+    if (ctx->cpu_level >= GSF_CPU_AVX2) job->hide8 = gsf__hide8_avx2;
 #endif
-        for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
-            gsf__vis_look(ctx, job, e);
-            gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
-            result = gsf__check_cancel(ctx);
-        }
+    for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
+        gsf__vis_look(ctx, job, e);
+        gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
+        result = gsf__check_cancel(ctx);
     }
-    if (geometry) rtcReleaseGeometry(geometry);
-    if (scene) rtcReleaseScene(scene);
-    rtcReleaseDevice(device);
+    return result;
+}
+
+// stats->used_embree stays 0, with a warning, where Embree cannot do it.
+static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_visibility_stats* stats) {
+    const double start = gsf__vis_seconds();
+    int refused = 0;
+    gsf_result result = GSF_OK;
+    RTCScene scene = NULL;
+    RTCDevice device = NULL;
+    enum RTCError error = RTC_ERROR_OUT_OF_MEMORY;
+    if (gsf__embree_has_room(2 * (size_t)GSF__EMBREE_MARGIN)) {
+        device = rtcNewDevice("threads=1,set_affinity=0"); // builds on the calling thread; rays run on the host's
+        error = rtcGetDeviceError(device);
+    }
+    if (device) {
+        rtcSetDeviceMemoryMonitorFunction(device, gsf__embree_may_allocate, &refused);
+        scene = rtcNewScene(device);
+        error = scene ? gsf__embree_build(device, scene, job) : rtcGetDeviceError(device);
+    }
+    if (device && error == RTC_ERROR_NONE) {
+        stats->used_embree = 1;
+        stats->seconds_build = gsf__vis_seconds() - start;
+        job->embree_scene = scene;
+        result = gsf__embree_run(ctx, job);
+    } else
+        gsf_log(ctx, GSF_LOG_WARNING, "visible points: Embree cannot take %zu discs (%s); they are projected instead",
+                job->discs.count, error == RTC_ERROR_OUT_OF_MEMORY ? "too little memory" : "no usable device");
+    // A build that failed by itself may have left a TBB task behind that never ran, for which a release would wait.
+    if (scene && (error == RTC_ERROR_NONE || refused)) rtcReleaseScene(scene);
+    if (device) rtcReleaseDevice(device);
     return result;
 }
 

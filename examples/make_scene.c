@@ -1067,6 +1067,7 @@ static int start_world(gsf_context* ctx, world* s, int bake_rays) {
     rtcCommitScene(s->scene);
     if (rtcGetDeviceError(s->device) != RTC_ERROR_NONE) {
         fprintf(stderr, "make_scene: Embree cannot build the scene\n");
+        s->scene = NULL; // not to be released: it may hold a TBB task that never ran, and would wait for it
         return 0;
     }
     bake_job bake = {s, bake_rays};

@@ -417,6 +417,91 @@ static void test_naive(void) {
     printf("naive loop: same answers for %zu points of 8 scenes, %zu left to rounding\n", points_met - undecided, undecided);
 }
 
+// ---- where memory ends ---------------------------------------------------------
+
+#if defined(__has_feature)
+#if __has_feature(address_sanitizer)
+#define HAVE_NO_LIMIT // its shadow is larger than any limit
+#endif
+#endif
+#if defined(GSF_USE_EMBREE) && defined(__linux__) && !defined(__SANITIZE_ADDRESS__) && !defined(HAVE_NO_LIMIT)
+#include <sys/resource.h>
+#include <sys/wait.h>
+
+enum { BY_EMBREE, PROJECTED, NO_MEMORY, WRONG };
+
+static int answer_within(const gsf_scene* scene, size_t spare, const uint8_t* expected) { // in a process of its own
+    static const uint32_t view[1] = {0};
+    gsf_context own;
+    gsf_visibility_desc desc;
+    gsf_visibility_stats stats;
+    unsigned long pages = 0;
+    struct rlimit limit;
+    uint8_t* keep = (uint8_t*)malloc(scene->point_count);
+    memset(&own, 0, sizeof own);
+    memset(&desc, 0, sizeof desc);
+    own.threads = 1;
+    desc.method = GSF_VISIBILITY_RAYS;
+    FILE* statm = fopen("/proc/self/statm", "r");
+    if (gsf_init_context(&own) != GSF_OK || !keep || !statm || fscanf(statm, "%lu", &pages) != 1) return WRONG;
+    limit.rlim_cur = limit.rlim_max = (rlim_t)pages * (rlim_t)sysconf(_SC_PAGESIZE) + spare;
+    if (setrlimit(RLIMIT_AS, &limit) != 0) return WRONG;
+    const gsf_result result = gsf_splat_visible_points(&own, scene, view, 1, &desc, keep, &stats);
+    if (result == GSF_ERROR_OUT_OF_MEMORY) return strstr(own.error, "memory") ? NO_MEMORY : WRONG;
+    if (result != GSF_OK || memcmp(keep, expected, scene->point_count) != 0) return WRONG;
+    return stats.used_embree ? BY_EMBREE : PROJECTED;
+}
+
+// However little is left, the program goes on: by Embree, without it, or with a result code. To be called before OpenMP
+// and Embree have started threads, which no child would have.
+static void test_little_memory(void) {
+    enum { SIDE = 100, COUNT = 2 * SIDE * SIDE };
+    static double points[3 * COUNT];
+    static uint8_t colors[3 * COUNT], expected[COUNT];
+    static size_t no_tracks[COUNT + 1];
+    gsf_scene_view view;
+    gsf_scene scene;
+    memset(&view, 0, sizeof view);
+    memset(&scene, 0, sizeof scene);
+    for (size_t i = 0; i < COUNT; i++) { // a wall that hides another of the same angular size
+        const size_t at = i % (SIDE * SIDE);
+        const double z = i < COUNT / 2 ? 2.0 : 4.0;
+        points[3 * i] = 0.4 * z * ((double)(at % SIDE) / (SIDE - 1) - 0.5);
+        points[3 * i + 1] = 0.4 * z * ((double)(at / SIDE) / (SIDE - 1) - 0.5);
+        points[3 * i + 2] = z;
+        expected[i] = i < COUNT / 2;
+    }
+    for (int k = 0; k < 4; k++) view.camera.w2c[5 * k] = 1.0;
+    view.camera.fx = view.camera.fy = 100.0;
+    view.camera.cx = view.camera.cy = 60.0;
+    view.camera.width = view.camera.height = 120;
+    scene.view_count = 1;
+    scene.views = &view;
+    scene.point_count = COUNT;
+    scene.points = points;
+    scene.colors = colors;
+    scene.track_begin = no_tracks;
+    size_t seen[4] = {0, 0, 0, 0};
+    for (size_t spare = 0; spare < (size_t)256 << 20; spare += (size_t)4 << 20) {
+        fflush(NULL);
+        const pid_t child = fork();
+        if (child == 0) {
+            alarm(60);
+            _exit(answer_within(&scene, spare, expected));
+        }
+        int status = 0;
+        if (!CHECK(child > 0 && waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) < WRONG))
+            fprintf(stderr, "  with %zu bytes: status %x\n", spare, (unsigned)status);
+        seen[WEXITSTATUS(status) & 3]++;
+    }
+    printf("little memory: %zu times by Embree, %zu projected, %zu refused\n", seen[BY_EMBREE], seen[PROJECTED],
+           seen[NO_MEMORY]);
+    CHECK(seen[BY_EMBREE] > 0 && seen[PROJECTED] > 0 && seen[NO_MEMORY] > 0);
+}
+#else
+static void test_little_memory(void) {}
+#endif
+
 // ---- on photos and in a procedural scene ---------------------------------------
 
 // Of the points that COLMAP's tracks prove visible, how many do the rays find?
@@ -636,6 +721,7 @@ int main(int argc, char** argv) { // [SEEDS]: procedural scenes to trace, defaul
     const int seeds = argc > 1 ? atoi(argv[1]) : SEEDS;
     memset(&ctx, 0, sizeof ctx);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
+    test_little_memory();
     test_neighbours();
     test_from_points();
     test_walls();
