@@ -42,9 +42,9 @@
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
-   SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn linear >>nn int8
-               >>nn norms >>nn attention >>nn convolution >>nn positions >>nn scheduler >>nn transformer >>nn vae
-               >>nn tokenizer >>nn t5 >>nn image encoders >>nn sampling >>nn bpe >>nn captioner >>nn restorer
+   SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn norms >>nn linear >>nn int8
+               >>nn attention >>nn convolution >>nn positions >>nn image encoders >>nn bpe >>nn captioner
+               >>nn tokenizer >>nn t5 >>nn vae >>nn transformer >>nn scheduler >>nn sampling >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -197,6 +197,25 @@ GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, con
 // Rows of (rows, columns) to softmax(scale * row); y may be x.
 GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale, float* y);
 
+// ---- convolution ----------------------------------------------------------------
+// Activations of convolutions are channels-last: (frames, height, width, channels).
+
+typedef struct gsf_nn_conv_desc {
+    const float* x;            // (frames, height, width, in)
+    int64_t frames, height, width;
+    const gsf_tensor* weight;  // (out, in, kh, kw): frame by frame; (out, in, kt, kh, kw), kt 1 or 3: causal in time.
+    const gsf_tensor* bias;    // (out) or NULL                      kh = kw is 1 or 3; f32, bf16 or f16
+    const float* before;       // (2, height, width, in): the frames before x; NULL: x's first frame, twice. kt = 3 only
+    int halve;                 // stride 2 and one row and column of zeros below and to the right, instead of stride 1
+    int accumulate;            //   and a border of zeros. y += instead of y = ...
+    float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
+} gsf_nn_conv_desc;
+
+// A convolution, 3D ones causal in time. `workspace` (or, where it is NULL, memory for this call) holds the widened
+// weights and three frames of the input with their borders.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace,
+                                                 const gsf_nn_conv_desc* desc);
+
 // ---- positions ------------------------------------------------------------------
 // Tables of the video transformer. Tokens stand in the order frame, row, column.
 
@@ -224,103 +243,228 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sincos(gsf_context* ctx, int32_t fr
 // value 0. Angles in float32 as the reference has them. (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
 GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out);
 
-// ---- noise schedule and solvers -------------------------------------------------
-// x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) noise. The model predicts v = sqrt(abar) noise - sqrt(1 - abar) x0, so that
-// x0 = sqrt(abar) x - sqrt(1 - abar) v. Coefficients are double, latents float32.
+// ---- image encoders: what the references show -----------------------------------
+// DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
 
-typedef enum gsf_nn_spacing { GSF_NN_TRAILING = 0, GSF_NN_LEADING, GSF_NN_LINSPACE } gsf_nn_spacing;
+// The official preprocessing of a reference: transparency over white, 518 pixels wide with PIL's bicubic filter, the
+// height rounded to a multiple of 14 (half to even), and cut around its middle where it is above 518. Photos with 1, 3 or
+// 4 channels; float ones are rounded to 8 bits first. out: u8, 3 channels; destroy it.
+// (GSFixer, vggt/utils/load_fn.py load_and_preprocess_images, mode "crop")
+GSF_API GSF_NODISCARD gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out);
 
-typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
-    int32_t train_steps;           // 0: 1000
-    double beta_start, beta_end;   // 0: 0.00085, 0.012
-    int linear_betas;              // else linear in sqrt(beta) ("scaled_linear")
-    int no_zero_snr;               // else the table is stretched so that abar ends at 0
-    int no_alpha_one;              // else the last step goes to abar = 1, not to abar of time step 0
-    gsf_nn_spacing spacing;
-    int32_t steps_offset;          // added to the time steps of GSF_NN_LEADING
-    double snr_shift_scale;        // 0: 1; CogVideoX-2B was trained with 3
-} gsf_nn_schedule_desc;
+typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped files
+    int32_t width, heads, layers, mlp_width;
+    int32_t channels, patch;     // of the images; side of the square that makes a token
+    int32_t special;             // tokens before the patches': the class token and the registers
+    int32_t grid;                // squares along a side of the images that it was trained with
+    double norm_eps;
+    gsf_nn_weights weights;
+    void* nets;                  // private
+} gsf_nn_dinov2;
 
-typedef struct gsf_nn_schedule {
-    gsf_nn_schedule_desc desc; // with the defaults filled in
-    double* alpha_bar;         // (train_steps), owned
-    double final_alpha_bar;
-} gsf_nn_schedule;
+// Opens a Hugging Face folder of Dinov2WithRegistersModel: config.json and model*.safetensors. Missing, misshaped and
+// surplus tensors are named. Its SwiGLU variant (use_swiglu_ffn) is unsupported.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out);
+GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2);
 
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc,
-                                                      gsf_nn_schedule* out);
-// From a scheduler_config.json; keys that are missing have the defaults of diffusers' DDIMScheduler. The class it names
-// is not looked at, as the official pipeline does not either. What is not v-prediction or clips is unsupported.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
-                                                       gsf_nn_schedule* out);
-GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out);
-GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule);
+typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapped files
+    int32_t width, heads, layers, mlp_width; // of its blocks; layers: pairs of a frame and a global block
+    int32_t patch, embed_layers; // side of the square that makes a token; blocks of the DINOv2 that embeds the images
+    int32_t special;             // patch_start_idx: a camera token and registers stand before the patches' tokens
+    int32_t grid;                // squares along a side of the images that the embedding was trained with
+    double rope_base;            // of the rotation of q and k, 0: none
+    gsf_nn_weights weights;
+    void* nets;                  // private
+} gsf_nn_vggt;
 
-// Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
-// (int)(steps * strength) of them, for latents that start as the noised render. out: room for `steps`.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
-                                                       double strength, int32_t* out, int32_t* count);
+// Opens a folder with model*.safetensors, or one .safetensors file: the tensors aggregator.* under their released names,
+// all others are passed over. Where the folder has a config.json, VGGT's own keys in it count, which are embed_dim, depth,
+// num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq; what it does not tell comes from
+// the shapes of tensors, but for num_heads (width / 64 where q and k have no norms) and rope_freq (100).
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
+GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
 
-// Elementwise over `count` values; out may be an input. timestep: 0..train_steps-1.
-GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                              const float* noise, size_t count, float* out);
-GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                                  const float* noise, size_t count, float* out);
-GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
-                               const float* v, size_t count, float* out);
+typedef struct gsf_nn_encoder_input {
+    const float* pixels;           // (images, 3, height, width) in [0,1]
+    int32_t images, height, width; // sides in pixels, multiples of the patch
+    int all_tokens;                // the special tokens, too; else those of the patches alone
+    // Shown every named intermediate of image `image`: data (rows, columns). NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_encoder_input;
 
-typedef enum gsf_nn_solver {
-    GSF_NN_DDIM = 0,   // first order; the next time is t - train_steps/steps (whole division), as diffusers has it
-    GSF_NN_DPMPP_2M,   // DPM-Solver++(2M): second order, remembers one prediction (Lu et al. 2022b)
-    GSF_NN_UNIPC,      // UniPC, B2, order 2: that and a corrector which needs no further model call (Zhao et al. 2023)
-} gsf_nn_solver;
+// The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, and `special`
+// before them with all_tokens. Images are taken as they are. Positions are interpolated from the square grid as PyTorch
+// does it (bicubic, antialiased, align_corners=False). A NaN or infinity gives GSF_ERROR_NUMERIC and the layer's name. On
+// error `out` is zeroed. The context is asked for cancelling and told of progress after every block.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
+                                                      const gsf_nn_encoder_input* input, float* out);
+// The last pair's outputs: out (images, tokens, 2 width), frame block | global block, for all images together, which see
+// one another. ImageNet's mean and deviation are taken out here. Otherwise as above.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt,
+                                                    const gsf_nn_encoder_input* input, float* out);
+// Bytes of memory (beside input, output, mapped weights and some 70 MB of the kernels' scratch) at the peak, and floating-
+// point operations, of such a call; either may be NULL. Reads the input's sizes only.
+GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
+                                double* flops);
+GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops);
 
-typedef struct gsf_nn_sampler_desc {
-    gsf_nn_solver solver;
-    int32_t steps;      // 0: 50
-    double strength;    // 0: 1
-    size_t value_count; // of the latents
-} gsf_nn_sampler_desc;
+typedef struct gsf_nn_features { // of reference photos; zero to begin with, destroy it
+    int64_t images, tokens;               // tokens of each image
+    int64_t dino_channels, vggt_channels; // 0: not computed
+    float *dino, *vggt;                   // (images, tokens, channels)
+} gsf_nn_features;
 
-// A run of a solver. `index` and `memory` are all that a checkpoint must keep beside the latents: make the sampler anew
-// with the same desc and fill them in.
-typedef struct gsf_nn_sampler {
-    gsf_nn_sampler_desc desc;
-    const gsf_nn_schedule* schedule; // borrowed
-    int32_t* timesteps;              // (count)
-    int32_t count, index;            // the next model call is for timesteps[index]
-    float* memory;                   // (memory_count): earlier predictions
-    size_t memory_count;             // 0, 1 or 3 times value_count
-} gsf_nn_sampler;
+// Prepares the photos and encodes them with the models that are given. A later call with the other model (of which only one
+// need then be open at a time) adds its tokens. All photos must come out in one size. On error the tokens that were to be
+// made are NULL.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
+                                                          const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
+                                                          gsf_nn_features* features);
+GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features);
+// Writes the file that gsf_nn_dit_desc.features names: dino_latents, vggt_latents (what was computed) and, unless NULL,
+// prompt_embeds (2, text tokens, text channels): negative prompt, prompt.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, const gsf_nn_features* features,
+                                                      const gsf_tensor* prompt_embeds);
 
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule,
-                                                     const gsf_nn_sampler_desc* desc, gsf_nn_sampler* out);
-GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler);
-// One step: x (value_count), the latents at timesteps[index], becomes those at the next one; v is the model's output for
-// x. x0 (NULL allowed) gets the predicted clean latents. eta is 0: nothing is random. A latent that is NaN or infinite
-// afterwards gives GSF_ERROR_NUMERIC, which names the step.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x,
-                                                     float* x0);
+// ---- tokens: byte-level pair encoding -----------------------------------------------
+// What GPT-2 and OPT read, as transformers 4.51.3 does it (GPT2Tokenizer).
 
-// ---- convolution ----------------------------------------------------------------
-// Activations of convolutions are channels-last: (frames, height, width, channels).
+typedef struct gsf_nn_bpe {     // an open tokenizer
+    int32_t bos, eos, unk, pad; // ids, -1: none
+    int32_t highest_id;
+    int add_bos;                // texts begin with `bos`
+    void* tables;               // private
+} gsf_nn_bpe;
 
-typedef struct gsf_nn_conv_desc {
-    const float* x;            // (frames, height, width, in)
-    int64_t frames, height, width;
-    const gsf_tensor* weight;  // (out, in, kh, kw): frame by frame; (out, in, kt, kh, kw), kt 1 or 3: causal in time.
-    const gsf_tensor* bias;    // (out) or NULL                      kh = kw is 1 or 3; f32, bf16 or f16
-    const float* before;       // (2, height, width, in): the frames before x; NULL: x's first frame, twice. kt = 3 only
-    int halve;                 // stride 2 and one row and column of zeros below and to the right, instead of stride 1
-    int accumulate;            //   and a border of zeros. y += instead of y = ...
-    float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
-} gsf_nn_conv_desc;
+// Opens FOLDER/vocab.json and merges.txt and, where they are there, tokenizer_config.json, special_tokens_map.json and
+// added_tokens.json. What is malformed, or names a token that there is not, gives GSF_ERROR_FORMAT with file and place.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
+GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe);
 
-// A convolution, 3D ones causal in time. `workspace` (or, where it is NULL, memory for this call) holds the widened
-// weights and three frames of the input with their borders.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace,
-                                                 const gsf_nn_conv_desc* desc);
+// Ids of a text of `size` bytes, which must be UTF-8; *ids is freed with gsf_free. `no_bos` leaves the first token out even
+// where add_bos says otherwise. Time n log n whatever the text. Any number of threads, each with its context, may use one
+// tokenizer.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
+                                                   int no_bos, int32_t** ids, size_t* count);
+// Appends the text of `count` ids to `out`, which may come to hold zero bytes; bytes that are no UTF-8 become U+FFFD.
+// Ids that no token has are left out, with `skip_special` the special tokens (bos, eos, pad, <image> ...) as well.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
+                                                   size_t count, int skip_special, gsf_text* out);
 
+// ---- captions ------------------------------------------------------------------------
+// BLIP-2 with OPT, which says in a few words what an image shows (transformers 4.51.3, Blip2ForConditionalGeneration). The
+// restorer's prompt begins with such a caption.
+
+typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
+    int32_t image_size;           // side of the square that images are resized to, whatever their shape
+    int32_t query_tokens;         // words that stand for the image
+    int32_t vocabulary, positions; // of the language model: words, and the most tokens of image, prompt and caption
+    int32_t bos, eos;             // begins a caption without prompt; ends every caption
+    int32_t image_token;          // "image_token_index"; -1: an older folder without it, whose default length is less
+    gsf_nn_bpe tokenizer;
+    gsf_nn_weights weights;
+    void* nets;                   // private
+} gsf_nn_captioner;
+
+// Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_make_bpe) and
+// model*.safetensors in f32, bf16 or f16, which are computed with in float32. Keys that are absent have the defaults of
+// transformers. Missing, misshaped and surplus tensors are named (GSF_ERROR_FORMAT), as is what this code does not do
+// (GSF_ERROR_UNSUPPORTED): another language model than OPT, norms behind the layers (do_layer_norm_before false).
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
+GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner);
+
+// The caption of an image (1, 3 or 4 channels, any dtype; alpha is left out) as zero-terminated UTF-8 without white space
+// at its ends. With a prompt, it goes on from there, and the prompt is not repeated; NULL: none. At most `max_new_tokens`
+// tokens, 0: 20 (older folders: 17, or 19 less two for each token of the prompt), the most likely one each time. The
+// text is cut behind a whole character where it does not fit `size` bytes; a zero byte in it becomes U+FFFD.
+// A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the tensor's or layer's name. Progress and
+// cancel after every layer. Any number of threads, each with its context, may use one captioner.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
+                                                const char* prompt, int32_t max_new_tokens, char* out, size_t size);
+
+typedef struct gsf_nn_caption_desc {
+    const gsf_image* image;
+    const char* prompt;     // NULL: none
+    int32_t max_new_tokens; // 0: as gsf_nn_caption
+    // Shown every intermediate: "pixel_values" (3, pixels), "vision" (tokens, width), "qformer", "projection", "logits" of
+    // the prompt (tokens, words). NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_caption_desc;
+
+// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
+                                                    const gsf_nn_caption_desc* desc, int32_t** ids, size_t* count);
+
+// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
+// `text_tokens` tokens of prompt (0: none).
+GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
+                                 double* bytes, double* flops);
+
+// ---- text: tokenizer ------------------------------------------------------------------
+// SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
+// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two
+// spellings of equal score.
+
+typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
+    int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
+    int32_t id_count;                   // all ids, those of added tokens as well, are smaller
+    int32_t unknown_id, end_id, pad_id; // of <unk>, </s>, <pad>
+    void* model;                        // private
+} gsf_nn_tokenizer;
+
+// Opens FOLDER/spiece.model, with the added tokens (<extra_id_0> ...) of FOLDER/tokenizer_config.json or, where that lists
+// none, FOLDER/added_tokens.json; without either file T5's 100. Every length and offset is checked: a malformed file gives
+// GSF_ERROR_FORMAT with its name and byte offset, another model than a unigram GSF_ERROR_UNSUPPORTED.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
+// The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model,
+                                                              size_t model_size, const char* config, size_t config_size,
+                                                              gsf_nn_tokenizer* out);
+GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer);
+
+// `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
+// the first room - 1 and end_id where there are more, filled up with pad_id where there are fewer. The official room is
+// 226. *count (NULL allowed): how many there are, end_id included, had there been room. ids NULL and room 0 only count.
+// Time and memory are in proportion to the text: some 20 bytes for each of its own. Fails only for want of memory, and with
+// GSF_ERROR_INVALID_ARGUMENT for texts that are 2 GiB normalised.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text,
+                                                 size_t size, int32_t* ids, size_t room, size_t* count);
+
+// ---- text: T5 encoder -------------------------------------------------------------------
+// The encoder of T5 v1.1 (Raffel et al. 2020; transformers 4.51.3 T5EncoderModel). As the official pipeline runs it, there
+// is no attention mask: padding is looked at like any other token. Every size comes from the folder's config.json.
+
+typedef struct gsf_nn_t5 { // an open model; its weights stay in the mapped files. Threads may share it
+    int32_t width, heads, head_dim, hidden, layers; // hidden: of the feed-forward
+    int32_t vocabulary;                             // ids are smaller
+    int32_t buckets, max_distance;                  // of the relative positions
+    double norm_eps;
+    gsf_nn_weights weights;
+    void* nets;                                     // private
+} gsf_nn_t5;
+
+// Opens FOLDER/config.json and FOLDER/model*.safetensors. Missing, misshaped and surplus tensors are named in the error.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out);
+GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5);
+
+typedef struct gsf_nn_t5_input {
+    const int32_t* ids;    // (batch, tokens), from gsf_nn_tokenize
+    int32_t batch, tokens; // prompts of a batch share each layer's way from disk through the cache
+    // Shown every named intermediate: data (rows, columns) of prompt `row`. NULL in normal use.
+    void (*tap_fn)(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns);
+    void* tap_user;
+} gsf_nn_t5_input;
+
+// The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so that of the mapped weights only one
+// layer's need be in memory at a time. An id that the vocabulary lacks: GSF_ERROR_INVALID_ARGUMENT. A NaN or infinity is
+// reported with the block where it first appears (GSF_ERROR_NUMERIC). Cancelled between layers; progress "text".
+GSF_API GSF_NODISCARD gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input,
+                                                  float* out);
+// Bytes of memory at the peak (beside out, the mapped weights and some 70 MB of the kernels' scratch) and floating-point
+// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 4.2e12 operations.
+GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops);
 // ---- video autoencoder ----------------------------------------------------------
 // AutoencoderKLCogVideoX as diffusers 0.32.1 runs it: clips go through in chunks of 8 frames (encoder) or 2 latent frames
 // (decoder), the remainder joins the first chunk, causal convolutions see the last two frames of the chunk before, and the
@@ -456,152 +600,83 @@ GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, cons
 GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
                                         int32_t reference_batch);
 
-// ---- text: tokenizer ------------------------------------------------------------------
-// SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
-// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two
-// spellings of equal score.
+// ---- noise schedule and solvers -------------------------------------------------
+// x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) noise. The model predicts v = sqrt(abar) noise - sqrt(1 - abar) x0, so that
+// x0 = sqrt(abar) x - sqrt(1 - abar) v. Coefficients are double, latents float32.
 
-typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
-    int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
-    int32_t id_count;                   // all ids, those of added tokens as well, are smaller
-    int32_t unknown_id, end_id, pad_id; // of <unk>, </s>, <pad>
-    void* model;                        // private
-} gsf_nn_tokenizer;
+typedef enum gsf_nn_spacing { GSF_NN_TRAILING = 0, GSF_NN_LEADING, GSF_NN_LINSPACE } gsf_nn_spacing;
 
-// Opens FOLDER/spiece.model, with the added tokens (<extra_id_0> ...) of FOLDER/tokenizer_config.json or, where that lists
-// none, FOLDER/added_tokens.json; without either file T5's 100. Every length and offset is checked: a malformed file gives
-// GSF_ERROR_FORMAT with its name and byte offset, another model than a unigram GSF_ERROR_UNSUPPORTED.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
-// The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model,
-                                                              size_t model_size, const char* config, size_t config_size,
-                                                              gsf_nn_tokenizer* out);
-GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer);
+typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
+    int32_t train_steps;           // 0: 1000
+    double beta_start, beta_end;   // 0: 0.00085, 0.012
+    int linear_betas;              // else linear in sqrt(beta) ("scaled_linear")
+    int no_zero_snr;               // else the table is stretched so that abar ends at 0
+    int no_alpha_one;              // else the last step goes to abar = 1, not to abar of time step 0
+    gsf_nn_spacing spacing;
+    int32_t steps_offset;          // added to the time steps of GSF_NN_LEADING
+    double snr_shift_scale;        // 0: 1; CogVideoX-2B was trained with 3
+} gsf_nn_schedule_desc;
 
-// `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
-// the first room - 1 and end_id where there are more, filled up with pad_id where there are fewer. The official room is
-// 226. *count (NULL allowed): how many there are, end_id included, had there been room. ids NULL and room 0 only count.
-// Time and memory are in proportion to the text: some 20 bytes for each of its own. Fails only for want of memory, and with
-// GSF_ERROR_INVALID_ARGUMENT for texts that are 2 GiB normalised.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text,
-                                                 size_t size, int32_t* ids, size_t room, size_t* count);
+typedef struct gsf_nn_schedule {
+    gsf_nn_schedule_desc desc; // with the defaults filled in
+    double* alpha_bar;         // (train_steps), owned
+    double final_alpha_bar;
+} gsf_nn_schedule;
 
-// ---- text: T5 encoder -------------------------------------------------------------------
-// The encoder of T5 v1.1 (Raffel et al. 2020; transformers 4.51.3 T5EncoderModel). As the official pipeline runs it, there
-// is no attention mask: padding is looked at like any other token. Every size comes from the folder's config.json.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc,
+                                                      gsf_nn_schedule* out);
+// From a scheduler_config.json; keys that are missing have the defaults of diffusers' DDIMScheduler. The class it names
+// is not looked at, as the official pipeline does not either. What is not v-prediction or clips is unsupported.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                                       gsf_nn_schedule* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out);
+GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule);
 
-typedef struct gsf_nn_t5 { // an open model; its weights stay in the mapped files. Threads may share it
-    int32_t width, heads, head_dim, hidden, layers; // hidden: of the feed-forward
-    int32_t vocabulary;                             // ids are smaller
-    int32_t buckets, max_distance;                  // of the relative positions
-    double norm_eps;
-    gsf_nn_weights weights;
-    void* nets;                                     // private
-} gsf_nn_t5;
+// Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
+// (int)(steps * strength) of them, for latents that start as the noised render. out: room for `steps`.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
+                                                       double strength, int32_t* out, int32_t* count);
 
-// Opens FOLDER/config.json and FOLDER/model*.safetensors. Missing, misshaped and surplus tensors are named in the error.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out);
-GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5);
+// Elementwise over `count` values; out may be an input. timestep: 0..train_steps-1.
+GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                              const float* noise, size_t count, float* out);
+GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                                  const float* noise, size_t count, float* out);
+GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
+                               const float* v, size_t count, float* out);
 
-typedef struct gsf_nn_t5_input {
-    const int32_t* ids;    // (batch, tokens), from gsf_nn_tokenize
-    int32_t batch, tokens; // prompts of a batch share each layer's way from disk through the cache
-    // Shown every named intermediate: data (rows, columns) of prompt `row`. NULL in normal use.
-    void (*tap_fn)(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
-} gsf_nn_t5_input;
+typedef enum gsf_nn_solver {
+    GSF_NN_DDIM = 0,   // first order; the next time is t - train_steps/steps (whole division), as diffusers has it
+    GSF_NN_DPMPP_2M,   // DPM-Solver++(2M): second order, remembers one prediction (Lu et al. 2022b)
+    GSF_NN_UNIPC,      // UniPC, B2, order 2: that and a corrector which needs no further model call (Zhao et al. 2023)
+} gsf_nn_solver;
 
-// The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so that of the mapped weights only one
-// layer's need be in memory at a time. An id that the vocabulary lacks: GSF_ERROR_INVALID_ARGUMENT. A NaN or infinity is
-// reported with the block where it first appears (GSF_ERROR_NUMERIC). Cancelled between layers; progress "text".
-GSF_API GSF_NODISCARD gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input,
-                                                  float* out);
-// Bytes of memory at the peak (beside out, the mapped weights and some 70 MB of the kernels' scratch) and floating-point
-// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 4.2e12 operations.
-GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops);
-// ---- image encoders: what the references show -----------------------------------
-// DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
+typedef struct gsf_nn_sampler_desc {
+    gsf_nn_solver solver;
+    int32_t steps;      // 0: 50
+    double strength;    // 0: 1
+    size_t value_count; // of the latents
+} gsf_nn_sampler_desc;
 
-// The official preprocessing of a reference: transparency over white, 518 pixels wide with PIL's bicubic filter, the
-// height rounded to a multiple of 14 (half to even), and cut around its middle where it is above 518. Photos with 1, 3 or
-// 4 channels; float ones are rounded to 8 bits first. out: u8, 3 channels; destroy it.
-// (GSFixer, vggt/utils/load_fn.py load_and_preprocess_images, mode "crop")
-GSF_API GSF_NODISCARD gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out);
+// A run of a solver. `index` and `memory` are all that a checkpoint must keep beside the latents: make the sampler anew
+// with the same desc and fill them in.
+typedef struct gsf_nn_sampler {
+    gsf_nn_sampler_desc desc;
+    const gsf_nn_schedule* schedule; // borrowed
+    int32_t* timesteps;              // (count)
+    int32_t count, index;            // the next model call is for timesteps[index]
+    float* memory;                   // (memory_count): earlier predictions
+    size_t memory_count;             // 0, 1 or 3 times value_count
+} gsf_nn_sampler;
 
-typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped files
-    int32_t width, heads, layers, mlp_width;
-    int32_t channels, patch;     // of the images; side of the square that makes a token
-    int32_t special;             // tokens before the patches': the class token and the registers
-    int32_t grid;                // squares along a side of the images that it was trained with
-    double norm_eps;
-    gsf_nn_weights weights;
-    void* nets;                  // private
-} gsf_nn_dinov2;
-
-// Opens a Hugging Face folder of Dinov2WithRegistersModel: config.json and model*.safetensors. Missing, misshaped and
-// surplus tensors are named. Its SwiGLU variant (use_swiglu_ffn) is unsupported.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out);
-GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2);
-
-typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapped files
-    int32_t width, heads, layers, mlp_width; // of its blocks; layers: pairs of a frame and a global block
-    int32_t patch, embed_layers; // side of the square that makes a token; blocks of the DINOv2 that embeds the images
-    int32_t special;             // patch_start_idx: a camera token and registers stand before the patches' tokens
-    int32_t grid;                // squares along a side of the images that the embedding was trained with
-    double rope_base;            // of the rotation of q and k, 0: none
-    gsf_nn_weights weights;
-    void* nets;                  // private
-} gsf_nn_vggt;
-
-// Opens a folder with model*.safetensors, or one .safetensors file: the tensors aggregator.* under their released names,
-// all others are passed over. Where the folder has a config.json, VGGT's own keys in it count, which are embed_dim, depth,
-// num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq; what it does not tell comes from
-// the shapes of tensors, but for num_heads (width / 64 where q and k have no norms) and rope_freq (100).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
-GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
-
-typedef struct gsf_nn_encoder_input {
-    const float* pixels;           // (images, 3, height, width) in [0,1]
-    int32_t images, height, width; // sides in pixels, multiples of the patch
-    int all_tokens;                // the special tokens, too; else those of the patches alone
-    // Shown every named intermediate of image `image`: data (rows, columns). NULL in normal use.
-    void (*tap_fn)(void* user, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
-} gsf_nn_encoder_input;
-
-// The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, and `special`
-// before them with all_tokens. Images are taken as they are. Positions are interpolated from the square grid as PyTorch
-// does it (bicubic, antialiased, align_corners=False). A NaN or infinity gives GSF_ERROR_NUMERIC and the layer's name. On
-// error `out` is zeroed. The context is asked for cancelling and told of progress after every block.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
-                                                      const gsf_nn_encoder_input* input, float* out);
-// The last pair's outputs: out (images, tokens, 2 width), frame block | global block, for all images together, which see
-// one another. ImageNet's mean and deviation are taken out here. Otherwise as above.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt,
-                                                    const gsf_nn_encoder_input* input, float* out);
-// Bytes of memory (beside input, output, mapped weights and some 70 MB of the kernels' scratch) at the peak, and floating-
-// point operations, of such a call; either may be NULL. Reads the input's sizes only.
-GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
-                                double* flops);
-GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops);
-
-typedef struct gsf_nn_features { // of reference photos; zero to begin with, destroy it
-    int64_t images, tokens;               // tokens of each image
-    int64_t dino_channels, vggt_channels; // 0: not computed
-    float *dino, *vggt;                   // (images, tokens, channels)
-} gsf_nn_features;
-
-// Prepares the photos and encodes them with the models that are given. A later call with the other model (of which only one
-// need then be open at a time) adds its tokens. All photos must come out in one size. On error the tokens that were to be
-// made are NULL.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
-                                                          const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
-                                                          gsf_nn_features* features);
-GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features);
-// Writes the file that gsf_nn_dit_desc.features names: dino_latents, vggt_latents (what was computed) and, unless NULL,
-// prompt_embeds (2, text tokens, text channels): negative prompt, prompt.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, const gsf_nn_features* features,
-                                                      const gsf_tensor* prompt_embeds);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule,
+                                                     const gsf_nn_sampler_desc* desc, gsf_nn_sampler* out);
+GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler);
+// One step: x (value_count), the latents at timesteps[index], becomes those at the next one; v is the model's output for
+// x. x0 (NULL allowed) gets the predicted clean latents. eta is 0: nothing is random. A latent that is NaN or infinite
+// afterwards gives GSF_ERROR_NUMERIC, which names the step.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x,
+                                                     float* x0);
 
 // ---- sampling: from artifact-ridden frames to restored ones --------------------------
 
@@ -653,81 +728,6 @@ typedef struct gsf_nn_cost { double bytes, flops; } gsf_nn_cost; // anonymous me
 GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                     const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
                                                     gsf_nn_cost* out);
-
-// ---- tokens: byte-level pair encoding -----------------------------------------------
-// What GPT-2 and OPT read, as transformers 4.51.3 does it (GPT2Tokenizer).
-
-typedef struct gsf_nn_bpe {     // an open tokenizer
-    int32_t bos, eos, unk, pad; // ids, -1: none
-    int32_t highest_id;
-    int add_bos;                // texts begin with `bos`
-    void* tables;               // private
-} gsf_nn_bpe;
-
-// Opens FOLDER/vocab.json and merges.txt and, where they are there, tokenizer_config.json, special_tokens_map.json and
-// added_tokens.json. What is malformed, or names a token that there is not, gives GSF_ERROR_FORMAT with file and place.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
-GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe);
-
-// Ids of a text of `size` bytes, which must be UTF-8; *ids is freed with gsf_free. `no_bos` leaves the first token out even
-// where add_bos says otherwise. Time n log n whatever the text. Any number of threads, each with its context, may use one
-// tokenizer.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
-                                                   int no_bos, int32_t** ids, size_t* count);
-// Appends the text of `count` ids to `out`, which may come to hold zero bytes; bytes that are no UTF-8 become U+FFFD.
-// Ids that no token has are left out, with `skip_special` the special tokens (bos, eos, pad, <image> ...) as well.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
-                                                   size_t count, int skip_special, gsf_text* out);
-
-// ---- captions ------------------------------------------------------------------------
-// BLIP-2 with OPT, which says in a few words what an image shows (transformers 4.51.3, Blip2ForConditionalGeneration). The
-// restorer's prompt begins with such a caption.
-
-typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
-    int32_t image_size;           // side of the square that images are resized to, whatever their shape
-    int32_t query_tokens;         // words that stand for the image
-    int32_t vocabulary, positions; // of the language model: words, and the most tokens of image, prompt and caption
-    int32_t bos, eos;             // begins a caption without prompt; ends every caption
-    int32_t image_token;          // "image_token_index"; -1: an older folder without it, whose default length is less
-    gsf_nn_bpe tokenizer;
-    gsf_nn_weights weights;
-    void* nets;                   // private
-} gsf_nn_captioner;
-
-// Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_make_bpe) and
-// model*.safetensors in f32, bf16 or f16, which are computed with in float32. Keys that are absent have the defaults of
-// transformers. Missing, misshaped and surplus tensors are named (GSF_ERROR_FORMAT), as is what this code does not do
-// (GSF_ERROR_UNSUPPORTED): another language model than OPT, norms behind the layers (do_layer_norm_before false).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
-GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner);
-
-// The caption of an image (1, 3 or 4 channels, any dtype; alpha is left out) as zero-terminated UTF-8 without white space
-// at its ends. With a prompt, it goes on from there, and the prompt is not repeated; NULL: none. At most `max_new_tokens`
-// tokens, 0: 20 (older folders: 17, or 19 less two for each token of the prompt), the most likely one each time. The
-// text is cut behind a whole character where it does not fit `size` bytes; a zero byte in it becomes U+FFFD.
-// A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the tensor's or layer's name. Progress and
-// cancel after every layer. Any number of threads, each with its context, may use one captioner.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
-                                                const char* prompt, int32_t max_new_tokens, char* out, size_t size);
-
-typedef struct gsf_nn_caption_desc {
-    const gsf_image* image;
-    const char* prompt;     // NULL: none
-    int32_t max_new_tokens; // 0: as gsf_nn_caption
-    // Shown every intermediate: "pixel_values" (3, pixels), "vision" (tokens, width), "qformer", "projection", "logits" of
-    // the prompt (tokens, words). NULL in normal use.
-    void (*tap_fn)(void* user, const char* name, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
-} gsf_nn_caption_desc;
-
-// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
-                                                    const gsf_nn_caption_desc* desc, int32_t** ids, size_t* count);
-
-// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
-// `text_tokens` tokens of prompt (0: none).
-GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
-                                 double* bytes, double* flops);
 
 // ---- the restorer `dit` ---------------------------------------------------------------
 
@@ -2331,6 +2331,517 @@ GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int6
     job.chunk_rows = gsf__nn_chunk_rows(columns);
     job.scale = scale;
     gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__softmax_chunk, &job);
+}
+
+// ---- >>nn norms -----------------------------------------------------------------
+
+typedef struct gsf__moments { double mean, square; } gsf__moments; // square: sum of (x - mean)^2
+
+typedef struct gsf__norm_job gsf__norm_job;
+typedef struct gsf__norm_kernels {
+    gsf__moments (*moments)(const float* x, int64_t count, int centre); // centre 0: mean is taken as 0
+    void (*row)(const gsf__norm_job* job, const float* x, float* y);
+    void (*head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin); // cos NULL: no rotation
+    // y = weight (x - mean) inverse + bias; y may be x
+    void (*affine)(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias, float* y,
+                   int stream);
+} gsf__norm_kernels;
+
+struct gsf__norm_job {
+    const gsf__norm_kernels* kernels;
+    const float *x, *weight, *bias, *scale, *shift, *cos, *sin;
+    float* y;
+    int64_t rows, dim, stride, chunk_rows, rope_first;
+    int64_t group_size, part_size, parts, first_group; // group norm: values of a group, of a part of it, parts of a group
+    gsf__moments* part_moments;
+    int32_t heads;
+    float eps;
+    int centre; // 0: root mean square only
+    int stream;
+};
+
+static float gsf__norm_inverse(gsf__moments m, int64_t count, float eps) {
+    return (float)(1.0 / sqrt(m.square / (double)count + (double)eps));
+}
+
+static gsf__moments gsf__moments_scalar(const float* x, int64_t count, int centre) {
+    gsf__moments m = {0.0, 0.0};
+    if (centre) {
+        for (int64_t i = 0; i < count; i++) m.mean += (double)x[i];
+        m.mean /= (double)count;
+    }
+    for (int64_t i = 0; i < count; i++) m.square += ((double)x[i] - m.mean) * ((double)x[i] - m.mean);
+    return m;
+}
+
+static void gsf__norm_row_scalar(const gsf__norm_job* job, const float* x, float* y) {
+    const gsf__moments m = gsf__moments_scalar(x, job->dim, job->centre);
+    const float inverse = gsf__norm_inverse(m, job->dim, job->eps);
+    for (int64_t i = 0; i < job->dim; i++) {
+        float v = (float)((double)x[i] - m.mean) * inverse;
+        if (job->weight) v *= job->weight[i];
+        if (job->bias) v += job->bias[i];
+        if (job->scale) v = v * (1.0f + job->scale[i]) + job->shift[i];
+        y[i] = v;
+    }
+}
+
+static void gsf__norm_head_scalar(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    gsf__norm_row_scalar(job, x, x);
+    for (int64_t i = 0; cos && i + 1 < job->dim; i += 2) {
+        const float a = x[i], b = x[i + 1];
+        x[i] = a * cos[i] - b * sin[i];
+        x[i + 1] = b * cos[i + 1] + a * sin[i + 1];
+    }
+}
+
+static void gsf__norm_affine_scalar(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias,
+                                    float* y, int stream) {
+    (void)stream;
+    for (int64_t i = 0; i < count; i++) y[i] = (float)((double)x[i] - m.mean) * inverse * weight + bias;
+}
+
+#if GSF__X86
+
+// One pass, in double. Values are taken relative to one of them, so (mean - pivot)^2 is at most `count` times the variance,
+// and subtracting it costs no more than log2(count) of the 53 bits.
+static gsf__moments gsf__moments_of(double pivot, double sum, double square, int64_t count, int centre) {
+    gsf__moments m = {0.0, square};
+    if (!centre) return m;
+    m.mean = pivot + sum / (double)count;
+    m.square = square - sum * sum / (double)count;
+    if (m.square < 0.0) m.square = 0.0;
+    return m;
+}
+
+GSF__INLINE_AVX2 gsf__moments gsf__moments_avx2_body(const float* x, int64_t count, int centre) {
+    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
+    const __m256d p = _mm256_set1_pd(pivot);
+    __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0, q0 = s0, q1 = s0, q2 = s0, q3 = s0;
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16) {
+        const __m256d d0 = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p, d1 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4)) - p;
+        const __m256d d2 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8)) - p, d3 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12)) - p;
+        s0 = s0 + d0, s1 = s1 + d1, s2 = s2 + d2, s3 = s3 + d3;
+        q0 = _mm256_fmadd_pd(d0, d0, q0), q1 = _mm256_fmadd_pd(d1, d1, q1);
+        q2 = _mm256_fmadd_pd(d2, d2, q2), q3 = _mm256_fmadd_pd(d3, d3, q3);
+    }
+    for (; i + 4 <= count; i += 4) {
+        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p;
+        s0 = s0 + d, q0 = _mm256_fmadd_pd(d, d, q0);
+    }
+    double sum = gsf__nn_sum4((s0 + s1) + (s2 + s3)), square = gsf__nn_sum4((q0 + q1) + (q2 + q3));
+    for (; i < count; i++) {
+        const double d = (double)x[i] - pivot;
+        sum += d;
+        square += d * d;
+    }
+    return gsf__moments_of(pivot, sum, square, count, centre);
+}
+
+GSF__TARGET_AVX2 static gsf__moments gsf__moments_avx2(const float* x, int64_t count, int centre) {
+    return gsf__moments_avx2_body(x, count, centre);
+}
+
+typedef struct gsf__norm8 { __m256 mean, low, inverse; } gsf__norm8; // mean + low: the mean in two floats
+
+GSF__INLINE_AVX2 gsf__norm8 gsf__norm8_of(gsf__moments m, float inverse) {
+    gsf__norm8 n;
+    const float mean = (float)m.mean;
+    n.mean = _mm256_set1_ps(mean);
+    n.low = _mm256_set1_ps((float)(m.mean - (double)mean));
+    n.inverse = _mm256_set1_ps(inverse);
+    return n;
+}
+
+// (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
+GSF__INLINE_AVX2 __m256 gsf__norm8_apply(const gsf__norm8* n, __m256 x) { return ((x - n->mean) - n->low) * n->inverse; }
+
+typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
+
+static gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
+    const gsf__norm_vectors v = {job->weight, job->bias, job->scale, job->shift};
+    return v;
+}
+
+GSF__INLINE_AVX2 __m256 gsf__norm_value8(gsf__norm_vectors by, const gsf__norm8* n, __m256 x, int64_t i, __m256i mask,
+                                         int whole) {
+#define GSF_X(p) (whole ? _mm256_loadu_ps((p) + i) : _mm256_maskload_ps((p) + i, mask))
+    __m256 v = gsf__norm8_apply(n, x);
+    if (by.weight) v = v * GSF_X(by.weight);
+    if (by.bias) v = v + GSF_X(by.bias);
+    if (by.scale) v = _mm256_fmadd_ps(v, _mm256_set1_ps(1.0f) + GSF_X(by.scale), GSF_X(by.shift));
+    return v;
+#undef GSF_X
+}
+
+GSF__INLINE_AVX2 void gsf__norm_row_avx2_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
+    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
+    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const __m256i all = _mm256_set1_epi32(-1);
+    const int64_t dim = job->dim;
+    int64_t i = 0;
+    for (; i + 8 <= dim; i += 8) {
+        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
+        gsf__nn_put8(y + i, gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1), stream);
+    }
+    if (i == job->dim) return;
+    const __m256i mask = gsf__nn_mask8(job->dim - i);
+    _mm256_maskstore_ps(y + i, mask, gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0));
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_row_avx2(const gsf__norm_job* job, const float* x, float* y) {
+    if (job->stream) gsf__norm_row_avx2_body(job, x, y, 1);
+    else gsf__norm_row_avx2_body(job, x, y, 0);
+    gsf__nn_end_stream(job->stream);
+}
+
+GSF__INLINE_AVX2 __m256 gsf__rotate8(__m256 v, __m256 cos, __m256 sin) { // (a c - b s, b c + a s) of each pair
+    return _mm256_fmaddsub_ps(v, cos, _mm256_permute_ps(v, 0xb1) * sin);
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_head_avx2(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
+    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const __m256i all = _mm256_set1_epi32(-1);
+    const int64_t dim = job->dim;
+    int64_t i = 0;
+    for (; i + 8 <= dim; i += 8) {
+        __m256 v = gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1);
+        if (cos) v = gsf__rotate8(v, _mm256_loadu_ps(cos + i), _mm256_loadu_ps(sin + i));
+        _mm256_storeu_ps(x + i, v);
+    }
+    if (i == job->dim) return;
+    const __m256i mask = gsf__nn_mask8(job->dim - i);
+    __m256 v = gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0);
+    const __m256 plain = v;
+    if (cos) v = gsf__rotate8(v, _mm256_maskload_ps(cos + i, mask), _mm256_maskload_ps(sin + i, mask));
+    _mm256_maskstore_ps(x + i, mask, v);
+    if (job->dim % 2) _mm256_maskstore_ps(x + i, _mm256_andnot_si256(gsf__nn_mask8(job->dim - i - 1), mask), plain);
+}
+
+GSF__INLINE_AVX2 void gsf__norm_affine_avx2_body(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                 float weight, float bias, float* y, int stream) {
+    const gsf__norm8 n = gsf__norm8_of(m, inverse);
+    const __m256 w = _mm256_set1_ps(weight), b = _mm256_set1_ps(bias);
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8)
+        gsf__nn_put8(y + i, _mm256_fmadd_ps(gsf__norm8_apply(&n, _mm256_loadu_ps(x + i)), w, b), stream);
+    if (i == count) return;
+    const __m256i mask = gsf__nn_mask8(count - i);
+    const __m256 v = gsf__norm8_apply(&n, _mm256_maskload_ps(x + i, mask));
+    _mm256_maskstore_ps(y + i, mask, _mm256_fmadd_ps(v, w, b));
+}
+
+GSF__TARGET_AVX2 static void gsf__norm_affine_avx2(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                   float weight, float bias, float* y, int stream) {
+    if (stream) gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 1);
+    else gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 0);
+    gsf__nn_end_stream(stream);
+}
+
+// The same, sixteen at a time.
+
+typedef struct gsf__moments16 { __m512d sum[2], square[2]; } gsf__moments16;
+
+GSF__INLINE_AVX512 void gsf__moments_add16(gsf__moments16* m, const float* x, __mmask16 mask, __m512d pivot) {
+    for (int h = 0; h < 2; h++) {
+        const __mmask8 half = (__mmask8)(mask >> 8 * h);
+        const __m512d d = _mm512_maskz_sub_pd(half, _mm512_cvtps_pd(_mm256_maskz_loadu_ps(half, x + 8 * h)), pivot);
+        m->sum[h] = m->sum[h] + d;
+        m->square[h] = _mm512_fmadd_pd(d, d, m->square[h]);
+    }
+}
+
+GSF__INLINE_AVX512 gsf__moments gsf__moments_avx512_body(const float* x, int64_t count, int centre) {
+    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
+    gsf__moments16 m = {{_mm512_setzero_pd(), _mm512_setzero_pd()}, {_mm512_setzero_pd(), _mm512_setzero_pd()}};
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16) gsf__moments_add16(&m, x + i, GSF__NN_WHOLE16, _mm512_set1_pd(pivot));
+    if (i < count) gsf__moments_add16(&m, x + i, gsf__nn_mask16(count - i), _mm512_set1_pd(pivot));
+    return gsf__moments_of(pivot, _mm512_reduce_add_pd(m.sum[0] + m.sum[1]),
+                           _mm512_reduce_add_pd(m.square[0] + m.square[1]), count, centre);
+}
+
+GSF__TARGET_AVX512 static gsf__moments gsf__moments_avx512(const float* x, int64_t count, int centre) {
+    return gsf__moments_avx512_body(x, count, centre);
+}
+
+typedef struct gsf__norm16 { __m512 mean, low, inverse; } gsf__norm16;
+
+GSF__INLINE_AVX512 gsf__norm16 gsf__norm16_of(gsf__moments m, float inverse) {
+    gsf__norm16 n;
+    const float mean = (float)m.mean;
+    n.mean = _mm512_set1_ps(mean);
+    n.low = _mm512_set1_ps((float)(m.mean - (double)mean));
+    n.inverse = _mm512_set1_ps(inverse);
+    return n;
+}
+
+GSF__INLINE_AVX512 __m512 gsf__norm16_apply(const gsf__norm16* n, __m512 x) { return ((x - n->mean) - n->low) * n->inverse; }
+
+GSF__INLINE_AVX512 __m512 gsf__norm_value16(gsf__norm_vectors by, const gsf__norm16* n, const float* x, int64_t i,
+                                            __mmask16 mask) {
+    __m512 v = gsf__norm16_apply(n, _mm512_maskz_loadu_ps(mask, x + i));
+    if (by.weight) v = v * _mm512_maskz_loadu_ps(mask, by.weight + i);
+    if (by.bias) v = v + _mm512_maskz_loadu_ps(mask, by.bias + i);
+    if (by.scale)
+        v = _mm512_fmadd_ps(v, _mm512_set1_ps(1.0f) + _mm512_maskz_loadu_ps(mask, by.scale + i),
+                            _mm512_maskz_loadu_ps(mask, by.shift + i));
+    return v;
+}
+
+GSF__INLINE_AVX512 void gsf__norm_row_avx512_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
+    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
+    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const int64_t dim = job->dim;
+    int64_t i = 0;
+    for (; i + 16 <= dim; i += 16) {
+        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
+        gsf__nn_put16(y + i, gsf__norm_value16(by, &n, x, i, GSF__NN_WHOLE16), stream);
+    }
+    if (i == dim) return;
+    const __mmask16 mask = gsf__nn_mask16(dim - i);
+    _mm512_mask_storeu_ps(y + i, mask, gsf__norm_value16(by, &n, x, i, mask));
+}
+
+GSF__TARGET_AVX512 static void gsf__norm_row_avx512(const gsf__norm_job* job, const float* x, float* y) {
+    if (job->stream) gsf__norm_row_avx512_body(job, x, y, 1);
+    else gsf__norm_row_avx512_body(job, x, y, 0);
+    gsf__nn_end_stream(job->stream);
+}
+
+GSF__INLINE_AVX512 void gsf__norm_head16(gsf__norm_vectors by, const gsf__norm16* n, float* x, const float* cos,
+                                         const float* sin, int64_t i, __mmask16 turned, __mmask16 mask) {
+    __m512 v = gsf__norm_value16(by, n, x, i, mask);
+    if (cos)
+        v = _mm512_mask_fmaddsub_ps(v, turned, _mm512_maskz_loadu_ps(mask, cos + i),
+                                    _mm512_permute_ps(v, 0xb1) * _mm512_maskz_loadu_ps(mask, sin + i));
+    gsf__nn_store16(x + i, mask, v);
+}
+
+GSF__TARGET_AVX512 static void gsf__norm_head_avx512(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
+    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const int64_t dim = job->dim;
+    int64_t i = 0;
+    for (; i + 16 <= dim; i += 16) gsf__norm_head16(by, &n, x, cos, sin, i, GSF__NN_WHOLE16, GSF__NN_WHOLE16);
+    if (i < dim) gsf__norm_head16(by, &n, x, cos, sin, i, gsf__nn_mask16((dim - i) / 2 * 2), gsf__nn_mask16(dim - i));
+}
+
+GSF__INLINE_AVX512 void gsf__norm_affine_avx512_body(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                     float weight, float bias, float* y, int stream) {
+    const gsf__norm16 n = gsf__norm16_of(m, inverse);
+    const __m512 w = _mm512_set1_ps(weight), b = _mm512_set1_ps(bias);
+    int64_t i = 0;
+    for (; i + 16 <= count; i += 16)
+        gsf__nn_put16(y + i, _mm512_fmadd_ps(gsf__norm16_apply(&n, _mm512_loadu_ps(x + i)), w, b), stream);
+    if (i == count) return;
+    const __mmask16 mask = gsf__nn_mask16(count - i);
+    const __m512 v = gsf__norm16_apply(&n, _mm512_maskz_loadu_ps(mask, x + i));
+    _mm512_mask_storeu_ps(y + i, mask, _mm512_fmadd_ps(v, w, b));
+}
+
+GSF__TARGET_AVX512 static void gsf__norm_affine_avx512(const float* x, int64_t count, gsf__moments m, float inverse,
+                                                       float weight, float bias, float* y, int stream) {
+    if (stream) gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 1);
+    else gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 0);
+    gsf__nn_end_stream(stream);
+}
+
+#endif // GSF__X86
+
+static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
+    static const gsf__norm_kernels scalar = {gsf__moments_scalar, gsf__norm_row_scalar, gsf__norm_head_scalar,
+                                             gsf__norm_affine_scalar};
+#if GSF__X86
+    static const gsf__norm_kernels avx2 = {gsf__moments_avx2, gsf__norm_row_avx2, gsf__norm_head_avx2,
+                                           gsf__norm_affine_avx2};
+    static const gsf__norm_kernels avx512 = {gsf__moments_avx512, gsf__norm_row_avx512, gsf__norm_head_avx512,
+                                             gsf__norm_affine_avx512};
+    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
+static void gsf__norm_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    const int64_t begin = (int64_t)chunk * job->chunk_rows;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++)
+        job->kernels->row(job, job->x + r * job->dim, job->y + r * job->dim);
+}
+
+static void gsf__norm_rows(gsf_context* ctx, gsf__norm_job* job) {
+    job->kernels = gsf__norm_kernels_of(ctx->cpu_level);
+    job->chunk_rows = gsf__nn_chunk_rows(job->dim);
+    job->stream = gsf__nn_streams(job->x, job->y, job->rows * job->dim, job->dim);
+    gsf__parallel_for(ctx, gsf__nn_chunks(job->rows, job->chunk_rows), gsf__norm_chunk, job);
+}
+
+GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+                                         const float* bias, float eps, const float* scale, const float* shift, float* y) {
+    gsf__norm_job job;
+    memset(&job, 0, sizeof job);
+    job.x = x;
+    job.y = y;
+    job.rows = rows;
+    job.dim = dim;
+    job.weight = weight;
+    job.bias = bias;
+    job.scale = scale;
+    job.shift = shift;
+    job.eps = eps;
+    job.centre = 1;
+    gsf__norm_rows(ctx, &job);
+}
+
+GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+                               const float* bias, float eps, float* y) {
+    gsf_nn_layer_norm_modulated(ctx, x, rows, dim, weight, bias, eps, NULL, NULL, y);
+}
+
+GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight, float eps,
+                             float* y) {
+    gsf__norm_job job;
+    memset(&job, 0, sizeof job);
+    job.x = x;
+    job.y = y;
+    job.rows = rows;
+    job.dim = dim;
+    job.weight = weight;
+    job.eps = eps;
+    gsf__norm_rows(ctx, &job);
+}
+
+// Groups are cut into parts that fit a core's cache, so that each is read once for both moments, and few large groups still
+// employ all workers. The moments of parts are put together in order (Chan et al. 1979). As many groups as a shared cache
+// holds are normalised before the next ones are read.
+enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; most parts of a group
+enum { GSF__NORM_BATCH = 1 << 21 };                        // values of the groups of a batch
+
+static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
+    const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: within the group
+    const int64_t end = gsf__least(begin + job->part_size, job->group_size);
+    for (int64_t i = begin; i < end;) { // by channel
+        const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
+        const int64_t count = gsf__least(next, end) - i;
+        job->kernels->affine(job->x + first + i, count, m, inverse, job->weight ? job->weight[channel] : 1.0f,
+                             job->bias ? job->bias[channel] : 0.0f, job->y + first + i, job->stream);
+        i += count;
+    }
+}
+
+static gsf__moments gsf__norm_part(const gsf__norm_job* job, int64_t group, int64_t part, int64_t* count) {
+    *count = gsf__least(job->part_size, job->group_size - part * job->part_size);
+    return job->kernels->moments(job->x + group * job->group_size + part * job->part_size, *count, 1);
+}
+
+static void gsf__norm_whole_group(void* arg, size_t group, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    int64_t count;
+    const gsf__moments m = gsf__norm_part(job, (int64_t)group, 0, &count);
+    gsf__norm_group_values(job, (int64_t)group, 0, m, gsf__norm_inverse(m, count, job->eps));
+}
+
+static void gsf__norm_part_moments(void* arg, size_t chunk, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    int64_t count;
+    const int64_t group = job->first_group + (int64_t)chunk / job->parts;
+    job->part_moments[chunk] = gsf__norm_part(job, group, (int64_t)chunk % job->parts, &count);
+}
+
+static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    const int64_t group = (int64_t)chunk / job->parts;
+    const gsf__moments* of = job->part_moments + group * job->parts;
+    gsf__moments m = of[0];
+    for (int64_t p = 1; p < job->parts; p++) {
+        const double before = (double)(p * job->part_size), delta = of[p].mean - m.mean;
+        const double after = (double)gsf__least((p + 1) * job->part_size, job->group_size);
+        const double share = (after - before) / after;
+        m.mean += delta * share;
+        m.square += of[p].square + delta * delta * before * share;
+    }
+    gsf__norm_group_values(job, job->first_group + group, (int64_t)chunk % job->parts, m,
+                           gsf__norm_inverse(m, job->group_size, job->eps));
+}
+
+GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
+                               const float* weight, const float* bias, float eps, float* y) {
+    gsf__moments part_moments[GSF__NORM_PARTS];
+    gsf__norm_job job;
+    memset(&job, 0, sizeof job);
+    if (channels < 1 || count < 1 || groups < 1) return;
+    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
+    job.x = x;
+    job.y = y;
+    job.rows = channels;
+    job.dim = count;
+    job.weight = weight;
+    job.bias = bias;
+    job.eps = eps;
+    job.stream = gsf__nn_streams(x, y, channels * count, count);
+    job.group_size = channels / groups * count;
+    job.part_size = gsf__ceil_div(job.group_size, gsf__least((int64_t)gsf__nn_chunks(job.group_size, GSF__NORM_PART),
+                                                             GSF__NORM_PARTS));
+    job.part_size = gsf__round_up(job.part_size, 16);
+    job.parts = gsf__ceil_div(job.group_size, job.part_size);
+    if (job.parts == 1) {
+        gsf__parallel_for(ctx, (size_t)groups, gsf__norm_whole_group, &job);
+        return;
+    }
+    job.part_moments = part_moments;
+    int64_t batch = gsf__least(GSF__NORM_BATCH / job.group_size, GSF__NORM_PARTS / job.parts);
+    if (batch < 1) batch = 1;
+    for (; job.first_group < groups; job.first_group += batch) {
+        const size_t parts = (size_t)(gsf__least(batch, groups - job.first_group) * job.parts);
+        gsf__parallel_for(ctx, parts, gsf__norm_part_moments, &job);
+        gsf__parallel_for(ctx, parts, gsf__norm_part_values, &job);
+    }
+}
+
+static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__norm_job* job = (const gsf__norm_job*)arg;
+    (void)worker;
+    const int64_t begin = (int64_t)chunk * job->chunk_rows;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
+        const int64_t at = (r - job->rope_first) * job->dim;
+        const int turn = job->cos && at >= 0;
+        const float *cos = turn ? job->cos + at : NULL, *sin = turn ? job->sin + at : NULL;
+        for (int32_t h = 0; h < job->heads; h++) job->kernels->head(job, job->y + r * job->stride + h * job->dim, cos, sin);
+    }
+}
+
+GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads, int32_t head_dim,
+                                   const float* weight, const float* bias, float eps, const float* cos, const float* sin,
+                                   int64_t rope_first) {
+    gsf__norm_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
+    job.y = x;
+    job.rows = rows;
+    job.stride = ldx ? ldx : (int64_t)heads * head_dim;
+    job.dim = head_dim;
+    job.heads = heads;
+    job.weight = weight;
+    job.bias = bias;
+    job.eps = eps;
+    job.centre = 1;
+    job.cos = cos;
+    job.sin = sin;
+    job.rope_first = rope_first;
+    job.chunk_rows = gsf__nn_chunk_rows((int64_t)heads * head_dim);
+    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__head_norm_rope_chunk, &job);
 }
 
 // ---- >>nn linear ----------------------------------------------------------------
@@ -4046,517 +4557,6 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
     return GSF_OK;
 }
 
-// ---- >>nn norms -----------------------------------------------------------------
-
-typedef struct gsf__moments { double mean, square; } gsf__moments; // square: sum of (x - mean)^2
-
-typedef struct gsf__norm_job gsf__norm_job;
-typedef struct gsf__norm_kernels {
-    gsf__moments (*moments)(const float* x, int64_t count, int centre); // centre 0: mean is taken as 0
-    void (*row)(const gsf__norm_job* job, const float* x, float* y);
-    void (*head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin); // cos NULL: no rotation
-    // y = weight (x - mean) inverse + bias; y may be x
-    void (*affine)(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias, float* y,
-                   int stream);
-} gsf__norm_kernels;
-
-struct gsf__norm_job {
-    const gsf__norm_kernels* kernels;
-    const float *x, *weight, *bias, *scale, *shift, *cos, *sin;
-    float* y;
-    int64_t rows, dim, stride, chunk_rows, rope_first;
-    int64_t group_size, part_size, parts, first_group; // group norm: values of a group, of a part of it, parts of a group
-    gsf__moments* part_moments;
-    int32_t heads;
-    float eps;
-    int centre; // 0: root mean square only
-    int stream;
-};
-
-static float gsf__norm_inverse(gsf__moments m, int64_t count, float eps) {
-    return (float)(1.0 / sqrt(m.square / (double)count + (double)eps));
-}
-
-static gsf__moments gsf__moments_scalar(const float* x, int64_t count, int centre) {
-    gsf__moments m = {0.0, 0.0};
-    if (centre) {
-        for (int64_t i = 0; i < count; i++) m.mean += (double)x[i];
-        m.mean /= (double)count;
-    }
-    for (int64_t i = 0; i < count; i++) m.square += ((double)x[i] - m.mean) * ((double)x[i] - m.mean);
-    return m;
-}
-
-static void gsf__norm_row_scalar(const gsf__norm_job* job, const float* x, float* y) {
-    const gsf__moments m = gsf__moments_scalar(x, job->dim, job->centre);
-    const float inverse = gsf__norm_inverse(m, job->dim, job->eps);
-    for (int64_t i = 0; i < job->dim; i++) {
-        float v = (float)((double)x[i] - m.mean) * inverse;
-        if (job->weight) v *= job->weight[i];
-        if (job->bias) v += job->bias[i];
-        if (job->scale) v = v * (1.0f + job->scale[i]) + job->shift[i];
-        y[i] = v;
-    }
-}
-
-static void gsf__norm_head_scalar(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
-    gsf__norm_row_scalar(job, x, x);
-    for (int64_t i = 0; cos && i + 1 < job->dim; i += 2) {
-        const float a = x[i], b = x[i + 1];
-        x[i] = a * cos[i] - b * sin[i];
-        x[i + 1] = b * cos[i + 1] + a * sin[i + 1];
-    }
-}
-
-static void gsf__norm_affine_scalar(const float* x, int64_t count, gsf__moments m, float inverse, float weight, float bias,
-                                    float* y, int stream) {
-    (void)stream;
-    for (int64_t i = 0; i < count; i++) y[i] = (float)((double)x[i] - m.mean) * inverse * weight + bias;
-}
-
-#if GSF__X86
-
-// One pass, in double. Values are taken relative to one of them, so (mean - pivot)^2 is at most `count` times the variance,
-// and subtracting it costs no more than log2(count) of the 53 bits.
-static gsf__moments gsf__moments_of(double pivot, double sum, double square, int64_t count, int centre) {
-    gsf__moments m = {0.0, square};
-    if (!centre) return m;
-    m.mean = pivot + sum / (double)count;
-    m.square = square - sum * sum / (double)count;
-    if (m.square < 0.0) m.square = 0.0;
-    return m;
-}
-
-GSF__INLINE_AVX2 gsf__moments gsf__moments_avx2_body(const float* x, int64_t count, int centre) {
-    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
-    const __m256d p = _mm256_set1_pd(pivot);
-    __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0, q0 = s0, q1 = s0, q2 = s0, q3 = s0;
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) {
-        const __m256d d0 = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p, d1 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4)) - p;
-        const __m256d d2 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8)) - p, d3 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12)) - p;
-        s0 = s0 + d0, s1 = s1 + d1, s2 = s2 + d2, s3 = s3 + d3;
-        q0 = _mm256_fmadd_pd(d0, d0, q0), q1 = _mm256_fmadd_pd(d1, d1, q1);
-        q2 = _mm256_fmadd_pd(d2, d2, q2), q3 = _mm256_fmadd_pd(d3, d3, q3);
-    }
-    for (; i + 4 <= count; i += 4) {
-        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p;
-        s0 = s0 + d, q0 = _mm256_fmadd_pd(d, d, q0);
-    }
-    double sum = gsf__nn_sum4((s0 + s1) + (s2 + s3)), square = gsf__nn_sum4((q0 + q1) + (q2 + q3));
-    for (; i < count; i++) {
-        const double d = (double)x[i] - pivot;
-        sum += d;
-        square += d * d;
-    }
-    return gsf__moments_of(pivot, sum, square, count, centre);
-}
-
-GSF__TARGET_AVX2 static gsf__moments gsf__moments_avx2(const float* x, int64_t count, int centre) {
-    return gsf__moments_avx2_body(x, count, centre);
-}
-
-typedef struct gsf__norm8 { __m256 mean, low, inverse; } gsf__norm8; // mean + low: the mean in two floats
-
-GSF__INLINE_AVX2 gsf__norm8 gsf__norm8_of(gsf__moments m, float inverse) {
-    gsf__norm8 n;
-    const float mean = (float)m.mean;
-    n.mean = _mm256_set1_ps(mean);
-    n.low = _mm256_set1_ps((float)(m.mean - (double)mean));
-    n.inverse = _mm256_set1_ps(inverse);
-    return n;
-}
-
-// (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
-GSF__INLINE_AVX2 __m256 gsf__norm8_apply(const gsf__norm8* n, __m256 x) { return ((x - n->mean) - n->low) * n->inverse; }
-
-typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
-
-static gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
-    const gsf__norm_vectors v = {job->weight, job->bias, job->scale, job->shift};
-    return v;
-}
-
-GSF__INLINE_AVX2 __m256 gsf__norm_value8(gsf__norm_vectors by, const gsf__norm8* n, __m256 x, int64_t i, __m256i mask,
-                                         int whole) {
-#define GSF_X(p) (whole ? _mm256_loadu_ps((p) + i) : _mm256_maskload_ps((p) + i, mask))
-    __m256 v = gsf__norm8_apply(n, x);
-    if (by.weight) v = v * GSF_X(by.weight);
-    if (by.bias) v = v + GSF_X(by.bias);
-    if (by.scale) v = _mm256_fmadd_ps(v, _mm256_set1_ps(1.0f) + GSF_X(by.scale), GSF_X(by.shift));
-    return v;
-#undef GSF_X
-}
-
-GSF__INLINE_AVX2 void gsf__norm_row_avx2_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
-    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
-    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
-    const __m256i all = _mm256_set1_epi32(-1);
-    const int64_t dim = job->dim;
-    int64_t i = 0;
-    for (; i + 8 <= dim; i += 8) {
-        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
-        gsf__nn_put8(y + i, gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1), stream);
-    }
-    if (i == job->dim) return;
-    const __m256i mask = gsf__nn_mask8(job->dim - i);
-    _mm256_maskstore_ps(y + i, mask, gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0));
-}
-
-GSF__TARGET_AVX2 static void gsf__norm_row_avx2(const gsf__norm_job* job, const float* x, float* y) {
-    if (job->stream) gsf__norm_row_avx2_body(job, x, y, 1);
-    else gsf__norm_row_avx2_body(job, x, y, 0);
-    gsf__nn_end_stream(job->stream);
-}
-
-GSF__INLINE_AVX2 __m256 gsf__rotate8(__m256 v, __m256 cos, __m256 sin) { // (a c - b s, b c + a s) of each pair
-    return _mm256_fmaddsub_ps(v, cos, _mm256_permute_ps(v, 0xb1) * sin);
-}
-
-GSF__TARGET_AVX2 static void gsf__norm_head_avx2(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
-    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
-    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
-    const __m256i all = _mm256_set1_epi32(-1);
-    const int64_t dim = job->dim;
-    int64_t i = 0;
-    for (; i + 8 <= dim; i += 8) {
-        __m256 v = gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1);
-        if (cos) v = gsf__rotate8(v, _mm256_loadu_ps(cos + i), _mm256_loadu_ps(sin + i));
-        _mm256_storeu_ps(x + i, v);
-    }
-    if (i == job->dim) return;
-    const __m256i mask = gsf__nn_mask8(job->dim - i);
-    __m256 v = gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0);
-    const __m256 plain = v;
-    if (cos) v = gsf__rotate8(v, _mm256_maskload_ps(cos + i, mask), _mm256_maskload_ps(sin + i, mask));
-    _mm256_maskstore_ps(x + i, mask, v);
-    if (job->dim % 2) _mm256_maskstore_ps(x + i, _mm256_andnot_si256(gsf__nn_mask8(job->dim - i - 1), mask), plain);
-}
-
-GSF__INLINE_AVX2 void gsf__norm_affine_avx2_body(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                 float weight, float bias, float* y, int stream) {
-    const gsf__norm8 n = gsf__norm8_of(m, inverse);
-    const __m256 w = _mm256_set1_ps(weight), b = _mm256_set1_ps(bias);
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8)
-        gsf__nn_put8(y + i, _mm256_fmadd_ps(gsf__norm8_apply(&n, _mm256_loadu_ps(x + i)), w, b), stream);
-    if (i == count) return;
-    const __m256i mask = gsf__nn_mask8(count - i);
-    const __m256 v = gsf__norm8_apply(&n, _mm256_maskload_ps(x + i, mask));
-    _mm256_maskstore_ps(y + i, mask, _mm256_fmadd_ps(v, w, b));
-}
-
-GSF__TARGET_AVX2 static void gsf__norm_affine_avx2(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                   float weight, float bias, float* y, int stream) {
-    if (stream) gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 1);
-    else gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 0);
-    gsf__nn_end_stream(stream);
-}
-
-// The same, sixteen at a time.
-
-typedef struct gsf__moments16 { __m512d sum[2], square[2]; } gsf__moments16;
-
-GSF__INLINE_AVX512 void gsf__moments_add16(gsf__moments16* m, const float* x, __mmask16 mask, __m512d pivot) {
-    for (int h = 0; h < 2; h++) {
-        const __mmask8 half = (__mmask8)(mask >> 8 * h);
-        const __m512d d = _mm512_maskz_sub_pd(half, _mm512_cvtps_pd(_mm256_maskz_loadu_ps(half, x + 8 * h)), pivot);
-        m->sum[h] = m->sum[h] + d;
-        m->square[h] = _mm512_fmadd_pd(d, d, m->square[h]);
-    }
-}
-
-GSF__INLINE_AVX512 gsf__moments gsf__moments_avx512_body(const float* x, int64_t count, int centre) {
-    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
-    gsf__moments16 m = {{_mm512_setzero_pd(), _mm512_setzero_pd()}, {_mm512_setzero_pd(), _mm512_setzero_pd()}};
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) gsf__moments_add16(&m, x + i, GSF__NN_WHOLE16, _mm512_set1_pd(pivot));
-    if (i < count) gsf__moments_add16(&m, x + i, gsf__nn_mask16(count - i), _mm512_set1_pd(pivot));
-    return gsf__moments_of(pivot, _mm512_reduce_add_pd(m.sum[0] + m.sum[1]),
-                           _mm512_reduce_add_pd(m.square[0] + m.square[1]), count, centre);
-}
-
-GSF__TARGET_AVX512 static gsf__moments gsf__moments_avx512(const float* x, int64_t count, int centre) {
-    return gsf__moments_avx512_body(x, count, centre);
-}
-
-typedef struct gsf__norm16 { __m512 mean, low, inverse; } gsf__norm16;
-
-GSF__INLINE_AVX512 gsf__norm16 gsf__norm16_of(gsf__moments m, float inverse) {
-    gsf__norm16 n;
-    const float mean = (float)m.mean;
-    n.mean = _mm512_set1_ps(mean);
-    n.low = _mm512_set1_ps((float)(m.mean - (double)mean));
-    n.inverse = _mm512_set1_ps(inverse);
-    return n;
-}
-
-GSF__INLINE_AVX512 __m512 gsf__norm16_apply(const gsf__norm16* n, __m512 x) { return ((x - n->mean) - n->low) * n->inverse; }
-
-GSF__INLINE_AVX512 __m512 gsf__norm_value16(gsf__norm_vectors by, const gsf__norm16* n, const float* x, int64_t i,
-                                            __mmask16 mask) {
-    __m512 v = gsf__norm16_apply(n, _mm512_maskz_loadu_ps(mask, x + i));
-    if (by.weight) v = v * _mm512_maskz_loadu_ps(mask, by.weight + i);
-    if (by.bias) v = v + _mm512_maskz_loadu_ps(mask, by.bias + i);
-    if (by.scale)
-        v = _mm512_fmadd_ps(v, _mm512_set1_ps(1.0f) + _mm512_maskz_loadu_ps(mask, by.scale + i),
-                            _mm512_maskz_loadu_ps(mask, by.shift + i));
-    return v;
-}
-
-GSF__INLINE_AVX512 void gsf__norm_row_avx512_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
-    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
-    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
-    const int64_t dim = job->dim;
-    int64_t i = 0;
-    for (; i + 16 <= dim; i += 16) {
-        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
-        gsf__nn_put16(y + i, gsf__norm_value16(by, &n, x, i, GSF__NN_WHOLE16), stream);
-    }
-    if (i == dim) return;
-    const __mmask16 mask = gsf__nn_mask16(dim - i);
-    _mm512_mask_storeu_ps(y + i, mask, gsf__norm_value16(by, &n, x, i, mask));
-}
-
-GSF__TARGET_AVX512 static void gsf__norm_row_avx512(const gsf__norm_job* job, const float* x, float* y) {
-    if (job->stream) gsf__norm_row_avx512_body(job, x, y, 1);
-    else gsf__norm_row_avx512_body(job, x, y, 0);
-    gsf__nn_end_stream(job->stream);
-}
-
-GSF__INLINE_AVX512 void gsf__norm_head16(gsf__norm_vectors by, const gsf__norm16* n, float* x, const float* cos,
-                                         const float* sin, int64_t i, __mmask16 turned, __mmask16 mask) {
-    __m512 v = gsf__norm_value16(by, n, x, i, mask);
-    if (cos)
-        v = _mm512_mask_fmaddsub_ps(v, turned, _mm512_maskz_loadu_ps(mask, cos + i),
-                                    _mm512_permute_ps(v, 0xb1) * _mm512_maskz_loadu_ps(mask, sin + i));
-    gsf__nn_store16(x + i, mask, v);
-}
-
-GSF__TARGET_AVX512 static void gsf__norm_head_avx512(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
-    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
-    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
-    const int64_t dim = job->dim;
-    int64_t i = 0;
-    for (; i + 16 <= dim; i += 16) gsf__norm_head16(by, &n, x, cos, sin, i, GSF__NN_WHOLE16, GSF__NN_WHOLE16);
-    if (i < dim) gsf__norm_head16(by, &n, x, cos, sin, i, gsf__nn_mask16((dim - i) / 2 * 2), gsf__nn_mask16(dim - i));
-}
-
-GSF__INLINE_AVX512 void gsf__norm_affine_avx512_body(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                     float weight, float bias, float* y, int stream) {
-    const gsf__norm16 n = gsf__norm16_of(m, inverse);
-    const __m512 w = _mm512_set1_ps(weight), b = _mm512_set1_ps(bias);
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16)
-        gsf__nn_put16(y + i, _mm512_fmadd_ps(gsf__norm16_apply(&n, _mm512_loadu_ps(x + i)), w, b), stream);
-    if (i == count) return;
-    const __mmask16 mask = gsf__nn_mask16(count - i);
-    const __m512 v = gsf__norm16_apply(&n, _mm512_maskz_loadu_ps(mask, x + i));
-    _mm512_mask_storeu_ps(y + i, mask, _mm512_fmadd_ps(v, w, b));
-}
-
-GSF__TARGET_AVX512 static void gsf__norm_affine_avx512(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                       float weight, float bias, float* y, int stream) {
-    if (stream) gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 1);
-    else gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 0);
-    gsf__nn_end_stream(stream);
-}
-
-#endif // GSF__X86
-
-static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
-    static const gsf__norm_kernels scalar = {gsf__moments_scalar, gsf__norm_row_scalar, gsf__norm_head_scalar,
-                                             gsf__norm_affine_scalar};
-#if GSF__X86
-    static const gsf__norm_kernels avx2 = {gsf__moments_avx2, gsf__norm_row_avx2, gsf__norm_head_avx2,
-                                           gsf__norm_affine_avx2};
-    static const gsf__norm_kernels avx512 = {gsf__moments_avx512, gsf__norm_row_avx512, gsf__norm_head_avx512,
-                                             gsf__norm_affine_avx512};
-    if (level >= GSF_CPU_AVX512) return &avx512;
-    if (level >= GSF_CPU_AVX2) return &avx2;
-#endif
-    (void)level;
-    return &scalar;
-}
-
-static void gsf__norm_chunk(void* arg, size_t chunk, int worker) {
-    const gsf__norm_job* job = (const gsf__norm_job*)arg;
-    (void)worker;
-    const int64_t begin = (int64_t)chunk * job->chunk_rows;
-    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++)
-        job->kernels->row(job, job->x + r * job->dim, job->y + r * job->dim);
-}
-
-static void gsf__norm_rows(gsf_context* ctx, gsf__norm_job* job) {
-    job->kernels = gsf__norm_kernels_of(ctx->cpu_level);
-    job->chunk_rows = gsf__nn_chunk_rows(job->dim);
-    job->stream = gsf__nn_streams(job->x, job->y, job->rows * job->dim, job->dim);
-    gsf__parallel_for(ctx, gsf__nn_chunks(job->rows, job->chunk_rows), gsf__norm_chunk, job);
-}
-
-GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                                         const float* bias, float eps, const float* scale, const float* shift, float* y) {
-    gsf__norm_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
-    job.rows = rows;
-    job.dim = dim;
-    job.weight = weight;
-    job.bias = bias;
-    job.scale = scale;
-    job.shift = shift;
-    job.eps = eps;
-    job.centre = 1;
-    gsf__norm_rows(ctx, &job);
-}
-
-GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                               const float* bias, float eps, float* y) {
-    gsf_nn_layer_norm_modulated(ctx, x, rows, dim, weight, bias, eps, NULL, NULL, y);
-}
-
-GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight, float eps,
-                             float* y) {
-    gsf__norm_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
-    job.rows = rows;
-    job.dim = dim;
-    job.weight = weight;
-    job.eps = eps;
-    gsf__norm_rows(ctx, &job);
-}
-
-// Groups are cut into parts that fit a core's cache, so that each is read once for both moments, and few large groups still
-// employ all workers. The moments of parts are put together in order (Chan et al. 1979). As many groups as a shared cache
-// holds are normalised before the next ones are read.
-enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; most parts of a group
-enum { GSF__NORM_BATCH = 1 << 21 };                        // values of the groups of a batch
-
-static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
-    const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: within the group
-    const int64_t end = gsf__least(begin + job->part_size, job->group_size);
-    for (int64_t i = begin; i < end;) { // by channel
-        const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
-        const int64_t count = gsf__least(next, end) - i;
-        job->kernels->affine(job->x + first + i, count, m, inverse, job->weight ? job->weight[channel] : 1.0f,
-                             job->bias ? job->bias[channel] : 0.0f, job->y + first + i, job->stream);
-        i += count;
-    }
-}
-
-static gsf__moments gsf__norm_part(const gsf__norm_job* job, int64_t group, int64_t part, int64_t* count) {
-    *count = gsf__least(job->part_size, job->group_size - part * job->part_size);
-    return job->kernels->moments(job->x + group * job->group_size + part * job->part_size, *count, 1);
-}
-
-static void gsf__norm_whole_group(void* arg, size_t group, int worker) {
-    const gsf__norm_job* job = (const gsf__norm_job*)arg;
-    (void)worker;
-    int64_t count;
-    const gsf__moments m = gsf__norm_part(job, (int64_t)group, 0, &count);
-    gsf__norm_group_values(job, (int64_t)group, 0, m, gsf__norm_inverse(m, count, job->eps));
-}
-
-static void gsf__norm_part_moments(void* arg, size_t chunk, int worker) {
-    const gsf__norm_job* job = (const gsf__norm_job*)arg;
-    (void)worker;
-    int64_t count;
-    const int64_t group = job->first_group + (int64_t)chunk / job->parts;
-    job->part_moments[chunk] = gsf__norm_part(job, group, (int64_t)chunk % job->parts, &count);
-}
-
-static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
-    const gsf__norm_job* job = (const gsf__norm_job*)arg;
-    (void)worker;
-    const int64_t group = (int64_t)chunk / job->parts;
-    const gsf__moments* of = job->part_moments + group * job->parts;
-    gsf__moments m = of[0];
-    for (int64_t p = 1; p < job->parts; p++) {
-        const double before = (double)(p * job->part_size), delta = of[p].mean - m.mean;
-        const double after = (double)gsf__least((p + 1) * job->part_size, job->group_size);
-        const double share = (after - before) / after;
-        m.mean += delta * share;
-        m.square += of[p].square + delta * delta * before * share;
-    }
-    gsf__norm_group_values(job, job->first_group + group, (int64_t)chunk % job->parts, m,
-                           gsf__norm_inverse(m, job->group_size, job->eps));
-}
-
-GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
-                               const float* weight, const float* bias, float eps, float* y) {
-    gsf__moments part_moments[GSF__NORM_PARTS];
-    gsf__norm_job job;
-    memset(&job, 0, sizeof job);
-    if (channels < 1 || count < 1 || groups < 1) return;
-    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
-    job.x = x;
-    job.y = y;
-    job.rows = channels;
-    job.dim = count;
-    job.weight = weight;
-    job.bias = bias;
-    job.eps = eps;
-    job.stream = gsf__nn_streams(x, y, channels * count, count);
-    job.group_size = channels / groups * count;
-    job.part_size = gsf__ceil_div(job.group_size, gsf__least((int64_t)gsf__nn_chunks(job.group_size, GSF__NORM_PART),
-                                                             GSF__NORM_PARTS));
-    job.part_size = gsf__round_up(job.part_size, 16);
-    job.parts = gsf__ceil_div(job.group_size, job.part_size);
-    if (job.parts == 1) {
-        gsf__parallel_for(ctx, (size_t)groups, gsf__norm_whole_group, &job);
-        return;
-    }
-    job.part_moments = part_moments;
-    int64_t batch = gsf__least(GSF__NORM_BATCH / job.group_size, GSF__NORM_PARTS / job.parts);
-    if (batch < 1) batch = 1;
-    for (; job.first_group < groups; job.first_group += batch) {
-        const size_t parts = (size_t)(gsf__least(batch, groups - job.first_group) * job.parts);
-        gsf__parallel_for(ctx, parts, gsf__norm_part_moments, &job);
-        gsf__parallel_for(ctx, parts, gsf__norm_part_values, &job);
-    }
-}
-
-static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int worker) {
-    const gsf__norm_job* job = (const gsf__norm_job*)arg;
-    (void)worker;
-    const int64_t begin = (int64_t)chunk * job->chunk_rows;
-    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
-        const int64_t at = (r - job->rope_first) * job->dim;
-        const int turn = job->cos && at >= 0;
-        const float *cos = turn ? job->cos + at : NULL, *sin = turn ? job->sin + at : NULL;
-        for (int32_t h = 0; h < job->heads; h++) job->kernels->head(job, job->y + r * job->stride + h * job->dim, cos, sin);
-    }
-}
-
-GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads, int32_t head_dim,
-                                   const float* weight, const float* bias, float eps, const float* cos, const float* sin,
-                                   int64_t rope_first) {
-    gsf__norm_job job;
-    memset(&job, 0, sizeof job);
-    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
-    job.y = x;
-    job.rows = rows;
-    job.stride = ldx ? ldx : (int64_t)heads * head_dim;
-    job.dim = head_dim;
-    job.heads = heads;
-    job.weight = weight;
-    job.bias = bias;
-    job.eps = eps;
-    job.centre = 1;
-    job.cos = cos;
-    job.sin = sin;
-    job.rope_first = rope_first;
-    job.chunk_rows = gsf__nn_chunk_rows((int64_t)heads * head_dim);
-    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__head_norm_rope_chunk, &job);
-}
-
 // ---- >>nn attention -------------------------------------------------------------
 
 /* Online softmax over blocks of keys, as FlashAttention. A chunk of work is a head and a range of its queries. Its queries
@@ -5928,3570 +5928,6 @@ GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
     }
 }
 
-// ---- >>nn scheduler -------------------------------------------------------------
-
-// Zero SNR: sqrt(abar) is shifted and scaled to end at 0 (Lin et al. 2024, algorithm 1). diffusers' DDIMScheduler, which
-// the official pipeline runs, does this in float32 and is up to 5e-7 away; its CogVideoXDDIMScheduler does it in double.
-static void gsf__nn_fill_table(const gsf_nn_schedule_desc* d, double* alpha_bar) {
-    const int32_t n = d->train_steps;
-    const double begin = d->linear_betas ? d->beta_start : sqrt(d->beta_start);
-    const double end = d->linear_betas ? d->beta_end : sqrt(d->beta_end);
-    double product = 1.0;
-    for (int32_t i = 0; i < n; i++) {
-        const double value = begin + (end - begin) / (n - 1) * i;
-        product *= 1.0 - (d->linear_betas ? value : value * value);
-        alpha_bar[i] = product / (d->snr_shift_scale + (1.0 - d->snr_shift_scale) * product);
-    }
-    if (d->no_zero_snr) return;
-    const double first = sqrt(alpha_bar[0]), last = sqrt(alpha_bar[n - 1]), scale = first / (first - last);
-    for (int32_t i = 0; i < n; i++) {
-        const double root = (sqrt(alpha_bar[i]) - last) * scale;
-        alpha_bar[i] = root * root;
-    }
-}
-
-static gsf_nn_schedule_desc gsf__nn_schedule_defaults(const gsf_nn_schedule_desc* desc) {
-    gsf_nn_schedule_desc d;
-    memset(&d, 0, sizeof d);
-    if (desc) d = *desc;
-    if (d.train_steps == 0) d.train_steps = 1000;
-    if (d.beta_start == 0.0) d.beta_start = 0.00085;
-    if (d.beta_end == 0.0) d.beta_end = 0.012;
-    if (d.snr_shift_scale == 0.0) d.snr_shift_scale = 1.0;
-    return d;
-}
-
-static gsf_result gsf__nn_check_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* d) {
-    if (d->train_steps < 2 || d->train_steps > 1000000)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: %d training steps", (int)d->train_steps);
-    if (!(d->beta_start > 0.0 && d->beta_start <= d->beta_end && d->beta_end < 1.0))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: betas from %g to %g", d->beta_start, d->beta_end);
-    if (!(d->snr_shift_scale > 0.0 && d->snr_shift_scale <= 1e6))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: snr_shift_scale %g", d->snr_shift_scale);
-    if ((int)d->spacing < 0 || d->spacing > GSF_NN_LINSPACE || d->steps_offset < 0 ||
-        d->steps_offset >= d->train_steps)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: spacing %d, steps_offset %d", (int)d->spacing,
-                        (int)d->steps_offset);
-    return GSF_OK;
-}
-
-GSF_API gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc, gsf_nn_schedule* out) {
-    memset(out, 0, sizeof *out);
-    const gsf_nn_schedule_desc d = gsf__nn_schedule_defaults(desc);
-    GSF__TRY(gsf__nn_check_schedule(ctx, &d));
-    double* table = (double*)gsf_alloc(ctx, (size_t)d.train_steps, sizeof(double));
-    if (!table) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__nn_fill_table(&d, table);
-    int falls = table[0] < 1.0 && table[d.train_steps - 1] >= 0.0; // a NaN fails
-    for (int32_t i = 1; falls && i < d.train_steps; i++) falls = table[i] <= table[i - 1];
-    if (!falls) {
-        gsf_free(ctx, table);
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "schedule: betas from %g to %g over %d steps do not take 1 down to 0",
-                        d.beta_start, d.beta_end, (int)d.train_steps);
-    }
-    out->desc = d;
-    out->alpha_bar = table;
-    out->final_alpha_bar = d.no_alpha_one ? table[0] : 1.0;
-    return GSF_OK;
-}
-
-GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule) {
-    gsf_free(ctx, schedule->alpha_bar);
-    memset(schedule, 0, sizeof *schedule);
-}
-
-// The word of `words` (ended by NULL) that the key holds; others are unsupported.
-static gsf_result gsf__nn_config_word(const gsf__nn_config* config, const char* key, const char* fallback,
-                                      const char* const* words, int* out) {
-    const char* text;
-    GSF__TRY(gsf__nn_config_string(config, key, fallback, &text));
-    for (*out = 0; words[*out]; ++*out)
-        if (strcmp(text, words[*out]) == 0) return GSF_OK;
-    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s \"%s\" is not supported", config->json.name, key,
-                    gsf__nn_show(text).text);
-}
-
-static gsf_result gsf__nn_config_refuse(const gsf__nn_config* config, const char* key, int fallback) {
-    int flag;
-    GSF__TRY(gsf__nn_config_bool_or(config, key, fallback, &flag));
-    return flag ? gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not supported", config->json.name, key) : GSF_OK;
-}
-
-static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_schedule_desc* d) {
-    static const char* const schedules[] = {"scaled_linear", "linear", NULL};
-    static const char* const spacings[] = {"trailing", "leading", "linspace", NULL};
-    static const char* const predictions[] = {"v_prediction", NULL};
-    int64_t whole;
-    int flag;
-    GSF__TRY(gsf__nn_config_word(config, "prediction_type", "epsilon", predictions, &flag));
-    GSF__TRY(gsf__nn_config_refuse(config, "clip_sample", 1));
-    GSF__TRY(gsf__nn_config_refuse(config, "thresholding", 0));
-    if (gsf__nn_config_find(config, "trained_betas"))
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: trained_betas is not supported", config->json.name);
-    GSF__TRY(gsf__nn_config_int_or(config, "num_train_timesteps", 1000, 2, 1000000, &whole));
-    d->train_steps = (int32_t)whole;
-    GSF__TRY(gsf__nn_config_int_or(config, "steps_offset", 0, 0, whole - 1, &whole));
-    d->steps_offset = (int32_t)whole;
-    GSF__TRY(gsf__nn_config_number_or(config, "beta_start", 0.0001, 1e-12, 0.999, &d->beta_start));
-    GSF__TRY(gsf__nn_config_number_or(config, "beta_end", 0.02, d->beta_start, 0.999, &d->beta_end));
-    GSF__TRY(gsf__nn_config_word(config, "beta_schedule", "linear", schedules, &d->linear_betas));
-    GSF__TRY(gsf__nn_config_bool_or(config, "rescale_betas_zero_snr", 0, &flag));
-    d->no_zero_snr = !flag;
-    GSF__TRY(gsf__nn_config_bool_or(config, "set_alpha_to_one", 1, &flag));
-    d->no_alpha_one = !flag;
-    GSF__TRY(gsf__nn_config_word(config, "timestep_spacing", "leading", spacings, &flag));
-    d->spacing = (gsf_nn_spacing)flag;
-    return GSF_OK;
-}
-
-static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_schedule* out) {
-    gsf_nn_schedule_desc d;
-    memset(&d, 0, sizeof d);
-    gsf_result result = gsf__nn_read_schedule(config, &d);
-    if (result == GSF_OK) result = gsf_nn_make_schedule(ctx, &d, out);
-    gsf__nn_close_config(config);
-    return result;
-}
-
-GSF_API gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
-                                         gsf_nn_schedule* out) {
-    gsf__nn_config config;
-    memset(out, 0, sizeof *out);
-    GSF__TRY(gsf__nn_parse_config(ctx, name, text, size, &config));
-    return gsf__nn_schedule_from(ctx, &config, out);
-}
-
-GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out) {
-    gsf__nn_config config;
-    memset(out, 0, sizeof *out);
-    GSF__TRY(gsf__nn_load_config(ctx, path, &config));
-    return gsf__nn_schedule_from(ctx, &config, out);
-}
-
-// One of the `steps` times before the cut by strength; numpy's arithmetic, half to even.
-static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, int32_t i) {
-    const double n = d->train_steps;
-    switch (d->spacing) {
-        case GSF_NN_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange adds multiples of its first difference
-            const double difference = (n - n / steps) - n;
-            return (int32_t)rint(n + i * difference) - 1;
-        }
-        case GSF_NN_LEADING: return (steps - 1 - i) * (d->train_steps / steps) + d->steps_offset;
-        case GSF_NN_LINSPACE: { // round(linspace(0, n - 1, steps)) reversed
-            if (steps == 1) return 0;
-            return i == 0 ? d->train_steps - 1 : (int32_t)rint((steps - 1 - i) * ((n - 1.0) / (steps - 1)));
-        }
-    }
-    return 0;
-}
-
-GSF_API gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
-                                         double strength, int32_t* out, int32_t* count) {
-    const gsf_nn_schedule_desc* d = &schedule->desc;
-    *count = 0;
-    if (steps < 1 || steps > d->train_steps)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%d steps, not 1 to %d", (int)steps, (int)d->train_steps);
-    if (strength == 0.0) strength = 1.0;
-    if (!(strength > 0.0 && strength <= 1.0))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "strength %g is not in (0, 1]", strength);
-    const int32_t kept = (int32_t)(steps * strength);
-    if (kept < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "strength %g of %d steps leaves none", strength, (int)steps);
-    if (gsf__nn_timestep(d, steps, 0) >= d->train_steps)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "steps_offset %d takes %d steps past the table",
-                        (int)d->steps_offset, (int)steps);
-    for (int32_t i = steps - kept; i < steps; i++) out[(*count)++] = gsf__nn_timestep(d, steps, i);
-    return GSF_OK;
-}
-
-// ---- elementwise work
-
-typedef struct gsf__nn_step { // m: predicted clean latents; m0, m1: those of the last two steps; last: corrected latents
-    double m_x, m_v;                        // m = m_x x + m_v v
-    double c_last, c_m, c_m0, c_m1;         // x = c_last last + c_m m + c_m0 m0 + c_m1 m1, if `correct`
-    double p_x, p_m, p_m0;                  // next x = p_x x + p_m m + p_m0 m0
-    int correct;
-    size_t count;
-    const float *x_in, *v;
-    float *x, *x0, *m0, *m1, *last;         // all but x may be NULL
-} gsf__nn_step;
-
-static void gsf__nn_step_chunk(void* arg, size_t chunk, int worker) {
-    const gsf__nn_step* s = (const gsf__nn_step*)arg;
-    (void)worker;
-    const size_t begin = chunk * GSF__NN_CHUNK;
-    const size_t end = begin + GSF__NN_CHUNK < s->count ? begin + GSF__NN_CHUNK : s->count;
-    for (size_t i = begin; i < end; i++) {
-        const double m0 = s->m0 ? (double)s->m0[i] : 0.0;
-        double x = (double)s->x_in[i];
-        const double m = s->m_x * x + s->m_v * (double)s->v[i];
-        if (s->correct) x = s->c_last * (double)s->last[i] + s->c_m * m + s->c_m0 * m0 + s->c_m1 * (double)s->m1[i];
-        s->x[i] = (float)(s->p_x * x + s->p_m * m + s->p_m0 * m0);
-        if (s->x0) s->x0[i] = (float)m;
-        if (s->last) s->last[i] = (float)x;
-        if (s->m1) s->m1[i] = (float)m0;
-        if (s->m0) s->m0[i] = (float)m;
-    }
-}
-
-// out = a * x + b * y
-static void gsf__nn_mix(gsf_context* ctx, double a, const float* x, double b, const float* y, size_t count, float* out) {
-    gsf__nn_step job;
-    memset(&job, 0, sizeof job);
-    job.m_x = a;
-    job.m_v = b;
-    job.p_m = 1.0;
-    job.count = count;
-    job.x_in = x;
-    job.v = y;
-    job.x = out;
-    gsf__parallel_for(ctx, (count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &job);
-}
-
-GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                              const float* noise, size_t count, float* out) {
-    const double bar = schedule->alpha_bar[timestep];
-    gsf__nn_mix(ctx, sqrt(bar), x0, sqrt(1.0 - bar), noise, count, out);
-}
-
-GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                                  const float* noise, size_t count, float* out) {
-    const double bar = schedule->alpha_bar[timestep];
-    gsf__nn_mix(ctx, -sqrt(1.0 - bar), x0, sqrt(bar), noise, count, out);
-}
-
-GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
-                               const float* v, size_t count, float* out) {
-    const double bar = schedule->alpha_bar[timestep];
-    gsf__nn_mix(ctx, sqrt(bar), x, -sqrt(1.0 - bar), v, count, out);
-}
-
-// ---- solvers
-/* With a = sqrt(abar), s = sqrt(1 - abar) and D(x) the predicted clean latents, the probability flow is
-       d(x/s) = D du,  u = a/s = exp(lambda).
-   DDIM holds D fixed over a step; DPM-Solver++(2M) and UniPC take it as linear (the corrector: as quadratic) in lambda. At
-   zero SNR u is 0 and lambda -infinity. From there the first step is exact for constant D; a linear D is then taken in u,
-   not in lambda, by the one step that would need that point. The last step ends at s = 0, where x is D. */
-
-typedef struct gsf__nn_point { double a, s; } gsf__nn_point;
-
-static gsf__nn_point gsf__nn_point_at(double alpha_bar) {
-    gsf__nn_point p;
-    p.a = sqrt(alpha_bar);
-    p.s = sqrt(1.0 - alpha_bar);
-    return p;
-}
-
-static gsf__nn_point gsf__nn_sampler_point(const gsf_nn_sampler* sampler, int32_t index) {
-    return gsf__nn_point_at(sampler->schedule->alpha_bar[sampler->timesteps[index]]);
-}
-
-// Where the step from `index` leads.
-static gsf__nn_point gsf__nn_sampler_target(const gsf_nn_sampler* sampler, int32_t index) {
-    const gsf_nn_schedule* schedule = sampler->schedule;
-    const int32_t next = sampler->desc.solver == GSF_NN_DDIM
-                             ? sampler->timesteps[index] - schedule->desc.train_steps / sampler->desc.steps
-                             : index + 1 < sampler->count ? sampler->timesteps[index + 1] : -1;
-    return gsf__nn_point_at(next >= 0 ? schedule->alpha_bar[next] : schedule->final_alpha_bar);
-}
-
-// lambda(q) - lambda(p), both finite.
-static double gsf__nn_lambda(gsf__nn_point p, gsf__nn_point q) { return log(q.a * p.s / (q.s * p.a)); }
-
-// Predictor from p to t; q is the point before p, if second order is wanted.
-static void gsf__nn_predictor(gsf__nn_step* step, gsf__nn_point p, gsf__nn_point t, const gsf__nn_point* q) {
-    step->p_x = t.s / p.s;
-    step->p_m = t.a - p.a * step->p_x; // t.a (1 - exp(-h))
-    step->p_m0 = 0.0;
-    if (!q || t.s == 0.0 || p.a == 0.0) return;
-    double weight; // of m - m0
-    if (q->a == 0.0) {
-        const double u = p.a / p.s, rise = t.a / t.s - u;
-        weight = t.s * rise * rise / (2.0 * u);
-    } else {
-        const double before = gsf__nn_lambda(*q, p);
-        weight = before != 0.0 ? 0.5 * step->p_m * gsf__nn_lambda(p, t) / before : 0.0;
-    }
-    step->p_m += weight;
-    step->p_m0 = -weight;
-}
-
-// UniC-2 with B(h) = exp(-h) - 1 at p, the step's own point, which was reached from m0's point o (before it m1's point n,
-// NULL in the second step, where the corrector has first order): n -> o -> p.
-static void gsf__nn_corrector(gsf__nn_step* step, const gsf__nn_point* n, gsf__nn_point o, gsf__nn_point p) {
-    const double rise = p.a - o.a * p.s / o.s; // p.a (1 - exp(-h))
-    double weight = 0.5, earlier = 0.0;        // of m - m0 and of m1 - m0
-    if (n) {
-        const double h = gsf__nn_lambda(o, p), phi = expm1(-h);
-        const double phi2 = phi / -h - 1.0, phi3 = phi2 / -h - 0.5; // h_phi_2, h_phi_3 of UniPC's code
-        weight = phi2 / phi;
-        if (n->a != 0.0) {
-            const double ratio = -gsf__nn_lambda(*n, o) / h, rho = (2.0 * phi3 / phi - weight) / (ratio - 1.0);
-            earlier = rho / ratio;
-            weight -= rho;
-        }
-    }
-    step->correct = 1;
-    step->c_last = p.s / o.s;
-    step->c_m = rise * weight;
-    step->c_m1 = rise * earlier;
-    step->c_m0 = rise * (1.0 - weight - earlier);
-}
-
-GSF_API gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule, const gsf_nn_sampler_desc* desc,
-                                       gsf_nn_sampler* out) {
-    static const size_t kept[] = {0, 1, 3}; // blocks of memory for each solver
-    gsf_nn_sampler sampler;
-    memset(out, 0, sizeof *out);
-    memset(&sampler, 0, sizeof sampler);
-    sampler.desc = *desc;
-    sampler.schedule = schedule;
-    if (!sampler.desc.steps) sampler.desc.steps = 50;
-    if ((int)desc->solver < 0 || desc->solver > GSF_NN_UNIPC || sampler.desc.steps < 1 ||
-        sampler.desc.steps > schedule->desc.train_steps || !gsf__mul_size(desc->value_count, 3, &sampler.memory_count))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: solver %d, %d steps, %zu values", (int)desc->solver,
-                        (int)sampler.desc.steps, desc->value_count);
-    sampler.memory_count = kept[desc->solver] * desc->value_count;
-    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
-    sampler.timesteps = (int32_t*)gsf_alloc(ctx, (size_t)sampler.desc.steps, sizeof(int32_t));
-    if (sampler.timesteps) sampler.memory = (float*)gsf_alloc_zeroed(ctx, sampler.memory_count, sizeof(float));
-    if (sampler.memory)
-        result = gsf_nn_make_timesteps(ctx, schedule, sampler.desc.steps, desc->strength, sampler.timesteps,
-                                       &sampler.count);
-    if (result != GSF_OK) gsf_nn_destroy_sampler(ctx, &sampler);
-    *out = sampler;
-    return result;
-}
-
-GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler) {
-    gsf_free(ctx, sampler->timesteps);
-    gsf_free(ctx, sampler->memory);
-    memset(sampler, 0, sizeof *sampler);
-}
-
-// A schedule that is no longer stretched to zero SNR, or a start below it, never meets a = 0.
-static void gsf__nn_plan_step(const gsf_nn_sampler* sampler, gsf__nn_step* step) {
-    const int32_t i = sampler->index;
-    const size_t n = sampler->desc.value_count;
-    const gsf__nn_point p = gsf__nn_sampler_point(sampler, i), t = gsf__nn_sampler_target(sampler, i);
-    gsf__nn_point before[2]; // one and two steps earlier
-    memset(before, 0, sizeof before);
-    if (i > 0) before[0] = gsf__nn_sampler_point(sampler, i - 1);
-    if (i > 1) before[1] = gsf__nn_sampler_point(sampler, i - 2);
-    step->m_x = p.a;
-    step->m_v = -p.s;
-    const int second = sampler->desc.solver != GSF_NN_DDIM && i > 0 && i + 1 < sampler->count;
-    gsf__nn_predictor(step, p, t, second ? &before[0] : NULL);
-    if (sampler->desc.solver == GSF_NN_DDIM) return;
-    step->m0 = sampler->memory;
-    if (sampler->desc.solver != GSF_NN_UNIPC) return;
-    step->m1 = sampler->memory + n;
-    step->last = sampler->memory + 2 * n;
-    if (i > 0) gsf__nn_corrector(step, i > 1 ? &before[1] : NULL, before[0], p);
-}
-
-GSF_API gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x, float* x0) {
-    gsf__nn_step step;
-    memset(&step, 0, sizeof step);
-    if (sampler->index < 0 || sampler->index >= sampler->count)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: step %d of %d", (int)sampler->index,
-                        (int)sampler->count);
-    gsf__nn_plan_step(sampler, &step);
-    step.count = sampler->desc.value_count;
-    step.x_in = x;
-    step.v = v;
-    step.x = x;
-    step.x0 = x0;
-    gsf__parallel_for(ctx, (step.count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &step);
-    const int64_t at = gsf__nn_find_not_finite(ctx, x, (int64_t)step.count);
-    if (at >= 0)
-        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "step %d (time %d): latent %lld of %zu is NaN or infinite",
-                        (int)sampler->index, (int)sampler->timesteps[sampler->index], (long long)at, step.count);
-    sampler->index++;
-    return GSF_OK;
-}
-
-// ---- >>nn transformer -----------------------------------------------------------
-
-typedef struct gsf__dit_attention { // one attention layer's tensors
-    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
-    const gsf_tensor *norm_q_weight, *norm_q_bias, *norm_k_weight, *norm_k_bias;
-} gsf__dit_attention;
-
-typedef struct gsf__dit_norm { // LayerNorm whose scale, shift and gates come from the time step
-    const gsf_tensor *linear_weight, *linear_bias, *weight, *bias;
-} gsf__dit_norm;
-
-typedef struct gsf__dit_block {
-    gsf__dit_norm norm1, norm2;
-    gsf__dit_attention self, cross;
-    const gsf_tensor *norm_cross_weight, *norm_cross_bias;
-    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias; // feed-forward
-} gsf__dit_block;
-
-typedef struct gsf__dit_projector {
-    const gsf_tensor *weight, *bias, *norm_weight, *norm_bias;
-} gsf__dit_projector;
-
-typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
-    gsf__dit_block* blocks;
-    gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
-    gsf__dit_projector dino, vggt;
-    gsf__dit_norm norm_out;
-    const gsf_tensor *patch_weight, *patch_bias, *text_weight, *text_bias, *positions;
-    const gsf_tensor *time1_weight, *time1_bias, *time2_weight, *time2_bias;
-    const gsf_tensor *norm_final_weight, *norm_final_bias, *out_weight, *out_bias;
-} gsf__dit_nets;
-
-static int64_t gsf__dit_width(const gsf_nn_transformer* c) { return (int64_t)c->heads * c->head_dim; }
-
-// ---- opening: which tensor goes where, and its shape
-
-// Shapes as letters: one dimension each.
-//   d width  h head_dim  f 4 width  t time channels  x text channels  m 6 width  n 2 width  p patch tokens' outputs
-//   i in_channels  k patch  r any (the reference tokens' channels)  1 one  s text and video tokens of the table
-typedef struct gsf__dit_entry {
-    const char* name;
-    const char* shape;
-    size_t offset; // of the pointer in its struct
-    int kind;      // see GSF__DIT_*
-} gsf__dit_entry;
-
-enum { GSF__DIT_ALWAYS = 0, GSF__DIT_ATTENTION_BIAS, GSF__DIT_LEARNED };
-
-#define GSF__DIT_ATTENTION(prefix, member)                                                                          \
-    {prefix ".to_q.weight", "dd", offsetof(gsf__dit_block, member.q_weight), GSF__DIT_ALWAYS},                      \
-    {prefix ".to_k.weight", "dd", offsetof(gsf__dit_block, member.k_weight), GSF__DIT_ALWAYS},                      \
-    {prefix ".to_v.weight", "dd", offsetof(gsf__dit_block, member.v_weight), GSF__DIT_ALWAYS},                      \
-    {prefix ".to_q.bias", "d", offsetof(gsf__dit_block, member.q_bias), GSF__DIT_ATTENTION_BIAS},                   \
-    {prefix ".to_k.bias", "d", offsetof(gsf__dit_block, member.k_bias), GSF__DIT_ATTENTION_BIAS},                   \
-    {prefix ".to_v.bias", "d", offsetof(gsf__dit_block, member.v_bias), GSF__DIT_ATTENTION_BIAS},                   \
-    {prefix ".to_out.0.weight", "dd", offsetof(gsf__dit_block, member.out_weight), GSF__DIT_ALWAYS},                \
-    {prefix ".to_out.0.bias", "d", offsetof(gsf__dit_block, member.out_bias), GSF__DIT_ALWAYS},                     \
-    {prefix ".norm_q.weight", "h", offsetof(gsf__dit_block, member.norm_q_weight), GSF__DIT_ALWAYS},                \
-    {prefix ".norm_q.bias", "h", offsetof(gsf__dit_block, member.norm_q_bias), GSF__DIT_ALWAYS},                    \
-    {prefix ".norm_k.weight", "h", offsetof(gsf__dit_block, member.norm_k_weight), GSF__DIT_ALWAYS},                \
-    {prefix ".norm_k.bias", "h", offsetof(gsf__dit_block, member.norm_k_bias), GSF__DIT_ALWAYS}
-
-#define GSF__DIT_NORM(prefix, member, shape)                                                                        \
-    {prefix ".linear.weight", shape "t", offsetof(gsf__dit_block, member.linear_weight), GSF__DIT_ALWAYS},          \
-    {prefix ".linear.bias", shape, offsetof(gsf__dit_block, member.linear_bias), GSF__DIT_ALWAYS},                  \
-    {prefix ".norm.weight", "d", offsetof(gsf__dit_block, member.weight), GSF__DIT_ALWAYS},                         \
-    {prefix ".norm.bias", "d", offsetof(gsf__dit_block, member.bias), GSF__DIT_ALWAYS}
-
-static const gsf__dit_entry gsf__dit_block_entries[] = { // below transformer_blocks.N.
-    GSF__DIT_NORM("norm1", norm1, "m"),
-    GSF__DIT_NORM("norm2", norm2, "m"),
-    GSF__DIT_ATTENTION("attn1", self),
-    GSF__DIT_ATTENTION("attn_cross", cross),
-    {"norm_cross.weight", "d", offsetof(gsf__dit_block, norm_cross_weight), GSF__DIT_ALWAYS},
-    {"norm_cross.bias", "d", offsetof(gsf__dit_block, norm_cross_bias), GSF__DIT_ALWAYS},
-    {"ff.net.0.proj.weight", "fd", offsetof(gsf__dit_block, up_weight), GSF__DIT_ALWAYS},
-    {"ff.net.0.proj.bias", "f", offsetof(gsf__dit_block, up_bias), GSF__DIT_ALWAYS},
-    {"ff.net.2.weight", "df", offsetof(gsf__dit_block, down_weight), GSF__DIT_ALWAYS},
-    {"ff.net.2.bias", "d", offsetof(gsf__dit_block, down_bias), GSF__DIT_ALWAYS},
-};
-
-#define GSF__DIT_AT(member) offsetof(gsf__dit_nets, member), GSF__DIT_ALWAYS
-static const gsf__dit_entry gsf__dit_entries[] = {
-    {"patch_embed.proj.weight", "dikk", GSF__DIT_AT(patch_weight)},
-    {"patch_embed.proj.bias", "d", GSF__DIT_AT(patch_bias)},
-    {"patch_embed.text_proj.weight", "dx", GSF__DIT_AT(text_weight)},
-    {"patch_embed.text_proj.bias", "d", GSF__DIT_AT(text_bias)},
-    {"patch_embed.pos_embedding", "1sd", offsetof(gsf__dit_nets, positions), GSF__DIT_LEARNED},
-    {"time_embedding.linear_1.weight", "td", GSF__DIT_AT(time1_weight)},
-    {"time_embedding.linear_1.bias", "t", GSF__DIT_AT(time1_bias)},
-    {"time_embedding.linear_2.weight", "tt", GSF__DIT_AT(time2_weight)},
-    {"time_embedding.linear_2.bias", "t", GSF__DIT_AT(time2_bias)},
-    {"projector_dino.proj.weight", "dr", GSF__DIT_AT(dino.weight)},
-    {"projector_dino.proj.bias", "d", GSF__DIT_AT(dino.bias)},
-    {"projector_dino.norm.weight", "d", GSF__DIT_AT(dino.norm_weight)},
-    {"projector_dino.norm.bias", "d", GSF__DIT_AT(dino.norm_bias)},
-    {"projector_vggt.proj.weight", "dr", GSF__DIT_AT(vggt.weight)},
-    {"projector_vggt.proj.bias", "d", GSF__DIT_AT(vggt.bias)},
-    {"projector_vggt.norm.weight", "d", GSF__DIT_AT(vggt.norm_weight)},
-    {"projector_vggt.norm.bias", "d", GSF__DIT_AT(vggt.norm_bias)},
-    {"norm_final.weight", "d", GSF__DIT_AT(norm_final_weight)},
-    {"norm_final.bias", "d", GSF__DIT_AT(norm_final_bias)},
-    {"norm_out.linear.weight", "nt", GSF__DIT_AT(norm_out.linear_weight)},
-    {"norm_out.linear.bias", "n", GSF__DIT_AT(norm_out.linear_bias)},
-    {"norm_out.norm.weight", "d", GSF__DIT_AT(norm_out.weight)},
-    {"norm_out.norm.bias", "d", GSF__DIT_AT(norm_out.bias)},
-    {"proj_out.weight", "pd", GSF__DIT_AT(out_weight)},
-    {"proj_out.bias", "p", GSF__DIT_AT(out_bias)},
-};
-#undef GSF__DIT_AT
-#undef GSF__DIT_NORM
-#undef GSF__DIT_ATTENTION
-
-static int64_t gsf__dit_dimension(const gsf_nn_transformer* c, char letter) {
-    const int64_t d = gsf__dit_width(c);
-    switch (letter) {
-        case 'd': return d;
-        case 'h': return c->head_dim;
-        case 'f': return 4 * d;
-        case 't': return c->time_channels;
-        case 'x': return c->text_channels;
-        case 'm': return 6 * d;
-        case 'n': return 2 * d;
-        case 'p': return (int64_t)c->out_channels * c->patch * c->patch;
-        case 'i': return c->in_channels;
-        case 'k': return c->patch;
-        case '1': return 1;
-        case 's':
-            return c->text_tokens + (int64_t)((c->sample_frames - 1) / c->temporal_ratio + 1) *
-                                        (c->sample_height / c->patch) * (c->sample_width / c->patch);
-        default: return -1; // any
-    }
-}
-
-static gsf_result gsf__dit_bind(gsf__nn_loader* loader, const gsf_nn_transformer* c, const gsf__dit_entry* entries,
-                                size_t count, const char* prefix, void* where) {
-    for (size_t i = 0; i < count; i++) {
-        const gsf__dit_entry* e = &entries[i];
-        if (e->kind == GSF__DIT_ATTENTION_BIAS && !c->attention_bias) continue;
-        if (e->kind == GSF__DIT_LEARNED && !c->learned_positions) continue;
-        int64_t shape[GSF_NN_MAX_RANK];
-        int rank = 0;
-        for (const char* s = e->shape; *s; s++) shape[rank++] = gsf__dit_dimension(c, *s);
-        const gsf_tensor* tensor;
-        GSF__TRY(gsf__nn_need(loader, &tensor, rank, shape, "%s%s", prefix, e->name));
-        memcpy((char*)where + e->offset, &tensor, sizeof tensor);
-    }
-    return GSF_OK;
-}
-
-// What this code computes in one way only must not be configured otherwise.
-static gsf_result gsf__dit_check_fixed(const gsf__nn_config* file) {
-    static const struct { const char *key, *value; } texts[] = {
-        {"activation_fn", "gelu-approximate"}, {"timestep_activation_fn", "silu"}};
-    static const struct { const char* key; int value; } flags[] = {
-        {"flip_sin_to_cos", 1}, {"norm_elementwise_affine", 1}, {"patch_bias", 1}};
-    static const char* const absent[] = {"ofs_embed_dim", "patch_size_t"};
-    double shift;
-    for (size_t i = 0; i < GSF__COUNT(texts); i++) {
-        const char* text;
-        GSF__TRY(gsf__nn_config_string(file, texts[i].key, texts[i].value, &text));
-        if (strcmp(text, texts[i].value) != 0)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
-                            texts[i].value);
-    }
-    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
-        int flag;
-        GSF__TRY(gsf__nn_config_bool_or(file, flags[i].key, flags[i].value, &flag));
-        if (flag != flags[i].value)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i].key);
-    }
-    for (size_t i = 0; i < GSF__COUNT(absent); i++)
-        if (gsf__nn_config_find(file, absent[i]))
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not null", file->json.name, absent[i]);
-    GSF__TRY(gsf__nn_config_number_or(file, "freq_shift", 0.0, -1e3, 1e3, &shift));
-    if (shift != 0.0) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: freq_shift is not 0", file->json.name);
-    return GSF_OK;
-}
-
-static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
-    const struct { const char* key; int32_t* to; int64_t low, high; } sizes[] = {
-        {"num_attention_heads", &c->heads, 1, 1024}, {"attention_head_dim", &c->head_dim, 8, 1024},
-        {"num_layers", &c->layers, 1, 1024}, {"in_channels", &c->in_channels, 1, 65536},
-        {"out_channels", &c->out_channels, 1, 65536}, {"text_embed_dim", &c->text_channels, 1, 1 << 20},
-        {"max_text_seq_length", &c->text_tokens, 1, 1 << 20}, {"time_embed_dim", &c->time_channels, 1, 1 << 20},
-        {"patch_size", &c->patch, 1, 64}, {"sample_width", &c->sample_width, 1, 1 << 16},
-        {"sample_height", &c->sample_height, 1, 1 << 16}, {"sample_frames", &c->sample_frames, 1, 1 << 16},
-        {"temporal_compression_ratio", &c->temporal_ratio, 1, 64}};
-    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
-        int64_t value = 0;
-        GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
-        *sizes[i].to = (int32_t)value;
-    }
-    int flag;
-    GSF__TRY(gsf__nn_config_bool_or(file, "attention_bias", 1, &flag));
-    c->attention_bias = flag;
-    GSF__TRY(gsf__nn_config_bool_or(file, "use_learned_positional_embeddings", 0, &flag));
-    c->learned_positions = flag;
-    GSF__TRY(gsf__nn_config_bool_or(file, "use_rotary_positional_embeddings", 0, &flag));
-    c->rotary_positions = flag;
-    GSF__TRY(gsf__nn_config_number_or(file, "norm_eps", 1e-5, 1e-12, 1.0, &c->norm_eps));
-    GSF__TRY(gsf__nn_config_number_or(file, "spatial_interpolation_scale", 1.875, 1e-3, 1e3, &c->spatial_scale));
-    GSF__TRY(gsf__nn_config_number_or(file, "temporal_interpolation_scale", 1.0, 1e-3, 1e3, &c->temporal_scale));
-    if (c->head_dim % 16 || c->sample_width % c->patch || c->sample_height % c->patch)
-        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
-                        "%s: attention_head_dim %d is no multiple of 16, or the sample no multiple of the patch",
-                        file->json.name, (int)c->head_dim);
-    return gsf__dit_check_fixed(file);
-}
-
-static gsf_result gsf__dit_bind_all(gsf_context* ctx, gsf_nn_transformer* net) {
-    gsf__nn_loader loader;
-    gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
-    net->nets = nets;
-    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    nets->blocks = (gsf__dit_block*)gsf_alloc_zeroed(ctx, (size_t)net->layers, sizeof(gsf__dit_block));
-    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
-    gsf_result result = gsf__dit_bind(&loader, net, gsf__dit_entries, GSF__COUNT(gsf__dit_entries), "", nets);
-    for (int32_t i = 0; i < net->layers && !result; i++) {
-        char prefix[48];
-        snprintf(prefix, sizeof prefix, "transformer_blocks.%d.", (int)i);
-        result = gsf__dit_bind(&loader, net, gsf__dit_block_entries, GSF__COUNT(gsf__dit_block_entries), prefix,
-                               &nets->blocks[i]);
-    }
-    if (!net->learned_positions) gsf__nn_ignore(&loader, "patch_embed.pos_embedding"); // computed
-    GSF__TRY(gsf__nn_end_loading(&loader, result));
-    net->dino_channels = (int32_t)nets->dino.weight->shape[1];
-    net->vggt_channels = (int32_t)nets->vggt.weight->shape[1];
-    return GSF_OK;
-}
-
-GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer) {
-    gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
-    if (nets) {
-        for (size_t i = 0; nets->quantized && i < transformer->weights.tensor_count; i++)
-            gsf_nn_destroy_quantized(ctx, &nets->quantized[i]);
-        gsf_free(ctx, nets->quantized);
-        gsf_free(ctx, nets->blocks);
-    }
-    gsf_free(ctx, nets);
-    gsf_nn_close_weights(ctx, &transformer->weights);
-    memset(transformer, 0, sizeof *transformer);
-}
-
-GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer, size_t* bytes) {
-    gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
-    const gsf_nn_weights* w = &transformer->weights;
-    size_t total = 0;
-    if (!nets->quantized)
-        nets->quantized = (gsf_nn_quantized*)gsf_alloc_zeroed(ctx, w->tensor_count, sizeof *nets->quantized);
-    if (!nets->quantized) return GSF_ERROR_OUT_OF_MEMORY;
-    for (int32_t i = 0; i < transformer->layers; i++) {
-        const gsf__dit_block* b = &nets->blocks[i];
-        const gsf_tensor* const layers[] = {
-            b->self.q_weight, b->self.k_weight, b->self.v_weight, b->self.out_weight, b->cross.q_weight,
-            b->cross.k_weight, b->cross.v_weight, b->cross.out_weight, b->up_weight, b->down_weight};
-        for (size_t k = 0; k < GSF__COUNT(layers); k++) {
-            gsf_nn_quantized* q = &nets->quantized[layers[k] - w->tensors];
-            if (!q->data) GSF__TRY(gsf_nn_quantize_weight(ctx, layers[k], 0, q));
-            total += q->bytes;
-        }
-        GSF__TRY(gsf__check_cancel(ctx));
-        gsf__progress(ctx, "quantize", i + 1, transformer->layers);
-    }
-    if (bytes) *bytes = total;
-    return GSF_OK;
-}
-
-GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
-    gsf__nn_config file;
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    memset(out, 0, sizeof *out);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
-    gsf_destroy_text(ctx, &path);
-    if (!result) {
-        result = gsf__dit_read_config(&file, out);
-        gsf__nn_close_config(&file);
-    }
-    if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
-    if (!result) result = gsf__dit_bind_all(ctx, out);
-    if (result) gsf_nn_destroy_transformer(ctx, out);
-    return result;
-}
-
-// ---- one forward pass
-
-typedef struct gsf__dit_run {
-    gsf_context* ctx;
-    const gsf_nn_transformer* net;
-    const gsf__dit_nets* nets;
-    gsf_nn_workspace workspace;
-    const gsf_nn_transformer_input* in;
-    int64_t width, text, video, tokens; // tokens = text + video: rows of a sample
-    float* x;       // (batch, tokens, width): the residual stream, text first
-    float* normed;  // (tokens, width)
-    float* qkv;     // 3 x (rows, width), rows the larger of tokens and reference tokens; the feed-forward's hidden rows
-    int64_t qkv_rows;
-    float* time;    // (batch, time_channels): SiLU of the time embedding
-    float* modulation; // (6 width)
-    float* vectors; // biases and norm weights of the block at work, widened
-    size_t vectors_used, vectors_size;
-    float *cos, *sin; // (video, head_dim) or NULL
-    float* probe;   // (tokens, width): what a gated layer adds; only with a tap
-    char label[48]; // of the block at work, for taps and errors
-} gsf__dit_run;
-
-static void gsf__dit_tap(const gsf__dit_run* run, const char* name, int32_t row, const float* data, int64_t rows,
-                         int64_t columns) {
-    if (!run->in->tap_fn || !data) return;
-    char whole[96];
-    snprintf(whole, sizeof whole, "%s%s", run->label, name);
-    run->in->tap_fn(run->in->tap_user, whole, row, data, rows, columns);
-}
-
-// A small tensor as floats; valid until the next block begins.
-static const float* gsf__dit_vector(gsf__dit_run* run, const gsf_tensor* tensor) {
-    if (!tensor) return NULL;
-    float* out = run->vectors + run->vectors_used;
-    GSF_ASSERT(run->vectors_used + (size_t)tensor->count <= run->vectors_size);
-    run->vectors_used += (size_t)tensor->count;
-    gsf_nn_read_tensor(tensor, 0, tensor->count, out);
-    return out;
-}
-
-static gsf_result gsf__dit_apply(gsf__dit_run* run, const gsf_nn_linear_desc* desc) {
-    const gsf_nn_quantized* q = run->nets->quantized;
-    if (q) q += desc->weight - run->net->weights.tensors;
-    if (q && q->data) return gsf_nn_linear_int8(run->ctx, &run->workspace, desc, q);
-    gsf_nn_linear_desc d = *desc;
-    d.bf16 = run->net->bf16;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
-}
-
-static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
-                                  const gsf_tensor* bias, gsf_nn_activation activation, float* y) {
-    gsf_nn_linear_desc d;
-    memset(&d, 0, sizeof d);
-    d.x = x;
-    d.rows = rows;
-    d.weight = weight;
-    d.bias = bias;
-    d.activation = activation;
-    d.y = y;
-    return gsf__dit_apply(run, &d);
-}
-
-// x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
-static gsf_result gsf__dit_add(gsf__dit_run* run, const float* h, int64_t rows, const gsf_tensor* weight,
-                               const gsf_tensor* bias, const float* gate, float* x, float* probe) {
-    gsf_nn_linear_desc d;
-    memset(&d, 0, sizeof d);
-    d.x = h;
-    d.rows = rows;
-    d.weight = weight;
-    d.bias = bias;
-    d.gate = gate;
-    d.accumulate = 1;
-    d.y = x;
-    if (probe) GSF__TRY(gsf__dit_linear(run, h, rows, weight, bias, GSF_NN_LINEAR, probe));
-    return gsf__dit_apply(run, &d);
-}
-
-// Both streams of a sample through LN(x) (1 + scale) + shift with their own shift and scale. The six parts of the
-// modulation: shift, scale, gate of the video, then of the text.
-static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t row, const gsf__dit_norm* norm) {
-    const int64_t d = run->width;
-    const float* x = run->x + row * run->tokens * d;
-    float* m = run->modulation;
-    GSF__TRY(gsf__dit_linear(run, run->time + row * run->net->time_channels, 1, norm->linear_weight,
-                             norm->linear_bias, GSF_NN_LINEAR, m));
-    const float *w = gsf__dit_vector(run, norm->weight), *b = gsf__dit_vector(run, norm->bias);
-    const float eps = (float)run->net->norm_eps;
-    float* video = run->normed + run->text * d;
-    gsf_nn_layer_norm_modulated(run->ctx, x, run->text, d, w, b, eps, m + 4 * d, m + 3 * d, run->normed);
-    gsf_nn_layer_norm_modulated(run->ctx, x + run->text * d, run->video, d, w, b, eps, m + d, m, video);
-    if (run->in->tap_fn) {
-        char part[32];
-        snprintf(part, sizeof part, "%s.0", name);
-        gsf__dit_tap(run, part, row, video, run->video, d);
-        snprintf(part, sizeof part, "%s.1", name);
-        gsf__dit_tap(run, part, row, run->normed, run->text, d);
-        snprintf(part, sizeof part, "%s.2", name);
-        gsf__dit_tap(run, part, row, m + 2 * d, 1, d);
-        snprintf(part, sizeof part, "%s.3", name);
-        gsf__dit_tap(run, part, row, m + 5 * d, 1, d);
-    }
-    return GSF_OK;
-}
-
-enum { GSF__DIT_TEXT_GATE = 5, GSF__DIT_VIDEO_GATE = 2 }; // places in the modulation
-static const float gsf__dit_head_eps = 1e-6f;              // of the norms of q and k (fixed in the official code)
-
-// x += gate * attention over text and video together.
-static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const gsf__dit_attention* a) {
-    const gsf_nn_transformer* c = run->net;
-    const int64_t d = run->width, n = run->tokens;
-    float *q = run->qkv, *k = q + run->qkv_rows * d, *v = k + run->qkv_rows * d;
-    float* x = run->x + row * n * d;
-    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
-    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->k_weight, a->k_bias, GSF_NN_LINEAR, k));
-    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->v_weight, a->v_bias, GSF_NN_LINEAR, v));
-    gsf_nn_head_norm_rope(run->ctx, q, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
-                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
-    gsf_nn_head_norm_rope(run->ctx, k, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
-                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
-    gsf_nn_attention_desc attention;
-    memset(&attention, 0, sizeof attention);
-    attention.queries = attention.keys = n;
-    attention.heads = c->heads;
-    attention.head_dim = c->head_dim;
-    attention.q = q;
-    attention.k = k;
-    attention.v = v;
-    attention.out = run->normed;
-    attention.bf16 = run->net->bf16;
-    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
-    float* video_probe = run->probe ? run->probe + run->text * d : NULL;
-    GSF__TRY(gsf__dit_add(run, run->normed, run->text, a->out_weight, a->out_bias,
-                          run->modulation + GSF__DIT_TEXT_GATE * d, x, run->probe));
-    GSF__TRY(gsf__dit_add(run, run->normed + run->text * d, run->video, a->out_weight, a->out_bias,
-                          run->modulation + GSF__DIT_VIDEO_GATE * d, x + run->text * d, video_probe));
-    gsf__dit_tap(run, "attn1.0", row, video_probe, run->video, d);
-    gsf__dit_tap(run, "attn1.1", row, run->probe, run->text, d);
-    return GSF_OK;
-}
-
-// Keys and values of the references for one block: (2, reference tokens, width).
-static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attention* a, const float* references,
-                                        float* kv) {
-    const gsf_nn_transformer* c = run->net;
-    const int64_t r = run->in->reference_tokens, d = run->width;
-    GSF__TRY(gsf__dit_linear(run, references, r, a->k_weight, a->k_bias, GSF_NN_LINEAR, kv));
-    GSF__TRY(gsf__dit_linear(run, references, r, a->v_weight, a->v_bias, GSF_NN_LINEAR, kv + r * d));
-    gsf_nn_head_norm_rope(run->ctx, kv, r, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
-                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, NULL, NULL, 0);
-    return GSF_OK;
-}
-
-// The video's tokens look at the references: x += attention(norm(x), references), no gate, no rotation.
-static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32_t index, const gsf__dit_block* block) {
-    const gsf_nn_transformer* c = run->net;
-    const gsf__dit_attention* a = &block->cross;
-    const int64_t d = run->width, r = run->in->reference_tokens;
-    float* x = run->x + (row * run->tokens + run->text) * d;
-    float *q = run->qkv, *normed = run->normed, *kv = run->qkv + run->qkv_rows * d;
-    const int32_t source = run->in->reference_batch == 1 ? 0 : row;
-    int ready = source < row; // row 0 has computed what all rows share
-    if (run->in->reference_kv) {
-        kv = run->in->reference_kv + ((int64_t)index * run->in->reference_batch + source) * 2 * r * d;
-        ready = ready || run->in->reference_kv_ready;
-    }
-    if (!ready) GSF__TRY(gsf__dit_reference_kv(run, a, run->in->references + source * r * d, kv));
-    gsf_nn_layer_norm(run->ctx, x, run->video, d, gsf__dit_vector(run, block->norm_cross_weight),
-                      gsf__dit_vector(run, block->norm_cross_bias), (float)c->norm_eps, normed);
-    gsf__dit_tap(run, "norm_cross", row, normed, run->video, d);
-    GSF__TRY(gsf__dit_linear(run, normed, run->video, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
-    gsf_nn_head_norm_rope(run->ctx, q, run->video, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
-                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, NULL, NULL, 0);
-    gsf_nn_attention_desc attention;
-    memset(&attention, 0, sizeof attention);
-    attention.queries = run->video;
-    attention.keys = r;
-    attention.heads = c->heads;
-    attention.head_dim = c->head_dim;
-    attention.q = q;
-    attention.k = kv;
-    attention.v = kv + r * d;
-    attention.out = normed;
-    attention.bf16 = run->net->bf16;
-    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
-    GSF__TRY(gsf__dit_add(run, normed, run->video, a->out_weight, a->out_bias, NULL, x, run->probe));
-    gsf__dit_tap(run, "attn_cross", row, run->probe, run->video, d);
-    return GSF_OK;
-}
-
-// x += gate * down(gelu(up(normed))), in row chunks whose hidden layer fits the room of q, k and v.
-static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gsf__dit_block* block) {
-    const int64_t d = run->width, most = run->qkv_rows * 3 / 4;
-    float* x = run->x + row * run->tokens * d;
-    for (int stream = 0; stream < 2; stream++) {
-        const int64_t first = stream ? run->text : 0, end = stream ? run->tokens : run->text;
-        const float* gate = run->modulation + (stream ? GSF__DIT_VIDEO_GATE : GSF__DIT_TEXT_GATE) * d;
-        for (int64_t r = first; r < end; r += most) {
-            const int64_t rows = end - r < most ? end - r : most;
-            GSF__TRY(gsf__dit_linear(run, run->normed + r * d, rows, block->up_weight, block->up_bias, GSF_NN_GELU_TANH,
-                                     run->qkv));
-            GSF__TRY(gsf__dit_add(run, run->qkv, rows, block->down_weight, block->down_bias, gate, x + r * d,
-                                  run->probe ? run->probe + r * d : NULL));
-        }
-    }
-    gsf__dit_tap(run, "ff", row, run->probe, run->tokens, d);
-    return GSF_OK;
-}
-
-// One block for all samples, layer by layer so that they share the keys and values of the references.
-static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
-    const gsf__dit_block* block = &run->nets->blocks[index];
-    const int32_t batch = run->in->batch;
-    snprintf(run->label, sizeof run->label, "block%d.", (int)index);
-    for (int32_t b = 0; b < batch; b++) {
-        run->vectors_used = 0;
-        GSF__TRY(gsf__dit_modulate(run, "norm1", b, &block->norm1));
-        GSF__TRY(gsf__dit_self_attention(run, b, &block->self));
-        GSF__TRY(gsf__check_cancel(run->ctx));
-    }
-    for (int32_t b = 0; b < batch && run->in->references; b++) {
-        run->vectors_used = 0;
-        GSF__TRY(gsf__dit_cross_attention(run, b, index, block));
-        GSF__TRY(gsf__check_cancel(run->ctx));
-    }
-    for (int32_t b = 0; b < batch; b++) {
-        run->vectors_used = 0;
-        GSF__TRY(gsf__dit_modulate(run, "norm2", b, &block->norm2));
-        GSF__TRY(gsf__dit_feed_forward(run, b, block));
-        GSF__TRY(gsf__check_cancel(run->ctx));
-    }
-    for (int32_t b = 0; b < batch; b++) {
-        const float* x = run->x + b * run->tokens * run->width;
-        gsf__dit_tap(run, "0", b, x + run->text * run->width, run->video, run->width);
-        gsf__dit_tap(run, "1", b, x, run->text, run->width);
-    }
-    run->label[0] = 0;
-    return GSF_OK;
-}
-
-// ---- a value that is not finite, and where it comes from
-
-static gsf_result gsf__dit_check(gsf__dit_run* run, const char* stage, const char* prefix, const float* x, int64_t count) {
-    return gsf__nn_check_finite(run->ctx, &run->net->weights, "transformer", prefix, stage, x, count);
-}
-
-// ---- first and last layers
-
-// SiLU of the embedding of each sample's time step.
-static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
-    const gsf_nn_transformer* net = run->net;
-    const int64_t d = run->width, t = net->time_channels;
-    for (int32_t b = 0; b < run->in->batch; b++) {
-        float *wave = run->qkv, *hidden = wave + d, *out = run->time + b * t;
-        gsf_nn_embed_timestep(run->in->timesteps[b], (int32_t)d, wave);
-        gsf__dit_tap(run, "time_proj", b, wave, 1, d);
-        GSF__TRY(gsf__dit_linear(run, wave, 1, run->nets->time1_weight, run->nets->time1_bias, GSF_NN_SILU, hidden));
-        GSF__TRY(gsf__dit_linear(run, hidden, 1, run->nets->time2_weight, run->nets->time2_bias, GSF_NN_LINEAR, out));
-        gsf__dit_tap(run, "time_embedding", b, out, 1, t);
-        gsf_nn_activate(run->ctx, GSF_NN_SILU, out, t, out);
-    }
-    return GSF_OK;
-}
-
-typedef struct gsf__patch_job { // patches of the latents as rows, or the other way round
-    const float* from;
-    float* to;
-    int32_t channels, height, width, patch;
-} gsf__patch_job;
-
-// (channels, height, width) of one frame to rows of (channels, patch, patch), tokens down and across.
-static void gsf__patch_frame(void* arg, size_t frame, int worker) {
-    const gsf__patch_job* job = (const gsf__patch_job*)arg;
-    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
-    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
-    const float* from = job->from + (int64_t)frame * job->channels * plane;
-    float* to = job->to + (int64_t)frame * across * down * row;
-    (void)worker;
-    for (int64_t ty = 0; ty < down; ty++)
-        for (int64_t tx = 0; tx < across; tx++)
-            for (int64_t c = 0; c < job->channels; c++)
-                for (int64_t y = 0; y < p; y++)
-                    for (int64_t x = 0; x < p; x++)
-                        *to++ = from[c * plane + (ty * p + y) * job->width + tx * p + x];
-}
-
-static void gsf__unpatch_frame(void* arg, size_t frame, int worker) {
-    const gsf__patch_job* job = (const gsf__patch_job*)arg;
-    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
-    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
-    const float* from = job->from + (int64_t)frame * across * down * row;
-    float* to = job->to + (int64_t)frame * job->channels * plane;
-    (void)worker;
-    for (int64_t ty = 0; ty < down; ty++)
-        for (int64_t tx = 0; tx < across; tx++)
-            for (int64_t c = 0; c < job->channels; c++)
-                for (int64_t y = 0; y < p; y++)
-                    for (int64_t x = 0; x < p; x++)
-                        to[c * plane + (ty * p + y) * job->width + tx * p + x] = *from++;
-}
-
-// Adds the position table to text and video: the stored one for the configured frame count, else sines and cosines (video
-// only), as the official code does.
-static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
-    const gsf_nn_transformer* c = run->net;
-    const gsf_nn_transformer_input* in = run->in;
-    if (!c->learned_positions && c->rotary_positions) return GSF_OK;
-    const int64_t d = run->width;
-    const int same_frames = (in->frames - 1) * c->temporal_ratio + 1 == c->sample_frames;
-    if (c->learned_positions && same_frames && run->text == c->text_tokens) {
-        for (int64_t r = 0; r < run->tokens; r++) { // a row at a time: the table may be bf16
-            gsf_nn_read_tensor(run->nets->positions, r * d, d, run->qkv);
-            for (int32_t b = 0; b < in->batch; b++)
-                for (int64_t i = 0; i < d; i++) run->x[(b * run->tokens + r) * d + i] += run->qkv[i];
-        }
-        return GSF_OK;
-    }
-    GSF__TRY(gsf_nn_make_sincos(run->ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
-                                c->spatial_scale, c->temporal_scale, run->qkv));
-    for (int32_t b = 0; b < in->batch; b++)
-        for (int64_t i = 0; i < run->video * d; i++) run->x[(b * run->tokens + run->text) * d + i] += run->qkv[i];
-    return GSF_OK;
-}
-
-static gsf_result gsf__dit_embed(gsf__dit_run* run) {
-    const gsf_nn_transformer* net = run->net;
-    const gsf_nn_transformer* c = net;
-    const gsf_nn_transformer_input* in = run->in;
-    const int64_t d = run->width, sample = (int64_t)in->frames * c->in_channels * in->height * in->width;
-    for (int32_t b = 0; b < in->batch; b++) {
-        float* x = run->x + b * run->tokens * d;
-        GSF__TRY(gsf__dit_linear(run, in->text + b * run->text * c->text_channels, run->text, run->nets->text_weight,
-                                 run->nets->text_bias, GSF_NN_LINEAR, x));
-        gsf__patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch};
-        gsf__parallel_for(run->ctx, (size_t)in->frames, gsf__patch_frame, &job);
-        GSF__TRY(gsf__dit_linear(run, run->qkv, run->video, run->nets->patch_weight, run->nets->patch_bias, GSF_NN_LINEAR,
-                                 x + run->text * d));
-    }
-    GSF__TRY(gsf__dit_add_positions(run));
-    for (int32_t b = 0; b < in->batch; b++)
-        gsf__dit_tap(run, "patch_embed", b, run->x + b * run->tokens * d, run->tokens, d);
-    return GSF_OK;
-}
-
-// Video tokens to velocities: two layer norms in a row, the second modulated, then the output projection.
-static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
-    const gsf_nn_transformer* net = run->net;
-    const gsf_nn_transformer* c = net;
-    const int64_t d = run->width;
-    const float eps = (float)c->norm_eps;
-    float *m = run->modulation, *normed = run->normed;
-    run->vectors_used = 0;
-    const float* weight = gsf__dit_vector(run, run->nets->norm_final_weight);
-    const float* bias = gsf__dit_vector(run, run->nets->norm_final_bias);
-    gsf_nn_layer_norm(run->ctx, run->x + (row * run->tokens + run->text) * d, run->video, d, weight, bias, eps, normed);
-    gsf__dit_tap(run, "norm_final", row, normed, run->video, d);
-    GSF__TRY(gsf__dit_linear(run, run->time + row * c->time_channels, 1, run->nets->norm_out.linear_weight,
-                             run->nets->norm_out.linear_bias, GSF_NN_LINEAR, m));
-    gsf_nn_layer_norm_modulated(run->ctx, normed, run->video, d, gsf__dit_vector(run, run->nets->norm_out.weight),
-                                gsf__dit_vector(run, run->nets->norm_out.bias), eps, m + d, m, normed);
-    gsf__dit_tap(run, "norm_out", row, normed, run->video, d);
-    GSF__TRY(gsf__dit_linear(run, normed, run->video, run->nets->out_weight, run->nets->out_bias, GSF_NN_LINEAR, run->qkv));
-    gsf__dit_tap(run, "proj_out", row, run->qkv, run->video, (int64_t)c->out_channels * c->patch * c->patch);
-    gsf__patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch};
-    gsf__parallel_for(run->ctx, (size_t)run->in->frames, gsf__unpatch_frame, &job);
-    return GSF_OK;
-}
-
-// ---- blocks, and the skip of those whose work would repeat the last step's
-
-GSF_API void gsf_nn_destroy_block_cache(gsf_context* ctx, gsf_nn_block_cache* cache) {
-    gsf_free(ctx, cache->first);
-    memset(cache, 0, sizeof *cache);
-}
-
-enum { GSF__DIT_CACHE_ROWS = 8 }; // the change is measured on every 8th row
-
-static gsf_result gsf__dit_open_cache(gsf__dit_run* run, gsf_nn_block_cache* cache) {
-    const size_t rows = (size_t)run->in->batch * (size_t)run->tokens, width = (size_t)run->width;
-    const size_t sampled = (rows + GSF__DIT_CACHE_ROWS - 1) / GSF__DIT_CACHE_ROWS * width;
-    if (cache->size == rows * width) return GSF_OK;
-    const float threshold = cache->threshold;
-    gsf_nn_destroy_block_cache(run->ctx, cache);
-    cache->threshold = threshold;
-    cache->first = (float*)gsf_alloc_zeroed(run->ctx, rows * width + 2 * sampled, sizeof(float));
-    if (!cache->first) return GSF_ERROR_OUT_OF_MEMORY;
-    cache->before = cache->first + sampled;
-    cache->rest = cache->before + sampled;
-    cache->size = rows * width;
-    return GSF_OK;
-}
-
-static void gsf__dit_note_before(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
-    const int64_t rows = run->in->batch * run->tokens, d = run->width;
-    float* to = cache->before;
-    for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, to += d) memcpy(to, run->x + r * d, (size_t)d * sizeof(float));
-}
-
-// 1 if what the first block added is close enough to what it added last time (relative L1); notes it for the next time.
-static int gsf__dit_is_similar(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
-    const int64_t rows = run->in->batch * run->tokens, d = run->width;
-    double change = 0.0, size = 0.0;
-    const float* before = cache->before;
-    float* first = cache->first;
-    for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, before += d, first += d)
-        for (int64_t i = 0; i < d; i++) {
-            const float added = run->x[r * d + i] - before[i];
-            change += fabs((double)(added - first[i]));
-            size += fabs((double)first[i]);
-            first[i] = added;
-        }
-    return cache->calls > 0 && change < (double)cache->threshold * size;
-}
-
-static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
-    const gsf_nn_transformer* c = run->net;
-    gsf_nn_block_cache* cache = run->in->cache && run->in->cache->threshold > 0.0f ? run->in->cache : NULL;
-    const int64_t count = run->in->batch * run->tokens * run->width;
-    if (cache) {
-        GSF__TRY(gsf__dit_open_cache(run, cache));
-        gsf__dit_note_before(run, cache);
-    }
-    for (int32_t i = 0; i < c->layers; i++) {
-        char name[48];
-        GSF__TRY(gsf__dit_block_forward(run, i));
-        snprintf(name, sizeof name, "transformer_blocks.%d.", (int)i);
-        GSF__TRY(gsf__dit_check(run, name, name, run->x, count));
-        gsf__progress(run->ctx, "transformer", i + 1, c->layers);
-        if (!cache || i > 0) continue;
-        const int similar = gsf__dit_is_similar(run, cache);
-        cache->calls++;
-        if (similar) { // what the other blocks added last time
-            cache->hits++;
-            for (int64_t j = 0; j < count; j++) run->x[j] += cache->rest[j];
-            return GSF_OK;
-        }
-        memcpy(cache->rest, run->x, (size_t)count * sizeof(float));
-    }
-    for (int64_t j = 0; cache && j < count; j++) cache->rest[j] = run->x[j] - cache->rest[j];
-    return GSF_OK;
-}
-
-// ---- the pass as a whole
-
-static gsf_result gsf__dit_check_size(gsf_context* ctx, const gsf_nn_transformer* c, int32_t height, int32_t width) {
-    if (height < c->patch || width < c->patch || height % c->patch || width % c->patch)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d x %d latents are no multiple of the patch %d",
-                        (int)width, (int)height, (int)c->patch);
-    if (c->learned_positions && (height != c->sample_height || width != c->sample_width))
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
-                        "transformer: latents of %d x %d; its learned positions are for %d x %d (the official code refuses "
-                        "other sizes as well)", (int)width, (int)height, (int)c->sample_width, (int)c->sample_height);
-    return GSF_OK;
-}
-
-static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* c, const gsf_nn_transformer_input* in) {
-    if (!in->hidden || !in->text || !in->timesteps || in->batch < 1 || in->frames < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: latents, text or time steps are missing");
-    GSF__TRY(gsf__dit_check_size(ctx, c, in->height, in->width));
-    if (in->text_tokens < 0 || (c->learned_positions && in->text_tokens && in->text_tokens != c->text_tokens))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d text tokens, not %d", (int)in->text_tokens,
-                        (int)c->text_tokens);
-    if (in->references && (in->reference_tokens < 1 || (in->reference_batch != 1 && in->reference_batch != in->batch)))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %lld reference tokens for %d of %d samples",
-                        (long long)in->reference_tokens, (int)in->reference_batch, (int)in->batch);
-    for (int32_t b = 0; b < in->batch; b++)
-        if (!(in->timesteps[b] >= 0.0 && in->timesteps[b] < 1e6))
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: time step %g", in->timesteps[b]);
-    return GSF_OK;
-}
-
-static void gsf__dit_sizes(gsf__dit_run* run, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in) {
-    const gsf_nn_transformer* c = net;
-    run->in = in;
-    run->width = gsf__dit_width(c);
-    run->text = in->text_tokens ? in->text_tokens : c->text_tokens;
-    run->video = (int64_t)in->frames * (in->height / c->patch) * (in->width / c->patch);
-    run->tokens = run->text + run->video;
-    run->qkv_rows = in->references && in->reference_tokens > run->tokens ? in->reference_tokens : run->tokens;
-    if (run->qkv_rows < 4) run->qkv_rows = 4; // a chunk of the feed-forward is 3/4 of them
-    // per block and layer: norm weights and biases, those of q and k; the head takes four
-    run->vectors_size = (size_t)(4 * run->width + 4 * c->head_dim);
-}
-
-// Floats of every buffer; their sum is what gsf_nn_transformer_cost tells.
-typedef struct gsf__dit_layout { size_t x, normed, qkv, time, modulation, vectors, rotary, probe; } gsf__dit_layout;
-
-static gsf__dit_layout gsf__dit_plan(const gsf__dit_run* run, const gsf_nn_transformer* c) {
-    const size_t d = (size_t)run->width, rows = (size_t)run->tokens;
-    gsf__dit_layout l;
-    const size_t patch_row = (size_t)c->patch * (size_t)c->patch *
-                             (size_t)(c->in_channels > c->out_channels ? c->in_channels : c->out_channels);
-    l.x = (size_t)run->in->batch * rows * d;
-    l.normed = rows * d;
-    l.qkv = 3 * (size_t)run->qkv_rows * d;
-    if (l.qkv < (size_t)run->video * patch_row) l.qkv = (size_t)run->video * patch_row;
-    if (l.qkv < d + (size_t)c->time_channels) l.qkv = d + (size_t)c->time_channels;
-    l.time = (size_t)run->in->batch * (size_t)c->time_channels;
-    l.modulation = 6 * d;
-    l.vectors = run->vectors_size;
-    l.rotary = c->rotary_positions && !run->in->no_rotary ? 2 * (size_t)run->video * (size_t)c->head_dim : 0;
-    l.probe = run->in->tap_fn ? rows * d : 0;
-    return l;
-}
-
-static size_t gsf__dit_total(const gsf__dit_layout* l) {
-    return l->x + l->normed + l->qkv + l->time + l->modulation + l->vectors + l->rotary + l->probe;
-}
-
-static void gsf__dit_share_out(gsf__dit_run* run, const gsf__dit_layout* l, float* memory) {
-    float* next = memory;
-    run->x = next, next += l->x;
-    run->normed = next, next += l->normed;
-    run->qkv = next, next += l->qkv;
-    run->time = next, next += l->time;
-    run->modulation = next, next += l->modulation;
-    run->vectors = next, next += l->vectors;
-    if (l->rotary) run->cos = next, run->sin = next + l->rotary / 2, next += l->rotary;
-    if (l->probe) run->probe = next;
-}
-
-static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
-    const gsf_nn_transformer* c = run->net;
-    const gsf_nn_transformer_input* in = run->in;
-    if (run->cos) {
-        gsf_nn_rope_desc rope;
-        memset(&rope, 0, sizeof rope);
-        rope.frames = in->frames;
-        rope.height = in->height / c->patch;
-        rope.width = in->width / c->patch;
-        rope.base_height = c->sample_height / c->patch;
-        rope.base_width = c->sample_width / c->patch;
-        rope.head_dim = c->head_dim;
-        GSF__TRY(gsf_nn_make_rope(run->ctx, &rope, run->cos, run->sin));
-    }
-    GSF__TRY(gsf__dit_embed_time(run));
-    GSF__TRY(gsf__dit_embed(run));
-    GSF__TRY(gsf__dit_check(run, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * run->width));
-    if (in->references)
-        for (int32_t b = 0; b < in->reference_batch; b++)
-            gsf__dit_tap(run, "cross_hidden_states", b, in->references + b * in->reference_tokens * run->width,
-                         in->reference_tokens, run->width);
-    GSF__TRY(gsf__dit_blocks(run));
-    const int64_t sample = (int64_t)in->frames * c->out_channels * in->height * in->width;
-    for (int32_t b = 0; b < in->batch; b++) GSF__TRY(gsf__dit_head(run, b, out + b * sample));
-    return gsf__dit_check(run, "the output layer", "proj_out.", out, in->batch * sample);
-}
-
-GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
-                                              const gsf_nn_transformer_input* input, float* out) {
-    gsf__dit_run run;
-    memset(&run, 0, sizeof run);
-    GSF__TRY(gsf__dit_check_input(ctx, transformer, input));
-    run.ctx = ctx;
-    run.net = transformer;
-    run.nets = (const gsf__dit_nets*)transformer->nets;
-    gsf__dit_sizes(&run, transformer, input);
-    const gsf__dit_layout l = gsf__dit_plan(&run, transformer);
-    float* memory = (float*)gsf_alloc(ctx, gsf__dit_total(&l), sizeof(float));
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__dit_share_out(&run, &l, memory);
-    const gsf_result result = gsf__dit_forward(&run, out);
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
-    gsf_free(ctx, memory);
-    return result;
-}
-
-GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
-                                        int32_t reference_batch) {
-    return (size_t)transformer->layers * (size_t)reference_batch * 2 * (size_t)reference_tokens *
-           (size_t)gsf__dit_width(transformer);
-}
-
-GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
-                                     double* bytes, double* flops) {
-    const gsf_nn_transformer* c = transformer;
-    gsf__dit_run run;
-    memset(&run, 0, sizeof run);
-    gsf__dit_sizes(&run, transformer, input);
-    const gsf__dit_layout l = gsf__dit_plan(&run, c);
-    const double d = (double)run.width, n = (double)run.tokens, v = (double)run.video;
-    const double r = input->references ? (double)input->reference_tokens : 0.0;
-    const double self = 2.0 * n * d * d * 4.0 + 4.0 * n * n * d, ff = 2.0 * n * d * 4.0 * d * 2.0;
-    const double cross = r > 0.0 ? 2.0 * v * d * d * 2.0 + 4.0 * v * r * d : 0.0, kv = 2.0 * r * d * d * 2.0;
-    const double patch = (double)c->patch * c->patch;
-    const double ends = 2.0 * v * patch * c->in_channels * d + 2.0 * v * patch * c->out_channels * d +
-                        2.0 * (double)run.text * c->text_channels * d;
-    const double kv_batch = input->reference_kv_ready ? 0.0 : (double)input->reference_batch;
-    *bytes = (double)gsf__dit_total(&l) * sizeof(float);
-    *flops = c->layers * (input->batch * (self + ff + cross) + kv_batch * kv) + input->batch * ends;
-}
-
-GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer, int64_t tokens,
-                                             const float* dino, const float* vggt, float* out) {
-    const int64_t d = gsf__dit_width(transformer);
-    const gsf__dit_nets* nets = (const gsf__dit_nets*)transformer->nets;
-    const gsf__dit_projector* projectors[2] = {&nets->dino, &nets->vggt};
-    const float* inputs[2] = {dino, vggt};
-    gsf__dit_run run;
-    memset(&run, 0, sizeof run);
-    run.ctx = ctx;
-    run.net = transformer;
-    run.nets = nets;
-    run.vectors_size = (size_t)(4 * d);
-    if (tokens < 1 || (!dino && !vggt))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no tokens to project");
-    float* memory = (float*)gsf_alloc(ctx, (size_t)tokens + 4, (size_t)d * sizeof(float));
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    run.vectors = memory + tokens * d;
-    gsf_result result = GSF_OK;
-    for (int i = 0; i < 2 && !result; i++) {
-        float* to = i && dino ? memory : out; // the second is added to the first
-        if (!inputs[i]) continue;
-        result = gsf__dit_linear(&run, inputs[i], tokens, projectors[i]->weight, projectors[i]->bias, GSF_NN_LINEAR, to);
-        if (result) break;
-        gsf_nn_layer_norm(ctx, to, tokens, d, gsf__dit_vector(&run, projectors[i]->norm_weight),
-                          gsf__dit_vector(&run, projectors[i]->norm_bias), 1e-5f, to); // torch's default eps
-        for (int64_t j = 0; to == memory && j < tokens * d; j++) out[j] += memory[j];
-    }
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
-    gsf_free(ctx, memory);
-    return result;
-}
-
-// ---- >>nn vae -------------------------------------------------------------------
-
-// A run keeps few large arrays (gsf__vae_run), each grown to the largest need: three activations (a block's input, the
-// middle of its resnet, and the result of a widening shortcut), one bordered frame, the widened weights of one layer. Norm
-// and SiLU are applied while a frame is given its border, so that normalised activations exist for three frames only, two
-// of which are the cache that the next chunk needs anyway. Sums for a group norm are taken while its input is written.
-// The same walk with `dry` set takes no memory and computes nothing, but counts both.
-
-enum { GSF__VAE_ENCODER_FRAMES = 8, GSF__VAE_DECODER_FRAMES = 2 }; // frames of a chunk
-enum { GSF__VAE_SLOTS = 4, GSF__VAE_INPUT = 3 };                   // activations; the last one is the chunk's input
-
-typedef struct gsf__vae_norm { // a group norm; spatial.out > 0: its result times y(z) plus b(z), z the latents
-    const gsf_tensor *weight, *bias;
-    gsf__conv_layer y, b;
-    double eps;
-} gsf__vae_norm;
-
-typedef struct gsf__vae_resnet { // x + conv2(silu(norm2(conv1(silu(norm1(x))))))
-    gsf__vae_norm norm1, norm2;
-    gsf__conv_layer conv1, conv2, shortcut; // shortcut.out 0: x itself
-} gsf__vae_resnet;
-
-typedef struct gsf__vae_block {
-    gsf__vae_resnet* resnets;
-    int32_t count;
-    gsf__conv_layer sampler; // out 0: none. The encoder's halves, the decoder's doubles
-    int time;                // frames, too
-} gsf__vae_block;
-
-typedef struct gsf__vae_net { // encoder or decoder
-    int decoder;
-    int64_t groups;
-    gsf__conv_layer conv_in, conv_out;
-    gsf__vae_norm norm_out;
-    gsf__vae_block blocks[GSF_NN_VAE_LEVELS + 1];
-    int32_t block_count, causal_count; // causal_count: layers that keep frames for the next chunk
-} gsf__vae_net;
-
-typedef struct gsf__vae_nets {
-    gsf__vae_net encoder, decoder;
-} gsf__vae_nets;
-
-// ---- opening a model
-
-typedef struct gsf__vae_loader {
-    gsf_context* ctx;
-    const gsf_nn_vae* vae;
-    gsf__nn_loader tensors;
-    gsf__vae_net* net;
-} gsf__vae_loader;
-
-static gsf_result gsf__vae_load_conv(gsf__vae_loader* l, const char* name, int64_t in, int64_t out, int64_t kt,
-                                     int64_t kernel, gsf__conv_layer* layer) {
-    int64_t shape[5];
-    int32_t rank = 0;
-    shape[rank++] = out;
-    shape[rank++] = in;
-    if (kt) shape[rank++] = kt; // 0: a 2D layer
-    shape[rank++] = kernel;
-    shape[rank++] = kernel;
-    GSF__TRY(gsf__nn_need(&l->tensors, &layer->weight, rank, shape, "%s.weight", name));
-    GSF__TRY(gsf__nn_need(&l->tensors, &layer->bias, 1, shape, "%s.bias", name));
-    layer->in = in;
-    layer->out = out;
-    layer->kt = kt ? kt : 1;
-    layer->kernel = kernel;
-    l->net->causal_count += kt == 3;
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_load_norm(gsf__vae_loader* l, const char* name, int64_t channels, double eps,
-                                     gsf__vae_norm* norm) {
-    char full[160];
-    const char* layer = l->net->decoder ? ".norm_layer" : "";
-    GSF__TRY(gsf__nn_need(&l->tensors, &norm->weight, 1, &channels, "%s%s.weight", name, layer));
-    GSF__TRY(gsf__nn_need(&l->tensors, &norm->bias, 1, &channels, "%s%s.bias", name, layer));
-    norm->eps = l->net->decoder ? 1e-6 : eps; // the spatial norm ignores the config's
-    if (!l->net->decoder) return GSF_OK;
-    snprintf(full, sizeof full, "%s.conv_y.conv", name);
-    GSF__TRY(gsf__vae_load_conv(l, full, l->vae->latent_channels, channels, 1, 1, &norm->y));
-    snprintf(full, sizeof full, "%s.conv_b.conv", name);
-    return gsf__vae_load_conv(l, full, l->vae->latent_channels, channels, 1, 1, &norm->b);
-}
-
-static gsf_result gsf__vae_load_resnet(gsf__vae_loader* l, const char* name, int64_t in, int64_t out,
-                                       gsf__vae_resnet* resnet) {
-    char full[128];
-    snprintf(full, sizeof full, "%s.norm1", name);
-    GSF__TRY(gsf__vae_load_norm(l, full, in, l->vae->norm_eps, &resnet->norm1));
-    snprintf(full, sizeof full, "%s.conv1.conv", name);
-    GSF__TRY(gsf__vae_load_conv(l, full, in, out, 3, 3, &resnet->conv1));
-    snprintf(full, sizeof full, "%s.norm2", name);
-    GSF__TRY(gsf__vae_load_norm(l, full, out, l->vae->norm_eps, &resnet->norm2));
-    snprintf(full, sizeof full, "%s.conv2.conv", name);
-    GSF__TRY(gsf__vae_load_conv(l, full, out, out, 3, 3, &resnet->conv2));
-    if (in == out) return GSF_OK;
-    snprintf(full, sizeof full, "%s.conv_shortcut", name);
-    return gsf__vae_load_conv(l, full, in, out, 1, 1, &resnet->shortcut);
-}
-
-// `count` resnets, the first of which changes the channels.
-static gsf_result gsf__vae_load_block(gsf__vae_loader* l, const char* name, int64_t in, int64_t out, int32_t count) {
-    char full[96];
-    gsf__vae_block* block = &l->net->blocks[l->net->block_count++];
-    block->resnets = (gsf__vae_resnet*)gsf_alloc_zeroed(l->ctx, (size_t)count, sizeof *block->resnets);
-    if (!block->resnets) return GSF_ERROR_OUT_OF_MEMORY;
-    block->count = count;
-    for (int32_t i = 0; i < count; i++) {
-        snprintf(full, sizeof full, "%s.resnets.%d", name, (int)i);
-        GSF__TRY(gsf__vae_load_resnet(l, full, i ? out : in, out, &block->resnets[i]));
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_load_net(gsf__vae_loader* l, int decoder) {
-    const gsf_nn_vae* vae = l->vae;
-    const char* side = decoder ? "decoder" : "encoder";
-    const int32_t last = vae->levels - 1;
-    const int64_t coarse = vae->channels[last];
-    char name[64];
-    l->net->decoder = decoder;
-    l->net->groups = vae->norm_groups;
-    snprintf(name, sizeof name, "%s.conv_in.conv", side);
-    GSF__TRY(gsf__vae_load_conv(l, name, decoder ? vae->latent_channels : vae->in_channels,
-                                decoder ? coarse : vae->channels[0], 3, 3, &l->net->conv_in));
-    snprintf(name, sizeof name, "%s.mid_block", side);
-    if (decoder) GSF__TRY(gsf__vae_load_block(l, name, coarse, coarse, 2));
-    int64_t in = decoder ? coarse : vae->channels[0];
-    for (int32_t i = 0; i < vae->levels; i++) {
-        const int64_t out = vae->channels[decoder ? last - i : i];
-        snprintf(name, sizeof name, "%s.%s_blocks.%d", side, decoder ? "up" : "down", (int)i);
-        GSF__TRY(gsf__vae_load_block(l, name, in, out, vae->layers_per_block + decoder));
-        in = out;
-        if (i == last) break;
-        gsf__vae_block* block = &l->net->blocks[l->net->block_count - 1];
-        block->time = 2 << i <= vae->temporal_ratio;
-        snprintf(name, sizeof name, "%s.%s_blocks.%d.%ssamplers.0.conv", side, decoder ? "up" : "down", (int)i,
-                 decoder ? "up" : "down");
-        GSF__TRY(gsf__vae_load_conv(l, name, out, out, 0, 3, &block->sampler));
-    }
-    snprintf(name, sizeof name, "%s.mid_block", side);
-    if (!decoder) GSF__TRY(gsf__vae_load_block(l, name, coarse, coarse, 2));
-    snprintf(name, sizeof name, "%s.norm_out", side);
-    GSF__TRY(gsf__vae_load_norm(l, name, in, 1e-6, &l->net->norm_out));
-    snprintf(name, sizeof name, "%s.conv_out.conv", side);
-    return gsf__vae_load_conv(l, name, in, decoder ? vae->out_channels : 2 * vae->latent_channels, 3, 3,
-                              &l->net->conv_out);
-}
-
-static gsf_result gsf__vae_check_types(const gsf__nn_config* config, const char* key, const char* type, size_t levels) {
-    const gsf_json_value* list = gsf_json_member(&config->json, &config->json.values[0], key);
-    if (!list || list->type == GSF_JSON_NULL) return GSF_OK;
-    int ok = list->type == GSF_JSON_ARRAY && list->count == levels;
-    for (uint32_t i = ok ? list->child : 0; i; i = config->json.values[i].next)
-        ok = ok && config->json.values[i].type == GSF_JSON_STRING && strcmp(config->json.values[i].string, type) == 0;
-    if (ok) return GSF_OK;
-    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s is not %zu times %s", config->json.name,
-                    (unsigned)list->offset, key, levels, type);
-}
-
-static gsf_result gsf__vae_config_int(const gsf__nn_config* config, const char* key, int64_t fallback, int64_t high,
-                                      int32_t* out) {
-    int64_t value;
-    GSF__TRY(gsf__nn_config_int_or(config, key, fallback, 1, high, &value));
-    *out = (int32_t)value;
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_check_unsupported(const gsf__nn_config* config) {
-    const char *act, *classname;
-    int quant, post_quant;
-    GSF__TRY(gsf__nn_config_string(config, "_class_name", "AutoencoderKLCogVideoX", &classname));
-    GSF__TRY(gsf__nn_config_string(config, "act_fn", "silu", &act));
-    GSF__TRY(gsf__nn_config_bool_or(config, "use_quant_conv", 0, &quant));
-    GSF__TRY(gsf__nn_config_bool_or(config, "use_post_quant_conv", 0, &post_quant));
-    if (strcmp(classname, "AutoencoderKLCogVideoX") != 0)
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: model is %.60s, not AutoencoderKLCogVideoX",
-                        config->json.name, classname);
-    if (strcmp(act, "silu") != 0)
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: act_fn is %.60s, not silu", config->json.name, act);
-    if (quant || post_quant)
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: quant_conv and post_quant_conv are not served",
-                        config->json.name);
-    return GSF_OK;
-}
-
-// Fallbacks are the class's own.
-static gsf_result gsf__vae_take_config(const gsf__nn_config* config, gsf_nn_vae* vae) {
-    int64_t channels[GSF_NN_VAE_LEVELS];
-    size_t levels;
-    GSF__TRY(gsf__vae_check_unsupported(config));
-    GSF__TRY(gsf__vae_config_int(config, "in_channels", 3, 64, &vae->in_channels));
-    GSF__TRY(gsf__vae_config_int(config, "out_channels", 3, 64, &vae->out_channels));
-    GSF__TRY(gsf__vae_config_int(config, "latent_channels", 16, 1024, &vae->latent_channels));
-    GSF__TRY(gsf__vae_config_int(config, "layers_per_block", 3, 64, &vae->layers_per_block));
-    GSF__TRY(gsf__vae_config_int(config, "norm_num_groups", 32, 8192, &vae->norm_groups));
-    GSF__TRY(gsf__vae_config_int(config, "temporal_compression_ratio", 4, 128, &vae->temporal_ratio));
-    GSF__TRY(gsf__vae_config_int(config, "sample_height", 480, 1 << 20, &vae->sample_height));
-    GSF__TRY(gsf__vae_config_int(config, "sample_width", 720, 1 << 20, &vae->sample_width));
-    GSF__TRY(gsf__nn_config_number_or(config, "norm_eps", 1e-6, 0.0, 1.0, &vae->norm_eps));
-    GSF__TRY(gsf__nn_config_number_or(config, "scaling_factor", 1.15258426, 1e-6, 1e6, &vae->scaling_factor));
-    GSF__TRY(gsf__nn_config_ints(config, "block_out_channels", 1, 8192, GSF_NN_VAE_LEVELS, channels, &levels));
-    GSF__TRY(gsf__vae_check_types(config, "down_block_types", "CogVideoXDownBlock3D", levels));
-    GSF__TRY(gsf__vae_check_types(config, "up_block_types", "CogVideoXUpBlock3D", levels));
-    vae->levels = (int32_t)levels;
-    vae->spatial_ratio = 1 << (levels - 1);
-    int32_t temporal = 1; // the nearest power of two from below, and no more than there are samplers
-    while (2 * temporal <= vae->temporal_ratio && 2 * temporal <= vae->spatial_ratio) temporal *= 2;
-    vae->temporal_ratio = temporal;
-    for (size_t i = 0; i < levels; i++) {
-        vae->channels[i] = (int32_t)channels[i];
-        if (channels[i] % vae->norm_groups != 0)
-            return gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s: %lld channels are no multiple of norm_num_groups %d",
-                            config->json.name, (long long)channels[i], (int)vae->norm_groups);
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_read_config(gsf_context* ctx, const char* folder, gsf_nn_vae* vae) {
-    gsf_text path;
-    gsf__nn_config config;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &config);
-    gsf_destroy_text(ctx, &path);
-    if (result != GSF_OK) return result;
-    result = gsf__vae_take_config(&config, vae);
-    gsf__nn_close_config(&config);
-    return result;
-}
-
-static gsf_result gsf__vae_load_nets(gsf_context* ctx, gsf_nn_vae* vae) {
-    gsf__vae_loader l;
-    memset(&l, 0, sizeof l);
-    gsf__vae_nets* nets = (gsf__vae_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
-    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    vae->nets = nets;
-    l.ctx = ctx;
-    l.vae = vae;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &vae->weights, &l.tensors));
-    l.net = &nets->encoder;
-    gsf_result result = gsf__vae_load_net(&l, 0);
-    l.net = &nets->decoder;
-    if (result == GSF_OK) result = gsf__vae_load_net(&l, 1);
-    return gsf__nn_end_loading(&l.tensors, result);
-}
-
-GSF_API gsf_result gsf_nn_make_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out) {
-    memset(out, 0, sizeof *out);
-    gsf_result result = gsf__vae_read_config(ctx, folder, out);
-    if (result == GSF_OK) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
-    if (result == GSF_OK) result = gsf__vae_load_nets(ctx, out);
-    if (result != GSF_OK) gsf_nn_destroy_vae(ctx, out);
-    return result;
-}
-
-static void gsf__vae_free_net(gsf_context* ctx, gsf__vae_net* net) {
-    for (int32_t i = 0; i < net->block_count; i++) gsf_free(ctx, net->blocks[i].resnets);
-}
-
-GSF_API void gsf_nn_destroy_vae(gsf_context* ctx, gsf_nn_vae* vae) {
-    gsf__vae_nets* nets = (gsf__vae_nets*)vae->nets;
-    if (nets) {
-        gsf__vae_free_net(ctx, &nets->encoder);
-        gsf__vae_free_net(ctx, &nets->decoder);
-        gsf_free(ctx, nets);
-    }
-    gsf_nn_close_weights(ctx, &vae->weights);
-    memset(vae, 0, sizeof *vae);
-}
-
-// ---- one run
-
-typedef struct gsf__vae_buffer {
-    float* data;
-    size_t size; // bytes
-} gsf__vae_buffer;
-
-typedef struct gsf__vae_cache { // of one causal layer: its last two input frames, normalised and bordered
-    gsf__vae_buffer frames[2];
-    int last[2]; // which of them comes last but one, and last; -1: none yet
-} gsf__vae_cache;
-
-typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
-    int slot;
-    int64_t frames, height, width, channels;
-} gsf__vae_map;
-
-// For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
-// `weight` names the layer.
-typedef struct gsf__vae_watch {
-    void (*fn)(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
-               const float* data);
-    void* user;
-} gsf__vae_watch;
-
-typedef struct gsf__vae_run {
-    gsf_context* ctx;
-    const gsf__vae_net* net;
-    int dry;
-    double flops;
-    size_t bytes, peak;
-    gsf__vae_buffer slots[GSF__VAE_SLOTS], spare, packed, table, partial, sums;
-    gsf__vae_cache* caches;  // per causal layer; a clip of one chunk uses only the first, for all
-    int32_t cache_at;
-    gsf__vae_map z;          // the chunk's latents (decoder)
-    int64_t chunk, chunks, done, total; // done, total: chunks of all tiles
-    const char* stage;
-    gsf__vae_watch watch;
-} gsf__vae_run;
-
-static gsf_result gsf__vae_grow(gsf__vae_run* run, gsf__vae_buffer* buffer, int64_t count) {
-    const size_t size = (size_t)count * sizeof(float); // gsf__vae_plan has bounded it
-    if (size <= buffer->size) return GSF_OK;
-    run->bytes += size - buffer->size;
-    if (run->bytes > run->peak) run->peak = run->bytes;
-    if (!run->dry) {
-        gsf_free(run->ctx, buffer->data);
-        buffer->size = 0;
-        buffer->data = (float*)gsf_alloc(run->ctx, size, 1);
-        if (!buffer->data) return GSF_ERROR_OUT_OF_MEMORY;
-    }
-    buffer->size = size;
-    return GSF_OK;
-}
-
-static void gsf__vae_release(gsf_context* ctx, gsf__vae_buffer* buffer) {
-    gsf_free(ctx, buffer->data);
-    memset(buffer, 0, sizeof *buffer);
-}
-
-static void gsf__vae_end(gsf__vae_run* run) {
-    for (int i = 0; i < GSF__VAE_SLOTS; i++) gsf__vae_release(run->ctx, &run->slots[i]);
-    for (int32_t i = 0; run->caches && i < run->net->causal_count; i++) {
-        gsf__vae_release(run->ctx, &run->caches[i].frames[0]);
-        gsf__vae_release(run->ctx, &run->caches[i].frames[1]);
-    }
-    gsf_free(run->ctx, run->caches);
-    gsf__vae_release(run->ctx, &run->spare);
-    gsf__vae_release(run->ctx, &run->packed);
-    gsf__vae_release(run->ctx, &run->table);
-    gsf__vae_release(run->ctx, &run->partial);
-    gsf__vae_release(run->ctx, &run->sums);
-}
-
-static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots, one frame and its part; groups, 2) doubles
-    run->caches = (gsf__vae_cache*)gsf_alloc_zeroed(run->ctx, (size_t)run->net->causal_count, sizeof *run->caches);
-    if (!run->caches) return GSF_ERROR_OUT_OF_MEMORY;
-    return gsf__vae_grow(run, &run->sums, (GSF__VAE_SLOTS + 2) * run->net->groups * 2 * 2);
-}
-
-static int64_t gsf__vae_plane(const gsf__vae_map* map) { return map->height * map->width * map->channels; }
-static double* gsf__vae_sums(const gsf__vae_run* run, int slot) { // slot GSF__VAE_SLOTS: of one frame, + 1: a part of it
-    return (double*)(void*)run->sums.data + slot * run->net->groups * 2;
-}
-static int64_t gsf__vae_groups(const gsf__vae_run* run, int64_t channels) {
-    return channels % run->net->groups == 0 ? run->net->groups : 1;
-}
-static int gsf__vae_free_slot(int a, int b) { // the first that is neither
-    int slot = 0;
-    while (slot == a || slot == b) slot++;
-    return slot;
-}
-
-// `tensor`: the weight of the layer whose result is at fault; its name loses ".conv.weight".
-static gsf_result gsf__vae_fail_nan(const gsf__vae_run* run, const gsf_tensor* tensor) {
-    char name[160];
-    snprintf(name, sizeof name, "%s", tensor->name);
-    char* end = strstr(name, ".weight");
-    if (end) *end = 0;
-    end = strstr(name, ".conv");
-    while (end && strcmp(end, ".conv") != 0) end = strstr(end + 1, ".conv");
-    if (end) *end = 0;
-    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: NaN or infinity in the result of %s, chunk %lld of %lld", run->stage,
-                    name, (long long)run->chunk + 1, (long long)run->chunks);
-}
-
-typedef struct gsf__vae_blend { // table (pixels, 2, channels): y and b become factors and summands of the normalised input
-    float* table;
-    const float *scale, *shift; // of the group norm: inverse deviation * weight, and bias
-    int64_t width, channels;
-} gsf__vae_blend;
-
-static void gsf__vae_blend_row(void* arg, size_t row, int worker) {
-    const gsf__vae_blend* job = (const gsf__vae_blend*)arg;
-    (void)worker;
-    for (int64_t x = 0; x < job->width; x++) {
-        float* y = job->table + ((int64_t)row * job->width + x) * 2 * job->channels;
-        float* b = y + job->channels;
-        for (int64_t c = 0; c < job->channels; c++) {
-            b[c] += y[c] * job->shift[c];
-            y[c] *= job->scale[c];
-        }
-    }
-}
-
-// conv_y and conv_b over the latents, at their own resolution: pointwise, so the nearest resize may follow.
-static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const float* scale, const float* shift,
-                             float* table) {
-    const int64_t c = norm->y.out;
-    const gsf__conv_layer* const layers[2] = {&norm->y, &norm->b};
-    gsf__vae_blend blend = {table, scale, shift, run->z.width, c};
-    for (int i = 0; i < 2; i++) {
-        gsf__conv_pack(run->ctx, layers[i], run->packed.data);
-        gsf__conv_job job = gsf__conv_begin(run->ctx, layers[i], run->z.frames * run->z.height, run->z.width, 0,
-                                            run->packed.data);
-        job.in[0] = run->slots[GSF__VAE_INPUT].data;
-        job.in_stride = run->z.width * run->z.channels; // no border
-        job.origin = 0;
-        job.out = table + i * c;
-        job.ldo = 2 * c;
-        job.out_row = run->z.width * job.ldo;
-        gsf__conv_frame(run->ctx, &job, NULL);
-    }
-    gsf__parallel_for(run->ctx, (size_t)(run->z.frames * run->z.height), gsf__vae_blend_row, &blend);
-}
-
-// run->table becomes (mean, scale, shift) per channel, and for the decoder the table of factors and summands after them.
-static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* norm, const gsf__vae_map* in) {
-    const int64_t c = in->channels, groups = run->net->groups, per = c / groups;
-    const int64_t pixels = norm->y.out ? run->z.frames * run->z.height * run->z.width : 0;
-    GSF__TRY(gsf__vae_grow(run, &run->table, c * 3 + pixels * 2 * c));
-    if (norm->y.out) {
-        GSF__TRY(gsf__vae_grow(run, &run->packed, gsf__conv_packed(&norm->y)));
-        run->flops += 4.0 * (double)(pixels * c * run->z.channels);
-    }
-    if (run->dry) return GSF_OK;
-    float *mean = run->table.data, *scale = mean + c, *shift = scale + c;
-    const double* sums = gsf__vae_sums(run, in->slot);
-    const double count = (double)in->frames * (double)in->height * (double)in->width * (double)per;
-    gsf_nn_read_tensor(norm->weight, 0, c, scale);
-    gsf_nn_read_tensor(norm->bias, 0, c, shift);
-    for (int64_t i = 0; i < c; i++) { // E[x^2] - E[x]^2 in double, of floats: good to 1e-8 at a mean of 1e4 deviations
-        const double m = sums[i / per * 2] / count, v = sums[i / per * 2 + 1] / count - m * m;
-        mean[i] = (float)m;
-        scale[i] = (float)((double)scale[i] / sqrt((v > 0.0 ? v : 0.0) + norm->eps));
-    }
-    if (norm->y.out) gsf__vae_spatial(run, norm, scale, shift, shift + c);
-    return GSF_OK;
-}
-
-// The latent frame that frame t of n sees: nearest, the first frame apart where n is odd.
-static int64_t gsf__vae_latent_frame(int64_t t, int64_t n, int64_t latents) {
-    if (n % 2 == 0 || n == 1) return t * latents / n;
-    return t == 0 ? 0 : 1 + (t - 1) * (latents - 1) / (n - 1);
-}
-
-// Frame `t` of `in`, normalised where there is a norm, into `out` with a border.
-static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gsf__vae_map* in, int64_t t, float* out) {
-    gsf__conv_fill fill;
-    memset(&fill, 0, sizeof fill);
-    fill.kernels = gsf__conv_kernels_of(run->ctx->cpu_level);
-    fill.x = run->slots[in->slot].data + t * gsf__vae_plane(in);
-    fill.height = in->height;
-    fill.width = in->width;
-    fill.channels = in->channels;
-    fill.out = out;
-    if (norm) {
-        fill.mean = run->table.data;
-        fill.table = fill.mean + in->channels; // scale, shift
-        if (norm->y.out) {
-            const int64_t z = gsf__vae_latent_frame(t, in->frames, run->z.frames);
-            fill.table_width = run->z.width;
-            fill.table += 2 * in->channels + z * run->z.height * run->z.width * 2 * in->channels;
-            while (run->z.height << fill.shift < in->height) fill.shift++;
-        }
-    }
-    gsf__conv_fill_frame(run->ctx, &fill);
-    if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
-}
-
-// Room for a layer's result in slot out->slot, its weights and its sums; starts the job. The weights are not packed yet.
-static gsf_result gsf__vae_start(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in, int halve,
-                                 gsf__vae_map* out, gsf__conv_job* job) {
-    GSF__TRY(gsf__check_cancel(run->ctx));
-    GSF__TRY(gsf__vae_grow(run, &run->packed, gsf__conv_packed(layer)));
-    GSF__TRY(gsf__vae_grow(run, &run->slots[out->slot], out->frames * gsf__vae_plane(out)));
-    *job = gsf__conv_begin(run->ctx, layer, in->height, in->width, halve, run->packed.data);
-    job->groups = gsf__vae_groups(run, layer->out);
-    GSF__TRY(gsf__vae_grow(run, &run->partial, gsf__conv_segments(job) * job->groups * 2 * 2));
-    job->partial = (double*)(void*)run->partial.data;
-    if (!run->dry) memset(gsf__vae_sums(run, out->slot), 0, (size_t)run->net->groups * 2 * sizeof(double));
-    return GSF_OK;
-}
-
-static void gsf__vae_count(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out, int64_t frames) {
-    run->flops += 2.0 * (double)(frames * out->height * out->width) *
-                  (double)(gsf__conv_taps(layer) * layer->in * layer->out);
-}
-
-static void gsf__vae_add_sums(gsf__vae_run* run, int slot) {
-    double* total = gsf__vae_sums(run, slot);
-    const double* frame = gsf__vae_sums(run, GSF__VAE_SLOTS);
-    for (int64_t i = 0; i < run->net->groups * 2; i++) total[i] += frame[i];
-}
-
-static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out) {
-    if (run->dry) return GSF_OK;
-    const double* sums = gsf__vae_sums(run, out->slot);
-    for (int64_t i = 0; i < gsf__vae_groups(run, layer->out) * 2; i++)
-        if (!(fabs(sums[i]) <= DBL_MAX)) return gsf__vae_fail_nan(run, layer->weight);
-    if (run->watch.fn)
-        run->watch.fn(run->watch.user, layer->weight, run->chunk, out, -1, run->slots[out->slot].data);
-    return GSF_OK;
-}
-
-// The frames that the next chunk's layer starts from; one that stands in the spare frame moves.
-static void gsf__vae_keep(gsf__vae_run* run, gsf__vae_cache* cache, int before, int last, size_t bytes) {
-    if (before == 2 || last == 2) {
-        const int other = before == 2 ? last : before;
-        const int room = other == 0;
-        memcpy(cache->frames[room].data, run->spare.data, bytes);
-        if (before == 2) before = room;
-        if (last == 2) last = room;
-    }
-    cache->last[0] = before;
-    cache->last[1] = last;
-}
-
-// A causal layer, `norm` and SiLU before it (NULL: neither); the result goes to out->slot, or is added to it.
-static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_norm* norm,
-                                  const gsf__vae_map* in, int accumulate, gsf__vae_map* out) {
-    gsf__conv_job job;
-    const int slot = out->slot;
-    *out = *in;
-    out->slot = slot;
-    out->channels = layer->out;
-    const int64_t frame = gsf__conv_frame_size(in->height, in->width, in->channels);
-    gsf__vae_cache* cache = &run->caches[run->chunks == 1 ? 0 : run->cache_at++];
-    if (run->chunk == 0) cache->last[0] = cache->last[1] = -1;
-    GSF__TRY(gsf__vae_grow(run, &cache->frames[0], frame));
-    GSF__TRY(gsf__vae_grow(run, &cache->frames[1], frame));
-    GSF__TRY(gsf__vae_grow(run, &run->spare, frame));
-    if (norm) GSF__TRY(gsf__vae_prepare_norm(run, norm, in));
-    GSF__TRY(gsf__vae_start(run, layer, in, 0, out, &job));
-    gsf__vae_count(run, layer, out, out->frames);
-    if (run->dry) return GSF_OK;
-    gsf__conv_pack(run->ctx, layer, run->packed.data);
-    float* const ring[3] = {cache->frames[0].data, cache->frames[1].data, run->spare.data};
-    int before = cache->last[0], last = cache->last[1];
-    job.accumulate = accumulate;
-    for (int64_t t = 0; t < in->frames; t++) {
-        GSF__TRY(gsf__check_cancel(run->ctx));
-        int now = 0;
-        while (now == before || now == last) now++;
-        gsf__vae_fill(run, norm, in, t, ring[now]);
-        if (last < 0) before = last = now; // before the first frame: itself
-        job.in[0] = ring[before];
-        job.in[1] = ring[last];
-        job.in[2] = ring[now];
-        job.out = run->slots[slot].data + t * gsf__vae_plane(out);
-        gsf__conv_frame(run->ctx, &job, gsf__vae_sums(run, GSF__VAE_SLOTS));
-        gsf__vae_add_sums(run, slot);
-        before = last;
-        last = now;
-    }
-    if (run->chunk + 1 < run->chunks) gsf__vae_keep(run, cache, before, last, (size_t)frame * sizeof(float));
-    return gsf__vae_finish(run, layer, out);
-}
-
-// Pointwise: to slot `slot`, or, where that is the input's and the channels get fewer, in place, frame by frame.
-static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in,
-                                    gsf__vae_map* out) {
-    gsf__conv_job job;
-    const int slot = out->slot;
-    *out = *in;
-    out->slot = slot;
-    out->channels = layer->out;
-    const int64_t plane = gsf__vae_plane(out);
-    GSF__TRY(gsf__vae_grow(run, &run->spare, plane));
-    GSF__TRY(gsf__vae_start(run, layer, in, 0, out, &job));
-    gsf__vae_count(run, layer, out, out->frames);
-    if (run->dry) return GSF_OK;
-    gsf__conv_pack(run->ctx, layer, run->packed.data);
-    job.in_stride = in->width * in->channels;
-    job.origin = 0;
-    job.partial = NULL; // conv2 will be added
-    for (int64_t t = 0; t < in->frames; t++) {
-        float* y = run->slots[slot].data + t * plane;
-        job.in[0] = run->slots[in->slot].data + t * gsf__vae_plane(in);
-        job.out = slot == in->slot ? run->spare.data : y;
-        gsf__conv_frame(run->ctx, &job, NULL);
-        if (slot == in->slot) memcpy(y, run->spare.data, (size_t)plane * sizeof(float));
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_resnet_run(gsf__vae_run* run, const gsf__vae_resnet* resnet, gsf__vae_map* x) {
-    gsf__vae_map middle, sum = *x;
-    middle.slot = gsf__vae_free_slot(x->slot, -1);
-    GSF__TRY(gsf__vae_causal(run, &resnet->conv1, &resnet->norm1, x, 0, &middle));
-    if (resnet->shortcut.out) {
-        if (resnet->shortcut.out > x->channels) sum.slot = gsf__vae_free_slot(x->slot, middle.slot);
-        GSF__TRY(gsf__vae_shortcut(run, &resnet->shortcut, x, &sum));
-    }
-    GSF__TRY(gsf__vae_causal(run, &resnet->conv2, &resnet->norm2, &middle, 1, &sum));
-    *x = sum;
-    return GSF_OK;
-}
-
-// Source frame of frame t of a doubled clip; an odd clip's first frame is not doubled.
-static int64_t gsf__vae_double_source(int64_t t, int64_t frames, int time) {
-    return !time || frames == 1 ? t : frames % 2 ? (t + 1) / 2 : t / 2;
-}
-
-// One frame of gsf__vae_double: `job` for parity (0, 0) of a `width` wide input, packed weights of all four.
-static void gsf__vae_double_frame(gsf__vae_run* run, const gsf__conv_layer* quarter, const gsf__conv_job* job, float* out) {
-    double* sums = gsf__vae_sums(run, GSF__VAE_SLOTS);
-    double* part = gsf__vae_sums(run, GSF__VAE_SLOTS + 1);
-    memset(sums, 0, (size_t)run->net->groups * 2 * sizeof(double));
-    for (int64_t parity = 0; parity < 4; parity++) {
-        const int64_t py = parity / 2, px = parity % 2;
-        gsf__conv_job one = *job;
-        one.pad = 1 - py;
-        one.origin = px * quarter->in;
-        one.packed += parity * gsf__conv_packed(quarter);
-        one.ldo = 2 * quarter->out;
-        one.out_row = 2 * job->width * one.ldo;
-        one.out = out + py * job->width * one.ldo + px * quarter->out;
-        gsf__conv_frame(run->ctx, &one, part);
-        for (int64_t i = 0; i < run->net->groups * 2; i++) sums[i] += part[i];
-    }
-}
-
-// Nearest resize to twice the size and, with `time`, twice the frames, then a 2D convolution, once for frames that are
-// alike.
-static gsf_result gsf__vae_double(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
-    const gsf__conv_layer quarter = gsf__conv_quarter(&block->sampler);
-    gsf__conv_job job;
-    gsf__vae_map out = *x;
-    out.height *= 2;
-    out.width *= 2;
-    out.slot = gsf__vae_free_slot(x->slot, -1);
-    if (block->time && x->frames > 1) out.frames = 2 * x->frames - x->frames % 2;
-    const int64_t plane = gsf__vae_plane(&out);
-    GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(x->height, x->width, x->channels)));
-    GSF__TRY(gsf__vae_grow(run, &run->packed, 4 * gsf__conv_packed(&quarter)));
-    GSF__TRY(gsf__vae_start(run, &quarter, x, 0, &out, &job));
-    gsf__vae_count(run, &quarter, &out, x->frames);
-    if (!run->dry) gsf__conv_pack_quarters(run->ctx, &block->sampler, run->packed.data);
-    job.in[0] = run->spare.data;
-    for (int64_t t = 0; !run->dry && t < out.frames; t++) {
-        const int64_t source = gsf__vae_double_source(t, x->frames, block->time);
-        float* y = run->slots[out.slot].data + t * plane;
-        if (t > 0 && source == gsf__vae_double_source(t - 1, x->frames, block->time)) {
-            memcpy(y, y - plane, (size_t)plane * sizeof(float));
-        } else {
-            GSF__TRY(gsf__check_cancel(run->ctx));
-            gsf__vae_fill(run, NULL, x, source, run->spare.data);
-            gsf__vae_double_frame(run, &quarter, &job, y);
-        }
-        gsf__vae_add_sums(run, out.slot);
-    }
-    *x = out;
-    return gsf__vae_finish(run, &block->sampler, x);
-}
-
-// With `time`, means of two frames (an odd clip's first frame stays alone), then a 2D convolution of stride 2.
-static gsf_result gsf__vae_halve(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
-    gsf__conv_job job;
-    gsf__conv_fill fill;
-    gsf__vae_map out = *x;
-    const int64_t odd = x->frames % 2;
-    out.slot = gsf__vae_free_slot(x->slot, -1);
-    out.height /= 2;
-    out.width /= 2;
-    if (block->time) out.frames = (x->frames + 1) / 2;
-    GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(x->height, x->width, x->channels)));
-    GSF__TRY(gsf__vae_start(run, &block->sampler, x, 1, &out, &job));
-    gsf__vae_count(run, &block->sampler, &out, out.frames);
-    if (!run->dry) gsf__conv_pack(run->ctx, &block->sampler, run->packed.data);
-    memset(&fill, 0, sizeof fill);
-    fill.height = x->height;
-    fill.width = x->width;
-    fill.channels = x->channels;
-    fill.out = run->spare.data;
-    job.in[0] = run->spare.data;
-    for (int64_t t = 0; !run->dry && t < out.frames; t++) {
-        const int64_t first = !block->time ? t : t == 0 ? 0 : 2 * t - odd;
-        GSF__TRY(gsf__check_cancel(run->ctx));
-        fill.x = run->slots[x->slot].data + first * gsf__vae_plane(x);
-        fill.x2 = block->time && !(odd && t == 0) ? fill.x + gsf__vae_plane(x) : NULL;
-        gsf__conv_fill_frame(run->ctx, &fill);
-        job.out = run->slots[out.slot].data + t * gsf__vae_plane(&out);
-        gsf__conv_frame(run->ctx, &job, gsf__vae_sums(run, GSF__VAE_SLOTS));
-        gsf__vae_add_sums(run, out.slot);
-    }
-    *x = out;
-    return gsf__vae_finish(run, &block->sampler, x);
-}
-
-// One chunk, whose input stands in slot GSF__VAE_INPUT.
-static gsf_result gsf__vae_chunk(gsf__vae_run* run, const gsf__vae_map* in, gsf__vae_map* out) {
-    const gsf__vae_net* net = run->net;
-    gsf__vae_map x;
-    run->z = *in;
-    run->cache_at = 0;
-    x.slot = 0;
-    GSF__TRY(gsf__vae_causal(run, &net->conv_in, NULL, in, 0, &x));
-    for (int32_t i = 0; i < net->block_count; i++) {
-        const gsf__vae_block* block = &net->blocks[i];
-        for (int32_t j = 0; j < block->count; j++) GSF__TRY(gsf__vae_resnet_run(run, &block->resnets[j], &x));
-        if (!block->sampler.out) continue;
-        if (net->decoder) GSF__TRY(gsf__vae_double(run, block, &x));
-        else GSF__TRY(gsf__vae_halve(run, block, &x));
-    }
-    out->slot = gsf__vae_free_slot(x.slot, -1);
-    return gsf__vae_causal(run, &net->conv_out, &net->norm_out, &x, 0, out);
-}
-
-// ---- clips
-
-typedef struct gsf__vae_planes { // a view of (channels, frames, height, width) floats
-    float* data;
-    int64_t channels, frames, height, width;
-    int64_t channel_stride, frame_stride, row_stride;
-} gsf__vae_planes;
-
-static gsf__vae_planes gsf__vae_wrap(float* data, int64_t channels, int64_t frames, int64_t height, int64_t width) {
-    gsf__vae_planes p;
-    p.data = data;
-    p.channels = channels;
-    p.frames = frames;
-    p.height = height;
-    p.width = width;
-    p.channel_stride = frames * height * width;
-    p.frame_stride = height * width;
-    p.row_stride = width;
-    return p;
-}
-
-static gsf__vae_planes gsf__vae_part(gsf__vae_planes p, int64_t y, int64_t x, int64_t height, int64_t width) {
-    if (p.data) p.data += y * p.row_stride + x;
-    p.height = p.height - y < height ? p.height - y : height;
-    p.width = p.width - x < width ? p.width - x : width;
-    return p;
-}
-
-static float* gsf__vae_row(const gsf__vae_planes* p, int64_t c, int64_t t, int64_t y) {
-    return p->data + c * p->channel_stride + t * p->frame_stride + y * p->row_stride;
-}
-
-// Frames of a clip to channels-last.
-static void gsf__vae_gather(const gsf__vae_planes* in, int64_t first, int64_t frames, float* out) {
-    for (int64_t t = 0; t < frames; t++)
-        for (int64_t y = 0; y < in->height; y++, out += in->width * in->channels)
-            for (int64_t c = 0; c < in->channels; c++) {
-                const float* row = gsf__vae_row(in, c, first + t, y);
-                for (int64_t x = 0; x < in->width; x++) out[x * in->channels + c] = row[x];
-            }
-}
-
-static void gsf__vae_scatter(const float* x, int64_t first, int64_t frames, const gsf__vae_planes* out) {
-    for (int64_t t = 0; t < frames; t++)
-        for (int64_t y = 0; y < out->height; y++, x += out->width * out->channels)
-            for (int64_t c = 0; c < out->channels; c++) {
-                float* row = gsf__vae_row(out, c, first + t, y);
-                for (int64_t i = 0; i < out->width; i++) row[i] = x[i * out->channels + c];
-            }
-}
-
-static int64_t gsf__vae_chunk_count(int64_t frames, int decoder) {
-    const int64_t per = decoder ? GSF__VAE_DECODER_FRAMES : GSF__VAE_ENCODER_FRAMES;
-    return frames < per ? 1 : frames / per;
-}
-
-// Frames of chunk k: the remainder joins the first.
-static int64_t gsf__vae_chunk_frames(int64_t frames, int decoder, int64_t k) {
-    const int64_t per = decoder ? GSF__VAE_DECODER_FRAMES : GSF__VAE_ENCODER_FRAMES;
-    if (frames < per) return frames;
-    return k == 0 ? per + frames % per : per;
-}
-
-static int64_t gsf__vae_out_frames(const gsf_nn_vae* vae, int64_t frames, int decoder) {
-    int64_t sum = 0;
-    const int64_t chunks = gsf__vae_chunk_count(frames, decoder);
-    for (int64_t k = 0; k < 2 && k < chunks; k++) { // all but the first are alike
-        int64_t n = gsf__vae_chunk_frames(frames, decoder, k);
-        for (int32_t ratio = vae->temporal_ratio; ratio > 1; ratio /= 2) {
-            if (!decoder) n = (n + 1) / 2;
-            else if (n > 1) n = 2 * n - n % 2;
-        }
-        sum += k ? n * (chunks - 1) : n;
-    }
-    return sum;
-}
-
-// All chunks of a clip or tile.
-static gsf_result gsf__vae_clip(gsf__vae_run* run, const gsf__vae_planes* in, const gsf__vae_planes* out) {
-    int64_t first = 0, out_first = 0;
-    run->chunks = gsf__vae_chunk_count(in->frames, run->net->decoder);
-    for (run->chunk = 0; run->chunk < run->chunks; run->chunk++) {
-        gsf__vae_map x, y;
-        x.slot = GSF__VAE_INPUT;
-        x.frames = gsf__vae_chunk_frames(in->frames, run->net->decoder, run->chunk);
-        x.height = in->height;
-        x.width = in->width;
-        x.channels = in->channels;
-        GSF__TRY(gsf__vae_grow(run, &run->slots[GSF__VAE_INPUT], x.frames * gsf__vae_plane(&x)));
-        if (!run->dry) gsf__vae_gather(in, first, x.frames, run->slots[GSF__VAE_INPUT].data);
-        GSF__TRY(gsf__vae_chunk(run, &x, &y));
-        if (!run->dry) {
-            gsf__vae_scatter(run->slots[y.slot].data, out_first, y.frames, out);
-            gsf__progress(run->ctx, run->stage, (double)++run->done, (double)run->total);
-        }
-        first += x.frames;
-        out_first += y.frames;
-    }
-    return GSF_OK;
-}
-
-typedef struct gsf__vae_plan { // how a job is tiled; an untiled one is a single tile
-    int64_t out_frames, out_height, out_width, out_channels;
-    int64_t rows, columns;                 // tiles
-    int64_t tile[2], step[2];              // height, width of a tile of the input; distance of two
-    int64_t out_step[2], blend[2];         // the same distance and the overlap in the result
-} gsf__vae_plan;
-
-// int() of a Python float.
-static int64_t gsf__vae_whole(double value) { return (int64_t)floor(value); }
-
-static gsf_result gsf__vae_plan_axis(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const char* axis, int64_t tile,
-                                     double overlap, int i, gsf__vae_plan* plan) {
-    const int64_t ratio = vae->spatial_ratio, latent = tile / ratio;
-    const int64_t blend = gsf__vae_whole((double)tile * overlap), latent_blend = gsf__vae_whole((double)latent * overlap);
-    const int64_t step = gsf__vae_whole((double)tile * (1.0 - overlap));
-    const int64_t latent_step = gsf__vae_whole((double)latent * (1.0 - overlap));
-    if (tile % ratio != 0 || blend != latent_blend * ratio || step != tile - blend ||
-        latent_step != latent - latent_blend || latent_step < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "tiling: a tile %s of %lld times overlap %g is not a whole number of latents (%d pixels each)",
-                        axis, (long long)tile, overlap, (int)ratio);
-    plan->tile[i] = decoder ? latent : tile;
-    plan->step[i] = decoder ? latent_step : step;
-    plan->out_step[i] = decoder ? step : latent_step;
-    plan->blend[i] = decoder ? blend : latent_blend;
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_check_size(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, int64_t frames, int64_t height,
-                                      int64_t width) {
-    double widest = 2.0 * vae->latent_channels;
-    const int64_t least = decoder ? 1 : vae->spatial_ratio;
-    if (!vae->nets) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: no model is open");
-    if (frames < 1 || height < least || width < least)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: %lld frames of %lld x %lld, but at least 1 of %lld x %lld "
-                        "is needed", (long long)frames, (long long)width, (long long)height, (long long)least,
-                        (long long)least);
-    for (int32_t i = 0; i < vae->levels; i++)
-        if (vae->channels[i] > widest) widest = vae->channels[i];
-    const double scale = decoder ? (double)vae->spatial_ratio * vae->spatial_ratio * vae->temporal_ratio : 1.0;
-    if ((double)frames * ((double)height + 2.0) * ((double)width + 2.0) * scale * widest > 1e15) // sizes below 2^63
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: %lld frames of %lld x %lld are too large", (long long)frames,
-                        (long long)width, (long long)height);
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_make_plan(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
-                                     int64_t frames, int64_t height, int64_t width, gsf__vae_plan* plan) {
-    const int64_t ratio = vae->spatial_ratio;
-    memset(plan, 0, sizeof *plan);
-    GSF__TRY(gsf__vae_check_size(ctx, vae, decoder, frames, height, width));
-    plan->out_channels = decoder ? vae->out_channels : 2 * vae->latent_channels;
-    plan->out_frames = gsf__vae_out_frames(vae, frames, decoder);
-    plan->out_height = decoder ? height * ratio : height / ratio;
-    plan->out_width = decoder ? width * ratio : width / ratio;
-    plan->rows = plan->columns = 1;
-    plan->tile[0] = plan->step[0] = height;
-    plan->tile[1] = plan->step[1] = width;
-    plan->out_step[0] = plan->out_height;
-    plan->out_step[1] = plan->out_width;
-    if (!desc || !desc->tiled) return GSF_OK;
-    gsf__vae_plan tiled = *plan;
-    const int64_t tile_height = desc->tile_height ? desc->tile_height : vae->sample_height / 2;
-    const int64_t tile_width = desc->tile_width ? desc->tile_width : vae->sample_width / 2;
-    GSF__TRY(gsf__vae_plan_axis(ctx, vae, decoder, "height", tile_height,
-                                desc->overlap_height > 0.0 ? desc->overlap_height : 1.0 / 6.0, 0, &tiled));
-    GSF__TRY(gsf__vae_plan_axis(ctx, vae, decoder, "width", tile_width,
-                                desc->overlap_width > 0.0 ? desc->overlap_width : 1.0 / 5.0, 1, &tiled));
-    if (height <= tiled.tile[0] && width <= tiled.tile[1]) return GSF_OK;
-    tiled.rows = (height + tiled.step[0] - 1) / tiled.step[0];
-    tiled.columns = (width + tiled.step[1] - 1) / tiled.step[1];
-    const int64_t bottom = height - (tiled.rows - 1) * tiled.step[0], right = width - (tiled.columns - 1) * tiled.step[1];
-    if (!decoder && (bottom % ratio != 0 || right % ratio != 0))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "tiling: %lld x %lld leaves a last tile of %lld x %lld, which is no multiple of %lld",
-                        (long long)width, (long long)height, (long long)right, (long long)bottom, (long long)ratio);
-    *plan = tiled;
-    return GSF_OK;
-}
-
-// b's first lines fade from a's last ones, in place. `across`: columns instead of rows.
-static void gsf__vae_fade(const gsf__vae_planes* a, const gsf__vae_planes* b, int64_t extent, int across) {
-    const int64_t a_size = across ? a->width : a->height, b_size = across ? b->width : b->height;
-    if (extent > a_size) extent = a_size;
-    if (extent > b_size) extent = b_size;
-    for (int64_t i = 0; i < extent; i++) {
-        const float weight = (float)((double)i / (double)extent), rest = (float)(1.0 - (double)i / (double)extent);
-        const int64_t lines = across ? b->height : b->width;
-        for (int64_t c = 0; c < b->channels; c++)
-            for (int64_t t = 0; t < b->frames; t++)
-                for (int64_t j = 0; j < lines; j++) {
-                    float* y = across ? gsf__vae_row(b, c, t, j) + i : gsf__vae_row(b, c, t, i) + j;
-                    const float x = across ? gsf__vae_row(a, c, t, j)[a_size - extent + i]
-                                           : gsf__vae_row(a, c, t, a_size - extent + i)[j];
-                    *y = x * rest + *y * weight;
-                }
-    }
-}
-
-static void gsf__vae_copy(const gsf__vae_planes* from, const gsf__vae_planes* to) { // what both have
-    const int64_t height = from->height < to->height ? from->height : to->height;
-    const int64_t width = from->width < to->width ? from->width : to->width;
-    for (int64_t c = 0; c < to->channels; c++)
-        for (int64_t t = 0; t < to->frames; t++)
-            for (int64_t y = 0; y < height; y++)
-                memcpy(gsf__vae_row(to, c, t, y), gsf__vae_row(from, c, t, y), (size_t)width * sizeof(float));
-}
-
-// Height (axis 0) or width of tile k of an input of `size`.
-static int64_t gsf__vae_tile_size(const gsf__vae_plan* plan, int axis, int64_t size, int64_t k) {
-    const int64_t left = size - k * plan->step[axis];
-    return left < plan->tile[axis] ? left : plan->tile[axis];
-}
-
-// Tile after tile, each over all frames. A tile is blended with the blended ones above and to the left, which is why two
-// rows of tiles are kept: tiles (2, columns).
-static gsf_result gsf__vae_tiles(gsf__vae_run* run, const gsf__vae_plan* plan, const gsf__vae_planes* in,
-                                 const gsf__vae_planes* out, gsf__vae_buffer* tiles) {
-    const int64_t ratio_up = run->net->decoder ? plan->out_step[0] / plan->step[0] : 1;
-    const int64_t ratio_down = run->net->decoder ? 1 : plan->step[0] / plan->out_step[0];
-    for (int64_t i = 0; i < plan->rows; i++)
-        for (int64_t j = 0; j < plan->columns; j++) {
-            const gsf__vae_planes part = gsf__vae_part(*in, i * plan->step[0], j * plan->step[1], plan->tile[0],
-                                                       plan->tile[1]);
-            gsf__vae_buffer *own = &tiles[i % 2 * plan->columns + j], *above = &tiles[(i + 1) % 2 * plan->columns + j];
-            const int64_t h = part.height * ratio_up / ratio_down, w = part.width * ratio_up / ratio_down;
-            GSF__TRY(gsf__vae_grow(run, own, plan->out_channels * plan->out_frames * h * w));
-            const gsf__vae_planes tile = gsf__vae_wrap(own->data, plan->out_channels, plan->out_frames, h, w);
-            GSF__TRY(gsf__vae_clip(run, &part, &tile));
-            if (run->dry) continue;
-            if (i > 0) {
-                const int64_t size = gsf__vae_tile_size(plan, 0, in->height, i - 1) * ratio_up / ratio_down;
-                const gsf__vae_planes a = gsf__vae_wrap(above->data, plan->out_channels, plan->out_frames, size, w);
-                gsf__vae_fade(&a, &tile, plan->blend[0], 0);
-            }
-            if (j > 0) {
-                const int64_t size = gsf__vae_tile_size(plan, 1, in->width, j - 1) * ratio_up / ratio_down;
-                const gsf__vae_planes a = gsf__vae_wrap(own[-1].data, plan->out_channels, plan->out_frames, h, size);
-                gsf__vae_fade(&a, &tile, plan->blend[1], 1);
-            }
-            const gsf__vae_planes place = gsf__vae_part(*out, i * plan->out_step[0], j * plan->out_step[1],
-                                                        plan->out_step[0], plan->out_step[1]);
-            gsf__vae_copy(&tile, &place);
-        }
-    return GSF_OK;
-}
-
-typedef struct gsf__vae_task {
-    const gsf_nn_vae* vae;
-    gsf__vae_plan plan;
-    int decoder;
-    int64_t frames, height, width;
-    gsf__vae_buffer moments; // encoder: (2 latent_channels, ...)
-    gsf__vae_buffer* tiles;
-    gsf__vae_watch watch;
-} gsf__vae_task;
-
-static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const float* in, float* out) {
-    const gsf__vae_plan* plan = &task->plan;
-    const gsf_nn_vae* vae = task->vae;
-    GSF__TRY(gsf__vae_begin(run));
-    if (!task->decoder) {
-        GSF__TRY(gsf__vae_grow(run, &task->moments,
-                               plan->out_channels * plan->out_frames * plan->out_height * plan->out_width));
-        out = task->moments.data;
-    }
-    // The input is only read; gsf__vae_planes serves both ways.
-    const gsf__vae_planes from =
-        gsf__vae_wrap((float*)(uintptr_t)in, task->decoder ? vae->latent_channels : vae->in_channels, task->frames,
-                      task->height, task->width);
-    const gsf__vae_planes to = gsf__vae_wrap(out, plan->out_channels, plan->out_frames, plan->out_height, plan->out_width);
-    if (plan->rows * plan->columns == 1) return gsf__vae_clip(run, &from, &to);
-    task->tiles = (gsf__vae_buffer*)gsf_alloc_zeroed(run->ctx, (size_t)plan->columns * 2, sizeof *task->tiles);
-    if (!task->tiles) return GSF_ERROR_OUT_OF_MEMORY;
-    return gsf__vae_tiles(run, plan, &from, &to, task->tiles);
-}
-
-// Runs, or with in == NULL only counts: *flops and *bytes.
-static gsf_result gsf__vae_execute(gsf_context* ctx, gsf__vae_task* task, const float* in, float* out, float* mean,
-                                   float* logvar, double* flops, double* bytes) {
-    const gsf__vae_nets* nets = (const gsf__vae_nets*)task->vae->nets;
-    gsf__vae_run run;
-    memset(&run, 0, sizeof run);
-    run.ctx = ctx;
-    run.net = task->decoder ? &nets->decoder : &nets->encoder;
-    run.dry = !in;
-    run.total = gsf__vae_chunk_count(task->frames, task->decoder) * task->plan.rows * task->plan.columns;
-    run.stage = task->decoder ? "vae decode" : "vae encode";
-    run.watch = task->watch;
-    const gsf_result result = gsf__vae_walk(&run, task, in, out);
-    *flops = run.flops;
-    *bytes = (double)run.peak;
-    if (result == GSF_OK && in && !task->decoder) {
-        const size_t half = task->moments.size / sizeof(float) / 2;
-        const float* moments = task->moments.data;
-        memcpy(mean, moments, half * sizeof(float));
-        for (size_t i = 0; logvar && i < half; i++) {
-            const float v = moments[half + i];
-            logvar[i] = v < -30.0f ? -30.0f : v > 20.0f ? 20.0f : v;
-        }
-    }
-    for (int64_t i = 0; task->tiles && i < task->plan.columns * 2; i++) gsf__vae_release(ctx, &task->tiles[i]);
-    gsf_free(ctx, task->tiles);
-    task->tiles = NULL;
-    gsf__vae_release(ctx, &task->moments);
-    gsf__vae_end(&run);
-    return result;
-}
-
-static gsf_result gsf__vae_make_task(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
-                                     int64_t frames, int64_t height, int64_t width, gsf__vae_task* task,
-                                     gsf_nn_vae_info* info) {
-    memset(task, 0, sizeof *task);
-    memset(info, 0, sizeof *info);
-    task->vae = vae;
-    task->decoder = decoder;
-    task->frames = frames;
-    task->height = height;
-    task->width = width;
-    GSF__TRY(gsf__vae_make_plan(ctx, vae, decoder, desc, frames, height, width, &task->plan));
-    info->frames = task->plan.out_frames;
-    info->height = task->plan.out_height;
-    info->width = task->plan.out_width;
-    info->chunks = gsf__vae_chunk_count(frames, decoder) * task->plan.rows * task->plan.columns;
-    return gsf__vae_execute(ctx, task, NULL, NULL, NULL, NULL, &info->flops, &info->bytes);
-}
-
-GSF_API gsf_result gsf_nn_query_vae(gsf_context* ctx, const gsf_nn_vae* vae, gsf_nn_vae_way way,
-                                    const gsf_nn_vae_desc* desc, int64_t frames, int64_t height, int64_t width,
-                                    gsf_nn_vae_info* out) {
-    gsf__vae_task task;
-    return gsf__vae_make_task(ctx, vae, way == GSF_NN_VAE_DECODE, desc, frames, height, width, &task, out);
-}
-
-static gsf_result gsf__vae_check_finite(gsf_context* ctx, const char* what, const float* x, int64_t channels,
-                                        int64_t frames, int64_t height, int64_t width) {
-    const int64_t at = gsf__nn_find_not_finite(ctx, x, channels * frames * height * width);
-    if (at < 0) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: NaN or infinity in channel %lld, frame %lld, row %lld, column %lld", what,
-                    (long long)(at / (frames * height * width)), (long long)(at / (height * width) % frames),
-                    (long long)(at / width % height), (long long)(at % width));
-}
-
-static gsf_result gsf__vae_apply(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
-                                 const float* in, int64_t frames, int64_t height, int64_t width, float* video, float* mean,
-                                 float* logvar) {
-    gsf__vae_task task;
-    gsf_nn_vae_info info;
-    const char* stage = decoder ? "vae decode" : "vae encode";
-    double flops, bytes;
-    if (!in || (decoder ? !video : !mean))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: an array is missing", stage);
-    GSF__TRY(gsf__vae_make_task(ctx, vae, decoder, desc, frames, height, width, &task, &info));
-    if (desc && desc->max_bytes > 0.0 && info.bytes > desc->max_bytes)
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: needs %.0f MiB, %.0f are allowed", stage,
-                        ceil(info.bytes / 1048576.0), desc->max_bytes / 1048576.0);
-    GSF__TRY(gsf__vae_check_finite(ctx, decoder ? "latents" : "video", in,
-                                   decoder ? vae->latent_channels : vae->in_channels, frames, height, width));
-    const gsf_result result = gsf__vae_execute(ctx, &task, in, video, mean, logvar, &flops, &bytes);
-    if (result == GSF_OK) return GSF_OK;
-    const size_t plane = (size_t)(info.frames * info.height * info.width) * sizeof(float);
-    if (video) memset(video, 0, plane * (size_t)vae->out_channels);
-    if (mean) memset(mean, 0, plane * (size_t)vae->latent_channels);
-    if (logvar) memset(logvar, 0, plane * (size_t)vae->latent_channels);
-    return result;
-}
-
-GSF_API gsf_result gsf_nn_vae_encode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
-                                     const float* video, int64_t frames, int64_t height, int64_t width, float* mean,
-                                     float* logvar) {
-    return gsf__vae_apply(ctx, vae, 0, desc, video, frames, height, width, NULL, mean, logvar);
-}
-
-GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
-                                     const float* latents, int64_t frames, int64_t height, int64_t width, float* video) {
-    return gsf__vae_apply(ctx, vae, 1, desc, latents, frames, height, width, video, NULL, NULL);
-}
-
-// ---- >>nn tokenizer -------------------------------------------------------------
-
-/* spiece.model is a protobuf message: fields, each a varint (field number << 3 | wire type) and its value. Of those read
-       1 piece, repeated   1 text, 2 score (float), 3 type: 1 normal, 2 unknown, 3 control, 4 user-defined, 5 unused, 6 byte
-       2 trainer           3 kind of model: 1 unigram; 24 spaces go behind words; 35 unknown characters become bytes
-       3 normaliser        2 character map, 3 dummy prefix, 4 remove extra spaces, 5 escape spaces; the three default to 1
-   Encoding a text: added tokens are cut out of it; what stands between is normalised, and of all ways to spell that with
-   pieces the one with the largest sum of scores is taken. A character that is no piece costs the lowest score - 10.
-   (github.com/google/sentencepiece: src/sentencepiece_model.proto, normalizer.cc, unigram_model.cc EncodeOptimized,
-   sentencepiece_processor.cc; transformers 4.51.3: tokenization_utils.py, tokenization_t5.py) */
-enum {
-    GSF__SP_NORMAL = 1, GSF__SP_UNKNOWN, GSF__SP_CONTROL, GSF__SP_USER, GSF__SP_UNUSED, GSF__SP_BYTE, GSF__SP_TYPES,
-    GSF__SP_PIECE = 1024,       // most bytes of a piece, of an added token,
-    GSF__SP_REPLACEMENT = 255,  //   of what the character map puts in
-    GSF__SP_MATCH = 256,        //   and looks at: bounds the time per byte of text whatever a file may hold
-    GSF__SP_EXTRA = 100,        // <extra_id_...> of T5
-};
-
-static const char gsf__sp_space[] = "\xe2\x96\x81"; // U+2581 stands for a space
-
-// ---- protobuf
-
-typedef struct gsf__pb {
-    gsf_context* ctx;
-    const char* name; // for errors
-    const unsigned char* data;
-    size_t at, end;
-} gsf__pb;
-
-typedef struct gsf__pb_field {
-    uint64_t number, value; // value: of all wire types but 2
-    int wire;               // 0 varint, 1 eight bytes, 2 a length and as many bytes, 5 four bytes
-    size_t at, size;        // of those bytes
-} gsf__pb_field;
-
-static gsf_result gsf__pb_varint(gsf__pb* in, uint64_t* out) {
-    const size_t begin = in->at;
-    *out = 0;
-    for (int shift = 0; shift < 70; shift += 7) {
-        if (in->at == in->end)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number is cut off", in->name, begin);
-        const unsigned char byte = in->data[in->at++];
-        if (shift < 64) *out |= (uint64_t)(byte & 127u) << shift;
-        if (!(byte & 128u)) return GSF_OK;
-    }
-    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number of more than ten bytes", in->name, begin);
-}
-
-static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // in->at < in->end
-    const size_t begin = in->at;
-    uint64_t key, size = 0;
-    memset(out, 0, sizeof *out);
-    GSF__TRY(gsf__pb_varint(in, &key));
-    out->number = key >> 3;
-    out->wire = (int)(key & 7);
-    if (out->number < 1 || out->number >= 1u << 29)
-        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: no field has the number %llu", in->name, begin,
-                        (unsigned long long)out->number);
-    if (out->wire == 0) return gsf__pb_varint(in, &out->value);
-    if (out->wire == 1) size = 8;
-    else if (out->wire == 5) size = 4;
-    else if (out->wire == 2) GSF__TRY(gsf__pb_varint(in, &size));
-    else return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: wire type %d", in->name, begin, out->wire);
-    if (size > in->end - in->at)
-        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: field %d has %llu bytes, but %zu are left", in->name, begin,
-                        (int)out->number, (unsigned long long)size, in->end - in->at);
-    out->at = in->at;
-    out->size = (size_t)size;
-    if (out->wire != 2) out->value = gsf__load_le(in->data + in->at, (int)size);
-    in->at += out->size;
-    return GSF_OK;
-}
-
-static gsf_result gsf__pb_expect(const gsf__pb* in, const gsf__pb_field* field, int wire) {
-    if (field->wire == wire) return GSF_OK;
-    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: field %d has wire type %d, not %d", in->name, in->at,
-                    (int)field->number, field->wire, wire);
-}
-
-static gsf__pb gsf__pb_inside(const gsf__pb* in, const gsf__pb_field* field) { // the message that a field holds
-    gsf__pb out = *in;
-    out.at = field->at;
-    out.end = field->at + field->size;
-    return out;
-}
-
-// ---- a trie over texts
-
-typedef struct gsf__sp_key {
-    const char* text;
-    uint32_t size;
-    int32_t id;
-} gsf__sp_key;
-
-typedef struct gsf__sp_node { // children stand one after another, sorted by byte
-    uint32_t first;
-    int32_t id; // of the text that ends here; -1: none
-    uint16_t count;
-    unsigned char byte;
-} gsf__sp_node;
-
-typedef struct gsf__sp_range { uint32_t begin, end, depth; } gsf__sp_range; // of sorted keys, below a node
-
-static int gsf__sp_compare(const void* a, const void* b) { // by bytes, then by id
-    const gsf__sp_key *x = (const gsf__sp_key*)a, *y = (const gsf__sp_key*)b;
-    const int order = memcmp(x->text, y->text, x->size < y->size ? x->size : y->size);
-    if (order) return order;
-    if (x->size != y->size) return x->size < y->size ? -1 : 1;
-    return x->id < y->id ? -1 : x->id > y->id;
-}
-
-static uint32_t gsf__sp_shared(const gsf__sp_key* a, const gsf__sp_key* b) { // bytes that both begin with
-    uint32_t n = 0;
-    while (n < a->size && n < b->size && a->text[n] == b->text[n]) n++;
-    return n;
-}
-
-// From sorted keys of different, nonempty texts. *out is freed by the caller.
-static gsf_result gsf__sp_build_trie(gsf_context* ctx, const gsf__sp_key* keys, size_t count, gsf__sp_node** out) {
-    size_t total = 1, made = 1;
-    for (size_t i = 0; i < count; i++) total += keys[i].size - (i ? gsf__sp_shared(&keys[i - 1], &keys[i]) : 0);
-    if (total > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "tokenizer: %zu pieces are too many", count);
-    gsf__sp_node* nodes = (gsf__sp_node*)gsf_alloc_zeroed(ctx, total, sizeof *nodes);
-    gsf__sp_range* ranges = (gsf__sp_range*)gsf_alloc_zeroed(ctx, total, sizeof *ranges);
-    *out = nodes;
-    if (!nodes || !ranges) {
-        gsf_free(ctx, ranges);
-        return GSF_ERROR_OUT_OF_MEMORY;
-    }
-    ranges[0].end = (uint32_t)count;
-    for (size_t n = 0; n < total; n++) {
-        const gsf__sp_range r = ranges[n];
-        uint32_t at = r.begin;
-        nodes[n].id = -1;
-        if (at < r.end && keys[at].size == r.depth) nodes[n].id = keys[at++].id;
-        nodes[n].first = (uint32_t)made;
-        while (at < r.end) {
-            const uint32_t begin = at;
-            const char byte = keys[at].text[r.depth];
-            while (at < r.end && keys[at].text[r.depth] == byte) at++;
-            nodes[made].byte = (unsigned char)byte;
-            ranges[made].begin = begin;
-            ranges[made].end = at;
-            ranges[made++].depth = r.depth + 1;
-            nodes[n].count++;
-        }
-    }
-    GSF_ASSERT(made == total);
-    gsf_free(ctx, ranges);
-    return GSF_OK;
-}
-
-static const gsf__sp_node* gsf__sp_child(const gsf__sp_node* nodes, const gsf__sp_node* node, unsigned char byte) {
-    uint32_t low = node->first, high = low + node->count;
-    const uint32_t end = high;
-    while (low < high) {
-        const uint32_t mid = low + (high - low) / 2;
-        if (nodes[mid].byte < byte) low = mid + 1;
-        else high = mid;
-    }
-    return low < end && nodes[low].byte == byte ? &nodes[low] : NULL;
-}
-
-static int32_t gsf__sp_find(const gsf__sp_node* nodes, const char* text, size_t size) { // the id of a text, or -1
-    const gsf__sp_node* node = nodes;
-    for (size_t i = 0; node && i < size; i++) node = gsf__sp_child(nodes, node, (unsigned char)text[i]);
-    return node ? node->id : -1;
-}
-
-// ---- the model
-
-typedef struct gsf__sp_added { // a text that is an id of its own
-    size_t at, size;           // in gsf__sp_model.texts, while opening
-    int32_t id;
-    int trim_left, trim_right; // takes white space beside it along
-} gsf__sp_added;
-
-typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
-    gsf__sp_node *pieces, *added; // ids of `added` are places in added_list
-    gsf__sp_added* added_list;
-    gsf_text texts;
-    size_t added_count, added_capacity;
-    float* scores;                // of each piece
-    unsigned char* types;
-    size_t count, scores_capacity, types_capacity;
-    float unknown_score;
-    int32_t unknown_id, bytes[256];
-    uint32_t* units;              // character map: a double-array trie, 0 units: none
-    size_t unit_count;
-    char* replacements;           // its values are places in here, each a zero-terminated text
-    size_t replacements_size;
-    int prefix, trim, escape, suffix, byte_fallback, has_user_pieces;
-} gsf__sp_model;
-
-static void gsf__sp_destroy(gsf_context* ctx, gsf__sp_model* m) {
-    if (!m) return;
-    gsf_free(ctx, m->pieces);
-    gsf_free(ctx, m->added);
-    gsf_free(ctx, m->added_list);
-    gsf_destroy_text(ctx, &m->texts);
-    gsf_free(ctx, m->scores);
-    gsf_free(ctx, m->types);
-    gsf_free(ctx, m->units);
-    gsf_free(ctx, m->replacements);
-    gsf_free(ctx, m);
-}
-
-GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer) {
-    gsf__sp_destroy(ctx, (gsf__sp_model*)tokenizer->model);
-    memset(tokenizer, 0, sizeof *tokenizer);
-}
-
-// ---- opening: pieces
-
-static int gsf__sp_is_text(const char* text, size_t size) { // UTF-8 without zeros
-    for (size_t at = 0, step; at < size; at += step) {
-        step = text[at] ? gsf__utf8_size(text + at, size - at) : 0;
-        if (!step) return 0;
-    }
-    return 1;
-}
-
-static gsf_result gsf__sp_read_piece(gsf__pb in, gsf__sp_key* key, float* score, unsigned char* type) {
-    const size_t begin = in.at;
-    uint64_t kind = GSF__SP_NORMAL;
-    gsf__pb_field field;
-    *score = 0.0f;
-    while (in.at < in.end) {
-        GSF__TRY(gsf__pb_next(&in, &field));
-        if (field.number == 1) {
-            GSF__TRY(gsf__pb_expect(&in, &field, 2));
-            if (field.size > GSF__SP_PIECE || !gsf__sp_is_text((const char*)in.data + field.at, field.size))
-                return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d is no UTF-8, or longer than %d bytes",
-                                in.name, field.at, (int)key->id, (int)GSF__SP_PIECE);
-            key->text = (const char*)in.data + field.at;
-            key->size = (uint32_t)field.size;
-        } else if (field.number == 2) {
-            GSF__TRY(gsf__pb_expect(&in, &field, 5));
-            const uint32_t bits = (uint32_t)field.value;
-            memcpy(score, &bits, sizeof bits);
-        } else if (field.number == 3) {
-            GSF__TRY(gsf__pb_expect(&in, &field, 0));
-            kind = field.value;
-        }
-    }
-    if (key->size == 0 || !(fabsf(*score) <= 1e30f) || kind < GSF__SP_NORMAL || kind >= GSF__SP_TYPES)
-        return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d has %u bytes, score %g and type %llu", in.name, begin,
-                        (int)key->id, (unsigned)key->size, (double)*score, (unsigned long long)kind);
-    *type = (unsigned char)kind;
-    return GSF_OK;
-}
-
-// "<0x1F>" to 31; -1: not of that form
-static int gsf__sp_byte_of(const gsf__sp_key* key) {
-    static const char digits[] = "0123456789ABCDEF";
-    if (key->size != 6 || memcmp(key->text, "<0x", 3) != 0 || key->text[5] != '>') return -1;
-    const char *high = strchr(digits, key->text[3]), *low = strchr(digits, key->text[4]);
-    return high && low ? (int)(high - digits) * 16 + (int)(low - digits) : -1;
-}
-
-static gsf_result gsf__sp_note_piece(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_key* key) {
-    const int type = m->types[key->id];
-    if (type == GSF__SP_UNKNOWN) {
-        if (m->unknown_id >= 0)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d are both the unknown one", in->name,
-                            (int)m->unknown_id, (int)key->id);
-        m->unknown_id = key->id;
-    } else if (type == GSF__SP_BYTE) {
-        const int byte = gsf__sp_byte_of(key);
-        if (byte < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: piece %d is no byte", in->name, (int)key->id);
-        m->bytes[byte] = key->id;
-    } else if (type == GSF__SP_USER) {
-        m->has_user_pieces = 1;
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__sp_read_trainer(gsf__pb in, gsf__sp_model* m) {
-    gsf__pb_field field;
-    while (in.at < in.end) {
-        GSF__TRY(gsf__pb_next(&in, &field));
-        if (field.number != 3 && field.number != 24 && field.number != 35) continue;
-        GSF__TRY(gsf__pb_expect(&in, &field, 0));
-        if (field.number == 24) m->suffix = field.value != 0;
-        else if (field.number == 35) m->byte_fallback = field.value != 0;
-        else if (field.value != 1)
-            return gsf_fail(in.ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: a model of kind %llu, not a unigram", in.name, in.at,
-                            (unsigned long long)field.value);
-    }
-    return GSF_OK;
-}
-
-// ---- opening: the character map
-
-/* u32 bytes of the trie | its units, each u32 | texts, each ending in a zero
-   A unit of the double array: label in bits 0-7 and 31 (a byte, or 1 << 31 for a value), 8: a value is among the children,
-   offset in bits 10-31, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b, if that one's
-   label is b; the value is in bits 0-30 of the child for 0. (github.com/s-yata/darts-clone) */
-static uint32_t gsf__sp_offset(uint32_t unit) { return unit >> 10 << ((unit & 512u) >> 6); }
-
-// Checks every unit, so that no walk leaves the array: children of a unit lie in one block of 256.
-static gsf_result gsf__sp_check_units(const gsf__pb* in, size_t at, const gsf__sp_model* m) {
-    for (size_t i = 0; i < m->unit_count; i++) {
-        const uint32_t unit = m->units[i];
-        if (unit >> 31 && i > 0) continue; // a value
-        const size_t base = i ^ gsf__sp_offset(unit);
-        const uint32_t value = base < m->unit_count ? m->units[base] & 0x7fffffffu : 0;
-        int ok = !(unit >> 31) && base < m->unit_count;
-        if (ok && unit >> 8 & 1u) {
-            const size_t left = value < m->replacements_size ? m->replacements_size - value : 0;
-            const size_t most = left <= GSF__SP_REPLACEMENT ? left : GSF__SP_REPLACEMENT + 1;
-            ok = most && memchr(m->replacements + value, 0, most) != NULL;
-        }
-        if (!ok)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: unit %zu of the character map leads nowhere", in->name,
-                            at + 4 * i, i);
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__sp_read_map(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m) {
-    const unsigned char* data = in->data + field->at;
-    gsf_free(in->ctx, m->units); // of an earlier field
-    gsf_free(in->ctx, m->replacements);
-    m->units = NULL;
-    m->replacements = NULL;
-    m->unit_count = m->replacements_size = 0;
-    if (field->size == 0) return GSF_OK;
-    const size_t bytes = field->size >= 4 ? (size_t)gsf__load_le(data, 4) : 0;
-    if (field->size < 5 || bytes > field->size - 5 || bytes == 0 || bytes % 1024 || data[field->size - 1] != 0)
-        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a character map of %zu bytes with %zu of trie", in->name,
-                        field->at, field->size, bytes);
-    m->unit_count = bytes / 4;
-    m->replacements_size = field->size - 4 - bytes;
-    m->units = (uint32_t*)gsf_alloc(in->ctx, m->unit_count, sizeof *m->units);
-    m->replacements = (char*)gsf_alloc(in->ctx, m->replacements_size, 1);
-    if (!m->units || !m->replacements) return GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < m->unit_count; i++) m->units[i] = (uint32_t)gsf__load_le(data + 4 + 4 * i, 4);
-    memcpy(m->replacements, data + 4 + bytes, m->replacements_size);
-    return gsf__sp_check_units(in, field->at + 4, m);
-}
-
-static gsf_result gsf__sp_read_normalizer(gsf__pb in, gsf__sp_model* m) {
-    gsf__pb_field field;
-    while (in.at < in.end) {
-        GSF__TRY(gsf__pb_next(&in, &field));
-        if (field.number == 2) {
-            GSF__TRY(gsf__pb_expect(&in, &field, 2));
-            GSF__TRY(gsf__sp_read_map(&in, &field, m));
-        } else if (field.number >= 3 && field.number <= 5) {
-            GSF__TRY(gsf__pb_expect(&in, &field, 0));
-            *(field.number == 3 ? &m->prefix : field.number == 4 ? &m->trim : &m->escape) = field.value != 0;
-        }
-    }
-    return GSF_OK;
-}
-
-// ---- opening: the file as a whole
-
-typedef struct gsf__sp_keys { // texts of the pieces, in the caller's bytes
-    gsf__sp_key* keys;
-    size_t count, capacity;
-} gsf__sp_keys;
-
-static gsf_result gsf__sp_add_piece(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m, gsf__sp_keys* all) {
-    const size_t n = all->count;
-    if (n >= INT32_MAX) return gsf_fail(in->ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", in->name);
-    GSF__TRY(gsf__reserve(in->ctx, (void**)&all->keys, &all->capacity, n, n + 1, sizeof *all->keys));
-    GSF__TRY(gsf__reserve(in->ctx, (void**)&m->scores, &m->scores_capacity, n, n + 1, sizeof *m->scores));
-    GSF__TRY(gsf__reserve(in->ctx, (void**)&m->types, &m->types_capacity, n, n + 1, 1));
-    memset(&all->keys[n], 0, sizeof all->keys[n]);
-    all->keys[n].id = (int32_t)n;
-    GSF__TRY(gsf__sp_read_piece(gsf__pb_inside(in, field), &all->keys[n], &m->scores[n], &m->types[n]));
-    GSF__TRY(gsf__sp_note_piece(in, m, &all->keys[n]));
-    all->count = m->count = n + 1;
-    return GSF_OK;
-}
-
-static gsf_result gsf__sp_check_pieces(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_keys* all) {
-    float low = FLT_MAX;
-    for (size_t i = 0; i < m->count; i++)
-        if (m->types[i] == GSF__SP_NORMAL && m->scores[i] < low) low = m->scores[i];
-    m->unknown_score = low - 10.0f;
-    if (m->unknown_id < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece is the unknown one", in->name);
-    for (int i = 0; m->byte_fallback && i < 256; i++)
-        if (m->bytes[i] < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece for the byte %d", in->name, i);
-    qsort(all->keys, all->count, sizeof *all->keys, gsf__sp_compare);
-    for (size_t i = 1; i < all->count; i++) {
-        const gsf__sp_key *a = &all->keys[i - 1], *b = &all->keys[i];
-        if (a->size == b->size && memcmp(a->text, b->text, a->size) == 0)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d have the same text", in->name, (int)a->id,
-                            (int)b->id);
-    }
-    return gsf__sp_build_trie(in->ctx, all->keys, all->count, &m->pieces);
-}
-
-static gsf_result gsf__sp_read_model(gsf__pb in, gsf__sp_model* m) {
-    gsf__sp_keys all;
-    gsf__pb_field field;
-    gsf_result result = GSF_OK;
-    memset(&all, 0, sizeof all);
-    m->unknown_id = -1;
-    for (int i = 0; i < 256; i++) m->bytes[i] = -1;
-    m->prefix = m->trim = m->escape = 1;
-    while (in.at < in.end && result == GSF_OK) {
-        result = gsf__pb_next(&in, &field);
-        if (result || field.number > 3) continue;
-        result = gsf__pb_expect(&in, &field, 2);
-        if (result) break;
-        if (field.number == 1) result = gsf__sp_add_piece(&in, &field, m, &all);
-        else if (field.number == 2) result = gsf__sp_read_trainer(gsf__pb_inside(&in, &field), m);
-        else result = gsf__sp_read_normalizer(gsf__pb_inside(&in, &field), m);
-    }
-    if (result == GSF_OK) result = gsf__sp_check_pieces(&in, m, &all);
-    gsf_free(in.ctx, all.keys);
-    return result;
-}
-
-// ---- opening: added tokens
-
-static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* text, size_t size, int64_t id, int trim_left,
-                              int trim_right) {
-    const size_t n = m->added_count;
-    if (size == 0) return GSF_OK;
-    GSF__TRY(gsf__reserve(ctx, (void**)&m->added_list, &m->added_capacity, n, n + 1, sizeof *m->added_list));
-    gsf__sp_added* a = &m->added_list[n];
-    a->at = m->texts.size;
-    a->size = size;
-    a->id = (int32_t)id;
-    a->trim_left = trim_left;
-    a->trim_right = trim_right;
-    gsf_text_append(ctx, &m->texts, text, size);
-    m->added_count++;
-    return m->texts.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
-}
-
-static gsf_result gsf__sp_fail_added(const gsf__nn_config* file, const gsf_json_value* value) {
-    return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no added token", file->json.name, (unsigned)value->offset);
-}
-
-// {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
-static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json_value* all, gsf__sp_model* m) {
-    const gsf_json* json = &file->json;
-    for (uint32_t i = all->child; i; i = json->values[i].next) {
-        const gsf_json_value* entry = &json->values[i];
-        const gsf_json_value* content = gsf_json_member(json, entry, "content");
-        const gsf_json_value* left = gsf_json_member(json, entry, "lstrip");
-        const gsf_json_value* right = gsf_json_member(json, entry, "rstrip");
-        const gsf_json_value* single = gsf_json_member(json, entry, "single_word");
-        int64_t id = 0;
-        int ok = entry->key_size > 0 && entry->key_size < 10 && content && content->type == GSF_JSON_STRING &&
-                 content->string_size <= GSF__SP_PIECE;
-        for (uint32_t k = 0; ok && k < entry->key_size; k++) {
-            ok = entry->key[k] >= '0' && entry->key[k] <= '9';
-            id = 10 * id + (entry->key[k] - '0');
-        }
-        if (!ok) return gsf__sp_fail_added(file, entry);
-        if (single && single->type == GSF_JSON_TRUE)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: an added token that is a single word", json->name,
-                            (unsigned)entry->offset);
-        GSF__TRY(gsf__sp_add(file->ctx, m, content->string, content->string_size, id, left && left->type == GSF_JSON_TRUE,
-                             right && right->type == GSF_JSON_TRUE));
-    }
-    return GSF_OK;
-}
-
-// added_tokens.json: {"<extra_id_0>": 32099, ...}
-static gsf_result gsf__sp_add_list(const gsf__nn_config* file, gsf__sp_model* m) {
-    for (uint32_t i = file->json.values[0].child; i; i = file->json.values[i].next) {
-        const gsf_json_value* entry = &file->json.values[i];
-        if (entry->type != GSF_JSON_NUMBER || !(entry->number >= 0 && entry->number < 1e9) ||
-            floor(entry->number) != entry->number || entry->key_size > GSF__SP_PIECE)
-            return gsf__sp_fail_added(file, entry);
-        GSF__TRY(gsf__sp_add(file->ctx, m, entry->key, entry->key_size, (int64_t)entry->number, 0, 0));
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__sp_add_extra(gsf_context* ctx, gsf__sp_model* m, int64_t extra) {
-    for (int64_t i = 0; i < extra; i++) {
-        char text[32];
-        const int size = snprintf(text, sizeof text, "<extra_id_%d>", (int)i); // extra_id_0 is the last one
-        GSF__TRY(gsf__sp_add(ctx, m, text, (size_t)size, (int64_t)m->count - 1 + extra - i, 1, 1));
-    }
-    return GSF_OK;
-}
-
-// Sorts the added tokens' texts into a trie; of those with the same text the one added last counts.
-static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
-    size_t kept = 0;
-    gsf__sp_key* keys = (gsf__sp_key*)gsf_alloc(ctx, m->added_count, sizeof *keys);
-    if (!keys) return GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < m->added_count; i++) {
-        keys[i].text = m->texts.data + m->added_list[i].at;
-        keys[i].size = (uint32_t)m->added_list[i].size;
-        keys[i].id = (int32_t)i;
-    }
-    if (m->added_count) qsort(keys, m->added_count, sizeof *keys, gsf__sp_compare);
-    for (size_t i = 0; i < m->added_count; i++) {
-        const int again = kept && keys[kept - 1].size == keys[i].size &&
-                          memcmp(keys[kept - 1].text, keys[i].text, keys[i].size) == 0;
-        keys[again ? kept - 1 : kept++] = keys[i];
-    }
-    const gsf_result result = gsf__sp_build_trie(ctx, keys, kept, &m->added);
-    gsf_free(ctx, keys);
-    gsf_destroy_text(ctx, &m->texts);
-    return result;
-}
-
-// "eos_token": "</s>", or an object with that as its "content"
-static const char* gsf__sp_token_text(const gsf__nn_config* file, const char* key, const char* fallback) {
-    const gsf_json_value* value = file ? gsf__nn_config_find(file, key) : NULL;
-    if (value && value->type == GSF_JSON_OBJECT) value = gsf_json_member(&file->json, value, "content");
-    return value && value->type == GSF_JSON_STRING ? value->string : fallback;
-}
-
-// config, added: NULL where there is no such file
-static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf__nn_config* config,
-                                  const gsf__nn_config* added, gsf__sp_model* m, gsf_nn_tokenizer* out) {
-    static const char* const names[][2] = {{"unk_token", "<unk>"}, {"eos_token", "</s>"}, {"pad_token", "<pad>"}};
-    int32_t* const ids[] = {NULL, &out->end_id, &out->pad_id};
-    int64_t extra = GSF__SP_EXTRA;
-    const gsf_json_value* decoder = config ? gsf__nn_config_find(config, "added_tokens_decoder") : NULL;
-    for (size_t i = 0; i < GSF__COUNT(names); i++) {
-        const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
-        const int32_t id = strlen(text) <= GSF__SP_PIECE ? gsf__sp_find(m->pieces, text, strlen(text)) : -1;
-        if (id >= 0) GSF__TRY(gsf__sp_add(ctx, m, text, strlen(text), id, 0, 0));
-    }
-    if (config) GSF__TRY(gsf__nn_config_int_or(config, "extra_ids", extra, 0, 100000, &extra));
-    if ((int64_t)m->count > INT32_MAX - extra) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", name);
-    GSF__TRY(gsf__sp_add_extra(ctx, m, extra));
-    if (decoder && decoder->type == GSF_JSON_OBJECT) GSF__TRY(gsf__sp_add_decoder(config, decoder, m));
-    else if (added) GSF__TRY(gsf__sp_add_list(added, m));
-    GSF__TRY(gsf__sp_sort_added(ctx, m));
-    out->id_count = (int32_t)m->count;
-    for (size_t i = 0; i < m->added_count; i++)
-        if (m->added_list[i].id >= out->id_count) out->id_count = m->added_list[i].id + 1;
-    for (size_t i = 1; i < GSF__COUNT(names); i++) {
-        const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
-        const int32_t place = gsf__sp_find(m->added, text, strlen(text));
-        if (place < 0)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: there is no %s %s", name, names[i][0], gsf__nn_show(text).text);
-        *ids[i] = m->added_list[place].id;
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__sp_make(gsf_context* ctx, const char* name, const void* data, size_t size,
-                               const gsf__nn_config* config, const gsf__nn_config* added, gsf_nn_tokenizer* out) {
-    const gsf__pb in = {ctx, gsf__nn_path_end(name), (const unsigned char*)data, 0, size};
-    gsf__sp_model* m = (gsf__sp_model*)gsf_alloc_zeroed(ctx, 1, sizeof *m);
-    out->model = m;
-    if (!m) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__sp_read_model(in, m));
-    out->piece_count = (int32_t)m->count;
-    out->unknown_id = m->unknown_id;
-    return gsf__sp_add_all(ctx, in.name, config, added, m, out);
-}
-
-GSF_API gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model, size_t model_size,
-                                                const char* config, size_t config_size, gsf_nn_tokenizer* out) {
-    gsf__nn_config file;
-    memset(out, 0, sizeof *out);
-    if (config) GSF__TRY(gsf__nn_parse_config(ctx, "tokenizer_config.json", config, config_size, &file));
-    const gsf_result result = gsf__sp_make(ctx, name, model, model_size, config ? &file : NULL, NULL, out);
-    if (config) gsf__nn_close_config(&file);
-    if (result) gsf_nn_destroy_tokenizer(ctx, out);
-    return result;
-}
-
-// A JSON file of the folder that may be absent: *found 0.
-static gsf_result gsf__sp_load_json(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* out,
-                                    int* found) {
-    gsf_text path;
-    void* data = NULL;
-    size_t size = 0;
-    memset(&path, 0, sizeof path);
-    *found = 0;
-    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &data, &size);
-    gsf_destroy_text(ctx, &path);
-    if (data) result = gsf__nn_parse_config(ctx, name, (const char*)data, size, out);
-    *found = data && result == GSF_OK;
-    gsf_free(ctx, data);
-    return result;
-}
-
-GSF_API gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out) {
-    static const char* const names[2] = {"tokenizer_config.json", "added_tokens.json"};
-    gsf__nn_config files[2];
-    int found[2] = {0, 0};
-    void* data = NULL;
-    size_t size = 0;
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    memset(out, 0, sizeof *out);
-    gsf_text_printf(ctx, &path, "%s/spiece.model", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_read_file(ctx, path.data, &data, &size);
-    for (int i = 0; i < 2 && !result; i++) result = gsf__sp_load_json(ctx, folder, names[i], &files[i], &found[i]);
-    if (!result)
-        result = gsf__sp_make(ctx, path.data, data, size, found[0] ? &files[0] : NULL, found[1] ? &files[1] : NULL, out);
-    for (int i = 0; i < 2; i++)
-        if (found[i]) gsf__nn_close_config(&files[i]);
-    gsf_free(ctx, data);
-    gsf_destroy_text(ctx, &path);
-    if (result) gsf_nn_destroy_tokenizer(ctx, out);
-    return result;
-}
-
-// ---- normalising
-
-typedef struct gsf__sp_step { // what stands for the next `used` bytes
-    const char* text;
-    size_t size, used;
-} gsf__sp_step;
-
-// Length of the longest entry of the character map that the text begins with, 0: none.
-static size_t gsf__sp_match(const gsf__sp_model* m, const char* text, size_t left, uint32_t* value) {
-    size_t length = 0;
-    if (left > GSF__SP_MATCH) left = GSF__SP_MATCH;
-    uint32_t at = gsf__sp_offset(m->units[0]);
-    for (size_t i = 0; i < left; i++) {
-        const unsigned char byte = (unsigned char)text[i];
-        at ^= byte;
-        const uint32_t unit = m->units[at];
-        if ((unit & 0x800000ffu) != byte) break;
-        at ^= gsf__sp_offset(unit);
-        if (unit >> 8 & 1u) {
-            length = i + 1;
-            *value = m->units[at] & 0x7fffffffu;
-        }
-    }
-    return length;
-}
-
-static size_t gsf__sp_match_user(const gsf__sp_model* m, const char* text, size_t left) { // pieces that stay as they are
-    size_t length = 0;
-    const gsf__sp_node* node = m->pieces;
-    for (size_t i = 0; i < left && (node = gsf__sp_child(m->pieces, node, (unsigned char)text[i])) != NULL; i++)
-        if (node->id >= 0 && m->types[node->id] == GSF__SP_USER) length = i + 1;
-    return length;
-}
-
-static gsf__sp_step gsf__sp_next(const gsf__sp_model* m, const char* text, size_t left) {
-    gsf__sp_step step = {text, 0, 0};
-    uint32_t value = 0;
-    step.used = m->has_user_pieces ? gsf__sp_match_user(m, text, left) : 0;
-    if (!step.used && m->unit_count) {
-        step.used = gsf__sp_match(m, text, left, &value);
-        if (step.used) {
-            step.text = m->replacements + value;
-            step.size = strlen(step.text);
-            return step;
-        }
-    }
-    if (!step.used) step.used = gsf__utf8_size(text, left);
-    step.size = step.used;
-    if (step.used) return step;
-    step.text = "\xef\xbf\xbd"; // U+FFFD for a malformed byte
-    step.size = 3;
-    step.used = 1;
-    return step;
-}
-
-typedef struct gsf__sp_best { // the best spelling of all bytes before this one
-    float score;
-    int32_t id;     // its last piece; -1: there is none so far
-    uint32_t start; // where that begins
-    uint32_t next;  // on the way back: where the piece that begins here ends
-} gsf__sp_best;
-
-typedef struct gsf__sp_run {
-    gsf_context* ctx;
-    const gsf__sp_model* m;
-    char* normal;
-    size_t size, capacity;
-    gsf__sp_best* best;
-    size_t best_capacity;
-    int32_t* ids;
-    size_t count, ids_capacity;
-} gsf__sp_run;
-
-static gsf_result gsf__sp_put(gsf__sp_run* run, const char* text, size_t size) { // spaces escaped
-    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->normal, &run->capacity, run->size, run->size + 3 * size, 1));
-    for (size_t i = 0; i < size; i++) {
-        if (text[i] == ' ' && run->m->escape) {
-            memcpy(run->normal + run->size, gsf__sp_space, 3);
-            run->size += 3;
-        } else {
-            run->normal[run->size++] = text[i];
-        }
-    }
-    return run->size < INT32_MAX ? GSF_OK
-                                 : gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "tokenizer: the text is too long");
-}
-
-static gsf_result gsf__sp_normalize(gsf__sp_run* run, const char* text, size_t left) {
-    const gsf__sp_model* m = run->m;
-    const char* space = m->escape ? gsf__sp_space : " ";
-    const size_t space_size = strlen(space);
-    int after_space = m->trim;
-    run->size = 0;
-    while (m->trim && left) { // leading spaces
-        const gsf__sp_step s = gsf__sp_next(m, text, left);
-        if (s.size != 1 || s.text[0] != ' ') break;
-        text += s.used;
-        left -= s.used;
-    }
-    if (!left) return GSF_OK;
-    if (m->prefix && !m->suffix) GSF__TRY(gsf__sp_put(run, " ", 1));
-    while (left) {
-        gsf__sp_step s = gsf__sp_next(m, text, left);
-        for (; after_space && s.size && s.text[0] == ' '; s.size--) s.text++;
-        GSF__TRY(gsf__sp_put(run, s.text, s.size));
-        if (s.size) after_space = m->trim && s.text[s.size - 1] == ' ';
-        text += s.used;
-        left -= s.used;
-    }
-    while (m->trim && run->size >= space_size &&
-           memcmp(run->normal + run->size - space_size, space, space_size) == 0)
-        run->size -= space_size;
-    return m->prefix && m->suffix ? gsf__sp_put(run, " ", 1) : GSF_OK;
-}
-
-// ---- spelling
-
-static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32_t id) {
-    if (best->id >= 0 && !(score > best->score)) return; // the first of equals stays
-    best->score = score;
-    best->start = start;
-    best->id = id;
-}
-
-// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of
-// digits.
-static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
-    const float base = run->best[at].score;
-    for (size_t i = at; i <= reached; i++)
-        if (i == at || run->best[i].id >= 0) run->best[i].score -= base;
-}
-
-// Viterbi over the bytes of run->normal. Sums are floats that are rebased where sentencepiece 0.2.3 does it, since their
-// rounding decides between spellings of nearly equal score.
-static void gsf__sp_spell(gsf__sp_run* run) {
-    static const unsigned char widths[17] = "\1\1\1\1\1\1\1\1\1\1\1\1\2\2\3\4"; // of a character, by its upper four bits
-    const gsf__sp_model* m = run->m;
-    const unsigned char* text = (const unsigned char*)run->normal;
-    const size_t n = run->size;
-    for (size_t i = 0; i <= n; i++) run->best[i].id = -1;
-    run->best[0].score = 0.0f;
-    size_t reached = 0;
-    for (size_t at = 0, width; at < n; at += width) {
-        if (fabsf(run->best[at].score) > 100000.0f) gsf__sp_rebase(run, at, reached);
-        const float here = run->best[at].score;
-        const gsf__sp_node* node = m->pieces;
-        int known = 0; // this character alone is a piece
-        width = widths[text[at] >> 4];
-        if (width > n - at) width = n - at;
-        for (size_t k = at; k < n && (node = gsf__sp_child(m->pieces, node, text[k])) != NULL; k++) {
-            const int type = node->id < 0 ? 0 : m->types[node->id];
-            const size_t length = k + 1 - at;
-            if (type != GSF__SP_NORMAL && type != GSF__SP_USER) continue;
-            const float score = type == GSF__SP_USER ? (float)(0.1 * (double)(length - 1)) : m->scores[node->id];
-            if (reached < k + 1) reached = k + 1;
-            gsf__sp_offer(&run->best[k + 1], score + here, (uint32_t)at, node->id);
-            known |= length == width;
-        }
-        if (!known) {
-            if (reached < at + width) reached = at + width;
-            gsf__sp_offer(&run->best[at + width], m->unknown_score + here, (uint32_t)at, m->unknown_id);
-        }
-    }
-    for (size_t end = n; end > 0; end = run->best[end].start) run->best[run->best[end].start].next = (uint32_t)end;
-}
-
-static gsf_result gsf__sp_emit(gsf__sp_run* run, int32_t id) {
-    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->ids_capacity, run->count, run->count + 1, sizeof *run->ids));
-    run->ids[run->count++] = id;
-    return GSF_OK;
-}
-
-// The ids of a stretch of text without added tokens.
-static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size) {
-    const gsf__sp_model* m = run->m;
-    GSF__TRY(gsf__sp_normalize(run, text, size));
-    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->best, &run->best_capacity, 0, run->size + 1, sizeof *run->best));
-    gsf__sp_spell(run);
-    for (size_t at = 0, end; at < run->size; at = end) {
-        end = run->best[at].next;
-        int32_t id = run->best[end].id;
-        if (id == m->unknown_id && m->byte_fallback) {
-            for (size_t i = at; i < end; i++) GSF__TRY(gsf__sp_emit(run, m->bytes[(unsigned char)run->normal[i]]));
-            continue;
-        }
-        if (id == m->unknown_id) { // a run of them is one; its text may be that of a piece which no spelling uses
-            while (end < run->size && run->best[run->best[end].next].id == id) end = run->best[end].next;
-            id = gsf__sp_find(m->pieces, run->normal + at, end - at);
-            if (id < 0) id = m->unknown_id;
-        }
-        GSF__TRY(gsf__sp_emit(run, id));
-    }
-    return GSF_OK;
-}
-
-// ---- added tokens within a text
-
-// Bytes of the white space character that the text begins with, as Python's str.isspace has it; 0: none.
-static size_t gsf__sp_white(const char* text, size_t left) {
-    const unsigned char* p = (const unsigned char*)text;
-    const size_t size = gsf__utf8_size(p, left);
-    if (size == 1) return (p[0] >= 9 && p[0] <= 13) || (p[0] >= 28 && p[0] <= 32);
-    if (size == 2) return p[0] == 0xc2 && (p[1] == 0x85 || p[1] == 0xa0) ? 2 : 0;
-    if (size != 3) return 0;
-    const unsigned c = (p[0] & 15u) << 12 | (p[1] & 63u) << 6 | (p[2] & 63u);
-    return c == 0x1680 || (c >= 0x2000 && c <= 0x200a) || c == 0x2028 || c == 0x2029 || c == 0x202f || c == 0x205f ||
-           c == 0x3000 ? 3 : 0;
-}
-
-static size_t gsf__sp_white_before(const char* text, size_t end) { // of the one that the text ends with
-    for (size_t size = 1; size <= 3 && size <= end; size++)
-        if (gsf__sp_white(text + end - size, size) == size) return size;
-    return 0;
-}
-
-// The longest added token that the text begins with, or NULL.
-static const gsf__sp_added* gsf__sp_match_added(const gsf__sp_model* m, const char* text, size_t left) {
-    const gsf__sp_added* found = NULL;
-    const gsf__sp_node* node = m->added;
-    for (size_t i = 0; i < left && (node = gsf__sp_child(m->added, node, (unsigned char)text[i])) != NULL; i++)
-        if (node->id >= 0) found = &m->added_list[node->id];
-    return found;
-}
-
-static gsf_result gsf__sp_encode_all(gsf__sp_run* run, const char* text, size_t size) {
-    size_t from = 0; // of the stretch since the last added token
-    for (size_t at = 0; at <= size; at++) {
-        const gsf__sp_added* found = at < size ? gsf__sp_match_added(run->m, text + at, size - at) : NULL;
-        size_t end = at, white;
-        if (at < size && !found) continue;
-        while (found && found->trim_left && end > from && (white = gsf__sp_white_before(text + from, end - from)) != 0)
-            end -= white;
-        if (end > from) GSF__TRY(gsf__sp_encode(run, text + from, end - from));
-        if (!found) break;
-        GSF__TRY(gsf__sp_emit(run, found->id));
-        from = at + found->size;
-        while (found->trim_right && (white = gsf__sp_white(text + from, size - from)) != 0) from += white;
-        at = from - 1;
-    }
-    return GSF_OK;
-}
-
-GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text, size_t size,
-                                   int32_t* ids, size_t room, size_t* count) {
-    gsf__sp_run run;
-    memset(&run, 0, sizeof run);
-    run.ctx = ctx;
-    run.m = (const gsf__sp_model*)tokenizer->model;
-    const gsf_result result = gsf__sp_encode_all(&run, text, size);
-    const int32_t end = tokenizer->end_id;
-    // where there is an end already, the official code adds none
-    const size_t all = run.count + !(run.count && run.ids[run.count - 1] == end);
-    if (result == GSF_OK && count) *count = all;
-    if (result == GSF_OK && room) {
-        size_t n = all <= room ? run.count : room - 1;
-        for (size_t i = 0; i < n; i++) ids[i] = run.ids[i];
-        if (!(n && ids[n - 1] == end)) ids[n++] = end;
-        for (; n < room; n++) ids[n] = tokenizer->pad_id;
-    }
-    gsf_free(ctx, run.normal);
-    gsf_free(ctx, run.best);
-    gsf_free(ctx, run.ids);
-    return result;
-}
-
-// ---- >>nn t5 --------------------------------------------------------------------
-
-typedef struct gsf__t5_block {
-    const gsf_tensor *attention_norm, *q, *k, *v, *out, *ff_norm, *gate, *up, *down;
-} gsf__t5_block;
-
-typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
-    gsf__t5_block* blocks;
-    const gsf_tensor *embedding, *positions, *final_norm; // positions: (buckets, heads), for all blocks
-} gsf__t5_nets;
-
-static gsf_result gsf__t5_bind_block(gsf__nn_loader* loader, const gsf_nn_t5* c, int32_t index, gsf__t5_block* b) {
-    const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
-    const struct { const char* name; const gsf_tensor** to; int32_t rank; int64_t shape[2]; } parts[] = {
-        {"0.layer_norm", &b->attention_norm, 1, {d, 0}},  {"0.SelfAttention.q", &b->q, 2, {inner, d}},
-        {"0.SelfAttention.k", &b->k, 2, {inner, d}},      {"0.SelfAttention.v", &b->v, 2, {inner, d}},
-        {"0.SelfAttention.o", &b->out, 2, {d, inner}},    {"1.layer_norm", &b->ff_norm, 1, {d, 0}},
-        {"1.DenseReluDense.wi_0", &b->gate, 2, {h, d}},   {"1.DenseReluDense.wi_1", &b->up, 2, {h, d}},
-        {"1.DenseReluDense.wo", &b->down, 2, {d, h}}};
-    for (size_t i = 0; i < GSF__COUNT(parts); i++)
-        GSF__TRY(gsf__nn_need(loader, parts[i].to, parts[i].rank, parts[i].shape, "encoder.block.%d.layer.%s.weight",
-                              (int)index, parts[i].name));
-    return GSF_OK;
-}
-
-static gsf_result gsf__t5_bind_all(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__t5_nets* nets) {
-    const int64_t table[2] = {c->vocabulary, c->width}, positions[2] = {c->buckets, c->heads};
-    GSF__TRY(gsf__nn_need(loader, &nets->embedding, 2, table, "shared.weight"));
-    GSF__TRY(gsf__nn_need(loader, &nets->positions, 2, positions,
-                          "encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight"));
-    GSF__TRY(gsf__nn_need(loader, &nets->final_norm, 1, table + 1, "encoder.final_layer_norm.weight"));
-    gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
-    for (int32_t i = 0; i < c->layers; i++) GSF__TRY(gsf__t5_bind_block(loader, c, i, &nets->blocks[i]));
-    return GSF_OK;
-}
-
-static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) {
-    const struct { const char* key; int32_t* to; int64_t fallback, low, high; } sizes[] = { // fallback 0: needed
-        {"d_model", &c->width, 0, 1, 1 << 20}, {"d_kv", &c->head_dim, 0, 1, 1024}, {"num_heads", &c->heads, 0, 1, 1024},
-        {"d_ff", &c->hidden, 0, 1, 1 << 20}, {"num_layers", &c->layers, 0, 1, 1024},
-        {"vocab_size", &c->vocabulary, 0, 1, INT32_MAX}, {"relative_attention_num_buckets", &c->buckets, 32, 4, 1 << 16},
-        {"relative_attention_max_distance", &c->max_distance, 128, 1, 1 << 24}};
-    static const struct { const char *key, *value; } texts[] = {
-        {"feed_forward_proj", "gated-gelu"}, {"dense_act_fn", "gelu_new"}};
-    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
-        int64_t value = 0;
-        if (sizes[i].fallback)
-            GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, &value));
-        else
-            GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
-        *sizes[i].to = (int32_t)value;
-    }
-    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_epsilon", 1e-6, 1e-12, 1.0, &c->norm_eps));
-    for (size_t i = 0; i < GSF__COUNT(texts); i++) { // T5 v1.0 has relu and no gate
-        const char* text;
-        GSF__TRY(gsf__nn_config_string(file, texts[i].key, i ? texts[i].value : NULL, &text));
-        if (strcmp(text, texts[i].value) != 0)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
-                            texts[i].value);
-    }
-    if (c->buckets % 4 || c->max_distance <= c->buckets / 4)
-        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %d buckets for relative positions up to %d",
-                        file->json.name, (int)c->buckets, (int)c->max_distance);
-    return GSF_OK;
-}
-
-static gsf_result gsf__t5_open(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
-    gsf__nn_config file;
-    gsf__nn_loader loader;
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
-    gsf_destroy_text(ctx, &path);
-    if (result) return result;
-    result = gsf__t5_read_config(&file, out);
-    gsf__nn_close_config(&file);
-    if (result) return result;
-    GSF__TRY(gsf_nn_open_weights(ctx, folder, "model", &out->weights));
-    gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
-    out->nets = nets;
-    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    nets->blocks = (gsf__t5_block*)gsf_alloc_zeroed(ctx, (size_t)out->layers, sizeof *nets->blocks);
-    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    return gsf__nn_end_loading(&loader, gsf__t5_bind_all(&loader, out, nets));
-}
-
-GSF_API gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
-    memset(out, 0, sizeof *out);
-    const gsf_result result = gsf__t5_open(ctx, folder, out);
-    if (result) gsf_nn_destroy_t5(ctx, out);
-    return result;
-}
-
-GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5) {
-    gsf__t5_nets* nets = (gsf__t5_nets*)t5->nets;
-    if (nets) gsf_free(ctx, nets->blocks);
-    gsf_free(ctx, nets);
-    gsf_nn_close_weights(ctx, &t5->weights);
-    memset(t5, 0, sizeof *t5);
-}
-
-// ---- relative positions
-
-// The bucket of key - query: half of them for keys behind the query. Of a side's, the lower half are distances, the rest
-// their logarithm up to max_distance. In float, as the reference rounds it. (modeling_t5.py _relative_position_bucket)
-static int32_t gsf__t5_bucket(const gsf_nn_t5* c, int64_t offset) {
-    const int32_t side = c->buckets / 2, exact = side / 2;
-    const int64_t distance = offset < 0 ? -offset : offset;
-    int64_t bucket = distance;
-    if (distance >= exact) {
-        const float spread = (float)log((double)c->max_distance / exact);
-        bucket = exact + (int64_t)(logf((float)distance / (float)exact) / spread * (float)(side - exact));
-        if (bucket > side - 1) bucket = side - 1;
-    }
-    return (int32_t)bucket + (offset > 0 ? side : 0);
-}
-
-// bias (heads, tokens, tokens), the same for every block; scratch: 2 tokens + buckets * heads floats.
-static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_tensor* positions, int64_t tokens, float* scratch,
-                              float* bias) {
-    float *line = scratch, *table = scratch + 2 * tokens; // line: by key - query, from 1 - tokens up
-    gsf_nn_read_tensor(positions, 0, positions->count, table);
-    for (int64_t h = 0; h < c->heads; h++) {
-        for (int64_t i = 0; i < 2 * tokens - 1; i++) line[i] = table[gsf__t5_bucket(c, i + 1 - tokens) * c->heads + h];
-        for (int64_t q = 0; q < tokens; q++, bias += tokens)
-            memcpy(bias, line + tokens - 1 - q, (size_t)tokens * sizeof(float));
-    }
-}
-
-// ---- one pass
-
-typedef struct gsf__t5_run {
-    gsf_context* ctx;
-    const gsf_nn_t5* net;
-    const gsf_nn_t5_input* in;
-    gsf_nn_workspace workspace;
-    int64_t rows;  // batch * tokens
-    float* x;      // (rows, width): the residual stream
-    float* normed; // (rows, width)
-    float* wide;   // q, k, v (rows, heads * head_dim) each; or both parts of the feed-forward's hidden layer
-    float* bias;   // (heads, tokens, tokens)
-    float* norm;   // (width): weights of the norm at work
-} gsf__t5_run;
-
-typedef struct gsf__t5_layout { double x, wide, bias, total; } gsf__t5_layout; // floats
-
-static gsf__t5_layout gsf__t5_plan(const gsf_nn_t5* c, const gsf_nn_t5_input* in) {
-    const double rows = (double)in->batch * in->tokens, n = in->tokens;
-    const double qkv = 3.0 * rows * c->heads * c->head_dim, ff = 2.0 * rows * c->hidden;
-    const double scratch = 2.0 * n + (double)c->buckets * c->heads; // of gsf__t5_fill_bias
-    gsf__t5_layout l;
-    l.x = rows * c->width;
-    l.wide = qkv > ff ? qkv : ff;
-    if (l.wide < scratch) l.wide = scratch;
-    l.bias = n * n * c->heads;
-    l.total = 2.0 * l.x + l.wide + l.bias + c->width;
-    return l;
-}
-
-GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops) {
-    const double rows = (double)input->batch * input->tokens, d = t5->width, inner = (double)t5->heads * t5->head_dim;
-    *bytes = gsf__t5_plan(t5, input).total * sizeof(float);
-    *flops = t5->layers * rows * (2.0 * d * (4.0 * inner + 3.0 * t5->hidden) + 4.0 * inner * input->tokens);
-}
-
-static void gsf__t5_tap(const gsf__t5_run* run, int32_t layer, const char* name, const float* x) {
-    const gsf_nn_t5_input* in = run->in;
-    char whole[64];
-    if (!in->tap_fn) return;
-    if (layer < 0) snprintf(whole, sizeof whole, "%s", name);
-    else snprintf(whole, sizeof whole, "block%d.%s", (int)layer, name);
-    for (int32_t b = 0; b < in->batch; b++)
-        in->tap_fn(in->tap_user, whole, b, x + (int64_t)b * in->tokens * run->net->width, in->tokens, run->net->width);
-}
-
-static void gsf__t5_norm(gsf__t5_run* run, const gsf_tensor* weight, float* out) {
-    gsf_nn_read_tensor(weight, 0, weight->count, run->norm);
-    gsf_nn_rms_norm(run->ctx, run->x, run->rows, run->net->width, run->norm, (float)run->net->norm_eps, out);
-}
-
-// y = activation(x w^T), or x += that where `add`.
-static gsf_result gsf__t5_linear(gsf__t5_run* run, const float* x, const gsf_tensor* weight, gsf_nn_activation activation,
-                                 int add, float* y) {
-    gsf_nn_linear_desc d;
-    memset(&d, 0, sizeof d);
-    d.x = x;
-    d.rows = run->rows;
-    d.weight = weight;
-    d.activation = activation;
-    d.accumulate = add;
-    d.y = y;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
-}
-
-// x += attention(norm(x)): logits are not scaled, and their bias is by relative position.
-static gsf_result gsf__t5_attention(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
-    const gsf_nn_t5* c = run->net;
-    const int64_t n = run->in->tokens, inner = (int64_t)c->heads * c->head_dim;
-    float *q = run->wide, *k = q + run->rows * inner, *v = k + run->rows * inner;
-    gsf__t5_norm(run, block->attention_norm, run->normed);
-    gsf__t5_tap(run, layer, "attn_norm", run->normed);
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->q, GSF_NN_LINEAR, 0, q));
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->k, GSF_NN_LINEAR, 0, k));
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->v, GSF_NN_LINEAR, 0, v));
-    gsf_nn_attention_desc d;
-    memset(&d, 0, sizeof d);
-    d.queries = d.keys = n;
-    d.heads = c->heads;
-    d.head_dim = c->head_dim;
-    d.bias = run->bias;
-    d.scale = 1.0f;
-    for (int64_t b = 0; b < run->in->batch; b++) {
-        d.q = q + b * n * inner;
-        d.k = k + b * n * inner;
-        d.v = v + b * n * inner;
-        d.out = q + b * n * inner;
-        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &d));
-    }
-    GSF__TRY(gsf__t5_linear(run, q, block->out, GSF_NN_LINEAR, 1, run->x));
-    gsf__t5_tap(run, layer, "after_attn", run->x);
-    return GSF_OK;
-}
-
-typedef struct gsf__t5_product {
-    float* a;
-    const float* b;
-    int64_t count;
-} gsf__t5_product;
-
-static void gsf__t5_multiply(void* arg, size_t chunk, int worker) { // a *= b
-    const gsf__t5_product* job = (const gsf__t5_product*)arg;
-    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
-    (void)worker;
-    for (int64_t i = begin; i < end; i++) job->a[i] *= job->b[i];
-}
-
-// x += down(gelu(gate(norm(x))) * up(norm(x)))
-static gsf_result gsf__t5_feed_forward(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
-    float *gate = run->wide, *up = gate + run->rows * run->net->hidden;
-    gsf__t5_norm(run, block->ff_norm, run->normed);
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->gate, GSF_NN_GELU_TANH, 0, gate));
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->up, GSF_NN_LINEAR, 0, up));
-    gsf__t5_product job = {gate, up, run->rows * run->net->hidden};
-    gsf__parallel_for(run->ctx, gsf__nn_chunks(job.count, GSF__NN_CHUNK), gsf__t5_multiply, &job);
-    GSF__TRY(gsf__t5_linear(run, gate, block->down, GSF_NN_LINEAR, 1, run->x));
-    gsf__t5_tap(run, layer, "out", run->x);
-    return GSF_OK;
-}
-
-static gsf_result gsf__t5_check(const gsf__t5_run* run, const char* stage, const char* prefix, const float* x) {
-    return gsf__nn_check_finite(run->ctx, &run->net->weights, "t5", prefix, stage, x, run->rows * run->net->width);
-}
-
-static gsf_result gsf__t5_forward(gsf__t5_run* run, float* out) {
-    const gsf_nn_t5* c = run->net;
-    const gsf__t5_nets* nets = (const gsf__t5_nets*)c->nets;
-    for (int64_t r = 0; r < run->rows; r++)
-        gsf_nn_read_tensor(nets->embedding, (int64_t)run->in->ids[r] * c->width, c->width, run->x + r * c->width);
-    GSF__TRY(gsf__t5_check(run, "the embedding", "shared.", run->x));
-    gsf__t5_tap(run, -1, "embed", run->x);
-    gsf__t5_fill_bias(c, nets->positions, run->in->tokens, run->wide, run->bias);
-    for (int32_t i = 0; i < c->layers; i++) {
-        char name[48];
-        GSF__TRY(gsf__t5_attention(run, i, &nets->blocks[i]));
-        GSF__TRY(gsf__t5_feed_forward(run, i, &nets->blocks[i]));
-        snprintf(name, sizeof name, "encoder.block.%d.", (int)i);
-        GSF__TRY(gsf__t5_check(run, name, name, run->x));
-        GSF__TRY(gsf__check_cancel(run->ctx));
-        gsf__progress(run->ctx, "text", i + 1, c->layers);
-    }
-    gsf__t5_norm(run, nets->final_norm, out);
-    return gsf__t5_check(run, "the last norm", "encoder.final", out);
-}
-
-GSF_API gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input, float* out) {
-    gsf__t5_run run;
-    memset(&run, 0, sizeof run);
-    if (!input->ids || input->batch < 1 || input->tokens < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: no tokens");
-    run.ctx = ctx;
-    run.net = t5;
-    run.in = input;
-    run.rows = (int64_t)input->batch * input->tokens;
-    for (int64_t i = 0; i < run.rows; i++)
-        if (input->ids[i] < 0 || input->ids[i] >= t5->vocabulary)
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: id %d; the vocabulary has %d", (int)input->ids[i],
-                            (int)t5->vocabulary);
-    const gsf__t5_layout l = gsf__t5_plan(t5, input);
-    if (l.total > (double)(SIZE_MAX / 16))
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "t5: %d tokens of %d prompts are too many", (int)input->tokens,
-                        (int)input->batch);
-    run.x = (float*)gsf_alloc(ctx, (size_t)l.total, sizeof(float));
-    if (!run.x) return GSF_ERROR_OUT_OF_MEMORY;
-    run.normed = run.x + (size_t)l.x;
-    run.wide = run.normed + (size_t)l.x;
-    run.bias = run.wide + (size_t)l.wide;
-    run.norm = run.bias + (size_t)l.bias;
-    const gsf_result result = gsf__t5_forward(&run, out);
-    if (result) memset(out, 0, (size_t)l.x * sizeof(float));
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
-    gsf_free(ctx, run.x);
-    return result;
-}
-
 // ---- >>nn image encoders --------------------------------------------------------
 //
 // DINOv2 with registers (Oquab et al. 2023; Darcet et al. 2023) and the aggregator of VGGT (Wang et al. 2025): a DINOv2
@@ -10655,427 +7091,6 @@ GSF_API gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, cons
         tensors[count++].name = "prompt_embeds";
     }
     return gsf_nn_save_tensors(ctx, path, tensors, count);
-}
-
-// ---- >>nn sampling --------------------------------------------------------------
-
-enum { GSF__SAMPLE_STREAM = 0x6e6f6973 }; // of the random numbers: the initial noise
-
-typedef struct gsf__sample_run {
-    gsf_context* ctx;
-    const gsf_nn_transformer* net;
-    const gsf_nn_vae* vae;
-    const gsf_nn_schedule* schedule;
-    gsf_nn_sample_desc desc;       // defaults filled in
-    gsf_nn_sample_stats stats;
-    int32_t frames, height, width; // of the latents
-    int32_t channels;              // of the latents
-    int64_t count;                 // values of the latents
-    float *latents, *control;      // (frames, channels, height, width), control scaled as the network takes it
-    float *input, *prediction;     // (2, frames, 2 channels, height, width), (2, frames, channels, height, width)
-    float* reference_kv;
-    int reference_kv_ready;
-    gsf_nn_block_cache cache;
-    gsf_nn_sampler sampler;
-    uint32_t settings, clip; // checksums of everything that the result depends on; with a checkpoint
-} gsf__sample_run;
-
-GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc) {
-    gsf_nn_sample_desc d = *desc;
-    if (!d.steps) d.steps = 50;
-    if (d.guidance == 0.0f) d.guidance = 6.0f;
-    if (d.guidance_end == 0.0f) d.guidance_end = 1.0f;
-    if (d.strength == 0.0f) d.strength = 1.0f;
-    return d;
-}
-
-static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) {
-    if (d->_start_canary != 0 || d->_end_canary != 0)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: the desc was not zeroed");
-    *d = gsf_nn_resolve_sample(d);
-    if (d->steps < 1 || d->steps > 1000)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: %d steps, not 1 to 1000", (int)d->steps);
-    if (!(d->strength > 0.0f && d->strength <= 1.0f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: strength %g is not in (0, 1]", (double)d->strength);
-    if (!(d->guidance >= 1.0f && d->guidance < 1e4f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: guidance %g is below 1", (double)d->guidance);
-    if (!(d->guidance_begin >= 0.0f && d->guidance_begin <= d->guidance_end && d->guidance_end <= 1.0f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: guidance from %g to %g of the steps",
-                        (double)d->guidance_begin, (double)d->guidance_end);
-    if (!(d->block_cache >= 0.0f && d->block_cache < 1e4f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: block cache threshold %g", (double)d->block_cache);
-    return GSF_OK;
-}
-
-// Frames that the VAE gives back as many: 1, 9, 17, ... at the usual compression of 4.
-static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
-                                         const gsf_nn_sample_desc* d) {
-    const int32_t step = 2 * v->temporal_ratio, square = v->spatial_ratio * t->patch;
-    if (t->temporal_ratio != v->temporal_ratio || t->in_channels != 2 * v->latent_channels ||
-        t->out_channels != v->latent_channels)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent) do not fit",
-                        (int)t->in_channels, (int)t->out_channels, (int)v->latent_channels);
-    if (d->frames < 1 || (d->frames - 1) % step)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: %d frames; it takes 1, %d, %d, ...", (int)d->frames,
-                        (int)(1 + step), (int)(1 + 2 * step));
-    if (d->height < square || d->width < square || d->height % square || d->width % square)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are no multiple of %d", (int)d->width,
-                        (int)d->height, (int)square);
-    if (t->learned_positions && d->frames != t->sample_frames && !d->any_frames)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
-                        "sample: %d frames; the model's positions are learned for %d (any_frames puts sines in their place)",
-                        (int)d->frames, (int)t->sample_frames);
-    return gsf__dit_check_size(ctx, t, d->height / v->spatial_ratio, d->width / v->spatial_ratio);
-}
-
-static gsf_result gsf__sample_check(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
-                                    gsf_nn_sample_desc* d) {
-    GSF__TRY(gsf__sample_defaults(ctx, d));
-    GSF__TRY(gsf__sample_check_size(ctx, t, v, d));
-    if (!d->control || !d->text)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: control frames or text embeddings are missing");
-    return GSF_OK;
-}
-
-// Between (channels, frames, plane) and (frames, channels, plane), times a factor.
-static void gsf__swap_frames(const float* from, int64_t outer, int64_t inner, int64_t plane, float factor, float* to) {
-    for (int64_t i = 0; i < inner; i++)
-        for (int64_t o = 0; o < outer; o++, to += plane) {
-            const float* source = from + (o * inner + i) * plane;
-            for (int64_t p = 0; p < plane; p++) to[p] = source[p] * factor;
-        }
-}
-
-static gsf_result gsf__sample_encode(gsf__sample_run* run) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    float* mean = run->prediction;
-    GSF__TRY(gsf_nn_vae_encode(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, mean, NULL));
-    gsf__swap_frames(mean, run->channels, run->frames, (int64_t)run->height * run->width,
-                     (float)run->vae->scaling_factor, run->control);
-    return GSF_OK;
-}
-
-static gsf_result gsf__sample_decode(gsf__sample_run* run, float* out) {
-    gsf__swap_frames(run->latents, run->frames, run->channels, (int64_t)run->height * run->width,
-                     (float)(1.0 / run->vae->scaling_factor), run->prediction);
-    return gsf_nn_vae_decode(run->ctx, run->vae, NULL, run->prediction, run->frames, run->height, run->width, out);
-}
-
-// Pure noise, or at strength < 1 the control latents with the noise of the first step.
-static void gsf__sample_begin(gsf__sample_run* run) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    for (int64_t i = 0; i < run->count; i++)
-        run->latents[i] = d->noise ? d->noise[i] : (float)gsf_random_normal(d->seed, GSF__SAMPLE_STREAM, (uint64_t)i);
-    if (run->sampler.count < d->steps)
-        gsf_nn_add_noise(run->ctx, run->schedule, run->sampler.timesteps[0], run->control, run->latents,
-                         (size_t)run->count, run->latents);
-}
-
-// ---- checkpoint: what identifies the job, the step, the latents and what the solver remembers
-
-// Tells weights apart without reading all of them: every tensor's name, type and shape, and 64 bytes from its beginning,
-// middle and end.
-static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weights) {
-    for (size_t i = 0; i < weights->tensor_count; i++) {
-        const gsf_tensor* t = &weights->tensors[i];
-        const size_t size = (size_t)t->count * gsf_nn_dtype_size(t->dtype), part = size < 64 ? size : 64;
-        const size_t at[3] = {0, (size - part) / 2, size - part};
-        crc = gsf__crc32(crc, t->name, strlen(t->name) + 1);
-        crc = gsf__crc32(crc, &t->dtype, sizeof t->dtype);
-        crc = gsf__crc32(crc, t->shape, (size_t)t->rank * sizeof t->shape[0]);
-        for (int k = 0; k < 3; k++) crc = gsf__crc32(crc, (const char*)t->data + at[k], part);
-    }
-    return crc;
-}
-
-// What every clip of a run has in common: model, precision, schedule and settings.
-static uint32_t gsf__sample_sum_settings(const gsf__sample_run* run) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    const gsf_nn_transformer* t = run->net;
-    const int int8 = ((const gsf__dit_nets*)t->nets)->quantized != NULL;
-    const int32_t whole[] = {d->steps, (int32_t)d->solver, d->dynamic_guidance, t->layers, t->heads, t->bf16 != 0, int8,
-                             run->schedule->desc.train_steps, (int32_t)run->schedule->desc.spacing,
-                             run->schedule->desc.steps_offset};
-    const float real[] = {d->guidance, d->guidance_begin, d->guidance_end, d->strength, d->block_cache};
-    const size_t steps = (size_t)run->schedule->desc.train_steps;
-    uint32_t crc = gsf__crc32(0, whole, sizeof whole);
-    crc = gsf__crc32(crc, real, sizeof real);
-    crc = gsf__crc32(crc, run->schedule->alpha_bar, steps * sizeof *run->schedule->alpha_bar);
-    crc = gsf__crc32(crc, &run->schedule->final_alpha_bar, sizeof run->schedule->final_alpha_bar);
-    crc = gsf__crc32(crc, run->sampler.timesteps, (size_t)run->sampler.count * sizeof *run->sampler.timesteps);
-    crc = gsf__sample_sum_weights(crc, &t->weights);
-    return gsf__sample_sum_weights(crc, &run->vae->weights);
-}
-
-// What this clip is made of.
-static uint32_t gsf__sample_sum_clip(const gsf__sample_run* run) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    const gsf_nn_transformer* t = run->net;
-    const int32_t whole[] = {d->frames, d->height, d->width, d->noise != NULL, (int32_t)d->reference_tokens,
-                             d->references != NULL};
-    const size_t text = 2 * (size_t)t->text_tokens * (size_t)t->text_channels;
-    uint32_t crc = gsf__crc32(0, whole, sizeof whole);
-    crc = gsf__crc32(crc, &d->seed, sizeof d->seed);
-    crc = gsf__crc32(crc, run->control, (size_t)run->count * sizeof(float));
-    crc = gsf__crc32(crc, d->text, text * sizeof(float));
-    if (d->noise) crc = gsf__crc32(crc, d->noise, (size_t)run->count * sizeof(float));
-    if (d->references)
-        crc = gsf__crc32(crc, d->references, (size_t)d->reference_tokens * (size_t)gsf__dit_width(t) * sizeof(float));
-    return crc;
-}
-
-static gsf_result gsf__sample_save(gsf__sample_run* run) {
-    if (!run->desc.checkpoint) return GSF_OK;
-    gsf_text file;
-    char head[12];
-    memset(&file, 0, sizeof file);
-    gsf__store_le(head, run->clip, 4);
-    gsf__store_le(head + 4, (uint64_t)run->sampler.index, 4);
-    gsf__store_le(head + 8, run->settings, 4);
-    gsf_chunks_add(run->ctx, &file, "SAMP", head, sizeof head);
-    gsf_chunks_add(run->ctx, &file, "LATE", run->latents, (size_t)run->count * sizeof(float));
-    gsf_chunks_add(run->ctx, &file, "MEMO", run->sampler.memory, run->sampler.memory_count * sizeof(float));
-    gsf_chunks_end(run->ctx, &file);
-    const gsf_result result =
-        file.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(run->ctx, run->desc.checkpoint, file.data, file.size);
-    gsf_destroy_text(run->ctx, &file);
-    return result;
-}
-
-static int gsf__sample_is_finite(const gsf_chunk* floats) {
-    for (size_t i = 0; i + sizeof(float) <= floats->size; i += sizeof(float)) {
-        float value;
-        memcpy(&value, (const char*)floats->data + i, sizeof value);
-        if (!(fabsf(value) <= FLT_MAX)) return 0;
-    }
-    return 1;
-}
-
-static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size) {
-    gsf_chunk head, latents, memory;
-    if (!gsf_chunks_find(data, size, "SAMP", &head) || !gsf_chunks_find(data, size, "LATE", &latents) ||
-        !gsf_chunks_find(data, size, "MEMO", &memory))
-        return;
-    if (head.size != 12 || gsf__load_le((const char*)head.data + 8, 4) != run->settings) {
-        gsf_log(run->ctx, GSF_LOG_WARNING, "%s: made with another model, precision or other settings: the clip starts anew",
-                run->desc.checkpoint);
-        return;
-    }
-    if (latents.size != (size_t)run->count * sizeof(float) ||
-        memory.size != run->sampler.memory_count * sizeof(float) || gsf__load_le(head.data, 4) != run->clip)
-        return; // of the clip before this
-    const int64_t index = (int64_t)gsf__load_le((const char*)head.data + 4, 4);
-    if (index < 1 || index > run->sampler.count) return;
-    if (!gsf__sample_is_finite(&latents) || !gsf__sample_is_finite(&memory)) return; // it would fail the same way each time
-    memcpy(run->latents, latents.data, latents.size);
-    if (memory.size) memcpy(run->sampler.memory, memory.data, memory.size);
-    run->sampler.index = (int32_t)index;
-}
-
-// Goes on from the checkpoint if there is one of this very job; one of another job, or a broken one, is overwritten after
-// the first step.
-static gsf_result gsf__sample_resume(gsf__sample_run* run) {
-    void* data;
-    size_t size;
-    if (!run->desc.checkpoint) return GSF_OK;
-    GSF__TRY(gsf__nn_read_if_there(run->ctx, run->desc.checkpoint, &data, &size));
-    if (!data) return GSF_OK;
-    if (gsf_chunks_check(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
-    gsf_free(run->ctx, data);
-    run->stats.resumed_from = run->sampler.index;
-    return GSF_OK;
-}
-
-// ---- the steps
-
-// Guidance of step `index`; 1: the prompt alone.
-static float gsf__sample_guidance(const gsf__sample_run* run, int32_t index) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    const float at = ((float)index + 0.5f) / (float)run->sampler.count;
-    if (at < d->guidance_begin || at > d->guidance_end) return 1.0f;
-    if (!d->dynamic_guidance) return d->guidance;
-    // The official code mixes units: the time step counts to 1000, n is the number of steps.
-    const double n = d->steps, t = run->sampler.timesteps[index];
-    return (float)(1.0 + (double)d->guidance * (1.0 - cos(3.14159265358979323846 * pow((n - t) / n, 5.0))) / 2.0);
-}
-
-// Noisy latents and control side by side, for each of `rows` samples.
-static void gsf__sample_fill_input(gsf__sample_run* run, int32_t rows) {
-    const size_t frame = (size_t)run->channels * (size_t)run->height * (size_t)run->width;
-    float* to = run->input;
-    for (int32_t b = 0; b < rows; b++)
-        for (size_t f = 0; f < (size_t)run->frames; f++, to += 2 * frame) {
-            memcpy(to, run->latents + f * frame, frame * sizeof(float));
-            memcpy(to + frame, run->control + f * frame, frame * sizeof(float));
-        }
-}
-
-static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    const gsf_nn_transformer* t = run->net;
-    const int32_t rows = guidance == 1.0f ? 1 : 2;
-    const double step = run->sampler.timesteps[run->sampler.index], steps[2] = {step, step};
-    gsf_nn_transformer_input in;
-    memset(&in, 0, sizeof in);
-    in.batch = rows;
-    in.frames = run->frames;
-    in.height = run->height;
-    in.width = run->width;
-    in.hidden = run->input;
-    in.text = rows == 2 ? d->text : d->text + (int64_t)t->text_tokens * t->text_channels; // negative prompt, prompt
-    in.timesteps = steps;
-    in.references = d->references;
-    in.reference_tokens = d->reference_tokens;
-    in.reference_batch = 1;
-    in.reference_kv = run->reference_kv;
-    in.reference_kv_ready = run->reference_kv_ready;
-    in.cache = &run->cache;
-    const int64_t hits = run->cache.hits;
-    gsf__sample_fill_input(run, rows);
-    GSF__TRY(gsf_nn_transformer_forward(run->ctx, t, &in, run->prediction));
-    // A step that the cache cut short after the first block has not filled the other blocks' keys and values.
-    if (run->cache.hits == hits) run->reference_kv_ready = 1;
-    run->stats.network_rows += rows;
-    run->stats.cached_steps += run->cache.hits - hits;
-    for (int64_t i = 0; rows == 2 && i < run->count; i++) {
-        const float u = run->prediction[i], c = run->prediction[run->count + i];
-        run->prediction[i] = u + guidance * (c - u);
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__sample_steps(gsf__sample_run* run) {
-    const gsf_nn_sample_desc* d = &run->desc;
-    while (run->sampler.index < run->sampler.count) {
-        const int32_t index = run->sampler.index;
-        GSF__TRY(gsf__check_cancel(run->ctx));
-        gsf__progress(run->ctx, "restore", index, run->sampler.count);
-        GSF__TRY(gsf__sample_predict(run, gsf__sample_guidance(run, index)));
-        GSF__TRY(gsf_nn_step_sampler(run->ctx, &run->sampler, run->prediction, run->latents, NULL));
-        if (d->step_fn) d->step_fn(d->step_user, index, run->latents, run->prediction, run->count);
-        run->stats.steps++;
-        GSF__TRY(gsf__sample_save(run));
-    }
-    gsf__progress(run->ctx, "restore", run->sampler.count, run->sampler.count);
-    return GSF_OK;
-}
-
-static gsf_result gsf__sample_run_all(gsf__sample_run* run, float* out) {
-    gsf_nn_sampler_desc desc;
-    memset(&desc, 0, sizeof desc);
-    desc.solver = run->desc.solver;
-    desc.steps = run->desc.steps;
-    desc.strength = (double)run->desc.strength;
-    desc.value_count = (size_t)run->count;
-    GSF__TRY(gsf_nn_make_sampler(run->ctx, run->schedule, &desc, &run->sampler));
-    GSF__TRY(gsf__sample_encode(run));
-    gsf__sample_begin(run);
-    if (run->desc.checkpoint) {
-        run->settings = gsf__sample_sum_settings(run);
-        run->clip = gsf__sample_sum_clip(run);
-    }
-    GSF__TRY(gsf__sample_resume(run));
-    run->cache.threshold = run->desc.block_cache;
-    GSF__TRY(gsf__sample_steps(run));
-    return gsf__sample_decode(run, out);
-}
-
-static void gsf__sample_sizes(gsf__sample_run* run, const gsf_nn_sample_desc* d) {
-    run->frames = (d->frames - 1) / run->vae->temporal_ratio + 1;
-    run->height = d->height / run->vae->spatial_ratio;
-    run->width = d->width / run->vae->spatial_ratio;
-    run->channels = run->vae->latent_channels;
-    run->count = (int64_t)run->frames * run->channels * run->height * run->width;
-}
-
-static size_t gsf__sample_kv_size(const gsf__sample_run* run) {
-    if (!run->desc.references || run->desc.no_reference_cache) return 0;
-    return gsf_nn_reference_kv_size(run->net, run->desc.reference_tokens, 1);
-}
-
-enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents, control, input 2 x 2, prediction 2
-
-GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
-                                      const gsf_nn_sample_desc* desc, gsf_nn_cost* out) {
-    gsf__sample_run run;
-    gsf_nn_vae_info encode, decode;
-    memset(&run, 0, sizeof run);
-    memset(out, 0, sizeof *out);
-    run.net = transformer;
-    run.vae = vae;
-    run.desc = *desc;
-    GSF__TRY(gsf__sample_defaults(ctx, &run.desc));
-    GSF__TRY(gsf__sample_check_size(ctx, transformer, vae, &run.desc));
-    gsf__sample_sizes(&run, &run.desc);
-    GSF__TRY(gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_ENCODE, NULL, desc->frames, desc->height, desc->width, &encode));
-    GSF__TRY(gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_DECODE, NULL, run.frames, run.height, run.width, &decode));
-    const int32_t steps = (int32_t)((double)run.desc.steps * (double)run.desc.strength);
-    double bytes = 0.0;
-    out->flops = encode.flops + decode.flops;
-    for (int32_t i = 0; i < steps; i++) {
-        const float at = ((float)i + 0.5f) / (float)steps;
-        const int guided = run.desc.guidance != 1.0f && at >= run.desc.guidance_begin && at <= run.desc.guidance_end;
-        gsf_nn_transformer_input in;
-        double step_bytes, step_flops;
-        memset(&in, 0, sizeof in);
-        in.batch = guided ? 2 : 1;
-        in.frames = run.frames;
-        in.height = run.height;
-        in.width = run.width;
-        in.references = desc->references;
-        in.reference_tokens = desc->reference_tokens;
-        in.reference_batch = 1;
-        in.reference_kv_ready = i > 0 && !desc->no_reference_cache;
-        gsf_nn_transformer_cost(transformer, &in, &step_bytes, &step_flops);
-        out->flops += step_flops;
-        if (step_bytes > bytes) bytes = step_bytes;
-    }
-    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // what the last step's blocks added, beside the stream itself
-    if (encode.bytes > bytes) bytes = encode.bytes;
-    if (decode.bytes > bytes) bytes = decode.bytes;
-    const double own = (double)GSF__SAMPLE_BUFFERS * (double)run.count + (double)gsf__sample_kv_size(&run);
-    out->bytes = bytes + own * sizeof(float);
-    return GSF_OK;
-}
-
-static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
-                                           const gsf_nn_sample_desc* d) {
-    gsf_nn_cost cost;
-    if (!(d->max_bytes > 0.0)) return GSF_OK;
-    GSF__TRY(gsf_nn_sample_cost(ctx, t, v, d, &cost));
-    if (cost.bytes <= d->max_bytes) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY,
-                    "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed",
-                    (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
-}
-
-GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
-                                 const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
-                                 gsf_nn_sample_stats* stats) {
-    gsf__sample_run run;
-    memset(&run, 0, sizeof run);
-    run.ctx = ctx;
-    run.net = transformer;
-    run.vae = vae;
-    run.schedule = schedule;
-    run.desc = *desc;
-    GSF__TRY(gsf__sample_check(ctx, transformer, vae, &run.desc));
-    GSF__TRY(gsf__sample_check_memory(ctx, transformer, vae, &run.desc));
-    gsf__sample_sizes(&run, &run.desc);
-    const size_t count = (size_t)run.count, kv = gsf__sample_kv_size(&run);
-    float* memory = (float*)gsf_alloc(ctx, GSF__SAMPLE_BUFFERS * count + kv, sizeof(float));
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    run.latents = memory;
-    run.control = memory + count;
-    run.input = memory + 2 * count;
-    run.prediction = memory + 6 * count;
-    run.reference_kv = kv ? memory + GSF__SAMPLE_BUFFERS * count : NULL;
-    const gsf_result result = gsf__sample_run_all(&run, out);
-    if (stats) *stats = run.stats;
-    gsf_nn_destroy_block_cache(ctx, &run.cache);
-    gsf_nn_destroy_sampler(ctx, &run.sampler);
-    gsf_free(ctx, memory);
-    return result;
 }
 
 // ---- >>nn bpe -------------------------------------------------------------------
@@ -12900,6 +8915,3991 @@ GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text
         *flops = gsf__vit_flops(&net->vision, &vision, 1.0) + (double)q->layers * self + crossing * cross +
                  2.0 * n * d * w + layers * (all * row + 2.0 * all * all * w) +
                  2.0 * (double)most * w * (double)opt->vocabulary;
+}
+
+// ---- >>nn tokenizer -------------------------------------------------------------
+
+/* spiece.model is a protobuf message: fields, each a varint (field number << 3 | wire type) and its value. Of those read
+       1 piece, repeated   1 text, 2 score (float), 3 type: 1 normal, 2 unknown, 3 control, 4 user-defined, 5 unused, 6 byte
+       2 trainer           3 kind of model: 1 unigram; 24 spaces go behind words; 35 unknown characters become bytes
+       3 normaliser        2 character map, 3 dummy prefix, 4 remove extra spaces, 5 escape spaces; the three default to 1
+   Encoding a text: added tokens are cut out of it; what stands between is normalised, and of all ways to spell that with
+   pieces the one with the largest sum of scores is taken. A character that is no piece costs the lowest score - 10.
+   (github.com/google/sentencepiece: src/sentencepiece_model.proto, normalizer.cc, unigram_model.cc EncodeOptimized,
+   sentencepiece_processor.cc; transformers 4.51.3: tokenization_utils.py, tokenization_t5.py) */
+enum {
+    GSF__SP_NORMAL = 1, GSF__SP_UNKNOWN, GSF__SP_CONTROL, GSF__SP_USER, GSF__SP_UNUSED, GSF__SP_BYTE, GSF__SP_TYPES,
+    GSF__SP_PIECE = 1024,       // most bytes of a piece, of an added token,
+    GSF__SP_REPLACEMENT = 255,  //   of what the character map puts in
+    GSF__SP_MATCH = 256,        //   and looks at: bounds the time per byte of text whatever a file may hold
+    GSF__SP_EXTRA = 100,        // <extra_id_...> of T5
+};
+
+static const char gsf__sp_space[] = "\xe2\x96\x81"; // U+2581 stands for a space
+
+// ---- protobuf
+
+typedef struct gsf__pb {
+    gsf_context* ctx;
+    const char* name; // for errors
+    const unsigned char* data;
+    size_t at, end;
+} gsf__pb;
+
+typedef struct gsf__pb_field {
+    uint64_t number, value; // value: of all wire types but 2
+    int wire;               // 0 varint, 1 eight bytes, 2 a length and as many bytes, 5 four bytes
+    size_t at, size;        // of those bytes
+} gsf__pb_field;
+
+static gsf_result gsf__pb_varint(gsf__pb* in, uint64_t* out) {
+    const size_t begin = in->at;
+    *out = 0;
+    for (int shift = 0; shift < 70; shift += 7) {
+        if (in->at == in->end)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number is cut off", in->name, begin);
+        const unsigned char byte = in->data[in->at++];
+        if (shift < 64) *out |= (uint64_t)(byte & 127u) << shift;
+        if (!(byte & 128u)) return GSF_OK;
+    }
+    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number of more than ten bytes", in->name, begin);
+}
+
+static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // in->at < in->end
+    const size_t begin = in->at;
+    uint64_t key, size = 0;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__pb_varint(in, &key));
+    out->number = key >> 3;
+    out->wire = (int)(key & 7);
+    if (out->number < 1 || out->number >= 1u << 29)
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: no field has the number %llu", in->name, begin,
+                        (unsigned long long)out->number);
+    if (out->wire == 0) return gsf__pb_varint(in, &out->value);
+    if (out->wire == 1) size = 8;
+    else if (out->wire == 5) size = 4;
+    else if (out->wire == 2) GSF__TRY(gsf__pb_varint(in, &size));
+    else return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: wire type %d", in->name, begin, out->wire);
+    if (size > in->end - in->at)
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: field %d has %llu bytes, but %zu are left", in->name, begin,
+                        (int)out->number, (unsigned long long)size, in->end - in->at);
+    out->at = in->at;
+    out->size = (size_t)size;
+    if (out->wire != 2) out->value = gsf__load_le(in->data + in->at, (int)size);
+    in->at += out->size;
+    return GSF_OK;
+}
+
+static gsf_result gsf__pb_expect(const gsf__pb* in, const gsf__pb_field* field, int wire) {
+    if (field->wire == wire) return GSF_OK;
+    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: field %d has wire type %d, not %d", in->name, in->at,
+                    (int)field->number, field->wire, wire);
+}
+
+static gsf__pb gsf__pb_inside(const gsf__pb* in, const gsf__pb_field* field) { // the message that a field holds
+    gsf__pb out = *in;
+    out.at = field->at;
+    out.end = field->at + field->size;
+    return out;
+}
+
+// ---- a trie over texts
+
+typedef struct gsf__sp_key {
+    const char* text;
+    uint32_t size;
+    int32_t id;
+} gsf__sp_key;
+
+typedef struct gsf__sp_node { // children stand one after another, sorted by byte
+    uint32_t first;
+    int32_t id; // of the text that ends here; -1: none
+    uint16_t count;
+    unsigned char byte;
+} gsf__sp_node;
+
+typedef struct gsf__sp_range { uint32_t begin, end, depth; } gsf__sp_range; // of sorted keys, below a node
+
+static int gsf__sp_compare(const void* a, const void* b) { // by bytes, then by id
+    const gsf__sp_key *x = (const gsf__sp_key*)a, *y = (const gsf__sp_key*)b;
+    const int order = memcmp(x->text, y->text, x->size < y->size ? x->size : y->size);
+    if (order) return order;
+    if (x->size != y->size) return x->size < y->size ? -1 : 1;
+    return x->id < y->id ? -1 : x->id > y->id;
+}
+
+static uint32_t gsf__sp_shared(const gsf__sp_key* a, const gsf__sp_key* b) { // bytes that both begin with
+    uint32_t n = 0;
+    while (n < a->size && n < b->size && a->text[n] == b->text[n]) n++;
+    return n;
+}
+
+// From sorted keys of different, nonempty texts. *out is freed by the caller.
+static gsf_result gsf__sp_build_trie(gsf_context* ctx, const gsf__sp_key* keys, size_t count, gsf__sp_node** out) {
+    size_t total = 1, made = 1;
+    for (size_t i = 0; i < count; i++) total += keys[i].size - (i ? gsf__sp_shared(&keys[i - 1], &keys[i]) : 0);
+    if (total > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "tokenizer: %zu pieces are too many", count);
+    gsf__sp_node* nodes = (gsf__sp_node*)gsf_alloc_zeroed(ctx, total, sizeof *nodes);
+    gsf__sp_range* ranges = (gsf__sp_range*)gsf_alloc_zeroed(ctx, total, sizeof *ranges);
+    *out = nodes;
+    if (!nodes || !ranges) {
+        gsf_free(ctx, ranges);
+        return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    ranges[0].end = (uint32_t)count;
+    for (size_t n = 0; n < total; n++) {
+        const gsf__sp_range r = ranges[n];
+        uint32_t at = r.begin;
+        nodes[n].id = -1;
+        if (at < r.end && keys[at].size == r.depth) nodes[n].id = keys[at++].id;
+        nodes[n].first = (uint32_t)made;
+        while (at < r.end) {
+            const uint32_t begin = at;
+            const char byte = keys[at].text[r.depth];
+            while (at < r.end && keys[at].text[r.depth] == byte) at++;
+            nodes[made].byte = (unsigned char)byte;
+            ranges[made].begin = begin;
+            ranges[made].end = at;
+            ranges[made++].depth = r.depth + 1;
+            nodes[n].count++;
+        }
+    }
+    GSF_ASSERT(made == total);
+    gsf_free(ctx, ranges);
+    return GSF_OK;
+}
+
+static const gsf__sp_node* gsf__sp_child(const gsf__sp_node* nodes, const gsf__sp_node* node, unsigned char byte) {
+    uint32_t low = node->first, high = low + node->count;
+    const uint32_t end = high;
+    while (low < high) {
+        const uint32_t mid = low + (high - low) / 2;
+        if (nodes[mid].byte < byte) low = mid + 1;
+        else high = mid;
+    }
+    return low < end && nodes[low].byte == byte ? &nodes[low] : NULL;
+}
+
+static int32_t gsf__sp_find(const gsf__sp_node* nodes, const char* text, size_t size) { // the id of a text, or -1
+    const gsf__sp_node* node = nodes;
+    for (size_t i = 0; node && i < size; i++) node = gsf__sp_child(nodes, node, (unsigned char)text[i]);
+    return node ? node->id : -1;
+}
+
+// ---- the model
+
+typedef struct gsf__sp_added { // a text that is an id of its own
+    size_t at, size;           // in gsf__sp_model.texts, while opening
+    int32_t id;
+    int trim_left, trim_right; // takes white space beside it along
+} gsf__sp_added;
+
+typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
+    gsf__sp_node *pieces, *added; // ids of `added` are places in added_list
+    gsf__sp_added* added_list;
+    gsf_text texts;
+    size_t added_count, added_capacity;
+    float* scores;                // of each piece
+    unsigned char* types;
+    size_t count, scores_capacity, types_capacity;
+    float unknown_score;
+    int32_t unknown_id, bytes[256];
+    uint32_t* units;              // character map: a double-array trie, 0 units: none
+    size_t unit_count;
+    char* replacements;           // its values are places in here, each a zero-terminated text
+    size_t replacements_size;
+    int prefix, trim, escape, suffix, byte_fallback, has_user_pieces;
+} gsf__sp_model;
+
+static void gsf__sp_destroy(gsf_context* ctx, gsf__sp_model* m) {
+    if (!m) return;
+    gsf_free(ctx, m->pieces);
+    gsf_free(ctx, m->added);
+    gsf_free(ctx, m->added_list);
+    gsf_destroy_text(ctx, &m->texts);
+    gsf_free(ctx, m->scores);
+    gsf_free(ctx, m->types);
+    gsf_free(ctx, m->units);
+    gsf_free(ctx, m->replacements);
+    gsf_free(ctx, m);
+}
+
+GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer) {
+    gsf__sp_destroy(ctx, (gsf__sp_model*)tokenizer->model);
+    memset(tokenizer, 0, sizeof *tokenizer);
+}
+
+// ---- opening: pieces
+
+static int gsf__sp_is_text(const char* text, size_t size) { // UTF-8 without zeros
+    for (size_t at = 0, step; at < size; at += step) {
+        step = text[at] ? gsf__utf8_size(text + at, size - at) : 0;
+        if (!step) return 0;
+    }
+    return 1;
+}
+
+static gsf_result gsf__sp_read_piece(gsf__pb in, gsf__sp_key* key, float* score, unsigned char* type) {
+    const size_t begin = in.at;
+    uint64_t kind = GSF__SP_NORMAL;
+    gsf__pb_field field;
+    *score = 0.0f;
+    while (in.at < in.end) {
+        GSF__TRY(gsf__pb_next(&in, &field));
+        if (field.number == 1) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 2));
+            if (field.size > GSF__SP_PIECE || !gsf__sp_is_text((const char*)in.data + field.at, field.size))
+                return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d is no UTF-8, or longer than %d bytes",
+                                in.name, field.at, (int)key->id, (int)GSF__SP_PIECE);
+            key->text = (const char*)in.data + field.at;
+            key->size = (uint32_t)field.size;
+        } else if (field.number == 2) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 5));
+            const uint32_t bits = (uint32_t)field.value;
+            memcpy(score, &bits, sizeof bits);
+        } else if (field.number == 3) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 0));
+            kind = field.value;
+        }
+    }
+    if (key->size == 0 || !(fabsf(*score) <= 1e30f) || kind < GSF__SP_NORMAL || kind >= GSF__SP_TYPES)
+        return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d has %u bytes, score %g and type %llu", in.name, begin,
+                        (int)key->id, (unsigned)key->size, (double)*score, (unsigned long long)kind);
+    *type = (unsigned char)kind;
+    return GSF_OK;
+}
+
+// "<0x1F>" to 31; -1: not of that form
+static int gsf__sp_byte_of(const gsf__sp_key* key) {
+    static const char digits[] = "0123456789ABCDEF";
+    if (key->size != 6 || memcmp(key->text, "<0x", 3) != 0 || key->text[5] != '>') return -1;
+    const char *high = strchr(digits, key->text[3]), *low = strchr(digits, key->text[4]);
+    return high && low ? (int)(high - digits) * 16 + (int)(low - digits) : -1;
+}
+
+static gsf_result gsf__sp_note_piece(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_key* key) {
+    const int type = m->types[key->id];
+    if (type == GSF__SP_UNKNOWN) {
+        if (m->unknown_id >= 0)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d are both the unknown one", in->name,
+                            (int)m->unknown_id, (int)key->id);
+        m->unknown_id = key->id;
+    } else if (type == GSF__SP_BYTE) {
+        const int byte = gsf__sp_byte_of(key);
+        if (byte < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: piece %d is no byte", in->name, (int)key->id);
+        m->bytes[byte] = key->id;
+    } else if (type == GSF__SP_USER) {
+        m->has_user_pieces = 1;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_read_trainer(gsf__pb in, gsf__sp_model* m) {
+    gsf__pb_field field;
+    while (in.at < in.end) {
+        GSF__TRY(gsf__pb_next(&in, &field));
+        if (field.number != 3 && field.number != 24 && field.number != 35) continue;
+        GSF__TRY(gsf__pb_expect(&in, &field, 0));
+        if (field.number == 24) m->suffix = field.value != 0;
+        else if (field.number == 35) m->byte_fallback = field.value != 0;
+        else if (field.value != 1)
+            return gsf_fail(in.ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: a model of kind %llu, not a unigram", in.name, in.at,
+                            (unsigned long long)field.value);
+    }
+    return GSF_OK;
+}
+
+// ---- opening: the character map
+
+/* u32 bytes of the trie | its units, each u32 | texts, each ending in a zero
+   A unit of the double array: label in bits 0-7 and 31 (a byte, or 1 << 31 for a value), 8: a value is among the children,
+   offset in bits 10-31, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b, if that one's
+   label is b; the value is in bits 0-30 of the child for 0. (github.com/s-yata/darts-clone) */
+static uint32_t gsf__sp_offset(uint32_t unit) { return unit >> 10 << ((unit & 512u) >> 6); }
+
+// Checks every unit, so that no walk leaves the array: children of a unit lie in one block of 256.
+static gsf_result gsf__sp_check_units(const gsf__pb* in, size_t at, const gsf__sp_model* m) {
+    for (size_t i = 0; i < m->unit_count; i++) {
+        const uint32_t unit = m->units[i];
+        if (unit >> 31 && i > 0) continue; // a value
+        const size_t base = i ^ gsf__sp_offset(unit);
+        const uint32_t value = base < m->unit_count ? m->units[base] & 0x7fffffffu : 0;
+        int ok = !(unit >> 31) && base < m->unit_count;
+        if (ok && unit >> 8 & 1u) {
+            const size_t left = value < m->replacements_size ? m->replacements_size - value : 0;
+            const size_t most = left <= GSF__SP_REPLACEMENT ? left : GSF__SP_REPLACEMENT + 1;
+            ok = most && memchr(m->replacements + value, 0, most) != NULL;
+        }
+        if (!ok)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: unit %zu of the character map leads nowhere", in->name,
+                            at + 4 * i, i);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_read_map(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m) {
+    const unsigned char* data = in->data + field->at;
+    gsf_free(in->ctx, m->units); // of an earlier field
+    gsf_free(in->ctx, m->replacements);
+    m->units = NULL;
+    m->replacements = NULL;
+    m->unit_count = m->replacements_size = 0;
+    if (field->size == 0) return GSF_OK;
+    const size_t bytes = field->size >= 4 ? (size_t)gsf__load_le(data, 4) : 0;
+    if (field->size < 5 || bytes > field->size - 5 || bytes == 0 || bytes % 1024 || data[field->size - 1] != 0)
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a character map of %zu bytes with %zu of trie", in->name,
+                        field->at, field->size, bytes);
+    m->unit_count = bytes / 4;
+    m->replacements_size = field->size - 4 - bytes;
+    m->units = (uint32_t*)gsf_alloc(in->ctx, m->unit_count, sizeof *m->units);
+    m->replacements = (char*)gsf_alloc(in->ctx, m->replacements_size, 1);
+    if (!m->units || !m->replacements) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < m->unit_count; i++) m->units[i] = (uint32_t)gsf__load_le(data + 4 + 4 * i, 4);
+    memcpy(m->replacements, data + 4 + bytes, m->replacements_size);
+    return gsf__sp_check_units(in, field->at + 4, m);
+}
+
+static gsf_result gsf__sp_read_normalizer(gsf__pb in, gsf__sp_model* m) {
+    gsf__pb_field field;
+    while (in.at < in.end) {
+        GSF__TRY(gsf__pb_next(&in, &field));
+        if (field.number == 2) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 2));
+            GSF__TRY(gsf__sp_read_map(&in, &field, m));
+        } else if (field.number >= 3 && field.number <= 5) {
+            GSF__TRY(gsf__pb_expect(&in, &field, 0));
+            *(field.number == 3 ? &m->prefix : field.number == 4 ? &m->trim : &m->escape) = field.value != 0;
+        }
+    }
+    return GSF_OK;
+}
+
+// ---- opening: the file as a whole
+
+typedef struct gsf__sp_keys { // texts of the pieces, in the caller's bytes
+    gsf__sp_key* keys;
+    size_t count, capacity;
+} gsf__sp_keys;
+
+static gsf_result gsf__sp_add_piece(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m, gsf__sp_keys* all) {
+    const size_t n = all->count;
+    if (n >= INT32_MAX) return gsf_fail(in->ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", in->name);
+    GSF__TRY(gsf__reserve(in->ctx, (void**)&all->keys, &all->capacity, n, n + 1, sizeof *all->keys));
+    GSF__TRY(gsf__reserve(in->ctx, (void**)&m->scores, &m->scores_capacity, n, n + 1, sizeof *m->scores));
+    GSF__TRY(gsf__reserve(in->ctx, (void**)&m->types, &m->types_capacity, n, n + 1, 1));
+    memset(&all->keys[n], 0, sizeof all->keys[n]);
+    all->keys[n].id = (int32_t)n;
+    GSF__TRY(gsf__sp_read_piece(gsf__pb_inside(in, field), &all->keys[n], &m->scores[n], &m->types[n]));
+    GSF__TRY(gsf__sp_note_piece(in, m, &all->keys[n]));
+    all->count = m->count = n + 1;
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_check_pieces(const gsf__pb* in, gsf__sp_model* m, const gsf__sp_keys* all) {
+    float low = FLT_MAX;
+    for (size_t i = 0; i < m->count; i++)
+        if (m->types[i] == GSF__SP_NORMAL && m->scores[i] < low) low = m->scores[i];
+    m->unknown_score = low - 10.0f;
+    if (m->unknown_id < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece is the unknown one", in->name);
+    for (int i = 0; m->byte_fallback && i < 256; i++)
+        if (m->bytes[i] < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece for the byte %d", in->name, i);
+    qsort(all->keys, all->count, sizeof *all->keys, gsf__sp_compare);
+    for (size_t i = 1; i < all->count; i++) {
+        const gsf__sp_key *a = &all->keys[i - 1], *b = &all->keys[i];
+        if (a->size == b->size && memcmp(a->text, b->text, a->size) == 0)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d have the same text", in->name, (int)a->id,
+                            (int)b->id);
+    }
+    return gsf__sp_build_trie(in->ctx, all->keys, all->count, &m->pieces);
+}
+
+static gsf_result gsf__sp_read_model(gsf__pb in, gsf__sp_model* m) {
+    gsf__sp_keys all;
+    gsf__pb_field field;
+    gsf_result result = GSF_OK;
+    memset(&all, 0, sizeof all);
+    m->unknown_id = -1;
+    for (int i = 0; i < 256; i++) m->bytes[i] = -1;
+    m->prefix = m->trim = m->escape = 1;
+    while (in.at < in.end && result == GSF_OK) {
+        result = gsf__pb_next(&in, &field);
+        if (result || field.number > 3) continue;
+        result = gsf__pb_expect(&in, &field, 2);
+        if (result) break;
+        if (field.number == 1) result = gsf__sp_add_piece(&in, &field, m, &all);
+        else if (field.number == 2) result = gsf__sp_read_trainer(gsf__pb_inside(&in, &field), m);
+        else result = gsf__sp_read_normalizer(gsf__pb_inside(&in, &field), m);
+    }
+    if (result == GSF_OK) result = gsf__sp_check_pieces(&in, m, &all);
+    gsf_free(in.ctx, all.keys);
+    return result;
+}
+
+// ---- opening: added tokens
+
+static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* text, size_t size, int64_t id, int trim_left,
+                              int trim_right) {
+    const size_t n = m->added_count;
+    if (size == 0) return GSF_OK;
+    GSF__TRY(gsf__reserve(ctx, (void**)&m->added_list, &m->added_capacity, n, n + 1, sizeof *m->added_list));
+    gsf__sp_added* a = &m->added_list[n];
+    a->at = m->texts.size;
+    a->size = size;
+    a->id = (int32_t)id;
+    a->trim_left = trim_left;
+    a->trim_right = trim_right;
+    gsf_text_append(ctx, &m->texts, text, size);
+    m->added_count++;
+    return m->texts.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
+static gsf_result gsf__sp_fail_added(const gsf__nn_config* file, const gsf_json_value* value) {
+    return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no added token", file->json.name, (unsigned)value->offset);
+}
+
+// {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
+static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json_value* all, gsf__sp_model* m) {
+    const gsf_json* json = &file->json;
+    for (uint32_t i = all->child; i; i = json->values[i].next) {
+        const gsf_json_value* entry = &json->values[i];
+        const gsf_json_value* content = gsf_json_member(json, entry, "content");
+        const gsf_json_value* left = gsf_json_member(json, entry, "lstrip");
+        const gsf_json_value* right = gsf_json_member(json, entry, "rstrip");
+        const gsf_json_value* single = gsf_json_member(json, entry, "single_word");
+        int64_t id = 0;
+        int ok = entry->key_size > 0 && entry->key_size < 10 && content && content->type == GSF_JSON_STRING &&
+                 content->string_size <= GSF__SP_PIECE;
+        for (uint32_t k = 0; ok && k < entry->key_size; k++) {
+            ok = entry->key[k] >= '0' && entry->key[k] <= '9';
+            id = 10 * id + (entry->key[k] - '0');
+        }
+        if (!ok) return gsf__sp_fail_added(file, entry);
+        if (single && single->type == GSF_JSON_TRUE)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: an added token that is a single word", json->name,
+                            (unsigned)entry->offset);
+        GSF__TRY(gsf__sp_add(file->ctx, m, content->string, content->string_size, id, left && left->type == GSF_JSON_TRUE,
+                             right && right->type == GSF_JSON_TRUE));
+    }
+    return GSF_OK;
+}
+
+// added_tokens.json: {"<extra_id_0>": 32099, ...}
+static gsf_result gsf__sp_add_list(const gsf__nn_config* file, gsf__sp_model* m) {
+    for (uint32_t i = file->json.values[0].child; i; i = file->json.values[i].next) {
+        const gsf_json_value* entry = &file->json.values[i];
+        if (entry->type != GSF_JSON_NUMBER || !(entry->number >= 0 && entry->number < 1e9) ||
+            floor(entry->number) != entry->number || entry->key_size > GSF__SP_PIECE)
+            return gsf__sp_fail_added(file, entry);
+        GSF__TRY(gsf__sp_add(file->ctx, m, entry->key, entry->key_size, (int64_t)entry->number, 0, 0));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_add_extra(gsf_context* ctx, gsf__sp_model* m, int64_t extra) {
+    for (int64_t i = 0; i < extra; i++) {
+        char text[32];
+        const int size = snprintf(text, sizeof text, "<extra_id_%d>", (int)i); // extra_id_0 is the last one
+        GSF__TRY(gsf__sp_add(ctx, m, text, (size_t)size, (int64_t)m->count - 1 + extra - i, 1, 1));
+    }
+    return GSF_OK;
+}
+
+// Sorts the added tokens' texts into a trie; of those with the same text the one added last counts.
+static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
+    size_t kept = 0;
+    gsf__sp_key* keys = (gsf__sp_key*)gsf_alloc(ctx, m->added_count, sizeof *keys);
+    if (!keys) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < m->added_count; i++) {
+        keys[i].text = m->texts.data + m->added_list[i].at;
+        keys[i].size = (uint32_t)m->added_list[i].size;
+        keys[i].id = (int32_t)i;
+    }
+    if (m->added_count) qsort(keys, m->added_count, sizeof *keys, gsf__sp_compare);
+    for (size_t i = 0; i < m->added_count; i++) {
+        const int again = kept && keys[kept - 1].size == keys[i].size &&
+                          memcmp(keys[kept - 1].text, keys[i].text, keys[i].size) == 0;
+        keys[again ? kept - 1 : kept++] = keys[i];
+    }
+    const gsf_result result = gsf__sp_build_trie(ctx, keys, kept, &m->added);
+    gsf_free(ctx, keys);
+    gsf_destroy_text(ctx, &m->texts);
+    return result;
+}
+
+// "eos_token": "</s>", or an object with that as its "content"
+static const char* gsf__sp_token_text(const gsf__nn_config* file, const char* key, const char* fallback) {
+    const gsf_json_value* value = file ? gsf__nn_config_find(file, key) : NULL;
+    if (value && value->type == GSF_JSON_OBJECT) value = gsf_json_member(&file->json, value, "content");
+    return value && value->type == GSF_JSON_STRING ? value->string : fallback;
+}
+
+// config, added: NULL where there is no such file
+static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf__nn_config* config,
+                                  const gsf__nn_config* added, gsf__sp_model* m, gsf_nn_tokenizer* out) {
+    static const char* const names[][2] = {{"unk_token", "<unk>"}, {"eos_token", "</s>"}, {"pad_token", "<pad>"}};
+    int32_t* const ids[] = {NULL, &out->end_id, &out->pad_id};
+    int64_t extra = GSF__SP_EXTRA;
+    const gsf_json_value* decoder = config ? gsf__nn_config_find(config, "added_tokens_decoder") : NULL;
+    for (size_t i = 0; i < GSF__COUNT(names); i++) {
+        const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
+        const int32_t id = strlen(text) <= GSF__SP_PIECE ? gsf__sp_find(m->pieces, text, strlen(text)) : -1;
+        if (id >= 0) GSF__TRY(gsf__sp_add(ctx, m, text, strlen(text), id, 0, 0));
+    }
+    if (config) GSF__TRY(gsf__nn_config_int_or(config, "extra_ids", extra, 0, 100000, &extra));
+    if ((int64_t)m->count > INT32_MAX - extra) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", name);
+    GSF__TRY(gsf__sp_add_extra(ctx, m, extra));
+    if (decoder && decoder->type == GSF_JSON_OBJECT) GSF__TRY(gsf__sp_add_decoder(config, decoder, m));
+    else if (added) GSF__TRY(gsf__sp_add_list(added, m));
+    GSF__TRY(gsf__sp_sort_added(ctx, m));
+    out->id_count = (int32_t)m->count;
+    for (size_t i = 0; i < m->added_count; i++)
+        if (m->added_list[i].id >= out->id_count) out->id_count = m->added_list[i].id + 1;
+    for (size_t i = 1; i < GSF__COUNT(names); i++) {
+        const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
+        const int32_t place = gsf__sp_find(m->added, text, strlen(text));
+        if (place < 0)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: there is no %s %s", name, names[i][0], gsf__nn_show(text).text);
+        *ids[i] = m->added_list[place].id;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sp_make(gsf_context* ctx, const char* name, const void* data, size_t size,
+                               const gsf__nn_config* config, const gsf__nn_config* added, gsf_nn_tokenizer* out) {
+    const gsf__pb in = {ctx, gsf__nn_path_end(name), (const unsigned char*)data, 0, size};
+    gsf__sp_model* m = (gsf__sp_model*)gsf_alloc_zeroed(ctx, 1, sizeof *m);
+    out->model = m;
+    if (!m) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__sp_read_model(in, m));
+    out->piece_count = (int32_t)m->count;
+    out->unknown_id = m->unknown_id;
+    return gsf__sp_add_all(ctx, in.name, config, added, m, out);
+}
+
+GSF_API gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model, size_t model_size,
+                                                const char* config, size_t config_size, gsf_nn_tokenizer* out) {
+    gsf__nn_config file;
+    memset(out, 0, sizeof *out);
+    if (config) GSF__TRY(gsf__nn_parse_config(ctx, "tokenizer_config.json", config, config_size, &file));
+    const gsf_result result = gsf__sp_make(ctx, name, model, model_size, config ? &file : NULL, NULL, out);
+    if (config) gsf__nn_close_config(&file);
+    if (result) gsf_nn_destroy_tokenizer(ctx, out);
+    return result;
+}
+
+// A JSON file of the folder that may be absent: *found 0.
+static gsf_result gsf__sp_load_json(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* out,
+                                    int* found) {
+    gsf_text path;
+    void* data = NULL;
+    size_t size = 0;
+    memset(&path, 0, sizeof path);
+    *found = 0;
+    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &data, &size);
+    gsf_destroy_text(ctx, &path);
+    if (data) result = gsf__nn_parse_config(ctx, name, (const char*)data, size, out);
+    *found = data && result == GSF_OK;
+    gsf_free(ctx, data);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out) {
+    static const char* const names[2] = {"tokenizer_config.json", "added_tokens.json"};
+    gsf__nn_config files[2];
+    int found[2] = {0, 0};
+    void* data = NULL;
+    size_t size = 0;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    memset(out, 0, sizeof *out);
+    gsf_text_printf(ctx, &path, "%s/spiece.model", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_read_file(ctx, path.data, &data, &size);
+    for (int i = 0; i < 2 && !result; i++) result = gsf__sp_load_json(ctx, folder, names[i], &files[i], &found[i]);
+    if (!result)
+        result = gsf__sp_make(ctx, path.data, data, size, found[0] ? &files[0] : NULL, found[1] ? &files[1] : NULL, out);
+    for (int i = 0; i < 2; i++)
+        if (found[i]) gsf__nn_close_config(&files[i]);
+    gsf_free(ctx, data);
+    gsf_destroy_text(ctx, &path);
+    if (result) gsf_nn_destroy_tokenizer(ctx, out);
+    return result;
+}
+
+// ---- normalising
+
+typedef struct gsf__sp_step { // what stands for the next `used` bytes
+    const char* text;
+    size_t size, used;
+} gsf__sp_step;
+
+// Length of the longest entry of the character map that the text begins with, 0: none.
+static size_t gsf__sp_match(const gsf__sp_model* m, const char* text, size_t left, uint32_t* value) {
+    size_t length = 0;
+    if (left > GSF__SP_MATCH) left = GSF__SP_MATCH;
+    uint32_t at = gsf__sp_offset(m->units[0]);
+    for (size_t i = 0; i < left; i++) {
+        const unsigned char byte = (unsigned char)text[i];
+        at ^= byte;
+        const uint32_t unit = m->units[at];
+        if ((unit & 0x800000ffu) != byte) break;
+        at ^= gsf__sp_offset(unit);
+        if (unit >> 8 & 1u) {
+            length = i + 1;
+            *value = m->units[at] & 0x7fffffffu;
+        }
+    }
+    return length;
+}
+
+static size_t gsf__sp_match_user(const gsf__sp_model* m, const char* text, size_t left) { // pieces that stay as they are
+    size_t length = 0;
+    const gsf__sp_node* node = m->pieces;
+    for (size_t i = 0; i < left && (node = gsf__sp_child(m->pieces, node, (unsigned char)text[i])) != NULL; i++)
+        if (node->id >= 0 && m->types[node->id] == GSF__SP_USER) length = i + 1;
+    return length;
+}
+
+static gsf__sp_step gsf__sp_next(const gsf__sp_model* m, const char* text, size_t left) {
+    gsf__sp_step step = {text, 0, 0};
+    uint32_t value = 0;
+    step.used = m->has_user_pieces ? gsf__sp_match_user(m, text, left) : 0;
+    if (!step.used && m->unit_count) {
+        step.used = gsf__sp_match(m, text, left, &value);
+        if (step.used) {
+            step.text = m->replacements + value;
+            step.size = strlen(step.text);
+            return step;
+        }
+    }
+    if (!step.used) step.used = gsf__utf8_size(text, left);
+    step.size = step.used;
+    if (step.used) return step;
+    step.text = "\xef\xbf\xbd"; // U+FFFD for a malformed byte
+    step.size = 3;
+    step.used = 1;
+    return step;
+}
+
+typedef struct gsf__sp_best { // the best spelling of all bytes before this one
+    float score;
+    int32_t id;     // its last piece; -1: there is none so far
+    uint32_t start; // where that begins
+    uint32_t next;  // on the way back: where the piece that begins here ends
+} gsf__sp_best;
+
+typedef struct gsf__sp_run {
+    gsf_context* ctx;
+    const gsf__sp_model* m;
+    char* normal;
+    size_t size, capacity;
+    gsf__sp_best* best;
+    size_t best_capacity;
+    int32_t* ids;
+    size_t count, ids_capacity;
+} gsf__sp_run;
+
+static gsf_result gsf__sp_put(gsf__sp_run* run, const char* text, size_t size) { // spaces escaped
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->normal, &run->capacity, run->size, run->size + 3 * size, 1));
+    for (size_t i = 0; i < size; i++) {
+        if (text[i] == ' ' && run->m->escape) {
+            memcpy(run->normal + run->size, gsf__sp_space, 3);
+            run->size += 3;
+        } else {
+            run->normal[run->size++] = text[i];
+        }
+    }
+    return run->size < INT32_MAX ? GSF_OK
+                                 : gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "tokenizer: the text is too long");
+}
+
+static gsf_result gsf__sp_normalize(gsf__sp_run* run, const char* text, size_t left) {
+    const gsf__sp_model* m = run->m;
+    const char* space = m->escape ? gsf__sp_space : " ";
+    const size_t space_size = strlen(space);
+    int after_space = m->trim;
+    run->size = 0;
+    while (m->trim && left) { // leading spaces
+        const gsf__sp_step s = gsf__sp_next(m, text, left);
+        if (s.size != 1 || s.text[0] != ' ') break;
+        text += s.used;
+        left -= s.used;
+    }
+    if (!left) return GSF_OK;
+    if (m->prefix && !m->suffix) GSF__TRY(gsf__sp_put(run, " ", 1));
+    while (left) {
+        gsf__sp_step s = gsf__sp_next(m, text, left);
+        for (; after_space && s.size && s.text[0] == ' '; s.size--) s.text++;
+        GSF__TRY(gsf__sp_put(run, s.text, s.size));
+        if (s.size) after_space = m->trim && s.text[s.size - 1] == ' ';
+        text += s.used;
+        left -= s.used;
+    }
+    while (m->trim && run->size >= space_size &&
+           memcmp(run->normal + run->size - space_size, space, space_size) == 0)
+        run->size -= space_size;
+    return m->prefix && m->suffix ? gsf__sp_put(run, " ", 1) : GSF_OK;
+}
+
+// ---- spelling
+
+static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32_t id) {
+    if (best->id >= 0 && !(score > best->score)) return; // the first of equals stays
+    best->score = score;
+    best->start = start;
+    best->id = id;
+}
+
+// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of
+// digits.
+static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
+    const float base = run->best[at].score;
+    for (size_t i = at; i <= reached; i++)
+        if (i == at || run->best[i].id >= 0) run->best[i].score -= base;
+}
+
+// Viterbi over the bytes of run->normal. Sums are floats that are rebased where sentencepiece 0.2.3 does it, since their
+// rounding decides between spellings of nearly equal score.
+static void gsf__sp_spell(gsf__sp_run* run) {
+    static const unsigned char widths[17] = "\1\1\1\1\1\1\1\1\1\1\1\1\2\2\3\4"; // of a character, by its upper four bits
+    const gsf__sp_model* m = run->m;
+    const unsigned char* text = (const unsigned char*)run->normal;
+    const size_t n = run->size;
+    for (size_t i = 0; i <= n; i++) run->best[i].id = -1;
+    run->best[0].score = 0.0f;
+    size_t reached = 0;
+    for (size_t at = 0, width; at < n; at += width) {
+        if (fabsf(run->best[at].score) > 100000.0f) gsf__sp_rebase(run, at, reached);
+        const float here = run->best[at].score;
+        const gsf__sp_node* node = m->pieces;
+        int known = 0; // this character alone is a piece
+        width = widths[text[at] >> 4];
+        if (width > n - at) width = n - at;
+        for (size_t k = at; k < n && (node = gsf__sp_child(m->pieces, node, text[k])) != NULL; k++) {
+            const int type = node->id < 0 ? 0 : m->types[node->id];
+            const size_t length = k + 1 - at;
+            if (type != GSF__SP_NORMAL && type != GSF__SP_USER) continue;
+            const float score = type == GSF__SP_USER ? (float)(0.1 * (double)(length - 1)) : m->scores[node->id];
+            if (reached < k + 1) reached = k + 1;
+            gsf__sp_offer(&run->best[k + 1], score + here, (uint32_t)at, node->id);
+            known |= length == width;
+        }
+        if (!known) {
+            if (reached < at + width) reached = at + width;
+            gsf__sp_offer(&run->best[at + width], m->unknown_score + here, (uint32_t)at, m->unknown_id);
+        }
+    }
+    for (size_t end = n; end > 0; end = run->best[end].start) run->best[run->best[end].start].next = (uint32_t)end;
+}
+
+static gsf_result gsf__sp_emit(gsf__sp_run* run, int32_t id) {
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->ids_capacity, run->count, run->count + 1, sizeof *run->ids));
+    run->ids[run->count++] = id;
+    return GSF_OK;
+}
+
+// The ids of a stretch of text without added tokens.
+static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size) {
+    const gsf__sp_model* m = run->m;
+    GSF__TRY(gsf__sp_normalize(run, text, size));
+    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->best, &run->best_capacity, 0, run->size + 1, sizeof *run->best));
+    gsf__sp_spell(run);
+    for (size_t at = 0, end; at < run->size; at = end) {
+        end = run->best[at].next;
+        int32_t id = run->best[end].id;
+        if (id == m->unknown_id && m->byte_fallback) {
+            for (size_t i = at; i < end; i++) GSF__TRY(gsf__sp_emit(run, m->bytes[(unsigned char)run->normal[i]]));
+            continue;
+        }
+        if (id == m->unknown_id) { // a run of them is one; its text may be that of a piece which no spelling uses
+            while (end < run->size && run->best[run->best[end].next].id == id) end = run->best[end].next;
+            id = gsf__sp_find(m->pieces, run->normal + at, end - at);
+            if (id < 0) id = m->unknown_id;
+        }
+        GSF__TRY(gsf__sp_emit(run, id));
+    }
+    return GSF_OK;
+}
+
+// ---- added tokens within a text
+
+// Bytes of the white space character that the text begins with, as Python's str.isspace has it; 0: none.
+static size_t gsf__sp_white(const char* text, size_t left) {
+    const unsigned char* p = (const unsigned char*)text;
+    const size_t size = gsf__utf8_size(p, left);
+    if (size == 1) return (p[0] >= 9 && p[0] <= 13) || (p[0] >= 28 && p[0] <= 32);
+    if (size == 2) return p[0] == 0xc2 && (p[1] == 0x85 || p[1] == 0xa0) ? 2 : 0;
+    if (size != 3) return 0;
+    const unsigned c = (p[0] & 15u) << 12 | (p[1] & 63u) << 6 | (p[2] & 63u);
+    return c == 0x1680 || (c >= 0x2000 && c <= 0x200a) || c == 0x2028 || c == 0x2029 || c == 0x202f || c == 0x205f ||
+           c == 0x3000 ? 3 : 0;
+}
+
+static size_t gsf__sp_white_before(const char* text, size_t end) { // of the one that the text ends with
+    for (size_t size = 1; size <= 3 && size <= end; size++)
+        if (gsf__sp_white(text + end - size, size) == size) return size;
+    return 0;
+}
+
+// The longest added token that the text begins with, or NULL.
+static const gsf__sp_added* gsf__sp_match_added(const gsf__sp_model* m, const char* text, size_t left) {
+    const gsf__sp_added* found = NULL;
+    const gsf__sp_node* node = m->added;
+    for (size_t i = 0; i < left && (node = gsf__sp_child(m->added, node, (unsigned char)text[i])) != NULL; i++)
+        if (node->id >= 0) found = &m->added_list[node->id];
+    return found;
+}
+
+static gsf_result gsf__sp_encode_all(gsf__sp_run* run, const char* text, size_t size) {
+    size_t from = 0; // of the stretch since the last added token
+    for (size_t at = 0; at <= size; at++) {
+        const gsf__sp_added* found = at < size ? gsf__sp_match_added(run->m, text + at, size - at) : NULL;
+        size_t end = at, white;
+        if (at < size && !found) continue;
+        while (found && found->trim_left && end > from && (white = gsf__sp_white_before(text + from, end - from)) != 0)
+            end -= white;
+        if (end > from) GSF__TRY(gsf__sp_encode(run, text + from, end - from));
+        if (!found) break;
+        GSF__TRY(gsf__sp_emit(run, found->id));
+        from = at + found->size;
+        while (found->trim_right && (white = gsf__sp_white(text + from, size - from)) != 0) from += white;
+        at = from - 1;
+    }
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text, size_t size,
+                                   int32_t* ids, size_t room, size_t* count) {
+    gsf__sp_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.m = (const gsf__sp_model*)tokenizer->model;
+    const gsf_result result = gsf__sp_encode_all(&run, text, size);
+    const int32_t end = tokenizer->end_id;
+    // where there is an end already, the official code adds none
+    const size_t all = run.count + !(run.count && run.ids[run.count - 1] == end);
+    if (result == GSF_OK && count) *count = all;
+    if (result == GSF_OK && room) {
+        size_t n = all <= room ? run.count : room - 1;
+        for (size_t i = 0; i < n; i++) ids[i] = run.ids[i];
+        if (!(n && ids[n - 1] == end)) ids[n++] = end;
+        for (; n < room; n++) ids[n] = tokenizer->pad_id;
+    }
+    gsf_free(ctx, run.normal);
+    gsf_free(ctx, run.best);
+    gsf_free(ctx, run.ids);
+    return result;
+}
+
+// ---- >>nn t5 --------------------------------------------------------------------
+
+typedef struct gsf__t5_block {
+    const gsf_tensor *attention_norm, *q, *k, *v, *out, *ff_norm, *gate, *up, *down;
+} gsf__t5_block;
+
+typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
+    gsf__t5_block* blocks;
+    const gsf_tensor *embedding, *positions, *final_norm; // positions: (buckets, heads), for all blocks
+} gsf__t5_nets;
+
+static gsf_result gsf__t5_bind_block(gsf__nn_loader* loader, const gsf_nn_t5* c, int32_t index, gsf__t5_block* b) {
+    const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
+    const struct { const char* name; const gsf_tensor** to; int32_t rank; int64_t shape[2]; } parts[] = {
+        {"0.layer_norm", &b->attention_norm, 1, {d, 0}},  {"0.SelfAttention.q", &b->q, 2, {inner, d}},
+        {"0.SelfAttention.k", &b->k, 2, {inner, d}},      {"0.SelfAttention.v", &b->v, 2, {inner, d}},
+        {"0.SelfAttention.o", &b->out, 2, {d, inner}},    {"1.layer_norm", &b->ff_norm, 1, {d, 0}},
+        {"1.DenseReluDense.wi_0", &b->gate, 2, {h, d}},   {"1.DenseReluDense.wi_1", &b->up, 2, {h, d}},
+        {"1.DenseReluDense.wo", &b->down, 2, {d, h}}};
+    for (size_t i = 0; i < GSF__COUNT(parts); i++)
+        GSF__TRY(gsf__nn_need(loader, parts[i].to, parts[i].rank, parts[i].shape, "encoder.block.%d.layer.%s.weight",
+                              (int)index, parts[i].name));
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_bind_all(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__t5_nets* nets) {
+    const int64_t table[2] = {c->vocabulary, c->width}, positions[2] = {c->buckets, c->heads};
+    GSF__TRY(gsf__nn_need(loader, &nets->embedding, 2, table, "shared.weight"));
+    GSF__TRY(gsf__nn_need(loader, &nets->positions, 2, positions,
+                          "encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight"));
+    GSF__TRY(gsf__nn_need(loader, &nets->final_norm, 1, table + 1, "encoder.final_layer_norm.weight"));
+    gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
+    for (int32_t i = 0; i < c->layers; i++) GSF__TRY(gsf__t5_bind_block(loader, c, i, &nets->blocks[i]));
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) {
+    const struct { const char* key; int32_t* to; int64_t fallback, low, high; } sizes[] = { // fallback 0: needed
+        {"d_model", &c->width, 0, 1, 1 << 20}, {"d_kv", &c->head_dim, 0, 1, 1024}, {"num_heads", &c->heads, 0, 1, 1024},
+        {"d_ff", &c->hidden, 0, 1, 1 << 20}, {"num_layers", &c->layers, 0, 1, 1024},
+        {"vocab_size", &c->vocabulary, 0, 1, INT32_MAX}, {"relative_attention_num_buckets", &c->buckets, 32, 4, 1 << 16},
+        {"relative_attention_max_distance", &c->max_distance, 128, 1, 1 << 24}};
+    static const struct { const char *key, *value; } texts[] = {
+        {"feed_forward_proj", "gated-gelu"}, {"dense_act_fn", "gelu_new"}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+        int64_t value = 0;
+        if (sizes[i].fallback)
+            GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, &value));
+        else
+            GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
+        *sizes[i].to = (int32_t)value;
+    }
+    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_epsilon", 1e-6, 1e-12, 1.0, &c->norm_eps));
+    for (size_t i = 0; i < GSF__COUNT(texts); i++) { // T5 v1.0 has relu and no gate
+        const char* text;
+        GSF__TRY(gsf__nn_config_string(file, texts[i].key, i ? texts[i].value : NULL, &text));
+        if (strcmp(text, texts[i].value) != 0)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
+                            texts[i].value);
+    }
+    if (c->buckets % 4 || c->max_distance <= c->buckets / 4)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %d buckets for relative positions up to %d",
+                        file->json.name, (int)c->buckets, (int)c->max_distance);
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_open(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
+    gsf__nn_config file;
+    gsf__nn_loader loader;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
+    gsf_destroy_text(ctx, &path);
+    if (result) return result;
+    result = gsf__t5_read_config(&file, out);
+    gsf__nn_close_config(&file);
+    if (result) return result;
+    GSF__TRY(gsf_nn_open_weights(ctx, folder, "model", &out->weights));
+    gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+    out->nets = nets;
+    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->blocks = (gsf__t5_block*)gsf_alloc_zeroed(ctx, (size_t)out->layers, sizeof *nets->blocks);
+    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
+    return gsf__nn_end_loading(&loader, gsf__t5_bind_all(&loader, out, nets));
+}
+
+GSF_API gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
+    memset(out, 0, sizeof *out);
+    const gsf_result result = gsf__t5_open(ctx, folder, out);
+    if (result) gsf_nn_destroy_t5(ctx, out);
+    return result;
+}
+
+GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5) {
+    gsf__t5_nets* nets = (gsf__t5_nets*)t5->nets;
+    if (nets) gsf_free(ctx, nets->blocks);
+    gsf_free(ctx, nets);
+    gsf_nn_close_weights(ctx, &t5->weights);
+    memset(t5, 0, sizeof *t5);
+}
+
+// ---- relative positions
+
+// The bucket of key - query: half of them for keys behind the query. Of a side's, the lower half are distances, the rest
+// their logarithm up to max_distance. In float, as the reference rounds it. (modeling_t5.py _relative_position_bucket)
+static int32_t gsf__t5_bucket(const gsf_nn_t5* c, int64_t offset) {
+    const int32_t side = c->buckets / 2, exact = side / 2;
+    const int64_t distance = offset < 0 ? -offset : offset;
+    int64_t bucket = distance;
+    if (distance >= exact) {
+        const float spread = (float)log((double)c->max_distance / exact);
+        bucket = exact + (int64_t)(logf((float)distance / (float)exact) / spread * (float)(side - exact));
+        if (bucket > side - 1) bucket = side - 1;
+    }
+    return (int32_t)bucket + (offset > 0 ? side : 0);
+}
+
+// bias (heads, tokens, tokens), the same for every block; scratch: 2 tokens + buckets * heads floats.
+static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_tensor* positions, int64_t tokens, float* scratch,
+                              float* bias) {
+    float *line = scratch, *table = scratch + 2 * tokens; // line: by key - query, from 1 - tokens up
+    gsf_nn_read_tensor(positions, 0, positions->count, table);
+    for (int64_t h = 0; h < c->heads; h++) {
+        for (int64_t i = 0; i < 2 * tokens - 1; i++) line[i] = table[gsf__t5_bucket(c, i + 1 - tokens) * c->heads + h];
+        for (int64_t q = 0; q < tokens; q++, bias += tokens)
+            memcpy(bias, line + tokens - 1 - q, (size_t)tokens * sizeof(float));
+    }
+}
+
+// ---- one pass
+
+typedef struct gsf__t5_run {
+    gsf_context* ctx;
+    const gsf_nn_t5* net;
+    const gsf_nn_t5_input* in;
+    gsf_nn_workspace workspace;
+    int64_t rows;  // batch * tokens
+    float* x;      // (rows, width): the residual stream
+    float* normed; // (rows, width)
+    float* wide;   // q, k, v (rows, heads * head_dim) each; or both parts of the feed-forward's hidden layer
+    float* bias;   // (heads, tokens, tokens)
+    float* norm;   // (width): weights of the norm at work
+} gsf__t5_run;
+
+typedef struct gsf__t5_layout { double x, wide, bias, total; } gsf__t5_layout; // floats
+
+static gsf__t5_layout gsf__t5_plan(const gsf_nn_t5* c, const gsf_nn_t5_input* in) {
+    const double rows = (double)in->batch * in->tokens, n = in->tokens;
+    const double qkv = 3.0 * rows * c->heads * c->head_dim, ff = 2.0 * rows * c->hidden;
+    const double scratch = 2.0 * n + (double)c->buckets * c->heads; // of gsf__t5_fill_bias
+    gsf__t5_layout l;
+    l.x = rows * c->width;
+    l.wide = qkv > ff ? qkv : ff;
+    if (l.wide < scratch) l.wide = scratch;
+    l.bias = n * n * c->heads;
+    l.total = 2.0 * l.x + l.wide + l.bias + c->width;
+    return l;
+}
+
+GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops) {
+    const double rows = (double)input->batch * input->tokens, d = t5->width, inner = (double)t5->heads * t5->head_dim;
+    *bytes = gsf__t5_plan(t5, input).total * sizeof(float);
+    *flops = t5->layers * rows * (2.0 * d * (4.0 * inner + 3.0 * t5->hidden) + 4.0 * inner * input->tokens);
+}
+
+static void gsf__t5_tap(const gsf__t5_run* run, int32_t layer, const char* name, const float* x) {
+    const gsf_nn_t5_input* in = run->in;
+    char whole[64];
+    if (!in->tap_fn) return;
+    if (layer < 0) snprintf(whole, sizeof whole, "%s", name);
+    else snprintf(whole, sizeof whole, "block%d.%s", (int)layer, name);
+    for (int32_t b = 0; b < in->batch; b++)
+        in->tap_fn(in->tap_user, whole, b, x + (int64_t)b * in->tokens * run->net->width, in->tokens, run->net->width);
+}
+
+static void gsf__t5_norm(gsf__t5_run* run, const gsf_tensor* weight, float* out) {
+    gsf_nn_read_tensor(weight, 0, weight->count, run->norm);
+    gsf_nn_rms_norm(run->ctx, run->x, run->rows, run->net->width, run->norm, (float)run->net->norm_eps, out);
+}
+
+// y = activation(x w^T), or x += that where `add`.
+static gsf_result gsf__t5_linear(gsf__t5_run* run, const float* x, const gsf_tensor* weight, gsf_nn_activation activation,
+                                 int add, float* y) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = run->rows;
+    d.weight = weight;
+    d.activation = activation;
+    d.accumulate = add;
+    d.y = y;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+// x += attention(norm(x)): logits are not scaled, and their bias is by relative position.
+static gsf_result gsf__t5_attention(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
+    const gsf_nn_t5* c = run->net;
+    const int64_t n = run->in->tokens, inner = (int64_t)c->heads * c->head_dim;
+    float *q = run->wide, *k = q + run->rows * inner, *v = k + run->rows * inner;
+    gsf__t5_norm(run, block->attention_norm, run->normed);
+    gsf__t5_tap(run, layer, "attn_norm", run->normed);
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->q, GSF_NN_LINEAR, 0, q));
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->k, GSF_NN_LINEAR, 0, k));
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->v, GSF_NN_LINEAR, 0, v));
+    gsf_nn_attention_desc d;
+    memset(&d, 0, sizeof d);
+    d.queries = d.keys = n;
+    d.heads = c->heads;
+    d.head_dim = c->head_dim;
+    d.bias = run->bias;
+    d.scale = 1.0f;
+    for (int64_t b = 0; b < run->in->batch; b++) {
+        d.q = q + b * n * inner;
+        d.k = k + b * n * inner;
+        d.v = v + b * n * inner;
+        d.out = q + b * n * inner;
+        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &d));
+    }
+    GSF__TRY(gsf__t5_linear(run, q, block->out, GSF_NN_LINEAR, 1, run->x));
+    gsf__t5_tap(run, layer, "after_attn", run->x);
+    return GSF_OK;
+}
+
+typedef struct gsf__t5_product {
+    float* a;
+    const float* b;
+    int64_t count;
+} gsf__t5_product;
+
+static void gsf__t5_multiply(void* arg, size_t chunk, int worker) { // a *= b
+    const gsf__t5_product* job = (const gsf__t5_product*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
+    (void)worker;
+    for (int64_t i = begin; i < end; i++) job->a[i] *= job->b[i];
+}
+
+// x += down(gelu(gate(norm(x))) * up(norm(x)))
+static gsf_result gsf__t5_feed_forward(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
+    float *gate = run->wide, *up = gate + run->rows * run->net->hidden;
+    gsf__t5_norm(run, block->ff_norm, run->normed);
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->gate, GSF_NN_GELU_TANH, 0, gate));
+    GSF__TRY(gsf__t5_linear(run, run->normed, block->up, GSF_NN_LINEAR, 0, up));
+    gsf__t5_product job = {gate, up, run->rows * run->net->hidden};
+    gsf__parallel_for(run->ctx, gsf__nn_chunks(job.count, GSF__NN_CHUNK), gsf__t5_multiply, &job);
+    GSF__TRY(gsf__t5_linear(run, gate, block->down, GSF_NN_LINEAR, 1, run->x));
+    gsf__t5_tap(run, layer, "out", run->x);
+    return GSF_OK;
+}
+
+static gsf_result gsf__t5_check(const gsf__t5_run* run, const char* stage, const char* prefix, const float* x) {
+    return gsf__nn_check_finite(run->ctx, &run->net->weights, "t5", prefix, stage, x, run->rows * run->net->width);
+}
+
+static gsf_result gsf__t5_forward(gsf__t5_run* run, float* out) {
+    const gsf_nn_t5* c = run->net;
+    const gsf__t5_nets* nets = (const gsf__t5_nets*)c->nets;
+    for (int64_t r = 0; r < run->rows; r++)
+        gsf_nn_read_tensor(nets->embedding, (int64_t)run->in->ids[r] * c->width, c->width, run->x + r * c->width);
+    GSF__TRY(gsf__t5_check(run, "the embedding", "shared.", run->x));
+    gsf__t5_tap(run, -1, "embed", run->x);
+    gsf__t5_fill_bias(c, nets->positions, run->in->tokens, run->wide, run->bias);
+    for (int32_t i = 0; i < c->layers; i++) {
+        char name[48];
+        GSF__TRY(gsf__t5_attention(run, i, &nets->blocks[i]));
+        GSF__TRY(gsf__t5_feed_forward(run, i, &nets->blocks[i]));
+        snprintf(name, sizeof name, "encoder.block.%d.", (int)i);
+        GSF__TRY(gsf__t5_check(run, name, name, run->x));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+        gsf__progress(run->ctx, "text", i + 1, c->layers);
+    }
+    gsf__t5_norm(run, nets->final_norm, out);
+    return gsf__t5_check(run, "the last norm", "encoder.final", out);
+}
+
+GSF_API gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input, float* out) {
+    gsf__t5_run run;
+    memset(&run, 0, sizeof run);
+    if (!input->ids || input->batch < 1 || input->tokens < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: no tokens");
+    run.ctx = ctx;
+    run.net = t5;
+    run.in = input;
+    run.rows = (int64_t)input->batch * input->tokens;
+    for (int64_t i = 0; i < run.rows; i++)
+        if (input->ids[i] < 0 || input->ids[i] >= t5->vocabulary)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: id %d; the vocabulary has %d", (int)input->ids[i],
+                            (int)t5->vocabulary);
+    const gsf__t5_layout l = gsf__t5_plan(t5, input);
+    if (l.total > (double)(SIZE_MAX / 16))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "t5: %d tokens of %d prompts are too many", (int)input->tokens,
+                        (int)input->batch);
+    run.x = (float*)gsf_alloc(ctx, (size_t)l.total, sizeof(float));
+    if (!run.x) return GSF_ERROR_OUT_OF_MEMORY;
+    run.normed = run.x + (size_t)l.x;
+    run.wide = run.normed + (size_t)l.x;
+    run.bias = run.wide + (size_t)l.wide;
+    run.norm = run.bias + (size_t)l.bias;
+    const gsf_result result = gsf__t5_forward(&run, out);
+    if (result) memset(out, 0, (size_t)l.x * sizeof(float));
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, run.x);
+    return result;
+}
+
+// ---- >>nn vae -------------------------------------------------------------------
+
+// A run keeps few large arrays (gsf__vae_run), each grown to the largest need: three activations (a block's input, the
+// middle of its resnet, and the result of a widening shortcut), one bordered frame, the widened weights of one layer. Norm
+// and SiLU are applied while a frame is given its border, so that normalised activations exist for three frames only, two
+// of which are the cache that the next chunk needs anyway. Sums for a group norm are taken while its input is written.
+// The same walk with `dry` set takes no memory and computes nothing, but counts both.
+
+enum { GSF__VAE_ENCODER_FRAMES = 8, GSF__VAE_DECODER_FRAMES = 2 }; // frames of a chunk
+enum { GSF__VAE_SLOTS = 4, GSF__VAE_INPUT = 3 };                   // activations; the last one is the chunk's input
+
+typedef struct gsf__vae_norm { // a group norm; spatial.out > 0: its result times y(z) plus b(z), z the latents
+    const gsf_tensor *weight, *bias;
+    gsf__conv_layer y, b;
+    double eps;
+} gsf__vae_norm;
+
+typedef struct gsf__vae_resnet { // x + conv2(silu(norm2(conv1(silu(norm1(x))))))
+    gsf__vae_norm norm1, norm2;
+    gsf__conv_layer conv1, conv2, shortcut; // shortcut.out 0: x itself
+} gsf__vae_resnet;
+
+typedef struct gsf__vae_block {
+    gsf__vae_resnet* resnets;
+    int32_t count;
+    gsf__conv_layer sampler; // out 0: none. The encoder's halves, the decoder's doubles
+    int time;                // frames, too
+} gsf__vae_block;
+
+typedef struct gsf__vae_net { // encoder or decoder
+    int decoder;
+    int64_t groups;
+    gsf__conv_layer conv_in, conv_out;
+    gsf__vae_norm norm_out;
+    gsf__vae_block blocks[GSF_NN_VAE_LEVELS + 1];
+    int32_t block_count, causal_count; // causal_count: layers that keep frames for the next chunk
+} gsf__vae_net;
+
+typedef struct gsf__vae_nets {
+    gsf__vae_net encoder, decoder;
+} gsf__vae_nets;
+
+// ---- opening a model
+
+typedef struct gsf__vae_loader {
+    gsf_context* ctx;
+    const gsf_nn_vae* vae;
+    gsf__nn_loader tensors;
+    gsf__vae_net* net;
+} gsf__vae_loader;
+
+static gsf_result gsf__vae_load_conv(gsf__vae_loader* l, const char* name, int64_t in, int64_t out, int64_t kt,
+                                     int64_t kernel, gsf__conv_layer* layer) {
+    int64_t shape[5];
+    int32_t rank = 0;
+    shape[rank++] = out;
+    shape[rank++] = in;
+    if (kt) shape[rank++] = kt; // 0: a 2D layer
+    shape[rank++] = kernel;
+    shape[rank++] = kernel;
+    GSF__TRY(gsf__nn_need(&l->tensors, &layer->weight, rank, shape, "%s.weight", name));
+    GSF__TRY(gsf__nn_need(&l->tensors, &layer->bias, 1, shape, "%s.bias", name));
+    layer->in = in;
+    layer->out = out;
+    layer->kt = kt ? kt : 1;
+    layer->kernel = kernel;
+    l->net->causal_count += kt == 3;
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_load_norm(gsf__vae_loader* l, const char* name, int64_t channels, double eps,
+                                     gsf__vae_norm* norm) {
+    char full[160];
+    const char* layer = l->net->decoder ? ".norm_layer" : "";
+    GSF__TRY(gsf__nn_need(&l->tensors, &norm->weight, 1, &channels, "%s%s.weight", name, layer));
+    GSF__TRY(gsf__nn_need(&l->tensors, &norm->bias, 1, &channels, "%s%s.bias", name, layer));
+    norm->eps = l->net->decoder ? 1e-6 : eps; // the spatial norm ignores the config's
+    if (!l->net->decoder) return GSF_OK;
+    snprintf(full, sizeof full, "%s.conv_y.conv", name);
+    GSF__TRY(gsf__vae_load_conv(l, full, l->vae->latent_channels, channels, 1, 1, &norm->y));
+    snprintf(full, sizeof full, "%s.conv_b.conv", name);
+    return gsf__vae_load_conv(l, full, l->vae->latent_channels, channels, 1, 1, &norm->b);
+}
+
+static gsf_result gsf__vae_load_resnet(gsf__vae_loader* l, const char* name, int64_t in, int64_t out,
+                                       gsf__vae_resnet* resnet) {
+    char full[128];
+    snprintf(full, sizeof full, "%s.norm1", name);
+    GSF__TRY(gsf__vae_load_norm(l, full, in, l->vae->norm_eps, &resnet->norm1));
+    snprintf(full, sizeof full, "%s.conv1.conv", name);
+    GSF__TRY(gsf__vae_load_conv(l, full, in, out, 3, 3, &resnet->conv1));
+    snprintf(full, sizeof full, "%s.norm2", name);
+    GSF__TRY(gsf__vae_load_norm(l, full, out, l->vae->norm_eps, &resnet->norm2));
+    snprintf(full, sizeof full, "%s.conv2.conv", name);
+    GSF__TRY(gsf__vae_load_conv(l, full, out, out, 3, 3, &resnet->conv2));
+    if (in == out) return GSF_OK;
+    snprintf(full, sizeof full, "%s.conv_shortcut", name);
+    return gsf__vae_load_conv(l, full, in, out, 1, 1, &resnet->shortcut);
+}
+
+// `count` resnets, the first of which changes the channels.
+static gsf_result gsf__vae_load_block(gsf__vae_loader* l, const char* name, int64_t in, int64_t out, int32_t count) {
+    char full[96];
+    gsf__vae_block* block = &l->net->blocks[l->net->block_count++];
+    block->resnets = (gsf__vae_resnet*)gsf_alloc_zeroed(l->ctx, (size_t)count, sizeof *block->resnets);
+    if (!block->resnets) return GSF_ERROR_OUT_OF_MEMORY;
+    block->count = count;
+    for (int32_t i = 0; i < count; i++) {
+        snprintf(full, sizeof full, "%s.resnets.%d", name, (int)i);
+        GSF__TRY(gsf__vae_load_resnet(l, full, i ? out : in, out, &block->resnets[i]));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_load_net(gsf__vae_loader* l, int decoder) {
+    const gsf_nn_vae* vae = l->vae;
+    const char* side = decoder ? "decoder" : "encoder";
+    const int32_t last = vae->levels - 1;
+    const int64_t coarse = vae->channels[last];
+    char name[64];
+    l->net->decoder = decoder;
+    l->net->groups = vae->norm_groups;
+    snprintf(name, sizeof name, "%s.conv_in.conv", side);
+    GSF__TRY(gsf__vae_load_conv(l, name, decoder ? vae->latent_channels : vae->in_channels,
+                                decoder ? coarse : vae->channels[0], 3, 3, &l->net->conv_in));
+    snprintf(name, sizeof name, "%s.mid_block", side);
+    if (decoder) GSF__TRY(gsf__vae_load_block(l, name, coarse, coarse, 2));
+    int64_t in = decoder ? coarse : vae->channels[0];
+    for (int32_t i = 0; i < vae->levels; i++) {
+        const int64_t out = vae->channels[decoder ? last - i : i];
+        snprintf(name, sizeof name, "%s.%s_blocks.%d", side, decoder ? "up" : "down", (int)i);
+        GSF__TRY(gsf__vae_load_block(l, name, in, out, vae->layers_per_block + decoder));
+        in = out;
+        if (i == last) break;
+        gsf__vae_block* block = &l->net->blocks[l->net->block_count - 1];
+        block->time = 2 << i <= vae->temporal_ratio;
+        snprintf(name, sizeof name, "%s.%s_blocks.%d.%ssamplers.0.conv", side, decoder ? "up" : "down", (int)i,
+                 decoder ? "up" : "down");
+        GSF__TRY(gsf__vae_load_conv(l, name, out, out, 0, 3, &block->sampler));
+    }
+    snprintf(name, sizeof name, "%s.mid_block", side);
+    if (!decoder) GSF__TRY(gsf__vae_load_block(l, name, coarse, coarse, 2));
+    snprintf(name, sizeof name, "%s.norm_out", side);
+    GSF__TRY(gsf__vae_load_norm(l, name, in, 1e-6, &l->net->norm_out));
+    snprintf(name, sizeof name, "%s.conv_out.conv", side);
+    return gsf__vae_load_conv(l, name, in, decoder ? vae->out_channels : 2 * vae->latent_channels, 3, 3,
+                              &l->net->conv_out);
+}
+
+static gsf_result gsf__vae_check_types(const gsf__nn_config* config, const char* key, const char* type, size_t levels) {
+    const gsf_json_value* list = gsf_json_member(&config->json, &config->json.values[0], key);
+    if (!list || list->type == GSF_JSON_NULL) return GSF_OK;
+    int ok = list->type == GSF_JSON_ARRAY && list->count == levels;
+    for (uint32_t i = ok ? list->child : 0; i; i = config->json.values[i].next)
+        ok = ok && config->json.values[i].type == GSF_JSON_STRING && strcmp(config->json.values[i].string, type) == 0;
+    if (ok) return GSF_OK;
+    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s is not %zu times %s", config->json.name,
+                    (unsigned)list->offset, key, levels, type);
+}
+
+static gsf_result gsf__vae_config_int(const gsf__nn_config* config, const char* key, int64_t fallback, int64_t high,
+                                      int32_t* out) {
+    int64_t value;
+    GSF__TRY(gsf__nn_config_int_or(config, key, fallback, 1, high, &value));
+    *out = (int32_t)value;
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_check_unsupported(const gsf__nn_config* config) {
+    const char *act, *classname;
+    int quant, post_quant;
+    GSF__TRY(gsf__nn_config_string(config, "_class_name", "AutoencoderKLCogVideoX", &classname));
+    GSF__TRY(gsf__nn_config_string(config, "act_fn", "silu", &act));
+    GSF__TRY(gsf__nn_config_bool_or(config, "use_quant_conv", 0, &quant));
+    GSF__TRY(gsf__nn_config_bool_or(config, "use_post_quant_conv", 0, &post_quant));
+    if (strcmp(classname, "AutoencoderKLCogVideoX") != 0)
+        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: model is %.60s, not AutoencoderKLCogVideoX",
+                        config->json.name, classname);
+    if (strcmp(act, "silu") != 0)
+        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: act_fn is %.60s, not silu", config->json.name, act);
+    if (quant || post_quant)
+        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: quant_conv and post_quant_conv are not served",
+                        config->json.name);
+    return GSF_OK;
+}
+
+// Fallbacks are the class's own.
+static gsf_result gsf__vae_take_config(const gsf__nn_config* config, gsf_nn_vae* vae) {
+    int64_t channels[GSF_NN_VAE_LEVELS];
+    size_t levels;
+    GSF__TRY(gsf__vae_check_unsupported(config));
+    GSF__TRY(gsf__vae_config_int(config, "in_channels", 3, 64, &vae->in_channels));
+    GSF__TRY(gsf__vae_config_int(config, "out_channels", 3, 64, &vae->out_channels));
+    GSF__TRY(gsf__vae_config_int(config, "latent_channels", 16, 1024, &vae->latent_channels));
+    GSF__TRY(gsf__vae_config_int(config, "layers_per_block", 3, 64, &vae->layers_per_block));
+    GSF__TRY(gsf__vae_config_int(config, "norm_num_groups", 32, 8192, &vae->norm_groups));
+    GSF__TRY(gsf__vae_config_int(config, "temporal_compression_ratio", 4, 128, &vae->temporal_ratio));
+    GSF__TRY(gsf__vae_config_int(config, "sample_height", 480, 1 << 20, &vae->sample_height));
+    GSF__TRY(gsf__vae_config_int(config, "sample_width", 720, 1 << 20, &vae->sample_width));
+    GSF__TRY(gsf__nn_config_number_or(config, "norm_eps", 1e-6, 0.0, 1.0, &vae->norm_eps));
+    GSF__TRY(gsf__nn_config_number_or(config, "scaling_factor", 1.15258426, 1e-6, 1e6, &vae->scaling_factor));
+    GSF__TRY(gsf__nn_config_ints(config, "block_out_channels", 1, 8192, GSF_NN_VAE_LEVELS, channels, &levels));
+    GSF__TRY(gsf__vae_check_types(config, "down_block_types", "CogVideoXDownBlock3D", levels));
+    GSF__TRY(gsf__vae_check_types(config, "up_block_types", "CogVideoXUpBlock3D", levels));
+    vae->levels = (int32_t)levels;
+    vae->spatial_ratio = 1 << (levels - 1);
+    int32_t temporal = 1; // the nearest power of two from below, and no more than there are samplers
+    while (2 * temporal <= vae->temporal_ratio && 2 * temporal <= vae->spatial_ratio) temporal *= 2;
+    vae->temporal_ratio = temporal;
+    for (size_t i = 0; i < levels; i++) {
+        vae->channels[i] = (int32_t)channels[i];
+        if (channels[i] % vae->norm_groups != 0)
+            return gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s: %lld channels are no multiple of norm_num_groups %d",
+                            config->json.name, (long long)channels[i], (int)vae->norm_groups);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_read_config(gsf_context* ctx, const char* folder, gsf_nn_vae* vae) {
+    gsf_text path;
+    gsf__nn_config config;
+    memset(&path, 0, sizeof path);
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &config);
+    gsf_destroy_text(ctx, &path);
+    if (result != GSF_OK) return result;
+    result = gsf__vae_take_config(&config, vae);
+    gsf__nn_close_config(&config);
+    return result;
+}
+
+static gsf_result gsf__vae_load_nets(gsf_context* ctx, gsf_nn_vae* vae) {
+    gsf__vae_loader l;
+    memset(&l, 0, sizeof l);
+    gsf__vae_nets* nets = (gsf__vae_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    vae->nets = nets;
+    l.ctx = ctx;
+    l.vae = vae;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &vae->weights, &l.tensors));
+    l.net = &nets->encoder;
+    gsf_result result = gsf__vae_load_net(&l, 0);
+    l.net = &nets->decoder;
+    if (result == GSF_OK) result = gsf__vae_load_net(&l, 1);
+    return gsf__nn_end_loading(&l.tensors, result);
+}
+
+GSF_API gsf_result gsf_nn_make_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out) {
+    memset(out, 0, sizeof *out);
+    gsf_result result = gsf__vae_read_config(ctx, folder, out);
+    if (result == GSF_OK) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
+    if (result == GSF_OK) result = gsf__vae_load_nets(ctx, out);
+    if (result != GSF_OK) gsf_nn_destroy_vae(ctx, out);
+    return result;
+}
+
+static void gsf__vae_free_net(gsf_context* ctx, gsf__vae_net* net) {
+    for (int32_t i = 0; i < net->block_count; i++) gsf_free(ctx, net->blocks[i].resnets);
+}
+
+GSF_API void gsf_nn_destroy_vae(gsf_context* ctx, gsf_nn_vae* vae) {
+    gsf__vae_nets* nets = (gsf__vae_nets*)vae->nets;
+    if (nets) {
+        gsf__vae_free_net(ctx, &nets->encoder);
+        gsf__vae_free_net(ctx, &nets->decoder);
+        gsf_free(ctx, nets);
+    }
+    gsf_nn_close_weights(ctx, &vae->weights);
+    memset(vae, 0, sizeof *vae);
+}
+
+// ---- one run
+
+typedef struct gsf__vae_buffer {
+    float* data;
+    size_t size; // bytes
+} gsf__vae_buffer;
+
+typedef struct gsf__vae_cache { // of one causal layer: its last two input frames, normalised and bordered
+    gsf__vae_buffer frames[2];
+    int last[2]; // which of them comes last but one, and last; -1: none yet
+} gsf__vae_cache;
+
+typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
+    int slot;
+    int64_t frames, height, width, channels;
+} gsf__vae_map;
+
+// For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
+// `weight` names the layer.
+typedef struct gsf__vae_watch {
+    void (*fn)(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+               const float* data);
+    void* user;
+} gsf__vae_watch;
+
+typedef struct gsf__vae_run {
+    gsf_context* ctx;
+    const gsf__vae_net* net;
+    int dry;
+    double flops;
+    size_t bytes, peak;
+    gsf__vae_buffer slots[GSF__VAE_SLOTS], spare, packed, table, partial, sums;
+    gsf__vae_cache* caches;  // per causal layer; a clip of one chunk uses only the first, for all
+    int32_t cache_at;
+    gsf__vae_map z;          // the chunk's latents (decoder)
+    int64_t chunk, chunks, done, total; // done, total: chunks of all tiles
+    const char* stage;
+    gsf__vae_watch watch;
+} gsf__vae_run;
+
+static gsf_result gsf__vae_grow(gsf__vae_run* run, gsf__vae_buffer* buffer, int64_t count) {
+    const size_t size = (size_t)count * sizeof(float); // gsf__vae_plan has bounded it
+    if (size <= buffer->size) return GSF_OK;
+    run->bytes += size - buffer->size;
+    if (run->bytes > run->peak) run->peak = run->bytes;
+    if (!run->dry) {
+        gsf_free(run->ctx, buffer->data);
+        buffer->size = 0;
+        buffer->data = (float*)gsf_alloc(run->ctx, size, 1);
+        if (!buffer->data) return GSF_ERROR_OUT_OF_MEMORY;
+    }
+    buffer->size = size;
+    return GSF_OK;
+}
+
+static void gsf__vae_release(gsf_context* ctx, gsf__vae_buffer* buffer) {
+    gsf_free(ctx, buffer->data);
+    memset(buffer, 0, sizeof *buffer);
+}
+
+static void gsf__vae_end(gsf__vae_run* run) {
+    for (int i = 0; i < GSF__VAE_SLOTS; i++) gsf__vae_release(run->ctx, &run->slots[i]);
+    for (int32_t i = 0; run->caches && i < run->net->causal_count; i++) {
+        gsf__vae_release(run->ctx, &run->caches[i].frames[0]);
+        gsf__vae_release(run->ctx, &run->caches[i].frames[1]);
+    }
+    gsf_free(run->ctx, run->caches);
+    gsf__vae_release(run->ctx, &run->spare);
+    gsf__vae_release(run->ctx, &run->packed);
+    gsf__vae_release(run->ctx, &run->table);
+    gsf__vae_release(run->ctx, &run->partial);
+    gsf__vae_release(run->ctx, &run->sums);
+}
+
+static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots, one frame and its part; groups, 2) doubles
+    run->caches = (gsf__vae_cache*)gsf_alloc_zeroed(run->ctx, (size_t)run->net->causal_count, sizeof *run->caches);
+    if (!run->caches) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf__vae_grow(run, &run->sums, (GSF__VAE_SLOTS + 2) * run->net->groups * 2 * 2);
+}
+
+static int64_t gsf__vae_plane(const gsf__vae_map* map) { return map->height * map->width * map->channels; }
+static double* gsf__vae_sums(const gsf__vae_run* run, int slot) { // slot GSF__VAE_SLOTS: of one frame, + 1: a part of it
+    return (double*)(void*)run->sums.data + slot * run->net->groups * 2;
+}
+static int64_t gsf__vae_groups(const gsf__vae_run* run, int64_t channels) {
+    return channels % run->net->groups == 0 ? run->net->groups : 1;
+}
+static int gsf__vae_free_slot(int a, int b) { // the first that is neither
+    int slot = 0;
+    while (slot == a || slot == b) slot++;
+    return slot;
+}
+
+// `tensor`: the weight of the layer whose result is at fault; its name loses ".conv.weight".
+static gsf_result gsf__vae_fail_nan(const gsf__vae_run* run, const gsf_tensor* tensor) {
+    char name[160];
+    snprintf(name, sizeof name, "%s", tensor->name);
+    char* end = strstr(name, ".weight");
+    if (end) *end = 0;
+    end = strstr(name, ".conv");
+    while (end && strcmp(end, ".conv") != 0) end = strstr(end + 1, ".conv");
+    if (end) *end = 0;
+    return gsf_fail(run->ctx, GSF_ERROR_NUMERIC, "%s: NaN or infinity in the result of %s, chunk %lld of %lld", run->stage,
+                    name, (long long)run->chunk + 1, (long long)run->chunks);
+}
+
+typedef struct gsf__vae_blend { // table (pixels, 2, channels): y and b become factors and summands of the normalised input
+    float* table;
+    const float *scale, *shift; // of the group norm: inverse deviation * weight, and bias
+    int64_t width, channels;
+} gsf__vae_blend;
+
+static void gsf__vae_blend_row(void* arg, size_t row, int worker) {
+    const gsf__vae_blend* job = (const gsf__vae_blend*)arg;
+    (void)worker;
+    for (int64_t x = 0; x < job->width; x++) {
+        float* y = job->table + ((int64_t)row * job->width + x) * 2 * job->channels;
+        float* b = y + job->channels;
+        for (int64_t c = 0; c < job->channels; c++) {
+            b[c] += y[c] * job->shift[c];
+            y[c] *= job->scale[c];
+        }
+    }
+}
+
+// conv_y and conv_b over the latents, at their own resolution: pointwise, so the nearest resize may follow.
+static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const float* scale, const float* shift,
+                             float* table) {
+    const int64_t c = norm->y.out;
+    const gsf__conv_layer* const layers[2] = {&norm->y, &norm->b};
+    gsf__vae_blend blend = {table, scale, shift, run->z.width, c};
+    for (int i = 0; i < 2; i++) {
+        gsf__conv_pack(run->ctx, layers[i], run->packed.data);
+        gsf__conv_job job = gsf__conv_begin(run->ctx, layers[i], run->z.frames * run->z.height, run->z.width, 0,
+                                            run->packed.data);
+        job.in[0] = run->slots[GSF__VAE_INPUT].data;
+        job.in_stride = run->z.width * run->z.channels; // no border
+        job.origin = 0;
+        job.out = table + i * c;
+        job.ldo = 2 * c;
+        job.out_row = run->z.width * job.ldo;
+        gsf__conv_frame(run->ctx, &job, NULL);
+    }
+    gsf__parallel_for(run->ctx, (size_t)(run->z.frames * run->z.height), gsf__vae_blend_row, &blend);
+}
+
+// run->table becomes (mean, scale, shift) per channel, and for the decoder the table of factors and summands after them.
+static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* norm, const gsf__vae_map* in) {
+    const int64_t c = in->channels, groups = run->net->groups, per = c / groups;
+    const int64_t pixels = norm->y.out ? run->z.frames * run->z.height * run->z.width : 0;
+    GSF__TRY(gsf__vae_grow(run, &run->table, c * 3 + pixels * 2 * c));
+    if (norm->y.out) {
+        GSF__TRY(gsf__vae_grow(run, &run->packed, gsf__conv_packed(&norm->y)));
+        run->flops += 4.0 * (double)(pixels * c * run->z.channels);
+    }
+    if (run->dry) return GSF_OK;
+    float *mean = run->table.data, *scale = mean + c, *shift = scale + c;
+    const double* sums = gsf__vae_sums(run, in->slot);
+    const double count = (double)in->frames * (double)in->height * (double)in->width * (double)per;
+    gsf_nn_read_tensor(norm->weight, 0, c, scale);
+    gsf_nn_read_tensor(norm->bias, 0, c, shift);
+    for (int64_t i = 0; i < c; i++) { // E[x^2] - E[x]^2 in double, of floats: good to 1e-8 at a mean of 1e4 deviations
+        const double m = sums[i / per * 2] / count, v = sums[i / per * 2 + 1] / count - m * m;
+        mean[i] = (float)m;
+        scale[i] = (float)((double)scale[i] / sqrt((v > 0.0 ? v : 0.0) + norm->eps));
+    }
+    if (norm->y.out) gsf__vae_spatial(run, norm, scale, shift, shift + c);
+    return GSF_OK;
+}
+
+// The latent frame that frame t of n sees: nearest, the first frame apart where n is odd.
+static int64_t gsf__vae_latent_frame(int64_t t, int64_t n, int64_t latents) {
+    if (n % 2 == 0 || n == 1) return t * latents / n;
+    return t == 0 ? 0 : 1 + (t - 1) * (latents - 1) / (n - 1);
+}
+
+// Frame `t` of `in`, normalised where there is a norm, into `out` with a border.
+static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gsf__vae_map* in, int64_t t, float* out) {
+    gsf__conv_fill fill;
+    memset(&fill, 0, sizeof fill);
+    fill.kernels = gsf__conv_kernels_of(run->ctx->cpu_level);
+    fill.x = run->slots[in->slot].data + t * gsf__vae_plane(in);
+    fill.height = in->height;
+    fill.width = in->width;
+    fill.channels = in->channels;
+    fill.out = out;
+    if (norm) {
+        fill.mean = run->table.data;
+        fill.table = fill.mean + in->channels; // scale, shift
+        if (norm->y.out) {
+            const int64_t z = gsf__vae_latent_frame(t, in->frames, run->z.frames);
+            fill.table_width = run->z.width;
+            fill.table += 2 * in->channels + z * run->z.height * run->z.width * 2 * in->channels;
+            while (run->z.height << fill.shift < in->height) fill.shift++;
+        }
+    }
+    gsf__conv_fill_frame(run->ctx, &fill);
+    if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
+}
+
+// Room for a layer's result in slot out->slot, its weights and its sums; starts the job. The weights are not packed yet.
+static gsf_result gsf__vae_start(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in, int halve,
+                                 gsf__vae_map* out, gsf__conv_job* job) {
+    GSF__TRY(gsf__check_cancel(run->ctx));
+    GSF__TRY(gsf__vae_grow(run, &run->packed, gsf__conv_packed(layer)));
+    GSF__TRY(gsf__vae_grow(run, &run->slots[out->slot], out->frames * gsf__vae_plane(out)));
+    *job = gsf__conv_begin(run->ctx, layer, in->height, in->width, halve, run->packed.data);
+    job->groups = gsf__vae_groups(run, layer->out);
+    GSF__TRY(gsf__vae_grow(run, &run->partial, gsf__conv_segments(job) * job->groups * 2 * 2));
+    job->partial = (double*)(void*)run->partial.data;
+    if (!run->dry) memset(gsf__vae_sums(run, out->slot), 0, (size_t)run->net->groups * 2 * sizeof(double));
+    return GSF_OK;
+}
+
+static void gsf__vae_count(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out, int64_t frames) {
+    run->flops += 2.0 * (double)(frames * out->height * out->width) *
+                  (double)(gsf__conv_taps(layer) * layer->in * layer->out);
+}
+
+static void gsf__vae_add_sums(gsf__vae_run* run, int slot) {
+    double* total = gsf__vae_sums(run, slot);
+    const double* frame = gsf__vae_sums(run, GSF__VAE_SLOTS);
+    for (int64_t i = 0; i < run->net->groups * 2; i++) total[i] += frame[i];
+}
+
+static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* out) {
+    if (run->dry) return GSF_OK;
+    const double* sums = gsf__vae_sums(run, out->slot);
+    for (int64_t i = 0; i < gsf__vae_groups(run, layer->out) * 2; i++)
+        if (!(fabs(sums[i]) <= DBL_MAX)) return gsf__vae_fail_nan(run, layer->weight);
+    if (run->watch.fn)
+        run->watch.fn(run->watch.user, layer->weight, run->chunk, out, -1, run->slots[out->slot].data);
+    return GSF_OK;
+}
+
+// The frames that the next chunk's layer starts from; one that stands in the spare frame moves.
+static void gsf__vae_keep(gsf__vae_run* run, gsf__vae_cache* cache, int before, int last, size_t bytes) {
+    if (before == 2 || last == 2) {
+        const int other = before == 2 ? last : before;
+        const int room = other == 0;
+        memcpy(cache->frames[room].data, run->spare.data, bytes);
+        if (before == 2) before = room;
+        if (last == 2) last = room;
+    }
+    cache->last[0] = before;
+    cache->last[1] = last;
+}
+
+// A causal layer, `norm` and SiLU before it (NULL: neither); the result goes to out->slot, or is added to it.
+static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_norm* norm,
+                                  const gsf__vae_map* in, int accumulate, gsf__vae_map* out) {
+    gsf__conv_job job;
+    const int slot = out->slot;
+    *out = *in;
+    out->slot = slot;
+    out->channels = layer->out;
+    const int64_t frame = gsf__conv_frame_size(in->height, in->width, in->channels);
+    gsf__vae_cache* cache = &run->caches[run->chunks == 1 ? 0 : run->cache_at++];
+    if (run->chunk == 0) cache->last[0] = cache->last[1] = -1;
+    GSF__TRY(gsf__vae_grow(run, &cache->frames[0], frame));
+    GSF__TRY(gsf__vae_grow(run, &cache->frames[1], frame));
+    GSF__TRY(gsf__vae_grow(run, &run->spare, frame));
+    if (norm) GSF__TRY(gsf__vae_prepare_norm(run, norm, in));
+    GSF__TRY(gsf__vae_start(run, layer, in, 0, out, &job));
+    gsf__vae_count(run, layer, out, out->frames);
+    if (run->dry) return GSF_OK;
+    gsf__conv_pack(run->ctx, layer, run->packed.data);
+    float* const ring[3] = {cache->frames[0].data, cache->frames[1].data, run->spare.data};
+    int before = cache->last[0], last = cache->last[1];
+    job.accumulate = accumulate;
+    for (int64_t t = 0; t < in->frames; t++) {
+        GSF__TRY(gsf__check_cancel(run->ctx));
+        int now = 0;
+        while (now == before || now == last) now++;
+        gsf__vae_fill(run, norm, in, t, ring[now]);
+        if (last < 0) before = last = now; // before the first frame: itself
+        job.in[0] = ring[before];
+        job.in[1] = ring[last];
+        job.in[2] = ring[now];
+        job.out = run->slots[slot].data + t * gsf__vae_plane(out);
+        gsf__conv_frame(run->ctx, &job, gsf__vae_sums(run, GSF__VAE_SLOTS));
+        gsf__vae_add_sums(run, slot);
+        before = last;
+        last = now;
+    }
+    if (run->chunk + 1 < run->chunks) gsf__vae_keep(run, cache, before, last, (size_t)frame * sizeof(float));
+    return gsf__vae_finish(run, layer, out);
+}
+
+// Pointwise: to slot `slot`, or, where that is the input's and the channels get fewer, in place, frame by frame.
+static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in,
+                                    gsf__vae_map* out) {
+    gsf__conv_job job;
+    const int slot = out->slot;
+    *out = *in;
+    out->slot = slot;
+    out->channels = layer->out;
+    const int64_t plane = gsf__vae_plane(out);
+    GSF__TRY(gsf__vae_grow(run, &run->spare, plane));
+    GSF__TRY(gsf__vae_start(run, layer, in, 0, out, &job));
+    gsf__vae_count(run, layer, out, out->frames);
+    if (run->dry) return GSF_OK;
+    gsf__conv_pack(run->ctx, layer, run->packed.data);
+    job.in_stride = in->width * in->channels;
+    job.origin = 0;
+    job.partial = NULL; // conv2 will be added
+    for (int64_t t = 0; t < in->frames; t++) {
+        float* y = run->slots[slot].data + t * plane;
+        job.in[0] = run->slots[in->slot].data + t * gsf__vae_plane(in);
+        job.out = slot == in->slot ? run->spare.data : y;
+        gsf__conv_frame(run->ctx, &job, NULL);
+        if (slot == in->slot) memcpy(y, run->spare.data, (size_t)plane * sizeof(float));
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_resnet_run(gsf__vae_run* run, const gsf__vae_resnet* resnet, gsf__vae_map* x) {
+    gsf__vae_map middle, sum = *x;
+    middle.slot = gsf__vae_free_slot(x->slot, -1);
+    GSF__TRY(gsf__vae_causal(run, &resnet->conv1, &resnet->norm1, x, 0, &middle));
+    if (resnet->shortcut.out) {
+        if (resnet->shortcut.out > x->channels) sum.slot = gsf__vae_free_slot(x->slot, middle.slot);
+        GSF__TRY(gsf__vae_shortcut(run, &resnet->shortcut, x, &sum));
+    }
+    GSF__TRY(gsf__vae_causal(run, &resnet->conv2, &resnet->norm2, &middle, 1, &sum));
+    *x = sum;
+    return GSF_OK;
+}
+
+// Source frame of frame t of a doubled clip; an odd clip's first frame is not doubled.
+static int64_t gsf__vae_double_source(int64_t t, int64_t frames, int time) {
+    return !time || frames == 1 ? t : frames % 2 ? (t + 1) / 2 : t / 2;
+}
+
+// One frame of gsf__vae_double: `job` for parity (0, 0) of a `width` wide input, packed weights of all four.
+static void gsf__vae_double_frame(gsf__vae_run* run, const gsf__conv_layer* quarter, const gsf__conv_job* job, float* out) {
+    double* sums = gsf__vae_sums(run, GSF__VAE_SLOTS);
+    double* part = gsf__vae_sums(run, GSF__VAE_SLOTS + 1);
+    memset(sums, 0, (size_t)run->net->groups * 2 * sizeof(double));
+    for (int64_t parity = 0; parity < 4; parity++) {
+        const int64_t py = parity / 2, px = parity % 2;
+        gsf__conv_job one = *job;
+        one.pad = 1 - py;
+        one.origin = px * quarter->in;
+        one.packed += parity * gsf__conv_packed(quarter);
+        one.ldo = 2 * quarter->out;
+        one.out_row = 2 * job->width * one.ldo;
+        one.out = out + py * job->width * one.ldo + px * quarter->out;
+        gsf__conv_frame(run->ctx, &one, part);
+        for (int64_t i = 0; i < run->net->groups * 2; i++) sums[i] += part[i];
+    }
+}
+
+// Nearest resize to twice the size and, with `time`, twice the frames, then a 2D convolution, once for frames that are
+// alike.
+static gsf_result gsf__vae_double(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
+    const gsf__conv_layer quarter = gsf__conv_quarter(&block->sampler);
+    gsf__conv_job job;
+    gsf__vae_map out = *x;
+    out.height *= 2;
+    out.width *= 2;
+    out.slot = gsf__vae_free_slot(x->slot, -1);
+    if (block->time && x->frames > 1) out.frames = 2 * x->frames - x->frames % 2;
+    const int64_t plane = gsf__vae_plane(&out);
+    GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(x->height, x->width, x->channels)));
+    GSF__TRY(gsf__vae_grow(run, &run->packed, 4 * gsf__conv_packed(&quarter)));
+    GSF__TRY(gsf__vae_start(run, &quarter, x, 0, &out, &job));
+    gsf__vae_count(run, &quarter, &out, x->frames);
+    if (!run->dry) gsf__conv_pack_quarters(run->ctx, &block->sampler, run->packed.data);
+    job.in[0] = run->spare.data;
+    for (int64_t t = 0; !run->dry && t < out.frames; t++) {
+        const int64_t source = gsf__vae_double_source(t, x->frames, block->time);
+        float* y = run->slots[out.slot].data + t * plane;
+        if (t > 0 && source == gsf__vae_double_source(t - 1, x->frames, block->time)) {
+            memcpy(y, y - plane, (size_t)plane * sizeof(float));
+        } else {
+            GSF__TRY(gsf__check_cancel(run->ctx));
+            gsf__vae_fill(run, NULL, x, source, run->spare.data);
+            gsf__vae_double_frame(run, &quarter, &job, y);
+        }
+        gsf__vae_add_sums(run, out.slot);
+    }
+    *x = out;
+    return gsf__vae_finish(run, &block->sampler, x);
+}
+
+// With `time`, means of two frames (an odd clip's first frame stays alone), then a 2D convolution of stride 2.
+static gsf_result gsf__vae_halve(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
+    gsf__conv_job job;
+    gsf__conv_fill fill;
+    gsf__vae_map out = *x;
+    const int64_t odd = x->frames % 2;
+    out.slot = gsf__vae_free_slot(x->slot, -1);
+    out.height /= 2;
+    out.width /= 2;
+    if (block->time) out.frames = (x->frames + 1) / 2;
+    GSF__TRY(gsf__vae_grow(run, &run->spare, gsf__conv_frame_size(x->height, x->width, x->channels)));
+    GSF__TRY(gsf__vae_start(run, &block->sampler, x, 1, &out, &job));
+    gsf__vae_count(run, &block->sampler, &out, out.frames);
+    if (!run->dry) gsf__conv_pack(run->ctx, &block->sampler, run->packed.data);
+    memset(&fill, 0, sizeof fill);
+    fill.height = x->height;
+    fill.width = x->width;
+    fill.channels = x->channels;
+    fill.out = run->spare.data;
+    job.in[0] = run->spare.data;
+    for (int64_t t = 0; !run->dry && t < out.frames; t++) {
+        const int64_t first = !block->time ? t : t == 0 ? 0 : 2 * t - odd;
+        GSF__TRY(gsf__check_cancel(run->ctx));
+        fill.x = run->slots[x->slot].data + first * gsf__vae_plane(x);
+        fill.x2 = block->time && !(odd && t == 0) ? fill.x + gsf__vae_plane(x) : NULL;
+        gsf__conv_fill_frame(run->ctx, &fill);
+        job.out = run->slots[out.slot].data + t * gsf__vae_plane(&out);
+        gsf__conv_frame(run->ctx, &job, gsf__vae_sums(run, GSF__VAE_SLOTS));
+        gsf__vae_add_sums(run, out.slot);
+    }
+    *x = out;
+    return gsf__vae_finish(run, &block->sampler, x);
+}
+
+// One chunk, whose input stands in slot GSF__VAE_INPUT.
+static gsf_result gsf__vae_chunk(gsf__vae_run* run, const gsf__vae_map* in, gsf__vae_map* out) {
+    const gsf__vae_net* net = run->net;
+    gsf__vae_map x;
+    run->z = *in;
+    run->cache_at = 0;
+    x.slot = 0;
+    GSF__TRY(gsf__vae_causal(run, &net->conv_in, NULL, in, 0, &x));
+    for (int32_t i = 0; i < net->block_count; i++) {
+        const gsf__vae_block* block = &net->blocks[i];
+        for (int32_t j = 0; j < block->count; j++) GSF__TRY(gsf__vae_resnet_run(run, &block->resnets[j], &x));
+        if (!block->sampler.out) continue;
+        if (net->decoder) GSF__TRY(gsf__vae_double(run, block, &x));
+        else GSF__TRY(gsf__vae_halve(run, block, &x));
+    }
+    out->slot = gsf__vae_free_slot(x.slot, -1);
+    return gsf__vae_causal(run, &net->conv_out, &net->norm_out, &x, 0, out);
+}
+
+// ---- clips
+
+typedef struct gsf__vae_planes { // a view of (channels, frames, height, width) floats
+    float* data;
+    int64_t channels, frames, height, width;
+    int64_t channel_stride, frame_stride, row_stride;
+} gsf__vae_planes;
+
+static gsf__vae_planes gsf__vae_wrap(float* data, int64_t channels, int64_t frames, int64_t height, int64_t width) {
+    gsf__vae_planes p;
+    p.data = data;
+    p.channels = channels;
+    p.frames = frames;
+    p.height = height;
+    p.width = width;
+    p.channel_stride = frames * height * width;
+    p.frame_stride = height * width;
+    p.row_stride = width;
+    return p;
+}
+
+static gsf__vae_planes gsf__vae_part(gsf__vae_planes p, int64_t y, int64_t x, int64_t height, int64_t width) {
+    if (p.data) p.data += y * p.row_stride + x;
+    p.height = p.height - y < height ? p.height - y : height;
+    p.width = p.width - x < width ? p.width - x : width;
+    return p;
+}
+
+static float* gsf__vae_row(const gsf__vae_planes* p, int64_t c, int64_t t, int64_t y) {
+    return p->data + c * p->channel_stride + t * p->frame_stride + y * p->row_stride;
+}
+
+// Frames of a clip to channels-last.
+static void gsf__vae_gather(const gsf__vae_planes* in, int64_t first, int64_t frames, float* out) {
+    for (int64_t t = 0; t < frames; t++)
+        for (int64_t y = 0; y < in->height; y++, out += in->width * in->channels)
+            for (int64_t c = 0; c < in->channels; c++) {
+                const float* row = gsf__vae_row(in, c, first + t, y);
+                for (int64_t x = 0; x < in->width; x++) out[x * in->channels + c] = row[x];
+            }
+}
+
+static void gsf__vae_scatter(const float* x, int64_t first, int64_t frames, const gsf__vae_planes* out) {
+    for (int64_t t = 0; t < frames; t++)
+        for (int64_t y = 0; y < out->height; y++, x += out->width * out->channels)
+            for (int64_t c = 0; c < out->channels; c++) {
+                float* row = gsf__vae_row(out, c, first + t, y);
+                for (int64_t i = 0; i < out->width; i++) row[i] = x[i * out->channels + c];
+            }
+}
+
+static int64_t gsf__vae_chunk_count(int64_t frames, int decoder) {
+    const int64_t per = decoder ? GSF__VAE_DECODER_FRAMES : GSF__VAE_ENCODER_FRAMES;
+    return frames < per ? 1 : frames / per;
+}
+
+// Frames of chunk k: the remainder joins the first.
+static int64_t gsf__vae_chunk_frames(int64_t frames, int decoder, int64_t k) {
+    const int64_t per = decoder ? GSF__VAE_DECODER_FRAMES : GSF__VAE_ENCODER_FRAMES;
+    if (frames < per) return frames;
+    return k == 0 ? per + frames % per : per;
+}
+
+static int64_t gsf__vae_out_frames(const gsf_nn_vae* vae, int64_t frames, int decoder) {
+    int64_t sum = 0;
+    const int64_t chunks = gsf__vae_chunk_count(frames, decoder);
+    for (int64_t k = 0; k < 2 && k < chunks; k++) { // all but the first are alike
+        int64_t n = gsf__vae_chunk_frames(frames, decoder, k);
+        for (int32_t ratio = vae->temporal_ratio; ratio > 1; ratio /= 2) {
+            if (!decoder) n = (n + 1) / 2;
+            else if (n > 1) n = 2 * n - n % 2;
+        }
+        sum += k ? n * (chunks - 1) : n;
+    }
+    return sum;
+}
+
+// All chunks of a clip or tile.
+static gsf_result gsf__vae_clip(gsf__vae_run* run, const gsf__vae_planes* in, const gsf__vae_planes* out) {
+    int64_t first = 0, out_first = 0;
+    run->chunks = gsf__vae_chunk_count(in->frames, run->net->decoder);
+    for (run->chunk = 0; run->chunk < run->chunks; run->chunk++) {
+        gsf__vae_map x, y;
+        x.slot = GSF__VAE_INPUT;
+        x.frames = gsf__vae_chunk_frames(in->frames, run->net->decoder, run->chunk);
+        x.height = in->height;
+        x.width = in->width;
+        x.channels = in->channels;
+        GSF__TRY(gsf__vae_grow(run, &run->slots[GSF__VAE_INPUT], x.frames * gsf__vae_plane(&x)));
+        if (!run->dry) gsf__vae_gather(in, first, x.frames, run->slots[GSF__VAE_INPUT].data);
+        GSF__TRY(gsf__vae_chunk(run, &x, &y));
+        if (!run->dry) {
+            gsf__vae_scatter(run->slots[y.slot].data, out_first, y.frames, out);
+            gsf__progress(run->ctx, run->stage, (double)++run->done, (double)run->total);
+        }
+        first += x.frames;
+        out_first += y.frames;
+    }
+    return GSF_OK;
+}
+
+typedef struct gsf__vae_plan { // how a job is tiled; an untiled one is a single tile
+    int64_t out_frames, out_height, out_width, out_channels;
+    int64_t rows, columns;                 // tiles
+    int64_t tile[2], step[2];              // height, width of a tile of the input; distance of two
+    int64_t out_step[2], blend[2];         // the same distance and the overlap in the result
+} gsf__vae_plan;
+
+// int() of a Python float.
+static int64_t gsf__vae_whole(double value) { return (int64_t)floor(value); }
+
+static gsf_result gsf__vae_plan_axis(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const char* axis, int64_t tile,
+                                     double overlap, int i, gsf__vae_plan* plan) {
+    const int64_t ratio = vae->spatial_ratio, latent = tile / ratio;
+    const int64_t blend = gsf__vae_whole((double)tile * overlap), latent_blend = gsf__vae_whole((double)latent * overlap);
+    const int64_t step = gsf__vae_whole((double)tile * (1.0 - overlap));
+    const int64_t latent_step = gsf__vae_whole((double)latent * (1.0 - overlap));
+    if (tile % ratio != 0 || blend != latent_blend * ratio || step != tile - blend ||
+        latent_step != latent - latent_blend || latent_step < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "tiling: a tile %s of %lld times overlap %g is not a whole number of latents (%d pixels each)",
+                        axis, (long long)tile, overlap, (int)ratio);
+    plan->tile[i] = decoder ? latent : tile;
+    plan->step[i] = decoder ? latent_step : step;
+    plan->out_step[i] = decoder ? step : latent_step;
+    plan->blend[i] = decoder ? blend : latent_blend;
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_check_size(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, int64_t frames, int64_t height,
+                                      int64_t width) {
+    double widest = 2.0 * vae->latent_channels;
+    const int64_t least = decoder ? 1 : vae->spatial_ratio;
+    if (!vae->nets) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: no model is open");
+    if (frames < 1 || height < least || width < least)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: %lld frames of %lld x %lld, but at least 1 of %lld x %lld "
+                        "is needed", (long long)frames, (long long)width, (long long)height, (long long)least,
+                        (long long)least);
+    for (int32_t i = 0; i < vae->levels; i++)
+        if (vae->channels[i] > widest) widest = vae->channels[i];
+    const double scale = decoder ? (double)vae->spatial_ratio * vae->spatial_ratio * vae->temporal_ratio : 1.0;
+    if ((double)frames * ((double)height + 2.0) * ((double)width + 2.0) * scale * widest > 1e15) // sizes below 2^63
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: %lld frames of %lld x %lld are too large", (long long)frames,
+                        (long long)width, (long long)height);
+    return GSF_OK;
+}
+
+static gsf_result gsf__vae_make_plan(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
+                                     int64_t frames, int64_t height, int64_t width, gsf__vae_plan* plan) {
+    const int64_t ratio = vae->spatial_ratio;
+    memset(plan, 0, sizeof *plan);
+    GSF__TRY(gsf__vae_check_size(ctx, vae, decoder, frames, height, width));
+    plan->out_channels = decoder ? vae->out_channels : 2 * vae->latent_channels;
+    plan->out_frames = gsf__vae_out_frames(vae, frames, decoder);
+    plan->out_height = decoder ? height * ratio : height / ratio;
+    plan->out_width = decoder ? width * ratio : width / ratio;
+    plan->rows = plan->columns = 1;
+    plan->tile[0] = plan->step[0] = height;
+    plan->tile[1] = plan->step[1] = width;
+    plan->out_step[0] = plan->out_height;
+    plan->out_step[1] = plan->out_width;
+    if (!desc || !desc->tiled) return GSF_OK;
+    gsf__vae_plan tiled = *plan;
+    const int64_t tile_height = desc->tile_height ? desc->tile_height : vae->sample_height / 2;
+    const int64_t tile_width = desc->tile_width ? desc->tile_width : vae->sample_width / 2;
+    GSF__TRY(gsf__vae_plan_axis(ctx, vae, decoder, "height", tile_height,
+                                desc->overlap_height > 0.0 ? desc->overlap_height : 1.0 / 6.0, 0, &tiled));
+    GSF__TRY(gsf__vae_plan_axis(ctx, vae, decoder, "width", tile_width,
+                                desc->overlap_width > 0.0 ? desc->overlap_width : 1.0 / 5.0, 1, &tiled));
+    if (height <= tiled.tile[0] && width <= tiled.tile[1]) return GSF_OK;
+    tiled.rows = (height + tiled.step[0] - 1) / tiled.step[0];
+    tiled.columns = (width + tiled.step[1] - 1) / tiled.step[1];
+    const int64_t bottom = height - (tiled.rows - 1) * tiled.step[0], right = width - (tiled.columns - 1) * tiled.step[1];
+    if (!decoder && (bottom % ratio != 0 || right % ratio != 0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "tiling: %lld x %lld leaves a last tile of %lld x %lld, which is no multiple of %lld",
+                        (long long)width, (long long)height, (long long)right, (long long)bottom, (long long)ratio);
+    *plan = tiled;
+    return GSF_OK;
+}
+
+// b's first lines fade from a's last ones, in place. `across`: columns instead of rows.
+static void gsf__vae_fade(const gsf__vae_planes* a, const gsf__vae_planes* b, int64_t extent, int across) {
+    const int64_t a_size = across ? a->width : a->height, b_size = across ? b->width : b->height;
+    if (extent > a_size) extent = a_size;
+    if (extent > b_size) extent = b_size;
+    for (int64_t i = 0; i < extent; i++) {
+        const float weight = (float)((double)i / (double)extent), rest = (float)(1.0 - (double)i / (double)extent);
+        const int64_t lines = across ? b->height : b->width;
+        for (int64_t c = 0; c < b->channels; c++)
+            for (int64_t t = 0; t < b->frames; t++)
+                for (int64_t j = 0; j < lines; j++) {
+                    float* y = across ? gsf__vae_row(b, c, t, j) + i : gsf__vae_row(b, c, t, i) + j;
+                    const float x = across ? gsf__vae_row(a, c, t, j)[a_size - extent + i]
+                                           : gsf__vae_row(a, c, t, a_size - extent + i)[j];
+                    *y = x * rest + *y * weight;
+                }
+    }
+}
+
+static void gsf__vae_copy(const gsf__vae_planes* from, const gsf__vae_planes* to) { // what both have
+    const int64_t height = from->height < to->height ? from->height : to->height;
+    const int64_t width = from->width < to->width ? from->width : to->width;
+    for (int64_t c = 0; c < to->channels; c++)
+        for (int64_t t = 0; t < to->frames; t++)
+            for (int64_t y = 0; y < height; y++)
+                memcpy(gsf__vae_row(to, c, t, y), gsf__vae_row(from, c, t, y), (size_t)width * sizeof(float));
+}
+
+// Height (axis 0) or width of tile k of an input of `size`.
+static int64_t gsf__vae_tile_size(const gsf__vae_plan* plan, int axis, int64_t size, int64_t k) {
+    const int64_t left = size - k * plan->step[axis];
+    return left < plan->tile[axis] ? left : plan->tile[axis];
+}
+
+// Tile after tile, each over all frames. A tile is blended with the blended ones above and to the left, which is why two
+// rows of tiles are kept: tiles (2, columns).
+static gsf_result gsf__vae_tiles(gsf__vae_run* run, const gsf__vae_plan* plan, const gsf__vae_planes* in,
+                                 const gsf__vae_planes* out, gsf__vae_buffer* tiles) {
+    const int64_t ratio_up = run->net->decoder ? plan->out_step[0] / plan->step[0] : 1;
+    const int64_t ratio_down = run->net->decoder ? 1 : plan->step[0] / plan->out_step[0];
+    for (int64_t i = 0; i < plan->rows; i++)
+        for (int64_t j = 0; j < plan->columns; j++) {
+            const gsf__vae_planes part = gsf__vae_part(*in, i * plan->step[0], j * plan->step[1], plan->tile[0],
+                                                       plan->tile[1]);
+            gsf__vae_buffer *own = &tiles[i % 2 * plan->columns + j], *above = &tiles[(i + 1) % 2 * plan->columns + j];
+            const int64_t h = part.height * ratio_up / ratio_down, w = part.width * ratio_up / ratio_down;
+            GSF__TRY(gsf__vae_grow(run, own, plan->out_channels * plan->out_frames * h * w));
+            const gsf__vae_planes tile = gsf__vae_wrap(own->data, plan->out_channels, plan->out_frames, h, w);
+            GSF__TRY(gsf__vae_clip(run, &part, &tile));
+            if (run->dry) continue;
+            if (i > 0) {
+                const int64_t size = gsf__vae_tile_size(plan, 0, in->height, i - 1) * ratio_up / ratio_down;
+                const gsf__vae_planes a = gsf__vae_wrap(above->data, plan->out_channels, plan->out_frames, size, w);
+                gsf__vae_fade(&a, &tile, plan->blend[0], 0);
+            }
+            if (j > 0) {
+                const int64_t size = gsf__vae_tile_size(plan, 1, in->width, j - 1) * ratio_up / ratio_down;
+                const gsf__vae_planes a = gsf__vae_wrap(own[-1].data, plan->out_channels, plan->out_frames, h, size);
+                gsf__vae_fade(&a, &tile, plan->blend[1], 1);
+            }
+            const gsf__vae_planes place = gsf__vae_part(*out, i * plan->out_step[0], j * plan->out_step[1],
+                                                        plan->out_step[0], plan->out_step[1]);
+            gsf__vae_copy(&tile, &place);
+        }
+    return GSF_OK;
+}
+
+typedef struct gsf__vae_task {
+    const gsf_nn_vae* vae;
+    gsf__vae_plan plan;
+    int decoder;
+    int64_t frames, height, width;
+    gsf__vae_buffer moments; // encoder: (2 latent_channels, ...)
+    gsf__vae_buffer* tiles;
+    gsf__vae_watch watch;
+} gsf__vae_task;
+
+static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const float* in, float* out) {
+    const gsf__vae_plan* plan = &task->plan;
+    const gsf_nn_vae* vae = task->vae;
+    GSF__TRY(gsf__vae_begin(run));
+    if (!task->decoder) {
+        GSF__TRY(gsf__vae_grow(run, &task->moments,
+                               plan->out_channels * plan->out_frames * plan->out_height * plan->out_width));
+        out = task->moments.data;
+    }
+    // The input is only read; gsf__vae_planes serves both ways.
+    const gsf__vae_planes from =
+        gsf__vae_wrap((float*)(uintptr_t)in, task->decoder ? vae->latent_channels : vae->in_channels, task->frames,
+                      task->height, task->width);
+    const gsf__vae_planes to = gsf__vae_wrap(out, plan->out_channels, plan->out_frames, plan->out_height, plan->out_width);
+    if (plan->rows * plan->columns == 1) return gsf__vae_clip(run, &from, &to);
+    task->tiles = (gsf__vae_buffer*)gsf_alloc_zeroed(run->ctx, (size_t)plan->columns * 2, sizeof *task->tiles);
+    if (!task->tiles) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf__vae_tiles(run, plan, &from, &to, task->tiles);
+}
+
+// Runs, or with in == NULL only counts: *flops and *bytes.
+static gsf_result gsf__vae_execute(gsf_context* ctx, gsf__vae_task* task, const float* in, float* out, float* mean,
+                                   float* logvar, double* flops, double* bytes) {
+    const gsf__vae_nets* nets = (const gsf__vae_nets*)task->vae->nets;
+    gsf__vae_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.net = task->decoder ? &nets->decoder : &nets->encoder;
+    run.dry = !in;
+    run.total = gsf__vae_chunk_count(task->frames, task->decoder) * task->plan.rows * task->plan.columns;
+    run.stage = task->decoder ? "vae decode" : "vae encode";
+    run.watch = task->watch;
+    const gsf_result result = gsf__vae_walk(&run, task, in, out);
+    *flops = run.flops;
+    *bytes = (double)run.peak;
+    if (result == GSF_OK && in && !task->decoder) {
+        const size_t half = task->moments.size / sizeof(float) / 2;
+        const float* moments = task->moments.data;
+        memcpy(mean, moments, half * sizeof(float));
+        for (size_t i = 0; logvar && i < half; i++) {
+            const float v = moments[half + i];
+            logvar[i] = v < -30.0f ? -30.0f : v > 20.0f ? 20.0f : v;
+        }
+    }
+    for (int64_t i = 0; task->tiles && i < task->plan.columns * 2; i++) gsf__vae_release(ctx, &task->tiles[i]);
+    gsf_free(ctx, task->tiles);
+    task->tiles = NULL;
+    gsf__vae_release(ctx, &task->moments);
+    gsf__vae_end(&run);
+    return result;
+}
+
+static gsf_result gsf__vae_make_task(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
+                                     int64_t frames, int64_t height, int64_t width, gsf__vae_task* task,
+                                     gsf_nn_vae_info* info) {
+    memset(task, 0, sizeof *task);
+    memset(info, 0, sizeof *info);
+    task->vae = vae;
+    task->decoder = decoder;
+    task->frames = frames;
+    task->height = height;
+    task->width = width;
+    GSF__TRY(gsf__vae_make_plan(ctx, vae, decoder, desc, frames, height, width, &task->plan));
+    info->frames = task->plan.out_frames;
+    info->height = task->plan.out_height;
+    info->width = task->plan.out_width;
+    info->chunks = gsf__vae_chunk_count(frames, decoder) * task->plan.rows * task->plan.columns;
+    return gsf__vae_execute(ctx, task, NULL, NULL, NULL, NULL, &info->flops, &info->bytes);
+}
+
+GSF_API gsf_result gsf_nn_query_vae(gsf_context* ctx, const gsf_nn_vae* vae, gsf_nn_vae_way way,
+                                    const gsf_nn_vae_desc* desc, int64_t frames, int64_t height, int64_t width,
+                                    gsf_nn_vae_info* out) {
+    gsf__vae_task task;
+    return gsf__vae_make_task(ctx, vae, way == GSF_NN_VAE_DECODE, desc, frames, height, width, &task, out);
+}
+
+static gsf_result gsf__vae_check_finite(gsf_context* ctx, const char* what, const float* x, int64_t channels,
+                                        int64_t frames, int64_t height, int64_t width) {
+    const int64_t at = gsf__nn_find_not_finite(ctx, x, channels * frames * height * width);
+    if (at < 0) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: NaN or infinity in channel %lld, frame %lld, row %lld, column %lld", what,
+                    (long long)(at / (frames * height * width)), (long long)(at / (height * width) % frames),
+                    (long long)(at / width % height), (long long)(at % width));
+}
+
+static gsf_result gsf__vae_apply(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const gsf_nn_vae_desc* desc,
+                                 const float* in, int64_t frames, int64_t height, int64_t width, float* video, float* mean,
+                                 float* logvar) {
+    gsf__vae_task task;
+    gsf_nn_vae_info info;
+    const char* stage = decoder ? "vae decode" : "vae encode";
+    double flops, bytes;
+    if (!in || (decoder ? !video : !mean))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: an array is missing", stage);
+    GSF__TRY(gsf__vae_make_task(ctx, vae, decoder, desc, frames, height, width, &task, &info));
+    if (desc && desc->max_bytes > 0.0 && info.bytes > desc->max_bytes)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: needs %.0f MiB, %.0f are allowed", stage,
+                        ceil(info.bytes / 1048576.0), desc->max_bytes / 1048576.0);
+    GSF__TRY(gsf__vae_check_finite(ctx, decoder ? "latents" : "video", in,
+                                   decoder ? vae->latent_channels : vae->in_channels, frames, height, width));
+    const gsf_result result = gsf__vae_execute(ctx, &task, in, video, mean, logvar, &flops, &bytes);
+    if (result == GSF_OK) return GSF_OK;
+    const size_t plane = (size_t)(info.frames * info.height * info.width) * sizeof(float);
+    if (video) memset(video, 0, plane * (size_t)vae->out_channels);
+    if (mean) memset(mean, 0, plane * (size_t)vae->latent_channels);
+    if (logvar) memset(logvar, 0, plane * (size_t)vae->latent_channels);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_vae_encode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
+                                     const float* video, int64_t frames, int64_t height, int64_t width, float* mean,
+                                     float* logvar) {
+    return gsf__vae_apply(ctx, vae, 0, desc, video, frames, height, width, NULL, mean, logvar);
+}
+
+GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
+                                     const float* latents, int64_t frames, int64_t height, int64_t width, float* video) {
+    return gsf__vae_apply(ctx, vae, 1, desc, latents, frames, height, width, video, NULL, NULL);
+}
+
+// ---- >>nn transformer -----------------------------------------------------------
+
+typedef struct gsf__dit_attention { // one attention layer's tensors
+    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
+    const gsf_tensor *norm_q_weight, *norm_q_bias, *norm_k_weight, *norm_k_bias;
+} gsf__dit_attention;
+
+typedef struct gsf__dit_norm { // LayerNorm whose scale, shift and gates come from the time step
+    const gsf_tensor *linear_weight, *linear_bias, *weight, *bias;
+} gsf__dit_norm;
+
+typedef struct gsf__dit_block {
+    gsf__dit_norm norm1, norm2;
+    gsf__dit_attention self, cross;
+    const gsf_tensor *norm_cross_weight, *norm_cross_bias;
+    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias; // feed-forward
+} gsf__dit_block;
+
+typedef struct gsf__dit_projector {
+    const gsf_tensor *weight, *bias, *norm_weight, *norm_bias;
+} gsf__dit_projector;
+
+typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
+    gsf__dit_block* blocks;
+    gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
+    gsf__dit_projector dino, vggt;
+    gsf__dit_norm norm_out;
+    const gsf_tensor *patch_weight, *patch_bias, *text_weight, *text_bias, *positions;
+    const gsf_tensor *time1_weight, *time1_bias, *time2_weight, *time2_bias;
+    const gsf_tensor *norm_final_weight, *norm_final_bias, *out_weight, *out_bias;
+} gsf__dit_nets;
+
+static int64_t gsf__dit_width(const gsf_nn_transformer* c) { return (int64_t)c->heads * c->head_dim; }
+
+// ---- opening: which tensor goes where, and its shape
+
+// Shapes as letters: one dimension each.
+//   d width  h head_dim  f 4 width  t time channels  x text channels  m 6 width  n 2 width  p patch tokens' outputs
+//   i in_channels  k patch  r any (the reference tokens' channels)  1 one  s text and video tokens of the table
+typedef struct gsf__dit_entry {
+    const char* name;
+    const char* shape;
+    size_t offset; // of the pointer in its struct
+    int kind;      // see GSF__DIT_*
+} gsf__dit_entry;
+
+enum { GSF__DIT_ALWAYS = 0, GSF__DIT_ATTENTION_BIAS, GSF__DIT_LEARNED };
+
+#define GSF__DIT_ATTENTION(prefix, member)                                                                          \
+    {prefix ".to_q.weight", "dd", offsetof(gsf__dit_block, member.q_weight), GSF__DIT_ALWAYS},                      \
+    {prefix ".to_k.weight", "dd", offsetof(gsf__dit_block, member.k_weight), GSF__DIT_ALWAYS},                      \
+    {prefix ".to_v.weight", "dd", offsetof(gsf__dit_block, member.v_weight), GSF__DIT_ALWAYS},                      \
+    {prefix ".to_q.bias", "d", offsetof(gsf__dit_block, member.q_bias), GSF__DIT_ATTENTION_BIAS},                   \
+    {prefix ".to_k.bias", "d", offsetof(gsf__dit_block, member.k_bias), GSF__DIT_ATTENTION_BIAS},                   \
+    {prefix ".to_v.bias", "d", offsetof(gsf__dit_block, member.v_bias), GSF__DIT_ATTENTION_BIAS},                   \
+    {prefix ".to_out.0.weight", "dd", offsetof(gsf__dit_block, member.out_weight), GSF__DIT_ALWAYS},                \
+    {prefix ".to_out.0.bias", "d", offsetof(gsf__dit_block, member.out_bias), GSF__DIT_ALWAYS},                     \
+    {prefix ".norm_q.weight", "h", offsetof(gsf__dit_block, member.norm_q_weight), GSF__DIT_ALWAYS},                \
+    {prefix ".norm_q.bias", "h", offsetof(gsf__dit_block, member.norm_q_bias), GSF__DIT_ALWAYS},                    \
+    {prefix ".norm_k.weight", "h", offsetof(gsf__dit_block, member.norm_k_weight), GSF__DIT_ALWAYS},                \
+    {prefix ".norm_k.bias", "h", offsetof(gsf__dit_block, member.norm_k_bias), GSF__DIT_ALWAYS}
+
+#define GSF__DIT_NORM(prefix, member, shape)                                                                        \
+    {prefix ".linear.weight", shape "t", offsetof(gsf__dit_block, member.linear_weight), GSF__DIT_ALWAYS},          \
+    {prefix ".linear.bias", shape, offsetof(gsf__dit_block, member.linear_bias), GSF__DIT_ALWAYS},                  \
+    {prefix ".norm.weight", "d", offsetof(gsf__dit_block, member.weight), GSF__DIT_ALWAYS},                         \
+    {prefix ".norm.bias", "d", offsetof(gsf__dit_block, member.bias), GSF__DIT_ALWAYS}
+
+static const gsf__dit_entry gsf__dit_block_entries[] = { // below transformer_blocks.N.
+    GSF__DIT_NORM("norm1", norm1, "m"),
+    GSF__DIT_NORM("norm2", norm2, "m"),
+    GSF__DIT_ATTENTION("attn1", self),
+    GSF__DIT_ATTENTION("attn_cross", cross),
+    {"norm_cross.weight", "d", offsetof(gsf__dit_block, norm_cross_weight), GSF__DIT_ALWAYS},
+    {"norm_cross.bias", "d", offsetof(gsf__dit_block, norm_cross_bias), GSF__DIT_ALWAYS},
+    {"ff.net.0.proj.weight", "fd", offsetof(gsf__dit_block, up_weight), GSF__DIT_ALWAYS},
+    {"ff.net.0.proj.bias", "f", offsetof(gsf__dit_block, up_bias), GSF__DIT_ALWAYS},
+    {"ff.net.2.weight", "df", offsetof(gsf__dit_block, down_weight), GSF__DIT_ALWAYS},
+    {"ff.net.2.bias", "d", offsetof(gsf__dit_block, down_bias), GSF__DIT_ALWAYS},
+};
+
+#define GSF__DIT_AT(member) offsetof(gsf__dit_nets, member), GSF__DIT_ALWAYS
+static const gsf__dit_entry gsf__dit_entries[] = {
+    {"patch_embed.proj.weight", "dikk", GSF__DIT_AT(patch_weight)},
+    {"patch_embed.proj.bias", "d", GSF__DIT_AT(patch_bias)},
+    {"patch_embed.text_proj.weight", "dx", GSF__DIT_AT(text_weight)},
+    {"patch_embed.text_proj.bias", "d", GSF__DIT_AT(text_bias)},
+    {"patch_embed.pos_embedding", "1sd", offsetof(gsf__dit_nets, positions), GSF__DIT_LEARNED},
+    {"time_embedding.linear_1.weight", "td", GSF__DIT_AT(time1_weight)},
+    {"time_embedding.linear_1.bias", "t", GSF__DIT_AT(time1_bias)},
+    {"time_embedding.linear_2.weight", "tt", GSF__DIT_AT(time2_weight)},
+    {"time_embedding.linear_2.bias", "t", GSF__DIT_AT(time2_bias)},
+    {"projector_dino.proj.weight", "dr", GSF__DIT_AT(dino.weight)},
+    {"projector_dino.proj.bias", "d", GSF__DIT_AT(dino.bias)},
+    {"projector_dino.norm.weight", "d", GSF__DIT_AT(dino.norm_weight)},
+    {"projector_dino.norm.bias", "d", GSF__DIT_AT(dino.norm_bias)},
+    {"projector_vggt.proj.weight", "dr", GSF__DIT_AT(vggt.weight)},
+    {"projector_vggt.proj.bias", "d", GSF__DIT_AT(vggt.bias)},
+    {"projector_vggt.norm.weight", "d", GSF__DIT_AT(vggt.norm_weight)},
+    {"projector_vggt.norm.bias", "d", GSF__DIT_AT(vggt.norm_bias)},
+    {"norm_final.weight", "d", GSF__DIT_AT(norm_final_weight)},
+    {"norm_final.bias", "d", GSF__DIT_AT(norm_final_bias)},
+    {"norm_out.linear.weight", "nt", GSF__DIT_AT(norm_out.linear_weight)},
+    {"norm_out.linear.bias", "n", GSF__DIT_AT(norm_out.linear_bias)},
+    {"norm_out.norm.weight", "d", GSF__DIT_AT(norm_out.weight)},
+    {"norm_out.norm.bias", "d", GSF__DIT_AT(norm_out.bias)},
+    {"proj_out.weight", "pd", GSF__DIT_AT(out_weight)},
+    {"proj_out.bias", "p", GSF__DIT_AT(out_bias)},
+};
+#undef GSF__DIT_AT
+#undef GSF__DIT_NORM
+#undef GSF__DIT_ATTENTION
+
+static int64_t gsf__dit_dimension(const gsf_nn_transformer* c, char letter) {
+    const int64_t d = gsf__dit_width(c);
+    switch (letter) {
+        case 'd': return d;
+        case 'h': return c->head_dim;
+        case 'f': return 4 * d;
+        case 't': return c->time_channels;
+        case 'x': return c->text_channels;
+        case 'm': return 6 * d;
+        case 'n': return 2 * d;
+        case 'p': return (int64_t)c->out_channels * c->patch * c->patch;
+        case 'i': return c->in_channels;
+        case 'k': return c->patch;
+        case '1': return 1;
+        case 's':
+            return c->text_tokens + (int64_t)((c->sample_frames - 1) / c->temporal_ratio + 1) *
+                                        (c->sample_height / c->patch) * (c->sample_width / c->patch);
+        default: return -1; // any
+    }
+}
+
+static gsf_result gsf__dit_bind(gsf__nn_loader* loader, const gsf_nn_transformer* c, const gsf__dit_entry* entries,
+                                size_t count, const char* prefix, void* where) {
+    for (size_t i = 0; i < count; i++) {
+        const gsf__dit_entry* e = &entries[i];
+        if (e->kind == GSF__DIT_ATTENTION_BIAS && !c->attention_bias) continue;
+        if (e->kind == GSF__DIT_LEARNED && !c->learned_positions) continue;
+        int64_t shape[GSF_NN_MAX_RANK];
+        int rank = 0;
+        for (const char* s = e->shape; *s; s++) shape[rank++] = gsf__dit_dimension(c, *s);
+        const gsf_tensor* tensor;
+        GSF__TRY(gsf__nn_need(loader, &tensor, rank, shape, "%s%s", prefix, e->name));
+        memcpy((char*)where + e->offset, &tensor, sizeof tensor);
+    }
+    return GSF_OK;
+}
+
+// What this code computes in one way only must not be configured otherwise.
+static gsf_result gsf__dit_check_fixed(const gsf__nn_config* file) {
+    static const struct { const char *key, *value; } texts[] = {
+        {"activation_fn", "gelu-approximate"}, {"timestep_activation_fn", "silu"}};
+    static const struct { const char* key; int value; } flags[] = {
+        {"flip_sin_to_cos", 1}, {"norm_elementwise_affine", 1}, {"patch_bias", 1}};
+    static const char* const absent[] = {"ofs_embed_dim", "patch_size_t"};
+    double shift;
+    for (size_t i = 0; i < GSF__COUNT(texts); i++) {
+        const char* text;
+        GSF__TRY(gsf__nn_config_string(file, texts[i].key, texts[i].value, &text));
+        if (strcmp(text, texts[i].value) != 0)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
+                            texts[i].value);
+    }
+    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
+        int flag;
+        GSF__TRY(gsf__nn_config_bool_or(file, flags[i].key, flags[i].value, &flag));
+        if (flag != flags[i].value)
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i].key);
+    }
+    for (size_t i = 0; i < GSF__COUNT(absent); i++)
+        if (gsf__nn_config_find(file, absent[i]))
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not null", file->json.name, absent[i]);
+    GSF__TRY(gsf__nn_config_number_or(file, "freq_shift", 0.0, -1e3, 1e3, &shift));
+    if (shift != 0.0) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: freq_shift is not 0", file->json.name);
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
+    const struct { const char* key; int32_t* to; int64_t low, high; } sizes[] = {
+        {"num_attention_heads", &c->heads, 1, 1024}, {"attention_head_dim", &c->head_dim, 8, 1024},
+        {"num_layers", &c->layers, 1, 1024}, {"in_channels", &c->in_channels, 1, 65536},
+        {"out_channels", &c->out_channels, 1, 65536}, {"text_embed_dim", &c->text_channels, 1, 1 << 20},
+        {"max_text_seq_length", &c->text_tokens, 1, 1 << 20}, {"time_embed_dim", &c->time_channels, 1, 1 << 20},
+        {"patch_size", &c->patch, 1, 64}, {"sample_width", &c->sample_width, 1, 1 << 16},
+        {"sample_height", &c->sample_height, 1, 1 << 16}, {"sample_frames", &c->sample_frames, 1, 1 << 16},
+        {"temporal_compression_ratio", &c->temporal_ratio, 1, 64}};
+    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+        int64_t value = 0;
+        GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
+        *sizes[i].to = (int32_t)value;
+    }
+    int flag;
+    GSF__TRY(gsf__nn_config_bool_or(file, "attention_bias", 1, &flag));
+    c->attention_bias = flag;
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_learned_positional_embeddings", 0, &flag));
+    c->learned_positions = flag;
+    GSF__TRY(gsf__nn_config_bool_or(file, "use_rotary_positional_embeddings", 0, &flag));
+    c->rotary_positions = flag;
+    GSF__TRY(gsf__nn_config_number_or(file, "norm_eps", 1e-5, 1e-12, 1.0, &c->norm_eps));
+    GSF__TRY(gsf__nn_config_number_or(file, "spatial_interpolation_scale", 1.875, 1e-3, 1e3, &c->spatial_scale));
+    GSF__TRY(gsf__nn_config_number_or(file, "temporal_interpolation_scale", 1.0, 1e-3, 1e3, &c->temporal_scale));
+    if (c->head_dim % 16 || c->sample_width % c->patch || c->sample_height % c->patch)
+        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
+                        "%s: attention_head_dim %d is no multiple of 16, or the sample no multiple of the patch",
+                        file->json.name, (int)c->head_dim);
+    return gsf__dit_check_fixed(file);
+}
+
+static gsf_result gsf__dit_bind_all(gsf_context* ctx, gsf_nn_transformer* net) {
+    gsf__nn_loader loader;
+    gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+    net->nets = nets;
+    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->blocks = (gsf__dit_block*)gsf_alloc_zeroed(ctx, (size_t)net->layers, sizeof(gsf__dit_block));
+    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
+    gsf_result result = gsf__dit_bind(&loader, net, gsf__dit_entries, GSF__COUNT(gsf__dit_entries), "", nets);
+    for (int32_t i = 0; i < net->layers && !result; i++) {
+        char prefix[48];
+        snprintf(prefix, sizeof prefix, "transformer_blocks.%d.", (int)i);
+        result = gsf__dit_bind(&loader, net, gsf__dit_block_entries, GSF__COUNT(gsf__dit_block_entries), prefix,
+                               &nets->blocks[i]);
+    }
+    if (!net->learned_positions) gsf__nn_ignore(&loader, "patch_embed.pos_embedding"); // computed
+    GSF__TRY(gsf__nn_end_loading(&loader, result));
+    net->dino_channels = (int32_t)nets->dino.weight->shape[1];
+    net->vggt_channels = (int32_t)nets->vggt.weight->shape[1];
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer) {
+    gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
+    if (nets) {
+        for (size_t i = 0; nets->quantized && i < transformer->weights.tensor_count; i++)
+            gsf_nn_destroy_quantized(ctx, &nets->quantized[i]);
+        gsf_free(ctx, nets->quantized);
+        gsf_free(ctx, nets->blocks);
+    }
+    gsf_free(ctx, nets);
+    gsf_nn_close_weights(ctx, &transformer->weights);
+    memset(transformer, 0, sizeof *transformer);
+}
+
+GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer, size_t* bytes) {
+    gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
+    const gsf_nn_weights* w = &transformer->weights;
+    size_t total = 0;
+    if (!nets->quantized)
+        nets->quantized = (gsf_nn_quantized*)gsf_alloc_zeroed(ctx, w->tensor_count, sizeof *nets->quantized);
+    if (!nets->quantized) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int32_t i = 0; i < transformer->layers; i++) {
+        const gsf__dit_block* b = &nets->blocks[i];
+        const gsf_tensor* const layers[] = {
+            b->self.q_weight, b->self.k_weight, b->self.v_weight, b->self.out_weight, b->cross.q_weight,
+            b->cross.k_weight, b->cross.v_weight, b->cross.out_weight, b->up_weight, b->down_weight};
+        for (size_t k = 0; k < GSF__COUNT(layers); k++) {
+            gsf_nn_quantized* q = &nets->quantized[layers[k] - w->tensors];
+            if (!q->data) GSF__TRY(gsf_nn_quantize_weight(ctx, layers[k], 0, q));
+            total += q->bytes;
+        }
+        GSF__TRY(gsf__check_cancel(ctx));
+        gsf__progress(ctx, "quantize", i + 1, transformer->layers);
+    }
+    if (bytes) *bytes = total;
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
+    gsf__nn_config file;
+    gsf_text path;
+    memset(&path, 0, sizeof path);
+    memset(out, 0, sizeof *out);
+    gsf_text_printf(ctx, &path, "%s/config.json", folder);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
+    gsf_destroy_text(ctx, &path);
+    if (!result) {
+        result = gsf__dit_read_config(&file, out);
+        gsf__nn_close_config(&file);
+    }
+    if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
+    if (!result) result = gsf__dit_bind_all(ctx, out);
+    if (result) gsf_nn_destroy_transformer(ctx, out);
+    return result;
+}
+
+// ---- one forward pass
+
+typedef struct gsf__dit_run {
+    gsf_context* ctx;
+    const gsf_nn_transformer* net;
+    const gsf__dit_nets* nets;
+    gsf_nn_workspace workspace;
+    const gsf_nn_transformer_input* in;
+    int64_t width, text, video, tokens; // tokens = text + video: rows of a sample
+    float* x;       // (batch, tokens, width): the residual stream, text first
+    float* normed;  // (tokens, width)
+    float* qkv;     // 3 x (rows, width), rows the larger of tokens and reference tokens; the feed-forward's hidden rows
+    int64_t qkv_rows;
+    float* time;    // (batch, time_channels): SiLU of the time embedding
+    float* modulation; // (6 width)
+    float* vectors; // biases and norm weights of the block at work, widened
+    size_t vectors_used, vectors_size;
+    float *cos, *sin; // (video, head_dim) or NULL
+    float* probe;   // (tokens, width): what a gated layer adds; only with a tap
+    char label[48]; // of the block at work, for taps and errors
+} gsf__dit_run;
+
+static void gsf__dit_tap(const gsf__dit_run* run, const char* name, int32_t row, const float* data, int64_t rows,
+                         int64_t columns) {
+    if (!run->in->tap_fn || !data) return;
+    char whole[96];
+    snprintf(whole, sizeof whole, "%s%s", run->label, name);
+    run->in->tap_fn(run->in->tap_user, whole, row, data, rows, columns);
+}
+
+// A small tensor as floats; valid until the next block begins.
+static const float* gsf__dit_vector(gsf__dit_run* run, const gsf_tensor* tensor) {
+    if (!tensor) return NULL;
+    float* out = run->vectors + run->vectors_used;
+    GSF_ASSERT(run->vectors_used + (size_t)tensor->count <= run->vectors_size);
+    run->vectors_used += (size_t)tensor->count;
+    gsf_nn_read_tensor(tensor, 0, tensor->count, out);
+    return out;
+}
+
+static gsf_result gsf__dit_apply(gsf__dit_run* run, const gsf_nn_linear_desc* desc) {
+    const gsf_nn_quantized* q = run->nets->quantized;
+    if (q) q += desc->weight - run->net->weights.tensors;
+    if (q && q->data) return gsf_nn_linear_int8(run->ctx, &run->workspace, desc, q);
+    gsf_nn_linear_desc d = *desc;
+    d.bf16 = run->net->bf16;
+    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+}
+
+static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
+                                  const gsf_tensor* bias, gsf_nn_activation activation, float* y) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = x;
+    d.rows = rows;
+    d.weight = weight;
+    d.bias = bias;
+    d.activation = activation;
+    d.y = y;
+    return gsf__dit_apply(run, &d);
+}
+
+// x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
+static gsf_result gsf__dit_add(gsf__dit_run* run, const float* h, int64_t rows, const gsf_tensor* weight,
+                               const gsf_tensor* bias, const float* gate, float* x, float* probe) {
+    gsf_nn_linear_desc d;
+    memset(&d, 0, sizeof d);
+    d.x = h;
+    d.rows = rows;
+    d.weight = weight;
+    d.bias = bias;
+    d.gate = gate;
+    d.accumulate = 1;
+    d.y = x;
+    if (probe) GSF__TRY(gsf__dit_linear(run, h, rows, weight, bias, GSF_NN_LINEAR, probe));
+    return gsf__dit_apply(run, &d);
+}
+
+// Both streams of a sample through LN(x) (1 + scale) + shift with their own shift and scale. The six parts of the
+// modulation: shift, scale, gate of the video, then of the text.
+static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t row, const gsf__dit_norm* norm) {
+    const int64_t d = run->width;
+    const float* x = run->x + row * run->tokens * d;
+    float* m = run->modulation;
+    GSF__TRY(gsf__dit_linear(run, run->time + row * run->net->time_channels, 1, norm->linear_weight,
+                             norm->linear_bias, GSF_NN_LINEAR, m));
+    const float *w = gsf__dit_vector(run, norm->weight), *b = gsf__dit_vector(run, norm->bias);
+    const float eps = (float)run->net->norm_eps;
+    float* video = run->normed + run->text * d;
+    gsf_nn_layer_norm_modulated(run->ctx, x, run->text, d, w, b, eps, m + 4 * d, m + 3 * d, run->normed);
+    gsf_nn_layer_norm_modulated(run->ctx, x + run->text * d, run->video, d, w, b, eps, m + d, m, video);
+    if (run->in->tap_fn) {
+        char part[32];
+        snprintf(part, sizeof part, "%s.0", name);
+        gsf__dit_tap(run, part, row, video, run->video, d);
+        snprintf(part, sizeof part, "%s.1", name);
+        gsf__dit_tap(run, part, row, run->normed, run->text, d);
+        snprintf(part, sizeof part, "%s.2", name);
+        gsf__dit_tap(run, part, row, m + 2 * d, 1, d);
+        snprintf(part, sizeof part, "%s.3", name);
+        gsf__dit_tap(run, part, row, m + 5 * d, 1, d);
+    }
+    return GSF_OK;
+}
+
+enum { GSF__DIT_TEXT_GATE = 5, GSF__DIT_VIDEO_GATE = 2 }; // places in the modulation
+static const float gsf__dit_head_eps = 1e-6f;              // of the norms of q and k (fixed in the official code)
+
+// x += gate * attention over text and video together.
+static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const gsf__dit_attention* a) {
+    const gsf_nn_transformer* c = run->net;
+    const int64_t d = run->width, n = run->tokens;
+    float *q = run->qkv, *k = q + run->qkv_rows * d, *v = k + run->qkv_rows * d;
+    float* x = run->x + row * n * d;
+    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
+    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->k_weight, a->k_bias, GSF_NN_LINEAR, k));
+    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->v_weight, a->v_bias, GSF_NN_LINEAR, v));
+    gsf_nn_head_norm_rope(run->ctx, q, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
+                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
+    gsf_nn_head_norm_rope(run->ctx, k, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
+                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
+    gsf_nn_attention_desc attention;
+    memset(&attention, 0, sizeof attention);
+    attention.queries = attention.keys = n;
+    attention.heads = c->heads;
+    attention.head_dim = c->head_dim;
+    attention.q = q;
+    attention.k = k;
+    attention.v = v;
+    attention.out = run->normed;
+    attention.bf16 = run->net->bf16;
+    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
+    float* video_probe = run->probe ? run->probe + run->text * d : NULL;
+    GSF__TRY(gsf__dit_add(run, run->normed, run->text, a->out_weight, a->out_bias,
+                          run->modulation + GSF__DIT_TEXT_GATE * d, x, run->probe));
+    GSF__TRY(gsf__dit_add(run, run->normed + run->text * d, run->video, a->out_weight, a->out_bias,
+                          run->modulation + GSF__DIT_VIDEO_GATE * d, x + run->text * d, video_probe));
+    gsf__dit_tap(run, "attn1.0", row, video_probe, run->video, d);
+    gsf__dit_tap(run, "attn1.1", row, run->probe, run->text, d);
+    return GSF_OK;
+}
+
+// Keys and values of the references for one block: (2, reference tokens, width).
+static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attention* a, const float* references,
+                                        float* kv) {
+    const gsf_nn_transformer* c = run->net;
+    const int64_t r = run->in->reference_tokens, d = run->width;
+    GSF__TRY(gsf__dit_linear(run, references, r, a->k_weight, a->k_bias, GSF_NN_LINEAR, kv));
+    GSF__TRY(gsf__dit_linear(run, references, r, a->v_weight, a->v_bias, GSF_NN_LINEAR, kv + r * d));
+    gsf_nn_head_norm_rope(run->ctx, kv, r, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
+                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, NULL, NULL, 0);
+    return GSF_OK;
+}
+
+// The video's tokens look at the references: x += attention(norm(x), references), no gate, no rotation.
+static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32_t index, const gsf__dit_block* block) {
+    const gsf_nn_transformer* c = run->net;
+    const gsf__dit_attention* a = &block->cross;
+    const int64_t d = run->width, r = run->in->reference_tokens;
+    float* x = run->x + (row * run->tokens + run->text) * d;
+    float *q = run->qkv, *normed = run->normed, *kv = run->qkv + run->qkv_rows * d;
+    const int32_t source = run->in->reference_batch == 1 ? 0 : row;
+    int ready = source < row; // row 0 has computed what all rows share
+    if (run->in->reference_kv) {
+        kv = run->in->reference_kv + ((int64_t)index * run->in->reference_batch + source) * 2 * r * d;
+        ready = ready || run->in->reference_kv_ready;
+    }
+    if (!ready) GSF__TRY(gsf__dit_reference_kv(run, a, run->in->references + source * r * d, kv));
+    gsf_nn_layer_norm(run->ctx, x, run->video, d, gsf__dit_vector(run, block->norm_cross_weight),
+                      gsf__dit_vector(run, block->norm_cross_bias), (float)c->norm_eps, normed);
+    gsf__dit_tap(run, "norm_cross", row, normed, run->video, d);
+    GSF__TRY(gsf__dit_linear(run, normed, run->video, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
+    gsf_nn_head_norm_rope(run->ctx, q, run->video, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
+                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, NULL, NULL, 0);
+    gsf_nn_attention_desc attention;
+    memset(&attention, 0, sizeof attention);
+    attention.queries = run->video;
+    attention.keys = r;
+    attention.heads = c->heads;
+    attention.head_dim = c->head_dim;
+    attention.q = q;
+    attention.k = kv;
+    attention.v = kv + r * d;
+    attention.out = normed;
+    attention.bf16 = run->net->bf16;
+    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
+    GSF__TRY(gsf__dit_add(run, normed, run->video, a->out_weight, a->out_bias, NULL, x, run->probe));
+    gsf__dit_tap(run, "attn_cross", row, run->probe, run->video, d);
+    return GSF_OK;
+}
+
+// x += gate * down(gelu(up(normed))), in row chunks whose hidden layer fits the room of q, k and v.
+static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gsf__dit_block* block) {
+    const int64_t d = run->width, most = run->qkv_rows * 3 / 4;
+    float* x = run->x + row * run->tokens * d;
+    for (int stream = 0; stream < 2; stream++) {
+        const int64_t first = stream ? run->text : 0, end = stream ? run->tokens : run->text;
+        const float* gate = run->modulation + (stream ? GSF__DIT_VIDEO_GATE : GSF__DIT_TEXT_GATE) * d;
+        for (int64_t r = first; r < end; r += most) {
+            const int64_t rows = end - r < most ? end - r : most;
+            GSF__TRY(gsf__dit_linear(run, run->normed + r * d, rows, block->up_weight, block->up_bias, GSF_NN_GELU_TANH,
+                                     run->qkv));
+            GSF__TRY(gsf__dit_add(run, run->qkv, rows, block->down_weight, block->down_bias, gate, x + r * d,
+                                  run->probe ? run->probe + r * d : NULL));
+        }
+    }
+    gsf__dit_tap(run, "ff", row, run->probe, run->tokens, d);
+    return GSF_OK;
+}
+
+// One block for all samples, layer by layer so that they share the keys and values of the references.
+static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
+    const gsf__dit_block* block = &run->nets->blocks[index];
+    const int32_t batch = run->in->batch;
+    snprintf(run->label, sizeof run->label, "block%d.", (int)index);
+    for (int32_t b = 0; b < batch; b++) {
+        run->vectors_used = 0;
+        GSF__TRY(gsf__dit_modulate(run, "norm1", b, &block->norm1));
+        GSF__TRY(gsf__dit_self_attention(run, b, &block->self));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+    }
+    for (int32_t b = 0; b < batch && run->in->references; b++) {
+        run->vectors_used = 0;
+        GSF__TRY(gsf__dit_cross_attention(run, b, index, block));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+    }
+    for (int32_t b = 0; b < batch; b++) {
+        run->vectors_used = 0;
+        GSF__TRY(gsf__dit_modulate(run, "norm2", b, &block->norm2));
+        GSF__TRY(gsf__dit_feed_forward(run, b, block));
+        GSF__TRY(gsf__check_cancel(run->ctx));
+    }
+    for (int32_t b = 0; b < batch; b++) {
+        const float* x = run->x + b * run->tokens * run->width;
+        gsf__dit_tap(run, "0", b, x + run->text * run->width, run->video, run->width);
+        gsf__dit_tap(run, "1", b, x, run->text, run->width);
+    }
+    run->label[0] = 0;
+    return GSF_OK;
+}
+
+// ---- a value that is not finite, and where it comes from
+
+static gsf_result gsf__dit_check(gsf__dit_run* run, const char* stage, const char* prefix, const float* x, int64_t count) {
+    return gsf__nn_check_finite(run->ctx, &run->net->weights, "transformer", prefix, stage, x, count);
+}
+
+// ---- first and last layers
+
+// SiLU of the embedding of each sample's time step.
+static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
+    const gsf_nn_transformer* net = run->net;
+    const int64_t d = run->width, t = net->time_channels;
+    for (int32_t b = 0; b < run->in->batch; b++) {
+        float *wave = run->qkv, *hidden = wave + d, *out = run->time + b * t;
+        gsf_nn_embed_timestep(run->in->timesteps[b], (int32_t)d, wave);
+        gsf__dit_tap(run, "time_proj", b, wave, 1, d);
+        GSF__TRY(gsf__dit_linear(run, wave, 1, run->nets->time1_weight, run->nets->time1_bias, GSF_NN_SILU, hidden));
+        GSF__TRY(gsf__dit_linear(run, hidden, 1, run->nets->time2_weight, run->nets->time2_bias, GSF_NN_LINEAR, out));
+        gsf__dit_tap(run, "time_embedding", b, out, 1, t);
+        gsf_nn_activate(run->ctx, GSF_NN_SILU, out, t, out);
+    }
+    return GSF_OK;
+}
+
+typedef struct gsf__patch_job { // patches of the latents as rows, or the other way round
+    const float* from;
+    float* to;
+    int32_t channels, height, width, patch;
+} gsf__patch_job;
+
+// (channels, height, width) of one frame to rows of (channels, patch, patch), tokens down and across.
+static void gsf__patch_frame(void* arg, size_t frame, int worker) {
+    const gsf__patch_job* job = (const gsf__patch_job*)arg;
+    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
+    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
+    const float* from = job->from + (int64_t)frame * job->channels * plane;
+    float* to = job->to + (int64_t)frame * across * down * row;
+    (void)worker;
+    for (int64_t ty = 0; ty < down; ty++)
+        for (int64_t tx = 0; tx < across; tx++)
+            for (int64_t c = 0; c < job->channels; c++)
+                for (int64_t y = 0; y < p; y++)
+                    for (int64_t x = 0; x < p; x++)
+                        *to++ = from[c * plane + (ty * p + y) * job->width + tx * p + x];
+}
+
+static void gsf__unpatch_frame(void* arg, size_t frame, int worker) {
+    const gsf__patch_job* job = (const gsf__patch_job*)arg;
+    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
+    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
+    const float* from = job->from + (int64_t)frame * across * down * row;
+    float* to = job->to + (int64_t)frame * job->channels * plane;
+    (void)worker;
+    for (int64_t ty = 0; ty < down; ty++)
+        for (int64_t tx = 0; tx < across; tx++)
+            for (int64_t c = 0; c < job->channels; c++)
+                for (int64_t y = 0; y < p; y++)
+                    for (int64_t x = 0; x < p; x++)
+                        to[c * plane + (ty * p + y) * job->width + tx * p + x] = *from++;
+}
+
+// Adds the position table to text and video: the stored one for the configured frame count, else sines and cosines (video
+// only), as the official code does.
+static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
+    const gsf_nn_transformer* c = run->net;
+    const gsf_nn_transformer_input* in = run->in;
+    if (!c->learned_positions && c->rotary_positions) return GSF_OK;
+    const int64_t d = run->width;
+    const int same_frames = (in->frames - 1) * c->temporal_ratio + 1 == c->sample_frames;
+    if (c->learned_positions && same_frames && run->text == c->text_tokens) {
+        for (int64_t r = 0; r < run->tokens; r++) { // a row at a time: the table may be bf16
+            gsf_nn_read_tensor(run->nets->positions, r * d, d, run->qkv);
+            for (int32_t b = 0; b < in->batch; b++)
+                for (int64_t i = 0; i < d; i++) run->x[(b * run->tokens + r) * d + i] += run->qkv[i];
+        }
+        return GSF_OK;
+    }
+    GSF__TRY(gsf_nn_make_sincos(run->ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
+                                c->spatial_scale, c->temporal_scale, run->qkv));
+    for (int32_t b = 0; b < in->batch; b++)
+        for (int64_t i = 0; i < run->video * d; i++) run->x[(b * run->tokens + run->text) * d + i] += run->qkv[i];
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_embed(gsf__dit_run* run) {
+    const gsf_nn_transformer* net = run->net;
+    const gsf_nn_transformer* c = net;
+    const gsf_nn_transformer_input* in = run->in;
+    const int64_t d = run->width, sample = (int64_t)in->frames * c->in_channels * in->height * in->width;
+    for (int32_t b = 0; b < in->batch; b++) {
+        float* x = run->x + b * run->tokens * d;
+        GSF__TRY(gsf__dit_linear(run, in->text + b * run->text * c->text_channels, run->text, run->nets->text_weight,
+                                 run->nets->text_bias, GSF_NN_LINEAR, x));
+        gsf__patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch};
+        gsf__parallel_for(run->ctx, (size_t)in->frames, gsf__patch_frame, &job);
+        GSF__TRY(gsf__dit_linear(run, run->qkv, run->video, run->nets->patch_weight, run->nets->patch_bias, GSF_NN_LINEAR,
+                                 x + run->text * d));
+    }
+    GSF__TRY(gsf__dit_add_positions(run));
+    for (int32_t b = 0; b < in->batch; b++)
+        gsf__dit_tap(run, "patch_embed", b, run->x + b * run->tokens * d, run->tokens, d);
+    return GSF_OK;
+}
+
+// Video tokens to velocities: two layer norms in a row, the second modulated, then the output projection.
+static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
+    const gsf_nn_transformer* net = run->net;
+    const gsf_nn_transformer* c = net;
+    const int64_t d = run->width;
+    const float eps = (float)c->norm_eps;
+    float *m = run->modulation, *normed = run->normed;
+    run->vectors_used = 0;
+    const float* weight = gsf__dit_vector(run, run->nets->norm_final_weight);
+    const float* bias = gsf__dit_vector(run, run->nets->norm_final_bias);
+    gsf_nn_layer_norm(run->ctx, run->x + (row * run->tokens + run->text) * d, run->video, d, weight, bias, eps, normed);
+    gsf__dit_tap(run, "norm_final", row, normed, run->video, d);
+    GSF__TRY(gsf__dit_linear(run, run->time + row * c->time_channels, 1, run->nets->norm_out.linear_weight,
+                             run->nets->norm_out.linear_bias, GSF_NN_LINEAR, m));
+    gsf_nn_layer_norm_modulated(run->ctx, normed, run->video, d, gsf__dit_vector(run, run->nets->norm_out.weight),
+                                gsf__dit_vector(run, run->nets->norm_out.bias), eps, m + d, m, normed);
+    gsf__dit_tap(run, "norm_out", row, normed, run->video, d);
+    GSF__TRY(gsf__dit_linear(run, normed, run->video, run->nets->out_weight, run->nets->out_bias, GSF_NN_LINEAR, run->qkv));
+    gsf__dit_tap(run, "proj_out", row, run->qkv, run->video, (int64_t)c->out_channels * c->patch * c->patch);
+    gsf__patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch};
+    gsf__parallel_for(run->ctx, (size_t)run->in->frames, gsf__unpatch_frame, &job);
+    return GSF_OK;
+}
+
+// ---- blocks, and the skip of those whose work would repeat the last step's
+
+GSF_API void gsf_nn_destroy_block_cache(gsf_context* ctx, gsf_nn_block_cache* cache) {
+    gsf_free(ctx, cache->first);
+    memset(cache, 0, sizeof *cache);
+}
+
+enum { GSF__DIT_CACHE_ROWS = 8 }; // the change is measured on every 8th row
+
+static gsf_result gsf__dit_open_cache(gsf__dit_run* run, gsf_nn_block_cache* cache) {
+    const size_t rows = (size_t)run->in->batch * (size_t)run->tokens, width = (size_t)run->width;
+    const size_t sampled = (rows + GSF__DIT_CACHE_ROWS - 1) / GSF__DIT_CACHE_ROWS * width;
+    if (cache->size == rows * width) return GSF_OK;
+    const float threshold = cache->threshold;
+    gsf_nn_destroy_block_cache(run->ctx, cache);
+    cache->threshold = threshold;
+    cache->first = (float*)gsf_alloc_zeroed(run->ctx, rows * width + 2 * sampled, sizeof(float));
+    if (!cache->first) return GSF_ERROR_OUT_OF_MEMORY;
+    cache->before = cache->first + sampled;
+    cache->rest = cache->before + sampled;
+    cache->size = rows * width;
+    return GSF_OK;
+}
+
+static void gsf__dit_note_before(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
+    const int64_t rows = run->in->batch * run->tokens, d = run->width;
+    float* to = cache->before;
+    for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, to += d) memcpy(to, run->x + r * d, (size_t)d * sizeof(float));
+}
+
+// 1 if what the first block added is close enough to what it added last time (relative L1); notes it for the next time.
+static int gsf__dit_is_similar(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
+    const int64_t rows = run->in->batch * run->tokens, d = run->width;
+    double change = 0.0, size = 0.0;
+    const float* before = cache->before;
+    float* first = cache->first;
+    for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, before += d, first += d)
+        for (int64_t i = 0; i < d; i++) {
+            const float added = run->x[r * d + i] - before[i];
+            change += fabs((double)(added - first[i]));
+            size += fabs((double)first[i]);
+            first[i] = added;
+        }
+    return cache->calls > 0 && change < (double)cache->threshold * size;
+}
+
+static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
+    const gsf_nn_transformer* c = run->net;
+    gsf_nn_block_cache* cache = run->in->cache && run->in->cache->threshold > 0.0f ? run->in->cache : NULL;
+    const int64_t count = run->in->batch * run->tokens * run->width;
+    if (cache) {
+        GSF__TRY(gsf__dit_open_cache(run, cache));
+        gsf__dit_note_before(run, cache);
+    }
+    for (int32_t i = 0; i < c->layers; i++) {
+        char name[48];
+        GSF__TRY(gsf__dit_block_forward(run, i));
+        snprintf(name, sizeof name, "transformer_blocks.%d.", (int)i);
+        GSF__TRY(gsf__dit_check(run, name, name, run->x, count));
+        gsf__progress(run->ctx, "transformer", i + 1, c->layers);
+        if (!cache || i > 0) continue;
+        const int similar = gsf__dit_is_similar(run, cache);
+        cache->calls++;
+        if (similar) { // what the other blocks added last time
+            cache->hits++;
+            for (int64_t j = 0; j < count; j++) run->x[j] += cache->rest[j];
+            return GSF_OK;
+        }
+        memcpy(cache->rest, run->x, (size_t)count * sizeof(float));
+    }
+    for (int64_t j = 0; cache && j < count; j++) cache->rest[j] = run->x[j] - cache->rest[j];
+    return GSF_OK;
+}
+
+// ---- the pass as a whole
+
+static gsf_result gsf__dit_check_size(gsf_context* ctx, const gsf_nn_transformer* c, int32_t height, int32_t width) {
+    if (height < c->patch || width < c->patch || height % c->patch || width % c->patch)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d x %d latents are no multiple of the patch %d",
+                        (int)width, (int)height, (int)c->patch);
+    if (c->learned_positions && (height != c->sample_height || width != c->sample_width))
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "transformer: latents of %d x %d; its learned positions are for %d x %d (the official code refuses "
+                        "other sizes as well)", (int)width, (int)height, (int)c->sample_width, (int)c->sample_height);
+    return GSF_OK;
+}
+
+static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* c, const gsf_nn_transformer_input* in) {
+    if (!in->hidden || !in->text || !in->timesteps || in->batch < 1 || in->frames < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: latents, text or time steps are missing");
+    GSF__TRY(gsf__dit_check_size(ctx, c, in->height, in->width));
+    if (in->text_tokens < 0 || (c->learned_positions && in->text_tokens && in->text_tokens != c->text_tokens))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d text tokens, not %d", (int)in->text_tokens,
+                        (int)c->text_tokens);
+    if (in->references && (in->reference_tokens < 1 || (in->reference_batch != 1 && in->reference_batch != in->batch)))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %lld reference tokens for %d of %d samples",
+                        (long long)in->reference_tokens, (int)in->reference_batch, (int)in->batch);
+    for (int32_t b = 0; b < in->batch; b++)
+        if (!(in->timesteps[b] >= 0.0 && in->timesteps[b] < 1e6))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: time step %g", in->timesteps[b]);
+    return GSF_OK;
+}
+
+static void gsf__dit_sizes(gsf__dit_run* run, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in) {
+    const gsf_nn_transformer* c = net;
+    run->in = in;
+    run->width = gsf__dit_width(c);
+    run->text = in->text_tokens ? in->text_tokens : c->text_tokens;
+    run->video = (int64_t)in->frames * (in->height / c->patch) * (in->width / c->patch);
+    run->tokens = run->text + run->video;
+    run->qkv_rows = in->references && in->reference_tokens > run->tokens ? in->reference_tokens : run->tokens;
+    if (run->qkv_rows < 4) run->qkv_rows = 4; // a chunk of the feed-forward is 3/4 of them
+    // per block and layer: norm weights and biases, those of q and k; the head takes four
+    run->vectors_size = (size_t)(4 * run->width + 4 * c->head_dim);
+}
+
+// Floats of every buffer; their sum is what gsf_nn_transformer_cost tells.
+typedef struct gsf__dit_layout { size_t x, normed, qkv, time, modulation, vectors, rotary, probe; } gsf__dit_layout;
+
+static gsf__dit_layout gsf__dit_plan(const gsf__dit_run* run, const gsf_nn_transformer* c) {
+    const size_t d = (size_t)run->width, rows = (size_t)run->tokens;
+    gsf__dit_layout l;
+    const size_t patch_row = (size_t)c->patch * (size_t)c->patch *
+                             (size_t)(c->in_channels > c->out_channels ? c->in_channels : c->out_channels);
+    l.x = (size_t)run->in->batch * rows * d;
+    l.normed = rows * d;
+    l.qkv = 3 * (size_t)run->qkv_rows * d;
+    if (l.qkv < (size_t)run->video * patch_row) l.qkv = (size_t)run->video * patch_row;
+    if (l.qkv < d + (size_t)c->time_channels) l.qkv = d + (size_t)c->time_channels;
+    l.time = (size_t)run->in->batch * (size_t)c->time_channels;
+    l.modulation = 6 * d;
+    l.vectors = run->vectors_size;
+    l.rotary = c->rotary_positions && !run->in->no_rotary ? 2 * (size_t)run->video * (size_t)c->head_dim : 0;
+    l.probe = run->in->tap_fn ? rows * d : 0;
+    return l;
+}
+
+static size_t gsf__dit_total(const gsf__dit_layout* l) {
+    return l->x + l->normed + l->qkv + l->time + l->modulation + l->vectors + l->rotary + l->probe;
+}
+
+static void gsf__dit_share_out(gsf__dit_run* run, const gsf__dit_layout* l, float* memory) {
+    float* next = memory;
+    run->x = next, next += l->x;
+    run->normed = next, next += l->normed;
+    run->qkv = next, next += l->qkv;
+    run->time = next, next += l->time;
+    run->modulation = next, next += l->modulation;
+    run->vectors = next, next += l->vectors;
+    if (l->rotary) run->cos = next, run->sin = next + l->rotary / 2, next += l->rotary;
+    if (l->probe) run->probe = next;
+}
+
+static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
+    const gsf_nn_transformer* c = run->net;
+    const gsf_nn_transformer_input* in = run->in;
+    if (run->cos) {
+        gsf_nn_rope_desc rope;
+        memset(&rope, 0, sizeof rope);
+        rope.frames = in->frames;
+        rope.height = in->height / c->patch;
+        rope.width = in->width / c->patch;
+        rope.base_height = c->sample_height / c->patch;
+        rope.base_width = c->sample_width / c->patch;
+        rope.head_dim = c->head_dim;
+        GSF__TRY(gsf_nn_make_rope(run->ctx, &rope, run->cos, run->sin));
+    }
+    GSF__TRY(gsf__dit_embed_time(run));
+    GSF__TRY(gsf__dit_embed(run));
+    GSF__TRY(gsf__dit_check(run, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * run->width));
+    if (in->references)
+        for (int32_t b = 0; b < in->reference_batch; b++)
+            gsf__dit_tap(run, "cross_hidden_states", b, in->references + b * in->reference_tokens * run->width,
+                         in->reference_tokens, run->width);
+    GSF__TRY(gsf__dit_blocks(run));
+    const int64_t sample = (int64_t)in->frames * c->out_channels * in->height * in->width;
+    for (int32_t b = 0; b < in->batch; b++) GSF__TRY(gsf__dit_head(run, b, out + b * sample));
+    return gsf__dit_check(run, "the output layer", "proj_out.", out, in->batch * sample);
+}
+
+GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                              const gsf_nn_transformer_input* input, float* out) {
+    gsf__dit_run run;
+    memset(&run, 0, sizeof run);
+    GSF__TRY(gsf__dit_check_input(ctx, transformer, input));
+    run.ctx = ctx;
+    run.net = transformer;
+    run.nets = (const gsf__dit_nets*)transformer->nets;
+    gsf__dit_sizes(&run, transformer, input);
+    const gsf__dit_layout l = gsf__dit_plan(&run, transformer);
+    float* memory = (float*)gsf_alloc(ctx, gsf__dit_total(&l), sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__dit_share_out(&run, &l, memory);
+    const gsf_result result = gsf__dit_forward(&run, out);
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
+                                        int32_t reference_batch) {
+    return (size_t)transformer->layers * (size_t)reference_batch * 2 * (size_t)reference_tokens *
+           (size_t)gsf__dit_width(transformer);
+}
+
+GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
+                                     double* bytes, double* flops) {
+    const gsf_nn_transformer* c = transformer;
+    gsf__dit_run run;
+    memset(&run, 0, sizeof run);
+    gsf__dit_sizes(&run, transformer, input);
+    const gsf__dit_layout l = gsf__dit_plan(&run, c);
+    const double d = (double)run.width, n = (double)run.tokens, v = (double)run.video;
+    const double r = input->references ? (double)input->reference_tokens : 0.0;
+    const double self = 2.0 * n * d * d * 4.0 + 4.0 * n * n * d, ff = 2.0 * n * d * 4.0 * d * 2.0;
+    const double cross = r > 0.0 ? 2.0 * v * d * d * 2.0 + 4.0 * v * r * d : 0.0, kv = 2.0 * r * d * d * 2.0;
+    const double patch = (double)c->patch * c->patch;
+    const double ends = 2.0 * v * patch * c->in_channels * d + 2.0 * v * patch * c->out_channels * d +
+                        2.0 * (double)run.text * c->text_channels * d;
+    const double kv_batch = input->reference_kv_ready ? 0.0 : (double)input->reference_batch;
+    *bytes = (double)gsf__dit_total(&l) * sizeof(float);
+    *flops = c->layers * (input->batch * (self + ff + cross) + kv_batch * kv) + input->batch * ends;
+}
+
+GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer, int64_t tokens,
+                                             const float* dino, const float* vggt, float* out) {
+    const int64_t d = gsf__dit_width(transformer);
+    const gsf__dit_nets* nets = (const gsf__dit_nets*)transformer->nets;
+    const gsf__dit_projector* projectors[2] = {&nets->dino, &nets->vggt};
+    const float* inputs[2] = {dino, vggt};
+    gsf__dit_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.net = transformer;
+    run.nets = nets;
+    run.vectors_size = (size_t)(4 * d);
+    if (tokens < 1 || (!dino && !vggt))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no tokens to project");
+    float* memory = (float*)gsf_alloc(ctx, (size_t)tokens + 4, (size_t)d * sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    run.vectors = memory + tokens * d;
+    gsf_result result = GSF_OK;
+    for (int i = 0; i < 2 && !result; i++) {
+        float* to = i && dino ? memory : out; // the second is added to the first
+        if (!inputs[i]) continue;
+        result = gsf__dit_linear(&run, inputs[i], tokens, projectors[i]->weight, projectors[i]->bias, GSF_NN_LINEAR, to);
+        if (result) break;
+        gsf_nn_layer_norm(ctx, to, tokens, d, gsf__dit_vector(&run, projectors[i]->norm_weight),
+                          gsf__dit_vector(&run, projectors[i]->norm_bias), 1e-5f, to); // torch's default eps
+        for (int64_t j = 0; to == memory && j < tokens * d; j++) out[j] += memory[j];
+    }
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+// ---- >>nn scheduler -------------------------------------------------------------
+
+// Zero SNR: sqrt(abar) is shifted and scaled to end at 0 (Lin et al. 2024, algorithm 1). diffusers' DDIMScheduler, which
+// the official pipeline runs, does this in float32 and is up to 5e-7 away; its CogVideoXDDIMScheduler does it in double.
+static void gsf__nn_fill_table(const gsf_nn_schedule_desc* d, double* alpha_bar) {
+    const int32_t n = d->train_steps;
+    const double begin = d->linear_betas ? d->beta_start : sqrt(d->beta_start);
+    const double end = d->linear_betas ? d->beta_end : sqrt(d->beta_end);
+    double product = 1.0;
+    for (int32_t i = 0; i < n; i++) {
+        const double value = begin + (end - begin) / (n - 1) * i;
+        product *= 1.0 - (d->linear_betas ? value : value * value);
+        alpha_bar[i] = product / (d->snr_shift_scale + (1.0 - d->snr_shift_scale) * product);
+    }
+    if (d->no_zero_snr) return;
+    const double first = sqrt(alpha_bar[0]), last = sqrt(alpha_bar[n - 1]), scale = first / (first - last);
+    for (int32_t i = 0; i < n; i++) {
+        const double root = (sqrt(alpha_bar[i]) - last) * scale;
+        alpha_bar[i] = root * root;
+    }
+}
+
+static gsf_nn_schedule_desc gsf__nn_schedule_defaults(const gsf_nn_schedule_desc* desc) {
+    gsf_nn_schedule_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.train_steps == 0) d.train_steps = 1000;
+    if (d.beta_start == 0.0) d.beta_start = 0.00085;
+    if (d.beta_end == 0.0) d.beta_end = 0.012;
+    if (d.snr_shift_scale == 0.0) d.snr_shift_scale = 1.0;
+    return d;
+}
+
+static gsf_result gsf__nn_check_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* d) {
+    if (d->train_steps < 2 || d->train_steps > 1000000)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: %d training steps", (int)d->train_steps);
+    if (!(d->beta_start > 0.0 && d->beta_start <= d->beta_end && d->beta_end < 1.0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: betas from %g to %g", d->beta_start, d->beta_end);
+    if (!(d->snr_shift_scale > 0.0 && d->snr_shift_scale <= 1e6))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: snr_shift_scale %g", d->snr_shift_scale);
+    if ((int)d->spacing < 0 || d->spacing > GSF_NN_LINSPACE || d->steps_offset < 0 ||
+        d->steps_offset >= d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: spacing %d, steps_offset %d", (int)d->spacing,
+                        (int)d->steps_offset);
+    return GSF_OK;
+}
+
+GSF_API gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc, gsf_nn_schedule* out) {
+    memset(out, 0, sizeof *out);
+    const gsf_nn_schedule_desc d = gsf__nn_schedule_defaults(desc);
+    GSF__TRY(gsf__nn_check_schedule(ctx, &d));
+    double* table = (double*)gsf_alloc(ctx, (size_t)d.train_steps, sizeof(double));
+    if (!table) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__nn_fill_table(&d, table);
+    int falls = table[0] < 1.0 && table[d.train_steps - 1] >= 0.0; // a NaN fails
+    for (int32_t i = 1; falls && i < d.train_steps; i++) falls = table[i] <= table[i - 1];
+    if (!falls) {
+        gsf_free(ctx, table);
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "schedule: betas from %g to %g over %d steps do not take 1 down to 0",
+                        d.beta_start, d.beta_end, (int)d.train_steps);
+    }
+    out->desc = d;
+    out->alpha_bar = table;
+    out->final_alpha_bar = d.no_alpha_one ? table[0] : 1.0;
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule) {
+    gsf_free(ctx, schedule->alpha_bar);
+    memset(schedule, 0, sizeof *schedule);
+}
+
+// The word of `words` (ended by NULL) that the key holds; others are unsupported.
+static gsf_result gsf__nn_config_word(const gsf__nn_config* config, const char* key, const char* fallback,
+                                      const char* const* words, int* out) {
+    const char* text;
+    GSF__TRY(gsf__nn_config_string(config, key, fallback, &text));
+    for (*out = 0; words[*out]; ++*out)
+        if (strcmp(text, words[*out]) == 0) return GSF_OK;
+    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s \"%s\" is not supported", config->json.name, key,
+                    gsf__nn_show(text).text);
+}
+
+static gsf_result gsf__nn_config_refuse(const gsf__nn_config* config, const char* key, int fallback) {
+    int flag;
+    GSF__TRY(gsf__nn_config_bool_or(config, key, fallback, &flag));
+    return flag ? gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not supported", config->json.name, key) : GSF_OK;
+}
+
+static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_schedule_desc* d) {
+    static const char* const schedules[] = {"scaled_linear", "linear", NULL};
+    static const char* const spacings[] = {"trailing", "leading", "linspace", NULL};
+    static const char* const predictions[] = {"v_prediction", NULL};
+    int64_t whole;
+    int flag;
+    GSF__TRY(gsf__nn_config_word(config, "prediction_type", "epsilon", predictions, &flag));
+    GSF__TRY(gsf__nn_config_refuse(config, "clip_sample", 1));
+    GSF__TRY(gsf__nn_config_refuse(config, "thresholding", 0));
+    if (gsf__nn_config_find(config, "trained_betas"))
+        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: trained_betas is not supported", config->json.name);
+    GSF__TRY(gsf__nn_config_int_or(config, "num_train_timesteps", 1000, 2, 1000000, &whole));
+    d->train_steps = (int32_t)whole;
+    GSF__TRY(gsf__nn_config_int_or(config, "steps_offset", 0, 0, whole - 1, &whole));
+    d->steps_offset = (int32_t)whole;
+    GSF__TRY(gsf__nn_config_number_or(config, "beta_start", 0.0001, 1e-12, 0.999, &d->beta_start));
+    GSF__TRY(gsf__nn_config_number_or(config, "beta_end", 0.02, d->beta_start, 0.999, &d->beta_end));
+    GSF__TRY(gsf__nn_config_word(config, "beta_schedule", "linear", schedules, &d->linear_betas));
+    GSF__TRY(gsf__nn_config_bool_or(config, "rescale_betas_zero_snr", 0, &flag));
+    d->no_zero_snr = !flag;
+    GSF__TRY(gsf__nn_config_bool_or(config, "set_alpha_to_one", 1, &flag));
+    d->no_alpha_one = !flag;
+    GSF__TRY(gsf__nn_config_word(config, "timestep_spacing", "leading", spacings, &flag));
+    d->spacing = (gsf_nn_spacing)flag;
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_schedule* out) {
+    gsf_nn_schedule_desc d;
+    memset(&d, 0, sizeof d);
+    gsf_result result = gsf__nn_read_schedule(config, &d);
+    if (result == GSF_OK) result = gsf_nn_make_schedule(ctx, &d, out);
+    gsf__nn_close_config(config);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                         gsf_nn_schedule* out) {
+    gsf__nn_config config;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__nn_parse_config(ctx, name, text, size, &config));
+    return gsf__nn_schedule_from(ctx, &config, out);
+}
+
+GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out) {
+    gsf__nn_config config;
+    memset(out, 0, sizeof *out);
+    GSF__TRY(gsf__nn_load_config(ctx, path, &config));
+    return gsf__nn_schedule_from(ctx, &config, out);
+}
+
+// One of the `steps` times before the cut by strength; numpy's arithmetic, half to even.
+static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, int32_t i) {
+    const double n = d->train_steps;
+    switch (d->spacing) {
+        case GSF_NN_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange adds multiples of its first difference
+            const double difference = (n - n / steps) - n;
+            return (int32_t)rint(n + i * difference) - 1;
+        }
+        case GSF_NN_LEADING: return (steps - 1 - i) * (d->train_steps / steps) + d->steps_offset;
+        case GSF_NN_LINSPACE: { // round(linspace(0, n - 1, steps)) reversed
+            if (steps == 1) return 0;
+            return i == 0 ? d->train_steps - 1 : (int32_t)rint((steps - 1 - i) * ((n - 1.0) / (steps - 1)));
+        }
+    }
+    return 0;
+}
+
+GSF_API gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
+                                         double strength, int32_t* out, int32_t* count) {
+    const gsf_nn_schedule_desc* d = &schedule->desc;
+    *count = 0;
+    if (steps < 1 || steps > d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%d steps, not 1 to %d", (int)steps, (int)d->train_steps);
+    if (strength == 0.0) strength = 1.0;
+    if (!(strength > 0.0 && strength <= 1.0))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "strength %g is not in (0, 1]", strength);
+    const int32_t kept = (int32_t)(steps * strength);
+    if (kept < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "strength %g of %d steps leaves none", strength, (int)steps);
+    if (gsf__nn_timestep(d, steps, 0) >= d->train_steps)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "steps_offset %d takes %d steps past the table",
+                        (int)d->steps_offset, (int)steps);
+    for (int32_t i = steps - kept; i < steps; i++) out[(*count)++] = gsf__nn_timestep(d, steps, i);
+    return GSF_OK;
+}
+
+// ---- elementwise work
+
+typedef struct gsf__nn_step { // m: predicted clean latents; m0, m1: those of the last two steps; last: corrected latents
+    double m_x, m_v;                        // m = m_x x + m_v v
+    double c_last, c_m, c_m0, c_m1;         // x = c_last last + c_m m + c_m0 m0 + c_m1 m1, if `correct`
+    double p_x, p_m, p_m0;                  // next x = p_x x + p_m m + p_m0 m0
+    int correct;
+    size_t count;
+    const float *x_in, *v;
+    float *x, *x0, *m0, *m1, *last;         // all but x may be NULL
+} gsf__nn_step;
+
+static void gsf__nn_step_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__nn_step* s = (const gsf__nn_step*)arg;
+    (void)worker;
+    const size_t begin = chunk * GSF__NN_CHUNK;
+    const size_t end = begin + GSF__NN_CHUNK < s->count ? begin + GSF__NN_CHUNK : s->count;
+    for (size_t i = begin; i < end; i++) {
+        const double m0 = s->m0 ? (double)s->m0[i] : 0.0;
+        double x = (double)s->x_in[i];
+        const double m = s->m_x * x + s->m_v * (double)s->v[i];
+        if (s->correct) x = s->c_last * (double)s->last[i] + s->c_m * m + s->c_m0 * m0 + s->c_m1 * (double)s->m1[i];
+        s->x[i] = (float)(s->p_x * x + s->p_m * m + s->p_m0 * m0);
+        if (s->x0) s->x0[i] = (float)m;
+        if (s->last) s->last[i] = (float)x;
+        if (s->m1) s->m1[i] = (float)m0;
+        if (s->m0) s->m0[i] = (float)m;
+    }
+}
+
+// out = a * x + b * y
+static void gsf__nn_mix(gsf_context* ctx, double a, const float* x, double b, const float* y, size_t count, float* out) {
+    gsf__nn_step job;
+    memset(&job, 0, sizeof job);
+    job.m_x = a;
+    job.m_v = b;
+    job.p_m = 1.0;
+    job.count = count;
+    job.x_in = x;
+    job.v = y;
+    job.x = out;
+    gsf__parallel_for(ctx, (count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &job);
+}
+
+GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                              const float* noise, size_t count, float* out) {
+    const double bar = schedule->alpha_bar[timestep];
+    gsf__nn_mix(ctx, sqrt(bar), x0, sqrt(1.0 - bar), noise, count, out);
+}
+
+GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+                                  const float* noise, size_t count, float* out) {
+    const double bar = schedule->alpha_bar[timestep];
+    gsf__nn_mix(ctx, -sqrt(1.0 - bar), x0, sqrt(bar), noise, count, out);
+}
+
+GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
+                               const float* v, size_t count, float* out) {
+    const double bar = schedule->alpha_bar[timestep];
+    gsf__nn_mix(ctx, sqrt(bar), x, -sqrt(1.0 - bar), v, count, out);
+}
+
+// ---- solvers
+/* With a = sqrt(abar), s = sqrt(1 - abar) and D(x) the predicted clean latents, the probability flow is
+       d(x/s) = D du,  u = a/s = exp(lambda).
+   DDIM holds D fixed over a step; DPM-Solver++(2M) and UniPC take it as linear (the corrector: as quadratic) in lambda. At
+   zero SNR u is 0 and lambda -infinity. From there the first step is exact for constant D; a linear D is then taken in u,
+   not in lambda, by the one step that would need that point. The last step ends at s = 0, where x is D. */
+
+typedef struct gsf__nn_point { double a, s; } gsf__nn_point;
+
+static gsf__nn_point gsf__nn_point_at(double alpha_bar) {
+    gsf__nn_point p;
+    p.a = sqrt(alpha_bar);
+    p.s = sqrt(1.0 - alpha_bar);
+    return p;
+}
+
+static gsf__nn_point gsf__nn_sampler_point(const gsf_nn_sampler* sampler, int32_t index) {
+    return gsf__nn_point_at(sampler->schedule->alpha_bar[sampler->timesteps[index]]);
+}
+
+// Where the step from `index` leads.
+static gsf__nn_point gsf__nn_sampler_target(const gsf_nn_sampler* sampler, int32_t index) {
+    const gsf_nn_schedule* schedule = sampler->schedule;
+    const int32_t next = sampler->desc.solver == GSF_NN_DDIM
+                             ? sampler->timesteps[index] - schedule->desc.train_steps / sampler->desc.steps
+                             : index + 1 < sampler->count ? sampler->timesteps[index + 1] : -1;
+    return gsf__nn_point_at(next >= 0 ? schedule->alpha_bar[next] : schedule->final_alpha_bar);
+}
+
+// lambda(q) - lambda(p), both finite.
+static double gsf__nn_lambda(gsf__nn_point p, gsf__nn_point q) { return log(q.a * p.s / (q.s * p.a)); }
+
+// Predictor from p to t; q is the point before p, if second order is wanted.
+static void gsf__nn_predictor(gsf__nn_step* step, gsf__nn_point p, gsf__nn_point t, const gsf__nn_point* q) {
+    step->p_x = t.s / p.s;
+    step->p_m = t.a - p.a * step->p_x; // t.a (1 - exp(-h))
+    step->p_m0 = 0.0;
+    if (!q || t.s == 0.0 || p.a == 0.0) return;
+    double weight; // of m - m0
+    if (q->a == 0.0) {
+        const double u = p.a / p.s, rise = t.a / t.s - u;
+        weight = t.s * rise * rise / (2.0 * u);
+    } else {
+        const double before = gsf__nn_lambda(*q, p);
+        weight = before != 0.0 ? 0.5 * step->p_m * gsf__nn_lambda(p, t) / before : 0.0;
+    }
+    step->p_m += weight;
+    step->p_m0 = -weight;
+}
+
+// UniC-2 with B(h) = exp(-h) - 1 at p, the step's own point, which was reached from m0's point o (before it m1's point n,
+// NULL in the second step, where the corrector has first order): n -> o -> p.
+static void gsf__nn_corrector(gsf__nn_step* step, const gsf__nn_point* n, gsf__nn_point o, gsf__nn_point p) {
+    const double rise = p.a - o.a * p.s / o.s; // p.a (1 - exp(-h))
+    double weight = 0.5, earlier = 0.0;        // of m - m0 and of m1 - m0
+    if (n) {
+        const double h = gsf__nn_lambda(o, p), phi = expm1(-h);
+        const double phi2 = phi / -h - 1.0, phi3 = phi2 / -h - 0.5; // h_phi_2, h_phi_3 of UniPC's code
+        weight = phi2 / phi;
+        if (n->a != 0.0) {
+            const double ratio = -gsf__nn_lambda(*n, o) / h, rho = (2.0 * phi3 / phi - weight) / (ratio - 1.0);
+            earlier = rho / ratio;
+            weight -= rho;
+        }
+    }
+    step->correct = 1;
+    step->c_last = p.s / o.s;
+    step->c_m = rise * weight;
+    step->c_m1 = rise * earlier;
+    step->c_m0 = rise * (1.0 - weight - earlier);
+}
+
+GSF_API gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule, const gsf_nn_sampler_desc* desc,
+                                       gsf_nn_sampler* out) {
+    static const size_t kept[] = {0, 1, 3}; // blocks of memory for each solver
+    gsf_nn_sampler sampler;
+    memset(out, 0, sizeof *out);
+    memset(&sampler, 0, sizeof sampler);
+    sampler.desc = *desc;
+    sampler.schedule = schedule;
+    if (!sampler.desc.steps) sampler.desc.steps = 50;
+    if ((int)desc->solver < 0 || desc->solver > GSF_NN_UNIPC || sampler.desc.steps < 1 ||
+        sampler.desc.steps > schedule->desc.train_steps || !gsf__mul_size(desc->value_count, 3, &sampler.memory_count))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: solver %d, %d steps, %zu values", (int)desc->solver,
+                        (int)sampler.desc.steps, desc->value_count);
+    sampler.memory_count = kept[desc->solver] * desc->value_count;
+    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    sampler.timesteps = (int32_t*)gsf_alloc(ctx, (size_t)sampler.desc.steps, sizeof(int32_t));
+    if (sampler.timesteps) sampler.memory = (float*)gsf_alloc_zeroed(ctx, sampler.memory_count, sizeof(float));
+    if (sampler.memory)
+        result = gsf_nn_make_timesteps(ctx, schedule, sampler.desc.steps, desc->strength, sampler.timesteps,
+                                       &sampler.count);
+    if (result != GSF_OK) gsf_nn_destroy_sampler(ctx, &sampler);
+    *out = sampler;
+    return result;
+}
+
+GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler) {
+    gsf_free(ctx, sampler->timesteps);
+    gsf_free(ctx, sampler->memory);
+    memset(sampler, 0, sizeof *sampler);
+}
+
+// A schedule that is no longer stretched to zero SNR, or a start below it, never meets a = 0.
+static void gsf__nn_plan_step(const gsf_nn_sampler* sampler, gsf__nn_step* step) {
+    const int32_t i = sampler->index;
+    const size_t n = sampler->desc.value_count;
+    const gsf__nn_point p = gsf__nn_sampler_point(sampler, i), t = gsf__nn_sampler_target(sampler, i);
+    gsf__nn_point before[2]; // one and two steps earlier
+    memset(before, 0, sizeof before);
+    if (i > 0) before[0] = gsf__nn_sampler_point(sampler, i - 1);
+    if (i > 1) before[1] = gsf__nn_sampler_point(sampler, i - 2);
+    step->m_x = p.a;
+    step->m_v = -p.s;
+    const int second = sampler->desc.solver != GSF_NN_DDIM && i > 0 && i + 1 < sampler->count;
+    gsf__nn_predictor(step, p, t, second ? &before[0] : NULL);
+    if (sampler->desc.solver == GSF_NN_DDIM) return;
+    step->m0 = sampler->memory;
+    if (sampler->desc.solver != GSF_NN_UNIPC) return;
+    step->m1 = sampler->memory + n;
+    step->last = sampler->memory + 2 * n;
+    if (i > 0) gsf__nn_corrector(step, i > 1 ? &before[1] : NULL, before[0], p);
+}
+
+GSF_API gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x, float* x0) {
+    gsf__nn_step step;
+    memset(&step, 0, sizeof step);
+    if (sampler->index < 0 || sampler->index >= sampler->count)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: step %d of %d", (int)sampler->index,
+                        (int)sampler->count);
+    gsf__nn_plan_step(sampler, &step);
+    step.count = sampler->desc.value_count;
+    step.x_in = x;
+    step.v = v;
+    step.x = x;
+    step.x0 = x0;
+    gsf__parallel_for(ctx, (step.count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &step);
+    const int64_t at = gsf__nn_find_not_finite(ctx, x, (int64_t)step.count);
+    if (at >= 0)
+        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "step %d (time %d): latent %lld of %zu is NaN or infinite",
+                        (int)sampler->index, (int)sampler->timesteps[sampler->index], (long long)at, step.count);
+    sampler->index++;
+    return GSF_OK;
+}
+
+// ---- >>nn sampling --------------------------------------------------------------
+
+enum { GSF__SAMPLE_STREAM = 0x6e6f6973 }; // of the random numbers: the initial noise
+
+typedef struct gsf__sample_run {
+    gsf_context* ctx;
+    const gsf_nn_transformer* net;
+    const gsf_nn_vae* vae;
+    const gsf_nn_schedule* schedule;
+    gsf_nn_sample_desc desc;       // defaults filled in
+    gsf_nn_sample_stats stats;
+    int32_t frames, height, width; // of the latents
+    int32_t channels;              // of the latents
+    int64_t count;                 // values of the latents
+    float *latents, *control;      // (frames, channels, height, width), control scaled as the network takes it
+    float *input, *prediction;     // (2, frames, 2 channels, height, width), (2, frames, channels, height, width)
+    float* reference_kv;
+    int reference_kv_ready;
+    gsf_nn_block_cache cache;
+    gsf_nn_sampler sampler;
+    uint32_t settings, clip; // checksums of everything that the result depends on; with a checkpoint
+} gsf__sample_run;
+
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc) {
+    gsf_nn_sample_desc d = *desc;
+    if (!d.steps) d.steps = 50;
+    if (d.guidance == 0.0f) d.guidance = 6.0f;
+    if (d.guidance_end == 0.0f) d.guidance_end = 1.0f;
+    if (d.strength == 0.0f) d.strength = 1.0f;
+    return d;
+}
+
+static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) {
+    if (d->_start_canary != 0 || d->_end_canary != 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: the desc was not zeroed");
+    *d = gsf_nn_resolve_sample(d);
+    if (d->steps < 1 || d->steps > 1000)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: %d steps, not 1 to 1000", (int)d->steps);
+    if (!(d->strength > 0.0f && d->strength <= 1.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: strength %g is not in (0, 1]", (double)d->strength);
+    if (!(d->guidance >= 1.0f && d->guidance < 1e4f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: guidance %g is below 1", (double)d->guidance);
+    if (!(d->guidance_begin >= 0.0f && d->guidance_begin <= d->guidance_end && d->guidance_end <= 1.0f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: guidance from %g to %g of the steps",
+                        (double)d->guidance_begin, (double)d->guidance_end);
+    if (!(d->block_cache >= 0.0f && d->block_cache < 1e4f))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: block cache threshold %g", (double)d->block_cache);
+    return GSF_OK;
+}
+
+// Frames that the VAE gives back as many: 1, 9, 17, ... at the usual compression of 4.
+static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
+                                         const gsf_nn_sample_desc* d) {
+    const int32_t step = 2 * v->temporal_ratio, square = v->spatial_ratio * t->patch;
+    if (t->temporal_ratio != v->temporal_ratio || t->in_channels != 2 * v->latent_channels ||
+        t->out_channels != v->latent_channels)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent) do not fit",
+                        (int)t->in_channels, (int)t->out_channels, (int)v->latent_channels);
+    if (d->frames < 1 || (d->frames - 1) % step)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: %d frames; it takes 1, %d, %d, ...", (int)d->frames,
+                        (int)(1 + step), (int)(1 + 2 * step));
+    if (d->height < square || d->width < square || d->height % square || d->width % square)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are no multiple of %d", (int)d->width,
+                        (int)d->height, (int)square);
+    if (t->learned_positions && d->frames != t->sample_frames && !d->any_frames)
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
+                        "sample: %d frames; the model's positions are learned for %d (any_frames puts sines in their place)",
+                        (int)d->frames, (int)t->sample_frames);
+    return gsf__dit_check_size(ctx, t, d->height / v->spatial_ratio, d->width / v->spatial_ratio);
+}
+
+static gsf_result gsf__sample_check(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
+                                    gsf_nn_sample_desc* d) {
+    GSF__TRY(gsf__sample_defaults(ctx, d));
+    GSF__TRY(gsf__sample_check_size(ctx, t, v, d));
+    if (!d->control || !d->text)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: control frames or text embeddings are missing");
+    return GSF_OK;
+}
+
+// Between (channels, frames, plane) and (frames, channels, plane), times a factor.
+static void gsf__swap_frames(const float* from, int64_t outer, int64_t inner, int64_t plane, float factor, float* to) {
+    for (int64_t i = 0; i < inner; i++)
+        for (int64_t o = 0; o < outer; o++, to += plane) {
+            const float* source = from + (o * inner + i) * plane;
+            for (int64_t p = 0; p < plane; p++) to[p] = source[p] * factor;
+        }
+}
+
+static gsf_result gsf__sample_encode(gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    float* mean = run->prediction;
+    GSF__TRY(gsf_nn_vae_encode(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, mean, NULL));
+    gsf__swap_frames(mean, run->channels, run->frames, (int64_t)run->height * run->width,
+                     (float)run->vae->scaling_factor, run->control);
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_decode(gsf__sample_run* run, float* out) {
+    gsf__swap_frames(run->latents, run->frames, run->channels, (int64_t)run->height * run->width,
+                     (float)(1.0 / run->vae->scaling_factor), run->prediction);
+    return gsf_nn_vae_decode(run->ctx, run->vae, NULL, run->prediction, run->frames, run->height, run->width, out);
+}
+
+// Pure noise, or at strength < 1 the control latents with the noise of the first step.
+static void gsf__sample_begin(gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    for (int64_t i = 0; i < run->count; i++)
+        run->latents[i] = d->noise ? d->noise[i] : (float)gsf_random_normal(d->seed, GSF__SAMPLE_STREAM, (uint64_t)i);
+    if (run->sampler.count < d->steps)
+        gsf_nn_add_noise(run->ctx, run->schedule, run->sampler.timesteps[0], run->control, run->latents,
+                         (size_t)run->count, run->latents);
+}
+
+// ---- checkpoint: what identifies the job, the step, the latents and what the solver remembers
+
+// Tells weights apart without reading all of them: every tensor's name, type and shape, and 64 bytes from its beginning,
+// middle and end.
+static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weights) {
+    for (size_t i = 0; i < weights->tensor_count; i++) {
+        const gsf_tensor* t = &weights->tensors[i];
+        const size_t size = (size_t)t->count * gsf_nn_dtype_size(t->dtype), part = size < 64 ? size : 64;
+        const size_t at[3] = {0, (size - part) / 2, size - part};
+        crc = gsf__crc32(crc, t->name, strlen(t->name) + 1);
+        crc = gsf__crc32(crc, &t->dtype, sizeof t->dtype);
+        crc = gsf__crc32(crc, t->shape, (size_t)t->rank * sizeof t->shape[0]);
+        for (int k = 0; k < 3; k++) crc = gsf__crc32(crc, (const char*)t->data + at[k], part);
+    }
+    return crc;
+}
+
+// What every clip of a run has in common: model, precision, schedule and settings.
+static uint32_t gsf__sample_sum_settings(const gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const gsf_nn_transformer* t = run->net;
+    const int int8 = ((const gsf__dit_nets*)t->nets)->quantized != NULL;
+    const int32_t whole[] = {d->steps, (int32_t)d->solver, d->dynamic_guidance, t->layers, t->heads, t->bf16 != 0, int8,
+                             run->schedule->desc.train_steps, (int32_t)run->schedule->desc.spacing,
+                             run->schedule->desc.steps_offset};
+    const float real[] = {d->guidance, d->guidance_begin, d->guidance_end, d->strength, d->block_cache};
+    const size_t steps = (size_t)run->schedule->desc.train_steps;
+    uint32_t crc = gsf__crc32(0, whole, sizeof whole);
+    crc = gsf__crc32(crc, real, sizeof real);
+    crc = gsf__crc32(crc, run->schedule->alpha_bar, steps * sizeof *run->schedule->alpha_bar);
+    crc = gsf__crc32(crc, &run->schedule->final_alpha_bar, sizeof run->schedule->final_alpha_bar);
+    crc = gsf__crc32(crc, run->sampler.timesteps, (size_t)run->sampler.count * sizeof *run->sampler.timesteps);
+    crc = gsf__sample_sum_weights(crc, &t->weights);
+    return gsf__sample_sum_weights(crc, &run->vae->weights);
+}
+
+// What this clip is made of.
+static uint32_t gsf__sample_sum_clip(const gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const gsf_nn_transformer* t = run->net;
+    const int32_t whole[] = {d->frames, d->height, d->width, d->noise != NULL, (int32_t)d->reference_tokens,
+                             d->references != NULL};
+    const size_t text = 2 * (size_t)t->text_tokens * (size_t)t->text_channels;
+    uint32_t crc = gsf__crc32(0, whole, sizeof whole);
+    crc = gsf__crc32(crc, &d->seed, sizeof d->seed);
+    crc = gsf__crc32(crc, run->control, (size_t)run->count * sizeof(float));
+    crc = gsf__crc32(crc, d->text, text * sizeof(float));
+    if (d->noise) crc = gsf__crc32(crc, d->noise, (size_t)run->count * sizeof(float));
+    if (d->references)
+        crc = gsf__crc32(crc, d->references, (size_t)d->reference_tokens * (size_t)gsf__dit_width(t) * sizeof(float));
+    return crc;
+}
+
+static gsf_result gsf__sample_save(gsf__sample_run* run) {
+    if (!run->desc.checkpoint) return GSF_OK;
+    gsf_text file;
+    char head[12];
+    memset(&file, 0, sizeof file);
+    gsf__store_le(head, run->clip, 4);
+    gsf__store_le(head + 4, (uint64_t)run->sampler.index, 4);
+    gsf__store_le(head + 8, run->settings, 4);
+    gsf_chunks_add(run->ctx, &file, "SAMP", head, sizeof head);
+    gsf_chunks_add(run->ctx, &file, "LATE", run->latents, (size_t)run->count * sizeof(float));
+    gsf_chunks_add(run->ctx, &file, "MEMO", run->sampler.memory, run->sampler.memory_count * sizeof(float));
+    gsf_chunks_end(run->ctx, &file);
+    const gsf_result result =
+        file.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(run->ctx, run->desc.checkpoint, file.data, file.size);
+    gsf_destroy_text(run->ctx, &file);
+    return result;
+}
+
+static int gsf__sample_is_finite(const gsf_chunk* floats) {
+    for (size_t i = 0; i + sizeof(float) <= floats->size; i += sizeof(float)) {
+        float value;
+        memcpy(&value, (const char*)floats->data + i, sizeof value);
+        if (!(fabsf(value) <= FLT_MAX)) return 0;
+    }
+    return 1;
+}
+
+static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size) {
+    gsf_chunk head, latents, memory;
+    if (!gsf_chunks_find(data, size, "SAMP", &head) || !gsf_chunks_find(data, size, "LATE", &latents) ||
+        !gsf_chunks_find(data, size, "MEMO", &memory))
+        return;
+    if (head.size != 12 || gsf__load_le((const char*)head.data + 8, 4) != run->settings) {
+        gsf_log(run->ctx, GSF_LOG_WARNING, "%s: made with another model, precision or other settings: the clip starts anew",
+                run->desc.checkpoint);
+        return;
+    }
+    if (latents.size != (size_t)run->count * sizeof(float) ||
+        memory.size != run->sampler.memory_count * sizeof(float) || gsf__load_le(head.data, 4) != run->clip)
+        return; // of the clip before this
+    const int64_t index = (int64_t)gsf__load_le((const char*)head.data + 4, 4);
+    if (index < 1 || index > run->sampler.count) return;
+    if (!gsf__sample_is_finite(&latents) || !gsf__sample_is_finite(&memory)) return; // it would fail the same way each time
+    memcpy(run->latents, latents.data, latents.size);
+    if (memory.size) memcpy(run->sampler.memory, memory.data, memory.size);
+    run->sampler.index = (int32_t)index;
+}
+
+// Goes on from the checkpoint if there is one of this very job; one of another job, or a broken one, is overwritten after
+// the first step.
+static gsf_result gsf__sample_resume(gsf__sample_run* run) {
+    void* data;
+    size_t size;
+    if (!run->desc.checkpoint) return GSF_OK;
+    GSF__TRY(gsf__nn_read_if_there(run->ctx, run->desc.checkpoint, &data, &size));
+    if (!data) return GSF_OK;
+    if (gsf_chunks_check(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
+    gsf_free(run->ctx, data);
+    run->stats.resumed_from = run->sampler.index;
+    return GSF_OK;
+}
+
+// ---- the steps
+
+// Guidance of step `index`; 1: the prompt alone.
+static float gsf__sample_guidance(const gsf__sample_run* run, int32_t index) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const float at = ((float)index + 0.5f) / (float)run->sampler.count;
+    if (at < d->guidance_begin || at > d->guidance_end) return 1.0f;
+    if (!d->dynamic_guidance) return d->guidance;
+    // The official code mixes units: the time step counts to 1000, n is the number of steps.
+    const double n = d->steps, t = run->sampler.timesteps[index];
+    return (float)(1.0 + (double)d->guidance * (1.0 - cos(3.14159265358979323846 * pow((n - t) / n, 5.0))) / 2.0);
+}
+
+// Noisy latents and control side by side, for each of `rows` samples.
+static void gsf__sample_fill_input(gsf__sample_run* run, int32_t rows) {
+    const size_t frame = (size_t)run->channels * (size_t)run->height * (size_t)run->width;
+    float* to = run->input;
+    for (int32_t b = 0; b < rows; b++)
+        for (size_t f = 0; f < (size_t)run->frames; f++, to += 2 * frame) {
+            memcpy(to, run->latents + f * frame, frame * sizeof(float));
+            memcpy(to + frame, run->control + f * frame, frame * sizeof(float));
+        }
+}
+
+static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    const gsf_nn_transformer* t = run->net;
+    const int32_t rows = guidance == 1.0f ? 1 : 2;
+    const double step = run->sampler.timesteps[run->sampler.index], steps[2] = {step, step};
+    gsf_nn_transformer_input in;
+    memset(&in, 0, sizeof in);
+    in.batch = rows;
+    in.frames = run->frames;
+    in.height = run->height;
+    in.width = run->width;
+    in.hidden = run->input;
+    in.text = rows == 2 ? d->text : d->text + (int64_t)t->text_tokens * t->text_channels; // negative prompt, prompt
+    in.timesteps = steps;
+    in.references = d->references;
+    in.reference_tokens = d->reference_tokens;
+    in.reference_batch = 1;
+    in.reference_kv = run->reference_kv;
+    in.reference_kv_ready = run->reference_kv_ready;
+    in.cache = &run->cache;
+    const int64_t hits = run->cache.hits;
+    gsf__sample_fill_input(run, rows);
+    GSF__TRY(gsf_nn_transformer_forward(run->ctx, t, &in, run->prediction));
+    // A step that the cache cut short after the first block has not filled the other blocks' keys and values.
+    if (run->cache.hits == hits) run->reference_kv_ready = 1;
+    run->stats.network_rows += rows;
+    run->stats.cached_steps += run->cache.hits - hits;
+    for (int64_t i = 0; rows == 2 && i < run->count; i++) {
+        const float u = run->prediction[i], c = run->prediction[run->count + i];
+        run->prediction[i] = u + guidance * (c - u);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_steps(gsf__sample_run* run) {
+    const gsf_nn_sample_desc* d = &run->desc;
+    while (run->sampler.index < run->sampler.count) {
+        const int32_t index = run->sampler.index;
+        GSF__TRY(gsf__check_cancel(run->ctx));
+        gsf__progress(run->ctx, "restore", index, run->sampler.count);
+        GSF__TRY(gsf__sample_predict(run, gsf__sample_guidance(run, index)));
+        GSF__TRY(gsf_nn_step_sampler(run->ctx, &run->sampler, run->prediction, run->latents, NULL));
+        if (d->step_fn) d->step_fn(d->step_user, index, run->latents, run->prediction, run->count);
+        run->stats.steps++;
+        GSF__TRY(gsf__sample_save(run));
+    }
+    gsf__progress(run->ctx, "restore", run->sampler.count, run->sampler.count);
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_run_all(gsf__sample_run* run, float* out) {
+    gsf_nn_sampler_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.solver = run->desc.solver;
+    desc.steps = run->desc.steps;
+    desc.strength = (double)run->desc.strength;
+    desc.value_count = (size_t)run->count;
+    GSF__TRY(gsf_nn_make_sampler(run->ctx, run->schedule, &desc, &run->sampler));
+    GSF__TRY(gsf__sample_encode(run));
+    gsf__sample_begin(run);
+    if (run->desc.checkpoint) {
+        run->settings = gsf__sample_sum_settings(run);
+        run->clip = gsf__sample_sum_clip(run);
+    }
+    GSF__TRY(gsf__sample_resume(run));
+    run->cache.threshold = run->desc.block_cache;
+    GSF__TRY(gsf__sample_steps(run));
+    return gsf__sample_decode(run, out);
+}
+
+static void gsf__sample_sizes(gsf__sample_run* run, const gsf_nn_sample_desc* d) {
+    run->frames = (d->frames - 1) / run->vae->temporal_ratio + 1;
+    run->height = d->height / run->vae->spatial_ratio;
+    run->width = d->width / run->vae->spatial_ratio;
+    run->channels = run->vae->latent_channels;
+    run->count = (int64_t)run->frames * run->channels * run->height * run->width;
+}
+
+static size_t gsf__sample_kv_size(const gsf__sample_run* run) {
+    if (!run->desc.references || run->desc.no_reference_cache) return 0;
+    return gsf_nn_reference_kv_size(run->net, run->desc.reference_tokens, 1);
+}
+
+enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents, control, input 2 x 2, prediction 2
+
+GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                      const gsf_nn_sample_desc* desc, gsf_nn_cost* out) {
+    gsf__sample_run run;
+    gsf_nn_vae_info encode, decode;
+    memset(&run, 0, sizeof run);
+    memset(out, 0, sizeof *out);
+    run.net = transformer;
+    run.vae = vae;
+    run.desc = *desc;
+    GSF__TRY(gsf__sample_defaults(ctx, &run.desc));
+    GSF__TRY(gsf__sample_check_size(ctx, transformer, vae, &run.desc));
+    gsf__sample_sizes(&run, &run.desc);
+    GSF__TRY(gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_ENCODE, NULL, desc->frames, desc->height, desc->width, &encode));
+    GSF__TRY(gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_DECODE, NULL, run.frames, run.height, run.width, &decode));
+    const int32_t steps = (int32_t)((double)run.desc.steps * (double)run.desc.strength);
+    double bytes = 0.0;
+    out->flops = encode.flops + decode.flops;
+    for (int32_t i = 0; i < steps; i++) {
+        const float at = ((float)i + 0.5f) / (float)steps;
+        const int guided = run.desc.guidance != 1.0f && at >= run.desc.guidance_begin && at <= run.desc.guidance_end;
+        gsf_nn_transformer_input in;
+        double step_bytes, step_flops;
+        memset(&in, 0, sizeof in);
+        in.batch = guided ? 2 : 1;
+        in.frames = run.frames;
+        in.height = run.height;
+        in.width = run.width;
+        in.references = desc->references;
+        in.reference_tokens = desc->reference_tokens;
+        in.reference_batch = 1;
+        in.reference_kv_ready = i > 0 && !desc->no_reference_cache;
+        gsf_nn_transformer_cost(transformer, &in, &step_bytes, &step_flops);
+        out->flops += step_flops;
+        if (step_bytes > bytes) bytes = step_bytes;
+    }
+    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // what the last step's blocks added, beside the stream itself
+    if (encode.bytes > bytes) bytes = encode.bytes;
+    if (decode.bytes > bytes) bytes = decode.bytes;
+    const double own = (double)GSF__SAMPLE_BUFFERS * (double)run.count + (double)gsf__sample_kv_size(&run);
+    out->bytes = bytes + own * sizeof(float);
+    return GSF_OK;
+}
+
+static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
+                                           const gsf_nn_sample_desc* d) {
+    gsf_nn_cost cost;
+    if (!(d->max_bytes > 0.0)) return GSF_OK;
+    GSF__TRY(gsf_nn_sample_cost(ctx, t, v, d, &cost));
+    if (cost.bytes <= d->max_bytes) return GSF_OK;
+    return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY,
+                    "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed",
+                    (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
+}
+
+GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                 const gsf_nn_schedule* schedule, const gsf_nn_sample_desc* desc, float* out,
+                                 gsf_nn_sample_stats* stats) {
+    gsf__sample_run run;
+    memset(&run, 0, sizeof run);
+    run.ctx = ctx;
+    run.net = transformer;
+    run.vae = vae;
+    run.schedule = schedule;
+    run.desc = *desc;
+    GSF__TRY(gsf__sample_check(ctx, transformer, vae, &run.desc));
+    GSF__TRY(gsf__sample_check_memory(ctx, transformer, vae, &run.desc));
+    gsf__sample_sizes(&run, &run.desc);
+    const size_t count = (size_t)run.count, kv = gsf__sample_kv_size(&run);
+    float* memory = (float*)gsf_alloc(ctx, GSF__SAMPLE_BUFFERS * count + kv, sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    run.latents = memory;
+    run.control = memory + count;
+    run.input = memory + 2 * count;
+    run.prediction = memory + 6 * count;
+    run.reference_kv = kv ? memory + GSF__SAMPLE_BUFFERS * count : NULL;
+    const gsf_result result = gsf__sample_run_all(&run, out);
+    if (stats) *stats = run.stats;
+    gsf_nn_destroy_block_cache(ctx, &run.cache);
+    gsf_nn_destroy_sampler(ctx, &run.sampler);
+    gsf_free(ctx, memory);
+    return result;
 }
 
 // ---- >>nn restorer --------------------------------------------------------------
