@@ -161,6 +161,7 @@ struct gsf_context {
     int threads;             // for the OpenMP default: number of workers, 0 = all cores
     int cancel;              // see gsf_request_cancel
     int initialized;
+    const struct gsf__services* services; // private: what the modules' implementations need of this header's
     char error[512];         // sentence of the last error
 };
 
@@ -816,28 +817,42 @@ GSF__SHARED gsf_result gsf__open_result(int reason) {
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
 }
 
-GSF__END_IMPLEMENTATION
+// What only gsfixer.h's own implementation can do. Other implementations, which may stand in other files or libraries, find
+// it through the context, so that no name of an internal function is ever exported.
+typedef struct gsf__services {
+    gsf_result (*inflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
+                             size_t room);
+    gsf_result (*deflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+    gsf_result (*parse_json_fn)(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
+                                gsf_json* out);
+    gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size); // the default hook
+} gsf__services;
 
-// What only gsfixer.h's own implementation can do, so that it is linked, not shared. First DEFLATE (RFC 1951): in through
-// stb (2^31 bytes; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB), out by the same bytes on every machine (2^30).
-#ifdef __cplusplus
-extern "C" {
-#endif
-// Inflates what starts at byte `body` of a file to exactly `room` > 0 bytes. The 8 bytes of a gzip file's end must follow
-// it within `size`: stb 2.27 reads ahead, and takes an end too near for a cut.
-GSF_API gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
-                                size_t room);
+// DEFLATE (RFC 1951): in through stb (2^31 bytes; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB), out by the same
+// bytes on every machine (2^30). Inflates what starts at byte `body` of a file to exactly `room` > 0 bytes. The 8 bytes of a
+// gzip file's end must follow it within `size`: stb 2.27 reads ahead, and takes an end too near for a cut.
+GSF__SHARED gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body,
+                                    void* out, size_t room) {
+    return ctx->services->inflate_fn(ctx, name, data, size, body, out, room);
+}
+
 // Appends `data` (size > 0) compressed.
-GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+GSF__SHARED gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+    return ctx->services->deflate_fn(ctx, name, data, size, out);
+}
 
 // JSON that begins at byte `start` of a file: offsets, also in error texts, count from the file's first byte.
-GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
-                                        gsf_json* out);
-// Are files those of the platform, which may list or map them?
-GSF_API int gsf__io_is_plain(const gsf_context* ctx);
-#ifdef __cplusplus
+GSF__SHARED gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size,
+                                            size_t start, gsf_json* out) {
+    return ctx->services->parse_json_fn(ctx, name, text, size, start, out);
 }
-#endif
+
+// Are files those of the platform, which may list or map them?
+GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
+    return ctx->io.read_fn == ctx->services->read_fn || ctx->io.plain_files;
+}
+
+GSF__END_IMPLEMENTATION
 
 #endif // GSF_INTERNALS_INCLUDED
 #endif
@@ -978,10 +993,18 @@ static void gsf__for_openmp(void* user, size_t chunk_count, gsf_chunk_fn body, v
 
 static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size);
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
+static gsf_result gsf__json_parse(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
+                                  gsf_json* out);
+static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
+                                   size_t room);
+
+static const gsf__services gsf__own_services = {gsf__stb_inflate, gsf__lz_compress, gsf__json_parse, gsf__stdio_read};
 
 GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
     if (!ctx) return GSF_ERROR_INVALID_ARGUMENT;
     ctx->error[0] = 0;
+    ctx->services = &gsf__own_services;
     if (!ctx->allocator.alloc_fn != !ctx->allocator.free_fn)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "allocator: set both functions or neither");
     if (!ctx->io.read_fn != !ctx->io.write_fn)
@@ -1241,10 +1264,6 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
     }
     gsf_destroy_text(ctx, &name);
     return result;
-}
-
-GSF_API int gsf__io_is_plain(const gsf_context* ctx) {
-    return ctx->io.read_fn == gsf__stdio_read || ctx->io.plain_files;
 }
 
 GSF_API gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size) {
@@ -1643,8 +1662,8 @@ GSF_API gsf_result gsf_parse_json(gsf_context* ctx, const char* name, const char
     return gsf__parse_json_from(ctx, name, text, size, 0, out);
 }
 
-GSF_API gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
-                                        gsf_json* out) {
+static gsf_result gsf__json_parse(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
+                                  gsf_json* out) {
     memset(out, 0, sizeof *out);
     snprintf(out->name, sizeof out->name, "%s", name ? name : "json");
     if (size > 0xfffffff0u)
@@ -1949,7 +1968,7 @@ static size_t gsf__lz_match(gsf__deflater* d, size_t at, size_t best, uint32_t* 
     return found;
 }
 
-GSF_API gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
     if (size > (size_t)1 << 30)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, at most 2^30 are", name, size);
     gsf__deflater* d = (gsf__deflater*)gsf_alloc_zeroed(ctx, 1, sizeof *d);
@@ -2247,7 +2266,8 @@ static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int
 static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char* data, size_t size, uint64_t most) {
     uint64_t packed = 0;
     for (size_t at = 8;;) {
-        if (size - at < 12) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is cut (no IEND)", name, at);
+        if (size < at || size - at < 12)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is cut (no IEND)", name, at);
         const unsigned char* head = (const unsigned char*)data + at;
         const size_t bytes = (size_t)head[0] << 24 | (size_t)head[1] << 16 | (size_t)head[2] << 8 | head[3];
         if (bytes > size - at - 12)
@@ -2265,9 +2285,6 @@ static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char*
     }
 }
 
-static int gsf__is_png(const void* data, size_t size) {
-    return size >= 8 && memcmp(data, "\x89PNG\r\n\x1a\n", 8) == 0;
-}
 #endif
 
 #ifdef GSF_USE_OIIO
@@ -2561,9 +2578,9 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
     // stb inflates all data before it counts rows: not more than twice what four channels of 16 bits would take unpacked
     const uint64_t most = 65536 + 2 * (uint64_t)height * (8 * (uint64_t)width + 1);
-    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, most));
     gsf__source_rewind(&source);
     const gsf__image_kind kind = gsf__image_kind_of(&source);
+    if (kind == GSF__IMAGE_PNG) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, most));
     if (kind == GSF__IMAGE_JPEG) GSF__TRY(gsf__check_jpeg(ctx, name, (const unsigned char*)data, size, source.at));
     gsf__source_rewind(&source);
     gsf_text whole;
@@ -2607,8 +2624,8 @@ static void gsf__stb_write(void* user, void* data, int size) {
 
 #endif // GSF_NO_STB
 
-GSF_API gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
-                                size_t room) {
+static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
+                                   size_t room) {
 #ifdef GSF_NO_STB
     (void)data, (void)size, (void)body, (void)out, (void)room;
     return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no compressed files (GSF_NO_STB)", name);
@@ -3876,7 +3893,8 @@ static const char* gsf__oiio_format(const void* data, size_t size) {
 static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void* data, size_t size,
                                  OIIO::Filesystem::IOMemReader* memory, std::unique_ptr<OIIO::ImageInput>* out) {
     const char* format = gsf__oiio_format(data, size);
-    if (gsf__is_png(data, size)) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, UINT64_MAX));
+    if (format && strcmp(format, "png") == 0)
+        GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, UINT64_MAX));
     std::unique_ptr<OIIO::ImageInput> input =
         format ? OIIO::ImageInput::create(format) : OIIO::ImageInput::open(name, nullptr, memory);
     if (!input)

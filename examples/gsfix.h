@@ -70,6 +70,8 @@ gsf_result gsfix_make_folder(gsf_context* ctx, const char* path); // with its pa
 gsf_result gsfix_list(gsf_context* ctx, const char* folder, const char* extensions, gsfix_names* out);
 void gsfix_free_names(gsf_context* ctx, gsfix_names* names);
 char* gsfix_copy_text(gsf_context* ctx, const char* text, size_t size);
+// Room for one more element of a list of `count`, of `size` bytes each.
+gsf_result gsfix_grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size);
 // File name without folder and extension.
 gsfix_path gsfix_stem(const char* path);
 // Name (without extension) under which a view's pictures are written: unique within the scene, no folders.

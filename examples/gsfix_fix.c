@@ -188,20 +188,9 @@ static void add_seconds(fix_run* run, int stage, double* since) {
     *since = now;
 }
 
-// Room for one more element of a list of the history.
-static gsf_result grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size) {
-    if (count < *room) return GSF_OK;
-    const size_t more = 2 * *room + 32;
-    void* fresh = gsf_alloc(ctx, more, size);
-    if (!fresh) return GSF_ERROR_OUT_OF_MEMORY;
-    if (count) memcpy(fresh, *list, count * size);
-    gsf_free(ctx, *list);
-    *list = fresh;
-    *room = more;
-    return GSF_OK;
-}
-// list: the member, stem: how its _count and _room begin
-#define GROW(ctx, h, list, stem) grow(ctx, (void**)&(h)->list, &(h)->stem##_room, (h)->stem##_count, sizeof *(h)->list)
+// Room for one more element of a list of the history. list: the member, stem: how its _count and _room begin
+#define GROW(ctx, h, list, stem) \
+    gsfix_grow(ctx, (void**)&(h)->list, &(h)->stem##_room, (h)->stem##_count, sizeof *(h)->list)
 
 // ---- initial splats --------------------------------------------------------------
 

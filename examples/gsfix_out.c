@@ -61,17 +61,6 @@ struct gsfix_out {
     int unsaved;    // the clip's checkpoint could not be written
 };
 
-static gsf_result out_grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size) {
-    if (count < *room) return GSF_OK;
-    void* fresh = gsf_alloc(ctx, 2 * *room + 16, size);
-    if (!fresh) return GSF_ERROR_OUT_OF_MEMORY;
-    if (count) memcpy(fresh, *list, count * size);
-    gsf_free(ctx, *list);
-    *list = fresh;
-    *room = 2 * *room + 16;
-    return GSF_OK;
-}
-
 static out_place place_of(const struct stat* s) {
     const out_place place = {s->st_dev, s->st_ino};
     return place;
@@ -167,7 +156,7 @@ static gsf_result add_place(gsfix_app* app, const char* path, const struct stat*
     for (size_t i = 0; i < o->input_count; i++)
         if (same_place(o->inputs[i].place, place)) return GSF_OK;
     const out_input input = {place, S_ISDIR(s->st_mode), gsfix_copy_text(ctx, path, strlen(path))};
-    gsf_result result = input.path ? out_grow(ctx, (void**)&o->inputs, &o->input_room, o->input_count, sizeof input)
+    gsf_result result = input.path ? gsfix_grow(ctx, (void**)&o->inputs, &o->input_room, o->input_count, sizeof input)
                                    : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) o->inputs[o->input_count++] = input;
     else gsf_free(ctx, input.path);
@@ -215,7 +204,7 @@ static gsf_result add_read(gsfix_app* app, const char* path, uint64_t size, uint
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
     const gsfix_read_file file = {gsfix_copy_text(ctx, path, strlen(path)), size, digest};
-    gsf_result result = file.path ? out_grow(ctx, (void**)&o->reads, &o->read_room, o->read_count, sizeof file)
+    gsf_result result = file.path ? gsfix_grow(ctx, (void**)&o->reads, &o->read_room, o->read_count, sizeof file)
                                   : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) o->reads[o->read_count++] = file;
     else gsf_free(ctx, file.path);
@@ -353,7 +342,7 @@ static char* take_name(gsf_context* ctx, const char* from, size_t size) {
 
 static gsf_result add_line(gsf_context* ctx, gsfix_out* o, const out_line* line) { // takes what it points to
     const gsf_result result = line->name && line->command
-                                  ? out_grow(ctx, (void**)&o->lines, &o->line_room, o->line_count, sizeof *line)
+                                  ? gsfix_grow(ctx, (void**)&o->lines, &o->line_room, o->line_count, sizeof *line)
                                   : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
         o->lines[o->line_count++] = *line;
@@ -543,7 +532,7 @@ gsf_result gsfix_claim(gsfix_app* app, const char* format, ...) {
     const int n = vsnprintf(name, sizeof name, format, args);
     va_end(args);
     if (n < 0 || (size_t)n >= sizeof name) return gsf_fail(ctx, GSF_ERROR_IO, "%s: too long a name", app->o.out);
-    gsf_result result = out_grow(ctx, (void**)&o->claims, &o->claim_room, o->claim_count, sizeof *o->claims);
+    gsf_result result = gsfix_grow(ctx, (void**)&o->claims, &o->claim_room, o->claim_count, sizeof *o->claims);
     if (result == GSF_OK) {
         o->claims[o->claim_count] = gsfix_copy_text(ctx, name, (size_t)n);
         if (!o->claims[o->claim_count]) return GSF_ERROR_OUT_OF_MEMORY;
@@ -857,7 +846,7 @@ gsf_result gsfix_claim_file(gsfix_app* app, const char* path) {
         result = gsf_fail(ctx, GSF_ERROR_IO, "%s: is there already, and not replaced (move it away or choose another name)", path);
     else if (faccessat(folder, ".", W_OK | X_OK, AT_EACCESS) != 0) result = unwritten(ctx, path, errno);
     if (folder >= 0) close(folder);
-    if (result == GSF_OK) result = out_grow(ctx, (void**)&o->files, &o->file_room, o->file_count, sizeof *o->files);
+    if (result == GSF_OK) result = gsfix_grow(ctx, (void**)&o->files, &o->file_room, o->file_count, sizeof *o->files);
     if (result == GSF_OK) {
         o->files[o->file_count] = gsfix_copy_text(ctx, path, strlen(path));
         if (!o->files[o->file_count]) return GSF_ERROR_OUT_OF_MEMORY;

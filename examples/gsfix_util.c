@@ -92,6 +92,18 @@ char* gsfix_copy_text(gsf_context* ctx, const char* text, size_t size) {
     return copy;
 }
 
+gsf_result gsfix_grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size) {
+    if (count < *room) return GSF_OK;
+    const size_t more = 2 * *room + 16;
+    void* fresh = gsf_alloc(ctx, more, size);
+    if (!fresh) return GSF_ERROR_OUT_OF_MEMORY;
+    if (count) memcpy(fresh, *list, count * size);
+    gsf_free(ctx, *list);
+    *list = fresh;
+    *room = more;
+    return GSF_OK;
+}
+
 static int compare_names(const void* a, const void* b) { return strcmp(*(char* const*)a, *(char* const*)b); }
 
 static int has_extension(const char* name, const char* extensions) {
@@ -113,15 +125,7 @@ gsf_result gsfix_list(gsf_context* ctx, const char* path, const char* extensions
     gsf_result result = GSF_OK;
     for (struct dirent* entry; (entry = readdir(folder)) != NULL;) {
         if (entry->d_name[0] == '.' || !has_extension(entry->d_name, extensions)) continue;
-        if (out->count == room) {
-            const size_t more = 2 * room + 64;
-            char** names = (char**)gsf_alloc(ctx, more, sizeof *names);
-            if (!names) { result = GSF_ERROR_OUT_OF_MEMORY; break; }
-            if (out->count) memcpy(names, out->names, out->count * sizeof *names);
-            gsf_free(ctx, out->names);
-            out->names = names;
-            room = more;
-        }
+        if ((result = gsfix_grow(ctx, (void**)&out->names, &room, out->count, sizeof *out->names)) != GSF_OK) break;
         out->names[out->count] = gsfix_copy_text(ctx, entry->d_name, strlen(entry->d_name));
         if (!out->names[out->count]) { result = GSF_ERROR_OUT_OF_MEMORY; break; }
         out->count++;
