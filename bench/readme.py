@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Writes the measured figures of README.md: what stands between its markers comes from bench/results.csv (bench/run.sh) and
-bench/quality.csv (bench/quality.py), and from nowhere else.
+"""Updates the tables of measured figures in README.md. The blocks between its markers are generated from bench/results.csv
+(written by bench/run.sh) and bench/quality.csv (written by bench/quality.py).
 
     bench/readme.py [--check]
 
---check changes nothing and fails where README.md says something else; the tests run it. A block whose CSV is not there is left
-as it is. Only the standard library is needed.
+--check changes nothing and fails if README.md differs from the CSV files; the tests run it. A block whose CSV file is missing
+is left alone. Needs only the standard library.
 """
 import csv
 import os
@@ -15,7 +15,7 @@ import sys
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 BF16 = "bf16 products"
-KERNELS = [  # case, variant, as README calls it
+KERNELS = [  # case, variant, name in README
     ("train step", "default", "a training step: render, loss, gradients, Adam"),
     ("linear f32 M=2048 N=3072 K=3072", "default", "a linear layer, 2048 x 3072 x 3072"),
     ("linear bf16 M=2048 N=3072 K=3072", BF16, "the same in bfloat16"),
@@ -24,9 +24,9 @@ KERNELS = [  # case, variant, as README calls it
     ("block f32 S=4096 R=0", "default", "a transformer block, 4096 tokens"),
     ("block bf16 S=4096 R=0", BF16, "the same in bfloat16"),
     ("conv3d f32 C=128 T=4 H=240 W=360", "default", "a causal convolution, 128 channels, 4 x 240 x 360"),
-    ("t5 layer f32 S=226", "default", "a layer of T5-XXL, 226 tokens"),
-    ("dinov2 f32 350x518 L=24", "default", "DINOv2-L, a photo of 350 x 518"),
-    ("vggt pair f32 350x518 N=2", "default", "a pair of VGGT's blocks, two photos"),
+    ("t5 layer f32 S=226", "default", "one layer of T5-XXL, 226 tokens"),
+    ("dinov2 f32 350x518 L=24", "default", "DINOv2-L, one photo of 350 x 518"),
+    ("vggt pair f32 350x518 N=2", "default", "one frame and one global block of VGGT, two photos"),
 ]
 
 
@@ -44,8 +44,8 @@ def seconds(row):
 
 
 def speed(rows):
-    """A row per case on two threads: ours, at the best instruction set it has, and the fastest peer."""
-    lines = ["| on two cores | ours | fastest peer | takes |", "|---|---|---|---|"]
+    """One row per case with two threads: ours, with its fastest instruction set, and the fastest peer."""
+    lines = ["| two cores | gsfixer | fastest peer | peer / gsfixer |", "|---|---|---|---|"]
     for case, variant, name in KERNELS:
         here = [r for r in rows if r["case"] == case and r["threads"] == "2"]
         ours = [r for r in here if r["variant"] == variant]
@@ -59,12 +59,12 @@ def speed(rows):
         ratio = float(best["ratio"] or float(best["seconds"]) / float(fastest["seconds"])) if best else 0.0
         lines.append("| %s | %s | %s | %s |" % (
             name, seconds(fastest), "%s, %s" % (best["variant"].replace(" bf16", ""), seconds(best)) if best else "",
-            ("%.0f times as long" if ratio >= 10.0 else "%.2f times as long") % ratio if best else ""))
+            ("%.0f" if ratio >= 10.0 else "%.2f") % ratio if best else ""))
     return lines
 
 
 def quality(rows):
-    """Means over the seeds: PSNR over seen pixels, over all in brackets."""
+    """Means over the seeds: PSNR over the seen pixels; over all pixels in brackets."""
     arms = ["plain", "none", "warp"] + sorted({r["arm"] for r in rows} - {"plain", "none", "warp"})
     head = {"plain": "plain 3DGS", "none": "with regularisers", "warp": "and `warp`"}
     lines = ["| start | photos | " + " | ".join(head.get(a, a) for a in arms) + " |", "|---|---|" + "---|" * len(arms)]
