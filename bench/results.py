@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Turns rows of bench_splat --json and bench_nn --json into tables and charts.
+"""Turns the output of bench_splat --json and bench_nn --json into tables and charts.
 
     bench/results.py ROWS.jsonl DIR
 
-Writes DIR/results.csv (every row), DIR/stages.svg (where a training step's time goes, by size), DIR/growth.svg (how cost
-grows), DIR/pipeline.svg (the video model's run time beside its error) and DIR/RESULTS.md. Several rows of the same case,
-instruction set and thread count are rounds: the median counts. Rows of test_stress --json are the table of worst errors,
-those of peers_nn.py with a peer as variant the ratios. Only the standard library is needed.
+Writes DIR/results.csv (every row), DIR/stages.svg (share of each stage in a training step, by size), DIR/growth.svg (how
+run time scales), DIR/pipeline.svg (run time against error of the video model) and DIR/RESULTS.md. Several rows with the same
+case, instruction set and thread count are rounds of one measurement; their median is reported. Rows of test_stress --json go
+to the table of worst errors, rows of peers_nn.py with a peer as variant to the ratios. Needs only the standard library.
 """
 import collections
 import csv
@@ -17,12 +17,13 @@ import statistics
 import sys
 
 COLUMNS = ["bench", "case", "variant", "isa", "threads", "seconds", "cpu_seconds", "work", "work_unit", "rate",
-           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes", "ratio", "cpu_ratio", "peer"]
+           "peak_share", "bytes", "bandwidth_share", "error_max", "error_rel_l2", "reference", "peak_rss_bytes", "ratio",
+           "cpu_ratio", "peer"]
 STAGES = ["project", "bin", "sort", "blend", "loss", "reverse", "gather", "adam"]
 COLORS = ["#8896ab", "#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "#bbbbbb"]
 
 
-def short(value):  # three digits, but never 1.14e+03
+def short(value):  # three significant digits, never in exponent notation such as 1.14e+03
     return "%.3g" % value if value < 999.5 else "%.0f" % value
 
 
@@ -37,6 +38,11 @@ def machine():
         return "%d x %s" % (len(names), names[0])
     except (OSError, IndexError):
         return "unknown processor"
+
+
+def version():
+    with open(os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "gsfixer.h")) as file:
+        return next(line.split('"')[1] for line in file if line.startswith("#define GSF_VERSION "))
 
 
 def medians(rows):
@@ -111,7 +117,7 @@ def growth_of(rows):  # {what grows: [(amount, seconds)]}
     return result
 
 
-def write_growth(path, rows):  # one panel each: both axes by decades, of the same length in all panels
+def write_growth(path, rows):  # one log-log panel each; a decade has the same length in all of them
     growth = growth_of(rows)
     seconds = [s for line in growth.values() for _, s in line]
     if not seconds:
@@ -142,7 +148,7 @@ def write_growth(path, rows):  # one panel each: both axes by decades, of the sa
         x0 += decade * (last - first) + panel + 20
     head = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
             % (x0, height), '<rect width="100%" height="100%" fill="white"/>',
-            '<text x="10" y="16" font-size="14">Seconds of render and backward together</text>']
+            '<text x="10" y="16" font-size="14">Time of the forward and the backward pass together</text>']
     with open(path, "w") as file:
         file.write("\n".join(head + out + ["</svg>"]) + "\n")
     return True
@@ -157,9 +163,9 @@ FAMILIES = [("ddim", COLORS[5]), ("dpmpp", COLORS[1]), ("unipc", COLORS[3]), ("g
             ("no guidance", COLORS[1]), ("strength", COLORS[5]), ("block cache", COLORS[3]), ("", COLORS[6])]
 
 
-def write_pipeline(path, rows):  # seconds to the right, error upwards by decades; one panel for steps, one for skips
+def write_pipeline(path, rows):  # error (logarithmic) over seconds; one panel for steps, one for skips
     panels = [("Solvers and steps: error against the converged path", pipeline_of(rows, "steps")),
-              ("Left out of 50 steps: error against all of it", pipeline_of(rows, "skips"))]
+              ("Work skipped in 50 steps: error against the full run", pipeline_of(rows, "skips"))]
     if not all(points for _, points in panels):
         return False
     errors = [e for _, points in panels for _, _, e in points if e > 0.0]
@@ -194,7 +200,7 @@ def write_pipeline(path, rows):  # seconds to the right, error upwards by decade
                 out.append('<polyline points="%s" fill="none" stroke="%s" stroke-opacity="0.5"/>'
                            % (" ".join("%.1f,%.1f" % p[:2] for p in line), color))
             for n, (x, y, label) in enumerate(line):
-                # labels of neighbouring lines, and of points that are no line, keep apart; none leaves the panel
+                # labels of neighbouring lines and of single points must not overlap, and none may leave the panel
                 below = (k if family else n) % 2 or x + 6 + 6 * len(label) > x0 + width + 12
                 out.append('<circle cx="%.1f" cy="%.1f" r="3.5" fill="%s"/>' % (x, y, color))
                 out.append('<text x="%.1f" y="%.1f" font-size="10" text-anchor="%s" fill="%s">%s</text>'
@@ -204,17 +210,17 @@ def write_pipeline(path, rows):  # seconds to the right, error upwards by decade
                           family or "number formats"))
         for k in range(0, len(exact), 3):
             out.append('<text x="%d" y="%d" font-size="11">%s%s</text>'
-                       % (x0, bottom + 36 + 14 * (k // 3), "" if k else "no error: ", ", ".join(exact[k:k + 3])))
+                       % (x0, bottom + 36 + 14 * (k // 3), "" if k else "exact: ", ", ".join(exact[k:k + 3])))
         x0 += width + 190
     head = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 %d %d" font-family="sans-serif" font-size="12">'
             % (x0 - 50, bottom + 70), '<rect width="100%" height="100%" fill="white"/>',
-            '<text x="10" y="18" font-size="14">Relative L2 error of the restored frames beside seconds</text>']
+            '<text x="10" y="18" font-size="14">Relative L2 error of the restored frames over run time</text>']
     with open(path, "w") as file:
         file.write("\n".join(head + out + ["</svg>"]) + "\n")
     return True
 
 
-def stress_rows(rows):  # the worst of each test
+def stress_rows(rows):  # the worst case of each test
     tests = collections.OrderedDict()
     for row in rows:
         tests.setdefault(row["test"], []).append(row)
@@ -250,45 +256,48 @@ def percent(row, key):
 def splat_sections(lines, rows, stress, has_growth):
     peaks = [r for r in rows if r["case"].startswith("machine: ")]
     lines += ["## The machine", "",
-              "What the bench itself reaches: chained multiply-adds, and the fastest of four sweeps over so much memory "
-              "(reading; reading and writing in place; copying through the caches or past them).", ""]
+              "Peaks measured by the bench itself: independent chains of multiply-adds, and the fastest of four sweeps over a "
+              "buffer of the given size (read; read and write in place; copy through the caches; copy with streaming stores).", ""]
     table(lines, ["", "instructions", "threads", "per second"],
           [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
-    lines += ["## Whole renders against double precision", "",
-              "A pair is a splat and a pixel that the reference blends it into. Errors are those of the picture (forward; where "
-              "no yes/no decision of the pixel is within 1e-4 of its threshold) and of the gradient of the means (backward).", ""]
+    lines += ["## Renders against double precision", "",
+              "A pair is one splat blended into one pixel by the reference. Forward errors are those of the image, over pixels "
+              "in which no binary decision is within 1e-4 of its threshold; backward errors are those of the gradient of the "
+              "means.", ""]
     table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M pairs/s", "largest error", "relative L2"],
           [[r["case"], r["isa"], str(r["threads"]), ms(r["seconds"]), ms(r["cpu_seconds"]),
             "%.0f" % (1e-6 * r["rate"]), "%.2g" % r["error_max"], "%.2g" % r["error_rel_l2"]]
            for r in rows if r["case"].startswith(("forward", "backward"))])
     lines += ["## Stages of a training step", "", "![Share of each stage](stages.svg)", "",
-              "Shares are of what the machine reaches above with the same instructions and threads: floating-point operations "
-              "as the kernels' source has them; bytes as each stage must move at least were its caches cold, beside a sweep "
-              "over as much memory as it must touch, or less.", ""]
+              "Shares are relative to the peaks above for the same instruction set and number of threads. Floating-point "
+              "operations are counted from the kernels' source. Bytes are the minimum that each stage must transfer with cold "
+              "caches, compared with a sweep over at most as much memory.", ""]
     table(lines, ["", "instructions", "threads", "ms", "CPU ms", "M/s", "FMA peak", "bandwidth"],
           [[r["case"], r["isa"], str(r["threads"]), ms(r["seconds"]), ms(r["cpu_seconds"]),
             "%s %s" % (short(1e-6 * r["rate"]), r["work_unit"]), percent(r, "peak_share"), percent(r, "bandwidth_share")]
            for r in rows if ": " in r["case"] and not r["case"].startswith(("machine", "visibility", "growth", "lazy", "skip"))])
     skips = [r for r in rows if r["case"].startswith(("skip: ", "lazy: "))]
     if skips:
-        lines += ["## What is left out, and what it saves and costs", "",
-                  "Renders with their backward: the default; splats drawn only in the tiles of their 3-sigma square, as the "
-                  "official rasterizer does (to compare with it; nothing uses it); splats in no spatial order (all other rows "
-                  "have the Morton order of `gsf_splat_sort`). The difference is that of the picture from the default's.", "",
-                  "Lazy Adam: the SH of blocks of splats that no picture of the step shows rest, and catch up when one is "
-                  "drawn again (off by default; `lazy_adam` and `--quality fast` turn it on). Steps in turns on five views; catching up is part "
-                  "of the step, not of its Adam stage. The difference is that of the SH from the dense run's, rounding fed "
-                  "back through all steps: the largest relative to at least 0.2, and in L2. Prescribed gradients leave "
-                  "4.7e-7 after 1,000 steps (`tests/test_trainer.c`).", "",
-                  "Windows that need no restoring, and the three values of `--quality`: see QUALITY.md.", ""]
+        lines += ["## Skipped work: savings and error", "",
+                  "Forward and backward passes: the default; splats drawn only in the tiles of their 3-sigma square, like the "
+                  "rasterizer of Inria's 3DGS (for comparison; not used elsewhere); splats in arbitrary order (all other rows use "
+                  "the Morton order of `gsf_splat_sort`). The difference is that of the image from the default's.", "",
+                  "Lazy Adam: the SH of blocks of splats that are not visible in a step are not updated, and catch up when a "
+                  "splat of the block is drawn again (off by default; turned on by `lazy_adam` and `--quality fast`). Steps "
+                  "alternate between five views; catching up counts as part of the step, not of its Adam stage. The difference "
+                  "is that of the SH from those of the dense run, including rounding fed back through all steps: the largest, "
+                  "relative to at least 0.2, and in L2. With prescribed gradients it is 4.7e-7 after 1,000 steps "
+                  "(`tests/test_trainer.c`).", "",
+                  "For skipped windows and the three values of `--quality`, see QUALITY.md.", ""]
         table(lines, ["", "", "threads", "ms", "CPU ms", "largest difference", "relative L2"],
               [[r["case"][6:], r["variant"], str(r["threads"]), ms(r["seconds"]),
                 ms(r["cpu_seconds"]), "%.1e" % r["error_max"] if "error_max" in r else "",
                 "%.1e" % r["error_rel_l2"] if "error_rel_l2" in r else ""] for r in skips])
     if has_growth:
-        lines += ["## How cost grows", "", "![Seconds by splats, by pixels and by magnification](growth.svg)", "",
-                  "Splats shrink as their number grows, so that about as many lie over a pixel; magnified, less of the "
-                  "same splats is in the frame. All axes are logarithmic, a decade has the same length on each.", ""]
+        lines += ["## Scaling", "", "![Seconds by splats, by pixels and by magnification](growth.svg)", "",
+                  "Splats shrink as their number grows, so that the number that overlaps a pixel stays about the same; under "
+                  "magnification, fewer of the same splats are in the frame. All axes are logarithmic with decades of equal "
+                  "length.", ""]
     filters = [r for r in rows if r["case"].startswith("visibility")]
     if filters:
         lines += ["## Visible-point filter", ""]
@@ -298,7 +307,7 @@ def splat_sections(lines, rows, stress, has_growth):
     steps = [r for r in rows if r["case"] == "train step"]
     if steps:
         lines += ["## Training steps on photos", "",
-                  "Render, loss, gradients and Adam, density control off; medians over %d rounds in turns."
+                  "Render, loss, gradients and Adam with density control off; medians of %d alternating rounds."
                   % max(r["rounds"] for r in steps), ""]
         table(lines, ["", "threads", "ms", "CPU ms", "peak memory"],
               [["ours, " + r["isa"] if r["variant"] == "default" else r["variant"], str(r["threads"]),
@@ -306,18 +315,18 @@ def splat_sections(lines, rows, stress, has_growth):
                 "%.0f MiB" % (r["peak_rss_bytes"] / 2**20) if "peak_rss_bytes" in r else ""] for r in steps])
         ours = [r for r in steps if r["variant"] == "default"]
         for peer in (r for r in steps if r["variant"] != "default"):
-            lines += ["%s takes %.1f times as long, %.1f times the CPU seconds and %.1f times the memory."
+            lines += ["%s takes %.1f times the time, %.1f times the CPU time and %.1f times the memory."
                       % (peer["variant"], peer["seconds"] / ours[0]["seconds"],
                          peer["cpu_seconds"] / ours[0]["cpu_seconds"],
                          peer["peak_rss_bytes"] / ours[0]["peak_rss_bytes"]), ""]
     if stress:
         lines += ["## Worst errors of the stress suite", "",
-                  "`tests/test_stress.c` against double precision, at every instruction set this machine has. A pixel is "
-                  "unclear where a yes/no decision of the reference (alpha = 1/255 and 0.99, T = 1e-4) is within 1e-4 "
-                  "relative of its threshold or two splats are within 1e-6 in depth. Colours lie between 0 and 1; gradients "
-                  "are relative L2 under the same decisions. Limits of ordinary scenes: 2e-5 where clear, 8e-3 where "
-                  "unclear, 2e-4 for gradients; the test gives each harder scene its own.", ""]
-        table(lines, ["", "cases", "pixels", "unclear", "largest error, clear", "unclear", "depth, relative", "gradient",
+                  "`tests/test_stress.c` against double precision, for every instruction set of this machine. A pixel is "
+                  "ambiguous if a binary decision of the reference (alpha = 1/255 and 0.99, T = 1e-4) is within a relative "
+                  "1e-4 of its threshold, or if two splats are within 1e-6 of each other in depth. Colours lie between 0 and "
+                  "1; gradients are in relative L2 under the same decisions. Limits for ordinary scenes: 2e-5 for clear "
+                  "pixels, 8e-3 for ambiguous ones, 2e-4 for gradients; harder scenes have limits of their own in the test.", ""]
+        table(lines, ["", "cases", "pixels", "ambiguous", "largest error, clear", "ambiguous", "depth, relative", "gradient",
                       "other"],
               stress_rows(stress))
 
@@ -327,7 +336,7 @@ def errors(row):
 
 
 def nn_sections(lines, rows, has_pipeline):
-    def peer(row):  # what a row and its peers have in common
+    def peer(row):  # the key that a row shares with its peers
         return row["case"], row["isa"], row["threads"], row["variant"].replace(" products", "").endswith("bf16")
 
     ratios = collections.defaultdict(list)
@@ -336,18 +345,19 @@ def nn_sections(lines, rows, has_pipeline):
     peaks = [r for r in rows if r["case"].startswith("machine: ")]
     kernels = [r for r in rows if "ratio" not in r and not r["case"].startswith(("machine: ", "pipeline: ", "model: "))]
     lines += ["## Kernels of the video model and its encoders", "",
-              "What the same run reaches without any kernel: chained multiply-adds, dot products of integers (of bytes where "
-              "there are instructions for that, else of 16 bits) and of bf16, sweeps over memory as above.", ""]
+              "Peaks measured in the same run: independent chains of multiply-adds, integer dot products (8-bit where there are "
+              "instructions for them, else 16-bit) and bf16 dot products, sweeps over memory as above.", ""]
     table(lines, ["", "instructions", "threads", "per second"],
           [[r["case"][9:], r["isa"], str(r["threads"]), "%.1f G%s" % (1e-9 * r["rate"], r["work_unit"])] for r in peaks])
-    lines += ["At the released model's sizes, the smallest cases at every level of instructions. Shares are of the peaks "
-              "above: 8-bit layers' of the integers', products of bf16 of theirs, all others' of the multiply-adds'; bandwidth "
-              "of a sweep over as much memory, or, where few rows cycle through 1 GiB of weights, of reading it between rounds. "
-              "Errors are against sums in double. The last column is the peers' seconds divided by ours, timed in turns in "
-              "the same run (`bench/peers_nn.py`), the fastest first: PyTorch as it comes, with oneDNN's linear layers on "
-              "weights packed beforehand, and OpenBLAS; in float32, beside our products of bf16 in bf16. 8-bit layers "
-              "quantize what comes in, but for oneDNN's product alone. PyTorch keeps the memory of its results there; "
-              "getting new pages for every large one takes it up to five times as long.", ""]
+    lines += ["Sizes are those of the released model; the smallest cases are measured with every instruction set. Shares are "
+              "relative to the peaks above: of 8-bit layers to the integer peak, of bf16 products to the bf16 peak, of all "
+              "others to the multiply-add peak. Bandwidth is relative to a sweep over as much memory or, where GEMV cases "
+              "cycle through 1 GiB of weights, to reading it between rounds. Errors are relative to sums in double precision. "
+              "The last column is the peers' time divided by ours, timed alternately in the same run (`bench/peers_nn.py`), "
+              "fastest first: PyTorch in its default configuration, PyTorch with oneDNN's linear layers on prepacked weights, "
+              "and OpenBLAS; in float32, or in bf16 where our products are in bf16. 8-bit layers include the quantization of "
+              "their input, except for the rows of oneDNN's product alone. PyTorch reuses the memory of its results here; "
+              "allocating fresh pages for every large result would make it up to five times slower.", ""]
     table(lines, ["", "", "instructions", "threads", "ms", "CPU ms", "peak", "bandwidth", "largest error", "relative L2",
                   "peers / ours"],
           [[r["case"], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), ms(r["seconds"]),
@@ -355,28 +365,30 @@ def nn_sections(lines, rows, has_pipeline):
            + [", ".join(ratios[peer(r)])]
            for r in kernels])
     if has_pipeline:
-        lines += ["## A whole restoration: run time beside error", "", "![Error beside seconds](pipeline.svg)", "",
-                  "A clip of 9 frames by a model of random weights (`make_model --size small`), encoder and decoder included. "
-                  "Such a model's field of velocities is no trained one's: the figures show what each choice costs and how "
-                  "errors rank, not how restored frames look. With strength below 1 the clip starts from the noised render "
-                  "instead of pure noise, which is another answer and not an error of the same one.", ""]
+        lines += ["## A whole restoration: run time against error", "", "![Error over run time](pipeline.svg)", "",
+                  "A clip of 9 frames through a model with random weights (`make_model --size small`), encoder and decoder "
+                  "included. Its velocity field is not that of a trained model: the figures show what each option costs and "
+                  "how the errors rank, not how restored frames look. With a strength below 1, the clip starts from the noised "
+                  "render instead of pure noise; it then converges to a different result, so the difference is not an error.", ""]
         table(lines, ["", "", "seconds", "CPU seconds", "largest error", "relative L2", "against"],
               [[r["case"][10:], r["variant"], short(r["seconds"]), short(r["cpu_seconds"])] + errors(r)
                + [r["reference"] if "error_max" in r else ""] for r in rows if r["case"].startswith("pipeline: ")])
     models = [r for r in rows if r["case"].startswith("model: ")]
     if models:
         lines += ["## The released size", "",
-                  "Random weights in the official layout (`make_model --size full`), 49 frames of 720 x 480: 17,550 video and "
-                  "226 text tokens, 1,850 reference tokens. Memory is anonymous; the weights stay in the mapped files.", ""]
-        table(lines, ["", "", "instructions", "threads", "seconds", "CPU seconds", "TFLOP", "FMA peak", "memory at most"],
-              [[r["case"][7:], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]), short(r["seconds"]), short(r["cpu_seconds"]), short(1e-12 * r["work"]),
+                  "Random weights in the layout of the GSFixer release (`make_model --size full`), 49 frames of 720 x 480: "
+                  "17,550 video and 226 text tokens, 1,850 reference tokens. Memory excludes the weights, which are "
+                  "memory-mapped.", ""]
+        table(lines, ["", "", "instructions", "threads", "seconds", "CPU seconds", "TFLOP", "FMA peak", "peak memory"],
+              [[r["case"][7:], "" if r["variant"] == "default" else r["variant"], r["isa"], str(r["threads"]),
+                short(r["seconds"]), short(r["cpu_seconds"]), short(1e-12 * r["work"]),
                 percent(r, "peak_share"), "%.2f GiB" % (r["peak_rss_bytes"] / 2**30)] for r in models])
 
 
 def write_markdown(path, rows, stress, has_growth, has_pipeline):
-    lines = ["# Speed beside error", "",
-             "Written by `bench/run.sh` on %s, which may have run other work: compare rows of one run, not of two."
-             % machine(), ""]
+    lines = ["# Speed and error", "",
+             "Version %s, measured by `bench/run.sh` on %s. The machine may have run other work at the same time: compare rows "
+             "within one run, not between runs." % (version(), machine()), ""]
     splat_sections(lines, [r for r in rows if r["bench"] != "nn"], stress, has_growth)
     if any(r["bench"] == "nn" for r in rows):
         nn_sections(lines, [r for r in rows if r["bench"] == "nn"], has_pipeline)
@@ -401,7 +413,7 @@ def main():
     above = ["%s, %s, %s, %d threads: %.0f %% of the %s" % (r["case"], r["variant"], r["isa"], r["threads"], 100.0 * r[key], what)
              for r in rows for key, what in (("peak_share", "peak"), ("bandwidth_share", "bandwidth")) if r.get(key, 0.0) > 1.02]
     if above:
-        sys.exit("results: a limit that is exceeded is none:\n  " + "\n  ".join(above))
+        sys.exit("results: shares above 100 %, so that a peak is measured too low:\n  " + "\n  ".join(above))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,20 @@
 #!/usr/bin/env bash
-# bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg, bench/RESULTS.md and (not
-# --quick) README's figures of speed.
-#   SCENE=COLMAP_FOLDER       training steps on its photos as well
-#   START=PLY                 from these splats instead of the scene's points
-#   OPENSPLAT=/path/opensplat and the same steps by OpenSplat in turns with ours, with the ratio (needs SCENE)
-#   ROUNDS=5 STEPS=200        of that comparison
-#   TORCH=python3             and the networks' kernels by the peers that this Python has, with the ratios (peers_nn.py)
-#   MODEL=FOLDER              and one pass of it: about an hour and a half (make_model --size full --parts transformer,vae)
-# About an hour with all peers, forty minutes without (and without MODEL); --quick is a look at it in two. The machine should do nothing else.
+# bench/run.sh [--quick]: builds the benches, runs them and writes bench/results.csv, bench/*.svg, bench/RESULTS.md and, unless
+# --quick is given, the speed table in README.md. Optional measurements, by environment variable:
+#   SCENE=COLMAP_FOLDER         training steps on its photos
+#   START=PLY                   these splats instead of the scene's points as the start
+#   OPENSPLAT=/path/opensplat   the same steps with OpenSplat, alternating with ours, and the ratio (needs SCENE)
+#   ROUNDS=5 STEPS=200          rounds and steps of that comparison
+#   TORCH=python3               the network kernels of the peers that this Python provides, and the ratios (peers_nn.py)
+#   MODEL=FOLDER                one forward pass of this model, about 90 minutes (make_model --size full --parts transformer,vae)
+# Without MODEL it takes about an hour with all peers and forty minutes without peers; --quick takes about two minutes. The
+# machine should be otherwise idle.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 build=${GSF_BUILD:-build}
 quick=()
 [ "${1:-}" = --quick ] && quick=(--quick)
-export OMP_WAIT_POLICY=passive # two workers that spin while they wait take each other's time
+export OMP_WAIT_POLICY=passive # spinning workers would take CPU time from each other
 
 cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release > "$build.cmake.log" 2>&1 || { cat "$build.cmake.log" >&2; exit 1; }
 rm -f "$build.cmake.log"
