@@ -46,13 +46,14 @@
                - frames all have the first camera's intrinsics; here a frame that is a photo's has the photo's
                One thing is corrected in both: views exactly upside down are turned by half a turn, where the released
                code mirrors the world.
+               The released functions that no path here takes (other splines and alignments) are internal: they stand in
+               the implementation, beside those that share their code, and tests/golden_traj.c holds them to their data.
    ERRORS      GSF_ERROR_NUMERIC for NaN and infinity anywhere in the input, GSF_ERROR_DEGENERATE where the geometry
                does not say what to do (one view, parallel axes, coincident cameras, a view along its up vector),
                GSF_ERROR_INVALID_ARGUMENT for the rest. Never a pose that is not a rotation: columns are orthonormal to
                1e-12. On an error outputs are untouched or zeroed.
-   MEMORY      None of its own. `scratch` is the caller's: aligned for double, of as many bytes as the function named
-               beside it returns (SIZE_MAX where that would overflow), contents of no meaning before and after.
-               Inputs and outputs must not overlap unless said.
+   MEMORY      None of its own. `scratch` is the caller's: aligned for double, of layout.scratch_bytes, contents of no
+               meaning before and after. Inputs and outputs must not overlap unless said.
    THREADS     Pure functions; the context is only used for error texts.
    SECTIONS    >>vectors >>order statistics >>eigen >>intrinsics >>poses >>rotations >>views >>normalisation >>splines
                >>ellipse >>windows >>legs >>schedule >>paths
@@ -70,140 +71,20 @@ extern "C" {
 
 // ---- intrinsics ----------------------------------------------------------------
 
-// Field of view of `pixels` pixels at a focal length in pixels, and back.
-GSF_API double gsf_traj_fov_from_focal(double focal, double pixels);
+// Focal length in pixels of a camera that sees `fov` across `pixels` pixels.
 GSF_API double gsf_traj_focal_from_fov(double fov, double pixels);
-// The camera of a model at an image reduced by `factor` (>= 1) whose file turned out to be width x height: intrinsics
-// are divided by factor, then scaled by actual / (model size div factor), as the official parser does. For factor 1
-// it is gsf_camera_resized.
-GSF_API gsf_camera gsf_traj_reduce_camera(const gsf_camera* camera, int32_t factor, int32_t width, int32_t height);
-// The part of the image that starts at pixel (x, y): the principal point moves.
-GSF_API gsf_camera gsf_traj_crop_camera(const gsf_camera* camera, int32_t x, int32_t y, int32_t width, int32_t height);
-// Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the
-// official full projection (near 0.01, far 100). Needs 0 < near_plane < far_plane.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane,
-                                                     double far_plane, double out[16]);
 
 // ---- poses ---------------------------------------------------------------------
 
-// Finite, rigid (1e-4), no reflection? Otherwise the error names the pose.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_check_poses(gsf_context* ctx, const double* poses, size_t count);
 // The pose at `eye` that looks at `target`; `up` is the world direction that points up in the image.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const double target[3],
                                                   const double up[3], double pose[16]);
-// The same from directions: forward becomes column 2, down the side to which column 1 points (official `viewmatrix`).
-GSF_API GSF_NODISCARD gsf_result gsf_traj_view_pose(gsf_context* ctx, const double forward[3], const double down[3],
-                                                    const double position[3], double pose[16]);
-// Unit quaternion (w x y z, w >= 0) of a pose's rotation, and back (any non-zero length; position untouched).
-GSF_API void gsf_traj_pose_quat(const double pose[16], double quat[4]);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]);
-// Spherical interpolation of unit quaternions along the shorter arc; t beyond [0,1] goes on. Half a turn apart: one
-// of the two arcs.
-GSF_API void gsf_traj_slerp(const double a[4], const double b[4], double t, double out[4]);
-// Position linear, rotation slerp. out may be a or b.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
-                                                     double out[16]);
 
 // ---- sets of views -------------------------------------------------------------
 
 // Least-squares point nearest to all optical axes. Degenerate for one view and for parallel axes.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, size_t count,
                                                       double focus[3]);
-// Mean position, mean forward, mean down. official: looks the opposite way, as the released average_pose does.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_average_pose(gsf_context* ctx, const double* poses, size_t count,
-                                                       int32_t official, double pose[16]);
-// Poses relative to their average pose; transform = inverse of that. out may be poses.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_recenter_poses(gsf_context* ctx, const double* poses, size_t count,
-                                                         int32_t official, double* out, double transform[16]);
-// Mean camera position and the largest distance from it. The official scene_scale is radius of all cameras,
-// cameras_extent is 1.1 times radius of the training cameras.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_camera_radius(gsf_context* ctx, const double* poses, size_t count,
-                                                        double center[3], double* radius);
-// Index of the view with the smallest score |position difference| + direction_weight * (1 - forward . forward); the
-// lowest index among equals (to 1e-9). scores: NULL or (count). The official weight is 0.5, in the normalised frame.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_nearest_view(gsf_context* ctx, const double pose[16], const double* poses,
-                                                       size_t count, double direction_weight, int32_t* index,
-                                                       double* scores);
-
-// ---- normalisation -------------------------------------------------------------
-
-typedef enum gsf_traj_center {
-    GSF_TRAJ_CENTER_FOCUS = 0, // median of the points of the optical axes nearest to the mean camera position
-    GSF_TRAJ_CENTER_POSES,     // median camera position
-} gsf_traj_center;
-
-typedef struct gsf_traj_similarity_desc {
-    gsf_traj_center center;
-    int32_t strict_scaling; // the farthest camera comes to distance 1; zero: the median camera
-    int32_t official;       // FOCUS: points of the axes nearest to the world's origin
-} gsf_traj_similarity_desc;
-
-// T that turns the mean camera up vector (minus column 1) to world -y, moves the middle to 0 and scales cameras to
-// distance 1 (official similarity_from_cameras). Degenerate where up vectors cancel or all cameras are in the middle.
-GSF_API size_t gsf_traj_similarity_scratch(size_t count);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_similarity(gsf_context* ctx, const double* poses, size_t count,
-                                                     const gsf_traj_similarity_desc* desc, void* scratch,
-                                                     double transform[16]);
-// Rigid T that moves the points' median to 0 and their principal axes to x, y, z by falling variance (official
-// align_principle_axes). The sign that an eigenvector lacks: the largest component of rows 0 and 1 is positive, the
-// determinant is +1. points (count,3). Degenerate for coincident and collinear points.
-GSF_API size_t gsf_traj_principal_axes_scratch(size_t count);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_principal_axes(gsf_context* ctx, const double* points, size_t count,
-                                                         void* scratch, double transform[16]);
-// Similarity, then principal axes of the points (NULL: of the camera positions; where these lie on a line, the mean up
-// vector decides the third axis). `transform` is the product, as the official parser has it. Points more than five times
-// as far from the median as nine in ten are left out (official: none).
-GSF_API size_t gsf_traj_normalize_scratch(size_t count, size_t point_count);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_normalize(gsf_context* ctx, const double* poses, size_t count,
-                                                    const double* points, size_t point_count,
-                                                    const gsf_traj_similarity_desc* desc, void* scratch,
-                                                    double transform[16]);
-// Principal axes of the positions about their mean, y down on average, largest coordinate 1 (official
-// transform_poses_pca; the same sign rule). out may be poses.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
-                                                    double transform[16]);
-// Applies a similarity; rotations stay rotations. out may be the input.
-GSF_API void gsf_traj_transform_poses(const double transform[16], const double* poses, size_t count, double* out);
-GSF_API void gsf_traj_transform_points(const double transform[16], const double* points, size_t count, double* out);
-// Inverse of a similarity; fails where it is none.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_invert_similarity(gsf_context* ctx, const double transform[16],
-                                                            double out[16]);
-
-// ---- splines -------------------------------------------------------------------
-
-// Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending
-// sites, not-a-knot ends (knots as FITPACK with s = 0 and scipy's make_interp_spline place them). Evaluated at `at`
-// (at_count), which is clamped to the sites' range; out (at_count,dims).
-GSF_API size_t gsf_traj_spline_scratch(size_t count, int32_t degree, size_t dims);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_spline(gsf_context* ctx, const double* sites, const double* values,
-                                                 size_t count, size_t dims, int32_t degree, const double* at,
-                                                 size_t at_count, void* scratch, double* out);
-
-typedef struct gsf_traj_spline_desc {
-    int32_t frames_per_leg; // 16
-    int32_t degree;         // 5 (lowered to count - 1)
-    double axis_length;     // 0.1: arm of the look-at and up points beside the position
-} gsf_traj_spline_desc;
-
-// Spline through (position, position - arm * forward, position + arm * down) of the poses, by chord length;
-// frames_per_leg * (count - 1) poses, the last one excluded (official generate_interpolated_path with smoothness 0;
-// the same for two poses whatever the smoothness). Degenerate where neighbouring poses coincide or directions cancel.
-GSF_API size_t gsf_traj_spline_path_scratch(size_t count, const gsf_traj_spline_desc* desc);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
-                                                      const gsf_traj_spline_desc* desc, void* scratch, double* out);
-
-// Positions by a spline over even sites (degree 1, 2, 3 for 2, 3, more views), rotations slerp, then each pose moved
-// by `push` along its forward axis (official interpolate_camera_path, which draws push from [0, 0.5)). `frames` poses
-// (>= 1), both ends included.
-GSF_API size_t gsf_traj_slerp_path_scratch(size_t count);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_slerp_path(gsf_context* ctx, const double* poses, size_t count,
-                                                     int32_t frames, double push, void* scratch, double* out);
-
-// From pose to pose with straight positions: (count - 1) * (frames_per_leg - 1) + 1 poses, both ends included (official
-// interp_traj). official: the released spacing u = 0, 1/n .. (n-2)/n of each leg, n = frames_per_leg >= 2, and its
-// interpolation of axes, arm 0.1; zero: even spacing, slerp.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_leg_path(gsf_context* ctx, const double* poses, size_t count,
-                                                   int32_t frames_per_leg, int32_t official, double* out);
 
 // ---- ellipse -------------------------------------------------------------------
 
@@ -214,24 +95,8 @@ typedef struct gsf_traj_ellipse_desc {
     double pitch_degrees; // every view is turned by this about its own x axis
 } gsf_traj_ellipse_desc;
 
-// The official parameters of an outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round, a
-// random z_phase (from seed and round). frames 0 = 85.
-GSF_API gsf_traj_ellipse_desc gsf_traj_round_ellipse(int32_t round, uint64_t seed, int32_t frames);
-// Closed loop in the xy plane about the focus point of the poses, which must be normalised. Half axes are 1.2 times the
-// 90th percentile of |position - focus|; views look at the focus; down is the axis nearest to the mean column 1.
-GSF_API size_t gsf_traj_ellipse_scratch(size_t count);
-GSF_API GSF_NODISCARD gsf_result gsf_traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
-                                                       const gsf_traj_ellipse_desc* desc, void* scratch, double* out);
+// ---- schedule ------------------------------------------------------------------
 
-// ---- windows and schedule ------------------------------------------------------
-
-// Frames of one window: `side` from the first reference to the ellipse, `middle` on it, `side` to the last reference.
-// middle + 2 side = window_length; 49 gives 16 and 17. Needs window_length >= 2.
-GSF_API void gsf_traj_split_window(int32_t window_length, int32_t* side, int32_t* middle);
-// The released table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL =
-// only the count is wanted). Fails where the table leaves the sequence (total < middle, mostly).
-GSF_API GSF_NODISCARD gsf_result gsf_traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle,
-                                                           int32_t* starts, int32_t* overlaps, int32_t* count);
 // Weight of the generative loss, between iterations start and until (0 elsewhere): lambda * sin(x), x from 0 to pi
 // (official: falls again in the second half) or to pi/2 (the paper: gradually increased).
 GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
@@ -258,9 +123,10 @@ typedef struct gsf_traj_path_desc {
     const double* points;    // (point_count,3) world points for the principal axes, borrowed; NULL = camera positions
     size_t point_count;
     const double* transform; // world to normalised frame, [16], for a host that has it from more cameras than these;
-                             // NULL = gsf_traj_normalize of these cameras and points
-    const gsf_traj_ellipse_desc* ellipse; // the loop's shape, its frames field not used; NULL =
-                             // gsf_traj_round_ellipse(round, seed)
+                             // NULL = from these cameras and points
+    const gsf_traj_ellipse_desc* ellipse; // the loop's shape, its frames field not used; NULL = the official one of an
+                             // outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round and a
+                             // z_phase drawn from seed and round
     const gsf_camera* intrinsics; // size and intrinsics of the frames; NULL = those of the first camera
     int32_t official;        // REFERENCE: the released windows (length 3n+1, count by its table over ellipse_poses =
                              // 85), spacing and interpolation; all kinds: the released similarity. See OFFICIAL
@@ -504,28 +370,14 @@ static void gsf__traj_fix_axes(const double values[3], double rows[9]) {
 
 // ---- >>intrinsics --------------------------------------------------------------
 
-GSF_API double gsf_traj_fov_from_focal(double focal, double pixels) { return 2.0 * atan(pixels / (2.0 * focal)); }
+// Field of view of `pixels` pixels at a focal length in pixels.
+GSF__SHARED double gsf__traj_fov_from_focal(double focal, double pixels) { return 2.0 * atan(pixels / (2.0 * focal)); }
 GSF_API double gsf_traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
 
-GSF_API gsf_camera gsf_traj_reduce_camera(const gsf_camera* camera, int32_t factor, int32_t width, int32_t height) {
-    gsf_camera model = *camera; // at the size that is `factor` times the whole pixels of the reduced image
-    const int32_t f = factor < 1 ? 1 : factor;
-    model.width = camera->width < f ? f : camera->width / f * f;
-    model.height = camera->height < f ? f : camera->height / f * f;
-    return gsf_camera_resized(&model, width, height);
-}
-
-GSF_API gsf_camera gsf_traj_crop_camera(const gsf_camera* camera, int32_t x, int32_t y, int32_t width, int32_t height) {
-    gsf_camera out = *camera;
-    out.cx -= x;
-    out.cy -= y;
-    out.width = width;
-    out.height = height;
-    return out;
-}
-
-GSF_API gsf_result gsf_traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane, double far_plane,
-                                       double out[16]) {
+// Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the
+// official full projection (near 0.01, far 100). Needs 0 < near_plane < far_plane.
+GSF__SHARED gsf_result gsf__traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane,
+                                            double far_plane, double out[16]) {
     GSF__TRY(gsf_check_camera(ctx, camera));
     if (!isfinite(near_plane) || !isfinite(far_plane))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "projection: planes %g, %g", near_plane, far_plane);
@@ -545,7 +397,8 @@ GSF_API gsf_result gsf_traj_projection(gsf_context* ctx, const gsf_camera* camer
 
 // ---- >>poses -------------------------------------------------------------------
 
-GSF_API gsf_result gsf_traj_check_poses(gsf_context* ctx, const double* poses, size_t count) {
+// Finite, rigid (1e-4), no reflection? Otherwise the error names the pose.
+static gsf_result gsf__traj_check_poses(gsf_context* ctx, const double* poses, size_t count) {
     if (!poses && count) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "poses: none given");
     for (size_t n = 0; n < count; n++) {
         const double* m = poses + 16 * n;
@@ -571,7 +424,8 @@ static gsf_result gsf__traj_check_path(gsf_context* ctx, double* poses, size_t c
     return gsf_fail(ctx, GSF_ERROR_NUMERIC, "path: coordinates are too large to compute with");
 }
 
-GSF_API gsf_result gsf_traj_view_pose(gsf_context* ctx, const double forward[3], const double down[3],
+// The same from directions: forward becomes column 2, down the side to which column 1 points (official `viewmatrix`).
+static gsf_result gsf__traj_view_pose(gsf_context* ctx, const double forward[3], const double down[3],
                                       const double position[3], double pose[16]) {
     if (!gsf__traj_finite(forward, 3) || !gsf__traj_finite(down, 3) || !gsf__traj_finite(position, 3))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "view: a direction or the position is not finite");
@@ -588,12 +442,12 @@ GSF_API gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const
     const double down[3] = {-up[0], -up[1], -up[2]};
     if (!(gsf__traj_length(forward) > 1e-14 * (gsf__traj_max_abs(eye) + gsf__traj_max_abs(target))))
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "look-at: the target is where the eye is");
-    return gsf_traj_view_pose(ctx, forward, down, eye, pose);
+    return gsf__traj_view_pose(ctx, forward, down, eye, pose);
 }
 
 // ---- >>rotations ---------------------------------------------------------------
 
-GSF_API void gsf_traj_pose_quat(const double m[16], double quat[4]) {
+static void gsf__traj_pose_quat(const double m[16], double quat[4]) {
     // Four times the squares of w, x, y, z; the largest is the safe one to divide by (Shepperd 1978).
     const double s[4] = {1.0 + m[0] + m[5] + m[10], 1.0 + m[0] - m[5] - m[10], 1.0 - m[0] + m[5] - m[10],
                          1.0 - m[0] - m[5] + m[10]};
@@ -629,7 +483,8 @@ static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
     pose[15] = 1.0;
 }
 
-GSF_API gsf_result gsf_traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]) {
+// Unit quaternion (w x y z, w >= 0) of a pose's rotation, and back (any non-zero length; position untouched).
+GSF__SHARED gsf_result gsf__traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]) {
     if (!gsf__traj_finite(quat, 4)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "quaternion: a value is not finite");
     double most = 0.0, unit[4];
     for (int i = 0; i < 4; i++)
@@ -640,7 +495,9 @@ GSF_API gsf_result gsf_traj_set_pose_quat(gsf_context* ctx, const double quat[4]
     return GSF_OK;
 }
 
-GSF_API void gsf_traj_slerp(const double a[4], const double b[4], double t, double out[4]) {
+// Spherical interpolation of unit quaternions along the shorter arc; t beyond [0,1] goes on. Half a turn apart: one
+// of the two arcs.
+static void gsf__traj_slerp(const double a[4], const double b[4], double t, double out[4]) {
     double dot = 0.0, apart = 0.0, along = 0.0, q[4];
     for (int i = 0; i < 4; i++) dot += a[i] * b[i];
     const double sign = dot < 0.0 ? -1.0 : 1.0;
@@ -666,18 +523,19 @@ GSF_API void gsf_traj_slerp(const double a[4], const double b[4], double t, doub
 
 static void gsf__traj_blend_poses(const double a[16], const double b[16], double t, double out[16]) {
     double qa[4], qb[4], q[4], position[3];
-    gsf_traj_pose_quat(a, qa);
-    gsf_traj_pose_quat(b, qb);
-    gsf_traj_slerp(qa, qb, t, q);
+    gsf__traj_pose_quat(a, qa);
+    gsf__traj_pose_quat(b, qb);
+    gsf__traj_slerp(qa, qb, t, q);
     for (int i = 0; i < 3; i++) position[i] = a[12 + i] + (b[12 + i] - a[12 + i]) * t;
     gsf__traj_quat_axes(q, out);
     memcpy(out + 12, position, sizeof position);
 }
 
-GSF_API gsf_result gsf_traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
-                                       double out[16]) {
-    GSF__TRY(gsf_traj_check_poses(ctx, a, 1));
-    GSF__TRY(gsf_traj_check_poses(ctx, b, 1));
+// Position linear, rotation slerp. out may be a or b.
+GSF__SHARED gsf_result gsf__traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
+                                            double out[16]) {
+    GSF__TRY(gsf__traj_check_poses(ctx, a, 1));
+    GSF__TRY(gsf__traj_check_poses(ctx, b, 1));
     if (!isfinite(t)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "slerp: t is %g", t);
     gsf__traj_blend_poses(a, b, t, out);
     return gsf__traj_check_path(ctx, out, 1);
@@ -687,7 +545,7 @@ GSF_API gsf_result gsf_traj_slerp_pose(gsf_context* ctx, const double a[16], con
 
 static gsf_result gsf__traj_check_views(gsf_context* ctx, const char* what, const double* poses, size_t count) {
     if (count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: no view", what);
-    return gsf_traj_check_poses(ctx, poses, count);
+    return gsf__traj_check_poses(ctx, poses, count);
 }
 
 // Mean of a column of the poses (0..3), summed as differences from the first so that far-off scenes keep their digits.
@@ -741,7 +599,8 @@ GSF_API gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, s
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_traj_average_pose(gsf_context* ctx, const double* poses, size_t count, int32_t official,
+// Mean position, mean forward, mean down. official: looks the opposite way, as the released average_pose does.
+static gsf_result gsf__traj_average_pose(gsf_context* ctx, const double* poses, size_t count, int32_t official,
                                          double pose[16]) {
     GSF__TRY(gsf__traj_check_views(ctx, "average pose", poses, count));
     double position[3], forward[3], down[3];
@@ -757,10 +616,11 @@ GSF_API gsf_result gsf_traj_average_pose(gsf_context* ctx, const double* poses, 
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_traj_recenter_poses(gsf_context* ctx, const double* poses, size_t count, int32_t official,
-                                           double* out, double transform[16]) {
+// Poses relative to their average pose; transform = inverse of that. out may be poses.
+GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* poses, size_t count, int32_t official,
+                                                double* out, double transform[16]) {
     double average[16];
-    GSF__TRY(gsf_traj_average_pose(ctx, poses, count, official, average));
+    GSF__TRY(gsf__traj_average_pose(ctx, poses, count, official, average));
     gsf_mat4_rigid_inverse(average, transform);
     for (size_t n = 0; n < count; n++) {
         double local[16];
@@ -774,8 +634,10 @@ GSF_API gsf_result gsf_traj_recenter_poses(gsf_context* ctx, const double* poses
     return gsf__traj_check_path(ctx, out, count);
 }
 
-GSF_API gsf_result gsf_traj_camera_radius(gsf_context* ctx, const double* poses, size_t count, double center[3],
-                                          double* radius) {
+// Mean camera position and the largest distance from it. The official scene_scale is radius of all cameras,
+// cameras_extent is 1.1 times radius of the training cameras.
+GSF__SHARED gsf_result gsf__traj_camera_radius(gsf_context* ctx, const double* poses, size_t count, double center[3],
+                                               double* radius) {
     GSF__TRY(gsf__traj_check_views(ctx, "camera radius", poses, count));
     gsf__traj_mean_column(poses, count, 3, center);
     *radius = 0.0;
@@ -786,11 +648,13 @@ GSF_API gsf_result gsf_traj_camera_radius(gsf_context* ctx, const double* poses,
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_traj_nearest_view(gsf_context* ctx, const double pose[16], const double* poses, size_t count,
+// Index of the view with the smallest score |position difference| + direction_weight * (1 - forward . forward); the
+// lowest index among equals (to 1e-9). scores: NULL or (count). The official weight is 0.5, in the normalised frame.
+static gsf_result gsf__traj_nearest_view(gsf_context* ctx, const double pose[16], const double* poses, size_t count,
                                          double direction_weight, int32_t* index, double* scores) {
     *index = 0;
     GSF__TRY(gsf__traj_check_views(ctx, "nearest view", poses, count));
-    GSF__TRY(gsf_traj_check_poses(ctx, pose, 1));
+    GSF__TRY(gsf__traj_check_poses(ctx, pose, 1));
     if (!isfinite(direction_weight))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "nearest view: direction weight is %g", direction_weight);
     if (count > INT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "nearest view: %zu views", count);
@@ -829,11 +693,22 @@ static void gsf__traj_upright(const double u[3], double r[9]) {
         }
 }
 
-GSF_API size_t gsf_traj_similarity_scratch(size_t count) { return gsf__traj_size_mul(count, 7 * sizeof(double)); }
+typedef enum gsf__traj_center {
+    GSF_TRAJ_CENTER_FOCUS = 0, // median of the points of the optical axes nearest to the mean camera position
+    GSF_TRAJ_CENTER_POSES,     // median camera position
+} gsf__traj_center;
+
+typedef struct gsf__traj_similarity_desc {
+    gsf__traj_center center;
+    int32_t strict_scaling; // the farthest camera comes to distance 1; zero: the median camera
+    int32_t official;       // FOCUS: points of the axes nearest to the world's origin
+} gsf__traj_similarity_desc;
+
+static size_t gsf__traj_similarity_scratch(size_t count) { return gsf__traj_size_mul(count, 7 * sizeof(double)); }
 
 // magnitude: size of the coordinates before an origin was subtracted; what is smaller by 1e-13 is rounding.
-static gsf_result gsf__traj_similarity(gsf_context* ctx, const double* poses, size_t count,
-                                       const gsf_traj_similarity_desc* desc, double magnitude, double* work,
+static gsf_result gsf__traj_solve_similarity(gsf_context* ctx, const double* poses, size_t count,
+                                       const gsf__traj_similarity_desc* desc, double magnitude, double* work,
                                        double transform[16]) {
     double ups[3], r[9], middle[3], mean[3] = {0.0, 0.0, 0.0};
     gsf__traj_mean_column(poses, count, 1, ups);
@@ -886,25 +761,28 @@ static double gsf__traj_magnitude(const double* points, size_t count, size_t str
     return most;
 }
 
-static gsf_result gsf__traj_check_center(gsf_context* ctx, const gsf_traj_similarity_desc* desc) {
+static gsf_result gsf__traj_check_center(gsf_context* ctx, const gsf__traj_similarity_desc* desc) {
     if (desc && desc->center != GSF_TRAJ_CENTER_FOCUS && desc->center != GSF_TRAJ_CENTER_POSES)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "similarity: center is %d", (int)desc->center);
     return GSF_OK;
 }
 
-static gsf_traj_similarity_desc gsf__traj_similarity_desc_defaults(const gsf_traj_similarity_desc* desc) {
-    gsf_traj_similarity_desc out;
+static gsf__traj_similarity_desc gsf__traj_similarity_desc_defaults(const gsf__traj_similarity_desc* desc) {
+    gsf__traj_similarity_desc out;
     memset(&out, 0, sizeof out);
     if (desc) out = *desc;
     return out;
 }
 
-GSF_API gsf_result gsf_traj_similarity(gsf_context* ctx, const double* poses, size_t count,
-                                       const gsf_traj_similarity_desc* desc, void* scratch, double transform[16]) {
+// T that turns the mean camera up vector (minus column 1) to world -y, moves the middle to 0 and scales cameras to
+// distance 1 (official similarity_from_cameras). Degenerate where up vectors cancel or all cameras are in the middle.
+GSF__SHARED gsf_result gsf__traj_similarity(gsf_context* ctx, const double* poses, size_t count,
+                                            const gsf__traj_similarity_desc* desc, void* scratch, double transform[16]) {
     GSF__TRY(gsf__traj_check_center(ctx, desc));
     GSF__TRY(gsf__traj_check_views(ctx, "similarity", poses, count));
-    const gsf_traj_similarity_desc d = gsf__traj_similarity_desc_defaults(desc);
-    return gsf__traj_similarity(ctx, poses, count, &d, gsf__traj_magnitude(poses + 12, count, 16), (double*)scratch,
+    const gsf__traj_similarity_desc d = gsf__traj_similarity_desc_defaults(desc);
+    return gsf__traj_solve_similarity(ctx, poses, count, &d, gsf__traj_magnitude(poses + 12, count, 16),
+                                      (double*)scratch,
                                 transform);
 }
 
@@ -1004,26 +882,29 @@ static void gsf__traj_cloud_init(gsf__traj_cloud* cloud, const double* points, s
     gsf__traj_identity(cloud->transform);
 }
 
-GSF_API size_t gsf_traj_principal_axes_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
+static size_t gsf__traj_principal_axes_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
 
-GSF_API gsf_result gsf_traj_principal_axes(gsf_context* ctx, const double* points, size_t count, void* scratch,
-                                           double transform[16]) {
+// Rigid T that moves the points' median to 0 and their principal axes to x, y, z by falling variance (official
+// align_principle_axes). The sign that an eigenvector lacks: the largest component of rows 0 and 1 is positive, the
+// determinant is +1. points (count,3). Degenerate for coincident and collinear points.
+GSF__SHARED gsf_result gsf__traj_principal_axes(gsf_context* ctx, const double* points, size_t count, void* scratch,
+                                                double transform[16]) {
     gsf__traj_cloud cloud;
     gsf__traj_cloud_init(&cloud, points, points ? count : 0, 3);
     return gsf__traj_cloud_axes(ctx, &cloud, NULL, (double*)scratch, transform);
 }
 
-GSF_API size_t gsf_traj_normalize_scratch(size_t count, size_t point_count) {
-    return gsf__traj_size_max(gsf_traj_similarity_scratch(count), gsf_traj_principal_axes_scratch(point_count));
+static size_t gsf__traj_normalize_scratch(size_t count, size_t point_count) {
+    return gsf__traj_size_max(gsf__traj_similarity_scratch(count), gsf__traj_principal_axes_scratch(point_count));
 }
 
-// As the public function; poses are relative to `origin`, points are not.
-static gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
+// As gsf__traj_normalize; poses are relative to `origin`, points are not.
+static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, size_t count, const double* points,
                                       size_t point_count, const double origin[3], double magnitude,
-                                      const gsf_traj_similarity_desc* desc, double* work, double transform[16]) {
+                                      const gsf__traj_similarity_desc* desc, double* work, double transform[16]) {
     static const double up[3] = {0.0, -1.0, 0.0}; // where the similarity turns the mean up vector
     double first[16], second[16];
-    GSF__TRY(gsf__traj_similarity(ctx, poses, count, desc, magnitude, work, first));
+    GSF__TRY(gsf__traj_solve_similarity(ctx, poses, count, desc, magnitude, work, first));
     gsf__traj_cloud cloud;
     if (points && point_count) {
         gsf__traj_cloud_init(&cloud, points, point_count, 3);
@@ -1038,19 +919,45 @@ static gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, siz
     return gsf__traj_check_path(ctx, transform, 1);
 }
 
-GSF_API gsf_result gsf_traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
-                                      size_t point_count, const gsf_traj_similarity_desc* desc, void* scratch,
-                                      double transform[16]) {
+// Similarity, then principal axes of the points (NULL: of the camera positions; where these lie on a line, the mean up
+// vector decides the third axis). `transform` is the product, as the official parser has it. Points more than five times
+// as far from the median as nine in ten are left out (official: none).
+GSF__SHARED gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
+                                           size_t point_count, const gsf__traj_similarity_desc* desc, void* scratch,
+                                           double transform[16]) {
     static const double origin[3] = {0.0, 0.0, 0.0};
     GSF__TRY(gsf__traj_check_center(ctx, desc));
     GSF__TRY(gsf__traj_check_views(ctx, "normalisation", poses, count));
-    const gsf_traj_similarity_desc d = gsf__traj_similarity_desc_defaults(desc);
-    return gsf__traj_normalize(ctx, poses, count, points, point_count, origin,
+    const gsf__traj_similarity_desc d = gsf__traj_similarity_desc_defaults(desc);
+    return gsf__traj_solve_frame(ctx, poses, count, points, point_count, origin,
                                gsf__traj_magnitude(poses + 12, count, 16), &d, (double*)scratch, transform);
 }
 
-GSF_API gsf_result gsf_traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
-                                      double transform[16]) {
+// Applies a similarity; rotations stay rotations. out may be the input.
+static void gsf__traj_transform_poses(const double transform[16], const double* poses, size_t count, double* out) {
+    double rotation[16];
+    const double row[3] = {transform[0], transform[4], transform[8]};
+    const double scale = gsf__traj_length(row);
+    gsf__traj_identity(rotation);
+    for (int c = 0; c < 3; c++)
+        for (int r = 0; r < 3; r++) rotation[4 * c + r] = transform[4 * c + r] / scale;
+    for (size_t n = 0; n < count; n++) {
+        double position[3];
+        gsf__traj_apply(transform, poses + 16 * n + 12, position);
+        gsf_mat4_mul(rotation, poses + 16 * n, out + 16 * n);
+        memcpy(out + 16 * n + 12, position, sizeof position);
+    }
+}
+
+GSF__SHARED void gsf__traj_transform_points(const double transform[16], const double* points, size_t count,
+                                            double* out) {
+    for (size_t n = 0; n < count; n++) gsf__traj_apply(transform, points + 3 * n, out + 3 * n);
+}
+
+// Principal axes of the positions about their mean, y down on average, largest coordinate 1 (official
+// transform_poses_pca; the same sign rule). out may be poses.
+GSF__SHARED gsf_result gsf__traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
+                                           double transform[16]) {
     GSF__TRY(gsf__traj_check_views(ctx, "principal axes", poses, count));
     double mean[3], scatter[9], values[3], rows[9], y_axis[3];
     gsf__traj_mean_column(poses, count, 3, mean);
@@ -1085,27 +992,8 @@ GSF_API gsf_result gsf_traj_pca_poses(gsf_context* ctx, const double* poses, siz
         transform[12 + i] = -gsf__traj_dot(rows + 3 * i, mean) / most;
     }
     GSF__TRY(gsf__traj_check_path(ctx, transform, 1));
-    gsf_traj_transform_poses(transform, poses, count, out);
+    gsf__traj_transform_poses(transform, poses, count, out);
     return GSF_OK;
-}
-
-GSF_API void gsf_traj_transform_poses(const double transform[16], const double* poses, size_t count, double* out) {
-    double rotation[16];
-    const double row[3] = {transform[0], transform[4], transform[8]};
-    const double scale = gsf__traj_length(row);
-    gsf__traj_identity(rotation);
-    for (int c = 0; c < 3; c++)
-        for (int r = 0; r < 3; r++) rotation[4 * c + r] = transform[4 * c + r] / scale;
-    for (size_t n = 0; n < count; n++) {
-        double position[3];
-        gsf__traj_apply(transform, poses + 16 * n + 12, position);
-        gsf_mat4_mul(rotation, poses + 16 * n, out + 16 * n);
-        memcpy(out + 16 * n + 12, position, sizeof position);
-    }
-}
-
-GSF_API void gsf_traj_transform_points(const double transform[16], const double* points, size_t count, double* out) {
-    for (size_t n = 0; n < count; n++) gsf__traj_apply(transform, points + 3 * n, out + 3 * n);
 }
 
 static gsf_result gsf__traj_check_similarity(gsf_context* ctx, const double t[16]) {
@@ -1126,7 +1014,8 @@ static gsf_result gsf__traj_check_similarity(gsf_context* ctx, const double t[16
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_traj_invert_similarity(gsf_context* ctx, const double transform[16], double out[16]) {
+// Inverse of a similarity; fails where it is none.
+static gsf_result gsf__traj_invert_similarity(gsf_context* ctx, const double transform[16], double out[16]) {
     GSF__TRY(gsf__traj_check_similarity(ctx, transform));
     const double scale = gsf__traj_length(transform);
     double rotation[9], inverse[16]; // rotation row-major
@@ -1246,19 +1135,22 @@ static void gsf__traj_eval_curve(const gsf__traj_curve* curve, double u, double*
     }
 }
 
-GSF_API size_t gsf_traj_spline_scratch(size_t count, int32_t degree, size_t dims) {
+static size_t gsf__traj_spline_scratch(size_t count, int32_t degree, size_t dims) {
     if (degree < 1 || degree > GSF__TRAJ_DEGREE_MAX) return SIZE_MAX;
     return gsf__traj_size_mul(gsf__traj_curve_doubles(count, degree, dims), sizeof(double));
 }
 
-GSF_API gsf_result gsf_traj_spline(gsf_context* ctx, const double* sites, const double* values, size_t count,
-                                   size_t dims, int32_t degree, const double* at, size_t at_count, void* scratch,
-                                   double* out) {
+// Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending
+// sites, not-a-knot ends (knots as FITPACK with s = 0 and scipy's make_interp_spline place them). Evaluated at `at`
+// (at_count), which is clamped to the sites' range; out (at_count,dims).
+GSF__SHARED gsf_result gsf__traj_spline(gsf_context* ctx, const double* sites, const double* values, size_t count,
+                                        size_t dims, int32_t degree, const double* at, size_t at_count, void* scratch,
+                                        double* out) {
     if (degree < 1 || degree > GSF__TRAJ_DEGREE_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline: degree %d is not 1..5", (int)degree);
     if (count < (size_t)degree + 1)
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline: %zu values for degree %d", count, (int)degree);
-    if (gsf_traj_spline_scratch(count, degree, dims) == SIZE_MAX)
+    if (gsf__traj_spline_scratch(count, degree, dims) == SIZE_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline: %zu x %zu values", count, dims);
     if (!gsf__traj_finite(sites, count) || !gsf__traj_finite(values, count * dims) || !gsf__traj_finite(at, at_count))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline: a value is not finite");
@@ -1271,8 +1163,14 @@ GSF_API gsf_result gsf_traj_spline(gsf_context* ctx, const double* sites, const 
     return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline: values are too large to compute with");
 }
 
-static gsf_traj_spline_desc gsf__traj_spline_desc_defaults(const gsf_traj_spline_desc* desc, size_t count) {
-    gsf_traj_spline_desc out;
+typedef struct gsf__traj_spline_desc {
+    int32_t frames_per_leg; // 16
+    int32_t degree;         // 5 (lowered to count - 1)
+    double axis_length;     // 0.1: arm of the look-at and up points beside the position
+} gsf__traj_spline_desc;
+
+static gsf__traj_spline_desc gsf__traj_spline_desc_defaults(const gsf__traj_spline_desc* desc, size_t count) {
+    gsf__traj_spline_desc out;
     memset(&out, 0, sizeof out);
     if (desc) out = *desc;
     if (out.frames_per_leg == 0) out.frames_per_leg = 16;
@@ -1282,7 +1180,7 @@ static gsf_traj_spline_desc gsf__traj_spline_desc_defaults(const gsf_traj_spline
     return out;
 }
 
-static gsf_result gsf__traj_check_spline(gsf_context* ctx, const gsf_traj_spline_desc* d) {
+static gsf_result gsf__traj_check_spline(gsf_context* ctx, const gsf__traj_spline_desc* d) {
     if (d->frames_per_leg < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline path: %d frames per leg", (int)d->frames_per_leg);
     if (d->degree < 1 || d->degree > GSF__TRAJ_DEGREE_MAX)
@@ -1294,16 +1192,19 @@ static gsf_result gsf__traj_check_spline(gsf_context* ctx, const gsf_traj_spline
     return GSF_OK;
 }
 
-GSF_API size_t gsf_traj_spline_path_scratch(size_t count, const gsf_traj_spline_desc* desc) {
-    const gsf_traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
+GSF__SHARED size_t gsf__traj_spline_path_scratch(size_t count, const gsf__traj_spline_desc* desc) {
+    const gsf__traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
     if (d.degree < 1 || d.degree > GSF__TRAJ_DEGREE_MAX) return SIZE_MAX;
     const size_t rows = gsf__traj_size_mul(count, 10); // 9 coordinates and the site of each pose
     return gsf__traj_size_mul(gsf__traj_size_add(rows, gsf__traj_curve_doubles(count, d.degree, 9)), sizeof(double));
 }
 
-GSF_API gsf_result gsf_traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
-                                        const gsf_traj_spline_desc* desc, void* scratch, double* out) {
-    const gsf_traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
+// Spline through (position, position - arm * forward, position + arm * down) of the poses, by chord length;
+// frames_per_leg * (count - 1) poses, the last one excluded (official generate_interpolated_path with smoothness 0;
+// the same for two poses whatever the smoothness). Degenerate where neighbouring poses coincide or directions cancel.
+GSF__SHARED gsf_result gsf__traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
+                                             const gsf__traj_spline_desc* desc, void* scratch, double* out) {
+    const gsf__traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
     GSF__TRY(gsf__traj_check_spline(ctx, &d));
     GSF__TRY(gsf__traj_check_views(ctx, "spline path", poses, count));
     if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline path: one view");
@@ -1348,7 +1249,7 @@ GSF_API gsf_result gsf_traj_spline_path(gsf_context* ctx, const double* poses, s
     return gsf__traj_check_path(ctx, out, frames);
 }
 
-GSF_API size_t gsf_traj_slerp_path_scratch(size_t count) {
+static size_t gsf__traj_slerp_path_scratch(size_t count) {
     const int degree = count < 3 ? 1 : count < 4 ? 2 : 3;
     const size_t rows = gsf__traj_size_mul(count, 4); // site and position of each pose
     return gsf__traj_size_mul(gsf__traj_size_add(rows, gsf__traj_curve_doubles(count, degree, 3)), sizeof(double));
@@ -1376,8 +1277,11 @@ static void gsf__traj_eval_glide(const gsf__traj_curve* curve, const double* pos
     for (int i = 0; i < 3; i++) out[12 + i] = poses[12 + i] + position[i];
 }
 
-GSF_API gsf_result gsf_traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames, double push,
-                                       void* scratch, double* out) {
+// Positions by a spline over even sites (degree 1, 2, 3 for 2, 3, more views), rotations slerp, then each pose moved
+// by `push` along its forward axis (official interpolate_camera_path, which draws push from [0, 0.5)). `frames` poses
+// (>= 1), both ends included.
+GSF__SHARED gsf_result gsf__traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames,
+                                            double push, void* scratch, double* out) {
     GSF__TRY(gsf__traj_check_views(ctx, "slerp path", poses, count));
     if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "slerp path: one view");
     if (frames < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "slerp path: %d frames", (int)frames);
@@ -1396,7 +1300,9 @@ GSF_API gsf_result gsf_traj_slerp_path(gsf_context* ctx, const double* poses, si
 
 // ---- >>ellipse -----------------------------------------------------------------
 
-GSF_API gsf_traj_ellipse_desc gsf_traj_round_ellipse(int32_t round, uint64_t seed, int32_t frames) {
+// The official parameters of an outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round, a
+// random z_phase (from seed and round). frames 0 = 85.
+static gsf_traj_ellipse_desc gsf__traj_round_ellipse(int32_t round, uint64_t seed, int32_t frames) {
     gsf_traj_ellipse_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.frames = frames;
@@ -1422,7 +1328,7 @@ static gsf_result gsf__traj_check_ellipse(gsf_context* ctx, const gsf_traj_ellip
     return GSF_OK;
 }
 
-GSF_API size_t gsf_traj_ellipse_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
+static size_t gsf__traj_ellipse_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
 
 // generate_ellipse_path of outpaint/sample_utils.py (after multinerf), its random sign, which is never used, left out.
 static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_t count, const gsf_traj_ellipse_desc* desc,
@@ -1470,8 +1376,10 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
     return gsf__traj_check_path(ctx, out, (size_t)d.frames);
 }
 
-GSF_API gsf_result gsf_traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
-                                         const gsf_traj_ellipse_desc* desc, void* scratch, double* out) {
+// Closed loop in the xy plane about the focus point of the poses, which must be normalised. Half axes are 1.2 times the
+// 90th percentile of |position - focus|; views look at the focus; down is the axis nearest to the mean column 1.
+GSF__SHARED gsf_result gsf__traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
+                                              const gsf_traj_ellipse_desc* desc, void* scratch, double* out) {
     const gsf_traj_ellipse_desc d = gsf__traj_ellipse_desc_defaults(desc);
     double focus[3];
     GSF__TRY(gsf__traj_check_ellipse(ctx, &d));
@@ -1481,7 +1389,9 @@ GSF_API gsf_result gsf_traj_ellipse_path(gsf_context* ctx, const double* poses, 
 
 // ---- >>windows -----------------------------------------------------------------
 
-GSF_API void gsf_traj_split_window(int32_t window_length, int32_t* side, int32_t* middle) {
+// Frames of one window: `side` from the first reference to the ellipse, `middle` on it, `side` to the last reference.
+// middle + 2 side = window_length; 49 gives 16 and 17. Needs window_length >= 2.
+static void gsf__traj_split_window(int32_t window_length, int32_t* side, int32_t* middle) {
     *side = window_length < 2 ? 0 : window_length / 3 + (window_length % 3 == 2);
     *middle = window_length - 2 * *side;
 }
@@ -1505,8 +1415,10 @@ static int64_t gsf__traj_table_start(gsf__traj_table table, int64_t w) {
                                  : (w - 1) * (table.middle - table.each) + table.middle - table.last;
 }
 
-GSF_API gsf_result gsf_traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
-                                             int32_t* overlaps, int32_t* count) {
+// The released table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL =
+// only the count is wanted). Fails where the table leaves the sequence (total < middle, mostly).
+GSF__SHARED gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
+                                                  int32_t* overlaps, int32_t* count) {
     *count = 0;
     if (middle < 1 || total < middle)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "windows: no window of %d in %d poses", (int)middle,
@@ -1537,8 +1449,11 @@ static int gsf__traj_blend_axes(const double a[16], const double b[16], double t
     return gsf__traj_length(forward) > 1e-9 && gsf__traj_axes(forward, down, position, out);
 }
 
-GSF_API gsf_result gsf_traj_leg_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames_per_leg,
-                                     int32_t official, double* out) {
+// From pose to pose with straight positions: (count - 1) * (frames_per_leg - 1) + 1 poses, both ends included (official
+// interp_traj). official: the released spacing u = 0, 1/n .. (n-2)/n of each leg, n = frames_per_leg >= 2, and its
+// interpolation of axes, arm 0.1; zero: even spacing, slerp.
+GSF__SHARED gsf_result gsf__traj_leg_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames_per_leg,
+                                          int32_t official, double* out) {
     GSF__TRY(gsf__traj_check_views(ctx, "leg path", poses, count));
     if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "leg path: one view");
     if (frames_per_leg < 2)
@@ -1595,7 +1510,7 @@ static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_pa
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "path: the released windows have 3n + 1 frames, at least 7, not %d", (int)length);
     int32_t windows;
-    GSF__TRY(gsf_traj_official_windows(ctx, poses, length / 3 + 1, NULL, NULL, &windows));
+    GSF__TRY(gsf__traj_official_windows(ctx, poses, length / 3 + 1, NULL, NULL, &windows));
     if (d->window_count && d->window_count != windows)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: the released table has %d windows here, not %d",
                         (int)windows, (int)d->window_count);
@@ -1622,7 +1537,7 @@ static gsf_result gsf__traj_resolve_path(gsf_context* ctx, size_t cameras, const
                         (long long)windows, (long long)length);
     if (d->kind == GSF_TRAJ_REFERENCE) {
         int32_t side, middle;
-        gsf_traj_split_window((int32_t)length, &side, &middle);
+        gsf__traj_split_window((int32_t)length, &side, &middle);
         const int64_t room = middle < 1 ? 1 : middle, share = (5 * room * windows + 3) / 7;
         poses = gsf__traj_or(d->ellipse_poses, windows == 1 ? room : share > room ? share : room);
     } else if (d->kind == GSF_TRAJ_ELLIPSE) {
@@ -1664,9 +1579,9 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
     GSF__TRY(gsf__traj_resolve_path(ctx, camera_count, &d, &out));
     out.frame_count = gsf__traj_size_mul((size_t)out.window_count, (size_t)out.window_length);
     // [local poses of the cameras][poses of the ellipse][work of one step at a time]
-    size_t work = gsf__traj_size_max(gsf_traj_normalize_scratch(camera_count, d.point_count),
-                                     gsf_traj_ellipse_scratch(camera_count));
-    if (d.kind == GSF_TRAJ_INTERPOLATE) work = gsf_traj_slerp_path_scratch(camera_count);
+    size_t work = gsf__traj_size_max(gsf__traj_normalize_scratch(camera_count, d.point_count),
+                                     gsf__traj_ellipse_scratch(camera_count));
+    if (d.kind == GSF_TRAJ_INTERPOLATE) work = gsf__traj_slerp_path_scratch(camera_count);
     const size_t poses = gsf__traj_size_add(camera_count, (size_t)out.ellipse_poses);
     out.scratch_bytes = gsf__traj_size_add(gsf__traj_size_mul(poses, 16 * sizeof(double)), work);
     if (out.scratch_bytes == SIZE_MAX || gsf__traj_size_mul(out.frame_count, sizeof(gsf_camera)) == SIZE_MAX)
@@ -1695,7 +1610,7 @@ typedef struct gsf__traj_job { // what the three kinds share
 // Writes frame `at` from a pose in the frame of `to_local`.
 static gsf_result gsf__traj_put_pose(gsf__traj_job* job, size_t at, const double pose[16]) {
     double world[16];
-    gsf_traj_transform_poses(job->to_local, pose, 1, world);
+    gsf__traj_transform_poses(job->to_local, pose, 1, world);
     for (int i = 0; i < 3; i++) world[12 + i] += job->origin[i];
     job->out[at] = job->frame;
     gsf_camera_set_c2w(&job->out[at], world);
@@ -1738,7 +1653,7 @@ static void gsf__traj_localize(gsf__traj_job* job) {
     for (size_t n = 0; n < job->count; n++) {
         double quat[4], *view = job->views + 16 * n;
         gsf_camera_c2w(&job->cameras[n], view);
-        gsf_traj_pose_quat(view, quat);
+        gsf__traj_pose_quat(view, quat);
         gsf__traj_quat_axes(quat, view);
     }
     job->magnitude = gsf__traj_magnitude(job->views + 12, job->count, 16);
@@ -1802,16 +1717,16 @@ static gsf_result gsf__traj_make_loop(gsf__traj_job* job) {
         memcpy(transform, job->desc.transform, sizeof transform);
         gsf__traj_apply(transform, job->origin, transform + 12);
     } else {
-        gsf_traj_similarity_desc similarity;
+        gsf__traj_similarity_desc similarity;
         memset(&similarity, 0, sizeof similarity);
         similarity.official = job->desc.official;
-        GSF__TRY(gsf__traj_normalize(job->ctx, job->views, job->count, job->desc.points, job->desc.point_count,
+        GSF__TRY(gsf__traj_solve_frame(job->ctx, job->views, job->count, job->desc.points, job->desc.point_count,
                                      job->origin, job->magnitude, &similarity, job->work, transform));
     }
-    GSF__TRY(gsf_traj_invert_similarity(job->ctx, transform, job->to_local));
-    gsf_traj_transform_poses(transform, job->views, job->count, job->views);
+    GSF__TRY(gsf__traj_invert_similarity(job->ctx, transform, job->to_local));
+    gsf__traj_transform_poses(transform, job->views, job->count, job->views);
     GSF__TRY(gsf__traj_check_path(job->ctx, job->views, job->count));
-    gsf_traj_ellipse_desc ellipse = gsf_traj_round_ellipse(job->desc.round, job->desc.seed, 0);
+    gsf_traj_ellipse_desc ellipse = gsf__traj_round_ellipse(job->desc.round, job->desc.seed, 0);
     if (job->desc.ellipse) ellipse = *job->desc.ellipse;
     ellipse.frames = job->layout.ellipse_poses;
     double focus[3];
@@ -1838,8 +1753,8 @@ static gsf_result gsf__traj_reference_window(gsf__traj_job* job, int32_t w, int3
     const size_t base = (size_t)w * (size_t)job->layout.window_length;
     const size_t last = base + (size_t)job->layout.window_length - 1;
     int32_t from, to;
-    GSF__TRY(gsf_traj_nearest_view(job->ctx, enter, job->views, job->count, 0.5, &from, NULL));
-    GSF__TRY(gsf_traj_nearest_view(job->ctx, leave, job->views, job->count, 0.5, &to, NULL));
+    GSF__TRY(gsf__traj_nearest_view(job->ctx, enter, job->views, job->count, 0.5, &from, NULL));
+    GSF__TRY(gsf__traj_nearest_view(job->ctx, leave, job->views, job->count, 0.5, &to, NULL));
     const double *first_view = job->views + 16 * (size_t)from, *last_view = job->views + 16 * (size_t)to;
     for (int32_t i = 1; i < side; i++) {
         double in[16], back[16];
@@ -1863,7 +1778,7 @@ static gsf_result gsf__traj_reference_window(gsf__traj_job* job, int32_t w, int3
 
 static gsf_result gsf__traj_sample_reference(gsf__traj_job* job) {
     int32_t side, middle;
-    gsf_traj_split_window(job->layout.window_length, &side, &middle);
+    gsf__traj_split_window(job->layout.window_length, &side, &middle);
     GSF__TRY(gsf__traj_make_loop(job));
     for (int32_t w = 0; w < job->layout.window_count; w++) GSF__TRY(gsf__traj_reference_window(job, w, side, middle));
     return GSF_OK;

@@ -4,6 +4,7 @@
 #define _DEFAULT_SOURCE 1 // opendir
 #include <dirent.h>
 
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h" // the train / test split
 #include "test.h"
 
@@ -95,16 +96,16 @@ static void check_normalisation(void) {
     for (size_t i = 0; i < n; i++) gsf_mat4_rigid_inverse(w2c + 16 * i, inverse + 16 * i);
     compare_poses("c2w", inverse, NULL, tolerance);
 
-    void* scratch = take(gsf_traj_similarity_scratch(n));
+    void* scratch = take(gsf__traj_similarity_scratch(n));
     double first[16], strict[16];
-    gsf_traj_similarity_desc desc;
+    gsf__traj_similarity_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.official = 1;
-    CHECK_OK(&ctx, gsf_traj_similarity(&ctx, c2w, n, &desc, scratch, first));
+    CHECK_OK(&ctx, gsf__traj_similarity(&ctx, c2w, n, &desc, scratch, first));
     compare_poses("norm.T1_similarity", first, NULL, tolerance);
     desc.strict_scaling = 1;
     desc.center = GSF_TRAJ_CENTER_POSES;
-    CHECK_OK(&ctx, gsf_traj_similarity(&ctx, c2w, n, &desc, scratch, strict));
+    CHECK_OK(&ctx, gsf__traj_similarity(&ctx, c2w, n, &desc, scratch, strict));
     compare_poses("norm.T1_strict_poses", strict, NULL, tolerance);
     free(scratch);
 
@@ -112,39 +113,39 @@ static void check_normalisation(void) {
     const size_t m = points->dim[0];
     double* after = (double*)take(3 * m * sizeof(double));
     double* moved = (double*)take(16 * n * sizeof(double));
-    gsf_traj_transform_poses(first, c2w, n, moved);
+    gsf__traj_transform_poses(first, c2w, n, moved);
     compare_poses("norm.c2w_after_T1", moved, NULL, tolerance);
-    gsf_traj_transform_points(first, points->v, m, after);
+    gsf__traj_transform_points(first, points->v, m, after);
     compare_values("norm.points_after_T1", after, 3 * m, tolerance);
 
     double second[16], whole[16], product[16], signs[3];
     double* expected = poses_of(get("norm.T2_pca"), NULL);
-    scratch = take(gsf_traj_principal_axes_scratch(m));
-    CHECK_OK(&ctx, gsf_traj_principal_axes(&ctx, after, m, scratch, second));
+    scratch = take(gsf__traj_principal_axes_scratch(m));
+    CHECK_OK(&ctx, gsf__traj_principal_axes(&ctx, after, m, scratch, second));
     free(scratch);
     find_signs(second, expected, signs);
     compare_poses("norm.T2_pca", second, signs, tolerance);
 
-    scratch = take(gsf_traj_normalize_scratch(n, m));
+    scratch = take(gsf__traj_normalize_scratch(n, m));
     desc.strict_scaling = 0;
     desc.center = GSF_TRAJ_CENTER_FOCUS;
-    CHECK_OK(&ctx, gsf_traj_normalize(&ctx, c2w, n, points->v, m, &desc, scratch, whole));
+    CHECK_OK(&ctx, gsf__traj_normalize(&ctx, c2w, n, points->v, m, &desc, scratch, whole));
     free(scratch);
     gsf_mat4_mul(second, first, product);
     test_compare("T2 T1", whole, product, 16, tolerance * test_max_abs(product, 16));
     compare_poses("norm.transform", whole, signs, tolerance);
-    gsf_traj_transform_poses(whole, c2w, n, moved);
+    gsf__traj_transform_poses(whole, c2w, n, moved);
     compare_poses("norm.c2w", moved, signs, tolerance);
-    gsf_traj_transform_points(whole, points->v, m, after);
+    gsf__traj_transform_points(whole, points->v, m, after);
     for (size_t i = 0; i < 3 * m; i++) after[i] *= signs[i % 3];
     compare_values("norm.points", after, 3 * m, tolerance);
     double center[3], radius;
-    CHECK_OK(&ctx, gsf_traj_camera_radius(&ctx, moved, n, center, &radius));
+    CHECK_OK(&ctx, gsf__traj_camera_radius(&ctx, moved, n, center, &radius));
     compare_values("norm.scene_scale", &radius, 1, tolerance);
 
     double back[16];
-    CHECK_OK(&ctx, gsf_traj_invert_similarity(&ctx, whole, back));
-    gsf_traj_transform_poses(back, moved, n, moved);
+    CHECK_OK(&ctx, gsf__traj_invert_similarity(&ctx, whole, back));
+    gsf__traj_transform_poses(back, moved, n, moved);
     compare_poses("c2w", moved, NULL, tolerance);
     free(expected);
     free(after);
@@ -166,20 +167,20 @@ static void check_training_views(void) {
     size_t n, train_count, test_count;
     double* c2w = poses_of(train, &n);
     double center[3], radius, focus[3], pose[16], transform[16], signs[3];
-    CHECK_OK(&ctx, gsf_traj_camera_radius(&ctx, c2w, n, center, &radius));
+    CHECK_OK(&ctx, gsf__traj_camera_radius(&ctx, c2w, n, center, &radius));
     compare_values("train.center", center, 3, tolerance);
     radius *= 1.1;
     compare_values("train.cameras_extent", &radius, 1, tolerance);
     CHECK_OK(&ctx, gsf_traj_focus_point(&ctx, c2w, n, focus));
     compare_values("focus_point", focus, 3, tolerance);
-    CHECK_OK(&ctx, gsf_traj_average_pose(&ctx, c2w, n, 1, pose));
+    CHECK_OK(&ctx, gsf__traj_average_pose(&ctx, c2w, n, 1, pose));
     compare_poses("average_pose", pose, NULL, tolerance);
 
     double* out = (double*)take(16 * n * sizeof(double));
-    CHECK_OK(&ctx, gsf_traj_recenter_poses(&ctx, c2w, n, 1, out, transform));
+    CHECK_OK(&ctx, gsf__traj_recenter_poses(&ctx, c2w, n, 1, out, transform));
     compare_poses("recenter.transform", transform, NULL, tolerance);
     compare_poses("recenter.poses", out, NULL, tolerance);
-    CHECK_OK(&ctx, gsf_traj_pca_poses(&ctx, c2w, n, out, transform));
+    CHECK_OK(&ctx, gsf__traj_pca_poses(&ctx, c2w, n, out, transform));
     double* expected = poses_of(get("pca_transform"), NULL);
     find_signs(transform, expected, signs);
     compare_poses("pca_transform", transform, signs, tolerance);
@@ -204,12 +205,12 @@ static void check_interpolations(void) {
     double* c2w = poses_of(get("train.c2w"), &n);
     const test_tensor* two = find("interp2.c2w");
     if (two && n >= 2) {
-        gsf_traj_spline_desc desc;
+        gsf__traj_spline_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.frames_per_leg = (int32_t)two->dim[0];
         double* out = (double*)take(two->dim[0] * 16 * sizeof(double));
-        void* scratch = take(gsf_traj_spline_path_scratch(2, &desc));
-        CHECK_OK(&ctx, gsf_traj_spline_path(&ctx, c2w, 2, &desc, scratch, out));
+        void* scratch = take(gsf__traj_spline_path_scratch(2, &desc));
+        CHECK_OK(&ctx, gsf__traj_spline_path(&ctx, c2w, 2, &desc, scratch, out));
         compare_poses("interp2.c2w", out, NULL, tolerance);
         free(scratch);
         free(out);
@@ -217,15 +218,16 @@ static void check_interpolations(void) {
     const test_tensor* legs = find("interp_traj3.c2w");
     if (legs && n >= 3) {
         double* out = (double*)take(legs->dim[0] * 16 * sizeof(double));
-        CHECK_OK(&ctx, gsf_traj_leg_path(&ctx, c2w, 3, (int32_t)(legs->dim[0] - 1) / 2 + 1, 1, out));
+        CHECK_OK(&ctx, gsf__traj_leg_path(&ctx, c2w, 3, (int32_t)(legs->dim[0] - 1) / 2 + 1, 1, out));
         compare_poses("interp_traj3.c2w", out, NULL, tolerance);
         free(out);
     }
     const test_tensor* glide = find("slerp_path.c2w20");
     if (glide && n >= 2) {
         double* out = (double*)take(glide->dim[0] * 16 * sizeof(double));
-        void* scratch = take(gsf_traj_slerp_path_scratch(n));
-        CHECK_OK(&ctx, gsf_traj_slerp_path(&ctx, c2w, n, (int32_t)glide->dim[0], get("slerp_path.trans")->v[0], scratch,
+        void* scratch = take(gsf__traj_slerp_path_scratch(n));
+        CHECK_OK(&ctx,
+                 gsf__traj_slerp_path(&ctx, c2w, n, (int32_t)glide->dim[0], get("slerp_path.trans")->v[0], scratch,
                                            out));
         compare_poses("slerp_path.c2w20", out, NULL, tolerance);
         free(scratch);
@@ -250,9 +252,9 @@ static void check_windows(int round, const double* c2w, size_t n, const gsf_traj
     int32_t found = 0;
     int32_t* starts = (int32_t*)take(count * sizeof(int32_t));
     int32_t* overlaps = (int32_t*)take(count * sizeof(int32_t));
-    CHECK_OK(&ctx, gsf_traj_official_windows(&ctx, (int32_t)loop->dim[0], middle, NULL, NULL, &found));
+    CHECK_OK(&ctx, gsf__traj_official_windows(&ctx, (int32_t)loop->dim[0], middle, NULL, NULL, &found));
     if (!CHECK((size_t)found == count)) { free(starts); free(overlaps); return; }
-    CHECK_OK(&ctx, gsf_traj_official_windows(&ctx, (int32_t)loop->dim[0], middle, starts, overlaps, &found));
+    CHECK_OK(&ctx, gsf__traj_official_windows(&ctx, (int32_t)loop->dim[0], middle, starts, overlaps, &found));
     double* poses = poses_of(loop, NULL);
     double* scores = (double*)take(n * sizeof(double));
     for (size_t w = 0; w < count; w++) {
@@ -262,7 +264,7 @@ static void check_windows(int round, const double* c2w, size_t n, const gsf_traj
             const double* pose = poses + 16 * (starts[w] + (last ? middle - 1 : 0));
             const test_tensor* expected = get_round(round, last ? "ref_scores_last" : "ref_scores_first", 1);
             int32_t index;
-            CHECK_OK(&ctx, gsf_traj_nearest_view(&ctx, pose, c2w, n, 0.5, &index, scores));
+            CHECK_OK(&ctx, gsf__traj_nearest_view(&ctx, pose, c2w, n, 0.5, &index, scores));
             CHECK(index == nearest->v[2 * w + (size_t)last]);
             const double most = test_max_abs(expected->v, expected->count);
             test_compare("scores", scores, expected->v + n * w, n, tolerance * most);
@@ -317,12 +319,12 @@ static int check_round(int round) { // 1 where the file has it
     size_t n;
     double* c2w = poses_of(get("train.c2w"), &n);
     double* out = (double*)take(loop->dim[0] * 16 * sizeof(double));
-    void* scratch = take(gsf_traj_ellipse_scratch(n));
-    gsf_traj_ellipse_desc desc = gsf_traj_round_ellipse(round, 0, (int32_t)loop->dim[0]);
+    void* scratch = take(gsf__traj_ellipse_scratch(n));
+    gsf_traj_ellipse_desc desc = gsf__traj_round_ellipse(round, 0, (int32_t)loop->dim[0]);
     CHECK_NEAR(desc.z_variation, get_round(round, "z_variation", 1)->v[0], 1e-12);
     CHECK(desc.z_phase >= 0.0 && desc.z_phase < 1.0);
     desc.z_phase = get_round(round, "z_phase", 1)->v[0];
-    CHECK_OK(&ctx, gsf_traj_ellipse_path(&ctx, c2w, n, &desc, scratch, out));
+    CHECK_OK(&ctx, gsf__traj_ellipse_path(&ctx, c2w, n, &desc, scratch, out));
     char name[64];
     snprintf(name, sizeof name, "round%d.ellipse_c2w", round);
     compare_poses(name, out, NULL, tolerance);
@@ -358,13 +360,13 @@ static void check_cameras(void) {
         double* w2c = poses_of(get(name), NULL);
         memcpy(camera.w2c, w2c, sizeof camera.w2c);
         free(w2c);
-        const double fov[2] = {gsf_traj_fov_from_focal(camera.fx, camera.width),
-                               gsf_traj_fov_from_focal(camera.fy, camera.height)};
+        const double fov[2] = {gsf__traj_fov_from_focal(camera.fx, camera.width),
+                               gsf__traj_fov_from_focal(camera.fy, camera.height)};
         snprintf(name, sizeof name, "cam%d.fov_xy", camera_count);
         compare_values(name, fov, 2, tolerance);
         CHECK_NEAR(gsf_traj_focal_from_fov(fov[0], camera.width), camera.fx, tolerance * camera.fx);
         double projection[16], full[16]; // stored transposed and row-major, so column-major as they are
-        CHECK_OK(&ctx, gsf_traj_projection(&ctx, &camera, 0.01, 100.0, projection));
+        CHECK_OK(&ctx, gsf__traj_projection(&ctx, &camera, 0.01, 100.0, projection));
         gsf_mat4_mul(projection, camera.w2c, full);
         snprintf(name, sizeof name, "cam%d.world_view_transform_T", camera_count);
         compare_values(name, camera.w2c, 16, 1e-6);
@@ -414,11 +416,11 @@ static void check_window_table(const gsf_json_value* row) {
     const int32_t total = (int32_t)number(row, "total"), middle = (int32_t)number(row, "num_frames") / 3 + 1;
     const gsf_json_value *starts = member(row, "starts"), *overlaps = member(row, "overlaps");
     int32_t count = 0, *a, *b;
-    CHECK_OK(&ctx, gsf_traj_official_windows(&ctx, total, middle, NULL, NULL, &count));
+    CHECK_OK(&ctx, gsf__traj_official_windows(&ctx, total, middle, NULL, NULL, &count));
     if (!CHECK((uint32_t)count == starts->count && starts->count == overlaps->count)) return;
     a = (int32_t*)take((size_t)count * sizeof(int32_t));
     b = (int32_t*)take((size_t)count * sizeof(int32_t));
-    CHECK_OK(&ctx, gsf_traj_official_windows(&ctx, total, middle, a, b, &count));
+    CHECK_OK(&ctx, gsf__traj_official_windows(&ctx, total, middle, a, b, &count));
     int32_t at = 0;
     for (const gsf_json_value* v = first_of(starts); v; v = next_of(v)) CHECK(a[at++] == v->number);
     at = 0;

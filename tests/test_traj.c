@@ -130,7 +130,7 @@ static double pose_distance(const gsf_camera* a, const gsf_camera* b) { // large
 static void check_reference_windows(const scene* s, const path* p, int official) {
     const int32_t length = p->layout.window_length;
     int32_t side, middle;
-    gsf_traj_split_window(length, &side, &middle);
+    gsf__traj_split_window(length, &side, &middle);
     CHECK(side >= 1 && middle >= 0 && 2 * side + middle == length);
     int wrong = 0, uneven = 0, twice = 0;
     for (int32_t w = 0; w < p->layout.window_count; w++) {
@@ -391,7 +391,7 @@ static void test_degenerate_cameras(void) {
             const double angle = (double)i, eye[3] = {cos(angle), 0.0, sin(angle)}, down[3] = {0.0, -1.0, 0.0};
             const double forward[3] = {-eye[0], 0.0, -eye[2]};
             double pose[16];
-            CHECK_OK(&ctx, gsf_traj_view_pose(&ctx, forward, down, eye, pose));
+            CHECK_OK(&ctx, gsf__traj_view_pose(&ctx, forward, down, eye, pose));
             s.cameras[i] = camera_at(pose);
         }
         CHECK(result_of(s.cameras, 6, GSF_TRAJ_REFERENCE, official) == GSF_OK);
@@ -505,7 +505,7 @@ static void test_degenerate_primitives(void) {
             forward[i] = uniform(-1.0, 1.0);
             down[i] = forward[i] * (trial % 2 ? 3.0 : -0.3) + apart * uniform(-1.0, 1.0);
         }
-        if (gsf_traj_view_pose(&ctx, forward, down, o, pose) == GSF_OK) CHECK(rigidity(pose) < 1e-14);
+        if (gsf__traj_view_pose(&ctx, forward, down, o, pose) == GSF_OK) CHECK(rigidity(pose) < 1e-14);
         else CHECK(apart < 1e-6);
     }
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, x, y, a));
@@ -514,7 +514,7 @@ static void test_degenerate_primitives(void) {
         out[16 * i + 12] = i ? 0.3 : 0.1 + 0.2;
     }
     int32_t index;
-    CHECK_OK(&ctx, gsf_traj_nearest_view(&ctx, a, out, 3, 0.5, &index, NULL));
+    CHECK_OK(&ctx, gsf__traj_nearest_view(&ctx, a, out, 3, 0.5, &index, NULL));
     CHECK(index == 0);
     CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 1, focus), GSF_ERROR_DEGENERATE);
     CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 0, focus), GSF_ERROR_DEGENERATE);
@@ -522,40 +522,40 @@ static void test_degenerate_primitives(void) {
     memcpy(out + 16, a, sizeof a);
     double two[32];
     memcpy(two, out, sizeof two);
-    CHECK_RESULT(&ctx, gsf_traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE); // coincide
-    CHECK_OK(&ctx, gsf_traj_leg_path(&ctx, two, 2, 8, 0, out));
+    CHECK_RESULT(&ctx, gsf__traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE); // coincide
+    CHECK_OK(&ctx, gsf__traj_leg_path(&ctx, two, 2, 8, 0, out));
     for (int i = 0; i < 8; i++) CHECK(rigidity(out + 16 * i) < 1e-14);
     const double back[3] = {-1, 0, 0};
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, back, y, b));
     memcpy(two + 16, b, sizeof b); // opposite directions: the released blend passes zero at u = 1/2
-    CHECK_RESULT(&ctx, gsf_traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE);
     for (int i = 0; i < 8 * 16; i++) CHECK(out[i] == 0.0);
-    CHECK_OK(&ctx, gsf_traj_leg_path(&ctx, two, 2, 9, 0, out));
+    CHECK_OK(&ctx, gsf__traj_leg_path(&ctx, two, 2, 9, 0, out));
     for (int i = 0; i < 9; i++) CHECK(rigidity(out + 16 * i) < 1e-14);
     CHECK_NEAR(fabs(out[4 * 16 + 8]), 0.0, 1e-12); // half way it looks sideways
-    CHECK_RESULT(&ctx, gsf_traj_average_pose(&ctx, two, 2, 0, pose), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_average_pose(&ctx, two, 2, 0, pose), GSF_ERROR_DEGENERATE);
     memcpy(two + 16, a, sizeof a);
-    CHECK_RESULT(&ctx, gsf_traj_spline_path(&ctx, two, 2, NULL, scratch, out), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_spline_path(&ctx, two, 1, NULL, scratch, out), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_slerp_path(&ctx, two, 1, 5, 0.0, scratch, out), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_similarity(&ctx, two, 2, NULL, scratch, transform), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_pca_poses(&ctx, two, 2, out, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_spline_path(&ctx, two, 2, NULL, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_spline_path(&ctx, two, 1, NULL, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_slerp_path(&ctx, two, 1, 5, 0.0, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_similarity(&ctx, two, 2, NULL, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_pca_poses(&ctx, two, 2, out, transform), GSF_ERROR_DEGENERATE);
     const double line[9] = {1, 2, 3, 2, 4, 6, 5, 10, 15}, same[9] = {1, 2, 3, 1, 2, 3, 1, 2, 3};
-    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, line, 3, scratch, transform), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, same, 3, scratch, transform), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, same, 1, scratch, transform), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, same, 0, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_principal_axes(&ctx, line, 3, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_principal_axes(&ctx, same, 3, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_principal_axes(&ctx, same, 1, scratch, transform), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_principal_axes(&ctx, same, 0, scratch, transform), GSF_ERROR_DEGENERATE);
     const double zero[4] = {0, 0, 0, 0}, tiny[4] = {1e-200, 0, 1e-200, 0};
-    CHECK_RESULT(&ctx, gsf_traj_set_pose_quat(&ctx, zero, pose), GSF_ERROR_DEGENERATE);
-    CHECK_OK(&ctx, gsf_traj_set_pose_quat(&ctx, tiny, pose));
+    CHECK_RESULT(&ctx, gsf__traj_set_pose_quat(&ctx, zero, pose), GSF_ERROR_DEGENERATE);
+    CHECK_OK(&ctx, gsf__traj_set_pose_quat(&ctx, tiny, pose));
     CHECK(rigidity(pose) < 1e-14);
     const double sites[3] = {0, 1, 1}, values[3] = {0, 1, 2};
-    CHECK_RESULT(&ctx, gsf_traj_spline(&ctx, sites, values, 3, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_spline(&ctx, sites, values, 2, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_spline(&ctx, sites, values, 3, 1, 6, sites, 3, scratch, out),
+    CHECK_RESULT(&ctx, gsf__traj_spline(&ctx, sites, values, 3, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_spline(&ctx, sites, values, 2, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf__traj_spline(&ctx, sites, values, 3, 1, 6, sites, 3, scratch, out),
                  GSF_ERROR_INVALID_ARGUMENT);
     a[0] = -a[0]; a[1] = -a[1]; a[2] = -a[2]; // a mirror
-    CHECK_RESULT(&ctx, gsf_traj_check_poses(&ctx, a, 1), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf__traj_check_poses(&ctx, a, 1), GSF_ERROR_INVALID_ARGUMENT);
 }
 
 // ---- NaN anywhere --------------------------------------------------------------
@@ -607,7 +607,7 @@ static void test_not_finite(void) {
                 identity[i] = keep;
             }
             desc.transform = NULL;
-            gsf_traj_ellipse_desc ellipse = gsf_traj_round_ellipse(0, 0, 0);
+            gsf_traj_ellipse_desc ellipse = gsf__traj_round_ellipse(0, 0, 0);
             double* shape[3] = {&ellipse.z_variation, &ellipse.z_phase, &ellipse.pitch_degrees};
             desc.ellipse = &ellipse;
             for (int i = 0; i < 3 && kind != GSF_TRAJ_INTERPOLATE; i++) {
@@ -630,37 +630,37 @@ static void test_not_finite_primitives(void) {
     for (int i = 0; i < 64; i++) {
         const double keep = poses[i];
         poses[i] = i % 2 ? NAN : INFINITY;
-        CHECK_RESULT(&ctx, gsf_traj_check_poses(&ctx, poses, 4), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_check_poses(&ctx, poses, 4), GSF_ERROR_NUMERIC);
         CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, poses, 4, three), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_average_pose(&ctx, poses, 4, 0, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_recenter_poses(&ctx, poses, 4, 0, out, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_camera_radius(&ctx, poses, 4, three, &radius), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_nearest_view(&ctx, poses, poses, 4, 0.5, &index, NULL), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_similarity(&ctx, poses, 4, NULL, scratch, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_normalize(&ctx, poses, 4, NULL, 0, NULL, scratch, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_pca_poses(&ctx, poses, 4, out, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_spline_path(&ctx, poses, 4, NULL, scratch, out), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_slerp_path(&ctx, poses, 4, 8, 0.0, scratch, out), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_leg_path(&ctx, poses, 4, 4, 0, out), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_ellipse_path(&ctx, poses, 4, NULL, scratch, out), GSF_ERROR_NUMERIC);
-        if (i < 16) CHECK_RESULT(&ctx, gsf_traj_slerp_pose(&ctx, poses, poses + 16, 0.5, out), GSF_ERROR_NUMERIC);
-        if (i < 16) CHECK_RESULT(&ctx, gsf_traj_invert_similarity(&ctx, poses, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_average_pose(&ctx, poses, 4, 0, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_recenter_poses(&ctx, poses, 4, 0, out, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_camera_radius(&ctx, poses, 4, three, &radius), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_nearest_view(&ctx, poses, poses, 4, 0.5, &index, NULL), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_similarity(&ctx, poses, 4, NULL, scratch, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_normalize(&ctx, poses, 4, NULL, 0, NULL, scratch, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_pca_poses(&ctx, poses, 4, out, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_spline_path(&ctx, poses, 4, NULL, scratch, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_slerp_path(&ctx, poses, 4, 8, 0.0, scratch, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_leg_path(&ctx, poses, 4, 4, 0, out), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_ellipse_path(&ctx, poses, 4, NULL, scratch, out), GSF_ERROR_NUMERIC);
+        if (i < 16) CHECK_RESULT(&ctx, gsf__traj_slerp_pose(&ctx, poses, poses + 16, 0.5, out), GSF_ERROR_NUMERIC);
+        if (i < 16) CHECK_RESULT(&ctx, gsf__traj_invert_similarity(&ctx, poses, out), GSF_ERROR_NUMERIC);
         poses[i] = keep;
     }
     for (int i = 0; i < 9; i++) {
         double v[9] = {0.1, 0.2, 0.3, 1.0, 0.5, 0.2, 0.0, 1.0, 0.0}, quat[4] = {1, 0, 0, 0};
         v[i] = NAN;
         CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, v, v + 3, v + 6, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_view_pose(&ctx, v, v + 3, v + 6, transform), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_principal_axes(&ctx, v, 3, scratch, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_view_pose(&ctx, v, v + 3, v + 6, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_principal_axes(&ctx, v, 3, scratch, transform), GSF_ERROR_NUMERIC);
         quat[i % 4] = NAN;
-        CHECK_RESULT(&ctx, gsf_traj_set_pose_quat(&ctx, quat, transform), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf__traj_set_pose_quat(&ctx, quat, transform), GSF_ERROR_NUMERIC);
     }
-    CHECK_RESULT(&ctx, gsf_traj_slerp_pose(&ctx, poses, poses + 16, NAN, out), GSF_ERROR_NUMERIC);
-    CHECK_RESULT(&ctx, gsf_traj_slerp_path(&ctx, poses, 4, 8, NAN, scratch, out), GSF_ERROR_NUMERIC);
-    CHECK_RESULT(&ctx, gsf_traj_nearest_view(&ctx, poses, poses, 4, NAN, &index, NULL), GSF_ERROR_NUMERIC);
-    CHECK_RESULT(&ctx, gsf_traj_projection(&ctx, &s.cameras[0], NAN, 1.0, out), GSF_ERROR_NUMERIC);
-    CHECK_RESULT(&ctx, gsf_traj_projection(&ctx, &s.cameras[0], 2.0, 1.0, out), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf__traj_slerp_pose(&ctx, poses, poses + 16, NAN, out), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf__traj_slerp_path(&ctx, poses, 4, 8, NAN, scratch, out), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf__traj_nearest_view(&ctx, poses, poses, 4, NAN, &index, NULL), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf__traj_projection(&ctx, &s.cameras[0], NAN, 1.0, out), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf__traj_projection(&ctx, &s.cameras[0], 2.0, 1.0, out), GSF_ERROR_INVALID_ARGUMENT);
 }
 
 // ---- the pieces against plain formulas -----------------------------------------
@@ -707,11 +707,11 @@ static void test_rotations(void) {
         for (int i = 0; i < 4; i++) p[i] = uniform(-1.0, 1.0);
         memset(pose, 0, sizeof pose);
         memset(other, 0, sizeof other);
-        CHECK_OK(&ctx, gsf_traj_set_pose_quat(&ctx, q, pose));
-        CHECK_OK(&ctx, gsf_traj_set_pose_quat(&ctx, p, other));
+        CHECK_OK(&ctx, gsf__traj_set_pose_quat(&ctx, q, pose));
+        CHECK_OK(&ctx, gsf__traj_set_pose_quat(&ctx, p, other));
         CHECK(rigidity(pose) < 1e-14);
-        gsf_traj_pose_quat(pose, back);
-        gsf_traj_pose_quat(other, p);
+        gsf__traj_pose_quat(pose, back);
+        gsf__traj_pose_quat(other, p);
         const double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         double dot = 0.0;
         for (int i = 0; i < 4; i++) dot += back[i] * q[i] / length;
@@ -719,7 +719,7 @@ static void test_rotations(void) {
         // slerp: ends, and the angle grows evenly
         double angle[5];
         for (int k = 0; k < 5; k++) {
-            gsf_traj_slerp(back, p, 0.25 * k, out);
+            gsf__traj_slerp(back, p, 0.25 * k, out);
             double c = 0.0;
             for (int i = 0; i < 4; i++) c += out[i] * back[i];
             angle[k] = 2.0 * acos(fabs(c) > 1.0 ? 1.0 : fabs(c));
@@ -727,13 +727,13 @@ static void test_rotations(void) {
         for (int k = 1; k < 4; k++) CHECK_NEAR(angle[k], 0.25 * k * angle[4], 1e-6);
         pose[12] = 1.0;
         other[13] = 4.0;
-        CHECK_OK(&ctx, gsf_traj_slerp_pose(&ctx, pose, other, 0.5, half));
+        CHECK_OK(&ctx, gsf__traj_slerp_pose(&ctx, pose, other, 0.5, half));
         CHECK(rigidity(half) < 1e-14);
         CHECK_NEAR(half[12], 0.5, 1e-15);
         CHECK_NEAR(half[13], 2.0, 1e-15);
-        CHECK_OK(&ctx, gsf_traj_slerp_pose(&ctx, pose, other, 1.0, half));
+        CHECK_OK(&ctx, gsf__traj_slerp_pose(&ctx, pose, other, 1.0, half));
         test_compare("slerp at 1", half, other, 16, 1e-14);
-        CHECK_OK(&ctx, gsf_traj_slerp_pose(&ctx, pose, pose, 0.3, pose)); // coincident, in place
+        CHECK_OK(&ctx, gsf__traj_slerp_pose(&ctx, pose, pose, 0.3, pose)); // coincident, in place
         CHECK(rigidity(pose) < 1e-14);
     }
 }
@@ -756,38 +756,38 @@ static void test_splines(void) {
                 if (i < 40) expected[(size_t)i * dims + d] = sum;
                 else values[(size_t)(i - 40) * dims + d] = sum;
             }
-        void* scratch = take(gsf_traj_spline_scratch(n, degree, dims));
+        void* scratch = take(gsf__traj_spline_scratch(n, degree, dims));
         double* out = (double*)take(40 * dims * sizeof(double));
-        CHECK_OK(&ctx, gsf_traj_spline(&ctx, sites, values, n, dims, degree, at, 40, scratch, out));
+        CHECK_OK(&ctx, gsf__traj_spline(&ctx, sites, values, n, dims, degree, at, 40, scratch, out));
         test_compare("polynomial", out, expected, 40 * dims, 1e-9 * (1.0 + test_max_abs(expected, 40 * dims)));
         for (size_t i = 0; i < n * dims; i++) values[i] = uniform(-1.0, 1.0);
-        CHECK_OK(&ctx, gsf_traj_spline(&ctx, sites, values, n, dims, degree, sites, n, scratch, out));
+        CHECK_OK(&ctx, gsf__traj_spline(&ctx, sites, values, n, dims, degree, sites, n, scratch, out));
         test_compare("interpolation", out, values, n * dims, 1e-10);
         free(out);
         free(scratch);
     }
-    CHECK(gsf_traj_spline_scratch(SIZE_MAX / 8, 3, 3) == SIZE_MAX);
-    CHECK(gsf_traj_spline_scratch(4, 9, 3) == SIZE_MAX);
-    CHECK(gsf_traj_normalize_scratch(4, SIZE_MAX / 4) == SIZE_MAX);
+    CHECK(gsf__traj_spline_scratch(SIZE_MAX / 8, 3, 3) == SIZE_MAX);
+    CHECK(gsf__traj_spline_scratch(4, 9, 3) == SIZE_MAX);
+    CHECK(gsf__traj_normalize_scratch(4, SIZE_MAX / 4) == SIZE_MAX);
     for (size_t count = 2; count <= 20; count++) { // spline paths pass through their poses, in exact scratch
         scene s;
         make_scene(&s, count);
         double poses[32 * 16];
         for (size_t i = 0; i < count; i++) gsf_camera_c2w(&s.cameras[i], poses + 16 * i);
-        gsf_traj_spline_desc desc;
+        gsf__traj_spline_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.degree = 1 + (int32_t)count % 5;
         desc.frames_per_leg = 7;
         double* out = (double*)take((count - 1) * 7 * 16 * sizeof(double));
-        void* scratch = take(gsf_traj_spline_path_scratch(count, &desc));
-        CHECK_OK(&ctx, gsf_traj_spline_path(&ctx, poses, count, &desc, scratch, out));
+        void* scratch = take(gsf__traj_spline_path_scratch(count, &desc));
+        CHECK_OK(&ctx, gsf__traj_spline_path(&ctx, poses, count, &desc, scratch, out));
         test_compare("first pose", out, poses, 16, 1e-12);
         for (size_t i = 0; i < (count - 1) * 7; i++) CHECK(rigidity(out + 16 * i) < 1e-12);
         free(scratch);
         free(out);
         out = (double*)take(((count - 1) * 5 + 1) * 16 * sizeof(double));
-        scratch = take(gsf_traj_slerp_path_scratch(count));
-        CHECK_OK(&ctx, gsf_traj_slerp_path(&ctx, poses, count, (int32_t)(count - 1) * 5 + 1, 0.0, scratch, out));
+        scratch = take(gsf__traj_slerp_path_scratch(count));
+        CHECK_OK(&ctx, gsf__traj_slerp_path(&ctx, poses, count, (int32_t)(count - 1) * 5 + 1, 0.0, scratch, out));
         for (size_t i = 0; i < count; i++) test_compare("slerp path", out + 80 * i, poses + 16 * i, 16, 1e-10);
         free(scratch);
         free(out);
@@ -809,26 +809,26 @@ static void test_sets_of_views(void) {
         test_compare("focus", focus, target, 3, 1e-10);
         int32_t index;
         for (size_t i = 0; i < n; i++) {
-            CHECK_OK(&ctx, gsf_traj_nearest_view(&ctx, poses + 16 * i, poses, n, 0.5, &index, NULL));
+            CHECK_OK(&ctx, gsf__traj_nearest_view(&ctx, poses + 16 * i, poses, n, 0.5, &index, NULL));
             CHECK((size_t)index == i);
         }
-        void* scratch = take(gsf_traj_normalize_scratch(n, 0));
-        CHECK_OK(&ctx, gsf_traj_normalize(&ctx, poses, n, NULL, 0, NULL, scratch, transform));
+        void* scratch = take(gsf__traj_normalize_scratch(n, 0));
+        CHECK_OK(&ctx, gsf__traj_normalize(&ctx, poses, n, NULL, 0, NULL, scratch, transform));
         free(scratch);
-        gsf_traj_transform_poses(transform, poses, n, out);
+        gsf__traj_transform_poses(transform, poses, n, out);
         for (size_t i = 0; i < n; i++) CHECK(rigidity(out + 16 * i) < 1e-13);
         double back[16];
-        CHECK_OK(&ctx, gsf_traj_invert_similarity(&ctx, transform, back));
-        gsf_traj_transform_poses(back, out, n, out); // in place
+        CHECK_OK(&ctx, gsf__traj_invert_similarity(&ctx, transform, back));
+        gsf__traj_transform_poses(back, out, n, out); // in place
         test_compare("there and back", out, poses, 16 * n, 1e-12 * (1.0 + test_max_abs(poses, 16 * n)));
-        if (gsf_traj_recenter_poses(&ctx, poses, n, 0, out, transform) == GSF_OK) {
+        if (gsf__traj_recenter_poses(&ctx, poses, n, 0, out, transform) == GSF_OK) {
             double mean[16];
-            CHECK_OK(&ctx, gsf_traj_average_pose(&ctx, out, n, 0, mean));
+            CHECK_OK(&ctx, gsf__traj_average_pose(&ctx, out, n, 0, mean));
             const double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
             test_compare("average of recentred poses", mean, identity, 16, 1e-9);
         }
-        CHECK_OK(&ctx, gsf_traj_pca_poses(&ctx, poses, n, out, transform));
-        CHECK_OK(&ctx, gsf_traj_camera_radius(&ctx, out, n, center, &radius));
+        CHECK_OK(&ctx, gsf__traj_pca_poses(&ctx, poses, n, out, transform));
+        CHECK_OK(&ctx, gsf__traj_camera_radius(&ctx, out, n, center, &radius));
         for (int k = 0; k < 3; k++) CHECK_NEAR(center[k], 0.0, 1e-12);
         double most = 0.0;
         for (size_t i = 0; i < n; i++) most = fmax(most, test_max_abs(out + 16 * i + 12, 3));
@@ -839,18 +839,12 @@ static void test_sets_of_views(void) {
 static void test_intrinsics(void) {
     scene s;
     make_scene(&s, 1);
-    gsf_camera camera = s.cameras[0], small;
+    gsf_camera camera = s.cameras[0];
     camera.width = 1001;
     camera.height = 667;
-    small = gsf_traj_reduce_camera(&camera, 4, 250, 166); // as its own 1001 / 4 x 667 / 4: nothing but the factor
-    CHECK(small.fx == camera.fx / 4 && small.cy == camera.cy / 4 && small.width == 250 && small.height == 166);
-    small = gsf_traj_reduce_camera(&camera, 1, 2002, 667);
-    CHECK(small.fx == 2.0 * camera.fx && small.fy == camera.fy);
-    small = gsf_traj_crop_camera(&camera, 10, 20, 100, 90);
-    CHECK(small.cx == camera.cx - 10.0 && small.cy == camera.cy - 20.0 && small.width == 100 && small.height == 90);
-    CHECK_NEAR(gsf_traj_fov_from_focal(50.0, 100.0), 1.5707963267948966, 1e-15);
+    CHECK_NEAR(gsf__traj_fov_from_focal(50.0, 100.0), 1.5707963267948966, 1e-15);
     double projection[16], full[16];
-    CHECK_OK(&ctx, gsf_traj_projection(&ctx, &camera, 0.01, 100.0, projection));
+    CHECK_OK(&ctx, gsf__traj_projection(&ctx, &camera, 0.01, 100.0, projection));
     gsf_mat4_mul(projection, camera.w2c, full);
     for (int i = 0; i < 50; i++) { // clip space against pixels
         const double p[3] = {uniform(-0.3, 0.3), uniform(-0.3, 0.3), uniform(-0.3, 0.3)};
@@ -880,12 +874,12 @@ static void test_schedule(void) {
     for (int32_t total = 1; total < 300; total++) // released tables: inside the sequence, or refused
         for (int32_t middle = 1; middle < 40; middle++) {
             int32_t windows, starts[310], overlaps[310];
-            if (gsf_traj_official_windows(&ctx, total, middle, NULL, NULL, &windows) != GSF_OK) {
+            if (gsf__traj_official_windows(&ctx, total, middle, NULL, NULL, &windows) != GSF_OK) {
                 CHECK(windows == 0);
                 continue;
             }
             if (!CHECK(windows <= 310)) continue;
-            CHECK_OK(&ctx, gsf_traj_official_windows(&ctx, total, middle, starts, overlaps, &windows));
+            CHECK_OK(&ctx, gsf__traj_official_windows(&ctx, total, middle, starts, overlaps, &windows));
             int wrong = starts[0] != 0;
             for (int32_t w = 1; w < windows; w++) {
                 wrong += starts[w] < 0 || starts[w] + middle > total;
