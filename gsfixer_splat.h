@@ -20,7 +20,7 @@
 
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
-               >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer
+               >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer >>few views
    SOURCES     Kerbl et al. 2023 (3DGS), Zwicker et al. 2002 (EWA), Yu et al. 2024 (Mip-Splatting), GSFixer (the loop)
 */
 #ifndef GSF_SPLAT_INCLUDED
@@ -551,6 +551,67 @@ GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer);
 GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* fixer, gsf_text* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* fixer, const char* name,
                                                          const void* chunks, size_t size);
+
+// ---- from photos to splats -----------------------------------------------------
+/* What the program `gsfix fix` decides before it starts the loop, chosen by measurement (bench/QUALITY.md) for scenes of 3 to
+   50 photos. A host that makes the same calls gets the same splats to the last bit; every value may be changed in between.
+       gsf_splat_load_scene         cameras and points
+       gsf_splat_load_train_views   photos
+       gsf_splat_initial_splats     points -> splats to begin with
+       gsf_splat_few_view_desc      settings of the loop and of the trainer
+       gsf_splat_make_fixer         or gsf_splat_make_trainer with the desc's `train`, to train without repair
+   `views` are indices into scene->views; NULL = all of them in their order (view_count is then scene->view_count). */
+
+// Decodes the photos of these views, as far as they are not there yet, and lists them for a trainer or fixer. *out is freed
+// with gsf_free; the images stay the scene's.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_load_train_views(gsf_context* ctx, gsf_scene* scene, const uint32_t* views,
+                                                            size_t view_count, gsf_train_view** out);
+
+typedef enum gsf_initial_kind { // which points become splats
+    GSF_INITIAL_AUTO = 0,  // RANDOM for a scene without points, BOTH for up to 5 views, DENSE for more
+    GSF_INITIAL_BOTH,      // the scene's points that a view sees, by track or by ray
+    GSF_INITIAL_TRACKS,    // those whose track holds a view: the papers' start
+    GSF_INITIAL_RAYS,      // those that a ray from a view meets
+    GSF_INITIAL_ALL,       // all points of the scene
+    GSF_INITIAL_DENSE,     // BOTH, and between them what stereo finds in the photos
+    GSF_INITIAL_RANDOM,    // drawn evenly from the volumes that the views see, coloured by their photos
+} gsf_initial_kind;
+
+typedef struct gsf_initial_desc {
+    gsf_initial_kind kind;
+    uint64_t seed;
+    int32_t sh_degree;              // of the splats; 0 = 3, negative = 0
+    int32_t random_points;          // RANDOM: how many; 0 = 20000
+    gsf_visibility_desc visibility; // BOTH, TRACKS, RAYS, DENSE; its method is the kind's
+    gsf_dense_desc dense;           // DENSE; max_points 0 = 40000, its seed is the one above, skip_sparse is on
+} gsf_initial_desc;
+
+typedef struct gsf_initial_stats {
+    gsf_initial_desc used;           // the desc with its defaults filled in; its kind is never AUTO
+    size_t scene_points, new_points; // of the scene, and by stereo or at random
+    gsf_visibility_stats visibility; // zero where it was not needed
+    gsf_dense_stats dense;           // likewise
+} gsf_initial_stats;
+
+// DENSE and RANDOM need the views' images. GSF_ERROR_DEGENERATE where no point is left. desc and stats may be NULL.
+GSF_API GSF_NODISCARD gsf_result gsf_splat_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                                          size_t view_count, const gsf_initial_desc* desc,
+                                                          gsf_splats* out, gsf_initial_stats* stats);
+
+typedef enum gsf_quality { // what each saves and costs: bench/QUALITY.md
+    GSF_QUALITY_BALANCED = 0, // windows whose render agrees with the photos to 45 dB are not restored
+    GSF_QUALITY_EXACT,        // nothing is left out
+    GSF_QUALITY_FAST,         // lazy_adam; windows are skipped from 36 dB on, frames restored at 320 x 240 pixels
+} gsf_quality;
+
+// The loop's settings for few photos: 1200 iterations, regularisers (train.dropout, opacity_decay, depth_smoothness), what
+// `quality` stands for, and from the scene (NULL = none) the near plane of all its cameras and the points that keep the path
+// upright, which are borrowed.
+GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality quality);
+
+// Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Splats
+// look as they were trained when they are rendered with the same.
+GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
 
 #ifdef __cplusplus
 }
@@ -12707,6 +12768,248 @@ GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const
     f->skipped = numbers[6];
     f->planned = 0; // the path is a function of views, round and seed
     return GSF_OK;
+}
+
+// ---- >>few views ---------------------------------------------------------------
+
+GSF_API gsf_result gsf_splat_load_train_views(gsf_context* ctx, gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                              gsf_train_view** out) {
+    *out = NULL;
+    gsf_train_view* list = (gsf_train_view*)gsf_alloc_zeroed(ctx, view_count + 1, sizeof *list);
+    if (!list) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < view_count; i++) {
+        const size_t v = views ? views[i] : i;
+        const gsf_result result = gsf_splat_load_view_image(ctx, scene, v);
+        if (result != GSF_OK) {
+            gsf_free(ctx, list);
+            return result;
+        }
+        list[i].camera = scene->views[v].camera;
+        list[i].image = scene->views[v].image;
+        list[i].weight = scene->views[v].weight;
+        list[i].image.owned = list[i].weight.owned = NULL;
+    }
+    *out = list;
+    return GSF_OK;
+}
+
+enum { GSF__DENSE_FROM_VIEWS = 6, GSF__STREAM_POINTS = 0x72616e64 }; // a stream apart from the trainer's
+
+static gsf_initial_desc gsf__initial_desc_defaults(const gsf_initial_desc* desc, const gsf_scene* scene, size_t view_count) {
+    gsf_initial_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.kind == GSF_INITIAL_AUTO)
+        d.kind = scene->point_count == 0               ? GSF_INITIAL_RANDOM
+                 : view_count < GSF__DENSE_FROM_VIEWS ? GSF_INITIAL_BOTH
+                                                      : GSF_INITIAL_DENSE;
+    d.sh_degree = d.sh_degree == 0 ? 3 : d.sh_degree < 0 ? 0 : d.sh_degree;
+    if (d.random_points == 0) d.random_points = 20000;
+    d.visibility.method = d.kind == GSF_INITIAL_RAYS     ? GSF_VISIBILITY_RAYS
+                          : d.kind == GSF_INITIAL_TRACKS ? GSF_VISIBILITY_TRACKS
+                                                         : GSF_VISIBILITY_BOTH;
+    d.visibility = gsf__visibility_desc_defaults(&d.visibility);
+    d.dense = gsf__dense_desc_defaults(&d.dense);
+    d.dense.seed = d.seed;
+    d.dense.skip_sparse = 1;
+    if (d.dense.max_points == 0) d.dense.max_points = 40000;
+    return d;
+}
+
+typedef struct gsf__colored_points {
+    size_t count;
+    double* points;  // (count,3)
+    uint8_t* colors; // (count,3)
+} gsf__colored_points;
+
+static gsf_result gsf__make_points(gsf_context* ctx, size_t count, gsf__colored_points* out) {
+    out->count = count;
+    out->points = (double*)gsf_alloc(ctx, count + 1, 3 * sizeof *out->points);
+    out->colors = (uint8_t*)gsf_alloc(ctx, count + 1, 3);
+    return out->points && out->colors ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static void gsf__destroy_points(gsf_context* ctx, gsf__colored_points* points) {
+    gsf_free(ctx, points->points);
+    gsf_free(ctx, points->colors);
+    memset(points, 0, sizeof *points);
+}
+
+// A pixel of the view and a depth from 0.3 to 2 times the focus' (even in volume), with the pixel's colour, or grey where the
+// photo does not count.
+static void gsf__random_point(const gsf_scene_view* view, const double* focus, uint64_t seed, uint64_t i, double point[3],
+                              uint8_t color[3]) {
+    const gsf_camera* camera = &view->camera;
+    double c2w[16], x, y, depth = 1.0;
+    gsf_camera_c2w(camera, c2w);
+    if (!focus || !gsf_camera_project(camera, focus, &x, &y, &depth)) depth = 1.0;
+    const double least = 0.3 * depth, most = 2.0 * depth, a = least * least * least;
+    const double z = cbrt(a + (most * most * most - a) * gsf_random_uniform(seed, GSF__STREAM_POINTS, 3 * i));
+    const double u = camera->width * gsf_random_uniform(seed, GSF__STREAM_POINTS, 3 * i + 1);
+    const double v = camera->height * gsf_random_uniform(seed, GSF__STREAM_POINTS, 3 * i + 2);
+    x = (u - camera->cx) / camera->fx * z;
+    y = (v - camera->cy) / camera->fy * z;
+    const gsf_image *image = &view->image, *weight = &view->weight;
+    const uint8_t* pixel = (const uint8_t*)image->data + (int64_t)v * image->stride_y + (int64_t)u * image->stride_x;
+    const int counts = !weight->data || ((const uint8_t*)weight->data)[(int64_t)v * weight->stride_y +
+                                                                       (int64_t)u * weight->stride_x] >= 128;
+    for (int k = 0; k < 3; k++) {
+        point[k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
+        color[k] = counts ? pixel[k * image->stride_c] : 128;
+    }
+}
+
+// Around what all views look at, in turns from each view.
+static gsf_result gsf__random_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                     const gsf_initial_desc* desc, gsf__colored_points* out) {
+    if (desc->random_points < 1 || view_count == 0)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: %d random points in %zu views",
+                        (int)desc->random_points, view_count);
+    for (size_t i = 0; i < view_count; i++)
+        if (views[i] >= scene->view_count || !scene->views[views[i]].image.data)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: the image of view %u is not loaded", views[i]);
+    double* poses = (double*)gsf_alloc(ctx, view_count, 16 * sizeof *poses);
+    if (!poses) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < view_count; i++) gsf_camera_c2w(&scene->views[views[i]].camera, poses + 16 * i);
+    double focus[3] = {0.0, 0.0, 0.0};
+    const int has_focus = gsf_traj_focus_point(ctx, poses, view_count, focus) == GSF_OK;
+    gsf_free(ctx, poses);
+    GSF__TRY(gsf__make_points(ctx, (size_t)desc->random_points, out));
+    for (size_t i = 0; i < out->count; i++)
+        gsf__random_point(&scene->views[views[i % view_count]], has_focus ? focus : NULL, desc->seed, i,
+                          out->points + 3 * i, out->colors + 3 * i);
+    return GSF_OK;
+}
+
+// The scene's points marked by `keep`, then `dense`.
+static gsf_result gsf__merge_points(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep, const gsf_dense* dense,
+                                    gsf__colored_points* out) {
+    size_t n = 0;
+    for (size_t i = 0; i < scene->point_count; i++) n += keep[i] != 0;
+    GSF__TRY(gsf__make_points(ctx, n + dense->count, out));
+    n = 0;
+    for (size_t i = 0; i < scene->point_count; i++) {
+        if (!keep[i]) continue;
+        memcpy(out->points + 3 * n, scene->points + 3 * i, 3 * sizeof *out->points);
+        memcpy(out->colors + 3 * n, scene->colors + 3 * i, 3);
+        n++;
+    }
+    if (dense->count) {
+        memcpy(out->points + 3 * n, dense->points, dense->count * 3 * sizeof *out->points);
+        memcpy(out->colors + 3 * n, dense->colors, dense->count * 3);
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__dense_and_kept(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                      const gsf_initial_desc* desc, const uint8_t* keep, gsf__colored_points* out,
+                                      gsf_initial_stats* stats) {
+    gsf_dense dense;
+    GSF__TRY(gsf_splat_dense_points(ctx, scene, views, view_count, keep, &desc->dense, &dense, &stats->dense));
+    gsf_result result = gsf__merge_points(ctx, scene, keep, &dense, out);
+    stats->new_points = dense.count;
+    if (result == GSF_OK && out->count == 0)
+        result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: no point of the scene is seen by one of the %zu views, "
+                          "and no two of them agree anywhere (random points do without)", view_count);
+    gsf_splat_destroy_dense(ctx, &dense);
+    return result;
+}
+
+// Of every kind but RANDOM.
+static gsf_result gsf__scene_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                    const gsf_initial_desc* d, uint8_t* keep, gsf_splats* out, gsf_initial_stats* stats) {
+    if (scene->point_count == 0 && d->kind != GSF_INITIAL_DENSE)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (random ones do without)",
+                        scene->folder ? scene->folder : "initial splats");
+    if (d->kind == GSF_INITIAL_ALL) memset(keep, 1, scene->point_count);
+    else GSF__TRY(gsf_splat_visible_points(ctx, scene, views, view_count, &d->visibility, keep, &stats->visibility));
+    for (size_t i = 0; i < scene->point_count; i++) stats->scene_points += keep[i] != 0;
+    if (d->kind != GSF_INITIAL_DENSE) {
+        if (stats->scene_points == 0)
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: no point of the scene is seen by one of the %zu views "
+                            "(all points, or random ones, do without)", view_count);
+        return gsf_splat_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, d->sh_degree,
+                                     scene->origin, out);
+    }
+    gsf__colored_points merged;
+    memset(&merged, 0, sizeof merged);
+    gsf_result result = gsf__dense_and_kept(ctx, scene, views, view_count, d, keep, &merged, stats);
+    if (result == GSF_OK)
+        result = gsf_splat_from_points(ctx, merged.points, merged.colors, merged.count, NULL, d->sh_degree, scene->origin, out);
+    gsf__destroy_points(ctx, &merged);
+    return result;
+}
+
+static gsf_result gsf__random_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                     const gsf_initial_desc* d, gsf_splats* out, gsf_initial_stats* stats) {
+    gsf__colored_points random;
+    memset(&random, 0, sizeof random);
+    gsf_result result = gsf__random_points(ctx, scene, views, view_count, d, &random);
+    stats->new_points = random.count;
+    if (result == GSF_OK)
+        result = gsf_splat_from_points(ctx, random.points, random.colors, random.count, NULL, d->sh_degree, scene->origin, out);
+    gsf__destroy_points(ctx, &random);
+    return result;
+}
+
+GSF_API gsf_result gsf_splat_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                            size_t view_count, const gsf_initial_desc* desc, gsf_splats* out,
+                                            gsf_initial_stats* stats) {
+    gsf_initial_stats ignored;
+    if (!stats) stats = &ignored;
+    memset(stats, 0, sizeof *stats);
+    memset(out, 0, sizeof *out);
+    const gsf_initial_desc d = gsf__initial_desc_defaults(desc, scene, view_count);
+    stats->used = d;
+    if (d.sh_degree > 3 || (int)d.kind < 0 || d.kind > GSF_INITIAL_RANDOM || (!views && view_count != scene->view_count))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: kind %d, SH degree %d, %zu of %zu views",
+                        (int)d.kind, (int)d.sh_degree, view_count, scene->view_count);
+    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count + 1, 1);
+    uint32_t* all = views ? NULL : (uint32_t*)gsf_alloc(ctx, view_count + 1, sizeof *all);
+    gsf_result result = keep && (views || all) ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; all && i < view_count; i++) all[i] = (uint32_t)i;
+    if (!views) views = all;
+    if (result == GSF_OK && d.kind == GSF_INITIAL_RANDOM)
+        result = gsf__random_splats(ctx, scene, views, view_count, &d, out, stats);
+    else if (result == GSF_OK)
+        result = gsf__scene_splats(ctx, scene, views, view_count, &d, keep, out, stats);
+    gsf_free(ctx, all);
+    gsf_free(ctx, keep);
+    return result;
+}
+
+GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, size_t count) {
+    double mean[3] = {0.0, 0.0, 0.0}, most = 0.0;
+    for (int pass = 0; pass < 2; pass++)
+        for (size_t i = 0; i < count; i++) {
+            double c[3], d2 = 0.0;
+            gsf_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
+            for (int k = 0; k < 3; k++) {
+                if (pass == 0) mean[k] += c[k] / (double)count;
+                else d2 += (c[k] - mean[k]) * (c[k] - mean[k]);
+            }
+            if (d2 > most) most = d2;
+        }
+    const double near_plane = 0.01 * 1.1 * sqrt(most);
+    return near_plane > 1e-6 && near_plane < 0.2 ? (float)near_plane : 0.2f;
+}
+
+GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality quality) {
+    gsf_fix_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.train.iterations = 1200;
+    desc.train.dropout = 0.1f;
+    desc.train.opacity_decay = 0.002f;
+    desc.train.depth_smoothness = 0.5f;
+    desc.train.lazy_adam = quality == GSF_QUALITY_FAST;
+    desc.skip_psnr = quality == GSF_QUALITY_EXACT ? 0.0f : quality == GSF_QUALITY_FAST ? 36.0f : 45.0f;
+    desc.max_pixels = quality == GSF_QUALITY_FAST ? 320 * 240 : 0;
+    if (!scene) return desc;
+    desc.points = scene->points;
+    desc.point_count = scene->point_count;
+    if (scene->view_count)
+        desc.train.render.near_plane = gsf_splat_near_plane(&scene->views->camera, sizeof *scene->views, scene->view_count);
+    return desc;
 }
 
 GSF__END_IMPLEMENTATION

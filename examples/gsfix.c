@@ -396,22 +396,6 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
     return GSF_OK;
 }
 
-float gsfix_near_plane(const gsf_camera* cameras, size_t stride, size_t count) {
-    double mean[3] = {0}, most = 0.0;
-    for (int pass = 0; pass < 2; pass++)
-        for (size_t i = 0; i < count; i++) {
-            double c[3], d = 0.0;
-            gsf_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
-            for (int k = 0; k < 3; k++) {
-                if (pass == 0) mean[k] += c[k] / (double)count;
-                else d += (c[k] - mean[k]) * (c[k] - mean[k]);
-            }
-            if (d > most) most = d;
-        }
-    const double near = 0.01 * 1.1 * sqrt(most);
-    return near > 1e-6 && near < 0.2 ? (float)near : 0.2f;
-}
-
 gsf_traj_kind gsfix_path_kind(const char* name) {
     return !name || strcmp(name, "reference") == 0 ? GSF_TRAJ_REFERENCE
            : strcmp(name, "ellipse") == 0          ? GSF_TRAJ_ELLIPSE
@@ -758,8 +742,8 @@ static gsf_result render_all(gsfix_app* app, const float background[3]) {
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
     if (result == GSF_OK && app->o.scene) count = scene.view_count;
     if (result == GSF_OK && count)
-        desc.near_plane = app->o.scene ? gsfix_near_plane(&scene.views[0].camera, sizeof scene.views[0], count)
-                                       : gsfix_near_plane(path, sizeof *path, count);
+        desc.near_plane = app->o.scene ? gsf_splat_near_plane(&scene.views[0].camera, sizeof scene.views[0], count)
+                                       : gsf_splat_near_plane(path, sizeof *path, count);
     if (result == GSF_OK) result = open_render_out(app, app->o.scene ? &scene : NULL, count);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
     gsfix_json_begin(ctx, &app->json, "frames", '[');

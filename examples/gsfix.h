@@ -160,18 +160,13 @@ extern const char* const gsfix_solvers[3];    // and --solver gsf_nn_solver
 gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app);      // as the options have it, for --restorer dit:MODEL_DIR
 gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app);      // of the clip that was at work, when the whole is done
 gsf_traj_kind gsfix_path_kind(const char* name);
-// Near plane for renders of a scene with these cameras (`stride` bytes apart): 0.01 times their extent, at most the official
-// 0.2. fix and render share the rule, so that splats look the same in both.
-float gsfix_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
 
 // ---- gsfix_fix.c, gsfix_report.c -------------------------------------------------
 
 typedef struct gsfix_quality { // --quality is one of these rows
     const char* name;
-    int32_t lazy_adam;  // of gsf_train_desc
-    float skip_psnr;    // dB from which a window counts as needing no restoring; 0 = all are restored
-    int32_t max_pixels; // of a frame that is restored; 0 = photo size
-    int32_t steps;      // of the restorer dit:
+    gsf_quality work; // of training and of the loop
+    int32_t steps;    // of the restorer dit:
     gsf_nn_solver solver;
     int bf16;
 } gsfix_quality;

@@ -5,19 +5,22 @@
 #include <math.h>
 #include <stddef.h>
 
-// ---- defaults: decided by measurement, kept here only ------------------------------
-
-enum { DEFAULT_ITERATIONS = 1200, DEFAULT_SH_DEGREE = 3, RANDOM_POINTS = 20000, DENSE_POINTS = 40000 };
-enum { DENSE_FROM = 6 }; // photos from which --init dense is the default: see bench/QUALITY.md
-
-static const struct { float dropout, opacity_decay, scale_penalty, depth_smoothness; } few_view_regularizers = {
-    0.1f, 0.002f, 0.0f, 0.5f}; // --regularize on
+// ---- defaults --------------------------------------------------------------------
 
 static const gsfix_quality qualities[] = { // what each saves and costs: bench/QUALITY.md
-    {"exact", 0, 0.0f, 0, 50, GSF_NN_DDIM, 0},
-    {"balanced", 0, 45.0f, 0, 50, GSF_NN_DDIM, 0},
-    {"fast", 1, 36.0f, 320 * 240, 10, GSF_NN_UNIPC, 1},
+    {"exact", GSF_QUALITY_EXACT, 50, GSF_NN_DDIM, 0},
+    {"balanced", GSF_QUALITY_BALANCED, 50, GSF_NN_DDIM, 0},
+    {"fast", GSF_QUALITY_FAST, 10, GSF_NN_UNIPC, 1},
 };
+
+// How --init spells gsf_initial_kind.
+static const char* const initial_kinds[] = {NULL, "both", "tracks", "embree", "all", "dense", "random"};
+
+static gsf_initial_kind find_initial_kind(const char* name) {
+    for (int i = 1; name && i < (int)(sizeof initial_kinds / sizeof *initial_kinds); i++)
+        if (strcmp(initial_kinds[i], name) == 0) return (gsf_initial_kind)i;
+    return GSF_INITIAL_AUTO;
+}
 
 const gsfix_quality* gsfix_find_quality(const char* name) {
     for (size_t i = 0; name && i < sizeof qualities / sizeof *qualities; i++)
@@ -29,20 +32,18 @@ const gsfix_quality* gsfix_find_quality(const char* name) {
 
 typedef struct fix_setup { // everything that decides what the run computes
     gsf_fix_desc fix;
-    gsf_dense_desc dense;
-    int32_t sh_degree, random_points, dense_points; // dense_points: at most
-    char init[16]; // method, resolved
+    gsf_initial_desc initial; // once the splats are made, with its defaults filled in
 } fix_setup;
 
 enum { SET_WHOLE, SET_REAL, SET_SWITCH, SET_COUNT }; // int32_t, float, int32_t of 0 (off) or 1 (on), size_t
 typedef struct setting { const char* name; int kind; size_t offset; double least, most; } setting;
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
-#define DENSE_AT(field) offsetof(fix_setup, dense.field)
+#define DENSE_AT(field) offsetof(fix_setup, initial.dense.field)
 static const setting settings[] = { // zero: the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc;
     // -1 where those have a meaning for negative values
-    {"sh_degree", SET_WHOLE, offsetof(fix_setup, sh_degree), 0, 3},
-    {"random_points", SET_WHOLE, offsetof(fix_setup, random_points), 1, 1e8},
+    {"sh_degree", SET_WHOLE, offsetof(fix_setup, initial.sh_degree), 0, 3},
+    {"random_points", SET_WHOLE, offsetof(fix_setup, initial.random_points), 1, 1e8},
     {"dropout", SET_REAL, TRAIN_AT(dropout), 0, 0.99},
     {"opacity_decay", SET_REAL, TRAIN_AT(opacity_decay), 0, 1},
     {"scale_penalty", SET_REAL, TRAIN_AT(scale_penalty), -1, 1000},
@@ -79,7 +80,7 @@ static const setting settings[] = { // zero: the library's default, see gsf_trai
     {"lambda", SET_REAL, FIX_AT(lambda), 0, 1000},
     {"skip_psnr", SET_REAL, FIX_AT(skip_psnr), 0, 1000},
     {"max_pixels", SET_WHOLE, FIX_AT(max_pixels), 0, 1e9},
-    {"dense_points", SET_WHOLE, offsetof(fix_setup, dense_points), 1, 1e8},
+    {"dense_points", SET_COUNT, DENSE_AT(max_points), 1, 1e8},
     {"dense_spacing", SET_WHOLE, DENSE_AT(spacing), 0, 10000},
     {"dense_max_cost", SET_REAL, DENSE_AT(max_cost), 0, 2},
     {"dense_max_reprojection", SET_REAL, DENSE_AT(max_reprojection), 0, 1000},
@@ -126,27 +127,21 @@ static int apply_settings(gsfix_app* app, fix_setup* setup) {
 static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp(app->o.restorer, "none") != 0; }
 
 static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit code
-    const gsfix_quality* quality = gsfix_find_quality(app->o.quality);
     memset(setup, 0, sizeof *setup);
-    setup->sh_degree = DEFAULT_SH_DEGREE;
-    setup->random_points = RANDOM_POINTS;
-    setup->dense_points = DENSE_POINTS;
+    setup->fix = gsf_splat_few_view_desc(NULL, gsfix_find_quality(app->o.quality)->work);
+    setup->initial.kind = find_initial_kind(app->o.init);
+    setup->initial.seed = app->o.seed;
+    setup->initial.sh_degree = 3;
     gsf_train_desc* train = &setup->fix.train;
-    train->iterations = app->o.iterations ? app->o.iterations : DEFAULT_ITERATIONS;
+    if (app->o.iterations) train->iterations = app->o.iterations;
     train->seed = app->o.seed;
-    train->lazy_adam = quality->lazy_adam;
-    if (!app->o.regularize || strcmp(app->o.regularize, "on") == 0) {
-        train->dropout = few_view_regularizers.dropout;
-        train->opacity_decay = few_view_regularizers.opacity_decay;
-        train->scale_penalty = few_view_regularizers.scale_penalty;
-        train->depth_smoothness = few_view_regularizers.depth_smoothness;
-    }
+    if (app->o.regularize && strcmp(app->o.regularize, "off") == 0)
+        train->dropout = train->opacity_decay = train->scale_penalty = train->depth_smoothness = 0.0f;
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
-    setup->fix.skip_psnr = quality->skip_psnr;
-    setup->fix.max_pixels = quality->max_pixels;
     int code = apply_settings(app, setup);
     if (!code) code = gsfix_background(app, train->background, &train->background_random);
     if (code) return code;
+    if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // set to 0
     if (app->o.compare && !has_restorer(app)) return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     return gsfix_check_restorer(app);
 }
@@ -194,138 +189,20 @@ static void add_seconds(fix_run* run, int stage, double* since) {
 
 // ---- initial splats --------------------------------------------------------------
 
-// Points drawn evenly from the volume that each training view sees around the depth of what all of them look at, with
-// the colour of their pixel.
-static gsf_result random_points(fix_run* run, double** points, uint8_t** colors, size_t count) {
-    gsf_context* ctx = run->ctx;
-    const size_t n = run->split.train_count;
-    double* poses = (double*)gsf_alloc(ctx, n, 16 * sizeof *poses);
-    *points = (double*)gsf_alloc(ctx, count, 3 * sizeof **points);
-    *colors = (uint8_t*)gsf_alloc(ctx, count, 3);
-    if (!poses || !*points || !*colors) {
-        gsf_free(ctx, poses);
-        return GSF_ERROR_OUT_OF_MEMORY;
-    }
-    for (size_t i = 0; i < n; i++) gsf_camera_c2w(&run->scene.views[run->split.train[i]].camera, poses + 16 * i);
-    double focus[3] = {0};
-    const int has_focus = gsf_traj_focus_point(ctx, poses, n, focus) == GSF_OK;
-    for (size_t i = 0; i < count; i++) {
-        const gsf_scene_view* view = &run->scene.views[run->split.train[i % n]];
-        const double* c2w = poses + 16 * (i % n);
-        double u, v, z, far = 0.0;
-        if (!has_focus || !gsf_camera_project(&view->camera, focus, &u, &v, &far)) far = 1.0;
-        const double near = 0.3 * far, a = near * near * near;
-        far *= 2.0;
-        z = cbrt(a + (far * far * far - a) * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i));
-        u = view->camera.width * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i + 1);
-        v = view->camera.height * gsf_random_uniform(run->setup.fix.train.seed, 0x72616e64u, 3 * i + 2);
-        const double x = (u - view->camera.cx) / view->camera.fx * z, y = (v - view->camera.cy) / view->camera.fy * z;
-        for (int k = 0; k < 3; k++)
-            (*points)[3 * i + (size_t)k] = c2w[k] * x + c2w[4 + k] * y + c2w[8 + k] * z + c2w[12 + k];
-        const char* pixel =
-            (const char*)view->image.data + (int64_t)v * view->image.stride_y + (int64_t)u * view->image.stride_x;
-        const gsf_image* w = &view->weight; // no colour is known where the photo does not count
-        const int counts = !w->data || ((const uint8_t*)w->data)[(int64_t)v * w->stride_y + (int64_t)u * w->stride_x] >= 128;
-        for (int k = 0; k < 3; k++)
-            (*colors)[3 * i + (size_t)k] = counts ? (uint8_t)pixel[k * view->image.stride_c] : 128;
-    }
-    gsf_free(ctx, poses);
-    return GSF_OK;
-}
-
-// The points marked by `keep`, and points where the training photos agree that lie apart from these.
-static gsf_result dense_points(fix_run* run, const uint8_t* keep, double** points, uint8_t** colors, size_t* count) {
-    gsf_context* ctx = run->ctx;
-    const gsf_scene* scene = &run->scene;
-    gsf_dense dense;
-    gsf_dense_stats stats;
-    gsf_dense_desc desc = run->setup.dense;
-    desc.seed = run->setup.fix.train.seed;
-    desc.skip_sparse = 1;
-    desc.max_points = (size_t)run->setup.dense_points;
-    gsf_result result = gsf_splat_dense_points(ctx, scene, run->split.train, run->split.train_count, keep, &desc, &dense,
-                                               &stats);
-    if (result != GSF_OK) return result;
-    size_t n = 0;
-    for (size_t i = 0; i < scene->point_count; i++) n += keep[i] != 0;
-    gsfix_note(run->app, "%zu points that a training view sees; %zu more by stereo between %zu pairs of views in %.1f s", n,
-               dense.count, stats.pairs, stats.seconds_prepare + stats.seconds_match + stats.seconds_fuse);
-    *points = (double*)gsf_alloc(ctx, n + dense.count + 1, 3 * sizeof **points);
-    *colors = (uint8_t*)gsf_alloc(ctx, n + dense.count + 1, 3);
-    if (*points && *colors) {
-        n = 0;
-        for (size_t i = 0; i < scene->point_count; i++) {
-            if (!keep[i]) continue;
-            memcpy(*points + 3 * n, scene->points + 3 * i, 3 * sizeof **points);
-            memcpy(*colors + 3 * n++, scene->colors + 3 * i, 3);
-        }
-        if (dense.count) {
-            memcpy(*points + 3 * n, dense.points, dense.count * 3 * sizeof **points);
-            memcpy(*colors + 3 * n, dense.colors, dense.count * 3);
-        }
-        *count = n + dense.count;
-        if (!*count)
-            result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "no sparse point is seen by a training view, and no two of them "
-                              "agree anywhere (try --init random)");
-    } else {
-        result = GSF_ERROR_OUT_OF_MEMORY;
-    }
-    gsf_splat_destroy_dense(ctx, &dense);
-    return result;
-}
-
 static gsf_result make_initial(fix_run* run) {
-    gsf_context* ctx = run->ctx;
-    const gsf_scene* scene = &run->scene;
-    const char* init = run->app->o.init;
-    if (!init) init = !scene->point_count ? "random" : run->split.train_count < DENSE_FROM ? "both" : "dense";
-    snprintf(run->setup.init, sizeof run->setup.init, "%s", init);
-    run->rays = "none";
-    if (strcmp(init, "random") == 0) {
-        double* points = NULL;
-        uint8_t* colors = NULL;
-        const size_t count = (size_t)run->setup.random_points;
-        gsf_result result = random_points(run, &points, &colors, count);
-        if (result == GSF_OK)
-            result = gsf_splat_from_points(ctx, points, colors, count, NULL, run->setup.sh_degree, scene->origin,
-                                           &run->initial);
-        gsf_free(ctx, points);
-        gsf_free(ctx, colors);
-        return result;
-    }
-    const int is_dense = strcmp(init, "dense") == 0;
-    if (!scene->point_count && !is_dense)
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (--init random does without)",
-                        scene->folder);
-    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count + 1, 1);
-    if (!keep) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf_result result = GSF_OK;
-    if (strcmp(init, "all") == 0) {
-        memset(keep, 1, scene->point_count);
-    } else if (scene->point_count) {
-        gsf_visibility_desc desc = {0};
-        gsf_visibility_stats stats = {0};
-        desc.method = strcmp(init, "embree") == 0   ? GSF_VISIBILITY_RAYS
-                      : strcmp(init, "tracks") == 0 ? GSF_VISIBILITY_TRACKS
-                                                    : GSF_VISIBILITY_BOTH;
-        result = gsf_splat_visible_points(ctx, scene, run->split.train, run->split.train_count, &desc, keep, &stats);
-        if (result == GSF_OK && !stats.kept && !is_dense)
-            result = gsf_fail(ctx, GSF_ERROR_DEGENERATE,
-                              "no point of the scene is seen by a training view (try --init all or random)");
-        if (desc.method != GSF_VISIBILITY_TRACKS) run->rays = stats.used_embree ? "embree" : "z-buffer";
-    }
-    double* points = NULL;
-    uint8_t* colors = NULL;
-    size_t count = 0;
-    if (result == GSF_OK && is_dense) result = dense_points(run, keep, &points, &colors, &count);
-    if (result == GSF_OK)
-        result = gsf_splat_from_points(ctx, is_dense ? points : scene->points, is_dense ? colors : scene->colors,
-                                       is_dense ? count : scene->point_count, is_dense ? NULL : keep, run->setup.sh_degree,
-                                       scene->origin, &run->initial);
-    gsf_free(ctx, points);
-    gsf_free(ctx, colors);
-    gsf_free(ctx, keep);
-    return result;
+    gsf_initial_stats stats;
+    const gsf_result result = gsf_splat_initial_splats(run->ctx, &run->scene, run->split.train, run->split.train_count,
+                                                       &run->setup.initial, &run->initial, &stats);
+    if (result != GSF_OK) return result;
+    run->setup.initial = stats.used;
+    const gsf_initial_kind kind = stats.used.kind;
+    const int traced = run->scene.point_count && kind != GSF_INITIAL_TRACKS && kind != GSF_INITIAL_ALL && kind != GSF_INITIAL_RANDOM;
+    run->rays = !traced ? "none" : stats.visibility.used_embree ? "embree" : "z-buffer";
+    if (kind == GSF_INITIAL_DENSE)
+        gsfix_note(run->app, "%zu points that a training view sees; %zu more by stereo between %zu pairs of views in %.1f s",
+                   stats.scene_points, stats.new_points, stats.dense.pairs,
+                   stats.dense.seconds_prepare + stats.dense.seconds_match + stats.dense.seconds_fuse);
+    return GSF_OK;
 }
 
 // ---- held-out views --------------------------------------------------------------
@@ -511,7 +388,6 @@ static void write_switches(fix_run* run) {
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
     fix_setup used = run->setup;
     used.fix = gsf_splat_fixer_desc(run->fixer);
-    used.dense = gsf_splat_dense_desc(&used.dense);
     const gsf_train_desc* train = &used.fix.train;
     gsfix_json_begin(ctx, t, NULL, '{');
     gsfix_json_number(ctx, t, "iterations", train->iterations);
@@ -521,13 +397,13 @@ static void write_switches(fix_run* run) {
     gsfix_json_text(ctx, t, "regularize", o->regularize ? o->regularize : "on");
     gsfix_json_text(ctx, t, "compare", o->compare ? "on" : "off");
     gsfix_json_text(ctx, t, "trajectory", kinds[used.fix.trajectory]);
-    gsfix_json_text(ctx, t, "init", used.init);
+    gsfix_json_text(ctx, t, "init", initial_kinds[used.initial.kind]);
     gsfix_json_text(ctx, t, "quality", gsfix_find_quality(o->quality)->name);
     gsfix_json_text(ctx, t, "gradient", train->render.gradient == GSF_GRADIENT_TRUE ? "true" : "official");
     for (int i = 0; i < SETTING_COUNT; i++) {
         const void* field = (const char*)&used + settings[i].offset;
-        if (strcmp(settings[i].name, "random_points") == 0 && strcmp(used.init, "random") != 0) continue;
-        if (strncmp(settings[i].name, "dense_", 6) == 0 && strcmp(used.init, "dense") != 0) continue;
+        if (strcmp(settings[i].name, "random_points") == 0 && used.initial.kind != GSF_INITIAL_RANDOM) continue;
+        if (strncmp(settings[i].name, "dense_", 6) == 0 && used.initial.kind != GSF_INITIAL_DENSE) continue;
         const int kind = settings[i].kind;
         const int32_t whole = kind == SET_WHOLE || kind == SET_SWITCH ? *(const int32_t*)field : 0;
         if (kind == SET_COUNT) gsfix_json_number(ctx, t, settings[i].name, (double)*(const size_t*)field);
@@ -818,18 +694,14 @@ static gsf_result start_fixer(fix_run* run) {
     gsf_splat_destroy_fixer(ctx, run->fixer);
     run->fixer = NULL;
     const size_t n = run->split.train_count;
-    gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, n, sizeof *views);
-    if (!views) return GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < n; i++) {
-        views[i].camera = run->scene.views[run->split.train[i]].camera;
-        views[i].image = run->scene.views[run->split.train[i]].image;
-        views[i].weight = run->scene.views[run->split.train[i]].weight;
-    }
+    gsf_train_view* views = NULL;
+    gsf_result result = gsf_splat_load_train_views(ctx, &run->scene, run->split.train, n, &views);
+    if (result != GSF_OK) return result;
     gsf_fix_desc desc = run->setup.fix;
     desc.points = run->scene.points; // they keep the path upright
     desc.point_count = run->scene.point_count;
-    const gsf_result result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
-                                                   run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
+    result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
+                                  run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
     gsf_free(ctx, views);
     return result;
 }
@@ -927,7 +799,7 @@ static gsf_result prepare(fix_run* run) {
     if (result == GSF_OK) result = gsfix_make_restorer(app, &run->restorer, &run->has_restorer);
     if (result == GSF_OK)
         run->setup.fix.train.render.near_plane =
-            gsfix_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
+            gsf_splat_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
     if (result == GSF_OK) result = load_photos(run);
     if (result == GSF_OK && app->o.masks) result = load_masks(run);
     if (result == GSF_OK) result = gsfix_digest_input(app, app->o.ref_features);
