@@ -7,23 +7,25 @@
 
 Each run is `gsfix fix SCENE --views K --seed S ARGS --threads 1`. The starts:
 
-    tracks    the points that a training photo tracks, as the papers have it (--init tracks)
-    default   what gsfix fix does unless told otherwise: below 6 photos also the points that a ray from a training photo
-              meets, from 6 on those and stereo between the training photos. Rays keep points that only held-out photos
-              tracked: where all photos made the model, that is a leak in a comparison and a gift in practice.
+    tracks    the points that have a track in a training photo, as in the papers (--init tracks)
+    default   the default of gsfix fix: with fewer than 6 photos also the points that a ray from a training photo reaches,
+              with 6 or more these and the points of stereo between the training photos. Rays keep points that have tracks
+              only in held-out photos. If the model was built from all photos, that is welcome in practice but leaks
+              information into a comparison.
 
-In both, poses and the points' places come from the model that SCENE holds. --opensplat adds OpenSplat's command line
-program (1.2.0) as a peer: it gets a COLMAP folder of the training photos alone with the start's points (of the default
-those by track or ray), as many steps, one thread, and the same black background; `gsfix render` and `gsfix metrics` measure
-its splats on the same pixels. Its random numbers have a fixed seed, hence one run. `OpenSplat` has its own schedule: from
-half of the steps on it moves splats only every 32nd, then every 64th step. `OpenSplat+` moves them at every step,
-densifies every 100 and adds a band of SH every 300 steps, which a run as short as these gains from.
+In both cases poses and point positions come from the COLMAP model in SCENE. --opensplat adds OpenSplat's command-line
+program (1.2.0) as a peer. It gets a COLMAP folder with the training photos only and the points of the start (for
+default: those by track or ray), the same number of steps, one thread and the same black background; `gsfix render` and
+`gsfix metrics` measure its splats over the same pixels. Its random seed is fixed, so one run suffices. `OpenSplat` uses
+its own schedule, which performs Adam's step only every 32nd and later every 64th time in the second half of a run.
+`OpenSplat+` performs it every time, densifies every 100 steps and adds an SH band every 300 steps, which suits runs as
+short as these.
 
---model is a model of all views (made first if not given): it fixes which pixels of each test view count as seen. --size is
-what masks and runs have in common, as "--max-size 240" (not with a peer). Each run leaves result.json and is not repeated;
-a call that was stopped goes on, and K = 3 comes first. DIR/quality.csv has a row for every run, DIR/quality.md the means and
-the paired differences with their standard errors; --tables writes them of what there is and runs nothing. CPU seconds are
-those of the whole program. Only the standard library is needed.
+--model is a model of all views (trained first if not given) that defines which pixels of each test view count as seen.
+--size holds options that masks and runs share, such as "--max-size 240" (not together with a peer). A run that has left
+result.json is not repeated, so that an interrupted call can be continued; K = 3 runs first. DIR/quality.csv has one row
+per run, DIR/quality.md the means and the paired differences with their standard errors; --tables writes both from the
+existing results without running anything. CPU seconds are those of the whole process. Needs only the standard library.
 """
 import argparse
 import concurrent.futures
@@ -42,14 +44,14 @@ DEFAULT_ARMS = [
     ("none", "--restorer none --regularize on"),
     ("warp", "--restorer warp --regularize on"),
 ]
-STARTS = {"tracks": ("--init tracks", "tracks"), "default": ("", "both")}  # of fix; of filter, for the peer
+STARTS = {"tracks": ("--init tracks", "tracks"), "default": ("", "both")}  # options of fix; --method of filter, for the peer
 PEER_ARMS = [("OpenSplat", ""),
              ("OpenSplat+", "--densify-from 100 --densify-until {steps} --refine-every 100 --sh-degree-interval 300")]
 FIGURES = ("psnr", "ssim", "psnr_seen", "ssim_seen")
 
 
 def run(command, environment=None):
-    """Standard output and CPU seconds."""
+    """Returns standard output and CPU seconds."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         errors = pool.submit(process.stderr.read)
@@ -108,8 +110,8 @@ def result_of(options, job):
 def fix(options, job, extra):
     start, views, _, seed = job
     out = folder_of(options, job)
-    command = [options.gsfix, "fix", options.scene, "--out", out, "--restart", "--views", views, "--seed", str(seed), "--threads", "1",
-               "--iterations", str(options.iterations), "--masks", masks_of(options, views)]
+    command = [options.gsfix, "fix", options.scene, "--out", out, "--restart", "--views", views, "--seed", str(seed),
+               "--threads", "1", "--iterations", str(options.iterations), "--masks", masks_of(options, views)]
     command += shlex.split(STARTS[start][0]) + shlex.split(options.size) + shlex.split(options.common) + shlex.split(extra)
     _, cpu = run(command)
     metrics = read_json(os.path.join(out, "metrics.json"))
@@ -120,7 +122,7 @@ def fix(options, job, extra):
 
 
 def training_scene(options, start, views, out):
-    """A COLMAP folder with the training photos alone and the start's points; the number of points."""
+    """Makes a COLMAP folder with the training photos only and the points of the start; returns the number of points."""
     text, _ = run([options.gsfix, "filter", options.scene, "--views", views, "--method", STARTS[start][1], "--out", out,
                    "--json"])
     kept = json.loads(text)["kept"]
@@ -129,7 +131,7 @@ def training_scene(options, start, views, out):
         data = file.read()
     train = set(split_of(options, views)["train"])
     at, records = 8, []
-    for _ in range(struct.unpack_from("<Q", data)[0]):  # id, pose, camera; name; number of 2D points; those: x, y, id
+    for _ in range(struct.unpack_from("<Q", data)[0]):  # id, pose, camera; name; number of 2D points; per point x, y, id
         end = data.index(b"\0", at + 64) + 1
         points = struct.unpack_from("<Q", data, end)[0]
         name = data[at + 64:end - 1].decode()
@@ -182,7 +184,7 @@ def work(options, job, body, extra):
     out = folder_of(options, job)
     if result_of(options, job) is None:
         if body is fix:
-            shutil.rmtree(out, ignore_errors=True)  # what a stopped call left
+            shutil.rmtree(out, ignore_errors=True)  # left by an interrupted call
         os.makedirs(out, exist_ok=True)
         write_json(os.path.join(out, "result.json"), body(options, job, extra))
     return result_of(options, job)
@@ -192,8 +194,8 @@ def prepare(options):
     model = options.model or os.path.join(options.out, "all", "splats.ply")
     if not os.path.exists(model):
         shutil.rmtree(os.path.dirname(model), ignore_errors=True)
-        run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--restart", "--views", "all", "--restorer", "none",
-             "--regularize", "off", "--seed", "1", "--iterations", str(options.iterations), "--threads", str(options.jobs)])
+        run([options.gsfix, "fix", options.scene, "--out", os.path.dirname(model), "--restart", "--views", "all",
+             "--restorer", "none", "--regularize", "off", "--seed", "1", "--iterations", str(options.iterations), "--threads", str(options.jobs)])
     for views in options.views:
         masks = masks_of(options, views)
         if not os.path.isdir(masks):
