@@ -227,9 +227,6 @@ typedef struct gsf_chunk {
 
 // Adds a chunk to `out` (which starts as a zeroed gsf_text). Finish with gsf_chunks_end, then gsf_write_file.
 GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size);
-// The same for bytes that are appended to `out` piece by piece: open, gsf_text_append ..., close what open returned.
-GSF_API size_t gsf_chunks_open(gsf_context* ctx, gsf_text* out, const char* tag);
-GSF_API void gsf_chunks_close(gsf_context* ctx, gsf_text* out, size_t opened);
 GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out);
 // Checks a whole file (magic, sizes, checksums, end). `name` is used in error texts.
 GSF_API GSF_NODISCARD gsf_result gsf_chunks_check(gsf_context* ctx, const char* name, const void* data, size_t size);
@@ -276,8 +273,6 @@ GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_j
 
 typedef enum gsf_dtype { GSF_U8 = 0, GSF_U16, GSF_F16, GSF_F32, GSF_F64 } gsf_dtype;
 typedef enum gsf_color_space { GSF_SRGB = 0, GSF_LINEAR } gsf_color_space; // a label; no function converts silently
-
-GSF_API size_t gsf_dtype_size(gsf_dtype dtype);
 
 // A view of pixels. Strides are in bytes, so packed, padded, planar and flipped images are all just views.
 // `owned` is non-NULL only in images made by this library, and is what gsf_destroy_image frees.
@@ -366,10 +361,6 @@ GSF_API void gsf_camera_set_c2w(gsf_camera* camera, const double c2w[16]); // in
 GSF_API int gsf_camera_project(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth);
 // The same view in another image size; intrinsics scale with width and height separately.
 GSF_API gsf_camera gsf_camera_resized(const gsf_camera* camera, int32_t width, int32_t height);
-// out = a * b for column-major 4x4.
-GSF_API void gsf_mat4_mul(const double a[16], const double b[16], double out[16]);
-// Inverse of a rigid transform (rotation transposed).
-GSF_API void gsf_mat4_rigid_inverse(const double m[16], double out[16]);
 
 // JSON list of cameras ({"cameras":[{"name","w2c":[16 numbers, row-major],"fx","fy","cx","cy","width","height"}]}),
 // the format of `gsfix path`, `gsfix render --path` and a restorer job's cameras.json. Names may be NULL.
@@ -792,6 +783,41 @@ GSF__SHARED uint16_t gsf__float_to_half(float value) {
     return (uint16_t)(sign | bits >> 13);
 }
 
+GSF__SHARED size_t gsf__dtype_size(gsf_dtype dtype) {
+    switch (dtype) {
+        case GSF_U8: return 1;
+        case GSF_U16: return 2;
+        case GSF_F16: return 2;
+        case GSF_F32: return 4;
+        case GSF_F64: return 8;
+    }
+    return 0;
+}
+
+// out = a * b for column-major 4x4.
+GSF__SHARED void gsf__mat4_mul(const double a[16], const double b[16], double out[16]) {
+    double m[16];
+    for (int c = 0; c < 4; c++)
+        for (int r = 0; r < 4; r++) {
+            double sum = 0.0;
+            for (int k = 0; k < 4; k++) sum += a[4 * k + r] * b[4 * c + k];
+            m[4 * c + r] = sum;
+        }
+    memcpy(out, m, sizeof m);
+}
+
+// Inverse of a rigid transform (rotation transposed).
+GSF__SHARED void gsf__mat4_rigid_inverse(const double m[16], double out[16]) {
+    double inv[16];
+    for (int c = 0; c < 3; c++) {
+        for (int r = 0; r < 3; r++) inv[4 * c + r] = m[4 * r + c];
+        inv[4 * c + 3] = 0.0;
+    }
+    for (int r = 0; r < 3; r++) inv[12 + r] = -(m[4 * r] * m[12] + m[4 * r + 1] * m[13] + m[4 * r + 2] * m[14]);
+    inv[15] = 1.0;
+    memcpy(out, inv, sizeof inv);
+}
+
 GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double point[3], double out[3]) {
     const double* m = camera->w2c;
     for (int r = 0; r < 3; r++) out[r] = m[r] * point[0] + m[4 + r] * point[1] + m[8 + r] * point[2] + m[12 + r];
@@ -815,6 +841,31 @@ GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t mos
 // What the platform says of a file that it does not open. What lies below a file (ENOTDIR) is not there, either.
 GSF__SHARED gsf_result gsf__open_result(int reason) {
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
+}
+
+enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
+
+// A chunk whose bytes are appended to `out` piece by piece: open, gsf_text_append ..., close what open returned.
+GSF__SHARED size_t gsf__open_chunk(gsf_context* ctx, gsf_text* out, const char* tag) {
+    char head[GSF__CHUNK_HEAD]; // or the file's, which is as long
+    if (out->size == 0) {
+        memcpy(head, "GSFCHUNK", 8);
+        gsf__store_le(head + 8, 1, 4);
+        gsf_text_append(ctx, out, head, GSF__CHUNK_FILE_HEAD);
+    }
+    const size_t opened = out->size;
+    memset(head, 0, sizeof head); // the size is filled in by close
+    memcpy(head, tag, 4);
+    gsf_text_append(ctx, out, head, GSF__CHUNK_HEAD);
+    return opened;
+}
+
+GSF__SHARED void gsf__close_chunk(gsf_context* ctx, gsf_text* out, size_t opened) {
+    char crc[GSF__CHUNK_TAIL];
+    if (out->failed) return;
+    gsf__store_le(out->data + opened + 4, out->size - opened - GSF__CHUNK_HEAD, 8);
+    gsf__store_le(crc, gsf__crc32(0, out->data + opened, out->size - opened), 4);
+    gsf_text_append(ctx, out, crc, sizeof crc);
 }
 
 // What only gsfixer.h's own implementation can do. Other implementations, which may stand in other files or libraries, find
@@ -1278,34 +1329,10 @@ GSF_API gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void
 
 // ---- >>chunks ------------------------------------------------------------------
 
-enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
-
-GSF_API size_t gsf_chunks_open(gsf_context* ctx, gsf_text* out, const char* tag) {
-    char head[GSF__CHUNK_HEAD]; // or the file's, which is as long
-    if (out->size == 0) {
-        memcpy(head, "GSFCHUNK", 8);
-        gsf__store_le(head + 8, 1, 4);
-        gsf_text_append(ctx, out, head, GSF__CHUNK_FILE_HEAD);
-    }
-    const size_t opened = out->size;
-    memset(head, 0, sizeof head); // the size is filled in by close
-    memcpy(head, tag, 4);
-    gsf_text_append(ctx, out, head, GSF__CHUNK_HEAD);
-    return opened;
-}
-
-GSF_API void gsf_chunks_close(gsf_context* ctx, gsf_text* out, size_t opened) {
-    char crc[GSF__CHUNK_TAIL];
-    if (out->failed) return;
-    gsf__store_le(out->data + opened + 4, out->size - opened - GSF__CHUNK_HEAD, 8);
-    gsf__store_le(crc, gsf__crc32(0, out->data + opened, out->size - opened), 4);
-    gsf_text_append(ctx, out, crc, sizeof crc);
-}
-
 GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size) {
-    const size_t opened = gsf_chunks_open(ctx, out, tag);
+    const size_t opened = gsf__open_chunk(ctx, out, tag);
     gsf_text_append(ctx, out, (const char*)data, size);
-    gsf_chunks_close(ctx, out, opened);
+    gsf__close_chunk(ctx, out, opened);
 }
 
 GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out) { gsf_chunks_add(ctx, out, "END ", "", 0); }
@@ -2065,17 +2092,6 @@ static void* gsf__stb_grow(void* block, size_t old_size, size_t size) {
 #endif
 #endif // GSF_NO_STB
 
-GSF_API size_t gsf_dtype_size(gsf_dtype dtype) {
-    switch (dtype) {
-        case GSF_U8: return 1;
-        case GSF_U16: return 2;
-        case GSF_F16: return 2;
-        case GSF_F32: return 4;
-        case GSF_F64: return 8;
-    }
-    return 0;
-}
-
 GSF_API gsf_image gsf_wrap_image(void* data, gsf_dtype dtype, int64_t width, int64_t height, int32_t channels) {
     gsf_image image;
     memset(&image, 0, sizeof image);
@@ -2084,7 +2100,7 @@ GSF_API gsf_image gsf_wrap_image(void* data, gsf_dtype dtype, int64_t width, int
     image.width = width;
     image.height = height;
     image.channels = channels;
-    image.stride_c = (int64_t)gsf_dtype_size(dtype);
+    image.stride_c = (int64_t)gsf__dtype_size(dtype);
     image.stride_x = image.stride_c * channels;
     image.stride_y = image.stride_x * width;
     return image;
@@ -2094,9 +2110,9 @@ GSF_API gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtype, int64_t wid
                                   gsf_image* out) {
     memset(out, 0, sizeof *out);
     size_t count, bytes;
-    if (width < 1 || height < 1 || channels < 1 || gsf_dtype_size(dtype) == 0 || (uint64_t)width > SIZE_MAX ||
+    if (width < 1 || height < 1 || channels < 1 || gsf__dtype_size(dtype) == 0 || (uint64_t)width > SIZE_MAX ||
         (uint64_t)height > SIZE_MAX || !gsf__mul_size((size_t)width, (size_t)height, &count) ||
-        !gsf__mul_size(count, (size_t)channels, &count) || !gsf__mul_size(count, gsf_dtype_size(dtype), &bytes) ||
+        !gsf__mul_size(count, (size_t)channels, &count) || !gsf__mul_size(count, gsf__dtype_size(dtype), &bytes) ||
         bytes > INT64_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "image: %lld x %lld with %d channels of type %d",
                         (long long)width, (long long)height, (int)channels, (int)dtype);
@@ -2114,7 +2130,7 @@ GSF_API void gsf_destroy_image(gsf_context* ctx, gsf_image* image) {
 
 static gsf_result gsf__check_image(gsf_context* ctx, const char* what, const gsf_image* image) {
     if (!image || !image->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: image without pixels", what);
-    if (image->width < 1 || image->height < 1 || image->channels < 1 || gsf_dtype_size(image->dtype) == 0)
+    if (image->width < 1 || image->height < 1 || image->channels < 1 || gsf__dtype_size(image->dtype) == 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: image of %lld x %lld with %d channels of type %d", what,
                         (long long)image->width, (long long)image->height, (int)image->channels, (int)image->dtype);
     return GSF_OK;
@@ -3458,36 +3474,14 @@ GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_imag
 
 // ---- >>cameras -----------------------------------------------------------------
 
-GSF_API void gsf_mat4_mul(const double a[16], const double b[16], double out[16]) {
-    double m[16];
-    for (int c = 0; c < 4; c++)
-        for (int r = 0; r < 4; r++) {
-            double sum = 0.0;
-            for (int k = 0; k < 4; k++) sum += a[4 * k + r] * b[4 * c + k];
-            m[4 * c + r] = sum;
-        }
-    memcpy(out, m, sizeof m);
-}
-
-GSF_API void gsf_mat4_rigid_inverse(const double m[16], double out[16]) {
-    double inv[16];
-    for (int c = 0; c < 3; c++) {
-        for (int r = 0; r < 3; r++) inv[4 * c + r] = m[4 * r + c];
-        inv[4 * c + 3] = 0.0;
-    }
-    for (int r = 0; r < 3; r++) inv[12 + r] = -(m[4 * r] * m[12] + m[4 * r + 1] * m[13] + m[4 * r + 2] * m[14]);
-    inv[15] = 1.0;
-    memcpy(out, inv, sizeof inv);
-}
-
 GSF_API void gsf_camera_center(const gsf_camera* camera, double center[3]) {
     double c2w[16];
-    gsf_mat4_rigid_inverse(camera->w2c, c2w);
+    gsf__mat4_rigid_inverse(camera->w2c, c2w);
     memcpy(center, c2w + 12, 3 * sizeof(double));
 }
 
-GSF_API void gsf_camera_c2w(const gsf_camera* camera, double c2w[16]) { gsf_mat4_rigid_inverse(camera->w2c, c2w); }
-GSF_API void gsf_camera_set_c2w(gsf_camera* camera, const double c2w[16]) { gsf_mat4_rigid_inverse(c2w, camera->w2c); }
+GSF_API void gsf_camera_c2w(const gsf_camera* camera, double c2w[16]) { gsf__mat4_rigid_inverse(camera->w2c, c2w); }
+GSF_API void gsf_camera_set_c2w(gsf_camera* camera, const double c2w[16]) { gsf__mat4_rigid_inverse(c2w, camera->w2c); }
 
 GSF_API int gsf_camera_project(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth) {
     double p[3];

@@ -2815,7 +2815,7 @@ static int gsf__pose_from_opengl(const double rows[12], double w2c[16]) {
         if (!(fabs(c2w[12 + r]) < 1e100)) return 0;
     }
     c2w[15] = 1.0;
-    gsf_mat4_rigid_inverse(c2w, w2c);
+    gsf__mat4_rigid_inverse(c2w, w2c);
     return 1;
 }
 
@@ -6265,7 +6265,7 @@ static void gsf__dense_choose_sources(gsf__dense_job* job, size_t r, double low,
 static void gsf__dense_relate(const gsf_camera* from, const gsf_camera* to, float m[9], float t[3], float rotation[9]) {
     double c2w[16], rel[16];
     gsf_camera_c2w(from, c2w);
-    gsf_mat4_mul(to->w2c, c2w, rel);
+    gsf__mat4_mul(to->w2c, c2w, rel);
     const double fx = from->fx, fy = from->fy, cx = from->cx - 0.5, cy = from->cy - 0.5;
     double rk[3][3]; // R K^-1
     for (int i = 0; i < 3; i++) {
@@ -10597,7 +10597,7 @@ static gsf_result gsf__photo_copy(gsf_context* ctx, const gsf_image* image, cons
 // The weights of a photo whose pixels are copied; where one is 0 they become black.
 static gsf_result gsf__photo_weigh(gsf_context* ctx, const gsf_image* weight, size_t index, gsf__photo* photo) {
     const size_t pixels = (size_t)weight->width * (size_t)weight->height;
-    const size_t bytes = 3 * gsf_dtype_size(photo->target.u8 ? GSF_U8 : GSF_F32);
+    const size_t bytes = 3 * gsf__dtype_size(photo->target.u8 ? GSF_U8 : GSF_F32);
     float* out = (float*)gsf_alloc(ctx, pixels, sizeof(float));
     if (!out) return GSF_ERROR_OUT_OF_MEMORY;
     photo->weight = out;
@@ -10631,7 +10631,7 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     out->camera = *camera;
     out->target.width = camera->width;
     out->target.height = camera->height;
-    out->pixels = gsf_alloc(ctx, pixels, 3 * gsf_dtype_size(image->dtype));
+    out->pixels = gsf_alloc(ctx, pixels, 3 * gsf__dtype_size(image->dtype));
     if (!out->pixels) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
     if (image->dtype == GSF_U8) out->target.u8 = (const uint8_t*)out->pixels;
@@ -12641,7 +12641,7 @@ enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
 static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag, const gsf__kept_frames* list) {
     char head[GSF__FRAME_HEAD];
-    const size_t opened = gsf_chunks_open(ctx, chunks, tag); // frames are most of a checkpoint: copied only once
+    const size_t opened = gsf__open_chunk(ctx, chunks, tag); // frames are most of a checkpoint: copied only once
     gsf__store_le(head, list->count, 8);
     gsf_text_append(ctx, chunks, head, 8);
     for (size_t i = 0; i < list->count; i++) {
@@ -12663,7 +12663,7 @@ static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag
         gsf_text_append(ctx, chunks, (const char*)list->frames[i].pixels,
                         4 * (size_t)camera->width * (size_t)camera->height);
     }
-    gsf_chunks_close(ctx, chunks, opened);
+    gsf__close_chunk(ctx, chunks, opened);
 }
 
 static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const void* data, size_t size, const char* tag,

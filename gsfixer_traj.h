@@ -69,11 +69,6 @@
 extern "C" {
 #endif
 
-// ---- intrinsics ----------------------------------------------------------------
-
-// Focal length in pixels of a camera that sees `fov` across `pixels` pixels.
-GSF_API double gsf_traj_focal_from_fov(double fov, double pixels);
-
 // ---- poses ---------------------------------------------------------------------
 
 // The pose at `eye` that looks at `target`; `up` is the world direction that points up in the image.
@@ -370,9 +365,9 @@ static void gsf__traj_fix_axes(const double values[3], double rows[9]) {
 
 // ---- >>intrinsics --------------------------------------------------------------
 
-// Field of view of `pixels` pixels at a focal length in pixels.
+// Field of view of `pixels` pixels at a focal length in pixels, and back.
 GSF__SHARED double gsf__traj_fov_from_focal(double focal, double pixels) { return 2.0 * atan(pixels / (2.0 * focal)); }
-GSF_API double gsf_traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
+GSF__SHARED double gsf__traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
 
 // Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the
 // official full projection (near 0.01, far 100). Needs 0 < near_plane < far_plane.
@@ -621,7 +616,7 @@ GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* 
                                                 double* out, double transform[16]) {
     double average[16];
     GSF__TRY(gsf__traj_average_pose(ctx, poses, count, official, average));
-    gsf_mat4_rigid_inverse(average, transform);
+    gsf__mat4_rigid_inverse(average, transform);
     for (size_t n = 0; n < count; n++) {
         double local[16];
         memcpy(local, poses + 16 * n, sizeof local);
@@ -629,7 +624,7 @@ GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* 
         double rotation[16];
         memcpy(rotation, transform, sizeof rotation);
         memset(rotation + 12, 0, 3 * sizeof(double));
-        gsf_mat4_mul(rotation, local, out + 16 * n);
+        gsf__mat4_mul(rotation, local, out + 16 * n);
     }
     return gsf__traj_check_path(ctx, out, count);
 }
@@ -915,7 +910,7 @@ static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, s
     }
     memcpy(cloud.transform, first, sizeof first);
     GSF__TRY(gsf__traj_cloud_axes(ctx, &cloud, points && point_count ? NULL : up, work, second));
-    gsf_mat4_mul(second, first, transform);
+    gsf__mat4_mul(second, first, transform);
     return gsf__traj_check_path(ctx, transform, 1);
 }
 
@@ -944,7 +939,7 @@ static void gsf__traj_transform_poses(const double transform[16], const double* 
     for (size_t n = 0; n < count; n++) {
         double position[3];
         gsf__traj_apply(transform, poses + 16 * n + 12, position);
-        gsf_mat4_mul(rotation, poses + 16 * n, out + 16 * n);
+        gsf__mat4_mul(rotation, poses + 16 * n, out + 16 * n);
         memcpy(out + 16 * n + 12, position, sizeof position);
     }
 }

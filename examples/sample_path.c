@@ -62,7 +62,7 @@ static gsf_result make_cameras(gsf_context* ctx, const options* o, gsf_camera** 
         if (result != GSF_OK) return result;
         camera->width = 720;
         camera->height = 480;
-        camera->fx = camera->fy = gsf_traj_focal_from_fov(1.0, camera->width); // radians
+        camera->fx = camera->fy = 0.5 * camera->width / tan(0.5); // sees one radian across
         camera->cx = 360.0;
         camera->cy = 240.0;
         gsf_camera_set_c2w(camera, pose);

@@ -93,7 +93,7 @@ static void check_normalisation(void) {
     double* c2w = poses_of(get("c2w"), &n);
     double* w2c = poses_of(get("in.w2c"), NULL);
     double* inverse = (double*)take(n * 16 * sizeof(double));
-    for (size_t i = 0; i < n; i++) gsf_mat4_rigid_inverse(w2c + 16 * i, inverse + 16 * i);
+    for (size_t i = 0; i < n; i++) gsf__mat4_rigid_inverse(w2c + 16 * i, inverse + 16 * i);
     compare_poses("c2w", inverse, NULL, tolerance);
 
     void* scratch = take(gsf__traj_similarity_scratch(n));
@@ -131,7 +131,7 @@ static void check_normalisation(void) {
     desc.center = GSF_TRAJ_CENTER_FOCUS;
     CHECK_OK(&ctx, gsf__traj_normalize(&ctx, c2w, n, points->v, m, &desc, scratch, whole));
     free(scratch);
-    gsf_mat4_mul(second, first, product);
+    gsf__mat4_mul(second, first, product);
     test_compare("T2 T1", whole, product, 16, tolerance * test_max_abs(product, 16));
     compare_poses("norm.transform", whole, signs, tolerance);
     gsf__traj_transform_poses(whole, c2w, n, moved);
@@ -364,10 +364,10 @@ static void check_cameras(void) {
                                gsf__traj_fov_from_focal(camera.fy, camera.height)};
         snprintf(name, sizeof name, "cam%d.fov_xy", camera_count);
         compare_values(name, fov, 2, tolerance);
-        CHECK_NEAR(gsf_traj_focal_from_fov(fov[0], camera.width), camera.fx, tolerance * camera.fx);
+        CHECK_NEAR(gsf__traj_focal_from_fov(fov[0], camera.width), camera.fx, tolerance * camera.fx);
         double projection[16], full[16]; // stored transposed and row-major, so column-major as they are
         CHECK_OK(&ctx, gsf__traj_projection(&ctx, &camera, 0.01, 100.0, projection));
-        gsf_mat4_mul(projection, camera.w2c, full);
+        gsf__mat4_mul(projection, camera.w2c, full);
         snprintf(name, sizeof name, "cam%d.world_view_transform_T", camera_count);
         compare_values(name, camera.w2c, 16, 1e-6);
         snprintf(name, sizeof name, "cam%d.projection_T", camera_count);

@@ -52,7 +52,7 @@ int main() {
         double wide[16];
         gsf_from_glm(inverse, wide);
         test_compare("rigid inverse", c2w, wide, 16, 1e-12);
-        gsf_mat4_mul(camera.w2c, &other[0][0], product);
+        gsf__mat4_mul(camera.w2c, &other[0][0], product);
         gsf_from_glm(w2c * other, wide);
         test_compare("product", product, wide, 16, 1e-12);
         gsf_camera same = camera;

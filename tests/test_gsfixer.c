@@ -6,6 +6,7 @@
 #endif
 #include <locale.h>
 
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
 #include "test.h"
 
@@ -218,10 +219,10 @@ static void test_damaged_chunks(gsf_context* ctx) {
     }
     for (size_t i = 0; i < 4; i++) stored |= (uint32_t)(unsigned char)file.data[long_end - 4 + i] << 8 * i;
     CHECK(stored == ~crc);
-    const size_t opened = gsf_chunks_open(ctx, &file, "LONG"); // the same chunk in pieces
+    const size_t opened = gsf__open_chunk(ctx, &file, "LONG"); // the same chunk in pieces
     for (size_t i = 0; i < sizeof payload; i += 999)
         gsf_text_append(ctx, &file, payload + i, sizeof payload - i < 999 ? sizeof payload - i : 999);
-    gsf_chunks_close(ctx, &file, opened);
+    gsf__close_chunk(ctx, &file, opened);
     CHECK(opened == long_end && file.size - opened == long_end - small_end);
     CHECK(memcmp(file.data + small_end, file.data + opened, long_end - small_end) == 0);
     file.size = long_end;
@@ -996,7 +997,7 @@ static void test_camera_functions(gsf_context* ctx) {
         CHECK_OK(ctx, gsf_check_camera(ctx, &camera));
         double c2w[16], identity[16], unit[16] = {0}, center[3];
         gsf_camera_c2w(&camera, c2w);
-        gsf_mat4_mul(camera.w2c, c2w, identity);
+        gsf__mat4_mul(camera.w2c, c2w, identity);
         for (int k = 0; k < 4; k++) unit[5 * k] = 1.0;
         test_compare("w2c c2w", identity, unit, 16, 1e-8); // translations are up to 1e6
         gsf_camera again = camera;

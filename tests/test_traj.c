@@ -845,7 +845,7 @@ static void test_intrinsics(void) {
     CHECK_NEAR(gsf__traj_fov_from_focal(50.0, 100.0), 1.5707963267948966, 1e-15);
     double projection[16], full[16];
     CHECK_OK(&ctx, gsf__traj_projection(&ctx, &camera, 0.01, 100.0, projection));
-    gsf_mat4_mul(projection, camera.w2c, full);
+    gsf__mat4_mul(projection, camera.w2c, full);
     for (int i = 0; i < 50; i++) { // clip space against pixels
         const double p[3] = {uniform(-0.3, 0.3), uniform(-0.3, 0.3), uniform(-0.3, 0.3)};
         double u, v, depth, clip[4];
