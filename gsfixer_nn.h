@@ -1779,6 +1779,120 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
     return GSF_OK;
 }
 
+// ---- for the networks: a config.json as a table of keys
+
+// FOLDER/NAME. One that may be absent, and is, counts as an empty object. gsf__nn_close_config also takes what failed.
+GSF__SHARED gsf_result gsf__nn_open_config(gsf_context* ctx, const char* folder, const char* name, int may_lack,
+                                           gsf__nn_config* out) {
+    gsf_text path;
+    void* data = NULL;
+    size_t size = 0;
+    memset(&path, 0, sizeof path);
+    memset(out, 0, sizeof *out);
+    out->ctx = ctx;
+    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
+    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY
+                        : may_lack  ? gsf__nn_read_if_there(ctx, path.data, &data, &size)
+                                    : gsf_read_file(ctx, path.data, &data, &size);
+    if (!result && !data && may_lack) result = gsf__nn_parse_config(ctx, path.data, "{}", 2, out);
+    else if (!result) result = gsf__nn_parse_config(ctx, path.data, (const char*)data, size, out);
+    gsf_free(ctx, data);
+    gsf_destroy_text(ctx, &path);
+    return result;
+}
+
+typedef enum gsf__nn_key_kind {
+    GSF__NN_INT, GSF__NN_NEEDED_INT, GSF__NN_REAL, GSF__NN_FLAG, GSF__NN_FIXED_FLAG, GSF__NN_WORD, GSF__NN_ACTIVATION,
+    GSF__NN_ABSENT,
+} gsf__nn_key_kind;
+
+typedef struct gsf__nn_key {
+    const char* key;
+    gsf__nn_key_kind kind;
+    void* to;                   // of `size` bytes: int32_t or int64_t, float or double, int
+    size_t size;
+    double fallback, low, high; // of a flag that must be as the code has it: `low`
+    const char *word, *words;   // the fallback, NULL: the key must be there; the words that are known: "a|b|c"
+} gsf__nn_key;
+
+#define GSF__KEY_INT(key, to, low, high) {key, GSF__NN_NEEDED_INT, &(to), sizeof(to), 0.0, low, high, NULL, NULL}
+#define GSF__KEY_INT_OR(key, to, usual, low, high) {key, GSF__NN_INT, &(to), sizeof(to), usual, low, high, NULL, NULL}
+#define GSF__KEY_REAL_OR(key, to, usual, low, high) {key, GSF__NN_REAL, &(to), sizeof(to), usual, low, high, NULL, NULL}
+#define GSF__KEY_FLAG_OR(key, to, usual) {key, GSF__NN_FLAG, &(to), sizeof(to), usual, 0.0, 0.0, NULL, NULL}
+#define GSF__KEY_WORD_OR(key, to, usual, words) {key, GSF__NN_WORD, &(to), sizeof(to), 0.0, 0.0, 0.0, usual, words}
+#define GSF__KEY_ACTIVATION_OR(key, to, usual) {key, GSF__NN_ACTIVATION, &(to), sizeof(to), 0.0, 0.0, 0.0, usual, NULL}
+// What the code does in one way only must not be configured otherwise.
+#define GSF__KEY_FLAG_IS(key, usual, must) {key, GSF__NN_FIXED_FLAG, NULL, 0, usual, must, 0.0, NULL, NULL}
+#define GSF__KEY_WORD_IS(key, usual, must) {key, GSF__NN_WORD, NULL, 0, 0.0, 0.0, 0.0, usual, must}
+#define GSF__KEY_ABSENT(key) {key, GSF__NN_ABSENT, NULL, 0, 0.0, 0.0, 0.0, NULL, NULL}
+
+// The place of the key's word among k->words.
+static gsf_result gsf__nn_config_word(const gsf__nn_config* config, const gsf__nn_key* k, const char* words, int* out) {
+    const char* text;
+    GSF__TRY(gsf__nn_config_string(config, k->key, k->word, &text));
+    const size_t size = strlen(text);
+    *out = 0;
+    for (const char* w = words; *w; w += strcspn(w, "|"), w += *w == '|', ++*out)
+        if (strcspn(w, "|") == size && memcmp(w, text, size) == 0) return GSF_OK;
+    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is %s, not %s", config->json.name, k->key,
+                    gsf__nn_show(text).text, words);
+}
+
+static gsf_result gsf__nn_config_flag_is(const gsf__nn_config* config, const gsf__nn_key* k) {
+    const int must = k->low != 0.0;
+    int flag;
+    GSF__TRY(gsf__nn_config_bool_or(config, k->key, k->fallback != 0.0, &flag));
+    if (flag == must) return GSF_OK;
+    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", config->json.name, k->key,
+                    must ? "true" : "false");
+}
+
+static void gsf__nn_store_int(const gsf__nn_key* k, int64_t value) { // int32_t and enums, or int64_t
+    const int32_t narrow = (int32_t)value;
+    if (k->size == sizeof narrow) memcpy(k->to, &narrow, sizeof narrow);
+    if (k->size == sizeof value) memcpy(k->to, &value, sizeof value);
+}
+
+static void gsf__nn_store_real(const gsf__nn_key* k, double value) {
+    const float narrow = (float)value;
+    if (k->size == sizeof narrow) memcpy(k->to, &narrow, sizeof narrow);
+    else memcpy(k->to, &value, sizeof value);
+}
+
+static gsf_result gsf__nn_config_read_key(const gsf__nn_config* config, const gsf__nn_key* k) {
+    static const gsf_nn_activation activations[] = {GSF_NN_GELU, GSF_NN_GELU_TANH, GSF_NN_GELU_TANH,
+                                                    GSF_NN_RELU, GSF_NN_SILU, GSF_NN_SILU};
+    const int64_t low = (int64_t)k->low, high = (int64_t)k->high;
+    int64_t whole = 0;
+    double real;
+    int flag = 0;
+    switch (k->kind) {
+        case GSF__NN_INT: GSF__TRY(gsf__nn_config_int_or(config, k->key, (int64_t)k->fallback, low, high, &whole)); break;
+        case GSF__NN_NEEDED_INT: GSF__TRY(gsf__nn_config_int(config, k->key, low, high, &whole)); break;
+        case GSF__NN_REAL:
+            GSF__TRY(gsf__nn_config_number_or(config, k->key, k->fallback, k->low, k->high, &real));
+            gsf__nn_store_real(k, real);
+            return GSF_OK;
+        case GSF__NN_FLAG: GSF__TRY(gsf__nn_config_bool_or(config, k->key, k->fallback != 0.0, &flag)); break;
+        case GSF__NN_FIXED_FLAG: return gsf__nn_config_flag_is(config, k);
+        case GSF__NN_WORD: GSF__TRY(gsf__nn_config_word(config, k, k->words, &flag)); break;
+        case GSF__NN_ACTIVATION:
+            GSF__TRY(gsf__nn_config_word(config, k, "gelu|gelu_new|gelu_pytorch_tanh|relu|silu|swish", &flag));
+            flag = (int)activations[flag];
+            break;
+        case GSF__NN_ABSENT:
+            if (!gsf__nn_config_find(config, k->key)) return GSF_OK;
+            return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not null", config->json.name, k->key);
+    }
+    gsf__nn_store_int(k, flag ? flag : whole);
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_config_read(const gsf__nn_config* config, const gsf__nn_key* keys, size_t count) {
+    for (size_t i = 0; i < count; i++) GSF__TRY(gsf__nn_config_read_key(config, &keys[i]));
+    return GSF_OK;
+}
+
 // ---- >>nn vector: exp and friends, eight at a time --------------------------------
 
 #if GSF__X86
@@ -6474,46 +6588,28 @@ static gsf_result gsf__vit_bind_blocks(gsf__nn_loader* loader, const gsf__vit_si
 
 // ---- image encoders: DINOv2
 
-static gsf_result gsf__dinov2_read_activation(const gsf__nn_config* file, gsf_nn_activation* out) {
-    static const struct { const char* name; gsf_nn_activation activation; } known[] = {
-        {"gelu", GSF_NN_GELU}, {"gelu_new", GSF_NN_GELU_TANH}, {"gelu_pytorch_tanh", GSF_NN_GELU_TANH},
-        {"relu", GSF_NN_RELU}, {"silu", GSF_NN_SILU}, {"swish", GSF_NN_SILU}};
-    const char* text;
-    GSF__TRY(gsf__nn_config_string(file, "hidden_act", "gelu", &text));
-    for (size_t i = 0; i < GSF__COUNT(known); i++)
-        if (strcmp(known[i].name, text) == 0) {
-            *out = known[i].activation;
-            return GSF_OK;
-        }
-    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: hidden_act is %.60s", file->json.name, text);
-}
-
 // Keys that are missing have the defaults of transformers' Dinov2WithRegistersConfig.
 static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, gsf__vit* vit) {
-    int64_t heads = 0, image = 0;
-    double ratio, eps;
-    int flag;
-    const struct { const char* key; int64_t* to; int64_t fallback, low, high; } sizes[] = {
-        {"hidden_size", &vit->sizes.width, 768, 1, 65536}, {"num_attention_heads", &heads, 12, 1, 1024},
-        {"num_hidden_layers", &vit->layers, 12, 1, 1024}, {"num_channels", &vit->channels, 3, 1, 1024},
-        {"patch_size", &vit->patch, 16, 1, 1024}, {"image_size", &image, 224, 1, 1 << 15},
-        {"num_register_tokens", &vit->registers, 4, 0, 1 << 16}};
-    for (size_t i = 0; i < GSF__COUNT(sizes); i++)
-        GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, sizes[i].to));
-    GSF__TRY(gsf__nn_config_number_or(file, "mlp_ratio", 4.0, 1e-3, 1024.0, &ratio));
-    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-6, 1e-12, 1.0, &eps));
-    GSF__TRY(gsf__nn_config_bool_or(file, "qkv_bias", 1, &vit->sizes.qkv_bias));
-    GSF__TRY(gsf__nn_config_bool_or(file, "use_swiglu_ffn", 0, &flag));
-    if (flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: use_swiglu_ffn is true", file->json.name);
-    GSF__TRY(gsf__dinov2_read_activation(file, &vit->sizes.activation));
-    if (vit->sizes.width % heads || image < vit->patch || (double)vit->sizes.width * ratio < 1.0)
+    int64_t image;
+    double ratio;
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT_OR("hidden_size", vit->sizes.width, 768, 1, 65536),
+        GSF__KEY_INT_OR("num_attention_heads", vit->sizes.heads, 12, 1, 1024),
+        GSF__KEY_INT_OR("num_hidden_layers", vit->layers, 12, 1, 1024),
+        GSF__KEY_INT_OR("num_channels", vit->channels, 3, 1, 1024), GSF__KEY_INT_OR("patch_size", vit->patch, 16, 1, 1024),
+        GSF__KEY_INT_OR("image_size", image, 224, 1, 1 << 15),
+        GSF__KEY_INT_OR("num_register_tokens", vit->registers, 4, 0, 1 << 16),
+        GSF__KEY_REAL_OR("mlp_ratio", ratio, 4.0, 1e-3, 1024.0),
+        GSF__KEY_REAL_OR("layer_norm_eps", vit->sizes.eps, 1e-6, 1e-12, 1.0),
+        GSF__KEY_FLAG_OR("qkv_bias", vit->sizes.qkv_bias, 1), GSF__KEY_FLAG_IS("use_swiglu_ffn", 0, 0),
+        GSF__KEY_ACTIVATION_OR("hidden_act", vit->sizes.activation, "gelu")};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
+    if (vit->sizes.width % vit->sizes.heads || image < vit->patch || (double)vit->sizes.width * ratio < 1.0)
         return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
-                        "%s: hidden_size %lld is no multiple of %lld heads, or image_size %lld below a patch",
-                        file->json.name, (long long)vit->sizes.width, (long long)heads, (long long)image);
-    vit->sizes.heads = (int32_t)heads;
-    vit->sizes.head_dim = (int32_t)(vit->sizes.width / heads);
+                        "%s: hidden_size %lld is no multiple of %d heads, or image_size %lld below a patch",
+                        file->json.name, (long long)vit->sizes.width, (int)vit->sizes.heads, (long long)image);
+    vit->sizes.head_dim = (int32_t)(vit->sizes.width / vit->sizes.heads);
     vit->sizes.mlp = (int64_t)((double)vit->sizes.width * ratio);
-    vit->sizes.eps = (float)eps;
     vit->grid = image / vit->patch;
     vit->block_names = "encoder.layer.";
     vit->prefix = "embeddings.";
@@ -6542,19 +6638,13 @@ GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2) {
 
 GSF_API gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out) {
     gsf__nn_config file;
-    gsf_text path;
-    memset(&path, 0, sizeof path);
     memset(out, 0, sizeof *out);
     gsf__vit* vit = (gsf__vit*)gsf_alloc_zeroed(ctx, 1, sizeof *vit);
     if (!vit) return GSF_ERROR_OUT_OF_MEMORY;
     out->nets = vit;
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
-    gsf_destroy_text(ctx, &path);
-    if (!result) {
-        result = gsf__dinov2_read_config(&file, vit);
-        gsf__nn_close_config(&file);
-    }
+    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
+    if (!result) result = gsf__dinov2_read_config(&file, vit);
+    gsf__nn_close_config(&file);
     if (!result) result = gsf_nn_open_weights(ctx, folder, "model", &out->weights);
     if (!result) result = gsf__dinov2_bind(ctx, out, vit);
     out->width = (int32_t)vit->sizes.width;
@@ -6684,27 +6774,28 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     return GSF_OK;
 }
 
-// What config.json tells.
+// What config.json tells; where it is silent, the sizes of the tensors stand.
 static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* net, double* rope_base) {
     gsf__vit* vit = &net->embed;
-    int64_t heads = net->sizes.heads, image = vit->grid * vit->patch, given, count = 0;
+    gsf__vit_sizes* s = &net->sizes;
+    int64_t image = vit->grid * vit->patch, count = 0;
     double ratio;
-    int flag;
-    const struct { const char* key; int64_t* value; int64_t low; } sizes[] = {
-        {"embed_dim", &net->sizes.width, 1}, {"patch_size", &vit->patch, 1}, {"img_size", &image, 1},
-        {"depth", &net->layers, 1}, {"num_register_tokens", &net->registers, 0}, {"num_heads", &heads, 1}};
-    for (size_t i = 0; i < GSF__COUNT(sizes); i++)
-        if (gsf__nn_config_find(file, sizes[i].key))
-            GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, 1 << 16, sizes[i].value));
-    GSF__TRY(gsf__nn_config_number_or(file, "mlp_ratio", 0.0, 0.0, 1024.0, &ratio));
-    if (ratio > 0.0) net->sizes.mlp = (int64_t)((double)net->sizes.width * ratio);
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT_OR("embed_dim", s->width, (double)s->width, 1, 1 << 16),
+        GSF__KEY_INT_OR("patch_size", vit->patch, (double)vit->patch, 1, 1 << 16),
+        GSF__KEY_INT_OR("img_size", image, (double)image, 1, 1 << 16),
+        GSF__KEY_INT_OR("depth", net->layers, (double)net->layers, 1, 1 << 16),
+        GSF__KEY_INT_OR("num_register_tokens", net->registers, (double)net->registers, 0, 1 << 16),
+        GSF__KEY_INT_OR("num_heads", s->heads, (double)s->heads, 1, 1 << 16),
+        GSF__KEY_REAL_OR("mlp_ratio", ratio, 0.0, 0.0, 1024.0),
+        GSF__KEY_REAL_OR("rope_freq", *rope_base, *rope_base, -1e9, 1e9),
+        GSF__KEY_FLAG_OR("qk_norm", s->head_norm, (double)s->head_norm)};
+    int64_t given;
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
+    if (ratio > 0.0) s->mlp = (int64_t)((double)s->width * ratio);
     if (gsf__nn_config_find(file, "num_register_tokens")) vit->registers = net->registers;
-    vit->sizes.width = net->sizes.width;
+    vit->sizes.width = s->width;
     vit->grid = image / vit->patch;
-    net->sizes.heads = (int32_t)heads;
-    GSF__TRY(gsf__nn_config_number_or(file, "rope_freq", *rope_base, -1e9, 1e9, rope_base));
-    GSF__TRY(gsf__nn_config_bool_or(file, "qk_norm", net->sizes.head_norm, &flag));
-    net->sizes.head_norm = flag;
     GSF__TRY(gsf__nn_config_int_or(file, "aa_block_size", 1, 1, 1 << 20, &given));
     const gsf_json_value* order = gsf__nn_config_find(file, "aa_order");
     int ok = given == 1 && (!order || (order->type == GSF_JSON_ARRAY && order->count == 2));
@@ -6716,27 +6807,6 @@ static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* n
         return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: aa_order is not frame, global, or aa_block_size not 1",
                         file->json.name);
     return GSF_OK;
-}
-
-// FOLDER/config.json, which may be absent.
-static gsf_result gsf__vggt_load_config(gsf_context* ctx, const char* folder, gsf__vggt* net, double* rope_base) {
-    gsf__nn_config file;
-    gsf_text path;
-    void* data = NULL;
-    size_t size = 0;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &data, &size);
-    if (!result && data) {
-        result = gsf__nn_parse_config(ctx, path.data, (const char*)data, size, &file);
-        if (!result) {
-            result = gsf__vggt_read_config(&file, net, rope_base);
-            gsf__nn_close_config(&file);
-        }
-    }
-    gsf_free(ctx, data);
-    gsf_destroy_text(ctx, &path);
-    return result;
 }
 
 static gsf_result gsf__vggt_check_sizes(gsf_context* ctx, const gsf_nn_weights* w, gsf__vggt* net, double rope_base) {
@@ -6775,6 +6845,7 @@ static gsf_result gsf__vggt_bind(gsf__nn_loader* loader, gsf__vggt* net) {
 }
 
 static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt* out, gsf__vggt* net) {
+    gsf__nn_config file;
     gsf__nn_loader loader;
     GSF__TRY(gsf_nn_open_weights(ctx, path, "model", &out->weights));
     GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
@@ -6783,8 +6854,11 @@ static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt
     gsf__nn_ignore(&loader, "aggregator.patch_embed.mask_token"); // for training
     gsf_result result = gsf__vggt_read_shapes(&loader, net);
     out->rope_base = 100.0;
-    if (!result && !gsf__nn_ends_in(path, ".safetensors"))
-        result = gsf__vggt_load_config(ctx, path, net, &out->rope_base);
+    if (!result && !gsf__nn_ends_in(path, ".safetensors")) {
+        result = gsf__nn_open_config(ctx, path, "config.json", 1, &file);
+        if (!result) result = gsf__vggt_read_config(&file, net, &out->rope_base);
+        gsf__nn_close_config(&file);
+    }
     if (!result) result = gsf__vggt_check_sizes(ctx, &out->weights, net, out->rope_base);
     if (!result) result = gsf__vggt_bind(&loader, net);
     return gsf__nn_end_loading(&loader, result);
@@ -8091,54 +8165,31 @@ static const float gsf__opt_eps = 1e-5f;                // PyTorch's, which no f
 
 // ---- captioner: configuration
 
-static gsf_result gsf__blip_read_activation(const gsf__nn_config* file, const char* key, const char* fallback,
-                                            gsf_nn_activation* out) {
-    static const struct { const char* name; gsf_nn_activation activation; } known[] = {
-        {"gelu", GSF_NN_GELU}, {"gelu_new", GSF_NN_GELU_TANH}, {"gelu_pytorch_tanh", GSF_NN_GELU_TANH},
-        {"relu", GSF_NN_RELU}, {"silu", GSF_NN_SILU}, {"swish", GSF_NN_SILU}};
-    const char* text;
-    GSF__TRY(gsf__nn_config_string(file, key, fallback, &text));
-    for (size_t i = 0; i < GSF__COUNT(known); i++)
-        if (strcmp(known[i].name, text) == 0) {
-            *out = known[i].activation;
-            return GSF_OK;
-        }
-    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is %.60s", file->json.name, key, text);
-}
-
-typedef struct gsf__blip_size { const char* key; int64_t* to; int64_t fallback, low, high; } gsf__blip_size;
-
-static gsf_result gsf__blip_read_sizes(const gsf__nn_config* file, const gsf__blip_size* sizes, size_t count) {
-    for (size_t i = 0; i < count; i++)
-        GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, sizes[i].to));
-    return GSF_OK;
-}
-
-static gsf_result gsf__blip_split_heads(const gsf__nn_config* file, int64_t width, int64_t heads, int32_t* out) {
-    *out = (int32_t)heads;
+// Of a part of config.json: `heads` divide `width`.
+static gsf_result gsf__blip_check_heads(const gsf__nn_config* file, int64_t width, int32_t heads) {
     if (width % heads == 0) return GSF_OK;
-    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld heads do not divide hidden_size %lld", file->json.name,
-                    (long long)heads, (long long)width);
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %d heads do not divide hidden_size %lld", file->json.name,
+                    (int)heads, (long long)width);
 }
 
 static gsf_result gsf__blip_read_vision(const gsf__nn_config* file, gsf__blip* net) {
     gsf__vit* vit = &net->vision;
-    int64_t heads = 0;
-    double eps;
-    const gsf__blip_size sizes[] = {
-        {"hidden_size", &vit->sizes.width, 1408, 1, 65536}, {"intermediate_size", &vit->sizes.mlp, 6144, 1, 1 << 20},
-        {"num_hidden_layers", &vit->layers, 39, 1, 1024}, {"num_attention_heads", &heads, 16, 1, 1024},
-        {"image_size", &net->image_size, 224, 1, 1 << 14}, {"patch_size", &vit->patch, 14, 1, 1024}};
-    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
-    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-6, 1e-15, 1.0, &eps));
-    GSF__TRY(gsf__nn_config_bool_or(file, "qkv_bias", 1, &vit->sizes.qkv_bias));
-    GSF__TRY(gsf__blip_read_activation(file, "hidden_act", "gelu", &vit->sizes.activation));
-    GSF__TRY(gsf__blip_split_heads(file, vit->sizes.width, heads, &vit->sizes.heads));
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT_OR("hidden_size", vit->sizes.width, 1408, 1, 65536),
+        GSF__KEY_INT_OR("intermediate_size", vit->sizes.mlp, 6144, 1, 1 << 20),
+        GSF__KEY_INT_OR("num_hidden_layers", vit->layers, 39, 1, 1024),
+        GSF__KEY_INT_OR("num_attention_heads", vit->sizes.heads, 16, 1, 1024),
+        GSF__KEY_INT_OR("image_size", net->image_size, 224, 1, 1 << 14),
+        GSF__KEY_INT_OR("patch_size", vit->patch, 14, 1, 1024),
+        GSF__KEY_REAL_OR("layer_norm_eps", vit->sizes.eps, 1e-6, 1e-15, 1.0),
+        GSF__KEY_FLAG_OR("qkv_bias", vit->sizes.qkv_bias, 1),
+        GSF__KEY_ACTIVATION_OR("hidden_act", vit->sizes.activation, "gelu")};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
+    GSF__TRY(gsf__blip_check_heads(file, vit->sizes.width, vit->sizes.heads));
     if (net->image_size < vit->patch)
         return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s: patch_size %lld is above image_size %lld", file->json.name,
                         (long long)vit->patch, (long long)net->image_size);
-    vit->sizes.head_dim = (int32_t)(vit->sizes.width / heads);
-    vit->sizes.eps = (float)eps;
+    vit->sizes.head_dim = (int32_t)(vit->sizes.width / vit->sizes.heads);
     vit->channels = 3;
     vit->grid = net->image_size / vit->patch;
     vit->block_names = "vision_model.encoder.layers.";
@@ -8148,69 +8199,48 @@ static gsf_result gsf__blip_read_vision(const gsf__nn_config* file, gsf__blip* n
 
 static gsf_result gsf__blip_read_qformer(const gsf__nn_config* file, gsf__blip* net) {
     gsf__qformer* q = &net->qformer;
-    int64_t heads = 0;
-    double eps;
-    const char* positions;
-    const gsf__blip_size sizes[] = {
-        {"hidden_size", &q->width, 768, 1, 65536}, {"intermediate_size", &q->mlp, 3072, 1, 1 << 20},
-        {"num_hidden_layers", &q->layers, 12, 1, 1024}, {"num_attention_heads", &heads, 12, 1, 1024},
-        {"cross_attention_frequency", &q->cross_every, 2, 1, 1024}};
-    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
-    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_eps", 1e-12, 1e-15, 1.0, &eps));
-    GSF__TRY(gsf__nn_config_bool_or(file, "use_qformer_text_input", 0, &q->text_input));
-    GSF__TRY(gsf__blip_read_activation(file, "hidden_act", "gelu", &q->activation));
-    GSF__TRY(gsf__blip_split_heads(file, q->width, heads, &q->heads));
-    GSF__TRY(gsf__nn_config_string(file, "position_embedding_type", "absolute", &positions));
-    if (strcmp(positions, "absolute") != 0)
-        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: position_embedding_type is %.60s", file->json.name,
-                        positions);
-    q->eps = (float)eps;
-    return GSF_OK;
-}
-
-// What this code computes in one way only must not be configured otherwise.
-static gsf_result gsf__blip_check_text(const gsf__nn_config* file, int64_t width) {
-    static const char* const flags[] = {"do_layer_norm_before", "enable_bias", "layer_norm_elementwise_affine"};
-    const char* type;
-    int64_t words;
-    GSF__TRY(gsf__nn_config_string(file, "model_type", "opt", &type));
-    if (strcmp(type, "opt") != 0)
-        return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: model_type of text_config is %.60s, not opt",
-                        file->json.name, type);
-    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
-        int flag;
-        GSF__TRY(gsf__nn_config_bool_or(file, flags[i], 1, &flag));
-        if (!flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i]);
-    }
-    GSF__TRY(gsf__nn_config_int_or(file, "word_embed_proj_dim", width, 1, 65536, &words));
-    if (words == width) return GSF_OK;
-    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: word_embed_proj_dim %lld is not hidden_size %lld",
-                    file->json.name, (long long)words, (long long)width);
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT_OR("hidden_size", q->width, 768, 1, 65536),
+        GSF__KEY_INT_OR("intermediate_size", q->mlp, 3072, 1, 1 << 20),
+        GSF__KEY_INT_OR("num_hidden_layers", q->layers, 12, 1, 1024),
+        GSF__KEY_INT_OR("num_attention_heads", q->heads, 12, 1, 1024),
+        GSF__KEY_INT_OR("cross_attention_frequency", q->cross_every, 2, 1, 1024),
+        GSF__KEY_REAL_OR("layer_norm_eps", q->eps, 1e-12, 1e-15, 1.0),
+        GSF__KEY_FLAG_OR("use_qformer_text_input", q->text_input, 0),
+        GSF__KEY_ACTIVATION_OR("hidden_act", q->activation, "gelu"),
+        GSF__KEY_WORD_IS("position_embedding_type", "absolute", "absolute")};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
+    return gsf__blip_check_heads(file, q->width, q->heads);
 }
 
 static gsf_result gsf__blip_read_text(const gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
     gsf__opt* opt = &net->text;
-    int64_t heads = 0, bos = 0, eos = 0;
+    int64_t words;
     int tied;
-    const gsf__blip_size sizes[] = {
-        {"hidden_size", &opt->sizes.width, 768, 1, 65536}, {"ffn_dim", &opt->sizes.mlp, 3072, 1, 1 << 20},
-        {"num_hidden_layers", &opt->layers, 12, 1, 1024}, {"num_attention_heads", &heads, 12, 1, 1024},
-        {"vocab_size", &opt->vocabulary, 50272, 1, 1 << 24},
-        {"max_position_embeddings", &opt->positions, 2048, 1, 1 << 20}};
-    GSF__TRY(gsf__blip_read_sizes(file, sizes, GSF__COUNT(sizes)));
-    GSF__TRY(gsf__nn_config_int_or(file, "bos_token_id", 2, 0, opt->vocabulary - 1, &bos));
-    GSF__TRY(gsf__nn_config_int_or(file, "eos_token_id", 2, 0, INT32_MAX, &eos));
-    GSF__TRY(gsf__nn_config_bool_or(file, "tie_word_embeddings", 1, &tied));
-    GSF__TRY(gsf__nn_config_bool_or(file, "_remove_final_layer_norm", 0, &opt->no_final_norm));
-    GSF__TRY(gsf__blip_read_activation(file, "activation_function", "relu", &opt->sizes.activation));
-    GSF__TRY(gsf__blip_split_heads(file, opt->sizes.width, heads, &opt->sizes.heads));
-    opt->sizes.head_dim = (int32_t)(opt->sizes.width / heads);
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT_OR("hidden_size", opt->sizes.width, 768, 1, 65536),
+        GSF__KEY_INT_OR("ffn_dim", opt->sizes.mlp, 3072, 1, 1 << 20),
+        GSF__KEY_INT_OR("num_hidden_layers", opt->layers, 12, 1, 1024),
+        GSF__KEY_INT_OR("num_attention_heads", opt->sizes.heads, 12, 1, 1024),
+        GSF__KEY_INT_OR("vocab_size", opt->vocabulary, 50272, 1, 1 << 24),
+        GSF__KEY_INT_OR("max_position_embeddings", opt->positions, 2048, 1, 1 << 20),
+        GSF__KEY_INT_OR("eos_token_id", out->eos, 2, 0, INT32_MAX), GSF__KEY_FLAG_OR("tie_word_embeddings", tied, 1),
+        GSF__KEY_FLAG_OR("_remove_final_layer_norm", opt->no_final_norm, 0),
+        GSF__KEY_ACTIVATION_OR("activation_function", opt->sizes.activation, "relu"),
+        GSF__KEY_WORD_IS("model_type", "opt", "opt"), GSF__KEY_FLAG_IS("do_layer_norm_before", 1, 1),
+        GSF__KEY_FLAG_IS("enable_bias", 1, 1), GSF__KEY_FLAG_IS("layer_norm_elementwise_affine", 1, 1)};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
+    const gsf__nn_key bos = GSF__KEY_INT_OR("bos_token_id", out->bos, 2, 0, (double)(opt->vocabulary - 1));
+    GSF__TRY(gsf__nn_config_read_key(file, &bos));
+    GSF__TRY(gsf__blip_check_heads(file, opt->sizes.width, opt->sizes.heads));
+    opt->sizes.head_dim = (int32_t)(opt->sizes.width / opt->sizes.heads);
     opt->sizes.eps = gsf__opt_eps;
     opt->sizes.qkv_bias = 1;
     opt->own_head = !tied;
-    out->bos = (int32_t)bos;
-    out->eos = (int32_t)eos;
-    return gsf__blip_check_text(file, opt->sizes.width);
+    GSF__TRY(gsf__nn_config_int_or(file, "word_embed_proj_dim", opt->sizes.width, 1, 65536, &words));
+    if (words == opt->sizes.width) return GSF_OK;
+    return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: word_embed_proj_dim %lld is not hidden_size %lld",
+                    file->json.name, (long long)words, (long long)opt->sizes.width);
 }
 
 // Runs `read` on the part of config.json called `key` as if it were the document; without it all keys are absent.
@@ -8227,10 +8257,9 @@ static gsf_result gsf__blip_read_text(const gsf__nn_config* file, gsf__blip* net
     } while (0)
 
 static gsf_result gsf__blip_read_config(gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
-    int64_t image_token;
-    GSF__TRY(gsf__nn_config_int_or(file, "num_query_tokens", 32, 1, 1 << 16, &net->qformer.queries));
-    GSF__TRY(gsf__nn_config_int_or(file, "image_token_index", -1, 0, INT32_MAX, &image_token));
-    out->image_token = (int32_t)image_token;
+    const gsf__nn_key keys[] = {GSF__KEY_INT_OR("num_query_tokens", net->qformer.queries, 32, 1, 1 << 16),
+                                GSF__KEY_INT_OR("image_token_index", out->image_token, -1, 0, INT32_MAX)};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
     GSF__BLIP_PART(file, "vision_config", gsf__blip_read_vision(file, net));
     GSF__BLIP_PART(file, "qformer_config", gsf__blip_read_qformer(file, net));
     GSF__BLIP_PART(file, "text_config", gsf__blip_read_text(file, net, out));
@@ -8255,19 +8284,16 @@ static gsf_result gsf__blip_read_colour(const gsf__nn_config* file, const char* 
 }
 
 static gsf_result gsf__blip_read_processor(const gsf__nn_config* file, gsf__blip* net) {
-    static const char* const steps[] = {"do_resize", "do_rescale", "do_normalize", "do_convert_rgb"};
     static const float mean[3] = {0.48145466f, 0.4578275f, 0.40821073f};
     static const float deviation[3] = {0.26862954f, 0.26130258f, 0.27577711f};
     static const gsf_resize_filter filters[] = {GSF_RESIZE_PIL_LANCZOS, GSF_RESIZE_PIL_BILINEAR, GSF_RESIZE_PIL_BICUBIC};
-    int64_t filter;
-    for (size_t i = 0; i < GSF__COUNT(steps); i++) {
-        int flag;
-        GSF__TRY(gsf__nn_config_bool_or(file, steps[i], 1, &flag));
-        if (!flag) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, steps[i]);
-    }
-    GSF__TRY(gsf__nn_config_int_or(file, "resample", 3, 1, 3, &filter)); // PIL's numbers
+    int64_t filter; // PIL's number of it
+    const gsf__nn_key keys[] = {
+        GSF__KEY_FLAG_IS("do_resize", 1, 1), GSF__KEY_FLAG_IS("do_rescale", 1, 1), GSF__KEY_FLAG_IS("do_normalize", 1, 1),
+        GSF__KEY_FLAG_IS("do_convert_rgb", 1, 1), GSF__KEY_INT_OR("resample", filter, 3, 1, 3),
+        GSF__KEY_REAL_OR("rescale_factor", net->rescale, 1.0 / 255.0, 1e-9, 1e9)};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
     net->filter = filters[filter - 1];
-    GSF__TRY(gsf__nn_config_number_or(file, "rescale_factor", 1.0 / 255.0, 1e-9, 1e9, &net->rescale));
     GSF__TRY(gsf__blip_read_colour(file, "image_mean", mean, -1e6, net->mean));
     GSF__TRY(gsf__blip_read_colour(file, "image_std", deviation, 1e-6, net->deviation));
     const gsf_json_value* size = gsf__nn_config_find(file, "size");
@@ -8422,28 +8448,17 @@ GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captio
     memset(captioner, 0, sizeof *captioner);
 }
 
-static gsf_result gsf__blip_load_config(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* file) {
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
-    const gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, file);
-    gsf_destroy_text(ctx, &path);
-    return result;
-}
-
 GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out) {
     gsf__nn_config file;
     memset(out, 0, sizeof *out);
     gsf__blip* net = (gsf__blip*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
     if (!net) return GSF_ERROR_OUT_OF_MEMORY;
     out->nets = net;
-    gsf_result result = gsf__blip_load_config(ctx, folder, "config.json", &file);
+    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
+    if (!result) result = gsf__blip_read_config(&file, net, out);
+    gsf__nn_close_config(&file);
     if (!result) {
-        result = gsf__blip_read_config(&file, net, out);
-        gsf__nn_close_config(&file);
-    }
-    if (!result) {
-        result = gsf__blip_load_config(ctx, folder, "preprocessor_config.json", &file);
+        result = gsf__nn_open_config(ctx, folder, "preprocessor_config.json", 0, &file);
         if (!result) result = gsf__blip_read_processor(&file, net);
         gsf__nn_close_config(&file);
     }
@@ -9828,29 +9843,16 @@ static gsf_result gsf__t5_bind_all(gsf__nn_loader* loader, const gsf_nn_t5* c, g
 }
 
 static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) {
-    const struct { const char* key; int32_t* to; int64_t fallback, low, high; } sizes[] = { // fallback 0: needed
-        {"d_model", &c->width, 0, 1, 1 << 20}, {"d_kv", &c->head_dim, 0, 1, 1024}, {"num_heads", &c->heads, 0, 1, 1024},
-        {"d_ff", &c->hidden, 0, 1, 1 << 20}, {"num_layers", &c->layers, 0, 1, 1024},
-        {"vocab_size", &c->vocabulary, 0, 1, INT32_MAX}, {"relative_attention_num_buckets", &c->buckets, 32, 4, 1 << 16},
-        {"relative_attention_max_distance", &c->max_distance, 128, 1, 1 << 24}};
-    static const struct { const char *key, *value; } texts[] = {
-        {"feed_forward_proj", "gated-gelu"}, {"dense_act_fn", "gelu_new"}};
-    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
-        int64_t value = 0;
-        if (sizes[i].fallback)
-            GSF__TRY(gsf__nn_config_int_or(file, sizes[i].key, sizes[i].fallback, sizes[i].low, sizes[i].high, &value));
-        else
-            GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
-        *sizes[i].to = (int32_t)value;
-    }
-    GSF__TRY(gsf__nn_config_number_or(file, "layer_norm_epsilon", 1e-6, 1e-12, 1.0, &c->norm_eps));
-    for (size_t i = 0; i < GSF__COUNT(texts); i++) { // T5 v1.0 has relu and no gate
-        const char* text;
-        GSF__TRY(gsf__nn_config_string(file, texts[i].key, i ? texts[i].value : NULL, &text));
-        if (strcmp(text, texts[i].value) != 0)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
-                            texts[i].value);
-    }
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT("d_model", c->width, 1, 1 << 20), GSF__KEY_INT("d_kv", c->head_dim, 1, 1024),
+        GSF__KEY_INT("num_heads", c->heads, 1, 1024), GSF__KEY_INT("d_ff", c->hidden, 1, 1 << 20),
+        GSF__KEY_INT("num_layers", c->layers, 1, 1024), GSF__KEY_INT("vocab_size", c->vocabulary, 1, INT32_MAX),
+        GSF__KEY_INT_OR("relative_attention_num_buckets", c->buckets, 32, 4, 1 << 16),
+        GSF__KEY_INT_OR("relative_attention_max_distance", c->max_distance, 128, 1, 1 << 24),
+        GSF__KEY_REAL_OR("layer_norm_epsilon", c->norm_eps, 1e-6, 1e-12, 1.0),
+        GSF__KEY_WORD_IS("feed_forward_proj", NULL, "gated-gelu"), // T5 v1.0 has relu and no gate
+        GSF__KEY_WORD_IS("dense_act_fn", "gelu_new", "gelu_new")};
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
     if (c->buckets % 4 || c->max_distance <= c->buckets / 4)
         return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %d buckets for relative positions up to %d",
                         file->json.name, (int)c->buckets, (int)c->max_distance);
@@ -9860,13 +9862,8 @@ static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) 
 static gsf_result gsf__t5_open(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
     gsf__nn_config file;
     gsf__nn_loader loader;
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
-    gsf_destroy_text(ctx, &path);
-    if (result) return result;
-    result = gsf__t5_read_config(&file, out);
+    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
+    if (!result) result = gsf__t5_read_config(&file, out);
     gsf__nn_close_config(&file);
     if (result) return result;
     GSF__TRY(gsf_nn_open_weights(ctx, folder, "model", &out->weights));
@@ -10257,47 +10254,25 @@ static gsf_result gsf__vae_check_types(const gsf__nn_config* config, const char*
                     (unsigned)list->offset, key, levels, type);
 }
 
-static gsf_result gsf__vae_config_int(const gsf__nn_config* config, const char* key, int64_t fallback, int64_t high,
-                                      int32_t* out) {
-    int64_t value;
-    GSF__TRY(gsf__nn_config_int_or(config, key, fallback, 1, high, &value));
-    *out = (int32_t)value;
-    return GSF_OK;
-}
-
-static gsf_result gsf__vae_check_unsupported(const gsf__nn_config* config) {
-    const char *act, *classname;
-    int quant, post_quant;
-    GSF__TRY(gsf__nn_config_string(config, "_class_name", "AutoencoderKLCogVideoX", &classname));
-    GSF__TRY(gsf__nn_config_string(config, "act_fn", "silu", &act));
-    GSF__TRY(gsf__nn_config_bool_or(config, "use_quant_conv", 0, &quant));
-    GSF__TRY(gsf__nn_config_bool_or(config, "use_post_quant_conv", 0, &post_quant));
-    if (strcmp(classname, "AutoencoderKLCogVideoX") != 0)
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: model is %.60s, not AutoencoderKLCogVideoX",
-                        config->json.name, classname);
-    if (strcmp(act, "silu") != 0)
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: act_fn is %.60s, not silu", config->json.name, act);
-    if (quant || post_quant)
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: quant_conv and post_quant_conv are not served",
-                        config->json.name);
-    return GSF_OK;
-}
-
 // Fallbacks are the class's own.
 static gsf_result gsf__vae_take_config(const gsf__nn_config* config, gsf_nn_vae* vae) {
+    static const char classname[] = "AutoencoderKLCogVideoX";
+    const gsf__nn_key keys[] = {
+        GSF__KEY_WORD_IS("_class_name", classname, classname), GSF__KEY_WORD_IS("act_fn", "silu", "silu"),
+        GSF__KEY_FLAG_IS("use_quant_conv", 0, 0), GSF__KEY_FLAG_IS("use_post_quant_conv", 0, 0),
+        GSF__KEY_INT_OR("in_channels", vae->in_channels, 3, 1, 64),
+        GSF__KEY_INT_OR("out_channels", vae->out_channels, 3, 1, 64),
+        GSF__KEY_INT_OR("latent_channels", vae->latent_channels, 16, 1, 1024),
+        GSF__KEY_INT_OR("layers_per_block", vae->layers_per_block, 3, 1, 64),
+        GSF__KEY_INT_OR("norm_num_groups", vae->norm_groups, 32, 1, 8192),
+        GSF__KEY_INT_OR("temporal_compression_ratio", vae->temporal_ratio, 4, 1, 128),
+        GSF__KEY_INT_OR("sample_height", vae->sample_height, 480, 1, 1 << 20),
+        GSF__KEY_INT_OR("sample_width", vae->sample_width, 720, 1, 1 << 20),
+        GSF__KEY_REAL_OR("norm_eps", vae->norm_eps, 1e-6, 0.0, 1.0),
+        GSF__KEY_REAL_OR("scaling_factor", vae->scaling_factor, 1.15258426, 1e-6, 1e6)};
     int64_t channels[GSF_NN_VAE_LEVELS];
     size_t levels;
-    GSF__TRY(gsf__vae_check_unsupported(config));
-    GSF__TRY(gsf__vae_config_int(config, "in_channels", 3, 64, &vae->in_channels));
-    GSF__TRY(gsf__vae_config_int(config, "out_channels", 3, 64, &vae->out_channels));
-    GSF__TRY(gsf__vae_config_int(config, "latent_channels", 16, 1024, &vae->latent_channels));
-    GSF__TRY(gsf__vae_config_int(config, "layers_per_block", 3, 64, &vae->layers_per_block));
-    GSF__TRY(gsf__vae_config_int(config, "norm_num_groups", 32, 8192, &vae->norm_groups));
-    GSF__TRY(gsf__vae_config_int(config, "temporal_compression_ratio", 4, 128, &vae->temporal_ratio));
-    GSF__TRY(gsf__vae_config_int(config, "sample_height", 480, 1 << 20, &vae->sample_height));
-    GSF__TRY(gsf__vae_config_int(config, "sample_width", 720, 1 << 20, &vae->sample_width));
-    GSF__TRY(gsf__nn_config_number_or(config, "norm_eps", 1e-6, 0.0, 1.0, &vae->norm_eps));
-    GSF__TRY(gsf__nn_config_number_or(config, "scaling_factor", 1.15258426, 1e-6, 1e6, &vae->scaling_factor));
+    GSF__TRY(gsf__nn_config_read(config, keys, GSF__COUNT(keys)));
     GSF__TRY(gsf__nn_config_ints(config, "block_out_channels", 1, 8192, GSF_NN_VAE_LEVELS, channels, &levels));
     GSF__TRY(gsf__vae_check_types(config, "down_block_types", "CogVideoXDownBlock3D", levels));
     GSF__TRY(gsf__vae_check_types(config, "up_block_types", "CogVideoXUpBlock3D", levels));
@@ -10313,19 +10288,6 @@ static gsf_result gsf__vae_take_config(const gsf__nn_config* config, gsf_nn_vae*
                             config->json.name, (long long)channels[i], (int)vae->norm_groups);
     }
     return GSF_OK;
-}
-
-static gsf_result gsf__vae_read_config(gsf_context* ctx, const char* folder, gsf_nn_vae* vae) {
-    gsf_text path;
-    gsf__nn_config config;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &config);
-    gsf_destroy_text(ctx, &path);
-    if (result != GSF_OK) return result;
-    result = gsf__vae_take_config(&config, vae);
-    gsf__nn_close_config(&config);
-    return result;
 }
 
 static gsf_result gsf__vae_load_nets(gsf_context* ctx, gsf_nn_vae* vae) {
@@ -10345,11 +10307,14 @@ static gsf_result gsf__vae_load_nets(gsf_context* ctx, gsf_nn_vae* vae) {
 }
 
 GSF_API gsf_result gsf_nn_make_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out) {
+    gsf__nn_config file;
     memset(out, 0, sizeof *out);
-    gsf_result result = gsf__vae_read_config(ctx, folder, out);
-    if (result == GSF_OK) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
-    if (result == GSF_OK) result = gsf__vae_load_nets(ctx, out);
-    if (result != GSF_OK) gsf_nn_destroy_vae(ctx, out);
+    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
+    if (!result) result = gsf__vae_take_config(&file, out);
+    gsf__nn_close_config(&file);
+    if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
+    if (!result) result = gsf__vae_load_nets(ctx, out);
+    if (result) gsf_nn_destroy_vae(ctx, out);
     return result;
 }
 
@@ -11336,64 +11301,37 @@ static gsf_result gsf__dit_bind(gsf__nn_loader* loader, const gsf_nn_transformer
     return GSF_OK;
 }
 
-// What this code computes in one way only must not be configured otherwise.
-static gsf_result gsf__dit_check_fixed(const gsf__nn_config* file) {
-    static const struct { const char *key, *value; } texts[] = {
-        {"activation_fn", "gelu-approximate"}, {"timestep_activation_fn", "silu"}};
-    static const struct { const char* key; int value; } flags[] = {
-        {"flip_sin_to_cos", 1}, {"norm_elementwise_affine", 1}, {"patch_bias", 1}};
-    static const char* const absent[] = {"ofs_embed_dim", "patch_size_t"};
+static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
+    const gsf__nn_key keys[] = {
+        GSF__KEY_INT("num_attention_heads", c->heads, 1, 1024), GSF__KEY_INT("attention_head_dim", c->head_dim, 8, 1024),
+        GSF__KEY_INT("num_layers", c->layers, 1, 1024), GSF__KEY_INT("in_channels", c->in_channels, 1, 65536),
+        GSF__KEY_INT("out_channels", c->out_channels, 1, 65536),
+        GSF__KEY_INT("text_embed_dim", c->text_channels, 1, 1 << 20),
+        GSF__KEY_INT("max_text_seq_length", c->text_tokens, 1, 1 << 20),
+        GSF__KEY_INT("time_embed_dim", c->time_channels, 1, 1 << 20), GSF__KEY_INT("patch_size", c->patch, 1, 64),
+        GSF__KEY_INT("sample_width", c->sample_width, 1, 1 << 16),
+        GSF__KEY_INT("sample_height", c->sample_height, 1, 1 << 16),
+        GSF__KEY_INT("sample_frames", c->sample_frames, 1, 1 << 16),
+        GSF__KEY_INT("temporal_compression_ratio", c->temporal_ratio, 1, 64),
+        GSF__KEY_FLAG_OR("attention_bias", c->attention_bias, 1),
+        GSF__KEY_FLAG_OR("use_learned_positional_embeddings", c->learned_positions, 0),
+        GSF__KEY_FLAG_OR("use_rotary_positional_embeddings", c->rotary_positions, 0),
+        GSF__KEY_REAL_OR("norm_eps", c->norm_eps, 1e-5, 1e-12, 1.0),
+        GSF__KEY_REAL_OR("spatial_interpolation_scale", c->spatial_scale, 1.875, 1e-3, 1e3),
+        GSF__KEY_REAL_OR("temporal_interpolation_scale", c->temporal_scale, 1.0, 1e-3, 1e3),
+        GSF__KEY_WORD_IS("activation_fn", "gelu-approximate", "gelu-approximate"),
+        GSF__KEY_WORD_IS("timestep_activation_fn", "silu", "silu"), GSF__KEY_FLAG_IS("flip_sin_to_cos", 1, 1),
+        GSF__KEY_FLAG_IS("norm_elementwise_affine", 1, 1), GSF__KEY_FLAG_IS("patch_bias", 1, 1),
+        GSF__KEY_ABSENT("ofs_embed_dim"), GSF__KEY_ABSENT("patch_size_t")};
     double shift;
-    for (size_t i = 0; i < GSF__COUNT(texts); i++) {
-        const char* text;
-        GSF__TRY(gsf__nn_config_string(file, texts[i].key, texts[i].value, &text));
-        if (strcmp(text, texts[i].value) != 0)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not %s", file->json.name, texts[i].key,
-                            texts[i].value);
-    }
-    for (size_t i = 0; i < GSF__COUNT(flags); i++) {
-        int flag;
-        GSF__TRY(gsf__nn_config_bool_or(file, flags[i].key, flags[i].value, &flag));
-        if (flag != flags[i].value)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not true", file->json.name, flags[i].key);
-    }
-    for (size_t i = 0; i < GSF__COUNT(absent); i++)
-        if (gsf__nn_config_find(file, absent[i]))
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not null", file->json.name, absent[i]);
+    GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
     GSF__TRY(gsf__nn_config_number_or(file, "freq_shift", 0.0, -1e3, 1e3, &shift));
     if (shift != 0.0) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: freq_shift is not 0", file->json.name);
-    return GSF_OK;
-}
-
-static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
-    const struct { const char* key; int32_t* to; int64_t low, high; } sizes[] = {
-        {"num_attention_heads", &c->heads, 1, 1024}, {"attention_head_dim", &c->head_dim, 8, 1024},
-        {"num_layers", &c->layers, 1, 1024}, {"in_channels", &c->in_channels, 1, 65536},
-        {"out_channels", &c->out_channels, 1, 65536}, {"text_embed_dim", &c->text_channels, 1, 1 << 20},
-        {"max_text_seq_length", &c->text_tokens, 1, 1 << 20}, {"time_embed_dim", &c->time_channels, 1, 1 << 20},
-        {"patch_size", &c->patch, 1, 64}, {"sample_width", &c->sample_width, 1, 1 << 16},
-        {"sample_height", &c->sample_height, 1, 1 << 16}, {"sample_frames", &c->sample_frames, 1, 1 << 16},
-        {"temporal_compression_ratio", &c->temporal_ratio, 1, 64}};
-    for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
-        int64_t value = 0;
-        GSF__TRY(gsf__nn_config_int(file, sizes[i].key, sizes[i].low, sizes[i].high, &value));
-        *sizes[i].to = (int32_t)value;
-    }
-    int flag;
-    GSF__TRY(gsf__nn_config_bool_or(file, "attention_bias", 1, &flag));
-    c->attention_bias = flag;
-    GSF__TRY(gsf__nn_config_bool_or(file, "use_learned_positional_embeddings", 0, &flag));
-    c->learned_positions = flag;
-    GSF__TRY(gsf__nn_config_bool_or(file, "use_rotary_positional_embeddings", 0, &flag));
-    c->rotary_positions = flag;
-    GSF__TRY(gsf__nn_config_number_or(file, "norm_eps", 1e-5, 1e-12, 1.0, &c->norm_eps));
-    GSF__TRY(gsf__nn_config_number_or(file, "spatial_interpolation_scale", 1.875, 1e-3, 1e3, &c->spatial_scale));
-    GSF__TRY(gsf__nn_config_number_or(file, "temporal_interpolation_scale", 1.0, 1e-3, 1e3, &c->temporal_scale));
     if (c->head_dim % 16 || c->sample_width % c->patch || c->sample_height % c->patch)
         return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
                         "%s: attention_head_dim %d is no multiple of 16, or the sample no multiple of the patch",
                         file->json.name, (int)c->head_dim);
-    return gsf__dit_check_fixed(file);
+    return GSF_OK;
 }
 
 static gsf_result gsf__dit_bind_all(gsf_context* ctx, gsf_nn_transformer* net) {
@@ -11457,16 +11395,10 @@ GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transfor
 
 GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
     gsf__nn_config file;
-    gsf_text path;
-    memset(&path, 0, sizeof path);
     memset(out, 0, sizeof *out);
-    gsf_text_printf(ctx, &path, "%s/config.json", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_load_config(ctx, path.data, &file);
-    gsf_destroy_text(ctx, &path);
-    if (!result) {
-        result = gsf__dit_read_config(&file, out);
-        gsf__nn_close_config(&file);
-    }
+    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
+    if (!result) result = gsf__dit_read_config(&file, out);
+    gsf__nn_close_config(&file);
     if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
     if (!result) result = gsf__dit_bind_all(ctx, out);
     if (result) gsf_nn_destroy_transformer(ctx, out);
@@ -12170,48 +12102,23 @@ GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule
     memset(schedule, 0, sizeof *schedule);
 }
 
-// The word of `words` (ended by NULL) that the key holds; others are unsupported.
-static gsf_result gsf__nn_config_word(const gsf__nn_config* config, const char* key, const char* fallback,
-                                      const char* const* words, int* out) {
-    const char* text;
-    GSF__TRY(gsf__nn_config_string(config, key, fallback, &text));
-    for (*out = 0; words[*out]; ++*out)
-        if (strcmp(text, words[*out]) == 0) return GSF_OK;
-    return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s \"%s\" is not supported", config->json.name, key,
-                    gsf__nn_show(text).text);
-}
-
-static gsf_result gsf__nn_config_refuse(const gsf__nn_config* config, const char* key, int fallback) {
-    int flag;
-    GSF__TRY(gsf__nn_config_bool_or(config, key, fallback, &flag));
-    return flag ? gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: %s is not supported", config->json.name, key) : GSF_OK;
-}
-
 static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_schedule_desc* d) {
-    static const char* const schedules[] = {"scaled_linear", "linear", NULL};
-    static const char* const spacings[] = {"trailing", "leading", "linspace", NULL};
-    static const char* const predictions[] = {"v_prediction", NULL};
-    int64_t whole;
-    int flag;
-    GSF__TRY(gsf__nn_config_word(config, "prediction_type", "epsilon", predictions, &flag));
-    GSF__TRY(gsf__nn_config_refuse(config, "clip_sample", 1));
-    GSF__TRY(gsf__nn_config_refuse(config, "thresholding", 0));
-    if (gsf__nn_config_find(config, "trained_betas"))
-        return gsf_fail(config->ctx, GSF_ERROR_UNSUPPORTED, "%s: trained_betas is not supported", config->json.name);
-    GSF__TRY(gsf__nn_config_int_or(config, "num_train_timesteps", 1000, 2, 1000000, &whole));
-    d->train_steps = (int32_t)whole;
-    GSF__TRY(gsf__nn_config_int_or(config, "steps_offset", 0, 0, whole - 1, &whole));
-    d->steps_offset = (int32_t)whole;
-    GSF__TRY(gsf__nn_config_number_or(config, "beta_start", 0.0001, 1e-12, 0.999, &d->beta_start));
-    GSF__TRY(gsf__nn_config_number_or(config, "beta_end", 0.02, d->beta_start, 0.999, &d->beta_end));
-    GSF__TRY(gsf__nn_config_word(config, "beta_schedule", "linear", schedules, &d->linear_betas));
-    GSF__TRY(gsf__nn_config_bool_or(config, "rescale_betas_zero_snr", 0, &flag));
-    d->no_zero_snr = !flag;
-    GSF__TRY(gsf__nn_config_bool_or(config, "set_alpha_to_one", 1, &flag));
-    d->no_alpha_one = !flag;
-    GSF__TRY(gsf__nn_config_word(config, "timestep_spacing", "leading", spacings, &flag));
-    d->spacing = (gsf_nn_spacing)flag;
-    return GSF_OK;
+    int rescale, alpha_one;
+    const gsf__nn_key keys[] = {
+        GSF__KEY_WORD_IS("prediction_type", "epsilon", "v_prediction"), GSF__KEY_FLAG_IS("clip_sample", 1, 0),
+        GSF__KEY_FLAG_IS("thresholding", 0, 0), GSF__KEY_ABSENT("trained_betas"),
+        GSF__KEY_INT_OR("num_train_timesteps", d->train_steps, 1000, 2, 1000000),
+        GSF__KEY_REAL_OR("beta_start", d->beta_start, 0.0001, 1e-12, 0.999),
+        GSF__KEY_WORD_OR("beta_schedule", d->linear_betas, "linear", "scaled_linear|linear"),
+        GSF__KEY_FLAG_OR("rescale_betas_zero_snr", rescale, 0), GSF__KEY_FLAG_OR("set_alpha_to_one", alpha_one, 1),
+        GSF__KEY_WORD_OR("timestep_spacing", d->spacing, "leading", "trailing|leading|linspace")};
+    GSF__TRY(gsf__nn_config_read(config, keys, GSF__COUNT(keys)));
+    const gsf__nn_key rest[] = { // whose bounds the others tell
+        GSF__KEY_INT_OR("steps_offset", d->steps_offset, 0, 0, (double)(d->train_steps - 1)),
+        GSF__KEY_REAL_OR("beta_end", d->beta_end, 0.02, d->beta_start, 0.999)};
+    d->no_zero_snr = !rescale;
+    d->no_alpha_one = !alpha_one;
+    return gsf__nn_config_read(config, rest, GSF__COUNT(rest));
 }
 
 static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_schedule* out) {

@@ -203,9 +203,9 @@ static void test_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule) {
 static void test_configs(gsf_context* ctx) {
     static const struct { const char* text; gsf_result result; const char* error; } cases[] = {
         {"{\"prediction_type\":\"v_prediction\",\"clip_sample\":false}", GSF_OK, ""},
-        {"{\"clip_sample\":false}", GSF_ERROR_UNSUPPORTED, "prediction_type \"epsilon\""},
+        {"{\"clip_sample\":false}", GSF_ERROR_UNSUPPORTED, "prediction_type is epsilon, not v_prediction"},
         {"{\"prediction_type\":\"v_prediction\"}", GSF_ERROR_UNSUPPORTED, "clip_sample"},
-        {"{\"prediction_type\":\"sample\",\"clip_sample\":false}", GSF_ERROR_UNSUPPORTED, "prediction_type \"sample\""},
+        {"{\"prediction_type\":\"sample\",\"clip_sample\":false}", GSF_ERROR_UNSUPPORTED, "prediction_type is sample, not v_prediction"},
         {"{\"prediction_type\":7}", GSF_ERROR_FORMAT, "prediction_type is not a text"},
         {"{\"prediction_type\":\"v_prediction\",\"clip_sample\":false,\"thresholding\":true}", GSF_ERROR_UNSUPPORTED,
          "thresholding"},
