@@ -20,107 +20,113 @@ typedef struct option_spec {
     option_kind kind;
     size_t offset;
     double least, most;   // INT, REAL
-    const char* value;    // how --help calls it; with | in it: the choices
-    const char* commands; // that take it
+    const char* value;    // placeholder in --help; choices are separated by |
+    const char* commands; // the commands that accept the option, separated by blanks
     const char* help;
 } option_spec;
 
 #define AT(field) offsetof(gsfix_options, field)
 #define ALL "info fix render filter path restore metrics masks"
 static const option_spec option_specs[] = {
-    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks", "where the results go: a folder (path: a new file) that is no input. Only what gsfix wrote there is ever replaced"},
+    {"--out", TEXT, AT(out), 0, 0, "PATH", "fix render filter path restore masks",
+     "output folder (path: output file), different from the inputs. Only files written by gsfix are ever replaced"},
     {"--views", TEXT, AT(views), 0, 0, "3|6|9|N|all|FILE", "fix filter path masks info",
-     "training views: so many of those that are not test views, all of them (default), or a file of names, one per line"},
+     "training views: this many of the views that are not held out, all of them (default), or those named in FILE (one\n"
+     "per line)"},
     {"--test-every", INT, AT(test_every), 2, 1e9, "N", "fix filter path masks info",
-     "every Nth view by name is held out (default 8)"},
+     "hold out every Nth view by name (default 8)"},
     {"--factor", INT, AT(factor), 1, 64, "N", "info fix render filter path masks",
-     "use images_N/, or photos N times smaller"},
+     "use the photos in images_N/ or, if there are none, shrink them N times"},
     {"--max-size", INT, AT(max_size), 16, 65536, "PIXELS", "info fix render filter path masks",
-     "shrink photos whose longer side is more than this"},
+     "shrink photos whose longer side exceeds this"},
     {"--restorer", TEXT, AT(restorer), 0, 0, "none|warp|dit:MODEL_DIR|exec:COMMAND", "fix restore",
-     "what repairs rendered frames (fix: none by default): warp = the photos, reprojected; exec = a program of yours,\n"
-     "called as COMMAND JOBDIR"},
+     "what repairs the rendered frames (fix: none by default): warp reprojects the photos; dit is the paper's video\n"
+     "diffusion model; exec is a program of yours, run as COMMAND JOBDIR"},
     {"--restorer-timeout", REAL, AT(restorer_timeout), 0.1, 1e7, "SECONDS", "fix restore",
-     "a COMMAND that takes longer for a window is stopped and the run fails (default 3600)"},
+     "exec: time limit per window; a COMMAND that exceeds it is stopped and the run fails (default 3600)"},
     {"--condition", TEXT, AT(condition), 0, 0, "none|2d|3d|both", "fix restore",
-     "which features of the photos guide the restorer dit: (default both: 2D semantic, 3D geometric)"},
+     "dit: features of the photos that guide the model: 2d (semantic), 3d (geometric), both (default) or none"},
     {"--ref-features", TEXT, AT(ref_features), 0, 0, "FILE", "fix restore",
-     "dit: encoded photos and prompts, as safetensors with any of dino_latents.photoI, vggt_latents.photoI,J and\n"
-     "prompt_embeds.clipK, counted from 0 (or, for one clip alone, dino_latents, vggt_latents, prompt_embeds); the model's\n"
-     "encoders make what is not there"},
+     "dit: encoded photos and prompts, a safetensors file with any of dino_latents.photoI, vggt_latents.photoI,J and\n"
+     "prompt_embeds.clipK, indices from 0 (for a single clip also dino_latents, vggt_latents, prompt_embeds); missing\n"
+     "tensors are computed by the model's encoders"},
     {"--save-features", TEXT, AT(save_features), 0, 0, "FILE", "fix restore",
-     "dit: write the encoded photos and the prompts of all clips, for --ref-features, into a new file"},
+     "dit: save the encoded photos and the prompts of all clips to a new file, for --ref-features"},
     {"--caption", TEXT, AT(caption), 0, 0, "TEXT", "fix restore",
-     "dit: what the scene is (default: the model's captioner looks at each clip's first frame)"},
-    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: steps from noise to frames (default 50; fast 10)"},
+     "dit: the prompt, a description of the scene (default: the model captions the first frame of each clip)"},
+    {"--steps", INT, AT(steps), 1, 1000, "N", "fix restore", "dit: denoising steps (default 50; with --quality fast 10)"},
     {"--solver", TEXT, AT(solver), 0, 0, "ddim|dpmpp|unipc", "fix restore",
-     "dit: how they are taken (default ddim, as published; fast unipc)"},
+     "dit: solver of the denoising steps (default ddim, as published; with --quality fast unipc)"},
     {"--guidance", REAL, AT(guidance), 1, 100, "G", "fix restore",
-     "dit: weight of the prompt against the negative one (default 6; 1 leaves that out, for half the work)"},
-    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "PART", "fix restore",
-     "dit: only the first PART of the steps is guided (default 1)"},
-    {"--strength", REAL, AT(strength), 0.001, 1, "PART", "fix restore",
-     "dit: start from the noised frames and run only the last PART of the steps (default 1: from pure noise)"},
+     "dit: scale of classifier-free guidance (default 6; 1 skips the unconditional pass and halves the work)"},
+    {"--guidance-until", REAL, AT(guidance_until), 0.001, 1, "FRACTION", "fix restore",
+     "dit: use guidance only in the first FRACTION of the steps (default 1)"},
+    {"--strength", REAL, AT(strength), 0.001, 1, "FRACTION", "fix restore",
+     "dit: start from the noised frames and run only the last FRACTION of the steps (default 1: from pure noise)"},
     {"--block-cache", REAL, AT(block_cache), 0, 10, "CHANGE", "fix restore",
-     "dit: a step whose first block changes less than this (0.1, say) reuses what the others did (default 0: never)"},
+     "dit: if the output of the first block changes by less than this (e.g. 0.1) from one step to the next, reuse the\n"
+     "last output of all other blocks (default 0: never)"},
     {"--int8", FLAG, AT(int8), 0, 0, NULL, "fix restore",
-     "dit: most of the transformer in 8-bit integers; takes a byte of memory for each of its weights"},
+     "dit: quantize most layers of the transformer to 8-bit integers; needs one byte of memory per weight"},
     {"--bf16", FLAG, AT(bf16), 0, 0, NULL, "fix restore",
-     "dit: the transformer's products in bfloat16 where the processor has them (AVX512_BF16); --quality fast has it"},
+     "dit: matrix products of the transformer in bfloat16 if the processor supports it (AVX512_BF16); implied by\n"
+     "--quality fast"},
     {"--any-frames", FLAG, AT(any_frames), 0, 0, NULL, "fix restore",
-     "dit: take other numbers of frames than the one that the model was trained on (49). Sines then stand in for its learned\n"
-     "positions, which it has never seen"},
+     "dit: allow window lengths other than the 49 frames the model was trained on. Sinusoidal embeddings, which the model\n"
+     "has never seen, then replace its learned positions"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
-     "regularisers for few views (default on); off is plain 3DGS"},
+     "regularisers for few views (default on); off gives plain 3DGS"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
-     "path of the frames to repair (default reference)"},
-    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "training steps in all (default 1200)"},
+     "camera path of the frames to repair (default reference)"},
+    {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "total number of training steps (default 1200)"},
     {"--init", TEXT, AT(init), 0, 0, "embree|tracks|both|all|dense|random", "fix",
-     "initial points: those that a training view sees by ray, by track, or by either (both, the default below 6 photos);\n"
-     "all points; those of both and, more densely, where the training photos agree by stereo (dense, the default from 6\n"
-     "photos on); random ones (the default where the scene has no points)"},
+     "initial points: those that a training view sees by ray (embree), by track (tracks) or by either (both, the default\n"
+     "with fewer than 6 photos); all points (all); those of both plus points of multi-view stereo between the training\n"
+     "photos (dense, the default with 6 photos or more); random points (random, the default if the scene has no points)"},
     {"--compare", FLAG, AT(compare), 0, 0, NULL, "fix",
-     "also train as many steps from the same start and seed without repair, and report both: what the repair alone gives"},
+     "also train the same number of steps from the same start and seed without repair, and report both runs: the\n"
+     "difference is what the repair alone contributes"},
     {"--quality", TEXT, AT(quality), 0, 0, "fast|balanced|exact", "fix",
-     "approximations allowed (default balanced; exact: none)"},
+     "approximations that are allowed (default balanced; exact allows none)"},
     {"--masks", TEXT, AT(masks), 0, 0, "DIR", "fix metrics",
-     "DIR/VIEW.png per test view, white where the figures \"seen\" are to be taken (gsfix masks makes them)"},
+     "DIR/VIEW.png for each held-out view: the \"seen\" figures are measured over the white pixels (see gsfix masks)"},
     {"--photo-masks", TEXT, AT(photo_masks), 0, 0, "on|off", "fix",
-     "the photos' alpha and SCENE/masks/NAME.png (or NAME.EXT.png) say which pixels are trained on and measured: black ones\n"
-     "are not, grey ones in part (default on)"},
+     "weight pixels by the photos' alpha and by SCENE/masks/NAME.png (or NAME.EXT.png): black pixels are neither trained\n"
+     "on nor measured, grey ones count partially (default on)"},
     {"--background", TEXT, AT(background), 0, 0, "COLOR", "fix render",
-     "what lies behind the splats: black (default), white, R,G,B from 0 to 1, or (fix) random, another in each step"},
-    {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "go on from OUT/checkpoint if there is one"},
-    {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix", "begin anew although OUT holds a checkpoint, which is then lost"},
+     "background colour: black (default), white, R,G,B from 0 to 1, or (fix) random, a new one in each step"},
+    {"--resume", FLAG, AT(resume), 0, 0, NULL, "fix", "continue from OUT/checkpoint if there is one"},
+    {"--restart", FLAG, AT(restart), 0, 0, NULL, "fix",
+     "start over even if OUT contains a checkpoint, which is then deleted"},
     {"--eval-every", INT, AT(eval_every), 1, 1e7, "N", "fix",
      "measure the held-out views every N steps (default: a tenth of the iterations)"},
     {"--checkpoint-every", INT, AT(checkpoint_every), 1, 1e7, "N", "fix",
-     "write OUT/checkpoint every N steps and after every repaired window (default: 20 times a run and after every window, "
-     "but so seldom that it costs less than 2 % of the time; never more than once a second)"},
+     "write OUT/checkpoint every N steps and after every repaired window (default: 20 times per run and after every\n"
+     "window, but at most once a second and never so often that it takes more than 2 % of the time)"},
     {"--also", TEXT, AT(also), 0, 0, "splat|spz|splat,spz", "fix",
-     "also write the splats as OUT/splats.splat (no view-dependent colour), OUT/splats.spz"},
+     "also write OUT/splats.splat (no view-dependent colour) or OUT/splats.spz"},
     {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix",
-     "single settings of the trainer and of the loop, by name:"},
-    {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render its views"},
-    {"--path", TEXT, AT(path), 0, 0, "PATH.json", "render", "render these cameras"},
+     "override individual settings of the trainer and of the repair loop:"},
+    {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render the views of this scene"},
+    {"--path", TEXT, AT(path), 0, 0, "PATH.json", "render", "render the cameras in this file"},
     {"--depth", FLAG, AT(depth), 0, 0, NULL, "render",
-     "also OUT/depth/NAME.npy (float32, scene units) and a picture of it"},
-    {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also OUT/alpha/NAME.png"},
+     "also write OUT/depth/NAME.npy (float32, scene units) and a colour-mapped image of it"},
+    {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also write OUT/alpha/NAME.png"},
     {"--method", TEXT, AT(method), 0, 0, "embree|tracks|both", "filter",
-     "a point is kept when a training view sees it by ray, by track, or by either (default both)"},
+     "keep the points that a training view sees by ray (embree), by track (tracks) or by either (both, the default)"},
     {"--kind", TEXT, AT(kind), 0, 0, "reference|ellipse|interpolate", "path", "kind of path (default reference)"},
-    {"--frames", INT, AT(frames), 2, 1e6, "N", "path", "cameras on the path, in all (default 120)"},
-    {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "clips that the frames are divided into (default 1)"},
+    {"--frames", INT, AT(frames), 2, 1e6, "N", "path", "total number of cameras on the path (default 120)"},
+    {"--windows", INT, AT(windows), 1, 1e5, "N", "path", "number of clips the frames are divided into (default 1)"},
     {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
-     "the photos that guide the repair (default FRAMES_DIR/refs/)"},
+     "photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
      "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage (default psnr,ssim_3dgs)"},
-    {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, say one of all views"},
+    {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
-     "workers (default: all cores); results are the same bits for any number"},
-    {"--seed", SEED, AT(seed), 0, 0, "S", ALL, "of everything random (default 0)"},
-    {"--json", FLAG, AT(json), 0, 0, NULL, ALL, "one JSON object on stdout; progress goes to stderr in any case"},
-    {"--help", FLAG, AT(help), 0, 0, NULL, ALL, "this text"},
+     "number of workers (default: all cores); results are bit-identical for any number"},
+    {"--seed", SEED, AT(seed), 0, 0, "S", ALL, "random seed (default 0)"},
+    {"--json", FLAG, AT(json), 0, 0, NULL, ALL, "print one JSON object to stdout; progress always goes to stderr"},
+    {"--help", FLAG, AT(help), 0, 0, NULL, ALL, "show this help"},
 };
 enum { OPTION_COUNT = sizeof option_specs / sizeof option_specs[0] };
 
@@ -139,20 +145,23 @@ typedef struct command_spec {
 } command_spec;
 
 static const command_spec command_specs[] = {
-    {"info", "SCENE | SPLATS.ply|.splat|.spz", "what a scene or a splat file holds", 1, run_info},
-    {"fix", "SCENE --out DIR", "photos and COLMAP model in, repaired splats and a report out", 1, gsfix_run_fix},
-    {"render", "SPLATS.ply|.splat|.spz (--scene SCENE | --path PATH.json) --out DIR", "pictures of splats", 1, run_render},
-    {"filter", "SCENE --out SCENE2", "COLMAP model with only the points that the training views see", 1, run_filter},
-    {"path", "SCENE --out PATH.json", "a camera path through a scene", 1, run_path},
-    {"restore", "FRAMES_DIR --restorer ... --out DIR", "repairs one clip of frames", 1, run_restore},
-    {"metrics", "DIR_A DIR_B", "compares pictures of the same name", 2, run_metrics},
-    {"masks", "SCENE --model ALL.ply --out DIR", "per test view: the pixels that some training view sees", 1, run_masks},
-    {"dataset", "", "", 0, NULL},  // not in this version
+    {"info", "SCENE | SPLATS.ply|.splat|.spz", "print the contents of a scene or a splat file", 1, run_info},
+    {"fix", "SCENE --out DIR", "train splats on photos, repair them, and write a report", 1, gsfix_run_fix},
+    {"render", "SPLATS.ply|.splat|.spz (--scene SCENE | --path PATH.json) --out DIR", "render splats to images", 1,
+     run_render},
+    {"filter", "SCENE --out SCENE2", "write a COLMAP model with only the points that the training views see", 1,
+     run_filter},
+    {"path", "SCENE --out PATH.json", "sample a camera path through a scene", 1, run_path},
+    {"restore", "FRAMES_DIR --restorer ... --out DIR", "repair one clip of frames", 1, run_restore},
+    {"metrics", "DIR_A DIR_B", "compare images of the same name", 2, run_metrics},
+    {"masks", "SCENE --model ALL.ply --out DIR", "write, for each held-out view, the pixels that some training view sees",
+     1, run_masks},
+    {"dataset", "", "", 0, NULL},  // reserved: refused with "not in this version"
     {"evaluate", "", "", 0, NULL},
 };
 enum { COMMAND_COUNT = sizeof command_specs / sizeof command_specs[0] };
 
-static int has_word(const char* words, const char* word) { // words are separated by single blanks
+static int has_word(const char* words, const char* word) { // words: separated by single blanks
     const size_t n = strlen(word);
     for (const char* p = words; (p = strstr(p, word)) != NULL; p += n)
         if ((p == words || p[-1] == ' ') && (p[n] == 0 || p[n] == ' ')) return 1;
@@ -167,7 +176,7 @@ static void print_version(void) {
 #else
     const char* rays = "z-buffer (built without Embree)";
 #endif
-    printf("gsfix %s  kernels: %s  workers: %d  visibility rays: %s\n", GSF_VERSION, gsf_cpu_level_name(ctx.cpu_level),
+    printf("gsfix %s  kernels: %s  workers: %d  visibility: %s\n", GSF_VERSION, gsf_cpu_level_name(ctx.cpu_level),
            ctx.parallel.worker_count, rays);
 }
 
@@ -175,13 +184,13 @@ static int print_overview(FILE* to) {
     fprintf(to, "gsfix %s - repairs 3D Gaussian Splatting scenes made from few photos\n\n", GSF_VERSION);
     for (int i = 0; i < COMMAND_COUNT; i++)
         if (command_specs[i].run) fprintf(to, "  gsfix %-8s %s\n", command_specs[i].name, command_specs[i].summary);
-    fprintf(to, "\n  gsfix COMMAND --help tells more.  gsfix --version: version and how it was built.\n"
+    fprintf(to, "\n  gsfix COMMAND --help lists its options; gsfix --version prints the version and build.\n"
                 "  SCENE is a COLMAP folder (images/, sparse/0/) or a nerfstudio / instant-ngp transforms.json.\n"
-                "  Exit status: 0 done, 1 the work failed (one line says why), 2 wrong usage.\n");
+                "  Exit status: 0 success, 1 failure (explained in one line), 2 usage error.\n");
     return to == stdout ? 0 : 2;
 }
 
-void gsfix_print_settings(FILE* to); // the names that --set knows; gsfix_fix.c
+void gsfix_print_settings(FILE* to); // the names that --set accepts; in gsfix_fix.c
 
 static void print_help(const command_spec* command) {
     printf("gsfix %s %s [options]\n%s\n\n", command->name, command->usage, command->summary);
@@ -314,7 +323,7 @@ gsf_result gsfix_load_scene(gsfix_app* app, const char* path, gsf_scene* out) {
     return result;
 }
 
-// Training views by name; test views are the usual ones as far as they are not trained on.
+// Training views by name. Test views are every Nth view as usual, except those that are trained on.
 static gsf_result split_by_file(gsfix_app* app, const gsf_scene* scene, const char* path, size_t test_every,
                                 gsfix_split* split) {
     void* data;
@@ -324,7 +333,7 @@ static gsf_result split_by_file(gsfix_app* app, const gsf_scene* scene, const ch
     uint8_t* chosen = (uint8_t*)gsf_alloc_zeroed(&app->ctx, scene->view_count + 1, 1);
     if (!chosen) result = GSF_ERROR_OUT_OF_MEMORY;
     const char* text = (const char*)data;
-    const size_t mark = size >= 3 && memcmp(text, "\xef\xbb\xbf", 3) == 0 ? 3 : 0; // of UTF-8, as some editors set it
+    const size_t mark = size >= 3 && memcmp(text, "\xef\xbb\xbf", 3) == 0 ? 3 : 0; // UTF-8 byte order mark
     for (size_t at = mark; at < size && result == GSF_OK;) {
         const size_t line = at;
         size_t end = at;
@@ -458,14 +467,14 @@ gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app) {
     return d;
 }
 
-// The time since the last unit of work is this stage's. Before the first clip others may report theirs.
+// Assigns the time since the last report to this stage. Encoders may report before the first clip.
 static void note_dit_stage(gsfix_app* app, const char* stage) {
     const double begin = app->stage_begin, memory = gsfix_anonymous_memory();
     const int is_clip = strcmp(stage, "clip") == 0;
     int i = 0;
     if (is_clip || begin > 0.0) app->stage_begin = gsfix_now();
     if (is_clip || begin == 0.0) return;
-    if (strcmp(stage, "restore") == 0) stage = "solver"; // what a step does beside the transformer
+    if (strcmp(stage, "restore") == 0) stage = "solver"; // the part of a step outside the transformer
     while (i < app->stage_count && strcmp(app->stages[i].name, stage) != 0) i++;
     if (i == GSFIX_CLIP_STAGES) return;
     gsfix_clip_stage* s = &app->stages[i];
@@ -497,7 +506,7 @@ void gsfix_print_stages(gsfix_app* app) {
                     app->stages[i].memory / (1 << 20));
 }
 
-// Steps of one clip: a bar where the clip is all there is to do, else a line whenever half a minute has passed.
+// Steps of one clip: a progress bar if the clip is the whole job, otherwise one line every half minute.
 static void show_dit_steps(void* user, const char* stage, double done, double total) {
     gsfix_app* app = (gsfix_app*)user;
     note_dit_stage(app, stage);
@@ -529,7 +538,7 @@ gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present) 
     return gsfix_make_exec(app, r + 5, app->o.restorer_timeout > 0.0 ? app->o.restorer_timeout : 3600.0, out);
 }
 
-gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { // and those of a clip's further parts
+gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app) { // and the checkpoints of the clip's other parts
     gsf_result result = gsfix_remove_output(app, "dit.checkpoint");
     for (int part = 1; result == GSF_OK && gsfix_has_output(app, gsfix_pathf("dit.checkpoint.%d", part).s); part++)
         result = gsfix_remove_output(app, gsfix_pathf("dit.checkpoint.%d", part).s);
@@ -550,7 +559,8 @@ static int compare_doubles(const void* a, const void* b) {
     return x < y ? -1 : x > y;
 }
 
-static void print_box(gsfix_app* app, const char* key, const double* points, size_t count) { // of the middle 98 %
+// Bounds of the middle 98 % of the points.
+static void print_box(gsfix_app* app, const char* key, const double* points, size_t count) {
     double low[3] = {0}, high[3] = {0};
     double* column = (double*)gsf_alloc(&app->ctx, count + 1, sizeof *column);
     if (!column || !count) {
@@ -681,7 +691,7 @@ static int run_info(gsfix_app* app) {
 
 // ---- render ----------------------------------------------------------------------
 
-// One picture (and depth, alpha) into the folders; buffers grow to the largest camera.
+// Writes one image (and depth, alpha) to the output folders; buffers grow to the size of the largest camera.
 static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const gsf_splats* splats, const gsf_camera* camera,
                              const gsf_render_desc* desc, const char* name) {
     gsf_context* ctx = &app->ctx;
@@ -709,7 +719,7 @@ static gsf_result render_one(gsfix_app* app, gsf_rasterizer* rasterizer, const g
     return result;
 }
 
-static gsfix_path frame_name(const gsf_scene* scene, size_t i) { // scene NULL: of a path
+static gsfix_path frame_name(const gsf_scene* scene, size_t i) { // scene NULL: the camera belongs to a path
     return scene ? gsfix_view_stem(scene, i) : gsfix_pathf("%05zu", i);
 }
 
@@ -914,7 +924,7 @@ static const char* metric_name(int metric, int seen, gsfix_path* name) {
     return name->s;
 }
 
-// The mask of a picture, if --masks names a folder that has one with a white pixel; else no data.
+// The image's mask, if the folder given with --masks has one with at least one white pixel; else data is NULL.
 static gsf_result load_pair_mask(gsfix_app* app, const char* stem, gsf_image* mask) {
     const gsfix_path path = gsfix_pathf("%s/%s.png", app->o.masks ? app->o.masks : "", stem);
     if (!app->o.masks || !gsfix_exists(path.s)) return GSF_OK;
@@ -1085,10 +1095,10 @@ static int run_masks(gsfix_app* app) {
 
 // ---- restore ---------------------------------------------------------------------
 
-/* One clip. FRAMES_DIR is a folder of pictures, or laid out as a restorer's job:
+/* One clip. FRAMES_DIR is a folder of images, or has the layout of a restorer's job:
        frames/NAME.png  depth/NAME.npy  cameras.json
        refs/NAME.png  refs/cameras.json  refs/depth/NAME.npy  refs/render/NAME.png
-   exec needs the frames only, warp needs all of it (without refs/render it carries over the photos themselves). */
+   exec needs only the frames; warp needs all of it (without refs/render it reprojects the photos themselves). */
 typedef struct clip {
     gsfix_names frame_names, ref_names;
     size_t frames, refs;
@@ -1132,7 +1142,7 @@ static gsf_result load_clip_frames(gsfix_app* app, clip* c) {
     for (size_t i = 0; i < n && result == GSF_OK; i++) {
         const gsfix_path stem = gsfix_stem(c->frame_names.names[i]);
         c->reference_index[i] = -1;
-        for (size_t k = 0; k < i; k++) // a.jpg and a.png would be written as one
+        for (size_t k = 0; k < i; k++) // a.jpg and a.png would share one output name
             if (strcmp(gsfix_stem(c->frame_names.names[k]).s, stem.s) == 0)
                 return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %s and %s differ in nothing but their ending", at,
                                 c->frame_names.names[k], c->frame_names.names[i]);
@@ -1198,7 +1208,7 @@ static gsf_result load_clip_refs(gsfix_app* app, clip* c) {
     return result;
 }
 
-static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // what the warp restorer cannot do without
+static gsf_result check_warp_clip(gsfix_app* app, const clip* c) { // requirements of the warp restorer
     const char* folder = app->o.inputs[0];
     const char* lacks = !c->cameras                       ? "cameras.json (where the frames are)"
                         : !c->depth                       ? "depth/NAME.npy of each frame"
@@ -1305,7 +1315,7 @@ static int run_restore(gsfix_app* app) {
 
 // ---- main ------------------------------------------------------------------------
 
-static gsf_context* volatile interrupted_context; // a signal handler has nowhere else to find it
+static gsf_context* volatile interrupted_context; // global because a signal handler takes no argument
 
 static void on_interrupt(int number) {
     (void)number;
@@ -1313,7 +1323,7 @@ static void on_interrupt(int number) {
 }
 
 static void on_log(void* user, gsf_log_level level, const char* text) {
-    if (level == GSF_LOG_WARNING) gsfix_note((gsfix_app*)user, "warning: %s", text); // errors are told once, at the end
+    if (level == GSF_LOG_WARNING) gsfix_note((gsfix_app*)user, "warning: %s", text); // errors are printed once, at the end
 }
 
 static gsf_result quote_command(gsfix_app* app, int argc, char** argv) {
@@ -1334,7 +1344,7 @@ static gsf_result quote_command(gsfix_app* app, int argc, char** argv) {
     return GSF_ERROR_OUT_OF_MEMORY;
 }
 
-static void catch_interrupts(gsfix_app* app) { // the first one asks to stop, a second one ends the program
+static void catch_interrupts(gsfix_app* app) { // the first signal requests a stop, the second one terminates the program
     struct sigaction action;
     memset(&action, 0, sizeof action);
     action.sa_handler = on_interrupt;
@@ -1344,7 +1354,7 @@ static void catch_interrupts(gsfix_app* app) { // the first one asks to stop, a 
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
 #ifdef SIGXFSZ
-    signal(SIGXFSZ, SIG_IGN); // a file above the limit is then a write that fails, as on a full disk
+    signal(SIGXFSZ, SIG_IGN); // exceeding the file size limit then fails the write, like a full disk
 #endif
 }
 
