@@ -1,4 +1,4 @@
-// gsfix_exec.c - a restorer that is another program: COMMAND JOBDIR for each window
+// gsfix_exec.c - the restorer exec: an external program, run as COMMAND JOBDIR for each window
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
@@ -12,27 +12,27 @@
 #include <sys/prctl.h>
 #endif
 
-/* JOBDIR, before the call:
+/* Contents of JOBDIR before the call:
        frames/%05d.png    rendered frames
        depth/%05d.npy     float32 (height,width) camera depth, 0 = nothing there
        alpha/%05d.png     1 - transmittance
-       cameras.json       cameras of the frames; a frame that is a photo's view is named after it ("refs/00002.png")
-       refs/%05d.png      the photos; refs/cameras.json; refs/depth/%05d.npy and refs/render/%05d.png (what the
-                          splats show there) where known
-   and what COMMAND leaves there with exit status 0:
-       out/%05d.png         as many and as large as frames/
-       confidence/%05d.png  optional, for all frames or for none: white = trust the pixel (none: all are trusted)
-   COMMAND goes through the shell; what it prints goes to stderr.
-   JOBDIR is fresh for each round and removed after it, with all that lies in it; after a failure it stays.
-   COMMAND and what it starts form one process group with a watcher. The watcher waits at a pipe whose other end only gsfix
-   holds: when gsfix ends, however that comes (kill -9), the pipe ends and the watcher ends the group. */
+       cameras.json       cameras of the frames; a frame that has a photo's pose is named after it ("refs/00002.png")
+       refs/%05d.png      the photos; refs/cameras.json; where known, refs/depth/%05d.npy and refs/render/%05d.png (the
+                          splats rendered from the photo's camera)
+   COMMAND writes, and exits with status 0:
+       out/%05d.png         one per frame, of the same size
+       confidence/%05d.png  optional, for all frames or for none: white = full weight (none: full weight everywhere)
+   COMMAND is run by the shell; its standard output is redirected to stderr.
+   JOBDIR is new in each round and removed afterwards with all its contents, except after a failure.
+   COMMAND, its child processes and a watcher form one process group. The watcher blocks on a pipe whose write end only
+   gsfix holds: when gsfix terminates for any reason, even kill -9, the watcher reads end of file and kills the group. */
 typedef struct exec_state {
     gsfix_app* app;
     char* command;
     const char* job;
     double timeout;
     int failed;
-    pid_t group; // the watcher's process, too; 0: none
+    pid_t group; // process group, and process ID of the watcher; 0: none
     int life;    // write end of the pipe
 } exec_state;
 
@@ -67,7 +67,7 @@ static gsf_result exec_begin(void* user, gsf_context* ctx, const gsf_reference* 
     return result;
 }
 
-static void exec_end(void* user, gsf_context* ctx) { // after a failure the job stays, for whoever looks for the cause
+static void exec_end(void* user, gsf_context* ctx) { // after a failure the job folder is kept for diagnosis
     const exec_state* e = (const exec_state*)user;
     (void)ctx;
     gsfix_leave_job(e->app, !e->failed);
@@ -105,14 +105,14 @@ static gsf_result write_job(gsf_context* ctx, exec_state* e, const gsf_restore_w
     return result == GSF_OK && w->cameras ? write_cameras(ctx, e, w) : result;
 }
 
-static void watch(int life) { // in a process of its own; only what may be called after a fork
+static void watch(int life) { // runs in its own process; only async-signal-safe calls after the fork
     static const int ignored[] = {SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGPIPE};
     const long most = sysconf(_SC_OPEN_MAX);
     char byte;
     ssize_t n;
     for (size_t i = 0; i < sizeof ignored / sizeof *ignored; i++) signal(ignored[i], SIG_IGN);
     for (int fd = 0; fd < (most > 0 && most < 65536 ? most : 65536); fd++)
-        if (fd != life) close(fd); // above all the lock of OUT
+        if (fd != life) close(fd); // most importantly the lock on OUT
     while ((n = read(life, &byte, 1)) < 0 && errno == EINTR) {}
     kill(0, SIGKILL);
     _exit(0);
@@ -134,7 +134,7 @@ static gsf_result start_watcher(gsf_context* ctx, exec_state* e) {
         close(ends[1]);
         return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
     }
-    setpgid(watcher, watcher); // whoever comes first
+    setpgid(watcher, watcher); // in parent and child, to avoid a race
     e->group = watcher;
     e->life = ends[1];
     return GSF_OK;
@@ -148,7 +148,7 @@ static void end_group(exec_state* e) {
     e->group = 0;
 }
 
-static void stop_program(exec_state* e, pid_t child) { // it has a second to leave
+static void stop_program(exec_state* e, pid_t child) { // grants it a second to exit
     kill(-e->group, SIGTERM);
     for (int i = 0; i < 50; i++) {
         const struct timespec pause = {0, 20000000};
@@ -163,16 +163,16 @@ static void stop_program(exec_state* e, pid_t child) { // it has a second to lea
     end_group(e);
 }
 
-static void become_program(const exec_state* e, const char* script, pid_t parent) { // after the fork
-    setpgid(0, e->group); // so that all of it can be stopped at once
+static void become_program(const exec_state* e, const char* script, pid_t parent) { // in the child
+    setpgid(0, e->group); // so that its children can be stopped with it
 #ifdef __linux__
     prctl(PR_SET_PDEATHSIG, SIGKILL);
 #endif
-    if (getppid() != parent) _exit(127); // it ended meanwhile
+    if (getppid() != parent) _exit(127); // the parent has terminated meanwhile
     signal(SIGINT, SIG_DFL);
     signal(SIGTERM, SIG_DFL);
     signal(SIGXFSZ, SIG_DFL);
-    dup2(2, 1); // stdout is for --json
+    dup2(2, 1); // stdout is reserved for --json
     execl("/bin/sh", "sh", "-c", script, "sh", e->job, (char*)NULL);
     _exit(127);
 }
@@ -188,7 +188,7 @@ static gsf_result run_program(gsf_context* ctx, exec_state* e) {
     gsf_destroy_text(ctx, &script);
     if (watched != GSF_OK) return watched;
     if (child < 0) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
-    setpgid(child, e->group); // whoever comes first
+    setpgid(child, e->group); // in parent and child, to avoid a race
     const double begin = gsfix_now();
     for (;;) {
         int status = 0;

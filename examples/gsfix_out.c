@@ -15,49 +15,50 @@
 #define st_ctim st_ctimespec
 #endif
 
-/* An output folder OUT is the user's; gsfix keeps book of what it wrote there:
+/* An output folder OUT belongs to the user. gsfix records what it has written there:
        OUT/.gsfix/manifest   "gsfix manifest 1", then a line per file: XXH64 of its bytes, size, command, name
        OUT/.gsfix/lock       locked by the run that is at work in OUT, as long as its process lives
        OUT/.gsfix/new        the file that is being written; renamed once it is whole
-   A file is ours while the manifest has its name with its size and digest: whoever edits or replaces it makes it his.
-   The line comes first and the rename second, so that after a kill at any moment both the old and the new file are known.
-   A cut last line says nothing. The manifest travels with a copy of OUT (names are relative) and is made anew by each run.
+   A file is ours as long as the manifest lists its name with its size and digest; once edited or replaced it is the user's.
+   The line is written before the file is renamed into place, so that after a kill at any moment both the old and the new
+   file are known. A truncated last line is ignored. Names are relative, so a copy of OUT takes its manifest along. Each run
+   rewrites the manifest.
 
-   Before a run does any work it claims every name that it may write. A file of someone else under such a name, a link
-   where a folder is needed, a folder that is an input or cannot be written: each ends the run there. Everything is then
-   written through the context's write hook, which knows only what was claimed. Folders below OUT are opened one by one and
-   never through a link; OUT itself may be one, that is the user's choice.
+   Before a run does any work, it claims every name that it may write. It fails there if a claimed name is taken by a file
+   that is not ours, if a folder it needs is a link, or if a folder is an input or not writable. Everything is then written
+   through the context's write hook, which accepts claimed names only. Folders below OUT are opened one by one and never
+   through a link; OUT itself may be a link, since that is the user's choice.
 
-   The read hook remembers what was read: outputs must not lie among inputs, and a checkpoint knows what it was made from. */
+   The read hook records what was read, to keep outputs out of input folders and to tie a checkpoint to its inputs. */
 
 typedef struct out_place { dev_t device; ino_t inode; } out_place;
 typedef struct out_input { out_place place; int is_folder; char* path; } out_input;
 
-typedef struct out_line { // of the manifest
+typedef struct out_line { // one line of the manifest
     char *name, *command;
     uint64_t size, digest;
-    int written;           // by this run, and in place: it is ours without another look as long as these are the same
+    int written;           // written by this run and in place: ours without rereading while the following are unchanged
     out_place place;
     struct timespec changed;
 } out_line;
 
 struct gsfix_out {
-    gsf_io plain; // the hooks below ours
+    gsf_io plain; // the hooks that ours wrap
     out_input* inputs;
     gsfix_read_file* reads;
-    char** claims; // names below OUT; '*' is any text without '/'
-    char** files;  // paths elsewhere
+    char** claims; // names below OUT; '*' matches any text without '/'
+    char** files;  // claimed paths outside OUT
     out_line* lines;
     size_t input_count, input_room, read_count, read_room, claim_count, claim_room, file_count, file_room, line_count, line_room;
     int reads_ended;
     int root, own, lock, manifest, job;   // descriptors; -1: none
     uint64_t manifest_size;
-    int is_new;                           // no manifest was there
-    size_t existed;                       // so much of OUT's path was there
+    int is_new;                           // there was no manifest
+    size_t existed;                       // length of the part of OUT's path that existed
     out_place root_place, job_place;
     gsfix_path job_path;
     char job_name[16];
-    unsigned count; // of temporaries elsewhere
+    unsigned count; // number of temporary files outside OUT
     int unsaved;    // the clip's checkpoint could not be written
 };
 
@@ -69,7 +70,7 @@ static out_place place_of(const struct stat* s) {
 static int same_place(out_place a, out_place b) { return a.device == b.device && a.inode == b.inode; }
 
 // ---- digests ---------------------------------------------------------------------
-// XXH64 with seed 0 (the specification is public), so that `xxhsum` can check a manifest.
+// XXH64 with seed 0, so that a manifest can be verified with `xxhsum`.
 
 #define XXH_1 0x9E3779B185EBCA87u
 #define XXH_2 0xC2B2AE3D27D4EB4Fu
@@ -126,7 +127,7 @@ static uint64_t digest_bytes(const void* data, size_t size) {
     return xxh_end(&x, (const unsigned char*)data + size / 32 * 32, size % 32);
 }
 
-static int digest_file(int file, uint64_t* size, uint64_t* digest) { // from where it stands to its end; 0: unreadable
+static int digest_file(int file, uint64_t* size, uint64_t* digest) { // from the current position to the end; 0: read error
     enum { BLOCK = 1 << 16 };
     unsigned char block[BLOCK];
     xxh64 x;
@@ -165,7 +166,7 @@ static gsf_result add_place(gsfix_app* app, const char* path, const struct stat*
 
 gsf_result gsfix_add_input(gsfix_app* app, const char* path) {
     struct stat s;
-    if (!path || stat(path, &s) != 0) return GSF_OK; // whoever needs it will say so
+    if (!path || stat(path, &s) != 0) return GSF_OK; // reported where it is needed
     gsf_result result = add_place(app, path, &s);
     if (result != GSF_OK || !S_ISREG(s.st_mode)) return result;
     gsfix_path folder = gsfix_pathf("%s", path);
@@ -182,7 +183,7 @@ gsf_result gsfix_add_scene_inputs(gsfix_app* app, const gsf_scene* scene) {
     return result;
 }
 
-static gsf_result add_options(gsfix_app* app) { // what the command line names
+static gsf_result add_options(gsfix_app* app) { // inputs named on the command line
     const gsfix_options* o = &app->o;
     const char* const paths[] = {o->masks, o->scene, o->path, o->ref_features, o->model,
                                  o->restorer && strncmp(o->restorer, "dit:", 4) == 0 ? o->restorer + 4 : NULL};
@@ -217,7 +218,7 @@ static gsf_result read_hook(void* user, gsf_context* ctx, const char* path, void
     gsf_result result = o->plain.read_fn(o->plain.user, ctx, path, data, size);
     if (result != GSF_OK || o->reads_ended) return result;
     for (size_t i = 0; i < o->file_count; i++)
-        if (strcmp(o->files[i], path) == 0) return GSF_OK; // an output of this run, from before it was interrupted
+        if (strcmp(o->files[i], path) == 0) return GSF_OK; // an output of this run before it was interrupted
     result = gsfix_add_input(app, path);
     if (result == GSF_OK) result = add_read(app, path, *size, digest_bytes(*data, *size));
     if (result == GSF_OK) return GSF_OK;
@@ -244,7 +245,8 @@ const gsfix_read_file* gsfix_end_inputs(gsfix_app* app, size_t* count) {
 
 // ---- folders below OUT -------------------------------------------------------------
 
-// Descriptor of the folder of `name`, or -1 and errno; *base is what remains of the name. No link is followed.
+// Opens the folder part of `name` without following links; *base is the rest of the name. Returns -1 and sets errno on
+// failure.
 static int open_folder(int root, const char* name, int make, const char** base) {
     int at = fcntl(root, F_DUPFD_CLOEXEC, 0);
     for (const char* slash; at >= 0 && (slash = strchr(name, '/')) != NULL; name = slash + 1) {
@@ -267,13 +269,13 @@ static const char* folder_trouble(int reason) {
 }
 
 static DIR* list_folder(int folder) {
-    const int own = openat(folder, ".", O_RDONLY | O_DIRECTORY | O_CLOEXEC); // its own place in the list
+    const int own = openat(folder, ".", O_RDONLY | O_DIRECTORY | O_CLOEXEC); // a descriptor with its own directory offset
     DIR* list = own >= 0 ? fdopendir(own) : NULL;
     if (!list && own >= 0) close(own);
     return list;
 }
 
-// Everything in a folder that gsfix made for a restorer. Links go, what they point to stays.
+// Removes the contents of a folder that gsfix made for a restorer. Links are removed, their targets are not.
 static int remove_below(int folder, dev_t device) {
     DIR* list = list_folder(folder);
     int ok = list != NULL;
@@ -305,7 +307,7 @@ static int write_bytes(int file, const void* data, size_t size) {
     return 1;
 }
 
-// A new file; nothing stays of it if it cannot be written whole. 0 and errno: it could not.
+// Writes a new file and removes it again if it cannot be written completely. Returns 0 and sets errno on failure.
 static int write_new(int folder, const char* name, const void* data, size_t size, int durable) {
     const int file = openat(folder, name, O_WRONLY | O_CREAT | O_EXCL | O_NOFOLLOW | O_CLOEXEC, 0666);
     if (file < 0) return 0;
@@ -321,7 +323,8 @@ static int write_new(int folder, const char* name, const void* data, size_t size
 
 static const char manifest_head[] = "gsfix manifest 1\n";
 
-static void put_name(gsf_context* ctx, gsf_text* text, const char* name) { // %XX for what would break a line
+// Bytes that would break the line format become %XX.
+static void put_name(gsf_context* ctx, gsf_text* text, const char* name) {
     for (; *name; name++) {
         if ((unsigned char)*name > 0x20 && *name != '%' && *name != 0x7f) gsf_text_append(ctx, text, name, 1);
         else gsf_text_printf(ctx, text, "%%%02X", (unsigned)(unsigned char)*name);
@@ -340,7 +343,7 @@ static char* take_name(gsf_context* ctx, const char* from, size_t size) {
     return name;
 }
 
-static gsf_result add_line(gsf_context* ctx, gsfix_out* o, const out_line* line) { // takes what it points to
+static gsf_result add_line(gsf_context* ctx, gsfix_out* o, const out_line* line) { // takes ownership of the line's memory
     const gsf_result result = line->name && line->command
                                   ? gsfix_grow(ctx, (void**)&o->lines, &o->line_room, o->line_count, sizeof *line)
                                   : GSF_ERROR_OUT_OF_MEMORY;
@@ -366,7 +369,7 @@ static void print_line(gsf_context* ctx, gsf_text* text, const out_line* line) {
     gsf_text_append(ctx, text, "\n", 1);
 }
 
-// What makes no sense is no line: it claims nothing.
+// Malformed lines are ignored, so that they claim nothing.
 static gsf_result parse_manifest(gsf_context* ctx, gsfix_out* o, const char* text, size_t size) {
     gsf_result result = GSF_OK;
     for (const char *p = text, *end; result == GSF_OK && (end = (const char*)memchr(p, '\n', size - (size_t)(p - text)));
@@ -413,7 +416,7 @@ static int is_written(const out_line* line, const struct stat* s) {
            line->changed.tv_sec == s->st_ctim.tv_sec && line->changed.tv_nsec == s->st_ctim.tv_nsec;
 }
 
-// Is the file `base` of the folder, known as `name`, what gsfix wrote? -1: nothing is there. *which: its line.
+// Is the file `base` in the folder, listed as `name`, what gsfix wrote? -1: there is no such file. *which: its line.
 static int look_at(const gsfix_out* o, int folder, const char* base, const char* name, struct stat* s, size_t* which) {
     uint64_t size = 0, digest = 0;
     int known = 0;
@@ -437,14 +440,15 @@ static int look_at(const gsfix_out* o, int folder, const char* base, const char*
     return 0;
 }
 
-static int folder_of(const gsfix_out* o, const char* name, const char** base) { // of a name in the manifest
+// Opens the folder of a name in the manifest.
+static int folder_of(const gsfix_out* o, const char* name, const char** base) {
     if (name[0] != '/') return open_folder(o->root, name, 0, base);
     const char* slash = strrchr(name, '/');
     *base = slash + 1;
     return open(gsfix_pathf("%.*s/", (int)(slash - name), name).s, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
 }
 
-// The manifest without the lines that no file stands behind any more, as a new file: a cut line or a hard link ends here.
+// Rewrites the manifest as a new file without lines whose files are gone; this also drops truncated lines and hard links.
 static gsf_result renew_manifest(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
@@ -474,7 +478,8 @@ static gsf_result renew_manifest(gsfix_app* app) {
     return result;
 }
 
-// Enters a file that is about to be put in place. 0 and errno: not possible; the manifest is as before.
+// Adds a line for a file that is about to be renamed into place. Returns 0, sets errno and leaves the manifest unchanged on
+// failure.
 static int enter_line(gsfix_app* app, const char* name, uint64_t size, uint64_t digest, int durable) {
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
@@ -497,7 +502,7 @@ static int enter_line(gsfix_app* app, const char* name, uint64_t size, uint64_t 
     return ok && (!durable || fsync(o->manifest) == 0 || errno == EINVAL);
 }
 
-// The last line's file is in place: what older lines say of the name is over.
+// The file of the last line is in place: drops older lines for the same name.
 static void settle_line(gsf_context* ctx, gsfix_out* o, int folder, const char* base) {
     struct stat s;
     out_line* last = o->lines + o->line_count - 1;
@@ -619,11 +624,12 @@ static gsf_result take_lock(gsfix_app* app) {
         if (fstat(o->lock, &mine) == 0 && fstatat(o->own, "lock", &there, AT_SYMLINK_NOFOLLOW) == 0 &&
             same_place(place_of(&mine), place_of(&there)))
             return GSF_OK;
-        close(o->lock); // its owner removed it just before it ended
+        close(o->lock); // its owner removed it just before exiting
     }
 }
 
-static gsf_result check_own(gsfix_app* app) { // is a .gsfix without a manifest what a run left that was killed at once?
+// A .gsfix without a manifest is ours if it contains only what a run that was killed at its start leaves.
+static gsf_result check_own(gsfix_app* app) {
     DIR* list = list_folder(app->out->own);
     gsf_result result = GSF_OK;
     for (struct dirent* entry; list && result == GSF_OK && (entry = readdir(list)) != NULL;)
@@ -634,7 +640,7 @@ static gsf_result check_own(gsfix_app* app) { // is a .gsfix without a manifest 
     return result;
 }
 
-static size_t existing_part(const char* path) { // its length
+static size_t existing_part(const char* path) { // length of the leading part that exists
     gsfix_path part = gsfix_pathf("%s", path);
     struct stat s;
     while (part.s[0] && lstat(part.s, &s) != 0) {
@@ -644,7 +650,8 @@ static size_t existing_part(const char* path) { // its length
     return strlen(part.s);
 }
 
-static void remove_made(const gsfix_out* o, const char* path) { // of OUT's folders those that were made and are empty
+// Removes the folders of OUT's path that were created and are empty.
+static void remove_made(const gsfix_out* o, const char* path) {
     for (gsfix_path part = gsfix_pathf("%s", path); strlen(part.s) > o->existed;) {
         char* slash = strrchr(part.s, '/');
         rmdir(part.s);
@@ -727,7 +734,7 @@ static gsf_result unwritten(gsf_context* ctx, const char* path, int reason) {
     return gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, folder_trouble(reason));
 }
 
-// What stands in OUT itself, results and checkpoint, outlives a power cut, too.
+// Files directly in OUT (results and checkpoint) are synced to disk, so that they survive a power failure.
 static gsf_result write_output(gsfix_app* app, gsf_context* ctx, const char* path, const char* name, const void* data,
                                size_t size) {
     gsfix_out* o = app->out;
@@ -757,19 +764,20 @@ static gsf_result write_job_file(gsfix_app* app, gsf_context* ctx, const char* p
     const char* base;
     const int folder = open_folder(app->out->job, name, 1, &base);
     if (folder < 0) return unwritten(ctx, path, errno);
-    unlinkat(folder, base, 0); // of the window before
+    unlinkat(folder, base, 0); // left by the previous window
     const gsf_result result = write_new(folder, base, data, size, 0) ? GSF_OK : unwritten(ctx, path, errno);
     close(folder);
     return result;
 }
 
-// A file elsewhere that was claimed: it is new, or what an earlier run with this OUT wrote.
+// A claimed file outside OUT: it is either new or was written by an earlier run with this OUT.
 static gsf_result write_file(gsfix_app* app, gsf_context* ctx, const char* path, const void* data, size_t size) {
     gsfix_out* o = app->out;
     gsfix_path name;
     struct stat s;
     const char* base;
-    if (stat(path, &s) == 0 && (S_ISCHR(s.st_mode) || S_ISFIFO(s.st_mode))) // nothing is replaced there
+    // Devices and pipes are written to, not replaced.
+    if (stat(path, &s) == 0 && (S_ISCHR(s.st_mode) || S_ISFIFO(s.st_mode)))
         return o->plain.write_fn(o->plain.user, ctx, path, data, size);
     name = gsfix_absolute(path);
     const int folder = name.s[0] ? folder_of(o, name.s, &base) : -1;
@@ -783,9 +791,10 @@ static gsf_result write_file(gsfix_app* app, gsf_context* ctx, const char* path,
         result = unwritten(ctx, path, errno);
     } else {
         int ok = o->manifest < 0 || enter_line(app, name.s, size, digest_bytes(data, size), 1);
-        if (ok && there < 0) { // a link does not replace what came there since
+        if (ok && there < 0) { // link() fails if the name was taken meanwhile
             ok = linkat(folder, temporary.s, folder, base, 0) == 0;
-            if (!ok && errno != EEXIST) ok = renameat(folder, temporary.s, folder, base) == 0; // no links there
+            // A file system without hard links.
+            if (!ok && errno != EEXIST) ok = renameat(folder, temporary.s, folder, base) == 0;
         } else if (ok) {
             ok = renameat(folder, temporary.s, folder, base) == 0;
         }
@@ -797,7 +806,7 @@ static gsf_result write_file(gsfix_app* app, gsf_context* ctx, const char* path,
     return result;
 }
 
-static const char* below(const char* path, const char* folder) { // what follows "folder/", or NULL
+static const char* below(const char* path, const char* folder) { // the part of path after "folder/", or NULL
     const size_t n = strlen(folder);
     if (!n || strncmp(path, folder, n) != 0 || (path[n] != '/' && folder[n - 1] != '/')) return NULL;
     return path + n + strspn(path + n, "/");
@@ -814,7 +823,7 @@ static gsf_result write_hook(void* user, gsf_context* ctx, const char* path, con
         if (!o->unsaved) gsf_log(ctx, GSF_LOG_WARNING, "going on without the clip's checkpoint: %s", ctx->error);
         o->unsaved = 1;
         ctx->error[0] = 0;
-        return GSF_OK; // it saves time after a stop, nothing that the run leaves depends on it
+        return GSF_OK; // it only saves time after an interruption; no result depends on it
     }
     for (size_t i = 0; i < o->file_count; i++)
         if (strcmp(o->files[i], path) == 0) return write_file(app, ctx, path, data, size);
@@ -870,7 +879,8 @@ gsf_result gsfix_make_job(gsfix_app* app, const char** path) {
             o->job = openat(o->root, o->job_name, O_RDONLY | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC);
         else if (errno != EEXIST) break;
     }
-    char* real = o->job >= 0 ? realpath(app->o.out, NULL) : NULL; // a command may change its folder
+    // Absolute, since a command may change its working directory.
+    char* real = o->job >= 0 ? realpath(app->o.out, NULL) : NULL;
     if (!real || fstat(o->job, &s) != 0)
         return gsf_fail(ctx, GSF_ERROR_IO, "%s/%s: folder cannot be made: %s", app->o.out, o->job_name, strerror(errno));
     o->job_place = place_of(&s);
@@ -918,7 +928,7 @@ gsf_result gsfix_begin_files(gsfix_app* app) {
     gsfix_out* o = (gsfix_out*)gsf_alloc_zeroed(ctx, 1, sizeof *o);
     if (!o) return GSF_ERROR_OUT_OF_MEMORY;
     o->root = o->own = o->lock = o->manifest = o->job = -1;
-    o->existed = SIZE_MAX; // OUT was not opened
+    o->existed = SIZE_MAX; // OUT has not been opened yet
     o->plain = ctx->io;
     app->out = o;
     ctx->io.read_fn = read_hook;
@@ -933,7 +943,7 @@ void gsfix_end_files(gsfix_app* app) {
     gsfix_out* o = app->out;
     if (!o) return;
     gsfix_leave_job(app, 0);
-    if (o->lock >= 0 && o->is_new && !o->line_count) { // a run that wrote nothing leaves nothing
+    if (o->lock >= 0 && o->is_new && !o->line_count) { // a run that wrote nothing leaves no trace
         unlinkat(o->own, "manifest", 0);
         unlinkat(o->own, "lock", 0);
         unlinkat(o->root, ".gsfix", AT_REMOVEDIR);
