@@ -60,21 +60,14 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 // of splats of equal depth.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats);
 
-// The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Splats with a non-finite
-// value are dropped and counted in a warning. Origin: zero, or the rounded centre where coordinates are large (centre
-// beyond 1e5, or beyond 1000 times the extent; both from medians of samples, so stray splats do not matter). Ids are
-// the rows. Memory in proportion to the file; a header that promises more rows than the file can hold is an error.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_load_ply(gsf_context* ctx, const char* path, gsf_splats* out);
-GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size,
-                                                     gsf_splats* out);
-// Binary little-endian float32 as the official code writes it. x y z are world positions; they become double when they
-// are large by the loader's rule, since float32 would then cost precision (and stay float32 otherwise, whatever origin
-// is, so that every viewer reads the file). format_ply appends to `out`, which starts zeroed.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const gsf_splats* splats);
-GSF_API GSF_NODISCARD gsf_result gsf_splat_format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out);
-
-/* The formats of engines and viewers beside PLY, in and out. Which one it is, the name's ending says (.ply, .splat, .spz,
-   in any case); a file of another name is known by its content if it is PLY or SPZ (a .splat has no mark).
+/* The formats of splats, in and out. Which one it is, the name's ending says (.ply, .splat, .spz, in any case); a file of
+   another name is known by its content if it is PLY or SPZ (a .splat has no mark).
+       .ply    The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Origin: zero, or the
+               rounded centre where coordinates are large (centre beyond 1e5, or beyond 1000 times the extent; both from
+               medians of samples, so stray splats do not matter). A header that promises more rows than the file can hold is
+               an error. Written as binary little-endian float32, as the official code does; x y z become double when they
+               are large by the loader's rule, since float32 would then cost precision (and stay float32 otherwise, whatever
+               origin is, so that every viewer reads the file).
        .splat  32 bytes a splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0 are
                lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
        .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes a splat. Versions 1 to 3 are read, 2 and 3 written. Errors:
@@ -84,12 +77,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_format_ply(gsf_context* ctx, const gs
                small). Axes are converted to and from SPZ's (y and z turned around), as the official library does.
                Extensions and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than
                2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under GSF_NO_STB.
-   Neither file has an origin: world positions are written, and steps that are coarse beside the splats (more than a quarter
-   of the median scale) or cannot be held at all are a warning or an error; `local` writes means without the origin instead.
-   Rows keep their order, ids are lost. Splats with a NaN or infinite value are left out, when writing as when reading, and
-   counted in a warning. An opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory in
-   proportion to the content; a file that claims more than DEFLATE can hold (1032
-   times its size) is refused before it is believed. */
+   No file has an origin: world positions are written. Of .splat and .spz, steps that are coarse beside the splats (more than
+   a quarter of the median scale) or cannot be held at all are a warning or an error; `local` writes means without the origin
+   instead. Rows keep their order, ids are lost: those of loaded splats are the rows. Splats with a NaN or infinite value are
+   left out, when writing as when reading, and counted in a warning. An opacity of 0 or 1 is read as 0.001 or 0.999, since
+   the logit must be finite. Memory in proportion to the content; a file that claims more than DEFLATE can hold (1032 times
+   its size) is refused before it is believed. */
 typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ } gsf_splat_type;
 
 typedef struct gsf_splat_save_desc {
@@ -373,9 +366,6 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf
                                                            const gsf_render_desc* desc, const float* d_color,
                                                            const float* d_depth, const float* d_alpha,
                                                            const gsf_splat_grads* grads);
-// Radii in pixels (0 = culled) of the last render, (count); valid until the next render.
-GSF_API const int32_t* gsf_splat_last_radii(const gsf_rasterizer* rasterizer);
-
 // For each pixel of `camera`: 1 where its 3D point, taken from the depth of `splats` (a good model, say of all views), is
 // seen by at least one of the other cameras (inside its image and not behind its own depth by more than 5 %), else 0.
 // mask: u8, one channel, of the camera's size. Pixels with alpha below 0.5 are 0.
@@ -1341,8 +1331,7 @@ static gsf_result gsf__ply_check_columns(gsf_context* ctx, const gsf__ply* ply, 
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size,
-                                       gsf_splats* out) {
+static gsf_result gsf__parse_ply(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
     gsf__ply ply;
     int32_t degree = 0;
     memset(out, 0, sizeof *out);
@@ -1368,16 +1357,6 @@ GSF_API gsf_result gsf_splat_parse_ply(gsf_context* ctx, const char* name, const
     if (result == GSF_OK) gsf__drop_rows(ctx, name, job.bad, out);
     else gsf_splat_destroy(ctx, out);
     gsf_free(ctx, job.bad);
-    return result;
-}
-
-GSF_API gsf_result gsf_splat_load_ply(gsf_context* ctx, const char* path, gsf_splats* out) {
-    void* data;
-    size_t size;
-    memset(out, 0, sizeof *out);
-    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
-    const gsf_result result = gsf_splat_parse_ply(ctx, path, data, size, out);
-    gsf_free(ctx, data);
     return result;
 }
 
@@ -1434,7 +1413,7 @@ static void gsf__splats_sample_position(const void* arg, size_t i, double* out) 
     for (size_t k = 0; k < 3; k++) out[k] = s->origin[k] + (double)s->means[3 * i + k];
 }
 
-GSF_API gsf_result gsf_splat_format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out) {
+static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out) {
     gsf__ply_write_job job;
     double origin[3];
     if (splats->sh_degree < 0 || splats->sh_degree > 3)
@@ -1463,15 +1442,6 @@ GSF_API gsf_result gsf_splat_format_ply(gsf_context* ctx, const gsf_splats* spla
     out->size += bytes;
     out->data[out->size] = 0;
     return GSF_OK;
-}
-
-GSF_API gsf_result gsf_splat_save_ply(gsf_context* ctx, const char* path, const gsf_splats* splats) {
-    gsf_text text;
-    memset(&text, 0, sizeof text);
-    gsf_result result = gsf_splat_format_ply(ctx, splats, &text);
-    if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
-    gsf_destroy_text(ctx, &text);
-    return result;
 }
 
 // ---- >>formats -----------------------------------------------------------------
@@ -2104,12 +2074,12 @@ GSF_API gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const voi
     const unsigned char* p = (const unsigned char*)data;
     memset(out, 0, sizeof *out);
     switch (gsf__type_of_name(name)) {
-        case GSF_SPLAT_PLY: return gsf_splat_parse_ply(ctx, name, data, size, out);
+        case GSF_SPLAT_PLY: return gsf__parse_ply(ctx, name, data, size, out);
         case GSF_SPLAT_SPLAT: return gsf__splat_parse(ctx, name, data, size, out);
         case GSF_SPLAT_SPZ: return gsf__spz_parse(ctx, name, data, size, out);
         case GSF_SPLAT_AUTO: break;
     }
-    if (size >= 4 && memcmp(p, "ply", 3) == 0) return gsf_splat_parse_ply(ctx, name, data, size, out);
+    if (size >= 4 && memcmp(p, "ply", 3) == 0) return gsf__parse_ply(ctx, name, data, size, out);
     if (size >= 4 && ((p[0] == 0x1f && p[1] == 0x8b) || memcmp(p, "NGSP", 4) == 0))
         return gsf__spz_parse(ctx, name, data, size, out);
     return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: neither PLY nor SPZ, and .splat is known by its name only", name);
@@ -2134,7 +2104,7 @@ GSF_API gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gs
     if (d.type == GSF_SPLAT_AUTO) d.type = gsf__type_of_name(name);
     if (d.local) memset(view.origin, 0, sizeof view.origin);
     switch (d.type) {
-        case GSF_SPLAT_PLY: return gsf_splat_format_ply(ctx, &view, out);
+        case GSF_SPLAT_PLY: return gsf__format_ply(ctx, &view, out);
         case GSF_SPLAT_SPLAT: return gsf__splat_format(ctx, name, &view, out);
         case GSF_SPLAT_SPZ: return gsf__spz_format(ctx, name, &view, d.spz_version ? d.spz_version : 3, out);
         case GSF_SPLAT_AUTO: break;
@@ -6980,8 +6950,6 @@ GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     gsf_free(ctx, r);
 }
 
-GSF_API const int32_t* gsf_splat_last_radii(const gsf_rasterizer* rasterizer) { return rasterizer->radii; }
-
 // ---- >>project -----------------------------------------------------------------
 
 // exp and log with the same bits on every machine; relative error below 1.2e-7 (float rounding of a double result).
@@ -11149,7 +11117,7 @@ static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf_
     else if (densifies) grads.means2d = model->screen[which];
     GSF__TRY(gsf_splat_render_backward(ctx, trainer->rasterizer, &trainer->view, &photo->camera, &render,
                                        trainer->d_color, smooth ? trainer->d_depth : NULL, NULL, &grads));
-    const int32_t* radii = gsf_splat_last_radii(trainer->rasterizer);
+    const int32_t* radii = trainer->rasterizer->radii;
     for (size_t i = 0; densifies && i < model->count; i++) model->seen[which][i] = radii[i] > 0;
     return GSF_OK;
 }

@@ -682,7 +682,7 @@ static void bench_training(const bench_options* o) {
         views[count++].image = scene.views[i].image;
     }
     gsf_splats start;
-    if (o->start) bench_require(&ctx, gsf_splat_load_ply(&ctx, o->start, &start));
+    if (o->start) bench_require(&ctx, gsf_splat_load(&ctx, o->start, &start));
     else
         bench_require(&ctx, gsf_splat_from_points(&ctx, scene.points, scene.colors, scene.point_count, NULL, 3,
                                                   scene.origin, &start));

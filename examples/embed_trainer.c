@@ -124,7 +124,7 @@ int main(int argc, char** argv) {
         result = GSF_OK;
     }
     if (result == GSF_OK && argc > 2)
-        result = gsf_splat_save_ply(&h.ctx, argv[2], gsf_splat_trainer_splats(h.trainer));
+        result = gsf_splat_save(&h.ctx, argv[2], gsf_splat_trainer_splats(h.trainer), NULL);
     if (result != GSF_OK) fprintf(stderr, "%s\n", h.ctx.error);
 
     gsf_splat_destroy_trainer(&h.ctx, h.trainer);

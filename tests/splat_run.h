@@ -121,7 +121,7 @@ static inline result render(machine* m, const gsf_splats* splats, const gsf_came
     result r = result_make(splats, camera);
     const gsf_render_output out = result_output(&r, camera);
     CHECK_OK(&m->ctx, gsf_splat_render(&m->ctx, m->rasterizer, splats, camera, desc, &out));
-    const int32_t* radii = gsf_splat_last_radii(m->rasterizer);
+    const int32_t* radii = m->rasterizer->radii;
     if (splats->count && CHECK(radii != NULL)) memcpy(r.radii, radii, splats->count * sizeof(int32_t));
     float* d_color = narrow(l->d_color, 3 * r.pixels);
     float* d_depth = l->d_depth ? narrow(l->d_depth, r.pixels) : NULL;

@@ -38,7 +38,7 @@ static void compare_ply(const char* file, const char* tensors, double tolerance)
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_splats s;
-    if (!CHECK_OK(&ctx, gsf_splat_load_ply(&ctx, test_golden(file), &s))) return;
+    if (!CHECK_OK(&ctx, gsf_splat_load(&ctx, test_golden(file), &s))) return;
     test_tensors t = test_open_tensors(test_golden(tensors));
     test_tensor xyz = test_get_tensor(&t, "expect.xyz"), dc = test_get_tensor(&t, "expect.f_dc");
     test_tensor rest = test_find_tensor(&t, "expect.f_rest"), opacity = test_get_tensor(&t, "expect.opacity");
@@ -76,7 +76,7 @@ static void test_ply_golden(void) {
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_splats s;
-    if (!CHECK_OK(&ctx, gsf_splat_load_ply(&ctx, test_golden("splat/ply/random_deg3.ply"), &s))) return;
+    if (!CHECK_OK(&ctx, gsf_splat_load(&ctx, test_golden("splat/ply/random_deg3.ply"), &s))) return;
     test_tensors t = test_open_tensors(test_golden("splat/scenes/random.safetensors"));
     test_tensor means = test_get_tensor(&t, "in.means"), sh = test_get_tensor(&t, "in.sh");
     CHECK(s.sh_degree == 3 && 3 * s.count == means.count);
@@ -87,7 +87,7 @@ static void test_ply_golden(void) {
     memset(&text, 0, sizeof text);
     size_t size;
     char* file = test_read_file(test_golden("splat/ply/random_deg3.ply"), &size);
-    CHECK_OK(&ctx, gsf_splat_format_ply(&ctx, &s, &text));
+    CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.ply", &s, NULL, &text));
     CHECK(text.size == size && memcmp(text.data, file, size) == 0);
     free(file);
     gsf_destroy_text(&ctx, &text);
@@ -110,16 +110,16 @@ static void test_ply_bad(void) {
         snprintf(relative, sizeof relative, "splat/bad/ply/%s.ply", names[i]);
         ctx.error[0] = 0;
         count.asked = 0;
-        CHECK_RESULT(&ctx, gsf_splat_load_ply(&ctx, test_golden(relative), &s), GSF_ERROR_FORMAT);
+        CHECK_RESULT(&ctx, gsf_splat_load(&ctx, test_golden(relative), &s), GSF_ERROR_FORMAT);
         CHECK(strstr(ctx.error, names[i]) != NULL && s.owned == NULL && count.asked < 1000000);
     }
-    CHECK_OK(&ctx, gsf_splat_load_ply(&ctx, test_golden("splat/bad/ply/05_nan_inf_xyz.ply"), &s));
+    CHECK_OK(&ctx, gsf_splat_load(&ctx, test_golden("splat/bad/ply/05_nan_inf_xyz.ply"), &s));
     CHECK(s.count == 30 && warnings == 1 && strstr(warning, "1 of 31 splats dropped"));
     gsf_splat_destroy(&ctx, &s);
-    CHECK_OK(&ctx, gsf_splat_load_ply(&ctx, test_golden("splat/bad/ply/11_huge_header.ply"), &s));
+    CHECK_OK(&ctx, gsf_splat_load(&ctx, test_golden("splat/bad/ply/11_huge_header.ply"), &s));
     CHECK(s.count == 31);
     gsf_splat_destroy(&ctx, &s);
-    CHECK_RESULT(&ctx, gsf_splat_load_ply(&ctx, "no/such/file.ply", &s), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(&ctx, gsf_splat_load(&ctx, "no/such/file.ply", &s), GSF_ERROR_NOT_FOUND);
     CHECK(count.live == 0);
 }
 
@@ -133,7 +133,7 @@ static void test_ply_damage(const char* relative, int all_values) {
     const int is_text = strstr(relative, "ascii") != NULL;
     for (size_t cut = 0; cut < size; cut++) {
         char* part = exact_copy(file, cut);
-        const gsf_result r = gsf_splat_parse_ply(&ctx, "cut.ply", part, cut, &s);
+        const gsf_result r = gsf_splat_parse(&ctx, "cut.ply", part, cut, &s);
         // of a text file the last number may lose digits and its line feed
         CHECK(is_text && cut + 32 > size ? r == GSF_OK || r == GSF_ERROR_FORMAT : r == GSF_ERROR_FORMAT);
         gsf_splat_destroy(&ctx, &s);
@@ -145,7 +145,7 @@ static void test_ply_damage(const char* relative, int all_values) {
     for (size_t at = 0; at < size; at += at < header ? 1 : 7)
         for (int flip = 1; flip < 256; flip += at < header && all_values ? 1 : 85) {
             whole[at] = (char)(file[at] ^ flip);
-            const gsf_result r = gsf_splat_parse_ply(&ctx, "flip.ply", whole, size, &s);
+            const gsf_result r = gsf_splat_parse(&ctx, "flip.ply", whole, size, &s);
             CHECK(r == GSF_OK || is_refusal(r));
             if (r != GSF_OK) CHECK(strncmp(ctx.error, "flip.ply", 8) == 0 && s.owned == NULL);
             gsf_splat_destroy(&ctx, &s);
@@ -165,13 +165,13 @@ static void test_ply_out_of_memory(const char* relative) {
         gsf_context ctx = make_context(&count);
         gsf_splats s;
         count.fail_at = k;
-        const gsf_result r = gsf_splat_parse_ply(&ctx, "oom.ply", file, size, &s);
+        const gsf_result r = gsf_splat_parse(&ctx, "oom.ply", file, size, &s);
         if (r == GSF_OK) {
             gsf_text text;
             memset(&text, 0, sizeof text);
             for (size_t j = 1;; j++) { // the same for writing
                 count.fail_at = count.calls + j;
-                const gsf_result w = gsf_splat_format_ply(&ctx, &s, &text);
+                const gsf_result w = gsf_splat_format(&ctx, "x.ply", &s, NULL, &text);
                 gsf_destroy_text(&ctx, &text);
                 if (w == GSF_OK) break;
                 if (!CHECK(w == GSF_ERROR_OUT_OF_MEMORY)) break;
@@ -201,9 +201,9 @@ static void test_ply_origin(void) {
         gsf_text text;
         memset(&text, 0, sizeof text);
         memcpy(s.origin, turn ? near_origin : far_origin, sizeof s.origin);
-        CHECK_OK(&ctx, gsf_splat_format_ply(&ctx, &s, &text));
+        CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.ply", &s, NULL, &text));
         CHECK((strstr(text.data, "property double x") != NULL) == (turn == 0));
-        if (CHECK_OK(&ctx, gsf_splat_parse_ply(&ctx, "origin.ply", text.data, text.size, &again))) {
+        if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, "origin.ply", text.data, text.size, &again))) {
             CHECK(again.count == s.count && (again.origin[0] != 0.0) == (turn == 0));
             CHECK(again.origin[0] == floor(again.origin[0]) && again.origin[2] == floor(again.origin[2]));
             double worst = 0.0;
@@ -233,7 +233,7 @@ static void test_ply_variants(void) { // elements before and after, carriage ret
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_splats s;
-    CHECK_OK(&ctx, gsf_splat_parse_ply(&ctx, "variant.ply", text, sizeof text - 1, &s));
+    CHECK_OK(&ctx, gsf_splat_parse(&ctx, "variant.ply", text, sizeof text - 1, &s));
     CHECK(s.count == 1 && warnings == 1);
     if (s.count == 1) {
         CHECK(s.means[0] == -5.0f && s.means[1] == 300.0f && s.means[2] == 1.5f);

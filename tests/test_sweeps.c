@@ -201,7 +201,7 @@ static gsf_result save(loop* l) {
     gsf_camera cameras[VIEWS];
     size_t count;
     for (size_t v = 0; v < l->scene.view_count; v++) cameras[v] = l->views[v].camera;
-    STEP(gsf_splat_save_ply(ctx, in(out_folder, "splats.ply"), &l->result));
+    STEP(gsf_splat_save(ctx, in(out_folder, "splats.ply"), &l->result, NULL));
     STEP(gsf_splat_save(ctx, in(out_folder, "splats.splat"), &l->result, NULL));
     STEP(gsf_splat_save(ctx, in(out_folder, "splats.spz"), &l->result, NULL));
     for (int i = 0; i < 3; i++) {
