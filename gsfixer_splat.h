@@ -493,6 +493,10 @@ typedef struct gsf_fix_desc {
     gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
     const double* points;         // (point_count,3) world points for the path's axes and depth; NULL = cameras only.
     size_t point_count;           //   Borrowed until the fixer is destroyed
+    const gsf_camera* path;       // (path_count) poses of the frames to repair, in place of the trajectory, in every round;
+    size_t path_count;            //   NULL = the trajectory. Spread evenly over windows x window_frames: where the counts
+                                  //   differ, poses are left out or repeated. Frames have the first photo's size and field
+                                  //   of view. Borrowed likewise
     int32_t rounds;               // restoration rounds, default 3; < 0: none
     int32_t first_round;          // iteration after which the first round runs; 0 = about 1/3 of the iterations, shortly
                                   // before a densification
@@ -12166,6 +12170,9 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
     if (!(d->lambda >= 0.0f && d->lambda <= 1e6f) || !(d->skip_psnr >= 0.0f) || d->max_pixels < 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: lambda %g, skip_psnr %g, max_pixels %d", (double)d->lambda,
                         (double)d->skip_psnr, (int)d->max_pixels);
+    if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: a path of %zu cameras", d->path_count);
+    for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
     if (restorer && (restorer->struct_size < sizeof(gsf_restorer) || !restorer->query_fn || !restorer->begin_fn ||
                      !restorer->restore_fn || !restorer->end_fn))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer lacks struct_size or a function");
@@ -12236,7 +12243,20 @@ static gsf_camera gsf__frame_camera(const gsf_fixer* f, const gsf_camera* camera
     return f->limits.squash ? gsf__squashed_camera(f, camera) : gsf__square_camera(f, camera);
 }
 
+static void gsf__spread_path(gsf_fixer* f) { // the host's
+    const size_t total = (size_t)f->desc.windows * (size_t)f->frames, given = f->desc.path_count;
+    for (size_t i = 0; i < total; i++) {
+        f->path[i] = f->cameras[0];
+        memcpy(f->path[i].w2c, f->desc.path[(size_t)((2 * (uint64_t)i + 1) * given / (2 * total))].w2c, sizeof f->path[i].w2c);
+        f->reference_index[i] = -1;
+    }
+}
+
 static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
+    if (f->desc.path_count) {
+        gsf__spread_path(f);
+        return GSF_OK;
+    }
     gsf_traj_path_desc desc;
     gsf_traj_path_layout layout;
     memset(&desc, 0, sizeof desc);

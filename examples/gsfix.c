@@ -108,7 +108,9 @@ static const option_spec option_specs[] = {
     {"--set", TEXT, AT(settings), 0, 0, "NAME=VALUE,...", "fix",
      "override individual settings of the trainer and of the repair loop:"},
     {"--scene", TEXT, AT(scene), 0, 0, "SCENE", "render", "render the views of this scene"},
-    {"--path", TEXT, AT(path), 0, 0, "PATH.json", "render", "render the cameras in this file"},
+    {"--path", TEXT, AT(path), 0, 0, "PATH.json", "fix render",
+     "fix: repair frames at the cameras in this file, in every round, instead of on the path of --trajectory;\n"
+     "render: render the cameras in this file"},
     {"--depth", FLAG, AT(depth), 0, 0, NULL, "render",
      "also write OUT/depth/NAME.npy (float32, scene units) and a colour-mapped image of it"},
     {"--alpha", FLAG, AT(alpha), 0, 0, NULL, "render", "also write OUT/alpha/NAME.png"},

@@ -142,6 +142,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     if (!code) code = gsfix_background(app, train->background, &train->background_random);
     if (code) return code;
     if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // set to 0
+    if (app->o.path && app->o.trajectory) return gsfix_misused(app, "--path and --trajectory exclude each other");
     if (app->o.compare && !has_restorer(app)) return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     return gsfix_check_restorer(app);
 }
@@ -158,6 +159,8 @@ typedef struct fix_run {
     gsf_scene scene;
     gsfix_split split;
     gsf_image* masks; // per test view, or NULL
+    gsf_camera* path; // of --path, or NULL
+    size_t path_count;
     gsf_splats initial;
     gsf_restorer restorer;
     int has_restorer;
@@ -396,7 +399,7 @@ static void write_switches(fix_run* run) {
     if (o->restorer && strncmp(o->restorer, "dit:", 4) == 0) write_dit_switches(run);
     gsfix_json_text(ctx, t, "regularize", o->regularize ? o->regularize : "on");
     gsfix_json_text(ctx, t, "compare", o->compare ? "on" : "off");
-    gsfix_json_text(ctx, t, "trajectory", kinds[used.fix.trajectory]);
+    gsfix_json_text(ctx, t, "trajectory", run->path ? "given" : kinds[used.fix.trajectory]);
     gsfix_json_text(ctx, t, "init", initial_kinds[used.initial.kind]);
     gsfix_json_text(ctx, t, "quality", gsfix_find_quality(o->quality)->name);
     gsfix_json_text(ctx, t, "gradient", train->render.gradient == GSF_GRADIENT_TRUE ? "true" : "official");
@@ -700,6 +703,8 @@ static gsf_result start_fixer(fix_run* run) {
     gsf_fix_desc desc = run->setup.fix;
     desc.points = run->scene.points; // they keep the path upright
     desc.point_count = run->scene.point_count;
+    desc.path = run->path;
+    desc.path_count = run->path_count;
     result = gsf_splat_make_fixer(ctx, &desc, views, n, &run->initial,
                                   run->has_restorer && !run->comparing ? &run->restorer : NULL, &run->fixer);
     gsf_free(ctx, views);
@@ -802,6 +807,9 @@ static gsf_result prepare(fix_run* run) {
             gsf_splat_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
     if (result == GSF_OK) result = load_photos(run);
     if (result == GSF_OK && app->o.masks) result = load_masks(run);
+    if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &run->path, &run->path_count);
+    if (result == GSF_OK && app->o.path && !run->path_count)
+        result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: no cameras", app->o.path);
     if (result == GSF_OK) result = gsfix_digest_input(app, app->o.ref_features);
     if (result == GSF_OK) result = make_initial(run);
     if (result == GSF_OK) result = start_fixer(run);
@@ -1180,6 +1188,7 @@ static void free_run(fix_run* run) {
     gsf_splat_destroy(ctx, &run->initial);
     for (size_t i = 0; run->masks && i < run->split.test_count; i++) gsf_destroy_image(ctx, run->masks + i);
     gsf_free(ctx, run->masks);
+    gsf_free(ctx, run->path);
     gsfix_free_split(run->app, &run->split);
     gsf_splat_destroy_scene(ctx, &run->scene);
     gsf_destroy_text(ctx, &run->switches);

@@ -626,6 +626,52 @@ static void test_rigs(gsf_context* ctx) {
     }
 }
 
+// A given path is flown in every round: its poses in order, spread over the frames, through the first photo's camera.
+static void test_given_path(gsf_context* ctx) {
+    static const size_t counts[] = {1, 5, 18, 40}; // of 18 frames
+    static repair r;
+    gsf_camera path[40];
+    repair_setup(ctx, &r);
+    gsf_fix_desc desc = repair_desc();
+    desc.train.iterations = 24;
+    desc.path = path;
+    for (int i = 0; i < 40; i++) {
+        path[i] = around(0.03 * i - 0.6, 0.1);
+        path[i].width /= 2; // not what frames have
+    }
+    for (size_t k = 0; k < sizeof counts / sizeof *counts; k++) {
+        desc.path_count = counts[k];
+        gsf_fixer* fixer = NULL;
+        gsf_fix_stats now;
+        memset(&now, 0, sizeof now);
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer));
+        size_t frames = 0, last = 0, jumps = 0, wrong = 0;
+        while (fixer && now.stage != GSF_FIX_DONE) {
+            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &now))) break;
+            for (int i = 0; i < (now.stage == GSF_FIX_RESTORE ? now.frame_count : 0); i++, frames++) {
+                const gsf_camera* camera = now.cameras + i;
+                size_t at = 0;
+                while (at < counts[k] && memcmp(path[at].w2c, camera->w2c, sizeof camera->w2c) != 0) at++;
+                wrong += at == counts[k] || now.reference_index[i] != -1 || camera->width != WIDTH ||
+                         camera->fx != r.views[0].camera.fx;
+                if (frames % 18 == 0) last = at; // a round begins
+                wrong += at < last;
+                jumps += at != last;
+                last = at;
+            }
+        }
+        CHECK(frames == 2 * 18 && wrong == 0);
+        CHECK(jumps == 2 * ((counts[k] < 18 ? counts[k] : 18) - 1));
+        gsf_splat_destroy_fixer(ctx, fixer);
+    }
+    gsf_fixer* fixer = NULL;
+    path[3].fx = -1.0;
+    CHECK(gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer) != GSF_OK && !fixer);
+    desc.path = NULL;
+    CHECK(gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer) == GSF_ERROR_INVALID_ARGUMENT);
+    repair_teardown(ctx, &r);
+}
+
 static void test_native_frames(gsf_context* ctx) {
     static repair r;
     gsf_fixer* fixer;
@@ -908,6 +954,7 @@ int main(void) {
     test_mixed_windows(&ctx);
     test_loop(&ctx);
     test_rigs(&ctx);
+    test_given_path(&ctx);
     test_native_frames(&ctx);
     test_trouble(&ctx);
     test_failed_restore();

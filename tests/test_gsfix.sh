@@ -116,6 +116,15 @@ done
 for trajectory in reference ellipse interpolate; do
     expect 0 "$gsfix" fix "$scene" --out d --restart "${small[@]}" --restorer warp --trajectory $trajectory --quality exact
 done
+expect 0 "$gsfix" path "$scene" --views 3 --max-size 48 --kind ellipse --frames 7 --out given.json
+expect 0 "$gsfix" fix "$scene" --out given "${small[@]}" --restorer warp --path given.json --quality exact
+holds '"trajectory":"given"' given/metrics.json
+[ "$(ls given/fixed | wc -l)" = 4 ] || fail "not the frames of a given path"
+cmp -s given/splats.ply d/splats.ply && fail "--path changes nothing"
+expect 2 "$gsfix" fix "$scene" --out given "${small[@]}" --restorer warp --path given.json --trajectory ellipse
+echo '{"cameras":[]}' > none.json
+expect 1 "$gsfix" fix "$scene" --out given2 "${small[@]}" --restorer warp --path none.json
+holds "no cameras" stderr
 expect 0 "$gsfix" fix "$scene" --out e --views 3 --iterations 5 --max-size 48 --regularize off
 [ ! -e e/fixed ] || fail "frames without a restorer"
 
