@@ -41,7 +41,7 @@
    MEMORY      All memory comes from the context's allocator. Who made an object destroys it with the same context.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a chunk grid that depends
                on sizes only, so results do not depend on the number of workers.
-   SECTIONS    >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images >>resize >>metrics
+   SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images >>resize >>metrics
                >>cameras >>clips >>glm >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
@@ -902,6 +902,484 @@ GSF__SHARED gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, 
 GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
     return ctx->io.read_fn == ctx->services->read_fn || ctx->io.plain_files;
 }
+
+// ---- >>lanes: the vector vocabulary --------------------------------------------
+
+/* A kernel that treats many values alike is written once, over the names below, and compiled once per instruction set:
+   the header that holds it includes itself, with the kernel's part selected and GSF__ISA set to scalar, avx2 or avx512.
+   Each copy is ordinary code at its own lines, so that a debugger steps through it. In a module:
+
+       #ifndef GSF__ISA                         // plain code, read once
+       ...
+       #define GSF__KERNELS "gsfixer_x.h"       // where the kernels are
+       #define GSF__KERNELS_BLUR                // which of them
+       #define GSF__KERNELS_AVX512              // only if a 16-lane copy is wanted besides the scalar and the AVX2 one
+       #include "gsfixer.h"                     // includes gsfixer_x.h once per instruction set
+       #undef GSF__KERNELS_BLUR
+       #endif
+       #ifdef GSF__KERNELS_BLUR                 // the kernels: gsf__blur_scalar, gsf__blur_avx2, gsf__blur_avx512
+       GSF__V_KERNEL void GSF__V(gsf__blur)(const float* x, size_t n, float* y) {
+           for (size_t i = 0; i < n; i += GSF__LANES) {
+               const gsf__vf v = gsf__v_load_first(x + i, n - i);
+               gsf__v_store_first(y + i, gsf__v_madd(v, gsf__v_set(0.5f), v), n - i);
+           }
+       }
+       #endif
+
+   Types       gsf__vf  GSF__LANES floats      gsf__vi  as many int32_t        gsf__vm  mask: a truth value per lane
+               gsf__vd  doubles, GSF__LANES / GSF__HALVES of them (one at one lane)
+   Names       gsf__v_ works on floats, gsf__vi_, gsf__vm_ and gsf__vd_ on the others. + - * / work on gsf__vf and gsf__vd:
+               they are floats and doubles themselves or vectors for which the compiler defines operators (GCC and Clang;
+               a compiler that does not would have them as C++ overloads). Nothing else relies on vector extensions.
+   madd        a * b + c; msub a * b - c; nmadd c - a * b: rounded once where the instruction set can, twice at one lane.
+   min, max    b where either is a NaN: max(limit, x) keeps a NaN, max(x, limit) replaces it.
+   _first      only the first n lanes (all if n >= GSF__LANES) are read or written; the others are 0.
+   sum         v[i] + v[i + n / 2] until one is left: ((0+4)+(2+6)) + ((1+5)+(3+7)) of eight lanes.
+
+   An instruction set is added by defining all of it with a new suffix and one more inclusion at the end of this file. */
+
+#define GSF__PASTE_(a, b) a##_##b
+#define GSF__PASTE(a, b) GSF__PASTE_(a, b)
+#define GSF__V(name) GSF__PASTE(name, GSF__ISA) // `name` as the instruction set that is being compiled has it
+#define GSF__V_KERNEL GSF__V(GSF__V_KERNEL) static // begins the definition of a kernel ...
+#define GSF__V_INLINE GSF__V(GSF__V_INLINE) // ... and of a function that is part of the kernels which call it
+#define GSF__LANES GSF__V(GSF__LANES)
+#define GSF__HALVES GSF__V(GSF__HALVES)
+
+#define gsf__vf GSF__V(gsf__vf)
+#define gsf__vi GSF__V(gsf__vi)
+#define gsf__vm GSF__V(gsf__vm)
+#define gsf__vd GSF__V(gsf__vd)
+
+#define gsf__v_set GSF__V(gsf__v_set)
+#define gsf__v_load GSF__V(gsf__v_load)
+#define gsf__v_store GSF__V(gsf__v_store)
+#define gsf__v_load_first GSF__V(gsf__v_load_first)
+#define gsf__v_store_first GSF__V(gsf__v_store_first)
+#define gsf__v_load_bytes GSF__V(gsf__v_load_bytes) // the first n of uint8_t
+#define gsf__v_gather GSF__V(gsf__v_gather)         // p[i]
+#define gsf__v_madd GSF__V(gsf__v_madd)
+#define gsf__v_msub GSF__V(gsf__v_msub)
+#define gsf__v_nmadd GSF__V(gsf__v_nmadd)
+#define gsf__v_sqrt GSF__V(gsf__v_sqrt)
+#define gsf__v_abs GSF__V(gsf__v_abs)
+#define gsf__v_with_sign GSF__V(gsf__v_with_sign)   // x, its sign flipped where that of `of` is set
+#define gsf__v_min GSF__V(gsf__v_min)
+#define gsf__v_max GSF__V(gsf__v_max)
+#define gsf__v_round GSF__V(gsf__v_round)           // to the nearest integer, ties to even
+#define gsf__v_floor GSF__V(gsf__v_floor)
+#define gsf__v_ceil GSF__V(gsf__v_ceil)
+#define gsf__v_eq GSF__V(gsf__v_eq)                 // comparisons are false where either is a NaN
+#define gsf__v_lt GSF__V(gsf__v_lt)
+#define gsf__v_le GSF__V(gsf__v_le)
+#define gsf__v_gt GSF__V(gsf__v_gt)
+#define gsf__v_ge GSF__V(gsf__v_ge)
+#define gsf__v_select GSF__V(gsf__v_select)         // mask ? yes : no
+#define gsf__v_keep GSF__V(gsf__v_keep)             // mask ? x : 0
+#define gsf__v_sum GSF__V(gsf__v_sum)
+#define gsf__v_largest GSF__V(gsf__v_largest)       // over the lanes, none of which is a NaN
+#define gsf__v_transpose GSF__V(gsf__v_transpose)   // GSF__LANES vectors, in place
+#define gsf__v_pin GSF__V(gsf__v_pin)               // a constant that stays in a register, else loops load it each time
+#define gsf__v_bits GSF__V(gsf__v_bits)             // bit patterns of floats
+#define gsf__v_to_int GSF__V(gsf__v_to_int)         // rounded as gsf__v_round
+#define gsf__v_truncate GSF__V(gsf__v_truncate)
+
+#define gsf__vi_set GSF__V(gsf__vi_set)
+#define gsf__vi_index GSF__V(gsf__vi_index)         // 0 1 2 ...
+#define gsf__vi_load GSF__V(gsf__vi_load)
+#define gsf__vi_store GSF__V(gsf__vi_store)
+#define gsf__vi_add GSF__V(gsf__vi_add)
+#define gsf__vi_sub GSF__V(gsf__vi_sub)
+#define gsf__vi_mul GSF__V(gsf__vi_mul)
+#define gsf__vi_min GSF__V(gsf__vi_min)
+#define gsf__vi_shl GSF__V(gsf__vi_shl)             // by the same constant in all lanes
+#define gsf__vi_sar GSF__V(gsf__vi_sar)             // arithmetic
+#define gsf__vi_keep GSF__V(gsf__vi_keep)
+#define gsf__vi_floats GSF__V(gsf__vi_floats)       // converted
+#define gsf__vi_as_floats GSF__V(gsf__vi_as_floats) // the inverse of gsf__v_bits
+
+#define gsf__vm_first GSF__V(gsf__vm_first)         // the first n lanes
+#define gsf__vm_of_bits GSF__V(gsf__vm_of_bits)     // lane i: bit i
+#define gsf__vm_bits GSF__V(gsf__vm_bits)
+#define gsf__vm_and GSF__V(gsf__vm_and)
+#define gsf__vm_or GSF__V(gsf__vm_or)
+#define gsf__vm_not GSF__V(gsf__vm_not)
+
+#define gsf__vd_set GSF__V(gsf__vd_set)
+#define gsf__vd_half GSF__V(gsf__vd_half)           // half h < GSF__HALVES of the floats of v
+#define gsf__vd_floats GSF__V(gsf__vd_floats)       // GSF__HALVES halves, rounded
+#define gsf__vd_madd GSF__V(gsf__vd_madd)
+#define gsf__vd_sqrt GSF__V(gsf__vd_sqrt)
+#define gsf__vd_max GSF__V(gsf__vd_max)
+#define gsf__vd_keep_above GSF__V(gsf__vd_keep_above) // a > limit ? x : 0
+#define gsf__vd_add_folded GSF__V(gsf__vd_add_folded) // sum + v, whose halves are added to each other as floats before
+#define gsf__vd_sum GSF__V(gsf__vd_sum)
+
+// One lane.
+
+#define GSF__LANES_scalar 1
+#define GSF__HALVES_scalar 1
+#define GSF__V_KERNEL_scalar
+#define GSF__V_INLINE_scalar GSF__SHARED inline
+
+typedef float gsf__vf_scalar;
+typedef int32_t gsf__vi_scalar;
+typedef int gsf__vm_scalar;
+typedef double gsf__vd_scalar;
+
+GSF__SHARED inline float gsf__v_set_scalar(float x) { return x; }
+GSF__SHARED inline float gsf__v_load_scalar(const float* p) { return *p; }
+GSF__SHARED inline void gsf__v_store_scalar(float* p, float x) { *p = x; }
+GSF__SHARED inline float gsf__v_load_first_scalar(const float* p, size_t n) { return n ? *p : 0.0f; }
+GSF__SHARED inline void gsf__v_store_first_scalar(float* p, float x, size_t n) { if (n) *p = x; }
+GSF__SHARED inline float gsf__v_load_bytes_scalar(const uint8_t* p, size_t n) { return n ? (float)*p : 0.0f; }
+GSF__SHARED inline float gsf__v_gather_scalar(const float* p, int32_t i) { return p[i]; }
+GSF__SHARED inline float gsf__v_madd_scalar(float a, float b, float c) { return a * b + c; }
+GSF__SHARED inline float gsf__v_msub_scalar(float a, float b, float c) { return a * b - c; }
+GSF__SHARED inline float gsf__v_nmadd_scalar(float a, float b, float c) { return c - a * b; }
+GSF__SHARED inline float gsf__v_sqrt_scalar(float x) { return sqrtf(x); }
+GSF__SHARED inline float gsf__v_abs_scalar(float x) { return fabsf(x); }
+GSF__SHARED inline float gsf__v_with_sign_scalar(float x, float of) { return signbit(of) ? -x : x; }
+GSF__SHARED inline float gsf__v_min_scalar(float a, float b) { return a < b ? a : b; }
+GSF__SHARED inline float gsf__v_max_scalar(float a, float b) { return a > b ? a : b; }
+GSF__SHARED inline float gsf__v_round_scalar(float x) { return rintf(x); }
+GSF__SHARED inline float gsf__v_floor_scalar(float x) { return floorf(x); }
+GSF__SHARED inline float gsf__v_ceil_scalar(float x) { return ceilf(x); }
+GSF__SHARED inline int gsf__v_eq_scalar(float a, float b) { return a == b; }
+GSF__SHARED inline int gsf__v_lt_scalar(float a, float b) { return a < b; }
+GSF__SHARED inline int gsf__v_le_scalar(float a, float b) { return a <= b; }
+GSF__SHARED inline int gsf__v_gt_scalar(float a, float b) { return a > b; }
+GSF__SHARED inline int gsf__v_ge_scalar(float a, float b) { return a >= b; }
+GSF__SHARED inline float gsf__v_select_scalar(int mask, float yes, float no) { return mask ? yes : no; }
+GSF__SHARED inline float gsf__v_keep_scalar(int mask, float x) { return mask ? x : 0.0f; }
+GSF__SHARED inline float gsf__v_sum_scalar(float x) { return x; }
+GSF__SHARED inline float gsf__v_largest_scalar(float x) { return x; }
+GSF__SHARED inline void gsf__v_transpose_scalar(float* m) { (void)m; }
+GSF__SHARED inline void gsf__v_pin_scalar(float* v) { (void)v; }
+GSF__SHARED inline int32_t gsf__v_bits_scalar(float x) {
+    int32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return bits;
+}
+GSF__SHARED inline int32_t gsf__v_to_int_scalar(float x) { return (int32_t)rintf(x); }
+GSF__SHARED inline int32_t gsf__v_truncate_scalar(float x) { return (int32_t)x; }
+
+GSF__SHARED inline int32_t gsf__vi_set_scalar(int32_t x) { return x; }
+GSF__SHARED inline int32_t gsf__vi_index_scalar(void) { return 0; }
+GSF__SHARED inline int32_t gsf__vi_load_scalar(const int32_t* p) { return *p; }
+GSF__SHARED inline void gsf__vi_store_scalar(int32_t* p, int32_t x) { *p = x; }
+GSF__SHARED inline int32_t gsf__vi_add_scalar(int32_t a, int32_t b) { return (int32_t)((uint32_t)a + (uint32_t)b); }
+GSF__SHARED inline int32_t gsf__vi_sub_scalar(int32_t a, int32_t b) { return (int32_t)((uint32_t)a - (uint32_t)b); }
+GSF__SHARED inline int32_t gsf__vi_mul_scalar(int32_t a, int32_t b) { return (int32_t)((uint32_t)a * (uint32_t)b); }
+GSF__SHARED inline int32_t gsf__vi_min_scalar(int32_t a, int32_t b) { return a < b ? a : b; }
+GSF__SHARED inline int32_t gsf__vi_shl_scalar(int32_t x, int by) { return (int32_t)((uint32_t)x << by); }
+GSF__SHARED inline int32_t gsf__vi_sar_scalar(int32_t x, int by) { return x >> by; }
+GSF__SHARED inline int32_t gsf__vi_keep_scalar(int mask, int32_t x) { return mask ? x : 0; }
+GSF__SHARED inline float gsf__vi_floats_scalar(int32_t x) { return (float)x; }
+GSF__SHARED inline float gsf__vi_as_floats_scalar(int32_t bits) {
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
+GSF__SHARED inline int gsf__vm_first_scalar(size_t n) { return n > 0; }
+GSF__SHARED inline int gsf__vm_of_bits_scalar(uint32_t bits) { return (int)(bits & 1u); }
+GSF__SHARED inline uint32_t gsf__vm_bits_scalar(int mask) { return (uint32_t)mask; }
+GSF__SHARED inline int gsf__vm_and_scalar(int a, int b) { return a & b; }
+GSF__SHARED inline int gsf__vm_or_scalar(int a, int b) { return a | b; }
+GSF__SHARED inline int gsf__vm_not_scalar(int mask) { return !mask; }
+
+GSF__SHARED inline double gsf__vd_set_scalar(double x) { return x; }
+GSF__SHARED inline double gsf__vd_half_scalar(float v, int h) { return h ? 0.0 : (double)v; }
+GSF__SHARED inline float gsf__vd_floats_scalar(const double* halves) { return (float)*halves; }
+GSF__SHARED inline double gsf__vd_madd_scalar(double a, double b, double c) { return a * b + c; }
+GSF__SHARED inline double gsf__vd_sqrt_scalar(double x) { return sqrt(x); }
+GSF__SHARED inline double gsf__vd_max_scalar(double a, double b) { return a > b ? a : b; }
+GSF__SHARED inline double gsf__vd_keep_above_scalar(double a, double limit, double x) { return a > limit ? x : 0.0; }
+GSF__SHARED inline double gsf__vd_add_folded_scalar(double sum, float v) { return sum + (double)v; }
+GSF__SHARED inline double gsf__vd_sum_scalar(double x) { return x; }
+
+#if GSF__X86
+
+// Eight lanes.
+
+#define GSF__LANES_avx2 8
+#define GSF__HALVES_avx2 2
+#define GSF__V_KERNEL_avx2 GSF__TARGET_AVX2
+#define GSF__V_INLINE_avx2 GSF__INLINE_AVX2
+
+typedef __m256 gsf__vf_avx2;
+typedef __m256i gsf__vi_avx2;
+typedef __m256 gsf__vm_avx2; // all bits of a lane or none
+typedef __m256d gsf__vd_avx2;
+
+GSF__INLINE_AVX2 __m256i gsf__vi_set_avx2(int32_t x) { return _mm256_set1_epi32(x); }
+GSF__INLINE_AVX2 __m256i gsf__vi_index_avx2(void) { return _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7); }
+GSF__INLINE_AVX2 __m256i gsf__vi_load_avx2(const int32_t* p) { return _mm256_loadu_si256((const __m256i*)(const void*)p); }
+GSF__INLINE_AVX2 void gsf__vi_store_avx2(int32_t* p, __m256i x) { _mm256_storeu_si256((__m256i*)(void*)p, x); }
+GSF__INLINE_AVX2 __m256i gsf__vi_add_avx2(__m256i a, __m256i b) { return _mm256_add_epi32(a, b); }
+GSF__INLINE_AVX2 __m256i gsf__vi_sub_avx2(__m256i a, __m256i b) { return _mm256_sub_epi32(a, b); }
+GSF__INLINE_AVX2 __m256i gsf__vi_mul_avx2(__m256i a, __m256i b) { return _mm256_mullo_epi32(a, b); }
+GSF__INLINE_AVX2 __m256i gsf__vi_min_avx2(__m256i a, __m256i b) { return _mm256_min_epi32(a, b); }
+GSF__INLINE_AVX2 __m256i gsf__vi_shl_avx2(__m256i x, int by) { return _mm256_slli_epi32(x, by); }
+GSF__INLINE_AVX2 __m256i gsf__vi_sar_avx2(__m256i x, int by) { return _mm256_srai_epi32(x, by); }
+GSF__INLINE_AVX2 __m256i gsf__vi_keep_avx2(__m256 mask, __m256i x) {
+    return _mm256_and_si256(_mm256_castps_si256(mask), x);
+}
+GSF__INLINE_AVX2 __m256 gsf__vi_floats_avx2(__m256i x) { return _mm256_cvtepi32_ps(x); }
+GSF__INLINE_AVX2 __m256 gsf__vi_as_floats_avx2(__m256i bits) { return _mm256_castsi256_ps(bits); }
+
+GSF__INLINE_AVX2 __m256 gsf__vm_first_avx2(size_t n) {
+    return _mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32(n < 8 ? (int)n : 8), gsf__vi_index_avx2()));
+}
+GSF__INLINE_AVX2 __m256 gsf__vm_of_bits_avx2(uint32_t bits) {
+    const __m256i bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+    return _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(_mm256_set1_epi32((int)bits), bit), bit));
+}
+GSF__INLINE_AVX2 uint32_t gsf__vm_bits_avx2(__m256 mask) { return (uint32_t)_mm256_movemask_ps(mask); }
+GSF__INLINE_AVX2 __m256 gsf__vm_and_avx2(__m256 a, __m256 b) { return _mm256_and_ps(a, b); }
+GSF__INLINE_AVX2 __m256 gsf__vm_or_avx2(__m256 a, __m256 b) { return _mm256_or_ps(a, b); }
+GSF__INLINE_AVX2 __m256 gsf__vm_not_avx2(__m256 mask) {
+    return _mm256_xor_ps(mask, _mm256_castsi256_ps(_mm256_set1_epi32(-1)));
+}
+
+GSF__INLINE_AVX2 __m256 gsf__v_set_avx2(float x) { return _mm256_set1_ps(x); }
+GSF__INLINE_AVX2 __m256 gsf__v_load_avx2(const float* p) { return _mm256_loadu_ps(p); }
+GSF__INLINE_AVX2 void gsf__v_store_avx2(float* p, __m256 x) { _mm256_storeu_ps(p, x); }
+GSF__INLINE_AVX2 __m256 gsf__v_load_first_avx2(const float* p, size_t n) {
+    return n >= 8 ? _mm256_loadu_ps(p) : _mm256_maskload_ps(p, _mm256_castps_si256(gsf__vm_first_avx2(n)));
+}
+GSF__INLINE_AVX2 void gsf__v_store_first_avx2(float* p, __m256 x, size_t n) { // a masked store takes several times as long
+    if (n >= 8) _mm256_storeu_ps(p, x);
+    else _mm256_maskstore_ps(p, _mm256_castps_si256(gsf__vm_first_avx2(n)), x);
+}
+GSF__INLINE_AVX2 __m256 gsf__v_load_bytes_avx2(const uint8_t* p, size_t n) {
+    uint64_t bytes = 0;
+    if (n >= 8) memcpy(&bytes, p, 8);
+    else memcpy(&bytes, p, n);
+    return _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes)));
+}
+GSF__INLINE_AVX2 __m256 gsf__v_gather_avx2(const float* p, __m256i i) { return _mm256_i32gather_ps(p, i, 4); }
+GSF__INLINE_AVX2 __m256 gsf__v_madd_avx2(__m256 a, __m256 b, __m256 c) { return _mm256_fmadd_ps(a, b, c); }
+GSF__INLINE_AVX2 __m256 gsf__v_msub_avx2(__m256 a, __m256 b, __m256 c) { return _mm256_fmsub_ps(a, b, c); }
+GSF__INLINE_AVX2 __m256 gsf__v_nmadd_avx2(__m256 a, __m256 b, __m256 c) { return _mm256_fnmadd_ps(a, b, c); }
+GSF__INLINE_AVX2 __m256 gsf__v_sqrt_avx2(__m256 x) { return _mm256_sqrt_ps(x); }
+GSF__INLINE_AVX2 __m256 gsf__v_abs_avx2(__m256 x) { return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), x); }
+GSF__INLINE_AVX2 __m256 gsf__v_with_sign_avx2(__m256 x, __m256 of) {
+    return _mm256_xor_ps(x, _mm256_and_ps(of, _mm256_set1_ps(-0.0f)));
+}
+GSF__INLINE_AVX2 __m256 gsf__v_min_avx2(__m256 a, __m256 b) { return _mm256_min_ps(a, b); }
+GSF__INLINE_AVX2 __m256 gsf__v_max_avx2(__m256 a, __m256 b) { return _mm256_max_ps(a, b); }
+GSF__INLINE_AVX2 __m256 gsf__v_round_avx2(__m256 x) {
+    return _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+}
+GSF__INLINE_AVX2 __m256 gsf__v_floor_avx2(__m256 x) { return _mm256_floor_ps(x); }
+GSF__INLINE_AVX2 __m256 gsf__v_ceil_avx2(__m256 x) { return _mm256_ceil_ps(x); }
+GSF__INLINE_AVX2 __m256 gsf__v_eq_avx2(__m256 a, __m256 b) { return _mm256_cmp_ps(a, b, _CMP_EQ_OQ); }
+GSF__INLINE_AVX2 __m256 gsf__v_lt_avx2(__m256 a, __m256 b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
+GSF__INLINE_AVX2 __m256 gsf__v_le_avx2(__m256 a, __m256 b) { return _mm256_cmp_ps(a, b, _CMP_LE_OQ); }
+GSF__INLINE_AVX2 __m256 gsf__v_gt_avx2(__m256 a, __m256 b) { return _mm256_cmp_ps(a, b, _CMP_GT_OQ); }
+GSF__INLINE_AVX2 __m256 gsf__v_ge_avx2(__m256 a, __m256 b) { return _mm256_cmp_ps(a, b, _CMP_GE_OQ); }
+GSF__INLINE_AVX2 __m256 gsf__v_select_avx2(__m256 mask, __m256 yes, __m256 no) { return _mm256_blendv_ps(no, yes, mask); }
+GSF__INLINE_AVX2 __m256 gsf__v_keep_avx2(__m256 mask, __m256 x) { return _mm256_and_ps(mask, x); }
+GSF__INLINE_AVX2 float gsf__v_sum_avx2(__m256 v) {
+    __m128 s = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    s = _mm_add_ps(s, _mm_movehl_ps(s, s));
+    return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
+}
+GSF__INLINE_AVX2 float gsf__v_largest_avx2(__m256 v) {
+    __m128 s = _mm_max_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    s = _mm_max_ps(s, _mm_movehl_ps(s, s));
+    return _mm_cvtss_f32(_mm_max_ss(s, _mm_movehdup_ps(s)));
+}
+GSF__INLINE_AVX2 void gsf__v_transpose_avx2(__m256 m[8]) {
+    const __m256 a0 = _mm256_unpacklo_ps(m[0], m[1]), a1 = _mm256_unpackhi_ps(m[0], m[1]);
+    const __m256 a2 = _mm256_unpacklo_ps(m[2], m[3]), a3 = _mm256_unpackhi_ps(m[2], m[3]);
+    const __m256 a4 = _mm256_unpacklo_ps(m[4], m[5]), a5 = _mm256_unpackhi_ps(m[4], m[5]);
+    const __m256 a6 = _mm256_unpacklo_ps(m[6], m[7]), a7 = _mm256_unpackhi_ps(m[6], m[7]);
+    const __m256 b0 = _mm256_shuffle_ps(a0, a2, 0x44), b4 = _mm256_shuffle_ps(a4, a6, 0x44);
+    const __m256 b1 = _mm256_shuffle_ps(a0, a2, 0xee), b5 = _mm256_shuffle_ps(a4, a6, 0xee);
+    const __m256 b2 = _mm256_shuffle_ps(a1, a3, 0x44), b6 = _mm256_shuffle_ps(a5, a7, 0x44);
+    const __m256 b3 = _mm256_shuffle_ps(a1, a3, 0xee), b7 = _mm256_shuffle_ps(a5, a7, 0xee);
+    m[0] = _mm256_permute2f128_ps(b0, b4, 0x20);
+    m[1] = _mm256_permute2f128_ps(b1, b5, 0x20);
+    m[2] = _mm256_permute2f128_ps(b2, b6, 0x20);
+    m[3] = _mm256_permute2f128_ps(b3, b7, 0x20);
+    m[4] = _mm256_permute2f128_ps(b0, b4, 0x31);
+    m[5] = _mm256_permute2f128_ps(b1, b5, 0x31);
+    m[6] = _mm256_permute2f128_ps(b2, b6, 0x31);
+    m[7] = _mm256_permute2f128_ps(b3, b7, 0x31);
+}
+GSF__INLINE_AVX2 void gsf__v_pin_avx2(__m256* v) { __asm__("" : "+x"(*v)); }
+GSF__INLINE_AVX2 __m256i gsf__v_bits_avx2(__m256 x) { return _mm256_castps_si256(x); }
+GSF__INLINE_AVX2 __m256i gsf__v_to_int_avx2(__m256 x) { return _mm256_cvtps_epi32(x); }
+GSF__INLINE_AVX2 __m256i gsf__v_truncate_avx2(__m256 x) { return _mm256_cvttps_epi32(x); }
+
+GSF__INLINE_AVX2 __m256d gsf__vd_set_avx2(double x) { return _mm256_set1_pd(x); }
+GSF__INLINE_AVX2 __m256d gsf__vd_half_avx2(__m256 v, int h) {
+    return _mm256_cvtps_pd(h ? _mm256_extractf128_ps(v, 1) : _mm256_castps256_ps128(v));
+}
+GSF__INLINE_AVX2 __m256 gsf__vd_floats_avx2(const __m256d halves[2]) {
+    return _mm256_set_m128(_mm256_cvtpd_ps(halves[1]), _mm256_cvtpd_ps(halves[0]));
+}
+GSF__INLINE_AVX2 __m256d gsf__vd_madd_avx2(__m256d a, __m256d b, __m256d c) { return _mm256_fmadd_pd(a, b, c); }
+GSF__INLINE_AVX2 __m256d gsf__vd_sqrt_avx2(__m256d x) { return _mm256_sqrt_pd(x); }
+GSF__INLINE_AVX2 __m256d gsf__vd_max_avx2(__m256d a, __m256d b) { return _mm256_max_pd(a, b); }
+GSF__INLINE_AVX2 __m256d gsf__vd_keep_above_avx2(__m256d a, __m256d limit, __m256d x) {
+    return _mm256_and_pd(x, _mm256_cmp_pd(a, limit, _CMP_GT_OQ));
+}
+GSF__INLINE_AVX2 __m256d gsf__vd_add_folded_avx2(__m256d sum, __m256 v) {
+    const __m128 pairs = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    return _mm256_add_pd(sum, _mm256_cvtps_pd(pairs));
+}
+GSF__INLINE_AVX2 double gsf__vd_sum_avx2(__m256d v) {
+    const __m128d s = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd(v, 1));
+    return _mm_cvtsd_f64(_mm_add_sd(s, _mm_unpackhi_pd(s, s)));
+}
+
+// Sixteen lanes.
+
+#define GSF__LANES_avx512 16
+#define GSF__HALVES_avx512 2
+#define GSF__V_KERNEL_avx512 GSF__TARGET_AVX512
+#define GSF__V_INLINE_avx512 GSF__INLINE_AVX512
+
+typedef __m512 gsf__vf_avx512;
+typedef __m512i gsf__vi_avx512;
+typedef __mmask16 gsf__vm_avx512;
+typedef __m512d gsf__vd_avx512;
+
+GSF__INLINE_AVX512 __m512i gsf__vi_set_avx512(int32_t x) { return _mm512_set1_epi32(x); }
+GSF__INLINE_AVX512 __m512i gsf__vi_index_avx512(void) {
+    return _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+}
+GSF__INLINE_AVX512 __m512i gsf__vi_load_avx512(const int32_t* p) { return _mm512_loadu_si512(p); }
+GSF__INLINE_AVX512 void gsf__vi_store_avx512(int32_t* p, __m512i x) { _mm512_storeu_si512(p, x); }
+GSF__INLINE_AVX512 __m512i gsf__vi_add_avx512(__m512i a, __m512i b) { return _mm512_add_epi32(a, b); }
+GSF__INLINE_AVX512 __m512i gsf__vi_sub_avx512(__m512i a, __m512i b) { return _mm512_sub_epi32(a, b); }
+GSF__INLINE_AVX512 __m512i gsf__vi_mul_avx512(__m512i a, __m512i b) { return _mm512_mullo_epi32(a, b); }
+GSF__INLINE_AVX512 __m512i gsf__vi_min_avx512(__m512i a, __m512i b) { return _mm512_min_epi32(a, b); }
+GSF__INLINE_AVX512 __m512i gsf__vi_shl_avx512(__m512i x, int by) { return _mm512_slli_epi32(x, (unsigned)by); }
+GSF__INLINE_AVX512 __m512i gsf__vi_sar_avx512(__m512i x, int by) { return _mm512_srai_epi32(x, (unsigned)by); }
+GSF__INLINE_AVX512 __m512i gsf__vi_keep_avx512(__mmask16 mask, __m512i x) { return _mm512_maskz_mov_epi32(mask, x); }
+GSF__INLINE_AVX512 __m512 gsf__vi_floats_avx512(__m512i x) { return _mm512_cvtepi32_ps(x); }
+GSF__INLINE_AVX512 __m512 gsf__vi_as_floats_avx512(__m512i bits) { return _mm512_castsi512_ps(bits); }
+
+GSF__INLINE_AVX512 __mmask16 gsf__vm_first_avx512(size_t n) { return (__mmask16)(n < 16 ? (1u << n) - 1u : 0xffffu); }
+GSF__INLINE_AVX512 __mmask16 gsf__vm_of_bits_avx512(uint32_t bits) { return (__mmask16)bits; }
+GSF__INLINE_AVX512 uint32_t gsf__vm_bits_avx512(__mmask16 mask) { return mask; }
+GSF__INLINE_AVX512 __mmask16 gsf__vm_and_avx512(__mmask16 a, __mmask16 b) { return (__mmask16)(a & b); }
+GSF__INLINE_AVX512 __mmask16 gsf__vm_or_avx512(__mmask16 a, __mmask16 b) { return (__mmask16)(a | b); }
+GSF__INLINE_AVX512 __mmask16 gsf__vm_not_avx512(__mmask16 mask) { return (__mmask16)~mask; }
+
+GSF__INLINE_AVX512 __m512 gsf__v_set_avx512(float x) { return _mm512_set1_ps(x); }
+GSF__INLINE_AVX512 __m512 gsf__v_load_avx512(const float* p) { return _mm512_loadu_ps(p); }
+GSF__INLINE_AVX512 void gsf__v_store_avx512(float* p, __m512 x) { _mm512_storeu_ps(p, x); }
+GSF__INLINE_AVX512 __m512 gsf__v_load_first_avx512(const float* p, size_t n) {
+    return n >= 16 ? _mm512_loadu_ps(p) : _mm512_maskz_loadu_ps(gsf__vm_first_avx512(n), p);
+}
+GSF__INLINE_AVX512 void gsf__v_store_first_avx512(float* p, __m512 x, size_t n) {
+    if (n >= 16) _mm512_storeu_ps(p, x);
+    else _mm512_mask_storeu_ps(p, gsf__vm_first_avx512(n), x);
+}
+GSF__INLINE_AVX512 __m512 gsf__v_load_bytes_avx512(const uint8_t* p, size_t n) {
+    return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_maskz_loadu_epi8(gsf__vm_first_avx512(n), p)));
+}
+GSF__INLINE_AVX512 __m512 gsf__v_madd_avx512(__m512 a, __m512 b, __m512 c) { return _mm512_fmadd_ps(a, b, c); }
+GSF__INLINE_AVX512 __m512 gsf__v_msub_avx512(__m512 a, __m512 b, __m512 c) { return _mm512_fmsub_ps(a, b, c); }
+GSF__INLINE_AVX512 __m512 gsf__v_nmadd_avx512(__m512 a, __m512 b, __m512 c) { return _mm512_fnmadd_ps(a, b, c); }
+GSF__INLINE_AVX512 __m512 gsf__v_sqrt_avx512(__m512 x) { return _mm512_sqrt_ps(x); }
+GSF__INLINE_AVX512 __m512 gsf__v_abs_avx512(__m512 x) { return _mm512_abs_ps(x); }
+GSF__INLINE_AVX512 __m512 gsf__v_with_sign_avx512(__m512 x, __m512 of) {
+    return _mm512_xor_ps(x, _mm512_and_ps(of, _mm512_set1_ps(-0.0f)));
+}
+GSF__INLINE_AVX512 __m512 gsf__v_min_avx512(__m512 a, __m512 b) { return _mm512_min_ps(a, b); }
+GSF__INLINE_AVX512 __m512 gsf__v_max_avx512(__m512 a, __m512 b) { return _mm512_max_ps(a, b); }
+GSF__INLINE_AVX512 __mmask16 gsf__v_eq_avx512(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_EQ_OQ); }
+GSF__INLINE_AVX512 __mmask16 gsf__v_lt_avx512(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+GSF__INLINE_AVX512 __mmask16 gsf__v_le_avx512(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+GSF__INLINE_AVX512 __mmask16 gsf__v_gt_avx512(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
+GSF__INLINE_AVX512 __mmask16 gsf__v_ge_avx512(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+GSF__INLINE_AVX512 __m512 gsf__v_select_avx512(__mmask16 mask, __m512 yes, __m512 no) {
+    return _mm512_mask_blend_ps(mask, no, yes);
+}
+GSF__INLINE_AVX512 __m512 gsf__v_keep_avx512(__mmask16 mask, __m512 x) { return _mm512_maskz_mov_ps(mask, x); }
+GSF__INLINE_AVX512 __m256 gsf__v_upper_avx512(__m512 v) { return _mm512_extractf32x8_ps(v, 1); }
+GSF__INLINE_AVX512 float gsf__v_sum_avx512(__m512 v) {
+    return gsf__v_sum_avx2(_mm256_add_ps(_mm512_castps512_ps256(v), gsf__v_upper_avx512(v)));
+}
+GSF__INLINE_AVX512 float gsf__v_largest_avx512(__m512 v) {
+    return gsf__v_largest_avx2(_mm256_max_ps(_mm512_castps512_ps256(v), gsf__v_upper_avx512(v)));
+}
+GSF__INLINE_AVX512 void gsf__v_transpose_avx512(__m512 m[16]) { // quarters of 8 x 8, of which two change places
+    __m256 quarter[4][8];
+    for (int i = 0; i < 8; i++) {
+        quarter[0][i] = _mm512_castps512_ps256(m[i]);
+        quarter[1][i] = gsf__v_upper_avx512(m[i]);
+        quarter[2][i] = _mm512_castps512_ps256(m[8 + i]);
+        quarter[3][i] = gsf__v_upper_avx512(m[8 + i]);
+    }
+    for (int q = 0; q < 4; q++) gsf__v_transpose_avx2(quarter[q]);
+    for (int i = 0; i < 8; i++) {
+        m[i] = _mm512_insertf32x8(_mm512_castps256_ps512(quarter[0][i]), quarter[2][i], 1);
+        m[8 + i] = _mm512_insertf32x8(_mm512_castps256_ps512(quarter[1][i]), quarter[3][i], 1);
+    }
+}
+#if !defined(__clang__) // gcc's headers have these as macros where it does not optimise, and then warn of their own masks
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wsign-conversion"
+#endif
+GSF__INLINE_AVX512 __m512 gsf__v_gather_avx512(const float* p, __m512i i) { return _mm512_i32gather_ps(i, p, 4); }
+GSF__INLINE_AVX512 __m512 gsf__v_round_avx512(__m512 x) {
+    return _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+}
+GSF__INLINE_AVX512 __m512 gsf__v_floor_avx512(__m512 x) {
+    return _mm512_roundscale_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
+}
+GSF__INLINE_AVX512 __m512 gsf__v_ceil_avx512(__m512 x) {
+    return _mm512_roundscale_ps(x, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC);
+}
+#if !defined(__clang__)
+#pragma GCC diagnostic pop
+#endif
+GSF__INLINE_AVX512 void gsf__v_pin_avx512(__m512* v) { __asm__("" : "+v"(*v)); }
+GSF__INLINE_AVX512 __m512i gsf__v_bits_avx512(__m512 x) { return _mm512_castps_si512(x); }
+GSF__INLINE_AVX512 __m512i gsf__v_to_int_avx512(__m512 x) { return _mm512_cvtps_epi32(x); }
+GSF__INLINE_AVX512 __m512i gsf__v_truncate_avx512(__m512 x) { return _mm512_cvttps_epi32(x); }
+
+GSF__INLINE_AVX512 __m512d gsf__vd_set_avx512(double x) { return _mm512_set1_pd(x); }
+GSF__INLINE_AVX512 __m512d gsf__vd_half_avx512(__m512 v, int h) {
+    return _mm512_cvtps_pd(h ? gsf__v_upper_avx512(v) : _mm512_castps512_ps256(v));
+}
+GSF__INLINE_AVX512 __m512 gsf__vd_floats_avx512(const __m512d halves[2]) {
+    return _mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps(halves[0])), _mm512_cvtpd_ps(halves[1]), 1);
+}
+GSF__INLINE_AVX512 __m512d gsf__vd_madd_avx512(__m512d a, __m512d b, __m512d c) { return _mm512_fmadd_pd(a, b, c); }
+GSF__INLINE_AVX512 __m512d gsf__vd_sqrt_avx512(__m512d x) { return _mm512_sqrt_pd(x); }
+GSF__INLINE_AVX512 __m512d gsf__vd_max_avx512(__m512d a, __m512d b) { return _mm512_max_pd(a, b); }
+GSF__INLINE_AVX512 __m512d gsf__vd_keep_above_avx512(__m512d a, __m512d limit, __m512d x) {
+    return _mm512_maskz_mov_pd(_mm512_cmp_pd_mask(a, limit, _CMP_GT_OQ), x);
+}
+GSF__INLINE_AVX512 __m512d gsf__vd_add_folded_avx512(__m512d sum, __m512 v) {
+    return _mm512_add_pd(sum, _mm512_cvtps_pd(_mm256_add_ps(_mm512_castps512_ps256(v), gsf__v_upper_avx512(v))));
+}
+GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
+    return gsf__vd_sum_avx2(_mm256_add_pd(_mm512_castpd512_pd256(v), _mm512_extractf64x4_pd(v, 1)));
+}
+
+#endif // GSF__X86
+
+// What follows from the vocabulary: powers. At one lane, where nothing is fused, they are libm's.
+
+#define gsf__v_exp2_terms GSF__V(gsf__v_exp2_terms)
+#define gsf__v_exp2_of GSF__V(gsf__v_exp2_of)
+#define gsf__v_exp2_low GSF__V(gsf__v_exp2_low)
+#define gsf__v_power GSF__V(gsf__v_power)
+#define gsf__v_exp2 GSF__V(gsf__v_exp2)
+#define gsf__v_exp GSF__V(gsf__v_exp)
+
+GSF__SHARED inline float gsf__v_exp2_scalar(float x) { return exp2f(x); }
+GSF__SHARED inline float gsf__v_exp_scalar(float x) { return expf(x); }
 
 GSF__END_IMPLEMENTATION
 
@@ -4058,3 +4536,110 @@ GSF__END_IMPLEMENTATION
 
 #endif // GSF_BASE_IMPLEMENTED
 #endif // GSFIXER_BASE_IMPLEMENTATION
+
+// ---- >>lanes: what is compiled per instruction set ------------------------------
+
+#ifdef GSF_INTERNALS_INCLUDED
+
+#ifdef GSF__KERNELS_POWERS
+#if GSF__LANES > 1
+
+// Constants of 2^x. Loops that hold them in registers, where they would rather be read again and again, pin them.
+typedef struct gsf__v_exp2_terms { gsf__vf lowest, rounder, c[7]; } gsf__v_exp2_terms;
+
+// The rounder, added to a number of [-126, 129], leaves the nearest integer n in the low bits as n + 126, which shifted by
+// 23 are the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial (that of Cephes' exp2f) therefore gives
+// 2 * 2^f, and all finite powers come out of one multiplication.
+GSF__V_INLINE gsf__v_exp2_terms gsf__v_exp2_of(int pinned) {
+    gsf__v_exp2_terms t;
+    t.lowest = gsf__v_set(-126.0f);
+    t.rounder = gsf__v_set(12583038.0f);
+    t.c[0] = gsf__v_set(2.0f);
+    t.c[1] = gsf__v_set(2.0f * 6.931472028550421e-1f);
+    t.c[2] = gsf__v_set(2.0f * 2.402264791363012e-1f);
+    t.c[3] = gsf__v_set(2.0f * 5.550332471162809e-2f);
+    t.c[4] = gsf__v_set(2.0f * 9.618437357674640e-3f);
+    t.c[5] = gsf__v_set(2.0f * 1.339887440266574e-3f);
+    t.c[6] = gsf__v_set(2.0f * 1.535336188319500e-4f);
+    if (pinned) {
+        gsf__v_pin(&t.lowest);
+        gsf__v_pin(&t.rounder);
+        gsf__v_pin(&t.c[0]);
+        gsf__v_pin(&t.c[1]);
+        gsf__v_pin(&t.c[2]);
+        gsf__v_pin(&t.c[3]);
+        gsf__v_pin(&t.c[4]);
+        gsf__v_pin(&t.c[5]);
+        gsf__v_pin(&t.c[6]);
+    }
+    return t;
+}
+
+// 2^(n + f) for rounded = n + rounder, |f| <= 1/2.
+GSF__V_INLINE gsf__vf gsf__v_power(const gsf__v_exp2_terms* t, gsf__vf rounded, gsf__vf f) {
+    gsf__vf p = gsf__v_madd(t->c[6], f, t->c[5]);
+    p = gsf__v_madd(p, f, t->c[4]);
+    p = gsf__v_madd(p, f, t->c[3]);
+    p = gsf__v_madd(p, f, t->c[2]);
+    p = gsf__v_madd(p, f, t->c[1]);
+    p = gsf__v_madd(p, f, t->c[0]);
+    return p * gsf__vi_as_floats(gsf__vi_shl(gsf__v_bits(rounded), 23));
+}
+
+// 2^x for x <= 129 or NaN: relative error below 2e-7, 2^0 = 1, results below 2^-125.5 (1.7e-38) are 0, a NaN stays.
+GSF__V_INLINE gsf__vf gsf__v_exp2_low(const gsf__v_exp2_terms* t, gsf__vf x) {
+    x = gsf__v_max(t->lowest, x);
+    const gsf__vf rounded = x + t->rounder;
+    return gsf__v_power(t, rounded, x - (rounded - t->rounder));
+}
+
+// 2^x, as above, for all x; inf above 128.
+GSF__V_INLINE gsf__vf gsf__v_exp2(gsf__vf x) {
+    const gsf__v_exp2_terms t = gsf__v_exp2_of(0);
+    return gsf__v_exp2_low(&t, gsf__v_min(gsf__v_set(129.0f), x));
+}
+
+// e^x for all x: relative error below 2e-7, results below 1.7e-38 are 0, inf above the largest float, a NaN stays.
+GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
+    const gsf__v_exp2_terms t = gsf__v_exp2_of(0);
+    const gsf__vf log2_e = gsf__v_set(1.44269504f), log2_e_low = gsf__v_set(1.92596299e-8f);
+    x = gsf__v_min(gsf__v_set(89.4f), gsf__v_max(gsf__v_set(-87.4f), x)); // -126.1 and 129 in powers of 2
+    const gsf__vf rounded = gsf__v_madd(x, log2_e, t.rounder), n = rounded - t.rounder;
+    return gsf__v_power(&t, rounded, gsf__v_madd(x, log2_e_low, gsf__v_msub(x, log2_e, n)));
+}
+
+#endif
+#endif // GSF__KERNELS_POWERS
+
+#ifndef GSF__ISA
+#ifndef GSF__POWERS_INCLUDED
+#define GSF__POWERS_INCLUDED
+#define GSF__KERNELS "gsfixer.h"
+#define GSF__KERNELS_POWERS
+#define GSF__KERNELS_AVX512
+GSF__BEGIN_IMPLEMENTATION
+#include "gsfixer.h" // these kernels
+GSF__END_IMPLEMENTATION
+#undef GSF__KERNELS_POWERS
+#endif
+
+#ifdef GSF__KERNELS // a module's, see the vocabulary; the module has begun its implementation
+#define GSF__ISA scalar
+#include GSF__KERNELS
+#undef GSF__ISA
+#if GSF__X86
+#define GSF__ISA avx2
+#include GSF__KERNELS
+#undef GSF__ISA
+#endif
+#if GSF__X86 && defined(GSF__KERNELS_AVX512)
+#define GSF__ISA avx512
+#include GSF__KERNELS
+#undef GSF__ISA
+#endif
+#undef GSF__KERNELS
+#undef GSF__KERNELS_AVX512
+#endif
+#endif // GSF__ISA
+
+#endif // GSF_INTERNALS_INCLUDED

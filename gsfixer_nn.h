@@ -1902,103 +1902,35 @@ GSF__INLINE_AVX2 __m256i gsf__nn_mask8(int64_t left) {
     return _mm256_cmpgt_epi32(_mm256_set1_epi32(left < 8 ? (int)left : 8), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
 }
 
-GSF__INLINE_AVX2 float gsf__nn_sum8(__m256 v) {
-    __m128 s = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
-    s = _mm_add_ps(s, _mm_movehl_ps(s, s));
-    return _mm_cvtss_f32(_mm_add_ss(s, _mm_movehdup_ps(s)));
-}
-
-GSF__INLINE_AVX2 double gsf__nn_sum4(__m256d v) {
-    const __m128d s = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd(v, 1));
-    return _mm_cvtsd_f64(_mm_add_sd(s, _mm_unpackhi_pd(s, s)));
-}
-
-GSF__INLINE_AVX2 float gsf__nn_max8(__m256 v) {
-    __m128 s = _mm_max_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
-    s = _mm_max_ps(s, _mm_movehl_ps(s, s));
-    return _mm_cvtss_f32(_mm_max_ss(s, _mm_movehdup_ps(s)));
-}
+GSF__INLINE_AVX2 float gsf__nn_sum8(__m256 v) { return gsf__v_sum_avx2(v); }
+GSF__INLINE_AVX2 double gsf__nn_sum4(__m256d v) { return gsf__vd_sum_avx2(v); }
+GSF__INLINE_AVX2 float gsf__nn_max8(__m256 v) { return gsf__v_largest_avx2(v); }
 
 // to[j to_ld + i] = from[i ld + j] for i, j < 8
 GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, float* to, int64_t to_ld) {
-    const __m256 r0 = _mm256_loadu_ps(from), r1 = _mm256_loadu_ps(from + ld), r2 = _mm256_loadu_ps(from + 2 * ld);
-    const __m256 r3 = _mm256_loadu_ps(from + 3 * ld), r4 = _mm256_loadu_ps(from + 4 * ld);
-    const __m256 r5 = _mm256_loadu_ps(from + 5 * ld), r6 = _mm256_loadu_ps(from + 6 * ld);
-    const __m256 r7 = _mm256_loadu_ps(from + 7 * ld);
-    const __m256 a0 = _mm256_unpacklo_ps(r0, r1), a1 = _mm256_unpackhi_ps(r0, r1), a2 = _mm256_unpacklo_ps(r2, r3);
-    const __m256 a3 = _mm256_unpackhi_ps(r2, r3), a4 = _mm256_unpacklo_ps(r4, r5), a5 = _mm256_unpackhi_ps(r4, r5);
-    const __m256 a6 = _mm256_unpacklo_ps(r6, r7), a7 = _mm256_unpackhi_ps(r6, r7);
-    const __m256 b0 = _mm256_shuffle_ps(a0, a2, 0x44), b4 = _mm256_shuffle_ps(a4, a6, 0x44);
-    const __m256 b1 = _mm256_shuffle_ps(a0, a2, 0xee), b5 = _mm256_shuffle_ps(a4, a6, 0xee);
-    const __m256 b2 = _mm256_shuffle_ps(a1, a3, 0x44), b6 = _mm256_shuffle_ps(a5, a7, 0x44);
-    const __m256 b3 = _mm256_shuffle_ps(a1, a3, 0xee), b7 = _mm256_shuffle_ps(a5, a7, 0xee);
-    _mm256_storeu_ps(to, _mm256_permute2f128_ps(b0, b4, 0x20));
-    _mm256_storeu_ps(to + to_ld, _mm256_permute2f128_ps(b1, b5, 0x20));
-    _mm256_storeu_ps(to + 2 * to_ld, _mm256_permute2f128_ps(b2, b6, 0x20));
-    _mm256_storeu_ps(to + 3 * to_ld, _mm256_permute2f128_ps(b3, b7, 0x20));
-    _mm256_storeu_ps(to + 4 * to_ld, _mm256_permute2f128_ps(b0, b4, 0x31));
-    _mm256_storeu_ps(to + 5 * to_ld, _mm256_permute2f128_ps(b1, b5, 0x31));
-    _mm256_storeu_ps(to + 6 * to_ld, _mm256_permute2f128_ps(b2, b6, 0x31));
-    _mm256_storeu_ps(to + 7 * to_ld, _mm256_permute2f128_ps(b3, b7, 0x31));
+    __m256 m[8] = {_mm256_loadu_ps(from), _mm256_loadu_ps(from + ld), _mm256_loadu_ps(from + 2 * ld),
+                   _mm256_loadu_ps(from + 3 * ld), _mm256_loadu_ps(from + 4 * ld), _mm256_loadu_ps(from + 5 * ld),
+                   _mm256_loadu_ps(from + 6 * ld), _mm256_loadu_ps(from + 7 * ld)};
+    gsf__v_transpose_avx2(m);
+    _mm256_storeu_ps(to, m[0]);
+    _mm256_storeu_ps(to + to_ld, m[1]);
+    _mm256_storeu_ps(to + 2 * to_ld, m[2]);
+    _mm256_storeu_ps(to + 3 * to_ld, m[3]);
+    _mm256_storeu_ps(to + 4 * to_ld, m[4]);
+    _mm256_storeu_ps(to + 5 * to_ld, m[5]);
+    _mm256_storeu_ps(to + 6 * to_ld, m[6]);
+    _mm256_storeu_ps(to + 7 * to_ld, m[7]);
 }
 
-// Constants of 2^x. Loops that hold them in registers, where they would rather be read again and again, pin them.
-typedef struct gsf__nn_exp2 { __m256 lowest, rounder, c0, c1, c2, c3, c4, c5, c6; } gsf__nn_exp2;
+typedef gsf__v_exp2_terms_avx2 gsf__nn_exp2;
 
-// The rounder, added to a number of [-126, 129], leaves the nearest integer n in the low bits as n + 126, which shifted by
-// 23 are the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial (that of Cephes' exp2f) therefore gives
-// 2 * 2^f, and all finite powers come out of one multiplication.
-GSF__INLINE_AVX2 gsf__nn_exp2 gsf__nn_exp2_constants(int pinned) {
-    gsf__nn_exp2 c;
-    c.lowest = _mm256_set1_ps(-126.0f);
-    c.rounder = _mm256_set1_ps(12583038.0f);
-    c.c0 = _mm256_set1_ps(2.0f);
-    c.c1 = _mm256_set1_ps(2.0f * 6.931472028550421e-1f);
-    c.c2 = _mm256_set1_ps(2.0f * 2.402264791363012e-1f);
-    c.c3 = _mm256_set1_ps(2.0f * 5.550332471162809e-2f);
-    c.c4 = _mm256_set1_ps(2.0f * 9.618437357674640e-3f);
-    c.c5 = _mm256_set1_ps(2.0f * 1.339887440266574e-3f);
-    c.c6 = _mm256_set1_ps(2.0f * 1.535336188319500e-4f);
-    if (pinned) {
-        __asm__("" : "+x"(c.lowest), "+x"(c.rounder), "+x"(c.c0), "+x"(c.c1), "+x"(c.c2));
-        __asm__("" : "+x"(c.c3), "+x"(c.c4), "+x"(c.c5), "+x"(c.c6));
-    }
-    return c;
-}
-
-// 2^(n + f) for rounded = n + rounder, |f| <= 1/2.
+GSF__INLINE_AVX2 gsf__nn_exp2 gsf__nn_exp2_constants(int pinned) { return gsf__v_exp2_of_avx2(pinned); }
 GSF__INLINE_AVX2 __m256 gsf__nn_power8(const gsf__nn_exp2* c, __m256 rounded, __m256 f) {
-    __m256 p = _mm256_fmadd_ps(c->c6, f, c->c5);
-    p = _mm256_fmadd_ps(p, f, c->c4);
-    p = _mm256_fmadd_ps(p, f, c->c3);
-    p = _mm256_fmadd_ps(p, f, c->c2);
-    p = _mm256_fmadd_ps(p, f, c->c1);
-    p = _mm256_fmadd_ps(p, f, c->c0);
-    return p * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_castps_si256(rounded), 23));
+    return gsf__v_power_avx2(c, rounded, f);
 }
-
-// 2^x for x <= 129 or NaN: relative error below 2e-7, 2^0 = 1, results below 2^-125.5 (1.7e-38) are 0, a NaN stays.
-GSF__INLINE_AVX2 __m256 gsf__nn_exp2_low8(const gsf__nn_exp2* c, __m256 x) {
-    x = _mm256_max_ps(c->lowest, x); // a NaN is the second operand, which max returns then
-    const __m256 rounded = x + c->rounder;
-    return gsf__nn_power8(c, rounded, x - (rounded - c->rounder));
-}
-
-// 2^x, as above, for all x; inf above 128.
-GSF__INLINE_AVX2 __m256 gsf__nn_exp2_8(__m256 x) {
-    const gsf__nn_exp2 c = gsf__nn_exp2_constants(0);
-    return gsf__nn_exp2_low8(&c, _mm256_min_ps(_mm256_set1_ps(129.0f), x));
-}
-
-// e^x for all x: relative error below 2e-7, results below 1.7e-38 are 0, inf above the largest float, a NaN stays.
-GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) {
-    const gsf__nn_exp2 c = gsf__nn_exp2_constants(0);
-    const __m256 log2_e = _mm256_set1_ps(1.44269504f);
-    x = _mm256_min_ps(_mm256_set1_ps(89.4f), _mm256_max_ps(_mm256_set1_ps(-87.4f), x)); // -126.1 and 129 in powers of 2
-    const __m256 rounded = _mm256_fmadd_ps(x, log2_e, c.rounder), n = rounded - c.rounder;
-    const __m256 f = _mm256_fmadd_ps(x, _mm256_set1_ps(1.92596299e-8f), _mm256_fmsub_ps(x, log2_e, n)); // log2 e, low part
-    return gsf__nn_power8(&c, rounded, f);
-}
+GSF__INLINE_AVX2 __m256 gsf__nn_exp2_low8(const gsf__nn_exp2* c, __m256 x) { return gsf__v_exp2_low_avx2(c, x); }
+GSF__INLINE_AVX2 __m256 gsf__nn_exp2_8(__m256 x) { return gsf__v_exp2_avx2(x); }
+GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) { return gsf__v_exp_avx2(x); }
 
 // The same, sixteen at a time.
 
@@ -2015,37 +1947,21 @@ GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { //
 
 GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
 
-GSF__INLINE_AVX512 float gsf__nn_sum16(__m512 v) { return gsf__nn_sum8(gsf__nn_fold16(v)); }
+GSF__INLINE_AVX512 float gsf__nn_sum16(__m512 v) { return gsf__v_sum_avx512(v); }
+GSF__INLINE_AVX512 float gsf__nn_max16(__m512 v) { return gsf__v_largest_avx512(v); }
+GSF__INLINE_AVX512 __m512 gsf__nn_rounder16(void) { return gsf__v_exp2_of_avx512(0).rounder; }
 
-GSF__INLINE_AVX512 float gsf__nn_max16(__m512 v) {
-    return gsf__nn_max8(_mm256_max_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps(v, 1)));
-}
-
-GSF__INLINE_AVX512 __m512 gsf__nn_rounder16(void) { return _mm512_set1_ps(12583038.0f); }
-
-GSF__INLINE_AVX512 __m512 gsf__nn_power16(__m512 rounded, __m512 f) { // gsf__nn_power8
-    __m512 p = _mm512_fmadd_ps(_mm512_set1_ps(2.0f * 1.535336188319500e-4f), f, _mm512_set1_ps(2.0f * 1.339887440266574e-3f));
-    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 9.618437357674640e-3f));
-    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 5.550332471162809e-2f));
-    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 2.402264791363012e-1f));
-    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f * 6.931472028550421e-1f));
-    p = _mm512_fmadd_ps(p, f, _mm512_set1_ps(2.0f));
-    return p * _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_castps_si512(rounded), 23));
+GSF__INLINE_AVX512 __m512 gsf__nn_power16(__m512 rounded, __m512 f) {
+    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(0);
+    return gsf__v_power_avx512(&terms, rounded, f);
 }
 
 GSF__INLINE_AVX512 __m512 gsf__nn_exp2_low16(__m512 x) { // 2^x for x <= 129 or NaN
-    x = _mm512_max_ps(_mm512_set1_ps(-126.0f), x);
-    const __m512 rounded = x + gsf__nn_rounder16();
-    return gsf__nn_power16(rounded, x - (rounded - gsf__nn_rounder16()));
+    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(0);
+    return gsf__v_exp2_low_avx512(&terms, x);
 }
 
-GSF__INLINE_AVX512 __m512 gsf__nn_exp16(__m512 x) { // gsf__nn_exp8
-    const __m512 log2_e = _mm512_set1_ps(1.44269504f);
-    x = _mm512_min_ps(_mm512_set1_ps(89.4f), _mm512_max_ps(_mm512_set1_ps(-87.4f), x));
-    const __m512 rounded = _mm512_fmadd_ps(x, log2_e, gsf__nn_rounder16()), n = rounded - gsf__nn_rounder16();
-    const __m512 f = _mm512_fmadd_ps(x, _mm512_set1_ps(1.92596299e-8f), _mm512_fmsub_ps(x, log2_e, n));
-    return gsf__nn_power16(rounded, f);
-}
+GSF__INLINE_AVX512 __m512 gsf__nn_exp16(__m512 x) { return gsf__v_exp_avx512(x); }
 
 // Pairs of bfloat16 lie in the lanes of floats.
 
