@@ -199,8 +199,8 @@ static gsf_result make_initial(fix_run* run) {
     if (result != GSF_OK) return result;
     run->setup.initial = stats.used;
     const gsf_initial_kind kind = stats.used.kind;
-    const int traced = run->scene.point_count && kind != GSF_INITIAL_TRACKS && kind != GSF_INITIAL_ALL && kind != GSF_INITIAL_RANDOM;
-    run->rays = !traced ? "none" : stats.visibility.used_embree ? "embree" : "z-buffer";
+    const int traced = kind == GSF_INITIAL_BOTH || kind == GSF_INITIAL_RAYS || kind == GSF_INITIAL_DENSE;
+    run->rays = !traced || !run->scene.point_count ? "none" : stats.visibility.used_embree ? "embree" : "z-buffer";
     if (kind == GSF_INITIAL_DENSE)
         gsfix_note(run->app, "%zu points that a training view sees; %zu more by stereo between %zu pairs of views in %.1f s",
                    stats.scene_points, stats.new_points, stats.dense.pairs,
