@@ -561,10 +561,12 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 
 #if defined(__GNUC__) || defined(__clang__)
 #define GSF__SHARED static __attribute__((unused)) // a translation unit need not use all of them
+#define GSF__NOINLINE __attribute__((noinline))
 #define GSF__ATOMIC_LOAD(p) __atomic_load_n((p), __ATOMIC_RELAXED)
 #define GSF__ATOMIC_STORE(p, v) __atomic_store_n((p), (v), __ATOMIC_RELAXED)
 #else
 #define GSF__SHARED static
+#define GSF__NOINLINE
 #define GSF__ATOMIC_LOAD(p) (*(volatile const int*)(p))
 #define GSF__ATOMIC_STORE(p, v) (*(volatile int*)(p) = (v))
 #endif

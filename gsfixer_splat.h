@@ -7029,6 +7029,11 @@ typedef struct gsf__view { // what is constant over a frame
     int antialiased, official_footprint, official_gradient;
 } gsf__view;
 
+// What x leaves over when it is rounded to the float `high`. Out of line because of a bug in gcc 12: the SLP vectoriser
+// (-O2) turns two neighbouring splits into one of two lanes, and value numbering then folds (double2)(float2)x into x, as
+// if it did not round, so that the rest is 0.
+static GSF__NOINLINE float gsf__low_part(double x, float high) { return (float)(x - (double)high); }
+
 static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* camera, const gsf_render_desc* desc) {
     gsf__view view;
     memset(&view, 0, sizeof view);
@@ -7042,7 +7047,7 @@ static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* came
         }
         view.t[r] = origin_in_camera[r];
         view.center[r] = (float)(center[r] - splats->origin[r]);
-        view.center_low[r] = (float)(center[r] - splats->origin[r] - (double)view.center[r]);
+        view.center_low[r] = gsf__low_part(center[r] - splats->origin[r], view.center[r]);
         view.background[r] = desc->background[r];
     }
     view.fx = (float)(view.focal[0] = camera->fx);
@@ -7093,8 +7098,8 @@ static int gsf__project_splat(const gsf__view* view, const gsf_splats* splats, s
     const double u = view->focal[0] * t[0] / t[2] + view->middle[0], v = view->focal[1] * t[1] / t[2] + view->middle[1];
     p->u = (float)u;
     p->v = (float)v;
-    p->u_low = (float)(u - (double)p->u);
-    p->v_low = (float)(v - (double)p->v);
+    p->u_low = gsf__low_part(u, p->u);
+    p->v_low = gsf__low_part(v, p->v);
 
     const float* raw = splats->quats + 4 * i;
     const double norm = sqrt((double)raw[0] * raw[0] + (double)raw[1] * raw[1] + (double)raw[2] * raw[2] +
