@@ -5,19 +5,77 @@
        #define GSFIXER_SPLAT_IMPLEMENTATION   // in one file; or GSFIXER_IMPLEMENTATION for everything included
        #include "gsfixer_splat.h"             // includes gsfixer.h and gsfixer_traj.h
 
-   CONVENTIONS (beside those of gsfixer.h)
+   WHAT IT DOES NOT DO
+       It estimates no camera poses, and it does not use the GPU. It knows no neural network: a restorer is a struct of
+       functions (gsf_restorer in gsfixer.h), of which gsfixer_nn.h provides one.
+
+   CONVENTIONS (in addition to those of gsfixer.h)
        A splat is mean, log-scale, raw quaternion wxyz (normalised when used; zero = identity), opacity logit and
        SH coefficients (K,3) with K = (degree + 1)^2, the 3DGS parametrisation:
            Sigma = R diag(exp(log_scale))^2 R^T,  opacity = sigmoid(logit),  colour = max(0, SH(direction) + 0.5)
        Means are float32 relative to a double origin, so georeferenced scenes keep their precision.
-       A desc starts zeroed: zero is every field's default. The large ones begin and end with a canary that stays zero, so
-       that one that was not zeroed is refused (GSF_ERROR_INVALID_ARGUMENT).
+       A desc must be zeroed before use; zero selects the default of every field. The large ones begin and end with a canary
+       that stays zero: a desc that was not zeroed is refused with GSF_ERROR_INVALID_ARGUMENT.
 
    CONFIGURATION (define before the implementation)
-       GSF_USE_EMBREE   visible-point filter by ray tracing (link embree3 or embree4); without it the same discs are
-                        projected, to the same result
-       GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> where there is one, else <embree3/rtcore.h>
+       GSF_USE_EMBREE       traces the rays of the visible-point filter with Embree (link embree3 or embree4); without it
+                            the same discs are projected into a z-buffer, with the same result
+       GSF_EMBREE_INCLUDE   default <embree4/rtcore.h> if available, else <embree3/rtcore.h>
 
+   DATA FLOW
+       photos, COLMAP model or transforms.json                 .ply .splat .spz
+             | gsf_splat_load_scene                                  ^ gsf_splat_save
+             v                                                       | gsf_splat_load
+         gsf_scene ---- gsf_splat_initial_splats ------------> gsf_splats ---- gsf_splat_render ----> colour, depth, alpha
+             |            visible points, dense stereo             |
+             | gsf_splat_load_train_views                          |
+             v                                                     v
+         gsf_train_view[] --------------------------------> gsf_trainer <------ restored views, weight lambda -----.
+                                                                   |                                               |
+                                                                   | gsf_splat_trainer_render                      |
+                                                                   v                                               |
+         gsf_fixer:  path (gsfixer_traj.h) ------> frames of a window: colour, depth, alpha ------> gsf_restorer --'
+
+   STEP BY STEP
+       gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
+       gsf_splat_load_train_views(&ctx, &scene, NULL, 0, &views);                        // photos
+       gsf_splat_initial_splats(&ctx, &scene, NULL, 0, NULL, &start, NULL);              // points -> splats
+       desc = gsf_splat_few_view_desc(&scene, GSF_QUALITY_BALANCED);
+       gsf_splat_make_warp(&ctx, &warp);                                                 // or your own gsf_restorer
+       gsf_splat_make_fixer(&ctx, &desc, views, scene.view_count, &start, &warp, &fixer);
+       while (stats.stage != GSF_FIX_DONE) gsf_splat_fix_step(&ctx, fixer, &stats);      // train, plan, restore
+       gsf_splat_save(&ctx, "splats.ply", gsf_splat_trainer_splats(gsf_splat_fixer_trainer(fixer)), NULL);
+       Each of these returns a result to be checked; README.md has the complete program. To train without repair, use
+       gsf_splat_make_trainer with desc.train and call gsf_splat_train_step.
+
+   A TRAINING STEP (gsf_splat_train_step), by section
+       >>project    splats -> screen-space records: centre, conic, colour, tile rectangle
+       >>bin        records -> per tile, a list sorted by depth
+       >>raster forward, >>loss, >>raster backward    per tile and pixel: blend; L1 + SSIM; gradients of the records
+       >>project backward    gradients of the records -> gradients of the splats
+       >>adam       optimizer step; >>densify    every densify_interval steps: clone, split, prune (or MCMC)
+
+   WHERE TO ADD
+       a regulariser    on the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass; on parameters:
+                        beside gsf__penalty_chunk in >>trainer, called by gsf__trainer_update. Its weight is a field of
+                        gsf_train_desc, in gsf__train_desc_check and (for checkpoints) in gsf__trainer_settings
+       a camera model   gsf__lens_kind and the table of COLMAP's models in >>colmap, the distortion in >>undistort
+       a file format    gsf_splat_type, a reader and a writer in >>formats
+       a restorer       outside this file: fill in a gsf_restorer; >>warp is an example
+       a start          gsf_initial_kind, in >>few views
+
+   ERRORS      As in gsfixer.h. Loaders report file and position and return only checked data; splats, pixels and gradients
+               that are not finite are dropped or neutralised and counted (gsf_train_stats.rejected). A step that fails,
+               because it was cancelled or is out of memory, changes nothing and may be repeated.
+   MEMORY      Everything comes from the context's allocator, except scratch memory of Embree and stb. A trainer takes about
+               1 kB per splat of SH degree 3 and, per pixel of a photo, 3 bytes (u8) or 12 (f32), and 4 more with a weight.
+               Buffers grow and are kept, so that rendering and training allocate only when the splats become more.
+   THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
+               through the parallel hook; results are bit-identical for any number of workers. To render while another
+               thread trains, export a copy of the splats and use a rasterizer and a context of its own.
+   STACK       With gcc 12 at -O2 the largest frames are 16 KiB on the calling thread (CRC-32 of checkpoints) and 8 KiB on
+               workers (rasterizer). Give the calling thread 256 KiB and workers 64 KiB; workers that also run the
+               convolutions of gsfixer_nn.h (frames of 32 KiB) 128 KiB.
    SECTIONS    >>splats >>order >>ply >>formats >>colmap >>transforms >>undistort >>scene >>neighbours >>visibility
                >>embree >>stereo >>rasterizer state >>project >>bin >>raster forward >>raster backward >>project backward
                >>render >>loss >>adam >>densify >>trainer >>warp >>seen mask >>fixer >>few views
