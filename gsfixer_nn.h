@@ -1906,11 +1906,12 @@ GSF__INLINE_AVX2 float gsf__nn_sum8(__m256 v) { return gsf__v_sum_avx2(v); }
 GSF__INLINE_AVX2 double gsf__nn_sum4(__m256d v) { return gsf__vd_sum_avx2(v); }
 GSF__INLINE_AVX2 float gsf__nn_max8(__m256 v) { return gsf__v_largest_avx2(v); }
 
-// to[j to_ld + i] = from[i ld + j] for i, j < 8
-GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, float* to, int64_t to_ld) {
-    __m256 m[8] = {_mm256_loadu_ps(from), _mm256_loadu_ps(from + ld), _mm256_loadu_ps(from + 2 * ld),
-                   _mm256_loadu_ps(from + 3 * ld), _mm256_loadu_ps(from + 4 * ld), _mm256_loadu_ps(from + 5 * ld),
-                   _mm256_loadu_ps(from + 6 * ld), _mm256_loadu_ps(from + 7 * ld)};
+// to[j to_ld + i] = (from[i ld + j] - center[j]) factor for i, j < 8
+GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, __m256 center, __m256 factor, float* to,
+                                         int64_t to_ld) {
+#define GSF_X(r) (_mm256_loadu_ps(from + (r) * ld) - center) * factor
+    __m256 m[8] = {GSF_X(0), GSF_X(1), GSF_X(2), GSF_X(3), GSF_X(4), GSF_X(5), GSF_X(6), GSF_X(7)};
+#undef GSF_X
     gsf__v_transpose_avx2(m);
     _mm256_storeu_ps(to, m[0]);
     _mm256_storeu_ps(to + to_ld, m[1]);
@@ -4608,6 +4609,7 @@ enum {
     GSF__ATT_QUERIES = GSF__ATT_GROUP * GSF__ATT_GROUPS,
     GSF__ATT_RANGE = 1536,    // most queries of a chunk: more hide the packing better, but leave the cache
     GSF__ATT_LEAST_RANGE = 384,
+    GSF__ATT_ROWS = 16,       // queries of the scalar kernel that see a key together
     GSF__ATT_AHEAD = 16,      // rows to ask for ahead of use
     GSF__ATT_CHUNKS = 64,     // so many chunks employ the workers evenly
 };
@@ -4616,61 +4618,97 @@ typedef struct gsf__attention_job {
     gsf_nn_attention_desc desc;
     float* scratch;             // of all workers
     size_t scratch_floats;      // of one
-    float* center;              // (heads, head_dim): what is taken off every key
     int64_t ranges, range_size; // of the queries
     int64_t panels;             // of 16 columns of v
 } gsf__attention_job;
 
 typedef struct gsf__attention_kernels {
     void (*chunk)(void* arg, size_t chunk, int worker);
-    int packed; // chunks are ranges of a head, and scratch is laid out as gsf__attention_scratch; else single queries
+    int packed; // scratch is laid out as gsf__attention_scratch, else as gsf__attention_chunk_scalar has it
 } gsf__attention_kernels;
 
 // Softmax is blind to what all keys have in common, which adds the same to each logit of a query, but their rounding is not.
 // So keys count from a value in their midst: the middle one of the means of three times five keys, which one wild key does
-// not move, where it is finite.
-static void gsf__attention_center(const gsf__attention_job* job) {
-    const gsf_nn_attention_desc* d = &job->desc;
-    const int64_t width = (int64_t)d->heads * d->head_dim;
-    for (int64_t i = 0; i < width; i++) {
+// not move, where it is finite. Of the head that stands in the columns from `column` on.
+static void gsf__attention_center(const gsf_nn_attention_desc* d, int64_t column, float* center) {
+    const float* keys[15];
+    for (int64_t n = 0; n < 15; n++) keys[n] = d->k + n * d->keys / 15 * d->ldk + column;
+    for (int32_t i = 0; i < d->head_dim; i++) {
         float mean[3];
-        for (int64_t g = 0; g < 3; g++) {
-            mean[g] = 0.0f;
-            for (int64_t n = g; n < 15; n += 3) mean[g] += d->k[n * d->keys / 15 * d->ldk + i];
-            mean[g] /= 5.0f;
-        }
+        for (int g = 0; g < 3; g++)
+            mean[g] = (keys[g][i] + keys[g + 3][i] + keys[g + 6][i] + keys[g + 9][i] + keys[g + 12][i]) / 5.0f;
         const float low = mean[0] < mean[1] ? mean[0] : mean[1], high = mean[0] < mean[1] ? mean[1] : mean[0];
         const float middle = mean[2] < low ? low : mean[2] > high ? high : mean[2];
-        job->center[i] = isfinite(middle) ? middle : 0.0f;
+        center[i] = isfinite(middle) ? middle : 0.0f;
     }
 }
 
-static void gsf__attention_row(void* arg, size_t row, int worker) {
+// Logits of a head's `queries` rows from `first` on, to p (queries, keys). Four queries at a time share a key's centring, and
+// their sums do not wait for each other.
+static void gsf__attention_logits_scalar(const gsf_nn_attention_desc* d, int64_t head, int64_t first, int64_t queries,
+                                         const float* center, float* p) {
+    const int64_t dim = d->head_dim, column = head * dim;
+    for (int64_t j = 0; j < d->keys; j++) {
+        const float *key = d->k + j * d->ldk + column, *q = d->q + first * d->ldq + column;
+        float* to = p + j;
+        int64_t r = 0;
+        for (; r + 4 <= queries; r += 4, q += 4 * d->ldq, to += 4 * d->keys) {
+            const float *q1 = q + d->ldq, *q2 = q1 + d->ldq, *q3 = q2 + d->ldq;
+            float dot0 = 0.0f, dot1 = 0.0f, dot2 = 0.0f, dot3 = 0.0f;
+            for (int64_t i = 0; i < dim; i++) {
+                const float k = key[i] - center[i];
+                dot0 += q[i] * k;
+                dot1 += q1[i] * k;
+                dot2 += q2[i] * k;
+                dot3 += q3[i] * k;
+            }
+            to[0] = dot0 * d->scale;
+            to[d->keys] = dot1 * d->scale;
+            to[2 * d->keys] = dot2 * d->scale;
+            to[3 * d->keys] = dot3 * d->scale;
+        }
+        for (; r < queries; r++, q += d->ldq, to += d->keys) {
+            float dot = 0.0f;
+            for (int64_t i = 0; i < dim; i++) dot += q[i] * (key[i] - center[i]);
+            *to = dot * d->scale;
+        }
+    }
+}
+
+// One query from its logits p; sum: (head_dim), scratch.
+static void gsf__attention_row(const gsf_nn_attention_desc* d, int64_t head, int64_t row, float* p, float* sum) {
+    const int64_t dim = d->head_dim, column = head * dim;
+    const int64_t at = (head * d->queries + row) * d->keys; // in mask and bias
+    const unsigned char* mask = d->mask ? d->mask + at : NULL;
+    float top = -FLT_MAX, total = 0.0f;
+    for (int64_t j = 0; j < d->keys; j++) {
+        if (d->bias) p[j] += d->bias[at + j];
+        if ((!mask || mask[j]) && p[j] > top) top = p[j];
+    }
+    for (int64_t i = 0; i < dim; i++) sum[i] = 0.0f;
+    for (int64_t j = 0; j < d->keys; j++) {
+        if (mask && !mask[j]) continue;
+        const float* v = d->v + j * d->ldv + column;
+        const float weight = expf(p[j] - top);
+        total += weight;
+        for (int64_t i = 0; i < dim; i++) sum[i] += weight * v[i];
+    }
+    float* out = d->out + row * d->ldo + column;
+    for (int64_t i = 0; i < dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN goes through
+}
+
+static void gsf__attention_chunk_scalar(void* arg, size_t chunk, int worker) {
     const gsf__attention_job* job = (const gsf__attention_job*)arg;
     const gsf_nn_attention_desc* d = &job->desc;
-    float *p = job->scratch + (size_t)worker * job->scratch_floats, *sum = p + d->keys;
-    for (int32_t h = 0; h < d->heads; h++) {
-        const float *q = d->q + (int64_t)row * d->ldq + (int64_t)h * d->head_dim, *center = job->center + (int64_t)h * d->head_dim;
-        const int64_t at = (h * d->queries + (int64_t)row) * d->keys; // in mask and bias
-        const unsigned char* mask = d->mask ? d->mask + at : NULL;
-        float top = -FLT_MAX, total = 0.0f;
-        for (int64_t j = 0; j < d->keys; j++) {
-            const float* k = d->k + j * d->ldk + (int64_t)h * d->head_dim;
-            float dot = 0.0f;
-            for (int32_t i = 0; i < d->head_dim; i++) dot += q[i] * (k[i] - center[i]);
-            p[j] = d->bias ? dot * d->scale + d->bias[at + j] : dot * d->scale;
-            if ((!mask || mask[j]) && p[j] > top) top = p[j];
-        }
-        for (int32_t i = 0; i < d->head_dim; i++) sum[i] = 0.0f;
-        for (int64_t j = 0; j < d->keys; j++) {
-            if (mask && !mask[j]) continue;
-            const float* v = d->v + j * d->ldv + (int64_t)h * d->head_dim;
-            const float weight = expf(p[j] - top);
-            total += weight;
-            for (int32_t i = 0; i < d->head_dim; i++) sum[i] += weight * v[i];
-        }
-        float* out = d->out + (int64_t)row * d->ldo + (int64_t)h * d->head_dim;
-        for (int32_t i = 0; i < d->head_dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN goes through
+    const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
+    const int64_t dim = d->head_dim, end = gsf__least(first + job->range_size, d->queries);
+    float* p = job->scratch + (size_t)worker * job->scratch_floats;
+    float *sum = p + GSF__ATT_ROWS * d->keys, *center = sum + dim;
+    gsf__attention_center(d, head * dim, center);
+    for (int64_t row = first; row < end; row += GSF__ATT_ROWS) {
+        const int64_t rows = gsf__least(end - row, GSF__ATT_ROWS);
+        gsf__attention_logits_scalar(d, head, row, rows, center, p);
+        for (int64_t r = 0; r < rows; r++) gsf__attention_row(d, head, row + r, p + r * d->keys, sum);
     }
 }
 
@@ -4678,15 +4716,17 @@ static void gsf__attention_row(void* arg, size_t row, int worker) {
 
 typedef struct gsf__attention_scratch { // of one worker
     float *q, *out, *k, *v, *p;
-    float* top; // [query] largest logit so far
-    float* sum; // [query][8] sum of the weights so far, by lane
+    float* top;    // [query] largest logit so far
+    float* sum;    // [query][8] sum of the weights so far, by lane
+    float* center; // [dim] what is taken off every key
 } gsf__attention_scratch;
 
 typedef struct gsf__attention_parts { // what instruction sets do differently; in bf16 pairs lie in the places of floats
-    void (*pack_queries)(const gsf__attention_job* job, const float* from, int64_t queries, float* packed);
-    void (*pack_keys)(const gsf__attention_job* job, const float* from, const float* center, int64_t keys, float* packed);
-    void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
     int64_t unit; // values in a place along head_dim: 1, or 2 in bf16
+    // Places of eight rows, of which `rows` are there, less `center` (NULL: nothing) and times `factor`: to[place to_ld + row]
+    void (*pack_rows)(const float* from, int64_t rows, int64_t ld, const float* center, float factor, int64_t dim, float* to,
+                      int64_t to_ld);
+    void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
     // p of `groups` groups of queries against `panels` panels of keys
     void (*logits)(const float* q, int64_t groups, const float* k, int64_t panels, int64_t dim, float* p);
     // Logits of `queries` rows to weights; raises `top`, updates `sum`, and gives in `fade` what earlier values are to be
@@ -4707,51 +4747,53 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
     s.sum = s.out + groups * GSF__ATT_TILE * job->panels;
     s.q = s.sum + groups * GSF__ATT_GROUP * 8;
     s.top = s.q + groups * 8 * dim;
+    s.center = s.top + groups * GSF__ATT_GROUP;
     return s;
 }
 
 // A head's rows are a few lines each, far apart, which no hardware foresees: asks for one of them ahead of its use.
-GSF__INLINE_AVX2 void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
+static void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
     for (int64_t i = 0; row < rows && i < dim; i += 16) _mm_prefetch((const char*)(from + row * ld + i), _MM_HINT_T0);
 }
 
-GSF__TARGET_AVX2 static void gsf__attention_pack_queries(const gsf__attention_job* job, const float* from, int64_t queries,
-                                                         float* packed) {
+GSF__TARGET_AVX2 static void gsf__attention_pack_rows(const float* from, int64_t rows, int64_t ld, const float* center,
+                                                      float factor, int64_t dim, float* to, int64_t to_ld) {
+    const __m256 f = _mm256_set1_ps(factor);
+    for (int64_t i = 0; i < dim; i += 8) {
+        const __m256i mask = gsf__nn_mask8(dim - i);
+        const __m256 c = center ? _mm256_maskload_ps(center + i, mask) : _mm256_setzero_ps();
+        if (rows >= 8 && dim - i >= 8) {
+            gsf__nn_transpose8(from + i, ld, c, f, to + i * to_ld, to_ld);
+            continue;
+        }
+        float whole[8][8], turned[8][8];
+        for (int r = 0; r < 8; r++)
+            _mm256_storeu_ps(whole[r], r < rows ? _mm256_maskload_ps(from + r * ld + i, mask) : _mm256_setzero_ps());
+        gsf__nn_transpose8(whole[0], 8, c, f, turned[0], 8);
+        for (int64_t u = 0; u < gsf__least(dim - i, 8); u++) memcpy(to + (i + u) * to_ld, turned[u], sizeof turned[u]);
+    }
+}
+
+static void gsf__attention_pack_queries(const gsf__attention_job* job, const gsf__attention_parts* parts, const float* from,
+                                        int64_t queries, float* packed) {
     const int64_t ld = job->desc.ldq, dim = job->desc.head_dim;
-    const __m256 factor = _mm256_set1_ps(job->desc.scale * 1.44269504f); // powers of 2 instead of e
-    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 8 * dim) {
-        const float* row = from + first * ld;
-        int64_t i = 0;
+    const float factor = job->desc.scale * 1.44269504f; // powers of 2 instead of e
+    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 8 * dim / parts->unit) {
         for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
             gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
-        for (; first + 8 <= queries && i + 8 <= dim; i += 8) gsf__nn_transpose8(row + i, ld, packed + 8 * i, 8);
-        for (; i < dim; i++)
-            for (int64_t r = 0; r < 8; r++) packed[8 * i + r] = first + r < queries ? row[r * ld + i] : 0.0f;
-        for (i = 0; i < dim; i++) _mm256_storeu_ps(packed + 8 * i, factor * _mm256_loadu_ps(packed + 8 * i));
+        parts->pack_rows(from + first * ld, queries - first, ld, NULL, factor, dim, packed, 8);
     }
 }
 
 // Keys of `from`, less `center`, to panels of 16, the last one filled up.
-GSF__TARGET_AVX2 static void gsf__attention_pack_keys(const gsf__attention_job* job, const float* from, const float* center,
-                                                      int64_t keys, float* packed) {
-    const int64_t ld = job->desc.ldk, dim = job->desc.head_dim;
-    for (int64_t j = 0; j < keys; j += 8) {
-        float* to = packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * dim + j % GSF__ATT_PANEL;
-        const float* row = from + j * ld;
-        int64_t i = 0;
+static void gsf__attention_pack_keys(const gsf__attention_job* job, const gsf__attention_parts* parts, const float* from,
+                                     const float* center, int64_t keys, float* packed) {
+    const int64_t ld = job->desc.ldk, dim = job->desc.head_dim, panel = GSF__ATT_PANEL * dim / parts->unit;
+    for (int64_t j = 0; j < gsf__round_up(keys, GSF__ATT_PANEL); j += 8) {
         for (int64_t r = j; r < j + 8; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, keys, ld, dim);
-        for (; j + 8 <= keys && i + 8 <= dim; i += 8)
-            gsf__nn_transpose8(row + i, ld, to + i * GSF__ATT_PANEL, GSF__ATT_PANEL);
-        for (; i < dim; i++)
-            for (int r = 0; r < 8; r++) to[i * GSF__ATT_PANEL + r] = j + r < keys ? row[r * ld + i] : 0.0f;
-        for (i = 0; i < dim; i++) {
-            float* at = to + i * GSF__ATT_PANEL;
-            _mm256_storeu_ps(at, _mm256_loadu_ps(at) - _mm256_set1_ps(center[i]));
-        }
+        parts->pack_rows(from + j * ld, keys - j, ld, center, 1.0f, dim,
+                         packed + j / GSF__ATT_PANEL * panel + j % GSF__ATT_PANEL, GSF__ATT_PANEL);
     }
-    if ((keys - 1) % GSF__ATT_PANEL < 8) // the last panel's second half
-        for (int64_t i = 0; i < dim; i++)
-            _mm256_storeu_ps(packed + ((keys - 1) / GSF__ATT_PANEL * dim + i) * GSF__ATT_PANEL + 8, _mm256_setzero_ps());
 }
 
 GSF__TARGET_AVX2 static void gsf__attention_pack_values(const gsf__attention_job* job, const float* from, int64_t keys,
@@ -4989,10 +5031,8 @@ GSF__TARGET_AVX512 static void gsf__attention_values_avx512(const float* p, int6
 
 // ---- attention in bf16: q and k are packed in pairs along head_dim, v and the weights along the keys
 
-// Units of eight rows from `row` on, of which `rows` are there, less `center` (NULL: nothing) and times `factor`:
-// to[i to_ld + r].
-GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* row, const float* center, int64_t rows, int64_t ld,
-                                                       int64_t dim, float factor, float* to, int64_t to_ld) {
+GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* from, int64_t rows, int64_t ld, const float* center,
+                                                       float factor, int64_t dim, float* to, int64_t to_ld) {
     const __m512 f = _mm512_set1_ps(factor);
     for (int64_t i = 0; i < dim; i += 16) {
         const __mmask16 mask = gsf__nn_mask16(dim - i);
@@ -5000,35 +5040,14 @@ GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* row, const f
         float units[8][8];
         for (int r = 0; r < 8; r++) {
             const __mmask16 there = r < rows ? mask : (__mmask16)0;
-            const __m512 v = f * (_mm512_maskz_loadu_ps(there, row + r * ld + i) - c);
+            const __m512 v = f * (_mm512_maskz_loadu_ps(there, from + r * ld + i) - c);
             _mm256_storeu_ps(units[r], _mm256_castsi256_ps(gsf__nn_round_bf16(v)));
         }
-        if (dim - i >= 16) gsf__nn_transpose8(units[0], 8, to + i / 2 * to_ld, to_ld);
+        if (dim - i >= 16)
+            gsf__nn_transpose8(units[0], 8, _mm256_setzero_ps(), _mm256_set1_ps(1.0f), to + i / 2 * to_ld, to_ld);
         else
             for (int64_t u = 0; u < (dim - i) / 2; u++)
                 for (int r = 0; r < 8; r++) to[(i / 2 + u) * to_ld + r] = units[r][u];
-    }
-}
-
-GSF__TARGET_BF16 static void gsf__attention_pack_queries_bf16(const gsf__attention_job* job, const float* from,
-                                                              int64_t queries, float* packed) {
-    const int64_t ld = job->desc.ldq, dim = job->desc.head_dim;
-    for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 4 * dim) {
-        for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
-            gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
-        gsf__attention_pack_pairs(from + first * ld, NULL, gsf__least(queries - first, GSF__ATT_GROUP), ld, dim,
-                                  job->desc.scale * 1.44269504f, packed, 8);
-    }
-}
-
-GSF__TARGET_BF16 static void gsf__attention_pack_keys_bf16(const gsf__attention_job* job, const float* from,
-                                                           const float* center, int64_t keys, float* packed) {
-    const int64_t ld = job->desc.ldk, dim = job->desc.head_dim;
-    for (int64_t j = 0; j < gsf__round_up(keys, GSF__ATT_PANEL); j += 8) {
-        for (int64_t r = j; r < j + 8; r++) gsf__attention_fetch(from, r + GSF__ATT_AHEAD, keys, ld, dim);
-        gsf__attention_pack_pairs(from + j * ld, center, keys - j, ld, dim, 1.0f,
-                                  packed + j / GSF__ATT_PANEL * GSF__ATT_PANEL * (dim / 2) + j % GSF__ATT_PANEL,
-                                  GSF__ATT_PANEL);
     }
 }
 
@@ -5133,14 +5152,15 @@ static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__atten
     const int64_t groups = (rows + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, column = head * d->head_dim;
     const int64_t length = d->head_dim / parts->unit; // places of a query or key
     float fade[GSF__ATT_QUERIES];
-    parts->pack_queries(job, d->q + first * d->ldq + column, rows, s.q);
+    gsf__attention_center(d, column, s.center);
+    gsf__attention_pack_queries(job, parts, d->q + first * d->ldq + column, rows, s.q);
     memset(s.out, 0, (size_t)(groups * job->panels * GSF__ATT_TILE) * sizeof(float));
     memset(s.sum, 0, (size_t)(groups * GSF__ATT_GROUP * 8) * sizeof(float));
     for (int64_t r = 0; r < groups * GSF__ATT_GROUP; r++) s.top[r] = -FLT_MAX;
     for (int64_t key = 0; key < d->keys; key += GSF__ATT_KEYS) {
         const int64_t keys = gsf__least(GSF__ATT_KEYS, d->keys - key);
         const int64_t key_panels = (keys + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL, columns = key_panels * GSF__ATT_PANEL;
-        parts->pack_keys(job, d->k + key * d->ldk + column, job->center + column, keys, s.k);
+        gsf__attention_pack_keys(job, parts, d->k + key * d->ldk + column, s.center, keys, s.k);
         parts->pack_values(job, d->v + key * d->ldv + column, keys, s.v);
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
@@ -5158,29 +5178,29 @@ static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__atten
 
 static void gsf__attention_chunk_avx2(void* arg, size_t chunk, int worker) {
     static const gsf__attention_parts parts = {
-        gsf__attention_pack_queries, gsf__attention_pack_keys,    gsf__attention_pack_values, 1,
+        1, gsf__attention_pack_rows, gsf__attention_pack_values,
         gsf__attention_logits_avx2,  gsf__attention_weights_avx2, gsf__attention_values_avx2};
     gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
 }
 
 static void gsf__attention_chunk_avx512(void* arg, size_t chunk, int worker) {
     static const gsf__attention_parts parts = {
-        gsf__attention_pack_queries,  gsf__attention_pack_keys,      gsf__attention_pack_values, 1,
+        1, gsf__attention_pack_rows, gsf__attention_pack_values,
         gsf__attention_logits_avx512, gsf__attention_weights_avx512, gsf__attention_values_avx512};
     gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
 }
 
 static void gsf__attention_chunk_bf16(void* arg, size_t chunk, int worker) {
     static const gsf__attention_parts parts = {
-        gsf__attention_pack_queries_bf16, gsf__attention_pack_keys_bf16, gsf__attention_pack_values_bf16, 2,
-        gsf__attention_logits_bf16,       gsf__attention_weights_bf16,   gsf__attention_values_bf16};
+        2, gsf__attention_pack_pairs, gsf__attention_pack_values_bf16,
+        gsf__attention_logits_bf16, gsf__attention_weights_bf16, gsf__attention_values_bf16};
     gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
 }
 
 #endif // GSF__X86
 
 static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level level, int pairs) { // pairs: of bf16
-    static const gsf__attention_kernels scalar = {gsf__attention_row, 0};
+    static const gsf__attention_kernels scalar = {gsf__attention_chunk_scalar, 0};
 #if GSF__X86
     static const gsf__attention_kernels avx2 = {gsf__attention_chunk_avx2, 1};
     static const gsf__attention_kernels avx512 = {gsf__attention_chunk_avx512, 1};
@@ -5195,9 +5215,8 @@ static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level lev
 }
 
 // Chooses the ranges of queries, from sizes alone; returns the number of chunks.
-static size_t gsf__attention_plan(gsf__attention_job* job, int packed) {
+static size_t gsf__attention_plan(gsf__attention_job* job) {
     const gsf_nn_attention_desc* d = &job->desc;
-    if (!packed) return (size_t)d->queries;
     const int64_t wanted = (GSF__ATT_CHUNKS - 1) / d->heads + 1, most = d->queries / GSF__ATT_LEAST_RANGE;
     job->ranges = (d->queries + GSF__ATT_RANGE - 1) / GSF__ATT_RANGE;
     if (job->ranges < wanted) job->ranges = wanted < most ? wanted : most > job->ranges ? most : job->ranges;
@@ -5215,10 +5234,10 @@ static size_t gsf__attention_floats(const gsf__attention_job* job, int packed) {
     size_t total;
     if (packed) { // p, k, v; then a query's share of out, sum, q (8 places for 6) and top
         if (!gsf__mul_size((size_t)job->range_size, padded + 8 + dim + (dim + 2) / 3 + 1, &total)) return 0;
-        total += GSF__ATT_QUERIES * GSF__ATT_KEYS + GSF__ATT_KEYS * (dim + padded);
+        total += GSF__ATT_QUERIES * GSF__ATT_KEYS + GSF__ATT_KEYS * (dim + padded) + dim;
     } else {
-        if ((uint64_t)d->keys > SIZE_MAX / 8) return 0;
-        total = (size_t)d->keys + dim;
+        if (!gsf__mul_size((size_t)d->keys, GSF__ATT_ROWS, &total)) return 0;
+        total += 2 * dim;
     }
     return total < SIZE_MAX / 8 ? (total + 15) / 16 * 16 : 0;
 }
@@ -5242,15 +5261,13 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
     if (!d->ldo) d->ldo = width;
     if (d->scale == 0.0f) d->scale = 1.0f / sqrtf((float)d->head_dim);
     job.panels = ((int64_t)d->head_dim + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL;
-    const size_t chunks = gsf__attention_plan(&job, kernels->packed);
+    const size_t chunks = gsf__attention_plan(&job);
     job.scratch_floats = gsf__attention_floats(&job, kernels->packed);
     if (!job.scratch_floats || !gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &size) ||
-        size > SIZE_MAX - (size_t)width || !gsf__mul_size(size + (size_t)width, sizeof(float), &size))
+        !gsf__mul_size(size, sizeof(float), &size))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld keys are too many", (long long)d->keys);
     job.scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own, size);
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    job.center = job.scratch + job.scratch_floats * (size_t)ctx->parallel.worker_count;
-    gsf__attention_center(&job);
     gsf__parallel_for(ctx, chunks, kernels->chunk, &job);
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;
