@@ -38,8 +38,8 @@
 
    STEP BY STEP
        gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
-       gsf_splat_load_train_views(&ctx, &scene, NULL, 0, &views);                        // photos
-       gsf_splat_initial_splats(&ctx, &scene, NULL, 0, NULL, &start, NULL);              // points -> splats
+       gsf_splat_load_train_views(&ctx, &scene, NULL, scene.view_count, &views);         // photos
+       gsf_splat_initial_splats(&ctx, &scene, NULL, scene.view_count, NULL, &start, NULL); // points -> splats
        desc = gsf_splat_few_view_desc(&scene, GSF_QUALITY_BALANCED);
        gsf_splat_make_warp(&ctx, &warp);                                                 // or your own gsf_restorer
        gsf_splat_make_fixer(&ctx, &desc, views, scene.view_count, &start, &warp, &fixer);
