@@ -3,6 +3,7 @@
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3
 [ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no program or no scene"; exit 77; }
+readme=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)/README.md
 rm -rf "$scratch"
 mkdir -p "$scratch"
 cd "$scratch"
@@ -215,7 +216,8 @@ expect 0 "$gsfix" render a/splats.ply --path path.json --out flight --depth
 expect 0 "$gsfix" filter "$scene" --views 3 --out filtered
 ln -s "$scene/images" filtered/images
 expect 0 "$gsfix" info filtered
-expect 0 "$gsfix" restore flight --restorer "exec:cp \"\$1\"/frames/* \"\$1\"/out; true" --out restored
+sed -n '/by the tests as restore.sh -->/,/^```$/p' "$readme" | sed '1,2d;$d' > restore.sh # of README's tutorial
+expect 0 "$gsfix" restore flight --restorer "exec:sh $PWD/restore.sh" --out restored
 cmp flight/00003.png restored/00003.png || fail "a copied frame changed"
 expect 1 "$gsfix" restore flight --restorer warp --out restored
 holds "cameras.json" stderr
