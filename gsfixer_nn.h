@@ -322,10 +322,6 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, cons
                                                           const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
                                                           gsf_nn_features* features);
 GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features);
-// Writes the file that gsf_nn_dit_desc.features names: dino_latents, vggt_latents (what was computed) and, unless NULL,
-// prompt_embeds (2, text tokens, text channels): negative prompt, prompt.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, const gsf_nn_features* features,
-                                                      const gsf_tensor* prompt_embeds);
 
 // ---- tokens: byte-level pair encoding -----------------------------------------------
 // What GPT-2 and OPT read, as transformers 4.51.3 does it (GPT2Tokenizer).
@@ -2955,7 +2951,6 @@ struct gsf__linear_job {
     float *bias, *packed, *few;   // bias: zeros where there is none, 16 more than `out`
     float* workers;
 };
-
 
 // `total` in equal pieces of at most `most`, rounded up to a multiple of `unit`.
 static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
@@ -7083,21 +7078,6 @@ GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features
     gsf_free(ctx, features->dino);
     gsf_free(ctx, features->vggt);
     memset(features, 0, sizeof *features);
-}
-
-GSF_API gsf_result gsf_nn_save_features(gsf_context* ctx, const char* path, const gsf_nn_features* features,
-                                        const gsf_tensor* prompt_embeds) {
-    gsf_tensor tensors[3];
-    size_t count = 0;
-    const int64_t dino[3] = {features->images, features->tokens, features->dino_channels};
-    const int64_t vggt[3] = {features->images, features->tokens, features->vggt_channels};
-    if (features->dino) tensors[count++] = gsf_nn_wrap_tensor("dino_latents", features->dino, 3, dino);
-    if (features->vggt) tensors[count++] = gsf_nn_wrap_tensor("vggt_latents", features->vggt, 3, vggt);
-    if (prompt_embeds) {
-        tensors[count] = *prompt_embeds;
-        tensors[count++].name = "prompt_embeds";
-    }
-    return gsf_nn_save_tensors(ctx, path, tensors, count);
 }
 
 // ---- >>nn bpe -------------------------------------------------------------------
@@ -12072,10 +12052,13 @@ GSF_API gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, con
 }
 
 GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out) {
-    gsf__nn_config config;
+    void* text;
+    size_t size;
     memset(out, 0, sizeof *out);
-    GSF__TRY(gsf__nn_load_config(ctx, path, &config));
-    return gsf__nn_schedule_from(ctx, &config, out);
+    GSF__TRY(gsf_read_file(ctx, path, &text, &size));
+    const gsf_result result = gsf_nn_parse_schedule(ctx, path, (const char*)text, size, out);
+    gsf_free(ctx, text);
+    return result;
 }
 
 // One of the `steps` times before the cut by strength; numpy's arithmetic, half to even.
@@ -13592,9 +13575,12 @@ static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, 
     return GSF_OK;
 }
 
-static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const char* path) {
+// data: the file's bytes where they have been read already, else NULL.
+static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const char* path, const void* data,
+                                         size_t size) {
     gsf_nn_weights file;
-    gsf_result result = gsf_nn_open_weights(ctx, path, NULL, &file);
+    gsf_result result = data ? gsf_nn_open_weights_memory(ctx, path, data, size, &file)
+                             : gsf_nn_open_weights(ctx, path, NULL, &file);
     for (size_t i = 0; i < file.tensor_count && !result; i++)
         result = gsf__dit_read_feature(ctx, r, file.name, &file.tensors[i]);
     const gsf__dit_kept *dino = gsf__dit_find(r, "dino_latents"), *vggt = gsf__dit_find(r, "vggt_latents");
@@ -13613,7 +13599,7 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
     const gsf__dit_part vggt = {ctx, r, "vggt_latents", NULL, 0, NULL};
     void* saved = NULL;
     size_t size;
-    if (r->desc.features) GSF__TRY(gsf__dit_read_features(ctx, r, r->desc.features));
+    if (r->desc.features) GSF__TRY(gsf__dit_read_features(ctx, r, r->desc.features, NULL, 0));
     r->unsaved = 1;
     if (!gsf__dit_has(r, "prompt_embeds", "clip")) {
         GSF__TRY(gsf__dit_text(&prompt, NULL));
@@ -13625,9 +13611,9 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
         GSF__TRY(gsf__dit_vggt(&vggt));
     if (r->desc.keep_saved && r->desc.save_features) // last, so that a run that goes on looks where it did before
         GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
-    const int there = saved != NULL;
+    const gsf_result result = saved ? gsf__dit_read_features(ctx, r, r->desc.save_features, saved, size) : GSF_OK;
     gsf_free(ctx, saved);
-    return there ? gsf__dit_read_features(ctx, r, r->desc.save_features) : GSF_OK;
+    return result;
 }
 
 static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
