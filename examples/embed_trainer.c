@@ -1,7 +1,7 @@
 // embed_trainer.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/embed_trainer.c -o embed_trainer -lm
-// The splat trainer inside a host's frame loop: start, some steps per frame, a render of the half-trained scene on
-// every frame, finish.   embed_trainer [SCENE [OUT.ply [FRAMES]]]
-// SCENE is a COLMAP folder; without one the program trains on pictures of random splats. Ctrl-C stops early and saves.
+// The splat trainer inside a host's frame loop: a few training steps and one render of the current state per frame.
+//     embed_trainer [SCENE [OUT.ply [FRAMES]]]
+// SCENE is a COLMAP folder; without one the program trains on renders of random splats. Ctrl-C stops early and saves.
 #include "gsfixer_splat.h"
 
 #include <math.h>
@@ -16,7 +16,7 @@ typedef struct host {
     gsf_scene scene;
     gsf_train_view* views;
     size_t view_count;
-    gsf_splats start; // what training begins with
+    gsf_splats start; // initial splats
     gsf_trainer* trainer;
 } host;
 
@@ -39,7 +39,7 @@ static gsf_result fill_random_splats(gsf_context* ctx, uint64_t seed, size_t cou
     return result;
 }
 
-// Photos of a scene that does not exist: 4 cameras around random splats.
+// Synthetic photos: random splats rendered from 4 cameras.
 static gsf_result make_random_views(host* h) {
     gsf_context* ctx = &h->ctx;
     gsf_splats truth = {0};
@@ -76,7 +76,7 @@ static gsf_result load_views(host* h, const char* path) {
         if (result != GSF_OK) return result;
         h->views[h->view_count].camera = h->scene.views[h->view_count].camera;
         h->views[h->view_count].image = h->scene.views[h->view_count].image;
-        h->views[h->view_count].image.owned = NULL; // stays the scene's
+        h->views[h->view_count].image.owned = NULL; // owned by the scene
     }
     return gsf_splat_from_points(ctx, h->scene.points, h->scene.colors, h->scene.point_count, NULL, 2, h->scene.origin,
                                  &h->start);
@@ -88,7 +88,7 @@ static gsf_result run_frames(host* h, int frames) {
     out.color = gsf_wrap_image(preview, GSF_F32, PREVIEW_WIDTH, PREVIEW_HEIGHT, 3);
     gsf_train_stats stats = {0};
     for (int frame = 0; frame < frames; frame++) {
-        for (int i = 0; i < STEPS_PER_FRAME; i++) { // a host would stop at its time budget
+        for (int i = 0; i < STEPS_PER_FRAME; i++) { // a real host would stop when its time budget is used up
             const gsf_result result = gsf_splat_train_step(&h->ctx, h->trainer, &stats);
             if (result != GSF_OK) return result;
         }
@@ -96,7 +96,7 @@ static gsf_result run_frames(host* h, int frames) {
         const gsf_camera camera = gsf_camera_resized(shot, PREVIEW_WIDTH, PREVIEW_HEIGHT);
         const gsf_result result = gsf_splat_trainer_render(&h->ctx, h->trainer, &camera, &out);
         if (result != GSF_OK) return result;
-        double mean = 0.0; // a host would show the picture
+        double mean = 0.0; // a real host would display the image
         const size_t values = sizeof preview / sizeof preview[0];
         for (size_t i = 0; i < values; i++) mean += (double)preview[i] / (double)values;
         printf("frame %3d  iteration %4d  %6zu splats  loss %.4f  mean brightness %.3f\n", frame, (int)stats.iteration,
@@ -119,7 +119,7 @@ int main(int argc, char** argv) {
     if (result == GSF_OK)
         result = gsf_splat_make_trainer(&h.ctx, &desc, h.views, h.view_count, &h.start, &h.trainer);
     if (result == GSF_OK) result = run_frames(&h, frames);
-    if (result == GSF_ERROR_CANCELLED) { // what is there by now is a complete set of splats
+    if (result == GSF_ERROR_CANCELLED) { // the splats are complete and usable after every step
         gsf_clear_cancel(&h.ctx);
         result = GSF_OK;
     }

@@ -1,4 +1,4 @@
-// gsfix.h - what the files of the program gsfix share
+// gsfix.h - shared declarations of the program gsfix
 // SPDX-License-Identifier: MIT
 #ifndef GSFIX_H
 #define GSFIX_H
@@ -28,12 +28,12 @@ typedef struct gsfix_options { // NULL, 0 or -1: not given; see the table in gsf
 
 enum { GSFIX_CLIP_STAGES = 12 };
 
-typedef struct gsfix_clip_stage { // what the restorer dit: did in all clips
+typedef struct gsfix_clip_stage { // one stage of the restorer dit, summed over all clips
     char name[16];
-    double seconds, memory;  // memory: anonymous bytes that were resident behind its units, at most
+    double seconds, memory;  // memory: peak of resident anonymous bytes
 } gsfix_clip_stage;
 
-typedef struct gsfix_out gsfix_out; // gsfix_out.c
+typedef struct gsfix_out gsfix_out; // defined in gsfix_out.c
 
 typedef struct gsfix_app {
     gsf_context ctx;
@@ -42,13 +42,13 @@ typedef struct gsfix_app {
     const char* command;
     char* command_line; // as typed, quoted for a shell
     double started;     // gsfix_now() at the start
-    gsf_text json;      // what --json prints; the other output is for people
-    int terminal;       // stderr is one
-    int bar_shown;      // a progress bar stands on the terminal's last line
+    gsf_text json;      // the object that --json prints
+    int terminal;       // stderr is a terminal
+    int bar_shown;      // the last line of the terminal is a progress bar
     double bar_time;
-    int line_share;     // tenth of the work that the last plain progress line told
-    double clip_line;   // gsfix_now() of the last line about the clip that is being restored
-    double stage_begin; // of the unit of the restorer's work that is being done
+    int line_share;     // tenth of the work that the last plain progress line reported
+    double clip_line;   // gsfix_now() of the last progress line of the current clip
+    double stage_begin; // gsfix_now() at the start of the restorer's current unit of work
     gsfix_clip_stage stages[GSFIX_CLIP_STAGES];
     int stage_count;
 } gsfix_app;
@@ -60,17 +60,17 @@ typedef struct gsfix_names { char** names; size_t count; } gsfix_names;
 
 double gsfix_now(void); // seconds, monotonic
 uint64_t gsfix_peak_memory(void);
-double gsfix_anonymous_memory(void); // resident bytes that are no file's, now; 0: unknown
-double gsfix_physical_memory(void); // bytes that the machine has; 0: unknown
+double gsfix_anonymous_memory(void); // resident bytes not backed by files, at present; 0: unknown
+double gsfix_physical_memory(void);  // bytes of RAM; 0: unknown
 gsfix_path gsfix_pathf(const char* format, ...) GSF_PRINTF(1, 2);
 int gsfix_exists(const char* path);
 int gsfix_is_folder(const char* path);
-gsf_result gsfix_make_folder(gsf_context* ctx, const char* path); // with its parents
+gsf_result gsfix_make_folder(gsf_context* ctx, const char* path); // creates missing parents, too
 // Sorted file names of a folder that end in one of the extensions (".png.jpg", lower case).
 gsf_result gsfix_list(gsf_context* ctx, const char* folder, const char* extensions, gsfix_names* out);
 void gsfix_free_names(gsf_context* ctx, gsfix_names* names);
 char* gsfix_copy_text(gsf_context* ctx, const char* text, size_t size);
-// Room for one more element of a list of `count`, of `size` bytes each.
+// Makes room for one more element of `size` bytes in a list of `count`.
 gsf_result gsfix_grow(gsf_context* ctx, void** list, size_t* room, size_t count, size_t size);
 // File name without folder and extension.
 gsfix_path gsfix_stem(const char* path);
@@ -78,60 +78,63 @@ gsfix_path gsfix_stem(const char* path);
 gsfix_path gsfix_view_stem(const gsf_scene* scene, size_t view);
 gsf_result gsfix_save_npy(gsf_context* ctx, const char* path, const gsf_image* image); // f32, one channel
 gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out);
-// gsf_save_image for each; they are encoded all at once, which takes longer than rendering.
+// gsf_save_image for each; in parallel, since encoding takes longer than rendering.
 gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gsf_image* images, size_t count);
-void gsfix_clamp(gsf_image* image); // packed f32 to [0,1], NaN to 0
-int gsfix_counts_any(const gsf_image* mask); // a u8 mask of one channel has a pixel that counts
-// Picture of packed f32 values: t = (value - low) / (high - low) through a perceptual map (warm: black to yellow).
+void gsfix_clamp(gsf_image* image);          // clamps packed f32 to [0,1], NaN to 0
+int gsfix_counts_any(const gsf_image* mask); // does a u8 mask of one channel have a pixel that counts?
+// Colour-maps packed f32 values: t = (value - low) / (high - low) on a perceptually uniform map (warm: black to yellow).
 gsf_result gsfix_color_map(gsf_context* ctx, const gsf_image* values, double low, double high, gsf_image* out);
-// Depth as people like to see it: near is bright, scaled to the depths that are there; black where nothing is.
+// Depth for display: near is bright, scaled to the range of the depths; black where there is none.
 gsf_result gsfix_color_depth(gsf_context* ctx, const gsf_image* depth, gsf_image* out);
 void gsfix_map_color(double t, uint8_t rgb[3]);
 gsf_result gsfix_mean_abs_error(gsf_context* ctx, const gsf_image* a, const gsf_image* b, gsf_image* out); // f32, 1 channel
 
 void gsfix_progress(gsfix_app* app, double done, double total, const char* format, ...) GSF_PRINTF(4, 5);
-void gsfix_note(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);   // a line on stderr
-void gsfix_print(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);  // on stdout, unless --json
+void gsfix_note(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);   // prints a line to stderr
+void gsfix_print(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);  // prints to stdout, unless --json
 void gsfix_hide_bar(gsfix_app* app);
 int gsfix_misused(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3); // one line on stderr; returns 2
-int gsfix_background(gsfix_app* app, float out[3], int32_t* random); // of --background; 0, or an exit code
-int gsfix_failed(gsfix_app* app);                                            // likewise from ctx.error; returns 1
+int gsfix_background(gsfix_app* app, float out[3], int32_t* random); // parses --background; 0 or an exit code
+int gsfix_failed(gsfix_app* app); // prints ctx.error; returns 1
 
-// A JSON object grows member by member in a gsf_text.
-void gsfix_json_begin(gsf_context* ctx, gsf_text* text, const char* key, char bracket); // key NULL: none
+// Append members to a JSON object in a gsf_text.
+void gsfix_json_begin(gsf_context* ctx, gsf_text* text, const char* key, char bracket); // key NULL: no key
 void gsfix_json_end(gsf_context* ctx, gsf_text* text, char bracket);
 void gsfix_json_text(gsf_context* ctx, gsf_text* text, const char* key, const char* value); // NULL: null
 void gsfix_json_number(gsf_context* ctx, gsf_text* text, const char* key, double value);
 void gsfix_json_bool(gsf_context* ctx, gsf_text* text, const char* key, int value);
 
-// ---- gsfix_out.c: whose file is whose -------------------------------------------
+// ---- gsfix_out.c: ownership of files ---------------------------------------------
 
 typedef struct gsfix_read_file { char* path; uint64_t size, digest; } gsfix_read_file;
 
-gsf_result gsfix_begin_files(gsfix_app* app); // from here on files are read and written through the hooks of gsfix_out.c
+gsf_result gsfix_begin_files(gsfix_app* app); // installs the read and write hooks of gsfix_out.c
 void gsfix_end_files(gsfix_app* app);
-// A file or folder that outputs must keep away from. What is read or named on the command line is known without this.
+// Declares a file or folder as an input, which outputs must not touch. Files that are read or named on the command line are
+// inputs without this.
 gsf_result gsfix_add_input(gsfix_app* app, const char* path);
-gsf_result gsfix_add_scene_inputs(gsfix_app* app, const gsf_scene* scene); // its photos, read or not
-gsf_result gsfix_digest_input(gsfix_app* app, const char* path); // of a file that is mapped, not read; NULL: nothing
-// What was read so far, in that order, with XXH64 digests; what is read from now on is no input.
+gsf_result gsfix_add_scene_inputs(gsfix_app* app, const gsf_scene* scene); // the scene's photos, whether read or not
+// For files that are mapped instead of read; NULL: does nothing.
+gsf_result gsfix_digest_input(gsfix_app* app, const char* path);
+// The files read so far, in order, with XXH64 digests. Files read from now on are not inputs.
 const gsfix_read_file* gsfix_end_inputs(gsfix_app* app, size_t* count);
 
-// A command claims each name below OUT that it may write ('*': any text without '/'), then opens OUT: fails with one line
-// where a file in the way was not written by gsfix, or OUT cannot be used. Nothing is changed so far.
+// A command claims each name below OUT that it may write ('*' matches any text without '/') and then opens OUT. Opening fails
+// with a message if a claimed name is taken by a file that gsfix did not write, or if OUT cannot be used; nothing has been
+// changed then.
 gsf_result gsfix_claim(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);
 gsf_result gsfix_open_out(gsfix_app* app);
-gsf_result gsfix_claim_file(gsfix_app* app, const char* path); // a file elsewhere that must be new; after gsfix_open_out
-// Removes what an earlier run of the same command wrote and this one will not write again.
+gsf_result gsfix_claim_file(gsfix_app* app, const char* path); // a new file outside OUT; call after gsfix_open_out
+// Removes what an earlier run of the same command wrote and this one does not write again.
 gsf_result gsfix_remove_stale(gsfix_app* app);
-gsf_result gsfix_remove_output(gsfix_app* app, const char* name); // if it is there and ours
-int gsfix_has_output(gsfix_app* app, const char* name);           // is it?
-gsfix_path gsfix_absolute(const char* path); // without links on the way; empty: there is no such folder
+gsf_result gsfix_remove_output(gsfix_app* app, const char* name); // if it exists and is ours
+int gsfix_has_output(gsfix_app* app, const char* name);           // does it exist and is it ours?
+gsfix_path gsfix_absolute(const char* path); // with links resolved; empty if there is no such folder
 
-// A fresh folder in OUT for a restorer. Only what lies in it is ever emptied or removed.
+// A new folder in OUT for a restorer's job. Nothing outside it is ever emptied or removed.
 gsf_result gsfix_make_job(gsfix_app* app, const char** path);
-gsf_result gsfix_empty_job(gsfix_app* app, const char* name); // its subfolder: made, or emptied
-gsf_result gsfix_check_job(gsfix_app* app, const char* name); // fails where the subfolder has become something else
+gsf_result gsfix_empty_job(gsfix_app* app, const char* name); // creates or empties a subfolder
+gsf_result gsfix_check_job(gsfix_app* app, const char* name); // fails if the subfolder has been replaced by something else
 void gsfix_leave_job(gsfix_app* app, int remove);
 
 // ---- gsfix_exec.c --------------------------------------------------------------
@@ -140,7 +143,7 @@ void gsfix_leave_job(gsfix_app* app, int remove);
 gsf_result gsfix_make_exec(gsfix_app* app, const char* command, double timeout, gsf_restorer* out);
 void gsfix_destroy_exec(gsf_context* ctx, gsf_restorer* restorer);
 
-// ---- gsfix.c: what several commands need -----------------------------------------
+// ---- gsfix.c: shared by several commands ------------------------------------------
 
 typedef struct gsfix_split { uint32_t *train, *test; size_t train_count, test_count; } gsfix_split;
 
@@ -149,24 +152,24 @@ gsf_result gsfix_split_scene(gsfix_app* app, const gsf_scene* scene, gsfix_split
 void gsfix_free_split(gsfix_app* app, gsfix_split* split);
 gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint32_t* views, size_t count,
                              gsf_camera** out); // freed with gsf_free
-// 0 = fine; else the exit code, with its line printed.
+// Returns 0, or an exit code after printing a message.
 int gsfix_check_restorer(gsfix_app* app);
 gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present);
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
-void gsfix_json_stages(gsfix_app* app, gsf_text* text); // "restorer_stages": [...], where there were any
+void gsfix_json_stages(gsfix_app* app, gsf_text* text); // "restorer_stages": [...], if there are any
 void gsfix_print_stages(gsfix_app* app);
-extern const char* const gsfix_conditions[4]; // how --condition spells gsf_nn_condition
-extern const char* const gsfix_solvers[3];    // and --solver gsf_nn_solver
-gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app);      // as the options have it, for --restorer dit:MODEL_DIR
-gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app);      // of the clip that was at work, when the whole is done
+extern const char* const gsfix_conditions[4]; // names of gsf_nn_condition for --condition
+extern const char* const gsfix_solvers[3];    // names of gsf_nn_solver for --solver
+gsf_nn_dit_desc gsfix_dit_desc(const gsfix_app* app); // from the options, for --restorer dit:MODEL_DIR
+gsf_result gsfix_drop_dit_checkpoint(gsfix_app* app); // removes the last clip's checkpoint when the run is complete
 gsf_traj_kind gsfix_path_kind(const char* name);
 
 // ---- gsfix_fix.c, gsfix_report.c -------------------------------------------------
 
 typedef struct gsfix_quality { // --quality is one of these rows
     const char* name;
-    gsf_quality work; // of training and of the loop
-    int32_t steps;    // of the restorer dit:
+    gsf_quality work; // for training and the loop
+    int32_t steps;    // denoising steps of dit
     gsf_nn_solver solver;
     int bf16;
 } gsfix_quality;
@@ -175,18 +178,19 @@ const gsfix_quality* gsfix_find_quality(const char* name); // NULL: the default
 typedef struct gsfix_score { double psnr, ssim, psnr_seen, ssim_seen; } gsfix_score; // NaN: not measured
 typedef struct gsfix_curve_point { int32_t iteration; uint64_t splats; double psnr, psnr_seen; } gsfix_curve_point;
 typedef struct gsfix_round { int32_t round, iteration, windows, skipped, frames; double confidence; } gsfix_round;
-typedef struct gsfix_flown { int32_t round, window, reference; double center[3], forward[3]; } gsfix_flown; // path frame
-typedef struct gsfix_sample { int32_t round, window, frame; } gsfix_sample; // pictures of it lie in DIR/report
+// A frame of the path.
+typedef struct gsfix_flown { int32_t round, window, reference; double center[3], forward[3]; } gsfix_flown;
+typedef struct gsfix_sample { int32_t round, window, frame; } gsfix_sample; // a frame whose images are in DIR/report
 
 enum { GSFIX_INIT, GSFIX_TRAIN, GSFIX_RENDER, GSFIX_RESTORE, GSFIX_DISTILL, GSFIX_CHECKPOINT, GSFIX_SAVE, GSFIX_COMPARE,
        GSFIX_STAGES };
 extern const char* const gsfix_stage_names[GSFIX_STAGES];
 
-typedef struct gsfix_history { // what a run remembers beside the fixer's state; part of the checkpoint
+typedef struct gsfix_history { // record of the run, stored in the checkpoint next to the fixer's state
     double seconds[GSFIX_STAGES], seconds_total;
     int32_t resumed;
     int32_t has_without;
-    gsfix_score* without; // one per test view, once has_without: after as many steps without repair (--compare)
+    gsfix_score* without; // one per test view if has_without: scores of the run without repair (--compare)
     gsfix_curve_point* without_curve;
     size_t view_count;
     gsfix_curve_point* curve;
@@ -197,7 +201,7 @@ typedef struct gsfix_history { // what a run remembers beside the fixer's state;
     size_t curve_room, without_room, round_room, path_room, sample_room;
 } gsfix_history;
 
-typedef struct gsfix_result { // of a finished run, for metrics.json and the report
+typedef struct gsfix_result { // results of a finished run, for metrics.json and the report
     const gsf_scene* scene;
     const gsfix_split* split;
     const gsfix_history* history;

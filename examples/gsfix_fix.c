@@ -1,4 +1,4 @@
-// gsfix_fix.c - the command fix: scene -> initial splats -> training with repair rounds -> splats, figures, report
+// gsfix_fix.c - the command fix: scene -> initial splats -> training with repair rounds -> splats, metrics, report
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
@@ -7,13 +7,13 @@
 
 // ---- defaults --------------------------------------------------------------------
 
-static const gsfix_quality qualities[] = { // what each saves and costs: bench/QUALITY.md
+static const gsfix_quality qualities[] = { // savings and costs: bench/QUALITY.md
     {"exact", GSF_QUALITY_EXACT, 50, GSF_NN_DDIM, 0},
     {"balanced", GSF_QUALITY_BALANCED, 50, GSF_NN_DDIM, 0},
     {"fast", GSF_QUALITY_FAST, 10, GSF_NN_UNIPC, 1},
 };
 
-// How --init spells gsf_initial_kind.
+// Names of gsf_initial_kind for --init.
 static const char* const initial_kinds[] = {NULL, "both", "tracks", "embree", "all", "dense", "random"};
 
 static gsf_initial_kind find_initial_kind(const char* name) {
@@ -30,9 +30,9 @@ const gsfix_quality* gsfix_find_quality(const char* name) {
 
 // ---- settings --------------------------------------------------------------------
 
-typedef struct fix_setup { // everything that decides what the run computes
+typedef struct fix_setup { // everything that determines the result
     gsf_fix_desc fix;
-    gsf_initial_desc initial; // once the splats are made, with its defaults filled in
+    gsf_initial_desc initial; // with its defaults filled in once the splats are made
 } fix_setup;
 
 enum { SET_WHOLE, SET_REAL, SET_SWITCH, SET_COUNT }; // int32_t, float, int32_t of 0 (off) or 1 (on), size_t
@@ -40,8 +40,9 @@ typedef struct setting { const char* name; int kind; size_t offset; double least
 #define TRAIN_AT(field) offsetof(fix_setup, fix.train.field)
 #define FIX_AT(field) offsetof(fix_setup, fix.field)
 #define DENSE_AT(field) offsetof(fix_setup, initial.dense.field)
-static const setting settings[] = { // zero: the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc;
-    // -1 where those have a meaning for negative values
+// Zero selects the library's default, see gsf_train_desc, gsf_fix_desc and gsf_dense_desc; -1 is allowed where those give
+// negative values a meaning.
+static const setting settings[] = {
     {"sh_degree", SET_WHOLE, offsetof(fix_setup, initial.sh_degree), 0, 3},
     {"random_points", SET_WHOLE, offsetof(fix_setup, initial.random_points), 1, 1e8},
     {"dropout", SET_REAL, TRAIN_AT(dropout), 0, 0.99},
@@ -141,7 +142,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     int code = apply_settings(app, setup);
     if (!code) code = gsfix_background(app, train->background, &train->background_random);
     if (code) return code;
-    if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // set to 0
+    if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // an explicit 0: the desc's zero means default
     if (app->o.path && app->o.trajectory) return gsfix_misused(app, "--path and --trajectory exclude each other");
     if (app->o.compare && !has_restorer(app)) return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     return gsfix_check_restorer(app);
@@ -164,19 +165,19 @@ typedef struct fix_run {
     gsf_splats initial;
     gsf_restorer restorer;
     int has_restorer;
-    int comparing; // now training without repair, for --compare; that comes first
+    int comparing; // in the run without repair, which comes first with --compare
     gsf_fixer* fixer;
     gsf_text switches; // JSON object
     const gsfix_read_file* inputs;
     size_t input_count;
     int resuming;
-    int checkpoint_failed; // the last one could not be written
-    const char* rays; // what traced them
+    int checkpoint_failed; // the last checkpoint could not be written
+    const char* rays; // what traced the visibility rays
     gsfix_history history;
     double total_before; // seconds of earlier runs that this one continues
     int32_t iteration, iterations, eval_every, checkpoint_every;
-    size_t checkpoint_bytes; // of the last one
-    double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds the last one took, all did; when it was done
+    size_t checkpoint_bytes; // size of the last checkpoint
+    double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds for the last one and for all; end time of the last
 } fix_run;
 
 static void add_seconds(fix_run* run, int stage, double* since) {
@@ -186,7 +187,7 @@ static void add_seconds(fix_run* run, int stage, double* since) {
     *since = now;
 }
 
-// Room for one more element of a list of the history. list: the member, stem: how its _count and _room begin
+// Makes room for one more element of a list in the history. list: the member; stem: prefix of its _count and _room
 #define GROW(ctx, h, list, stem) \
     gsfix_grow(ctx, (void**)&(h)->list, &(h)->stem##_room, (h)->stem##_count, sizeof *(h)->list)
 
@@ -222,7 +223,7 @@ static gsf_result render_view(fix_run* run, size_t i, gsf_image* color) { // tes
     return result;
 }
 
-// Over the pixels of a mask (NULL: all). No figures where it has none.
+// Scores over the pixels of a mask (NULL: all). NaN if the mask is empty.
 static gsf_result score_pixels(fix_run* run, const gsf_image* color, const gsf_image* photo, const gsf_image* mask,
                                double* psnr, double* ssim) {
     *psnr = NAN;
@@ -233,8 +234,8 @@ static gsf_result score_pixels(fix_run* run, const gsf_image* color, const gsf_i
     return result;
 }
 
-// What of a test view is measured where its photo has pixels that do not count: render and photo, black there, so that the
-// windows of SSIM hold nothing of them; which count; and which of these are seen, if that is asked for.
+// The images to measure for a test view whose photo has masked pixels: render and photo with these pixels black, so that they
+// do not enter the windows of SSIM; the mask; and, if wanted, the mask of the seen pixels among them.
 typedef struct cut_view { gsf_image color, photo, counts, seen; } cut_view;
 
 static gsf_result cut_to_photo(gsf_context* ctx, const gsf_scene_view* view, const gsf_image* color, const gsf_image* seen,
@@ -282,7 +283,7 @@ static gsf_result score_view(fix_run* run, size_t i, const gsf_image* color, int
     return result;
 }
 
-static gsfix_score mean_score(const gsfix_score* scores, size_t count) { // each figure over the views that have it
+static gsfix_score mean_score(const gsfix_score* scores, size_t count) { // each score averaged over the views that have it
     double sums[4] = {0}, counts[4] = {0};
     for (size_t i = 0; i < count; i++) {
         const double values[4] = {scores[i].psnr, scores[i].ssim, scores[i].psnr_seen, scores[i].ssim_seen};
@@ -293,7 +294,7 @@ static gsfix_score mean_score(const gsfix_score* scores, size_t count) { // each
     return mean;
 }
 
-// All held-out views; folder: where their pictures go, or NULL. scores: one per view.
+// Renders and scores all held-out views. folder: where the images are saved, or NULL. scores: one per view.
 static gsf_result evaluate(fix_run* run, const char* folder, int with_ssim, gsfix_score* scores) {
     gsf_result result = GSF_OK;
     for (size_t i = 0; i < run->split.test_count && result == GSF_OK; i++) {
@@ -357,13 +358,13 @@ static double as_written(float value) { // the shortest decimal that reads back 
     return strtod(text, NULL);
 }
 
-static size_t masked_photos(const fix_run* run) { // of those that are trained on or measured
+static size_t masked_photos(const fix_run* run) { // number of masked photos among those trained on or measured
     size_t count = 0;
     for (size_t i = 0; i < run->scene.view_count; i++) count += run->scene.views[i].weight.data != NULL;
     return count;
 }
 
-// What the run computes, by name and with every default filled in: printed in metrics.json, and what --resume insists on.
+// All settings that affect the result, with defaults filled in: printed in metrics.json, and compared by --resume.
 static void write_dit_switches(fix_run* run) {
     const gsf_nn_dit_desc dit = gsfix_dit_desc(run->app);
     const gsf_nn_sample_desc d = gsf_nn_resolve_sample(&dit.sample);
@@ -455,13 +456,13 @@ static void write_curve_rows(gsf_context* ctx, gsf_text* t, const char* key, con
     gsfix_json_end(ctx, t, ']');
 }
 
-// History as JSON: lists of numbers, so that reading back is one loop per list.
+// The history as JSON: lists of numbers, so that each list is read back by one loop.
 static void write_history(fix_run* run, gsf_text* t) {
     gsf_context* ctx = run->ctx;
     const gsfix_history* h = &run->history;
     gsfix_json_begin(ctx, t, NULL, '{');
     gsfix_json_begin(ctx, t, "switches", '{');
-    t->size--; // the object itself follows
+    t->size--; // drop the brace; the object itself is appended
     gsf_text_append(ctx, t, run->switches.data, run->switches.size);
     gsfix_json_begin(ctx, t, "inputs", '[');
     for (size_t i = 0; i < run->input_count; i++) {
@@ -509,7 +510,7 @@ static gsf_result save_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_text chunks = {0}, history = {0};
     const double begin = gsfix_now();
-    const size_t room = run->checkpoint_bytes + run->checkpoint_bytes / 8; // mostly enough, so that nothing grows
+    const size_t room = run->checkpoint_bytes + run->checkpoint_bytes / 8; // usually enough to avoid reallocation
     chunks.data = room ? (char*)gsf_alloc(ctx, room, 1) : NULL;
     chunks.capacity = chunks.data ? room : 0;
     write_history(run, &history);
@@ -528,8 +529,8 @@ static gsf_result save_checkpoint(fix_run* run) {
     return result;
 }
 
-// Where a checkpoint may be written, is this one worth its time? What the run computes does not depend on the answer.
-// With the next one and the last, which is always written, they take less than 2 % of the time so far.
+// Decides whether to write a checkpoint at a point where one may be written; the result of the run does not depend on it.
+// Together with the next one and the last, which is always written, checkpoints take less than 2 % of the elapsed time.
 static int checkpoint_pays(const fix_run* run) {
     const double now = gsfix_now();
     return now - run->checkpoint_end >= 1.0 &&
@@ -567,7 +568,7 @@ static gsf_result compare_switches(fix_run* run, const char* name, const gsf_jso
     return result;
 }
 
-// Every file that was read then and now has the bytes that it had; where they lie does not matter.
+// Checks that every file read then and now has the same content; its path does not matter.
 static gsf_result compare_inputs(fix_run* run, const char* name, const gsf_json* old, const gsf_json_value* was) {
     if (!was || was->type != GSF_JSON_ARRAY)
         return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: does not say what it was made from (--restart begins anew)", name);
@@ -583,13 +584,14 @@ static gsf_result compare_inputs(fix_run* run, const char* name, const gsf_json*
     return GSF_OK;
 }
 
-static const gsf_json_value* whole_member(const gsf_json* json, const char* key, double most) { // NULL: not there, not such
+// NULL: missing or out of range.
+static const gsf_json_value* whole_member(const gsf_json* json, const char* key, double most) {
     const gsf_json_value* v = gsf_json_member(json, &json->values[0], key);
     return v && v->type == GSF_JSON_NUMBER && v->number >= 0.0 && v->number <= most && v->number == floor(v->number) ? v : NULL;
 }
 
-// The rows of a list of the history. kinds: what each column holds: w = 0 to 1e9, i = the same or -1, c = a count up to
-// 2^53 (all whole), f = a finite number, n = that or null, which is NaN.
+// Reads the rows of a list in the history. kinds gives the type of each column: w = integer in 0..1e9, i = the same or -1,
+// c = integer in 0..2^53, f = finite number, n = finite number or null (NaN).
 static gsf_result read_rows(fix_run* run, const char* name, const gsf_json* json, const char* key, const char* kinds,
                             double** rows, size_t* count) {
     gsf_context* ctx = run->ctx;
@@ -655,7 +657,7 @@ static gsf_result read_history(fix_run* run, const char* name, const gsf_json* j
     size_t n = 0;
     if (!resumed || !iteration || !comparing)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid number of steps or of earlier runs", name);
-    h->resumed = (int32_t)resumed->number + (resumed->number < 1e9); // no further than is read again
+    h->resumed = (int32_t)resumed->number + (resumed->number < 1e9); // capped at the largest value that can be read back
     run->iteration = (int32_t)iteration->number;
     run->comparing = (int)comparing->number;
     for (size_t i = 0; i < GSFIX_STAGES; i++) {
@@ -679,7 +681,7 @@ static gsf_result read_history(fix_run* run, const char* name, const gsf_json* j
     return result;
 }
 
-// The checkpoint's bytes and its JSON; both are the caller's to free, also after a failure.
+// Reads the checkpoint and its JSON; the caller frees both, even after a failure.
 static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, size_t* size, gsf_json* json) {
     gsf_context* ctx = run->ctx;
     gsf_chunk chunk;
@@ -691,7 +693,7 @@ static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, s
     return result;
 }
 
-// A new one, in the place of what there was: with the restorer unless the run is comparing.
+// Replaces the fixer by a new one, with the restorer unless this is the run without repair.
 static gsf_result start_fixer(fix_run* run) {
     gsf_context* ctx = run->ctx;
     gsf_splat_destroy_fixer(ctx, run->fixer);
@@ -701,7 +703,7 @@ static gsf_result start_fixer(fix_run* run) {
     gsf_result result = gsf_splat_load_train_views(ctx, &run->scene, run->split.train, n, &views);
     if (result != GSF_OK) return result;
     gsf_fix_desc desc = run->setup.fix;
-    desc.points = run->scene.points; // they keep the path upright
+    desc.points = run->scene.points; // they determine the up direction of the path
     desc.point_count = run->scene.point_count;
     desc.path = run->path;
     desc.path_count = run->path_count;
@@ -729,7 +731,7 @@ static gsf_result resume(fix_run* run) {
     return result;
 }
 
-// A checkpoint that is there is gone on from, or given up by name; never just replaced.
+// An existing checkpoint is continued or, with --restart, discarded; it is never silently replaced.
 static gsf_result meet_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
     const gsfix_options* o = &run->app->o;
@@ -751,7 +753,7 @@ static gsf_result meet_checkpoint(fix_run* run) {
     return gsf_fail(ctx, GSF_ERROR_IO, "%s holds the checkpoint of a run%s: --resume goes on, --restart begins anew", o->out, step);
 }
 
-// A training that could finish goes on without one; the last good one stays where it is.
+// Training continues if a checkpoint cannot be written; the last good one stays in place.
 static void keep_checkpoint(fix_run* run) {
     const gsf_result result = save_checkpoint(run);
     if (result != GSF_OK && !run->checkpoint_failed)
@@ -763,7 +765,7 @@ static void keep_checkpoint(fix_run* run) {
 
 // ---- the loop --------------------------------------------------------------------
 
-// Every name that this run may write. What is missing here cannot be written.
+// Claims every name that this run may write; others cannot be written.
 static gsf_result open_fix_out(fix_run* run) {
     gsfix_app* app = run->app;
     static const char* const always[] = {"checkpoint", "dit.checkpoint", "splats.ply", "metrics.json", "report.html"};
@@ -799,7 +801,7 @@ static gsf_result prepare(fix_run* run) {
     if (result == GSF_OK) result = gsfix_split_scene(app, &run->scene, &run->split);
     if (result == GSF_OK && app->o.compare && !run->split.test_count)
         result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "--compare: the scene has no held-out view to compare on");
-    if (result == GSF_OK) result = open_fix_out(run); // before the work that would be wasted
+    if (result == GSF_OK) result = open_fix_out(run); // before any expensive work
     if (result == GSF_OK) result = meet_checkpoint(run);
     if (result == GSF_OK) result = gsfix_make_restorer(app, &run->restorer, &run->has_restorer);
     if (result == GSF_OK)
@@ -817,7 +819,7 @@ static gsf_result prepare(fix_run* run) {
     run->inputs = gsfix_end_inputs(app, &run->input_count);
     run->history.view_count = run->split.test_count;
     run->history.without = (gsfix_score*)gsf_alloc_zeroed(ctx, run->split.test_count + 1, sizeof *run->history.without);
-    write_switches(run); // of the fixer with the restorer, if there is one
+    write_switches(run); // from the fixer with the restorer, if there is one
     if (!run->history.without || run->switches.failed) return GSF_ERROR_OUT_OF_MEMORY;
     run->comparing = app->o.compare;
     if (run->resuming) result = resume(run);
@@ -830,7 +832,7 @@ static gsf_result prepare(fix_run* run) {
     return result;
 }
 
-// For the report: a frame a quarter along the window, where the camera is leaving the photo it starts from.
+// The frame shown in the report: a quarter into the window, where the camera leaves the photo it started from.
 static gsf_result keep_sample(fix_run* run, const gsf_fix_stats* stats) {
     gsfix_history* h = &run->history;
     const int32_t i = stats->frame_count / 4;
@@ -900,7 +902,7 @@ static gsf_result after_window(fix_run* run, const gsf_fix_stats* stats) {
     return result;
 }
 
-// What is due after a step: pictures, held-out figures, checkpoint. The step itself is done and stays done.
+// Work due after a step: images, held-out scores, checkpoint. The step itself is already complete.
 static gsf_result follow_step(fix_run* run, const gsf_fix_stats* stats, double* clock) {
     gsf_result result = GSF_OK;
     int due = 0;
@@ -955,7 +957,7 @@ static gsf_result run_loop(fix_run* run) {
         gsf_fix_stats stats;
         result = gsf_splat_fix_step(ctx, run->fixer, &stats);
         if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
-        const int cancelled = gsf_is_cancelled(ctx); // what follows belongs to the step
+        const int cancelled = gsf_is_cancelled(ctx); // the rest of the step is completed first
         gsf_clear_cancel(ctx);
         result = follow_step(run, &stats, &clock);
         if (cancelled) gsf_request_cancel(ctx);
@@ -973,7 +975,7 @@ static gsf_result run_loop(fix_run* run) {
                     (int)run->iteration, (int)run->iterations, run->app->o.out);
 }
 
-// The training without repair is over: its figures and pictures are kept, its splats are not.
+// The run without repair is complete: keeps its scores and images, discards its splats.
 static gsf_result end_comparison(fix_run* run) {
     gsfix_history* h = &run->history;
     double clock = gsfix_now();
@@ -1023,7 +1025,7 @@ static void write_views(fix_run* run, const gsfix_result* r, gsf_text* t) {
     gsfix_json_end(ctx, t, ']');
 }
 
-static int window_frames(const gsfix_history* h, int32_t round) { // of each window of a round, as the restorer had them
+static int window_frames(const gsfix_history* h, int32_t round) { // frames per window of a round, as given to the restorer
     int count = 0;
     for (size_t i = 0; i < h->path_count; i++) count += h->path[i].round == round && h->path[i].window == 1;
     return count;
@@ -1063,7 +1065,7 @@ static void write_course(fix_run* run, gsf_text* t) { // rounds and curves
     if (h->has_without) write_curve(ctx, t, "curve_without_repair", h->without_curve, h->without_count);
 }
 
-// The members of metrics.json into app->json (whose opening brace stands already).
+// Appends the members of metrics.json to app->json, which already has the opening brace.
 static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsf_context* ctx = run->ctx;
     gsf_text* t = &run->app->json;

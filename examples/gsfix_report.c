@@ -1,4 +1,4 @@
-// gsfix_report.c - DIR/report.html: one file that shows a stranger what a run did; no request leaves it
+// gsfix_report.c - DIR/report.html: a self-contained page about a run; it makes no network requests
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
@@ -7,8 +7,8 @@
 
 enum {
     PICTURE_SIDE = 512,        // longer side of an embedded picture, pixels
-    VIEW_BYTES = 3400000,      // what the held-out views may take of the file
-    SAMPLE_BYTES = 1100000,    // and the repaired frames
+    VIEW_BYTES = 3400000,      // share of the file for the held-out views
+    SAMPLE_BYTES = 1100000,    // share of the file for the repaired frames
     VIEWS_MOST = 12, SAMPLES_MOST = 6, CLOUD_POINTS = 6000,
 };
 static const double error_white = 0.3; // mean absolute error at the bright end of the error maps
@@ -60,9 +60,9 @@ static void put_base64(page* p, const char* data, size_t size) {
     gsf_text_append(p->ctx, &p->html, out, used);
 }
 
-// ---- pictures --------------------------------------------------------------------
+// ---- images ----------------------------------------------------------------------
 
-static gsf_result put_image(page* p, const gsf_image* image, const char* alt) { // u8, shrunk where it is large
+static gsf_result put_image(page* p, const gsf_image* image, const char* alt) { // u8; large images are shrunk
     gsf_image small = {0};
     gsf_text bytes = {0};
     const int64_t side = image->width > image->height ? image->width : image->height;
@@ -96,7 +96,7 @@ static gsf_result put_error_map(page* p, const gsf_image* a, const gsf_image* b,
 }
 
 static gsf_result put_pane(page* p, const char* key, const char* side, const char* label, const gsf_image* a,
-                           const gsf_image* b) { // b: show the difference
+                           const gsf_image* b) { // b: show the difference from this image
     put(p, "<div class=\"pane%s%s\" data-k=\"%s\">", *side ? " " : "", side, key);
     const gsf_result result = b ? put_error_map(p, a, b, label) : put_image(p, a, label);
     put(p, "<span>%s</span></div>", label);
@@ -139,7 +139,7 @@ static gsf_result put_view(page* p, size_t i) {
     return result;
 }
 
-static void put_legend(page* p) { // of the error maps
+static void put_legend(page* p) { // colour scale of the error maps
     put_raw(p, "<div class=legend><span>error per pixel</span><span class=num>0</span><i style=\"background:linear-gradient(90deg");
     for (int i = 0; i <= 10; i++) {
         uint8_t c[3];
@@ -281,7 +281,7 @@ static void put_line(page* p, const plot* f, const gsfix_curve_point* points, si
     }
 }
 
-// The PSNR that a curve shows, widened to low..high; whether any is of seen pixels.
+// Widens low..high to the PSNR values of a curve; returns whether any of them is over seen pixels.
 static int curve_range(const gsfix_curve_point* points, size_t count, double* low, double* high) {
     int has_seen = 0;
     for (size_t i = 0; i < count; i++)
@@ -391,7 +391,7 @@ static void put_table(page* p) {
     put_raw(p, "</tbody></table></div></section>\n");
 }
 
-// How a switch of metrics.json is shown: under which heading, what zero (or less) means, and the unit ("<x": before it).
+// How a switch of metrics.json is displayed: heading, meaning of zero (or less), and unit ("<x": placed before the value).
 static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"views", "Photos", NULL, ""}, {"test_every", "Photos", "none held out", ""}, {"factor", "Photos", NULL, ""},
     {"max_size", "Photos", "no limit", " pixels"}, {"photo_masks", "Photos", NULL, ""}, {"photos_masked", "Photos", "none", ""},
@@ -411,7 +411,7 @@ static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"opacity_reset_interval", "Training", "never", " steps"}, {"lambda_ssim", "Training", "no SSIM term", ""},
 };
 
-static void put_number(page* p, double x) { // whole numbers in full
+static void put_number(page* p, double x) { // integers with all digits
     if (x == floor(x) && fabs(x) < 1e15) put(p, "%.0f", x);
     else put(p, "%.6g", x);
 }
@@ -511,7 +511,7 @@ static frame3 make_frame(const gsf_scene* scene) {
     const double along = forward[0] * up[0] + forward[1] * up[1] + forward[2] * up[2];
     for (int k = 0; k < 3; k++) forward[k] -= along * up[k];
     if (forward[0] * forward[0] + forward[1] * forward[1] + forward[2] * forward[2] < 1e-6) {
-        const double other[3] = {fabs(up[0]) < 0.7, fabs(up[0]) >= 0.7, 0.0}; // any direction across
+        const double other[3] = {fabs(up[0]) < 0.7, fabs(up[0]) >= 0.7, 0.0}; // any direction not parallel to up
         const double part = other[0] * up[0] + other[1] * up[1];
         for (int k = 0; k < 3; k++) forward[k] = other[k] - part * up[k];
     }
@@ -532,7 +532,7 @@ static frame3 make_frame(const gsf_scene* scene) {
 }
 
 static void put_cameras(page* p, const frame3* f, const char* key, const uint32_t* views, size_t count) {
-    put(p, "\"%s\":[", key); // centre and four corners of the image plane
+    put(p, "\"%s\":[", key); // centre and the four corners of the image plane
     for (size_t i = 0; i < count; i++) {
         const gsf_camera* camera = &p->r->scene->views[views[i]].camera;
         double c2w[16], center[3];
@@ -554,7 +554,7 @@ static void put_cameras(page* p, const frame3* f, const char* key, const uint32_
     put_raw(p, "],");
 }
 
-static void put_cloud(page* p, const frame3* f) { // splats that can be seen, coloured
+static void put_cloud(page* p, const frame3* f) { // coloured points of the splats that are visible enough
     const gsf_splats* s = p->r->splats;
     const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
     size_t solid = 0, taken = 0, shown = 0;
@@ -563,7 +563,7 @@ static void put_cloud(page* p, const frame3* f) { // splats that can be seen, co
     put_raw(p, "\"cloud\":[");
     for (size_t i = 0; i < s->count; i++) {
         if (!(s->opacity_logits[i] > least)) continue;
-        if (taken++ * CLOUD_POINTS / (solid + 1) < shown) continue; // evenly
+        if (taken++ * CLOUD_POINTS / (solid + 1) < shown) continue; // evenly spaced sample
         shown++;
         double world[3];
         int v[3], c[3];
@@ -608,7 +608,7 @@ static void put_scene(page* p) {
 
 // ---- page ------------------------------------------------------------------------
 
-static const char* const style[] = { // in pieces, since C only promises strings of 4095
+static const char* const style[] = { // in pieces, since C guarantees string literals of 4095 characters only
     ":root{--bg:#fbfaf8;--card:#fff;--ink:#1d1c1a;--soft:#6b6862;--line:#e4e1da;--accent:#0d7a6f;--warm:#c2570c;--good:#15803d;--bad:#b91c1c}",
     "@media(prefers-color-scheme:dark){:root{--bg:#161614;--card:#201f1d;--ink:#eceae4;--soft:#a09c93;--line:#35332f;--accent:#35b8a8;",
     "--warm:#f09149;--good:#4cc274;--bad:#f07575}}",
@@ -672,7 +672,7 @@ static const char* const style[] = { // in pieces, since C only promises strings
     "section{margin-top:22px}h2,h2+p{break-after:avoid}.cards.broad{grid-template-columns:1fr 1fr}svg,.stage3{break-inside:avoid}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}",
     NULL};
 
-static const char* const script[] = { // in pieces, since C only promises strings of 4095
+static const char* const script[] = { // in pieces, since C guarantees string literals of 4095 characters only
     "(function(){'use strict';var all=function(q){return Array.prototype.slice.call(document.querySelectorAll(q))};\n",
     "all('.cmp input').forEach(function(i){var f=function(){i.parentNode.style.setProperty('--x',i.value/10+'%')};i.addEventListener('input',f);f()});\n",
     "all('.choice button').forEach(function(b){b.addEventListener('click',function(){\n",

@@ -1,4 +1,4 @@
-// gsfix_util.c - files, pictures, JSON and progress for gsfix
+// gsfix_util.c - files, images, JSON and progress output for gsfix
 // SPDX-License-Identifier: MIT
 #include "gsfix.h"
 
@@ -50,7 +50,7 @@ double gsfix_anonymous_memory(void) {
     return bytes;
 }
 
-gsfix_path gsfix_pathf(const char* format, ...) { // too long a path is empty, and then not found
+gsfix_path gsfix_pathf(const char* format, ...) { // a path that is too long becomes empty, and is then not found
     gsfix_path path;
     va_list args;
     va_start(args, format);
@@ -77,7 +77,7 @@ gsf_result gsfix_make_folder(gsf_context* ctx, const char* path) {
         const char end = *p;
         *p = 0;
         const int reason = mkdir(part.s, 0777) == 0 ? 0 : errno;
-        if (reason && !gsfix_is_folder(part.s)) // EEXIST is also a file, or a link to nothing
+        if (reason && !gsfix_is_folder(part.s)) // EEXIST may also mean a file or a dangling link
             return gsf_fail(ctx, GSF_ERROR_IO, "%s: folder cannot be made: %s", part.s, strerror(reason));
         *p = end;
         if (!end) return GSF_OK;
@@ -150,7 +150,7 @@ gsfix_path gsfix_stem(const char* path) {
     return stem;
 }
 
-// Short: without extension, folders joined by '_'. Else whole, and different for every name.
+// Short form: no extension, folders joined by '_'. Full form: escaped, so that different names stay different.
 static gsfix_path flat_name(const char* name, int is_short) {
     gsfix_path flat = {""};
     size_t n = 0;
@@ -223,7 +223,7 @@ gsf_result gsfix_load_npy(gsf_context* ctx, const char* path, gsf_image* out) {
     return result;
 }
 
-// ---- pictures --------------------------------------------------------------------
+// ---- images ----------------------------------------------------------------------
 
 static size_t value_count(const gsf_image* image) {
     return (size_t)image->width * (size_t)image->height * (size_t)image->channels;
@@ -239,7 +239,7 @@ typedef struct encode_job {
 
 static void encode_one(void* arg, size_t i, int worker) {
     const encode_job* job = (const encode_job*)arg;
-    gsf_context own = *job->ctx; // a context serves one thread; this one starts no further work and says nothing
+    gsf_context own = *job->ctx; // a context serves one thread; this copy starts no parallel work and does not log
     (void)worker;
     own.parallel.worker_count = 1;
     memset(&own.logger, 0, sizeof own.logger);
@@ -325,7 +325,7 @@ gsf_result gsfix_color_depth(gsf_context* ctx, const gsf_image* depth, gsf_image
     gsf_free(ctx, inverse);
     const gsf_result result = gsf_make_image(ctx, GSF_U8, depth->width, depth->height, 3, out);
     if (result != GSF_OK) return result;
-    for (size_t i = 0; i < pixels; i++) // from 0.08, so that far differs from nothing
+    for (size_t i = 0; i < pixels; i++) // from 0.08, so that far surfaces differ from no surface
         if (z[i] > 0.0f)
             gsfix_map_color(0.08 + 0.92 * (1.0 / (double)z[i] - low) / (high - low), (uint8_t*)out->data + 3 * i);
     return GSF_OK;
@@ -353,7 +353,7 @@ gsf_result gsfix_mean_abs_error(gsf_context* ctx, const gsf_image* a, const gsf_
     return result;
 }
 
-// ---- talking ---------------------------------------------------------------------
+// ---- messages and progress -------------------------------------------------------
 
 void gsfix_hide_bar(gsfix_app* app) {
     if (app->bar_shown) fputs("\r\033[K", stderr);
@@ -366,7 +366,7 @@ static void print_time(double seconds, char text[32]) {
     else snprintf(text, 32, "%d:%02d:%02d", s / 3600, s / 60 % 60, s % 60);
 }
 
-// A bar on a terminal, at most ten times a second; elsewhere a line for each tenth of the work.
+// A progress bar on a terminal, at most ten updates a second; elsewhere one line per tenth of the work.
 void gsfix_progress(gsfix_app* app, double done, double total, const char* format, ...) {
     const double now = gsfix_now(), share = total > 0.0 ? done / total : 0.0;
     const int tenth = (int)(10.0 * share);

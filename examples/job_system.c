@@ -1,6 +1,6 @@
 // job_system.c - cc -O2 -std=c11 -DGSFIXER_IMPLEMENTATION -I. examples/job_system.c -o job_system -lpthread -lm
-// A host's own job system behind the parallel hook: here a small pool of POSIX threads. Renders random splats with one
-// worker and with four, and compares: the pictures are the same to the last bit.
+// A host's own job system behind the parallel hook, here a small pool of POSIX threads. Renders random splats with one
+// worker and with four and compares: the images are bit-identical.
 #define _POSIX_C_SOURCE 200809L
 #include "gsfixer_splat.h"
 #include <pthread.h>
@@ -14,9 +14,9 @@ typedef struct job_system {
     pthread_mutex_t lock; // guards everything below
     pthread_cond_t start, done;
     pthread_t threads[JOB_WORKERS_MAX];
-    int worker_count; // with the caller, who is worker 0
+    int worker_count; // including the caller, which is worker 0
     int busy, quit;
-    unsigned round; // number of the current loop
+    unsigned round; // counts the calls of job_for
     size_t count, next;
     gsf_chunk_fn body;
     void* arg;
@@ -24,7 +24,7 @@ typedef struct job_system {
 
 typedef struct job_worker { job_system* jobs; int index; } job_worker;
 
-static void job_take_chunks(job_system* jobs, int worker) { // lock held before and after
+static void job_take_chunks(job_system* jobs, int worker) { // called and returns with the lock held
     while (jobs->next < jobs->count) {
         const size_t chunk = jobs->next++;
         pthread_mutex_unlock(&jobs->lock);
@@ -53,7 +53,7 @@ static void* job_thread(void* arg) {
     return NULL;
 }
 
-// The hook: returns when every chunk is done. A thread that wakes up late finds no chunk left and does nothing.
+// The hook: returns when all chunks are done. A thread that wakes up late finds no chunks left and does nothing.
 static void job_for(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
     job_system* jobs = (job_system*)user;
     pthread_mutex_lock(&jobs->lock);
@@ -90,14 +90,14 @@ static int job_start(job_system* jobs, int worker_count) { // 0 on failure
         if (worker) *worker = (job_worker){jobs, jobs->worker_count};
         if (!worker || pthread_create(&jobs->threads[worker->index], NULL, job_thread, worker) != 0) {
             free(worker);
-            job_stop(jobs); // those that already run
+            job_stop(jobs); // stops the threads that have been started
             return 0;
         }
     }
     return 1;
 }
 
-#ifndef JOB_SYSTEM_ONLY // a file may include this one for the pool alone
+#ifndef JOB_SYSTEM_ONLY // define it to include only the pool
 enum { WIDTH = 320, HEIGHT = 240, SPLATS = 3000 };
 
 static gsf_result render_random_splats(gsf_context* ctx, float* pixels) {
@@ -141,7 +141,7 @@ int main(void) {
         if (result != GSF_OK) return fprintf(stderr, "%s\n", ctx.error), 1;
     }
     const int same = memcmp(pixels[0], pixels[1], sizeof pixels[0]) == 0;
-    printf("1 worker and 4 workers: %s\n", same ? "the same bits" : "DIFFERENT pictures");
+    printf("1 worker and 4 workers: %s\n", same ? "bit-identical images" : "DIFFERENT images");
     return same ? 0 : 1;
 }
 #endif

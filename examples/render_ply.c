@@ -1,6 +1,6 @@
 // render_ply.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/render_ply.c -o render_ply -lm
 // Renders splats (.ply, .splat, .spz) to PNG files:   render_ply SPLATS OUT_PREFIX [CAMERAS.json]
-// Without a camera list (the format of `gsfix path`) it flies one orbit of 8 pictures around the middle of the splats.
+// Without a camera list (the format of `gsfix path`) it renders an orbit of 8 images around the centre of the splats.
 // Writes OUT_PREFIX000.png, OUT_PREFIX001.png, ...
 #include "gsfixer_splat.h"
 
@@ -15,7 +15,7 @@ static int compare_floats(const void* a, const void* b) {
     return (x > y) - (x < y);
 }
 
-// Median position and median distance from it: stray splats do not matter.
+// Median position and median distance from it, which are robust against stray splats.
 static gsf_result measure_splats(gsf_context* ctx, const gsf_splats* splats, double center[3], double* radius) {
     const size_t n = splats->count;
     if (n == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "there are no splats to look at");
