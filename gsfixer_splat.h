@@ -361,8 +361,6 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_dense_points(gsf_context* ctx, const 
                                                         const gsf_dense_desc* desc, gsf_dense* out,
                                                         gsf_dense_stats* stats);
 GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense);
-// The desc with every default filled in.
-GSF_API gsf_dense_desc gsf_splat_dense_desc(const gsf_dense_desc* desc);
 
 // ---- rendering -----------------------------------------------------------------
 
@@ -6833,8 +6831,6 @@ GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense) {
     gsf_free(ctx, dense->view_counts);
     memset(dense, 0, sizeof *dense);
 }
-
-GSF_API gsf_dense_desc gsf_splat_dense_desc(const gsf_dense_desc* desc) { return gsf__dense_desc_defaults(desc); }
 
 GSF_API gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
                                           size_t view_count, const uint8_t* keep, const gsf_dense_desc* desc,
