@@ -318,11 +318,10 @@ typedef enum gsf_resize_filter {
     GSF_RESIZE_PIL_BILINEAR,   // PIL.Image.resize: antialiased when shrinking, u8 in two integer passes, bit-exact
     GSF_RESIZE_PIL_BICUBIC,    //   (a = -0.5)
     GSF_RESIZE_PIL_LANCZOS,    //   (a = 3)
-    GSF_RESIZE_TORCH_BILINEAR, // F.interpolate(bilinear, align_corners=False, antialias=False), f32 in and out
 } gsf_resize_filter;
 
-// Resizes src into dst (sizes taken from the views, which must not overlap; same dtype and channels; PIL: u8 or f32;
-// torch: f32). Channels are resized one by one: PIL itself multiplies colours by alpha first when it resizes RGBA.
+// Resizes src into dst (sizes taken from the views, which must not overlap; same dtype, u8 or f32, and channels). Channels
+// are resized one by one: PIL itself multiplies colours by alpha first when it resizes RGBA.
 GSF_API GSF_NODISCARD gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
                                                   const gsf_image* dst);
 
@@ -3579,89 +3578,20 @@ cleanup:
     return result;
 }
 
-// torch's upsample_bilinear2d with align_corners=False: position (i + 0.5) * in / out - 0.5, not below 0. Positions and
-// sums in double, rounded once; torch's own float32 run loses up to 4e-6 of the value range in its positions.
-typedef struct gsf__torch_tap {
-    int64_t low, high;
-    double weight_low, weight_high;
-} gsf__torch_tap;
-
-static gsf__torch_tap gsf__torch_position(int64_t i, int64_t in, int64_t out) {
-    gsf__torch_tap tap;
-    double at = ((double)i + 0.5) * ((double)in / (double)out) - 0.5;
-    if (at < 0.0) at = 0.0;
-    tap.low = (int64_t)at < in - 1 ? (int64_t)at : in - 1;
-    tap.high = tap.low < in - 1 ? tap.low + 1 : tap.low;
-    double share = at - (double)tap.low;
-    if (share > 1.0) share = 1.0;
-    tap.weight_low = 1.0 - share;
-    tap.weight_high = share;
-    return tap;
-}
-
-typedef struct gsf__torch_job {
-    const gsf_image *src, *dst;
-    const gsf__torch_tap* columns;
-} gsf__torch_job;
-
-static double gsf__float_at(const char* p) {
-    float v;
-    memcpy(&v, p, sizeof v);
-    return (double)v;
-}
-
-static void gsf__resize_rows_torch(void* arg, size_t chunk, int worker) {
-    (void)worker;
-    const gsf__torch_job* job = (const gsf__torch_job*)arg;
-    const gsf_image *src = job->src, *dst = job->dst;
-    const gsf__rows rows = gsf__chunk_rows(dst, chunk);
-    for (int64_t y = rows.begin; y < rows.end; y++) {
-        const gsf__torch_tap r = gsf__torch_position(y, src->height, dst->height);
-        for (int32_t c = 0; c < dst->channels; c++) {
-            const char* low = (const char*)src->data + r.low * src->stride_y + c * src->stride_c;
-            const char* high = (const char*)src->data + r.high * src->stride_y + c * src->stride_c;
-            char* to = (char*)dst->data + y * dst->stride_y + c * dst->stride_c;
-            for (int64_t x = 0; x < dst->width; x++, to += dst->stride_x) {
-                const gsf__torch_tap t = job->columns[x];
-                const int64_t a = t.low * src->stride_x, b = t.high * src->stride_x;
-                const double upper = gsf__float_at(low + a) * t.weight_low + gsf__float_at(low + b) * t.weight_high;
-                const double lower = gsf__float_at(high + a) * t.weight_low + gsf__float_at(high + b) * t.weight_high;
-                const float v = (float)(upper * r.weight_low + lower * r.weight_high);
-                memcpy(to, &v, sizeof v);
-            }
-        }
-    }
-}
-
-static gsf_result gsf__resize_torch(gsf_context* ctx, const gsf_image* src, const gsf_image* dst) {
-    gsf__torch_tap* columns = (gsf__torch_tap*)gsf_alloc(ctx, (size_t)dst->width, sizeof *columns);
-    if (!columns) return GSF_ERROR_OUT_OF_MEMORY;
-    for (int64_t x = 0; x < dst->width; x++) columns[x] = gsf__torch_position(x, src->width, dst->width);
-    gsf__torch_job job;
-    job.src = src;
-    job.dst = dst;
-    job.columns = columns;
-    gsf__parallel_for(ctx, gsf__row_chunks(dst), gsf__resize_rows_torch, &job);
-    gsf_free(ctx, columns);
-    return GSF_OK;
-}
-
 GSF_API gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
                                     const gsf_image* dst) {
     GSF__TRY(gsf__check_image(ctx, "resize: source", src));
     GSF__TRY(gsf__check_image(ctx, "resize: destination", dst));
     if (src->dtype != dst->dtype || src->channels != dst->channels)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: both images must have one dtype and channel count");
-    const int torch = filter == GSF_RESIZE_TORCH_BILINEAR;
-    if ((int)filter < 0 || filter > GSF_RESIZE_TORCH_BILINEAR)
+    if ((int)filter < 0 || filter > GSF_RESIZE_PIL_LANCZOS)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: filter %d", (int)filter);
-    if (src->dtype != GSF_F32 && (torch || src->dtype != GSF_U8))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: dtype %d (PIL filters: u8 or f32, torch: f32)",
-                        (int)src->dtype);
+    if (src->dtype != GSF_F32 && src->dtype != GSF_U8)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "resize: dtype %d (u8 or f32)", (int)src->dtype);
     const int64_t longest = 1 << 24;
     if (src->width > longest || src->height > longest || dst->width > longest || dst->height > longest)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "resize: more than %lld pixels along a side", (long long)longest);
-    return torch ? gsf__resize_torch(ctx, src, dst) : gsf__resize_pil(ctx, src, filter, dst);
+    return gsf__resize_pil(ctx, src, filter, dst);
 }
 
 // ---- >>metrics -----------------------------------------------------------------

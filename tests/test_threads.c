@@ -78,7 +78,7 @@ static void run_images(gsf_context* ctx, run_output* run) {
         CHECK_OK(ctx, gsf_resize_image(ctx, &image_bytes, filters[i], &image_small));
         add(out, small, W2 * H2 * 3);
     }
-    CHECK_OK(ctx, gsf_resize_image(ctx, &image_a, GSF_RESIZE_TORCH_BILINEAR, &image_small_floats));
+    CHECK_OK(ctx, gsf_resize_image(ctx, &image_a, GSF_RESIZE_PIL_BILINEAR, &image_small_floats));
     add(out, small_floats, W2 * H2 * 3 * sizeof(float));
 
     out = begin_stage(run, "metrics");
