@@ -779,8 +779,11 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 #define GSFIXER_NN_IMPLEMENTATION
 #endif
 #if defined(GSFIXER_NN_IMPLEMENTATION) || defined(__INTELLISENSE__) || defined(__JETBRAINS_IDE__)
-#ifndef GSF_NN_IMPLEMENTED
+#if !defined(GSF_NN_IMPLEMENTED) || defined(GSF__ISA)
 #define GSF_NN_IMPLEMENTED
+
+// Under GSF__ISA this header includes itself for one of its parts GSF__KERNELS_...: see >>lanes of gsfixer.h.
+#ifndef GSF__ISA
 
 #include "gsfixer.h" // again: its internals, if all was included before without an implementation macro
 
@@ -1889,18 +1892,58 @@ static gsf_result gsf__nn_config_read(const gsf__nn_config* config, const gsf__n
     return GSF_OK;
 }
 
-// ---- >>nn vector: exp and friends, eight at a time --------------------------------
+// ---- >>nn vector: what the vocabulary of >>lanes lacks ----------------------------
+
+// Asks for a line that is used soon, which may lie outside of what is there.
+GSF__SHARED void gsf__nn_prefetch(const float* at) {
+#if GSF__X86
+    _mm_prefetch((const char*)at, _MM_HINT_T0);
+#endif
+    (void)at;
+}
+
+#define gsf__v_put GSF__V(gsf__v_put)               // stores, with `stream` past the caches to an aligned place
+#define gsf__vd_load GSF__V(gsf__vd_load)           // as many floats as gsf__vd has lanes, widened
+#define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) of each pair of lanes (a, b)
 
 #if GSF__X86
+
+GSF__INLINE_AVX2 void gsf__v_put_avx2(float* y, __m256 v, int stream) {
+    if (stream) _mm256_stream_ps(y, v);
+    else _mm256_storeu_ps(y, v);
+}
+
+GSF__INLINE_AVX512 void gsf__v_put_avx512(float* y, __m512 v, int stream) {
+    if (stream) _mm512_stream_ps(y, v);
+    else _mm512_storeu_ps(y, v);
+}
+
+GSF__INLINE_AVX2 __m256d gsf__vd_load_avx2(const float* p) { return _mm256_cvtps_pd(_mm_loadu_ps(p)); }
+GSF__INLINE_AVX512 __m512d gsf__vd_load_avx512(const float* p) { return _mm512_cvtps_pd(_mm256_loadu_ps(p)); }
+
+GSF__INLINE_AVX2 __m256 gsf__v_turn_pairs_avx2(__m256 v, __m256 cos, __m256 sin) {
+    return _mm256_fmaddsub_ps(v, cos, _mm256_permute_ps(v, 0xb1) * sin);
+}
+
+GSF__INLINE_AVX512 __m512 gsf__v_turn_pairs_avx512(__m512 v, __m512 cos, __m512 sin) {
+    return _mm512_fmaddsub_ps(v, cos, _mm512_permute_ps(v, 0xb1) * sin);
+}
 
 // Lanes below `left` (at most 8 count) as a mask for _mm256_maskload_ps and _mm256_maskstore_ps.
 GSF__INLINE_AVX2 __m256i gsf__nn_mask8(int64_t left) {
     return _mm256_cmpgt_epi32(_mm256_set1_epi32(left < 8 ? (int)left : 8), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
 }
 
-GSF__INLINE_AVX2 float gsf__nn_sum8(__m256 v) { return gsf__v_sum_avx2(v); }
-GSF__INLINE_AVX2 double gsf__nn_sum4(__m256d v) { return gsf__vd_sum_avx2(v); }
-GSF__INLINE_AVX2 float gsf__nn_max8(__m256 v) { return gsf__v_largest_avx2(v); }
+GSF__INLINE_AVX512 __mmask16 gsf__nn_mask16(int64_t left) { return gsf__vm_first_avx512((size_t)left); } // left >= 0
+
+enum { GSF__NN_WHOLE16 = 0xffff }; // every lane
+
+GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { // a masked store takes several times as long
+    if (mask == GSF__NN_WHOLE16) _mm512_storeu_ps(y, v);
+    else _mm512_mask_storeu_ps(y, mask, v);
+}
+
+GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
 
 // to[j to_ld + i] = (from[i ld + j] - center[j]) factor for i, j < 8
 GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, __m256 center, __m256 factor, float* to,
@@ -1918,47 +1961,6 @@ GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, __m256 c
     _mm256_storeu_ps(to + 6 * to_ld, m[6]);
     _mm256_storeu_ps(to + 7 * to_ld, m[7]);
 }
-
-typedef gsf__v_exp2_terms_avx2 gsf__nn_exp2;
-
-GSF__INLINE_AVX2 gsf__nn_exp2 gsf__nn_exp2_constants(int pinned) { return gsf__v_exp2_of_avx2(pinned); }
-GSF__INLINE_AVX2 __m256 gsf__nn_power8(const gsf__nn_exp2* c, __m256 rounded, __m256 f) {
-    return gsf__v_power_avx2(c, rounded, f);
-}
-GSF__INLINE_AVX2 __m256 gsf__nn_exp2_low8(const gsf__nn_exp2* c, __m256 x) { return gsf__v_exp2_low_avx2(c, x); }
-GSF__INLINE_AVX2 __m256 gsf__nn_exp2_8(__m256 x) { return gsf__v_exp2_avx2(x); }
-GSF__INLINE_AVX2 __m256 gsf__nn_exp8(__m256 x) { return gsf__v_exp_avx2(x); }
-
-// The same, sixteen at a time.
-
-GSF__INLINE_AVX512 __mmask16 gsf__nn_mask16(int64_t left) { // lanes below `left`
-    return (__mmask16)(left < 16 ? (1u << left) - 1u : 0xffffu);
-}
-
-enum { GSF__NN_WHOLE16 = 0xffff }; // every lane
-
-GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { // a masked store takes several times as long
-    if (mask == GSF__NN_WHOLE16) _mm512_storeu_ps(y, v);
-    else _mm512_mask_storeu_ps(y, mask, v);
-}
-
-GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
-
-GSF__INLINE_AVX512 float gsf__nn_sum16(__m512 v) { return gsf__v_sum_avx512(v); }
-GSF__INLINE_AVX512 float gsf__nn_max16(__m512 v) { return gsf__v_largest_avx512(v); }
-GSF__INLINE_AVX512 __m512 gsf__nn_rounder16(void) { return gsf__v_exp2_of_avx512(0).rounder; }
-
-GSF__INLINE_AVX512 __m512 gsf__nn_power16(__m512 rounded, __m512 f) {
-    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(0);
-    return gsf__v_power_avx512(&terms, rounded, f);
-}
-
-GSF__INLINE_AVX512 __m512 gsf__nn_exp2_low16(__m512 x) { // 2^x for x <= 129 or NaN
-    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(0);
-    return gsf__v_exp2_low_avx512(&terms, x);
-}
-
-GSF__INLINE_AVX512 __m512 gsf__nn_exp16(__m512 x) { return gsf__v_exp_avx512(x); }
 
 // Pairs of bfloat16 lie in the lanes of floats.
 
@@ -2008,71 +2010,6 @@ static float gsf__nn_activation_ref(gsf_nn_activation activation, float x) {
     return x;
 }
 
-#if GSF__X86
-
-GSF__INLINE_AVX2 __m256 gsf__nn_gelu8(__m256 x) { // gsf__nn_gelu_ref
-    const gsf__nn_exp2 c = gsf__nn_exp2_constants(0);
-    const __m256 sign = _mm256_set1_ps(-0.0f), half_log2_e = _mm256_set1_ps(-0.72134752f), k = _mm256_set1_ps(3.5f);
-    const __m256 z = _mm256_min_ps(_mm256_set1_ps(13.2f), _mm256_andnot_ps(sign, x)); // a NaN stays, as below
-    const __m256 t = k / (z + k), s = t - _mm256_set1_ps(0.5f), square = z * z;
-    const __m256 rounded = _mm256_fmadd_ps(square, half_log2_e, c.rounder), n = rounded - c.rounder;
-    // what rounding took from the square and from the factor
-    const __m256 lost = _mm256_fmsub_ps(z, z, square) * half_log2_e;
-    const __m256 low = _mm256_fmadd_ps(square, _mm256_set1_ps(-9.62981495e-9f), lost);
-    const __m256 power = gsf__nn_power8(&c, rounded, _mm256_fmsub_ps(square, half_log2_e, n) + low);
-    __m256 tail = _mm256_set1_ps(gsf__nn_gelu_tail[9]);
-    for (int i = 8; i >= 0; i--) tail = _mm256_fmadd_ps(tail, s, _mm256_set1_ps(gsf__nn_gelu_tail[i]));
-    return _mm256_fnmadd_ps(z, power * (t * tail), _mm256_max_ps(_mm256_setzero_ps(), x));
-}
-
-// As gsf__nn_activation_ref; at -inf the limit -0, a NaN stays. `activation` had better be a constant.
-GSF__INLINE_AVX2 __m256 gsf__nn_activate8(gsf_nn_activation activation, __m256 x) {
-    const __m256 one = _mm256_set1_ps(1.0f);
-    if (activation == GSF_NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
-        x = _mm256_max_ps(_mm256_set1_ps(-12.0f), x); // from where on the power is inf
-        const __m256 slope = _mm256_fmadd_ps(x * x, _mm256_set1_ps(-0.10294324f), _mm256_set1_ps(-2.30220819f));
-        return x / (one + gsf__nn_exp2_8(x * slope));
-    }
-    if (activation == GSF_NN_SILU) {
-        x = _mm256_max_ps(_mm256_set1_ps(-100.0f), x);
-        return x / (one + gsf__nn_exp8(_mm256_sub_ps(_mm256_setzero_ps(), x)));
-    }
-    if (activation == GSF_NN_GELU) return gsf__nn_gelu8(x);
-    if (activation == GSF_NN_RELU) return _mm256_max_ps(_mm256_setzero_ps(), x); // of a NaN the second operand
-    return x;
-}
-
-GSF__INLINE_AVX512 __m512 gsf__nn_gelu16(__m512 x) { // gsf__nn_gelu8
-    const __m512 half_log2_e = _mm512_set1_ps(-0.72134752f), k = _mm512_set1_ps(3.5f);
-    const __m512 z = _mm512_min_ps(_mm512_set1_ps(13.2f), _mm512_abs_ps(x));
-    const __m512 t = k / (z + k), s = t - _mm512_set1_ps(0.5f), square = z * z;
-    const __m512 rounded = _mm512_fmadd_ps(square, half_log2_e, gsf__nn_rounder16()), n = rounded - gsf__nn_rounder16();
-    const __m512 lost = _mm512_fmsub_ps(z, z, square) * half_log2_e;
-    const __m512 low = _mm512_fmadd_ps(square, _mm512_set1_ps(-9.62981495e-9f), lost);
-    const __m512 power = gsf__nn_power16(rounded, _mm512_fmsub_ps(square, half_log2_e, n) + low);
-    __m512 tail = _mm512_set1_ps(gsf__nn_gelu_tail[9]);
-    for (int i = 8; i >= 0; i--) tail = _mm512_fmadd_ps(tail, s, _mm512_set1_ps(gsf__nn_gelu_tail[i]));
-    return _mm512_fnmadd_ps(z, power * (t * tail), _mm512_max_ps(_mm512_setzero_ps(), x));
-}
-
-GSF__INLINE_AVX512 __m512 gsf__nn_activate16(gsf_nn_activation activation, __m512 x) { // gsf__nn_activate8
-    const __m512 one = _mm512_set1_ps(1.0f);
-    if (activation == GSF_NN_GELU_TANH) {
-        x = _mm512_max_ps(_mm512_set1_ps(-12.0f), x);
-        const __m512 slope = _mm512_fmadd_ps(x * x, _mm512_set1_ps(-0.10294324f), _mm512_set1_ps(-2.30220819f));
-        return x / (one + gsf__nn_exp2_low16(_mm512_min_ps(_mm512_set1_ps(129.0f), x * slope)));
-    }
-    if (activation == GSF_NN_SILU) {
-        x = _mm512_max_ps(_mm512_set1_ps(-100.0f), x);
-        return x / (one + gsf__nn_exp16(_mm512_sub_ps(_mm512_setzero_ps(), x)));
-    }
-    if (activation == GSF_NN_GELU) return gsf__nn_gelu16(x);
-    if (activation == GSF_NN_RELU) return _mm512_max_ps(_mm512_setzero_ps(), x);
-    return x;
-}
-
-#endif // GSF__X86
-
 // Results of 32 MiB and more bypass the caches (`stream`): lines that are written whole need not be read before.
 enum { GSF__NN_STREAM = 1 << 23 }; // values
 
@@ -2100,138 +2037,119 @@ static void gsf__softmax_scalar(const float* x, int64_t count, float scale, floa
     for (int64_t i = 0; i < count; i++) y[i] *= inverse;
 }
 
+GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may read what was written
 #if GSF__X86
-
-static void gsf__nn_end_stream(int stream) { // before other threads may read what was written
     if (stream) _mm_sfence();
+#endif
+    (void)stream;
 }
 
-GSF__INLINE_AVX2 void gsf__nn_put8(float* y, __m256 v, int stream) {
-    if (stream) _mm256_stream_ps(y, v);
-    else _mm256_storeu_ps(y, v);
+#define gsf__v_gelu GSF__V(gsf__v_gelu)
+#define gsf__v_activate GSF__V(gsf__v_activate)
+
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_ACTIVATIONS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_ACTIVATIONS
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_ACTIVATIONS
+#if GSF__LANES > 1 // at one lane: the reference above
+
+GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
+    const gsf__v_exp2_terms terms = gsf__v_exp2_of(0);
+    const gsf__vf half_log2_e = gsf__v_set(-0.72134752f), k = gsf__v_set(3.5f);
+    const gsf__vf z = gsf__v_min(gsf__v_set(13.2f), gsf__v_abs(x)); // a NaN stays, as below
+    const gsf__vf t = k / (z + k), s = t - gsf__v_set(0.5f), square = z * z;
+    const gsf__vf rounded = gsf__v_madd(square, half_log2_e, terms.rounder), n = rounded - terms.rounder;
+    // what rounding took from the square and from the factor
+    const gsf__vf lost = gsf__v_msub(z, z, square) * half_log2_e;
+    const gsf__vf low = gsf__v_madd(square, gsf__v_set(-9.62981495e-9f), lost);
+    const gsf__vf power = gsf__v_power(&terms, rounded, gsf__v_msub(square, half_log2_e, n) + low);
+    gsf__vf tail = gsf__v_set(gsf__nn_gelu_tail[9]);
+    for (int i = 8; i >= 0; i--) tail = gsf__v_madd(tail, s, gsf__v_set(gsf__nn_gelu_tail[i]));
+    return gsf__v_nmadd(z, power * (t * tail), gsf__v_max(gsf__v_set(0.0f), x));
 }
 
-GSF__INLINE_AVX2 void gsf__activate_avx2_body(gsf_nn_activation activation, const float* x, int64_t count, float* y,
-                                              int stream) {
+// As gsf__nn_activation_ref; at -inf the limit -0, a NaN stays. Pass a compile-time constant as `activation` in loops.
+GSF__V_INLINE gsf__vf gsf__v_activate(gsf_nn_activation activation, gsf__vf x) {
+    const gsf__vf one = gsf__v_set(1.0f);
+    if (activation == GSF_NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
+        x = gsf__v_max(gsf__v_set(-12.0f), x); // from where on the power is inf
+        const gsf__vf slope = gsf__v_madd(x * x, gsf__v_set(-0.10294324f), gsf__v_set(-2.30220819f));
+        return x / (one + gsf__v_exp2(x * slope));
+    }
+    if (activation == GSF_NN_SILU) {
+        x = gsf__v_max(gsf__v_set(-100.0f), x);
+        return x / (one + gsf__v_exp(gsf__v_set(0.0f) - x));
+    }
+    if (activation == GSF_NN_GELU) return gsf__v_gelu(x);
+    if (activation == GSF_NN_RELU) return gsf__v_max(gsf__v_set(0.0f), x);
+    return x;
+}
+
+GSF__V_INLINE void GSF__V(gsf__activate_all)(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+                                             int stream) {
     int64_t i = 0;
-    for (; i + 8 <= count; i += 8) gsf__nn_put8(y + i, gsf__nn_activate8(activation, _mm256_loadu_ps(x + i)), stream);
-    if (i == count) return;
-    const __m256i mask = gsf__nn_mask8(count - i);
-    _mm256_maskstore_ps(y + i, mask, gsf__nn_activate8(activation, _mm256_maskload_ps(x + i, mask)));
+    for (; i + GSF__LANES <= count; i += GSF__LANES)
+        gsf__v_put(y + i, gsf__v_activate(activation, gsf__v_load(x + i)), stream);
+    const size_t tail = (size_t)(count - i);
+    if (tail) gsf__v_store_first(y + i, gsf__v_activate(activation, gsf__v_load_first(x + i, tail)), tail);
 }
 
-#define GSF__ACTIVATE(body, kind)                     \
-    case kind:                                        \
-        if (stream) body(kind, x, count, y, 1);       \
-        else body(kind, x, count, y, 0);              \
+GSF__V_KERNEL void GSF__V(gsf__activate)(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+                                         int stream) {
+#define GSF_X(kind)                                                          \
+    case kind:                                                               \
+        if (stream) GSF__V(gsf__activate_all)(kind, x, count, y, 1);         \
+        else GSF__V(gsf__activate_all)(kind, x, count, y, 0);                \
         break;
-
-#define GSF__ACTIVATE_ANY(body)                       \
-    switch (activation) {                             \
-        GSF__ACTIVATE(body, GSF_NN_LINEAR)            \
-        GSF__ACTIVATE(body, GSF_NN_GELU_TANH)         \
-        GSF__ACTIVATE(body, GSF_NN_SILU)              \
-        GSF__ACTIVATE(body, GSF_NN_GELU)              \
-        GSF__ACTIVATE(body, GSF_NN_RELU)              \
-    }                                                 \
+    switch (activation) {
+        GSF_X(GSF_NN_LINEAR)
+        GSF_X(GSF_NN_GELU_TANH)
+        GSF_X(GSF_NN_SILU)
+        GSF_X(GSF_NN_GELU)
+        GSF_X(GSF_NN_RELU)
+    }
+#undef GSF_X
     gsf__nn_end_stream(stream);
-
-GSF__TARGET_AVX2 static void gsf__activate_avx2(gsf_nn_activation activation, const float* x, int64_t count, float* y,
-                                                int stream) {
-    GSF__ACTIVATE_ANY(gsf__activate_avx2_body)
 }
 
-// The largest factor * x[i], at least -FLT_MAX; NaNs are passed over.
-GSF__INLINE_AVX2 float gsf__nn_top(const float* x, int64_t count, float factor) {
-    const __m256 f = _mm256_set1_ps(factor), lowest = _mm256_set1_ps(-FLT_MAX);
-    __m256 top0 = lowest, top1 = lowest;
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) { // max returns its second operand where the first is NaN
-        top0 = _mm256_max_ps(f * _mm256_loadu_ps(x + i), top0);
-        top1 = _mm256_max_ps(f * _mm256_loadu_ps(x + i + 8), top1);
+GSF__V_KERNEL void GSF__V(gsf__softmax)(const float* x, int64_t count, float scale, float* y) {
+    const gsf__v_exp2_terms terms = gsf__v_exp2_of(1);
+    const gsf__vf factor = gsf__v_set(scale * 1.44269504f), lowest = gsf__v_set(-FLT_MAX); // powers of 2 instead of e
+    const int64_t whole = count / GSF__LANES * GSF__LANES;
+    const size_t left = (size_t)(count - whole);
+    const gsf__vm first = gsf__vm_first(left);
+    const gsf__vf tail = gsf__v_load_first(x + whole, left);
+    gsf__vf top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest), top1 = top0; // NaNs do not count
+    for (int64_t i = 0; i + GSF__LANES < whole; i += 2 * GSF__LANES) {
+        top0 = gsf__v_max(factor * gsf__v_load(x + i), top0);
+        top1 = gsf__v_max(factor * gsf__v_load(x + i + GSF__LANES), top1);
     }
-    for (; i < count; i += 8) {
-        const __m256i mask = gsf__nn_mask8(count - i);
-        const __m256 v = f * _mm256_maskload_ps(x + i, mask);
-        top0 = _mm256_max_ps(_mm256_blendv_ps(lowest, v, _mm256_castsi256_ps(mask)), top0);
-    }
-    return gsf__nn_max8(_mm256_max_ps(top0, top1));
-}
-
-GSF__TARGET_AVX2 static void gsf__softmax_avx2(const float* x, int64_t count, float scale, float* y) {
-    const float factor = scale * 1.44269504f; // powers of 2 instead of e
-    const float top = gsf__nn_top(x, count, factor);
-    const __m256 f = _mm256_set1_ps(factor), t = _mm256_set1_ps(top);
-    const gsf__nn_exp2 c = gsf__nn_exp2_constants(1);
-    double sum = 0.0;
-    int64_t i = 0;
-    while (i + 8 <= count) { // float sums of short stretches
-        const int64_t end = gsf__least(i + 512, count);
-        __m256 part = _mm256_setzero_ps();
-        for (; i + 8 <= end; i += 8) {
-            const __m256 p = gsf__nn_exp2_low8(&c, _mm256_fmsub_ps(_mm256_loadu_ps(x + i), f, t));
-            _mm256_storeu_ps(y + i, p);
-            part = part + p;
+    if (whole / GSF__LANES % 2) top0 = gsf__v_max(factor * gsf__v_load(x + whole - GSF__LANES), top0);
+    const gsf__vf top = gsf__v_set(gsf__v_largest(gsf__v_max(top0, top1)));
+    const gsf__vf last = gsf__v_keep(first, gsf__v_exp2_low(&terms, gsf__v_msub(tail, factor, top)));
+    double sum = (double)gsf__v_sum(last);
+    for (int64_t begin = 0; begin < whole; begin += 64 * GSF__LANES) { // float sums of short stretches
+        const int64_t end = gsf__least(begin + 64 * GSF__LANES, whole);
+        gsf__vf part = gsf__v_set(0.0f);
+        for (int64_t i = begin; i < end; i += GSF__LANES) {
+            const gsf__vf power = gsf__v_exp2_low(&terms, gsf__v_msub(gsf__v_load(x + i), factor, top));
+            gsf__v_store(y + i, power);
+            part = part + power;
         }
-        sum += (double)gsf__nn_sum8(part);
+        sum += (double)gsf__v_sum(part);
     }
-    const __m256i mask = gsf__nn_mask8(count - i);
-    if (i < count) {
-        const __m256 p = gsf__nn_exp2_low8(&c, _mm256_fmsub_ps(_mm256_maskload_ps(x + i, mask), f, t));
-        _mm256_maskstore_ps(y + i, mask, p);
-        sum += (double)gsf__nn_sum8(_mm256_and_ps(p, _mm256_castsi256_ps(mask)));
-    }
-    const __m256 inverse = _mm256_set1_ps((float)(1.0 / sum));
-    for (i = 0; i + 8 <= count; i += 8) _mm256_storeu_ps(y + i, inverse * _mm256_loadu_ps(y + i));
-    if (i < count) _mm256_maskstore_ps(y + i, mask, inverse * _mm256_maskload_ps(y + i, mask));
+    const gsf__vf inverse = gsf__v_set((float)(1.0 / sum));
+    for (int64_t i = 0; i < whole; i += GSF__LANES) gsf__v_store(y + i, inverse * gsf__v_load(y + i));
+    if (left) gsf__v_store_first(y + whole, inverse * last, left);
 }
 
-GSF__INLINE_AVX512 void gsf__nn_put16(float* y, __m512 v, int stream) {
-    if (stream) _mm512_stream_ps(y, v);
-    else _mm512_storeu_ps(y, v);
-}
-
-GSF__INLINE_AVX512 void gsf__activate_avx512_body(gsf_nn_activation activation, const float* x, int64_t count, float* y,
-                                                  int stream) {
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) gsf__nn_put16(y + i, gsf__nn_activate16(activation, _mm512_loadu_ps(x + i)), stream);
-    if (i == count) return;
-    const __mmask16 mask = gsf__nn_mask16(count - i);
-    _mm512_mask_storeu_ps(y + i, mask, gsf__nn_activate16(activation, _mm512_maskz_loadu_ps(mask, x + i)));
-}
-
-GSF__TARGET_AVX512 static void gsf__activate_avx512(gsf_nn_activation activation, const float* x, int64_t count, float* y,
-                                                    int stream) {
-    GSF__ACTIVATE_ANY(gsf__activate_avx512_body)
-}
-
-GSF__TARGET_AVX512 static void gsf__softmax_avx512(const float* x, int64_t count, float scale, float* y) {
-    const float factor = scale * 1.44269504f; // powers of 2 instead of e
-    const __m512 f = _mm512_set1_ps(factor), lowest = _mm512_set1_ps(-FLT_MAX);
-    const int64_t whole = count / 16 * 16;
-    const __mmask16 mask = gsf__nn_mask16(count - whole); // of the rest
-    const __m512 rest = _mm512_maskz_loadu_ps(mask, x + whole);
-    __m512 top = _mm512_mask_max_ps(lowest, mask, f * rest, lowest); // the second operand where the first is NaN
-    for (int64_t i = 0; i < whole; i += 16) top = _mm512_max_ps(f * _mm512_loadu_ps(x + i), top);
-    const __m512 t = _mm512_set1_ps(gsf__nn_max16(top));
-    const __m512 last = _mm512_maskz_mov_ps(mask, gsf__nn_exp2_low16(_mm512_fmsub_ps(rest, f, t)));
-    double sum = (double)gsf__nn_sum16(last);
-    for (int64_t first = 0; first < whole; first += 1024) { // float sums of short stretches
-        const int64_t end = gsf__least(first + 1024, whole);
-        __m512 part = _mm512_setzero_ps();
-        for (int64_t i = first; i < end; i += 16) {
-            const __m512 p = gsf__nn_exp2_low16(_mm512_fmsub_ps(_mm512_loadu_ps(x + i), f, t));
-            _mm512_storeu_ps(y + i, p);
-            part = part + p;
-        }
-        sum += (double)gsf__nn_sum16(part);
-    }
-    const __m512 inverse = _mm512_set1_ps((float)(1.0 / sum));
-    for (int64_t i = 0; i < whole; i += 16) _mm512_storeu_ps(y + i, inverse * _mm512_loadu_ps(y + i));
-    if (mask) _mm512_mask_storeu_ps(y + whole, mask, inverse * last);
-}
-
-#endif // GSF__X86
+#endif
+#endif // GSF__KERNELS_ACTIVATIONS
+#ifndef GSF__ISA
 
 static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level level) {
     static const gsf__activation_kernels scalar = {gsf__activate_scalar, gsf__softmax_scalar};
@@ -2428,11 +2346,9 @@ static void gsf__norm_affine_scalar(const float* x, int64_t count, gsf__moments 
     for (int64_t i = 0; i < count; i++) y[i] = (float)((double)x[i] - m.mean) * inverse * weight + bias;
 }
 
-#if GSF__X86
-
 // One pass, in double. Values are taken relative to one of them, so (mean - pivot)^2 is at most `count` times the variance,
 // and subtracting it costs no more than log2(count) of the 53 bits.
-static gsf__moments gsf__moments_of(double pivot, double sum, double square, int64_t count, int centre) {
+GSF__SHARED gsf__moments gsf__moments_of(double pivot, double sum, double square, int64_t count, int centre) {
     gsf__moments m = {0.0, square};
     if (!centre) return m;
     m.mean = pivot + sum / (double)count;
@@ -2441,246 +2357,152 @@ static gsf__moments gsf__moments_of(double pivot, double sum, double square, int
     return m;
 }
 
-GSF__INLINE_AVX2 gsf__moments gsf__moments_avx2_body(const float* x, int64_t count, int centre) {
-    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
-    const __m256d p = _mm256_set1_pd(pivot);
-    __m256d s0 = _mm256_setzero_pd(), s1 = s0, s2 = s0, s3 = s0, q0 = s0, q1 = s0, q2 = s0, q3 = s0;
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) {
-        const __m256d d0 = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p, d1 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 4)) - p;
-        const __m256d d2 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 8)) - p, d3 = _mm256_cvtps_pd(_mm_loadu_ps(x + i + 12)) - p;
-        s0 = s0 + d0, s1 = s1 + d1, s2 = s2 + d2, s3 = s3 + d3;
-        q0 = _mm256_fmadd_pd(d0, d0, q0), q1 = _mm256_fmadd_pd(d1, d1, q1);
-        q2 = _mm256_fmadd_pd(d2, d2, q2), q3 = _mm256_fmadd_pd(d3, d3, q3);
-    }
-    for (; i + 4 <= count; i += 4) {
-        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(x + i)) - p;
-        s0 = s0 + d, q0 = _mm256_fmadd_pd(d, d, q0);
-    }
-    double sum = gsf__nn_sum4((s0 + s1) + (s2 + s3)), square = gsf__nn_sum4((q0 + q1) + (q2 + q3));
-    for (; i < count; i++) {
-        const double d = (double)x[i] - pivot;
-        sum += d;
-        square += d * d;
-    }
-    return gsf__moments_of(pivot, sum, square, count, centre);
-}
-
-GSF__TARGET_AVX2 static gsf__moments gsf__moments_avx2(const float* x, int64_t count, int centre) {
-    return gsf__moments_avx2_body(x, count, centre);
-}
-
-typedef struct gsf__norm8 { __m256 mean, low, inverse; } gsf__norm8; // mean + low: the mean in two floats
-
-GSF__INLINE_AVX2 gsf__norm8 gsf__norm8_of(gsf__moments m, float inverse) {
-    gsf__norm8 n;
-    const float mean = (float)m.mean;
-    n.mean = _mm256_set1_ps(mean);
-    n.low = _mm256_set1_ps((float)(m.mean - (double)mean));
-    n.inverse = _mm256_set1_ps(inverse);
-    return n;
-}
-
-// (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
-GSF__INLINE_AVX2 __m256 gsf__norm8_apply(const gsf__norm8* n, __m256 x) { return ((x - n->mean) - n->low) * n->inverse; }
-
 typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
 
-static gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
+GSF__SHARED gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
     const gsf__norm_vectors v = {job->weight, job->bias, job->scale, job->shift};
     return v;
 }
 
-GSF__INLINE_AVX2 __m256 gsf__norm_value8(gsf__norm_vectors by, const gsf__norm8* n, __m256 x, int64_t i, __m256i mask,
-                                         int whole) {
-#define GSF_X(p) (whole ? _mm256_loadu_ps((p) + i) : _mm256_maskload_ps((p) + i, mask))
-    __m256 v = gsf__norm8_apply(n, x);
-    if (by.weight) v = v * GSF_X(by.weight);
-    if (by.bias) v = v + GSF_X(by.bias);
-    if (by.scale) v = _mm256_fmadd_ps(v, _mm256_set1_ps(1.0f) + GSF_X(by.scale), GSF_X(by.shift));
-    return v;
-#undef GSF_X
+#define gsf__moments_sums GSF__V(gsf__moments_sums)
+#define gsf__moments_add GSF__V(gsf__moments_add)
+#define gsf__norm_terms GSF__V(gsf__norm_terms)
+#define gsf__norm_terms_of GSF__V(gsf__norm_terms_of)
+#define gsf__norm_apply GSF__V(gsf__norm_apply)
+#define gsf__norm_value GSF__V(gsf__norm_value)
+
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_NORMS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_NORMS
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_NORMS
+#if GSF__LANES > 1
+
+typedef struct gsf__moments_sums { gsf__vd sum0, sum1, square0, square1; } gsf__moments_sums;
+
+GSF__V_INLINE void gsf__moments_add(gsf__moments_sums* m, gsf__vd d0, gsf__vd d1) {
+    m->sum0 = m->sum0 + d0;
+    m->sum1 = m->sum1 + d1;
+    m->square0 = gsf__vd_madd(d0, d0, m->square0);
+    m->square1 = gsf__vd_madd(d1, d1, m->square1);
 }
 
-GSF__INLINE_AVX2 void gsf__norm_row_avx2_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
-    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
-    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
-    const __m256i all = _mm256_set1_epi32(-1);
-    const int64_t dim = job->dim;
+GSF__V_INLINE gsf__moments GSF__V(gsf__moments_all)(const float* x, int64_t count, int centre) {
+    const int64_t half = GSF__LANES / GSF__HALVES;
+    const float pivot = centre && count > 0 ? x[0] : 0.0f;
+    const gsf__vd p = gsf__vd_set((double)pivot), zero = gsf__vd_set(0.0);
+    gsf__moments_sums m = {zero, zero, zero, zero}, n = m;
     int64_t i = 0;
-    for (; i + 8 <= dim; i += 8) {
-        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
-        gsf__nn_put8(y + i, gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1), stream);
+    for (; i + 4 * half <= count; i += 4 * half) {
+        gsf__moments_add(&m, gsf__vd_load(x + i) - p, gsf__vd_load(x + i + half) - p);
+        gsf__moments_add(&n, gsf__vd_load(x + i + 2 * half) - p, gsf__vd_load(x + i + 3 * half) - p);
     }
-    if (i == job->dim) return;
-    const __m256i mask = gsf__nn_mask8(job->dim - i);
-    _mm256_maskstore_ps(y + i, mask, gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0));
-}
-
-GSF__TARGET_AVX2 static void gsf__norm_row_avx2(const gsf__norm_job* job, const float* x, float* y) {
-    if (job->stream) gsf__norm_row_avx2_body(job, x, y, 1);
-    else gsf__norm_row_avx2_body(job, x, y, 0);
-    gsf__nn_end_stream(job->stream);
-}
-
-GSF__INLINE_AVX2 __m256 gsf__rotate8(__m256 v, __m256 cos, __m256 sin) { // (a c - b s, b c + a s) of each pair
-    return _mm256_fmaddsub_ps(v, cos, _mm256_permute_ps(v, 0xb1) * sin);
-}
-
-GSF__TARGET_AVX2 static void gsf__norm_head_avx2(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
-    const gsf__moments m = gsf__moments_avx2_body(x, job->dim, job->centre);
-    const gsf__norm8 n = gsf__norm8_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
-    const __m256i all = _mm256_set1_epi32(-1);
-    const int64_t dim = job->dim;
-    int64_t i = 0;
-    for (; i + 8 <= dim; i += 8) {
-        __m256 v = gsf__norm_value8(by, &n, _mm256_loadu_ps(x + i), i, all, 1);
-        if (cos) v = gsf__rotate8(v, _mm256_loadu_ps(cos + i), _mm256_loadu_ps(sin + i));
-        _mm256_storeu_ps(x + i, v);
+    if (i + 2 * half <= count) {
+        gsf__moments_add(&m, gsf__vd_load(x + i) - p, gsf__vd_load(x + i + half) - p);
+        i += 2 * half;
     }
-    if (i == job->dim) return;
-    const __m256i mask = gsf__nn_mask8(job->dim - i);
-    __m256 v = gsf__norm_value8(by, &n, _mm256_maskload_ps(x + i, mask), i, mask, 0);
-    const __m256 plain = v;
-    if (cos) v = gsf__rotate8(v, _mm256_maskload_ps(cos + i, mask), _mm256_maskload_ps(sin + i, mask));
-    _mm256_maskstore_ps(x + i, mask, v);
-    if (job->dim % 2) _mm256_maskstore_ps(x + i, _mm256_andnot_si256(gsf__nn_mask8(job->dim - i - 1), mask), plain);
-}
-
-GSF__INLINE_AVX2 void gsf__norm_affine_avx2_body(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                 float weight, float bias, float* y, int stream) {
-    const gsf__norm8 n = gsf__norm8_of(m, inverse);
-    const __m256 w = _mm256_set1_ps(weight), b = _mm256_set1_ps(bias);
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8)
-        gsf__nn_put8(y + i, _mm256_fmadd_ps(gsf__norm8_apply(&n, _mm256_loadu_ps(x + i)), w, b), stream);
-    if (i == count) return;
-    const __m256i mask = gsf__nn_mask8(count - i);
-    const __m256 v = gsf__norm8_apply(&n, _mm256_maskload_ps(x + i, mask));
-    _mm256_maskstore_ps(y + i, mask, _mm256_fmadd_ps(v, w, b));
-}
-
-GSF__TARGET_AVX2 static void gsf__norm_affine_avx2(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                   float weight, float bias, float* y, int stream) {
-    if (stream) gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 1);
-    else gsf__norm_affine_avx2_body(x, count, m, inverse, weight, bias, y, 0);
-    gsf__nn_end_stream(stream);
-}
-
-// The same, sixteen at a time.
-
-typedef struct gsf__moments16 { __m512d sum[2], square[2]; } gsf__moments16;
-
-GSF__INLINE_AVX512 void gsf__moments_add16(gsf__moments16* m, const float* x, __mmask16 mask, __m512d pivot) {
-    for (int h = 0; h < 2; h++) {
-        const __mmask8 half = (__mmask8)(mask >> 8 * h);
-        const __m512d d = _mm512_maskz_sub_pd(half, _mm512_cvtps_pd(_mm256_maskz_loadu_ps(half, x + 8 * h)), pivot);
-        m->sum[h] = m->sum[h] + d;
-        m->square[h] = _mm512_fmadd_pd(d, d, m->square[h]);
+    if (i < count) { // lanes beyond the last value hold the pivot: they add nothing
+        const size_t left = (size_t)(count - i);
+        const gsf__vf v = gsf__v_select(gsf__vm_first(left), gsf__v_load_first(x + i, left), gsf__v_set(pivot));
+        gsf__moments_add(&m, gsf__vd_half(v, 0) - p, gsf__vd_half(v, 1) - p);
     }
+    return gsf__moments_of((double)pivot, gsf__vd_sum((m.sum0 + m.sum1) + (n.sum0 + n.sum1)),
+                           gsf__vd_sum((m.square0 + m.square1) + (n.square0 + n.square1)), count, centre);
 }
 
-GSF__INLINE_AVX512 gsf__moments gsf__moments_avx512_body(const float* x, int64_t count, int centre) {
-    const double pivot = centre && count > 0 ? (double)x[0] : 0.0;
-    gsf__moments16 m = {{_mm512_setzero_pd(), _mm512_setzero_pd()}, {_mm512_setzero_pd(), _mm512_setzero_pd()}};
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) gsf__moments_add16(&m, x + i, GSF__NN_WHOLE16, _mm512_set1_pd(pivot));
-    if (i < count) gsf__moments_add16(&m, x + i, gsf__nn_mask16(count - i), _mm512_set1_pd(pivot));
-    return gsf__moments_of(pivot, _mm512_reduce_add_pd(m.sum[0] + m.sum[1]),
-                           _mm512_reduce_add_pd(m.square[0] + m.square[1]), count, centre);
+GSF__V_KERNEL gsf__moments GSF__V(gsf__moments)(const float* x, int64_t count, int centre) {
+    return GSF__V(gsf__moments_all)(x, count, centre);
 }
 
-GSF__TARGET_AVX512 static gsf__moments gsf__moments_avx512(const float* x, int64_t count, int centre) {
-    return gsf__moments_avx512_body(x, count, centre);
-}
+typedef struct gsf__norm_terms { gsf__vf mean, low, inverse; } gsf__norm_terms; // mean + low: the mean in two floats
 
-typedef struct gsf__norm16 { __m512 mean, low, inverse; } gsf__norm16;
-
-GSF__INLINE_AVX512 gsf__norm16 gsf__norm16_of(gsf__moments m, float inverse) {
-    gsf__norm16 n;
+GSF__V_INLINE gsf__norm_terms gsf__norm_terms_of(gsf__moments m, float inverse) {
     const float mean = (float)m.mean;
-    n.mean = _mm512_set1_ps(mean);
-    n.low = _mm512_set1_ps((float)(m.mean - (double)mean));
-    n.inverse = _mm512_set1_ps(inverse);
+    gsf__norm_terms n;
+    n.mean = gsf__v_set(mean);
+    n.low = gsf__v_set((float)(m.mean - (double)mean));
+    n.inverse = gsf__v_set(inverse);
     return n;
 }
 
-GSF__INLINE_AVX512 __m512 gsf__norm16_apply(const gsf__norm16* n, __m512 x) { return ((x - n->mean) - n->low) * n->inverse; }
+// (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
+GSF__V_INLINE gsf__vf gsf__norm_apply(const gsf__norm_terms* n, gsf__vf x) { return ((x - n->mean) - n->low) * n->inverse; }
 
-GSF__INLINE_AVX512 __m512 gsf__norm_value16(gsf__norm_vectors by, const gsf__norm16* n, const float* x, int64_t i,
-                                            __mmask16 mask) {
-    __m512 v = gsf__norm16_apply(n, _mm512_maskz_loadu_ps(mask, x + i));
-    if (by.weight) v = v * _mm512_maskz_loadu_ps(mask, by.weight + i);
-    if (by.bias) v = v + _mm512_maskz_loadu_ps(mask, by.bias + i);
+// Of the values from x[i] on, `left` of which are there; in loops over whole vectors that is a constant.
+GSF__V_INLINE gsf__vf gsf__norm_value(gsf__norm_vectors by, const gsf__norm_terms* n, const float* x, int64_t i,
+                                      size_t left) {
+    gsf__vf v = gsf__norm_apply(n, gsf__v_load_first(x + i, left));
+    if (by.weight) v = v * gsf__v_load_first(by.weight + i, left);
+    if (by.bias) v = v + gsf__v_load_first(by.bias + i, left);
     if (by.scale)
-        v = _mm512_fmadd_ps(v, _mm512_set1_ps(1.0f) + _mm512_maskz_loadu_ps(mask, by.scale + i),
-                            _mm512_maskz_loadu_ps(mask, by.shift + i));
+        v = gsf__v_madd(v, gsf__v_set(1.0f) + gsf__v_load_first(by.scale + i, left), gsf__v_load_first(by.shift + i, left));
     return v;
 }
 
-GSF__INLINE_AVX512 void gsf__norm_row_avx512_body(const gsf__norm_job* job, const float* x, float* y, int stream) {
-    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
-    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+GSF__V_INLINE void GSF__V(gsf__norm_row_all)(const gsf__norm_job* job, const float* x, float* y, int stream) {
+    const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre);
+    const gsf__norm_terms n = gsf__norm_terms_of(m, gsf__norm_inverse(m, job->dim, job->eps));
     const gsf__norm_vectors by = gsf__norm_vectors_of(job);
     const int64_t dim = job->dim;
     int64_t i = 0;
-    for (; i + 16 <= dim; i += 16) {
-        _mm_prefetch((const char*)(x + dim + i), _MM_HINT_T0); // of the next row
-        gsf__nn_put16(y + i, gsf__norm_value16(by, &n, x, i, GSF__NN_WHOLE16), stream);
+    for (; i + GSF__LANES <= dim; i += GSF__LANES) {
+        gsf__nn_prefetch(x + dim + i); // of the next row
+        gsf__v_put(y + i, gsf__norm_value(by, &n, x, i, GSF__LANES), stream);
     }
-    if (i == dim) return;
-    const __mmask16 mask = gsf__nn_mask16(dim - i);
-    _mm512_mask_storeu_ps(y + i, mask, gsf__norm_value16(by, &n, x, i, mask));
+    if (i < dim) gsf__v_store_first(y + i, gsf__norm_value(by, &n, x, i, (size_t)(dim - i)), (size_t)(dim - i));
 }
 
-GSF__TARGET_AVX512 static void gsf__norm_row_avx512(const gsf__norm_job* job, const float* x, float* y) {
-    if (job->stream) gsf__norm_row_avx512_body(job, x, y, 1);
-    else gsf__norm_row_avx512_body(job, x, y, 0);
+GSF__V_KERNEL void GSF__V(gsf__norm_row)(const gsf__norm_job* job, const float* x, float* y) {
+    if (job->stream) GSF__V(gsf__norm_row_all)(job, x, y, 1);
+    else GSF__V(gsf__norm_row_all)(job, x, y, 0);
     gsf__nn_end_stream(job->stream);
 }
 
-GSF__INLINE_AVX512 void gsf__norm_head16(gsf__norm_vectors by, const gsf__norm16* n, float* x, const float* cos,
-                                         const float* sin, int64_t i, __mmask16 turned, __mmask16 mask) {
-    __m512 v = gsf__norm_value16(by, n, x, i, mask);
-    if (cos)
-        v = _mm512_mask_fmaddsub_ps(v, turned, _mm512_maskz_loadu_ps(mask, cos + i),
-                                    _mm512_permute_ps(v, 0xb1) * _mm512_maskz_loadu_ps(mask, sin + i));
-    gsf__nn_store16(x + i, mask, v);
-}
-
-GSF__TARGET_AVX512 static void gsf__norm_head_avx512(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
-    const gsf__moments m = gsf__moments_avx512_body(x, job->dim, job->centre);
-    const gsf__norm16 n = gsf__norm16_of(m, gsf__norm_inverse(m, job->dim, job->eps));
+GSF__V_KERNEL void GSF__V(gsf__norm_head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
+    const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre);
+    const gsf__norm_terms n = gsf__norm_terms_of(m, gsf__norm_inverse(m, job->dim, job->eps));
     const gsf__norm_vectors by = gsf__norm_vectors_of(job);
     const int64_t dim = job->dim;
     int64_t i = 0;
-    for (; i + 16 <= dim; i += 16) gsf__norm_head16(by, &n, x, cos, sin, i, GSF__NN_WHOLE16, GSF__NN_WHOLE16);
-    if (i < dim) gsf__norm_head16(by, &n, x, cos, sin, i, gsf__nn_mask16((dim - i) / 2 * 2), gsf__nn_mask16(dim - i));
+    for (; i + GSF__LANES <= dim; i += GSF__LANES) {
+        gsf__vf v = gsf__norm_value(by, &n, x, i, GSF__LANES);
+        if (cos) v = gsf__v_turn_pairs(v, gsf__v_load(cos + i), gsf__v_load(sin + i));
+        gsf__v_store(x + i, v);
+    }
+    if (i == dim) return;
+    const size_t left = (size_t)(dim - i);
+    gsf__vf v = gsf__norm_value(by, &n, x, i, left);
+    if (cos) { // an odd last value stays
+        const gsf__vf turned = gsf__v_turn_pairs(v, gsf__v_load_first(cos + i, left), gsf__v_load_first(sin + i, left));
+        v = gsf__v_select(gsf__vm_first(left / 2 * 2), turned, v);
+    }
+    gsf__v_store_first(x + i, v, left);
 }
 
-GSF__INLINE_AVX512 void gsf__norm_affine_avx512_body(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                     float weight, float bias, float* y, int stream) {
-    const gsf__norm16 n = gsf__norm16_of(m, inverse);
-    const __m512 w = _mm512_set1_ps(weight), b = _mm512_set1_ps(bias);
+GSF__V_INLINE void GSF__V(gsf__norm_affine_all)(const float* x, int64_t count, gsf__moments m, float inverse, float weight,
+                                                float bias, float* y, int stream) {
+    const gsf__norm_terms n = gsf__norm_terms_of(m, inverse);
+    const gsf__vf w = gsf__v_set(weight), b = gsf__v_set(bias);
     int64_t i = 0;
-    for (; i + 16 <= count; i += 16)
-        gsf__nn_put16(y + i, _mm512_fmadd_ps(gsf__norm16_apply(&n, _mm512_loadu_ps(x + i)), w, b), stream);
-    if (i == count) return;
-    const __mmask16 mask = gsf__nn_mask16(count - i);
-    const __m512 v = gsf__norm16_apply(&n, _mm512_maskz_loadu_ps(mask, x + i));
-    _mm512_mask_storeu_ps(y + i, mask, _mm512_fmadd_ps(v, w, b));
+    for (; i + GSF__LANES <= count; i += GSF__LANES)
+        gsf__v_put(y + i, gsf__v_madd(gsf__norm_apply(&n, gsf__v_load(x + i)), w, b), stream);
+    const size_t left = (size_t)(count - i);
+    if (left) gsf__v_store_first(y + i, gsf__v_madd(gsf__norm_apply(&n, gsf__v_load_first(x + i, left)), w, b), left);
 }
 
-GSF__TARGET_AVX512 static void gsf__norm_affine_avx512(const float* x, int64_t count, gsf__moments m, float inverse,
-                                                       float weight, float bias, float* y, int stream) {
-    if (stream) gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 1);
-    else gsf__norm_affine_avx512_body(x, count, m, inverse, weight, bias, y, 0);
+GSF__V_KERNEL void GSF__V(gsf__norm_affine)(const float* x, int64_t count, gsf__moments m, float inverse, float weight,
+                                            float bias, float* y, int stream) {
+    if (stream) GSF__V(gsf__norm_affine_all)(x, count, m, inverse, weight, bias, y, 1);
+    else GSF__V(gsf__norm_affine_all)(x, count, m, inverse, weight, bias, y, 0);
     gsf__nn_end_stream(stream);
 }
 
-#endif // GSF__X86
+#endif
+#endif // GSF__KERNELS_NORMS
+#ifndef GSF__ISA
 
 static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
     static const gsf__norm_kernels scalar = {gsf__moments_scalar, gsf__norm_row_scalar, gsf__norm_head_scalar,
@@ -3177,7 +2999,7 @@ GSF__TARGET_AVX2 static void gsf__finish_avx2(const gsf__linear_job* job, const 
         for (int64_t r = 0; r < rows; r++) {
             float* y = d->y + (row + r) * d->ldy + column + c;
             __m256 v = _mm256_add_ps(_mm256_loadu_ps(sums + r * pitch + c), bias);
-            v = gsf__nn_activate8(d->activation, v);
+            v = gsf__v_activate_avx2(d->activation, v);
             if (d->gate || d->accumulate) v = _mm256_fmadd_ps(gate, v, _mm256_maskload_ps(y, mask));
             if (n == 8) _mm256_storeu_ps(y, v);
             else _mm256_maskstore_ps(y, mask, v);
@@ -3361,7 +3183,7 @@ GSF__INLINE_AVX512 void gsf__finish16(const gsf__linear_job* job, const float* s
     for (int64_t r = 0; r < rows; r++) {
         float* y = d->y + (row + r) * d->ldy + column;
         __m512 v = _mm512_maskz_loadu_ps(mask, sums + r * pitch) + bias;
-        v = gsf__nn_activate16(d->activation, v);
+        v = gsf__v_activate_avx512(d->activation, v);
         if (d->gate || d->accumulate) v = _mm512_fmadd_ps(gate, v, _mm512_maskz_loadu_ps(mask, y));
         gsf__nn_store16(y, mask, v);
     }
@@ -3395,7 +3217,7 @@ GSF__INLINE_AVX512 float gsf__few_one16(const char* w, gsf_nn_dtype dtype, const
         s0 = _mm512_fmadd_ps(gsf__load16(w, dtype), _mm512_load_ps(x), s0);
         s1 = _mm512_fmadd_ps(gsf__load16(w + vector, dtype), _mm512_load_ps(x + 16), s1);
     }
-    return gsf__nn_sum16((s0 + s1) + (s2 + s3));
+    return gsf__v_sum_avx512((s0 + s1) + (s2 + s3));
 }
 
 // Two rows of x, laid out as [k / 16][2][16], times four rows of weights, added to sums[4][2]. `count` is a multiple of 32.
@@ -3425,8 +3247,8 @@ GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtyp
 #undef GSF_X
     }
 #define GSF_X(r)                                           \
-    sums[2 * r] += gsf__nn_sum16(s##r##0 + t##r##0);       \
-    sums[2 * r + 1] += gsf__nn_sum16(s##r##1 + t##r##1);
+    sums[2 * r] += gsf__v_sum_avx512(s##r##0 + t##r##0);       \
+    sums[2 * r + 1] += gsf__v_sum_avx512(s##r##1 + t##r##1);
     GSF_ROWS(GSF_X)
 #undef GSF_X
 #undef GSF_ROWS
@@ -3460,10 +3282,10 @@ GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtyp
         }
     }
 #define GSF_X(r)                                  \
-    sums[4 * r] += gsf__nn_sum16(s##r##0);        \
-    sums[4 * r + 1] += gsf__nn_sum16(s##r##1);    \
-    sums[4 * r + 2] += gsf__nn_sum16(s##r##2);    \
-    sums[4 * r + 3] += gsf__nn_sum16(s##r##3);
+    sums[4 * r] += gsf__v_sum_avx512(s##r##0);        \
+    sums[4 * r + 1] += gsf__v_sum_avx512(s##r##1);    \
+    sums[4 * r + 2] += gsf__v_sum_avx512(s##r##2);    \
+    sums[4 * r + 3] += gsf__v_sum_avx512(s##r##3);
     GSF_ROWS(GSF_X)
 #undef GSF_X
 #undef GSF_ROWS
@@ -4748,7 +4570,7 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
 
 // A head's rows are a few lines each, far apart, which no hardware foresees: asks for one of them ahead of its use.
 static void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
-    for (int64_t i = 0; row < rows && i < dim; i += 16) _mm_prefetch((const char*)(from + row * ld + i), _MM_HINT_T0);
+    for (int64_t i = 0; row < rows && i < dim; i += 16) gsf__nn_prefetch(from + row * ld + i);
 }
 
 GSF__TARGET_AVX2 static void gsf__attention_pack_rows(const float* from, int64_t rows, int64_t ld, const float* center,
@@ -4911,7 +4733,7 @@ static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, 
 
 GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queries, int64_t columns, float* top, float* sum,
                                                          float fade[GSF__ATT_QUERIES]) {
-    const gsf__nn_exp2 c = gsf__nn_exp2_constants(1);
+    const gsf__v_exp2_terms_avx2 c = gsf__v_exp2_of_avx2(1);
     for (int64_t r = 0; r < queries; r++) {
         const float* row = p + r * GSF__ATT_KEYS;
         __m256 top0 = _mm256_set1_ps(top[r]), top1 = top0;
@@ -4919,20 +4741,20 @@ GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queri
             top0 = _mm256_max_ps(_mm256_loadu_ps(row + j), top0);
             top1 = _mm256_max_ps(_mm256_loadu_ps(row + j + 8), top1);
         }
-        const float raised = gsf__nn_max8(_mm256_max_ps(top0, top1));
+        const float raised = gsf__v_largest_avx2(_mm256_max_ps(top0, top1));
         fade[r] = top[r] - raised;
         top[r] = raised;
     }
     for (int64_t r = 0; r < queries; r += 8) {
         const __m256i mask = gsf__nn_mask8(queries - r);
-        _mm256_maskstore_ps(fade + r, mask, gsf__nn_exp2_low8(&c, _mm256_maskload_ps(fade + r, mask)));
+        _mm256_maskstore_ps(fade + r, mask, gsf__v_exp2_low_avx2(&c, _mm256_maskload_ps(fade + r, mask)));
     }
     for (int64_t r = 0; r < queries; r++) {
         float* row = p + r * GSF__ATT_KEYS;
         const __m256 t = _mm256_set1_ps(top[r]);
         __m256 total = _mm256_set1_ps(fade[r]) * _mm256_loadu_ps(sum + 8 * r);
         for (int64_t j = 0; j < columns; j += 8) {
-            const __m256 weight = gsf__nn_exp2_low8(&c, _mm256_loadu_ps(row + j) - t);
+            const __m256 weight = gsf__v_exp2_low_avx2(&c, _mm256_loadu_ps(row + j) - t);
             _mm256_storeu_ps(row + j, weight);
             total = total + weight;
         }
@@ -4943,17 +4765,18 @@ GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queri
 // Raises `top` to the largest logit of each row; fade = 2^(top before - top).
 GSF__INLINE_AVX512 void gsf__attention_tops_avx512(const float* p, int64_t queries, int64_t columns, float* top,
                                                    float fade[GSF__ATT_QUERIES]) {
+    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(0);
     for (int64_t r = 0; r < queries; r++) {
         __m512 highest = _mm512_set1_ps(top[r]);
         for (int64_t j = 0; j < columns; j += 16)
             highest = _mm512_max_ps(_mm512_loadu_ps(p + r * GSF__ATT_KEYS + j), highest);
-        const float raised = gsf__nn_max16(highest);
+        const float raised = gsf__v_largest_avx512(highest);
         fade[r] = top[r] - raised;
         top[r] = raised;
     }
     for (int64_t r = 0; r < queries; r += 16) {
         const __mmask16 mask = gsf__nn_mask16(queries - r);
-        gsf__nn_store16(fade + r, mask, gsf__nn_exp2_low16(_mm512_maskz_loadu_ps(mask, fade + r)));
+        gsf__nn_store16(fade + r, mask, gsf__v_exp2_low_avx512(&terms, _mm512_maskz_loadu_ps(mask, fade + r)));
     }
 }
 
@@ -4963,13 +4786,14 @@ GSF__INLINE_AVX512 void gsf__attention_add_total(__m512 total, float fade, float
 
 GSF__TARGET_AVX512 static void gsf__attention_weights_avx512(float* p, int64_t queries, int64_t columns, float* top,
                                                              float* sum, float fade[GSF__ATT_QUERIES]) {
+    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(1);
     gsf__attention_tops_avx512(p, queries, columns, top, fade);
     for (int64_t r = 0; r < queries; r++) {
         float* row = p + r * GSF__ATT_KEYS;
         const __m512 t = _mm512_set1_ps(top[r]);
         __m512 total = _mm512_setzero_ps();
         for (int64_t j = 0; j < columns; j += 16) {
-            const __m512 weight = gsf__nn_exp2_low16(_mm512_loadu_ps(row + j) - t);
+            const __m512 weight = gsf__v_exp2_low_avx512(&terms, _mm512_loadu_ps(row + j) - t);
             _mm512_storeu_ps(row + j, weight);
             total = total + weight;
         }
@@ -5093,13 +4917,14 @@ GSF__TARGET_BF16 static void gsf__attention_logits_bf16(const float* q, int64_t 
 // The weights are written as bf16 over the logits, those of 16 keys in 8 places; sums are of what was written.
 GSF__TARGET_BF16 static void gsf__attention_weights_bf16(float* p, int64_t queries, int64_t columns, float* top, float* sum,
                                                          float fade[GSF__ATT_QUERIES]) {
+    const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(1);
     gsf__attention_tops_avx512(p, queries, columns, top, fade);
     for (int64_t r = 0; r < queries; r++) {
         float* row = p + r * GSF__ATT_KEYS;
         const __m512 t = _mm512_set1_ps(top[r]);
         __m512 total = _mm512_setzero_ps();
         for (int64_t j = 0; j < columns; j += 16) {
-            const __m256i weight = gsf__nn_round_bf16(gsf__nn_exp2_low16(_mm512_loadu_ps(row + j) - t));
+            const __m256i weight = gsf__nn_round_bf16(gsf__v_exp2_low_avx512(&terms, _mm512_loadu_ps(row + j) - t));
             _mm256_storeu_si256((__m256i*)(void*)(row + j / 2), weight);
             total = total + _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(weight), 16));
         }
@@ -5129,7 +4954,7 @@ GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job
     const int64_t dim = job->desc.head_dim, ld = job->desc.ldo;
     for (int64_t r = 0; r < queries; r++) {
         gsf__attention_fetch(out, r + GSF__ATT_AHEAD, queries, ld, dim);
-        const float total = gsf__nn_sum8(_mm256_loadu_ps(s->sum + 8 * r));
+        const float total = gsf__v_sum_avx2(_mm256_loadu_ps(s->sum + 8 * r));
         const float* from = s->out + r / GSF__ATT_GROUP * job->panels * GSF__ATT_TILE + r % GSF__ATT_GROUP * GSF__ATT_PANEL;
         const __m256 divisor = _mm256_set1_ps(total);
         for (int64_t i = 0; i < dim; i += 8) {
@@ -5457,7 +5282,7 @@ GSF__TARGET_AVX2 static void gsf__conv_norm_silu_avx2(const float* x, int64_t co
     for (; i + 8 <= count; i += 8) {
         const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(x + i), _mm256_loadu_ps(mean + i));
         const __m256 v = _mm256_fmadd_ps(d, _mm256_loadu_ps(scale + i), _mm256_loadu_ps(offset + i));
-        _mm256_storeu_ps(y + i, gsf__nn_activate8(GSF_NN_SILU, v));
+        _mm256_storeu_ps(y + i, gsf__v_activate_avx2(GSF_NN_SILU, v));
     }
     gsf__conv_norm_silu_ref(x + i, count - i, mean + i, scale + i, offset + i, y + i);
 }
@@ -5466,7 +5291,7 @@ GSF__INLINE_AVX512 void gsf__conv_norm_silu16(const float* x, __mmask16 mask, co
                                               const float* offset, float* y) {
     const __m512 d = _mm512_maskz_loadu_ps(mask, x) - _mm512_maskz_loadu_ps(mask, mean);
     const __m512 v = _mm512_fmadd_ps(d, _mm512_maskz_loadu_ps(mask, scale), _mm512_maskz_loadu_ps(mask, offset));
-    gsf__nn_store16(y, mask, gsf__nn_activate16(GSF_NN_SILU, v));
+    gsf__nn_store16(y, mask, gsf__v_activate_avx512(GSF_NN_SILU, v));
 }
 
 GSF__TARGET_AVX512 static void gsf__conv_norm_silu_avx512(const float* x, int64_t count, const float* mean,
@@ -13693,5 +13518,6 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
 
 GSF__END_IMPLEMENTATION
 
+#endif // GSF__ISA
 #endif // GSF_NN_IMPLEMENTED
 #endif // GSFIXER_NN_IMPLEMENTATION

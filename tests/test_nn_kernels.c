@@ -41,7 +41,7 @@ static int same_bits(const float* a, const float* b, size_t count) { return memc
 #if GSF__X86
 GSF__TARGET_AVX2 static void exp8(const float* x, int base, float* y) { // base 0: e
     const __m256 v = _mm256_loadu_ps(x);
-    _mm256_storeu_ps(y, base ? gsf__nn_exp2_8(v) : gsf__nn_exp8(v));
+    _mm256_storeu_ps(y, base ? gsf__v_exp2_avx2(v) : gsf__v_exp_avx2(v));
 }
 
 static void check_exp(void) {
