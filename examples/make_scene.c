@@ -11,7 +11,16 @@
                                                     could see them, a few of them wrong
        OUT/truth/depth_001.npy ...                  float32 (height,width) camera depth at pixel centres, 0 = sky
        OUT/truth/visibility.bin                     see write_truth
-   OUT is a new or an empty folder, or one that make_scene wrote: nobody else's files are replaced. */
+       OUT/truth/scene.json                         the options that made it
+   OUT is a new or an empty folder, or one that make_scene wrote: nobody else's files are replaced.
+
+       make_scene SCENE --render CAMERAS.json --out PICTURES
+
+   photographs a scene that was made before at other cameras (the format of `gsfix path`), as if they were further photos
+   of it: with the same light, noise included. The scene's own cameras give its photos.
+       PICTURES/00000.png ...        in the order of the cameras
+       PICTURES/depth/00000.npy ...  as in OUT/truth
+   PICTURES is a new or an empty folder. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L // mkdir
 #endif
@@ -41,6 +50,13 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
     fprintf(stderr, "make_scene: this build has no Embree (compile with GSF_USE_EMBREE), nothing else traces the rays\n");
     return 1;
 }
+
+#ifndef MAKE_SCENE_NO_MAIN
+static int render_scene(gsf_context* ctx, const char* folder, const char* cameras, const char* out) {
+    (void)cameras, (void)out;
+    return make_scene(ctx, &make_scene_defaults, folder); // says so
+}
+#endif
 
 #else
 
@@ -1046,9 +1062,22 @@ static gsf_result write_truth(gsf_context* ctx, const char* path, const cloud* c
     return result;
 }
 
+// OUT/truth/scene.json: what the scene is a function of.
+static gsf_result write_options(gsf_context* ctx, const char* path, const make_scene_options* o) {
+    char text[256];
+    const int size = snprintf(text, sizeof text, "{\"views\":%d,\"width\":%d,\"height\":%d,\"points\":%d,\"noise\":%.17g,"
+                              "\"arc\":%.17g,\"seed\":%llu}\n", o->views, o->width, o->height, o->points, o->noise, o->arc,
+                              (unsigned long long)o->seed);
+    return gsf_write_file(ctx, path, text, (size_t)size);
+}
+
 // ---- all of it -----------------------------------------------------------------
 
-static int start_world(gsf_context* ctx, world* s, int bake_rays) {
+static int start_world(gsf_context* ctx, world* s, const make_scene_options* o) {
+    const int bake_rays = o->width * o->height < 20000 ? 8 : 32; // small photos do not show the difference
+    s->seed = o->seed;
+    s->pixel_angle = 1.0f / (0.9f * (float)o->width);
+    make_lattice();
     build_world(s);
     s->device = rtcNewDevice("threads=1,set_affinity=0");
     if (s->failed || !s->device) {
@@ -1118,18 +1147,17 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
     char path[2048];
     memset(&s, 0, sizeof s);
     memset(&c, 0, sizeof c);
-    s.seed = o->seed;
-    s.pixel_angle = 1.0f / (0.9f * (float)o->width);
-    make_lattice();
     uint8_t** photos = (uint8_t**)gsf_alloc_zeroed(ctx, (size_t)o->views, sizeof *photos);
     c.scene.views = (gsf_scene_view*)gsf_alloc_zeroed(ctx, (size_t)o->views, sizeof(gsf_scene_view));
     int ok = photos && c.scene.views && make_folder(folder, "") && make_folder(folder, "/images") &&
              make_folder(folder, "/truth") && make_folder(folder, "/sparse") && make_folder(folder, "/sparse/0");
     c.scene.view_count = (size_t)o->views;
-    ok = ok && start_world(ctx, &s, o->width * o->height < 20000 ? 8 : 32); // small photos do not show the difference
+    ok = ok && start_world(ctx, &s, o);
     ok = ok && take_photos(ctx, &s, o, folder, &c.scene, photos) && find_points(ctx, &s, o, photos, &c);
     snprintf(path, sizeof path, "%s/truth/visibility.bin", folder);
     ok = ok && gsf_splat_save_colmap(ctx, &c.scene, NULL, folder) == GSF_OK && write_truth(ctx, path, &c) == GSF_OK;
+    snprintf(path, sizeof path, "%s/truth/scene.json", folder);
+    ok = ok && write_options(ctx, path, o) == GSF_OK;
     if (!ok && ctx->error[0]) fprintf(stderr, "make_scene: %s\n", ctx->error);
     if (ok)
         fprintf(
@@ -1153,37 +1181,124 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
     return ok ? 0 : 1;
 }
 
+#ifndef MAKE_SCENE_NO_MAIN
+
+// ---- further photos of a made scene ---------------------------------------------
+
+// What decides how the scene looks. Seeds are below 1e9, so that a number of JSON holds them.
+static gsf_result read_options(gsf_context* ctx, const char* path, make_scene_options* o) {
+    static const char* const keys[] = {"width", "height", "seed"};
+    double values[3] = {0};
+    void* data;
+    size_t size;
+    gsf_json json;
+    gsf_result result = gsf_read_file(ctx, path, &data, &size);
+    if (result != GSF_OK) return result;
+    result = gsf_parse_json(ctx, path, (const char*)data, size, &json);
+    gsf_free(ctx, data);
+    if (result != GSF_OK) return result;
+    for (size_t i = 0; i < 3 && result == GSF_OK; i++) {
+        const gsf_json_value* value = gsf_json_member(&json, &json.values[0], keys[i]);
+        if (value && value->type == GSF_JSON_NUMBER && value->number >= 0.0 && value->number < 1e9) values[i] = value->number;
+        else result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid \"%s\"", path, keys[i]);
+    }
+    gsf_destroy_json(ctx, &json);
+    if (result == GSF_OK && !(values[0] >= 16.0 && values[1] >= 16.0 && values[0] <= 8192.0 && values[1] <= 8192.0))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %g x %g", path, values[0], values[1]);
+    *o = make_scene_defaults;
+    o->width = (int)values[0];
+    o->height = (int)values[1];
+    o->seed = (uint64_t)values[2];
+    return result;
+}
+
+// Picture and depth of camera i, as if it had taken photo i.
+static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_camera* camera, size_t i, const char* out) {
+    char path[2048];
+    const size_t pixels = (size_t)camera->width * (size_t)camera->height;
+    gsf_result result = gsf_check_camera(ctx, camera);
+    if (result != GSF_OK) return result;
+    photo_job job = {s, *camera, (uint64_t)i, (uint8_t*)gsf_alloc(ctx, pixels, 3),
+                     (float*)gsf_alloc(ctx, pixels, sizeof(float))};
+    result = job.pixels && job.depth ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) {
+        ctx->parallel.for_fn(ctx->parallel.user, (size_t)camera->height, photo_row, &job);
+        const gsf_image image = gsf_wrap_image(job.pixels, GSF_U8, camera->width, camera->height, 3);
+        snprintf(path, sizeof path, "%s/%05zu.png", out, i);
+        result = gsf_save_image(ctx, path, &image);
+    }
+    if (result == GSF_OK) {
+        snprintf(path, sizeof path, "%s/depth/%05zu.npy", out, i);
+        result = write_depth(ctx, path, job.depth, camera->width, camera->height);
+    }
+    gsf_free(ctx, job.pixels);
+    gsf_free(ctx, job.depth);
+    return result;
+}
+
+// Photographs the scene in `folder` at the cameras of a file. 0 when it went well, else a line on stderr says what did not.
+static int render_scene(gsf_context* ctx, const char* folder, const char* cameras, const char* out) {
+    char path[2048];
+    make_scene_options o = make_scene_defaults;
+    gsf_camera* list = NULL;
+    size_t count = 0;
+    world s;
+    memset(&s, 0, sizeof s);
+    snprintf(path, sizeof path, "%s/truth/scene.json", folder);
+    gsf_result result = read_options(ctx, path, &o);
+    if (result == GSF_OK) result = gsf_load_cameras(ctx, cameras, &list, &count);
+    int ok = result == GSF_OK && make_folder(out, "") && make_folder(out, "/depth") && start_world(ctx, &s, &o);
+    const float angle = s.pixel_angle;
+    for (size_t i = 0; ok && i < count; i++) {
+        s.pixel_angle = angle * (float)(0.9 * o.width / list[i].fx); // texture as fine as these pixels show it
+        result = render_camera(ctx, &s, list + i, i, out);
+        ok = result == GSF_OK;
+    }
+    if (result != GSF_OK)
+        fprintf(stderr, "make_scene: %s\n", result == GSF_ERROR_OUT_OF_MEMORY ? "out of memory" : ctx->error);
+    gsf_free(ctx, list);
+    end_world(&s);
+    return ok ? 0 : 1;
+}
+
+#endif // MAKE_SCENE_NO_MAIN
 #endif // GSF_USE_EMBREE
 
 #ifndef MAKE_SCENE_NO_MAIN
 
-// May the folder be written into: is it not there, empty, or of make_scene's own making, as its truth shows?
-static int may_write(const char* folder) {
-    char path[2048], magic[8] = "";
+static int is_vacant(const char* folder) { // not there, or empty
     DIR* list = opendir(folder);
     if (!list) return errno == ENOENT;
     int empty = 1;
     for (struct dirent* entry; (entry = readdir(list)) != NULL;)
         empty &= strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0;
     closedir(list);
+    return empty;
+}
+
+// Of make_scene's own making, as its truth shows?
+static int is_made_scene(const char* folder) {
+    char path[2048], magic[8] = "";
     snprintf(path, sizeof path, "%s/truth/visibility.bin", folder);
-    FILE* truth = empty ? NULL : fopen(path, "rb");
+    FILE* truth = fopen(path, "rb");
     const int ours = truth && fread(magic, 1, sizeof magic, truth) == sizeof magic && memcmp(magic, "GSFTRUTH", 8) == 0;
     if (truth) fclose(truth);
-    return empty || ours;
+    return ours;
 }
 
 static int usage(FILE* to) {
     fprintf(
         to,
         "usage: make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]\n"
-        "Writes a ray-traced courtyard as photos with a COLMAP model, and the truth about it, into the folder OUT.\n");
+        "Writes a ray-traced courtyard as photos with a COLMAP model, and the truth about it, into the folder OUT.\n"
+        "       make_scene SCENE --render CAMERAS.json --out PICTURES\n"
+        "Photographs a scene that was made before at other cameras, into the folder PICTURES.\n");
     return to == stdout ? 0 : 2;
 }
 
 int main(int argc, char** argv) {
     make_scene_options o = make_scene_defaults;
-    const char* folder = NULL;
+    const char *folder = NULL, *cameras = NULL, *pictures = NULL;
     for (int i = 1; i < argc; i++) {
         if (strcmp(argv[i], "--help") == 0) return usage(stdout);
         if (argv[i][0] != '-') {
@@ -1191,9 +1306,18 @@ int main(int argc, char** argv) {
             folder = argv[i];
             continue;
         }
+        if (i + 1 >= argc) return usage(stderr);
+        if (strcmp(argv[i], "--render") == 0) {
+            cameras = argv[++i];
+            continue;
+        }
+        if (strcmp(argv[i], "--out") == 0) {
+            pictures = argv[++i];
+            continue;
+        }
         char* end = NULL;
-        const double x = i + 1 < argc ? strtod(argv[i + 1], &end) : 0.0;
-        if (i + 1 >= argc || end == argv[i + 1] || *end || !(x >= 0.0 && x < 1e9)) return usage(stderr);
+        const double x = strtod(argv[i + 1], &end);
+        if (end == argv[i + 1] || *end || !(x >= 0.0 && x < 1e9)) return usage(stderr);
         if (strcmp(argv[i], "--views") == 0) o.views = (int)x;
         else if (strcmp(argv[i], "--width") == 0) o.width = (int)x;
         else if (strcmp(argv[i], "--height") == 0) o.height = (int)x;
@@ -1207,7 +1331,12 @@ int main(int argc, char** argv) {
     if (!folder || o.views < 2 || o.views > 999 || o.width < 16 || o.height < 16 || o.width > 8192 || o.height > 8192 ||
         o.points < 1 || o.arc > 360.0)
         return usage(stderr);
-    if (!may_write(folder)) {
+    if (!cameras != !pictures) return usage(stderr);
+    if (pictures && !is_vacant(pictures)) {
+        fprintf(stderr, "make_scene: %s: is there already (choose a new folder)\n", pictures);
+        return 1;
+    }
+    if (!pictures && !is_vacant(folder) && !is_made_scene(folder)) {
         fprintf(stderr, "make_scene: %s: is there already, and not of make_scene's making (choose a new folder)\n", folder);
         return 1;
     }
@@ -1217,7 +1346,7 @@ int main(int argc, char** argv) {
         fprintf(stderr, "make_scene: %s\n", ctx.error);
         return 1;
     }
-    return make_scene(&ctx, &o, folder);
+    return cameras ? render_scene(&ctx, folder, cameras, pictures) : make_scene(&ctx, &o, folder);
 }
 
 #endif // MAKE_SCENE_NO_MAIN

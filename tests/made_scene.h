@@ -8,7 +8,8 @@
 
 static void remove_scene(const char* folder, int views) {
     static const char* const files[] = {"sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin",
-                                        "truth/visibility.bin", "sparse/0", "sparse", "images", "truth", ""};
+                                        "truth/visibility.bin", "truth/scene.json", "sparse/0", "sparse", "images", "truth",
+                                        ""};
     char path[1200];
     for (int i = 0; i < views; i++) {
         snprintf(path, sizeof path, "%s/images/frame_%03d.png", folder, i + 1);
