@@ -165,6 +165,42 @@ static void check_plane(double tilt, double offset) {
     free_plane(&s);
 }
 
+// The views' rays are 8 and 16 degrees apart: fewer pairs are compared where min_angle is between, none where it is above.
+// Normals that may not differ at all leave few points; those that may differ by anything leave more than the default.
+static void test_angles(void) {
+    static const struct { float min_angle, max_normal_angle; uint32_t pairs; } cases[] = {
+        {0.0f, 0.0f, 6}, {12.0f, 0.0f, 2}, {25.0f, 0.0f, 0}, {0.0f, 2.0f, 6}, {0.0f, 180.0f, 6}};
+    enum { CASES = (int)(sizeof cases / sizeof *cases), POINTS = 60 };
+    static double points[3 * POINTS]; // by which views are paired
+    static uint8_t colors[3 * POINTS];
+    static size_t tracks[POINTS + 1];
+    size_t consistent[CASES];
+    plane_scene s;
+    make_plane(&s, 0.2, 60.0, 0.0);
+    for (size_t i = 0; i < POINTS; i++)
+        plane_depth(&s, &s.views[1].camera, 30.0 + 4.0 * (double)(i % 10), 25.0 + 5.0 * (double)(i / 10), points + 3 * i);
+    s.scene.points = points;
+    s.scene.colors = colors;
+    s.scene.track_begin = tracks;
+    s.scene.point_count = POINTS;
+    for (int i = 0; i < CASES; i++) {
+        gsf_dense dense;
+        gsf_dense_stats stats;
+        gsf_dense_desc desc = {0};
+        desc.min_angle = cases[i].min_angle;
+        desc.max_normal_angle = cases[i].max_normal_angle;
+        memset(&stats, 0, sizeof stats);
+        CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense, &stats));
+        CHECK(stats.pairs == cases[i].pairs);
+        consistent[i] = stats.consistent;
+        printf("min_angle %g, max_normal_angle %g: %zu pairs, %zu consistent\n", (double)desc.min_angle,
+               (double)desc.max_normal_angle, (size_t)stats.pairs, consistent[i]);
+        gsf_splat_destroy_dense(&ctx, &dense);
+    }
+    CHECK(consistent[2] == 0 && consistent[3] * 2 < consistent[0] && consistent[0] < consistent[4]);
+    free_plane(&s);
+}
+
 // The left of view 1 does not count. What is there, and how it is called that, makes no point: none projects there with that
 // view's confirmation, its map is empty there, and the colours there change no bit.
 static void test_masked(void) {
@@ -506,6 +542,7 @@ int main(void) {
     check_plane(0.0, 0.0);
     check_plane(0.7, 0.0);
     check_plane(-0.9, 1e6);
+    test_angles();
     test_masked();
     test_nothing_to_see();
     test_refused();

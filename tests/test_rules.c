@@ -1,0 +1,204 @@
+// test_rules.c - rules that hang on a number, each tried on both sides of it: where a wrong number would cost quality and
+// nothing else would fail.
+// gcc -O2 -std=c11 -I. -Itests tests/test_rules.c -lm
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_splat.h"
+#include "test.h"
+
+// ---- the repair loop -----------------------------------------------------------
+
+// The restored views' weight rises from 0 at the first round to lambda at the end as t (2 - t).
+static void test_restored_weight(void) {
+    static const struct { int32_t iteration; double t; } cases[] = {
+        {0, 0.0}, {400, 0.0}, {500, 0.125}, {600, 0.25}, {800, 0.5}, {1000, 0.75}, {1200, 1.0}, {1300, 1.0}};
+    gsf_trainer trainer;
+    gsf_fixer fixer;
+    memset(&trainer, 0, sizeof trainer);
+    memset(&fixer, 0, sizeof fixer);
+    fixer.trainer = &trainer;
+    fixer.desc.lambda = 0.6f;
+    fixer.desc.first_round = 400;
+    fixer.desc.train.iterations = 1200;
+    for (size_t i = 0; i < GSF__COUNT(cases); i++) {
+        const double t = cases[i].t;
+        trainer.iteration = cases[i].iteration;
+        CHECK_NEAR(gsf__restored_weight(&fixer), 0.6 * (2.0 * t - t * t), 1e-6);
+    }
+    fixer.desc.first_round = 1200; // no span to rise over
+    CHECK_NEAR(gsf__restored_weight(&fixer), 0.6, 1e-7);
+}
+
+// ---- densification -------------------------------------------------------------
+
+static gsf__model make_model(gsf_context* ctx, size_t count) {
+    gsf__model model;
+    memset(&model, 0, sizeof model);
+    if (!CHECK_OK(ctx, gsf__model_reserve(ctx, &model, count))) exit(2);
+    model.count = count;
+    return model;
+}
+
+// Photos and restored views have means of their own, of which the larger one decides: many visits of the one kind do not
+// hide what few of the other say.
+static void test_densify_means(gsf_context* ctx) {
+    enum { COUNT = 5 };
+    static const struct { float sum[2]; uint32_t visits[2]; float mean; int grows; } cases[COUNT] = {
+        {{3e-3f, 0.0f}, {10, 0}, 3e-4f, 1},     // photos only
+        {{0.0f, 3e-3f}, {0, 10}, 3e-4f, 1},     // restored views only
+        {{3e-3f, 1e-3f}, {10, 90}, 3e-4f, 1},   // together 4e-5
+        {{1e-3f, 3e-3f}, {90, 10}, 3e-4f, 1},
+        {{1e-3f, 1.5e-3f}, {10, 10}, 1.5e-4f, 0}}; // added up they would pass
+    gsf__model model = make_model(ctx, COUNT);
+    for (size_t i = 0; i < COUNT; i++) {
+        for (int k = 0; k < 2; k++) {
+            model.grad_sum[k][i] = cases[i].sum[k];
+            model.visits[k][i] = cases[i].visits[k];
+        }
+        CHECK_NEAR(gsf__densify_mean_grad(&model, i), cases[i].mean, 1e-9);
+    }
+    gsf__densify_rule rule;
+    memset(&rule, 0, sizeof rule);
+    rule.grad = 2e-4f;
+    rule.clone_scale = 10.0;
+    rule.max_splats = 100;
+    size_t clones, splits;
+    gsf__densify_select(&model, &rule, &clones, &splits);
+    for (size_t i = 0; i < COUNT; i++) CHECK((model.action[i] == GSF__CLONE) == cases[i].grows);
+    CHECK(clones == 4 && splits == 0);
+    gsf__model_destroy(ctx, &model);
+}
+
+// What a step leaves in the two sums: each kind of view in its own.
+static void test_visits(gsf_context* ctx) {
+    gsf__model model = make_model(ctx, 2);
+    gsf__visit_job job;
+    memset(&job, 0, sizeof job);
+    job.model = &model;
+    for (int k = 0; k < 2; k++) {
+        job.counts[k] = 1;
+        job.half[k][0] = 10.0f;
+        job.half[k][1] = 20.0f;
+        for (size_t i = 0; i < 2; i++) {
+            model.screen[k][2 * i] = 0.3f * (float)(k + 1);
+            model.screen[k][2 * i + 1] = 0.2f * (float)(k + 1);
+            model.seen[k][i] = i == (size_t)k;
+        }
+    }
+    gsf__visit_chunk(&job, 0, 0);
+    for (int k = 0; k < 2; k++)
+        for (size_t i = 0; i < 2; i++) {
+            CHECK_NEAR(model.grad_sum[k][i], i == (size_t)k ? 5.0 * (k + 1) : 0.0, 1e-5);
+            CHECK(model.visits[k][i] == (i == (size_t)k));
+        }
+    gsf__model_destroy(ctx, &model);
+}
+
+// ---- origins -------------------------------------------------------------------
+
+// An origin of its own from 1e5 away, or from 1000 times the extent.
+static void test_origin(void) {
+    static const struct { double centre, extent; int moved; } cases[] = {
+        {990.0, 1.0, 0}, {1010.0, 1.0, 1}, {-990.0, 1.0, 0}, {-1010.0, 1.0, 1}, {9900.0, 10.0, 0}, {10100.0, 10.0, 1},
+        {99000.0, 1000.0, 0}, {101000.0, 1000.0, 1}, {5.0, 0.0, 0}, {99000.0, 0.0, 0}, {101000.0, 0.0, 1}};
+    enum { N = 201 };
+    for (size_t i = 0; i < GSF__COUNT(cases); i++)
+        for (int far_axis = 0; far_axis < 3; far_axis++) {
+            double axis[3 * N], origin[3];
+            for (int k = 0; k < 3; k++)
+                for (int j = 0; j < N; j++) // 5 % stand out at either end and do not count
+                    axis[k * N + j] = (k == far_axis ? cases[i].centre : 0.0) + cases[i].extent * (j - 100) / 180.0;
+            axis[far_axis * N] -= 1e7;
+            gsf__choose_origin(axis, N, origin);
+            for (int k = 0; k < 3; k++)
+                CHECK_NEAR(origin[k], cases[i].moved && k == far_axis ? floor(cases[i].centre + 0.5) : 0.0, 0.0);
+        }
+}
+
+// ---- warp ----------------------------------------------------------------------
+
+enum { SIDE = 8, PIXELS = SIDE * SIDE };
+
+// Two references at the frame's own place carry red at depth 1 and green at depth 2 with the given weights. The nearer one
+// shows where it has 0.35 of the farther one's weight.
+static int warp_shows_near(float near_weight, float far_weight) {
+    static float color[2][3 * PIXELS], depth[2][PIXELS], score[2][PIXELS], inv_z[2 * PIXELS];
+    gsf__warp_reference references[2];
+    gsf__warp warp;
+    gsf_camera camera;
+    memset(references, 0, sizeof references);
+    memset(&warp, 0, sizeof warp);
+    memset(&camera, 0, sizeof camera);
+    camera.w2c[0] = camera.w2c[5] = camera.w2c[10] = camera.w2c[15] = 1.0;
+    camera.width = camera.height = SIDE;
+    camera.fx = camera.fy = SIDE;
+    camera.cx = camera.cy = SIDE / 2.0;
+    for (int k = 0; k < 2; k++) {
+        references[k].camera = camera;
+        references[k].color = references[k].carried = color[k];
+        references[k].depth = depth[k];
+        references[k].score = score[k];
+        for (int i = 0; i < PIXELS; i++) {
+            for (int c = 0; c < 3; c++) color[k][3 * i + c] = c == k ? 1.0f : 0.0f;
+            depth[k][i] = (float)(k + 1);
+            score[k][i] = k == 0 ? near_weight : far_weight;
+            inv_z[k * PIXELS + i] = 1.0f / (float)(k + 1);
+        }
+    }
+    warp.references = references;
+    warp.count = 2;
+    const int32_t nearest[GSF__WARP_NEAREST] = {0, 1};
+    const double center[3] = {0.0, 0.0, 0.0};
+    const int32_t x = SIDE / 2, y = SIDE / 2;
+    float rgb[3] = {0.0f, 0.0f, 0.0f};
+    const float confidence = gsf__warp_pixel(&warp, nearest, 2, &camera, center, x, y, inv_z + y * SIDE + x, PIXELS, 5.0f,
+                                             rgb);
+    CHECK(confidence > 0.0f && rgb[0] + rgb[1] > 0.99f && rgb[0] * rgb[1] < 1e-3f);
+    return rgb[0] > 0.5f;
+}
+
+static void test_warp_groups(void) {
+    CHECK(warp_shows_near(1.0f, 1.0f) && warp_shows_near(0.36f, 1.0f) && warp_shows_near(0.19f, 0.5f));
+    CHECK(!warp_shows_near(0.34f, 1.0f) && !warp_shows_near(0.16f, 0.5f) && !warp_shows_near(0.01f, 1.0f));
+    CHECK(warp_shows_near(1.0f, 0.1f)); // the heavier group in front hides the other
+}
+
+// ---- dense points --------------------------------------------------------------
+
+// A point 100 units away and two cameras whose rays to it are `degrees` apart.
+static double dense_vote(const gsf_dense_desc* desc, double degrees) {
+    gsf__dense_job job;
+    gsf_camera a, b;
+    memset(&job, 0, sizeof job);
+    memset(&a, 0, sizeof a);
+    job.desc = gsf__dense_desc_defaults(desc);
+    a.w2c[0] = a.w2c[5] = a.w2c[10] = a.w2c[15] = 1.0;
+    a.fx = a.fy = 100.0;
+    b = a;
+    const double angle = degrees * 3.14159265358979323846 / 180.0;
+    b.w2c[12] = -100.0 * sin(angle);                   // minus its place
+    b.w2c[14] = -(100.0 - 100.0 * cos(angle));
+    const double point[3] = {0.0, 0.0, 100.0};
+    return gsf__dense_vote(&job, &a, &b, point, 100.0, 100.0);
+}
+
+static void test_dense_angles(void) {
+    gsf_dense_desc desc;
+    memset(&desc, 0, sizeof desc);
+    CHECK(dense_vote(NULL, 0.95) == 0.0 && dense_vote(NULL, 1.05) > 0.0);
+    CHECK(dense_vote(NULL, 10.0) > 0.99 && dense_vote(NULL, 6.0) < 0.51 && dense_vote(NULL, 30.0) < 0.51);
+    desc.min_angle = 5.0f;
+    CHECK(dense_vote(&desc, 4.9) == 0.0 && dense_vote(&desc, 5.1) > 0.0);
+    CHECK(gsf__dense_desc_defaults(NULL).max_normal_angle == 40.0f);
+}
+
+int main(void) {
+    gsf_context ctx;
+    test_context_init(&ctx);
+    test_restored_weight();
+    test_densify_means(&ctx);
+    test_visits(&ctx);
+    test_origin();
+    test_warp_groups();
+    test_dense_angles();
+    return test_report();
+}
