@@ -1,5 +1,5 @@
-// bench.h - what the benches share: clocks, contexts, rows of output, what the machine can do at most. Included behind the
-// implementation; BENCH_NAME ("splat") goes into every row.
+// bench.h - shared by the benches: clocks, contexts, output rows, peaks of the machine. Include it after the
+// implementation; BENCH_NAME ("splat") is written to every row.
 #ifndef BENCH_H
 #define BENCH_H
 
@@ -9,22 +9,22 @@ typedef struct bench_row {
     const char *name, *variant, *isa, *work_unit, *reference;
     int threads;
     double seconds, cpu_seconds, work, error_max, error_rel_l2; // errors < 0: not measured
-    double flops, ops, bytes; // of the whole; ops: with integers; 0: not counted, or not the bound to look at
-    double bandwidth, cpu_bandwidth; // shares of what reading the same memory between the rounds gave; 0: of a sweep's
+    double flops, ops, bytes; // totals; ops: integer operations; 0: not counted or not a meaningful bound
+    double bandwidth, cpu_bandwidth; // shares relative to reading the same memory between rounds; 0: relative to a sweep
     double peak_rss;     // bytes; 0: not measured
 } bench_row;
 
 enum { BENCH_LEVELS = GSF_CPU_AVX512_BF16 + 1 };
 static void bench_print(int json, const bench_row* row);
 
-// What the machine can do, per second, by instruction set and threads (1, 2): multiply-adds in float32, dot products of
-// integers and of bf16. 0: not measured, or no instructions for it.
+// Measured peaks per second, by instruction set and threads (1, 2): float32 multiply-adds, integer and bf16 dot products.
+// 0: not measured or no instructions for it.
 typedef struct bench_peak { double flops, ops, bf16; } bench_peak;
 static bench_peak bench_peaks[BENCH_LEVELS][3];
 
-#define BENCH_BF16 "bf16 products" // variant whose shares are of the bf16 peak
+#define BENCH_BF16 "bf16 products" // the variant whose shares are relative to the bf16 peak
 
-static gsf_cpu_level bench_level_of(const char* isa) { // AUTO: there is no such set
+static gsf_cpu_level bench_level_of(const char* isa) { // AUTO: unknown name
     int level = GSF_CPU_SCALAR;
     while (level < BENCH_LEVELS && strcmp(isa, gsf_cpu_level_name((gsf_cpu_level)level)) != 0) level++;
     return level < BENCH_LEVELS ? (gsf_cpu_level)level : GSF_CPU_AUTO;
@@ -89,18 +89,18 @@ static void* bench_alloc(gsf_context* ctx, size_t count, size_t size) {
     return memory;
 }
 
-// ---- multiply-adds: a chunk does FMA_CHAINS * FMA_ROUNDS of them in each lane, and writes 16 floats ----------------
+// ---- multiply-adds: a chunk runs FMA_CHAINS * FMA_ROUNDS per lane and writes 16 floats --------------------------------
 
 enum { FMA_CHAINS = 10, FMA_ROUNDS = 1 << 22 };
 
 static float bench_sink; // keeps the compiler from dropping the loops
 
-#define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would lie in memory at -O2
+#define BENCH_TEN(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) // an array would be kept in memory at -O2
 
-// Scalar code, too, is vectorized by the compiler, with what every processor of the architecture has (SSE2, Neon).
+// The compiler vectorizes scalar code, too, with the baseline vectors of the architecture (SSE2, Neon).
 typedef float bench_baseline __attribute__((vector_size(16)));
 
-static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add: no fused one without AVX2
+static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add; there is no fused one without AVX2
     const bench_baseline a = {0.999f, 0.999f, 0.999f, 0.999f}, b = {0.001f, 0.001f, 0.001f, 0.001f};
     (void)worker;
 #define BENCH_SCALAR(k) bench_baseline v##k = {(float)k, (float)k, (float)k, (float)k};
@@ -139,7 +139,7 @@ GSF__TARGET_AVX512 static void bench_fma_avx512(void* arg, size_t chunk, int wor
 }
 #endif
 
-static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* flops) { // flops: of a step
+static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* flops) { // flops: per step
 #if GSF__X86
     *flops = level >= GSF_CPU_AVX512 ? 32.0 : level >= GSF_CPU_AVX2 ? 16.0 : 8.0;
     if (level >= GSF_CPU_AVX512) return bench_fma_avx512;
@@ -150,7 +150,7 @@ static gsf_chunk_fn bench_fma_of(gsf_cpu_level level, double* flops) { // flops:
     return bench_fma_scalar;
 }
 
-// The fastest of nine rounds, `chunks` for each thread, by the clock or by CPU time: whichever was disturbed less.
+// The fastest of nine rounds with `chunks` per thread, by wall clock or by CPU time, whichever is higher.
 static double bench_fastest(gsf_context* ctx, size_t chunks, gsf_chunk_fn body, void* arg) {
     double best = 1e30;
     for (int i = 0; i < 9; i++) {
@@ -162,7 +162,7 @@ static double bench_fastest(gsf_context* ctx, size_t chunks, gsf_chunk_fn body, 
     return best;
 }
 
-// Runs a loop of FMA_CHAINS * FMA_ROUNDS steps of `work` each, shows the row and returns the rate.
+// Runs a loop of FMA_CHAINS * FMA_ROUNDS steps of `work` each, prints the row and returns the rate.
 static double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_chunk_fn body, double work, const char* unit) {
     float sums[4 * 2 * 16];
     const double seconds = bench_fastest(ctx, 4, body, sums), all = work * FMA_CHAINS * (double)FMA_ROUNDS * 4.0 * ctx->threads;
@@ -172,19 +172,19 @@ static double bench_peak_rate(int json, gsf_context* ctx, const char* name, gsf_
     return all / seconds;
 }
 
-// ---- memory: a sweep over so many bytes, each thread over its part -------------------
+// ---- memory: a sweep over a buffer, each thread over its part --------------------------
 
 typedef enum bench_sweep_kind { SWEEP_READ, SWEEP_UPDATE, SWEEP_COPY, SWEEP_STREAM, SWEEP_KINDS } bench_sweep_kind;
 
 typedef struct bench_sweep {
     char* memory;    // 64-byte aligned
-    size_t part;     // bytes of a thread, a multiple of 512
-    int passes;      // over the part, without anything between
-    bench_sweep_kind kind; // read; read and write in place; the first half into the second, through the caches or past them
+    size_t part;     // bytes per thread, a multiple of 512
+    int passes;      // consecutive passes over the part
+    bench_sweep_kind kind; // read; update in place; copy the first half to the second, through the caches or streaming
     float sums[2 * 16];
 } bench_sweep;
 
-// BODY(load, store, stream) for one instruction set: V, WIDTH and XOR say how.
+// BODY(load, store, stream) for one instruction set, given V, WIDTH and XOR.
 #define BENCH_SWEEP_BODY(V, LOAD, STORE, STREAM, XOR, ZERO)                                                              \
     bench_sweep* job = (bench_sweep*)arg;                                                                                \
     char* p = job->memory + chunk * job->part;                                                                           \
@@ -208,7 +208,7 @@ typedef struct bench_sweep {
             for (size_t i = 0; i < half; i += sizeof(V)) STORE(p + half + i, LOAD(p + i));                               \
         else                                                                                                             \
             for (size_t i = 0; i < half; i += sizeof(V)) STREAM(p + half + i, LOAD(p + i));                              \
-        __asm__ volatile("" ::: "memory"); /* no pass is left out */                                                     \
+        __asm__ volatile("" ::: "memory"); /* keeps every pass    */                                                     \
     }                                                                                                                    \
     const V sum = XOR(XOR(a, b), XOR(c, d));                                                                             \
     memcpy(job->sums + 16 * chunk, &sum, sizeof(float));
@@ -260,8 +260,8 @@ static gsf_chunk_fn bench_sweep_of(gsf_cpu_level level) {
 enum { SWEEP_SMALLEST = 16, SWEEP_LARGEST = 28 }; // log2 of bytes
 static double bench_sweep_rates[BENCH_LEVELS][3][SWEEP_LARGEST + 1];
 
-// Bytes per second of the fastest kind of sweep over 2^size bytes: the limit of a case that goes over at least as many. A
-// write counts once, also where the cache line was read before.
+// Bytes per second of the fastest kind of sweep over 2^size bytes: the limit for a case that touches at least as many. A
+// write counts once, even if the cache line is read first.
 static double bench_sweep_rate(int json, gsf_cpu_level level, int threads, int size) {
     double* rate = &bench_sweep_rates[level][threads][size];
     gsf_context ctx;
@@ -289,8 +289,8 @@ static double bench_sweep_rate(int json, gsf_cpu_level level, int threads, int s
     return *rate;
 }
 
-// The limit of a case that moves `bytes`: it goes over half of them at least (each read and written), and what is larger
-// lies no nearer.
+// The limit for a case that transfers `bytes`: it touches at least half of them (each read and written), and a larger
+// buffer is never faster.
 static double bench_bandwidth(int json, gsf_cpu_level level, int threads, double bytes) {
     int size = SWEEP_SMALLEST;
     while (size < SWEEP_LARGEST && (double)((size_t)2 << size) <= 0.5 * bytes) size++;
@@ -299,8 +299,8 @@ static double bench_bandwidth(int json, gsf_cpu_level level, int threads, double
 
 // ---- rows ----------------------------------------------------------------------------
 
-// Shares are of the limits by the clock; cpu_... ones make rates by CPU time of rates by the clock, for machines that do
-// other things as well. What has no limit has no share.
+// Shares are relative to the limits by wall clock; those with cpu_ use rates by CPU time, for machines that are not idle.
+// Rows without a limit have no share.
 typedef struct bench_shares { double peak, bandwidth, cpu_bandwidth; const char* of; } bench_shares;
 
 static bench_shares bench_shares_of(int json, const bench_row* row, double cpu) {

@@ -1,20 +1,20 @@
-// bench_nn.c - seconds beside error of the network kernels.
+// bench_nn.c - run time and error of the network kernels.
 // By hand: cc -O2 -fopenmp -I. bench/bench_nn.c -o bench_nn -lm
 //
 //     bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] [--model FOLDER | --pipeline FOLDER...]
 //
-// First what the machine can do (multiply-adds, dot products of integers and of bf16 per second; bytes per second of a sweep
-// over so many, measured where first needed), then every kernel at the sizes of the released model and at a small one, for
-// each instruction set, one and two threads. Shares are of what the same instructions and threads reach at most, in memory as
-// large as the case's; those of layers of few rows, which cycle through 1 GiB of weights, of reading the same memory between
-// their rounds. Errors are against sums in double, for large shapes of some rows. bench/peers_nn.py
-// runs PyTorch on the same cases, which it reads from their names.
-// Seconds are the median; cpu_seconds, the process' CPU time of all threads, is the least of the rounds. Peaks are by CPU
-// time, too: on a machine that does other things as well, cpu_peak_share is the figure to look at.
-// --model runs a model's VAE and one forward pass of its transformer once, at the configured size, instead: seconds,
-// operations and the peak of anonymous memory (make_model writes such a folder; the released size takes hours here).
-// --pipeline restores a clip with a small model by every solver, with fewer steps, and with what can be left out: seconds
-// beside error of the frames. Further folders hold the same weights in other types.
+// Measures the machine's peaks (multiply-adds, integer and bf16 dot products per second; memory bandwidth by size of the
+// buffer, when first needed), then every kernel at the sizes of the released model and at a small size, for each
+// instruction set, with one and two threads. Shares are relative to the peak of the same instruction set and number of
+// threads; bandwidth is relative to a sweep over as much memory or, for GEMV cases, which cycle through 1 GiB of
+// weights, to reading the same memory between rounds. Errors are relative to sums in double, over a sample of rows for
+// large shapes. bench/peers_nn.py runs PyTorch on the same cases, which it parses from their names. Seconds are the
+// median of the rounds; cpu_seconds, the CPU time of all threads, is their minimum. Peaks are also measured by CPU
+// time: on a machine that is not idle, cpu_peak_share is the more reliable figure. --model instead runs a model's VAE
+// and one forward pass of its transformer once, at the configured size: seconds, operations and peak anonymous memory
+// (make_model writes such a folder; the released size takes hours here). --pipeline restores a clip with a small model,
+// with every solver, fewer steps and each option that skips work: run time and error of the frames. Further folders
+// hold the same weights in other dtypes.
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
 #include "../gsfixer_nn.h"
@@ -27,12 +27,12 @@
 
 typedef struct bench_options {
     int json, quick, threads;
-    gsf_cpu_level level; // of all but the smallest cases, which are run at every level
+    gsf_cpu_level level; // for all but the smallest cases, which run at every level
     const char *filter, *model, *pipelines[4];
     int pipeline_count;
 } bench_options;
 
-// Every instruction set of the machine; bench_context leaves those out that it lacks.
+// All instruction sets; bench_context skips those that the machine lacks.
 #define BENCH_EACH(level) \
     for (gsf_cpu_level level = GSF_CPU_SCALAR; level <= bench_best_level; level = (gsf_cpu_level)(level + 1))
 static gsf_cpu_level bench_best_level;
@@ -41,7 +41,7 @@ static int bench_wanted(const bench_options* o, const char* name, int threads) {
     return (!o->filter || strstr(name, o->filter)) && (!o->threads || o->threads == threads);
 }
 
-// ---- what the machine can do ----------------------------------------------------
+// ---- peaks of the machine -------------------------------------------------------
 
 // Reading `size` bytes of `memory` once.
 static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t size) {
@@ -58,10 +58,11 @@ static void bench_read_all(gsf_context* ctx, bench_sweep* read) {
     bench_sink += read->sums[0];
 }
 
-// Integers: a dot product per step in each 32-bit lane, of four bytes where there are instructions for it, else of pairs.
+// Integers: one dot product per step in each 32-bit lane, of four bytes if there are instructions for it, else of two
+// words.
 
 #if GSF__X86
-#define BENCH_DOT_STEP(k) v##k = BENCH_DOT(v##k); __asm__("" : "+v"(v##k)); // no equal products, computed once
+#define BENCH_DOT_STEP(k) v##k = BENCH_DOT(v##k); __asm__("" : "+v"(v##k)); // keeps them apart
 GSF__TARGET_AVX2 static void bench_dot_avx2(void* arg, size_t chunk, int worker) {
     const __m256i a = _mm256_set1_epi32(0x10001);
     (void)worker;
@@ -104,12 +105,12 @@ GSF__TARGET_VNNI static void bench_dot_vnni(void* arg, size_t chunk, int worker)
     BENCH_STORE_INTEGERS
 }
 
-GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int worker) { // of pairs, in each 32-bit lane
+GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int worker) { // of pairs in each 32-bit lane
     const __m512bh a = (__m512bh)_mm512_set1_epi16(0x3f80);
     (void)worker;
 #define BENCH_WIDE_PAIRS(k) __m512 v##k = _mm512_set1_ps((float)k), w##k = _mm512_set1_ps((float)k + 32.0f);
     BENCH_TEN(BENCH_WIDE_PAIRS)
-    for (int i = 0; i < FMA_ROUNDS / 2; i++) { // latency is longer than that of multiply-adds: twice the chains
+    for (int i = 0; i < FMA_ROUNDS / 2; i++) { // the latency exceeds that of multiply-adds: twice the chains
 #define BENCH_PAIRS_STEP(k) v##k = _mm512_dpbf16_ps(v##k, a, a); w##k = _mm512_dpbf16_ps(w##k, a, a);
         BENCH_TEN(BENCH_PAIRS_STEP)
     }
@@ -118,7 +119,7 @@ GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int worker)
 }
 #endif
 
-static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* ops) { // ops: of a step; NULL: no instructions
+static gsf_chunk_fn bench_dot_of(gsf_cpu_level level, double* ops) { // ops: per step; NULL: no instructions for it
 #if GSF__X86
     *ops = level >= GSF_CPU_AVX512_VNNI ? 128.0 : level >= GSF_CPU_AVX512 ? 64.0 : 32.0;
     if (level >= GSF_CPU_AVX512_VNNI) return bench_dot_vnni;
@@ -149,9 +150,9 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
 
 typedef void (*bench_body)(gsf_context* ctx, void* arg);
 
-// One round to warm up, then rounds for about a second (quick: 0.2), at least three. Each does `repeats` units of the row.
-// With `read`, that memory is read before each round, and the row's bandwidth is its share of what that gave: other tenants
-// of the machine's memory come and go, and meet both alike.
+// One warm-up round, then at least three rounds, for about a second (quick: 0.2). Each runs `repeats` units of the row.
+// With `read`, that memory is read before each round, and the row's bandwidth is relative to that: other users of the
+// memory bus then affect both alike.
 static void bench_time_beside(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
                               double repeats, bench_sweep* read) {
     enum { MOST = 101 };
@@ -184,7 +185,7 @@ static void bench_time(const bench_options* o, gsf_context* ctx, bench_row* row,
     bench_time_beside(o, ctx, row, body, arg, repeats, NULL);
 }
 
-// ---- made-up values ---------------------------------------------------------------
+// ---- synthetic values -------------------------------------------------------------
 
 static uint64_t bench_random(uint64_t* state) { // xorshift64
     uint64_t x = *state;
@@ -194,7 +195,7 @@ static uint64_t bench_random(uint64_t* state) { // xorshift64
     return *state = x;
 }
 
-// Values of either sign with sizes in [1/4, 1/2). Bits of one value stand in each 16 or 32 bits.
+// Values of either sign with magnitudes in [1/4, 1/2). Each 16 or 32 bits hold one value.
 static void bench_fill(void* memory, size_t bytes, gsf_nn_dtype dtype, uint64_t seed) {
     static const uint64_t keeps[] = {0x807fffff807fffffu, 0x807f807f807f807fu, 0x83ff83ff83ff83ffu}; // f32, bf16, f16
     static const uint64_t sets[] = {0x3e8000003e800000u, 0x3e803e803e803e80u, 0x3400340034003400u};
@@ -212,7 +213,7 @@ typedef struct bench_linear {
     gsf_nn_linear_desc desc;
     gsf_tensor weight, bias;
     gsf_nn_workspace workspace;
-    int64_t in, out, copies; // of the weights, one after another: a round uses each once
+    int64_t in, out, copies; // copies of the weights, contiguous: a round uses each once
 } bench_linear;
 
 static void bench_run_linear(gsf_context* ctx, void* arg) {
@@ -230,7 +231,8 @@ static double bench_activation(gsf_nn_activation activation, double x) {
     return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
-// Against sums in double, over at most 4 rows: the last, the first and some between. y must hold one call's results.
+// Error relative to sums in double, over at most 4 rows: the last, the first and some between. y holds one call's
+// results.
 static void bench_linear_error(const bench_linear* l, const float* w, const float* bias, bench_row* row) {
     const gsf_nn_linear_desc* d = &l->desc;
     double worst = 0.0, difference = 0.0, square = 0.0;
@@ -251,12 +253,12 @@ static void bench_linear_error(const bench_linear* l, const float* w, const floa
     row->reference = "float64";
 }
 
-// Products of bf16 pairs are a variant of their own where the processor has instructions for them.
+// Products of bf16 pairs are a separate variant if the processor has instructions for them.
 static int bench_has_bf16(const bench_options* o, gsf_nn_dtype weights) {
     return o->level >= GSF_CPU_AVX512_BF16 && weights == GSF_NN_BF16;
 }
 
-// `memory` holds `size` bytes for the weights; few rows cycle through all of it.
+// `memory` holds `size` bytes for the weights; GEMV cases cycle through all of it.
 static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int threads, gsf_nn_dtype dtype, int bf16,
                              int64_t rows, int64_t out, int64_t in, gsf_nn_activation activation, char* memory,
                              size_t size) {
@@ -318,7 +320,7 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
 typedef struct bench_shape {
     int64_t rows, out, in;
     gsf_nn_activation activation;
-    int quick; // is also measured by --quick
+    int quick; // also measured with --quick
 } bench_shape;
 
 static void bench_linears(const bench_options* o, char* memory, size_t size) {
@@ -343,10 +345,10 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
         }
 }
 
-// ---- linear layers in 8-bit integers ------------------------------------------------
+// ---- 8-bit linear layers --------------------------------------------------------------
 
 typedef struct bench_int8 {
-    bench_linear linear; // copies: of the quantised weights
+    bench_linear linear; // copies: of the quantized weights
     gsf_nn_quantized weight;
 } bench_int8;
 
@@ -365,7 +367,7 @@ static void bench_run_quantize(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_quantize_weight(ctx, &l->linear.weight, 0, &l->weight));
 }
 
-// Floats in; rotation, rounding, product, scales and bias counted. Errors are those of the rounding, not of sums.
+// Float input; the time includes rotation, rounding, product, scales and bias. Errors are those of the quantization.
 static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int threads, int64_t rows, int64_t out, int64_t in,
                            char* memory, size_t size) {
     char name[96];
@@ -398,7 +400,7 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? bytes : ops, few ? "B" : "op");
     bench_linear_error(&l.linear, w, bias, &row);
     if (few) {
-        bench_int8 many = l; // copies of the weights fill the memory
+        bench_int8 many = l; // copies of the weights that fill the memory
         many.weight.data = (int8_t*)(void*)memory;
         many.linear.copies = (int64_t)(size / l.weight.bytes);
         for (int64_t i = 0; i < many.linear.copies; i++)
@@ -452,14 +454,15 @@ static void bench_run_attention(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_attention(ctx, &a->workspace, &a->desc));
 }
 
-static void bench_add_error(bench_row* row, double value, double expected, double* square) { // rel_l2: squares so far
+// Error_rel_l2 accumulates squares.
+static void bench_add_error(bench_row* row, double value, double expected, double* square) {
     const double error = fabs(value - expected);
     if (!(error <= row->error_max)) row->error_max = error;
     row->error_rel_l2 += error * error;
     *square += expected * expected;
 }
 
-// Against sums in double: three queries of the first and of the last head.
+// Error relative to sums in double: three queries of the first and of the last head.
 static void bench_attention_error(gsf_context* ctx, const gsf_nn_attention_desc* d, bench_row* row) {
     double *p = (double*)bench_alloc(ctx, (size_t)d->keys, sizeof(double)), square = 0.0;
     const int64_t dim = d->head_dim, width = d->heads * dim;
@@ -494,7 +497,7 @@ static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int
     const size_t q_size = (size_t)queries * (size_t)heads * 64, k_size = (size_t)keys * (size_t)heads * 64;
     float* memory = (float*)bench_alloc(&ctx, 2 * q_size + 2 * k_size, sizeof(float));
     bench_fill(memory, (2 * q_size + 2 * k_size) * sizeof(float), GSF_NN_F32, 4);
-    for (size_t i = 0; i < q_size + k_size; i++) memory[i] *= 4.0f; // as after a norm: logits of a few
+    for (size_t i = 0; i < q_size + k_size; i++) memory[i] *= 4.0f; // as after a norm: logits of small magnitude
     bench_attention a;
     memset(&a, 0, sizeof a);
     a.desc.queries = queries;
@@ -535,8 +538,8 @@ typedef enum bench_kind { LAYER_NORM, MODULATED, RMS_NORM, HEAD_NORM, GROUP_NORM
 
 typedef struct bench_rows {
     bench_kind kind;
-    int64_t rows, dim; // group norm: channels and their values
-    const float *x, *vector, *table; // vector: weight, bias, scale and shift alike; table: cosines and sines
+    int64_t rows, dim; // group norm: channels, values per channel
+    const float *x, *vector, *table; // vector: used as weight, bias, scale and shift; table: cosines and sines
     float* y;
 } bench_rows;
 
@@ -560,7 +563,7 @@ static void bench_run_rows(gsf_context* ctx, void* arg) {
     }
 }
 
-// The first `n` values of the result in double: a row, a group, or a head.
+// The first `n` values of the result in double precision: a row, a group or a head.
 static void bench_expect_rows(const bench_rows* b, int64_t n, double* out) {
     double mean = 0.0, square = 0.0, sum = 0.0;
     for (int64_t i = 0; i < n; i++) mean += (double)b->x[i] / (double)n;
@@ -647,7 +650,7 @@ static void bench_run_conv(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_convolve(ctx, &c->workspace, &c->desc));
 }
 
-// Output n of pixel (t, y, x): the plain sum in double.
+// Output n of pixel (t, y, x), as a direct sum in double.
 static double bench_conv_value(const bench_conv* c, const float* w, int64_t t, int64_t y, int64_t x, int64_t n) {
     const gsf_nn_conv_desc* d = &c->desc;
     double sum = 0.0;
@@ -665,7 +668,7 @@ static void bench_conv_error(const bench_conv* c, const float* w, bench_row* row
     const gsf_nn_conv_desc* d = &c->desc;
     const int64_t count = d->frames * d->height * d->width * c->channels;
     double worst = 0.0, difference = 0.0, square = 0.0;
-    for (int64_t i = 0; i < LOOKS; i++) { // first and last value among them
+    for (int64_t i = 0; i < LOOKS; i++) { // includes the first and the last value
         const int64_t at = i * (count - 1) / (LOOKS - 1), pixel = at / c->channels;
         const double value = bench_conv_value(c, w, pixel / d->width / d->height, pixel / d->width % d->height,
                                               pixel % d->width, at % c->channels);
@@ -679,7 +682,7 @@ static void bench_conv_error(const bench_conv* c, const float* w, bench_row* row
     row->reference = "float64";
 }
 
-// Causal 3 x 3 x 3 over `frames` of height x width with as many outputs as inputs, channels last.
+// Causal 3 x 3 x 3 convolution over `frames` of height x width, channels last, with equal numbers of inputs and outputs.
 static void bench_one_conv(const bench_options* o, gsf_cpu_level level, int threads, int64_t channels, int64_t frames,
                            int64_t height, int64_t width) {
     char name[96];
@@ -715,7 +718,7 @@ static void bench_one_conv(const bench_options* o, gsf_cpu_level level, int thre
     gsf_nn_destroy_workspace(&ctx, &c.workspace);
 }
 
-// ---- the autoencoder's resnet: two convolutions; group norms and SiLU are done on their way in
+// ---- the autoencoder's resnet block: two convolutions with fused group norm and SiLU on their input
 
 typedef struct bench_resnet {
     gsf__vae_net net;
@@ -765,7 +768,7 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
     bench_require(&ctx, gsf__vae_begin(&r.run));
     bench_require(&ctx, gsf__vae_grow(&r.run, &r.run.slots[0], (int64_t)values));
     bench_fill(r.run.slots[0].data, values * sizeof(float), GSF_NN_F32, 1);
-    for (int64_t g = 0; g < 2 * r.net.groups; g++) // what filling it would have summed up: mean 0, deviation 3/8
+    for (int64_t g = 0; g < 2 * r.net.groups; g++) // the sums that filling it would have given: mean 0, deviation 3/8
         gsf__vae_sums(&r.run, 0)[g] = g % 2 ? 0.140625 * (double)values / 32.0 : 0.0;
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, 2.0 * 54.0 * (double)values * (double)channels, "flop");
     row.flops = row.work;
@@ -798,7 +801,7 @@ typedef struct bench_block {
 
 enum { BENCH_BLOCK_TEXT = 226 };
 
-// The release's sizes; `tokens` in all, text among them.
+// The release's sizes; `tokens` includes the text tokens.
 static void bench_block_sizes(bench_block* b, int64_t tokens, int64_t references) {
     b->net.heads = 48;
     b->net.head_dim = 64;
@@ -816,7 +819,7 @@ static void bench_block_sizes(bench_block* b, int64_t tokens, int64_t references
     b->in.reference_tokens = references;
 }
 
-// Weights of the block, one after another in `memory`, of a size that keeps the stream's.
+// The block's weights, contiguous in `memory`, scaled so that the residual stream keeps its magnitude.
 static size_t bench_block_weights(bench_block* b, gsf_nn_dtype dtype, char* memory) {
     size_t used = 0;
     for (size_t i = 0; i < GSF__COUNT(gsf__dit_block_entries); i++) {
@@ -830,7 +833,7 @@ static size_t bench_block_weights(bench_block* b, gsf_nn_dtype dtype, char* memo
         t->data = memory + used;
         const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(dtype);
         if (memory) {
-            // values of [1/4, 1/2) in a vector; of a matrix all bits but the exponent's, which makes them 1/128 and less
+            // vectors: values in [1/4, 1/2); matrices: the same with exponents changed to give at most 1/128
             bench_fill(memory + used, bytes, dtype, i + 1);
             for (size_t k = 1; t->rank > 1 && k < bytes; k += 2)
                 if (dtype == GSF_NN_BF16 || k % 4 == 3) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
@@ -848,7 +851,7 @@ static void bench_run_block(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf__dit_block_forward(&b->run, 0));
 }
 
-// `references`: tokens of the cross-attention, 0: none, which is what diffusers' CogVideoXBlock computes.
+// `references`: tokens of the cross-attention; 0: no cross-attention, as in diffusers' CogVideoXBlock.
 static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dtype, int bf16, int64_t tokens,
                             int64_t references) {
     char name[96];
@@ -874,7 +877,7 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     float* memory = (float*)bench_alloc(&ctx, gsf__dit_total(&l) + l.x, sizeof(float));
     gsf__dit_share_out(&b.run, &l, memory);
     b.first = memory + gsf__dit_total(&l);
-    bench_fill(memory, (gsf__dit_total(&l) + l.x) * sizeof(float), GSF_NN_F32, 6); // also the rotation
+    bench_fill(memory, (gsf__dit_total(&l) + l.x) * sizeof(float), GSF_NN_F32, 6); // includes the rotation table
     double bytes, flops;
     gsf_nn_transformer_cost(&b.net, &b.in, &bytes, &flops);
     flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
@@ -910,14 +913,14 @@ enum { BENCH_VIT_WIDTH = 1024, BENCH_VIT_HEADS = 16, BENCH_VIT_ROWS = 25, BENCH_
 typedef struct bench_vit {
     gsf_nn_dinov2 net;
     gsf__vit vit;
-    gsf__vit_block blocks[24]; // all on one block's weights, which no cache holds
+    gsf__vit_block blocks[24]; // all share one block's weights, which exceed every cache
     gsf_tensor tensors[64];
     gsf_nn_encoder_input in;
     gsf__vit_run run;
-    float *first, *x, *out;    // the stream before a block; at work; the encoder's output
+    float *first, *x, *out;    // residual stream before a block; working copy; the encoder's output
 } bench_vit;
 
-// Tensors of `entries` one after another in `memory`; matrices of small values.
+// The tensors of `entries`, contiguous in `memory`; matrices have small values.
 static size_t bench_vit_weights(bench_vit* b, const gsf__vit_entry* entries, size_t count, gsf_tensor* tensors, void* where,
                                 char* memory) {
     size_t used = 0;
@@ -969,7 +972,7 @@ static void bench_run_dinov2(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_dinov2_encode(ctx, &b->net, &b->in, b->out));
 }
 
-// The whole of DINOv2-L with registers, from pixels to the last norm.
+// Complete DINOv2-L with registers, from pixels to the last norm.
 static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers) {
     char name[96];
     snprintf(name, sizeof name, "dinov2 f32 %dx%d L=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)layers);
@@ -1009,7 +1012,7 @@ static void bench_run_pair(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf__vit_block_forward(&b->run, &b->blocks[0], b->x, 1, images * tokens));
 }
 
-// A frame and a global block of VGGT.
+// One frame block and one global block of VGGT.
 static void bench_one_pair(const bench_options* o, int threads, int32_t images) {
     char name[96];
     snprintf(name, sizeof name, "vggt pair f32 %dx%d N=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)images);
@@ -1067,7 +1070,7 @@ static void bench_encoders(const bench_options* o) {
 
 // ---- a whole model from its folder ---------------------------------------------------
 
-typedef struct bench_memory { // resident bytes of this process, watched from a thread of its own
+typedef struct bench_memory { // resident bytes of this process, sampled by a separate thread
     pthread_t thread;
     atomic_int stop;
     double anonymous, file; // peaks
@@ -1090,7 +1093,7 @@ static void* bench_watch(void* arg) {
     return NULL;
 }
 
-typedef struct bench_steps { // clock at every step that is reported
+typedef struct bench_steps { // time of every reported step
     double* seconds;
     size_t count, limit;
 } bench_steps;
@@ -1125,10 +1128,10 @@ static void bench_run_encode(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf_nn_vae_encode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y, NULL));
 }
 
-// Once: these take minutes. Memory is all that the process holds, inputs and outputs included.
+// Runs once, since it takes minutes. Memory is that of the whole process, including inputs and outputs.
 static void bench_once(const bench_options* o, gsf_context* ctx, const char* name, const char* variant, bench_model* m,
                        bench_body body, double flops, double bytes) {
-    double times[256]; // more steps than that are not looked at
+    double times[256]; // further steps are ignored
     bench_steps steps = {times, 0, 256};
     bench_memory memory;
     memset(&memory, 0, sizeof memory);
@@ -1190,11 +1193,12 @@ static void bench_forward(const bench_options* o, gsf_context* ctx, bench_model*
     m->in.reference_kv = kv;
     double bytes, flops;
     gsf_nn_transformer_cost(t, &m->in, &bytes, &flops);
-    bytes += (double)gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1) * sizeof(float); // the caller's, filled here
+    // The caller's buffer, filled here.
+    bytes += (double)gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1) * sizeof(float);
     bench_once(o, ctx, "model: transformer forward", "default", m, bench_run_forward, flops, bytes);
     m->transformer.bf16 = 1;
     m->in.reference_kv_ready = 0;
-    if (bench_has_bf16(o, GSF_NN_BF16)) // with weights of another type only attention is
+    if (bench_has_bf16(o, GSF_NN_BF16)) // with weights of another dtype, only attention uses bf16
         bench_once(o, ctx, "model: transformer forward", BENCH_BF16, m, bench_run_forward, flops, bytes);
     float* all[] = {hidden, text, dino, vggt, references, m->y, kv};
     for (size_t i = 0; i < GSF__COUNT(all); i++) gsf_free(ctx, all[i]);
@@ -1234,7 +1238,7 @@ static void bench_whole_model(const bench_options* o) {
     if (bench_wanted(o, "model: vae encode", ctx.threads)) bench_vae(o, &ctx, &m, GSF_NN_VAE_ENCODE);
 }
 
-// ---- the pipeline: run time beside error of the final frames, on a small model ------------
+// ---- the pipeline: run time and error of the final frames, on a small model ---------------
 
 typedef struct bench_pipeline {
     const bench_options* options;
@@ -1242,8 +1246,8 @@ typedef struct bench_pipeline {
     gsf_nn_transformer transformer;
     gsf_nn_vae vae;
     gsf_nn_schedule schedule;
-    gsf_nn_sample_desc desc;   // as the official code runs: 50 steps of DDIM, guidance 6
-    char dtype[8];             // of the weights
+    gsf_nn_sample_desc desc;   // as in the GSFixer release: 50 steps of DDIM, guidance 6
+    char dtype[8];             // dtype of the weights
     float* out;
     size_t count;
 } bench_pipeline;
@@ -1298,7 +1302,7 @@ static void bench_close_pipeline(bench_pipeline* p) {
     gsf_nn_destroy_transformer(ctx, &p->transformer);
 }
 
-// Once: a row's rounding repeats are not worth their minutes. Error of the frames against `reference`'s, if any.
+// Runs once, since repetitions would take minutes. Error of the frames relative to `reference`, if any.
 static void bench_restore(bench_pipeline* p, const gsf_nn_sample_desc* desc, const char* series, const char* variant,
                           const float* expected, const char* reference) {
     char name[96];
@@ -1326,13 +1330,13 @@ static void bench_restore(bench_pipeline* p, const gsf_nn_sample_desc* desc, con
     bench_print(p->options->json, &row);
 }
 
-static float* bench_keep(bench_pipeline* p) { // the frames of the last run
+static float* bench_keep(bench_pipeline* p) { // a copy of the frames of the last run
     float* kept = (float*)bench_alloc(&p->ctx, p->count, sizeof(float));
     memcpy(kept, p->out, p->count * sizeof(float));
     return kept;
 }
 
-// Fewer steps and other solvers, against the path that all of them approximate.
+// Fewer steps and other solvers, relative to the converged path that all of them approximate.
 static void bench_solvers(bench_pipeline* p, const float* converged) {
     static const char* const names[] = {"ddim", "dpmpp", "unipc"};
     static const int32_t steps[] = {5, 8, 12, 20, 50};
@@ -1347,7 +1351,7 @@ static void bench_solvers(bench_pipeline* p, const float* converged) {
         }
 }
 
-// What leaves work out of each step, against the same steps with all of it.
+// Options that skip work within a step, relative to the same steps without them.
 static void bench_skips(bench_pipeline* p, const float* expected) {
     static const struct {
         const char* name;
@@ -1372,7 +1376,7 @@ static void bench_skips(bench_pipeline* p, const float* expected) {
     }
 }
 
-// The first model's frames are the reference of the others, which have its weights in another type.
+// The first model's frames are the reference for the others, which have the same weights in other dtypes.
 static void bench_pipelines(const bench_options* o) {
     bench_pipeline p;
     float *converged, *expected = NULL;
@@ -1391,7 +1395,8 @@ static void bench_pipelines(const bench_options* o) {
         }
         bench_restore(&p, &p.desc, "skips", i ? p.dtype : "all of it", expected, "all of it");
         if (bench_has_bf16(o, GSF_NN_BF16)) {
-            const char* const names[] = {"bf16 attention", "bf16 weights and products"}; // f32 weights keep float32 products
+            // F32 weights keep float32 products.
+            const char* const names[] = {"bf16 attention", "bf16 weights and products"};
             if (i == 0) expected = bench_keep(&p);
             p.transformer.bf16 = 1;
             bench_restore(&p, &p.desc, "skips", names[i != 0], expected, "all of it");
@@ -1421,7 +1426,7 @@ typedef struct bench_t5 {
     float* first; // the layer's input
 } bench_t5;
 
-// Weights one after another in `memory` (NULL: only their size), norms f32; matrices of sizes up to 2^-7, as in a block.
+// Weights contiguous in `memory` (NULL: only computes their size), norms in f32; matrix values up to 2^-7, as in a block.
 static size_t bench_t5_weights(bench_t5* b, gsf_nn_dtype dtype, char* memory) {
     const int64_t d = b->net.width, h = b->net.hidden;
     const struct { const gsf_tensor** to; int64_t out, in; } parts[] = {
@@ -1477,7 +1482,7 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
     bench_t5_weights(&b, dtype, weights);
     const gsf__t5_layout l = gsf__t5_plan(&b.net, &b.in);
     float* memory = (float*)bench_alloc(&ctx, (size_t)(l.total + l.x), sizeof(float));
-    bench_fill(memory, (size_t)(l.total + l.x) * sizeof(float), GSF_NN_F32, 6); // also the bias
+    bench_fill(memory, (size_t)(l.total + l.x) * sizeof(float), GSF_NN_F32, 6); // includes the bias
     b.run.ctx = &ctx;
     b.run.net = &b.net;
     b.run.in = &b.in;
@@ -1517,7 +1522,7 @@ typedef struct bench_opt {
     gsf__caption_run run;
     gsf__opt_run state;
     int64_t rows, past;
-    const float* first; // the stream before the layer
+    const float* first; // residual stream before the layer
 } bench_opt;
 
 static void bench_run_opt(gsf_context* ctx, void* arg) {
@@ -1527,7 +1532,7 @@ static void bench_run_opt(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf__opt_block(&b->run, &b->state, 0, b->rows));
 }
 
-// The layer's tensors in half precision, one after another; returns their bytes.
+// The layer's tensors in half precision, contiguous; returns their size in bytes.
 static size_t bench_opt_weights(bench_opt* b, char* memory) {
     size_t used = 0;
     for (size_t i = 0; i < GSF__COUNT(gsf__opt_block_entries); i++) {
@@ -1547,7 +1552,7 @@ static size_t bench_opt_weights(bench_opt* b, char* memory) {
     return used;
 }
 
-// One layer of OPT-2.7b: all rows of an image's queries and bos at once, or one token behind them, which is a matter of
+// One layer of OPT-2.7b: the prefill of an image's query tokens and bos, or the decoding of one token, which is bound by
 // reading the weights.
 static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     char name[96];
@@ -1629,8 +1634,8 @@ int main(int argc, char** argv) {
     (void)bench_context(&ctx, GSF_CPU_AUTO, 1);
     bench_best_level = ctx.cpu_level;
     (void)bench_context(&ctx, o.level, 1);
-    o.level = ctx.cpu_level; // what the machine has of it
-    const size_t size = (size_t)1 << (o.quick ? 28 : 30); // more than any cache
+    o.level = ctx.cpu_level; // limited to what the machine supports
+    const size_t size = (size_t)1 << (o.quick ? 28 : 30); // larger than any cache
     char* memory = (char*)bench_alloc(&ctx, size, 1);
     bench_fill(memory, size, GSF_NN_F32, 1);
     for (int threads = 1; threads <= 2; threads++) {

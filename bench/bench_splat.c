@@ -1,18 +1,18 @@
-// bench_splat.c - seconds beside error of the splat path.
+// bench_splat.c - run time and error of the splat code.
 // By hand: cc -O2 -fopenmp -I. bench/bench_splat.c -o bench_splat -lm
 //
 //     bench_splat [--json] [--quick] [--filter TEXT] [--threads N] [--scene COLMAP [--views FILE] [--start PLY] [--steps N]]
 //     bench_splat --growth [--json]
 //
-// Without a scene: what the machine can do (multiply-adds per second; bytes per second of a sweep over so many, measured
-// where first needed), then for made-up splats at several sizes, each instruction set and one and two threads: every stage
-// of a training step by itself, and render and backward whole, against the double-precision reference of
-// tests/reference_splat.h where that is affordable. A pair is a splat and a pixel that it is blended into. Shares are of
-// what the same instructions and threads reach at most, in memory as large as the case's.
-// With a scene: whole training steps (render, loss, backward, Adam; density control off) on its photos. --views names a
-// text file of image names, one per line; --start a PLY to begin with instead of the scene's points. The first 5 steps
-// warm up; the median, and the process' CPU seconds per step, are over the rest.
-// --growth: how a step's cost grows with the splats, with the pixels and with the share of the splats in the frame.
+// Without a scene: the machine's peaks (multiply-adds per second; memory bandwidth by size of the buffer, when first
+// needed), then, for synthetic splats at several sizes, each instruction set, and one and two threads: every stage of a
+// training step, and complete forward and backward passes against the double-precision reference of
+// tests/reference_splat.h where that is affordable. A pair is one splat blended into one pixel. Shares are relative to
+// the peaks of the same instruction set and number of threads, for a buffer as large as the case's. With a scene:
+// complete training steps (render, loss, backward, Adam; density control off) on its photos. --views is a text file of
+// image names, one per line; --start a PLY to use instead of the scene's points. The first 5 steps are warm-up; the
+// median, and the process' CPU seconds per step, are over the rest. --growth: how the cost of a step scales with the
+// splats, with the pixels and with the share of the splats in the frame.
 #define _XOPEN_SOURCE 700 // getrusage
 #define GSFIXER_IMPLEMENTATION
 #define GSF_ASSERT(x) ((void)0)
@@ -33,7 +33,7 @@ static void bench_show(const bench_options* o, const bench_row* row) {
     if (!o->filter || strstr(row->name, o->filter)) bench_print(o->json, row);
 }
 
-// ---- what the machine can do ----------------------------------------------------
+// ---- peaks of the machine -------------------------------------------------------
 
 static void bench_machine(const bench_options* o, gsf_cpu_level level, int threads) {
     gsf_context ctx;
@@ -43,9 +43,9 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
     bench_peaks[level][threads].flops = bench_peak_rate(o->json, &ctx, "machine: multiply-add", fma, flops, "flop");
 }
 
-// ---- made-up splats -------------------------------------------------------------
+// ---- synthetic splats -----------------------------------------------------------
 
-// A cloud that covers the image about evenly: anisotropic, half transparent, SH degree 3.
+// A cloud that covers the image roughly evenly: anisotropic, half transparent, SH degree 3.
 static void bench_make_splats(gsf_context* ctx, size_t count, double size, gsf_splats* s) {
     bench_require(ctx, gsf_splat_make(ctx, count, 3, s));
     for (size_t i = 0; i < count; i++) {
@@ -74,8 +74,8 @@ static gsf_camera bench_camera(int width, int height) {
 
 // ---- the stages of a step ---------------------------------------------------------
 
-// Floating-point operations (an FMA is two) of the kernels' source, per pair: place and exponent 6, 2^x 13, transmittance 4,
-// colour 7; backward: the first three again, then gradient of alpha 12 and ten sums 20.
+// Floating-point operations per pair, counted from the kernels' source (an FMA is two): position and exponent 6, 2^x 13,
+// transmittance 4, colour 7; backward: the first three again, then gradient of alpha 12 and ten sums 20.
 #define BENCH_FORWARD_FLOPS 30.0
 #define BENCH_BACKWARD_FLOPS 55.0
 
@@ -88,7 +88,7 @@ typedef struct bench_count {
     uint64_t* pairs; // per tile
 } bench_count;
 
-// Pairs of one tile: lanes with an alpha in the steps that backward keeps.
+// Pairs of one tile: lanes with an alpha in the steps that the backward pass keeps.
 static void bench_count_tile(void* arg, size_t index, int worker) {
     const bench_count* job = (const bench_count*)arg;
     const gsf__tile tile = gsf__tile_of(job->r, index);
@@ -105,7 +105,8 @@ static void bench_count_tile(void* arg, size_t index, int worker) {
     }
 }
 
-static double bench_pairs(gsf_context* ctx, gsf_rasterizer* r) { // of the last render; backward has made the scratch
+// Of the last render; its backward pass has made the scratch memory.
+static double bench_pairs(gsf_context* ctx, gsf_rasterizer* r) {
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
     bench_count job;
     job.r = r;
@@ -121,7 +122,7 @@ static double bench_pairs(gsf_context* ctx, gsf_rasterizer* r) { // of the last 
 
 typedef struct bench_clock { double wall[STAGES], cpu[STAGES], wall_from, cpu_from; } bench_clock;
 
-static void bench_lap(bench_clock* clock, int stage) { // the time since the last lap belongs to `stage`
+static void bench_lap(bench_clock* clock, int stage) { // assigns the time since the last lap to `stage`
     const double wall = bench_now(), cpu = bench_cpu();
     clock->wall[stage] = wall - clock->wall_from;
     clock->cpu[stage] = cpu - clock->cpu_from;
@@ -169,7 +170,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     for (size_t i = 0; i < 3 * pixels; i++) photo[i] = (float)gsf_random_uniform(7, 0, i);
     gsf_rasterizer* r;
     bench_require(&ctx, gsf_splat_make_rasterizer(&ctx, &r));
-    // one step through the front door makes every buffer
+    // one step through the public functions allocates all buffers
     bench_require(&ctx, gsf_splat_render(&ctx, r, &trained, &camera, NULL, &out));
     bench_require(&ctx, gsf_splat_render_backward(&ctx, r, &trained, &camera, NULL, d_color, NULL, NULL, &grads));
     float* front = (float*)gsf_alloc(&ctx, 3 * pixels, sizeof(float));
@@ -208,7 +209,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     target.height = height;
     target.f32 = photo;
     gsf__adam_rates rates;
-    memset(&rates, 0, sizeof rates); // all work, but nothing moves: every round has the same splats
+    memset(&rates, 0, sizeof rates); // full work with zero rates, so that every round has the same splats
 
     const size_t splat_chunks = (count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK;
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
@@ -216,7 +217,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     const int rounds = o->quick ? 3 : MOST;
     double wall[STAGES][MOST], cpu[STAGES], step[MOST], step_cpu = 0.0, pairs = 0.0;
     memset(cpu, 0, sizeof cpu);
-    for (int i = -1; i < rounds; i++) { // one round of warming up
+    for (int i = -1; i < rounds; i++) { // one warm-up round
         bench_clock clock;
         clock.wall_from = bench_now();
         clock.cpu_from = bench_cpu();
@@ -252,7 +253,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     }
     pairs = bench_pairs(&ctx, r);
 
-    // bytes that a stage must move at least, were its caches cold: what it reads and writes once
+    // minimum bytes that a stage transfers with cold caches: everything it reads and writes, once
     const double n = (double)count, entries = (double)r->pair_count, p = (double)pixels;
     const double bytes[STAGES] = {
         n * (59 * 4 + sizeof(gsf__record) + 4),
@@ -287,17 +288,17 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     gsf_splat_destroy(&ctx, &splats);
 }
 
-// ---- whole renders against float64 ------------------------------------------------
+// ---- renders against float64 -------------------------------------------------------
 
-typedef struct bench_pass { // a render and its backward, with what they need
+typedef struct bench_pass { // a forward and backward pass with its buffers
     gsf_rasterizer* r;
     gsf_camera camera;
-    gsf_splats splats, sums; // the sums hold the gradients
+    gsf_splats splats, sums; // sums: the gradients
     gsf_splat_grads grads;
     gsf_render_desc desc;
     gsf_render_output out;
     float* d_color;
-    size_t values;           // of a picture
+    size_t values;           // values per image
 } bench_pass;
 
 static void bench_open_pass(gsf_context* ctx, bench_pass* p, size_t count, double size, int width, int height, double zoom) {
@@ -329,7 +330,7 @@ static void bench_close_pass(gsf_context* ctx, bench_pass* p) {
     gsf_splat_destroy(ctx, &p->splats);
 }
 
-// One round: wall and CPU seconds of the render, then of its backward.
+// One round: wall and CPU seconds of the forward, then of the backward pass.
 static void bench_run_pass(gsf_context* ctx, bench_pass* p, double wall[2], double cpu[2]) {
     memset(p->sums.owned, 0, p->splats.count * (3 + 3 + 4 + 1 + 48) * sizeof(float));
     const double t0 = bench_now(), c0 = bench_cpu();
@@ -347,7 +348,8 @@ static void bench_error(const float* actual, const double* expected, const doubl
                         bench_row* row) {
     double worst = 0.0, difference = 0.0, total = 0.0;
     for (size_t i = 0; i < count; i++) {
-        if (margin && margin[i / per_pixel] < 1e-4) continue; // a yes/no decision of this pixel is within rounding
+        // A binary decision of this pixel is within rounding of its threshold.
+        if (margin && margin[i / per_pixel] < 1e-4) continue;
         const double d = fabs((double)actual[i] - expected[i]);
         if (d > worst) worst = d;
         difference += d * d;
@@ -372,7 +374,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     enum { MOST = 15 };
     double forward[MOST], backward[MOST], cpu[2] = {0.0, 0.0};
     const int rounds = o->quick ? 5 : MOST;
-    for (int i = -1; i < rounds; i++) { // one round of warming up
+    for (int i = -1; i < rounds; i++) { // one warm-up round
         double wall[2], seconds[2];
         bench_run_pass(&ctx, &p, wall, seconds);
         if (i < 0) continue;
@@ -399,7 +401,7 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
         bench_error((const float*)p.out.color.data, image.color, image.margin, p.values, 3, &rows[0]);
         bench_error(p.sums.means, expected.means, NULL, 3 * count, 1, &rows[1]);
         for (int k = 0; k < 2; k++) {
-            rows[k].work = blended; // the reference's own count
+            rows[k].work = blended; // counted by the reference
             rows[k].reference = "float64";
         }
         free(d_wide);
@@ -411,9 +413,10 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     bench_close_pass(&ctx, &p);
 }
 
-// ---- what can be left out -----------------------------------------------------------
+// ---- skipped work -------------------------------------------------------------------
 
-// Render and backward with and without a skip, in turns; the error is that of the picture against the first variant's.
+// Forward and backward with and without a skip, alternating; the error is that of the image relative to the first
+// variant.
 static void bench_skips(const bench_options* o, const char* name, size_t count, double size, int width, int height,
                         int threads) {
     enum { FULL, OFFICIAL, SHUFFLED, VARIANTS, MOST = 9 };
@@ -459,10 +462,10 @@ static void bench_skips(const bench_options* o, const char* name, size_t count, 
 
 // ---- lazy Adam --------------------------------------------------------------------
 
-// Training steps with dense and with lazy Adam in turns, on five views that see different parts of the splats where `zoom`
-// is above 1. The splats lie in memory by their place, or at random. What lazy Adam catches up with counts in the step, not
-// in its Adam stage. The error is that of the SH against the dense trainer's after all steps, relative to at least 0.2 and in
-// L2.
+// Training steps with dense and with lazy Adam, alternating, on five views that see different parts of the splats if
+// `zoom` is above 1. The splats are in Morton or in random order. Catching up counts as part of the step, not of its
+// Adam stage. The error is that of the SH relative to the dense trainer's after all steps: the largest, relative to at
+// least 0.2, and in L2.
 static void bench_lazy(const bench_options* o, const char* size_name, size_t count, double size, int width, int height,
                        double zoom, int in_order, int rounds, int threads) {
     if (o->filter && !strstr("lazy: adam step", o->filter)) return;
@@ -499,7 +502,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
     if (rounds > MOST) rounds = MOST;
     for (int i = -2 * VIEWS; i < rounds; i++)
         for (int turn = 0; turn < 2; turn++) {
-            const int k = turn ^ (i & 1); // none always comes first
+            const int k = turn ^ (i & 1); // alternates which one runs first
             gsf_trainer* trainer = trainers[k];
             gsf__visit_job visits;
             gsf_train_stats stats;
@@ -547,8 +550,8 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
 
 // ---- growth -----------------------------------------------------------------------
 
-// Render and backward of splats that shrink as their number grows, so that about as many lie over a pixel; `zoom` enlarges
-// the picture, so that less of the splats is in it.
+// Forward and backward with splats that shrink as their number grows, so that the number that overlaps a pixel stays
+// about the same; `zoom` magnifies the image, so that fewer of the splats are in it.
 static void bench_growth_row(const bench_options* o, const char* by, double amount, size_t count, int width, int height,
                              double zoom) {
     gsf_context ctx;
@@ -559,7 +562,7 @@ static void bench_growth_row(const bench_options* o, const char* by, double amou
     bench_open_pass(&ctx, &p, count, 2.0 / sqrt((double)count), width, height, zoom);
     enum { ROUNDS = 7 };
     double seconds[ROUNDS], cpu = 0.0;
-    for (int i = -1; i < ROUNDS; i++) { // one round of warming up
+    for (int i = -1; i < ROUNDS; i++) { // one warm-up round
         double wall[2], used[2];
         bench_run_pass(&ctx, &p, wall, used);
         if (i < 0) continue;
@@ -588,8 +591,8 @@ static void bench_growth(const bench_options* o) {
 
 // ---- visible points ---------------------------------------------------------------
 
-// 125 balls of points in a 5 x 5 x 5 grid, nearly touching, seen from an arc of 60 degrees: no view shows a back, and the
-// front balls hide most of the others, so that about 30 % of the points are seen.
+// 125 balls of points in a 5 x 5 x 5 grid, nearly touching, seen from an arc of 60 degrees: no view shows the back
+// sides, and the front balls occlude most of the others, so that about 30 % of the points are visible.
 static void bench_visibility(const bench_options* o, const char* name, size_t count, size_t view_count, int threads) {
     if (o->filter && !strstr(name, o->filter)) return;
     gsf_context ctx;

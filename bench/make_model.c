@@ -422,8 +422,8 @@ static int model_ends_in(const char* text, const char* end) {
 
 typedef struct model_range { const char* end; double middle, spread, factor; } model_range;
 
-// Of tensors whose names end so: values are uniform in middle - spread .. middle + spread; or factor, with no spread, times
-// those of any other. The first that fits holds.
+// Of tensors whose names end so: values are uniform in middle - spread .. middle + spread; or factor, with no spread,
+// times those of any other. The first that fits holds.
 static const model_range model_ranges[] = {
     {".conv_y.conv.bias", 1.0, 0.05, 0.0}, {".conv_y.conv.weight", 0.0, 0.0, 0.25}, // makes a factor, too
     {".pos_embedding", 0.0, 0.05, 0.0}, // is added to the transformer's tokens
@@ -435,8 +435,8 @@ static const model_range model_ranges[] = {
     {"_embedding", 0.0, 1.0, 0.0}, {"_embeddings", 0.0, 1.0, 0.0}, {".pos_embed", 0.0, 1.0, 0.0},
 };
 
-// Every layer keeps the size of what goes through it: weights of variance 1 / fan-in, norms near 1. So the modulations and
-// gates of the transformer's blocks come out about 0.2 in size, from the time embedding's own size.
+// Every layer keeps the size of what goes through it: weights of variance 1 / fan-in, norms near 1. So the modulations
+// and gates of the transformer's blocks come out about 0.2 in size, from the time embedding's own size.
 static void model_choose_range(model_tensor* t) {
     const int norm = t->rank == 1 && model_ends_in(t->name, ".weight");
     t->middle = norm ? 1.0 : 0.0;

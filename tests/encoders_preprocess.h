@@ -1,4 +1,4 @@
-// encoders_preprocess.h - the official preprocessing of reference photos, bit for bit.
+// encoders_preprocess.h - preprocessing of reference photos as in the GSFixer release, bit-exact.
 #ifndef ENCODERS_PREPROCESS_H
 #define ENCODERS_PREPROCESS_H
 

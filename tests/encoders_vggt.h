@@ -1,4 +1,4 @@
-// encoders_vggt.h - VGGT's aggregator against the float64 run of the official code.
+// encoders_vggt.h - VGGT's aggregator against a float64 run of VGGT's own code.
 #ifndef ENCODERS_VGGT_H
 #define ENCODERS_VGGT_H
 

@@ -1,4 +1,4 @@
-// The encoders of references against the golden data of the official code: every part reads its shapes, configs and values
+// The encoders of references against golden data of the GSFixer release: every part reads its shapes, configs and values
 // from GSF_GOLDEN/encoders, so that another folder of the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every
 // error.
 #include "gsfixer_nn.h"

@@ -1,4 +1,4 @@
-// The restorer against the golden data of the official code: every part reads its shapes, configs and values from
+// The restorer against golden data of the GSFixer release: every part reads its shapes, configs and values from
 // GSF_GOLDEN/restorer, so that another folder of the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every error.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"

@@ -1,4 +1,4 @@
-// golden_traj - gsfixer_traj.h against what the official code computed (tests/golden/traj/README.md). Every file of the
+// golden_traj - gsfixer_traj.h against data computed by the GSFixer release (tests/golden/traj/README.md). Every file of the
 // folder that has the tensors of a scene is taken; counts come from the shapes. Tolerance: 1e-9 of the largest value of
 // a float64 tensor, 1e-6 for float32, modulo the signs of eigenvectors.
 #define _DEFAULT_SOURCE 1 // opendir

@@ -1,7 +1,7 @@
 // reference_splat.h - double-precision reference of the splat rasterizer: the oracle of tests and benches.
 //
 // Plain scalar C, one pixel after the other, nothing clever; correctness is all it is for. It follows the conventions
-// of golden/splat/README.md (3D Gaussian Splatting as the official CUDA rasterizer computes it):
+// of golden/splat/README.md (3D Gaussian Splatting as Inria's CUDA rasterizer computes it):
 //     u = fx X/Z + cx - 0.5 (pixel centres are integers), J with x/z clamped at +-1.3 W/(2 fx), 0.3 px^2 of blur,
 //     front to back in order of Z (ties by index), alpha = min(0.99, o G), skipped below 1/255,
 //     stop before a splat that would bring the transmittance below 1e-4.
@@ -51,7 +51,7 @@ typedef struct ref_options { // zero = default
     int official_footprint; // blend only in the 16x16 tiles of the 3-sigma square
     int official_gradient;  // straight through the 0.99 clamp; the clamped x/z (times z) held constant
     int antialiased;        // opacity times sqrt(max(compensation_floor, det cov / det(cov + blur)))
-    double compensation_floor; // of the ratio; ref_options_from: 2.5e-5, as the official antialiased rasterizer
+    double compensation_floor; // of the ratio; ref_options_from: 2.5e-5, as in Inria's antialiased rasterizer
     int sh_bands;           // degree + 1; 0 = all stored
     double near_plane;      // 0 = 0.2
     double opacity_scale;   // 0 = 1
@@ -73,7 +73,7 @@ typedef struct ref_projected { // one splat on the screen; all zero but z when i
     double box[4];          // pixels that can be within REF_MARGIN_CAP of alpha = 1/255: u0 v0 u1 v1
     double near_margin;     // |z / near - 1|
     double official_margin;  // smallest distance of 3 sigma and of the tile rectangle's sides (in tiles) from an
-                             // integer, relative where they are above 1: what the official footprint hangs on
+                             // integer, relative where they are above 1: what Inria's footprint depends on
     double kink_margin;     // distance of the colour clamp (absolute), of the x/z clamp and of the compensation's floor
                             // (relative): kinks of gradients
 } ref_projected;
@@ -449,7 +449,7 @@ static inline void ref_project_backward(const ref_splats* s, const gsf_camera* c
         if (!g.clamped[a]) { // ratio = p[a] / z
             dp[a] -= dJ2 * f / (z * z);
             dp[2] += 2 * dJ2 * f * r / (z * z);
-        } else {             // ratio constant; official: ratio z constant
+        } else {             // ratio constant; Inria's: ratio z constant
             dp[2] += (o->official_gradient ? 2 : 1) * dJ2 * f * r / (z * z);
         }
         // u = f p[a] / z + c

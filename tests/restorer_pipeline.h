@@ -1,4 +1,4 @@
-// restorer_pipeline.h - frames to restored frames: control latents, every step, the decoded video, and the official
+// restorer_pipeline.h - frames to restored frames: control latents, every step, the decoded video, and the release's
 // variants (ten steps, no guidance, dynamic guidance).
 #ifndef RESTORER_PIPELINE_H
 #define RESTORER_PIPELINE_H
@@ -6,7 +6,7 @@
 #include "restorer_golden.h"
 #include "restorer_transformer.h"
 
-static const double pipeline_bar = 10.0 * 2.5e-6;      // relative L2: ten times the official float32 run's error
+static const double pipeline_bar = 10.0 * 2.5e-6;      // relative L2: ten times the error of the reference's float32 run
 static const double pipeline_bf16_bar = 2.0 * 3.0e-2;  // final latents with weights rounded to bf16
 
 typedef struct pipeline_case {
@@ -131,7 +131,7 @@ static void check_pipeline(void) {
     char* run = test_read_file(test_golden("restorer/pipeline/run.json"), NULL);
     test_tensor tokens;
     c.desc.frames = (int32_t)run_number(run, "num_frames", 0);
-    c.desc.any_frames = 1; // as the official code
+    c.desc.any_frames = 1; // as in the GSFixer release
     c.desc.height = (int32_t)run_number(run, "height", 0);
     c.desc.width = (int32_t)run_number(run, "width", 0);
     c.desc.steps = (int32_t)run_number(run, "num_inference_steps", 0);

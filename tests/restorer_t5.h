@@ -1,10 +1,10 @@
-// restorer_t5.h - the text encoder and its intermediates against the official code's runs.
+// restorer_t5.h - the text encoder and its intermediates against runs of transformers.
 #ifndef RESTORER_T5_H
 #define RESTORER_T5_H
 
 #include "restorer_golden.h"
 
-static const double t5_bar = 10.0 * 3.211e-7;     // relative L2 against float64: ten times the official float32 run's
+static const double t5_bar = 10.0 * 3.211e-7;     // relative L2 against float64: ten times that of transformers' float32 run
 static const double t5_long_bar = 10.0 * 5.275e-7; // the same for 226 tokens, against the float32 run
 static const double t5_bf16_bar = 2.0 * 7.022e-3; // against the run whose activations are bf16 as well
 

@@ -1,4 +1,4 @@
-// Position tables against the official ones: rotary 3e-6, sine-cosine 1e-12, time sinusoid 1e-4, all absolute. And
+// Position tables against those of diffusers: rotary 3e-6, sine-cosine 1e-12, time sinusoid 1e-4, all absolute. And
 // against the exact formula: within one float32 ulp of the value plus what the float32 angles of the reference, which
 // are kept on purpose, can cost.
 #ifndef RESTORER_TABLES_H

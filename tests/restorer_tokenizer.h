@@ -1,4 +1,4 @@
-// restorer_tokenizer.h - token ids against those of the official tokenizer: all of them, exactly.
+// restorer_tokenizer.h - token ids against those of transformers' tokenizer, exactly.
 #ifndef RESTORER_TOKENIZER_H
 #define RESTORER_TOKENIZER_H
 

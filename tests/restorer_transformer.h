@@ -1,4 +1,4 @@
-// restorer_transformer.h - the transformer and all its intermediates against the official code's float64 run.
+// restorer_transformer.h - the transformer and all its intermediates against a float64 run of the GSFixer release.
 #ifndef RESTORER_TRANSFORMER_H
 #define RESTORER_TRANSFORMER_H
 
@@ -7,7 +7,7 @@
 static const double transformer_bar = 1e-5;    // relative L2 against float64
 static const double intermediate_bar = 1e-5;   // against the float32 run
 static const double int8_bar = 5e-2;           // the blocks' linear layers in 8 bits
-static const double bf16_bar = 2.0 * 8.8e-3;   // against float64, weights rounded to bf16; twice the official bf16 run's
+static const double bf16_bar = 2.0 * 8.8e-3;   // against float64, weights rounded to bf16; twice that of the release's bf16 run
 
 typedef struct transformer_case {
     gsf_context ctx;

@@ -1,9 +1,9 @@
-// restorer_vae.h - encoder and decoder of the video autoencoder against the official code's output.
+// restorer_vae.h - encoder and decoder of the video autoencoder against the output of diffusers.
 // Included by golden_restorer.c. Clips, shapes and values are found in GSF_GOLDEN/restorer/vae and model/vae.
 #ifndef RESTORER_VAE_H
 #define RESTORER_VAE_H
 
-// Ten times the relative L2 error of the official float32 run against its float64 run (vae/README.md).
+// Ten times the relative L2 error of the float32 run of diffusers against its float64 run (vae/README.md).
 #define VAE_TOLERANCE 9e-6
 
 static double vae_rel_l2(const float* a, const double* b, size_t count) {

@@ -1,4 +1,4 @@
-// test_formats.c - .splat and .spz: files worked out by hand, files of the official library, error bounds of a round trip,
+// test_formats.c - .splat and .spz: files worked out by hand, files written by Niantic's spz library, error bounds of a round trip,
 // damage, failing allocations, splats that are not finite, positions that do not fit; and the gzip inside.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -177,7 +177,7 @@ static void test_spz_by_hand(void) {
     CHECK(count.live == 0 && warnings == 0);
 }
 
-// The official library (nianticlabs/spz 21715c3: loadSplatFromPly and saveSpz with RDF axes, antialiased set) made
+// Niantic's library (nianticlabs/spz 21715c3: loadSplatFromPly and saveSpz with RDF axes, antialiased set) made
 // corpus/spz/official_v2 and _v3 from a golden PLY: the content that we make of it is the same byte by byte.
 static void test_official(void) {
     counter count;
@@ -279,7 +279,7 @@ static void test_round_trips(void) {
     static const size_t counts[4] = {0, 1, 2, 5000};
     const double u8 = 0.5 / 255 * 1.001; // SH is rounded twice: to 1/128, then to 8 or 16 of these
     // Version 2 quaternions: x, y, z to half a step of 1/127.5; w follows from them, so near w = 0 it can be off by
-    // sqrt(3 * 2 * 0.0039), which the official format accepts.
+    // sqrt(3 * 2 * 0.0039), which the format accepts.
     const bounds spz3 = {0.5 / 4096 * 1.001, 1.0 / 32 * 1.001, u8, u8 / 0.15, 4.5 / 128 * 1.001, 8.5 / 128 * 1.001, 0.002};
     bounds spz2 = spz3;
     spz2.quat = 0.16;

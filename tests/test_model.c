@@ -157,7 +157,7 @@ static double list_values(const model_list* list) {
     return values;
 }
 
-// Counted with the official classes.
+// Counted with the classes of diffusers and transformers.
 static void check_full(gsf_context* ctx) {
     static const struct { size_t tensors; double values; } known[MODEL_PARTS] = {
         {1621, 7166167104.0 + 54607872.0}, {436, 215583907.0}, {0, 0.0}, {0, 0.0}, {440, 304372736.0}, {1210, 909112320.0},
@@ -185,7 +185,7 @@ static void check_list(model_list* list, const gsf_nn_weights* weights) {
     }
 }
 
-// Names and shapes of the models that the official code wrote.
+// Names and shapes of the golden models, which diffusers and transformers wrote.
 #define CHECK_GOLDEN(net, path, add, source)                               \
     do {                                                                   \
         gsf_nn_##net net;                                                  \

@@ -1,5 +1,5 @@
 // The text half of the restorer: tokenizer and T5 encoder on made and golden models; bad files, odd texts, out of memory,
-// workers, cancelling. (golden_restorer compares with the official code.)
+// workers, cancelling. (golden_restorer compares with transformers.)
 //
 //     test_nn_text --tokenize FOLDER    reads texts from stdin, each a 32-bit size and as many bytes, and prints the ids of
 //                                       each on a line: what tests/compare_tokenizer.py runs

@@ -1,5 +1,5 @@
 // test_nn_vae.c - convolutions against a double reference; a small random autoencoder: cpu levels, workers, tiles, chunks,
-// bad files, NaN, cancel and lack of memory. What the official code computes is golden_restorer's matter.
+// bad files, NaN, cancel and lack of memory. golden_restorer compares with diffusers.
 // gcc -O2 -std=c11 -fopenmp -I. -Itests tests/test_nn_vae.c -lm
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"

@@ -946,7 +946,7 @@ static double difference_error(const difference_case* d, double* parameters, con
 }
 
 // Gradients over a background that is not black, in every mode: the reference's against central differences in double, the
-// rasterizer's against the reference's. The official gradient is no derivative where it passes the 0.99 clamp or holds a
+// rasterizer's against the reference's. Inria's gradient is not a derivative where it passes the 0.99 clamp or holds a
 // clamped x/z: where it should be one, no splat does either.
 static void test_backgrounds(void) {
     static const recipe modes[] = {
@@ -1304,7 +1304,7 @@ static void test_long_run(void) {
         memset(&desc, 0, sizeof desc);
         desc.iterations = iterations;
         desc.seed = 1;
-        desc.densify_grad = 2e-3f; // the official 2e-4 is meant for photos of a megapixel: here it fills 8,400 splats
+        desc.densify_grad = 2e-3f; // Inria's 2e-4 is meant for photos of a megapixel; here it would produce 8,400 splats
         gsf_trainer* trainer = trainer_make(ctx, &desc, &t, &t.start);
         gsf_train_stats stats;
         double first = 0, last = 0;

@@ -204,7 +204,7 @@ static uint8_t* visible(const gsf_scene* scene, const uint32_t* views, size_t co
     return keep;
 }
 
-// K training views of the official split.
+// K training views of the papers' split.
 static size_t training_views(const gsf_scene* scene, size_t k, uint32_t* views) {
     uint32_t* test = (uint32_t*)malloc(scene->view_count * sizeof *test);
     size_t train_count = 0, test_count = 0;
@@ -604,7 +604,7 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
 
 // The generator's own scene, through its files, against the visibility that it traced. The photos are smaller than the
 // program's and the pixel noise with them, so that the points are as good. `split` sums up, per K, the views of the
-// official split, `choices` random choices of as many.
+// papers' split, `choices` random choices of as many.
 static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3]) {
     char folder[1024], path[1100], what[64];
     snprintf(folder, sizeof folder, "%s", test_scratch("procedural"));

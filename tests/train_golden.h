@@ -1,4 +1,4 @@
-// train_golden.h - loss, Adam, learning rates and densification against the golden data of the official Python code.
+// train_golden.h - loss, Adam, learning rates and densification against golden data of Inria's Python code.
 // Needs GSFIXER_IMPLEMENTATION (it calls internals); golden_train.c runs it, and any other program may.
 #ifndef TRAIN_GOLDEN_H
 #define TRAIN_GOLDEN_H
