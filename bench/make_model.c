@@ -1,26 +1,26 @@
-// make_model.c - a restorer model of seeded random weights in the official release's layout, at its size or smaller, for
-// benches and tests of speed, memory and plumbing. What it restores is noise.
-// By hand: cc -O2 -fopenmp -I. bench/make_model.c -o make_model -lm
+// make_model.c - a restorer model with seeded random weights in the layout of the GSFixer release, at its size or
+// smaller, for benches and tests of speed, memory and data flow. Its output is noise. By hand: cc -O2 -fopenmp -I.
+// bench/make_model.c -o make_model -lm
 //
 //     make_model OUT [--size tiny|small|full] [--dtype f32|bf16|f16] [--seed S] [--shards N] [--threads N]
 //                    [--layers N] [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]
 //
-// --layers N: so many in every network but the autoencoder, for the widths of `full` without its depth.
-// Defaults: small, bf16, seed 0, one file, all parts. `full` has the release's configuration: 34.3 GB as bf16 (14.9 GB of
-// them transformer and VAE), of which never more than one block of values is in memory. OUT gets
+// --layers N: number of layers of every network except the autoencoder, for the widths of `full` without its depth.
+// Defaults: small, bf16, seed 0, one file, all parts. `full` has the release's configuration: 34.3 GB in bf16 (14.9 GB
+// of it transformer and VAE), of which only one block of values is in memory at a time. OUT gets
 //     transformer/{config.json, diffusion_pytorch_model*.safetensors}      with N > 1 shards and their index
 //     vae/{config.json, diffusion_pytorch_model.safetensors}
 //     scheduler/scheduler_config.json, model_index.json
 //     features.safetensors    dino_latents (2, tokens, 1024), vggt_latents (2, tokens, 2048): two reference images;
 //                             prompt_embeds (2, text tokens, text channels): negative and positive
 //     dinov2/, vggt/          {config.json, model.safetensors}             encoders of reference images
-//     text_encoder/{config.json, model*.safetensors}                       T5, in shards, too
+//     text_encoder/{config.json, model*.safetensors}                       T5, also in shards
 //     tokenizer/{spiece.model, ...}                                        its pieces: ASCII and some words of captions
-//     blip2/{config.json, model*.safetensors, vocab.json, merges.txt, preprocessor_config.json, ...}    in shards, too
-// The encoders of tiny and small have one layer, and the vocabularies are the same few hundred texts at all sizes.
-// A value depends on seed, tensor and place only: not on shards, threads or other parts, and a narrow type's are those of
-// f32 rounded. Each file is written beside its place and renamed. OUT is a new folder or one that make_model made, as its
-// make_model.txt says: a folder of real weights is left alone.
+//     blip2/{config.json, model*.safetensors, vocab.json, merges.txt, preprocessor_config.json, ...}    also in shards
+// The encoders of tiny and small have one layer; the vocabularies are the same few hundred tokens at all sizes.
+// A value depends only on seed, tensor and index, not on shards, threads or other parts; narrow dtypes hold the rounded
+// f32 values. Each file is written under a temporary name and renamed. OUT must be a new folder or one that make_model
+// made (it contains make_model.txt), so that a folder of real weights is never written into.
 #define GSFIXER_IMPLEMENTATION
 #include "../gsfixer_nn.h"
 
@@ -37,19 +37,19 @@
 
 // ---- sizes and configurations ----------------------------------------------------
 
-typedef struct model_blocks { int width, heads, hidden, layers; } model_blocks; // hidden: of the feed-forward
+typedef struct model_blocks { int width, heads, hidden, layers; } model_blocks; // hidden: width of the feed-forward layers
 
 typedef struct model_size {
     const char* name;
     int heads, layers, time_channels, text_tokens; // heads of 64
     int sample_height, sample_width, frames;       // latents; video frames
-    int reference_tokens;                          // of one image
+    int reference_tokens;                          // per image
     int channels[4], vae_layers, vae_groups;
     int vae_height, vae_width; // pixels; multiples of 96 and 80, so that tiles overlap by whole latents
     model_blocks text;         // T5; heads of 64
-    int text_words;            // its vocabulary
+    int text_words;            // size of its vocabulary
     model_blocks eyes;         // DINOv2, and each of VGGT's three stacks
-    int eyes_grid;             // patches along a side of the images that they were made for
+    int eyes_grid;             // patches along a side of their configured image size
     model_blocks see, ask, tell; // BLIP-2: vision, queries, language
     int see_side, queries, tell_words, tell_tokens; // pixels; vocabulary; longest text
 } model_size;
@@ -65,7 +65,7 @@ static const model_size model_sizes[] = {
      {2560, 32, 10240, 32}, 224, 32, 50304, 2048},
 };
 
-enum { MODEL_PATCH = 14, MODEL_REGISTERS = 4 }; // of the encoders of images
+enum { MODEL_PATCH = 14, MODEL_REGISTERS = 4 }; // of the image encoders
 
 static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_text* out) {
     gsf_text_printf(ctx, out,
@@ -120,7 +120,7 @@ static void model_print_scheduler(gsf_context* ctx, const model_size* s, gsf_tex
                     "  \"steps_offset\": 0,\n  \"timestep_spacing\": \"trailing\",\n  \"trained_betas\": null\n}\n");
 }
 
-// A text encoder that is not there is two nulls, as diffusers has it: features.safetensors has the embeddings.
+// A missing text encoder is written as two nulls, as in diffusers: features.safetensors has the embeddings.
 static void model_print_pipeline(gsf_context* ctx, int has_text, gsf_text* out) {
     static const char* const classes[][2] = {{"text_encoder", "T5EncoderModel"}, {"tokenizer", "T5Tokenizer"}};
     gsf_text_printf(ctx, out,
@@ -169,7 +169,7 @@ static void model_print_t5(gsf_context* ctx, const model_size* s, gsf_text* out)
                     s->text.layers, s->text_words);
 }
 
-// Ids of BLIP-2's vocabulary: four special tokens, the 256 bytes, the words and their beginnings, last of all <image>.
+// Ids of BLIP-2's vocabulary: four special tokens, the 256 bytes, the words and their prefixes, finally <image>.
 enum { MODEL_BYTE_0 = 4, MODEL_CAPTION_END = MODEL_BYTE_0 + '\n', MODEL_WORD_0 = MODEL_BYTE_0 + 256 };
 
 static void model_print_blocks(gsf_context* ctx, const model_blocks* b, const char* hidden, gsf_text* out) {
@@ -233,7 +233,7 @@ static void model_print_blip2_generation(gsf_context* ctx, const model_size* s, 
 
 // ---- the vocabularies ------------------------------------------------------------
 
-static const char* const model_words[] = { // of captions; sorted, which model_print_words relies on
+static const char* const model_words[] = { // of captions; sorted, as model_print_words requires
     "a", "above", "an", "and", "are", "art", "at", "background", "beach", "behind", "beside", "black", "blue", "boat",
     "book", "bridge", "brown", "building", "by", "camera", "car", "chair", "city", "cloud", "clouds", "dark", "day",
     "dog", "door", "field", "floor", "flower", "flowers", "fox", "front", "garden", "glass", "grass", "gray", "green",
@@ -245,7 +245,7 @@ static const char* const model_words[] = { // of captions; sorted, which model_p
     "walking", "wall", "water", "white", "window", "with", "woman", "wood", "wooden", "yellow"
 };
 
-static void model_print_token(gsf_context* ctx, gsf_text* out, int id, const char* text, int strip) { // an added one
+static void model_print_token(gsf_context* ctx, gsf_text* out, int id, const char* text, int strip) { // an added token
     const char* flag = strip ? "true" : "false";
     gsf_text_printf(ctx, out,
                     "    \"%d\": {\"content\": \"%s\", \"lstrip\": %s, \"normalized\": false, \"rstrip\": %s, "
@@ -271,7 +271,7 @@ static void model_put_piece(gsf_context* ctx, gsf_text* out, const char* before,
     gsf_text_append(ctx, out, (const char*)tail, sizeof tail);
 }
 
-// A word scores more than its characters together.
+// A word scores higher than its characters together.
 static void model_print_pieces(gsf_context* ctx, const model_size* s, gsf_text* out) {
     static const char ends[] = "\x12\x02\x18\x01"                 // trainer: kind 1, a unigram
                                "\x1a\x0a\x0a\x08" "identity"; // normaliser: its name; characters stay as they are
@@ -324,15 +324,15 @@ static void model_print_entry(gsf_context* ctx, gsf_text* out, const char* text,
     gsf_text_printf(ctx, out, ": %d", id);
 }
 
-// Every beginning of a word, with the space before it, is a token: one character more than another. As entries of the
-// vocabulary, or as merges.
+// Every prefix of a word, including the leading space, is a token, so that each is one character longer than another.
+// Printed as vocabulary entries or as merges.
 static void model_print_words(gsf_context* ctx, int merges, gsf_text* out) {
     char text[48];
     const size_t space = gsf__bpe_store_character(gsf__bpe_character(' '), text);
     int id = MODEL_WORD_0;
     for (size_t i = 0; i < GSF__COUNT(model_words); i++) {
         const char* word = model_words[i];
-        size_t n = 0; // characters that the word before begins with, too
+        size_t n = 0; // characters shared with the beginning of the previous word
         while (i && word[n] && word[n] == model_words[i - 1][n]) n++;
         for (; word[n]; n++) {
             snprintf(text + space, sizeof text - space, "%.*s", (int)n + !merges, word);
@@ -390,7 +390,7 @@ typedef struct model_tensor {
     char name[104];
     int64_t shape[5], count;
     int32_t rank, shard;
-    uint64_t stream;       // of its random numbers
+    uint64_t stream;       // stream of its random numbers
     double middle, spread; // values are uniform in middle - spread .. middle + spread
 } model_tensor;
 
@@ -398,7 +398,7 @@ typedef struct model_list {
     gsf_context* ctx;
     model_tensor* tensors;
     size_t count, capacity;
-    uint64_t stream; // of the first one
+    uint64_t stream; // stream of the first tensor
     gsf_result result;
 } model_list;
 
@@ -422,10 +422,10 @@ static int model_ends_in(const char* text, const char* end) {
 
 typedef struct model_range { const char* end; double middle, spread, factor; } model_range;
 
-// Of tensors whose names end so: values are uniform in middle - spread .. middle + spread; or factor, with no spread,
-// times those of any other. The first that fits holds.
+// Ranges by the end of a tensor's name: uniform in middle - spread .. middle + spread or, without a spread, `factor`
+// times the default range. The first match applies.
 static const model_range model_ranges[] = {
-    {".conv_y.conv.bias", 1.0, 0.05, 0.0}, {".conv_y.conv.weight", 0.0, 0.0, 0.25}, // makes a factor, too
+    {".conv_y.conv.bias", 1.0, 0.05, 0.0}, {".conv_y.conv.weight", 0.0, 0.0, 0.25}, // also yields a factor
     {".pos_embedding", 0.0, 0.05, 0.0}, // is added to the transformer's tokens
     {"_latents", 0.0, 1.7320508075688772, 0.0}, {"_embeds", 0.0, 1.7320508075688772, 0.0}, // variance 1
     {".lambda1", 1.0, 0.1, 0.0}, {".gamma", 1.0, 0.1, 0.0}, // LayerScale
@@ -435,8 +435,8 @@ static const model_range model_ranges[] = {
     {"_embedding", 0.0, 1.0, 0.0}, {"_embeddings", 0.0, 1.0, 0.0}, {".pos_embed", 0.0, 1.0, 0.0},
 };
 
-// Every layer keeps the size of what goes through it: weights of variance 1 / fan-in, norms near 1. So the modulations
-// and gates of the transformer's blocks come out about 0.2 in size, from the time embedding's own size.
+// Every layer preserves the magnitude of its input: weights with variance 1 / fan-in, norms near 1. The modulations and
+// gates of the transformer's blocks are then about 0.2, which follows from the magnitude of the time embedding.
 static void model_choose_range(model_tensor* t) {
     const int norm = t->rank == 1 && model_ends_in(t->name, ".weight");
     t->middle = norm ? 1.0 : 0.0;
@@ -469,7 +469,7 @@ static void model_add(model_list* list, int32_t rank, const int64_t* shape, cons
     model_choose_range(t);
 }
 
-// The tables by which the transformer is opened have every name and shape.
+// The tables that the loader uses for the transformer contain every name and shape.
 static void model_add_entries(model_list* list, const gsf_nn_transformer* c, const gsf__dit_entry* entries, size_t count,
                               const char* prefix) {
     for (size_t i = 0; i < count; i++) {
@@ -495,7 +495,8 @@ static void model_add_transformer(model_list* list, const gsf_nn_transformer* c)
     }
 }
 
-// The autoencoder is opened by a walk, not by a table; this is the same walk. Opening the model afterwards compares them.
+// The loader walks the autoencoder instead of using a table; this is the same walk. Opening the model afterwards checks
+// it.
 static void model_add_conv(model_list* list, const char* prefix, const char* name, int64_t in, int64_t out, int64_t kt,
                            int64_t kernel) { // kt 0: a 2D layer
     char full[96];
@@ -556,7 +557,7 @@ static void model_add_vae(model_list* list, const gsf_nn_vae* vae) {
     model_add_coder(list, vae, 1);
 }
 
-// The encoders of images are opened by tables, too. vit: NULL for entries of blocks.
+// The image encoders are loaded by tables as well. vit: NULL for entries of blocks.
 static void model_add_vit(model_list* list, const gsf__vit_sizes* sizes, const gsf__vit* vit, const gsf__vit_entry* entries,
                           size_t count, const char* prefix) {
     for (size_t i = 0; i < count; i++) {
@@ -600,7 +601,7 @@ static void model_add_vggt(model_list* list, const gsf__vggt* net) {
     model_add_vit_blocks(list, &net->sizes, entries, count, gsf__vggt_global_names, net->layers);
 }
 
-// Walks again, as the readers have them.
+// Walks again, the same as in the loaders.
 static void model_add_t5(model_list* list, const gsf_nn_t5* c) {
     const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
     const struct { const char* name; int32_t rank; int64_t shape[2]; } parts[] = {
@@ -669,7 +670,7 @@ static void model_add_blip2(model_list* list, const gsf__blip* net) {
                          "language_model.model.decoder.layers.", opt->layers);
 }
 
-// ---- the list of a part: sizes come out of the text that goes into its config.json
+// ---- the list of a part: sizes are taken from the text of its config.json
 
 static void model_list_transformer(model_list* list, const model_size* s, gsf__nn_config* config) {
     gsf_nn_transformer net;
@@ -705,7 +706,7 @@ static void model_list_dinov2(model_list* list, const model_size* s, gsf__nn_con
     model_add_dinov2(list, &vit);
 }
 
-// Its reader has most sizes from the tensors.
+// Its loader takes most sizes from the tensors.
 static void model_list_vggt(model_list* list, const model_size* s, gsf__nn_config* config) {
     gsf__vggt net;
     (void)config;
@@ -746,9 +747,9 @@ static void model_list_blip2(model_list* list, const model_size* s, gsf__nn_conf
 
 // ---- values ----------------------------------------------------------------------
 
-GSF__BEGIN_IMPLEMENTATION // gcc inlines the library's functions only where its rounding mode holds, too
+GSF__BEGIN_IMPLEMENTATION // gcc inlines the library's functions only under the same rounding mode
 
-// Values made in one go; by one worker; by all. Each is a multiple of the one before.
+// Values per batch, per chunk of a worker, and per block of all workers. Each is a multiple of the previous one.
 enum { MODEL_BATCH = 256, MODEL_CHUNK = 1 << 15, MODEL_BLOCK = 1 << 20 };
 
 typedef struct model_fill {
@@ -759,7 +760,7 @@ typedef struct model_fill {
     unsigned char* out;
 } model_fill;
 
-// Four values from each random word; a batch at a time, in loops that compilers turn into vectors.
+// Four values from each random word, a batch at a time, in loops that compilers vectorize.
 static void model_fill_batch(const model_fill* f, int64_t first, unsigned char out[4 * MODEL_BATCH]) {
     const float middle = (float)f->tensor->middle, step = (float)(f->tensor->spread / 32768.0);
     uint64_t words[MODEL_BATCH / 4];
@@ -802,7 +803,7 @@ typedef struct model_options {
     const model_size* size;
     gsf_nn_dtype dtype;
     uint64_t seed;
-    int shards, layers; // layers 0: the size's own
+    int shards, layers; // layers 0: as configured for the size
     unsigned parts;
 } model_options;
 
@@ -810,7 +811,7 @@ typedef struct model_writer {
     gsf_context* ctx;
     const model_options* options;
     const char* part;     // for the progress
-    const char *folder, *stem; // of the files, called STEM.safetensors or STEM-00001-of-00002.safetensors
+    const char *folder, *stem; // files are STEM.safetensors or STEM-00001-of-00002.safetensors
     int shards;
     unsigned char* block; // MODEL_BLOCK values
     double done, total;   // bytes
@@ -828,7 +829,7 @@ static gsf_result model_format_header(const model_writer* w, const model_tensor*
                                       gsf_text* out) {
     const gsf_nn_dtype dtype = w->options->dtype;
     long long begin = 0;
-    gsf_text_append(w->ctx, out, "        ", GSF__NN_FILE_HEAD); // for the length
+    gsf_text_append(w->ctx, out, "        ", GSF__NN_FILE_HEAD); // room for the length
     gsf_text_printf(w->ctx, out, "{\"__metadata__\":{\"format\":\"pt\"}");
     for (size_t i = 0; i < count; i++) {
         const long long end = begin + (long long)tensors[i]->count * (long long)gsf_nn_dtype_size(dtype);
@@ -876,7 +877,7 @@ static gsf_result model_write_open_file(model_writer* w, FILE* file, const char*
     return result;
 }
 
-// One safetensors file of these tensors, in the order of their names as the official writer has it.
+// Writes one safetensors file with these tensors, sorted by name as in Hugging Face's writer.
 static gsf_result model_write_file(model_writer* w, const char* path, const model_tensor** tensors, size_t count) {
     gsf_text temporary;
     memset(&temporary, 0, sizeof temporary);
@@ -891,7 +892,7 @@ static gsf_result model_write_file(model_writer* w, const char* path, const mode
         result = model_write_open_file(w, file, path, tensors, count);
         errno = 0;
         int ok = fclose(file) == 0;
-#ifdef _WIN32 // rename does not replace there
+#ifdef _WIN32 // rename does not replace files there
         if (ok && result == GSF_OK) remove(path);
 #endif
         if (ok && result == GSF_OK) ok = rename(temporary.data, path) == 0;
@@ -903,12 +904,12 @@ static gsf_result model_write_file(model_writer* w, const char* path, const mode
     return result;
 }
 
-// Consecutive tensors with about the same bytes in each shard, and no shard without a tensor.
+// Consecutive tensors, with about the same number of bytes in each shard and no empty shard.
 static void model_deal(const model_writer* w, model_list* list) {
     double before = 0.0;
     int shard = 0;
     for (size_t i = 0; i < list->count; i++) {
-        const int left = w->shards - 1 - shard; // still to begin
+        const int left = w->shards - 1 - shard; // shards still to begin
         if (i && left > 0 && (before * w->shards >= w->total * (shard + 1) || list->count - i == (size_t)left)) shard++;
         list->tensors[i].shard = shard;
         before += model_bytes(w, &list->tensors[i]);
@@ -960,7 +961,7 @@ static void model_remove(const model_writer* w, const char* end) {
     gsf_destroy_text(w->ctx, &path);
 }
 
-// The files of a list: a single one, or shards with their index. What would be opened before them goes.
+// Writes the files of a list: a single one, or shards with their index. Removes files that a loader would prefer to them.
 static gsf_result model_write_shards(model_writer* w, model_list* list) {
     const model_tensor** picked = (const model_tensor**)gsf_alloc(w->ctx, list->count, sizeof *picked);
     gsf_result result = picked ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
@@ -998,10 +999,10 @@ static gsf_result model_make_folder(gsf_context* ctx, const char* path) {
     return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
 }
 
-typedef struct model_report { // of one part
+typedef struct model_report { // what was written for one part
     const char* part;
     size_t tensors;
-    double values, bytes, seconds; // bytes of the values alone
+    double values, bytes, seconds; // bytes: without the headers
 } model_report;
 
 typedef struct model_file {
@@ -1012,14 +1013,14 @@ typedef struct model_file {
 typedef struct model_part {
     const char *name, *folder;
     unsigned bit;
-    const char* stem; // of its files of weights; NULL: none
+    const char* stem; // stem of its weight files; NULL: none
     int sharded;
     void (*list_fn)(model_list* list, const model_size* s, gsf__nn_config* config);
-    gsf_result (*open_fn)(gsf_context* ctx, const char* folder); // the library's reader
-    model_file files[9];                                         // the first is what list_fn reads
+    gsf_result (*open_fn)(gsf_context* ctx, const char* folder); // the library's loader
+    model_file files[9];                                         // the first one is read by list_fn
 } model_part;
 
-// Opening what was written compares names and shapes.
+// Opens what was written, which checks names and shapes.
 #define MODEL_OPENS(net)                                                            \
     static gsf_result model_open_##net(gsf_context* ctx, const char* folder) {      \
         gsf_nn_##net net;                                                           \
@@ -1059,7 +1060,7 @@ static const model_part model_parts[MODEL_PARTS] = {
       {"added_tokens.json", model_print_blip2_added}}},
 };
 
-// The tensors of a part, which nothing is written for; list->tensors is freed by the caller.
+// Lists the tensors of a part without writing anything; the caller frees list->tensors.
 static gsf_result model_list_part(gsf_context* ctx, const model_part* part, const model_size* size, model_list* list) {
     gsf_text text;
     gsf__nn_config config;
@@ -1128,7 +1129,7 @@ static gsf_result model_make_part(gsf_context* ctx, const model_options* o, cons
 
 static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
     gsf_text path, text;
-    void* encoder = NULL; // its configuration, where the folder has one
+    void* encoder = NULL; // its configuration, if the folder has one
     size_t size;
     memset(&path, 0, sizeof path);
     memset(&text, 0, sizeof text);
@@ -1142,8 +1143,7 @@ static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
     return model_end_text(ctx, out, "model_index.json", &text);
 }
 
-// reports: MODEL_PARTS of them; a part that was not asked for has no name.
-// The folder itself, with what says that it may be written into again.
+// Creates the folder with the marker file that allows writing into it again.
 static gsf_result model_make_out(gsf_context* ctx, const char* out) {
     static const char note[] = "Random weights, written by make_model: what they restore is noise.\n";
     gsf_text path;
@@ -1161,6 +1161,7 @@ static gsf_result model_make_out(gsf_context* ctx, const char* out) {
     return result;
 }
 
+// reports: MODEL_PARTS of them; the name of a part that was not requested is NULL.
 static gsf_result model_make(gsf_context* ctx, const model_options* o, model_report* reports) {
     memset(reports, 0, MODEL_PARTS * sizeof *reports);
     GSF__TRY(model_make_out(ctx, o->out));
@@ -1183,14 +1184,14 @@ static const char model_usage[] =
     "usage: make_model OUT [--size tiny|small|full] [--dtype f32|bf16|f16] [--seed S] [--shards N] [--threads N]\n"
     "                      [--layers N] [--parts transformer,vae,scheduler,features,dinov2,vggt,text,blip2]\n";
 
-static gsf_context* model_context; // for the signal
+static gsf_context* model_context; // for the signal handler
 static void model_interrupt(int number) {
     (void)number;
     gsf_request_cancel(model_context);
 }
 
 static void model_show_progress(void* user, const char* stage, double done, double total) {
-    int* shown = (int*)user; // percent
+    int* shown = (int*)user; // percentage shown last
     const int percent = (int)(100.0 * done / total);
     if (percent == *shown) return;
     *shown = percent;

@@ -3,12 +3,12 @@
 
     bench/peer_opensplat.py OPENSPLAT SCENE [START.ply] [--steps 200] [--threads 2]
 
-OpenSplat prints a line per step, after backward and before Adam, so that the time between two lines is one whole step.
-Density control is off (it would begin after the run), all SH bands are in from the first step, no downscaling. Left to
-itself it takes Adam's step only every 32nd or 64th time in the second half of a run; here it is told that this half never
-comes, since ours moves every splat at every step (it still moves the bands of SH above the first every 16th step only).
-Its START.ply must be one that it wrote itself. Wall seconds are the median over the steps after the first, CPU seconds
-their mean.
+OpenSplat prints a line per step, after the backward pass and before Adam, so the time between two lines is one complete
+step. Density control is off (it would begin after the run), all SH bands are active from the first step, no
+downscaling. By default it performs Adam's step only every 32nd or 64th time in the second half of a run; this is
+disabled here, since ours updates every splat in every step (OpenSplat still updates the SH bands above the first only
+every 16th step). START.ply must have been written by OpenSplat. Wall seconds are the median over the steps after the
+first, CPU seconds their mean.
 """
 import argparse
 import json
@@ -22,7 +22,7 @@ import time
 
 
 def first_step(ply):
-    """The step that OpenSplat resumes after, as its PLY's header has it."""
+    """The step after which OpenSplat resumes, from the PLY's header."""
     with open(ply, "rb") as file:
         found = re.search(rb"at iteration (\d+)", file.read(1000))
     if not found:
@@ -46,7 +46,7 @@ def main():
             command += ["--resume", options.start]
         environment = dict(os.environ, OMP_NUM_THREADS=str(options.threads))
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, bufsize=0)
-        clock = ((~process.pid) << 3) | 2  # the CPU clock of another process, as clock_getcpuclockid makes it
+        clock = ((~process.pid) << 3) | 2  # the CPU clock of another process, as computed by clock_getcpuclockid
         stamps, rest = [], b""
         while True:
             block = os.read(process.stdout.fileno(), 65536)

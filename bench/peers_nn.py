@@ -1,25 +1,27 @@
 #!/usr/bin/env python3
-"""Runs bench_nn and then its peers on the same cases, and prints the ratios.
+"""Runs bench_nn and its peers on the same cases and prints the ratios.
 
     bench/peers_nn.py BENCH_NN [--quick] [--filter TEXT] [--threads N] [--rounds N]
 
-BENCH_NN is the built program; its rows are passed through. Every case that a peer can do, too, is read from its name and
-timed on as many threads right after; that row has the peer as variant (" bf16" behind it beside our products of bf16) and
-"ratio": the peer's seconds divided by ours (above 1: we are faster), "cpu_ratio" the same of CPU seconds, for machines that
-do other things as well. --rounds repeats them in turns; the median counts. The peers:
+BENCH_NN is the built program; its rows are passed through. Each case that a peer supports is parsed from its name and
+timed right after ours with the same number of threads. That row has the peer as variant (with " bf16" appended if our
+products are in bf16), "ratio" (the peer's seconds divided by ours; above 1 we are faster) and "cpu_ratio" (the same for
+CPU seconds, for machines that are not idle). --rounds repeats all cases, alternating; the median is reported. The
+peers:
 
-    PyTorch    as it comes. Its float32 products are MKL's, which leave AVX-512 unused on AMD; 8-bit layers are FBGEMM's
-    oneDNN     PyTorch with each linear layer by oneDNN on weights packed beforehand, activations fused where the layer is
-               the case; 8-bit layers by its engine onednn
-    OpenBLAS   numpy's, float32 products and the bias (needs threadpoolctl)
-    oneDNN's product alone    8-bit layers without quantizing what comes in and what goes out, which ours do
+    PyTorch    default configuration. Its float32 products are MKL's, which do not use AVX-512 on AMD; its 8-bit layers are
+               FBGEMM's
+    oneDNN     PyTorch with each linear layer by oneDNN on prepacked weights, with fused activations where the case is the
+               layer itself; 8-bit layers by PyTorch's engine onednn
+    OpenBLAS   from numpy: float32 products and the bias (needs threadpoolctl)
+    oneDNN's product alone    8-bit layers without the quantization of input and output, which ours include
 
-Needs PyTorch and numpy (pip install torch numpy threadpoolctl), for the transformer's and the autoencoder's block diffusers
-and for DINOv2 transformers, too; without PyTorch only our rows are printed and the exit code is 77.
+Needs PyTorch and numpy (pip install torch numpy threadpoolctl), diffusers for the blocks of the transformer and the
+autoencoder, and transformers for DINOv2. Without PyTorch only our rows are printed and the exit code is 77.
 
-PyTorch makes a new tensor for every result. So that its time is that of the kernel and not of the pages that Linux fills with
-zeros for a large one, up to four fifths of it, the C library is told to keep memory that was freed. Each library chooses its
-kernels by the processor: environment variables that tell OpenBLAS otherwise are removed.
+PyTorch allocates a new tensor for every result. To measure the kernel instead of the zeroing of fresh pages, which
+takes up to four fifths of the time for large results, the C library is configured to keep freed memory. Each library
+chooses its kernels by processor: environment variables that override OpenBLAS's choice are removed.
 """
 import argparse
 import contextlib
@@ -42,14 +44,14 @@ try:
 except ImportError:
     numpy = None
 
-KEEP_MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": "2000000000"}  # glibc reads them as a program starts
-CYCLE_BYTES = 1 << 30  # up to 4 rows: over this much of distinct weights, as bench_nn does (a quarter with --quick)
+KEEP_MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": "2000000000"}  # read by glibc at program start
+CYCLE_BYTES = 1 << 30  # up to 4 rows: cycle through this much of weights, as bench_nn does (a quarter with --quick)
 
 
 def measure(function, units, quick):
-    """Median seconds and least CPU seconds of one unit; function does `units` of them."""
+    """Median seconds and minimum CPU seconds of one unit; function runs `units` of them."""
     wall, cpu = [], []
-    for _ in range(8):  # until it has all its memory
+    for _ in range(8):  # until it has allocated all its memory
         faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         function()
         if resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults < 1000:
@@ -65,12 +67,12 @@ def measure(function, units, quick):
 
 @contextlib.contextmanager
 def onednn_linears():
-    """torch.nn.functional.linear by oneDNN, on weights packed when they are first seen."""
+    """torch.nn.functional.linear by oneDNN, on weights that are packed at their first use."""
     plain, packed = torch.nn.functional.linear, {}
 
     def linear(x, w, bias=None):
         rows = x.numel() // x.shape[-1]
-        if (id(w), rows) not in packed:  # w is kept, so that its id stays its own
+        if (id(w), rows) not in packed:  # w is kept alive, so that its id stays unique
             packed[id(w), rows] = torch.ops.mkldnn._reorder_linear_weight(w.detach(), rows), w
         return torch.ops.mkldnn._linear_pointwise(x, packed[id(w), rows][0], bias, "none", [], "")
     torch.nn.functional.linear = linear
@@ -85,7 +87,7 @@ def linear_copies(m, size, quick):
 
 
 def linear(match, quick, low=False):
-    """The layer by each peer that has it."""
+    """The layer in each peer that supports it."""
     dtype = {"f32": torch.float32, "bf16": torch.bfloat16, "f16": torch.float16}[match.group(1)]
     m, n, k = (int(match.group(i)) for i in (2, 3, 4))
     copies = linear_copies(m, n * k * torch.tensor([], dtype=dtype).element_size(), quick)
@@ -102,7 +104,7 @@ def linear(match, quick, low=False):
                 after(y)
     yield "PyTorch", pytorch, copies
     if dtype == torch.float16:
-        return  # oneDNN's takes minutes on processors without products of f16
+        return  # oneDNN takes minutes on processors without f16 products
     fused = {"": ("none", ""), "gelu": ("gelu", "tanh"), "silu": ("swish", "")}[kind]
     packed = [torch.ops.mkldnn._reorder_linear_weight(w, m) for w in weights]
 
@@ -125,7 +127,7 @@ def linear(match, quick, low=False):
 
 
 def int8_linear(match, quick):
-    """float32 in and out, the activations quantized on the way as ours are; and the bare product."""
+    """float32 input and output with quantized activations, like ours; and the product alone."""
     m, n, k = (int(match.group(i)) for i in (1, 2, 3))
     copies, bias = linear_copies(m, n * k, quick), torch.rand(n)
     x, w = torch.rand(m, k).sub_(0.5), torch.rand(n, k).sub_(0.5)
@@ -157,7 +159,7 @@ def rows(match, quick):
     f = torch.nn.functional
     x, w = torch.rand(n, dim).sub_(0.5), torch.rand(n if kind == "group_norm" else dim)
 
-    def rope():  # as diffusers: norm of each head, then the rotation of pairs
+    def rope():  # as in diffusers: norm of each head, then rotation of pairs
         y = f.layer_norm(x.view(n, -1, 64), (64,), w[:64], w[:64], 1e-6)
         turned = y.reshape(n, -1, 32, 2)
         turned = torch.stack([-turned[..., 1], turned[..., 0]], -1).flatten(2)
@@ -172,7 +174,7 @@ def rows(match, quick):
 
 
 def better(runs):
-    """The fastest of `runs`, each tried once."""
+    """The fastest of `runs`, after trying each once."""
     seconds = []
     for run in runs:
         run()
@@ -183,7 +185,7 @@ def better(runs):
 
 
 def conv3d(match, quick):
-    """Causal: three frames of the input before each one of the output. The better of both memory layouts counts."""
+    """Causal convolution over three input frames; the faster of both memory layouts is reported."""
     c, t, h, w = (int(match.group(i)) for i in (1, 2, 3, 4))
     x, weight = torch.rand(1, c, t + 2, h, w).sub_(0.5), torch.rand(c, c, 3, 3, 3).sub_(0.5)
     bias = torch.rand(c)
@@ -192,7 +194,7 @@ def conv3d(match, quick):
 
 
 def resnet(match, quick):
-    """diffusers' CogVideoXResnetBlock3D: group norm, SiLU and convolution twice; the better of both memory layouts counts."""
+    """diffusers' CogVideoXResnetBlock3D: group norm, SiLU and convolution, twice; the faster of both memory layouts is reported."""
     from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
     c, t, h, w = (int(match.group(i)) for i in (1, 2, 3, 4))
     runs = []
@@ -216,7 +218,7 @@ def block(match, quick, low=False):
 
 
 def dinov2(match, quick):
-    """transformers' model at DINOv2-L's sizes; all layers are one and the same, as in bench_nn."""
+    """transformers' model at the size of DINOv2-L; all layers share their weights, as in bench_nn."""
     import transformers
     height, width, layers = (int(match.group(i)) for i in (1, 2, 3))
     config = transformers.Dinov2WithRegistersConfig(hidden_size=1024, num_hidden_layers=1, num_attention_heads=16,
@@ -242,7 +244,7 @@ def pair(match, quick):
     angles = torch.arange(max(down, across) + 1).float()[:, None] * 100.0 ** (-torch.arange(0, 32, 2).float() / 32)
     cos, sin = torch.cat([angles, angles], -1).cos(), torch.cat([angles, angles], -1).sin()
 
-    def turned(y, where):  # halves of each head by row and column; pairs half of it apart
+    def turned(y, where):  # halves of each head by row and column; pairs are half of that apart
         parts = []
         for axis, part in enumerate(y.chunk(2, -1)):
             a, b = part.chunk(2, -1)
@@ -265,7 +267,7 @@ def pair(match, quick):
 
 
 def t5_layer(match, quick):
-    """The layers of transformers' T5Block (v1.1) at T5-XXL's size, one prompt; bf16: activations are bf16, too."""
+    """The layers of transformers' T5Block (v1.1) at the size of T5-XXL, one prompt; bf16: activations are bf16 as well."""
     f, d, heads, hidden = torch.nn.functional, 4096, 64, 10240
     dtype = torch.float32 if match.group(1) == "f32" else torch.bfloat16
     n = int(match.group(2))
@@ -281,7 +283,7 @@ def t5_layer(match, quick):
     def split(y):
         return y.view(1, n, heads, 64).transpose(1, 2)
 
-    def run():  # attention as T5Attention has it; the better of that and the fused one counts
+    def run():  # attention as in T5Attention; the faster of that and fused attention is reported
         y = norm(x)
         a, b, c = split(f.linear(y, q)), split(f.linear(y, k)), split(f.linear(y, v))
         if fused:
@@ -302,9 +304,9 @@ def t5_layer(match, quick):
     return run, 1
 
 
-LOW = "bf16 products"  # a variant of ours; PyTorch's side is computed in bf16 then
+LOW = "bf16 products"  # a variant of ours; the peers then compute in bf16
 
-CASES = [ # name of a case, what makes (function, units)
+CASES = [  # pattern of the case's name, generator of (function, units)
     (re.compile(r"linear (f32|bf16|f16) M=(\d+) N=(\d+) K=(\d+)(?: (gelu|silu))?$"), linear),
     (re.compile(r"linear int8 M=(\d+) N=(\d+) K=(\d+)$"), int8_linear),
     (re.compile(r"attention f32 H=(\d+) D=(\d+) Q=(\d+) K=(\d+)$"), attention),
@@ -321,7 +323,7 @@ WITH_LINEARS = (block, t5_layer, dinov2, pair)
 
 
 def peers_of(ours, match, make, quick):
-    """(name, function, units) of each peer that has the case; what one needs lives while it is the current one."""
+    """(name, function, units) of each peer that supports the case; its data live only while it is the current one."""
     low = ours["variant"] == LOW
     if make in (linear, int8_linear):
         yield from make(match, quick)
@@ -339,7 +341,7 @@ def compute_in_bf16(ours, match):
 
 def comparable(ours, match, make):
     low, bf16, few = ours["variant"] == LOW, match.group(1) == "bf16", make is linear and int(match.group(2)) <= 4
-    # PyTorch multiplies bf16 weights with bf16 only: where it has instructions for it, our float32 has no counterpart
+    # PyTorch multiplies bf16 weights by bf16 activations only: with bf16 instructions, our float32 products have no peer
     if low != bf16 and (make is block or (make is linear and not few and ours["isa"] == "avx512_bf16")):
         return False
     return not (make is linear and match.group(1) == "f16" and not few)  # takes PyTorch minutes

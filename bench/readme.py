@@ -4,8 +4,8 @@
 
     bench/readme.py [--check]
 
---check changes nothing and fails if README.md differs from the CSV files; the tests run it. A block whose CSV file is missing
-is left alone. Needs only the standard library.
+--check changes nothing and fails if README.md differs from the CSV files; the tests run it. A block whose CSV file is
+missing is left alone. Needs only the standard library.
 """
 import csv
 import os

@@ -3,10 +3,11 @@
 
     bench/results.py ROWS.jsonl DIR
 
-Writes DIR/results.csv (every row), DIR/stages.svg (share of each stage in a training step, by size), DIR/growth.svg (how
-run time scales), DIR/pipeline.svg (run time against error of the video model) and DIR/RESULTS.md. Several rows with the same
-case, instruction set and thread count are rounds of one measurement; their median is reported. Rows of test_stress --json go
-to the table of worst errors, rows of peers_nn.py with a peer as variant to the ratios. Needs only the standard library.
+Writes DIR/results.csv (every row), DIR/stages.svg (share of each stage in a training step, by size), DIR/growth.svg
+(how run time scales), DIR/pipeline.svg (run time against error of the video model) and DIR/RESULTS.md. Several rows
+with the same case, instruction set and thread count are rounds of one measurement; their median is reported. Rows of
+test_stress --json go to the table of worst errors, rows of peers_nn.py with a peer as variant to the ratios. Needs only
+the standard library.
 """
 import collections
 import csv
