@@ -1,6 +1,6 @@
-// fuzz_bpe.c - the byte-level tokenizer. Build line: fuzz.h. The input is split at its zero bytes: vocab.json, merges.txt,
-// tokenizer_config.json, special_tokens_map.json, added_tokens.json and, whatever it holds, the text, which is also taken
-// as ids. What is encoded must decode, to UTF-8.
+// fuzz_bpe.c - the byte-level BPE tokenizer. Build line: fuzz.h. The input is split at zero bytes into vocab.json,
+// merges.txt, tokenizer_config.json, special_tokens_map.json, added_tokens.json and arbitrary text, which is also used
+// as ids. Encoded text must decode, and decoded text must be UTF-8.
 #include "gsfixer_nn.h"
 
 #include "fuzz.h"

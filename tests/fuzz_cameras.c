@@ -1,5 +1,5 @@
-// fuzz_cameras.c - cameras.json: what is accepted are cameras that can be used, and is read again as it was saved. Build
-// line: fuzz.h.
+// fuzz_cameras.c - cameras.json: accepted cameras are usable and survive being saved and loaded again. Build line:
+// fuzz.h.
 #include "fuzz.h"
 
 static int same(double a, double b) { return memcmp(&a, &b, sizeof a) == 0 || (a == 0.0 && b == 0.0); }

@@ -1,7 +1,7 @@
-// fuzz_checkpoint.c - checkpoints of the repair loop. Build line: fuzz.h. Input: a byte, the steps after which a small loop
-// is saved, then patches to that checkpoint (fuzz_patch_chunks); or a byte from 128 on and a whole file. Checksums are made
-// right. What is refused leaves the loop as it was; what is accepted
-// is saved and restored as the same bytes, and the loop goes on from there.
+// fuzz_checkpoint.c - checkpoints of the repair loop. Build line: fuzz.h. Input: a byte below 128, the number of steps
+// after which a small loop is saved, followed by patches to that checkpoint (fuzz_patch_chunks); or a byte from 128 on,
+// followed by a whole file. Checksums are corrected. A refused checkpoint leaves the loop unchanged; an accepted one is
+// saved again as the same bytes, and the loop continues from it.
 #include "fuzz.h"
 
 enum { SIDE = 8, VIEWS = 3, SPLATS = 5, STEPS = 16 };

@@ -1,5 +1,5 @@
 // fuzz_colmap_bin.c - the three binary files of a COLMAP model. Build line: fuzz.h. Input: u32 size of cameras.bin, u32
-// size of images.bin (little-endian, cut to what is there), then the three files one behind the other.
+// size of images.bin (little-endian, clamped to the input), then the concatenated files.
 #include "fuzz.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {

@@ -1,6 +1,6 @@
-// fuzz_config.c - the configurations of the networks and of the tokenizer. Build line: fuzz.h, with -DTEST_GOLDEN=
-// '"tests/golden"'. The first byte tells whose configuration the others are; the weights are the small golden model's. What
-// opens can run; what does not is refused in one line.
+// fuzz_config.c - configurations of the networks and of the tokenizer. Build line: fuzz.h, with -DTEST_GOLDEN=
+// '"tests/golden"'. The first byte selects the network, the rest is its configuration; the weights are those of the
+// small golden model. Accepted models can run; refused ones give one line of error.
 #include "gsfixer_nn.h"
 
 #include "fuzz.h"

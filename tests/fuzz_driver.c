@@ -1,5 +1,5 @@
-// fuzz_driver.c - runs a fuzz target over files and folders given on the command line (corpus replay without
-// libFuzzer). Each input stands in a block of exactly its size, so that a sanitizer sees the first byte read past it.
+// fuzz_driver.c - runs a fuzz target on files and folders given on the command line (replays the corpus without
+// libFuzzer). Each input is copied to a block of exactly its size, so that a sanitizer detects any read past its end.
 #define _POSIX_C_SOURCE 200809L
 #include <dirent.h>
 #include <stdint.h>

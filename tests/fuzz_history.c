@@ -1,5 +1,5 @@
-// fuzz_history.c - what gsfix fix remembers of a run beside the loop's state, as its checkpoint holds it. Build line: fuzz.h,
-// with the other examples/gsfix*.c. What is accepted is in range, and is read again as it was written.
+// fuzz_history.c - gsfix fix's record of a run in its checkpoint. Build line: fuzz.h, with the other examples/gsfix*.c.
+// Accepted records are in range and survive being written and read again.
 #include "../examples/gsfix_fix.c"
 
 #include "fuzz.h"

@@ -1,5 +1,5 @@
-// fuzz_json.c - the JSON parser. Build line: fuzz.h. What it accepts must print as text that parses to the same values again;
-// else it must answer with one line of error and no memory left.
+// fuzz_json.c - the JSON parser. Build line: fuzz.h. Accepted documents print as text that parses to the same values;
+// refused ones give one line of error and leave no memory allocated.
 #include "fuzz.h"
 
 static void print_value(gsf_context* ctx, const gsf_json* json, const gsf_json_value* value, gsf_text* out) {

@@ -1,5 +1,5 @@
-// fuzz_npy.c - gsfix's .npy files of depth: what is accepted is saved and read again as the same values. Build line: fuzz.h,
-// with examples/gsfix*.c.
+// fuzz_npy.c - gsfix's .npy depth files: accepted files survive being saved and loaded with the same values. Build
+// line: fuzz.h, with examples/gsfix*.c.
 #include "../examples/gsfix.h"
 
 #include "fuzz.h"

@@ -1,4 +1,5 @@
-// fuzz_ply.c - splat files: what is accepted is finite and survives being written and read again. Build line: fuzz.h.
+// fuzz_ply.c - PLY splat files: accepted splats are finite and survive being written and read again. Build line:
+// fuzz.h.
 #include "fuzz.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {

@@ -1,4 +1,4 @@
-// fuzz_points.c - the points of a transforms.json: a PLY of any columns that ply_file_path names. Build line: fuzz.h.
+// fuzz_points.c - the points of a transforms.json: a PLY with any columns, named by ply_file_path. Build line: fuzz.h.
 #include "fuzz.h"
 
 static const char scene_file[] =

@@ -1,6 +1,7 @@
-// fuzz_sample.c - the checkpoint of a stopped sampling. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION. Input: u8
-// solver, u8 steps after which a small job is saved, and patches to that file (fuzz_patch_chunks); or from 128 on as second
-// byte, a whole file. What does not fit the job is passed over; the job goes on from what does, and ends.
+// fuzz_sample.c - checkpoints of an interrupted sampling run. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION.
+// Input: u8 solver, u8 number of steps after which a small job is saved, and patches to that file (fuzz_patch_chunks);
+// or, with a second byte from 128 on, a whole file. A checkpoint that does not fit the job is ignored; from one that
+// fits, the job continues and finishes.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 

@@ -1,5 +1,5 @@
-// fuzz_spiece.c - the tokenizer. Build line: fuzz.h. The first byte tells what the others are: 255 a spiece.model, else a
-// text for the model of made_spiece.h with the flags that its low six bits are.
+// fuzz_spiece.c - the SentencePiece tokenizer. Build line: fuzz.h. The first byte tells what the rest is: 255 a
+// spiece.model, else a text for the model of made_spiece.h with the flags in the low six bits.
 #include "fuzz.h"
 
 #include "gsfixer_nn.h"

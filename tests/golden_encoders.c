@@ -1,6 +1,6 @@
-// The encoders of references against golden data of the GSFixer release: every part reads its shapes, configs and values
-// from GSF_GOLDEN/encoders, so that another folder of the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every
-// error.
+// The image encoders and the captioner against golden data of the GSFixer release: every part reads its shapes, configs
+// and values from GSF_GOLDEN/encoders, so that another folder with the same layout passes unchanged. GSF_TEST_VERBOSE=1
+// prints every error.
 #include "gsfixer_nn.h"
 
 #include "encoders_golden.h"

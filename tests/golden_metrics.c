@@ -1,4 +1,5 @@
-// PSNR and SSIM against golden/metrics (float64 runs of the references) and against plain double loops.
+// PSNR and SSIM against golden/metrics (float64 runs of the reference implementations) and against direct loops in
+// double precision.
 #include "gsfixer.h"
 #include "test.h"
 #include "test_hooks.h"

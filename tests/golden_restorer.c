@@ -1,5 +1,6 @@
 // The restorer against golden data of the GSFixer release: every part reads its shapes, configs and values from
-// GSF_GOLDEN/restorer, so that another folder of the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every error.
+// GSF_GOLDEN/restorer, so that another folder with the same layout passes unchanged. GSF_TEST_VERBOSE=1 prints every
+// error.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 

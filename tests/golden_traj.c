@@ -1,6 +1,6 @@
-// golden_traj - gsfixer_traj.h against data computed by the GSFixer release (tests/golden/traj/README.md). Every file of the
-// folder that has the tensors of a scene is taken; counts come from the shapes. Tolerance: 1e-9 of the largest value of
-// a float64 tensor, 1e-6 for float32, modulo the signs of eigenvectors.
+// golden_traj.c - gsfixer_traj.h against data computed by the GSFixer release (tests/golden/traj/README.md). Every file
+// in the folder that has the tensors of a scene is used; counts come from the shapes. Tolerance: 1e-9 of the largest
+// value for float64 tensors, 1e-6 for float32, up to the signs of eigenvectors.
 #define _DEFAULT_SOURCE 1 // opendir
 #include <dirent.h>
 

@@ -1,4 +1,4 @@
-// test_checkpoint.c - gsfix fix --resume from a checkpoint with forged figures: refused with one line, or harmless
+// test_checkpoint.c - gsfix fix --resume with forged numbers in the checkpoint: refused with one line, or harmless
 #include "../examples/gsfix.h"
 
 #include "made_scene.h"

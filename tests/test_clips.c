@@ -1,4 +1,4 @@
-// test_clips.c - gsf_restore_clip: clips of every size and length through restorers that take only some.
+// test_clips.c - gsf_restore_clip: clips of all sizes and lengths through restorers with limits.
 #include "gsfixer.h"
 #include "test.h"
 #include "test_hooks.h"

@@ -1,4 +1,5 @@
-// test_few_views.c - from photos to splats as gsfix fix goes: which points the splats begin with, and the loop's settings.
+// test_few_views.c - the path of gsfix fix from photos to splats: choice of the initial points, and the loop's
+// settings.
 #include "gsfixer_splat.h"
 #include "test.h"
 #include "test_hooks.h"

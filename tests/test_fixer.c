@@ -1,5 +1,5 @@
-// test_fixer.c - the warp restorer against an analytic scene, and the repair loop: schedule, legal sizes, skipping,
-// failing restorers, cancel, and checkpoints that continue bit for bit.
+// test_fixer.c - the restorer warp on an analytic scene, and the repair loop: schedule, legal sizes, skipping, failing
+// restorers, cancellation, and checkpoints that resume bit-identically.
 #include "gsfixer_splat.h"
 #include "test.h"
 #include "test_hooks.h"

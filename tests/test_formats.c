@@ -1,5 +1,5 @@
-// test_formats.c - .splat and .spz: files worked out by hand, files written by Niantic's spz library, error bounds of a round trip,
-// damage, failing allocations, splats that are not finite, positions that do not fit; and the gzip inside.
+// test_formats.c - .splat and .spz: hand-made files, files written by Niantic's spz library, error bounds of a round
+// trip, damage, failing allocations, non-finite splats, positions out of range; and the gzip layer.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 #include "test.h"

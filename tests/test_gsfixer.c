@@ -1,4 +1,4 @@
-// gsfixer.h at its edges: hooks, failing memory and disks, damaged files, JSON, images, random numbers, cameras.
+// Edge cases of gsfixer.h: hooks, failing memory and disks, damaged files, JSON, images, random numbers, cameras.
 #ifdef __linux__
 #define _POSIX_C_SOURCE 200809L
 #include <sys/stat.h>

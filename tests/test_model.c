@@ -1,5 +1,5 @@
-// bench/make_model.c, which makes restorer models of random weights: the same bytes however they are made, the official
-// models' lists of tensors, values that run, and vocabularies that spell what they should.
+// bench/make_model.c, which makes restorer models with random weights: the same bytes regardless of shards and threads,
+// the tensor lists of the released models, values that run, and vocabularies that encode their words.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 

@@ -1,5 +1,5 @@
-// The encoders of reference photos on the small golden models: folders and inputs that are wrong, workers, groups of
-// images, memory, cancelling, features saved and read again. Their values are golden_encoders' matter.
+// The encoders of reference photos on the small golden models: bad folders and inputs, workers, groups of images,
+// memory, cancellation, saving and loading features. golden_encoders checks their values.
 #include "gsfixer_nn.h"
 
 #include "test.h"

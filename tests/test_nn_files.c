@@ -1,4 +1,4 @@
-// Weight files of gsfixer_nn.h: safetensors, alone and in shards, whole and broken; what the networks read them with.
+// Weight files of gsfixer_nn.h: safetensors, single and sharded, valid and damaged; and the loader of the networks.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 

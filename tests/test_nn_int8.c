@@ -1,6 +1,6 @@
-// 8-bit linear layers: the scalar kernels against integers worked out here; all instruction sets and workers bit for bit;
-// the error of the whole against sums in double, with and without outliers and rotation; every epilogue; NaN and infinity;
-// bad arguments; allocations that fail.
+// 8-bit linear layers: the scalar kernels against integers computed here; bit-identical for all instruction sets and
+// workers; total error against sums in double, with and without outliers and rotation; every epilogue; NaN and
+// infinity; bad arguments; failing allocations.
 #define GSF__INT8_HELD 3000 // so that few rows are quantised at a time
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"

@@ -1,5 +1,6 @@
-// Kernels of gsfixer_nn.h against plain double-precision references: odd sizes, tails and strides, special values, in
-// place; the same bits for one and three workers; out of memory. Every check runs at each cpu level of the machine.
+// Kernels of gsfixer_nn.h against direct double-precision references: odd sizes, tails and strides, special values,
+// in-place operation; bit-identical for one and three workers; out of memory. Every check runs at each CPU level of the
+// machine.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 

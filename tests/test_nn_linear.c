@@ -1,5 +1,5 @@
-// Linear layers against sums in double: odd shapes, every weight type at any address, strides, every epilogue, all
-// instruction sets; same bits for any workers; NaN and infinity; bad arguments; allocations that fail.
+// Linear layers against sums in double: odd shapes, all weight dtypes at any alignment, strides, every epilogue, all
+// instruction sets; bit-identical for any number of workers; NaN and infinity; bad arguments; failing allocations.
 #define GSF__LINEAR_PACKED 20000 // so that small layers take several groups of outputs
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"

@@ -1,5 +1,5 @@
-// The restorer `dit` behind gsfixer.h's interface, on the small golden model: what it accepts, what it skips, workers,
-// cancelling and resuming, weights and features that are wrong.
+// The restorer `dit` behind the interface of gsfixer.h, on the small golden model: accepted inputs, skipped work,
+// workers, cancelling and resuming, bad weights and features.
 #include "gsfixer_nn.h"
 
 #include "test.h"

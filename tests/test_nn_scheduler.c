@@ -1,5 +1,5 @@
-// Noise schedule, time steps and solvers of gsfixer_nn.h: against a case with a closed solution, against the multistep
-// formulas written out, checkpoints, other orders of work, bad input. (The tables of diffusers: golden_restorer.)
+// Noise schedule, time steps and solvers of gsfixer_nn.h: against a case with a closed-form solution and the multistep
+// formulas written out; checkpoints, other orders of work, bad input. (The tables of diffusers: golden_restorer.)
 #include "gsfixer_nn.h"
 
 #include "test.h"

@@ -1,5 +1,6 @@
-// The networks on a pthread job system behind the hook: 1, 2 and 3 workers give the same bytes, kernel by kernel and for a
-// whole run of the small golden model. Built with ThreadSanitizer it is also the test for data races.
+// The networks on a pthread job system behind the parallel hook: 1, 2 and 3 workers give the same bytes, kernel by
+// kernel and for a complete run of the small golden model. Built with ThreadSanitizer, this is also the test for data
+// races.
 #define JOB_SYSTEM_ONLY
 #include "../examples/job_system.c"
 #include "gsfixer_nn.h"

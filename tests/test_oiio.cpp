@@ -1,5 +1,5 @@
-// The OpenImageIO section: EXR, TIFF and 16-bit PNG there and back, through files and memory; and OpenImageIO as a
-// judge of our decoder, of gsf_psnr and of half precision.
+// The OpenImageIO section: round trips of EXR, TIFF and 16-bit PNG through files and memory; and OpenImageIO as an
+// oracle for our decoder, gsf_psnr and half precision.
 #define GSF_USE_OIIO
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"

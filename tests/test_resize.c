@@ -1,4 +1,4 @@
-// Resizes against golden/encoders/preprocess: PIL byte for byte. (Whole photos: golden_encoders.)
+// Resizing against golden/encoders/preprocess: PIL's filters bit-exactly. (Whole photos: golden_encoders.)
 #include "gsfixer.h"
 #include "test.h"
 

@@ -1,6 +1,6 @@
-// test_sweeps.c - the whole loop, from photos on disk to results on disk, under each failure that its hooks can bring: the
-// k-th allocation, the k-th read, the k-th write. Whatever fails, the result says so, nothing leaks, and what was on disk
-// is there as it was; and where the call that failed is repeated, the run ends in the same bytes as one without failures.
+// test_sweeps.c - the complete loop, from photos on disk to results on disk, under every failure of a hook: the k-th
+// allocation, the k-th read, the k-th write. In each case the result reports the failure, nothing leaks, and existing
+// files stay as they were; if the failed call is repeated, the run ends with the same bytes as one without failures.
 #include "gsfixer_splat.h"
 #include "test.h"
 #include "test_hooks.h"

@@ -1,5 +1,5 @@
-// Everything that runs in parallel, on a pthread job system behind the hook: 1, 2 and 3 workers give the same bytes.
-// Built with ThreadSanitizer it is also the test for data races.
+// All parallel code on a pthread job system behind the parallel hook: 1, 2 and 3 workers give the same bytes. Built
+// with ThreadSanitizer, this is also the test for data races.
 #define JOB_SYSTEM_ONLY
 #include "../examples/job_system.c"
 #include "test.h"

@@ -1,5 +1,6 @@
-// test_traj.c - gsfixer_traj.h beyond the golden data: any number of views, window lengths, seeds; scenes moved and
-// scaled; degenerate and non-finite input; scratch of exactly the promised size (for a sanitizer to see).
+// test_traj.c - gsfixer_traj.h beyond the golden data: any number of views, window lengths, seeds; moved and scaled
+// scenes; degenerate and non-finite input; scratch memory of exactly the queried size (so that a sanitizer detects
+// overruns).
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_traj.h"
 #include "test.h"

@@ -1,5 +1,5 @@
-// The restorer of README's tutorial: a clip of a legal size comes back as it was, its confidence is the alpha, and a cancelled
-// call stops.
+// The restorer of README's tutorial: a clip of a legal size is returned unchanged, its confidence is the alpha, and a
+// cancelled call stops.
 #include "readme_restorer.h"
 #include "test.h"
 

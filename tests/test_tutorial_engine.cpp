@@ -1,5 +1,5 @@
-// The frame loop of README's tutorial: photos as linear EXR files, cameras from glm, a job system of three threads. It reads
-// the photos as they were before they were made linear, trains to a lower loss, and renders the same bits with one thread.
+// The frame loop of README's tutorial: photos as linear EXR files, cameras from glm, a job system of three threads. The
+// decoded photos match the originals, training reduces the loss, and one thread renders the same bits.
 #define GSF_USE_OIIO
 #define GSF_USE_GLM
 #define GSFIXER_IMPLEMENTATION
