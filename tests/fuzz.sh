@@ -2,11 +2,11 @@
 # tests/fuzz.sh [SECONDS] [TARGET...]: libFuzzer with AddressSanitizer and UndefinedBehaviorSanitizer, SECONDS (600) for each
 # TARGET (all; "ply" is fuzz_ply.c). Needs clang-14 and libclang-rt-14-dev. Not part of run.sh, which replays the corpora.
 #   build/fuzz/             the build tree
-#   build/fuzz/run/TARGET/  log, findings, and corpus/, a copy of tests/corpus/TARGET with what was found to be new
-# Ends with a table; exit 1 if there was a finding: a crash, undefined behaviour, a leak, an input that takes 5 s, or memory
-# above 1 GiB (256 MiB at once).
-# GSF_FUZZ_JOBS=N runs N targets at a time (1).
-# What is worth keeping:  build/fuzz/tests/fuzz_ply -merge=1 tests/corpus/ply build/fuzz/run/ply/corpus
+#   build/fuzz/run/TARGET/  log, findings, and corpus/, a copy of tests/corpus/TARGET plus new inputs
+# Prints a table at the end; exits with 1 if there was a finding: a crash, undefined behaviour, a leak, an input that takes
+# 5 s, or memory above 1 GiB (256 MiB in one allocation).
+# GSF_FUZZ_JOBS=N runs N targets in parallel (default 1).
+# To add new inputs to the corpus:  build/fuzz/tests/fuzz_ply -merge=1 tests/corpus/ply build/fuzz/run/ply/corpus
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 build=$PWD/build/fuzz
@@ -32,7 +32,7 @@ flags="-O1 -g -finline-hint-functions"
     cmake --build "$build" --target "${targets[@]/#/fuzz_}"
 } > "$build/build.log" 2>&1 || { tail -n 30 "$build/build.log" >&2; exit 1; }
 
-# A small quarantine: freed blocks are soon used again, so that less memory is met for the first time.
+# A small quarantine: freed blocks are reused soon, so that fewer pages are touched for the first time.
 export ASAN_OPTIONS=${ASAN_OPTIONS:-quarantine_size_mb=8}
 export UBSAN_OPTIONS=${UBSAN_OPTIONS:-print_stacktrace=1}
 

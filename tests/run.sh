@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# tests/run.sh [CTEST ARGUMENTS]: everything there is to test, on a fresh Debian machine as well.
+# tests/run.sh [CTEST ARGUMENTS]: runs all tests, also on a fresh Debian machine.
 #   build/        gcc, Release: all tests, and again with the scalar kernels; compile matrix; consumers; fuzz corpora
 #   build/asan/   clang, AddressSanitizer and UndefinedBehaviorSanitizer: all tests and fuzz corpora
 #   build/tsan/   clang, ThreadSanitizer: the threaded tests, on a pthread job system
 #   build/all/    one ctest run over the three; its log is build/all/Testing/Temporary/LastTest.log
-# What is missing is installed with apt-get (as root or by sudo); with everything there the network is not touched.
-# Photos beside the checkout (../shared/data/fox, or GSF_FOX=folder) are used where present, else their tests are skipped.
-# GSF_BUILD=folder builds elsewhere than in build/.
+# Missing packages are installed with apt-get (as root or with sudo); if none is missing, the network is not used.
+# Tests that need the fox photos (../shared/data/fox beside the checkout, or GSF_FOX=folder) are skipped without them.
+# GSF_BUILD=folder replaces build/.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 root=$PWD
@@ -37,14 +37,14 @@ install_missing() {
 }
 
 mkdir -p "$build"
-# Output goes to a log, which is shown only if the step fails.
+# Output goes to a log that is shown only if the step fails.
 step() { # LOG COMMAND...
     local log=$build/$1.log
     shift
     "$@" > "$log" 2>&1 || { tail -n 60 "$log" >&2; echo "$0: failed: $* (whole log: $log)" >&2; exit 1; }
 }
 
-# ThreadSanitizer of clang 14 needs the old address space layout; kernels that randomise more bits kill it at start.
+# clang 14's ThreadSanitizer crashes at start on kernels that randomise more address bits than it expects.
 tsan_launcher() {
     local probe=$build/tsan_probe
     printf 'int main(void) { return 0; }\n' > "$probe.c"
@@ -65,15 +65,15 @@ build_tree() { # NAME SOURCE-RELATIVE-DIR CMAKE-ARGUMENT...
 
 install_missing
 
-# The compiler goes by environment: given as an option, one that differs from the tree's makes CMake forget all other
-# options. If build/ was made with another compiler, it is made anew.
+# The compiler is passed by environment: as an option, one that differs from the tree's makes CMake forget all other
+# options. If build/ was configured with another compiler, it is recreated.
 if ! grep -qE '^CMAKE_C_COMPILER:[A-Z]+=.*/(gcc|cc)$' "$build/CMakeCache.txt" 2> /dev/null; then
     rm -rf "$build/CMakeCache.txt" "$build/CMakeFiles"
 fi
 export CC=gcc CXX=g++
 build_tree gcc "$build" -DCMAKE_BUILD_TYPE=Release -DGSFIXER_TEST_SCALAR=ON
 export CC=clang-14 CXX=clang++-14
-# Inlining only what is marked so takes a quarter off the compilation and nothing off the tests' speed.
+# Inlining only functions marked inline saves a quarter of the compile time without slowing the tests down.
 flags="-O1 -g -finline-hint-functions"
 clang=(-DCMAKE_BUILD_TYPE=Sanitize "-DCMAKE_C_FLAGS=$flags" "-DCMAKE_CXX_FLAGS=$flags" -DGSFIXER_BENCH=OFF)
 build_tree asan "$build/asan" "${clang[@]}" -DGSFIXER_SANITIZE=address,undefined -DGSFIXER_TEST_PREFIX=asan.

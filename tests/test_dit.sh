@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# test_dit.sh GSFIX MAKE_MODEL SCENE SCRATCH: the restorer dit through the program, on a small model of random weights: a
-# clip and a scene are restored, stopped, killed and resumed to the same bytes. Exit status 1 and a line on the first fault.
+# test_dit.sh GSFIX MAKE_MODEL SCENE SCRATCH: gsfix with the restorer dit, on a small model with random weights: a clip and a
+# scene are restored, interrupted, killed and resumed with the same bytes. Stops at the first failure with a line and exit 1.
 set -euo pipefail
 gsfix=$1 make_model=$2 scene=$3 scratch=$4
 [ -x "$gsfix" ] && [ -x "$make_model" ] && [ -d "$scene" ] || { echo "SKIPPED: no programs or no scene"; exit 77; }
@@ -23,7 +23,7 @@ fix() { # OUT OPTION...
     "$gsfix" fix "$scene" --out "$out" "${options[@]}" "$@" > "$log" 2>&1
 }
 
-# Three clips, each with a caption and photos of its own, by the model's encoders; then without encoders from what they gave.
+# Three clips, each with its own caption and photos, first with the model's encoders, then with the features saved from them.
 fix "$scratch/whole" "${from_photos[@]}" --save-features "$saved" --threads 2 || fail "the run from photos failed"
 [ ! -e "$scratch/whole/dit.checkpoint" ] || fail "the clip's checkpoint is left behind"
 grep -q '"solver": *"ddim"' "$scratch/whole/metrics.json" || fail "metrics.json does not tell the solver"
@@ -37,7 +37,7 @@ cmp "$scratch/whole/splats.ply" "$scratch/one/splats.ply" || fail "saved feature
 ! grep -q '"name": *"caption"' "$scratch/one/metrics.json" || fail "the captioner ran although prompts were given"
 
 kills=0
-kill_clips() { # OUT TIMES OPTION...: kill -9 as soon as a clip is at work, then a last run to the end
+kill_clips() { # OUT TIMES OPTION...: kill -9 as soon as a clip has started, then a final run to the end
     local out=$1 left=$2 pid
     shift 2
     while [ "$left" -gt 0 ]; do
@@ -46,7 +46,7 @@ kill_clips() { # OUT TIMES OPTION...: kill -9 as soon as a clip is at work, then
         pid=$!
         while kill -0 "$pid" 2> /dev/null && [ ! -e "$out/dit.checkpoint" ]; do sleep 0.01; done
         kill -9 "$pid" 2> /dev/null || true
-        wait "$pid" 2> /dev/null && break # it was done before
+        wait "$pid" 2> /dev/null && break # it finished before the kill
         kills=$((kills + 1)) left=$((left - 1))
     done
     fix "$out" "$@" --resume || fail "the last run failed after $kills kills"
@@ -57,8 +57,7 @@ kill_clips "$scratch/photos_killed" 1 "${from_photos[@]}" --save-features "$scra
 cmp "$scratch/whole/splats.ply" "$scratch/photos_killed/splats.ply" || fail "from photos: differs after a kill"
 cmp "$saved" "$scratch/again.safetensors" || fail "other features are saved after a kill"
 
-# One clip: the frames that the first window of the scene gave, as they come out of a folder of pictures. A file of features
-# for that clip alone.
+# One clip: the frames of the scene's first window, from a folder of images, with a feature file for that clip only.
 dit=(--restorer "dit:$scratch/model" --ref-features "$scratch/all/features.safetensors")
 mkdir -p "$scratch/clip"
 for frame in "$scratch"/whole/fixed/*window1*.png; do cp "$frame" "$scratch/clip/"; done
@@ -68,7 +67,7 @@ restore() { # OUT OPTION...
     "$gsfix" restore "$scratch/clip" --out "$out" "${dit[@]}" --steps 40 "$@" > "$log" 2>&1
 }
 restore "$scratch/restored" || fail "restore failed"
-# No room for the clip's checkpoint (a limit on the size of a file stands for a full disk): the clip is restored all the same.
+# No room for the clip's checkpoint (a file size limit simulates a full disk): the clip is restored nevertheless.
 largest=$(stat -c %s "$scratch"/restored/*.png "$scratch"/restored/confidence/*.png | sort -n | tail -n 1)
 (ulimit -f $((largest / 1024 + 2)); restore "$scratch/full") || fail "restore failed for want of a checkpoint"
 [ "$(grep -c "warning: going on without the clip's checkpoint" "$log")" = 1 ] || fail "not one warning"
@@ -102,7 +101,7 @@ expect 1 "cut.safetensors" "$gsfix" restore "$scratch/clip" --out "$scratch/x" "
     --ref-features "$scratch/cut.safetensors"
 
 
-# Frames of any number and size: more and fewer than the 9 of 96 x 64 that the model was made for.
+# Any number and size of frames: more and fewer than the 9 frames of 96 x 64 that the model was trained for.
 size() { od -An -tx1 -j16 -N8 "$1"; } # of a PNG
 expect 0 "" "$gsfix" render "$scratch/whole/splats.ply" --scene "$scene" --max-size 50 --out "$scratch/views"
 views=("$scratch"/views/*.png)
@@ -115,7 +114,7 @@ for count in 1 5 21; do
         fail "checkpoints are left behind"
 done
 [ "$(size "$scratch/back5/1.png")" = "$(size "$scratch/clip5/1.png")" ] || fail "frames of another size came back"
-# Stopped in the last part of a long clip: those that were done are not sampled again.
+# Interrupted in the last part of a long clip: completed parts are not sampled again.
 "$gsfix" restore "$scratch/clip21" --out "$scratch/long" "${dit[@]}" --steps 2 > "$log" 2>&1 &
 pid=$!
 while kill -0 "$pid" 2> /dev/null && [ ! -e "$scratch/long/dit.checkpoint.2" ]; do sleep 0.01; done
@@ -124,7 +123,7 @@ wait "$pid" 2> /dev/null || true
 expect 0 "restored by" "$gsfix" restore "$scratch/clip21" --out "$scratch/long" "${dit[@]}" --steps 2
 for frame in "$scratch"/back21/*.png; do cmp "$frame" "${frame/back21/long}" || fail "a long clip differs after a kill"; done
 
-# Features of a clip that the file does not have are named; other counts than the trained one are to be asked for.
+# Missing features of a clip are named in the message; window lengths other than the trained one must be requested.
 expect 1 "prompt_embeds.clip3" "$gsfix" fix "$scene" --out "$scratch/x" "${options[@]}" --ref-features "$saved" \
     --restorer "dit:$scratch/model" --set "rounds=2,windows=3,first_round=20,last_round=40"
 expect 1 "prompt_embeds.clip1" "$gsfix" fix "$scene" --out "$scratch/bare" "${options[@]}" "${dit[@]}"

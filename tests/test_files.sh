@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# test_files.sh GSFIX SCENE SCRATCH: ways to lose files with gsfix. Each is refused with one line, before any work, and
-# leaves every file as it was; then what must go on working. SCENE: make_scene's.
+# test_files.sh GSFIX SCENE SCRATCH: ways in which gsfix could destroy files. Each is refused with one line before any work and
+# leaves all files unchanged. Then the cases that must keep working. SCENE: made by make_scene.
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3
 [ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no program or no scene"; exit 77; }
@@ -11,7 +11,7 @@ scratch=$PWD
 export OMP_WAIT_POLICY=passive
 failures=0 cases=0 case=""
 fail() { echo "FAILED: $case: $*"; failures=$((failures + 1)); }
-tree() { # every file, link and folder with its bytes, but gsfix's own book
+tree() { # every file, link and folder with its content, except gsfix's manifest
     find . -name .gsfix -type d -prune -o -type f -printf '%p ' -exec sha256sum {} \; -o -type l -printf '%p -> %l\n' -o -type d -print -o -print |
         LC_ALL=C sort
 }
@@ -28,7 +28,7 @@ new() { # NAME: a fresh folder with its own copy of the scene
     cd now
     cp -r "$scene" S
 }
-refused() { # STATUS TEXT COMMAND...: nothing but one line with the text, quickly, and all is as it was
+refused() { # STATUS TEXT COMMAND...: prints one line with the text, quickly, and changes nothing
     local want=$1 text=$2
     shift 2
     tree > ../before
@@ -51,7 +51,7 @@ quick=(--views 3 --iterations 4 --max-size 48 --checkpoint-every 2)
 repair=(--compare --restorer warp --set rounds=1,windows=1,window_frames=4,first_round=1,last_round=3)
 fix() { timeout -k 5 120 "$gsfix" fix "$@" "${quick[@]}"; }
 
-# ---- what others are made from: splats, an output folder of a run with repair, a path
+# ---- fixtures: splats, the output folder of a run with repair, a path
 cp -r "$scene" S
 "$gsfix" fix S --out made "${quick[@]}" "${repair[@]}" --also spz > /dev/null 2>&1 || { echo "FAILED: no run to start from"; exit 1; }
 "$gsfix" path S --views 3 --frames 4 --out path.json > /dev/null
@@ -92,7 +92,7 @@ new "restore over the references"; mkdir R; cp S/images/"$view" R/ref.png; refus
 new "path over a photo";           refused 1 "S/images/$view" "$gsfix" path S --views 3 --out S/images/"$view"
 new "path over the model";         refused 1 "is there already" "$gsfix" path S --views 3 --out S/sparse/0/images.bin
 
-# ---- files of someone else under the names
+# ---- foreign files under output names
 for name in splats.ply metrics.json report.html checkpoint dit.checkpoint "test/$view"; do
     new "a file at $name"; mkdir -p "OUT/$(dirname "$name")"; echo mine > "OUT/$name"
     refused 1 "OUT/$name" fix S --out OUT
@@ -145,7 +145,7 @@ new "a foreign .gsfix";      mkdir -p OUT/.gsfix; echo mine > OUT/.gsfix/notes; 
 new "a foreign manifest";    mkdir -p OUT/.gsfix; echo mine > OUT/.gsfix/manifest; refused 1 "manifest" fix S --out OUT; [ "$(cat OUT/.gsfix/manifest)" = mine ] || fail "lost"
 new "a name that is too long"; mkdir -p L; refused 1 "L" fix S --out "L/$(printf 'x%.0s' $(seq 300))"
 
-# ---- what gsfix wrote and someone changed since; checkpoints
+# ---- files of gsfix that were changed since; checkpoints
 edited() { cp -r ../made OUT; }
 new "an edited picture";     edited; echo mine >> "OUT/test/$view"; refused 1 "OUT/test/$view" fix S --out OUT --restart
 new "an edited report";      edited; sed -i s/PSNR/mine/ OUT/report.html; refused 1 "OUT/report.html" fix S --out OUT --restart
@@ -167,7 +167,7 @@ new "resume after the names changed"; printf 'frame_002.png\nframe_004.png\n' > 
 printf 'frame_004.png\nframe_002.png\n' > names; refused 1 "names" "$gsfix" fix S --views names --iterations 2 --max-size 48 --out OUT --resume
 new "usage"; refused 2 "exclude each other" fix S --out OUT --resume --restart
 
-# ---- two runs at once, and a lock that dies with its process
+# ---- two runs at once, and a lock that is released when its process dies
 new "a second run"
 "$gsfix" fix S --out OUT --views 3 --iterations 100000 --max-size 48 > /dev/null 2> ../first &
 first=$!
@@ -181,7 +181,7 @@ works fix S --out OUT --restart
 
 # ---- restorers that misbehave
 exec_fix() { fix S --out OUT --restorer "exec:$1" --set rounds=1,windows=2,window_frames=4,first_round=1,last_round=3; }
-copy='cp "$1"/frames/*.png "$1"/out/; true' # the command gets the folder once more as its last word
+copy='cp "$1"/frames/*.png "$1"/out/; true' # the command gets the folder as its last argument
 hostile() { # NAME TEXT SCRIPT: exit status 1, the folder docs as it was
     new "a restorer that $1"
     mkdir docs; echo mine > docs/mine; cp S/images/*.png docs/
@@ -211,7 +211,7 @@ works "$gsfix" restore "$job" --restorer "exec:$copy" --out OUT
 (cd "$job" && tree) > ../after
 same ../before ../after
 
-# ---- what a restorer started ends with the run
+# ---- processes started by a restorer end with the run
 gone() { # PID: within two seconds
     for _ in $(seq 20); do
         [ -e "/proc/$1" ] && ! grep -q '^State:.*Z' "/proc/$1/status" 2> /dev/null || return 0
@@ -231,8 +231,8 @@ for signal in KILL INT; do
     works fix S --out OUT --restart # the lock is free
 done
 
-# ---- disks that are full: a limit on the size of a file stands for them
-new "no room for the checkpoint" # but for the splats
+# ---- full disks, simulated by a file size limit
+new "no room for the checkpoint" # except the splats
 room=$(( $(stat -c %s ../made/splats.ply) / 1024 + 20 ))
 [ $((room * 1024)) -lt "$(stat -c %s ../made/checkpoint)" ] || fail "the test needs a larger checkpoint"
 (ulimit -f $room; run fix S --out OUT "${repair[@]}"; echo $status > ../status)
@@ -252,7 +252,7 @@ for _ in $(seq 300); do grep -q "step" ../stderr && break; sleep 0.1; done
 kill -INT $pid; status=0; wait $pid || status=$?
 [ "$status" = 1 ] && grep -q "stopped at step .* without a checkpoint: OUT/checkpoint: cannot be written" ../stderr || fail "$(tail -n 1 ../stderr)"
 
-# ---- what must go on working
+# ---- cases that must keep working
 new "begin anew"; cp -r ../made OUT; echo mine > OUT/notes.txt; echo mine > OUT/test/notes.txt; echo mine > OUT/fixed/mine.png; mkdir OUT/report/mine
 works fix S --out OUT "${repair[@]}" --also spz --restart
 for file in splats.ply splats.spz "test/$view" fixed/round1_window1_00001.png; do same OUT/$file ../made/$file; done
@@ -281,7 +281,7 @@ new "views of almost one name"; transforms a; mv T/a/frame_001.png T/a/b.png; mv
 cp T/a_b.png T/a_b.jpg; sed -i 's,a/frame_001.png,a/b.png,;s,a/frame_002.png,a_b.png,;s,a/frame_003.png,a_b.jpg.png,;s,a/frame_004.png,a_b.jpg,' T/transforms.json
 works "$gsfix" render "$splats" --scene T --out OUT; [ "$(ls OUT/*.png | wc -l)" = "$(grep -o file_path T/transforms.json | wc -l)" ] || fail "views share a picture: $(ls OUT)"
 
-# ---- the makers of scenes and models
+# ---- make_scene and make_model
 folder=$(dirname "$gsfix")
 new "a scene over a scene"; rm -r S/truth; refused 1 "not of make_scene's making" "$folder/make_scene" S --views 4 --width 32 --height 32
 mkdir E; works "$folder/make_scene" E --views 4 --width 32 --height 32 --points 40; works "$folder/make_scene" E --views 5 --width 32 --height 32 --points 40

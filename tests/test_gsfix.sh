@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# test_gsfix.sh GSFIX SCENE SCRATCH: every command once, exit codes, and what the files hold. SCENE: make_scene's.
+# test_gsfix.sh GSFIX SCENE SCRATCH: every command, its exit codes and the contents of its files. SCENE: made by make_scene.
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3
 [ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no program or no scene"; exit 77; }
@@ -10,7 +10,7 @@ cd "$scratch"
 export OMP_WAIT_POLICY=passive
 failures=0
 fail() { echo "FAILED: $*"; failures=$((failures + 1)); }
-expect() { # STATUS COMMAND...: exit status, and one line that says why where it is not 0
+expect() { # STATUS COMMAND...: checks the exit status and, if it is not 0, that one line explains it
     local want=$1 got=0
     shift
     "$@" > stdout 2> stderr || got=$?
@@ -18,12 +18,12 @@ expect() { # STATUS COMMAND...: exit status, and one line that says why where it
     if [ "$want" != 0 ]; then [ "$(grep -c '^gsfix' stderr)" = 1 ] || { fail "not one line of error: $*"; cat stderr; }; fi
 }
 holds() { grep -q -- "$1" "$2" || fail "$2 does not hold $1"; }
-is_json() { # one object on one line, and every brace of it closed
+is_json() { # one object on one line with balanced braces
     [ "$(wc -l < "$1")" = 1 ] && head -c 1 "$1" | grep -q '{' && tail -c 2 "$1" | grep -q '}' || fail "$1 is not one JSON object"
     if command -v python3 > /dev/null; then python3 -c 'import json, sys; json.load(open(sys.argv[1]))' "$1" || fail "$1 is not JSON"; fi
 }
 
-# usage: 2
+# usage errors: exit status 2
 expect 2 "$gsfix" bogus
 expect 2 "$gsfix" dataset "$scene"
 expect 2 "$gsfix" evaluate
@@ -55,7 +55,7 @@ expect 2 "$gsfix" metrics a b --models m
 expect 2 "$gsfix" path "$scene" --out x.json --frames 10 --windows 3
 expect 2 "$gsfix" info "$scene" --out x
 expect 2 "$gsfix" fix "$scene" --out x --also ply
-# the work fails: 1
+# failures: exit status 1
 expect 1 "$gsfix" info nothing_here
 expect 1 "$gsfix" info nothing_here.ply
 expect 1 "$gsfix" info nothing_here.spz
@@ -76,7 +76,7 @@ expect 0 "$gsfix" info "$scene"
 expect 0 "$gsfix" info "$scene" --json
 is_json stdout
 
-# fix, with the repair by a program: it copies the frames (in a subfolder's job) and trusts every pixel
+# fix with an external restorer, which copies the frames with full confidence everywhere
 cat > copy.sh <<'SH'
 #!/bin/sh
 [ -s "$1/cameras.json" ] && [ -s "$1/depth/00000.npy" ] && [ -s "$1/alpha/00000.png" ] && [ -s "$1/refs/00000.png" ] &&
@@ -96,7 +96,7 @@ for key in psnr ssim per_view seconds total init train render restore distill it
     switches version command; do holds "\"$key\":" a/metrics.json; done
 for value in '"rounds":1' '"windows":1' '"window_frames":4' '"lambda":1' '"first_round":[1-9][0-9]*' '"densify_interval":100' \
     '"lr_means":0.00016' '"lambda_ssim":0.2' '"dropout":0.1' '"trajectory":"reference"' '"antialiased":"off"'; do
-    holds "\"switches\":.*$value[,}]" a/metrics.json # what was used, defaults filled in
+    holds "\"switches\":.*$value[,}]" a/metrics.json # the settings in effect, with defaults filled in
 done
 for file in splats.ply report.html checkpoint fixed/round1_window1_00001.png; do [ -s a/$file ] || fail "no a/$file"; done
 [ -z "$(find a -name "job*")" ] || fail "the job folder was left behind"
@@ -109,7 +109,7 @@ expect 1 "$gsfix" fix "$scene" --out b --restart "${small[@]}" --restorer "exec:
 holds "took longer" stderr
 expect 1 "$gsfix" fix "$scene" --out b --restart "${small[@]}" --restorer "exec:exit 5"
 holds "status 5" stderr
-# the other ways to start, the three paths, warp, plain; no repair gives no frames
+# the other starts, the three paths, warp, plain; without repair there are no frames
 for init in embree tracks both all dense random; do
     expect 0 "$gsfix" fix "$scene" --out c --restart --views 3 --iterations 2 --max-size 48 --init $init --json
     holds "\"init\":\"$init\"" stdout
@@ -129,12 +129,12 @@ holds "no cameras" stderr
 expect 0 "$gsfix" fix "$scene" --out e --views 3 --iterations 5 --max-size 48 --regularize off
 [ ! -e e/fixed ] || fail "frames without a restorer"
 
-# names with a byte order mark, as some editors write it
+# a list of names with a byte order mark
 printf '\xef\xbb\xbfframe_002.png\r\nframe_003.png\nframe_004.png\n' > names
 expect 0 "$gsfix" fix "$scene" --out marked --views names --iterations 2 --max-size 48
 
-# masks change splats and figures, are inputs as photos are, and --photo-masks off does not look at them.
-# Here the folder masks holds the photos themselves, so that dark pixels hardly count.
+# Masks change splats and metrics, are inputs like photos, and are ignored by --photo-masks off. Here the folder masks holds
+# the photos themselves, so that dark pixels hardly count.
 mkdir -p cut/images cut/masks
 cp -r "$scene/sparse" cut/
 cp "$scene"/images/* cut/images/
@@ -162,7 +162,7 @@ expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out
 expect 0 "$gsfix" render colored/splats.ply --scene "$scene" --max-size 48 --out on_black
 if cmp -s on_white/frame_001.png on_black/frame_001.png; then fail "the background changes nothing"; fi
 
-# --compare: the figures without repair are those of a run without repair, the others of one without --compare
+# --compare: the metrics without repair equal those of a run without repair, the others those of a run without --compare
 expect 0 "$gsfix" fix "$scene" --out compared "${small[@]}" --restorer warp --compare --seed 3
 holds "by the repair alone" stdout
 expect 0 "$gsfix" fix "$scene" --out repaired "${small[@]}" --restorer warp --seed 3
@@ -182,18 +182,18 @@ holds '"curve_without_repair":' compared/metrics.json
 holds "without repair | with repair\|without | with repair" compared/report.html
 if grep -q "without repair" repaired/report.html; then fail "a report without --compare speaks of it"; fi
 
-# the smaller commands
+# the other commands
 expect 0 "$gsfix" masks "$scene" --views 3 --model a/splats.ply --out masks --max-size 48 --json
 is_json stdout
 expect 0 "$gsfix" fix "$scene" --out f --views 3 --iterations 5 --max-size 48 --masks masks --json
 holds '"psnr_seen":' stdout
 expect 1 "$gsfix" fix "$scene" --out f --restart --views 3 --iterations 5 --max-size 40 --masks masks
-# metrics over the same masks says of the pictures that fix left what fix said (they are rounded to 8 bits)
+# metrics with the same masks gives fix's figures for the images that fix wrote (up to rounding to 8 bits)
 expect 0 "$gsfix" masks "$scene" --views 3 --model a/splats.ply --out masks_full
 expect 0 "$gsfix" fix "$scene" --out full --views 3 --iterations 5 --masks masks_full
 expect 0 "$gsfix" metrics full/test "$scene/images" --masks masks_full --json
 numbers() { grep -o "\"$1\":[-+.0-9e]*" "$2" | cut -d : -f 2; } # of a file, in its order
-for key in psnr psnr_seen; do # the mean is the last that metrics prints, the first in metrics.json
+for key in psnr psnr_seen; do # the mean is the last value that metrics prints and the first one in metrics.json
     says=$(numbers $key stdout | tail -n 1) said=$(numbers $key full/metrics.json | head -n 1)
     awk -v a="$says" -v b="$said" 'BEGIN { exit !(a != "" && b != "" && a - b < 0.02 && b - a < 0.02) }' ||
         fail "metrics: $key is $says, fix said $said"
@@ -209,7 +209,7 @@ done
 expect 0 "$gsfix" render a/splats.ply --scene "$scene" --max-size 48 --out frames --depth --alpha
 expect 0 "$gsfix" metrics a/test frames --which psnr,ssim_3dgs,ssim_torchmetrics,ssim_skimage --json
 holds '"ssim_skimage":' stdout
-holds '"ssim_3dgs":1[,}]' stdout # the render of the saved splats is the picture that fix left
+holds '"ssim_3dgs":1[,}]' stdout # the render of the saved splats is the image that fix wrote
 expect 0 "$gsfix" path "$scene" --views 3 --frames 8 --out path.json
 expect 0 "$gsfix" render a/splats.ply --path path.json --out flight --depth
 [ "$(ls flight/*.png | wc -l)" = 8 ] && [ "$(ls flight/depth/*.npy | wc -l)" = 8 ] || fail "not 8 frames and depths"
@@ -221,13 +221,13 @@ expect 0 "$gsfix" restore flight --restorer "exec:sh $PWD/restore.sh" --out rest
 cmp flight/00003.png restored/00003.png || fail "a copied frame changed"
 expect 1 "$gsfix" restore flight --restorer warp --out restored
 holds "cameras.json" stderr
-# a restorer's job folder is all that warp needs
+# a restorer's job folder contains everything that warp needs
 expect 1 "$gsfix" fix "$scene" --out g "${small[@]}" --restorer "exec:exit 5"
 expect 0 "$gsfix" restore g/job-* --restorer warp --out warped --json
 is_json stdout
 [ "$(ls warped/*.png | wc -l)" = 4 ] || fail "not 4 frames"
 
-# Ctrl-C leaves a checkpoint that goes on
+# Ctrl-C leaves a checkpoint that can be resumed
 "$gsfix" fix "$scene" --out h --views 3 --iterations 100000 --max-size 48 > stdout 2> stderr &
 pid=$!
 for _ in $(seq 100); do grep -q "step" stderr && break; sleep 0.1; done

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# test_quality.sh GSFIX SCENE SCRATCH: bench/quality.py over two starts, two seeds and a peer, which sees the training photos
-# and the start's points alone; a second call runs nothing again. SCENE: make_scene's.
+# test_quality.sh GSFIX SCENE SCRATCH: bench/quality.py with two starts, two seeds and a peer, which gets only the training
+# photos and the points of the start; a second call repeats no run. SCENE: made by make_scene.
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3
 command -v python3 > /dev/null && [ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no python3, program or scene"; exit 77; }
@@ -13,7 +13,7 @@ fail() { echo "FAILED: $*"; exit 1; }
 "$gsfix" fix "$scene" --out peer --views 3 --iterations 3 --restorer none > log 2>&1 || { cat log; fail "no splats for the peer"; }
 cat > opensplat << 'SH'
 #!/bin/sh
-# opensplat SCENE -n STEPS -o OUT ...: notes what it is given and leaves splats of its own
+# opensplat SCENE -n STEPS -o OUT ...: logs its input and writes prepared splats
 [ "$2" = -n ] && [ "$3" = 4 ] && [ "$4" = -o ] || exit 3
 echo "$(ls "$1/images" | wc -l) $(od -A n -t u8 -N 8 "$1/sparse/0/images.bin") $(od -A n -t u8 -N 8 "$1/sparse/0/points3D.bin")" >> peer.log
 cp peer/splats.ply "$5"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# test_resume.sh GSFIX SCENE SCRATCH [KILLS]: a run that is killed at random moments and resumed, with and without repair
-# for --compare, leaves the same bytes as an undisturbed one; so do one and two workers. Exit status 1 and a line on the first difference.
+# test_resume.sh GSFIX SCENE SCRATCH [KILLS]: a run with --compare that is killed at random moments and resumed writes the same
+# bytes as an uninterrupted one; so do runs with one and two workers. Stops at the first difference with a line and exit 1.
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3 kills=${4:-5}
 [ -x "$gsfix" ] && [ -d "$scene" ] || { echo "SKIPPED: no program or no scene"; exit 77; }
@@ -22,8 +22,8 @@ whole_ms=$(( ($(date +%s%N) - begin) / 1000000 ))
 fix "$scratch/one" --threads 1 || fail "the run with one worker failed"
 cmp "$scratch/whole/splats.ply" "$scratch/one/splats.ply" || fail "one and two workers differ"
 
-# Kills fall anywhere in what a run takes; every second one waits for a file being written, as the temporary one
-# shows (and has mostly been renamed when the kill arrives: the count of those that were not is printed).
+# Kills happen at random times during a run; every second one waits until a temporary file shows that a file is being written
+# (which has usually been renamed when the kill arrives: the number of those that had not is printed).
 done_kills=0 finished_early=0 while_writing=0
 RANDOM=${SEED:-12345}
 while [ "$done_kills" -lt "$kills" ]; do
@@ -38,7 +38,7 @@ while [ "$done_kills" -lt "$kills" ]; do
     kill -9 "$pid" 2> /dev/null || true
     status=0
     wait "$pid" 2> /dev/null || status=$?
-    if [ "$status" = 0 ]; then # it was done before; start over
+    if [ "$status" = 0 ]; then # it finished before the kill; start over
         finished_early=$((finished_early + 1))
         cmp "$scratch/whole/splats.ply" "$scratch/killed/splats.ply" || fail "differs after $done_kills kills"
         rm -rf "$scratch/killed"
@@ -54,12 +54,12 @@ cmp "$scratch/whole/splats.ply" "$scratch/killed/splats.ply" || fail "differs af
 for view in "$scratch/whole/test/"*.png "$scratch/whole/fixed/"*.png "$scratch/whole/report/without/"*.png; do
     cmp "$view" "${view/whole/killed}" || fail "pictures differ after $kills kills"
 done
-figures() { # of metrics.json, without what the clock says
+figures() { # metrics.json without timings
     grep -o '"\(psnr\|ssim\|iteration\|splats\)[a-z_]*":[^,}]*' "$1/metrics.json"
 }
 [ "$(figures "$scratch/whole")" = "$(figures "$scratch/killed")" ] || fail "figures differ after $kills kills"
 
-# A finished run resumes to the same bytes; other switches are refused by name; a broken checkpoint is refused.
+# A finished run resumes with the same bytes; changed options are refused and named; a damaged checkpoint is refused.
 rm "$scratch/killed/splats.ply"
 fix "$scratch/killed" --resume || fail "resuming a finished run failed"
 cmp "$scratch/whole/splats.ply" "$scratch/killed/splats.ply" || fail "differs after resuming a finished run"
