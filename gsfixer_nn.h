@@ -243,6 +243,12 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sincos(gsf_context* ctx, int32_t fr
 // value 0. Angles in float32 as the reference has them. (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
 GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out);
 
+// Private, for tests: shown every named intermediate of a network's pass, (rows, columns) of sample `index`.
+typedef struct gsf__nn_tap {
+    void (*fn)(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns);
+    void* user;
+} gsf__nn_tap;
+
 // ---- image encoders: what the references show -----------------------------------
 // DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
 
@@ -288,9 +294,7 @@ typedef struct gsf_nn_encoder_input {
     const float* pixels;           // (images, 3, height, width) in [0,1]
     int32_t images, height, width; // sides in pixels, multiples of the patch
     int all_tokens;                // the special tokens, too; else those of the patches alone
-    // Shown every named intermediate of image `image`: data (rows, columns). NULL in normal use.
-    void (*tap_fn)(void* user, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
+    const gsf__nn_tap* _tap;       // private
 } gsf_nn_encoder_input;
 
 // The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, and `special`
@@ -383,10 +387,7 @@ typedef struct gsf_nn_caption_desc {
     const gsf_image* image;
     const char* prompt;     // NULL: none
     int32_t max_new_tokens; // 0: as gsf_nn_caption
-    // Shown every intermediate: "pixel_values" (3, pixels), "vision" (tokens, width), "qformer", "projection", "logits" of
-    // the prompt (tokens, words). NULL in normal use.
-    void (*tap_fn)(void* user, const char* name, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
+    const gsf__nn_tap* _tap; // private
 } gsf_nn_caption_desc;
 
 // The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
@@ -448,9 +449,7 @@ GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5);
 typedef struct gsf_nn_t5_input {
     const int32_t* ids;    // (batch, tokens), from gsf_nn_tokenize
     int32_t batch, tokens; // prompts of a batch share each layer's way from disk through the cache
-    // Shown every named intermediate: data (rows, columns) of prompt `row`. NULL in normal use.
-    void (*tap_fn)(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
+    const gsf__nn_tap* _tap; // private
 } gsf_nn_t5_input;
 
 // The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so that of the mapped weights only one
@@ -576,9 +575,7 @@ typedef struct gsf_nn_transformer_input {
     gsf_nn_block_cache* cache;            // NULL: every block runs
     float* reference_kv;                  // gsf_nn_reference_kv_size floats that hold the references' keys and values
     int reference_kv_ready;               // from an earlier call; NULL: computed anew in every call
-    // Shown every named intermediate: data (rows, columns) of batch row `row`. NULL in normal use; costs a copy.
-    void (*tap_fn)(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns);
-    void* tap_user;
+    const gsf__nn_tap* _tap;              // private
 } gsf_nn_transformer_input;
 
 // Predicted velocity: out (batch, frames, out_channels, height, width). A NaN or infinity is reported with the block
@@ -698,9 +695,7 @@ typedef struct gsf_nn_sample_desc {
     double max_bytes;               // refuse before starting what needs more memory (GSF_ERROR_OUT_OF_MEMORY); 0: no limit
     const char* checkpoint;         // file written after every step and resumed from when model, precision, settings and
                                     //   inputs are the same; NULL: none
-    // After every step: the latents and what the network predicted (guided); NULL in normal use.
-    void (*step_fn)(void* user, int32_t step, const float* latents, const float* prediction, int64_t count);
-    void* step_user;
+    const gsf__nn_tap* _tap;        // private
     uint32_t _end_canary;
 } gsf_nn_sample_desc;
 
@@ -5795,92 +5790,277 @@ GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
     }
 }
 
-// ---- >>nn image encoders --------------------------------------------------------
-//
-// DINOv2 with registers (Oquab et al. 2023; Darcet et al. 2023) and the aggregator of VGGT (Wang et al. 2025): a DINOv2
-// embeds each image, then blocks that look within an image take turns with blocks that look at all images together. All
-// are vision transformers of one kind of block, with LayerNorm before attention and MLP. The facts are those of
-// transformers 4.51.3 (modeling_dinov2_with_registers.py) and of VGGT's aggregator.py, block.py, attention.py and rope.py.
+// ---- >>nn layers ----------------------------------------------------------------
+/* What the networks are built of. A network is
+     a struct whose members are gsf__nn_layer, or const gsf_tensor* where a tensor stands alone;
+     a table of gsf__nn_entry: the name, shape and place of each of them. gsf__nn_visit walks it for whoever wants all
+       tensors of a network: gsf__nn_bind opens them, bench/make_model.c makes them up;
+     a gsf__nn_run: what a pass needs beside the layers, from the context to the scratch memory.
+   A forward pass calls gsf__nn_linear, gsf__nn_add, gsf__nn_norm, gsf__nn_attend and the like, and nothing below them.
+   Networks of equal blocks with the norms before the layers have gsf__nn_block in common: DINOv2, VGGT and BLIP-2's vision
+   (>>nn image encoders), OPT (>>nn captioner) and T5 (>>nn t5). */
 
-typedef struct gsf__vit_sizes { // of a block
-    int64_t width, mlp;         // of a token, of the MLP's hidden layer
+typedef struct gsf__nn_layer { // linear: (out, in), (out); a norm: (width), (width). What the network lacks is NULL
+    const gsf_tensor *weight, *bias;
+} gsf__nn_layer;
+
+// ---- layers: tables of tensors
+
+typedef enum gsf__nn_form {
+    GSF__NN_PAIR = 0, // a gsf__nn_layer: NAME.weight of the entry's shape, NAME.bias of its first dimension
+    GSF__NN_BIASED,   // the same, but without a bias where the network lacks the option
+    GSF__NN_WEIGHT,   // NAME.weight alone
+    GSF__NN_TENSOR,   // NAME itself
+} gsf__nn_form;
+
+typedef struct gsf__nn_entry { // a table ends with a name of NULL
+    const char *name, *shape;  // a letter for each dimension: of gsf__nn_sizes, '1': one, '?': any
+    size_t offset;             // of its gsf__nn_layer or const gsf_tensor*
+    gsf__nn_form form;
+    char option;               // a letter whose size is 0 where the network lacks this; 0: none does
+} gsf__nn_entry;
+
+#define GSF__NN_AT(type, member) offsetof(type, member), GSF__NN_PAIR, 0
+#define GSF__NN_END {NULL, NULL, 0, GSF__NN_PAIR, 0}
+
+typedef struct gsf__nn_sizes { // of a network, by letter; ended by letter 0
+    struct { char letter; int64_t size; } of[16];
+} gsf__nn_sizes;
+
+static int64_t gsf__nn_size_of(const gsf__nn_sizes* sizes, char letter) {
+    for (size_t i = 0; sizes->of[i].letter; i++)
+        if (sizes->of[i].letter == letter) return sizes->of[i].size;
+    return letter == '1' ? 1 : -1;
+}
+
+// Told of one tensor after another; *to belongs to the network.
+typedef gsf_result (*gsf__nn_visit_fn)(void* user, const char* name, int32_t rank, const int64_t* shape,
+                                       const gsf_tensor** to);
+
+static gsf_result gsf__nn_visit_entry(const gsf__nn_sizes* sizes, const gsf__nn_entry* e, const char* prefix, void* where,
+                                      gsf__nn_visit_fn fn, void* user) {
+    const int has_option = !e->option || gsf__nn_size_of(sizes, e->option) != 0;
+    const gsf_tensor** to = (const gsf_tensor**)(void*)((char*)where + e->offset);
+    int64_t shape[GSF_NN_MAX_RANK];
+    int32_t rank = 0;
+    char name[200];
+    if (!has_option && e->form != GSF__NN_BIASED) return GSF_OK;
+    for (const char* letter = e->shape; *letter; letter++) shape[rank++] = gsf__nn_size_of(sizes, *letter);
+    snprintf(name, sizeof name, "%s%s%s", prefix, e->name, e->form == GSF__NN_TENSOR ? "" : ".weight");
+    GSF__TRY(fn(user, name, rank, shape, to));
+    if (!has_option || e->form == GSF__NN_WEIGHT || e->form == GSF__NN_TENSOR) return GSF_OK;
+    snprintf(name, sizeof name, "%s%s.bias", prefix, e->name);
+    return fn(user, name, 1, shape, to + 1);
+}
+
+// All tensors of a table below `prefix`, for the struct at `where`.
+static gsf_result gsf__nn_visit(const gsf__nn_sizes* sizes, const gsf__nn_entry* entries, const char* prefix, void* where,
+                                gsf__nn_visit_fn fn, void* user) {
+    for (const gsf__nn_entry* e = entries; e->name; e++)
+        GSF__TRY(gsf__nn_visit_entry(sizes, e, prefix, where, fn, user));
+    return GSF_OK;
+}
+
+static gsf_result gsf__nn_take_visited(void* user, const char* name, int32_t rank, const int64_t* shape,
+                                       const gsf_tensor** to) {
+    return gsf__nn_take((gsf__nn_loader*)user, name, to, rank, shape);
+}
+
+static gsf_result gsf__nn_bind(gsf__nn_loader* loader, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
+                               const char* prefix, void* where) {
+    return gsf__nn_visit(sizes, entries, prefix, where, gsf__nn_take_visited, loader);
+}
+
+// `count` blocks of `size` bytes called NAMES0., NAMES1., ...; *blocks is to be freed, also on error.
+static gsf_result gsf__nn_bind_blocks(gsf__nn_loader* loader, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
+                                      const char* names, int64_t count, size_t size, void** blocks) {
+    char prefix[96];
+    *blocks = gsf_alloc_zeroed(loader->ctx, (size_t)count, size);
+    if (!*blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    for (int64_t i = 0; i < count; i++) {
+        snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
+        GSF__TRY(gsf__nn_bind(loader, sizes, entries, prefix, (char*)*blocks + (size_t)i * size));
+    }
+    return GSF_OK;
+}
+
+// ---- layers: a pass
+
+typedef struct gsf__nn_block_sizes { // of the blocks at work
+    int64_t width, mlp;              // of a token, of the MLP's hidden layer
     int32_t heads, head_dim;
-    float eps, head_eps;        // of the LayerNorms, of those of q and k
+    float eps, head_eps;             // of the norms, of those of q and k
     gsf_nn_activation activation;
-    int qkv_bias, head_norm;    // there is a bias of q, k, v; q and k have LayerNorms over each head
-} gsf__vit_sizes;
+    int qkv_bias, head_norm;         // there is a bias of q, k, v; q and k have LayerNorms over each head
+    int rms, gated;                  // RMSNorm in place of LayerNorm; the MLP's hidden layer has a gate
+} gsf__nn_block_sizes;
 
-typedef struct gsf__vit_block {
-    const gsf_tensor *norm1_weight, *norm1_bias, *norm2_weight, *norm2_bias;
-    const gsf_tensor *qkv_weight, *qkv_bias;                                    // (3 width, width); NULL: these
-    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias;
-    const gsf_tensor *q_norm_weight, *q_norm_bias, *k_norm_weight, *k_norm_bias; // (head_dim) or NULL
-    const gsf_tensor *out_weight, *out_bias, *up_weight, *up_bias, *down_weight, *down_bias;
-    const gsf_tensor *scale1, *scale2;                                          // LayerScale or NULL
-} gsf__vit_block;
+typedef struct gsf__nn_cache { // keys and values of the tokens before
+    int64_t capacity, past;    // tokens; of these in use
+    float *keys, *values;      // (layers, capacity, width)
+    unsigned char* mask;       // (heads, tokens, tokens) for several new tokens: each sees itself and those before
+} gsf__nn_cache;
 
-typedef struct gsf__vit_run { // buffers of a run of blocks
+typedef struct gsf__nn_run {
     gsf_context* ctx;
-    const char* name;              // of the network, for errors and progress
-    const gsf_nn_weights* weights; // where a NaN may come from
-    const gsf__vit_sizes* sizes;
+    const char *name, *stage;          // of the network, for errors; for progress
+    const gsf_nn_weights* weights;     // where a NaN may come from
+    const gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
+    int bf16;                          // see gsf_nn_linear_desc
+    const gsf__nn_tap* tap;
+    char label[48];                    // before the names of a block's intermediates; empty: those are not shown
     gsf_nn_workspace workspace;
-    float* normed;                 // (rows, width)
-    float* wide;                   // (rows, 3 width): q | k | v of each row; hidden rows of the MLP
-    int64_t wide_count;            // floats there
-    float* vectors;                // norm weights and the like of the block at work, widened
-    size_t vectors_used, vectors_size;
-    const float *cos, *sin;        // (positions, head_dim / 4) for positions 1, 2, ...; NULL: no rotation
+    float* vectors;                    // the layer's vectors at work, widened: two of the longest
+    size_t vectors_size;
+    double done, steps;                // progress, in blocks
+    // of networks of gsf__nn_block
+    const gsf__nn_block_sizes* sizes;
+    float* normed;                     // (rows, the larger of width and heads * head_dim)
+    float* wide;                       // (rows, 3 heads * head_dim): q | k | v of each row; hidden rows of the MLP
+    int64_t wide_count;                // floats there
+    const float* bias;                 // (heads, tokens, tokens) of the logits, or NULL
+    float scale;                       // of the logits; 0: 1 / sqrt(head_dim)
+    gsf__nn_cache* cache;              // NULL: none
+    const float *cos, *sin;            // (positions, head_dim / 4) for positions 1, 2, ...; NULL: no rotation
     int64_t image_tokens, special, across; // the rotation's grid: tokens of an image, those without place, of a row
-    double done, steps;            // progress, in blocks
-} gsf__vit_run;
+} gsf__nn_run;
 
-// ---- image encoders: a block
+// Memory that is shared out twice: without `memory` it is only counted.
+typedef struct gsf__nn_arena {
+    float* memory;
+    size_t used; // floats; SIZE_MAX, which no allocator gives: too many to count
+} gsf__nn_arena;
 
-// A small tensor as floats; valid until the next block begins.
-static const float* gsf__vit_vector(gsf__vit_run* run, const gsf_tensor* tensor) {
+static float* gsf__nn_share(gsf__nn_arena* arena, size_t count) {
+    float* part = arena->memory ? arena->memory + arena->used : NULL;
+    arena->used = count > SIZE_MAX - arena->used ? SIZE_MAX : arena->used + count;
+    return part;
+}
+
+static size_t gsf__nn_product(size_t a, size_t b) { return b != 0 && a > SIZE_MAX / b ? SIZE_MAX : a * b; }
+static size_t gsf__nn_larger(size_t a, size_t b) { return a > b ? a : b; }
+
+// Shows the tap `count` samples of (rows, columns), numbered from `first`, under the run's label and a name (printf style).
+GSF_PRINTF(7, 8)
+static void gsf__nn_reveal(const gsf__nn_run* run, const float* data, int64_t first, int64_t count, int64_t rows,
+                           int64_t columns, const char* format, ...) {
+    char name[96];
+    va_list args;
+    if (!run->tap || !data) return;
+    const size_t size = (size_t)snprintf(name, sizeof name, "%s", run->label);
+    va_start(args, format);
+    vsnprintf(name + size, sizeof name - size, format, args);
+    va_end(args);
+    for (int64_t i = 0; i < count; i++)
+        run->tap->fn(run->tap->user, name, (int32_t)(first + i), data + i * rows * columns, rows, columns);
+}
+
+// A value that is not finite is named with the tensor below `prefix` that it comes from, else with the stage.
+static gsf_result gsf__nn_check(const gsf__nn_run* run, const char* stage, const char* prefix, const float* x,
+                                int64_t count) {
+    return gsf__nn_check_finite(run->ctx, run->weights, run->name, prefix, stage, x, count);
+}
+
+// What follows block `index` of those called `names`: check, progress, cancel.
+static gsf_result gsf__nn_end_block(gsf__nn_run* run, const char* names, int64_t index, const float* x, int64_t count) {
+    char prefix[96];
+    snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)index);
+    GSF__TRY(gsf__nn_check(run, prefix, prefix, x, count));
+    gsf__progress(run->ctx, run->stage, ++run->done, run->steps);
+    return gsf__check_cancel(run->ctx);
+}
+
+// ---- layers: forward
+
+typedef struct gsf__nn_vectors { const float *weight, *bias; } gsf__nn_vectors;
+
+// A small tensor as floats, which last until another layer's vectors are widened; NULL: NULL.
+static const float* gsf__nn_widen(gsf__nn_run* run, const gsf_tensor* tensor, size_t at) {
     if (!tensor) return NULL;
-    float* out = run->vectors + run->vectors_used;
-    GSF_ASSERT(run->vectors_used + (size_t)tensor->count <= run->vectors_size);
-    run->vectors_used += (size_t)tensor->count;
-    gsf_nn_read_tensor(tensor, 0, tensor->count, out);
-    return out;
+    GSF_ASSERT(at + (size_t)tensor->count <= run->vectors_size);
+    gsf_nn_read_tensor(tensor, 0, tensor->count, run->vectors + at);
+    return run->vectors + at;
+}
+
+static gsf__nn_vectors gsf__nn_widen_layer(gsf__nn_run* run, const gsf__nn_layer* layer) {
+    gsf__nn_vectors v;
+    v.weight = gsf__nn_widen(run, layer->weight, 0);
+    v.bias = gsf__nn_widen(run, layer->bias, layer->bias ? (size_t)layer->bias->count : 0);
+    return v;
+}
+
+// The one place where a network's linear layer is computed, in whatever precision.
+static gsf_result gsf__nn_apply(gsf__nn_run* run, const gsf__nn_layer* layer, gsf_nn_linear_desc* d) {
+    const gsf_nn_quantized* q = run->quantized ? run->quantized + (layer->weight - run->weights->tensors) : NULL;
+    d->weight = layer->weight;
+    d->bias = layer->bias;
+    d->bf16 = run->bf16;
+    return q && q->data ? gsf_nn_linear_int8(run->ctx, &run->workspace, d, q)
+                        : gsf_nn_linear(run->ctx, &run->workspace, d);
 }
 
 // y (rows of ldy, 0: dense) = activation(x w^T + b)
-static gsf_result gsf__vit_linear(gsf__vit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
-                                  const gsf_tensor* bias, gsf_nn_activation activation, float* y, int64_t ldy) {
+static gsf_result gsf__nn_linear(gsf__nn_run* run, const gsf__nn_layer* layer, gsf_nn_activation activation, const float* x,
+                                 int64_t rows, float* y, int64_t ldy) {
     gsf_nn_linear_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.rows = rows;
-    d.weight = weight;
-    d.bias = bias;
     d.activation = activation;
     d.y = y;
     d.ldy = ldy;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+    return gsf__nn_apply(run, layer, &d);
 }
 
 // y += gate * (x w^T + b), or without a gate.
-static gsf_result gsf__vit_add(gsf__vit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
-                               const gsf_tensor* bias, const float* gate, float* y) {
+static gsf_result gsf__nn_add(gsf__nn_run* run, const gsf__nn_layer* layer, const float* gate, const float* x, int64_t rows,
+                              float* y) {
     gsf_nn_linear_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.rows = rows;
-    d.weight = weight;
-    d.bias = bias;
     d.gate = gate;
     d.accumulate = 1;
     d.y = y;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
+    return gsf__nn_apply(run, layer, &d);
 }
 
-// Pairs (x[i], x[i + count]) turned by the angles of cos and sin (count).
-typedef void (*gsf__vit_turn_fn)(float* x, int64_t count, const float* cos, const float* sin);
+// LayerNorm of (rows, the layer's width); y may be x.
+static void gsf__nn_norm(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, const float* x, int64_t rows, float* y) {
+    const gsf__nn_vectors v = gsf__nn_widen_layer(run, layer);
+    gsf_nn_layer_norm(run->ctx, x, rows, layer->weight->count, v.weight, v.bias, eps, y);
+}
 
-static void gsf__vit_turn_scalar(float* x, int64_t count, const float* cos, const float* sin) {
+// LayerNorm of each head of q or k where the network has one, then the rotation: see gsf_nn_head_norm_rope.
+static void gsf__nn_norm_heads(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, int32_t heads, int32_t head_dim,
+                               const float* cosine, const float* sine, int64_t rope_first, float* x, int64_t rows,
+                               int64_t ldx) {
+    if (!layer->weight) return;
+    const gsf__nn_vectors v = gsf__nn_widen_layer(run, layer);
+    gsf_nn_head_norm_rope(run->ctx, x, rows, ldx, heads, head_dim, v.weight, v.bias, eps, cosine, sine, rope_first);
+}
+
+// Attention within each of `samples` samples, which follow each other in q, k, v and out.
+static gsf_result gsf__nn_attend(gsf__nn_run* run, const gsf_nn_attention_desc* desc, int64_t samples) {
+    gsf_nn_attention_desc d = *desc;
+    const int64_t width = (int64_t)d.heads * d.head_dim;
+    d.bf16 = run->bf16;
+    for (int64_t i = 0; i < samples; i++) {
+        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &d));
+        d.q += d.queries * (d.ldq ? d.ldq : width);
+        d.k += d.keys * (d.ldk ? d.ldk : width);
+        d.v += d.keys * (d.ldv ? d.ldv : width);
+        d.out += d.queries * (d.ldo ? d.ldo : width);
+    }
+    return GSF_OK;
+}
+
+// ---- layers: rotation by row and column
+
+// Pairs (x[i], x[i + count]) turned by the angles of cos and sin (count).
+typedef void (*gsf__nn_turn_fn)(float* x, int64_t count, const float* cos, const float* sin);
+
+static void gsf__nn_turn_scalar(float* x, int64_t count, const float* cos, const float* sin) {
     for (int64_t i = 0; i < count; i++) {
         const float a = x[i], b = x[i + count];
         x[i] = a * cos[i] - b * sin[i];
@@ -5889,7 +6069,7 @@ static void gsf__vit_turn_scalar(float* x, int64_t count, const float* cos, cons
 }
 
 #if GSF__X86
-GSF__TARGET_AVX2 static void gsf__vit_turn_avx2(float* x, int64_t count, const float* cos, const float* sin) {
+GSF__TARGET_AVX2 static void gsf__nn_turn_avx2(float* x, int64_t count, const float* cos, const float* sin) {
     int64_t i = 0;
     for (; i + 8 <= count; i += 8) {
         const __m256 a = _mm256_loadu_ps(x + i), b = _mm256_loadu_ps(x + i + count);
@@ -5906,30 +6086,30 @@ GSF__TARGET_AVX2 static void gsf__vit_turn_avx2(float* x, int64_t count, const f
 }
 #endif
 
-static gsf__vit_turn_fn gsf__vit_turn_of(gsf_cpu_level level) {
+static gsf__nn_turn_fn gsf__nn_turn_of(gsf_cpu_level level) {
 #if GSF__X86
-    if (level >= GSF_CPU_AVX2) return gsf__vit_turn_avx2;
+    if (level >= GSF_CPU_AVX2) return gsf__nn_turn_avx2;
 #endif
     (void)level;
-    return gsf__vit_turn_scalar;
+    return gsf__nn_turn_scalar;
 }
 
-enum { GSF__VIT_TURN_ROWS = 32 }; // in a chunk
+enum { GSF__NN_TURN_ROWS = 32 }; // in a chunk
 
-typedef struct gsf__vit_turn_job {
-    const gsf__vit_run* run;
-    gsf__vit_turn_fn turn;
+typedef struct gsf__nn_turn_job {
+    const gsf__nn_run* run;
+    gsf__nn_turn_fn turn;
     float* x;       // q | k in rows of `stride`
     int64_t rows, stride;
-} gsf__vit_turn_job;
+} gsf__nn_turn_job;
 
 // The first half of every head turns with the row of the patch, counted from 1, the second half with its column. Tokens
 // without a place stand at 0, where nothing turns.
-static void gsf__vit_turn_chunk(void* arg, size_t chunk, int worker) {
-    const gsf__vit_turn_job* job = (const gsf__vit_turn_job*)arg;
-    const gsf__vit_run* run = job->run;
+static void gsf__nn_turn_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__nn_turn_job* job = (const gsf__nn_turn_job*)arg;
+    const gsf__nn_run* run = job->run;
     const int64_t dim = run->sizes->head_dim, quarter = dim / 4, heads = 2 * (int64_t)run->sizes->heads; // of q and k
-    const int64_t begin = (int64_t)chunk * GSF__VIT_TURN_ROWS, end = gsf__least(begin + GSF__VIT_TURN_ROWS, job->rows);
+    const int64_t begin = (int64_t)chunk * GSF__NN_TURN_ROWS, end = gsf__least(begin + GSF__NN_TURN_ROWS, job->rows);
     (void)worker;
     for (int64_t r = begin; r < end; r++) {
         const int64_t at = r % run->image_tokens - run->special;
@@ -5943,106 +6123,254 @@ static void gsf__vit_turn_chunk(void* arg, size_t chunk, int worker) {
     }
 }
 
-// q, k and v of (rows, width) side by side in run->wide, q and k normed and turned.
-static gsf_result gsf__vit_project(gsf__vit_run* run, const gsf__vit_block* b, const float* x, int64_t rows) {
-    const gsf__vit_sizes* s = run->sizes;
-    const int64_t d = s->width, ld = 3 * d;
-    if (b->qkv_weight) {
-        GSF__TRY(gsf__vit_linear(run, x, rows, b->qkv_weight, b->qkv_bias, GSF_NN_LINEAR, run->wide, ld));
+// ---- layers: blocks
+
+typedef struct gsf__nn_block { // x += scale1 * out(attention(norm1(x))); x += scale2 * down(hidden(norm2(x)))
+    gsf__nn_layer norm1, norm2, qkv, q, k, v; // qkv (3 heads * head_dim, width), or three of their own
+    gsf__nn_layer q_norm, k_norm;             // (head_dim)
+    gsf__nn_layer out, gate, up, down;        // hidden: activation(up(x)), or activation(gate(x)) * up(x)
+    const gsf_tensor *scale1, *scale2;        // LayerScale or NULL
+} gsf__nn_block;
+
+static void gsf__nn_norm_block(gsf__nn_run* run, const gsf__nn_layer* norm, const float* x, int64_t rows) {
+    const gsf__nn_block_sizes* s = run->sizes;
+    if (s->rms) gsf_nn_rms_norm(run->ctx, x, rows, s->width, gsf__nn_widen(run, norm->weight, 0), s->eps, run->normed);
+    else gsf__nn_norm(run, norm, s->eps, x, rows, run->normed);
+}
+
+// q, k and v of run->normed side by side in run->wide, q and k normed and turned.
+static gsf_result gsf__nn_project_block(gsf__nn_run* run, const gsf__nn_block* b, int64_t rows) {
+    const gsf__nn_block_sizes* s = run->sizes;
+    const int64_t inner = (int64_t)s->heads * s->head_dim, ld = 3 * inner;
+    float* q = run->wide;
+    if (b->qkv.weight) {
+        GSF__TRY(gsf__nn_linear(run, &b->qkv, GSF_NN_LINEAR, run->normed, rows, q, ld));
     } else {
-        GSF__TRY(gsf__vit_linear(run, x, rows, b->q_weight, b->q_bias, GSF_NN_LINEAR, run->wide, ld));
-        GSF__TRY(gsf__vit_linear(run, x, rows, b->k_weight, b->k_bias, GSF_NN_LINEAR, run->wide + d, ld));
-        GSF__TRY(gsf__vit_linear(run, x, rows, b->v_weight, b->v_bias, GSF_NN_LINEAR, run->wide + 2 * d, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->q, GSF_NN_LINEAR, run->normed, rows, q, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->k, GSF_NN_LINEAR, run->normed, rows, q + inner, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->v, GSF_NN_LINEAR, run->normed, rows, q + 2 * inner, ld));
     }
-    if (b->q_norm_weight)
-        gsf_nn_head_norm_rope(run->ctx, run->wide, rows, ld, s->heads, s->head_dim, gsf__vit_vector(run, b->q_norm_weight),
-                              gsf__vit_vector(run, b->q_norm_bias), s->head_eps, NULL, NULL, 0);
-    if (b->k_norm_weight)
-        gsf_nn_head_norm_rope(run->ctx, run->wide + d, rows, ld, s->heads, s->head_dim,
-                              gsf__vit_vector(run, b->k_norm_weight), gsf__vit_vector(run, b->k_norm_bias), s->head_eps,
-                              NULL, NULL, 0);
+    gsf__nn_norm_heads(run, &b->q_norm, s->head_eps, s->heads, s->head_dim, NULL, NULL, 0, q, rows, ld);
+    gsf__nn_norm_heads(run, &b->k_norm, s->head_eps, s->heads, s->head_dim, NULL, NULL, 0, q + inner, rows, ld);
     if (!run->cos) return GSF_OK;
-    gsf__vit_turn_job job = {run, gsf__vit_turn_of(run->ctx->cpu_level), run->wide, rows, ld};
-    gsf__parallel_for(run->ctx, gsf__nn_chunks(rows, GSF__VIT_TURN_ROWS), gsf__vit_turn_chunk, &job);
+    gsf__nn_turn_job job = {run, gsf__nn_turn_of(run->ctx->cpu_level), q, rows, ld};
+    gsf__parallel_for(run->ctx, gsf__nn_chunks(rows, GSF__NN_TURN_ROWS), gsf__nn_turn_chunk, &job);
     return GSF_OK;
 }
 
-// x += scale * down(activation(up(normed))), in runs of rows whose hidden layer fits run->wide.
-static gsf_result gsf__vit_feed_forward(gsf__vit_run* run, const gsf__vit_block* b, const float* scale, float* x,
-                                        int64_t rows) {
-    const gsf__vit_sizes* s = run->sizes;
-    const int64_t runs = gsf__ceil_div(rows, run->wide_count / s->mlp), most = gsf__ceil_div(rows, runs);
+// The new tokens' keys and values go behind those of layer `index` in the cache, which are what they look at.
+static void gsf__nn_look_back(gsf__nn_run* run, int64_t index, int64_t rows, gsf_nn_attention_desc* a) {
+    const gsf__nn_cache* cache = run->cache;
+    const int64_t inner = (int64_t)a->heads * a->head_dim, first = index * cache->capacity * inner;
+    for (int64_t r = 0; r < rows; r++) {
+        const int64_t to = first + (cache->past + r) * inner;
+        memcpy(cache->keys + to, a->k + r * a->ldk, (size_t)inner * sizeof(float));
+        memcpy(cache->values + to, a->v + r * a->ldv, (size_t)inner * sizeof(float));
+    }
+    a->keys = cache->past + rows;
+    a->k = cache->keys + first;
+    a->v = cache->values + first;
+    a->ldk = a->ldv = inner;
+    a->mask = rows > 1 ? cache->mask : NULL;
+}
+
+typedef struct gsf__nn_product_job {
+    float* a;
+    const float* b;
+    int64_t count;
+} gsf__nn_product_job;
+
+static void gsf__nn_multiply_chunk(void* arg, size_t chunk, int worker) { // a *= b
+    const gsf__nn_product_job* job = (const gsf__nn_product_job*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
+    (void)worker;
+    for (int64_t i = begin; i < end; i++) job->a[i] *= job->b[i];
+}
+
+// x += scale * down(hidden(run->normed)), in runs of rows whose hidden layer fits run->wide.
+static gsf_result gsf__nn_feed_forward(gsf__nn_run* run, const gsf__nn_block* b, const float* scale, float* x,
+                                       int64_t rows) {
+    const gsf__nn_block_sizes* s = run->sizes;
+    const int64_t runs = gsf__ceil_div(rows, run->wide_count / (s->mlp * (1 + s->gated))), most = gsf__ceil_div(rows, runs);
     for (int64_t r = 0; r < rows; r += most) {
         const int64_t n = gsf__least(rows - r, most);
         const float* from = run->normed + r * s->width;
-        GSF__TRY(gsf__vit_linear(run, from, n, b->up_weight, b->up_bias, s->activation, run->wide, 0));
-        GSF__TRY(gsf__vit_add(run, run->wide, n, b->down_weight, b->down_bias, scale, x + r * s->width));
+        GSF__TRY(gsf__nn_linear(run, s->gated ? &b->gate : &b->up, s->activation, from, n, run->wide, 0));
+        if (s->gated) {
+            gsf__nn_product_job job = {run->wide, run->wide + n * s->mlp, n * s->mlp};
+            GSF__TRY(gsf__nn_linear(run, &b->up, GSF_NN_LINEAR, from, n, run->wide + n * s->mlp, 0));
+            gsf__parallel_for(run->ctx, gsf__nn_chunks(job.count, GSF__NN_CHUNK), gsf__nn_multiply_chunk, &job);
+        }
+        GSF__TRY(gsf__nn_add(run, &b->down, scale, run->wide, n, x + r * s->width));
     }
     return GSF_OK;
 }
 
-// One block on x (samples, tokens, width), in place; tokens of a sample see each other.
-static gsf_result gsf__vit_block_forward(gsf__vit_run* run, const gsf__vit_block* b, float* x, int64_t samples,
-                                         int64_t tokens) {
-    const gsf__vit_sizes* s = run->sizes;
-    const int64_t d = s->width, rows = samples * tokens;
-    run->vectors_used = 0;
-    gsf_nn_layer_norm(run->ctx, x, rows, d, gsf__vit_vector(run, b->norm1_weight), gsf__vit_vector(run, b->norm1_bias),
-                      s->eps, run->normed);
-    GSF__TRY(gsf__vit_project(run, b, run->normed, rows));
+// Block `index` of a network on x (samples, tokens, width), in place; tokens of a sample see each other.
+static gsf_result gsf__nn_block_forward(gsf__nn_run* run, const gsf__nn_block* b, int64_t index, float* x, int64_t samples,
+                                        int64_t tokens) {
+    const gsf__nn_block_sizes* s = run->sizes;
+    const int64_t inner = (int64_t)s->heads * s->head_dim, rows = samples * tokens;
     gsf_nn_attention_desc a;
+    gsf__nn_norm_block(run, &b->norm1, x, rows);
+    if (run->label[0]) gsf__nn_reveal(run, run->normed, 0, samples, tokens, s->width, "attn_norm");
+    GSF__TRY(gsf__nn_project_block(run, b, rows));
     memset(&a, 0, sizeof a);
     a.queries = a.keys = tokens;
     a.heads = s->heads;
     a.head_dim = s->head_dim;
-    a.ldq = a.ldk = a.ldv = 3 * d;
-    for (int64_t i = 0; i < samples; i++) {
-        a.q = run->wide + i * tokens * 3 * d;
-        a.k = a.q + d;
-        a.v = a.k + d;
-        a.out = run->normed + i * tokens * d;
-        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &a));
-    }
-    GSF__TRY(gsf__vit_add(run, run->normed, rows, b->out_weight, b->out_bias, gsf__vit_vector(run, b->scale1), x));
+    a.q = run->wide;
+    a.k = a.q + inner;
+    a.v = a.k + inner;
+    a.ldq = a.ldk = a.ldv = 3 * inner;
+    a.bias = run->bias;
+    a.scale = run->scale;
+    a.out = run->normed;
+    if (run->cache) gsf__nn_look_back(run, index, rows, &a);
+    GSF__TRY(gsf__nn_attend(run, &a, samples));
+    GSF__TRY(gsf__nn_add(run, &b->out, gsf__nn_widen(run, b->scale1, 0), run->normed, rows, x));
+    if (run->label[0]) gsf__nn_reveal(run, x, 0, samples, tokens, s->width, "after_attn");
     GSF__TRY(gsf__check_cancel(run->ctx));
-    gsf_nn_layer_norm(run->ctx, x, rows, d, gsf__vit_vector(run, b->norm2_weight), gsf__vit_vector(run, b->norm2_bias),
-                      s->eps, run->normed);
-    return gsf__vit_feed_forward(run, b, gsf__vit_vector(run, b->scale2), x, rows);
+    gsf__nn_norm_block(run, &b->norm2, x, rows);
+    return gsf__nn_feed_forward(run, b, gsf__nn_widen(run, b->scale2, 0), x, rows);
 }
 
-static gsf_result gsf__vit_check(gsf__vit_run* run, const char* prefix, const float* x, int64_t count) {
-    return gsf__nn_check_finite(run->ctx, run->weights, run->name, prefix, prefix, x, count);
+// Blocks of a vision transformer under the names that files have for them: sizes d width, m MLP, t 3 width, h head_dim,
+// b 0 without biases of q, k, v, n 0 without norms of q and k.
+#define GSF__NN_BLOCK(member) GSF__NN_AT(gsf__nn_block, member)
+#define GSF__NN_BLOCK_AS(member, form, option) offsetof(gsf__nn_block, member), form, option
+
+static gsf__nn_sizes gsf__nn_sizes_of_block(const gsf__nn_block_sizes* s) {
+    const int64_t inner = (int64_t)s->heads * s->head_dim;
+    const gsf__nn_sizes sizes = {{{'d', s->width}, {'m', s->mlp}, {'i', inner}, {'t', 3 * inner}, {'h', s->head_dim},
+                                  {'b', s->qkv_bias}, {'n', s->head_norm}}};
+    return sizes;
 }
 
-// Block `index` of those called `names` and what follows it: check, cancel, progress.
-static gsf_result gsf__vit_step(gsf__vit_run* run, const gsf__vit_block* blocks, const char* names, int64_t index, float* x,
-                                int64_t samples, int64_t tokens) {
-    char prefix[96];
-    GSF__TRY(gsf__vit_block_forward(run, &blocks[index], x, samples, tokens));
-    snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)index);
-    GSF__TRY(gsf__vit_check(run, prefix, x, samples * tokens * run->sizes->width));
-    gsf__progress(run->ctx, run->name, ++run->done, run->steps);
-    return gsf__check_cancel(run->ctx);
+// Floats that run->wide needs for `rows` rows, of which those of the MLP may come in runs of `most`.
+static size_t gsf__nn_wide(const gsf__nn_block_sizes* s, int64_t rows, int64_t most) {
+    const size_t inner = (size_t)s->heads * (size_t)s->head_dim;
+    const size_t hidden = gsf__nn_product((size_t)gsf__least(rows, most), (size_t)(s->mlp * (1 + s->gated)));
+    return gsf__nn_larger(hidden, gsf__nn_product(3 * (size_t)rows, inner));
 }
 
-static void gsf__vit_tap(const gsf_nn_encoder_input* in, const char* names, int64_t index, int64_t image, const float* data,
-                         int64_t rows, int64_t columns) {
-    char name[64];
-    if (!in->tap_fn) return;
-    if (index < 0) snprintf(name, sizeof name, "%s", names);
-    else snprintf(name, sizeof name, "%s%lld", names, (long long)index);
-    in->tap_fn(in->tap_user, name, (int32_t)image, data, rows, columns);
+static double gsf__nn_block_flops(const gsf__nn_block_sizes* s, double samples, double tokens) {
+    const double inner = (double)s->heads * s->head_dim, rows = samples * tokens;
+    return 2.0 * rows * (double)s->width * (4.0 * inner + (2.0 + s->gated) * (double)s->mlp) +
+           4.0 * rows * tokens * inner;
 }
+// ---- >>nn image encoders --------------------------------------------------------
+//
+// DINOv2 with registers (Oquab et al. 2023; Darcet et al. 2023) and the aggregator of VGGT (Wang et al. 2025): a DINOv2
+// embeds each image, then blocks that look within an image take turns with blocks that look at all images together. All
+// are vision transformers of gsf__nn_block. The facts are those of transformers 4.51.3
+// (modeling_dinov2_with_registers.py) and of VGGT's aggregator.py, block.py, attention.py and rope.py.
 
-// ---- image encoders: from pixels to tokens, a DINOv2
-
-typedef struct gsf__vit {
-    gsf__vit_sizes sizes;
+typedef struct gsf__vit { // from pixels to tokens: a DINOv2
+    gsf__nn_block_sizes sizes;
     int64_t channels, patch, registers, grid, layers;
     const char *block_names, *prefix; // of its tensors; of those before and after the blocks
-    const gsf_tensor *class_token, *register_tokens, *positions, *patch_weight, *patch_bias, *norm_weight, *norm_bias;
-    gsf__vit_block* blocks;
+    const gsf_tensor *class_token, *register_tokens, *positions;
+    gsf__nn_layer patches, norm;
+    gsf__nn_block* blocks;
 } gsf__vit;
+
+typedef struct gsf__vggt {
+    gsf__vit embed;
+    gsf__nn_block_sizes sizes; // of the blocks
+    int64_t registers, layers;
+    double rope_base;          // 0: no rotation
+    gsf__nn_block *frame, *global; // (layers)
+    const gsf_tensor *camera_token, *register_token; // (1, 2, count, width): of the first image, of all others
+} gsf__vggt;
+
+// ---- image encoders: tables of tensors
+
+// Sizes beside those of a block: c channels, p patch, r registers, s positions.
+#define GSF__VIT_COMMON                                 \
+    {"norm1", "d", GSF__NN_BLOCK(norm1)},               \
+    {"norm2", "d", GSF__NN_BLOCK(norm2)},               \
+    {"mlp.fc1", "md", GSF__NN_BLOCK(up)},               \
+    {"mlp.fc2", "dm", GSF__NN_BLOCK(down)}
+
+static const gsf__nn_entry gsf__dinov2_block_entries[] = { // below encoder.layer.N.
+    GSF__VIT_COMMON,
+    {"attention.attention.query", "dd", GSF__NN_BLOCK_AS(q, GSF__NN_BIASED, 'b')},
+    {"attention.attention.key", "dd", GSF__NN_BLOCK_AS(k, GSF__NN_BIASED, 'b')},
+    {"attention.attention.value", "dd", GSF__NN_BLOCK_AS(v, GSF__NN_BIASED, 'b')},
+    {"attention.output.dense", "dd", GSF__NN_BLOCK(out)},
+    {"layer_scale1.lambda1", "d", GSF__NN_BLOCK_AS(scale1, GSF__NN_TENSOR, 0)},
+    {"layer_scale2.lambda1", "d", GSF__NN_BLOCK_AS(scale2, GSF__NN_TENSOR, 0)},
+    GSF__NN_END,
+};
+
+static const gsf__nn_entry gsf__vggt_block_entries[] = { // below aggregator.patch_embed.blocks.N. and the like
+    GSF__VIT_COMMON,
+    {"attn.qkv", "td", GSF__NN_BLOCK_AS(qkv, GSF__NN_BIASED, 'b')},
+    {"attn.q_norm", "h", GSF__NN_BLOCK_AS(q_norm, GSF__NN_PAIR, 'n')},
+    {"attn.k_norm", "h", GSF__NN_BLOCK_AS(k_norm, GSF__NN_PAIR, 'n')},
+    {"attn.proj", "dd", GSF__NN_BLOCK(out)},
+    {"ls1.gamma", "d", GSF__NN_BLOCK_AS(scale1, GSF__NN_TENSOR, 0)},
+    {"ls2.gamma", "d", GSF__NN_BLOCK_AS(scale2, GSF__NN_TENSOR, 0)},
+    GSF__NN_END,
+};
+#undef GSF__VIT_COMMON
+
+#define GSF__VIT_TENSOR(member) offsetof(gsf__vit, member), GSF__NN_TENSOR, 0
+static const gsf__nn_entry gsf__dinov2_entries[] = {
+    {"embeddings.cls_token", "11d", GSF__VIT_TENSOR(class_token)},
+    {"embeddings.register_tokens", "1rd", GSF__VIT_TENSOR(register_tokens)},
+    {"embeddings.position_embeddings", "1sd", GSF__VIT_TENSOR(positions)},
+    {"embeddings.patch_embeddings.projection", "dcpp", GSF__NN_AT(gsf__vit, patches)},
+    {"layernorm", "d", GSF__NN_AT(gsf__vit, norm)},
+    GSF__NN_END,
+};
+
+static const gsf__nn_entry gsf__vggt_embed_entries[] = {
+    {"aggregator.patch_embed.cls_token", "11d", GSF__VIT_TENSOR(class_token)},
+    {"aggregator.patch_embed.register_tokens", "1rd", GSF__VIT_TENSOR(register_tokens)},
+    {"aggregator.patch_embed.pos_embed", "1sd", GSF__VIT_TENSOR(positions)},
+    {"aggregator.patch_embed.patch_embed.proj", "dcpp", GSF__NN_AT(gsf__vit, patches)},
+    {"aggregator.patch_embed.norm", "d", GSF__NN_AT(gsf__vit, norm)},
+    GSF__NN_END,
+};
+
+static const gsf__nn_entry gsf__vggt_entries[] = {
+    {"aggregator.camera_token", "121d", offsetof(gsf__vggt, camera_token), GSF__NN_TENSOR, 0},
+    {"aggregator.register_token", "12rd", offsetof(gsf__vggt, register_token), GSF__NN_TENSOR, 0},
+    GSF__NN_END,
+};
+
+static gsf__nn_sizes gsf__vit_sizes(const gsf__vit* vit) {
+    const gsf__nn_sizes sizes = {{{'d', vit->sizes.width}, {'c', vit->channels}, {'p', vit->patch}, {'r', vit->registers},
+                                  {'s', vit->grid * vit->grid + 1}}};
+    return sizes;
+}
+
+static gsf__nn_sizes gsf__vggt_sizes(const gsf__vggt* net) {
+    const gsf__nn_sizes sizes = {{{'d', net->sizes.width}, {'r', net->registers}, {'2', 2}}};
+    return sizes;
+}
+
+// `count` blocks called names0, names1, ...; *out is to be freed, also on error.
+static gsf_result gsf__vit_bind_blocks(gsf__nn_loader* loader, const gsf__nn_block_sizes* s, const gsf__nn_entry* entries,
+                                       const char* names, int64_t count, gsf__nn_block** out) {
+    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(s);
+    void* blocks;
+    const gsf_result result = gsf__nn_bind_blocks(loader, &sizes, entries, names, count, sizeof **out, &blocks);
+    *out = (gsf__nn_block*)blocks;
+    return result;
+}
+
+// A vision transformer: what is below `prefix`, and its blocks.
+static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* entries, const gsf__nn_entry* block_entries,
+                                const char* prefix, gsf__vit* vit) {
+    const gsf__nn_sizes sizes = gsf__vit_sizes(vit);
+    GSF__TRY(gsf__nn_bind(loader, &sizes, entries, prefix, vit));
+    return gsf__vit_bind_blocks(loader, &vit->sizes, block_entries, vit->block_names, vit->layers, &vit->blocks);
+}
+
+// ---- image encoders: from pixels to tokens
 
 typedef struct gsf__vit_patch_job {
     const float* pixels; // (channels, height, width)
@@ -6087,9 +6415,10 @@ static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int6
 static const float gsf__imagenet_mean[3] = {0.485f, 0.456f, 0.406f}, gsf__imagenet_deviation[3] = {0.229f, 0.224f, 0.225f};
 
 // Tokens of image `image` before the blocks: class, registers, patches.
-static gsf_result gsf__vit_embed(gsf__vit_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t image,
+static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t image,
                                  int normalize, const float* positions, float* x) {
     const int64_t d = vit->sizes.width, p = vit->patch, down = in->height / p, across = in->width / p;
+    const int64_t tokens = 1 + vit->registers + down * across;
     float* patches = x + (1 + vit->registers) * d;
     gsf__vit_patch_job job;
     job.pixels = in->pixels + image * vit->channels * in->height * in->width;
@@ -6105,13 +6434,13 @@ static gsf_result gsf__vit_embed(gsf__vit_run* run, const gsf__vit* vit, const g
     for (int64_t i = 0; i < d; i++) x[i] += positions[i];
     gsf_nn_read_tensor(vit->register_tokens, 0, vit->registers * d, x + d);
     memcpy(patches, positions + d, (size_t)(down * across * d) * sizeof(float));
-    GSF__TRY(gsf__vit_add(run, run->wide, down * across, vit->patch_weight, vit->patch_bias, NULL, patches));
-    gsf__vit_tap(in, "embeddings", -1, image, x, 1 + vit->registers + down * across, d);
-    return gsf__vit_check(run, vit->prefix, x, (1 + vit->registers + down * across) * d);
+    GSF__TRY(gsf__nn_add(run, &vit->patches, NULL, run->wide, down * across, patches));
+    gsf__nn_reveal(run, x, image, 1, tokens, d, "embeddings");
+    return gsf__nn_check(run, vit->prefix, vit->prefix, x, tokens * d);
 }
 
 // Images first ... through embedding and blocks: x (count, tokens, width), before the last norm.
-static gsf_result gsf__vit_forward(gsf__vit_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t first,
+static gsf_result gsf__vit_forward(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t first,
                                    int64_t count, int normalize, const float* positions, float* x) {
     const int64_t d = vit->sizes.width;
     const int64_t tokens = 1 + vit->registers + in->height / vit->patch * (in->width / vit->patch);
@@ -6119,11 +6448,10 @@ static gsf_result gsf__vit_forward(gsf__vit_run* run, const gsf__vit* vit, const
     for (int64_t i = 0; i < count; i++)
         GSF__TRY(gsf__vit_embed(run, vit, in, first + i, normalize, positions, x + i * tokens * d));
     for (int64_t layer = 0; layer < vit->layers; layer++) {
-        GSF__TRY(gsf__vit_step(run, vit->blocks, vit->block_names, layer, x, count, tokens));
-        for (int64_t i = 0; i < count; i++)
-            gsf__vit_tap(in, "layer", layer, first + i, x + i * tokens * d, tokens, d);
+        GSF__TRY(gsf__nn_block_forward(run, &vit->blocks[layer], layer, x, count, tokens));
+        GSF__TRY(gsf__nn_end_block(run, vit->block_names, layer, x, count * tokens * d));
+        gsf__nn_reveal(run, x, first, count, tokens, d, "layer%lld", (long long)layer);
     }
-    run->vectors_used = 0; // what follows may use them
     return GSF_OK;
 }
 
@@ -6131,60 +6459,67 @@ static gsf_result gsf__vit_forward(gsf__vit_run* run, const gsf__vit* vit, const
 
 enum { GSF__VIT_GROUP_ROWS = 4096, GSF__VIT_MLP_ROWS = 2048 }; // tokens of images that go together; hidden rows held
 
-typedef struct gsf__vit_plan { // in floats, but for counts
-    int64_t patches, tokens;   // of an image; tokens of the embedding DINOv2
-    int64_t group;             // images that it takes together
-    size_t x, normed, wide, vectors, positions, stream, rotation; // stream: the aggregator's
-    size_t square;             // held only while positions are interpolated
+typedef struct gsf__vit_plan {
+    int64_t patches, tokens, group;        // of an image; of one in the DINOv2; images that go through it together
+    float *positions, *x, *stream, *turns; // stream, turns: the aggregator's tokens and its rotation
+    size_t turn_count;                     // cosines, and as many sines
+    size_t floats, square;                 // all of them; held only while positions are interpolated
 } gsf__vit_plan;
 
-// Products of sizes; a run that would overflow gets SIZE_MAX, which no allocator gives.
-static size_t gsf__vit_product(size_t a, size_t b) { return b != 0 && a > SIZE_MAX / b ? SIZE_MAX : a * b; }
-static size_t gsf__vit_larger(size_t a, size_t b) { return a > b ? a : b; }
-
-static size_t gsf__vit_wide(const gsf__vit_sizes* s, int64_t rows) {
-    const size_t hidden = gsf__vit_product((size_t)gsf__least(rows, GSF__VIT_MLP_ROWS), (size_t)s->mlp);
-    return gsf__vit_larger(hidden, gsf__vit_product(3 * (size_t)rows, (size_t)s->width));
-}
-
-static gsf__vit_plan gsf__vit_plan_of(const gsf__vit* vit, const gsf_nn_encoder_input* in) {
+// Shares out `memory`, or counts what a run will take. net: the aggregator around the DINOv2, or NULL.
+static gsf__vit_plan gsf__vit_lay_out(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
+                                      const gsf_nn_encoder_input* in, float* memory) {
+    const size_t d = (size_t)vit->sizes.width, longer = (size_t)(in->height > in->width ? in->height : in->width);
+    gsf__nn_arena arena = {memory, 0};
     gsf__vit_plan p;
     memset(&p, 0, sizeof p);
-    const size_t d = (size_t)vit->sizes.width;
     p.patches = in->height / vit->patch * (in->width / vit->patch);
     p.tokens = 1 + vit->registers + p.patches;
     p.group = gsf__least(in->images, p.tokens < GSF__VIT_GROUP_ROWS ? GSF__VIT_GROUP_ROWS / p.tokens : 1);
-    p.x = p.normed = gsf__vit_product((size_t)(p.group * p.tokens), d);
-    p.wide = gsf__vit_larger(gsf__vit_wide(&vit->sizes, p.group * p.tokens),
-                             (size_t)p.patches * (size_t)(vit->channels * vit->patch * vit->patch));
-    p.vectors = 6 * d + 4 * (size_t)vit->sizes.head_dim;
-    p.positions = gsf__vit_product((size_t)p.patches + 1, d);
-    p.square = in->height / vit->patch == vit->grid && in->width / vit->patch == vit->grid
-                   ? 0
-                   : (size_t)(vit->grid * (vit->grid + in->width / vit->patch)) * d;
+    const int64_t rows = p.group * p.tokens, rows2 = net ? in->images * (1 + net->registers + p.patches) : 0;
+    const size_t x = gsf__nn_product((size_t)rows, d), stream = gsf__nn_product((size_t)rows2, d);
+    size_t wide = gsf__nn_larger(gsf__nn_wide(&vit->sizes, rows, GSF__VIT_MLP_ROWS),
+                                 (size_t)p.patches * (size_t)(vit->channels * vit->patch * vit->patch));
+    if (net) wide = gsf__nn_larger(wide, gsf__nn_wide(&net->sizes, rows2, GSF__VIT_MLP_ROWS));
+    if (net && net->rope_base > 0.0) p.turn_count = longer / (size_t)vit->patch * (size_t)(net->sizes.head_dim / 4);
+    if (in->height / vit->patch != vit->grid || in->width / vit->patch != vit->grid)
+        p.square = (size_t)(vit->grid * (vit->grid + in->width / vit->patch)) * d;
+    run->vectors_size = 2 * d;
+    run->wide_count = (int64_t)wide;
+    p.positions = gsf__nn_share(&arena, gsf__nn_product((size_t)p.patches + 1, d));
+    p.x = gsf__nn_share(&arena, x);
+    run->normed = gsf__nn_share(&arena, gsf__nn_larger(x, stream));
+    run->wide = gsf__nn_share(&arena, wide);
+    run->vectors = gsf__nn_share(&arena, run->vectors_size);
+    p.stream = gsf__nn_share(&arena, stream);
+    p.turns = gsf__nn_share(&arena, 2 * p.turn_count);
+    p.floats = arena.used;
     return p;
 }
 
-static size_t gsf__vit_total(const gsf__vit_plan* p) { // SIZE_MAX: too many to count
-    const size_t parts[] = {p->x, p->normed, p->wide, p->vectors, p->positions, p->stream, p->rotation};
-    size_t total = 0;
-    for (size_t i = 0; i < GSF__COUNT(parts); i++) total = parts[i] > SIZE_MAX - total ? SIZE_MAX : total + parts[i];
-    return total;
+// Memory for a run, shared out; *memory is to be freed. The positions are in it already.
+static gsf_result gsf__vit_open_run(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
+                                    const gsf_nn_encoder_input* in, gsf__vit_plan* plan, float** memory) {
+    *memory = (float*)gsf_alloc(run->ctx, gsf__vit_lay_out(run, vit, net, in, NULL).floats, sizeof(float));
+    if (!*memory) return GSF_ERROR_OUT_OF_MEMORY;
+    *plan = gsf__vit_lay_out(run, vit, net, in, *memory);
+    GSF__TRY(gsf__vit_positions(run->ctx, vit, in->height / vit->patch, in->width / vit->patch, plan->positions));
+    gsf__nn_reveal(run, plan->positions, 0, 1, plan->patches + 1, vit->sizes.width, "positions");
+    return GSF_OK;
 }
 
-static double gsf__vit_bytes(const gsf__vit_plan* p) {
-    return 4.0 * ((double)gsf__vit_total(p) + (double)p->square);
+static double gsf__vit_bytes(const gsf__vit* vit, const gsf__vggt* net, const gsf_nn_encoder_input* in) {
+    gsf__nn_run run;
+    memset(&run, 0, sizeof run);
+    const gsf__vit_plan p = gsf__vit_lay_out(&run, vit, net, in, NULL);
+    return 4.0 * ((double)p.floats + (double)p.square);
 }
 
-static double gsf__vit_block_flops(const gsf__vit_sizes* s, double samples, double tokens) {
-    const double d = (double)s->width, rows = samples * tokens;
-    return 2.0 * rows * d * (4.0 * d + 2.0 * (double)s->mlp) + 4.0 * samples * tokens * tokens * d;
-}
-
-static double gsf__vit_flops(const gsf__vit* vit, const gsf__vit_plan* p, double images) {
+static double gsf__vit_flops(const gsf__vit* vit, const gsf_nn_encoder_input* in) {
+    const double patches = (double)(in->height / vit->patch * (in->width / vit->patch));
     const double patch = (double)(vit->channels * vit->patch * vit->patch) * (double)vit->sizes.width;
-    return images * ((double)vit->layers * gsf__vit_block_flops(&vit->sizes, 1.0, (double)p->tokens) +
-                     2.0 * (double)p->patches * patch);
+    const double tokens = 1.0 + (double)vit->registers + patches;
+    return in->images * ((double)vit->layers * gsf__nn_block_flops(&vit->sizes, 1.0, tokens) + 2.0 * patches * patch);
 }
 
 static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64_t channels, int64_t patch,
@@ -6201,141 +6536,6 @@ static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64
     if (at >= 0)
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: value %lld of %lld of the images is %g", name, (long long)at,
                         (long long)count, (double)in->pixels[at]);
-    return GSF_OK;
-}
-
-// Memory for a run, shared out; *memory is to be freed. The positions are in it already.
-static gsf_result gsf__vit_open_run(gsf_context* ctx, const gsf__vit* vit, const gsf_nn_encoder_input* in,
-                                    const gsf__vit_plan* p, gsf__vit_run* run, float** memory) {
-    const size_t total = gsf__vit_total(p);
-    *memory = (float*)gsf_alloc(ctx, total, sizeof(float));
-    if (!*memory) return GSF_ERROR_OUT_OF_MEMORY;
-    run->ctx = ctx;
-    run->normed = *memory + p->positions + p->x;
-    run->wide = run->normed + p->normed;
-    run->wide_count = (int64_t)p->wide;
-    run->vectors = run->wide + p->wide;
-    run->vectors_size = p->vectors;
-    GSF__TRY(gsf__vit_positions(ctx, vit, in->height / vit->patch, in->width / vit->patch, *memory));
-    gsf__vit_tap(in, "positions", -1, 0, *memory, p->patches + 1, vit->sizes.width);
-    return GSF_OK;
-}
-
-// ---- image encoders: opening, which tensor goes where
-
-// Shapes as letters: d width, m MLP, t 3 width, h head_dim, c channels, p patch, r registers,
-// n positions, 1 one.
-typedef struct gsf__vit_entry {
-    const char *name, *shape;
-    size_t offset; // of the pointer in its struct
-    int kind;
-} gsf__vit_entry;
-
-enum { GSF__VIT_ALWAYS = 0, GSF__VIT_QKV_BIAS, GSF__VIT_HEAD_NORM };
-
-#define GSF__VIT_AT(member) offsetof(gsf__vit_block, member)
-#define GSF__VIT_COMMON                                                                 \
-    {"norm1.weight", "d", GSF__VIT_AT(norm1_weight), GSF__VIT_ALWAYS},                  \
-    {"norm1.bias", "d", GSF__VIT_AT(norm1_bias), GSF__VIT_ALWAYS},                      \
-    {"norm2.weight", "d", GSF__VIT_AT(norm2_weight), GSF__VIT_ALWAYS},                  \
-    {"norm2.bias", "d", GSF__VIT_AT(norm2_bias), GSF__VIT_ALWAYS},                      \
-    {"mlp.fc1.weight", "md", GSF__VIT_AT(up_weight), GSF__VIT_ALWAYS},                  \
-    {"mlp.fc1.bias", "m", GSF__VIT_AT(up_bias), GSF__VIT_ALWAYS},                       \
-    {"mlp.fc2.weight", "dm", GSF__VIT_AT(down_weight), GSF__VIT_ALWAYS},                \
-    {"mlp.fc2.bias", "d", GSF__VIT_AT(down_bias), GSF__VIT_ALWAYS}
-
-static const gsf__vit_entry gsf__dinov2_block_entries[] = { // below encoder.layer.N.
-    GSF__VIT_COMMON,
-    {"attention.attention.query.weight", "dd", GSF__VIT_AT(q_weight), GSF__VIT_ALWAYS},
-    {"attention.attention.query.bias", "d", GSF__VIT_AT(q_bias), GSF__VIT_QKV_BIAS},
-    {"attention.attention.key.weight", "dd", GSF__VIT_AT(k_weight), GSF__VIT_ALWAYS},
-    {"attention.attention.key.bias", "d", GSF__VIT_AT(k_bias), GSF__VIT_QKV_BIAS},
-    {"attention.attention.value.weight", "dd", GSF__VIT_AT(v_weight), GSF__VIT_ALWAYS},
-    {"attention.attention.value.bias", "d", GSF__VIT_AT(v_bias), GSF__VIT_QKV_BIAS},
-    {"attention.output.dense.weight", "dd", GSF__VIT_AT(out_weight), GSF__VIT_ALWAYS},
-    {"attention.output.dense.bias", "d", GSF__VIT_AT(out_bias), GSF__VIT_ALWAYS},
-    {"layer_scale1.lambda1", "d", GSF__VIT_AT(scale1), GSF__VIT_ALWAYS},
-    {"layer_scale2.lambda1", "d", GSF__VIT_AT(scale2), GSF__VIT_ALWAYS},
-};
-
-static const gsf__vit_entry gsf__vggt_block_entries[] = { // below aggregator.patch_embed.blocks.N. and the like
-    GSF__VIT_COMMON,
-    {"attn.qkv.weight", "td", GSF__VIT_AT(qkv_weight), GSF__VIT_ALWAYS},
-    {"attn.qkv.bias", "t", GSF__VIT_AT(qkv_bias), GSF__VIT_QKV_BIAS},
-    {"attn.q_norm.weight", "h", GSF__VIT_AT(q_norm_weight), GSF__VIT_HEAD_NORM},
-    {"attn.q_norm.bias", "h", GSF__VIT_AT(q_norm_bias), GSF__VIT_HEAD_NORM},
-    {"attn.k_norm.weight", "h", GSF__VIT_AT(k_norm_weight), GSF__VIT_HEAD_NORM},
-    {"attn.k_norm.bias", "h", GSF__VIT_AT(k_norm_bias), GSF__VIT_HEAD_NORM},
-    {"attn.proj.weight", "dd", GSF__VIT_AT(out_weight), GSF__VIT_ALWAYS},
-    {"attn.proj.bias", "d", GSF__VIT_AT(out_bias), GSF__VIT_ALWAYS},
-    {"ls1.gamma", "d", GSF__VIT_AT(scale1), GSF__VIT_ALWAYS},
-    {"ls2.gamma", "d", GSF__VIT_AT(scale2), GSF__VIT_ALWAYS},
-};
-#undef GSF__VIT_COMMON
-#undef GSF__VIT_AT
-
-#define GSF__VIT_AT(member) offsetof(gsf__vit, member), GSF__VIT_ALWAYS
-static const gsf__vit_entry gsf__dinov2_entries[] = {
-    {"embeddings.cls_token", "11d", GSF__VIT_AT(class_token)},
-    {"embeddings.register_tokens", "1rd", GSF__VIT_AT(register_tokens)},
-    {"embeddings.position_embeddings", "1nd", GSF__VIT_AT(positions)},
-    {"embeddings.patch_embeddings.projection.weight", "dcpp", GSF__VIT_AT(patch_weight)},
-    {"embeddings.patch_embeddings.projection.bias", "d", GSF__VIT_AT(patch_bias)},
-    {"layernorm.weight", "d", GSF__VIT_AT(norm_weight)},
-    {"layernorm.bias", "d", GSF__VIT_AT(norm_bias)},
-};
-
-static const gsf__vit_entry gsf__vggt_entries[] = {
-    {"aggregator.patch_embed.cls_token", "11d", GSF__VIT_AT(class_token)},
-    {"aggregator.patch_embed.register_tokens", "1rd", GSF__VIT_AT(register_tokens)},
-    {"aggregator.patch_embed.pos_embed", "1nd", GSF__VIT_AT(positions)},
-    {"aggregator.patch_embed.patch_embed.proj.weight", "dcpp", GSF__VIT_AT(patch_weight)},
-    {"aggregator.patch_embed.patch_embed.proj.bias", "d", GSF__VIT_AT(patch_bias)},
-    {"aggregator.patch_embed.norm.weight", "d", GSF__VIT_AT(norm_weight)},
-    {"aggregator.patch_embed.norm.bias", "d", GSF__VIT_AT(norm_bias)},
-};
-#undef GSF__VIT_AT
-
-// `vit` may be NULL for entries of blocks.
-static int64_t gsf__vit_dimension(const gsf__vit_sizes* s, const gsf__vit* vit, char letter) {
-    switch (letter) {
-        case 'd': return s->width;
-        case 'm': return s->mlp;
-        case 't': return 3 * s->width;
-        case 'h': return s->head_dim;
-        case '1': return 1;
-        default: break;
-    }
-    if (!vit) return -1;
-    return letter == 'c' ? vit->channels : letter == 'p' ? vit->patch : letter == 'r' ? vit->registers
-                                                                                     : vit->grid * vit->grid + 1;
-}
-
-static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__vit_sizes* s, const gsf__vit* vit,
-                                const gsf__vit_entry* entries, size_t count, const char* prefix, void* where) {
-    for (size_t i = 0; i < count; i++) {
-        const gsf__vit_entry* e = &entries[i];
-        if ((e->kind == GSF__VIT_QKV_BIAS && !s->qkv_bias) || (e->kind == GSF__VIT_HEAD_NORM && !s->head_norm)) continue;
-        int64_t shape[GSF_NN_MAX_RANK];
-        int rank = 0;
-        for (const char* c = e->shape; *c; c++) shape[rank++] = gsf__vit_dimension(s, vit, *c);
-        const gsf_tensor* tensor;
-        GSF__TRY(gsf__nn_need(loader, &tensor, rank, shape, "%s%s", prefix, e->name));
-        memcpy((char*)where + e->offset, &tensor, sizeof tensor);
-    }
-    return GSF_OK;
-}
-
-// `count` blocks called names0, names1, ...; *out is to be freed, also on error.
-static gsf_result gsf__vit_bind_blocks(gsf__nn_loader* loader, const gsf__vit_sizes* s, const gsf__vit_entry* entries,
-                                       size_t entry_count, const char* names, int64_t count, gsf__vit_block** out) {
-    *out = (gsf__vit_block*)gsf_alloc_zeroed(loader->ctx, (size_t)count, sizeof(gsf__vit_block));
-    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
-    for (int64_t i = 0; i < count; i++) {
-        char prefix[96];
-        snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
-        GSF__TRY(gsf__vit_bind(loader, s, NULL, entries, entry_count, prefix, &(*out)[i]));
-    }
     return GSF_OK;
 }
 
@@ -6372,11 +6572,7 @@ static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, gsf__vit* 
 static gsf_result gsf__dinov2_bind(gsf_context* ctx, gsf_nn_dinov2* out, gsf__vit* vit) {
     gsf__nn_loader loader;
     GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    gsf_result result = gsf__vit_bind(&loader, &vit->sizes, vit, gsf__dinov2_entries, GSF__COUNT(gsf__dinov2_entries), "",
-                                      vit);
-    if (!result)
-        result = gsf__vit_bind_blocks(&loader, &vit->sizes, gsf__dinov2_block_entries,
-                                      GSF__COUNT(gsf__dinov2_block_entries), vit->block_names, vit->layers, &vit->blocks);
+    const gsf_result result = gsf__vit_bind(&loader, gsf__dinov2_entries, gsf__dinov2_block_entries, "", vit);
     gsf__nn_ignore(&loader, "embeddings.mask_token"); // for training
     return gsf__nn_end_loading(&loader, result);
 }
@@ -6416,61 +6612,29 @@ GSF_API gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_
 GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
                                 double* flops) {
     const gsf__vit* vit = (const gsf__vit*)dinov2->nets;
-    const gsf__vit_plan plan = gsf__vit_plan_of(vit, input);
-    if (bytes) *bytes = gsf__vit_bytes(&plan);
-    if (flops) *flops = gsf__vit_flops(vit, &plan, (double)input->images);
+    if (bytes) *bytes = gsf__vit_bytes(vit, NULL, input);
+    if (flops) *flops = gsf__vit_flops(vit, input);
 }
 
-static gsf_result gsf__dinov2_run(gsf__vit_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in,
-                                  const gsf__vit_plan* plan, const float* memory, float* x, float* out) {
+static gsf_result gsf__dinov2_run(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in,
+                                  const gsf__vit_plan* plan, float* out) {
     const int64_t d = vit->sizes.width, skip = in->all_tokens ? 0 : vit->registers + 1, kept = plan->tokens - skip;
     run->steps = (double)(gsf__ceil_div(in->images, plan->group) * vit->layers);
     for (int64_t first = 0; first < in->images; first += plan->group) {
         const int64_t count = gsf__least(in->images - first, plan->group);
-        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 0, memory, x));
-        const float *weight = gsf__vit_vector(run, vit->norm_weight), *bias = gsf__vit_vector(run, vit->norm_bias);
+        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 0, plan->positions, plan->x));
         for (int64_t i = 0; i < count; i++) {
-            const float* tokens = x + i * plan->tokens * d;
-            gsf_nn_layer_norm(run->ctx, tokens + skip * d, kept, d, weight, bias, vit->sizes.eps,
-                              out + (first + i) * kept * d);
-            if (!in->tap_fn) continue;
-            gsf_nn_layer_norm(run->ctx, tokens, plan->tokens, d, weight, bias, vit->sizes.eps, run->normed);
-            gsf__vit_tap(in, "last_hidden_state", -1, first + i, run->normed, plan->tokens, d);
+            const float* tokens = plan->x + i * plan->tokens * d;
+            gsf__nn_norm(run, &vit->norm, vit->sizes.eps, tokens + skip * d, kept, out + (first + i) * kept * d);
+            if (!run->tap) continue;
+            gsf__nn_norm(run, &vit->norm, vit->sizes.eps, tokens, plan->tokens, run->normed);
+            gsf__nn_reveal(run, run->normed, first + i, 1, plan->tokens, d, "last_hidden_state");
         }
     }
-    return gsf__vit_check(run, "layernorm.", out, in->images * kept * d);
-}
-
-GSF_API gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input,
-                                        float* out) {
-    const gsf__vit* vit = (const gsf__vit*)dinov2->nets;
-    gsf__vit_run run;
-    float* memory = NULL;
-    memset(&run, 0, sizeof run);
-    GSF__TRY(gsf__vit_check_input(ctx, "dinov2", vit->channels, vit->patch, input, out));
-    const gsf__vit_plan plan = gsf__vit_plan_of(vit, input);
-    run.name = "dinov2";
-    run.weights = &dinov2->weights;
-    gsf_result result = gsf__vit_open_run(ctx, vit, input, &plan, &run, &memory);
-    if (!result) result = gsf__dinov2_run(&run, vit, input, &plan, memory, memory + plan.positions, out);
-    if (result) {
-        const int64_t kept = plan.tokens - (input->all_tokens ? 0 : vit->registers + 1);
-        memset(out, 0, (size_t)(input->images * kept * vit->sizes.width) * sizeof(float));
-    }
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
-    gsf_free(ctx, memory);
-    return result;
+    return gsf__nn_check(run, "layernorm.", "layernorm.", out, in->images * kept * d);
 }
 
 // ---- image encoders: VGGT's aggregator
-
-typedef struct gsf__vggt {
-    gsf__vit embed;
-    gsf__vit_sizes sizes; // of the blocks
-    int64_t registers, layers;
-    gsf__vit_block *frame, *global; // (layers)
-    const gsf_tensor *camera_token, *register_token; // (1, 2, count, width): of the first image, of all others
-} gsf__vggt;
 
 static const char gsf__vggt_frame_names[] = "aggregator.frame_blocks.";
 static const char gsf__vggt_global_names[] = "aggregator.global_blocks.";
@@ -6528,9 +6692,9 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
 }
 
 // What config.json tells; where it is silent, the sizes of the tensors stand.
-static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* net, double* rope_base) {
+static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* net) {
     gsf__vit* vit = &net->embed;
-    gsf__vit_sizes* s = &net->sizes;
+    gsf__nn_block_sizes* s = &net->sizes;
     int64_t image = vit->grid * vit->patch, count = 0;
     double ratio;
     const gsf__nn_key keys[] = {
@@ -6541,7 +6705,7 @@ static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* n
         GSF__KEY_INT_OR("num_register_tokens", net->registers, (double)net->registers, 0, 1 << 16),
         GSF__KEY_INT_OR("num_heads", s->heads, (double)s->heads, 1, 1 << 16),
         GSF__KEY_REAL_OR("mlp_ratio", ratio, 0.0, 0.0, 1024.0),
-        GSF__KEY_REAL_OR("rope_freq", *rope_base, *rope_base, -1e9, 1e9),
+        GSF__KEY_REAL_OR("rope_freq", net->rope_base, net->rope_base, -1e9, 1e9),
         GSF__KEY_FLAG_OR("qk_norm", s->head_norm, (double)s->head_norm)};
     int64_t given;
     GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
@@ -6562,7 +6726,7 @@ static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* n
     return GSF_OK;
 }
 
-static gsf_result gsf__vggt_check_sizes(gsf_context* ctx, const gsf_nn_weights* w, gsf__vggt* net, double rope_base) {
+static gsf_result gsf__vggt_check_sizes(gsf_context* ctx, const gsf_nn_weights* w, gsf__vggt* net) {
     const gsf__vit* vit = &net->embed;
     const int32_t heads = net->sizes.heads;
     const struct { const char* what; int64_t value, low, high; } sizes[] = {
@@ -6575,7 +6739,7 @@ static gsf_result gsf__vggt_check_sizes(gsf_context* ctx, const gsf_nn_weights* 
         if (sizes[i].value < sizes[i].low || sizes[i].value > sizes[i].high)
             return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: a %s of %lld", w->name, sizes[i].what,
                             (long long)sizes[i].value);
-    if (heads < 1 || net->sizes.width % heads || (rope_base > 0.0 && net->sizes.width / heads % 4))
+    if (heads < 1 || net->sizes.width % heads || (net->rope_base > 0.0 && net->sizes.width / heads % 4))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %d heads of a width of %lld", w->name, (int)heads,
                         (long long)net->sizes.width);
     net->sizes.head_dim = (int32_t)(net->sizes.width / heads);
@@ -6585,16 +6749,12 @@ static gsf_result gsf__vggt_check_sizes(gsf_context* ctx, const gsf_nn_weights* 
 }
 
 static gsf_result gsf__vggt_bind(gsf__nn_loader* loader, gsf__vggt* net) {
-    gsf__vit* vit = &net->embed;
-    const gsf__vit_entry* entries = gsf__vggt_block_entries;
-    const size_t count = GSF__COUNT(gsf__vggt_block_entries);
-    const int64_t camera[4] = {1, 2, 1, net->sizes.width}, registers[4] = {1, 2, net->registers, net->sizes.width};
-    GSF__TRY(gsf__vit_bind(loader, &vit->sizes, vit, gsf__vggt_entries, GSF__COUNT(gsf__vggt_entries), "", vit));
-    GSF__TRY(gsf__vit_bind_blocks(loader, &vit->sizes, entries, count, vit->block_names, vit->layers, &vit->blocks));
-    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, count, gsf__vggt_frame_names, net->layers, &net->frame));
-    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, count, gsf__vggt_global_names, net->layers, &net->global));
-    GSF__TRY(gsf__nn_need(loader, &net->camera_token, 4, camera, "aggregator.camera_token"));
-    return gsf__nn_need(loader, &net->register_token, 4, registers, "aggregator.register_token");
+    const gsf__nn_entry* entries = gsf__vggt_block_entries;
+    const gsf__nn_sizes sizes = gsf__vggt_sizes(net);
+    GSF__TRY(gsf__vit_bind(loader, gsf__vggt_embed_entries, entries, "", &net->embed));
+    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, gsf__vggt_frame_names, net->layers, &net->frame));
+    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, gsf__vggt_global_names, net->layers, &net->global));
+    return gsf__nn_bind(loader, &sizes, gsf__vggt_entries, "", net);
 }
 
 static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt* out, gsf__vggt* net) {
@@ -6606,13 +6766,13 @@ static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt
         if (strncmp(out->weights.tensors[i].name, "aggregator.", 11) != 0) loader.taken[i] = 1;
     gsf__nn_ignore(&loader, "aggregator.patch_embed.mask_token"); // for training
     gsf_result result = gsf__vggt_read_shapes(&loader, net);
-    out->rope_base = 100.0;
+    net->rope_base = 100.0;
     if (!result && !gsf__nn_ends_in(path, ".safetensors")) {
         result = gsf__nn_open_config(ctx, path, "config.json", 1, &file);
-        if (!result) result = gsf__vggt_read_config(&file, net, &out->rope_base);
+        if (!result) result = gsf__vggt_read_config(&file, net);
         gsf__nn_close_config(&file);
     }
-    if (!result) result = gsf__vggt_check_sizes(ctx, &out->weights, net, out->rope_base);
+    if (!result) result = gsf__vggt_check_sizes(ctx, &out->weights, net);
     if (!result) result = gsf__vggt_bind(&loader, net);
     return gsf__nn_end_loading(&loader, result);
 }
@@ -6643,32 +6803,20 @@ GSF_API gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_v
     out->embed_layers = (int32_t)net->embed.layers;
     out->special = (int32_t)net->registers + 1;
     out->grid = (int32_t)net->embed.grid;
+    out->rope_base = net->rope_base;
     if (result) gsf_nn_destroy_vggt(ctx, out);
     return result;
 }
 
-static gsf__vit_plan gsf__vggt_plan(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* in) {
-    const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
-    const size_t d = (size_t)net->sizes.width;
-    gsf__vit_plan p = gsf__vit_plan_of(&net->embed, in);
-    const int64_t rows = in->images * (1 + net->registers + p.patches);
-    const int64_t longer = in->height > in->width ? in->height : in->width;
-    p.stream = gsf__vit_product((size_t)rows, d);
-    p.normed = gsf__vit_larger(p.normed, p.stream);
-    p.wide = gsf__vit_larger(p.wide, gsf__vit_wide(&net->sizes, rows));
-    p.rotation = vggt->rope_base > 0.0 ? 2 * (size_t)(longer / net->embed.patch) * (size_t)(net->sizes.head_dim / 4) : 0;
-    return p;
-}
-
 GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops) {
     const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
-    const gsf__vit_plan plan = gsf__vggt_plan(vggt, input);
-    const double images = (double)input->images, tokens = (double)(1 + net->registers + plan.patches);
-    if (bytes) *bytes = gsf__vit_bytes(&plan);
+    const int64_t patch = net->embed.patch, patches = input->height / patch * (input->width / patch);
+    const double images = (double)input->images, tokens = (double)(1 + net->registers + patches);
+    if (bytes) *bytes = gsf__vit_bytes(&net->embed, net, input);
     if (!flops) return;
-    *flops = gsf__vit_flops(&net->embed, &plan, images) +
-             (double)net->layers * (gsf__vit_block_flops(&net->sizes, images, tokens) +
-                                    gsf__vit_block_flops(&net->sizes, 1.0, images * tokens));
+    *flops = gsf__vit_flops(&net->embed, input) +
+             (double)net->layers * (gsf__nn_block_flops(&net->sizes, images, tokens) +
+                                    gsf__nn_block_flops(&net->sizes, 1.0, images * tokens));
 }
 
 // Angles position * base^(-i / count) of positions 1, 2, ...: cos, sin (positions, count).
@@ -6682,25 +6830,24 @@ static void gsf__vggt_make_rotation(double base, int64_t positions, int64_t coun
 }
 
 // The stream (images, tokens, width): camera token, registers and the embedded patches of each image.
-static gsf_result gsf__vggt_embed(gsf__vit_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
-                                  const gsf__vit_plan* plan, const float* positions, float* x, float* stream) {
+static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
+                                  const gsf__vit_plan* plan) {
     const gsf__vit* vit = &net->embed;
     const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches;
     for (int64_t first = 0; first < in->images; first += plan->group) {
         const int64_t count = gsf__least(in->images - first, plan->group);
-        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 1, positions, x));
-        const float *weight = gsf__vit_vector(run, vit->norm_weight), *bias = gsf__vit_vector(run, vit->norm_bias);
+        GSF__TRY(gsf__vit_forward(run, vit, in, first, count, 1, plan->positions, plan->x));
         for (int64_t i = 0; i < count; i++) {
-            float* to = stream + (first + i) * tokens * d;
+            const float* patches = plan->x + (i * plan->tokens + 1 + vit->registers) * d;
+            float* to = plan->stream + (first + i) * tokens * d;
             const int64_t other = first + i > 0;
             gsf_nn_read_tensor(net->camera_token, other * d, d, to);
             gsf_nn_read_tensor(net->register_token, other * net->registers * d, net->registers * d, to + d);
-            gsf_nn_layer_norm(run->ctx, x + (i * plan->tokens + 1 + vit->registers) * d, plan->patches, d, weight, bias,
-                              vit->sizes.eps, to + special * d);
-            gsf__vit_tap(in, "patch_tokens", -1, first + i, to + special * d, plan->patches, d);
+            gsf__nn_norm(run, &vit->norm, vit->sizes.eps, patches, plan->patches, to + special * d);
+            gsf__nn_reveal(run, to + special * d, first + i, 1, plan->patches, d, "patch_tokens");
         }
     }
-    return gsf__vit_check(run, "aggregator.", stream, in->images * tokens * d);
+    return gsf__nn_check(run, "aggregator.", "aggregator.", plan->stream, in->images * tokens * d);
 }
 
 // One half of the output: rows of the stream to every other `width` floats.
@@ -6712,53 +6859,69 @@ static void gsf__vggt_store(const gsf__vit_plan* plan, const float* stream, int6
             memcpy(out, stream + (i * tokens + t) * d, (size_t)d * sizeof(float));
 }
 
-static gsf_result gsf__vggt_run(gsf__vit_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
-                                const gsf__vit_plan* plan, float* memory, double rope_base, float* out) {
-    const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches;
-    const int64_t skip = in->all_tokens ? 0 : special, down = in->height / net->embed.patch;
-    float *x = memory + plan->positions, *stream = run->vectors + plan->vectors, *rotation = stream + plan->stream;
-    run->steps = (double)(gsf__ceil_div(in->images, plan->group) * net->embed.layers + 2 * net->layers);
-    GSF__TRY(gsf__vggt_embed(run, net, in, plan, memory, x, stream));
+static gsf_result gsf__vggt_run(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
+                                const gsf__vit_plan* plan, float* out) {
+    const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches, n = in->images;
+    const int64_t skip = in->all_tokens ? 0 : special, quarter = net->sizes.head_dim / 4;
+    float* x = plan->stream;
+    run->steps = (double)(gsf__ceil_div(n, plan->group) * net->embed.layers + 2 * net->layers);
+    GSF__TRY(gsf__vggt_embed(run, net, in, plan));
     run->sizes = &net->sizes;
     run->image_tokens = tokens;
     run->special = special;
     run->across = in->width / net->embed.patch;
-    if (plan->rotation) {
-        const int64_t longer = down > run->across ? down : run->across;
-        run->cos = rotation;
-        run->sin = rotation + plan->rotation / 2;
-        gsf__vggt_make_rotation(rope_base, longer, net->sizes.head_dim / 4, rotation, rotation + plan->rotation / 2);
+    if (plan->turn_count) {
+        float* sine = plan->turns + plan->turn_count;
+        gsf__vggt_make_rotation(net->rope_base, (int64_t)plan->turn_count / quarter, quarter, plan->turns, sine);
+        run->cos = plan->turns;
+        run->sin = sine;
     }
     for (int64_t layer = 0; layer < net->layers; layer++) {
-        GSF__TRY(gsf__vit_step(run, net->frame, gsf__vggt_frame_names, layer, stream, in->images, tokens));
-        for (int64_t i = 0; i < in->images; i++) gsf__vit_tap(in, "frame", layer, i, stream + i * tokens * d, tokens, d);
-        if (layer + 1 == net->layers) gsf__vggt_store(plan, stream, in->images, special, skip, d, out);
-        GSF__TRY(gsf__vit_step(run, net->global, gsf__vggt_global_names, layer, stream, 1, in->images * tokens));
-        for (int64_t i = 0; i < in->images; i++) gsf__vit_tap(in, "global", layer, i, stream + i * tokens * d, tokens, d);
+        GSF__TRY(gsf__nn_block_forward(run, &net->frame[layer], layer, x, n, tokens));
+        GSF__TRY(gsf__nn_end_block(run, gsf__vggt_frame_names, layer, x, n * tokens * d));
+        gsf__nn_reveal(run, x, 0, n, tokens, d, "frame%lld", (long long)layer);
+        if (layer + 1 == net->layers) gsf__vggt_store(plan, x, n, special, skip, d, out);
+        GSF__TRY(gsf__nn_block_forward(run, &net->global[layer], layer, x, 1, n * tokens));
+        GSF__TRY(gsf__nn_end_block(run, gsf__vggt_global_names, layer, x, n * tokens * d));
+        gsf__nn_reveal(run, x, 0, n, tokens, d, "global%lld", (long long)layer);
     }
-    gsf__vggt_store(plan, stream, in->images, special, skip, d, out + d);
+    gsf__vggt_store(plan, x, n, special, skip, d, out + d);
     return GSF_OK;
+}
+
+// Both encoders; net NULL: the DINOv2 alone.
+static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_nn_weights* weights, const gsf__vit* vit,
+                                  const gsf__vggt* net, const gsf_nn_encoder_input* in, float* out) {
+    gsf__nn_run run;
+    gsf__vit_plan plan;
+    float* memory = NULL;
+    memset(&run, 0, sizeof run);
+    GSF__TRY(gsf__vit_check_input(ctx, name, vit->channels, vit->patch, in, out));
+    run.ctx = ctx;
+    run.name = run.stage = name;
+    run.weights = weights;
+    run.tap = in->_tap;
+    gsf_result result = gsf__vit_open_run(&run, vit, net, in, &plan, &memory);
+    if (!result) result = net ? gsf__vggt_run(&run, net, in, &plan, out) : gsf__dinov2_run(&run, vit, in, &plan, out);
+    if (result) {
+        const int64_t special = !in->all_tokens ? 0 : 1 + (net ? net->registers : vit->registers);
+        const int64_t kept = special + in->height / vit->patch * (in->width / vit->patch);
+        memset(out, 0, (size_t)(in->images * kept * vit->sizes.width * (net ? 2 : 1)) * sizeof(float));
+    }
+    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_free(ctx, memory);
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input,
+                                        float* out) {
+    return gsf__vit_encode(ctx, "dinov2", &dinov2->weights, (const gsf__vit*)dinov2->nets, NULL, input, out);
 }
 
 GSF_API gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input,
                                       float* out) {
     const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
-    gsf__vit_run run;
-    float* memory = NULL;
-    memset(&run, 0, sizeof run);
-    GSF__TRY(gsf__vit_check_input(ctx, "vggt", net->embed.channels, net->embed.patch, input, out));
-    const gsf__vit_plan plan = gsf__vggt_plan(vggt, input);
-    run.name = "vggt";
-    run.weights = &vggt->weights;
-    gsf_result result = gsf__vit_open_run(ctx, &net->embed, input, &plan, &run, &memory);
-    if (!result) result = gsf__vggt_run(&run, net, input, &plan, memory, vggt->rope_base, out);
-    if (result) {
-        const int64_t kept = plan.patches + (input->all_tokens ? 1 + net->registers : 0);
-        memset(out, 0, (size_t)(input->images * kept * 2 * net->sizes.width) * sizeof(float));
-    }
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
-    gsf_free(ctx, memory);
-    return result;
+    return gsf__vit_encode(ctx, "vggt", &vggt->weights, &net->embed, net, input, out);
 }
 
 // ---- image encoders: from photos to a file of features
@@ -7860,13 +8023,12 @@ GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
 // As transformers 4.51.3 has it: models/blip_2/modeling_blip_2.py, models/opt/modeling_opt.py, image_processing_blip.py.
 
 typedef struct gsf__qformer_attention {
-    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
-    const gsf_tensor *norm_weight, *norm_bias;
+    gsf__nn_layer q, k, v, out, norm;
 } gsf__qformer_attention;
 
 typedef struct gsf__qformer_layer {
-    gsf__qformer_attention self, cross; // cross.q_weight NULL: this layer has none
-    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias, *norm_weight, *norm_bias;
+    gsf__qformer_attention self, cross; // cross.q.weight NULL: this layer has none
+    gsf__nn_layer up, down, norm;
 } gsf__qformer_layer;
 
 typedef struct gsf__qformer {
@@ -7875,16 +8037,18 @@ typedef struct gsf__qformer {
     float eps;
     gsf_nn_activation activation;
     int text_input;                                   // the file holds tensors for texts, which nobody needs here
-    const gsf_tensor *tokens, *norm_weight, *norm_bias;
+    const gsf_tensor* tokens;
+    gsf__nn_layer norm;
     gsf__qformer_layer* all;
 } gsf__qformer;
 
 typedef struct gsf__opt {
-    gsf__vit_sizes sizes;
+    gsf__nn_block_sizes sizes;
     int64_t layers, vocabulary, positions;
     int own_head, no_final_norm;
-    const gsf_tensor *tokens, *places, *norm_weight, *norm_bias, *head;
-    gsf__vit_block* blocks;
+    const gsf_tensor *tokens, *places;
+    gsf__nn_layer norm, head;
+    gsf__nn_block* blocks;
 } gsf__opt;
 
 typedef struct gsf__blip { // behind gsf_nn_captioner.nets
@@ -7894,8 +8058,8 @@ typedef struct gsf__blip { // behind gsf_nn_captioner.nets
     float mean[3], deviation[3];
     gsf__vit vision;
     gsf__qformer qformer;
+    gsf__nn_layer projection;
     gsf__opt text;
-    const gsf_tensor *projection_weight, *projection_bias;
 } gsf__blip;
 
 enum { GSF__OPT_OFFSET = 2, GSF__CAPTION_TOKENS = 20 }; // rows of OPT's position table before position 0; new tokens
@@ -8048,90 +8212,96 @@ static gsf_result gsf__blip_read_processor(const gsf__nn_config* file, gsf__blip
                     sides[1], sides[0], (long long)net->image_size, (long long)net->image_size);
 }
 
-// ---- captioner: opening, which tensor goes where
+// ---- captioner: tables of tensors
 
-#define GSF__BLIP_AT(member) offsetof(gsf__vit_block, member), GSF__VIT_ALWAYS
-static const gsf__vit_entry gsf__blip_block_entries[] = { // below vision_model.encoder.layers.N.
-    {"layer_norm1.weight", "d", GSF__BLIP_AT(norm1_weight)},
-    {"layer_norm1.bias", "d", GSF__BLIP_AT(norm1_bias)},
-    {"self_attn.qkv.weight", "td", GSF__BLIP_AT(qkv_weight)},
-    {"self_attn.qkv.bias", "t", offsetof(gsf__vit_block, qkv_bias), GSF__VIT_QKV_BIAS},
-    {"self_attn.projection.weight", "dd", GSF__BLIP_AT(out_weight)},
-    {"self_attn.projection.bias", "d", GSF__BLIP_AT(out_bias)},
-    {"layer_norm2.weight", "d", GSF__BLIP_AT(norm2_weight)},
-    {"layer_norm2.bias", "d", GSF__BLIP_AT(norm2_bias)},
-    {"mlp.fc1.weight", "md", GSF__BLIP_AT(up_weight)},
-    {"mlp.fc1.bias", "m", GSF__BLIP_AT(up_bias)},
-    {"mlp.fc2.weight", "dm", GSF__BLIP_AT(down_weight)},
-    {"mlp.fc2.bias", "d", GSF__BLIP_AT(down_bias)},
+static const gsf__nn_entry gsf__blip_block_entries[] = { // below vision_model.encoder.layers.N.
+    {"layer_norm1", "d", GSF__NN_BLOCK(norm1)},
+    {"self_attn.qkv", "td", GSF__NN_BLOCK_AS(qkv, GSF__NN_BIASED, 'b')},
+    {"self_attn.projection", "dd", GSF__NN_BLOCK(out)},
+    {"layer_norm2", "d", GSF__NN_BLOCK(norm2)},
+    {"mlp.fc1", "md", GSF__NN_BLOCK(up)},
+    {"mlp.fc2", "dm", GSF__NN_BLOCK(down)},
+    GSF__NN_END,
 };
 
-static const gsf__vit_entry gsf__opt_block_entries[] = { // below language_model.model.decoder.layers.N.
-    {"self_attn_layer_norm.weight", "d", GSF__BLIP_AT(norm1_weight)},
-    {"self_attn_layer_norm.bias", "d", GSF__BLIP_AT(norm1_bias)},
-    {"self_attn.q_proj.weight", "dd", GSF__BLIP_AT(q_weight)},
-    {"self_attn.q_proj.bias", "d", GSF__BLIP_AT(q_bias)},
-    {"self_attn.k_proj.weight", "dd", GSF__BLIP_AT(k_weight)},
-    {"self_attn.k_proj.bias", "d", GSF__BLIP_AT(k_bias)},
-    {"self_attn.v_proj.weight", "dd", GSF__BLIP_AT(v_weight)},
-    {"self_attn.v_proj.bias", "d", GSF__BLIP_AT(v_bias)},
-    {"self_attn.out_proj.weight", "dd", GSF__BLIP_AT(out_weight)},
-    {"self_attn.out_proj.bias", "d", GSF__BLIP_AT(out_bias)},
-    {"final_layer_norm.weight", "d", GSF__BLIP_AT(norm2_weight)},
-    {"final_layer_norm.bias", "d", GSF__BLIP_AT(norm2_bias)},
-    {"fc1.weight", "md", GSF__BLIP_AT(up_weight)},
-    {"fc1.bias", "m", GSF__BLIP_AT(up_bias)},
-    {"fc2.weight", "dm", GSF__BLIP_AT(down_weight)},
-    {"fc2.bias", "d", GSF__BLIP_AT(down_bias)},
+static const gsf__nn_entry gsf__opt_block_entries[] = { // below language_model.model.decoder.layers.N.
+    {"self_attn_layer_norm", "d", GSF__NN_BLOCK(norm1)},
+    {"self_attn.q_proj", "dd", GSF__NN_BLOCK(q)},
+    {"self_attn.k_proj", "dd", GSF__NN_BLOCK(k)},
+    {"self_attn.v_proj", "dd", GSF__NN_BLOCK(v)},
+    {"self_attn.out_proj", "dd", GSF__NN_BLOCK(out)},
+    {"final_layer_norm", "d", GSF__NN_BLOCK(norm2)},
+    {"fc1", "md", GSF__NN_BLOCK(up)},
+    {"fc2", "dm", GSF__NN_BLOCK(down)},
+    GSF__NN_END,
 };
-#undef GSF__BLIP_AT
 
-#define GSF__BLIP_AT(member) offsetof(gsf__vit, member), GSF__VIT_ALWAYS
-static const gsf__vit_entry gsf__blip_entries[] = { // below vision_model.
-    {"embeddings.class_embedding", "11d", GSF__BLIP_AT(class_token)},
-    {"embeddings.position_embedding", "1nd", GSF__BLIP_AT(positions)},
-    {"embeddings.patch_embedding.weight", "dcpp", GSF__BLIP_AT(patch_weight)},
-    {"embeddings.patch_embedding.bias", "d", GSF__BLIP_AT(patch_bias)},
-    {"post_layernorm.weight", "d", GSF__BLIP_AT(norm_weight)},
-    {"post_layernorm.bias", "d", GSF__BLIP_AT(norm_bias)},
+static const gsf__nn_entry gsf__blip_vision_entries[] = { // below vision_model.
+    {"embeddings.class_embedding", "11d", GSF__VIT_TENSOR(class_token)},
+    {"embeddings.position_embedding", "1sd", GSF__VIT_TENSOR(positions)},
+    {"embeddings.patch_embedding", "dcpp", GSF__NN_AT(gsf__vit, patches)},
+    {"post_layernorm", "d", GSF__NN_AT(gsf__vit, norm)},
+    GSF__NN_END,
 };
-#undef GSF__BLIP_AT
 
-// PREFIX.weight (out, in), or (out) with in = 0, and PREFIX.bias (out).
-static gsf_result gsf__blip_bind_pair(gsf__nn_loader* loader, const char* prefix, const char* name, int64_t out, int64_t in,
-                                      const gsf_tensor** weight, const gsf_tensor** bias) {
-    const int64_t shape[2] = {out, in};
-    GSF__TRY(gsf__nn_need(loader, weight, in ? 2 : 1, shape, "%s%s.weight", prefix, name));
-    return gsf__nn_need(loader, bias, 1, shape, "%s%s.bias", prefix, name);
+// Sizes: d width, m MLP, e width of what is looked at, q queries, x 0 where a layer does not look at the image.
+#define GSF__QFORMER_AT(member) offsetof(gsf__qformer_layer, member), GSF__NN_PAIR
+static const gsf__nn_entry gsf__qformer_layer_entries[] = { // below qformer.encoder.layer.N.
+    {"attention.attention.query", "dd", GSF__QFORMER_AT(self.q), 0},
+    {"attention.attention.key", "dd", GSF__QFORMER_AT(self.k), 0},
+    {"attention.attention.value", "dd", GSF__QFORMER_AT(self.v), 0},
+    {"attention.output.dense", "dd", GSF__QFORMER_AT(self.out), 0},
+    {"attention.output.LayerNorm", "d", GSF__QFORMER_AT(self.norm), 0},
+    {"crossattention.attention.query", "dd", GSF__QFORMER_AT(cross.q), 'x'},
+    {"crossattention.attention.key", "de", GSF__QFORMER_AT(cross.k), 'x'},
+    {"crossattention.attention.value", "de", GSF__QFORMER_AT(cross.v), 'x'},
+    {"crossattention.output.dense", "dd", GSF__QFORMER_AT(cross.out), 'x'},
+    {"crossattention.output.LayerNorm", "d", GSF__QFORMER_AT(cross.norm), 'x'},
+    {"intermediate_query.dense", "md", GSF__QFORMER_AT(up), 0},
+    {"output_query.dense", "dm", GSF__QFORMER_AT(down), 0},
+    {"output_query.LayerNorm", "d", GSF__QFORMER_AT(norm), 0},
+    GSF__NN_END,
+};
+#undef GSF__QFORMER_AT
+
+// Sizes: d width of the language model, e of the Q-Former, q queries, v words, s rows of the position table, h 0 where the
+// words are the head as well, n 0 without a last norm.
+static const gsf__nn_entry gsf__blip_entries[] = {
+    {"query_tokens", "1qe", offsetof(gsf__blip, qformer.tokens), GSF__NN_TENSOR, 0},
+    {"qformer.layernorm", "e", GSF__NN_AT(gsf__blip, qformer.norm)},
+    {"language_projection", "de", GSF__NN_AT(gsf__blip, projection)},
+    {"language_model.model.decoder.embed_tokens", "vd", offsetof(gsf__blip, text.tokens), GSF__NN_WEIGHT, 0},
+    {"language_model.model.decoder.embed_positions", "sd", offsetof(gsf__blip, text.places), GSF__NN_WEIGHT, 0},
+    {"language_model.model.decoder.final_layer_norm", "d", offsetof(gsf__blip, text.norm), GSF__NN_PAIR, 'n'},
+    {"language_model.lm_head", "vd", offsetof(gsf__blip, text.head), GSF__NN_WEIGHT, 'h'},
+    GSF__NN_END,
+};
+
+static gsf__nn_sizes gsf__blip_sizes(const gsf__blip* net) {
+    const gsf__opt* opt = &net->text;
+    const gsf__nn_sizes sizes = {{{'d', opt->sizes.width}, {'e', net->qformer.width}, {'q', net->qformer.queries},
+                                  {'v', opt->vocabulary}, {'s', opt->positions + GSF__OPT_OFFSET}, {'h', opt->own_head},
+                                  {'n', !opt->no_final_norm}}};
+    return sizes;
 }
 
-static gsf_result gsf__qformer_bind_attention(gsf__nn_loader* loader, const char* layer, const char* name, int64_t width,
-                                              int64_t source, gsf__qformer_attention* a) {
-    char prefix[112];
-    snprintf(prefix, sizeof prefix, "%s%s.", layer, name);
-    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.query", width, width, &a->q_weight, &a->q_bias));
-    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.key", width, source, &a->k_weight, &a->k_bias));
-    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "attention.value", width, source, &a->v_weight, &a->v_bias));
-    GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output.dense", width, width, &a->out_weight, &a->out_bias));
-    return gsf__blip_bind_pair(loader, prefix, "output.LayerNorm", width, 0, &a->norm_weight, &a->norm_bias);
+// Of layer `index` of the Q-Former.
+static gsf__nn_sizes gsf__qformer_sizes(const gsf__blip* net, int64_t index) {
+    const gsf__qformer* q = &net->qformer;
+    const gsf__nn_sizes sizes = {{{'d', q->width}, {'m', q->mlp}, {'e', net->vision.sizes.width},
+                                  {'x', index % q->cross_every == 0}}};
+    return sizes;
 }
 
-static gsf_result gsf__qformer_bind(gsf__nn_loader* loader, gsf__qformer* q, int64_t source) {
-    const int64_t d = q->width, tokens[3] = {1, q->queries, d};
-    GSF__TRY(gsf__nn_need(loader, &q->tokens, 3, tokens, "query_tokens"));
-    GSF__TRY(gsf__blip_bind_pair(loader, "qformer.", "layernorm", d, 0, &q->norm_weight, &q->norm_bias));
+static gsf_result gsf__qformer_bind(gsf__nn_loader* loader, gsf__blip* net) {
+    gsf__qformer* q = &net->qformer;
     q->all = (gsf__qformer_layer*)gsf_alloc_zeroed(loader->ctx, (size_t)q->layers, sizeof *q->all);
     if (!q->all) return GSF_ERROR_OUT_OF_MEMORY;
     for (int64_t i = 0; i < q->layers; i++) {
-        gsf__qformer_layer* l = &q->all[i];
+        const gsf__nn_sizes sizes = gsf__qformer_sizes(net, i);
         char prefix[64], unused[96];
         snprintf(prefix, sizeof prefix, "qformer.encoder.layer.%lld.", (long long)i);
-        GSF__TRY(gsf__qformer_bind_attention(loader, prefix, "attention", d, d, &l->self));
-        if (i % q->cross_every == 0)
-            GSF__TRY(gsf__qformer_bind_attention(loader, prefix, "crossattention", d, source, &l->cross));
-        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "intermediate_query.dense", q->mlp, d, &l->up_weight, &l->up_bias));
-        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output_query.dense", d, q->mlp, &l->down_weight, &l->down_bias));
-        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "output_query.LayerNorm", d, 0, &l->norm_weight, &l->norm_bias));
+        GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__qformer_layer_entries, prefix, &q->all[i]));
         for (int k = 0; k < 2 && q->text_input; k++) {
             snprintf(unused, sizeof unused, "%s%s", prefix, k ? "output." : "intermediate.");
             gsf__nn_ignore(loader, unused);
@@ -8141,36 +8311,25 @@ static gsf_result gsf__qformer_bind(gsf__nn_loader* loader, gsf__qformer* q, int
     return GSF_OK;
 }
 
-static gsf_result gsf__opt_bind(gsf__nn_loader* loader, gsf__opt* opt) {
-    const int64_t d = opt->sizes.width, words[2] = {opt->vocabulary, d}, places[2] = {opt->positions + GSF__OPT_OFFSET, d};
-    static const char prefix[] = "language_model.model.decoder.";
-    GSF__TRY(gsf__nn_need(loader, &opt->tokens, 2, words, "%sembed_tokens.weight", prefix));
-    GSF__TRY(gsf__nn_need(loader, &opt->places, 2, places, "%sembed_positions.weight", prefix));
-    if (!opt->no_final_norm)
-        GSF__TRY(gsf__blip_bind_pair(loader, prefix, "final_layer_norm", d, 0, &opt->norm_weight, &opt->norm_bias));
-    opt->head = opt->tokens;
-    if (opt->own_head) GSF__TRY(gsf__nn_need(loader, &opt->head, 2, words, "language_model.lm_head.weight"));
-    else gsf__nn_ignore(loader, "language_model.lm_head."); // the words again
-    return gsf__vit_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, GSF__COUNT(gsf__opt_block_entries),
-                                "language_model.model.decoder.layers.", opt->layers, &opt->blocks);
+static gsf_result gsf__blip_bind_all(gsf__nn_loader* loader, gsf__blip* net) {
+    gsf__opt* opt = &net->text;
+    const gsf__nn_sizes sizes = gsf__blip_sizes(net);
+    GSF__TRY(gsf__vit_bind(loader, gsf__blip_vision_entries, gsf__blip_block_entries, "vision_model.", &net->vision));
+    net->vision.register_tokens = net->vision.class_token; // there are none
+    GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__blip_entries, "", net));
+    GSF__TRY(gsf__qformer_bind(loader, net));
+    if (!opt->own_head) {
+        opt->head.weight = opt->tokens;
+        gsf__nn_ignore(loader, "language_model.lm_head."); // the words again
+    }
+    return gsf__vit_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, "language_model.model.decoder.layers.",
+                                opt->layers, &opt->blocks);
 }
 
 static gsf_result gsf__blip_bind(gsf_context* ctx, gsf_nn_captioner* out, gsf__blip* net) {
     gsf__nn_loader loader;
-    gsf__vit* vit = &net->vision;
     GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    gsf_result result = gsf__vit_bind(&loader, &vit->sizes, vit, gsf__blip_entries, GSF__COUNT(gsf__blip_entries),
-                                      "vision_model.", vit);
-    vit->register_tokens = vit->class_token; // there are none
-    if (!result)
-        result = gsf__vit_bind_blocks(&loader, &vit->sizes, gsf__blip_block_entries, GSF__COUNT(gsf__blip_block_entries),
-                                      vit->block_names, vit->layers, &vit->blocks);
-    if (!result) result = gsf__qformer_bind(&loader, &net->qformer, vit->sizes.width);
-    if (!result)
-        result = gsf__blip_bind_pair(&loader, "", "language_projection", net->text.sizes.width, net->qformer.width,
-                                     &net->projection_weight, &net->projection_bias);
-    if (!result) result = gsf__opt_bind(&loader, &net->text);
-    return gsf__nn_end_loading(&loader, result);
+    return gsf__nn_end_loading(&loader, gsf__blip_bind_all(&loader, net));
 }
 
 GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner) {
@@ -8214,26 +8373,11 @@ GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, g
 // ---- captioner: from the image to the queries' words
 
 typedef struct gsf__caption_run {
-    gsf__vit_run vit;  // scratch, progress
+    gsf__nn_run nn;
     const gsf_nn_captioner* captioner;
     const gsf__blip* net;
     const gsf_nn_caption_desc* desc;
 } gsf__caption_run;
-
-static void gsf__caption_tap(const gsf__caption_run* run, const char* name, const float* data, int64_t rows,
-                             int64_t columns) {
-    if (run->desc->tap_fn) run->desc->tap_fn(run->desc->tap_user, name, data, rows, columns);
-}
-
-// After a layer: a value that is not finite is named with the tensors below `prefix`; cancel, progress.
-static gsf_result gsf__caption_step(gsf__caption_run* run, const char* prefix, int64_t index, const float* x,
-                                    int64_t count) {
-    char name[96];
-    snprintf(name, sizeof name, "%s%lld.", prefix, (long long)index);
-    GSF__TRY(gsf__vit_check(&run->vit, name, x, count));
-    gsf__progress(run->vit.ctx, run->vit.name, ++run->vit.done, run->vit.steps);
-    return gsf__check_cancel(run->vit.ctx);
-}
 
 // The image, resized as PIL does it, as normalised floats (3, image_size, image_size).
 static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const gsf_image* image, float* out) {
@@ -8260,35 +8404,34 @@ static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const
 // Tokens of the image: out (1 + patches, width), after the last norm.
 static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, float* out) {
     const gsf__vit* vit = &run->net->vision;
-    gsf_context* ctx = run->vit.ctx;
-    const int64_t d = vit->sizes.width;
+    const gsf__nn_tap* tap = run->nn.tap;
     gsf_nn_encoder_input in;
+    gsf__vit_plan plan;
     float* memory = NULL;
     memset(&in, 0, sizeof in);
     in.pixels = pixels;
     in.images = 1;
     in.height = in.width = (int32_t)run->net->image_size;
-    const gsf__vit_plan plan = gsf__vit_plan_of(vit, &in);
-    gsf_result result = gsf__vit_open_run(ctx, vit, &in, &plan, &run->vit, &memory);
-    if (!result) result = gsf__vit_forward(&run->vit, vit, &in, 0, 1, 0, memory, memory + plan.positions);
+    run->nn.tap = NULL; // only the result is shown
+    gsf_result result = gsf__vit_open_run(&run->nn, vit, NULL, &in, &plan, &memory);
+    if (!result) result = gsf__vit_forward(&run->nn, vit, &in, 0, 1, 0, plan.positions, plan.x);
     if (!result) {
-        gsf_nn_layer_norm(ctx, memory + plan.positions, plan.tokens, d, gsf__vit_vector(&run->vit, vit->norm_weight),
-                          gsf__vit_vector(&run->vit, vit->norm_bias), vit->sizes.eps, out);
-        result = gsf__vit_check(&run->vit, "vision_model.post_layernorm.", out, plan.tokens * d);
+        static const char name[] = "vision_model.post_layernorm.";
+        gsf__nn_norm(&run->nn, &vit->norm, vit->sizes.eps, plan.x, plan.tokens, out);
+        result = gsf__nn_check(&run->nn, name, name, out, plan.tokens * vit->sizes.width);
     }
-    if (!result) gsf__caption_tap(run, "vision", out, plan.tokens, d);
-    gsf_free(ctx, memory);
+    run->nn.tap = tap;
+    if (!result) gsf__nn_reveal(&run->nn, out, 0, 1, plan.tokens, vit->sizes.width, "vision");
+    gsf_free(run->nn.ctx, memory);
     return result;
 }
 
 // x (queries, width) = norm(x + dense(h)), in place.
-static gsf_result gsf__qformer_add(gsf__caption_run* run, const float* h, const gsf_tensor* weight, const gsf_tensor* bias,
-                                   const gsf_tensor* norm_weight, const gsf_tensor* norm_bias, float* x) {
+static gsf_result gsf__qformer_add(gsf__caption_run* run, const float* h, const gsf__nn_layer* dense,
+                                   const gsf__nn_layer* norm, float* x) {
     const gsf__qformer* q = &run->net->qformer;
-    GSF__TRY(gsf__vit_add(&run->vit, h, q->queries, weight, bias, NULL, x));
-    run->vit.vectors_used = 0;
-    gsf_nn_layer_norm(run->vit.ctx, x, q->queries, q->width, gsf__vit_vector(&run->vit, norm_weight),
-                      gsf__vit_vector(&run->vit, norm_bias), q->eps, x);
+    GSF__TRY(gsf__nn_add(&run->nn, dense, NULL, h, q->queries, x));
+    gsf__nn_norm(&run->nn, norm, q->eps, x, q->queries, x);
     return GSF_OK;
 }
 
@@ -8298,9 +8441,9 @@ static gsf_result gsf__qformer_attend(gsf__caption_run* run, const gsf__qformer_
     const gsf__qformer* q = &run->net->qformer;
     const int64_t d = q->width;
     float *k = scratch + q->queries * d, *v = k + rows * d;
-    GSF__TRY(gsf__vit_linear(&run->vit, x, q->queries, a->q_weight, a->q_bias, GSF_NN_LINEAR, scratch, 0));
-    GSF__TRY(gsf__vit_linear(&run->vit, from, rows, a->k_weight, a->k_bias, GSF_NN_LINEAR, k, 0));
-    GSF__TRY(gsf__vit_linear(&run->vit, from, rows, a->v_weight, a->v_bias, GSF_NN_LINEAR, v, 0));
+    GSF__TRY(gsf__nn_linear(&run->nn, &a->q, GSF_NN_LINEAR, x, q->queries, scratch, 0));
+    GSF__TRY(gsf__nn_linear(&run->nn, &a->k, GSF_NN_LINEAR, from, rows, k, 0));
+    GSF__TRY(gsf__nn_linear(&run->nn, &a->v, GSF_NN_LINEAR, from, rows, v, 0));
     gsf_nn_attention_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.queries = q->queries;
@@ -8310,8 +8453,8 @@ static gsf_result gsf__qformer_attend(gsf__caption_run* run, const gsf__qformer_
     desc.q = desc.out = scratch;
     desc.k = k;
     desc.v = v;
-    GSF__TRY(gsf_nn_attention(run->vit.ctx, &run->vit.workspace, &desc));
-    return gsf__qformer_add(run, scratch, a->out_weight, a->out_bias, a->norm_weight, a->norm_bias, x);
+    GSF__TRY(gsf__nn_attend(&run->nn, &desc, 1));
+    return gsf__qformer_add(run, scratch, &a->out, &a->norm, x);
 }
 
 static size_t gsf__qformer_floats(const gsf__blip* net) { // x; scratch; two vectors
@@ -8321,70 +8464,65 @@ static size_t gsf__qformer_floats(const gsf__blip* net) { // x; scratch; two vec
     return n * d + (attention > hidden ? attention : hidden) + 2 * d;
 }
 
+static gsf_result gsf__qformer_layers(gsf__caption_run* run, const float* image, float* scratch, float* x, float* out) {
+    const gsf__qformer* q = &run->net->qformer;
+    const int64_t d = q->width, seen = run->net->vision.grid * run->net->vision.grid + 1, words = run->net->text.sizes.width;
+    gsf_nn_read_tensor(q->tokens, 0, q->queries * d, x);
+    gsf__nn_norm(&run->nn, &q->norm, q->eps, x, q->queries, x);
+    GSF__TRY(gsf__nn_check(&run->nn, "query_tokens", "query_tokens", x, q->queries * d));
+    for (int64_t i = 0; i < q->layers; i++) {
+        const gsf__qformer_layer* l = &q->all[i];
+        GSF__TRY(gsf__qformer_attend(run, &l->self, x, q->queries, scratch, x));
+        if (l->cross.q.weight) GSF__TRY(gsf__qformer_attend(run, &l->cross, image, seen, scratch, x));
+        GSF__TRY(gsf__nn_linear(&run->nn, &l->up, q->activation, x, q->queries, scratch, 0));
+        GSF__TRY(gsf__qformer_add(run, scratch, &l->down, &l->norm, x));
+        GSF__TRY(gsf__nn_end_block(&run->nn, "qformer.encoder.layer.", i, x, q->queries * d));
+    }
+    gsf__nn_reveal(&run->nn, x, 0, 1, q->queries, d, "qformer");
+    GSF__TRY(gsf__nn_linear(&run->nn, &run->net->projection, GSF_NN_LINEAR, x, q->queries, out, 0));
+    GSF__TRY(gsf__nn_check(&run->nn, "language_projection.", "language_projection.", out, q->queries * words));
+    gsf__nn_reveal(&run->nn, out, 0, 1, q->queries, words, "projection");
+    return GSF_OK;
+}
+
 // What the queries find in the image's tokens, as words of the language model: out (queries, text width).
 static gsf_result gsf__qformer_ask(gsf__caption_run* run, const float* image, float* out) {
-    const gsf__qformer* q = &run->net->qformer;
-    gsf_context* ctx = run->vit.ctx;
-    const int64_t d = q->width, seen = run->net->vision.grid * run->net->vision.grid + 1;
+    const int64_t d = run->net->qformer.width;
     const size_t floats = gsf__qformer_floats(run->net);
-    float* x = (float*)gsf_alloc(ctx, floats, sizeof(float));
+    float* x = (float*)gsf_alloc(run->nn.ctx, floats, sizeof(float));
     if (!x) return GSF_ERROR_OUT_OF_MEMORY;
-    float* scratch = x + q->queries * d;
-    run->vit.vectors_size = (size_t)(2 * d);
-    run->vit.vectors = x + floats - run->vit.vectors_size;
-    run->vit.vectors_used = 0;
-    gsf_nn_read_tensor(q->tokens, 0, q->queries * d, x);
-    gsf_nn_layer_norm(ctx, x, q->queries, d, gsf__vit_vector(&run->vit, q->norm_weight),
-                      gsf__vit_vector(&run->vit, q->norm_bias), q->eps, x);
-    gsf_result result = gsf__vit_check(&run->vit, "query_tokens", x, q->queries * d);
-    for (int64_t i = 0; i < q->layers && !result; i++) {
-        const gsf__qformer_layer* l = &q->all[i];
-        result = gsf__qformer_attend(run, &l->self, x, q->queries, scratch, x);
-        if (!result && l->cross.q_weight) result = gsf__qformer_attend(run, &l->cross, image, seen, scratch, x);
-        if (!result)
-            result = gsf__vit_linear(&run->vit, x, q->queries, l->up_weight, l->up_bias, q->activation, scratch, 0);
-        if (!result)
-            result = gsf__qformer_add(run, scratch, l->down_weight, l->down_bias, l->norm_weight, l->norm_bias, x);
-        if (!result) result = gsf__caption_step(run, "qformer.encoder.layer.", i, x, q->queries * d);
-    }
-    if (!result) gsf__caption_tap(run, "qformer", x, q->queries, d);
-    if (!result)
-        result = gsf__vit_linear(&run->vit, x, q->queries, run->net->projection_weight, run->net->projection_bias,
-                                 GSF_NN_LINEAR, out, 0);
-    if (!result)
-        result = gsf__vit_check(&run->vit, "language_projection.", out, q->queries * run->net->text.sizes.width);
-    if (!result) gsf__caption_tap(run, "projection", out, q->queries, run->net->text.sizes.width);
-    gsf_free(ctx, x);
+    run->nn.vectors_size = (size_t)(2 * d);
+    run->nn.vectors = x + floats - run->nn.vectors_size;
+    const gsf_result result = gsf__qformer_layers(run, image, x + run->net->qformer.queries * d, x, out);
+    gsf_free(run->nn.ctx, x);
     return result;
 }
 
 // ---- captioner: the language model
 
 typedef struct gsf__opt_run {
-    int64_t capacity, past; // rows of the cache; of these in use
-    float *keys, *values;   // (layers, capacity, width)
-    float *x, *logits;      // (rows, width); (vocabulary), or with a tap (rows, vocabulary)
-    unsigned char* mask;    // (heads, rows, rows): a token sees itself and those before
+    gsf__nn_cache cache;
+    float *x, *logits; // (rows, width); (vocabulary), or with a tap (rows, vocabulary)
 } gsf__opt_run;
 
-typedef struct gsf__opt_plan { // floats, but for `mask`
-    size_t cache, x, normed, wide, vectors, logits, mask;
-} gsf__opt_plan;
-
-static gsf__opt_plan gsf__opt_plan_of(const gsf__opt* opt, int64_t rows, int64_t capacity, int64_t logits) {
-    gsf__opt_plan p;
-    const size_t d = (size_t)opt->sizes.width, n = (size_t)rows;
-    p.cache = (size_t)opt->layers * (size_t)capacity * d;
-    p.x = p.normed = n * d;
-    p.wide = gsf__vit_wide(&opt->sizes, rows);
-    p.vectors = 4 * d;
-    p.logits = (size_t)logits * (size_t)opt->vocabulary;
-    p.mask = (size_t)opt->sizes.heads * n * n;
-    return p;
-}
-
-static size_t gsf__opt_floats(const gsf__opt_plan* p) {
-    return 2 * p->cache + p->x + p->normed + p->wide + p->vectors + p->logits + (p->mask + 3) / 4;
+// Shares out `memory`, or counts its floats.
+static size_t gsf__opt_lay_out(gsf__nn_run* run, const gsf__opt* opt, int64_t rows, int64_t logits, gsf__opt_run* o,
+                               float* memory) {
+    gsf__nn_arena arena = {memory, 0};
+    const size_t d = (size_t)opt->sizes.width, n = (size_t)rows, wide = gsf__nn_wide(&opt->sizes, rows, GSF__VIT_MLP_ROWS);
+    const size_t cache = (size_t)opt->layers * (size_t)o->cache.capacity * d;
+    run->sizes = &opt->sizes;
+    run->wide_count = (int64_t)wide;
+    run->vectors_size = 2 * d;
+    o->cache.keys = gsf__nn_share(&arena, cache);
+    o->cache.values = gsf__nn_share(&arena, cache);
+    o->x = gsf__nn_share(&arena, n * d);
+    o->logits = gsf__nn_share(&arena, (size_t)logits * (size_t)opt->vocabulary);
+    run->normed = gsf__nn_share(&arena, n * d);
+    run->wide = gsf__nn_share(&arena, wide);
+    run->vectors = gsf__nn_share(&arena, run->vectors_size);
+    o->cache.mask = (unsigned char*)gsf__nn_share(&arena, ((size_t)opt->sizes.heads * n * n + 3) / 4);
+    return arena.used;
 }
 
 // x (count, width): words, those of `ids` unless it is NULL and they are there, at the places from `place` on.
@@ -8398,55 +8536,24 @@ static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t coun
     }
 }
 
-// One layer on the rows of x, which follow the `past` ones whose keys and values are in the cache.
-static gsf_result gsf__opt_block(gsf__caption_run* run, gsf__opt_run* o, int64_t layer, int64_t rows) {
-    const gsf__opt* opt = &run->net->text;
-    const gsf__vit_block* b = &opt->blocks[layer];
-    gsf__vit_run* v = &run->vit;
-    const int64_t d = opt->sizes.width, at = layer * o->capacity * d, fresh = at + o->past * d;
-    v->vectors_used = 0;
-    gsf_nn_layer_norm(v->ctx, o->x, rows, d, gsf__vit_vector(v, b->norm1_weight), gsf__vit_vector(v, b->norm1_bias),
-                      opt->sizes.eps, v->normed);
-    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->q_weight, b->q_bias, GSF_NN_LINEAR, v->wide, 0));
-    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->k_weight, b->k_bias, GSF_NN_LINEAR, o->keys + fresh, 0));
-    GSF__TRY(gsf__vit_linear(v, v->normed, rows, b->v_weight, b->v_bias, GSF_NN_LINEAR, o->values + fresh, 0));
-    gsf_nn_attention_desc a;
-    memset(&a, 0, sizeof a);
-    a.queries = rows;
-    a.keys = o->past + rows;
-    a.heads = opt->sizes.heads;
-    a.head_dim = opt->sizes.head_dim;
-    a.q = a.out = v->wide;
-    a.k = o->keys + at;
-    a.v = o->values + at;
-    a.mask = rows > 1 ? o->mask : NULL;
-    GSF__TRY(gsf_nn_attention(v->ctx, &v->workspace, &a));
-    GSF__TRY(gsf__vit_add(v, v->wide, rows, b->out_weight, b->out_bias, NULL, o->x));
-    gsf_nn_layer_norm(v->ctx, o->x, rows, d, gsf__vit_vector(v, b->norm2_weight), gsf__vit_vector(v, b->norm2_bias),
-                      opt->sizes.eps, v->normed);
-    return gsf__vit_feed_forward(v, b, NULL, o->x, rows);
-}
-
 // All layers on the rows of x; then o->logits has those of the last row, with a tap and several rows those of all.
 static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64_t rows) {
     const gsf__opt* opt = &run->net->text;
-    gsf__vit_run* v = &run->vit;
-    const int64_t d = opt->sizes.width, shown = run->desc->tap_fn && rows > 1 ? rows : 1;
+    gsf__nn_run* nn = &run->nn;
+    const int64_t d = opt->sizes.width, shown = nn->tap && rows > 1 ? rows : 1;
     for (int64_t layer = 0; layer < opt->layers; layer++) {
-        GSF__TRY(gsf__opt_block(run, o, layer, rows));
-        GSF__TRY(gsf__caption_step(run, "language_model.model.decoder.layers.", layer, o->x, rows * d));
+        GSF__TRY(gsf__nn_block_forward(nn, &opt->blocks[layer], layer, o->x, 1, rows));
+        GSF__TRY(gsf__nn_end_block(nn, "language_model.model.decoder.layers.", layer, o->x, rows * d));
     }
-    o->past += rows;
+    o->cache.past += rows;
     const float* last = o->x + (rows - shown) * d;
-    v->vectors_used = 0;
     if (!opt->no_final_norm) {
-        gsf_nn_layer_norm(v->ctx, last, shown, d, gsf__vit_vector(v, opt->norm_weight), gsf__vit_vector(v, opt->norm_bias),
-                          opt->sizes.eps, v->normed);
-        last = v->normed;
+        gsf__nn_norm(nn, &opt->norm, opt->sizes.eps, last, shown, nn->normed);
+        last = nn->normed;
     }
-    GSF__TRY(gsf__vit_linear(v, last, shown, opt->head, NULL, GSF_NN_LINEAR, o->logits, 0));
-    GSF__TRY(gsf__vit_check(v, "language_model.", o->logits, shown * opt->vocabulary));
-    if (rows > 1) gsf__caption_tap(run, "logits", o->logits, shown, opt->vocabulary);
+    GSF__TRY(gsf__nn_linear(nn, &opt->head, GSF_NN_LINEAR, last, shown, o->logits, 0));
+    GSF__TRY(gsf__nn_check(nn, "language_model.", "language_model.", o->logits, shown * opt->vocabulary));
+    if (rows > 1) gsf__nn_reveal(nn, o->logits, 0, 1, shown, opt->vocabulary, "logits");
     if (shown > 1) memmove(o->logits, o->logits + (shown - 1) * opt->vocabulary, (size_t)opt->vocabulary * sizeof(float));
     return GSF_OK;
 }
@@ -8457,8 +8564,8 @@ static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int6
     const gsf__opt* opt = &run->net->text;
     for (int64_t h = 0; h < opt->sizes.heads; h++)
         for (int64_t r = 0; r < rows; r++)
-            for (int64_t k = 0; k < rows; k++) o->mask[(h * rows + r) * rows + k] = k <= r;
-    gsf__opt_embed(opt, NULL, rows, 0, run->vit.normed, o->x);
+            for (int64_t k = 0; k < rows; k++) o->cache.mask[(h * rows + r) * rows + k] = k <= r;
+    gsf__opt_embed(opt, NULL, rows, 0, run->nn.normed, o->x);
     GSF__TRY(gsf__opt_forward(run, o, rows));
     for (;;) {
         int32_t best = 0;
@@ -8466,10 +8573,10 @@ static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int6
             if (o->logits[i] > o->logits[best]) best = (int32_t)i;
         ids[(*count)++] = best;
         if (best == run->captioner->eos || *count == (size_t)most) break;
-        gsf__opt_embed(opt, &best, 1, o->past, run->vit.normed, o->x);
+        gsf__opt_embed(opt, &best, 1, o->cache.past, run->nn.normed, o->x);
         GSF__TRY(gsf__opt_forward(run, o, 1));
     }
-    gsf__progress(run->vit.ctx, run->vit.name, run->vit.steps, run->vit.steps);
+    gsf__progress(run->nn.ctx, run->nn.stage, run->nn.steps, run->nn.steps);
     return GSF_OK;
 }
 
@@ -8477,25 +8584,16 @@ static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int6
 static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, const int32_t* text, size_t text_count,
                                  int32_t most, int32_t* ids, size_t* count) {
     const gsf__opt* opt = &run->net->text;
-    gsf_context* ctx = run->vit.ctx;
+    gsf_context* ctx = run->nn.ctx;
     const int64_t d = opt->sizes.width, queries = run->net->qformer.queries, rows = queries + (int64_t)text_count;
+    const int64_t logits = run->nn.tap ? rows : 1;
     gsf__opt_run o;
     memset(&o, 0, sizeof o);
-    o.capacity = rows + most - 1;
-    const gsf__opt_plan p = gsf__opt_plan_of(opt, rows, o.capacity, run->desc->tap_fn ? rows : 1);
-    float* memory = (float*)gsf_alloc(ctx, gsf__opt_floats(&p), sizeof(float));
+    o.cache.capacity = rows + most - 1;
+    float* memory = (float*)gsf_alloc(ctx, gsf__opt_lay_out(&run->nn, opt, rows, logits, &o, NULL), sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    o.keys = memory;
-    o.values = o.keys + p.cache;
-    o.x = o.values + p.cache;
-    o.logits = o.x + p.x;
-    run->vit.sizes = &opt->sizes;
-    run->vit.normed = o.logits + p.logits;
-    run->vit.wide = run->vit.normed + p.normed;
-    run->vit.wide_count = (int64_t)p.wide;
-    run->vit.vectors = run->vit.wide + p.wide;
-    run->vit.vectors_size = p.vectors;
-    o.mask = (unsigned char*)(run->vit.vectors + p.vectors);
+    gsf__opt_lay_out(&run->nn, opt, rows, logits, &o, memory);
+    run->nn.cache = &o.cache;
     memcpy(o.x, words, (size_t)(queries * d) * sizeof(float));
     for (int64_t i = 0; i < (int64_t)text_count; i++)
         gsf_nn_read_tensor(opt->tokens, text[i] * d, d, o.x + (queries + i) * d);
@@ -8560,15 +8658,15 @@ static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* c
 static gsf_result gsf__caption_write(gsf__caption_run* run, const int32_t* text, size_t text_count, int64_t most,
                                      int32_t* ids, size_t* count) {
     const gsf__blip* net = run->net;
-    gsf_context* ctx = run->vit.ctx;
+    gsf_context* ctx = run->nn.ctx;
     const size_t pixels = (size_t)(3 * net->image_size * net->image_size);
     const size_t seen = (size_t)((net->vision.grid * net->vision.grid + 1) * net->vision.sizes.width);
     float* words = (float*)gsf_alloc(ctx, (size_t)(net->qformer.queries * net->text.sizes.width), sizeof(float));
     float* image = (float*)gsf_alloc(ctx, pixels + seen, sizeof(float));
     gsf_result result = words && image ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    run->vit.steps = (double)(net->vision.layers + net->qformer.layers + net->text.layers * most);
+    run->nn.steps = (double)(net->vision.layers + net->qformer.layers + net->text.layers * most);
     if (!result) result = gsf__blip_pixels(ctx, net, run->desc->image, image);
-    if (!result) gsf__caption_tap(run, "pixel_values", image, 3, net->image_size * net->image_size);
+    if (!result) gsf__nn_reveal(&run->nn, image, 0, 1, 3, net->image_size * net->image_size, "pixel_values");
     if (!result) result = gsf__blip_look(run, image, image + pixels);
     if (!result) result = gsf__qformer_ask(run, image + pixels, words);
     gsf_free(ctx, image);
@@ -8586,19 +8684,20 @@ GSF_API gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* 
     *ids = NULL;
     *count = 0;
     memset(&run, 0, sizeof run);
-    run.vit.ctx = ctx;
-    run.vit.name = "caption";
-    run.vit.weights = &captioner->weights;
+    run.nn.ctx = ctx;
+    run.nn.name = run.nn.stage = "caption";
+    run.nn.weights = &captioner->weights;
     run.captioner = captioner;
     run.net = (const gsf__blip*)captioner->nets;
     run.desc = desc;
+    run.nn.tap = desc->_tap;
     GSF__TRY(gsf__caption_text(ctx, captioner, desc->prompt, &text, &text_count));
     gsf_result result = gsf__caption_check(ctx, captioner, desc, (int64_t)text_count, &most);
     if (!result) {
         *ids = (int32_t*)gsf_alloc(ctx, (size_t)most, sizeof **ids);
         result = *ids ? gsf__caption_write(&run, text, text_count, most, *ids, count) : GSF_ERROR_OUT_OF_MEMORY;
     }
-    gsf_nn_destroy_workspace(ctx, &run.vit.workspace);
+    gsf_nn_destroy_workspace(ctx, &run.nn.workspace);
     gsf_free(ctx, text);
     if (!result) return GSF_OK;
     gsf_free(ctx, *ids);
@@ -8649,23 +8748,27 @@ GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text
     if (text_tokens < 1) text_tokens = 1;
     int64_t most = gsf__caption_most(captioner, text_tokens, max_new_tokens);
     if (most < 1) most = 1;
-    const gsf__vit_plan vision = gsf__vit_plan_of(&net->vision, &in);
+    gsf__nn_run run;
+    gsf__opt_run o;
+    memset(&run, 0, sizeof run);
+    memset(&o, 0, sizeof o);
     const int64_t rows = q->queries + text_tokens;
-    const gsf__opt_plan text = gsf__opt_plan_of(opt, rows, rows + most - 1, 1);
+    o.cache.capacity = rows + most - 1;
+    const double seen = (double)(net->vision.grid * net->vision.grid + 1);
     const double words = 4.0 * (double)q->queries * (double)opt->sizes.width;
     const double image = 12.0 * (double)net->image_size * (double)net->image_size +
-                         4.0 * (double)vision.tokens * (double)net->vision.sizes.width;
-    const double look = image + gsf__vit_bytes(&vision), ask = image + 4.0 * (double)gsf__qformer_floats(net);
-    const double write = 4.0 * (double)gsf__opt_floats(&text), first = look > ask ? look : ask;
+                         4.0 * seen * (double)net->vision.sizes.width;
+    const double look = image + gsf__vit_bytes(&net->vision, NULL, &in), ask = image + 4.0 * (double)gsf__qformer_floats(net);
+    const double write = 4.0 * (double)gsf__opt_lay_out(&run, opt, rows, 1, &o, NULL), first = look > ask ? look : ask;
     if (bytes) *bytes = words + (first > write ? first : write);
-    const double d = (double)q->width, n = (double)q->queries, seen = (double)vision.tokens;
+    const double d = (double)q->width, n = (double)q->queries;
     const double crossing = (double)gsf__ceil_div(q->layers, q->cross_every);
     const double self = 8.0 * n * d * d + 4.0 * n * n * d + 4.0 * n * d * (double)q->mlp;
     const double cross = 4.0 * n * d * d + 4.0 * seen * d * (double)net->vision.sizes.width + 4.0 * n * seen * d;
     const double w = (double)opt->sizes.width, all = (double)(rows + most - 1);
     const double row = 2.0 * w * (4.0 * w + 2.0 * (double)opt->sizes.mlp), layers = (double)opt->layers;
     if (flops)
-        *flops = gsf__vit_flops(&net->vision, &vision, 1.0) + (double)q->layers * self + crossing * cross +
+        *flops = gsf__vit_flops(&net->vision, &in) + (double)q->layers * self + crossing * cross +
                  2.0 * n * d * w + layers * (all * row + 2.0 * all * all * w) +
                  2.0 * (double)most * w * (double)opt->vocabulary;
 }
@@ -9546,37 +9649,62 @@ GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tok
 
 // ---- >>nn t5 --------------------------------------------------------------------
 
-typedef struct gsf__t5_block {
-    const gsf_tensor *attention_norm, *q, *k, *v, *out, *ff_norm, *gate, *up, *down;
-} gsf__t5_block;
-
 typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
-    gsf__t5_block* blocks;
-    const gsf_tensor *embedding, *positions, *final_norm; // positions: (buckets, heads), for all blocks
+    gsf__nn_block_sizes sizes;
+    gsf__nn_block* blocks;
+    const gsf_tensor *embedding, *positions; // positions: (buckets, heads), for all blocks
+    gsf__nn_layer norm;
 } gsf__t5_nets;
 
-static gsf_result gsf__t5_bind_block(gsf__nn_loader* loader, const gsf_nn_t5* c, int32_t index, gsf__t5_block* b) {
-    const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
-    const struct { const char* name; const gsf_tensor** to; int32_t rank; int64_t shape[2]; } parts[] = {
-        {"0.layer_norm", &b->attention_norm, 1, {d, 0}},  {"0.SelfAttention.q", &b->q, 2, {inner, d}},
-        {"0.SelfAttention.k", &b->k, 2, {inner, d}},      {"0.SelfAttention.v", &b->v, 2, {inner, d}},
-        {"0.SelfAttention.o", &b->out, 2, {d, inner}},    {"1.layer_norm", &b->ff_norm, 1, {d, 0}},
-        {"1.DenseReluDense.wi_0", &b->gate, 2, {h, d}},   {"1.DenseReluDense.wi_1", &b->up, 2, {h, d}},
-        {"1.DenseReluDense.wo", &b->down, 2, {d, h}}};
-    for (size_t i = 0; i < GSF__COUNT(parts); i++)
-        GSF__TRY(gsf__nn_need(loader, parts[i].to, parts[i].rank, parts[i].shape, "encoder.block.%d.layer.%s.weight",
-                              (int)index, parts[i].name));
-    return GSF_OK;
+static const gsf__nn_entry gsf__t5_block_entries[] = { // below encoder.block.N.layer.
+    {"0.layer_norm", "d", GSF__NN_BLOCK_AS(norm1, GSF__NN_WEIGHT, 0)},
+    {"0.SelfAttention.q", "id", GSF__NN_BLOCK_AS(q, GSF__NN_WEIGHT, 0)},
+    {"0.SelfAttention.k", "id", GSF__NN_BLOCK_AS(k, GSF__NN_WEIGHT, 0)},
+    {"0.SelfAttention.v", "id", GSF__NN_BLOCK_AS(v, GSF__NN_WEIGHT, 0)},
+    {"0.SelfAttention.o", "di", GSF__NN_BLOCK_AS(out, GSF__NN_WEIGHT, 0)},
+    {"1.layer_norm", "d", GSF__NN_BLOCK_AS(norm2, GSF__NN_WEIGHT, 0)},
+    {"1.DenseReluDense.wi_0", "md", GSF__NN_BLOCK_AS(gate, GSF__NN_WEIGHT, 0)},
+    {"1.DenseReluDense.wi_1", "md", GSF__NN_BLOCK_AS(up, GSF__NN_WEIGHT, 0)},
+    {"1.DenseReluDense.wo", "dm", GSF__NN_BLOCK_AS(down, GSF__NN_WEIGHT, 0)},
+    GSF__NN_END,
+};
+
+#define GSF__T5_AT(member) offsetof(gsf__t5_nets, member), GSF__NN_WEIGHT, 0
+static const gsf__nn_entry gsf__t5_entries[] = { // sizes: d width, v vocabulary, u buckets, h heads
+    {"shared", "vd", GSF__T5_AT(embedding)},
+    {"encoder.block.0.layer.0.SelfAttention.relative_attention_bias", "uh", GSF__T5_AT(positions)},
+    {"encoder.final_layer_norm", "d", GSF__T5_AT(norm)},
+    GSF__NN_END,
+};
+#undef GSF__T5_AT
+
+static gsf__nn_sizes gsf__t5_sizes(const gsf_nn_t5* c) {
+    const gsf__nn_sizes sizes = {{{'d', c->width}, {'v', c->vocabulary}, {'u', c->buckets}, {'h', c->heads}}};
+    return sizes;
 }
 
-static gsf_result gsf__t5_bind_all(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__t5_nets* nets) {
-    const int64_t table[2] = {c->vocabulary, c->width}, positions[2] = {c->buckets, c->heads};
-    GSF__TRY(gsf__nn_need(loader, &nets->embedding, 2, table, "shared.weight"));
-    GSF__TRY(gsf__nn_need(loader, &nets->positions, 2, positions,
-                          "encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight"));
-    GSF__TRY(gsf__nn_need(loader, &nets->final_norm, 1, table + 1, "encoder.final_layer_norm.weight"));
+static gsf__nn_block_sizes gsf__t5_block_sizes(const gsf_nn_t5* c) {
+    gsf__nn_block_sizes s;
+    memset(&s, 0, sizeof s);
+    s.width = c->width;
+    s.mlp = c->hidden;
+    s.heads = c->heads;
+    s.head_dim = c->head_dim;
+    s.eps = (float)c->norm_eps;
+    s.activation = GSF_NN_GELU_TANH;
+    s.rms = s.gated = 1;
+    return s;
+}
+
+static gsf_result gsf__t5_bind(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__t5_nets* nets) {
+    const gsf__nn_sizes sizes = gsf__t5_sizes(c), block = gsf__nn_sizes_of_block(&nets->sizes);
+    char prefix[48];
+    GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__t5_entries, "", nets));
     gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
-    for (int32_t i = 0; i < c->layers; i++) GSF__TRY(gsf__t5_bind_block(loader, c, i, &nets->blocks[i]));
+    for (int32_t i = 0; i < c->layers; i++) {
+        snprintf(prefix, sizeof prefix, "encoder.block.%d.layer.", (int)i);
+        GSF__TRY(gsf__nn_bind(loader, &block, gsf__t5_block_entries, prefix, &nets->blocks[i]));
+    }
     return GSF_OK;
 }
 
@@ -9608,10 +9736,11 @@ static gsf_result gsf__t5_open(gsf_context* ctx, const char* folder, gsf_nn_t5* 
     gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
     out->nets = nets;
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    nets->blocks = (gsf__t5_block*)gsf_alloc_zeroed(ctx, (size_t)out->layers, sizeof *nets->blocks);
+    nets->sizes = gsf__t5_block_sizes(out);
+    nets->blocks = (gsf__nn_block*)gsf_alloc_zeroed(ctx, (size_t)out->layers, sizeof *nets->blocks);
     if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    return gsf__nn_end_loading(&loader, gsf__t5_bind_all(&loader, out, nets));
+    return gsf__nn_end_loading(&loader, gsf__t5_bind(&loader, out, nets));
 }
 
 GSF_API gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
@@ -9659,176 +9788,82 @@ static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_tensor* positions, i
 
 // ---- one pass
 
-typedef struct gsf__t5_run {
-    gsf_context* ctx;
-    const gsf_nn_t5* net;
-    const gsf_nn_t5_input* in;
-    gsf_nn_workspace workspace;
-    int64_t rows;  // batch * tokens
-    float* x;      // (rows, width): the residual stream
-    float* normed; // (rows, width)
-    float* wide;   // q, k, v (rows, heads * head_dim) each; or both parts of the feed-forward's hidden layer
-    float* bias;   // (heads, tokens, tokens)
-    float* norm;   // (width): weights of the norm at work
-} gsf__t5_run;
-
-typedef struct gsf__t5_layout { double x, wide, bias, total; } gsf__t5_layout; // floats
-
-static gsf__t5_layout gsf__t5_plan(const gsf_nn_t5* c, const gsf_nn_t5_input* in) {
-    const double rows = (double)in->batch * in->tokens, n = in->tokens;
-    const double qkv = 3.0 * rows * c->heads * c->head_dim, ff = 2.0 * rows * c->hidden;
-    const double scratch = 2.0 * n + (double)c->buckets * c->heads; // of gsf__t5_fill_bias
-    gsf__t5_layout l;
-    l.x = rows * c->width;
-    l.wide = qkv > ff ? qkv : ff;
-    if (l.wide < scratch) l.wide = scratch;
-    l.bias = n * n * c->heads;
-    l.total = 2.0 * l.x + l.wide + l.bias + c->width;
-    return l;
+// Shares out `memory`, or counts its floats.
+static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_input* in, float** x, float** bias,
+                              float* memory) {
+    gsf__nn_arena arena = {memory, 0};
+    const gsf__nn_block_sizes s = gsf__t5_block_sizes(c);
+    const int64_t rows = (int64_t)in->batch * in->tokens, inner = (int64_t)c->heads * c->head_dim;
+    const size_t d = (size_t)c->width, n = (size_t)in->tokens, heads = (size_t)c->heads;
+    const size_t scratch = 2 * n + (size_t)c->buckets * heads; // of gsf__t5_fill_bias
+    const size_t wide = gsf__nn_larger(gsf__nn_wide(&s, rows, rows), scratch);
+    run->wide_count = (int64_t)wide;
+    run->vectors_size = d;
+    *x = gsf__nn_share(&arena, gsf__nn_product((size_t)rows, d));
+    run->normed = gsf__nn_share(&arena, gsf__nn_product((size_t)rows, gsf__nn_larger(d, (size_t)inner)));
+    run->wide = gsf__nn_share(&arena, wide);
+    *bias = gsf__nn_share(&arena, gsf__nn_product(gsf__nn_product(n, n), heads));
+    run->vectors = gsf__nn_share(&arena, d);
+    return arena.used;
 }
 
 GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops) {
-    const double rows = (double)input->batch * input->tokens, d = t5->width, inner = (double)t5->heads * t5->head_dim;
-    *bytes = gsf__t5_plan(t5, input).total * sizeof(float);
-    *flops = t5->layers * rows * (2.0 * d * (4.0 * inner + 3.0 * t5->hidden) + 4.0 * inner * input->tokens);
+    const gsf__nn_block_sizes s = gsf__t5_block_sizes(t5);
+    gsf__nn_run run;
+    float *x, *bias;
+    *bytes = (double)gsf__t5_lay_out(&run, t5, input, &x, &bias, NULL) * sizeof(float);
+    *flops = t5->layers * gsf__nn_block_flops(&s, input->batch, input->tokens);
 }
 
-static void gsf__t5_tap(const gsf__t5_run* run, int32_t layer, const char* name, const float* x) {
-    const gsf_nn_t5_input* in = run->in;
-    char whole[64];
-    if (!in->tap_fn) return;
-    if (layer < 0) snprintf(whole, sizeof whole, "%s", name);
-    else snprintf(whole, sizeof whole, "block%d.%s", (int)layer, name);
-    for (int32_t b = 0; b < in->batch; b++)
-        in->tap_fn(in->tap_user, whole, b, x + (int64_t)b * in->tokens * run->net->width, in->tokens, run->net->width);
-}
-
-static void gsf__t5_norm(gsf__t5_run* run, const gsf_tensor* weight, float* out) {
-    gsf_nn_read_tensor(weight, 0, weight->count, run->norm);
-    gsf_nn_rms_norm(run->ctx, run->x, run->rows, run->net->width, run->norm, (float)run->net->norm_eps, out);
-}
-
-// y = activation(x w^T), or x += that where `add`.
-static gsf_result gsf__t5_linear(gsf__t5_run* run, const float* x, const gsf_tensor* weight, gsf_nn_activation activation,
-                                 int add, float* y) {
-    gsf_nn_linear_desc d;
-    memset(&d, 0, sizeof d);
-    d.x = x;
-    d.rows = run->rows;
-    d.weight = weight;
-    d.activation = activation;
-    d.accumulate = add;
-    d.y = y;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
-}
-
-// x += attention(norm(x)): logits are not scaled, and their bias is by relative position.
-static gsf_result gsf__t5_attention(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
-    const gsf_nn_t5* c = run->net;
-    const int64_t n = run->in->tokens, inner = (int64_t)c->heads * c->head_dim;
-    float *q = run->wide, *k = q + run->rows * inner, *v = k + run->rows * inner;
-    gsf__t5_norm(run, block->attention_norm, run->normed);
-    gsf__t5_tap(run, layer, "attn_norm", run->normed);
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->q, GSF_NN_LINEAR, 0, q));
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->k, GSF_NN_LINEAR, 0, k));
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->v, GSF_NN_LINEAR, 0, v));
-    gsf_nn_attention_desc d;
-    memset(&d, 0, sizeof d);
-    d.queries = d.keys = n;
-    d.heads = c->heads;
-    d.head_dim = c->head_dim;
-    d.bias = run->bias;
-    d.scale = 1.0f;
-    for (int64_t b = 0; b < run->in->batch; b++) {
-        d.q = q + b * n * inner;
-        d.k = k + b * n * inner;
-        d.v = v + b * n * inner;
-        d.out = q + b * n * inner;
-        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &d));
-    }
-    GSF__TRY(gsf__t5_linear(run, q, block->out, GSF_NN_LINEAR, 1, run->x));
-    gsf__t5_tap(run, layer, "after_attn", run->x);
-    return GSF_OK;
-}
-
-typedef struct gsf__t5_product {
-    float* a;
-    const float* b;
-    int64_t count;
-} gsf__t5_product;
-
-static void gsf__t5_multiply(void* arg, size_t chunk, int worker) { // a *= b
-    const gsf__t5_product* job = (const gsf__t5_product*)arg;
-    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
-    (void)worker;
-    for (int64_t i = begin; i < end; i++) job->a[i] *= job->b[i];
-}
-
-// x += down(gelu(gate(norm(x))) * up(norm(x)))
-static gsf_result gsf__t5_feed_forward(gsf__t5_run* run, int32_t layer, const gsf__t5_block* block) {
-    float *gate = run->wide, *up = gate + run->rows * run->net->hidden;
-    gsf__t5_norm(run, block->ff_norm, run->normed);
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->gate, GSF_NN_GELU_TANH, 0, gate));
-    GSF__TRY(gsf__t5_linear(run, run->normed, block->up, GSF_NN_LINEAR, 0, up));
-    gsf__t5_product job = {gate, up, run->rows * run->net->hidden};
-    gsf__parallel_for(run->ctx, gsf__nn_chunks(job.count, GSF__NN_CHUNK), gsf__t5_multiply, &job);
-    GSF__TRY(gsf__t5_linear(run, gate, block->down, GSF_NN_LINEAR, 1, run->x));
-    gsf__t5_tap(run, layer, "out", run->x);
-    return GSF_OK;
-}
-
-static gsf_result gsf__t5_check(const gsf__t5_run* run, const char* stage, const char* prefix, const float* x) {
-    return gsf__nn_check_finite(run->ctx, &run->net->weights, "t5", prefix, stage, x, run->rows * run->net->width);
-}
-
-static gsf_result gsf__t5_forward(gsf__t5_run* run, float* out) {
-    const gsf_nn_t5* c = run->net;
+static gsf_result gsf__t5_forward(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_input* in, float* x, float* bias,
+                                  float* out) {
     const gsf__t5_nets* nets = (const gsf__t5_nets*)c->nets;
-    for (int64_t r = 0; r < run->rows; r++)
-        gsf_nn_read_tensor(nets->embedding, (int64_t)run->in->ids[r] * c->width, c->width, run->x + r * c->width);
-    GSF__TRY(gsf__t5_check(run, "the embedding", "shared.", run->x));
-    gsf__t5_tap(run, -1, "embed", run->x);
-    gsf__t5_fill_bias(c, nets->positions, run->in->tokens, run->wide, run->bias);
+    const int64_t d = c->width, rows = (int64_t)in->batch * in->tokens;
+    for (int64_t r = 0; r < rows; r++) gsf_nn_read_tensor(nets->embedding, (int64_t)in->ids[r] * d, d, x + r * d);
+    GSF__TRY(gsf__nn_check(run, "the embedding", "shared.", x, rows * d));
+    gsf__nn_reveal(run, x, 0, in->batch, in->tokens, d, "embed");
+    gsf__t5_fill_bias(c, nets->positions, in->tokens, run->wide, bias);
+    run->sizes = &nets->sizes;
+    run->bias = bias;
+    run->scale = 1.0f; // of the logits, which are not scaled
+    run->steps = c->layers;
     for (int32_t i = 0; i < c->layers; i++) {
-        char name[48];
-        GSF__TRY(gsf__t5_attention(run, i, &nets->blocks[i]));
-        GSF__TRY(gsf__t5_feed_forward(run, i, &nets->blocks[i]));
-        snprintf(name, sizeof name, "encoder.block.%d.", (int)i);
-        GSF__TRY(gsf__t5_check(run, name, name, run->x));
-        GSF__TRY(gsf__check_cancel(run->ctx));
-        gsf__progress(run->ctx, "text", i + 1, c->layers);
+        snprintf(run->label, sizeof run->label, "block%d.", (int)i);
+        GSF__TRY(gsf__nn_block_forward(run, &nets->blocks[i], i, x, in->batch, in->tokens));
+        gsf__nn_reveal(run, x, 0, in->batch, in->tokens, d, "out");
+        GSF__TRY(gsf__nn_end_block(run, "encoder.block.", i, x, rows * d));
     }
-    gsf__t5_norm(run, nets->final_norm, out);
-    return gsf__t5_check(run, "the last norm", "encoder.final", out);
+    gsf_nn_rms_norm(run->ctx, x, rows, d, gsf__nn_widen(run, nets->norm.weight, 0), nets->sizes.eps, out);
+    return gsf__nn_check(run, "the last norm", "encoder.final", out, rows * d);
 }
 
 GSF_API gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input, float* out) {
-    gsf__t5_run run;
+    const int64_t rows = (int64_t)input->batch * input->tokens;
+    gsf__nn_run run;
+    float *x, *bias;
     memset(&run, 0, sizeof run);
     if (!input->ids || input->batch < 1 || input->tokens < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: no tokens");
-    run.ctx = ctx;
-    run.net = t5;
-    run.in = input;
-    run.rows = (int64_t)input->batch * input->tokens;
-    for (int64_t i = 0; i < run.rows; i++)
+    for (int64_t i = 0; i < rows; i++)
         if (input->ids[i] < 0 || input->ids[i] >= t5->vocabulary)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "t5: id %d; the vocabulary has %d", (int)input->ids[i],
                             (int)t5->vocabulary);
-    const gsf__t5_layout l = gsf__t5_plan(t5, input);
-    if (l.total > (double)(SIZE_MAX / 16))
+    run.ctx = ctx;
+    run.name = "t5";
+    run.stage = "text";
+    run.weights = &t5->weights;
+    run.tap = input->_tap;
+    const size_t floats = gsf__t5_lay_out(&run, t5, input, &x, &bias, NULL);
+    if (floats > SIZE_MAX / 16)
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "t5: %d tokens of %d prompts are too many", (int)input->tokens,
                         (int)input->batch);
-    run.x = (float*)gsf_alloc(ctx, (size_t)l.total, sizeof(float));
-    if (!run.x) return GSF_ERROR_OUT_OF_MEMORY;
-    run.normed = run.x + (size_t)l.x;
-    run.wide = run.normed + (size_t)l.x;
-    run.bias = run.wide + (size_t)l.wide;
-    run.norm = run.bias + (size_t)l.bias;
-    const gsf_result result = gsf__t5_forward(&run, out);
-    if (result) memset(out, 0, (size_t)l.x * sizeof(float));
+    float* memory = (float*)gsf_alloc(ctx, floats, sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__t5_lay_out(&run, t5, input, &x, &bias, memory);
+    const gsf_result result = gsf__t5_forward(&run, t5, input, x, bias, out);
+    if (result) memset(out, 0, (size_t)(rows * t5->width) * sizeof(float));
     gsf_nn_destroy_workspace(ctx, &run.workspace);
-    gsf_free(ctx, run.x);
+    gsf_free(ctx, memory);
     return result;
 }
 
@@ -10891,152 +10926,88 @@ GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, co
 
 // ---- >>nn transformer -----------------------------------------------------------
 
-typedef struct gsf__dit_attention { // one attention layer's tensors
-    const gsf_tensor *q_weight, *q_bias, *k_weight, *k_bias, *v_weight, *v_bias, *out_weight, *out_bias;
-    const gsf_tensor *norm_q_weight, *norm_q_bias, *norm_k_weight, *norm_k_bias;
+typedef struct gsf__dit_attention { // its keys and values come from the stream itself, or from the references
+    gsf__nn_layer q, k, v, out, norm_q, norm_k;
 } gsf__dit_attention;
 
 typedef struct gsf__dit_norm { // LayerNorm whose scale, shift and gates come from the time step
-    const gsf_tensor *linear_weight, *linear_bias, *weight, *bias;
+    gsf__nn_layer linear, norm;
 } gsf__dit_norm;
 
 typedef struct gsf__dit_block {
     gsf__dit_norm norm1, norm2;
     gsf__dit_attention self, cross;
-    const gsf_tensor *norm_cross_weight, *norm_cross_bias;
-    const gsf_tensor *up_weight, *up_bias, *down_weight, *down_bias; // feed-forward
+    gsf__nn_layer norm_cross, up, down; // feed-forward
 } gsf__dit_block;
 
-typedef struct gsf__dit_projector {
-    const gsf_tensor *weight, *bias, *norm_weight, *norm_bias;
-} gsf__dit_projector;
+typedef struct gsf__dit_projector { gsf__nn_layer linear, norm; } gsf__dit_projector;
 
 typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
     gsf__dit_block* blocks;
     gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
     gsf__dit_projector dino, vggt;
     gsf__dit_norm norm_out;
-    const gsf_tensor *patch_weight, *patch_bias, *text_weight, *text_bias, *positions;
-    const gsf_tensor *time1_weight, *time1_bias, *time2_weight, *time2_bias;
-    const gsf_tensor *norm_final_weight, *norm_final_bias, *out_weight, *out_bias;
+    gsf__nn_layer patch, text, time1, time2, norm_final, out;
+    const gsf_tensor* positions;
 } gsf__dit_nets;
 
 static int64_t gsf__dit_width(const gsf_nn_transformer* c) { return (int64_t)c->heads * c->head_dim; }
 
 // ---- opening: which tensor goes where, and its shape
 
-// Shapes as letters: one dimension each.
-//   d width  h head_dim  f 4 width  t time channels  x text channels  m 6 width  n 2 width  p patch tokens' outputs
-//   i in_channels  k patch  r any (the reference tokens' channels)  1 one  s text and video tokens of the table
-typedef struct gsf__dit_entry {
-    const char* name;
-    const char* shape;
-    size_t offset; // of the pointer in its struct
-    int kind;      // see GSF__DIT_*
-} gsf__dit_entry;
+#define GSF__DIT_AT(member) GSF__NN_AT(gsf__dit_block, member)
+#define GSF__DIT_ATTENTION(prefix, member)                                                           \
+    {prefix ".to_q", "dd", offsetof(gsf__dit_block, member.q), GSF__NN_BIASED, 'b'},                 \
+    {prefix ".to_k", "dd", offsetof(gsf__dit_block, member.k), GSF__NN_BIASED, 'b'},                 \
+    {prefix ".to_v", "dd", offsetof(gsf__dit_block, member.v), GSF__NN_BIASED, 'b'},                 \
+    {prefix ".to_out.0", "dd", GSF__DIT_AT(member.out)},                                             \
+    {prefix ".norm_q", "h", GSF__DIT_AT(member.norm_q)},                                             \
+    {prefix ".norm_k", "h", GSF__DIT_AT(member.norm_k)}
 
-enum { GSF__DIT_ALWAYS = 0, GSF__DIT_ATTENTION_BIAS, GSF__DIT_LEARNED };
-
-#define GSF__DIT_ATTENTION(prefix, member)                                                                          \
-    {prefix ".to_q.weight", "dd", offsetof(gsf__dit_block, member.q_weight), GSF__DIT_ALWAYS},                      \
-    {prefix ".to_k.weight", "dd", offsetof(gsf__dit_block, member.k_weight), GSF__DIT_ALWAYS},                      \
-    {prefix ".to_v.weight", "dd", offsetof(gsf__dit_block, member.v_weight), GSF__DIT_ALWAYS},                      \
-    {prefix ".to_q.bias", "d", offsetof(gsf__dit_block, member.q_bias), GSF__DIT_ATTENTION_BIAS},                   \
-    {prefix ".to_k.bias", "d", offsetof(gsf__dit_block, member.k_bias), GSF__DIT_ATTENTION_BIAS},                   \
-    {prefix ".to_v.bias", "d", offsetof(gsf__dit_block, member.v_bias), GSF__DIT_ATTENTION_BIAS},                   \
-    {prefix ".to_out.0.weight", "dd", offsetof(gsf__dit_block, member.out_weight), GSF__DIT_ALWAYS},                \
-    {prefix ".to_out.0.bias", "d", offsetof(gsf__dit_block, member.out_bias), GSF__DIT_ALWAYS},                     \
-    {prefix ".norm_q.weight", "h", offsetof(gsf__dit_block, member.norm_q_weight), GSF__DIT_ALWAYS},                \
-    {prefix ".norm_q.bias", "h", offsetof(gsf__dit_block, member.norm_q_bias), GSF__DIT_ALWAYS},                    \
-    {prefix ".norm_k.weight", "h", offsetof(gsf__dit_block, member.norm_k_weight), GSF__DIT_ALWAYS},                \
-    {prefix ".norm_k.bias", "h", offsetof(gsf__dit_block, member.norm_k_bias), GSF__DIT_ALWAYS}
-
-#define GSF__DIT_NORM(prefix, member, shape)                                                                        \
-    {prefix ".linear.weight", shape "t", offsetof(gsf__dit_block, member.linear_weight), GSF__DIT_ALWAYS},          \
-    {prefix ".linear.bias", shape, offsetof(gsf__dit_block, member.linear_bias), GSF__DIT_ALWAYS},                  \
-    {prefix ".norm.weight", "d", offsetof(gsf__dit_block, member.weight), GSF__DIT_ALWAYS},                         \
-    {prefix ".norm.bias", "d", offsetof(gsf__dit_block, member.bias), GSF__DIT_ALWAYS}
-
-static const gsf__dit_entry gsf__dit_block_entries[] = { // below transformer_blocks.N.
-    GSF__DIT_NORM("norm1", norm1, "m"),
-    GSF__DIT_NORM("norm2", norm2, "m"),
+static const gsf__nn_entry gsf__dit_block_entries[] = { // below transformer_blocks.N.
+    {"norm1.linear", "mt", GSF__DIT_AT(norm1.linear)},
+    {"norm1.norm", "d", GSF__DIT_AT(norm1.norm)},
+    {"norm2.linear", "mt", GSF__DIT_AT(norm2.linear)},
+    {"norm2.norm", "d", GSF__DIT_AT(norm2.norm)},
     GSF__DIT_ATTENTION("attn1", self),
     GSF__DIT_ATTENTION("attn_cross", cross),
-    {"norm_cross.weight", "d", offsetof(gsf__dit_block, norm_cross_weight), GSF__DIT_ALWAYS},
-    {"norm_cross.bias", "d", offsetof(gsf__dit_block, norm_cross_bias), GSF__DIT_ALWAYS},
-    {"ff.net.0.proj.weight", "fd", offsetof(gsf__dit_block, up_weight), GSF__DIT_ALWAYS},
-    {"ff.net.0.proj.bias", "f", offsetof(gsf__dit_block, up_bias), GSF__DIT_ALWAYS},
-    {"ff.net.2.weight", "df", offsetof(gsf__dit_block, down_weight), GSF__DIT_ALWAYS},
-    {"ff.net.2.bias", "d", offsetof(gsf__dit_block, down_bias), GSF__DIT_ALWAYS},
-};
-
-#define GSF__DIT_AT(member) offsetof(gsf__dit_nets, member), GSF__DIT_ALWAYS
-static const gsf__dit_entry gsf__dit_entries[] = {
-    {"patch_embed.proj.weight", "dikk", GSF__DIT_AT(patch_weight)},
-    {"patch_embed.proj.bias", "d", GSF__DIT_AT(patch_bias)},
-    {"patch_embed.text_proj.weight", "dx", GSF__DIT_AT(text_weight)},
-    {"patch_embed.text_proj.bias", "d", GSF__DIT_AT(text_bias)},
-    {"patch_embed.pos_embedding", "1sd", offsetof(gsf__dit_nets, positions), GSF__DIT_LEARNED},
-    {"time_embedding.linear_1.weight", "td", GSF__DIT_AT(time1_weight)},
-    {"time_embedding.linear_1.bias", "t", GSF__DIT_AT(time1_bias)},
-    {"time_embedding.linear_2.weight", "tt", GSF__DIT_AT(time2_weight)},
-    {"time_embedding.linear_2.bias", "t", GSF__DIT_AT(time2_bias)},
-    {"projector_dino.proj.weight", "dr", GSF__DIT_AT(dino.weight)},
-    {"projector_dino.proj.bias", "d", GSF__DIT_AT(dino.bias)},
-    {"projector_dino.norm.weight", "d", GSF__DIT_AT(dino.norm_weight)},
-    {"projector_dino.norm.bias", "d", GSF__DIT_AT(dino.norm_bias)},
-    {"projector_vggt.proj.weight", "dr", GSF__DIT_AT(vggt.weight)},
-    {"projector_vggt.proj.bias", "d", GSF__DIT_AT(vggt.bias)},
-    {"projector_vggt.norm.weight", "d", GSF__DIT_AT(vggt.norm_weight)},
-    {"projector_vggt.norm.bias", "d", GSF__DIT_AT(vggt.norm_bias)},
-    {"norm_final.weight", "d", GSF__DIT_AT(norm_final_weight)},
-    {"norm_final.bias", "d", GSF__DIT_AT(norm_final_bias)},
-    {"norm_out.linear.weight", "nt", GSF__DIT_AT(norm_out.linear_weight)},
-    {"norm_out.linear.bias", "n", GSF__DIT_AT(norm_out.linear_bias)},
-    {"norm_out.norm.weight", "d", GSF__DIT_AT(norm_out.weight)},
-    {"norm_out.norm.bias", "d", GSF__DIT_AT(norm_out.bias)},
-    {"proj_out.weight", "pd", GSF__DIT_AT(out_weight)},
-    {"proj_out.bias", "p", GSF__DIT_AT(out_bias)},
+    {"norm_cross", "d", GSF__DIT_AT(norm_cross)},
+    {"ff.net.0.proj", "fd", GSF__DIT_AT(up)},
+    {"ff.net.2", "df", GSF__DIT_AT(down)},
+    GSF__NN_END,
 };
 #undef GSF__DIT_AT
-#undef GSF__DIT_NORM
 #undef GSF__DIT_ATTENTION
 
-static int64_t gsf__dit_dimension(const gsf_nn_transformer* c, char letter) {
-    const int64_t d = gsf__dit_width(c);
-    switch (letter) {
-        case 'd': return d;
-        case 'h': return c->head_dim;
-        case 'f': return 4 * d;
-        case 't': return c->time_channels;
-        case 'x': return c->text_channels;
-        case 'm': return 6 * d;
-        case 'n': return 2 * d;
-        case 'p': return (int64_t)c->out_channels * c->patch * c->patch;
-        case 'i': return c->in_channels;
-        case 'k': return c->patch;
-        case '1': return 1;
-        case 's':
-            return c->text_tokens + (int64_t)((c->sample_frames - 1) / c->temporal_ratio + 1) *
-                                        (c->sample_height / c->patch) * (c->sample_width / c->patch);
-        default: return -1; // any
-    }
-}
+#define GSF__DIT_AT(member) GSF__NN_AT(gsf__dit_nets, member)
+static const gsf__nn_entry gsf__dit_entries[] = {
+    {"patch_embed.proj", "dikk", GSF__DIT_AT(patch)},
+    {"patch_embed.text_proj", "dx", GSF__DIT_AT(text)},
+    {"patch_embed.pos_embedding", "1sd", offsetof(gsf__dit_nets, positions), GSF__NN_TENSOR, 'l'},
+    {"time_embedding.linear_1", "td", GSF__DIT_AT(time1)},
+    {"time_embedding.linear_2", "tt", GSF__DIT_AT(time2)},
+    {"projector_dino.proj", "d?", GSF__DIT_AT(dino.linear)},
+    {"projector_dino.norm", "d", GSF__DIT_AT(dino.norm)},
+    {"projector_vggt.proj", "d?", GSF__DIT_AT(vggt.linear)},
+    {"projector_vggt.norm", "d", GSF__DIT_AT(vggt.norm)},
+    {"norm_final", "d", GSF__DIT_AT(norm_final)},
+    {"norm_out.linear", "nt", GSF__DIT_AT(norm_out.linear)},
+    {"norm_out.norm", "d", GSF__DIT_AT(norm_out.norm)},
+    {"proj_out", "pd", GSF__DIT_AT(out)},
+    GSF__NN_END,
+};
+#undef GSF__DIT_AT
 
-static gsf_result gsf__dit_bind(gsf__nn_loader* loader, const gsf_nn_transformer* c, const gsf__dit_entry* entries,
-                                size_t count, const char* prefix, void* where) {
-    for (size_t i = 0; i < count; i++) {
-        const gsf__dit_entry* e = &entries[i];
-        if (e->kind == GSF__DIT_ATTENTION_BIAS && !c->attention_bias) continue;
-        if (e->kind == GSF__DIT_LEARNED && !c->learned_positions) continue;
-        int64_t shape[GSF_NN_MAX_RANK];
-        int rank = 0;
-        for (const char* s = e->shape; *s; s++) shape[rank++] = gsf__dit_dimension(c, *s);
-        const gsf_tensor* tensor;
-        GSF__TRY(gsf__nn_need(loader, &tensor, rank, shape, "%s%s", prefix, e->name));
-        memcpy((char*)where + e->offset, &tensor, sizeof tensor);
-    }
-    return GSF_OK;
+// d width, h head_dim, f 4 width, m 6 width, n 2 width, t time channels, x text channels, i in_channels, k patch, p outputs
+// of a token, s text and video tokens of the learned table, b 0 without biases of q, k, v, l 0 without that table.
+static gsf__nn_sizes gsf__dit_tensor_sizes(const gsf_nn_transformer* c) {
+    const int64_t d = gsf__dit_width(c), frames = c->temporal_ratio ? (c->sample_frames - 1) / c->temporal_ratio + 1 : 0;
+    const int64_t places = c->text_tokens + frames * (c->sample_height / c->patch) * (c->sample_width / c->patch);
+    const gsf__nn_sizes sizes = {{{'d', d}, {'h', c->head_dim}, {'f', 4 * d}, {'m', 6 * d}, {'n', 2 * d},
+                                  {'t', c->time_channels}, {'x', c->text_channels}, {'i', c->in_channels}, {'k', c->patch},
+                                  {'p', (int64_t)c->out_channels * c->patch * c->patch}, {'s', places},
+                                  {'b', c->attention_bias}, {'l', c->learned_positions}}};
+    return sizes;
 }
 
 static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
@@ -11072,25 +11043,23 @@ static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transf
     return GSF_OK;
 }
 
-static gsf_result gsf__dit_bind_all(gsf_context* ctx, gsf_nn_transformer* net) {
+static gsf_result gsf__dit_bind(gsf_context* ctx, gsf_nn_transformer* net) {
     gsf__nn_loader loader;
+    const gsf__nn_sizes sizes = gsf__dit_tensor_sizes(net);
+    void* blocks = NULL;
     gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
     net->nets = nets;
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    nets->blocks = (gsf__dit_block*)gsf_alloc_zeroed(ctx, (size_t)net->layers, sizeof(gsf__dit_block));
-    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
-    gsf_result result = gsf__dit_bind(&loader, net, gsf__dit_entries, GSF__COUNT(gsf__dit_entries), "", nets);
-    for (int32_t i = 0; i < net->layers && !result; i++) {
-        char prefix[48];
-        snprintf(prefix, sizeof prefix, "transformer_blocks.%d.", (int)i);
-        result = gsf__dit_bind(&loader, net, gsf__dit_block_entries, GSF__COUNT(gsf__dit_block_entries), prefix,
-                               &nets->blocks[i]);
-    }
+    gsf_result result = gsf__nn_bind(&loader, &sizes, gsf__dit_entries, "", nets);
+    if (!result)
+        result = gsf__nn_bind_blocks(&loader, &sizes, gsf__dit_block_entries, "transformer_blocks.", net->layers,
+                                     sizeof *nets->blocks, &blocks);
+    nets->blocks = (gsf__dit_block*)blocks;
     if (!net->learned_positions) gsf__nn_ignore(&loader, "patch_embed.pos_embedding"); // computed
     GSF__TRY(gsf__nn_end_loading(&loader, result));
-    net->dino_channels = (int32_t)nets->dino.weight->shape[1];
-    net->vggt_channels = (int32_t)nets->vggt.weight->shape[1];
+    net->dino_channels = (int32_t)nets->dino.linear.weight->shape[1];
+    net->vggt_channels = (int32_t)nets->vggt.linear.weight->shape[1];
     return GSF_OK;
 }
 
@@ -11117,8 +11086,8 @@ GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transfor
     for (int32_t i = 0; i < transformer->layers; i++) {
         const gsf__dit_block* b = &nets->blocks[i];
         const gsf_tensor* const layers[] = {
-            b->self.q_weight, b->self.k_weight, b->self.v_weight, b->self.out_weight, b->cross.q_weight,
-            b->cross.k_weight, b->cross.v_weight, b->cross.out_weight, b->up_weight, b->down_weight};
+            b->self.q.weight, b->self.k.weight, b->self.v.weight, b->self.out.weight, b->cross.q.weight,
+            b->cross.k.weight, b->cross.v.weight, b->cross.out.weight, b->up.weight, b->down.weight};
         for (size_t k = 0; k < GSF__COUNT(layers); k++) {
             gsf_nn_quantized* q = &nets->quantized[layers[k] - w->tensors];
             if (!q->data) GSF__TRY(gsf_nn_quantize_weight(ctx, layers[k], 0, q));
@@ -11138,7 +11107,7 @@ GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder,
     if (!result) result = gsf__dit_read_config(&file, out);
     gsf__nn_close_config(&file);
     if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
-    if (!result) result = gsf__dit_bind_all(ctx, out);
+    if (!result) result = gsf__dit_bind(ctx, out);
     if (result) gsf_nn_destroy_transformer(ctx, out);
     return result;
 }
@@ -11146,10 +11115,9 @@ GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder,
 // ---- one forward pass
 
 typedef struct gsf__dit_run {
-    gsf_context* ctx;
+    gsf__nn_run nn;
     const gsf_nn_transformer* net;
     const gsf__dit_nets* nets;
-    gsf_nn_workspace workspace;
     const gsf_nn_transformer_input* in;
     int64_t width, text, video, tokens; // tokens = text + video: rows of a sample
     float* x;       // (batch, tokens, width): the residual stream, text first
@@ -11158,148 +11126,94 @@ typedef struct gsf__dit_run {
     int64_t qkv_rows;
     float* time;    // (batch, time_channels): SiLU of the time embedding
     float* modulation; // (6 width)
-    float* vectors; // biases and norm weights of the block at work, widened
-    size_t vectors_used, vectors_size;
     float *cos, *sin; // (video, head_dim) or NULL
     float* probe;   // (tokens, width): what a gated layer adds; only with a tap
-    char label[48]; // of the block at work, for taps and errors
 } gsf__dit_run;
 
-static void gsf__dit_tap(const gsf__dit_run* run, const char* name, int32_t row, const float* data, int64_t rows,
-                         int64_t columns) {
-    if (!run->in->tap_fn || !data) return;
-    char whole[96];
-    snprintf(whole, sizeof whole, "%s%s", run->label, name);
-    run->in->tap_fn(run->in->tap_user, whole, row, data, rows, columns);
-}
-
-// A small tensor as floats; valid until the next block begins.
-static const float* gsf__dit_vector(gsf__dit_run* run, const gsf_tensor* tensor) {
-    if (!tensor) return NULL;
-    float* out = run->vectors + run->vectors_used;
-    GSF_ASSERT(run->vectors_used + (size_t)tensor->count <= run->vectors_size);
-    run->vectors_used += (size_t)tensor->count;
-    gsf_nn_read_tensor(tensor, 0, tensor->count, out);
-    return out;
-}
-
-static gsf_result gsf__dit_apply(gsf__dit_run* run, const gsf_nn_linear_desc* desc) {
-    const gsf_nn_quantized* q = run->nets->quantized;
-    if (q) q += desc->weight - run->net->weights.tensors;
-    if (q && q->data) return gsf_nn_linear_int8(run->ctx, &run->workspace, desc, q);
-    gsf_nn_linear_desc d = *desc;
-    d.bf16 = run->net->bf16;
-    return gsf_nn_linear(run->ctx, &run->workspace, &d);
-}
-
-static gsf_result gsf__dit_linear(gsf__dit_run* run, const float* x, int64_t rows, const gsf_tensor* weight,
-                                  const gsf_tensor* bias, gsf_nn_activation activation, float* y) {
-    gsf_nn_linear_desc d;
-    memset(&d, 0, sizeof d);
-    d.x = x;
-    d.rows = rows;
-    d.weight = weight;
-    d.bias = bias;
-    d.activation = activation;
-    d.y = y;
-    return gsf__dit_apply(run, &d);
+static gsf_result gsf__dit_linear(gsf__dit_run* run, const gsf__nn_layer* layer, const float* x, int64_t rows, float* y) {
+    return gsf__nn_linear(&run->nn, layer, GSF_NN_LINEAR, x, rows, y, 0);
 }
 
 // x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
-static gsf_result gsf__dit_add(gsf__dit_run* run, const float* h, int64_t rows, const gsf_tensor* weight,
-                               const gsf_tensor* bias, const float* gate, float* x, float* probe) {
-    gsf_nn_linear_desc d;
-    memset(&d, 0, sizeof d);
-    d.x = h;
-    d.rows = rows;
-    d.weight = weight;
-    d.bias = bias;
-    d.gate = gate;
-    d.accumulate = 1;
-    d.y = x;
-    if (probe) GSF__TRY(gsf__dit_linear(run, h, rows, weight, bias, GSF_NN_LINEAR, probe));
-    return gsf__dit_apply(run, &d);
+static gsf_result gsf__dit_add(gsf__dit_run* run, const gsf__nn_layer* layer, const float* gate, const float* h, int64_t rows,
+                               float* x, float* probe) {
+    if (probe) GSF__TRY(gsf__dit_linear(run, layer, h, rows, probe));
+    return gsf__nn_add(&run->nn, layer, gate, h, rows, x);
+}
+
+static void gsf__dit_norm_heads(gsf__dit_run* run, const gsf__nn_layer* norm, int rotate, float* x, int64_t rows) {
+    const gsf_nn_transformer* c = run->net;
+    const float eps = 1e-6f; // fixed in the official code
+    gsf__nn_norm_heads(&run->nn, norm, eps, c->heads, c->head_dim, rotate ? run->cos : NULL, rotate ? run->sin : NULL,
+                       rotate ? run->text : 0, x, rows, run->width);
+}
+
+static gsf_result gsf__dit_attend(gsf__dit_run* run, int64_t queries, int64_t keys, const float* q, const float* k,
+                                  const float* v) { // into run->normed
+    gsf_nn_attention_desc a;
+    memset(&a, 0, sizeof a);
+    a.queries = queries;
+    a.keys = keys;
+    a.heads = run->net->heads;
+    a.head_dim = run->net->head_dim;
+    a.q = q;
+    a.k = k;
+    a.v = v;
+    a.out = run->normed;
+    return gsf__nn_attend(&run->nn, &a, 1);
 }
 
 // Both streams of a sample through LN(x) (1 + scale) + shift with their own shift and scale. The six parts of the
 // modulation: shift, scale, gate of the video, then of the text.
 static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t row, const gsf__dit_norm* norm) {
     const int64_t d = run->width;
-    const float* x = run->x + row * run->tokens * d;
-    float* m = run->modulation;
-    GSF__TRY(gsf__dit_linear(run, run->time + row * run->net->time_channels, 1, norm->linear_weight,
-                             norm->linear_bias, GSF_NN_LINEAR, m));
-    const float *w = gsf__dit_vector(run, norm->weight), *b = gsf__dit_vector(run, norm->bias);
+    const float *x = run->x + row * run->tokens * d, *time = run->time + row * run->net->time_channels;
     const float eps = (float)run->net->norm_eps;
-    float* video = run->normed + run->text * d;
-    gsf_nn_layer_norm_modulated(run->ctx, x, run->text, d, w, b, eps, m + 4 * d, m + 3 * d, run->normed);
-    gsf_nn_layer_norm_modulated(run->ctx, x + run->text * d, run->video, d, w, b, eps, m + d, m, video);
-    if (run->in->tap_fn) {
-        char part[32];
-        snprintf(part, sizeof part, "%s.0", name);
-        gsf__dit_tap(run, part, row, video, run->video, d);
-        snprintf(part, sizeof part, "%s.1", name);
-        gsf__dit_tap(run, part, row, run->normed, run->text, d);
-        snprintf(part, sizeof part, "%s.2", name);
-        gsf__dit_tap(run, part, row, m + 2 * d, 1, d);
-        snprintf(part, sizeof part, "%s.3", name);
-        gsf__dit_tap(run, part, row, m + 5 * d, 1, d);
-    }
+    float *m = run->modulation, *video = run->normed + run->text * d;
+    GSF__TRY(gsf__dit_linear(run, &norm->linear, time, 1, m));
+    const gsf__nn_vectors v = gsf__nn_widen_layer(&run->nn, &norm->norm);
+    gsf_nn_layer_norm_modulated(run->nn.ctx, x, run->text, d, v.weight, v.bias, eps, m + 4 * d, m + 3 * d, run->normed);
+    gsf_nn_layer_norm_modulated(run->nn.ctx, x + run->text * d, run->video, d, v.weight, v.bias, eps, m + d, m, video);
+    gsf__nn_reveal(&run->nn, video, row, 1, run->video, d, "%s.0", name);
+    gsf__nn_reveal(&run->nn, run->normed, row, 1, run->text, d, "%s.1", name);
+    gsf__nn_reveal(&run->nn, m + 2 * d, row, 1, 1, d, "%s.2", name);
+    gsf__nn_reveal(&run->nn, m + 5 * d, row, 1, 1, d, "%s.3", name);
     return GSF_OK;
 }
 
 enum { GSF__DIT_TEXT_GATE = 5, GSF__DIT_VIDEO_GATE = 2 }; // places in the modulation
-static const float gsf__dit_head_eps = 1e-6f;              // of the norms of q and k (fixed in the official code)
 
 // x += gate * attention over text and video together.
 static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const gsf__dit_attention* a) {
-    const gsf_nn_transformer* c = run->net;
     const int64_t d = run->width, n = run->tokens;
-    float *q = run->qkv, *k = q + run->qkv_rows * d, *v = k + run->qkv_rows * d;
-    float* x = run->x + row * n * d;
-    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
-    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->k_weight, a->k_bias, GSF_NN_LINEAR, k));
-    GSF__TRY(gsf__dit_linear(run, run->normed, n, a->v_weight, a->v_bias, GSF_NN_LINEAR, v));
-    gsf_nn_head_norm_rope(run->ctx, q, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
-                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
-    gsf_nn_head_norm_rope(run->ctx, k, n, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
-                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, run->cos, run->sin, run->text);
-    gsf_nn_attention_desc attention;
-    memset(&attention, 0, sizeof attention);
-    attention.queries = attention.keys = n;
-    attention.heads = c->heads;
-    attention.head_dim = c->head_dim;
-    attention.q = q;
-    attention.k = k;
-    attention.v = v;
-    attention.out = run->normed;
-    attention.bf16 = run->net->bf16;
-    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
-    float* video_probe = run->probe ? run->probe + run->text * d : NULL;
-    GSF__TRY(gsf__dit_add(run, run->normed, run->text, a->out_weight, a->out_bias,
-                          run->modulation + GSF__DIT_TEXT_GATE * d, x, run->probe));
-    GSF__TRY(gsf__dit_add(run, run->normed + run->text * d, run->video, a->out_weight, a->out_bias,
-                          run->modulation + GSF__DIT_VIDEO_GATE * d, x + run->text * d, video_probe));
-    gsf__dit_tap(run, "attn1.0", row, video_probe, run->video, d);
-    gsf__dit_tap(run, "attn1.1", row, run->probe, run->text, d);
+    const float *text_gate = run->modulation + GSF__DIT_TEXT_GATE * d, *gate = run->modulation + GSF__DIT_VIDEO_GATE * d;
+    float *q = run->qkv, *k = q + run->qkv_rows * d, *v = k + run->qkv_rows * d, *video = run->normed + run->text * d;
+    float *x = run->x + row * n * d, *probe = run->probe ? run->probe + run->text * d : NULL;
+    GSF__TRY(gsf__dit_linear(run, &a->q, run->normed, n, q));
+    GSF__TRY(gsf__dit_linear(run, &a->k, run->normed, n, k));
+    GSF__TRY(gsf__dit_linear(run, &a->v, run->normed, n, v));
+    gsf__dit_norm_heads(run, &a->norm_q, 1, q, n);
+    gsf__dit_norm_heads(run, &a->norm_k, 1, k, n);
+    GSF__TRY(gsf__dit_attend(run, n, n, q, k, v));
+    GSF__TRY(gsf__dit_add(run, &a->out, text_gate, run->normed, run->text, x, run->probe));
+    GSF__TRY(gsf__dit_add(run, &a->out, gate, video, run->video, x + run->text * d, probe));
+    gsf__nn_reveal(&run->nn, probe, row, 1, run->video, d, "attn1.0");
+    gsf__nn_reveal(&run->nn, run->probe, row, 1, run->text, d, "attn1.1");
     return GSF_OK;
 }
 
 // Keys and values of the references for one block: (2, reference tokens, width).
 static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attention* a, const float* references,
                                         float* kv) {
-    const gsf_nn_transformer* c = run->net;
-    const int64_t r = run->in->reference_tokens, d = run->width;
-    GSF__TRY(gsf__dit_linear(run, references, r, a->k_weight, a->k_bias, GSF_NN_LINEAR, kv));
-    GSF__TRY(gsf__dit_linear(run, references, r, a->v_weight, a->v_bias, GSF_NN_LINEAR, kv + r * d));
-    gsf_nn_head_norm_rope(run->ctx, kv, r, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_k_weight),
-                          gsf__dit_vector(run, a->norm_k_bias), gsf__dit_head_eps, NULL, NULL, 0);
+    const int64_t r = run->in->reference_tokens;
+    GSF__TRY(gsf__dit_linear(run, &a->k, references, r, kv));
+    GSF__TRY(gsf__dit_linear(run, &a->v, references, r, kv + r * run->width));
+    gsf__dit_norm_heads(run, &a->norm_k, 0, kv, r);
     return GSF_OK;
 }
 
 // The video's tokens look at the references: x += attention(norm(x), references), no gate, no rotation.
 static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32_t index, const gsf__dit_block* block) {
-    const gsf_nn_transformer* c = run->net;
     const gsf__dit_attention* a = &block->cross;
     const int64_t d = run->width, r = run->in->reference_tokens;
     float* x = run->x + (row * run->tokens + run->text) * d;
@@ -11311,26 +11225,13 @@ static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32
         ready = ready || run->in->reference_kv_ready;
     }
     if (!ready) GSF__TRY(gsf__dit_reference_kv(run, a, run->in->references + source * r * d, kv));
-    gsf_nn_layer_norm(run->ctx, x, run->video, d, gsf__dit_vector(run, block->norm_cross_weight),
-                      gsf__dit_vector(run, block->norm_cross_bias), (float)c->norm_eps, normed);
-    gsf__dit_tap(run, "norm_cross", row, normed, run->video, d);
-    GSF__TRY(gsf__dit_linear(run, normed, run->video, a->q_weight, a->q_bias, GSF_NN_LINEAR, q));
-    gsf_nn_head_norm_rope(run->ctx, q, run->video, d, c->heads, c->head_dim, gsf__dit_vector(run, a->norm_q_weight),
-                          gsf__dit_vector(run, a->norm_q_bias), gsf__dit_head_eps, NULL, NULL, 0);
-    gsf_nn_attention_desc attention;
-    memset(&attention, 0, sizeof attention);
-    attention.queries = run->video;
-    attention.keys = r;
-    attention.heads = c->heads;
-    attention.head_dim = c->head_dim;
-    attention.q = q;
-    attention.k = kv;
-    attention.v = kv + r * d;
-    attention.out = normed;
-    attention.bf16 = run->net->bf16;
-    GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &attention));
-    GSF__TRY(gsf__dit_add(run, normed, run->video, a->out_weight, a->out_bias, NULL, x, run->probe));
-    gsf__dit_tap(run, "attn_cross", row, run->probe, run->video, d);
+    gsf__nn_norm(&run->nn, &block->norm_cross, (float)run->net->norm_eps, x, run->video, normed);
+    gsf__nn_reveal(&run->nn, normed, row, 1, run->video, d, "norm_cross");
+    GSF__TRY(gsf__dit_linear(run, &a->q, normed, run->video, q));
+    gsf__dit_norm_heads(run, &a->norm_q, 0, q, run->video);
+    GSF__TRY(gsf__dit_attend(run, run->video, r, q, kv, kv + r * d));
+    GSF__TRY(gsf__dit_add(run, &a->out, NULL, normed, run->video, x, run->probe));
+    gsf__nn_reveal(&run->nn, run->probe, row, 1, run->video, d, "attn_cross");
     return GSF_OK;
 }
 
@@ -11342,14 +11243,14 @@ static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gs
         const int64_t first = stream ? run->text : 0, end = stream ? run->tokens : run->text;
         const float* gate = run->modulation + (stream ? GSF__DIT_VIDEO_GATE : GSF__DIT_TEXT_GATE) * d;
         for (int64_t r = first; r < end; r += most) {
-            const int64_t rows = end - r < most ? end - r : most;
-            GSF__TRY(gsf__dit_linear(run, run->normed + r * d, rows, block->up_weight, block->up_bias, GSF_NN_GELU_TANH,
-                                     run->qkv));
-            GSF__TRY(gsf__dit_add(run, run->qkv, rows, block->down_weight, block->down_bias, gate, x + r * d,
+            const int64_t rows = gsf__least(end - r, most);
+            const float* from = run->normed + r * d;
+            GSF__TRY(gsf__nn_linear(&run->nn, &block->up, GSF_NN_GELU_TANH, from, rows, run->qkv, 0));
+            GSF__TRY(gsf__dit_add(run, &block->down, gate, run->qkv, rows, x + r * d,
                                   run->probe ? run->probe + r * d : NULL));
         }
     }
-    gsf__dit_tap(run, "ff", row, run->probe, run->tokens, d);
+    gsf__nn_reveal(&run->nn, run->probe, row, 1, run->tokens, d, "ff");
     return GSF_OK;
 }
 
@@ -11357,53 +11258,43 @@ static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gs
 static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
     const gsf__dit_block* block = &run->nets->blocks[index];
     const int32_t batch = run->in->batch;
-    snprintf(run->label, sizeof run->label, "block%d.", (int)index);
+    snprintf(run->nn.label, sizeof run->nn.label, "block%d.", (int)index);
     for (int32_t b = 0; b < batch; b++) {
-        run->vectors_used = 0;
         GSF__TRY(gsf__dit_modulate(run, "norm1", b, &block->norm1));
         GSF__TRY(gsf__dit_self_attention(run, b, &block->self));
-        GSF__TRY(gsf__check_cancel(run->ctx));
+        GSF__TRY(gsf__check_cancel(run->nn.ctx));
     }
     for (int32_t b = 0; b < batch && run->in->references; b++) {
-        run->vectors_used = 0;
         GSF__TRY(gsf__dit_cross_attention(run, b, index, block));
-        GSF__TRY(gsf__check_cancel(run->ctx));
+        GSF__TRY(gsf__check_cancel(run->nn.ctx));
     }
     for (int32_t b = 0; b < batch; b++) {
-        run->vectors_used = 0;
         GSF__TRY(gsf__dit_modulate(run, "norm2", b, &block->norm2));
         GSF__TRY(gsf__dit_feed_forward(run, b, block));
-        GSF__TRY(gsf__check_cancel(run->ctx));
+        GSF__TRY(gsf__check_cancel(run->nn.ctx));
     }
     for (int32_t b = 0; b < batch; b++) {
         const float* x = run->x + b * run->tokens * run->width;
-        gsf__dit_tap(run, "0", b, x + run->text * run->width, run->video, run->width);
-        gsf__dit_tap(run, "1", b, x, run->text, run->width);
+        gsf__nn_reveal(&run->nn, x + run->text * run->width, b, 1, run->video, run->width, "0");
+        gsf__nn_reveal(&run->nn, x, b, 1, run->text, run->width, "1");
     }
-    run->label[0] = 0;
+    run->nn.label[0] = 0;
     return GSF_OK;
-}
-
-// ---- a value that is not finite, and where it comes from
-
-static gsf_result gsf__dit_check(gsf__dit_run* run, const char* stage, const char* prefix, const float* x, int64_t count) {
-    return gsf__nn_check_finite(run->ctx, &run->net->weights, "transformer", prefix, stage, x, count);
 }
 
 // ---- first and last layers
 
 // SiLU of the embedding of each sample's time step.
 static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
-    const gsf_nn_transformer* net = run->net;
-    const int64_t d = run->width, t = net->time_channels;
+    const int64_t d = run->width, t = run->net->time_channels;
     for (int32_t b = 0; b < run->in->batch; b++) {
         float *wave = run->qkv, *hidden = wave + d, *out = run->time + b * t;
         gsf_nn_embed_timestep(run->in->timesteps[b], (int32_t)d, wave);
-        gsf__dit_tap(run, "time_proj", b, wave, 1, d);
-        GSF__TRY(gsf__dit_linear(run, wave, 1, run->nets->time1_weight, run->nets->time1_bias, GSF_NN_SILU, hidden));
-        GSF__TRY(gsf__dit_linear(run, hidden, 1, run->nets->time2_weight, run->nets->time2_bias, GSF_NN_LINEAR, out));
-        gsf__dit_tap(run, "time_embedding", b, out, 1, t);
-        gsf_nn_activate(run->ctx, GSF_NN_SILU, out, t, out);
+        gsf__nn_reveal(&run->nn, wave, b, 1, 1, d, "time_proj");
+        GSF__TRY(gsf__nn_linear(&run->nn, &run->nets->time1, GSF_NN_SILU, wave, 1, hidden, 0));
+        GSF__TRY(gsf__dit_linear(run, &run->nets->time2, hidden, 1, out));
+        gsf__nn_reveal(&run->nn, out, b, 1, 1, t, "time_embedding");
+        gsf_nn_activate(run->nn.ctx, GSF_NN_SILU, out, t, out);
     }
     return GSF_OK;
 }
@@ -11412,37 +11303,26 @@ typedef struct gsf__patch_job { // patches of the latents as rows, or the other 
     const float* from;
     float* to;
     int32_t channels, height, width, patch;
+    int back;                   // rows to latents
 } gsf__patch_job;
 
-// (channels, height, width) of one frame to rows of (channels, patch, patch), tokens down and across.
+// (channels, height, width) of one frame to rows of (channels, patch, patch), tokens down and across; or back.
 static void gsf__patch_frame(void* arg, size_t frame, int worker) {
     const gsf__patch_job* job = (const gsf__patch_job*)arg;
     const int64_t p = job->patch, across = job->width / p, down = job->height / p;
-    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
-    const float* from = job->from + (int64_t)frame * job->channels * plane;
-    float* to = job->to + (int64_t)frame * across * down * row;
+    const int64_t plane = (int64_t)job->height * job->width, values = job->channels * plane;
+    const float* from = job->from + (int64_t)frame * values;
+    float* to = job->to + (int64_t)frame * values;
+    int64_t at = 0; // in the rows
     (void)worker;
     for (int64_t ty = 0; ty < down; ty++)
         for (int64_t tx = 0; tx < across; tx++)
             for (int64_t c = 0; c < job->channels; c++)
                 for (int64_t y = 0; y < p; y++)
-                    for (int64_t x = 0; x < p; x++)
-                        *to++ = from[c * plane + (ty * p + y) * job->width + tx * p + x];
-}
-
-static void gsf__unpatch_frame(void* arg, size_t frame, int worker) {
-    const gsf__patch_job* job = (const gsf__patch_job*)arg;
-    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
-    const int64_t plane = (int64_t)job->height * job->width, row = job->channels * p * p;
-    const float* from = job->from + (int64_t)frame * across * down * row;
-    float* to = job->to + (int64_t)frame * job->channels * plane;
-    (void)worker;
-    for (int64_t ty = 0; ty < down; ty++)
-        for (int64_t tx = 0; tx < across; tx++)
-            for (int64_t c = 0; c < job->channels; c++)
-                for (int64_t y = 0; y < p; y++)
-                    for (int64_t x = 0; x < p; x++)
-                        to[c * plane + (ty * p + y) * job->width + tx * p + x] = *from++;
+                    for (int64_t x = 0; x < p; x++, at++) {
+                        const int64_t pixel = c * plane + (ty * p + y) * job->width + tx * p + x;
+                        to[job->back ? pixel : at] = from[job->back ? at : pixel];
+                    }
 }
 
 // Adds the position table to text and video: the stored one for the configured frame count, else sines and cosines (video
@@ -11461,7 +11341,7 @@ static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
         }
         return GSF_OK;
     }
-    GSF__TRY(gsf_nn_make_sincos(run->ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
+    GSF__TRY(gsf_nn_make_sincos(run->nn.ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
                                 c->spatial_scale, c->temporal_scale, run->qkv));
     for (int32_t b = 0; b < in->batch; b++)
         for (int64_t i = 0; i < run->video * d; i++) run->x[(b * run->tokens + run->text) * d + i] += run->qkv[i];
@@ -11469,46 +11349,39 @@ static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
 }
 
 static gsf_result gsf__dit_embed(gsf__dit_run* run) {
-    const gsf_nn_transformer* net = run->net;
-    const gsf_nn_transformer* c = net;
+    const gsf_nn_transformer* c = run->net;
     const gsf_nn_transformer_input* in = run->in;
     const int64_t d = run->width, sample = (int64_t)in->frames * c->in_channels * in->height * in->width;
     for (int32_t b = 0; b < in->batch; b++) {
         float* x = run->x + b * run->tokens * d;
-        GSF__TRY(gsf__dit_linear(run, in->text + b * run->text * c->text_channels, run->text, run->nets->text_weight,
-                                 run->nets->text_bias, GSF_NN_LINEAR, x));
-        gsf__patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch};
-        gsf__parallel_for(run->ctx, (size_t)in->frames, gsf__patch_frame, &job);
-        GSF__TRY(gsf__dit_linear(run, run->qkv, run->video, run->nets->patch_weight, run->nets->patch_bias, GSF_NN_LINEAR,
-                                 x + run->text * d));
+        const float* text = in->text + b * run->text * c->text_channels;
+        GSF__TRY(gsf__dit_linear(run, &run->nets->text, text, run->text, x));
+        gsf__patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch, 0};
+        gsf__parallel_for(run->nn.ctx, (size_t)in->frames, gsf__patch_frame, &job);
+        GSF__TRY(gsf__dit_linear(run, &run->nets->patch, run->qkv, run->video, x + run->text * d));
     }
     GSF__TRY(gsf__dit_add_positions(run));
-    for (int32_t b = 0; b < in->batch; b++)
-        gsf__dit_tap(run, "patch_embed", b, run->x + b * run->tokens * d, run->tokens, d);
-    return GSF_OK;
+    gsf__nn_reveal(&run->nn, run->x, 0, in->batch, run->tokens, d, "patch_embed");
+    return gsf__nn_check(&run->nn, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * d);
 }
 
 // Video tokens to velocities: two layer norms in a row, the second modulated, then the output projection.
 static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
-    const gsf_nn_transformer* net = run->net;
-    const gsf_nn_transformer* c = net;
-    const int64_t d = run->width;
-    const float eps = (float)c->norm_eps;
+    const gsf_nn_transformer* c = run->net;
+    const int64_t d = run->width, outputs = (int64_t)c->out_channels * c->patch * c->patch;
+    const float eps = (float)c->norm_eps, *x = run->x + (row * run->tokens + run->text) * d;
+    const gsf__dit_norm* norm = &run->nets->norm_out;
     float *m = run->modulation, *normed = run->normed;
-    run->vectors_used = 0;
-    const float* weight = gsf__dit_vector(run, run->nets->norm_final_weight);
-    const float* bias = gsf__dit_vector(run, run->nets->norm_final_bias);
-    gsf_nn_layer_norm(run->ctx, run->x + (row * run->tokens + run->text) * d, run->video, d, weight, bias, eps, normed);
-    gsf__dit_tap(run, "norm_final", row, normed, run->video, d);
-    GSF__TRY(gsf__dit_linear(run, run->time + row * c->time_channels, 1, run->nets->norm_out.linear_weight,
-                             run->nets->norm_out.linear_bias, GSF_NN_LINEAR, m));
-    gsf_nn_layer_norm_modulated(run->ctx, normed, run->video, d, gsf__dit_vector(run, run->nets->norm_out.weight),
-                                gsf__dit_vector(run, run->nets->norm_out.bias), eps, m + d, m, normed);
-    gsf__dit_tap(run, "norm_out", row, normed, run->video, d);
-    GSF__TRY(gsf__dit_linear(run, normed, run->video, run->nets->out_weight, run->nets->out_bias, GSF_NN_LINEAR, run->qkv));
-    gsf__dit_tap(run, "proj_out", row, run->qkv, run->video, (int64_t)c->out_channels * c->patch * c->patch);
-    gsf__patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch};
-    gsf__parallel_for(run->ctx, (size_t)run->in->frames, gsf__unpatch_frame, &job);
+    gsf__nn_norm(&run->nn, &run->nets->norm_final, eps, x, run->video, normed);
+    gsf__nn_reveal(&run->nn, normed, row, 1, run->video, d, "norm_final");
+    GSF__TRY(gsf__dit_linear(run, &norm->linear, run->time + row * c->time_channels, 1, m));
+    const gsf__nn_vectors v = gsf__nn_widen_layer(&run->nn, &norm->norm);
+    gsf_nn_layer_norm_modulated(run->nn.ctx, normed, run->video, d, v.weight, v.bias, eps, m + d, m, normed);
+    gsf__nn_reveal(&run->nn, normed, row, 1, run->video, d, "norm_out");
+    GSF__TRY(gsf__dit_linear(run, &run->nets->out, normed, run->video, run->qkv));
+    gsf__nn_reveal(&run->nn, run->qkv, row, 1, run->video, outputs, "proj_out");
+    gsf__patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch, 1};
+    gsf__parallel_for(run->nn.ctx, (size_t)run->in->frames, gsf__patch_frame, &job);
     return GSF_OK;
 }
 
@@ -11526,9 +11399,9 @@ static gsf_result gsf__dit_open_cache(gsf__dit_run* run, gsf_nn_block_cache* cac
     const size_t sampled = (rows + GSF__DIT_CACHE_ROWS - 1) / GSF__DIT_CACHE_ROWS * width;
     if (cache->size == rows * width) return GSF_OK;
     const float threshold = cache->threshold;
-    gsf_nn_destroy_block_cache(run->ctx, cache);
+    gsf_nn_destroy_block_cache(run->nn.ctx, cache);
     cache->threshold = threshold;
-    cache->first = (float*)gsf_alloc_zeroed(run->ctx, rows * width + 2 * sampled, sizeof(float));
+    cache->first = (float*)gsf_alloc_zeroed(run->nn.ctx, rows * width + 2 * sampled, sizeof(float));
     if (!cache->first) return GSF_ERROR_OUT_OF_MEMORY;
     cache->before = cache->first + sampled;
     cache->rest = cache->before + sampled;
@@ -11567,11 +11440,8 @@ static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
         gsf__dit_note_before(run, cache);
     }
     for (int32_t i = 0; i < c->layers; i++) {
-        char name[48];
         GSF__TRY(gsf__dit_block_forward(run, i));
-        snprintf(name, sizeof name, "transformer_blocks.%d.", (int)i);
-        GSF__TRY(gsf__dit_check(run, name, name, run->x, count));
-        gsf__progress(run->ctx, "transformer", i + 1, c->layers);
+        GSF__TRY(gsf__nn_end_block(&run->nn, "transformer_blocks.", i, run->x, count));
         if (!cache || i > 0) continue;
         const int similar = gsf__dit_is_similar(run, cache);
         cache->calls++;
@@ -11615,54 +11485,51 @@ static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transforme
     return GSF_OK;
 }
 
-static void gsf__dit_sizes(gsf__dit_run* run, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in) {
-    const gsf_nn_transformer* c = net;
-    run->in = in;
+static void gsf__dit_begin_run(gsf__dit_run* run, gsf_context* ctx, const gsf_nn_transformer* c) {
+    memset(run, 0, sizeof *run);
+    run->net = c;
+    run->nets = (const gsf__dit_nets*)c->nets;
     run->width = gsf__dit_width(c);
+    run->nn.ctx = ctx;
+    run->nn.name = run->nn.stage = "transformer";
+    run->nn.weights = &c->weights;
+    run->nn.quantized = run->nets->quantized;
+    run->nn.bf16 = c->bf16;
+    run->nn.steps = c->layers;
+}
+
+static void gsf__dit_set_input(gsf__dit_run* run, const gsf_nn_transformer_input* in) {
+    const gsf_nn_transformer* c = run->net;
+    run->in = in;
+    run->nn.tap = in->_tap;
     run->text = in->text_tokens ? in->text_tokens : c->text_tokens;
     run->video = (int64_t)in->frames * (in->height / c->patch) * (in->width / c->patch);
     run->tokens = run->text + run->video;
     run->qkv_rows = in->references && in->reference_tokens > run->tokens ? in->reference_tokens : run->tokens;
     if (run->qkv_rows < 4) run->qkv_rows = 4; // a chunk of the feed-forward is 3/4 of them
-    // per block and layer: norm weights and biases, those of q and k; the head takes four
-    run->vectors_size = (size_t)(4 * run->width + 4 * c->head_dim);
 }
 
-// Floats of every buffer; their sum is what gsf_nn_transformer_cost tells.
-typedef struct gsf__dit_layout { size_t x, normed, qkv, time, modulation, vectors, rotary, probe; } gsf__dit_layout;
-
-static gsf__dit_layout gsf__dit_plan(const gsf__dit_run* run, const gsf_nn_transformer* c) {
-    const size_t d = (size_t)run->width, rows = (size_t)run->tokens;
-    gsf__dit_layout l;
-    const size_t patch_row = (size_t)c->patch * (size_t)c->patch *
-                             (size_t)(c->in_channels > c->out_channels ? c->in_channels : c->out_channels);
-    l.x = (size_t)run->in->batch * rows * d;
-    l.normed = rows * d;
-    l.qkv = 3 * (size_t)run->qkv_rows * d;
-    if (l.qkv < (size_t)run->video * patch_row) l.qkv = (size_t)run->video * patch_row;
-    if (l.qkv < d + (size_t)c->time_channels) l.qkv = d + (size_t)c->time_channels;
-    l.time = (size_t)run->in->batch * (size_t)c->time_channels;
-    l.modulation = 6 * d;
-    l.vectors = run->vectors_size;
-    l.rotary = c->rotary_positions && !run->in->no_rotary ? 2 * (size_t)run->video * (size_t)c->head_dim : 0;
-    l.probe = run->in->tap_fn ? rows * d : 0;
-    return l;
-}
-
-static size_t gsf__dit_total(const gsf__dit_layout* l) {
-    return l->x + l->normed + l->qkv + l->time + l->modulation + l->vectors + l->rotary + l->probe;
-}
-
-static void gsf__dit_share_out(gsf__dit_run* run, const gsf__dit_layout* l, float* memory) {
-    float* next = memory;
-    run->x = next, next += l->x;
-    run->normed = next, next += l->normed;
-    run->qkv = next, next += l->qkv;
-    run->time = next, next += l->time;
-    run->modulation = next, next += l->modulation;
-    run->vectors = next, next += l->vectors;
-    if (l->rotary) run->cos = next, run->sin = next + l->rotary / 2, next += l->rotary;
-    if (l->probe) run->probe = next;
+// Shares out `memory`, or counts its floats.
+static size_t gsf__dit_lay_out(gsf__dit_run* run, float* memory) {
+    const gsf_nn_transformer* c = run->net;
+    const size_t d = (size_t)run->width, rows = (size_t)run->tokens, time = (size_t)c->time_channels;
+    const size_t channels = (size_t)(c->in_channels > c->out_channels ? c->in_channels : c->out_channels);
+    const size_t patches = (size_t)run->video * (size_t)c->patch * (size_t)c->patch * channels;
+    const int rotary = c->rotary_positions && !run->in->no_rotary;
+    const size_t turns = rotary ? (size_t)run->video * (size_t)c->head_dim : 0;
+    gsf__nn_arena arena = {memory, 0};
+    run->nn.vectors_size = 2 * d;
+    run->x = gsf__nn_share(&arena, (size_t)run->in->batch * rows * d);
+    run->normed = gsf__nn_share(&arena, rows * d);
+    run->qkv = gsf__nn_share(&arena, gsf__nn_larger(gsf__nn_larger(3 * (size_t)run->qkv_rows * d, patches), d + time));
+    run->time = gsf__nn_share(&arena, (size_t)run->in->batch * time);
+    run->modulation = gsf__nn_share(&arena, 6 * d);
+    run->nn.vectors = gsf__nn_share(&arena, run->nn.vectors_size);
+    run->cos = gsf__nn_share(&arena, turns);
+    run->sin = gsf__nn_share(&arena, turns);
+    if (!rotary) run->cos = run->sin = NULL;
+    if (run->nn.tap) run->probe = gsf__nn_share(&arena, rows * d);
+    return arena.used;
 }
 
 static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
@@ -11677,36 +11544,30 @@ static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
         rope.base_height = c->sample_height / c->patch;
         rope.base_width = c->sample_width / c->patch;
         rope.head_dim = c->head_dim;
-        GSF__TRY(gsf_nn_make_rope(run->ctx, &rope, run->cos, run->sin));
+        GSF__TRY(gsf_nn_make_rope(run->nn.ctx, &rope, run->cos, run->sin));
     }
     GSF__TRY(gsf__dit_embed_time(run));
     GSF__TRY(gsf__dit_embed(run));
-    GSF__TRY(gsf__dit_check(run, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * run->width));
     if (in->references)
-        for (int32_t b = 0; b < in->reference_batch; b++)
-            gsf__dit_tap(run, "cross_hidden_states", b, in->references + b * in->reference_tokens * run->width,
-                         in->reference_tokens, run->width);
+        gsf__nn_reveal(&run->nn, in->references, 0, in->reference_batch, in->reference_tokens, run->width,
+                       "cross_hidden_states");
     GSF__TRY(gsf__dit_blocks(run));
     const int64_t sample = (int64_t)in->frames * c->out_channels * in->height * in->width;
     for (int32_t b = 0; b < in->batch; b++) GSF__TRY(gsf__dit_head(run, b, out + b * sample));
-    return gsf__dit_check(run, "the output layer", "proj_out.", out, in->batch * sample);
+    return gsf__nn_check(&run->nn, "the output layer", "proj_out.", out, in->batch * sample);
 }
 
 GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                               const gsf_nn_transformer_input* input, float* out) {
     gsf__dit_run run;
-    memset(&run, 0, sizeof run);
     GSF__TRY(gsf__dit_check_input(ctx, transformer, input));
-    run.ctx = ctx;
-    run.net = transformer;
-    run.nets = (const gsf__dit_nets*)transformer->nets;
-    gsf__dit_sizes(&run, transformer, input);
-    const gsf__dit_layout l = gsf__dit_plan(&run, transformer);
-    float* memory = (float*)gsf_alloc(ctx, gsf__dit_total(&l), sizeof(float));
+    gsf__dit_begin_run(&run, ctx, transformer);
+    gsf__dit_set_input(&run, input);
+    float* memory = (float*)gsf_alloc(ctx, gsf__dit_lay_out(&run, NULL), sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__dit_share_out(&run, &l, memory);
+    gsf__dit_lay_out(&run, memory);
     const gsf_result result = gsf__dit_forward(&run, out);
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_nn_destroy_workspace(ctx, &run.nn.workspace);
     gsf_free(ctx, memory);
     return result;
 }
@@ -11721,9 +11582,8 @@ GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, cons
                                      double* bytes, double* flops) {
     const gsf_nn_transformer* c = transformer;
     gsf__dit_run run;
-    memset(&run, 0, sizeof run);
-    gsf__dit_sizes(&run, transformer, input);
-    const gsf__dit_layout l = gsf__dit_plan(&run, c);
+    gsf__dit_begin_run(&run, NULL, c);
+    gsf__dit_set_input(&run, input);
     const double d = (double)run.width, n = (double)run.tokens, v = (double)run.video;
     const double r = input->references ? (double)input->reference_tokens : 0.0;
     const double self = 2.0 * n * d * d * 4.0 + 4.0 * n * n * d, ff = 2.0 * n * d * 4.0 * d * 2.0;
@@ -11732,7 +11592,7 @@ GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, cons
     const double ends = 2.0 * v * patch * c->in_channels * d + 2.0 * v * patch * c->out_channels * d +
                         2.0 * (double)run.text * c->text_channels * d;
     const double kv_batch = input->reference_kv_ready ? 0.0 : (double)input->reference_batch;
-    *bytes = (double)gsf__dit_total(&l) * sizeof(float);
+    *bytes = (double)gsf__dit_lay_out(&run, NULL) * sizeof(float);
     *flops = c->layers * (input->batch * (self + ff + cross) + kv_batch * kv) + input->batch * ends;
 }
 
@@ -11740,30 +11600,24 @@ GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_tran
                                              const float* dino, const float* vggt, float* out) {
     const int64_t d = gsf__dit_width(transformer);
     const gsf__dit_nets* nets = (const gsf__dit_nets*)transformer->nets;
-    const gsf__dit_projector* projectors[2] = {&nets->dino, &nets->vggt};
-    const float* inputs[2] = {dino, vggt};
+    const struct { const gsf__dit_projector* by; const float* from; } parts[2] = {{&nets->dino, dino}, {&nets->vggt, vggt}};
     gsf__dit_run run;
-    memset(&run, 0, sizeof run);
-    run.ctx = ctx;
-    run.net = transformer;
-    run.nets = nets;
-    run.vectors_size = (size_t)(4 * d);
     if (tokens < 1 || (!dino && !vggt))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no tokens to project");
-    float* memory = (float*)gsf_alloc(ctx, (size_t)tokens + 4, (size_t)d * sizeof(float));
+    gsf__dit_begin_run(&run, ctx, transformer);
+    float* memory = (float*)gsf_alloc(ctx, (size_t)tokens + 2, (size_t)d * sizeof(float));
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    run.vectors = memory + tokens * d;
+    run.nn.vectors = memory + tokens * d;
+    run.nn.vectors_size = (size_t)(2 * d);
     gsf_result result = GSF_OK;
     for (int i = 0; i < 2 && !result; i++) {
         float* to = i && dino ? memory : out; // the second is added to the first
-        if (!inputs[i]) continue;
-        result = gsf__dit_linear(&run, inputs[i], tokens, projectors[i]->weight, projectors[i]->bias, GSF_NN_LINEAR, to);
-        if (result) break;
-        gsf_nn_layer_norm(ctx, to, tokens, d, gsf__dit_vector(&run, projectors[i]->norm_weight),
-                          gsf__dit_vector(&run, projectors[i]->norm_bias), 1e-5f, to); // torch's default eps
-        for (int64_t j = 0; to == memory && j < tokens * d; j++) out[j] += memory[j];
+        if (!parts[i].from) continue;
+        result = gsf__dit_linear(&run, &parts[i].by->linear, parts[i].from, tokens, to);
+        if (!result) gsf__nn_norm(&run.nn, &parts[i].by->norm, 1e-5f, to, tokens, to); // torch's default eps
+        for (int64_t j = 0; !result && to == memory && j < tokens * d; j++) out[j] += memory[j];
     }
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf_nn_destroy_workspace(ctx, &run.nn.workspace);
     gsf_free(ctx, memory);
     return result;
 }
@@ -12417,14 +12271,16 @@ static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
 }
 
 static gsf_result gsf__sample_steps(gsf__sample_run* run) {
-    const gsf_nn_sample_desc* d = &run->desc;
     while (run->sampler.index < run->sampler.count) {
         const int32_t index = run->sampler.index;
         GSF__TRY(gsf__check_cancel(run->ctx));
         gsf__progress(run->ctx, "restore", index, run->sampler.count);
         GSF__TRY(gsf__sample_predict(run, gsf__sample_guidance(run, index)));
         GSF__TRY(gsf_nn_step_sampler(run->ctx, &run->sampler, run->prediction, run->latents, NULL));
-        if (d->step_fn) d->step_fn(d->step_user, index, run->latents, run->prediction, run->count);
+        if (run->desc._tap) { // the latents, and what the network predicted (guided)
+            run->desc._tap->fn(run->desc._tap->user, "latents", index, run->latents, 1, run->count);
+            run->desc._tap->fn(run->desc._tap->user, "prediction", index, run->prediction, 1, run->count);
+        }
         run->stats.steps++;
         GSF__TRY(gsf__sample_save(run));
     }

@@ -787,6 +787,52 @@ static void bench_convs(const bench_options* o) {
     }
 }
 
+// ---- weights of a block, by its table ------------------------------------------------
+
+typedef struct bench_weights {
+    gsf_tensor tensors[64];
+    size_t count, used; // used: bytes
+    gsf_nn_dtype dtype;
+    char* memory;       // NULL: only counts
+} bench_weights;
+
+// Of a size that keeps the stream's: values of [1/4, 1/2) in a vector; of a matrix all bits but the exponent's, which makes
+// them 1/128 and less.
+static gsf_result bench_add_weight(void* user, const char* name, int32_t rank, const int64_t* shape, const gsf_tensor** to) {
+    bench_weights* w = (bench_weights*)user;
+    gsf_tensor* t = &w->tensors[w->count++];
+    memset(t, 0, sizeof *t);
+    t->name = name[0] ? "weight" : name;
+    t->dtype = w->dtype;
+    t->rank = rank;
+    t->count = 1;
+    for (int32_t i = 0; i < rank; i++) t->count *= t->shape[i] = shape[i];
+    t->data = w->memory + w->used;
+    const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(t->dtype);
+    if (w->memory) {
+        char* data = w->memory + w->used;
+        bench_fill(data, bytes, t->dtype, w->count);
+        for (size_t k = 1; rank > 1 && t->dtype != GSF_NN_F16 && k < bytes; k += 2)
+            if (t->dtype == GSF_NN_BF16 || k % 4 == 3) data[k] = (char)((data[k] & 0x80) | 0x3b);
+    }
+    *to = t;
+    w->used += (bytes + 63) / 64 * 64;
+    return GSF_OK;
+}
+
+// The tensors of `entries` for the struct at `where`; returns their memory, which is to be freed.
+static char* bench_make_weights(gsf_context* ctx, bench_weights* w, gsf_nn_dtype dtype, const gsf__nn_sizes* sizes,
+                                const gsf__nn_entry* entries, void* where) {
+    for (int pass = 0; pass < 2; pass++) {
+        char* memory = pass ? (char*)bench_alloc(ctx, w->used, 1) : NULL;
+        memset(w, 0, sizeof *w);
+        w->dtype = dtype;
+        w->memory = memory;
+        bench_require(ctx, gsf__nn_visit(sizes, entries, "", where, bench_add_weight, w));
+    }
+    return w->memory;
+}
+
 // ---- a whole transformer block ------------------------------------------------------
 
 typedef struct bench_block {
@@ -795,7 +841,7 @@ typedef struct bench_block {
     gsf__dit_block block;
     gsf_nn_transformer_input in;
     gsf__dit_run run;
-    gsf_tensor tensors[GSF__COUNT(gsf__dit_block_entries)];
+    bench_weights weights;
     float* first; // the residual stream before the block
 } bench_block;
 
@@ -811,38 +857,12 @@ static void bench_block_sizes(bench_block* b, int64_t tokens, int64_t references
     b->net.text_tokens = BENCH_BLOCK_TEXT;
     b->net.text_channels = 4096;
     b->net.time_channels = 512;
-    b->net.patch = 1;
+    b->net.patch = b->net.temporal_ratio = 1;
     b->net.attention_bias = b->net.rotary_positions = 1;
     b->net.norm_eps = 1e-5;
     b->in.batch = b->in.reference_batch = b->in.frames = b->in.height = 1;
     b->in.width = (int32_t)(tokens - BENCH_BLOCK_TEXT);
     b->in.reference_tokens = references;
-}
-
-// The block's weights, contiguous in `memory`, scaled so that the residual stream keeps its magnitude.
-static size_t bench_block_weights(bench_block* b, gsf_nn_dtype dtype, char* memory) {
-    size_t used = 0;
-    for (size_t i = 0; i < GSF__COUNT(gsf__dit_block_entries); i++) {
-        const gsf__dit_entry* e = &gsf__dit_block_entries[i];
-        gsf_tensor* t = &b->tensors[i];
-        memset(t, 0, sizeof *t);
-        t->name = e->name;
-        t->dtype = dtype;
-        t->count = 1;
-        for (const char* c = e->shape; *c; c++) t->count *= t->shape[t->rank++] = gsf__dit_dimension(&b->net, *c);
-        t->data = memory + used;
-        const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(dtype);
-        if (memory) {
-            // vectors: values in [1/4, 1/2); matrices: the same with exponents changed to give at most 1/128
-            bench_fill(memory + used, bytes, dtype, i + 1);
-            for (size_t k = 1; t->rank > 1 && k < bytes; k += 2)
-                if (dtype == GSF_NN_BF16 || k % 4 == 3) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
-        }
-        used += (bytes + 63) / 64 * 64;
-        const gsf_tensor* pointer = t;
-        memcpy((char*)&b->block + e->offset, &pointer, sizeof pointer);
-    }
-    return used;
 }
 
 static void bench_run_block(gsf_context* ctx, void* arg) {
@@ -864,20 +884,18 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     bench_block_sizes(&b, tokens, references);
     b.in.references = references ? (float*)bench_alloc(&ctx, (size_t)references * 3072, sizeof(float)) : NULL;
     if (references) bench_fill((void*)(uintptr_t)b.in.references, (size_t)references * 3072 * sizeof(float), GSF_NN_F32, 5);
-    char* weights = (char*)bench_alloc(&ctx, bench_block_weights(&b, dtype, NULL), 1);
-    bench_block_weights(&b, dtype, weights);
+    const gsf__nn_sizes sizes = gsf__dit_tensor_sizes(&b.net);
+    char* weights = bench_make_weights(&ctx, &b.weights, dtype, &sizes, gsf__dit_block_entries, &b.block);
     b.nets.blocks = &b.block;
     b.net.nets = &b.nets;
     b.net.bf16 = bf16;
-    b.run.ctx = &ctx;
-    b.run.net = &b.net;
-    b.run.nets = &b.nets;
-    gsf__dit_sizes(&b.run, &b.net, &b.in);
-    const gsf__dit_layout l = gsf__dit_plan(&b.run, &b.net);
-    float* memory = (float*)bench_alloc(&ctx, gsf__dit_total(&l) + l.x, sizeof(float));
-    gsf__dit_share_out(&b.run, &l, memory);
-    b.first = memory + gsf__dit_total(&l);
-    bench_fill(memory, (gsf__dit_total(&l) + l.x) * sizeof(float), GSF_NN_F32, 6); // includes the rotation table
+    gsf__dit_begin_run(&b.run, &ctx, &b.net);
+    gsf__dit_set_input(&b.run, &b.in);
+    const size_t floats = gsf__dit_lay_out(&b.run, NULL), stream = (size_t)(b.run.tokens * b.run.width);
+    float* memory = (float*)bench_alloc(&ctx, floats + stream, sizeof(float));
+    gsf__dit_lay_out(&b.run, memory);
+    b.first = memory + floats;
+    bench_fill(memory, (floats + stream) * sizeof(float), GSF_NN_F32, 6); // includes the rotation table
     double bytes, flops;
     gsf_nn_transformer_cost(&b.net, &b.in, &bytes, &flops);
     flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
@@ -886,7 +904,7 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     if (bf16) row.variant = BENCH_BF16;
     bench_time(o, &ctx, &row, bench_run_block, &b, 1.0);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &b.run.workspace);
+    gsf_nn_destroy_workspace(&ctx, &b.run.nn.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
     gsf_free(&ctx, (void*)(uintptr_t)b.in.references);
@@ -913,37 +931,12 @@ enum { BENCH_VIT_WIDTH = 1024, BENCH_VIT_HEADS = 16, BENCH_VIT_ROWS = 25, BENCH_
 typedef struct bench_vit {
     gsf_nn_dinov2 net;
     gsf__vit vit;
-    gsf__vit_block blocks[24]; // all share one block's weights, which exceed every cache
-    gsf_tensor tensors[64];
+    gsf__nn_block blocks[24]; // all share one block's weights, which exceed every cache
+    bench_weights block_weights, weights;
     gsf_nn_encoder_input in;
-    gsf__vit_run run;
+    gsf__nn_run run;
     float *first, *x, *out;    // residual stream before a block; working copy; the encoder's output
 } bench_vit;
-
-// The tensors of `entries`, contiguous in `memory`; matrices have small values.
-static size_t bench_vit_weights(bench_vit* b, const gsf__vit_entry* entries, size_t count, gsf_tensor* tensors, void* where,
-                                char* memory) {
-    size_t used = 0;
-    for (size_t i = 0; i < count; i++) {
-        const gsf__vit_entry* e = &entries[i];
-        gsf_tensor* t = &tensors[i];
-        memset(t, 0, sizeof *t);
-        t->name = e->name;
-        t->count = 1;
-        for (const char* c = e->shape; *c; c++)
-            t->count *= t->shape[t->rank++] = gsf__vit_dimension(&b->vit.sizes, &b->vit, *c);
-        t->data = memory + used;
-        const size_t bytes = (size_t)t->count * sizeof(float);
-        if (memory) {
-            bench_fill(memory + used, bytes, GSF_NN_F32, i + 1);
-            for (size_t k = 3; t->rank > 1 && k < bytes; k += 4) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
-            const gsf_tensor* pointer = t;
-            memcpy((char*)where + e->offset, &pointer, sizeof pointer);
-        }
-        used += (bytes + 63) / 64 * 64;
-    }
-    return used;
-}
 
 static void bench_vit_sizes(bench_vit* b, int64_t layers) {
     gsf__vit* v = &b->vit;
@@ -978,15 +971,11 @@ static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers
     snprintf(name, sizeof name, "dinov2 f32 %dx%d L=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)layers);
     gsf_context ctx;
     if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
-    const gsf__vit_entry* entries = gsf__dinov2_block_entries;
-    const size_t count = GSF__COUNT(gsf__dinov2_block_entries), others = GSF__COUNT(gsf__dinov2_entries);
     bench_vit* b = (bench_vit*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
     bench_vit_sizes(b, layers);
-    const size_t block = bench_vit_weights(b, entries, count, b->tensors, b->blocks, NULL);
-    const size_t rest = bench_vit_weights(b, gsf__dinov2_entries, others, b->tensors + count, &b->vit, NULL);
-    char* weights = (char*)bench_alloc(&ctx, block + rest, 1);
-    bench_vit_weights(b, entries, count, b->tensors, b->blocks, weights);
-    bench_vit_weights(b, gsf__dinov2_entries, others, b->tensors + count, &b->vit, weights + block);
+    const gsf__nn_sizes block_sizes = gsf__nn_sizes_of_block(&b->vit.sizes), sizes = gsf__vit_sizes(&b->vit);
+    char* block = bench_make_weights(&ctx, &b->block_weights, GSF_NN_F32, &block_sizes, gsf__dinov2_block_entries, b->blocks);
+    char* weights = bench_make_weights(&ctx, &b->weights, GSF_NN_F32, &sizes, gsf__dinov2_entries, &b->vit);
     for (int64_t i = 1; i < layers; i++) b->blocks[i] = b->blocks[0];
     const size_t pixels = 3 * (size_t)b->in.height * (size_t)b->in.width;
     float* memory = (float*)bench_alloc(&ctx, pixels + BENCH_VIT_ROWS * BENCH_VIT_ACROSS * BENCH_VIT_WIDTH, sizeof(float));
@@ -1000,6 +989,7 @@ static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers
     bench_time(o, &ctx, &row, bench_run_dinov2, b, 1.0);
     bench_print(o->json, &row);
     gsf_free(&ctx, memory);
+    gsf_free(&ctx, block);
     gsf_free(&ctx, weights);
     gsf_free(&ctx, b);
 }
@@ -1008,8 +998,8 @@ static void bench_run_pair(gsf_context* ctx, void* arg) {
     bench_vit* b = (bench_vit*)arg;
     const int64_t images = b->in.images, tokens = b->run.image_tokens;
     memcpy(b->x, b->first, (size_t)(images * tokens * BENCH_VIT_WIDTH) * sizeof(float));
-    bench_require(ctx, gsf__vit_block_forward(&b->run, &b->blocks[0], b->x, images, tokens));
-    bench_require(ctx, gsf__vit_block_forward(&b->run, &b->blocks[0], b->x, 1, images * tokens));
+    bench_require(ctx, gsf__nn_block_forward(&b->run, &b->blocks[0], 0, b->x, images, tokens));
+    bench_require(ctx, gsf__nn_block_forward(&b->run, &b->blocks[0], 0, b->x, 1, images * tokens));
 }
 
 // One frame block and one global block of VGGT.
@@ -1018,13 +1008,11 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
     snprintf(name, sizeof name, "vggt pair f32 %dx%d N=%d", BENCH_VIT_ROWS * 14, BENCH_VIT_ACROSS * 14, (int)images);
     gsf_context ctx;
     if (!bench_wanted(o, name, threads) || !bench_context(&ctx, o->level, threads)) return;
-    const gsf__vit_entry* entries = gsf__vggt_block_entries;
-    const size_t count = GSF__COUNT(gsf__vggt_block_entries);
     bench_vit* b = (bench_vit*)gsf_alloc_zeroed(&ctx, 1, sizeof *b);
     bench_vit_sizes(b, 1);
-    char* weights = (char*)bench_alloc(&ctx, bench_vit_weights(b, entries, count, b->tensors, b->blocks, NULL), 1);
-    bench_vit_weights(b, entries, count, b->tensors, b->blocks, weights);
-    gsf__vit_run* run = &b->run;
+    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(&b->vit.sizes);
+    char* weights = bench_make_weights(&ctx, &b->weights, GSF_NN_F32, &sizes, gsf__vggt_block_entries, b->blocks);
+    gsf__nn_run* run = &b->run;
     const int64_t quarter = b->vit.sizes.head_dim / 4;
     b->in.images = images;
     run->ctx = &ctx;
@@ -1034,8 +1022,8 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
     run->image_tokens = 5 + BENCH_VIT_ROWS * BENCH_VIT_ACROSS;
     const int64_t rows = images * run->image_tokens;
     const size_t values = (size_t)(rows * BENCH_VIT_WIDTH), rotation = (size_t)(BENCH_VIT_ACROSS * quarter);
-    run->vectors_size = 6 * BENCH_VIT_WIDTH + 4 * (size_t)b->vit.sizes.head_dim;
-    run->wide_count = (int64_t)gsf__vit_wide(run->sizes, rows);
+    run->vectors_size = 2 * BENCH_VIT_WIDTH;
+    run->wide_count = (int64_t)gsf__nn_wide(run->sizes, rows, GSF__VIT_MLP_ROWS);
     float* memory = (float*)bench_alloc(&ctx, 3 * values + (size_t)run->wide_count + run->vectors_size + 2 * rotation,
                                         sizeof(float));
     b->first = memory;
@@ -1048,8 +1036,8 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
     run->sin = table + rotation;
     bench_fill(memory, values * sizeof(float), GSF_NN_F32, 6);
     gsf__vggt_make_rotation(100.0, BENCH_VIT_ACROSS, quarter, table, table + rotation);
-    const double flops = gsf__vit_block_flops(run->sizes, images, (double)run->image_tokens) +
-                         gsf__vit_block_flops(run->sizes, 1.0, (double)rows);
+    const double flops = gsf__nn_block_flops(run->sizes, images, (double)run->image_tokens) +
+                         gsf__nn_block_flops(run->sizes, 1.0, (double)rows);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_pair, b, 1.0);
@@ -1418,48 +1406,19 @@ static void bench_pipelines(const bench_options* o) {
 // ---- a layer of the text encoder at T5-XXL's size ---------------------------------------
 
 typedef struct bench_t5 {
-    gsf__t5_run run;
+    gsf__nn_run run;
     gsf_nn_t5 net;
+    gsf__nn_block_sizes sizes;
     gsf_nn_t5_input in;
-    gsf__t5_block block;
-    gsf_tensor tensors[9];
-    float* first; // the layer's input
+    gsf__nn_block block;
+    bench_weights weights;
+    float *x, *first; // at work; the layer's input
 } bench_t5;
-
-// Weights contiguous in `memory` (NULL: only computes their size), norms in f32; matrix values up to 2^-7, as in a block.
-static size_t bench_t5_weights(bench_t5* b, gsf_nn_dtype dtype, char* memory) {
-    const int64_t d = b->net.width, h = b->net.hidden;
-    const struct { const gsf_tensor** to; int64_t out, in; } parts[] = {
-        {&b->block.attention_norm, d, 1}, {&b->block.q, d, d}, {&b->block.k, d, d}, {&b->block.v, d, d},
-        {&b->block.out, d, d}, {&b->block.ff_norm, d, 1}, {&b->block.gate, h, d}, {&b->block.up, h, d}, {&b->block.down, d, h}};
-    size_t used = 0;
-    for (size_t i = 0; i < GSF__COUNT(parts); i++) {
-        gsf_tensor* t = &b->tensors[i];
-        const int is_matrix = parts[i].in > 1;
-        memset(t, 0, sizeof *t);
-        t->dtype = is_matrix ? dtype : GSF_NN_F32;
-        t->rank = is_matrix ? 2 : 1;
-        t->shape[0] = parts[i].out;
-        t->shape[1] = parts[i].in;
-        t->count = parts[i].out * parts[i].in;
-        t->data = memory + used;
-        *parts[i].to = t;
-        const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(t->dtype);
-        if (memory) {
-            bench_fill(memory + used, bytes, t->dtype, i + 1);
-            for (size_t k = 1; is_matrix && k < bytes; k += 2)
-                if (dtype == GSF_NN_BF16 || k % 4 == 3) memory[used + k] = (char)((memory[used + k] & 0x80) | 0x3b);
-        }
-        used += (bytes + 63) / 64 * 64;
-    }
-    return used;
-}
 
 static void bench_run_t5(gsf_context* ctx, void* arg) {
     bench_t5* b = (bench_t5*)arg;
-    memcpy(b->run.x, b->first, (size_t)(b->run.rows * b->net.width) * sizeof(float));
-    bench_require(ctx, gsf__t5_attention(&b->run, 0, &b->block));
-    bench_require(ctx, gsf__t5_feed_forward(&b->run, 0, &b->block));
+    memcpy(b->x, b->first, (size_t)b->in.tokens * (size_t)b->net.width * sizeof(float));
+    bench_require(ctx, gsf__nn_block_forward(&b->run, &b->block, 0, b->x, 1, b->in.tokens));
 }
 
 static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype, int32_t tokens) {
@@ -1478,21 +1437,19 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
     b.net.norm_eps = 1e-6;
     b.in.batch = 1;
     b.in.tokens = tokens;
-    char* weights = (char*)bench_alloc(&ctx, bench_t5_weights(&b, dtype, NULL), 1);
-    bench_t5_weights(&b, dtype, weights);
-    const gsf__t5_layout l = gsf__t5_plan(&b.net, &b.in);
-    float* memory = (float*)bench_alloc(&ctx, (size_t)(l.total + l.x), sizeof(float));
-    bench_fill(memory, (size_t)(l.total + l.x) * sizeof(float), GSF_NN_F32, 6); // includes the bias
+    b.sizes = gsf__t5_block_sizes(&b.net);
+    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(&b.sizes);
+    char* weights = bench_make_weights(&ctx, &b.weights, dtype, &sizes, gsf__t5_block_entries, &b.block);
+    float* bias;
+    const size_t floats = gsf__t5_lay_out(&b.run, &b.net, &b.in, &b.x, &bias, NULL), stream = (size_t)tokens * 4096;
+    float* memory = (float*)bench_alloc(&ctx, floats + stream, sizeof(float));
+    bench_fill(memory, (floats + stream) * sizeof(float), GSF_NN_F32, 6); // includes the bias
+    gsf__t5_lay_out(&b.run, &b.net, &b.in, &b.x, &bias, memory);
     b.run.ctx = &ctx;
-    b.run.net = &b.net;
-    b.run.in = &b.in;
-    b.run.rows = tokens;
-    b.run.x = memory;
-    b.run.normed = b.run.x + (size_t)l.x;
-    b.run.wide = b.run.normed + (size_t)l.x;
-    b.run.bias = b.run.wide + (size_t)l.wide;
-    b.run.norm = b.run.bias + (size_t)l.bias;
-    b.first = memory + (size_t)l.total;
+    b.run.sizes = &b.sizes;
+    b.run.bias = bias;
+    b.run.scale = 1.0f;
+    b.first = memory + floats;
     double bytes, flops;
     gsf_nn_t5_cost(&b.net, &b.in, &bytes, &flops);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
@@ -1517,9 +1474,9 @@ enum { BENCH_OPT_WIDTH = 2560, BENCH_OPT_HEADS = 32, BENCH_OPT_ROWS = 33, BENCH_
 
 typedef struct bench_opt {
     gsf__blip net;
-    gsf__vit_block block;
-    gsf_tensor tensors[GSF__COUNT(gsf__opt_block_entries)];
-    gsf__caption_run run;
+    gsf__nn_block block;
+    bench_weights weights;
+    gsf__nn_run run;
     gsf__opt_run state;
     int64_t rows, past;
     const float* first; // residual stream before the layer
@@ -1527,29 +1484,9 @@ typedef struct bench_opt {
 
 static void bench_run_opt(gsf_context* ctx, void* arg) {
     bench_opt* b = (bench_opt*)arg;
-    b->state.past = b->past;
+    b->state.cache.past = b->past;
     memcpy(b->state.x, b->first, (size_t)(b->rows * BENCH_OPT_WIDTH) * sizeof(float));
-    bench_require(ctx, gsf__opt_block(&b->run, &b->state, 0, b->rows));
-}
-
-// The layer's tensors in half precision, contiguous; returns their size in bytes.
-static size_t bench_opt_weights(bench_opt* b, char* memory) {
-    size_t used = 0;
-    for (size_t i = 0; i < GSF__COUNT(gsf__opt_block_entries); i++) {
-        const gsf__vit_entry* e = &gsf__opt_block_entries[i];
-        gsf_tensor* t = &b->tensors[i];
-        memset(t, 0, sizeof *t);
-        t->name = e->name;
-        t->dtype = GSF_NN_F16;
-        t->count = 1;
-        for (const char* c = e->shape; *c; c++)
-            t->count *= t->shape[t->rank++] = gsf__vit_dimension(&b->net.text.sizes, NULL, *c);
-        t->data = memory + used;
-        if (memory) bench_fill(memory + used, (size_t)t->count * 2, GSF_NN_F16, i + 1);
-        memcpy((char*)&b->block + e->offset, &t, sizeof t);
-        used += (size_t)gsf__round_up(t->count * 2, 64);
-    }
-    return used;
+    bench_require(ctx, gsf__nn_block_forward(&b->run, &b->block, 0, b->state.x, 1, b->rows));
 }
 
 // One layer of OPT-2.7b: the prefill of an image's query tokens and bos, or the decoding of one token, which is bound by
@@ -1569,29 +1506,21 @@ static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     opt->sizes.activation = GSF_NN_RELU;
     opt->layers = opt->vocabulary = 1;
     opt->blocks = &b->block;
-    const size_t bytes = bench_opt_weights(b, NULL);
-    char* weights = (char*)bench_alloc(&ctx, bytes, 1);
-    bench_opt_weights(b, weights);
-    const gsf__opt_plan p = gsf__opt_plan_of(opt, rows, BENCH_OPT_CACHE, 1);
-    float* memory = (float*)bench_alloc(&ctx, gsf__opt_floats(&p) + p.x, sizeof(float));
-    bench_fill(memory, (2 * p.cache + p.x) * sizeof(float), GSF_NN_F32, 6);
+    opt->sizes.qkv_bias = 1;
+    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(&opt->sizes);
+    char* weights = bench_make_weights(&ctx, &b->weights, GSF_NN_F16, &sizes, gsf__opt_block_entries, &b->block);
+    const size_t bytes = b->weights.used, stream = (size_t)rows * BENCH_OPT_WIDTH;
+    b->state.cache.capacity = BENCH_OPT_CACHE;
+    const size_t floats = gsf__opt_lay_out(&b->run, opt, rows, 1, &b->state, NULL);
+    float* memory = (float*)bench_alloc(&ctx, floats + stream, sizeof(float));
+    bench_fill(memory, (floats + stream) * sizeof(float), GSF_NN_F32, 6);
+    gsf__opt_lay_out(&b->run, opt, rows, 1, &b->state, memory);
     b->rows = rows;
     b->past = rows > 1 ? 0 : BENCH_OPT_ROWS;
-    b->first = memory + 2 * p.cache;
-    b->state.capacity = BENCH_OPT_CACHE;
-    b->state.keys = memory;
-    b->state.values = memory + p.cache;
-    b->state.x = memory + 2 * p.cache + p.x;
-    b->run.net = &b->net;
-    b->run.vit.ctx = &ctx;
-    b->run.vit.sizes = &opt->sizes;
-    b->run.vit.normed = b->state.x + p.x;
-    b->run.vit.wide = b->run.vit.normed + p.normed;
-    b->run.vit.wide_count = (int64_t)p.wide;
-    b->run.vit.vectors = b->run.vit.wide + p.wide;
-    b->run.vit.vectors_size = p.vectors;
-    b->state.mask = (unsigned char*)(b->run.vit.vectors + p.vectors);
-    for (size_t i = 0; i < p.mask; i++) b->state.mask[i] = (int64_t)i % rows <= (int64_t)i / rows % rows;
+    b->first = memory + floats;
+    b->run.ctx = &ctx;
+    b->run.cache = &b->state.cache;
+    for (int64_t i = 0; i < BENCH_OPT_HEADS * rows * rows; i++) b->state.cache.mask[i] = i % rows <= i / rows % rows;
     const double d = BENCH_OPT_WIDTH, n = (double)rows;
     const double flops = 24.0 * n * d * d + 4.0 * n * (n + (double)b->past) * d;
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, rows > 1 ? flops : (double)bytes,
@@ -1600,7 +1529,7 @@ static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     else row.bytes = (double)bytes;
     bench_time(o, &ctx, &row, bench_run_opt, b, 1.0);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &b->run.vit.workspace);
+    gsf_nn_destroy_workspace(&ctx, &b->run.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
     gsf_free(&ctx, b);

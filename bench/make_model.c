@@ -399,6 +399,7 @@ typedef struct model_list {
     model_tensor* tensors;
     size_t count, capacity;
     uint64_t stream; // stream of the first tensor
+    int64_t dino, vggt; // channels of the reference tokens
     gsf_result result;
 } model_list;
 
@@ -469,30 +470,39 @@ static void model_add(model_list* list, int32_t rank, const int64_t* shape, cons
     model_choose_range(t);
 }
 
-// The tables that the loader uses for the transformer contain every name and shape.
-static void model_add_entries(model_list* list, const gsf_nn_transformer* c, const gsf__dit_entry* entries, size_t count,
+// The tables by which a network is opened have every name and shape, but for the channels of reference tokens.
+static gsf_result model_add_visited(void* user, const char* name, int32_t rank, const int64_t* shape,
+                                    const gsf_tensor** to) {
+    model_list* list = (model_list*)user;
+    int64_t known[GSF_NN_MAX_RANK];
+    (void)to;
+    for (int32_t i = 0; i < rank; i++) known[i] = shape[i] >= 0 ? shape[i] : strstr(name, "dino") ? list->dino : list->vggt;
+    model_add(list, rank, known, "", name);
+    return list->result;
+}
+
+static void model_add_entries(model_list* list, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
                               const char* prefix) {
-    for (size_t i = 0; i < count; i++) {
-        int64_t shape[5];
-        int32_t rank = 0;
-        for (const char* s = entries[i].shape; *s && rank < 5; s++) {
-            int64_t size = gsf__dit_dimension(c, *s);
-            if (size < 0) size = strstr(entries[i].name, "dino") ? c->dino_channels : c->vggt_channels;
-            shape[rank++] = size;
-        }
-        if (entries[i].kind == GSF__DIT_ATTENTION_BIAS && !c->attention_bias) continue;
-        if (entries[i].kind == GSF__DIT_LEARNED && !c->learned_positions) continue;
-        model_add(list, rank, shape, prefix, entries[i].name);
+    union { gsf__vit vit; gsf__vggt vggt; gsf__blip blip; gsf__qformer_layer qformer; gsf__nn_block block; gsf__t5_nets t5;
+            gsf__dit_nets dit; gsf__dit_block dit_block; } unused; // is told where its tensors would be
+    (void)gsf__nn_visit(sizes, entries, prefix, &unused, model_add_visited, list);
+}
+
+static void model_add_blocks(model_list* list, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries, const char* names,
+                             const char* below, int64_t count) {
+    char prefix[80];
+    for (int64_t i = 0; i < count; i++) {
+        snprintf(prefix, sizeof prefix, "%s%lld.%s", names, (long long)i, below);
+        model_add_entries(list, sizes, entries, prefix);
     }
 }
 
 static void model_add_transformer(model_list* list, const gsf_nn_transformer* c) {
-    char prefix[48];
-    model_add_entries(list, c, gsf__dit_entries, GSF__COUNT(gsf__dit_entries), "");
-    for (int32_t i = 0; i < c->layers; i++) {
-        snprintf(prefix, sizeof prefix, "transformer_blocks.%d.", (int)i);
-        model_add_entries(list, c, gsf__dit_block_entries, GSF__COUNT(gsf__dit_block_entries), prefix);
-    }
+    const gsf__nn_sizes sizes = gsf__dit_tensor_sizes(c);
+    list->dino = c->dino_channels;
+    list->vggt = c->vggt_channels;
+    model_add_entries(list, &sizes, gsf__dit_entries, "");
+    model_add_blocks(list, &sizes, gsf__dit_block_entries, "transformer_blocks.", "", c->layers);
 }
 
 // The loader walks the autoencoder instead of using a table; this is the same walk. Opening the model afterwards checks
@@ -557,117 +567,58 @@ static void model_add_vae(model_list* list, const gsf_nn_vae* vae) {
     model_add_coder(list, vae, 1);
 }
 
-// The image encoders are loaded by tables as well. vit: NULL for entries of blocks.
-static void model_add_vit(model_list* list, const gsf__vit_sizes* sizes, const gsf__vit* vit, const gsf__vit_entry* entries,
-                          size_t count, const char* prefix) {
-    for (size_t i = 0; i < count; i++) {
-        int64_t shape[5];
-        int32_t rank = 0;
-        for (const char* s = entries[i].shape; *s && rank < 5; s++) shape[rank++] = gsf__vit_dimension(sizes, vit, *s);
-        if (entries[i].kind == GSF__VIT_QKV_BIAS && !sizes->qkv_bias) continue;
-        if (entries[i].kind == GSF__VIT_HEAD_NORM && !sizes->head_norm) continue;
-        model_add(list, rank, shape, prefix, entries[i].name);
-    }
+static void model_add_vit(model_list* list, const gsf__vit* vit, const gsf__nn_entry* entries, const char* prefix) {
+    const gsf__nn_sizes sizes = gsf__vit_sizes(vit);
+    model_add_entries(list, &sizes, entries, prefix);
 }
 
-static void model_add_vit_blocks(model_list* list, const gsf__vit_sizes* sizes, const gsf__vit_entry* entries, size_t count,
+static void model_add_vit_blocks(model_list* list, const gsf__nn_block_sizes* s, const gsf__nn_entry* entries,
                                  const char* names, int64_t layers) {
-    char prefix[64];
-    for (int64_t i = 0; i < layers; i++) {
-        snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
-        model_add_vit(list, sizes, NULL, entries, count, prefix);
-    }
+    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(s);
+    model_add_blocks(list, &sizes, entries, names, "", layers);
 }
 
 static void model_add_dinov2(model_list* list, const gsf__vit* vit) {
     const int64_t mask[2] = {1, vit->sizes.width};
-    model_add_vit(list, &vit->sizes, vit, gsf__dinov2_entries, GSF__COUNT(gsf__dinov2_entries), "");
+    model_add_vit(list, vit, gsf__dinov2_entries, "");
     model_add(list, 2, mask, "", "embeddings.mask_token"); // for training
-    model_add_vit_blocks(list, &vit->sizes, gsf__dinov2_block_entries, GSF__COUNT(gsf__dinov2_block_entries),
-                         vit->block_names, vit->layers);
+    model_add_vit_blocks(list, &vit->sizes, gsf__dinov2_block_entries, vit->block_names, vit->layers);
 }
 
 static void model_add_vggt(model_list* list, const gsf__vggt* net) {
     const gsf__vit* vit = &net->embed;
-    const gsf__vit_entry* entries = gsf__vggt_block_entries;
-    const size_t count = GSF__COUNT(gsf__vggt_block_entries);
-    const int64_t camera[4] = {1, 2, 1, net->sizes.width}, registers[4] = {1, 2, net->registers, net->sizes.width};
-    model_add(list, 4, camera, "aggregator.", "camera_token");
-    model_add(list, 4, registers, "aggregator.", "register_token");
-    model_add_vit(list, &vit->sizes, vit, gsf__vggt_entries, GSF__COUNT(gsf__vggt_entries), "");
-    model_add(list, 2, camera + 2, vit->prefix, "mask_token");
-    model_add_vit_blocks(list, &vit->sizes, entries, count, vit->block_names, vit->layers);
-    model_add_vit_blocks(list, &net->sizes, entries, count, gsf__vggt_frame_names, net->layers);
-    model_add_vit_blocks(list, &net->sizes, entries, count, gsf__vggt_global_names, net->layers);
+    const gsf__nn_entry* entries = gsf__vggt_block_entries;
+    const gsf__nn_sizes sizes = gsf__vggt_sizes(net);
+    const int64_t mask[2] = {1, net->sizes.width};
+    model_add_entries(list, &sizes, gsf__vggt_entries, "");
+    model_add_vit(list, vit, gsf__vggt_embed_entries, "");
+    model_add(list, 2, mask, vit->prefix, "mask_token");
+    model_add_vit_blocks(list, &vit->sizes, entries, vit->block_names, vit->layers);
+    model_add_vit_blocks(list, &net->sizes, entries, gsf__vggt_frame_names, net->layers);
+    model_add_vit_blocks(list, &net->sizes, entries, gsf__vggt_global_names, net->layers);
 }
 
-// Walks again, the same as in the loaders.
 static void model_add_t5(model_list* list, const gsf_nn_t5* c) {
-    const int64_t d = c->width, inner = (int64_t)c->heads * c->head_dim, h = c->hidden;
-    const struct { const char* name; int32_t rank; int64_t shape[2]; } parts[] = {
-        {"0.layer_norm.weight", 1, {d, 0}},           {"0.SelfAttention.q.weight", 2, {inner, d}},
-        {"0.SelfAttention.k.weight", 2, {inner, d}},  {"0.SelfAttention.v.weight", 2, {inner, d}},
-        {"0.SelfAttention.o.weight", 2, {d, inner}},  {"1.layer_norm.weight", 1, {d, 0}},
-        {"1.DenseReluDense.wi_0.weight", 2, {h, d}},  {"1.DenseReluDense.wi_1.weight", 2, {h, d}},
-        {"1.DenseReluDense.wo.weight", 2, {d, h}}};
-    const int64_t words[2] = {c->vocabulary, d}, positions[2] = {c->buckets, c->heads};
-    char prefix[48];
-    model_add(list, 2, words, "", "shared.weight");
-    model_add(list, 2, positions, "", "encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight");
-    model_add(list, 1, &d, "", "encoder.final_layer_norm.weight");
-    for (int32_t i = 0; i < c->layers; i++) {
-        snprintf(prefix, sizeof prefix, "encoder.block.%d.layer.", (int)i);
-        for (size_t k = 0; k < GSF__COUNT(parts); k++)
-            model_add(list, parts[k].rank, parts[k].shape, prefix, parts[k].name);
-    }
-}
-
-// PREFIX.weight (out, in), or (out) with in = 0, and PREFIX.bias (out).
-static void model_add_linear(model_list* list, const char* prefix, const char* name, int64_t out, int64_t in) {
-    const int64_t shape[2] = {out, in};
-    char full[96];
-    snprintf(full, sizeof full, "%s%s", prefix, name);
-    model_add(list, in ? 2 : 1, shape, full, ".weight");
-    model_add(list, 1, shape, full, ".bias");
-}
-
-static void model_add_qformer(model_list* list, const gsf__qformer* q, int64_t source) {
-    static const char* const kinds[] = {"attention", "crossattention"};
-    const int64_t d = q->width, tokens[3] = {1, q->queries, d};
-    char layer[48], prefix[80];
-    model_add(list, 3, tokens, "", "query_tokens");
-    model_add_linear(list, "qformer.", "layernorm", d, 0);
-    for (int64_t i = 0; i < q->layers; i++) {
-        snprintf(layer, sizeof layer, "qformer.encoder.layer.%lld.", (long long)i);
-        for (int cross = 0; cross < (i % q->cross_every == 0 ? 2 : 1); cross++) {
-            snprintf(prefix, sizeof prefix, "%s%s.", layer, kinds[cross]);
-            model_add_linear(list, prefix, "attention.query", d, d);
-            model_add_linear(list, prefix, "attention.key", d, cross ? source : d);
-            model_add_linear(list, prefix, "attention.value", d, cross ? source : d);
-            model_add_linear(list, prefix, "output.dense", d, d);
-            model_add_linear(list, prefix, "output.LayerNorm", d, 0);
-        }
-        model_add_linear(list, layer, "intermediate_query.dense", q->mlp, d);
-        model_add_linear(list, layer, "output_query.dense", d, q->mlp);
-        model_add_linear(list, layer, "output_query.LayerNorm", d, 0);
-    }
+    const gsf__nn_block_sizes block = gsf__t5_block_sizes(c);
+    const gsf__nn_sizes sizes = gsf__t5_sizes(c), block_sizes = gsf__nn_sizes_of_block(&block);
+    model_add_entries(list, &sizes, gsf__t5_entries, "");
+    model_add_blocks(list, &block_sizes, gsf__t5_block_entries, "encoder.block.", "layer.", c->layers);
 }
 
 static void model_add_blip2(model_list* list, const gsf__blip* net) {
-    static const char decoder[] = "language_model.model.decoder.";
     const gsf__vit* vit = &net->vision;
-    const gsf__opt* opt = &net->text;
-    const int64_t d = opt->sizes.width, words[2] = {opt->vocabulary, d}, places[2] = {opt->positions + GSF__OPT_OFFSET, d};
-    model_add_vit(list, &vit->sizes, vit, gsf__blip_entries, GSF__COUNT(gsf__blip_entries), "vision_model.");
-    model_add_vit_blocks(list, &vit->sizes, gsf__blip_block_entries, GSF__COUNT(gsf__blip_block_entries), vit->block_names,
-                         vit->layers);
-    model_add_qformer(list, &net->qformer, vit->sizes.width);
-    model_add_linear(list, "", "language_projection", d, net->qformer.width);
-    model_add(list, 2, words, decoder, "embed_tokens.weight"); // and head
-    model_add(list, 2, places, decoder, "embed_positions.weight");
-    model_add_linear(list, decoder, "final_layer_norm", d, 0);
-    model_add_vit_blocks(list, &opt->sizes, gsf__opt_block_entries, GSF__COUNT(gsf__opt_block_entries),
-                         "language_model.model.decoder.layers.", opt->layers);
+    const gsf__nn_sizes sizes = gsf__blip_sizes(net);
+    model_add_vit(list, vit, gsf__blip_vision_entries, "vision_model.");
+    model_add_vit_blocks(list, &vit->sizes, gsf__blip_block_entries, vit->block_names, vit->layers);
+    model_add_entries(list, &sizes, gsf__blip_entries, "");
+    for (int64_t i = 0; i < net->qformer.layers; i++) {
+        const gsf__nn_sizes layer = gsf__qformer_sizes(net, i);
+        char prefix[48];
+        snprintf(prefix, sizeof prefix, "qformer.encoder.layer.%lld.", (long long)i);
+        model_add_entries(list, &layer, gsf__qformer_layer_entries, prefix);
+    }
+    model_add_vit_blocks(list, &net->text.sizes, gsf__opt_block_entries, "language_model.model.decoder.layers.",
+                         net->text.layers);
 }
 
 // ---- the list of a part: sizes are taken from the text of its config.json
@@ -713,6 +664,7 @@ static void model_list_vggt(model_list* list, const model_size* s, gsf__nn_confi
     memset(&net, 0, sizeof net);
     net.sizes.width = s->eyes.width;
     net.sizes.mlp = s->eyes.hidden;
+    net.sizes.heads = s->eyes.heads;
     net.sizes.head_dim = s->eyes.width / s->eyes.heads;
     net.sizes.qkv_bias = 1;
     net.embed.sizes = net.sizes;

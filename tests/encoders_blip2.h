@@ -18,7 +18,8 @@ typedef struct blip2_case {
     int seen;
 } blip2_case;
 
-static void see_blip2_tap(void* user, const char* name, const float* data, int64_t rows, int64_t columns) {
+static void see_blip2_tap(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns) {
+    (void)index;
     blip2_case* c = (blip2_case*)user;
     for (size_t i = 0; i < sizeof blip2_stages / sizeof *blip2_stages; i++) {
         if (strcmp(blip2_stages[i].tap, name) != 0) continue;
@@ -95,8 +96,8 @@ static void check_blip2_run(blip2_case* c, const gsf_nn_captioner* net, const gs
     check_blip2_ids("hf_generate_default", json, usual, inputs->count, ids, count);
     gsf_free(c->ctx, ids);
     d.max_new_tokens = 24;
-    d.tap_fn = see_blip2_tap;
-    d.tap_user = c;
+    const gsf__nn_tap tap = {see_blip2_tap, c};
+    d._tap = &tap;
     CHECK_OK(c->ctx, gsf_nn_caption_ids(c->ctx, net, &d, &ids, &count));
     check_blip2_ids("hf_generate_max_new_24", json, gsf_json_member(json, expected, "hf_generate_max_new_24"),
                     inputs->count, ids, count);

@@ -54,8 +54,8 @@ static inline void check_encoder_case(gsf_context* ctx, golden_encoder* e, gsf_n
     float* out = (float*)malloc(count * sizeof(float));
     test_tensor last = golden_case(e, e->output);
     if (CHECK(last.count == count)) {
-        in.tap_fn = e->see_tap;
-        in.tap_user = e;
+        const gsf__nn_tap tap = {e->see_tap, e};
+        in._tap = &tap;
         e->images = in.images;
         e->seen = 0;
         CHECK_OK(ctx, e->encode(ctx, e->net, &in, out));
@@ -63,7 +63,7 @@ static inline void check_encoder_case(gsf_context* ctx, golden_encoder* e, gsf_n
         for (int64_t i = 0; i < in.images; i++)
             check_rows("patches", out + i * tokens * d, tokens, d, d, last.v + (i * all + e->special) * d, d, e->bar);
         in.all_tokens = 1;
-        in.tap_fn = NULL;
+        in._tap = NULL;
         CHECK_OK(ctx, e->encode(ctx, e->net, &in, out));
         check_rows("all tokens", out, in.images * all, d, d, last.v, d, e->bar);
     }

@@ -18,24 +18,30 @@ typedef struct pipeline_case {
     float *control, *noise, *text, *references, *video;
     gsf_nn_sample_desc desc;
     int compare_steps; // against latents_after_step*
+    int seen_latents, seen_prediction; // compared
     float* latents;    // after the last step
 } pipeline_case;
 
-static void see_step(void* user, int32_t step, const float* latents, const float* prediction, int64_t count) {
+// The latents after a step, and what the network predicted in it (guided).
+static void see_step(void* user, const char* what, int32_t step, const float* data, int64_t rows, int64_t columns) {
     pipeline_case* c = (pipeline_case*)user;
+    const size_t count = (size_t)(rows * columns);
     char name[64];
-    memcpy(c->latents, latents, (size_t)count * sizeof(float));
-    if (!c->compare_steps) return;
-    if (step == 0) { // the file has the two halves before guidance
+    if (strcmp(what, "latents") == 0) {
+        memcpy(c->latents, data, count * sizeof(float));
+        if (!c->compare_steps) return;
+        snprintf(name, sizeof name, "latents_after_step%d", (int)step);
+        double* wanted = golden_doubles(&c->expected, name, NULL);
+        check_rel_l2(name, data, wanted, count, pipeline_bar);
+        free(wanted);
+        c->seen_latents++;
+    } else if (c->compare_steps && step == 0) { // the file has the two halves before guidance
         double* halves = golden_doubles(&c->expected, "step0_noise_pred", NULL);
-        for (int64_t i = 0; i < count; i++) halves[i] += (double)c->desc.guidance * (halves[count + i] - halves[i]);
-        check_rel_l2("step0_noise_pred", prediction, halves, (size_t)count, pipeline_bar);
+        for (size_t i = 0; i < count; i++) halves[i] += (double)c->desc.guidance * (halves[count + i] - halves[i]);
+        check_rel_l2("step0_noise_pred", data, halves, count, pipeline_bar);
         free(halves);
+        c->seen_prediction++;
     }
-    snprintf(name, sizeof name, "latents_after_step%d", (int)step);
-    double* wanted = golden_doubles(&c->expected, name, NULL);
-    check_rel_l2(name, latents, wanted, (size_t)count, pipeline_bar);
-    free(wanted);
 }
 
 // Artifact frames with the reference images as first and last one, (3, frames, height, width) in [-1,1].
@@ -147,13 +153,14 @@ static void check_pipeline(void) {
     CHECK_OK(&c.ctx, gsf_nn_project_references(&c.ctx, &c.net, c.desc.reference_tokens, dino, vggt, c.references));
     c.desc.references = c.references;
     c.video = (float*)malloc(3 * (size_t)c.desc.frames * (size_t)c.desc.height * (size_t)c.desc.width * sizeof(float));
-    c.desc.step_fn = see_step;
-    c.desc.step_user = &c;
+    const gsf__nn_tap tap = {see_step, &c};
+    c.desc._tap = &tap;
 
     check_control(&c);
     c.compare_steps = 1;
     run_pipeline(&c, "final latents", "final_latents_f64", pipeline_bar);
     c.compare_steps = 0;
+    CHECK(c.seen_latents == c.desc.steps && c.seen_prediction == 1);
     check_video(&c);
     c.desc.no_reference_cache = 1;
     run_pipeline(&c, "final latents without the reference cache", "final_latents_f64", pipeline_bar);

@@ -129,10 +129,10 @@ static void check_t5(void) {
     c.taps = test_open_tensors(test_golden("restorer/t5/intermediates_f32.safetensors"));
     int32_t *ids = t5_ids(&c, "ids", &in), *ids226 = t5_ids(&c, "ids226", &in226);
     check_t5_positions(&c);
-    in.tap_fn = see_t5;
-    in.tap_user = &c;
+    const gsf__nn_tap tap = {see_t5, &c};
+    in._tap = &tap;
     check_t5_output(&c, &c.net, &in, &c.f64, "out", t5_bar);
-    in.tap_fn = NULL;
+    in._tap = NULL;
     if (CHECK_OK(&c.ctx, gsf_nn_open_weights(&c.ctx, c.taps.path, NULL, &names))) {
         size_t rows = 0; // each tensor holds that many prompts
         for (size_t i = 0; i < names.tensor_count; i++) rows += (size_t)names.tensors[i].shape[0];

@@ -147,10 +147,10 @@ static void check_transformer(void) {
         char name[32];
         snprintf(name, sizeof name, "out_t%d", times[i]);
         for (int b = 0; b < batch; b++) steps[b] = times[i];
-        in.tap_fn = times[i] == 999 ? see_tap : NULL;
-        in.tap_user = &c;
+        const gsf__nn_tap tap = {see_tap, &c};
+        in._tap = times[i] == 999 ? &tap : NULL;
         check_output(&c, &c.net, &in, name, transformer_bar);
-        in.tap_fn = NULL;
+        in._tap = NULL;
         check_output(&c, &rounded, &in, name, bf16_bar);
         rounded.bf16 = 1; // products of bf16 as well, where the processor has them
         check_output(&c, &rounded, &in, name, bf16_bar);

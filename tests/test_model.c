@@ -275,7 +275,8 @@ static void check_transformer(gsf_context* ctx, const folder* model) {
         in.timesteps = steps;
         in.references = references;
         in.reference_tokens = tokens;
-        in.tap_fn = see_tap;
+        const gsf__nn_tap tap = {see_tap, NULL};
+        in._tap = &tap;
         CHECK_OK(ctx, gsf_nn_transformer_forward(ctx, &net, &in, out));
         check_rms("velocity", out, plane * (size_t)net.out_channels, 0.5, 2.0);
         CHECK(gates == 2 * net.layers);

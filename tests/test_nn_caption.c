@@ -391,9 +391,10 @@ static void test_image_kinds(gsf_context* ctx, const gsf_nn_captioner* net, cons
 
 typedef struct seen { uint64_t sum; int stages; } seen; // of all intermediates' bits
 
-static void see_tap(void* user, const char* name, const float* data, int64_t rows, int64_t columns) {
+static void see_tap(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns) {
     seen* s = (seen*)user;
     (void)name;
+    (void)index;
     for (int64_t i = 0; i < rows * columns; i++) {
         uint32_t bits;
         memcpy(&bits, &data[i], sizeof bits);
@@ -435,14 +436,14 @@ static void test_runs(const gsf_image* photo) {
         memset(&d, 0, sizeof d);
         d.image = photo;
         d.max_new_tokens = 3;
-        d.tap_fn = see_tap;
-        d.tap_user = &sums[k];
+        const gsf__nn_tap tap = {see_tap, &sums[k]};
+        d._tap = &tap;
         CHECK_OK(&ctx, gsf_nn_caption_ids(&ctx, &net, &d, &ids, &count));
         for (size_t i = 0; i < count; i++) sums[k].sum = (sums[k].sum ^ (uint64_t)ids[i]) * 0x100000001b3u;
         gsf_free(&ctx, ids);
         CHECK(sums[k].stages == 5 && w.last == w.total && w.calls > 3);
         const double steps = w.total;
-        d.tap_fn = NULL;
+        d._tap = NULL;
         for (double stop = 1.0; stop < steps && k == 0; stop += 1.0) {
             w.last = 0.0;
             w.stop_at = stop;
