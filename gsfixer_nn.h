@@ -992,6 +992,13 @@ static void gsf__nn_unmap(const unsigned char* data, size_t size) {
 }
 #endif
 
+// FOLDER/NAME; `out` is to be freed, also on error.
+static gsf_result gsf__nn_join(gsf_context* ctx, const char* folder, const char* name, gsf_text* out) {
+    memset(out, 0, sizeof *out);
+    gsf_text_printf(ctx, out, "%s%s%s", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
+    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+}
+
 // ---- reading the header
 
 // A name for one line of text: ASCII, and not too long.
@@ -1653,10 +1660,12 @@ GSF__SHARED gsf_result gsf__nn_end_loading(gsf__nn_loader* loader, gsf_result re
 typedef struct gsf__nn_config {
     gsf_context* ctx;
     gsf_json json;
+    const gsf_json_value* root; // the object whose keys are read; NULL: all are absent
 } gsf__nn_config;
 
 static gsf_result gsf__nn_check_config(gsf__nn_config* config) {
-    if (config->json.values[0].type == GSF_JSON_OBJECT) return GSF_OK;
+    config->root = &config->json.values[0];
+    if (config->root->type == GSF_JSON_OBJECT) return GSF_OK;
     const gsf_result result = gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s:0: no object", config->json.name);
     gsf_destroy_json(config->ctx, &config->json);
     return result;
@@ -1670,20 +1679,10 @@ GSF__SHARED gsf_result gsf__nn_parse_config(gsf_context* ctx, const char* name, 
     return gsf__nn_check_config(out);
 }
 
-GSF__SHARED gsf_result gsf__nn_load_config(gsf_context* ctx, const char* path, gsf__nn_config* out) {
-    void* data;
-    size_t size;
-    memset(out, 0, sizeof *out);
-    GSF__TRY(gsf_read_file(ctx, path, &data, &size));
-    const gsf_result result = gsf__nn_parse_config(ctx, path, (const char*)data, size, out);
-    gsf_free(ctx, data);
-    return result;
-}
-
 GSF__SHARED void gsf__nn_close_config(gsf__nn_config* config) { gsf_destroy_json(config->ctx, &config->json); }
 
 static const gsf_json_value* gsf__nn_config_find(const gsf__nn_config* config, const char* key) {
-    const gsf_json_value* value = gsf_json_member(&config->json, &config->json.values[0], key);
+    const gsf_json_value* value = gsf_json_member(&config->json, config->root, key);
     return value && value->type != GSF_JSON_NULL ? value : NULL;
 }
 
@@ -1737,14 +1736,19 @@ GSF__SHARED gsf_result gsf__nn_config_number_or(const gsf__nn_config* config, co
     return gsf__nn_config_find(config, key) ? gsf__nn_config_number(config, key, low, high, out) : GSF_OK;
 }
 
-GSF__SHARED gsf_result gsf__nn_config_bool_or(const gsf__nn_config* config, const char* key, int fallback, int* out) {
-    const gsf_json_value* value = gsf__nn_config_find(config, key);
+// Of any object: null counts as absent.
+static gsf_result gsf__nn_config_flag(const gsf__nn_config* config, const gsf_json_value* value, const char* key,
+                                      int fallback, int* out) {
     *out = fallback;
-    if (!value) return GSF_OK;
+    if (!value || value->type == GSF_JSON_NULL) return GSF_OK;
     if (value->type != GSF_JSON_TRUE && value->type != GSF_JSON_FALSE)
         return gsf__nn_config_fail(config, value, key, "true or false");
     *out = value->type == GSF_JSON_TRUE;
     return GSF_OK;
+}
+
+GSF__SHARED gsf_result gsf__nn_config_bool_or(const gsf__nn_config* config, const char* key, int fallback, int* out) {
+    return gsf__nn_config_flag(config, gsf__nn_config_find(config, key), key, fallback, out);
 }
 
 // *out points into the config, or to the fallback; NULL as fallback: the key must be there.
@@ -1756,6 +1760,14 @@ GSF__SHARED gsf_result gsf__nn_config_string(const gsf__nn_config* config, const
     if (!value || value->type != GSF_JSON_STRING) return gsf__nn_config_fail(config, value, key, "a text");
     *out = value->string;
     return GSF_OK;
+}
+
+// The object under `key`, as a config that lives as long as the whole; where there is none, all its keys are absent.
+static gsf_result gsf__nn_config_part(const gsf__nn_config* config, const char* key, gsf__nn_config* part) {
+    *part = *config;
+    part->root = gsf__nn_config_find(config, key);
+    if (!part->root || part->root->type == GSF_JSON_OBJECT) return GSF_OK;
+    return gsf__nn_config_fail(config, part->root, key, "an object");
 }
 
 // Between 1 and `room` whole numbers.
@@ -1781,13 +1793,11 @@ GSF__SHARED gsf_result gsf__nn_open_config(gsf_context* ctx, const char* folder,
     gsf_text path;
     void* data = NULL;
     size_t size = 0;
-    memset(&path, 0, sizeof path);
     memset(out, 0, sizeof *out);
     out->ctx = ctx;
-    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY
-                        : may_lack  ? gsf__nn_read_if_there(ctx, path.data, &data, &size)
-                                    : gsf_read_file(ctx, path.data, &data, &size);
+    gsf_result result = gsf__nn_join(ctx, folder, name, &path);
+    if (!result && may_lack) result = gsf__nn_read_if_there(ctx, path.data, &data, &size);
+    else if (!result) result = gsf_read_file(ctx, path.data, &data, &size);
     if (!result && !data && may_lack) result = gsf__nn_parse_config(ctx, path.data, "{}", 2, out);
     else if (!result) result = gsf__nn_parse_config(ctx, path.data, (const char*)data, size, out);
     gsf_free(ctx, data);
@@ -5844,6 +5854,7 @@ static gsf_result gsf__nn_visit_entry(const gsf__nn_sizes* sizes, const gsf__nn_
     int64_t shape[GSF_NN_MAX_RANK];
     int32_t rank = 0;
     char name[200];
+    memset(shape, 0, sizeof shape);
     if (!has_option && e->form != GSF__NN_BIASED) return GSF_OK;
     for (const char* letter = e->shape; *letter; letter++) shape[rank++] = gsf__nn_size_of(sizes, *letter);
     snprintf(name, sizeof name, "%s%s%s", prefix, e->name, e->form == GSF__NN_TENSOR ? "" : ".weight");
@@ -5882,6 +5893,23 @@ static gsf_result gsf__nn_bind_blocks(gsf__nn_loader* loader, const gsf__nn_size
         GSF__TRY(gsf__nn_bind(loader, sizes, entries, prefix, (char*)*blocks + (size_t)i * size));
     }
     return GSF_OK;
+}
+
+// A network from FOLDER/config.json and FOLDER/PREFIX*.safetensors: `read` fills in what the config tells, `bind` takes the
+// tensors. A part of it that was opened before an error is the caller's to destroy.
+static gsf_result gsf__nn_open_network(gsf_context* ctx, const char* folder, const char* prefix,
+                                       gsf_result (*read)(const gsf__nn_config* file, void* network),
+                                       gsf_result (*bind)(gsf__nn_loader* loader, void* network), void* network,
+                                       gsf_nn_weights* weights) {
+    gsf__nn_config file;
+    gsf__nn_loader loader;
+    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
+    if (!result) result = read(&file, network);
+    gsf__nn_close_config(&file);
+    if (!result) result = gsf_nn_open_weights(ctx, folder, prefix, weights);
+    if (result) return result;
+    GSF__TRY(gsf__nn_begin_loading(ctx, weights, &loader));
+    return gsf__nn_end_loading(&loader, bind(&loader, network));
 }
 
 // ---- layers: a pass
@@ -6053,6 +6081,39 @@ static gsf_result gsf__nn_attend(gsf__nn_run* run, const gsf_nn_attention_desc* 
         d.out += d.queries * (d.ldo ? d.ldo : width);
     }
     return GSF_OK;
+}
+
+// ---- layers: patches
+
+typedef struct gsf__nn_patch_job { // images (channels, height, width) and rows (channels, patch, patch) of their patches
+    const float* from;
+    float* to;
+    int64_t channels, height, width, patch;
+    int back;                      // rows to images
+    const float *mean, *deviation; // of each channel, taken out; NULL: neither
+} gsf__nn_patch_job;
+
+static void gsf__nn_patch_row(void* arg, size_t index, int worker) { // the patches of one row of them
+    const gsf__nn_patch_job* job = (const gsf__nn_patch_job*)arg;
+    const int64_t p = job->patch, across = job->width / p, down = job->height / p, row = (int64_t)index;
+    const int64_t plane = job->height * job->width, image = row / down * job->channels * plane;
+    int64_t at = row * across * job->channels * p * p; // in the rows
+    (void)worker;
+    for (int64_t column = 0; column < across; column++)
+        for (int64_t c = 0; c < job->channels; c++) {
+            const int64_t corner = image + c * plane + row % down * p * job->width + column * p;
+            const float mean = job->mean ? job->mean[c] : 0.0f, deviation = job->mean ? job->deviation[c] : 1.0f;
+            for (int64_t y = 0; y < p; y++, at += p)
+                for (int64_t x = 0; x < p; x++) {
+                    const int64_t pixel = corner + y * job->width + x;
+                    if (job->back) job->to[pixel] = job->from[at + x];
+                    else job->to[at + x] = (job->from[pixel] - mean) / deviation;
+                }
+        }
+}
+
+static void gsf__nn_patch(gsf_context* ctx, const gsf__nn_patch_job* job, int64_t images) {
+    gsf__parallel_for(ctx, (size_t)(images * (job->height / job->patch)), gsf__nn_patch_row, (void*)(uintptr_t)job);
 }
 
 // ---- layers: rotation by row and column
@@ -6372,27 +6433,6 @@ static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* ent
 
 // ---- image encoders: from pixels to tokens
 
-typedef struct gsf__vit_patch_job {
-    const float* pixels; // (channels, height, width)
-    float* rows;         // (patches, channels, patch, patch)
-    int64_t channels, height, width, patch;
-    const float *mean, *deviation; // of each channel, taken out; NULL: neither
-} gsf__vit_patch_job;
-
-static void gsf__vit_patch_row(void* arg, size_t index, int worker) { // the patches of one row of them
-    const gsf__vit_patch_job* job = (const gsf__vit_patch_job*)arg;
-    const int64_t p = job->patch, across = job->width / p, row = (int64_t)index;
-    float* to = job->rows + row * across * job->channels * p * p;
-    (void)worker;
-    for (int64_t column = 0; column < across; column++)
-        for (int64_t c = 0; c < job->channels; c++) {
-            const float* from = job->pixels + (c * job->height + row * p) * job->width + column * p;
-            const float mean = job->mean ? job->mean[c] : 0.0f, deviation = job->mean ? job->deviation[c] : 1.0f;
-            for (int64_t y = 0; y < p; y++, from += job->width)
-                for (int64_t x = 0; x < p; x++) *to++ = (from[x] - mean) / deviation;
-        }
-}
-
 // Positions of the class token and of (down, across) patches, interpolated from the square grid: out (1 + patches, width).
 // The weights are PyTorch's for bicubic, antialias, align_corners=False, which are Pillow's.
 static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int64_t down, int64_t across, float* out) {
@@ -6420,16 +6460,9 @@ static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gs
     const int64_t d = vit->sizes.width, p = vit->patch, down = in->height / p, across = in->width / p;
     const int64_t tokens = 1 + vit->registers + down * across;
     float* patches = x + (1 + vit->registers) * d;
-    gsf__vit_patch_job job;
-    job.pixels = in->pixels + image * vit->channels * in->height * in->width;
-    job.rows = run->wide;
-    job.channels = vit->channels;
-    job.height = in->height;
-    job.width = in->width;
-    job.patch = p;
-    job.mean = normalize ? gsf__imagenet_mean : NULL;
-    job.deviation = gsf__imagenet_deviation;
-    gsf__parallel_for(run->ctx, (size_t)down, gsf__vit_patch_row, &job);
+    gsf__nn_patch_job job = {in->pixels + image * vit->channels * in->height * in->width, run->wide, vit->channels,
+                             in->height, in->width, p, 0, normalize ? gsf__imagenet_mean : NULL, gsf__imagenet_deviation};
+    gsf__nn_patch(run->ctx, &job, 1);
     gsf_nn_read_tensor(vit->class_token, 0, d, x);
     for (int64_t i = 0; i < d; i++) x[i] += positions[i];
     gsf_nn_read_tensor(vit->register_tokens, 0, vit->registers * d, x + d);
@@ -6542,7 +6575,8 @@ static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64
 // ---- image encoders: DINOv2
 
 // Keys that are missing have the defaults of transformers' Dinov2WithRegistersConfig.
-static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, gsf__vit* vit) {
+static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, void* network) {
+    gsf__vit* vit = (gsf__vit*)network;
     int64_t image;
     double ratio;
     const gsf__nn_key keys[] = {
@@ -6569,12 +6603,9 @@ static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, gsf__vit* 
     return GSF_OK;
 }
 
-static gsf_result gsf__dinov2_bind(gsf_context* ctx, gsf_nn_dinov2* out, gsf__vit* vit) {
-    gsf__nn_loader loader;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    const gsf_result result = gsf__vit_bind(&loader, gsf__dinov2_entries, gsf__dinov2_block_entries, "", vit);
-    gsf__nn_ignore(&loader, "embeddings.mask_token"); // for training
-    return gsf__nn_end_loading(&loader, result);
+static gsf_result gsf__dinov2_bind(gsf__nn_loader* loader, void* network) {
+    gsf__nn_ignore(loader, "embeddings.mask_token"); // for training
+    return gsf__vit_bind(loader, gsf__dinov2_entries, gsf__dinov2_block_entries, "", (gsf__vit*)network);
 }
 
 GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2) {
@@ -6586,16 +6617,12 @@ GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2) {
 }
 
 GSF_API gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out) {
-    gsf__nn_config file;
     memset(out, 0, sizeof *out);
     gsf__vit* vit = (gsf__vit*)gsf_alloc_zeroed(ctx, 1, sizeof *vit);
     if (!vit) return GSF_ERROR_OUT_OF_MEMORY;
     out->nets = vit;
-    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
-    if (!result) result = gsf__dinov2_read_config(&file, vit);
-    gsf__nn_close_config(&file);
-    if (!result) result = gsf_nn_open_weights(ctx, folder, "model", &out->weights);
-    if (!result) result = gsf__dinov2_bind(ctx, out, vit);
+    const gsf_result result =
+        gsf__nn_open_network(ctx, folder, "model", gsf__dinov2_read_config, gsf__dinov2_bind, vit, &out->weights);
     out->width = (int32_t)vit->sizes.width;
     out->heads = vit->sizes.heads;
     out->layers = (int32_t)vit->layers;
@@ -7163,7 +7190,7 @@ typedef struct gsf__bpe_merge {
 } gsf__bpe_merge;
 
 typedef struct gsf__bpe_tables { // behind gsf_nn_bpe.tables
-    gsf_json config, special_map, added_tokens; // hold the texts of added tokens
+    gsf__nn_config config, special_map, added_tokens; // hold the texts of added tokens
     char* strings;           // those of the vocabulary
     gsf__bpe_token* tokens;  // (vocabulary) sorted by text
     gsf__bpe_token* added;   // (added_count) sorted by text
@@ -7254,7 +7281,7 @@ typedef struct gsf__bpe_loader {
     const char* folder;
     gsf__bpe_tables* t;
     const gsf_json_value* decoder; // "added_tokens_decoder" of tokenizer_config.json, or NULL
-    gsf_text path, scratch;
+    gsf_text scratch;
 } gsf__bpe_loader;
 
 static int gsf__bpe_compare(const char* a, size_t a_size, const char* b, size_t b_size) {
@@ -7311,32 +7338,6 @@ static int32_t gsf__bpe_find_id(const gsf__bpe_tables* t, int32_t id) {
     return low;
 }
 
-// *data NULL: the file may be absent, and is.
-static gsf_result gsf__bpe_read(gsf__bpe_loader* l, const char* name, int must, void** data, size_t* size) {
-    l->path.size = 0;
-    gsf_text_printf(l->ctx, &l->path, "%s%s%s", l->folder, gsf__nn_ends_in(l->folder, "/") ? "" : "/", name);
-    if (l->path.failed) return GSF_ERROR_OUT_OF_MEMORY;
-    return must ? gsf_read_file(l->ctx, l->path.data, data, size)
-                : gsf__nn_read_if_there(l->ctx, l->path.data, data, size);
-}
-
-static gsf_result gsf__bpe_open_json(gsf__bpe_loader* l, const char* name, int must, gsf_json* out) {
-    void* data = NULL;
-    size_t size;
-    GSF__TRY(gsf__bpe_read(l, name, must, &data, &size));
-    if (!data) return GSF_OK;
-    const gsf_result result = gsf_parse_json(l->ctx, name, (const char*)data, size, out);
-    gsf_free(l->ctx, data);
-    if (result != GSF_OK || out->values[0].type == GSF_JSON_OBJECT) return result;
-    return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:0: no object", name);
-}
-
-// Member of a document that may be absent; null counts as absent.
-static const gsf_json_value* gsf__bpe_member(const gsf_json* json, const char* key) {
-    const gsf_json_value* value = json->values ? gsf_json_member(json, json->values, key) : NULL;
-    return value && value->type != GSF_JSON_NULL ? value : NULL;
-}
-
 static gsf_result gsf__bpe_copy_tokens(gsf__bpe_loader* l, const gsf_json* json) {
     const gsf_json_value* root = json->values;
     size_t bytes = 0;
@@ -7368,11 +7369,10 @@ static gsf_result gsf__bpe_copy_tokens(gsf__bpe_loader* l, const gsf_json* json)
 }
 
 static gsf_result gsf__bpe_read_vocabulary(gsf__bpe_loader* l) {
-    gsf_json json;
-    memset(&json, 0, sizeof json);
-    gsf_result result = gsf__bpe_open_json(l, "vocab.json", 1, &json);
-    if (!result) result = gsf__bpe_copy_tokens(l, &json);
-    gsf_destroy_json(l->ctx, &json);
+    gsf__nn_config file;
+    gsf_result result = gsf__nn_open_config(l->ctx, l->folder, "vocab.json", 0, &file);
+    if (!result) result = gsf__bpe_copy_tokens(l, &file.json);
+    gsf__nn_close_config(&file);
     for (unsigned byte = 0; byte < 256 && !result; byte++) {
         char text[2];
         l->t->bytes[byte] = gsf__bpe_find(l->t, text, gsf__bpe_store_character(gsf__bpe_character(byte), text));
@@ -7455,37 +7455,28 @@ static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, si
 }
 
 static gsf_result gsf__bpe_read_merges(gsf__bpe_loader* l) {
-    void* data;
+    void* data = NULL;
     size_t size;
-    GSF__TRY(gsf__bpe_read(l, "merges.txt", 1, &data, &size));
-    const gsf_result result = gsf__bpe_parse_merges(l, (const char*)data, size);
+    gsf_text path;
+    gsf_result result = gsf__nn_join(l->ctx, l->folder, "merges.txt", &path);
+    if (!result) result = gsf_read_file(l->ctx, path.data, &data, &size);
+    if (!result) result = gsf__bpe_parse_merges(l, (const char*)data, size);
     gsf_free(l->ctx, data);
+    gsf_destroy_text(l->ctx, &path);
     return result;
 }
 
 // ---- loading: added and special tokens
 
-static gsf_result gsf__bpe_flag(gsf__bpe_loader* l, const gsf_json* json, const gsf_json_value* object, const char* key,
-                                int fallback, int* out) {
-    const gsf_json_value* value = gsf_json_member(json, object, key);
-    *out = fallback;
-    if (!value || value->type == GSF_JSON_NULL) return GSF_OK;
-    if (value->type != GSF_JSON_TRUE && value->type != GSF_JSON_FALSE)
-        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: %s is not true or false", json->name, (unsigned)value->offset,
-                        key);
-    *out = value->type == GSF_JSON_TRUE;
-    return GSF_OK;
-}
-
 // A token as text, or as an object with its text in "content" and flags. Its id stays open.
-static gsf_result gsf__bpe_read_token(gsf__bpe_loader* l, const gsf_json* json, const gsf_json_value* value,
-                                      gsf__bpe_token* out) {
+static gsf_result gsf__bpe_read_token(const gsf__nn_config* file, const gsf_json_value* value, gsf__bpe_token* out) {
+    const gsf_json* json = &file->json;
     static const struct { const char* key; int flag; } keys[] = {
         {"lstrip", GSF__BPE_LSTRIP}, {"rstrip", GSF__BPE_RSTRIP}, {"special", GSF__BPE_SPECIAL}, {"single_word", 0}};
     const gsf_json_value* text = value->type == GSF_JSON_OBJECT ? gsf_json_member(json, value, "content") : value;
     memset(out, 0, sizeof *out);
     if (!text || text->type != GSF_JSON_STRING || text->string_size == 0)
-        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: no token, as text or with its \"content\"", json->name,
+        return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no token, as text or with its \"content\"", json->name,
                         (unsigned)value->offset);
     out->text = text->string;
     out->size = text->string_size;
@@ -7493,9 +7484,9 @@ static gsf_result gsf__bpe_read_token(gsf__bpe_loader* l, const gsf_json* json, 
     out->flags = GSF__BPE_ADDED | (value->type == GSF_JSON_OBJECT ? GSF__BPE_OBJECT : 0);
     for (size_t i = 0; i < GSF__COUNT(keys) && value->type == GSF_JSON_OBJECT; i++) {
         int flag;
-        GSF__TRY(gsf__bpe_flag(l, json, value, keys[i].key, 0, &flag));
+        GSF__TRY(gsf__nn_config_flag(file, gsf_json_member(json, value, keys[i].key), keys[i].key, 0, &flag));
         if (flag && !keys[i].flag)
-            return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s of token %s", json->name, (unsigned)value->offset,
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s of token %s", json->name, (unsigned)value->offset,
                             keys[i].key, gsf__nn_show(out->text).text);
         if (flag) out->flags |= keys[i].flag;
     }
@@ -7518,9 +7509,9 @@ static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) 
 // "added_tokens_decoder" of tokenizer_config.json: {"id": token, ...}; else added_tokens.json: {"token": id, ...}.
 static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
     gsf__bpe_tables* t = l->t;
-    const gsf_json* json = l->decoder ? &t->config : &t->added_tokens;
+    const gsf__nn_config* file = l->decoder ? &t->config : &t->added_tokens;
+    const gsf_json* json = &file->json;
     const gsf_json_value* map = l->decoder ? l->decoder : json->values;
-    if (!map) return GSF_OK;
     if (map->type != GSF_JSON_OBJECT)
         return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are no object", json->name,
                         (unsigned)map->offset);
@@ -7529,7 +7520,7 @@ static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
         gsf__bpe_token token;
         double id = value->number;
         if (l->decoder) {
-            GSF__TRY(gsf__bpe_read_token(l, json, value, &token));
+            GSF__TRY(gsf__bpe_read_token(file, value, &token));
             id = value->key_size > 0 && value->key_size <= 10 ? 0.0 : -1.0;
             for (uint32_t k = 0; k < value->key_size && id >= 0.0; k++)
                 id = value->key[k] >= '0' && value->key[k] <= '9' ? 10.0 * id + (value->key[k] - '0') : -1.0;
@@ -7571,8 +7562,9 @@ static gsf_result gsf__bpe_add_special(gsf__bpe_loader* l, const gsf__bpe_token*
     return GSF_OK;
 }
 
-static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf_json* json, int32_t* next) {
-    const gsf_json_value* list = gsf__bpe_member(json, "additional_special_tokens");
+static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf__nn_config* file, int32_t* next) {
+    const gsf_json* json = &file->json;
+    const gsf_json_value* list = gsf__nn_config_find(file, "additional_special_tokens");
     if (!list) return GSF_OK;
     if (list->type != GSF_JSON_ARRAY)
         return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: additional_special_tokens is no list", json->name,
@@ -7580,7 +7572,7 @@ static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf_json* 
     for (uint32_t i = list->child; i; i = json->values[i].next) {
         gsf__bpe_token token;
         int32_t id;
-        GSF__TRY(gsf__bpe_read_token(l, json, &json->values[i], &token));
+        GSF__TRY(gsf__bpe_read_token(file, &json->values[i], &token));
         GSF__TRY(gsf__bpe_add_special(l, &token, 1, next, &id));
     }
     return GSF_OK;
@@ -7593,19 +7585,20 @@ static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
                                        "mask_token"};
     gsf__bpe_tables* t = l->t;
     int32_t other, *const ids[GSF__COUNT(keys)] = {&out->bos, &out->eos, &out->unk, &other, &out->pad, &other, &other};
-    l->decoder = gsf__bpe_member(&t->config, "added_tokens_decoder");
+    l->decoder = gsf__nn_config_find(&t->config, "added_tokens_decoder");
     GSF__TRY(gsf__bpe_read_added(l));
     int32_t next = t->vocabulary;
     for (int32_t i = 0; i < t->added_count; i++)
         next += gsf__bpe_find(t, t->added[i].text, t->added[i].size) < 0;
     for (size_t i = 0; i < GSF__COUNT(keys); i++) {
-        const gsf_json* json = !l->decoder && gsf__bpe_member(&t->special_map, keys[i]) ? &t->special_map : &t->config;
-        const gsf_json_value* value = gsf__bpe_member(json, keys[i]);
-        const int given = t->config.values && gsf_json_member(&t->config, t->config.values, keys[i]) != NULL;
+        const int mapped = !l->decoder && gsf__nn_config_find(&t->special_map, keys[i]);
+        const gsf__nn_config* file = mapped ? &t->special_map : &t->config;
+        const gsf_json_value* value = gsf__nn_config_find(file, keys[i]);
+        const int given = gsf_json_member(&t->config.json, t->config.json.values, keys[i]) != NULL;
         gsf__bpe_token token;
         *ids[i] = -1;
         if (value) {
-            GSF__TRY(gsf__bpe_read_token(l, json, value, &token));
+            GSF__TRY(gsf__bpe_read_token(file, value, &token));
         } else if (i < 3 && !given) { // GPT2Tokenizer's own
             memset(&token, 0, sizeof token);
             token.text = "<|endoftext|>";
@@ -7621,17 +7614,13 @@ static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
     return GSF_OK;
 }
 
-static gsf_result gsf__bpe_read_switches(gsf__bpe_loader* l, gsf_nn_bpe* out) {
-    gsf__bpe_tables* t = l->t;
-    const gsf_json_value* root = t->config.values;
-    const gsf_json_value* errors = gsf__bpe_member(&t->config, "errors");
-    if (errors && (errors->type != GSF_JSON_STRING || strcmp(errors->string, "replace") != 0))
-        return gsf_fail(l->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: errors is not \"replace\"", t->config.name,
-                        (unsigned)errors->offset);
-    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "add_bos_token", 0, &out->add_bos));
-    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "add_prefix_space", 0, &t->prefix_space));
-    GSF__TRY(gsf__bpe_flag(l, &t->config, root, "clean_up_tokenization_spaces", 0, &t->clean_up));
-    return gsf__bpe_flag(l, &t->config, root, "split_special_tokens", 0, &t->split_special);
+static gsf_result gsf__bpe_read_switches(const gsf__nn_config* file, gsf__bpe_tables* t, gsf_nn_bpe* out) {
+    const gsf__nn_key keys[] = {
+        GSF__KEY_WORD_IS("errors", "replace", "replace"), GSF__KEY_FLAG_OR("add_bos_token", out->add_bos, 0),
+        GSF__KEY_FLAG_OR("add_prefix_space", t->prefix_space, 0),
+        GSF__KEY_FLAG_OR("clean_up_tokenization_spaces", t->clean_up, 0),
+        GSF__KEY_FLAG_OR("split_special_tokens", t->split_special, 0)};
+    return gsf__nn_config_read(file, keys, GSF__COUNT(keys));
 }
 
 static gsf_result gsf__bpe_sort_ids(gsf__bpe_loader* l, gsf_nn_bpe* out) {
@@ -7656,10 +7645,10 @@ static gsf_result gsf__bpe_sort_ids(gsf__bpe_loader* l, gsf_nn_bpe* out) {
 
 static gsf_result gsf__bpe_load(gsf__bpe_loader* l, gsf_nn_bpe* out) {
     GSF__TRY(gsf__bpe_unpack_kinds(l->ctx, l->t));
-    GSF__TRY(gsf__bpe_open_json(l, "tokenizer_config.json", 0, &l->t->config));
-    GSF__TRY(gsf__bpe_open_json(l, "special_tokens_map.json", 0, &l->t->special_map));
-    GSF__TRY(gsf__bpe_open_json(l, "added_tokens.json", 0, &l->t->added_tokens));
-    GSF__TRY(gsf__bpe_read_switches(l, out));
+    GSF__TRY(gsf__nn_open_config(l->ctx, l->folder, "tokenizer_config.json", 1, &l->t->config));
+    GSF__TRY(gsf__nn_open_config(l->ctx, l->folder, "special_tokens_map.json", 1, &l->t->special_map));
+    GSF__TRY(gsf__nn_open_config(l->ctx, l->folder, "added_tokens.json", 1, &l->t->added_tokens));
+    GSF__TRY(gsf__bpe_read_switches(&l->t->config, l->t, out));
     GSF__TRY(gsf__bpe_read_vocabulary(l));
     GSF__TRY(gsf__bpe_read_merges(l));
     GSF__TRY(gsf__bpe_read_special(l, out));
@@ -7672,9 +7661,9 @@ static gsf_result gsf__bpe_load(gsf__bpe_loader* l, gsf_nn_bpe* out) {
 GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe) {
     gsf__bpe_tables* t = (gsf__bpe_tables*)bpe->tables;
     if (t) {
-        gsf_destroy_json(ctx, &t->config);
-        gsf_destroy_json(ctx, &t->special_map);
-        gsf_destroy_json(ctx, &t->added_tokens);
+        gsf_destroy_json(ctx, &t->config.json);
+        gsf_destroy_json(ctx, &t->special_map.json);
+        gsf_destroy_json(ctx, &t->added_tokens.json);
         gsf_free(ctx, t->strings);
         gsf_free(ctx, t->tokens);
         gsf_free(ctx, t->added);
@@ -7696,7 +7685,6 @@ GSF_API gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_
     l.t = (gsf__bpe_tables*)gsf_alloc_zeroed(ctx, 1, sizeof *l.t);
     out->tables = l.t;
     const gsf_result result = l.t ? gsf__bpe_load(&l, out) : GSF_ERROR_OUT_OF_MEMORY;
-    gsf_destroy_text(ctx, &l.path);
     gsf_destroy_text(ctx, &l.scratch);
     if (result) gsf_nn_destroy_bpe(ctx, out);
     return result;
@@ -8145,29 +8133,20 @@ static gsf_result gsf__blip_read_text(const gsf__nn_config* file, gsf__blip* net
                     file->json.name, (long long)words, (long long)opt->sizes.width);
 }
 
-// Runs `read` on the part of config.json called `key` as if it were the document; without it all keys are absent.
-#define GSF__BLIP_PART(file, key, read)                                                                             \
-    do {                                                                                                            \
-        const gsf_json_value whole = (file)->json.values[0];                                                        \
-        const gsf_json_value* part = gsf__nn_config_find((file), (key));                                            \
-        if (part && part->type != GSF_JSON_OBJECT) return gsf__nn_config_fail((file), part, (key), "an object");   \
-        if (part) (file)->json.values[0] = *part;                                                                   \
-        else (file)->json.values[0].child = (file)->json.values[0].count = 0;                                       \
-        const gsf_result read_result = (read);                                                                      \
-        (file)->json.values[0] = whole;                                                                             \
-        if (read_result) return read_result;                                                                        \
-    } while (0)
-
-static gsf_result gsf__blip_read_config(gsf__nn_config* file, gsf__blip* net, gsf_nn_captioner* out) {
+static gsf_result gsf__blip_read_config(const gsf__nn_config* file, void* network) {
+    gsf_nn_captioner* out = (gsf_nn_captioner*)network;
+    gsf__blip* net = (gsf__blip*)out->nets;
+    gsf__nn_config part;
     const gsf__nn_key keys[] = {GSF__KEY_INT_OR("num_query_tokens", net->qformer.queries, 32, 1, 1 << 16),
                                 GSF__KEY_INT_OR("image_token_index", out->image_token, -1, 0, INT32_MAX)};
     GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
-    GSF__BLIP_PART(file, "vision_config", gsf__blip_read_vision(file, net));
-    GSF__BLIP_PART(file, "qformer_config", gsf__blip_read_qformer(file, net));
-    GSF__BLIP_PART(file, "text_config", gsf__blip_read_text(file, net, out));
-    return GSF_OK;
+    GSF__TRY(gsf__nn_config_part(file, "vision_config", &part));
+    GSF__TRY(gsf__blip_read_vision(&part, net));
+    GSF__TRY(gsf__nn_config_part(file, "qformer_config", &part));
+    GSF__TRY(gsf__blip_read_qformer(&part, net));
+    GSF__TRY(gsf__nn_config_part(file, "text_config", &part));
+    return gsf__blip_read_text(&part, net, out);
 }
-#undef GSF__BLIP_PART
 
 // Three numbers, or one for all.
 static gsf_result gsf__blip_read_colour(const gsf__nn_config* file, const char* key, const float fallback[3], double low,
@@ -8311,7 +8290,8 @@ static gsf_result gsf__qformer_bind(gsf__nn_loader* loader, gsf__blip* net) {
     return GSF_OK;
 }
 
-static gsf_result gsf__blip_bind_all(gsf__nn_loader* loader, gsf__blip* net) {
+static gsf_result gsf__blip_bind(gsf__nn_loader* loader, void* network) {
+    gsf__blip* net = (gsf__blip*)((gsf_nn_captioner*)network)->nets;
     gsf__opt* opt = &net->text;
     const gsf__nn_sizes sizes = gsf__blip_sizes(net);
     GSF__TRY(gsf__vit_bind(loader, gsf__blip_vision_entries, gsf__blip_block_entries, "vision_model.", &net->vision));
@@ -8324,12 +8304,6 @@ static gsf_result gsf__blip_bind_all(gsf__nn_loader* loader, gsf__blip* net) {
     }
     return gsf__vit_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, "language_model.model.decoder.layers.",
                                 opt->layers, &opt->blocks);
-}
-
-static gsf_result gsf__blip_bind(gsf_context* ctx, gsf_nn_captioner* out, gsf__blip* net) {
-    gsf__nn_loader loader;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    return gsf__nn_end_loading(&loader, gsf__blip_bind_all(&loader, net));
 }
 
 GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner) {
@@ -8351,17 +8325,13 @@ GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, g
     gsf__blip* net = (gsf__blip*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
     if (!net) return GSF_ERROR_OUT_OF_MEMORY;
     out->nets = net;
-    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
-    if (!result) result = gsf__blip_read_config(&file, net, out);
-    gsf__nn_close_config(&file);
+    gsf_result result = gsf__nn_open_network(ctx, folder, "model", gsf__blip_read_config, gsf__blip_bind, out, &out->weights);
     if (!result) {
         result = gsf__nn_open_config(ctx, folder, "preprocessor_config.json", 0, &file);
         if (!result) result = gsf__blip_read_processor(&file, net);
         gsf__nn_close_config(&file);
     }
     if (!result) result = gsf_nn_make_bpe(ctx, folder, &out->tokenizer);
-    if (!result) result = gsf_nn_open_weights(ctx, folder, "model", &out->weights);
-    if (!result) result = gsf__blip_bind(ctx, out, net);
     out->image_size = (int32_t)net->image_size;
     out->query_tokens = (int32_t)net->qformer.queries;
     out->vocabulary = (int32_t)net->text.vocabulary;
@@ -9284,28 +9254,27 @@ static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
 
 // "eos_token": "</s>", or an object with that as its "content"
 static const char* gsf__sp_token_text(const gsf__nn_config* file, const char* key, const char* fallback) {
-    const gsf_json_value* value = file ? gsf__nn_config_find(file, key) : NULL;
+    const gsf_json_value* value = gsf__nn_config_find(file, key);
     if (value && value->type == GSF_JSON_OBJECT) value = gsf_json_member(&file->json, value, "content");
     return value && value->type == GSF_JSON_STRING ? value->string : fallback;
 }
 
-// config, added: NULL where there is no such file
 static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf__nn_config* config,
                                   const gsf__nn_config* added, gsf__sp_model* m, gsf_nn_tokenizer* out) {
     static const char* const names[][2] = {{"unk_token", "<unk>"}, {"eos_token", "</s>"}, {"pad_token", "<pad>"}};
     int32_t* const ids[] = {NULL, &out->end_id, &out->pad_id};
     int64_t extra = GSF__SP_EXTRA;
-    const gsf_json_value* decoder = config ? gsf__nn_config_find(config, "added_tokens_decoder") : NULL;
+    const gsf_json_value* decoder = gsf__nn_config_find(config, "added_tokens_decoder");
     for (size_t i = 0; i < GSF__COUNT(names); i++) {
         const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
         const int32_t id = strlen(text) <= GSF__SP_PIECE ? gsf__sp_find(m->pieces, text, strlen(text)) : -1;
         if (id >= 0) GSF__TRY(gsf__sp_add(ctx, m, text, strlen(text), id, 0, 0));
     }
-    if (config) GSF__TRY(gsf__nn_config_int_or(config, "extra_ids", extra, 0, 100000, &extra));
+    GSF__TRY(gsf__nn_config_int_or(config, "extra_ids", extra, 0, 100000, &extra));
     if ((int64_t)m->count > INT32_MAX - extra) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", name);
     GSF__TRY(gsf__sp_add_extra(ctx, m, extra));
     if (decoder && decoder->type == GSF_JSON_OBJECT) GSF__TRY(gsf__sp_add_decoder(config, decoder, m));
-    else if (added) GSF__TRY(gsf__sp_add_list(added, m));
+    else GSF__TRY(gsf__sp_add_list(added, m));
     GSF__TRY(gsf__sp_sort_added(ctx, m));
     out->id_count = (int32_t)m->count;
     for (size_t i = 0; i < m->added_count; i++)
@@ -9320,8 +9289,9 @@ static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf_
     return GSF_OK;
 }
 
+// files: tokenizer_config.json and added_tokens.json, empty objects where there is no such file
 static gsf_result gsf__sp_make(gsf_context* ctx, const char* name, const void* data, size_t size,
-                               const gsf__nn_config* config, const gsf__nn_config* added, gsf_nn_tokenizer* out) {
+                               const gsf__nn_config files[2], gsf_nn_tokenizer* out) {
     const gsf__pb in = {ctx, gsf__nn_path_end(name), (const unsigned char*)data, 0, size};
     gsf__sp_model* m = (gsf__sp_model*)gsf_alloc_zeroed(ctx, 1, sizeof *m);
     out->model = m;
@@ -9329,56 +9299,42 @@ static gsf_result gsf__sp_make(gsf_context* ctx, const char* name, const void* d
     GSF__TRY(gsf__sp_read_model(in, m));
     out->piece_count = (int32_t)m->count;
     out->unknown_id = m->unknown_id;
-    return gsf__sp_add_all(ctx, in.name, config, added, m, out);
+    return gsf__sp_add_all(ctx, in.name, &files[0], &files[1], m, out);
+}
+
+static void gsf__sp_end_making(gsf_context* ctx, gsf_result result, gsf__nn_config files[2], gsf_nn_tokenizer* out) {
+    for (int i = 0; i < 2; i++) gsf_destroy_json(ctx, &files[i].json);
+    if (result) gsf_nn_destroy_tokenizer(ctx, out);
 }
 
 GSF_API gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model, size_t model_size,
                                                 const char* config, size_t config_size, gsf_nn_tokenizer* out) {
-    gsf__nn_config file;
+    gsf__nn_config files[2];
+    memset(files, 0, sizeof files);
     memset(out, 0, sizeof *out);
-    if (config) GSF__TRY(gsf__nn_parse_config(ctx, "tokenizer_config.json", config, config_size, &file));
-    const gsf_result result = gsf__sp_make(ctx, name, model, model_size, config ? &file : NULL, NULL, out);
-    if (config) gsf__nn_close_config(&file);
-    if (result) gsf_nn_destroy_tokenizer(ctx, out);
-    return result;
-}
-
-// A JSON file of the folder that may be absent: *found 0.
-static gsf_result gsf__sp_load_json(gsf_context* ctx, const char* folder, const char* name, gsf__nn_config* out,
-                                    int* found) {
-    gsf_text path;
-    void* data = NULL;
-    size_t size = 0;
-    memset(&path, 0, sizeof path);
-    *found = 0;
-    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &data, &size);
-    gsf_destroy_text(ctx, &path);
-    if (data) result = gsf__nn_parse_config(ctx, name, (const char*)data, size, out);
-    *found = data && result == GSF_OK;
-    gsf_free(ctx, data);
+    gsf_result result = gsf__nn_parse_config(ctx, "tokenizer_config.json", config ? config : "{}", config ? config_size : 2,
+                                             &files[0]);
+    if (!result) result = gsf__nn_parse_config(ctx, "added_tokens.json", "{}", 2, &files[1]);
+    if (!result) result = gsf__sp_make(ctx, name, model, model_size, files, out);
+    gsf__sp_end_making(ctx, result, files, out);
     return result;
 }
 
 GSF_API gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out) {
-    static const char* const names[2] = {"tokenizer_config.json", "added_tokens.json"};
     gsf__nn_config files[2];
-    int found[2] = {0, 0};
     void* data = NULL;
     size_t size = 0;
     gsf_text path;
-    memset(&path, 0, sizeof path);
+    memset(files, 0, sizeof files);
     memset(out, 0, sizeof *out);
-    gsf_text_printf(ctx, &path, "%s/spiece.model", folder);
-    gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_read_file(ctx, path.data, &data, &size);
-    for (int i = 0; i < 2 && !result; i++) result = gsf__sp_load_json(ctx, folder, names[i], &files[i], &found[i]);
-    if (!result)
-        result = gsf__sp_make(ctx, path.data, data, size, found[0] ? &files[0] : NULL, found[1] ? &files[1] : NULL, out);
-    for (int i = 0; i < 2; i++)
-        if (found[i]) gsf__nn_close_config(&files[i]);
+    gsf_result result = gsf__nn_join(ctx, folder, "spiece.model", &path);
+    if (!result) result = gsf_read_file(ctx, path.data, &data, &size);
+    if (!result) result = gsf__nn_open_config(ctx, folder, "tokenizer_config.json", 1, &files[0]);
+    if (!result) result = gsf__nn_open_config(ctx, folder, "added_tokens.json", 1, &files[1]);
+    if (!result) result = gsf__sp_make(ctx, path.data, data, size, files, out);
     gsf_free(ctx, data);
     gsf_destroy_text(ctx, &path);
-    if (result) gsf_nn_destroy_tokenizer(ctx, out);
+    gsf__sp_end_making(ctx, result, files, out);
     return result;
 }
 
@@ -9696,9 +9652,17 @@ static gsf__nn_block_sizes gsf__t5_block_sizes(const gsf_nn_t5* c) {
     return s;
 }
 
-static gsf_result gsf__t5_bind(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__t5_nets* nets) {
-    const gsf__nn_sizes sizes = gsf__t5_sizes(c), block = gsf__nn_sizes_of_block(&nets->sizes);
+static gsf_result gsf__t5_bind(gsf__nn_loader* loader, void* network) {
+    gsf_nn_t5* c = (gsf_nn_t5*)network;
+    const gsf__nn_block_sizes block_sizes = gsf__t5_block_sizes(c);
+    const gsf__nn_sizes sizes = gsf__t5_sizes(c), block = gsf__nn_sizes_of_block(&block_sizes);
     char prefix[48];
+    gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(loader->ctx, 1, sizeof *nets);
+    c->nets = nets;
+    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->sizes = block_sizes;
+    nets->blocks = (gsf__nn_block*)gsf_alloc_zeroed(loader->ctx, (size_t)c->layers, sizeof *nets->blocks);
+    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__t5_entries, "", nets));
     gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
     for (int32_t i = 0; i < c->layers; i++) {
@@ -9708,7 +9672,8 @@ static gsf_result gsf__t5_bind(gsf__nn_loader* loader, const gsf_nn_t5* c, gsf__
     return GSF_OK;
 }
 
-static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) {
+static gsf_result gsf__t5_read_config(const gsf__nn_config* file, void* network) {
+    gsf_nn_t5* c = (gsf_nn_t5*)network;
     const gsf__nn_key keys[] = {
         GSF__KEY_INT("d_model", c->width, 1, 1 << 20), GSF__KEY_INT("d_kv", c->head_dim, 1, 1024),
         GSF__KEY_INT("num_heads", c->heads, 1, 1024), GSF__KEY_INT("d_ff", c->hidden, 1, 1 << 20),
@@ -9725,27 +9690,10 @@ static gsf_result gsf__t5_read_config(const gsf__nn_config* file, gsf_nn_t5* c) 
     return GSF_OK;
 }
 
-static gsf_result gsf__t5_open(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
-    gsf__nn_config file;
-    gsf__nn_loader loader;
-    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
-    if (!result) result = gsf__t5_read_config(&file, out);
-    gsf__nn_close_config(&file);
-    if (result) return result;
-    GSF__TRY(gsf_nn_open_weights(ctx, folder, "model", &out->weights));
-    gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
-    out->nets = nets;
-    if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    nets->sizes = gsf__t5_block_sizes(out);
-    nets->blocks = (gsf__nn_block*)gsf_alloc_zeroed(ctx, (size_t)out->layers, sizeof *nets->blocks);
-    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    return gsf__nn_end_loading(&loader, gsf__t5_bind(&loader, out, nets));
-}
-
 GSF_API gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
     memset(out, 0, sizeof *out);
-    const gsf_result result = gsf__t5_open(ctx, folder, out);
+    const gsf_result result =
+        gsf__nn_open_network(ctx, folder, "model", gsf__t5_read_config, gsf__t5_bind, out, &out->weights);
     if (result) gsf_nn_destroy_t5(ctx, out);
     return result;
 }
@@ -9914,7 +9862,7 @@ typedef struct gsf__vae_nets {
 typedef struct gsf__vae_loader {
     gsf_context* ctx;
     const gsf_nn_vae* vae;
-    gsf__nn_loader tensors;
+    gsf__nn_loader* tensors;
     gsf__vae_net* net;
 } gsf__vae_loader;
 
@@ -9927,8 +9875,8 @@ static gsf_result gsf__vae_load_conv(gsf__vae_loader* l, const char* name, int64
     if (kt) shape[rank++] = kt; // 0: a 2D layer
     shape[rank++] = kernel;
     shape[rank++] = kernel;
-    GSF__TRY(gsf__nn_need(&l->tensors, &layer->weight, rank, shape, "%s.weight", name));
-    GSF__TRY(gsf__nn_need(&l->tensors, &layer->bias, 1, shape, "%s.bias", name));
+    GSF__TRY(gsf__nn_need(l->tensors, &layer->weight, rank, shape, "%s.weight", name));
+    GSF__TRY(gsf__nn_need(l->tensors, &layer->bias, 1, shape, "%s.bias", name));
     layer->in = in;
     layer->out = out;
     layer->kt = kt ? kt : 1;
@@ -9941,8 +9889,8 @@ static gsf_result gsf__vae_load_norm(gsf__vae_loader* l, const char* name, int64
                                      gsf__vae_norm* norm) {
     char full[160];
     const char* layer = l->net->decoder ? ".norm_layer" : "";
-    GSF__TRY(gsf__nn_need(&l->tensors, &norm->weight, 1, &channels, "%s%s.weight", name, layer));
-    GSF__TRY(gsf__nn_need(&l->tensors, &norm->bias, 1, &channels, "%s%s.bias", name, layer));
+    GSF__TRY(gsf__nn_need(l->tensors, &norm->weight, 1, &channels, "%s%s.weight", name, layer));
+    GSF__TRY(gsf__nn_need(l->tensors, &norm->bias, 1, &channels, "%s%s.bias", name, layer));
     norm->eps = l->net->decoder ? 1e-6 : eps; // the spatial norm ignores the config's
     if (!l->net->decoder) return GSF_OK;
     snprintf(full, sizeof full, "%s.conv_y.conv", name);
@@ -10028,7 +9976,8 @@ static gsf_result gsf__vae_check_types(const gsf__nn_config* config, const char*
 }
 
 // Fallbacks are the class's own.
-static gsf_result gsf__vae_take_config(const gsf__nn_config* config, gsf_nn_vae* vae) {
+static gsf_result gsf__vae_take_config(const gsf__nn_config* config, void* network) {
+    gsf_nn_vae* vae = (gsf_nn_vae*)network;
     static const char classname[] = "AutoencoderKLCogVideoX";
     const gsf__nn_key keys[] = {
         GSF__KEY_WORD_IS("_class_name", classname, classname), GSF__KEY_WORD_IS("act_fn", "silu", "silu"),
@@ -10063,30 +10012,22 @@ static gsf_result gsf__vae_take_config(const gsf__nn_config* config, gsf_nn_vae*
     return GSF_OK;
 }
 
-static gsf_result gsf__vae_load_nets(gsf_context* ctx, gsf_nn_vae* vae) {
-    gsf__vae_loader l;
-    memset(&l, 0, sizeof l);
-    gsf__vae_nets* nets = (gsf__vae_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+static gsf_result gsf__vae_bind(gsf__nn_loader* loader, void* network) {
+    gsf_nn_vae* vae = (gsf_nn_vae*)network;
+    gsf__vae_nets* nets = (gsf__vae_nets*)gsf_alloc_zeroed(loader->ctx, 1, sizeof *nets);
+    gsf__vae_loader l = {loader->ctx, vae, loader, NULL};
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
     vae->nets = nets;
-    l.ctx = ctx;
-    l.vae = vae;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &vae->weights, &l.tensors));
     l.net = &nets->encoder;
-    gsf_result result = gsf__vae_load_net(&l, 0);
+    GSF__TRY(gsf__vae_load_net(&l, 0));
     l.net = &nets->decoder;
-    if (result == GSF_OK) result = gsf__vae_load_net(&l, 1);
-    return gsf__nn_end_loading(&l.tensors, result);
+    return gsf__vae_load_net(&l, 1);
 }
 
 GSF_API gsf_result gsf_nn_make_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out) {
-    gsf__nn_config file;
     memset(out, 0, sizeof *out);
-    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
-    if (!result) result = gsf__vae_take_config(&file, out);
-    gsf__nn_close_config(&file);
-    if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
-    if (!result) result = gsf__vae_load_nets(ctx, out);
+    const gsf_result result = gsf__nn_open_network(ctx, folder, "diffusion_pytorch_model", gsf__vae_take_config,
+                                                   gsf__vae_bind, out, &out->weights);
     if (result) gsf_nn_destroy_vae(ctx, out);
     return result;
 }
@@ -11010,7 +10951,8 @@ static gsf__nn_sizes gsf__dit_tensor_sizes(const gsf_nn_transformer* c) {
     return sizes;
 }
 
-static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transformer* c) {
+static gsf_result gsf__dit_read_config(const gsf__nn_config* file, void* network) {
+    gsf_nn_transformer* c = (gsf_nn_transformer*)network;
     const gsf__nn_key keys[] = {
         GSF__KEY_INT("num_attention_heads", c->heads, 1, 1024), GSF__KEY_INT("attention_head_dim", c->head_dim, 8, 1024),
         GSF__KEY_INT("num_layers", c->layers, 1, 1024), GSF__KEY_INT("in_channels", c->in_channels, 1, 65536),
@@ -11043,24 +10985,21 @@ static gsf_result gsf__dit_read_config(const gsf__nn_config* file, gsf_nn_transf
     return GSF_OK;
 }
 
-static gsf_result gsf__dit_bind(gsf_context* ctx, gsf_nn_transformer* net) {
-    gsf__nn_loader loader;
+static gsf_result gsf__dit_bind(gsf__nn_loader* loader, void* network) {
+    gsf_nn_transformer* net = (gsf_nn_transformer*)network;
     const gsf__nn_sizes sizes = gsf__dit_tensor_sizes(net);
-    void* blocks = NULL;
-    gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(ctx, 1, sizeof *nets);
+    void* blocks;
+    gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(loader->ctx, 1, sizeof *nets);
     net->nets = nets;
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__nn_begin_loading(ctx, &net->weights, &loader));
-    gsf_result result = gsf__nn_bind(&loader, &sizes, gsf__dit_entries, "", nets);
-    if (!result)
-        result = gsf__nn_bind_blocks(&loader, &sizes, gsf__dit_block_entries, "transformer_blocks.", net->layers,
-                                     sizeof *nets->blocks, &blocks);
+    GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__dit_entries, "", nets));
+    const gsf_result result = gsf__nn_bind_blocks(loader, &sizes, gsf__dit_block_entries, "transformer_blocks.",
+                                                  net->layers, sizeof *nets->blocks, &blocks);
     nets->blocks = (gsf__dit_block*)blocks;
-    if (!net->learned_positions) gsf__nn_ignore(&loader, "patch_embed.pos_embedding"); // computed
-    GSF__TRY(gsf__nn_end_loading(&loader, result));
+    if (!net->learned_positions) gsf__nn_ignore(loader, "patch_embed.pos_embedding"); // computed
     net->dino_channels = (int32_t)nets->dino.linear.weight->shape[1];
     net->vggt_channels = (int32_t)nets->vggt.linear.weight->shape[1];
-    return GSF_OK;
+    return result;
 }
 
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer) {
@@ -11101,13 +11040,9 @@ GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transfor
 }
 
 GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
-    gsf__nn_config file;
     memset(out, 0, sizeof *out);
-    gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
-    if (!result) result = gsf__dit_read_config(&file, out);
-    gsf__nn_close_config(&file);
-    if (!result) result = gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &out->weights);
-    if (!result) result = gsf__dit_bind(ctx, out);
+    const gsf_result result = gsf__nn_open_network(ctx, folder, "diffusion_pytorch_model", gsf__dit_read_config,
+                                                   gsf__dit_bind, out, &out->weights);
     if (result) gsf_nn_destroy_transformer(ctx, out);
     return result;
 }
@@ -11299,32 +11234,6 @@ static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
     return GSF_OK;
 }
 
-typedef struct gsf__patch_job { // patches of the latents as rows, or the other way round
-    const float* from;
-    float* to;
-    int32_t channels, height, width, patch;
-    int back;                   // rows to latents
-} gsf__patch_job;
-
-// (channels, height, width) of one frame to rows of (channels, patch, patch), tokens down and across; or back.
-static void gsf__patch_frame(void* arg, size_t frame, int worker) {
-    const gsf__patch_job* job = (const gsf__patch_job*)arg;
-    const int64_t p = job->patch, across = job->width / p, down = job->height / p;
-    const int64_t plane = (int64_t)job->height * job->width, values = job->channels * plane;
-    const float* from = job->from + (int64_t)frame * values;
-    float* to = job->to + (int64_t)frame * values;
-    int64_t at = 0; // in the rows
-    (void)worker;
-    for (int64_t ty = 0; ty < down; ty++)
-        for (int64_t tx = 0; tx < across; tx++)
-            for (int64_t c = 0; c < job->channels; c++)
-                for (int64_t y = 0; y < p; y++)
-                    for (int64_t x = 0; x < p; x++, at++) {
-                        const int64_t pixel = c * plane + (ty * p + y) * job->width + tx * p + x;
-                        to[job->back ? pixel : at] = from[job->back ? at : pixel];
-                    }
-}
-
 // Adds the position table to text and video: the stored one for the configured frame count, else sines and cosines (video
 // only), as the official code does.
 static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
@@ -11356,8 +11265,9 @@ static gsf_result gsf__dit_embed(gsf__dit_run* run) {
         float* x = run->x + b * run->tokens * d;
         const float* text = in->text + b * run->text * c->text_channels;
         GSF__TRY(gsf__dit_linear(run, &run->nets->text, text, run->text, x));
-        gsf__patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch, 0};
-        gsf__parallel_for(run->nn.ctx, (size_t)in->frames, gsf__patch_frame, &job);
+        gsf__nn_patch_job job = {in->hidden + b * sample, run->qkv, c->in_channels, in->height, in->width, c->patch, 0,
+                                 NULL, NULL};
+        gsf__nn_patch(run->nn.ctx, &job, in->frames);
         GSF__TRY(gsf__dit_linear(run, &run->nets->patch, run->qkv, run->video, x + run->text * d));
     }
     GSF__TRY(gsf__dit_add_positions(run));
@@ -11380,8 +11290,8 @@ static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
     gsf__nn_reveal(&run->nn, normed, row, 1, run->video, d, "norm_out");
     GSF__TRY(gsf__dit_linear(run, &run->nets->out, normed, run->video, run->qkv));
     gsf__nn_reveal(&run->nn, run->qkv, row, 1, run->video, outputs, "proj_out");
-    gsf__patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch, 1};
-    gsf__parallel_for(run->nn.ctx, (size_t)run->in->frames, gsf__patch_frame, &job);
+    gsf__nn_patch_job job = {run->qkv, out, c->out_channels, run->in->height, run->in->width, c->patch, 1, NULL, NULL};
+    gsf__nn_patch(run->nn.ctx, &job, run->in->frames);
     return GSF_OK;
 }
 
@@ -11713,21 +11623,17 @@ static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_sch
     return gsf__nn_config_read(config, rest, GSF__COUNT(rest));
 }
 
-static gsf_result gsf__nn_schedule_from(gsf_context* ctx, gsf__nn_config* config, gsf_nn_schedule* out) {
-    gsf_nn_schedule_desc d;
-    memset(&d, 0, sizeof d);
-    gsf_result result = gsf__nn_read_schedule(config, &d);
-    if (result == GSF_OK) result = gsf_nn_make_schedule(ctx, &d, out);
-    gsf__nn_close_config(config);
-    return result;
-}
-
 GSF_API gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
                                          gsf_nn_schedule* out) {
     gsf__nn_config config;
+    gsf_nn_schedule_desc d;
     memset(out, 0, sizeof *out);
+    memset(&d, 0, sizeof d);
     GSF__TRY(gsf__nn_parse_config(ctx, name, text, size, &config));
-    return gsf__nn_schedule_from(ctx, &config, out);
+    gsf_result result = gsf__nn_read_schedule(&config, &d);
+    if (!result) result = gsf_nn_make_schedule(ctx, &d, out);
+    gsf__nn_close_config(&config);
+    return result;
 }
 
 GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out) {
@@ -12696,12 +12602,6 @@ typedef struct gsf__dit_part { // an encoder: `photos` NULL only opens it, check
     gsf_nn_features* out;
 } gsf__dit_part;
 
-static gsf_result gsf__dit_folder(const gsf__dit_part* p, const char* name, gsf_text* out) {
-    memset(out, 0, sizeof *out);
-    gsf_text_printf(p->ctx, out, "%s/%s", p->r->desc.model, name);
-    return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
-}
-
 // To the error of a folder that is not there: what it is for, and what does without it.
 static gsf_result gsf__dit_absent(const gsf__dit_part* p, gsf_result result, const char* makes, const char* instead) {
     char before[sizeof p->ctx->error];
@@ -12735,39 +12635,38 @@ static gsf_nn_encoder_input gsf__dit_usual_references(const gsf__dit_restorer* r
     return in;
 }
 
-static gsf_result gsf__dit_dinov2(const gsf__dit_part* p) {
-    gsf_text folder;
-    gsf_nn_dinov2 model;
-    double bytes, flops;
-    const gsf_nn_encoder_input usual = gsf__dit_usual_references(p->r);
-    GSF__TRY(gsf__dit_folder(p, "dinov2", &folder));
-    gsf_result result = gsf_nn_make_dinov2(p->ctx, folder.data, &model);
-    gsf_destroy_text(p->ctx, &folder);
-    if (result)
-        return gsf__dit_absent(p, result, "the 2D reference tokens", ", or condition 3d or none,");
-    result = gsf__dit_misfit(p, "dinov2", model.width, p->r->transformer.dino_channels);
-    gsf_nn_dinov2_cost(&model, &usual, &bytes, &flops);
-    if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
-    else if (!result) result = gsf_nn_encode_references(p->ctx, &model, NULL, p->photos, p->count, p->out);
-    gsf_nn_destroy_dinov2(p->ctx, &model);
-    return result;
-}
+typedef struct gsf__dit_kind { // of reference tokens
+    const char *name, *folder, *makes, *instead; // see gsf__dit_absent
+} gsf__dit_kind;
 
-static gsf_result gsf__dit_vggt(const gsf__dit_part* p) {
-    gsf_text folder;
-    gsf_nn_vggt model;
-    double bytes, flops;
+enum { GSF__DIT_DINO, GSF__DIT_VGGT };
+static const gsf__dit_kind gsf__dit_kinds[2] = {
+    {"dino_latents", "dinov2", "the 2D reference tokens", ", or condition 3d or none,"},
+    {"vggt_latents", "vggt", "the 3D reference tokens", ", or condition 2d or none,"}};
+
+// Encodes p->photos by DINOv2 or VGGT.
+static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
+    const gsf__dit_kind* k = &gsf__dit_kinds[kind];
+    const gsf_nn_transformer* t = &p->r->transformer;
     const gsf_nn_encoder_input usual = gsf__dit_usual_references(p->r);
-    GSF__TRY(gsf__dit_folder(p, "vggt", &folder));
-    gsf_result result = gsf_nn_make_vggt(p->ctx, folder.data, &model);
+    const int vggt = kind == GSF__DIT_VGGT;
+    gsf_nn_dinov2 flat;
+    gsf_nn_vggt deep;
+    gsf_text folder;
+    double bytes, flops;
+    gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, k->folder, &folder);
+    if (!result) result = vggt ? gsf_nn_make_vggt(p->ctx, folder.data, &deep) : gsf_nn_make_dinov2(p->ctx, folder.data, &flat);
     gsf_destroy_text(p->ctx, &folder);
-    if (result)
-        return gsf__dit_absent(p, result, "the 3D reference tokens", ", or condition 2d or none,");
-    result = gsf__dit_misfit(p, "vggt", 2 * (int64_t)model.width, p->r->transformer.vggt_channels);
-    gsf_nn_vggt_cost(&model, &usual, &bytes, &flops);
+    if (result) return gsf__dit_absent(p, result, k->makes, k->instead);
+    if (vggt) gsf_nn_vggt_cost(&deep, &usual, &bytes, &flops);
+    else gsf_nn_dinov2_cost(&flat, &usual, &bytes, &flops);
+    result = gsf__dit_misfit(p, k->folder, vggt ? 2 * (int64_t)deep.width : flat.width,
+                             vggt ? t->vggt_channels : t->dino_channels);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
-    else if (!result) result = gsf_nn_encode_references(p->ctx, NULL, &model, p->photos, p->count, p->out);
-    gsf_nn_destroy_vggt(p->ctx, &model);
+    else if (!result)
+        result = gsf_nn_encode_references(p->ctx, vggt ? NULL : &flat, vggt ? &deep : NULL, p->photos, p->count, p->out);
+    if (vggt) gsf_nn_destroy_vggt(p->ctx, &deep);
+    else gsf_nn_destroy_dinov2(p->ctx, &flat);
     return result;
 }
 
@@ -12776,8 +12675,9 @@ static gsf_result gsf__dit_tokenize(const gsf__dit_part* p, const char* caption,
     gsf_text text;
     gsf_nn_tokenizer model;
     const size_t room = (size_t)p->r->transformer.text_tokens;
-    GSF__TRY(gsf__dit_folder(p, "tokenizer", &text));
-    gsf_result result = gsf_nn_make_tokenizer(p->ctx, text.data, &model);
+    gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "tokenizer", &text);
+    memset(&model, 0, sizeof model);
+    if (!result) result = gsf_nn_make_tokenizer(p->ctx, text.data, &model);
     if (!result && caption) {
         text.size = 0;
         gsf_text_printf(p->ctx, &text, "%s%s", caption, gsf__dit_praise);
@@ -12800,8 +12700,8 @@ static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids
     in.ids = ids;
     in.batch = 2;
     in.tokens = p->r->transformer.text_tokens;
-    GSF__TRY(gsf__dit_folder(p, "text_encoder", &folder));
-    gsf_result result = gsf_nn_make_t5(p->ctx, folder.data, &model);
+    gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "text_encoder", &folder);
+    if (!result) result = gsf_nn_make_t5(p->ctx, folder.data, &model);
     gsf_destroy_text(p->ctx, &folder);
     if (result) return result;
     result = gsf__dit_misfit(p, "text_encoder", model.width, p->r->transformer.text_channels);
@@ -12839,8 +12739,8 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     gsf_text folder;
     gsf_nn_captioner model;
     double bytes, flops;
-    GSF__TRY(gsf__dit_folder(p, "blip2", &folder));
-    gsf_result result = gsf_nn_make_captioner(p->ctx, folder.data, &model);
+    gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "blip2", &folder);
+    if (!result) result = gsf_nn_make_captioner(p->ctx, folder.data, &model);
     gsf_destroy_text(p->ctx, &folder);
     if (result) return gsf__dit_absent(p, result, "the caption", ", or a caption,");
     gsf_nn_caption_cost(&model, 0, 0, &bytes, &flops);
@@ -12889,8 +12789,7 @@ static int32_t gsf__dit_choose(const gsf__dit_restorer* r, const gsf_restore_win
 
 // Photos squashed to the model's size first, as the official loop feeds them: whatever their aspect, each gives as many
 // tokens as a frame would.
-static gsf_result gsf__dit_encode(const gsf__dit_part* part, const int32_t* chosen, int32_t count,
-                                  gsf_result (*encode)(const gsf__dit_part* part)) {
+static gsf_result gsf__dit_encode(const gsf__dit_part* part, int kind, const int32_t* chosen, int32_t count) {
     gsf__dit_restorer* r = part->r;
     gsf_context* ctx = part->ctx;
     gsf__dit_part p = *part;
@@ -12908,7 +12807,7 @@ static gsf_result gsf__dit_encode(const gsf__dit_part* part, const int32_t* chos
     }
     p.photos = photos;
     p.count = count;
-    if (!result) result = encode(&p);
+    if (!result) result = gsf__dit_see(&p, kind);
     for (int32_t i = 0; i < count; i++) gsf_destroy_image(ctx, &photos[i]);
     gsf_free(ctx, photos);
     return result;
@@ -13035,87 +12934,75 @@ static gsf_result gsf__dit_append(gsf__dit_clip* c, const gsf__dit_kept* kept, i
     return GSF_OK;
 }
 
-// Encodes those of the clip's photos of which nothing is kept, all in one go, and keeps them one by one.
-static gsf_result gsf__dit_encode_dino(gsf__dit_clip* c) {
+/* DINOv2 sees each photo by itself, so that each has a name and is encoded once in a run; VGGT sees a clip's photos together,
+   so that they have one name: groups of `per` photos. */
+
+// c->name of the group that begins with photo number `first` of `photos`.
+static gsf_result gsf__dit_name_group(gsf__dit_clip* c, int kind, const int32_t* photos, int32_t first, int32_t per) {
+    return gsf__dit_name_photos(c->ctx, gsf__dit_kinds[kind].name, photos + first, per, &c->name);
+}
+
+// Encodes those of the clip's photos of which nothing is kept, all in one go, and keeps them group by group.
+static gsf_result gsf__dit_encode_missing(gsf__dit_clip* c, int kind, int32_t per) {
     gsf_nn_features made;
     gsf_result result = GSF_OK;
     int32_t missing = 0;
     memset(&made, 0, sizeof made);
     int32_t* list = (int32_t*)gsf_alloc(c->ctx, (size_t)c->count, sizeof *list);
     if (!list) return GSF_ERROR_OUT_OF_MEMORY;
-    for (int32_t i = 0; i < c->count && !result; i++) {
+    if (per > 1 && !c->r->desc.save_features) gsf__dit_drop_encoded(c->ctx, c->r, "vggt_latents."); // there may be many
+    for (int32_t i = 0; i < c->count && !result; i += per) {
         int known = 0;
-        for (int32_t k = 0; k < missing; k++) known |= list[k] == c->chosen[i];
-        result = gsf__dit_name_photos(c->ctx, "dino_latents", &c->chosen[i], 1, &c->name);
-        if (!result && !known && !gsf__dit_find(c->r, c->name.data)) list[missing++] = c->chosen[i];
+        for (int32_t k = 0; k < missing && per == 1; k++) known |= list[k] == c->chosen[i];
+        result = gsf__dit_name_group(c, kind, c->chosen, i, per);
+        if (result || known || gsf__dit_find(c->r, c->name.data)) continue;
+        memcpy(list + missing, c->chosen + i, (size_t)per * sizeof *list);
+        missing += per;
     }
     if (!result && missing) {
-        result = gsf__dit_name_photos(c->ctx, "dino_latents", list, 1, &c->name);
+        result = gsf__dit_name_group(c, kind, list, 0, per);
         const gsf__dit_part part = {c->ctx, c->r, c->name.data, NULL, 0, &made};
-        if (!result) result = gsf__dit_encode(&part, list, missing, gsf__dit_dinov2);
+        if (!result) result = gsf__dit_encode(&part, kind, list, missing);
     }
-    for (int32_t i = 0; i < missing && !result; i++) {
+    const int64_t channels = kind == GSF__DIT_VGGT ? made.vggt_channels : made.dino_channels;
+    const float* from = kind == GSF__DIT_VGGT ? made.vggt : made.dino;
+    for (int32_t i = 0; i < missing && !result; i += per) {
         float* values;
-        const int64_t each = made.tokens * made.dino_channels;
-        result = gsf__dit_name_photos(c->ctx, "dino_latents", &list[i], 1, &c->name);
-        if (!result) result = gsf__dit_keep(c->ctx, c->r, c->name.data, 1, made.tokens, made.dino_channels, 1, &values);
-        if (!result) memcpy(values, made.dino + i * each, (size_t)each * sizeof(float));
+        const size_t each = (size_t)(per * made.tokens * channels);
+        result = gsf__dit_name_group(c, kind, list, i, per);
+        if (!result) result = gsf__dit_keep(c->ctx, c->r, c->name.data, per, made.tokens, channels, 1, &values);
+        if (!result) memcpy(values, from + (size_t)(i / per) * each, each * sizeof(float));
     }
     gsf_nn_destroy_features(c->ctx, &made);
     gsf_free(c->ctx, list);
     return result;
 }
 
-static gsf_result gsf__dit_gather_dino(gsf__dit_clip* c) {
-    const gsf__dit_kept* bare = c->clip ? NULL : gsf__dit_find(c->r, "dino_latents");
+// The clip's tokens of a kind, as kept or encoded now.
+static gsf_result gsf__dit_gather(gsf__dit_clip* c, int kind, float** values, int64_t* channels) {
+    const int32_t per = kind == GSF__DIT_VGGT && c->count > 0 ? c->count : 1;
+    const gsf__dit_kept* bare = c->clip ? NULL : gsf__dit_find(c->r, gsf__dit_kinds[kind].name);
     int own = c->count > 0;
-    for (int32_t i = 0; i < c->count; i++) {
-        GSF__TRY(gsf__dit_name_photos(c->ctx, "dino_latents", &c->chosen[i], 1, &c->name));
+    for (int32_t i = 0; i < c->count; i += per) {
+        GSF__TRY(gsf__dit_name_group(c, kind, c->chosen, i, per));
         own &= gsf__dit_find(c->r, c->name.data) != NULL;
-    }
-    c->features.images = 0;
-    c->features.dino_channels = c->r->transformer.dino_channels;
-    if (!own && bare) return gsf__dit_append(c, bare, bare->shape[0], &c->features.dino);
-    GSF__TRY(gsf__dit_need_photos(c));
-    if (!own) GSF__TRY(gsf__dit_encode_dino(c));
-    for (int32_t i = 0; i < c->count; i++) {
-        GSF__TRY(gsf__dit_name_photos(c->ctx, "dino_latents", &c->chosen[i], 1, &c->name));
-        GSF__TRY(gsf__dit_append(c, gsf__dit_find(c->r, c->name.data), c->count, &c->features.dino));
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__dit_encode_vggt(gsf__dit_clip* c) {
-    gsf_nn_features made;
-    float* values;
-    memset(&made, 0, sizeof made);
-    const gsf__dit_part part = {c->ctx, c->r, c->name.data, NULL, 0, &made};
-    if (!c->r->desc.save_features) gsf__dit_drop_encoded(c->ctx, c->r, "vggt_latents."); // of pairs there may be many
-    gsf_result result = gsf__dit_encode(&part, c->chosen, c->count, gsf__dit_vggt);
-    if (!result)
-        result = gsf__dit_keep(c->ctx, c->r, c->name.data, made.images, made.tokens, made.vggt_channels, 1, &values);
-    if (!result)
-        memcpy(values, made.vggt, (size_t)(made.images * made.tokens * made.vggt_channels) * sizeof(float));
-    gsf_nn_destroy_features(c->ctx, &made);
-    return result;
-}
-
-static gsf_result gsf__dit_gather_vggt(gsf__dit_clip* c) {
-    GSF__TRY(gsf__dit_name_photos(c->ctx, "vggt_latents", c->chosen, c->count, &c->name));
-    const gsf__dit_kept* kept = gsf__dit_find_own(c->r, "vggt_latents", c->name.data, c->clip);
-    if (!kept) {
-        GSF__TRY(gsf__dit_need_photos(c));
-        GSF__TRY(gsf__dit_encode_vggt(c));
-        kept = gsf__dit_find(c->r, c->name.data);
     }
     const int64_t before = c->features.images;
     c->features.images = 0;
-    c->features.vggt_channels = c->r->transformer.vggt_channels;
-    GSF__TRY(gsf__dit_append(c, kept, kept->shape[0], &c->features.vggt));
-    if (c->features.dino && before != c->features.images)
-        return gsf_fail(c->ctx, GSF_ERROR_FORMAT, "dit: 2D features of %lld images, but 3D features of %lld",
-                        (long long)before, (long long)c->features.images);
-    return GSF_OK;
+    *channels = kind == GSF__DIT_VGGT ? c->r->transformer.vggt_channels : c->r->transformer.dino_channels;
+    if (!own && bare) {
+        GSF__TRY(gsf__dit_append(c, bare, bare->shape[0], values));
+    } else {
+        GSF__TRY(gsf__dit_need_photos(c));
+        if (!own) GSF__TRY(gsf__dit_encode_missing(c, kind, per));
+        for (int32_t i = 0; i < c->count; i += per) {
+            GSF__TRY(gsf__dit_name_group(c, kind, c->chosen, i, per));
+            GSF__TRY(gsf__dit_append(c, gsf__dit_find(c->r, c->name.data), c->count, values));
+        }
+    }
+    if (before == 0 || before == c->features.images) return GSF_OK;
+    return gsf_fail(c->ctx, GSF_ERROR_FORMAT, "dit: 2D features of %lld images, but 3D features of %lld", (long long)before,
+                    (long long)c->features.images);
 }
 
 // Reference tokens from the clip's features, through the transformer's projectors.
@@ -13147,8 +13034,10 @@ static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const g
     gsf_result result = gsf__dit_name_photos(ctx, c.clip ? "references" : "first", c.chosen, c.count, &shown);
     if (!result && (!r->shown.size || strcmp(r->shown.data, shown.data) != 0)) {
         r->shown.size = 0;
-        if (r->desc.condition != GSF_NN_3D) result = gsf__dit_gather_dino(&c);
-        if (!result && r->desc.condition != GSF_NN_2D) result = gsf__dit_gather_vggt(&c);
+        gsf_nn_features* f = &c.features;
+        if (r->desc.condition != GSF_NN_3D) result = gsf__dit_gather(&c, GSF__DIT_DINO, &f->dino, &f->dino_channels);
+        if (!result && r->desc.condition != GSF_NN_2D)
+            result = gsf__dit_gather(&c, GSF__DIT_VGGT, &f->vggt, &f->vggt_channels);
         if (!result) result = gsf__dit_project(ctx, r, &c.features);
         if (!result) gsf_text_printf(ctx, &r->shown, "%s", shown.data);
         if (r->shown.failed) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -13287,9 +13176,9 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
         if (!r->desc.caption) GSF__TRY(gsf__dit_describe(&prompt, NULL));
     }
     if (condition != GSF_NN_NONE && condition != GSF_NN_3D && !gsf__dit_has(r, "dino_latents", "photo"))
-        GSF__TRY(gsf__dit_dinov2(&dino));
+        GSF__TRY(gsf__dit_see(&dino, GSF__DIT_DINO));
     if (condition != GSF_NN_NONE && condition != GSF_NN_2D && !gsf__dit_has(r, "vggt_latents", "photo"))
-        GSF__TRY(gsf__dit_vggt(&vggt));
+        GSF__TRY(gsf__dit_see(&vggt, GSF__DIT_VGGT));
     if (r->desc.keep_saved && r->desc.save_features) // last, so that a run that goes on looks where it did before
         GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
     const gsf_result result = saved ? gsf__dit_read_features(ctx, r, r->desc.save_features, saved, size) : GSF_OK;
@@ -13298,18 +13187,17 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
 }
 
 static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
-    gsf_text path;
-    memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/transformer", r->desc.model);
-    if (path.failed) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf_result result = gsf_nn_make_transformer(ctx, path.data, &r->transformer);
-    path.size = 0;
-    gsf_text_printf(ctx, &path, "%s/vae", r->desc.model);
-    if (!result) result = gsf_nn_make_vae(ctx, path.data, &r->vae);
-    path.size = 0;
-    gsf_text_printf(ctx, &path, "%s/scheduler/scheduler_config.json", r->desc.model);
-    if (!result) result = gsf_nn_load_schedule(ctx, path.data, &r->schedule);
-    gsf_destroy_text(ctx, &path);
+    static const char* const parts[3] = {"transformer", "vae", "scheduler/scheduler_config.json"};
+    gsf_result result = GSF_OK;
+    for (int i = 0; i < 3 && !result; i++) {
+        gsf_text path;
+        result = gsf__nn_join(ctx, r->desc.model, parts[i], &path);
+        if (!result)
+            result = i == 0   ? gsf_nn_make_transformer(ctx, path.data, &r->transformer)
+                     : i == 1 ? gsf_nn_make_vae(ctx, path.data, &r->vae)
+                              : gsf_nn_load_schedule(ctx, path.data, &r->schedule);
+        gsf_destroy_text(ctx, &path);
+    }
     if (!result) result = gsf__dit_open_conditions(ctx, r);
     r->transformer.bf16 = r->desc.bf16;
     return !result && r->desc.int8 ? gsf_nn_quantize_transformer(ctx, &r->transformer, NULL) : result;

@@ -693,7 +693,8 @@ static void model_list_blip2(model_list* list, const model_size* s, gsf__nn_conf
     (void)s;
     memset(&net, 0, sizeof net);
     memset(&captioner, 0, sizeof captioner);
-    list->result = gsf__blip_read_config(config, &net, &captioner);
+    captioner.nets = &net;
+    list->result = gsf__blip_read_config(config, &captioner);
     model_add_blip2(list, &net);
 }
 

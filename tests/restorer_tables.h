@@ -136,13 +136,13 @@ static void check_tables(void) {
     size_t levels = 4;
     double spatial = 1.875, temporal = 1.0;
     test_context_init(&ctx);
-    if (CHECK_OK(&ctx, gsf__nn_load_config(&ctx, test_golden("restorer/model/transformer/config.json"), &config))) {
+    if (CHECK_OK(&ctx, gsf__nn_open_config(&ctx, test_golden("restorer/model/transformer"), "config.json", 0, &config))) {
         CHECK_OK(&ctx, gsf__nn_config_int(&config, "patch_size", 1, 64, &patch));
         CHECK_OK(&ctx, gsf__nn_config_number(&config, "spatial_interpolation_scale", 0.01, 100.0, &spatial));
         CHECK_OK(&ctx, gsf__nn_config_number(&config, "temporal_interpolation_scale", 0.01, 100.0, &temporal));
     }
     gsf__nn_close_config(&config);
-    if (CHECK_OK(&ctx, gsf__nn_load_config(&ctx, test_golden("restorer/model/vae/config.json"), &vae)))
+    if (CHECK_OK(&ctx, gsf__nn_open_config(&ctx, test_golden("restorer/model/vae"), "config.json", 0, &vae)))
         CHECK_OK(&ctx, gsf__nn_config_ints(&vae, "block_out_channels", 1, 65536, 16, blocks, &levels));
     gsf__nn_close_config(&vae);
 

@@ -621,8 +621,14 @@ static void test_config(gsf_context* ctx) {
     CHECK_RESULT(ctx, gsf__nn_config_ints(&c, "heads", 1, 15, 3, list, &count), GSF_ERROR_FORMAT);
     gsf__nn_close_config(&c);
     CHECK_RESULT(ctx, gsf__nn_parse_config(ctx, "config.json", "[]", 2, &c), GSF_ERROR_FORMAT);
-    CHECK_RESULT(ctx, gsf__nn_load_config(ctx, test_scratch("absent.json"), &c), GSF_ERROR_NOT_FOUND);
-    if (CHECK_OK(ctx, gsf__nn_load_config(ctx, test_golden("restorer/model/transformer/config.json"), &c)))
+    CHECK_RESULT(ctx, gsf__nn_open_config(ctx, test_scratch("."), "absent.json", 0, &c), GSF_ERROR_NOT_FOUND);
+    if (CHECK_OK(ctx, gsf__nn_open_config(ctx, test_scratch("."), "absent.json", 1, &c))) { // as an empty object
+        CHECK_OK(ctx, gsf__nn_config_int_or(&c, "heads", 7, 1, 64, &n));
+        CHECK(n == 7);
+        CHECK_RESULT(ctx, gsf__nn_config_int(&c, "heads", 1, 64, &n), GSF_ERROR_FORMAT);
+    }
+    gsf__nn_close_config(&c);
+    if (CHECK_OK(ctx, gsf__nn_open_config(ctx, test_golden("restorer/model/transformer"), "config.json", 0, &c)))
         CHECK_OK(ctx, gsf__nn_config_int(&c, "num_layers", 1, 1000, &n));
     gsf__nn_close_config(&c);
 }
