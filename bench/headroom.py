@@ -31,9 +31,9 @@ most 1.02 (ray-traced) or 1.05 times (model) as deep in one of the training phot
 
 A run that has left its result.json is not repeated, so an interrupted call can be continued. DIR/headroom.csv has one row
 per run. DIR/headroom.md, also printed, has three tables per scene: PSNR of the rows on the held-out views, with gains over
-`none` paired by seed and their standard errors; the frames of each round against the truth; and the distance of held-out
-views to the nearest frame of each path. With several scenes the means over them follow. --tables only writes the tables
-of the runs there are. Needs only the standard library.
+`none` paired by seed and their standard errors; the frames of each round against the truth; and how far held-out views
+are from each path. With several scenes the means over them follow. --tables only writes the tables of the runs there are.
+Needs only the standard library.
 """
 import argparse
 import collections
@@ -72,8 +72,8 @@ FAR = "1000"      # depth of the sky of make_scene's courtyard
 
 FRAMES_TEXT = ("Frames against the truth, PSNR in dB: rendered and restored, over all pixels and over those with "
                "confidence; share of pixels with confidence, share that a photo sees, mean confidence where there is any:")
-PATHS_TEXT = ("Held-out views to the nearest frame of the path: distance in diameters of the capture, degrees between the "
-              "axes:")
+PATHS_TEXT = ("Held-out views and the path: distance to the nearest frame, in diameters of the capture; angle to the frame "
+              "nearest in direction, in degrees:")
 
 Scene = collections.namedtuple("Scene", "name folder out made")
 
@@ -147,12 +147,12 @@ def degrees(a, b):
 
 
 def path_distances(views, frames, diameter):
-    """Of each view to the nearest frame: share of the capture's diameter, angle between the two axes."""
+    """Of each view: to the nearest frame, as a share of the capture's diameter; to the axis nearest in direction."""
     found = []
     for camera in views:
         center, forward = center_of(camera), forward_of(camera)
-        nearest = min(frames, key=lambda frame: distance(center, frame["center"]))
-        found.append((distance(center, nearest["center"]) / diameter, degrees(forward, nearest["forward"])))
+        found.append((min(distance(center, frame["center"]) for frame in frames) / diameter,
+                      min(degrees(forward, frame["forward"]) for frame in frames)))
     return found
 
 
