@@ -384,6 +384,9 @@ typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
     int32_t frame_count, width, height; // what it was made for, and so the default; 0: nothing in particular
     int32_t squash;                 // it was made for frames that are the whole picture at `width` x `height` (or at another
                                     //   legal size), each axis scaled by itself; else pixels stay square
+    int32_t explains;               // what it writes shows what the references explain, with confidence 0 where they explain
+                                    //   nothing: the loop compares its frames with the renders to find windows that need no
+                                    //   repair, where else it reprojects the references itself
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
 } gsf_restorer_limits;
 

@@ -11630,6 +11630,7 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     const gsf__warp* warp = (const gsf__warp*)user;
     (void)ctx;
     out->needs_depth = 1;
+    out->explains = 1;
     const int32_t count = warp->count > 0 ? warp->count : 3, drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
     out->bytes = (double)width * height * (8 * count + drawn) * sizeof(float);
     out->flops = (double)width * height * frame_count * 200.0 * drawn;
@@ -12139,7 +12140,7 @@ typedef struct gsf__kept_frames {
 struct gsf_fixer {
     gsf_fix_desc desc;              // resolved
     const gsf_restorer* restorer;
-    gsf_restorer explain;           // a warp of our own, for the skip test
+    gsf_restorer explain;           // a warp of our own, for the skip test; unless the restorer explains
     gsf_trainer* trainer;
     size_t view_count;
     gsf_camera* cameras;
@@ -12380,7 +12381,8 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     }
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
-    if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f) result = gsf_splat_make_warp(ctx, &f->explain);
+    if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f && !f->limits.explains)
+        result = gsf_splat_make_warp(ctx, &f->explain);
 cleanup:
     if (result != GSF_OK) gsf_splat_destroy_fixer(ctx, f);
     else *out = f;
@@ -12395,18 +12397,16 @@ GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer) {
 
 GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer) { return fixer->trainer; }
 
-// Iteration before which round k runs.
-static int32_t gsf__round_iteration(const gsf_fix_desc* d, int32_t round) {
-    if (d->rounds <= 1) return d->first_round;
-    return d->first_round + (int32_t)((int64_t)(d->last_round - d->first_round) * round / (d->rounds - 1));
+// Rises from 0 at the first round to desc.lambda at the end.
+static float gsf__restored_weight(const gsf_fixer* f) {
+    return (float)gsf_traj_generative_weight(f->trainer->iteration, f->desc.first_round, f->desc.train.iterations,
+                                             (double)f->desc.lambda, 0);
 }
 
-// Rises from 0 at the first round to desc.lambda at the end, flattening out (the paper: "gradually increase"; the
-// official code's half sine falls again).
-static float gsf__restored_weight(const gsf_fixer* f) {
-    const float span = (float)(f->desc.train.iterations - f->desc.first_round);
-    const float t = span > 0.0f ? (float)(f->trainer->iteration - f->desc.first_round) / span : 1.0f;
-    return t <= 0.0f ? 0.0f : f->desc.lambda * (t < 1.0f ? t * (2.0f - t) : 1.0f);
+static int gsf__round_is_due(const gsf_fixer* f) {
+    const gsf_fix_desc* d = &f->desc;
+    return f->round < d->rounds &&
+           f->trainer->iteration >= gsf_traj_repair_round(d->first_round, d->last_round, d->rounds, f->round);
 }
 
 // Path of this round, its frames' sizes and buffers.
@@ -12502,12 +12502,10 @@ static gsf_result gsf__fit_image(gsf_context* ctx, gsf_image* image, const gsf_c
     return gsf_make_image(ctx, GSF_F32, camera->width, camera->height, channels, image);
 }
 
-// How well the render of these frames agrees with what the references show there, in dB over the explained pixels (weighted
-// by confidence); 0 when less than half of the pixels are explained at all. Uses the restored/confidence buffers.
-static gsf_result gsf__window_agreement(gsf_context* ctx, gsf_fixer* f, gsf_restore_window* window, double* psnr) {
+// How well the render of these frames agrees with what the references explain (out_color, out_confidence), in dB over the
+// explained pixels, weighted by confidence; 0 when less than half of the pixels are explained at all.
+static double gsf__window_agreement(const gsf_restore_window* window) {
     double error = 0.0, weight = 0.0, pixels = 0.0, explained = 0.0;
-    *psnr = 0.0;
-    GSF__TRY(f->explain.restore_fn(f->explain.user, ctx, window));
     for (int32_t i = 0; i < window->frame_count; i++)
         for (int64_t y = 0; y < window->color[i].height; y++)
             for (int64_t x = 0; x < window->color[i].width; x++) {
@@ -12521,8 +12519,20 @@ static gsf_result gsf__window_agreement(gsf_context* ctx, gsf_fixer* f, gsf_rest
                     error += w * d * d / 3.0;
                 }
             }
-    if (explained >= 0.5 * pixels) *psnr = error > 0.0 ? -10.0 * log10(error / weight) : INFINITY;
-    return GSF_OK;
+    if (explained < 0.5 * pixels) return 0.0;
+    return error > 0.0 ? -10.0 * log10(error / weight) : INFINITY;
+}
+
+// Has the window restored, unless its render agrees with the photos.
+static gsf_result gsf__restore_or_skip(gsf_context* ctx, const gsf_fixer* f, const gsf_restore_window* window, int* skip) {
+    *skip = 0;
+    if (f->desc.skip_psnr > 0.0f) {
+        const gsf_restorer* explain = f->limits.explains ? f->restorer : &f->explain;
+        GSF__TRY(explain->restore_fn(explain->user, ctx, window));
+        *skip = gsf__window_agreement(window) >= (double)f->desc.skip_psnr;
+        if (*skip || f->limits.explains) return GSF_OK;
+    }
+    return f->restorer->restore_fn(f->restorer->user, ctx, window);
 }
 
 static gsf_result gsf__keep_frame(gsf_context* ctx, gsf_fixer* f, const gsf_camera* camera, const gsf_image* color,
@@ -12576,20 +12586,11 @@ static void gsf__distrust_margin(const gsf_fixer* f, gsf_image* confidence) {
                 ((float*)confidence->data)[(size_t)y * (size_t)width + (size_t)x] = 0.0f;
 }
 
-static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
-    const size_t begin = (size_t)f->window * (size_t)f->frames;
-    GSF__TRY(gsf__open_references(ctx, f));
-    gsf_restore_window window;
-    memset(&window, 0, sizeof window);
-    window.struct_size = sizeof window;
-    window.frame_count = f->frames;
-    window.cameras = f->path + begin;
-    window.reference_index = f->reference_index + begin;
-    window.seed = gsf_random_bits(f->desc.train.seed, 0x77696e64u, (uint64_t)f->round * 4096u + (uint64_t)f->window);
-    window.clip = f->round * f->desc.windows + f->window;
+// The splats as the frames' cameras see them, in buffers of their sizes.
+static gsf_result gsf__render_window(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras) {
     for (int32_t i = 0; i < f->frames; i++) {
+        const gsf_camera* camera = cameras + i;
         GSF__TRY(gsf__check_cancel(ctx));
-        const gsf_camera* camera = window.cameras + i;
         GSF__TRY(gsf__fit_image(ctx, f->rendered + i, camera, 3));
         GSF__TRY(gsf__fit_image(ctx, f->depth + i, camera, 1));
         GSF__TRY(gsf__fit_image(ctx, f->alpha + i, camera, 1));
@@ -12602,30 +12603,43 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
         out.alpha = f->alpha[i];
         GSF__TRY(gsf_splat_trainer_render(ctx, f->trainer, camera, &out));
     }
+    return GSF_OK;
+}
+
+// All frames of the restored window, or none of them.
+static gsf_result gsf__keep_window(gsf_context* ctx, gsf_fixer* f, const gsf_restore_window* window) {
+    const size_t before = f->pending.count;
+    for (int32_t i = 0; i < f->frames; i++) {
+        gsf__distrust_margin(f, f->confidence + i);
+        if (window->reference_index[i] >= 0) continue; // the photo itself is trained on anyway
+        const gsf_result result = gsf__keep_frame(ctx, f, window->cameras + i, f->restored + i, f->confidence + i);
+        if (result == GSF_OK) continue;
+        while (f->pending.count > before) gsf_free(ctx, f->pending.frames[--f->pending.count].pixels);
+        return result;
+    }
+    return GSF_OK;
+}
+
+static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
+    const size_t begin = (size_t)f->window * (size_t)f->frames;
+    int skip;
+    GSF__TRY(gsf__open_references(ctx, f));
+    gsf_restore_window window;
+    memset(&window, 0, sizeof window);
+    window.struct_size = sizeof window;
+    window.frame_count = f->frames;
+    window.cameras = f->path + begin;
+    window.reference_index = f->reference_index + begin;
+    window.seed = gsf_random_bits(f->desc.train.seed, 0x77696e64u, (uint64_t)f->round * 4096u + (uint64_t)f->window);
+    window.clip = f->round * f->desc.windows + f->window;
+    GSF__TRY(gsf__render_window(ctx, f, window.cameras));
     window.color = f->rendered;
     window.depth = f->limits.needs_depth ? f->depth : NULL;
     window.alpha = f->limits.needs_alpha ? f->alpha : NULL;
     window.out_color = f->restored;
     window.out_confidence = f->confidence;
-    int skip = 0;
-    if (f->explain.user) {
-        double psnr;
-        GSF__TRY(gsf__window_agreement(ctx, f, &window, &psnr));
-        skip = psnr >= (double)f->desc.skip_psnr;
-    }
-    if (!skip) {
-        const int done = f->explain.user && f->restorer->restore_fn == gsf__warp_restore; // the test was the restoration
-        if (!done) GSF__TRY(f->restorer->restore_fn(f->restorer->user, ctx, &window));
-        for (int32_t i = 0; i < f->frames; i++) gsf__distrust_margin(f, f->confidence + i);
-        const size_t before = f->pending.count;
-        for (int32_t i = 0; i < f->frames; i++) {
-            if (window.reference_index[i] >= 0) continue; // the photo itself is trained on anyway
-            const gsf_result result = gsf__keep_frame(ctx, f, window.cameras + i, f->restored + i, f->confidence + i);
-            if (result == GSF_OK) continue;
-            while (f->pending.count > before) gsf_free(ctx, f->pending.frames[--f->pending.count].pixels);
-            return result;
-        }
-    }
+    GSF__TRY(gsf__restore_or_skip(ctx, f, &window, &skip));
+    if (!skip) GSF__TRY(gsf__keep_window(ctx, f, &window));
     f->skipped += skip;
     stats->frame_count = f->frames;
     stats->cameras = window.cameras;
@@ -12664,7 +12678,7 @@ GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
         stats->stage = GSF_FIX_RESTORE;
         if (!f->planned) GSF__TRY(gsf__plan_round(ctx, f));
         GSF__TRY(gsf__restore_window(ctx, f, stats));
-    } else if (f->round < f->desc.rounds && f->trainer->iteration >= gsf__round_iteration(&f->desc, f->round)) {
+    } else if (gsf__round_is_due(f)) {
         stats->stage = GSF_FIX_PLAN;
         GSF__TRY(gsf__plan_round(ctx, f));
         f->restoring = 1;

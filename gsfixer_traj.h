@@ -92,12 +92,13 @@ typedef struct gsf_traj_ellipse_desc {
 
 // ---- schedule ------------------------------------------------------------------
 
-// Weight of the generative loss, between iterations start and until (0 elsewhere): lambda * sin(x), x from 0 to pi
-// (official: falls again in the second half) or to pi/2 (the paper: gradually increased).
+// Weight of the generative loss, 0 up to iteration start: lambda * t (2 - t) with t from 0 to 1 at `until`, and lambda from
+// there on (the paper: "gradually increased"; computed in float32); or, official, lambda * sin(pi t), which falls again in
+// the second half and is 0 from `until` on.
 GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
                                           int32_t official);
-// Iterations at which a repair round is made: start, start + every, ... up to `until`. rounds: NULL or up to *count.
-GSF_API void gsf_traj_repair_rounds(int64_t start, int64_t every, int64_t until, int64_t* rounds, size_t* count);
+// Iteration at which repair round `round` (from 0) of `count` is made: spread evenly from `first` to `last`, rounded down.
+GSF_API int32_t gsf_traj_repair_round(int32_t first, int32_t last, int32_t count, int32_t round);
 
 // ---- paths ---------------------------------------------------------------------
 
@@ -1477,18 +1478,17 @@ GSF__SHARED gsf_result gsf__traj_leg_path(gsf_context* ctx, const double* poses,
 
 GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
                                           int32_t official) {
-    if (iteration <= start || iteration >= until) return 0.0;
+    if (iteration >= until) return official ? 0.0 : lambda;
+    if (iteration <= start) return 0.0;
     const double pi = 3.1415926535897932384626433832795;
     const double progress = ((double)iteration - (double)start) / ((double)until - (double)start);
-    return lambda * sin(progress * (official ? pi : 0.5 * pi));
+    if (official) return lambda * sin(progress * pi);
+    const float t = (float)progress;
+    return (double)((float)lambda * (t * (2.0f - t)));
 }
 
-GSF_API void gsf_traj_repair_rounds(int64_t start, int64_t every, int64_t until, int64_t* rounds, size_t* count) {
-    *count = 0;
-    if (start > until) return;
-    const uint64_t span = (uint64_t)until - (uint64_t)start, step = every < 1 ? span + 1 : (uint64_t)every;
-    *count = (size_t)(step == 0 ? 0 : span / step) + 1;
-    for (size_t i = 0; rounds && i < *count; i++) rounds[i] = (int64_t)((uint64_t)start + i * step);
+GSF_API int32_t gsf_traj_repair_round(int32_t first, int32_t last, int32_t count, int32_t round) {
+    return count > 1 ? first + (int32_t)(((int64_t)last - first) * round / (count - 1)) : first;
 }
 
 // ---- >>paths -------------------------------------------------------------------

@@ -912,6 +912,65 @@ static void test_mixed_windows(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
+// A host's restorer that has warp do the work: what its query says, and nothing else, tells the loop what to make of it.
+typedef struct wrapped { gsf_restorer warp; int hides, begun, restored; } wrapped;
+
+static gsf_result wrapped_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
+                                gsf_restorer_limits* out) {
+    const wrapped* w = (const wrapped*)user;
+    const gsf_result result = w->warp.query_fn(w->warp.user, ctx, frames, width, height, out);
+    CHECK(out->explains);
+    if (w->hides) out->explains = 0;
+    return result;
+}
+static gsf_result wrapped_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
+    wrapped* w = (wrapped*)user;
+    w->begun++;
+    return w->warp.begin_fn(w->warp.user, ctx, references, count);
+}
+static gsf_result wrapped_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
+    wrapped* w = (wrapped*)user;
+    w->restored++;
+    return w->warp.restore_fn(w->warp.user, ctx, window);
+}
+static void wrapped_end(void* user, gsf_context* ctx) { ((wrapped*)user)->warp.end_fn(((wrapped*)user)->warp.user, ctx); }
+
+static void test_explaining_restorer(gsf_context* ctx) {
+    static repair r;
+    wrapped all[3];
+    gsf_restorer outer[3]; // borrowed by the fixers
+    gsf_fixer* fixers[3];
+    memset(all, 0, sizeof all);
+    mixed_setup(ctx, &r);
+    gsf_fix_desc desc = repair_desc();
+    desc.windows = 4;
+    desc.train.iterations = 12;
+    desc.first_round = 3;
+    desc.last_round = 6;
+    desc.skip_psnr = 17.0f; // two of the four windows agree, in each of the two rounds
+    for (int i = 0; i < 3; i++) { // it explains; it does not say so; warp itself
+        wrapped* w = all + i;
+        const gsf_restorer host = {sizeof host, "wrapped", w, wrapped_query, wrapped_begin, wrapped_restore, wrapped_end};
+        const gsf_restorer* used = i == 2 ? &w->warp : &outer[i];
+        outer[i] = host;
+        CHECK_OK(ctx, gsf_splat_make_warp(ctx, &w->warp));
+        w->hides = i == 1;
+        CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, used, &fixers[i]));
+        int skipped = 0;
+        for (gsf_fix_stats stats = {0}; stats.stage != GSF_FIX_DONE; skipped = stats.skipped)
+            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixers[i], &stats))) break;
+        CHECK(skipped == 4);
+        CHECK(w->begun == (i < 2 ? 2 : 0) && w->restored == (i == 0 ? 8 : i == 1 ? 4 : 0)); // all windows; those to repair
+        CHECK(same_splats(fixers[0], fixers[i]));
+    }
+    for (int i = 0; i < 3; i++) {
+        gsf_splat_destroy_fixer(ctx, fixers[i]);
+        gsf_splat_destroy_warp(ctx, &all[i].warp);
+    }
+    memset(&r.start, 0, sizeof r.start); // was the truth
+    repair_teardown(ctx, &r);
+}
+
 static void test_seen_mask(gsf_context* ctx) {
     static repair r;
     static uint8_t seen[PIXELS], all[PIXELS];
@@ -952,6 +1011,7 @@ int main(void) {
     test_desc(&ctx);
     test_masked_references(&ctx);
     test_mixed_windows(&ctx);
+    test_explaining_restorer(&ctx);
     test_loop(&ctx);
     test_rigs(&ctx);
     test_given_path(&ctx);

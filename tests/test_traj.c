@@ -859,18 +859,21 @@ static void test_intrinsics(void) {
 }
 
 static void test_schedule(void) {
-    size_t count;
-    int64_t rounds[8];
-    gsf_traj_repair_rounds(100, 50, 99, NULL, &count);
-    CHECK(count == 0);
-    gsf_traj_repair_rounds(100, 50, 210, rounds, &count);
-    CHECK(count == 3 && rounds[0] == 100 && rounds[2] == 200);
-    gsf_traj_repair_rounds(100, 0, 210, rounds, &count);
-    CHECK(count == 1 && rounds[0] == 100);
+    static const int32_t even[4] = {100, 150, 200, 250}, uneven[4] = {10, 13, 16, 20}; // 3 1/3 apart
+    for (int32_t k = 0; k < 4; k++) {
+        CHECK(gsf_traj_repair_round(100, 250, 4, k) == even[k]);
+        CHECK(gsf_traj_repair_round(10, 20, 4, k) == uneven[k]);
+    }
+    CHECK(gsf_traj_repair_round(100, 210, 1, 0) == 100);
+    CHECK(gsf_traj_repair_round(7, INT32_MAX, 1001, 1000) == INT32_MAX);
     CHECK(gsf_traj_generative_weight(10, 10, 20, 1.0, 0) == 0.0);
-    CHECK(gsf_traj_generative_weight(20, 10, 20, 1.0, 0) == 0.0);
+    CHECK(gsf_traj_generative_weight(20, 10, 20, 0.75, 0) == 0.75 && gsf_traj_generative_weight(20, 10, 20, 0.75, 1) == 0.0);
     for (int i = 12; i < 20; i++) // rises all the way; the released one falls again
         CHECK(gsf_traj_generative_weight(i, 10, 20, 2.0, 0) > gsf_traj_generative_weight(i - 1, 10, 20, 2.0, 0));
+    for (int i = 11; i < 20; i++) {
+        const double t = 0.1 * i - 1.0;
+        CHECK_NEAR(gsf_traj_generative_weight(i, 10, 20, 2.0, 0), 2.0 * t * (2.0 - t), 1e-6);
+    }
     CHECK(gsf_traj_generative_weight(19, 10, 20, 2.0, 1) < gsf_traj_generative_weight(15, 10, 20, 2.0, 1));
     for (int32_t total = 1; total < 300; total++) // released tables: inside the sequence, or refused
         for (int32_t middle = 1; middle < 40; middle++) {
