@@ -6,16 +6,16 @@
        #include "gsfixer_traj.h"             // includes gsfixer.h, whose implementation is needed as well
 
    WHAT IT DOES NOT DO
-       It allocates nothing and reads no file. It does not look at images or points to keep a path out of walls. It has
-       no smoothing splines (FITPACK's s > 0): its splines pass through their poses.
+       It allocates no memory and reads no files. It does not avoid obstacles: a path may pass through walls. It has no
+       smoothing splines (FITPACK's s > 0): its splines interpolate their poses.
 
-   CONVENTIONS (beside those of gsfixer.h)
+   CONVENTIONS (in addition to those of gsfixer.h)
        pose            camera to world, double[16], column-major, OpenCV axes: column 0 right, 1 down, 2 forward,
-                       3 position. An array of n poses is (n,16). Not to be mixed up with gsf_camera.w2c, its inverse.
+                       3 position. An array of n poses is (n,16). Do not confuse it with its inverse, gsf_camera.w2c.
        similarity      double[16], column-major: scale * rotation | translation, last row 0 0 0 1
        angles          radians unless the name says degrees
-       unit            the normalised frame, in which the median camera is at distance 1 from the middle of the scene;
-                       weights that add lengths to angles (nearest view, axis_length) are meant for that frame
+       unit            of the normalised frame, in which the median camera is at distance 1 from the centre of the scene;
+                       weights that add lengths to angles (nearest view, axis_length) refer to that frame
 
    STEP BY STEP
        gsf_traj_path_desc desc;                         // all zero: reference-guided, windows of 49 frames
@@ -29,36 +29,38 @@
        int32_t* reference = malloc(layout.frame_count * sizeof *reference);
        if (gsf_traj_sample_path(&ctx, cameras, camera_count, &desc, scratch, path, reference) != GSF_OK) ...
 
-   PATHS       gsf_traj_sample_path does all of it: normalise, sample, map back to the world. Three kinds:
-               reference    (GSFixer) each window leaves a photo, joins the ellipse, follows it, and ends in the photo
-                            that is nearest to where it left the ellipse. 49 = 16 + 17 + 16 frames; any other length
-                            works.
-               ellipse      round the scene, looking at the point nearest to all optical axes
-               interpolate  through the cameras in their given order
-   OFFICIAL    The released code has quirks. `official` reproduces them to rounding; zero is the corrected behaviour:
-               - legs ref -> ellipse have u = 0, 1/16 .. 14/16, 1 and then the same pose again; here u is even and no
-                 pose is given twice
-               - legs interpolate three points of the pose linearly, which fails for opposite directions; here positions
-                 are linear and rotations slerp
-               - windows follow a table over an open sequence of poses; here they are spread evenly over the closed loop
-               - the similarity finds the middle nearest to the world's origin, so it depends on where that is; here
-                 nearest to the mean camera position, so paths follow their scene wherever it lies
-               - frames all have the first camera's intrinsics; here a frame that is a photo's has the photo's
-               One thing is corrected in both: views exactly upside down are turned by half a turn, where the released
-               code mirrors the world.
-               The released functions that no path here takes (other splines and alignments) are internal: they stand in
-               the implementation, beside those that share their code, and tests/golden_traj.c holds them to their data.
-   ERRORS      GSF_ERROR_NUMERIC for NaN and infinity anywhere in the input, GSF_ERROR_DEGENERATE where the geometry
-               does not say what to do (one view, parallel axes, coincident cameras, a view along its up vector),
-               GSF_ERROR_INVALID_ARGUMENT for the rest. Never a pose that is not a rotation: columns are orthonormal to
-               1e-12. On an error outputs are untouched or zeroed.
-   MEMORY      None of its own. `scratch` is the caller's: aligned for double, of layout.scratch_bytes, contents of no
-               meaning before and after. Inputs and outputs must not overlap unless said.
-   THREADS     Pure functions; the context is only used for error texts.
+   PATHS       gsf_traj_sample_path normalises the scene, samples the path and maps it back to the world. Three kinds:
+               reference    (GSFixer) each window starts at a photo, joins the ellipse, follows it, and ends at the photo
+                            nearest to the point where it leaves the ellipse. 49 = 16 + 17 + 16 frames; any other length
+                            works as well.
+               ellipse      around the scene, looking at the point nearest to all optical axes
+               interpolate  through the cameras in the given order
+   OFFICIAL    The code of the GSFixer release has quirks. The field `official` reproduces them up to rounding; zero
+               selects the corrected behaviour:
+               - legs from a photo to the ellipse have u = 0, 1/16 .. 14/16, 1 and then repeat the pose; corrected: u is
+                 evenly spaced and no pose is repeated
+               - legs interpolate three points of the pose linearly, which fails for opposite directions; corrected:
+                 linear positions and slerped rotations
+               - windows follow a table over an open sequence of poses; corrected: they are spread evenly over the closed
+                 loop
+               - the similarity uses the points of the optical axes nearest to the world's origin and so depends on it;
+                 corrected: nearest to the mean camera position, so that paths do not depend on the choice of origin
+               - all frames have the first camera's intrinsics; corrected: a frame at a photo's pose has that photo's
+               One quirk is corrected in both: exactly upside-down views are rotated by half a turn, where the release
+               mirrors the world.
+               Functions of the release that these paths do not use (other splines and alignments) are internal. They are
+               next to the code that they share, and tests/golden_traj.c checks them against data of the release.
+   ERRORS      GSF_ERROR_NUMERIC for NaN and infinity anywhere in the input, GSF_ERROR_DEGENERATE if the geometry does not
+               determine a result (one view, parallel axes, coincident cameras, a view along its up vector),
+               GSF_ERROR_INVALID_ARGUMENT otherwise. The rotation of every returned pose is orthonormal to 1e-12. On an
+               error, outputs are unchanged or zeroed.
+   MEMORY      Allocates nothing. `scratch` belongs to the caller: aligned for double, layout.scratch_bytes long, contents
+               undefined before and after the call. Inputs and outputs must not overlap unless stated.
+   THREADS     Pure functions; the context is used for error messages only.
    SECTIONS    >>vectors >>order statistics >>eigen >>intrinsics >>poses >>rotations >>views >>normalisation >>splines
                >>ellipse >>windows >>legs >>schedule >>paths
    SOURCES     GSFixer (its released code: datasets/normalize.py, outpaint/sample_utils.py, sparse.py, base.py),
-               multinerf camera_utils (ellipse, focus point), de Boor (B-splines), Shoemake 1985 (slerp)
+               multinerf's camera_utils (ellipse, focus point), de Boor (B-splines), Shoemake 1985 (slerp)
 */
 #ifndef GSF_TRAJ_INCLUDED
 #define GSF_TRAJ_INCLUDED
@@ -71,13 +73,13 @@ extern "C" {
 
 // ---- poses ---------------------------------------------------------------------
 
-// The pose at `eye` that looks at `target`; `up` is the world direction that points up in the image.
+// The pose at `eye` that looks at `target`; `up` is the world direction that is up in the image.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const double target[3],
                                                   const double up[3], double pose[16]);
 
 // ---- sets of views -------------------------------------------------------------
 
-// Least-squares point nearest to all optical axes. Degenerate for one view and for parallel axes.
+// The point nearest to all optical axes in the least-squares sense. Degenerate for one view and for parallel axes.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, size_t count,
                                                       double focus[3]);
 
@@ -85,61 +87,62 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_focus_point(gsf_context* ctx, const do
 
 typedef struct gsf_traj_ellipse_desc {
     int32_t frames;       // 85
-    double z_variation;   // share of the cameras' height range (10th to 90th percentile) swept; 0 = flat, at z = 0
-    double z_phase;       // [0,1): where on the loop the height starts
-    double pitch_degrees; // every view is turned by this about its own x axis
+    double z_variation;   // fraction of the cameras' height range (10th to 90th percentile) covered; 0 = flat, at z = 0
+    double z_phase;       // [0,1): phase of the height along the loop
+    double pitch_degrees; // rotation of every view about its own x axis
 } gsf_traj_ellipse_desc;
 
 // ---- schedule ------------------------------------------------------------------
 
-// Weight of the generative loss, 0 up to iteration start: lambda * t (2 - t) with t from 0 to 1 at `until`, and lambda from
-// there on (the paper: "gradually increased"; computed in float32); or, official, lambda * sin(pi t), which falls again in
+// Weight of the generative loss, 0 up to iteration start: lambda * t (2 - t) with t from 0 to 1 at `until`, constant lambda
+// afterwards (the paper: "gradually increased"; computed in float32). official: lambda * sin(pi t), which decreases again in
 // the second half and is 0 from `until` on.
 GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
                                           int32_t official);
-// Iteration at which repair round `round` (from 0) of `count` is made: spread evenly from `first` to `last`, rounded down.
+// Iteration of repair round `round` (from 0) of `count`: spread evenly from `first` to `last`, rounded down.
 GSF_API int32_t gsf_traj_repair_round(int32_t first, int32_t last, int32_t count, int32_t round);
 
 // ---- paths ---------------------------------------------------------------------
 
 typedef enum gsf_traj_kind {
     GSF_TRAJ_REFERENCE = 0, // photo -> ellipse -> nearest photo, per window
-    GSF_TRAJ_ELLIPSE,       // windows are consecutive pieces of the loop
-    GSF_TRAJ_INTERPOLATE,   // windows are consecutive pieces of a path through the cameras in their order
+    GSF_TRAJ_ELLIPSE,       // windows are consecutive sections of the loop
+    GSF_TRAJ_INTERPOLATE,   // windows are consecutive sections of a path through the cameras in their order
 } gsf_traj_kind;
 
 typedef struct gsf_traj_path_desc {
     gsf_traj_kind kind;
     int32_t window_length;   // frames per window, at least 2; 0 = 49
-    int32_t window_count;    // 0 = 7, for INTERPOLATE cameras - 1. One window takes the whole loop, or path
-    int32_t ellipse_poses;   // poses of the whole loop; 0 = REFERENCE: 5/7 of what the windows take, so that neighbours
-                             // overlap (85 for 7 windows of 49 frames); ELLIPSE: all windows together are one loop
-    int32_t round;           // repair round, from 0: changes height, tilt and phase of the ellipse
+    int32_t window_count;    // 0 = 7, for INTERPOLATE cameras - 1. A single window covers the whole loop or path
+    int32_t ellipse_poses;   // poses of the whole loop; 0 = REFERENCE: 5/7 of the poses in all windows, so that neighbours
+                             // overlap (85 for 7 windows of 49 frames); ELLIPSE: all windows together form one loop
+    int32_t round;           // repair round, from 0: determines height, tilt and phase of the ellipse
     uint64_t seed;
     const double* points;    // (point_count,3) world points for the principal axes, borrowed; NULL = camera positions
     size_t point_count;
-    const double* transform; // world to normalised frame, [16], for a host that has it from more cameras than these;
-                             // NULL = from these cameras and points
-    const gsf_traj_ellipse_desc* ellipse; // the loop's shape, its frames field not used; NULL = the official one of an
-                             // outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round and a
-                             // z_phase drawn from seed and round
+    const double* transform; // world to normalised frame, [16], if the host has computed it from more cameras; NULL = from
+                             // these cameras and points
+    const gsf_traj_ellipse_desc* ellipse; // the loop's shape (`frames` is ignored); NULL = as in the release's outpaint
+                             // rounds: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round and a z_phase drawn
+                             // from seed and round
     const gsf_camera* intrinsics; // size and intrinsics of the frames; NULL = those of the first camera
-    int32_t official;        // REFERENCE: the released windows (length 3n+1, count by its table over ellipse_poses =
-                             // 85), spacing and interpolation; all kinds: the released similarity. See OFFICIAL
+    int32_t official;        // REFERENCE: windows as in the release (length 3n+1, count by its table over ellipse_poses =
+                             // 85), with its spacing and interpolation; all kinds: its similarity. See OFFICIAL
 } gsf_traj_path_desc;
 
-typedef struct gsf_traj_path_layout { // everything resolved
+typedef struct gsf_traj_path_layout { // the desc's counts with defaults filled in
     int32_t window_count, window_length, ellipse_poses;
     size_t frame_count;   // window_count * window_length
-    size_t scratch_bytes; // for gsf_traj_sample_path with as many cameras and points
+    size_t scratch_bytes; // for gsf_traj_sample_path with this number of cameras and points
 } gsf_traj_path_layout;
 
 GSF_API GSF_NODISCARD gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count,
                                                      const gsf_traj_path_desc* desc, gsf_traj_path_layout* layout);
-// Samples a path for world cameras (camera_count). out (frame_count): window after window, in world coordinates, all
-// of one size. reference_index (frame_count) or NULL: the camera whose photo a frame is, else -1; REFERENCE windows
-// start and end with one. Such a frame has that camera's w2c bit for bit. All need two cameras, ELLIPSE and
-// REFERENCE at different places. Where all axes are parallel, these two look as deep as the points lie before the cameras.
+// Samples a path for world cameras (camera_count). out (frame_count): window after window, in world coordinates, all of
+// the same size. reference_index (frame_count) or NULL: the camera whose pose a frame has, else -1; such a frame has
+// that camera's w2c bit for bit. REFERENCE windows start and end with one. All kinds need two cameras, ELLIPSE and
+// REFERENCE at different positions. If all axes are parallel, these two look at the depth of the points in front of the
+// cameras.
 GSF_API GSF_NODISCARD gsf_result gsf_traj_sample_path(gsf_context* ctx, const gsf_camera* cameras, size_t camera_count,
                                                       const gsf_traj_path_desc* desc, void* scratch, gsf_camera* out,
                                                       int32_t* reference_index);
@@ -196,7 +199,7 @@ static double gsf__traj_distance(const double a[3], const double b[3]) {
     return gsf__traj_length(d);
 }
 
-// Unit vector; 0 where there is no direction (zero, NaN, infinite). out may be v.
+// Unit vector; returns 0 if v has no direction (zero, NaN, infinite). out may be v.
 static int gsf__traj_unit(const double v[3], double out[3]) {
     const double m = gsf__traj_max_abs(v);
     if (!(m > 0.0) || !isfinite(v[0]) || !isfinite(v[1]) || !isfinite(v[2])) return 0;
@@ -222,8 +225,8 @@ static void gsf__traj_apply(const double m[16], const double p[3], double out[3]
     for (int r = 0; r < 3; r++) out[r] = m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r];
 }
 
-// Pose from forward and down directions; 0 where they do not span a plane. Columns orthonormal to a few ulp: what the
-// short cross product of nearly parallel directions loses is taken out again by the second projection.
+// Pose from forward and down directions; returns 0 if they are parallel. Columns are orthonormal to a few ulp: the second
+// projection removes the error of the cross product of nearly parallel directions.
 static int gsf__traj_axes(const double forward[3], const double down[3], const double position[3], double pose[16]) {
     double x[3], y[3], z[3], d[3];
     if (!gsf__traj_unit(forward, z) || !gsf__traj_unit(down, d)) return 0;
@@ -244,7 +247,7 @@ static int gsf__traj_axes(const double forward[3], const double down[3], const d
     return 1;
 }
 
-// Sizes of scratch memory: SIZE_MAX once anything overflowed.
+// Sizes of scratch memory, saturating at SIZE_MAX on overflow.
 static size_t gsf__traj_size_mul(size_t a, size_t b) {
     size_t out;
     return a != SIZE_MAX && b != SIZE_MAX && gsf__mul_size(a, b, &out) ? out : SIZE_MAX;
@@ -254,7 +257,7 @@ static size_t gsf__traj_size_max(size_t a, size_t b) { return a > b ? a : b; }
 
 // ---- >>order statistics --------------------------------------------------------
 
-// Heap sort: n log n whatever the order, and in place. NaN must not come in.
+// Heap sort: in place, n log n in the worst case. The input must not contain NaN.
 static void gsf__traj_sort(double* v, size_t n) {
     if (n < 2) return;
     for (size_t start = n / 2, end = n; end > 1;) {
@@ -275,7 +278,7 @@ static void gsf__traj_sort(double* v, size_t n) {
     }
 }
 
-// Of sorted values, linear between neighbours (numpy's default); share in [0,1].
+// Percentile of sorted values with linear interpolation (numpy's default); share in [0,1].
 static double gsf__traj_percentile(const double* sorted, size_t n, double share) {
     const double at = share * (double)(n - 1);
     size_t below = (size_t)at;
@@ -292,8 +295,8 @@ static double gsf__traj_median(double* v, size_t n) {
 
 // ---- >>eigen -------------------------------------------------------------------
 
-// Eigenvalues of a symmetric 3x3 matrix (row-major), falling, and unit eigenvectors as rows. Cyclic Jacobi:
-// eigenvectors are products of plane rotations, so they are orthonormal to rounding whatever the matrix.
+// Eigenvalues of a symmetric 3x3 matrix (row-major), descending, and unit eigenvectors as rows. Cyclic Jacobi:
+// eigenvectors are products of plane rotations, so they are orthonormal up to rounding for any matrix.
 static void gsf__traj_eigen(const double matrix[9], double values[3], double rows[9]) {
     double a[9], v[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
     memcpy(a, matrix, sizeof a);
@@ -335,14 +338,14 @@ static void gsf__traj_eigen(const double matrix[9], double values[3], double row
     }
 }
 
-// The coordinate axis least along `away`, made perpendicular to it.
+// The coordinate axis least aligned with `away`, made perpendicular to it.
 static void gsf__traj_side_axis(const double away[3], double out[3]) {
     const int axis = fabs(away[0]) < 0.7 ? 0 : 1;
     for (int i = 0; i < 3; i++) out[i] = (i == axis) - away[axis] * away[i];
     (void)gsf__traj_unit(out, out);
 }
 
-// Makes eigenvectors a function of the input where the matrix leaves them open: equal eigenvalues take coordinate axes,
+// Makes eigenvectors unique where the matrix does not determine them: equal eigenvalues take coordinate axes,
 // the largest component of rows 0 and 1 is positive (the first of equal ones), the determinant is +1.
 static void gsf__traj_fix_axes(const double values[3], double rows[9]) {
     const double tie = 1e-7 * values[0];
@@ -371,7 +374,7 @@ GSF__SHARED double gsf__traj_fov_from_focal(double focal, double pixels) { retur
 GSF__SHARED double gsf__traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
 
 // Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the
-// official full projection (near 0.01, far 100). Needs 0 < near_plane < far_plane.
+// full projection of Inria's 3DGS (near 0.01, far 100). Needs 0 < near_plane < far_plane.
 GSF__SHARED gsf_result gsf__traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane,
                                             double far_plane, double out[16]) {
     GSF__TRY(gsf_check_camera(ctx, camera));
@@ -393,7 +396,7 @@ GSF__SHARED gsf_result gsf__traj_projection(gsf_context* ctx, const gsf_camera* 
 
 // ---- >>poses -------------------------------------------------------------------
 
-// Finite, rigid (1e-4), no reflection? Otherwise the error names the pose.
+// Checks that poses are finite, rigid (to 1e-4) and no reflections; otherwise the error names the pose.
 static gsf_result gsf__traj_check_poses(gsf_context* ctx, const double* poses, size_t count) {
     if (!poses && count) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "poses: none given");
     for (size_t n = 0; n < count; n++) {
@@ -413,14 +416,14 @@ static gsf_result gsf__traj_check_poses(gsf_context* ctx, const double* poses, s
     return GSF_OK;
 }
 
-// Last guard of every path: coordinates near the end of double's range overflow on the way.
+// Final check of every path: coordinates near the limits of double may have overflowed.
 static gsf_result gsf__traj_check_path(gsf_context* ctx, double* poses, size_t count) {
     if (gsf__traj_finite(poses, 16 * count)) return GSF_OK;
     memset(poses, 0, 16 * count * sizeof(double));
     return gsf_fail(ctx, GSF_ERROR_NUMERIC, "path: coordinates are too large to compute with");
 }
 
-// The same from directions: forward becomes column 2, down the side to which column 1 points (official `viewmatrix`).
+// The same from directions: forward becomes column 2, column 1 points to the side of down (the release's `viewmatrix`).
 static gsf_result gsf__traj_view_pose(gsf_context* ctx, const double forward[3], const double down[3],
                                       const double position[3], double pose[16]) {
     if (!gsf__traj_finite(forward, 3) || !gsf__traj_finite(down, 3) || !gsf__traj_finite(position, 3))
@@ -444,7 +447,7 @@ GSF_API gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const
 // ---- >>rotations ---------------------------------------------------------------
 
 static void gsf__traj_pose_quat(const double m[16], double quat[4]) {
-    // Four times the squares of w, x, y, z; the largest is the safe one to divide by (Shepperd 1978).
+    // Four times the squares of w, x, y, z; dividing by the largest is well conditioned (Shepperd 1978).
     const double s[4] = {1.0 + m[0] + m[5] + m[10], 1.0 + m[0] - m[5] - m[10], 1.0 - m[0] + m[5] - m[10],
                          1.0 - m[0] - m[5] + m[10]};
     int most = 0;
@@ -462,7 +465,7 @@ static void gsf__traj_pose_quat(const double m[16], double quat[4]) {
     for (int i = 0; i < 4; i++) quat[i] = q[i] * scale;
 }
 
-// The rotation of a quaternion of any length but zero.
+// The rotation of a quaternion of any non-zero length.
 static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
     const double w = q[0], x = q[1], y = q[2], z = q[3];
     const double s = 2.0 / (w * w + x * x + y * y + z * z);
@@ -491,8 +494,8 @@ GSF__SHARED gsf_result gsf__traj_set_pose_quat(gsf_context* ctx, const double qu
     return GSF_OK;
 }
 
-// Spherical interpolation of unit quaternions along the shorter arc; t beyond [0,1] goes on. Half a turn apart: one
-// of the two arcs.
+// Spherical interpolation of unit quaternions along the shorter arc; t outside [0,1] extrapolates. For rotations half a
+// turn apart, one of the two arcs is chosen.
 static void gsf__traj_slerp(const double a[4], const double b[4], double t, double out[4]) {
     double dot = 0.0, apart = 0.0, along = 0.0, q[4];
     for (int i = 0; i < 4; i++) dot += a[i] * b[i];
@@ -502,7 +505,7 @@ static void gsf__traj_slerp(const double a[4], const double b[4], double t, doub
         apart += d * d;
         along += s * s;
     }
-    const double angle = 2.0 * atan2(sqrt(apart), sqrt(along)); // at most a quarter turn: sin(angle) is no trouble
+    const double angle = 2.0 * atan2(sqrt(apart), sqrt(along)); // at most a quarter turn, so sin(angle) is well conditioned
     double wa = 1.0 - t, wb = t;
     if (angle > 1e-9) {
         wa = sin(angle * (1.0 - t)) / sin(angle);
@@ -544,7 +547,7 @@ static gsf_result gsf__traj_check_views(gsf_context* ctx, const char* what, cons
     return gsf__traj_check_poses(ctx, poses, count);
 }
 
-// Mean of a column of the poses (0..3), summed as differences from the first so that far-off scenes keep their digits.
+// Mean of a column of the poses (0..3), summed as differences from the first to keep precision far from the origin.
 static void gsf__traj_mean_column(const double* poses, size_t count, int column, double out[3]) {
     const double* first = poses + 4 * column;
     double sum[3] = {0.0, 0.0, 0.0};
@@ -553,9 +556,9 @@ static void gsf__traj_mean_column(const double* poses, size_t count, int column,
     for (int i = 0; i < 3; i++) out[i] = first[i] + sum[i] / (double)count;
 }
 
-// Solves mean(M^T M) x = mean(M^T M o), M = I - d d^T, o position and d direction of a view, relative to the mean o. Returns
-// the least eigenvalue, the mean squared sine of the angles to the common direction. Where it is not above `least`, the axes
-// are parallel, and how far along them the focus lies is taken from `prior`.
+// Solves mean(M^T M) x = mean(M^T M o), M = I - d d^T, o position and d direction of a view, relative to the mean o.
+// Returns the least eigenvalue, the mean squared sine of the angles to the common direction. If it is not above
+// `least`, the axes are parallel, and the position of the focus along them is taken from `prior`.
 static double gsf__traj_solve_focus(const double* poses, size_t count, double least, const double prior[3],
                                     double focus[3]) {
     double center[3], a[9], b[3], values[3], rows[9];
@@ -595,7 +598,7 @@ GSF_API gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, s
     return GSF_OK;
 }
 
-// Mean position, mean forward, mean down. official: looks the opposite way, as the released average_pose does.
+// Mean position, mean forward, mean down. official: looks in the opposite direction, like the release's average_pose.
 static gsf_result gsf__traj_average_pose(gsf_context* ctx, const double* poses, size_t count, int32_t official,
                                          double pose[16]) {
     GSF__TRY(gsf__traj_check_views(ctx, "average pose", poses, count));
@@ -621,7 +624,7 @@ GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* 
     for (size_t n = 0; n < count; n++) {
         double local[16];
         memcpy(local, poses + 16 * n, sizeof local);
-        for (int i = 0; i < 3; i++) local[12 + i] -= average[12 + i]; // first, so that far-off scenes keep their digits
+        for (int i = 0; i < 3; i++) local[12 + i] -= average[12 + i]; // first, to keep precision far from the origin
         double rotation[16];
         memcpy(rotation, transform, sizeof rotation);
         memset(rotation + 12, 0, 3 * sizeof(double));
@@ -630,8 +633,8 @@ GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* 
     return gsf__traj_check_path(ctx, out, count);
 }
 
-// Mean camera position and the largest distance from it. The official scene_scale is radius of all cameras,
-// cameras_extent is 1.1 times radius of the training cameras.
+// Mean camera position and the largest distance from it. The release's scene_scale is the radius of all cameras, 3DGS's
+// cameras_extent is 1.1 times the radius of the training cameras.
 GSF__SHARED gsf_result gsf__traj_camera_radius(gsf_context* ctx, const double* poses, size_t count, double center[3],
                                                double* radius) {
     GSF__TRY(gsf__traj_check_views(ctx, "camera radius", poses, count));
@@ -645,7 +648,7 @@ GSF__SHARED gsf_result gsf__traj_camera_radius(gsf_context* ctx, const double* p
 }
 
 // Index of the view with the smallest score |position difference| + direction_weight * (1 - forward . forward); the
-// lowest index among equals (to 1e-9). scores: NULL or (count). The official weight is 0.5, in the normalised frame.
+// lowest index among equals (to 1e-9). scores: NULL or (count). The release's weight is 0.5, in the normalised frame.
 static gsf_result gsf__traj_nearest_view(gsf_context* ctx, const double pose[16], const double* poses, size_t count,
                                          double direction_weight, int32_t* index, double* scores) {
     *index = 0;
@@ -670,8 +673,8 @@ static gsf_result gsf__traj_nearest_view(gsf_context* ctx, const double pose[16]
 
 // ---- >>normalisation -----------------------------------------------------------
 
-// The rotation (row-major) that takes unit vector u to (0,-1,0) by the shortest way: I + [v] + [v]^2 / (1 + c) with
-// v = u x (0,-1,0), c = -u_y. 1 + c is taken from |v| where it would cancel. The released code has a mirror for c = -1.
+// The smallest rotation (row-major) that takes the unit vector u to (0,-1,0): I + [v] + [v]^2 / (1 + c) with
+// v = u x (0,-1,0), c = -u_y. 1 + c is computed from |v| where it would cancel. The release uses a reflection for c = -1.
 static void gsf__traj_upright(const double u[3], double r[9]) {
     const double across = u[0] * u[0] + u[2] * u[2]; // |v|^2
     if (u[1] > 0.0 && across < 1e-300) {
@@ -696,13 +699,13 @@ typedef enum gsf__traj_center {
 
 typedef struct gsf__traj_similarity_desc {
     gsf__traj_center center;
-    int32_t strict_scaling; // the farthest camera comes to distance 1; zero: the median camera
+    int32_t strict_scaling; // scale so that the farthest camera is at distance 1; zero: the median camera
     int32_t official;       // FOCUS: points of the axes nearest to the world's origin
 } gsf__traj_similarity_desc;
 
 static size_t gsf__traj_similarity_scratch(size_t count) { return gsf__traj_size_mul(count, 7 * sizeof(double)); }
 
-// magnitude: size of the coordinates before an origin was subtracted; what is smaller by 1e-13 is rounding.
+// magnitude: size of the coordinates before an origin was subtracted; anything smaller by a factor of 1e-13 is rounding.
 static gsf_result gsf__traj_solve_similarity(gsf_context* ctx, const double* poses, size_t count,
                                        const gsf__traj_similarity_desc* desc, double magnitude, double* work,
                                        double transform[16]) {
@@ -770,8 +773,8 @@ static gsf__traj_similarity_desc gsf__traj_similarity_desc_defaults(const gsf__t
     return out;
 }
 
-// T that turns the mean camera up vector (minus column 1) to world -y, moves the middle to 0 and scales cameras to
-// distance 1 (official similarity_from_cameras). Degenerate where up vectors cancel or all cameras are in the middle.
+// T that rotates the mean camera up vector (minus column 1) to world -y, moves the centre to 0 and scales cameras to
+// distance 1 (the release's similarity_from_cameras). Degenerate if up vectors cancel or all cameras are at the centre.
 GSF__SHARED gsf_result gsf__traj_similarity(gsf_context* ctx, const double* poses, size_t count,
                                             const gsf__traj_similarity_desc* desc, void* scratch, double transform[16]) {
     GSF__TRY(gsf__traj_check_center(ctx, desc));
@@ -782,12 +785,12 @@ GSF__SHARED gsf_result gsf__traj_similarity(gsf_context* ctx, const double* pose
                                 transform);
 }
 
-typedef struct gsf__traj_cloud { // points as seen after origin and transform: T (p - origin)
+typedef struct gsf__traj_cloud { // points after subtracting the origin and transforming: T (p - origin)
     const double* points;
     size_t count, stride; // stride in doubles
     double origin[3];
     double transform[16];
-    int robust; // leave out what lies far outside
+    int robust; // leave out outliers
 } gsf__traj_cloud;
 
 static void gsf__traj_cloud_point(const gsf__traj_cloud* cloud, size_t n, double out[3]) {
@@ -795,8 +798,9 @@ static void gsf__traj_cloud_point(const gsf__traj_cloud* cloud, size_t n, double
     gsf__traj_apply(cloud->transform, out, out);
 }
 
-// Distance from the median within which points count: 5 times that of nine in ten, infinite where all do. A variance knows
-// no bound: of a structure-from-motion cloud's 4,000 points 10 wrong ones can turn the axes by 30 degrees.
+// Distance from the median within which points are used: 5 times the 90th percentile; infinite if all are. Variances
+// are not robust: 10 outliers among the 4,000 points of a structure-from-motion cloud can rotate the axes by 30
+// degrees.
 static double gsf__traj_cloud_reach(const gsf__traj_cloud* cloud, const double median[3], double* work) {
     if (!cloud->robust) return (double)INFINITY;
     for (size_t n = 0; n < cloud->count; n++) {
@@ -830,7 +834,7 @@ static void gsf__traj_cloud_moments(const gsf__traj_cloud* cloud, const double m
         }
 }
 
-// up: NULL, or what takes the third axis where the points lie on a line.
+// up: NULL, or the vector that determines the third axis if the points are collinear.
 static gsf_result gsf__traj_cloud_axes(gsf_context* ctx, const gsf__traj_cloud* cloud, const double* up, double* work,
                                        double transform[16]) {
     double median[3], mean[3], covariance[9], values[3], rows[9], p[3];
@@ -858,7 +862,7 @@ static gsf_result gsf__traj_cloud_axes(gsf_context* ctx, const gsf__traj_cloud* 
         for (int i = 0; i < 3; i++) rows[6 + i] = up[i] - along * rows[i];
         (void)gsf__traj_unit(rows + 6, rows + 6);
         gsf__traj_cross(rows + 6, rows, rows + 3);
-        values[1] = 0.5 * values[0]; // settled: no tie left
+        values[1] = 0.5 * values[0]; // no tie left
         values[2] = 0.0;
     }
     gsf__traj_fix_axes(values, rows);
@@ -880,9 +884,9 @@ static void gsf__traj_cloud_init(gsf__traj_cloud* cloud, const double* points, s
 
 static size_t gsf__traj_principal_axes_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
 
-// Rigid T that moves the points' median to 0 and their principal axes to x, y, z by falling variance (official
-// align_principle_axes). The sign that an eigenvector lacks: the largest component of rows 0 and 1 is positive, the
-// determinant is +1. points (count,3). Degenerate for coincident and collinear points.
+// Rigid T that moves the points' median to 0 and their principal axes to x, y, z by descending variance (the release's
+// align_principle_axes). Signs of the eigenvectors: the largest component of rows 0 and 1 is positive, the determinant is
+// +1. points (count,3). Degenerate for coincident and collinear points.
 GSF__SHARED gsf_result gsf__traj_principal_axes(gsf_context* ctx, const double* points, size_t count, void* scratch,
                                                 double transform[16]) {
     gsf__traj_cloud cloud;
@@ -894,7 +898,7 @@ static size_t gsf__traj_normalize_scratch(size_t count, size_t point_count) {
     return gsf__traj_size_max(gsf__traj_similarity_scratch(count), gsf__traj_principal_axes_scratch(point_count));
 }
 
-// As gsf__traj_normalize; poses are relative to `origin`, points are not.
+// Like gsf__traj_normalize; poses are relative to `origin`, points are not.
 static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, size_t count, const double* points,
                                       size_t point_count, const double origin[3], double magnitude,
                                       const gsf__traj_similarity_desc* desc, double* work, double transform[16]) {
@@ -916,8 +920,8 @@ static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, s
 }
 
 // Similarity, then principal axes of the points (NULL: of the camera positions; where these lie on a line, the mean up
-// vector decides the third axis). `transform` is the product, as the official parser has it. Points more than five times
-// as far from the median as nine in ten are left out (official: none).
+// vector determines the third axis). `transform` is the product, as in the release's parser. Points farther from the
+// median than five times the 90th percentile are left out (official: none).
 GSF__SHARED gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
                                            size_t point_count, const gsf__traj_similarity_desc* desc, void* scratch,
                                            double transform[16]) {
@@ -929,7 +933,7 @@ GSF__SHARED gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses
                                gsf__traj_magnitude(poses + 12, count, 16), &d, (double*)scratch, transform);
 }
 
-// Applies a similarity; rotations stay rotations. out may be the input.
+// Applies a similarity and keeps rotations orthonormal. out may be the input.
 static void gsf__traj_transform_poses(const double transform[16], const double* poses, size_t count, double* out) {
     double rotation[16];
     const double row[3] = {transform[0], transform[4], transform[8]};
@@ -950,7 +954,7 @@ GSF__SHARED void gsf__traj_transform_points(const double transform[16], const do
     for (size_t n = 0; n < count; n++) gsf__traj_apply(transform, points + 3 * n, out + 3 * n);
 }
 
-// Principal axes of the positions about their mean, y down on average, largest coordinate 1 (official
+// Principal axes of the positions about their mean, y down on average, largest coordinate 1 (the release's
 // transform_poses_pca; the same sign rule). out may be poses.
 GSF__SHARED gsf_result gsf__traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
                                            double transform[16]) {
@@ -1010,7 +1014,7 @@ static gsf_result gsf__traj_check_similarity(gsf_context* ctx, const double t[16
     return GSF_OK;
 }
 
-// Inverse of a similarity; fails where it is none.
+// Inverse of a similarity; fails if the matrix is not one.
 static gsf_result gsf__traj_invert_similarity(gsf_context* ctx, const double transform[16], double out[16]) {
     GSF__TRY(gsf__traj_check_similarity(ctx, transform));
     const double scale = gsf__traj_length(transform);
@@ -1036,7 +1040,7 @@ typedef struct gsf__traj_curve { // views into scratch
     int degree;
     double* knots;        // (count + degree + 1)
     double* coefficients; // (count,dims)
-    double* band;         // (count, 2 degree + 1), only while it is made
+    double* band;         // (count, 2 degree + 1), needed only while the spline is made
 } gsf__traj_curve;
 
 static size_t gsf__traj_curve_doubles(size_t count, int degree, size_t dims) {
@@ -1044,8 +1048,8 @@ static size_t gsf__traj_curve_doubles(size_t count, int degree, size_t dims) {
     return gsf__traj_size_add(gsf__traj_size_mul(count, gsf__traj_size_add(dims, 2 * k + 2)), k + 1);
 }
 
-// The knot span of u and the degree + 1 basis functions that live there (de Boor's recurrence, as A2.2 of The NURBS
-// Book).
+// The knot span of u and the degree + 1 basis functions that are non-zero on it (de Boor's recurrence, algorithm A2.2
+// of The NURBS Book).
 static size_t gsf__traj_basis(const gsf__traj_curve* curve, double u, double basis[GSF__TRAJ_DEGREE_MAX + 1]) {
     const size_t k = (size_t)curve->degree;
     size_t low = k, high = curve->count; // knots[low] <= u < knots[high], or the last span
@@ -1071,7 +1075,7 @@ static size_t gsf__traj_basis(const gsf__traj_curve* curve, double u, double bas
 }
 
 // Makes the curve through values[i] (stride doubles apart) at sites. Collocation matrices of B-splines are totally
-// positive, so elimination inside the band needs no pivoting. 0 where a site is not above its predecessor.
+// positive, so elimination within the band needs no pivoting. Returns 0 if sites are not strictly ascending.
 static int gsf__traj_make_curve(gsf__traj_curve* curve, const double* sites, const double* values, size_t stride,
                                 size_t count, size_t dims, int degree, double* work) {
     const size_t k = (size_t)degree, width = 2 * k + 1;
@@ -1137,8 +1141,8 @@ static size_t gsf__traj_spline_scratch(size_t count, int32_t degree, size_t dims
 }
 
 // Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending
-// sites, not-a-knot ends (knots as FITPACK with s = 0 and scipy's make_interp_spline place them). Evaluated at `at`
-// (at_count), which is clamped to the sites' range; out (at_count,dims).
+// sites, with not-a-knot ends (knots as in FITPACK with s = 0 and scipy's make_interp_spline). Evaluated at `at`
+// (at_count), which is clamped to the range of the sites; out (at_count,dims).
 GSF__SHARED gsf_result gsf__traj_spline(gsf_context* ctx, const double* sites, const double* values, size_t count,
                                         size_t dims, int32_t degree, const double* at, size_t at_count, void* scratch,
                                         double* out) {
@@ -1162,7 +1166,7 @@ GSF__SHARED gsf_result gsf__traj_spline(gsf_context* ctx, const double* sites, c
 typedef struct gsf__traj_spline_desc {
     int32_t frames_per_leg; // 16
     int32_t degree;         // 5 (lowered to count - 1)
-    double axis_length;     // 0.1: arm of the look-at and up points beside the position
+    double axis_length;     // 0.1: distance of the look-at and up points from the position
 } gsf__traj_spline_desc;
 
 static gsf__traj_spline_desc gsf__traj_spline_desc_defaults(const gsf__traj_spline_desc* desc, size_t count) {
@@ -1196,8 +1200,8 @@ GSF__SHARED size_t gsf__traj_spline_path_scratch(size_t count, const gsf__traj_s
 }
 
 // Spline through (position, position - arm * forward, position + arm * down) of the poses, by chord length;
-// frames_per_leg * (count - 1) poses, the last one excluded (official generate_interpolated_path with smoothness 0;
-// the same for two poses whatever the smoothness). Degenerate where neighbouring poses coincide or directions cancel.
+// frames_per_leg * (count - 1) poses, the last one excluded (the release's generate_interpolated_path with smoothness
+// 0; for two poses, with any smoothness). Degenerate if neighbouring poses coincide or directions cancel.
 GSF__SHARED gsf_result gsf__traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
                                              const gsf__traj_spline_desc* desc, void* scratch, double* out) {
     const gsf__traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
@@ -1251,7 +1255,8 @@ static size_t gsf__traj_slerp_path_scratch(size_t count) {
     return gsf__traj_size_mul(gsf__traj_size_add(rows, gsf__traj_curve_doubles(count, degree, 3)), sizeof(double));
 }
 
-// A path through poses at even sites, position relative to the first pose: splines of degree 1, 2, 3 for 2, 3, more.
+// A path through poses at evenly spaced sites, positions relative to the first pose: splines of degree 1, 2, 3 for 2,
+// 3, more poses.
 static int gsf__traj_make_glide(gsf__traj_curve* curve, const double* poses, size_t count, double* work) {
     double *sites = work, *positions = work + count;
     for (size_t n = 0; n < count; n++) {
@@ -1273,9 +1278,9 @@ static void gsf__traj_eval_glide(const gsf__traj_curve* curve, const double* pos
     for (int i = 0; i < 3; i++) out[12 + i] = poses[12 + i] + position[i];
 }
 
-// Positions by a spline over even sites (degree 1, 2, 3 for 2, 3, more views), rotations slerp, then each pose moved
-// by `push` along its forward axis (official interpolate_camera_path, which draws push from [0, 0.5)). `frames` poses
-// (>= 1), both ends included.
+// Positions by a spline over evenly spaced sites (degree 1, 2, 3 for 2, 3, more views), rotations by slerp, then each
+// pose moved by `push` along its forward axis (the release's interpolate_camera_path, which draws push from [0, 0.5)).
+// `frames` poses (>= 1), both ends included.
 GSF__SHARED gsf_result gsf__traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames,
                                             double push, void* scratch, double* out) {
     GSF__TRY(gsf__traj_check_views(ctx, "slerp path", poses, count));
@@ -1296,15 +1301,15 @@ GSF__SHARED gsf_result gsf__traj_slerp_path(gsf_context* ctx, const double* pose
 
 // ---- >>ellipse -----------------------------------------------------------------
 
-// The official parameters of an outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round, a
-// random z_phase (from seed and round). frames 0 = 85.
+// The release's parameters of an outpaint round: z_variation max(0.5, 1.5 - 0.2 round), pitch 2 degrees * round, a random
+// z_phase (from seed and round). frames 0 = 85.
 static gsf_traj_ellipse_desc gsf__traj_round_ellipse(int32_t round, uint64_t seed, int32_t frames) {
     gsf_traj_ellipse_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.frames = frames;
     desc.z_variation = 1.5 - 0.2 * round;
     if (desc.z_variation < 0.5) desc.z_variation = 0.5;
-    desc.z_phase = gsf_random_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // a stream of its own
+    desc.z_phase = gsf_random_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // a random stream of its own
     desc.pitch_degrees = 2.0 * round;
     return desc;
 }
@@ -1326,7 +1331,7 @@ static gsf_result gsf__traj_check_ellipse(gsf_context* ctx, const gsf_traj_ellip
 
 static size_t gsf__traj_ellipse_scratch(size_t count) { return gsf__traj_size_mul(count, sizeof(double)); }
 
-// generate_ellipse_path of outpaint/sample_utils.py (after multinerf), its random sign, which is never used, left out.
+// generate_ellipse_path of outpaint/sample_utils.py (after multinerf), without its random sign, which is never used.
 static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_t count, const gsf_traj_ellipse_desc* desc,
                                     const double focus[3], double* work, double* out) {
     const double two_pi = 6.283185307179586476925286766559;
@@ -1336,7 +1341,7 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
         for (size_t n = 0; n < count; n++) work[n] = fabs(poses[16 * n + 12 + (size_t)i] - focus[i]);
         gsf__traj_sort(work, count);
         const double half_axis = gsf__traj_percentile(work, count, 0.9);
-        low[i] = (focus[i] - half_axis) * 1.2; // the released code enlarges the offset too
+        low[i] = (focus[i] - half_axis) * 1.2; // the release enlarges the offset, too
         high[i] = (focus[i] + half_axis) * 1.2;
     }
     for (size_t n = 0; n < count; n++) work[n] = poses[16 * n + 14];
@@ -1373,7 +1378,8 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
 }
 
 // Closed loop in the xy plane about the focus point of the poses, which must be normalised. Half axes are 1.2 times the
-// 90th percentile of |position - focus|; views look at the focus; down is the axis nearest to the mean column 1.
+// 90th percentile of |position - focus|; views look at the focus; down is the coordinate axis nearest to the mean
+// column 1.
 GSF__SHARED gsf_result gsf__traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
                                               const gsf_traj_ellipse_desc* desc, void* scratch, double* out) {
     const gsf_traj_ellipse_desc d = gsf__traj_ellipse_desc_defaults(desc);
@@ -1392,7 +1398,7 @@ static void gsf__traj_split_window(int32_t window_length, int32_t* side, int32_t
     *middle = window_length - 2 * *side;
 }
 
-typedef struct gsf__traj_table { int64_t middle, windows, each, last; } gsf__traj_table; // each, last: poses shared
+typedef struct gsf__traj_table { int64_t middle, windows, each, last; } gsf__traj_table; // each, last: shared poses
 
 // generate_overlapping_indices of outpaint/base.py; total >= middle >= 1.
 static gsf__traj_table gsf__traj_make_table(int64_t total, int64_t middle) {
@@ -1411,8 +1417,8 @@ static int64_t gsf__traj_table_start(gsf__traj_table table, int64_t w) {
                                  : (w - 1) * (table.middle - table.each) + table.middle - table.last;
 }
 
-// The released table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL =
-// only the count is wanted). Fails where the table leaves the sequence (total < middle, mostly).
+// The release's table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL =
+// only the count is wanted). Fails if the table exceeds the sequence (usually total < middle).
 GSF__SHARED gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
                                                   int32_t* overlaps, int32_t* count) {
     *count = 0;
@@ -1434,7 +1440,7 @@ GSF__SHARED gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t tota
 
 // ---- >>legs --------------------------------------------------------------------
 
-// The released interpolation of two poses: forward and down linear, then made orthonormal. 0 where they cancel.
+// The release's interpolation of two poses: forward and down linear, then orthonormalised. Returns 0 if they cancel.
 static int gsf__traj_blend_axes(const double a[16], const double b[16], double t, double out[16]) {
     double forward[3], down[3], position[3];
     for (int i = 0; i < 3; i++) {
@@ -1445,9 +1451,9 @@ static int gsf__traj_blend_axes(const double a[16], const double b[16], double t
     return gsf__traj_length(forward) > 1e-9 && gsf__traj_axes(forward, down, position, out);
 }
 
-// From pose to pose with straight positions: (count - 1) * (frames_per_leg - 1) + 1 poses, both ends included (official
-// interp_traj). official: the released spacing u = 0, 1/n .. (n-2)/n of each leg, n = frames_per_leg >= 2, and its
-// interpolation of axes, arm 0.1; zero: even spacing, slerp.
+// From pose to pose with linear positions: (count - 1) * (frames_per_leg - 1) + 1 poses, both ends included (the
+// release's interp_traj). official: its spacing u = 0, 1/n .. (n-2)/n of each leg, n = frames_per_leg >= 2, and its
+// interpolation of axes with arm 0.1; zero: even spacing and slerp.
 GSF__SHARED gsf_result gsf__traj_leg_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames_per_leg,
                                           int32_t official, double* out) {
     GSF__TRY(gsf__traj_check_views(ctx, "leg path", poses, count));
@@ -1497,7 +1503,7 @@ enum { GSF__TRAJ_ELLIPSE_DEFAULT = 85, GSF__TRAJ_WINDOW_DEFAULT = 49, GSF__TRAJ_
 
 static int64_t gsf__traj_or(int64_t value, int64_t if_zero) { return value ? value : if_zero; }
 
-// Resolves lengths and counts of the released reference path: n + (n + 1) + n frames, windows by its table.
+// Resolves lengths and counts of the release's reference path: n + (n + 1) + n frames, windows by its table.
 static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_path_desc* d, gsf_traj_path_layout* out) {
     const int32_t length = (int32_t)gsf__traj_or(d->window_length, GSF__TRAJ_WINDOW_DEFAULT);
     const int32_t poses = (int32_t)gsf__traj_or(d->ellipse_poses, GSF__TRAJ_ELLIPSE_DEFAULT);
@@ -1573,7 +1579,7 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
     memset(&out, 0, sizeof out);
     GSF__TRY(gsf__traj_resolve_path(ctx, camera_count, &d, &out));
     out.frame_count = gsf__traj_size_mul((size_t)out.window_count, (size_t)out.window_length);
-    // [local poses of the cameras][poses of the ellipse][work of one step at a time]
+    // Scratch layout: [local poses of the cameras][poses of the ellipse][workspace of the current step]
     size_t work = gsf__traj_size_max(gsf__traj_normalize_scratch(camera_count, d.point_count),
                                      gsf__traj_ellipse_scratch(camera_count));
     if (d.kind == GSF_TRAJ_INTERPOLATE) work = gsf__traj_slerp_path_scratch(camera_count);
@@ -1585,14 +1591,14 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
     return GSF_OK;
 }
 
-typedef struct gsf__traj_job { // what the three kinds share
+typedef struct gsf__traj_job { // shared by the three kinds
     gsf_context* ctx;
     gsf_traj_path_desc desc;
     gsf_traj_path_layout layout;
     const gsf_camera* cameras;
     size_t count;
     gsf_camera frame;    // size and intrinsics of the frames
-    double origin[3];    // world position of the local frame, in which all poses below are until they are normalised
+    double origin[3];    // world position of the local frame, which the poses below use until they are normalised
     double magnitude;    // of the world coordinates
     double to_local[16]; // normalised to local
     double* views;       // (count,16) poses of the cameras: local, then normalised
@@ -1642,8 +1648,8 @@ static gsf_result gsf__traj_check_job(gsf__traj_job* job) {
     return GSF_OK;
 }
 
-// Camera poses with exact rotations, relative to their mean position: what follows then rounds as in a scene at the
-// origin. The released similarity depends on where the world's origin is, so there it stays.
+// Camera poses with exact rotations, relative to their mean position, so that rounding is the same as for a scene at the
+// origin. The release's similarity depends on the world's origin, so with `official` the origin is kept.
 static void gsf__traj_localize(gsf__traj_job* job) {
     for (size_t n = 0; n < job->count; n++) {
         double quat[4], *view = job->views + 16 * n;
@@ -1660,8 +1666,8 @@ static void gsf__traj_localize(gsf__traj_job* job) {
         for (int i = 0; i < 3; i++) job->views[16 * n + 12 + (size_t)i] -= job->origin[i];
 }
 
-// Mean of what the views (normalised, by `transform`) look at: for each the median depth of the points before it, where
-// there are none four times the radius of the cameras. A few thousand points, evenly picked, do.
+// Mean of the points that the views (normalised, by `transform`) look at: for each, at the median depth of the points in
+// front of it or, without any, at four times the radius of the cameras. A few thousand evenly sampled points suffice.
 static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform[16], double out[3]) {
     double center[3], radius = 0.0;
     gsf__traj_cloud cloud;
@@ -1689,8 +1695,8 @@ static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform
     }
 }
 
-// What the loop looks at. Axes within half a degree of each other meet far behind the scene if at all: their loop looks as
-// deep as the scene is. The released code has no such case.
+// The point that the loop looks at. Axes within half a degree of each other meet far behind the scene, if at all; their
+// loop looks at the depth of the scene. The release does not handle this case.
 static gsf_result gsf__traj_focus(const gsf__traj_job* job, const double transform[16], double focus[3]) {
     const double parallel = 1e-4;
     if (job->desc.official) return gsf_traj_focus_point(job->ctx, job->views, job->count, focus);
@@ -1734,7 +1740,7 @@ static const double* gsf__traj_loop_pose(const gsf__traj_job* job, int64_t index
     return job->loop + 16 * (size_t)(index % job->layout.ellipse_poses);
 }
 
-// First pose on the loop of window w: by the released table, or evenly round the loop.
+// First pose of window w on the loop: by the release's table, or evenly spaced around the loop.
 static int64_t gsf__traj_window_start(const gsf__traj_job* job, int64_t w, int32_t middle) {
     const int64_t poses = job->layout.ellipse_poses, windows = job->layout.window_count;
     return job->desc.official ? gsf__traj_table_start(gsf__traj_make_table(poses, middle), w) : w * poses / windows;
@@ -1786,7 +1792,7 @@ static gsf_result gsf__traj_sample_ellipse(gsf__traj_job* job) {
     return GSF_OK;
 }
 
-// Each window is an equal share of the way through all cameras; neighbours share their end frames.
+// Each window covers an equal part of the path through all cameras; neighbours share their end frames.
 static gsf_result gsf__traj_sample_interpolate(gsf__traj_job* job) {
     gsf__traj_curve curve;
     if (!gsf__traj_make_glide(&curve, job->views, job->count, job->work))
