@@ -1910,6 +1910,9 @@ GSF__SHARED void gsf__nn_prefetch(const float* at) {
 #define gsf__v_put GSF__V(gsf__v_put)               // stores, with `stream` past the caches to an aligned place
 #define gsf__vd_load GSF__V(gsf__vd_load)           // as many floats as gsf__vd has lanes, widened
 #define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) of each pair of lanes (a, b)
+#define gsf__v_hadamard GSF__V(gsf__v_hadamard)     // of each block of so many lanes (1, 2, 4 ...), unscaled
+#define gsf__vi_max GSF__V(gsf__vi_max)
+#define gsf__vi_largest GSF__V(gsf__vi_largest)     // over the lanes
 
 #if GSF__X86
 
@@ -1932,6 +1935,37 @@ GSF__INLINE_AVX2 __m256 gsf__v_turn_pairs_avx2(__m256 v, __m256 cos, __m256 sin)
 
 GSF__INLINE_AVX512 __m512 gsf__v_turn_pairs_avx512(__m512 v, __m512 cos, __m512 sin) {
     return _mm512_fmaddsub_ps(v, cos, _mm512_permute_ps(v, 0xb1) * sin);
+}
+
+// Each value gets its partner, plus itself or (the upper one) minus itself. The FMAs are exact there, so these are the bits
+// of the scalar kernel.
+GSF__INLINE_AVX2 __m256 gsf__v_hadamard_avx2(__m256 v, int64_t block) {
+    if (block > 1) v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, -1, 1, -1, 1, -1, 1, -1), _mm256_permute_ps(v, 0xb1));
+    if (block > 2) v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, -1, -1, 1, 1, -1, -1), _mm256_permute_ps(v, 0x4e));
+    if (block > 4) v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, 1, 1, -1, -1, -1, -1), _mm256_permute2f128_ps(v, v, 1));
+    return v;
+}
+
+GSF__INLINE_AVX512 __m512 gsf__v_hadamard_avx512(__m512 v, int64_t block) {
+    const __m512 one = _mm512_set1_ps(1.0f), less = _mm512_set1_ps(-1.0f);
+    if (block > 1) v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xaaaa, one, less), _mm512_permute_ps(v, 0xb1));
+    if (block > 2) v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xcccc, one, less), _mm512_permute_ps(v, 0x4e));
+    if (block > 4) v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xf0f0, one, less), _mm512_shuffle_f32x4(v, v, 0xb1));
+    if (block > 8) v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xff00, one, less), _mm512_shuffle_f32x4(v, v, 0x4e));
+    return v;
+}
+
+GSF__INLINE_AVX2 __m256i gsf__vi_max_avx2(__m256i a, __m256i b) { return _mm256_max_epi32(a, b); }
+GSF__INLINE_AVX512 __m512i gsf__vi_max_avx512(__m512i a, __m512i b) { return _mm512_max_epi32(a, b); }
+
+GSF__INLINE_AVX2 int32_t gsf__vi_largest_avx2(__m256i v) {
+    __m128i s = _mm_max_epi32(_mm256_castsi256_si128(v), _mm256_extracti128_si256(v, 1));
+    s = _mm_max_epi32(s, _mm_shuffle_epi32(s, 0x4e));
+    return _mm_cvtsi128_si32(_mm_max_epi32(s, _mm_shuffle_epi32(s, 0xb1)));
+}
+
+GSF__INLINE_AVX512 int32_t gsf__vi_largest_avx512(__m512i v) {
+    return gsf__vi_largest_avx2(_mm256_max_epi32(_mm512_castsi512_si256(v), _mm512_extracti32x8_epi32(v, 1)));
 }
 
 // Lanes below `left` (at most 8 count) as a mask for _mm256_maskload_ps and _mm256_maskstore_ps.
@@ -2362,6 +2396,12 @@ GSF__SHARED gsf__moments gsf__moments_of(double pivot, double sum, double square
     return m;
 }
 
+static void gsf__norm_silu_scalar(const float* x, int64_t count, const float* mean, const float* scale,
+                                    const float* offset, float* y) {
+    for (int64_t i = 0; i < count; i++)
+        y[i] = gsf__nn_activation_ref(GSF_NN_SILU, (x[i] - mean[i]) * scale[i] + offset[i]);
+}
+
 typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
 
 GSF__SHARED gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
@@ -2503,6 +2543,22 @@ GSF__V_KERNEL void GSF__V(gsf__norm_affine)(const float* x, int64_t count, gsf__
     if (stream) GSF__V(gsf__norm_affine_all)(x, count, m, inverse, weight, bias, y, 1);
     else GSF__V(gsf__norm_affine_all)(x, count, m, inverse, weight, bias, y, 0);
     gsf__nn_end_stream(stream);
+}
+
+GSF__V_INLINE void GSF__V(gsf__norm_silu_first)(const float* x, const float* mean, const float* scale, const float* offset,
+                                                float* y, size_t left) {
+    const gsf__vf d = gsf__v_load_first(x, left) - gsf__v_load_first(mean, left);
+    const gsf__vf v = gsf__v_madd(d, gsf__v_load_first(scale, left), gsf__v_load_first(offset, left));
+    gsf__v_store_first(y, gsf__v_activate(GSF_NN_SILU, v), left);
+}
+
+GSF__V_KERNEL void GSF__V(gsf__norm_silu)(const float* x, int64_t count, const float* mean, const float* scale,
+                                          const float* offset, float* y) {
+    int64_t i = 0;
+    for (; i + GSF__LANES <= count; i += GSF__LANES)
+        GSF__V(gsf__norm_silu_first)(x + i, mean + i, scale + i, offset + i, y + i, GSF__LANES);
+    const size_t left = (size_t)(count - i);
+    if (left) GSF__V(gsf__norm_silu_first)(x + i, mean + i, scale + i, offset + i, y + i, left);
 }
 
 #endif
@@ -2860,6 +2916,44 @@ static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t 
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
                                                        NULL, gsf__finish_scalar, gsf__few_scalar, 0, 1};
 
+// The end of a tile: what `finish` does.
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_EPILOGUE
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_EPILOGUE
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_EPILOGUE
+#if GSF__LANES > 1
+
+// `left` outputs from column `column` on; sums, too, begin there.
+GSF__V_INLINE void GSF__V(gsf__finish_columns)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
+                                               int64_t rows, int64_t column, size_t left) {
+    const gsf_nn_linear_desc* d = &job->desc;
+    const gsf__vf bias = gsf__v_load_first(job->bias + column, left);
+    const gsf__vf gate = d->gate ? gsf__v_load_first(d->gate + column, left) : gsf__v_set(1.0f);
+    for (int64_t r = 0; r < rows; r++) {
+        float* y = d->y + (row + r) * d->ldy + column;
+        gsf__vf v = gsf__v_activate(d->activation, gsf__v_load_first(sums + r * pitch, left) + bias);
+        if (d->gate || d->accumulate) v = gsf__v_madd(gate, v, gsf__v_load_first(y, left));
+        gsf__v_store_first(y, v, left);
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__finish)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
+                                       int64_t rows, int64_t column, int64_t columns) {
+    int64_t c = 0;
+    for (; c + GSF__LANES <= columns; c += GSF__LANES)
+        GSF__V(gsf__finish_columns)(job, sums + c, pitch, row, rows, column + c, GSF__LANES);
+    const size_t left = (size_t)(columns - c);
+    if (left) GSF__V(gsf__finish_columns)(job, sums + c, pitch, row, rows, column + c, left);
+}
+
+#endif
+#endif // GSF__KERNELS_EPILOGUE
+#ifndef GSF__ISA
+
 // ---- linear: AVX2 kernels
 
 #if GSF__X86
@@ -2870,27 +2964,6 @@ GSF__INLINE_AVX2 __m256 gsf__load8(const char* p, gsf_nn_dtype dtype) { // eight
     if (dtype == GSF_NN_F16) return _mm256_cvtph_ps(bits);
     return _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_cvtepu16_epi32(bits), 16));
 }
-
-// r0 ... r7: eight rows to eight columns, in place. A macro: gcc -O2 would keep an array in memory.
-#define GSF__TRANSPOSE8(r)                                                                                               \
-    {                                                                                                                    \
-        const __m256 a0 = _mm256_unpacklo_ps(r##0, r##1), a1 = _mm256_unpackhi_ps(r##0, r##1);                           \
-        const __m256 a2 = _mm256_unpacklo_ps(r##2, r##3), a3 = _mm256_unpackhi_ps(r##2, r##3);                           \
-        const __m256 a4 = _mm256_unpacklo_ps(r##4, r##5), a5 = _mm256_unpackhi_ps(r##4, r##5);                           \
-        const __m256 a6 = _mm256_unpacklo_ps(r##6, r##7), a7 = _mm256_unpackhi_ps(r##6, r##7);                           \
-        const __m256 b0 = _mm256_shuffle_ps(a0, a2, 0x44), b1 = _mm256_shuffle_ps(a0, a2, 0xee);                         \
-        const __m256 b2 = _mm256_shuffle_ps(a1, a3, 0x44), b3 = _mm256_shuffle_ps(a1, a3, 0xee);                         \
-        const __m256 b4 = _mm256_shuffle_ps(a4, a6, 0x44), b5 = _mm256_shuffle_ps(a4, a6, 0xee);                         \
-        const __m256 b6 = _mm256_shuffle_ps(a5, a7, 0x44), b7 = _mm256_shuffle_ps(a5, a7, 0xee);                         \
-        r##0 = _mm256_permute2f128_ps(b0, b4, 0x20);                                                                     \
-        r##1 = _mm256_permute2f128_ps(b1, b5, 0x20);                                                                     \
-        r##2 = _mm256_permute2f128_ps(b2, b6, 0x20);                                                                     \
-        r##3 = _mm256_permute2f128_ps(b3, b7, 0x20);                                                                     \
-        r##4 = _mm256_permute2f128_ps(b0, b4, 0x31);                                                                     \
-        r##5 = _mm256_permute2f128_ps(b1, b5, 0x31);                                                                     \
-        r##6 = _mm256_permute2f128_ps(b2, b6, 0x31);                                                                     \
-        r##7 = _mm256_permute2f128_ps(b3, b7, 0x31);                                                                     \
-    }
 
 GSF__INLINE_AVX2 void gsf__pack_weights8(const char* w, gsf_nn_dtype dtype, size_t size, size_t pitch, int64_t columns,
                                          int64_t count, float* out) {
@@ -2904,19 +2977,19 @@ GSF__INLINE_AVX2 void gsf__pack_weights8(const char* w, gsf_nn_dtype dtype, size
         const char* p = w + (size_t)c * pitch;
         float* to = out + c;
         for (int64_t k = 0; k < whole; k += 8, p += 8 * size, to += 8 * GSF__TILE_COLUMNS) {
-            __m256 r0 = gsf__load8(p, dtype), r1 = gsf__load8(p + pitch, dtype);
-            __m256 r2 = gsf__load8(p + 2 * pitch, dtype), r3 = gsf__load8(p + 3 * pitch, dtype);
-            __m256 r4 = gsf__load8(p + 4 * pitch, dtype), r5 = gsf__load8(p + 5 * pitch, dtype);
-            __m256 r6 = gsf__load8(p + 6 * pitch, dtype), r7 = gsf__load8(p + 7 * pitch, dtype);
-            GSF__TRANSPOSE8(r)
-            _mm256_store_ps(to, r0);
-            _mm256_store_ps(to + 16, r1);
-            _mm256_store_ps(to + 32, r2);
-            _mm256_store_ps(to + 48, r3);
-            _mm256_store_ps(to + 64, r4);
-            _mm256_store_ps(to + 80, r5);
-            _mm256_store_ps(to + 96, r6);
-            _mm256_store_ps(to + 112, r7);
+            __m256 r[8] = {gsf__load8(p, dtype),             gsf__load8(p + pitch, dtype),
+                           gsf__load8(p + 2 * pitch, dtype), gsf__load8(p + 3 * pitch, dtype),
+                           gsf__load8(p + 4 * pitch, dtype), gsf__load8(p + 5 * pitch, dtype),
+                           gsf__load8(p + 6 * pitch, dtype), gsf__load8(p + 7 * pitch, dtype)};
+            gsf__v_transpose_avx2(r);
+            _mm256_store_ps(to, r[0]);
+            _mm256_store_ps(to + 16, r[1]);
+            _mm256_store_ps(to + 32, r[2]);
+            _mm256_store_ps(to + 48, r[3]);
+            _mm256_store_ps(to + 64, r[4]);
+            _mm256_store_ps(to + 80, r[5]);
+            _mm256_store_ps(to + 96, r[6]);
+            _mm256_store_ps(to + 112, r[7]);
         }
         gsf__pack_corner(w, dtype, pitch, c, 8, whole, count, out);
     }
@@ -2929,12 +3002,18 @@ GSF__TARGET_AVX2 static void gsf__pack_weights_avx2(const char* w, gsf_nn_dtype 
     else gsf__pack_weights8(w, GSF_NN_F16, 2, pitch, columns, count, out);
 }
 
-// Eight steps of six rows from r0 ... r7; each writes two floats too many, which the next one takes back.
-#define GSF__STORE_STEPS(to, r)                                                \
-    _mm256_storeu_ps(to, r##0), _mm256_storeu_ps(to + 6, r##1);                \
-    _mm256_storeu_ps(to + 12, r##2), _mm256_storeu_ps(to + 18, r##3);          \
-    _mm256_storeu_ps(to + 24, r##4), _mm256_storeu_ps(to + 30, r##5);          \
-    _mm256_storeu_ps(to + 36, r##6), _mm256_storeu_ps(to + 42, r##7);
+// Eight steps of six rows, the rows in r[0] ... r[5]; each step writes two floats too many, which the next one takes back.
+GSF__INLINE_AVX2 void gsf__store_steps(float* to, __m256 r[8]) {
+    gsf__v_transpose_avx2(r);
+    _mm256_storeu_ps(to, r[0]);
+    _mm256_storeu_ps(to + 6, r[1]);
+    _mm256_storeu_ps(to + 12, r[2]);
+    _mm256_storeu_ps(to + 18, r[3]);
+    _mm256_storeu_ps(to + 24, r[4]);
+    _mm256_storeu_ps(to + 30, r[5]);
+    _mm256_storeu_ps(to + 36, r[6]);
+    _mm256_storeu_ps(to + 42, r[7]);
+}
 
 GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
     static const float zeros[8] = {0, 0, 0, 0, 0, 0, 0, 0};
@@ -2947,12 +3026,11 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
         step[r] = r < rows ? -1 : 0;
     }
     for (int64_t k = 0; k < whole; k += 8, to += 8 * GSF__TILE_ROWS) {
-        __m256 r0 = _mm256_loadu_ps(p[0] + (k & step[0])), r1 = _mm256_loadu_ps(p[1] + (k & step[1]));
-        __m256 r2 = _mm256_loadu_ps(p[2] + (k & step[2])), r3 = _mm256_loadu_ps(p[3] + (k & step[3]));
-        __m256 r4 = _mm256_loadu_ps(p[4] + (k & step[4])), r5 = _mm256_loadu_ps(p[5] + (k & step[5]));
-        __m256 r6 = _mm256_setzero_ps(), r7 = r6;
-        GSF__TRANSPOSE8(r)
-        GSF__STORE_STEPS(to, r)
+        __m256 r[8] = {_mm256_loadu_ps(p[0] + (k & step[0])), _mm256_loadu_ps(p[1] + (k & step[1])),
+                       _mm256_loadu_ps(p[2] + (k & step[2])), _mm256_loadu_ps(p[3] + (k & step[3])),
+                       _mm256_loadu_ps(p[4] + (k & step[4])), _mm256_loadu_ps(p[5] + (k & step[5])),
+                       _mm256_setzero_ps(), _mm256_setzero_ps()};
+        gsf__store_steps(to, r);
     }
     for (int64_t k = whole; k < count; k++)
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
@@ -2990,26 +3068,6 @@ GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int6
 #undef GSF_X
 #undef GSF_STEP
 #undef GSF_ROW
-}
-
-GSF__TARGET_AVX2 static void gsf__finish_avx2(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
-                                              int64_t rows, int64_t column, int64_t columns) {
-    static const int32_t lanes[16] = {-1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0, 0, 0, 0};
-    const gsf_nn_linear_desc* d = &job->desc;
-    for (int64_t c = 0; c < columns; c += 8) {
-        const int64_t n = gsf__least(columns - c, 8);
-        const __m256i mask = _mm256_loadu_si256((const __m256i*)(const void*)(lanes + 8 - n));
-        const __m256 bias = _mm256_loadu_ps(job->bias + column + c);
-        const __m256 gate = d->gate ? _mm256_maskload_ps(d->gate + column + c, mask) : _mm256_set1_ps(1.0f);
-        for (int64_t r = 0; r < rows; r++) {
-            float* y = d->y + (row + r) * d->ldy + column + c;
-            __m256 v = _mm256_add_ps(_mm256_loadu_ps(sums + r * pitch + c), bias);
-            v = gsf__v_activate_avx2(d->activation, v);
-            if (d->gate || d->accumulate) v = _mm256_fmadd_ps(gate, v, _mm256_maskload_ps(y, mask));
-            if (n == 8) _mm256_storeu_ps(y, v);
-            else _mm256_maskstore_ps(y, mask, v);
-        }
-    }
 }
 
 // Few rows. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so the more of them
@@ -3178,27 +3236,6 @@ GSF__INLINE_AVX512 __m512 gsf__nn_add_product(__m512 sum, __m512 a, __m512 b) { 
 GSF__TARGET_AVX512 static void gsf__four_tiles_avx512(const float* a, const float* b, int64_t count, int add, float* sums,
                                                       int64_t next, const float* ahead, int64_t ahead_count) {
     GSF__FOUR_TILES(gsf__nn_add_product)
-}
-
-GSF__INLINE_AVX512 void gsf__finish16(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
-                                      int64_t rows, int64_t column, __mmask16 mask) {
-    const gsf_nn_linear_desc* d = &job->desc;
-    const __m512 bias = _mm512_maskz_loadu_ps(mask, job->bias + column);
-    const __m512 gate = d->gate ? _mm512_maskz_loadu_ps(mask, d->gate + column) : _mm512_set1_ps(1.0f);
-    for (int64_t r = 0; r < rows; r++) {
-        float* y = d->y + (row + r) * d->ldy + column;
-        __m512 v = _mm512_maskz_loadu_ps(mask, sums + r * pitch) + bias;
-        v = gsf__v_activate_avx512(d->activation, v);
-        if (d->gate || d->accumulate) v = _mm512_fmadd_ps(gate, v, _mm512_maskz_loadu_ps(mask, y));
-        gsf__nn_store16(y, mask, v);
-    }
-}
-
-GSF__TARGET_AVX512 static void gsf__finish_avx512(const gsf__linear_job* job, const float* sums, int64_t pitch,
-                                                  int64_t row, int64_t rows, int64_t column, int64_t columns) {
-    int64_t c = 0;
-    for (; c + 16 <= columns; c += 16) gsf__finish16(job, sums + c, pitch, row, rows, column + c, GSF__NN_WHOLE16);
-    if (c < columns) gsf__finish16(job, sums + c, pitch, row, rows, column + c, gsf__nn_mask16(columns - c));
 }
 
 GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // sixteen weights, widened
@@ -3374,13 +3411,11 @@ GSF__INLINE_BF16 __m256 gsf__bf16_units(const float* row, int64_t first, int64_t
 GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
     float tile[8 * GSF__TILE_ROWS + 2];
     for (int64_t k = 0; k < count; k += 8, out += 8 * GSF__TILE_ROWS) {
-#define GSF_X(i) __m256 r##i = gsf__bf16_units(x + (i) * ldx, 2 * k, i < rows ? 2 * count : 0);
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+#define GSF_X(i) gsf__bf16_units(x + (i) * ldx, 2 * k, i < rows ? 2 * count : 0)
+        __m256 r[8] = {GSF_X(0), GSF_X(1), GSF_X(2), GSF_X(3), GSF_X(4), GSF_X(5), _mm256_setzero_ps(), _mm256_setzero_ps()};
 #undef GSF_X
-        __m256 r6 = _mm256_setzero_ps(), r7 = r6;
         float* to = k + 8 <= count ? out : tile;
-        GSF__TRANSPOSE8(r)
-        GSF__STORE_STEPS(to, r)
+        gsf__store_steps(to, r);
         if (to == tile) memcpy(out, tile, (size_t)((count - k) * GSF__TILE_ROWS) * sizeof(float));
     }
 }
@@ -3768,62 +3803,67 @@ static const gsf__int8_kernels gsf__int8_scalar = {
     gsf__int8_rotate_scalar, gsf__int8_quantize_scalar, gsf__int8_quantize_scalar, sizeof(int16_t), gsf__int8_widen_scalar,
     gsf__int8_tile_scalar, NULL, gsf__int8_few_scalar, 2, gsf__int8_scale_scalar};
 
+// The rotation.
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_INT8
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_INT8
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_INT8
+#if GSF__LANES > 1
+
+// Two steps, of `half` and twice that; half is a multiple of GSF__LANES.
+GSF__V_INLINE void GSF__V(gsf__int8_two_steps)(float* x, int64_t block, int64_t half) {
+    for (int64_t i = 0; i < block; i += 4 * half)
+        for (int64_t j = i; j < i + half; j += GSF__LANES) {
+            const gsf__vf a = gsf__v_load(x + j), b = gsf__v_load(x + j + half);
+            const gsf__vf c = gsf__v_load(x + j + 2 * half), d = gsf__v_load(x + j + 3 * half);
+            const gsf__vf ab = a + b, cd = c + d, a_b = a - b, c_d = c - d;
+            gsf__v_store(x + j, ab + cd);
+            gsf__v_store(x + j + half, a_b + c_d);
+            gsf__v_store(x + j + 2 * half, ab - cd);
+            gsf__v_store(x + j + 3 * half, a_b - c_d);
+        }
+}
+
+GSF__V_INLINE void GSF__V(gsf__int8_one_step)(float* x, int64_t block, int64_t half) {
+    for (int64_t i = 0; i < block; i += 2 * half)
+        for (int64_t j = i; j < i + half; j += GSF__LANES) {
+            const gsf__vf a = gsf__v_load(x + j), b = gsf__v_load(x + j + half);
+            gsf__v_store(x + j, a + b);
+            gsf__v_store(x + j + half, a - b);
+        }
+}
+
+GSF__V_KERNEL float GSF__V(gsf__int8_rotate)(float* x, int64_t count, int64_t block) {
+    const int64_t stride = block > GSF__LANES ? block : GSF__LANES; // a vector may hold several blocks
+    for (int64_t i = 0; i < count; i += stride) {
+        float* p = x + i;
+        int64_t half = GSF__LANES;
+        for (int64_t j = 0; j < block; j += GSF__LANES) {
+            const size_t left = (size_t)(count - i - j);
+            if (block >= GSF__LANES) gsf__v_store(p + j, gsf__v_hadamard(gsf__v_load(p + j), GSF__LANES));
+            else gsf__v_store_first(p + j, gsf__v_hadamard(gsf__v_load_first(p + j, left), block), left);
+        }
+        for (; 4 * half <= block; half *= 4) GSF__V(gsf__int8_two_steps)(p, block, half);
+        if (half < block) GSF__V(gsf__int8_one_step)(p, block, half);
+    }
+    gsf__vi top = gsf__vi_set(0); // bits of sizes, see gsf__int8_top
+    int64_t k = 0;
+    for (; k + GSF__LANES <= count; k += GSF__LANES) top = gsf__vi_max(top, gsf__v_bits(gsf__v_abs(gsf__v_load(x + k))));
+    if (k < count) top = gsf__vi_max(top, gsf__v_bits(gsf__v_abs(gsf__v_load_first(x + k, (size_t)(count - k)))));
+    return gsf__int8_size((uint32_t)gsf__vi_largest(top));
+}
+
+#endif
+#endif // GSF__KERNELS_INT8
+#ifndef GSF__ISA
+
 // ---- int8: AVX2 kernels
 
 #if GSF__X86
-
-// Steps of 1, 2 and 4: each value gets its partner, plus itself or (the upper one) minus itself. The FMAs are exact there,
-// so these are the bits of the scalar kernel.
-GSF__INLINE_AVX2 __m256 gsf__int8_rotate8(__m256 v) {
-    v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, -1, 1, -1, 1, -1, 1, -1), _mm256_permute_ps(v, 0xb1));
-    v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, -1, -1, 1, 1, -1, -1), _mm256_permute_ps(v, 0x4e));
-    return _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, 1, 1, -1, -1, -1, -1), _mm256_permute2f128_ps(v, v, 1));
-}
-
-// Two steps, of `half` and twice that; half is a multiple of 8.
-GSF__INLINE_AVX2 void gsf__int8_two_steps(float* x, int64_t block, int64_t half) {
-    for (int64_t i = 0; i < block; i += 4 * half)
-        for (int64_t j = i; j < i + half; j += 8) {
-            const __m256 a = _mm256_loadu_ps(x + j), b = _mm256_loadu_ps(x + j + half);
-            const __m256 c = _mm256_loadu_ps(x + j + 2 * half), d = _mm256_loadu_ps(x + j + 3 * half);
-            const __m256 ab = _mm256_add_ps(a, b), cd = _mm256_add_ps(c, d);
-            const __m256 a_b = _mm256_sub_ps(a, b), c_d = _mm256_sub_ps(c, d);
-            _mm256_storeu_ps(x + j, _mm256_add_ps(ab, cd));
-            _mm256_storeu_ps(x + j + half, _mm256_add_ps(a_b, c_d));
-            _mm256_storeu_ps(x + j + 2 * half, _mm256_sub_ps(ab, cd));
-            _mm256_storeu_ps(x + j + 3 * half, _mm256_sub_ps(a_b, c_d));
-        }
-}
-
-GSF__INLINE_AVX2 void gsf__int8_one_step(float* x, int64_t block, int64_t half) {
-    for (int64_t i = 0; i < block; i += 2 * half)
-        for (int64_t j = i; j < i + half; j += 8) {
-            const __m256 a = _mm256_loadu_ps(x + j), b = _mm256_loadu_ps(x + j + half);
-            _mm256_storeu_ps(x + j, _mm256_add_ps(a, b));
-            _mm256_storeu_ps(x + j + half, _mm256_sub_ps(a, b));
-        }
-}
-
-GSF__TARGET_AVX2 static float gsf__int8_rotate_avx2(float* x, int64_t count, int64_t block) {
-    const __m256i size = _mm256_set1_epi32(0x7fffffff);
-    __m256i top = _mm256_setzero_si256();
-    uint32_t tops[8];
-    int64_t k = 0;
-    if (block < 8) return gsf__int8_rotate_scalar(x, count, block); // sizes of no model
-    for (int64_t i = 0; i < count; i += block) {
-        float* p = x + i;
-        int64_t half = 8;
-        for (int64_t j = 0; j < block; j += 8) _mm256_storeu_ps(p + j, gsf__int8_rotate8(_mm256_loadu_ps(p + j)));
-        for (; 4 * half <= block; half *= 4) gsf__int8_two_steps(p, block, half);
-        if (half < block) gsf__int8_one_step(p, block, half);
-    }
-    for (; k + 8 <= count; k += 8)
-        top = _mm256_max_epi32(top, _mm256_and_si256(size, _mm256_loadu_si256((const __m256i*)(const void*)(x + k))));
-    _mm256_storeu_si256((__m256i*)(void*)tops, top);
-    for (int i = 1; i < 8; i++)
-        if (tops[i] > tops[0]) tops[0] = tops[i];
-    return gsf__int8_size(tops[0]);
-}
 
 GSF__TARGET_AVX2 static void gsf__int8_quantize_avx2(const float* x, int64_t count, float factor, void* out, int64_t pitch) {
     const __m256 f = _mm256_set1_ps(factor);
@@ -3932,45 +3972,6 @@ static const gsf__int8_kernels gsf__int8_avx2 = {
     gsf__int8_tile_avx2, NULL, gsf__int8_few_avx2, 2, gsf__int8_scale_avx2};
 
 // ---- int8: AVX-512 kernels with dot products of bytes
-
-GSF__INLINE_AVX512 __m512 gsf__int8_rotate16(__m512 v) { // gsf__int8_rotate8, and the step of 8
-    const __m512 one = _mm512_set1_ps(1.0f), less = _mm512_set1_ps(-1.0f);
-    v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xaaaa, one, less), _mm512_permute_ps(v, 0xb1));
-    v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xcccc, one, less), _mm512_permute_ps(v, 0x4e));
-    v = _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xf0f0, one, less), _mm512_shuffle_f32x4(v, v, 0xb1));
-    return _mm512_fmadd_ps(v, _mm512_mask_blend_ps(0xff00, one, less), _mm512_shuffle_f32x4(v, v, 0x4e));
-}
-
-GSF__TARGET_AVX512 static float gsf__int8_rotate_avx512(float* x, int64_t count, int64_t block) {
-    const __m512i size = _mm512_set1_epi32(0x7fffffff);
-    __m512i top = _mm512_setzero_si512();
-    if (block < 64) return gsf__int8_rotate_avx2(x, count, block);
-    for (int64_t i = 0; i < count; i += block) {
-        float* p = x + i;
-        int64_t half = 16;
-        for (int64_t j = 0; j < block; j += 16) _mm512_storeu_ps(p + j, gsf__int8_rotate16(_mm512_loadu_ps(p + j)));
-        for (; 4 * half <= block; half *= 4) // two steps at a time
-            for (int64_t g = 0; g < block; g += 4 * half)
-                for (int64_t j = g; j < g + half; j += 16) {
-                    const __m512 a = _mm512_loadu_ps(p + j), b = _mm512_loadu_ps(p + j + half);
-                    const __m512 c = _mm512_loadu_ps(p + j + 2 * half), d = _mm512_loadu_ps(p + j + 3 * half);
-                    const __m512 ab = a + b, cd = c + d, a_b = a - b, c_d = c - d;
-                    _mm512_storeu_ps(p + j, ab + cd);
-                    _mm512_storeu_ps(p + j + half, a_b + c_d);
-                    _mm512_storeu_ps(p + j + 2 * half, ab - cd);
-                    _mm512_storeu_ps(p + j + 3 * half, a_b - c_d);
-                }
-        if (half < block) gsf__int8_one_step(p, block, half);
-    }
-    for (int64_t k = 0; k < count; k += 16) // count is a multiple of the block
-        top = _mm512_max_epi32(top, _mm512_and_si512(size, _mm512_loadu_si512(x + k)));
-    const __m256i half = _mm256_max_epi32(_mm512_castsi512_si256(top), _mm512_extracti32x8_epi32(top, 1));
-    uint32_t tops[8];
-    _mm256_storeu_si256((__m256i*)(void*)tops, half);
-    for (int i = 1; i < 8; i++)
-        if (tops[i] > tops[0]) tops[0] = tops[i];
-    return gsf__int8_size(tops[0]);
-}
 
 GSF__TARGET_AVX512 static void gsf__int8_quantize_x_vnni(const float* x, int64_t count, float factor, void* out,
                                                          int64_t pitch) {
@@ -5156,12 +5157,6 @@ static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int ac
         }
 }
 
-static void gsf__conv_norm_silu_ref(const float* x, int64_t count, const float* mean, const float* scale,
-                                    const float* offset, float* y) {
-    for (int64_t i = 0; i < count; i++)
-        y[i] = gsf__nn_activation_ref(GSF_NN_SILU, (x[i] - mean[i]) * scale[i] + offset[i]);
-}
-
 #if GSF__X86
 GSF__INLINE_AVX2 void gsf__conv_add8(float* c, __m256 v) { _mm256_storeu_ps(c, _mm256_add_ps(_mm256_loadu_ps(c), v)); }
 
@@ -5281,38 +5276,14 @@ GSF__TARGET_AVX2 static void gsf__conv_store_avx2(const float* c, int64_t count,
     if (i < n) gsf__conv_store_ref(c + i, count, n - i, accumulate, out + i, ldo, sums + i);
 }
 
-GSF__TARGET_AVX2 static void gsf__conv_norm_silu_avx2(const float* x, int64_t count, const float* mean, const float* scale,
-                                                      const float* offset, float* y) {
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8) {
-        const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(x + i), _mm256_loadu_ps(mean + i));
-        const __m256 v = _mm256_fmadd_ps(d, _mm256_loadu_ps(scale + i), _mm256_loadu_ps(offset + i));
-        _mm256_storeu_ps(y + i, gsf__v_activate_avx2(GSF_NN_SILU, v));
-    }
-    gsf__conv_norm_silu_ref(x + i, count - i, mean + i, scale + i, offset + i, y + i);
-}
-
-GSF__INLINE_AVX512 void gsf__conv_norm_silu16(const float* x, __mmask16 mask, const float* mean, const float* scale,
-                                              const float* offset, float* y) {
-    const __m512 d = _mm512_maskz_loadu_ps(mask, x) - _mm512_maskz_loadu_ps(mask, mean);
-    const __m512 v = _mm512_fmadd_ps(d, _mm512_maskz_loadu_ps(mask, scale), _mm512_maskz_loadu_ps(mask, offset));
-    gsf__nn_store16(y, mask, gsf__v_activate_avx512(GSF_NN_SILU, v));
-}
-
-GSF__TARGET_AVX512 static void gsf__conv_norm_silu_avx512(const float* x, int64_t count, const float* mean,
-                                                          const float* scale, const float* offset, float* y) {
-    int64_t i = 0;
-    for (; i + 16 <= count; i += 16) gsf__conv_norm_silu16(x + i, GSF__NN_WHOLE16, mean + i, scale + i, offset + i, y + i);
-    if (i < count) gsf__conv_norm_silu16(x + i, gsf__nn_mask16(count - i), mean + i, scale + i, offset + i, y + i);
-}
 #endif
 
 static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
-    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, NULL, gsf__conv_store_ref, gsf__conv_norm_silu_ref};
+    static const gsf__conv_kernels scalar = {gsf__conv_multiply_ref, NULL, gsf__conv_store_ref, gsf__norm_silu_scalar};
 #if GSF__X86
-    static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, NULL, gsf__conv_store_avx2, gsf__conv_norm_silu_avx2};
+    static const gsf__conv_kernels avx2 = {gsf__conv_multiply_avx2, NULL, gsf__conv_store_avx2, gsf__norm_silu_avx2};
     static const gsf__conv_kernels avx512 = {gsf__conv_multiply_avx2, gsf__conv_multiply_two_avx512, gsf__conv_store_avx2,
-                                             gsf__conv_norm_silu_avx512};
+                                             gsf__norm_silu_avx512};
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
