@@ -96,15 +96,15 @@ extern "C" {
 typedef struct gsf_splats { // structure of arrays; all arrays have `count` rows
     size_t count;
     int32_t sh_degree;      // 0..3, of the stored coefficients
-    int32_t antialiased;    // made for gsf_render_desc.antialiased; a note that only .spz files carry, nothing reads it
-    double origin[3];       // world position of the means' zero
+    int32_t antialiased;    // made for gsf_render_desc.antialiased; informative, stored in .spz files only
+    double origin[3];       // world position that the means are relative to
     float* means;           // (count,3) relative to origin
     float* log_scales;      // (count,3)
     float* quats;           // (count,4) w x y z, raw
     float* opacity_logits;  // (count)
     float* sh;              // (count,K,3), coefficient-major, RGB last
-    uint32_t* ids;          // (count) stable names of the splats; unique
-    void* owned;            // memory to free; NULL for views of caller arrays
+    uint32_t* ids;          // (count) stable unique identifiers
+    void* owned;            // memory to free; NULL if the arrays belong to the caller
 } gsf_splats;
 
 // Number of SH coefficients per channel of a degree: (degree + 1)^2.
@@ -113,42 +113,42 @@ GSF_API int32_t gsf_splat_sh_count(int32_t sh_degree);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make(gsf_context* ctx, size_t count, int32_t sh_degree, gsf_splats* out);
 GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 
-// Morton order of the means: neighbours in space become neighbours in memory, which at a million splats saves a sixth of a
-// training step (before a trainer is made of them; it keeps the order and appends). Renders stay the same but for the order
-// of splats of equal depth.
+// Sorts by the Morton order of the means: neighbours in space become neighbours in memory, which at a million splats
+// saves a sixth of a training step. Sort before making a trainer, which keeps the order and appends. Renders are
+// unchanged except for the order of splats at equal depth.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats);
 
-/* The formats of splats, in and out. Which one it is, the name's ending says (.ply, .splat, .spz, in any case); a file of
-   another name is known by its content if it is PLY or SPZ (a .splat has no mark).
-       .ply    The standard 3DGS PLY: columns found by name, ascii and both endians, float and double. Origin: zero, or the
-               rounded centre where coordinates are large (centre beyond 1e5, or beyond 1000 times the extent; both from
-               medians of samples, so stray splats do not matter). A header that promises more rows than the file can hold is
-               an error. Written as binary little-endian float32, as the official code does; x y z become double when they
-               are large by the loader's rule, since float32 would then cost precision (and stay float32 otherwise, whatever
-               origin is, so that every viewer reads the file).
-       .splat  32 bytes a splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0 are
+/* Splat files. The format is chosen by the extension (.ply, .splat, .spz, case-insensitive); files with another extension are
+   recognised by content if they are PLY or SPZ (.splat has no magic number).
+       .ply    The standard 3DGS PLY: columns are found by name; ascii and both endians, float and double are read. Origin:
+               zero, or the rounded centre if coordinates are large (centre beyond 1e5 or beyond 1000 times the extent; both
+               are medians of samples and so robust against stray splats). A header with more rows than fit in the file is an
+               error. Written as binary little-endian float32, as by Inria's code; x y z become double if they are large by
+               the loader's rule, since float32 would lose precision (otherwise they stay float32, whatever the origin, so
+               that every viewer can read the file).
+       .splat  32 bytes per splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0 are
                lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
-       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes a splat. Versions 1 to 3 are read, 2 and 3 written. Errors:
-               positions half a step (2^-12, finer where the median scale is below 2^-7, coarser where a coordinate passes
+       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes per splat. Versions 1 to 3 are read, 2 and 3 written. Errors:
+               positions half a step (2^-12; finer if the median scale is below 2^-7, coarser if a coordinate exceeds
                2047), log-scales 1/32 within -10..5.94, opacity 0.5/255, colour 0.5/255/0.15 as coefficient, SH 4.5/128
-               (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15, where w is
-               small). Axes are converted to and from SPZ's (y and z turned around), as the official library does.
+               (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15 for small
+               w). Axes are converted to and from SPZ's (y and z negated), as Niantic's library does.
                Extensions and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than
                2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under GSF_NO_STB.
-   No file has an origin: world positions are written. Of .splat and .spz, steps that are coarse beside the splats (more than
-   a quarter of the median scale) or cannot be held at all are a warning or an error; `local` writes means without the origin
-   instead. Rows keep their order, ids are lost: those of loaded splats are the rows. Splats with a NaN or infinite value are
-   left out, when writing as when reading, and counted in a warning. An opacity of 0 or 1 is read as 0.001 or 0.999, since
-   the logit must be finite. Memory in proportion to the content; a file that claims more than DEFLATE can hold (1032 times
-   its size) is refused before it is believed. */
+   No format stores an origin, so world positions are written. For .splat and .spz, positions whose quantization is coarse
+   relative to the splats (more than a quarter of the median scale) cause a warning and positions out of range an error; with
+   `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers. Splats
+   with a NaN or infinite value are dropped, both when writing and when reading, and counted in a warning. An opacity of 0 or
+   1 is read as 0.001 or 0.999, since the logit must be finite. Memory is proportional to the content; a file that claims more
+   content than DEFLATE can compress into it (1032 times its size) is refused in advance. */
 typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ } gsf_splat_type;
 
 typedef struct gsf_splat_save_desc {
-    gsf_splat_type type;  // AUTO: by the ending of the name, which must then be one of the three
-    int32_t local;        // write positions relative to splats->origin, which the file does not keep
-    int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers know by now: a byte more a splat, and rotations a
-                          // tenth as wrong (which pictures of compact splats do not show). 2 is for readers from before
-                          // July 2025 and for glTF's KHR_gaussian_splatting_compression_spz_2
+    gsf_splat_type type;  // AUTO: by the extension, which must then be one of the three
+    int32_t local;        // write positions relative to splats->origin, which the file does not store
+    int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers support: one byte more per splat and a tenth of the
+                          // rotation error (not visible for compact splats). Use 2 for readers from before July 2025 and
+                          // for glTF's KHR_gaussian_splatting_compression_spz_2
 } gsf_splat_save_desc;
 
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out);
@@ -165,10 +165,10 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_format(gsf_context* ctx, const char* 
 typedef struct gsf_scene_view {
     char* name;         // image file name relative to the image folder
     uint32_t image_id;  // COLMAP's
-    gsf_camera camera;  // pinhole, already at the size of `image` (undistorted, scaled)
+    gsf_camera camera;  // pinhole camera of the undistorted, resized image
     gsf_image image;    // u8 RGB; data is NULL until gsf_splat_load_view_image
-    gsf_image weight;   // u8, 1 channel, of the image's size: how much each pixel counts, 255 fully and 0 not at all (the
-                        // photo's alpha times its mask); data is NULL where all do
+    gsf_image weight;   // u8, 1 channel, of the image's size: weight of each pixel, 255 = full, 0 = ignored (the photo's
+                        // alpha times its mask); data is NULL if all have full weight
 } gsf_scene_view;
 
 typedef struct gsf_scene {
@@ -178,31 +178,31 @@ typedef struct gsf_scene {
     double* points;         // (point_count,3) world
     uint8_t* colors;        // (point_count,3)
     uint64_t* point_ids;    // (point_count) COLMAP's
-    size_t* track_begin;    // (point_count+1) into track_views; all zero when the scene has no tracks
-    uint32_t* track_views;  // indices into views, ascending within a point, without repeats
-    double origin[3];       // for splats made from this scene: mean camera centre
-    size_t missing_count;   // photos that the model names and that are not there: their views are left out
+    size_t* track_begin;    // (point_count+1) into track_views; all zero if the scene has no tracks
+    uint32_t* track_views;  // indices into views, ascending and unique within a point
+    double origin[3];       // mean camera centre, the origin for splats made from this scene
+    size_t missing_count;   // photos that the model lists but that do not exist; their views are left out
     char* folder;           // as given to the loader
     void* state;            // private: source cameras and sizes for gsf_splat_load_view_image
 } gsf_scene;
 
 typedef struct gsf_scene_desc {
     int32_t factor;    // images are 1/factor of the model's size: images_<factor>/ if present, else resized; 0 = 1
-    int32_t max_size;  // shrink so that the longer side is at most this many pixels; 0 = no limit; not with factor
-    int32_t no_masks;  // all pixels count: masks/ and the photos' alpha are not looked at
+    int32_t max_size;  // shrink so that the longer side is at most this many pixels; 0 = no limit; excludes factor
+    int32_t no_masks;  // ignore masks/ and the photos' alpha: all pixels have full weight
 } gsf_scene_desc;
 
 // Reads a COLMAP folder (images/ or images_<factor>/, sparse/0/ or sparse/ with {cameras,images,points3D}.{bin,txt}) or
 // a nerfstudio / instant-ngp transforms.json (its folder or the file itself; points from its ply_file_path, else none).
-// Images are not read; their headers are, since a COLMAP camera is rescaled to the actual image size as the official
-// parser does. Views whose photo is missing are left out with a warning and counted; a photo that is there and cannot be
-// read is an error; photos are never enlarged. All of COLMAP's camera models are read (up to EUCM, of version 4.1) but
-// EQUIRECTANGULAR, whose panoramas no pinhole camera shows. Distorted ones become pinhole cameras: RADIAL and OPENCV
-// models by OpenCV's getOptimalNewCameraMatrix (alpha 0) and crop, as the official parser; fisheye, FOV, DIVISION and
-// EUCM models by the smallest zoom, at most 75 degrees off axis, that shows no pixel from outside the photo. The rigs
-// and frames that COLMAP writes beside the model since 3.12 are not needed: its images have their own poses. Tracks that
-// name unknown images lose those entries; points that are not finite are dropped; both with a warning. Image names that
-// lead out of the folder ("..", absolute) are refused. Memory and time in proportion to the files.
+// Only the headers of images are read, since a COLMAP camera is rescaled to the actual image size, as in the COLMAP
+// parser of the GSFixer release. Views whose photo is missing are left out with a warning and counted; a photo that
+// exists but cannot be read is an error; photos are never enlarged. All camera models of COLMAP are supported (up to
+// EUCM, version 4.1) except EQUIRECTANGULAR, whose panoramas have no pinhole image. Distorted ones become pinhole
+// cameras: RADIAL and OPENCV models by OpenCV's getOptimalNewCameraMatrix (alpha 0) and crop, as in that parser;
+// fisheye, FOV, DIVISION and EUCM models by the smallest zoom, at most 75 degrees off axis, that shows no pixel from
+// outside the photo. The rigs and frames that COLMAP writes since 3.12 are not needed, because images have their own
+// poses. Track entries for unknown images and non-finite points are dropped with a warning. Image names that lead out
+// of the folder ("..", absolute) are refused. Memory and time are proportional to the files.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
                                                       gsf_scene* out);
 typedef struct gsf_bytes {
@@ -211,38 +211,39 @@ typedef struct gsf_bytes {
     const char* name; // for error texts; NULL = the file's usual name
 } gsf_bytes;
 
-// In-memory twin: contents of the three COLMAP files, binary or (is_text) text. `points` may be NULL. All images are
-// kept, since there is no folder to look for them; sizes are the cameras', after undistortion. View images stay empty
-// until gsf_splat_set_view_image.
+// The same from memory: contents of the three COLMAP files, binary or (is_text) text. `points` may be NULL. All images
+// are kept, since there is no folder to search; sizes are those of the cameras after undistortion. View images are
+// empty until gsf_splat_set_view_image.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras,
                                                         const gsf_bytes* images, const gsf_bytes* points,
                                                         gsf_scene* out);
-// In-memory twin for transforms.json; w and h must stand in it. No points.
+// transforms.json from memory; it must contain w and h. No points.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out);
-// File of a view's photo, with the path to the scene; valid as long as the scene. NULL for scenes that came from memory.
+// Path of a view's photo, including the scene's path; valid as long as the scene. NULL for scenes parsed from memory.
 GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view);
-// Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already there). Pixel rows
-// of the undistortion run in parallel. Only for scenes that were loaded from files.
-// view->weight comes from the photo's alpha and from its mask, masks/NAME.png or (COLMAP's way) masks/NAME.EXT.png for the
-// photo images/NAME.EXT: any image in the shape of the photo, of any size, black where the photo does not count. Colours
-// stay as they are stored (alpha is taken to be straight); where photos are resized or undistorted each pixel counts with
-// its weight, so that no colour of a pixel that does not count gets into the others.
+// Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already present). Rows are
+// undistorted in parallel. Only for scenes that were loaded from files.
+// view->weight is the photo's alpha times its mask, masks/NAME.png or (as in COLMAP) masks/NAME.EXT.png for the photo
+// images/NAME.EXT: an image of any size with the photo's aspect ratio, black where the photo is to be ignored. Colours
+// are used as stored (straight alpha). Resizing and undistortion weight each pixel, so that colours of ignored pixels
+// do not bleed into others.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view);
-// The same for a photo that the host has decoded: any dtype and layout, 1 to 4 channels, the second of two or the fourth
-// its alpha (and so the place for a mask), distorted as the camera took it, of any size (it is resized to the camera's). The
-// photo is borrowed for the call; image and weight already there are replaced.
+// The same for a photo decoded by the host: any dtype and layout, 1 to 4 channels (the second of two or the fourth is
+// alpha, which can also carry a mask), distorted as taken, of any size (it is resized to the camera's). The photo is
+// borrowed for the call; an existing image and weight are replaced.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view,
                                                           const gsf_image* photo);
-// Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are the views' PINHOLE
-// ones; tracks are kept, and since a scene does not hold the measured 2D points, the projections stand in for them.
-// keep: NULL or one byte per point, zero = left out.
+// Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are PINHOLE; tracks are
+// kept, with projections in place of the measured 2D points, which a scene does not store. keep: NULL or one byte per
+// point, zero = left out.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep,
                                                        const char* folder);
 GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene);
 
-// The papers' split of n name-sorted views: every test_every-th (from 0 on) is a test view (0: none is), train =
-// round(linspace(0, m-1, K)) over the other m (half to even; with K > m views repeat, as in the official code). K = 0:
-// all the rest. Counts are returned. train holds up to max(n, K) entries, test up to n; pointers may be NULL.
+// The papers' split of n views sorted by name: every test_every-th view, starting with the first, is a test view (0:
+// none); train = round(linspace(0, m-1, K)) over the other m (half to even; with K > m views repeat, as in the GSFixer
+// release). K = 0: all others. Counts are returned. train holds up to max(n, K) entries, test up to n; pointers may be
+// NULL.
 GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_target, uint32_t* train,
                                    size_t* train_count, uint32_t* test, size_t* test_count);
 
@@ -250,79 +251,79 @@ GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_tar
 
 typedef enum gsf_visibility_method {
     GSF_VISIBILITY_BOTH = 0, // seen by track or by ray (default)
-    GSF_VISIBILITY_TRACKS,   // the official code: the point's track holds one of the views
-    GSF_VISIBILITY_RAYS,     // points as oriented discs; by Embree, or without it by projecting the same discs
+    GSF_VISIBILITY_TRACKS,   // the point's track contains one of the views, as in the GSFixer release
+    GSF_VISIBILITY_RAYS,     // rays against points as oriented discs; with Embree, or by projecting the same discs
 } gsf_visibility_method;
 
-/* Every point is a disc: normal by PCA of its neighbours, radius in proportion to their spacing. A point is hidden from a
-   view when the discs between them cover the ray by more than a limit: each disc that is hit at distance q from its
-   centre adds 1 - (q / radius)^2, unless the point lies less than `tolerance` radii (the larger of the two discs')
-   behind it. On a plane sampled evenly the defaults add up to about 7, so a surface still hides when half of its points
-   are missing, while a stray point hides nothing.
-   The limit is `coverage`. Where the scene has tracks, three things move it: whether the view found the point's
-   neighbours where it should have if they are visible; how far the view stands from the nearest other one that found
-   the point; whether it looks from behind, seen from where the neighbours were found. Whether the point's own track
-   holds the view does not count here: that is the method of tracks, and recall against it stays a fair test.
+/* Every point is a disc: normal by PCA of its neighbours, radius proportional to their spacing. A point is occluded in a view
+   if the discs on its ray have a total coverage above a limit: each disc hit at distance q from its centre adds
+   1 - (q / radius)^2, unless the point is less than `tolerance` radii (of the larger disc) behind it. On an evenly sampled
+   plane, the defaults add up to about 7, so that a surface occludes even if half of its points are missing, while a stray
+   point does not.
+   The limit is `coverage`. If the scene has tracks, it is adjusted by three observations: whether the point's neighbours
+   have the view in their tracks, as expected if they are visible; the distance of the view from the nearest other view in
+   the point's track; and whether the view is behind the surface, relative to the views in the neighbours' tracks. Whether the
+   point's own track contains the view is not used: that is the method of tracks, and recall against it remains a fair test.
    Measured (tests/test_visibility.c): balanced accuracy 0.94, 0.92 and 0.91 for three, six and nine views of eight
    ray-traced scenes together; recall against the tracks 0.96, 0.99 and 0.99 on real photos. */
 typedef struct gsf_visibility_desc {
     gsf_visibility_method method;
     int32_t neighbours;    // for normals, default 12
     int32_t radius_neighbour; // disc radius = distance to this neighbour (at most 3 times the median), default 6
-    float radius_scale;    // times this, default 1.4
-    float tolerance;       // radii, default 0.7
-    float coverage;        // default 2; the smaller, the more is hidden (tiny: any disc hides)
-    float min_grazing_cos; // |cos| between ray and normal below which no ray is shot, default 0.02
-    int32_t use_zbuffer;   // project the discs, depth-tested at each point, even where Embree is compiled in
+    float radius_scale;    // factor on that radius, default 1.4
+    float tolerance;       // in radii, default 0.7
+    float coverage;        // default 2; smaller values occlude more (tiny: any disc occludes)
+    float min_grazing_cos; // |cos| between ray and normal below which no ray is traced, default 0.02
+    int32_t use_zbuffer;   // project the discs and test depth at each point, even if Embree is compiled in
 } gsf_visibility_desc;
 
 typedef struct gsf_visibility_stats {
-    size_t points, kept, by_tracks, by_rays;  // by_rays: kept by rays; no ray goes to what tracks keep
-    size_t rays, culled;                      // rays shot; (point, view) pairs rejected without one
+    size_t points, kept, by_tracks, by_rays;  // by_rays: kept by rays; points already kept by tracks are not traced
+    size_t rays, culled;                      // rays traced; (point, view) pairs rejected without one
     double seconds_normals, seconds_build, seconds_rays;
-    int32_t used_embree; // 0 also where Embree has too little memory: with a warning the discs are projected instead
+    int32_t used_embree; // 0 also if Embree ran out of memory: the discs are then projected instead, with a warning
 } gsf_visibility_stats;
 
-// keep[i] = 1 where some of the given views sees point i. stats may be NULL.
+// Sets keep[i] to 1 if at least one of the given views sees point i, else to 0. stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_visible_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
                                                           size_t view_count, const gsf_visibility_desc* desc,
                                                           uint8_t* keep, gsf_visibility_stats* stats);
 
-// Initial splats from points: scale = sqrt(mean squared distance to the 3 nearest kept points, at least 1e-7), opacity 0.1,
-// SH dc from colour (the official create_from_pcd). keep: NULL or one byte per point. origin: NULL = zero. Ids are the
-// rows of the points. Points with a non-finite coordinate make no splat and are counted in a warning.
+// Initial splats from points: scale = sqrt(mean squared distance to the 3 nearest kept points, at least 1e-7), opacity
+// 0.1, SH dc from colour (create_from_pcd of Inria's 3DGS). keep: NULL or one byte per point. origin: NULL = zero. Ids
+// are the rows of the points. Points with a non-finite coordinate are skipped and counted in a warning.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_from_points(gsf_context* ctx, const double* points, const uint8_t* colors,
                                                        size_t count, const uint8_t* keep, int32_t sh_degree,
                                                        const double origin[3], gsf_splats* out);
 
 // ---- dense stereo --------------------------------------------------------------
 
-/* Points where the photos of a few posed views agree, by PatchMatch multi-view stereo: every pixel of every view holds a
-   plane (inverse depth and slope); planes spread over the image and are perturbed at random as long as they make the
-   photo's window match better in the other views (weighted normalised cross-correlation, views weighted per pixel by how
-   well they match around it). Coarse to fine. A pixel counts when its match is good and at least one other view's plane at
-   its place there leads back to it; such pixels are merged over the views and thinned.
-   Zero is every field's default. Pixels are those of the working size. */
+/* Points on which the photos of a few posed views agree, by PatchMatch multi-view stereo, coarse to fine: every pixel of every
+   view holds a plane (inverse depth and slope). Planes are propagated to neighbours and perturbed at random, and kept if they
+   improve the match of the photo's window in the other views (weighted normalised cross-correlation, with view weights per
+   pixel). A pixel is accepted if its match is good and it passes a consistency check: the plane of at least one other view at
+   the corresponding pixel leads back to it. Accepted pixels are merged over the views and thinned.
+   Zero is the default of every field. Pixels are those of the working size. */
 typedef struct gsf_dense_desc {
     uint64_t seed;
-    int32_t max_size;        // longer side of the working images; photos that are larger are shrunk; 0 = 640
-    int32_t levels;          // sizes halved this often, at most, less one; 0 = 3 (as long as 40 pixels are left)
-    int32_t iterations;      // per level, 0 = 2; two more at the coarsest, half as many at the finest, where two more follow
-                             // that also weigh how well the views' depths agree
-    int32_t sources;         // other views that a view is compared with, at most 8; 0 = 4
-    int32_t radius;          // of the matching window, pixels, at most 15; 0 = 5
-    int32_t stride;          // between its samples; 0 = 2
+    int32_t max_size;        // longer side of the working images; larger photos are shrunk; 0 = 640
+    int32_t levels;          // maximum number of pyramid levels; 0 = 3 (while at least 40 pixels are left)
+    int32_t iterations;      // per level; 0 = 2. Two more at the coarsest level; half as many at the finest, followed by two
+                             // that include the depth consistency of the views in the cost
+    int32_t sources;         // other views that each view is matched with, at most 8; 0 = 4
+    int32_t radius;          // of the matching window in pixels, at most 15; 0 = 5
+    int32_t stride;          // between samples of the window; 0 = 2
     float color_sigma;       // grey levels of 255 at which a sample's weight falls to 1/e; 0 = 18
-    float min_angle;         // degrees between two views' rays to a point below which they do not help; 0 = 1
-    float max_cost;          // 1 - correlation that a pixel may have, and those that confirm it; 0 = 0.35
-    float max_cost_many;     // the same where one more view agrees than must; 0 = 0.5
-    float max_reprojection;  // pixels between a pixel and its way to the other view and back; 0 = 1
-    float max_depth_error;   // relative difference of the two depths; 0 = 0.02
-    float max_normal_angle;  // degrees between the two normals; 0 = 40
-    int32_t min_consistent;  // other views that must agree; 0 = 1
+    float min_angle;         // minimum triangulation angle in degrees; 0 = 1
+    float max_cost;          // maximum of 1 - correlation for a pixel and for those that confirm it; 0 = 0.35
+    float max_cost_many;     // the same if one view more than required agrees; 0 = 0.5
+    float max_reprojection;  // maximum forward-backward reprojection error in pixels; 0 = 1
+    float max_depth_error;   // maximum relative difference of the two depths; 0 = 0.02
+    float max_normal_angle;  // maximum angle between the two normals in degrees; 0 = 40
+    int32_t min_consistent;  // number of other views that must agree; 0 = 1
     int32_t spacing;         // pixels between points, at least 1; 0 = 2
-    size_t max_points;       // spacing grows until no more than this are left; 0 = no limit
-    int32_t skip_sparse;     // no points closer than `spacing` to a sparse point (of `keep`), so that both may be united
+    size_t max_points;       // spacing is increased until at most this many are left; 0 = no limit
+    int32_t skip_sparse;     // no points closer than `spacing` to a sparse point (of `keep`), so that both can be merged
     double depth_min, depth_max; // search range of the camera depth; 0 = from the sparse points and the camera poses
     int32_t want_maps;       // fill in `maps`
 } gsf_dense_desc;
@@ -330,14 +331,14 @@ typedef struct gsf_dense_desc {
 typedef struct gsf_dense_map { // one view
     uint32_t view;           // index into the scene's views
     gsf_camera camera;       // at the map's size
-    float* depth;            // (height,width) camera depth at the pixels' centres where the views agree, else 0
-    float* normals;          // (height,width,3) world, unit, towards the camera; 0 where depth is
+    float* depth;            // (height,width) camera depth at pixel centres where the views agree, else 0
+    float* normals;          // (height,width,3) world, unit, towards the camera; 0 where depth is 0
 } gsf_dense_map;
 
 typedef struct gsf_dense_stats {
-    size_t views, pairs;     // different views; ordered pairs compared
-    size_t pixels, matched, consistent; // of all views: with any texture; that match; that the other views confirm
-    int32_t spacing;         // used
+    size_t views, pairs;     // distinct views; ordered pairs compared
+    size_t pixels, matched, consistent; // over all views: pixels with texture; with a good match; confirmed by other views
+    int32_t spacing;         // in effect
     double seconds_prepare, seconds_match, seconds_fuse;
 } gsf_dense_stats;
 
@@ -346,16 +347,16 @@ typedef struct gsf_dense {
     double* points;          // (count,3) world
     float* normals;          // (count,3) world, unit, towards the views
     uint8_t* colors;         // (count,3) mean of the views that agree
-    float* confidence;       // (count) 1 - cost, of the best view's pixel
+    float* confidence;       // (count) 1 - cost of the best view's pixel
     uint8_t* view_counts;    // (count) views that agree, at least 2
     size_t map_count;
-    gsf_dense_map* maps;     // NULL unless wanted
+    gsf_dense_map* maps;     // NULL unless want_maps
 } gsf_dense;
 
-// Views are indices into scene->views, whose images must be loaded (pixels of a weight below 128 make no points and confirm
-// none); repeated ones count once. keep: NULL or one byte per
-// sparse point, zero = not to be used; the points only guide the search. With fewer than two different views, or none that
-// overlap, the result is GSF_OK and no points. stats may be NULL. Same bits for any number of workers and instruction set.
+// Views are indices into scene->views, whose images must be loaded (pixels with a weight below 128 neither yield nor
+// confirm points); repeated views count once. keep: NULL or one byte per sparse point, zero = not used; sparse points
+// only guide the search. With fewer than two distinct views, or without overlap, the result is GSF_OK with no points.
+// stats may be NULL. Bit-identical for any number of workers and any instruction set.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
                                                         size_t view_count, const uint8_t* keep,
                                                         const gsf_dense_desc* desc, gsf_dense* out,
@@ -366,12 +367,12 @@ GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense);
 
 typedef enum gsf_footprint {
     GSF_FOOTPRINT_FULL = 0, // a splat reaches every pixel where its alpha is at least 1/255
-    GSF_FOOTPRINT_OFFICIAL, // only the 16x16 tiles of its 3-sigma square, as the official CUDA rasterizer
+    GSF_FOOTPRINT_OFFICIAL, // only the 16x16 tiles of its 3-sigma square, as in Inria's CUDA rasterizer
 } gsf_footprint;
 
 typedef enum gsf_gradient {
     GSF_GRADIENT_TRUE = 0,  // the derivative of what was rendered
-    GSF_GRADIENT_OFFICIAL,  // straight through the 0.99 alpha clamp; the clamped x/z held constant
+    GSF_GRADIENT_OFFICIAL,  // as in Inria's: ignores the 0.99 clamp of alpha; treats the clamped x/z as constant
 } gsf_gradient;
 
 typedef struct gsf_render_desc {
@@ -381,13 +382,13 @@ typedef struct gsf_render_desc {
     gsf_footprint footprint;
     gsf_gradient gradient;
     int32_t antialiased;       // Mip-Splatting's 2D filter: opacity times sqrt(det/det_blurred)
-    float near_plane;          // splats with camera depth <= this are culled; 0 = 0.2 (official)
+    float near_plane;          // splats with camera depth <= this are culled; 0 = 0.2 (Inria's 3DGS)
     const uint8_t* hidden;     // NULL or one byte per splat: non-zero splats are not drawn (dropout)
     float opacity_scale;       // every opacity is multiplied by this; 0 = 1
     uint32_t _end_canary;
 } gsf_render_desc;
 
-typedef struct gsf_render_output { // caller's images, all f32 of the camera's size; data NULL = not wanted
+typedef struct gsf_render_output { // images of the caller, all f32 of the camera's size; data NULL = not wanted
     gsf_image color;   // 3 channels, not clamped
     gsf_image depth;   // 1 channel: expected camera depth sum(w z)/sum(w), 0 where nothing was blended
     gsf_image alpha;   // 1 channel: 1 - final transmittance
@@ -405,13 +406,14 @@ typedef struct gsf_splat_grads {
     float* background;      // (3)
 } gsf_splat_grads;
 
-// Workspace of the rasterizer: what backward needs of the last forward. Buffers only grow, so steady rendering does not
-// allocate. One rasterizer serves one thread at a time (it splits its work through the context's parallel hook).
+// Workspace of the rasterizer, which keeps the state of the last forward pass for the backward pass. Buffers only grow,
+// so steady rendering does not allocate. A rasterizer serves one thread at a time and splits its work through the
+// parallel hook.
 typedef struct gsf_rasterizer gsf_rasterizer;
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_rasterizer(gsf_context* ctx, gsf_rasterizer** out);
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* rasterizer);
 
-// Renders splats as `camera` sees them. Splats with a non-finite value are skipped.
+// Renders splats from `camera`. Splats with a non-finite value are skipped.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* rasterizer, const gsf_splats* splats,
                                                   const gsf_camera* camera, const gsf_render_desc* desc,
                                                   const gsf_render_output* out);
@@ -434,9 +436,9 @@ typedef struct gsf_train_view {
     gsf_camera camera;
     gsf_image image;   // u8 or f32 RGB, same size as the camera; copied. Values beyond 0..1 count as 0 and 1 in the loss
     gsf_image weight;  // 1 channel, u8 (255 = 1) or f32: per-pixel weight of the loss (a photo's mask or alpha, a restorer's
-                       // confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A pixel of weight 0 is
-                       // one outside the image: it counts as already right, and its colour is looked at by nobody, nor is
-                       // what is rendered there. Colours are not multiplied by alpha
+                       // confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A pixel of
+                       // weight 0 is one outside the image: it counts as already right, and its colour is looked at by
+                       // nobody, nor is what is rendered there. Colours are not multiplied by alpha
 } gsf_train_view;
 
 typedef struct gsf_train_desc { // zero = the official 3DGS value given beside each field; s = iterations / 30000
@@ -464,9 +466,10 @@ typedef struct gsf_train_desc { // zero = the official 3DGS value given beside e
     int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
     size_t max_splats;             // densification stops growing here; 0 = 2 million (mcmc: 1 million)
     int32_t mcmc;                  // 0; 1: densification as "3DGS as Markov Chain Monte Carlo" has it: splats of at most
-                                   // prune_opacity move onto others, up to 5 % a time join them until there are max_splats,
-                                   // and means are shaken in every step. Nothing is pruned, no opacity is reset;
-                                   // densify_grad, densify_absolute, densify_scale and prune_scale have no effect
+                                   // prune_opacity move onto others, up to 5 % a time join them until there are
+                                   // max_splats, and means are shaken in every step. Nothing is pruned, no opacity is
+                                   // reset; densify_grad, densify_absolute, densify_scale and prune_scale have no
+                                   // effect
     float mcmc_noise;              // 5e5 with mcmc, negative = means are not shaken
     gsf_render_desc render;        // footprint, gradient kind, antialiasing, near plane (0 = the smaller of 0.2 and 0.01
                                    // extent); background is taken from above; hidden, sh_bands, opacity_scale stay zero
@@ -492,11 +495,12 @@ typedef struct gsf_train_stats {
 
 typedef struct gsf_trainer gsf_trainer;
 
-// The trainer copies views and splats (non-finite ones are left out). Steps are deterministic: same bits for any number of
-// workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored views
-// and their weight is above 0, one restored view: both gradients go into one Adam step (unseen splats, too, move by their
-// momentum). For densification the gradients of photos and of restored views are averaged apart, and the larger mean counts.
-// Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4 with a weight.
+// The trainer copies views and splats (non-finite ones are left out). Steps are deterministic: same bits for any number
+// of workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored
+// views and their weight is above 0, one restored view: both gradients go into one Adam step (unseen splats, too, move
+// by their momentum). For densification the gradients of photos and of restored views are averaged apart, and the
+// larger mean counts. Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4
+// with a weight.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc,
                                                         const gsf_train_view* views, size_t view_count,
                                                         const gsf_splats* initial, gsf_trainer** out);
@@ -504,8 +508,8 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer);
 // What the trainer runs by: its desc with every default, the extent and the near plane filled in. To be shown, not to be
 // made from again: there, zero means default (lambda_ssim without an SSIM term is 0 here).
 GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer);
-// One iteration. After the last one it is GSF_ERROR_INVALID_ARGUMENT. A step that fails (cancelled, out of memory) changes
-// nothing, so it may be tried again. stats may be NULL.
+// One iteration. After the last one it is GSF_ERROR_INVALID_ARGUMENT. A step that fails (cancelled, out of memory)
+// changes nothing, so it may be tried again. stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats);
 // Replaces the restored views (their loss has weight `lambda`, may be changed at any time). count 0 removes them.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer,
@@ -518,9 +522,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
 // The current splats, borrowed until the next step or call of restore.
 GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer);
-// Adds the whole state as chunks / continues from it, bit-identically. Views and desc are the caller's to give again (in any
-// order; a difference is only a warning); the restored views' weight is part of the state. `chunks` of restore is a whole
-// file of chunks, which is checked; when it is refused the trainer stays as it was.
+// Adds the whole state as chunks / continues from it, bit-identically. Views and desc are the caller's to give again
+// (in any order; a difference is only a warning); the restored views' weight is part of the state. `chunks` of restore
+// is a whole file of chunks, which is checked; when it is refused the trainer stays as it was.
 GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer, gsf_text* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trainer, const char* name,
                                                            const void* chunks, size_t size);
@@ -529,8 +533,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf
 
 // Training-free restorer: reprojects what the splats do not yet explain of the reference photos (photo - render) through
 // the splats' depth with occlusion tests, blends by confidence, and adds it to the frame; keeps the render where no
-// reference sees. Floaters, which two references look through, are replaced by the photos behind them. References without a
-// render: the photos themselves. Fills *out; out->user is freed by gsf_splat_destroy_warp.
+// reference sees. Floaters, which two references look through, are replaced by the photos behind them. References
+// without a render: the photos themselves. Fills *out; out->user is freed by gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -585,7 +589,8 @@ typedef struct gsf_fix_stats { // what the last step did
 typedef struct gsf_fixer gsf_fixer;
 
 // Views and splats are copied; the restorer (NULL: plain training) is borrowed until the fixer is destroyed.
-// The path of every round is sampled once: cameras among which none can be flown are GSF_ERROR_DEGENERATE before any training.
+// The path of every round is sampled once: cameras among which none can be flown are GSF_ERROR_DEGENERATE before any
+// training.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc,
                                                       const gsf_train_view* views, size_t view_count,
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
@@ -612,8 +617,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_f
        gsf_splat_make_fixer         or gsf_splat_make_trainer with the desc's `train`, to train without repair
    `views` are indices into scene->views; NULL = all of them in their order (view_count is then scene->view_count). */
 
-// Decodes the photos of these views, as far as they are not there yet, and lists them for a trainer or fixer. *out is freed
-// with gsf_free; the images stay the scene's.
+// Decodes the photos of these views, as far as they are not there yet, and lists them for a trainer or fixer. *out is
+// freed with gsf_free; the images stay the scene's.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_train_views(gsf_context* ctx, gsf_scene* scene, const uint32_t* views,
                                                             size_t view_count, gsf_train_view** out);
 
@@ -654,13 +659,13 @@ typedef enum gsf_quality { // what each saves and costs: bench/QUALITY.md
     GSF_QUALITY_FAST,         // lazy_adam; windows are skipped from 36 dB on, frames restored at 320 x 240 pixels
 } gsf_quality;
 
-// The loop's settings for few photos: 1200 iterations, regularisers (train.dropout, opacity_decay, depth_smoothness), what
-// `quality` stands for, and from the scene (NULL = none) the near plane of all its cameras and the points that keep the path
-// upright, which are borrowed.
+// The loop's settings for few photos: 1200 iterations, regularisers (train.dropout, opacity_decay, depth_smoothness),
+// what `quality` stands for, and from the scene (NULL = none) the near plane of all its cameras and the points that
+// keep the path upright, which are borrowed.
 GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality quality);
 
-// Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Splats
-// look as they were trained when they are rendered with the same.
+// Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2.
+// Splats look as they were trained when they are rendered with the same.
 GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
 
 #ifdef __cplusplus
