@@ -3,6 +3,7 @@
 #ifndef TEST_H
 #define TEST_H
 
+#include <dirent.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -94,6 +95,34 @@ static inline const char* test_golden(const char* relative) {
     char* path = paths[turn++ & 7];
     snprintf(path, sizeof paths[0], "%s/%s", root, relative);
     return path;
+}
+
+// Names, without the ending, of the files `prefix`NAME`ending` in a golden folder, in order; there has to be one.
+enum { TEST_NAMES = 64, TEST_NAME_SIZE = 64 };
+typedef struct test_names { size_t count; char name[TEST_NAMES][TEST_NAME_SIZE]; } test_names;
+
+static inline int test_compare_names(const void* a, const void* b) { return strcmp((const char*)a, (const char*)b); }
+
+static inline test_names test_list_golden(const char* folder, const char* prefix, const char* ending) {
+    test_names names;
+    names.count = 0;
+    const size_t before = strlen(prefix), after = strlen(ending);
+    DIR* list = opendir(test_golden(folder));
+    for (const struct dirent* entry; list && (entry = readdir(list)) != NULL;) {
+        const size_t length = strlen(entry->d_name);
+        if (length <= before + after || length - after >= TEST_NAME_SIZE || names.count == TEST_NAMES) continue;
+        if (strncmp(entry->d_name, prefix, before) != 0 || strcmp(entry->d_name + length - after, ending) != 0) continue;
+        char* name = names.name[names.count++];
+        memcpy(name, entry->d_name, length - after);
+        name[length - after] = 0;
+    }
+    if (list) closedir(list);
+    qsort(names.name, names.count, TEST_NAME_SIZE, test_compare_names);
+    if (!names.count) {
+        fprintf(stderr, "%s: no %s*%s\n", test_golden(folder), prefix, ending);
+        exit(2);
+    }
+    return names;
 }
 
 // Path of a scratch file of this test program (its own folder in the build tree); static buffers as above.

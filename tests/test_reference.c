@@ -302,7 +302,8 @@ static void test_finite_differences(uint64_t seed, fd_seen* seen) {
 }
 
 int main(void) {
-    for (int k = 0; k < SPLAT_GOLDEN_COUNT; k++) test_golden_scene(splat_golden_names[k]);
+    const test_names scenes = splat_golden_scenes();
+    for (size_t k = 0; k < scenes.count; k++) test_golden_scene(scenes.name[k]);
     fd_seen seen;
     memset(&seen, 0, sizeof seen);
     for (uint64_t seed = 0; seed < 24; seed++) test_finite_differences(seed, &seen);

@@ -1,5 +1,5 @@
 // train_golden.h - loss, Adam, learning rates and densification against golden data of Inria's Python code.
-// Needs GSFIXER_IMPLEMENTATION (it calls internals); golden_train.c runs it, and any other program may.
+// Needs GSFIXER_IMPLEMENTATION (it calls internals); a part of golden_splat.c.
 #ifndef TRAIN_GOLDEN_H
 #define TRAIN_GOLDEN_H
 
@@ -19,9 +19,10 @@ static inline float* train_golden_pixels(const test_tensor* t, double scale) {
 static inline void train_golden_loss(gsf_context* ctx) {
     gsf__loss_scratch scratch;
     memset(&scratch, 0, sizeof scratch);
-    for (int s = 0; s < SPLAT_GOLDEN_COUNT; s++) {
+    const test_names scenes = splat_golden_scenes();
+    for (size_t s = 0; s < scenes.count; s++) {
         char label[160];
-        snprintf(label, sizeof label, "splat/scenes/%s.safetensors", splat_golden_names[s]);
+        snprintf(label, sizeof label, "splat/scenes/%s.safetensors", scenes.name[s]);
         test_tensors file = test_open_tensors(test_golden(label));
         test_tensor image = test_get_tensor(&file, "out.image"), photo = test_get_tensor(&file, "in.target");
         test_tensor loss = test_get_tensor(&file, "loss"), gradient = test_get_tensor(&file, "grad.dL_dimage");
@@ -38,7 +39,7 @@ static inline void train_golden_loss(gsf_context* ctx) {
         CHECK_NEAR(value.total, loss.v[0], 3e-7);
         CHECK_NEAR(value.l1, loss.v[1], 3e-7);
         CHECK_NEAR(value.ssim, loss.v[2], 3e-7);
-        snprintf(label, sizeof label, "%s dL/dimage (%s)", splat_golden_names[s], gsf_cpu_level_name(ctx->cpu_level));
+        snprintf(label, sizeof label, "%s dL/dimage (%s)", scenes.name[s], gsf_cpu_level_name(ctx->cpu_level));
         test_compare_floats(label, d, expected, image.count, 1e-5 * test_max_abs(expected, image.count));
         free(render); free(pixels); free(expected); free(d);
         test_free_tensor(&image); test_free_tensor(&photo); test_free_tensor(&loss); test_free_tensor(&gradient);
@@ -48,17 +49,26 @@ static inline void train_golden_loss(gsf_context* ctx) {
 }
 
 static inline void train_golden_ssim_gradient(gsf_context* ctx) {
-    static const char* const pairs[] = {"noisy", "shift", "unrelated_small"};
+    static const char suffix[] = ".grad_ssim_wrt_a";
     gsf__loss_scratch scratch;
     memset(&scratch, 0, sizeof scratch);
     test_tensors file = test_open_tensors(test_golden("metrics/pairs.safetensors"));
-    for (size_t p = 0; p < sizeof pairs / sizeof *pairs; p++) {
-        char label[160];
-        snprintf(label, sizeof label, "%s.a", pairs[p]);
+    uint64_t header;
+    memcpy(&header, file.data, 8);
+    gsf_json json;
+    CHECK_OK(ctx, gsf_parse_json(ctx, file.path, file.data + 8, (size_t)header, &json));
+    size_t pairs = 0;
+    for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
+        const size_t length = strlen(json.values[i].key);
+        if (length < sizeof suffix || strcmp(json.values[i].key + length - (sizeof suffix - 1), suffix) != 0) continue;
+        pairs++;
+        char pair[96], label[160];
+        snprintf(pair, sizeof pair, "%.*s", (int)(length - (sizeof suffix - 1)), json.values[i].key);
+        snprintf(label, sizeof label, "%s.a", pair);
         test_tensor a = test_get_tensor(&file, label);
-        snprintf(label, sizeof label, "%s.b", pairs[p]);
+        snprintf(label, sizeof label, "%s.b", pair);
         test_tensor b = test_get_tensor(&file, label);
-        snprintf(label, sizeof label, "%s.grad_ssim_wrt_a", pairs[p]);
+        snprintf(label, sizeof label, "%s%s", pair, suffix);
         test_tensor gradient = test_get_tensor(&file, label);
         float *render = train_golden_pixels(&a, 1.0 / 255.0), *d = (float*)malloc((a.count + 1) * sizeof(float));
         double *expected = splat_golden_interleave(&gradient), *photo = splat_golden_interleave(&b);
@@ -76,6 +86,8 @@ static inline void train_golden_ssim_gradient(gsf_context* ctx) {
         free(render); free(d); free(expected); free(photo); free(u8);
         test_free_tensor(&a); test_free_tensor(&b); test_free_tensor(&gradient);
     }
+    CHECK(pairs > 0);
+    gsf_destroy_json(ctx, &json);
     test_close_tensors(&file);
     gsf__loss_destroy_scratch(ctx, &scratch);
 }
@@ -221,7 +233,9 @@ static inline void train_golden_adam_reference(const test_tensors* file, const t
 }
 
 static inline void train_golden_adam(gsf_context* ctx, const char* name) {
-    test_tensors file = test_open_tensors(test_golden(name));
+    char path[160];
+    snprintf(path, sizeof path, "splat/%s.safetensors", name);
+    test_tensors file = test_open_tensors(test_golden(path));
     gsf__model model = train_golden_model(ctx, &file);
     test_tensor lr = test_get_tensor(&file, "lr");
     CHECK(lr.count == 30);
@@ -296,7 +310,9 @@ static inline void train_golden_check_indices(const test_tensors* file, const ch
 }
 
 static inline void train_golden_densify(gsf_context* ctx, const char* name) {
-    test_tensors file = test_open_tensors(test_golden(name));
+    char path[160];
+    snprintf(path, sizeof path, "splat/%s.safetensors", name);
+    test_tensors file = test_open_tensors(test_golden(path));
     gsf__model model = train_golden_model(ctx, &file);
     const size_t before = model.count;
     train_golden_fill(&file, "before.exp_avg", TRAIN_M, &model);
@@ -351,6 +367,8 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
 
 // Everything, with every instruction set of this machine.
 static inline void train_golden_checks(void) {
+    const test_names adam = test_list_golden("splat", "adam_", ".safetensors");
+    const test_names densify = test_list_golden("splat", "densify_", ".safetensors");
     for (int level = GSF_CPU_SCALAR; level <= GSF_CPU_AVX512_BF16; level++) {
         gsf_context ctx;
         memset(&ctx, 0, sizeof ctx);
@@ -358,10 +376,8 @@ static inline void train_golden_checks(void) {
         if (!CHECK_OK(&ctx, gsf_init_context(&ctx))) return;
         train_golden_loss(&ctx);
         train_golden_ssim_gradient(&ctx);
-        train_golden_adam(&ctx, "splat/adam_early.safetensors");
-        train_golden_adam(&ctx, "splat/adam_late.safetensors");
-        train_golden_densify(&ctx, "splat/densify_no_size_limit.safetensors");
-        train_golden_densify(&ctx, "splat/densify_size_limit20.safetensors");
+        for (size_t k = 0; k < adam.count; k++) train_golden_adam(&ctx, adam.name[k]);
+        for (size_t k = 0; k < densify.count; k++) train_golden_densify(&ctx, densify.name[k]);
     }
     train_golden_rates();
 }

@@ -92,6 +92,7 @@ static void check_wide(renderer* r) {
 
 int main(void) {
     static const gsf_cpu_level levels[] = {GSF_CPU_SCALAR, GSF_CPU_AVX2};
+    const test_names scenes = splat_golden_scenes();
     for (size_t k = 0; k < sizeof levels / sizeof levels[0]; k++) {
         renderer r;
         memset(&r, 0, sizeof r);
@@ -100,7 +101,7 @@ int main(void) {
         if (!CHECK_OK(&r.ctx, gsf_init_context(&r.ctx))) break;
         if (r.ctx.cpu_level != levels[k]) continue; // not on this machine
         if (!CHECK_OK(&r.ctx, gsf_splat_make_rasterizer(&r.ctx, &r.rasterizer))) break;
-        for (int s = 0; s < SPLAT_GOLDEN_COUNT; s++) check_golden(&r, splat_golden_names[s]);
+        for (size_t s = 0; s < scenes.count; s++) check_golden(&r, scenes.name[s]);
         check_wide(&r);
         gsf_splat_destroy_rasterizer(&r.ctx, r.rasterizer);
         printf("%s %016llx\n", gsf_cpu_level_name(r.ctx.cpu_level), (unsigned long long)r.hash);
