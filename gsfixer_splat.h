@@ -118,37 +118,37 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
 // unchanged except for the order of splats at equal depth.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats);
 
-/* Splat files. The format is chosen by the extension (.ply, .splat, .spz, case-insensitive); files with another extension are
-   recognised by content if they are PLY or SPZ (.splat has no magic number).
-       .ply    The standard 3DGS PLY: columns are found by name; ascii and both endians, float and double are read. Origin:
-               zero, or the rounded centre if coordinates are large (centre beyond 1e5 or beyond 1000 times the extent; both
-               are medians of samples and so robust against stray splats). A header with more rows than fit in the file is an
-               error. Written as binary little-endian float32, as by Inria's code; x y z become double if they are large by
-               the loader's rule, since float32 would lose precision (otherwise they stay float32, whatever the origin, so
-               that every viewer can read the file).
-       .splat  32 bytes per splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0 are
-               lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
-       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes per splat. Versions 1 to 3 are read, 2 and 3 written. Errors:
-               positions half a step (2^-12; finer if the median scale is below 2^-7, coarser if a coordinate exceeds
-               2047), log-scales 1/32 within -10..5.94, opacity 0.5/255, colour 0.5/255/0.15 as coefficient, SH 4.5/128
-               (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15 for small
-               w). Axes are converted to and from SPZ's (y and z negated), as Niantic's library does.
-               Extensions and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than
-               2^30 bytes of content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under GSF_NO_STB.
+/* Splat files. The format is chosen by the extension (.ply, .splat, .spz, case-insensitive); files with another
+   extension are recognised by content if they are PLY or SPZ (.splat has no magic number).
+       .ply    The standard 3DGS PLY: columns are found by name; ascii and both endians, float and double are read.
+               Origin: zero, or the rounded centre if coordinates are large (centre beyond 1e5 or beyond 1000 times the
+               extent; both are medians of samples and so robust against stray splats). A header with more rows than fit
+               in the file is an error. Written as binary little-endian float32, as by Inria's code; x y z become double
+               if they are large by the loader's rule, since float32 would lose precision (otherwise they stay float32,
+               whatever the origin, so that every viewer can read the file).
+       .splat  32 bytes per splat: float32 positions and scales, 8-bit colour, opacity and quaternion. SH bands above 0
+               are lost. Errors: scales 1e-6 relative, colour and opacity 0.5/255, quaternion components 0.012.
+       .spz    Niantic's SPZ: gzip of 20 (SH degree 0) to 65 bytes per splat. Versions 1 to 3 are read, 2 and 3 written.
+               Errors: positions half a step (2^-12; finer if the median scale is below 2^-7, coarser if a coordinate
+               exceeds 2047), log-scales 1/32 within -10..5.94, opacity 0.5/255, colour 0.5/255/0.15 as coefficient, SH
+               4.5/128 (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15 for
+               small w). Axes are converted to and from SPZ's (y and z negated), as Niantic's library does. Extensions
+               and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than 2^30 bytes of
+               content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under GSF_NO_STB.
    No format stores an origin, so world positions are written. For .splat and .spz, positions whose quantization is coarse
-   relative to the splats (more than a quarter of the median scale) cause a warning and positions out of range an error; with
-   `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers. Splats
-   with a NaN or infinite value are dropped, both when writing and when reading, and counted in a warning. An opacity of 0 or
-   1 is read as 0.001 or 0.999, since the logit must be finite. Memory is proportional to the content; a file that claims more
-   content than DEFLATE can compress into it (1032 times its size) is refused in advance. */
+   relative to the splats (more than a quarter of the median scale) cause a warning and positions out of range an error;
+   with `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers.
+   Splats with a NaN or infinite value are dropped, both when writing and when reading, and counted in a warning. An
+   opacity of 0 or 1 is read as 0.001 or 0.999, since the logit must be finite. Memory is proportional to the content; a
+   file that claims more content than DEFLATE can compress into it (1032 times its size) is refused in advance. */
 typedef enum gsf_splat_type { GSF_SPLAT_AUTO = 0, GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ } gsf_splat_type;
 
 typedef struct gsf_splat_save_desc {
     gsf_splat_type type;  // AUTO: by the extension, which must then be one of the three
     int32_t local;        // write positions relative to splats->origin, which the file does not store
-    int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers support: one byte more per splat and a tenth of the
-                          // rotation error (not visible for compact splats). Use 2 for readers from before July 2025 and
-                          // for glTF's KHR_gaussian_splatting_compression_spz_2
+    int32_t spz_version;  // 2 or 3; 0 = 3, which all maintained readers support: one byte more per splat and a tenth of
+                          // the rotation error (not visible for compact splats). Use 2 for readers from before July 2025
+                          // and for glTF's KHR_gaussian_splatting_compression_spz_2
 } gsf_splat_save_desc;
 
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out);
@@ -255,17 +255,17 @@ typedef enum gsf_visibility_method {
     GSF_VISIBILITY_RAYS,     // rays against points as oriented discs; with Embree, or by projecting the same discs
 } gsf_visibility_method;
 
-/* Every point is a disc: normal by PCA of its neighbours, radius proportional to their spacing. A point is occluded in a view
-   if the discs on its ray have a total coverage above a limit: each disc hit at distance q from its centre adds
-   1 - (q / radius)^2, unless the point is less than `tolerance` radii (of the larger disc) behind it. On an evenly sampled
-   plane, the defaults add up to about 7, so that a surface occludes even if half of its points are missing, while a stray
-   point does not.
-   The limit is `coverage`. If the scene has tracks, it is adjusted by three observations: whether the point's neighbours
-   have the view in their tracks, as expected if they are visible; the distance of the view from the nearest other view in
-   the point's track; and whether the view is behind the surface, relative to the views in the neighbours' tracks. Whether the
-   point's own track contains the view is not used: that is the method of tracks, and recall against it remains a fair test.
-   Measured (tests/test_visibility.c): balanced accuracy 0.94, 0.92 and 0.91 for three, six and nine views of eight
-   ray-traced scenes together; recall against the tracks 0.96, 0.99 and 0.99 on real photos. */
+/* Every point is a disc: normal by PCA of its neighbours, radius proportional to their spacing. A point is occluded in a
+   view if the discs on its ray have a total coverage above a limit: each disc hit at distance q from its centre adds 1 -
+   (q / radius)^2, unless the point is less than `tolerance` radii (of the larger disc) behind it. On an evenly sampled
+   plane, the defaults add up to about 7, so that a surface occludes even if half of its points are missing, while a
+   stray point does not. The limit is `coverage`. If the scene has tracks, it is adjusted by three observations: whether
+   the point's neighbours have the view in their tracks, as expected if they are visible; the distance of the view from
+   the nearest other view in the point's track; and whether the view is behind the surface, relative to the views in the
+   neighbours' tracks. Whether the point's own track contains the view is not used: that is the method of tracks, and
+   recall against it remains a fair test. Measured (tests/test_visibility.c): balanced accuracy 0.94, 0.92 and 0.91 for
+   three, six and nine views of eight ray-traced scenes together; recall against the tracks 0.96, 0.99 and 0.99 on real
+   photos. */
 typedef struct gsf_visibility_desc {
     gsf_visibility_method method;
     int32_t neighbours;    // for normals, default 12
@@ -298,18 +298,18 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_from_points(gsf_context* ctx, const d
 
 // ---- dense stereo --------------------------------------------------------------
 
-/* Points on which the photos of a few posed views agree, by PatchMatch multi-view stereo, coarse to fine: every pixel of every
-   view holds a plane (inverse depth and slope). Planes are propagated to neighbours and perturbed at random, and kept if they
-   improve the match of the photo's window in the other views (weighted normalised cross-correlation, with view weights per
-   pixel). A pixel is accepted if its match is good and it passes a consistency check: the plane of at least one other view at
-   the corresponding pixel leads back to it. Accepted pixels are merged over the views and thinned.
-   Zero is the default of every field. Pixels are those of the working size. */
+/* Points on which the photos of a few posed views agree, by PatchMatch multi-view stereo, coarse to fine: every pixel of
+   every view holds a plane (inverse depth and slope). Planes are propagated to neighbours and perturbed at random, and
+   kept if they improve the match of the photo's window in the other views (weighted normalised cross-correlation, with
+   view weights per pixel). A pixel is accepted if its match is good and it passes a consistency check: the plane of at
+   least one other view at the corresponding pixel leads back to it. Accepted pixels are merged over the views and
+   thinned. Zero is the default of every field. Pixels are those of the working size. */
 typedef struct gsf_dense_desc {
     uint64_t seed;
     int32_t max_size;        // longer side of the working images; larger photos are shrunk; 0 = 640
     int32_t levels;          // maximum number of pyramid levels; 0 = 3 (while at least 40 pixels are left)
-    int32_t iterations;      // per level; 0 = 2. Two more at the coarsest level; half as many at the finest, followed by two
-                             // that include the depth consistency of the views in the cost
+    int32_t iterations;      // per level; 0 = 2. Two more at the coarsest level; half as many at the finest, followed by
+                             // two that include the depth consistency of the views in the cost
     int32_t sources;         // other views that each view is matched with, at most 8; 0 = 4
     int32_t radius;          // of the matching window in pixels, at most 15; 0 = 5
     int32_t stride;          // between samples of the window; 0 = 2
@@ -337,7 +337,8 @@ typedef struct gsf_dense_map { // one view
 
 typedef struct gsf_dense_stats {
     size_t views, pairs;     // distinct views; ordered pairs compared
-    size_t pixels, matched, consistent; // over all views: pixels with texture; with a good match; confirmed by other views
+    size_t pixels, matched, consistent; // over all views: pixels with texture; with a good match; confirmed by other
+                                        // views
     int32_t spacing;         // in effect
     double seconds_prepare, seconds_match, seconds_fuse;
 } gsf_dense_stats;
@@ -435,53 +436,56 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf
 typedef struct gsf_train_view {
     gsf_camera camera;
     gsf_image image;   // u8 or f32 RGB, same size as the camera; copied. Values beyond 0..1 count as 0 and 1 in the loss
-    gsf_image weight;  // 1 channel, u8 (255 = 1) or f32: per-pixel weight of the loss (a photo's mask or alpha, a restorer's
-                       // confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A pixel of
-                       // weight 0 is one outside the image: it counts as already right, and its colour is looked at by
-                       // nobody, nor is what is rendered there. Colours are not multiplied by alpha
+    gsf_image weight;  // 1 channel, u8 (255 = 1) or f32: per-pixel weight of the loss (a photo's mask or alpha, a
+                       // restorer's confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A
+                       // pixel of weight 0 is one outside the image: it counts as already right, and its colour is
+                       // looked at by nobody, nor is what is rendered there. Colours are not multiplied by alpha
 } gsf_train_view;
 
-typedef struct gsf_train_desc { // zero = the official 3DGS value given beside each field; s = iterations / 30000
+typedef struct gsf_train_desc { // zero = the value given beside each field, that of Inria's 3DGS; s = iterations / 30000
     uint32_t _start_canary;
     int32_t iterations;            // 30000
     uint64_t seed;
     int32_t sh_degree;             // degree to train; 0 = the splats' own
-    int32_t sh_interval;           // 1000 s: iterations per further SH band; bands that the splats already use stay on
+    int32_t sh_interval;           // 1000 s: iterations per additional SH band; bands that the splats already use stay
+                                   // active
     float lr_means, lr_means_final;// 1.6e-4, 1.6e-6, both times extent, exponential decay over all iterations
-    int32_t lr_means_delay_steps;  // 0; over so many iterations lr_means is eased in, from lr_means_delay times it
-    float lr_means_delay;
+    int32_t lr_means_delay_steps;  // 0; number of warm-up iterations of lr_means
+    float lr_means_delay;          // initial factor of lr_means in the warm-up
     float lr_sh_dc, lr_sh_rest, lr_opacity, lr_scales, lr_quats; // 2.5e-3, 1.25e-4, 0.025, 5e-3, 1e-3
-    float extent;                  // 1.1 * largest distance of a training camera from their mean; median depth of the
-                                   // splats where the cameras coincide
+    float extent;                  // 1.1 * largest distance of a training camera from their mean; if the cameras
+                                   // coincide, the median depth of the splats
     float lambda_ssim;             // 0.2; negative = no SSIM term
-    float background[3];           // what lies behind the splats
-    int32_t background_random;     // 0; 1: any colour, another in each step, in place of `background`
+    float background[3];           // colour behind the splats
+    int32_t background_random;     // 0; 1: a new random colour in each step instead of `background`
     int32_t densify_from, densify_until; // 500 s, 15000 s (mcmc: 25000 s); densify_until < 0 = never, nor opacity resets
     int32_t densify_interval;      // 100, whatever s is
     float densify_grad;            // 2e-4
-    int32_t densify_absolute;      // 0; 1: gradients whose pixels cannot cancel (AbsGS; densify_grad is then 4e-4 to 8e-4)
-    float densify_scale;           // 0.01: clone below this share of extent, split above
+    int32_t densify_absolute;      // 0; 1: sum absolute gradients over the pixels (AbsGS; use densify_grad 4e-4 to 8e-4)
+    float densify_scale;           // 0.01: clone below this fraction of extent, split above
     float prune_opacity;           // 0.005
     float prune_scale;             // 0.1 of extent, after the first opacity reset
     int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
     size_t max_splats;             // densification stops growing here; 0 = 2 million (mcmc: 1 million)
-    int32_t mcmc;                  // 0; 1: densification as "3DGS as Markov Chain Monte Carlo" has it: splats of at most
-                                   // prune_opacity move onto others, up to 5 % a time join them until there are
-                                   // max_splats, and means are shaken in every step. Nothing is pruned, no opacity is
-                                   // reset; densify_grad, densify_absolute, densify_scale and prune_scale have no
-                                   // effect
-    float mcmc_noise;              // 5e5 with mcmc, negative = means are not shaken
+    int32_t mcmc;                  // 0; 1: densification as in "3DGS as Markov Chain Monte Carlo": splats with at most
+                                   // prune_opacity are relocated to others, up to 5 % are added at a time until there
+                                   // are max_splats, and noise is added to the means in every step. Nothing is pruned,
+                                   // no opacity is reset; densify_grad, densify_absolute, densify_scale and
+                                   // prune_scale have no effect
+    float mcmc_noise;              // 5e5 with mcmc; negative = no noise
     gsf_render_desc render;        // footprint, gradient kind, antialiasing, near plane (0 = the smaller of 0.2 and 0.01
                                    // extent); background is taken from above; hidden, sh_bands, opacity_scale stay zero
     // regularisers for few views; zero = off
     float dropout;                 // share of splats hidden in a step, growing linearly from 0 to this; the others'
                                    // opacities are divided by 1 - share (DropGaussian)
-    float opacity_decay;           // every opacity loses this share per iteration (applied every 10; Binocular3DGS: 0.005)
+    float opacity_decay;           // relative decay of every opacity per iteration (applied every 10; Binocular3DGS:
+                                   // 0.005)
     float scale_penalty;           // weight of mean(exp(log_scale)) / extent; with mcmc zero = 0.01, negative = off
     float opacity_penalty;         // weight of mean(opacity); with mcmc zero = 0.01, negative = off
     float depth_smoothness;        // weight of edge-aware smoothness of rendered inverse depth (times extent)
-    int32_t lazy_adam;             // 0; 1: the SH of splats that are not drawn catch up when they are, to the same values but
-                                   // for rounding (5e-7 after 1000 steps); pays where views see little of the scene
+    int32_t lazy_adam;             // 0; 1: the SH of splats that are not drawn are updated when they are drawn again, to
+                                   // the same values up to rounding (5e-7 after 1000 steps); pays off if views see
+                                   // little of the scene
     uint32_t _end_canary;
 } gsf_train_desc;
 
@@ -489,85 +493,89 @@ typedef struct gsf_train_stats {
     int32_t iteration;     // just done, from 1
     size_t splats;
     double loss, l1, ssim; // of this step's photo, without regularisers
-    double restored_loss;  // of this step's restored view, without its weight; 0 when none was taken
-    size_t rejected;       // non-finite initial splats, gradients and parameters left out or neutralised so far
+    double restored_loss;  // of this step's restored view, without its weight; 0 if there was none
+    size_t rejected;       // non-finite initial splats, gradients and parameters dropped or neutralised so far
 } gsf_train_stats;
 
 typedef struct gsf_trainer gsf_trainer;
 
-// The trainer copies views and splats (non-finite ones are left out). Steps are deterministic: same bits for any number
-// of workers. Each step takes one photo of a random permutation, reshuffled when used up, and, while there are restored
-// views and their weight is above 0, one restored view: both gradients go into one Adam step (unseen splats, too, move
-// by their momentum). For densification the gradients of photos and of restored views are averaged apart, and the
-// larger mean counts. Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), 4
-// with a weight.
+// The trainer copies views and splats (non-finite ones are dropped). Steps are deterministic: bit-identical for any
+// number of workers. Each step uses one photo of a random permutation, reshuffled when exhausted, and, if there are
+// restored views with a weight above 0, one restored view; both gradients enter one Adam step (splats that are not
+// visible also move by their momentum). For densification, the gradients of photos and of restored views are averaged
+// separately, and the larger mean is used.
+// Memory: about 1 kB per splat of SH degree 3; per pixel of a photo 3 bytes (u8) or 12 (f32), and 4 more with a weight.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const gsf_train_desc* desc,
                                                         const gsf_train_view* views, size_t view_count,
                                                         const gsf_splats* initial, gsf_trainer** out);
 GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer);
-// What the trainer runs by: its desc with every default, the extent and the near plane filled in. To be shown, not to be
-// made from again: there, zero means default (lambda_ssim without an SSIM term is 0 here).
+// The trainer's desc with all defaults, the extent and the near plane filled in. For display; not valid as input, because
+// zero means default there (e.g. lambda_ssim is 0 here without an SSIM term).
 GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer);
-// One iteration. After the last one it is GSF_ERROR_INVALID_ARGUMENT. A step that fails (cancelled, out of memory)
-// changes nothing, so it may be tried again. stats may be NULL.
+// Runs one iteration; GSF_ERROR_INVALID_ARGUMENT after the last one. A step that fails (cancelled, out of memory)
+// changes nothing and may be repeated. stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats);
-// Replaces the restored views (their loss has weight `lambda`, may be changed at any time). count 0 removes them.
+// Replaces the restored views; count 0 removes them. The weight of their loss, lambda, may be changed at any time.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer,
                                                               const gsf_train_view* views, size_t count);
 GSF_API void gsf_splat_set_restored_weight(gsf_trainer* trainer, float lambda);
-// Renders the current state (between steps).
+// Renders the current state. Call between steps.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_trainer* trainer,
                                                           const gsf_camera* camera, const gsf_render_output* out);
 // A copy of the current splats.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
 // The current splats, borrowed until the next step or call of restore.
 GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer);
-// Adds the whole state as chunks / continues from it, bit-identically. Views and desc are the caller's to give again
-// (in any order; a difference is only a warning); the restored views' weight is part of the state. `chunks` of restore
-// is a whole file of chunks, which is checked; when it is refused the trainer stays as it was.
+// Saves the complete state as chunks / restores it; training then continues bit-identically. The caller provides the
+// same views and desc again (views in any order; a difference causes only a warning); the weight of the restored views
+// is part of the state. restore takes a complete chunk file and checks it; if it is refused, the trainer is unchanged.
 GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer, gsf_text* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trainer, const char* name,
                                                            const void* chunks, size_t size);
 
 // ---- restorers -----------------------------------------------------------------
 
-// Training-free restorer: reprojects what the splats do not yet explain of the reference photos (photo - render) through
-// the splats' depth with occlusion tests, blends by confidence, and adds it to the frame; keeps the render where no
-// reference sees. Floaters, which two references look through, are replaced by the photos behind them. References
-// without a render: the photos themselves. Fills *out; out->user is freed by gsf_splat_destroy_warp.
+// Training-free restorer: reprojects the residual of the reference photos (photo - render) through the splats' depth
+// with occlusion tests, blends by confidence, and adds it to the frame; where no reference sees a pixel, the render is
+// kept. Floaters, identified by two references that see through them, are replaced by the photos behind them. For
+// references without a render, the photos themselves are reprojected. Fills *out; out->user is freed by
+// gsf_splat_destroy_warp.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_warp(gsf_context* ctx, gsf_restorer* out);
 GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 
 // ---- the repair loop -----------------------------------------------------------
-/* Trains, and at set iterations runs a round: sample a path, render it window by window, have the restorer fix the frames,
-   and train on with the fixed frames beside the photos: L = L_recon + lambda * L_gen. A new round's frames replace the
-   old ones. A frame shows all that a photo's field of view holds. Where the restorer asks for that (limits.squash), it is
-   rendered at the restorer's own size with fx and fy scaled by themselves, and trained on through that camera; else pixels
-   stay square, the frame may lack or add a margin, and what lies beyond the photo's field of view is not trained on. The
-   loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at any time.
+/* Trains, and at certain iterations runs a round: sample a path, render it window by window, have the restorer repair the
+   frames, and continue training on photos and repaired frames: L = L_recon + lambda * L_gen. The frames of a new round
+   replace the old ones. A frame shows all that a photo's field of view holds. Where the restorer asks for that
+   (limits.squash), it is rendered at the restorer's own size with fx and fy scaled by themselves, and trained on through
+   that camera; else pixels stay square, the frame may lack or add a margin, and what lies beyond the photo's field of
+   view is not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at
+   any time.
        gsf_splat_make_fixer -> gsf_splat_fix_step until stats.stage is GSF_FIX_DONE -> gsf_splat_trainer_export */
 
 typedef struct gsf_fix_desc {
     uint32_t _start_canary;
-    gsf_train_desc train;         // the whole run; train.iterations counts all steps
+    gsf_train_desc train;         // for the whole run; train.iterations is the total number of steps
     gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
     const double* points;         // (point_count,3) world points for the path's axes and depth; NULL = cameras only.
     size_t point_count;           //   Borrowed until the fixer is destroyed
-    const gsf_camera* path;       // (path_count) poses of the frames to repair, in place of the trajectory, in every round;
-    size_t path_count;            //   NULL = the trajectory. Spread evenly over windows x window_frames: where the counts
-                                  //   differ, poses are left out or repeated. Frames have the first photo's size and field
-                                  //   of view. Borrowed likewise
-    int32_t rounds;               // restoration rounds, default 3; < 0: none
+    const gsf_camera* path;       // (path_count) poses of the frames to repair, in place of the trajectory, in every
+                                  // round;
+    size_t path_count;            //   NULL = the trajectory. Spread evenly over windows x window_frames: where the
+                                  // counts differ, poses are left out or repeated. Frames have the first photo's size
+                                  // and field of view. Borrowed likewise
+    int32_t rounds;               // repair rounds, default 3; negative = none
     int32_t first_round;          // iteration after which the first round runs; 0 = about 1/3 of the iterations, shortly
                                   // before a densification
     int32_t last_round;           // the others are spread evenly up to this iteration; 0 = about 5/6, likewise
     int32_t windows;              // per round; 0 = one per training view, at least 2
-    int32_t window_frames;        // 0 = what the restorer was made for, else 17; moved to the nearest count that it takes
+    int32_t window_frames;        // 0 = the restorer's preferred count, else 17; changed to the nearest count that it
+                                  // accepts
     float lambda;                 // weight of the restored views at the end of training, default 1
-    float skip_psnr;              // a window is not restored when its render agrees with the references' warp to this many
-                                  // dB over the pixels that they explain; 0 = never skip
-    int32_t max_pixels;           // frames of more are rendered smaller for the restorer, with the same field of view, where
-                                  //   it takes smaller ones; 0 = its own size, or the photos'
+    float skip_psnr;              // skip windows whose render agrees with the warped references by this many dB, over the
+                                  // pixels that the references explain; 0 = never skip
+    int32_t max_pixels;           // frames of more are rendered smaller for the restorer, with the same field of view,
+                                  // where it takes smaller ones; 0 = its own size, or the photos'
     uint32_t _end_canary;
 } gsf_fix_desc;
 
@@ -575,15 +583,16 @@ typedef enum gsf_fix_stage { GSF_FIX_TRAIN = 0, GSF_FIX_PLAN, GSF_FIX_RESTORE, G
 
 typedef struct gsf_fix_stats { // what the last step did
     gsf_fix_stage stage;
-    gsf_train_stats train;            // of the last training step
+    gsf_train_stats train;            // TRAIN: of this step, else zero
     float lambda;
-    int32_t round, rounds;            // 1-based round that is planned or restored
+    int32_t round, rounds;            // 1-based round being planned or restored
     int32_t window, windows;          // likewise
     int32_t skipped;                  // windows skipped so far
-    int32_t frame_count;              // RESTORE: frames of this window, borrowed until the next step:
+    int32_t frame_count;              // RESTORE: number of frames in this window. The following are borrowed until the
+                                      // next step
     const gsf_camera* cameras;        // of the frames
     const gsf_image *rendered, *restored, *confidence; // f32; restored is NULL where the window was skipped
-    const int32_t* reference_index;   // per frame: the training view that it is, or -1
+    const int32_t* reference_index;   // per frame: the training view with the same pose, or -1
 } gsf_fix_stats;
 
 typedef struct gsf_fixer gsf_fixer;
@@ -596,20 +605,22 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gs
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
                                                       gsf_fixer** out);
 GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* fixer);
-// Likewise what the loop runs by, train as gsf_splat_trainer_desc has it (rounds is 0 without a restorer).
+// The loop's desc with defaults filled in, with `train` from gsf_splat_trainer_desc (rounds is 0 without a restorer). For
+// display, too.
 GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer);
-// One training iteration, or the planning of a round, or one window. After an error (or cancel) the fixer stays usable.
+// Runs one training iteration, plans a round, or restores one window. After an error or cancellation the fixer stays
+// usable.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
-// The trainer inside, for rendering and export.
+// The fixer's trainer, for rendering and export.
 GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer);
-// Checkpoint between steps, continued bit-identically by a fixer made from the same desc, views and initial splats.
+// Checkpoint between steps. A fixer made from the same desc, views and initial splats continues from it bit-identically.
 GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* fixer, gsf_text* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* fixer, const char* name,
                                                          const void* chunks, size_t size);
 
 // ---- from photos to splats -----------------------------------------------------
-/* What the program `gsfix fix` decides before it starts the loop, chosen by measurement (bench/QUALITY.md) for scenes of 3 to
-   50 photos. A host that makes the same calls gets the same splats to the last bit; every value may be changed in between.
+/* The choices of the program `gsfix fix`, based on measurements (bench/QUALITY.md) with scenes of 3 to 50 photos. A host
+   that makes the same calls gets bit-identical splats; every value may be changed in between.
        gsf_splat_load_scene         cameras and points
        gsf_splat_load_train_views   photos
        gsf_splat_initial_splats     points -> splats to begin with
@@ -617,18 +628,18 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_f
        gsf_splat_make_fixer         or gsf_splat_make_trainer with the desc's `train`, to train without repair
    `views` are indices into scene->views; NULL = all of them in their order (view_count is then scene->view_count). */
 
-// Decodes the photos of these views, as far as they are not there yet, and lists them for a trainer or fixer. *out is
-// freed with gsf_free; the images stay the scene's.
+// Decodes the photos of these views, unless already present, and lists them for a trainer or fixer. *out is freed with
+// gsf_free; the scene keeps ownership of the images.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_train_views(gsf_context* ctx, gsf_scene* scene, const uint32_t* views,
                                                             size_t view_count, gsf_train_view** out);
 
 typedef enum gsf_initial_kind { // which points become splats
     GSF_INITIAL_AUTO = 0,  // RANDOM for a scene without points, BOTH for up to 5 views, DENSE for more
-    GSF_INITIAL_BOTH,      // the scene's points that a view sees, by track or by ray
-    GSF_INITIAL_TRACKS,    // those whose track holds a view: the papers' start
-    GSF_INITIAL_RAYS,      // those that a ray from a view meets
+    GSF_INITIAL_BOTH,      // points of the scene that a view sees, by track or by ray
+    GSF_INITIAL_TRACKS,    // points whose track contains a view: the start used in the papers
+    GSF_INITIAL_RAYS,      // points that a ray from a view reaches
     GSF_INITIAL_ALL,       // all points of the scene
-    GSF_INITIAL_DENSE,     // BOTH, and between them what stereo finds in the photos
+    GSF_INITIAL_DENSE,     // BOTH, plus points of multi-view stereo between the views
     GSF_INITIAL_RANDOM,    // drawn evenly from the volumes that the views see, coloured by their photos
 } gsf_initial_kind;
 
@@ -637,35 +648,35 @@ typedef struct gsf_initial_desc {
     uint64_t seed;
     int32_t sh_degree;              // of the splats; 0 = 3, negative = 0
     int32_t random_points;          // RANDOM: how many; 0 = 20000
-    gsf_visibility_desc visibility; // BOTH, TRACKS, RAYS, DENSE; its method is the kind's
+    gsf_visibility_desc visibility; // BOTH, TRACKS, RAYS, DENSE; its method follows from the kind
     gsf_dense_desc dense;           // DENSE; max_points 0 = 40000, its seed is the one above, skip_sparse is on
 } gsf_initial_desc;
 
 typedef struct gsf_initial_stats {
     gsf_initial_desc used;           // the desc with its defaults filled in; its kind is never AUTO
-    size_t scene_points, new_points; // of the scene, and by stereo or at random
-    gsf_visibility_stats visibility; // zero where it was not needed
-    gsf_dense_stats dense;           // likewise
+    size_t scene_points, new_points; // from the scene; by stereo or at random
+    gsf_visibility_stats visibility; // zero if the filter was not used
+    gsf_dense_stats dense;           // zero if stereo was not used
 } gsf_initial_stats;
 
-// DENSE and RANDOM need the views' images. GSF_ERROR_DEGENERATE where no point is left. desc and stats may be NULL.
+// DENSE and RANDOM need the views' images. GSF_ERROR_DEGENERATE if no point is left. desc and stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
                                                           size_t view_count, const gsf_initial_desc* desc,
                                                           gsf_splats* out, gsf_initial_stats* stats);
 
-typedef enum gsf_quality { // what each saves and costs: bench/QUALITY.md
+typedef enum gsf_quality { // savings and costs: bench/QUALITY.md
     GSF_QUALITY_BALANCED = 0, // windows whose render agrees with the photos to 45 dB are not restored
-    GSF_QUALITY_EXACT,        // nothing is left out
+    GSF_QUALITY_EXACT,        // no approximations
     GSF_QUALITY_FAST,         // lazy_adam; windows are skipped from 36 dB on, frames restored at 320 x 240 pixels
 } gsf_quality;
 
 // The loop's settings for few photos: 1200 iterations, regularisers (train.dropout, opacity_decay, depth_smoothness),
-// what `quality` stands for, and from the scene (NULL = none) the near plane of all its cameras and the points that
-// keep the path upright, which are borrowed.
+// the settings of `quality`, and from the scene (NULL = none) the near plane for all its cameras and the points that
+// determine the axes of the path, which are borrowed.
 GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality quality);
 
-// Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2.
-// Splats look as they were trained when they are rendered with the same.
+// Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Use
+// the same near plane for training and rendering.
 GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
 
 #ifdef __cplusplus
