@@ -1,4 +1,4 @@
-/* gsfixer.h - common ground of the gsfixer toolkit: repair 3D Gaussian Splatting scenes made from few photos
+/* gsfixer.h - shared foundation of the gsfixer toolkit, which repairs 3D Gaussian Splatting scenes made from few photos
    SPDX-License-Identifier: MIT
 
    HOW TO INCLUDE
@@ -9,23 +9,23 @@
        only. Define GSFIXER_STATIC before every include to make all functions private to one file.
 
    WHAT IT DOES NOT DO
-       It never prints, exits, aborts or keeps global state; it starts no thread of its own.
+       It never prints, exits, aborts, keeps global state or starts threads.
 
    CONVENTIONS
        camera axes     OpenCV: x right, y down, z forward
        matrices        double[16], column-major (the layout of glm::dmat4); w2c maps world to camera, c2w back
        pixels          (0,0) is the top left corner of the top left pixel; its centre is (0.5, 0.5). COLMAP cx, cy.
        quaternions     w, x, y, z
-       colour          sRGB-coded values as they stand in the photo, [0,1] when float; nothing is linearised
+       colour          sRGB-coded values as in the photo, [0,1] if float; nothing is linearised
        lengths         those of the scene file
        paths, text     UTF-8
 
    CONFIGURATION (define before the implementation)
-       GSF_NO_STB              no image files through stb (the host decodes images itself; PNG is written), no .spz files read
-       GSF_STB_IMAGE_INCLUDE / GSF_STB_IMAGE_WRITE_INCLUDE   where stb lies (default <stb/stb_image.h>, ...)
-       GSF_USE_OIIO            C++ only: EXR, TIFF, 16-bit files through OpenImageIO
-       GSF_USE_GLM             C++ only: adapters to glm matrices (declared as soon as it is defined)
-       GSF_ASSERT(x)           default assert(x); only for this library's own bugs
+       GSF_NO_STB              do not use stb: the host decodes images, .spz files cannot be read; PNG can still be written
+       GSF_STB_IMAGE_INCLUDE / GSF_STB_IMAGE_WRITE_INCLUDE   paths of stb (default <stb/stb_image.h>, ...)
+       GSF_USE_OIIO            C++ only: EXR, TIFF and 16-bit files through OpenImageIO
+       GSF_USE_GLM             C++ only: adapters to glm matrices (define it before every include)
+       GSF_ASSERT(x)           default assert(x); used only to detect bugs of this library
        GSF_NO_SIMD             scalar kernels only
 
    STEP BY STEP
@@ -36,10 +36,11 @@
        if (gsf_load_image(&ctx, "photo.jpg", 3, &photo) != GSF_OK) puts(ctx.error);
        gsf_destroy_image(&ctx, &photo);
 
-   ERRORS      Every fallible function returns gsf_result; the sentence ("file:offset: expected x, got y") stands in
-               ctx->error and goes to the log hook. On error outputs are zeroed or untouched and nothing leaks.
-   MEMORY      All memory comes from the context's allocator. Who made an object destroys it with the same context.
-   THREADS     One thread at a time per context. Work is split through the parallel hook on a chunk grid that depends
+   ERRORS      Every fallible function returns gsf_result; the message ("file:offset: expected x, got y") is stored in
+               ctx->error and passed to the log hook. On error, outputs are zeroed or unchanged and nothing leaks.
+   MEMORY      All memory comes from the context's allocator. The caller that makes an object destroys it with the same
+               context.
+   THREADS     One thread at a time per context. Work is split through the parallel hook on a grid of chunks that depends
                on sizes only, so results do not depend on the number of workers.
    SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images >>resize >>metrics
                >>cameras >>clips >>glm >>oiio
@@ -104,13 +105,13 @@ GSF_API const char* gsf_describe_result(gsf_result result);
 
 typedef struct gsf_context gsf_context;
 
-typedef enum gsf_cpu_level { // instruction sets a kernel may use; AUTO picks the best one of the machine
+typedef enum gsf_cpu_level { // instruction sets that kernels may use; AUTO selects the best one of the machine
     GSF_CPU_AUTO = 0,
     GSF_CPU_SCALAR = 1,
     GSF_CPU_AVX2 = 2,        // with FMA and F16C
     GSF_CPU_AVX512 = 3,      // F, BW, DQ and VL
-    GSF_CPU_AVX512_VNNI = 4, // dot products of bytes
-    GSF_CPU_AVX512_BF16 = 5, // and of bfloat16
+    GSF_CPU_AVX512_VNNI = 4, // AVX512 and 8-bit dot products
+    GSF_CPU_AVX512_BF16 = 5, // AVX512_VNNI and bfloat16 dot products
 } gsf_cpu_level;
 
 typedef enum gsf_log_level { GSF_LOG_ERROR = 0, GSF_LOG_WARNING = 1, GSF_LOG_INFO = 2 } gsf_log_level;
@@ -135,18 +136,18 @@ typedef struct gsf_parallel { // run body for chunks 0..chunk_count-1, return wh
     void* user;
 } gsf_parallel;
 
-typedef struct gsf_io { // both or neither (neither: stdio; writes go to a temporary that is then renamed)
-    // Reads a whole file. *data comes from ctx->allocator via gsf_alloc and is freed by the library. GSF_ERROR_NOT_FOUND
-    // where there is no such file, and for nothing else: such files are gone without where they may lack (a photo, one of
-    // two formats), while every other result ends the work, since a file that is there was asked for.
+typedef struct gsf_io { // both or neither (neither: stdio; files are written under a temporary name and renamed)
+    // Reads a whole file. *data comes from ctx->allocator via gsf_alloc and is freed by the library. Return
+    // GSF_ERROR_NOT_FOUND if the file does not exist, and only then: optional files (a photo, one of two formats) may be
+    // missing, while any other error ends the call.
     gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size);
     gsf_result (*write_fn)(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
     void* user;
-    int plain_files; // 1: what read_fn reads are the platform's own files (it logs or counts reads, say), which the library
-                     // may then also list, map and read in part, as it does with stdio's
+    int plain_files; // 1: read_fn reads ordinary files of the platform (and only logs or counts reads, for example); the
+                     // library may then also list folders, map files and read parts of them, as with stdio
 } gsf_io;
 
-typedef struct gsf_progress { // called from the calling thread, at most a few times a second's worth of work
+typedef struct gsf_progress { // called on the calling thread, at most a few times per second of work
     void (*progress_fn)(void* user, const char* stage, double done, double total);
     void* user;
 } gsf_progress;
@@ -154,23 +155,23 @@ typedef struct gsf_progress { // called from the calling thread, at most a few t
 struct gsf_context {
     gsf_allocator allocator;
     gsf_logger logger;
-    gsf_parallel parallel;   // zero: OpenMP where compiled with it, else serial
+    gsf_parallel parallel;   // zero: OpenMP if compiled with it, else serial
     gsf_io io;
     gsf_progress progress;
     gsf_cpu_level cpu_level; // in: AUTO or a level to force; out: the level in use
     int threads;             // for the OpenMP default: number of workers, 0 = all cores
     int cancel;              // see gsf_request_cancel
     int initialized;
-    const struct gsf__services* services; // private: what the modules' implementations need of this header's
-    char error[512];         // sentence of the last error
+    const struct gsf__services* services; // private: internals of this header for the other modules' implementations
+    char error[512];         // message of the last error
 };
 
-// Fills in every hook that is zero and resolves cpu_level (lowered, never raised, to what the machine has).
+// Fills in every hook that is zero and resolves cpu_level (a level that the machine lacks is lowered).
 // Call once on a zeroed or filled-in struct. Owns nothing, so there is no counterpart.
 GSF_API GSF_NODISCARD gsf_result gsf_init_context(gsf_context* ctx);
 
-// Asks running work to stop at its next safe point with GSF_ERROR_CANCELLED. Safe from signal handlers and other
-// threads. Cleared by gsf_clear_cancel.
+// Requests that running work stop at its next safe point with GSF_ERROR_CANCELLED. Safe to call from signal handlers and
+// other threads. Reset by gsf_clear_cancel.
 GSF_API void gsf_request_cancel(gsf_context* ctx);
 GSF_API void gsf_clear_cancel(gsf_context* ctx);
 GSF_API int gsf_is_cancelled(const gsf_context* ctx);
@@ -179,7 +180,7 @@ GSF_API int gsf_is_cancelled(const gsf_context* ctx);
 GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.
-// One line: what a file's text may bring of line ends and other control characters prints as '?'.
+// The message is one line: control characters, for example in text quoted from a file, become '?'.
 GSF_API gsf_result gsf_fail(gsf_context* ctx, gsf_result result, const char* format, ...) GSF_PRINTF(3, 4);
 GSF_API void gsf_log(gsf_context* ctx, gsf_log_level level, const char* format, ...) GSF_PRINTF(3, 4);
 
@@ -197,7 +198,7 @@ GSF_API double gsf_random_normal(uint64_t seed, uint64_t stream, uint64_t index)
 
 // ---- text and files ------------------------------------------------------------
 
-typedef struct gsf_text { // growing UTF-8 buffer, always zero-terminated once something was added
+typedef struct gsf_text { // growing UTF-8 buffer, zero-terminated as soon as anything has been appended
     char* data;
     size_t size, capacity;
     int failed; // an allocation failed; later calls do nothing
@@ -209,16 +210,16 @@ GSF_API void gsf_text_json_string(gsf_context* ctx, gsf_text* text, const char* 
 GSF_API void gsf_text_json_number(gsf_context* ctx, gsf_text* text, double value);       // NaN, inf become null
 GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text);
 
-// Whole-file input and output through the io hook. `*data` is freed with gsf_free. Only regular files are read: a pipe or
-// a device is refused, not waited for.
-// gsf_write_file replaces the file only once everything is written: on a full disk the previous file survives.
+// Whole-file input and output through the io hook. `*data` is freed with gsf_free. Only regular files are read: pipes and
+// devices are refused instead of blocking.
+// gsf_write_file replaces the file only after everything is written: on a full disk, the previous file survives.
 GSF_API GSF_NODISCARD gsf_result gsf_read_file(gsf_context* ctx, const char* path, void** data, size_t* size);
 GSF_API GSF_NODISCARD gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void* data, size_t size);
 
 /* Tagged chunks, the container of checkpoints. Little-endian:
        char magic[8] "GSFCHUNK" | u32 version
        repeated: char tag[4] | u64 size | bytes[size] | u32 crc32(tag, size, bytes)
-       the last chunk is "END " of size 0, so a cut file is noticed. */
+       the last chunk is "END " of size 0, so that truncation is detected. */
 typedef struct gsf_chunk {
     char tag[5]; // zero-terminated
     const void* data; // points into the file's buffer; any alignment
@@ -351,14 +352,15 @@ typedef struct gsf_camera { // pinhole: u = fx X/Z + cx, v = fy Y/Z + cy with (X
     int32_t width, height;
 } gsf_camera;
 
-// Finite, rigid (1e-4), positive focal lengths and size? Otherwise the error names the entry.
+// Checks that a camera is finite and rigid (to 1e-4) with positive focal lengths and size; otherwise the error names the
+// entry.
 GSF_API GSF_NODISCARD gsf_result gsf_check_camera(gsf_context* ctx, const gsf_camera* camera);
 GSF_API void gsf_camera_center(const gsf_camera* camera, double center[3]);
 GSF_API void gsf_camera_c2w(const gsf_camera* camera, double c2w[16]);
 GSF_API void gsf_camera_set_c2w(gsf_camera* camera, const double c2w[16]); // inverts a rigid transform
-// World point to pixel and camera depth. Returns 0 (u, v untouched) where depth <= 0.
+// World point to pixel and camera depth. Returns 0 (u, v unchanged) if depth <= 0.
 GSF_API int gsf_camera_project(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth);
-// The same view in another image size; intrinsics scale with width and height separately.
+// The same view at another image size; intrinsics are scaled separately in width and height.
 GSF_API gsf_camera gsf_camera_resized(const gsf_camera* camera, int32_t width, int32_t height);
 
 // JSON list of cameras ({"cameras":[{"name","w2c":[16 numbers, row-major],"fx","fy","cx","cy","width","height"}]}),
@@ -370,75 +372,74 @@ GSF_API GSF_NODISCARD gsf_result gsf_load_cameras(gsf_context* ctx, const char* 
                                                   size_t* count);
 
 // ---- restorer interface --------------------------------------------------------
-// What turns artifact-ridden renders into clean frames. The repair loop of gsfixer_splat.h sees only this struct; a
-// host fills in its own functions, or takes one of the toolkit's (warp in gsfixer_splat.h, the video model in
+// A restorer turns renders with artifacts into clean frames. The repair loop of gsfixer_splat.h uses only this struct; a
+// host fills in its own functions or uses one of the toolkit's restorers (warp in gsfixer_splat.h, the video model in
 // gsfixer_nn.h).
 
 typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
-    uint32_t struct_size;           // set by the caller, who zeroes the rest: nothing is written beyond it
+    uint32_t struct_size;           // set by the caller, which zeroes the rest: nothing is written beyond it
     int32_t frame_count_min, frame_count_max;
     int32_t frame_count_step;       // legal counts: min, min + step, ... up to max
     int32_t width_multiple, height_multiple;
     int32_t width_max, height_max;
     int32_t needs_depth, needs_alpha, needs_caption;
-    int32_t frame_count, width, height; // what it was made for, and so the default; 0: nothing in particular
-    int32_t squash;                 // it was made for frames that are the whole picture at `width` x `height` (or at another
-                                    //   legal size), each axis scaled by itself; else pixels stay square
-    int32_t explains;               // what it writes shows what the references explain, with confidence 0 where they explain
-                                    //   nothing: the loop compares its frames with the renders to find windows that need no
-                                    //   repair, where else it reprojects the references itself
+    int32_t frame_count, width, height; // preferred values, used by default; 0: no preference
+    int32_t squash;                 // frames contain the full image scaled to `width` x `height` (or another legal size), each
+                                    //   axis separately; otherwise pixels stay square
+    int32_t explains;               // its output shows what the references explain, with confidence 0 where they explain
+                                    //   nothing: the loop compares it with the renders to find windows that need no repair,
+                                    //   instead of reprojecting the references itself
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
 } gsf_restorer_limits;
 
 typedef struct gsf_reference { // a photo the scene was trained on
-    gsf_image color;  // f32, 3 channels; the splats' render where the photo has pixels that do not count, and no depth
-    gsf_image render; // f32, 3 channels: what the splats show there; data NULL unless needs_depth
-    gsf_image depth;  // f32 camera depth rendered from the splats, 0 = nothing there; data NULL unless needs_depth
+    gsf_image color;  // f32, 3 channels; masked pixels are replaced by the splats' render and have no depth
+    gsf_image render; // f32, 3 channels: the splats rendered from this camera; data NULL unless needs_depth
+    gsf_image depth;  // f32 camera depth rendered from the splats, 0 = none; data NULL unless needs_depth
     gsf_camera camera;
 } gsf_reference;
 
 typedef struct gsf_restore_window { // one clip; all pointers are borrowed for the call
     uint32_t struct_size;
     int32_t frame_count;
-    const gsf_image* color;           // f32, 3 channels, [0,1]; all of one size
-    const gsf_image* depth;           // f32, 1 channel: expected camera depth, 0 = nothing; NULL unless needs_depth
+    const gsf_image* color;           // f32, 3 channels, [0,1]; all of the same size
+    const gsf_image* depth;           // f32, 1 channel: expected camera depth, 0 = none; NULL unless needs_depth
     const gsf_image* alpha;           // f32, 1 channel: 1 - transmittance; NULL unless needs_alpha
     const gsf_camera* cameras;
-    const int32_t* reference_index;   // per frame: this frame IS that reference's view, or -1
+    const int32_t* reference_index;   // per frame: the reference with the same pose, or -1
     const char* caption;              // NULL = none
     uint64_t seed;
     gsf_image* out_color;             // f32, 3 channels, same size; written by the restorer
     gsf_image* out_confidence;        // f32, 1 channel, [0,1]; weight of each restored pixel in training
-    int32_t clip;                     // number of the clip in its run, from 0: the loop's windows, round after round
-    int32_t part;                     // of a clip that is restored in several parts: which, from 0
+    int32_t clip;                     // index of the clip in its run, from 0: the loop's windows, round after round
+    int32_t part;                     // index of the part if a clip is restored in several parts, from 0
 } gsf_restore_window;
 
-// One restorer serves one loop at a time: what begin took is one run's, and ends with it.
+// One restorer serves one loop at a time: its state belongs to one run, from begin_fn to end_fn.
 typedef struct gsf_restorer {
     uint32_t struct_size; // sizeof(gsf_restorer) of the caller, so that fields can be added
     const char* name;
     void* user;
     gsf_result (*query_fn)(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                            gsf_restorer_limits* out);
-    // References are borrowed for the call: what later windows need of them is copied. The toolkit's restorers refuse a
-    // second begin before end.
+    // References are borrowed for the call; copy what later windows need. The toolkit's restorers refuse a second begin
+    // before end.
     gsf_result (*begin_fn)(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count);
     gsf_result (*restore_fn)(void* user, gsf_context* ctx, const gsf_restore_window* window);
-    void (*end_fn)(void* user, gsf_context* ctx); // releases what begin took; called once per successful begin
+    void (*end_fn)(void* user, gsf_context* ctx); // releases what begin allocated; called once per successful begin
 } gsf_restorer;
 
-/* Restores a clip of any size and length, between begin_fn and end_fn, where restore_fn takes only what its limits allow.
-   out_color and out_confidence get the caller's frames, in the caller's size.
-       size    Frames are resized to what the restorer was made for (limits.squash) or to the nearest size that it takes, and
-               back, each axis by itself, with PIL's bicubic filter (depth: the nearest pixel). A restorer of square pixels
-               whose sizes are all of another aspect refuses (GSF_ERROR_UNSUPPORTED).
-       length  A clip too short, or of a count between two legal ones, is stretched to the next legal count: each frame that
-               the restorer sees is the clip's nearest in time, and so is each frame that the clip gets back. One too long is
-               restored in parts of the count that the restorer was made for, spread evenly, neighbours overlapping by a
-               sixth of their frames or more; there they are blended, each weighing less towards its end. Part p has the
-               seed window->seed + p, and window->clip for all.
-   Frames that need neither are passed as they are. (The official code has no way for clips of other lengths: its benchmark
-   thins clips out to 49 frames and skips shorter ones, so that other frames are not restored at all.) */
+/* Restores a clip of any size and length. Call between begin_fn and end_fn. restore_fn gets only sizes and lengths that its
+   limits allow; out_color and out_confidence receive the caller's frames at the caller's size.
+       size    Frames are resized to the restorer's preferred size (limits.squash) or the nearest legal one, and back, each
+               axis separately, with PIL's bicubic filter (depth: nearest neighbour). If pixels must stay square and all
+               legal sizes have a different aspect ratio, the result is GSF_ERROR_UNSUPPORTED.
+       length  A clip that is too short or between two legal lengths is stretched to the next legal length, by nearest frame
+               in time in both directions. A clip that is too long is restored in evenly spaced parts of the preferred
+               length, which overlap by at least a sixth of their frames and are cross-faded there. Part p gets the seed
+               window->seed + p; window->clip is the same for all parts.
+   Clips that need neither are passed through unchanged. (The GSFixer release does not support other lengths: its benchmark
+   subsamples clips to 49 frames and skips shorter ones, so the remaining frames are not restored.) */
 GSF_API GSF_NODISCARD gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restorer,
                                                   const gsf_restore_window* window);
 
@@ -453,7 +454,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_re
 #include <glm/vec3.hpp>
 #include <cstring>
 
-// Matrices have glm's layout already (column-major doubles), so these only copy.
+// Matrices already have glm's layout (column-major doubles), so these functions only copy.
 inline glm::dmat4 gsf_to_glm(const double m[16]) {
     glm::dmat4 out;
     std::memcpy(&out[0][0], m, sizeof out);
