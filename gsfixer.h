@@ -21,7 +21,7 @@
        paths, text     UTF-8
 
    CONFIGURATION (define before the implementation)
-       GSF_NO_STB              do not use stb: the host decodes images, .spz files cannot be read; PNG can still be written
+       GSF_NO_STB              no stb: the host decodes images, .spz cannot be read; PNG can still be written
        GSF_STB_IMAGE_INCLUDE / GSF_STB_IMAGE_WRITE_INCLUDE   paths of stb (default <stb/stb_image.h>, ...)
        GSF_USE_OIIO            C++ only: EXR, TIFF and 16-bit files through OpenImageIO
        GSF_USE_GLM             C++ only: adapters to glm matrices (define it before every include)
@@ -384,11 +384,11 @@ typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
     int32_t width_max, height_max;
     int32_t needs_depth, needs_alpha, needs_caption;
     int32_t frame_count, width, height; // preferred values, used by default; 0: no preference
-    int32_t squash;                 // frames contain the full image scaled to `width` x `height` (or another legal size), each
-                                    //   axis separately; otherwise pixels stay square
+    int32_t squash;                 // frames contain the full image scaled to `width` x `height` (or another legal
+                                    // size), each axis separately; otherwise pixels stay square
     int32_t explains;               // its output shows what the references explain, with confidence 0 where they explain
-                                    //   nothing: the loop compares it with the renders to find windows that need no repair,
-                                    //   instead of reprojecting the references itself
+                                    // nothing: the loop compares it with the renders to find windows that need no
+                                    // repair, instead of reprojecting the references itself
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
 } gsf_restorer_limits;
 
@@ -429,17 +429,17 @@ typedef struct gsf_restorer {
     void (*end_fn)(void* user, gsf_context* ctx); // releases what begin allocated; called once per successful begin
 } gsf_restorer;
 
-/* Restores a clip of any size and length. Call between begin_fn and end_fn. restore_fn gets only sizes and lengths that its
-   limits allow; out_color and out_confidence receive the caller's frames at the caller's size.
-       size    Frames are resized to the restorer's preferred size (limits.squash) or the nearest legal one, and back, each
-               axis separately, with PIL's bicubic filter (depth: nearest neighbour). If pixels must stay square and all
+/* Restores a clip of any size and length. Call between begin_fn and end_fn. restore_fn gets only sizes and lengths that
+   its limits allow; out_color and out_confidence receive the caller's frames at the caller's size.
+       size    Frames are resized to the restorer's preferred size (limits.squash) or the nearest legal one, and back,
+               each axis separately, with PIL's bicubic filter (depth: nearest neighbour). If pixels must stay square and all
                legal sizes have a different aspect ratio, the result is GSF_ERROR_UNSUPPORTED.
-       length  A clip that is too short or between two legal lengths is stretched to the next legal length, by nearest frame
-               in time in both directions. A clip that is too long is restored in evenly spaced parts of the preferred
+       length  A clip that is too short or between two legal lengths is stretched to the next legal length, by nearest
+               frame in time in both directions. A clip that is too long is restored in evenly spaced parts of the preferred
                length, which overlap by at least a sixth of their frames and are cross-faded there. Part p gets the seed
                window->seed + p; window->clip is the same for all parts.
-   Clips that need neither are passed through unchanged. (The GSFixer release does not support other lengths: its benchmark
-   subsamples clips to 49 frames and skips shorter ones, so the remaining frames are not restored.) */
+   Clips that need neither are passed through unchanged. (The GSFixer release does not support other lengths: its
+   benchmark subsamples clips to 49 frames and skips shorter ones, so the remaining frames are not restored.) */
 GSF_API GSF_NODISCARD gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restorer,
                                                   const gsf_restore_window* window);
 
