@@ -2321,6 +2321,8 @@ GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int6
 
 typedef struct gsf__moments { double mean, square; } gsf__moments; // square: sum of (x - mean)^2
 
+typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
+
 typedef struct gsf__norm_job gsf__norm_job;
 typedef struct gsf__norm_kernels {
     gsf__moments (*moments)(const float* x, int64_t count, int centre); // centre 0: mean is taken as 0
@@ -2333,7 +2335,8 @@ typedef struct gsf__norm_kernels {
 
 struct gsf__norm_job {
     const gsf__norm_kernels* kernels;
-    const float *x, *weight, *bias, *scale, *shift, *cos, *sin;
+    const float *x, *cos, *sin;
+    gsf__norm_vectors by;
     float* y;
     int64_t rows, dim, stride, chunk_rows, rope_first;
     int64_t group_size, part_size, parts, first_group; // group norm: values of a group, of a part of it, parts of a group
@@ -2363,9 +2366,9 @@ static void gsf__norm_row_scalar(const gsf__norm_job* job, const float* x, float
     const float inverse = gsf__norm_inverse(m, job->dim, job->eps);
     for (int64_t i = 0; i < job->dim; i++) {
         float v = (float)((double)x[i] - m.mean) * inverse;
-        if (job->weight) v *= job->weight[i];
-        if (job->bias) v += job->bias[i];
-        if (job->scale) v = v * (1.0f + job->scale[i]) + job->shift[i];
+        if (job->by.weight) v *= job->by.weight[i];
+        if (job->by.bias) v += job->by.bias[i];
+        if (job->by.scale) v = v * (1.0f + job->by.scale[i]) + job->by.shift[i];
         y[i] = v;
     }
 }
@@ -2400,13 +2403,6 @@ static void gsf__norm_silu_scalar(const float* x, int64_t count, const float* me
                                     const float* offset, float* y) {
     for (int64_t i = 0; i < count; i++)
         y[i] = gsf__nn_activation_ref(GSF_NN_SILU, (x[i] - mean[i]) * scale[i] + offset[i]);
-}
-
-typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; } gsf__norm_vectors; // each may be NULL
-
-GSF__SHARED gsf__norm_vectors gsf__norm_vectors_of(const gsf__norm_job* job) {
-    const gsf__norm_vectors v = {job->weight, job->bias, job->scale, job->shift};
-    return v;
 }
 
 #define gsf__moments_sums GSF__V(gsf__moments_sums)
@@ -2490,7 +2486,7 @@ GSF__V_INLINE gsf__vf gsf__norm_value(gsf__norm_vectors by, const gsf__norm_term
 GSF__V_INLINE void GSF__V(gsf__norm_row_all)(const gsf__norm_job* job, const float* x, float* y, int stream) {
     const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre);
     const gsf__norm_terms n = gsf__norm_terms_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const gsf__norm_vectors by = job->by;
     const int64_t dim = job->dim;
     int64_t i = 0;
     for (; i + GSF__LANES <= dim; i += GSF__LANES) {
@@ -2509,7 +2505,7 @@ GSF__V_KERNEL void GSF__V(gsf__norm_row)(const gsf__norm_job* job, const float* 
 GSF__V_KERNEL void GSF__V(gsf__norm_head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin) {
     const gsf__moments m = GSF__V(gsf__moments_all)(x, job->dim, job->centre);
     const gsf__norm_terms n = gsf__norm_terms_of(m, gsf__norm_inverse(m, job->dim, job->eps));
-    const gsf__norm_vectors by = gsf__norm_vectors_of(job);
+    const gsf__norm_vectors by = job->by;
     const int64_t dim = job->dim;
     int64_t i = 0;
     for (; i + GSF__LANES <= dim; i += GSF__LANES) {
@@ -2588,28 +2584,27 @@ static void gsf__norm_chunk(void* arg, size_t chunk, int worker) {
         job->kernels->row(job, job->x + r * job->dim, job->y + r * job->dim);
 }
 
-static void gsf__norm_rows(gsf_context* ctx, gsf__norm_job* job) {
-    job->kernels = gsf__norm_kernels_of(ctx->cpu_level);
-    job->chunk_rows = gsf__nn_chunk_rows(job->dim);
-    job->stream = gsf__nn_streams(job->x, job->y, job->rows * job->dim, job->dim);
-    gsf__parallel_for(ctx, gsf__nn_chunks(job->rows, job->chunk_rows), gsf__norm_chunk, job);
-}
-
-GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                                         const float* bias, float eps, const float* scale, const float* shift, float* y) {
+static void gsf__norm_rows(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, gsf__norm_vectors by, float eps,
+                           int centre, float* y) {
     gsf__norm_job job;
     memset(&job, 0, sizeof job);
+    job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
     job.x = x;
     job.y = y;
     job.rows = rows;
     job.dim = dim;
-    job.weight = weight;
-    job.bias = bias;
-    job.scale = scale;
-    job.shift = shift;
+    job.by = by;
     job.eps = eps;
-    job.centre = 1;
-    gsf__norm_rows(ctx, &job);
+    job.centre = centre;
+    job.chunk_rows = gsf__nn_chunk_rows(dim);
+    job.stream = gsf__nn_streams(x, y, rows * dim, dim);
+    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__norm_chunk, &job);
+}
+
+GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+                                         const float* bias, float eps, const float* scale, const float* shift, float* y) {
+    const gsf__norm_vectors by = {weight, bias, scale, shift};
+    gsf__norm_rows(ctx, x, rows, dim, by, eps, 1, y);
 }
 
 GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
@@ -2619,15 +2614,8 @@ GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, i
 
 GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight, float eps,
                              float* y) {
-    gsf__norm_job job;
-    memset(&job, 0, sizeof job);
-    job.x = x;
-    job.y = y;
-    job.rows = rows;
-    job.dim = dim;
-    job.weight = weight;
-    job.eps = eps;
-    gsf__norm_rows(ctx, &job);
+    const gsf__norm_vectors by = {weight, NULL, NULL, NULL};
+    gsf__norm_rows(ctx, x, rows, dim, by, eps, 0, y);
 }
 
 // Groups are cut into parts that fit a core's cache, so that each is read once for both moments, and few large groups still
@@ -2642,8 +2630,8 @@ static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int6
     for (int64_t i = begin; i < end;) { // by channel
         const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
         const int64_t count = gsf__least(next, end) - i;
-        job->kernels->affine(job->x + first + i, count, m, inverse, job->weight ? job->weight[channel] : 1.0f,
-                             job->bias ? job->bias[channel] : 0.0f, job->y + first + i, job->stream);
+        job->kernels->affine(job->x + first + i, count, m, inverse, job->by.weight ? job->by.weight[channel] : 1.0f,
+                             job->by.bias ? job->by.bias[channel] : 0.0f, job->y + first + i, job->stream);
         i += count;
     }
 }
@@ -2697,8 +2685,8 @@ GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channel
     job.y = y;
     job.rows = channels;
     job.dim = count;
-    job.weight = weight;
-    job.bias = bias;
+    job.by.weight = weight;
+    job.by.bias = bias;
     job.eps = eps;
     job.stream = gsf__nn_streams(x, y, channels * count, count);
     job.group_size = channels / groups * count;
@@ -2743,8 +2731,8 @@ GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
     job.stride = ldx ? ldx : (int64_t)heads * head_dim;
     job.dim = head_dim;
     job.heads = heads;
-    job.weight = weight;
-    job.bias = bias;
+    job.by.weight = weight;
+    job.by.bias = bias;
     job.eps = eps;
     job.centre = 1;
     job.cos = cos;
@@ -3036,38 +3024,41 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
 }
 
-GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int64_t count, int add, float* sums,
-                                            const float* ahead, int64_t ahead_count) {
-    for (int i = 0; i < GSF__TILE_SUMS; i += 16) _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);
-    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
-    // 12 registers of sums, 2 of b, 1 or 2 of a; named, as gcc would keep an array in memory
+// The micro-kernel of the GEMM and of attention: c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...]
+// for 6 rows r. 12 registers of sums, 2 of b, 1 or 2 of a; named, as gcc would keep an array in memory.
+GSF__INLINE_AVX2 void gsf__nn_tile(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
+                                   __m256 c[12]) {
     __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
     __m256 c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
-#define GSF_ROW(i, at)                               \
-    v = _mm256_broadcast_ss(a + (at));               \
-    c##i##0 = _mm256_fmadd_ps(v, b0, c##i##0);       \
-    c##i##1 = _mm256_fmadd_ps(v, b1, c##i##1);
-#define GSF_STEP(u)                                                                                             \
-    {                                                                                                           \
-        const __m256 b0 = _mm256_load_ps(b + 16 * (u)), b1 = _mm256_load_ps(b + 16 * (u) + 8);                   \
-        __m256 v;                                                                                               \
-        GSF_ROW(0, 6 * (u)) GSF_ROW(1, 6 * (u) + 1) GSF_ROW(2, 6 * (u) + 2)                                      \
-        GSF_ROW(3, 6 * (u) + 3) GSF_ROW(4, 6 * (u) + 4) GSF_ROW(5, 6 * (u) + 5)                                  \
+    __m256 x, b0, b1;
+#define GSF_X(r, k)                                          \
+    x = _mm256_broadcast_ss(a + (r) * a_row + (k) * a_step); \
+    c##r##0 = _mm256_fmadd_ps(x, b0, c##r##0);               \
+    c##r##1 = _mm256_fmadd_ps(x, b1, c##r##1);
+#define GSF_STEP(k)                                        \
+    b0 = _mm256_loadu_ps(b + (k) * GSF__TILE_COLUMNS);     \
+    b1 = _mm256_loadu_ps(b + (k) * GSF__TILE_COLUMNS + 8); \
+    GSF_X(0, k) GSF_X(1, k) GSF_X(2, k) GSF_X(3, k) GSF_X(4, k) GSF_X(5, k)
+    int64_t k = 0;
+    for (; k + 4 <= count; k += 4, a += 4 * a_step, b += 4 * GSF__TILE_COLUMNS) {
+        GSF_STEP(0) GSF_STEP(1) GSF_STEP(2) GSF_STEP(3)
     }
-    for (; count >= 4; count -= 4, a += 4 * 6, b += 4 * 16) {
-        GSF_STEP(0)
-        GSF_STEP(1)
-        GSF_STEP(2)
-        GSF_STEP(3)
-    }
-    for (; count > 0; count--, a += 6, b += 16) GSF_STEP(0)
-#define GSF_X(i)                                                                                                \
-    _mm256_store_ps(sums + 16 * i, add ? _mm256_add_ps(_mm256_load_ps(sums + 16 * i), c##i##0) : c##i##0);       \
-    _mm256_store_ps(sums + 16 * i + 8, add ? _mm256_add_ps(_mm256_load_ps(sums + 16 * i + 8), c##i##1) : c##i##1);
-    GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
-#undef GSF_X
+    for (; k < count; k++, a += a_step, b += GSF__TILE_COLUMNS) { GSF_STEP(0) }
 #undef GSF_STEP
-#undef GSF_ROW
+#undef GSF_X
+    c[0] = c00; c[1] = c01; c[2] = c10; c[3] = c11; c[4] = c20; c[5] = c21;
+    c[6] = c30; c[7] = c31; c[8] = c40; c[9] = c41; c[10] = c50; c[11] = c51;
+}
+
+GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int64_t count, int add, float* sums,
+                                            const float* ahead, int64_t ahead_count) {
+    __m256 c[12];
+    for (int i = 0; i < GSF__TILE_SUMS; i += 16) _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);
+    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
+    gsf__nn_tile(a, 1, GSF__TILE_ROWS, b, count, c);
+#define GSF_X(i) _mm256_store_ps(sums + 8 * (i), add ? _mm256_add_ps(_mm256_load_ps(sums + 8 * (i)), c[i]) : c[i]);
+    GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5) GSF_X(6) GSF_X(7) GSF_X(8) GSF_X(9) GSF_X(10) GSF_X(11)
+#undef GSF_X
 }
 
 // Few rows. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so the more of them
@@ -3202,40 +3193,46 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
 #define GSF__FOUR_STORE(i)                                                                                              \
     GSF__FOUR_PUT(sums + 16 * (i), c##i) GSF__FOUR_PUT(right + 16 * (i), d##i)                                          \
     GSF__FOUR_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF__FOUR_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
-#define GSF__FOUR_STEP(i, multiply)                                                                                     \
-    v = _mm512_set1_ps(a[i]);                                                                                           \
-    c##i = multiply(c##i, v, w0);                                                                                       \
-    d##i = multiply(d##i, v, w1);                                                                                       \
-    v = _mm512_set1_ps(a1[i]);                                                                                          \
-    e##i = multiply(e##i, v, w0);                                                                                       \
-    f##i = multiply(f##i, v, w1);
-#define GSF__FOUR_TILES(multiply)                                                                                       \
-    const float *a1 = a + GSF__TILE_ROWS * count, *b1 = b + GSF__TILE_COLUMNS * count;                                  \
+// As gsf__nn_tile for two groups of rows, `a_next` apart, and two panels, `b_next` apart. Sums are added to c, d (first group,
+// by panel) and e, f; each takes its products in the same order as there. `each` is done in every step.
+#define GSF__FOUR_TILES(multiply, each, a, a_row, a_step, a_next, b, b_next, count)                                     \
+    for (int64_t k_ = 0; k_ < (count); k_++, a += a_step, b += GSF__TILE_COLUMNS) {                                     \
+        const __m512 w0 = _mm512_loadu_ps(b), w1 = _mm512_loadu_ps(b + (b_next));                                       \
+        __m512 x;                                                                                                       \
+        each                                                                                                            \
+        GSF__FOUR_STEP(0, multiply, a_row, a_next) GSF__FOUR_STEP(1, multiply, a_row, a_next)                           \
+        GSF__FOUR_STEP(2, multiply, a_row, a_next) GSF__FOUR_STEP(3, multiply, a_row, a_next)                           \
+        GSF__FOUR_STEP(4, multiply, a_row, a_next) GSF__FOUR_STEP(5, multiply, a_row, a_next)                           \
+    }
+#define GSF__FOUR_STEP(r, multiply, a_row, a_next)        \
+    x = _mm512_set1_ps(a[(r) * (a_row)]);                 \
+    c##r = multiply(c##r, x, w0);                         \
+    d##r = multiply(d##r, x, w1);                         \
+    x = _mm512_set1_ps(a[(a_next) + (r) * (a_row)]);      \
+    e##r = multiply(e##r, x, w0);                         \
+    f##r = multiply(f##r, x, w1);
+
+#define GSF__LINEAR_FOUR(multiply)                                                                                      \
+    const int64_t a_next = GSF__TILE_ROWS * count, b_next = GSF__TILE_COLUMNS * count;                                  \
     const int64_t share = gsf__ceil_div(ahead_count, count); /* a request a step: the processor drops most of a burst */ \
     float* right = sums + next;                                                                                         \
     for (int i = 0; i < 2 * GSF__TILE_SUMS; i += 16) {                                                                  \
         _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);                                                             \
         _mm_prefetch((const char*)(right + i), _MM_HINT_T0);                                                            \
     }                                                                                                                   \
-    GSF__FOUR_ROWS(GSF__FOUR_ZEROS) /* c, d: the first group by both panels; e, f: the second */                        \
-    for (; count > 0; count--, b += GSF__TILE_COLUMNS, b1 += GSF__TILE_COLUMNS) {                                       \
-        const __m512 w0 = _mm512_load_ps(b), w1 = _mm512_load_ps(b1);                                                   \
-        __m512 v;                                                                                                       \
-        _mm_prefetch((const char*)ahead, _MM_HINT_T1);                                                                  \
-        ahead += share;                                                                                                 \
-        GSF__FOUR_STEP(0, multiply) GSF__FOUR_STEP(1, multiply) GSF__FOUR_STEP(2, multiply)                             \
-        GSF__FOUR_STEP(3, multiply) GSF__FOUR_STEP(4, multiply) GSF__FOUR_STEP(5, multiply)                             \
-        a += GSF__TILE_ROWS;                                                                                            \
-        a1 += GSF__TILE_ROWS;                                                                                           \
-    }                                                                                                                   \
+    GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                                     \
+    GSF__FOUR_TILES(multiply, GSF__LINEAR_AHEAD, a, 1, GSF__TILE_ROWS, a_next, b, b_next, count)                        \
     GSF__FOUR_ROWS(GSF__FOUR_STORE)
+#define GSF__LINEAR_AHEAD                              \
+    _mm_prefetch((const char*)ahead, _MM_HINT_T1);     \
+    ahead += share;
 
 GSF__INLINE_AVX512 __m512 gsf__nn_add_product(__m512 sum, __m512 a, __m512 b) { return _mm512_fmadd_ps(a, b, sum); }
 
 // Each sum takes its products in the order of gsf__tile_avx2: the same bits.
 GSF__TARGET_AVX512 static void gsf__four_tiles_avx512(const float* a, const float* b, int64_t count, int add, float* sums,
                                                       int64_t next, const float* ahead, int64_t ahead_count) {
-    GSF__FOUR_TILES(gsf__nn_add_product)
+    GSF__LINEAR_FOUR(gsf__nn_add_product)
 }
 
 GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // sixteen weights, widened
@@ -3420,28 +3417,31 @@ GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, in
     }
 }
 
-GSF__TARGET_BF16 static void gsf__tile_bf16(const float* a, const float* b, int64_t count, int add, float* sums,
-                                            const float* ahead, int64_t ahead_count) {
-    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
-#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
-#define GSF_X(i) __m512 c##i = _mm512_setzero_ps();
-    GSF_ROWS(GSF_X)
-#undef GSF_X
-    for (; count > 0; count--, a += GSF__TILE_ROWS, b += GSF__TILE_COLUMNS) {
-        const __m512 w = _mm512_load_ps(b);
-#define GSF_X(i) c##i = gsf__nn_add_pairs(c##i, _mm512_set1_ps(a[i]), w);
-        GSF_ROWS(GSF_X)
+GSF__INLINE_BF16 void gsf__nn_tile_bf16(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
+                                        __m512 c[GSF__TILE_ROWS]) {
+    __m512 c0 = _mm512_setzero_ps(), c1 = c0, c2 = c0, c3 = c0, c4 = c0, c5 = c0;
+    for (; count > 0; count--, a += a_step, b += GSF__TILE_COLUMNS) {
+        const __m512 w = _mm512_loadu_ps(b);
+#define GSF_X(r) c##r = gsf__nn_add_pairs(c##r, _mm512_set1_ps(a[(r) * a_row]), w);
+        GSF__FOUR_ROWS(GSF_X)
 #undef GSF_X
     }
-#define GSF_X(i) _mm512_store_ps(sums + 16 * (i), add ? _mm512_add_ps(_mm512_load_ps(sums + 16 * (i)), c##i) : c##i);
-    GSF_ROWS(GSF_X)
+    c[0] = c0; c[1] = c1; c[2] = c2; c[3] = c3; c[4] = c4; c[5] = c5;
+}
+
+GSF__TARGET_BF16 static void gsf__tile_bf16(const float* a, const float* b, int64_t count, int add, float* sums,
+                                            const float* ahead, int64_t ahead_count) {
+    __m512 c[GSF__TILE_ROWS];
+    for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
+    gsf__nn_tile_bf16(a, 1, GSF__TILE_ROWS, b, count, c);
+#define GSF_X(i) GSF__FOUR_PUT(sums + 16 * (i), c[i])
+    GSF__FOUR_ROWS(GSF_X)
 #undef GSF_X
-#undef GSF_ROWS
 }
 
 GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b, int64_t count, int add, float* sums,
                                                   int64_t next, const float* ahead, int64_t ahead_count) {
-    GSF__FOUR_TILES(gsf__nn_add_pairs)
+    GSF__LINEAR_FOUR(gsf__nn_add_pairs)
 }
 
 static const gsf__linear_kernels gsf__linear_bf16 = {gsf__pack_weights_bf16, gsf__pack_rows_bf16, gsf__tile_bf16,
@@ -4439,16 +4439,12 @@ enum {
 
 typedef struct gsf__attention_job {
     gsf_nn_attention_desc desc;
+    const struct gsf__attention_parts* parts; // NULL: the scalar kernel
     float* scratch;             // of all workers
     size_t scratch_floats;      // of one
     int64_t ranges, range_size; // of the queries
     int64_t panels;             // of 16 columns of v
 } gsf__attention_job;
-
-typedef struct gsf__attention_kernels {
-    void (*chunk)(void* arg, size_t chunk, int worker);
-    int packed; // scratch is laid out as gsf__attention_scratch, else as gsf__attention_chunk_scalar has it
-} gsf__attention_kernels;
 
 // Softmax is blind to what all keys have in common, which adds the same to each logit of a query, but their rounding is not.
 // So keys count from a value in their midst: the middle one of the means of three times five keys, which one wild key does
@@ -4520,8 +4516,7 @@ static void gsf__attention_row(const gsf_nn_attention_desc* d, int64_t head, int
     for (int64_t i = 0; i < dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN goes through
 }
 
-static void gsf__attention_chunk_scalar(void* arg, size_t chunk, int worker) {
-    const gsf__attention_job* job = (const gsf__attention_job*)arg;
+static void gsf__attention_chunk_scalar(const gsf__attention_job* job, size_t chunk, int worker) {
     const gsf_nn_attention_desc* d = &job->desc;
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
     const int64_t dim = d->head_dim, end = gsf__least(first + job->range_size, d->queries);
@@ -4534,8 +4529,6 @@ static void gsf__attention_chunk_scalar(void* arg, size_t chunk, int worker) {
         for (int64_t r = 0; r < rows; r++) gsf__attention_row(d, head, row + r, p + r * d->keys, sum);
     }
 }
-
-#if GSF__X86
 
 typedef struct gsf__attention_scratch { // of one worker
     float *q, *out, *k, *v, *p;
@@ -4559,6 +4552,8 @@ typedef struct gsf__attention_parts { // what instruction sets do differently; i
     void (*values)(const float* p, int64_t groups, const float* v, int64_t keys, int64_t panels, const float* fade,
                    float* out);
 } gsf__attention_parts;
+
+#if GSF__X86
 
 static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job* job, int worker) {
     const int64_t groups = (job->range_size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, dim = job->desc.head_dim;
@@ -4633,62 +4628,19 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_values(const gsf__attention_job
     }
 }
 
-// c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...], for 6 rows r.
-GSF__INLINE_AVX2 void gsf__attention_tile(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
-                                          __m256 c[12]) {
-    __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
-    __m256 c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
-    __m256 x, b0, b1;
-#define GSF_X(r, k)                                          \
-    x = _mm256_broadcast_ss(a + (r) * a_row + (k) * a_step); \
-    c##r##0 = _mm256_fmadd_ps(x, b0, c##r##0);               \
-    c##r##1 = _mm256_fmadd_ps(x, b1, c##r##1);
-#define GSF_STEP(k)                                  \
-    b0 = _mm256_loadu_ps(b + (k) * GSF__ATT_PANEL);     \
-    b1 = _mm256_loadu_ps(b + (k) * GSF__ATT_PANEL + 8); \
-    GSF_X(0, k) GSF_X(1, k) GSF_X(2, k) GSF_X(3, k) GSF_X(4, k) GSF_X(5, k)
-    int64_t k = 0;
-    for (; k + 4 <= count; k += 4, a += 4 * a_step, b += 4 * GSF__ATT_PANEL) {
-        GSF_STEP(0) GSF_STEP(1) GSF_STEP(2) GSF_STEP(3)
-    }
-    for (; k < count; k++, a += a_step, b += GSF__ATT_PANEL) { GSF_STEP(0) }
-#undef GSF_STEP
-#undef GSF_X
-    c[0] = c00; c[1] = c01; c[2] = c10; c[3] = c11; c[4] = c20; c[5] = c21;
-    c[6] = c30; c[7] = c31; c[8] = c40; c[9] = c41; c[10] = c50; c[11] = c51;
-}
-
 GSF__TARGET_AVX2 static void gsf__attention_logits_avx2(const float* q, int64_t groups, const float* k, int64_t panels,
                                                         int64_t dim, float* p) {
     for (int64_t panel = 0; panel < panels; panel++, k += GSF__ATT_PANEL * dim)
         for (int64_t g = 0; g < groups; g++) {
             __m256 c[12];
             float* to = p + g * GSF__ATT_GROUP * GSF__ATT_KEYS + panel * GSF__ATT_PANEL;
-            gsf__attention_tile(q + g * 8 * dim, 1, 8, k, dim, c);
+            gsf__nn_tile(q + g * 8 * dim, 1, 8, k, dim, c);
             for (int r = 0; r < GSF__ATT_GROUP; r++) {
                 _mm256_storeu_ps(to + r * GSF__ATT_KEYS, c[2 * r]);
                 _mm256_storeu_ps(to + r * GSF__ATT_KEYS + 8, c[2 * r + 1]);
             }
         }
 }
-
-// a and b as in gsf__attention_tile, with a second group `a_next` and a second panel `b_next` behind them. Sums are added to
-// c, d (first group, by panel) and e, f; each takes its products in the same order as there.
-#define GSF__ATT_FOUR_TILES(multiply, a, a_row, a_step, a_next, b, b_next, count)                                        \
-    for (int64_t k_ = 0; k_ < (count); k_++, a += a_step, b += GSF__ATT_PANEL) {                                        \
-        const __m512 w0 = _mm512_loadu_ps(b), w1 = _mm512_loadu_ps(b + (b_next));                                       \
-        __m512 x;                                                                                                       \
-        GSF__ATT_STEP(0, multiply, a_row, a_next) GSF__ATT_STEP(1, multiply, a_row, a_next)                             \
-        GSF__ATT_STEP(2, multiply, a_row, a_next) GSF__ATT_STEP(3, multiply, a_row, a_next)                             \
-        GSF__ATT_STEP(4, multiply, a_row, a_next) GSF__ATT_STEP(5, multiply, a_row, a_next)                             \
-    }
-#define GSF__ATT_STEP(r, multiply, a_row, a_next)           \
-    x = _mm512_set1_ps(a[(r) * (a_row)]);                   \
-    c##r = multiply(c##r, x, w0);                           \
-    d##r = multiply(d##r, x, w1);                           \
-    x = _mm512_set1_ps(a[(a_next) + (r) * (a_row)]);        \
-    e##r = multiply(e##r, x, w0);                           \
-    f##r = multiply(f##r, x, w1);
 
 // Pairs of panels by pairs of groups; an odd one that is left is done by `rest`, a function for any number of both.
 #define GSF__ATT_LOGITS(multiply, rest)                                                                                 \
@@ -4698,7 +4650,7 @@ GSF__TARGET_AVX2 static void gsf__attention_logits_avx2(const float* q, int64_t 
         for (int64_t g = 0; g < even; g += 2, to += 2 * height) {                                                       \
             const float *a = q + g * 8 * dim, *b = k;                                                                   \
             GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                             \
-            GSF__ATT_FOUR_TILES(multiply, a, 1, 8, 8 * dim, b, GSF__ATT_PANEL * dim, dim)                               \
+            GSF__FOUR_TILES(multiply, , a, 1, 8, 8 * dim, b, GSF__ATT_PANEL * dim, dim)                               \
             GSF__FOUR_ROWS(GSF__ATT_STORE)                                                                              \
         }                                                                                                               \
         if (even < groups) rest(q + even * 8 * dim, 1, k, 2, dim, to);                                                  \
@@ -4814,7 +4766,7 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
             __m256 c[12];
             float* to = out + (g * panels + panel) * GSF__ATT_TILE;
             for (int i = 0; i < GSF__ATT_TILE; i += 16) _mm_prefetch((const char*)(to + i), _MM_HINT_T0);
-            gsf__attention_tile(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, keys, c);
+            gsf__nn_tile(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, keys, c);
             for (int r = 0; r < GSF__ATT_GROUP; r++, to += GSF__ATT_PANEL) {
                 const __m256 f = _mm256_broadcast_ss(fade + g * GSF__ATT_GROUP + r);
                 _mm256_storeu_ps(to, _mm256_fmadd_ps(f, _mm256_loadu_ps(to), c[2 * r]));
@@ -4837,7 +4789,7 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
                 _mm_prefetch((const char*)(to + width + i), _MM_HINT_T0);                                               \
             }                                                                                                           \
             GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                             \
-            GSF__ATT_FOUR_TILES(multiply, a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, places)       \
+            GSF__FOUR_TILES(multiply, , a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, places)       \
             GSF__FOUR_ROWS(GSF__ATT_FADE)                                                                               \
         }                                                                                                               \
     if (even < groups) rest(p + even * height, groups - even, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
@@ -4892,25 +4844,13 @@ GSF__TARGET_BF16 static void gsf__attention_pack_values_bf16(const gsf__attentio
     }
 }
 
-GSF__INLINE_BF16 void gsf__attention_tile_bf16(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
-                                               __m512 c[GSF__ATT_GROUP]) {
-    __m512 c0 = _mm512_setzero_ps(), c1 = c0, c2 = c0, c3 = c0, c4 = c0, c5 = c0;
-    for (; count > 0; count--, a += a_step, b += GSF__ATT_PANEL) {
-        const __m512 w = _mm512_loadu_ps(b);
-#define GSF_X(r) c##r = gsf__nn_add_pairs(c##r, _mm512_set1_ps(a[(r) * a_row]), w);
-        GSF__FOUR_ROWS(GSF_X)
-#undef GSF_X
-    }
-    c[0] = c0; c[1] = c1; c[2] = c2; c[3] = c3; c[4] = c4; c[5] = c5;
-}
-
 GSF__TARGET_BF16 static void gsf__attention_logits_one_bf16(const float* q, int64_t groups, const float* k, int64_t panels,
                                                             int64_t dim, float* p) {
     for (int64_t panel = 0; panel < panels; panel++, k += GSF__ATT_PANEL * dim)
         for (int64_t g = 0; g < groups; g++) {
             __m512 c[GSF__ATT_GROUP];
             float* to = p + g * GSF__ATT_GROUP * GSF__ATT_KEYS + panel * GSF__ATT_PANEL;
-            gsf__attention_tile_bf16(q + g * 8 * dim, 1, 8, k, dim, c);
+            gsf__nn_tile_bf16(q + g * 8 * dim, 1, 8, k, dim, c);
             for (int r = 0; r < GSF__ATT_GROUP; r++) _mm512_storeu_ps(to + r * GSF__ATT_KEYS, c[r]);
         }
 }
@@ -4944,7 +4884,7 @@ GSF__TARGET_BF16 static void gsf__attention_values_one_bf16(const float* p, int6
         for (int64_t g = 0; g < groups; g++) {
             __m512 c[GSF__ATT_GROUP];
             float* to = out + (g * panels + panel) * GSF__ATT_TILE;
-            gsf__attention_tile_bf16(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, (keys + 1) / 2, c);
+            gsf__nn_tile_bf16(p + g * GSF__ATT_GROUP * GSF__ATT_KEYS, GSF__ATT_KEYS, 1, v, (keys + 1) / 2, c);
             for (int r = 0; r < GSF__ATT_GROUP; r++, to += GSF__ATT_PANEL)
                 GSF__ATT_FADE_ONE(to, fade[g * GSF__ATT_GROUP + r], c[r])
         }
@@ -4970,7 +4910,8 @@ GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job
     }
 }
 
-static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__attention_parts* parts, size_t chunk, int worker) {
+static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t chunk, int worker) {
+    const gsf__attention_parts* parts = job->parts;
     const gsf_nn_attention_desc* d = &job->desc;
     const gsf__attention_scratch s = gsf__attention_scratch_of(job, worker);
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
@@ -5002,42 +4943,34 @@ static void gsf__attention_chunk(const gsf__attention_job* job, const gsf__atten
     gsf__attention_finish(job, &s, rows, d->out + first * d->ldo + column);
 }
 
-static void gsf__attention_chunk_avx2(void* arg, size_t chunk, int worker) {
-    static const gsf__attention_parts parts = {
-        1, gsf__attention_pack_rows, gsf__attention_pack_values,
-        gsf__attention_logits_avx2,  gsf__attention_weights_avx2, gsf__attention_values_avx2};
-    gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
-}
-
-static void gsf__attention_chunk_avx512(void* arg, size_t chunk, int worker) {
-    static const gsf__attention_parts parts = {
-        1, gsf__attention_pack_rows, gsf__attention_pack_values,
-        gsf__attention_logits_avx512, gsf__attention_weights_avx512, gsf__attention_values_avx512};
-    gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
-}
-
-static void gsf__attention_chunk_bf16(void* arg, size_t chunk, int worker) {
-    static const gsf__attention_parts parts = {
-        2, gsf__attention_pack_pairs, gsf__attention_pack_values_bf16,
-        gsf__attention_logits_bf16, gsf__attention_weights_bf16, gsf__attention_values_bf16};
-    gsf__attention_chunk((const gsf__attention_job*)arg, &parts, chunk, worker);
-}
-
 #endif // GSF__X86
 
-static const gsf__attention_kernels* gsf__attention_kernels_of(gsf_cpu_level level, int pairs) { // pairs: of bf16
-    static const gsf__attention_kernels scalar = {gsf__attention_chunk_scalar, 0};
+static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, int pairs) { // pairs: of bf16
 #if GSF__X86
-    static const gsf__attention_kernels avx2 = {gsf__attention_chunk_avx2, 1};
-    static const gsf__attention_kernels avx512 = {gsf__attention_chunk_avx512, 1};
-    static const gsf__attention_kernels bf16 = {gsf__attention_chunk_bf16, 1};
+    static const gsf__attention_parts avx2 = {
+        1, gsf__attention_pack_rows, gsf__attention_pack_values,
+        gsf__attention_logits_avx2,  gsf__attention_weights_avx2, gsf__attention_values_avx2};
+    static const gsf__attention_parts avx512 = {
+        1, gsf__attention_pack_rows, gsf__attention_pack_values,
+        gsf__attention_logits_avx512, gsf__attention_weights_avx512, gsf__attention_values_avx512};
+    static const gsf__attention_parts bf16 = {
+        2, gsf__attention_pack_pairs, gsf__attention_pack_values_bf16,
+        gsf__attention_logits_bf16, gsf__attention_weights_bf16, gsf__attention_values_bf16};
     if (level >= GSF_CPU_AVX512_BF16 && pairs) return &bf16;
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
     (void)pairs;
     (void)level;
-    return &scalar;
+    return NULL;
+}
+
+static void gsf__attention_chunk(void* arg, size_t chunk, int worker) {
+    const gsf__attention_job* job = (const gsf__attention_job*)arg;
+#if GSF__X86
+    if (job->parts) gsf__attention_chunk_packed(job, chunk, worker);
+#endif
+    if (!job->parts) gsf__attention_chunk_scalar(job, chunk, worker);
 }
 
 // Chooses the ranges of queries, from sizes alone; returns the number of chunks.
@@ -5054,11 +4987,11 @@ static size_t gsf__attention_plan(gsf__attention_job* job) {
 }
 
 // Floats that one worker needs, a multiple of 16; 0 on overflow.
-static size_t gsf__attention_floats(const gsf__attention_job* job, int packed) {
+static size_t gsf__attention_floats(const gsf__attention_job* job) {
     const gsf_nn_attention_desc* d = &job->desc;
     const size_t dim = (size_t)d->head_dim, padded = (size_t)job->panels * GSF__ATT_PANEL;
     size_t total;
-    if (packed) { // p, k, v; then a query's share of out, sum, q (8 places for 6) and top
+    if (job->parts) { // p, k, v; then a query's share of out, sum, q (8 places for 6) and top
         if (!gsf__mul_size((size_t)job->range_size, padded + 8 + dim + (dim + 2) / 3 + 1, &total)) return 0;
         total += GSF__ATT_QUERIES * GSF__ATT_KEYS + GSF__ATT_KEYS * (dim + padded) + dim;
     } else {
@@ -5070,13 +5003,13 @@ static size_t gsf__attention_floats(const gsf__attention_job* job, int packed) {
 
 GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_attention_desc* desc) {
     const int pairs = desc->bf16 && desc->head_dim % 2 == 0;
-    const gsf__attention_kernels* kernels = gsf__attention_kernels_of(ctx->cpu_level, pairs);
     gsf_nn_workspace own;
     gsf__attention_job job;
     size_t size;
     memset(&own, 0, sizeof own);
     memset(&job, 0, sizeof job);
     job.desc = *desc;
+    job.parts = gsf__attention_parts_of(ctx->cpu_level, pairs);
     gsf_nn_attention_desc* d = &job.desc;
     if (!d->q || !d->k || !d->v || !d->out || d->queries < 0 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "attention: a tensor or a size is missing");
@@ -5088,13 +5021,13 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
     if (d->scale == 0.0f) d->scale = 1.0f / sqrtf((float)d->head_dim);
     job.panels = ((int64_t)d->head_dim + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL;
     const size_t chunks = gsf__attention_plan(&job);
-    job.scratch_floats = gsf__attention_floats(&job, kernels->packed);
+    job.scratch_floats = gsf__attention_floats(&job);
     if (!job.scratch_floats || !gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &size) ||
         !gsf__mul_size(size, sizeof(float), &size))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld keys are too many", (long long)d->keys);
     job.scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own, size);
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__parallel_for(ctx, chunks, kernels->chunk, &job);
+    gsf__parallel_for(ctx, chunks, gsf__attention_chunk, &job);
     gsf_nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }
