@@ -14,8 +14,10 @@
        SH coefficients (K,3) with K = (degree + 1)^2, the 3DGS parametrisation:
            Sigma = R diag(exp(log_scale))^2 R^T,  opacity = sigmoid(logit),  colour = max(0, SH(direction) + 0.5)
        Means are float32 relative to a double origin, so georeferenced scenes keep their precision.
-       A desc must be zeroed before use; zero selects the default of every field. The large ones begin and end with a canary
-       that stays zero: a desc that was not zeroed is refused with GSF_ERROR_INVALID_ARGUMENT.
+       A desc must be zeroed before use; zero selects the default of every field. Where zero itself is a legal value (a
+       learning rate, a weight, a threshold), a negative value stands for it: lr_opacity = -1 trains no opacity. A resolved
+       desc, as the trainer returns it, has the zero. The large ones begin and end with a canary that stays zero: a desc
+       that was not zeroed is refused with GSF_ERROR_INVALID_ARGUMENT.
 
    CONFIGURATION (define before the implementation)
        GSF_USE_EMBREE       traces the rays of the visible-point filter with Embree (link embree3 or embree4); without it
@@ -314,7 +316,7 @@ typedef struct gsf_dense_desc {
     int32_t radius;          // of the matching window in pixels, at most 15; 0 = 5
     int32_t stride;          // between samples of the window; 0 = 2
     float color_sigma;       // grey levels of 255 at which a sample's weight falls to 1/e; 0 = 18
-    float min_angle;         // minimum triangulation angle in degrees; 0 = 1
+    float min_angle;         // minimum triangulation angle in degrees; 0 = 1, negative = 0
     float max_cost;          // maximum of 1 - correlation for a pixel and for those that confirm it; 0 = 0.35
     float max_cost_many;     // the same if one view more than required agrees; 0 = 0.5
     float max_reprojection;  // maximum forward-backward reprojection error in pixels; 0 = 1
@@ -442,7 +444,10 @@ typedef struct gsf_train_view {
                        // looked at by nobody, nor is what is rendered there. Colours are not multiplied by alpha
 } gsf_train_view;
 
-typedef struct gsf_train_desc { // zero = the value given beside each field, that of Inria's 3DGS; s = iterations / 30000
+// Zero = the value given beside each field, that of Inria's 3DGS; s = iterations / 30000. Negative = zero for all learning
+// rates except lr_means_final, for lambda_ssim, densify_from, densify_grad, densify_scale and prune_opacity, and where a
+// field says so.
+typedef struct gsf_train_desc {
     uint32_t _start_canary;
     int32_t iterations;            // 30000
     uint64_t seed;
@@ -455,7 +460,7 @@ typedef struct gsf_train_desc { // zero = the value given beside each field, tha
     float lr_sh_dc, lr_sh_rest, lr_opacity, lr_scales, lr_quats; // 2.5e-3, 1.25e-4, 0.025, 5e-3, 1e-3
     float extent;                  // 1.1 * largest distance of a training camera from their mean; if the cameras
                                    // coincide, the median depth of the splats
-    float lambda_ssim;             // 0.2; negative = no SSIM term
+    float lambda_ssim;             // 0.2; negative = 0: no SSIM term
     float background[3];           // colour behind the splats
     int32_t background_random;     // 0; 1: a new random colour in each step instead of `background`
     int32_t densify_from, densify_until; // 500 s, 15000 s (mcmc: 25000 s); densify_until < 0 = never, nor opacity resets
@@ -571,7 +576,7 @@ typedef struct gsf_fix_desc {
     int32_t windows;              // per round; 0 = one per training view, at least 2
     int32_t window_frames;        // 0 = the restorer's preferred count, else 17; changed to the nearest count that it
                                   // accepts
-    float lambda;                 // weight of the restored views at the end of training, default 1
+    float lambda;                 // weight of the restored views at the end of training, default 1; negative = 0
     float skip_psnr;              // skip windows whose render agrees with the warped references by this many dB, over the
                                   // pixels that the references explain; 0 = never skip
     int32_t max_pixels;           // frames of more are rendered smaller for the restorer, with the same field of view,
@@ -725,6 +730,12 @@ GSF__BEGIN_IMPLEMENTATION
         if ((desc)->_start_canary != 0 || (desc)->_end_canary != 0)                                                   \
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s desc: was not zeroed (its canaries are not)", name); \
     } while (0)
+
+// A field of a desc where zero is legal: zero is the default, a negative value is zero.
+static float gsf__or_zero(float value, float fallback) {
+    if (value == 0.0f) return fallback;
+    return value < 0.0f ? 0.0f : value;
+}
 
 GSF_API int32_t gsf_splat_sh_count(int32_t sh_degree) { return (sh_degree + 1) * (sh_degree + 1); }
 
@@ -5640,7 +5651,7 @@ static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
     if (d.radius == 0) d.radius = 5;
     if (d.stride == 0) d.stride = 2;
     if (d.color_sigma == 0.0f) d.color_sigma = 18.0f;
-    if (d.min_angle == 0.0f) d.min_angle = 1.0f;
+    d.min_angle = gsf__or_zero(d.min_angle, 1.0f);
     if (d.max_cost == 0.0f) d.max_cost = 0.35f;
     if (d.max_cost_many == 0.0f) d.max_cost_many = 0.5f;
     if (d.max_cost_many < d.max_cost) d.max_cost_many = d.max_cost;
@@ -10730,36 +10741,34 @@ static int32_t gsf__scaled_interval(int32_t set, int32_t official, int32_t itera
     return scaled > (double)least ? (int32_t)scaled : least;
 }
 
-static float gsf__or_default(float value, float fallback) { return value != 0.0f ? value : fallback; }
-
 static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     gsf_train_desc d;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     if (d.iterations == 0) d.iterations = 30000;
     d.sh_interval = gsf__scaled_interval(d.sh_interval, 1000, d.iterations, 1);
-    d.densify_from = gsf__scaled_interval(d.densify_from, 500, d.iterations, 1);
+    d.densify_from = d.densify_from < 0 ? 0 : gsf__scaled_interval(d.densify_from, 500, d.iterations, 1);
     d.densify_until = gsf__scaled_interval(d.densify_until, d.mcmc ? 25000 : 15000, d.iterations, 1);
     if (d.densify_interval == 0) d.densify_interval = 100;
     d.opacity_reset_interval = gsf__scaled_interval(d.opacity_reset_interval, 3000, d.iterations, 1000);
-    d.lr_means = gsf__or_default(d.lr_means, 1.6e-4f);
-    d.lr_means_final = gsf__or_default(d.lr_means_final, 1.6e-6f);
-    d.lr_sh_dc = gsf__or_default(d.lr_sh_dc, 2.5e-3f);
-    d.lr_sh_rest = gsf__or_default(d.lr_sh_rest, 1.25e-4f);
-    d.lr_opacity = gsf__or_default(d.lr_opacity, 0.025f);
-    d.lr_scales = gsf__or_default(d.lr_scales, 5e-3f);
-    d.lr_quats = gsf__or_default(d.lr_quats, 1e-3f);
-    d.lambda_ssim = d.lambda_ssim < 0.0f ? 0.0f : gsf__or_default(d.lambda_ssim, 0.2f);
-    d.densify_grad = gsf__or_default(d.densify_grad, 2e-4f);
-    d.densify_scale = gsf__or_default(d.densify_scale, 0.01f);
-    d.prune_opacity = gsf__or_default(d.prune_opacity, 0.005f);
-    d.prune_scale = gsf__or_default(d.prune_scale, 0.1f);
+    d.lr_means = gsf__or_zero(d.lr_means, 1.6e-4f);
+    if (d.lr_means_final == 0.0f) d.lr_means_final = 1.6e-6f; // decays exponentially, so never to 0
+    d.lr_sh_dc = gsf__or_zero(d.lr_sh_dc, 2.5e-3f);
+    d.lr_sh_rest = gsf__or_zero(d.lr_sh_rest, 1.25e-4f);
+    d.lr_opacity = gsf__or_zero(d.lr_opacity, 0.025f);
+    d.lr_scales = gsf__or_zero(d.lr_scales, 5e-3f);
+    d.lr_quats = gsf__or_zero(d.lr_quats, 1e-3f);
+    d.lambda_ssim = gsf__or_zero(d.lambda_ssim, 0.2f);
+    d.densify_grad = gsf__or_zero(d.densify_grad, 2e-4f);
+    d.densify_scale = gsf__or_zero(d.densify_scale, 0.01f);
+    d.prune_opacity = gsf__or_zero(d.prune_opacity, 0.005f);
+    if (d.prune_scale == 0.0f) d.prune_scale = 0.1f;
     if (d.max_splats == 0) d.max_splats = d.mcmc ? 1000000 : 2000000;
     if (d.mcmc) { // as the official code of MCMC has them
         d.opacity_reset_interval = -1;
-        d.mcmc_noise = d.mcmc_noise < 0.0f ? 0.0f : gsf__or_default(d.mcmc_noise, 5e5f);
-        d.scale_penalty = d.scale_penalty < 0.0f ? 0.0f : gsf__or_default(d.scale_penalty, 0.01f);
-        d.opacity_penalty = d.opacity_penalty < 0.0f ? 0.0f : gsf__or_default(d.opacity_penalty, 0.01f);
+        d.mcmc_noise = gsf__or_zero(d.mcmc_noise, 5e5f);
+        d.scale_penalty = gsf__or_zero(d.scale_penalty, 0.01f);
+        d.opacity_penalty = gsf__or_zero(d.opacity_penalty, 0.01f);
     }
     memcpy(d.render.background, d.background, sizeof d.background);
     return d;
@@ -10773,7 +10782,7 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"sh_interval", (double)d->sh_interval, 1, 1e9},
         {"densify_from", (double)d->densify_from, 0, 1e9},
         {"densify_interval", (double)d->densify_interval, 1, 1e9},
-        {"lr_means", (double)d->lr_means, 1e-30, 1e3},
+        {"lr_means", (double)d->lr_means, 0, 1e3},
         {"lr_means_final", (double)d->lr_means_final, 1e-30, 1e3},
         {"lr_means_delay_steps", (double)d->lr_means_delay_steps, 0, 1e9},
         {"lr_means_delay", (double)d->lr_means_delay, 0, 1},
@@ -10960,9 +10969,11 @@ static int32_t gsf__trainer_bands(const gsf_trainer* trainer, int32_t iteration)
 static gsf__adam_rates gsf__trainer_rates(const gsf_trainer* trainer, int32_t iteration) {
     const gsf_train_desc* d = &trainer->desc;
     gsf__adam_rates rates;
-    rates.means = gsf__exponential_rate(iteration, (double)d->lr_means * (double)d->extent,
-                                        (double)d->lr_means_final * (double)d->extent, d->lr_means_delay_steps,
-                                        (double)d->lr_means_delay, d->iterations);
+    rates.means = 0.0;
+    if (d->lr_means > 0.0f)
+        rates.means = gsf__exponential_rate(iteration, (double)d->lr_means * (double)d->extent,
+                                            (double)d->lr_means_final * (double)d->extent, d->lr_means_delay_steps,
+                                            (double)d->lr_means_delay, d->iterations);
     rates.scales = (double)d->lr_scales;
     rates.quats = (double)d->lr_quats;
     rates.opacity = (double)d->lr_opacity;
@@ -12232,7 +12243,7 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
         d.last_round = desc->last_round == 0 && late > d.first_round ? late : d.first_round;
     }
     if (d.windows == 0) d.windows = view_count < 2 ? 2 : view_count > 64 ? 64 : (int32_t)view_count;
-    if (d.lambda == 0.0f) d.lambda = 1.0f;
+    d.lambda = gsf__or_zero(d.lambda, 1.0f);
     return d;
 }
 

@@ -480,10 +480,11 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     CHECK(used.train.extent > 1.0f && used.train.extent < 4.0f &&
           used.train.render.near_plane == 0.01f * used.train.extent);
     gsf_splat_destroy_fixer(ctx, fixer);
+    given.lambda = -1.0f; // 0
     given.train.iterations = 150; // only one iteration comes shortly before a densification: rounds stay apart
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
     used = gsf_splat_fixer_desc(fixer);
-    CHECK(used.first_round == 99 && used.last_round == 125);
+    CHECK(used.first_round == 99 && used.last_round == 125 && used.lambda == 0.0f);
     gsf_splat_destroy_fixer(ctx, fixer);
     given = repair_desc();
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, NULL, &fixer));

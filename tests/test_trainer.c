@@ -1009,6 +1009,36 @@ static void test_restored_gradient(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, one);
 }
 
+// A negative rate is 0: that parameter stays as it was, and all others learn. lazy: the SH catch up by rates of 0.
+static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
+    for (int rate = 0; rate < 6; rate++) {
+        gsf_train_desc desc = busy_desc();
+        gsf_trainer* trainer;
+        desc.densify_until = -1;
+        desc.dropout = desc.opacity_decay = 0.0f;
+        desc.lazy_adam = lazy;
+        float* const rates[6] = {&desc.lr_means,   &desc.lr_scales, &desc.lr_quats,
+                                 &desc.lr_opacity, &desc.lr_sh_dc,  &desc.lr_sh_rest};
+        *rates[rate] = -1.0f;
+        CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer));
+        const float resolved[6] = {trainer->desc.lr_means,   trainer->desc.lr_scales, trainer->desc.lr_quats,
+                                   trainer->desc.lr_opacity, trainer->desc.lr_sh_dc,  trainer->desc.lr_sh_rest};
+        for (int k = 0; k < 6; k++) CHECK((resolved[k] == 0.0f) == (k == rate));
+        take_steps(ctx, trainer, 30);
+        const gsf_splats *now = gsf_splat_trainer_splats(trainer), *was = &s->start;
+        const size_t n = was->count, row = 3 * (size_t)gsf_splat_sh_count(was->sh_degree);
+        int dc = 0, rest = 0; // floats that changed
+        for (size_t i = 0; i < n * row; i++) *(i % row < 3 ? &dc : &rest) += now->sh[i] != was->sh[i];
+        CHECK(now->count == n && row > 3);
+        CHECK((memcmp(now->means, was->means, 3 * n * sizeof(float)) == 0) == (rate == 0));
+        CHECK((memcmp(now->log_scales, was->log_scales, 3 * n * sizeof(float)) == 0) == (rate == 1));
+        CHECK((memcmp(now->quats, was->quats, 4 * n * sizeof(float)) == 0) == (rate == 2));
+        CHECK((memcmp(now->opacity_logits, was->opacity_logits, n * sizeof(float)) == 0) == (rate == 3));
+        CHECK((dc == 0) == (rate == 4) && (rest == 0) == (rate == 5));
+        gsf_splat_destroy_trainer(ctx, trainer);
+    }
+}
+
 static void test_settings(gsf_context* ctx, const scene* s) {
     gsf_trainer* trainer;
     gsf_train_desc desc;
@@ -1039,6 +1069,16 @@ static void test_settings(gsf_context* ctx, const scene* s) {
     CHECK_NEAR(trainer->desc.extent, 4.0, 0.4);
     CHECK(trainer->desc.mcmc_noise == 0.0f && trainer->desc.opacity_penalty == 0.0f);
     gsf_splat_destroy_trainer(ctx, trainer);
+
+    gsf_train_desc zeros = desc;
+    zeros.lambda_ssim = zeros.densify_grad = zeros.densify_scale = zeros.prune_opacity = -1.0f;
+    zeros.densify_from = -1;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &zeros, s->views, 1, &s->start, &trainer));
+    CHECK(trainer->desc.lambda_ssim == 0.0f && trainer->desc.densify_grad == 0.0f && trainer->desc.densify_scale == 0.0f);
+    CHECK(trainer->desc.prune_opacity == 0.0f && trainer->desc.densify_from == 0);
+    gsf_splat_destroy_trainer(ctx, trainer);
+    zeros.lr_means_final = -1.0f; // decays exponentially: never to 0
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &zeros, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
 
     desc.mcmc = 1;
     desc.scale_penalty = -1.0f;
@@ -1632,6 +1672,7 @@ int main(void) {
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
     test_settings(&ctx, &s);
+    for (int lazy = 0; lazy < 2; lazy++) test_zero_rates(&ctx, &s, lazy);
     for (int mcmc = 0; mcmc < 2; mcmc++) test_workers(&s, ctx.cpu_level, mcmc);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_lazy_training(&s, (gsf_cpu_level)level);
     for (int mcmc = 0; mcmc < 2; mcmc++) test_resume(&ctx, &s, mcmc);
