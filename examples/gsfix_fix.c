@@ -1117,14 +1117,14 @@ static void print_results(fix_run* run, const gsfix_result* r) {
     const gsfix_history* h = &run->history;
     const size_t missing = run->scene.missing_count;
     if (missing)
-        gsfix_print(app, "missing    %zu of %zu photos: the views, and which of them are held out, are not the whole scene's",
+        gsfix_print(app, "missing    %zu of %zu photos, so that views and held-out split differ from the complete scene",
                     missing, missing + run->scene.view_count);
     if (run->split.test_count) {
         gsfix_print(app, "held-out   PSNR %.3f dB  SSIM %.4f  (%zu views)", r->mean.psnr, r->mean.ssim,
                     run->split.test_count);
         if (run->masks) gsfix_print(app, "seen       PSNR %.3f dB  SSIM %.4f", r->mean.psnr_seen, r->mean.ssim_seen);
         if (h->has_without)
-            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (as many steps; by the repair alone %+.3f dB)", r->without.psnr,
+            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (same number of steps; repair alone: %+.3f dB)", r->without.psnr,
                         r->without.ssim, r->mean.psnr - r->without.psnr);
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,

@@ -146,7 +146,7 @@ static void put_legend(page* p) { // colour scale of the error maps
         gsfix_map_color(i / 10.0, c);
         put(p, ",rgb(%d,%d,%d)", c[0], c[1], c[2]);
     }
-    put(p, ")\"></i><span class=num>&ge; %.1f</span><span>mean absolute difference to the photo, colours from 0 to 1</span></div>\n",
+    put(p, ")\"></i><span class=num>&ge; %.1f</span><span>mean absolute difference from the photo, colours from 0 to 1</span></div>\n",
         error_white);
 }
 
@@ -154,10 +154,10 @@ static gsf_result put_views(page* p) {
     const gsfix_result* r = p->r;
     const size_t count = r->split->test_count;
     if (!count) return GSF_OK;
-    put_raw(p, "<section><h2>Held-out views</h2><p>Photos that training never saw. Drag the divider in a picture.");
+    put_raw(p, "<section><h2>Held-out views</h2><p>Photos that were not used for training. Drag the divider in an image to compare.");
     if (r->history->has_without)
-        put(p, " <em>Without repair</em> is a second training from the same start and seed with as many steps (%d), but no repair: "
-               "what differs is what the repair alone gave, %+.2f dB in the mean.",
+        put(p, " <em>Without repair</em> is a second run from the same start and seed with the same number of steps (%d): the "
+               "difference, %+.2f dB on average, is what the repair alone contributes.",
             (int)r->iterations, r->mean.psnr - r->without.psnr);
     put_raw(p, "</p>\n<div class=choice role=group aria-label=\"pictures to compare\">");
     if (r->history->has_without)
@@ -207,11 +207,11 @@ static gsf_result put_samples(page* p) {
     if (!h->sample_count) return GSF_OK;
     int restored = 0, skipped = 0;
     for (size_t i = 0; i < h->round_count; i++) restored += h->rounds[i].frames, skipped += h->rounds[i].skipped;
-    put(p, "<section><h2>Repaired frames</h2><p>Between training steps the camera flies along a path, the restorer repairs what it "
-           "sees, and training goes on with the repaired frames beside the photos: %d frames in %zu rounds", restored, h->round_count);
+    put(p, "<section><h2>Repaired frames</h2><p>Between training steps, frames along a camera path are rendered and repaired, and "
+           "training continues on the photos and the repaired frames: %d frames in %zu rounds", restored, h->round_count);
     if (skipped) put(p, ", %d windows skipped because their render already agreed with the photos", skipped);
-    put_raw(p, ". The brighter the confidence, the more a pixel counts; black ones, where the repair may look torn, do "
-               "not count at all.</p>\n<div class=\"cards broad\">\n");
+    put_raw(p, ". Confidence is the weight of each pixel in training; black pixels, where the repair may show seams, are "
+               "ignored.</p>\n<div class=\"cards broad\">\n");
     const size_t begin = p->html.size;
     gsf_result result = put_sample(p, &h->samples[0]);
     const size_t each = p->html.size - begin;
@@ -235,7 +235,7 @@ static void put_tile(page* p, const char* name, double value, double without, in
     if (isnan(value)) return;
     put(p, "<div class=tile><dt>%s</dt><dd>%.*f<small>%s</small></dd>", name, digits, value, unit);
     if (!isnan(without))
-        put(p, "<p class=%s>%+.*f%s by the repair alone</p>", value >= without ? "up" : "down", digits, value - without, unit);
+        put(p, "<p class=%s>%+.*f%s from repair alone</p>", value >= without ? "up" : "down", digits, value - without, unit);
     put_raw(p, "</div>\n");
 }
 
@@ -311,7 +311,7 @@ static void put_curve(page* p) {
     f.sy = (BOTTOM - TOP) / (high - low);
     f.y0 = BOTTOM + f.sy * low;
     put_raw(p, "<section><h2>PSNR over the steps</h2><p>Mean over the held-out views, measured while training");
-    if (h->round_count) put_raw(p, "; a vertical line is a repair round");
+    if (h->round_count) put_raw(p, "; vertical lines mark repair rounds");
     put_raw(p, ".</p>\n<svg class=chart viewBox=\"0 0 720 290\" role=img aria-label=\"PSNR over training steps\">");
     for (double y = low; y <= high + 0.01 * step; y += step)
         put(p, "<line class=grid x1=%d x2=%d y1=%.1f y2=%.1f /><text x=%d y=%.1f text-anchor=end>%.*f</text>", LEFT, RIGHT,
@@ -342,8 +342,8 @@ static void put_curve(page* p) {
 static void put_seconds(page* p) {
     static const char* const what[GSFIX_STAGES] = {"loading, visible points, initial splats", "training before the first round",
                                                    "rendering and measuring held-out views", "rendering and repairing path frames",
-                                                   "training with repaired frames", "checkpoints, from which --resume goes on",
-                                                   "files: pictures, splats", "training as many steps without repair, to compare"};
+                                                   "training with repaired frames", "writing checkpoints for --resume",
+                                                   "writing images and splats", "run without repair, for comparison"};
     const gsfix_history* h = p->r->history;
     double sum = 0.0;
     for (int i = 0; i < GSFIX_STAGES; i++) sum += h->seconds[i];
@@ -368,7 +368,7 @@ static void put_table(page* p) {
     const gsfix_result* r = p->r;
     const int has_without = r->history->has_without, has_seen = r->masks != NULL;
     if (!r->split->test_count) return;
-    put_raw(p, "<section><h2>Figures per view</h2><div class=scroll><table><thead><tr><th>view");
+    put_raw(p, "<section><h2>Metrics per view</h2><div class=scroll><table><thead><tr><th>view");
     if (has_without) put_raw(p, "<th>PSNR without repair, dB");
     put_raw(p, has_without ? "<th>with, dB" : "<th>PSNR, dB");
     if (has_seen) put_raw(p, has_without ? "<th>with, seen pixels, dB" : "<th>seen pixels, dB");
@@ -451,9 +451,9 @@ static gsf_result put_switches(page* p, const char* command) {
     if (result != GSF_OK) return result;
     put_raw(p, "<section><h2>How it was made</h2><pre>");
     put_escaped(p, command);
-    put(p, "</pre><p>gsfixer %s, %s kernels, %d worker%s. The same command gives the same bits on any number of workers. "
-           "PSNR and SSIM compare the render, clamped to [0,1], with the 8-bit photo; SSIM is the 3DGS papers' (11x11 Gaussian window). "
-           "Below stands what the run used, under the names that metrics.json has.</p>", GSF_VERSION,
+    put(p, "</pre><p>gsfixer %s, %s kernels, %d worker%s. The same command gives bit-identical results with any number of workers. "
+           "PSNR and SSIM compare the render, clamped to [0,1], with the 8-bit photo; SSIM is that of the 3DGS papers (11x11 Gaussian window). "
+           "The settings of the run are listed below, with their names in metrics.json.</p>", GSF_VERSION,
         gsf_cpu_level_name(p->ctx->cpu_level), p->ctx->parallel.worker_count, p->ctx->parallel.worker_count == 1 ? "" : "s");
     for (int group = 0; group < GROUPS; group++) {
         put(p, "<h3>%s</h3><dl class=switches>", groups[group]);
@@ -583,7 +583,7 @@ static void put_scene(page* p) {
     const gsfix_result* r = p->r;
     const gsfix_history* h = r->history;
     const frame3 f = make_frame(r->scene);
-    put_raw(p, "<section><h2>Cameras and path</h2><p>Drag to turn, use the buttons to come closer.</p>\n<div class=stage3>"
+    put_raw(p, "<section><h2>Cameras and path</h2><p>Drag to rotate, use the buttons to zoom.</p>\n<div class=stage3>"
                "<canvas id=space aria-label=\"cameras, path and splats in three dimensions\"></canvas>"
                "<div class=zoom><button data-z=1.25 aria-label=closer>+</button><button data-z=0.8 aria-label=farther>&minus;</button></div></div>"
                "<p class=keys><span><i class=k-train></i>training photos</span><span><i class=k-test></i>held-out photos</span>");
@@ -717,8 +717,8 @@ static void put_header(page* p) {
     put_escaped(p, title);
     put(p, "</h1><p class=lede>A 3D Gaussian Splatting scene from %zu photo%s, trained for %d steps", r->split->train_count,
         r->split->train_count == 1 ? "" : "s", (int)r->iterations);
-    if (h->round_count) put(p, " and repaired in %zu round%s on the way", h->round_count, h->round_count == 1 ? "" : "s");
-    if (r->split->test_count) put(p, ". The quality is measured on %zu photos that training never saw", r->split->test_count);
+    if (h->round_count) put(p, " with %zu round%s of repair", h->round_count, h->round_count == 1 ? "" : "s");
+    if (r->split->test_count) put(p, ". The quality is measured on %zu photos that were not used for training", r->split->test_count);
     put_raw(p, ".</p>\n");
 }
 
