@@ -128,11 +128,11 @@ typedef struct gsf_logger {
 } gsf_logger;
 
 // One unit of parallel work. `worker` is below the hook's worker_count; no two chunks run on one worker at a time.
-typedef void (*gsf_chunk_fn)(void* arg, size_t chunk, int worker);
+typedef void (*gsf_chunk_fn)(void* arg, size_t chunk, int32_t worker);
 
 typedef struct gsf_parallel { // run body for chunks 0..chunk_count-1, return when all are done; never nested
     void (*for_fn)(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg);
-    int worker_count;
+    int32_t worker_count;
     void* user;
 } gsf_parallel;
 
@@ -143,7 +143,7 @@ typedef struct gsf_io { // both or neither (neither: stdio; files are written un
     gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size);
     gsf_result (*write_fn)(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
     void* user;
-    int plain_files; // 1: read_fn reads ordinary files of the platform (and only logs or counts reads, for example); the
+    int32_t plain_files; // 1: read_fn reads ordinary files of the platform (and only logs or counts reads, for example); the
                      // library may then also list folders, map files and read parts of them, as with stdio
 } gsf_io;
 
@@ -159,9 +159,9 @@ struct gsf_context {
     gsf_io io;
     gsf_progress progress;
     gsf_cpu_level cpu_level; // in: AUTO or a level to force; out: the level in use
-    int threads;             // for the OpenMP default: number of workers, 0 = all cores
-    int cancel;              // see gsf_request_cancel
-    int initialized;
+    int32_t threads;         // for the OpenMP default: number of workers, 0 = all cores
+    int32_t cancel;          // see gsf_request_cancel
+    int32_t initialized;
     const struct gsf__services* services; // private: internals of this header for the other modules' implementations
     char error[512];         // message of the last error
 };
@@ -174,10 +174,10 @@ GSF_API GSF_NODISCARD gsf_result gsf_init_context(gsf_context* ctx);
 // other threads. Reset by gsf_clear_cancel.
 GSF_API void gsf_request_cancel(gsf_context* ctx);
 GSF_API void gsf_clear_cancel(gsf_context* ctx);
-GSF_API int gsf_is_cancelled(const gsf_context* ctx);
+GSF_API int32_t gsf_is_cancelled(const gsf_context* ctx);
 
 // Name of an instruction set level ("scalar", "avx2", "avx512", "avx512_vnni", "avx512_bf16").
-GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level);
+GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level);
 
 // Sets ctx->error (printf style), logs it and returns `result`. For hooks and restorers written by the host as well.
 // The message is one line: control characters, for example in text quoted from a file, become '?'.
@@ -192,23 +192,23 @@ GSF_API void gsf_free(gsf_context* ctx, void* memory); // NULL is fine
 // ---- random numbers ------------------------------------------------------------
 // Counter-based: a pure function of (seed, stream, index), so threads, skipping and resuming change nothing.
 
-GSF_API uint64_t gsf_random_bits(uint64_t seed, uint64_t stream, uint64_t index);
-GSF_API double gsf_random_uniform(uint64_t seed, uint64_t stream, uint64_t index); // [0,1)
-GSF_API double gsf_random_normal(uint64_t seed, uint64_t stream, uint64_t index);  // mean 0, variance 1
+GSF_API uint64_t gsf_draw_bits(uint64_t seed, uint64_t stream, uint64_t index);
+GSF_API double gsf_draw_uniform(uint64_t seed, uint64_t stream, uint64_t index); // [0,1)
+GSF_API double gsf_draw_normal(uint64_t seed, uint64_t stream, uint64_t index);    // mean 0, variance 1
 
 // ---- text and files ------------------------------------------------------------
 
-typedef struct gsf_text { // growing UTF-8 buffer, zero-terminated as soon as anything has been appended
+typedef struct gsf_buffer { // growing UTF-8 buffer, zero-terminated as soon as anything has been appended
     char* data;
     size_t size, capacity;
-    int failed; // an allocation failed; later calls do nothing
-} gsf_text;
+    int32_t failed; // an allocation failed; later calls do nothing
+} gsf_buffer;
 
-GSF_API void gsf_text_printf(gsf_context* ctx, gsf_text* text, const char* format, ...) GSF_PRINTF(3, 4);
-GSF_API void gsf_text_append(gsf_context* ctx, gsf_text* text, const char* data, size_t size);
-GSF_API void gsf_text_json_string(gsf_context* ctx, gsf_text* text, const char* string); // quoted and escaped
-GSF_API void gsf_text_json_number(gsf_context* ctx, gsf_text* text, double value);       // NaN, inf become null
-GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text);
+GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* text, const char* format, ...) GSF_PRINTF(3, 4);
+GSF_API void gsf_append_bytes(gsf_context* ctx, gsf_buffer* text, const char* data, size_t size);
+GSF_API void gsf_append_json_string(gsf_context* ctx, gsf_buffer* text, const char* string); // quoted and escaped
+GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* text, double value);   // NaN, inf become null
+GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* text);
 
 // Whole-file input and output through the io hook. `*data` is freed with gsf_free. Only regular files are read: pipes and
 // devices are refused instead of blocking.
@@ -226,13 +226,13 @@ typedef struct gsf_chunk {
     size_t size;
 } gsf_chunk;
 
-// Adds a chunk to `out` (which starts as a zeroed gsf_text). Finish with gsf_chunks_end, then gsf_write_file.
-GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size);
-GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out);
+// Adds a chunk to `out` (which starts as a zeroed gsf_buffer). Finish with gsf_append_last_chunk, then gsf_write_file.
+GSF_API void gsf_append_chunk(gsf_context* ctx, gsf_buffer* out, const char* tag, const void* data, size_t size);
+GSF_API void gsf_append_last_chunk(gsf_context* ctx, gsf_buffer* out);
 // Checks a whole file (magic, sizes, checksums, end). `name` is used in error texts.
-GSF_API GSF_NODISCARD gsf_result gsf_chunks_check(gsf_context* ctx, const char* name, const void* data, size_t size);
+GSF_API GSF_NODISCARD gsf_result gsf_check_chunks(gsf_context* ctx, const char* name, const void* data, size_t size);
 // Finds a chunk in checked data; returns 0 when there is none.
-GSF_API int gsf_chunks_find(const void* data, size_t size, const char* tag, gsf_chunk* out);
+GSF_API int32_t gsf_find_chunk(const void* data, size_t size, const char* tag, gsf_chunk* out);
 
 // ---- JSON ----------------------------------------------------------------------
 
@@ -266,14 +266,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_parse_json(gsf_context* ctx, const char* na
                                                 gsf_json* out);
 GSF_API void gsf_destroy_json(gsf_context* ctx, gsf_json* json);
 // Member of an object or NULL (also when `object` is NULL or no object).
-GSF_API const gsf_json_value* gsf_json_member(const gsf_json* json, const gsf_json_value* object, const char* key);
+GSF_API const gsf_json_value* gsf_find_json_member(const gsf_json* json, const gsf_json_value* object, const char* key);
 // Element of an array or NULL. Linear in index; walk `child` and `next` for long arrays.
-GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_json_value* array, size_t index);
+GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const gsf_json_value* array, size_t index);
 
 // ---- images --------------------------------------------------------------------
 
 typedef enum gsf_dtype { GSF_U8 = 0, GSF_U16, GSF_F16, GSF_F32, GSF_F64 } gsf_dtype;
-typedef enum gsf_color_space { GSF_SRGB = 0, GSF_LINEAR } gsf_color_space; // a label; no function converts silently
+typedef enum gsf_color_space { GSF_COLOR_SRGB = 0,
+                              GSF_COLOR_LINEAR } gsf_color_space; // a label; no function converts silently
 
 // A view of pixels. Strides are in bytes, so packed, padded, planar and flipped images are all just views.
 // `owned` is non-NULL only in images made by this library, and is what gsf_destroy_image frees.
@@ -303,8 +304,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_convert_image(gsf_context* ctx, const gsf_i
 // A file that claims more pixels than its size can hold is refused before it is decoded. EXIF rotation is not applied.
 // Scratch memory of stb and OpenImageIO does not come from the context; the returned pixels do.
 GSF_API GSF_NODISCARD gsf_result gsf_load_image(gsf_context* ctx, const char* path, int32_t channels, gsf_image* out);
-GSF_API GSF_NODISCARD gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, const void* data,
-                                                       size_t size, int32_t channels, gsf_image* out);
+GSF_API GSF_NODISCARD gsf_result gsf_decode_image(gsf_context* ctx, const char* name, const void* data,
+                                                  size_t size, int32_t channels, gsf_image* out);
 // Reads only the header.
 GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* width, int64_t* height,
                                                  int32_t* channels);
@@ -313,7 +314,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_query_image(gsf_context* ctx, const char* p
 GSF_API GSF_NODISCARD gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image);
 // PNG or JPEG bytes in memory (reports embed them). `extension` is ".png" or ".jpg".
 GSF_API GSF_NODISCARD gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension,
-                                                  gsf_text* out);
+                                                  gsf_buffer* out);
 
 typedef enum gsf_resize_filter {
     GSF_RESIZE_PIL_BILINEAR,   // PIL.Image.resize: antialiased when shrinking, u8 in two integer passes, bit-exact
@@ -339,10 +340,10 @@ typedef enum gsf_ssim_kind {
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
 // them). With no pixel to count, or an image smaller than the window needs (6 pixels for TORCHMETRICS, 7 for SKIMAGE),
 // the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), of identical images +infinity.
-GSF_API GSF_NODISCARD gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
-                                          const gsf_image* mask, double* out);
-GSF_API GSF_NODISCARD gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
-                                          const gsf_image* mask, double* out);
+GSF_API GSF_NODISCARD gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
+                                                  const gsf_image* mask, double* out);
+GSF_API GSF_NODISCARD gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a,
+                                                  const gsf_image* b, const gsf_image* mask, double* out);
 
 // ---- cameras -------------------------------------------------------------------
 
@@ -355,13 +356,13 @@ typedef struct gsf_camera { // pinhole: u = fx X/Z + cx, v = fy Y/Z + cy with (X
 // Checks that a camera is finite and rigid (to 1e-4) with positive focal lengths and size; otherwise the error names the
 // entry.
 GSF_API GSF_NODISCARD gsf_result gsf_check_camera(gsf_context* ctx, const gsf_camera* camera);
-GSF_API void gsf_camera_center(const gsf_camera* camera, double center[3]);
-GSF_API void gsf_camera_c2w(const gsf_camera* camera, double c2w[16]);
-GSF_API void gsf_camera_set_c2w(gsf_camera* camera, const double c2w[16]); // inverts a rigid transform
+GSF_API void gsf_get_camera_center(const gsf_camera* camera, double center[3]);
+GSF_API void gsf_get_camera_c2w(const gsf_camera* camera, double c2w[16]);
+GSF_API void gsf_set_camera_c2w(gsf_camera* camera, const double c2w[16]); // inverts a rigid transform
 // World point to pixel and camera depth. Returns 0 (u, v unchanged) if depth <= 0.
-GSF_API int gsf_camera_project(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth);
+GSF_API int32_t gsf_project_point(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth);
 // The same view at another image size; intrinsics are scaled separately in width and height.
-GSF_API gsf_camera gsf_camera_resized(const gsf_camera* camera, int32_t width, int32_t height);
+GSF_API gsf_camera gsf_resize_camera(const gsf_camera* camera, int32_t width, int32_t height);
 
 // JSON list of cameras ({"cameras":[{"name","w2c":[16 numbers, row-major],"fx","fy","cx","cy","width","height"}]}),
 // the format of `gsfix path`, `gsfix render --path` and a restorer job's cameras.json. Names may be NULL.
@@ -376,7 +377,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_load_cameras(gsf_context* ctx, const char* 
 // host fills in its own functions or uses one of the toolkit's restorers (warp in gsfixer_splat.h, the video model in
 // gsfixer_nn.h).
 
-typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
+typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
     uint32_t struct_size;           // set by the caller, which zeroes the rest: nothing is written beyond it
     int32_t frame_count_min, frame_count_max;
     int32_t frame_count_step;       // legal counts: min, min + step, ... up to max
@@ -390,7 +391,7 @@ typedef struct gsf_restorer_limits { // what a restorer accepts; zero = any
                                     // nothing: the loop compares it with the renders to find windows that need no
                                     // repair, instead of reprojecting the references itself
     double bytes, flops;            // estimate for one window of the queried size; 0 = unknown
-} gsf_restorer_limits;
+} gsf_restorer_info;
 
 typedef struct gsf_reference { // a photo the scene was trained on
     gsf_image color;  // f32, 3 channels; masked pixels are replaced by the splats' render and have no depth
@@ -421,7 +422,7 @@ typedef struct gsf_restorer {
     const char* name;
     void* user;
     gsf_result (*query_fn)(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
-                           gsf_restorer_limits* out);
+                           gsf_restorer_info* out);
     // References are borrowed for the call; copy what later windows need. The toolkit's restorers refuse a second begin
     // before end.
     gsf_result (*begin_fn)(void* user, gsf_context* ctx, const gsf_reference* references, int32_t reference_count);
@@ -850,27 +851,27 @@ GSF__SHARED gsf_result gsf__open_result(int reason) {
 
 enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 
-// A chunk whose bytes are appended to `out` piece by piece: open, gsf_text_append ..., close what open returned.
-GSF__SHARED size_t gsf__open_chunk(gsf_context* ctx, gsf_text* out, const char* tag) {
+// A chunk whose bytes are appended to `out` piece by piece: open, gsf_append_bytes ..., close what open returned.
+GSF__SHARED size_t gsf__open_chunk(gsf_context* ctx, gsf_buffer* out, const char* tag) {
     char head[GSF__CHUNK_HEAD]; // or the file's, which is as long
     if (out->size == 0) {
         memcpy(head, "GSFCHUNK", 8);
         gsf__store_le(head + 8, 1, 4);
-        gsf_text_append(ctx, out, head, GSF__CHUNK_FILE_HEAD);
+        gsf_append_bytes(ctx, out, head, GSF__CHUNK_FILE_HEAD);
     }
     const size_t opened = out->size;
     memset(head, 0, sizeof head); // the size is filled in by close
     memcpy(head, tag, 4);
-    gsf_text_append(ctx, out, head, GSF__CHUNK_HEAD);
+    gsf_append_bytes(ctx, out, head, GSF__CHUNK_HEAD);
     return opened;
 }
 
-GSF__SHARED void gsf__close_chunk(gsf_context* ctx, gsf_text* out, size_t opened) {
+GSF__SHARED void gsf__close_chunk(gsf_context* ctx, gsf_buffer* out, size_t opened) {
     char crc[GSF__CHUNK_TAIL];
     if (out->failed) return;
     gsf__store_le(out->data + opened + 4, out->size - opened - GSF__CHUNK_HEAD, 8);
     gsf__store_le(crc, gsf__crc32(0, out->data + opened, out->size - opened), 4);
-    gsf_text_append(ctx, out, crc, sizeof crc);
+    gsf_append_bytes(ctx, out, crc, sizeof crc);
 }
 
 // What only gsfixer.h's own implementation can do. Other implementations, which may stand in other files or libraries, find
@@ -878,7 +879,7 @@ GSF__SHARED void gsf__close_chunk(gsf_context* ctx, gsf_text* out, size_t opened
 typedef struct gsf__services {
     gsf_result (*inflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
                              size_t room);
-    gsf_result (*deflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+    gsf_result (*deflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out);
     gsf_result (*parse_json_fn)(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
                                 gsf_json* out);
     gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size); // the default hook
@@ -893,7 +894,8 @@ GSF__SHARED gsf_result gsf__inflate(gsf_context* ctx, const char* name, const vo
 }
 
 // Appends `data` (size > 0) compressed.
-GSF__SHARED gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+GSF__SHARED gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                    gsf_buffer* out) {
     return ctx->services->deflate_fn(ctx, name, data, size, out);
 }
 
@@ -1422,7 +1424,7 @@ GSF_API const char* gsf_describe_result(gsf_result result) {
     return "unknown result";
 }
 
-GSF_API const char* gsf_cpu_level_name(gsf_cpu_level level) {
+GSF_API const char* gsf_describe_cpu_level(gsf_cpu_level level) {
     switch (level) {
         case GSF_CPU_AUTO: return "auto";
         case GSF_CPU_SCALAR: return "scalar";
@@ -1474,7 +1476,7 @@ GSF_API gsf_result gsf_fail(gsf_context* ctx, gsf_result result, const char* for
 
 GSF_API void gsf_request_cancel(gsf_context* ctx) { GSF__ATOMIC_STORE(&ctx->cancel, 1); }
 GSF_API void gsf_clear_cancel(gsf_context* ctx) { GSF__ATOMIC_STORE(&ctx->cancel, 0); }
-GSF_API int gsf_is_cancelled(const gsf_context* ctx) { return GSF__ATOMIC_LOAD(&ctx->cancel) != 0; }
+GSF_API int32_t gsf_is_cancelled(const gsf_context* ctx) { return GSF__ATOMIC_LOAD(&ctx->cancel) != 0; }
 
 // ---- >>memory ------------------------------------------------------------------
 
@@ -1529,7 +1531,7 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
 static gsf_result gsf__json_parse(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
                                   gsf_json* out);
-static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out);
+static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out);
 static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
                                    size_t room);
 
@@ -1579,25 +1581,25 @@ static uint64_t gsf__mix64(uint64_t x) {
     return x ^ (x >> 31);
 }
 
-GSF_API uint64_t gsf_random_bits(uint64_t seed, uint64_t stream, uint64_t index) {
+GSF_API uint64_t gsf_draw_bits(uint64_t seed, uint64_t stream, uint64_t index) {
     uint64_t x = gsf__mix64(seed + 0x9e3779b97f4a7c15u);
     x = gsf__mix64(x ^ (stream * 0xd1342543de82ef95u + 0x2545f4914f6cdd1du));
     return gsf__mix64(x ^ (index * 0x9e3779b97f4a7c15u + 0x632be59bd9b4e019u));
 }
 
-GSF_API double gsf_random_uniform(uint64_t seed, uint64_t stream, uint64_t index) {
-    return (double)(gsf_random_bits(seed, stream, index) >> 11) * (1.0 / 9007199254740992.0);
+GSF_API double gsf_draw_uniform(uint64_t seed, uint64_t stream, uint64_t index) {
+    return (double)(gsf_draw_bits(seed, stream, index) >> 11) * (1.0 / 9007199254740992.0);
 }
 
-GSF_API double gsf_random_normal(uint64_t seed, uint64_t stream, uint64_t index) { // Box-Muller
-    const double u = 1.0 - gsf_random_uniform(seed, stream, 2 * index);
-    const double v = gsf_random_uniform(seed, stream, 2 * index + 1);
+GSF_API double gsf_draw_normal(uint64_t seed, uint64_t stream, uint64_t index) { // Box-Muller
+    const double u = 1.0 - gsf_draw_uniform(seed, stream, 2 * index);
+    const double v = gsf_draw_uniform(seed, stream, 2 * index + 1);
     return sqrt(-2.0 * log(u)) * cos(6.283185307179586 * v);
 }
 
 // ---- >>text --------------------------------------------------------------------
 
-GSF_API void gsf_text_append(gsf_context* ctx, gsf_text* text, const char* data, size_t size) {
+GSF_API void gsf_append_bytes(gsf_context* ctx, gsf_buffer* text, const char* data, size_t size) {
     if (text->failed) return;
     if (size > SIZE_MAX - text->size - 1 ||
         gsf__reserve(ctx, (void**)&text->data, &text->capacity, text->size, text->size + size + 1, 1) != GSF_OK) {
@@ -1609,7 +1611,7 @@ GSF_API void gsf_text_append(gsf_context* ctx, gsf_text* text, const char* data,
     text->data[text->size] = 0;
 }
 
-GSF_API void gsf_text_printf(gsf_context* ctx, gsf_text* text, const char* format, ...) {
+GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* text, const char* format, ...) {
     va_list args, again;
     va_start(args, format);
     va_copy(again, args);
@@ -1619,7 +1621,7 @@ GSF_API void gsf_text_printf(gsf_context* ctx, gsf_text* text, const char* forma
     if (length < 0) {
         text->failed = 1;
     } else if ((size_t)length < sizeof small) {
-        gsf_text_append(ctx, text, small, (size_t)length);
+        gsf_append_bytes(ctx, text, small, (size_t)length);
     } else if (!text->failed) {
         if (gsf__reserve(ctx, (void**)&text->data, &text->capacity, text->size, text->size + (size_t)length + 1, 1) ==
             GSF_OK) {
@@ -1632,33 +1634,33 @@ GSF_API void gsf_text_printf(gsf_context* ctx, gsf_text* text, const char* forma
     va_end(again);
 }
 
-GSF_API void gsf_text_json_string(gsf_context* ctx, gsf_text* text, const char* string) {
+GSF_API void gsf_append_json_string(gsf_context* ctx, gsf_buffer* text, const char* string) {
     const char* p = string ? string : "";
     size_t left = strlen(p);
-    gsf_text_append(ctx, text, "\"", 1);
+    gsf_append_bytes(ctx, text, "\"", 1);
     while (left) {
         size_t plain = 0; // bytes that need no escape
         size_t step;
         while (plain < left && (unsigned char)p[plain] >= 0x20 && p[plain] != '"' && p[plain] != '\\' &&
                (step = gsf__utf8_size(p + plain, left - plain)) != 0)
             plain += step;
-        gsf_text_append(ctx, text, p, plain);
+        gsf_append_bytes(ctx, text, p, plain);
         p += plain;
         left -= plain;
         if (!left) break;
         const unsigned char c = (unsigned char)*p++;
         left--;
-        if (c == '"' || c == '\\') gsf_text_printf(ctx, text, "\\%c", c);
-        else if (c < 0x20) gsf_text_printf(ctx, text, "\\u%04x", (unsigned)c);
-        else gsf_text_append(ctx, text, "\\ufffd", 6); // a byte that is no UTF-8
+        if (c == '"' || c == '\\') gsf_append_text(ctx, text, "\\%c", c);
+        else if (c < 0x20) gsf_append_text(ctx, text, "\\u%04x", (unsigned)c);
+        else gsf_append_bytes(ctx, text, "\\ufffd", 6); // a byte that is no UTF-8
     }
-    gsf_text_append(ctx, text, "\"", 1);
+    gsf_append_bytes(ctx, text, "\"", 1);
 }
 
 // The shortest of 15, 16 or 17 digits that reads back as the same double; the point is a point in every locale.
-GSF_API void gsf_text_json_number(gsf_context* ctx, gsf_text* text, double value) {
+GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* text, double value) {
     if (!isfinite(value)) {
-        gsf_text_append(ctx, text, "null", 4);
+        gsf_append_bytes(ctx, text, "null", 4);
         return;
     }
     char printed[64], plain[64];
@@ -1673,10 +1675,10 @@ GSF_API void gsf_text_json_number(gsf_context* ctx, gsf_text* text, double value
         double back = 0.0;
         if (gsf__scan_double(plain, size, &back) == size && back == value) break;
     }
-    gsf_text_append(ctx, text, plain, size);
+    gsf_append_bytes(ctx, text, plain, size);
 }
 
-GSF_API void gsf_destroy_text(gsf_context* ctx, gsf_text* text) {
+GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* text) {
     gsf_free(ctx, text->data);
     memset(text, 0, sizeof *text);
 }
@@ -1715,7 +1717,7 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
     (void)user;
     FILE* file;
     GSF__TRY(gsf__open_file(ctx, path, &file));
-    gsf_text buffer;
+    gsf_buffer buffer;
     memset(&buffer, 0, sizeof buffer);
     gsf_result result = GSF_OK;
     size_t step = 1 << 16;
@@ -1741,7 +1743,7 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
     }
     fclose(file);
     if (result != GSF_OK) {
-        gsf_destroy_text(ctx, &buffer);
+        gsf_destroy_buffer(ctx, &buffer);
         return result;
     }
     buffer.data[buffer.size] = 0;
@@ -1751,10 +1753,10 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
 }
 
 // A new file beside `path`, whose name goes to `name`: a file or link that is there already is someone's, and stays.
-static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_text* name) {
+static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name) {
     for (int i = 0; i < 100; i++) {
         name->size = 0;
-        gsf_text_printf(ctx, name, i ? "%s.tmp%d" : "%s.tmp", path, i);
+        gsf_append_text(ctx, name, i ? "%s.tmp%d" : "%s.tmp", path, i);
         errno = 0;
         FILE* file = name->failed ? NULL : fopen(name->data, "wbx");
         if (file || name->failed || errno != EEXIST) return file;
@@ -1767,7 +1769,7 @@ static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_text* name) {
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     (void)user;
     const int device = gsf__is_device(path);
-    gsf_text name;
+    gsf_buffer name;
     memset(&name, 0, sizeof name);
     gsf_result result = GSF_OK;
     FILE* file = device ? fopen(path, "wb") : gsf__open_new(ctx, path, &name);
@@ -1796,7 +1798,7 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
             result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(reason));
         }
     }
-    gsf_destroy_text(ctx, &name);
+    gsf_destroy_buffer(ctx, &name);
     return result;
 }
 
@@ -1812,15 +1814,15 @@ GSF_API gsf_result gsf_write_file(gsf_context* ctx, const char* path, const void
 
 // ---- >>chunks ------------------------------------------------------------------
 
-GSF_API void gsf_chunks_add(gsf_context* ctx, gsf_text* out, const char* tag, const void* data, size_t size) {
+GSF_API void gsf_append_chunk(gsf_context* ctx, gsf_buffer* out, const char* tag, const void* data, size_t size) {
     const size_t opened = gsf__open_chunk(ctx, out, tag);
-    gsf_text_append(ctx, out, (const char*)data, size);
+    gsf_append_bytes(ctx, out, (const char*)data, size);
     gsf__close_chunk(ctx, out, opened);
 }
 
-GSF_API void gsf_chunks_end(gsf_context* ctx, gsf_text* out) { gsf_chunks_add(ctx, out, "END ", "", 0); }
+GSF_API void gsf_append_last_chunk(gsf_context* ctx, gsf_buffer* out) { gsf_append_chunk(ctx, out, "END ", "", 0); }
 
-GSF_API gsf_result gsf_chunks_check(gsf_context* ctx, const char* name, const void* data, size_t size) {
+GSF_API gsf_result gsf_check_chunks(gsf_context* ctx, const char* name, const void* data, size_t size) {
     const char* p = (const char*)data;
     if (size < GSF__CHUNK_FILE_HEAD || memcmp(p, "GSFCHUNK", 8) != 0)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not a checkpoint (magic GSFCHUNK expected)", name);
@@ -1846,7 +1848,7 @@ GSF_API gsf_result gsf_chunks_check(gsf_context* ctx, const char* name, const vo
     }
 }
 
-GSF_API int gsf_chunks_find(const void* data, size_t size, const char* tag, gsf_chunk* out) {
+GSF_API int32_t gsf_find_chunk(const void* data, size_t size, const char* tag, gsf_chunk* out) {
     const char* p = (const char*)data;
     memset(out, 0, sizeof *out);
     for (size_t at = GSF__CHUNK_FILE_HEAD; size - at >= GSF__CHUNK_HEAD && memcmp(p + at, "END ", 4) != 0;) {
@@ -2208,7 +2210,8 @@ GSF_API void gsf_destroy_json(gsf_context* ctx, gsf_json* json) {
     memset(json, 0, sizeof *json);
 }
 
-GSF_API const gsf_json_value* gsf_json_member(const gsf_json* json, const gsf_json_value* object, const char* key) {
+GSF_API const gsf_json_value* gsf_find_json_member(const gsf_json* json, const gsf_json_value* object,
+                                                   const char* key) {
     if (!object || object->type != GSF_JSON_OBJECT) return NULL;
     const size_t size = strlen(key);
     for (uint32_t i = object->child; i; i = json->values[i].next)
@@ -2216,7 +2219,7 @@ GSF_API const gsf_json_value* gsf_json_member(const gsf_json* json, const gsf_js
     return NULL;
 }
 
-GSF_API const gsf_json_value* gsf_json_element(const gsf_json* json, const gsf_json_value* array, size_t index) {
+GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const gsf_json_value* array, size_t index) {
     if (!array || array->type != GSF_JSON_ARRAY || index >= array->count) return NULL;
     uint32_t i = array->child;
     while (index--) i = json->values[i].next;
@@ -2234,7 +2237,7 @@ enum {
 
 typedef struct gsf__deflater {
     gsf_context* ctx;
-    gsf_text* out;
+    gsf_buffer* out;
     uint64_t bits; // not yet in `buffer`
     int bit_count;
     size_t used;
@@ -2254,7 +2257,7 @@ static void gsf__put_bits(gsf__deflater* d, uint32_t value, int count) {
     for (d->bit_count += count; d->bit_count >= 8; d->bit_count -= 8, d->bits >>= 8) {
         d->buffer[d->used++] = (unsigned char)(d->bits & 255u);
         if (d->used < sizeof d->buffer) continue;
-        gsf_text_append(d->ctx, d->out, (const char*)d->buffer, d->used);
+        gsf_append_bytes(d->ctx, d->out, (const char*)d->buffer, d->used);
         d->used = 0;
     }
 }
@@ -2478,7 +2481,7 @@ static size_t gsf__lz_match(gsf__deflater* d, size_t at, size_t best, uint32_t* 
     return found;
 }
 
-static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out) {
     if (size > (size_t)1 << 30)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, at most 2^30 are", name, size);
     gsf__deflater* d = (gsf__deflater*)gsf_alloc_zeroed(ctx, 1, sizeof *d);
@@ -2499,7 +2502,7 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
     }
     gsf__put_block(d, 1, size);
     gsf__put_bits(d, 0, 7); // the last byte's rest
-    gsf_text_append(ctx, out, (const char*)d->buffer, d->used);
+    gsf_append_bytes(ctx, out, (const char*)d->buffer, d->used);
     gsf_free(ctx, d);
     return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
@@ -2707,7 +2710,7 @@ typedef struct gsf__convert_job {
     const gsf_image *src, *dst;
 } gsf__convert_job;
 
-static void gsf__convert_rows(void* arg, size_t chunk, int worker) {
+static void gsf__convert_rows(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__convert_job* job = (const gsf__convert_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
@@ -2792,7 +2795,7 @@ static gsf_result gsf__oiio_load(gsf_context* ctx, const char* name, const void*
 static gsf_result gsf__oiio_query(gsf_context* ctx, const char* name, const void* data, size_t size, int64_t* width,
                                   int64_t* height, int32_t* channels);
 static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const char* extension, const gsf_image* image,
-                                   gsf_text* out);
+                                   gsf_buffer* out);
 #endif
 
 #ifndef GSF_NO_STB
@@ -3023,7 +3026,7 @@ static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_so
 
 // stb looks up colours in 256 entries of which it fills as many as the file has; the others are whatever was there before.
 // So it gets the file with a whole palette, black behind its end.
-static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t size, gsf_text* out) {
+static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t size, gsf_buffer* out) {
     enum { FULL = 768 };
     static const char zeros[FULL] = {0}, head[8] = {0, 0, FULL >> 8, FULL & 255, 'P', 'L', 'T', 'E'};
     for (size_t at = 8; at + 12 <= size;) { // lengths are checked
@@ -3032,11 +3035,11 @@ static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t siz
         if (memcmp(p + 4, "IDAT", 4) == 0) return;
         if (memcmp(p + 4, "PLTE", 4) == 0) {
             if (bytes >= FULL || bytes % 3) return; // stb refuses others
-            gsf_text_append(ctx, out, data, at);
-            gsf_text_append(ctx, out, head, sizeof head);
-            gsf_text_append(ctx, out, data + at + 8, bytes);
-            gsf_text_append(ctx, out, zeros, FULL - bytes);
-            gsf_text_append(ctx, out, data + at + 8 + bytes, size - at - 8 - bytes); // stb skips the sum
+            gsf_append_bytes(ctx, out, data, at);
+            gsf_append_bytes(ctx, out, head, sizeof head);
+            gsf_append_bytes(ctx, out, data + at + 8, bytes);
+            gsf_append_bytes(ctx, out, zeros, FULL - bytes);
+            gsf_append_bytes(ctx, out, data + at + 8 + bytes, size - at - 8 - bytes); // stb skips the sum
             return;
         }
         at += 12 + bytes;
@@ -3044,7 +3047,8 @@ static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t siz
 }
 
 // The same for a BMP. Of the old header (12 bytes) stb counts four colours less than there are, as if it had 24.
-static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, const char* data, size_t size, gsf_text* out) {
+static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, const char* data, size_t size,
+                                        gsf_buffer* out) {
     static const char zeros[1024 + 12] = {0};
     if (size < 32) return GSF_OK; // stb says that it is cut
     const unsigned char* p = (const unsigned char*)data;
@@ -3058,11 +3062,11 @@ static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, cons
     const size_t old = header == 12 ? 12 : 0, full = (size_t)entry * 256, used = (size_t)(colors * entry);
     const uint64_t moved = begin + full + old;
     const char place[4] = {(char)(moved & 255), (char)(moved >> 8), 0, 0};
-    gsf_text_append(ctx, out, data, 10);
-    gsf_text_append(ctx, out, place, 4);
-    gsf_text_append(ctx, out, data + 14, (size_t)header + used);
-    gsf_text_append(ctx, out, zeros, full - used + old);
-    gsf_text_append(ctx, out, data + (size_t)offset, size - (size_t)offset);
+    gsf_append_bytes(ctx, out, data, 10);
+    gsf_append_bytes(ctx, out, place, 4);
+    gsf_append_bytes(ctx, out, data + 14, (size_t)header + used);
+    gsf_append_bytes(ctx, out, zeros, full - used + old);
+    gsf_append_bytes(ctx, out, data + (size_t)offset, size - (size_t)offset);
     return GSF_OK;
 }
 
@@ -3082,7 +3086,7 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     if (kind == GSF__IMAGE_PNG) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, most));
     if (kind == GSF__IMAGE_JPEG) GSF__TRY(gsf__check_jpeg(ctx, name, (const unsigned char*)data, size, source.at));
     gsf__source_rewind(&source);
-    gsf_text whole;
+    gsf_buffer whole;
     memset(&whole, 0, sizeof whole);
     if (kind == GSF__IMAGE_BMP) GSF__TRY(gsf__bmp_full_palette(ctx, name, (const char*)data, size, &whole));
     if (kind == GSF__IMAGE_PNG) gsf__png_full_palette(ctx, (const char*)data, size, &whole);
@@ -3095,7 +3099,7 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     if (result == GSF_OK) result = gsf_make_image(ctx, GSF_U8, w, h, channels ? channels : c, out);
     if (result == GSF_OK) memcpy(out->data, pixels, (size_t)out->stride_y * (size_t)h);
     stbi_image_free(pixels);
-    gsf_destroy_text(ctx, &whole);
+    gsf_destroy_buffer(ctx, &whole);
     return result;
 }
 
@@ -3118,7 +3122,7 @@ static int gsf__stb_reads(const void* data, size_t size) {
 
 static void gsf__stb_write(void* user, void* data, int size) {
     void** both = (void**)user; // context, text
-    gsf_text_append((gsf_context*)both[0], (gsf_text*)both[1], (const char*)data, (size_t)size);
+    gsf_append_bytes((gsf_context*)both[0], (gsf_buffer*)both[1], (const char*)data, (size_t)size);
 }
 
 #endif // GSF_NO_STB
@@ -3152,8 +3156,8 @@ static void gsf__path_extension(const char* path, char out[8]) {
     out[n] = 0;
 }
 
-GSF_API gsf_result gsf_load_image_memory(gsf_context* ctx, const char* name, const void* data, size_t size,
-                                         int32_t channels, gsf_image* out) {
+GSF_API gsf_result gsf_decode_image(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                    int32_t channels, gsf_image* out) {
     memset(out, 0, sizeof *out);
     if (channels != 0 && channels != 1 && channels != 3 && channels != 4)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %d channels wanted (0, 1, 3 or 4)", name, (int)channels);
@@ -3178,7 +3182,7 @@ GSF_API gsf_result gsf_load_image(gsf_context* ctx, const char* path, int32_t ch
     void* data;
     size_t size;
     GSF__TRY(gsf_read_file(ctx, path, &data, &size));
-    const gsf_result result = gsf_load_image_memory(ctx, path, data, size, channels, out);
+    const gsf_result result = gsf_decode_image(ctx, path, data, size, channels, out);
     gsf_free(ctx, data);
     return result;
 }
@@ -3279,16 +3283,16 @@ static uint32_t gsf__adler32(const unsigned char* data, size_t size) {
 }
 
 // Fills in the length of the chunk that began at `begin` and appends its checksum.
-static void gsf__png_close(gsf_context* ctx, gsf_text* out, size_t begin) {
+static void gsf__png_close(gsf_context* ctx, gsf_buffer* out, size_t begin) {
     char sum[4];
     if (out->failed) return;
     gsf__store_be32(out->data + begin, (uint32_t)(out->size - begin - 8));
     gsf__store_be32(sum, gsf__crc32(0, out->data + begin + 4, out->size - begin - 4));
-    gsf_text_append(ctx, out, sum, sizeof sum);
+    gsf_append_bytes(ctx, out, sum, sizeof sum);
 }
 
 // `image`: packed, of 1 to 4 channels.
-static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_text* out) {
+static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_buffer* out) {
     static const char kinds[5] = {0, 0, 4, 2, 6}; // by channels
     char head[33] = "\x89PNG\r\n\x1a\n\0\0\0\0IHDR", sum[4];
     const size_t row = (size_t)image->stride_y, filtered_size = (row + 1) * (size_t)image->height;
@@ -3300,22 +3304,22 @@ static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_
     gsf__store_be32(head + 20, (uint32_t)image->height);
     head[24] = 8;
     head[25] = kinds[image->channels];
-    gsf_text_append(ctx, out, head, 8 + 8 + 13);
+    gsf_append_bytes(ctx, out, head, 8 + 8 + 13);
     gsf__png_close(ctx, out, begin);
     begin = out->size;
-    gsf_text_append(ctx, out, "\0\0\0\0IDAT\x78\x5e", 10); // zlib: a window of 32 KiB
+    gsf_append_bytes(ctx, out, "\0\0\0\0IDAT\x78\x5e", 10); // zlib: a window of 32 KiB
     gsf_result result = gsf__deflate(ctx, name, filtered, filtered_size, out);
     gsf__store_be32(sum, gsf__adler32(filtered, filtered_size));
-    gsf_text_append(ctx, out, sum, sizeof sum);
+    gsf_append_bytes(ctx, out, sum, sizeof sum);
     gsf__png_close(ctx, out, begin);
     begin = out->size;
-    gsf_text_append(ctx, out, "\0\0\0\0IEND", 8);
+    gsf_append_bytes(ctx, out, "\0\0\0\0IEND", 8);
     gsf__png_close(ctx, out, begin);
     gsf_free(ctx, filtered);
     return result == GSF_OK && out->failed ? GSF_ERROR_OUT_OF_MEMORY : result;
 }
 
-static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_text* out) {
+static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_buffer* out) {
 #ifdef GSF_NO_STB
     (void)image, (void)out;
     return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no JPEG (GSF_NO_STB)", name);
@@ -3333,7 +3337,7 @@ static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf
 
 // Appends the encoded file to `out`, or leaves it as it was.
 static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gsf_image* image, const char* extension,
-                                    gsf_text* out) {
+                                    gsf_buffer* out) {
     GSF__TRY(gsf__check_image(ctx, name, image));
     const int png = strcmp(extension, ".png") == 0;
     if (!png && strcmp(extension, ".jpg") != 0 && strcmp(extension, ".jpeg") != 0)
@@ -3357,14 +3361,14 @@ static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gs
     return result;
 }
 
-GSF_API gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension, gsf_text* out) {
+GSF_API gsf_result gsf_encode_image(gsf_context* ctx, const gsf_image* image, const char* extension, gsf_buffer* out) {
     return gsf__encode_image(ctx, "encode", image, extension, out);
 }
 
 GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_image* image) {
     char extension[8];
     gsf__path_extension(path, extension);
-    gsf_text file;
+    gsf_buffer file;
     memset(&file, 0, sizeof file);
     gsf_result result;
 #ifdef GSF_USE_OIIO
@@ -3381,7 +3385,7 @@ GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_
 #endif
         result = gsf__encode_image(ctx, path, image, extension, &file);
     if (result == GSF_OK) result = gsf_write_file(ctx, path, file.data, file.size);
-    gsf_destroy_text(ctx, &file);
+    gsf_destroy_buffer(ctx, &file);
     return result;
 }
 
@@ -3468,7 +3472,7 @@ typedef struct gsf__resize_job {
 } gsf__resize_job;
 
 // Along x, same height.
-static void gsf__resize_rows_x(void* arg, size_t chunk, int worker) {
+static void gsf__resize_rows_x(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
@@ -3501,7 +3505,7 @@ static void gsf__resize_rows_x(void* arg, size_t chunk, int worker) {
 }
 
 // Along y, same width: runs of pixels, so that the memory is walked along rows.
-static void gsf__resize_rows_y(void* arg, size_t chunk, int worker) {
+static void gsf__resize_rows_y(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
     const gsf_image *src = job->src, *dst = job->dst;
@@ -3645,7 +3649,7 @@ typedef struct gsf__psnr_job {
     gsf__metric_sum* sums; // one per chunk
 } gsf__psnr_job;
 
-static void gsf__psnr_rows(void* arg, size_t chunk, int worker) {
+static void gsf__psnr_rows(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__psnr_job* job = (const gsf__psnr_job*)arg;
     const gsf_image *a = job->a, *b = job->b;
@@ -3670,8 +3674,8 @@ static void gsf__psnr_rows(void* arg, size_t chunk, int worker) {
     job->sums[chunk].count = count;
 }
 
-GSF_API gsf_result gsf_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
-                            double* out) {
+GSF_API gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
+                                    double* out) {
     GSF__TRY(gsf__check_image_pair(ctx, "psnr", a, b, mask));
     gsf__psnr_job job;
     job.a = a;
@@ -3797,7 +3801,7 @@ static double gsf__ssim_value(gsf_ssim_kind kind, double ma, double mb, double m
     return ((2.0 * ma * mb + c1) * (2.0 * cov + c2)) / ((ma * ma + mb * mb + c1) * (va + vb + c2));
 }
 
-static void gsf__ssim_rows(void* arg, size_t chunk, int worker) {
+static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf__ssim_job* job = (const gsf__ssim_job*)arg;
     const int32_t channel = (int32_t)(chunk / job->chunks_per_channel);
     const int64_t last = job->a->height - job->inset, radius = job->radius;
@@ -3830,8 +3834,8 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int worker) {
     job->sums[chunk].count = count;
 }
 
-GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
-                            const gsf_image* mask, double* out) {
+GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
+                                    const gsf_image* mask, double* out) {
     // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5. The 3DGS code rounds these to float32 and their products once more, so that
     // its window sums up to 1 - 6.94e-8, which adds as much of mu^2 to its variances: here the rounded taps, scaled to that
     // sum. The others in double as torchmetrics has them for double images.
@@ -3888,16 +3892,17 @@ GSF_API gsf_result gsf_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_imag
 
 // ---- >>cameras -----------------------------------------------------------------
 
-GSF_API void gsf_camera_center(const gsf_camera* camera, double center[3]) {
+GSF_API void gsf_get_camera_center(const gsf_camera* camera, double center[3]) {
     double c2w[16];
     gsf__mat4_rigid_inverse(camera->w2c, c2w);
     memcpy(center, c2w + 12, 3 * sizeof(double));
 }
 
-GSF_API void gsf_camera_c2w(const gsf_camera* camera, double c2w[16]) { gsf__mat4_rigid_inverse(camera->w2c, c2w); }
-GSF_API void gsf_camera_set_c2w(gsf_camera* camera, const double c2w[16]) { gsf__mat4_rigid_inverse(c2w, camera->w2c); }
+GSF_API void gsf_get_camera_c2w(const gsf_camera* camera, double c2w[16]) { gsf__mat4_rigid_inverse(camera->w2c, c2w); }
+GSF_API void gsf_set_camera_c2w(gsf_camera* camera, const double c2w[16]) { gsf__mat4_rigid_inverse(c2w, camera->w2c); }
 
-GSF_API int gsf_camera_project(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth) {
+GSF_API int32_t gsf_project_point(const gsf_camera* camera, const double point[3], double* u, double* v,
+                                  double* depth) {
     double p[3];
     gsf__camera_transform(camera, point, p);
     *depth = p[2];
@@ -3907,7 +3912,7 @@ GSF_API int gsf_camera_project(const gsf_camera* camera, const double point[3], 
     return 1;
 }
 
-GSF_API gsf_camera gsf_camera_resized(const gsf_camera* camera, int32_t width, int32_t height) {
+GSF_API gsf_camera gsf_resize_camera(const gsf_camera* camera, int32_t width, int32_t height) {
     gsf_camera out = *camera;
     const double sx = (double)width / camera->width, sy = (double)height / camera->height;
     out.fx *= sx;
@@ -3947,10 +3952,10 @@ GSF_API gsf_result gsf_check_camera(gsf_context* ctx, const gsf_camera* camera) 
 GSF_API gsf_result gsf_save_cameras(gsf_context* ctx, const char* path, const gsf_camera* cameras,
                                     const char* const* names, size_t count) {
     static const char* const keys[4] = {"fx", "fy", "cx", "cy"};
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     gsf_result result = GSF_OK;
-    gsf_text_printf(ctx, &text, "{\"cameras\":[");
+    gsf_append_text(ctx, &text, "{\"cameras\":[");
     for (size_t i = 0; i < count && result == GSF_OK; i++) {
         const gsf_camera* camera = &cameras[i];
         result = gsf_check_camera(ctx, camera);
@@ -3958,35 +3963,35 @@ GSF_API gsf_result gsf_save_cameras(gsf_context* ctx, const char* path, const gs
             (void)gsf_fail(ctx, result, "%s: camera %zu: %s", path, i, ctx->error);
             break;
         }
-        gsf_text_printf(ctx, &text, "%s\n{", i ? "," : "");
+        gsf_append_text(ctx, &text, "%s\n{", i ? "," : "");
         if (names && names[i]) {
-            gsf_text_printf(ctx, &text, "\"name\":");
-            gsf_text_json_string(ctx, &text, names[i]);
-            gsf_text_printf(ctx, &text, ",");
+            gsf_append_text(ctx, &text, "\"name\":");
+            gsf_append_json_string(ctx, &text, names[i]);
+            gsf_append_text(ctx, &text, ",");
         }
-        gsf_text_printf(ctx, &text, "\"w2c\":[");
+        gsf_append_text(ctx, &text, "\"w2c\":[");
         for (int k = 0; k < 16; k++) { // row-major
-            if (k) gsf_text_append(ctx, &text, ",", 1);
-            gsf_text_json_number(ctx, &text, camera->w2c[4 * (k % 4) + k / 4]);
+            if (k) gsf_append_bytes(ctx, &text, ",", 1);
+            gsf_append_json_number(ctx, &text, camera->w2c[4 * (k % 4) + k / 4]);
         }
-        gsf_text_append(ctx, &text, "]", 1);
+        gsf_append_bytes(ctx, &text, "]", 1);
         const double values[4] = {camera->fx, camera->fy, camera->cx, camera->cy};
         for (int k = 0; k < 4; k++) {
-            gsf_text_printf(ctx, &text, ",\"%s\":", keys[k]);
-            gsf_text_json_number(ctx, &text, values[k]);
+            gsf_append_text(ctx, &text, ",\"%s\":", keys[k]);
+            gsf_append_json_number(ctx, &text, values[k]);
         }
-        gsf_text_printf(ctx, &text, ",\"width\":%d,\"height\":%d}", (int)camera->width, (int)camera->height);
+        gsf_append_text(ctx, &text, ",\"width\":%d,\"height\":%d}", (int)camera->width, (int)camera->height);
     }
-    gsf_text_printf(ctx, &text, "\n]}\n");
+    gsf_append_text(ctx, &text, "\n]}\n");
     if (result == GSF_OK && text.failed) result = GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return result;
 }
 
 static gsf_result gsf__camera_number(gsf_context* ctx, const gsf_json* json, const gsf_json_value* object,
                                      const char* key, double* out) {
-    const gsf_json_value* value = gsf_json_member(json, object, key);
+    const gsf_json_value* value = gsf_find_json_member(json, object, key);
     if (!value || value->type != GSF_JSON_NUMBER)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: camera: expected a number \"%s\"", json->name,
                         (unsigned)(value ? value->offset : object->offset), key);
@@ -3996,7 +4001,7 @@ static gsf_result gsf__camera_number(gsf_context* ctx, const gsf_json* json, con
 
 static gsf_result gsf__camera_from_json(gsf_context* ctx, const gsf_json* json, const gsf_json_value* object,
                                         gsf_camera* camera) {
-    const gsf_json_value* matrix = gsf_json_member(json, object, "w2c");
+    const gsf_json_value* matrix = gsf_find_json_member(json, object, "w2c");
     int good = matrix && matrix->type == GSF_JSON_ARRAY && matrix->count == 16;
     uint32_t at = good ? matrix->child : 0;
     for (int k = 0; k < 16 && good; k++, at = json->values[at].next) {
@@ -4034,7 +4039,7 @@ GSF_API gsf_result gsf_load_cameras(gsf_context* ctx, const char* path, gsf_came
     gsf_result result = gsf_parse_json(ctx, path, (const char*)data, size, &json);
     gsf_free(ctx, data);
     GSF__TRY(result);
-    const gsf_json_value* list = gsf_json_member(&json, &json.values[0], "cameras");
+    const gsf_json_value* list = gsf_find_json_member(&json, &json.values[0], "cameras");
     gsf_camera* out = NULL;
     if (!list || list->type != GSF_JSON_ARRAY) {
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: expected an object with a list \"cameras\"", json.name,
@@ -4061,7 +4066,7 @@ GSF_API gsf_result gsf_load_cameras(gsf_context* ctx, const char* path, gsf_came
 typedef struct gsf__clip { // a clip on its way through a restorer
     const gsf_restorer* restorer;
     const gsf_restore_window* window;
-    gsf_restorer_limits limits;
+    gsf_restorer_info limits;
     int32_t taken, shown;       // the clip's frames in a part; frames that the restorer sees of them
     int32_t parts, width, height;
     gsf_image *color, *depth, *alpha, *out_color, *out_confidence; // (shown)
@@ -4075,7 +4080,7 @@ static int32_t gsf__clip_spread(int64_t i, int64_t from, int64_t to) { // place 
 }
 
 static void gsf__clip_plan_length(gsf__clip* c) {
-    const gsf_restorer_limits* l = &c->limits;
+    const gsf_restorer_info* l = &c->limits;
     const int32_t frames = c->window->frame_count, most = l->frame_count_max;
     const int32_t least = l->frame_count_min > 0 ? l->frame_count_min : 1;
     const int32_t step = l->frame_count_step > 1 ? l->frame_count_step : 1;
@@ -4090,7 +4095,7 @@ static void gsf__clip_plan_length(gsf__clip* c) {
 }
 
 static gsf_result gsf__clip_plan_size(gsf_context* ctx, gsf__clip* c) {
-    const gsf_restorer_limits* l = &c->limits;
+    const gsf_restorer_info* l = &c->limits;
     const gsf_image* first = &c->window->color[0];
     const double width = (double)first->width, height = (double)first->height;
     if (first->width > 65536 || first->height > 65536)
@@ -4172,7 +4177,7 @@ static gsf_result gsf__clip_take(gsf_context* ctx, gsf__clip* c, int32_t begin) 
         GSF__TRY(gsf__clip_fit(ctx, &w->color[at], c->width, c->height, GSF__CLIP_BYTES, &c->color[i]));
         if (w->depth) GSF__TRY(gsf__clip_fit(ctx, &w->depth[at], c->width, c->height, GSF__CLIP_NEAREST, &c->depth[i]));
         if (w->alpha) GSF__TRY(gsf__clip_fit(ctx, &w->alpha[at], c->width, c->height, GSF__CLIP_FLOATS, &c->alpha[i]));
-        if (w->cameras) c->cameras[i] = gsf_camera_resized(&w->cameras[at], c->width, c->height);
+        if (w->cameras) c->cameras[i] = gsf_resize_camera(&w->cameras[at], c->width, c->height);
         c->reference_index[i] = w->reference_index ? w->reference_index[at] : -1;
         GSF__TRY(gsf_make_image(ctx, GSF_F32, c->width, c->height, 3, &c->out_color[i]));
         GSF__TRY(gsf_make_image(ctx, GSF_F32, c->width, c->height, 1, &c->out_confidence[i]));
@@ -4382,7 +4387,7 @@ static gsf_result gsf__oiio_read(gsf_context* ctx, const char* name, const void*
     gsf_result result = GSF_OK;
     if (!input->read_image(0, 0, 0, spec.nchannels, gsf__oiio_type(file.dtype), file.data))
         result = gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "image is cut or malformed", input->geterror());
-    file.color_space = spec.get_string_attribute("oiio:ColorSpace") == "Linear" ? GSF_LINEAR : GSF_SRGB;
+    file.color_space = spec.get_string_attribute("oiio:ColorSpace") == "Linear" ? GSF_COLOR_LINEAR : GSF_COLOR_SRGB;
     if (result == GSF_OK && (channels == 0 || channels == spec.nchannels)) {
         *out = file;
         return GSF_OK;
@@ -4421,7 +4426,7 @@ static gsf_result gsf__oiio_query(gsf_context* ctx, const char* name, const void
 }
 
 static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char* extension, const gsf_image* image,
-                                  gsf_text* out) {
+                                  gsf_buffer* out) {
     const int exr = strcmp(extension, ".exr") == 0, png = strcmp(extension, ".png") == 0;
     const int tiff = strcmp(extension, ".tif") == 0 || strcmp(extension, ".tiff") == 0;
     if (image->channels > 4 || image->width > 1 << 24 || image->height > 1 << 24)
@@ -4444,7 +4449,7 @@ static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char
         OIIO::Filesystem::IOVecOutput memory(bytes);
         OIIO::ImageSpec spec((int)image->width, (int)image->height, (int)image->channels, gsf__oiio_type(dtype));
         if (!tiff) // there it becomes an EXIF directory, whose writing into memory breaks the file (OpenImageIO 2.4)
-            spec.attribute("oiio:ColorSpace", image->color_space == GSF_LINEAR ? "Linear" : "sRGB");
+            spec.attribute("oiio:ColorSpace", image->color_space == GSF_COLOR_LINEAR ? "Linear" : "sRGB");
         if (!exr) spec.attribute("oiio:UnassociatedAlpha", 1);
         spec.attribute("CompressionQuality", (int)GSF__JPEG_QUALITY);
         if (!output->set_ioproxy(&memory) || !output->open(name, spec) ||
@@ -4453,12 +4458,12 @@ static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char
     }
     gsf_destroy_image(ctx, &packed);
     GSF__TRY(result);
-    gsf_text_append(ctx, out, (const char*)bytes.data(), bytes.size());
+    gsf_append_bytes(ctx, out, (const char*)bytes.data(), bytes.size());
     return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
 
 static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const char* extension, const gsf_image* image,
-                                   gsf_text* out) {
+                                   gsf_buffer* out) {
     try {
         return gsf__oiio_write(ctx, name, extension, image, out);
     } catch (...) {

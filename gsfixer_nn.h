@@ -23,8 +23,8 @@
        gsf_nn_transformer transformer;
        gsf_nn_vae vae;
        gsf_nn_schedule schedule;
-       gsf_nn_make_transformer(&ctx, "MODEL/transformer", &transformer);
-       gsf_nn_make_vae(&ctx, "MODEL/vae", &vae);
+       gsf_nn_load_transformer(&ctx, "MODEL/transformer", &transformer);
+       gsf_nn_load_vae(&ctx, "MODEL/vae", &vae);
        gsf_nn_load_schedule(&ctx, "MODEL/scheduler/scheduler_config.json", &schedule);
        gsf_nn_project_references(&ctx, &transformer, tokens, dino, vggt, references);
        gsf_nn_sample_desc desc;
@@ -34,7 +34,7 @@
        gsf_nn_sample(&ctx, &transformer, &vae, &schedule, &desc, restored, NULL);   // check every result
 
    MEMORY      Weight files are mapped where the platform can (else read whole) and used in place; what no layer touches
-               never leaves the disk. Kernels take a gsf_nn_workspace that grows to the largest need and stays there.
+               never leaves the disk. Kernels take a gsf__nn_workspace that grows to the largest need and stays there.
    THREADS     As gsfixer.h: the same bits for any number of workers.
    PROCESSORS  Every kernel is there in scalar C and for AVX2, those that count for AVX-512; 8-bit layers use its dot
                products of bytes (VNNI), layers and attention those of bfloat16 where a descriptor's member `bf16` asks for
@@ -61,26 +61,25 @@ typedef enum gsf_nn_dtype {
     GSF_NN_F32 = 0, GSF_NN_BF16, GSF_NN_F16, GSF_NN_F64, GSF_NN_U8, GSF_NN_I8, GSF_NN_I16, GSF_NN_I32, GSF_NN_I64,
 } gsf_nn_dtype;
 
-GSF_API size_t gsf_nn_dtype_size(gsf_nn_dtype dtype);      // bytes of one element
-GSF_API const char* gsf_nn_dtype_name(gsf_nn_dtype dtype); // as safetensors spells it: "BF16"
+GSF_API size_t gsf_nn_get_dtype_size(gsf_nn_dtype dtype);  // bytes of one element
 
 enum { GSF_NN_MAX_RANK = 8 };
 
-typedef struct gsf_tensor { // a view; owns nothing
+typedef struct gsf_nn_tensor { // a view; owns nothing
     const char* name;
     const void* data;       // row-major; in weight files of ANY alignment
     gsf_nn_dtype dtype;
     int32_t rank;           // 0: one element
     int64_t shape[GSF_NN_MAX_RANK];
     int64_t count;          // product of the shape
-} gsf_tensor;
+} gsf_nn_tensor;
 
 // A float tensor over the caller's memory, for arguments.
-GSF_API gsf_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32_t rank, const int64_t* shape);
+GSF_API gsf_nn_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32_t rank, const int64_t* shape);
 
 typedef struct gsf_nn_weights { // an open file or folder of safetensors; tensors sorted by name
     char name[256];             // of the file or folder, for error texts
-    gsf_tensor* tensors;
+    gsf_nn_tensor* tensors;
     size_t tensor_count;
     uint64_t mapped_bytes;      // file-backed: the system may drop them at any time
     uint64_t read_bytes;        // held in memory because the platform or the io hook cannot map
@@ -92,156 +91,18 @@ typedef struct gsf_nn_weights { // an open file or folder of safetensors; tensor
 // Every length, offset, shape and dtype is checked: malformed files give GSF_ERROR_FORMAT with file and byte offset. The
 // tensors of a file must cover its data exactly. BOOL reads as U8; other dtypes are unsupported. With the default io hook
 // files are mapped where the platform can: nobody may shorten them while they are open.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_open_weights(gsf_context* ctx, const char* path, const char* prefix,
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix,
                                                      gsf_nn_weights* out);
 // The same over one file's bytes, which the caller keeps until the weights are closed.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_open_weights_memory(gsf_context* ctx, const char* name, const void* data,
-                                                            size_t size, gsf_nn_weights* out);
-GSF_API void gsf_nn_close_weights(gsf_context* ctx, gsf_nn_weights* weights);
-GSF_API const gsf_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name); // NULL when absent
+GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_weights(gsf_context* ctx, const char* name, const void* data,
+                                                      size_t size, gsf_nn_weights* out);
+GSF_API void gsf_nn_destroy_weights(gsf_context* ctx, gsf_nn_weights* weights);
+GSF_API const gsf_nn_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name); // NULL when absent
 // Writes a safetensors file (names must differ; 8-byte aligned data, as the official writer does).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const gsf_tensor* tensors,
+GSF_API GSF_NODISCARD gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const gsf_nn_tensor* tensors,
                                                      size_t count);
 // Widens `count` elements from `first` to float (f32, bf16, f16, f64 and the integers).
-GSF_API void gsf_nn_read_tensor(const gsf_tensor* tensor, int64_t first, int64_t count, float* out);
-
-// ---- kernels --------------------------------------------------------------------
-// All pointers are float32 and 4-byte aligned; outputs do not overlap inputs unless a comment allows it.
-
-typedef struct gsf_nn_workspace { // scratch memory of kernels; zero to begin with, grows, and is reused
-    void* memory;
-    size_t size;
-} gsf_nn_workspace;
-
-GSF_API void gsf_nn_destroy_workspace(gsf_context* ctx, gsf_nn_workspace* workspace);
-
-// GELU is x/2 (1 + erf(x / sqrt 2)) with a relative error below 1e-6 for all x, GELU_TANH the usual approximation of it.
-typedef enum gsf_nn_activation {
-    GSF_NN_LINEAR = 0, GSF_NN_GELU_TANH, GSF_NN_SILU, GSF_NN_GELU, GSF_NN_RELU,
-} gsf_nn_activation;
-
-typedef struct gsf_nn_linear_desc {
-    const float* x;            // (rows, in), row stride ldx
-    int64_t rows, ldx;         // ldx 0: in
-    const gsf_tensor* weight;  // (out, in); f32, bf16 or f16. Higher ranks: (out, product of the rest)
-    const gsf_tensor* bias;    // (out) or NULL
-    gsf_nn_activation activation;
-    const float* gate;         // (out) or NULL: y += gate * activation(x w^T + b) instead of y = ...
-    int accumulate;            // y += activation(x w^T + b) instead of y = ...
-    float* y;                  // (rows, out), row stride ldy
-    int64_t ldy;               // 0: out
-    int bf16;                  // bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: x is rounded to bf16, too, and products
-                               //   are summed in pairs. Relative L2 error 1.7e-3. Else nothing changes.
-} gsf_nn_linear_desc;
-
-// A linear layer with its activation and residual. `workspace` NULL: scratch for this call only.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace,
-                                               const gsf_nn_linear_desc* desc);
-
-typedef struct gsf_nn_quantized { // a weight in 8 bits; owns its memory: destroy it
-    int64_t out, in;
-    int32_t block;             // values that the rotation mixes: a power of two up to 256; 1: none
-    int8_t* data;              // private: whole tiles, [out/16][in/4][16][4]
-    float* scales;             // private: of each output
-    int32_t* offsets;          // private: 128 times the sum of each output's weights
-    size_t bytes;              // of all three: about out*in
-} gsf_nn_quantized;
-
-// Symmetric 8-bit integers per output from (out, in) weights in f32, bf16 or f16, after a Hadamard rotation of blocks of
-// inputs (the largest power of two up to 256 that divides `in`), which spreads outliers. `no_rotation` leaves it out. A NaN
-// or infinity gives GSF_ERROR_NUMERIC, and the tensor's name.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* weight, int no_rotation,
-                                                        gsf_nn_quantized* out);
-GSF_API void gsf_nn_destroy_quantized(gsf_context* ctx, gsf_nn_quantized* weight);
-// gsf_nn_linear with such a weight; desc->weight is not looked at. Each row of x is rotated and rounded to 8 bits by a
-// scale of its own; sums are exact. Relative L2 error for gaussian values: 1.2e-2. A row with a NaN or infinity gives NaNs.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* workspace,
-                                                    const gsf_nn_linear_desc* desc, const gsf_nn_quantized* weight);
-
-typedef struct gsf_nn_attention_desc {
-    int64_t queries, keys;     // rows of q and out; of k and v
-    int32_t heads, head_dim;   // head h stands in columns h*head_dim ...
-    const float *q, *k, *v;
-    int64_t ldq, ldk, ldv;     // row strides, 0: heads*head_dim
-    const unsigned char* mask; // (heads, queries, keys), 1 = may attend; NULL = all. A row of zeros gives 0.
-    const float* bias;         // (heads, queries, keys), added to the logits, unscaled; NULL = none
-    float scale;               // of the logits, 0: 1/sqrt(head_dim)
-    float* out;                // (queries, heads*head_dim), row stride ldo; may be q
-    int64_t ldo;
-    int bf16;                  // GSF_CPU_AVX512_BF16, even head_dim: q, k, v and the weights are rounded to bf16
-} gsf_nn_attention_desc;
-
-// softmax(scale q k^T + bias) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may
-// reach queries that the mask keeps from it.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace,
-                                                  const gsf_nn_attention_desc* desc);
-
-// Normalisations over the last dimension of (rows, dim); y may be x; weight, bias (dim) or NULL. Variances are biased,
-// sums are in double.
-GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                               const float* bias, float eps, float* y);
-GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight, float eps,
-                             float* y);
-// y = layer_norm(x) * (1 + scale) + shift, scale and shift (dim): one pass of an adaptive layer norm.
-GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                                         const float* bias, float eps, const float* scale, const float* shift, float* y);
-// x: (channels, count); statistics over the channels of a group and all their values; y may be x.
-GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
-                               const float* weight, const float* bias, float eps, float* y);
-// LayerNorm over each head of q or k, then the rotation of interleaved pairs on rows `rope_first` and up, in place.
-// cos, sin: (rows - rope_first, head_dim) or NULL: no rotation. weight, bias (head_dim) or NULL.
-GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads, int32_t head_dim,
-                                   const float* weight, const float* bias, float eps, const float* cos, const float* sin,
-                                   int64_t rope_first);
-GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, const float* x, int64_t count, float* y);
-// Rows of (rows, columns) to softmax(scale * row); y may be x.
-GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale, float* y);
-
-// ---- convolution ----------------------------------------------------------------
-// Activations of convolutions are channels-last: (frames, height, width, channels).
-
-typedef struct gsf_nn_conv_desc {
-    const float* x;            // (frames, height, width, in)
-    int64_t frames, height, width;
-    const gsf_tensor* weight;  // (out, in, kh, kw): frame by frame; (out, in, kt, kh, kw), kt 1 or 3: causal in time.
-    const gsf_tensor* bias;    // (out) or NULL                      kh = kw is 1 or 3; f32, bf16 or f16
-    const float* before;       // (2, height, width, in): the frames before x; NULL: x's first frame, twice. kt = 3 only
-    int halve;                 // stride 2 and one row and column of zeros below and to the right, instead of stride 1
-    int accumulate;            //   and a border of zeros. y += instead of y = ...
-    float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
-} gsf_nn_conv_desc;
-
-// A convolution, 3D ones causal in time. `workspace` (or, where it is NULL, memory for this call) holds the widened
-// weights and three frames of the input with their borders.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace,
-                                                 const gsf_nn_conv_desc* desc);
-
-// ---- positions ------------------------------------------------------------------
-// Tables of the video transformer. Tokens stand in the order frame, row, column.
-
-typedef struct gsf_nn_rope_desc {
-    int32_t frames, height, width;   // of the grid of tokens: latent frames, latent height and width / patch size
-    int32_t base_height, base_width; // the grid the model was trained with: sample_height, sample_width / patch size
-    int32_t head_dim;                // a multiple of 16: time has head_dim/4 of it, rows and columns 3*head_dim/8 each
-    double theta;                    // 0: 10000
-} gsf_nn_rope_desc;
-
-// Rotary table: cos, sin (frames*height*width, head_dim), every value twice, for interleaved pairs. Pair i of an axis of
-// d values turns by position * theta^(-2i/d). Positions: frames 0, 1, ...; rows linspace(top, bottom*(h-1)/h, h) where
-// the grid, resized to fit into the base grid with its aspect ratio kept, lies from top to bottom in it; columns alike.
-// Angles are float32 products in the order of the reference, so they match its tables, not the exact ones.
-// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_rope(gsf_context* ctx, const gsf_nn_rope_desc* desc, float* cos, float* sin);
-
-// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is time dim/4 | columns 3*dim/8 | rows
-// 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. scales: 0 = 1.
-// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width,
-                                                    int32_t dim, double spatial_scale, double temporal_scale, float* out);
-
-// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)), an odd last
-// value 0. Angles in float32 as the reference has them. (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
-GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out);
+GSF_API void gsf_nn_convert_tensor(const gsf_nn_tensor* tensor, int64_t first, int64_t count, float* out);
 
 // Private, for tests: shown every named intermediate of a network's pass, (rows, columns) of sample `index`.
 typedef struct gsf__nn_tap {
@@ -251,12 +112,6 @@ typedef struct gsf__nn_tap {
 
 // ---- image encoders: what the references show -----------------------------------
 // DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
-
-// The official preprocessing of a reference: transparency over white, 518 pixels wide with PIL's bicubic filter, the
-// height rounded to a multiple of 14 (half to even), and cut around its middle where it is above 518. Photos with 1, 3 or
-// 4 channels; float ones are rounded to 8 bits first. out: u8, 3 channels; destroy it.
-// (GSFixer, vggt/utils/load_fn.py load_and_preprocess_images, mode "crop")
-GSF_API GSF_NODISCARD gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out);
 
 typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped files
     int32_t width, heads, layers, mlp_width;
@@ -270,7 +125,7 @@ typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped 
 
 // Opens a Hugging Face folder of Dinov2WithRegistersModel: config.json and model*.safetensors. Missing, misshaped and
 // surplus tensors are named. Its SwiGLU variant (use_swiglu_ffn) is unsupported.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out);
 GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2);
 
 typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapped files
@@ -287,31 +142,26 @@ typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapp
 // all others are passed over. Where the folder has a config.json, VGGT's own keys in it count, which are embed_dim, depth,
 // num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq; what it does not tell comes from
 // the shapes of tensors, but for num_heads (width / 64 where q and k have no norms) and rope_freq (100).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
 GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
 
-typedef struct gsf_nn_encoder_input {
+typedef struct gsf_nn_encoder_desc {
     const float* pixels;           // (images, 3, height, width) in [0,1]
     int32_t images, height, width; // sides in pixels, multiples of the patch
-    int all_tokens;                // the special tokens, too; else those of the patches alone
+    int32_t all_tokens;            // the special tokens, too; else those of the patches alone
     const gsf__nn_tap* _tap;       // private
-} gsf_nn_encoder_input;
+} gsf_nn_encoder_desc;
 
 // The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, and `special`
 // before them with all_tokens. Images are taken as they are. Positions are interpolated from the square grid as PyTorch
 // does it (bicubic, antialiased, align_corners=False). A NaN or infinity gives GSF_ERROR_NUMERIC and the layer's name. On
 // error `out` is zeroed. The context is asked for cancelling and told of progress after every block.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
-                                                      const gsf_nn_encoder_input* input, float* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_dinov2(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
+                                                      const gsf_nn_encoder_desc* input, float* out);
 // The last pair's outputs: out (images, tokens, 2 width), frame block | global block, for all images together, which see
 // one another. ImageNet's mean and deviation are taken out here. Otherwise as above.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt,
-                                                    const gsf_nn_encoder_input* input, float* out);
-// Bytes of memory (beside input, output, mapped weights and some 70 MB of the kernels' scratch) at the peak, and floating-
-// point operations, of such a call; either may be NULL. Reads the input's sizes only.
-GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
-                                double* flops);
-GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_vggt(gsf_context* ctx, const gsf_nn_vggt* vggt,
+                                                    const gsf_nn_encoder_desc* input, float* out);
 
 typedef struct gsf_nn_features { // of reference photos; zero to begin with, destroy it
     int64_t images, tokens;               // tokens of each image
@@ -333,24 +183,24 @@ GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features
 typedef struct gsf_nn_bpe {     // an open tokenizer
     int32_t bos, eos, unk, pad; // ids, -1: none
     int32_t highest_id;
-    int add_bos;                // texts begin with `bos`
+    int32_t add_bos;            // texts begin with `bos`
     void* tables;               // private
 } gsf_nn_bpe;
 
 // Opens FOLDER/vocab.json and merges.txt and, where they are there, tokenizer_config.json, special_tokens_map.json and
 // added_tokens.json. What is malformed, or names a token that there is not, gives GSF_ERROR_FORMAT with file and place.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
 GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe);
 
 // Ids of a text of `size` bytes, which must be UTF-8; *ids is freed with gsf_free. `no_bos` leaves the first token out even
 // where add_bos says otherwise. Time n log n whatever the text. Any number of threads, each with its context, may use one
 // tokenizer.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
-                                                   int no_bos, int32_t** ids, size_t* count);
+                                                   int32_t no_bos, int32_t** ids, size_t* count);
 // Appends the text of `count` ids to `out`, which may come to hold zero bytes; bytes that are no UTF-8 become U+FFFD.
 // Ids that no token has are left out, with `skip_special` the special tokens (bos, eos, pad, <image> ...) as well.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
-                                                   size_t count, int skip_special, gsf_text* out);
+                                                   size_t count, int32_t skip_special, gsf_buffer* out);
 
 // ---- captions ------------------------------------------------------------------------
 // BLIP-2 with OPT, which says in a few words what an image shows (transformers 4.51.3, Blip2ForConditionalGeneration). The
@@ -367,11 +217,11 @@ typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapp
     void* nets;                   // private
 } gsf_nn_captioner;
 
-// Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_make_bpe) and
+// Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_load_bpe) and
 // model*.safetensors in f32, bf16 or f16, which are computed with in float32. Keys that are absent have the defaults of
 // transformers. Missing, misshaped and surplus tensors are named (GSF_ERROR_FORMAT), as is what this code does not do
 // (GSF_ERROR_UNSUPPORTED): another language model than OPT, norms behind the layers (do_layer_norm_before false).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
 GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner);
 
 // The caption of an image (1, 3 or 4 channels, any dtype; alpha is left out) as zero-terminated UTF-8 without white space
@@ -380,24 +230,9 @@ GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captio
 // text is cut behind a whole character where it does not fit `size` bytes; a zero byte in it becomes U+FFFD.
 // A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the tensor's or layer's name. Progress and
 // cancel after every layer. Any number of threads, each with its context, may use one captioner.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
-                                                const char* prompt, int32_t max_new_tokens, char* out, size_t size);
-
-typedef struct gsf_nn_caption_desc {
-    const gsf_image* image;
-    const char* prompt;     // NULL: none
-    int32_t max_new_tokens; // 0: as gsf_nn_caption
-    const gsf__nn_tap* _tap; // private
-} gsf_nn_caption_desc;
-
-// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
-                                                    const gsf_nn_caption_desc* desc, int32_t** ids, size_t* count);
-
-// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
-// `text_tokens` tokens of prompt (0: none).
-GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
-                                 double* bytes, double* flops);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_image(gsf_context* ctx, const gsf_nn_captioner* captioner,
+                                                      const gsf_image* image, const char* prompt,
+                                                      int32_t max_new_tokens, char* out, size_t size);
 
 // ---- text: tokenizer ------------------------------------------------------------------
 // SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
@@ -414,11 +249,8 @@ typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that 
 // Opens FOLDER/spiece.model, with the added tokens (<extra_id_0> ...) of FOLDER/tokenizer_config.json or, where that lists
 // none, FOLDER/added_tokens.json; without either file T5's 100. Every length and offset is checked: a malformed file gives
 // GSF_ERROR_FORMAT with its name and byte offset, another model than a unigram GSF_ERROR_UNSUPPORTED.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
 // The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model,
-                                                              size_t model_size, const char* config, size_t config_size,
-                                                              gsf_nn_tokenizer* out);
 GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer);
 
 // `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
@@ -426,8 +258,9 @@ GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokeni
 // 226. *count (NULL allowed): how many there are, end_id included, had there been room. ids NULL and room 0 only count.
 // Time and memory are in proportion to the text: some 20 bytes for each of its own. Fails only for want of memory, and with
 // GSF_ERROR_INVALID_ARGUMENT for texts that are 2 GiB normalised.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text,
-                                                 size_t size, int32_t* ids, size_t room, size_t* count);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer,
+                                                    const char* text, size_t size, int32_t* ids, size_t room,
+                                                    size_t* count);
 
 // ---- text: T5 encoder -------------------------------------------------------------------
 // The encoder of T5 v1.1 (Raffel et al. 2020; transformers 4.51.3 T5EncoderModel). As the official pipeline runs it, there
@@ -443,23 +276,20 @@ typedef struct gsf_nn_t5 { // an open model; its weights stay in the mapped file
 } gsf_nn_t5;
 
 // Opens FOLDER/config.json and FOLDER/model*.safetensors. Missing, misshaped and surplus tensors are named in the error.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out);
 GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5);
 
-typedef struct gsf_nn_t5_input {
-    const int32_t* ids;    // (batch, tokens), from gsf_nn_tokenize
+typedef struct gsf_nn_t5_desc {
+    const int32_t* ids; // (batch, tokens), from gsf_nn_encode_text
     int32_t batch, tokens; // prompts of a batch share each layer's way from disk through the cache
     const gsf__nn_tap* _tap; // private
-} gsf_nn_t5_input;
+} gsf_nn_t5_desc;
 
 // The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so that of the mapped weights only one
 // layer's need be in memory at a time. An id that the vocabulary lacks: GSF_ERROR_INVALID_ARGUMENT. A NaN or infinity is
 // reported with the block where it first appears (GSF_ERROR_NUMERIC). Cancelled between layers; progress "text".
-GSF_API GSF_NODISCARD gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input,
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_t5(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_desc* input,
                                                   float* out);
-// Bytes of memory at the peak (beside out, the mapped weights and some 70 MB of the kernels' scratch) and floating-point
-// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 4.2e12 operations.
-GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops);
 // ---- video autoencoder ----------------------------------------------------------
 // AutoencoderKLCogVideoX as diffusers 0.32.1 runs it: clips go through in chunks of 8 frames (encoder) or 2 latent frames
 // (decoder), the remainder joins the first chunk, causal convolutions see the last two frames of the chunk before, and the
@@ -480,11 +310,11 @@ typedef struct gsf_nn_vae { // an open model; its weights stay in the mapped fil
 
 // Opens a diffusers folder: config.json and diffusion_pytorch_model*.safetensors. A missing, misshaped or surplus tensor
 // gives GSF_ERROR_FORMAT and is named.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out);
 GSF_API void gsf_nn_destroy_vae(gsf_context* ctx, gsf_nn_vae* vae);
 
 typedef struct gsf_nn_vae_desc {
-    int tiled;                 // in overlapping tiles, blended linearly: less memory, other values (statistics per tile)
+    int32_t tiled;             // in overlapping tiles, blended linearly: less memory, other values (statistics per tile)
     int32_t tile_height, tile_width;   // pixels, 0: half of sample_height, sample_width
     double overlap_height, overlap_width; // parts of a tile, 0: 1/6 and 1/5. Tile times overlap must be whole latents.
     double max_bytes;          // refuse before starting, with GSF_ERROR_OUT_OF_MEMORY, what needs more; 0: no limit
@@ -508,11 +338,11 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_query_vae(gsf_context* ctx, const gsf_nn
 // video: (in_channels, frames, height, width) in [-1, 1], any size of at least 8 x 8. mean, logvar (or NULL):
 // (latent_channels, info.frames, info.height, info.width); logvar is clamped to [-30, 20].
 // A NaN or infinity gives GSF_ERROR_NUMERIC and the name of the layer where it appears. On error outputs are zeroed.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_vae_encode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
+GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_vae(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
                                                    const float* video, int64_t frames, int64_t height, int64_t width,
                                                    float* mean, float* logvar);
 // latents: (latent_channels, frames, height, width); video: (out_channels, info.frames, info.height, info.width).
-GSF_API GSF_NODISCARD gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
+GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_vae(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
                                                    const float* latents, int64_t frames, int64_t height, int64_t width,
                                                    float* video);
 
@@ -532,17 +362,17 @@ typedef struct gsf_nn_transformer { // an open model; its weights stay in the ma
     double spatial_scale, temporal_scale;                   // of the sine-cosine positions
     double norm_eps;
     gsf_nn_weights weights;
-    int bf16;                                               // set it at any time: linear layers and attention by the
+    int32_t bf16;                                           // set it at any time: linear layers and attention by the
                                                             //   members `bf16` of their descriptions
     void* nets;                                             // private
 } gsf_nn_transformer;
 
 // Opens FOLDER/config.json and FOLDER/diffusion_pytorch_model*.safetensors. Missing, misshaped and surplus tensors are
 // named in the error.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_load_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out);
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer);
 
-// From now on the blocks' linear layers work in 8-bit integers (gsf_nn_linear_int8). Takes about a byte for each of their
+// From now on the blocks' linear layers work in 8-bit integers (gsf__nn_run_linear_int8). Takes about a byte for each of their
 // weights, 7.1 GB at the release's size, which *bytes (NULL allowed) tells; the mapped ones are not touched any more.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer,
                                                              size_t* bytes);
@@ -553,7 +383,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_project_references(gsf_context* ctx, con
                                                            int64_t tokens, const float* dino, const float* vggt,
                                                            float* out);
 
-typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_input; zero it, set threshold, destroy when done
+typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_desc; zero it, set threshold, destroy when done
     float threshold; // a step whose first block changes less than this (relative L1) reuses what the others did; 0: never
     float *first, *before, *rest; // private: what the first block, and all others, added
     size_t size;
@@ -562,7 +392,7 @@ typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_input; zero it, se
 
 GSF_API void gsf_nn_destroy_block_cache(gsf_context* ctx, gsf_nn_block_cache* cache);
 
-typedef struct gsf_nn_transformer_input {
+typedef struct gsf_nn_transformer_desc {
     int32_t batch, frames, height, width; // of the latents
     const float* hidden;                  // (batch, frames, in_channels, height, width)
     const float* text;                    // (batch, text tokens, text_channels)
@@ -571,42 +401,35 @@ typedef struct gsf_nn_transformer_input {
     const float* references;              // (reference_batch, reference_tokens, width); NULL: no cross-attention
     int64_t reference_tokens;
     int32_t reference_batch;              // batch, or 1: all rows of the batch share them
-    int no_rotary;                        // leave the rotation out even if the configuration has it
+    int32_t no_rotary;                    // leave the rotation out even if the configuration has it
     gsf_nn_block_cache* cache;            // NULL: every block runs
-    float* reference_kv;                  // gsf_nn_reference_kv_size floats that hold the references' keys and values
-    int reference_kv_ready;               // from an earlier call; NULL: computed anew in every call
+    float* reference_kv;                // gsf__nn_query_reference_kv floats that hold the references' keys and values
+    int32_t reference_kv_ready;           // from an earlier call; NULL: computed anew in every call
     const gsf__nn_tap* _tap;              // private
-} gsf_nn_transformer_input;
+} gsf_nn_transformer_desc;
 
 // Predicted velocity: out (batch, frames, out_channels, height, width). A NaN or infinity is reported with the block
 // where it first appears (GSF_ERROR_NUMERIC). Other sizes than the configured ones: GSF_ERROR_UNSUPPORTED where the
 // position table is learned. For other frame counts (or text tokens) sines and cosines stand in for that table, as the
 // official code has it: positions that the model was not trained with, which gsf_nn_sample_desc.any_frames asks for.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
-                                                            const gsf_nn_transformer_input* input, float* out);
-
-// Bytes of memory (beside the mapped weights and some 70 MB of the kernels' scratch) and floating-point operations of one
-// such call.
-GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
-                                     double* bytes, double* flops);
-// Floats of reference_kv: every block's keys and values of all reference tokens.
-GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
-                                        int32_t reference_batch);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_run_transformer(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                        const gsf_nn_transformer_desc* input, float* out);
 
 // ---- noise schedule and solvers -------------------------------------------------
 // x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) noise. The model predicts v = sqrt(abar) noise - sqrt(1 - abar) x0, so that
 // x0 = sqrt(abar) x - sqrt(1 - abar) v. Coefficients are double, latents float32.
 
-typedef enum gsf_nn_spacing { GSF_NN_TRAILING = 0, GSF_NN_LEADING, GSF_NN_LINSPACE } gsf_nn_spacing;
+typedef enum gsf_nn_spacing { GSF_NN_SPACING_TRAILING = 0, GSF_NN_SPACING_LEADING,
+                             GSF_NN_SPACING_LINSPACE } gsf_nn_spacing;
 
 typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
     int32_t train_steps;           // 0: 1000
     double beta_start, beta_end;   // 0: 0.00085, 0.012
-    int linear_betas;              // else linear in sqrt(beta) ("scaled_linear")
-    int no_zero_snr;               // else the table is stretched so that abar ends at 0
-    int no_alpha_one;              // else the last step goes to abar = 1, not to abar of time step 0
+    int32_t linear_betas;          // else linear in sqrt(beta) ("scaled_linear")
+    int32_t no_zero_snr;           // else the table is stretched so that abar ends at 0
+    int32_t no_alpha_one;          // else the last step goes to abar = 1, not to abar of time step 0
     gsf_nn_spacing spacing;
-    int32_t steps_offset;          // added to the time steps of GSF_NN_LEADING
+    int32_t steps_offset;  // added to the time steps of GSF_NN_SPACING_LEADING
     double snr_shift_scale;        // 0: 1; CogVideoX-2B was trained with 3
 } gsf_nn_schedule_desc;
 
@@ -625,23 +448,10 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const c
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out);
 GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule);
 
-// Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
-// (int)(steps * strength) of them, for latents that start as the noised render. out: room for `steps`.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
-                                                       double strength, int32_t* out, int32_t* count);
-
-// Elementwise over `count` values; out may be an input. timestep: 0..train_steps-1.
-GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                              const float* noise, size_t count, float* out);
-GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                                  const float* noise, size_t count, float* out);
-GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
-                               const float* v, size_t count, float* out);
-
 typedef enum gsf_nn_solver {
-    GSF_NN_DDIM = 0,   // first order; the next time is t - train_steps/steps (whole division), as diffusers has it
-    GSF_NN_DPMPP_2M,   // DPM-Solver++(2M): second order, remembers one prediction (Lu et al. 2022b)
-    GSF_NN_UNIPC,      // UniPC, B2, order 2: that and a corrector which needs no further model call (Zhao et al. 2023)
+    GSF_NN_SOLVER_DDIM = 0, // first order; the next time is t - train_steps/steps (whole division), as diffusers has it
+    GSF_NN_SOLVER_DPMPP_2M, // DPM-Solver++(2M): second order, remembers one prediction (Lu et al. 2022b)
+    GSF_NN_SOLVER_UNIPC, // UniPC, B2, order 2: that and a corrector which needs no further model call (Zhao et al. 2023)
 } gsf_nn_solver;
 
 typedef struct gsf_nn_sampler_desc {
@@ -676,8 +486,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sa
 typedef struct gsf_nn_sample_desc {
     uint32_t _start_canary;
     int32_t frames, height, width;  // of the video; frames 1, 9, 17, ... so that the VAE gives back as many
-    int any_frames;                 // take other counts than the trained one where positions are learned: see
-                                    //   gsf_nn_transformer_forward
+    int32_t any_frames;             // take other counts than the trained one where positions are learned: see
+                                    //   gsf_nn_run_transformer
     const float* control;           // (3, frames, height, width) in [-1,1]: what is to be restored
     const float* text;              // (2, text tokens, text channels): negative prompt, prompt
     const float* references;        // (reference_tokens, width) from gsf_nn_project_references; NULL: none
@@ -686,10 +496,10 @@ typedef struct gsf_nn_sample_desc {
     gsf_nn_solver solver;           // default DDIM
     float guidance;                 // classifier-free guidance; default 6, 1: none (half the work)
     float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; default 0 to 1
-    int dynamic_guidance;           // the official code's cosine ramp of the guidance
+    int32_t dynamic_guidance;       // the official code's cosine ramp of the guidance
     float strength;                 // (0,1]: how much of the noise schedule is run; default 1: from pure noise
     float block_cache;              // gsf_nn_block_cache.threshold; default 0: off
-    int no_reference_cache;         // project the references' keys and values anew in every step, to save memory
+    int32_t no_reference_cache;     // project the references' keys and values anew in every step, to save memory
     uint64_t seed;
     const float* noise;             // (latent frames, latent channels, height/8, width/8) or NULL: from the seed
     double max_bytes;               // refuse before starting what needs more memory (GSF_ERROR_OUT_OF_MEMORY); 0: no limit
@@ -700,7 +510,7 @@ typedef struct gsf_nn_sample_desc {
 } gsf_nn_sample_desc;
 
 // A desc with its defaults filled in.
-GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc);
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample_desc(const gsf_nn_sample_desc* desc);
 
 typedef struct gsf_nn_sample_stats {
     int32_t steps, resumed_from;    // steps run in this call; first step of it
@@ -713,16 +523,18 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_tr
                                                const gsf_nn_vae* vae, const gsf_nn_schedule* schedule,
                                                const gsf_nn_sample_desc* desc, float* out, gsf_nn_sample_stats* stats);
 
-typedef struct gsf_nn_cost { double bytes, flops; } gsf_nn_cost; // anonymous memory at the peak; operations
+typedef struct gsf_nn_sample_info { double bytes,
+                                   flops; } gsf_nn_sample_info; // anonymous memory at the peak; operations
 
 // What gsf_nn_sample will take, before it runs; refuses what it would refuse.
-GSF_API GSF_NODISCARD gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer,
-                                                    const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
-                                                    gsf_nn_cost* out);
+GSF_API GSF_NODISCARD gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                                     const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
+                                                     gsf_nn_sample_info* out);
 
 // ---- the restorer `dit` ---------------------------------------------------------------
 
-typedef enum gsf_nn_condition { GSF_NN_BOTH = 0, GSF_NN_2D, GSF_NN_3D, GSF_NN_NONE } gsf_nn_condition;
+typedef enum gsf_nn_condition { GSF_NN_CONDITION_BOTH = 0, GSF_NN_CONDITION_2D, GSF_NN_CONDITION_3D,
+                               GSF_NN_CONDITION_NONE } gsf_nn_condition;
 
 typedef struct gsf_nn_dit_desc {
     const char* model;       // folder as released: transformer/, vae/, scheduler/; and, for what `features` does not hold,
@@ -730,10 +542,10 @@ typedef struct gsf_nn_dit_desc {
     const char* features;    // NULL, or safetensors of what was encoded before: see FEATURES below
     const char* caption;     // what all clips show; NULL: the window's, else blip2/ describes the first frame
     const char* save_features; // file that gets the features of all photos and clips, as `features` takes them; NULL: none
-    int keep_saved;          // what it holds already is kept and used: a run goes on. Else it is replaced
+    int32_t keep_saved;      // what it holds already is kept and used: a run goes on. Else it is replaced
     gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
-    int int8;                // gsf_nn_quantize_transformer
-    int bf16;                // gsf_nn_transformer.bf16
+    int32_t int8;            // gsf_nn_quantize_transformer
+    int32_t bf16;            // gsf_nn_transformer.bf16
     gsf_nn_sample_desc sample;  // steps, solver, guidance, any_frames ...; sizes, pointers and seed are filled in for each
                                 //   window
 } gsf_nn_dit_desc;
@@ -784,6 +596,146 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
 GSF__BEGIN_IMPLEMENTATION
 
+// ---- >>nn kernels: what the layers are made of --------------------------------
+// All pointers are float32 and 4-byte aligned; outputs do not overlap inputs unless a comment allows it.
+
+typedef struct gsf__nn_workspace { // scratch memory of kernels; zero to begin with, grows, and is reused
+    void* memory;
+    size_t size;
+} gsf__nn_workspace;
+
+static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* workspace);
+
+// GELU is x/2 (1 + erf(x / sqrt 2)) with a relative error below 1e-6 for all x, GELU_TANH the usual approximation of it.
+typedef enum gsf__nn_activation {
+    GSF__NN_LINEAR = 0, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU, GSF__NN_RELU,
+} gsf__nn_activation;
+
+typedef struct gsf__nn_linear_desc {
+    const float* x;            // (rows, in), row stride ldx
+    int64_t rows, ldx;         // ldx 0: in
+    const gsf_nn_tensor* weight; // (out, in); f32, bf16 or f16. Higher ranks: (out, product of the rest)
+    const gsf_nn_tensor* bias; // (out) or NULL
+    gsf__nn_activation activation;
+    const float* gate;         // (out) or NULL: y += gate * activation(x w^T + b) instead of y = ...
+    int32_t accumulate;        // y += activation(x w^T + b) instead of y = ...
+    float* y;                  // (rows, out), row stride ldy
+    int64_t ldy;               // 0: out
+    int32_t bf16;              // bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: x is rounded to bf16, too, and products
+                               //   are summed in pairs. Relative L2 error 1.7e-3. Else nothing changes.
+} gsf__nn_linear_desc;
+
+// A linear layer with its activation and residual. `workspace` NULL: scratch for this call only.
+static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* workspace,
+                                     const gsf__nn_linear_desc* desc);
+
+typedef struct gsf__nn_quantized { // a weight in 8 bits; owns its memory: destroy it
+    int64_t out, in;
+    int32_t block;             // values that the rotation mixes: a power of two up to 256; 1: none
+    int8_t* data;              // private: whole tiles, [out/16][in/4][16][4]
+    float* scales;             // private: of each output
+    int32_t* offsets;          // private: 128 times the sum of each output's weights
+    size_t bytes;              // of all three: about out*in
+} gsf__nn_quantized;
+
+// Symmetric 8-bit integers per output from (out, in) weights in f32, bf16 or f16, after a Hadamard rotation of blocks of
+// inputs (the largest power of two up to 256 that divides `in`), which spreads outliers. `no_rotation` leaves it out. A NaN
+// or infinity gives GSF_ERROR_NUMERIC, and the tensor's name.
+static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor* weight, int32_t no_rotation,
+                                          gsf__nn_quantized* out);
+static void gsf__nn_destroy_quantized(gsf_context* ctx, gsf__nn_quantized* weight);
+// gsf__nn_run_linear with such a weight; desc->weight is not looked at. Each row of x is rotated and rounded to 8 bits by a
+// scale of its own; sums are exact. Relative L2 error for gaussian values: 1.2e-2. A row with a NaN or infinity gives NaNs.
+static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* workspace,
+                                          const gsf__nn_linear_desc* desc, const gsf__nn_quantized* weight);
+
+typedef struct gsf__nn_attention_desc {
+    int64_t queries, keys;     // rows of q and out; of k and v
+    int32_t heads, head_dim;   // head h stands in columns h*head_dim ...
+    const float *q, *k, *v;
+    int64_t ldq, ldk, ldv;     // row strides, 0: heads*head_dim
+    const unsigned char* mask; // (heads, queries, keys), 1 = may attend; NULL = all. A row of zeros gives 0.
+    const float* bias;         // (heads, queries, keys), added to the logits, unscaled; NULL = none
+    float scale;               // of the logits, 0: 1/sqrt(head_dim)
+    float* out;                // (queries, heads*head_dim), row stride ldo; may be q
+    int64_t ldo;
+    int32_t bf16;              // GSF_CPU_AVX512_BF16, even head_dim: q, k, v and the weights are rounded to bf16
+} gsf__nn_attention_desc;
+
+// softmax(scale q k^T + bias) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may
+// reach queries that the mask keeps from it.
+static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* workspace,
+                                        const gsf__nn_attention_desc* desc);
+
+// Normalisations over the last dimension of (rows, dim); y may be x; weight, bias (dim) or NULL. Variances are biased,
+// sums are in double.
+static void gsf__nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+                               const float* bias, float eps, float* y);
+static void gsf__nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+                             float eps, float* y);
+// y = layer_norm(x) * (1 + scale) + shift, scale and shift (dim): one pass of an adaptive layer norm.
+static void gsf__nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim,
+                                         const float* weight, const float* bias, float eps, const float* scale,
+                                         const float* shift, float* y);
+// x: (channels, count); statistics over the channels of a group and all their values; y may be x.
+GSF__SHARED void gsf__nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
+                                    const float* weight, const float* bias, float eps, float* y);
+// LayerNorm over each head of q or k, then the rotation of interleaved pairs on rows `rope_first` and up, in place.
+// cos, sin: (rows - rope_first, head_dim) or NULL: no rotation. weight, bias (head_dim) or NULL.
+static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads,
+                                   int32_t head_dim, const float* weight, const float* bias, float eps,
+                                   const float* cos, const float* sin, int64_t rope_first);
+static void gsf__nn_activate(gsf_context* ctx, gsf__nn_activation activation, const float* x, int64_t count, float* y);
+// Rows of (rows, columns) to softmax(scale * row); y may be x.
+GSF__SHARED void gsf__nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale,
+                                 float* y);
+
+// ---- convolution ----
+// Activations of convolutions are channels-last: (frames, height, width, channels).
+
+typedef struct gsf__nn_conv_desc {
+    const float* x;            // (frames, height, width, in)
+    int64_t frames, height, width;
+    const gsf_nn_tensor* weight; // (out, in, kh, kw): frame by frame; (out, in, kt, kh, kw), kt 1 or 3: causal in time.
+    const gsf_nn_tensor* bias; // (out) or NULL                      kh = kw is 1 or 3; f32, bf16 or f16
+    const float* before;       // (2, height, width, in): the frames before x; NULL: x's first frame, twice. kt = 3 only
+    int32_t halve;             // stride 2 and one row and column of zeros below and to the right, instead of stride 1
+    int32_t accumulate;        //   and a border of zeros. y += instead of y = ...
+    float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
+} gsf__nn_conv_desc;
+
+// A convolution, 3D ones causal in time. `workspace` (or, where it is NULL, memory for this call) holds the widened
+// weights and three frames of the input with their borders.
+GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* workspace,
+                                        const gsf__nn_conv_desc* desc);
+
+// ---- positions ----
+// Tables of the video transformer. Tokens stand in the order frame, row, column.
+
+typedef struct gsf__nn_rope_desc {
+    int32_t frames, height, width;   // of the grid of tokens: latent frames, latent height and width / patch size
+    int32_t base_height, base_width; // the grid the model was trained with: sample_height, sample_width / patch size
+    int32_t head_dim;                // a multiple of 16: time has head_dim/4 of it, rows and columns 3*head_dim/8 each
+    double theta;                    // 0: 10000
+} gsf__nn_rope_desc;
+
+// Rotary table: cos, sin (frames*height*width, head_dim), every value twice, for interleaved pairs. Pair i of an axis of
+// d values turns by position * theta^(-2i/d). Positions: frames 0, 1, ...; rows linspace(top, bottom*(h-1)/h, h) where
+// the grid, resized to fit into the base grid with its aspect ratio kept, lies from top to bottom in it; columns alike.
+// Angles are float32 products in the order of the reference, so they match its tables, not the exact ones.
+// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
+static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* desc, float* cos, float* sin);
+
+// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is time dim/4 | columns 3*dim/8 | rows
+// 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. scales: 0 = 1.
+// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
+static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width,
+                                      int32_t dim, double spatial_scale, double temporal_scale, float* out);
+
+// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)), an odd last
+// value 0. Angles in float32 as the reference has them. (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
+static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out);
+
 // ---- >>nn numbers ---------------------------------------------------------------
 
 static int64_t gsf__least(int64_t a, int64_t b) { return a < b ? a : b; }
@@ -805,7 +757,7 @@ GSF__SHARED uint16_t gsf__float_to_bf16(float value) {
     return (uint16_t)((bits + 0x7fffu + (bits >> 16 & 1u)) >> 16);
 }
 
-GSF_API size_t gsf_nn_dtype_size(gsf_nn_dtype dtype) {
+GSF_API size_t gsf_nn_get_dtype_size(gsf_nn_dtype dtype) {
     switch (dtype) {
         case GSF_NN_F32: case GSF_NN_I32: return 4;
         case GSF_NN_BF16: case GSF_NN_F16: case GSF_NN_I16: return 2;
@@ -815,7 +767,8 @@ GSF_API size_t gsf_nn_dtype_size(gsf_nn_dtype dtype) {
     return 0;
 }
 
-GSF_API const char* gsf_nn_dtype_name(gsf_nn_dtype dtype) {
+// as safetensors spells it: "BF16"
+static const char* gsf__nn_dtype_name(gsf_nn_dtype dtype) {
     switch (dtype) {
         case GSF_NN_F32: return "F32";
         case GSF_NN_BF16: return "BF16";
@@ -830,8 +783,8 @@ GSF_API const char* gsf_nn_dtype_name(gsf_nn_dtype dtype) {
     return "unknown";
 }
 
-GSF_API gsf_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32_t rank, const int64_t* shape) {
-    gsf_tensor tensor;
+GSF_API gsf_nn_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32_t rank, const int64_t* shape) {
+    gsf_nn_tensor tensor;
     memset(&tensor, 0, sizeof tensor);
     tensor.name = name;
     tensor.data = data;
@@ -844,8 +797,8 @@ GSF_API gsf_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32
     return tensor;
 }
 
-GSF_API void gsf_nn_read_tensor(const gsf_tensor* tensor, int64_t first, int64_t count, float* out) {
-    const char* p = (const char*)tensor->data + (size_t)first * gsf_nn_dtype_size(tensor->dtype);
+GSF_API void gsf_nn_convert_tensor(const gsf_nn_tensor* tensor, int64_t first, int64_t count, float* out) {
+    const char* p = (const char*)tensor->data + (size_t)first * gsf_nn_get_dtype_size(tensor->dtype);
 #define GSF_X(type, value) \
     for (int64_t i = 0; i < count; i++, p += sizeof(type)) { type v; memcpy(&v, p, sizeof v); out[i] = (value); } break
     switch (tensor->dtype) {
@@ -865,15 +818,15 @@ GSF_API void gsf_nn_read_tensor(const gsf_tensor* tensor, int64_t first, int64_t
 // ---- >>nn workspace -------------------------------------------------------------
 
 // At least `size` bytes; what the workspace held before is lost. NULL when out of memory.
-static void* gsf__nn_scratch(gsf_context* ctx, gsf_nn_workspace* workspace, size_t size) {
+static void* gsf__nn_scratch(gsf_context* ctx, gsf__nn_workspace* workspace, size_t size) {
     if (size <= workspace->size) return workspace->memory;
-    gsf_nn_destroy_workspace(ctx, workspace);
+    gsf__nn_destroy_workspace(ctx, workspace);
     workspace->memory = gsf_alloc(ctx, size, 1);
     workspace->size = workspace->memory ? size : 0;
     return workspace->memory;
 }
 
-GSF_API void gsf_nn_destroy_workspace(gsf_context* ctx, gsf_nn_workspace* workspace) {
+static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* workspace) {
     gsf_free(ctx, workspace->memory);
     memset(workspace, 0, sizeof *workspace);
 }
@@ -910,7 +863,7 @@ typedef enum gsf__nn_path_kind { GSF__NN_UNKNOWN, GSF__NN_IS_FILE, GSF__NN_IS_FO
 // Name of the one file of `folder` that ends in `suffix`; its size is 0 where there is none. More than one is an error.
 typedef struct gsf__nn_listing {
     const char *folder, *suffix;
-    gsf_text found;
+    gsf_buffer found;
 } gsf__nn_listing;
 
 static int gsf__nn_ends_in(const char* text, const char* suffix) {
@@ -941,7 +894,7 @@ static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing
             result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: holds %s and %s: name one by its prefix",
                               listing->folder, listing->found.data, entry->d_name);
         } else {
-            gsf_text_append(ctx, &listing->found, entry->d_name, strlen(entry->d_name));
+            gsf_append_bytes(ctx, &listing->found, entry->d_name, strlen(entry->d_name));
             if (listing->found.failed) result = GSF_ERROR_OUT_OF_MEMORY;
         }
     }
@@ -993,9 +946,9 @@ static void gsf__nn_unmap(const unsigned char* data, size_t size) {
 #endif
 
 // FOLDER/NAME; `out` is to be freed, also on error.
-static gsf_result gsf__nn_join(gsf_context* ctx, const char* folder, const char* name, gsf_text* out) {
+static gsf_result gsf__nn_join(gsf_context* ctx, const char* folder, const char* name, gsf_buffer* out) {
     memset(out, 0, sizeof *out);
-    gsf_text_printf(ctx, out, "%s%s%s", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
+    gsf_append_text(ctx, out, "%s%s%s", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
     return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
 
@@ -1046,13 +999,13 @@ static gsf_result gsf__nn_entry_fail(const gsf__nn_header* h, const gsf_json_val
                     text);
 }
 
-static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
-    const gsf_json_value* value = gsf_json_member(&h->json, entry, "dtype");
+static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
+    const gsf_json_value* value = gsf_find_json_member(&h->json, entry, "dtype");
     if (!value || value->type != GSF_JSON_STRING)
         return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"dtype\" is not given as text");
     for (int i = GSF_NN_F32; i <= GSF_NN_I64; i++) {
         out->dtype = (gsf_nn_dtype)i;
-        if (strcmp(value->string, gsf_nn_dtype_name(out->dtype)) == 0) return GSF_OK;
+        if (strcmp(value->string, gsf__nn_dtype_name(out->dtype)) == 0) return GSF_OK;
     }
     out->dtype = GSF_NN_U8;
     if (strcmp(value->string, "BOOL") == 0) return GSF_OK;
@@ -1061,8 +1014,8 @@ static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_val
     return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_UNSUPPORTED, text);
 }
 
-static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
-    const gsf_json_value* value = gsf_json_member(&h->json, entry, "shape");
+static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
+    const gsf_json_value* value = gsf_find_json_member(&h->json, entry, "shape");
     if (!value || value->type != GSF_JSON_ARRAY)
         return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"shape\" is not given as a list");
     if (value->count > GSF_NN_MAX_RANK)
@@ -1080,12 +1033,12 @@ static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_val
     return GSF_OK;
 }
 
-static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
-    const gsf_json_value* value = gsf_json_member(&h->json, entry, "data_offsets");
+static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
+    const gsf_json_value* value = gsf_find_json_member(&h->json, entry, "data_offsets");
     uint64_t begin, end;
     if (!value || value->type != GSF_JSON_ARRAY || value->count != 2 ||
-        !gsf__nn_read_size(h->text, gsf_json_element(&h->json, value, 0), &begin) ||
-        !gsf__nn_read_size(h->text, gsf_json_element(&h->json, value, 1), &end))
+        !gsf__nn_read_size(h->text, gsf_find_json_element(&h->json, value, 0), &begin) ||
+        !gsf__nn_read_size(h->text, gsf_find_json_element(&h->json, value, 1), &end))
         return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT,
                                   "\"data_offsets\" are not two whole numbers");
     char text[160];
@@ -1094,17 +1047,17 @@ static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_val
                  (unsigned long long)end, (unsigned long long)h->data_size);
         return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, text);
     }
-    const uint64_t size = gsf_nn_dtype_size(out->dtype), count = (uint64_t)out->count;
+    const uint64_t size = gsf_nn_get_dtype_size(out->dtype), count = (uint64_t)out->count;
     if (count > UINT64_MAX / size || count * size != end - begin) {
         snprintf(text, sizeof text, "%llu bytes for %llu values of %s", (unsigned long long)(end - begin),
-                 (unsigned long long)count, gsf_nn_dtype_name(out->dtype));
+                 (unsigned long long)count, gsf__nn_dtype_name(out->dtype));
         return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, text);
     }
     out->data = h->data + begin;
     return GSF_OK;
 }
 
-static gsf_result gsf__nn_read_entry(const gsf__nn_header* h, const gsf_json_value* entry, gsf_tensor* out) {
+static gsf_result gsf__nn_read_entry(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
     memset(out, 0, sizeof *out);
     if (entry->type != GSF_JSON_OBJECT) return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "no object");
     if (strlen(entry->key) != entry->key_size)
@@ -1122,21 +1075,21 @@ static gsf_result gsf__nn_check_metadata(const gsf__nn_header* h, const gsf_json
                                   (unsigned)metadata->offset);
 }
 
-static uint64_t gsf__nn_bytes(const gsf_tensor* tensor) {
-    return (uint64_t)tensor->count * gsf_nn_dtype_size(tensor->dtype);
+static uint64_t gsf__nn_bytes(const gsf_nn_tensor* tensor) {
+    return (uint64_t)tensor->count * gsf_nn_get_dtype_size(tensor->dtype);
 }
 
 static int gsf__nn_compare_places(const void* a, const void* b) { // an empty tensor before what begins where it stands
-    const gsf_tensor *x = (const gsf_tensor*)a, *y = (const gsf_tensor*)b;
+    const gsf_nn_tensor *x = (const gsf_nn_tensor*)a, *y = (const gsf_nn_tensor*)b;
     if (x->data != y->data) return (const char*)x->data < (const char*)y->data ? -1 : 1;
     return gsf__nn_bytes(x) < gsf__nn_bytes(y) ? -1 : gsf__nn_bytes(x) > gsf__nn_bytes(y);
 }
 
 static int gsf__nn_compare_names(const void* a, const void* b) {
-    return strcmp(((const gsf_tensor*)a)->name, ((const gsf_tensor*)b)->name);
+    return strcmp(((const gsf_nn_tensor*)a)->name, ((const gsf_nn_tensor*)b)->name);
 }
 
-static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_tensor* tensors, size_t count) {
+static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_nn_tensor* tensors, size_t count) {
     const char* next = h->data;
     const char* const end = h->data + h->data_size;
     if (count) qsort(tensors, count, sizeof *tensors, gsf__nn_compare_places);
@@ -1171,7 +1124,7 @@ static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weight
             GSF__TRY(gsf__nn_check_metadata(h, entry));
             continue;
         }
-        gsf_tensor* tensor = &weights->tensors[weights->tensor_count];
+        gsf_nn_tensor* tensor = &weights->tensors[weights->tensor_count];
         GSF__TRY(gsf__nn_read_entry(h, entry, tensor));
         tensor->name = file->names + file->names_size;
         memcpy(file->names + file->names_size, entry->key, entry->key_size + 1);
@@ -1252,7 +1205,7 @@ typedef struct gsf__nn_index { // weight_map of a sharded model while it is read
     gsf_context* ctx;
     const char* name;
     size_t folder_size;       // the shards' names follow this many bytes of `path`
-    gsf_text path;
+    gsf_buffer path;
     gsf_json json;
     const gsf_json_value* map;
     const char** shards;      // names of the opened files, in the order of gsf__nn_files
@@ -1273,7 +1226,7 @@ static gsf_result gsf__nn_open_shards(gsf__nn_index* index, gsf_nn_weights* weig
                               sizeof *index->shards));
         index->shards[files->count] = value->string;
         index->path.size = index->folder_size;
-        gsf_text_append(index->ctx, &index->path, value->string, value->string_size);
+        gsf_append_bytes(index->ctx, &index->path, value->string, value->string_size);
         if (index->path.failed) return GSF_ERROR_OUT_OF_MEMORY;
         GSF__TRY(gsf__nn_add_file(index->ctx, index->path.data, weights));
     }
@@ -1295,7 +1248,7 @@ static gsf_result gsf__nn_check_index(const gsf__nn_index* index, const gsf_nn_w
     const gsf__nn_files* files = (const gsf__nn_files*)weights->files;
     for (uint32_t i = index->map->child; i; i = index->json.values[i].next) {
         const gsf_json_value* value = &index->json.values[i];
-        const gsf_tensor* tensor = gsf_nn_find_tensor(weights, value->key);
+        const gsf_nn_tensor* tensor = gsf_nn_find_tensor(weights, value->key);
         if (!tensor || strlen(value->key) != value->key_size)
             return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s is not in %s", index->name,
                             (unsigned)value->offset, gsf__nn_show(value->key).text, gsf__nn_show(value->string).text);
@@ -1317,19 +1270,19 @@ static gsf_result gsf__nn_read_index(gsf_context* ctx, const char* path, const v
     index.name = gsf__nn_path_end(path);
     gsf_result result = gsf_parse_json(ctx, index.name, (const char*)data, size, &index.json);
     if (result != GSF_OK) return result;
-    index.map = gsf_json_member(&index.json, &index.json.values[0], "weight_map");
+    index.map = gsf_find_json_member(&index.json, &index.json.values[0], "weight_map");
     if (!index.map || index.map->type != GSF_JSON_OBJECT) {
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: no \"weight_map\" object", index.name);
     } else {
         const char* slash = strrchr(path, '/');
         index.folder_size = slash ? (size_t)(slash - path) + 1 : 0;
-        gsf_text_append(ctx, &index.path, path, index.folder_size);
+        gsf_append_bytes(ctx, &index.path, path, index.folder_size);
         result = gsf__nn_open_shards(&index, weights);
         if (result == GSF_OK) result = gsf__nn_sort_names(ctx, weights);
         if (result == GSF_OK) result = gsf__nn_check_index(&index, weights);
     }
     gsf_free(ctx, (void*)index.shards);
-    gsf_destroy_text(ctx, &index.path);
+    gsf_destroy_buffer(ctx, &index.path);
     gsf_destroy_json(ctx, &index.json);
     return result;
 }
@@ -1355,12 +1308,13 @@ static gsf_result gsf__nn_read_if_there(gsf_context* ctx, const char* path, void
 }
 
 // Opens <path>.index.json, else <path>. *found 0: neither is there, which is an error unless `may_lack`.
-static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_lack, int* found, gsf_nn_weights* weights) {
+static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_buffer* path, int may_lack, int* found,
+                                      gsf_nn_weights* weights) {
     const gsf_logger logger = ctx->logger;
     const size_t plain = path->size;
     void* data = NULL;
     size_t size;
-    gsf_text_append(ctx, path, ".index.json", 11);
+    gsf_append_bytes(ctx, path, ".index.json", 11);
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = gsf__nn_read_if_there(ctx, path->data, &data, &size);
     *found = data != NULL;
@@ -1380,12 +1334,12 @@ static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_text* path, int may_
 
 static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const char* name, int may_lack, int* found,
                                      gsf_nn_weights* weights) {
-    gsf_text path;
+    gsf_buffer path;
     memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s%s%s.safetensors", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
+    gsf_append_text(ctx, &path, "%s%s%s.safetensors", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
     const gsf_result result =
         path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_open_either(ctx, &path, may_lack, found, weights);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
@@ -1410,7 +1364,7 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
             listing.found.data[listing.found.size - strlen(suffixes[i])] = 0;
             result = gsf__nn_open_named(ctx, folder, listing.found.data, 0, &found, weights);
         }
-        gsf_destroy_text(ctx, &listing.found);
+        gsf_destroy_buffer(ctx, &listing.found);
     }
     if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: no .safetensors file in it", folder);
     return result;
@@ -1433,7 +1387,7 @@ static gsf_result gsf__nn_open_index_file(gsf_context* ctx, const char* path, gs
     return result;
 }
 
-GSF_API gsf_result gsf_nn_open_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
+GSF_API gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
     gsf_result result = gsf__nn_begin_weights(ctx, path, out);
     if (result != GSF_OK) return result;
     const gsf__nn_path_kind kind = gsf__io_is_plain(ctx) ? gsf__nn_look_at_path(path) : GSF__NN_UNKNOWN;
@@ -1448,20 +1402,20 @@ GSF_API gsf_result gsf_nn_open_weights(gsf_context* ctx, const char* path, const
     } else {
         result = gsf__nn_open_folder(ctx, path, out);
     }
-    if (result != GSF_OK) gsf_nn_close_weights(ctx, out);
+    if (result != GSF_OK) gsf_nn_destroy_weights(ctx, out);
     return result;
 }
 
-GSF_API gsf_result gsf_nn_open_weights_memory(gsf_context* ctx, const char* name, const void* data, size_t size,
-                                              gsf_nn_weights* out) {
+GSF_API gsf_result gsf_nn_parse_weights(gsf_context* ctx, const char* name, const void* data, size_t size,
+                                        gsf_nn_weights* out) {
     gsf_result result = gsf__nn_begin_weights(ctx, name, out);
     if (result == GSF_OK) result = gsf__nn_add_bytes(ctx, name, (const unsigned char*)data, size, GSF__NN_BORROWED, out);
     if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
-    if (result != GSF_OK) gsf_nn_close_weights(ctx, out);
+    if (result != GSF_OK) gsf_nn_destroy_weights(ctx, out);
     return result;
 }
 
-GSF_API void gsf_nn_close_weights(gsf_context* ctx, gsf_nn_weights* weights) {
+GSF_API void gsf_nn_destroy_weights(gsf_context* ctx, gsf_nn_weights* weights) {
     gsf__nn_files* files = (gsf__nn_files*)weights->files;
     for (size_t i = 0; files && i < files->count; i++) {
         gsf__nn_release(ctx, files->files[i].data, files->files[i].size, files->files[i].holder);
@@ -1473,7 +1427,7 @@ GSF_API void gsf_nn_close_weights(gsf_context* ctx, gsf_nn_weights* weights) {
     memset(weights, 0, sizeof *weights);
 }
 
-GSF_API const gsf_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name) {
+GSF_API const gsf_nn_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name) {
     size_t low = 0, high = weights->tensor_count;
     while (low < high) {
         const size_t middle = low + (high - low) / 2;
@@ -1487,7 +1441,7 @@ GSF_API const gsf_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, cons
 
 // ---- writing
 
-static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_tensor* tensor) {
+static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_nn_tensor* tensor) {
     const char* name = tensor->name ? tensor->name : "";
     size_t left = strlen(name);
     int64_t count = 1;
@@ -1497,55 +1451,56 @@ static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_tensor* tensor
         p += step;
         left -= step;
     }
-    int ok = tensor->name && strcmp(name, "__metadata__") != 0 && gsf_nn_dtype_size(tensor->dtype) != 0 &&
+    int ok = tensor->name && strcmp(name, "__metadata__") != 0 && gsf_nn_get_dtype_size(tensor->dtype) != 0 &&
              tensor->rank >= 0 && tensor->rank <= GSF_NN_MAX_RANK;
     for (int32_t i = 0; ok && i < tensor->rank; i++) {
         ok = tensor->shape[i] >= 0 && (tensor->shape[i] == 0 || count <= INT64_MAX / tensor->shape[i]);
         if (ok) count *= tensor->shape[i];
     }
     ok = ok && count == tensor->count && (count == 0 || tensor->data) &&
-         (uint64_t)count <= SIZE_MAX / 2 / gsf_nn_dtype_size(tensor->dtype);
+         (uint64_t)count <= SIZE_MAX / 2 / gsf_nn_get_dtype_size(tensor->dtype);
     if (ok) return GSF_OK;
     return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name, dtype, shape, count and data do not fit",
                     gsf__nn_show(name).text);
 }
 
 static int gsf__nn_compare_saved(const void* a, const void* b) { // wide types first, so that all stay aligned
-    const gsf_tensor *x = *(const gsf_tensor* const*)a, *y = *(const gsf_tensor* const*)b;
-    const size_t p = gsf_nn_dtype_size(x->dtype), q = gsf_nn_dtype_size(y->dtype);
+    const gsf_nn_tensor *x = *(const gsf_nn_tensor* const*)a, *y = *(const gsf_nn_tensor* const*)b;
+    const size_t p = gsf_nn_get_dtype_size(x->dtype), q = gsf_nn_get_dtype_size(y->dtype);
     return p != q ? (p > q ? -1 : 1) : strcmp(x->name, y->name);
 }
 
 static int gsf__nn_compare_saved_names(const void* a, const void* b) {
-    return strcmp((*(const gsf_tensor* const*)a)->name, (*(const gsf_tensor* const*)b)->name);
+    return strcmp((*(const gsf_nn_tensor* const*)a)->name, (*(const gsf_nn_tensor* const*)b)->name);
 }
 
-static gsf_result gsf__nn_format_header(gsf_context* ctx, const gsf_tensor* const* order, size_t count, gsf_text* out) {
+static gsf_result gsf__nn_format_header(gsf_context* ctx, const gsf_nn_tensor* const* order, size_t count,
+                                        gsf_buffer* out) {
     size_t begin = 0;
-    gsf_text_append(ctx, out, "        {", 9); // the length goes where the spaces are
+    gsf_append_bytes(ctx, out, "        {", 9); // the length goes where the spaces are
     for (size_t i = 0; i < count; i++) {
-        const gsf_tensor* t = order[i];
+        const gsf_nn_tensor* t = order[i];
         const size_t bytes = (size_t)gsf__nn_bytes(t);
         if (bytes > SIZE_MAX / 2 - begin) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "the tensors' sizes overflow");
-        if (i) gsf_text_append(ctx, out, ",", 1);
-        gsf_text_json_string(ctx, out, t->name);
-        gsf_text_printf(ctx, out, ":{\"dtype\":\"%s\",\"shape\":[", gsf_nn_dtype_name(t->dtype));
-        for (int32_t k = 0; k < t->rank; k++) gsf_text_printf(ctx, out, "%s%lld", k ? "," : "", (long long)t->shape[k]);
-        gsf_text_printf(ctx, out, "],\"data_offsets\":[%zu,%zu]}", begin, begin + bytes);
+        if (i) gsf_append_bytes(ctx, out, ",", 1);
+        gsf_append_json_string(ctx, out, t->name);
+        gsf_append_text(ctx, out, ":{\"dtype\":\"%s\",\"shape\":[", gsf__nn_dtype_name(t->dtype));
+        for (int32_t k = 0; k < t->rank; k++) gsf_append_text(ctx, out, "%s%lld", k ? "," : "", (long long)t->shape[k]);
+        gsf_append_text(ctx, out, "],\"data_offsets\":[%zu,%zu]}", begin, begin + bytes);
         begin += bytes;
     }
-    gsf_text_append(ctx, out, "}", 1);
-    gsf_text_append(ctx, out, "       ", (8 - out->size % 8) % 8);
+    gsf_append_bytes(ctx, out, "}", 1);
+    gsf_append_bytes(ctx, out, "       ", (8 - out->size % 8) % 8);
     if (out->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__store_le(out->data, out->size - GSF__NN_FILE_HEAD, GSF__NN_FILE_HEAD);
     return gsf__reserve(ctx, (void**)&out->data, &out->capacity, out->size, out->size + begin + 1, 1);
 }
 
-GSF_API gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const gsf_tensor* tensors, size_t count) {
-    gsf_text out;
+GSF_API gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const gsf_nn_tensor* tensors, size_t count) {
+    gsf_buffer out;
     memset(&out, 0, sizeof out);
     for (size_t i = 0; i < count; i++) GSF__TRY(gsf__nn_check_saved(ctx, &tensors[i]));
-    const gsf_tensor** order = (const gsf_tensor**)gsf_alloc(ctx, count, sizeof *order);
+    const gsf_nn_tensor** order = (const gsf_nn_tensor**)gsf_alloc(ctx, count, sizeof *order);
     if (!order) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = GSF_OK;
     for (size_t i = 0; i < count; i++) order[i] = &tensors[i];
@@ -1557,9 +1512,9 @@ GSF_API gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const
     if (count) qsort((void*)order, count, sizeof *order, gsf__nn_compare_saved);
     if (result == GSF_OK) result = gsf__nn_format_header(ctx, order, count, &out);
     for (size_t i = 0; i < count && result == GSF_OK; i++)
-        gsf_text_append(ctx, &out, (const char*)order[i]->data, (size_t)gsf__nn_bytes(order[i]));
+        gsf_append_bytes(ctx, &out, (const char*)order[i]->data, (size_t)gsf__nn_bytes(order[i]));
     if (result == GSF_OK) result = out.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, out.data, out.size);
-    gsf_destroy_text(ctx, &out);
+    gsf_destroy_buffer(ctx, &out);
     gsf_free(ctx, (void*)order);
     return result;
 }
@@ -1590,7 +1545,7 @@ static void gsf__nn_print_shape(int32_t rank, const int64_t* shape, char* out, s
     if (at < room) snprintf(out + at, room - at, "]");
 }
 
-static gsf_result gsf__nn_check_taken(const gsf__nn_loader* loader, const gsf_tensor* t, int32_t rank,
+static gsf_result gsf__nn_check_taken(const gsf__nn_loader* loader, const gsf_nn_tensor* t, int32_t rank,
                                       const int64_t* shape) {
     char found[200], wanted[200];
     int ok = t->rank == rank;
@@ -1603,14 +1558,14 @@ static gsf_result gsf__nn_check_taken(const gsf__nn_loader* loader, const gsf_te
     }
     if (t->dtype != GSF_NN_F32 && t->dtype != GSF_NN_BF16 && t->dtype != GSF_NN_F16)
         return gsf_fail(loader->ctx, GSF_ERROR_UNSUPPORTED, "%s: tensor %s is %s, not F32, BF16 or F16",
-                        loader->weights->name, gsf__nn_show(t->name).text, gsf_nn_dtype_name(t->dtype));
+                        loader->weights->name, gsf__nn_show(t->name).text, gsf__nn_dtype_name(t->dtype));
     return GSF_OK;
 }
 
-static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, const gsf_tensor** out, int32_t rank,
+static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, const gsf_nn_tensor** out, int32_t rank,
                                const int64_t* shape) {
     *out = NULL;
-    const gsf_tensor* found = gsf_nn_find_tensor(loader->weights, name);
+    const gsf_nn_tensor* found = gsf_nn_find_tensor(loader->weights, name);
     if (!found)
         return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s is missing", loader->weights->name,
                         gsf__nn_show(name).text);
@@ -1623,8 +1578,8 @@ static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, const g
 // Finds the tensor of that name (printf style), which must be F32, BF16 or F16 and have exactly this shape; a negative
 // size means any.
 GSF_PRINTF(5, 6)
-GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_tensor** out, int32_t rank, const int64_t* shape,
-                                    const char* format, ...) {
+GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_nn_tensor** out, int32_t rank,
+                                    const int64_t* shape, const char* format, ...) {
     char name[256];
     va_list args;
     va_start(args, format);
@@ -1682,7 +1637,7 @@ GSF__SHARED gsf_result gsf__nn_parse_config(gsf_context* ctx, const char* name, 
 GSF__SHARED void gsf__nn_close_config(gsf__nn_config* config) { gsf_destroy_json(config->ctx, &config->json); }
 
 static const gsf_json_value* gsf__nn_config_find(const gsf__nn_config* config, const char* key) {
-    const gsf_json_value* value = gsf_json_member(&config->json, config->root, key);
+    const gsf_json_value* value = gsf_find_json_member(&config->json, config->root, key);
     return value && value->type != GSF_JSON_NULL ? value : NULL;
 }
 
@@ -1790,7 +1745,7 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
 // FOLDER/NAME. One that may be absent, and is, counts as an empty object. gsf__nn_close_config also takes what failed.
 GSF__SHARED gsf_result gsf__nn_open_config(gsf_context* ctx, const char* folder, const char* name, int may_lack,
                                            gsf__nn_config* out) {
-    gsf_text path;
+    gsf_buffer path;
     void* data = NULL;
     size_t size = 0;
     memset(out, 0, sizeof *out);
@@ -1801,7 +1756,7 @@ GSF__SHARED gsf_result gsf__nn_open_config(gsf_context* ctx, const char* folder,
     if (!result && !data && may_lack) result = gsf__nn_parse_config(ctx, path.data, "{}", 2, out);
     else if (!result) result = gsf__nn_parse_config(ctx, path.data, (const char*)data, size, out);
     gsf_free(ctx, data);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
@@ -1864,8 +1819,8 @@ static void gsf__nn_store_real(const gsf__nn_key* k, double value) {
 }
 
 static gsf_result gsf__nn_config_read_key(const gsf__nn_config* config, const gsf__nn_key* k) {
-    static const gsf_nn_activation activations[] = {GSF_NN_GELU, GSF_NN_GELU_TANH, GSF_NN_GELU_TANH,
-                                                    GSF_NN_RELU, GSF_NN_SILU, GSF_NN_SILU};
+    static const gsf__nn_activation activations[] = {GSF__NN_GELU, GSF__NN_GELU_TANH, GSF__NN_GELU_TANH,
+                                                    GSF__NN_RELU, GSF__NN_SILU, GSF__NN_SILU};
     const int64_t low = (int64_t)k->low, high = (int64_t)k->high;
     int64_t whole = 0;
     double real;
@@ -2034,17 +1989,17 @@ static float gsf__nn_gelu_ref(float x) {
     return (x < 0.0f ? 0.0f : x) - z * (power * two_n * t * tail);
 }
 
-static float gsf__nn_activation_ref(gsf_nn_activation activation, float x) {
+static float gsf__nn_activation_ref(gsf__nn_activation activation, float x) {
     switch (activation) {
-        case GSF_NN_LINEAR: return x;
-        case GSF_NN_GELU_TANH: { // x/2 (1 + tanh(u)) = x / (1 + exp(-2u))
+        case GSF__NN_LINEAR: return x;
+        case GSF__NN_GELU_TANH: { // x/2 (1 + tanh(u)) = x / (1 + exp(-2u))
             if (x < -12.0f) return -0.0f * (x == x); // below float's resolution of the limit, and no inf * 0
             const float u = 0.7978845608028654f * (x + 0.044715f * x * x * x);
             return x / (1.0f + expf(-2.0f * u));
         }
-        case GSF_NN_SILU: return x < -104.0f ? -0.0f : x / (1.0f + expf(-x));
-        case GSF_NN_GELU: return gsf__nn_gelu_ref(x);
-        case GSF_NN_RELU: return x < 0.0f ? 0.0f : x;
+        case GSF__NN_SILU: return x < -104.0f ? -0.0f : x / (1.0f + expf(-x));
+        case GSF__NN_GELU: return gsf__nn_gelu_ref(x);
+        case GSF__NN_RELU: return x < 0.0f ? 0.0f : x;
     }
     return x;
 }
@@ -2057,11 +2012,11 @@ static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_
 }
 
 typedef struct gsf__activation_kernels { // y may be x in both
-    void (*activate)(gsf_nn_activation activation, const float* x, int64_t count, float* y, int stream);
+    void (*activate)(gsf__nn_activation activation, const float* x, int64_t count, float* y, int stream);
     void (*softmax)(const float* x, int64_t count, float scale, float* y);
 } gsf__activation_kernels;
 
-static void gsf__activate_scalar(gsf_nn_activation activation, const float* x, int64_t count, float* y, int stream) {
+static void gsf__activate_scalar(gsf__nn_activation activation, const float* x, int64_t count, float* y, int stream) {
     (void)stream;
     for (int64_t i = 0; i < count; i++) y[i] = gsf__nn_activation_ref(activation, x[i]);
 }
@@ -2112,23 +2067,23 @@ GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
 }
 
 // As gsf__nn_activation_ref; at -inf the limit -0, a NaN stays. Pass a compile-time constant as `activation` in loops.
-GSF__V_INLINE gsf__vf gsf__v_activate(gsf_nn_activation activation, gsf__vf x) {
+GSF__V_INLINE gsf__vf gsf__v_activate(gsf__nn_activation activation, gsf__vf x) {
     const gsf__vf one = gsf__v_set(1.0f);
-    if (activation == GSF_NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
+    if (activation == GSF__NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
         x = gsf__v_max(gsf__v_set(-12.0f), x); // from where on the power is inf
         const gsf__vf slope = gsf__v_madd(x * x, gsf__v_set(-0.10294324f), gsf__v_set(-2.30220819f));
         return x / (one + gsf__v_exp2(x * slope));
     }
-    if (activation == GSF_NN_SILU) {
+    if (activation == GSF__NN_SILU) {
         x = gsf__v_max(gsf__v_set(-100.0f), x);
         return x / (one + gsf__v_exp(gsf__v_set(0.0f) - x));
     }
-    if (activation == GSF_NN_GELU) return gsf__v_gelu(x);
-    if (activation == GSF_NN_RELU) return gsf__v_max(gsf__v_set(0.0f), x);
+    if (activation == GSF__NN_GELU) return gsf__v_gelu(x);
+    if (activation == GSF__NN_RELU) return gsf__v_max(gsf__v_set(0.0f), x);
     return x;
 }
 
-GSF__V_INLINE void GSF__V(gsf__activate_all)(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+GSF__V_INLINE void GSF__V(gsf__activate_all)(gsf__nn_activation activation, const float* x, int64_t count, float* y,
                                              int stream) {
     int64_t i = 0;
     for (; i + GSF__LANES <= count; i += GSF__LANES)
@@ -2137,7 +2092,7 @@ GSF__V_INLINE void GSF__V(gsf__activate_all)(gsf_nn_activation activation, const
     if (tail) gsf__v_store_first(y + i, gsf__v_activate(activation, gsf__v_load_first(x + i, tail)), tail);
 }
 
-GSF__V_KERNEL void GSF__V(gsf__activate)(gsf_nn_activation activation, const float* x, int64_t count, float* y,
+GSF__V_KERNEL void GSF__V(gsf__activate)(gsf__nn_activation activation, const float* x, int64_t count, float* y,
                                          int stream) {
 #define GSF_X(kind)                                                          \
     case kind:                                                               \
@@ -2145,11 +2100,11 @@ GSF__V_KERNEL void GSF__V(gsf__activate)(gsf_nn_activation activation, const flo
         else GSF__V(gsf__activate_all)(kind, x, count, y, 0);                \
         break;
     switch (activation) {
-        GSF_X(GSF_NN_LINEAR)
-        GSF_X(GSF_NN_GELU_TANH)
-        GSF_X(GSF_NN_SILU)
-        GSF_X(GSF_NN_GELU)
-        GSF_X(GSF_NN_RELU)
+        GSF_X(GSF__NN_LINEAR)
+        GSF_X(GSF__NN_GELU_TANH)
+        GSF_X(GSF__NN_SILU)
+        GSF_X(GSF__NN_GELU)
+        GSF_X(GSF__NN_RELU)
     }
 #undef GSF_X
     gsf__nn_end_stream(stream);
@@ -2214,7 +2169,7 @@ typedef struct gsf__finite_job {
     int64_t first[64]; // per part, -1: none
 } gsf__finite_job;
 
-static void gsf__finite_part(void* arg, size_t index, int worker) {
+static void gsf__finite_part(void* arg, size_t index, int32_t worker) {
     gsf__finite_job* job = (gsf__finite_job*)arg;
     const int64_t begin = (int64_t)index * job->part, end = gsf__least(begin + job->part, job->count);
     (void)worker;
@@ -2240,11 +2195,11 @@ static int64_t gsf__nn_find_not_finite(gsf_context* ctx, const float* x, int64_t
     return -1;
 }
 
-static int gsf__nn_tensor_is_finite(const gsf_tensor* tensor) {
+static int gsf__nn_tensor_is_finite(const gsf_nn_tensor* tensor) {
     float part[1024];
     for (int64_t i = 0; i < tensor->count; i += 1024) {
         const int64_t n = tensor->count - i < 1024 ? tensor->count - i : 1024;
-        gsf_nn_read_tensor(tensor, i, n, part);
+        gsf_nn_convert_tensor(tensor, i, n, part);
         for (int64_t k = 0; k < n; k++)
             if (!(fabsf(part[k]) <= FLT_MAX)) return 0;
     }
@@ -2258,7 +2213,7 @@ static gsf_result gsf__nn_check_finite(gsf_context* ctx, const gsf_nn_weights* w
     const int64_t at = gsf__nn_find_not_finite(ctx, x, count);
     if (at < 0) return GSF_OK;
     for (size_t i = 0; i < weights->tensor_count; i++) {
-        const gsf_tensor* t = &weights->tensors[i];
+        const gsf_nn_tensor* t = &weights->tensors[i];
         if (strncmp(t->name, prefix, strlen(prefix)) == 0 && !gsf__nn_tensor_is_finite(t))
             return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: tensor %s holds a NaN or an infinity", weights->name, t->name);
     }
@@ -2268,7 +2223,7 @@ static gsf_result gsf__nn_check_finite(gsf_context* ctx, const gsf_nn_weights* w
 
 typedef struct gsf__activate_job {
     const gsf__activation_kernels* kernels;
-    gsf_nn_activation activation;
+    gsf__nn_activation activation;
     const float* x;
     float* y;
     int64_t rows, columns, chunk_rows;
@@ -2276,7 +2231,7 @@ typedef struct gsf__activate_job {
     int stream;
 } gsf__activate_job;
 
-static void gsf__activate_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__activate_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__activate_job* job = (const gsf__activate_job*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK;
@@ -2284,7 +2239,7 @@ static void gsf__activate_chunk(void* arg, size_t chunk, int worker) {
                            job->y + begin, job->stream);
 }
 
-GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, const float* x, int64_t count, float* y) {
+static void gsf__nn_activate(gsf_context* ctx, gsf__nn_activation activation, const float* x, int64_t count, float* y) {
     gsf__activate_job job;
     memset(&job, 0, sizeof job);
     job.kernels = gsf__activation_kernels_of(ctx->cpu_level);
@@ -2296,7 +2251,7 @@ GSF_API void gsf_nn_activate(gsf_context* ctx, gsf_nn_activation activation, con
     gsf__parallel_for(ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__activate_chunk, &job);
 }
 
-static void gsf__softmax_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__softmax_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__activate_job* job = (const gsf__activate_job*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * job->chunk_rows, n = job->columns;
@@ -2304,7 +2259,8 @@ static void gsf__softmax_chunk(void* arg, size_t chunk, int worker) {
         job->kernels->softmax(job->x + r * n, n, job->scale, job->y + r * n);
 }
 
-GSF_API void gsf_nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale, float* y) {
+GSF__SHARED void gsf__nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale,
+                                 float* y) {
     gsf__activate_job job;
     memset(&job, 0, sizeof job);
     job.kernels = gsf__activation_kernels_of(ctx->cpu_level);
@@ -2402,7 +2358,7 @@ GSF__SHARED gsf__moments gsf__moments_of(double pivot, double sum, double square
 static void gsf__norm_silu_scalar(const float* x, int64_t count, const float* mean, const float* scale,
                                     const float* offset, float* y) {
     for (int64_t i = 0; i < count; i++)
-        y[i] = gsf__nn_activation_ref(GSF_NN_SILU, (x[i] - mean[i]) * scale[i] + offset[i]);
+        y[i] = gsf__nn_activation_ref(GSF__NN_SILU, (x[i] - mean[i]) * scale[i] + offset[i]);
 }
 
 #define gsf__moments_sums GSF__V(gsf__moments_sums)
@@ -2545,7 +2501,7 @@ GSF__V_INLINE void GSF__V(gsf__norm_silu_first)(const float* x, const float* mea
                                                 float* y, size_t left) {
     const gsf__vf d = gsf__v_load_first(x, left) - gsf__v_load_first(mean, left);
     const gsf__vf v = gsf__v_madd(d, gsf__v_load_first(scale, left), gsf__v_load_first(offset, left));
-    gsf__v_store_first(y, gsf__v_activate(GSF_NN_SILU, v), left);
+    gsf__v_store_first(y, gsf__v_activate(GSF__NN_SILU, v), left);
 }
 
 GSF__V_KERNEL void GSF__V(gsf__norm_silu)(const float* x, int64_t count, const float* mean, const float* scale,
@@ -2576,7 +2532,7 @@ static const gsf__norm_kernels* gsf__norm_kernels_of(gsf_cpu_level level) {
     return &scalar;
 }
 
-static void gsf__norm_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__norm_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * job->chunk_rows;
@@ -2601,19 +2557,20 @@ static void gsf__norm_rows(gsf_context* ctx, const float* x, int64_t rows, int64
     gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__norm_chunk, &job);
 }
 
-GSF_API void gsf_nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                                         const float* bias, float eps, const float* scale, const float* shift, float* y) {
+static void gsf__nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim,
+                                         const float* weight, const float* bias, float eps, const float* scale,
+                                         const float* shift, float* y) {
     const gsf__norm_vectors by = {weight, bias, scale, shift};
     gsf__norm_rows(ctx, x, rows, dim, by, eps, 1, y);
 }
 
-GSF_API void gsf_nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+static void gsf__nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
                                const float* bias, float eps, float* y) {
-    gsf_nn_layer_norm_modulated(ctx, x, rows, dim, weight, bias, eps, NULL, NULL, y);
+    gsf__nn_layer_norm_modulated(ctx, x, rows, dim, weight, bias, eps, NULL, NULL, y);
 }
 
-GSF_API void gsf_nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight, float eps,
-                             float* y) {
+static void gsf__nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
+                             float eps, float* y) {
     const gsf__norm_vectors by = {weight, NULL, NULL, NULL};
     gsf__norm_rows(ctx, x, rows, dim, by, eps, 0, y);
 }
@@ -2641,7 +2598,7 @@ static gsf__moments gsf__norm_part(const gsf__norm_job* job, int64_t group, int6
     return job->kernels->moments(job->x + group * job->group_size + part * job->part_size, *count, 1);
 }
 
-static void gsf__norm_whole_group(void* arg, size_t group, int worker) {
+static void gsf__norm_whole_group(void* arg, size_t group, int32_t worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
     int64_t count;
@@ -2649,7 +2606,7 @@ static void gsf__norm_whole_group(void* arg, size_t group, int worker) {
     gsf__norm_group_values(job, (int64_t)group, 0, m, gsf__norm_inverse(m, count, job->eps));
 }
 
-static void gsf__norm_part_moments(void* arg, size_t chunk, int worker) {
+static void gsf__norm_part_moments(void* arg, size_t chunk, int32_t worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
     int64_t count;
@@ -2657,7 +2614,7 @@ static void gsf__norm_part_moments(void* arg, size_t chunk, int worker) {
     job->part_moments[chunk] = gsf__norm_part(job, group, (int64_t)chunk % job->parts, &count);
 }
 
-static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
+static void gsf__norm_part_values(void* arg, size_t chunk, int32_t worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
     const int64_t group = (int64_t)chunk / job->parts;
@@ -2674,8 +2631,8 @@ static void gsf__norm_part_values(void* arg, size_t chunk, int worker) {
                            gsf__norm_inverse(m, job->group_size, job->eps));
 }
 
-GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
-                               const float* weight, const float* bias, float eps, float* y) {
+GSF__SHARED void gsf__nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
+                                    const float* weight, const float* bias, float eps, float* y) {
     gsf__moments part_moments[GSF__NORM_PARTS];
     gsf__norm_job job;
     memset(&job, 0, sizeof job);
@@ -2708,7 +2665,7 @@ GSF_API void gsf_nn_group_norm(gsf_context* ctx, const float* x, int64_t channel
     }
 }
 
-static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__norm_job* job = (const gsf__norm_job*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * job->chunk_rows;
@@ -2720,9 +2677,9 @@ static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int worker) {
     }
 }
 
-GSF_API void gsf_nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads, int32_t head_dim,
-                                   const float* weight, const float* bias, float eps, const float* cos, const float* sin,
-                                   int64_t rope_first) {
+static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads,
+                                   int32_t head_dim, const float* weight, const float* bias, float eps,
+                                   const float* cos, const float* sin, int64_t rope_first) {
     gsf__norm_job job;
     memset(&job, 0, sizeof job);
     job.kernels = gsf__norm_kernels_of(ctx->cpu_level);
@@ -2813,7 +2770,7 @@ typedef struct gsf__linear_plan { // how a product is cut; depends on its sizes 
 } gsf__linear_plan;
 
 struct gsf__linear_job {
-    gsf_nn_linear_desc desc;
+    gsf__nn_linear_desc desc;
     gsf__linear_plan plan;
     const gsf__linear_kernels* kernels;
     int64_t in, out;
@@ -2847,7 +2804,7 @@ static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f3
 // The part of a panel at steps k ... and columns first ...
 static void gsf__pack_corner(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t first, int64_t columns, int64_t k,
                              int64_t count, float* out) {
-    const size_t size = gsf_nn_dtype_size(dtype);
+    const size_t size = gsf_nn_get_dtype_size(dtype);
     for (int64_t c = first; c < first + columns; c++)
         for (int64_t i = k; i < count; i++)
             out[i * GSF__TILE_COLUMNS + c] = gsf__nn_load(w + (size_t)c * pitch + (size_t)i * size, dtype);
@@ -2878,7 +2835,7 @@ static void gsf__tile_scalar(const float* a, const float* b, int64_t count, int 
 
 static void gsf__finish_scalar(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows,
                                int64_t column, int64_t columns) {
-    const gsf_nn_linear_desc* d = &job->desc;
+    const gsf__nn_linear_desc* d = &job->desc;
     for (int64_t r = 0; r < rows; r++) {
         float* y = d->y + (row + r) * d->ldy + column;
         for (int64_t c = 0; c < columns; c++) {
@@ -2889,8 +2846,8 @@ static void gsf__finish_scalar(const gsf__linear_job* job, const float* sums, in
 }
 
 static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch) {
-    const gsf_nn_linear_desc* d = &job->desc;
-    const size_t size = gsf_nn_dtype_size(d->weight->dtype);
+    const gsf__nn_linear_desc* d = &job->desc;
+    const size_t size = gsf_nn_get_dtype_size(d->weight->dtype);
     for (int64_t c = 0; c < columns; c++)
         for (int64_t m = 0; m < d->rows; m++) {
             const char* w = (const char*)d->weight->data + (size_t)(column + c) * (size_t)job->in * size;
@@ -2918,7 +2875,7 @@ static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar,
 // `left` outputs from column `column` on; sums, too, begin there.
 GSF__V_INLINE void GSF__V(gsf__finish_columns)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
                                                int64_t rows, int64_t column, size_t left) {
-    const gsf_nn_linear_desc* d = &job->desc;
+    const gsf__nn_linear_desc* d = &job->desc;
     const gsf__vf bias = gsf__v_load_first(job->bias + column, left);
     const gsf__vf gate = d->gate ? gsf__v_load_first(d->gate + column, left) : gsf__v_set(1.0f);
     for (int64_t r = 0; r < rows; r++) {
@@ -3467,11 +3424,11 @@ static float* gsf__packed_panel(const gsf__linear_job* job, int64_t at, int64_t 
     return job->packed + k * gsf__round_up(job->columns, GSF__TILE_COLUMNS) + at * count;
 }
 
-static void gsf__linear_pack_panel(void* arg, size_t panel, int worker) { // of the group in work, all of its depth
+static void gsf__linear_pack_panel(void* arg, size_t panel, int32_t worker) { // of the group in work, all of its depth
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
-    const gsf_tensor* w = job->desc.weight;
+    const gsf_nn_tensor* w = job->desc.weight;
     const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS, width = gsf__least(job->columns - at, GSF__TILE_COLUMNS);
-    const size_t size = gsf_nn_dtype_size(w->dtype), pitch = (size_t)job->in * size;
+    const size_t size = gsf_nn_get_dtype_size(w->dtype), pitch = (size_t)job->in * size;
     const char* from = (const char*)w->data + (size_t)(job->first + at) * pitch;
     (void)worker;
     for (int64_t k = 0; k < job->length; k += job->plan.depth) {
@@ -3505,16 +3462,16 @@ static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const
     }
 }
 
-static void gsf__linear_block(void* arg, size_t index, int worker) { // a block of rows and outputs
+static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a block of rows and outputs
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const gsf__linear_plan* plan = &job->plan;
-    const gsf_nn_linear_desc* d = &job->desc;
+    const gsf__nn_linear_desc* d = &job->desc;
     const int64_t row = (int64_t)index % plan->row_blocks * plan->block_rows;
     const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // in the group
     const int64_t rows = gsf__least(d->rows - row, plan->block_rows);
     const int64_t columns = gsf__least(job->columns - at, plan->block_columns);
     const int64_t groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
-    const size_t size = gsf_nn_dtype_size(d->weight->dtype), pitch = (size_t)job->in * size;
+    const size_t size = gsf_nn_get_dtype_size(d->weight->dtype), pitch = (size_t)job->in * size;
     float* sums = job->workers + (size_t)worker * plan->per_worker;
     float* panel = sums + plan->block_rows * plan->block_columns; // both whole tiles
     float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
@@ -3536,7 +3493,7 @@ static void gsf__linear_block(void* arg, size_t index, int worker) { // a block 
     }
 }
 
-static void gsf__linear_few(void* arg, size_t index, int worker) { // some outputs of all rows
+static void gsf__linear_few(void* arg, size_t index, int32_t worker) { // some outputs of all rows
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const int64_t at = (int64_t)index * job->plan.block_columns;
     const int64_t columns = gsf__least(job->out - at, job->plan.block_columns);
@@ -3547,7 +3504,7 @@ static void gsf__linear_few(void* arg, size_t index, int worker) { // some outpu
 
 // x as the kernels of few rows want it, with zeros behind.
 static void gsf__few_order(gsf__linear_job* job) {
-    const gsf_nn_linear_desc* d = &job->desc;
+    const gsf__nn_linear_desc* d = &job->desc;
     const int64_t rows = gsf__few_rows(d->rows), lanes = job->kernels->few_lanes;
     float* to = job->few;
     for (int64_t first = 0; lanes > 0 && first < job->in; first += lanes)
@@ -3587,15 +3544,15 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
     return plan->shared >= shared;
 }
 
-static gsf_result gsf__check_linear(gsf_context* ctx, const gsf_nn_linear_desc* desc, int64_t* in, int64_t* out) {
-    const gsf_tensor* w = desc->weight;
+static gsf_result gsf__check_linear(gsf_context* ctx, const gsf__nn_linear_desc* desc, int64_t* in, int64_t* out) {
+    const gsf_nn_tensor* w = desc->weight;
     if (!desc->x || !desc->y || !w || !w->data || desc->rows < 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: x, y or weight is missing");
     const char* name = w->name ? w->name : "weight";
     if (w->rank < 2 || w->shape[0] < 1 || w->count / w->shape[0] < 1 || w->count % w->shape[0])
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: %s is no matrix", name);
     if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "linear: %s is %s", name, gsf_nn_dtype_name(w->dtype));
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "linear: %s is %s", name, gsf__nn_dtype_name(w->dtype));
     *out = w->shape[0];
     *in = w->count / w->shape[0];
     if (desc->bias && (desc->bias->count != *out || !desc->bias->data))
@@ -3610,7 +3567,7 @@ static gsf_result gsf__check_linear(gsf_context* ctx, const gsf_nn_linear_desc* 
 static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch is there
     const gsf__linear_plan* plan = &job->plan;
     memset(job->bias, 0, (size_t)(job->out + 16) * sizeof(float));
-    if (job->desc.bias) gsf_nn_read_tensor(job->desc.bias, 0, job->out, job->bias);
+    if (job->desc.bias) gsf_nn_convert_tensor(job->desc.bias, 0, job->out, job->bias);
     if (plan->few) {
         gsf__few_order(job);
         gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->out, plan->block_columns), gsf__linear_few, job);
@@ -3625,8 +3582,8 @@ static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch
     }
 }
 
-GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_linear_desc* desc) {
-    gsf_nn_workspace own;
+static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_linear_desc* desc) {
+    gsf__nn_workspace own;
     gsf__linear_job job;
     size_t floats, bytes;
     memset(&own, 0, sizeof own);
@@ -3639,7 +3596,7 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
     const int few = desc->rows <= GSF__FEW_ROWS, pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0;
     job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !few);
     job.length = job.in / job.kernels->unit;
-    if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_dtype_size(desc->weight->dtype), &job.plan) ||
+    if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), &job.plan) ||
         !gsf__mul_size(job.plan.per_worker, (size_t)ctx->parallel.worker_count, &floats) ||
         floats > SIZE_MAX - job.plan.shared || !gsf__mul_size(floats + job.plan.shared, sizeof(float), &bytes))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows x %lld x %lld", (long long)desc->rows,
@@ -3650,7 +3607,7 @@ GSF_API gsf_result gsf_nn_linear(gsf_context* ctx, gsf_nn_workspace* workspace, 
     job.bias = scratch + floats;
     job.packed = job.few = job.bias + gsf__round_up(job.out + 16, 16);
     gsf__run_linear(ctx, &job);
-    gsf_nn_destroy_workspace(ctx, &own);
+    gsf__nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }
 
@@ -3713,7 +3670,7 @@ typedef struct gsf__int8_kernels { // one set per instruction set
 typedef struct gsf__int8_job {
     gsf__linear_job linear;      // desc and bias, for the end of a tile
     const gsf__int8_kernels* kernels;
-    const gsf_nn_quantized* weight;
+    const gsf__nn_quantized* weight;
     int64_t padded;              // in, up to a multiple of 4
     int64_t depth, block_rows, block_columns, row_blocks;
     int64_t held, first, rows;   // rows of x quantised at a time; those in work
@@ -4125,16 +4082,16 @@ static float gsf__int8_row(const gsf__int8_kernels* kernels, int weight, float* 
 
 typedef struct gsf__quantize_job {
     const gsf__int8_kernels* kernels;
-    const gsf_tensor* tensor;
-    gsf_nn_quantized* weight;
+    const gsf_nn_tensor* tensor;
+    gsf__nn_quantized* weight;
     int64_t padded;
     float* workers; // (padded) floats, then as many 16-bit integers
     size_t per_worker;
 } gsf__quantize_job;
 
-static void gsf__quantize_panel(void* arg, size_t panel, int worker) {
+static void gsf__quantize_panel(void* arg, size_t panel, int32_t worker) {
     const gsf__quantize_job* job = (const gsf__quantize_job*)arg;
-    const gsf_nn_quantized* w = job->weight;
+    const gsf__nn_quantized* w = job->weight;
     float* x = job->workers + (size_t)worker * job->per_worker;
     int16_t* q = (int16_t*)(void*)(x + job->padded);
     int8_t* to = w->data + panel * (size_t)job->padded * GSF__TILE_COLUMNS;
@@ -4143,7 +4100,7 @@ static void gsf__quantize_panel(void* arg, size_t panel, int worker) {
         float scale = 0.0f;
         int32_t sum = 0;
         if (row < w->out) {
-            gsf_nn_read_tensor(job->tensor, row * w->in, w->in, x);
+            gsf_nn_convert_tensor(job->tensor, row * w->in, w->in, x);
             scale = gsf__int8_row(job->kernels, 1, x, w->in, job->padded, w->block, q, 4) / (float)w->block;
         } else {
             memset(q, 0, (size_t)job->padded * sizeof *q);
@@ -4157,23 +4114,23 @@ static void gsf__quantize_panel(void* arg, size_t panel, int worker) {
     }
 }
 
-static gsf_result gsf__check_quantize(gsf_context* ctx, const gsf_tensor* w) {
+static gsf_result gsf__check_quantize(gsf_context* ctx, const gsf_nn_tensor* w) {
     if (!w || !w->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: the weight is missing");
     const char* name = w->name ? w->name : "weight";
     if (w->rank < 2 || w->shape[0] < 1 || w->count / w->shape[0] < 1 || w->count % w->shape[0])
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: %s is no matrix", name);
     if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "int8: %s is %s", name, gsf_nn_dtype_name(w->dtype));
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "int8: %s is %s", name, gsf__nn_dtype_name(w->dtype));
     if (w->count / w->shape[0] > GSF__INT8_LONGEST)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "int8: %s has %lld inputs, at most %d fit 32-bit sums", name,
                         (long long)(w->count / w->shape[0]), GSF__INT8_LONGEST);
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* weight, int no_rotation,
-                                          gsf_nn_quantized* out) {
+static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor* weight, int32_t no_rotation,
+                                          gsf__nn_quantized* out) {
     gsf__quantize_job job;
-    gsf_nn_quantized made;
+    gsf__nn_quantized made;
     memset(out, 0, sizeof *out);
     memset(&job, 0, sizeof job);
     memset(&made, 0, sizeof made);
@@ -4195,7 +4152,7 @@ GSF_API gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* we
     made.offsets = (int32_t*)(void*)(made.scales + columns);
     job.workers = (float*)gsf_alloc(ctx, scratch, sizeof(float));
     if (!job.workers) {
-        gsf_nn_destroy_quantized(ctx, &made);
+        gsf__nn_destroy_quantized(ctx, &made);
         return GSF_ERROR_OUT_OF_MEMORY;
     }
     job.kernels = gsf__int8_kernels_of(ctx->cpu_level);
@@ -4205,7 +4162,7 @@ GSF_API gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* we
     gsf_free(ctx, job.workers);
     for (int64_t n = 0; n < made.out; n++)
         if (!(made.scales[n] <= FLT_MAX)) {
-            gsf_nn_destroy_quantized(ctx, &made);
+            gsf__nn_destroy_quantized(ctx, &made);
             return gsf_fail(ctx, GSF_ERROR_NUMERIC, "int8: %s has a NaN or infinity in row %lld",
                             weight->name ? weight->name : "weight", (long long)n);
         }
@@ -4213,14 +4170,14 @@ GSF_API gsf_result gsf_nn_quantize_weight(gsf_context* ctx, const gsf_tensor* we
     return GSF_OK;
 }
 
-GSF_API void gsf_nn_destroy_quantized(gsf_context* ctx, gsf_nn_quantized* weight) {
+static void gsf__nn_destroy_quantized(gsf_context* ctx, gsf__nn_quantized* weight) {
     gsf_free(ctx, weight->data);
     memset(weight, 0, sizeof *weight);
 }
 
-static void gsf__int8_quantize_rows(void* arg, size_t group, int worker) { // six rows of x
+static void gsf__int8_quantize_rows(void* arg, size_t group, int32_t worker) { // six rows of x
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
-    const gsf_nn_linear_desc* d = &job->linear.desc;
+    const gsf__nn_linear_desc* d = &job->linear.desc;
     const int64_t at = (int64_t)group * GSF__TILE_ROWS, in = job->weight->in;
     float* x = (float*)(void*)(job->workers + (size_t)worker * job->per_worker);
     const size_t size = job->kernels->x_size;
@@ -4244,7 +4201,7 @@ static void gsf__int8_fetch(const int8_t* p, int64_t count) { // panels come fro
 // The end of a tile: its sums to y.
 static void gsf__int8_finish(const gsf__int8_job* job, const int32_t* sums, int64_t row, int64_t rows, int64_t column,
                              int64_t columns, float* tile) {
-    const gsf_nn_quantized* w = job->weight;
+    const gsf__nn_quantized* w = job->weight;
     job->kernels->scale(sums, w->offsets + column, job->scales + row, w->scales + column, tile);
     job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, job->first + row, rows, column, columns);
 }
@@ -4283,7 +4240,7 @@ static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows
     }
 }
 
-static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of rows and outputs
+static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a block of rows and outputs
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
     const int64_t row = (int64_t)index % job->row_blocks * job->block_rows; // of those in work
     const int64_t column = (int64_t)index / job->row_blocks * job->block_columns;
@@ -4306,7 +4263,7 @@ static void gsf__int8_block(void* arg, size_t index, int worker) { // a block of
     }
 }
 
-static void gsf__int8_few(void* arg, size_t index, int worker) { // some panels of outputs of all rows
+static void gsf__int8_few(void* arg, size_t index, int32_t worker) { // some panels of outputs of all rows
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
     const int64_t rows = job->rows, few = job->kernels->few_rows, first = (int64_t)index * job->block_columns;
     const int64_t end = gsf__least(first + job->block_columns, job->weight->out);
@@ -4322,7 +4279,7 @@ static void gsf__int8_few(void* arg, size_t index, int worker) { // some panels 
 }
 
 static void gsf__int8_run_few(gsf_context* ctx, gsf__int8_job* job) {
-    const gsf_nn_linear_desc* d = &job->linear.desc;
+    const gsf__nn_linear_desc* d = &job->linear.desc;
     float* x = (float*)(void*)job->workers;
     job->rows = d->rows;
     memset(job->scales, 0, GSF__TILE_ROWS * sizeof *job->scales);
@@ -4359,7 +4316,7 @@ static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     return bytes > SIZE_MAX - x ? 0 : bytes + x;
 }
 
-static gsf_result gsf__check_int8(gsf_context* ctx, const gsf_nn_linear_desc* desc, const gsf_nn_quantized* w) {
+static gsf_result gsf__check_int8(gsf_context* ctx, const gsf__nn_linear_desc* desc, const gsf__nn_quantized* w) {
     if (!desc->x || !desc->y || !w || !w->data || desc->rows < 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: x, y or weight is missing");
     if (desc->bias && (desc->bias->count != w->out || !desc->bias->data))
@@ -4372,9 +4329,9 @@ static gsf_result gsf__check_int8(gsf_context* ctx, const gsf_nn_linear_desc* de
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_linear_desc* desc,
-                                      const gsf_nn_quantized* weight) {
-    gsf_nn_workspace own;
+static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* workspace,
+                                          const gsf__nn_linear_desc* desc, const gsf__nn_quantized* weight) {
+    gsf__nn_workspace own;
     gsf__int8_job job;
     memset(&own, 0, sizeof own);
     memset(&job, 0, sizeof job);
@@ -4397,7 +4354,7 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
     job.scales = (float*)(void*)(job.x + (size_t)(job.held * job.padded) * sizeof(int16_t));
     linear->bias = job.scales + job.held;
     memset(linear->bias, 0, (size_t)(weight->out + 16) * sizeof(float));
-    if (desc->bias) gsf_nn_read_tensor(desc->bias, 0, weight->out, linear->bias);
+    if (desc->bias) gsf_nn_convert_tensor(desc->bias, 0, weight->out, linear->bias);
     linear->kernels = gsf__linear_kernels_of(ctx->cpu_level, 0);
     const int64_t column_blocks = gsf__ceil_div(weight->out, job.block_columns);
     if (desc->rows <= GSF__FEW_ROWS) gsf__int8_run_few(ctx, &job);
@@ -4407,7 +4364,7 @@ GSF_API gsf_result gsf_nn_linear_int8(gsf_context* ctx, gsf_nn_workspace* worksp
         gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.rows, GSF__TILE_ROWS), gsf__int8_quantize_rows, &job);
         gsf__parallel_for(ctx, (size_t)(job.row_blocks * column_blocks), gsf__int8_block, &job);
     }
-    gsf_nn_destroy_workspace(ctx, &own);
+    gsf__nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }
 
@@ -4438,7 +4395,7 @@ enum {
 };
 
 typedef struct gsf__attention_job {
-    gsf_nn_attention_desc desc;
+    gsf__nn_attention_desc desc;
     const struct gsf__attention_parts* parts; // NULL: the scalar kernel
     float* scratch;             // of all workers
     size_t scratch_floats;      // of one
@@ -4449,7 +4406,7 @@ typedef struct gsf__attention_job {
 // Softmax is blind to what all keys have in common, which adds the same to each logit of a query, but their rounding is not.
 // So keys count from a value in their midst: the middle one of the means of three times five keys, which one wild key does
 // not move, where it is finite. Of the head that stands in the columns from `column` on.
-static void gsf__attention_center(const gsf_nn_attention_desc* d, int64_t column, float* center) {
+static void gsf__attention_center(const gsf__nn_attention_desc* d, int64_t column, float* center) {
     const float* keys[15];
     for (int64_t n = 0; n < 15; n++) keys[n] = d->k + n * d->keys / 15 * d->ldk + column;
     for (int32_t i = 0; i < d->head_dim; i++) {
@@ -4464,7 +4421,7 @@ static void gsf__attention_center(const gsf_nn_attention_desc* d, int64_t column
 
 // Logits of a head's `queries` rows from `first` on, to p (queries, keys). Four queries at a time share a key's centring, and
 // their sums do not wait for each other.
-static void gsf__attention_logits_scalar(const gsf_nn_attention_desc* d, int64_t head, int64_t first, int64_t queries,
+static void gsf__attention_logits_scalar(const gsf__nn_attention_desc* d, int64_t head, int64_t first, int64_t queries,
                                          const float* center, float* p) {
     const int64_t dim = d->head_dim, column = head * dim;
     for (int64_t j = 0; j < d->keys; j++) {
@@ -4495,7 +4452,7 @@ static void gsf__attention_logits_scalar(const gsf_nn_attention_desc* d, int64_t
 }
 
 // One query from its logits p; sum: (head_dim), scratch.
-static void gsf__attention_row(const gsf_nn_attention_desc* d, int64_t head, int64_t row, float* p, float* sum) {
+static void gsf__attention_row(const gsf__nn_attention_desc* d, int64_t head, int64_t row, float* p, float* sum) {
     const int64_t dim = d->head_dim, column = head * dim;
     const int64_t at = (head * d->queries + row) * d->keys; // in mask and bias
     const unsigned char* mask = d->mask ? d->mask + at : NULL;
@@ -4516,8 +4473,8 @@ static void gsf__attention_row(const gsf_nn_attention_desc* d, int64_t head, int
     for (int64_t i = 0; i < dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN goes through
 }
 
-static void gsf__attention_chunk_scalar(const gsf__attention_job* job, size_t chunk, int worker) {
-    const gsf_nn_attention_desc* d = &job->desc;
+static void gsf__attention_chunk_scalar(const gsf__attention_job* job, size_t chunk, int32_t worker) {
+    const gsf__nn_attention_desc* d = &job->desc;
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
     const int64_t dim = d->head_dim, end = gsf__least(first + job->range_size, d->queries);
     float* p = job->scratch + (size_t)worker * job->scratch_floats;
@@ -4555,7 +4512,7 @@ typedef struct gsf__attention_parts { // what instruction sets do differently; i
 
 #if GSF__X86
 
-static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job* job, int worker) {
+static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job* job, int32_t worker) {
     const int64_t groups = (job->range_size + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, dim = job->desc.head_dim;
     gsf__attention_scratch s;
     s.p = job->scratch + (size_t)worker * job->scratch_floats;
@@ -4910,9 +4867,9 @@ GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job
     }
 }
 
-static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t chunk, int worker) {
+static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t chunk, int32_t worker) {
     const gsf__attention_parts* parts = job->parts;
-    const gsf_nn_attention_desc* d = &job->desc;
+    const gsf__nn_attention_desc* d = &job->desc;
     const gsf__attention_scratch s = gsf__attention_scratch_of(job, worker);
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
     const int64_t rows = gsf__least(job->range_size, d->queries - first);
@@ -4965,7 +4922,7 @@ static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, 
     return NULL;
 }
 
-static void gsf__attention_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__attention_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__attention_job* job = (const gsf__attention_job*)arg;
 #if GSF__X86
     if (job->parts) gsf__attention_chunk_packed(job, chunk, worker);
@@ -4975,7 +4932,7 @@ static void gsf__attention_chunk(void* arg, size_t chunk, int worker) {
 
 // Chooses the ranges of queries, from sizes alone; returns the number of chunks.
 static size_t gsf__attention_plan(gsf__attention_job* job) {
-    const gsf_nn_attention_desc* d = &job->desc;
+    const gsf__nn_attention_desc* d = &job->desc;
     const int64_t wanted = (GSF__ATT_CHUNKS - 1) / d->heads + 1, most = d->queries / GSF__ATT_LEAST_RANGE;
     job->ranges = (d->queries + GSF__ATT_RANGE - 1) / GSF__ATT_RANGE;
     if (job->ranges < wanted) job->ranges = wanted < most ? wanted : most > job->ranges ? most : job->ranges;
@@ -4988,7 +4945,7 @@ static size_t gsf__attention_plan(gsf__attention_job* job) {
 
 // Floats that one worker needs, a multiple of 16; 0 on overflow.
 static size_t gsf__attention_floats(const gsf__attention_job* job) {
-    const gsf_nn_attention_desc* d = &job->desc;
+    const gsf__nn_attention_desc* d = &job->desc;
     const size_t dim = (size_t)d->head_dim, padded = (size_t)job->panels * GSF__ATT_PANEL;
     size_t total;
     if (job->parts) { // p, k, v; then a query's share of out, sum, q (8 places for 6) and top
@@ -5001,16 +4958,17 @@ static size_t gsf__attention_floats(const gsf__attention_job* job) {
     return total < SIZE_MAX / 8 ? (total + 15) / 16 * 16 : 0;
 }
 
-GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_attention_desc* desc) {
+static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* workspace,
+                                        const gsf__nn_attention_desc* desc) {
     const int pairs = desc->bf16 && desc->head_dim % 2 == 0;
-    gsf_nn_workspace own;
+    gsf__nn_workspace own;
     gsf__attention_job job;
     size_t size;
     memset(&own, 0, sizeof own);
     memset(&job, 0, sizeof job);
     job.desc = *desc;
     job.parts = gsf__attention_parts_of(ctx->cpu_level, pairs);
-    gsf_nn_attention_desc* d = &job.desc;
+    gsf__nn_attention_desc* d = &job.desc;
     if (!d->q || !d->k || !d->v || !d->out || d->queries < 0 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "attention: a tensor or a size is missing");
     const int64_t width = (int64_t)d->heads * d->head_dim;
@@ -5028,7 +4986,7 @@ GSF_API gsf_result gsf_nn_attention(gsf_context* ctx, gsf_nn_workspace* workspac
     job.scratch = (float*)gsf__nn_scratch(ctx, workspace ? workspace : &own, size);
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__parallel_for(ctx, chunks, gsf__attention_chunk, &job);
-    gsf_nn_destroy_workspace(ctx, &own);
+    gsf__nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }
 
@@ -5225,7 +5183,7 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
 }
 
 typedef struct gsf__conv_layer { // weight: (out, in, kt, kernel, kernel), or without kt
-    const gsf_tensor *weight, *bias;
+    const gsf_nn_tensor *weight, *bias;
     int64_t in, out, kt, kernel;
 } gsf__conv_layer;
 
@@ -5246,7 +5204,7 @@ typedef struct gsf__conv_pack_job {
 
 // Sixteen outputs: (out, in, taps) to (taps, in, 16), absent outputs zero. A few input channels at a time, so that both
 // sides stay in the first level cache.
-static void gsf__conv_pack_block(void* arg, size_t block, int worker) {
+static void gsf__conv_pack_block(void* arg, size_t block, int32_t worker) {
     enum { CHANNELS = 16 };
     const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
     const gsf__conv_layer* layer = job->layer;
@@ -5257,11 +5215,11 @@ static void gsf__conv_pack_block(void* arg, size_t block, int worker) {
     float values[CHANNELS * GSF__CONV_TAPS];
     (void)worker;
     if (n_end < GSF__CONV_N || !layer->bias) memset(panel, 0, (size_t)gsf__conv_panel(layer) * sizeof(float));
-    if (layer->bias) gsf_nn_read_tensor(layer->bias, first, n_end, panel);
+    if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, panel);
     for (int64_t c0 = 0; c0 < layer->in; c0 += CHANNELS) {
         const int64_t channels = gsf__least(layer->in - c0, CHANNELS);
         for (int64_t n = 0; n < n_end; n++) {
-            gsf_nn_read_tensor(layer->weight, ((first + n) * layer->in + c0) * taps, channels * taps, values);
+            gsf_nn_convert_tensor(layer->weight, ((first + n) * layer->in + c0) * taps, channels * taps, values);
             for (int64_t t = 0; t < taps; t++)
                 for (int64_t c = 0; c < channels; c++)
                     weights[(t * layer->in + c0 + c) * GSF__CONV_N + n] = values[c * taps + t];
@@ -5283,7 +5241,7 @@ static gsf__conv_layer gsf__conv_quarter(const gsf__conv_layer* layer) { // what
     return quarter;
 }
 
-static void gsf__conv_pack_quarter(void* arg, size_t chunk, int worker) { // chunk: parity and 16 outputs
+static void gsf__conv_pack_quarter(void* arg, size_t chunk, int32_t worker) { // chunk: parity and 16 outputs
     const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
     const gsf__conv_layer* layer = job->layer;
     const gsf__conv_layer quarter = gsf__conv_quarter(layer);
@@ -5292,11 +5250,11 @@ static void gsf__conv_pack_quarter(void* arg, size_t chunk, int worker) { // chu
     float* panel = job->out + (int64_t)chunk * gsf__conv_panel(&quarter);
     (void)worker;
     memset(panel, 0, (size_t)gsf__conv_panel(&quarter) * sizeof(float));
-    if (layer->bias) gsf_nn_read_tensor(layer->bias, first, n_end, panel);
+    if (layer->bias) gsf_nn_convert_tensor(layer->bias, first, n_end, panel);
     for (int64_t c = 0; c < in; c++)
         for (int64_t n = 0; n < n_end; n++) {
             float values[9];
-            gsf_nn_read_tensor(layer->weight, ((first + n) * in + c) * 9, 9, values);
+            gsf_nn_convert_tensor(layer->weight, ((first + n) * in + c) * 9, 9, values);
             for (int64_t y = 0; y < 3; y++)
                 for (int64_t x = 0; x < 3; x++) {
                     const int64_t row = y > parity / 2, column = x > parity % 2;
@@ -5323,7 +5281,7 @@ typedef struct gsf__conv_job { // one frame of output
     int64_t height, width, outputs;
     float* out;                      // pixels ldo apart, rows out_row
     int64_t ldo, out_row;
-    int accumulate;
+    int32_t accumulate;
     int64_t groups;                  // of outputs
     double* partial;                 // (segments, groups, 2): sums and sums of squares, or NULL
 } gsf__conv_job;
@@ -5374,7 +5332,7 @@ static void gsf__conv_store(const gsf__conv_job* job, const float* tile, int64_t
     }
 }
 
-static void gsf__conv_segment(void* arg, size_t segment, int worker) {
+static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
     const gsf__conv_job* job = (const gsf__conv_job*)arg;
     const int64_t across = gsf__conv_columns(job);
     const int64_t y0 = (int64_t)segment / across * GSF__CONV_ROWS, x0 = (int64_t)segment % across * GSF__CONV_COLUMNS;
@@ -5439,7 +5397,7 @@ static void gsf__conv_fill_row(const gsf__conv_fill* job, int64_t y) {
     }
 }
 
-static void gsf__conv_fill_rows(void* arg, size_t chunk, int worker) {
+static void gsf__conv_fill_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf__conv_fill* job = (const gsf__conv_fill*)arg;
     (void)worker;
     const int64_t begin = (int64_t)chunk * GSF__CONV_FILL_ROWS;
@@ -5480,13 +5438,13 @@ static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* la
     return job;
 }
 
-static gsf_result gsf__check_conv(gsf_context* ctx, const gsf_nn_conv_desc* desc, gsf__conv_layer* layer) {
-    const gsf_tensor* w = desc->weight;
+static gsf_result gsf__check_conv(gsf_context* ctx, const gsf__nn_conv_desc* desc, gsf__conv_layer* layer) {
+    const gsf_nn_tensor* w = desc->weight;
     memset(layer, 0, sizeof *layer);
     if (!desc->x || !desc->y || !w || desc->frames < 1 || desc->height < 1 || desc->width < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "convolution: x, y, weight or a size is missing");
     if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s is %s", w->name, gsf_nn_dtype_name(w->dtype));
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s is %s", w->name, gsf__nn_dtype_name(w->dtype));
     const int64_t kernel = w->rank == 4 || w->rank == 5 ? w->shape[w->rank - 1] : 0, kt = w->rank == 5 ? w->shape[2] : 1;
     if ((kernel != 1 && kernel != 3) || w->shape[w->rank - 2] != kernel || (kt != 1 && kt != 3) || w->count < 1)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s is no kernel of 1 or 3 x 1 or 3 x 3", w->name);
@@ -5509,9 +5467,9 @@ static gsf_result gsf__check_conv(gsf_context* ctx, const gsf_nn_conv_desc* desc
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace, const gsf_nn_conv_desc* desc) {
+GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_conv_desc* desc) {
     gsf__conv_layer layer;
-    gsf_nn_workspace own;
+    gsf__nn_workspace own;
     memset(&own, 0, sizeof own);
     GSF__TRY(gsf__check_conv(ctx, desc, &layer));
     const size_t plane = (size_t)desc->height * (size_t)desc->width * (size_t)layer.in;
@@ -5541,7 +5499,7 @@ GSF_API gsf_result gsf_nn_convolve(gsf_context* ctx, gsf_nn_workspace* workspace
         job.out = desc->y + t * job.height * job.width * layer.out;
         gsf__conv_frame(ctx, &job, NULL);
     }
-    gsf_nn_destroy_workspace(ctx, &own);
+    gsf__nn_destroy_workspace(ctx, &own);
     return GSF_OK;
 }
 
@@ -5556,7 +5514,7 @@ static float gsf__nn_linspace(float start, float end, int32_t count, int32_t i) 
 
 // Where a grid of height x width lies in the base grid when it is resized to fit: first[0], last[0] rows, [1] columns,
 // last exclusive. Rounding is Python's, half to even, which rint is in the default rounding mode.
-static void gsf__nn_fit_grid(const gsf_nn_rope_desc* desc, double first[2], double last[2]) {
+static void gsf__nn_fit_grid(const gsf__nn_rope_desc* desc, double first[2], double last[2]) {
     const double th = desc->base_height, tw = desc->base_width, h = desc->height, w = desc->width;
     const int tall = h / w > th / tw;
     const double rows = tall ? th : rint(tw / w * h), columns = tall ? rint(th / h * w) : tw;
@@ -5607,7 +5565,7 @@ static void gsf__nn_join_axes(const gsf__nn_axes* axes, size_t row, int32_t part
     *at = part == 0 ? t * time : ((part == 1) != axes->columns_first ? h : w) * space;
 }
 
-GSF_API gsf_result gsf_nn_make_rope(gsf_context* ctx, const gsf_nn_rope_desc* desc, float* cosine, float* sine) {
+static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* desc, float* cosine, float* sine) {
     GSF__TRY(gsf__nn_check_grid(ctx, "rope", desc->frames, desc->height, desc->width, desc->head_dim));
     if (desc->base_height < 1 || desc->base_width < 1 || !(desc->theta >= 0.0) || desc->theta > 1e30)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "rope: a base grid of %d x %d, theta %g", (int)desc->base_height,
@@ -5686,14 +5644,14 @@ static gsf_result gsf__nn_sincos(gsf_context* ctx, const gsf__nn_axes* axes, dou
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width, int32_t dim,
+static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width, int32_t dim,
                                       double spatial_scale, double temporal_scale, float* out) {
     const gsf__nn_axes axes = {frames, height, width, dim, 1};
     return gsf__nn_sincos(ctx, &axes, spatial_scale != 0.0 ? spatial_scale : 1.0,
                           temporal_scale != 0.0 ? temporal_scale : 1.0, NULL, out);
 }
 
-GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
+static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out) {
     const int32_t half = dim / 2;
     if (dim % 2 != 0) out[dim - 1] = 0.0f;
     for (int32_t i = 0; i < half; i++) {
@@ -5706,7 +5664,7 @@ GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
 
 // ---- >>nn layers ----------------------------------------------------------------
 /* What the networks are built of. A network is
-     a struct whose members are gsf__nn_layer, or const gsf_tensor* where a tensor stands alone;
+     a struct whose members are gsf__nn_layer, or const gsf_nn_tensor* where a tensor stands alone;
      a table of gsf__nn_entry: the name, shape and place of each of them. gsf__nn_visit walks it for whoever wants all
        tensors of a network: gsf__nn_bind opens them, bench/make_model.c makes them up;
      a gsf__nn_run: what a pass needs beside the layers, from the context to the scratch memory.
@@ -5715,7 +5673,7 @@ GSF_API void gsf_nn_embed_timestep(double timestep, int32_t dim, float* out) {
    (>>nn image encoders), OPT (>>nn captioner) and T5 (>>nn t5). */
 
 typedef struct gsf__nn_layer { // linear: (out, in), (out); a norm: (width), (width). What the network lacks is NULL
-    const gsf_tensor *weight, *bias;
+    const gsf_nn_tensor *weight, *bias;
 } gsf__nn_layer;
 
 // ---- layers: tables of tensors
@@ -5729,7 +5687,7 @@ typedef enum gsf__nn_form {
 
 typedef struct gsf__nn_entry { // a table ends with a name of NULL
     const char *name, *shape;  // a letter for each dimension: of gsf__nn_sizes, '1': one, '?': any
-    size_t offset;             // of its gsf__nn_layer or const gsf_tensor*
+    size_t offset;          // of its gsf__nn_layer or const gsf_nn_tensor*
     gsf__nn_form form;
     char option;               // a letter whose size is 0 where the network lacks this; 0: none does
 } gsf__nn_entry;
@@ -5749,12 +5707,12 @@ static int64_t gsf__nn_size_of(const gsf__nn_sizes* sizes, char letter) {
 
 // Told of one tensor after another; *to belongs to the network.
 typedef gsf_result (*gsf__nn_visit_fn)(void* user, const char* name, int32_t rank, const int64_t* shape,
-                                       const gsf_tensor** to);
+                                       const gsf_nn_tensor** to);
 
 static gsf_result gsf__nn_visit_entry(const gsf__nn_sizes* sizes, const gsf__nn_entry* e, const char* prefix, void* where,
                                       gsf__nn_visit_fn fn, void* user) {
     const int has_option = !e->option || gsf__nn_size_of(sizes, e->option) != 0;
-    const gsf_tensor** to = (const gsf_tensor**)(void*)((char*)where + e->offset);
+    const gsf_nn_tensor** to = (const gsf_nn_tensor**)(void*)((char*)where + e->offset);
     int64_t shape[GSF_NN_MAX_RANK];
     int32_t rank = 0;
     char name[200];
@@ -5777,7 +5735,7 @@ static gsf_result gsf__nn_visit(const gsf__nn_sizes* sizes, const gsf__nn_entry*
 }
 
 static gsf_result gsf__nn_take_visited(void* user, const char* name, int32_t rank, const int64_t* shape,
-                                       const gsf_tensor** to) {
+                                       const gsf_nn_tensor** to) {
     return gsf__nn_take((gsf__nn_loader*)user, name, to, rank, shape);
 }
 
@@ -5810,7 +5768,7 @@ static gsf_result gsf__nn_open_network(gsf_context* ctx, const char* folder, con
     gsf_result result = gsf__nn_open_config(ctx, folder, "config.json", 0, &file);
     if (!result) result = read(&file, network);
     gsf__nn_close_config(&file);
-    if (!result) result = gsf_nn_open_weights(ctx, folder, prefix, weights);
+    if (!result) result = gsf_nn_load_weights(ctx, folder, prefix, weights);
     if (result) return result;
     GSF__TRY(gsf__nn_begin_loading(ctx, weights, &loader));
     return gsf__nn_end_loading(&loader, bind(&loader, network));
@@ -5822,7 +5780,7 @@ typedef struct gsf__nn_block_sizes { // of the blocks at work
     int64_t width, mlp;              // of a token, of the MLP's hidden layer
     int32_t heads, head_dim;
     float eps, head_eps;             // of the norms, of those of q and k
-    gsf_nn_activation activation;
+    gsf__nn_activation activation;
     int qkv_bias, head_norm;         // there is a bias of q, k, v; q and k have LayerNorms over each head
     int rms, gated;                  // RMSNorm in place of LayerNorm; the MLP's hidden layer has a gate
 } gsf__nn_block_sizes;
@@ -5837,11 +5795,11 @@ typedef struct gsf__nn_run {
     gsf_context* ctx;
     const char *name, *stage;          // of the network, for errors; for progress
     const gsf_nn_weights* weights;     // where a NaN may come from
-    const gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
-    int bf16;                          // see gsf_nn_linear_desc
+    const gsf__nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
+    int32_t bf16;                     // see gsf__nn_linear_desc
     const gsf__nn_tap* tap;
     char label[48];                    // before the names of a block's intermediates; empty: those are not shown
-    gsf_nn_workspace workspace;
+    gsf__nn_workspace workspace;
     float* vectors;                    // the layer's vectors at work, widened: two of the longest
     size_t vectors_size;
     double done, steps;                // progress, in blocks
@@ -5907,10 +5865,10 @@ static gsf_result gsf__nn_end_block(gsf__nn_run* run, const char* names, int64_t
 typedef struct gsf__nn_vectors { const float *weight, *bias; } gsf__nn_vectors;
 
 // A small tensor as floats, which last until another layer's vectors are widened; NULL: NULL.
-static const float* gsf__nn_widen(gsf__nn_run* run, const gsf_tensor* tensor, size_t at) {
+static const float* gsf__nn_widen(gsf__nn_run* run, const gsf_nn_tensor* tensor, size_t at) {
     if (!tensor) return NULL;
     GSF_ASSERT(at + (size_t)tensor->count <= run->vectors_size);
-    gsf_nn_read_tensor(tensor, 0, tensor->count, run->vectors + at);
+    gsf_nn_convert_tensor(tensor, 0, tensor->count, run->vectors + at);
     return run->vectors + at;
 }
 
@@ -5922,19 +5880,19 @@ static gsf__nn_vectors gsf__nn_widen_layer(gsf__nn_run* run, const gsf__nn_layer
 }
 
 // The one place where a network's linear layer is computed, in whatever precision.
-static gsf_result gsf__nn_apply(gsf__nn_run* run, const gsf__nn_layer* layer, gsf_nn_linear_desc* d) {
-    const gsf_nn_quantized* q = run->quantized ? run->quantized + (layer->weight - run->weights->tensors) : NULL;
+static gsf_result gsf__nn_apply(gsf__nn_run* run, const gsf__nn_layer* layer, gsf__nn_linear_desc* d) {
+    const gsf__nn_quantized* q = run->quantized ? run->quantized + (layer->weight - run->weights->tensors) : NULL;
     d->weight = layer->weight;
     d->bias = layer->bias;
     d->bf16 = run->bf16;
-    return q && q->data ? gsf_nn_linear_int8(run->ctx, &run->workspace, d, q)
-                        : gsf_nn_linear(run->ctx, &run->workspace, d);
+    return q && q->data ? gsf__nn_run_linear_int8(run->ctx, &run->workspace, d, q)
+                        : gsf__nn_run_linear(run->ctx, &run->workspace, d);
 }
 
 // y (rows of ldy, 0: dense) = activation(x w^T + b)
-static gsf_result gsf__nn_linear(gsf__nn_run* run, const gsf__nn_layer* layer, gsf_nn_activation activation, const float* x,
-                                 int64_t rows, float* y, int64_t ldy) {
-    gsf_nn_linear_desc d;
+static gsf_result gsf__nn_linear(gsf__nn_run* run, const gsf__nn_layer* layer, gsf__nn_activation activation,
+                                 const float* x, int64_t rows, float* y, int64_t ldy) {
+    gsf__nn_linear_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.rows = rows;
@@ -5947,7 +5905,7 @@ static gsf_result gsf__nn_linear(gsf__nn_run* run, const gsf__nn_layer* layer, g
 // y += gate * (x w^T + b), or without a gate.
 static gsf_result gsf__nn_add(gsf__nn_run* run, const gsf__nn_layer* layer, const float* gate, const float* x, int64_t rows,
                               float* y) {
-    gsf_nn_linear_desc d;
+    gsf__nn_linear_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.rows = rows;
@@ -5960,25 +5918,25 @@ static gsf_result gsf__nn_add(gsf__nn_run* run, const gsf__nn_layer* layer, cons
 // LayerNorm of (rows, the layer's width); y may be x.
 static void gsf__nn_norm(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, const float* x, int64_t rows, float* y) {
     const gsf__nn_vectors v = gsf__nn_widen_layer(run, layer);
-    gsf_nn_layer_norm(run->ctx, x, rows, layer->weight->count, v.weight, v.bias, eps, y);
+    gsf__nn_layer_norm(run->ctx, x, rows, layer->weight->count, v.weight, v.bias, eps, y);
 }
 
-// LayerNorm of each head of q or k where the network has one, then the rotation: see gsf_nn_head_norm_rope.
+// LayerNorm of each head of q or k where the network has one, then the rotation: see gsf__nn_head_norm_rope.
 static void gsf__nn_norm_heads(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, int32_t heads, int32_t head_dim,
                                const float* cosine, const float* sine, int64_t rope_first, float* x, int64_t rows,
                                int64_t ldx) {
     if (!layer->weight) return;
     const gsf__nn_vectors v = gsf__nn_widen_layer(run, layer);
-    gsf_nn_head_norm_rope(run->ctx, x, rows, ldx, heads, head_dim, v.weight, v.bias, eps, cosine, sine, rope_first);
+    gsf__nn_head_norm_rope(run->ctx, x, rows, ldx, heads, head_dim, v.weight, v.bias, eps, cosine, sine, rope_first);
 }
 
 // Attention within each of `samples` samples, which follow each other in q, k, v and out.
-static gsf_result gsf__nn_attend(gsf__nn_run* run, const gsf_nn_attention_desc* desc, int64_t samples) {
-    gsf_nn_attention_desc d = *desc;
+static gsf_result gsf__nn_attend(gsf__nn_run* run, const gsf__nn_attention_desc* desc, int64_t samples) {
+    gsf__nn_attention_desc d = *desc;
     const int64_t width = (int64_t)d.heads * d.head_dim;
     d.bf16 = run->bf16;
     for (int64_t i = 0; i < samples; i++) {
-        GSF__TRY(gsf_nn_attention(run->ctx, &run->workspace, &d));
+        GSF__TRY(gsf__nn_run_attention(run->ctx, &run->workspace, &d));
         d.q += d.queries * (d.ldq ? d.ldq : width);
         d.k += d.keys * (d.ldk ? d.ldk : width);
         d.v += d.keys * (d.ldv ? d.ldv : width);
@@ -5997,7 +5955,7 @@ typedef struct gsf__nn_patch_job { // images (channels, height, width) and rows 
     const float *mean, *deviation; // of each channel, taken out; NULL: neither
 } gsf__nn_patch_job;
 
-static void gsf__nn_patch_row(void* arg, size_t index, int worker) { // the patches of one row of them
+static void gsf__nn_patch_row(void* arg, size_t index, int32_t worker) { // the patches of one row of them
     const gsf__nn_patch_job* job = (const gsf__nn_patch_job*)arg;
     const int64_t p = job->patch, across = job->width / p, down = job->height / p, row = (int64_t)index;
     const int64_t plane = job->height * job->width, image = row / down * job->channels * plane;
@@ -6070,7 +6028,7 @@ typedef struct gsf__nn_turn_job {
 
 // The first half of every head turns with the row of the patch, counted from 1, the second half with its column. Tokens
 // without a place stand at 0, where nothing turns.
-static void gsf__nn_turn_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__nn_turn_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__nn_turn_job* job = (const gsf__nn_turn_job*)arg;
     const gsf__nn_run* run = job->run;
     const int64_t dim = run->sizes->head_dim, quarter = dim / 4, heads = 2 * (int64_t)run->sizes->heads; // of q and k
@@ -6094,12 +6052,12 @@ typedef struct gsf__nn_block { // x += scale1 * out(attention(norm1(x))); x += s
     gsf__nn_layer norm1, norm2, qkv, q, k, v; // qkv (3 heads * head_dim, width), or three of their own
     gsf__nn_layer q_norm, k_norm;             // (head_dim)
     gsf__nn_layer out, gate, up, down;        // hidden: activation(up(x)), or activation(gate(x)) * up(x)
-    const gsf_tensor *scale1, *scale2;        // LayerScale or NULL
+    const gsf_nn_tensor *scale1, *scale2;     // LayerScale or NULL
 } gsf__nn_block;
 
 static void gsf__nn_norm_block(gsf__nn_run* run, const gsf__nn_layer* norm, const float* x, int64_t rows) {
     const gsf__nn_block_sizes* s = run->sizes;
-    if (s->rms) gsf_nn_rms_norm(run->ctx, x, rows, s->width, gsf__nn_widen(run, norm->weight, 0), s->eps, run->normed);
+    if (s->rms) gsf__nn_rms_norm(run->ctx, x, rows, s->width, gsf__nn_widen(run, norm->weight, 0), s->eps, run->normed);
     else gsf__nn_norm(run, norm, s->eps, x, rows, run->normed);
 }
 
@@ -6109,11 +6067,11 @@ static gsf_result gsf__nn_project_block(gsf__nn_run* run, const gsf__nn_block* b
     const int64_t inner = (int64_t)s->heads * s->head_dim, ld = 3 * inner;
     float* q = run->wide;
     if (b->qkv.weight) {
-        GSF__TRY(gsf__nn_linear(run, &b->qkv, GSF_NN_LINEAR, run->normed, rows, q, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->qkv, GSF__NN_LINEAR, run->normed, rows, q, ld));
     } else {
-        GSF__TRY(gsf__nn_linear(run, &b->q, GSF_NN_LINEAR, run->normed, rows, q, ld));
-        GSF__TRY(gsf__nn_linear(run, &b->k, GSF_NN_LINEAR, run->normed, rows, q + inner, ld));
-        GSF__TRY(gsf__nn_linear(run, &b->v, GSF_NN_LINEAR, run->normed, rows, q + 2 * inner, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->q, GSF__NN_LINEAR, run->normed, rows, q, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->k, GSF__NN_LINEAR, run->normed, rows, q + inner, ld));
+        GSF__TRY(gsf__nn_linear(run, &b->v, GSF__NN_LINEAR, run->normed, rows, q + 2 * inner, ld));
     }
     gsf__nn_norm_heads(run, &b->q_norm, s->head_eps, s->heads, s->head_dim, NULL, NULL, 0, q, rows, ld);
     gsf__nn_norm_heads(run, &b->k_norm, s->head_eps, s->heads, s->head_dim, NULL, NULL, 0, q + inner, rows, ld);
@@ -6124,7 +6082,7 @@ static gsf_result gsf__nn_project_block(gsf__nn_run* run, const gsf__nn_block* b
 }
 
 // The new tokens' keys and values go behind those of layer `index` in the cache, which are what they look at.
-static void gsf__nn_look_back(gsf__nn_run* run, int64_t index, int64_t rows, gsf_nn_attention_desc* a) {
+static void gsf__nn_look_back(gsf__nn_run* run, int64_t index, int64_t rows, gsf__nn_attention_desc* a) {
     const gsf__nn_cache* cache = run->cache;
     const int64_t inner = (int64_t)a->heads * a->head_dim, first = index * cache->capacity * inner;
     for (int64_t r = 0; r < rows; r++) {
@@ -6145,7 +6103,7 @@ typedef struct gsf__nn_product_job {
     int64_t count;
 } gsf__nn_product_job;
 
-static void gsf__nn_multiply_chunk(void* arg, size_t chunk, int worker) { // a *= b
+static void gsf__nn_multiply_chunk(void* arg, size_t chunk, int32_t worker) { // a *= b
     const gsf__nn_product_job* job = (const gsf__nn_product_job*)arg;
     const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->count);
     (void)worker;
@@ -6163,7 +6121,7 @@ static gsf_result gsf__nn_feed_forward(gsf__nn_run* run, const gsf__nn_block* b,
         GSF__TRY(gsf__nn_linear(run, s->gated ? &b->gate : &b->up, s->activation, from, n, run->wide, 0));
         if (s->gated) {
             gsf__nn_product_job job = {run->wide, run->wide + n * s->mlp, n * s->mlp};
-            GSF__TRY(gsf__nn_linear(run, &b->up, GSF_NN_LINEAR, from, n, run->wide + n * s->mlp, 0));
+            GSF__TRY(gsf__nn_linear(run, &b->up, GSF__NN_LINEAR, from, n, run->wide + n * s->mlp, 0));
             gsf__parallel_for(run->ctx, gsf__nn_chunks(job.count, GSF__NN_CHUNK), gsf__nn_multiply_chunk, &job);
         }
         GSF__TRY(gsf__nn_add(run, &b->down, scale, run->wide, n, x + r * s->width));
@@ -6176,7 +6134,7 @@ static gsf_result gsf__nn_block_forward(gsf__nn_run* run, const gsf__nn_block* b
                                         int64_t tokens) {
     const gsf__nn_block_sizes* s = run->sizes;
     const int64_t inner = (int64_t)s->heads * s->head_dim, rows = samples * tokens;
-    gsf_nn_attention_desc a;
+    gsf__nn_attention_desc a;
     gsf__nn_norm_block(run, &b->norm1, x, rows);
     if (run->label[0]) gsf__nn_reveal(run, run->normed, 0, samples, tokens, s->width, "attn_norm");
     GSF__TRY(gsf__nn_project_block(run, b, rows));
@@ -6235,7 +6193,7 @@ typedef struct gsf__vit { // from pixels to tokens: a DINOv2
     gsf__nn_block_sizes sizes;
     int64_t channels, patch, registers, grid, layers;
     const char *block_names, *prefix; // of its tensors; of those before and after the blocks
-    const gsf_tensor *class_token, *register_tokens, *positions;
+    const gsf_nn_tensor *class_token, *register_tokens, *positions;
     gsf__nn_layer patches, norm;
     gsf__nn_block* blocks;
 } gsf__vit;
@@ -6246,7 +6204,7 @@ typedef struct gsf__vggt {
     int64_t registers, layers;
     double rope_base;          // 0: no rotation
     gsf__nn_block *frame, *global; // (layers)
-    const gsf_tensor *camera_token, *register_token; // (1, 2, count, width): of the first image, of all others
+    const gsf_nn_tensor *camera_token, *register_token; // (1, 2, count, width): of the first image, of all others
 } gsf__vggt;
 
 // ---- image encoders: tables of tensors
@@ -6342,13 +6300,13 @@ static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* ent
 static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int64_t down, int64_t across, float* out) {
     const int64_t d = vit->sizes.width, grid = vit->grid;
     if (down == grid && across == grid) {
-        gsf_nn_read_tensor(vit->positions, 0, vit->positions->count, out);
+        gsf_nn_convert_tensor(vit->positions, 0, vit->positions->count, out);
         return GSF_OK;
     }
     float* square = (float*)gsf_alloc(ctx, (size_t)(grid * grid * d), sizeof(float));
     if (!square) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf_nn_read_tensor(vit->positions, 0, d, out);
-    gsf_nn_read_tensor(vit->positions, d, grid * grid * d, square);
+    gsf_nn_convert_tensor(vit->positions, 0, d, out);
+    gsf_nn_convert_tensor(vit->positions, d, grid * grid * d, square);
     const gsf_image from = gsf_wrap_image(square, GSF_F32, grid, grid, (int32_t)d);
     const gsf_image to = gsf_wrap_image(out + d, GSF_F32, across, down, (int32_t)d);
     const gsf_result result = gsf_resize_image(ctx, &from, GSF_RESIZE_PIL_BICUBIC, &to);
@@ -6359,7 +6317,7 @@ static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int6
 static const float gsf__imagenet_mean[3] = {0.485f, 0.456f, 0.406f}, gsf__imagenet_deviation[3] = {0.229f, 0.224f, 0.225f};
 
 // Tokens of image `image` before the blocks: class, registers, patches.
-static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t image,
+static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in, int64_t image,
                                  int normalize, const float* positions, float* x) {
     const int64_t d = vit->sizes.width, p = vit->patch, down = in->height / p, across = in->width / p;
     const int64_t tokens = 1 + vit->registers + down * across;
@@ -6367,9 +6325,9 @@ static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gs
     gsf__nn_patch_job job = {in->pixels + image * vit->channels * in->height * in->width, run->wide, vit->channels,
                              in->height, in->width, p, 0, normalize ? gsf__imagenet_mean : NULL, gsf__imagenet_deviation};
     gsf__nn_patch(run->ctx, &job, 1);
-    gsf_nn_read_tensor(vit->class_token, 0, d, x);
+    gsf_nn_convert_tensor(vit->class_token, 0, d, x);
     for (int64_t i = 0; i < d; i++) x[i] += positions[i];
-    gsf_nn_read_tensor(vit->register_tokens, 0, vit->registers * d, x + d);
+    gsf_nn_convert_tensor(vit->register_tokens, 0, vit->registers * d, x + d);
     memcpy(patches, positions + d, (size_t)(down * across * d) * sizeof(float));
     GSF__TRY(gsf__nn_add(run, &vit->patches, NULL, run->wide, down * across, patches));
     gsf__nn_reveal(run, x, image, 1, tokens, d, "embeddings");
@@ -6377,7 +6335,7 @@ static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gs
 }
 
 // Images first ... through embedding and blocks: x (count, tokens, width), before the last norm.
-static gsf_result gsf__vit_forward(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in, int64_t first,
+static gsf_result gsf__vit_forward(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in, int64_t first,
                                    int64_t count, int normalize, const float* positions, float* x) {
     const int64_t d = vit->sizes.width;
     const int64_t tokens = 1 + vit->registers + in->height / vit->patch * (in->width / vit->patch);
@@ -6405,7 +6363,7 @@ typedef struct gsf__vit_plan {
 
 // Shares out `memory`, or counts what a run will take. net: the aggregator around the DINOv2, or NULL.
 static gsf__vit_plan gsf__vit_lay_out(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
-                                      const gsf_nn_encoder_input* in, float* memory) {
+                                      const gsf_nn_encoder_desc* in, float* memory) {
     const size_t d = (size_t)vit->sizes.width, longer = (size_t)(in->height > in->width ? in->height : in->width);
     gsf__nn_arena arena = {memory, 0};
     gsf__vit_plan p;
@@ -6436,7 +6394,7 @@ static gsf__vit_plan gsf__vit_lay_out(gsf__nn_run* run, const gsf__vit* vit, con
 
 // Memory for a run, shared out; *memory is to be freed. The positions are in it already.
 static gsf_result gsf__vit_open_run(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
-                                    const gsf_nn_encoder_input* in, gsf__vit_plan* plan, float** memory) {
+                                    const gsf_nn_encoder_desc* in, gsf__vit_plan* plan, float** memory) {
     *memory = (float*)gsf_alloc(run->ctx, gsf__vit_lay_out(run, vit, net, in, NULL).floats, sizeof(float));
     if (!*memory) return GSF_ERROR_OUT_OF_MEMORY;
     *plan = gsf__vit_lay_out(run, vit, net, in, *memory);
@@ -6445,14 +6403,14 @@ static gsf_result gsf__vit_open_run(gsf__nn_run* run, const gsf__vit* vit, const
     return GSF_OK;
 }
 
-static double gsf__vit_bytes(const gsf__vit* vit, const gsf__vggt* net, const gsf_nn_encoder_input* in) {
+static double gsf__vit_bytes(const gsf__vit* vit, const gsf__vggt* net, const gsf_nn_encoder_desc* in) {
     gsf__nn_run run;
     memset(&run, 0, sizeof run);
     const gsf__vit_plan p = gsf__vit_lay_out(&run, vit, net, in, NULL);
     return 4.0 * ((double)p.floats + (double)p.square);
 }
 
-static double gsf__vit_flops(const gsf__vit* vit, const gsf_nn_encoder_input* in) {
+static double gsf__vit_flops(const gsf__vit* vit, const gsf_nn_encoder_desc* in) {
     const double patches = (double)(in->height / vit->patch * (in->width / vit->patch));
     const double patch = (double)(vit->channels * vit->patch * vit->patch) * (double)vit->sizes.width;
     const double tokens = 1.0 + (double)vit->registers + patches;
@@ -6460,7 +6418,7 @@ static double gsf__vit_flops(const gsf__vit* vit, const gsf_nn_encoder_input* in
 }
 
 static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64_t channels, int64_t patch,
-                                       const gsf_nn_encoder_input* in, const float* out) {
+                                       const gsf_nn_encoder_desc* in, const float* out) {
     enum { MOST = 1 << 15 }; // pixels along a side
     if (!in->pixels || !out || in->images < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: images are missing", name);
@@ -6516,11 +6474,11 @@ GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2) {
     gsf__vit* vit = (gsf__vit*)dinov2->nets;
     if (vit) gsf_free(ctx, vit->blocks);
     gsf_free(ctx, vit);
-    gsf_nn_close_weights(ctx, &dinov2->weights);
+    gsf_nn_destroy_weights(ctx, &dinov2->weights);
     memset(dinov2, 0, sizeof *dinov2);
 }
 
-GSF_API gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out) {
+GSF_API gsf_result gsf_nn_load_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out) {
     memset(out, 0, sizeof *out);
     gsf__vit* vit = (gsf__vit*)gsf_alloc_zeroed(ctx, 1, sizeof *vit);
     if (!vit) return GSF_ERROR_OUT_OF_MEMORY;
@@ -6540,14 +6498,14 @@ GSF_API gsf_result gsf_nn_make_dinov2(gsf_context* ctx, const char* folder, gsf_
     return result;
 }
 
-GSF_API void gsf_nn_dinov2_cost(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input, double* bytes,
-                                double* flops) {
+static void gsf__nn_query_dinov2(const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_desc* input, double* bytes,
+                                 double* flops) {
     const gsf__vit* vit = (const gsf__vit*)dinov2->nets;
     if (bytes) *bytes = gsf__vit_bytes(vit, NULL, input);
     if (flops) *flops = gsf__vit_flops(vit, input);
 }
 
-static gsf_result gsf__dinov2_run(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_input* in,
+static gsf_result gsf__dinov2_run(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in,
                                   const gsf__vit_plan* plan, float* out) {
     const int64_t d = vit->sizes.width, skip = in->all_tokens ? 0 : vit->registers + 1, kept = plan->tokens - skip;
     run->steps = (double)(gsf__ceil_div(in->images, plan->group) * vit->layers);
@@ -6588,7 +6546,7 @@ static int64_t gsf__vggt_count_blocks(const gsf_nn_weights* weights, const char*
 static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) {
     const gsf_nn_weights* w = loader->weights;
     const int64_t any[4] = {-1, -1, -1, -1};
-    const gsf_tensor *patch, *positions, *up, *registers, *embed_up, *embed_registers;
+    const gsf_nn_tensor *patch, *positions, *up, *registers, *embed_up, *embed_registers;
     gsf__vit* vit = &net->embed;
     GSF__TRY(gsf__nn_need(loader, &patch, 4, any, "aggregator.patch_embed.patch_embed.proj.weight"));
     GSF__TRY(gsf__nn_need(loader, &positions, 3, any, "aggregator.patch_embed.pos_embed"));
@@ -6611,11 +6569,11 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     vit->block_names = "aggregator.patch_embed.blocks.";
     vit->prefix = "aggregator.patch_embed.";
     while (vit->grid < 1 << 15 && (vit->grid + 1) * (vit->grid + 1) < positions->shape[1]) vit->grid++;
-    vit->sizes.activation = net->sizes.activation = GSF_NN_GELU;
+    vit->sizes.activation = net->sizes.activation = GSF__NN_GELU;
     vit->sizes.qkv_bias = net->sizes.qkv_bias = 1;
     vit->sizes.eps = 1e-6f;
     net->sizes.eps = net->sizes.head_eps = 1e-5f;
-    const gsf_tensor* norm = gsf_nn_find_tensor(w, "aggregator.frame_blocks.0.attn.q_norm.weight");
+    const gsf_nn_tensor* norm = gsf_nn_find_tensor(w, "aggregator.frame_blocks.0.attn.q_norm.weight");
     const int64_t dim = norm && norm->count > 0 ? norm->count : 64;
     net->sizes.head_norm = norm != NULL;
     net->sizes.heads = net->sizes.width / dim < 1024 ? (int32_t)(net->sizes.width / dim) : 0;
@@ -6691,7 +6649,7 @@ static gsf_result gsf__vggt_bind(gsf__nn_loader* loader, gsf__vggt* net) {
 static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt* out, gsf__vggt* net) {
     gsf__nn_config file;
     gsf__nn_loader loader;
-    GSF__TRY(gsf_nn_open_weights(ctx, path, "model", &out->weights));
+    GSF__TRY(gsf_nn_load_weights(ctx, path, "model", &out->weights));
     GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
     for (size_t i = 0; i < out->weights.tensor_count; i++) // heads for cameras, depths, points and tracks
         if (strncmp(out->weights.tensors[i].name, "aggregator.", 11) != 0) loader.taken[i] = 1;
@@ -6716,11 +6674,11 @@ GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt) {
         gsf_free(ctx, net->global);
     }
     gsf_free(ctx, net);
-    gsf_nn_close_weights(ctx, &vggt->weights);
+    gsf_nn_destroy_weights(ctx, &vggt->weights);
     memset(vggt, 0, sizeof *vggt);
 }
 
-GSF_API gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out) {
+GSF_API gsf_result gsf_nn_load_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out) {
     memset(out, 0, sizeof *out);
     gsf__vggt* net = (gsf__vggt*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
     if (!net) return GSF_ERROR_OUT_OF_MEMORY;
@@ -6739,7 +6697,10 @@ GSF_API gsf_result gsf_nn_make_vggt(gsf_context* ctx, const char* path, gsf_nn_v
     return result;
 }
 
-GSF_API void gsf_nn_vggt_cost(const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input, double* bytes, double* flops) {
+// Bytes of memory (beside input, output, mapped weights and some 70 MB of the kernels' scratch) at the peak, and floating-
+// point operations, of such a call; either may be NULL. Reads the input's sizes only.
+static void gsf__nn_query_vggt(const gsf_nn_vggt* vggt, const gsf_nn_encoder_desc* input, double* bytes,
+                               double* flops) {
     const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
     const int64_t patch = net->embed.patch, patches = input->height / patch * (input->width / patch);
     const double images = (double)input->images, tokens = (double)(1 + net->registers + patches);
@@ -6761,7 +6722,7 @@ static void gsf__vggt_make_rotation(double base, int64_t positions, int64_t coun
 }
 
 // The stream (images, tokens, width): camera token, registers and the embedded patches of each image.
-static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
+static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_desc* in,
                                   const gsf__vit_plan* plan) {
     const gsf__vit* vit = &net->embed;
     const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches;
@@ -6772,8 +6733,8 @@ static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const 
             const float* patches = plan->x + (i * plan->tokens + 1 + vit->registers) * d;
             float* to = plan->stream + (first + i) * tokens * d;
             const int64_t other = first + i > 0;
-            gsf_nn_read_tensor(net->camera_token, other * d, d, to);
-            gsf_nn_read_tensor(net->register_token, other * net->registers * d, net->registers * d, to + d);
+            gsf_nn_convert_tensor(net->camera_token, other * d, d, to);
+            gsf_nn_convert_tensor(net->register_token, other * net->registers * d, net->registers * d, to + d);
             gsf__nn_norm(run, &vit->norm, vit->sizes.eps, patches, plan->patches, to + special * d);
             gsf__nn_reveal(run, to + special * d, first + i, 1, plan->patches, d, "patch_tokens");
         }
@@ -6790,7 +6751,7 @@ static void gsf__vggt_store(const gsf__vit_plan* plan, const float* stream, int6
             memcpy(out, stream + (i * tokens + t) * d, (size_t)d * sizeof(float));
 }
 
-static gsf_result gsf__vggt_run(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_input* in,
+static gsf_result gsf__vggt_run(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_desc* in,
                                 const gsf__vit_plan* plan, float* out) {
     const int64_t d = net->sizes.width, special = 1 + net->registers, tokens = special + plan->patches, n = in->images;
     const int64_t skip = in->all_tokens ? 0 : special, quarter = net->sizes.head_dim / 4;
@@ -6822,7 +6783,7 @@ static gsf_result gsf__vggt_run(gsf__nn_run* run, const gsf__vggt* net, const gs
 
 // Both encoders; net NULL: the DINOv2 alone.
 static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_nn_weights* weights, const gsf__vit* vit,
-                                  const gsf__vggt* net, const gsf_nn_encoder_input* in, float* out) {
+                                  const gsf__vggt* net, const gsf_nn_encoder_desc* in, float* out) {
     gsf__nn_run run;
     gsf__vit_plan plan;
     float* memory = NULL;
@@ -6839,17 +6800,17 @@ static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_
         const int64_t kept = special + in->height / vit->patch * (in->width / vit->patch);
         memset(out, 0, (size_t)(in->images * kept * vit->sizes.width * (net ? 2 : 1)) * sizeof(float));
     }
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf__nn_destroy_workspace(ctx, &run.workspace);
     gsf_free(ctx, memory);
     return result;
 }
 
-GSF_API gsf_result gsf_nn_dinov2_encode(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_input* input,
+GSF_API gsf_result gsf_nn_encode_dinov2(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_encoder_desc* input,
                                         float* out) {
     return gsf__vit_encode(ctx, "dinov2", &dinov2->weights, (const gsf__vit*)dinov2->nets, NULL, input, out);
 }
 
-GSF_API gsf_result gsf_nn_vggt_encode(gsf_context* ctx, const gsf_nn_vggt* vggt, const gsf_nn_encoder_input* input,
+GSF_API gsf_result gsf_nn_encode_vggt(gsf_context* ctx, const gsf_nn_vggt* vggt, const gsf_nn_encoder_desc* input,
                                       float* out) {
     const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
     return gsf__vit_encode(ctx, "vggt", &vggt->weights, &net->embed, net, input, out);
@@ -6881,7 +6842,11 @@ static gsf_result gsf__reference_rgb(gsf_context* ctx, const gsf_image* photo, g
     return result;
 }
 
-GSF_API gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out) {
+// The official preprocessing of a reference: transparency over white, 518 pixels wide with PIL's bicubic filter, the
+// height rounded to a multiple of 14 (half to even), and cut around its middle where it is above 518. Photos with 1, 3 or
+// 4 channels; float ones are rounded to 8 bits first. out: u8, 3 channels; destroy it.
+// (GSFixer, vggt/utils/load_fn.py load_and_preprocess_images, mode "crop")
+static gsf_result gsf__nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out) {
     gsf_image rgb, whole;
     memset(&rgb, 0, sizeof rgb);
     memset(&whole, 0, sizeof whole);
@@ -6911,11 +6876,11 @@ GSF_API gsf_result gsf_nn_prepare_reference(gsf_context* ctx, const gsf_image* p
 
 // The photos prepared, as (count, 3, height, width) in [0,1]; *pixels is to be freed.
 static gsf_result gsf__load_references(gsf_context* ctx, const gsf_image* photos, int32_t count, float** pixels,
-                                       gsf_nn_encoder_input* in) {
+                                       gsf_nn_encoder_desc* in) {
     size_t floats = 0, plane = 0;
     for (int32_t i = 0; i < count; i++) {
         gsf_image image, planar;
-        GSF__TRY(gsf_nn_prepare_reference(ctx, &photos[i], &image));
+        GSF__TRY(gsf__nn_prepare_reference(ctx, &photos[i], &image));
         gsf_result result = GSF_OK;
         if (i == 0) {
             plane = (size_t)(image.width * image.height);
@@ -6943,7 +6908,7 @@ static gsf_result gsf__load_references(gsf_context* ctx, const gsf_image* photos
 }
 
 // Room for (images, tokens, channels) in the features, which earlier calls must have left alike.
-static gsf_result gsf__room_for_features(gsf_context* ctx, gsf_nn_features* f, const gsf_nn_encoder_input* in,
+static gsf_result gsf__room_for_features(gsf_context* ctx, gsf_nn_features* f, const gsf_nn_encoder_desc* in,
                                          int64_t patch, int64_t channels, float** values, int64_t* of) {
     size_t count;
     if (in->height % patch || in->width % patch)
@@ -6968,18 +6933,18 @@ static gsf_result gsf__room_for_features(gsf_context* ctx, gsf_nn_features* f, c
 GSF_API gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2, const gsf_nn_vggt* vggt,
                                             const gsf_image* photos, int32_t count, gsf_nn_features* features) {
     gsf_nn_features* f = features;
-    gsf_nn_encoder_input in;
+    gsf_nn_encoder_desc in;
     float* pixels = NULL;
     memset(&in, 0, sizeof in);
     if (!photos || count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no photos are given");
     gsf_result result = gsf__load_references(ctx, photos, count, &pixels, &in);
     if (!result && dinov2) {
         result = gsf__room_for_features(ctx, f, &in, dinov2->patch, dinov2->width, &f->dino, &f->dino_channels);
-        if (!result) result = gsf_nn_dinov2_encode(ctx, dinov2, &in, f->dino);
+        if (!result) result = gsf_nn_encode_dinov2(ctx, dinov2, &in, f->dino);
     }
     if (!result && vggt) {
         result = gsf__room_for_features(ctx, f, &in, vggt->patch, 2 * (int64_t)vggt->width, &f->vggt, &f->vggt_channels);
-        if (!result) result = gsf_nn_vggt_encode(ctx, vggt, &in, f->vggt);
+        if (!result) result = gsf_nn_encode_vggt(ctx, vggt, &in, f->vggt);
     }
     gsf_free(ctx, pixels);
     if (result && dinov2) {
@@ -7185,7 +7150,7 @@ typedef struct gsf__bpe_loader {
     const char* folder;
     gsf__bpe_tables* t;
     const gsf_json_value* decoder; // "added_tokens_decoder" of tokenizer_config.json, or NULL
-    gsf_text scratch;
+    gsf_buffer scratch;
 } gsf__bpe_loader;
 
 static int gsf__bpe_compare(const char* a, size_t a_size, const char* b, size_t b_size) {
@@ -7321,8 +7286,8 @@ static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size
     GSF__TRY(gsf__bpe_need_token(l, number, parts[0], sizes[0], &out->left));
     GSF__TRY(gsf__bpe_need_token(l, number, parts[1], sizes[1], &out->right));
     l->scratch.size = 0;
-    gsf_text_append(l->ctx, &l->scratch, parts[0], sizes[0]);
-    gsf_text_append(l->ctx, &l->scratch, parts[1], sizes[1]);
+    gsf_append_bytes(l->ctx, &l->scratch, parts[0], sizes[0]);
+    gsf_append_bytes(l->ctx, &l->scratch, parts[1], sizes[1]);
     if (l->scratch.failed) return GSF_ERROR_OUT_OF_MEMORY;
     return gsf__bpe_need_token(l, number, l->scratch.data, l->scratch.size, &out->result);
 }
@@ -7361,12 +7326,12 @@ static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, si
 static gsf_result gsf__bpe_read_merges(gsf__bpe_loader* l) {
     void* data = NULL;
     size_t size;
-    gsf_text path;
+    gsf_buffer path;
     gsf_result result = gsf__nn_join(l->ctx, l->folder, "merges.txt", &path);
     if (!result) result = gsf_read_file(l->ctx, path.data, &data, &size);
     if (!result) result = gsf__bpe_parse_merges(l, (const char*)data, size);
     gsf_free(l->ctx, data);
-    gsf_destroy_text(l->ctx, &path);
+    gsf_destroy_buffer(l->ctx, &path);
     return result;
 }
 
@@ -7377,7 +7342,7 @@ static gsf_result gsf__bpe_read_token(const gsf__nn_config* file, const gsf_json
     const gsf_json* json = &file->json;
     static const struct { const char* key; int flag; } keys[] = {
         {"lstrip", GSF__BPE_LSTRIP}, {"rstrip", GSF__BPE_RSTRIP}, {"special", GSF__BPE_SPECIAL}, {"single_word", 0}};
-    const gsf_json_value* text = value->type == GSF_JSON_OBJECT ? gsf_json_member(json, value, "content") : value;
+    const gsf_json_value* text = value->type == GSF_JSON_OBJECT ? gsf_find_json_member(json, value, "content") : value;
     memset(out, 0, sizeof *out);
     if (!text || text->type != GSF_JSON_STRING || text->string_size == 0)
         return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no token, as text or with its \"content\"", json->name,
@@ -7388,7 +7353,7 @@ static gsf_result gsf__bpe_read_token(const gsf__nn_config* file, const gsf_json
     out->flags = GSF__BPE_ADDED | (value->type == GSF_JSON_OBJECT ? GSF__BPE_OBJECT : 0);
     for (size_t i = 0; i < GSF__COUNT(keys) && value->type == GSF_JSON_OBJECT; i++) {
         int flag;
-        GSF__TRY(gsf__nn_config_flag(file, gsf_json_member(json, value, keys[i].key), keys[i].key, 0, &flag));
+        GSF__TRY(gsf__nn_config_flag(file, gsf_find_json_member(json, value, keys[i].key), keys[i].key, 0, &flag));
         if (flag && !keys[i].flag)
             return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: %s of token %s", json->name, (unsigned)value->offset,
                             keys[i].key, gsf__nn_show(out->text).text);
@@ -7498,7 +7463,7 @@ static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
         const int mapped = !l->decoder && gsf__nn_config_find(&t->special_map, keys[i]);
         const gsf__nn_config* file = mapped ? &t->special_map : &t->config;
         const gsf_json_value* value = gsf__nn_config_find(file, keys[i]);
-        const int given = gsf_json_member(&t->config.json, t->config.json.values, keys[i]) != NULL;
+        const int given = gsf_find_json_member(&t->config.json, t->config.json.values, keys[i]) != NULL;
         gsf__bpe_token token;
         *ids[i] = -1;
         if (value) {
@@ -7580,7 +7545,7 @@ GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe) {
     memset(bpe, 0, sizeof *bpe);
 }
 
-GSF_API gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out) {
+GSF_API gsf_result gsf_nn_load_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out) {
     gsf__bpe_loader l;
     memset(&l, 0, sizeof l);
     memset(out, 0, sizeof *out);
@@ -7589,7 +7554,7 @@ GSF_API gsf_result gsf_nn_make_bpe(gsf_context* ctx, const char* folder, gsf_nn_
     l.t = (gsf__bpe_tables*)gsf_alloc_zeroed(ctx, 1, sizeof *l.t);
     out->tables = l.t;
     const gsf_result result = l.t ? gsf__bpe_load(&l, out) : GSF_ERROR_OUT_OF_MEMORY;
-    gsf_destroy_text(ctx, &l.scratch);
+    gsf_destroy_buffer(ctx, &l.scratch);
     if (result) gsf_nn_destroy_bpe(ctx, out);
     return result;
 }
@@ -7786,8 +7751,8 @@ static gsf_result gsf__bpe_text(gsf__bpe_run* run, const char* text, size_t size
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size, int no_bos,
-                                     int32_t** ids, size_t* count) {
+GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
+                                     int32_t no_bos, int32_t** ids, size_t* count) {
     gsf__bpe_run run;
     memset(&run, 0, sizeof run);
     run.ctx = ctx;
@@ -7805,12 +7770,12 @@ GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
     gsf_result result = gsf__reserve(ctx, (void**)&run.ids, &run.capacity, 0, 16, sizeof *run.ids);
     if (!result && bpe->add_bos && !no_bos) result = gsf__bpe_emit(&run, bpe->bos);
     if (!result && run.t->prefix_space) {
-        gsf_text spaced;
+        gsf_buffer spaced;
         memset(&spaced, 0, sizeof spaced);
-        gsf_text_append(ctx, &spaced, " ", 1);
-        gsf_text_append(ctx, &spaced, text, size);
+        gsf_append_bytes(ctx, &spaced, " ", 1);
+        gsf_append_bytes(ctx, &spaced, text, size);
         result = spaced.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__bpe_text(&run, spaced.data, spaced.size);
-        gsf_destroy_text(ctx, &spaced);
+        gsf_destroy_buffer(ctx, &spaced);
     } else if (!result) {
         result = gsf__bpe_text(&run, text, size);
     }
@@ -7826,12 +7791,12 @@ GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
 // ---- decoding
 
 // Appends bytes as UTF-8. What is none becomes U+FFFD, one for each longest beginning of a character, as in Python.
-static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_text* out, const char* text, size_t size) {
+static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_buffer* out, const char* text, size_t size) {
     const unsigned char* p = (const unsigned char*)text;
     for (size_t i = 0; i < size;) {
         size_t step, good = i;
         while (good < size && (step = gsf__utf8_size(text + good, size - good)) != 0) good += step;
-        if (good > i) gsf_text_append(ctx, out, text + i, good - i);
+        if (good > i) gsf_append_bytes(ctx, out, text + i, good - i);
         i = good;
         if (i == size) break;
         const unsigned c = p[i++];
@@ -7839,22 +7804,22 @@ static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_text* out, const char
         const size_t more = c >= 0xf0 && c <= 0xf4 ? 2 : c >= 0xe0 && c <= 0xef; // bytes before the last that may be there
         for (size_t k = 0; k < more && i < size; k++, i++)
             if (k == 0 ? p[i] < low || p[i] > high : (p[i] & 0xc0) != 0x80) break;
-        gsf_text_append(ctx, out, "\xef\xbf\xbd", 3);
+        gsf_append_bytes(ctx, out, "\xef\xbf\xbd", 3);
     }
 }
 
 // The bytes that a token of the vocabulary spells.
-static void gsf__bpe_append_bytes(gsf_context* ctx, gsf_text* out, const gsf__bpe_token* token) {
+static void gsf__bpe_append_bytes(gsf_context* ctx, gsf_buffer* out, const gsf__bpe_token* token) {
     for (size_t i = 0, step; i < token->size; i += step) {
         step = gsf__utf8_size(token->text + i, token->size - i);
         const int byte = gsf__bpe_byte(gsf__bpe_load_character(token->text + i, step));
         const char c = (char)byte;
-        gsf_text_append(ctx, out, byte < 0 ? token->text + i : &c, byte < 0 ? step : 1);
+        gsf_append_bytes(ctx, out, byte < 0 ? token->text + i : &c, byte < 0 ? step : 1);
     }
 }
 
 // Replaces all `from` by the shorter `to` behind `start`.
-static void gsf__bpe_replace(gsf_text* text, size_t start, const char* from, const char* to) {
+static void gsf__bpe_replace(gsf_buffer* text, size_t start, const char* from, const char* to) {
     const size_t from_size = strlen(from), to_size = strlen(to);
     size_t end = start;
     for (size_t i = start; i < text->size;) {
@@ -7870,23 +7835,23 @@ static void gsf__bpe_replace(gsf_text* text, size_t start, const char* from, con
     if (text->data) text->data[end] = 0;
 }
 
-static void gsf__bpe_flush(gsf_context* ctx, gsf_text* bytes, gsf_text* out, int* parts) {
+static void gsf__bpe_flush(gsf_context* ctx, gsf_buffer* bytes, gsf_buffer* out, int* parts) {
     if (!bytes->size) return;
-    if ((*parts)++) gsf_text_append(ctx, out, " ", 1);
+    if ((*parts)++) gsf_append_bytes(ctx, out, " ", 1);
     gsf__bpe_append_replaced(ctx, out, bytes->data, bytes->size);
     bytes->size = 0;
 }
 
 GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids, size_t count,
-                                     int skip_special, gsf_text* out) {
+                                     int32_t skip_special, gsf_buffer* out) {
     static const char* const tidy[][2] = {{" .", "."}, {" ?", "?"}, {" !", "!"}, {" ,", ","}, {" ' ", "'"},
                                           {" n't", "n't"}, {" 'm", "'m"}, {" 's", "'s"}, {" 've", "'ve"}, {" 're", "'re"}};
     const gsf__bpe_tables* t = (const gsf__bpe_tables*)bpe->tables;
     const size_t start = out->size;
-    gsf_text bytes;
+    gsf_buffer bytes;
     int parts = 0;
     memset(&bytes, 0, sizeof bytes);
-    gsf_text_append(ctx, out, "", 0);
+    gsf_append_bytes(ctx, out, "", 0);
     for (size_t i = 0; i < count; i++) {
         const int32_t at = gsf__bpe_find_id(t, ids[i]);
         if (at == t->by_id_count || t->by_id[at].id != ids[i]) continue;
@@ -7894,15 +7859,15 @@ GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
         if (skip_special && token->flags & GSF__BPE_SPECIAL) continue;
         if (token->flags & GSF__BPE_APART) {
             gsf__bpe_flush(ctx, &bytes, out, &parts);
-            if (parts++) gsf_text_append(ctx, out, " ", 1);
-            gsf_text_append(ctx, out, token->text, token->size);
+            if (parts++) gsf_append_bytes(ctx, out, " ", 1);
+            gsf_append_bytes(ctx, out, token->text, token->size);
         } else {
             gsf__bpe_append_bytes(ctx, &bytes, token);
         }
     }
     gsf__bpe_flush(ctx, &bytes, out, &parts);
     const int failed = bytes.failed || out->failed;
-    gsf_destroy_text(ctx, &bytes);
+    gsf_destroy_buffer(ctx, &bytes);
     if (failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; t->clean_up && i < GSF__COUNT(tidy); i++) gsf__bpe_replace(out, start, tidy[i][0], tidy[i][1]);
     return GSF_OK;
@@ -7927,9 +7892,9 @@ typedef struct gsf__qformer {
     int64_t queries, width, mlp, layers, cross_every; // every so many layers look at the image
     int32_t heads;
     float eps;
-    gsf_nn_activation activation;
+    gsf__nn_activation activation;
     int text_input;                                   // the file holds tensors for texts, which nobody needs here
-    const gsf_tensor* tokens;
+    const gsf_nn_tensor* tokens;
     gsf__nn_layer norm;
     gsf__qformer_layer* all;
 } gsf__qformer;
@@ -7938,7 +7903,7 @@ typedef struct gsf__opt {
     gsf__nn_block_sizes sizes;
     int64_t layers, vocabulary, positions;
     int own_head, no_final_norm;
-    const gsf_tensor *tokens, *places;
+    const gsf_nn_tensor *tokens, *places;
     gsf__nn_layer norm, head;
     gsf__nn_block* blocks;
 } gsf__opt;
@@ -8058,7 +8023,8 @@ static gsf_result gsf__blip_read_colour(const gsf__nn_config* file, const char* 
     const gsf_json_value* value = gsf__nn_config_find(file, key);
     for (size_t i = 0; i < 3; i++) {
         const gsf_json_value* number =
-            value && value->type == GSF_JSON_ARRAY && value->count == 3 ? gsf_json_element(&file->json, value, i) : value;
+            value && value->type == GSF_JSON_ARRAY && value->count == 3 ? gsf_find_json_element(&file->json, value,
+                                                                                                i) : value;
         out[i] = fallback[i];
         if (!number) continue;
         if (number->type != GSF_JSON_NUMBER || !(number->number >= low) || !(number->number <= 1e6))
@@ -8085,7 +8051,7 @@ static gsf_result gsf__blip_read_processor(const gsf__nn_config* file, gsf__blip
     double sides[2] = {384.0, 384.0};
     for (int i = 0; i < 2 && size; i++) {
         const gsf_json_value* side =
-            size->type == GSF_JSON_OBJECT ? gsf_json_member(&file->json, size, i ? "width" : "height") : size;
+            size->type == GSF_JSON_OBJECT ? gsf_find_json_member(&file->json, size, i ? "width" : "height") : size;
         if (!side || side->type != GSF_JSON_NUMBER)
             return gsf__nn_config_fail(file, size, "size", "a number, or an object with height and width");
         sides[i] = side->number;
@@ -8219,11 +8185,11 @@ GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captio
     }
     gsf_free(ctx, net);
     gsf_nn_destroy_bpe(ctx, &captioner->tokenizer);
-    gsf_nn_close_weights(ctx, &captioner->weights);
+    gsf_nn_destroy_weights(ctx, &captioner->weights);
     memset(captioner, 0, sizeof *captioner);
 }
 
-GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out) {
+GSF_API gsf_result gsf_nn_load_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out) {
     gsf__nn_config file;
     memset(out, 0, sizeof *out);
     gsf__blip* net = (gsf__blip*)gsf_alloc_zeroed(ctx, 1, sizeof *net);
@@ -8235,7 +8201,7 @@ GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, g
         if (!result) result = gsf__blip_read_processor(&file, net);
         gsf__nn_close_config(&file);
     }
-    if (!result) result = gsf_nn_make_bpe(ctx, folder, &out->tokenizer);
+    if (!result) result = gsf_nn_load_bpe(ctx, folder, &out->tokenizer);
     out->image_size = (int32_t)net->image_size;
     out->query_tokens = (int32_t)net->qformer.queries;
     out->vocabulary = (int32_t)net->text.vocabulary;
@@ -8246,11 +8212,18 @@ GSF_API gsf_result gsf_nn_make_captioner(gsf_context* ctx, const char* folder, g
 
 // ---- captioner: from the image to the queries' words
 
+typedef struct gsf__nn_caption_desc {
+    const gsf_image* image;
+    const char* prompt;     // NULL: none
+    int32_t max_new_tokens; // 0: as gsf_nn_caption_image
+    const gsf__nn_tap* _tap; // private
+} gsf__nn_caption_desc;
+
 typedef struct gsf__caption_run {
     gsf__nn_run nn;
     const gsf_nn_captioner* captioner;
     const gsf__blip* net;
-    const gsf_nn_caption_desc* desc;
+    const gsf__nn_caption_desc* desc;
 } gsf__caption_run;
 
 // The image, resized as PIL does it, as normalised floats (3, image_size, image_size).
@@ -8279,7 +8252,7 @@ static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const
 static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, float* out) {
     const gsf__vit* vit = &run->net->vision;
     const gsf__nn_tap* tap = run->nn.tap;
-    gsf_nn_encoder_input in;
+    gsf_nn_encoder_desc in;
     gsf__vit_plan plan;
     float* memory = NULL;
     memset(&in, 0, sizeof in);
@@ -8315,10 +8288,10 @@ static gsf_result gsf__qformer_attend(gsf__caption_run* run, const gsf__qformer_
     const gsf__qformer* q = &run->net->qformer;
     const int64_t d = q->width;
     float *k = scratch + q->queries * d, *v = k + rows * d;
-    GSF__TRY(gsf__nn_linear(&run->nn, &a->q, GSF_NN_LINEAR, x, q->queries, scratch, 0));
-    GSF__TRY(gsf__nn_linear(&run->nn, &a->k, GSF_NN_LINEAR, from, rows, k, 0));
-    GSF__TRY(gsf__nn_linear(&run->nn, &a->v, GSF_NN_LINEAR, from, rows, v, 0));
-    gsf_nn_attention_desc desc;
+    GSF__TRY(gsf__nn_linear(&run->nn, &a->q, GSF__NN_LINEAR, x, q->queries, scratch, 0));
+    GSF__TRY(gsf__nn_linear(&run->nn, &a->k, GSF__NN_LINEAR, from, rows, k, 0));
+    GSF__TRY(gsf__nn_linear(&run->nn, &a->v, GSF__NN_LINEAR, from, rows, v, 0));
+    gsf__nn_attention_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.queries = q->queries;
     desc.keys = rows;
@@ -8341,7 +8314,7 @@ static size_t gsf__qformer_floats(const gsf__blip* net) { // x; scratch; two vec
 static gsf_result gsf__qformer_layers(gsf__caption_run* run, const float* image, float* scratch, float* x, float* out) {
     const gsf__qformer* q = &run->net->qformer;
     const int64_t d = q->width, seen = run->net->vision.grid * run->net->vision.grid + 1, words = run->net->text.sizes.width;
-    gsf_nn_read_tensor(q->tokens, 0, q->queries * d, x);
+    gsf_nn_convert_tensor(q->tokens, 0, q->queries * d, x);
     gsf__nn_norm(&run->nn, &q->norm, q->eps, x, q->queries, x);
     GSF__TRY(gsf__nn_check(&run->nn, "query_tokens", "query_tokens", x, q->queries * d));
     for (int64_t i = 0; i < q->layers; i++) {
@@ -8353,7 +8326,7 @@ static gsf_result gsf__qformer_layers(gsf__caption_run* run, const float* image,
         GSF__TRY(gsf__nn_end_block(&run->nn, "qformer.encoder.layer.", i, x, q->queries * d));
     }
     gsf__nn_reveal(&run->nn, x, 0, 1, q->queries, d, "qformer");
-    GSF__TRY(gsf__nn_linear(&run->nn, &run->net->projection, GSF_NN_LINEAR, x, q->queries, out, 0));
+    GSF__TRY(gsf__nn_linear(&run->nn, &run->net->projection, GSF__NN_LINEAR, x, q->queries, out, 0));
     GSF__TRY(gsf__nn_check(&run->nn, "language_projection.", "language_projection.", out, q->queries * words));
     gsf__nn_reveal(&run->nn, out, 0, 1, q->queries, words, "projection");
     return GSF_OK;
@@ -8404,8 +8377,8 @@ static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t coun
                            float* x) {
     const int64_t d = opt->sizes.width;
     for (int64_t i = 0; i < count; i++) {
-        if (ids) gsf_nn_read_tensor(opt->tokens, ids[i] * d, d, x + i * d);
-        gsf_nn_read_tensor(opt->places, (place + i + GSF__OPT_OFFSET) * d, d, scratch);
+        if (ids) gsf_nn_convert_tensor(opt->tokens, ids[i] * d, d, x + i * d);
+        gsf_nn_convert_tensor(opt->places, (place + i + GSF__OPT_OFFSET) * d, d, scratch);
         for (int64_t k = 0; k < d; k++) x[i * d + k] += scratch[k];
     }
 }
@@ -8425,7 +8398,7 @@ static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64
         gsf__nn_norm(nn, &opt->norm, opt->sizes.eps, last, shown, nn->normed);
         last = nn->normed;
     }
-    GSF__TRY(gsf__nn_linear(nn, &opt->head, GSF_NN_LINEAR, last, shown, o->logits, 0));
+    GSF__TRY(gsf__nn_linear(nn, &opt->head, GSF__NN_LINEAR, last, shown, o->logits, 0));
     GSF__TRY(gsf__nn_check(nn, "language_model.", "language_model.", o->logits, shown * opt->vocabulary));
     if (rows > 1) gsf__nn_reveal(nn, o->logits, 0, 1, shown, opt->vocabulary, "logits");
     if (shown > 1) memmove(o->logits, o->logits + (shown - 1) * opt->vocabulary, (size_t)opt->vocabulary * sizeof(float));
@@ -8470,7 +8443,7 @@ static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, cons
     run->nn.cache = &o.cache;
     memcpy(o.x, words, (size_t)(queries * d) * sizeof(float));
     for (int64_t i = 0; i < (int64_t)text_count; i++)
-        gsf_nn_read_tensor(opt->tokens, text[i] * d, d, o.x + (queries + i) * d);
+        gsf_nn_convert_tensor(opt->tokens, text[i] * d, d, o.x + (queries + i) * d);
     const gsf_result result = gsf__opt_continue(run, &o, rows, most, ids, count);
     gsf_free(ctx, memory);
     return result;
@@ -8514,8 +8487,8 @@ static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text
     return captioner->image_token >= 0 ? usual : usual - 1 - 2 * text_tokens;
 }
 
-static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
-                                     int64_t text_tokens, int64_t* most) {
+static gsf_result gsf__caption_check(gsf_context* ctx, const gsf_nn_captioner* captioner,
+                                     const gsf__nn_caption_desc* desc, int64_t text_tokens, int64_t* most) {
     if (!desc->image || !desc->image->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: no image");
     *most = gsf__caption_most(captioner, text_tokens, desc->max_new_tokens);
     if (*most < 1 || desc->max_new_tokens < 0)
@@ -8549,8 +8522,9 @@ static gsf_result gsf__caption_write(gsf__caption_run* run, const int32_t* text,
     return result;
 }
 
-GSF_API gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_nn_caption_desc* desc,
-                                      int32_t** ids, size_t* count) {
+// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
+static gsf_result gsf__nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
+                                      const gsf__nn_caption_desc* desc, int32_t** ids, size_t* count) {
     gsf__caption_run run;
     int32_t* text;
     size_t text_count;
@@ -8571,7 +8545,7 @@ GSF_API gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* 
         *ids = (int32_t*)gsf_alloc(ctx, (size_t)most, sizeof **ids);
         result = *ids ? gsf__caption_write(&run, text, text_count, most, *ids, count) : GSF_ERROR_OUT_OF_MEMORY;
     }
-    gsf_nn_destroy_workspace(ctx, &run.nn.workspace);
+    gsf__nn_destroy_workspace(ctx, &run.nn.workspace);
     gsf_free(ctx, text);
     if (!result) return GSF_OK;
     gsf_free(ctx, *ids);
@@ -8580,10 +8554,10 @@ GSF_API gsf_result gsf_nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* 
     return result;
 }
 
-GSF_API gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
-                                  const char* prompt, int32_t max_new_tokens, char* out, size_t size) {
-    gsf_nn_caption_desc desc;
-    gsf_text text;
+GSF_API gsf_result gsf_nn_caption_image(gsf_context* ctx, const gsf_nn_captioner* captioner, const gsf_image* image,
+                                        const char* prompt, int32_t max_new_tokens, char* out, size_t size) {
+    gsf__nn_caption_desc desc;
+    gsf_buffer text;
     int32_t* ids;
     size_t count, begin = 0;
     if (!out || !size) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: no room for the text");
@@ -8593,7 +8567,7 @@ GSF_API gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* capt
     desc.image = image;
     desc.prompt = prompt;
     desc.max_new_tokens = max_new_tokens;
-    GSF__TRY(gsf_nn_caption_ids(ctx, captioner, &desc, &ids, &count));
+    GSF__TRY(gsf__nn_caption_ids(ctx, captioner, &desc, &ids, &count));
     const gsf_result result = gsf_nn_decode_bpe(ctx, &captioner->tokenizer, ids, count, 1, &text);
     size_t end = text.size, used = 0;
     if (!result) gsf__bpe_strip((const gsf__bpe_tables*)captioner->tokenizer.tables, text.data, 1, 1, &begin, &end);
@@ -8605,17 +8579,19 @@ GSF_API gsf_result gsf_nn_caption(gsf_context* ctx, const gsf_nn_captioner* capt
         used += zero ? 3 : step;
     }
     out[used] = 0;
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     gsf_free(ctx, ids);
     return result;
 }
 
-GSF_API void gsf_nn_caption_cost(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
-                                 double* bytes, double* flops) {
+// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
+// `text_tokens` tokens of prompt (0: none).
+static void gsf__nn_query_captioner(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
+                                    double* bytes, double* flops) {
     const gsf__blip* net = (const gsf__blip*)captioner->nets;
     const gsf__qformer* q = &net->qformer;
     const gsf__opt* opt = &net->text;
-    gsf_nn_encoder_input in;
+    gsf_nn_encoder_desc in;
     memset(&in, 0, sizeof in);
     in.images = 1;
     in.height = in.width = (int32_t)net->image_size;
@@ -8827,7 +8803,7 @@ typedef struct gsf__sp_added { // a text that is an id of its own
 typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
     gsf__sp_node *pieces, *added; // ids of `added` are places in added_list
     gsf__sp_added* added_list;
-    gsf_text texts;
+    gsf_buffer texts;
     size_t added_count, added_capacity;
     float* scores;                // of each piece
     unsigned char* types;
@@ -8846,7 +8822,7 @@ static void gsf__sp_destroy(gsf_context* ctx, gsf__sp_model* m) {
     gsf_free(ctx, m->pieces);
     gsf_free(ctx, m->added);
     gsf_free(ctx, m->added_list);
-    gsf_destroy_text(ctx, &m->texts);
+    gsf_destroy_buffer(ctx, &m->texts);
     gsf_free(ctx, m->scores);
     gsf_free(ctx, m->types);
     gsf_free(ctx, m->units);
@@ -9078,7 +9054,7 @@ static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* te
     a->id = (int32_t)id;
     a->trim_left = trim_left;
     a->trim_right = trim_right;
-    gsf_text_append(ctx, &m->texts, text, size);
+    gsf_append_bytes(ctx, &m->texts, text, size);
     m->added_count++;
     return m->texts.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
@@ -9092,10 +9068,10 @@ static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json
     const gsf_json* json = &file->json;
     for (uint32_t i = all->child; i; i = json->values[i].next) {
         const gsf_json_value* entry = &json->values[i];
-        const gsf_json_value* content = gsf_json_member(json, entry, "content");
-        const gsf_json_value* left = gsf_json_member(json, entry, "lstrip");
-        const gsf_json_value* right = gsf_json_member(json, entry, "rstrip");
-        const gsf_json_value* single = gsf_json_member(json, entry, "single_word");
+        const gsf_json_value* content = gsf_find_json_member(json, entry, "content");
+        const gsf_json_value* left = gsf_find_json_member(json, entry, "lstrip");
+        const gsf_json_value* right = gsf_find_json_member(json, entry, "rstrip");
+        const gsf_json_value* single = gsf_find_json_member(json, entry, "single_word");
         int64_t id = 0;
         int ok = entry->key_size > 0 && entry->key_size < 10 && content && content->type == GSF_JSON_STRING &&
                  content->string_size <= GSF__SP_PIECE;
@@ -9152,14 +9128,14 @@ static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
     }
     const gsf_result result = gsf__sp_build_trie(ctx, keys, kept, &m->added);
     gsf_free(ctx, keys);
-    gsf_destroy_text(ctx, &m->texts);
+    gsf_destroy_buffer(ctx, &m->texts);
     return result;
 }
 
 // "eos_token": "</s>", or an object with that as its "content"
 static const char* gsf__sp_token_text(const gsf__nn_config* file, const char* key, const char* fallback) {
     const gsf_json_value* value = gsf__nn_config_find(file, key);
-    if (value && value->type == GSF_JSON_OBJECT) value = gsf_json_member(&file->json, value, "content");
+    if (value && value->type == GSF_JSON_OBJECT) value = gsf_find_json_member(&file->json, value, "content");
     return value && value->type == GSF_JSON_STRING ? value->string : fallback;
 }
 
@@ -9211,8 +9187,9 @@ static void gsf__sp_end_making(gsf_context* ctx, gsf_result result, gsf__nn_conf
     if (result) gsf_nn_destroy_tokenizer(ctx, out);
 }
 
-GSF_API gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* name, const void* model, size_t model_size,
-                                                const char* config, size_t config_size, gsf_nn_tokenizer* out) {
+// The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
+GSF__SHARED gsf_result gsf__nn_parse_tokenizer(gsf_context* ctx, const char* name, const void* model, size_t model_size,
+                                               const char* config, size_t config_size, gsf_nn_tokenizer* out) {
     gsf__nn_config files[2];
     memset(files, 0, sizeof files);
     memset(out, 0, sizeof *out);
@@ -9224,11 +9201,11 @@ GSF_API gsf_result gsf_nn_make_tokenizer_memory(gsf_context* ctx, const char* na
     return result;
 }
 
-GSF_API gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out) {
+GSF_API gsf_result gsf_nn_load_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out) {
     gsf__nn_config files[2];
     void* data = NULL;
     size_t size = 0;
-    gsf_text path;
+    gsf_buffer path;
     memset(files, 0, sizeof files);
     memset(out, 0, sizeof *out);
     gsf_result result = gsf__nn_join(ctx, folder, "spiece.model", &path);
@@ -9237,7 +9214,7 @@ GSF_API gsf_result gsf_nn_make_tokenizer(gsf_context* ctx, const char* folder, g
     if (!result) result = gsf__nn_open_config(ctx, folder, "added_tokens.json", 1, &files[1]);
     if (!result) result = gsf__sp_make(ctx, path.data, data, size, files, out);
     gsf_free(ctx, data);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     gsf__sp_end_making(ctx, result, files, out);
     return result;
 }
@@ -9484,8 +9461,8 @@ static gsf_result gsf__sp_encode_all(gsf__sp_run* run, const char* text, size_t 
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text, size_t size,
-                                   int32_t* ids, size_t room, size_t* count) {
+GSF_API gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer, const char* text,
+                                      size_t size, int32_t* ids, size_t room, size_t* count) {
     gsf__sp_run run;
     memset(&run, 0, sizeof run);
     run.ctx = ctx;
@@ -9512,7 +9489,7 @@ GSF_API gsf_result gsf_nn_tokenize(gsf_context* ctx, const gsf_nn_tokenizer* tok
 typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
     gsf__nn_block_sizes sizes;
     gsf__nn_block* blocks;
-    const gsf_tensor *embedding, *positions; // positions: (buckets, heads), for all blocks
+    const gsf_nn_tensor *embedding, *positions; // positions: (buckets, heads), for all blocks
     gsf__nn_layer norm;
 } gsf__t5_nets;
 
@@ -9551,7 +9528,7 @@ static gsf__nn_block_sizes gsf__t5_block_sizes(const gsf_nn_t5* c) {
     s.heads = c->heads;
     s.head_dim = c->head_dim;
     s.eps = (float)c->norm_eps;
-    s.activation = GSF_NN_GELU_TANH;
+    s.activation = GSF__NN_GELU_TANH;
     s.rms = s.gated = 1;
     return s;
 }
@@ -9594,7 +9571,7 @@ static gsf_result gsf__t5_read_config(const gsf__nn_config* file, void* network)
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_make_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
+GSF_API gsf_result gsf_nn_load_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out) {
     memset(out, 0, sizeof *out);
     const gsf_result result =
         gsf__nn_open_network(ctx, folder, "model", gsf__t5_read_config, gsf__t5_bind, out, &out->weights);
@@ -9606,7 +9583,7 @@ GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5) {
     gsf__t5_nets* nets = (gsf__t5_nets*)t5->nets;
     if (nets) gsf_free(ctx, nets->blocks);
     gsf_free(ctx, nets);
-    gsf_nn_close_weights(ctx, &t5->weights);
+    gsf_nn_destroy_weights(ctx, &t5->weights);
     memset(t5, 0, sizeof *t5);
 }
 
@@ -9627,10 +9604,10 @@ static int32_t gsf__t5_bucket(const gsf_nn_t5* c, int64_t offset) {
 }
 
 // bias (heads, tokens, tokens), the same for every block; scratch: 2 tokens + buckets * heads floats.
-static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_tensor* positions, int64_t tokens, float* scratch,
+static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_nn_tensor* positions, int64_t tokens, float* scratch,
                               float* bias) {
     float *line = scratch, *table = scratch + 2 * tokens; // line: by key - query, from 1 - tokens up
-    gsf_nn_read_tensor(positions, 0, positions->count, table);
+    gsf_nn_convert_tensor(positions, 0, positions->count, table);
     for (int64_t h = 0; h < c->heads; h++) {
         for (int64_t i = 0; i < 2 * tokens - 1; i++) line[i] = table[gsf__t5_bucket(c, i + 1 - tokens) * c->heads + h];
         for (int64_t q = 0; q < tokens; q++, bias += tokens)
@@ -9641,7 +9618,7 @@ static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_tensor* positions, i
 // ---- one pass
 
 // Shares out `memory`, or counts its floats.
-static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_input* in, float** x, float** bias,
+static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_desc* in, float** x, float** bias,
                               float* memory) {
     gsf__nn_arena arena = {memory, 0};
     const gsf__nn_block_sizes s = gsf__t5_block_sizes(c);
@@ -9659,7 +9636,9 @@ static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn
     return arena.used;
 }
 
-GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, double* bytes, double* flops) {
+// Bytes of memory at the peak (beside out, the mapped weights and some 70 MB of the kernels' scratch) and floating-point
+// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 4.2e12 operations.
+static void gsf__nn_query_t5(const gsf_nn_t5* t5, const gsf_nn_t5_desc* input, double* bytes, double* flops) {
     const gsf__nn_block_sizes s = gsf__t5_block_sizes(t5);
     gsf__nn_run run;
     float *x, *bias;
@@ -9667,11 +9646,11 @@ GSF_API void gsf_nn_t5_cost(const gsf_nn_t5* t5, const gsf_nn_t5_input* input, d
     *flops = t5->layers * gsf__nn_block_flops(&s, input->batch, input->tokens);
 }
 
-static gsf_result gsf__t5_forward(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_input* in, float* x, float* bias,
+static gsf_result gsf__t5_forward(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_desc* in, float* x, float* bias,
                                   float* out) {
     const gsf__t5_nets* nets = (const gsf__t5_nets*)c->nets;
     const int64_t d = c->width, rows = (int64_t)in->batch * in->tokens;
-    for (int64_t r = 0; r < rows; r++) gsf_nn_read_tensor(nets->embedding, (int64_t)in->ids[r] * d, d, x + r * d);
+    for (int64_t r = 0; r < rows; r++) gsf_nn_convert_tensor(nets->embedding, (int64_t)in->ids[r] * d, d, x + r * d);
     GSF__TRY(gsf__nn_check(run, "the embedding", "shared.", x, rows * d));
     gsf__nn_reveal(run, x, 0, in->batch, in->tokens, d, "embed");
     gsf__t5_fill_bias(c, nets->positions, in->tokens, run->wide, bias);
@@ -9685,11 +9664,11 @@ static gsf_result gsf__t5_forward(gsf__nn_run* run, const gsf_nn_t5* c, const gs
         gsf__nn_reveal(run, x, 0, in->batch, in->tokens, d, "out");
         GSF__TRY(gsf__nn_end_block(run, "encoder.block.", i, x, rows * d));
     }
-    gsf_nn_rms_norm(run->ctx, x, rows, d, gsf__nn_widen(run, nets->norm.weight, 0), nets->sizes.eps, out);
+    gsf__nn_rms_norm(run->ctx, x, rows, d, gsf__nn_widen(run, nets->norm.weight, 0), nets->sizes.eps, out);
     return gsf__nn_check(run, "the last norm", "encoder.final", out, rows * d);
 }
 
-GSF_API gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_input* input, float* out) {
+GSF_API gsf_result gsf_nn_encode_t5(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_desc* input, float* out) {
     const int64_t rows = (int64_t)input->batch * input->tokens;
     gsf__nn_run run;
     float *x, *bias;
@@ -9714,7 +9693,7 @@ GSF_API gsf_result gsf_nn_t5_encode(gsf_context* ctx, const gsf_nn_t5* t5, const
     gsf__t5_lay_out(&run, t5, input, &x, &bias, memory);
     const gsf_result result = gsf__t5_forward(&run, t5, input, x, bias, out);
     if (result) memset(out, 0, (size_t)(rows * t5->width) * sizeof(float));
-    gsf_nn_destroy_workspace(ctx, &run.workspace);
+    gsf__nn_destroy_workspace(ctx, &run.workspace);
     gsf_free(ctx, memory);
     return result;
 }
@@ -9731,7 +9710,7 @@ enum { GSF__VAE_ENCODER_FRAMES = 8, GSF__VAE_DECODER_FRAMES = 2 }; // frames of 
 enum { GSF__VAE_SLOTS = 4, GSF__VAE_INPUT = 3 };                   // activations; the last one is the chunk's input
 
 typedef struct gsf__vae_norm { // a group norm; spatial.out > 0: its result times y(z) plus b(z), z the latents
-    const gsf_tensor *weight, *bias;
+    const gsf_nn_tensor *weight, *bias;
     gsf__conv_layer y, b;
     double eps;
 } gsf__vae_norm;
@@ -9869,7 +9848,7 @@ static gsf_result gsf__vae_load_net(gsf__vae_loader* l, int decoder) {
 }
 
 static gsf_result gsf__vae_check_types(const gsf__nn_config* config, const char* key, const char* type, size_t levels) {
-    const gsf_json_value* list = gsf_json_member(&config->json, &config->json.values[0], key);
+    const gsf_json_value* list = gsf_find_json_member(&config->json, &config->json.values[0], key);
     if (!list || list->type == GSF_JSON_NULL) return GSF_OK;
     int ok = list->type == GSF_JSON_ARRAY && list->count == levels;
     for (uint32_t i = ok ? list->child : 0; i; i = config->json.values[i].next)
@@ -9928,7 +9907,7 @@ static gsf_result gsf__vae_bind(gsf__nn_loader* loader, void* network) {
     return gsf__vae_load_net(&l, 1);
 }
 
-GSF_API gsf_result gsf_nn_make_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out) {
+GSF_API gsf_result gsf_nn_load_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out) {
     memset(out, 0, sizeof *out);
     const gsf_result result = gsf__nn_open_network(ctx, folder, "diffusion_pytorch_model", gsf__vae_take_config,
                                                    gsf__vae_bind, out, &out->weights);
@@ -9947,7 +9926,7 @@ GSF_API void gsf_nn_destroy_vae(gsf_context* ctx, gsf_nn_vae* vae) {
         gsf__vae_free_net(ctx, &nets->decoder);
         gsf_free(ctx, nets);
     }
-    gsf_nn_close_weights(ctx, &vae->weights);
+    gsf_nn_destroy_weights(ctx, &vae->weights);
     memset(vae, 0, sizeof *vae);
 }
 
@@ -9971,7 +9950,7 @@ typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
 // For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
 // `weight` names the layer.
 typedef struct gsf__vae_watch {
-    void (*fn)(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+    void (*fn)(void* user, const gsf_nn_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
                const float* data);
     void* user;
 } gsf__vae_watch;
@@ -10045,7 +10024,7 @@ static int gsf__vae_free_slot(int a, int b) { // the first that is neither
 }
 
 // `tensor`: the weight of the layer whose result is at fault; its name loses ".conv.weight".
-static gsf_result gsf__vae_fail_nan(const gsf__vae_run* run, const gsf_tensor* tensor) {
+static gsf_result gsf__vae_fail_nan(const gsf__vae_run* run, const gsf_nn_tensor* tensor) {
     char name[160];
     snprintf(name, sizeof name, "%s", tensor->name);
     char* end = strstr(name, ".weight");
@@ -10063,7 +10042,7 @@ typedef struct gsf__vae_blend { // table (pixels, 2, channels): y and b become f
     int64_t width, channels;
 } gsf__vae_blend;
 
-static void gsf__vae_blend_row(void* arg, size_t row, int worker) {
+static void gsf__vae_blend_row(void* arg, size_t row, int32_t worker) {
     const gsf__vae_blend* job = (const gsf__vae_blend*)arg;
     (void)worker;
     for (int64_t x = 0; x < job->width; x++) {
@@ -10110,8 +10089,8 @@ static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* 
     float *mean = run->table.data, *scale = mean + c, *shift = scale + c;
     const double* sums = gsf__vae_sums(run, in->slot);
     const double count = (double)in->frames * (double)in->height * (double)in->width * (double)per;
-    gsf_nn_read_tensor(norm->weight, 0, c, scale);
-    gsf_nn_read_tensor(norm->bias, 0, c, shift);
+    gsf_nn_convert_tensor(norm->weight, 0, c, scale);
+    gsf_nn_convert_tensor(norm->bias, 0, c, shift);
     for (int64_t i = 0; i < c; i++) { // E[x^2] - E[x]^2 in double, of floats: good to 1e-8 at a mean of 1e4 deviations
         const double m = sums[i / per * 2] / count, v = sums[i / per * 2 + 1] / count - m * m;
         mean[i] = (float)m;
@@ -10758,13 +10737,13 @@ static gsf_result gsf__vae_apply(gsf_context* ctx, const gsf_nn_vae* vae, int de
     return result;
 }
 
-GSF_API gsf_result gsf_nn_vae_encode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
+GSF_API gsf_result gsf_nn_encode_vae(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
                                      const float* video, int64_t frames, int64_t height, int64_t width, float* mean,
                                      float* logvar) {
     return gsf__vae_apply(ctx, vae, 0, desc, video, frames, height, width, NULL, mean, logvar);
 }
 
-GSF_API gsf_result gsf_nn_vae_decode(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
+GSF_API gsf_result gsf_nn_decode_vae(gsf_context* ctx, const gsf_nn_vae* vae, const gsf_nn_vae_desc* desc,
                                      const float* latents, int64_t frames, int64_t height, int64_t width, float* video) {
     return gsf__vae_apply(ctx, vae, 1, desc, latents, frames, height, width, video, NULL, NULL);
 }
@@ -10789,11 +10768,11 @@ typedef struct gsf__dit_projector { gsf__nn_layer linear, norm; } gsf__dit_proje
 
 typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
     gsf__dit_block* blocks;
-    gsf_nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
+    gsf__nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
     gsf__dit_projector dino, vggt;
     gsf__dit_norm norm_out;
     gsf__nn_layer patch, text, time1, time2, norm_final, out;
-    const gsf_tensor* positions;
+    const gsf_nn_tensor* positions;
 } gsf__dit_nets;
 
 static int64_t gsf__dit_width(const gsf_nn_transformer* c) { return (int64_t)c->heads * c->head_dim; }
@@ -10910,12 +10889,12 @@ GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* tr
     gsf__dit_nets* nets = (gsf__dit_nets*)transformer->nets;
     if (nets) {
         for (size_t i = 0; nets->quantized && i < transformer->weights.tensor_count; i++)
-            gsf_nn_destroy_quantized(ctx, &nets->quantized[i]);
+            gsf__nn_destroy_quantized(ctx, &nets->quantized[i]);
         gsf_free(ctx, nets->quantized);
         gsf_free(ctx, nets->blocks);
     }
     gsf_free(ctx, nets);
-    gsf_nn_close_weights(ctx, &transformer->weights);
+    gsf_nn_destroy_weights(ctx, &transformer->weights);
     memset(transformer, 0, sizeof *transformer);
 }
 
@@ -10924,16 +10903,16 @@ GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transfor
     const gsf_nn_weights* w = &transformer->weights;
     size_t total = 0;
     if (!nets->quantized)
-        nets->quantized = (gsf_nn_quantized*)gsf_alloc_zeroed(ctx, w->tensor_count, sizeof *nets->quantized);
+        nets->quantized = (gsf__nn_quantized*)gsf_alloc_zeroed(ctx, w->tensor_count, sizeof *nets->quantized);
     if (!nets->quantized) return GSF_ERROR_OUT_OF_MEMORY;
     for (int32_t i = 0; i < transformer->layers; i++) {
         const gsf__dit_block* b = &nets->blocks[i];
-        const gsf_tensor* const layers[] = {
+        const gsf_nn_tensor* const layers[] = {
             b->self.q.weight, b->self.k.weight, b->self.v.weight, b->self.out.weight, b->cross.q.weight,
             b->cross.k.weight, b->cross.v.weight, b->cross.out.weight, b->up.weight, b->down.weight};
         for (size_t k = 0; k < GSF__COUNT(layers); k++) {
-            gsf_nn_quantized* q = &nets->quantized[layers[k] - w->tensors];
-            if (!q->data) GSF__TRY(gsf_nn_quantize_weight(ctx, layers[k], 0, q));
+            gsf__nn_quantized* q = &nets->quantized[layers[k] - w->tensors];
+            if (!q->data) GSF__TRY(gsf__nn_quantize_weight(ctx, layers[k], 0, q));
             total += q->bytes;
         }
         GSF__TRY(gsf__check_cancel(ctx));
@@ -10943,7 +10922,7 @@ GSF_API gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transfor
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_nn_make_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
+GSF_API gsf_result gsf_nn_load_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out) {
     memset(out, 0, sizeof *out);
     const gsf_result result = gsf__nn_open_network(ctx, folder, "diffusion_pytorch_model", gsf__dit_read_config,
                                                    gsf__dit_bind, out, &out->weights);
@@ -10957,7 +10936,7 @@ typedef struct gsf__dit_run {
     gsf__nn_run nn;
     const gsf_nn_transformer* net;
     const gsf__dit_nets* nets;
-    const gsf_nn_transformer_input* in;
+    const gsf_nn_transformer_desc* in;
     int64_t width, text, video, tokens; // tokens = text + video: rows of a sample
     float* x;       // (batch, tokens, width): the residual stream, text first
     float* normed;  // (tokens, width)
@@ -10970,7 +10949,7 @@ typedef struct gsf__dit_run {
 } gsf__dit_run;
 
 static gsf_result gsf__dit_linear(gsf__dit_run* run, const gsf__nn_layer* layer, const float* x, int64_t rows, float* y) {
-    return gsf__nn_linear(&run->nn, layer, GSF_NN_LINEAR, x, rows, y, 0);
+    return gsf__nn_linear(&run->nn, layer, GSF__NN_LINEAR, x, rows, y, 0);
 }
 
 // x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
@@ -10989,7 +10968,7 @@ static void gsf__dit_norm_heads(gsf__dit_run* run, const gsf__nn_layer* norm, in
 
 static gsf_result gsf__dit_attend(gsf__dit_run* run, int64_t queries, int64_t keys, const float* q, const float* k,
                                   const float* v) { // into run->normed
-    gsf_nn_attention_desc a;
+    gsf__nn_attention_desc a;
     memset(&a, 0, sizeof a);
     a.queries = queries;
     a.keys = keys;
@@ -11011,8 +10990,9 @@ static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t
     float *m = run->modulation, *video = run->normed + run->text * d;
     GSF__TRY(gsf__dit_linear(run, &norm->linear, time, 1, m));
     const gsf__nn_vectors v = gsf__nn_widen_layer(&run->nn, &norm->norm);
-    gsf_nn_layer_norm_modulated(run->nn.ctx, x, run->text, d, v.weight, v.bias, eps, m + 4 * d, m + 3 * d, run->normed);
-    gsf_nn_layer_norm_modulated(run->nn.ctx, x + run->text * d, run->video, d, v.weight, v.bias, eps, m + d, m, video);
+    gsf__nn_layer_norm_modulated(run->nn.ctx, x, run->text, d, v.weight, v.bias, eps, m + 4 * d, m + 3 * d,
+                                 run->normed);
+    gsf__nn_layer_norm_modulated(run->nn.ctx, x + run->text * d, run->video, d, v.weight, v.bias, eps, m + d, m, video);
     gsf__nn_reveal(&run->nn, video, row, 1, run->video, d, "%s.0", name);
     gsf__nn_reveal(&run->nn, run->normed, row, 1, run->text, d, "%s.1", name);
     gsf__nn_reveal(&run->nn, m + 2 * d, row, 1, 1, d, "%s.2", name);
@@ -11084,7 +11064,7 @@ static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gs
         for (int64_t r = first; r < end; r += most) {
             const int64_t rows = gsf__least(end - r, most);
             const float* from = run->normed + r * d;
-            GSF__TRY(gsf__nn_linear(&run->nn, &block->up, GSF_NN_GELU_TANH, from, rows, run->qkv, 0));
+            GSF__TRY(gsf__nn_linear(&run->nn, &block->up, GSF__NN_GELU_TANH, from, rows, run->qkv, 0));
             GSF__TRY(gsf__dit_add(run, &block->down, gate, run->qkv, rows, x + r * d,
                                   run->probe ? run->probe + r * d : NULL));
         }
@@ -11128,12 +11108,12 @@ static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
     const int64_t d = run->width, t = run->net->time_channels;
     for (int32_t b = 0; b < run->in->batch; b++) {
         float *wave = run->qkv, *hidden = wave + d, *out = run->time + b * t;
-        gsf_nn_embed_timestep(run->in->timesteps[b], (int32_t)d, wave);
+        gsf__nn_embed_timestep(run->in->timesteps[b], (int32_t)d, wave);
         gsf__nn_reveal(&run->nn, wave, b, 1, 1, d, "time_proj");
-        GSF__TRY(gsf__nn_linear(&run->nn, &run->nets->time1, GSF_NN_SILU, wave, 1, hidden, 0));
+        GSF__TRY(gsf__nn_linear(&run->nn, &run->nets->time1, GSF__NN_SILU, wave, 1, hidden, 0));
         GSF__TRY(gsf__dit_linear(run, &run->nets->time2, hidden, 1, out));
         gsf__nn_reveal(&run->nn, out, b, 1, 1, t, "time_embedding");
-        gsf_nn_activate(run->nn.ctx, GSF_NN_SILU, out, t, out);
+        gsf__nn_activate(run->nn.ctx, GSF__NN_SILU, out, t, out);
     }
     return GSF_OK;
 }
@@ -11142,20 +11122,20 @@ static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
 // only), as the official code does.
 static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
     const gsf_nn_transformer* c = run->net;
-    const gsf_nn_transformer_input* in = run->in;
+    const gsf_nn_transformer_desc* in = run->in;
     if (!c->learned_positions && c->rotary_positions) return GSF_OK;
     const int64_t d = run->width;
     const int same_frames = (in->frames - 1) * c->temporal_ratio + 1 == c->sample_frames;
     if (c->learned_positions && same_frames && run->text == c->text_tokens) {
         for (int64_t r = 0; r < run->tokens; r++) { // a row at a time: the table may be bf16
-            gsf_nn_read_tensor(run->nets->positions, r * d, d, run->qkv);
+            gsf_nn_convert_tensor(run->nets->positions, r * d, d, run->qkv);
             for (int32_t b = 0; b < in->batch; b++)
                 for (int64_t i = 0; i < d; i++) run->x[(b * run->tokens + r) * d + i] += run->qkv[i];
         }
         return GSF_OK;
     }
-    GSF__TRY(gsf_nn_make_sincos(run->nn.ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
-                                c->spatial_scale, c->temporal_scale, run->qkv));
+    GSF__TRY(gsf__nn_make_sincos(run->nn.ctx, in->frames, in->height / c->patch, in->width / c->patch, (int32_t)d,
+                                 c->spatial_scale, c->temporal_scale, run->qkv));
     for (int32_t b = 0; b < in->batch; b++)
         for (int64_t i = 0; i < run->video * d; i++) run->x[(b * run->tokens + run->text) * d + i] += run->qkv[i];
     return GSF_OK;
@@ -11163,7 +11143,7 @@ static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
 
 static gsf_result gsf__dit_embed(gsf__dit_run* run) {
     const gsf_nn_transformer* c = run->net;
-    const gsf_nn_transformer_input* in = run->in;
+    const gsf_nn_transformer_desc* in = run->in;
     const int64_t d = run->width, sample = (int64_t)in->frames * c->in_channels * in->height * in->width;
     for (int32_t b = 0; b < in->batch; b++) {
         float* x = run->x + b * run->tokens * d;
@@ -11190,7 +11170,7 @@ static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
     gsf__nn_reveal(&run->nn, normed, row, 1, run->video, d, "norm_final");
     GSF__TRY(gsf__dit_linear(run, &norm->linear, run->time + row * c->time_channels, 1, m));
     const gsf__nn_vectors v = gsf__nn_widen_layer(&run->nn, &norm->norm);
-    gsf_nn_layer_norm_modulated(run->nn.ctx, normed, run->video, d, v.weight, v.bias, eps, m + d, m, normed);
+    gsf__nn_layer_norm_modulated(run->nn.ctx, normed, run->video, d, v.weight, v.bias, eps, m + d, m, normed);
     gsf__nn_reveal(&run->nn, normed, row, 1, run->video, d, "norm_out");
     GSF__TRY(gsf__dit_linear(run, &run->nets->out, normed, run->video, run->qkv));
     gsf__nn_reveal(&run->nn, run->qkv, row, 1, run->video, outputs, "proj_out");
@@ -11283,7 +11263,7 @@ static gsf_result gsf__dit_check_size(gsf_context* ctx, const gsf_nn_transformer
     return GSF_OK;
 }
 
-static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* c, const gsf_nn_transformer_input* in) {
+static gsf_result gsf__dit_check_input(gsf_context* ctx, const gsf_nn_transformer* c, const gsf_nn_transformer_desc* in) {
     if (!in->hidden || !in->text || !in->timesteps || in->batch < 1 || in->frames < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: latents, text or time steps are missing");
     GSF__TRY(gsf__dit_check_size(ctx, c, in->height, in->width));
@@ -11312,7 +11292,7 @@ static void gsf__dit_begin_run(gsf__dit_run* run, gsf_context* ctx, const gsf_nn
     run->nn.steps = c->layers;
 }
 
-static void gsf__dit_set_input(gsf__dit_run* run, const gsf_nn_transformer_input* in) {
+static void gsf__dit_set_input(gsf__dit_run* run, const gsf_nn_transformer_desc* in) {
     const gsf_nn_transformer* c = run->net;
     run->in = in;
     run->nn.tap = in->_tap;
@@ -11348,9 +11328,9 @@ static size_t gsf__dit_lay_out(gsf__dit_run* run, float* memory) {
 
 static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
     const gsf_nn_transformer* c = run->net;
-    const gsf_nn_transformer_input* in = run->in;
+    const gsf_nn_transformer_desc* in = run->in;
     if (run->cos) {
-        gsf_nn_rope_desc rope;
+        gsf__nn_rope_desc rope;
         memset(&rope, 0, sizeof rope);
         rope.frames = in->frames;
         rope.height = in->height / c->patch;
@@ -11358,7 +11338,7 @@ static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
         rope.base_height = c->sample_height / c->patch;
         rope.base_width = c->sample_width / c->patch;
         rope.head_dim = c->head_dim;
-        GSF__TRY(gsf_nn_make_rope(run->nn.ctx, &rope, run->cos, run->sin));
+        GSF__TRY(gsf__nn_make_rope(run->nn.ctx, &rope, run->cos, run->sin));
     }
     GSF__TRY(gsf__dit_embed_time(run));
     GSF__TRY(gsf__dit_embed(run));
@@ -11371,8 +11351,8 @@ static gsf_result gsf__dit_forward(gsf__dit_run* run, float* out) {
     return gsf__nn_check(&run->nn, "the output layer", "proj_out.", out, in->batch * sample);
 }
 
-GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_transformer* transformer,
-                                              const gsf_nn_transformer_input* input, float* out) {
+GSF_API gsf_result gsf_nn_run_transformer(gsf_context* ctx, const gsf_nn_transformer* transformer,
+                                          const gsf_nn_transformer_desc* input, float* out) {
     gsf__dit_run run;
     GSF__TRY(gsf__dit_check_input(ctx, transformer, input));
     gsf__dit_begin_run(&run, ctx, transformer);
@@ -11381,19 +11361,22 @@ GSF_API gsf_result gsf_nn_transformer_forward(gsf_context* ctx, const gsf_nn_tra
     if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__dit_lay_out(&run, memory);
     const gsf_result result = gsf__dit_forward(&run, out);
-    gsf_nn_destroy_workspace(ctx, &run.nn.workspace);
+    gsf__nn_destroy_workspace(ctx, &run.nn.workspace);
     gsf_free(ctx, memory);
     return result;
 }
 
-GSF_API size_t gsf_nn_reference_kv_size(const gsf_nn_transformer* transformer, int64_t reference_tokens,
-                                        int32_t reference_batch) {
+// Floats of reference_kv: every block's keys and values of all reference tokens.
+static size_t gsf__nn_query_reference_kv(const gsf_nn_transformer* transformer, int64_t reference_tokens,
+                                         int32_t reference_batch) {
     return (size_t)transformer->layers * (size_t)reference_batch * 2 * (size_t)reference_tokens *
            (size_t)gsf__dit_width(transformer);
 }
 
-GSF_API void gsf_nn_transformer_cost(const gsf_nn_transformer* transformer, const gsf_nn_transformer_input* input,
-                                     double* bytes, double* flops) {
+// Bytes of memory (beside the mapped weights and some 70 MB of the kernels' scratch) and floating-point operations of one
+// such call.
+static void gsf__nn_query_transformer(const gsf_nn_transformer* transformer, const gsf_nn_transformer_desc* input,
+                                      double* bytes, double* flops) {
     const gsf_nn_transformer* c = transformer;
     gsf__dit_run run;
     gsf__dit_begin_run(&run, NULL, c);
@@ -11431,7 +11414,7 @@ GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_tran
         if (!result) gsf__nn_norm(&run.nn, &parts[i].by->norm, 1e-5f, to, tokens, to); // torch's default eps
         for (int64_t j = 0; !result && to == memory && j < tokens * d; j++) out[j] += memory[j];
     }
-    gsf_nn_destroy_workspace(ctx, &run.nn.workspace);
+    gsf__nn_destroy_workspace(ctx, &run.nn.workspace);
     gsf_free(ctx, memory);
     return result;
 }
@@ -11476,7 +11459,7 @@ static gsf_result gsf__nn_check_schedule(gsf_context* ctx, const gsf_nn_schedule
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: betas from %g to %g", d->beta_start, d->beta_end);
     if (!(d->snr_shift_scale > 0.0 && d->snr_shift_scale <= 1e6))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: snr_shift_scale %g", d->snr_shift_scale);
-    if ((int)d->spacing < 0 || d->spacing > GSF_NN_LINSPACE || d->steps_offset < 0 ||
+    if ((int)d->spacing < 0 || d->spacing > GSF_NN_SPACING_LINSPACE || d->steps_offset < 0 ||
         d->steps_offset >= d->train_steps)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "schedule: spacing %d, steps_offset %d", (int)d->spacing,
                         (int)d->steps_offset);
@@ -11554,12 +11537,12 @@ GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_
 static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, int32_t i) {
     const double n = d->train_steps;
     switch (d->spacing) {
-        case GSF_NN_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange adds multiples of its first difference
+        case GSF_NN_SPACING_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange adds multiples of its first difference
             const double difference = (n - n / steps) - n;
             return (int32_t)rint(n + i * difference) - 1;
         }
-        case GSF_NN_LEADING: return (steps - 1 - i) * (d->train_steps / steps) + d->steps_offset;
-        case GSF_NN_LINSPACE: { // round(linspace(0, n - 1, steps)) reversed
+        case GSF_NN_SPACING_LEADING: return (steps - 1 - i) * (d->train_steps / steps) + d->steps_offset;
+        case GSF_NN_SPACING_LINSPACE: { // round(linspace(0, n - 1, steps)) reversed
             if (steps == 1) return 0;
             return i == 0 ? d->train_steps - 1 : (int32_t)rint((steps - 1 - i) * ((n - 1.0) / (steps - 1)));
         }
@@ -11567,7 +11550,9 @@ static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, in
     return 0;
 }
 
-GSF_API gsf_result gsf_nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
+// Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
+// (int)(steps * strength) of them, for latents that start as the noised render. out: room for `steps`.
+static gsf_result gsf__nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
                                          double strength, int32_t* out, int32_t* count) {
     const gsf_nn_schedule_desc* d = &schedule->desc;
     *count = 0;
@@ -11598,7 +11583,7 @@ typedef struct gsf__nn_step { // m: predicted clean latents; m0, m1: those of th
     float *x, *x0, *m0, *m1, *last;         // all but x may be NULL
 } gsf__nn_step;
 
-static void gsf__nn_step_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__nn_step_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__nn_step* s = (const gsf__nn_step*)arg;
     (void)worker;
     const size_t begin = chunk * GSF__NN_CHUNK;
@@ -11630,20 +11615,21 @@ static void gsf__nn_mix(gsf_context* ctx, double a, const float* x, double b, co
     gsf__parallel_for(ctx, (count + GSF__NN_CHUNK - 1) / GSF__NN_CHUNK, gsf__nn_step_chunk, &job);
 }
 
-GSF_API void gsf_nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
+static void gsf__nn_add_noise(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
                               const float* noise, size_t count, float* out) {
     const double bar = schedule->alpha_bar[timestep];
     gsf__nn_mix(ctx, sqrt(bar), x0, sqrt(1.0 - bar), noise, count, out);
 }
 
-GSF_API void gsf_nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x0,
-                                  const float* noise, size_t count, float* out) {
+GSF__SHARED void gsf__nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep,
+                                       const float* x0, const float* noise, size_t count, float* out) {
     const double bar = schedule->alpha_bar[timestep];
     gsf__nn_mix(ctx, -sqrt(1.0 - bar), x0, sqrt(bar), noise, count, out);
 }
 
-GSF_API void gsf_nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
-                               const float* v, size_t count, float* out) {
+// Elementwise over `count` values; out may be an input. timestep: 0..train_steps-1.
+GSF__SHARED void gsf__nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
+                                    const float* v, size_t count, float* out) {
     const double bar = schedule->alpha_bar[timestep];
     gsf__nn_mix(ctx, sqrt(bar), x, -sqrt(1.0 - bar), v, count, out);
 }
@@ -11671,7 +11657,7 @@ static gsf__nn_point gsf__nn_sampler_point(const gsf_nn_sampler* sampler, int32_
 // Where the step from `index` leads.
 static gsf__nn_point gsf__nn_sampler_target(const gsf_nn_sampler* sampler, int32_t index) {
     const gsf_nn_schedule* schedule = sampler->schedule;
-    const int32_t next = sampler->desc.solver == GSF_NN_DDIM
+    const int32_t next = sampler->desc.solver == GSF_NN_SOLVER_DDIM
                              ? sampler->timesteps[index] - schedule->desc.train_steps / sampler->desc.steps
                              : index + 1 < sampler->count ? sampler->timesteps[index + 1] : -1;
     return gsf__nn_point_at(next >= 0 ? schedule->alpha_bar[next] : schedule->final_alpha_bar);
@@ -11729,7 +11715,7 @@ GSF_API gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* 
     sampler.desc = *desc;
     sampler.schedule = schedule;
     if (!sampler.desc.steps) sampler.desc.steps = 50;
-    if ((int)desc->solver < 0 || desc->solver > GSF_NN_UNIPC || sampler.desc.steps < 1 ||
+    if ((int)desc->solver < 0 || desc->solver > GSF_NN_SOLVER_UNIPC || sampler.desc.steps < 1 ||
         sampler.desc.steps > schedule->desc.train_steps || !gsf__mul_size(desc->value_count, 3, &sampler.memory_count))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sampler: solver %d, %d steps, %zu values", (int)desc->solver,
                         (int)sampler.desc.steps, desc->value_count);
@@ -11738,8 +11724,8 @@ GSF_API gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* 
     sampler.timesteps = (int32_t*)gsf_alloc(ctx, (size_t)sampler.desc.steps, sizeof(int32_t));
     if (sampler.timesteps) sampler.memory = (float*)gsf_alloc_zeroed(ctx, sampler.memory_count, sizeof(float));
     if (sampler.memory)
-        result = gsf_nn_make_timesteps(ctx, schedule, sampler.desc.steps, desc->strength, sampler.timesteps,
-                                       &sampler.count);
+        result = gsf__nn_make_timesteps(ctx, schedule, sampler.desc.steps, desc->strength, sampler.timesteps,
+                                        &sampler.count);
     if (result != GSF_OK) gsf_nn_destroy_sampler(ctx, &sampler);
     *out = sampler;
     return result;
@@ -11762,11 +11748,11 @@ static void gsf__nn_plan_step(const gsf_nn_sampler* sampler, gsf__nn_step* step)
     if (i > 1) before[1] = gsf__nn_sampler_point(sampler, i - 2);
     step->m_x = p.a;
     step->m_v = -p.s;
-    const int second = sampler->desc.solver != GSF_NN_DDIM && i > 0 && i + 1 < sampler->count;
+    const int second = sampler->desc.solver != GSF_NN_SOLVER_DDIM && i > 0 && i + 1 < sampler->count;
     gsf__nn_predictor(step, p, t, second ? &before[0] : NULL);
-    if (sampler->desc.solver == GSF_NN_DDIM) return;
+    if (sampler->desc.solver == GSF_NN_SOLVER_DDIM) return;
     step->m0 = sampler->memory;
-    if (sampler->desc.solver != GSF_NN_UNIPC) return;
+    if (sampler->desc.solver != GSF_NN_SOLVER_UNIPC) return;
     step->m1 = sampler->memory + n;
     step->last = sampler->memory + 2 * n;
     if (i > 0) gsf__nn_corrector(step, i > 1 ? &before[1] : NULL, before[0], p);
@@ -11810,13 +11796,13 @@ typedef struct gsf__sample_run {
     float *latents, *control;      // (frames, channels, height, width), control scaled as the network takes it
     float *input, *prediction;     // (2, frames, 2 channels, height, width), (2, frames, channels, height, width)
     float* reference_kv;
-    int reference_kv_ready;
+    int32_t reference_kv_ready;
     gsf_nn_block_cache cache;
     gsf_nn_sampler sampler;
     uint32_t settings, clip; // checksums of everything that the result depends on; with a checkpoint
 } gsf__sample_run;
 
-GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc) {
+GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample_desc(const gsf_nn_sample_desc* desc) {
     gsf_nn_sample_desc d = *desc;
     if (!d.steps) d.steps = 50;
     if (d.guidance == 0.0f) d.guidance = 6.0f;
@@ -11828,7 +11814,7 @@ GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample(const gsf_nn_sample_desc* desc)
 static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) {
     if (d->_start_canary != 0 || d->_end_canary != 0)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: the desc was not zeroed");
-    *d = gsf_nn_resolve_sample(d);
+    *d = gsf_nn_resolve_sample_desc(d);
     if (d->steps < 1 || d->steps > 1000)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sample: %d steps, not 1 to 1000", (int)d->steps);
     if (!(d->strength > 0.0f && d->strength <= 1.0f))
@@ -11885,7 +11871,7 @@ static void gsf__swap_frames(const float* from, int64_t outer, int64_t inner, in
 static gsf_result gsf__sample_encode(gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     float* mean = run->prediction;
-    GSF__TRY(gsf_nn_vae_encode(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, mean, NULL));
+    GSF__TRY(gsf_nn_encode_vae(run->ctx, run->vae, NULL, d->control, d->frames, d->height, d->width, mean, NULL));
     gsf__swap_frames(mean, run->channels, run->frames, (int64_t)run->height * run->width,
                      (float)run->vae->scaling_factor, run->control);
     return GSF_OK;
@@ -11894,17 +11880,17 @@ static gsf_result gsf__sample_encode(gsf__sample_run* run) {
 static gsf_result gsf__sample_decode(gsf__sample_run* run, float* out) {
     gsf__swap_frames(run->latents, run->frames, run->channels, (int64_t)run->height * run->width,
                      (float)(1.0 / run->vae->scaling_factor), run->prediction);
-    return gsf_nn_vae_decode(run->ctx, run->vae, NULL, run->prediction, run->frames, run->height, run->width, out);
+    return gsf_nn_decode_vae(run->ctx, run->vae, NULL, run->prediction, run->frames, run->height, run->width, out);
 }
 
 // Pure noise, or at strength < 1 the control latents with the noise of the first step.
 static void gsf__sample_begin(gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     for (int64_t i = 0; i < run->count; i++)
-        run->latents[i] = d->noise ? d->noise[i] : (float)gsf_random_normal(d->seed, GSF__SAMPLE_STREAM, (uint64_t)i);
+        run->latents[i] = d->noise ? d->noise[i] : (float)gsf_draw_normal(d->seed, GSF__SAMPLE_STREAM, (uint64_t)i);
     if (run->sampler.count < d->steps)
-        gsf_nn_add_noise(run->ctx, run->schedule, run->sampler.timesteps[0], run->control, run->latents,
-                         (size_t)run->count, run->latents);
+        gsf__nn_add_noise(run->ctx, run->schedule, run->sampler.timesteps[0], run->control, run->latents,
+                          (size_t)run->count, run->latents);
 }
 
 // ---- checkpoint: what identifies the job, the step, the latents and what the solver remembers
@@ -11913,8 +11899,8 @@ static void gsf__sample_begin(gsf__sample_run* run) {
 // middle and end.
 static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weights) {
     for (size_t i = 0; i < weights->tensor_count; i++) {
-        const gsf_tensor* t = &weights->tensors[i];
-        const size_t size = (size_t)t->count * gsf_nn_dtype_size(t->dtype), part = size < 64 ? size : 64;
+        const gsf_nn_tensor* t = &weights->tensors[i];
+        const size_t size = (size_t)t->count * gsf_nn_get_dtype_size(t->dtype), part = size < 64 ? size : 64;
         const size_t at[3] = {0, (size - part) / 2, size - part};
         crc = gsf__crc32(crc, t->name, strlen(t->name) + 1);
         crc = gsf__crc32(crc, &t->dtype, sizeof t->dtype);
@@ -11962,19 +11948,19 @@ static uint32_t gsf__sample_sum_clip(const gsf__sample_run* run) {
 
 static gsf_result gsf__sample_save(gsf__sample_run* run) {
     if (!run->desc.checkpoint) return GSF_OK;
-    gsf_text file;
+    gsf_buffer file;
     char head[12];
     memset(&file, 0, sizeof file);
     gsf__store_le(head, run->clip, 4);
     gsf__store_le(head + 4, (uint64_t)run->sampler.index, 4);
     gsf__store_le(head + 8, run->settings, 4);
-    gsf_chunks_add(run->ctx, &file, "SAMP", head, sizeof head);
-    gsf_chunks_add(run->ctx, &file, "LATE", run->latents, (size_t)run->count * sizeof(float));
-    gsf_chunks_add(run->ctx, &file, "MEMO", run->sampler.memory, run->sampler.memory_count * sizeof(float));
-    gsf_chunks_end(run->ctx, &file);
+    gsf_append_chunk(run->ctx, &file, "SAMP", head, sizeof head);
+    gsf_append_chunk(run->ctx, &file, "LATE", run->latents, (size_t)run->count * sizeof(float));
+    gsf_append_chunk(run->ctx, &file, "MEMO", run->sampler.memory, run->sampler.memory_count * sizeof(float));
+    gsf_append_last_chunk(run->ctx, &file);
     const gsf_result result =
         file.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(run->ctx, run->desc.checkpoint, file.data, file.size);
-    gsf_destroy_text(run->ctx, &file);
+    gsf_destroy_buffer(run->ctx, &file);
     return result;
 }
 
@@ -11989,8 +11975,8 @@ static int gsf__sample_is_finite(const gsf_chunk* floats) {
 
 static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size) {
     gsf_chunk head, latents, memory;
-    if (!gsf_chunks_find(data, size, "SAMP", &head) || !gsf_chunks_find(data, size, "LATE", &latents) ||
-        !gsf_chunks_find(data, size, "MEMO", &memory))
+    if (!gsf_find_chunk(data, size, "SAMP", &head) || !gsf_find_chunk(data, size, "LATE", &latents) ||
+        !gsf_find_chunk(data, size, "MEMO", &memory))
         return;
     if (head.size != 12 || gsf__load_le((const char*)head.data + 8, 4) != run->settings) {
         gsf_log(run->ctx, GSF_LOG_WARNING, "%s: made with another model, precision or other settings: the clip starts anew",
@@ -12016,7 +12002,7 @@ static gsf_result gsf__sample_resume(gsf__sample_run* run) {
     if (!run->desc.checkpoint) return GSF_OK;
     GSF__TRY(gsf__nn_read_if_there(run->ctx, run->desc.checkpoint, &data, &size));
     if (!data) return GSF_OK;
-    if (gsf_chunks_check(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
+    if (gsf_check_chunks(run->ctx, run->desc.checkpoint, data, size) == GSF_OK) gsf__sample_take(run, data, size);
     gsf_free(run->ctx, data);
     run->stats.resumed_from = run->sampler.index;
     return GSF_OK;
@@ -12051,7 +12037,7 @@ static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
     const gsf_nn_transformer* t = run->net;
     const int32_t rows = guidance == 1.0f ? 1 : 2;
     const double step = run->sampler.timesteps[run->sampler.index], steps[2] = {step, step};
-    gsf_nn_transformer_input in;
+    gsf_nn_transformer_desc in;
     memset(&in, 0, sizeof in);
     in.batch = rows;
     in.frames = run->frames;
@@ -12068,7 +12054,7 @@ static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
     in.cache = &run->cache;
     const int64_t hits = run->cache.hits;
     gsf__sample_fill_input(run, rows);
-    GSF__TRY(gsf_nn_transformer_forward(run->ctx, t, &in, run->prediction));
+    GSF__TRY(gsf_nn_run_transformer(run->ctx, t, &in, run->prediction));
     // A step that the cache cut short after the first block has not filled the other blocks' keys and values.
     if (run->cache.hits == hits) run->reference_kv_ready = 1;
     run->stats.network_rows += rows;
@@ -12128,13 +12114,13 @@ static void gsf__sample_sizes(gsf__sample_run* run, const gsf_nn_sample_desc* d)
 
 static size_t gsf__sample_kv_size(const gsf__sample_run* run) {
     if (!run->desc.references || run->desc.no_reference_cache) return 0;
-    return gsf_nn_reference_kv_size(run->net, run->desc.reference_tokens, 1);
+    return gsf__nn_query_reference_kv(run->net, run->desc.reference_tokens, 1);
 }
 
 enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents, control, input 2 x 2, prediction 2
 
-GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
-                                      const gsf_nn_sample_desc* desc, gsf_nn_cost* out) {
+GSF_API gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
+                                       const gsf_nn_sample_desc* desc, gsf_nn_sample_info* out) {
     gsf__sample_run run;
     gsf_nn_vae_info encode, decode;
     memset(&run, 0, sizeof run);
@@ -12153,7 +12139,7 @@ GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer
     for (int32_t i = 0; i < steps; i++) {
         const float at = ((float)i + 0.5f) / (float)steps;
         const int guided = run.desc.guidance != 1.0f && at >= run.desc.guidance_begin && at <= run.desc.guidance_end;
-        gsf_nn_transformer_input in;
+        gsf_nn_transformer_desc in;
         double step_bytes, step_flops;
         memset(&in, 0, sizeof in);
         in.batch = guided ? 2 : 1;
@@ -12164,7 +12150,7 @@ GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer
         in.reference_tokens = desc->reference_tokens;
         in.reference_batch = 1;
         in.reference_kv_ready = i > 0 && !desc->no_reference_cache;
-        gsf_nn_transformer_cost(transformer, &in, &step_bytes, &step_flops);
+        gsf__nn_query_transformer(transformer, &in, &step_bytes, &step_flops);
         out->flops += step_flops;
         if (step_bytes > bytes) bytes = step_bytes;
     }
@@ -12178,9 +12164,9 @@ GSF_API gsf_result gsf_nn_sample_cost(gsf_context* ctx, const gsf_nn_transformer
 
 static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
                                            const gsf_nn_sample_desc* d) {
-    gsf_nn_cost cost;
+    gsf_nn_sample_info cost;
     if (!(d->max_bytes > 0.0)) return GSF_OK;
-    GSF__TRY(gsf_nn_sample_cost(ctx, t, v, d, &cost));
+    GSF__TRY(gsf_nn_query_sample(ctx, t, v, d, &cost));
     if (cost.bytes <= d->max_bytes) return GSF_OK;
     return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY,
                     "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed",
@@ -12235,8 +12221,8 @@ typedef struct gsf__dit_restorer {
     size_t kept_count, kept_capacity;
     int unsaved;               // something was kept that the file of saved features lacks
     float *prompt, *references; // (2, text tokens, text channels); (reference_tokens, width) or NULL
-    gsf_text caption;          // that `prompt` was made of
-    gsf_text shown;            // which photos `references` were made of
+    gsf_buffer caption;        // that `prompt` was made of
+    gsf_buffer shown;          // which photos `references` were made of
     int64_t reference_tokens;
     double encoder_bytes, encoder_flops; // at the configured size: at the peak; of all
     gsf_reference* photos;     // colours (u8) and cameras, between begin and end
@@ -12246,7 +12232,7 @@ typedef struct gsf__dit_restorer {
 } gsf__dit_restorer;
 
 static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
-                                 gsf_restorer_limits* out) {
+                                 gsf_restorer_info* out) {
     const gsf__dit_restorer* r = (const gsf__dit_restorer*)user;
     const gsf_nn_transformer* t = &r->transformer;
     const gsf_nn_vae* v = &r->vae;
@@ -12271,10 +12257,10 @@ static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_cou
     d.height = height;
     d.references = r->references;
     d.reference_tokens = r->reference_tokens;
-    gsf_nn_cost cost;
+    gsf_nn_sample_info cost;
     if (frame_count >= out->frame_count_min && frame_count <= out->frame_count_max && (frame_count - 1) % step == 0 &&
         width % out->width_multiple == 0 && height % out->height_multiple == 0 &&
-        gsf_nn_sample_cost(ctx, &r->transformer, &r->vae, &d, &cost) == GSF_OK) {
+        gsf_nn_query_sample(ctx, &r->transformer, &r->vae, &d, &cost) == GSF_OK) {
         out->bytes = cost.bytes > r->encoder_bytes ? cost.bytes : r->encoder_bytes;
         out->flops = cost.flops + r->encoder_flops;
     }
@@ -12303,19 +12289,19 @@ static gsf_result gsf__dit_measure(gsf_context* ctx, gsf__dit_restorer* r) {
     double* distances = (double*)gsf_alloc(ctx, (size_t)n, sizeof *distances);
     if (!distances) return GSF_ERROR_OUT_OF_MEMORY;
     for (int32_t i = 0; i < n; i++) {
-        gsf_camera_center(&r->photos[i].camera, center);
+        gsf_get_camera_center(&r->photos[i].camera, center);
         for (int k = 0; k < 3; k++) mean[k] += center[k] / n;
     }
     for (int32_t i = 0; i < n; i++) {
         const double* m = r->photos[i].camera.w2c;
         double along = 0.0;
-        gsf_camera_center(&r->photos[i].camera, center);
+        gsf_get_camera_center(&r->photos[i].camera, center);
         for (int k = 0; k < 3; k++) along += m[4 * k + 2] * (mean[k] - center[k]); // third row: forward
         for (int k = 0; k < 3; k++) focus[k] += (center[k] + along * m[4 * k + 2]) / n;
     }
     for (int32_t i = 0; i < n; i++) {
         double square = 0.0;
-        gsf_camera_center(&r->photos[i].camera, center);
+        gsf_get_camera_center(&r->photos[i].camera, center);
         for (int k = 0; k < 3; k++) square += (center[k] - focus[k]) * (center[k] - focus[k]);
         distances[i] = sqrt(square);
     }
@@ -12395,7 +12381,7 @@ static int gsf__dit_sample(const gsf__dit_control* control, int64_t x, int64_t y
     return 1;
 }
 
-static void gsf__dit_control_row(void* arg, size_t row, int worker) { // to [-1,1]; a NaN is black
+static void gsf__dit_control_row(void* arg, size_t row, int32_t worker) { // to [-1,1]; a NaN is black
     const gsf__dit_control* control = (const gsf__dit_control*)arg;
     const gsf_image* image = control->image;
     const int64_t y = (int64_t)row;
@@ -12527,9 +12513,9 @@ static void gsf__dit_add_cost(gsf__dit_restorer* r, double bytes, double flops) 
 }
 
 // Two photos of the aspect that the transformer was made for, prepared.
-static gsf_nn_encoder_input gsf__dit_usual_references(const gsf__dit_restorer* r) {
+static gsf_nn_encoder_desc gsf__dit_usual_references(const gsf__dit_restorer* r) {
     const gsf_nn_transformer* t = &r->transformer;
-    gsf_nn_encoder_input in;
+    gsf_nn_encoder_desc in;
     memset(&in, 0, sizeof in);
     const double side = GSF__REFERENCE_SIDE, patch = GSF__REFERENCE_PATCH;
     const double patches = rint(side * t->sample_height / t->sample_width / patch);
@@ -12552,18 +12538,18 @@ static const gsf__dit_kind gsf__dit_kinds[2] = {
 static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
     const gsf__dit_kind* k = &gsf__dit_kinds[kind];
     const gsf_nn_transformer* t = &p->r->transformer;
-    const gsf_nn_encoder_input usual = gsf__dit_usual_references(p->r);
+    const gsf_nn_encoder_desc usual = gsf__dit_usual_references(p->r);
     const int vggt = kind == GSF__DIT_VGGT;
     gsf_nn_dinov2 flat;
     gsf_nn_vggt deep;
-    gsf_text folder;
+    gsf_buffer folder;
     double bytes, flops;
     gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, k->folder, &folder);
-    if (!result) result = vggt ? gsf_nn_make_vggt(p->ctx, folder.data, &deep) : gsf_nn_make_dinov2(p->ctx, folder.data, &flat);
-    gsf_destroy_text(p->ctx, &folder);
+    if (!result) result = vggt ? gsf_nn_load_vggt(p->ctx, folder.data, &deep) : gsf_nn_load_dinov2(p->ctx, folder.data, &flat);
+    gsf_destroy_buffer(p->ctx, &folder);
     if (result) return gsf__dit_absent(p, result, k->makes, k->instead);
-    if (vggt) gsf_nn_vggt_cost(&deep, &usual, &bytes, &flops);
-    else gsf_nn_dinov2_cost(&flat, &usual, &bytes, &flops);
+    if (vggt) gsf__nn_query_vggt(&deep, &usual, &bytes, &flops);
+    else gsf__nn_query_dinov2(&flat, &usual, &bytes, &flops);
     result = gsf__dit_misfit(p, k->folder, vggt ? 2 * (int64_t)deep.width : flat.width,
                              vggt ? t->vggt_channels : t->dino_channels);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
@@ -12576,42 +12562,43 @@ static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
 
 // Ids of both prompts; caption NULL: only opens the tokenizer.
 static gsf_result gsf__dit_tokenize(const gsf__dit_part* p, const char* caption, int32_t* ids) {
-    gsf_text text;
+    gsf_buffer text;
     gsf_nn_tokenizer model;
     const size_t room = (size_t)p->r->transformer.text_tokens;
     gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "tokenizer", &text);
     memset(&model, 0, sizeof model);
-    if (!result) result = gsf_nn_make_tokenizer(p->ctx, text.data, &model);
+    if (!result) result = gsf_nn_load_tokenizer(p->ctx, text.data, &model);
     if (!result && caption) {
         text.size = 0;
-        gsf_text_printf(p->ctx, &text, "%s%s", caption, gsf__dit_praise);
+        gsf_append_text(p->ctx, &text, "%s%s", caption, gsf__dit_praise);
         if (text.failed) result = GSF_ERROR_OUT_OF_MEMORY;
         if (!result)
-            result = gsf_nn_tokenize(p->ctx, &model, gsf__dit_negative, sizeof gsf__dit_negative - 1, ids, room, NULL);
-        if (!result) result = gsf_nn_tokenize(p->ctx, &model, text.data, text.size, ids + room, room, NULL);
+            result = gsf_nn_encode_text(p->ctx, &model, gsf__dit_negative, sizeof gsf__dit_negative - 1, ids, room,
+                                        NULL);
+        if (!result) result = gsf_nn_encode_text(p->ctx, &model, text.data, text.size, ids + room, room, NULL);
     }
     gsf_nn_destroy_tokenizer(p->ctx, &model);
-    gsf_destroy_text(p->ctx, &text);
+    gsf_destroy_buffer(p->ctx, &text);
     return result;
 }
 
 static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids) { // NULL: only opens the encoder
-    gsf_text folder;
+    gsf_buffer folder;
     gsf_nn_t5 model;
-    gsf_nn_t5_input in;
+    gsf_nn_t5_desc in;
     double bytes, flops;
     memset(&in, 0, sizeof in);
     in.ids = ids;
     in.batch = 2;
     in.tokens = p->r->transformer.text_tokens;
     gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "text_encoder", &folder);
-    if (!result) result = gsf_nn_make_t5(p->ctx, folder.data, &model);
-    gsf_destroy_text(p->ctx, &folder);
+    if (!result) result = gsf_nn_load_t5(p->ctx, folder.data, &model);
+    gsf_destroy_buffer(p->ctx, &folder);
     if (result) return result;
     result = gsf__dit_misfit(p, "text_encoder", model.width, p->r->transformer.text_channels);
-    gsf_nn_t5_cost(&model, &in, &bytes, &flops);
+    gsf__nn_query_t5(&model, &in, &bytes, &flops);
     if (!ids) gsf__dit_add_cost(p->r, bytes, flops);
-    else if (!result) result = gsf_nn_t5_encode(p->ctx, &model, &in, p->r->prompt);
+    else if (!result) result = gsf_nn_encode_t5(p->ctx, &model, &in, p->r->prompt);
     gsf_nn_destroy_t5(p->ctx, &model);
     return result;
 }
@@ -12625,7 +12612,7 @@ static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
         if (!r->prompt)
             r->prompt = (float*)gsf_alloc(p->ctx, 2 * tokens * sizeof(float), (size_t)r->transformer.text_channels);
         ids = (int32_t*)gsf_alloc(p->ctx, 2 * tokens, sizeof *ids);
-        gsf_destroy_text(p->ctx, &r->caption);
+        gsf_destroy_buffer(p->ctx, &r->caption);
         if (!ids || !r->prompt) {
             gsf_free(p->ctx, ids);
             return GSF_ERROR_OUT_OF_MEMORY;
@@ -12634,22 +12621,22 @@ static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
     gsf_result result = gsf__dit_tokenize(p, caption, ids);
     if (!result) result = gsf__dit_encode_ids(p, ids);
     gsf_free(p->ctx, ids);
-    if (!result && caption) gsf_text_printf(p->ctx, &r->caption, "%s", caption);
+    if (!result && caption) gsf_append_text(p->ctx, &r->caption, "%s", caption);
     return gsf__dit_absent(p, result, "the prompts' embeddings", "");
 }
 
 // What the photo shows, as `out` (GSF__DIT_CAPTION_BYTES); without a photo the captioner is only opened.
 static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
-    gsf_text folder;
+    gsf_buffer folder;
     gsf_nn_captioner model;
     double bytes, flops;
     gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "blip2", &folder);
-    if (!result) result = gsf_nn_make_captioner(p->ctx, folder.data, &model);
-    gsf_destroy_text(p->ctx, &folder);
+    if (!result) result = gsf_nn_load_captioner(p->ctx, folder.data, &model);
+    gsf_destroy_buffer(p->ctx, &folder);
     if (result) return gsf__dit_absent(p, result, "the caption", ", or a caption,");
-    gsf_nn_caption_cost(&model, 0, 0, &bytes, &flops);
+    gsf__nn_query_captioner(&model, 0, 0, &bytes, &flops);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
-    else result = gsf_nn_caption(p->ctx, &model, p->photos, NULL, 0, out, GSF__DIT_CAPTION_BYTES);
+    else result = gsf_nn_caption_image(p->ctx, &model, p->photos, NULL, 0, out, GSF__DIT_CAPTION_BYTES);
     gsf_nn_destroy_captioner(p->ctx, &model);
     return result;
 }
@@ -12659,11 +12646,11 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
 static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* camera) {
     int32_t best = 0;
     double least = 0.0, center[3], other[3];
-    gsf_camera_center(camera, center);
+    gsf_get_camera_center(camera, center);
     for (int32_t i = 0; i < r->photo_count; i++) {
         const gsf_camera* c = &r->photos[i].camera;
         double square = 0.0, cosine = 0.0;
-        gsf_camera_center(c, other);
+        gsf_get_camera_center(c, other);
         for (int k = 0; k < 3; k++) {
             square += (center[k] - other[k]) * (center[k] - other[k]);
             cosine += camera->w2c[4 * k + 2] * c->w2c[4 * k + 2]; // third row: forward
@@ -12786,7 +12773,7 @@ static int gsf__dit_compare_names(const void* a, const void* b) {
 static gsf_result gsf__dit_save(gsf_context* ctx, gsf__dit_restorer* r) {
     if (!r->desc.save_features || !r->unsaved) return GSF_OK;
     if (r->kept_count) qsort(r->kept, r->kept_count, sizeof *r->kept, gsf__dit_compare_names); // in whatever order they came
-    gsf_tensor* tensors = (gsf_tensor*)gsf_alloc(ctx, r->kept_count + 1, sizeof *tensors);
+    gsf_nn_tensor* tensors = (gsf_nn_tensor*)gsf_alloc(ctx, r->kept_count + 1, sizeof *tensors);
     if (!tensors) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < r->kept_count; i++)
         tensors[i] = gsf_nn_wrap_tensor(r->kept[i].name, r->kept[i].values, 3, r->kept[i].shape);
@@ -12798,10 +12785,10 @@ static gsf_result gsf__dit_save(gsf_context* ctx, gsf__dit_restorer* r) {
 
 // "dino_latents.photo4,7"
 static gsf_result gsf__dit_name_photos(gsf_context* ctx, const char* bare, const int32_t* photos, int32_t count,
-                                       gsf_text* out) {
+                                       gsf_buffer* out) {
     out->size = 0;
-    gsf_text_printf(ctx, out, "%s.photo", bare);
-    for (int32_t i = 0; i < count; i++) gsf_text_printf(ctx, out, i ? ",%d" : "%d", (int)photos[i]);
+    gsf_append_text(ctx, out, "%s.photo", bare);
+    for (int32_t i = 0; i < count; i++) gsf_append_text(ctx, out, i ? ",%d" : "%d", (int)photos[i]);
     return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
 
@@ -12813,7 +12800,7 @@ typedef struct gsf__dit_clip { // whose features are wanted
     int32_t clip;
     int32_t* chosen;           // photos
     int32_t count;
-    gsf_text name;             // scratch
+    gsf_buffer name;           // scratch
     gsf_nn_features features;
 } gsf__dit_clip;
 
@@ -12925,8 +12912,8 @@ static int32_t gsf__dit_clip_number(const gsf_restore_window* window) { // 0 whe
 
 static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window) {
     gsf__dit_clip c;
-    gsf_text shown;
-    if (r->desc.condition == GSF_NN_NONE) return GSF_OK;
+    gsf_buffer shown;
+    if (r->desc.condition == GSF_NN_CONDITION_NONE) return GSF_OK;
     memset(&c, 0, sizeof c);
     memset(&shown, 0, sizeof shown);
     c.ctx = ctx;
@@ -12939,16 +12926,17 @@ static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const g
     if (!result && (!r->shown.size || strcmp(r->shown.data, shown.data) != 0)) {
         r->shown.size = 0;
         gsf_nn_features* f = &c.features;
-        if (r->desc.condition != GSF_NN_3D) result = gsf__dit_gather(&c, GSF__DIT_DINO, &f->dino, &f->dino_channels);
-        if (!result && r->desc.condition != GSF_NN_2D)
+        if (r->desc.condition != GSF_NN_CONDITION_3D) result = gsf__dit_gather(&c, GSF__DIT_DINO, &f->dino,
+                                                                               &f->dino_channels);
+        if (!result && r->desc.condition != GSF_NN_CONDITION_2D)
             result = gsf__dit_gather(&c, GSF__DIT_VGGT, &f->vggt, &f->vggt_channels);
         if (!result) result = gsf__dit_project(ctx, r, &c.features);
-        if (!result) gsf_text_printf(ctx, &r->shown, "%s", shown.data);
+        if (!result) gsf_append_text(ctx, &r->shown, "%s", shown.data);
         if (r->shown.failed) result = GSF_ERROR_OUT_OF_MEMORY;
     }
     gsf_nn_destroy_features(ctx, &c.features);
-    gsf_destroy_text(ctx, &c.name);
-    gsf_destroy_text(ctx, &shown);
+    gsf_destroy_buffer(ctx, &c.name);
+    gsf_destroy_buffer(ctx, &shown);
     gsf_free(ctx, c.chosen);
     return result;
 }
@@ -12983,9 +12971,9 @@ static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const 
 
 // File of the part's steps: each part of a clip has its own, so that those that are done need not be done again.
 static gsf_result gsf__dit_checkpoint(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
-                                      gsf_text* path, gsf_nn_sample_desc* d) {
+                                      gsf_buffer* path, gsf_nn_sample_desc* d) {
     if (!d->checkpoint || window->struct_size < sizeof *window || !window->part) return GSF_OK;
-    gsf_text_printf(ctx, path, "%s.%d", r->desc.sample.checkpoint, (int)window->part);
+    gsf_append_text(ctx, path, "%s.%d", r->desc.sample.checkpoint, (int)window->part);
     d->checkpoint = path->data;
     return path->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
@@ -12993,7 +12981,7 @@ static gsf_result gsf__dit_checkpoint(gsf_context* ctx, const gsf__dit_restorer*
 static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_restore_window* window) {
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
     gsf_nn_sample_desc d = r->desc.sample;
-    gsf_text checkpoint;
+    gsf_buffer checkpoint;
     memset(&checkpoint, 0, sizeof checkpoint);
     gsf__progress(ctx, "clip", 0.0, 1.0);
     GSF__TRY(gsf__dit_prompt(ctx, r, window, &d.text));
@@ -13013,7 +13001,7 @@ static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_resto
     d.control = video;
     if (!result) result = gsf_nn_sample(ctx, &r->transformer, &r->vae, &r->schedule, &d, video + values, NULL);
     if (!result) gsf__dit_store_frames(window, video + values);
-    gsf_destroy_text(ctx, &checkpoint);
+    gsf_destroy_buffer(ctx, &checkpoint);
     gsf_free(ctx, video);
     return result;
 }
@@ -13034,7 +13022,8 @@ static int gsf__dit_has(const gsf__dit_restorer* r, const char* bare, const char
     return 0;
 }
 
-static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, const char* file, const gsf_tensor* t) {
+static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, const char* file,
+                                        const gsf_nn_tensor* t) {
     const gsf_nn_transformer* c = &r->transformer;
     const int prompt = gsf__dit_is_name(t->name, "prompt_embeds", "clip"), dino = gsf__dit_is_name(t->name, "dino_latents", "photo");
     const int64_t channels = prompt ? c->text_channels : dino ? c->dino_channels : c->vggt_channels;
@@ -13045,7 +13034,7 @@ static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, 
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", file, t->name,
                         (long long)channels);
     GSF__TRY(gsf__dit_keep(ctx, r, t->name, t->shape[0], t->shape[1], t->shape[2], 0, &values));
-    gsf_nn_read_tensor(t, 0, t->count, values);
+    gsf_nn_convert_tensor(t, 0, t->count, values);
     return GSF_OK;
 }
 
@@ -13053,8 +13042,8 @@ static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, 
 static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const char* path, const void* data,
                                          size_t size) {
     gsf_nn_weights file;
-    gsf_result result = data ? gsf_nn_open_weights_memory(ctx, path, data, size, &file)
-                             : gsf_nn_open_weights(ctx, path, NULL, &file);
+    gsf_result result = data ? gsf_nn_parse_weights(ctx, path, data, size, &file)
+                             : gsf_nn_load_weights(ctx, path, NULL, &file);
     for (size_t i = 0; i < file.tensor_count && !result; i++)
         result = gsf__dit_read_feature(ctx, r, file.name, &file.tensors[i]);
     const gsf__dit_kept *dino = gsf__dit_find(r, "dino_latents"), *vggt = gsf__dit_find(r, "vggt_latents");
@@ -13062,7 +13051,7 @@ static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r,
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld rows of dino_latents, but %lld x %lld of vggt_latents",
                           file.name, (long long)dino->shape[0], (long long)dino->shape[1], (long long)vggt->shape[0],
                           (long long)vggt->shape[1]);
-    gsf_nn_close_weights(ctx, &file);
+    gsf_nn_destroy_weights(ctx, &file);
     return result;
 }
 
@@ -13079,9 +13068,11 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
         GSF__TRY(gsf__dit_text(&prompt, NULL));
         if (!r->desc.caption) GSF__TRY(gsf__dit_describe(&prompt, NULL));
     }
-    if (condition != GSF_NN_NONE && condition != GSF_NN_3D && !gsf__dit_has(r, "dino_latents", "photo"))
+    if (condition != GSF_NN_CONDITION_NONE && condition != GSF_NN_CONDITION_3D && !gsf__dit_has(r, "dino_latents",
+                                                                                                "photo"))
         GSF__TRY(gsf__dit_see(&dino, GSF__DIT_DINO));
-    if (condition != GSF_NN_NONE && condition != GSF_NN_2D && !gsf__dit_has(r, "vggt_latents", "photo"))
+    if (condition != GSF_NN_CONDITION_NONE && condition != GSF_NN_CONDITION_2D && !gsf__dit_has(r, "vggt_latents",
+                                                                                                "photo"))
         GSF__TRY(gsf__dit_see(&vggt, GSF__DIT_VGGT));
     if (r->desc.keep_saved && r->desc.save_features) // last, so that a run that goes on looks where it did before
         GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
@@ -13094,13 +13085,13 @@ static gsf_result gsf__dit_open(gsf_context* ctx, gsf__dit_restorer* r) {
     static const char* const parts[3] = {"transformer", "vae", "scheduler/scheduler_config.json"};
     gsf_result result = GSF_OK;
     for (int i = 0; i < 3 && !result; i++) {
-        gsf_text path;
+        gsf_buffer path;
         result = gsf__nn_join(ctx, r->desc.model, parts[i], &path);
         if (!result)
-            result = i == 0   ? gsf_nn_make_transformer(ctx, path.data, &r->transformer)
-                     : i == 1 ? gsf_nn_make_vae(ctx, path.data, &r->vae)
+            result = i == 0   ? gsf_nn_load_transformer(ctx, path.data, &r->transformer)
+                     : i == 1 ? gsf_nn_load_vae(ctx, path.data, &r->vae)
                               : gsf_nn_load_schedule(ctx, path.data, &r->schedule);
-        gsf_destroy_text(ctx, &path);
+        gsf_destroy_buffer(ctx, &path);
     }
     if (!result) result = gsf__dit_open_conditions(ctx, r);
     r->transformer.bf16 = r->desc.bf16;
@@ -13117,8 +13108,8 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
     gsf_nn_destroy_schedule(ctx, &r->schedule);
     while (r->kept_count) gsf__dit_drop(ctx, r, r->kept_count - 1);
     gsf_free(ctx, r->kept);
-    gsf_destroy_text(ctx, &r->caption);
-    gsf_destroy_text(ctx, &r->shown);
+    gsf_destroy_buffer(ctx, &r->caption);
+    gsf_destroy_buffer(ctx, &r->shown);
     gsf_free(ctx, r->prompt);
     gsf_free(ctx, r->references);
     gsf_free(ctx, r->texts);

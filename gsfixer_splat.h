@@ -28,29 +28,29 @@
        photos, COLMAP model or transforms.json                 .ply .splat .spz
              | gsf_splat_load_scene                                  ^ gsf_splat_save
              v                                                       | gsf_splat_load
-         gsf_scene ---- gsf_splat_initial_splats ------------> gsf_splats ---- gsf_splat_render ----> colour, depth, alpha
+         gsf_scene ---- gsf_splat_make_initial_splats ------------> gsf_splats ---- gsf_splat_render ----> colour, depth, alpha
              |            visible points, dense stereo             |
              | gsf_splat_load_train_views                          |
              v                                                     v
          gsf_train_view[] --------------------------------> gsf_trainer <------ restored views, weight lambda -----.
                                                                    |                                               |
-                                                                   | gsf_splat_trainer_render                      |
+                                                                   | gsf_splat_render_trainer                      |
                                                                    v                                               |
          gsf_fixer:  path (gsfixer_traj.h) ------> frames of a window: colour, depth, alpha ------> gsf_restorer --'
 
    STEP BY STEP
        gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
        gsf_splat_load_train_views(&ctx, &scene, NULL, scene.view_count, &views);         // photos
-       gsf_splat_initial_splats(&ctx, &scene, NULL, scene.view_count, NULL, &start, NULL); // points -> splats
-       desc = gsf_splat_few_view_desc(&scene, GSF_QUALITY_BALANCED);
+       gsf_splat_make_initial_splats(&ctx, &scene, NULL, scene.view_count, NULL, &start, NULL); // points -> splats
+       desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_BALANCED);
        gsf_splat_make_warp(&ctx, &warp);                                                 // or your own gsf_restorer
        gsf_splat_make_fixer(&ctx, &desc, views, scene.view_count, &start, &warp, &fixer);
-       while (stats.stage != GSF_FIX_DONE) gsf_splat_fix_step(&ctx, fixer, &stats);      // train, plan, restore
-       gsf_splat_save(&ctx, "splats.ply", gsf_splat_trainer_splats(gsf_splat_fixer_trainer(fixer)), NULL);
+       while (stats.stage != GSF_FIX_DONE) gsf_splat_step_fixer(&ctx, fixer, &stats);    // train, plan, restore
+       gsf_splat_save(&ctx, "splats.ply", gsf_splat_get_trained(gsf_splat_get_trainer(fixer)), NULL);
        Each of these returns a result to be checked; README.md has the complete program. To train without repair, use
-       gsf_splat_make_trainer with desc.train and call gsf_splat_train_step.
+       gsf_splat_make_trainer with desc.train and call gsf_splat_step_trainer.
 
-   A TRAINING STEP (gsf_splat_train_step), by section
+   A TRAINING STEP (gsf_splat_step_trainer), by section
        >>project    splats -> screen-space records: centre, conic, colour, tile rectangle
        >>bin        records -> per tile, a list sorted by depth
        >>raster forward, >>loss, >>raster backward    per tile and pixel: blend; L1 + SSIM; gradients of the records
@@ -110,7 +110,7 @@ typedef struct gsf_splats { // structure of arrays; all arrays have `count` rows
 } gsf_splats;
 
 // Number of SH coefficients per channel of a degree: (degree + 1)^2.
-GSF_API int32_t gsf_splat_sh_count(int32_t sh_degree);
+GSF_API int32_t gsf_splat_count_sh(int32_t sh_degree);
 // Zeroed splats with ids 0..count-1.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make(gsf_context* ctx, size_t count, int32_t sh_degree, gsf_splats* out);
 GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats);
@@ -160,7 +160,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse(gsf_context* ctx, const char* n
 GSF_API GSF_NODISCARD gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_splats* splats,
                                                 const gsf_splat_save_desc* desc);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats,
-                                                  const gsf_splat_save_desc* desc, gsf_text* out);
+                                                  const gsf_splat_save_desc* desc, gsf_buffer* out);
 
 // ---- scenes --------------------------------------------------------------------
 
@@ -216,13 +216,13 @@ typedef struct gsf_bytes {
 // The same from memory: contents of the three COLMAP files, binary or (is_text) text. `points` may be NULL. All images
 // are kept, since there is no folder to search; sizes are those of the cameras after undistortion. View images are
 // empty until gsf_splat_set_view_image.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras,
+GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int32_t is_text, const gsf_bytes* cameras,
                                                         const gsf_bytes* images, const gsf_bytes* points,
                                                         gsf_scene* out);
 // transforms.json from memory; it must contain w and h. No points.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes* json, gsf_scene* out);
 // Path of a view's photo, including the scene's path; valid as long as the scene. NULL for scenes parsed from memory.
-GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view);
+GSF_API const char* gsf_splat_get_view_path(const gsf_scene* scene, size_t view);
 // Decodes, resizes (PIL bicubic) and undistorts one view's photo into view->image (kept if already present). Rows are
 // undistorted in parallel. Only for scenes that were loaded from files.
 // view->weight is the photo's alpha times its mask, masks/NAME.png or (as in COLMAP) masks/NAME.EXT.png for the photo
@@ -287,16 +287,16 @@ typedef struct gsf_visibility_stats {
 } gsf_visibility_stats;
 
 // Sets keep[i] to 1 if at least one of the given views sees point i, else to 0. stats may be NULL.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_visible_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
-                                                          size_t view_count, const gsf_visibility_desc* desc,
-                                                          uint8_t* keep, gsf_visibility_stats* stats);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                                         size_t view_count, const gsf_visibility_desc* desc,
+                                                         uint8_t* keep, gsf_visibility_stats* stats);
 
 // Initial splats from points: scale = sqrt(mean squared distance to the 3 nearest kept points, at least 1e-7), opacity
 // 0.1, SH dc from colour (create_from_pcd of Inria's 3DGS). keep: NULL or one byte per point. origin: NULL = zero. Ids
 // are the rows of the points. Points with a non-finite coordinate are skipped and counted in a warning.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_from_points(gsf_context* ctx, const double* points, const uint8_t* colors,
-                                                       size_t count, const uint8_t* keep, int32_t sh_degree,
-                                                       const double origin[3], gsf_splats* out);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* points,
+                                                            const uint8_t* colors, size_t count, const uint8_t* keep,
+                                                            int32_t sh_degree, const double origin[3], gsf_splats* out);
 
 // ---- dense stereo --------------------------------------------------------------
 
@@ -360,10 +360,10 @@ typedef struct gsf_dense {
 // confirm points); repeated views count once. keep: NULL or one byte per sparse point, zero = not used; sparse points
 // only guide the search. With fewer than two distinct views, or without overlap, the result is GSF_OK with no points.
 // stats may be NULL. Bit-identical for any number of workers and any instruction set.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
-                                                        size_t view_count, const uint8_t* keep,
-                                                        const gsf_dense_desc* desc, gsf_dense* out,
-                                                        gsf_dense_stats* stats);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                                      size_t view_count, const uint8_t* keep,
+                                                      const gsf_dense_desc* desc, gsf_dense* out,
+                                                      gsf_dense_stats* stats);
 GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense);
 
 // ---- rendering -----------------------------------------------------------------
@@ -430,8 +430,9 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf
 // For each pixel of `camera`: 1 where its 3D point, taken from the depth of `splats` (a good model, say of all views), is
 // seen by at least one of the other cameras (inside its image and not behind its own depth by more than 5 %), else 0.
 // mask: u8, one channel, of the camera's size. Pixels with alpha below 0.5 are 0.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera,
-                                                     const gsf_camera* seeing, size_t seeing_count, const gsf_image* mask);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, const gsf_splats* splats,
+                                                            const gsf_camera* camera, const gsf_camera* seeing,
+                                                            size_t seeing_count, const gsf_image* mask);
 
 // ---- training ------------------------------------------------------------------
 
@@ -516,27 +517,27 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_trainer(gsf_context* ctx, const 
 GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer);
 // The trainer's desc with all defaults, the extent and the near plane filled in. For display; not valid as input, because
 // zero means default there (e.g. lambda_ssim is 0 here without an SSIM term).
-GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer);
+GSF_API gsf_train_desc gsf_splat_get_trainer_desc(const gsf_trainer* trainer);
 // Runs one iteration; GSF_ERROR_INVALID_ARGUMENT after the last one. A step that fails (cancelled, out of memory)
 // changes nothing and may be repeated. stats may be NULL.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_step_trainer(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats);
 // Replaces the restored views; count 0 removes them. The weight of their loss, lambda, may be changed at any time.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_restored_views(gsf_context* ctx, gsf_trainer* trainer,
                                                               const gsf_train_view* views, size_t count);
 GSF_API void gsf_splat_set_restored_weight(gsf_trainer* trainer, float lambda);
 // Renders the current state. Call between steps.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_trainer* trainer,
+GSF_API GSF_NODISCARD gsf_result gsf_splat_render_trainer(gsf_context* ctx, gsf_trainer* trainer,
                                                           const gsf_camera* camera, const gsf_render_output* out);
 // A copy of the current splats.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_copy_trained(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
 // The current splats, borrowed until the next step or call of restore.
-GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer);
+GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer);
 // Saves the complete state as chunks / restores it; training then continues bit-identically. The caller provides the
 // same views and desc again (views in any order; a difference causes only a warning); the weight of the restored views
 // is part of the state. restore takes a complete chunk file and checks it; if it is refused, the trainer is unchanged.
-GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer, gsf_text* chunks);
-GSF_API GSF_NODISCARD gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trainer, const char* name,
-                                                           const void* chunks, size_t size);
+GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* trainer, gsf_buffer* chunks);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* trainer, const char* name,
+                                                         const void* chunks, size_t size);
 
 // ---- restorers -----------------------------------------------------------------
 
@@ -556,7 +557,7 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
    that camera; else pixels stay square, the frame may lack or add a margin, and what lies beyond the photo's field of
    view is not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at
    any time.
-       gsf_splat_make_fixer -> gsf_splat_fix_step until stats.stage is GSF_FIX_DONE -> gsf_splat_trainer_export */
+       gsf_splat_make_fixer -> gsf_splat_step_fixer until stats.stage is GSF_FIX_DONE -> gsf_splat_copy_trained */
 
 typedef struct gsf_fix_desc {
     uint32_t _start_canary;
@@ -610,26 +611,26 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gs
                                                       const gsf_splats* initial, const gsf_restorer* restorer,
                                                       gsf_fixer** out);
 GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* fixer);
-// The loop's desc with defaults filled in, with `train` from gsf_splat_trainer_desc (rounds is 0 without a restorer). For
+// The loop's desc with defaults filled in, with `train` from gsf_splat_get_trainer_desc (rounds is 0 without a restorer). For
 // display, too.
-GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer);
+GSF_API gsf_fix_desc gsf_splat_get_fixer_desc(const gsf_fixer* fixer);
 // Runs one training iteration, plans a round, or restores one window. After an error or cancellation the fixer stays
 // usable.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* fixer, gsf_fix_stats* stats);
 // The fixer's trainer, for rendering and export.
-GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer);
+GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer);
 // Checkpoint between steps. A fixer made from the same desc, views and initial splats continues from it bit-identically.
-GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* fixer, gsf_text* chunks);
-GSF_API GSF_NODISCARD gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* fixer, const char* name,
-                                                         const void* chunks, size_t size);
+GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* fixer, gsf_buffer* chunks);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* fixer, const char* name,
+                                                       const void* chunks, size_t size);
 
 // ---- from photos to splats -----------------------------------------------------
 /* The choices of the program `gsfix fix`, based on measurements (bench/QUALITY.md) with scenes of 3 to 50 photos. A host
    that makes the same calls gets bit-identical splats; every value may be changed in between.
        gsf_splat_load_scene         cameras and points
        gsf_splat_load_train_views   photos
-       gsf_splat_initial_splats     points -> splats to begin with
-       gsf_splat_few_view_desc      settings of the loop and of the trainer
+       gsf_splat_make_initial_splats     points -> splats to begin with
+       gsf_splat_resolve_few_view_desc      settings of the loop and of the trainer
        gsf_splat_make_fixer         or gsf_splat_make_trainer with the desc's `train`, to train without repair
    `views` are indices into scene->views; NULL = all of them in their order (view_count is then scene->view_count). */
 
@@ -665,9 +666,10 @@ typedef struct gsf_initial_stats {
 } gsf_initial_stats;
 
 // DENSE and RANDOM need the views' images. GSF_ERROR_DEGENERATE if no point is left. desc and stats may be NULL.
-GSF_API GSF_NODISCARD gsf_result gsf_splat_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
-                                                          size_t view_count, const gsf_initial_desc* desc,
-                                                          gsf_splats* out, gsf_initial_stats* stats);
+GSF_API GSF_NODISCARD gsf_result gsf_splat_make_initial_splats(gsf_context* ctx, const gsf_scene* scene,
+                                                               const uint32_t* views, size_t view_count,
+                                                               const gsf_initial_desc* desc, gsf_splats* out,
+                                                               gsf_initial_stats* stats);
 
 typedef enum gsf_quality { // savings and costs: bench/QUALITY.md
     GSF_QUALITY_BALANCED = 0, // windows whose render agrees with the photos to 45 dB are not restored
@@ -678,11 +680,11 @@ typedef enum gsf_quality { // savings and costs: bench/QUALITY.md
 // The loop's settings for few photos: 1200 iterations, regularisers (train.dropout, opacity_decay, depth_smoothness),
 // the settings of `quality`, and from the scene (NULL = none) the near plane for all its cameras and the points that
 // determine the axes of the path, which are borrowed.
-GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality quality);
+GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, gsf_quality quality);
 
 // Near plane for renders of a scene with these cameras, `stride` bytes apart: 0.01 times their extent, at most 0.2. Use
 // the same near plane for training and rendering.
-GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
+GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t stride, size_t count);
 
 #ifdef __cplusplus
 }
@@ -737,13 +739,13 @@ static float gsf__or_zero(float value, float fallback) {
     return value < 0.0f ? 0.0f : value;
 }
 
-GSF_API int32_t gsf_splat_sh_count(int32_t sh_degree) { return (sh_degree + 1) * (sh_degree + 1); }
+GSF_API int32_t gsf_splat_count_sh(int32_t sh_degree) { return (sh_degree + 1) * (sh_degree + 1); }
 
 GSF_API gsf_result gsf_splat_make(gsf_context* ctx, size_t count, int32_t sh_degree, gsf_splats* out) {
     memset(out, 0, sizeof *out);
     if (sh_degree < 0 || sh_degree > 3)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "splats: SH degree %d is not 0..3", (int)sh_degree);
-    const size_t sh_floats = 3 * (size_t)gsf_splat_sh_count(sh_degree);
+    const size_t sh_floats = 3 * (size_t)gsf_splat_count_sh(sh_degree);
     const size_t row = 3 + 3 + 4 + 1 + sh_floats + 1; // the id is 4 bytes too
     float* block = (float*)gsf_alloc_zeroed(ctx, count ? count : 1, row * sizeof(float));
     if (!block) return GSF_ERROR_OUT_OF_MEMORY;
@@ -846,7 +848,7 @@ static void gsf__reorder(void* rows, size_t row_size, const uint64_t* order, siz
 }
 
 GSF_API gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats) {
-    const size_t count = splats->count, sh_row = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree) * sizeof(float);
+    const size_t count = splats->count, sh_row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree) * sizeof(float);
     if (count > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sort: %zu splats are too many", count);
     uint64_t* keys = (uint64_t*)gsf_alloc(ctx, count ? count : 1, 2 * sizeof(uint64_t));
     void* spare = gsf_alloc(ctx, count ? count : 1, sh_row > 16 ? sh_row : 16);
@@ -1255,7 +1257,7 @@ static int gsf__float_is_bad(float f) {
 static void gsf__ply_list_targets(gsf__ply_job* job) {
     static const unsigned char first[5] = {GSF__PLY_DC, GSF__PLY_OPACITY, GSF__PLY_SCALE, GSF__PLY_ROT, GSF__PLY_REST};
     gsf_splats* s = job->splats;
-    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree);
     float* base[4];
     base[0] = s->sh;
     base[1] = s->opacity_logits;
@@ -1313,7 +1315,7 @@ static int gsf__ply_decode_any(const gsf__ply_job* job, const unsigned char* row
 
 enum { GSF__PLY_CHUNK = 4096 }; // rows
 
-static void gsf__ply_decode_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__ply_decode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__ply_job* job = (const gsf__ply_job*)arg;
     const gsf__ply* ply = job->ply;
     const gsf_splats* s = job->splats;
@@ -1381,7 +1383,7 @@ static gsf_result gsf__ply_decode_ascii(gsf_context* ctx, gsf__ply_job* job) {
 
 // Removes the bad rows; ids stay 0..count-1.
 static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* bad, gsf_splats* s) {
-    const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree);
+    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree);
     size_t kept = 0;
     for (size_t i = 0; i < s->count; i++) {
         if (bad[i]) continue;
@@ -1471,10 +1473,10 @@ static unsigned char* gsf__put_f64(unsigned char* p, double value) {
     return p + 8;
 }
 
-static void gsf__ply_encode_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__ply_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__ply_write_job* job = (const gsf__ply_write_job*)arg;
     const gsf_splats* s = job->splats;
-    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree);
     const size_t begin = chunk * GSF__PLY_CHUNK;
     const size_t end = begin + GSF__PLY_CHUNK < s->count ? begin + GSF__PLY_CHUNK : s->count;
     (void)worker;
@@ -1500,25 +1502,25 @@ static void gsf__splats_sample_position(const void* arg, size_t i, double* out) 
     for (size_t k = 0; k < 3; k++) out[k] = s->origin[k] + (double)s->means[3 * i + k];
 }
 
-static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_text* out) {
+static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gsf_buffer* out) {
     gsf__ply_write_job job;
     double origin[3];
     if (splats->sh_degree < 0 || splats->sh_degree > 3)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "splats: SH degree %d is not 0..3", (int)splats->sh_degree);
     GSF__TRY(gsf__sample_origin(ctx, splats->count, gsf__splats_sample_position, splats, origin));
-    const int rest = 3 * (gsf_splat_sh_count(splats->sh_degree) - 1);
+    const int rest = 3 * (gsf_splat_count_sh(splats->sh_degree) - 1);
     job.splats = splats;
     job.wide = origin[0] != 0.0 || origin[1] != 0.0 || origin[2] != 0.0;
     job.row_bytes = 4 * (size_t)(17 + rest) + (job.wide ? 12 : 0);
-    gsf_text_printf(ctx, out, "ply\nformat binary_little_endian 1.0\nelement vertex %zu\n", splats->count);
-    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property %s %c\n", job.wide ? "double" : "float", "xyz"[k]);
-    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property float n%c\n", "xyz"[k]);
-    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property float f_dc_%d\n", k);
-    for (int k = 0; k < rest; k++) gsf_text_printf(ctx, out, "property float f_rest_%d\n", k);
-    gsf_text_printf(ctx, out, "property float opacity\n");
-    for (int k = 0; k < 3; k++) gsf_text_printf(ctx, out, "property float scale_%d\n", k);
-    for (int k = 0; k < 4; k++) gsf_text_printf(ctx, out, "property float rot_%d\n", k);
-    gsf_text_printf(ctx, out, "end_header\n");
+    gsf_append_text(ctx, out, "ply\nformat binary_little_endian 1.0\nelement vertex %zu\n", splats->count);
+    for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property %s %c\n", job.wide ? "double" : "float", "xyz"[k]);
+    for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property float n%c\n", "xyz"[k]);
+    for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property float f_dc_%d\n", k);
+    for (int k = 0; k < rest; k++) gsf_append_text(ctx, out, "property float f_rest_%d\n", k);
+    gsf_append_text(ctx, out, "property float opacity\n");
+    for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property float scale_%d\n", k);
+    for (int k = 0; k < 4; k++) gsf_append_text(ctx, out, "property float rot_%d\n", k);
+    gsf_append_text(ctx, out, "end_header\n");
     size_t bytes;
     if (!gsf__mul_size(splats->count, job.row_bytes, &bytes) || bytes > SIZE_MAX / 2)
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", splats->count);
@@ -1603,10 +1605,10 @@ static int gsf__any_bad(const float* values, size_t count) {
     return bad;
 }
 
-static void gsf__pack_check_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__pack_check_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__pack* job = (const gsf__pack*)arg;
     const gsf_splats* s = job->splats;
-    const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
     (void)worker;
     for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
         int bad = gsf__any_bad(s->log_scales + 3 * i, 3) | gsf__any_bad(s->quats + 4 * i, 4) |
@@ -1694,7 +1696,7 @@ static void gsf__splat_sample_position(const void* arg, size_t i, double* out) {
     for (int k = 0; k < 3; k++) out[k] = (double)gsf__get_f32((const unsigned char*)arg + GSF__SPLAT_ROW * i + 4 * k);
 }
 
-static void gsf__splat_decode_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__splat_decode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__splat_job* job = (const gsf__splat_job*)arg;
     const gsf_splats* s = job->splats;
     const size_t begin = chunk * GSF__PACK_CHUNK;
@@ -1740,10 +1742,10 @@ static gsf_result gsf__splat_parse(gsf_context* ctx, const char* name, const voi
     return result;
 }
 
-static void gsf__splat_encode_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__splat_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__pack* job = (const gsf__pack*)arg;
     const gsf_splats* s = job->splats;
-    const size_t sh = 3 * (size_t)gsf_splat_sh_count(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
     (void)worker;
     for (size_t row = begin; row < gsf__pack_end(job->count, begin); row++) {
         const size_t i = job->rows ? job->rows[row] : row;
@@ -1758,7 +1760,7 @@ static void gsf__splat_encode_chunk(void* arg, size_t chunk, int worker) {
     }
 }
 
-static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf_text* out) {
+static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf_buffer* out) {
     gsf__pack job;
     size_t bytes = 0;
     GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
@@ -1831,15 +1833,15 @@ static gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsig
 }
 
 // Appends `data` (size > 0) as a gzip file, or leaves `out` as it was.
-static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_text* out) {
+static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out) {
     static const unsigned char head[10] = {0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255}; // no time, no system: same bytes always
     const size_t before = out->size;
     char tail[8];
-    gsf_text_append(ctx, out, (const char*)head, sizeof head);
+    gsf_append_bytes(ctx, out, (const char*)head, sizeof head);
     gsf_result result = gsf__deflate(ctx, name, data, size, out);
     gsf__store_le(tail, gsf__crc32(0, data, size), 4);
     gsf__store_le(tail + 4, size & 0xffffffffu, 4);
-    gsf_text_append(ctx, out, tail, sizeof tail);
+    gsf_append_bytes(ctx, out, tail, sizeof tail);
     if (result == GSF_OK && out->failed) result = GSF_ERROR_OUT_OF_MEMORY;
     if (result != GSF_OK) out->size = before;
     return result;
@@ -1980,11 +1982,11 @@ static void gsf__spz_decode_rotation(const unsigned char* p, int version, float 
     q[3] = -q[3];
 }
 
-static void gsf__spz_decode_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__spz_decode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__spz* spz = (const gsf__spz*)arg;
     const gsf_splats* s = spz->splats;
     const size_t begin = chunk * GSF__PACK_CHUNK, rotation = spz->version == 3 ? 4 : 3;
-    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree), stored = (size_t)(spz->degree * (spz->degree + 2));
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), stored = (size_t)(spz->degree * (spz->degree + 2));
     (void)worker;
     for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
         const unsigned char* sh = spz->sh + 3 * stored * i;
@@ -2065,10 +2067,10 @@ static unsigned char gsf__spz_encode_sh(float value, int bucket) {
     return (unsigned char)(rounded < 255 ? rounded : 255);
 }
 
-static void gsf__spz_encode_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__pack* job = (const gsf__pack*)arg;
     const gsf_splats* s = job->splats;
-    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
     const size_t rotation = job->version == 3 ? 4 : 3;
     const double units = ldexp(1.0, job->fraction);
     (void)worker;
@@ -2121,7 +2123,7 @@ static void gsf__spz_warn_scales(gsf_context* ctx, const gsf__pack* job) {
 }
 
 static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_splats* splats, int version,
-                                  gsf_text* out) {
+                                  gsf_buffer* out) {
     gsf__pack job;
     size_t size = 0;
     if (version != 2 && version != 3)
@@ -2183,7 +2185,7 @@ GSF_API gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats
 }
 
 GSF_API gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats,
-                                    const gsf_splat_save_desc* desc, gsf_text* out) {
+                                    const gsf_splat_save_desc* desc, gsf_buffer* out) {
     gsf_splat_save_desc d;
     gsf_splats view = *splats;
     memset(&d, 0, sizeof d);
@@ -2201,11 +2203,11 @@ GSF_API gsf_result gsf_splat_format(gsf_context* ctx, const char* name, const gs
 
 GSF_API gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_splats* splats,
                                   const gsf_splat_save_desc* desc) {
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     gsf_result result = gsf_splat_format(ctx, path, splats, desc, &text);
     if (result == GSF_OK) result = gsf_write_file(ctx, path, text.data, text.size);
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return result;
 }
 
@@ -2714,7 +2716,7 @@ static gsf_result gsf__colmap_points_txt(gsf_context* ctx, gsf__line* l, gsf__sf
 }
 
 // points NULL = none. The model's names point into `images`. To be destroyed also after an error.
-static gsf_result gsf__colmap_read(gsf_context* ctx, int is_text, const gsf_bytes* cameras, const gsf_bytes* images,
+static gsf_result gsf__colmap_read(gsf_context* ctx, int32_t is_text, const gsf_bytes* cameras, const gsf_bytes* images,
                                    const gsf_bytes* points, gsf__sfm* m) {
     memset(m, 0, sizeof *m);
     if (is_text) {
@@ -2756,8 +2758,8 @@ static const char* gsf__json_where(const gsf_json* json) { return json->name; }
 // A number from the frame, else from the root, else `fallback`.
 static gsf_result gsf__json_setting(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                     const char* key, double fallback, double* out) {
-    const gsf_json_value* value = gsf_json_member(json, frame, key);
-    if (!value) value = gsf_json_member(json, &json->values[0], key);
+    const gsf_json_value* value = gsf_find_json_member(json, frame, key);
+    if (!value) value = gsf_find_json_member(json, &json->values[0], key);
     *out = fallback;
     if (!value) return GSF_OK;
     if (value->type != GSF_JSON_NUMBER)
@@ -2772,10 +2774,10 @@ static gsf_result gsf__transforms_lens_kind(gsf_context* ctx, const gsf_json* js
     static const char* const perspective[6] = {"OPENCV", "PINHOLE",     "SIMPLE_PINHOLE",
                                                "RADIAL", "FULL_OPENCV", "SIMPLE_RADIAL"};
     const gsf_json_value* root = &json->values[0];
-    const gsf_json_value* model = gsf_json_member(json, frame, "camera_model");
-    const gsf_json_value* fisheye = gsf_json_member(json, frame, "is_fisheye"); // instant-ngp
-    if (!model) model = gsf_json_member(json, root, "camera_model");
-    if (!fisheye) fisheye = gsf_json_member(json, root, "is_fisheye");
+    const gsf_json_value* model = gsf_find_json_member(json, frame, "camera_model");
+    const gsf_json_value* fisheye = gsf_find_json_member(json, frame, "is_fisheye"); // instant-ngp
+    if (!model) model = gsf_find_json_member(json, root, "camera_model");
+    if (!fisheye) fisheye = gsf_find_json_member(json, root, "is_fisheye");
     *out = fisheye && fisheye->type == GSF_JSON_TRUE ? GSF__LENS_FISHEYE : GSF__LENS_RATIONAL;
     if (!model) return GSF_OK;
     const char* name = model->type == GSF_JSON_STRING ? model->string : "";
@@ -2837,7 +2839,7 @@ static int gsf__transforms_has_camera(const gsf_json* json, const gsf_json_value
                                          "k3", "k4", "p1",   "p2",   "camera_angle_x", "camera_angle_y",
                                          "camera_model", "is_fisheye"};
     for (int i = 0; i < 16; i++)
-        if (gsf_json_member(json, frame, keys[i])) return 1;
+        if (gsf_find_json_member(json, frame, keys[i])) return 1;
     return 0;
 }
 
@@ -2879,8 +2881,8 @@ static int gsf__pose_from_opengl(const double rows[12], double w2c[16]) {
 static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                             size_t camera, gsf__sfm* m) {
     const char* where = gsf__json_where(json);
-    const gsf_json_value* path = gsf_json_member(json, frame, "file_path");
-    const gsf_json_value* matrix = gsf_json_member(json, frame, "transform_matrix");
+    const gsf_json_value* path = gsf_find_json_member(json, frame, "file_path");
+    const gsf_json_value* matrix = gsf_find_json_member(json, frame, "transform_matrix");
     double rows[12];
     if (!path || path->type != GSF_JSON_STRING)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without file_path", where, (unsigned)frame->offset);
@@ -2888,10 +2890,10 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: frame without a 4x4 transform_matrix", where,
                         (unsigned)frame->offset);
     for (size_t r = 0; r < 3; r++) {
-        const gsf_json_value* row = gsf_json_element(json, matrix, r);
+        const gsf_json_value* row = gsf_find_json_element(json, matrix, r);
         for (size_t c = 0; c < 4; c++) {
             const gsf_json_value* value =
-                row && row->type == GSF_JSON_ARRAY && row->count == 4 ? gsf_json_element(json, row, c) : NULL;
+                row && row->type == GSF_JSON_ARRAY && row->count == 4 ? gsf_find_json_element(json, row, c) : NULL;
             if (!value || value->type != GSF_JSON_NUMBER)
                 return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is no 4x4 matrix of numbers", where,
                                 (unsigned)matrix->offset);
@@ -2918,7 +2920,7 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
 
 // The model's names point into `json`. To be destroyed also after an error.
 static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, gsf__sfm* m) {
-    const gsf_json_value* frames = gsf_json_member(json, &json->values[0], "frames");
+    const gsf_json_value* frames = gsf_find_json_member(json, &json->values[0], "frames");
     size_t shared = SIZE_MAX;
     memset(m, 0, sizeof *m);
     m->images_name = gsf__json_where(json);
@@ -3233,7 +3235,7 @@ enum { GSF__RECTIFY_ROWS = 16 };
 
 // One bilinear sample per pixel, weights in 1/1024 from positions in 1/32 pixel as cv::remap has them; beyond the
 // border the nearest pixel counts.
-static void gsf__rectify_rows(void* arg, size_t chunk, int worker) {
+static void gsf__rectify_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf__rectify_job* job = (const gsf__rectify_job*)arg;
     const gsf__rectify* r = job->r;
     const int32_t w = r->lens.width, h = r->lens.height, channels = job->channels;
@@ -3283,7 +3285,7 @@ typedef struct gsf__view_source { // what gsf_splat_load_view_image needs of a v
 typedef struct gsf__scene_state {
     gsf__view_source* sources; // per view
     char* names;               // what the views' names point to
-    gsf_text paths;            // of photos and masks, each terminated
+    gsf_buffer paths;          // of photos and masks, each terminated
     int32_t no_masks;
 } gsf__scene_state;
 
@@ -3296,7 +3298,7 @@ GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene) {
     if (state) {
         gsf_free(ctx, state->sources);
         gsf_free(ctx, state->names);
-        gsf_destroy_text(ctx, &state->paths);
+        gsf_destroy_buffer(ctx, &state->paths);
         gsf_free(ctx, state);
     }
     gsf_free(ctx, scene->views);
@@ -3331,11 +3333,11 @@ static void gsf__hush_end(gsf_context* ctx, const gsf__hush* hush, int forget) {
 }
 
 // Reads <folder><relative>; *data NULL where there is no such file.
-static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_text* path,
+static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_buffer* path,
                                      void** data, size_t* size) {
     gsf__hush hush;
     path->size = 0;
-    gsf_text_printf(ctx, path, "%s%s", folder, relative);
+    gsf_append_text(ctx, path, "%s%s", folder, relative);
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__hush_begin(ctx, &hush);
     const gsf_result result = gsf_read_file(ctx, path->data, data, size);
@@ -3366,7 +3368,7 @@ typedef struct gsf__photos { // where the photos of a model lie; NULL instead: n
 } gsf__photos;
 
 // Is there an image at `path`? Its size then; *width 0 otherwise.
-static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_text* path, int64_t* width, int64_t* height) {
+static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_buffer* path, int64_t* width, int64_t* height) {
     gsf__hush hush;
     int32_t channels;
     if (path->failed) return GSF_ERROR_OUT_OF_MEMORY;
@@ -3381,7 +3383,7 @@ static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_text* path, int64
 // Finds a view's photo. With a factor first in <first folder>_<factor>/, under its own name or with another extension
 // (downscaled copies often are .png of .jpg); then the full-size one; transforms.json may leave the extension out.
 // *reduced: it is the downscaled copy. *width 0: not there.
-static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, const char* name, gsf_text* path,
+static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, const char* name, gsf_buffer* path,
                                   int64_t* width, int64_t* height, int* reduced) {
     static const char* const extensions[6] = {".png", ".jpg", ".JPG", ".jpeg", ".PNG", ".JPEG"};
     const int count = (int)GSF__COUNT(extensions);
@@ -3395,7 +3397,7 @@ static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, c
         for (int i = -1; i < count; i++) {
             const size_t kept = i < 0 || !dot ? strlen(rest) : (size_t)(dot - rest);
             path->size = 0;
-            gsf_text_printf(ctx, path, "%s%.*s_%d/%.*s%s", photos->folder, (int)(slash - first), first,
+            gsf_append_text(ctx, path, "%s%.*s_%d/%.*s%s", photos->folder, (int)(slash - first), first,
                             (int)photos->factor, (int)kept, rest, i < 0 ? "" : extensions[i]);
             GSF__TRY(gsf__query_photo(ctx, path, width, height));
             if (*width) return GSF_OK;
@@ -3404,7 +3406,7 @@ static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, c
     *reduced = 0;
     for (int i = -1; i < (photos->prefix[0] || dot ? 0 : count); i++) {
         path->size = 0;
-        gsf_text_printf(ctx, path, "%s%s%s%s", photos->folder, photos->prefix, name, i < 0 ? "" : extensions[i]);
+        gsf_append_text(ctx, path, "%s%s%s%s", photos->folder, photos->prefix, name, i < 0 ? "" : extensions[i]);
         GSF__TRY(gsf__query_photo(ctx, path, width, height));
         if (*width) return GSF_OK;
     }
@@ -3458,7 +3460,7 @@ static void gsf__target_size(const gsf__photos* photos, int64_t width, int64_t h
 // The official parser divides K by the factor and multiplies by actual / (COLMAP size / factor, rounded down); taken
 // here without the rounding down, K simply follows the ratio of the sizes, each axis and each view for itself.
 static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, const gsf__sfm_image* image,
-                                       const gsf__photos* photos, gsf_text* path, gsf_scene_view* view,
+                                       const gsf__photos* photos, gsf_buffer* path, gsf_scene_view* view,
                                        gsf__view_source* source, int* present) {
     int64_t width = 0, height = 0;
     int reduced = 0;
@@ -3505,7 +3507,7 @@ static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, cons
 // becomes the index of the view (UINT32_MAX: left out).
 static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_scene* scene) {
     gsf__scene_state* state = (gsf__scene_state*)scene->state;
-    gsf_text path;
+    gsf_buffer path;
     gsf_result result = GSF_OK;
     size_t name_bytes = 0, missing = 0;
     memset(&path, 0, sizeof path);
@@ -3546,10 +3548,10 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
         if (result == GSF_OK && present && photos) {
             const char* slash = photos->prefix[0] ? NULL : strchr(view->name, '/');
             source->path = state->paths.size;
-            gsf_text_append(ctx, &state->paths, path.data, path.size + 1);
+            gsf_append_bytes(ctx, &state->paths, path.data, path.size + 1);
             source->mask = state->paths.size; // the folder masks takes the place of the photos' own
-            gsf_text_printf(ctx, &state->paths, "%smasks/%s", photos->folder, slash ? slash + 1 : view->name);
-            gsf_text_append(ctx, &state->paths, "", 1);
+            gsf_append_text(ctx, &state->paths, "%smasks/%s", photos->folder, slash ? slash + 1 : view->name);
+            gsf_append_bytes(ctx, &state->paths, "", 1);
             if (state->paths.failed) result = GSF_ERROR_OUT_OF_MEMORY;
         }
         if (result == GSF_OK && present) scene->view_count++;
@@ -3560,7 +3562,7 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
     if (result == GSF_OK && scene->view_count == 0)
         result = gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s%s: none of the %zu photos is there", photos->folder, photos->prefix,
                           m->image_count);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
@@ -3678,7 +3680,7 @@ static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__pho
     }
     for (size_t i = 0; i < scene->view_count && result == GSF_OK; i++) {
         double centre[3];
-        gsf_camera_center(&scene->views[i].camera, centre);
+        gsf_get_camera_center(&scene->views[i].camera, centre);
         for (int k = 0; k < 3; k++) scene->origin[k] += centre[k] / (double)scene->view_count;
     }
     if (result == GSF_OK && m->dropped_points)
@@ -3690,7 +3692,7 @@ static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__pho
 
 // ---- public ----
 
-GSF_API gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int is_text, const gsf_bytes* cameras,
+GSF_API gsf_result gsf_splat_parse_colmap(gsf_context* ctx, int32_t is_text, const gsf_bytes* cameras,
                                           const gsf_bytes* images, const gsf_bytes* points, gsf_scene* out) {
     gsf__sfm m;
     memset(out, 0, sizeof *out);
@@ -3715,18 +3717,18 @@ GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes*
 
 // folder: with a separator at its end. path: scratch.
 static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const void* data, size_t size,
-                                       gsf__photos* photos, gsf_text* path, gsf_scene* out) {
+                                       gsf__photos* photos, gsf_buffer* path, gsf_scene* out) {
     gsf_json document;
     gsf__sfm m;
     void* points = NULL;
     size_t points_size = 0;
     GSF__TRY(gsf_parse_json(ctx, name, (const char*)data, size, &document));
     gsf_result result = gsf__transforms_read(ctx, &document, &m);
-    const gsf_json_value* ply = gsf_json_member(&document, &document.values[0], "ply_file_path");
+    const gsf_json_value* ply = gsf_find_json_member(&document, &document.values[0], "ply_file_path");
     if (result == GSF_OK && ply && ply->type == GSF_JSON_STRING) {
         result = gsf__check_relative(ctx, name, ply->offset, ply->string, ply->string_size);
         path->size = 0;
-        gsf_text_printf(ctx, path, "%s%s", photos->folder, ply->string);
+        gsf_append_text(ctx, path, "%s%s", photos->folder, ply->string);
         if (result == GSF_OK && path->failed) result = GSF_ERROR_OUT_OF_MEMORY;
         if (result == GSF_OK) result = gsf_read_file(ctx, path->data, &points, &points_size);
         if (result == GSF_OK) result = gsf__transforms_read_points(ctx, path->data, points, points_size, &m);
@@ -3739,13 +3741,13 @@ static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const
 }
 
 // Reads the three files of the first model found. *found = 0: none.
-static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, gsf_text* path, int* found,
+static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, gsf_buffer* path, int* found,
                                    gsf_scene* out) {
     static const char* const folders[3] = {"sparse/0/", "sparse/", ""};
     static const char* const files[3] = {"cameras", "images", "points3D"};
     gsf_bytes bytes[3];
     void* data[3] = {NULL, NULL, NULL};
-    gsf_text names[3];
+    gsf_buffer names[3];
     gsf__sfm m;
     gsf_result result = GSF_OK;
     memset(bytes, 0, sizeof bytes);
@@ -3760,7 +3762,7 @@ static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, 
         if (result != GSF_OK || !data[0]) continue;
         *found = 1;
         for (int k = 0; k < 3 && result == GSF_OK; k++) {
-            gsf_text_printf(ctx, &names[k], "%s%s%s%s", photos->folder, folders[i / 2], files[k], extension);
+            gsf_append_text(ctx, &names[k], "%s%s%s%s", photos->folder, folders[i / 2], files[k], extension);
             if (names[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
             else if (k > 0) result = gsf_read_file(ctx, names[k].data, &data[k], &bytes[k].size);
             bytes[k].data = data[k];
@@ -3772,23 +3774,23 @@ static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, 
     gsf__sfm_destroy(ctx, &m);
     for (int k = 0; k < 3; k++) {
         gsf_free(ctx, data[k]);
-        gsf_destroy_text(ctx, &names[k]);
+        gsf_destroy_buffer(ctx, &names[k]);
     }
     return result;
 }
 
-static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__photos* photos, gsf_text* folder,
-                                     gsf_text* scratch, void** json, gsf_scene* out) {
+static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__photos* photos, gsf_buffer* folder,
+                                     gsf_buffer* scratch, void** json, gsf_scene* out) {
     const size_t length = strlen(path);
     const int is_file = length >= 5 && strcmp(path + length - 5, ".json") == 0;
     size_t size = 0, folder_size = length;
     int found = 0;
     if (is_file) {
         while (folder_size && path[folder_size - 1] != '/' && path[folder_size - 1] != '\\') folder_size--;
-        gsf_text_append(ctx, folder, path, folder_size);
+        gsf_append_bytes(ctx, folder, path, folder_size);
     } else {
         const int closed = length == 0 || path[length - 1] == '/' || path[length - 1] == '\\';
-        gsf_text_printf(ctx, folder, "%s%s", path, closed ? "" : "/");
+        gsf_append_text(ctx, folder, "%s%s", path, closed ? "" : "/");
     }
     if (folder->failed) return GSF_ERROR_OUT_OF_MEMORY;
     photos->folder = folder->data;
@@ -3811,7 +3813,7 @@ static gsf_result gsf__load_scene_at(gsf_context* ctx, const char* path, gsf__ph
 GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, const gsf_scene_desc* desc,
                                         gsf_scene* out) {
     gsf__photos photos;
-    gsf_text folder, scratch;
+    gsf_buffer folder, scratch;
     void* json = NULL;
     memset(&photos, 0, sizeof photos);
     memset(&folder, 0, sizeof folder);
@@ -3831,8 +3833,8 @@ GSF_API gsf_result gsf_splat_load_scene(gsf_context* ctx, const char* path, cons
     }
     if (result != GSF_OK) gsf_splat_destroy_scene(ctx, out);
     gsf_free(ctx, json);
-    gsf_destroy_text(ctx, &folder);
-    gsf_destroy_text(ctx, &scratch);
+    gsf_destroy_buffer(ctx, &folder);
+    gsf_destroy_buffer(ctx, &scratch);
     return result;
 }
 
@@ -3968,19 +3970,19 @@ static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view,
 }
 
 // Reads NAME.png or NAME.EXT.png, `name` being NAME.EXT with its path; *data NULL where there is neither. *path: which.
-static gsf_result gsf__read_mask(gsf_context* ctx, const char* name, gsf_text* path, void** data, size_t* size) {
+static gsf_result gsf__read_mask(gsf_context* ctx, const char* name, gsf_buffer* path, void** data, size_t* size) {
     const char *dot = strrchr(name, '.'), *slash = strrchr(name, '/');
     const size_t length = strlen(name), stem = dot && (!slash || dot > slash) ? (size_t)(dot - name) : length;
-    gsf_text wanted;
+    gsf_buffer wanted;
     gsf_result result = GSF_OK;
     memset(&wanted, 0, sizeof wanted);
     for (int k = 0; k < 2 && !*data && result == GSF_OK; k++) {
         wanted.size = 0;
-        gsf_text_append(ctx, &wanted, name, k ? length : stem);
-        gsf_text_append(ctx, &wanted, ".png", 5);
+        gsf_append_bytes(ctx, &wanted, name, k ? length : stem);
+        gsf_append_bytes(ctx, &wanted, ".png", 5);
         result = wanted.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__read_if_there(ctx, "", wanted.data, path, data, size);
     }
-    gsf_destroy_text(ctx, &wanted);
+    gsf_destroy_buffer(ctx, &wanted);
     return result;
 }
 
@@ -3992,7 +3994,7 @@ static int gsf__same_shape(const gsf_image* a, const gsf_image* b) {
 
 // The mask of the photo that the folder of masks calls `name`, at the photo's size; *out without data: it has none.
 static gsf_result gsf__load_mask(gsf_context* ctx, const char* name, const gsf_image* photo, gsf_image* out) {
-    gsf_text path;
+    gsf_buffer path;
     void* data = NULL;
     size_t size = 0;
     gsf_image file, bytes;
@@ -4002,7 +4004,7 @@ static gsf_result gsf__load_mask(gsf_context* ctx, const char* name, const gsf_i
     memset(out, 0, sizeof *out);
     gsf_result result = gsf__read_mask(ctx, name, &path, &data, &size);
     if (result != GSF_OK || !data) goto cleanup;
-    result = gsf_load_image_memory(ctx, path.data, data, size, 1, &file);
+    result = gsf_decode_image(ctx, path.data, data, size, 1, &file);
     if (result != GSF_OK) goto cleanup;
     if (!gsf__same_shape(&file, photo)) {
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld pixels have not the shape of the photo's, %lld x %lld",
@@ -4019,7 +4021,7 @@ cleanup:
     gsf_destroy_image(ctx, &file);
     gsf_destroy_image(ctx, &bytes);
     gsf_free(ctx, data);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
@@ -4031,7 +4033,7 @@ GSF_API gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, 
     return gsf__set_view(ctx, scene, view, photo, NULL);
 }
 
-GSF_API const char* gsf_splat_view_path(const gsf_scene* scene, size_t view) {
+GSF_API const char* gsf_splat_get_view_path(const gsf_scene* scene, size_t view) {
     const gsf__scene_state* state = (const gsf__scene_state*)scene->state;
     if (view >= scene->view_count || state->sources[view].path == SIZE_MAX) return NULL;
     return state->paths.data + state->sources[view].path;
@@ -4065,13 +4067,13 @@ GSF_API gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene,
 
 // ---- writing ----
 
-static void gsf__put_le(gsf_context* ctx, gsf_text* out, uint64_t value, int bytes) {
+static void gsf__put_le(gsf_context* ctx, gsf_buffer* out, uint64_t value, int bytes) {
     char p[8];
     gsf__store_le(p, value, bytes);
-    gsf_text_append(ctx, out, p, (size_t)bytes);
+    gsf_append_bytes(ctx, out, p, (size_t)bytes);
 }
 
-static void gsf__put_double(gsf_context* ctx, gsf_text* out, double value) {
+static void gsf__put_double(gsf_context* ctx, gsf_buffer* out, double value) {
     uint64_t bits;
     memcpy(&bits, &value, sizeof bits);
     gsf__put_le(ctx, out, bits, 8);
@@ -4100,7 +4102,7 @@ static int gsf__same_intrinsics(const gsf_camera* a, const gsf_camera* b) {
 }
 
 // camera_of: (view_count) index of each view's camera. Cameras are numbered in the order of their first view.
-static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint32_t* camera_of, gsf_text* out) {
+static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint32_t* camera_of, gsf_buffer* out) {
     size_t count = 0;
     for (size_t i = 0; i < scene->view_count; i++) {
         const gsf_camera* c = &scene->views[i].camera;
@@ -4136,7 +4138,7 @@ static void gsf__sort_observations(const gsf_scene* scene, const uint8_t* keep, 
 }
 
 static void gsf__format_images(gsf_context* ctx, const gsf_scene* scene, const uint32_t* camera_of, const size_t* first,
-                               const size_t* point_of, gsf_text* out) {
+                               const size_t* point_of, gsf_buffer* out) {
     gsf__put_le(ctx, out, scene->view_count, 8);
     for (size_t v = 0; v < scene->view_count; v++) {
         const gsf_scene_view* view = &scene->views[v];
@@ -4146,11 +4148,11 @@ static void gsf__format_images(gsf_context* ctx, const gsf_scene* scene, const u
         for (int k = 0; k < 4; k++) gsf__put_double(ctx, out, q[k]);
         for (int k = 0; k < 3; k++) gsf__put_double(ctx, out, view->camera.w2c[12 + k]);
         gsf__put_le(ctx, out, camera_of[v] + 1u, 4);
-        gsf_text_append(ctx, out, view->name, strlen(view->name) + 1);
+        gsf_append_bytes(ctx, out, view->name, strlen(view->name) + 1);
         gsf__put_le(ctx, out, first[v + 1] - first[v], 8);
         for (size_t k = first[v]; k < first[v + 1]; k++) {
             double x = 0.0, y = 0.0, depth;
-            (void)gsf_camera_project(&view->camera, scene->points + 3 * point_of[k], &x, &y, &depth);
+            (void)gsf_project_point(&view->camera, scene->points + 3 * point_of[k], &x, &y, &depth);
             gsf__put_double(ctx, out, x);
             gsf__put_double(ctx, out, y);
             gsf__put_le(ctx, out, scene->point_ids[point_of[k]], 8);
@@ -4159,7 +4161,7 @@ static void gsf__format_images(gsf_context* ctx, const gsf_scene* scene, const u
 }
 
 static void gsf__format_points(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep, const uint32_t* slot_of,
-                               gsf_text* out) {
+                               gsf_buffer* out) {
     size_t kept = 0;
     for (size_t p = 0; p < scene->point_count; p++) kept += !keep || keep[p];
     gsf__put_le(ctx, out, kept, 8);
@@ -4167,7 +4169,7 @@ static void gsf__format_points(gsf_context* ctx, const gsf_scene* scene, const u
         if (keep && !keep[p]) continue;
         gsf__put_le(ctx, out, scene->point_ids[p], 8);
         for (size_t k = 0; k < 3; k++) gsf__put_double(ctx, out, scene->points[3 * p + k]);
-        gsf_text_append(ctx, out, (const char*)scene->colors + 3 * p, 3);
+        gsf_append_bytes(ctx, out, (const char*)scene->colors + 3 * p, 3);
         gsf__put_double(ctx, out, -1.0); // reprojection error: unknown
         gsf__put_le(ctx, out, scene->track_begin[p + 1] - scene->track_begin[p], 8);
         for (size_t e = scene->track_begin[p]; e < scene->track_begin[p + 1]; e++) {
@@ -4181,7 +4183,7 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
                                          const char* folder) {
     static const char* const names[3] = {"cameras", "images", "points3D"};
     const size_t observations = scene->point_count ? scene->track_begin[scene->point_count] : 0;
-    gsf_text files[3], path, cameras;
+    gsf_buffer files[3], path, cameras;
     memset(files, 0, sizeof files);
     memset(&path, 0, sizeof path);
     memset(&cameras, 0, sizeof cameras);
@@ -4192,7 +4194,7 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
     gsf_result result = camera_of && first && point_of && slot_of ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
         gsf__put_le(ctx, &files[0], gsf__format_cameras(ctx, scene, camera_of, &cameras), 8);
-        gsf_text_append(ctx, &files[0], cameras.data ? cameras.data : "", cameras.size);
+        gsf_append_bytes(ctx, &files[0], cameras.data ? cameras.data : "", cameras.size);
         gsf__sort_observations(scene, keep, first, point_of, slot_of);
         gsf__format_images(ctx, scene, camera_of, first, point_of, &files[1]);
         gsf__format_points(ctx, scene, keep, slot_of, &files[2]);
@@ -4202,12 +4204,12 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
         if (files[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
     for (int k = 2; k >= 0 && result == GSF_OK; k--) { // cameras last: a reader looks for them first
         path.size = 0;
-        gsf_text_printf(ctx, &path, "%s/sparse/0/%s.bin", folder, names[k]);
+        gsf_append_text(ctx, &path, "%s/sparse/0/%s.bin", folder, names[k]);
         result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path.data, files[k].data, files[k].size);
     }
-    for (int k = 0; k < 3; k++) gsf_destroy_text(ctx, &files[k]);
-    gsf_destroy_text(ctx, &path);
-    gsf_destroy_text(ctx, &cameras);
+    for (int k = 0; k < 3; k++) gsf_destroy_buffer(ctx, &files[k]);
+    gsf_destroy_buffer(ctx, &path);
+    gsf_destroy_buffer(ctx, &cameras);
     gsf_free(ctx, camera_of);
     gsf_free(ctx, first);
     gsf_free(ctx, point_of);
@@ -4274,7 +4276,7 @@ static void gsf__knn_swap(gsf__knn_tree* tree, size_t a, size_t b) {
 // Three-way, so equal coordinates cost nothing; the pivots are random but reproducible.
 static void gsf__knn_select(gsf__knn_tree* tree, size_t begin, size_t nth, size_t end, int axis) {
     while (end - begin > 1) {
-        const size_t pick = begin + (size_t)(gsf_random_bits(begin, end, nth) % (end - begin));
+        const size_t pick = begin + (size_t)(gsf_draw_bits(begin, end, nth) % (end - begin));
         const double pivot = tree->points[3 * pick + (size_t)axis];
         size_t below = begin, above = end;
         for (size_t i = begin; i < above;) {
@@ -4295,7 +4297,7 @@ typedef struct gsf__knn_build_job {
     size_t nodes_per_chunk;
 } gsf__knn_build_job;
 
-static void gsf__knn_build_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__knn_build_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__knn_build_job* job = (const gsf__knn_build_job*)arg;
     gsf__knn_tree* tree = job->tree;
@@ -4421,7 +4423,7 @@ typedef struct gsf__init_job {
     float* log_scales; // by place in the tree
 } gsf__init_job;
 
-static void gsf__init_scales_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__init_job* job = (const gsf__init_job*)arg;
     const size_t first = chunk * GSF__KNN_CHUNK;
@@ -4438,9 +4440,9 @@ static void gsf__init_scales_chunk(void* arg, size_t chunk, int worker) {
 
 #define GSF__SH_C0 0.28209479177387814 // SH basis function 0
 
-GSF_API gsf_result gsf_splat_from_points(gsf_context* ctx, const double* points, const uint8_t* colors, size_t count,
-                                         const uint8_t* keep, int32_t sh_degree, const double origin[3],
-                                         gsf_splats* out) {
+GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* points, const uint8_t* colors,
+                                              size_t count, const uint8_t* keep, int32_t sh_degree,
+                                              const double origin[3], gsf_splats* out) {
     memset(out, 0, sizeof *out);
     if (count && (!points || !colors))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "splats from points: points or colours are missing");
@@ -4462,7 +4464,7 @@ GSF_API gsf_result gsf_splat_from_points(gsf_context* ctx, const double* points,
         for (size_t i = 0; i < count; i++) order[i] = UINT32_MAX;
         for (size_t i = 0; i < tree.count; i++) order[tree.rows[i]] = (uint32_t)i;
         if (origin) memcpy(out->origin, origin, sizeof out->origin);
-        const size_t sh_floats = 3 * (size_t)gsf_splat_sh_count(sh_degree);
+        const size_t sh_floats = 3 * (size_t)gsf_splat_count_sh(sh_degree);
         for (size_t i = 0; i < count; i++) {
             kept += !keep || keep[i];
             if (order[i] == UINT32_MAX) continue;
@@ -4580,7 +4582,7 @@ typedef struct gsf__disc_job {
     gsf__discs* discs;
 } gsf__disc_job;
 
-static void gsf__discs_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__disc_job* job = (const gsf__disc_job*)arg;
     const gsf__knn_tree* tree = job->tree;
@@ -4737,7 +4739,7 @@ typedef struct gsf__vis_job {
 
 enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
 
-static void gsf__vis_run(gsf_context* ctx, gsf__vis_job* job, void (*chunk)(void* arg, size_t chunk, int worker)) {
+static void gsf__vis_run(gsf_context* ctx, gsf__vis_job* job, void (*chunk)(void* arg, size_t chunk, int32_t worker)) {
     gsf__parallel_for(ctx, (job->discs.count + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK, chunk, job);
 }
 
@@ -4828,7 +4830,7 @@ static int gsf__vis_bin(float apart) {
 }
 
 // Region of each chunk, mean direction of each track, how often tracks hold the eyes' views.
-static void gsf__vis_survey_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__vis_survey_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const gsf_scene* scene = job->scene;
@@ -4867,7 +4869,7 @@ static void gsf__vis_survey_chunk(void* arg, size_t chunk, int worker) {
 }
 
 // Turns each normal to the side from which the neighbours were seen; the point's own track is left out.
-static void gsf__vis_orient_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__vis_orient_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const gsf__discs* discs = &job->discs;
@@ -4902,7 +4904,7 @@ static void gsf__vis_likelihoods(gsf__vis_job* job) {
     }
 }
 
-static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const size_t first = chunk * GSF__VIS_CHUNK;
@@ -4985,7 +4987,7 @@ static void gsf__vis_span(double c, double e, double z0, double z1, double scale
 }
 
 // Cell of every point that is worth a ray, cells of every disc.
-static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     gsf__vis_counts* counts = job->counts + chunk;
@@ -5029,7 +5031,7 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int worker) {
 }
 
 // A band of rows of cells: its points meet the discs in the discs' order, whatever the number of workers.
-static void gsf__vis_band_of_cells(void* arg, size_t band, int worker) {
+static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     const int32_t y0 = (int32_t)band * job->side / GSF__VIS_BANDS, y1 = ((int32_t)band + 1) * job->side / GSF__VIS_BANDS;
@@ -5128,14 +5130,14 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
     for (size_t i = 0; i < view_count; i++) {
         gsf__eye* eye = job->eyes + i;
         eye->camera = scene->views[views[i]].camera;
-        gsf_camera_center(&eye->camera, eye->center);
+        gsf_get_camera_center(&eye->camera, eye->center);
         eye->view = views[i];
         for (int k = 0; k < 3; k++) origin[k] += eye->center[k] / (double)view_count;
     }
     for (size_t i = 0; i < view_count; i++)
         for (int k = 0; k < 3; k++) job->eyes[i].center[k] -= origin[k];
     for (size_t i = 0; i < scene->view_count; i++) {
-        gsf_camera_center(&scene->views[i].camera, job->centers + 3 * i);
+        gsf_get_camera_center(&scene->views[i].camera, job->centers + 3 * i);
         for (int k = 0; k < 3; k++) job->centers[3 * i + (size_t)k] -= origin[k];
     }
 
@@ -5189,9 +5191,9 @@ static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, con
     return result;
 }
 
-GSF_API gsf_result gsf_splat_visible_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
-                                            size_t view_count, const gsf_visibility_desc* desc, uint8_t* keep,
-                                            gsf_visibility_stats* stats) {
+GSF_API gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                           size_t view_count, const gsf_visibility_desc* desc, uint8_t* keep,
+                                           gsf_visibility_stats* stats) {
     gsf_visibility_stats counted;
     memset(&counted, 0, sizeof counted);
     if (stats) *stats = counted;
@@ -5415,7 +5417,7 @@ static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
     }
 }
 
-static void gsf__vis_embree_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
     gsf__vis_counts* counts = job->counts + chunk;
@@ -5897,7 +5899,7 @@ static int gsf__dense_plane_of(const gsf__dense_view* view, int x, int y, float 
 
 // Four numbers in (-1,1).
 static void gsf__dense_random(uint64_t seed, uint64_t stream, uint64_t index, float out[4]) {
-    const uint64_t bits = gsf_random_bits(seed, stream, index);
+    const uint64_t bits = gsf_draw_bits(seed, stream, index);
     for (int k = 0; k < 4; k++) out[k] = ((float)(bits >> (16 * k) & 65535u) - 32767.5f) * (1.0f / 32768.0f);
 }
 
@@ -6143,7 +6145,7 @@ static void gsf__dense_visit(const gsf__dense_job* job, const gsf__dense_view* v
     memcpy(own, costs[best], sizeof costs[0]);
 }
 
-static void gsf__dense_sweep_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__dense_sweep_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__dense_job* job = (const gsf__dense_job*)arg;
     const gsf__dense_view* view = job->views + job->blocks[chunk].view;
@@ -6153,7 +6155,7 @@ static void gsf__dense_sweep_chunk(void* arg, size_t chunk, int worker) {
 }
 
 // Start planes: of the coarser level, or near the sparse points and at random.
-static void gsf__dense_start_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__dense_start_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__dense_job* job = (const gsf__dense_job*)arg;
     const gsf__dense_view* view = job->views + job->blocks[chunk].view;
@@ -6213,7 +6215,7 @@ static int gsf__dense_tracked(const gsf_scene* scene, size_t point, uint32_t vie
 }
 
 static int gsf__dense_in_view(const gsf_camera* camera, const double point[3], double* u, double* v, double* depth) {
-    return gsf_camera_project(camera, point, u, v, depth) && *u >= 0.0 && *u < camera->width && *v >= 0.0 &&
+    return gsf_project_point(camera, point, u, v, depth) && *u >= 0.0 && *u < camera->width && *v >= 0.0 &&
            *v < camera->height;
 }
 
@@ -6237,10 +6239,10 @@ static void gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double*
         *high = 1.4 * depths[n - 1 - n / 50];
     } else {
         double center[3], other[3];
-        gsf_camera_center(&view->camera, center);
+        gsf_get_camera_center(&view->camera, center);
         n = 0;
         for (size_t i = 0; i < job->view_count; i++) {
-            gsf_camera_center(&job->views[i].camera, other);
+            gsf_get_camera_center(&job->views[i].camera, other);
             const double dx = other[0] - center[0], dy = other[1] - center[1], dz = other[2] - center[2];
             if (&job->views[i] != view) depths[n++] = sqrt(dx * dx + dy * dy + dz * dz);
         }
@@ -6261,8 +6263,8 @@ static void gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double*
 static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, const gsf_camera* b, const double point[3],
                               double depth_a, double depth_b) {
     double ca[3], cb[3], dot = 0.0, aa = 0.0, bb = 0.0;
-    gsf_camera_center(a, ca);
-    gsf_camera_center(b, cb);
+    gsf_get_camera_center(a, ca);
+    gsf_get_camera_center(b, cb);
     for (int k = 0; k < 3; k++) {
         const double x = point[k] - ca[k], y = point[k] - cb[k];
         dot += x * y;
@@ -6296,7 +6298,7 @@ static void gsf__dense_choose_sources(gsf__dense_job* job, size_t r, double low,
             scores[s] += (both ? 1.0 : 0.2) * gsf__dense_vote(job, &view->camera, camera, point, z, z2);
         }
     }
-    gsf_camera_c2w(&view->camera, c2w);
+    gsf_get_camera_c2w(&view->camera, c2w);
     for (int i = 0; i < 6 * 6 * 6 && votes < 20 && low > 0.0; i++) {
         z = 1.0 / (1.0 / high + (1.0 / low - 1.0 / high) * (i / 36 + 0.5) / 6.0);
         const double x = ((i % 6 + 0.5) / 6.0 * view->camera.width - view->camera.cx) / view->camera.fx * z;
@@ -6321,7 +6323,7 @@ static void gsf__dense_choose_sources(gsf__dense_job* job, size_t r, double low,
 // m, t, rotation of camera `from` to camera `to`, pixel centres at integers.
 static void gsf__dense_relate(const gsf_camera* from, const gsf_camera* to, float m[9], float t[3], float rotation[9]) {
     double c2w[16], rel[16];
-    gsf_camera_c2w(from, c2w);
+    gsf_get_camera_c2w(from, c2w);
     gsf__mat4_mul(to->w2c, c2w, rel);
     const double fx = from->fx, fy = from->fy, cx = from->cx - 0.5, cy = from->cy - 0.5;
     double rk[3][3]; // R K^-1
@@ -6462,7 +6464,7 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
         gsf__dense_view* view = job->views + i;
         const gsf_camera* camera = &job->scene->views[view->index].camera;
         gsf__dense_size(camera, job->desc.max_size, level, &view->width, &view->height);
-        view->camera = gsf_camera_resized(camera, view->width, view->height);
+        view->camera = gsf_resize_camera(camera, view->width, view->height);
         view->fx = (float)view->camera.fx;
         view->fy = (float)view->camera.fy;
         view->cx = (float)(view->camera.cx - 0.5);
@@ -6493,7 +6495,7 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
             const gsf_camera* other = &job->scene->views[job->views[source->view].index].camera;
             int32_t width, height;
             gsf__dense_size(other, job->desc.max_size, level, &width, &height);
-            const gsf_camera to = gsf_camera_resized(other, width, height);
+            const gsf_camera to = gsf_resize_camera(other, width, height);
             gsf__dense_relate(&view->camera, &to, source->m, source->t, source->rotation);
             gsf__dense_relate(&to, &view->camera, source->back_m, source->back_t, NULL);
         }
@@ -6599,7 +6601,7 @@ static int gsf__dense_confirmed(const gsf__dense_job* job, const gsf__dense_view
     return dot >= job->min_normal_dot;
 }
 
-static void gsf__dense_link_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__dense_link_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__dense_job* job = (const gsf__dense_job*)arg;
     const gsf__dense_view* view = job->views + job->blocks[chunk].view;
@@ -6685,7 +6687,7 @@ static void gsf__dense_locate(const gsf__dense_job* job, size_t pixel, double po
     const double ray[3] = {(x + 0.5 - camera->cx) / camera->fx * z, (y + 0.5 - camera->cy) / camera->fy * z, z};
     double c2w[16];
     float n[3];
-    gsf_camera_c2w(camera, c2w);
+    gsf_get_camera_c2w(camera, c2w);
     gsf__dense_normal(view, x, y, plane, n);
     for (int k = 0; k < 3; k++) {
         point[k] = c2w[12 + k];
@@ -6859,9 +6861,9 @@ GSF_API void gsf_splat_destroy_dense(gsf_context* ctx, gsf_dense* dense) {
     memset(dense, 0, sizeof *dense);
 }
 
-GSF_API gsf_result gsf_splat_dense_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
-                                          size_t view_count, const uint8_t* keep, const gsf_dense_desc* desc,
-                                          gsf_dense* out, gsf_dense_stats* stats) {
+GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                        size_t view_count, const uint8_t* keep, const gsf_dense_desc* desc,
+                                        gsf_dense* out, gsf_dense_stats* stats) {
     gsf_dense_stats counted;
     memset(&counted, 0, sizeof counted);
     memset(out, 0, sizeof *out);
@@ -6994,7 +6996,7 @@ struct gsf_rasterizer {
     double* tile_background;   // (tiles, 3)
     size_t tile_background_capacity;
 
-    int worker_count;
+    int32_t worker_count;
     gsf__worker_scratch* workers;
 
     // the last render
@@ -7120,7 +7122,7 @@ static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* came
     memset(&view, 0, sizeof view);
     double origin_in_camera[3], center[3];
     gsf__camera_transform(camera, splats->origin, origin_in_camera);
-    gsf_camera_center(camera, center);
+    gsf_get_camera_center(camera, center);
     for (int r = 0; r < 3; r++) {
         for (int c = 0; c < 3; c++) {
             view.rotation[3 * r + c] = camera->w2c[4 * c + r];
@@ -7306,7 +7308,7 @@ static float gsf__view_direction(const gsf__view* view, const float* mean, float
 }
 
 static void gsf__splat_color(const gsf__view* view, const gsf_splats* splats, size_t i, float rgb[3]) {
-    const int32_t stored = gsf_splat_sh_count(splats->sh_degree);
+    const int32_t stored = gsf_splat_count_sh(splats->sh_degree);
     const float* sh = splats->sh + 3 * (size_t)stored * i;
     float d[3], basis[16];
     gsf__view_direction(view, splats->means + 3 * i, d);
@@ -7617,7 +7619,7 @@ GSF__TARGET_AVX2 static inline __m256 gsf__view_direction8(const gsf__view* view
 // The first `count` floats of eight rows of SH coefficients, as columns.
 GSF__TARGET_AVX2 static inline void gsf__sh_columns8(const gsf_splats* splats, size_t i, __m256i lane, int count,
                                                      __m256 sh[48]) {
-    const int stored = 3 * gsf_splat_sh_count(splats->sh_degree);
+    const int stored = 3 * gsf_splat_count_sh(splats->sh_degree);
     const float* rows = splats->sh + (size_t)stored * i;
     int32_t at[8];
     int k = 0;
@@ -7730,7 +7732,7 @@ static int gsf__meets_image(const gsf_rasterizer* r, const gsf__view* view, cons
            rec->v + reach_y >= 0.0f && rec->v - reach_y <= (float)(r->height - 1);
 }
 
-static void gsf__project_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__project_job* job = (const gsf__project_job*)arg;
     gsf_rasterizer* r = job->r;
@@ -7864,7 +7866,7 @@ static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int
     for (int32_t i = 0; i < left && i < GSF__SPANS; i++) spans[i] = gsf__tile_columns(job->r, job->view, rec, ty + i);
 }
 
-static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__bin_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__bin_job* job = (const gsf__bin_job*)arg;
     gsf_rasterizer* r = job->r;
@@ -7895,7 +7897,7 @@ static void gsf__bin_chunk(void* arg, size_t chunk, int worker) {
     }
 }
 
-static void gsf__sort_tile(void* arg, size_t index, int worker) {
+static void gsf__sort_tile(void* arg, size_t index, int32_t worker) {
     (void)worker;
     const gsf_rasterizer* r = (const gsf_rasterizer*)arg;
     const size_t first = r->tile_begin[index], count = r->tile_begin[index + 1] - first;
@@ -8542,7 +8544,7 @@ static void gsf__project_backward(const gsf__view* view, const gsf_splats* splat
     const float rgb[3] = {rec->r, rec->g, rec->b};
     float d_rgb[3];
     for (int c = 0; c < 3; c++) d_rgb[c] = rgb[c] > 0.0f ? (float)sums[GSF__SLOT_R + c] : 0.0f;
-    const size_t stored = (size_t)gsf_splat_sh_count(splats->sh_degree);
+    const size_t stored = (size_t)gsf_splat_count_sh(splats->sh_degree);
     const float* sh = splats->sh + 3 * stored * i;
     float d[3], basis[16], gx[16], gy[16], gz[16];
     const float distance = gsf__view_direction(view, splats->means + 3 * i, d);
@@ -8658,7 +8660,7 @@ static inline void gsf__gather_ahead(const gsf_rasterizer* r, const gsf_splats* 
         _mm_prefetch(slot, _MM_HINT_T0);
         _mm_prefetch(slot + GSF__SLOT_FLOATS * sizeof(float) - 1, _MM_HINT_T0);
     }
-    const size_t row = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree);
+    const size_t row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree);
     for (size_t k = 0; k < 8 * row; k += 16) {
         _mm_prefetch((const char*)(splats->sh + row * i + k), _MM_HINT_T0);
         if (grads->sh) _mm_prefetch((const char*)(grads->sh + row * i + k), _MM_HINT_T0);
@@ -8739,7 +8741,7 @@ GSF__TARGET_AVX2 static void gsf__gather_avx2(const gsf_rasterizer* r, const gsf
                               d_t[2]);
 
     const int32_t bands = view->sh_coefficients;
-    const int stored = 3 * gsf_splat_sh_count(splats->sh_degree);
+    const int stored = 3 * gsf_splat_count_sh(splats->sh_degree);
     __m256 d_rgb[3], d[3], basis[16];
     for (int c = 0; c < 3; c++) {
         const __m256 shown = gsf__column8(&r->records[i].r, lane, sizeof(gsf__record) / sizeof(float), c);
@@ -8821,7 +8823,7 @@ typedef struct gsf__gather_job {
 } gsf__gather_job;
 
 // In index order, so that parameters and gradients stream through the cache.
-static void gsf__gather_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__gather_job* job = (const gsf__gather_job*)arg;
     const gsf_rasterizer* r = job->r;
@@ -8953,7 +8955,7 @@ static float gsf__get_pixel(const gsf_image* image, int64_t x, int64_t y, int ch
     return value;
 }
 
-static void gsf__blend_chunk(void* arg, size_t index, int worker) {
+static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     (void)worker;
     const gsf__raster_job* job = (const gsf__raster_job*)arg;
     gsf_rasterizer* r = job->r;
@@ -9067,7 +9069,7 @@ static void gsf__load_tile_gradient(const gsf__raster_job* job, const gsf__tile*
     }
 }
 
-static void gsf__reverse_chunk(void* arg, size_t index, int worker) {
+static void gsf__reverse_chunk(void* arg, size_t index, int32_t worker) {
     const gsf__raster_job* job = (const gsf__raster_job*)arg;
     gsf_rasterizer* r = job->r;
     const gsf__tile tile = gsf__tile_of(r, index);
@@ -9667,7 +9669,7 @@ static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_b
     }
 }
 
-static void gsf__loss_band(void* arg, size_t band, int worker) {
+static void gsf__loss_band(void* arg, size_t band, int32_t worker) {
     const gsf__loss_job* job = (const gsf__loss_job*)arg;
     const int32_t height = job->target->height, rows = gsf__loss_band_rows(height);
     gsf__loss_buffers b;
@@ -9761,7 +9763,7 @@ static float gsf__smooth_edge(const gsf__target* target, size_t p, size_t q) {
     return 1.0f / (1.0f + scale * d * (scale * d));
 }
 
-static void gsf__smooth_band(void* arg, size_t band, int worker) {
+static void gsf__smooth_band(void* arg, size_t band, int32_t worker) {
     const gsf__smooth_job* job = (const gsf__smooth_job*)arg;
     (void)worker;
     const int32_t width = job->target->width, height = job->target->height, rows = gsf__loss_band_rows(height);
@@ -9858,7 +9860,7 @@ static size_t gsf__model_chunk_end(size_t count, size_t chunk) {
 
 // Places the arrays of a model of `capacity` splats in `block`; returns the bytes used (block NULL: only counts).
 static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block) {
-    const size_t widths[GSF__GROUPS] = {3, 3, 4, 1, 3 * (size_t)gsf_splat_sh_count(model->sh_degree)};
+    const size_t widths[GSF__GROUPS] = {3, 3, 4, 1, 3 * (size_t)gsf_splat_count_sh(model->sh_degree)};
     size_t at = 0;
 #define GSF__PLACE(pointer, type, count)                            \
     do {                                                            \
@@ -10199,7 +10201,7 @@ static void gsf__lazy_wake(void* user, size_t splat) { // for gsf_rasterizer.wak
     lazy->model->rest[block] = GSF__AWAKE;
 }
 
-static void gsf__lazy_all_chunk(void* arg, size_t chunk, int worker) { // all of the chunk catch up
+static void gsf__lazy_all_chunk(void* arg, size_t chunk, int32_t worker) { // all of the chunk catch up
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     (void)worker;
     const size_t end = gsf__model_blocks(gsf__model_chunk_end(lazy->model->count, chunk));
@@ -10207,7 +10209,7 @@ static void gsf__lazy_all_chunk(void* arg, size_t chunk, int worker) { // all of
 }
 
 // Puts what the SH are, caught up, where their gradients are in a step.
-static void gsf__lazy_show_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__lazy_show_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     const gsf__group* sh = &lazy->model->groups[GSF__SH];
     const size_t row = sh->width * sizeof(float), end = gsf__model_chunk_end(lazy->model->count, chunk);
@@ -10244,7 +10246,7 @@ static uint32_t gsf__adam_lazy_sh(const gsf__adam_job* job, size_t begin, size_t
     return rejected;
 }
 
-static void gsf__adam_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__adam_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__adam_job* job = (const gsf__adam_job*)arg;
     gsf__model* model = job->model;
     (void)worker;
@@ -10461,8 +10463,8 @@ static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule,
             double normal[3];
             for (size_t a = 0; a < 3; a++)
                 normal[a] = rule->normals ? (double)rule->normals[(copy * splits + (child - count - clones)) * 3 + a]
-                                          : gsf_random_normal(rule->seed, rule->stream,
-                                                              (uint64_t)model->ids[i] * 6 + copy * 3 + a);
+                                          : gsf_draw_normal(rule->seed, rule->stream,
+                                                            (uint64_t)model->ids[i] * 6 + copy * 3 + a);
             gsf__densify_child(model, i, child + copy * splits, normal);
         }
         child++;
@@ -10502,7 +10504,7 @@ static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, f
     }
     if (!(total > 0.0)) return 0;
     for (size_t k = 0; k < draws; k++) {
-        const double at = total * gsf_random_uniform(rule->seed, rule->stream, index + k); // < total
+        const double at = total * gsf_draw_uniform(rule->seed, rule->stream, index + k); // < total
         size_t low = 0, high = model->count - 1;
         while (low < high) { // the first sum above
             const size_t middle = low + (high - low) / 2;
@@ -10725,7 +10727,7 @@ static gsf__photo* gsf__photo_at(gsf__photo_set* set, uint64_t seed, uint64_t ki
     if (set->order_epoch != epoch + 1) {
         for (size_t i = 0; i < set->count; i++) set->order[i] = (uint32_t)i;
         for (size_t i = set->count - 1; i > 0; i--) {
-            const size_t j = (size_t)(gsf_random_bits(seed, gsf__stream(kind, epoch), i) % (i + 1));
+            const size_t j = (size_t)(gsf_draw_bits(seed, gsf__stream(kind, epoch), i) % (i + 1));
             const uint32_t swapped = set->order[i];
             set->order[i] = set->order[j];
             set->order[j] = swapped;
@@ -10845,7 +10847,7 @@ static gsf_result gsf__trainer_take_splats(gsf_context* ctx, gsf_trainer* traine
     gsf__model* model = &trainer->model;
     model->sh_degree = trainer->desc.sh_degree ? trainer->desc.sh_degree : initial->sh_degree;
     GSF__TRY(gsf__model_reserve(ctx, model, initial->count));
-    const size_t from_sh = 3 * (size_t)gsf_splat_sh_count(initial->sh_degree);
+    const size_t from_sh = 3 * (size_t)gsf_splat_count_sh(initial->sh_degree);
     const float* from[GSF__GROUPS] = {initial->means, initial->log_scales, initial->quats, initial->opacity_logits,
                                       initial->sh};
     size_t used_sh = 3; // floats of an SH row up to the last one that is not zero anywhere
@@ -10930,11 +10932,11 @@ static gsf_result gsf__trainer_find_extent(gsf_context* ctx, gsf_trainer* traine
     double mean[3] = {0.0, 0.0, 0.0}, largest = 0.0, median = 0.0;
     const size_t count = trainer->photos.count;
     double first[3]; // summed relative to the first centre, so that large coordinates cost no precision
-    gsf_camera_center(&trainer->photos.photos[0].camera, first);
+    gsf_get_camera_center(&trainer->photos.photos[0].camera, first);
     for (int pass = 0; pass < 2; pass++)
         for (size_t i = 0; i < count; i++) {
             double c[3], d2 = 0.0;
-            gsf_camera_center(&trainer->photos.photos[i].camera, c);
+            gsf_get_camera_center(&trainer->photos.photos[i].camera, c);
             for (int a = 0; a < 3; a++) {
                 if (pass == 0) mean[a] += (c[a] - first[a]) / (double)count;
                 d2 += (c[a] - first[a] - mean[a]) * (c[a] - first[a] - mean[a]);
@@ -11014,13 +11016,13 @@ typedef struct gsf__dropout_job {
     double share;
 } gsf__dropout_job;
 
-static void gsf__dropout_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__dropout_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__dropout_job* job = (const gsf__dropout_job*)arg;
     const gsf__model* model = job->model;
     (void)worker;
     const size_t end = gsf__model_chunk_end(model->count, chunk);
     for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
-        model->hidden[i] = gsf_random_uniform(job->seed, job->stream, model->ids[i]) < job->share;
+        model->hidden[i] = gsf_draw_uniform(job->seed, job->stream, model->ids[i]) < job->share;
 }
 
 // Densification statistics of this step, and the means' screen gradients back to zero.
@@ -11030,7 +11032,7 @@ typedef struct gsf__visit_job {
     float half[2][2];        // half width and height of each
 } gsf__visit_job;
 
-static void gsf__visit_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__visit_job* job = (const gsf__visit_job*)arg;
     gsf__model* model = job->model;
     (void)worker;
@@ -11068,7 +11070,7 @@ typedef struct gsf__penalty_job {
     float opacity; // weight / count; 0 = none
 } gsf__penalty_job;
 
-static void gsf__penalty_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__penalty_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__penalty_job* job = (const gsf__penalty_job*)arg;
     const gsf__group *scales = &job->model->groups[GSF__SCALES], *logits = &job->model->groups[GSF__OPACITY];
     (void)worker;
@@ -11088,7 +11090,7 @@ typedef struct gsf__noise_job {
     double rate;
 } gsf__noise_job;
 
-static void gsf__noise_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__noise_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__noise_job* job = (const gsf__noise_job*)arg;
     const gsf__model* model = job->model;
     (void)worker;
@@ -11101,7 +11103,7 @@ static void gsf__noise_chunk(void* arg, size_t chunk, int worker) {
         double r[9], normal[3], axis[3];
         gsf__densify_rotation(model->groups[GSF__QUATS].value + 4 * i, r);
         for (size_t a = 0; a < 3; a++)
-            normal[a] = gsf_random_normal(job->seed, job->stream, (uint64_t)model->ids[i] * 3 + a);
+            normal[a] = gsf_draw_normal(job->seed, job->stream, (uint64_t)model->ids[i] * 3 + a);
         for (int a = 0; a < 3; a++) {
             const double variance = (double)gsf__exp_poly(scale[a] < 40.0f ? 2.0f * scale[a] : 80.0f);
             axis[a] = variance * (r[a] * normal[0] + r[3 + a] * normal[1] + r[6 + a] * normal[2]);
@@ -11121,7 +11123,7 @@ typedef struct gsf__decay_job {
     double factor;
 } gsf__decay_job;
 
-static void gsf__decay_chunk(void* arg, size_t chunk, int worker) {
+static void gsf__decay_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__decay_job* job = (const gsf__decay_job*)arg;
     float* logits = job->model->groups[GSF__OPACITY].value;
     (void)worker;
@@ -11177,8 +11179,8 @@ static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf_
         render.opacity_scale = (float)(1.0 / (1.0 - share));
     }
     for (uint64_t c = 0; c < 3 && d->background_random; c++)
-        render.background[c] = (float)gsf_random_uniform(d->seed, gsf__stream(GSF__STREAM_BACKGROUND, (uint64_t)iteration),
-                                                         3 * (uint64_t)which + c);
+        render.background[c] = (float)gsf_draw_uniform(d->seed, gsf__stream(GSF__STREAM_BACKGROUND, (uint64_t)iteration),
+                                                       3 * (uint64_t)which + c);
     const int32_t width = photo->camera.width, height = photo->camera.height;
     gsf_render_output out;
     memset(&out, 0, sizeof out);
@@ -11291,7 +11293,7 @@ static void gsf__trainer_update(gsf_context* ctx, gsf_trainer* trainer, int32_t 
     }
 }
 
-GSF_API gsf_result gsf_splat_train_step(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats) {
+GSF_API gsf_result gsf_splat_step_trainer(gsf_context* ctx, gsf_trainer* trainer, gsf_train_stats* stats) {
     const gsf_train_desc* d = &trainer->desc;
     gsf__model* model = &trainer->model;
     gsf_train_stats local;
@@ -11377,7 +11379,7 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
     for (size_t i = 0; i < GSF__COUNT(values); i++) {
         uint64_t bits;
         memcpy(&bits, &values[i], sizeof bits);
-        hash = gsf_random_bits(hash, bits, i);
+        hash = gsf_draw_bits(hash, bits, i);
     }
     return hash;
 }
@@ -11404,7 +11406,7 @@ static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void*
     return 1;
 }
 
-GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer, gsf_text* chunks) {
+GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* trainer, gsf_buffer* chunks) {
     const gsf__model* model = &trainer->model;
     char state[GSF__STATE_SIZE];
     const uint32_t mark = GSF__BYTE_ORDER_MARK;
@@ -11425,13 +11427,13 @@ GSF_API void gsf_splat_trainer_save(gsf_context* ctx, const gsf_trainer* trainer
         memcpy(&bits, &trainer->view.origin[a], 8);
         gsf__store_le(state + 56 + 8 * a, bits, 8);
     }
-    gsf_chunks_add(ctx, chunks, "TRNR", state, sizeof state);
+    gsf_append_chunk(ctx, chunks, "TRNR", state, sizeof state);
     char tag[5];
     void* data;
     size_t row;
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
-        gsf_chunks_add(ctx, chunks, tag, data, model->count * row);
-    gsf_chunks_add(ctx, chunks, "TRST", model->rest, gsf__model_blocks(model->count));
+        gsf_append_chunk(ctx, chunks, tag, data, model->count * row);
+    gsf_append_chunk(ctx, chunks, "TRST", model->rest, gsf__model_blocks(model->count));
 }
 
 // Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids.
@@ -11455,12 +11457,12 @@ static gsf_result gsf__trainer_check_array(gsf_context* ctx, const char* name, i
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trainer, const char* name,
-                                             const void* chunks, size_t size) {
+GSF_API gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* trainer, const char* name,
+                                           const void* chunks, size_t size) {
     gsf__model* model = &trainer->model;
     gsf_chunk chunk;
-    GSF__TRY(gsf_chunks_check(ctx, name, chunks, size));
-    if (!gsf_chunks_find(chunks, size, "TRNR", &chunk) || chunk.size != GSF__STATE_SIZE)
+    GSF__TRY(gsf_check_chunks(ctx, name, chunks, size));
+    if (!gsf_find_chunk(chunks, size, "TRNR", &chunk) || chunk.size != GSF__STATE_SIZE)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no trainer state (chunk TRNR of %d bytes)", name, GSF__STATE_SIZE);
     const char* state = (const char*)chunk.data;
     uint32_t mark;
@@ -11489,12 +11491,12 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     void* data;
     size_t row;
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++) {
-        if (!gsf_chunks_find(chunks, size, tag, &chunk))
+        if (!gsf_find_chunk(chunks, size, tag, &chunk))
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s is missing", name, tag);
         GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id));
     }
     const size_t blocks = gsf__model_blocks((size_t)count);
-    if (!gsf_chunks_find(chunks, size, "TRST", &chunk) || chunk.size != blocks)
+    if (!gsf_find_chunk(chunks, size, "TRST", &chunk) || chunk.size != blocks)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no chunk TRST of %zu bytes", name, blocks);
     for (size_t b = 0; b < blocks; b++) {
         const unsigned behind = ((const unsigned char*)chunk.data)[b];
@@ -11507,7 +11509,7 @@ GSF_API gsf_result gsf_splat_trainer_restore(gsf_context* ctx, gsf_trainer* trai
     memset(model->rest, 0, gsf__model_blocks(model->capacity));
     if (blocks) memcpy(model->rest, chunk.data, blocks);
     for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
-        if (gsf_chunks_find(chunks, size, tag, &chunk) && chunk.size) memcpy(data, chunk.data, chunk.size);
+        if (gsf_find_chunk(chunks, size, tag, &chunk) && chunk.size) memcpy(data, chunk.data, chunk.size);
     model->count = (size_t)count;
     model->next_id = next_id;
     memcpy(trainer->view.origin, origin, sizeof origin);
@@ -11552,7 +11554,7 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
     gsf_free(ctx, trainer);
 }
 
-GSF_API gsf_train_desc gsf_splat_trainer_desc(const gsf_trainer* trainer) { return trainer->desc; }
+GSF_API gsf_train_desc gsf_splat_get_trainer_desc(const gsf_trainer* trainer) { return trainer->desc; }
 
 // Replacing the restored views in two steps: all that can fail, and the exchange.
 static gsf_result gsf__restored_make(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views, size_t count,
@@ -11580,17 +11582,17 @@ GSF_API void gsf_splat_set_restored_weight(gsf_trainer* trainer, float lambda) {
     trainer->restored_weight = lambda > 0.0f && lambda <= 1e6f ? lambda : 0.0f;
 }
 
-GSF_API gsf_result gsf_splat_trainer_render(gsf_context* ctx, gsf_trainer* trainer, const gsf_camera* camera,
+GSF_API gsf_result gsf_splat_render_trainer(gsf_context* ctx, gsf_trainer* trainer, const gsf_camera* camera,
                                             const gsf_render_output* out) {
     gsf_render_desc render = trainer->desc.render;
     render.sh_bands = gsf__trainer_bands(trainer, trainer->iteration);
     return gsf_splat_render(ctx, trainer->rasterizer, gsf__trainer_show(ctx, trainer), camera, &render, out);
 }
 
-GSF_API gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out) {
+GSF_API gsf_result gsf_splat_copy_trained(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out) {
     const gsf_splats* view = gsf__trainer_show(ctx, (gsf_trainer*)trainer);
     GSF__TRY(gsf_splat_make(ctx, view->count, view->sh_degree, out));
-    const size_t n = view->count, sh = 3 * (size_t)gsf_splat_sh_count(view->sh_degree);
+    const size_t n = view->count, sh = 3 * (size_t)gsf_splat_count_sh(view->sh_degree);
     memcpy(out->origin, view->origin, sizeof out->origin);
     if (n == 0) return GSF_OK;
     memcpy(out->means, view->means, 3 * n * sizeof(float));
@@ -11602,7 +11604,7 @@ GSF_API gsf_result gsf_splat_trainer_export(gsf_context* ctx, const gsf_trainer*
     return GSF_OK;
 }
 
-GSF_API const gsf_splats* gsf_splat_trainer_splats(const gsf_trainer* trainer) {
+GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
     return gsf__trainer_show(NULL, (gsf_trainer*)trainer);
 }
 
@@ -11653,7 +11655,7 @@ typedef struct gsf__warp {
 enum { GSF__WARP_NEAREST = 4 };         // references drawn per frame
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
-                                  gsf_restorer_limits* out) {
+                                  gsf_restorer_info* out) {
     const gsf__warp* warp = (const gsf__warp*)user;
     (void)ctx;
     out->needs_depth = 1;
@@ -11704,7 +11706,7 @@ typedef struct gsf__warp_score_job {
     int32_t reference;
 } gsf__warp_score_job;
 
-static void gsf__warp_score_row(void* arg, size_t row, int worker) {
+static void gsf__warp_score_row(void* arg, size_t row, int32_t worker) {
     (void)worker;
     const gsf__warp_score_job* job = (const gsf__warp_score_job*)arg;
     const gsf__warp_reference* ref = job->warp->references + job->reference;
@@ -11718,7 +11720,7 @@ static void gsf__warp_score_row(void* arg, size_t row, int worker) {
         for (int32_t k = 0; k < job->warp->count; k++) {
             const gsf__warp_reference* other = job->warp->references + k;
             double u, v, z;
-            if (k == job->reference || !gsf_camera_project(&other->camera, point, &u, &v, &z)) continue;
+            if (k == job->reference || !gsf_project_point(&other->camera, point, &u, &v, &z)) continue;
             const float seen = gsf__nearest_depth(other, u, v);
             if (!(seen > 0.0f)) continue;
             const float off = (float)z / seen - 1.0f;
@@ -11759,7 +11761,7 @@ static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_refere
             result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: reference %d needs colour and depth", (int)i);
         if (result == GSF_OK) {
             ref->camera = *camera;
-            gsf_camera_center(camera, ref->center);
+            gsf_get_camera_center(camera, ref->center);
             ref->color = (float*)gsf_alloc(ctx, pixels, 8 * sizeof(float));
             if (!ref->color) result = GSF_ERROR_OUT_OF_MEMORY;
         }
@@ -11838,7 +11840,7 @@ static void gsf__warp_draw(const gsf__warp_reference* ref, const gsf_camera* cam
             now[x].inv_z = 0.0f;
             if (!(depth[x] > 0.0f)) continue;
             gsf__unproject(&ref->camera, x + 0.5, y + 0.5, (double)depth[x], point);
-            if (!gsf_camera_project(camera, point, &u, &v, &z)) continue;
+            if (!gsf_project_point(camera, point, &u, &v, &z)) continue;
             now[x].u = (float)u;
             now[x].v = (float)v;
             now[x].inv_z = (float)(1.0 / z);
@@ -11905,7 +11907,7 @@ static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int 
     gsf__unproject(camera, x + 0.5, y + 0.5, z, point);
     for (int k = 0; k < near_count; k++) {
         const gsf__warp_reference* ref = warp->references + nearest[k];
-        if (!gsf_camera_project(&ref->camera, point, &u, &v, &depth)) continue;
+        if (!gsf_project_point(&ref->camera, point, &u, &v, &depth)) continue;
         int behind = 0;
         for (int i = 0; i < 9; i++) {
             const double at_u = u + GSF__WARP_CLEARANCE * (i % 3 - 1), at_v = v + GSF__WARP_CLEARANCE * (i / 3 - 1);
@@ -11941,7 +11943,7 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
         at->ref = warp->references + nearest[k];
         double point[3], z;
         gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
-        if (!gsf_camera_project(&at->ref->camera, point, &at->u, &at->v, &z)) continue;
+        if (!gsf_project_point(&at->ref->camera, point, &at->u, &at->v, &z)) continue;
         const double cosine = gsf__warp_cosine(point, center, at->ref->center);
         const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // angle squared, to second order
         const float score = gsf__sample(at->ref->score, at->ref->camera.width, at->ref->camera.height, 1, 0, at->u, at->v);
@@ -11987,7 +11989,7 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
     return (refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
-static void gsf__warp_frame(void* arg, size_t frame, int worker) {
+static void gsf__warp_frame(void* arg, size_t frame, int32_t worker) {
     const gsf__warp_job* job = (const gsf__warp_job*)arg;
     const gsf__warp* warp = job->warp;
     const gsf_restore_window* window = job->window;
@@ -11999,7 +12001,7 @@ static void gsf__warp_frame(void* arg, size_t frame, int worker) {
     gsf__warp_vertex* rows = (gsf__warp_vertex*)(void*)(inv_z + job->scratch_floats - job->row_floats);
     double center[3];
     int32_t nearest[GSF__WARP_NEAREST];
-    gsf_camera_center(camera, center);
+    gsf_get_camera_center(camera, center);
     const int near_count = gsf__warp_nearest(warp, center, nearest);
     memset(inv_z, 0, (job->scratch_floats - job->row_floats) * sizeof(float));
     for (int k = 0; k < near_count && known < 0; k++)
@@ -12081,7 +12083,7 @@ typedef struct gsf__seen_job {
     const gsf_image* mask;
 } gsf__seen_job;
 
-static void gsf__seen_row(void* arg, size_t row, int worker) {
+static void gsf__seen_row(void* arg, size_t row, int32_t worker) {
     (void)worker;
     const gsf__seen_job* job = (const gsf__seen_job*)arg;
     for (int32_t x = 0; x < job->camera->width; x++) {
@@ -12091,7 +12093,7 @@ static void gsf__seen_row(void* arg, size_t row, int worker) {
             double point[3], u, v, z;
             gsf__unproject(job->camera, x + 0.5, (double)row + 0.5, (double)job->depth[at], point);
             for (size_t k = 0; k < job->seeing_count && !seen; k++) {
-                if (!gsf_camera_project(job->seeing + k, point, &u, &v, &z)) continue;
+                if (!gsf_project_point(job->seeing + k, point, &u, &v, &z)) continue;
                 const float limit = gsf__nearest_depth(job->others + k, u, v);
                 seen = limit > 0.0f && z <= 1.05 * (double)limit;
             }
@@ -12110,8 +12112,8 @@ static gsf_result gsf__render_depth(gsf_context* ctx, gsf_rasterizer* rasterizer
     return gsf_splat_render(ctx, rasterizer, splats, camera, NULL, &out);
 }
 
-GSF_API gsf_result gsf_splat_seen_mask(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera,
-                                       const gsf_camera* seeing, size_t seeing_count, const gsf_image* mask) {
+GSF_API gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, const gsf_splats* splats, const gsf_camera* camera,
+                                              const gsf_camera* seeing, size_t seeing_count, const gsf_image* mask) {
     GSF__TRY(gsf_check_camera(ctx, camera));
     if (mask->dtype != GSF_U8 || mask->channels != 1 || mask->width != camera->width || mask->height != camera->height)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "seen mask: mask must be u8, 1 channel, of the camera's size");
@@ -12182,7 +12184,7 @@ struct gsf_fixer {
     int references_open;
     gsf_image *rendered, *depth, *alpha, *restored, *confidence; // one window
     gsf__kept_frames active, pending; // what the trainer has; what this round collected so far
-    gsf_restorer_limits limits;
+    gsf_restorer_info limits;
 };
 
 static void gsf__drop_frames(gsf_context* ctx, gsf__kept_frames* list) {
@@ -12269,7 +12271,7 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
 // What the restorer takes, and so how long windows are.
 static gsf_result gsf__ask_restorer(gsf_context* ctx, gsf_fixer* f) {
     const gsf_camera* first = f->cameras;
-    gsf_restorer_limits* limits = &f->limits;
+    gsf_restorer_info* limits = &f->limits;
     memset(limits, 0, sizeof *limits);
     limits->struct_size = sizeof *limits;
     const int32_t usual = f->desc.window_frames > 0 ? f->desc.window_frames : 17;
@@ -12291,18 +12293,18 @@ static gsf_result gsf__ask_restorer(gsf_context* ctx, gsf_fixer* f) {
 
 // All of the path camera's field of view, each axis scaled to the restorer's own size, or to a smaller one.
 static gsf_camera gsf__squashed_camera(const gsf_fixer* f, const gsf_camera* camera) {
-    const gsf_restorer_limits* limits = &f->limits;
+    const gsf_restorer_info* limits = &f->limits;
     const double pixels = (double)limits->width * limits->height, most = f->desc.max_pixels;
     const double scale = most > 0.0 && pixels > most ? sqrt(most / pixels) : 1.0;
-    return gsf_camera_resized(camera, gsf__legal_side(limits->width * scale, limits->width_multiple, limits->width_max),
-                              gsf__legal_side(limits->height * scale, limits->height_multiple, limits->height_max));
+    return gsf_resize_camera(camera, gsf__legal_side(limits->width * scale, limits->width_multiple, limits->width_max),
+                             gsf__legal_side(limits->height * scale, limits->height_multiple, limits->height_max));
 }
 
 // Size of a frame with square pixels for a view of width x height, and the scale of both axes. Where the smallest legal
 // size is larger than what was wanted, the view fills it as far as it can.
 static double gsf__square_size(const gsf_fixer* f, int32_t width, int32_t height, int32_t* frame_width,
                                int32_t* frame_height) {
-    const gsf_restorer_limits* limits = &f->limits;
+    const gsf_restorer_info* limits = &f->limits;
     double scale = 1.0;
     if (limits->width_max > 0 && width > limits->width_max) scale = (double)limits->width_max / width;
     if (limits->height_max > 0 && height * scale > limits->height_max) scale = (double)limits->height_max / height;
@@ -12345,7 +12347,7 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
         return GSF_OK;
     }
     gsf_traj_path_desc desc;
-    gsf_traj_path_layout layout;
+    gsf_traj_path_info layout;
     memset(&desc, 0, sizeof desc);
     desc.kind = f->desc.trajectory;
     desc.window_length = f->frames;
@@ -12416,24 +12418,24 @@ cleanup:
     return result;
 }
 
-GSF_API gsf_fix_desc gsf_splat_fixer_desc(const gsf_fixer* fixer) {
+GSF_API gsf_fix_desc gsf_splat_get_fixer_desc(const gsf_fixer* fixer) {
     gsf_fix_desc desc = fixer->desc;
-    desc.train = gsf_splat_trainer_desc(fixer->trainer);
+    desc.train = gsf_splat_get_trainer_desc(fixer->trainer);
     return desc;
 }
 
-GSF_API gsf_trainer* gsf_splat_fixer_trainer(const gsf_fixer* fixer) { return fixer->trainer; }
+GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer) { return fixer->trainer; }
 
 // Rises from 0 at the first round to desc.lambda at the end.
 static float gsf__restored_weight(const gsf_fixer* f) {
-    return (float)gsf_traj_generative_weight(f->trainer->iteration, f->desc.first_round, f->desc.train.iterations,
-                                             (double)f->desc.lambda, 0);
+    return (float)gsf_traj_query_generative_weight(f->trainer->iteration, f->desc.first_round, f->desc.train.iterations,
+                                                   (double)f->desc.lambda, 0);
 }
 
 static int gsf__round_is_due(const gsf_fixer* f) {
     const gsf_fix_desc* d = &f->desc;
     return f->round < d->rounds &&
-           f->trainer->iteration >= gsf_traj_repair_round(d->first_round, d->last_round, d->rounds, f->round);
+           f->trainer->iteration >= gsf_traj_query_repair_round(d->first_round, d->last_round, d->rounds, f->round);
 }
 
 // Path of this round, its frames' sizes and buffers.
@@ -12490,7 +12492,7 @@ static gsf_result gsf__make_reference(gsf_context* ctx, gsf_fixer* f, size_t i, 
         result = gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 1, &out->depth);
     if (result == GSF_OK) {
         shown.depth = out->depth;
-        result = gsf_splat_trainer_render(ctx, f->trainer, camera, &shown);
+        result = gsf_splat_render_trainer(ctx, f->trainer, camera, &shown);
     }
     if (result == GSF_OK && weight) result = gsf__patch_reference(ctx, weight, &shown.color, out);
     if (needs_depth) out->render = shown.color;
@@ -12628,7 +12630,7 @@ static gsf_result gsf__render_window(gsf_context* ctx, gsf_fixer* f, const gsf_c
         out.color = f->rendered[i];
         out.depth = f->depth[i];
         out.alpha = f->alpha[i];
-        GSF__TRY(gsf_splat_trainer_render(ctx, f->trainer, camera, &out));
+        GSF__TRY(gsf_splat_render_trainer(ctx, f->trainer, camera, &out));
     }
     return GSF_OK;
 }
@@ -12657,7 +12659,7 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
     window.frame_count = f->frames;
     window.cameras = f->path + begin;
     window.reference_index = f->reference_index + begin;
-    window.seed = gsf_random_bits(f->desc.train.seed, 0x77696e64u, (uint64_t)f->round * 4096u + (uint64_t)f->window);
+    window.seed = gsf_draw_bits(f->desc.train.seed, 0x77696e64u, (uint64_t)f->round * 4096u + (uint64_t)f->window);
     window.clip = f->round * f->desc.windows + f->window;
     GSF__TRY(gsf__render_window(ctx, f, window.cameras));
     window.color = f->rendered;
@@ -12691,7 +12693,7 @@ static gsf_result gsf__finish_round(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
-GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
+GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_stats* stats) {
     gsf_fix_stats ignored;
     if (!stats) stats = &ignored;
     memset(stats, 0, sizeof *stats);
@@ -12716,7 +12718,7 @@ GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
         stats->stage = GSF_FIX_TRAIN;
         stats->lambda = f->active.count ? gsf__restored_weight(f) : 0.0f;
         gsf_splat_set_restored_weight(f->trainer, stats->lambda);
-        GSF__TRY(gsf_splat_train_step(ctx, f->trainer, &stats->train));
+        GSF__TRY(gsf_splat_step_trainer(ctx, f->trainer, &stats->train));
     }
     stats->skipped = f->skipped;
     return GSF_OK;
@@ -12727,11 +12729,11 @@ GSF_API gsf_result gsf_splat_fix_step(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
    fx, fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
-static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag, const gsf__kept_frames* list) {
+static void gsf__save_frames(gsf_context* ctx, gsf_buffer* chunks, const char* tag, const gsf__kept_frames* list) {
     char head[GSF__FRAME_HEAD];
     const size_t opened = gsf__open_chunk(ctx, chunks, tag); // frames are most of a checkpoint: copied only once
     gsf__store_le(head, list->count, 8);
-    gsf_text_append(ctx, chunks, head, 8);
+    gsf_append_bytes(ctx, chunks, head, 8);
     for (size_t i = 0; i < list->count; i++) {
         const gsf_camera* camera = &list->frames[i].camera;
         double numbers[20];
@@ -12747,9 +12749,9 @@ static void gsf__save_frames(gsf_context* ctx, gsf_text* chunks, const char* tag
         }
         gsf__store_le(head + 160, (uint32_t)camera->width, 4);
         gsf__store_le(head + 164, (uint32_t)camera->height, 4);
-        gsf_text_append(ctx, chunks, head, sizeof head);
-        gsf_text_append(ctx, chunks, (const char*)list->frames[i].pixels,
-                        4 * (size_t)camera->width * (size_t)camera->height);
+        gsf_append_bytes(ctx, chunks, head, sizeof head);
+        gsf_append_bytes(ctx, chunks, (const char*)list->frames[i].pixels,
+                         4 * (size_t)camera->width * (size_t)camera->height);
     }
     gsf__close_chunk(ctx, chunks, opened);
 }
@@ -12758,7 +12760,7 @@ static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const voi
                                    gsf__kept_frames* out) {
     gsf_chunk chunk;
     memset(out, 0, sizeof *out);
-    if (!gsf_chunks_find(data, size, tag, &chunk) || chunk.size < 8)
+    if (!gsf_find_chunk(data, size, tag, &chunk) || chunk.size < 8)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no %s chunk", name, tag);
     const char* p = (const char*)chunk.data;
     const uint64_t count = gsf__load_le(p, 8);
@@ -12807,22 +12809,22 @@ static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const voi
     return GSF_OK;
 }
 
-GSF_API void gsf_splat_fixer_save(gsf_context* ctx, const gsf_fixer* f, gsf_text* chunks) {
-    gsf_splat_trainer_save(ctx, f->trainer, chunks);
+GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* f, gsf_buffer* chunks) {
+    gsf_splat_format_trainer(ctx, f->trainer, chunks);
     const int32_t numbers[7] = {1, f->trainer->iteration, f->round, f->restoring, f->window, f->desc.windows, f->skipped};
     char body[28];
     for (int k = 0; k < 7; k++) gsf__store_le(body + 4 * k, (uint32_t)numbers[k], 4);
-    gsf_chunks_add(ctx, chunks, "FIXR", body, sizeof body);
+    gsf_append_chunk(ctx, chunks, "FIXR", body, sizeof body);
     gsf__save_frames(ctx, chunks, "FIXA", &f->active);
     gsf__save_frames(ctx, chunks, "FIXP", &f->pending);
 }
 
-GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const char* name, const void* data,
-                                           size_t size) {
+GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const char* name, const void* data,
+                                         size_t size) {
     gsf_chunk chunk;
     int32_t numbers[7];
-    GSF__TRY(gsf_chunks_check(ctx, name, data, size));
-    if (!gsf_chunks_find(data, size, "FIXR", &chunk) || chunk.size != 28)
+    GSF__TRY(gsf_check_chunks(ctx, name, data, size));
+    if (!gsf_find_chunk(data, size, "FIXR", &chunk) || chunk.size != 28)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no FIXR chunk: not a checkpoint of the repair loop", name);
     for (int k = 0; k < 7; k++) numbers[k] = (int32_t)gsf__load_le((const char*)chunk.data + 4 * k, 4);
     if (numbers[0] != 1)
@@ -12837,7 +12839,7 @@ GSF_API gsf_result gsf_splat_fixer_restore(gsf_context* ctx, gsf_fixer* f, const
     memset(&photos, 0, sizeof photos);
     gsf_result result = gsf__load_frames(ctx, name, data, size, "FIXP", &pending);
     if (result == GSF_OK) result = gsf__frames_to_photos(ctx, f, &active, &photos);
-    if (result == GSF_OK) result = gsf_splat_trainer_restore(ctx, f->trainer, name, data, size);
+    if (result == GSF_OK) result = gsf_splat_parse_trainer(ctx, f->trainer, name, data, size);
     if (result != GSF_OK) { // nothing has changed
         gsf__photo_set_destroy(ctx, &photos);
         gsf__drop_frames(ctx, &active);
@@ -12929,12 +12931,12 @@ static void gsf__random_point(const gsf_scene_view* view, const double* focus, u
                               uint8_t color[3]) {
     const gsf_camera* camera = &view->camera;
     double c2w[16], x, y, depth = 1.0;
-    gsf_camera_c2w(camera, c2w);
-    if (!focus || !gsf_camera_project(camera, focus, &x, &y, &depth)) depth = 1.0;
+    gsf_get_camera_c2w(camera, c2w);
+    if (!focus || !gsf_project_point(camera, focus, &x, &y, &depth)) depth = 1.0;
     const double least = 0.3 * depth, most = 2.0 * depth, a = least * least * least;
-    const double z = cbrt(a + (most * most * most - a) * gsf_random_uniform(seed, GSF__STREAM_POINTS, 3 * i));
-    const double u = camera->width * gsf_random_uniform(seed, GSF__STREAM_POINTS, 3 * i + 1);
-    const double v = camera->height * gsf_random_uniform(seed, GSF__STREAM_POINTS, 3 * i + 2);
+    const double z = cbrt(a + (most * most * most - a) * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i));
+    const double u = camera->width * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i + 1);
+    const double v = camera->height * gsf_draw_uniform(seed, GSF__STREAM_POINTS, 3 * i + 2);
     x = (u - camera->cx) / camera->fx * z;
     y = (v - camera->cy) / camera->fy * z;
     const gsf_image *image = &view->image, *weight = &view->weight;
@@ -12958,9 +12960,9 @@ static gsf_result gsf__random_points(gsf_context* ctx, const gsf_scene* scene, c
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: the image of view %u is not loaded", views[i]);
     double* poses = (double*)gsf_alloc(ctx, view_count, 16 * sizeof *poses);
     if (!poses) return GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < view_count; i++) gsf_camera_c2w(&scene->views[views[i]].camera, poses + 16 * i);
+    for (size_t i = 0; i < view_count; i++) gsf_get_camera_c2w(&scene->views[views[i]].camera, poses + 16 * i);
     double focus[3] = {0.0, 0.0, 0.0};
-    const int has_focus = gsf_traj_focus_point(ctx, poses, view_count, focus) == GSF_OK;
+    const int has_focus = gsf_traj_find_focus(ctx, poses, view_count, focus) == GSF_OK;
     gsf_free(ctx, poses);
     GSF__TRY(gsf__make_points(ctx, (size_t)desc->random_points, out));
     for (size_t i = 0; i < out->count; i++)
@@ -12993,7 +12995,7 @@ static gsf_result gsf__dense_and_kept(gsf_context* ctx, const gsf_scene* scene, 
                                       const gsf_initial_desc* desc, const uint8_t* keep, gsf__colored_points* out,
                                       gsf_initial_stats* stats) {
     gsf_dense dense;
-    GSF__TRY(gsf_splat_dense_points(ctx, scene, views, view_count, keep, &desc->dense, &dense, &stats->dense));
+    GSF__TRY(gsf_splat_make_dense(ctx, scene, views, view_count, keep, &desc->dense, &dense, &stats->dense));
     gsf_result result = gsf__merge_points(ctx, scene, keep, &dense, out);
     stats->new_points = dense.count;
     if (result == GSF_OK && out->count == 0)
@@ -13010,20 +13012,21 @@ static gsf_result gsf__scene_splats(gsf_context* ctx, const gsf_scene* scene, co
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (random ones do without)",
                         scene->folder ? scene->folder : "initial splats");
     if (d->kind == GSF_INITIAL_ALL) memset(keep, 1, scene->point_count);
-    else GSF__TRY(gsf_splat_visible_points(ctx, scene, views, view_count, &d->visibility, keep, &stats->visibility));
+    else GSF__TRY(gsf_splat_filter_points(ctx, scene, views, view_count, &d->visibility, keep, &stats->visibility));
     for (size_t i = 0; i < scene->point_count; i++) stats->scene_points += keep[i] != 0;
     if (d->kind != GSF_INITIAL_DENSE) {
         if (stats->scene_points == 0)
             return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: no point of the scene is seen by one of the %zu views "
                             "(all points, or random ones, do without)", view_count);
-        return gsf_splat_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, d->sh_degree,
-                                     scene->origin, out);
+        return gsf_splat_make_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, d->sh_degree,
+                                          scene->origin, out);
     }
     gsf__colored_points merged;
     memset(&merged, 0, sizeof merged);
     gsf_result result = gsf__dense_and_kept(ctx, scene, views, view_count, d, keep, &merged, stats);
     if (result == GSF_OK)
-        result = gsf_splat_from_points(ctx, merged.points, merged.colors, merged.count, NULL, d->sh_degree, scene->origin, out);
+        result = gsf_splat_make_from_points(ctx, merged.points, merged.colors, merged.count, NULL, d->sh_degree,
+                                            scene->origin, out);
     gsf__destroy_points(ctx, &merged);
     return result;
 }
@@ -13035,14 +13038,15 @@ static gsf_result gsf__random_splats(gsf_context* ctx, const gsf_scene* scene, c
     gsf_result result = gsf__random_points(ctx, scene, views, view_count, d, &random);
     stats->new_points = random.count;
     if (result == GSF_OK)
-        result = gsf_splat_from_points(ctx, random.points, random.colors, random.count, NULL, d->sh_degree, scene->origin, out);
+        result = gsf_splat_make_from_points(ctx, random.points, random.colors, random.count, NULL, d->sh_degree,
+                                            scene->origin, out);
     gsf__destroy_points(ctx, &random);
     return result;
 }
 
-GSF_API gsf_result gsf_splat_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
-                                            size_t view_count, const gsf_initial_desc* desc, gsf_splats* out,
-                                            gsf_initial_stats* stats) {
+GSF_API gsf_result gsf_splat_make_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
+                                                 size_t view_count, const gsf_initial_desc* desc, gsf_splats* out,
+                                                 gsf_initial_stats* stats) {
     gsf_initial_stats ignored;
     if (!stats) stats = &ignored;
     memset(stats, 0, sizeof *stats);
@@ -13066,12 +13070,12 @@ GSF_API gsf_result gsf_splat_initial_splats(gsf_context* ctx, const gsf_scene* s
     return result;
 }
 
-GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, size_t count) {
+GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t stride, size_t count) {
     double mean[3] = {0.0, 0.0, 0.0}, most = 0.0;
     for (int pass = 0; pass < 2; pass++)
         for (size_t i = 0; i < count; i++) {
             double c[3], d2 = 0.0;
-            gsf_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
+            gsf_get_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
             for (int k = 0; k < 3; k++) {
                 if (pass == 0) mean[k] += c[k] / (double)count;
                 else d2 += (c[k] - mean[k]) * (c[k] - mean[k]);
@@ -13082,7 +13086,7 @@ GSF_API float gsf_splat_near_plane(const gsf_camera* cameras, size_t stride, siz
     return near_plane > 1e-6 && near_plane < 0.2 ? (float)near_plane : 0.2f;
 }
 
-GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality quality) {
+GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, gsf_quality quality) {
     gsf_fix_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.train.iterations = 1200;
@@ -13096,7 +13100,8 @@ GSF_API gsf_fix_desc gsf_splat_few_view_desc(const gsf_scene* scene, gsf_quality
     desc.points = scene->points;
     desc.point_count = scene->point_count;
     if (scene->view_count)
-        desc.train.render.near_plane = gsf_splat_near_plane(&scene->views->camera, sizeof *scene->views, scene->view_count);
+        desc.train.render.near_plane = gsf_splat_measure_near_plane(&scene->views->camera, sizeof *scene->views,
+                                                                    scene->view_count);
     return desc;
 }
 

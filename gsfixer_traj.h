@@ -22,7 +22,7 @@
        memset(&desc, 0, sizeof desc);
        desc.points = scene.points; desc.point_count = scene.point_count;   // or none
        desc.round = 2; desc.seed = 1;
-       gsf_traj_path_layout layout;
+       gsf_traj_path_info layout;
        if (gsf_traj_query_path(&ctx, camera_count, &desc, &layout) != GSF_OK) ...
        void* scratch = malloc(layout.scratch_bytes);
        gsf_camera* path = malloc(layout.frame_count * sizeof *path);
@@ -80,8 +80,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_look_at(gsf_context* ctx, const double
 // ---- sets of views -------------------------------------------------------------
 
 // The point nearest to all optical axes in the least-squares sense. Degenerate for one view and for parallel axes.
-GSF_API GSF_NODISCARD gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, size_t count,
-                                                      double focus[3]);
+GSF_API GSF_NODISCARD gsf_result gsf_traj_find_focus(gsf_context* ctx, const double* poses, size_t count,
+                                                     double focus[3]);
 
 // ---- ellipse -------------------------------------------------------------------
 
@@ -97,10 +97,10 @@ typedef struct gsf_traj_ellipse_desc {
 // Weight of the generative loss, 0 up to iteration start: lambda * t (2 - t) with t from 0 to 1 at `until`, constant lambda
 // afterwards (the paper: "gradually increased"; computed in float32). official: lambda * sin(pi t), which decreases again in
 // the second half and is 0 from `until` on.
-GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
-                                          int32_t official);
+GSF_API double gsf_traj_query_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
+                                                int32_t official);
 // Iteration of repair round `round` (from 0) of `count`: spread evenly from `first` to `last`, rounded down.
-GSF_API int32_t gsf_traj_repair_round(int32_t first, int32_t last, int32_t count, int32_t round);
+GSF_API int32_t gsf_traj_query_repair_round(int32_t first, int32_t last, int32_t count, int32_t round);
 
 // ---- paths ---------------------------------------------------------------------
 
@@ -130,14 +130,14 @@ typedef struct gsf_traj_path_desc {
                              // 85), with its spacing and interpolation; all kinds: its similarity. See OFFICIAL
 } gsf_traj_path_desc;
 
-typedef struct gsf_traj_path_layout { // the desc's counts with defaults filled in
+typedef struct gsf_traj_path_info { // the desc's counts with defaults filled in
     int32_t window_count, window_length, ellipse_poses;
     size_t frame_count;   // window_count * window_length
     size_t scratch_bytes; // for gsf_traj_sample_path with this number of cameras and points
-} gsf_traj_path_layout;
+} gsf_traj_path_info;
 
 GSF_API GSF_NODISCARD gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count,
-                                                     const gsf_traj_path_desc* desc, gsf_traj_path_layout* layout);
+                                                     const gsf_traj_path_desc* desc, gsf_traj_path_info* layout);
 // Samples a path for world cameras (camera_count). out (frame_count): window after window, in world coordinates, all of
 // the same size. reference_index (frame_count) or NULL: the camera whose pose a frame has, else -1; such a frame has
 // that camera's w2c bit for bit. REFERENCE windows start and end with one. All kinds need two cameras, ELLIPSE and
@@ -589,7 +589,7 @@ static double gsf__traj_solve_focus(const double* poses, size_t count, double le
     return values[2];
 }
 
-GSF_API gsf_result gsf_traj_focus_point(gsf_context* ctx, const double* poses, size_t count, double focus[3]) {
+GSF_API gsf_result gsf_traj_find_focus(gsf_context* ctx, const double* poses, size_t count, double focus[3]) {
     const double least = 1e-12, zero[3] = {0.0, 0.0, 0.0};
     GSF__TRY(gsf__traj_check_views(ctx, "focus point", poses, count));
     if (!(gsf__traj_solve_focus(poses, count, least, zero, focus) > least))
@@ -1309,7 +1309,7 @@ static gsf_traj_ellipse_desc gsf__traj_round_ellipse(int32_t round, uint64_t see
     desc.frames = frames;
     desc.z_variation = 1.5 - 0.2 * round;
     if (desc.z_variation < 0.5) desc.z_variation = 0.5;
-    desc.z_phase = gsf_random_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // a random stream of its own
+    desc.z_phase = gsf_draw_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // a random stream of its own
     desc.pitch_degrees = 2.0 * round;
     return desc;
 }
@@ -1385,7 +1385,7 @@ GSF__SHARED gsf_result gsf__traj_ellipse_path(gsf_context* ctx, const double* po
     const gsf_traj_ellipse_desc d = gsf__traj_ellipse_desc_defaults(desc);
     double focus[3];
     GSF__TRY(gsf__traj_check_ellipse(ctx, &d));
-    GSF__TRY(gsf_traj_focus_point(ctx, poses, count, focus));
+    GSF__TRY(gsf_traj_find_focus(ctx, poses, count, focus));
     return gsf__traj_ellipse(ctx, poses, count, &d, focus, (double*)scratch, out);
 }
 
@@ -1482,8 +1482,8 @@ GSF__SHARED gsf_result gsf__traj_leg_path(gsf_context* ctx, const double* poses,
 
 // ---- >>schedule ----------------------------------------------------------------
 
-GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
-                                          int32_t official) {
+GSF_API double gsf_traj_query_generative_weight(int64_t iteration, int64_t start, int64_t until, double lambda,
+                                                int32_t official) {
     if (iteration >= until) return official ? 0.0 : lambda;
     if (iteration <= start) return 0.0;
     const double pi = 3.1415926535897932384626433832795;
@@ -1493,7 +1493,7 @@ GSF_API double gsf_traj_generative_weight(int64_t iteration, int64_t start, int6
     return (double)((float)lambda * (t * (2.0f - t)));
 }
 
-GSF_API int32_t gsf_traj_repair_round(int32_t first, int32_t last, int32_t count, int32_t round) {
+GSF_API int32_t gsf_traj_query_repair_round(int32_t first, int32_t last, int32_t count, int32_t round) {
     return count > 1 ? first + (int32_t)(((int64_t)last - first) * round / (count - 1)) : first;
 }
 
@@ -1504,7 +1504,7 @@ enum { GSF__TRAJ_ELLIPSE_DEFAULT = 85, GSF__TRAJ_WINDOW_DEFAULT = 49, GSF__TRAJ_
 static int64_t gsf__traj_or(int64_t value, int64_t if_zero) { return value ? value : if_zero; }
 
 // Resolves lengths and counts of the release's reference path: n + (n + 1) + n frames, windows by its table.
-static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_path_desc* d, gsf_traj_path_layout* out) {
+static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_path_desc* d, gsf_traj_path_info* out) {
     const int32_t length = (int32_t)gsf__traj_or(d->window_length, GSF__TRAJ_WINDOW_DEFAULT);
     const int32_t poses = (int32_t)gsf__traj_or(d->ellipse_poses, GSF__TRAJ_ELLIPSE_DEFAULT);
     if (length < 7 || length % 3 != 1)
@@ -1525,7 +1525,7 @@ static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_pa
 }
 
 static gsf_result gsf__traj_resolve_path(gsf_context* ctx, size_t cameras, const gsf_traj_path_desc* d,
-                                         gsf_traj_path_layout* out) {
+                                         gsf_traj_path_info* out) {
     if (d->kind == GSF_TRAJ_REFERENCE && d->official) return gsf__traj_resolve_official(ctx, d, out);
     const int64_t length = gsf__traj_or(d->window_length, GSF__TRAJ_WINDOW_DEFAULT);
     const int64_t legs = cameras > 1 ? (int64_t)cameras - 1 : 1;
@@ -1564,7 +1564,7 @@ static gsf_traj_path_desc gsf__traj_path_desc_defaults(const gsf_traj_path_desc*
 }
 
 GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, const gsf_traj_path_desc* desc,
-                                       gsf_traj_path_layout* layout) {
+                                       gsf_traj_path_info* layout) {
     memset(layout, 0, sizeof *layout);
     const gsf_traj_path_desc d = gsf__traj_path_desc_defaults(desc);
     if (d.kind != GSF_TRAJ_REFERENCE && d.kind != GSF_TRAJ_ELLIPSE && d.kind != GSF_TRAJ_INTERPOLATE)
@@ -1575,7 +1575,7 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
                         (int)d.window_count, (int)d.ellipse_poses, (int)d.round);
     if (camera_count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "path: no camera");
     if (camera_count > INT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: %zu cameras", camera_count);
-    gsf_traj_path_layout out;
+    gsf_traj_path_info out;
     memset(&out, 0, sizeof out);
     GSF__TRY(gsf__traj_resolve_path(ctx, camera_count, &d, &out));
     out.frame_count = gsf__traj_size_mul((size_t)out.window_count, (size_t)out.window_length);
@@ -1594,7 +1594,7 @@ GSF_API gsf_result gsf_traj_query_path(gsf_context* ctx, size_t camera_count, co
 typedef struct gsf__traj_job { // shared by the three kinds
     gsf_context* ctx;
     gsf_traj_path_desc desc;
-    gsf_traj_path_layout layout;
+    gsf_traj_path_info layout;
     const gsf_camera* cameras;
     size_t count;
     gsf_camera frame;    // size and intrinsics of the frames
@@ -1614,7 +1614,7 @@ static gsf_result gsf__traj_put_pose(gsf__traj_job* job, size_t at, const double
     gsf__traj_transform_poses(job->to_local, pose, 1, world);
     for (int i = 0; i < 3; i++) world[12 + i] += job->origin[i];
     job->out[at] = job->frame;
-    gsf_camera_set_c2w(&job->out[at], world);
+    gsf_set_camera_c2w(&job->out[at], world);
     if (job->reference_index) job->reference_index[at] = -1;
     if (!gsf__traj_finite(job->out[at].w2c, 16))
         return gsf_fail(job->ctx, GSF_ERROR_NUMERIC, "path: coordinates are too large to compute with");
@@ -1624,7 +1624,7 @@ static gsf_result gsf__traj_put_pose(gsf__traj_job* job, size_t at, const double
 // Writes frame `at` as the view of a camera.
 static void gsf__traj_put_reference(gsf__traj_job* job, size_t at, int32_t camera) {
     const gsf_camera* own = &job->cameras[camera];
-    job->out[at] = job->desc.official ? job->frame : gsf_camera_resized(own, job->frame.width, job->frame.height);
+    job->out[at] = job->desc.official ? job->frame : gsf_resize_camera(own, job->frame.width, job->frame.height);
     memcpy(job->out[at].w2c, own->w2c, sizeof own->w2c);
     if (job->reference_index) job->reference_index[at] = camera;
 }
@@ -1653,7 +1653,7 @@ static gsf_result gsf__traj_check_job(gsf__traj_job* job) {
 static void gsf__traj_localize(gsf__traj_job* job) {
     for (size_t n = 0; n < job->count; n++) {
         double quat[4], *view = job->views + 16 * n;
-        gsf_camera_c2w(&job->cameras[n], view);
+        gsf_get_camera_c2w(&job->cameras[n], view);
         gsf__traj_pose_quat(view, quat);
         gsf__traj_quat_axes(quat, view);
     }
@@ -1699,7 +1699,7 @@ static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform
 // loop looks at the depth of the scene. The release does not handle this case.
 static gsf_result gsf__traj_focus(const gsf__traj_job* job, const double transform[16], double focus[3]) {
     const double parallel = 1e-4;
-    if (job->desc.official) return gsf_traj_focus_point(job->ctx, job->views, job->count, focus);
+    if (job->desc.official) return gsf_traj_find_focus(job->ctx, job->views, job->count, focus);
     memset(focus, 0, 3 * sizeof(double));
     if (!(gsf__traj_solve_focus(job->views, job->count, 0.0, focus, focus) > parallel)) {
         double middle[3];

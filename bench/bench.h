@@ -26,7 +26,7 @@ static bench_peak bench_peaks[BENCH_LEVELS][3];
 
 static gsf_cpu_level bench_level_of(const char* isa) { // AUTO: unknown name
     int level = GSF_CPU_SCALAR;
-    while (level < BENCH_LEVELS && strcmp(isa, gsf_cpu_level_name((gsf_cpu_level)level)) != 0) level++;
+    while (level < BENCH_LEVELS && strcmp(isa, gsf_describe_cpu_level((gsf_cpu_level)level)) != 0) level++;
     return level < BENCH_LEVELS ? (gsf_cpu_level)level : GSF_CPU_AUTO;
 }
 
@@ -58,7 +58,7 @@ static bench_row bench_make_row(const char* name, gsf_cpu_level level, int threa
     memset(&row, 0, sizeof row);
     row.name = name;
     row.variant = "default";
-    row.isa = gsf_cpu_level_name(level);
+    row.isa = gsf_describe_cpu_level(level);
     row.threads = threads;
     row.seconds = seconds;
     row.cpu_seconds = cpu_seconds;
@@ -100,7 +100,8 @@ static float bench_sink; // keeps the compiler from dropping the loops
 // The compiler vectorizes scalar code, too, with the baseline vectors of the architecture (SSE2, Neon).
 typedef float bench_baseline __attribute__((vector_size(16)));
 
-static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply and add; there is no fused one without AVX2
+static void bench_fma_scalar(void* arg, size_t chunk,
+                             int32_t worker) { // multiply and add; there is no fused one without AVX2
     const bench_baseline a = {0.999f, 0.999f, 0.999f, 0.999f}, b = {0.001f, 0.001f, 0.001f, 0.001f};
     (void)worker;
 #define BENCH_SCALAR(k) bench_baseline v##k = {(float)k, (float)k, (float)k, (float)k};
@@ -114,7 +115,7 @@ static void bench_fma_scalar(void* arg, size_t chunk, int worker) { // multiply 
 }
 
 #if GSF__X86
-GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker) {
+GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int32_t worker) {
     const __m256 a = _mm256_set1_ps(0.999f), b = _mm256_set1_ps(0.001f);
     (void)worker;
 #define BENCH_VECTOR(k) __m256 v##k = _mm256_set1_ps((float)k);
@@ -126,7 +127,7 @@ GSF__TARGET_AVX2 static void bench_fma_avx2(void* arg, size_t chunk, int worker)
     _mm256_storeu_ps((float*)arg + 16 * chunk, v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9);
 }
 
-GSF__TARGET_AVX512 static void bench_fma_avx512(void* arg, size_t chunk, int worker) {
+GSF__TARGET_AVX512 static void bench_fma_avx512(void* arg, size_t chunk, int32_t worker) {
     const __m512 a = _mm512_set1_ps(0.999f), b = _mm512_set1_ps(0.001f);
     (void)worker;
 #define BENCH_WIDE(k) __m512 v##k = _mm512_set1_ps((float)k);
@@ -215,7 +216,7 @@ typedef struct bench_sweep {
 
 typedef uint32_t bench_bits __attribute__((vector_size(16)));
 
-static void bench_sweep_scalar(void* arg, size_t chunk, int worker) {
+static void bench_sweep_scalar(void* arg, size_t chunk, int32_t worker) {
 #define BENCH_LOAD(q) (*(const bench_bits*)(const void*)(q))
 #define BENCH_STORE(q, v) (*(bench_bits*)(void*)(q) = (v))
 #define BENCH_XOR(x, y) ((x) ^ (y))
@@ -227,7 +228,7 @@ static void bench_sweep_scalar(void* arg, size_t chunk, int worker) {
 }
 
 #if GSF__X86
-GSF__TARGET_AVX2 static void bench_sweep_avx2(void* arg, size_t chunk, int worker) {
+GSF__TARGET_AVX2 static void bench_sweep_avx2(void* arg, size_t chunk, int32_t worker) {
 #define BENCH_LOAD(q) _mm256_load_ps((const float*)(const void*)(q))
 #define BENCH_STORE(q, v) _mm256_store_ps((float*)(void*)(q), v)
 #define BENCH_STREAM(q, v) _mm256_stream_ps((float*)(void*)(q), v)
@@ -237,7 +238,7 @@ GSF__TARGET_AVX2 static void bench_sweep_avx2(void* arg, size_t chunk, int worke
 #undef BENCH_STREAM
 }
 
-GSF__TARGET_AVX512 static void bench_sweep_avx512(void* arg, size_t chunk, int worker) {
+GSF__TARGET_AVX512 static void bench_sweep_avx512(void* arg, size_t chunk, int32_t worker) {
 #define BENCH_LOAD(q) _mm512_load_ps((const float*)(const void*)(q))
 #define BENCH_STORE(q, v) _mm512_store_ps((float*)(void*)(q), v)
 #define BENCH_STREAM(q, v) _mm512_stream_ps((float*)(void*)(q), v)

@@ -63,7 +63,7 @@ static void bench_read_all(gsf_context* ctx, bench_sweep* read) {
 
 #if GSF__X86
 #define BENCH_DOT_STEP(k) v##k = BENCH_DOT(v##k); __asm__("" : "+v"(v##k)); // keeps them apart
-GSF__TARGET_AVX2 static void bench_dot_avx2(void* arg, size_t chunk, int worker) {
+GSF__TARGET_AVX2 static void bench_dot_avx2(void* arg, size_t chunk, int32_t worker) {
     const __m256i a = _mm256_set1_epi32(0x10001);
     (void)worker;
 #define BENCH_INTEGERS(k) __m256i v##k = _mm256_set1_epi32(k);
@@ -81,7 +81,7 @@ GSF__TARGET_AVX2 static void bench_dot_avx2(void* arg, size_t chunk, int worker)
 #define BENCH_STORE_INTEGERS                                                                \
     const __m512i sum = v0 + v1 + v2 + v3 + v4 + v5 + v6 + v7 + v8 + v9;                    \
     _mm512_storeu_si512((float*)arg + 16 * chunk, sum);
-GSF__TARGET_AVX512 static void bench_dot_avx512(void* arg, size_t chunk, int worker) {
+GSF__TARGET_AVX512 static void bench_dot_avx512(void* arg, size_t chunk, int32_t worker) {
     const __m512i a = _mm512_set1_epi32(0x10001);
     (void)worker;
     BENCH_TEN(BENCH_WIDE_INTEGERS)
@@ -93,7 +93,7 @@ GSF__TARGET_AVX512 static void bench_dot_avx512(void* arg, size_t chunk, int wor
     BENCH_STORE_INTEGERS
 }
 
-GSF__TARGET_VNNI static void bench_dot_vnni(void* arg, size_t chunk, int worker) {
+GSF__TARGET_VNNI static void bench_dot_vnni(void* arg, size_t chunk, int32_t worker) {
     const __m512i a = _mm512_set1_epi32(0x1010101);
     (void)worker;
     BENCH_TEN(BENCH_WIDE_INTEGERS)
@@ -105,7 +105,7 @@ GSF__TARGET_VNNI static void bench_dot_vnni(void* arg, size_t chunk, int worker)
     BENCH_STORE_INTEGERS
 }
 
-GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int worker) { // of pairs in each 32-bit lane
+GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int32_t worker) { // of pairs in each 32-bit lane
     const __m512bh a = (__m512bh)_mm512_set1_epi16(0x3f80);
     (void)worker;
 #define BENCH_WIDE_PAIRS(k) __m512 v##k = _mm512_set1_ps((float)k), w##k = _mm512_set1_ps((float)k + 32.0f);
@@ -210,9 +210,9 @@ static void bench_fill(void* memory, size_t bytes, gsf_nn_dtype dtype, uint64_t 
 // ---- linear layers ----------------------------------------------------------------
 
 typedef struct bench_linear {
-    gsf_nn_linear_desc desc;
-    gsf_tensor weight, bias;
-    gsf_nn_workspace workspace;
+    gsf__nn_linear_desc desc;
+    gsf_nn_tensor weight, bias;
+    gsf__nn_workspace workspace;
     int64_t in, out, copies; // copies of the weights, contiguous: a round uses each once
 } bench_linear;
 
@@ -220,21 +220,21 @@ static void bench_run_linear(gsf_context* ctx, void* arg) {
     bench_linear* l = (bench_linear*)arg;
     const char* first = (const char*)l->weight.data;
     for (int64_t i = 0; i < l->copies; i++) {
-        l->weight.data = first + (size_t)i * (size_t)l->weight.count * gsf_nn_dtype_size(l->weight.dtype);
-        bench_require(ctx, gsf_nn_linear(ctx, &l->workspace, &l->desc));
+        l->weight.data = first + (size_t)i * (size_t)l->weight.count * gsf_nn_get_dtype_size(l->weight.dtype);
+        bench_require(ctx, gsf__nn_run_linear(ctx, &l->workspace, &l->desc));
     }
     l->weight.data = first;
 }
 
-static double bench_activation(gsf_nn_activation activation, double x) {
-    if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
+static double bench_activation(gsf__nn_activation activation, double x) {
+    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
 // Error relative to sums in double, over at most 4 rows: the last, the first and some between. y holds one call's
 // results.
 static void bench_linear_error(const bench_linear* l, const float* w, const float* bias, bench_row* row) {
-    const gsf_nn_linear_desc* d = &l->desc;
+    const gsf__nn_linear_desc* d = &l->desc;
     double worst = 0.0, difference = 0.0, square = 0.0;
     const int64_t looks = d->rows < 4 ? d->rows : 4;
     for (int64_t i = 0; i < looks; i++) {
@@ -260,7 +260,7 @@ static int bench_has_bf16(const bench_options* o, gsf_nn_dtype weights) {
 
 // `memory` holds `size` bytes for the weights; GEMV cases cycle through all of it.
 static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int threads, gsf_nn_dtype dtype, int bf16,
-                             int64_t rows, int64_t out, int64_t in, gsf_nn_activation activation, char* memory,
+                             int64_t rows, int64_t out, int64_t in, gsf__nn_activation activation, char* memory,
                              size_t size) {
     static const char* const dtypes[] = {"f32", "bf16", "f16"};
     static const char* const activations[] = {"", " gelu", " silu"};
@@ -273,7 +273,7 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     memset(&l, 0, sizeof l);
     l.in = in;
     l.out = out;
-    const size_t bytes = (size_t)in * (size_t)out * gsf_nn_dtype_size(dtype);
+    const size_t bytes = (size_t)in * (size_t)out * gsf_nn_get_dtype_size(dtype);
     l.copies = rows <= GSF__FEW_ROWS ? (int64_t)(size / bytes) : 1;
     bench_fill(memory, l.copies > 1 ? size : bytes, dtype, 1);
     l.weight.name = "weight";
@@ -307,34 +307,35 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     l.copies = 1;
     bench_run_linear(&ctx, &l);
     float* wide = (float*)bench_alloc(&ctx, (size_t)(in * out), sizeof(float));
-    gsf_nn_read_tensor(&l.weight, 0, in * out, wide);
+    gsf_nn_convert_tensor(&l.weight, 0, in * out, wide);
     bench_linear_error(&l, wide, bias, &row);
     bench_print(o->json, &row);
     gsf_free(&ctx, wide);
     gsf_free(&ctx, bias);
     gsf_free(&ctx, y);
     gsf_free(&ctx, x);
-    gsf_nn_destroy_workspace(&ctx, &l.workspace);
+    gsf__nn_destroy_workspace(&ctx, &l.workspace);
 }
 
 typedef struct bench_shape {
     int64_t rows, out, in;
-    gsf_nn_activation activation;
+    gsf__nn_activation activation;
     int quick; // also measured with --quick
 } bench_shape;
 
 static void bench_linears(const bench_options* o, char* memory, size_t size) {
     static const bench_shape shapes[] = {
-        {1, 3072, 3072, GSF_NN_LINEAR, 1},     {2, 3072, 3072, GSF_NN_LINEAR, 0},
-        {4, 3072, 3072, GSF_NN_LINEAR, 1},     {2, 18432, 512, GSF_NN_LINEAR, 0},
-        {226, 3072, 3072, GSF_NN_LINEAR, 1},   {2048, 3072, 3072, GSF_NN_LINEAR, 1},
-        {2048, 12288, 3072, GSF_NN_GELU_TANH, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0},
-        {17776, 3072, 3072, GSF_NN_LINEAR, 0},
+        {1, 3072, 3072, GSF__NN_LINEAR, 1},     {2, 3072, 3072, GSF__NN_LINEAR, 0},
+        {4, 3072, 3072, GSF__NN_LINEAR, 1},     {2, 18432, 512, GSF__NN_LINEAR, 0},
+        {226, 3072, 3072, GSF__NN_LINEAR, 1},   {2048, 3072, 3072, GSF__NN_LINEAR, 1},
+        {2048, 12288, 3072, GSF__NN_GELU_TANH, 0}, {2048, 3072, 12288, GSF__NN_LINEAR, 0},
+        {17776, 3072, 3072, GSF__NN_LINEAR, 0},
     };
     static const gsf_nn_dtype dtypes[] = {GSF_NN_F32, GSF_NN_BF16, GSF_NN_F16};
     for (int threads = 1; threads <= 2; threads++)
         for (size_t t = 0; t < GSF__COUNT(dtypes); t++) {
-            BENCH_EACH(level) bench_one_linear(o, level, threads, dtypes[t], 0, 64, 256, 256, GSF_NN_LINEAR, memory, size);
+            BENCH_EACH(level) bench_one_linear(o, level, threads, dtypes[t], 0, 64, 256, 256, GSF__NN_LINEAR, memory,
+                                               size);
             for (size_t i = 0; i < GSF__COUNT(shapes); i++) {
                 const bench_shape* s = &shapes[i];
                 if (o->quick && !s->quick) continue;
@@ -349,22 +350,22 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
 
 typedef struct bench_int8 {
     bench_linear linear; // copies: of the quantized weights
-    gsf_nn_quantized weight;
+    gsf__nn_quantized weight;
 } bench_int8;
 
 static void bench_run_int8(gsf_context* ctx, void* arg) {
     bench_int8* l = (bench_int8*)arg;
-    gsf_nn_quantized weight = l->weight;
+    gsf__nn_quantized weight = l->weight;
     for (int64_t i = 0; i < l->linear.copies; i++) {
-        bench_require(ctx, gsf_nn_linear_int8(ctx, &l->linear.workspace, &l->linear.desc, &weight));
+        bench_require(ctx, gsf__nn_run_linear_int8(ctx, &l->linear.workspace, &l->linear.desc, &weight));
         weight.data += weight.bytes;
     }
 }
 
 static void bench_run_quantize(gsf_context* ctx, void* arg) {
     bench_int8* l = (bench_int8*)arg;
-    gsf_nn_destroy_quantized(ctx, &l->weight);
-    bench_require(ctx, gsf_nn_quantize_weight(ctx, &l->linear.weight, 0, &l->weight));
+    gsf__nn_destroy_quantized(ctx, &l->weight);
+    bench_require(ctx, gsf__nn_quantize_weight(ctx, &l->linear.weight, 0, &l->weight));
 }
 
 // Float input; the time includes rotation, rounding, product, scales and bias. Errors are those of the quantization.
@@ -423,15 +424,17 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
     gsf_free(&ctx, bias);
     gsf_free(&ctx, y);
     gsf_free(&ctx, x);
-    gsf_nn_destroy_quantized(&ctx, &l.weight);
-    gsf_nn_destroy_workspace(&ctx, &l.linear.workspace);
+    gsf__nn_destroy_quantized(&ctx, &l.weight);
+    gsf__nn_destroy_workspace(&ctx, &l.linear.workspace);
 }
 
 static void bench_int8s(const bench_options* o, char* memory, size_t size) {
     static const bench_shape shapes[] = {
-        {1, 3072, 3072, GSF_NN_LINEAR, 1},    {2, 3072, 3072, GSF_NN_LINEAR, 0},    {4, 3072, 3072, GSF_NN_LINEAR, 1},
-        {226, 3072, 3072, GSF_NN_LINEAR, 0},  {2048, 3072, 3072, GSF_NN_LINEAR, 1},
-        {2048, 12288, 3072, GSF_NN_LINEAR, 0}, {2048, 3072, 12288, GSF_NN_LINEAR, 0}, {17776, 3072, 3072, GSF_NN_LINEAR, 0},
+        {1, 3072, 3072, GSF__NN_LINEAR, 1},    {2, 3072, 3072, GSF__NN_LINEAR, 0},    {4, 3072, 3072, GSF__NN_LINEAR,
+                                                                                       1},
+        {226, 3072, 3072, GSF__NN_LINEAR, 0},  {2048, 3072, 3072, GSF__NN_LINEAR, 1},
+        {2048, 12288, 3072, GSF__NN_LINEAR, 0}, {2048, 3072, 12288, GSF__NN_LINEAR, 0}, {17776, 3072, 3072,
+                                                                                         GSF__NN_LINEAR, 0},
     };
     for (int threads = 1; threads <= 2; threads++) {
         BENCH_EACH(level) bench_one_int8(o, level, threads, 64, 256, 256, memory, size);
@@ -445,13 +448,13 @@ static void bench_int8s(const bench_options* o, char* memory, size_t size) {
 // ---- attention ----------------------------------------------------------------------
 
 typedef struct bench_attention {
-    gsf_nn_attention_desc desc;
-    gsf_nn_workspace workspace;
+    gsf__nn_attention_desc desc;
+    gsf__nn_workspace workspace;
 } bench_attention;
 
 static void bench_run_attention(gsf_context* ctx, void* arg) {
     bench_attention* a = (bench_attention*)arg;
-    bench_require(ctx, gsf_nn_attention(ctx, &a->workspace, &a->desc));
+    bench_require(ctx, gsf__nn_run_attention(ctx, &a->workspace, &a->desc));
 }
 
 // Error_rel_l2 accumulates squares.
@@ -463,7 +466,7 @@ static void bench_add_error(bench_row* row, double value, double expected, doubl
 }
 
 // Error relative to sums in double: three queries of the first and of the last head.
-static void bench_attention_error(gsf_context* ctx, const gsf_nn_attention_desc* d, bench_row* row) {
+static void bench_attention_error(gsf_context* ctx, const gsf__nn_attention_desc* d, bench_row* row) {
     double *p = (double*)bench_alloc(ctx, (size_t)d->keys, sizeof(double)), square = 0.0;
     const int64_t dim = d->head_dim, width = d->heads * dim;
     row->error_max = row->error_rel_l2 = 0.0;
@@ -516,7 +519,7 @@ static void bench_one_attention(const bench_options* o, gsf_cpu_level level, int
     bench_time(o, &ctx, &row, bench_run_attention, &a, 1.0);
     bench_attention_error(&ctx, &a.desc, &row);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &a.workspace);
+    gsf__nn_destroy_workspace(&ctx, &a.workspace);
     gsf_free(&ctx, memory);
 }
 
@@ -549,17 +552,17 @@ static void bench_run_rows(gsf_context* ctx, void* arg) {
     const bench_rows* b = (const bench_rows*)arg;
     const float* v = b->vector;
     switch (b->kind) {
-        case LAYER_NORM: gsf_nn_layer_norm(ctx, b->x, b->rows, b->dim, v, v, 1e-6f, b->y); break;
-        case MODULATED: gsf_nn_layer_norm_modulated(ctx, b->x, b->rows, b->dim, v, v, 1e-6f, v, v, b->y); break;
-        case RMS_NORM: gsf_nn_rms_norm(ctx, b->x, b->rows, b->dim, v, 1e-6f, b->y); break;
+        case LAYER_NORM: gsf__nn_layer_norm(ctx, b->x, b->rows, b->dim, v, v, 1e-6f, b->y); break;
+        case MODULATED: gsf__nn_layer_norm_modulated(ctx, b->x, b->rows, b->dim, v, v, 1e-6f, v, v, b->y); break;
+        case RMS_NORM: gsf__nn_rms_norm(ctx, b->x, b->rows, b->dim, v, 1e-6f, b->y); break;
         case HEAD_NORM:
-            gsf_nn_head_norm_rope(ctx, b->y, b->rows, b->dim, (int32_t)(b->dim / BENCH_HEAD), BENCH_HEAD, v, v, 1e-6f,
-                                  b->table, b->table, 0);
+            gsf__nn_head_norm_rope(ctx, b->y, b->rows, b->dim, (int32_t)(b->dim / BENCH_HEAD), BENCH_HEAD, v, v, 1e-6f,
+                                   b->table, b->table, 0);
             break;
-        case GROUP_NORM: gsf_nn_group_norm(ctx, b->x, b->rows, b->dim, BENCH_GROUPS, v, v, 1e-6f, b->y); break;
-        case SOFTMAX: gsf_nn_softmax(ctx, b->x, b->rows, b->dim, 1.0f, b->y); break;
-        case GELU: gsf_nn_activate(ctx, GSF_NN_GELU_TANH, b->x, b->rows * b->dim, b->y); break;
-        default: gsf_nn_activate(ctx, GSF_NN_SILU, b->x, b->rows * b->dim, b->y); break;
+        case GROUP_NORM: gsf__nn_group_norm(ctx, b->x, b->rows, b->dim, BENCH_GROUPS, v, v, 1e-6f, b->y); break;
+        case SOFTMAX: gsf__nn_softmax(ctx, b->x, b->rows, b->dim, 1.0f, b->y); break;
+        case GELU: gsf__nn_activate(ctx, GSF__NN_GELU_TANH, b->x, b->rows * b->dim, b->y); break;
+        default: gsf__nn_activate(ctx, GSF__NN_SILU, b->x, b->rows * b->dim, b->y); break;
     }
 }
 
@@ -575,7 +578,7 @@ static void bench_expect_rows(const bench_rows* b, int64_t n, double* out) {
         out[i] = (x - mean) / sqrt(square + 1e-6) * w + (b->kind == RMS_NORM ? 0.0 : w);
         if (b->kind == MODULATED) out[i] = out[i] * (1.0 + w) + w;
         if (b->kind == SOFTMAX) out[i] = exp(x) / sum;
-        if (b->kind >= GELU) out[i] = bench_activation(b->kind == GELU ? GSF_NN_GELU_TANH : GSF_NN_SILU, x);
+        if (b->kind >= GELU) out[i] = bench_activation(b->kind == GELU ? GSF__NN_GELU_TANH : GSF__NN_SILU, x);
     }
     for (int64_t i = 0; b->kind == HEAD_NORM && i < n; i += 2) {
         const double first = out[i], second = out[i + 1];
@@ -639,20 +642,20 @@ static void bench_norms(const bench_options* o) {
 // ---- convolutions -------------------------------------------------------------------
 
 typedef struct bench_conv {
-    gsf_nn_conv_desc desc;
-    gsf_tensor weight;
-    gsf_nn_workspace workspace;
+    gsf__nn_conv_desc desc;
+    gsf_nn_tensor weight;
+    gsf__nn_workspace workspace;
     int64_t channels;
 } bench_conv;
 
 static void bench_run_conv(gsf_context* ctx, void* arg) {
     bench_conv* c = (bench_conv*)arg;
-    bench_require(ctx, gsf_nn_convolve(ctx, &c->workspace, &c->desc));
+    bench_require(ctx, gsf__nn_convolve(ctx, &c->workspace, &c->desc));
 }
 
 // Output n of pixel (t, y, x), as a direct sum in double.
 static double bench_conv_value(const bench_conv* c, const float* w, int64_t t, int64_t y, int64_t x, int64_t n) {
-    const gsf_nn_conv_desc* d = &c->desc;
+    const gsf__nn_conv_desc* d = &c->desc;
     double sum = 0.0;
     for (int64_t tap = 0; tap < 27; tap++) {
         const int64_t from = t - 2 + tap / 9, row = y - 1 + tap / 3 % 3, column = x - 1 + tap % 3;
@@ -665,7 +668,7 @@ static double bench_conv_value(const bench_conv* c, const float* w, int64_t t, i
 
 static void bench_conv_error(const bench_conv* c, const float* w, bench_row* row) {
     enum { LOOKS = 64 };
-    const gsf_nn_conv_desc* d = &c->desc;
+    const gsf__nn_conv_desc* d = &c->desc;
     const int64_t count = d->frames * d->height * d->width * c->channels;
     double worst = 0.0, difference = 0.0, square = 0.0;
     for (int64_t i = 0; i < LOOKS; i++) { // includes the first and the last value
@@ -715,7 +718,7 @@ static void bench_one_conv(const bench_options* o, gsf_cpu_level level, int thre
     gsf_free(&ctx, w);
     gsf_free(&ctx, y);
     gsf_free(&ctx, x);
-    gsf_nn_destroy_workspace(&ctx, &c.workspace);
+    gsf__nn_destroy_workspace(&ctx, &c.workspace);
 }
 
 // ---- the autoencoder's resnet block: two convolutions with fused group norm and SiLU on their input
@@ -725,7 +728,7 @@ typedef struct bench_resnet {
     gsf__vae_resnet resnet;
     gsf__vae_run run;
     gsf__vae_map x;
-    gsf_tensor weight, ones;
+    gsf_nn_tensor weight, ones;
 } bench_resnet;
 
 static void bench_run_resnet(gsf_context* ctx, void* arg) {
@@ -790,7 +793,7 @@ static void bench_convs(const bench_options* o) {
 // ---- weights of a block, by its table ------------------------------------------------
 
 typedef struct bench_weights {
-    gsf_tensor tensors[64];
+    gsf_nn_tensor tensors[64];
     size_t count, used; // used: bytes
     gsf_nn_dtype dtype;
     char* memory;       // NULL: only counts
@@ -798,9 +801,10 @@ typedef struct bench_weights {
 
 // Of a size that keeps the stream's: values of [1/4, 1/2) in a vector; of a matrix all bits but the exponent's, which makes
 // them 1/128 and less.
-static gsf_result bench_add_weight(void* user, const char* name, int32_t rank, const int64_t* shape, const gsf_tensor** to) {
+static gsf_result bench_add_weight(void* user, const char* name, int32_t rank, const int64_t* shape,
+                                   const gsf_nn_tensor** to) {
     bench_weights* w = (bench_weights*)user;
-    gsf_tensor* t = &w->tensors[w->count++];
+    gsf_nn_tensor* t = &w->tensors[w->count++];
     memset(t, 0, sizeof *t);
     t->name = name[0] ? "weight" : name;
     t->dtype = w->dtype;
@@ -808,7 +812,7 @@ static gsf_result bench_add_weight(void* user, const char* name, int32_t rank, c
     t->count = 1;
     for (int32_t i = 0; i < rank; i++) t->count *= t->shape[i] = shape[i];
     t->data = w->memory + w->used;
-    const size_t bytes = (size_t)t->count * gsf_nn_dtype_size(t->dtype);
+    const size_t bytes = (size_t)t->count * gsf_nn_get_dtype_size(t->dtype);
     if (w->memory) {
         char* data = w->memory + w->used;
         bench_fill(data, bytes, t->dtype, w->count);
@@ -839,7 +843,7 @@ typedef struct bench_block {
     gsf_nn_transformer net;
     gsf__dit_nets nets;
     gsf__dit_block block;
-    gsf_nn_transformer_input in;
+    gsf_nn_transformer_desc in;
     gsf__dit_run run;
     bench_weights weights;
     float* first; // the residual stream before the block
@@ -897,14 +901,14 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     b.first = memory + floats;
     bench_fill(memory, (floats + stream) * sizeof(float), GSF_NN_F32, 6); // includes the rotation table
     double bytes, flops;
-    gsf_nn_transformer_cost(&b.net, &b.in, &bytes, &flops);
+    gsf__nn_query_transformer(&b.net, &b.in, &bytes, &flops);
     flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     if (bf16) row.variant = BENCH_BF16;
     bench_time(o, &ctx, &row, bench_run_block, &b, 1.0);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &b.run.nn.workspace);
+    gsf__nn_destroy_workspace(&ctx, &b.run.nn.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
     gsf_free(&ctx, (void*)(uintptr_t)b.in.references);
@@ -933,7 +937,7 @@ typedef struct bench_vit {
     gsf__vit vit;
     gsf__nn_block blocks[24]; // all share one block's weights, which exceed every cache
     bench_weights block_weights, weights;
-    gsf_nn_encoder_input in;
+    gsf_nn_encoder_desc in;
     gsf__nn_run run;
     float *first, *x, *out;    // residual stream before a block; working copy; the encoder's output
 } bench_vit;
@@ -945,7 +949,7 @@ static void bench_vit_sizes(bench_vit* b, int64_t layers) {
     v->sizes.heads = BENCH_VIT_HEADS;
     v->sizes.head_dim = BENCH_VIT_WIDTH / BENCH_VIT_HEADS;
     v->sizes.eps = v->sizes.head_eps = 1e-6f;
-    v->sizes.activation = GSF_NN_GELU;
+    v->sizes.activation = GSF__NN_GELU;
     v->sizes.qkv_bias = v->sizes.head_norm = 1;
     v->channels = 3;
     v->patch = 14;
@@ -962,7 +966,7 @@ static void bench_vit_sizes(bench_vit* b, int64_t layers) {
 
 static void bench_run_dinov2(gsf_context* ctx, void* arg) {
     bench_vit* b = (bench_vit*)arg;
-    bench_require(ctx, gsf_nn_dinov2_encode(ctx, &b->net, &b->in, b->out));
+    bench_require(ctx, gsf_nn_encode_dinov2(ctx, &b->net, &b->in, b->out));
 }
 
 // Complete DINOv2-L with registers, from pixels to the last norm.
@@ -983,7 +987,7 @@ static void bench_one_dinov2(const bench_options* o, int threads, int64_t layers
     b->in.pixels = memory;
     b->out = memory + pixels;
     double flops;
-    gsf_nn_dinov2_cost(&b->net, &b->in, NULL, &flops);
+    gsf__nn_query_dinov2(&b->net, &b->in, NULL, &flops);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_dinov2, b, 1.0);
@@ -1042,7 +1046,7 @@ static void bench_one_pair(const bench_options* o, int threads, int32_t images) 
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_pair, b, 1.0);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &run->workspace);
+    gsf__nn_destroy_workspace(&ctx, &run->workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
     gsf_free(&ctx, b);
@@ -1095,7 +1099,7 @@ static void bench_step(void* user, const char* stage, double done, double total)
 typedef struct bench_model {
     const char* folder;
     gsf_nn_transformer transformer;
-    gsf_nn_transformer_input in;
+    gsf_nn_transformer_desc in;
     gsf_nn_vae vae;
     int64_t frames, height, width; // of the latents
     float *x, *y;
@@ -1103,17 +1107,17 @@ typedef struct bench_model {
 
 static void bench_run_forward(gsf_context* ctx, void* arg) {
     bench_model* m = (bench_model*)arg;
-    bench_require(ctx, gsf_nn_transformer_forward(ctx, &m->transformer, &m->in, m->y));
+    bench_require(ctx, gsf_nn_run_transformer(ctx, &m->transformer, &m->in, m->y));
 }
 
 static void bench_run_decode(gsf_context* ctx, void* arg) {
     bench_model* m = (bench_model*)arg;
-    bench_require(ctx, gsf_nn_vae_decode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y));
+    bench_require(ctx, gsf_nn_decode_vae(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y));
 }
 
 static void bench_run_encode(gsf_context* ctx, void* arg) {
     bench_model* m = (bench_model*)arg;
-    bench_require(ctx, gsf_nn_vae_encode(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y, NULL));
+    bench_require(ctx, gsf_nn_encode_vae(ctx, &m->vae, NULL, m->x, m->frames, m->height, m->width, m->y, NULL));
 }
 
 // Runs once, since it takes minutes. Memory is that of the whole process, including inputs and outputs.
@@ -1154,7 +1158,7 @@ static void bench_forward(const bench_options* o, gsf_context* ctx, bench_model*
     char path[1024];
     snprintf(path, sizeof path, "%s/transformer", m->folder);
     gsf_nn_transformer* t = &m->transformer;
-    bench_require(ctx, gsf_nn_make_transformer(ctx, path, t));
+    bench_require(ctx, gsf_nn_load_transformer(ctx, path, t));
     const int32_t frames = (t->sample_frames - 1) / t->temporal_ratio + 1;
     const size_t pixels = (size_t)frames * (size_t)t->sample_height * (size_t)t->sample_width;
     const double timestep = 500.0;
@@ -1173,16 +1177,16 @@ static void bench_forward(const bench_options* o, gsf_context* ctx, bench_model*
     bench_fill_floats(ctx, &vggt, tokens * (size_t)t->vggt_channels, 4);
     bench_fill_floats(ctx, &references, tokens * (size_t)(t->heads * t->head_dim), 5);
     bench_fill_floats(ctx, &m->y, pixels * (size_t)t->out_channels, 6);
-    kv = (float*)bench_alloc(ctx, gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1), sizeof(float));
+    kv = (float*)bench_alloc(ctx, gsf__nn_query_reference_kv(t, m->in.reference_tokens, 1), sizeof(float));
     bench_require(ctx, gsf_nn_project_references(ctx, t, m->in.reference_tokens, dino, vggt, references));
     m->in.hidden = hidden;
     m->in.text = text;
     m->in.references = references;
     m->in.reference_kv = kv;
     double bytes, flops;
-    gsf_nn_transformer_cost(t, &m->in, &bytes, &flops);
+    gsf__nn_query_transformer(t, &m->in, &bytes, &flops);
     // The caller's buffer, filled here.
-    bytes += (double)gsf_nn_reference_kv_size(t, m->in.reference_tokens, 1) * sizeof(float);
+    bytes += (double)gsf__nn_query_reference_kv(t, m->in.reference_tokens, 1) * sizeof(float);
     bench_once(o, ctx, "model: transformer forward", "default", m, bench_run_forward, flops, bytes);
     m->transformer.bf16 = 1;
     m->in.reference_kv_ready = 0;
@@ -1197,7 +1201,7 @@ static void bench_vae(const bench_options* o, gsf_context* ctx, bench_model* m, 
     char path[1024];
     snprintf(path, sizeof path, "%s/vae", m->folder);
     gsf_nn_vae* v = &m->vae;
-    bench_require(ctx, gsf_nn_make_vae(ctx, path, v));
+    bench_require(ctx, gsf_nn_load_vae(ctx, path, v));
     const int encode = way == GSF_NN_VAE_ENCODE;
     const int64_t frames = 49; // of the paper's clips
     m->frames = encode ? frames : (frames - 1) / v->temporal_ratio + 1;
@@ -1246,13 +1250,13 @@ static void bench_open_pipeline(bench_pipeline* p, const char* folder) {
     memset(p, 0, sizeof *p);
     (void)bench_context(ctx, GSF_CPU_AUTO, 2);
     snprintf(path, sizeof path, "%s/transformer", folder);
-    bench_require(ctx, gsf_nn_make_transformer(ctx, path, &p->transformer));
+    bench_require(ctx, gsf_nn_load_transformer(ctx, path, &p->transformer));
     snprintf(path, sizeof path, "%s/vae", folder);
-    bench_require(ctx, gsf_nn_make_vae(ctx, path, &p->vae));
+    bench_require(ctx, gsf_nn_load_vae(ctx, path, &p->vae));
     snprintf(path, sizeof path, "%s/scheduler/scheduler_config.json", folder);
     bench_require(ctx, gsf_nn_load_schedule(ctx, path, &p->schedule));
     const gsf_nn_transformer* t = &p->transformer;
-    snprintf(p->dtype, sizeof p->dtype, "%s", gsf_nn_dtype_name(t->weights.tensors[0].dtype));
+    snprintf(p->dtype, sizeof p->dtype, "%s", gsf__nn_dtype_name(t->weights.tensors[0].dtype));
     gsf_nn_sample_desc* d = &p->desc;
     d->frames = 9;
     d->any_frames = 1;
@@ -1374,7 +1378,7 @@ static void bench_pipelines(const bench_options* o) {
         p.desc.steps = o->quick ? 4 : 50;
         if (i == 0) {
             gsf_nn_sample_desc d = p.desc;
-            d.solver = GSF_NN_UNIPC;
+            d.solver = GSF_NN_SOLVER_UNIPC;
             d.steps = o->quick ? 12 : 150;
             bench_restore(&p, &d, "steps", "unipc, converged", NULL, "none");
             converged = bench_keep(&p);
@@ -1409,7 +1413,7 @@ typedef struct bench_t5 {
     gsf__nn_run run;
     gsf_nn_t5 net;
     gsf__nn_block_sizes sizes;
-    gsf_nn_t5_input in;
+    gsf_nn_t5_desc in;
     gsf__nn_block block;
     bench_weights weights;
     float *x, *first; // at work; the layer's input
@@ -1451,12 +1455,12 @@ static void bench_one_t5(const bench_options* o, int threads, gsf_nn_dtype dtype
     b.run.scale = 1.0f;
     b.first = memory + floats;
     double bytes, flops;
-    gsf_nn_t5_cost(&b.net, &b.in, &bytes, &flops);
+    gsf__nn_query_t5(&b.net, &b.in, &bytes, &flops);
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     bench_time(o, &ctx, &row, bench_run_t5, &b, 1.0);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &b.run.workspace);
+    gsf__nn_destroy_workspace(&ctx, &b.run.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
 }
@@ -1503,7 +1507,7 @@ static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     opt->sizes.heads = BENCH_OPT_HEADS;
     opt->sizes.head_dim = BENCH_OPT_WIDTH / BENCH_OPT_HEADS;
     opt->sizes.eps = 1e-5f;
-    opt->sizes.activation = GSF_NN_RELU;
+    opt->sizes.activation = GSF__NN_RELU;
     opt->layers = opt->vocabulary = 1;
     opt->blocks = &b->block;
     opt->sizes.qkv_bias = 1;
@@ -1529,7 +1533,7 @@ static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     else row.bytes = (double)bytes;
     bench_time(o, &ctx, &row, bench_run_opt, b, 1.0);
     bench_print(o->json, &row);
-    gsf_nn_destroy_workspace(&ctx, &b->run.workspace);
+    gsf__nn_destroy_workspace(&ctx, &b->run.workspace);
     gsf_free(&ctx, memory);
     gsf_free(&ctx, weights);
     gsf_free(&ctx, b);

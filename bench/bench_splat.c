@@ -50,12 +50,12 @@ static void bench_make_splats(gsf_context* ctx, size_t count, double size, gsf_s
     bench_require(ctx, gsf_splat_make(ctx, count, 3, s));
     for (size_t i = 0; i < count; i++) {
         for (uint64_t k = 0; k < 3; k++) {
-            s->means[3 * i + k] = (float)((gsf_random_uniform(1, k, i) * 2.0 - 1.0) * (k == 2 ? 1.0 : 2.0));
-            s->log_scales[3 * i + k] = (float)(log(size) + 0.5 * gsf_random_normal(2, k, i));
+            s->means[3 * i + k] = (float)((gsf_draw_uniform(1, k, i) * 2.0 - 1.0) * (k == 2 ? 1.0 : 2.0));
+            s->log_scales[3 * i + k] = (float)(log(size) + 0.5 * gsf_draw_normal(2, k, i));
         }
-        for (uint64_t k = 0; k < 4; k++) s->quats[4 * i + k] = (float)gsf_random_normal(3, k, i);
-        s->opacity_logits[i] = (float)gsf_random_normal(4, 0, i);
-        for (uint64_t k = 0; k < 48; k++) s->sh[48 * i + k] = (float)(0.2 * gsf_random_normal(5, k, i));
+        for (uint64_t k = 0; k < 4; k++) s->quats[4 * i + k] = (float)gsf_draw_normal(3, k, i);
+        s->opacity_logits[i] = (float)gsf_draw_normal(4, 0, i);
+        for (uint64_t k = 0; k < 48; k++) s->sh[48 * i + k] = (float)(0.2 * gsf_draw_normal(5, k, i));
     }
 }
 
@@ -89,7 +89,7 @@ typedef struct bench_count {
 } bench_count;
 
 // Pairs of one tile: lanes with an alpha in the steps that the backward pass keeps.
-static void bench_count_tile(void* arg, size_t index, int worker) {
+static void bench_count_tile(void* arg, size_t index, int32_t worker) {
     const bench_count* job = (const bench_count*)arg;
     const gsf__tile tile = gsf__tile_of(job->r, index);
     const gsf__worker_scratch* scratch = job->r->workers + worker;
@@ -167,7 +167,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     grads.opacity_logits = model.groups[GSF__OPACITY].grad;
     grads.sh = model.groups[GSF__SH].grad;
     if (!d_color || !photo) exit(1);
-    for (size_t i = 0; i < 3 * pixels; i++) photo[i] = (float)gsf_random_uniform(7, 0, i);
+    for (size_t i = 0; i < 3 * pixels; i++) photo[i] = (float)gsf_draw_uniform(7, 0, i);
     gsf_rasterizer* r;
     bench_require(&ctx, gsf_splat_make_rasterizer(&ctx, &r));
     // one step through the public functions allocates all buffers
@@ -313,7 +313,7 @@ static void bench_open_pass(gsf_context* ctx, bench_pass* p, size_t count, doubl
     p->d_color = (float*)gsf_alloc(ctx, p->values, sizeof(float));
     bench_require(ctx, gsf_make_image(ctx, GSF_F32, width, height, 3, &p->out.color));
     if (!p->d_color) exit(1);
-    for (size_t i = 0; i < p->values; i++) p->d_color[i] = (float)gsf_random_normal(6, 0, i);
+    for (size_t i = 0; i < p->values; i++) p->d_color[i] = (float)gsf_draw_normal(6, 0, i);
     p->grads.means = p->sums.means;
     p->grads.log_scales = p->sums.log_scales;
     p->grads.quats = p->sums.quats;
@@ -487,7 +487,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
         c->cx += 0.25 * width * (zoom - 1.0) * ((double)v - 2.0);
         bench_require(&ctx, gsf_make_image(&ctx, GSF_U8, width, height, 3, &views[v].image));
         for (size_t i = 0; i < 3 * (size_t)width * (size_t)height; i++)
-            ((uint8_t*)views[v].image.data)[i] = (uint8_t)(gsf_random_bits(8, v, i) & 255u);
+            ((uint8_t*)views[v].image.data)[i] = (uint8_t)(gsf_draw_bits(8, v, i) & 255u);
     }
     gsf_trainer* trainers[2]; // dense, lazy
     for (int k = 0; k < 2; k++) {
@@ -519,7 +519,7 @@ static void bench_lazy(const bench_options* o, const char* size_name, size_t cou
             cpu[k][1] += (bench_cpu() - c0) / rounds;
             for (size_t j = 0; k == 0 && j < count; j++) drawn += trainer->rasterizer->radii[j] > 0 ? 1.0 / rounds : 0.0;
         }
-    const gsf_splats* shown[2] = {gsf_splat_trainer_splats(trainers[0]), gsf_splat_trainer_splats(trainers[1])};
+    const gsf_splats* shown[2] = {gsf_splat_get_trained(trainers[0]), gsf_splat_get_trained(trainers[1])};
     double worst = 0.0, difference = 0.0, total = 0.0;
     for (size_t i = 0; i < 48 * count; i++) {
         const double a = (double)shown[0]->sh[i], d = (double)shown[1]->sh[i] - a;
@@ -612,10 +612,10 @@ static void bench_visibility(const bench_options* o, const char* name, size_t co
     for (size_t i = 0; i < count; i++) {
         double d[3], length2 = 0.0;
         for (uint64_t k = 0; k < 3; k++) {
-            d[k] = gsf_random_normal(11, k, i);
+            d[k] = gsf_draw_normal(11, k, i);
             length2 += d[k] * d[k];
         }
-        const uint64_t ball = gsf_random_bits(12, 0, i) % 125;
+        const uint64_t ball = gsf_draw_bits(12, 0, i) % 125;
         const double centre[3] = {(double)(ball % 5) - 2.0, (double)(ball / 5 % 5) - 2.0, (double)(ball / 25) - 2.0};
         for (int k = 0; k < 3; k++) scene.points[3 * i + (size_t)k] = centre[k] + 0.48 * d[k] / sqrt(length2);
     }
@@ -627,7 +627,7 @@ static void bench_visibility(const bench_options* o, const char* name, size_t co
         gsf_camera* c = &scene.views[v].camera;
         *c = bench_camera(1600, 1200);
         c->fx = c->fy = 1600.0;
-        gsf_camera_set_c2w(c, pose);
+        gsf_set_camera_c2w(c, pose);
         views[v] = (uint32_t)v;
     }
     gsf_visibility_desc desc;
@@ -635,7 +635,7 @@ static void bench_visibility(const bench_options* o, const char* name, size_t co
     desc.method = GSF_VISIBILITY_RAYS;
     gsf_visibility_stats stats;
     const double cpu = bench_cpu();
-    bench_require(&ctx, gsf_splat_visible_points(&ctx, &scene, views, view_count, &desc, keep, &stats));
+    bench_require(&ctx, gsf_splat_filter_points(&ctx, &scene, views, view_count, &desc, keep, &stats));
     const double cpu_seconds = bench_cpu() - cpu;
     const char* by = stats.used_embree ? "embree" : "cells";
     char label[96];
@@ -687,8 +687,8 @@ static void bench_training(const bench_options* o) {
     gsf_splats start;
     if (o->start) bench_require(&ctx, gsf_splat_load(&ctx, o->start, &start));
     else
-        bench_require(&ctx, gsf_splat_from_points(&ctx, scene.points, scene.colors, scene.point_count, NULL, 3,
-                                                  scene.origin, &start));
+        bench_require(&ctx, gsf_splat_make_from_points(&ctx, scene.points, scene.colors, scene.point_count, NULL, 3,
+                                                       scene.origin, &start));
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.iterations = 30000;
@@ -701,11 +701,11 @@ static void bench_training(const bench_options* o) {
     double* seconds = (double*)gsf_alloc(&ctx, (size_t)o->steps, sizeof(double));
     if (!seconds) exit(1);
     gsf_train_stats stats;
-    for (int i = 0; i < 5; i++) bench_require(&ctx, gsf_splat_train_step(&ctx, trainer, &stats));
+    for (int i = 0; i < 5; i++) bench_require(&ctx, gsf_splat_step_trainer(&ctx, trainer, &stats));
     const double cpu = bench_cpu();
     for (int i = 0; i < o->steps; i++) {
         const double t = bench_now();
-        bench_require(&ctx, gsf_splat_train_step(&ctx, trainer, &stats));
+        bench_require(&ctx, gsf_splat_step_trainer(&ctx, trainer, &stats));
         seconds[i] = bench_now() - t;
     }
     const double step_cpu = (bench_cpu() - cpu) / o->steps;

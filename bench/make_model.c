@@ -67,8 +67,8 @@ static const model_size model_sizes[] = {
 
 enum { MODEL_PATCH = 14, MODEL_REGISTERS = 4 }; // of the image encoders
 
-static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "{\n  \"_class_name\": \"CogVideoXCrossTransformer3DModel\",\n  \"_diffusers_version\": \"0.32.1\",\n"
                     "  \"activation_fn\": \"gelu-approximate\",\n  \"attention_bias\": true,\n"
                     "  \"attention_head_dim\": 64,\n  \"dropout\": 0.0,\n  \"flip_sin_to_cos\": true,\n"
@@ -77,7 +77,7 @@ static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_t
                     "  \"num_layers\": %d,\n  \"ofs_embed_dim\": null,\n  \"out_channels\": 16,\n"
                     "  \"patch_bias\": true,\n  \"patch_size\": 2,\n  \"patch_size_t\": null,\n",
                     s->text_tokens, s->heads, s->layers);
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "  \"sample_frames\": %d,\n  \"sample_height\": %d,\n  \"sample_width\": %d,\n"
                     "  \"spatial_interpolation_scale\": 1.875,\n  \"temporal_compression_ratio\": 4,\n"
                     "  \"temporal_interpolation_scale\": 1.0,\n  \"text_embed_dim\": %d,\n  \"time_embed_dim\": %d,\n"
@@ -86,15 +86,15 @@ static void model_print_transformer(gsf_context* ctx, const model_size* s, gsf_t
                     s->frames, s->sample_height, s->sample_width, s->text.width, s->time_channels);
 }
 
-static void model_print_vae(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_vae(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "{\n  \"_class_name\": \"AutoencoderKLCogVideoX\",\n  \"_diffusers_version\": \"0.32.1\",\n"
                     "  \"act_fn\": \"silu\",\n  \"block_out_channels\": [\n    %d,\n    %d,\n    %d,\n    %d\n  ],\n",
                     s->channels[0], s->channels[1], s->channels[2], s->channels[3]);
     for (int up = 0; up < 2; up++) {
         const char* way = up ? "Up" : "Down";
         if (up)
-            gsf_text_printf(ctx, out,
+            gsf_append_text(ctx, out,
                             "  \"force_upcast\": true,\n  \"in_channels\": 3,\n  \"invert_scale_latents\": false,\n"
                             "  \"latent_channels\": 16,\n  \"latents_mean\": null,\n  \"latents_std\": null,\n"
                             "  \"layers_per_block\": %d,\n  \"norm_eps\": 1e-06,\n  \"norm_num_groups\": %d,\n"
@@ -102,16 +102,16 @@ static void model_print_vae(gsf_context* ctx, const model_size* s, gsf_text* out
                             "  \"scaling_factor\": 0.7,\n  \"shift_factor\": null,\n"
                             "  \"temporal_compression_ratio\": 4,\n",
                             s->vae_layers, s->vae_groups, s->vae_height, s->vae_width);
-        gsf_text_printf(ctx, out, "  \"%s_block_types\": [\n", up ? "up" : "down");
-        for (int i = 0; i < 4; i++) gsf_text_printf(ctx, out, "    \"CogVideoX%sBlock3D\"%s\n", way, i < 3 ? "," : "");
-        gsf_text_printf(ctx, out, "  ],\n");
+        gsf_append_text(ctx, out, "  \"%s_block_types\": [\n", up ? "up" : "down");
+        for (int i = 0; i < 4; i++) gsf_append_text(ctx, out, "    \"CogVideoX%sBlock3D\"%s\n", way, i < 3 ? "," : "");
+        gsf_append_text(ctx, out, "  ],\n");
     }
-    gsf_text_printf(ctx, out, "  \"use_post_quant_conv\": false,\n  \"use_quant_conv\": false\n}\n");
+    gsf_append_text(ctx, out, "  \"use_post_quant_conv\": false,\n  \"use_quant_conv\": false\n}\n");
 }
 
-static void model_print_scheduler(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_scheduler(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     (void)s;
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "{\n  \"_class_name\": \"CogVideoXDDIMScheduler\",\n  \"_diffusers_version\": \"0.32.1\",\n"
                     "  \"beta_end\": 0.012,\n  \"beta_schedule\": \"scaled_linear\",\n  \"beta_start\": 0.00085,\n"
                     "  \"clip_sample\": false,\n  \"clip_sample_range\": 1.0,\n  \"num_train_timesteps\": 1000,\n"
@@ -121,24 +121,24 @@ static void model_print_scheduler(gsf_context* ctx, const model_size* s, gsf_tex
 }
 
 // A missing text encoder is written as two nulls, as in diffusers: features.safetensors has the embeddings.
-static void model_print_pipeline(gsf_context* ctx, int has_text, gsf_text* out) {
+static void model_print_pipeline(gsf_context* ctx, int has_text, gsf_buffer* out) {
     static const char* const classes[][2] = {{"text_encoder", "T5EncoderModel"}, {"tokenizer", "T5Tokenizer"}};
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "{\n  \"_class_name\": \"CogVideoXImageToVideoPipeline\",\n  \"_diffusers_version\": \"0.32.1\",\n"
                     "  \"scheduler\": [\n    \"diffusers\",\n    \"CogVideoXDDIMScheduler\"\n  ],\n");
     for (int i = 0; i < 2; i++) {
         if (has_text)
-            gsf_text_printf(ctx, out, "  \"%s\": [\n    \"transformers\",\n    \"%s\"\n  ],\n", classes[i][0],
+            gsf_append_text(ctx, out, "  \"%s\": [\n    \"transformers\",\n    \"%s\"\n  ],\n", classes[i][0],
                             classes[i][1]);
-        else gsf_text_printf(ctx, out, "  \"%s\": [\n    null,\n    null\n  ],\n", classes[i][0]);
+        else gsf_append_text(ctx, out, "  \"%s\": [\n    null,\n    null\n  ],\n", classes[i][0]);
     }
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "  \"transformer\": [\n    \"diffusers\",\n    \"CogVideoXTransformer3DModel\"\n  ],\n"
                     "  \"vae\": [\n    \"diffusers\",\n    \"AutoencoderKLCogVideoX\"\n  ]\n}\n");
 }
 
-static void model_print_dinov2(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_dinov2(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "{\n  \"architectures\": [\n    \"Dinov2WithRegistersModel\"\n  ],\n  \"hidden_act\": \"gelu\",\n"
                     "  \"hidden_size\": %d,\n  \"image_size\": %d,\n  \"layer_norm_eps\": 1e-06,\n  \"mlp_ratio\": %d,\n"
                     "  \"model_type\": \"dinov2_with_registers\",\n  \"num_attention_heads\": %d,\n"
@@ -149,20 +149,20 @@ static void model_print_dinov2(gsf_context* ctx, const model_size* s, gsf_text* 
                     s->eyes.layers, (int)MODEL_REGISTERS, (int)MODEL_PATCH);
 }
 
-static void model_print_vggt(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out, "{\n  \"embed_dim\": %d,\n  \"img_size\": %d,\n  \"patch_size\": %d\n}\n", s->eyes.width,
+static void model_print_vggt(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out, "{\n  \"embed_dim\": %d,\n  \"img_size\": %d,\n  \"patch_size\": %d\n}\n", s->eyes.width,
                     s->eyes_grid * MODEL_PATCH, (int)MODEL_PATCH);
 }
 
-static void model_print_t5(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_t5(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "{\n  \"architectures\": [\n    \"T5EncoderModel\"\n  ],\n  \"d_ff\": %d,\n  \"d_kv\": 64,\n"
                     "  \"d_model\": %d,\n  \"decoder_start_token_id\": 0,\n  \"dense_act_fn\": \"gelu_new\",\n"
                     "  \"dropout_rate\": 0.1,\n  \"eos_token_id\": 1,\n  \"feed_forward_proj\": \"gated-gelu\",\n"
                     "  \"is_encoder_decoder\": true,\n  \"is_gated_act\": true,\n  \"layer_norm_epsilon\": 1e-06,\n"
                     "  \"model_type\": \"t5\",\n  \"num_decoder_layers\": %d,\n  \"num_heads\": %d,\n",
                     s->text.hidden, s->text.width, s->text.layers, s->text.heads);
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "  \"num_layers\": %d,\n  \"pad_token_id\": 0,\n  \"relative_attention_max_distance\": 128,\n"
                     "  \"relative_attention_num_buckets\": 32,\n  \"tie_word_embeddings\": false,\n"
                     "  \"transformers_version\": \"4.51.3\",\n  \"use_cache\": true,\n  \"vocab_size\": %d\n}\n",
@@ -172,43 +172,43 @@ static void model_print_t5(gsf_context* ctx, const model_size* s, gsf_text* out)
 // Ids of BLIP-2's vocabulary: four special tokens, the 256 bytes, the words and their prefixes, finally <image>.
 enum { MODEL_BYTE_0 = 4, MODEL_CAPTION_END = MODEL_BYTE_0 + '\n', MODEL_WORD_0 = MODEL_BYTE_0 + 256 };
 
-static void model_print_blocks(gsf_context* ctx, const model_blocks* b, const char* hidden, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_blocks(gsf_context* ctx, const model_blocks* b, const char* hidden, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "    \"hidden_size\": %d,\n    \"%s\": %d,\n    \"num_attention_heads\": %d,\n"
                     "    \"num_hidden_layers\": %d,\n",
                     b->width, hidden, b->hidden, b->heads, b->layers);
 }
 
-static void model_print_blip2(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_blip2(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "{\n  \"architectures\": [\n    \"Blip2ForConditionalGeneration\"\n  ],\n"
                     "  \"image_text_hidden_size\": 256,\n  \"image_token_index\": %d,\n  \"model_type\": \"blip-2\",\n"
                     "  \"num_query_tokens\": %d,\n  \"qformer_config\": {\n    \"cross_attention_frequency\": 2,\n"
                     "    \"encoder_hidden_size\": %d,\n    \"hidden_act\": \"gelu\",\n",
                     s->tell_words - 1, s->queries, s->see.width);
     model_print_blocks(ctx, &s->ask, "intermediate_size", out);
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "    \"layer_norm_eps\": 1e-12,\n    \"model_type\": \"blip_2_qformer\",\n"
                     "    \"position_embedding_type\": \"absolute\",\n    \"use_qformer_text_input\": false\n  },\n"
                     "  \"text_config\": {\n    \"activation_function\": \"relu\",\n    \"bos_token_id\": 2,\n"
                     "    \"do_layer_norm_before\": true,\n    \"eos_token_id\": %d,\n",
                     (int)MODEL_CAPTION_END);
     model_print_blocks(ctx, &s->tell, "ffn_dim", out);
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "    \"max_position_embeddings\": %d,\n    \"model_type\": \"opt\",\n    \"vocab_size\": %d,\n"
                     "    \"word_embed_proj_dim\": %d\n  },\n  \"transformers_version\": \"4.51.3\",\n"
                     "  \"use_decoder_only_language_model\": true,\n  \"vision_config\": {\n    \"hidden_act\": \"gelu\",\n",
                     s->tell_tokens, s->tell_words, s->tell.width);
     model_print_blocks(ctx, &s->see, "intermediate_size", out);
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "    \"image_size\": %d,\n    \"layer_norm_eps\": 1e-06,\n"
                     "    \"model_type\": \"blip_2_vision_model\",\n    \"patch_size\": %d,\n    \"qkv_bias\": true\n"
                     "  }\n}\n",
                     s->see_side, (int)MODEL_PATCH);
 }
 
-static void model_print_blip2_images(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out,
+static void model_print_blip2_images(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out,
                     "{\n  \"do_convert_rgb\": true,\n  \"do_normalize\": true,\n  \"do_rescale\": true,\n"
                     "  \"do_resize\": true,\n  \"image_mean\": [\n    0.48145466,\n    0.4578275,\n    0.40821073\n  ],\n"
                     "  \"image_processor_type\": \"BlipImageProcessor\",\n"
@@ -219,13 +219,13 @@ static void model_print_blip2_images(gsf_context* ctx, const model_size* s, gsf_
                     s->see_side, s->see_side);
 }
 
-static void model_print_blip2_processor(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out, "{\n  \"num_query_tokens\": %d,\n  \"processor_class\": \"Blip2Processor\"\n}\n", s->queries);
+static void model_print_blip2_processor(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out, "{\n  \"num_query_tokens\": %d,\n  \"processor_class\": \"Blip2Processor\"\n}\n", s->queries);
 }
 
-static void model_print_blip2_generation(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_blip2_generation(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     (void)s;
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "{\n  \"_from_model_config\": true,\n  \"bos_token_id\": 2,\n  \"eos_token_id\": %d,\n"
                     "  \"pad_token_id\": 1,\n  \"transformers_version\": \"4.51.3\"\n}\n",
                     (int)MODEL_CAPTION_END);
@@ -245,9 +245,10 @@ static const char* const model_words[] = { // of captions; sorted, as model_prin
     "walking", "wall", "water", "white", "window", "with", "woman", "wood", "wooden", "yellow"
 };
 
-static void model_print_token(gsf_context* ctx, gsf_text* out, int id, const char* text, int strip) { // an added token
+static void model_print_token(gsf_context* ctx, gsf_buffer* out, int id, const char* text,
+                              int strip) { // an added token
     const char* flag = strip ? "true" : "false";
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "    \"%d\": {\"content\": \"%s\", \"lstrip\": %s, \"normalized\": false, \"rstrip\": %s, "
                     "\"single_word\": false, \"special\": true}",
                     id, text, flag, flag);
@@ -257,7 +258,8 @@ static void model_print_token(gsf_context* ctx, gsf_text* out, int id, const cha
 
 enum { MODEL_PIECES = 4 + (int)GSF__COUNT(model_words) + '~' - '!' + 1 }; // <pad>, </s>, <unk>, space, words, ASCII
 
-static void model_put_piece(gsf_context* ctx, gsf_text* out, const char* before, const char* text, double score, int type) {
+static void model_put_piece(gsf_context* ctx, gsf_buffer* out, const char* before, const char* text, double score,
+                            int type) {
     const float value = (float)score;
     const size_t first = strlen(before), size = first + strlen(text);
     const unsigned char head[4] = {1 << 3 | 2, (unsigned char)(size + 9), 1 << 3 | 2, (unsigned char)size};
@@ -265,14 +267,14 @@ static void model_put_piece(gsf_context* ctx, gsf_text* out, const char* before,
     uint32_t bits;
     memcpy(&bits, &value, sizeof bits);
     gsf__store_le(tail + 1, bits, 4);
-    gsf_text_append(ctx, out, (const char*)head, sizeof head);
-    gsf_text_append(ctx, out, before, first);
-    gsf_text_append(ctx, out, text, size - first);
-    gsf_text_append(ctx, out, (const char*)tail, sizeof tail);
+    gsf_append_bytes(ctx, out, (const char*)head, sizeof head);
+    gsf_append_bytes(ctx, out, before, first);
+    gsf_append_bytes(ctx, out, text, size - first);
+    gsf_append_bytes(ctx, out, (const char*)tail, sizeof tail);
 }
 
 // A word scores higher than its characters together.
-static void model_print_pieces(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_pieces(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     static const char ends[] = "\x12\x02\x18\x01"                 // trainer: kind 1, a unigram
                                "\x1a\x0a\x0a\x08" "identity"; // normaliser: its name; characters stay as they are
     (void)s;
@@ -286,30 +288,31 @@ static void model_print_pieces(gsf_context* ctx, const model_size* s, gsf_text* 
         const char text[2] = {c, 0};
         model_put_piece(ctx, out, "", text, -8.0 - 0.01 * (c - '!'), GSF__SP_NORMAL);
     }
-    gsf_text_append(ctx, out, ends, sizeof ends - 1);
+    gsf_append_bytes(ctx, out, ends, sizeof ends - 1);
 }
 
-static void model_print_t5_added(gsf_context* ctx, const model_size* s, gsf_text* out) { // <extra_id_0> is the last one
+static void model_print_t5_added(gsf_context* ctx, const model_size* s,
+                                 gsf_buffer* out) { // <extra_id_0> is the last one
     (void)s;
     for (int i = 0; i < GSF__SP_EXTRA; i++)
-        gsf_text_printf(ctx, out, "%s  \"<extra_id_%d>\": %d", i ? ",\n" : "{\n", i, MODEL_PIECES + GSF__SP_EXTRA - 1 - i);
-    gsf_text_printf(ctx, out, "\n}\n");
+        gsf_append_text(ctx, out, "%s  \"<extra_id_%d>\": %d", i ? ",\n" : "{\n", i, MODEL_PIECES + GSF__SP_EXTRA - 1 - i);
+    gsf_append_text(ctx, out, "\n}\n");
 }
 
-static void model_print_t5_tokenizer(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_t5_tokenizer(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     static const char* const special[] = {"<pad>", "</s>", "<unk>"};
     char name[32];
-    gsf_text_printf(ctx, out, "{\n  \"added_tokens_decoder\": {\n");
+    gsf_append_text(ctx, out, "{\n  \"added_tokens_decoder\": {\n");
     for (int i = 0; i < 3; i++) {
         model_print_token(ctx, out, i, special[i], 0);
-        gsf_text_printf(ctx, out, ",\n");
+        gsf_append_text(ctx, out, ",\n");
     }
     for (int i = GSF__SP_EXTRA; i-- > 0;) {
         snprintf(name, sizeof name, "<extra_id_%d>", i);
         model_print_token(ctx, out, MODEL_PIECES + GSF__SP_EXTRA - 1 - i, name, 1);
-        gsf_text_printf(ctx, out, "%s\n", i ? "," : "");
+        gsf_append_text(ctx, out, "%s\n", i ? "," : "");
     }
-    gsf_text_printf(ctx, out,
+    gsf_append_text(ctx, out,
                     "  },\n  \"eos_token\": \"</s>\",\n  \"extra_ids\": %d,\n  \"legacy\": true,\n"
                     "  \"model_max_length\": %d,\n  \"pad_token\": \"<pad>\",\n"
                     "  \"tokenizer_class\": \"T5Tokenizer\",\n  \"unk_token\": \"<unk>\"\n}\n",
@@ -318,15 +321,15 @@ static void model_print_t5_tokenizer(gsf_context* ctx, const model_size* s, gsf_
 
 // ---- BLIP-2's: pairs of bytes
 
-static void model_print_entry(gsf_context* ctx, gsf_text* out, const char* text, int id) {
-    gsf_text_printf(ctx, out, "%s  ", id ? ",\n" : "{\n");
-    gsf_text_json_string(ctx, out, text);
-    gsf_text_printf(ctx, out, ": %d", id);
+static void model_print_entry(gsf_context* ctx, gsf_buffer* out, const char* text, int id) {
+    gsf_append_text(ctx, out, "%s  ", id ? ",\n" : "{\n");
+    gsf_append_json_string(ctx, out, text);
+    gsf_append_text(ctx, out, ": %d", id);
 }
 
 // Every prefix of a word, including the leading space, is a token, so that each is one character longer than another.
 // Printed as vocabulary entries or as merges.
-static void model_print_words(gsf_context* ctx, int merges, gsf_text* out) {
+static void model_print_words(gsf_context* ctx, int merges, gsf_buffer* out) {
     char text[48];
     const size_t space = gsf__bpe_store_character(gsf__bpe_character(' '), text);
     int id = MODEL_WORD_0;
@@ -336,13 +339,13 @@ static void model_print_words(gsf_context* ctx, int merges, gsf_text* out) {
         while (i && word[n] && word[n] == model_words[i - 1][n]) n++;
         for (; word[n]; n++) {
             snprintf(text + space, sizeof text - space, "%.*s", (int)n + !merges, word);
-            if (merges) gsf_text_printf(ctx, out, "%s %c\n", text, word[n]);
+            if (merges) gsf_append_text(ctx, out, "%s %c\n", text, word[n]);
             else model_print_entry(ctx, out, text, id++);
         }
     }
 }
 
-static void model_print_vocabulary(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_vocabulary(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     static const char* const special[MODEL_BYTE_0] = {"<s>", "<pad>", "</s>", "<unk>"};
     char text[4];
     (void)s;
@@ -352,36 +355,36 @@ static void model_print_vocabulary(gsf_context* ctx, const model_size* s, gsf_te
         model_print_entry(ctx, out, text, MODEL_BYTE_0 + i);
     }
     model_print_words(ctx, 0, out);
-    gsf_text_printf(ctx, out, "\n}\n");
+    gsf_append_text(ctx, out, "\n}\n");
 }
 
-static void model_print_merges(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_merges(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     (void)s;
-    gsf_text_printf(ctx, out, "#version: 0.2\n");
+    gsf_append_text(ctx, out, "#version: 0.2\n");
     model_print_words(ctx, 1, out);
 }
 
-static void model_print_blip2_added(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out, "{\n  \"<image>\": %d\n}\n", s->tell_words - 1);
+static void model_print_blip2_added(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out, "{\n  \"<image>\": %d\n}\n", s->tell_words - 1);
 }
 
 #define MODEL_BLIP2_SPECIAL \
     "  \"additional_special_tokens\": [\"<image>\"],\n  \"bos_token\": \"</s>\",\n  \"eos_token\": \"</s>\",\n" \
     "  \"pad_token\": \"<pad>\",\n  \"unk_token\": \"</s>\"\n}\n"
 
-static void model_print_blip2_special(gsf_context* ctx, const model_size* s, gsf_text* out) {
+static void model_print_blip2_special(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
     (void)s;
-    gsf_text_printf(ctx, out, "{\n" MODEL_BLIP2_SPECIAL);
+    gsf_append_text(ctx, out, "{\n" MODEL_BLIP2_SPECIAL);
 }
 
-static void model_print_blip2_tokenizer(gsf_context* ctx, const model_size* s, gsf_text* out) {
-    gsf_text_printf(ctx, out, "{\n  \"add_bos_token\": true,\n  \"added_tokens_decoder\": {\n");
+static void model_print_blip2_tokenizer(gsf_context* ctx, const model_size* s, gsf_buffer* out) {
+    gsf_append_text(ctx, out, "{\n  \"add_bos_token\": true,\n  \"added_tokens_decoder\": {\n");
     model_print_token(ctx, out, 1, "<pad>", 0);
-    gsf_text_printf(ctx, out, ",\n");
+    gsf_append_text(ctx, out, ",\n");
     model_print_token(ctx, out, 2, "</s>", 0);
-    gsf_text_printf(ctx, out, ",\n");
+    gsf_append_text(ctx, out, ",\n");
     model_print_token(ctx, out, s->tell_words - 1, "<image>", 0);
-    gsf_text_printf(ctx, out, "\n  },\n  \"tokenizer_class\": \"GPT2Tokenizer\",\n" MODEL_BLIP2_SPECIAL);
+    gsf_append_text(ctx, out, "\n  },\n  \"tokenizer_class\": \"GPT2Tokenizer\",\n" MODEL_BLIP2_SPECIAL);
 }
 
 // ---- the lists of tensors --------------------------------------------------------
@@ -472,7 +475,7 @@ static void model_add(model_list* list, int32_t rank, const int64_t* shape, cons
 
 // The tables by which a network is opened have every name and shape, but for the channels of reference tokens.
 static gsf_result model_add_visited(void* user, const char* name, int32_t rank, const int64_t* shape,
-                                    const gsf_tensor** to) {
+                                    const gsf_nn_tensor** to) {
     model_list* list = (model_list*)user;
     int64_t known[GSF_NN_MAX_RANK];
     (void)to;
@@ -720,7 +723,7 @@ static void model_fill_batch(const model_fill* f, int64_t first, unsigned char o
     uint16_t bits[MODEL_BATCH], narrow[MODEL_BATCH];
     float values[MODEL_BATCH];
     for (int i = 0; i < MODEL_BATCH / 4; i++)
-        words[i] = gsf_random_bits(f->seed, f->tensor->stream, (uint64_t)first / 4 + (uint64_t)i);
+        words[i] = gsf_draw_bits(f->seed, f->tensor->stream, (uint64_t)first / 4 + (uint64_t)i);
     memcpy(bits, words, sizeof bits);
     for (int i = 0; i < MODEL_BATCH; i++) values[i] = middle + step * ((float)(int32_t)bits[i] - 32767.5f);
     if (f->dtype == GSF_NN_F32) {
@@ -734,11 +737,11 @@ static void model_fill_batch(const model_fill* f, int64_t first, unsigned char o
     memcpy(out, narrow, sizeof narrow);
 }
 
-static void model_fill_chunk(void* arg, size_t chunk, int worker) {
+static void model_fill_chunk(void* arg, size_t chunk, int32_t worker) {
     const model_fill* f = (const model_fill*)arg;
     const int64_t begin = (int64_t)chunk * MODEL_CHUNK;
     const int64_t end = begin + MODEL_CHUNK < f->count ? begin + MODEL_CHUNK : f->count;
-    const size_t size = gsf_nn_dtype_size(f->dtype);
+    const size_t size = gsf_nn_get_dtype_size(f->dtype);
     unsigned char batch[4 * MODEL_BATCH];
     (void)worker;
     for (int64_t i = begin; i < end; i += MODEL_BATCH) {
@@ -771,7 +774,7 @@ typedef struct model_writer {
 } model_writer;
 
 static double model_bytes(const model_writer* w, const model_tensor* t) {
-    return (double)t->count * (double)gsf_nn_dtype_size(w->options->dtype);
+    return (double)t->count * (double)gsf_nn_get_dtype_size(w->options->dtype);
 }
 
 static int model_compare_names(const void* a, const void* b) {
@@ -779,21 +782,22 @@ static int model_compare_names(const void* a, const void* b) {
 }
 
 static gsf_result model_format_header(const model_writer* w, const model_tensor* const* tensors, size_t count,
-                                      gsf_text* out) {
+                                      gsf_buffer* out) {
     const gsf_nn_dtype dtype = w->options->dtype;
     long long begin = 0;
-    gsf_text_append(w->ctx, out, "        ", GSF__NN_FILE_HEAD); // room for the length
-    gsf_text_printf(w->ctx, out, "{\"__metadata__\":{\"format\":\"pt\"}");
+    gsf_append_bytes(w->ctx, out, "        ", GSF__NN_FILE_HEAD); // room for the length
+    gsf_append_text(w->ctx, out, "{\"__metadata__\":{\"format\":\"pt\"}");
     for (size_t i = 0; i < count; i++) {
-        const long long end = begin + (long long)tensors[i]->count * (long long)gsf_nn_dtype_size(dtype);
-        gsf_text_printf(w->ctx, out, ",\"%s\":{\"dtype\":\"%s\",\"shape\":[", tensors[i]->name, gsf_nn_dtype_name(dtype));
+        const long long end = begin + (long long)tensors[i]->count * (long long)gsf_nn_get_dtype_size(dtype);
+        gsf_append_text(w->ctx, out, ",\"%s\":{\"dtype\":\"%s\",\"shape\":[", tensors[i]->name,
+                        gsf__nn_dtype_name(dtype));
         for (int32_t k = 0; k < tensors[i]->rank; k++)
-            gsf_text_printf(w->ctx, out, "%s%lld", k ? "," : "", (long long)tensors[i]->shape[k]);
-        gsf_text_printf(w->ctx, out, "],\"data_offsets\":[%lld,%lld]}", begin, end);
+            gsf_append_text(w->ctx, out, "%s%lld", k ? "," : "", (long long)tensors[i]->shape[k]);
+        gsf_append_text(w->ctx, out, "],\"data_offsets\":[%lld,%lld]}", begin, end);
         begin = end;
     }
-    gsf_text_append(w->ctx, out, "}", 1);
-    gsf_text_append(w->ctx, out, "       ", (8 - out->size % 8) % 8);
+    gsf_append_bytes(w->ctx, out, "}", 1);
+    gsf_append_bytes(w->ctx, out, "       ", (8 - out->size % 8) % 8);
     if (out->failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__store_le(out->data, out->size - GSF__NN_FILE_HEAD, GSF__NN_FILE_HEAD);
     return GSF_OK;
@@ -807,7 +811,7 @@ static gsf_result model_write_bytes(model_writer* w, FILE* file, const char* pat
 
 static gsf_result model_write_tensor(model_writer* w, FILE* file, const char* path, const model_tensor* tensor) {
     model_fill fill = {tensor, w->options->seed, w->options->dtype, 0, 0, w->block};
-    const size_t size = gsf_nn_dtype_size(fill.dtype);
+    const size_t size = gsf_nn_get_dtype_size(fill.dtype);
     for (; fill.first < tensor->count; fill.first += fill.count) {
         GSF__TRY(gsf__check_cancel(w->ctx));
         fill.count = tensor->count - fill.first < MODEL_BLOCK ? tensor->count - fill.first : MODEL_BLOCK;
@@ -821,20 +825,20 @@ static gsf_result model_write_tensor(model_writer* w, FILE* file, const char* pa
 
 static gsf_result model_write_open_file(model_writer* w, FILE* file, const char* path,
                                         const model_tensor* const* tensors, size_t count) {
-    gsf_text header;
+    gsf_buffer header;
     memset(&header, 0, sizeof header);
     gsf_result result = model_format_header(w, tensors, count, &header);
     if (result == GSF_OK) result = model_write_bytes(w, file, path, header.data, header.size);
-    gsf_destroy_text(w->ctx, &header);
+    gsf_destroy_buffer(w->ctx, &header);
     for (size_t i = 0; i < count && result == GSF_OK; i++) result = model_write_tensor(w, file, path, tensors[i]);
     return result;
 }
 
 // Writes one safetensors file with these tensors, sorted by name as in Hugging Face's writer.
 static gsf_result model_write_file(model_writer* w, const char* path, const model_tensor** tensors, size_t count) {
-    gsf_text temporary;
+    gsf_buffer temporary;
     memset(&temporary, 0, sizeof temporary);
-    gsf_text_printf(w->ctx, &temporary, "%s.tmp", path);
+    gsf_append_text(w->ctx, &temporary, "%s.tmp", path);
     if (temporary.failed) return GSF_ERROR_OUT_OF_MEMORY;
     qsort((void*)tensors, count, sizeof *tensors, model_compare_names);
     gsf_result result = GSF_OK;
@@ -853,7 +857,7 @@ static gsf_result model_write_file(model_writer* w, const char* path, const mode
             result = gsf_fail(w->ctx, GSF_ERROR_IO, "%s: cannot be written: %s", path, strerror(errno));
         if (result != GSF_OK) remove(temporary.data);
     }
-    gsf_destroy_text(w->ctx, &temporary);
+    gsf_destroy_buffer(w->ctx, &temporary);
     return result;
 }
 
@@ -869,49 +873,49 @@ static void model_deal(const model_writer* w, model_list* list) {
     }
 }
 
-static void model_print_file(const model_writer* w, int shard, gsf_text* out) {
-    if (w->shards > 1) gsf_text_printf(w->ctx, out, "%s-%05d-of-%05d.safetensors", w->stem, shard + 1, w->shards);
-    else gsf_text_printf(w->ctx, out, "%s.safetensors", w->stem);
+static void model_print_file(const model_writer* w, int shard, gsf_buffer* out) {
+    if (w->shards > 1) gsf_append_text(w->ctx, out, "%s-%05d-of-%05d.safetensors", w->stem, shard + 1, w->shards);
+    else gsf_append_text(w->ctx, out, "%s.safetensors", w->stem);
 }
 
 static gsf_result model_write_text(gsf_context* ctx, const char* folder, const char* name, const char* data, size_t size) {
-    gsf_text path;
+    gsf_buffer path;
     memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/%s", folder, name);
+    gsf_append_text(ctx, &path, "%s/%s", folder, name);
     const gsf_result result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path.data, data, size);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
 // The same of a text that goes with it.
-static gsf_result model_end_text(gsf_context* ctx, const char* folder, const char* name, gsf_text* text) {
+static gsf_result model_end_text(gsf_context* ctx, const char* folder, const char* name, gsf_buffer* text) {
     const gsf_result result =
         text->failed ? GSF_ERROR_OUT_OF_MEMORY : model_write_text(ctx, folder, name, text->data, text->size);
-    gsf_destroy_text(ctx, text);
+    gsf_destroy_buffer(ctx, text);
     return result;
 }
 
 static gsf_result model_write_index(const model_writer* w, const model_tensor** sorted, size_t count) {
-    gsf_text out;
+    gsf_buffer out;
     char name[64];
     memset(&out, 0, sizeof out);
     snprintf(name, sizeof name, "%s.safetensors.index.json", w->stem);
-    gsf_text_printf(w->ctx, &out, "{\n  \"metadata\": {\n    \"total_size\": %.0f\n  },\n  \"weight_map\": {\n", w->total);
+    gsf_append_text(w->ctx, &out, "{\n  \"metadata\": {\n    \"total_size\": %.0f\n  },\n  \"weight_map\": {\n", w->total);
     for (size_t i = 0; i < count; i++) {
-        gsf_text_printf(w->ctx, &out, "    \"%s\": \"", sorted[i]->name);
+        gsf_append_text(w->ctx, &out, "    \"%s\": \"", sorted[i]->name);
         model_print_file(w, sorted[i]->shard, &out);
-        gsf_text_printf(w->ctx, &out, "\"%s\n", i + 1 < count ? "," : "");
+        gsf_append_text(w->ctx, &out, "\"%s\n", i + 1 < count ? "," : "");
     }
-    gsf_text_printf(w->ctx, &out, "  }\n}\n");
+    gsf_append_text(w->ctx, &out, "  }\n}\n");
     return model_end_text(w->ctx, w->folder, name, &out);
 }
 
 static void model_remove(const model_writer* w, const char* end) {
-    gsf_text path;
+    gsf_buffer path;
     memset(&path, 0, sizeof path);
-    gsf_text_printf(w->ctx, &path, "%s/%s%s", w->folder, w->stem, end);
+    gsf_append_text(w->ctx, &path, "%s/%s%s", w->folder, w->stem, end);
     if (!path.failed) remove(path.data);
-    gsf_destroy_text(w->ctx, &path);
+    gsf_destroy_buffer(w->ctx, &path);
 }
 
 // Writes the files of a list: a single one, or shards with their index. Removes files that a loader would prefer to them.
@@ -919,15 +923,15 @@ static gsf_result model_write_shards(model_writer* w, model_list* list) {
     const model_tensor** picked = (const model_tensor**)gsf_alloc(w->ctx, list->count, sizeof *picked);
     gsf_result result = picked ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     for (int shard = 0; shard < w->shards && result == GSF_OK; shard++) {
-        gsf_text path;
+        gsf_buffer path;
         size_t count = 0;
         memset(&path, 0, sizeof path);
-        gsf_text_printf(w->ctx, &path, "%s/", w->folder);
+        gsf_append_text(w->ctx, &path, "%s/", w->folder);
         model_print_file(w, shard, &path);
         for (size_t i = 0; i < list->count; i++)
             if (list->tensors[i].shard == shard) picked[count++] = &list->tensors[i];
         result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : model_write_file(w, path.data, picked, count);
-        gsf_destroy_text(w->ctx, &path);
+        gsf_destroy_buffer(w->ctx, &path);
     }
     if (result == GSF_OK && w->shards > 1) {
         for (size_t i = 0; i < list->count; i++) picked[i] = &list->tensors[i];
@@ -960,7 +964,7 @@ typedef struct model_report { // what was written for one part
 
 typedef struct model_file {
     const char* name;
-    void (*print_fn)(gsf_context* ctx, const model_size* s, gsf_text* out);
+    void (*print_fn)(gsf_context* ctx, const model_size* s, gsf_buffer* out);
 } model_file;
 
 typedef struct model_part {
@@ -977,7 +981,7 @@ typedef struct model_part {
 #define MODEL_OPENS(net)                                                            \
     static gsf_result model_open_##net(gsf_context* ctx, const char* folder) {      \
         gsf_nn_##net net;                                                           \
-        GSF__TRY(gsf_nn_make_##net(ctx, folder, &net));                             \
+        GSF__TRY(gsf_nn_load_##net(ctx, folder, &net));                             \
         gsf_nn_destroy_##net(ctx, &net);                                            \
         return GSF_OK;                                                              \
     }
@@ -1015,7 +1019,7 @@ static const model_part model_parts[MODEL_PARTS] = {
 
 // Lists the tensors of a part without writing anything; the caller frees list->tensors.
 static gsf_result model_list_part(gsf_context* ctx, const model_part* part, const model_size* size, model_list* list) {
-    gsf_text text;
+    gsf_buffer text;
     gsf__nn_config config;
     *list = model_begin_list(ctx, part->bit);
     memset(&text, 0, sizeof text);
@@ -1029,7 +1033,7 @@ static gsf_result model_list_part(gsf_context* ctx, const model_part* part, cons
         part->list_fn(list, size, &config);
         gsf_destroy_json(ctx, &config.json);
     }
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return list->result;
 }
 
@@ -1051,7 +1055,7 @@ static gsf_result model_write_list(gsf_context* ctx, const model_options* o, con
         report->values += (double)list->tensors[i].count;
     }
     model_deal(&w, list);
-    w.block = (unsigned char*)gsf_alloc(ctx, MODEL_BLOCK, gsf_nn_dtype_size(o->dtype));
+    w.block = (unsigned char*)gsf_alloc(ctx, MODEL_BLOCK, gsf_nn_get_dtype_size(o->dtype));
     if (!w.block) return GSF_ERROR_OUT_OF_MEMORY;
     const gsf_result result = model_write_shards(&w, list);
     gsf_free(ctx, w.block);
@@ -1072,7 +1076,7 @@ static gsf_result model_make_part(gsf_context* ctx, const model_options* o, cons
         gsf_free(ctx, list.tensors);
     }
     for (size_t i = 0; i < GSF__COUNT(part->files) && part->files[i].name && result == GSF_OK; i++) {
-        gsf_text text;
+        gsf_buffer text;
         memset(&text, 0, sizeof text);
         part->files[i].print_fn(ctx, o->size, &text);
         result = model_end_text(ctx, folder, part->files[i].name, &text);
@@ -1081,15 +1085,15 @@ static gsf_result model_make_part(gsf_context* ctx, const model_options* o, cons
 }
 
 static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
-    gsf_text path, text;
+    gsf_buffer path, text;
     void* encoder = NULL; // its configuration, if the folder has one
     size_t size;
     memset(&path, 0, sizeof path);
     memset(&text, 0, sizeof text);
-    gsf_text_printf(ctx, &path, "%s/text_encoder/config.json", out);
+    gsf_append_text(ctx, &path, "%s/text_encoder/config.json", out);
     const gsf_result result =
         path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_read_if_there(ctx, path.data, &encoder, &size);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     if (result != GSF_OK) return result;
     model_print_pipeline(ctx, encoder != NULL, &text);
     gsf_free(ctx, encoder);
@@ -1099,9 +1103,9 @@ static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
 // Creates the folder with the marker file that allows writing into it again.
 static gsf_result model_make_out(gsf_context* ctx, const char* out) {
     static const char note[] = "Random weights, written by make_model: what they restore is noise.\n";
-    gsf_text path;
+    gsf_buffer path;
     memset(&path, 0, sizeof path);
-    gsf_text_printf(ctx, &path, "%s/make_model.txt", out);
+    gsf_append_text(ctx, &path, "%s/make_model.txt", out);
     if (path.failed) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = GSF_OK;
     FILE* file = NULL;
@@ -1110,7 +1114,7 @@ static gsf_result model_make_out(gsf_context* ctx, const char* out) {
     else if ((file = fopen(path.data, "rb")) == NULL)
         result = gsf_fail(ctx, GSF_ERROR_IO, "%s: is there already, and not of make_model's making (choose a new folder)", out);
     if (file) fclose(file);
-    gsf_destroy_text(ctx, &path);
+    gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
@@ -1120,12 +1124,12 @@ static gsf_result model_make(gsf_context* ctx, const model_options* o, model_rep
     GSF__TRY(model_make_out(ctx, o->out));
     for (int i = 0; i < MODEL_PARTS; i++) {
         if (!(o->parts & model_parts[i].bit)) continue;
-        gsf_text folder;
+        gsf_buffer folder;
         memset(&folder, 0, sizeof folder);
-        gsf_text_printf(ctx, &folder, "%s%s", o->out, model_parts[i].folder);
+        gsf_append_text(ctx, &folder, "%s%s", o->out, model_parts[i].folder);
         const gsf_result result = folder.failed ? GSF_ERROR_OUT_OF_MEMORY
                                                 : model_make_part(ctx, o, &model_parts[i], folder.data, &reports[i]);
-        gsf_destroy_text(ctx, &folder);
+        gsf_destroy_buffer(ctx, &folder);
         if (result != GSF_OK) return result;
     }
     return model_write_pipeline(ctx, o->out);

@@ -91,7 +91,7 @@ static gsf_result load_depth(gsf_context* ctx, const char* path, const gsf_camer
 
 static gsf_result load_view(gsf_context* ctx, const char* folder, size_t i, int with_color, double far,
                             truth_view* view) {
-    gsf_camera_center(&view->camera, view->center);
+    gsf_get_camera_center(&view->camera, view->center);
     TRY(load_depth(ctx, gsfix_pathf("%s/depth/%05zu.npy", folder, i).s, &view->camera, far, &view->depth));
     return with_color ? load_color(ctx, gsfix_pathf("%s/%05zu.png", folder, i).s, &view->camera, &view->color) : GSF_OK;
 }
@@ -124,7 +124,7 @@ static void unproject(const gsf_camera* camera, int64_t x, int64_t y, double z, 
 // Does the photo see a point? u, v: where, also if not.
 static int sees(const truth_view* photo, const double point[3], double tolerance, double* u, double* v) {
     double z;
-    if (!gsf_camera_project(&photo->camera, point, u, v, &z)) return 0;
+    if (!gsf_project_point(&photo->camera, point, u, v, &z)) return 0;
     if (!(*u >= 0.0 && *v >= 0.0 && *u < photo->camera.width && *v < photo->camera.height)) return 0;
     return z <= (1.0 + tolerance) * (double)row_of(&photo->depth, (int64_t)*v)[(int64_t)*u];
 }
@@ -182,9 +182,9 @@ static gsf_result read_references(job* j) {
     gsf_result result = gsf_parse_json(j->ctx, path.s, (const char*)data, size, &json);
     gsf_free(j->ctx, data);
     if (result != GSF_OK) return result;
-    const gsf_json_value* list = gsf_json_member(&json, &json.values[0], "cameras");
+    const gsf_json_value* list = gsf_find_json_member(&json, &json.values[0], "cameras");
     for (uint32_t at = list ? list->child : 0; at && i < j->truth.count; at = json.values[at].next, i++) {
-        const gsf_json_value* name = gsf_json_member(&json, &json.values[at], "name");
+        const gsf_json_value* name = gsf_find_json_member(&json, &json.values[at], "name");
         int photo = -1;
         if (!name || name->type != GSF_JSON_STRING || sscanf(name->string, "refs/%d.png", &photo) != 1) photo = -1;
         j->reference[i] = photo >= 0 && (size_t)photo < j->photos.count ? photo : -1;
@@ -370,7 +370,7 @@ static void carry_photos(job* j, size_t i) {
                 const truth_view* photo = j->photos.views + k;
                 double u, v, z, again[2], rgb[3];
                 if (!sees(photo, point, j->o->tolerance, &u, &v)) continue;
-                gsf_camera_project(&photo->camera, point, again, again + 1, &z);
+                gsf_project_point(&photo->camera, point, again, again + 1, &z);
                 if (!carried_color(photo, u, v, z, rgb)) continue;
                 const double weight = angle_weight(point, view->center, photo->center);
                 total += weight;
@@ -446,7 +446,7 @@ static void add_sums(const job* j, size_t i, double sums[SUMS]) {
 }
 
 static void print_sums(const job* j) { // of the frames that are trained on; those at a photo's view are not
-    gsf_text text = {0};
+    gsf_buffer text = {0};
     double sums[SUMS] = {0};
     size_t frames = 0;
     for (size_t i = 0; i < j->truth.count; i++) {
@@ -459,7 +459,7 @@ static void print_sums(const job* j) { // of the frames that are trained on; tho
     for (int k = 0; k < SUMS; k++) gsfix_json_number(j->ctx, &text, sum_names[k], sums[k]);
     gsfix_json_end(j->ctx, &text, '}');
     printf("%s\n", text.data ? text.data : "{}");
-    gsf_destroy_text(j->ctx, &text);
+    gsf_destroy_buffer(j->ctx, &text);
 }
 
 // ---- commands --------------------------------------------------------------------
@@ -483,7 +483,7 @@ static gsf_result run_restore(gsf_context* ctx, const oracle_options* o, const c
 
 static gsf_result run_masks(gsf_context* ctx, const oracle_options* o, const char** argument) {
     view_list views, photos;
-    gsf_text text = {0};
+    gsf_buffer text = {0};
     TRY(load_views(ctx, argument[0], argument[1], 0, o->far, &views));
     gsf_result result = load_views(ctx, argument[2], argument[3], 0, o->far, &photos);
     if (result == GSF_OK) result = gsfix_make_folder(ctx, argument[4]);
@@ -508,7 +508,7 @@ static gsf_result run_masks(gsf_context* ctx, const oracle_options* o, const cha
     gsfix_json_end(ctx, &text, ']');
     gsfix_json_end(ctx, &text, '}');
     if (result == GSF_OK) printf("%s\n", text.data ? text.data : "{}");
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     free_views(ctx, &views);
     free_views(ctx, &photos);
     return result;

@@ -30,9 +30,9 @@ static gsf_result fill_random_splats(gsf_context* ctx, uint64_t seed, size_t cou
     gsf_result result = gsf_splat_make(ctx, count, 0, out);
     for (size_t i = 0; i < out->count; i++) {
         for (uint64_t a = 0; a < 3; a++) {
-            out->means[3 * i + a] = (float)(2.0 * gsf_random_uniform(seed, a, i) - 1.0);
-            out->log_scales[3 * i + a] = (float)(-3.5 + gsf_random_uniform(seed, 3 + a, i));
-            out->sh[3 * i + a] = (float)gsf_random_normal(seed, 6 + a, i);
+            out->means[3 * i + a] = (float)(2.0 * gsf_draw_uniform(seed, a, i) - 1.0);
+            out->log_scales[3 * i + a] = (float)(-3.5 + gsf_draw_uniform(seed, 3 + a, i));
+            out->sh[3 * i + a] = (float)gsf_draw_normal(seed, 6 + a, i);
         }
         out->quats[4 * i] = 1.0f;
     }
@@ -78,8 +78,8 @@ static gsf_result load_views(host* h, const char* path) {
         h->views[h->view_count].image = h->scene.views[h->view_count].image;
         h->views[h->view_count].image.owned = NULL; // owned by the scene
     }
-    return gsf_splat_from_points(ctx, h->scene.points, h->scene.colors, h->scene.point_count, NULL, 2, h->scene.origin,
-                                 &h->start);
+    return gsf_splat_make_from_points(ctx, h->scene.points, h->scene.colors, h->scene.point_count, NULL, 2,
+                                      h->scene.origin, &h->start);
 }
 
 static gsf_result run_frames(host* h, int frames) {
@@ -89,12 +89,12 @@ static gsf_result run_frames(host* h, int frames) {
     gsf_train_stats stats = {0};
     for (int frame = 0; frame < frames; frame++) {
         for (int i = 0; i < STEPS_PER_FRAME; i++) { // a real host would stop when its time budget is used up
-            const gsf_result result = gsf_splat_train_step(&h->ctx, h->trainer, &stats);
+            const gsf_result result = gsf_splat_step_trainer(&h->ctx, h->trainer, &stats);
             if (result != GSF_OK) return result;
         }
         const gsf_camera* shot = &h->views[(size_t)frame % h->view_count].camera;
-        const gsf_camera camera = gsf_camera_resized(shot, PREVIEW_WIDTH, PREVIEW_HEIGHT);
-        const gsf_result result = gsf_splat_trainer_render(&h->ctx, h->trainer, &camera, &out);
+        const gsf_camera camera = gsf_resize_camera(shot, PREVIEW_WIDTH, PREVIEW_HEIGHT);
+        const gsf_result result = gsf_splat_render_trainer(&h->ctx, h->trainer, &camera, &out);
         if (result != GSF_OK) return result;
         double mean = 0.0; // a real host would display the image
         const size_t values = sizeof preview / sizeof preview[0];
@@ -124,7 +124,7 @@ int main(int argc, char** argv) {
         result = GSF_OK;
     }
     if (result == GSF_OK && argc > 2)
-        result = gsf_splat_save(&h.ctx, argv[2], gsf_splat_trainer_splats(h.trainer), NULL);
+        result = gsf_splat_save(&h.ctx, argv[2], gsf_splat_get_trained(h.trainer), NULL);
     if (result != GSF_OK) fprintf(stderr, "%s\n", h.ctx.error);
 
     gsf_splat_destroy_trainer(&h.ctx, h.trainer);

@@ -178,7 +178,7 @@ static void print_version(void) {
 #else
     const char* rays = "z-buffer (built without Embree)";
 #endif
-    printf("gsfix %s  kernels: %s  workers: %d  visibility: %s\n", GSF_VERSION, gsf_cpu_level_name(ctx.cpu_level),
+    printf("gsfix %s  kernels: %s  workers: %d  visibility: %s\n", GSF_VERSION, gsf_describe_cpu_level(ctx.cpu_level),
            ctx.parallel.worker_count, rays);
 }
 
@@ -488,7 +488,7 @@ static void note_dit_stage(gsfix_app* app, const char* stage) {
     if (memory > s->memory) s->memory = memory;
 }
 
-void gsfix_json_stages(gsfix_app* app, gsf_text* text) {
+void gsfix_json_stages(gsfix_app* app, gsf_buffer* text) {
     gsf_context* ctx = &app->ctx;
     if (!app->stage_count) return;
     gsfix_json_begin(ctx, text, "restorer_stages", '[');
@@ -594,7 +594,7 @@ static gsf_result info_scene(gsfix_app* app) {
         return result;
     }
     gsf_context* ctx = &app->ctx;
-    gsf_text* json = &app->json;
+    gsf_buffer* json = &app->json;
     int32_t least[2] = {0}, most[2] = {0};
     for (size_t i = 0; i < scene.view_count; i++) {
         const int32_t size[2] = {scene.views[i].camera.width, scene.views[i].camera.height};
@@ -647,7 +647,7 @@ static gsf_result info_splats(gsfix_app* app) {
     double* column = (double*)gsf_alloc(&app->ctx, s.count + 1, sizeof *column);
     result = world && column ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
-        gsf_text* json = &app->json;
+        gsf_buffer* json = &app->json;
         gsfix_json_text(&app->ctx, json, "kind", "splats");
         gsfix_json_number(&app->ctx, json, "splats", (double)s.count);
         gsfix_json_number(&app->ctx, json, "sh_degree", s.sh_degree);
@@ -754,8 +754,9 @@ static gsf_result render_all(gsfix_app* app, const float background[3]) {
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &path, &count);
     if (result == GSF_OK && app->o.scene) count = scene.view_count;
     if (result == GSF_OK && count)
-        desc.near_plane = app->o.scene ? gsf_splat_near_plane(&scene.views[0].camera, sizeof scene.views[0], count)
-                                       : gsf_splat_near_plane(path, sizeof *path, count);
+        desc.near_plane = app->o.scene ? gsf_splat_measure_near_plane(&scene.views[0].camera, sizeof scene.views[0],
+                                                                      count)
+                                       : gsf_splat_measure_near_plane(path, sizeof *path, count);
     if (result == GSF_OK) result = open_render_out(app, app->o.scene ? &scene : NULL, count);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(ctx, &rasterizer);
     gsfix_json_begin(ctx, &app->json, "frames", '[');
@@ -815,7 +816,7 @@ static gsf_result filter_scene(gsfix_app* app) {
     for (int k = 0; k < 3 && result == GSF_OK; k++) result = gsfix_claim(app, "sparse/0/%s.bin", files[k]);
     if (result == GSF_OK) result = gsfix_open_out(app);
     if (result == GSF_OK)
-        result = gsf_splat_visible_points(ctx, &scene, split.train, split.train_count, &desc, keep, &stats);
+        result = gsf_splat_filter_points(ctx, &scene, split.train, split.train_count, &desc, keep, &stats);
     const double seconds = gsfix_now() - begin;
     if (result == GSF_OK) result = gsf_splat_save_colmap(ctx, &scene, keep, app->o.out);
     if (result == GSF_OK) {
@@ -851,7 +852,7 @@ static gsf_result write_path(gsfix_app* app, int frames, int windows) {
     const char** names = NULL;
     void* scratch = NULL;
     gsf_traj_path_desc desc = {0};
-    gsf_traj_path_layout layout = {0};
+    gsf_traj_path_info layout = {0};
     gsf_result result = gsfix_load_scene(app, app->o.inputs[0], &scene);
     if (result != GSF_OK) return result;
     result = gsfix_claim_file(app, app->o.out);
@@ -911,9 +912,9 @@ enum { METRIC_COUNT = 4 };
 
 static gsf_result measure(gsf_context* ctx, int metric, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
                           double* out) {
-    if (metric == 0) return gsf_psnr(ctx, a, b, mask, out);
+    if (metric == 0) return gsf_measure_psnr(ctx, a, b, mask, out);
     static const gsf_ssim_kind kinds[] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
-    return gsf_ssim(ctx, kinds[metric - 1], a, b, mask, out);
+    return gsf_measure_ssim(ctx, kinds[metric - 1], a, b, mask, out);
 }
 
 typedef struct metric_sums { // [0]: over all pixels, [1]: over those of the masks
@@ -1057,7 +1058,8 @@ static gsf_result write_masks(gsfix_app* app) {
         const gsf_scene_view* view = &scene.views[split.test[i]];
         gsf_image mask = {0};
         result = gsf_make_image(ctx, GSF_U8, view->camera.width, view->camera.height, 1, &mask);
-        if (result == GSF_OK) result = gsf_splat_seen_mask(ctx, &splats, &view->camera, train, split.train_count, &mask);
+        if (result == GSF_OK) result = gsf_splat_render_seen_mask(ctx, &splats, &view->camera, train, split.train_count,
+                                                                  &mask);
         if (result == GSF_OK) {
             uint8_t* p = (uint8_t*)mask.data;
             const size_t pixels = (size_t)mask.width * (size_t)mask.height;
@@ -1329,17 +1331,17 @@ static void on_log(void* user, gsf_log_level level, const char* text) {
 }
 
 static gsf_result quote_command(gsfix_app* app, int argc, char** argv) {
-    gsf_text text = {0};
+    gsf_buffer text = {0};
     for (int i = 0; i < argc; i++) {
-        if (i) gsf_text_append(&app->ctx, &text, " ", 1);
+        if (i) gsf_append_bytes(&app->ctx, &text, " ", 1);
         const char* p = argv[i];
         if (*p && strspn(p, "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+=./,:@%") == strlen(p)) {
-            gsf_text_append(&app->ctx, &text, p, strlen(p));
+            gsf_append_bytes(&app->ctx, &text, p, strlen(p));
             continue;
         }
-        gsf_text_append(&app->ctx, &text, "'", 1);
-        for (; *p; p++) gsf_text_append(&app->ctx, &text, *p == '\'' ? "'\\''" : p, *p == '\'' ? 4 : 1);
-        gsf_text_append(&app->ctx, &text, "'", 1);
+        gsf_append_bytes(&app->ctx, &text, "'", 1);
+        for (; *p; p++) gsf_append_bytes(&app->ctx, &text, *p == '\'' ? "'\\''" : p, *p == '\'' ? 4 : 1);
+        gsf_append_bytes(&app->ctx, &text, "'", 1);
     }
     app->command_line = text.data;
     if (!text.failed) return GSF_OK;
@@ -1380,7 +1382,7 @@ static int run_command(gsfix_app* app, const command_spec* command, int argc, ch
     }
     interrupted_context = NULL;
     gsfix_end_files(app);
-    gsf_destroy_text(&app->ctx, &app->json);
+    gsf_destroy_buffer(&app->ctx, &app->json);
     gsf_free(&app->ctx, app->command_line);
     return code;
 }

@@ -42,7 +42,7 @@ typedef struct gsfix_app {
     const char* command;
     char* command_line; // as typed, quoted for a shell
     double started;     // gsfix_now() at the start
-    gsf_text json;      // the object that --json prints
+    gsf_buffer json;    // the object that --json prints
     int terminal;       // stderr is a terminal
     int bar_shown;      // the last line of the terminal is a progress bar
     double bar_time;
@@ -97,12 +97,12 @@ int gsfix_misused(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3); // 
 int gsfix_background(gsfix_app* app, float out[3], int32_t* random); // parses --background; 0 or an exit code
 int gsfix_failed(gsfix_app* app); // prints ctx.error; returns 1
 
-// Append members to a JSON object in a gsf_text.
-void gsfix_json_begin(gsf_context* ctx, gsf_text* text, const char* key, char bracket); // key NULL: no key
-void gsfix_json_end(gsf_context* ctx, gsf_text* text, char bracket);
-void gsfix_json_text(gsf_context* ctx, gsf_text* text, const char* key, const char* value); // NULL: null
-void gsfix_json_number(gsf_context* ctx, gsf_text* text, const char* key, double value);
-void gsfix_json_bool(gsf_context* ctx, gsf_text* text, const char* key, int value);
+// Append members to a JSON object in a gsf_buffer.
+void gsfix_json_begin(gsf_context* ctx, gsf_buffer* text, const char* key, char bracket); // key NULL: no key
+void gsfix_json_end(gsf_context* ctx, gsf_buffer* text, char bracket);
+void gsfix_json_text(gsf_context* ctx, gsf_buffer* text, const char* key, const char* value); // NULL: null
+void gsfix_json_number(gsf_context* ctx, gsf_buffer* text, const char* key, double value);
+void gsfix_json_bool(gsf_context* ctx, gsf_buffer* text, const char* key, int value);
 
 // ---- gsfix_out.c: ownership of files ---------------------------------------------
 
@@ -156,7 +156,7 @@ gsf_result gsfix_camera_list(gsfix_app* app, const gsf_scene* scene, const uint3
 int gsfix_check_restorer(gsfix_app* app);
 gsf_result gsfix_make_restorer(gsfix_app* app, gsf_restorer* out, int* present);
 void gsfix_destroy_restorer(gsfix_app* app, gsf_restorer* restorer);
-void gsfix_json_stages(gsfix_app* app, gsf_text* text); // "restorer_stages": [...], if there are any
+void gsfix_json_stages(gsfix_app* app, gsf_buffer* text); // "restorer_stages": [...], if there are any
 void gsfix_print_stages(gsfix_app* app);
 extern const char* const gsfix_conditions[4]; // names of gsf_nn_condition for --condition
 extern const char* const gsfix_solvers[3];    // names of gsf_nn_solver for --solver

@@ -37,7 +37,7 @@ typedef struct exec_state {
 } exec_state;
 
 static gsf_result exec_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
-                             gsf_restorer_limits* out) {
+                             gsf_restorer_info* out) {
     (void)user, (void)ctx, (void)frame_count, (void)width, (void)height;
     out->needs_depth = 1;
     out->needs_alpha = 1;
@@ -178,14 +178,14 @@ static void become_program(const exec_state* e, const char* script, pid_t parent
 }
 
 static gsf_result run_program(gsf_context* ctx, exec_state* e) {
-    gsf_text script = {0};
-    gsf_text_printf(ctx, &script, "%s \"$@\"", e->command);
+    gsf_buffer script = {0};
+    gsf_append_text(ctx, &script, "%s \"$@\"", e->command);
     if (script.failed) return GSF_ERROR_OUT_OF_MEMORY;
     const gsf_result watched = start_watcher(ctx, e);
     fflush(NULL);
     const pid_t parent = getpid(), child = watched == GSF_OK ? fork() : -1;
     if (child == 0) become_program(e, script.data, parent);
-    gsf_destroy_text(ctx, &script);
+    gsf_destroy_buffer(ctx, &script);
     if (watched != GSF_OK) return watched;
     if (child < 0) return gsf_fail(ctx, GSF_ERROR_RESTORER, "exec: no new process: %s", strerror(errno));
     setpgid(child, e->group); // in parent and child, to avoid a race

@@ -8,9 +8,9 @@
 // ---- defaults --------------------------------------------------------------------
 
 static const gsfix_quality qualities[] = { // savings and costs: bench/QUALITY.md
-    {"exact", GSF_QUALITY_EXACT, 50, GSF_NN_DDIM, 0},
-    {"balanced", GSF_QUALITY_BALANCED, 50, GSF_NN_DDIM, 0},
-    {"fast", GSF_QUALITY_FAST, 10, GSF_NN_UNIPC, 1},
+    {"exact", GSF_QUALITY_EXACT, 50, GSF_NN_SOLVER_DDIM, 0},
+    {"balanced", GSF_QUALITY_BALANCED, 50, GSF_NN_SOLVER_DDIM, 0},
+    {"fast", GSF_QUALITY_FAST, 10, GSF_NN_SOLVER_UNIPC, 1},
 };
 
 // Names of gsf_initial_kind for --init.
@@ -129,7 +129,7 @@ static int has_restorer(const gsfix_app* app) { return app->o.restorer && strcmp
 
 static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit code
     memset(setup, 0, sizeof *setup);
-    setup->fix = gsf_splat_few_view_desc(NULL, gsfix_find_quality(app->o.quality)->work);
+    setup->fix = gsf_splat_resolve_few_view_desc(NULL, gsfix_find_quality(app->o.quality)->work);
     setup->initial.kind = find_initial_kind(app->o.init);
     setup->initial.seed = app->o.seed;
     setup->initial.sh_degree = 3;
@@ -167,7 +167,7 @@ typedef struct fix_run {
     int has_restorer;
     int comparing; // in the run without repair, which comes first with --compare
     gsf_fixer* fixer;
-    gsf_text switches; // JSON object
+    gsf_buffer switches; // JSON object
     const gsfix_read_file* inputs;
     size_t input_count;
     int resuming;
@@ -195,8 +195,9 @@ static void add_seconds(fix_run* run, int stage, double* since) {
 
 static gsf_result make_initial(fix_run* run) {
     gsf_initial_stats stats;
-    const gsf_result result = gsf_splat_initial_splats(run->ctx, &run->scene, run->split.train, run->split.train_count,
-                                                       &run->setup.initial, &run->initial, &stats);
+    const gsf_result result = gsf_splat_make_initial_splats(run->ctx, &run->scene, run->split.train,
+                                                            run->split.train_count, &run->setup.initial, &run->initial,
+                                                            &stats);
     if (result != GSF_OK) return result;
     run->setup.initial = stats.used;
     const gsf_initial_kind kind = stats.used.kind;
@@ -217,7 +218,7 @@ static gsf_result render_view(fix_run* run, size_t i, gsf_image* color) { // tes
     gsf_result result = gsf_make_image(run->ctx, GSF_F32, camera->width, camera->height, 3, color);
     if (result != GSF_OK) return result;
     out.color = *color;
-    result = gsf_splat_trainer_render(run->ctx, gsf_splat_fixer_trainer(run->fixer), camera, &out);
+    result = gsf_splat_render_trainer(run->ctx, gsf_splat_get_trainer(run->fixer), camera, &out);
     if (result == GSF_OK) gsfix_clamp(color);
     else gsf_destroy_image(run->ctx, color);
     return result;
@@ -229,8 +230,8 @@ static gsf_result score_pixels(fix_run* run, const gsf_image* color, const gsf_i
     *psnr = NAN;
     if (ssim) *ssim = NAN;
     if (mask && !gsfix_counts_any(mask)) return GSF_OK;
-    gsf_result result = gsf_psnr(run->ctx, color, photo, mask, psnr);
-    if (result == GSF_OK && ssim) result = gsf_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, ssim);
+    gsf_result result = gsf_measure_psnr(run->ctx, color, photo, mask, psnr);
+    if (result == GSF_OK && ssim) result = gsf_measure_ssim(run->ctx, GSF_SSIM_3DGS, color, photo, mask, ssim);
     return result;
 }
 
@@ -322,7 +323,7 @@ static gsf_result add_curve_point(fix_run* run) {
         const gsfix_score mean = mean_score(scores, run->split.test_count);
         gsfix_curve_point* p = &h->curve[h->curve_count++];
         p->iteration = run->iteration;
-        p->splats = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(run->fixer))->count;
+        p->splats = gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer))->count;
         p->psnr = mean.psnr;
         p->psnr_seen = mean.psnr_seen;
     }
@@ -367,9 +368,9 @@ static size_t masked_photos(const fix_run* run) { // number of masked photos amo
 // All settings that affect the result, with defaults filled in: printed in metrics.json, and compared by --resume.
 static void write_dit_switches(fix_run* run) {
     const gsf_nn_dit_desc dit = gsfix_dit_desc(run->app);
-    const gsf_nn_sample_desc d = gsf_nn_resolve_sample(&dit.sample);
+    const gsf_nn_sample_desc d = gsf_nn_resolve_sample_desc(&dit.sample);
     gsf_context* ctx = run->ctx;
-    gsf_text* t = &run->switches;
+    gsf_buffer* t = &run->switches;
     gsfix_json_text(ctx, t, "condition", gsfix_conditions[dit.condition]);
     gsfix_json_text(ctx, t, "ref_features", dit.features);
     gsfix_json_text(ctx, t, "caption", dit.caption);
@@ -386,12 +387,12 @@ static void write_dit_switches(fix_run* run) {
 
 static void write_switches(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    gsf_text* t = &run->switches;
+    gsf_buffer* t = &run->switches;
     const gsfix_options* o = &run->app->o;
     static const char* const kinds[] = {"reference", "ellipse", "interpolate"};
     const gsf_camera* first = &run->scene.views[run->split.train[0]].camera;
     fix_setup used = run->setup;
-    used.fix = gsf_splat_fixer_desc(run->fixer);
+    used.fix = gsf_splat_get_fixer_desc(run->fixer);
     const gsf_train_desc* train = &used.fix.train;
     gsfix_json_begin(ctx, t, NULL, '{');
     gsfix_json_number(ctx, t, "iterations", train->iterations);
@@ -437,7 +438,7 @@ static void write_switches(fix_run* run) {
     gsfix_json_end(ctx, t, '}');
 }
 
-static void write_list(gsf_context* ctx, gsf_text* t, const char* key, const double* values, size_t count) {
+static void write_list(gsf_context* ctx, gsf_buffer* t, const char* key, const double* values, size_t count) {
     gsfix_json_begin(ctx, t, key, '[');
     for (size_t i = 0; i < count; i++) gsfix_json_number(ctx, t, NULL, values[i]);
     gsfix_json_end(ctx, t, ']');
@@ -447,7 +448,8 @@ static gsfix_path input_digest(const gsfix_read_file* file) {
     return gsfix_pathf("%016llx %llu", (unsigned long long)file->digest, (unsigned long long)file->size);
 }
 
-static void write_curve_rows(gsf_context* ctx, gsf_text* t, const char* key, const gsfix_curve_point* points, size_t count) {
+static void write_curve_rows(gsf_context* ctx, gsf_buffer* t, const char* key, const gsfix_curve_point* points,
+                             size_t count) {
     gsfix_json_begin(ctx, t, key, '[');
     for (size_t i = 0; i < count; i++) {
         const double row[4] = {points[i].iteration, (double)points[i].splats, points[i].psnr, points[i].psnr_seen};
@@ -457,13 +459,13 @@ static void write_curve_rows(gsf_context* ctx, gsf_text* t, const char* key, con
 }
 
 // The history as JSON: lists of numbers, so that each list is read back by one loop.
-static void write_history(fix_run* run, gsf_text* t) {
+static void write_history(fix_run* run, gsf_buffer* t) {
     gsf_context* ctx = run->ctx;
     const gsfix_history* h = &run->history;
     gsfix_json_begin(ctx, t, NULL, '{');
     gsfix_json_begin(ctx, t, "switches", '{');
     t->size--; // drop the brace; the object itself is appended
-    gsf_text_append(ctx, t, run->switches.data, run->switches.size);
+    gsf_append_bytes(ctx, t, run->switches.data, run->switches.size);
     gsfix_json_begin(ctx, t, "inputs", '[');
     for (size_t i = 0; i < run->input_count; i++) {
         gsfix_json_begin(ctx, t, NULL, '[');
@@ -508,21 +510,21 @@ static void write_history(fix_run* run, gsf_text* t) {
 
 static gsf_result save_checkpoint(fix_run* run) {
     gsf_context* ctx = run->ctx;
-    gsf_text chunks = {0}, history = {0};
+    gsf_buffer chunks = {0}, history = {0};
     const double begin = gsfix_now();
     const size_t room = run->checkpoint_bytes + run->checkpoint_bytes / 8; // usually enough to avoid reallocation
     chunks.data = room ? (char*)gsf_alloc(ctx, room, 1) : NULL;
     chunks.capacity = chunks.data ? room : 0;
     write_history(run, &history);
-    gsf_splat_fixer_save(ctx, run->fixer, &chunks);
-    gsf_chunks_add(ctx, &chunks, "GFIX", history.data, history.size);
-    gsf_chunks_end(ctx, &chunks);
+    gsf_splat_format_fixer(ctx, run->fixer, &chunks);
+    gsf_append_chunk(ctx, &chunks, "GFIX", history.data, history.size);
+    gsf_append_last_chunk(ctx, &chunks);
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
     if (!history.failed && !chunks.failed)
         result = gsf_write_file(ctx, gsfix_pathf("%s/checkpoint", run->app->o.out).s, chunks.data, chunks.size);
     run->checkpoint_bytes = chunks.size;
-    gsf_destroy_text(ctx, &chunks);
-    gsf_destroy_text(ctx, &history);
+    gsf_destroy_buffer(ctx, &chunks);
+    gsf_destroy_buffer(ctx, &history);
     run->checkpoint_end = gsfix_now();
     run->checkpoint_last = run->checkpoint_end - begin;
     run->checkpoint_sum += run->checkpoint_last;
@@ -542,7 +544,7 @@ static int same_json(const gsf_json* a, const gsf_json_value* x, const gsf_json*
     if (x->type == GSF_JSON_STRING) return strcmp(x->string, y->string) == 0;
     if (x->type == GSF_JSON_NUMBER) return x->number == y->number;
     for (size_t i = 0; i < x->count; i++)
-        if (!same_json(a, gsf_json_element(a, x, i), b, gsf_json_element(b, y, i))) return 0;
+        if (!same_json(a, gsf_find_json_element(a, x, i), b, gsf_find_json_element(b, y, i))) return 0;
     return 1;
 }
 
@@ -557,7 +559,7 @@ static gsf_result compare_switches(fix_run* run, const char* name, const gsf_jso
     gsf_result result = gsf_parse_json(run->ctx, "switches", run->switches.data, run->switches.size, &now);
     if (result != GSF_OK) return result;
     for (uint32_t i = now.values[0].child; i && result == GSF_OK; i = now.values[i].next) {
-        const gsf_json_value *x = &now.values[i], *y = gsf_json_member(old, was, x->key);
+        const gsf_json_value *x = &now.values[i], *y = gsf_find_json_member(old, was, x->key);
         char mine[128], theirs[128];
         if (same_json(&now, x, old, y)) continue;
         show_json(x, mine);
@@ -573,8 +575,10 @@ static gsf_result compare_inputs(fix_run* run, const char* name, const gsf_json*
     if (!was || was->type != GSF_JSON_ARRAY)
         return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: does not say what it was made from (--restart begins anew)", name);
     for (size_t i = 0; i < was->count || i < run->input_count; i++) {
-        const gsf_json_value* row = i < was->count ? gsf_json_element(old, was, i) : NULL;
-        const gsf_json_value *path = row ? gsf_json_element(old, row, 0) : NULL, *digest = row ? gsf_json_element(old, row, 1) : NULL;
+        const gsf_json_value* row = i < was->count ? gsf_find_json_element(old, was, i) : NULL;
+        const gsf_json_value *path = row ? gsf_find_json_element(old, row,
+                                                                 0) : NULL, *digest = row ? gsf_find_json_element(old,
+                                                                                                                  row, 1) : NULL;
         const int valid = path && digest && path->type == GSF_JSON_STRING && digest->type == GSF_JSON_STRING;
         if (row && !valid) return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: broken list of inputs", name);
         if (row && i < run->input_count && strcmp(digest->string, input_digest(run->inputs + i).s) == 0) continue;
@@ -586,7 +590,7 @@ static gsf_result compare_inputs(fix_run* run, const char* name, const gsf_json*
 
 // NULL: missing or out of range.
 static const gsf_json_value* whole_member(const gsf_json* json, const char* key, double most) {
-    const gsf_json_value* v = gsf_json_member(json, &json->values[0], key);
+    const gsf_json_value* v = gsf_find_json_member(json, &json->values[0], key);
     return v && v->type == GSF_JSON_NUMBER && v->number >= 0.0 && v->number <= most && v->number == floor(v->number) ? v : NULL;
 }
 
@@ -595,7 +599,7 @@ static const gsf_json_value* whole_member(const gsf_json* json, const char* key,
 static gsf_result read_rows(fix_run* run, const char* name, const gsf_json* json, const char* key, const char* kinds,
                             double** rows, size_t* count) {
     gsf_context* ctx = run->ctx;
-    const gsf_json_value* list = gsf_json_member(json, &json->values[0], key);
+    const gsf_json_value* list = gsf_find_json_member(json, &json->values[0], key);
     const size_t columns = strlen(kinds);
     *rows = NULL;
     *count = 0;
@@ -648,8 +652,8 @@ static gsf_result read_history(fix_run* run, const char* name, const gsf_json* j
         {"samples", "www"}};
     gsf_context* ctx = run->ctx;
     gsfix_history* h = &run->history;
-    const gsf_json_value* seconds = gsf_json_member(json, &json->values[0], "seconds");
-    const gsf_json_value* total = gsf_json_member(json, &json->values[0], "seconds_total");
+    const gsf_json_value* seconds = gsf_find_json_member(json, &json->values[0], "seconds");
+    const gsf_json_value* total = gsf_find_json_member(json, &json->values[0], "seconds_total");
     const gsf_json_value* resumed = whole_member(json, "resumed", 1e9);
     const gsf_json_value* iteration = whole_member(json, "iteration", run->iterations);
     const gsf_json_value* comparing = whole_member(json, "comparing", run->app->o.compare);
@@ -661,7 +665,7 @@ static gsf_result read_history(fix_run* run, const char* name, const gsf_json* j
     run->iteration = (int32_t)iteration->number;
     run->comparing = (int)comparing->number;
     for (size_t i = 0; i < GSFIX_STAGES; i++) {
-        const gsf_json_value* s = gsf_json_element(json, seconds, i);
+        const gsf_json_value* s = gsf_find_json_element(json, seconds, i);
         if (s && s->type == GSF_JSON_NUMBER && isfinite(s->number)) h->seconds[i] += s->number;
     }
     if (total && total->type == GSF_JSON_NUMBER && isfinite(total->number)) run->total_before = total->number;
@@ -686,8 +690,8 @@ static gsf_result open_checkpoint(fix_run* run, const char* name, void** data, s
     gsf_context* ctx = run->ctx;
     gsf_chunk chunk;
     gsf_result result = gsf_read_file(ctx, name, data, size);
-    if (result == GSF_OK) result = gsf_chunks_check(ctx, name, *data, *size);
-    if (result == GSF_OK && !gsf_chunks_find(*data, *size, "GFIX", &chunk))
+    if (result == GSF_OK) result = gsf_check_chunks(ctx, name, *data, *size);
+    if (result == GSF_OK && !gsf_find_chunk(*data, *size, "GFIX", &chunk))
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: not a checkpoint of gsfix fix", name);
     if (result == GSF_OK) result = gsf_parse_json(ctx, name, (const char*)chunk.data, chunk.size, json);
     return result;
@@ -721,11 +725,12 @@ static gsf_result resume(fix_run* run) {
     gsf_json json = {0};
     gsf_result result = open_checkpoint(run, path.s, &data, &size, &json);
     if (result == GSF_OK)
-        result = compare_switches(run, path.s, &json, gsf_json_member(&json, &json.values[0], "switches"));
-    if (result == GSF_OK) result = compare_inputs(run, path.s, &json, gsf_json_member(&json, &json.values[0], "inputs"));
+        result = compare_switches(run, path.s, &json, gsf_find_json_member(&json, &json.values[0], "switches"));
+    if (result == GSF_OK) result = compare_inputs(run, path.s, &json,
+                                                  gsf_find_json_member(&json, &json.values[0], "inputs"));
     if (result == GSF_OK) result = read_history(run, path.s, &json);
     if (result == GSF_OK) result = start_fixer(run); // without the restorer if it was comparing
-    if (result == GSF_OK) result = gsf_splat_fixer_restore(ctx, run->fixer, path.s, data, size);
+    if (result == GSF_OK) result = gsf_splat_parse_fixer(ctx, run->fixer, path.s, data, size);
     gsf_destroy_json(ctx, &json);
     gsf_free(ctx, data);
     return result;
@@ -744,8 +749,8 @@ static gsf_result meet_checkpoint(fix_run* run) {
     if (o->resume) return GSF_OK;
     const gsf_result result = open_checkpoint(run, path.s, &data, &size, &json);
     const gsf_json_value* now = result == GSF_OK ? whole_member(&json, "iteration", 1e9) : NULL;
-    const gsf_json_value* switches = now ? gsf_json_member(&json, &json.values[0], "switches") : NULL;
-    const gsf_json_value* all = switches ? gsf_json_member(&json, switches, "iterations") : NULL;
+    const gsf_json_value* switches = now ? gsf_find_json_member(&json, &json.values[0], "switches") : NULL;
+    const gsf_json_value* all = switches ? gsf_find_json_member(&json, switches, "iterations") : NULL;
     char step[64] = "";
     if (all && all->type == GSF_JSON_NUMBER) snprintf(step, sizeof step, " at step %.0f of %.0f", now->number, all->number);
     gsf_destroy_json(ctx, &json);
@@ -806,7 +811,8 @@ static gsf_result prepare(fix_run* run) {
     if (result == GSF_OK) result = gsfix_make_restorer(app, &run->restorer, &run->has_restorer);
     if (result == GSF_OK)
         run->setup.fix.train.render.near_plane =
-            gsf_splat_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0], run->scene.view_count);
+            gsf_splat_measure_near_plane(&run->scene.views[0].camera, sizeof run->scene.views[0],
+                                         run->scene.view_count);
     if (result == GSF_OK) result = load_photos(run);
     if (result == GSF_OK && app->o.masks) result = load_masks(run);
     if (result == GSF_OK && app->o.path) result = gsf_load_cameras(ctx, app->o.path, &run->path, &run->path_count);
@@ -885,7 +891,7 @@ static gsf_result after_window(fix_run* run, const gsf_fix_stats* stats) {
     for (int32_t i = 0; i < stats->frame_count && result == GSF_OK; i++) {
         gsfix_flown flown;
         double c2w[16];
-        gsf_camera_c2w(stats->cameras + i, c2w);
+        gsf_get_camera_c2w(stats->cameras + i, c2w);
         flown.round = stats->round;
         flown.window = stats->window;
         flown.reference = stats->reference_index[i];
@@ -955,7 +961,7 @@ static gsf_result run_loop(fix_run* run) {
     run->checkpoint_end = clock;
     while (result == GSF_OK) {
         gsf_fix_stats stats;
-        result = gsf_splat_fix_step(ctx, run->fixer, &stats);
+        result = gsf_splat_step_fixer(ctx, run->fixer, &stats);
         if (result != GSF_OK || stats.stage == GSF_FIX_DONE) break;
         const int cancelled = gsf_is_cancelled(ctx); // the rest of the step is completed first
         gsf_clear_cancel(ctx);
@@ -1004,14 +1010,14 @@ static gsf_result run_trainings(fix_run* run) {
 
 // ---- results ---------------------------------------------------------------------
 
-static void write_scores(gsf_context* ctx, gsf_text* t, const char* suffix, const gsfix_score* s) {
+static void write_scores(gsf_context* ctx, gsf_buffer* t, const char* suffix, const gsfix_score* s) {
     gsfix_json_number(ctx, t, gsfix_pathf("psnr%s", suffix).s, s->psnr);
     gsfix_json_number(ctx, t, gsfix_pathf("ssim%s", suffix).s, s->ssim);
     gsfix_json_number(ctx, t, gsfix_pathf("psnr_seen%s", suffix).s, s->psnr_seen);
     gsfix_json_number(ctx, t, gsfix_pathf("ssim_seen%s", suffix).s, s->ssim_seen);
 }
 
-static void write_views(fix_run* run, const gsfix_result* r, gsf_text* t) {
+static void write_views(fix_run* run, const gsfix_result* r, gsf_buffer* t) {
     gsf_context* ctx = run->ctx;
     gsfix_json_begin(ctx, t, "per_view", '[');
     for (size_t i = 0; i < run->split.test_count; i++) {
@@ -1031,7 +1037,8 @@ static int window_frames(const gsfix_history* h, int32_t round) { // frames per 
     return count;
 }
 
-static void write_curve(gsf_context* ctx, gsf_text* t, const char* key, const gsfix_curve_point* points, size_t count) {
+static void write_curve(gsf_context* ctx, gsf_buffer* t, const char* key, const gsfix_curve_point* points,
+                        size_t count) {
     gsfix_json_begin(ctx, t, key, '[');
     for (size_t i = 0; i < count; i++) {
         gsfix_json_begin(ctx, t, NULL, '{');
@@ -1044,7 +1051,7 @@ static void write_curve(gsf_context* ctx, gsf_text* t, const char* key, const gs
     gsfix_json_end(ctx, t, ']');
 }
 
-static void write_course(fix_run* run, gsf_text* t) { // rounds and curves
+static void write_course(fix_run* run, gsf_buffer* t) { // rounds and curves
     gsf_context* ctx = run->ctx;
     const gsfix_history* h = &run->history;
     gsfix_json_begin(ctx, t, "rounds", '[');
@@ -1068,7 +1075,7 @@ static void write_course(fix_run* run, gsf_text* t) { // rounds and curves
 // Appends the members of metrics.json to app->json, which already has the opening brace.
 static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsf_context* ctx = run->ctx;
-    gsf_text* t = &run->app->json;
+    gsf_buffer* t = &run->app->json;
     const gsfix_history* h = &run->history;
     gsfix_json_text(ctx, t, "version", GSF_VERSION);
     gsfix_json_text(ctx, t, "command", run->app->command_line);
@@ -1091,24 +1098,24 @@ static void write_metrics(fix_run* run, const gsfix_result* r) {
     gsfix_json_number(ctx, t, "peak_rss_bytes", (double)gsfix_peak_memory());
     gsfix_json_number(ctx, t, "seed", (double)run->app->o.seed);
     gsfix_json_number(ctx, t, "threads", ctx->parallel.worker_count);
-    gsfix_json_text(ctx, t, "isa", gsf_cpu_level_name(ctx->cpu_level));
+    gsfix_json_text(ctx, t, "isa", gsf_describe_cpu_level(ctx->cpu_level));
     gsfix_json_text(ctx, t, "visibility_rays", run->rays);
     gsfix_json_number(ctx, t, "resumed", h->resumed);
     write_course(run, t);
     gsfix_json_begin(ctx, t, "switches", '{');
     t->size--;
-    gsf_text_append(ctx, t, run->switches.data, run->switches.size);
+    gsf_append_bytes(ctx, t, run->switches.data, run->switches.size);
 }
 
 static gsf_result save_metrics(fix_run* run) {
-    gsf_text file = {0};
-    gsf_text_append(run->ctx, &file, run->app->json.data, run->app->json.size);
-    gsf_text_append(run->ctx, &file, "}\n", 2);
+    gsf_buffer file = {0};
+    gsf_append_bytes(run->ctx, &file, run->app->json.data, run->app->json.size);
+    gsf_append_bytes(run->ctx, &file, "}\n", 2);
     const gsf_result result =
         file.failed || run->app->json.failed
             ? GSF_ERROR_OUT_OF_MEMORY
             : gsf_write_file(run->ctx, gsfix_pathf("%s/metrics.json", run->app->o.out).s, file.data, file.size);
-    gsf_destroy_text(run->ctx, &file);
+    gsf_destroy_buffer(run->ctx, &file);
     return result;
 }
 
@@ -1165,7 +1172,7 @@ static gsf_result finish(fix_run* run) {
     r.masks = run->masks;
     r.views = views;
     r.iterations = run->iterations;
-    r.splats = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(run->fixer));
+    r.splats = gsf_splat_get_trained(gsf_splat_get_trainer(run->fixer));
     gsf_result result = save_splats(run, r.splats);
     add_seconds(run, GSFIX_SAVE, &clock);
     if (result == GSF_OK) result = evaluate(run, gsfix_pathf("%s/test", out).s, 1, views);
@@ -1193,7 +1200,7 @@ static void free_run(fix_run* run) {
     gsf_free(ctx, run->path);
     gsfix_free_split(run->app, &run->split);
     gsf_splat_destroy_scene(ctx, &run->scene);
-    gsf_destroy_text(ctx, &run->switches);
+    gsf_destroy_buffer(ctx, &run->switches);
     gsf_free(ctx, run->history.without);
     gsf_free(ctx, run->history.without_curve);
     gsf_free(ctx, run->history.curve);

@@ -179,7 +179,7 @@ gsf_result gsfix_add_input(gsfix_app* app, const char* path) {
 gsf_result gsfix_add_scene_inputs(gsfix_app* app, const gsf_scene* scene) {
     gsf_result result = gsfix_add_input(app, scene->folder);
     for (size_t i = 0; i < scene->view_count && result == GSF_OK; i++)
-        result = gsfix_add_input(app, gsf_splat_view_path(scene, i));
+        result = gsfix_add_input(app, gsf_splat_get_view_path(scene, i));
     return result;
 }
 
@@ -324,10 +324,10 @@ static int write_new(int folder, const char* name, const void* data, size_t size
 static const char manifest_head[] = "gsfix manifest 1\n";
 
 // Bytes that would break the line format become %XX.
-static void put_name(gsf_context* ctx, gsf_text* text, const char* name) {
+static void put_name(gsf_context* ctx, gsf_buffer* text, const char* name) {
     for (; *name; name++) {
-        if ((unsigned char)*name > 0x20 && *name != '%' && *name != 0x7f) gsf_text_append(ctx, text, name, 1);
-        else gsf_text_printf(ctx, text, "%%%02X", (unsigned)(unsigned char)*name);
+        if ((unsigned char)*name > 0x20 && *name != '%' && *name != 0x7f) gsf_append_bytes(ctx, text, name, 1);
+        else gsf_append_text(ctx, text, "%%%02X", (unsigned)(unsigned char)*name);
     }
 }
 
@@ -362,11 +362,11 @@ static void drop_line(gsf_context* ctx, gsfix_out* o, size_t i) {
     memmove(o->lines + i, o->lines + i + 1, (--o->line_count - i) * sizeof *o->lines);
 }
 
-static void print_line(gsf_context* ctx, gsf_text* text, const out_line* line) {
-    gsf_text_printf(ctx, text, "%016llx %llu %s ", (unsigned long long)line->digest, (unsigned long long)line->size,
+static void print_line(gsf_context* ctx, gsf_buffer* text, const out_line* line) {
+    gsf_append_text(ctx, text, "%016llx %llu %s ", (unsigned long long)line->digest, (unsigned long long)line->size,
                     line->command);
     put_name(ctx, text, line->name);
-    gsf_text_append(ctx, text, "\n", 1);
+    gsf_append_bytes(ctx, text, "\n", 1);
 }
 
 // Malformed lines are ignored, so that they claim nothing.
@@ -452,8 +452,8 @@ static int folder_of(const gsfix_out* o, const char* name, const char** base) {
 static gsf_result renew_manifest(gsfix_app* app) {
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
-    gsf_text text = {0};
-    gsf_text_append(ctx, &text, manifest_head, sizeof manifest_head - 1);
+    gsf_buffer text = {0};
+    gsf_append_bytes(ctx, &text, manifest_head, sizeof manifest_head - 1);
     for (size_t i = o->line_count; i-- > 0;) {
         const char* base;
         struct stat s;
@@ -474,7 +474,7 @@ static gsf_result renew_manifest(gsfix_app* app) {
                              (o->manifest = openat(o->own, "manifest", O_WRONLY | O_APPEND | O_NOFOLLOW | O_CLOEXEC)) < 0))
         result = gsf_fail(ctx, GSF_ERROR_IO, "%s: cannot be written: %s", app->o.out, strerror(errno));
     o->manifest_size = text.size;
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return result;
 }
 
@@ -483,7 +483,7 @@ static gsf_result renew_manifest(gsfix_app* app) {
 static int enter_line(gsfix_app* app, const char* name, uint64_t size, uint64_t digest, int durable) {
     gsf_context* ctx = &app->ctx;
     gsfix_out* o = app->out;
-    gsf_text text = {0};
+    gsf_buffer text = {0};
     const out_line line = {gsfix_copy_text(ctx, name, strlen(name)), gsfix_copy_text(ctx, app->command, strlen(app->command)),
                            size, digest, 0, {0, 0}, {0, 0}};
     int ok = add_line(ctx, o, &line) == GSF_OK;
@@ -498,7 +498,7 @@ static int enter_line(gsfix_app* app, const char* name, uint64_t size, uint64_t 
         drop_line(ctx, o, o->line_count - 1);
         errno = reason;
     }
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return ok && (!durable || fsync(o->manifest) == 0 || errno == EINVAL);
 }
 
@@ -873,7 +873,7 @@ gsf_result gsfix_make_job(gsfix_app* app, const char** path) {
     struct stat s;
     clock_gettime(CLOCK_REALTIME, &now);
     for (uint64_t i = 0; o->job < 0 && i < 1000; i++) {
-        const uint64_t bits = gsf_random_bits((uint64_t)now.tv_nsec ^ (uint64_t)now.tv_sec << 30, (uint64_t)getpid(), i);
+        const uint64_t bits = gsf_draw_bits((uint64_t)now.tv_nsec ^ (uint64_t)now.tv_sec << 30, (uint64_t)getpid(), i);
         snprintf(o->job_name, sizeof o->job_name, "job-%06x", (unsigned)(bits >> 40));
         if (mkdirat(o->root, o->job_name, 0777) == 0)
             o->job = openat(o->root, o->job_name, O_RDONLY | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC);

@@ -16,7 +16,7 @@ static const double error_white = 0.3; // mean absolute error at the bright end 
 typedef struct page {
     gsf_context* ctx;
     const gsfix_result* r;
-    gsf_text html;
+    gsf_buffer html;
 } page;
 
 static void put(page* p, const char* format, ...) GSF_PRINTF(2, 3);
@@ -26,10 +26,10 @@ static void put(page* p, const char* format, ...) {
     va_start(args, format);
     const int n = vsnprintf(text, sizeof text, format, args);
     va_end(args);
-    gsf_text_append(p->ctx, &p->html, text, n < 0 ? 0 : (size_t)n < sizeof text ? (size_t)n : sizeof text - 1);
+    gsf_append_bytes(p->ctx, &p->html, text, n < 0 ? 0 : (size_t)n < sizeof text ? (size_t)n : sizeof text - 1);
 }
 
-static void put_raw(page* p, const char* text) { gsf_text_append(p->ctx, &p->html, text, strlen(text)); }
+static void put_raw(page* p, const char* text) { gsf_append_bytes(p->ctx, &p->html, text, strlen(text)); }
 
 static void put_lines(page* p, const char* const* lines) {
     for (; *lines; lines++) put_raw(p, *lines);
@@ -39,7 +39,7 @@ static void put_escaped(page* p, const char* text) {
     for (; *text; text++) {
         const char* as = *text == '&' ? "&amp;" : *text == '<' ? "&lt;" : *text == '>' ? "&gt;" : *text == '"' ? "&quot;" : NULL;
         if (as) put_raw(p, as);
-        else gsf_text_append(p->ctx, &p->html, text, 1);
+        else gsf_append_bytes(p->ctx, &p->html, text, 1);
     }
 }
 
@@ -55,16 +55,16 @@ static void put_base64(page* p, const char* data, size_t size) {
         out[used++] = digits[v >> 12 & 63];
         out[used++] = left > 1 ? digits[v >> 6 & 63] : '=';
         out[used++] = left > 2 ? digits[v & 63] : '=';
-        if (used == sizeof out) gsf_text_append(p->ctx, &p->html, out, used), used = 0;
+        if (used == sizeof out) gsf_append_bytes(p->ctx, &p->html, out, used), used = 0;
     }
-    gsf_text_append(p->ctx, &p->html, out, used);
+    gsf_append_bytes(p->ctx, &p->html, out, used);
 }
 
 // ---- images ----------------------------------------------------------------------
 
 static gsf_result put_image(page* p, const gsf_image* image, const char* alt) { // u8; large images are shrunk
     gsf_image small = {0};
-    gsf_text bytes = {0};
+    gsf_buffer bytes = {0};
     const int64_t side = image->width > image->height ? image->width : image->height;
     const gsf_image* shown = image;
     gsf_result result = GSF_OK;
@@ -80,7 +80,7 @@ static gsf_result put_image(page* p, const gsf_image* image, const char* alt) { 
         put_base64(p, bytes.data, bytes.size);
         put_raw(p, "\">");
     }
-    gsf_destroy_text(p->ctx, &bytes);
+    gsf_destroy_buffer(p->ctx, &bytes);
     gsf_destroy_image(p->ctx, &small);
     return result;
 }
@@ -454,7 +454,7 @@ static gsf_result put_switches(page* p, const char* command) {
     put(p, "</pre><p>gsfixer %s, %s kernels, %d worker%s. The same command gives bit-identical results with any number of workers. "
            "PSNR and SSIM compare the render, clamped to [0,1], with the 8-bit photo; SSIM is that of the 3DGS papers (11x11 Gaussian window). "
            "The settings of the run are listed below, with their names in metrics.json.</p>", GSF_VERSION,
-        gsf_cpu_level_name(p->ctx->cpu_level), p->ctx->parallel.worker_count, p->ctx->parallel.worker_count == 1 ? "" : "s");
+        gsf_describe_cpu_level(p->ctx->cpu_level), p->ctx->parallel.worker_count, p->ctx->parallel.worker_count == 1 ? "" : "s");
     for (int group = 0; group < GROUPS; group++) {
         put(p, "<h3>%s</h3><dl class=switches>", groups[group]);
         for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
@@ -500,7 +500,7 @@ static frame3 make_frame(const gsf_scene* scene) {
     double up[3] = {0}, forward[3] = {0}, most = 0.0;
     for (size_t i = 0; i < scene->view_count; i++) {
         double c2w[16];
-        gsf_camera_c2w(&scene->views[i].camera, c2w);
+        gsf_get_camera_c2w(&scene->views[i].camera, c2w);
         for (int k = 0; k < 3; k++) {
             f.center[k] += c2w[12 + k] / (double)scene->view_count;
             up[k] -= c2w[4 + k];
@@ -523,7 +523,7 @@ static frame3 make_frame(const gsf_scene* scene) {
     }
     for (size_t i = 0; i < scene->view_count; i++) {
         double c[3], d = 0.0;
-        gsf_camera_center(&scene->views[i].camera, c);
+        gsf_get_camera_center(&scene->views[i].camera, c);
         for (int k = 0; k < 3; k++) d += (c[k] - f.center[k]) * (c[k] - f.center[k]);
         if (d > most) most = d;
     }
@@ -537,7 +537,7 @@ static void put_cameras(page* p, const frame3* f, const char* key, const uint32_
         const gsf_camera* camera = &p->r->scene->views[views[i]].camera;
         double c2w[16], center[3];
         int v[3];
-        gsf_camera_c2w(camera, c2w);
+        gsf_get_camera_c2w(camera, c2w);
         memcpy(center, c2w + 12, sizeof center);
         to_view(f, center, v);
         put(p, "%s[%d,%d,%d", i ? "," : "", v[0], v[1], v[2]);
@@ -556,7 +556,7 @@ static void put_cameras(page* p, const frame3* f, const char* key, const uint32_
 
 static void put_cloud(page* p, const frame3* f) { // coloured points of the splats that are visible enough
     const gsf_splats* s = p->r->splats;
-    const size_t bands = (size_t)gsf_splat_sh_count(s->sh_degree);
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree);
     size_t solid = 0, taken = 0, shown = 0;
     const float least = -1.4f; // logit of opacity 0.2
     for (size_t i = 0; i < s->count; i++) solid += s->opacity_logits[i] > least;
@@ -739,6 +739,6 @@ gsf_result gsfix_write_report(gsfix_app* app, const gsfix_result* result_) {
     if (result == GSF_OK)
         result = p.html.failed ? GSF_ERROR_OUT_OF_MEMORY
                                : gsf_write_file(&app->ctx, gsfix_pathf("%s/report.html", result_->out).s, p.html.data, p.html.size);
-    gsf_destroy_text(&app->ctx, &p.html);
+    gsf_destroy_buffer(&app->ctx, &p.html);
     return result;
 }

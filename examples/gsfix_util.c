@@ -180,12 +180,13 @@ gsf_result gsfix_save_npy(gsf_context* ctx, const char* path, const gsf_image* i
                               (long long)image->height, (long long)image->width);
     memset(header + used, ' ', sizeof header - (size_t)used);
     header[sizeof header - 1] = '\n';
-    gsf_text text = {0};
-    gsf_text_append(ctx, &text, "\x93NUMPY\x01\x00\x76\x00", 10); // 118 = 0x76: the data starts at byte 128
-    gsf_text_append(ctx, &text, header, sizeof header);
-    gsf_text_append(ctx, &text, (const char*)image->data, (size_t)image->width * (size_t)image->height * sizeof(float));
+    gsf_buffer text = {0};
+    gsf_append_bytes(ctx, &text, "\x93NUMPY\x01\x00\x76\x00", 10); // 118 = 0x76: the data starts at byte 128
+    gsf_append_bytes(ctx, &text, header, sizeof header);
+    gsf_append_bytes(ctx, &text, (const char*)image->data,
+                     (size_t)image->width * (size_t)image->height * sizeof(float));
     const gsf_result result = text.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, text.data, text.size);
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return result;
 }
 
@@ -232,12 +233,12 @@ static size_t value_count(const gsf_image* image) {
 typedef struct encode_job {
     const gsf_context* ctx;
     const gsf_image* images;
-    gsf_text* files;
+    gsf_buffer* files;
     gsf_result* results;
     char (*errors)[sizeof((gsf_context*)0)->error];
 } encode_job;
 
-static void encode_one(void* arg, size_t i, int worker) {
+static void encode_one(void* arg, size_t i, int32_t worker) {
     const encode_job* job = (const encode_job*)arg;
     gsf_context own = *job->ctx; // a context serves one thread; this copy starts no parallel work and does not log
     (void)worker;
@@ -252,7 +253,7 @@ gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gs
     encode_job job = {ctx, images, NULL, NULL, NULL};
     gsf_result result = GSF_OK;
     if (!count) return GSF_OK;
-    job.files = (gsf_text*)gsf_alloc_zeroed(ctx, count, sizeof *job.files);
+    job.files = (gsf_buffer*)gsf_alloc_zeroed(ctx, count, sizeof *job.files);
     job.results = (gsf_result*)gsf_alloc_zeroed(ctx, count, sizeof *job.results);
     job.errors = gsf_alloc_zeroed(ctx, count, sizeof *job.errors);
     if (!job.files || !job.results || !job.errors) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -260,7 +261,7 @@ gsf_result gsfix_save_images(gsf_context* ctx, const gsfix_path* paths, const gs
     for (size_t i = 0; i < count && result == GSF_OK; i++)
         result = job.results[i] != GSF_OK ? gsf_fail(ctx, job.results[i], "%s: %s", paths[i].s, job.errors[i])
                                           : gsf_write_file(ctx, paths[i].s, job.files[i].data, job.files[i].size);
-    for (size_t i = 0; job.files && i < count; i++) gsf_destroy_text(ctx, &job.files[i]);
+    for (size_t i = 0; job.files && i < count; i++) gsf_destroy_buffer(ctx, &job.files[i]);
     gsf_free(ctx, job.files);
     gsf_free(ctx, job.results);
     gsf_free(ctx, job.errors);
@@ -428,7 +429,7 @@ int gsfix_failed(gsfix_app* app) {
     const char* text = app->ctx.error[0] ? app->ctx.error : "out of memory";
     fprintf(stderr, "gsfix %s: %s\n", app->command, text);
     if (app->o.json) {
-        gsf_destroy_text(&app->ctx, &app->json);
+        gsf_destroy_buffer(&app->ctx, &app->json);
         gsfix_json_begin(&app->ctx, &app->json, NULL, '{');
         gsfix_json_text(&app->ctx, &app->json, "error", text);
         gsfix_json_end(&app->ctx, &app->json, '}');
@@ -438,33 +439,33 @@ int gsfix_failed(gsfix_app* app) {
 
 // ---- JSON ------------------------------------------------------------------------
 
-static void json_member(gsf_context* ctx, gsf_text* text, const char* key) {
+static void json_member(gsf_context* ctx, gsf_buffer* text, const char* key) {
     const char last = text->size ? text->data[text->size - 1] : '{';
-    if (last != '{' && last != '[') gsf_text_append(ctx, text, ",", 1);
+    if (last != '{' && last != '[') gsf_append_bytes(ctx, text, ",", 1);
     if (!key) return;
-    gsf_text_json_string(ctx, text, key);
-    gsf_text_append(ctx, text, ":", 1);
+    gsf_append_json_string(ctx, text, key);
+    gsf_append_bytes(ctx, text, ":", 1);
 }
 
-void gsfix_json_begin(gsf_context* ctx, gsf_text* text, const char* key, char bracket) {
+void gsfix_json_begin(gsf_context* ctx, gsf_buffer* text, const char* key, char bracket) {
     json_member(ctx, text, key);
-    gsf_text_append(ctx, text, &bracket, 1);
+    gsf_append_bytes(ctx, text, &bracket, 1);
 }
 
-void gsfix_json_end(gsf_context* ctx, gsf_text* text, char bracket) { gsf_text_append(ctx, text, &bracket, 1); }
+void gsfix_json_end(gsf_context* ctx, gsf_buffer* text, char bracket) { gsf_append_bytes(ctx, text, &bracket, 1); }
 
-void gsfix_json_text(gsf_context* ctx, gsf_text* text, const char* key, const char* value) {
+void gsfix_json_text(gsf_context* ctx, gsf_buffer* text, const char* key, const char* value) {
     json_member(ctx, text, key);
-    if (value) gsf_text_json_string(ctx, text, value);
-    else gsf_text_append(ctx, text, "null", 4);
+    if (value) gsf_append_json_string(ctx, text, value);
+    else gsf_append_bytes(ctx, text, "null", 4);
 }
 
-void gsfix_json_number(gsf_context* ctx, gsf_text* text, const char* key, double value) {
+void gsfix_json_number(gsf_context* ctx, gsf_buffer* text, const char* key, double value) {
     json_member(ctx, text, key);
-    gsf_text_json_number(ctx, text, value);
+    gsf_append_json_number(ctx, text, value);
 }
 
-void gsfix_json_bool(gsf_context* ctx, gsf_text* text, const char* key, int value) {
+void gsfix_json_bool(gsf_context* ctx, gsf_buffer* text, const char* key, int value) {
     json_member(ctx, text, key);
-    gsf_text_append(ctx, text, value ? "true" : "false", value ? 4 : 5);
+    gsf_append_bytes(ctx, text, value ? "true" : "false", value ? 4 : 5);
 }

@@ -61,7 +61,7 @@ static gsf_result set_photo(host* h, const char* folder, size_t view) {
     snprintf(name, sizeof name, strchr(file, '/') ? "%s" : "images/%s", file);
     const gsf_bytes bytes = fetch(folder, name);
     gsf_result result = bytes.data ? GSF_OK : gsf_fail(&h->ctx, GSF_ERROR_NOT_FOUND, "%s: no such photo", name);
-    if (result == GSF_OK) result = gsf_load_image_memory(&h->ctx, name, bytes.data, bytes.size, 3, &photo);
+    if (result == GSF_OK) result = gsf_decode_image(&h->ctx, name, bytes.data, bytes.size, 3, &photo);
     if (result == GSF_OK) result = gsf_splat_set_view_image(&h->ctx, &h->scene, view, &photo);
     gsf_destroy_image(&h->ctx, &photo);
     free((void*)bytes.data);
@@ -71,7 +71,7 @@ static gsf_result set_photo(host* h, const char* folder, size_t view) {
 static gsf_result train(host* h, int steps) {
     gsf_result result = GSF_OK;
     gsf_train_stats stats = {0};
-    for (int i = 0; i < steps && result == GSF_OK; i++) result = gsf_splat_train_step(&h->ctx, h->trainer, &stats);
+    for (int i = 0; i < steps && result == GSF_OK; i++) result = gsf_splat_step_trainer(&h->ctx, h->trainer, &stats);
     if (result == GSF_OK)
         printf("iteration %d: %zu splats, loss %.4f\n", (int)stats.iteration, stats.splats, stats.loss);
     return result;
@@ -84,13 +84,13 @@ static gsf_result repair(host* h) {
     gsf_render_output out = {0};
     double c2w[16], other[16];
     between.camera = h->views[0].camera;
-    gsf_camera_c2w(&h->views[0].camera, c2w);
-    gsf_camera_c2w(&h->views[h->scene.view_count > 1].camera, other);
+    gsf_get_camera_c2w(&h->views[0].camera, c2w);
+    gsf_get_camera_c2w(&h->views[h->scene.view_count > 1].camera, other);
     for (int k = 12; k < 15; k++) c2w[k] = 0.5 * (c2w[k] + other[k]);
-    gsf_camera_set_c2w(&between.camera, c2w);
+    gsf_set_camera_c2w(&between.camera, c2w);
     gsf_result result = gsf_make_image(ctx, GSF_F32, between.camera.width, between.camera.height, 3, &between.image);
     out.color = between.image;
-    if (result == GSF_OK) result = gsf_splat_trainer_render(ctx, h->trainer, &between.camera, &out);
+    if (result == GSF_OK) result = gsf_splat_render_trainer(ctx, h->trainer, &between.camera, &out);
     // here the host mends the picture in between.image; this program leaves it as it is
     if (result == GSF_OK) result = gsf_splat_set_restored_views(ctx, h->trainer, &between, 1);
     gsf_splat_set_restored_weight(h->trainer, 0.5f);
@@ -108,7 +108,7 @@ static gsf_result run(host* h, const char* folder) {
     for (size_t i = 0; i < count && result == GSF_OK; i++) result = set_photo(h, folder, i);
     if (result == GSF_OK) result = gsf_splat_load_train_views(ctx, &h->scene, NULL, count, &h->views); // all are there
     initial.kind = h->scene.point_count ? GSF_INITIAL_ALL : GSF_INITIAL_RANDOM;
-    if (result == GSF_OK) result = gsf_splat_initial_splats(ctx, &h->scene, NULL, count, &initial, &start, NULL);
+    if (result == GSF_OK) result = gsf_splat_make_initial_splats(ctx, &h->scene, NULL, count, &initial, &start, NULL);
     if (result == GSF_OK) result = gsf_splat_sort(ctx, &start); // neighbours in space become neighbours in memory
     desc.iterations = STEPS + REPAIRED_STEPS;
     if (result == GSF_OK) result = gsf_splat_make_trainer(ctx, &desc, h->views, count, &start, &h->trainer);
@@ -116,7 +116,7 @@ static gsf_result run(host* h, const char* folder) {
     if (result == GSF_OK) result = train(h, STEPS);
     if (result == GSF_OK) result = repair(h);
     if (result == GSF_OK) result = train(h, REPAIRED_STEPS);
-    if (result == GSF_OK) result = gsf_splat_trainer_export(ctx, h->trainer, &h->splats);
+    if (result == GSF_OK) result = gsf_splat_copy_trained(ctx, h->trainer, &h->splats);
     gsf_splat_destroy_trainer(ctx, h->trainer); // the splats are a copy
     return result;
 }
@@ -124,7 +124,7 @@ static gsf_result run(host* h, const char* folder) {
 int main(int argc, char** argv) {
     if (argc != 3) return fprintf(stderr, "usage: %s SCENE OUT.ply\n", argv[0]), 2;
     host h = {0};
-    gsf_text out = {0};
+    gsf_buffer out = {0};
     gsf_result result = gsf_init_context(&h.ctx);
     if (result == GSF_OK) result = run(&h, argv[1]);
     if (result == GSF_OK) result = gsf_splat_format(&h.ctx, argv[2], &h.splats, NULL, &out);
@@ -133,7 +133,7 @@ int main(int argc, char** argv) {
         result = gsf_fail(&h.ctx, GSF_ERROR_IO, "%s: cannot be written", argv[2]);
     if (file && fclose(file) != 0) result = gsf_fail(&h.ctx, GSF_ERROR_IO, "%s: cannot be written", argv[2]);
     if (result != GSF_OK) fprintf(stderr, "%s\n", h.ctx.error);
-    gsf_destroy_text(&h.ctx, &out);
+    gsf_destroy_buffer(&h.ctx, &out);
     gsf_splat_destroy(&h.ctx, &h.splats);
     gsf_free(&h.ctx, h.views);
     gsf_splat_destroy_scene(&h.ctx, &h.scene);

@@ -14,7 +14,7 @@ typedef struct job_system {
     pthread_mutex_t lock; // guards everything below
     pthread_cond_t start, done;
     pthread_t threads[JOB_WORKERS_MAX];
-    int worker_count; // including the caller, which is worker 0
+    int32_t worker_count; // including the caller, which is worker 0
     int busy, quit;
     unsigned round; // counts the calls of job_for
     size_t count, next;
@@ -24,7 +24,7 @@ typedef struct job_system {
 
 typedef struct job_worker { job_system* jobs; int index; } job_worker;
 
-static void job_take_chunks(job_system* jobs, int worker) { // called and returns with the lock held
+static void job_take_chunks(job_system* jobs, int32_t worker) { // called and returns with the lock held
     while (jobs->next < jobs->count) {
         const size_t chunk = jobs->next++;
         pthread_mutex_unlock(&jobs->lock);
@@ -80,7 +80,7 @@ static void job_stop(job_system* jobs) {
     pthread_mutex_destroy(&jobs->lock);
 }
 
-static int job_start(job_system* jobs, int worker_count) { // 0 on failure
+static int job_start(job_system* jobs, int32_t worker_count) { // 0 on failure
     memset(jobs, 0, sizeof *jobs);
     if (worker_count < 1 || worker_count > JOB_WORKERS_MAX) return 0;
     if (pthread_mutex_init(&jobs->lock, NULL)) return 0;
@@ -106,9 +106,9 @@ static gsf_result render_random_splats(gsf_context* ctx, float* pixels) {
     if (result != GSF_OK) return result;
     for (size_t i = 0; i < SPLATS; i++) {
         for (uint64_t a = 0; a < 3; a++) {
-            splats.means[3 * i + a] = (float)(2.0 * gsf_random_uniform(1, a, i) - 1.0);
-            splats.log_scales[3 * i + a] = (float)(-4.5 + gsf_random_uniform(1, 3 + a, i));
-            splats.sh[3 * i + a] = (float)gsf_random_normal(1, 6 + a, i);
+            splats.means[3 * i + a] = (float)(2.0 * gsf_draw_uniform(1, a, i) - 1.0);
+            splats.log_scales[3 * i + a] = (float)(-4.5 + gsf_draw_uniform(1, 3 + a, i));
+            splats.sh[3 * i + a] = (float)gsf_draw_normal(1, 6 + a, i);
         }
         splats.quats[4 * i] = 1.0f;
         splats.opacity_logits[i] = 1.0f;

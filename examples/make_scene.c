@@ -506,7 +506,7 @@ static void add_box(world* s, v3 lo, v3 hi, int cells, material m, uint32_t seed
 }
 
 static float pick(world* s, uint64_t stream, uint64_t index, float lo, float hi) {
-    return lo + (hi - lo) * (float)gsf_random_uniform(s->seed, stream, index);
+    return lo + (hi - lo) * (float)gsf_draw_uniform(s->seed, stream, index);
 }
 
 static void add_bush(world* s, place where, float radius, float height, int leaves, uint64_t stream) {
@@ -695,7 +695,7 @@ static v3 mean_albedo(material m) {
 typedef struct bake_job { world* s; int rays; } bake_job;
 enum { BAKE_CHUNK = 512 };
 
-static void bake_chunk(void* arg, size_t chunk, int worker) {
+static void bake_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const bake_job* job = (const bake_job*)arg;
     world* s = job->s;
@@ -773,7 +773,7 @@ typedef struct photo_job {
 
 static v3 eye_of(const gsf_camera* camera) {
     double c[3];
-    gsf_camera_center(camera, c);
+    gsf_get_camera_center(camera, c);
     return v((float)c[0], (float)c[1], (float)c[2]);
 }
 static v3 ray_through(const gsf_camera* camera, double x, double y, float* z) { // z: camera depth per unit of length
@@ -790,7 +790,7 @@ static float film(float x) { // Narkowicz's fit of the ACES curve, then sRGB cod
     return x <= 0.0031308f ? 12.92f * x : 1.055f * powf(x, 1.0f / 2.4f) - 0.055f;
 }
 
-static void photo_row(void* arg, size_t row, int worker) {
+static void photo_row(void* arg, size_t row, int32_t worker) {
     (void)worker;
     enum { SAMPLES = 4 };
     static const float jitter[SAMPLES][2] = {{0.375f, 0.125f}, {0.875f, 0.375f}, {0.125f, 0.625f}, {0.625f, 0.875f}};
@@ -821,7 +821,7 @@ static void photo_row(void* arg, size_t row, int worker) {
         sum = mul(sum, (1.0f - 0.11f * (px * px + py * py)) / SAMPLES); // vignetting
         const float c[3] = {film(sum.x), film(sum.y), film(sum.z)};
         for (size_t k = 0; k < 3; k++) { // sensor noise
-            const float grain = 1.1f * (float)gsf_random_normal(job->s->seed, 100 + job->view, 3 * pixel + k);
+            const float grain = 1.1f * (float)gsf_draw_normal(job->s->seed, 100 + job->view, 3 * pixel + k);
             job->pixels[3 * pixel + k] = (uint8_t)clampf(255.0f * c[k] + grain + 0.5f, 0, 255);
         }
     }
@@ -880,7 +880,7 @@ typedef struct cloud {
 static uint8_t truth_of(const world* s, const gsf_camera* camera, v3 at) {
     const double p[3] = {(double)at.x, (double)at.y, (double)at.z};
     double x, y, z;
-    if (!gsf_camera_project(camera, p, &x, &y, &z) || x < 0 || y < 0 || x >= camera->width || y >= camera->height) return 0;
+    if (!gsf_project_point(camera, p, &x, &y, &z) || x < 0 || y < 0 || x >= camera->width || y >= camera->height) return 0;
     const v3 eye = eye_of(camera), d = sub(at, eye);
     const float distance = sqrtf(dot(d, d));
     return TRUTH_IN_FRAME | (blocked(s, eye, mul(d, 1.0f / distance), 0.01f, distance - 4e-3f) ? 0 : TRUTH_VISIBLE);
@@ -897,7 +897,7 @@ static int triangulate(const gsf_scene* scene, const uint32_t* views, const doub
         double d[3], c[3];
         const double size = sqrt(q[0] * q[0] + q[1] * q[1] + 1.0);
         for (int k = 0; k < 3; k++) d[k] = (m[4 * k] * q[0] + m[4 * k + 1] * q[1] + m[4 * k + 2]) / size;
-        gsf_camera_center(camera, c);
+        gsf_get_camera_center(camera, c);
         for (int r = 0; r < 3; r++)
             for (int k = 0; k < 3; k++) {
                 const double w = (r == k) - d[r] * d[k];
@@ -936,13 +936,13 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
                          uint32_t* track, double (*seen)[2], double at[3], uint8_t* truth, uint8_t* color, int* outlier) {
     const gsf_scene* scene = &c->scene;
     const uint64_t k = (uint64_t)try_ * 512;
-    const uint32_t anchor = (uint32_t)(gsf_random_bits(s->seed, 2, k) % (uint64_t)o->views);
+    const uint32_t anchor = (uint32_t)(gsf_draw_bits(s->seed, 2, k) % (uint64_t)o->views);
     const gsf_camera* camera = &scene->views[anchor].camera;
-    const double x = 2.0 + gsf_random_uniform(s->seed, 2, k + 1) * (o->width - 4.0),
-                 y = 2.0 + gsf_random_uniform(s->seed, 2, k + 2) * (o->height - 4.0);
+    const double x = 2.0 + gsf_draw_uniform(s->seed, 2, k + 1) * (o->width - 4.0),
+                 y = 2.0 + gsf_draw_uniform(s->seed, 2, k + 2) * (o->height - 4.0);
     const uint8_t* pixel = photos[anchor] + 3 * ((size_t)y * (size_t)o->width + (size_t)x);
     const float corner = texture_at(photos[anchor], o->width, (int)x, (int)y);
-    if (gsf_random_uniform(s->seed, 2, k + 3) > fmin(1.0, 0.004 + corner / 9000.0)) return 0;
+    if (gsf_draw_uniform(s->seed, 2, k + 3) > fmin(1.0, 0.004 + corner / 9000.0)) return 0;
     float z;
     hit h;
     const v3 eye = eye_of(camera), d = ray_through(camera, x, y, &z);
@@ -951,13 +951,13 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
         hit near;
         const v3 side = ray_through(camera, x + (i & 1 ? 3.0 : -3.0), y + (i & 2 ? 3.0 : -3.0), &z);
         const int jump = !trace(s, eye, side, 0.01f, &near) || fabsf(near.t - h.t) > 0.06f * h.t;
-        if (jump && gsf_random_uniform(s->seed, 2, k + 7) < 0.9) return 0;
+        if (jump && gsf_draw_uniform(s->seed, 2, k + 7) < 0.9) return 0;
     }
-    *outlier = gsf_random_uniform(s->seed, 2, k + 4) < 0.012;
-    if (*outlier) h.at = add(eye, mul(d, h.t * (float)exp((gsf_random_uniform(s->seed, 2, k + 5) - 0.5) * 1.2)));
+    *outlier = gsf_draw_uniform(s->seed, 2, k + 4) < 0.012;
+    if (*outlier) h.at = add(eye, mul(d, h.t * (float)exp((gsf_draw_uniform(s->seed, 2, k + 5) - 0.5) * 1.2)));
     memcpy(color, pixel, 3);
     size_t length = 0;
-    int wrong_left = 1 + (gsf_random_uniform(s->seed, 2, k + 6) < 0.3); // a wrong match joins two views, rarely three
+    int wrong_left = 1 + (gsf_draw_uniform(s->seed, 2, k + 6) < 0.3); // a wrong match joins two views, rarely three
     float widest = 0.0f; // angle between the anchor's ray and another's
     for (int i = 0; i < o->views; i++) {
         const gsf_camera* other = &scene->views[i].camera;
@@ -966,23 +966,23 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
         const v3 from = unit(sub(h.at, eye_of(other)));
         const float angle = acosf(clampf(dot(from, d), -1, 1)), facing = fabsf(dot(from, h.normal));
         double chance = 0.85 * exp(-(double)(angle * angle) / 0.30) * (double)step_between(0.08f, 0.35f, facing);
-        int found = (truth[i] & TRUTH_VISIBLE) && gsf_random_uniform(s->seed, 3, j + (uint64_t)i) < chance;
+        int found = (truth[i] & TRUTH_VISIBLE) && gsf_draw_uniform(s->seed, 3, j + (uint64_t)i) < chance;
         if (*outlier) found = (truth[i] & TRUTH_IN_FRAME) && angle > 0.04f && angle < 0.25f && wrong_left-- > 0;
         if ((uint32_t)i == anchor) found = 1;
         if (!found) continue;
         const double p[3] = {(double)h.at.x, (double)h.at.y, (double)h.at.z};
         double u, w, depth;
-        if (!gsf_camera_project(other, p, &u, &w, &depth)) continue;
+        if (!gsf_project_point(other, p, &u, &w, &depth)) continue;
         track[length] = (uint32_t)i;
-        seen[length][0] = u + o->noise * gsf_random_normal(s->seed, 4, 2 * (k + (uint64_t)i));
-        seen[length++][1] = w + o->noise * gsf_random_normal(s->seed, 4, 2 * (k + (uint64_t)i) + 1);
+        seen[length][0] = u + o->noise * gsf_draw_normal(s->seed, 4, 2 * (k + (uint64_t)i));
+        seen[length++][1] = w + o->noise * gsf_draw_normal(s->seed, 4, 2 * (k + (uint64_t)i) + 1);
         widest = maxf(widest, angle);
     }
     if (length < 2 || widest < 0.026f || !triangulate(scene, track, (const double(*)[2])seen, length, at))
         return 0;                         // 1.5 degrees
     for (size_t i = 0; i < length; i++) { // COLMAP's filter of 4 pixels
         double u, w, depth;
-        if (!gsf_camera_project(&scene->views[track[i]].camera, at, &u, &w, &depth) ||
+        if (!gsf_project_point(&scene->views[track[i]].camera, at, &u, &w, &depth) ||
             hypot(u - seen[i][0], w - seen[i][1]) > 4.0)
             return 0;
     }
@@ -1031,15 +1031,15 @@ static int make_folder(const char* folder, const char* below) {
 }
 
 static gsf_result write_depth(gsf_context* ctx, const char* path, const float* depth, int width, int height) {
-    gsf_text out;
+    gsf_buffer out;
     char head[128];
     memset(&out, 0, sizeof out);
     snprintf(head, sizeof head, "{'descr': '<f4', 'fortran_order': False, 'shape': (%d, %d), }", height, width);
-    gsf_text_append(ctx, &out, "\x93NUMPY\x01\x00\x76\x00", 10); // version 1.0, header of 118 bytes
-    gsf_text_printf(ctx, &out, "%-117s\n", head);
-    gsf_text_append(ctx, &out, (const char*)depth, (size_t)width * (size_t)height * sizeof(float));
+    gsf_append_bytes(ctx, &out, "\x93NUMPY\x01\x00\x76\x00", 10); // version 1.0, header of 118 bytes
+    gsf_append_text(ctx, &out, "%-117s\n", head);
+    gsf_append_bytes(ctx, &out, (const char*)depth, (size_t)width * (size_t)height * sizeof(float));
     const gsf_result result = out.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, out.data, out.size);
-    gsf_destroy_text(ctx, &out);
+    gsf_destroy_buffer(ctx, &out);
     return result;
 }
 
@@ -1050,15 +1050,15 @@ static gsf_result write_depth(gsf_context* ctx, const char* path, const float* d
    Points as in points3D.bin, views sorted by name. The place is the surface point that the noisy point stands for; of an
    outlier, where the wrong match lies. */
 static gsf_result write_truth(gsf_context* ctx, const char* path, const cloud* c) {
-    gsf_text out;
+    gsf_buffer out;
     memset(&out, 0, sizeof out);
     const uint64_t sizes[2] = {c->scene.point_count, c->scene.view_count};
-    gsf_text_append(ctx, &out, "GSFTRUTH", 8);
-    gsf_text_append(ctx, &out, (const char*)sizes, sizeof sizes);
-    gsf_text_append(ctx, &out, (const char*)c->truth, c->scene.point_count * c->scene.view_count);
-    gsf_text_append(ctx, &out, (const char*)c->outlier, c->scene.point_count);
+    gsf_append_bytes(ctx, &out, "GSFTRUTH", 8);
+    gsf_append_bytes(ctx, &out, (const char*)sizes, sizeof sizes);
+    gsf_append_bytes(ctx, &out, (const char*)c->truth, c->scene.point_count * c->scene.view_count);
+    gsf_append_bytes(ctx, &out, (const char*)c->outlier, c->scene.point_count);
     const gsf_result result = out.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, out.data, out.size);
-    gsf_destroy_text(ctx, &out);
+    gsf_destroy_buffer(ctx, &out);
     return result;
 }
 
@@ -1198,7 +1198,7 @@ static gsf_result read_options(gsf_context* ctx, const char* path, make_scene_op
     gsf_free(ctx, data);
     if (result != GSF_OK) return result;
     for (size_t i = 0; i < 3 && result == GSF_OK; i++) {
-        const gsf_json_value* value = gsf_json_member(&json, &json.values[0], keys[i]);
+        const gsf_json_value* value = gsf_find_json_member(&json, &json.values[0], keys[i]);
         if (value && value->type == GSF_JSON_NUMBER && value->number >= 0.0 && value->number < 1e9) values[i] = value->number;
         else result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid \"%s\"", path, keys[i]);
     }

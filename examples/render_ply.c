@@ -61,7 +61,7 @@ static gsf_camera orbit_camera(const double center[3], double radius, int index)
     camera.cy = ORBIT_HEIGHT / 2.0;
     camera.width = ORBIT_WIDTH;
     camera.height = ORBIT_HEIGHT;
-    gsf_camera_set_c2w(&camera, c2w);
+    gsf_set_camera_c2w(&camera, c2w);
     return camera;
 }
 
@@ -103,11 +103,11 @@ int main(int argc, char** argv) {
                           : make_orbit(&ctx, &splats, &cameras, &count);
     if (result == GSF_OK) result = gsf_splat_make_rasterizer(&ctx, &rasterizer);
     for (size_t i = 0; i < count && result == GSF_OK; i++) {
-        gsf_text path = {0};
-        gsf_text_printf(&ctx, &path, "%s%03zu.png", argv[2], i);
+        gsf_buffer path = {0};
+        gsf_append_text(&ctx, &path, "%s%03zu.png", argv[2], i);
         result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : render_one(&ctx, rasterizer, &splats, &cameras[i], path.data);
         if (result == GSF_OK) printf("%s\n", path.data);
-        gsf_destroy_text(&ctx, &path);
+        gsf_destroy_buffer(&ctx, &path);
     }
     if (result != GSF_OK) fprintf(stderr, "%s\n", ctx.error);
     gsf_splat_destroy_rasterizer(&ctx, rasterizer);

@@ -65,7 +65,7 @@ static gsf_result make_cameras(gsf_context* ctx, const options* o, gsf_camera** 
         camera->fx = camera->fy = 0.5 * camera->width / tan(0.5); // sees one radian across
         camera->cx = 360.0;
         camera->cy = 240.0;
-        gsf_camera_set_c2w(camera, pose);
+        gsf_set_camera_c2w(camera, pose);
     }
     return GSF_OK;
 }
@@ -73,15 +73,15 @@ static gsf_result make_cameras(gsf_context* ctx, const options* o, gsf_camera** 
 static double length_of(const gsf_camera* frames, size_t count) {
     double sum = 0.0, a[3], b[3];
     for (size_t f = 1; f < count; f++) {
-        gsf_camera_center(&frames[f - 1], a);
-        gsf_camera_center(&frames[f], b);
+        gsf_get_camera_center(&frames[f - 1], a);
+        gsf_get_camera_center(&frames[f], b);
         sum += sqrt((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1]) + (a[2] - b[2]) * (a[2] - b[2]));
     }
     return sum;
 }
 
 static gsf_result run(gsf_context* ctx, const options* o, const gsf_camera* cameras, size_t count) {
-    gsf_traj_path_layout layout;
+    gsf_traj_path_info layout;
     gsf_result result = gsf_traj_query_path(ctx, count, &o->desc, &layout);
     if (result != GSF_OK) return result;
     gsf_camera* frames = (gsf_camera*)gsf_alloc(ctx, layout.frame_count, sizeof *frames);

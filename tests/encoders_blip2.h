@@ -38,7 +38,7 @@ static void see_blip2_tap(void* user, const char* name, int32_t index, const flo
 
 // Numbers of a JSON list from `skip` on; -1 where there are no more.
 static int32_t blip2_id(const gsf_json* json, const gsf_json_value* list, size_t index) {
-    const gsf_json_value* value = gsf_json_element(json, list, index);
+    const gsf_json_value* value = gsf_find_json_element(json, list, index);
     return value ? (int32_t)value->number : -1;
 }
 
@@ -77,10 +77,10 @@ static void check_blip2_text(const gsf_json_value* expected, const char* caption
 
 static void check_blip2_run(blip2_case* c, const gsf_nn_captioner* net, const gsf_image* image, const gsf_json* json,
                             const gsf_json_value* expected) {
-    const gsf_json_value* prompt = gsf_json_member(json, expected, "prompt");
-    const gsf_json_value* inputs = gsf_json_member(json, expected, "input_ids");
-    const gsf_json_value* usual = gsf_json_member(json, expected, "hf_generate_default");
-    gsf_nn_caption_desc d;
+    const gsf_json_value* prompt = gsf_find_json_member(json, expected, "prompt");
+    const gsf_json_value* inputs = gsf_find_json_member(json, expected, "input_ids");
+    const gsf_json_value* usual = gsf_find_json_member(json, expected, "hf_generate_default");
+    gsf__nn_caption_desc d;
     int32_t* ids;
     size_t count;
     memset(&d, 0, sizeof d);
@@ -92,19 +92,19 @@ static void check_blip2_run(blip2_case* c, const gsf_nn_captioner* net, const gs
         check_blip2_ids("prompt", json, inputs, (size_t)net->query_tokens, ids, count);
         gsf_free(c->ctx, ids);
     }
-    CHECK_OK(c->ctx, gsf_nn_caption_ids(c->ctx, net, &d, &ids, &count));
+    CHECK_OK(c->ctx, gsf__nn_caption_ids(c->ctx, net, &d, &ids, &count));
     check_blip2_ids("hf_generate_default", json, usual, inputs->count, ids, count);
     gsf_free(c->ctx, ids);
     d.max_new_tokens = 24;
     const gsf__nn_tap tap = {see_blip2_tap, c};
     d._tap = &tap;
-    CHECK_OK(c->ctx, gsf_nn_caption_ids(c->ctx, net, &d, &ids, &count));
-    check_blip2_ids("hf_generate_max_new_24", json, gsf_json_member(json, expected, "hf_generate_max_new_24"),
+    CHECK_OK(c->ctx, gsf__nn_caption_ids(c->ctx, net, &d, &ids, &count));
+    check_blip2_ids("hf_generate_max_new_24", json, gsf_find_json_member(json, expected, "hf_generate_max_new_24"),
                     inputs->count, ids, count);
     gsf_free(c->ctx, ids);
     char caption[4096];
-    const gsf_json_value* text = gsf_json_member(json, expected, "text");
-    CHECK_OK(c->ctx, gsf_nn_caption(c->ctx, net, image, d.prompt, 24, caption, sizeof caption));
+    const gsf_json_value* text = gsf_find_json_member(json, expected, "text");
+    CHECK_OK(c->ctx, gsf_nn_caption_image(c->ctx, net, image, d.prompt, 24, caption, sizeof caption));
     if (CHECK(text && text->type == GSF_JSON_STRING)) check_blip2_text(text, caption);
 }
 
@@ -114,22 +114,23 @@ static void check_blip2_legacy(const gsf_image* image, const gsf_json* json, con
     blip2_folder folder;
     gsf_context ctx;
     gsf_nn_captioner net;
-    gsf_nn_caption_desc d;
+    gsf__nn_caption_desc d;
     int32_t* ids;
     size_t count;
     blip2_open(&folder, &ctx);
     char* config = blip2_edit("config.json", "\"image_token_index\"", "\"unused\"");
     blip2_put(&folder, "config.json", config, 0);
-    if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_captioner(&ctx, blip2_golden(), &net))) return;
     CHECK(net.image_token == -1);
     memset(&d, 0, sizeof d);
     d.image = image;
-    CHECK_OK(&ctx, gsf_nn_caption_ids(&ctx, &net, &d, &ids, &count));
-    check_blip2_ids("legacy default", json, gsf_json_member(json, expected, "hf_generate_default"), 1, ids, count);
+    CHECK_OK(&ctx, gsf__nn_caption_ids(&ctx, &net, &d, &ids, &count));
+    check_blip2_ids("legacy default", json, gsf_find_json_member(json, expected, "hf_generate_default"), 1, ids, count);
     gsf_free(&ctx, ids);
     d.max_new_tokens = 30 - 3; // max_length 30: the queries do not count, one bos twice and 1 off
-    CHECK_OK(&ctx, gsf_nn_caption_ids(&ctx, &net, &d, &ids, &count));
-    check_blip2_ids("legacy of 30", json, gsf_json_member(json, expected, "hf_generate_max_len_30"), 1, ids, count);
+    CHECK_OK(&ctx, gsf__nn_caption_ids(&ctx, &net, &d, &ids, &count));
+    check_blip2_ids("legacy of 30", json, gsf_find_json_member(json, expected, "hf_generate_max_len_30"), 1, ids,
+                    count);
     gsf_free(&ctx, ids);
     CHECK(count > 0 && net.query_tokens == (int32_t)queries);
     gsf_nn_destroy_captioner(&ctx, &net);
@@ -138,21 +139,21 @@ static void check_blip2_legacy(const gsf_image* image, const gsf_json* json, con
 
 static void check_blip2_tokens(gsf_context* ctx, const gsf_nn_bpe* bpe, const gsf_json* json) {
     static const char* const lists[] = {"ids", "ids_no_special"};
-    const gsf_json_value* cases = gsf_json_member(json, json->values, "tokenizer_cases");
+    const gsf_json_value* cases = gsf_find_json_member(json, json->values, "tokenizer_cases");
     CHECK(cases && cases->count > 0);
     for (uint32_t i = cases->child; i; i = json->values[i].next) {
-        const gsf_json_value* text = gsf_json_member(json, &json->values[i], "text");
-        const gsf_json_value* decoded = gsf_json_member(json, &json->values[i], "decoded");
+        const gsf_json_value* text = gsf_find_json_member(json, &json->values[i], "text");
+        const gsf_json_value* decoded = gsf_find_json_member(json, &json->values[i], "decoded");
         for (int k = 0; k < 2; k++) {
             int32_t* ids;
             size_t count;
-            gsf_text out;
+            gsf_buffer out;
             memset(&out, 0, sizeof out);
             CHECK_OK(ctx, gsf_nn_encode_bpe(ctx, bpe, text->string, text->string_size, k, &ids, &count));
-            check_blip2_ids(text->string, json, gsf_json_member(json, &json->values[i], lists[k]), 0, ids, count);
+            check_blip2_ids(text->string, json, gsf_find_json_member(json, &json->values[i], lists[k]), 0, ids, count);
             CHECK_OK(ctx, gsf_nn_decode_bpe(ctx, bpe, ids, count, 1, &out));
             CHECK(out.size == decoded->string_size && memcmp(out.data, decoded->string, out.size) == 0);
-            gsf_destroy_text(ctx, &out);
+            gsf_destroy_buffer(ctx, &out);
             gsf_free(ctx, ids);
         }
     }
@@ -166,27 +167,27 @@ static void check_blip2(void) {
     blip2_case c;
     size_t size, index = 0;
     test_context_init(&ctx);
-    if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_captioner(&ctx, blip2_golden(), &net))) return;
     char* text = test_read_file(test_golden("encoders/blip2/expected.json"), &size);
     if (!CHECK_OK(&ctx, gsf_parse_json(&ctx, "expected.json", text, size, &json))) return;
     check_blip2_tokens(&ctx, &net.tokenizer, &json);
     memset(&c, 0, sizeof c);
     c.ctx = &ctx;
     c.expected = test_open_tensors(test_golden("encoders/blip2/expected.safetensors"));
-    const gsf_json_value* cases = gsf_json_member(&json, json.values, "cases");
+    const gsf_json_value* cases = gsf_find_json_member(&json, json.values, "cases");
     CHECK(cases && cases->count > 0);
     for (uint32_t i = cases->child; i; i = json.values[i].next, index++) {
         char path[256];
         gsf_image image;
-        snprintf(path, sizeof path, "encoders/blip2/%s", gsf_json_member(&json, &json.values[i], "image")->string);
+        snprintf(path, sizeof path, "encoders/blip2/%s", gsf_find_json_member(&json, &json.values[i], "image")->string);
         if (!CHECK_OK(&ctx, gsf_load_image(&ctx, test_golden(path), 3, &image))) continue;
         snprintf(c.label, sizeof c.label, "case%zu", index);
         for (size_t k = 0; k < 2; k++) {
-            const gsf_json_value* expected = gsf_json_member(&json, &json.values[i], runs[k]);
+            const gsf_json_value* expected = gsf_find_json_member(&json, &json.values[i], runs[k]);
             c.run = runs[k];
             if (expected) check_blip2_run(&c, &net, &image, &json, expected);
         }
-        const gsf_json_value* legacy = gsf_json_member(&json, &json.values[i], "legacy_no_image_token_index");
+        const gsf_json_value* legacy = gsf_find_json_member(&json, &json.values[i], "legacy_no_image_token_index");
         if (legacy) check_blip2_legacy(&image, &json, legacy, (size_t)net.query_tokens);
         gsf_destroy_image(&ctx, &image);
     }

@@ -20,15 +20,15 @@ static void see_dinov2_tap(void* encoder, const char* name, int32_t image, const
     test_free_tensor(&t);
 }
 
-static gsf_result encode_dinov2(gsf_context* ctx, const void* net, const gsf_nn_encoder_input* in, float* out) {
-    return gsf_nn_dinov2_encode(ctx, (const gsf_nn_dinov2*)net, in, out);
+static gsf_result encode_dinov2(gsf_context* ctx, const void* net, const gsf_nn_encoder_desc* in, float* out) {
+    return gsf_nn_encode_dinov2(ctx, (const gsf_nn_dinov2*)net, in, out);
 }
 
 static void check_dinov2(void) {
     gsf_context ctx;
     gsf_nn_dinov2 net;
     test_context_init(&ctx);
-    if (!CHECK_OK(&ctx, gsf_nn_make_dinov2(&ctx, test_golden("encoders/dinov2_reg"), &net))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_dinov2(&ctx, test_golden("encoders/dinov2_reg"), &net))) return;
     golden_encoder e = {.net = &net, .input = "pixel_values", .output = "last_hidden_state",
                         .patch = net.patch, .special = net.special, .width = net.width,
                         .bar = dinov2_bar, .encode = encode_dinov2, .see_tap = see_dinov2_tap};

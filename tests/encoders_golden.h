@@ -19,7 +19,7 @@ static inline void check_rows(const char* what, const float* actual, int64_t row
 }
 
 // Images as an encoder takes them; a leading dimension of 1 is passed over.
-static inline float* golden_images(const test_tensor* t, gsf_nn_encoder_input* in) { // to be freed
+static inline float* golden_images(const test_tensor* t, gsf_nn_encoder_desc* in) { // to be freed
     float* pixels = test_tensor_floats(t);
     const size_t* dim = t->dim + (t->rank - 4);
     memset(in, 0, sizeof *in);
@@ -36,7 +36,7 @@ typedef struct golden_encoder {
     const char *input, *output;
     int64_t patch, special, width; // width: channels of a token
     double bar;
-    gsf_result (*encode)(gsf_context* ctx, const void* net, const gsf_nn_encoder_input* in, float* out);
+    gsf_result (*encode)(gsf_context* ctx, const void* net, const gsf_nn_encoder_desc* in, float* out);
     void (*see_tap)(void* encoder, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
     test_tensors expected;
     int index, images, seen; // of the case at work: number, images, intermediates compared
@@ -48,7 +48,7 @@ static inline test_tensor golden_case(const golden_encoder* e, const char* name)
     return test_find_tensor(&e->expected, whole);
 }
 
-static inline void check_encoder_case(gsf_context* ctx, golden_encoder* e, gsf_nn_encoder_input in) {
+static inline void check_encoder_case(gsf_context* ctx, golden_encoder* e, gsf_nn_encoder_desc in) {
     const int64_t d = e->width, tokens = in.height / e->patch * (in.width / e->patch), all = tokens + e->special;
     const size_t count = (size_t)(in.images * all * d);
     float* out = (float*)malloc(count * sizeof(float));
@@ -77,7 +77,7 @@ static inline void check_encoder(gsf_context* ctx, golden_encoder* e, const char
     for (e->index = 0;; e->index++) {
         test_tensor input = golden_case(e, e->input);
         if (!input.v) break;
-        gsf_nn_encoder_input in;
+        gsf_nn_encoder_desc in;
         float* pixels = golden_images(&input, &in);
         check_encoder_case(ctx, e, in);
         free(pixels);

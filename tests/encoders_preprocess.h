@@ -12,25 +12,25 @@ static const char* preprocess_path(const char* name) {
 }
 
 static void check_photo(gsf_context* ctx, const gsf_json* json, const gsf_json_value* entry, const test_tensors* samples) {
-    const char* input = gsf_json_member(json, entry, "input")->string;
-    const gsf_json_value* shape = gsf_json_member(json, entry, "expected_shape_chw");
-    const gsf_json_value* full = gsf_json_member(json, entry, "expected_full");
+    const char* input = gsf_find_json_member(json, entry, "input")->string;
+    const gsf_json_value* shape = gsf_find_json_member(json, entry, "expected_shape_chw");
+    const gsf_json_value* full = gsf_find_json_member(json, entry, "expected_full");
     gsf_image photo, image, wide;
     char hex[65];
     CHECK_OK(ctx, gsf_load_image(ctx, preprocess_path(input), 0, &photo));
-    if (!CHECK_OK(ctx, gsf_nn_prepare_reference(ctx, &photo, &image))) return;
+    if (!CHECK_OK(ctx, gsf__nn_prepare_reference(ctx, &photo, &image))) return;
     CHECK(image.channels == 3 && image.dtype == GSF_U8);
-    CHECK(image.height == (int64_t)gsf_json_element(json, shape, 1)->number);
-    CHECK(image.width == (int64_t)gsf_json_element(json, shape, 2)->number);
+    CHECK(image.height == (int64_t)gsf_find_json_element(json, shape, 1)->number);
+    CHECK(image.width == (int64_t)gsf_find_json_element(json, shape, 2)->number);
     const uint8_t* pixels = (const uint8_t*)image.data;
     const size_t count = (size_t)(image.width * image.height * 3);
     double sum = 0.0;
     for (size_t i = 0; i < count; i++) sum += pixels[i];
-    CHECK(sum == gsf_json_member(json, entry, "sum")->number);
-    const gsf_json_value* row = gsf_json_member(json, entry, "first_row_rgb");
+    CHECK(sum == gsf_find_json_member(json, entry, "sum")->number);
+    const gsf_json_value* row = gsf_find_json_member(json, entry, "first_row_rgb");
     for (size_t i = 0; i < row->count; i++)
         for (size_t k = 0; k < 3; k++)
-            CHECK(pixels[3 * i + k] == gsf_json_element(json, gsf_json_element(json, row, i), k)->number);
+            CHECK(pixels[3 * i + k] == gsf_find_json_element(json, gsf_find_json_element(json, row, i), k)->number);
     test_tensor sample = test_get_tensor(samples, entry->key);
     size_t wrong = 0, at = 0;
     for (int64_t y = 0; y < image.height; y += 7)
@@ -40,7 +40,7 @@ static void check_photo(gsf_context* ctx, const gsf_json* json, const gsf_json_v
     CHECK(wrong == 0 && at == sample.count);
     test_free_tensor(&sample);
     sha256(pixels, count, hex);
-    if (!CHECK(strcmp(hex, gsf_json_member(json, entry, "sha256_of_hwc_uint8")->string) == 0))
+    if (!CHECK(strcmp(hex, gsf_find_json_member(json, entry, "sha256_of_hwc_uint8")->string) == 0))
         fprintf(stderr, "    %s has sha256 %s\n", input, hex);
     if (full->type == GSF_JSON_STRING) {
         gsf_image expected;
@@ -53,9 +53,9 @@ static void check_photo(gsf_context* ctx, const gsf_json* json, const gsf_json_v
     CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, photo.width, photo.height, photo.channels, &wide));
     CHECK_OK(ctx, gsf_convert_image(ctx, &photo, &wide));
     gsf_destroy_image(ctx, &image);
-    CHECK_OK(ctx, gsf_nn_prepare_reference(ctx, &wide, &image));
+    CHECK_OK(ctx, gsf__nn_prepare_reference(ctx, &wide, &image));
     sha256(image.data, count, hex);
-    CHECK(strcmp(hex, gsf_json_member(json, entry, "sha256_of_hwc_uint8")->string) == 0);
+    CHECK(strcmp(hex, gsf_find_json_member(json, entry, "sha256_of_hwc_uint8")->string) == 0);
     gsf_destroy_image(ctx, &wide);
     gsf_destroy_image(ctx, &image);
     gsf_destroy_image(ctx, &photo);

@@ -20,15 +20,15 @@ static void see_vggt_tap(void* encoder, const char* name, int32_t image, const f
     test_free_tensor(&t);
 }
 
-static gsf_result encode_vggt(gsf_context* ctx, const void* net, const gsf_nn_encoder_input* in, float* out) {
-    return gsf_nn_vggt_encode(ctx, (const gsf_nn_vggt*)net, in, out);
+static gsf_result encode_vggt(gsf_context* ctx, const void* net, const gsf_nn_encoder_desc* in, float* out) {
+    return gsf_nn_encode_vggt(ctx, (const gsf_nn_vggt*)net, in, out);
 }
 
 static void check_vggt(void) {
     gsf_context ctx;
     gsf_nn_vggt net;
     test_context_init(&ctx);
-    if (!CHECK_OK(&ctx, gsf_nn_make_vggt(&ctx, test_golden("encoders/vggt"), &net))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_vggt(&ctx, test_golden("encoders/vggt"), &net))) return;
     golden_encoder e = {.net = &net, .input = "images", .output = "out_last",
                         .patch = net.patch, .special = net.special, .width = 2 * (int64_t)net.width,
                         .bar = vggt_bar, .encode = encode_vggt, .see_tap = see_vggt_tap};

@@ -55,28 +55,28 @@ static inline uint64_t fuzz_number(const uint8_t* p, int bytes) { // little-endi
 }
 
 // A checkpoint with the right checksums, which no mutation would hit: what of `data` is chunks, then the rest as it is.
-static inline void fuzz_sum_chunks(gsf_context* ctx, const uint8_t* data, size_t size, gsf_text* out) {
+static inline void fuzz_sum_chunks(gsf_context* ctx, const uint8_t* data, size_t size, gsf_buffer* out) {
     size_t at = 12;
     while (at <= size && size - at >= 16) {
         const uint64_t bytes = fuzz_number(data + at + 4, 8);
         if (bytes > size - at - 16) break;
-        gsf_chunks_add(ctx, out, (const char*)data + at, data + at + 12, (size_t)bytes);
+        gsf_append_chunk(ctx, out, (const char*)data + at, data + at + 12, (size_t)bytes);
         at += 16 + (size_t)bytes;
     }
-    if (at < size) gsf_text_append(ctx, out, (const char*)data + at, size - at);
+    if (at < size) gsf_append_bytes(ctx, out, (const char*)data + at, size - at);
     FUZZ_CHECK(!out->failed);
 }
 
 // One chunk as patches change it: u8 index of the chunk, u8 kind (0 overwrite, 1 cut, 2 append, 3 another tag, 4 left out or
 // doubled), u16 at (little-endian), u8 size and so many bytes.
 static inline void fuzz_patch_chunk(gsf_context* ctx, const uint8_t* chunk, size_t bytes, unsigned index, const uint8_t* p,
-                                    size_t size, gsf_text* out) {
-    gsf_text body;
+                                    size_t size, gsf_buffer* out) {
+    gsf_buffer body;
     char tag[4];
     size_t repeat = 1;
     memset(&body, 0, sizeof body);
     memcpy(tag, chunk, 4);
-    gsf_text_append(ctx, &body, (const char*)chunk + 12, bytes);
+    gsf_append_bytes(ctx, &body, (const char*)chunk + 12, bytes);
     for (size_t at = 0, n; size - at >= 5; at += 5 + n) {
         const size_t where = (size_t)fuzz_number(p + at + 2, 2);
         const char* data = (const char*)p + at + 5;
@@ -85,17 +85,17 @@ static inline void fuzz_patch_chunk(gsf_context* ctx, const uint8_t* chunk, size
         if (p[at] != index) continue;
         if (kind == 0 && where < body.size) memcpy(body.data + where, data, n < body.size - where ? n : body.size - where);
         if (kind == 1 && where < body.size) body.size = where;
-        if (kind == 2) gsf_text_append(ctx, &body, data, n);
+        if (kind == 2) gsf_append_bytes(ctx, &body, data, n);
         if (kind == 3 && n >= 4) memcpy(tag, data, 4);
         if (kind == 4) repeat = where % 3;
     }
-    while (repeat-- > 0) gsf_chunks_add(ctx, out, tag, body.size ? body.data : "", body.size);
-    gsf_destroy_text(ctx, &body);
+    while (repeat-- > 0) gsf_append_chunk(ctx, out, tag, body.size ? body.data : "", body.size);
+    gsf_destroy_buffer(ctx, &body);
 }
 
 // A checkpoint with the patches that `p` holds.
 static inline void fuzz_patch_chunks(gsf_context* ctx, const uint8_t* file, size_t file_size, const uint8_t* p, size_t size,
-                                     gsf_text* out) {
+                                     gsf_buffer* out) {
     unsigned index = 0;
     for (size_t at = 12; at < file_size; index++) {
         const size_t bytes = (size_t)fuzz_number(file + at + 4, 8);

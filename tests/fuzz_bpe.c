@@ -31,7 +31,7 @@ static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const
     return gsf_fail(ctx, GSF_ERROR_IO, "%s", path);
 }
 
-static void check_utf8(const gsf_text* text) {
+static void check_utf8(const gsf_buffer* text) {
     const uint8_t* p = (const uint8_t*)text->data;
     for (size_t i = 0; i < text->size;) {
         const size_t more = p[i] < 0x80 ? 0 : p[i] < 0xe0 ? 1 : p[i] < 0xf0 ? 2 : 3;
@@ -43,11 +43,11 @@ static void check_utf8(const gsf_text* text) {
 
 static void check_decoded(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids, size_t count) {
     for (int skip = 0; skip < 2; skip++) {
-        gsf_text text;
+        gsf_buffer text;
         memset(&text, 0, sizeof text);
         FUZZ_CHECK(gsf_nn_decode_bpe(ctx, bpe, ids, count, skip, &text) == GSF_OK);
         check_utf8(&text);
-        gsf_destroy_text(ctx, &text);
+        gsf_destroy_buffer(ctx, &text);
     }
 }
 
@@ -85,7 +85,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     ctx.io.read_fn = read_fn;
     ctx.io.write_fn = write_fn;
     ctx.io.user = parts;
-    const gsf_result result = gsf_nn_make_bpe(&ctx, "fuzz", &bpe);
+    const gsf_result result = gsf_nn_load_bpe(&ctx, "fuzz", &bpe);
     if (result == GSF_OK) use_tokenizer(&ctx, &bpe, parts[FILES]);
     else FUZZ_CHECK((result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED) && ctx.error[0] && !bpe.tables);
     gsf_nn_destroy_bpe(&ctx, &bpe);

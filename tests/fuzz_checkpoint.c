@@ -7,7 +7,7 @@
 enum { SIDE = 8, VIEWS = 3, SPLATS = 5, STEPS = 16 };
 
 static gsf_result query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
-                        gsf_restorer_limits* limits) {
+                        gsf_restorer_info* limits) {
     (void)user, (void)ctx, (void)frames, (void)width, (void)height, (void)limits;
     return GSF_OK; // takes everything
 }
@@ -72,48 +72,48 @@ static void run(gsf_context* ctx, gsf_fixer* loop, int steps) {
     gsf_fix_stats now;
     memset(&now, 0, sizeof now);
     for (int i = 0; i < steps && now.stage != GSF_FIX_DONE; i++)
-        if (gsf_splat_fix_step(ctx, loop, &now) != GSF_OK) FUZZ_CHECK(ctx->error[0] != 0);
+        if (gsf_splat_step_fixer(ctx, loop, &now) != GSF_OK) FUZZ_CHECK(ctx->error[0] != 0);
 }
 
-static gsf_text save(gsf_context* ctx, const gsf_fixer* loop) {
-    gsf_text text;
+static gsf_buffer save(gsf_context* ctx, const gsf_fixer* loop) {
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
-    gsf_splat_fixer_save(ctx, loop, &text);
-    gsf_chunks_end(ctx, &text);
+    gsf_splat_format_fixer(ctx, loop, &text);
+    gsf_append_last_chunk(ctx, &text);
     FUZZ_CHECK(!text.failed);
     return text;
 }
 
 // The checkpoint after `steps` steps, made once.
-static const gsf_text* saved_at(gsf_context* ctx, size_t steps) {
-    static gsf_text all[STEPS];
+static const gsf_buffer* saved_at(gsf_context* ctx, size_t steps) {
+    static gsf_buffer all[STEPS];
     if (!all[steps].data) {
         gsf_fixer* loop = make_loop(ctx);
         run(ctx, loop, (int)steps);
-        gsf_text text = save(ctx, loop);
+        gsf_buffer text = save(ctx, loop);
         all[steps] = text;
         all[steps].data = (char*)malloc(text.size);
         FUZZ_CHECK(all[steps].data);
         memcpy(all[steps].data, text.data, text.size);
-        gsf_destroy_text(ctx, &text);
+        gsf_destroy_buffer(ctx, &text);
         gsf_splat_destroy_fixer(ctx, loop);
     }
     return &all[steps];
 }
 
-static gsf_text make_file(gsf_context* ctx, const uint8_t* data, size_t size) {
-    gsf_text file;
+static gsf_buffer make_file(gsf_context* ctx, const uint8_t* data, size_t size) {
+    gsf_buffer file;
     memset(&file, 0, sizeof file);
     if (data[0] >= 128) {
         fuzz_sum_chunks(ctx, data + 1, size - 1, &file);
     } else {
-        const gsf_text* base = saved_at(ctx, data[0] % STEPS);
+        const gsf_buffer* base = saved_at(ctx, data[0] % STEPS);
         fuzz_patch_chunks(ctx, (const uint8_t*)base->data, base->size, data + 1, size - 1, &file);
     }
     return file;
 }
 
-static void check_same(const gsf_text* a, const gsf_text* b) {
+static void check_same(const gsf_buffer* a, const gsf_buffer* b) {
     FUZZ_CHECK(a->size == b->size && memcmp(a->data, b->data, a->size) == 0);
 }
 
@@ -122,26 +122,26 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     if (size == 0) return 0;
     gsf_context ctx = fuzz_context(size);
     fuzz_limit += (size_t)4 << 20; // the loop's own
-    gsf_text file = make_file(&ctx, data, size);
+    gsf_buffer file = make_file(&ctx, data, size);
     gsf_fixer* loop = make_loop(&ctx);
-    gsf_text before = save(&ctx, loop);
-    const gsf_result result = gsf_splat_fixer_restore(&ctx, loop, "fuzz", file.data, file.size);
-    gsf_text after = save(&ctx, loop);
+    gsf_buffer before = save(&ctx, loop);
+    const gsf_result result = gsf_splat_parse_fixer(&ctx, loop, "fuzz", file.data, file.size);
+    gsf_buffer after = save(&ctx, loop);
     if (result != GSF_OK) {
         FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED);
         fuzz_check_error(&ctx, "fuzz:");
         check_same(&before, &after);
         FUZZ_CHECK(size > 1 || data[0] >= 128); // no patch: it is what the loop saved
     } else {
-        FUZZ_CHECK(gsf_splat_fixer_restore(&ctx, loop, "again", after.data, after.size) == GSF_OK);
-        gsf_text again = save(&ctx, loop);
+        FUZZ_CHECK(gsf_splat_parse_fixer(&ctx, loop, "again", after.data, after.size) == GSF_OK);
+        gsf_buffer again = save(&ctx, loop);
         check_same(&after, &again);
-        gsf_destroy_text(&ctx, &again);
+        gsf_destroy_buffer(&ctx, &again);
         run(&ctx, loop, STEPS);
     }
-    gsf_destroy_text(&ctx, &after);
-    gsf_destroy_text(&ctx, &before);
-    gsf_destroy_text(&ctx, &file);
+    gsf_destroy_buffer(&ctx, &after);
+    gsf_destroy_buffer(&ctx, &before);
+    gsf_destroy_buffer(&ctx, &file);
     gsf_splat_destroy_fixer(&ctx, loop);
     FUZZ_CHECK(fuzz_live == 0);
     return 0;

@@ -68,9 +68,9 @@ static size_t fill_folder(size_t kind, fuzz_file* files) {
 
 static gsf_result use_transformer(gsf_context* ctx) {
     gsf_nn_transformer net;
-    gsf_nn_transformer_input in;
+    gsf_nn_transformer_desc in;
     const double time = 500.0;
-    gsf_result result = gsf_nn_make_transformer(ctx, "fuzz", &net);
+    gsf_result result = gsf_nn_load_transformer(ctx, "fuzz", &net);
     if (result != GSF_OK) return result;
     memset(&in, 0, sizeof in);
     in.batch = in.frames = 1;
@@ -80,7 +80,7 @@ static gsf_result use_transformer(gsf_context* ctx) {
     in.timesteps = &time;
     const int64_t pixels = (int64_t)in.height * in.width;
     if (runs && pixels <= 400 && pixels * net.in_channels <= (1 << 15) && pixels * net.out_channels <= (1 << 15))
-        result = gsf_nn_transformer_forward(ctx, &net, &in, results);
+        result = gsf_nn_run_transformer(ctx, &net, &in, results);
     FUZZ_CHECK(result == GSF_OK || ctx->error[0] != 0);
     gsf_nn_destroy_transformer(ctx, &net);
     return GSF_OK;
@@ -89,11 +89,11 @@ static gsf_result use_transformer(gsf_context* ctx) {
 static gsf_result use_vae(gsf_context* ctx) {
     gsf_nn_vae vae;
     gsf_nn_vae_info info;
-    gsf_result result = gsf_nn_make_vae(ctx, "fuzz", &vae);
+    gsf_result result = gsf_nn_load_vae(ctx, "fuzz", &vae);
     if (result != GSF_OK) return result;
     FUZZ_CHECK(gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_DECODE, NULL, 2, 1, 1, &info) != GSF_OK ||
                (info.frames > 0 && info.height > 0 && info.width > 0));
-    if (runs) result = gsf_nn_vae_decode(ctx, &vae, NULL, values, 2, 1, 1, results);
+    if (runs) result = gsf_nn_decode_vae(ctx, &vae, NULL, values, 2, 1, 1, results);
     FUZZ_CHECK(result == GSF_OK || ctx->error[0] != 0);
     gsf_nn_destroy_vae(ctx, &vae);
     return GSF_OK;
@@ -127,21 +127,21 @@ static gsf_result use_schedule(gsf_context* ctx) {
 static gsf_result use_t5(gsf_context* ctx) {
     static const int32_t ids[3] = {2, 1, 0};
     gsf_nn_t5 t5;
-    gsf_nn_t5_input in;
-    gsf_result result = gsf_nn_make_t5(ctx, "fuzz", &t5);
+    gsf_nn_t5_desc in;
+    gsf_result result = gsf_nn_load_t5(ctx, "fuzz", &t5);
     if (result != GSF_OK) return result;
     memset(&in, 0, sizeof in);
     in.ids = ids;
     in.batch = 1;
     in.tokens = 3;
-    if (runs && t5.width <= (1 << 15)) result = gsf_nn_t5_encode(ctx, &t5, &in, results);
+    if (runs && t5.width <= (1 << 15)) result = gsf_nn_encode_t5(ctx, &t5, &in, results);
     FUZZ_CHECK(result == GSF_OK || ctx->error[0] != 0);
     gsf_nn_destroy_t5(ctx, &t5);
     return GSF_OK;
 }
 
-static gsf_nn_encoder_input square(int32_t patch) { // 2 x 1 patches
-    gsf_nn_encoder_input in;
+static gsf_nn_encoder_desc square(int32_t patch) { // 2 x 1 patches
+    gsf_nn_encoder_desc in;
     memset(&in, 0, sizeof in);
     in.pixels = values;
     in.images = 1;
@@ -152,11 +152,11 @@ static gsf_nn_encoder_input square(int32_t patch) { // 2 x 1 patches
 
 static gsf_result use_dinov2(gsf_context* ctx) {
     gsf_nn_dinov2 net;
-    gsf_result result = gsf_nn_make_dinov2(ctx, "fuzz", &net);
+    gsf_result result = gsf_nn_load_dinov2(ctx, "fuzz", &net);
     if (result != GSF_OK) return result;
-    const gsf_nn_encoder_input in = square(net.patch);
+    const gsf_nn_encoder_desc in = square(net.patch);
     if (runs && net.patch <= 64 && net.channels <= 3 && net.width <= (1 << 15))
-        result = gsf_nn_dinov2_encode(ctx, &net, &in, results);
+        result = gsf_nn_encode_dinov2(ctx, &net, &in, results);
     FUZZ_CHECK(result == GSF_OK || ctx->error[0] != 0);
     gsf_nn_destroy_dinov2(ctx, &net);
     return GSF_OK;
@@ -164,10 +164,10 @@ static gsf_result use_dinov2(gsf_context* ctx) {
 
 static gsf_result use_vggt(gsf_context* ctx) {
     gsf_nn_vggt net;
-    gsf_result result = gsf_nn_make_vggt(ctx, "fuzz", &net);
+    gsf_result result = gsf_nn_load_vggt(ctx, "fuzz", &net);
     if (result != GSF_OK) return result;
-    const gsf_nn_encoder_input in = square(net.patch);
-    if (runs && net.patch <= 64 && net.width <= (1 << 15)) result = gsf_nn_vggt_encode(ctx, &net, &in, results);
+    const gsf_nn_encoder_desc in = square(net.patch);
+    if (runs && net.patch <= 64 && net.width <= (1 << 15)) result = gsf_nn_encode_vggt(ctx, &net, &in, results);
     FUZZ_CHECK(result == GSF_OK || ctx->error[0] != 0);
     gsf_nn_destroy_vggt(ctx, &net);
     return GSF_OK;
@@ -178,9 +178,9 @@ static gsf_result use_captioner(gsf_context* ctx) {
     const gsf_image photo = gsf_wrap_image(pixels, GSF_U8, 2, 2, 3);
     gsf_nn_captioner net;
     char text[32];
-    gsf_result result = gsf_nn_make_captioner(ctx, "fuzz", &net);
+    gsf_result result = gsf_nn_load_captioner(ctx, "fuzz", &net);
     if (result != GSF_OK) return result;
-    if (runs && net.image_size <= 64) result = gsf_nn_caption(ctx, &net, &photo, NULL, 1, text, sizeof text);
+    if (runs && net.image_size <= 64) result = gsf_nn_caption_image(ctx, &net, &photo, NULL, 1, text, sizeof text);
     FUZZ_CHECK(result == GSF_OK || ctx->error[0] != 0);
     gsf_nn_destroy_captioner(ctx, &net);
     return GSF_OK;
@@ -191,9 +191,9 @@ static gsf_result use_tokenizer(gsf_context* ctx) {
     gsf_nn_tokenizer net;
     int32_t ids[64];
     size_t count;
-    const gsf_result result = gsf_nn_make_tokenizer(ctx, "fuzz", &net);
+    const gsf_result result = gsf_nn_load_tokenizer(ctx, "fuzz", &net);
     if (result != GSF_OK) return result;
-    FUZZ_CHECK(gsf_nn_tokenize(ctx, &net, text, sizeof text - 1, ids, 64, &count) == GSF_OK && count <= 64);
+    FUZZ_CHECK(gsf_nn_encode_text(ctx, &net, text, sizeof text - 1, ids, 64, &count) == GSF_OK && count <= 64);
     for (size_t i = 0; i < count; i++) FUZZ_CHECK(ids[i] >= 0 && ids[i] < net.id_count);
     gsf_nn_destroy_tokenizer(ctx, &net);
     return GSF_OK;

@@ -14,22 +14,23 @@ static void begin(fix_run* run, gsfix_app* app) {
     run->history.view_count = VIEWS;
     run->history.without = (gsfix_score*)gsf_alloc_zeroed(run->ctx, VIEWS, sizeof(gsfix_score));
     FUZZ_CHECK(run->history.without);
-    gsf_text_printf(run->ctx, &run->switches, "{}");
+    gsf_append_text(run->ctx, &run->switches, "{}");
 }
 
 static void end(fix_run* run) {
     gsfix_history* h = &run->history;
     void* const lists[] = {h->without, h->without_curve, h->curve, h->rounds, h->path, h->samples};
     for (size_t i = 0; i < sizeof lists / sizeof *lists; i++) gsf_free(run->ctx, lists[i]);
-    gsf_destroy_text(run->ctx, &run->switches);
+    gsf_destroy_buffer(run->ctx, &run->switches);
 }
 
 static gsf_result read_back(fix_run* run, const char* text, size_t size) {
     gsf_json json;
     gsf_result result = gsf_parse_json(run->ctx, "fuzz", text, size, &json);
     if (result != GSF_OK) return result;
-    result = compare_switches(run, "fuzz", &json, gsf_json_member(&json, &json.values[0], "switches"));
-    if (result == GSF_OK) result = compare_inputs(run, "fuzz", &json, gsf_json_member(&json, &json.values[0], "inputs"));
+    result = compare_switches(run, "fuzz", &json, gsf_find_json_member(&json, &json.values[0], "switches"));
+    if (result == GSF_OK) result = compare_inputs(run, "fuzz", &json,
+                                                  gsf_find_json_member(&json, &json.values[0], "inputs"));
     if (result == GSF_OK) result = read_history(run, "fuzz", &json);
     gsf_destroy_json(run->ctx, &json);
     return result;
@@ -54,14 +55,14 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     begin(&run, &app);
     const gsf_result result = read_back(&run, size ? (const char*)data : "", size);
     if (result == GSF_OK) {
-        gsf_text text;
+        gsf_buffer text;
         memset(&text, 0, sizeof text);
         FUZZ_CHECK(run.iteration >= 0 && run.iteration <= ITERATIONS && run.history.resumed > 0);
         write_history(&run, &text);
         begin(&again, &app);
         FUZZ_CHECK(!text.failed && read_back(&again, text.data, text.size) == GSF_OK);
         check_same(&run.history, &again.history);
-        gsf_destroy_text(&app.ctx, &text);
+        gsf_destroy_buffer(&app.ctx, &text);
         end(&again);
     } else {
         FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_INVALID_ARGUMENT);

@@ -1,4 +1,4 @@
-// Fuzz target for the image decoders: the pixels behind gsf_load_image_memory, the size behind gsf_query_image, which
+// Fuzz target for the image decoders: the pixels behind gsf_decode_image, the size behind gsf_query_image, which
 // parses headers by another path and must not contradict the pixels.
 //   clang -g -O1 -fsanitize=fuzzer,address,undefined -DGSFIXER_IMPLEMENTATION -I. tests/fuzz_image.c -o fuzz_image -lm
 //   ./fuzz_image tests/corpus/image
@@ -39,7 +39,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     int32_t file_channels = 0;
     const gsf_result query = gsf_query_image(&ctx, "fuzz", &width, &height, &file_channels);
     if (query != GSF_OK && strncmp(ctx.error, "fuzz:", 5) != 0) abort();
-    const gsf_result result = gsf_load_image_memory(&ctx, "fuzz", data, size, channels[size % 4], &image);
+    const gsf_result result = gsf_decode_image(&ctx, "fuzz", data, size, channels[size % 4], &image);
     if (result == GSF_OK) {
         unsigned sum = 0; // every pixel is readable
         for (int64_t i = 0; i < image.stride_y * image.height; i++) sum += ((const uint8_t*)image.data)[i];

@@ -2,23 +2,23 @@
 // refused ones give one line of error and leave no memory allocated.
 #include "fuzz.h"
 
-static void print_value(gsf_context* ctx, const gsf_json* json, const gsf_json_value* value, gsf_text* out) {
+static void print_value(gsf_context* ctx, const gsf_json* json, const gsf_json_value* value, gsf_buffer* out) {
     static const char* const words[] = {"null", "false", "true"};
-    if (value->type <= GSF_JSON_TRUE) gsf_text_printf(ctx, out, "%s", words[value->type]);
-    if (value->type == GSF_JSON_NUMBER) gsf_text_json_number(ctx, out, value->number);
-    if (value->type == GSF_JSON_STRING) gsf_text_json_string(ctx, out, value->string); // up to a zero byte
+    if (value->type <= GSF_JSON_TRUE) gsf_append_text(ctx, out, "%s", words[value->type]);
+    if (value->type == GSF_JSON_NUMBER) gsf_append_json_number(ctx, out, value->number);
+    if (value->type == GSF_JSON_STRING) gsf_append_json_string(ctx, out, value->string); // up to a zero byte
     if (value->type < GSF_JSON_ARRAY) return;
     const int is_object = value->type == GSF_JSON_OBJECT;
     uint32_t count = 0;
-    gsf_text_append(ctx, out, is_object ? "{" : "[", 1);
+    gsf_append_bytes(ctx, out, is_object ? "{" : "[", 1);
     for (uint32_t i = value->child; i; i = json->values[i].next, count++) {
         FUZZ_CHECK(i > (uint32_t)(value - json->values) && i < json->count); // children follow their parent
-        if (count) gsf_text_append(ctx, out, ",", 1);
-        if (is_object) gsf_text_printf(ctx, out, "\"%u\":", (unsigned)count); // keys may hold zero bytes
+        if (count) gsf_append_bytes(ctx, out, ",", 1);
+        if (is_object) gsf_append_text(ctx, out, "\"%u\":", (unsigned)count); // keys may hold zero bytes
         print_value(ctx, json, &json->values[i], out);
     }
     FUZZ_CHECK(count == value->count);
-    gsf_text_append(ctx, out, is_object ? "}" : "]", 1);
+    gsf_append_bytes(ctx, out, is_object ? "}" : "]", 1);
 }
 
 static int same_value(const gsf_json_value* a, const gsf_json_value* b) {
@@ -32,14 +32,14 @@ static void check_access(const gsf_json* json, const gsf_json_value* value) {
     size_t place = 0;
     const int is_object = value->type == GSF_JSON_OBJECT, is_array = value->type == GSF_JSON_ARRAY;
     FUZZ_CHECK(value->type != GSF_JSON_STRING || value->string[value->string_size] == 0);
-    FUZZ_CHECK(gsf_json_element(json, value, value->count) == NULL);
-    FUZZ_CHECK(is_object || gsf_json_member(json, value, "") == NULL);
+    FUZZ_CHECK(gsf_find_json_element(json, value, value->count) == NULL);
+    FUZZ_CHECK(is_object || gsf_find_json_member(json, value, "") == NULL);
     for (uint32_t i = value->child; i && place < 40; i = json->values[i].next, place++) { // both walk the whole list
         const gsf_json_value* child = &json->values[i];
-        FUZZ_CHECK(gsf_json_element(json, value, place) == (is_array ? child : NULL));
+        FUZZ_CHECK(gsf_find_json_element(json, value, place) == (is_array ? child : NULL));
         FUZZ_CHECK((child->key != NULL) == is_object);
         if (is_object && strlen(child->key) == child->key_size)
-            FUZZ_CHECK(gsf_json_member(json, value, child->key) == child);
+            FUZZ_CHECK(gsf_find_json_member(json, value, child->key) == child);
     }
 }
 
@@ -47,7 +47,7 @@ static void check_parser(gsf_context* ctx, const char* data, size_t size) {
     gsf_json json, again;
     const gsf_result result = gsf_parse_json(ctx, "fuzz", data, size, &json);
     if (result == GSF_OK) {
-        gsf_text text;
+        gsf_buffer text;
         memset(&text, 0, sizeof text);
         print_value(ctx, &json, json.values, &text);
         FUZZ_CHECK(!text.failed && gsf_parse_json(ctx, "again", text.data, text.size, &again) == GSF_OK);
@@ -57,7 +57,7 @@ static void check_parser(gsf_context* ctx, const char* data, size_t size) {
             check_access(&json, &json.values[i]);
         }
         gsf_destroy_json(ctx, &again);
-        gsf_destroy_text(ctx, &text);
+        gsf_destroy_buffer(ctx, &text);
     } else {
         fuzz_check_error(ctx, "fuzz:");
         FUZZ_CHECK(result == GSF_ERROR_FORMAT && json.values == NULL && json.count == 0 && json.strings == NULL);

@@ -11,13 +11,13 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     }
     for (size_t i = 0; i < 3 * splats.count; i++) FUZZ_CHECK(isfinite(splats.means[i]));
     for (size_t i = 0; i < splats.count; i++) FUZZ_CHECK(isfinite(splats.opacity_logits[i]));
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     FUZZ_CHECK(gsf_splat_format(&ctx, "x.ply", &splats, NULL, &text) == GSF_OK);
     // A position of a splat far from a large origin may leave float32 when it is written in world coordinates.
     FUZZ_CHECK(gsf_splat_parse(&ctx, "again.ply", text.data, text.size, &again) == GSF_OK);
     FUZZ_CHECK(again.count <= splats.count && again.sh_degree == splats.sh_degree);
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     gsf_splat_destroy(&ctx, &again);
     gsf_splat_destroy(&ctx, &splats);
     FUZZ_CHECK(fuzz_live == 0);

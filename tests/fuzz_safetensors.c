@@ -33,12 +33,12 @@ static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const
     return GSF_OK;
 }
 
-static uint64_t bytes_of(const gsf_tensor* t) { return (uint64_t)t->count * gsf_nn_dtype_size(t->dtype); }
+static uint64_t bytes_of(const gsf_nn_tensor* t) { return (uint64_t)t->count * gsf_nn_get_dtype_size(t->dtype); }
 
 // Sorted names, shapes that fit, and data inside [begin, end) where that is known. Every value is read.
 static void check_tensors(const gsf_nn_weights* w, const uint8_t* begin, const uint8_t* end) {
     for (size_t i = 0; i < w->tensor_count; i++) {
-        const gsf_tensor* t = &w->tensors[i];
+        const gsf_nn_tensor* t = &w->tensors[i];
         int64_t count = 1;
         float values[64];
         FUZZ_CHECK(i == 0 || strcmp(w->tensors[i - 1].name, t->name) < 0);
@@ -47,7 +47,7 @@ static void check_tensors(const gsf_nn_weights* w, const uint8_t* begin, const u
         FUZZ_CHECK(count == t->count && count >= 0 && t->rank <= GSF_NN_MAX_RANK);
         const uint8_t* data = (const uint8_t*)t->data;
         FUZZ_CHECK(!begin || (data >= begin && data <= end && (uint64_t)(end - data) >= bytes_of(t)));
-        for (int64_t k = 0; k < count; k += 64) gsf_nn_read_tensor(t, k, count - k < 64 ? count - k : 64, values);
+        for (int64_t k = 0; k < count; k += 64) gsf_nn_convert_tensor(t, k, count - k < 64 ? count - k : 64, values);
     }
 }
 
@@ -55,15 +55,15 @@ static void check_again(gsf_context* ctx, fuzz_files* files, const gsf_nn_weight
     gsf_nn_weights again;
     FUZZ_CHECK(gsf_nn_save_tensors(ctx, "again", w->tensors, w->tensor_count) == GSF_OK);
     const bytes written = files->written;
-    FUZZ_CHECK(gsf_nn_open_weights_memory(ctx, "again", written.data, written.size, &again) == GSF_OK);
+    FUZZ_CHECK(gsf_nn_parse_weights(ctx, "again", written.data, written.size, &again) == GSF_OK);
     FUZZ_CHECK(again.tensor_count == w->tensor_count);
     for (size_t i = 0; i < w->tensor_count; i++) {
-        const gsf_tensor *a = &w->tensors[i], *b = &again.tensors[i];
+        const gsf_nn_tensor *a = &w->tensors[i], *b = &again.tensors[i];
         FUZZ_CHECK(strcmp(a->name, b->name) == 0 && a->dtype == b->dtype && a->rank == b->rank);
         FUZZ_CHECK(memcmp(a->shape, b->shape, sizeof a->shape) == 0);
         FUZZ_CHECK(memcmp(a->data, b->data, (size_t)bytes_of(a)) == 0);
     }
-    gsf_nn_close_weights(ctx, &again);
+    gsf_nn_destroy_weights(ctx, &again);
     free((void*)(uintptr_t)written.data);
 }
 
@@ -77,12 +77,12 @@ static void check_refused(const gsf_context* ctx, const gsf_nn_weights* w, gsf_r
 static int64_t open_shards(gsf_context* ctx, fuzz_files* files, const char* path) {
     gsf_nn_weights w;
     files->reads = 0;
-    const gsf_result result = gsf_nn_open_weights(ctx, path, NULL, &w);
+    const gsf_result result = gsf_nn_load_weights(ctx, path, NULL, &w);
     const int64_t count = result == GSF_OK ? (int64_t)w.tensor_count : -(int64_t)result;
     if (result == GSF_OK) check_tensors(&w, NULL, NULL);
     else check_refused(ctx, &w, result);
     if (result == GSF_OK) check_again(ctx, files, &w);
-    gsf_nn_close_weights(ctx, &w);
+    gsf_nn_destroy_weights(ctx, &w);
     return count;
 }
 
@@ -97,7 +97,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     ctx.io.write_fn = write_fn;
     ctx.io.user = &files;
     if (!data) data = &none;
-    gsf_result result = gsf_nn_open_weights_memory(&ctx, "fuzz", data, size, &w);
+    gsf_result result = gsf_nn_parse_weights(&ctx, "fuzz", data, size, &w);
     if (result == GSF_OK) {
         check_tensors(&w, data, data + size);
         check_again(&ctx, &files, &w);
@@ -105,7 +105,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
         check_refused(&ctx, &w, result);
         FUZZ_CHECK(result != GSF_ERROR_NOT_FOUND && strncmp(ctx.error, "fuzz:", 5) == 0);
     }
-    gsf_nn_close_weights(&ctx, &w);
+    gsf_nn_destroy_weights(&ctx, &w);
 
     const uint8_t* zero = size > 2 ? (const uint8_t*)memchr(data, 0, size - 2) : NULL;
     if (zero) {

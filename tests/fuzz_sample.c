@@ -32,11 +32,11 @@ static gsf_result step(gsf__sample_run* run) {
     return gsf_nn_step_sampler(run->ctx, &run->sampler, velocity, run->latents, NULL);
 }
 
-static gsf_text make_file(gsf_context* ctx, const gsf_nn_schedule* schedule, fuzz_file* saved, const uint8_t* data,
-                          size_t size) {
+static gsf_buffer make_file(gsf_context* ctx, const gsf_nn_schedule* schedule, fuzz_file* saved, const uint8_t* data,
+                            size_t size) {
     gsf__sample_run run;
     float latents[VALUES];
-    gsf_text file;
+    gsf_buffer file;
     memset(&file, 0, sizeof file);
     if (data[1] >= 128) {
         fuzz_sum_chunks(ctx, data + 2, size - 2, &file);
@@ -67,7 +67,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     float latents[VALUES];
     fuzz_hook_files(&ctx, files);
     FUZZ_CHECK(gsf_nn_make_schedule(&ctx, NULL, &schedule) == GSF_OK);
-    gsf_text file = make_file(&ctx, &schedule, &files[0], data, size);
+    gsf_buffer file = make_file(&ctx, &schedule, &files[0], data, size);
     files[0].data = file.data;
     files[0].size = file.size;
     begin(&ctx, &schedule, data[0] % 3, latents, &run);
@@ -81,7 +81,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     FUZZ_CHECK(result == GSF_OK ? all_finite(latents, VALUES) : result == GSF_ERROR_NUMERIC);
     gsf_nn_destroy_sampler(&ctx, &run.sampler);
     gsf_nn_destroy_schedule(&ctx, &schedule);
-    gsf_destroy_text(&ctx, &file);
+    gsf_destroy_buffer(&ctx, &file);
     FUZZ_CHECK(fuzz_live == 0);
     return 0;
 }

@@ -2,19 +2,20 @@
 // spiece.model, else a text for the model of made_spiece.h with the flags in the low six bits.
 #include "fuzz.h"
 
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 #include "made_spiece.h"
 
 // Ids in range, one end, the same with any room.
 static void check_text(gsf_context* ctx, const gsf_nn_tokenizer* t, const char* text, size_t size) {
     size_t count = 0, again = 0;
-    FUZZ_CHECK(gsf_nn_tokenize(ctx, t, text, size, NULL, 0, &count) == GSF_OK && count > 0);
+    FUZZ_CHECK(gsf_nn_encode_text(ctx, t, text, size, NULL, 0, &count) == GSF_OK && count > 0);
     int32_t* ids = (int32_t*)malloc((count + 1) * sizeof *ids);
-    FUZZ_CHECK(ids && gsf_nn_tokenize(ctx, t, text, size, ids, count + 1, &again) == GSF_OK && again == count);
+    FUZZ_CHECK(ids && gsf_nn_encode_text(ctx, t, text, size, ids, count + 1, &again) == GSF_OK && again == count);
     for (size_t i = 0; i < count; i++) FUZZ_CHECK(ids[i] >= 0 && ids[i] < t->id_count);
     FUZZ_CHECK(ids[count - 1] == t->end_id && ids[count] == t->pad_id);
     int32_t few[4];
-    FUZZ_CHECK(gsf_nn_tokenize(ctx, t, text, size, few, 4, NULL) == GSF_OK);
+    FUZZ_CHECK(gsf_nn_encode_text(ctx, t, text, size, few, 4, NULL) == GSF_OK);
     for (size_t i = 0; i < 3 && i < count; i++) FUZZ_CHECK(few[i] == ids[i]);
     free(ids);
 }
@@ -27,7 +28,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     if (size == 0) return 0;
     const char* rest = (const char*)data + 1;
     if (data[0] == 255) {
-        if (gsf_nn_make_tokenizer_memory(&ctx, "fuzz", rest, size - 1, NULL, 0, &t) == GSF_OK) {
+        if (gsf__nn_parse_tokenizer(&ctx, "fuzz", rest, size - 1, NULL, 0, &t) == GSF_OK) {
             check_text(&ctx, &t, fixed, sizeof fixed - 1);
             check_text(&ctx, &t, rest, size - 1 < 64 ? size - 1 : 64);
         } else {
@@ -36,7 +37,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     } else {
         made_bytes m;
         made_spiece(data[0] & 63, &m);
-        FUZZ_CHECK(gsf_nn_make_tokenizer_memory(&ctx, "made", m.data, m.size, NULL, 0, &t) == GSF_OK);
+        FUZZ_CHECK(gsf__nn_parse_tokenizer(&ctx, "made", m.data, m.size, NULL, 0, &t) == GSF_OK);
         check_text(&ctx, &t, rest, size - 1 < 1024 ? size - 1 : 1024);
     }
     gsf_nn_destroy_tokenizer(&ctx, &t);

@@ -11,8 +11,8 @@ static int packs;
 // What was accepted is finite and, unless a coordinate is out of SPZ's range, survives being written and read again.
 static void use(gsf_context* ctx, gsf_splats* splats) {
     gsf_splats again;
-    gsf_text text;
-    const size_t sh = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree);
+    gsf_buffer text;
+    const size_t sh = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree);
     memset(&text, 0, sizeof text);
     for (size_t i = 0; i < 3 * splats->count; i++)
         FUZZ_CHECK(isfinite(splats->means[i]) && isfinite(splats->log_scales[i]));
@@ -30,7 +30,7 @@ static void use(gsf_context* ctx, gsf_splats* splats) {
         FUZZ_CHECK(memcmp(again.opacity_logits, splats->opacity_logits, splats->count * sizeof(float)) == 0);
         gsf_splat_destroy(ctx, &again);
     }
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     gsf_splat_destroy(ctx, splats);
 }
 
@@ -44,7 +44,7 @@ static void parse(gsf_context* ctx, const void* data, size_t size) {
 
 // What is packed unpacks to the same.
 static void check_gzip(gsf_context* ctx, const uint8_t* data, size_t size) {
-    gsf_text packed;
+    gsf_buffer packed;
     unsigned char* back;
     size_t back_size;
     memset(&packed, 0, sizeof packed);
@@ -54,27 +54,27 @@ static void check_gzip(gsf_context* ctx, const uint8_t* data, size_t size) {
     FUZZ_CHECK(gsf__gzip_read(ctx, "packed", bytes, packed.size, &back, &back_size) == GSF_OK);
     FUZZ_CHECK(back_size == size && memcmp(back, data, size) == 0);
     gsf_free(ctx, back);
-    gsf_destroy_text(ctx, &packed);
+    gsf_destroy_buffer(ctx, &packed);
 }
 
 // A gzip file of the bytes as they are: blocks of DEFLATE that are not compressed.
-static gsf_text store(gsf_context* ctx, const uint8_t* data, size_t size) {
+static gsf_buffer store(gsf_context* ctx, const uint8_t* data, size_t size) {
     static const char head[10] = "\x1f\x8b\x08\0\0\0\0\0\0";
-    gsf_text file;
+    gsf_buffer file;
     char tail[8];
     memset(&file, 0, sizeof file);
-    gsf_text_append(ctx, &file, head, sizeof head);
+    gsf_append_bytes(ctx, &file, head, sizeof head);
     for (size_t at = 0; at < size;) {
         const size_t bytes = size - at < 65535 ? size - at : 65535;
         const char block[5] = {at + bytes == size, (char)(bytes & 255), (char)(bytes >> 8), (char)(~bytes & 255),
                                (char)(~bytes >> 8 & 255)};
-        gsf_text_append(ctx, &file, block, sizeof block);
-        gsf_text_append(ctx, &file, (const char*)data + at, bytes);
+        gsf_append_bytes(ctx, &file, block, sizeof block);
+        gsf_append_bytes(ctx, &file, (const char*)data + at, bytes);
         at += bytes;
     }
     gsf__store_le(tail, gsf__crc32(0, data, size), 4);
     gsf__store_le(tail + 4, size & 0xffffffffu, 4);
-    gsf_text_append(ctx, &file, tail, sizeof tail);
+    gsf_append_bytes(ctx, &file, tail, sizeof tail);
     FUZZ_CHECK(!file.failed);
     return file;
 }
@@ -89,9 +89,9 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
 
     if (size > 0 && packs) check_gzip(&ctx, data, size);
     if (size > 0) {
-        gsf_text file = store(&ctx, data, size);
+        gsf_buffer file = store(&ctx, data, size);
         parse(&ctx, file.data, file.size);
-        gsf_destroy_text(&ctx, &file);
+        gsf_destroy_buffer(&ctx, &file);
     }
     if (size > 2) {
         const size_t room = 1 + data[0] + 256u * (data[1] & 15u);

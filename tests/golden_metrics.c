@@ -52,7 +52,7 @@ static void close_pair(gsf_context* ctx, pair* p) {
 }
 
 static double number_or_inf(const gsf_json* json, const gsf_json_value* object, const char* key) {
-    const gsf_json_value* v = gsf_json_member(json, object, key);
+    const gsf_json_value* v = gsf_find_json_member(json, object, key);
     if (!CHECK(v != NULL)) return NAN;
     if (v->type == GSF_JSON_STRING && strcmp(v->string, "inf") == 0) return INFINITY;
     CHECK(v->type == GSF_JSON_NUMBER);
@@ -92,7 +92,7 @@ static double plain_ssim_skimage(const gsf_image* a, const gsf_image* b, const g
 }
 
 // The 3DGS SSIM with its full 11x11 window, zeros outside. The window is the product of two float32 rows, rounded to
-// float32 once more; gsf_ssim has a product of two rows of the same sum.
+// float32 once more; gsf_measure_ssim has a product of two rows of the same sum.
 static double plain_ssim_3dgs(const gsf_image* a, const gsf_image* b, const gsf_image* mask) {
     // float32 of exp(-x^2/4.5) / sum, the sum taken in torch's order
     static const float kernel[11] = {0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f,
@@ -150,29 +150,29 @@ static void check_pair(gsf_context* ctx, const gsf_json* json, const gsf_json_va
     const double psnr = number_or_inf(json, e, "psnr"), tg = number_or_inf(json, e, "ssim_3dgs");
     // The references read the photo as float32, so on the f32 images only rounding is left; the u8 images stand for the
     // exact v/255, which moves a PSNR by up to 1e-6 dB.
-    CHECK_OK(ctx, gsf_psnr(ctx, &p->fa, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &psnr, 1, 1e-9);
-    CHECK_OK(ctx, gsf_psnr(ctx, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &psnr, 1, 2e-6);
     CHECK_NEAR(got, number_or_inf(json, e, "psnr_torchmetrics"), 1e-4);
-    CHECK_OK(ctx, gsf_psnr(ctx, &p->a, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->a, &p->fb, NULL, &got));
     if (isinf(psnr)) CHECK(got > 140.0); // u8 against its own float32 rounding
     else test_compare(name, &got, &psnr, 1, 2e-6);
 
     const double plain = plain_ssim_3dgs(&p->fa, &p->fb, NULL);
     test_compare(name, &plain, &tg, 1, 1e-9);
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_3DGS, &p->fa, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &tg, 1, 1e-8);
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_3DGS, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &tg, 1, 2e-7);
 
     const double tm = number_or_inf(json, e, "ssim_torchmetrics");
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_TORCHMETRICS, &p->fa, &p->fb, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &tm, 1, 1e-11);
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_TORCHMETRICS, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, &p->a, &p->b, NULL, &got));
     test_compare(name, &got, &tm, 1, 1e-7);
 
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_SKIMAGE, &p->a, &p->b, NULL, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, &p->a, &p->b, NULL, &got));
     const double sk = plain_ssim_skimage(&p->a, &p->b, NULL);
     test_compare(name, &got, &sk, 1, 1e-12);
     for (size_t i = 0; i < sizeof skimage / sizeof *skimage; i++)
@@ -187,12 +187,12 @@ static void check_masks(gsf_context* ctx, const pair* p) {
     double got = NAN, all = NAN;
     for (int kind = 0; kind < 3; kind++) {
         memset(bytes, 1, n);
-        CHECK_OK(ctx, gsf_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got));
-        CHECK_OK(ctx, gsf_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, NULL, &all));
+        CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got));
+        CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, NULL, &all));
         CHECK(got == all);
         memset(bytes, 0, n);
         bytes[0] = kind != GSF_SSIM_SKIMAGE; // the corner has no skimage window
-        CHECK_RESULT(ctx, gsf_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got),
+        CHECK_RESULT(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got),
                      kind == GSF_SSIM_SKIMAGE ? GSF_ERROR_DEGENERATE : GSF_OK);
     }
     double sum = 0.0, counted = 0.0;
@@ -205,16 +205,16 @@ static void check_masks(gsf_context* ctx, const pair* p) {
             counted += 1.0;
         }
     }
-    CHECK_OK(ctx, gsf_psnr(ctx, &p->a, &p->b, &mask, &got));
+    CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, &mask, &got));
     CHECK_NEAR(got, 20.0 * log10(1.0 / sqrt(sum / counted)), 1e-10);
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_SKIMAGE, &p->a, &p->b, &mask, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, &p->a, &p->b, &mask, &got));
     CHECK_NEAR(got, plain_ssim_skimage(&p->a, &p->b, &mask), 1e-12);
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_3DGS, &p->a, &p->b, &mask, &got));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &p->a, &p->b, &mask, &got));
     CHECK_NEAR(got, plain_ssim_3dgs(&p->a, &p->b, &mask), 1e-7);
     memset(bytes, 0, n);
-    CHECK_RESULT(ctx, gsf_psnr(ctx, &p->a, &p->b, &mask, &got), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, &mask, &got), GSF_ERROR_DEGENERATE);
     mask.dtype = GSF_F32;
-    CHECK_RESULT(ctx, gsf_psnr(ctx, &p->a, &p->b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &p->a, &p->b, &mask, &got), GSF_ERROR_INVALID_ARGUMENT);
     free(bytes);
 }
 
@@ -238,30 +238,30 @@ static void check_determinism(gsf_context* ctx) {
     CHECK_OK(&scalar, gsf_init_context(&scalar));
     double one = 0, three = 1, plain = 2;
     for (int kind = 0; kind < 3; kind++) {
-        CHECK_OK(ctx, gsf_ssim(ctx, (gsf_ssim_kind)kind, &x, &y, NULL, &one));
-        CHECK_OK(&other, gsf_ssim(&other, (gsf_ssim_kind)kind, &x, &y, NULL, &three));
-        CHECK_OK(&scalar, gsf_ssim(&scalar, (gsf_ssim_kind)kind, &x, &y, NULL, &plain));
+        CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &x, &y, NULL, &one));
+        CHECK_OK(&other, gsf_measure_ssim(&other, (gsf_ssim_kind)kind, &x, &y, NULL, &three));
+        CHECK_OK(&scalar, gsf_measure_ssim(&scalar, (gsf_ssim_kind)kind, &x, &y, NULL, &plain));
         CHECK(one == three);
         CHECK(one == plain);
     }
-    CHECK_OK(ctx, gsf_psnr(ctx, &x, &y, NULL, &one));
-    CHECK_OK(&other, gsf_psnr(&other, &x, &y, NULL, &three));
+    CHECK_OK(ctx, gsf_measure_psnr(ctx, &x, &y, NULL, &one));
+    CHECK_OK(&other, gsf_measure_psnr(&other, &x, &y, NULL, &three));
     CHECK(one == three);
     a[777] = NAN;
-    CHECK_RESULT(ctx, gsf_psnr(ctx, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
-    CHECK_RESULT(ctx, gsf_ssim(ctx, GSF_SSIM_3DGS, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
     a[777] = INFINITY;
-    CHECK_RESULT(ctx, gsf_psnr(ctx, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &x, &y, NULL, &one), GSF_ERROR_NUMERIC);
     gsf_image narrow = x;
     narrow.width--;
-    CHECK_RESULT(ctx, gsf_psnr(ctx, &narrow, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_ssim(ctx, (gsf_ssim_kind)9, &y, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_measure_psnr(ctx, &narrow, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)9, &y, &y, NULL, &one), GSF_ERROR_INVALID_ARGUMENT);
     gsf_image tiny = y;
     tiny.width = 5;
-    CHECK_RESULT(ctx, gsf_ssim(ctx, GSF_SSIM_TORCHMETRICS, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(ctx, gsf_ssim(ctx, GSF_SSIM_SKIMAGE, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, GSF_SSIM_TORCHMETRICS, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_measure_ssim(ctx, GSF_SSIM_SKIMAGE, &tiny, &tiny, NULL, &one), GSF_ERROR_DEGENERATE);
     tiny.width = tiny.height = 1;
-    CHECK_OK(ctx, gsf_ssim(ctx, GSF_SSIM_3DGS, &tiny, &tiny, NULL, &one));
+    CHECK_OK(ctx, gsf_measure_ssim(ctx, GSF_SSIM_3DGS, &tiny, &tiny, NULL, &one));
     CHECK(one == 1.0);
 }
 

@@ -246,7 +246,7 @@ static void random_splat(gsf_splats* s, size_t i, kind what, double pixel, uint6
     if (what == QUATERNIONS && i % 9 == 4) memset(s->quats + 4 * i, 0, 4 * sizeof(float));
     s->opacity_logits[i] = (float)test_random_in(state, -3, 4);
     if (what == OPACITIES && i % 3) s->opacity_logits[i] = i % 3 == 1 ? 20.0f : -20.0f;
-    const size_t K = (size_t)gsf_splat_sh_count(s->sh_degree);
+    const size_t K = (size_t)gsf_splat_count_sh(s->sh_degree);
     for (size_t k = 0; k < 3 * K; k++)
         s->sh[3 * K * i + k] = (float)test_random_in(state, k < 3 ? -1.5 : -0.3, k < 3 ? 1.5 : 0.3);
 }
@@ -299,7 +299,7 @@ static random_scene random_scene_make(gsf_context* ctx, uint64_t seed) {
             one.log_scales = r.splats.log_scales + 3 * i;
             one.quats = r.splats.quats + 4 * i;
             one.opacity_logits = r.splats.opacity_logits + i;
-            one.sh = r.splats.sh + 3 * (size_t)gsf_splat_sh_count(degree) * i;
+            one.sh = r.splats.sh + 3 * (size_t)gsf_splat_count_sh(degree) * i;
             ref_splats wide = ref_splats_from(&one);
             ref_options visible = options;
             visible.hidden = NULL;
@@ -375,7 +375,7 @@ static void test_steady_memory(machine* m, const random_scene* scene, const orac
 
 // A splat with a NaN or infinity is as good as hidden, and gets no gradient.
 static void test_not_finite(machine* m, const random_scene* scene, const oracle* o) {
-    const size_t n = scene->splats.count, K = (size_t)gsf_splat_sh_count(scene->splats.sh_degree);
+    const size_t n = scene->splats.count, K = (size_t)gsf_splat_count_sh(scene->splats.sh_degree);
     gsf_splats bad;
     CHECK_OK(&m->ctx, gsf_splat_make(&m->ctx, n, scene->splats.sh_degree, &bad));
     memcpy(bad.origin, scene->splats.origin, sizeof bad.origin);

@@ -171,7 +171,7 @@ static void check_training_views(void) {
     compare_values("train.center", center, 3, tolerance);
     radius *= 1.1;
     compare_values("train.cameras_extent", &radius, 1, tolerance);
-    CHECK_OK(&ctx, gsf_traj_focus_point(&ctx, c2w, n, focus));
+    CHECK_OK(&ctx, gsf_traj_find_focus(&ctx, c2w, n, focus));
     compare_values("focus_point", focus, 3, tolerance);
     CHECK_OK(&ctx, gsf__traj_average_pose(&ctx, c2w, n, 1, pose));
     compare_poses("average_pose", pose, NULL, tolerance);
@@ -274,7 +274,7 @@ static void check_windows(int round, const double* c2w, size_t n, const gsf_traj
     gsf_camera* cameras = (gsf_camera*)take(n * sizeof(gsf_camera));
     for (size_t i = 0; i < n; i++) {
         gsf_camera camera = {{0}, 500.0, 500.0, 320.0, 240.0, 640, 480};
-        gsf_camera_set_c2w(&camera, c2w + 16 * i);
+        gsf_set_camera_c2w(&camera, c2w + 16 * i);
         cameras[i] = camera;
     }
     double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
@@ -285,7 +285,7 @@ static void check_windows(int round, const double* c2w, size_t n, const gsf_traj
     desc.ellipse_poses = (int32_t)loop->dim[0];
     desc.transform = identity; // train.c2w is normalised
     desc.ellipse = ellipse;
-    gsf_traj_path_layout layout;
+    gsf_traj_path_info layout;
     CHECK_OK(&ctx, gsf_traj_query_path(&ctx, n, &desc, &layout));
     if (CHECK(layout.frame_count == count * length && (size_t)layout.window_count == count)) {
         gsf_camera* path = (gsf_camera*)take(layout.frame_count * sizeof(gsf_camera));
@@ -294,7 +294,7 @@ static void check_windows(int round, const double* c2w, size_t n, const gsf_traj
         void* scratch = take(layout.scratch_bytes);
         CHECK_OK(&ctx, gsf_traj_sample_path(&ctx, cameras, n, &desc, scratch, path, reference));
         for (size_t f = 0; f < layout.frame_count; f++) {
-            gsf_camera_c2w(&path[f], actual + 16 * f);
+            gsf_get_camera_c2w(&path[f], actual + 16 * f);
             const int at_end = f % length == 0 || f % length == length - 1;
             CHECK(reference[f] == (at_end ? nearest->v[2 * (f / length) + (f % length != 0)] : -1.0));
         }
@@ -381,7 +381,7 @@ static void check_cameras(void) {
 static gsf_json tables;
 
 static const gsf_json_value* member(const gsf_json_value* object, const char* key) {
-    const gsf_json_value* value = gsf_json_member(&tables, object, key);
+    const gsf_json_value* value = gsf_find_json_member(&tables, object, key);
     if (!value) { fprintf(stderr, "tables.json: no %s\n", key); exit(2); }
     return value;
 }
@@ -403,7 +403,8 @@ static void check_split_table(const gsf_json_value* row) {
     for (const gsf_json_value* v = first_of(expected); v && at < train_count; v = next_of(v))
         CHECK((double)train[at++] == v->number);
     const gsf_json_value* ends = member(row, "test_first_last");
-    const gsf_json_value *head = gsf_json_element(&tables, ends, 0), *tail = gsf_json_element(&tables, ends, 1);
+    const gsf_json_value *head = gsf_find_json_element(&tables, ends, 0), *tail = gsf_find_json_element(&tables, ends,
+                                                                                                        1);
     if (CHECK(test_count && head && tail)) {
         CHECK((double)test[0] == head->number);
         CHECK((double)test[test_count - 1] == tail->number);
@@ -439,8 +440,8 @@ static void check_tables(void) {
 
     const gsf_json_value* weight = member(root, "reg_weight");
     for (const gsf_json_value* v = first_of(member(weight, "values")); v; v = next_of(v))
-        CHECK_NEAR(gsf_traj_generative_weight(strtol(v->key, NULL, 10), (int64_t)number(weight, "start"),
-                                              (int64_t)number(weight, "until"), number(weight, "lambda_reg"), 1),
+        CHECK_NEAR(gsf_traj_query_generative_weight(strtol(v->key, NULL, 10), (int64_t)number(weight, "start"),
+                                                    (int64_t)number(weight, "until"), number(weight, "lambda_reg"), 1),
                    v->number, tolerance);
     for (const gsf_json_value* v = first_of(member(root, "sample_steps")); v; v = next_of(v)) {
         long start, every, until; // in the key: "script (7000,10000,30000)"; the list has iteration 0 in front
@@ -451,7 +452,7 @@ static void check_tables(void) {
         const gsf_json_value* expected = first_of(v);
         CHECK(expected->number == 0.0);
         for (int32_t i = 0; i < count && (expected = next_of(expected)) != NULL; i++)
-            CHECK(gsf_traj_repair_round((int32_t)start, (int32_t)last, (int32_t)count, i) == expected->number);
+            CHECK(gsf_traj_query_repair_round((int32_t)start, (int32_t)last, (int32_t)count, i) == expected->number);
     }
     gsf_destroy_json(&ctx, &tables);
     free(text);

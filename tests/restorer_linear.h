@@ -1,8 +1,8 @@
 // restorer_linear.h - products of matrices against restorer/numerics.
 // Errors are judged against the sums of the products' sizes, times 1e-6: gemm_cancel's README.
 
-static gsf_tensor linear_weight(const test_tensor* t, uint16_t** bits, float** floats) { // as the file has it
-    gsf_tensor w;
+static gsf_nn_tensor linear_weight(const test_tensor* t, uint16_t** bits, float** floats) { // as the file has it
+    gsf_nn_tensor w;
     memset(&w, 0, sizeof w);
     w.name = t->name;
     w.rank = 2;
@@ -28,17 +28,17 @@ static void check_linear_case(gsf_context* ctx, const test_tensors* file, const 
     const size_t rows = a.dim[0], in = a.dim[1], out = b.dim[0];
     uint16_t* bits;
     float *floats, *once = test_tensor_floats(&a);
-    const gsf_tensor w = linear_weight(&b, &bits, &floats);
+    const gsf_nn_tensor w = linear_weight(&b, &bits, &floats);
     float* x = (float*)malloc(copies * a.count * sizeof(float)); // the same rows again: other ways through the kernels
     float* y = (float*)malloc(copies * rows * out * sizeof(float));
     for (size_t i = 0; i < copies; i++) memcpy(x + i * a.count, once, a.count * sizeof(float));
-    gsf_nn_linear_desc d;
+    gsf__nn_linear_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.rows = (int64_t)(copies * rows);
     d.weight = &w;
     d.y = y;
-    CHECK_OK(ctx, gsf_nn_linear(ctx, NULL, &d));
+    CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
     for (size_t i = 0; i < copies * rows; i++)
         for (size_t n = 0; n < out; n++) {
             double size = 0.0;

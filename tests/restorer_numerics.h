@@ -87,7 +87,7 @@ static void check_numerics_attention(const test_tensors* file) {
         q = numerics_to_columns(q, heads, queries, dim);
         k = numerics_to_columns(k, heads, keys, dim);
         v = numerics_to_columns(v, heads, keys, dim);
-        gsf_nn_attention_desc d;
+        gsf__nn_attention_desc d;
         memset(&d, 0, sizeof d);
         d.queries = queries;
         d.keys = keys;
@@ -98,7 +98,7 @@ static void check_numerics_attention(const test_tensors* file) {
         d.v = v;
         d.mask = allowed;
         d.out = q;
-        CHECK_OK(&numerics_ctx, gsf_nn_attention(&numerics_ctx, NULL, &d));
+        CHECK_OK(&numerics_ctx, gsf__nn_run_attention(&numerics_ctx, NULL, &d));
         float* out = (float*)malloc(expected.count * sizeof(float));
         for (int64_t r = 0; r < queries; r++)
             for (int64_t h = 0; h < heads; h++)
@@ -134,10 +134,11 @@ static void check_numerics_rows(const test_tensors* file, const char* group, int
         const int plain = shape.dim[1] != wide.count; // no weight of this width
         if (centre) {
             test_tensor eps = numerics_get(file, group, name, "eps");
-            gsf_nn_layer_norm(&numerics_ctx, x, rows, dim, plain ? NULL : weight, plain ? NULL : bias, (float)eps.v[0], x);
+            gsf__nn_layer_norm(&numerics_ctx, x, rows, dim, plain ? NULL : weight, plain ? NULL : bias, (float)eps.v[0],
+                               x);
             test_free_tensor(&eps);
         } else {
-            gsf_nn_rms_norm(&numerics_ctx, x, rows, dim, plain ? NULL : weight, 1e-6f, x);
+            gsf__nn_rms_norm(&numerics_ctx, x, rows, dim, plain ? NULL : weight, 1e-6f, x);
         }
         numerics_compare(group, name, x, &expected);
         free(x);
@@ -157,8 +158,8 @@ static void check_numerics_groups(const test_tensors* file) {
         float* bias = numerics_floats(file, "gn", name, "bias", NULL);
         const size_t per = shape.count / shape.dim[0];
         for (size_t b = 0; b < shape.dim[0]; b++)
-            gsf_nn_group_norm(&numerics_ctx, x + b * per, (int64_t)shape.dim[1], (int64_t)(per / shape.dim[1]),
-                              (int64_t)groups.v[0], weight, bias, 1e-6f, x + b * per);
+            gsf__nn_group_norm(&numerics_ctx, x + b * per, (int64_t)shape.dim[1], (int64_t)(per / shape.dim[1]),
+                               (int64_t)groups.v[0], weight, bias, 1e-6f, x + b * per);
         numerics_compare("gn", name, x, &expected);
         free(x); free(weight); free(bias);
         test_free_tensor(&groups);
@@ -168,14 +169,14 @@ static void check_numerics_groups(const test_tensors* file) {
 
 // ---- activations and half floats -----------------------------------------------
 
-static void check_numerics_activation(const test_tensors* file, gsf_nn_activation kind, const char* name, double bar) {
+static void check_numerics_activation(const test_tensors* file, gsf__nn_activation kind, const char* name, double bar) {
     char what[128];
     test_tensor shape;
     float* x = golden_floats(file, "act.x", &shape);
     float* y = (float*)malloc(shape.count * sizeof(float));
     snprintf(what, sizeof what, "act.%s_f64", name);
     test_tensor expected = test_get_tensor(file, what);
-    gsf_nn_activate(&numerics_ctx, kind, x, (int64_t)shape.count, y);
+    gsf__nn_activate(&numerics_ctx, kind, x, (int64_t)shape.count, y);
     CHECK(expected.count == shape.count);
     for (size_t i = 0; i < shape.count; i++) {
         const double e = expected.v[i];
@@ -220,8 +221,8 @@ static void check_numerics(void) {
     check_numerics_rows(&file, "ln", 1);
     check_numerics_rows(&file, "rms", 0);
     check_numerics_groups(&file);
-    check_numerics_activation(&file, GSF_NN_GELU_TANH, "gelu_tanh", 2 * 3.791e-07);
-    check_numerics_activation(&file, GSF_NN_SILU, "silu", 2 * 9.483e-07);
+    check_numerics_activation(&file, GSF__NN_GELU_TANH, "gelu_tanh", 2 * 3.791e-07);
+    check_numerics_activation(&file, GSF__NN_SILU, "silu", 2 * 9.483e-07);
     check_numerics_halves(&file);
     test_close_tensors(&file);
 }

@@ -116,7 +116,7 @@ static void check_control(const pipeline_case* c) {
     double* wanted = golden_doubles(&c->expected, "control_mode", &count);
     float* mean = (float*)malloc(count * sizeof(float));
     CHECK(count == (size_t)(frames * plane * c->vae.latent_channels));
-    CHECK_OK((gsf_context*)&c->ctx, gsf_nn_vae_encode((gsf_context*)(uintptr_t)&c->ctx, &c->vae, NULL, c->control,
+    CHECK_OK((gsf_context*)&c->ctx, gsf_nn_encode_vae((gsf_context*)(uintptr_t)&c->ctx, &c->vae, NULL, c->control,
                                                       c->desc.frames, c->desc.height, c->desc.width, mean, NULL));
     check_rel_l2("control_mode", mean, wanted, count, pipeline_bar);
     free(wanted);
@@ -127,8 +127,8 @@ static void check_pipeline(void) {
     pipeline_case c;
     memset(&c, 0, sizeof c);
     test_context_init(&c.ctx);
-    if (!CHECK_OK(&c.ctx, gsf_nn_make_transformer(&c.ctx, test_golden("restorer/model/transformer"), &c.net)) ||
-        !CHECK_OK(&c.ctx, gsf_nn_make_vae(&c.ctx, test_golden("restorer/model/vae"), &c.vae)) ||
+    if (!CHECK_OK(&c.ctx, gsf_nn_load_transformer(&c.ctx, test_golden("restorer/model/transformer"), &c.net)) ||
+        !CHECK_OK(&c.ctx, gsf_nn_load_vae(&c.ctx, test_golden("restorer/model/vae"), &c.vae)) ||
         !CHECK_OK(&c.ctx, gsf_nn_load_schedule(&c.ctx, test_golden("restorer/model/scheduler/scheduler_config.json"),
                                                &c.schedule)))
         return;

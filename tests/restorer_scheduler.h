@@ -111,9 +111,9 @@ static void scheduler_check_noise(gsf_context* ctx, const test_tensors* file, co
         const int32_t time = (int32_t)t.v[i];
         const scheduler_roots ours = scheduler_roots_of(schedule->alpha_bar[time]);
         const scheduler_roots theirs = scheduler_roots_of(table.v[time]);
-        gsf_nn_add_noise(ctx, schedule, time, x + i * row, e + i * row, row, out);
-        gsf_nn_make_velocity(ctx, schedule, time, x + i * row, e + i * row, row, v);
-        gsf_nn_predict_x0(ctx, schedule, time, out, v, row, back);
+        gsf__nn_add_noise(ctx, schedule, time, x + i * row, e + i * row, row, out);
+        gsf__nn_make_velocity(ctx, schedule, time, x + i * row, e + i * row, row, v);
+        gsf__nn_predict_x0(ctx, schedule, time, out, v, row, back);
         for (size_t k = 0, at = i * row; k < row; k++, at++) {
             scheduler_check_mix(out[k], noisy.v[at], &ours, &theirs, x0.v[at], eps.v[at]);
             scheduler_check_mix(v[k], velocity.v[at], &ours, &theirs, eps.v[at], x0.v[at]);
@@ -150,14 +150,14 @@ static void check_scheduler(void) {
     scheduler_check_exact(&schedule);
     scheduler_check_noise(&ctx, &file, &schedule);
     int lists = 0, trajectories = 0;
-    CHECK_OK(&ctx, gsf_nn_open_weights(&ctx, path, NULL, &names));
+    CHECK_OK(&ctx, gsf_nn_load_weights(&ctx, path, NULL, &names));
     for (size_t i = 0; i < names.tensor_count; i++) {
         const char* name = names.tensors[i].name;
         int steps, end = 0;
         if (sscanf(name, "timesteps%d%n", &steps, &end) == 1 && name[end] == 0) {
             test_tensor t = test_get_tensor(&file, name);
             int32_t* times = (int32_t*)malloc((size_t)steps * sizeof *times), count;
-            if (CHECK_OK(&ctx, gsf_nn_make_timesteps(&ctx, &schedule, steps, 1.0, times, &count)) &&
+            if (CHECK_OK(&ctx, gsf__nn_make_timesteps(&ctx, &schedule, steps, 1.0, times, &count)) &&
                 CHECK((size_t)count == t.count))
                 for (size_t k = 0; k < t.count; k++) CHECK((double)times[k] == t.v[k]);
             free(times);
@@ -172,7 +172,7 @@ static void check_scheduler(void) {
         }
     }
     CHECK(lists > 0 && trajectories > 0);
-    gsf_nn_close_weights(&ctx, &names);
+    gsf_nn_destroy_weights(&ctx, &names);
     test_close_tensors(&file);
     gsf_nn_destroy_schedule(&ctx, &schedule);
     gsf_nn_destroy_schedule(&ctx, &shifted);

@@ -38,7 +38,7 @@ static void see_t5(void* user, const char* name, int32_t row, const float* data,
     }
 }
 
-static int32_t* t5_ids(const t5_case* c, const char* name, gsf_nn_t5_input* in) { // to be freed
+static int32_t* t5_ids(const t5_case* c, const char* name, gsf_nn_t5_desc* in) { // to be freed
     test_tensor t = test_get_tensor(&c->inputs, name);
     int32_t* ids = (int32_t*)malloc(t.count * sizeof *ids);
     for (size_t i = 0; i < t.count; i++) ids[i] = (int32_t)t.v[i];
@@ -50,12 +50,12 @@ static int32_t* t5_ids(const t5_case* c, const char* name, gsf_nn_t5_input* in) 
     return ids;
 }
 
-static void check_t5_output(t5_case* c, const gsf_nn_t5* net, const gsf_nn_t5_input* in, const test_tensors* file,
+static void check_t5_output(t5_case* c, const gsf_nn_t5* net, const gsf_nn_t5_desc* in, const test_tensors* file,
                             const char* name, double bar) {
     test_tensor t = test_get_tensor(file, name);
     float* out = (float*)malloc(t.count * sizeof(float));
     CHECK(t.count == (size_t)in->batch * (size_t)in->tokens * (size_t)net->width);
-    if (CHECK_OK(&c->ctx, gsf_nn_t5_encode(&c->ctx, net, in, out))) check_rel_l2(name, out, t.v, t.count, bar);
+    if (CHECK_OK(&c->ctx, gsf_nn_encode_t5(&c->ctx, net, in, out))) check_rel_l2(name, out, t.v, t.count, bar);
     free(out);
     test_free_tensor(&t);
 }
@@ -67,13 +67,13 @@ static gsf_nn_t5 open_t5_as(gsf_context* ctx, const char* folder, gsf_nn_dtype d
     char path[1200];
     size_t size;
     memset(&net, 0, sizeof net);
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, folder, "model", &weights))) return net;
-    gsf_tensor* changed = (gsf_tensor*)malloc(weights.tensor_count * sizeof *changed);
+    if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "model", &weights))) return net;
+    gsf_nn_tensor* changed = (gsf_nn_tensor*)malloc(weights.tensor_count * sizeof *changed);
     for (size_t i = 0; i < weights.tensor_count; i++) {
-        gsf_tensor* t = &changed[i];
+        gsf_nn_tensor* t = &changed[i];
         *t = weights.tensors[i];
         float* wide = (float*)malloc((size_t)t->count * sizeof(float));
-        gsf_nn_read_tensor(&weights.tensors[i], 0, t->count, wide);
+        gsf_nn_convert_tensor(&weights.tensors[i], 0, t->count, wide);
         for (int64_t k = 0; dtype == GSF_NN_F16 && k < t->count; k++) {
             const uint16_t half = gsf__float_to_half(wide[k]);
             memcpy((char*)wide + 2 * k, &half, sizeof half);
@@ -84,12 +84,12 @@ static gsf_nn_t5 open_t5_as(gsf_context* ctx, const char* folder, gsf_nn_dtype d
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("model.safetensors"), changed, weights.tensor_count));
     for (size_t i = 0; i < weights.tensor_count; i++) free((void*)(uintptr_t)changed[i].data);
     free(changed);
-    gsf_nn_close_weights(ctx, &weights);
+    gsf_nn_destroy_weights(ctx, &weights);
     snprintf(path, sizeof path, "%s/config.json", folder);
     char* config = test_read_file(path, &size);
     CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("config.json"), config, size));
     free(config);
-    CHECK_OK(ctx, gsf_nn_make_t5(ctx, test_scratch("."), &net));
+    CHECK_OK(ctx, gsf_nn_load_t5(ctx, test_scratch("."), &net));
     return net;
 }
 
@@ -117,12 +117,12 @@ static void check_t5_positions(const t5_case* c) {
 
 static void check_t5(void) {
     t5_case c;
-    gsf_nn_t5_input in, in226;
+    gsf_nn_t5_desc in, in226;
     gsf_nn_weights names;
     memset(&c, 0, sizeof c);
     test_context_init(&c.ctx);
     const char* folder = test_golden("restorer/model/text_encoder");
-    if (!CHECK_OK(&c.ctx, gsf_nn_make_t5(&c.ctx, folder, &c.net))) return;
+    if (!CHECK_OK(&c.ctx, gsf_nn_load_t5(&c.ctx, folder, &c.net))) return;
     c.inputs = test_open_tensors(test_golden("restorer/t5/inputs.safetensors"));
     c.f32 = test_open_tensors(test_golden("restorer/t5/expected_f32.safetensors"));
     c.f64 = test_open_tensors(test_golden("restorer/t5/expected_f64.safetensors"));
@@ -133,11 +133,11 @@ static void check_t5(void) {
     in._tap = &tap;
     check_t5_output(&c, &c.net, &in, &c.f64, "out", t5_bar);
     in._tap = NULL;
-    if (CHECK_OK(&c.ctx, gsf_nn_open_weights(&c.ctx, c.taps.path, NULL, &names))) {
+    if (CHECK_OK(&c.ctx, gsf_nn_load_weights(&c.ctx, c.taps.path, NULL, &names))) {
         size_t rows = 0; // each tensor holds that many prompts
         for (size_t i = 0; i < names.tensor_count; i++) rows += (size_t)names.tensors[i].shape[0];
         CHECK(c.seen == rows && rows > 0);
-        gsf_nn_close_weights(&c.ctx, &names);
+        gsf_nn_destroy_weights(&c.ctx, &names);
     }
     check_t5_output(&c, &c.net, &in, &c.f32, "out_bf16", t5_bf16_bar);
     check_t5_output(&c, &c.net, &in226, &c.f32, "out226", t5_long_bar);

@@ -11,7 +11,7 @@ static inline double tables_ulp(double v) { // spacing of floats at v
 
 // Exact: cos and sin of position * theta^(-2i/d); the angle is allowed (5 + 10 e) half ulps: position, frequency, product,
 // and the exponent e = 2i/d, whose rounding counts ln(10000) times.
-static void tables_check_rope_exact(const gsf_nn_rope_desc* d, const float* c, const float* s) {
+static void tables_check_rope_exact(const gsf__nn_rope_desc* d, const float* c, const float* s) {
     const double tall = (double)d->height / d->width > (double)d->base_height / d->base_width;
     const double rows = tall ? d->base_height : rint((double)d->base_width / d->width * d->height);
     const double columns = tall ? rint((double)d->base_height / d->height * d->width) : d->base_width;
@@ -46,7 +46,7 @@ static void tables_check_rope(gsf_context* ctx, const test_tensors* file, int in
     test_tensor c = test_get_tensor(file, name);
     snprintf(name, sizeof name, "rope%d.sin", index);
     test_tensor s = test_get_tensor(file, name);
-    gsf_nn_rope_desc d;
+    gsf__nn_rope_desc d;
     memset(&d, 0, sizeof d);
     d.base_height = (int32_t)meta.v[0] / patch;
     d.base_width = (int32_t)meta.v[1] / patch;
@@ -58,7 +58,7 @@ static void tables_check_rope(gsf_context* ctx, const test_tensors* file, int in
     CHECK(c.dim[0] == (rows + stride - 1) / stride && s.dim[0] == c.dim[0]); // every stride-th row
     float* cosine = (float*)malloc(rows * c.dim[1] * sizeof(float));
     float* sine = (float*)malloc(rows * c.dim[1] * sizeof(float));
-    if (CHECK_OK(ctx, gsf_nn_make_rope(ctx, &d, cosine, sine))) {
+    if (CHECK_OK(ctx, gsf__nn_make_rope(ctx, &d, cosine, sine))) {
         for (size_t r = 0; r < c.dim[0] && r * stride < rows; r++) {
             test_compare_floats(c.name, cosine + r * stride * c.dim[1], c.v + r * c.dim[1], c.dim[1], 3e-6);
             test_compare_floats(s.name, sine + r * stride * c.dim[1], s.v + r * c.dim[1], c.dim[1], 3e-6);
@@ -87,7 +87,8 @@ static void tables_check_sincos(gsf_context* ctx, const test_tensors* file, cons
         for (size_t i = 0; i < t.count; i++) error = fmax(error, fabs(wide[i] - t.v[i]));
         if (error >= best) continue;
         best = error;
-        CHECK_OK(ctx, gsf_nn_make_sincos(ctx, axes.frames, axes.height, axes.width, axes.dim, spatial, temporal, narrow));
+        CHECK_OK(ctx,
+                 gsf__nn_make_sincos(ctx, axes.frames, axes.height, axes.width, axes.dim, spatial, temporal, narrow));
         int bad = 0;
         for (size_t i = 0; i < t.count; i++) bad += fabs(narrow[i] - wide[i]) > tables_ulp(wide[i]);
         CHECK(bad == 0);
@@ -107,7 +108,7 @@ static void tables_check_timesteps(const test_tensors* file, const char* name, c
     for (size_t row = 0; row < t.dim[0]; row++) {
         double error = INFINITY;
         for (; next < times->count && error > 1e-4; next++) {
-            gsf_nn_embed_timestep(times->v[next], dim, out);
+            gsf__nn_embed_timestep(times->v[next], dim, out);
             error = 0.0;
             for (int k = 0; k < dim; k++) error = fmax(error, fabs(out[k] - t.v[row * t.dim[1] + (size_t)k]));
         }
@@ -115,7 +116,7 @@ static void tables_check_timesteps(const test_tensors* file, const char* name, c
     }
     for (size_t k = 0; k < times->count; k++) {
         int bad = 0;
-        gsf_nn_embed_timestep(times->v[k], dim, out);
+        gsf__nn_embed_timestep(times->v[k], dim, out);
         for (int i = 0; i < dim / 2; i++) {
             const double e = log(10000.0) * i / (dim / 2), angle = times->v[k] * exp(-e);
             const double slack = angle * (3 + 2 * e) / 16777216.0;
@@ -147,7 +148,7 @@ static void check_tables(void) {
     gsf__nn_close_config(&vae);
 
     const char* path = test_golden("restorer/transformer/tables.safetensors");
-    if (!CHECK_OK(&ctx, gsf_nn_open_weights(&ctx, path, NULL, &names))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_weights(&ctx, path, NULL, &names))) return;
     test_tensors file = test_open_tensors(path);
     test_tensor times = test_get_tensor(&file, "timestep_emb.t");
     int ropes = 0, sincos = 0, embeddings = 0;
@@ -162,7 +163,7 @@ static void check_tables(void) {
     CHECK(ropes > 0 && sincos > 0 && embeddings > 0);
     test_free_tensor(&times);
     test_close_tensors(&file);
-    gsf_nn_close_weights(&ctx, &names);
+    gsf_nn_destroy_weights(&ctx, &names);
 }
 
 #endif

@@ -60,11 +60,11 @@ static void check_projectors(transformer_case* c, const float* dino, const float
 }
 
 // bars: of the float32 path; the same run with other weights (net) takes its own.
-static void check_output(transformer_case* c, const gsf_nn_transformer* net, const gsf_nn_transformer_input* in,
+static void check_output(transformer_case* c, const gsf_nn_transformer* net, const gsf_nn_transformer_desc* in,
                          const char* name, double bar) {
     test_tensor t = test_get_tensor(&c->f64, name);
     float* out = (float*)malloc(t.count * sizeof(float));
-    CHECK_OK(&c->ctx, gsf_nn_transformer_forward(&c->ctx, net, in, out));
+    CHECK_OK(&c->ctx, gsf_nn_run_transformer(&c->ctx, net, in, out));
     check_rel_l2(name, out, t.v, t.count, bar);
     free(out);
     test_free_tensor(&t);
@@ -74,13 +74,13 @@ static void check_output(transformer_case* c, const gsf_nn_transformer* net, con
 static gsf_nn_transformer open_rounded(gsf_context* ctx, const char* folder) {
     gsf_nn_weights weights;
     gsf_nn_transformer net;
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, folder, "diffusion_pytorch_model", &weights));
-    gsf_tensor* rounded = (gsf_tensor*)malloc(weights.tensor_count * sizeof(gsf_tensor));
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "diffusion_pytorch_model", &weights));
+    gsf_nn_tensor* rounded = (gsf_nn_tensor*)malloc(weights.tensor_count * sizeof(gsf_nn_tensor));
     for (size_t i = 0; i < weights.tensor_count; i++) {
         rounded[i] = weights.tensors[i];
         float* wide = (float*)malloc((size_t)rounded[i].count * sizeof(float));
         uint16_t* narrow = (uint16_t*)malloc((size_t)rounded[i].count * sizeof(uint16_t));
-        gsf_nn_read_tensor(&weights.tensors[i], 0, rounded[i].count, wide);
+        gsf_nn_convert_tensor(&weights.tensors[i], 0, rounded[i].count, wide);
         for (int64_t j = 0; j < rounded[i].count; j++) narrow[j] = gsf__float_to_bf16(wide[j]);
         rounded[i].dtype = GSF_NN_BF16;
         rounded[i].data = narrow;
@@ -90,14 +90,14 @@ static gsf_nn_transformer open_rounded(gsf_context* ctx, const char* folder) {
                                           weights.tensor_count));
     for (size_t i = 0; i < weights.tensor_count; i++) free((void*)(uintptr_t)rounded[i].data);
     free(rounded);
-    gsf_nn_close_weights(ctx, &weights);
+    gsf_nn_destroy_weights(ctx, &weights);
     char path[1200];
     snprintf(path, sizeof path, "%s/config.json", folder);
     size_t size;
     char* config = test_read_file(path, &size);
     CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("config.json"), config, size));
     free(config);
-    CHECK_OK(ctx, gsf_nn_make_transformer(ctx, test_scratch("."), &net));
+    CHECK_OK(ctx, gsf_nn_load_transformer(ctx, test_scratch("."), &net));
     return net;
 }
 
@@ -107,12 +107,12 @@ static void check_transformer(void) {
     test_context_init(&c.ctx);
     char folder[1100];
     snprintf(folder, sizeof folder, "%s", test_golden("restorer/model/transformer"));
-    if (!CHECK_OK(&c.ctx, gsf_nn_make_transformer(&c.ctx, folder, &c.net))) return;
+    if (!CHECK_OK(&c.ctx, gsf_nn_load_transformer(&c.ctx, folder, &c.net))) return;
     c.inputs = test_open_tensors(test_golden("restorer/transformer/inputs.safetensors"));
     c.f32 = test_open_tensors(test_golden("restorer/transformer/expected_f32.safetensors"));
     c.f64 = test_open_tensors(test_golden("restorer/transformer/expected_f64.safetensors"));
     c.taps = test_open_tensors(test_golden("restorer/transformer/intermediates_f32.safetensors"));
-    CHECK_OK(&c.ctx, gsf_nn_open_weights(&c.ctx, c.taps.path, NULL, &c.names));
+    CHECK_OK(&c.ctx, gsf_nn_load_weights(&c.ctx, c.taps.path, NULL, &c.names));
     c.seen = (unsigned char*)calloc(c.names.tensor_count, 1);
     const gsf_nn_transformer* net = &c.net;
     const int64_t width = (int64_t)net->heads * net->head_dim;
@@ -129,7 +129,7 @@ static void check_transformer(void) {
     check_projectors(&c, dino, vggt, tokens, width);
 
     double* steps = (double*)calloc((size_t)batch, sizeof(double));
-    gsf_nn_transformer_input in;
+    gsf_nn_transformer_desc in;
     memset(&in, 0, sizeof in);
     in.batch = batch;
     in.frames = (int32_t)hidden.dim[1];
@@ -187,7 +187,7 @@ static void check_transformer(void) {
     free(text_b_v);
     free(steps);
     free(c.seen);
-    gsf_nn_close_weights(&c.ctx, &c.names);
+    gsf_nn_destroy_weights(&c.ctx, &c.names);
     test_close_tensors(&c.inputs);
     test_close_tensors(&c.f32);
     test_close_tensors(&c.f64);

@@ -74,7 +74,7 @@ static void vae_check_decode(gsf_context* ctx, const gsf_nn_vae* vae, const vae_
     if (CHECK(info.frames == (int64_t)expected.dim[2] && info.height == (int64_t)expected.dim[3] &&
               info.width == (int64_t)expected.dim[4])) {
         float* video = (float*)malloc(expected.count * sizeof(float));
-        CHECK_OK(ctx, gsf_nn_vae_decode(ctx, vae, NULL, latents, f, h, w, video));
+        CHECK_OK(ctx, gsf_nn_decode_vae(ctx, vae, NULL, latents, f, h, w, video));
         vae_compare(clip, "decoded", video, &expected);
         free(video);
     }
@@ -92,7 +92,7 @@ static void vae_check_clip(gsf_context* ctx, const gsf_nn_vae* vae, const vae_fi
     CHECK_OK(ctx, gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_ENCODE, NULL, f, h, w, &info));
     const size_t count = (size_t)(vae->latent_channels * info.frames * info.height * info.width);
     float *mean = (float*)malloc(count * sizeof(float)), *logvar = (float*)malloc(count * sizeof(float));
-    CHECK_OK(ctx, gsf_nn_vae_encode(ctx, vae, NULL, video, f, h, w, mean, logvar));
+    CHECK_OK(ctx, gsf_nn_encode_vae(ctx, vae, NULL, video, f, h, w, mean, logvar));
     CHECK(vae_compare_with(&files->f32, clip, "mean", mean, count));
     (void)vae_compare_with(&files->f32, clip, "logvar", logvar, count);
     if (vae_compare_with(&files->f64, clip, "mean", mean, count))
@@ -128,7 +128,7 @@ static void vae_check_tiled(gsf_context* ctx, const gsf_nn_vae* vae, const vae_f
     CHECK_OK(ctx, gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_ENCODE, &desc, f, h, w, &info));
     size_t count = (size_t)(vae->latent_channels * info.frames * info.height * info.width);
     float* mean = (float*)malloc(count * sizeof(float));
-    CHECK_OK(ctx, gsf_nn_vae_encode(ctx, vae, &desc, video, f, h, w, mean, NULL));
+    CHECK_OK(ctx, gsf_nn_encode_vae(ctx, vae, &desc, video, f, h, w, mean, NULL));
     CHECK(vae_compare_with(&files->f32, "tiled", "mean", mean, count));
     free(video);
     free(mean);
@@ -151,7 +151,7 @@ static void vae_check_tiled(gsf_context* ctx, const gsf_nn_vae* vae, const vae_f
         }
         snprintf(what, sizeof what, "%s%s", prefix + strlen("tiled."), numbers);
         video = (float*)malloc((size_t)(vae->out_channels * info.frames * info.height * info.width) * sizeof(float));
-        CHECK_OK(ctx, gsf_nn_vae_decode(ctx, vae, &desc, latents, f, h, w, video));
+        CHECK_OK(ctx, gsf_nn_decode_vae(ctx, vae, &desc, latents, f, h, w, video));
         vae_check_frames(video, vae, &info, &files->f32, what, frames, picked);
         free(video);
     }
@@ -222,7 +222,7 @@ static void vae_compare_map(vae_watcher* w, const char* what, const gsf__vae_map
     w->seen++;
 }
 
-static void vae_watch(void* user, const gsf_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
+static void vae_watch(void* user, const gsf_nn_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
                       const float* data) {
     static const char* const parts[] = {"conv_in", "mid", "mid.resnet0.norm1", "norm_out", "up0", "up1", "up2", "up3",
                                         "down0", "down1", "down2", "down3"};
@@ -317,7 +317,7 @@ static void check_vae(void) {
     files.inputs = test_open_tensors(test_golden("restorer/vae/inputs.safetensors"));
     files.f32 = test_open_tensors(test_golden("restorer/vae/expected_f32.safetensors"));
     files.f64 = test_open_tensors(test_golden("restorer/vae/expected_f64.safetensors"));
-    if (CHECK_OK(&ctx, gsf_nn_make_vae(&ctx, test_golden("restorer/model/vae"), &vae))) {
+    if (CHECK_OK(&ctx, gsf_nn_load_vae(&ctx, test_golden("restorer/model/vae"), &vae))) {
         vae_check_clips(&ctx, &vae, &files);
         vae_check_tiled(&ctx, &vae, &files);
         vae_check_intermediates(&ctx, &vae, &files);

@@ -48,7 +48,7 @@ static inline splat_golden splat_golden_open(const char* name) {
     test_tensor background = test_get_tensor(&g.file, "in.bg"), image = test_get_tensor(&g.file, "out.image");
     test_tensor d_image = test_get_tensor(&g.file, "grad.dL_dimage"), fragile = test_get_tensor(&g.file, "out.fragile");
     g.splats.count = means.dim[0];
-    while ((size_t)gsf_splat_sh_count(g.splats.sh_degree) < sh.dim[1]) g.splats.sh_degree++;
+    while ((size_t)gsf_splat_count_sh(g.splats.sh_degree) < sh.dim[1]) g.splats.sh_degree++;
     g.splats.means = test_tensor_floats(&means);
     g.splats.log_scales = splat_golden_floats(&g.file, "in.scales_log");
     g.splats.quats = splat_golden_floats(&g.file, "in.quats_wxyz_raw");

@@ -36,7 +36,7 @@ static inline int machine_open(machine* m, gsf_cpu_level level, int reversed) {
     m->ctx.allocator.free_fn = counting_free;
     CHECK_OK(&m->ctx, gsf_init_context(&m->ctx));
     if (m->ctx.cpu_level != level) return 0;
-    m->name = gsf_cpu_level_name(level);
+    m->name = gsf_describe_cpu_level(level);
     return CHECK_OK(&m->ctx, gsf_splat_make_rasterizer(&m->ctx, &m->rasterizer));
 }
 
@@ -69,7 +69,7 @@ static inline result result_make(const gsf_splats* splats, const gsf_camera* cam
     memset(&r, 0, sizeof r);
     r.splat_count = splats->count;
     r.pixels = (size_t)camera->width * (size_t)camera->height;
-    r.sh_floats = 3 * (size_t)gsf_splat_sh_count(splats->sh_degree);
+    r.sh_floats = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree);
     r.floats = 5 * r.pixels + splats->count * (3 + 3 + 4 + 1 + r.sh_floats + 2 + 2) + 3;
     r.block = (float*)calloc(r.floats, sizeof(float));
     r.color = r.block;

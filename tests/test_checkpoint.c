@@ -58,7 +58,7 @@ static void put_checkpoint(const void* data, size_t size) {
 
 // The checkpoint `data` with other JSON.
 static void forge(gsf_context* ctx, const void* data, size_t size, const char* json, size_t json_size) {
-    gsf_text file = {0};
+    gsf_buffer file = {0};
     const char* p = (const char*)data + 12; // after magic and version
     while ((size_t)(p - (const char*)data) + 16 <= size) {
         uint64_t bytes = 0;
@@ -66,13 +66,13 @@ static void forge(gsf_context* ctx, const void* data, size_t size, const char* j
         memcpy(tag, p, 4);
         for (int i = 0; i < 8; i++) bytes |= (uint64_t)(unsigned char)p[4 + i] << 8 * i;
         if (strcmp(tag, "END ") == 0) break;
-        if (strcmp(tag, "GFIX") == 0) gsf_chunks_add(ctx, &file, tag, json, json_size);
-        else gsf_chunks_add(ctx, &file, tag, p + 12, (size_t)bytes);
+        if (strcmp(tag, "GFIX") == 0) gsf_append_chunk(ctx, &file, tag, json, json_size);
+        else gsf_append_chunk(ctx, &file, tag, p + 12, (size_t)bytes);
         p += 16 + bytes;
     }
-    gsf_chunks_end(ctx, &file);
+    gsf_append_last_chunk(ctx, &file);
     if (CHECK(!file.failed)) put_checkpoint(file.data, file.size);
-    gsf_destroy_text(ctx, &file);
+    gsf_destroy_buffer(ctx, &file);
 }
 
 static size_t number_at(const char* text) { // its length, or that of null
@@ -91,15 +91,15 @@ static void forge_list(gsf_context* ctx, const void* data, size_t size, const ch
     for (size_t column = 0; number_at(at); column++) {
         for (size_t v = 0; v < sizeof values / sizeof *values; v++) {
             if (wholes[column] != 'w' && v % 2 == 0) continue; // little can go wrong with those
-            gsf_text text = {0};
-            gsf_text_append(ctx, &text, json, (size_t)(at - json));
-            gsf_text_append(ctx, &text, values[v], strlen(values[v]));
-            gsf_text_append(ctx, &text, at + number_at(at), json_size - (size_t)(at - json) - number_at(at));
+            gsf_buffer text = {0};
+            gsf_append_bytes(ctx, &text, json, (size_t)(at - json));
+            gsf_append_bytes(ctx, &text, values[v], strlen(values[v]));
+            gsf_append_bytes(ctx, &text, at + number_at(at), json_size - (size_t)(at - json) - number_at(at));
             forge(ctx, data, size, text.data, text.size);
             const int status = resume("--resume"), must_fail = wholes[column] == 'w' && v != 4;
             if (!CHECK(status == 1 || (status == 0 && !must_fail)) || !CHECK(error_lines(ctx) == (status == 1)))
                 printf("  %s, column %zu: %s\n", key, column, values[v]);
-            gsf_destroy_text(ctx, &text);
+            gsf_destroy_buffer(ctx, &text);
         }
         at += number_at(at);
         if (*at != ',') break;
@@ -113,9 +113,9 @@ static void test_forged(gsf_context* ctx) {
     gsf_chunk chunk;
     if (!CHECK(resume("--restart") == 0) || !CHECK(resume("--resume") == 0)) return;
     if (!CHECK_OK(ctx, gsf_read_file(ctx, TEST_TMP "/out/checkpoint", &data, &size))) return;
-    if (CHECK(gsf_chunks_find(data, size, "GFIX", &chunk))) {
-        gsf_text json = {0};
-        gsf_text_append(ctx, &json, (const char*)chunk.data, chunk.size);
+    if (CHECK(gsf_find_chunk(data, size, "GFIX", &chunk))) {
+        gsf_buffer json = {0};
+        gsf_append_bytes(ctx, &json, (const char*)chunk.data, chunk.size);
         forge(ctx, data, size, json.data, json.size); // as it was
         CHECK(resume("--resume") == 0);
         forge_list(ctx, data, size, json.data, json.size, "\"iteration\"", "w");
@@ -129,7 +129,7 @@ static void test_forged(gsf_context* ctx) {
         forge_list(ctx, data, size, json.data, json.size, "\"rounds\":[[", "wwwwwf");
         forge_list(ctx, data, size, json.data, json.size, "\"path\"", "wwwffffff");
         forge_list(ctx, data, size, json.data, json.size, "\"samples\"", "www");
-        gsf_destroy_text(ctx, &json);
+        gsf_destroy_buffer(ctx, &json);
     }
     gsf_free(ctx, data);
 }

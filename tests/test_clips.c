@@ -7,7 +7,7 @@ enum { MOST = 160, SHOWN = 64 };
 
 typedef struct fake { // gives back what it gets, a little brighter with every part
     gsf_restorer restorer;
-    gsf_restorer_limits limits;
+    gsf_restorer_info limits;
     int calls, counts[SHOWN];
     int32_t width, height;
     int fail_at, seen_reference;
@@ -15,7 +15,7 @@ typedef struct fake { // gives back what it gets, a little brighter with every p
 } fake;
 
 static gsf_result fake_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
-                             gsf_restorer_limits* out) {
+                             gsf_restorer_info* out) {
     (void)ctx, (void)frames, (void)width, (void)height;
     const uint32_t size = out->struct_size;
     *out = ((fake*)user)->limits;

@@ -37,7 +37,7 @@ static void test_random_numbers(void) {
     double mean = 0.0, variance = 0.0, uniform = 0.0;
     enum { COUNT = 20000 };
     for (uint64_t i = 0; i < COUNT; i++) {
-        const double x = gsf_random_normal(5, 2, i), u = gsf_random_uniform(5, 3, i);
+        const double x = gsf_draw_normal(5, 2, i), u = gsf_draw_uniform(5, 3, i);
         mean += x;
         variance += x * x;
         uniform += u;
@@ -46,17 +46,17 @@ static void test_random_numbers(void) {
     CHECK_NEAR(mean / COUNT, 0.0, 0.03); // four standard errors
     CHECK_NEAR(variance / COUNT, 1.0, 0.04);
     CHECK_NEAR(uniform / COUNT, 0.5, 0.009);
-    CHECK(gsf_random_bits(1, 2, 3) == gsf_random_bits(1, 2, 3));
-    CHECK(gsf_random_bits(1, 2, 3) != gsf_random_bits(1, 3, 2) && gsf_random_bits(1, 2, 3) != gsf_random_bits(2, 1, 3));
+    CHECK(gsf_draw_bits(1, 2, 3) == gsf_draw_bits(1, 2, 3));
+    CHECK(gsf_draw_bits(1, 2, 3) != gsf_draw_bits(1, 3, 2) && gsf_draw_bits(1, 2, 3) != gsf_draw_bits(2, 1, 3));
 }
 
 static void test_chunks(gsf_context* ctx) {
-    gsf_text file;
+    gsf_buffer file;
     memset(&file, 0, sizeof file);
-    gsf_chunks_add(ctx, &file, "ONE ", "first", 5);
-    gsf_chunks_add(ctx, &file, "TWO ", "", 0);
-    gsf_chunks_add(ctx, &file, "TRE ", "third part", 10);
-    gsf_chunks_end(ctx, &file);
+    gsf_append_chunk(ctx, &file, "ONE ", "first", 5);
+    gsf_append_chunk(ctx, &file, "TWO ", "", 0);
+    gsf_append_chunk(ctx, &file, "TRE ", "third part", 10);
+    gsf_append_last_chunk(ctx, &file);
     CHECK(!file.failed);
 
     const char* path = test_scratch("chunks.bin");
@@ -65,25 +65,25 @@ static void test_chunks(gsf_context* ctx) {
     size_t size = 0;
     CHECK_OK(ctx, gsf_read_file(ctx, path, &data, &size));
     CHECK(size == file.size && memcmp(data, file.data, size) == 0);
-    CHECK_OK(ctx, gsf_chunks_check(ctx, "chunks", data, size));
+    CHECK_OK(ctx, gsf_check_chunks(ctx, "chunks", data, size));
     gsf_chunk chunk;
-    CHECK(gsf_chunks_find(data, size, "TRE ", &chunk) && chunk.size == 10 && memcmp(chunk.data, "third part", 10) == 0);
-    CHECK(gsf_chunks_find(data, size, "TWO ", &chunk) && chunk.size == 0);
-    CHECK(!gsf_chunks_find(data, size, "NONE", &chunk));
+    CHECK(gsf_find_chunk(data, size, "TRE ", &chunk) && chunk.size == 10 && memcmp(chunk.data, "third part", 10) == 0);
+    CHECK(gsf_find_chunk(data, size, "TWO ", &chunk) && chunk.size == 0);
+    CHECK(!gsf_find_chunk(data, size, "NONE", &chunk));
 
     for (size_t cut = 0; cut < size; cut++) { // every length, in a block of exactly that size
         char* part = (char*)malloc(cut ? cut : 1);
         memcpy(part, data, cut);
-        CHECK_RESULT(ctx, gsf_chunks_check(ctx, "cut", part, cut), GSF_ERROR_FORMAT);
+        CHECK_RESULT(ctx, gsf_check_chunks(ctx, "cut", part, cut), GSF_ERROR_FORMAT);
         free(part);
     }
     for (size_t i = 0; i < size; i++) { // every byte changed
         ((unsigned char*)data)[i] ^= 0x41;
-        CHECK(gsf_chunks_check(ctx, "flip", data, size) != GSF_OK);
+        CHECK(gsf_check_chunks(ctx, "flip", data, size) != GSF_OK);
         ((unsigned char*)data)[i] ^= 0x41;
     }
     gsf_free(ctx, data);
-    gsf_destroy_text(ctx, &file);
+    gsf_destroy_buffer(ctx, &file);
 }
 
 static void test_files(gsf_context* ctx) {

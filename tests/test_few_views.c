@@ -25,7 +25,7 @@ static void make_host(host* h) {
     for (int v = 0; v < VIEWS; v++) {
         gsf_camera* camera = &h->views[v].camera;
         const double c2w[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0.3 * v - 0.9, 0.05 * (v % 3), 0, 1};
-        gsf_camera_set_c2w(camera, c2w);
+        gsf_set_camera_c2w(camera, c2w);
         camera->width = WIDTH;
         camera->height = HEIGHT;
         camera->fx = camera->fy = 60.0;
@@ -68,7 +68,7 @@ static size_t count_kind(gsf_context* ctx, const host* h, gsf_initial_kind kind,
     const uint32_t list[VIEWS] = {0, 1, 2, 3, 4, 5, 6};
     desc.kind = kind;
     desc.random_points = 50;
-    CHECK_OK(ctx, gsf_splat_initial_splats(ctx, &h->scene, list, views, &desc, &splats, stats));
+    CHECK_OK(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, list, views, &desc, &splats, stats));
     const size_t count = splats.count;
     CHECK(count == stats->scene_points + stats->new_points && splats.sh_degree == 3);
     gsf_splat_destroy(ctx, &splats);
@@ -102,12 +102,12 @@ static void test_random_points(gsf_context* ctx, const host* h) {
     gsf_splats splats;
     desc.kind = GSF_INITIAL_RANDOM;
     desc.random_points = 70;
-    CHECK_OK(ctx, gsf_splat_initial_splats(ctx, &h->scene, NULL, VIEWS, &desc, &splats, NULL));
+    CHECK_OK(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, NULL, VIEWS, &desc, &splats, NULL));
     for (size_t i = 0; i < splats.count; i++) { // each in its view, with the colour that stands there
         const float* mean = splats.means + 3 * i;
         const double point[3] = {mean[0], mean[1], mean[2]};
         double u, v, z;
-        const int inside = gsf_camera_project(&h->views[i % VIEWS].camera, point, &u, &v, &z);
+        const int inside = gsf_project_point(&h->views[i % VIEWS].camera, point, &u, &v, &z);
         if (!CHECK(inside && u > -1e-3 && u < WIDTH + 1e-3 && v > -1e-3 && v < HEIGHT + 1e-3)) continue;
         if (fabs(u - floor(u) - 0.5) > 0.49 || fabs(v - floor(v) - 0.5) > 0.49) continue; // float32 may cross an edge
         const uint8_t* pixel = h->pixels[i % VIEWS] + 3 * ((size_t)v * WIDTH + (size_t)u);
@@ -120,35 +120,41 @@ static void test_desc(gsf_context* ctx, const host* h) {
     gsf_initial_desc desc = {0};
     gsf_splats all, listed;
     const uint32_t list[VIEWS] = {0, 1, 2, 3, 4, 5, 6}, wrong[2] = {0, VIEWS};
-    CHECK_OK(ctx, gsf_splat_initial_splats(ctx, &h->scene, NULL, VIEWS, NULL, &all, NULL));
-    CHECK_OK(ctx, gsf_splat_initial_splats(ctx, &h->scene, list, VIEWS, &desc, &listed, NULL));
+    CHECK_OK(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, NULL, VIEWS, NULL, &all, NULL));
+    CHECK_OK(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, list, VIEWS, &desc, &listed, NULL));
     CHECK(same_splats(&all, &listed));
     gsf_splat_destroy(ctx, &listed);
     desc.sh_degree = -1;
-    CHECK_OK(ctx, gsf_splat_initial_splats(ctx, &h->scene, list, VIEWS, &desc, &listed, NULL));
+    CHECK_OK(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, list, VIEWS, &desc, &listed, NULL));
     CHECK(listed.sh_degree == 0 && listed.count == all.count);
     gsf_splat_destroy(ctx, &listed);
     gsf_splat_destroy(ctx, &all);
     desc.sh_degree = 4;
-    CHECK_RESULT(ctx, gsf_splat_initial_splats(ctx, &h->scene, list, 2, &desc, &all, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, list, 2, &desc, &all, NULL),
+                 GSF_ERROR_INVALID_ARGUMENT);
     desc.sh_degree = 0;
     desc.kind = GSF_INITIAL_RANDOM;
-    CHECK_RESULT(ctx, gsf_splat_initial_splats(ctx, &h->scene, wrong, 2, &desc, &all, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, wrong, 2, &desc, &all, NULL),
+                 GSF_ERROR_INVALID_ARGUMENT);
     desc.random_points = -1;
-    CHECK_RESULT(ctx, gsf_splat_initial_splats(ctx, &h->scene, list, 2, &desc, &all, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, list, 2, &desc, &all, NULL),
+                 GSF_ERROR_INVALID_ARGUMENT);
     host blind = *h;
     blind.views[1].image.data = NULL;
     blind.scene.views = blind.views;
     desc.random_points = 0;
-    CHECK_RESULT(ctx, gsf_splat_initial_splats(ctx, &blind.scene, list, 2, &desc, &all, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_make_initial_splats(ctx, &blind.scene, list, 2, &desc, &all, NULL),
+                 GSF_ERROR_INVALID_ARGUMENT);
     blind.scene.point_count = 0;
     desc.kind = GSF_INITIAL_BOTH;
-    CHECK_RESULT(ctx, gsf_splat_initial_splats(ctx, &blind.scene, list, 2, &desc, &all, NULL), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_splat_make_initial_splats(ctx, &blind.scene, list, 2, &desc, &all, NULL),
+                 GSF_ERROR_DEGENERATE);
     blind = *h;
     memset(blind.track_begin, 0, sizeof blind.track_begin);
     blind.scene.track_begin = blind.track_begin;
     desc.kind = GSF_INITIAL_TRACKS;
-    CHECK_RESULT(ctx, gsf_splat_initial_splats(ctx, &blind.scene, list, 2, &desc, &all, NULL), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(ctx, gsf_splat_make_initial_splats(ctx, &blind.scene, list, 2, &desc, &all, NULL),
+                 GSF_ERROR_DEGENERATE);
 }
 
 static void test_memory(const host* h) {
@@ -172,7 +178,7 @@ static void test_memory(const host* h) {
         for (; result == GSF_ERROR_OUT_OF_MEMORY && failures < 2000; failures++) {
             memory.calls = 0;
             memory.fail_at = failures + 1;
-            result = gsf_splat_initial_splats(&ctx, &h->scene, list, 2, &desc, &splats, NULL);
+            result = gsf_splat_make_initial_splats(&ctx, &h->scene, list, 2, &desc, &splats, NULL);
             if (result != GSF_OK && !CHECK(memory.live == 0 && splats.count == 0)) break;
         }
         CHECK(result == GSF_OK && failures > 5);
@@ -182,20 +188,20 @@ static void test_memory(const host* h) {
 }
 
 static void test_settings(gsf_context* ctx, host* h) {
-    const gsf_fix_desc alone = gsf_splat_few_view_desc(NULL, GSF_QUALITY_BALANCED);
+    const gsf_fix_desc alone = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_BALANCED);
     CHECK(alone.train.iterations == 1200 && alone.train.dropout == 0.1f && alone.train.opacity_decay == 0.002f);
     CHECK(alone.train.depth_smoothness == 0.5f && alone.skip_psnr == 45.0f && !alone.train.lazy_adam);
     CHECK(!alone.points && alone.train.render.near_plane == 0.0f);
-    const gsf_fix_desc fast = gsf_splat_few_view_desc(NULL, GSF_QUALITY_FAST);
+    const gsf_fix_desc fast = gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_FAST);
     CHECK(fast.skip_psnr == 36.0f && fast.max_pixels == 320 * 240 && fast.train.lazy_adam);
-    CHECK(gsf_splat_few_view_desc(NULL, GSF_QUALITY_EXACT).skip_psnr == 0.0f);
-    const gsf_fix_desc desc = gsf_splat_few_view_desc(&h->scene, GSF_QUALITY_BALANCED);
+    CHECK(gsf_splat_resolve_few_view_desc(NULL, GSF_QUALITY_EXACT).skip_psnr == 0.0f);
+    const gsf_fix_desc desc = gsf_splat_resolve_few_view_desc(&h->scene, GSF_QUALITY_BALANCED);
     CHECK(desc.points == h->points && desc.point_count == POINTS);
     CHECK_NEAR(desc.train.render.near_plane, 0.011 * 0.9, 1e-4); // the outer cameras are 0.9 from the middle
     gsf_camera far_apart[2] = {h->views[0].camera, h->views[0].camera};
-    CHECK(gsf_splat_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f); // at one place: no extent
+    CHECK(gsf_splat_measure_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f); // at one place: no extent
     far_apart[1].w2c[12] += 1000.0;
-    CHECK(gsf_splat_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f);
+    CHECK(gsf_splat_measure_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f);
 
     const uint32_t some[2] = {4, 1}, wrong[1] = {VIEWS};
     gsf_train_view* views;

@@ -23,14 +23,14 @@ static gsf_camera look(double x, double y, double angle, int width, int height) 
     c.cy = 0.5 * height;
     c.width = width;
     c.height = height;
-    gsf_camera_set_c2w(&c, c2w);
+    gsf_set_camera_c2w(&c, c2w);
     return c;
 }
 
 static void draw_plane(const gsf_camera* camera, float* color, float* depth) {
     double c2w[16], center[3];
-    gsf_camera_c2w(camera, c2w);
-    gsf_camera_center(camera, center);
+    gsf_get_camera_c2w(camera, c2w);
+    gsf_get_camera_center(camera, center);
     for (int y = 0; y < camera->height; y++)
         for (int x = 0; x < camera->width; x++) {
             const double ray[3] = {(x + 0.5 - camera->cx) / camera->fx, (y + 0.5 - camera->cy) / camera->fy, 1.0};
@@ -239,7 +239,7 @@ typedef struct repair {
     float photos[VIEWS][3 * PIXELS];
     gsf_restorer restorer;          // renders the truth
     int32_t multiple, frames_step;  // the restorer's limits
-    gsf_restorer_limits also;       // further ones: what it was made for
+    gsf_restorer_info also;         // further ones: what it was made for
     int begun, ended, windows, fail_at, checked, restored;
 } repair;
 
@@ -249,12 +249,12 @@ static gsf_camera around(double angle, double height) { // on a circle of radius
     gsf_camera c = look(0, 0, 0, WIDTH, HEIGHT);
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
-    if (gsf_traj_look_at(&ctx, eye, target, up, pose) == GSF_OK) gsf_camera_set_c2w(&c, pose);
+    if (gsf_traj_look_at(&ctx, eye, target, up, pose) == GSF_OK) gsf_set_camera_c2w(&c, pose);
     return c;
 }
 
 static gsf_result repair_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
-                               gsf_restorer_limits* out) {
+                               gsf_restorer_info* out) {
     const repair* r = (const repair*)user;
     (void)ctx; (void)frames; (void)width; (void)height;
     CHECK(out->struct_size == sizeof *out);
@@ -384,7 +384,7 @@ static gsf_fix_desc repair_desc(void) {
 static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]) {
     gsf_fix_stats stats;
     for (int i = 0; i < stop; i++) {
-        if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) return 1;
+        if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) return 1;
         if (counts) counts[stats.stage]++;
         if (stats.stage == GSF_FIX_DONE) return 1;
         if (stats.stage == GSF_FIX_RESTORE)
@@ -399,7 +399,7 @@ typedef struct masked { // references as a restorer is given them
 } masked;
 
 static gsf_result masked_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
-                               gsf_restorer_limits* out) {
+                               gsf_restorer_info* out) {
     (void)ctx; (void)frames; (void)width; (void)height;
     out->frame_count_min = out->frame_count_step = 1;
     out->needs_depth = ((masked*)user)->needs_depth;
@@ -458,7 +458,7 @@ static void test_masked_references(gsf_context* ctx) {
         desc.first_round = 2;
         if (!CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &restorer, &fixer))) break;
         gsf_fix_stats stats;
-        for (int i = 0; i < 8 && !m.begun; i++) CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats));
+        for (int i = 0; i < 8 && !m.begun; i++) CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats));
         CHECK(m.begun == 1);
         gsf_splat_destroy_fixer(ctx, fixer);
     }
@@ -473,7 +473,7 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     memset(&given, 0, sizeof given);
     given.train.lambda_ssim = -1.0f;
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
-    used = gsf_splat_fixer_desc(fixer);
+    used = gsf_splat_get_fixer_desc(fixer);
     CHECK(used.rounds == 3 && used.windows == VIEWS && used.window_frames == 17 && used.lambda == 1.0f);
     CHECK(used.first_round == 9999 && used.last_round == 24999 && used.skip_psnr == 0.0f);
     CHECK(used.train.iterations == 30000 && used.train.lr_means == 1.6e-4f && used.train.lambda_ssim == 0.0f);
@@ -483,12 +483,12 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     given.lambda = -1.0f; // 0
     given.train.iterations = 150; // only one iteration comes shortly before a densification: rounds stay apart
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
-    used = gsf_splat_fixer_desc(fixer);
+    used = gsf_splat_get_fixer_desc(fixer);
     CHECK(used.first_round == 99 && used.last_round == 125 && used.lambda == 0.0f);
     gsf_splat_destroy_fixer(ctx, fixer);
     given = repair_desc();
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, NULL, &fixer));
-    used = gsf_splat_fixer_desc(fixer);
+    used = gsf_splat_get_fixer_desc(fixer);
     CHECK(used.rounds == 0 && used.train.densify_interval == 20); // nobody to restore
     gsf_splat_destroy_fixer(ctx, fixer);
 
@@ -532,7 +532,7 @@ static double held_out_psnr(gsf_context* ctx, repair* r, gsf_fixer* fixer) {
         out.color = gsf_wrap_image(a, GSF_F32, WIDTH, HEIGHT, 3);
         CHECK_OK(ctx, gsf_splat_render(ctx, r->rasterizer, &r->truth, &camera, NULL, &out));
         out.color = gsf_wrap_image(b, GSF_F32, WIDTH, HEIGHT, 3);
-        CHECK_OK(ctx, gsf_splat_trainer_render(ctx, gsf_splat_fixer_trainer(fixer), &camera, &out));
+        CHECK_OK(ctx, gsf_splat_render_trainer(ctx, gsf_splat_get_trainer(fixer), &camera, &out));
         double error = 0.0;
         for (int k = 0; k < 3 * PIXELS; k++) error += pow((double)(a[k] - b[k]), 2.0) / (3.0 * PIXELS);
         sum += -10.0 * log10(error) / 3.0;
@@ -541,8 +541,8 @@ static double held_out_psnr(gsf_context* ctx, repair* r, gsf_fixer* fixer) {
 }
 
 static int same_splats(gsf_fixer* a, gsf_fixer* b) {
-    const gsf_splats *x = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(a));
-    const gsf_splats *y = gsf_splat_trainer_splats(gsf_splat_fixer_trainer(b));
+    const gsf_splats *x = gsf_splat_get_trained(gsf_splat_get_trainer(a));
+    const gsf_splats *y = gsf_splat_get_trained(gsf_splat_get_trainer(b));
     return x->count == y->count && memcmp(x->means, y->means, 12 * x->count) == 0 &&
            memcmp(x->sh, y->sh, 12 * x->count) == 0 && memcmp(x->opacity_logits, y->opacity_logits, 4 * x->count) == 0;
 }
@@ -567,22 +567,22 @@ static void test_loop(gsf_context* ctx) {
     // continue from a checkpoint taken after every few steps, in all stages
     for (int stop = 1; stop < 126; stop += stop > 38 && stop < 48 ? 1 : 13) {
         gsf_fixer *first, *second;
-        gsf_text chunks;
+        gsf_buffer chunks;
         memset(&chunks, 0, sizeof chunks);
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &first));
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &second));
         run_steps(ctx, first, stop, NULL);
-        gsf_splat_fixer_save(ctx, first, &chunks);
-        gsf_chunks_end(ctx, &chunks);
+        gsf_splat_format_fixer(ctx, first, &chunks);
+        gsf_append_last_chunk(ctx, &chunks);
         CHECK(!chunks.failed);
         gsf_splat_destroy_fixer(ctx, first);
-        CHECK_OK(ctx, gsf_splat_fixer_restore(ctx, second, "checkpoint", chunks.data, chunks.size));
+        CHECK_OK(ctx, gsf_splat_parse_fixer(ctx, second, "checkpoint", chunks.data, chunks.size));
         CHECK(run_steps(ctx, second, 1000, NULL));
         if (!CHECK(same_splats(fixed, second))) fprintf(stderr, "  resumed after %d steps\n", stop);
         for (size_t cut = 0; cut < chunks.size && stop == 1; cut += chunks.size / 50 + 1)
-            CHECK(gsf_splat_fixer_restore(ctx, second, "cut", chunks.data, cut) != GSF_OK);
+            CHECK(gsf_splat_parse_fixer(ctx, second, "cut", chunks.data, cut) != GSF_OK);
         gsf_splat_destroy_fixer(ctx, second);
-        gsf_destroy_text(ctx, &chunks);
+        gsf_destroy_buffer(ctx, &chunks);
     }
     CHECK(r.begun == r.ended);
     gsf_splat_destroy_fixer(ctx, plain);
@@ -604,12 +604,12 @@ static void test_rigs(gsf_context* ctx) {
         for (int i = 0; i < VIEWS; i++) {
             gsf_camera c = around(0.0, 0.0);
             double pose[16];
-            gsf_camera_c2w(&c, pose);
+            gsf_get_camera_c2w(&c, pose);
             if (!rig) pose[12] += 0.3 * i - 0.45;
             const double eye[3] = {pose[12], pose[13], pose[14]}, up[3] = {0, -1, 0}, turn = rig ? 0.2 * i : 0.0;
             const double target[3] = {eye[0] + sin(turn), eye[1], eye[2] + cos(turn)};
             CHECK_OK(ctx, gsf_traj_look_at(ctx, eye, target, up, pose));
-            gsf_camera_set_c2w(&c, pose);
+            gsf_set_camera_c2w(&c, pose);
             r.views[i].camera = c;
         }
         gsf_fixer* fixer = NULL;
@@ -618,7 +618,7 @@ static void test_rigs(gsf_context* ctx) {
         gsf_fix_stats now;
         memset(&now, 0, sizeof now);
         while (fixer && now.stage != GSF_FIX_DONE)
-            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &now))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &now))) break;
         gsf_splat_destroy_fixer(ctx, fixer);
         desc.rounds = -1;
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, NULL, &fixer));
@@ -648,7 +648,7 @@ static void test_given_path(gsf_context* ctx) {
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer));
         size_t frames = 0, last = 0, jumps = 0, wrong = 0;
         while (fixer && now.stage != GSF_FIX_DONE) {
-            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &now))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &now))) break;
             for (int i = 0; i < (now.stage == GSF_FIX_RESTORE ? now.frame_count : 0); i++, frames++) {
                 const gsf_camera* camera = now.cameras + i;
                 size_t at = 0;
@@ -692,10 +692,10 @@ static void test_native_frames(gsf_context* ctx) {
         if (kind >= 2) r.also.width_max = 96, r.also.height_max = 40;
         if (kind == 2) r.multiple = 40, r.also.width_max = 120, desc.max_pixels = 100; // as if to shrink photos to a corner
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer));
-        CHECK(gsf_splat_fixer_desc(fixer).window_frames == 13);
+        CHECK(gsf_splat_get_fixer_desc(fixer).window_frames == 13);
         int windows = 0, wrong = 0;
         for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE;) {
-            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) break;
             if (stats.stage != GSF_FIX_RESTORE) continue;
             windows++;
             CHECK(stats.frame_count == 13);
@@ -735,7 +735,7 @@ static void test_trouble(gsf_context* ctx) {
     int errors = 0, cancels = 0, steps = 0;
     for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE && steps < 1000; steps++) {
         if (steps == 30 || steps == 43) gsf_request_cancel(ctx);
-        const gsf_result result = gsf_splat_fix_step(ctx, rough, &stats);
+        const gsf_result result = gsf_splat_step_fixer(ctx, rough, &stats);
         if (result == GSF_ERROR_CANCELLED) {
             cancels++;
             gsf_clear_cancel(ctx);
@@ -753,7 +753,7 @@ static void test_trouble(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough));
     r.checked = 0;
     for (stats.stage = GSF_FIX_TRAIN, steps = 0; stats.stage != GSF_FIX_DONE && steps < 1000; steps++)
-        CHECK_OK(ctx, gsf_splat_fix_step(ctx, rough, &stats));
+        CHECK_OK(ctx, gsf_splat_step_fixer(ctx, rough, &stats));
     printf("%d of 4 windows skipped\n", (int)stats.skipped);
     CHECK(stats.skipped > 0 && r.checked == 4 - stats.skipped);
     gsf_splat_destroy_fixer(ctx, rough);
@@ -773,13 +773,13 @@ static void test_trouble(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-static int saves_as(gsf_context* ctx, const gsf_fixer* fixer, const gsf_text* expected) {
-    gsf_text chunks;
+static int saves_as(gsf_context* ctx, const gsf_fixer* fixer, const gsf_buffer* expected) {
+    gsf_buffer chunks;
     memset(&chunks, 0, sizeof chunks);
-    gsf_splat_fixer_save(ctx, fixer, &chunks);
-    gsf_chunks_end(ctx, &chunks);
+    gsf_splat_format_fixer(ctx, fixer, &chunks);
+    gsf_append_last_chunk(ctx, &chunks);
     const int same = chunks.size == expected->size && memcmp(chunks.data, expected->data, chunks.size) == 0;
-    gsf_destroy_text(ctx, &chunks);
+    gsf_destroy_buffer(ctx, &chunks);
     return same;
 }
 
@@ -796,38 +796,38 @@ static void test_failed_restore(void) {
     const gsf_fix_desc desc = repair_desc();
     gsf_fixer *whole, *first, *second;
     gsf_fix_stats stats;
-    gsf_text untouched = {0}, chunks = {0};
+    gsf_buffer untouched = {0}, chunks = {0};
     CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &whole));
     CHECK(run_steps(&ctx, whole, 1000, NULL));
     CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &first));
     for (int round = 0; round < 2;) { // frames of the first round are trained on, the second is being restored
-        CHECK_OK(&ctx, gsf_splat_fix_step(&ctx, first, &stats));
+        CHECK_OK(&ctx, gsf_splat_step_fixer(&ctx, first, &stats));
         round = stats.stage == GSF_FIX_RESTORE ? stats.round : 0;
     }
-    gsf_splat_fixer_save(&ctx, first, &chunks);
-    gsf_chunks_end(&ctx, &chunks);
+    gsf_splat_format_fixer(&ctx, first, &chunks);
+    gsf_append_last_chunk(&ctx, &chunks);
     gsf_splat_destroy_fixer(&ctx, first);
     CHECK_OK(&ctx, gsf_splat_make_fixer(&ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &second));
-    gsf_splat_fixer_save(&ctx, second, &untouched);
-    gsf_chunks_end(&ctx, &untouched);
+    gsf_splat_format_fixer(&ctx, second, &untouched);
+    gsf_append_last_chunk(&ctx, &untouched);
     CHECK(!chunks.failed && !untouched.failed);
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
     size_t failures = 0;
     for (; result == GSF_ERROR_OUT_OF_MEMORY && failures < 1000; failures++) {
         memory.fail_at = memory.calls + 1 + failures;
-        result = gsf_splat_fixer_restore(&ctx, second, "checkpoint", chunks.data, chunks.size);
+        result = gsf_splat_parse_fixer(&ctx, second, "checkpoint", chunks.data, chunks.size);
         memory.fail_at = 0;
         if (result != GSF_OK && !CHECK(saves_as(&ctx, second, &untouched))) break;
     }
     CHECK(result == GSF_OK && failures > 10 && saves_as(&ctx, second, &chunks));
     memory.fail_at = memory.calls + 1;
-    CHECK_RESULT(&ctx, gsf_splat_fix_step(&ctx, second, &stats), GSF_ERROR_OUT_OF_MEMORY);
+    CHECK_RESULT(&ctx, gsf_splat_step_fixer(&ctx, second, &stats), GSF_ERROR_OUT_OF_MEMORY);
     memory.fail_at = 0;
     CHECK(run_steps(&ctx, second, 1000, NULL) && same_splats(whole, second));
     gsf_splat_destroy_fixer(&ctx, second);
     gsf_splat_destroy_fixer(&ctx, whole);
-    gsf_destroy_text(&ctx, &untouched);
-    gsf_destroy_text(&ctx, &chunks);
+    gsf_destroy_buffer(&ctx, &untouched);
+    gsf_destroy_buffer(&ctx, &chunks);
     repair_teardown(&ctx, &r);
     CHECK(memory.live == 0);
 }
@@ -844,10 +844,10 @@ static void mixed_setup(gsf_context* ctx, repair* r) {
 }
 
 // Frames in the checkpoint's list `tag`, as drawn above gsf__save_frames.
-static uint64_t frames_in(const gsf_text* chunks, const char* tag) {
+static uint64_t frames_in(const gsf_buffer* chunks, const char* tag) {
     gsf_chunk chunk;
     uint64_t count = 0;
-    if (!CHECK(gsf_chunks_find(chunks->data, chunks->size, tag, &chunk) && chunk.size >= 8)) return 0;
+    if (!CHECK(gsf_find_chunk(chunks->data, chunks->size, tag, &chunk) && chunk.size >= 8)) return 0;
     for (int i = 7; i >= 0; i--) count = count << 8 | ((const unsigned char*)chunk.data)[i];
     return count;
 }
@@ -858,7 +858,7 @@ static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int sk
     gsf_fix_desc desc = repair_desc();
     gsf_fixer *fixer, *next;
     gsf_fix_stats stats;
-    gsf_text chunks;
+    gsf_buffer chunks;
     desc.windows = 4;
     desc.train.iterations = 12;
     desc.first_round = 3;
@@ -870,7 +870,7 @@ static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int sk
     uint64_t pending = 0;
     int skipped = 0, windows = 0;
     for (stats.stage = GSF_FIX_TRAIN; stats.stage != GSF_FIX_DONE;) {
-        if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) break;
+        if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) break;
         if (stats.stage != GSF_FIX_RESTORE) continue;
         const int skip = stats.window <= skips;
         windows++;
@@ -881,19 +881,19 @@ static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int sk
         for (int i = 0; i < stats.frame_count; i++) pending += !skip && stats.reference_index[i] < 0;
         if (!resumed) continue;
         chunks.size = 0;
-        gsf_splat_fixer_save(ctx, fixer, &chunks);
-        gsf_chunks_end(ctx, &chunks);
+        gsf_splat_format_fixer(ctx, fixer, &chunks);
+        gsf_append_last_chunk(ctx, &chunks);
         CHECK(!chunks.failed && frames_in(&chunks, "FIXP") == pending);
         gsf_splat_destroy_fixer(ctx, fixer);
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r->views, VIEWS, &r->start, &r->restorer, &next));
-        CHECK_OK(ctx, gsf_splat_fixer_restore(ctx, next, "checkpoint", chunks.data, chunks.size));
+        CHECK_OK(ctx, gsf_splat_parse_fixer(ctx, next, "checkpoint", chunks.data, chunks.size));
         fixer = next;
     }
     CHECK(windows == 8 && r->restored == 8 - 2 * skips);
     chunks.size = 0;
-    gsf_splat_fixer_save(ctx, fixer, &chunks);
+    gsf_splat_format_fixer(ctx, fixer, &chunks);
     CHECK(frames_in(&chunks, "FIXA") == pending); // what the second round restored, and only that, is trained on
-    gsf_destroy_text(ctx, &chunks);
+    gsf_destroy_buffer(ctx, &chunks);
     return fixer;
 }
 
@@ -917,7 +917,7 @@ static void test_mixed_windows(gsf_context* ctx) {
 typedef struct wrapped { gsf_restorer warp; int hides, begun, restored; } wrapped;
 
 static gsf_result wrapped_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
-                                gsf_restorer_limits* out) {
+                                gsf_restorer_info* out) {
     const wrapped* w = (const wrapped*)user;
     const gsf_result result = w->warp.query_fn(w->warp.user, ctx, frames, width, height, out);
     CHECK(out->explains);
@@ -959,7 +959,7 @@ static void test_explaining_restorer(gsf_context* ctx) {
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, used, &fixers[i]));
         int skipped = 0;
         for (gsf_fix_stats stats = {0}; stats.stage != GSF_FIX_DONE; skipped = stats.skipped)
-            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixers[i], &stats))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixers[i], &stats))) break;
         CHECK(skipped == 4);
         CHECK(w->begun == (i < 2 ? 2 : 0) && w->restored == (i == 0 ? 8 : i == 1 ? 4 : 0)); // all windows; those to repair
         CHECK(same_splats(fixers[0], fixers[i]));
@@ -981,8 +981,8 @@ static void test_seen_mask(gsf_context* ctx) {
     for (int i = 0; i < VIEWS; i++) cameras[i] = r.views[i].camera;
     gsf_image mask = gsf_wrap_image(seen, GSF_U8, WIDTH, HEIGHT, 1),
               full = gsf_wrap_image(all, GSF_U8, WIDTH, HEIGHT, 1);
-    CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, cameras, VIEWS, &full));
-    CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, &novel, 1, &mask)); // a camera sees what it sees
+    CHECK_OK(ctx, gsf_splat_render_seen_mask(ctx, &r.truth, &novel, cameras, VIEWS, &full));
+    CHECK_OK(ctx, gsf_splat_render_seen_mask(ctx, &r.truth, &novel, &novel, 1, &mask)); // a camera sees what it sees
     int self = 0, more = 0, covered = 0;
     static float alpha[PIXELS];
     gsf_render_output out;
@@ -996,7 +996,7 @@ static void test_seen_mask(gsf_context* ctx) {
         CHECK(seen[i] <= 1 && all[i] <= 1 && (alpha[i] >= 0.5f || !(seen[i] | all[i])));
     }
     CHECK(self == covered && more <= covered && more > covered / 2);
-    CHECK_OK(ctx, gsf_splat_seen_mask(ctx, &r.truth, &novel, NULL, 0, &mask));
+    CHECK_OK(ctx, gsf_splat_render_seen_mask(ctx, &r.truth, &novel, NULL, 0, &mask));
     for (int i = 0; i < PIXELS; i++) CHECK(seen[i] == 0);
     repair_teardown(ctx, &r);
 }

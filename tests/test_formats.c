@@ -98,11 +98,11 @@ static void test_splat_by_hand(void) {
     s.sh[1] = -10.0f;
     s.sh[5] = 0.7f;
     s.opacity_logits[1] = 10.0f;
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     if (CHECK_OK(&ctx, gsf_splat_format(&ctx, "hand.splat", &s, NULL, &text)))
         CHECK(text.size == sizeof written && memcmp(text.data, written, sizeof written) == 0);
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     gsf_splat_destroy(&ctx, &s);
     CHECK(count.live == 0 && warnings == 0);
 }
@@ -163,7 +163,7 @@ static void test_spz_by_hand(void) {
     s = hand_splats(&ctx);
     for (int version = 2; version <= 3; version++) {
         gsf_splat_save_desc desc = {GSF_SPLAT_SPZ, 0, version};
-        gsf_text text;
+        gsf_buffer text;
         size_t size;
         memset(&text, 0, sizeof text);
         if (CHECK_OK(&ctx, gsf_splat_format(&ctx, "any name", &s, &desc, &text))) {
@@ -171,7 +171,7 @@ static void test_spz_by_hand(void) {
             CHECK(size == spz_by_hand_size[version - 1] && memcmp(content, spz_by_hand[version - 1], size) == 0);
             gsf_free(&ctx, content);
         }
-        gsf_destroy_text(&ctx, &text);
+        gsf_destroy_buffer(&ctx, &text);
     }
     gsf_splat_destroy(&ctx, &s);
     CHECK(count.live == 0 && warnings == 0);
@@ -188,7 +188,7 @@ static void test_official(void) {
     for (int version = 2; version <= 3; version++) {
         char path[1024];
         gsf_splat_save_desc desc = {GSF_SPLAT_SPZ, 0, version};
-        gsf_text text;
+        gsf_buffer text;
         memset(&text, 0, sizeof text);
         snprintf(path, sizeof path, "%s/corpus/spz/official_v%d", TESTS, version);
         size_t file_size, size, our_size;
@@ -205,7 +205,7 @@ static void test_official(void) {
             gsf_free(&ctx, ours);
             CHECK(text.size <= file_size + file_size / 4); // zlib's is smaller by what codes of its own save
         }
-        gsf_destroy_text(&ctx, &text);
+        gsf_destroy_buffer(&ctx, &text);
         if (CHECK_OK(&ctx, gsf_splat_load(&ctx, path, &official))) { // known by its content
             CHECK(official.count == s.count && official.sh_degree == 3 && official.antialiased == 1);
             gsf_splat_destroy(&ctx, &official);
@@ -221,7 +221,7 @@ static void test_official(void) {
 static gsf_splats random_splats(gsf_context* ctx, size_t n, int32_t degree, double extent, uint64_t seed) {
     gsf_splats s;
     CHECK_OK(ctx, gsf_splat_make(ctx, n, degree, &s));
-    const size_t sh = (size_t)gsf_splat_sh_count(degree);
+    const size_t sh = (size_t)gsf_splat_count_sh(degree);
     for (size_t i = 0; i < 3 * n; i++) s.means[i] = (float)test_random_in(&seed, -extent, extent);
     for (size_t i = 0; i < 3 * n; i++) s.log_scales[i] = (float)test_random_in(&seed, -8, 5);
     for (size_t i = 0; i < 4 * n; i++) s.quats[i] = (float)test_random_in(&seed, -3, 3);
@@ -237,7 +237,7 @@ typedef struct bounds { double mean, log_scale, opacity, dc, band1, rest, quat; 
 
 static void check_close(const gsf_splats* a, const gsf_splats* b, bounds most) {
     bounds worst = {0, 0, 0, 0, 0, 0, 0};
-    const size_t ka = (size_t)gsf_splat_sh_count(a->sh_degree), kb = (size_t)gsf_splat_sh_count(b->sh_degree);
+    const size_t ka = (size_t)gsf_splat_count_sh(a->sh_degree), kb = (size_t)gsf_splat_count_sh(b->sh_degree);
     CHECK(a->count == b->count && (kb == ka || kb == 1));
     if (a->count != b->count) return;
     for (size_t i = 0; i < a->count; i++) {
@@ -311,7 +311,7 @@ static void test_workers(void) {
     gsf_splats s = random_splats(&ctx, 20000, 3, 2.0, 5), again;
     static const char* const names[2] = {"x.splat", "x.spz"};
     for (int i = 0; i < 2; i++) {
-        gsf_text a, b;
+        gsf_buffer a, b;
         memset(&a, 0, sizeof a);
         memset(&b, 0, sizeof b);
         CHECK_OK(&ctx, gsf_splat_format(&ctx, names[i], &s, NULL, &a));
@@ -322,8 +322,8 @@ static void test_workers(void) {
             CHECK_NEAR(again.means[3 * 19999], s.means[3 * 19999], 0.5 / 4096);
             gsf_splat_destroy(&odd, &again);
         }
-        gsf_destroy_text(&ctx, &a);
-        gsf_destroy_text(&odd, &b);
+        gsf_destroy_buffer(&ctx, &a);
+        gsf_destroy_buffer(&odd, &b);
     }
     gsf_splat_destroy(&ctx, &s);
     CHECK(count.live == 0 && odd_count.live == 0);
@@ -342,7 +342,7 @@ static void test_not_finite(void) {
                 gsf_splats s = random_splats(&ctx, 5, 1, 1.0, 3), again;
                 float* arrays[5] = {s.means + 3 * 2, s.log_scales + 3 * 2 + 1, s.quats + 4 * 2 + 3, s.opacity_logits + 2,
                                     s.sh + 12 * 2 + 11};
-                gsf_text text;
+                gsf_buffer text;
                 memset(&text, 0, sizeof text);
                 arrays[attribute][0] = evil[e];
                 CHECK_OK(&ctx, gsf_splat_format(&ctx, names[f], &s, NULL, &text));
@@ -352,7 +352,7 @@ static void test_not_finite(void) {
                     CHECK_NEAR(again.means[3 * 2], s.means[3 * 3], 1.0 / 4096); // the others moved up
                     gsf_splat_destroy(&ctx, &again);
                 }
-                gsf_destroy_text(&ctx, &text);
+                gsf_destroy_buffer(&ctx, &text);
                 gsf_splat_destroy(&ctx, &s);
                 CHECK(count.live == 0);
             }
@@ -378,7 +378,7 @@ static void test_not_finite(void) {
         for (size_t i = 0; i < 6; i++) s.sh[i] = i < 3 ? -3e38f : 3e38f;
         for (int f = 0; f < 2; f++) {
             static const char* const limits[2] = {"y.splat", "y.spz"};
-            gsf_text text;
+            gsf_buffer text;
             gsf_splats again;
             memset(&text, 0, sizeof text);
             CHECK_OK(&ctx, gsf_splat_format(&ctx, limits[f], &s, NULL, &text));
@@ -387,7 +387,7 @@ static void test_not_finite(void) {
                 for (size_t i = 0; i < 8; i++) CHECK_NEAR(again.quats[i], 0.5, 0.005);
                 gsf_splat_destroy(&ctx, &again);
             }
-            gsf_destroy_text(&ctx, &text);
+            gsf_destroy_buffer(&ctx, &text);
         }
         gsf_splat_destroy(&ctx, &s);
     }
@@ -395,7 +395,7 @@ static void test_not_finite(void) {
 }
 
 static int fraction_of(gsf_context* ctx, const gsf_splats* s, const gsf_splat_save_desc* desc) { // -1: refused
-    gsf_text text;
+    gsf_buffer text;
     size_t size;
     int fraction = -1;
     memset(&text, 0, sizeof text);
@@ -404,7 +404,7 @@ static int fraction_of(gsf_context* ctx, const gsf_splats* s, const gsf_splat_sa
         fraction = content[13];
         gsf_free(ctx, content);
     }
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
     return fraction;
 }
 
@@ -413,7 +413,7 @@ static void test_extent(void) {
     gsf_context ctx = make_context(&count, 0);
     const gsf_splat_save_desc local = {GSF_SPLAT_SPZ, 1, 0}, wrong = {GSF_SPLAT_SPZ, 0, 1};
     gsf_splats s = random_splats(&ctx, 300, 0, 3.0, 9), again;
-    gsf_text text;
+    gsf_buffer text;
     for (size_t i = 0; i < 3 * s.count; i++) s.log_scales[i] = -4.0f;
     CHECK(fraction_of(&ctx, &s, NULL) == 12 && warnings == 0);
     s.means[5] = 2047.99f;
@@ -457,7 +457,7 @@ static void test_extent(void) {
             CHECK(worst <= (is_local ? 0.0 : 0.2501) && (again.origin[0] != 0.0) == !is_local);
             gsf_splat_destroy(&ctx, &again);
         }
-        gsf_destroy_text(&ctx, &text);
+        gsf_destroy_buffer(&ctx, &text);
     }
     s.log_scales[0] = 7.0f; // larger than SPZ holds
     warnings = 0;
@@ -473,7 +473,7 @@ static void test_types(void) {
     static const gsf_splat_type types[3] = {GSF_SPLAT_PLY, GSF_SPLAT_SPLAT, GSF_SPLAT_SPZ};
     static const char* const names[4] = {"a.ply", "a.SPLAT", "a.Spz", "a"};
     for (int t = 0; t < 3; t++) {
-        gsf_text text;
+        gsf_buffer text;
         gsf_splat_save_desc desc = {types[t], 0, 0};
         memset(&text, 0, sizeof text);
         CHECK_OK(&ctx, gsf_splat_format(&ctx, "nothing", &s, &desc, &text));
@@ -484,7 +484,7 @@ static void test_types(void) {
             else CHECK(r == GSF_ERROR_FORMAT && strncmp(ctx.error, names[n], strlen(names[n])) == 0);
             gsf_splat_destroy(&ctx, &again);
         }
-        gsf_destroy_text(&ctx, &text);
+        gsf_destroy_buffer(&ctx, &text);
     }
     CHECK_RESULT(&ctx, gsf_splat_save(&ctx, test_scratch("x.obj"), &s, NULL), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_RESULT(&ctx, gsf_splat_load(&ctx, "no/such/file.spz", &again), GSF_ERROR_NOT_FOUND);
@@ -509,7 +509,7 @@ static void test_damage(void) {
     counter count;
     gsf_context ctx = make_context(&count, 0);
     gsf_splats s = random_splats(&ctx, 3, 1, 1.0, 13);
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.spz", &s, NULL, &text));
     for (size_t cut = 0; cut < text.size; cut++) {
@@ -566,14 +566,14 @@ static void test_damage(void) {
             free(file);
         }
     }
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.splat", &s, NULL, &text));
     for (size_t cut = 0; cut < text.size; cut++) {
         unsigned char* part = exact_copy(text.data, cut);
         parse_damaged(&ctx, "cut.splat", part, cut, cut % 32 == 0);
         free(part);
     }
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     gsf_splat_destroy(&ctx, &s);
     CHECK(count.live == 0);
 }
@@ -631,7 +631,7 @@ static void test_out_of_memory(void) {
                 counter count;
                 gsf_context ctx = make_context(&count, 0);
                 gsf_splats s = random_splats(&ctx, 50, 1, 1.0, 17), again;
-                gsf_text text;
+                gsf_buffer text;
                 memset(&text, 0, sizeof text);
                 memset(&again, 0, sizeof again);
                 s.means[0] = NAN; // so that rows are left out
@@ -642,7 +642,7 @@ static void test_out_of_memory(void) {
                     r = gsf_splat_parse(&ctx, names[f], text.data, text.size, &again);
                 }
                 const int expected = CHECK(r == GSF_OK || (r == GSF_ERROR_OUT_OF_MEMORY && again.owned == NULL));
-                gsf_destroy_text(&ctx, &text);
+                gsf_destroy_buffer(&ctx, &text);
                 gsf_splat_destroy(&ctx, &again);
                 gsf_splat_destroy(&ctx, &s);
                 CHECK(count.live == 0);
@@ -654,7 +654,7 @@ static void test_out_of_memory(void) {
 // ---- gzip ----------------------------------------------------------------------
 
 static void check_gzip(gsf_context* ctx, const unsigned char* data, size_t size, double most) {
-    gsf_text text;
+    gsf_buffer text;
     size_t back_size;
     memset(&text, 0, sizeof text);
     CHECK_OK(ctx, gsf__gzip_append(ctx, "data", data, size, &text));
@@ -662,7 +662,7 @@ static void check_gzip(gsf_context* ctx, const unsigned char* data, size_t size,
     CHECK(back_size == size && memcmp(back, data, size) == 0);
     CHECK((double)text.size <= most * (double)size + 40);
     gsf_free(ctx, back);
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
 }
 
 static void test_gzip(void) {

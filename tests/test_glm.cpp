@@ -23,11 +23,11 @@ static gsf_camera random_camera(uint64_t* seed) {
     }
     gsf_from_glm_view(glm::lookAt(eye, to, glm::dvec3(0.1, 1.0, -0.2)), &camera);
     double center[3];
-    gsf_camera_center(&camera, center);
+    gsf_get_camera_center(&camera, center);
     for (int k = 0; k < 3; k++) CHECK_NEAR(center[k], eye[k], 1e-12);
     double u = 0, v = 0, depth = 0; // the point looked at lies in the middle, before the camera
     const double target[3] = {to.x, to.y, to.z};
-    CHECK(gsf_camera_project(&camera, target, &u, &v, &depth));
+    CHECK(gsf_project_point(&camera, target, &u, &v, &depth));
     CHECK_NEAR(u, camera.cx, 1e-9);
     CHECK_NEAR(v, camera.cy, 1e-9);
     CHECK_NEAR(depth, glm::length(to - eye), 1e-12);
@@ -47,7 +47,7 @@ int main() {
         double back[16], c2w[16], product[16];
         gsf_from_glm(w2c, back);
         CHECK(memcmp(back, camera.w2c, sizeof back) == 0);
-        gsf_camera_c2w(&camera, c2w);
+        gsf_get_camera_c2w(&camera, c2w);
         const glm::dmat4 inverse = glm::inverse(w2c), other = glm::translate(inverse, glm::dvec3(1, 2, 3));
         double wide[16];
         gsf_from_glm(inverse, wide);
@@ -56,7 +56,7 @@ int main() {
         gsf_from_glm(w2c * other, wide);
         test_compare("product", product, wide, 16, 1e-12);
         gsf_camera same = camera;
-        gsf_camera_set_c2w(&same, c2w);
+        gsf_set_camera_c2w(&same, c2w);
         test_compare("set_c2w", same.w2c, camera.w2c, 16, 1e-12);
         // rotation through a glm quaternion and back
         const glm::dmat4 turned = glm::mat4_cast(glm::quat_cast(glm::dmat3(w2c)));
@@ -72,7 +72,7 @@ int main() {
         const glm::dvec3 window = glm::project(world, view, projection, viewport);
         const double point[3] = {world.x, world.y, world.z};
         double u = 0, v = 0, depth = 0;
-        CHECK(gsf_camera_project(&camera, point, &u, &v, &depth));
+        CHECK(gsf_project_point(&camera, point, &u, &v, &depth));
         CHECK_NEAR(u, window.x, 1e-9);
         CHECK_NEAR(camera.height - v, window.y, 1e-9);
         CHECK_NEAR(depth, local.z, 1e-12);
@@ -81,7 +81,7 @@ int main() {
         // a point behind the camera
         const glm::dvec3 behind(inverse * glm::dvec4(0.0, 0.0, -1.0, 1.0));
         const double hidden[3] = {behind.x, behind.y, behind.z};
-        CHECK(!gsf_camera_project(&camera, hidden, &u, &v, &depth));
+        CHECK(!gsf_project_point(&camera, hidden, &u, &v, &depth));
 
         // the same projection as glm::frustum of the image borders on the near plane
         const double near_plane = 0.1, l = -camera.cx / camera.fx, r = (camera.width - camera.cx) / camera.fx;

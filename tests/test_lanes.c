@@ -94,8 +94,8 @@ GSF__V_KERNEL void GSF__V(check_integers)(void) {
     float out[MOST];
     int32_t ints[MOST], a[MOST], b[MOST];
     for (int i = 0; i < MOST; i++) {
-        a[i] = (int32_t)(uint32_t)gsf_random_bits(1, 2, (uint64_t)i);
-        b[i] = (int32_t)(uint32_t)gsf_random_bits(1, 3, (uint64_t)i);
+        a[i] = (int32_t)(uint32_t)gsf_draw_bits(1, 2, (uint64_t)i);
+        b[i] = (int32_t)(uint32_t)gsf_draw_bits(1, 3, (uint64_t)i);
     }
     const gsf__vi p = gsf__vi_load(a), q = gsf__vi_load(b);
     const gsf__vm odd = gsf__vm_of_bits(0xaaaau & ((1u << GSF__LANES) - 1u));

@@ -62,23 +62,23 @@ static int exists(const folder* f, const char* name) {
 static double same_values(gsf_context* ctx, const folder* a, const folder* b, const char* name, int narrow) {
     gsf_nn_weights x, y;
     double same = 0.0, count = 0.0;
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(a, name), NULL, &x))) return -1.0;
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(b, name), NULL, &y))) return -1.0;
+    if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, inside(a, name), NULL, &x))) return -1.0;
+    if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, inside(b, name), NULL, &y))) return -1.0;
     int ok = x.tensor_count == y.tensor_count && x.tensor_count > 0;
     for (size_t i = 0; ok && i < x.tensor_count; i++) {
-        const gsf_tensor *s = &x.tensors[i], *t = &y.tensors[i];
+        const gsf_nn_tensor *s = &x.tensors[i], *t = &y.tensors[i];
         ok = strcmp(s->name, t->name) == 0 && s->rank == t->rank && memcmp(s->shape, t->shape, sizeof s->shape) == 0;
         for (int64_t k = 0; ok && k < s->count; k++) {
             float u, v;
-            gsf_nn_read_tensor(s, k, 1, &u);
-            gsf_nn_read_tensor(t, k, 1, &v);
+            gsf_nn_convert_tensor(s, k, 1, &u);
+            gsf_nn_convert_tensor(t, k, 1, &v);
             if (narrow) u = gsf__bf16_to_float(gsf__float_to_bf16(u));
             same += u == v;
         }
         count += (double)s->count;
     }
-    gsf_nn_close_weights(ctx, &x);
-    gsf_nn_close_weights(ctx, &y);
+    gsf_nn_destroy_weights(ctx, &x);
+    gsf_nn_destroy_weights(ctx, &y);
     return ok ? same / count : -1.0;
 }
 
@@ -178,7 +178,7 @@ static void check_list(model_list* list, const gsf_nn_weights* weights) {
     CHECK_OK(list->ctx, list->result);
     CHECK(list->count == weights->tensor_count);
     for (size_t i = 0; i < list->count; i++) {
-        const gsf_tensor* t = gsf_nn_find_tensor(weights, list->tensors[i].name);
+        const gsf_nn_tensor* t = gsf_nn_find_tensor(weights, list->tensors[i].name);
         const int ok = t && t->rank == list->tensors[i].rank &&
                        memcmp(t->shape, list->tensors[i].shape, (size_t)t->rank * sizeof t->shape[0]) == 0;
         if (!CHECK(ok)) fprintf(stderr, "    %s\n", list->tensors[i].name);
@@ -190,7 +190,7 @@ static void check_list(model_list* list, const gsf_nn_weights* weights) {
     do {                                                                   \
         gsf_nn_##net net;                                                  \
         model_list list = model_begin_list(ctx, MODEL_ALL);                \
-        if (CHECK_OK(ctx, gsf_nn_make_##net(ctx, test_golden(path), &net))) { \
+        if (CHECK_OK(ctx, gsf_nn_load_##net(ctx, test_golden(path), &net))) { \
             add(&list, source);                                            \
             check_list(&list, &net.weights);                               \
             gsf_nn_destroy_##net(ctx, &net);                               \
@@ -223,7 +223,7 @@ static void check_rms(const char* what, const float* x, size_t count, double low
 
 static float* made_noise(uint64_t seed, size_t count) {
     float* x = (float*)malloc(count * sizeof(float));
-    for (size_t i = 0; i < count; i++) x[i] = (float)gsf_random_normal(seed, 0, i);
+    for (size_t i = 0; i < count; i++) x[i] = (float)gsf_draw_normal(seed, 0, i);
     return x;
 }
 
@@ -244,11 +244,11 @@ static void see_tap(void* user, const char* name, int32_t row, const float* data
 static void check_transformer(gsf_context* ctx, const folder* model) {
     gsf_nn_transformer net;
     gsf_nn_weights features;
-    if (!CHECK_OK(ctx, gsf_nn_make_transformer(ctx, inside(model, "transformer"), &net))) return;
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, inside(model, "features.safetensors"), NULL, &features));
-    const gsf_tensor* dino = gsf_nn_find_tensor(&features, "dino_latents");
-    const gsf_tensor* vggt = gsf_nn_find_tensor(&features, "vggt_latents");
-    const gsf_tensor* text = gsf_nn_find_tensor(&features, "prompt_embeds");
+    if (!CHECK_OK(ctx, gsf_nn_load_transformer(ctx, inside(model, "transformer"), &net))) return;
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, inside(model, "features.safetensors"), NULL, &features));
+    const gsf_nn_tensor* dino = gsf_nn_find_tensor(&features, "dino_latents");
+    const gsf_nn_tensor* vggt = gsf_nn_find_tensor(&features, "vggt_latents");
+    const gsf_nn_tensor* text = gsf_nn_find_tensor(&features, "prompt_embeds");
     if (CHECK(dino && vggt && text)) {
         const int64_t tokens = dino->shape[0] * dino->shape[1], width = (int64_t)net.heads * net.head_dim;
         const int32_t frames = (net.sample_frames - 1) / net.temporal_ratio + 1;
@@ -260,11 +260,11 @@ static void check_transformer(gsf_context* ctx, const folder* model) {
         float* references = (float*)malloc((size_t)(tokens * width) * sizeof(float));
         float* out = (float*)malloc(plane * (size_t)net.out_channels * sizeof(float));
         float* hidden = made_noise(5, plane * (size_t)net.in_channels);
-        gsf_nn_read_tensor(dino, 0, dino->count, dino_values);
-        gsf_nn_read_tensor(vggt, 0, vggt->count, vggt_values);
-        gsf_nn_read_tensor(text, 0, text->count, text_values);
+        gsf_nn_convert_tensor(dino, 0, dino->count, dino_values);
+        gsf_nn_convert_tensor(vggt, 0, vggt->count, vggt_values);
+        gsf_nn_convert_tensor(text, 0, text->count, text_values);
         CHECK_OK(ctx, gsf_nn_project_references(ctx, &net, tokens, dino_values, vggt_values, references));
-        gsf_nn_transformer_input in;
+        gsf_nn_transformer_desc in;
         memset(&in, 0, sizeof in);
         in.batch = in.reference_batch = 1;
         in.frames = frames;
@@ -277,7 +277,7 @@ static void check_transformer(gsf_context* ctx, const folder* model) {
         in.reference_tokens = tokens;
         const gsf__nn_tap tap = {see_tap, NULL};
         in._tap = &tap;
-        CHECK_OK(ctx, gsf_nn_transformer_forward(ctx, &net, &in, out));
+        CHECK_OK(ctx, gsf_nn_run_transformer(ctx, &net, &in, out));
         check_rms("velocity", out, plane * (size_t)net.out_channels, 0.5, 2.0);
         CHECK(gates == 2 * net.layers);
         free(dino_values);
@@ -287,7 +287,7 @@ static void check_transformer(gsf_context* ctx, const folder* model) {
         free(out);
         free(hidden);
     }
-    gsf_nn_close_weights(ctx, &features);
+    gsf_nn_destroy_weights(ctx, &features);
     gsf_nn_destroy_transformer(ctx, &net);
 }
 
@@ -295,16 +295,16 @@ static void check_vae(gsf_context* ctx, const folder* model) {
     gsf_nn_vae vae;
     gsf_nn_vae_info info, back;
     const int64_t frames = 9, height = 48, width = 40;
-    if (!CHECK_OK(ctx, gsf_nn_make_vae(ctx, inside(model, "vae"), &vae))) return;
+    if (!CHECK_OK(ctx, gsf_nn_load_vae(ctx, inside(model, "vae"), &vae))) return;
     CHECK_OK(ctx, gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_ENCODE, NULL, frames, height, width, &info));
     CHECK_OK(ctx, gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_DECODE, NULL, info.frames, info.height, info.width, &back));
     const size_t count = (size_t)(vae.latent_channels * info.frames * info.height * info.width);
     const size_t pixels = (size_t)(vae.out_channels * back.frames * back.height * back.width);
     float* video = made_noise(6, (size_t)(vae.in_channels * frames * height * width));
     float *mean = (float*)malloc(count * sizeof(float)), *decoded = (float*)malloc(pixels * sizeof(float));
-    CHECK_OK(ctx, gsf_nn_vae_encode(ctx, &vae, NULL, video, frames, height, width, mean, NULL));
+    CHECK_OK(ctx, gsf_nn_encode_vae(ctx, &vae, NULL, video, frames, height, width, mean, NULL));
     check_rms("latents", mean, count, 0.2, 2.0);
-    CHECK_OK(ctx, gsf_nn_vae_decode(ctx, &vae, NULL, mean, info.frames, info.height, info.width, decoded));
+    CHECK_OK(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, mean, info.frames, info.height, info.width, decoded));
     check_rms("decoded", decoded, pixels, 0.2, 2.0);
     free(video);
     free(mean);
@@ -324,26 +324,26 @@ static void check_images(gsf_context* ctx, const folder* model) {
     enum { IMAGES = 2, TOKENS = 6, SIDE = 28, LONG_SIDE = 42, PIXELS = IMAGES * 3 * SIDE * LONG_SIDE };
     gsf_nn_dinov2 dinov2;
     gsf_nn_vggt vggt;
-    gsf_nn_encoder_input in;
+    gsf_nn_encoder_desc in;
     float* pixels = (float*)malloc(PIXELS * sizeof(float));
-    for (size_t i = 0; i < PIXELS; i++) pixels[i] = (float)gsf_random_uniform(9, 0, i);
+    for (size_t i = 0; i < PIXELS; i++) pixels[i] = (float)gsf_draw_uniform(9, 0, i);
     memset(&in, 0, sizeof in);
     in.pixels = pixels;
     in.images = IMAGES;
     in.height = SIDE;
     in.width = LONG_SIDE;
-    if (CHECK_OK(ctx, gsf_nn_make_dinov2(ctx, inside(model, "dinov2"), &dinov2))) {
+    if (CHECK_OK(ctx, gsf_nn_load_dinov2(ctx, inside(model, "dinov2"), &dinov2))) {
         float* out = (float*)malloc((size_t)(IMAGES * TOKENS * dinov2.width) * sizeof(float));
         CHECK(dinov2.width == 1024 && dinov2.layers == 1);
-        CHECK_OK(ctx, gsf_nn_dinov2_encode(ctx, &dinov2, &in, out));
+        CHECK_OK(ctx, gsf_nn_encode_dinov2(ctx, &dinov2, &in, out));
         check_rows("dinov2", out, IMAGES * TOKENS, dinov2.width);
         gsf_nn_destroy_dinov2(ctx, &dinov2);
         free(out);
     }
-    if (CHECK_OK(ctx, gsf_nn_make_vggt(ctx, inside(model, "vggt"), &vggt))) {
+    if (CHECK_OK(ctx, gsf_nn_load_vggt(ctx, inside(model, "vggt"), &vggt))) {
         float* out = (float*)malloc((size_t)(IMAGES * TOKENS * 2 * vggt.width) * sizeof(float));
         CHECK(vggt.width == 1024 && vggt.layers == 1);
-        CHECK_OK(ctx, gsf_nn_vggt_encode(ctx, &vggt, &in, out));
+        CHECK_OK(ctx, gsf_nn_encode_vggt(ctx, &vggt, &in, out));
         check_rows("vggt", out, IMAGES * TOKENS, 2 * vggt.width);
         gsf_nn_destroy_vggt(ctx, &vggt);
         free(out);
@@ -357,12 +357,12 @@ static void check_text(gsf_context* ctx, const folder* model) {
     static const char* const pieces[] = {"", "A", " red", " house", " by", " the", " river", ":"};
     gsf_nn_tokenizer tokenizer;
     gsf_nn_t5 t5;
-    gsf_nn_t5_input in;
+    gsf_nn_t5_desc in;
     int32_t ids[26];
     size_t count = 0;
-    if (!CHECK_OK(ctx, gsf_nn_make_tokenizer(ctx, inside(model, "tokenizer"), &tokenizer))) return;
+    if (!CHECK_OK(ctx, gsf_nn_load_tokenizer(ctx, inside(model, "tokenizer"), &tokenizer))) return;
     CHECK(tokenizer.piece_count == MODEL_PIECES && tokenizer.id_count == MODEL_PIECES + 100);
-    CHECK_OK(ctx, gsf_nn_tokenize(ctx, &tokenizer, sentence, strlen(sentence), ids, GSF__COUNT(ids), &count));
+    CHECK_OK(ctx, gsf_nn_encode_text(ctx, &tokenizer, sentence, strlen(sentence), ids, GSF__COUNT(ids), &count));
     CHECK(count == GSF__COUNT(pieces) + 10 && ids[count - 1] == 1 && ids[count - 2] == tokenizer.id_count - 1);
     CHECK(ids[0] == 3 && ids[1] == MODEL_PIECES - '~' - 1 + 'A'); // a space, and characters
     for (size_t i = 2; i < 7; i++) {
@@ -375,10 +375,10 @@ static void check_text(gsf_context* ctx, const folder* model) {
     in.ids = ids;
     in.batch = 1;
     in.tokens = (int32_t)count;
-    if (CHECK_OK(ctx, gsf_nn_make_t5(ctx, inside(model, "text_encoder"), &t5))) {
+    if (CHECK_OK(ctx, gsf_nn_load_t5(ctx, inside(model, "text_encoder"), &t5))) {
         float* out = (float*)malloc(count * (size_t)t5.width * sizeof(float));
         CHECK(tokenizer.id_count <= t5.vocabulary);
-        CHECK_OK(ctx, gsf_nn_t5_encode(ctx, &t5, &in, out));
+        CHECK_OK(ctx, gsf_nn_encode_t5(ctx, &t5, &in, out));
         check_rows("text", out, (int64_t)count, t5.width);
         gsf_nn_destroy_t5(ctx, &t5);
         free(out);
@@ -392,7 +392,7 @@ static void check_captions(gsf_context* ctx, const folder* model) {
     int32_t* ids = NULL;
     size_t count = 0;
     char captions[2][400];
-    if (!CHECK_OK(ctx, gsf_nn_make_captioner(ctx, inside(model, "blip2"), &captioner))) return;
+    if (!CHECK_OK(ctx, gsf_nn_load_captioner(ctx, inside(model, "blip2"), &captioner))) return;
     CHECK(captioner.image_token == captioner.vocabulary - 1 && captioner.tokenizer.highest_id == captioner.image_token);
     CHECK_OK(ctx, gsf_nn_encode_bpe(ctx, &captioner.tokenizer, sentence, strlen(sentence), 1, &ids, &count));
     CHECK(count == 3 && ids[0] == MODEL_BYTE_0 + 'a' && ids[1] > MODEL_WORD_0); // "a", " red", " house"
@@ -402,7 +402,7 @@ static void check_captions(gsf_context* ctx, const folder* model) {
         gsf_image image;
         captions[i][0] = 0;
         if (!CHECK_OK(ctx, gsf_load_image(ctx, path, 3, &image))) continue;
-        CHECK_OK(ctx, gsf_nn_caption(ctx, &captioner, &image, NULL, 0, captions[i], sizeof captions[i]));
+        CHECK_OK(ctx, gsf_nn_caption_image(ctx, &captioner, &image, NULL, 0, captions[i], sizeof captions[i]));
         if (getenv("GSF_TEST_VERBOSE")) printf("caption: %s\n", captions[i]);
         gsf_destroy_image(ctx, &image);
     }

@@ -1,6 +1,7 @@
 // The captioner and its tokenizer on the small golden model: files and texts that are wrong or odd, images of other kinds,
 // workers, memory, cancelling. Their values are golden_encoders' matter.
 //     test_nn_caption encode FOLDER FILE    prints the tokens of texts for compare_bpe.py
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "blip2_folder.h"
@@ -66,7 +67,7 @@ static void test_bad_tokenizers(void) {
         gsf_context ctx;
         gsf_nn_bpe bpe;
         small_folder(&f, &ctx, cases[i].vocabulary, cases[i].merges, cases[i].config);
-        CHECK_RESULT(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe), cases[i].wanted);
+        CHECK_RESULT(&ctx, gsf_nn_load_bpe(&ctx, blip2_golden(), &bpe), cases[i].wanted);
         if (!CHECK(strstr(ctx.error, cases[i].named) != NULL)) fprintf(stderr, "    %zu: %s\n", i, ctx.error);
         CHECK(bpe.tables == NULL);
     }
@@ -97,7 +98,7 @@ static void test_small_tokenizer(void) {
     int32_t* ids;
     size_t count;
     small_folder(&f, &ctx, small_vocabulary, "ignored\nab a\nab c\na b\nb c\nb c\n", small_config);
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_bpe(&ctx, blip2_golden(), &bpe))) return;
     CHECK(bpe.bos == -1 && bpe.eos == -1 && bpe.unk == 9 && bpe.highest_id == 10);
     CHECK_IDS("abab", 2, 2);
     CHECK_IDS("aba", 8);
@@ -110,7 +111,7 @@ static void test_small_tokenizer(void) {
                  "{\"unk_token\": null, \"bos_token\": {\"content\": \"new\", \"lstrip\": true, \"rstrip\": true}, "
                  "\"eos_token\": \"<end>\", \"add_bos_token\": true, \"add_prefix_space\": true, "
                  "\"clean_up_tokenization_spaces\": true}");
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_bpe(&ctx, blip2_golden(), &bpe))) return;
     CHECK(bpe.bos == 11 && bpe.eos == 12 && bpe.unk == -1 && bpe.pad == -1 && bpe.highest_id == 12);
     CHECK_IDS("a", 11, 4);
     CHECK_IDS("abc", 11, 3, 2, 5);
@@ -118,27 +119,27 @@ static void test_small_tokenizer(void) {
     CHECK_RESULT(&ctx, gsf_nn_encode_bpe(&ctx, &bpe, "a z", 3, 0, &ids, &count), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(strstr(ctx.error, "0x7a") != NULL && ids == NULL && count == 0);
     static const int32_t tidy[] = {0, 3, 10, 1, 77, 11, -5, 12};
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     CHECK_OK(&ctx, gsf_nn_decode_bpe(&ctx, &bpe, tidy, 8, 1, &text));
     CHECK(text.size == 3 && strcmp(text.data, "a.b") == 0);
     CHECK_OK(&ctx, gsf_nn_decode_bpe(&ctx, &bpe, tidy, 8, 0, &text)); // appends
     CHECK(strcmp(text.data, "a.ba.bnew<end>") == 0);
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     gsf_nn_destroy_bpe(&ctx, &bpe);
 }
 
 static void check_round_trip(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size) {
     int32_t* ids = NULL;
     size_t count = 0;
-    gsf_text back;
+    gsf_buffer back;
     memset(&back, 0, sizeof back);
     CHECK_OK(ctx, gsf_nn_encode_bpe(ctx, bpe, text, size, 1, &ids, &count));
     CHECK(count <= size);
     CHECK_OK(ctx, gsf_nn_decode_bpe(ctx, bpe, ids, count, 0, &back));
     if (!CHECK(back.size == size && (!size || memcmp(back.data, text, size) == 0)))
         fprintf(stderr, "    %.40s\n", text);
-    gsf_destroy_text(ctx, &back);
+    gsf_destroy_buffer(ctx, &back);
     gsf_free(ctx, ids);
 }
 
@@ -155,7 +156,7 @@ static void test_odd_texts(void) {
     gsf_context ctx;
     gsf_nn_bpe bpe;
     test_context_init(&ctx);
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_bpe(&ctx, blip2_golden(), &bpe))) return;
     for (size_t i = 0; i < sizeof texts / sizeof *texts; i++) check_round_trip(&ctx, &bpe, texts[i].text, texts[i].size);
     check_round_trip(&ctx, &bpe, NULL, 0);
     const size_t most = 1 << 20;
@@ -198,12 +199,12 @@ static void test_broken_bytes(void) {
     gsf_context ctx;
     gsf_nn_bpe bpe;
     small_folder(&f, &ctx, vocabulary, "", "{\"unk_token\": null, \"bos_token\": null, \"eos_token\": null}");
-    if (!CHECK_OK(&ctx, gsf_nn_make_bpe(&ctx, blip2_golden(), &bpe))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_bpe(&ctx, blip2_golden(), &bpe))) return;
     CHECK_IDS("a \xc3\xad\n", 'a', ' ', 0xc3, 0xad, '\n');
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
         int32_t ids[8];
         size_t count = 0, at = 0;
-        gsf_text text;
+        gsf_buffer text;
         for (const char* b = cases[i].bytes; *b; b++) ids[count++] = (unsigned char)*b;
         memset(&text, 0, sizeof text);
         CHECK_OK(&ctx, gsf_nn_decode_bpe(&ctx, &bpe, ids, count, 0, &text));
@@ -215,7 +216,7 @@ static void test_broken_bytes(void) {
             at += step;
         }
         if (!CHECK(same && at == text.size)) fprintf(stderr, "    case %zu\n", i);
-        gsf_destroy_text(&ctx, &text);
+        gsf_destroy_buffer(&ctx, &text);
     }
     gsf_nn_destroy_bpe(&ctx, &bpe);
 }
@@ -256,7 +257,7 @@ static void test_bad_configs(void) {
         char* text = cases[i].from ? blip2_edit(cases[i].file, cases[i].from, cases[i].to) : NULL;
         blip2_open(&f, &ctx);
         blip2_put(&f, cases[i].file, text, 0);
-        CHECK_RESULT(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net), cases[i].wanted);
+        CHECK_RESULT(&ctx, gsf_nn_load_captioner(&ctx, blip2_golden(), &net), cases[i].wanted);
         if (!CHECK(strstr(ctx.error, cases[i].named) != NULL)) fprintf(stderr, "    %zu: %s\n", i, ctx.error);
         CHECK(net.nets == NULL && net.weights.tensors == NULL);
         free(text);
@@ -289,8 +290,8 @@ static void test_bad_weights(void) {
         gsf_nn_captioner net;
         size_t count = 0, size;
         blip2_open(&f, &ctx);
-        CHECK_OK(&f.plain, gsf_nn_open_weights(&f.plain, blip2_golden(), "model", &w));
-        gsf_tensor* tensors = (gsf_tensor*)malloc((w.tensor_count + 1) * sizeof *tensors);
+        CHECK_OK(&f.plain, gsf_nn_load_weights(&f.plain, blip2_golden(), "model", &w));
+        gsf_nn_tensor* tensors = (gsf_nn_tensor*)malloc((w.tensor_count + 1) * sizeof *tensors);
         float* poisoned = NULL;
         for (size_t k = 0; k < w.tensor_count; k++) {
             const int named = strcmp(w.tensors[k].name, cases[i].name) == 0;
@@ -298,23 +299,24 @@ static void test_bad_weights(void) {
             tensors[count++] = w.tensors[k];
             if (!named) continue;
             poisoned = (float*)malloc((size_t)w.tensors[k].count * sizeof(float));
-            gsf_nn_read_tensor(&w.tensors[k], 0, w.tensors[k].count, poisoned);
+            gsf_nn_convert_tensor(&w.tensors[k], 0, w.tensors[k].count, poisoned);
             poisoned[w.tensors[k].count / 2] = NAN;
             tensors[count - 1].data = poisoned;
             tensors[count - 1].dtype = GSF_NN_F32;
         }
         if (cases[i].kind == 1) tensors[count++] = gsf_nn_wrap_tensor(cases[i].name, ones, 1, two);
         CHECK_OK(&f.plain, gsf_nn_save_tensors(&f.plain, test_scratch("edited.safetensors"), tensors, count));
-        gsf_nn_close_weights(&f.plain, &w);
+        gsf_nn_destroy_weights(&f.plain, &w);
         char* bytes = test_read_file(test_scratch("edited.safetensors"), &size);
         blip2_put(&f, "model.safetensors.index.json", NULL, 0);
         blip2_put(&f, "model.safetensors", bytes, size);
         const gsf_result wanted = cases[i].kind == 2 ? GSF_OK : GSF_ERROR_FORMAT;
-        CHECK_RESULT(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net), wanted);
+        CHECK_RESULT(&ctx, gsf_nn_load_captioner(&ctx, blip2_golden(), &net), wanted);
         if (cases[i].kind == 2) {
             gsf_image photo = make_photo(&ctx);
             char caption[64] = "before";
-            CHECK_RESULT(&ctx, gsf_nn_caption(&ctx, &net, &photo, NULL, 2, caption, sizeof caption), GSF_ERROR_NUMERIC);
+            CHECK_RESULT(&ctx, gsf_nn_caption_image(&ctx, &net, &photo, NULL, 2, caption, sizeof caption),
+                         GSF_ERROR_NUMERIC);
             CHECK(caption[0] == 0);
             gsf_destroy_image(&ctx, &photo);
             gsf_nn_destroy_captioner(&ctx, &net);
@@ -335,35 +337,37 @@ static void test_arguments(gsf_context* ctx, const gsf_nn_captioner* net, const 
         {"\xff", 0, "text:0"}, {"a <image> of", 0, "image's token"}};
     for (size_t i = 0; i < sizeof bad / sizeof *bad; i++) {
         strcpy(caption, "before");
-        CHECK_RESULT(ctx, gsf_nn_caption(ctx, net, photo, bad[i].prompt, bad[i].most, caption, sizeof caption),
+        CHECK_RESULT(ctx, gsf_nn_caption_image(ctx, net, photo, bad[i].prompt, bad[i].most, caption, sizeof caption),
                      GSF_ERROR_INVALID_ARGUMENT);
         if (!CHECK(strstr(ctx->error, bad[i].named) != NULL && caption[0] == 0)) fprintf(stderr, "    %s\n", ctx->error);
     }
-    CHECK_RESULT(ctx, gsf_nn_caption(ctx, net, NULL, NULL, 0, caption, sizeof caption), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_nn_caption(ctx, net, photo, NULL, 0, caption, 0), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_nn_caption_image(ctx, net, NULL, NULL, 0, caption, sizeof caption),
+                 GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_nn_caption_image(ctx, net, photo, NULL, 0, caption, 0), GSF_ERROR_INVALID_ARGUMENT);
     gsf_image empty;
     memset(&empty, 0, sizeof empty);
-    CHECK_RESULT(ctx, gsf_nn_caption(ctx, net, &empty, NULL, 0, caption, sizeof caption), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_OK(ctx, gsf_nn_caption(ctx, net, photo, "a photo of", 12, whole, sizeof whole));
+    CHECK_RESULT(ctx, gsf_nn_caption_image(ctx, net, &empty, NULL, 0, caption, sizeof caption),
+                 GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, photo, "a photo of", 12, whole, sizeof whole));
     const size_t size = strlen(whole);
     CHECK(size > 0);
     for (size_t room = 1; room <= size + 1; room++) { // the longest beginning of whole characters that fits
-        CHECK_OK(ctx, gsf_nn_caption(ctx, net, photo, "a photo of", 12, caption, room));
+        CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, photo, "a photo of", 12, caption, room));
         const size_t kept = strlen(caption);
         CHECK(kept < room && memcmp(caption, whole, kept) == 0 && ((unsigned char)whole[kept] & 0xc0) != 0x80);
         if (room > 12 && room < size) room = size - 1;
     }
     CHECK(strcmp(caption, whole) == 0);
     double bytes[2], flops[2];
-    gsf_nn_caption_cost(net, 0, 0, &bytes[0], &flops[0]);
-    gsf_nn_caption_cost(net, 9, 20, &bytes[1], &flops[1]);
+    gsf__nn_query_captioner(net, 0, 0, &bytes[0], &flops[0]);
+    gsf__nn_query_captioner(net, 9, 20, &bytes[1], &flops[1]);
     CHECK(bytes[0] > 0.0 && flops[0] > 0.0 && flops[1] > flops[0] && bytes[1] >= bytes[0]);
 }
 
 // The same picture as floats, with an alpha channel, upside down in memory.
 static void test_image_kinds(gsf_context* ctx, const gsf_nn_captioner* net, const gsf_image* photo) {
     char expected[512], caption[512];
-    CHECK_OK(ctx, gsf_nn_caption(ctx, net, photo, NULL, 0, expected, sizeof expected));
+    CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, photo, NULL, 0, expected, sizeof expected));
     for (int kind = 0; kind < 3; kind++) {
         gsf_image image;
         const gsf_dtype dtype = kind == 0 ? GSF_F32 : GSF_U8;
@@ -383,7 +387,7 @@ static void test_image_kinds(gsf_context* ctx, const gsf_nn_captioner* net, cons
             view.data = (char*)image.data + (image.height - 1) * image.stride_y;
             view.stride_y = -image.stride_y;
         }
-        CHECK_OK(ctx, gsf_nn_caption(ctx, net, &view, NULL, 0, caption, sizeof caption));
+        CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, &view, NULL, 0, caption, sizeof caption));
         if (!CHECK(strcmp(caption, expected) == 0)) fprintf(stderr, "    kind %d\n", kind);
         gsf_destroy_image(ctx, &image);
     }
@@ -421,7 +425,7 @@ static void test_runs(const gsf_image* photo) {
     for (int k = 0; k < 2; k++) {
         gsf_context ctx;
         gsf_nn_captioner net;
-        gsf_nn_caption_desc d;
+        gsf__nn_caption_desc d;
         watcher w;
         int32_t* ids;
         size_t count;
@@ -432,13 +436,13 @@ static void test_runs(const gsf_image* photo) {
         ctx.progress.progress_fn = watch_progress;
         ctx.progress.user = &w;
         CHECK_OK(&ctx, gsf_init_context(&ctx));
-        if (!CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) return;
+        if (!CHECK_OK(&ctx, gsf_nn_load_captioner(&ctx, blip2_golden(), &net))) return;
         memset(&d, 0, sizeof d);
         d.image = photo;
         d.max_new_tokens = 3;
         const gsf__nn_tap tap = {see_tap, &sums[k]};
         d._tap = &tap;
-        CHECK_OK(&ctx, gsf_nn_caption_ids(&ctx, &net, &d, &ids, &count));
+        CHECK_OK(&ctx, gsf__nn_caption_ids(&ctx, &net, &d, &ids, &count));
         for (size_t i = 0; i < count; i++) sums[k].sum = (sums[k].sum ^ (uint64_t)ids[i]) * 0x100000001b3u;
         gsf_free(&ctx, ids);
         CHECK(sums[k].stages == 5 && w.last == w.total && w.calls > 3);
@@ -447,7 +451,7 @@ static void test_runs(const gsf_image* photo) {
         for (double stop = 1.0; stop < steps && k == 0; stop += 1.0) {
             w.last = 0.0;
             w.stop_at = stop;
-            CHECK_RESULT(&ctx, gsf_nn_caption_ids(&ctx, &net, &d, &ids, &count), GSF_ERROR_CANCELLED);
+            CHECK_RESULT(&ctx, gsf__nn_caption_ids(&ctx, &net, &d, &ids, &count), GSF_ERROR_CANCELLED);
             CHECK(ids == NULL && count == 0 && w.last == stop);
             gsf_clear_cancel(&ctx);
         }
@@ -466,9 +470,9 @@ static void test_memory(const gsf_image* photo) {
         count_memory(&ctx, &c);
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         c.fail_at = fail;
-        gsf_result result = gsf_nn_make_captioner(&ctx, blip2_golden(), &net);
+        gsf_result result = gsf_nn_load_captioner(&ctx, blip2_golden(), &net);
         if (!result) {
-            result = gsf_nn_caption(&ctx, &net, photo, "a", 2, caption, sizeof caption);
+            result = gsf_nn_caption_image(&ctx, &net, photo, "a", 2, caption, sizeof caption);
             gsf_nn_destroy_captioner(&ctx, &net);
         }
         CHECK(c.live == 0);
@@ -488,7 +492,7 @@ static int encode_file(const char* from, const char* path) {
     size_t size, count;
     char* data = test_read_file(path, &size);
     test_context_init(&ctx);
-    if (gsf_nn_make_bpe(&ctx, from, &bpe) != GSF_OK) {
+    if (gsf_nn_load_bpe(&ctx, from, &bpe) != GSF_OK) {
         fprintf(stderr, "%s\n", ctx.error);
         return 1;
     }
@@ -499,12 +503,12 @@ static int encode_file(const char* from, const char* path) {
         if (gsf_nn_encode_bpe(&ctx, &bpe, data + at + 4, length, 0, &ids, &count) != GSF_OK) printf("%s", ctx.error);
         for (size_t i = 0; i < count; i++) printf("%d ", (int)ids[i]);
         for (int skip = 0; skip < 2; skip++) {
-            gsf_text text;
+            gsf_buffer text;
             memset(&text, 0, sizeof text);
             if (gsf_nn_decode_bpe(&ctx, &bpe, ids, count, skip, &text) != GSF_OK) return 1;
             putchar('|');
             for (size_t i = 0; i < text.size; i++) printf("%02x", (unsigned)(unsigned char)text.data[i]);
-            gsf_destroy_text(&ctx, &text);
+            gsf_destroy_buffer(&ctx, &text);
         }
         putchar('\n');
         gsf_free(&ctx, ids);
@@ -526,7 +530,7 @@ int main(int argc, char** argv) {
     test_broken_bytes();
     test_bad_configs();
     test_bad_weights();
-    if (CHECK_OK(&ctx, gsf_nn_make_captioner(&ctx, blip2_golden(), &net))) {
+    if (CHECK_OK(&ctx, gsf_nn_load_captioner(&ctx, blip2_golden(), &net))) {
         gsf_image photo = make_photo(&ctx);
         test_arguments(&ctx, &net, &photo);
         test_image_kinds(&ctx, &net, &photo);

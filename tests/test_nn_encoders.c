@@ -1,5 +1,6 @@
 // The encoders of reference photos on the small golden models: bad folders and inputs, workers, groups of images,
 // memory, cancellation, saving and loading features. golden_encoders checks their values.
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "test.h"
@@ -25,46 +26,46 @@ static const char* write_model(gsf_context* ctx, const char* name, const edit* e
     snprintf(path, sizeof path, "encoders/%s/config.json", name);
     char* config = test_read_file(test_golden(path), &size);
     snprintf(path, sizeof path, "encoders/%s", name);
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden(path), NULL, &w));
-    gsf_tensor* tensors = (gsf_tensor*)malloc((w.tensor_count + 1) * sizeof *tensors);
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden(path), NULL, &w));
+    gsf_nn_tensor* tensors = (gsf_nn_tensor*)malloc((w.tensor_count + 1) * sizeof *tensors);
     float* poisoned = NULL;
     for (size_t i = 0; i < w.tensor_count; i++) {
-        gsf_tensor* t = &tensors[count];
+        gsf_nn_tensor* t = &tensors[count];
         if (e->drop && strcmp(w.tensors[i].name, e->drop) == 0) continue;
         *t = w.tensors[i];
         count++;
         if (e->widen && strcmp(t->name, e->widen) == 0) t->shape[t->rank++] = 1;
         if (e->poison && strcmp(t->name, e->poison) == 0) {
             poisoned = (float*)malloc((size_t)t->count * sizeof(float));
-            gsf_nn_read_tensor(t, 0, t->count, poisoned);
+            gsf_nn_convert_tensor(t, 0, t->count, poisoned);
             poisoned[t->count / 2] = NAN;
             t->data = poisoned;
         }
     }
     if (e->add) tensors[count++] = gsf_nn_wrap_tensor(e->add, one, 1, single);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("model.safetensors"), tensors, count));
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     const char* at = e->from ? strstr(config, e->from) : NULL;
     if (at) {
-        gsf_text_append(ctx, &text, config, (size_t)(at - config));
-        gsf_text_append(ctx, &text, e->to, strlen(e->to));
+        gsf_append_bytes(ctx, &text, config, (size_t)(at - config));
+        gsf_append_bytes(ctx, &text, e->to, strlen(e->to));
         at += strlen(e->from);
     }
-    gsf_text_append(ctx, &text, at ? at : config, strlen(at ? at : config));
+    gsf_append_bytes(ctx, &text, at ? at : config, strlen(at ? at : config));
     CHECK(!e->from || at);
     if (e->no_config) remove(test_scratch("config.json"));
     else CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("config.json"), text.data, text.size));
-    gsf_destroy_text(ctx, &text);
-    gsf_nn_close_weights(ctx, &w);
+    gsf_destroy_buffer(ctx, &text);
+    gsf_nn_destroy_weights(ctx, &w);
     free(tensors);
     free(poisoned);
     free(config);
     return test_scratch(".");
 }
 
-static gsf_nn_encoder_input small_input(void) {
-    gsf_nn_encoder_input in;
+static gsf_nn_encoder_desc small_input(void) {
+    gsf_nn_encoder_desc in;
     memset(&in, 0, sizeof in);
     in.pixels = pixels;
     in.images = IMAGES;
@@ -94,7 +95,7 @@ static void test_bad_dinov2(gsf_context* ctx) {
         {{0, 0, 0, 0, 0, 0, 1}, GSF_ERROR_NOT_FOUND, "config.json"}};
     gsf_nn_dinov2 net;
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
-        CHECK_RESULT(ctx, gsf_nn_make_dinov2(ctx, write_model(ctx, "dinov2_reg", &cases[i].e), &net), cases[i].wanted);
+        CHECK_RESULT(ctx, gsf_nn_load_dinov2(ctx, write_model(ctx, "dinov2_reg", &cases[i].e), &net), cases[i].wanted);
         if (!CHECK(strstr(ctx->error, cases[i].named) != NULL)) fprintf(stderr, "    %zu: %s\n", i, ctx->error);
         CHECK(net.nets == NULL && net.weights.tensors == NULL);
     }
@@ -117,7 +118,7 @@ static void test_bad_vggt(gsf_context* ctx) {
         {{0, 0, 0, 0, "\"qk_norm\": true", "\"qk_norm\": false", 0}, GSF_ERROR_FORMAT, "_norm."}};
     gsf_nn_vggt net;
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
-        CHECK_RESULT(ctx, gsf_nn_make_vggt(ctx, write_model(ctx, "vggt", &cases[i].e), &net), cases[i].wanted);
+        CHECK_RESULT(ctx, gsf_nn_load_vggt(ctx, write_model(ctx, "vggt", &cases[i].e), &net), cases[i].wanted);
         if (!CHECK(strstr(ctx->error, cases[i].named) != NULL)) fprintf(stderr, "    %zu: %s\n", i, ctx->error);
         CHECK(net.nets == NULL && net.weights.tensors == NULL);
     }
@@ -126,14 +127,14 @@ static void test_bad_vggt(gsf_context* ctx) {
 // Without config.json, with tensors of other parts, as one file: the same model.
 static void test_vggt_alone(gsf_context* ctx, const float* expected, float* out) {
     const edit e = {0, 0, "depth_head.norm.weight", 0, 0, 0, 1};
-    const gsf_nn_encoder_input in = small_input();
+    const gsf_nn_encoder_desc in = small_input();
     (void)write_model(ctx, "vggt", &e);
     for (int file = 0; file < 2; file++) {
         gsf_nn_vggt net;
-        if (!CHECK_OK(ctx, gsf_nn_make_vggt(ctx, test_scratch(file ? "model.safetensors" : "."), &net))) return;
+        if (!CHECK_OK(ctx, gsf_nn_load_vggt(ctx, test_scratch(file ? "model.safetensors" : "."), &net))) return;
         const size_t count = (size_t)(IMAGES * (HEIGHT / net.patch) * (WIDTH / net.patch) * 2 * net.width);
         CHECK(net.layers > 0 && net.embed_layers > 0 && net.rope_base == 100.0 && net.width % net.heads == 0);
-        CHECK_OK(ctx, gsf_nn_vggt_encode(ctx, &net, &in, out));
+        CHECK_OK(ctx, gsf_nn_encode_vggt(ctx, &net, &in, out));
         CHECK(memcmp(out, expected, count * sizeof(float)) == 0);
         gsf_nn_destroy_vggt(ctx, &net);
     }
@@ -145,7 +146,7 @@ static void test_poison(gsf_context* ctx, float* out) {
     static const char* const vggt[] = {"aggregator.patch_embed.pos_embed", "aggregator.patch_embed.blocks.1.ls2.gamma",
                                        "aggregator.register_token", "aggregator.frame_blocks.1.attn.q_norm.weight",
                                        "aggregator.global_blocks.2.mlp.fc2.weight"};
-    const gsf_nn_encoder_input in = small_input();
+    const gsf_nn_encoder_desc in = small_input();
     for (size_t i = 0; i < sizeof dino / sizeof dino[0] + sizeof vggt / sizeof vggt[0]; i++) {
         const int first = i < sizeof dino / sizeof dino[0];
         const char* name = first ? dino[i] : vggt[i - sizeof dino / sizeof dino[0]];
@@ -154,12 +155,12 @@ static void test_poison(gsf_context* ctx, float* out) {
         gsf_nn_vggt v;
         out[0] = 7.0f;
         if (first) {
-            CHECK_OK(ctx, gsf_nn_make_dinov2(ctx, write_model(ctx, "dinov2_reg", &e), &d));
-            CHECK_RESULT(ctx, gsf_nn_dinov2_encode(ctx, &d, &in, out), GSF_ERROR_NUMERIC);
+            CHECK_OK(ctx, gsf_nn_load_dinov2(ctx, write_model(ctx, "dinov2_reg", &e), &d));
+            CHECK_RESULT(ctx, gsf_nn_encode_dinov2(ctx, &d, &in, out), GSF_ERROR_NUMERIC);
             gsf_nn_destroy_dinov2(ctx, &d);
         } else {
-            CHECK_OK(ctx, gsf_nn_make_vggt(ctx, write_model(ctx, "vggt", &e), &v));
-            CHECK_RESULT(ctx, gsf_nn_vggt_encode(ctx, &v, &in, out), GSF_ERROR_NUMERIC);
+            CHECK_OK(ctx, gsf_nn_load_vggt(ctx, write_model(ctx, "vggt", &e), &v));
+            CHECK_RESULT(ctx, gsf_nn_encode_vggt(ctx, &v, &in, out), GSF_ERROR_NUMERIC);
             gsf_nn_destroy_vggt(ctx, &v);
         }
         if (!CHECK(strstr(ctx->error, name) != NULL)) fprintf(stderr, "    %s: %s\n", name, ctx->error);
@@ -173,7 +174,7 @@ static void test_bad_inputs(gsf_context* ctx, const gsf_nn_dinov2* dino, const g
     static float nan_pixels[3 * HEIGHT * WIDTH];
     for (int kind = 0; kind < 2; kind++)
         for (int i = 0; i < 7; i++) {
-            gsf_nn_encoder_input in = small_input();
+            gsf_nn_encoder_desc in = small_input();
             if (i == 0) in.pixels = NULL;
             if (i == 1) in.images = 0;
             if (i == 2) in.height += 1;
@@ -187,8 +188,8 @@ static void test_bad_inputs(gsf_context* ctx, const gsf_nn_dinov2* dino, const g
                 in.images = 1;
             }
             const gsf_result wanted = i == 6 ? GSF_ERROR_NUMERIC : GSF_ERROR_INVALID_ARGUMENT;
-            if (kind) CHECK_RESULT(ctx, gsf_nn_vggt_encode(ctx, vggt, &in, out), wanted);
-            else CHECK_RESULT(ctx, gsf_nn_dinov2_encode(ctx, dino, &in, out), wanted);
+            if (kind) CHECK_RESULT(ctx, gsf_nn_encode_vggt(ctx, vggt, &in, out), wanted);
+            else CHECK_RESULT(ctx, gsf_nn_encode_dinov2(ctx, dino, &in, out), wanted);
         }
 }
 
@@ -208,7 +209,7 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
     float* more = (float*)malloc(MORE * 3 * HIGH * WIDE * sizeof(float));
     for (size_t i = 0; i < MORE * 3 * HIGH * WIDE; i++) more[i] = pixels[i * 7 % (sizeof pixels / sizeof pixels[0])];
     for (int small = 0; small < 2; small++) {
-        gsf_nn_encoder_input in = small_input();
+        gsf_nn_encoder_desc in = small_input();
         if (!small) {
             in.pixels = more;
             in.images = MORE;
@@ -217,11 +218,11 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
         }
         const size_t tokens = (size_t)(in.images * (in.height / dino->patch) * (in.width / dino->patch));
         CHECK(tokens * 2 * (size_t)vggt->width <= ROOM);
-        CHECK_OK(&one, gsf_nn_dinov2_encode(&one, dino, &in, expected));
-        CHECK_OK(&three, gsf_nn_dinov2_encode(&three, dino, &in, out));
+        CHECK_OK(&one, gsf_nn_encode_dinov2(&one, dino, &in, expected));
+        CHECK_OK(&three, gsf_nn_encode_dinov2(&three, dino, &in, out));
         CHECK(memcmp(out, expected, tokens * (size_t)dino->width * sizeof(float)) == 0);
-        CHECK_OK(&one, gsf_nn_vggt_encode(&one, vggt, &in, expected));
-        CHECK_OK(&three, gsf_nn_vggt_encode(&three, vggt, &in, out));
+        CHECK_OK(&one, gsf_nn_encode_vggt(&one, vggt, &in, expected));
+        CHECK_OK(&three, gsf_nn_encode_vggt(&three, vggt, &in, out));
         CHECK(memcmp(out, expected, tokens * 2 * (size_t)vggt->width * sizeof(float)) == 0);
     }
     free(more);
@@ -230,7 +231,7 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
 // More images than go together: each as it is alone.
 static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out) {
     enum { MANY = 420 };
-    gsf_nn_encoder_input in = small_input();
+    gsf_nn_encoder_desc in = small_input();
     const size_t image = (size_t)(3 * HEIGHT * WIDTH), count = (size_t)(6 * dino->width);
     float *many = (float*)malloc(MANY * image * sizeof(float)), *whole = (float*)malloc(MANY * count * sizeof(float));
     for (size_t i = 0; i < MANY; i++)
@@ -238,11 +239,11 @@ static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out)
     in.images = MANY;
     in.pixels = many;
     CHECK(HEIGHT / dino->patch * (WIDTH / dino->patch) == 6);
-    CHECK_OK(ctx, gsf_nn_dinov2_encode(ctx, dino, &in, whole));
+    CHECK_OK(ctx, gsf_nn_encode_dinov2(ctx, dino, &in, whole));
     in.images = 1;
     for (size_t i = 0; i < MANY; i += i < 3 || i > MANY - 5 ? 1 : 40) {
         in.pixels = many + i * image;
-        CHECK_OK(ctx, gsf_nn_dinov2_encode(ctx, dino, &in, out));
+        CHECK_OK(ctx, gsf_nn_encode_dinov2(ctx, dino, &in, out));
         double worst = 0.0;
         for (size_t k = 0; k < count; k++) worst = fmax(worst, fabs((double)(out[k] - whole[i * count + k])));
         CHECK_NEAR(worst, 0.0, 1e-5);
@@ -253,7 +254,7 @@ static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out)
 
 // Each allocation fails once; what is counted is what the cost tells and the kernels' scratch.
 static void test_memory(float* out) {
-    const gsf_nn_encoder_input in = small_input();
+    const gsf_nn_encoder_desc in = small_input();
     gsf_context ctx;
     counter count;
     test_context_zero(&ctx);
@@ -270,13 +271,13 @@ static void test_memory(float* out) {
             memset(&vggt, 0, sizeof vggt);
             count.calls = 0;
             count.fail_at = k;
-            gsf_result result = kind ? gsf_nn_make_vggt(&ctx, test_golden("encoders/vggt"), &vggt)
-                                     : gsf_nn_make_dinov2(&ctx, test_golden("encoders/dinov2_reg"), &dino);
+            gsf_result result = kind ? gsf_nn_load_vggt(&ctx, test_golden("encoders/vggt"), &vggt)
+                                     : gsf_nn_load_dinov2(&ctx, test_golden("encoders/dinov2_reg"), &dino);
             count.asked = 0;
             if (!result) {
-                if (kind) gsf_nn_vggt_cost(&vggt, &in, &bytes, &flops);
-                else gsf_nn_dinov2_cost(&dino, &in, &bytes, &flops);
-                result = kind ? gsf_nn_vggt_encode(&ctx, &vggt, &in, out) : gsf_nn_dinov2_encode(&ctx, &dino, &in, out);
+                if (kind) gsf__nn_query_vggt(&vggt, &in, &bytes, &flops);
+                else gsf__nn_query_dinov2(&dino, &in, &bytes, &flops);
+                result = kind ? gsf_nn_encode_vggt(&ctx, &vggt, &in, out) : gsf_nn_encode_dinov2(&ctx, &dino, &in, out);
             }
             gsf_nn_destroy_dinov2(&ctx, &dino);
             gsf_nn_destroy_vggt(&ctx, &vggt);
@@ -301,16 +302,16 @@ static void stop_at(void* user, const char* stage, double done, double total) {
 }
 
 static void test_cancel(gsf_context* ctx, const gsf_nn_vggt* vggt, float* out) {
-    const gsf_nn_encoder_input in = small_input();
+    const gsf_nn_encoder_desc in = small_input();
     stopper s = {ctx, 0.0, 0.0, 0.0};
     ctx->progress.progress_fn = stop_at;
     ctx->progress.user = &s;
-    CHECK_OK(ctx, gsf_nn_vggt_encode(ctx, vggt, &in, out));
+    CHECK_OK(ctx, gsf_nn_encode_vggt(ctx, vggt, &in, out));
     CHECK(s.last == s.total && s.total == vggt->embed_layers + 2 * vggt->layers);
     s.after = 2.0;
     s.last = 0.0;
     out[0] = 7.0f;
-    CHECK_RESULT(ctx, gsf_nn_vggt_encode(ctx, vggt, &in, out), GSF_ERROR_CANCELLED);
+    CHECK_RESULT(ctx, gsf_nn_encode_vggt(ctx, vggt, &in, out), GSF_ERROR_CANCELLED);
     CHECK(s.last == 2.0 && out[0] == 0.0f);
     gsf_clear_cancel(ctx);
     memset(&ctx->progress, 0, sizeof ctx->progress);
@@ -350,7 +351,7 @@ static void test_features(gsf_context* ctx, const gsf_nn_dinov2* dino, const gsf
     photos[0].width = 1; // 518 times as high as it is
     photos[0].height = 300;
     gsf_image image;
-    CHECK_RESULT(ctx, gsf_nn_prepare_reference(ctx, &photos[0], &image), GSF_ERROR_UNSUPPORTED);
+    CHECK_RESULT(ctx, gsf__nn_prepare_reference(ctx, &photos[0], &image), GSF_ERROR_UNSUPPORTED);
     gsf_nn_destroy_features(ctx, &both);
     gsf_nn_destroy_features(ctx, &turns);
     for (int i = 0; i < 2; i++) gsf_destroy_image(ctx, &photos[i]);
@@ -366,8 +367,8 @@ int main(void) {
     if (gsf_init_context(&ctx) != GSF_OK) return 2;
     for (size_t i = 0; i < sizeof pixels / sizeof pixels[0]; i++) pixels[i] = (float)test_random(&seed);
     float *expected = (float*)malloc(ROOM * sizeof(float)), *out = (float*)malloc(ROOM * sizeof(float));
-    if (!CHECK_OK(&ctx, gsf_nn_make_dinov2(&ctx, test_golden("encoders/dinov2_reg"), &dino)) ||
-        !CHECK_OK(&ctx, gsf_nn_make_vggt(&ctx, test_golden("encoders/vggt"), &vggt)))
+    if (!CHECK_OK(&ctx, gsf_nn_load_dinov2(&ctx, test_golden("encoders/dinov2_reg"), &dino)) ||
+        !CHECK_OK(&ctx, gsf_nn_load_vggt(&ctx, test_golden("encoders/vggt"), &vggt)))
         return test_report();
     test_workers(&dino, &vggt, expected, out);
     test_vggt_alone(&ctx, expected, out);

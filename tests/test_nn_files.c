@@ -31,7 +31,7 @@ static made make_file(const char* header, size_t data) {
 
 enum { ALL = 11 };
 
-static void make_tensors(gsf_tensor t[ALL]) { // every dtype; ranks 0 to 8; no value; odd sizes
+static void make_tensors(gsf_nn_tensor t[ALL]) { // every dtype; ranks 0 to 8; no value; odd sizes
     static const char* const names[ALL] = {"f32", "bf16", "f16", "f64",   "u8",          "i8",
                                            "i16", "i32",  "i64", "empty", "\xc3\xa9\"\n"};
     static const int64_t shapes[ALL][8] = {{2, 3}, {5}, {3}, {0}, {1, 1, 1, 1, 1, 1, 1, 3}, {7},
@@ -50,15 +50,15 @@ static void make_tensors(gsf_tensor t[ALL]) { // every dtype; ranks 0 to 8; no v
     }
 }
 
-static void check_same(const gsf_nn_weights* w, const gsf_tensor* expected, size_t count) {
+static void check_same(const gsf_nn_weights* w, const gsf_nn_tensor* expected, size_t count) {
     CHECK(w->tensor_count == count);
     for (size_t i = 1; i < w->tensor_count; i++) CHECK(strcmp(w->tensors[i - 1].name, w->tensors[i].name) < 0);
     for (size_t i = 0; i < count; i++) {
-        const gsf_tensor *e = &expected[i], *t = gsf_nn_find_tensor(w, e->name);
+        const gsf_nn_tensor *e = &expected[i], *t = gsf_nn_find_tensor(w, e->name);
         if (!CHECK(t != NULL)) continue;
         CHECK(t->dtype == e->dtype && t->rank == e->rank && t->count == e->count);
         CHECK(memcmp(t->shape, e->shape, sizeof t->shape) == 0);
-        CHECK(memcmp(t->data, e->data, (size_t)e->count * gsf_nn_dtype_size(e->dtype)) == 0);
+        CHECK(memcmp(t->data, e->data, (size_t)e->count * gsf_nn_get_dtype_size(e->dtype)) == 0);
     }
     CHECK(gsf_nn_find_tensor(w, "") == NULL && gsf_nn_find_tensor(w, "f3") == NULL && gsf_nn_find_tensor(w, "zzz") == NULL);
 }
@@ -81,31 +81,32 @@ static gsf_result hooked_write(void* user, gsf_context* ctx, const char* path, c
 }
 
 static void test_round_trip(gsf_context* ctx) {
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     make_tensors(tensors);
     const char* path = test_scratch("all.safetensors");
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, ALL));
     gsf_nn_weights w;
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, path, NULL, &w))) return;
+    if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, path, NULL, &w))) return;
     check_same(&w, tensors, ALL);
     CHECK(HAS_FOLDERS ? w.mapped_bytes > 0 && w.read_bytes == 0 : w.read_bytes > 0);
     for (size_t i = 0; i < w.tensor_count; i++) // a file of ours is aligned
-        CHECK((uintptr_t)w.tensors[i].data % gsf_nn_dtype_size(w.tensors[i].dtype) == 0);
-    gsf_nn_close_weights(ctx, &w);
+        CHECK((uintptr_t)w.tensors[i].data % gsf_nn_get_dtype_size(w.tensors[i].dtype) == 0);
+    gsf_nn_destroy_weights(ctx, &w);
     CHECK(w.tensors == NULL && w.tensor_count == 0);
-    gsf_nn_close_weights(ctx, &w);
+    gsf_nn_destroy_weights(ctx, &w);
 
     size_t size; // from memory, at every alignment
     char* data = test_read_file(path, &size);
     for (size_t shift = 0; shift < 8; shift++) {
         char* moved = (char*)malloc(size + shift);
         memcpy(moved + shift, data, size);
-        if (CHECK_OK(ctx, gsf_nn_open_weights_memory(ctx, "moved", moved + shift, size, &w))) {
+        if (CHECK_OK(ctx, gsf_nn_parse_weights(ctx, "moved", moved + shift, size, &w))) {
             check_same(&w, tensors, ALL);
             CHECK(w.mapped_bytes == 0 && w.read_bytes == 0);
             float values[8];
-            for (size_t i = 0; i < w.tensor_count; i++) gsf_nn_read_tensor(&w.tensors[i], 0, w.tensors[i].count, values);
-            gsf_nn_close_weights(ctx, &w);
+            for (size_t i = 0; i < w.tensor_count; i++) gsf_nn_convert_tensor(&w.tensors[i], 0, w.tensors[i].count,
+                                                                              values);
+            gsf_nn_destroy_weights(ctx, &w);
         }
         free(moved);
     }
@@ -119,22 +120,22 @@ static void test_round_trip(gsf_context* ctx) {
     hooked.io.write_fn = hooked_write;
     hooked.io.user = &calls;
     CHECK_OK(&hooked, gsf_init_context(&hooked));
-    if (CHECK_OK(&hooked, gsf_nn_open_weights(&hooked, path, NULL, &w))) {
+    if (CHECK_OK(&hooked, gsf_nn_load_weights(&hooked, path, NULL, &w))) {
         check_same(&w, tensors, ALL);
         CHECK(calls == 1 && w.mapped_bytes == 0 && w.read_bytes == size);
-        gsf_nn_close_weights(&hooked, &w);
+        gsf_nn_destroy_weights(&hooked, &w);
     }
     CHECK_RESULT(&hooked, gsf_nn_save_tensors(&hooked, path, tensors, ALL), GSF_ERROR_IO);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("none.safetensors"), NULL, 0)); // no tensor at all
-    if (CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_scratch("none.safetensors"), NULL, &w))) {
+    if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_scratch("none.safetensors"), NULL, &w))) {
         CHECK(w.tensor_count == 0 && gsf_nn_find_tensor(&w, "x") == NULL);
-        gsf_nn_close_weights(ctx, &w);
+        gsf_nn_destroy_weights(ctx, &w);
     }
 }
 
 static void test_bad_save(gsf_context* ctx) {
     const char* path = test_scratch("bad.safetensors");
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     for (int fault = 0; fault < 8; fault++) {
         make_tensors(tensors);
         switch (fault) {
@@ -157,17 +158,17 @@ static void test_values(gsf_context* ctx) { // a header of no whole number of wo
                        "\"__metadata__\":{\"k\":\"v\"}} ", 7);
     CHECK(m.size % 8 != 7);
     gsf_nn_weights w;
-    if (CHECK_OK(ctx, gsf_nn_open_weights_memory(ctx, "values", m.data, m.size, &w)) && CHECK(w.tensor_count == 2)) {
+    if (CHECK_OK(ctx, gsf_nn_parse_weights(ctx, "values", m.data, m.size, &w)) && CHECK(w.tensor_count == 2)) {
         float v[3];
         CHECK(w.tensors[1].dtype == GSF_NN_U8 && w.tensors[1].rank == 0 && w.tensors[1].count == 1);
-        gsf_nn_read_tensor(&w.tensors[1], 0, 1, v);
+        gsf_nn_convert_tensor(&w.tensors[1], 0, 1, v);
         CHECK(v[0] == 0.0f);
-        gsf_nn_read_tensor(&w.tensors[0], 0, 3, v);
+        gsf_nn_convert_tensor(&w.tensors[0], 0, 3, v);
         CHECK(v[0] == 513.0f && v[1] == 1027.0f && v[2] == 1541.0f);
-        gsf_nn_read_tensor(&w.tensors[0], 1, 2, v);
+        gsf_nn_convert_tensor(&w.tensors[0], 1, 2, v);
         CHECK(v[0] == 1027.0f && v[1] == 1541.0f);
     }
-    gsf_nn_close_weights(ctx, &w);
+    gsf_nn_destroy_weights(ctx, &w);
     free(m.data);
 }
 
@@ -238,7 +239,7 @@ static void test_broken(gsf_context* ctx) {
     for (size_t i = 0; i < GSF__COUNT(broken_files); i++) {
         const broken* b = &broken_files[i];
         made m = make_file(b->header, b->data);
-        const int ok = CHECK_RESULT(ctx, gsf_nn_open_weights_memory(ctx, "f", m.data, m.size, &w), b->result);
+        const int ok = CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "f", m.data, m.size, &w), b->result);
         if (ok && !CHECK(strncmp(ctx->error, "f:", 2) == 0 && strstr(ctx->error, b->text) != NULL))
             fprintf(stderr, "  %s: \"%s\" is not in \"%s\"\n", b->header, b->text, ctx->error);
         CHECK(w.tensors == NULL && w.tensor_count == 0 && w.files == NULL);
@@ -248,25 +249,25 @@ static void test_broken(gsf_context* ctx) {
     for (size_t i = 0; i < GSF__COUNT(claims); i++) { // the header's length
         made m = make_file("{}", 0);
         for (int k = 0; k < 8; k++) m.data[k] = (unsigned char)(claims[i] >> 8 * k);
-        CHECK_RESULT(ctx, gsf_nn_open_weights_memory(ctx, "f", m.data, m.size, &w), GSF_ERROR_FORMAT);
+        CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "f", m.data, m.size, &w), GSF_ERROR_FORMAT);
         CHECK(strstr(ctx->error, "f:0: a header of") != NULL);
         free(m.data);
     }
-    gsf_text deep; // nesting
+    gsf_buffer deep; // nesting
     memset(&deep, 0, sizeof deep);
-    gsf_text_append(ctx, &deep, "{\"x\":", 5);
-    for (int i = 0; i < 200; i++) gsf_text_append(ctx, &deep, "[", 1);
+    gsf_append_bytes(ctx, &deep, "{\"x\":", 5);
+    for (int i = 0; i < 200; i++) gsf_append_bytes(ctx, &deep, "[", 1);
     made m = make_file(deep.data, 0);
-    CHECK_RESULT(ctx, gsf_nn_open_weights_memory(ctx, "f", m.data, m.size, &w), GSF_ERROR_FORMAT);
+    CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "f", m.data, m.size, &w), GSF_ERROR_FORMAT);
     CHECK(strstr(ctx->error, "levels deep") != NULL);
-    gsf_destroy_text(ctx, &deep);
+    gsf_destroy_buffer(ctx, &deep);
     free(m.data);
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent.safetensors"), NULL, &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, test_scratch("absent.safetensors"), NULL, &w), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "absent.safetensors") != NULL);
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent"), NULL, &w), GSF_ERROR_NOT_FOUND);
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("absent"), "model", &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, test_scratch("absent"), NULL, &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, test_scratch("absent"), "model", &w), GSF_ERROR_NOT_FOUND);
     CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("empty.safetensors"), "", 0));
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, test_scratch("empty.safetensors"), NULL, &w), GSF_ERROR_FORMAT);
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, test_scratch("empty.safetensors"), NULL, &w), GSF_ERROR_FORMAT);
 }
 
 // Whatever was accepted is inside the file.
@@ -274,14 +275,14 @@ static void read_all(const gsf_nn_weights* w) {
     float sum = 0.0f, value;
     for (size_t i = 0; i < w->tensor_count; i++)
         for (int64_t k = 0; k < w->tensors[i].count; k++) {
-            gsf_nn_read_tensor(&w->tensors[i], k, 1, &value);
+            gsf_nn_convert_tensor(&w->tensors[i], k, 1, &value);
             sum += value;
         }
     CHECK(sum == sum || sum != sum);
 }
 
 static void test_cut_and_flipped(gsf_context* ctx) {
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     gsf_nn_weights w;
     size_t size;
     make_tensors(tensors);
@@ -290,7 +291,7 @@ static void test_cut_and_flipped(gsf_context* ctx) {
     for (size_t cut = 0; cut < size; cut++) { // every length, in a block of exactly that size
         unsigned char* part = (unsigned char*)malloc(cut ? cut : 1);
         memcpy(part, data, cut);
-        CHECK_RESULT(ctx, gsf_nn_open_weights_memory(ctx, "cut", part, cut, &w), GSF_ERROR_FORMAT);
+        CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "cut", part, cut, &w), GSF_ERROR_FORMAT);
         CHECK(strncmp(ctx->error, "cut:", 4) == 0);
         free(part);
     }
@@ -302,12 +303,12 @@ static void test_cut_and_flipped(gsf_context* ctx) {
         for (size_t k = 0; k < GSF__COUNT(masks); k++) {
             memcpy(copy, data, size);
             copy[i] ^= masks[k];
-            const gsf_result r = gsf_nn_open_weights_memory(ctx, "flip", copy, size, &w);
+            const gsf_result r = gsf_nn_parse_weights(ctx, "flip", copy, size, &w);
             CHECK(r == GSF_OK || r == GSF_ERROR_FORMAT || r == GSF_ERROR_UNSUPPORTED);
             CHECK(r == GSF_OK || strncmp(ctx->error, "flip:", 5) == 0);
             if (r == GSF_OK) read_all(&w);
             *(r == GSF_OK ? &accepted : &refused) += 1;
-            gsf_nn_close_weights(ctx, &w);
+            gsf_nn_destroy_weights(ctx, &w);
         }
     CHECK(refused > 5 * accepted && accepted > 0); // only letters of names can change without harm
     free(copy);
@@ -321,7 +322,7 @@ static void write_text(gsf_context* ctx, const char* name, const char* text) {
 }
 
 static void test_shards(gsf_context* ctx) {
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     gsf_nn_weights w;
     make_tensors(tensors);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("s-1.safetensors"), tensors, 4));
@@ -334,11 +335,11 @@ static void test_shards(gsf_context* ctx) {
     for (int way = 0; way < 3; way++) {
         if (way == 1) folder[strlen(folder) - 1] = 0; // without its slash
         const char* path = way == 2 ? test_scratch("s.safetensors.index.json") : folder;
-        if (CHECK_OK(ctx, gsf_nn_open_weights(ctx, path, way == 2 ? NULL : "s", &w))) check_same(&w, tensors, 7);
-        gsf_nn_close_weights(ctx, &w);
+        if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, path, way == 2 ? NULL : "s", &w))) check_same(&w, tensors, 7);
+        gsf_nn_destroy_weights(ctx, &w);
     }
-    if (CHECK_OK(ctx, gsf_nn_open_weights(ctx, folder, "s-2", &w))) check_same(&w, tensors + 4, 3); // one file by prefix
-    gsf_nn_close_weights(ctx, &w);
+    if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "s-2", &w))) check_same(&w, tensors + 4, 3); // one file by prefix
+    gsf_nn_destroy_weights(ctx, &w);
 
     static const broken indices[] = {
         {"{\"weight_map\":{\"absent\":\"s-1.safetensors\"}}", 0, GSF_ERROR_FORMAT, ":24: tensor absent is not in s-1"},
@@ -365,29 +366,29 @@ static void test_shards(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("s-4.safetensors"), tensors, 1));
     for (size_t i = 0; i < GSF__COUNT(indices); i++) {
         write_text(ctx, "b.safetensors.index.json", indices[i].header);
-        const int ok = CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, folder, "b", &w), indices[i].result);
+        const int ok = CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, folder, "b", &w), indices[i].result);
         if (ok && !CHECK(strstr(ctx->error, indices[i].text) != NULL))
             fprintf(stderr, "  %s: \"%s\" is not in \"%s\"\n", indices[i].header, indices[i].text, ctx->error);
         CHECK(w.tensors == NULL && w.files == NULL);
     }
     remove(test_scratch("b.safetensors.index.json"));
     write_text(ctx, "b.safetensors.index.json", "{\"weight_map\":{}}"); // a map of nothing opens nothing
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, folder, "b", &w));
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "b", &w));
     CHECK(w.tensor_count == 0);
-    gsf_nn_close_weights(ctx, &w);
+    gsf_nn_destroy_weights(ctx, &w);
 }
 
-static void check_opens(gsf_context* ctx, const char* folder, const gsf_tensor* tensors, size_t count) {
+static void check_opens(gsf_context* ctx, const char* folder, const gsf_nn_tensor* tensors, size_t count) {
     gsf_nn_weights w;
-    if (CHECK_OK(ctx, gsf_nn_open_weights(ctx, folder, NULL, &w))) check_same(&w, tensors, count);
-    gsf_nn_close_weights(ctx, &w);
+    if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, NULL, &w))) check_same(&w, tensors, count);
+    gsf_nn_destroy_weights(ctx, &w);
 }
 
 static void test_folders(gsf_context* ctx) { // without a prefix
 #if HAS_FOLDERS
     char folder[1024], path[1100];
     int calls = 0;
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     gsf_nn_weights w;
     gsf_context hooked;
     test_context_zero(&hooked);
@@ -404,17 +405,17 @@ static void test_folders(gsf_context* ctx) { // without a prefix
         snprintf(path, sizeof path, "%s/%s", folder, names[i]);
         remove(path);
     }
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "no .safetensors file") != NULL);
-    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(&hooked, gsf_nn_load_weights(&hooked, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
     snprintf(path, sizeof path, "%s/%s", folder, names[0]);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 3));
     check_opens(ctx, folder, tensors, 3);
     check_opens(&hooked, folder, tensors, 3);
-    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, "absent", &w), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(&hooked, gsf_nn_load_weights(&hooked, folder, "absent", &w), GSF_ERROR_NOT_FOUND);
     snprintf(path, sizeof path, "%s/%s", folder, names[1]);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 2));
-    CHECK_RESULT(ctx, gsf_nn_open_weights(ctx, folder, NULL, &w), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, folder, NULL, &w), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(strstr(ctx->error, "model.safetensors") != NULL && strstr(ctx->error, "other.safetensors") != NULL);
     snprintf(path, sizeof path, "%s/%s", folder, names[2]);
     const char* index = "{\"weight_map\":{\"f32\":\"other.safetensors\"}}";
@@ -422,7 +423,7 @@ static void test_folders(gsf_context* ctx) { // without a prefix
     check_opens(ctx, folder, tensors, 2);
     snprintf(path, sizeof path, "%s/%s", folder, names[0]);
     CHECK_OK(ctx, gsf_write_file(ctx, path, "junk", 4));
-    CHECK_RESULT(&hooked, gsf_nn_open_weights(&hooked, folder, NULL, &w), GSF_ERROR_FORMAT);
+    CHECK_RESULT(&hooked, gsf_nn_load_weights(&hooked, folder, NULL, &w), GSF_ERROR_FORMAT);
     CHECK(strstr(hooked.error, "model.safetensors:0: 4 bytes") != NULL);
 #else
     (void)ctx;
@@ -432,7 +433,7 @@ static void test_folders(gsf_context* ctx) { // without a prefix
 // ---- memory
 
 static void test_memory(gsf_context* plain) {
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     made m = make_file("{\"a\":{\"dtype\":\"U8\",\"shape\":[3],\"data_offsets\":[0,3]}}", 3);
     make_tensors(tensors);
     write_text(plain, "m.safetensors.index.json",
@@ -450,14 +451,14 @@ static void test_memory(gsf_context* plain) {
             CHECK_OK(&ctx, gsf_init_context(&ctx));
             c.fail_at = k;
             const char* out = test_scratch("oom.safetensors");
-            const gsf_result r = job == 0   ? gsf_nn_open_weights_memory(&ctx, "m", m.data, m.size, &w)
-                                 : job == 1 ? gsf_nn_open_weights(&ctx, test_scratch(""), "m", &w)
-                                 : job == 2 ? gsf_nn_open_weights(&ctx, test_scratch(""), "s-1", &w)
+            const gsf_result r = job == 0   ? gsf_nn_parse_weights(&ctx, "m", m.data, m.size, &w)
+                                 : job == 1 ? gsf_nn_load_weights(&ctx, test_scratch(""), "m", &w)
+                                 : job == 2 ? gsf_nn_load_weights(&ctx, test_scratch(""), "s-1", &w)
                                             : gsf_nn_save_tensors(&ctx, out, tensors, ALL);
             done = r == GSF_OK;
             CHECK_RESULT(&ctx, r, done ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY);
             CHECK(done == (c.calls < k));
-            gsf_nn_close_weights(&ctx, &w);
+            gsf_nn_destroy_weights(&ctx, &w);
             CHECK(c.live == 0);
             if (k > 1000) break;
         }
@@ -468,32 +469,32 @@ static void test_memory(gsf_context* plain) {
 
 static void test_large_header(gsf_context* ctx) { // some 10 MB, as no model has it
     enum { TENSORS = 100000 };
-    gsf_text text;
+    gsf_buffer text;
     gsf_nn_weights w;
     memset(&text, 0, sizeof text);
-    gsf_text_append(ctx, &text, "{", 1);
+    gsf_append_bytes(ctx, &text, "{", 1);
     for (int i = 0; i < TENSORS; i++)
-        gsf_text_printf(ctx, &text,
+        gsf_append_text(ctx, &text,
                         "%s\"transformer_blocks.%d.attn1.to_q.weight\":{\"dtype\":\"U8\",\"shape\":[1],"
                         "\"data_offsets\":[%d,%d]}",
                         i ? "," : "", i, i, i + 1);
-    gsf_text_append(ctx, &text, "}", 1);
+    gsf_append_bytes(ctx, &text, "}", 1);
     CHECK(text.size > 9000000);
     made m = make_file(text.data, TENSORS);
-    if (CHECK_OK(ctx, gsf_nn_open_weights_memory(ctx, "large", m.data, m.size, &w))) {
+    if (CHECK_OK(ctx, gsf_nn_parse_weights(ctx, "large", m.data, m.size, &w))) {
         CHECK(w.tensor_count == TENSORS);
         for (int i = 0; i < TENSORS; i += 999) {
             char name[80];
             float v;
             snprintf(name, sizeof name, "transformer_blocks.%d.attn1.to_q.weight", i);
-            const gsf_tensor* t = gsf_nn_find_tensor(&w, name);
+            const gsf_nn_tensor* t = gsf_nn_find_tensor(&w, name);
             if (!CHECK(t != NULL)) continue;
-            gsf_nn_read_tensor(t, 0, 1, &v);
+            gsf_nn_convert_tensor(t, 0, 1, &v);
             CHECK(v == (float)(i & 255));
         }
     }
-    gsf_nn_close_weights(ctx, &w);
-    gsf_destroy_text(ctx, &text);
+    gsf_nn_destroy_weights(ctx, &w);
+    gsf_destroy_buffer(ctx, &text);
     free(m.data);
 }
 
@@ -503,7 +504,7 @@ static void test_golden_model(gsf_context* ctx, const char* part, const char* pr
     char folder[256], path[320];
     gsf_nn_weights w;
     snprintf(folder, sizeof folder, "restorer/model/%s", part);
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden(folder), prefix, &w))) return;
+    if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden(folder), prefix, &w))) return;
     CHECK(w.tensor_count > 10 && (!HAS_FOLDERS || w.mapped_bytes > 1000));
     snprintf(path, sizeof path, "%s/diffusion_pytorch_model.safetensors", folder);
     FILE* single = fopen(test_golden(path), "rb");
@@ -512,12 +513,12 @@ static void test_golden_model(gsf_context* ctx, const char* part, const char* pr
         test_tensors reference = test_open_tensors(test_golden(path));
         CHECK(w.mapped_bytes + w.read_bytes == reference.size);
         for (size_t i = 0; i < w.tensor_count; i += 7) {
-            const gsf_tensor* t = &w.tensors[i];
+            const gsf_nn_tensor* t = &w.tensors[i];
             test_tensor e = test_get_tensor(&reference, t->name);
             if (CHECK(e.count == (size_t)t->count && e.rank == t->rank &&
-                      strcmp(e.dtype, gsf_nn_dtype_name(t->dtype)) == 0)) {
+                      strcmp(e.dtype, gsf__nn_dtype_name(t->dtype)) == 0)) {
                 float* v = (float*)malloc((e.count + 1) * sizeof(float));
-                gsf_nn_read_tensor(t, 0, t->count, v);
+                gsf_nn_convert_tensor(t, 0, t->count, v);
                 for (int k = 0; k < e.rank; k++) CHECK((int64_t)e.dim[k] == t->shape[k]);
                 test_compare_floats(t->name, v, e.v, e.count, 0.0);
                 free(v);
@@ -528,21 +529,21 @@ static void test_golden_model(gsf_context* ctx, const char* part, const char* pr
     } else {
         CHECK(files == 0 || ((gsf__nn_files*)w.files)->count >= files);
     }
-    gsf_nn_close_weights(ctx, &w);
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden(folder), NULL, &w)); // the prefix is found
-    gsf_nn_close_weights(ctx, &w);
+    gsf_nn_destroy_weights(ctx, &w);
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden(folder), NULL, &w)); // the prefix is found
+    gsf_nn_destroy_weights(ctx, &w);
 }
 
 // ---- what the networks use
 
 static void test_loader(gsf_context* ctx) {
-    gsf_tensor tensors[ALL];
+    gsf_nn_tensor tensors[ALL];
     gsf_nn_weights w;
     gsf__nn_loader loader;
-    const gsf_tensor* t;
+    const gsf_nn_tensor* t;
     const int64_t six[2] = {2, 3}, five[1] = {5}, wrong[2] = {3, 2}, any[2] = {-1, 3};
     make_tensors(tensors);
-    if (!CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_scratch("all.safetensors"), NULL, &w))) return;
+    if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_scratch("all.safetensors"), NULL, &w))) return;
     CHECK_OK(ctx, gsf__nn_begin_loading(ctx, &w, &loader));
     CHECK_OK(ctx, gsf__nn_need(&loader, &t, 2, six, "f%d", 32));
     CHECK(t == gsf_nn_find_tensor(&w, "f32"));
@@ -572,7 +573,7 @@ static void test_loader(gsf_context* ctx) {
     CHECK_OK(ctx, gsf__nn_begin_loading(ctx, &w, &loader));
     gsf__nn_ignore(&loader, "");
     CHECK_OK(ctx, gsf__nn_end_loading(&loader, GSF_OK));
-    gsf_nn_close_weights(ctx, &w);
+    gsf_nn_destroy_weights(ctx, &w);
 }
 
 static void test_config(gsf_context* ctx) {

@@ -9,8 +9,8 @@
 #include "test_hooks.h"
 
 typedef struct layer { // everything in blocks of its exact size, so that ASan sees a step too far
-    gsf_nn_linear_desc desc;
-    gsf_tensor weight, bias;
+    gsf__nn_linear_desc desc;
+    gsf_nn_tensor weight, bias;
     float *x, *w, *y, *gate, *before, *bias_values;
     int64_t in, out;
     size_t y_count;
@@ -60,20 +60,20 @@ static void free_layer(layer* l) {
     free(l->bias_values);
 }
 
-static void run(gsf_context* ctx, gsf_nn_workspace* workspace, layer* l, const gsf_nn_quantized* q) {
+static void run(gsf_context* ctx, gsf__nn_workspace* workspace, layer* l, const gsf__nn_quantized* q) {
     memcpy(l->y, l->before, l->y_count * sizeof(float));
-    CHECK_OK(ctx, gsf_nn_linear_int8(ctx, workspace, &l->desc, q));
+    CHECK_OK(ctx, gsf__nn_run_linear_int8(ctx, workspace, &l->desc, q));
 }
 
-static void quantize(gsf_context* ctx, layer* l, int no_rotation, gsf_nn_quantized* q) {
-    CHECK_OK(ctx, gsf_nn_quantize_weight(ctx, &l->weight, no_rotation, q));
+static void quantize(gsf_context* ctx, layer* l, int32_t no_rotation, gsf__nn_quantized* q) {
+    CHECK_OK(ctx, gsf__nn_quantize_weight(ctx, &l->weight, no_rotation, q));
 }
 
-static double activation_of(gsf_nn_activation activation, double x) {
-    if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    if (activation == GSF_NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
-    if (activation == GSF_NN_RELU) return x < 0.0 ? 0.0 : x;
-    return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
+static double activation_of(gsf__nn_activation activation, double x) {
+    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    if (activation == GSF__NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
+    if (activation == GSF__NN_RELU) return x < 0.0 ? 0.0 : x;
+    return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
 // What the definition says, in double but for the rounding to 8 bits: a rotation by the signs of the bits that i and j share.
@@ -99,19 +99,19 @@ static void test_definition(gsf_context* ctx) {
     static const int64_t rows[] = {1, 2, 3, 4, 5, 6, 7, 13, 40};
     static const int64_t ins[] = {1, 2, 3, 4, 6, 8, 13, 16, 24, 40, 64, 100, 128, 192, 256, 320, 512, 520, 768};
     static const int64_t outs[] = {1, 3, 8, 15, 16, 17, 33, 50};
-    gsf_nn_workspace workspace;
+    gsf__nn_workspace workspace;
     memset(&workspace, 0, sizeof workspace);
     for (int i = 0; i < 60; i++) {
         const int64_t m = rows[i % (int)GSF__COUNT(rows)], in = ins[i % (int)GSF__COUNT(ins)];
         const int64_t out = outs[test_random_bits(&seed) % GSF__COUNT(outs)];
         layer l = make_layer(m, in, out, i % 5 == 4 ? 3 : 0);
-        gsf_nn_quantized q;
+        gsf__nn_quantized q;
         quantize(ctx, &l, i % 4 == 3, &q);
         int64_t block = 1;
         while (i % 4 != 3 && block < 256 && in % (2 * block) == 0) block *= 2;
         CHECK(q.block == block && q.in == in && q.out == out);
         CHECK(q.bytes == (size_t)(gsf__round_up(out, 16) * (gsf__round_up(in, 4) + 8)));
-        l.desc.activation = (gsf_nn_activation)(i / 5 % 5);
+        l.desc.activation = (gsf__nn_activation)(i / 5 % 5);
         l.desc.bias = i % 2 ? &l.bias : NULL;
         l.desc.gate = i % 7 < 2 ? l.gate : NULL;
         l.desc.accumulate = i % 3 == 0;
@@ -150,16 +150,16 @@ static void test_definition(gsf_context* ctx) {
         CHECK(touched == 0);
         free(qx);
         free(qw);
-        gsf_nn_destroy_quantized(ctx, &q);
+        gsf__nn_destroy_quantized(ctx, &q);
         CHECK(q.data == NULL && q.bytes == 0);
         free_layer(&l);
     }
-    gsf_nn_destroy_workspace(ctx, &workspace);
+    gsf__nn_destroy_workspace(ctx, &workspace);
 }
 
 // Error of the layer against the product of the unrounded values in double.
-static double error_of(gsf_context* ctx, layer* l, int no_rotation) {
-    gsf_nn_quantized q;
+static double error_of(gsf_context* ctx, layer* l, int32_t no_rotation) {
+    gsf__nn_quantized q;
     double difference = 0.0, square = 0.0;
     quantize(ctx, l, no_rotation, &q);
     run(ctx, NULL, l, &q);
@@ -171,7 +171,7 @@ static double error_of(gsf_context* ctx, layer* l, int no_rotation) {
             difference += error * error;
             square += sum * sum;
         }
-    gsf_nn_destroy_quantized(ctx, &q);
+    gsf__nn_destroy_quantized(ctx, &q);
     return sqrt(difference / square);
 }
 
@@ -199,7 +199,7 @@ static void test_types(gsf_context* ctx) {
     for (int t = 0; t < 2; t++)
         for (size_t offset = 0; offset < 4; offset++) {
             layer l = make_layer(1, in, out, 0);
-            gsf_nn_quantized a, b;
+            gsf__nn_quantized a, b;
             char* block = (char*)malloc(offset + 2 * (size_t)(in * out));
             for (int64_t i = 0; i < in * out; i++) {
                 const uint16_t bits = t ? gsf__float_to_bf16(l.w[i]) : gsf__float_to_half(l.w[i]);
@@ -211,8 +211,8 @@ static void test_types(gsf_context* ctx) {
             l.weight.dtype = t ? GSF_NN_BF16 : GSF_NN_F16;
             quantize(ctx, &l, 0, &b);
             CHECK(a.bytes == b.bytes && memcmp(a.data, b.data, a.bytes) == 0);
-            gsf_nn_destroy_quantized(ctx, &a);
-            gsf_nn_destroy_quantized(ctx, &b);
+            gsf__nn_destroy_quantized(ctx, &a);
+            gsf__nn_destroy_quantized(ctx, &b);
             free(block);
             free_layer(&l);
         }
@@ -232,7 +232,7 @@ static void test_same_bits(gsf_cpu_level best) {
         for (int level = GSF_CPU_SCALAR; level <= (int)best; level++)
             for (int workers = 1; workers <= 3; workers += 2) {
                 gsf_context ctx;
-                gsf_nn_quantized q;
+                gsf__nn_quantized q;
                 memset(&ctx, 0, sizeof ctx);
                 ctx.cpu_level = (gsf_cpu_level)level;
                 ctx.threads = 1;
@@ -247,7 +247,7 @@ static void test_same_bits(gsf_cpu_level best) {
                 }
                 CHECK(memcmp(first_weight, q.data, q.bytes) == 0);
                 CHECK(memcmp(first, l.y, l.y_count * sizeof(float)) == 0);
-                gsf_nn_destroy_quantized(&ctx, &q);
+                gsf__nn_destroy_quantized(&ctx, &q);
             }
         free(first_weight);
         free(first);
@@ -311,9 +311,9 @@ static void test_special(gsf_context* ctx) {
             const int64_t in = sizes[s], rows = 15, out = 19;
             if (i == 4 && in == 5) continue; // no rotation, so nothing adds the large values up
             layer l = make_layer(rows, in, out, 0);
-            gsf_nn_quantized q;
+            gsf__nn_quantized q;
             l.desc.bias = &l.bias;
-            l.desc.activation = s == 3 ? GSF_NN_GELU_TANH : s == 2 ? GSF_NN_SILU : GSF_NN_LINEAR;
+            l.desc.activation = s == 3 ? GSF__NN_GELU_TANH : s == 2 ? GSF__NN_SILU : GSF__NN_LINEAR;
             quantize(ctx, &l, 0, &q);
             l.x[7 * in + (i % 2 ? in - 1 : 2)] = bad[i];
             if (i == 4) l.x[7 * in] = l.x[7 * in + 1] = l.x[7 * in + 3] = bad[i]; // their sum is infinite
@@ -326,13 +326,13 @@ static void test_special(gsf_context* ctx) {
                     const float y = l.y[m * out + n];
                     if (m == 7) wrong += y == y;
                     else wrong += !(fabsf(y) <= FLT_MAX);
-                    if ((m == 9 || m == 10) && l.desc.activation == GSF_NN_LINEAR) wrong += y != l.bias_values[n];
+                    if ((m == 9 || m == 10) && l.desc.activation == GSF__NN_LINEAR) wrong += y != l.bias_values[n];
                 }
             CHECK(wrong == 0);
-            gsf_nn_destroy_quantized(ctx, &q);
+            gsf__nn_destroy_quantized(ctx, &q);
             l.w[11 * in + in - 1] = bad[i];
             if (i < 4) {
-                CHECK_RESULT(ctx, gsf_nn_quantize_weight(ctx, &l.weight, (int)(s % 2), &q), GSF_ERROR_NUMERIC);
+                CHECK_RESULT(ctx, gsf__nn_quantize_weight(ctx, &l.weight, (int)(s % 2), &q), GSF_ERROR_NUMERIC);
                 CHECK(strstr(ctx->error, "made.weight") != NULL && strstr(ctx->error, "row 11") != NULL);
                 CHECK(q.data == NULL);
             }
@@ -342,13 +342,13 @@ static void test_special(gsf_context* ctx) {
 
 static void test_bad_arguments(gsf_context* ctx) {
     layer l = make_layer(5, 6, 7, 0);
-    gsf_nn_quantized q, none;
+    gsf__nn_quantized q, none;
     memset(&none, 0, sizeof none);
     quantize(ctx, &l, 0, &q);
 #define REFUSED(call, change, code)                                            \
     do {                                                                       \
-        gsf_nn_linear_desc d = l.desc;                                         \
-        gsf_tensor weight = l.weight, bias = l.bias;                           \
+        gsf__nn_linear_desc d = l.desc;                                         \
+        gsf_nn_tensor weight = l.weight, bias = l.bias;                           \
         d.bias = &bias;                                                        \
         ctx->error[0] = 0;                                                     \
         change;                                                                \
@@ -357,7 +357,7 @@ static void test_bad_arguments(gsf_context* ctx) {
         (void)weight;                                                          \
         (void)d;                                                               \
     } while (0)
-#define LINEAR gsf_nn_linear_int8(ctx, NULL, &d, &q)
+#define LINEAR gsf__nn_run_linear_int8(ctx, NULL, &d, &q)
     REFUSED(LINEAR, d.x = NULL, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(LINEAR, d.y = NULL, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(LINEAR, d.rows = -1, GSF_ERROR_INVALID_ARGUMENT);
@@ -366,10 +366,10 @@ static void test_bad_arguments(gsf_context* ctx) {
     REFUSED(LINEAR, bias.count = 6, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(LINEAR, bias.data = NULL, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(LINEAR, d.rows = INT64_MAX, GSF_ERROR_OUT_OF_MEMORY);
-    REFUSED(gsf_nn_linear_int8(ctx, NULL, &d, NULL), (void)0, GSF_ERROR_INVALID_ARGUMENT);
-    REFUSED(gsf_nn_linear_int8(ctx, NULL, &d, &none), (void)0, GSF_ERROR_INVALID_ARGUMENT);
-#define QUANTIZE gsf_nn_quantize_weight(ctx, &weight, 0, &none)
-    REFUSED(gsf_nn_quantize_weight(ctx, NULL, 0, &none), (void)0, GSF_ERROR_INVALID_ARGUMENT);
+    REFUSED(gsf__nn_run_linear_int8(ctx, NULL, &d, NULL), (void)0, GSF_ERROR_INVALID_ARGUMENT);
+    REFUSED(gsf__nn_run_linear_int8(ctx, NULL, &d, &none), (void)0, GSF_ERROR_INVALID_ARGUMENT);
+#define QUANTIZE gsf__nn_quantize_weight(ctx, &weight, 0, &none)
+    REFUSED(gsf__nn_quantize_weight(ctx, NULL, 0, &none), (void)0, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(QUANTIZE, weight.data = NULL, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(QUANTIZE, weight.rank = 1, GSF_ERROR_INVALID_ARGUMENT);
     REFUSED(QUANTIZE, weight.shape[0] = 0, GSF_ERROR_INVALID_ARGUMENT);
@@ -380,7 +380,7 @@ static void test_bad_arguments(gsf_context* ctx) {
     l.desc.rows = 0; // nothing to do
     run(ctx, NULL, &l, &q);
     CHECK(memcmp(l.y, l.before, l.y_count * sizeof(float)) == 0);
-    gsf_nn_destroy_quantized(ctx, &q);
+    gsf__nn_destroy_quantized(ctx, &q);
     free_layer(&l);
 }
 
@@ -394,22 +394,22 @@ static void test_memory(void) {
     layer l = make_layer(20, 50, 60, 0);
     size_t failed = 0;
     for (size_t k = 1;; k++, failed++) {
-        gsf_nn_quantized q;
+        gsf__nn_quantized q;
         count.calls = 0;
         count.fail_at = k;
-        gsf_result result = gsf_nn_quantize_weight(&ctx, &l.weight, 0, &q);
+        gsf_result result = gsf__nn_quantize_weight(&ctx, &l.weight, 0, &q);
         if (result == GSF_OK) {
-            result = gsf_nn_linear_int8(&ctx, NULL, &l.desc, &q);
+            result = gsf__nn_run_linear_int8(&ctx, NULL, &l.desc, &q);
             CHECK(count.live == 1);
-            gsf_nn_destroy_quantized(&ctx, &q);
+            gsf__nn_destroy_quantized(&ctx, &q);
         }
         CHECK(count.live == 0);
         if (result == GSF_OK) break;
         if (!CHECK(result == GSF_ERROR_OUT_OF_MEMORY)) break;
     }
     CHECK(failed == 3);
-    gsf_nn_quantized q;
-    gsf_nn_workspace workspace;
+    gsf__nn_quantized q;
+    gsf__nn_workspace workspace;
     memset(&workspace, 0, sizeof workspace);
     count.fail_at = 0;
     quantize(&ctx, &l, 0, &q);
@@ -417,8 +417,8 @@ static void test_memory(void) {
     const size_t calls = count.calls;
     run(&ctx, &workspace, &l, &q); // what is there is enough
     CHECK(count.calls == calls && count.live == 2);
-    gsf_nn_destroy_workspace(&ctx, &workspace);
-    gsf_nn_destroy_quantized(&ctx, &q);
+    gsf__nn_destroy_workspace(&ctx, &workspace);
+    gsf__nn_destroy_quantized(&ctx, &q);
     CHECK(count.live == 0);
     free_layer(&l);
 }

@@ -76,11 +76,11 @@ static void check_exp(void) {
 
 // ---- activations ---------------------------------------------------------------
 
-static double activation_of(gsf_nn_activation activation, double x) {
-    if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    if (activation == GSF_NN_SILU) return x / (1.0 + exp(-x));
-    if (activation == GSF_NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
-    return activation == GSF_NN_RELU && x < 0.0 ? 0.0 : x;
+static double activation_of(gsf__nn_activation activation, double x) {
+    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    if (activation == GSF__NN_SILU) return x / (1.0 + exp(-x));
+    if (activation == GSF__NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
+    return activation == GSF__NN_RELU && x < 0.0 ? 0.0 : x;
 }
 
 // GELU's relative error, from where results become too small for it to where they are x.
@@ -89,9 +89,9 @@ static void check_gelu(void) {
     float *x = make_floats(COUNT, -14.0, 7.0), *y = make_floats(COUNT, 0, 1);
     double worst = 0.0;
     for (size_t i = 0; i < COUNT / 8; i++) x[i] *= 0.001f;
-    gsf_nn_activate(&one, GSF_NN_GELU, x, COUNT, y);
+    gsf__nn_activate(&one, GSF__NN_GELU, x, COUNT, y);
     for (size_t i = 0; i < COUNT; i++) {
-        const double expected = activation_of(GSF_NN_GELU, (double)x[i]), size = fabs(expected);
+        const double expected = activation_of(GSF__NN_GELU, (double)x[i]), size = fabs(expected);
         if (size > 1e-36) worst = fmax(worst, fabs((double)y[i] - expected) / size);
         else CHECK(fabs((double)y[i] - expected) <= 1e-36);
     }
@@ -102,7 +102,8 @@ static void check_gelu(void) {
 
 static void check_activate(void) {
     static const size_t sizes[] = {0, 1, 7, 8, 9, 31, 70003};
-    static const gsf_nn_activation kinds[] = {GSF_NN_LINEAR, GSF_NN_GELU_TANH, GSF_NN_SILU, GSF_NN_GELU, GSF_NN_RELU};
+    static const gsf__nn_activation kinds[] = {GSF__NN_LINEAR, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU,
+                                               GSF__NN_RELU};
     for (size_t s = 0; s < sizeof sizes / sizeof sizes[0]; s++)
         for (int k = 0; k < 5; k++) {
             const size_t n = sizes[s];
@@ -110,16 +111,16 @@ static void check_activate(void) {
             double* expected = make_doubles(n);
             const float after = y[n];
             for (size_t i = 0; i < n; i++) expected[i] = activation_of(kinds[k], (double)x[i]);
-            gsf_nn_activate(&one, kinds[k], x, (int64_t)n, y);
+            gsf__nn_activate(&one, kinds[k], x, (int64_t)n, y);
             test_compare_floats("activate", y, expected, n, 2e-6);
-            gsf_nn_activate(&three, kinds[k], z, (int64_t)n, z);
+            gsf__nn_activate(&three, kinds[k], z, (int64_t)n, z);
             CHECK(same_bits(y, z, n) && y[n] == after);
             free(x); free(y); free(z); free(expected);
         }
     const float x[9] = {INFINITY, -INFINITY, NAN, FLT_MAX, -FLT_MAX, 1e3f, -1e3f, 0.0f, NAN};
     for (int k = 1; k < 5; k++) {
         float y[9];
-        gsf_nn_activate(&one, kinds[k], x, 9, y);
+        gsf__nn_activate(&one, kinds[k], x, 9, y);
         CHECK(y[0] == INFINITY && y[1] == 0.0f && y[2] != y[2] && y[3] == FLT_MAX && y[4] == 0.0f);
         CHECK(y[5] == 1e3f && y[6] == 0.0f && y[7] == 0.0f && y[8] != y[8]);
     }
@@ -141,18 +142,18 @@ static void check_softmax(void) {
                     sum += expected[i] = exp((double)scale * (double)x[i] - top);
                 for (int64_t i = r * columns; i < (r + 1) * columns; i++) expected[i] /= sum;
             }
-            gsf_nn_softmax(&one, x, rows, columns, scale, y);
+            gsf__nn_softmax(&one, x, rows, columns, scale, y);
             test_compare_floats("softmax", y, expected, n, 2e-6 * test_max_abs(expected, n));
-            gsf_nn_softmax(&three, z, rows, columns, scale, z);
+            gsf__nn_softmax(&three, z, rows, columns, scale, z);
             CHECK(same_bits(y, z, n));
             free(x); free(y); free(z); free(expected);
         }
     float x[13], y[13];
     for (int i = 0; i < 13; i++) x[i] = (float)i * 1e4f;
-    gsf_nn_softmax(&one, x, 1, 13, 1.0f, y);
+    gsf__nn_softmax(&one, x, 1, 13, 1.0f, y);
     CHECK(y[12] == 1.0f && y[0] == 0.0f && y[11] == 0.0f);
     x[3] = NAN;
-    gsf_nn_softmax(&one, x, 1, 13, 1.0f, y);
+    gsf__nn_softmax(&one, x, 1, 13, 1.0f, y);
     for (int i = 0; i < 13; i++) CHECK(y[i] != y[i]);
 }
 
@@ -194,21 +195,22 @@ static void check_row_norms(void) {
             gsf_context* contexts[2] = {&one, &three};
             for (int k = 0; k < 2; k++) { // the second time in place
                 float *in = k ? z : x, *out = k ? z : y;
-                if (way == 5) gsf_nn_rms_norm(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, eps, out);
+                if (way == 5) gsf__nn_rms_norm(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, eps, out);
                 else if (with_m)
-                    gsf_nn_layer_norm_modulated(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, pb, eps, ps, shift, out);
-                else gsf_nn_layer_norm(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, pb, eps, out);
+                    gsf__nn_layer_norm_modulated(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, pb, eps, ps, shift,
+                                                 out);
+                else gsf__nn_layer_norm(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, pb, eps, out);
             }
             test_compare_floats("row norm", y, expected, n, 5e-7 * fmax(1.0, test_max_abs(expected, n)));
             CHECK(same_bits(y, z, n));
             x[n - 1] = NAN;
-            gsf_nn_layer_norm(&one, x, (int64_t)rows, (int64_t)dim, pw, pb, eps, y);
+            gsf__nn_layer_norm(&one, x, (int64_t)rows, (int64_t)dim, pw, pb, eps, y);
             for (size_t i = n - dim; i < n; i++) CHECK(y[i] != y[i]);
             CHECK(rows == 1 || y[n - dim - 1] == y[n - dim - 1]);
             free(x); free(y); free(z); free(w); free(b); free(scale); free(shift); free(expected);
         }
     float before[1];
-    gsf_nn_layer_norm(&one, before + 1, 3, 0, NULL, NULL, 1e-6f, before + 1); // reads nothing
+    gsf__nn_layer_norm(&one, before + 1, 3, 0, NULL, NULL, 1e-6f, before + 1); // reads nothing
 }
 
 static void check_group_norm(void) {
@@ -227,12 +229,12 @@ static void check_group_norm(void) {
                 expected[i] = expected[i] * (double)w[i / count] + (double)b[i / count];
             const float *pw = way ? w : NULL, *pb = way ? b : NULL;
             const int64_t c0 = cases[c][0], c1 = cases[c][1], c2 = cases[c][2];
-            gsf_nn_group_norm(&one, x, c0, c1, c2, pw, pb, 1e-6f, y);
+            gsf__nn_group_norm(&one, x, c0, c1, c2, pw, pb, 1e-6f, y);
             test_compare_floats("group norm", y, expected, n, 5e-7 * fmax(1.0, test_max_abs(expected, n)));
-            gsf_nn_group_norm(&three, z, c0, c1, c2, pw, pb, 1e-6f, z);
+            gsf__nn_group_norm(&three, z, c0, c1, c2, pw, pb, 1e-6f, z);
             CHECK(same_bits(y, z, n));
             x[per - 1] = INFINITY;
-            gsf_nn_group_norm(&three, x, c0, c1, c2, NULL, NULL, 1e-6f, y);
+            gsf__nn_group_norm(&three, x, c0, c1, c2, NULL, NULL, 1e-6f, y);
             CHECK(y[0] != y[0] && y[per - 1] != y[per - 1]);
             CHECK(groups == 1 || y[per] == y[per]);
             free(x); free(y); free(z); free(w); free(b); free(expected);
@@ -243,9 +245,9 @@ enum { LARGE_CHANNELS = 8, LARGE_COUNT = GSF__NN_STREAM / LARGE_CHANNELS + 96, L
 enum { LARGE = LARGE_CHANNELS * LARGE_COUNT };
 
 static void run_large(gsf_context* ctx, int kind, const float* x, const float* w, float* y) {
-    if (kind == 0) gsf_nn_layer_norm(ctx, x, LARGE / LARGE_DIM, LARGE_DIM, w, w, 1e-6f, y);
-    if (kind == 1) gsf_nn_group_norm(ctx, x, LARGE_CHANNELS, LARGE_COUNT, 2, w, w, 1e-6f, y);
-    if (kind == 2) gsf_nn_activate(ctx, GSF_NN_GELU, x, LARGE, y);
+    if (kind == 0) gsf__nn_layer_norm(ctx, x, LARGE / LARGE_DIM, LARGE_DIM, w, w, 1e-6f, y);
+    if (kind == 1) gsf__nn_group_norm(ctx, x, LARGE_CHANNELS, LARGE_COUNT, 2, w, w, 1e-6f, y);
+    if (kind == 2) gsf__nn_activate(ctx, GSF__NN_GELU, x, LARGE, y);
 }
 
 // Results larger than any cache bypass it, if they are aligned: the same bits as of those that do not.
@@ -291,11 +293,11 @@ static void check_head_norm_rope(void) {
                     e[i + 1] = head[i + 1] * (double)co[i + 1] + head[i] * (double)si[i + 1];
                 }
             }
-        gsf_nn_head_norm_rope(&one, x, (int64_t)rows, (int64_t)ld, (int32_t)heads, (int32_t)dim, w, b, 1e-5f,
-                              first < 0 ? NULL : cosine, first < 0 ? NULL : sine, first < 0 ? 0 : first);
+        gsf__nn_head_norm_rope(&one, x, (int64_t)rows, (int64_t)ld, (int32_t)heads, (int32_t)dim, w, b, 1e-5f,
+                               first < 0 ? NULL : cosine, first < 0 ? NULL : sine, first < 0 ? 0 : first);
         test_compare_floats("head norm", x, expected, n, 2e-6);
-        gsf_nn_head_norm_rope(&three, y, (int64_t)rows, (int64_t)ld, (int32_t)heads, (int32_t)dim, w, b, 1e-5f,
-                              first < 0 ? NULL : cosine, first < 0 ? NULL : sine, first < 0 ? 0 : first);
+        gsf__nn_head_norm_rope(&three, y, (int64_t)rows, (int64_t)ld, (int32_t)heads, (int32_t)dim, w, b, 1e-5f,
+                               first < 0 ? NULL : cosine, first < 0 ? NULL : sine, first < 0 ? 0 : first);
         CHECK(same_bits(x, y, n));
         free(x); free(y); free(w); free(b); free(cosine); free(sine); free(expected); free(head);
     }
@@ -313,7 +315,7 @@ typedef struct attention_case {
 } attention_case;
 
 typedef struct attention_data {
-    gsf_nn_attention_desc desc;
+    gsf__nn_attention_desc desc;
     float *q, *k, *v, *bias, *out;
     unsigned char* mask;
     size_t q_count, k_count;
@@ -337,7 +339,7 @@ static attention_data make_attention(const attention_case* c) {
         for (int64_t j = 0; j < c->keys; j++) a.mask[(c->queries - 1) * c->keys + j] = j == c->keys - 1;
     }
     if (c->bias != 0.0f) a.bias = make_floats((size_t)(c->heads * c->queries * c->keys), -c->bias, c->bias);
-    gsf_nn_attention_desc* d = &a.desc;
+    gsf__nn_attention_desc* d = &a.desc;
     d->queries = c->queries;
     d->keys = c->keys;
     d->heads = c->heads;
@@ -424,10 +426,10 @@ static void check_attention(void) {
         // the weights are rounded, too: 2^-9 of each, of numerator and denominator; values differ by up to 3
         const double rounding = attention_rounds(&a) ? 3.0 / 256 : 0.0;
         double* expected = make_doubles(values);
-        gsf_nn_workspace workspace;
+        gsf__nn_workspace workspace;
         memset(&workspace, 0, sizeof workspace);
         attention_of(c, &a, expected);
-        CHECK_OK(&one, gsf_nn_attention(&one, &workspace, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, &workspace, &a.desc));
         float* dense = dense_rows(c, a.out);
         char what[80];
         snprintf(what, sizeof what, "attention case %zu%s", n / 2, n % 2 ? " bf16" : "");
@@ -440,10 +442,10 @@ static void check_attention(void) {
         for (int64_t r = 0; c->extra && r < c->queries; r++) // gaps keep what stood there
             CHECK(a.out[r * (c->heads * c->dim + c->extra) + c->heads * c->dim] >= 7.0f);
         a.desc.out = a.q; // in place, other workers, scratch for this call only
-        CHECK_OK(&three, gsf_nn_attention(&three, NULL, &a.desc));
+        CHECK_OK(&three, gsf__nn_run_attention(&three, NULL, &a.desc));
         float* again = dense_rows(c, a.q);
         CHECK(same_bits(dense, again, values));
-        gsf_nn_destroy_workspace(&one, &workspace);
+        gsf__nn_destroy_workspace(&one, &workspace);
         free(dense); free(again); free(expected);
         free_attention(&a);
     }
@@ -473,7 +475,7 @@ static void check_attention_offset(void) {
         for (size_t i = 0; i < a.k_count; i++) a.k[i] += offsets[n / 2 % 2];
         double* expected = make_doubles(values);
         attention_of(c, &a, expected);
-        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         float* dense = dense_rows(c, a.out);
         char what[80];
         snprintf(what, sizeof what, "attention case %zu, keys at %g%s", n / 4, (double)offsets[n / 2 % 2], n % 2 ? " bf16" : "");
@@ -490,16 +492,16 @@ static void check_attention_values(int bf16) {
         attention_data a = make_attention(&c);
         a.desc.bf16 = bf16;
         a.q[3 * width + 5] = NAN; // query 3 of head 0
-        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         CHECK(all_nan(a.out + 3 * width, 24) && none_nan(a.out + 3 * width + 24, 24) && none_nan(a.out, 3 * width));
         CHECK(none_nan(a.out + 4 * width, 16 * width));
         a.q[3 * width + 5] = 1.0f;
         a.k[(size_t)key * width + 30] = NAN; // all queries of head 1
-        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         for (size_t r = 0; r < 20; r++) CHECK(none_nan(a.out + r * width, 24) && all_nan(a.out + r * width + 24, 24));
         a.k[(size_t)key * width + 30] = 1.0f;
         a.v[(size_t)key * width + 7] = NAN; // column 7
-        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         for (size_t r = 0; r < 20; r++)
             for (size_t i = 0; i < width; i++) CHECK((a.out[r * width + i] != a.out[r * width + i]) == (i == 7));
         a.v[(size_t)key * width + 7] = 1.0f;
@@ -507,10 +509,10 @@ static void check_attention_values(int bf16) {
             a.q[i] = 1e30f;
             a.k[(size_t)key * width + i] = 1e30f;
         }
-        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         CHECK(all_nan(a.out, 24) && none_nan(a.out + width + 24, 24));
         for (size_t i = 0; i < 24; i++) a.k[(size_t)key * width + i] = -1e30f; // weight 0 at -inf
-        CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+        CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         CHECK(none_nan(a.out, 20 * width));
         free_attention(&a);
     }
@@ -525,13 +527,13 @@ static void check_attention_bias(void) {
         a.bias[j] = -INFINITY;                              // query 0 of head 0
         a.bias[(20 + 7) * 300 + j] = j == 299 ? -5e3f : -INFINITY; // query 7 of head 1
     }
-    CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+    CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
     for (size_t i = 0; i < 24; i++) {
         CHECK(a.out[i] == 0.0f);
         CHECK_NEAR(a.out[7 * width + 24 + i], a.v[299 * width + 24 + i], 1e-6);
     }
     a.bias[3 * 300 + 299] = NAN;
-    CHECK_OK(&one, gsf_nn_attention(&one, NULL, &a.desc));
+    CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
     CHECK(all_nan(a.out + 3 * width, 24) && none_nan(a.out + 3 * width + 24, 16 * width));
     free_attention(&a);
 }
@@ -543,33 +545,33 @@ static void check_attention_errors(void) {
     memset(&memory, 0, sizeof memory);
     gsf_context ctx = three;
     count_memory(&ctx, &memory);
-    gsf_nn_workspace workspace;
+    gsf__nn_workspace workspace;
     memset(&workspace, 0, sizeof workspace);
     memory.fail_at = 1;
-    CHECK_RESULT(&ctx, gsf_nn_attention(&ctx, NULL, &a.desc), GSF_ERROR_OUT_OF_MEMORY);
+    CHECK_RESULT(&ctx, gsf__nn_run_attention(&ctx, NULL, &a.desc), GSF_ERROR_OUT_OF_MEMORY);
     memory.calls = 0;
-    CHECK_RESULT(&ctx, gsf_nn_attention(&ctx, &workspace, &a.desc), GSF_ERROR_OUT_OF_MEMORY);
+    CHECK_RESULT(&ctx, gsf__nn_run_attention(&ctx, &workspace, &a.desc), GSF_ERROR_OUT_OF_MEMORY);
     CHECK(memory.live == 0);
     memory.fail_at = 0;
-    CHECK_OK(&ctx, gsf_nn_attention(&ctx, &workspace, &a.desc));
+    CHECK_OK(&ctx, gsf__nn_run_attention(&ctx, &workspace, &a.desc));
     memory.calls = 0;
-    CHECK_OK(&ctx, gsf_nn_attention(&ctx, &workspace, &a.desc)); // allocates nothing more
+    CHECK_OK(&ctx, gsf__nn_run_attention(&ctx, &workspace, &a.desc)); // allocates nothing more
     CHECK(memory.calls == 0 && memory.live == 1);
-    gsf_nn_destroy_workspace(&ctx, &workspace);
-    CHECK_OK(&ctx, gsf_nn_attention(&ctx, NULL, &a.desc));
+    gsf__nn_destroy_workspace(&ctx, &workspace);
+    CHECK_OK(&ctx, gsf__nn_run_attention(&ctx, NULL, &a.desc));
     CHECK(memory.live == 0);
-    gsf_nn_attention_desc d = a.desc;
+    gsf__nn_attention_desc d = a.desc;
     d.queries = 0;
-    CHECK_OK(&ctx, gsf_nn_attention(&ctx, NULL, &d));
+    CHECK_OK(&ctx, gsf__nn_run_attention(&ctx, NULL, &d));
     d = a.desc;
     d.k = NULL;
-    CHECK_RESULT(&ctx, gsf_nn_attention(&ctx, NULL, &d), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf__nn_run_attention(&ctx, NULL, &d), GSF_ERROR_INVALID_ARGUMENT);
     d = a.desc;
     d.keys = 0;
-    CHECK_RESULT(&ctx, gsf_nn_attention(&ctx, NULL, &d), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf__nn_run_attention(&ctx, NULL, &d), GSF_ERROR_INVALID_ARGUMENT);
     d = a.desc;
     d.head_dim = -1;
-    CHECK_RESULT(&ctx, gsf_nn_attention(&ctx, NULL, &d), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf__nn_run_attention(&ctx, NULL, &d), GSF_ERROR_INVALID_ARGUMENT);
     free_attention(&a);
 }
 

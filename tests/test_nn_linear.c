@@ -8,8 +8,8 @@
 #include "test_hooks.h"
 
 typedef struct layer { // everything in blocks of its exact size, so that ASan sees a step too far
-    gsf_nn_linear_desc desc;
-    gsf_tensor weight, bias;
+    gsf__nn_linear_desc desc;
+    gsf_nn_tensor weight, bias;
     float *x, *y, *gate, *before;
     char *weight_block, *bias_block;
     double *w, *b; // as read
@@ -20,8 +20,8 @@ typedef struct layer { // everything in blocks of its exact size, so that ASan s
 static uint64_t seed = 1;
 
 // `count` values of `dtype`, `offset` bytes into a block; *wide gets what they stand for.
-static char* make_values(gsf_nn_dtype dtype, int64_t count, size_t offset, double** wide, gsf_tensor* tensor) {
-    const size_t size = gsf_nn_dtype_size(dtype);
+static char* make_values(gsf_nn_dtype dtype, int64_t count, size_t offset, double** wide, gsf_nn_tensor* tensor) {
+    const size_t size = gsf_nn_get_dtype_size(dtype);
     char* block = (char*)malloc(offset + (size_t)count * size);
     *wide = (double*)malloc((size_t)count * sizeof(double));
     for (int64_t i = 0; i < count; i++) {
@@ -81,22 +81,22 @@ static void free_layer(layer* l) {
     free(l->gate);
 }
 
-static void run(gsf_context* ctx, gsf_nn_workspace* workspace, layer* l) {
+static void run(gsf_context* ctx, gsf__nn_workspace* workspace, layer* l) {
     l->desc.weight = &l->weight; // here, as layers are copied
     memcpy(l->y, l->before, l->y_count * sizeof(float));
-    CHECK_OK(ctx, gsf_nn_linear(ctx, workspace, &l->desc));
+    CHECK_OK(ctx, gsf__nn_run_linear(ctx, workspace, &l->desc));
 }
 
-static double activation_of(gsf_nn_activation activation, double x) {
-    if (activation == GSF_NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    if (activation == GSF_NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
-    if (activation == GSF_NN_RELU) return x < 0.0 ? 0.0 : x;
-    return activation == GSF_NN_SILU ? x / (1.0 + exp(-x)) : x;
+static double activation_of(gsf__nn_activation activation, double x) {
+    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+    if (activation == GSF__NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
+    if (activation == GSF__NN_RELU) return x < 0.0 ? 0.0 : x;
+    return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
 // Every value of y, and that what stands between its rows is as before. At most `most` rows are looked at.
 static void check_layer(const layer* l, int64_t most) {
-    const gsf_nn_linear_desc* d = &l->desc;
+    const gsf__nn_linear_desc* d = &l->desc;
     const int64_t ldx = d->ldx ? d->ldx : l->in, ldy = d->ldy ? d->ldy : l->out;
     const int64_t step = d->rows > most ? d->rows / most : 1;
     double worst = 0.0;
@@ -119,7 +119,7 @@ static void check_layer(const layer* l, int64_t most) {
     CHECK(worst <= 1.0);
     if (!(worst <= 1.0))
         fprintf(stderr, "    %lld x %lld x %lld, %s, activation %d: %g of what is allowed\n", (long long)d->rows,
-                (long long)l->in, (long long)l->out, gsf_nn_dtype_name(l->weight.dtype), (int)d->activation, worst);
+                (long long)l->in, (long long)l->out, gsf__nn_dtype_name(l->weight.dtype), (int)d->activation, worst);
     int touched = 0;
     for (int64_t m = 0; m + 1 < d->rows; m++)
         for (int64_t n = l->out; n < ldy; n++) touched += l->y[m * ldy + n] != l->before[m * ldy + n];
@@ -131,14 +131,14 @@ static const gsf_nn_dtype dtypes[] = {GSF_NN_F32, GSF_NN_BF16, GSF_NN_F16};
 static void test_shapes(gsf_context* ctx) {
     static const int64_t rows[] = {1, 2, 3, 4, 5, 6, 7, 11, 12, 13, 37, 100};
     static const int64_t sizes[] = {1, 2, 3, 7, 8, 9, 15, 16, 17, 31, 33, 64, 100, 193, 255, 257, 512, 513};
-    gsf_nn_workspace workspace;
+    gsf__nn_workspace workspace;
     memset(&workspace, 0, sizeof workspace);
     for (int i = 0; i < 300; i++) {
         const int64_t m = rows[i % (int)GSF__COUNT(rows)];
         const int64_t in = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         const int64_t out = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         layer l = make_layer(m, in, out, dtypes[i / 3 % 3], i % 4 == 3 ? 1 + (size_t)(i % 7) : 0, i % 5 == 4 ? 3 : 0);
-        l.desc.activation = (gsf_nn_activation)(i / 5 % 5);
+        l.desc.activation = (gsf__nn_activation)(i / 5 % 5);
         l.desc.bias = test_random_bits(&seed) % 3 ? &l.bias : NULL;
         l.desc.gate = test_random_bits(&seed) % 3 ? NULL : l.gate;
         l.desc.accumulate = test_random_bits(&seed) % 3 == 0;
@@ -151,7 +151,7 @@ static void test_shapes(gsf_context* ctx) {
         check_layer(&l, 25);
         free_layer(&l);
     }
-    gsf_nn_destroy_workspace(ctx, &workspace);
+    gsf__nn_destroy_workspace(ctx, &workspace);
 }
 
 // What rounding x to bf16 costs where it is rounded, and that it is not elsewhere.
@@ -185,7 +185,7 @@ static void test_blocks(gsf_context* ctx) {
         for (int t = 0; t < 3; t++) {
             layer l = make_layer(sizes[i][0], sizes[i][1], sizes[i][2], dtypes[t], (size_t)t, t == 1);
             l.desc.bias = &l.bias;
-            l.desc.activation = (gsf_nn_activation)t;
+            l.desc.activation = (gsf__nn_activation)t;
             l.desc.gate = t == 2 ? l.gate : NULL;
             run(ctx, NULL, &l);
             check_layer(&l, 20);
@@ -207,7 +207,7 @@ static void test_workers(gsf_cpu_level level) {
         for (int t = 0; t < 3; t++) {
             layer l = make_layer(sizes[i][0], sizes[i][1], sizes[i][2], dtypes[t], 0, 0);
             l.desc.bias = &l.bias;
-            l.desc.activation = GSF_NN_SILU;
+            l.desc.activation = GSF__NN_SILU;
             l.desc.bf16 = 1;
             run(&one, NULL, &l);
             float* first = (float*)malloc(l.y_count * sizeof(float));
@@ -249,14 +249,14 @@ static void test_special(gsf_context* ctx) {
 static void test_bad_arguments(gsf_context* ctx) {
     layer l = make_layer(5, 6, 7, GSF_NN_F32, 0, 0);
     l.desc.weight = &l.weight;
-    gsf_nn_linear_desc d;
+    gsf__nn_linear_desc d;
 #define REFUSED(change, code)                                                  \
     do {                                                                       \
-        const gsf_tensor weight = l.weight;                                    \
+        const gsf_nn_tensor weight = l.weight;                                    \
         d = l.desc;                                                            \
         ctx->error[0] = 0;                                                     \
         change;                                                                \
-        CHECK_RESULT(ctx, gsf_nn_linear(ctx, NULL, &d), code);                 \
+        CHECK_RESULT(ctx, gsf__nn_run_linear(ctx, NULL, &d), code);                 \
         CHECK(strstr(ctx->error, "linear") != NULL);                           \
         l.weight = weight;                                                     \
     } while (0)
@@ -277,7 +277,7 @@ static void test_bad_arguments(gsf_context* ctx) {
     memcpy(l.y, l.before, l.y_count * sizeof(float));
     d = l.desc;
     d.rows = 0; // nothing to do
-    CHECK_OK(ctx, gsf_nn_linear(ctx, NULL, &d));
+    CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
     CHECK(memcmp(l.y, l.before, l.y_count * sizeof(float)) == 0);
     free_layer(&l);
 }
@@ -296,19 +296,19 @@ static void test_memory(void) {
         for (size_t k = 1;; k++) {
             count.calls = 0;
             count.fail_at = k;
-            const gsf_result result = gsf_nn_linear(&ctx, NULL, &l.desc);
+            const gsf_result result = gsf__nn_run_linear(&ctx, NULL, &l.desc);
             CHECK(count.live == 0);
             if (result == GSF_OK) break;
             if (!CHECK(result == GSF_ERROR_OUT_OF_MEMORY)) break;
         }
-        gsf_nn_workspace workspace;
+        gsf__nn_workspace workspace;
         memset(&workspace, 0, sizeof workspace);
         count.fail_at = 0;
         run(&ctx, &workspace, &l);
         const size_t calls = count.calls;
         run(&ctx, &workspace, &l); // what is there is enough
         CHECK(count.calls == calls && count.live == 1);
-        gsf_nn_destroy_workspace(&ctx, &workspace);
+        gsf__nn_destroy_workspace(&ctx, &workspace);
         CHECK(count.live == 0);
         free_layer(&l);
     }

@@ -20,18 +20,18 @@ static const char* model_folder(void) { return test_golden("restorer/model"); }
 static const char* write_features(gsf_context* ctx, const char* name, const char* without) {
     const char* path = test_scratch(name);
     gsf_nn_weights inputs, expected;
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden("restorer/pipeline/inputs.safetensors"), NULL, &inputs));
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, test_golden("restorer/pipeline/expected.safetensors"), NULL, &expected));
-    const gsf_tensor* const all[] = {gsf_nn_find_tensor(&inputs, "dino_latents"),
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden("restorer/pipeline/inputs.safetensors"), NULL, &inputs));
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden("restorer/pipeline/expected.safetensors"), NULL, &expected));
+    const gsf_nn_tensor* const all[] = {gsf_nn_find_tensor(&inputs, "dino_latents"),
                                      gsf_nn_find_tensor(&inputs, "vggt_latents"),
                                      gsf_nn_find_tensor(&expected, "prompt_embeds")};
-    gsf_tensor tensors[3];
+    gsf_nn_tensor tensors[3];
     size_t count = 0;
     for (int i = 0; i < 3; i++)
         if (CHECK(all[i] != NULL) && !(without && strcmp(all[i]->name, without) == 0)) tensors[count++] = *all[i];
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, count));
-    gsf_nn_close_weights(ctx, &inputs);
-    gsf_nn_close_weights(ctx, &expected);
+    gsf_nn_destroy_weights(ctx, &inputs);
+    gsf_nn_destroy_weights(ctx, &expected);
     return path;
 }
 
@@ -97,7 +97,7 @@ static uint32_t restore(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c, 
 static void test_limits(gsf_context* ctx, const char* features, clip* c) {
     const gsf_nn_dit_desc desc = small_desc(features, 2);
     gsf_restorer r;
-    gsf_restorer_limits limits;
+    gsf_restorer_info limits;
     memset(&limits, 0, sizeof limits);
     limits.struct_size = sizeof limits;
     if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
@@ -202,7 +202,7 @@ static void test_photo_frames(gsf_context* ctx, const char* features, clip* c) {
     photo.camera.fx = photo.camera.fy = 200.0;
     photo.camera.cx = 0.5 * width;
     photo.camera.cy = 0.5 * height;
-    gsf_camera camera = gsf_camera_resized(&photo.camera, c->width, c->height);
+    gsf_camera camera = gsf_resize_camera(&photo.camera, c->width, c->height);
     check_photo_frame(ctx, &r, c, &photo, &camera, &seen);
     camera.cx -= 8.0;
     float* v = (float*)seen.data;
@@ -232,10 +232,10 @@ static void test_conditions(gsf_context* ctx, const char* features, clip* c) {
     }
     const char* no_vggt = write_features(ctx, "no_vggt.safetensors", "vggt_latents");
     gsf_nn_dit_desc desc = small_desc(no_vggt, 2);
-    desc.condition = GSF_NN_2D;
-    CHECK(restore(ctx, &desc, c, GSF_OK) == sums[GSF_NN_2D]); // what is not asked for need not be there
+    desc.condition = GSF_NN_CONDITION_2D;
+    CHECK(restore(ctx, &desc, c, GSF_OK) == sums[GSF_NN_CONDITION_2D]); // what is not asked for need not be there
     gsf_restorer r;
-    desc.condition = GSF_NN_BOTH;
+    desc.condition = GSF_NN_CONDITION_BOTH;
     CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND); // the folder has no encoder, either
     CHECK(strstr(ctx->error, "/vggt/") != NULL && strstr(ctx->error, "vggt_latents") != NULL && r.user == NULL);
 }
@@ -261,7 +261,7 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     desc.features = NULL;
     CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "/dinov2/") != NULL && strstr(ctx->error, "dino_latents") != NULL);
-    desc.condition = GSF_NN_NONE;
+    desc.condition = GSF_NN_CONDITION_NONE;
     CHECK(restore(ctx, &desc, c, GSF_OK) != 0);
     desc.model = test_golden("restorer/model/transformer"); // names the part that is missing first
     CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND);
@@ -288,7 +288,7 @@ static void place_photos(gsf_camera* cameras, double scale, double turn, double 
             moved[4 * k + 3] = c2w[4 * k + 3];
         }
         memset(&cameras[i], 0, sizeof cameras[i]);
-        gsf_camera_set_c2w(&cameras[i], moved);
+        gsf_set_camera_c2w(&cameras[i], moved);
         cameras[i].fx = cameras[i].fy = 20.0;
         cameras[i].cx = cameras[i].cy = 8.0;
         cameras[i].width = cameras[i].height = 16;
@@ -310,7 +310,7 @@ static void lend_photos(gsf_context* ctx, gsf_restorer* r, const gsf_camera* cam
 
 static void save_random(gsf_context* ctx, const char* path, char (*names)[40], const int64_t (*shapes)[3], size_t count,
                         uint64_t seed) {
-    gsf_tensor tensors[16];
+    gsf_nn_tensor tensors[16];
     memset(tensors, 0, sizeof tensors);
     for (size_t i = 0; i < count; i++) {
         const int64_t values = shapes[i][0] * shapes[i][1] * shapes[i][2];
@@ -351,7 +351,7 @@ static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* ne
     snprintf(path, sizeof path, "%s", test_scratch("one_photo.safetensors"));
     save_random(ctx, path, names, shapes, 2, 9);
     gsf_nn_dit_desc desc = small_desc(path, 1);
-    desc.condition = GSF_NN_2D;
+    desc.condition = GSF_NN_CONDITION_2D;
     if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
     for (size_t w = 0; w < sizeof worlds / sizeof *worlds; w++) {
         gsf_camera photos[PHOTOS];
@@ -364,11 +364,11 @@ static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* ne
             gsf_camera camera = photos[(size_t)(test_random(&state) * PHOTOS)];
             const double t = 0.6 * test_random(&state);
             double c2w[16], first[3], second[3];
-            gsf_camera_c2w(&camera, c2w);
-            gsf_camera_center(a, first);
-            gsf_camera_center(b, second);
+            gsf_get_camera_c2w(&camera, c2w);
+            gsf_get_camera_center(a, first);
+            gsf_get_camera_center(b, second);
             for (int i = 0; i < 3; i++) c2w[12 + i] = first[i] + t * (second[i] - first[i]);
-            gsf_camera_set_c2w(&camera, c2w);
+            gsf_set_camera_c2w(&camera, c2w);
             const int chosen = missing_photo(ctx, &r, c, &camera, &camera);
             if (w == 0) seen[wanted[k] = chosen]++;
             CHECK(chosen == wanted[k]);
@@ -413,13 +413,13 @@ static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c
 static void write_bare(gsf_context* ctx, const char* all, const char* path, int k, const gsf_nn_transformer* net) {
     gsf_nn_weights file;
     char name[40];
-    gsf_tensor tensors[3];
-    CHECK_OK(ctx, gsf_nn_open_weights(ctx, all, NULL, &file));
+    gsf_nn_tensor tensors[3];
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, all, NULL, &file));
     const int64_t each = (int64_t)PHOTO_TOKENS * net->dino_channels, shape[3] = {2, PHOTO_TOKENS, net->dino_channels};
     float* dino = (float*)malloc(2 * (size_t)each * sizeof(float));
     for (int i = 0; i < 2; i++) {
         snprintf(name, sizeof name, "dino_latents.photo%d", k + i);
-        gsf_nn_read_tensor(gsf_nn_find_tensor(&file, name), 0, each, dino + i * each);
+        gsf_nn_convert_tensor(gsf_nn_find_tensor(&file, name), 0, each, dino + i * each);
     }
     tensors[0] = gsf_nn_wrap_tensor("dino_latents", dino, 3, shape);
     snprintf(name, sizeof name, "vggt_latents.photo%d,%d", k, k + 1);
@@ -429,7 +429,7 @@ static void write_bare(gsf_context* ctx, const char* all, const char* path, int 
     tensors[2] = *gsf_nn_find_tensor(&file, name);
     tensors[2].name = "prompt_embeds";
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 3));
-    gsf_nn_close_weights(ctx, &file);
+    gsf_nn_destroy_weights(ctx, &file);
     free(dino);
 }
 
@@ -487,9 +487,9 @@ static void open_sample(gsf_context* ctx, sample_case* s) {
     char path[1200];
     memset(s, 0, sizeof *s);
     snprintf(path, sizeof path, "%s/transformer", model_folder());
-    CHECK_OK(ctx, gsf_nn_make_transformer(ctx, path, &s->net));
+    CHECK_OK(ctx, gsf_nn_load_transformer(ctx, path, &s->net));
     snprintf(path, sizeof path, "%s/vae", model_folder());
-    CHECK_OK(ctx, gsf_nn_make_vae(ctx, path, &s->vae));
+    CHECK_OK(ctx, gsf_nn_load_vae(ctx, path, &s->vae));
     snprintf(path, sizeof path, "%s/scheduler/scheduler_config.json", model_folder());
     CHECK_OK(ctx, gsf_nn_load_schedule(ctx, path, &s->schedule));
     s->desc.frames = 9;
@@ -558,20 +558,20 @@ static void test_skips(gsf_context* ctx, sample_case* s) {
     CHECK(stats.steps == 4 && stats.network_rows == 8);
     s->desc.strength = 0.0f;
 
-    for (int solver = GSF_NN_DDIM; solver <= GSF_NN_UNIPC; solver++) { // all near each other with many steps
+    for (int solver = GSF_NN_SOLVER_DDIM; solver <= GSF_NN_SOLVER_UNIPC; solver++) { // all near each other with many steps
         s->desc.solver = (gsf_nn_solver)solver;
         s->desc.steps = 40;
         run_sample(ctx, s, solver ? s->video : reference);
         if (solver) CHECK(difference(s->video, reference, s->values) < 0.2);
     }
-    s->desc.solver = GSF_NN_DDIM;
+    s->desc.solver = GSF_NN_SOLVER_DDIM;
     s->desc.steps = 0;
     free(reference);
 }
 
 static void test_bad_sample(gsf_context* ctx, sample_case* s) {
     const gsf_nn_sample_desc good = s->desc;
-    gsf_nn_cost cost;
+    gsf_nn_sample_info cost;
 #define EXPECT(result, text)                                                                                       \
     CHECK_RESULT(ctx, gsf_nn_sample(ctx, &s->net, &s->vae, &s->schedule, &s->desc, s->video, NULL), result);       \
     CHECK(strstr(ctx->error, text) != NULL);                                                                       \
@@ -592,18 +592,18 @@ static void test_bad_sample(gsf_context* ctx, sample_case* s) {
     CHECK_RESULT(ctx, gsf_nn_sample(ctx, &s->net, &s->vae, &s->schedule, &s->desc, s->video, NULL), GSF_ERROR_NUMERIC);
     CHECK(strstr(ctx->error, "embedding") != NULL);
     s->text[3] = kept;
-    CHECK_OK(ctx, gsf_nn_sample_cost(ctx, &s->net, &s->vae, &s->desc, &cost));
+    CHECK_OK(ctx, gsf_nn_query_sample(ctx, &s->net, &s->vae, &s->desc, &cost));
     CHECK(cost.bytes > 1e5 && cost.flops > 1e9);
 }
 
 // A NaN in a weight is named, with the block where it shows.
 static void test_bad_weight(gsf_context* ctx, sample_case* s) {
     const char* name = "transformer_blocks.1.ff.net.2.weight";
-    gsf_tensor* tensor = NULL;
+    gsf_nn_tensor* tensor = NULL;
     for (size_t i = 0; i < s->net.weights.tensor_count; i++)
         if (strcmp(s->net.weights.tensors[i].name, name) == 0) tensor = &s->net.weights.tensors[i];
     if (!CHECK(tensor != NULL)) return;
-    const size_t bytes = (size_t)tensor->count * gsf_nn_dtype_size(tensor->dtype);
+    const size_t bytes = (size_t)tensor->count * gsf_nn_get_dtype_size(tensor->dtype);
     char* copy = (char*)malloc(bytes);
     const void* mapped = tensor->data;
     memcpy(copy, mapped, bytes);
@@ -625,7 +625,7 @@ static void stop_at(void* user, const char* stage, double done, double total) {
 static void test_resume(gsf_context* ctx, sample_case* s) {
     float* reference = (float*)malloc(s->values * sizeof(float));
     const char* path = test_scratch("sample.checkpoint");
-    for (int solver = GSF_NN_DDIM; solver <= GSF_NN_UNIPC; solver++) {
+    for (int solver = GSF_NN_SOLVER_DDIM; solver <= GSF_NN_SOLVER_UNIPC; solver++) {
         remove(path);
         s->desc.solver = (gsf_nn_solver)solver;
         s->desc.steps = 6;
@@ -653,7 +653,7 @@ static void test_resume(gsf_context* ctx, sample_case* s) {
         CHECK(stats.resumed_from == 0 && memcmp(s->video, reference, s->values * sizeof(float)) == 0);
     }
     s->desc.checkpoint = NULL;
-    s->desc.solver = GSF_NN_DDIM;
+    s->desc.solver = GSF_NN_SOLVER_DDIM;
     s->desc.steps = 0;
     free(reference);
 }
@@ -680,8 +680,8 @@ static void test_other_models(gsf_context* ctx, sample_case* s) {
         gsf_nn_sample_stats stats = run_sample(ctx, &other, other.video);
         CHECK(stats.resumed_from == 2 && stats.steps == 0);
         gsf_nn_weights* weights = kind == 2 ? &other.vae.weights : &other.net.weights;
-        gsf_tensor* tensor = &weights->tensors[weights->tensor_count / 2];
-        const size_t bytes = (size_t)tensor->count * gsf_nn_dtype_size(tensor->dtype);
+        gsf_nn_tensor* tensor = &weights->tensors[weights->tensor_count / 2];
+        const size_t bytes = (size_t)tensor->count * gsf_nn_get_dtype_size(tensor->dtype);
         char* copy = (char*)malloc(bytes);
         memcpy(copy, tensor->data, bytes);
         copy[bytes - 2] ^= 1;

@@ -1,5 +1,6 @@
 // Noise schedule, time steps and solvers of gsfixer_nn.h: against a case with a closed-form solution and the multistep
 // formulas written out; checkpoints, other orders of work, bad input. (The tables of diffusers: golden_restorer.)
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "test.h"
@@ -58,7 +59,7 @@ static flow_error run_flow(gsf_context* ctx, const gsf_nn_schedule* schedule, gs
 static void test_order(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     static const double low[] = {0.9, 1.8, 2.4}; // UniPC's corrector of order 2 makes it third order
     static const double high[] = {1.1, 2.2, 3.3};
-    for (int solver = GSF_NN_DDIM; solver <= GSF_NN_UNIPC; solver++)
+    for (int solver = GSF_NN_SOLVER_DDIM; solver <= GSF_NN_SOLVER_UNIPC; solver++)
         for (int k = 0; k < 4; k++) {
             const double s = k & 1 ? 1.0 : 0.3, strength = k & 2 ? 0.6 : 1.0;
             const flow_error coarse = run_flow(ctx, schedule, (gsf_nn_solver)solver, 25, strength, s);
@@ -121,7 +122,7 @@ static void test_formulas(gsf_context* ctx) {
     schedule_desc.no_zero_snr = 1;
     schedule_desc.no_alpha_one = 1; // the last lambda is finite, too
     CHECK_OK(ctx, gsf_nn_make_schedule(ctx, &schedule_desc, &schedule));
-    for (int solver = GSF_NN_DPMPP_2M; solver <= GSF_NN_UNIPC; solver++)
+    for (int solver = GSF_NN_SOLVER_DPMPP_2M; solver <= GSF_NN_SOLVER_UNIPC; solver++)
         for (int steps = 1; steps <= 12; steps++) {
             gsf_nn_sampler sampler;
             const gsf_nn_sampler_desc desc = {(gsf_nn_solver)solver, steps, 0.0, 1};
@@ -137,7 +138,7 @@ static void test_formulas(gsf_context* ctx) {
                                                                           : schedule.final_alpha_bar);
                 const float v = (float)some_model(bar, (double)x);
                 const double m_t = here.a * y - here.s * some_model(bar, y);
-                if (solver == GSF_NN_UNIPC && i > 0) y = plain_corrector(i > 1 ? 2 : 1, here, p, last, m, m_t);
+                if (solver == GSF_NN_SOLVER_UNIPC && i > 0) y = plain_corrector(i > 1 ? 2 : 1, here, p, last, m, m_t);
                 p[1] = p[0];
                 p[0] = here;
                 m[1] = m[0];
@@ -157,43 +158,43 @@ static void test_formulas(gsf_context* ctx) {
 static void test_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     int32_t t[1000], all[1000], count;
     for (int steps = 1; steps <= 1000; steps++) {
-        CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, steps, 0.0, t, &count));
+        CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, schedule, steps, 0.0, t, &count));
         int ok = count == steps && t[0] == 999 && t[steps - 1] >= 0;
         for (int i = 1; i < steps; i++) ok &= t[i] < t[i - 1];
         CHECK(ok);
     }
     // halves, where numpy's way of counting decides (np.round(np.arange(1000, 0, -1000/48)) - 1)
     static const int32_t by_48[] = {999, 978, 957, 936, 916, 895, 874, 853};
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 48, 0.0, t, &count));
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, schedule, 48, 0.0, t, &count));
     for (size_t i = 0; i < COUNT_OF(by_48); i++) CHECK(t[i] == by_48[i]);
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, 1.0, all, &count));
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, 0.6, t, &count)); // diffusers' get_timesteps: int(50 * 0.6)
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, schedule, 50, 1.0, all, &count));
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, schedule, 50, 0.6, t, &count)); // diffusers' get_timesteps: int(50 * 0.6)
     CHECK(count == 30 && memcmp(t, all + 20, 30 * sizeof *t) == 0);
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, 0.39, t, &count));
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, schedule, 50, 0.39, t, &count));
     CHECK(count == 19 && t[0] == all[31] && t[18] == 19);
     static const double bad[] = {-0.1, 1.1, 0.01, NAN, INFINITY};
     for (size_t i = 0; i < COUNT_OF(bad); i++)
-        CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, schedule, 50, bad[i], t, &count), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, schedule, 0, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, schedule, 1001, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
+        CHECK_RESULT(ctx, gsf__nn_make_timesteps(ctx, schedule, 50, bad[i], t, &count), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf__nn_make_timesteps(ctx, schedule, 0, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf__nn_make_timesteps(ctx, schedule, 1001, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
 
     gsf_nn_schedule other;
     gsf_nn_schedule_desc desc;
     memset(&desc, 0, sizeof desc);
-    desc.spacing = GSF_NN_LEADING;
+    desc.spacing = GSF_NN_SPACING_LEADING;
     desc.steps_offset = 1;
     CHECK_OK(ctx, gsf_nn_make_schedule(ctx, &desc, &other));
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, &other, 3, 1.0, t, &count));
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 3, 1.0, t, &count));
     CHECK(count == 3 && t[0] == 667 && t[1] == 334 && t[2] == 1);
-    CHECK_RESULT(ctx, gsf_nn_make_timesteps(ctx, &other, 1000, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf__nn_make_timesteps(ctx, &other, 1000, 1.0, t, &count), GSF_ERROR_INVALID_ARGUMENT);
     gsf_nn_destroy_schedule(ctx, &other);
-    desc.spacing = GSF_NN_LINSPACE;
+    desc.spacing = GSF_NN_SPACING_LINSPACE;
     CHECK_OK(ctx, gsf_nn_make_schedule(ctx, &desc, &other));
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, &other, 4, 1.0, t, &count));
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 4, 1.0, t, &count));
     CHECK(t[0] == 999 && t[1] == 666 && t[2] == 333 && t[3] == 0);
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, &other, 7, 1.0, t, &count)); // 832.5, 666, 499.5, ...: half to even
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 7, 1.0, t, &count)); // 832.5, 666, 499.5, ...: half to even
     CHECK(t[1] == 832 && t[2] == 666 && t[3] == 500 && t[4] == 333 && t[5] == 166 && t[6] == 0);
-    CHECK_OK(ctx, gsf_nn_make_timesteps(ctx, &other, 1, 1.0, t, &count));
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 1, 1.0, t, &count));
     CHECK(count == 1 && t[0] == 0);
     gsf_nn_destroy_schedule(ctx, &other);
 }
@@ -229,7 +230,7 @@ static void test_configs(gsf_context* ctx) {
         if (!CHECK(cases[i].result == GSF_OK || strstr(ctx->error, cases[i].error) != NULL))
             fprintf(stderr, "  \"%s\" is not in \"%s\"\n", cases[i].error, ctx->error);
         if (cases[i].result == GSF_OK) { // diffusers' own defaults
-            CHECK(schedule.desc.train_steps == 1000 && schedule.desc.spacing == GSF_NN_LEADING);
+            CHECK(schedule.desc.train_steps == 1000 && schedule.desc.spacing == GSF_NN_SPACING_LEADING);
             CHECK(schedule.desc.linear_betas && schedule.desc.no_zero_snr && schedule.final_alpha_bar == 1.0);
             CHECK_NEAR(schedule.alpha_bar[0], 0.9999, 1e-7);
             CHECK_NEAR(schedule.alpha_bar[999], 4.0358e-5, 1e-8); // of the usual linear schedule
@@ -276,7 +277,7 @@ static void test_steep_config(gsf_context* ctx) {
 // ---- samplers
 
 static void fill_noise(float* x, size_t count, uint64_t stream) {
-    for (size_t i = 0; i < count; i++) x[i] = (float)gsf_random_normal(7, stream, i);
+    for (size_t i = 0; i < count; i++) x[i] = (float)gsf_draw_normal(7, stream, i);
 }
 
 static void backward_for(void* user, size_t chunks, gsf_chunk_fn body, void* arg) { // another order, other workers
@@ -328,7 +329,7 @@ static void test_repeatable(gsf_context* ctx, const gsf_nn_schedule* schedule) {
 
 static void test_bad_samplers(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     gsf_nn_sampler s;
-    gsf_nn_sampler_desc desc = {GSF_NN_UNIPC, 5, 0.0, 3};
+    gsf_nn_sampler_desc desc = {GSF_NN_SOLVER_UNIPC, 5, 0.0, 3};
     float x[3] = {1.0f, 2.0f, 3.0f}, v[3] = {0.0f, 0.0f, 0.0f};
     CHECK_OK(ctx, gsf_nn_make_sampler(ctx, schedule, &desc, &s));
     CHECK_OK(ctx, gsf_nn_step_sampler(ctx, &s, v, x, NULL));
@@ -343,7 +344,7 @@ static void test_bad_samplers(gsf_context* ctx, const gsf_nn_schedule* schedule)
     desc.steps = 5;
     desc.solver = (gsf_nn_solver)3;
     CHECK_RESULT(ctx, gsf_nn_make_sampler(ctx, schedule, &desc, &s), GSF_ERROR_INVALID_ARGUMENT);
-    desc.solver = GSF_NN_UNIPC;
+    desc.solver = GSF_NN_SOLVER_UNIPC;
     desc.strength = 2.0;
     CHECK_RESULT(ctx, gsf_nn_make_sampler(ctx, schedule, &desc, &s), GSF_ERROR_INVALID_ARGUMENT);
     desc.strength = 0.0;
@@ -368,7 +369,7 @@ static void test_memory(void) {
         CHECK_OK(&ctx, gsf_init_context(&ctx));
         c.fail_at = k;
         gsf_result r = gsf_nn_make_schedule(&ctx, NULL, &schedule);
-        const gsf_nn_sampler_desc desc = {GSF_NN_DPMPP_2M, 0, 0.0, 10};
+        const gsf_nn_sampler_desc desc = {GSF_NN_SOLVER_DPMPP_2M, 0, 0.0, 10};
         if (r == GSF_OK) r = gsf_nn_make_sampler(&ctx, &schedule, &desc, &sampler);
         CHECK_RESULT(&ctx, r, k < 4 ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK);
         CHECK(k < 4 || (sampler.count == 50 && sampler.memory_count == 10));
@@ -381,11 +382,11 @@ static void test_memory(void) {
 // ---- positions: what the golden tables do not ask
 
 static void test_positions(gsf_context* ctx) {
-    gsf_nn_rope_desc d = {2, 3, 4, 3, 4, 16, 0.0};
+    gsf__nn_rope_desc d = {2, 3, 4, 3, 4, 16, 0.0};
     float c[2 * 3 * 4 * 16], s[2 * 3 * 4 * 16], same[2 * 3 * 4 * 16], out[2 * 3 * 4 * 16];
-    CHECK_OK(ctx, gsf_nn_make_rope(ctx, &d, c, s));
+    CHECK_OK(ctx, gsf__nn_make_rope(ctx, &d, c, s));
     d.theta = 10000.0;
-    CHECK_OK(ctx, gsf_nn_make_rope(ctx, &d, same, out));
+    CHECK_OK(ctx, gsf__nn_make_rope(ctx, &d, same, out));
     CHECK(memcmp(c, same, sizeof c) == 0 && memcmp(s, out, sizeof s) == 0);
     for (size_t i = 0; i < COUNT_OF(c); i += 2) CHECK(c[i] == c[i + 1] && s[i] == s[i + 1]);
     for (size_t i = 0; i < COUNT_OF(c); i++) CHECK_NEAR(c[i] * c[i] + s[i] * s[i], 1.0f, 1e-6);
@@ -393,25 +394,25 @@ static void test_positions(gsf_context* ctx) {
     CHECK_NEAR(s[row], sin(1.0), 1e-7);
     CHECK_NEAR(s[row + 4], sin(2.0), 1e-7);
     CHECK_NEAR(s[row + 10], sin(3.0), 1e-7);
-    CHECK_OK(ctx, gsf_nn_make_sincos(ctx, 2, 3, 4, 16, 0.0, 0.0, out));
+    CHECK_OK(ctx, gsf__nn_make_sincos(ctx, 2, 3, 4, 16, 0.0, 0.0, out));
     CHECK_NEAR(out[row], sin(1.0), 1e-7);     // time
     CHECK_NEAR(out[row + 4], sin(3.0), 1e-7); // column
     CHECK_NEAR(out[row + 10], sin(2.0), 1e-7); // row
     CHECK_NEAR(out[row + 13], cos(2.0), 1e-7);
     d.head_dim = 24;
-    CHECK_RESULT(ctx, gsf_nn_make_rope(ctx, &d, c, s), GSF_ERROR_UNSUPPORTED);
+    CHECK_RESULT(ctx, gsf__nn_make_rope(ctx, &d, c, s), GSF_ERROR_UNSUPPORTED);
     d.head_dim = 16;
     d.frames = 0;
-    CHECK_RESULT(ctx, gsf_nn_make_rope(ctx, &d, c, s), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf__nn_make_rope(ctx, &d, c, s), GSF_ERROR_INVALID_ARGUMENT);
     d.frames = 1 << 20;
     d.height = 1 << 20;
-    CHECK_RESULT(ctx, gsf_nn_make_rope(ctx, &d, c, s), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf__nn_make_rope(ctx, &d, c, s), GSF_ERROR_INVALID_ARGUMENT);
     d.frames = d.height = 1;
     d.base_width = 0;
-    CHECK_RESULT(ctx, gsf_nn_make_rope(ctx, &d, c, s), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(ctx, gsf_nn_make_sincos(ctx, 1, 1, 1, 8, 1.0, 1.0, out), GSF_ERROR_UNSUPPORTED);
-    CHECK_RESULT(ctx, gsf_nn_make_sincos(ctx, 1, 1, 1, 16, -1.0, 1.0, out), GSF_ERROR_INVALID_ARGUMENT);
-    gsf_nn_embed_timestep(1.0, 5, out); // odd: a last zero
+    CHECK_RESULT(ctx, gsf__nn_make_rope(ctx, &d, c, s), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf__nn_make_sincos(ctx, 1, 1, 1, 8, 1.0, 1.0, out), GSF_ERROR_UNSUPPORTED);
+    CHECK_RESULT(ctx, gsf__nn_make_sincos(ctx, 1, 1, 1, 16, -1.0, 1.0, out), GSF_ERROR_INVALID_ARGUMENT);
+    gsf__nn_embed_timestep(1.0, 5, out); // odd: a last zero
     CHECK_NEAR(out[0], cos(1.0), 1e-7);
     CHECK_NEAR(out[2], sin(1.0), 1e-7);
     CHECK_NEAR(out[1], cos(0.01), 1e-7);

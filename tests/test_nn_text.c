@@ -3,6 +3,7 @@
 //
 //     test_nn_text --tokenize FOLDER    reads texts from stdin, each a 32-bit size and as many bytes, and prints the ids of
 //                                       each on a line: what tests/compare_tokenizer.py runs
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "made_spiece.h"
@@ -17,7 +18,7 @@ static uint64_t seed = 11;
 static gsf_result open_made(gsf_context* c, int flags, gsf_nn_tokenizer* t) {
     made_bytes m;
     made_spiece(flags, &m);
-    return gsf_nn_make_tokenizer_memory(c, "made", m.data, m.size, NULL, 0, t);
+    return gsf__nn_parse_tokenizer(c, "made", m.data, m.size, NULL, 0, t);
 }
 
 // ids: of the text without the end.
@@ -26,7 +27,7 @@ static void expect_ids(int flags, const char* text, size_t size, const int32_t* 
     int32_t got[64];
     size_t n = 0;
     if (!CHECK_OK(&ctx, open_made(&ctx, flags, &t))) return;
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, text, size, got, 64, &n));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, text, size, got, 64, &n));
     int same = n == count + 1 && got[count] == t.end_id;
     for (size_t i = 0; i < count; i++) same &= got[i] == ids[i];
     for (size_t i = count + 1; i < 64; i++) same &= got[i] == t.pad_id;
@@ -91,21 +92,21 @@ static void test_room(void) {
     size_t count = 0;
     if (!CHECK_OK(&ctx, open_made(&ctx, 0, &t))) return;
     CHECK(t.piece_count == 14 && t.id_count == 114 && t.pad_id == 0 && t.end_id == 1 && t.unknown_id == 2);
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, "ababab", 6, NULL, 0, &count));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ababab", 6, NULL, 0, &count));
     CHECK(count == 4);
     for (size_t room = 1; room <= 8; room++) {
         for (int i = 0; i < 8; i++) ids[i] = -7;
-        CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, "ababab", 6, ids, room, NULL));
+        CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ababab", 6, ids, room, NULL));
         for (size_t i = 0; i < 8; i++) {
             const size_t kept = room < 4 ? room - 1 : 3;
             CHECK(ids[i] == (i >= room ? -7 : i < kept ? (i ? 7 : 8) : i == kept ? t.end_id : t.pad_id));
         }
     }
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, "ab</s>", 6, ids, 8, &count)); // no second end
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ab</s>", 6, ids, 8, &count)); // no second end
     CHECK(count == 2 && ids[0] == 8 && ids[1] == 1 && ids[2] == 0);
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, "ab</s>ab", 8, ids, 3, &count)); // nor where it is cut off
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ab</s>ab", 8, ids, 3, &count)); // nor where it is cut off
     CHECK(count == 4 && ids[0] == 8 && ids[1] == 1 && ids[2] == 0);
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, NULL, 0, ids, 2, &count));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, NULL, 0, ids, 2, &count));
     CHECK(count == 1 && ids[0] == 1 && ids[1] == 0);
     gsf_nn_destroy_tokenizer(&ctx, &t);
     gsf_nn_destroy_tokenizer(&ctx, &t); // twice is fine
@@ -118,10 +119,10 @@ static void check_ids(const gsf_nn_tokenizer* t, const char* text, size_t size) 
     int32_t padded[226];
     char* exact = (char*)malloc(size ? size : 1); // so that a sanitizer sees the first byte read past it
     memcpy(exact, text, size);
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, t, exact, size, padded, 226, &count));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, t, exact, size, padded, 226, &count));
     int32_t* all = (int32_t*)malloc(count * sizeof *all);
     size_t again = 0;
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, t, exact, size, all, count, &again));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, t, exact, size, all, count, &again));
     int ok = count > 0 && again == count && count <= 40 * size + 2 && all[count - 1] == t->end_id;
     for (size_t i = 0; i < count; i++) ok &= all[i] >= 0 && all[i] < t->id_count;
     for (size_t i = 0; i < 225; i++) ok &= padded[i] == (i < count ? all[i] : t->pad_id);
@@ -164,10 +165,10 @@ static void test_long_texts(const char* folder) {
         test_context_zero(&counted);
         count_memory(&counted, &memory);
         CHECK_OK(&counted, gsf_init_context(&counted));
-        if (!CHECK_OK(&counted, gsf_nn_make_tokenizer(&counted, folder, &t))) break;
+        if (!CHECK_OK(&counted, gsf_nn_load_tokenizer(&counted, folder, &t))) break;
         memory.asked = 0;
         for (size_t i = 0; i < size; i++) text[i] = units[k][i % unit];
-        CHECK_OK(&counted, gsf_nn_tokenize(&counted, &t, text, size, NULL, 0, &count));
+        CHECK_OK(&counted, gsf_nn_encode_text(&counted, &t, text, size, NULL, 0, &count));
         CHECK(count > 0 && count <= 40 * size + 2 && memory.asked < (size_t)SIZE * 800); // U+FDFA becomes 18 characters
         gsf_nn_destroy_tokenizer(&counted, &t);
         CHECK(memory.live == 0);
@@ -184,7 +185,7 @@ static void try_model(const unsigned char* data, size_t size) {
     gsf_nn_tokenizer t;
     unsigned char* exact = (unsigned char*)malloc(size ? size : 1);
     if (size) memcpy(exact, data, size);
-    const gsf_result result = gsf_nn_make_tokenizer_memory(&ctx, "bad.model", exact, size, NULL, 0, &t);
+    const gsf_result result = gsf__nn_parse_tokenizer(&ctx, "bad.model", exact, size, NULL, 0, &t);
     free(exact);
     if (result == GSF_OK) {
         static const char text[] = "ab A\tu[K] \xe4\xb8\xad xyz</s> The video";
@@ -239,7 +240,7 @@ static void test_bad_golden(const char* folder) {
 // One thing wrong at a time, each with its own sentence.
 static void expect_refused(const made_bytes* m, gsf_result wanted, const char* words) {
     gsf_nn_tokenizer t;
-    CHECK_RESULT(&ctx, gsf_nn_make_tokenizer_memory(&ctx, "bad.model", m->data, m->size, NULL, 0, &t), wanted);
+    CHECK_RESULT(&ctx, gsf__nn_parse_tokenizer(&ctx, "bad.model", m->data, m->size, NULL, 0, &t), wanted);
     if (!CHECK(strstr(ctx.error, words) != NULL)) fprintf(stderr, "    \"%s\" has no \"%s\"\n", ctx.error, words);
     gsf_nn_destroy_tokenizer(&ctx, &t);
 }
@@ -297,20 +298,20 @@ static void test_configs(void) {
     write_file("spiece.model", m.data, m.size);
     remove(test_scratch("tokenizer_config.json"));
     remove(test_scratch("added_tokens.json"));
-    CHECK_OK(&ctx, gsf_nn_make_tokenizer(&ctx, test_scratch("."), &t)); // T5's 100 extra ids
+    CHECK_OK(&ctx, gsf_nn_load_tokenizer(&ctx, test_scratch("."), &t)); // T5's 100 extra ids
     CHECK(t.id_count == 114);
     gsf_nn_destroy_tokenizer(&ctx, &t);
     static const char list[] = "{\"<extra_id_0>\": 200, \"[one]\": 7}";
     write_file("added_tokens.json", list, sizeof list - 1);
-    CHECK_OK(&ctx, gsf_nn_make_tokenizer(&ctx, test_scratch("."), &t));
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, "[one]<extra_id_0><extra_id_1>", 29, ids, 4, NULL));
+    CHECK_OK(&ctx, gsf_nn_load_tokenizer(&ctx, test_scratch("."), &t));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "[one]<extra_id_0><extra_id_1>", 29, ids, 4, NULL));
     CHECK(t.id_count == 201 && ids[0] == 7 && ids[1] == 200 && ids[2] == 112 && ids[3] == 1);
     gsf_nn_destroy_tokenizer(&ctx, &t);
     static const char config[] = "{\"extra_ids\": 2, \"eos_token\": {\"content\": \"[end]\"}, \"pad_token\": \"</s>\","
                                  "\"added_tokens_decoder\": {\"40\": {\"content\": \"[end]\", \"rstrip\": true}}}";
     write_file("tokenizer_config.json", config, sizeof config - 1);
-    CHECK_OK(&ctx, gsf_nn_make_tokenizer(&ctx, test_scratch("."), &t));
-    CHECK_OK(&ctx, gsf_nn_tokenize(&ctx, &t, "<extra_id_0>", 12, ids, 4, NULL));
+    CHECK_OK(&ctx, gsf_nn_load_tokenizer(&ctx, test_scratch("."), &t));
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "<extra_id_0>", 12, ids, 4, NULL));
     CHECK(t.id_count == 41 && ids[0] == 15 && ids[1] == 40 && ids[2] == 1 && ids[3] == 1);
     gsf_nn_destroy_tokenizer(&ctx, &t);
     static const char* const bad[] = {
@@ -319,14 +320,14 @@ static void test_configs(void) {
         "{\"added_tokens_decoder\": {\"1\": {\"content\": 2}}}",
         "{\"added_tokens_decoder\": {\"12345678901\": {\"content\": \"y\"}}}"};
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
-        CHECK_RESULT(&ctx, gsf_nn_make_tokenizer_memory(&ctx, "m", m.data, m.size, bad[i], strlen(bad[i]), &t),
+        CHECK_RESULT(&ctx, gsf__nn_parse_tokenizer(&ctx, "m", m.data, m.size, bad[i], strlen(bad[i]), &t),
                      GSF_ERROR_FORMAT);
         CHECK(strchr(ctx.error, ':') && t.model == NULL);
     }
     static const char single[] = "{\"added_tokens_decoder\": {\"1\": {\"content\": \"y\", \"single_word\": true}}}";
-    CHECK_RESULT(&ctx, gsf_nn_make_tokenizer_memory(&ctx, "m", m.data, m.size, single, sizeof single - 1, &t),
+    CHECK_RESULT(&ctx, gsf__nn_parse_tokenizer(&ctx, "m", m.data, m.size, single, sizeof single - 1, &t),
                  GSF_ERROR_UNSUPPORTED);
-    CHECK_RESULT(&ctx, gsf_nn_make_tokenizer(&ctx, test_scratch("nowhere"), &t), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(&ctx, gsf_nn_load_tokenizer(&ctx, test_scratch("nowhere"), &t), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx.error, "spiece.model") != NULL);
 }
 
@@ -342,7 +343,7 @@ static void test_tokenizer_memory(void) { // every allocation fails once
         count_memory(&failing, &memory);
         CHECK_OK(&failing, gsf_init_context(&failing));
         gsf_result result = open_made(&failing, 0, &t);
-        if (result == GSF_OK) result = gsf_nn_tokenize(&failing, &t, "ab cd <pad>", 11, ids, 8, NULL);
+        if (result == GSF_OK) result = gsf_nn_encode_text(&failing, &t, "ab cd <pad>", 11, ids, 8, NULL);
         gsf_nn_destroy_tokenizer(&failing, &t);
         CHECK(memory.live == 0);
         if (result == GSF_OK) break;
@@ -362,7 +363,7 @@ static int all_zero(const float* x, size_t count) {
 
 enum { BATCH = 2, TOKENS = 37 };
 
-static void make_input(const gsf_nn_t5* net, int32_t* ids, gsf_nn_t5_input* in) {
+static void make_input(const gsf_nn_t5* net, int32_t* ids, gsf_nn_t5_desc* in) {
     memset(in, 0, sizeof *in);
     for (int i = 0; i < BATCH * TOKENS; i++) ids[i] = (int32_t)(test_random(&seed) * net->vocabulary);
     in->ids = ids;
@@ -372,35 +373,35 @@ static void make_input(const gsf_nn_t5* net, int32_t* ids, gsf_nn_t5_input* in) 
 
 static void test_t5_runs(void) {
     gsf_nn_t5 net;
-    gsf_nn_t5_input in;
+    gsf_nn_t5_desc in;
     int32_t ids[BATCH * TOKENS];
     gsf_context three;
-    if (!CHECK_OK(&ctx, gsf_nn_make_t5(&ctx, t5_folder(), &net))) return;
+    if (!CHECK_OK(&ctx, gsf_nn_load_t5(&ctx, t5_folder(), &net))) return;
     const size_t values = (size_t)BATCH * TOKENS * (size_t)net.width;
     float *one = (float*)malloc(values * sizeof(float)), *other = (float*)malloc(values * sizeof(float));
     make_input(&net, ids, &in);
-    CHECK_OK(&ctx, gsf_nn_t5_encode(&ctx, &net, &in, one));
+    CHECK_OK(&ctx, gsf_nn_encode_t5(&ctx, &net, &in, one));
     test_context_zero(&three);
     work_backwards(&three);
     CHECK_OK(&three, gsf_init_context(&three));
-    CHECK_OK(&three, gsf_nn_t5_encode(&three, &net, &in, other));
+    CHECK_OK(&three, gsf_nn_encode_t5(&three, &net, &in, other));
     CHECK(memcmp(one, other, values * sizeof(float)) == 0);
     for (int b = 0; b < BATCH; b++) { // a batch is its prompts
-        gsf_nn_t5_input single = in;
+        gsf_nn_t5_desc single = in;
         single.batch = 1;
         single.ids = ids + b * TOKENS;
-        CHECK_OK(&ctx, gsf_nn_t5_encode(&ctx, &net, &single, other));
+        CHECK_OK(&ctx, gsf_nn_encode_t5(&ctx, &net, &single, other));
         for (size_t i = 0; i < values / BATCH; i++) CHECK_NEAR(other[i], one[(size_t)b * values / BATCH + i], 2e-5);
     }
     in.tokens = 1;
     in.batch = 1;
-    CHECK_OK(&ctx, gsf_nn_t5_encode(&ctx, &net, &in, other));
+    CHECK_OK(&ctx, gsf_nn_encode_t5(&ctx, &net, &in, other));
     for (int bad = -1; bad <= net.vocabulary; bad += net.vocabulary + 1) {
         ids[0] = bad;
-        CHECK_RESULT(&ctx, gsf_nn_t5_encode(&ctx, &net, &in, other), GSF_ERROR_INVALID_ARGUMENT);
+        CHECK_RESULT(&ctx, gsf_nn_encode_t5(&ctx, &net, &in, other), GSF_ERROR_INVALID_ARGUMENT);
     }
     in.tokens = 0;
-    CHECK_RESULT(&ctx, gsf_nn_t5_encode(&ctx, &net, &in, other), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf_nn_encode_t5(&ctx, &net, &in, other), GSF_ERROR_INVALID_ARGUMENT);
     free(one);
     free(other);
     gsf_nn_destroy_t5(&ctx, &net);
@@ -421,7 +422,7 @@ static void* measured_alloc(void* user, size_t size) {
 
 static void test_t5_hooks(void) {
     gsf_nn_t5 net;
-    gsf_nn_t5_input in;
+    gsf_nn_t5_desc in;
     int32_t ids[BATCH * TOKENS];
     gsf_context other;
     counter memory;
@@ -434,26 +435,26 @@ static void test_t5_hooks(void) {
     other.progress.progress_fn = cancel_at_first;
     other.progress.user = &other;
     CHECK_OK(&other, gsf_init_context(&other));
-    if (!CHECK_OK(&other, gsf_nn_make_t5(&other, t5_folder(), &net))) return;
+    if (!CHECK_OK(&other, gsf_nn_load_t5(&other, t5_folder(), &net))) return;
     make_input(&net, ids, &in);
     const size_t values = (size_t)BATCH * TOKENS * (size_t)net.width;
     float* out = (float*)malloc(values * sizeof(float));
-    gsf_nn_t5_cost(&net, &in, &bytes, &flops);
+    gsf__nn_query_t5(&net, &in, &bytes, &flops);
     const double d = net.width, inner = (double)net.heads * net.head_dim, rows = BATCH * TOKENS;
     CHECK_NEAR(flops, net.layers * rows * (8 * d * inner + 6 * d * net.hidden + 4 * inner * TOKENS), 1.0);
     largest = 0;
     memset(out, 1, values * sizeof(float));
-    CHECK_RESULT(&other, gsf_nn_t5_encode(&other, &net, &in, out), GSF_ERROR_CANCELLED);
+    CHECK_RESULT(&other, gsf_nn_encode_t5(&other, &net, &in, out), GSF_ERROR_CANCELLED);
     CHECK(reports == 1 && all_zero(out, values));
     CHECK(largest > 0 && bytes > 0.0 && memory.asked > 0);
     gsf_clear_cancel(&other);
     other.progress.progress_fn = NULL;
-    CHECK_OK(&other, gsf_nn_t5_encode(&other, &net, &in, out));
+    CHECK_OK(&other, gsf_nn_encode_t5(&other, &net, &in, out));
     const size_t live = memory.live;
     for (size_t k = 1; k < 100; k++) { // every allocation fails once
         memory.calls = 0;
         memory.fail_at = k;
-        const gsf_result result = gsf_nn_t5_encode(&other, &net, &in, out);
+        const gsf_result result = gsf_nn_encode_t5(&other, &net, &in, out);
         CHECK(memory.live == live);
         if (result == GSF_OK) break;
         if (!CHECK(result == GSF_ERROR_OUT_OF_MEMORY)) break;
@@ -465,7 +466,7 @@ static void test_t5_hooks(void) {
     for (size_t k = 1; k < 10000; k++) {
         memory.calls = 0;
         memory.fail_at = k;
-        const gsf_result result = gsf_nn_make_t5(&other, t5_folder(), &net);
+        const gsf_result result = gsf_nn_load_t5(&other, t5_folder(), &net);
         gsf_nn_destroy_t5(&other, &net);
         CHECK(memory.live == 0);
         if (result == GSF_OK) break;
@@ -478,11 +479,11 @@ static void test_t5_hooks(void) {
 
 typedef struct changed_model { // the golden model with one tensor changed, in one file
     gsf_nn_weights weights;
-    gsf_tensor tensors[512];
+    gsf_nn_tensor tensors[512];
     size_t count;
 } changed_model;
 
-static gsf_tensor* changed_tensor(changed_model* m, const char* name) {
+static gsf_nn_tensor* changed_tensor(changed_model* m, const char* name) {
     for (size_t i = 0; i < m->count; i++)
         if (strcmp(m->tensors[i].name, name) == 0) return &m->tensors[i];
     fprintf(stderr, "no tensor %s\n", name);
@@ -490,7 +491,7 @@ static gsf_tensor* changed_tensor(changed_model* m, const char* name) {
 }
 
 static void open_changed(changed_model* m) {
-    CHECK_OK(&ctx, gsf_nn_open_weights(&ctx, t5_folder(), "model", &m->weights));
+    CHECK_OK(&ctx, gsf_nn_load_weights(&ctx, t5_folder(), "model", &m->weights));
     m->count = m->weights.tensor_count;
     CHECK(m->count < 512);
     memcpy(m->tensors, m->weights.tensors, m->count * sizeof *m->tensors);
@@ -499,23 +500,23 @@ static void open_changed(changed_model* m) {
 static void expect_t5(changed_model* m, gsf_result wanted, const char* words) { // of opening, or else of running
     gsf_nn_t5 net;
     CHECK_OK(&ctx, gsf_nn_save_tensors(&ctx, test_scratch("model.safetensors"), m->tensors, m->count));
-    gsf_result result = gsf_nn_make_t5(&ctx, test_scratch("."), &net);
+    gsf_result result = gsf_nn_load_t5(&ctx, test_scratch("."), &net);
     if (result == GSF_OK) {
         const int32_t ids[3] = {1, 2, 3};
-        gsf_nn_t5_input in;
+        gsf_nn_t5_desc in;
         memset(&in, 0, sizeof in);
         in.ids = ids;
         in.batch = 1;
         in.tokens = 3;
         float* out = (float*)malloc(3 * (size_t)net.width * sizeof(float));
-        result = gsf_nn_t5_encode(&ctx, &net, &in, out);
+        result = gsf_nn_encode_t5(&ctx, &net, &in, out);
         CHECK(result == GSF_OK || all_zero(out, 3 * (size_t)net.width));
         free(out);
     }
     gsf_nn_destroy_t5(&ctx, &net);
     CHECK_RESULT(&ctx, result, wanted);
     if (!CHECK(result == GSF_OK || strstr(ctx.error, words))) fprintf(stderr, "    \"%s\": no \"%s\"\n", ctx.error, words);
-    gsf_nn_close_weights(&ctx, &m->weights);
+    gsf_nn_destroy_weights(&ctx, &m->weights);
 }
 
 static void test_t5_weights(void) {
@@ -531,7 +532,7 @@ static void test_t5_weights(void) {
     open_changed(&m);
     expect_t5(&m, GSF_OK, "");
     open_changed(&m);
-    gsf_tensor* t = changed_tensor(&m, down);
+    gsf_nn_tensor* t = changed_tensor(&m, down);
     float* values = (float*)calloc((size_t)t->count, sizeof(float));
     t->data = values;
     t->dtype = GSF_NN_F32;
@@ -574,10 +575,10 @@ static void test_t5_configs(void) {
     gsf_nn_t5 net;
     for (size_t i = 0; i < sizeof configs / sizeof configs[0]; i++) {
         write_file("config.json", configs[i].text, strlen(configs[i].text));
-        CHECK_RESULT(&ctx, gsf_nn_make_t5(&ctx, test_scratch("."), &net), configs[i].wanted);
+        CHECK_RESULT(&ctx, gsf_nn_load_t5(&ctx, test_scratch("."), &net), configs[i].wanted);
         CHECK(net.nets == NULL && net.weights.tensors == NULL);
     }
-    CHECK_RESULT(&ctx, gsf_nn_make_t5(&ctx, test_scratch("nowhere"), &net), GSF_ERROR_NOT_FOUND);
+    CHECK_RESULT(&ctx, gsf_nn_load_t5(&ctx, test_scratch("nowhere"), &net), GSF_ERROR_NOT_FOUND);
 }
 
 // ---- as a program for compare_tokenizer.py --------------------------------------------
@@ -585,7 +586,7 @@ static void test_t5_configs(void) {
 static int tokenize_stdin(const char* folder) {
     gsf_nn_tokenizer t;
     unsigned char head[4];
-    if (gsf_nn_make_tokenizer(&ctx, folder, &t) != GSF_OK) {
+    if (gsf_nn_load_tokenizer(&ctx, folder, &t) != GSF_OK) {
         fprintf(stderr, "%s\n", ctx.error);
         return 1;
     }
@@ -594,9 +595,9 @@ static int tokenize_stdin(const char* folder) {
         char* text = (char*)malloc(size + 1);
         size_t count = 0;
         if (!text || fread(text, 1, size, stdin) != size ||
-            gsf_nn_tokenize(&ctx, &t, text, size, NULL, 0, &count) != GSF_OK) return 1;
+            gsf_nn_encode_text(&ctx, &t, text, size, NULL, 0, &count) != GSF_OK) return 1;
         int32_t* ids = (int32_t*)malloc(count * sizeof *ids);
-        if (!ids || gsf_nn_tokenize(&ctx, &t, text, size, ids, count, NULL) != GSF_OK) return 1;
+        if (!ids || gsf_nn_encode_text(&ctx, &t, text, size, ids, count, NULL) != GSF_OK) return 1;
         for (size_t i = 0; i < count; i++) printf(i ? " %d" : "%d", (int)ids[i]);
         printf("\n");
         free(ids);
@@ -613,7 +614,7 @@ int main(int argc, char** argv) {
     gsf_nn_tokenizer golden, made;
     test_made();
     test_room();
-    if (CHECK_OK(&ctx, gsf_nn_make_tokenizer(&ctx, folder, &golden))) test_odd_texts(&golden);
+    if (CHECK_OK(&ctx, gsf_nn_load_tokenizer(&ctx, folder, &golden))) test_odd_texts(&golden);
     if (CHECK_OK(&ctx, open_made(&ctx, MADE_BYTES | MADE_NO_TRIM, &made))) test_odd_texts(&made);
     gsf_nn_destroy_tokenizer(&ctx, &golden);
     gsf_nn_destroy_tokenizer(&ctx, &made);

@@ -3,19 +3,20 @@
 // races.
 #define JOB_SYSTEM_ONLY
 #include "../examples/job_system.c"
+#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 #include "test.h"
 #include "worker_runs.h"
 
 static float* make_floats(int64_t count, uint64_t stream) { // in [-1, 1)
     float* v = (float*)malloc((size_t)count * sizeof(float));
-    for (int64_t i = 0; i < count; i++) v[i] = (float)(2.0 * gsf_random_uniform(3, stream, (uint64_t)i) - 1.0);
+    for (int64_t i = 0; i < count; i++) v[i] = (float)(2.0 * gsf_draw_uniform(3, stream, (uint64_t)i) - 1.0);
     return v;
 }
 
 static void add_floats(stage_output* out, const float* v, int64_t count) { add(out, v, (size_t)count * sizeof(float)); }
 
-static gsf_tensor make_weight(const float* v, int64_t a, int64_t b, int64_t c) { // (a, b); c: (a, b, c, 3, 3)
+static gsf_nn_tensor make_weight(const float* v, int64_t a, int64_t b, int64_t c) { // (a, b); c: (a, b, c, 3, 3)
     const int64_t shape[5] = {a, b, c, 3, 3};
     return gsf_nn_wrap_tensor("weight", v, c ? 5 : 2, shape);
 }
@@ -26,24 +27,24 @@ static void run_linear(gsf_context* ctx, run_output* run) {
     enum { ROWS = 333, IN = 160, OUT = 272 };
     stage_output* out = begin_stage(run, "linear");
     float *x = make_floats(ROWS * IN, 0), *w = make_floats(OUT * IN, 1), *y = make_floats(ROWS * OUT, 2);
-    const gsf_tensor weight = make_weight(w, OUT, IN, 0);
-    gsf_nn_quantized quantized;
-    gsf_nn_linear_desc d;
+    const gsf_nn_tensor weight = make_weight(w, OUT, IN, 0);
+    gsf__nn_quantized quantized;
+    gsf__nn_linear_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.rows = ROWS;
     d.weight = &weight;
-    d.activation = GSF_NN_GELU_TANH;
+    d.activation = GSF__NN_GELU_TANH;
     d.accumulate = 1;
     d.y = y;
-    CHECK_OK(ctx, gsf_nn_linear(ctx, NULL, &d));
+    CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
     d.rows = 2; // a product of its own
-    CHECK_OK(ctx, gsf_nn_linear(ctx, NULL, &d));
+    CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
     d.rows = ROWS;
-    if (CHECK_OK(ctx, gsf_nn_quantize_weight(ctx, &weight, 0, &quantized))) {
-        CHECK_OK(ctx, gsf_nn_linear_int8(ctx, NULL, &d, &quantized));
+    if (CHECK_OK(ctx, gsf__nn_quantize_weight(ctx, &weight, 0, &quantized))) {
+        CHECK_OK(ctx, gsf__nn_run_linear_int8(ctx, NULL, &d, &quantized));
         add(out, quantized.data, OUT * IN);
-        gsf_nn_destroy_quantized(ctx, &quantized);
+        gsf__nn_destroy_quantized(ctx, &quantized);
     }
     add_floats(out, y, ROWS * OUT);
     free(x);
@@ -55,7 +56,7 @@ static void run_attention(gsf_context* ctx, run_output* run) {
     enum { QUERIES = 210, KEYS = 333, HEADS = 3, DIM = 64, WIDTH = HEADS * DIM };
     stage_output* out = begin_stage(run, "attention");
     float *q = make_floats(QUERIES * WIDTH, 3), *k = make_floats(KEYS * WIDTH, 4), *v = make_floats(KEYS * WIDTH, 5);
-    gsf_nn_attention_desc d;
+    gsf__nn_attention_desc d;
     memset(&d, 0, sizeof d);
     d.queries = QUERIES;
     d.keys = KEYS;
@@ -65,7 +66,7 @@ static void run_attention(gsf_context* ctx, run_output* run) {
     d.k = k;
     d.v = v;
     d.out = q;
-    CHECK_OK(ctx, gsf_nn_attention(ctx, NULL, &d));
+    CHECK_OK(ctx, gsf__nn_run_attention(ctx, NULL, &d));
     add_floats(out, q, QUERIES * WIDTH);
     free(q);
     free(k);
@@ -76,13 +77,13 @@ static void run_norms(gsf_context* ctx, run_output* run) {
     enum { ROWS = 700, HEADS = 3, HEAD = 32, DIM = HEADS * HEAD, GROUPS = 4 };
     stage_output* out = begin_stage(run, "norms");
     float *x = make_floats(ROWS * DIM, 6), *a = make_floats(ROWS * DIM, 7), *b = make_floats(ROWS * DIM, 8);
-    gsf_nn_layer_norm(ctx, x, ROWS, DIM, a, b, 1e-5f, x);
-    gsf_nn_rms_norm(ctx, x, ROWS, DIM, a, 1e-6f, x);
-    gsf_nn_layer_norm_modulated(ctx, x, ROWS, DIM, a, b, 1e-5f, a + DIM, b + DIM, x);
-    gsf_nn_group_norm(ctx, x, ROWS, DIM, GROUPS, a, b, 1e-6f, x);
-    gsf_nn_head_norm_rope(ctx, x, ROWS, DIM, HEADS, HEAD, a, b, 1e-6f, a, b, 10);
-    gsf_nn_softmax(ctx, x, ROWS, DIM, 0.5f, a);
-    gsf_nn_activate(ctx, GSF_NN_SILU, x, ROWS * DIM, b);
+    gsf__nn_layer_norm(ctx, x, ROWS, DIM, a, b, 1e-5f, x);
+    gsf__nn_rms_norm(ctx, x, ROWS, DIM, a, 1e-6f, x);
+    gsf__nn_layer_norm_modulated(ctx, x, ROWS, DIM, a, b, 1e-5f, a + DIM, b + DIM, x);
+    gsf__nn_group_norm(ctx, x, ROWS, DIM, GROUPS, a, b, 1e-6f, x);
+    gsf__nn_head_norm_rope(ctx, x, ROWS, DIM, HEADS, HEAD, a, b, 1e-6f, a, b, 10);
+    gsf__nn_softmax(ctx, x, ROWS, DIM, 0.5f, a);
+    gsf__nn_activate(ctx, GSF__NN_SILU, x, ROWS * DIM, b);
     add_floats(out, x, ROWS * DIM);
     add_floats(out, a, ROWS * DIM);
     add_floats(out, b, ROWS * DIM);
@@ -96,8 +97,8 @@ static void run_convolution(gsf_context* ctx, run_output* run) {
     stage_output* out = begin_stage(run, "convolution");
     float *x = make_floats(FRAMES * H * W * IN, 9), *w = make_floats(OUT * IN * 27, 10);
     float* y = make_floats(FRAMES * H * W * OUT, 11);
-    const gsf_tensor weight = make_weight(w, OUT, IN, 3);
-    gsf_nn_conv_desc d;
+    const gsf_nn_tensor weight = make_weight(w, OUT, IN, 3);
+    gsf__nn_conv_desc d;
     memset(&d, 0, sizeof d);
     d.x = x;
     d.frames = FRAMES;
@@ -106,7 +107,7 @@ static void run_convolution(gsf_context* ctx, run_output* run) {
     d.weight = &weight;
     d.accumulate = 1;
     d.y = y;
-    CHECK_OK(ctx, gsf_nn_convolve(ctx, NULL, &d));
+    CHECK_OK(ctx, gsf__nn_convolve(ctx, NULL, &d));
     add_floats(out, y, FRAMES * H * W * OUT);
     free(x);
     free(w);
@@ -123,8 +124,8 @@ typedef struct model {
 
 static int open_model(gsf_context* ctx, model* m) {
     memset(m, 0, sizeof *m);
-    return CHECK_OK(ctx, gsf_nn_make_transformer(ctx, test_golden("restorer/model/transformer"), &m->transformer)) &&
-           CHECK_OK(ctx, gsf_nn_make_vae(ctx, test_golden("restorer/model/vae"), &m->vae)) &&
+    return CHECK_OK(ctx, gsf_nn_load_transformer(ctx, test_golden("restorer/model/transformer"), &m->transformer)) &&
+           CHECK_OK(ctx, gsf_nn_load_vae(ctx, test_golden("restorer/model/vae"), &m->vae)) &&
            CHECK_OK(ctx, gsf_nn_load_schedule(ctx, test_golden("restorer/model/scheduler/scheduler_config.json"),
                                               &m->schedule));
 }
@@ -162,7 +163,7 @@ static void run_sampling(gsf_context* ctx, run_output* run, model* m) {
     CHECK_OK(ctx, gsf_nn_sample(ctx, t, &m->vae, &m->schedule, &d, video, NULL));
     add_floats(out, video, values);
     const double timestep = 500.0;
-    gsf_nn_transformer_input in;
+    gsf_nn_transformer_desc in;
     memset(&in, 0, sizeof in);
     in.batch = in.reference_batch = 1;
     in.frames = (t->sample_frames - 1) / t->temporal_ratio + 1;
@@ -177,7 +178,7 @@ static void run_sampling(gsf_context* ctx, run_output* run, model* m) {
     const int64_t latents = (int64_t)in.frames * in.height * in.width;
     CHECK(latents * t->in_channels <= values && latents * t->out_channels <= values);
     CHECK_OK(ctx, gsf_nn_quantize_transformer(ctx, &m->transformer, NULL));
-    CHECK_OK(ctx, gsf_nn_transformer_forward(ctx, t, &in, video));
+    CHECK_OK(ctx, gsf_nn_run_transformer(ctx, t, &in, video));
     add_floats(out, video, latents * t->out_channels);
     free(control);
     free(text);
@@ -198,7 +199,7 @@ static void run_tiles(gsf_context* ctx, run_output* run, const gsf_nn_vae* vae) 
     if (CHECK_OK(ctx, gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_DECODE, &d, 3, h, w, &info))) {
         const int64_t count = vae->out_channels * info.frames * info.height * info.width;
         float* video = make_floats(count, 19);
-        CHECK_OK(ctx, gsf_nn_vae_decode(ctx, vae, &d, latents, 3, h, w, video));
+        CHECK_OK(ctx, gsf_nn_decode_vae(ctx, vae, &d, latents, 3, h, w, video));
         add_floats(out, video, count);
         free(video);
     }

@@ -95,10 +95,10 @@ static void check_conv(gsf_context* ctx, const conv_case* c, gsf_nn_dtype dtype,
     float *start = random_floats(seed, out, 3.0), *y = (float*)malloc(out * sizeof(float));
     const int64_t shape[5] = {c->out, c->in, c->kt, c->kernel, c->kernel};
     const int64_t flat[4] = {c->out, c->in, c->kernel, c->kernel};
-    gsf_tensor weight = gsf_nn_wrap_tensor("w", w, c->kt == 1 ? 4 : 5, c->kt == 1 ? flat : shape);
-    const gsf_tensor b = gsf_nn_wrap_tensor("b", bias, 1, shape);
+    gsf_nn_tensor weight = gsf_nn_wrap_tensor("w", w, c->kt == 1 ? 4 : 5, c->kt == 1 ? flat : shape);
+    const gsf_nn_tensor b = gsf_nn_wrap_tensor("b", bias, 1, shape);
     char* narrow = NULL;
-    gsf_nn_conv_desc desc;
+    gsf__nn_conv_desc desc;
     memset(&desc, 0, sizeof desc);
     if (dtype != GSF_NN_F32) weight.data = narrow_weights(w, count, dtype, &narrow);
     weight.dtype = dtype;
@@ -113,7 +113,7 @@ static void check_conv(gsf_context* ctx, const conv_case* c, gsf_nn_dtype dtype,
     desc.halve = c->halve;
     desc.accumulate = c->accumulate;
     desc.y = y;
-    if (CHECK_OK(ctx, gsf_nn_convolve(ctx, NULL, &desc)))
+    if (CHECK_OK(ctx, gsf__nn_convolve(ctx, NULL, &desc)))
         check_conv_values(c, x, desc.before, w, c->bias ? bias : NULL, start, y);
     free(x), free(w), free(before), free(bias), free(start), free(y), free(narrow);
 }
@@ -135,14 +135,14 @@ static void test_convolve(void) {
         for (size_t i = 0; i < GSF__COUNT(cases); i++)
             check_conv(&ctx, &cases[i], (gsf_nn_dtype)(GSF_NN_F32 + i % 3), &seed);
     }
-    gsf_nn_conv_desc desc;
+    gsf__nn_conv_desc desc;
     float value = 0.0f;
     const int64_t shape[5] = {1, 1, 2, 3, 3};
-    gsf_tensor weight = gsf_nn_wrap_tensor("odd.weight", &value, 5, shape);
+    gsf_nn_tensor weight = gsf_nn_wrap_tensor("odd.weight", &value, 5, shape);
     memset(&desc, 0, sizeof desc);
-    CHECK_RESULT(&ctx, gsf_nn_convolve(&ctx, NULL, &desc), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf__nn_convolve(&ctx, NULL, &desc), GSF_ERROR_INVALID_ARGUMENT);
     desc.x = &value, desc.y = &value, desc.weight = &weight, desc.frames = desc.height = desc.width = 1;
-    CHECK_RESULT(&ctx, gsf_nn_convolve(&ctx, NULL, &desc), GSF_ERROR_UNSUPPORTED);
+    CHECK_RESULT(&ctx, gsf__nn_convolve(&ctx, NULL, &desc), GSF_ERROR_UNSUPPORTED);
     CHECK(strstr(ctx.error, "odd.weight") != NULL);
 }
 
@@ -151,7 +151,7 @@ static void test_convolve(void) {
 typedef struct vae_shape { int32_t channels[4], levels, groups, layers, latents, ratio; } vae_shape;
 
 typedef struct vae_file { // tensors under construction
-    gsf_tensor tensors[600];
+    gsf_nn_tensor tensors[600];
     char names[600][96];
     size_t count;
     uint64_t seed;
@@ -163,7 +163,7 @@ static void add_tensor(vae_file* f, int32_t rank, const int64_t* shape, double c
     va_start(args, format);
     vsnprintf(f->names[f->count], sizeof f->names[0], format, args);
     va_end(args);
-    gsf_tensor t = gsf_nn_wrap_tensor(f->names[f->count], NULL, rank, shape);
+    gsf_nn_tensor t = gsf_nn_wrap_tensor(f->names[f->count], NULL, rank, shape);
     float* data = random_floats(&f->seed, (size_t)t.count, spread);
     for (int64_t i = 0; i < t.count; i++) data[i] += (float)centre;
     t.data = data;
@@ -240,7 +240,7 @@ static void free_file(vae_file* f) {
     free(f);
 }
 
-static gsf_tensor* file_tensor(vae_file* f, const char* name) {
+static gsf_nn_tensor* file_tensor(vae_file* f, const char* name) {
     for (size_t i = 0; i < f->count; i++)
         if (strcmp(f->tensors[i].name, name) == 0) return &f->tensors[i];
     fprintf(stderr, "no tensor %s\n", name);
@@ -248,15 +248,15 @@ static gsf_tensor* file_tensor(vae_file* f, const char* name) {
 }
 
 static void save_config(gsf_context* ctx, const vae_shape* s, const char* more) {
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
-    gsf_text_printf(ctx, &text, "{\"block_out_channels\": [");
-    for (int i = 0; i < s->levels; i++) gsf_text_printf(ctx, &text, "%s%d", i ? ", " : "", (int)s->channels[i]);
-    gsf_text_printf(ctx, &text, "], \"norm_num_groups\": %d, \"layers_per_block\": %d, \"latent_channels\": %d, "
+    gsf_append_text(ctx, &text, "{\"block_out_channels\": [");
+    for (int i = 0; i < s->levels; i++) gsf_append_text(ctx, &text, "%s%d", i ? ", " : "", (int)s->channels[i]);
+    gsf_append_text(ctx, &text, "], \"norm_num_groups\": %d, \"layers_per_block\": %d, \"latent_channels\": %d, "
                     "\"temporal_compression_ratio\": %d, \"sample_height\": 40, \"sample_width\": 32%s}", (int)s->groups,
                     (int)s->layers, (int)s->latents, (int)s->ratio, more);
     CHECK_OK(ctx, gsf_write_file(ctx, test_scratch("config.json"), text.data, text.size));
-    gsf_destroy_text(ctx, &text);
+    gsf_destroy_buffer(ctx, &text);
 }
 
 static void save_model(gsf_context* ctx, const vae_shape* s, const vae_file* f) {
@@ -287,18 +287,18 @@ static vae_result both_ways(gsf_context* ctx, const gsf_nn_vae_desc* desc, int64
     vae_result r;
     uint64_t seed = 3;
     memset(&r, 0, sizeof r);
-    if (!CHECK_OK(ctx, gsf_nn_make_vae(ctx, model_folder(), &vae))) exit(1);
+    if (!CHECK_OK(ctx, gsf_nn_load_vae(ctx, model_folder(), &vae))) exit(1);
     float* clip = random_floats(&seed, (size_t)(3 * frames * height * width), 1.0);
     CHECK_OK(ctx, gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_ENCODE, desc, frames, height, width, &r.encoded));
     const gsf_nn_vae_info e = r.encoded;
     r.latents = (size_t)(vae.latent_channels * e.frames * e.height * e.width);
     r.mean = (float*)calloc(r.latents, sizeof(float));
     r.logvar = (float*)calloc(r.latents, sizeof(float));
-    CHECK_OK(ctx, gsf_nn_vae_encode(ctx, &vae, desc, clip, frames, height, width, r.mean, r.logvar));
+    CHECK_OK(ctx, gsf_nn_encode_vae(ctx, &vae, desc, clip, frames, height, width, r.mean, r.logvar));
     CHECK_OK(ctx, gsf_nn_query_vae(ctx, &vae, GSF_NN_VAE_DECODE, desc, e.frames, e.height, e.width, &r.decoded));
     r.pixels = (size_t)(3 * r.decoded.frames * r.decoded.height * r.decoded.width);
     r.video = (float*)calloc(r.pixels, sizeof(float));
-    CHECK_OK(ctx, gsf_nn_vae_decode(ctx, &vae, desc, r.mean, e.frames, e.height, e.width, r.video));
+    CHECK_OK(ctx, gsf_nn_decode_vae(ctx, &vae, desc, r.mean, e.frames, e.height, e.width, r.video));
     free(clip);
     gsf_nn_destroy_vae(ctx, &vae);
     return r;
@@ -393,7 +393,7 @@ static void test_memory(void) {
     ctx.allocator.free_fn = metered_free;
     ctx.allocator.user = &m;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    CHECK_OK(&ctx, gsf_nn_make_vae(&ctx, model_folder(), &vae));
+    CHECK_OK(&ctx, gsf_nn_load_vae(&ctx, model_folder(), &vae));
     for (int tiled = 0; tiled < 2; tiled++) {
         gsf_nn_vae_desc desc;
         gsf_nn_vae_info info;
@@ -406,11 +406,11 @@ static void test_memory(void) {
         float* video = (float*)malloc((size_t)(3 * info.frames * info.height * info.width) * sizeof(float));
         const size_t start = m.live;
         m.peak = start;
-        CHECK_OK(&ctx, gsf_nn_vae_decode(&ctx, &vae, &desc, latents, 5, 13, 14, video));
+        CHECK_OK(&ctx, gsf_nn_decode_vae(&ctx, &vae, &desc, latents, 5, 13, 14, video));
         CHECK(m.live == start);
         CHECK((double)(m.peak - start) >= info.bytes && (double)(m.peak - start) <= info.bytes + 20000.0);
         desc.max_bytes = info.bytes - 1.0;
-        CHECK_RESULT(&ctx, gsf_nn_vae_decode(&ctx, &vae, &desc, latents, 5, 13, 14, video), GSF_ERROR_OUT_OF_MEMORY);
+        CHECK_RESULT(&ctx, gsf_nn_decode_vae(&ctx, &vae, &desc, latents, 5, 13, 14, video), GSF_ERROR_OUT_OF_MEMORY);
         CHECK(strstr(ctx.error, "MiB") != NULL);
         free(latents);
         free(video);
@@ -455,14 +455,15 @@ static void expect_bad(gsf_context* ctx, const vae_file* f, gsf_result code, con
     gsf_nn_vae vae;
     if (f)
         CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("diffusion_pytorch_model.safetensors"), f->tensors, f->count));
-    CHECK_RESULT(ctx, gsf_nn_make_vae(ctx, model_folder(), &vae), code);
+    CHECK_RESULT(ctx, gsf_nn_load_vae(ctx, model_folder(), &vae), code);
     if (!CHECK(strstr(ctx->error, text) != NULL)) fprintf(stderr, "%s (wanted %s)\n", ctx->error, text);
 }
 
 static void test_bad_tensors(gsf_context* ctx) {
     vae_file* f = make_file(&tiny);
-    gsf_tensor *last = &f->tensors[f->count - 1], *t = file_tensor(f, "decoder.up_blocks.1.upsamplers.0.conv.weight");
-    const gsf_tensor kept = *t;
+    gsf_nn_tensor *last = &f->tensors[f->count - 1], *t = file_tensor(f,
+                                                                      "decoder.up_blocks.1.upsamplers.0.conv.weight");
+    const gsf_nn_tensor kept = *t;
     save_model(ctx, &tiny, f);
     t->shape[0]--;
     t->count = t->shape[0] * t->shape[1] * 9;
@@ -523,16 +524,16 @@ static void test_nan(gsf_context* ctx) {
     uint64_t seed = 9;
     float *latents = random_floats(&seed, 4 * FRAMES * SIDE * SIDE, 1.0), *video = (float*)malloc(PIXELS * sizeof(float));
     vae_file* f = make_file(&tiny);
-    CHECK_OK(ctx, gsf_nn_make_vae(ctx, model_folder(), &vae));
+    CHECK_OK(ctx, gsf_nn_load_vae(ctx, model_folder(), &vae));
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = NAN;
-    CHECK_RESULT(ctx, gsf_nn_vae_decode(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
     CHECK(strstr(ctx->error, "channel 2, frame 4, row 1, column 2") != NULL);
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = 1e30f; // finite, but not for long
-    CHECK_RESULT(ctx, gsf_nn_vae_decode(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_OK);
+    CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_OK);
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = 3e38f;
     for (int i = 0; i < 4; i++) latents[(i * FRAMES + 4) * SIDE * SIDE + 5] = i % 2 ? -3.4e38f : 3.4e38f;
     memset(video, 1, PIXELS * sizeof(float));
-    CHECK_RESULT(ctx, gsf_nn_vae_decode(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
     CHECK(strstr(ctx->error, "chunk 2 of 2") != NULL); // frame 4 of 5
     CHECK(all_zero(video, PIXELS));
     gsf_nn_destroy_vae(ctx, &vae);
@@ -544,8 +545,8 @@ static void test_nan(gsf_context* ctx) {
         w[1] = NAN;
         save_model(ctx, &tiny, f);
         w[1] = kept;
-        CHECK_OK(ctx, gsf_nn_make_vae(ctx, model_folder(), &vae));
-        CHECK_RESULT(ctx, gsf_nn_vae_decode(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
+        CHECK_OK(ctx, gsf_nn_load_vae(ctx, model_folder(), &vae));
+        CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
         if (!CHECK(strstr(ctx->error, named[i]) != NULL)) fprintf(stderr, "%s (wanted %s)\n", ctx->error, named[i]);
         gsf_nn_destroy_vae(ctx, &vae);
     }
@@ -578,13 +579,13 @@ static void test_cancel(void) {
     ctx.progress.progress_fn = cancel_soon;
     ctx.progress.user = &c;
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    CHECK_OK(&ctx, gsf_nn_make_vae(&ctx, model_folder(), &vae));
-    CHECK_RESULT(&ctx, gsf_nn_vae_encode(&ctx, &vae, NULL, clip, 33, 8, 8, mean, NULL), GSF_ERROR_CANCELLED);
+    CHECK_OK(&ctx, gsf_nn_load_vae(&ctx, model_folder(), &vae));
+    CHECK_RESULT(&ctx, gsf_nn_encode_vae(&ctx, &vae, NULL, clip, 33, 8, 8, mean, NULL), GSF_ERROR_CANCELLED);
     CHECK(c.calls == 2 && c.total == 4.0);
     CHECK(all_zero(mean, 4 * 9 * 2 * 2));
     gsf_clear_cancel(&ctx);
     c.done = 0.0;
-    CHECK_OK(&ctx, gsf_nn_vae_encode(&ctx, &vae, NULL, clip, 33, 8, 8, mean, NULL));
+    CHECK_OK(&ctx, gsf_nn_encode_vae(&ctx, &vae, NULL, clip, 33, 8, 8, mean, NULL));
     CHECK(c.done == 4.0);
     gsf_nn_destroy_vae(&ctx, &vae);
     free(clip);
@@ -605,8 +606,8 @@ static gsf_result run_short_of_memory(counter* c) {
     test_context_zero(&ctx);
     count_memory(&ctx, c);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    gsf_result result = gsf_nn_make_vae(&ctx, model_folder(), &vae);
-    if (result == GSF_OK) result = gsf_nn_vae_decode(&ctx, &vae, &desc, latents, 4, 6, 2, video);
+    gsf_result result = gsf_nn_load_vae(&ctx, model_folder(), &vae);
+    if (result == GSF_OK) result = gsf_nn_decode_vae(&ctx, &vae, &desc, latents, 4, 6, 2, video);
     gsf_nn_destroy_vae(&ctx, &vae);
     CHECK(c->live == 0);
     return result;
@@ -637,7 +638,7 @@ int main(void) {
     vae_file* file = make_file(&tiny);
     save_model(&ctx, &tiny, file);
     free_file(file);
-    CHECK_OK(&ctx, gsf_nn_make_vae(&ctx, model_folder(), &vae));
+    CHECK_OK(&ctx, gsf_nn_load_vae(&ctx, model_folder(), &vae));
     test_sizes(&ctx, &vae);
     test_tiles(&ctx, &vae);
     gsf_nn_destroy_vae(&ctx, &vae);

@@ -1,5 +1,5 @@
 // The OpenImageIO section: round trips of EXR, TIFF and 16-bit PNG through files and memory; and OpenImageIO as an
-// oracle for our decoder, gsf_psnr and half precision.
+// oracle for our decoder, gsf_measure_psnr and half precision.
 #define GSF_USE_OIIO
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer.h"
@@ -33,7 +33,7 @@ static void check_round_trips(gsf_context* ctx) {
         for (int channels = 1; channels <= 4; channels++) {
             if (channels == 2) continue;
             gsf_image image = make_test_image(ctx, cases[i].in, channels), back, expected;
-            image.color_space = strstr(cases[i].name, ".exr") ? GSF_LINEAR : GSF_SRGB;
+            image.color_space = strstr(cases[i].name, ".exr") ? GSF_COLOR_LINEAR : GSF_COLOR_SRGB;
             const char* path = test_scratch(cases[i].name);
             CHECK_OK(ctx, gsf_save_image(ctx, path, &image));
             int64_t w = 0, h = 0;
@@ -94,7 +94,7 @@ static void check_damage(gsf_context* ctx) {
         for (size_t n = 0; n < size; n += 1 + size / 97, tried++) {
             char* copy = (char*)malloc(n ? n : 1);
             memcpy(copy, data, n);
-            const gsf_result result = gsf_load_image_memory(ctx, names[k], copy, n, 0, &back);
+            const gsf_result result = gsf_decode_image(ctx, names[k], copy, n, 0, &back);
             refused += result != GSF_OK;
             if (result != GSF_OK) CHECK(back.data == NULL && strlen(ctx->error) > 0);
             gsf_destroy_image(ctx, &back);
@@ -105,7 +105,7 @@ static void check_damage(gsf_context* ctx) {
         gsf_destroy_image(ctx, &image);
     }
     gsf_image out;
-    CHECK_RESULT(ctx, gsf_load_image_memory(ctx, "nonsense", "no image at all", 15, 0, &out), GSF_ERROR_FORMAT);
+    CHECK_RESULT(ctx, gsf_decode_image(ctx, "nonsense", "no image at all", 15, 0, &out), GSF_ERROR_FORMAT);
     CHECK_RESULT(ctx, gsf_load_image(ctx, test_scratch("absent.exr"), 0, &out), GSF_ERROR_NOT_FOUND);
     gsf_image image = make_test_image(ctx, GSF_F32, 3);
     CHECK_RESULT(ctx, gsf_save_image(ctx, "no/such/folder/x.exr", &image), GSF_ERROR_IO);
@@ -134,7 +134,7 @@ static void check_half(uint64_t* seed) {
     }
 }
 
-// Same photo through OpenImageIO and through us; PSNR by ImageBufAlgo::compare and by gsf_psnr.
+// Same photo through OpenImageIO and through us; PSNR by ImageBufAlgo::compare and by gsf_measure_psnr.
 static void check_oracle(gsf_context* ctx) {
     static const char* const names[] = {"landscape.png", "wide.png", "small.png", "large.png"};
     for (int k = 0; k < 4; k++) {
@@ -164,7 +164,7 @@ static void check_oracle(gsf_context* ctx) {
         const OIIO::ImageBufAlgo::CompareResults judged = OIIO::ImageBufAlgo::compare(x, y, 1e-3f, 1e-4f);
         const gsf_image p = gsf_wrap_image(a.data(), GSF_F32, W, H, 3), q = gsf_wrap_image(b.data(), GSF_F32, W, H, 3);
         double psnr = 0;
-        CHECK_OK(ctx, gsf_psnr(ctx, &p, &q, NULL, &psnr));
+        CHECK_OK(ctx, gsf_measure_psnr(ctx, &p, &q, NULL, &psnr));
         // their peak is the largest value of the image, not 1
         float peak = 0.0f;
         for (size_t i = 0; i < a.size(); i++) peak = fmaxf(peak, fmaxf(fabsf(a[i]), fabsf(b[i])));

@@ -43,7 +43,7 @@ static void compare_ply(const char* file, const char* tensors, double tolerance)
     test_tensor xyz = test_get_tensor(&t, "expect.xyz"), dc = test_get_tensor(&t, "expect.f_dc");
     test_tensor rest = test_find_tensor(&t, "expect.f_rest"), opacity = test_get_tensor(&t, "expect.opacity");
     test_tensor scaling = test_get_tensor(&t, "expect.scaling"), rotation = test_get_tensor(&t, "expect.rotation");
-    const size_t n = xyz.dim[0], k = (size_t)gsf_splat_sh_count(s.sh_degree), k_rest = rest.rank > 1 ? rest.dim[1] : 0;
+    const size_t n = xyz.dim[0], k = (size_t)gsf_splat_count_sh(s.sh_degree), k_rest = rest.rank > 1 ? rest.dim[1] : 0;
     CHECK(s.count == n && k == k_rest + 1);
     CHECK(s.origin[0] == 0.0 && s.origin[1] == 0.0 && s.origin[2] == 0.0);
     if (s.count == n && k == k_rest + 1) {
@@ -83,14 +83,14 @@ static void test_ply_golden(void) {
     if (3 * s.count == means.count) test_compare_floats("means", s.means, means.v, means.count, 0);
     if (48 * s.count == sh.count) test_compare_floats("sh", s.sh, sh.v, sh.count, 0);
     // and written again it is the same file
-    gsf_text text;
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
     size_t size;
     char* file = test_read_file(test_golden("splat/ply/random_deg3.ply"), &size);
     CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.ply", &s, NULL, &text));
     CHECK(text.size == size && memcmp(text.data, file, size) == 0);
     free(file);
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     test_free_tensor(&means);
     test_free_tensor(&sh);
     test_close_tensors(&t);
@@ -130,7 +130,7 @@ static void test_ply_damage(const char* relative, int all_values) {
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_splats s;
-    const int is_text = strstr(relative, "ascii") != NULL;
+    const int32_t is_text = strstr(relative, "ascii") != NULL;
     for (size_t cut = 0; cut < size; cut++) {
         char* part = exact_copy(file, cut);
         const gsf_result r = gsf_splat_parse(&ctx, "cut.ply", part, cut, &s);
@@ -167,12 +167,12 @@ static void test_ply_out_of_memory(const char* relative) {
         count.fail_at = k;
         const gsf_result r = gsf_splat_parse(&ctx, "oom.ply", file, size, &s);
         if (r == GSF_OK) {
-            gsf_text text;
+            gsf_buffer text;
             memset(&text, 0, sizeof text);
             for (size_t j = 1;; j++) { // the same for writing
                 count.fail_at = count.calls + j;
                 const gsf_result w = gsf_splat_format(&ctx, "x.ply", &s, NULL, &text);
-                gsf_destroy_text(&ctx, &text);
+                gsf_destroy_buffer(&ctx, &text);
                 if (w == GSF_OK) break;
                 if (!CHECK(w == GSF_ERROR_OUT_OF_MEMORY)) break;
             }
@@ -198,7 +198,7 @@ static void test_ply_origin(void) {
     s.means[0] = 400.0f; // a stray one
     const double far_origin[3] = {4512345.0, -331.5, 5400000.25}, near_origin[3] = {0.5, -2.0, 1.0};
     for (int turn = 0; turn < 2; turn++) {
-        gsf_text text;
+        gsf_buffer text;
         memset(&text, 0, sizeof text);
         memcpy(s.origin, turn ? near_origin : far_origin, sizeof s.origin);
         CHECK_OK(&ctx, gsf_splat_format(&ctx, "x.ply", &s, NULL, &text));
@@ -214,7 +214,7 @@ static void test_ply_origin(void) {
             CHECK(memcmp(again.quats, s.quats, 4 * s.count * sizeof(float)) == 0);
             gsf_splat_destroy(&ctx, &again);
         }
-        gsf_destroy_text(&ctx, &text);
+        gsf_destroy_buffer(&ctx, &text);
     }
     gsf_splat_destroy(&ctx, &s);
     CHECK(count.live == 0);
@@ -287,7 +287,7 @@ static void disk_put_photo(memory_disk* disk, const char* path, int width, int h
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_image image;
-    gsf_text png;
+    gsf_buffer png;
     memset(&png, 0, sizeof png);
     CHECK_OK(&ctx, gsf_make_image(&ctx, GSF_U8, width, height, 3, &image));
     for (int y = 0; y < height; y++)
@@ -297,7 +297,7 @@ static void disk_put_photo(memory_disk* disk, const char* path, int width, int h
                     (uint8_t)(128 + 100 * sin(seed + c + 6.0 * x / width) * cos(4.0 * y / height));
     CHECK_OK(&ctx, gsf_encode_image(&ctx, &image, ".png", &png));
     (void)disk_write(disk, &ctx, path, png.data, png.size);
-    gsf_destroy_text(&ctx, &png);
+    gsf_destroy_buffer(&ctx, &png);
     gsf_destroy_image(&ctx, &image);
     CHECK(count.live == 0);
 }
@@ -338,13 +338,13 @@ static model_files read_model(const char* folder, const char* extension) {
 }
 static void free_model(model_files* m) { for (int i = 0; i < 3; i++) free(m->data[i]); }
 
-static gsf_result parse_model(gsf_context* ctx, int is_text, const model_files* m, gsf_scene* out) {
+static gsf_result parse_model(gsf_context* ctx, int32_t is_text, const model_files* m, gsf_scene* out) {
     gsf_bytes bytes[3];
     for (int i = 0; i < 3; i++) bytes[i].data = m->data[i], bytes[i].size = m->size[i], bytes[i].name = NULL;
     return gsf_splat_parse_colmap(ctx, is_text, &bytes[0], &bytes[1], m->data[2] ? &bytes[2] : NULL, out);
 }
 
-static void test_colmap_golden(int is_text) {
+static void test_colmap_golden(int32_t is_text) {
     counter count;
     gsf_context ctx = make_context(&count);
     gsf_scene scene;
@@ -366,7 +366,7 @@ static void test_colmap_golden(int is_text) {
         double pose[16], rows[16];
         CHECK(view->image_id == (uint32_t)ids.v[file_index]);
         CHECK(i == 0 || strcmp(scene.views[i - 1].name, view->name) < 0);
-        gsf_camera_c2w(&view->camera, pose);
+        gsf_get_camera_c2w(&view->camera, pose);
         for (int k = 0; k < 16; k++) rows[k] = pose[4 * (k % 4) + k / 4];
         test_compare("c2w", rows, c2w.v + 16 * i, 16, 1e-12);
         for (int k = 0; k < 3; k++) mean[k] += pose[12 + k] / (double)order.count;
@@ -503,7 +503,7 @@ static void test_colmap_bad(void) {
 }
 
 // Every truncation of each file; then every byte with a few, the first 64 with all other values.
-static void test_colmap_damage(int is_text) {
+static void test_colmap_damage(int32_t is_text) {
     model_files files = read_model(is_text ? "splat/colmap/txt" : "splat/colmap/bin", is_text ? "txt" : "bin");
     counter count;
     gsf_context ctx = make_context(&count);
@@ -535,7 +535,7 @@ static void test_colmap_damage(int is_text) {
     CHECK(count.live == 0);
 }
 
-static void test_colmap_out_of_memory(int is_text) {
+static void test_colmap_out_of_memory(int32_t is_text) {
     model_files files = read_model(is_text ? "splat/colmap/txt" : "splat/colmap/bin", is_text ? "txt" : "bin");
     for (size_t k = 1;; k++) {
         counter count;
@@ -735,7 +735,7 @@ static void test_colmap_lenses(const char* folder, size_t camera_count) {
             size_t point = 0;
             double u = 0, w = 0, depth = 0, x, y;
             while (point + 1 < scene.point_count && scene.point_ids[point] != gsf__load_le(p + 16, 8)) point++;
-            CHECK(gsf_camera_project(camera, scene.points + 3 * point, &u, &w, &depth));
+            CHECK(gsf_project_point(camera, scene.points + 3 * point, &u, &w, &depth));
             gsf__rectify_map(r, u - r->centre, w - r->centre, &x, &y);
             CHECK_NEAR(x + r->centre, gsf__load_f64(p), 1e-8);
             CHECK_NEAR(y + r->centre, gsf__load_f64(p + 8), 1e-8);
@@ -787,7 +787,7 @@ static void test_rigs(void) {
     gsf_scene scenes[2];
     counter count;
     gsf_context ctx = make_disk_context(&count, &disk);
-    for (int is_text = 0; is_text < 2; is_text++) {
+    for (int32_t is_text = 0; is_text < 2; is_text++) {
         const char* extension = is_text ? "txt" : "bin";
         char from[1000], to[160];
         for (int i = 0; i < 5; i++) {
@@ -1200,12 +1200,12 @@ static void test_transforms(void) {
         CHECK(b->fx == 35.5 && b->fy == 36.5 && b->cx == 20.25 && b->cy == 14.5 && b->width == 40 && b->height == 30);
         CHECK(a->width == 39 && fabs(a->fx / 70 - 1) < 0.05); // its own lens, undistorted
         double centre[3], u, v, depth;
-        gsf_camera_center(b, centre);
+        gsf_get_camera_center(b, centre);
         CHECK(centre[0] == 1 && centre[1] == 2 && centre[2] == 3);
         const double ahead[3] = {1, 2, -7}, above[3] = {1, 4, -7}; // OpenGL: looks along -z, y is up
-        CHECK(gsf_camera_project(b, ahead, &u, &v, &depth) && depth == 10 && u == b->cx && v == b->cy);
-        CHECK(gsf_camera_project(b, above, &u, &v, &depth) && v < b->cy);
-        gsf_camera_center(a, centre);
+        CHECK(gsf_project_point(b, ahead, &u, &v, &depth) && depth == 10 && u == b->cx && v == b->cy);
+        CHECK(gsf_project_point(b, above, &u, &v, &depth) && v < b->cy);
+        gsf_get_camera_center(a, centre);
         CHECK_NEAR(centre[0] + 10 * centre[1] + 100 * centre[2], 765, 1e-12);
         CHECK_NEAR(scene.origin[0], 3, 1e-12);
     }
@@ -1309,23 +1309,23 @@ static void test_split(void) {
     char* text = test_read_file(test_golden("traj/tables.json"), &size);
     gsf_json json;
     if (!CHECK_OK(&ctx, gsf_parse_json(&ctx, "tables.json", text, size, &json))) return;
-    const gsf_json_value* splits = gsf_json_member(&json, &json.values[0], "splits");
+    const gsf_json_value* splits = gsf_find_json_member(&json, &json.values[0], "splits");
     for (uint32_t i = splits ? splits->child : 0; i; i = json.values[i].next, tables++) {
         const gsf_json_value* row = &json.values[i];
-        const size_t n = (size_t)gsf_json_member(&json, row, "n")->number;
-        const size_t every = (size_t)gsf_json_member(&json, row, "test_every")->number;
-        const size_t k = (size_t)gsf_json_member(&json, row, "K")->number;
-        const gsf_json_value *train = gsf_json_member(&json, row, "train"),
-                             *ends = gsf_json_member(&json, row, "test_first_last");
+        const size_t n = (size_t)gsf_find_json_member(&json, row, "n")->number;
+        const size_t every = (size_t)gsf_find_json_member(&json, row, "test_every")->number;
+        const size_t k = (size_t)gsf_find_json_member(&json, row, "K")->number;
+        const gsf_json_value *train = gsf_find_json_member(&json, row, "train"),
+                             *ends = gsf_find_json_member(&json, row, "test_first_last");
         uint32_t* arrays = (uint32_t*)malloc(2 * (n + k) * sizeof(uint32_t));
         size_t train_count, test_count;
         gsf_splat_split_views(n, every, k, arrays, &train_count, arrays + n + k, &test_count);
-        CHECK(train_count == gsf_json_member(&json, row, "n_train")->number);
-        CHECK(test_count == gsf_json_member(&json, row, "n_test")->number);
-        CHECK(arrays[n + k] == gsf_json_element(&json, ends, 0)->number);
-        CHECK(arrays[n + k + test_count - 1] == gsf_json_element(&json, ends, 1)->number);
+        CHECK(train_count == gsf_find_json_member(&json, row, "n_train")->number);
+        CHECK(test_count == gsf_find_json_member(&json, row, "n_test")->number);
+        CHECK(arrays[n + k] == gsf_find_json_element(&json, ends, 0)->number);
+        CHECK(arrays[n + k + test_count - 1] == gsf_find_json_element(&json, ends, 1)->number);
         if (train->type == GSF_JSON_ARRAY)
-            for (size_t j = 0; j < train_count; j++) CHECK(arrays[j] == gsf_json_element(&json, train, j)->number);
+            for (size_t j = 0; j < train_count; j++) CHECK(arrays[j] == gsf_find_json_element(&json, train, j)->number);
         else
             for (size_t j = 0; j < train_count; j++) CHECK(arrays[j] % every != 0 && (!j || arrays[j - 1] < arrays[j]));
         free(arrays);
@@ -1348,10 +1348,10 @@ static void test_split(void) {
 
 static void check_split_list(const gsf_json* json, const char* key, const gsf_scene* scene, const uint32_t* views,
                              size_t n) {
-    const gsf_json_value* list = gsf_json_member(json, &json->values[0], key);
+    const gsf_json_value* list = gsf_find_json_member(json, &json->values[0], key);
     if (!CHECK(list && list->count == n)) return;
     for (size_t i = 0; i < n; i++)
-        CHECK(strcmp(gsf_json_element(json, list, i)->string, scene->views[views[i]].name) == 0);
+        CHECK(strcmp(gsf_find_json_element(json, list, i)->string, scene->views[views[i]].name) == 0);
 }
 
 static void test_fox_photos(void) {
@@ -1389,7 +1389,7 @@ static void test_fox_photos(void) {
             for (size_t e = scene.track_begin[p]; e < scene.track_begin[p + 1]; e++, all++) {
                 const gsf_camera* c = &scene.views[scene.track_views[e]].camera;
                 double u, v, depth;
-                inside += gsf_camera_project(c, scene.points + 3 * p, &u, &v, &depth) && u > -5 && v > -5 &&
+                inside += gsf_project_point(c, scene.points + 3 * p, &u, &v, &depth) && u > -5 && v > -5 &&
                           u < c->width + 5 && v < c->height + 5;
             }
         CHECK(all > 20000 && inside > all - all / 100);
@@ -1412,7 +1412,7 @@ int main(void) {
     test_ply_out_of_memory("splat/ply/small_deg1_ascii.ply");
     test_ply_origin();
     test_ply_variants();
-    for (int is_text = 0; is_text < 2; is_text++) {
+    for (int32_t is_text = 0; is_text < 2; is_text++) {
         test_colmap_golden(is_text);
         test_colmap_damage(is_text);
         test_colmap_out_of_memory(is_text);

@@ -34,7 +34,7 @@ static void heap_free(void* user, void* memory) {
 // ---- a textured plane ----------------------------------------------------------
 
 static double lattice_value(int64_t x, int64_t y, uint64_t octave) {
-    return gsf_random_uniform(7, octave, (uint64_t)(x & 0xffff) << 16 | (uint64_t)(y & 0xffff));
+    return gsf_draw_uniform(7, octave, (uint64_t)(x & 0xffff) << 16 | (uint64_t)(y & 0xffff));
 }
 
 static double texture(double u, double v) { // three octaves of smooth noise, [0,1]
@@ -58,7 +58,7 @@ typedef struct plane_scene {
 
 static double plane_depth(const plane_scene* s, const gsf_camera* camera, double u, double v, double at[3]) {
     double c2w[16], ray[3] = {(u - camera->cx) / camera->fx, (v - camera->cy) / camera->fy, 1.0}, a = 0.0, b = 0.0;
-    gsf_camera_c2w(camera, c2w);
+    gsf_get_camera_c2w(camera, c2w);
     double direction[3];
     for (int k = 0; k < 3; k++) {
         direction[k] = c2w[k] * ray[0] + c2w[4 + k] * ray[1] + c2w[8 + k] * ray[2];
@@ -88,7 +88,7 @@ static void make_plane(plane_scene* s, double tilt, double contrast, double offs
         view->camera.cy = HEIGHT / 2.0 - 0.7;
         view->camera.width = WIDTH;
         view->camera.height = HEIGHT;
-        gsf_camera_set_c2w(&view->camera, c2w);
+        gsf_set_camera_c2w(&view->camera, c2w);
         CHECK_OK(&ctx, gsf_make_image(&ctx, GSF_U8, WIDTH, HEIGHT, 3, &view->image));
         uint8_t* rgb = (uint8_t*)view->image.data;
         for (int y = 0; y < HEIGHT; y++)
@@ -117,7 +117,7 @@ static void check_plane(double tilt, double offset) {
     gsf_dense_stats stats;
     gsf_dense_desc desc = {0};
     desc.want_maps = 1;
-    if (!CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense, &stats))) {
+    if (!CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense, &stats))) {
         free_plane(&s);
         return;
     }
@@ -190,7 +190,7 @@ static void test_angles(void) {
         desc.min_angle = cases[i].min_angle;
         desc.max_normal_angle = cases[i].max_normal_angle;
         memset(&stats, 0, sizeof stats);
-        CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense, &stats));
+        CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense, &stats));
         CHECK(stats.pairs == cases[i].pairs);
         consistent[i] = stats.consistent;
         printf("min_angle %g, max_normal_angle %g: %zu pairs, %zu consistent\n", (double)desc.min_angle,
@@ -216,7 +216,7 @@ static void test_masked(void) {
         uint8_t* rgb = (uint8_t*)s.views[1].image.data;
         for (int i = 0; i < 3 * WIDTH * HEIGHT && run; i++)
             if (weight[i / 3] == 0) rgb[i] = (uint8_t)test_random_in(&state, 0, 255.9);
-        CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense[run], NULL));
+        CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &dense[run], NULL));
         size_t masked = 0, open = 0, elsewhere = 0;
         for (size_t m = 0; m < dense[run].map_count; m++)
             for (int i = 0; i < WIDTH * HEIGHT; i++) {
@@ -241,7 +241,7 @@ static void test_nothing_to_see(void) {
     gsf_dense dense;
     gsf_dense_stats stats;
     make_plane(&s, 0.0, 0.0, 0.0);
-    CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, NULL, &dense, &stats));
+    CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, NULL, &dense, &stats));
     CHECK(dense.count == 0 && stats.matched == 0 && dense.map_count == 0);
     gsf_splat_destroy_dense(&ctx, &dense);
     free_plane(&s);
@@ -249,15 +249,15 @@ static void test_nothing_to_see(void) {
     make_plane(&s, 0.0, 220.0, 0.0);
     static const uint32_t same[3] = {1, 1, 1};
     for (size_t n = 0; n <= 3; n++) { // no view, one view, and one that is named again
-        CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, same, n, NULL, NULL, &dense, &stats));
+        CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, same, n, NULL, NULL, &dense, &stats));
         CHECK(dense.count == 0 && stats.views == (n > 0) && stats.pairs == 0);
         gsf_splat_destroy_dense(&ctx, &dense);
     }
     double c2w[16]; // the third looks away: two views of one pair are left
-    gsf_camera_c2w(&s.views[2].camera, c2w);
+    gsf_get_camera_c2w(&s.views[2].camera, c2w);
     for (int k = 0; k < 3; k++) c2w[k] = -c2w[k], c2w[8 + k] = -c2w[8 + k];
-    gsf_camera_set_c2w(&s.views[2].camera, c2w);
-    CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, NULL, &dense, &stats));
+    gsf_set_camera_c2w(&s.views[2].camera, c2w);
+    CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, NULL, &dense, &stats));
     CHECK(dense.count > 100 && stats.views == VIEWS && stats.pairs == 2);
     gsf_splat_destroy_dense(&ctx, &dense);
     free_plane(&s);
@@ -266,7 +266,7 @@ static void test_nothing_to_see(void) {
 static void expect_refused(plane_scene* s, const uint32_t* views, size_t count, const gsf_dense_desc* desc) {
     gsf_dense dense;
     ctx.error[0] = 0;
-    CHECK(gsf_splat_dense_points(&ctx, &s->scene, views, count, NULL, desc, &dense, NULL) != GSF_OK && ctx.error[0]);
+    CHECK(gsf_splat_make_dense(&ctx, &s->scene, views, count, NULL, desc, &dense, NULL) != GSF_OK && ctx.error[0]);
     CHECK(dense.points == NULL && dense.count == 0);
 }
 
@@ -322,11 +322,11 @@ static void test_same_bits(void) {
     other[1].threads = 1;
     work_backwards(&other[2]);
     other[3].cpu_level = GSF_CPU_SCALAR;
-    CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &first, NULL));
+    CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &desc, &first, NULL));
     CHECK(first.count > 100);
     for (int i = 0; i < 4; i++) {
         CHECK_OK(&other[i], gsf_init_context(&other[i]));
-        CHECK_OK(&other[i], gsf_splat_dense_points(&other[i], &s.scene, all_views, VIEWS, NULL, &desc, &again, NULL));
+        CHECK_OK(&other[i], gsf_splat_make_dense(&other[i], &s.scene, all_views, VIEWS, NULL, &desc, &again, NULL));
         int same = again.count == first.count && again.map_count == first.map_count;
         same = same && memcmp(again.points, first.points, first.count * 3 * sizeof(double)) == 0 &&
                memcmp(again.normals, first.normals, first.count * 3 * sizeof(float)) == 0 &&
@@ -339,14 +339,14 @@ static void test_same_bits(void) {
     }
     gsf_dense_desc seeded = desc; // and another seed is another run
     seeded.seed = 1;
-    CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &seeded, &again, NULL));
+    CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &seeded, &again, NULL));
     CHECK(again.count != first.count || memcmp(again.points, first.points, first.count * 3 * sizeof(double)) != 0);
     gsf_splat_destroy_dense(&ctx, &again);
 
     gsf_dense_desc capped = desc;
     capped.max_points = first.count / 3;
     gsf_dense_stats stats;
-    CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, NULL, &capped, &again, &stats));
+    CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &capped, &again, &stats));
     CHECK(again.count <= capped.max_points && again.count > 20 && stats.spacing > 3);
     gsf_splat_destroy_dense(&ctx, &again);
     gsf_splat_destroy_dense(&ctx, &first);
@@ -373,7 +373,7 @@ static void test_beside_sparse_points(void) {
     gsf_dense_desc desc = quick_desc();
     desc.skip_sparse = 1;
     gsf_dense dense;
-    CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, &s.scene, all_views, VIEWS, keep, &desc, &dense, NULL));
+    CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, keep, &desc, &dense, NULL));
     double nearest_kept = 1e9, nearest_left = 1e9;
     for (size_t i = 0; i < dense.count; i++)
         for (size_t k = 0; k < POINTS; k++) {
@@ -409,7 +409,7 @@ static void test_out_of_memory_and_cancel(void) {
     for (size_t k = 1; k < 1000; k++) {
         h.calls = 0;
         h.fail_at = k;
-        const gsf_result result = gsf_splat_dense_points(&small, &s.scene, all_views, VIEWS, NULL, &desc, &dense, NULL);
+        const gsf_result result = gsf_splat_make_dense(&small, &s.scene, all_views, VIEWS, NULL, &desc, &dense, NULL);
         if (result == GSF_OK) {
             last = k;
             gsf_splat_destroy_dense(&small, &dense);
@@ -421,7 +421,7 @@ static void test_out_of_memory_and_cancel(void) {
     CHECK(last > 10);
     h.fail_at = 0;
     gsf_request_cancel(&small);
-    CHECK(gsf_splat_dense_points(&small, &s.scene, all_views, VIEWS, NULL, &desc, &dense, NULL) == GSF_ERROR_CANCELLED);
+    CHECK(gsf_splat_make_dense(&small, &s.scene, all_views, VIEWS, NULL, &desc, &dense, NULL) == GSF_ERROR_CANCELLED);
     CHECK(h.live == 0 && dense.points == NULL);
     free_plane(&s);
 }
@@ -453,11 +453,11 @@ static int seen_elsewhere(const gsf_dense* dense, float* const* truth, size_t m,
     const double z = (double)truth[m][y * camera->width + x];
     const double ray[3] = {(x + 0.5 - camera->cx) / camera->fx * z, (y + 0.5 - camera->cy) / camera->fy * z, z};
     double c2w[16], point[3], u, v, depth;
-    gsf_camera_c2w(camera, c2w);
+    gsf_get_camera_c2w(camera, c2w);
     for (int k = 0; k < 3; k++) point[k] = c2w[12 + k] + c2w[k] * ray[0] + c2w[4 + k] * ray[1] + c2w[8 + k] * ray[2];
     for (size_t i = 0; i < dense->map_count; i++) {
         const gsf_camera* other = &dense->maps[i].camera;
-        if (i == m || !gsf_camera_project(other, point, &u, &v, &depth)) continue;
+        if (i == m || !gsf_project_point(other, point, &u, &v, &depth)) continue;
         if (!(u >= 0.0 && u < other->width && v >= 0.0 && v < other->height)) continue;
         const double there = (double)truth[i][(int)v * other->width + (int)u];
         if (there > 0.0 && fabs(there - depth) < 0.02 * depth) return 1;
@@ -476,8 +476,8 @@ static void check_courtyard(const gsf_scene* scene, const char* folder, const co
     gsf_dense dense;
     gsf_dense_stats stats;
     desc.want_maps = 1;
-    CHECK_OK(&ctx, gsf_splat_visible_points(&ctx, scene, train, count, NULL, keep, NULL));
-    if (!CHECK_OK(&ctx, gsf_splat_dense_points(&ctx, scene, train, count, keep, &desc, &dense, &stats))) return;
+    CHECK_OK(&ctx, gsf_splat_filter_points(&ctx, scene, train, count, NULL, keep, NULL));
+    if (!CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, scene, train, count, keep, &desc, &dense, &stats))) return;
     float *truth[16], *errors = (float*)malloc((stats.consistent + 1) * sizeof(float));
     for (size_t m = 0; m < dense.map_count; m++)
         truth[m] = load_truth(folder, scene->views[dense.maps[m].view].name,

@@ -154,7 +154,7 @@ static ref_projected project_one(const scene* s, size_t i) {
     one.log_scales += 3 * i;
     one.quats += 4 * i;
     one.opacity_logits += i;
-    one.sh += 3 * (size_t)gsf_splat_sh_count(one.sh_degree) * i;
+    one.sh += 3 * (size_t)gsf_splat_count_sh(one.sh_degree) * i;
     ref_splats wide = ref_splats_from(&one);
     ref_options options = ref_options_from(&s->desc);
     options.hidden = NULL;
@@ -196,7 +196,7 @@ static void draw_splat(scene* s, const recipe* r, size_t i, uint64_t* state) {
     for (size_t k = 0; k < 4; k++) s->splats.quats[4 * i + k] = (float)q[k];
     s->splats.opacity_logits[i] =
         (float)test_random_in(state, or_default(r->logit_low, -3), or_default(r->logit_high, 4));
-    const size_t K = (size_t)gsf_splat_sh_count(s->splats.sh_degree);
+    const size_t K = (size_t)gsf_splat_count_sh(s->splats.sh_degree);
     for (size_t k = 0; k < 3 * K; k++)
         s->splats.sh[3 * K * i + k] = (float)test_random_in(state, k < 3 ? -1.5 : -0.15, k < 3 ? 1.5 : 0.15);
 }
@@ -784,7 +784,7 @@ static void test_culling(void) {
 
 static scene scene_copy(const scene* s) {
     scene c = *s;
-    const size_t n = s->splats.count, K = (size_t)gsf_splat_sh_count(s->splats.sh_degree);
+    const size_t n = s->splats.count, K = (size_t)gsf_splat_count_sh(s->splats.sh_degree);
     CHECK_OK(&levels[0].ctx, gsf_splat_make(&levels[0].ctx, n, s->splats.sh_degree, &c.splats));
     memcpy(c.splats.origin, s->splats.origin, sizeof c.splats.origin);
     memcpy(c.splats.means, s->splats.means, 3 * n * sizeof(float));
@@ -1094,22 +1094,22 @@ static gsf_trainer* trainer_make(gsf_context* ctx, const gsf_train_desc* desc, c
 }
 
 // The whole state after training, and the picture of the first camera behind it.
-static gsf_text train_whole(machine* m, const training* t, size_t* splats) {
+static gsf_buffer train_whole(machine* m, const training* t, size_t* splats) {
     const gsf_train_desc desc = busy_desc();
     gsf_trainer* trainer = trainer_make(&m->ctx, &desc, t, &t->start);
     for (int i = 0; i < desc.iterations; i++)
-        if (!CHECK_OK(&m->ctx, gsf_splat_train_step(&m->ctx, trainer, NULL))) break;
-    gsf_text text;
+        if (!CHECK_OK(&m->ctx, gsf_splat_step_trainer(&m->ctx, trainer, NULL))) break;
+    gsf_buffer text;
     gsf_render_output out;
     float* pixels = (float*)calloc(3 * TRAIN_W * TRAIN_H, sizeof(float));
     memset(&text, 0, sizeof text);
     memset(&out, 0, sizeof out);
     out.color = packed_view(pixels, &t->views[0].camera, 3);
-    CHECK_OK(&m->ctx, gsf_splat_trainer_render(&m->ctx, trainer, &t->views[0].camera, &out));
-    gsf_splat_trainer_save(&m->ctx, trainer, &text);
-    gsf_chunks_add(&m->ctx, &text, "PIXL", pixels, 3 * TRAIN_W * TRAIN_H * sizeof(float));
+    CHECK_OK(&m->ctx, gsf_splat_render_trainer(&m->ctx, trainer, &t->views[0].camera, &out));
+    gsf_splat_format_trainer(&m->ctx, trainer, &text);
+    gsf_append_chunk(&m->ctx, &text, "PIXL", pixels, 3 * TRAIN_W * TRAIN_H * sizeof(float));
     CHECK(!text.failed);
-    *splats = gsf_splat_trainer_splats(trainer)->count;
+    *splats = gsf_splat_get_trained(trainer)->count;
     free(pixels);
     gsf_splat_destroy_trainer(&m->ctx, trainer);
     return text;
@@ -1120,7 +1120,7 @@ static void test_training_bits(void) {
     static const int workers[] = {1, 1, 2, 3, 2, 3};
     for (size_t k = 0; k < level_count; k++) {
         training t = training_make(&levels[k], 110);
-        gsf_text first;
+        gsf_buffer first;
         size_t splats;
         int differ = 0;
         memset(&first, 0, sizeof first);
@@ -1129,17 +1129,17 @@ static void test_training_bits(void) {
             if (!CHECK(machine_open(&m, levels[k].ctx.cpu_level, run >= 4))) return;
             m.ctx.parallel.worker_count = workers[run];
             m.ctx.parallel.user = (void*)(uintptr_t)&workers[run];
-            gsf_text text = train_whole(&m, &t, &splats);
+            gsf_buffer text = train_whole(&m, &t, &splats);
             if (run == 0) CHECK(splats != t.start.count && splats > 50); // it did densify and prune
             else if (!CHECK(text.size == first.size && memcmp(text.data, first.data, text.size) == 0)) {
                 fprintf(stderr, "training, %s: other bits with %d workers (run %zu)\n", m.name, workers[run], run);
                 differ++;
             }
             if (run == 0) first = text;
-            else gsf_destroy_text(&m.ctx, &text);
+            else gsf_destroy_buffer(&m.ctx, &text);
             machine_close(&m);
         }
-        gsf_destroy_text(&levels[k].ctx, &first);
+        gsf_destroy_buffer(&levels[k].ctx, &first);
         row* w = add_row("training", "80 steps, 6 runs", levels[k].name);
         w->what = "runs_that_differ";
         w->other = differ;
@@ -1223,8 +1223,8 @@ static void test_invisible(void) {
                     gsf__trainer_clear_gradients(a);
                     gsf__trainer_clear_gradients(b);
                 }
-                CHECK_OK(ctx, gsf_splat_train_step(ctx, a, &stats[0]));
-                CHECK_OK(ctx, gsf_splat_train_step(ctx, b, &stats[1]));
+                CHECK_OK(ctx, gsf_splat_step_trainer(ctx, a, &stats[0]));
+                CHECK_OK(ctx, gsf_splat_step_trainer(ctx, b, &stats[1]));
                 CHECK(stats[0].loss == stats[1].loss);
                 if (i == 9) put_in = stats[1].splats - stats[0].splats;
                 wrong += compare_models(&a->model, &b->model, i, levels[k].name);
@@ -1271,7 +1271,7 @@ static void test_scaled_training(void) {
             gsf_train_stats stats;
             losses[c] = 0;
             for (int i = 0; i < desc.iterations; i++) {
-                CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+                CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats));
                 CHECK(stats.rejected == 0);
                 if (i >= desc.iterations - VIEWS) losses[c] += stats.loss / VIEWS;
             }
@@ -1310,7 +1310,7 @@ static void test_long_run(void) {
         double first = 0, last = 0;
         size_t most = 0, bad = 0;
         for (int32_t i = 0; i < iterations; i++) {
-            if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats))) break;
             if (i < VIEWS) first += stats.loss / VIEWS;
             if (i >= iterations - VIEWS) last += stats.loss / VIEWS;
             if (stats.splats > most) most = stats.splats;

@@ -116,12 +116,12 @@ static int shall_repeat(loop* l, gsf_result result, const char* call) {
     } while (0)
 
 static gsf_result write_checkpoint(loop* l) {
-    gsf_text chunks = {0};
-    gsf_splat_fixer_save(&l->ctx, l->fixer, &chunks);
-    gsf_chunks_end(&l->ctx, &chunks);
+    gsf_buffer chunks = {0};
+    gsf_splat_format_fixer(&l->ctx, l->fixer, &chunks);
+    gsf_append_last_chunk(&l->ctx, &chunks);
     const gsf_result result = chunks.failed ? GSF_ERROR_OUT_OF_MEMORY
                                             : gsf_write_file(&l->ctx, in(out_folder, "checkpoint"), chunks.data, chunks.size);
-    gsf_destroy_text(&l->ctx, &chunks);
+    gsf_destroy_buffer(&l->ctx, &chunks);
     return result;
 }
 
@@ -129,7 +129,7 @@ static gsf_result read_checkpoint(loop* l) {
     void* data;
     size_t size;
     gsf_result result = gsf_read_file(&l->ctx, in(out_folder, "checkpoint"), &data, &size);
-    if (result == GSF_OK) result = gsf_splat_fixer_restore(&l->ctx, l->resumed, in(out_folder, "checkpoint"), data, size);
+    if (result == GSF_OK) result = gsf_splat_parse_fixer(&l->ctx, l->resumed, in(out_folder, "checkpoint"), data, size);
     gsf_free(&l->ctx, data);
     return result;
 }
@@ -152,10 +152,10 @@ static gsf_result load(loop* l) {
         l->views[v].image = l->scene.views[v].image;
         all[v] = v;
     }
-    STEP(gsf_splat_visible_points(ctx, &l->scene, all, l->scene.view_count, &discs, keep, NULL));
-    STEP(gsf_splat_dense_points(ctx, &l->scene, all, l->scene.view_count < 2 ? 1 : 2, keep, &stereo, &l->dense, NULL));
-    STEP(gsf_splat_from_points(ctx, l->scene.points, l->scene.colors, l->scene.point_count, keep, 1, l->scene.origin,
-                               &l->start));
+    STEP(gsf_splat_filter_points(ctx, &l->scene, all, l->scene.view_count, &discs, keep, NULL));
+    STEP(gsf_splat_make_dense(ctx, &l->scene, all, l->scene.view_count < 2 ? 1 : 2, keep, &stereo, &l->dense, NULL));
+    STEP(gsf_splat_make_from_points(ctx, l->scene.points, l->scene.colors, l->scene.point_count, keep, 1,
+                                    l->scene.origin, &l->start));
     STEP(gsf_splat_sort(ctx, &l->start));
     return GSF_OK;
 }
@@ -182,16 +182,16 @@ static gsf_result repair(loop* l) {
     desc.skip_psnr = 60.0f;
     STEP(gsf_splat_make_warp(ctx, &l->warp));
     STEP(gsf_splat_make_fixer(ctx, &desc, l->views, l->scene.view_count, &l->start, &l->warp, &l->fixer));
-    do STEP(gsf_splat_fix_step(ctx, l->fixer, &stats));
+    do STEP(gsf_splat_step_fixer(ctx, l->fixer, &stats));
     while (stats.stage != GSF_FIX_RESTORE || stats.round != 2); // the first round's frames are in use, the second's pending
     STEP(write_checkpoint(l));
     gsf_splat_destroy_fixer(ctx, l->fixer);
     l->fixer = NULL;
     STEP(gsf_splat_make_fixer(ctx, &desc, l->views, l->scene.view_count, &l->start, &l->warp, &l->resumed));
     STEP(read_checkpoint(l));
-    do STEP(gsf_splat_fix_step(ctx, l->resumed, &stats));
+    do STEP(gsf_splat_step_fixer(ctx, l->resumed, &stats));
     while (stats.stage != GSF_FIX_DONE);
-    STEP(gsf_splat_trainer_export(ctx, gsf_splat_fixer_trainer(l->resumed), &l->result));
+    STEP(gsf_splat_copy_trained(ctx, gsf_splat_get_trainer(l->resumed), &l->result));
     return GSF_OK;
 }
 
@@ -210,7 +210,7 @@ static gsf_result save(loop* l) {
     }
     STEP(gsf_make_image(ctx, GSF_F32, cameras[0].width, cameras[0].height, 3, &l->picture));
     rendered.color = l->picture;
-    STEP(gsf_splat_trainer_render(ctx, gsf_splat_fixer_trainer(l->resumed), &cameras[0], &rendered));
+    STEP(gsf_splat_render_trainer(ctx, gsf_splat_get_trainer(l->resumed), &cameras[0], &rendered));
     STEP(gsf_save_image(ctx, in(out_folder, "render.png"), &l->picture));
     STEP(gsf_save_image(ctx, in(out_folder, "render.jpg"), &l->picture));
     STEP(gsf_save_cameras(ctx, in(out_folder, "cameras.json"), cameras, NULL, l->scene.view_count));

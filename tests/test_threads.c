@@ -13,7 +13,7 @@ static void add_splats(stage_output* out, const gsf_splats* s) {
     add(out, s->log_scales, s->count * 3 * sizeof(float));
     add(out, s->quats, s->count * 4 * sizeof(float));
     add(out, s->opacity_logits, s->count * sizeof(float));
-    add(out, s->sh, s->count * 3 * (size_t)gsf_splat_sh_count(s->sh_degree) * sizeof(float));
+    add(out, s->sh, s->count * 3 * (size_t)gsf_splat_count_sh(s->sh_degree) * sizeof(float));
     add(out, s->ids, s->count * sizeof(uint32_t));
 }
 
@@ -35,22 +35,22 @@ static gsf_camera make_camera(int view) { // around the z axis, looking at a uni
 
 static void make_splats(gsf_context* ctx, uint64_t seed, gsf_splats* out) {
     CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 1, out));
-    const size_t row = 3 * (size_t)gsf_splat_sh_count(1);
+    const size_t row = 3 * (size_t)gsf_splat_count_sh(1);
     for (size_t i = 0; i < SPLATS; i++) {
         for (uint64_t a = 0; a < 3; a++) {
-            out->means[3 * i + a] = (float)(1.6 * gsf_random_uniform(seed, a, i) - 0.8);
-            out->log_scales[3 * i + a] = (float)(-3.5 + gsf_random_uniform(seed, 3 + a, i));
+            out->means[3 * i + a] = (float)(1.6 * gsf_draw_uniform(seed, a, i) - 0.8);
+            out->log_scales[3 * i + a] = (float)(-3.5 + gsf_draw_uniform(seed, 3 + a, i));
         }
-        for (uint64_t a = 0; a < 4; a++) out->quats[4 * i + a] = (float)gsf_random_normal(seed, 6 + a, i);
+        for (uint64_t a = 0; a < 4; a++) out->quats[4 * i + a] = (float)gsf_draw_normal(seed, 6 + a, i);
         for (uint64_t a = 0; a < row; a++)
-            out->sh[row * i + a] = (float)((a < 3 ? 1.0 : 0.1) * gsf_random_normal(seed, 10 + a, i));
-        out->opacity_logits[i] = (float)gsf_random_normal(seed, 99, i);
+            out->sh[row * i + a] = (float)((a < 3 ? 1.0 : 0.1) * gsf_draw_normal(seed, 10 + a, i));
+        out->opacity_logits[i] = (float)gsf_draw_normal(seed, 99, i);
     }
 }
 
 static float* make_floats(size_t count, uint64_t stream) {
     float* v = (float*)malloc(count * sizeof(float));
-    for (size_t i = 0; i < count; i++) v[i] = (float)gsf_random_uniform(3, stream, i);
+    for (size_t i = 0; i < count; i++) v[i] = (float)gsf_draw_uniform(3, stream, i);
     return v;
 }
 
@@ -83,11 +83,11 @@ static void run_images(gsf_context* ctx, run_output* run) {
 
     out = begin_stage(run, "metrics");
     double value;
-    CHECK_OK(ctx, gsf_psnr(ctx, &image_a, &image_b, NULL, &value));
+    CHECK_OK(ctx, gsf_measure_psnr(ctx, &image_a, &image_b, NULL, &value));
     add(out, &value, sizeof value);
     const gsf_ssim_kind kinds[3] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
     for (int i = 0; i < 3; i++) {
-        CHECK_OK(ctx, gsf_ssim(ctx, kinds[i], &image_a, &image_b, NULL, &value));
+        CHECK_OK(ctx, gsf_measure_ssim(ctx, kinds[i], &image_a, &image_b, NULL, &value));
         add(out, &value, sizeof value);
     }
     free(a);
@@ -102,13 +102,13 @@ static void run_points(gsf_context* ctx, run_output* run) {
     uint8_t* colors = (uint8_t*)malloc(POINTS * 3);
     for (size_t i = 0; i < POINTS; i++)
         for (uint64_t a = 0; a < 3; a++) {
-            points[3 * i + a] = gsf_random_uniform(4, a, i) * 1.6 - 0.8;
-            colors[3 * i + a] = (uint8_t)(gsf_random_bits(4, 3 + a, i) & 255u);
+            points[3 * i + a] = gsf_draw_uniform(4, a, i) * 1.6 - 0.8;
+            colors[3 * i + a] = (uint8_t)(gsf_draw_bits(4, 3 + a, i) & 255u);
         }
     const double origin[3] = {0.0, 0.0, 0.0};
     gsf_splats splats;
     stage_output* out = begin_stage(run, "splats from points");
-    if (CHECK_OK(ctx, gsf_splat_from_points(ctx, points, colors, POINTS, NULL, 0, origin, &splats)))
+    if (CHECK_OK(ctx, gsf_splat_make_from_points(ctx, points, colors, POINTS, NULL, 0, origin, &splats)))
         add_splats(out, &splats);
     gsf_splat_destroy(ctx, &splats);
 
@@ -131,7 +131,7 @@ static void run_points(gsf_context* ctx, run_output* run) {
     for (int z = 0; z < 2; z++) {
         desc.use_zbuffer = z;
         out = begin_stage(run, z ? "visible points, z-buffer" : "visible points, rays");
-        CHECK_OK(ctx, gsf_splat_visible_points(ctx, &scene, chosen, VIEWS, &desc, keep, NULL));
+        CHECK_OK(ctx, gsf_splat_filter_points(ctx, &scene, chosen, VIEWS, &desc, keep, NULL));
         add(out, keep, POINTS);
     }
     free(keep);
@@ -244,21 +244,21 @@ static void run_training(gsf_context* ctx, run_output* run) {
                 CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, views + 2, 1));
                 gsf_splat_set_restored_weight(trainer, 0.5f);
             }
-            if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats))) break;
             add(out, &stats.loss, sizeof stats.loss);
             if (stats.splats > most) most = stats.splats;
         }
         CHECK(most > SPLATS); // it did densify
         gsf_splats trained;
-        if (CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &trained))) add_splats(out, &trained);
+        if (CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &trained))) add_splats(out, &trained);
         gsf_splat_destroy(ctx, &trained);
         out = begin_stage(run, "checkpoint");
-        gsf_text chunks;
+        gsf_buffer chunks;
         memset(&chunks, 0, sizeof chunks);
-        gsf_splat_trainer_save(ctx, trainer, &chunks);
+        gsf_splat_format_trainer(ctx, trainer, &chunks);
         CHECK(!chunks.failed && chunks.size > 0);
         add(out, chunks.data, chunks.size);
-        gsf_destroy_text(ctx, &chunks);
+        gsf_destroy_buffer(ctx, &chunks);
         gsf_splat_destroy_trainer(ctx, trainer);
     }
     gsf_splat_destroy(ctx, &start);
@@ -289,7 +289,7 @@ static void run_repair(gsf_context* ctx, run_output* run) {
         memset(&stats, 0, sizeof stats);
         int restored = 0;
         while (stats.stage != GSF_FIX_DONE) {
-            if (!CHECK_OK(ctx, gsf_splat_fix_step(ctx, fixer, &stats))) break;
+            if (!CHECK_OK(ctx, gsf_splat_step_fixer(ctx, fixer, &stats))) break;
             for (int32_t f = 0; stats.stage == GSF_FIX_RESTORE && stats.restored && f < stats.frame_count; f++) {
                 const gsf_image* frame = &stats.restored[f];
                 add(out, frame->data, (size_t)(frame->stride_y * frame->height));
@@ -297,7 +297,7 @@ static void run_repair(gsf_context* ctx, run_output* run) {
             }
         }
         CHECK(restored > 0);
-        add_splats(out, gsf_splat_trainer_splats(gsf_splat_fixer_trainer(fixer)));
+        add_splats(out, gsf_splat_get_trained(gsf_splat_get_trainer(fixer)));
         gsf_splat_destroy_fixer(ctx, fixer);
     }
     gsf_splat_destroy_warp(ctx, &warp);

@@ -421,7 +421,7 @@ static void test_lazy_adam(gsf_context* ctx) {
         total += exact[i] * exact[i];
     }
     printf("lazy Adam (%s): rel L2 %.2g, worst %.2g against dense; against double: dense %.2g, %.2g, lazy %.2g, %.2g\n",
-           gsf_cpu_level_name(ctx->cpu_level), sqrt(sum[0] / total), worst, sqrt(sum[1] / total), worst_exact[0],
+           gsf_describe_cpu_level(ctx->cpu_level), sqrt(sum[0] / total), worst, sqrt(sum[1] / total), worst_exact[0],
            sqrt(sum[2] / total), worst_exact[1]);
     CHECK(longest > 400 && replayed > 100);
     CHECK(sqrt(sum[0] / total) < 1e-6 && sum[0] > 0.0);
@@ -747,8 +747,8 @@ static void test_masked_training(gsf_context* ctx, const scene* s) {
         desc.depth_smoothness = 0.01f;
         gsf_trainer* trainer;
         if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, views, VIEWS, &s->start, &trainer))) return;
-        for (int i = 0; i < desc.iterations; i++) CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, NULL));
-        CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &made[run]));
+        for (int i = 0; i < desc.iterations; i++) CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, NULL));
+        CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &made[run]));
         gsf_splat_destroy_trainer(ctx, trainer);
         render_to(ctx, &made[run], &views[0].camera, shown);
         for (int i = 0; i < 3 * PIXELS; i++)
@@ -809,22 +809,22 @@ static gsf_trainer* make_busy(gsf_context* ctx, const scene* s, int mcmc) {
     return trainer;
 }
 
-static gsf_text save_state(gsf_context* ctx, const gsf_trainer* trainer) {
-    gsf_text text;
+static gsf_buffer save_state(gsf_context* ctx, const gsf_trainer* trainer) {
+    gsf_buffer text;
     memset(&text, 0, sizeof text);
-    gsf_splat_trainer_save(ctx, trainer, &text);
-    gsf_chunks_end(ctx, &text);
+    gsf_splat_format_trainer(ctx, trainer, &text);
+    gsf_append_last_chunk(ctx, &text);
     CHECK(!text.failed);
     return text;
 }
 
-static int same_text(const gsf_text* a, const gsf_text* b) {
+static int same_text(const gsf_buffer* a, const gsf_buffer* b) {
     return a->size == b->size && memcmp(a->data, b->data, a->size) == 0;
 }
 
 static void take_steps(gsf_context* ctx, gsf_trainer* trainer, int steps) {
     for (int i = 0; i < steps; i++)
-        if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, NULL))) return;
+        if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, NULL))) return;
 }
 
 // ---- learning ----------------------------------------------------------------------
@@ -836,7 +836,7 @@ static double mean_square_error(gsf_context* ctx, gsf_trainer* trainer, const sc
     memset(&out, 0, sizeof out);
     out.color = gsf_wrap_image(pixels, GSF_F32, WIDTH, HEIGHT, 3);
     for (int v = 0; v < VIEWS; v++) {
-        CHECK_OK(ctx, gsf_splat_trainer_render(ctx, trainer, &s->views[v].camera, &out));
+        CHECK_OK(ctx, gsf_splat_render_trainer(ctx, trainer, &s->views[v].camera, &out));
         for (int i = 0; i < WIDTH * HEIGHT * 3; i++) {
             const double d = (double)pixels[i] - (double)s->pixels[v][i];
             sum += d * d / (WIDTH * HEIGHT * 3 * VIEWS);
@@ -856,22 +856,22 @@ static void test_learns(gsf_context* ctx, const scene* s) {
     double first = 0.0, last = 0.0;
     for (int i = 0; i < 300; i++) {
         gsf_train_stats stats;
-        if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+        if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats))) break;
         CHECK(stats.iteration == i + 1 && stats.splats == SPLATS && stats.rejected == 0 && stats.restored_loss == 0.0);
         CHECK_NEAR(stats.loss, 0.8 * stats.l1 + 0.2 * (1.0 - stats.ssim), 1e-7);
         if (i < VIEWS) first += stats.loss;
         if (i >= 300 - VIEWS) last += stats.loss;
     }
     const double after = mean_square_error(ctx, trainer, s);
-    printf("learning (%s): loss %.4f -> %.4f, %.2f -> %.2f dB\n", gsf_cpu_level_name(ctx->cpu_level), first / VIEWS,
+    printf("learning (%s): loss %.4f -> %.4f, %.2f -> %.2f dB\n", gsf_describe_cpu_level(ctx->cpu_level), first / VIEWS,
            last / VIEWS, -10.0 * log10(before), -10.0 * log10(after));
     CHECK(last < 0.25 * first);
     CHECK(after < before * 0.1); // 10 dB
     gsf_train_stats stats;
-    CHECK_RESULT(ctx, gsf_splat_train_step(ctx, trainer, &stats), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(ctx, gsf_splat_step_trainer(ctx, trainer, &stats), GSF_ERROR_INVALID_ARGUMENT);
     gsf_splats copy;
-    CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &copy));
-    const gsf_splats* view = gsf_splat_trainer_splats(trainer);
+    CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &copy));
+    const gsf_splats* view = gsf_splat_get_trained(trainer);
     CHECK(copy.count == view->count && memcmp(copy.means, view->means, 3 * copy.count * sizeof(float)) == 0 &&
           memcmp(copy.ids, s->start.ids, copy.count * sizeof(uint32_t)) == 0);
     gsf_splat_destroy(ctx, &copy);
@@ -897,16 +897,16 @@ static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
     double first = 0.0, last = 0.0;
     for (int i = 0; i < 300; i++) {
         gsf_train_stats stats;
-        if (!CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats))) break;
+        if (!CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats))) break;
         CHECK(stats.splats >= SPLATS && stats.splats <= BUDGET && stats.rejected == 0);
         if (i < VIEWS) first += stats.loss;
         if (i >= 300 - VIEWS) last += stats.loss;
     }
     const double after = mean_square_error(ctx, trainer, s);
-    const gsf_splats* end = gsf_splat_trainer_splats(trainer);
+    const gsf_splats* end = gsf_splat_get_trained(trainer);
     size_t faint = 0;
     for (size_t i = 0; i < end->count; i++) faint += end->opacity_logits[i] < -5.0f;
-    printf("MCMC (%s): loss %.4f -> %.4f, %.2f -> %.2f dB, %zu faint\n", gsf_cpu_level_name(ctx->cpu_level),
+    printf("MCMC (%s): loss %.4f -> %.4f, %.2f -> %.2f dB, %zu faint\n", gsf_describe_cpu_level(ctx->cpu_level),
            first / VIEWS, last / VIEWS, -10.0 * log10(before), -10.0 * log10(after), faint);
     CHECK(end->count == BUDGET && faint < SPLATS / 12);
     CHECK(last < 0.4 * first);
@@ -941,14 +941,14 @@ static void test_order_and_visits(gsf_context* ctx, const scene* s) {
     take_steps(ctx, trainer, 1);
     gsf_splat_set_restored_weight(trainer, 1.0f);
     gsf_train_stats stats;
-    CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+    CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats));
     CHECK(stats.restored_loss > 0.0);
     size_t six = 0;
     for (size_t i = 0; i < trainer->model.count; i++)
         six += trainer->model.visits[0][i] == 5 && trainer->model.visits[1][i] == 1;
     CHECK(six == SPLATS);
     CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, NULL, 0));
-    CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+    CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats));
     CHECK(stats.restored_loss == 0.0);
     gsf_splat_destroy_trainer(ctx, trainer);
 }
@@ -1025,8 +1025,8 @@ static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
                                    trainer->desc.lr_opacity, trainer->desc.lr_sh_dc,  trainer->desc.lr_sh_rest};
         for (int k = 0; k < 6; k++) CHECK((resolved[k] == 0.0f) == (k == rate));
         take_steps(ctx, trainer, 30);
-        const gsf_splats *now = gsf_splat_trainer_splats(trainer), *was = &s->start;
-        const size_t n = was->count, row = 3 * (size_t)gsf_splat_sh_count(was->sh_degree);
+        const gsf_splats *now = gsf_splat_get_trained(trainer), *was = &s->start;
+        const size_t n = was->count, row = 3 * (size_t)gsf_splat_count_sh(was->sh_degree);
         int dc = 0, rest = 0; // floats that changed
         for (size_t i = 0; i < n * row; i++) *(i % row < 3 ? &dc : &rest) += now->sh[i] != was->sh[i];
         CHECK(now->count == n && row > 3);
@@ -1051,7 +1051,7 @@ static void test_settings(gsf_context* ctx, const scene* s) {
           gsf__trainer_bands(trainer, 1000) == 2 && gsf__trainer_bands(trainer, 5000) == 2);
     // five cameras 4 from the origin
     double centers[VIEWS][3], mean[3] = {0, 0, 0}, extent = 0.0;
-    for (int v = 0; v < VIEWS; v++) gsf_camera_center(&s->views[v].camera, centers[v]);
+    for (int v = 0; v < VIEWS; v++) gsf_get_camera_center(&s->views[v].camera, centers[v]);
     for (int v = 0; v < VIEWS; v++) for (int a = 0; a < 3; a++) mean[a] += centers[v][a] / VIEWS;
     for (int v = 0; v < VIEWS; v++)
         extent = fmax(extent, 1.1 * sqrt(pow(centers[v][0] - mean[0], 2) + pow(centers[v][1] - mean[1], 2) +
@@ -1096,7 +1096,7 @@ static void test_settings(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, trainer);
     desc.sh_degree = 3;
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
-    CHECK(gsf_splat_trainer_splats(trainer)->sh_degree == 3 && trainer->first_bands == 2);
+    CHECK(gsf_splat_get_trained(trainer)->sh_degree == 3 && trainer->first_bands == 2);
     CHECK(trainer->view.sh[48 + 11] == s->truth.sh[12 + 11] && trainer->view.sh[48 + 12] == 0.0f);
     gsf_splat_destroy_trainer(ctx, trainer);
 }
@@ -1104,14 +1104,14 @@ static void test_settings(gsf_context* ctx, const scene* s) {
 // ---- determinism ---------------------------------------------------------------------
 
 static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
-    gsf_text states[3];
+    gsf_buffer states[3];
     for (int run = 0; run < 3; run++) {
         int workers = run == 1 ? 2 : 5;
         gsf_context ctx = open_context(level, run ? &workers : NULL);
         gsf_trainer* trainer = make_busy(&ctx, s, mcmc);
         take_steps(&ctx, trainer, 60);
         states[run] = save_state(&ctx, trainer);
-        if (run == 0) printf("busy run (%s): %zu splats, %u ids\n", gsf_cpu_level_name(ctx.cpu_level),
+        if (run == 0) printf("busy run (%s): %zu splats, %u ids\n", gsf_describe_cpu_level(ctx.cpu_level),
                              trainer->model.count, (unsigned)trainer->model.next_id);
         if (run == 0 && !mcmc) CHECK(trainer->model.count > SPLATS + 10);
         if (run == 0 && mcmc) { // all of the budget; more ids than splats came from moves
@@ -1125,7 +1125,7 @@ static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
-    for (int run = 0; run < 3; run++) gsf_destroy_text(&ctx, &states[run]);
+    for (int run = 0; run < 3; run++) gsf_destroy_buffer(&ctx, &states[run]);
 }
 
 // ---- checkpoints -----------------------------------------------------------------------
@@ -1134,30 +1134,30 @@ static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
     static const int stops[] = {0, 1, 9, 10, 11, 25, 37, 50, 60};
     gsf_trainer* trainer = make_busy(ctx, s, mcmc);
     take_steps(ctx, trainer, 60);
-    gsf_text whole = save_state(ctx, trainer);
+    gsf_buffer whole = save_state(ctx, trainer);
     gsf_splat_destroy_trainer(ctx, trainer);
     for (size_t k = 0; k < sizeof stops / sizeof *stops; k++) {
         trainer = make_busy(ctx, s, mcmc);
         take_steps(ctx, trainer, stops[k]);
-        gsf_text state = save_state(ctx, trainer);
+        gsf_buffer state = save_state(ctx, trainer);
         gsf_splat_destroy_trainer(ctx, trainer);
         // the caller gives views and settings again, some before and some after
         gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
         if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->truth, &trainer))) exit(2);
         if (k % 2) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
-        CHECK_OK(ctx, gsf_splat_trainer_restore(ctx, trainer, "state", state.data, state.size));
+        CHECK_OK(ctx, gsf_splat_parse_trainer(ctx, trainer, "state", state.data, state.size));
         if (k % 2 == 0) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
-        gsf_text again = save_state(ctx, trainer);
+        gsf_buffer again = save_state(ctx, trainer);
         CHECK(same_text(&state, &again)); // save of restore is the identity
         take_steps(ctx, trainer, 60 - stops[k]);
-        gsf_text end = save_state(ctx, trainer);
+        gsf_buffer end = save_state(ctx, trainer);
         if (!CHECK(same_text(&whole, &end))) fprintf(stderr, "resumed at %d\n", stops[k]);
         gsf_splat_destroy_trainer(ctx, trainer);
-        gsf_destroy_text(ctx, &state);
-        gsf_destroy_text(ctx, &again);
-        gsf_destroy_text(ctx, &end);
+        gsf_destroy_buffer(ctx, &state);
+        gsf_destroy_buffer(ctx, &again);
+        gsf_destroy_buffer(ctx, &end);
     }
-    gsf_destroy_text(ctx, &whole);
+    gsf_destroy_buffer(ctx, &whole);
 }
 
 static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
@@ -1167,22 +1167,22 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
     gsf_trainer* trainer;
     if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &few, &trainer))) return;
     take_steps(ctx, trainer, 3);
-    gsf_text state = save_state(ctx, trainer);
+    gsf_buffer state = save_state(ctx, trainer);
     size_t accepted = 0;
     for (size_t size = 0; size < state.size; size++) { // in buffers of the exact size
         char* cut = (char*)malloc(size ? size : 1);
         memcpy(cut, state.data, size);
-        accepted += gsf_splat_trainer_restore(ctx, trainer, "cut", cut, size) == GSF_OK;
+        accepted += gsf_splat_parse_trainer(ctx, trainer, "cut", cut, size) == GSF_OK;
         free(cut);
     }
     CHECK(accepted == 0);
     for (size_t i = 0; i < state.size; i++) {
         state.data[i] ^= (char)(1 << i % 8);
-        accepted += gsf_splat_trainer_restore(ctx, trainer, "flipped", state.data, state.size) == GSF_OK;
+        accepted += gsf_splat_parse_trainer(ctx, trainer, "flipped", state.data, state.size) == GSF_OK;
         state.data[i] ^= (char)(1 << i % 8);
     }
     CHECK(accepted == 0);
-    gsf_text same = save_state(ctx, trainer);
+    gsf_buffer same = save_state(ctx, trainer);
     CHECK(same_text(&state, &same)); // untouched by the refused ones
 
     // valid chunks with wrong contents
@@ -1193,7 +1193,7 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
         {"TS2 ", 8, 0xbf800000}, {"TIDS", 4, 0xffffffff}, {"TGRD", 0, 0xff800000}, {"TRST", 0, 4}};
     const size_t lie_count = sizeof lies / sizeof *lies;
     for (size_t k = 0; k < lie_count + 3; k++) { // the last is true
-        gsf_text lie;
+        gsf_buffer lie;
         memset(&lie, 0, sizeof lie);
         for (int i = -2;; i++) {
             char tag[5] = "TRNR";
@@ -1202,26 +1202,26 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
             if (i == -2) strcpy(tag, "TRST");
             else if (i >= 0 && !gsf__trainer_array(&trainer->model, i, tag, &data, &row)) break;
             gsf_chunk chunk;
-            CHECK(gsf_chunks_find(state.data, state.size, tag, &chunk));
+            CHECK(gsf_find_chunk(state.data, state.size, tag, &chunk));
             if (k == lie_count && strcmp(tag, "TVIS") == 0) continue; // left out
             if (k == lie_count + 1 && strcmp(tag, "TRST") == 0) continue;
             char* copy = (char*)malloc(chunk.size);
             memcpy(copy, chunk.data, chunk.size);
             if (k < lie_count && strcmp(tag, lies[k].tag) == 0)
                 memcpy(copy + lies[k].offset, &lies[k].value, strcmp(tag, "TRST") ? 4 : 1); // (its low byte)
-            gsf_chunks_add(ctx, &lie, tag, copy, chunk.size);
+            gsf_append_chunk(ctx, &lie, tag, copy, chunk.size);
             free(copy);
         }
-        gsf_chunks_end(ctx, &lie);
-        if (!CHECK((gsf_splat_trainer_restore(ctx, trainer, "lie", lie.data, lie.size) != GSF_OK) == (k < lie_count + 2)))
+        gsf_append_last_chunk(ctx, &lie);
+        if (!CHECK((gsf_splat_parse_trainer(ctx, trainer, "lie", lie.data, lie.size) != GSF_OK) == (k < lie_count + 2)))
             fprintf(stderr, "lie %zu\n", k);
-        gsf_destroy_text(ctx, &lie);
+        gsf_destroy_buffer(ctx, &lie);
     }
-    gsf_destroy_text(ctx, &same);
+    gsf_destroy_buffer(ctx, &same);
     same = save_state(ctx, trainer);
     CHECK(same_text(&state, &same));
-    gsf_destroy_text(ctx, &same);
-    gsf_destroy_text(ctx, &state);
+    gsf_destroy_buffer(ctx, &same);
+    gsf_destroy_buffer(ctx, &state);
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
@@ -1265,9 +1265,9 @@ static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int lazy) {
 
 static float* export_sh(gsf_context* ctx, const gsf_trainer* trainer, size_t* count) {
     gsf_splats splats;
-    CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &splats));
-    const gsf_splats* same = gsf_splat_trainer_splats(trainer);
-    *count = splats.count * 3 * (size_t)gsf_splat_sh_count(splats.sh_degree);
+    CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &splats));
+    const gsf_splats* same = gsf_splat_get_trained(trainer);
+    *count = splats.count * 3 * (size_t)gsf_splat_count_sh(splats.sh_degree);
     CHECK(same->count == splats.count && memcmp(same->sh, splats.sh, *count * sizeof(float)) == 0);
     float* sh = (float*)malloc(*count * sizeof(float));
     memcpy(sh, splats.sh, *count * sizeof(float));
@@ -1282,13 +1282,13 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
     gsf_context ctx = open_context(level, NULL), other = open_context(level, &workers);
     gsf_trainer *dense = make_narrow(&ctx, s, 0), *lazy = make_narrow(&ctx, s, 1), *watched = make_narrow(&other, s, 1);
     size_t rests = 0, longest = 0, drawn = 0, n, dense_n;
-    gsf_text middle;
+    gsf_buffer middle;
     memset(&middle, 0, sizeof middle);
     for (int i = 0; i < LAZY_STEPS; i++) {
         gsf_train_stats a, b;
-        CHECK_OK(&ctx, gsf_splat_train_step(&ctx, dense, &a));
-        CHECK_OK(&ctx, gsf_splat_train_step(&ctx, lazy, &b));
-        CHECK_OK(&other, gsf_splat_train_step(&other, watched, NULL));
+        CHECK_OK(&ctx, gsf_splat_step_trainer(&ctx, dense, &a));
+        CHECK_OK(&ctx, gsf_splat_step_trainer(&ctx, lazy, &b));
+        CHECK_OK(&other, gsf_splat_step_trainer(&other, watched, NULL));
         if (!CHECK(a.splats == b.splats)) break;
         CHECK_NEAR(b.loss, a.loss, 1e-3 * a.loss);
         for (size_t k = 0; k < gsf__model_blocks(lazy->model.count); k++) {
@@ -1302,9 +1302,9 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
             gsf_render_output out;
             memset(&out, 0, sizeof out);
             out.color = gsf_wrap_image(pixels, GSF_F32, WIDTH, HEIGHT, 3);
-            CHECK_OK(&other, gsf_splat_trainer_render(&other, watched, &s->views[1].camera, &out));
+            CHECK_OK(&other, gsf_splat_render_trainer(&other, watched, &s->views[1].camera, &out));
             gsf_splats splats;
-            CHECK_OK(&other, gsf_splat_trainer_export(&other, watched, &splats));
+            CHECK_OK(&other, gsf_splat_copy_trained(&other, watched, &splats));
             gsf_render_desc desc = watched->desc.render;
             desc.sh_bands = gsf__trainer_bands(watched, watched->iteration);
             out.color = gsf_wrap_image(exported, GSF_F32, WIDTH, HEIGHT, 3);
@@ -1322,15 +1322,15 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
             total += (double)a[i] * (double)a[i];
         }
     printf("lazy training (%s): %zu splats, %.0f %% of the blocks at rest in a step, for up to %zu steps; SH differ by %.2g\n",
-           gsf_cpu_level_name(level), lazy->model.count, 100.0 * (double)rests / (double)(rests + drawn), longest,
+           gsf_describe_cpu_level(level), lazy->model.count, 100.0 * (double)rests / (double)(rests + drawn), longest,
            sqrt(sum / total));
     CHECK(rests > drawn / 4 && longest > 100 && sqrt(sum / total) < 1e-3);
 
-    gsf_text end = save_state(&ctx, lazy), seen = save_state(&other, watched), resumed, again;
+    gsf_buffer end = save_state(&ctx, lazy), seen = save_state(&other, watched), resumed, again;
     CHECK(same_text(&end, &seen));
     gsf_trainer* late = make_narrow(&ctx, s, 1);
-    (void)gsf_splat_trainer_splats(late); // shown, then replaced
-    CHECK_OK(&ctx, gsf_splat_trainer_restore(&ctx, late, "middle", middle.data, middle.size));
+    (void)gsf_splat_get_trained(late); // shown, then replaced
+    CHECK_OK(&ctx, gsf_splat_parse_trainer(&ctx, late, "middle", middle.data, middle.size));
     again = save_state(&ctx, late);
     CHECK(same_text(&middle, &again));
     take_steps(&ctx, late, LAZY_STEPS / 2 - 4);
@@ -1339,7 +1339,7 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
     gsf_splat_destroy_trainer(&ctx, late);
 
     late = make_narrow(&ctx, s, 0); // a dense run takes over
-    CHECK_OK(&ctx, gsf_splat_trainer_restore(&ctx, late, "end", end.data, end.size));
+    CHECK_OK(&ctx, gsf_splat_parse_trainer(&ctx, late, "end", end.data, end.size));
     free(a);
     a = export_sh(&ctx, late, &dense_n);
     CHECK(dense_n == n && memcmp(a, b, n * sizeof(float)) == 0);
@@ -1350,8 +1350,8 @@ static void test_lazy_training(const scene* s, gsf_cpu_level level) {
 
     free(a);
     free(b);
-    gsf_text* const texts[] = {&middle, &end, &seen, &resumed, &again};
-    for (size_t i = 0; i < sizeof texts / sizeof *texts; i++) gsf_destroy_text(&ctx, texts[i]);
+    gsf_buffer* const texts[] = {&middle, &end, &seen, &resumed, &again};
+    for (size_t i = 0; i < sizeof texts / sizeof *texts; i++) gsf_destroy_buffer(&ctx, texts[i]);
     gsf_splat_destroy_trainer(&ctx, dense);
     gsf_splat_destroy_trainer(&ctx, lazy);
     gsf_splat_destroy_trainer(&other, watched);
@@ -1419,18 +1419,18 @@ static void test_bad_input(gsf_context* ctx, const scene* s) {
     desc.render.hidden = NULL;
 
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->start, &trainer));
-    gsf_text before = save_state(ctx, trainer);
+    gsf_buffer before = save_state(ctx, trainer);
     bad = s->views[0];
     bad.image.channels = 4;
     CHECK_RESULT(ctx, gsf_splat_set_restored_views(ctx, trainer, &bad, 1), GSF_ERROR_INVALID_ARGUMENT);
     gsf_request_cancel(ctx);
-    CHECK_RESULT(ctx, gsf_splat_train_step(ctx, trainer, NULL), GSF_ERROR_CANCELLED);
+    CHECK_RESULT(ctx, gsf_splat_step_trainer(ctx, trainer, NULL), GSF_ERROR_CANCELLED);
     gsf_clear_cancel(ctx);
-    gsf_text after = save_state(ctx, trainer);
+    gsf_buffer after = save_state(ctx, trainer);
     CHECK(same_text(&before, &after));
     take_steps(ctx, trainer, 5);
-    gsf_destroy_text(ctx, &before);
-    gsf_destroy_text(ctx, &after);
+    gsf_destroy_buffer(ctx, &before);
+    gsf_destroy_buffer(ctx, &after);
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
@@ -1445,7 +1445,7 @@ static void test_degenerate(gsf_context* ctx, const scene* s) {
     splats.means[3] = NAN;
     splats.sh[5 * 12 + 7] = INFINITY;
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &splats, &trainer));
-    CHECK_OK(ctx, gsf_splat_train_step(ctx, trainer, &stats));
+    CHECK_OK(ctx, gsf_splat_step_trainer(ctx, trainer, &stats));
     CHECK(stats.rejected == 2 && stats.splats == SPLATS - 2 && trainer->view.ids[1] == 2);
     gsf_splat_destroy_trainer(ctx, trainer);
     for (int i = 0; i < SPLATS; i++) splats.quats[4 * i] = NAN;
@@ -1481,11 +1481,11 @@ static void test_degenerate(gsf_context* ctx, const scene* s) {
     CHECK(trainer->desc.extent == 1.0f);
     take_steps(ctx, trainer, 60);
     CHECK(trainer->model.count == 0); // faded and pruned; training goes on with nothing
-    gsf_text state = save_state(ctx, trainer);
-    CHECK_OK(ctx, gsf_splat_trainer_restore(ctx, trainer, "empty", state.data, state.size));
-    gsf_destroy_text(ctx, &state);
+    gsf_buffer state = save_state(ctx, trainer);
+    CHECK_OK(ctx, gsf_splat_parse_trainer(ctx, trainer, "empty", state.data, state.size));
+    gsf_destroy_buffer(ctx, &state);
     gsf_splats none;
-    CHECK_OK(ctx, gsf_splat_trainer_export(ctx, trainer, &none));
+    CHECK_OK(ctx, gsf_splat_copy_trained(ctx, trainer, &none));
     gsf_splat_destroy(ctx, &none);
     gsf_splat_destroy_trainer(ctx, trainer);
 }
@@ -1507,7 +1507,7 @@ static void failing_free(void* user, void* memory) {
 }
 
 // A small run in which allocation `fail_at` fails. A failed step is taken again: it must have changed nothing.
-static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_text* end) {
+static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_buffer* end) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
     ctx.allocator.alloc_fn = failing_alloc;
@@ -1517,7 +1517,7 @@ static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_text* en
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
     gsf_trainer* trainer;
-    gsf_text chunks;
+    gsf_buffer chunks;
     memset(&chunks, 0, sizeof chunks);
     gsf_result result = gsf_splat_make_trainer(&ctx, &desc, s->views, VIEWS, &s->start, &trainer), worst = result;
     if (result == GSF_OK) {
@@ -1527,13 +1527,13 @@ static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_text* en
             CHECK_OK(&ctx, gsf_splat_set_restored_views(&ctx, trainer, s->views + VIEWS, 2));
         }
         for (int i = 0; i < 24; i++) {
-            result = gsf_splat_train_step(&ctx, trainer, NULL);
+            result = gsf_splat_step_trainer(&ctx, trainer, NULL);
             if (result == GSF_OK) continue;
             worst = result;
-            CHECK_OK(&ctx, gsf_splat_train_step(&ctx, trainer, NULL));
+            CHECK_OK(&ctx, gsf_splat_step_trainer(&ctx, trainer, NULL));
         }
-        gsf_splat_trainer_save(&ctx, trainer, &chunks);
-        gsf_chunks_end(&ctx, &chunks);
+        gsf_splat_format_trainer(&ctx, trainer, &chunks);
+        gsf_append_last_chunk(&ctx, &chunks);
         if (chunks.failed) worst = GSF_ERROR_OUT_OF_MEMORY;
         else if (end->size == 0) {
             end->data = (char*)malloc(chunks.size);
@@ -1541,7 +1541,7 @@ static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_text* en
         } else {
             CHECK(same_text(end, &chunks));
         }
-        gsf_destroy_text(&ctx, &chunks);
+        gsf_destroy_buffer(&ctx, &chunks);
         gsf_splat_destroy_trainer(&ctx, trainer);
     }
     CHECK(f->live == 0);
@@ -1549,7 +1549,7 @@ static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_text* en
 }
 
 static void test_out_of_memory(const scene* s, int mcmc) {
-    gsf_text end;
+    gsf_buffer end;
     memset(&end, 0, sizeof end);
     failing f = {0, 0, 0};
     CHECK(run_failing(s, &f, mcmc, &end) == GSF_OK);

@@ -28,7 +28,7 @@ typedef struct scene {
 
 static gsf_camera camera_at(const double pose[16]) {
     gsf_camera camera = {{0}, 500.0, 510.0, 320.0, 230.0, 640, 480};
-    gsf_camera_set_c2w(&camera, pose);
+    gsf_set_camera_c2w(&camera, pose);
     return camera;
 }
 
@@ -52,16 +52,16 @@ static void move_scene(const scene* s, double scale, const double offset[3], sce
     *out = *s;
     for (size_t i = 0; i < s->count; i++) {
         double pose[16];
-        gsf_camera_c2w(&s->cameras[i], pose);
+        gsf_get_camera_c2w(&s->cameras[i], pose);
         for (int k = 0; k < 3; k++) pose[12 + k] = pose[12 + k] * scale + offset[k];
-        gsf_camera_set_c2w(&out->cameras[i], pose);
+        gsf_set_camera_c2w(&out->cameras[i], pose);
     }
     for (int i = 0; i < 3 * POINTS; i++) out->points[i] = s->points[i] * scale + offset[i % 3];
 }
 
 typedef struct path { // result of one call in memory of exactly the promised size
     gsf_result result;
-    gsf_traj_path_layout layout;
+    gsf_traj_path_info layout;
     gsf_camera* frames;
     int32_t* reference;
 } path;
@@ -119,8 +119,8 @@ static void check_frames(const path* p) {
 
 static double pose_distance(const gsf_camera* a, const gsf_camera* b) { // largest difference of pose entries
     double x[16], y[16], worst = 0.0;
-    gsf_camera_c2w(a, x);
-    gsf_camera_c2w(b, y);
+    gsf_get_camera_c2w(a, x);
+    gsf_get_camera_c2w(b, y);
     for (int i = 0; i < 16; i++)
         if (!(fabs(x[i] - y[i]) <= worst)) worst = fabs(x[i] - y[i]);
     return worst;
@@ -148,9 +148,9 @@ static void check_reference_windows(const scene* s, const path* p, int official)
             double a[3], b[3], c[3];
             for (int leg = 0; leg < 2; leg++) {
                 const gsf_camera* at = frames + (leg ? length - 1 - f : f);
-                gsf_camera_center(at - 1, a);
-                gsf_camera_center(at, b);
-                gsf_camera_center(at + 1, c);
+                gsf_get_camera_center(at - 1, a);
+                gsf_get_camera_center(at, b);
+                gsf_get_camera_center(at + 1, c);
                 for (int i = 0; i < 3; i++) uneven += !(fabs(a[i] - 2.0 * b[i] + c[i]) < 1e-10);
             }
         }
@@ -204,7 +204,7 @@ static void test_all_sizes(void) {
 static void test_defaults(void) {
     scene s;
     make_scene(&s, 6);
-    gsf_traj_path_layout layout;
+    gsf_traj_path_info layout;
     CHECK_OK(&ctx, gsf_traj_query_path(&ctx, 6, NULL, &layout));
     CHECK(layout.window_count == 7 && layout.window_length == 49);
     CHECK(layout.ellipse_poses == 85 && layout.frame_count == 343);
@@ -271,8 +271,8 @@ static void check_following(const scene* s, const gsf_traj_path_desc* base, doub
     double worst = 0.0;
     for (size_t f = 0; f < a.layout.frame_count && a.result == GSF_OK && b.result == GSF_OK; f++) {
         double x[16], y[16];
-        gsf_camera_c2w(&a.frames[f], x);
-        gsf_camera_c2w(&b.frames[f], y);
+        gsf_get_camera_c2w(&a.frames[f], x);
+        gsf_get_camera_c2w(&b.frames[f], y);
         for (int i = 0; i < 3; i++) y[12 + i] = (y[12 + i] - offset[i]) / scale;
         for (int i = 0; i < 16; i++)
             if (!(fabs(x[i] - y[i]) <= worst)) worst = fabs(x[i] - y[i]);
@@ -433,7 +433,7 @@ static void check_rig(double wobble, double unit, size_t count, int outlier) {
         double least = 1.0, farthest = 0.0;
         for (size_t f = 0; f < p.layout.frame_count && p.result == GSF_OK; f++) {
             double pose[16];
-            gsf_camera_c2w(&p.frames[f], pose);
+            gsf_get_camera_c2w(&p.frames[f], pose);
             least = fmin(least, pose[10]);
             farthest = fmax(farthest, fmax(fabs(pose[12]), fmax(fabs(pose[13]), fabs(pose[14]))));
         }
@@ -479,8 +479,8 @@ static void test_outliers(void) {
             double turned = 1.0;
             for (size_t f = 0; f < with.layout.frame_count && with.result == GSF_OK && without.result == GSF_OK; f++) {
                 double a[16], b[16];
-                gsf_camera_c2w(&with.frames[f], a);
-                gsf_camera_c2w(&without.frames[f], b);
+                gsf_get_camera_c2w(&with.frames[f], a);
+                gsf_get_camera_c2w(&without.frames[f], b);
                 turned = fmin(turned, a[8] * b[8] + a[9] * b[9] + a[10] * b[10]);
             }
             if (desc.kind == GSF_TRAJ_ELLIPSE && !CHECK(turned > cos(0.2)))
@@ -517,8 +517,8 @@ static void test_degenerate_primitives(void) {
     int32_t index;
     CHECK_OK(&ctx, gsf__traj_nearest_view(&ctx, a, out, 3, 0.5, &index, NULL));
     CHECK(index == 0);
-    CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 1, focus), GSF_ERROR_DEGENERATE);
-    CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, a, 0, focus), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_find_focus(&ctx, a, 1, focus), GSF_ERROR_DEGENERATE);
+    CHECK_RESULT(&ctx, gsf_traj_find_focus(&ctx, a, 0, focus), GSF_ERROR_DEGENERATE);
     memcpy(out, a, sizeof a);
     memcpy(out + 16, a, sizeof a);
     double two[32];
@@ -627,12 +627,12 @@ static void test_not_finite_primitives(void) {
     make_scene(&s, 4);
     double poses[64], out[64 * 16], scratch[2048], transform[16], three[3], radius;
     int32_t index;
-    for (size_t i = 0; i < 4; i++) gsf_camera_c2w(&s.cameras[i], poses + 16 * i);
+    for (size_t i = 0; i < 4; i++) gsf_get_camera_c2w(&s.cameras[i], poses + 16 * i);
     for (int i = 0; i < 64; i++) {
         const double keep = poses[i];
         poses[i] = i % 2 ? NAN : INFINITY;
         CHECK_RESULT(&ctx, gsf__traj_check_poses(&ctx, poses, 4), GSF_ERROR_NUMERIC);
-        CHECK_RESULT(&ctx, gsf_traj_focus_point(&ctx, poses, 4, three), GSF_ERROR_NUMERIC);
+        CHECK_RESULT(&ctx, gsf_traj_find_focus(&ctx, poses, 4, three), GSF_ERROR_NUMERIC);
         CHECK_RESULT(&ctx, gsf__traj_average_pose(&ctx, poses, 4, 0, transform), GSF_ERROR_NUMERIC);
         CHECK_RESULT(&ctx, gsf__traj_recenter_poses(&ctx, poses, 4, 0, out, transform), GSF_ERROR_NUMERIC);
         CHECK_RESULT(&ctx, gsf__traj_camera_radius(&ctx, poses, 4, three, &radius), GSF_ERROR_NUMERIC);
@@ -774,7 +774,7 @@ static void test_splines(void) {
         scene s;
         make_scene(&s, count);
         double poses[32 * 16];
-        for (size_t i = 0; i < count; i++) gsf_camera_c2w(&s.cameras[i], poses + 16 * i);
+        for (size_t i = 0; i < count; i++) gsf_get_camera_c2w(&s.cameras[i], poses + 16 * i);
         gsf__traj_spline_desc desc;
         memset(&desc, 0, sizeof desc);
         desc.degree = 1 + (int32_t)count % 5;
@@ -806,7 +806,7 @@ static void test_sets_of_views(void) {
                 eye[k] = target[k] + uniform(0.5, 2.0) * (test_random_bits(&rng) % 2 ? 1.0 : -1.0);
             CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, poses + 16 * i));
         }
-        CHECK_OK(&ctx, gsf_traj_focus_point(&ctx, poses, n, focus)); // axes that meet
+        CHECK_OK(&ctx, gsf_traj_find_focus(&ctx, poses, n, focus)); // axes that meet
         test_compare("focus", focus, target, 3, 1e-10);
         int32_t index;
         for (size_t i = 0; i < n; i++) {
@@ -850,7 +850,7 @@ static void test_intrinsics(void) {
     for (int i = 0; i < 50; i++) { // clip space against pixels
         const double p[3] = {uniform(-0.3, 0.3), uniform(-0.3, 0.3), uniform(-0.3, 0.3)};
         double u, v, depth, clip[4];
-        if (!CHECK(gsf_camera_project(&camera, p, &u, &v, &depth))) continue;
+        if (!CHECK(gsf_project_point(&camera, p, &u, &v, &depth))) continue;
         for (int r = 0; r < 4; r++) clip[r] = full[r] * p[0] + full[4 + r] * p[1] + full[8 + r] * p[2] + full[12 + r];
         CHECK_NEAR((clip[0] / clip[3] + 1.0) * 0.5 * camera.width, u, 1e-9);
         CHECK_NEAR((clip[1] / clip[3] + 1.0) * 0.5 * camera.height, v, 1e-9);
@@ -861,20 +861,22 @@ static void test_intrinsics(void) {
 static void test_schedule(void) {
     static const int32_t even[4] = {100, 150, 200, 250}, uneven[4] = {10, 13, 16, 20}; // 3 1/3 apart
     for (int32_t k = 0; k < 4; k++) {
-        CHECK(gsf_traj_repair_round(100, 250, 4, k) == even[k]);
-        CHECK(gsf_traj_repair_round(10, 20, 4, k) == uneven[k]);
+        CHECK(gsf_traj_query_repair_round(100, 250, 4, k) == even[k]);
+        CHECK(gsf_traj_query_repair_round(10, 20, 4, k) == uneven[k]);
     }
-    CHECK(gsf_traj_repair_round(100, 210, 1, 0) == 100);
-    CHECK(gsf_traj_repair_round(7, INT32_MAX, 1001, 1000) == INT32_MAX);
-    CHECK(gsf_traj_generative_weight(10, 10, 20, 1.0, 0) == 0.0);
-    CHECK(gsf_traj_generative_weight(20, 10, 20, 0.75, 0) == 0.75 && gsf_traj_generative_weight(20, 10, 20, 0.75, 1) == 0.0);
+    CHECK(gsf_traj_query_repair_round(100, 210, 1, 0) == 100);
+    CHECK(gsf_traj_query_repair_round(7, INT32_MAX, 1001, 1000) == INT32_MAX);
+    CHECK(gsf_traj_query_generative_weight(10, 10, 20, 1.0, 0) == 0.0);
+    CHECK(gsf_traj_query_generative_weight(20, 10, 20, 0.75, 0) == 0.75 && gsf_traj_query_generative_weight(20, 10, 20,
+                                                                                                            0.75, 1) == 0.0);
     for (int i = 12; i < 20; i++) // rises all the way; the released one falls again
-        CHECK(gsf_traj_generative_weight(i, 10, 20, 2.0, 0) > gsf_traj_generative_weight(i - 1, 10, 20, 2.0, 0));
+        CHECK(gsf_traj_query_generative_weight(i, 10, 20, 2.0, 0) > gsf_traj_query_generative_weight(i - 1, 10, 20, 2.0,
+                                                                                                     0));
     for (int i = 11; i < 20; i++) {
         const double t = 0.1 * i - 1.0;
-        CHECK_NEAR(gsf_traj_generative_weight(i, 10, 20, 2.0, 0), 2.0 * t * (2.0 - t), 1e-6);
+        CHECK_NEAR(gsf_traj_query_generative_weight(i, 10, 20, 2.0, 0), 2.0 * t * (2.0 - t), 1e-6);
     }
-    CHECK(gsf_traj_generative_weight(19, 10, 20, 2.0, 1) < gsf_traj_generative_weight(15, 10, 20, 2.0, 1));
+    CHECK(gsf_traj_query_generative_weight(19, 10, 20, 2.0, 1) < gsf_traj_query_generative_weight(15, 10, 20, 2.0, 1));
     for (int32_t total = 1; total < 300; total++) // released tables: inside the sequence, or refused
         for (int32_t middle = 1; middle < 40; middle++) {
             int32_t windows, starts[310], overlaps[310];

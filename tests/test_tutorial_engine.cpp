@@ -13,14 +13,14 @@
 
 struct job_system {
     int workers;
-    int worker_count() const { return workers; }
+    int32_t worker_count() const { return workers; }
     void parallel_for(size_t count, const std::function<void(size_t, int)>& body) {
         std::atomic<size_t> next(0);
-        const auto work = [&](int worker) {
+        const auto work = [&](int32_t worker) {
             for (size_t i = next++; i < count; i = next++) body(i, worker);
         };
         std::vector<std::thread> threads;
-        for (int worker = 1; worker < workers; worker++) threads.emplace_back(work, worker);
+        for (int32_t worker = 1; worker < workers; worker++) threads.emplace_back(work, worker);
         work(0);
         for (std::thread& thread : threads) thread.join();
     }
@@ -42,9 +42,9 @@ static void make_splats(gsf_context* ctx, uint64_t seed, gsf_splats* out) {
     CHECK_OK(ctx, gsf_splat_make(ctx, SPLATS, 0, out));
     for (size_t i = 0; i < SPLATS; i++) {
         for (uint64_t a = 0; a < 3; a++) {
-            out->means[3 * i + a] = (float)(2.0 * gsf_random_uniform(seed, a, i) - 1.0);
+            out->means[3 * i + a] = (float)(2.0 * gsf_draw_uniform(seed, a, i) - 1.0);
             out->log_scales[3 * i + a] = -2.0f;
-            out->sh[3 * i + a] = (float)gsf_random_normal(seed, 3 + a, i);
+            out->sh[3 * i + a] = (float)gsf_draw_normal(seed, 3 + a, i);
         }
         out->quats[4 * i] = 1.0f;
         out->opacity_logits[i] = 1.0f;
@@ -68,7 +68,7 @@ static void take_photo(gsf_context* ctx, const gsf_splats* splats, int i, std::v
         linear[k] = (float)linear_of(coded[k]);
     }
     gsf_image file = gsf_wrap_image(linear, GSF_F32, W, H, 3);
-    file.color_space = GSF_LINEAR;
+    file.color_space = GSF_COLOR_LINEAR;
     char name[16];
     snprintf(name, sizeof name, "photo%d.exr", i);
     CHECK_OK(ctx, gsf_save_image(ctx, test_scratch(name), &file));

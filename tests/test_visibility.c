@@ -128,7 +128,7 @@ static void test_from_points(void) {
     double error = 0.0;
     for (size_t i = 0; i < 3 * n; i++) bytes[i] = (uint8_t)(colors.v[i] * 255.0 + 0.5);
     gsf_splats splats;
-    if (CHECK_OK(&ctx, gsf_splat_from_points(&ctx, points.v, bytes, n, NULL, 3, NULL, &splats)) &&
+    if (CHECK_OK(&ctx, gsf_splat_make_from_points(&ctx, points.v, bytes, n, NULL, 3, NULL, &splats)) &&
         CHECK(splats.count == n)) {
         test_compare_floats("means", splats.means, xyz.v, xyz.count, 1e-5);
         test_compare_floats("log_scales", splats.log_scales, scaling.v, scaling.count, 1e-5);
@@ -154,7 +154,7 @@ static void test_from_points(void) {
         for (size_t k = 0; k < 3; k++) moved[3 * i + k] = points.v[3 * i + k] + origin[k];
     }
     moved[3 * 3] = NAN;
-    if (CHECK_OK(&ctx, gsf_splat_from_points(&ctx, moved, bytes, n, keep, 1, origin, &splats))) {
+    if (CHECK_OK(&ctx, gsf_splat_make_from_points(&ctx, moved, bytes, n, keep, 1, origin, &splats))) {
         CHECK(splats.count == n / 2 - 1 && splats.sh_degree == 1);
         CHECK(splats.ids[0] == 1 && splats.ids[1] == 5 && splats.origin[0] == origin[0]);
         for (size_t s = 0; s < splats.count; s++) {
@@ -175,14 +175,15 @@ static void test_from_points(void) {
 
     // No point, one point, two points.
     for (size_t few = 0; few < 3; few++) {
-        CHECK_OK(&ctx, gsf_splat_from_points(&ctx, points.v, bytes, few, NULL, 0, NULL, &splats));
+        CHECK_OK(&ctx, gsf_splat_make_from_points(&ctx, points.v, bytes, few, NULL, 0, NULL, &splats));
         CHECK(splats.count == few);
         for (size_t i = 0; i < few; i++) CHECK(isfinite(splats.log_scales[3 * i]));
         gsf_splat_destroy(&ctx, &splats);
     }
-    CHECK_RESULT(&ctx, gsf_splat_from_points(&ctx, points.v, bytes, n, NULL, 4, NULL, &splats),
+    CHECK_RESULT(&ctx, gsf_splat_make_from_points(&ctx, points.v, bytes, n, NULL, 4, NULL, &splats),
                  GSF_ERROR_INVALID_ARGUMENT);
-    CHECK_RESULT(&ctx, gsf_splat_from_points(&ctx, NULL, bytes, n, NULL, 0, NULL, &splats), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf_splat_make_from_points(&ctx, NULL, bytes, n, NULL, 0, NULL, &splats),
+                 GSF_ERROR_INVALID_ARGUMENT);
     free(keep);
     free(moved);
     free(bytes);
@@ -200,7 +201,7 @@ static uint8_t* visible(const gsf_scene* scene, const uint32_t* views, size_t co
     desc.method = method;
     desc.use_zbuffer = use_zbuffer;
     uint8_t* keep = (uint8_t*)malloc(scene->point_count);
-    CHECK_OK(&ctx, gsf_splat_visible_points(&ctx, scene, views, count, &desc, keep, stats));
+    CHECK_OK(&ctx, gsf_splat_filter_points(&ctx, scene, views, count, &desc, keep, stats));
     return keep;
 }
 
@@ -298,21 +299,21 @@ static void test_walls(void) {
     // One point only; bad arguments.
     uint8_t* keep = (uint8_t*)malloc(COUNT);
     scene.point_count = 1;
-    CHECK_OK(&ctx, gsf_splat_visible_points(&ctx, &scene, first, 1, NULL, keep, NULL));
+    CHECK_OK(&ctx, gsf_splat_filter_points(&ctx, &scene, first, 1, NULL, keep, NULL));
     CHECK(keep[0]);
     scene.point_count = 0;
-    CHECK_OK(&ctx, gsf_splat_visible_points(&ctx, &scene, first, 1, NULL, keep, NULL));
+    CHECK_OK(&ctx, gsf_splat_filter_points(&ctx, &scene, first, 1, NULL, keep, NULL));
     scene.point_count = COUNT;
-    CHECK_RESULT(&ctx, gsf_splat_visible_points(&ctx, &scene, wrong, 1, NULL, keep, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf_splat_filter_points(&ctx, &scene, wrong, 1, NULL, keep, NULL), GSF_ERROR_INVALID_ARGUMENT);
     gsf_visibility_desc desc;
     memset(&desc, 0, sizeof desc);
     desc.neighbours = GSF__KNN_MAX + 1;
-    CHECK_RESULT(&ctx, gsf_splat_visible_points(&ctx, &scene, first, 1, &desc, keep, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf_splat_filter_points(&ctx, &scene, first, 1, &desc, keep, NULL), GSF_ERROR_INVALID_ARGUMENT);
     desc.neighbours = 0;
     desc.tolerance = NAN;
-    CHECK_RESULT(&ctx, gsf_splat_visible_points(&ctx, &scene, first, 1, &desc, keep, NULL), GSF_ERROR_INVALID_ARGUMENT);
+    CHECK_RESULT(&ctx, gsf_splat_filter_points(&ctx, &scene, first, 1, &desc, keep, NULL), GSF_ERROR_INVALID_ARGUMENT);
     views[0].camera.w2c[3] = NAN;
-    CHECK_RESULT(&ctx, gsf_splat_visible_points(&ctx, &scene, first, 1, NULL, keep, NULL), GSF_ERROR_NUMERIC);
+    CHECK_RESULT(&ctx, gsf_splat_filter_points(&ctx, &scene, first, 1, NULL, keep, NULL), GSF_ERROR_NUMERIC);
     free(keep);
     free(points);
     free(colors);
@@ -371,7 +372,7 @@ static void test_naive(void) {
             c->cy = 75.0;
             c->width = 200;
             c->height = 150;
-            gsf_camera_set_c2w(c, pose);
+            gsf_set_camera_c2w(c, pose);
             if (v % 2 == 0) chosen[v / 2] = (uint32_t)v;
         }
         for (size_t i = 0; i < n; i++) {
@@ -446,7 +447,7 @@ static int answer_within(const gsf_scene* scene, size_t spare, const uint8_t* ex
     if (gsf_init_context(&own) != GSF_OK || !keep || !statm || fscanf(statm, "%lu", &pages) != 1) return WRONG;
     limit.rlim_cur = limit.rlim_max = (rlim_t)pages * (rlim_t)sysconf(_SC_PAGESIZE) + spare;
     if (setrlimit(RLIMIT_AS, &limit) != 0) return WRONG;
-    const gsf_result result = gsf_splat_visible_points(&own, scene, view, 1, &desc, keep, &stats);
+    const gsf_result result = gsf_splat_filter_points(&own, scene, view, 1, &desc, keep, &stats);
     if (result == GSF_ERROR_OUT_OF_MEMORY) return strstr(own.error, "memory") ? NO_MEMORY : WRONG;
     if (result != GSF_OK || memcmp(keep, expected, scene->point_count) != 0) return WRONG;
     return stats.used_embree ? BY_EMBREE : PROJECTED;
@@ -590,7 +591,7 @@ static void count_answers(accuracy* a, const uint8_t* kept, const uint8_t* truth
 // Different views in random order.
 static void pick_views(uint64_t stream, size_t views, size_t count, uint32_t* chosen) {
     for (uint64_t draw = 0, n = 0; n < count; draw++) {
-        const uint32_t view = (uint32_t)(gsf_random_bits(7, stream, draw) % views);
+        const uint32_t view = (uint32_t)(gsf_draw_bits(7, stream, draw) % views);
         int taken = 0;
         for (uint64_t i = 0; i < n; i++) taken |= chosen[i] == view;
         if (!taken) chosen[n++] = view;

@@ -39,7 +39,7 @@ static inline void train_golden_loss(gsf_context* ctx) {
         CHECK_NEAR(value.total, loss.v[0], 3e-7);
         CHECK_NEAR(value.l1, loss.v[1], 3e-7);
         CHECK_NEAR(value.ssim, loss.v[2], 3e-7);
-        snprintf(label, sizeof label, "%s dL/dimage (%s)", scenes.name[s], gsf_cpu_level_name(ctx->cpu_level));
+        snprintf(label, sizeof label, "%s dL/dimage (%s)", scenes.name[s], gsf_describe_cpu_level(ctx->cpu_level));
         test_compare_floats(label, d, expected, image.count, 1e-5 * test_max_abs(expected, image.count));
         free(render); free(pixels); free(expected); free(d);
         test_free_tensor(&image); test_free_tensor(&photo); test_free_tensor(&loss); test_free_tensor(&gradient);
@@ -153,7 +153,7 @@ static inline gsf__model train_golden_model(gsf_context* ctx, const test_tensors
     gsf__model model;
     memset(&model, 0, sizeof model);
     test_tensor xyz = test_get_tensor(file, "before.xyz"), rest = test_get_tensor(file, "before.f_rest");
-    while ((size_t)gsf_splat_sh_count(model.sh_degree) < rest.dim[1] + 1) model.sh_degree++;
+    while ((size_t)gsf_splat_count_sh(model.sh_degree) < rest.dim[1] + 1) model.sh_degree++;
     if (!CHECK_OK(ctx, gsf__model_reserve(ctx, &model, xyz.dim[0]))) exit(2);
     model.count = xyz.dim[0];
     train_golden_fill(file, "before", TRAIN_VALUE, &model);

@@ -73,7 +73,7 @@ int main(void) {
     static const char* const names[2] = {"a.ply", "a.splat"};
     gsf_context ctx;
     gsf_splats splats, again;
-    gsf_text text;
+    gsf_buffer text;
     memset(&ctx, 0, sizeof ctx);
     memset(&text, 0, sizeof text);
     if (gsf_init_context(&ctx) != GSF_OK || gsf_splat_make(&ctx, 2, 1, &splats) != GSF_OK) return 1;
@@ -89,7 +89,7 @@ int main(void) {
         if (gsf_splat_parse(&ctx, names[i], text.data, text.size, &again) != GSF_OK || again.count != 2) return 5;
         gsf_splat_destroy(&ctx, &again);
     }
-    gsf_destroy_text(&ctx, &text);
+    gsf_destroy_buffer(&ctx, &text);
     gsf_splat_destroy(&ctx, &splats);
     return 0;
 }

@@ -39,10 +39,10 @@ static void check_render(renderer* r, const char* scene, const gsf_splats* splat
     }
     CHECK(compared > pixels / 2 && drawn > pixels / 20);
     if (!CHECK(worst <= tolerance))
-        fprintf(stderr, "%s, %s: off by %.3g, allowed %.3g\n", scene, gsf_cpu_level_name(r->ctx.cpu_level), worst,
+        fprintf(stderr, "%s, %s: off by %.3g, allowed %.3g\n", scene, gsf_describe_cpu_level(r->ctx.cpu_level), worst,
                 tolerance);
     if (getenv("GSF_TEST_VERBOSE"))
-        printf("%s %s: %.3g\n", gsf_cpu_level_name(r->ctx.cpu_level), scene, worst);
+        printf("%s %s: %.3g\n", gsf_describe_cpu_level(r->ctx.cpu_level), scene, worst);
     free(actual);
     ref_destroy_image(&expected);
     ref_destroy_splats(&s);
@@ -104,7 +104,7 @@ int main(void) {
         for (size_t s = 0; s < scenes.count; s++) check_golden(&r, scenes.name[s]);
         check_wide(&r);
         gsf_splat_destroy_rasterizer(&r.ctx, r.rasterizer);
-        printf("%s %016llx\n", gsf_cpu_level_name(r.ctx.cpu_level), (unsigned long long)r.hash);
+        printf("%s %016llx\n", gsf_describe_cpu_level(r.ctx.cpu_level), (unsigned long long)r.hash);
     }
     return test_report();
 }
