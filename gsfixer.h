@@ -42,8 +42,8 @@
                context.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a grid of chunks that depends
                on sizes only, so results do not depend on the number of workers.
-   SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images >>resize >>metrics
-               >>cameras >>clips >>glm >>oiio
+   SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images
+               >>resize >>metrics >>cameras >>clips >>glm >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
 #define GSF_BASE_INCLUDED
@@ -3057,7 +3057,8 @@ static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, cons
     if (bits >= 16 || header > 124) return GSF_OK;
     const uint64_t begin = 14 + header, colors = offset > begin ? (offset - begin) / entry : 0;
     if (colors < 1 || colors > 256 || offset > size)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:10: BMP of %u bits whose pixels begin at byte %llu, not behind a palette", name,
+        return gsf_fail(ctx, GSF_ERROR_FORMAT,
+                        "%s:10: BMP of %u bits whose pixels begin at byte %llu, not behind a palette", name,
                         bits, (unsigned long long)offset);
     const size_t old = header == 12 ? 12 : 0, full = (size_t)entry * 256, used = (size_t)(colors * entry);
     const uint64_t moved = begin + full + old;

@@ -4143,7 +4143,8 @@ static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor*
     job.per_worker = (size_t)gsf__round_up(job.padded + job.padded / 2, 16);
     size_t values, scratch;
     const size_t columns = ((size_t)made.out + GSF__TILE_COLUMNS - 1) / GSF__TILE_COLUMNS * GSF__TILE_COLUMNS;
-    if (!gsf__mul_size(columns, (size_t)job.padded, &values) || columns > (SIZE_MAX - values) / 8 || !gsf__mul_size(job.per_worker, (size_t)ctx->parallel.worker_count, &scratch))
+    if (!gsf__mul_size(columns, (size_t)job.padded, &values) || columns > (SIZE_MAX - values) / 8 ||
+        !gsf__mul_size(job.per_worker, (size_t)ctx->parallel.worker_count, &scratch))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "int8: %lld x %lld", (long long)made.out, (long long)made.in);
     made.bytes = values + columns * (sizeof(float) + sizeof(int32_t));
     made.data = (int8_t*)gsf_alloc(ctx, made.bytes, 1); // scales and offsets stand behind: values is a multiple of 64
@@ -4749,7 +4750,8 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
             GSF__FOUR_TILES(multiply, , a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, places)       \
             GSF__FOUR_ROWS(GSF__ATT_FADE)                                                                               \
         }                                                                                                               \
-    if (even < groups) rest(p + even * height, groups - even, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
+    if (even < groups)                                                                                                  \
+        rest(p + even * height, groups - even, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
 #define GSF__ATT_FADE(r)                                                                                                \
     GSF__ATT_FADE_ONE(to + (r) * GSF__ATT_PANEL, fades[r], c##r)                                                        \
     GSF__ATT_FADE_ONE(to + GSF__ATT_TILE + (r) * GSF__ATT_PANEL, fades[r], d##r)                                        \
@@ -4795,7 +4797,8 @@ GSF__TARGET_BF16 static void gsf__attention_pack_values_bf16(const gsf__attentio
             const __mmask16 mask = gsf__nn_mask16(dim - i), second = j + 1 < keys ? mask : (__mmask16)0;
             const __m256i low = gsf__nn_round_bf16(_mm512_maskz_loadu_ps(mask, from + j * ld + i));
             const __m256i high = gsf__nn_round_bf16(_mm512_maskz_loadu_ps(second, from + (j + 1) * ld + i));
-            const __m512i pair = _mm512_or_si512(_mm512_cvtepu16_epi32(low), _mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16));
+            const __m512i pair = _mm512_or_si512(_mm512_cvtepu16_epi32(low),
+                                                 _mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16));
             _mm512_storeu_si512(packed + (i * GSF__ATT_KEYS / GSF__ATT_PANEL + j / 2) * GSF__ATT_PANEL, pair);
         }
     }
@@ -12414,7 +12417,8 @@ static gsf_result gsf__dit_fit_photo(gsf_context* ctx, const gsf_reference* phot
     int64_t size[2];
     for (int k = 0; k < 2; k++) {
         const double wanted = rint(sides[k] / step[k]);
-        if (!(wanted < 65536.0)) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dit: a frame shows a photo %g-fold", 1.0 / step[k]);
+        if (!(wanted < 65536.0))
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dit: a frame shows a photo %g-fold", 1.0 / step[k]);
         size[k] = wanted < 1.0 ? 1 : (int64_t)wanted;
         const double scale = (double)size[k] / sides[k];
         control->step[k] = step[k] * scale;
@@ -13025,7 +13029,8 @@ static int gsf__dit_has(const gsf__dit_restorer* r, const char* bare, const char
 static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, const char* file,
                                         const gsf_nn_tensor* t) {
     const gsf_nn_transformer* c = &r->transformer;
-    const int prompt = gsf__dit_is_name(t->name, "prompt_embeds", "clip"), dino = gsf__dit_is_name(t->name, "dino_latents", "photo");
+    const int prompt = gsf__dit_is_name(t->name, "prompt_embeds", "clip");
+    const int dino = gsf__dit_is_name(t->name, "dino_latents", "photo");
     const int64_t channels = prompt ? c->text_channels : dino ? c->dino_channels : c->vggt_channels;
     float* values;
     if (!prompt && !dino && !gsf__dit_is_name(t->name, "vggt_latents", "photo")) return GSF_OK;

@@ -136,7 +136,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* sp
                4.5/128 (band 1) and 8.5/128 (above) within -1..1, quaternion components 0.002 (version 2: up to 0.15 for
                small w). Axes are converted to and from SPZ's (y and z negated), as Niantic's library does. Extensions
                and SH band 4 are ignored with a warning. GSF_ERROR_UNSUPPORTED: version 4 (zstd); more than 2^30 bytes of
-               content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under GSF_NO_STB.
+               content to write (16 million splats of degree 3), 2^31 to read; reading .spz at all under
+               GSF_NO_STB.
    No format stores an origin, so world positions are written. For .splat and .spz, positions whose quantization is coarse
    relative to the splats (more than a quarter of the median scale) cause a warning and positions out of range an error;
    with `local` the means are written without the origin. Rows keep their order; ids are lost and become the row numbers.
@@ -3892,7 +3893,8 @@ static gsf_result gsf__joint_bytes(gsf_context* ctx, gsf_image* joint) {
     const float* from = (const float*)joint->data;
     for (size_t i = 0; i < 4 * (size_t)joint->width * (size_t)joint->height; i += 4)
         for (size_t k = 0; k < 4; k++)
-            ((uint8_t*)bytes.data)[i + k] = gsf__byte_of(from[i + 3] > 255.0f ? from[i + k] * (255.0f / from[i + 3]) : from[i + k]);
+            ((uint8_t*)bytes.data)[i + k] =
+                gsf__byte_of(from[i + 3] > 255.0f ? from[i + k] * (255.0f / from[i + 3]) : from[i + k]);
     gsf_destroy_image(ctx, joint);
     *joint = bytes;
     return GSF_OK;
@@ -8654,7 +8656,8 @@ GSF__TARGET_AVX2 static inline uint32_t gsf__sum_slots_avx2(const gsf_rasterizer
 }
 
 // Fetches what the eight splats from i on will need: their slots lie all over memory, and rows of SH are long.
-static inline void gsf__gather_ahead(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads, size_t i) {
+static inline void gsf__gather_ahead(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads,
+                                     size_t i) {
     for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + 8]; s++) {
         const char* slot = (const char*)(r->slots + GSF__SLOT_FLOATS * r->splat_pairs[s]);
         _mm_prefetch(slot, _MM_HINT_T0);

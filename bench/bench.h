@@ -283,7 +283,8 @@ static double bench_sweep_rate(int json, gsf_cpu_level level, int threads, int s
     bench_sink += sweep.sums[0];
     gsf_free(&ctx, block);
     char name[64];
-    snprintf(name, sizeof name, "machine: sweep over %g %s", size < 20 ? bytes / 1024.0 : bytes / 1048576.0, size < 20 ? "KiB" : "MiB");
+    snprintf(name, sizeof name, "machine: sweep over %g %s", size < 20 ? bytes / 1024.0 : bytes / 1048576.0,
+             size < 20 ? "KiB" : "MiB");
     const double seconds = (double)bytes / *rate;
     const bench_row row = bench_make_row(name, level, threads, seconds, seconds * threads, (double)bytes, "B");
     bench_print(json, &row);
@@ -324,7 +325,8 @@ static void bench_print(int json, const bench_row* row) {
     const double cpu = row->cpu_seconds > 0.0 ? row->seconds * row->threads / row->cpu_seconds : 0.0;
     const bench_shares share = bench_shares_of(json, row, cpu);
     if (json) {
-        printf("{\"bench\":\"" BENCH_NAME "\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,\"seconds\":%.6g,"
+        printf("{\"bench\":\"" BENCH_NAME "\",\"case\":\"%s\",\"variant\":\"%s\",\"isa\":\"%s\",\"threads\":%d,"
+               "\"seconds\":%.6g,"
                "\"cpu_seconds\":%.6g,\"work\":%.6g,\"work_unit\":\"%s\",\"rate\":%.6g,\"reference\":\"%s\"",
                row->name, row->variant, row->isa, row->threads, row->seconds, row->cpu_seconds, row->work, row->work_unit,
                rate, row->reference);
@@ -341,7 +343,8 @@ static void bench_print(int json, const bench_row* row) {
                1e3 * row->seconds, 1e3 * row->cpu_seconds, rate, row->work_unit);
         if (share.peak > 0.0)
             printf("  %.1f%% (cpu %.1f%%) of the %s peak", 100.0 * share.peak, 100.0 * cpu * share.peak, share.of);
-        if (row->bytes > 0.0) printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * share.bandwidth, 100.0 * share.cpu_bandwidth);
+        if (row->bytes > 0.0)
+            printf("  %.1f%% (cpu %.1f%%) of bandwidth", 100.0 * share.bandwidth, 100.0 * share.cpu_bandwidth);
         if (row->peak_rss > 0.0) printf("  %.0f MiB at most", row->peak_rss / (1 << 20));
         if (row->error_max >= 0.0) printf("  max %.2g  rel L2 %.2g", row->error_max, row->error_rel_l2);
         printf("\n");

@@ -1557,9 +1557,11 @@ int main(int argc, char** argv) {
         else if (value && strcmp(argv[i], "--threads") == 0) o.threads = atoi(argv[++i]);
         else if (value && strcmp(argv[i], "--isa") == 0) o.level = bench_level_of(argv[++i]);
         else if (value && strcmp(argv[i], "--model") == 0) o.model = argv[++i];
-        else if (value && strcmp(argv[i], "--pipeline") == 0 && o.pipeline_count < 4) o.pipelines[o.pipeline_count++] = argv[++i];
+        else if (value && strcmp(argv[i], "--pipeline") == 0 && o.pipeline_count < 4)
+            o.pipelines[o.pipeline_count++] = argv[++i];
         else {
-            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] [--model FOLDER] [--pipeline FOLDER]...\n");
+            fprintf(stderr, "usage: bench_nn [--json] [--quick] [--filter TEXT] [--threads N] [--isa NAME] "
+                            "[--model FOLDER] [--pipeline FOLDER]...\n");
             return 2;
         }
     }

@@ -144,7 +144,8 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     if (code) return code;
     if (setup->initial.sh_degree == 0) setup->initial.sh_degree = -1; // an explicit 0: the desc's zero means default
     if (app->o.path && app->o.trajectory) return gsfix_misused(app, "--path and --trajectory exclude each other");
-    if (app->o.compare && !has_restorer(app)) return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
+    if (app->o.compare && !has_restorer(app))
+        return gsfix_misused(app, "--compare: without a --restorer there is nothing to compare");
     return gsfix_check_restorer(app);
 }
 
@@ -576,9 +577,8 @@ static gsf_result compare_inputs(fix_run* run, const char* name, const gsf_json*
         return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: does not say what it was made from (--restart begins anew)", name);
     for (size_t i = 0; i < was->count || i < run->input_count; i++) {
         const gsf_json_value* row = i < was->count ? gsf_find_json_element(old, was, i) : NULL;
-        const gsf_json_value *path = row ? gsf_find_json_element(old, row,
-                                                                 0) : NULL, *digest = row ? gsf_find_json_element(old,
-                                                                                                                  row, 1) : NULL;
+        const gsf_json_value* path = row ? gsf_find_json_element(old, row, 0) : NULL;
+        const gsf_json_value* digest = row ? gsf_find_json_element(old, row, 1) : NULL;
         const int valid = path && digest && path->type == GSF_JSON_STRING && digest->type == GSF_JSON_STRING;
         if (row && !valid) return gsf_fail(run->ctx, GSF_ERROR_FORMAT, "%s: broken list of inputs", name);
         if (row && i < run->input_count && strcmp(digest->string, input_digest(run->inputs + i).s) == 0) continue;
@@ -755,7 +755,8 @@ static gsf_result meet_checkpoint(fix_run* run) {
     if (all && all->type == GSF_JSON_NUMBER) snprintf(step, sizeof step, " at step %.0f of %.0f", now->number, all->number);
     gsf_destroy_json(ctx, &json);
     gsf_free(ctx, data);
-    return gsf_fail(ctx, GSF_ERROR_IO, "%s holds the checkpoint of a run%s: --resume goes on, --restart begins anew", o->out, step);
+    return gsf_fail(ctx, GSF_ERROR_IO, "%s holds the checkpoint of a run%s: --resume goes on, --restart begins anew",
+                    o->out, step);
 }
 
 // Training continues if a checkpoint cannot be written; the last good one stays in place.
@@ -943,7 +944,8 @@ static void show_step(fix_run* run, const gsf_fix_stats* stats) {
     const double trainings = run->app->o.compare ? 2.0 : 1.0, all = trainings * run->iterations;
     const double done = run->iteration + (run->comparing ? 0.0 : all - run->iterations);
     if (stats->stage == GSF_FIX_TRAIN)
-        gsfix_progress(run->app, done, all, "%sstep %d of %d  loss %.4f  %zu splats%s", run->comparing ? "without repair: " : "",
+        gsfix_progress(run->app, done, all, "%sstep %d of %d  loss %.4f  %zu splats%s",
+                       run->comparing ? "without repair: " : "",
                        (int)run->iteration, (int)run->iterations, stats->train.loss, stats->train.splats, held_out);
     else if (stats->stage == GSF_FIX_RESTORE && run->app->terminal)
         gsfix_progress(run->app, done, all, "round %d of %d: window %d of %d %s",
@@ -1131,7 +1133,8 @@ static void print_results(fix_run* run, const gsfix_result* r) {
                     run->split.test_count);
         if (run->masks) gsfix_print(app, "seen       PSNR %.3f dB  SSIM %.4f", r->mean.psnr_seen, r->mean.ssim_seen);
         if (h->has_without)
-            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (same number of steps; repair alone: %+.3f dB)", r->without.psnr,
+            gsfix_print(app, "no repair  PSNR %.3f dB  SSIM %.4f  (same number of steps; repair alone: %+.3f dB)",
+                        r->without.psnr,
                         r->without.ssim, r->mean.psnr - r->without.psnr);
     }
     gsfix_print(app, "splats     %zu after %d steps, %.1f s, %.0f MB at the peak", r->splats->count, (int)r->iterations,

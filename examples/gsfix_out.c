@@ -49,7 +49,8 @@ struct gsfix_out {
     char** claims; // names below OUT; '*' matches any text without '/'
     char** files;  // claimed paths outside OUT
     out_line* lines;
-    size_t input_count, input_room, read_count, read_room, claim_count, claim_room, file_count, file_room, line_count, line_room;
+    size_t input_count, input_room, read_count, read_room, claim_count, claim_room;
+    size_t file_count, file_room, line_count, line_room;
     int reads_ended;
     int root, own, lock, manifest, job;   // descriptors; -1: none
     uint64_t manifest_size;
@@ -560,7 +561,8 @@ static gsf_result check_name(gsfix_app* app, int folder, const char* base, const
         return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/%s: %s", app->o.out, name, strerror(errno));
     if (!ours) return not_ours(app, name);
     if (!input_at(app->out, &s)) return GSF_OK;
-    return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/%s: an input, and not to be replaced (choose another --out)", app->o.out, name);
+    return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/%s: an input, and not to be replaced (choose another --out)", app->o.out,
+                    name);
 }
 
 static gsf_result check_matches(gsfix_app* app, int folder, const char* base, const char* pattern) {
@@ -580,10 +582,12 @@ static gsf_result check_folder(gsfix_app* app, int folder, const char* name, int
     const char* slash = length ? "/" : "";
     const char* input = fstat(folder, &s) == 0 ? input_at(app->out, &s) : NULL;
     if (input)
-        return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s%s%.*s: input is read from there (%s), so nothing is written there (choose another --out)",
+        return gsf_fail(&app->ctx, GSF_ERROR_IO,
+                        "%s%s%.*s: input is read from there (%s), so nothing is written there (choose another --out)",
                         app->o.out, slash, length, name, input);
     if (length && s.st_dev != app->out->root_place.device)
-        return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/%.*s: on another file system than %s", app->o.out, length, name, app->o.out);
+        return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/%.*s: on another file system than %s", app->o.out, length, name,
+                        app->o.out);
     if (faccessat(folder, ".", W_OK | X_OK, AT_EACCESS) != 0)
         return gsf_fail(&app->ctx, GSF_ERROR_IO, "%s%s%.*s: cannot be written: %s", app->o.out, slash, length, name,
                         strerror(errno));
@@ -618,7 +622,8 @@ static gsf_result take_lock(gsfix_app* app) {
         if (locked != 0 && errno == EWOULDBLOCK)
             return gsf_fail(ctx, GSF_ERROR_IO, "%s: another gsfix is at work there", app->o.out);
         if (locked != 0) {
-            gsf_log(ctx, GSF_LOG_WARNING, "%s: cannot be locked (%s); do not start a second run there", app->o.out, strerror(errno));
+            gsf_log(ctx, GSF_LOG_WARNING, "%s: cannot be locked (%s); do not start a second run there", app->o.out,
+                    strerror(errno));
             return GSF_OK;
         }
         if (fstat(o->lock, &mine) == 0 && fstatat(o->own, "lock", &there, AT_SYMLINK_NOFOLLOW) == 0 &&
@@ -633,7 +638,8 @@ static gsf_result check_own(gsfix_app* app) {
     DIR* list = list_folder(app->out->own);
     gsf_result result = GSF_OK;
     for (struct dirent* entry; list && result == GSF_OK && (entry = readdir(list)) != NULL;)
-        if (strcmp(entry->d_name, ".") && strcmp(entry->d_name, "..") && strcmp(entry->d_name, "lock") && strcmp(entry->d_name, "new"))
+        if (strcmp(entry->d_name, ".") && strcmp(entry->d_name, "..") && strcmp(entry->d_name, "lock") &&
+            strcmp(entry->d_name, "new"))
             result = gsf_fail(&app->ctx, GSF_ERROR_IO, "%s/.gsfix/%s: not written by gsfix (choose another --out)", app->o.out,
                               entry->d_name);
     if (list) closedir(list);
@@ -852,7 +858,8 @@ gsf_result gsfix_claim_file(gsfix_app* app, const char* path) {
     if (folder < 0 || !*base) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: no such folder to write into", path);
     else if (stat(path, &s) == 0 && (S_ISCHR(s.st_mode) || S_ISFIFO(s.st_mode))) {}
     else if (look_at(o, folder, base, name.s, &s, NULL) == 0)
-        result = gsf_fail(ctx, GSF_ERROR_IO, "%s: is there already, and not replaced (move it away or choose another name)", path);
+        result = gsf_fail(ctx, GSF_ERROR_IO,
+                          "%s: is there already, and not replaced (move it away or choose another name)", path);
     else if (faccessat(folder, ".", W_OK | X_OK, AT_EACCESS) != 0) result = unwritten(ctx, path, errno);
     if (folder >= 0) close(folder);
     if (result == GSF_OK) result = gsfix_grow(ctx, (void**)&o->files, &o->file_room, o->file_count, sizeof *o->files);

@@ -329,7 +329,8 @@ static look look_fruit(material m, v3 p, uint32_t seed, float w) {
     return l;
 }
 
-// Appearance of a material at `p` in the object's own axes (n: its normal there); `seed` tells objects apart; w: width of a pixel.
+// Appearance of a material at `p` in the object's own axes (n: its normal there); `seed` tells objects apart; w: width of
+// a pixel.
 static look look_at(material m, v3 p, v3 n, uint32_t seed, float w) {
     look l = {{0.5f, 0.5f, 0.5f}, 0.0f, 0.0f};
     switch (m) {

@@ -14,7 +14,8 @@ static const char* const scene_folder = TEST_TMP "/scene";
 static const char* const out = TEST_TMP "/out";
 
 static int resume(const char* option) { // exit status of the program; its lines go to TEST_TMP/stderr
-    const char* arguments[] = {"gsfix", "fix", scene_folder, "--out", out, "--views", "2", "--iterations", "4", "--threads", "1",
+    const char* arguments[] = {"gsfix", "fix", scene_folder, "--out", out, "--views", "2", "--iterations", "4",
+                               "--threads", "1",
                                "--restorer", "warp", "--set", "rounds=1,windows=1,window_frames=3,first_round=2,last_round=2",
                                "--compare", "--json", option};
     char* copies[sizeof arguments / sizeof *arguments + 1] = {NULL};

@@ -136,7 +136,8 @@ static void test_lengths(gsf_context* ctx) {
                 CHECK(f.counts[p] <= 49 && f.counts[p] >= 9 && (f.counts[p] - 9) % 8 == 0);
                 if (step == 1 || frames > 49) CHECK(f.counts[p] == 49);
             }
-            if (frames <= 49) CHECK(f.calls == 1 && f.counts[0] >= frames && (step == 1 || f.counts[0] - frames < 8 || frames < 9));
+            if (frames <= 49)
+                CHECK(f.calls == 1 && f.counts[0] >= frames && (step == 1 || f.counts[0] - frames < 8 || frames < 9));
             else CHECK(f.calls == 1 + (frames - 8 - 1) / 41);
             CHECK_NEAR(f.first[0], shade(0), 1e-6); // both ends of the clip are seen, and parts overlap
             CHECK_NEAR(f.last[f.calls - 1], shade(frames - 1), 1e-6);
@@ -148,7 +149,9 @@ static void test_lengths(gsf_context* ctx) {
 }
 
 static void test_sizes(gsf_context* ctx) {
-    static const struct { int squash, width, height, multiple, most_width, in_width, in_height, out_width, out_height; } cases[] = {
+    static const struct {
+        int squash, width, height, multiple, most_width, in_width, in_height, out_width, out_height;
+    } cases[] = {
         {1, 72, 48, 72, 72, 26, 48, 72, 48}, // another aspect, squashed, larger and smaller than it came
         {1, 72, 48, 72, 72, 96, 54, 72, 48},
         {1, 72, 48, 8, 0, 200, 90, 72, 48},

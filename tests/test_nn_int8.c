@@ -221,7 +221,8 @@ static void test_types(gsf_context* ctx) {
 // All levels, with one worker and with three, give the same weights and the same bits. Sizes: several blocks of rows and
 // outputs, several steps of depth, several groups of rows held. Linear epilogues only, as activations differ by rounding.
 static void test_same_bits(gsf_cpu_level best) {
-    static const int64_t sizes[][3] = {{1, 300, 700}, {4, 1030, 900}, {3, 5, 40}, {7, 1, 5}, {13, 7, 3}, {6, 1024, 400}, {50, 1044, 33}, {401, 130, 500},
+    static const int64_t sizes[][3] = {{1, 300, 700}, {4, 1030, 900}, {3, 5, 40}, {7, 1, 5}, {13, 7, 3}, {6, 1024, 400},
+                                       {50, 1044, 33}, {401, 130, 500},
                                        {200, 2048, 90}, {390, 96, 20}, {33, 12, 800}};
     for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
         layer l = make_layer(sizes[i][0], sizes[i][1], sizes[i][2], i % 2 ? 1 : 0);

@@ -364,7 +364,8 @@ static int attention_rounds(const attention_data* a) { // operands to bfloat16
 }
 
 static double attention_operand(const attention_data* a, float value, float factor) {
-    return attention_rounds(a) ? (double)gsf__bf16_to_float(gsf__float_to_bf16(value * factor)) / (double)factor : (double)value;
+    if (!attention_rounds(a)) return (double)value;
+    return (double)gsf__bf16_to_float(gsf__float_to_bf16(value * factor)) / (double)factor;
 }
 
 static void attention_of(const attention_case* c, const attention_data* a, double* out) { // (queries, heads * dim)
@@ -478,7 +479,8 @@ static void check_attention_offset(void) {
         CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         float* dense = dense_rows(c, a.out);
         char what[80];
-        snprintf(what, sizeof what, "attention case %zu, keys at %g%s", n / 4, (double)offsets[n / 2 % 2], n % 2 ? " bf16" : "");
+        snprintf(what, sizeof what, "attention case %zu, keys at %g%s", n / 4, (double)offsets[n / 2 % 2],
+                 n % 2 ? " bf16" : "");
         test_compare_floats(what, dense, expected, values, attention_rounds(&a) ? 3.0 / 256 : 2e-6);
         free(dense); free(expected);
         free_attention(&a);

@@ -190,7 +190,8 @@ static void test_photo_frames(gsf_context* ctx, const char* features, clip* c) {
     CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, width, height, 3, &photo.color));
     CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, c->width, c->height, 3, &bytes));
     CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, c->width, c->height, 3, &seen));
-    for (int64_t i = 0; i < 3 * (int64_t)width * height; i++) ((uint8_t*)photo.color.data)[i] = (uint8_t)(i * 2654435761u >> 24);
+    for (int64_t i = 0; i < 3 * (int64_t)width * height; i++)
+        ((uint8_t*)photo.color.data)[i] = (uint8_t)(i * 2654435761u >> 24);
     CHECK_OK(ctx, gsf_resize_image(ctx, &photo.color, GSF_RESIZE_PIL_BICUBIC, &bytes));
     CHECK_OK(ctx, gsf_convert_image(ctx, &bytes, &seen));
     if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;

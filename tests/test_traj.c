@@ -438,7 +438,8 @@ static void check_rig(double wobble, double unit, size_t count, int outlier) {
             farthest = fmax(farthest, fmax(fabs(pose[12]), fmax(fabs(pose[13]), fabs(pose[14]))));
         }
         if (!CHECK(least > 0.5 && farthest < 12.0 * unit))
-            fprintf(stderr, "wobble %g, unit %g, %zu points, outlier %d: %g, %g\n", wobble, unit, count, outlier, least, farthest / unit);
+            fprintf(stderr, "wobble %g, unit %g, %zu points, outlier %d: %g, %g\n", wobble, unit, count, outlier, least,
+                    farthest / unit);
         drop(&p);
     }
 }
@@ -484,7 +485,8 @@ static void test_outliers(void) {
                 turned = fmin(turned, a[8] * b[8] + a[9] * b[9] + a[10] * b[10]);
             }
             if (desc.kind == GSF_TRAJ_ELLIPSE && !CHECK(turned > cos(0.2)))
-                fprintf(stderr, "trial %d, point at %g: a frame turns by %.3g degrees\n", trial, far[k], acos(turned) * 57.2957795);
+                fprintf(stderr, "trial %d, point at %g: a frame turns by %.3g degrees\n", trial, far[k],
+                        acos(turned) * 57.2957795);
             drop(&with);
         }
         drop(&without);

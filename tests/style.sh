@@ -1,0 +1,24 @@
+#!/usr/bin/env bash
+# style.sh: what .clang-format says and needs no clang-format to hold: no line of C or C++ is longer than its ColumnLimit
+# (lines that begin with a string literal and gsfix_report.c, a page of HTML in such literals, apart), no tabs, no blanks at
+# line ends, a newline at the end of each file.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+limit=$(sed -n 's/^ColumnLimit: //p' .clang-format)
+[ -n "$limit" ] || { echo "style.sh: .clang-format has no ColumnLimit" >&2; exit 1; }
+sources=(*.h {examples,bench,tests,tests/compile}/*.[ch] tests/*.cpp)
+others=(*.md CMakeLists.txt {examples,tests}/CMakeLists.txt {examples,bench,tests,tests/compile}/*.sh bench/*.py tests/*.py)
+status=0
+for file in "${sources[@]}" "${others[@]}"; do
+    [ -e "$file" ] || continue
+    [ -z "$(tail -c 1 "$file")" ] || { echo "$file: no newline at the end"; status=1; }
+done
+LC_ALL=C.UTF-8 awk -v limit="$limit" '
+    function fault(what) { print FILENAME ":" FNR ": " what; bad = 1 }
+    /\t/ { fault("a tab") }
+    /[ \r]$/ && FILENAME !~ /\.md$/ { fault("blanks at the end") }
+    length($0) > limit && FILENAME ~ /\.(h|c|cpp)$/ && FILENAME != "examples/gsfix_report.c" && !/^ *"/ {
+        fault(length($0) " columns, more than " limit)
+    }
+    END { exit bad }' $(ls "${sources[@]}" "${others[@]}" 2> /dev/null) || status=1
+exit $status
