@@ -1,4 +1,4 @@
-// encoders_golden.h - what the parts of golden_encoders share.
+// encoders_golden.h - shared by the parts of golden_encoders.
 #ifndef ENCODERS_GOLDEN_H
 #define ENCODERS_GOLDEN_H
 

@@ -1,9 +1,8 @@
-// fuzz.h - what the fuzz targets share: a context whose allocator traps when a reader asks for more memory than its
-// input justifies (64 times its size and 1 MiB, all live blocks together), and checks of what a reader hands out. Where
-// few bytes may rightly stand for many, fuzz_room says from where on the machine is taken to have no more: the reader must
-// answer with GSF_ERROR_OUT_OF_MEMORY, and no input takes long.
-// tests/fuzz.sh builds and runs all of them.
-// By hand: clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all
+// fuzz.h - shared by the fuzz targets: a context whose allocator traps if a reader allocates more memory than its input
+// justifies (64 times its size plus 1 MiB, summed over all live blocks), and checks of what a reader returns. For
+// formats in which few bytes may legitimately expand to many, fuzz_room sets a limit above which allocations fail: the
+// reader must return GSF_ERROR_OUT_OF_MEMORY, and no input takes long. tests/fuzz.sh builds and runs all targets. By
+// hand: clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all
 //          -DGSFIXER_STATIC -DGSFIXER_IMPLEMENTATION -I. -Itests tests/fuzz_X.c -lm
 //          ./a.out -max_len=8192 tests/corpus/X
 #ifndef FUZZ_H
@@ -54,7 +53,8 @@ static inline uint64_t fuzz_number(const uint8_t* p, int bytes) { // little-endi
     return value;
 }
 
-// A checkpoint with the right checksums, which no mutation would hit: what of `data` is chunks, then the rest as it is.
+// A checkpoint with corrected checksums, which mutations would never match: the chunks in `data`, then the rest
+// unchanged.
 static inline void fuzz_sum_chunks(gsf_context* ctx, const uint8_t* data, size_t size, gsf_buffer* out) {
     size_t at = 12;
     while (at <= size && size - at >= 16) {
@@ -67,8 +67,8 @@ static inline void fuzz_sum_chunks(gsf_context* ctx, const uint8_t* data, size_t
     FUZZ_CHECK(!out->failed);
 }
 
-// One chunk as patches change it: u8 index of the chunk, u8 kind (0 overwrite, 1 cut, 2 append, 3 another tag, 4 left out or
-// doubled), u16 at (little-endian), u8 size and so many bytes.
+// Applies patches to one chunk: u8 index of the chunk, u8 kind (0 overwrite, 1 truncate, 2 append, 3 change the tag, 4
+// drop or duplicate), u16 offset (little-endian), u8 size and that many bytes.
 static inline void fuzz_patch_chunk(gsf_context* ctx, const uint8_t* chunk, size_t bytes, unsigned index, const uint8_t* p,
                                     size_t size, gsf_buffer* out) {
     gsf_buffer body;
@@ -110,8 +110,8 @@ static inline void fuzz_check_error(const gsf_context* ctx, const char* name) { 
     for (const char* c = ctx->error; *c; c++) FUZZ_CHECK((unsigned char)*c >= 0x20);
 }
 
-// File hooks for targets whose reader opens files by name: `user` is a list of files, ended by a NULL name; what a path
-// ends in names the file. What is written becomes the first file, in memory that the target frees.
+// File hooks for targets whose reader opens files by name: `user` is a list of files, terminated by a NULL name; a file
+// is found by the end of the path. Written data become the first file, in memory that the target frees.
 typedef struct fuzz_file { const char* name; const void* data; size_t size; } fuzz_file;
 
 static inline gsf_result fuzz_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
@@ -144,7 +144,7 @@ static inline void fuzz_hook_files(gsf_context* ctx, fuzz_file* files) {
     ctx->io.user = files;
 }
 
-// A scene that was accepted must be usable: cameras checked, tracks in range and ascending, images made.
+// An accepted scene must be usable: valid cameras, tracks in range and ascending, images allocated.
 static inline void fuzz_use_scene(gsf_context* ctx, gsf_scene* scene) {
     FUZZ_CHECK(scene->view_count > 0 && isfinite(scene->origin[0] + scene->origin[1] + scene->origin[2]));
     for (size_t v = 0; v < scene->view_count; v++) {

@@ -1,4 +1,4 @@
-// made_scene.h - the procedural scene of examples/make_scene.c for tests: make_scene(), and how to be rid of its files.
+// made_scene.h - the procedural scene of examples/make_scene.c for tests: make_scene() and removal of its files.
 #ifndef MADE_SCENE_H
 #define MADE_SCENE_H
 

@@ -1,4 +1,4 @@
-// made_spiece.h - a small spiece.model with a piece of every kind, as test and fuzz target of the tokenizer need it.
+// made_spiece.h - a small spiece.model with pieces of every kind, for the test and the fuzz target of the tokenizer.
 #ifndef MADE_SPIECE_H
 #define MADE_SPIECE_H
 

@@ -1,6 +1,6 @@
 // reference_splat.h - double-precision reference of the splat rasterizer: the oracle of tests and benches.
 //
-// Plain scalar C, one pixel after the other, nothing clever; correctness is all it is for. It follows the conventions
+// Plain scalar C, one pixel at a time, without optimisations: it serves correctness only. It follows the conventions
 // of golden/splat/README.md (3D Gaussian Splatting as Inria's CUDA rasterizer computes it):
 //     u = fx X/Z + cx - 0.5 (pixel centres are integers), J with x/z clamped at +-1.3 W/(2 fx), 0.3 px^2 of blur,
 //     front to back in order of Z (ties by index), alpha = min(0.99, o G), skipped below 1/255,
@@ -15,7 +15,7 @@
 //     ref_render_backward(&s, &camera, &o, &image, d_color, d_depth, d_alpha, &grads);
 //     ref_destroy_grads(&grads); ref_destroy_image(&image); ref_destroy_splats(&s);
 //
-// Out of memory ends the program: this is test code.
+// It exits when out of memory, since this is test code.
 #ifndef REFERENCE_SPLAT_H
 #define REFERENCE_SPLAT_H
 
@@ -34,7 +34,7 @@
 #define REF_FRUSTUM 1.3
 #define REF_TILE 16
 #define REF_COMPENSATION_FLOOR 2.5e-5
-// Decision margins are exact below this and reported as this above it (a splat's far surroundings are not visited).
+// Decision margins are exact below this cap and reported as the cap above it (pixels far from a splat are not visited).
 #define REF_MARGIN_CAP 0.0099
 
 typedef struct ref_splats { // parameters in double; arrays are owned
@@ -73,7 +73,7 @@ typedef struct ref_projected { // one splat on the screen; all zero but z when i
     double box[4];          // pixels that can be within REF_MARGIN_CAP of alpha = 1/255: u0 v0 u1 v1
     double near_margin;     // |z / near - 1|
     double official_margin;  // smallest distance of 3 sigma and of the tile rectangle's sides (in tiles) from an
-                             // integer, relative where they are above 1: what Inria's footprint depends on
+                             // integer, relative if above 1: Inria's footprint depends on these
     double kink_margin;     // distance of the colour clamp (absolute), of the x/z clamp and of the compensation's floor
                             // (relative): kinks of gradients
 } ref_projected;
@@ -313,7 +313,7 @@ static inline ref_geometry ref_geometry_of(const ref_splats* s, const gsf_camera
     return g;
 }
 
-// (int) of a quotient by 16, clamped to the grid, as getRect does it but safe for any size.
+// (int) of a quotient by 16, clamped to the grid, as in getRect but safe for any size.
 static inline int ref_tile(double pixels, int grid) {
     return (int)fmin(fmax(trunc(pixels / REF_TILE), 0.0), (double)grid);
 }

@@ -1,4 +1,4 @@
-// restorer_golden.h - what the parts of golden_restorer share.
+// restorer_golden.h - shared by the parts of golden_restorer.
 #ifndef RESTORER_GOLDEN_H
 #define RESTORER_GOLDEN_H
 

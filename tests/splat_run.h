@@ -1,5 +1,6 @@
-// splat_run.h - what the tests of the rasterizer share: machines (a context of a given CPU level and order of work, with a
-// rasterizer), one render with all its gradients, random cameras. Include gsfixer_splat.h, test.h, reference_splat.h first.
+// splat_run.h - shared by the tests of the rasterizer: machines (a context with a given CPU level and order of work,
+// and a rasterizer), one render with all gradients, random cameras. Include gsfixer_splat.h, test.h and
+// reference_splat.h first.
 #ifndef SPLAT_RUN_H
 #define SPLAT_RUN_H
 
@@ -10,8 +11,8 @@ static const int one_worker = 1, many_workers = WORKERS;
 
 static inline size_t workers_of(const void* user) { return (size_t)(*(const int*)user); }
 
-// Job systems; user: the number of workers. The first keeps the natural order. The other disagrees with it as much as the
-// hook's contract allows: last chunk first. In both the workers change from chunk to chunk.
+// Job systems; user: the number of workers. The first one runs chunks in order; the second one deviates as far as the
+// hook's contract allows: last chunk first. Both change the worker from chunk to chunk.
 static inline void for_in_order(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
     for (size_t i = 0; i < chunk_count; i++) body(arg, i, (int)((i * 2654435761u >> 7) % workers_of(user)));
 }
@@ -25,7 +26,7 @@ static inline void counting_free(void* user, void* memory) { (void)user; free(me
 
 typedef struct machine { gsf_context ctx; gsf_rasterizer* rasterizer; const char* name; } machine;
 
-// 0 when the machine lacks the level.
+// Returns 0 if the machine lacks the level.
 static inline int machine_open(machine* m, gsf_cpu_level level, int reversed) {
     memset(m, 0, sizeof *m);
     m->ctx.cpu_level = level;
@@ -42,7 +43,7 @@ static inline int machine_open(machine* m, gsf_cpu_level level, int reversed) {
 
 static inline void machine_close(machine* m) { gsf_splat_destroy_rasterizer(&m->ctx, m->rasterizer); }
 
-// One machine for each level that this computer has, the scalar one first; returns how many.
+// One machine for each level that this computer supports, scalar first; returns their number.
 enum { MACHINES = 2 };
 static inline size_t machines_open(machine levels[MACHINES]) {
     static const gsf_cpu_level known[MACHINES] = {GSF_CPU_SCALAR, GSF_CPU_AVX2};

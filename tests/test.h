@@ -1,4 +1,4 @@
-// test.h - what the test programs share: checks that survive NDEBUG, seeded numbers, golden tensors.
+// test.h - shared by the test programs: checks that survive NDEBUG, seeded random numbers, golden tensors.
 // A test program calls CHECK..., ends with `return test_report();` and exits non-zero if any check failed.
 #ifndef TEST_H
 #define TEST_H
@@ -10,12 +10,12 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { TEST_SKIPPED = 77 }; // exit code that ctest counts as skipped
+enum { TEST_SKIPPED = 77 }; // exit code that CTest reports as skipped
 
 static int test_checks, test_failures;
 
 #define CHECK(condition) test_check((condition) != 0, #condition, __FILE__, __LINE__)
-// Expects gsf_result `code` from `call`; prints ctx->error when it differs.
+// Expects the gsf_result `code` from `call`; prints ctx->error otherwise.
 #define CHECK_RESULT(ctx, call, code) test_check_result((ctx), (int)(call), (int)(code), #call, __FILE__, __LINE__)
 #define CHECK_OK(ctx, call) CHECK_RESULT(ctx, call, GSF_OK)
 #define CHECK_NEAR(actual, expected, tolerance) \
@@ -46,8 +46,8 @@ static inline int test_check_result(gsf_context* ctx, int actual, int expected, 
     return actual == expected;
 }
 
-// Zeroes and initialises a context; GSF_TEST_CPU=scalar|avx2|... (environment) forces a cpu level. For hooks of your own
-// call test_context_zero, fill them in and call gsf_init_context.
+// Zeroes and initialises a context; the environment variable GSF_TEST_CPU=scalar|avx2|... forces a CPU level. To install
+// hooks, call test_context_zero, fill them in and call gsf_init_context.
 static inline void test_context_zero(gsf_context* ctx) {
     memset(ctx, 0, sizeof *ctx);
     const char* level = getenv("GSF_TEST_CPU");
@@ -141,7 +141,7 @@ static inline const char* test_scratch(const char* name) {
 }
 
 // Folder of the real photos (environment GSF_FOX, default data/fox in the shared folder beside the checkout), or NULL.
-// A test without them says so and returns TEST_SKIPPED, or goes on with a scene of its own making.
+// Without them a test prints a message and returns TEST_SKIPPED, or uses a synthetic scene.
 static inline const char* test_fox(void) {
     const char* root = getenv("GSF_FOX");
     if (root && *root) return root;
@@ -284,7 +284,7 @@ static inline float* test_tensor_floats(const test_tensor* t) { // malloc'd floa
     return f;
 }
 
-// One check: max |actual - expected| <= tolerance over `count` values; prints the worst index.
+// One check of max |actual - expected| <= tolerance over `count` values; prints the worst index.
 static inline int test_compare(const char* what, const double* actual, const double* expected, size_t count,
                                double tolerance) {
     size_t worst = 0;

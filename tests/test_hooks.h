@@ -1,5 +1,5 @@
-// test_hooks.h - hooks of tests that look at memory, warnings and workers: an allocator that counts, and fails when told;
-// a log that keeps the last warning; workers that take the chunks in another order.
+// test_hooks.h - hooks for tests of memory, warnings and workers: an allocator that counts and fails on demand; a log that
+// keeps the last warning; workers that process chunks in another order.
 #ifndef TEST_HOOKS_H
 #define TEST_HOOKS_H
 
@@ -33,7 +33,7 @@ static inline void keep_warning(void* user, gsf_log_level level, const char* tex
     warnings++;
 }
 
-// Backwards, and the workers in turn, so that scratch left by other chunks is met again.
+// Backwards, with workers in rotation, so that scratch memory left by other chunks is reused.
 static inline void backwards(void* user, size_t count, gsf_chunk_fn body, void* arg) {
     (void)user;
     for (size_t i = count; i-- > 0;) body(arg, i, (int)(i % 3));

@@ -123,7 +123,7 @@ static inline void train_golden_fill(const test_tensors* file, const char* prefi
     }
 }
 
-// Tolerance relative to each value above 1, else absolute.
+// The tolerance is relative for values above 1, else absolute.
 static inline void train_golden_check(const test_tensors* file, const char* prefix, train_golden_part part,
                                       gsf__model* model, double tolerance) {
     for (size_t t = 0; t < sizeof train_golden_tensors / sizeof *train_golden_tensors; t++) {
@@ -164,8 +164,8 @@ static inline gsf__model train_golden_model(gsf_context* ctx, const test_tensors
 
 // ---- Adam ----------------------------------------------------------------------
 
-// Do the parameters after the steps differ from those before? In the committed files they do not, beyond the rounding
-// to float32 (the moments beside them are right), so there is nothing in them that a step could be held against.
+// Do the parameters after the steps differ from those before? In the committed files they do not, except for rounding to
+// float32 (their moments are correct), so they cannot be used to check a step.
 static inline int train_golden_moved(const test_tensors* file, const char* prefix) {
     double largest = 0.0;
     for (size_t t = 0; t < sizeof train_golden_tensors / sizeof *train_golden_tensors; t++) {
@@ -184,9 +184,9 @@ static inline int train_golden_moved(const test_tensors* file, const char* prefi
     return largest > 1e-5;
 }
 
-// torch.optim.Adam in double precision, from the file's gradients and rates. Its moments are held against the file's,
-// its parameters against the file's where these moved, and `model` (which took the same steps) against both. Row 2 has
-// gradients of 1e-13.
+// torch.optim.Adam in double precision, with the file's gradients and rates. Its moments are compared with the file's,
+// its parameters with the file's if these moved, and `model` (which took the same steps) with both. Row 2 has gradients
+// of 1e-13.
 static inline void train_golden_adam_reference(const test_tensors* file, const test_tensor* lr, gsf__model* model) {
     const int moved = train_golden_moved(file, "after5.f64");
     for (size_t t = 0; t < sizeof train_golden_tensors / sizeof *train_golden_tensors; t++) {
@@ -215,7 +215,7 @@ static inline void train_golden_adam_reference(const test_tensors* file, const t
         test_tensor after = test_get_tensor(file, name);
         test_compare(first.name, m, first.v, value.count, 1e-12);
         test_compare(second.name, v, second.v, value.count, 1e-12);
-        if (moved) test_compare(after.name, value.v, after.v, value.count, 1e-6); // the file's start is not rounded
+        if (moved) test_compare(after.name, value.v, after.v, value.count, 1e-6); // the file's initial values are not rounded
         const size_t width = model->groups[e->group].width;
         const size_t used = e->end < width ? e->end - e->begin : width - e->begin;
         size_t wrong = 0;

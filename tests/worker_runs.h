@@ -1,4 +1,4 @@
-// worker_runs.h - the same work with 1, 2 and 3 workers of a pthread job system, and its outputs compared byte for byte.
+// worker_runs.h - runs the same work with 1, 2 and 3 workers of a pthread job system and compares the outputs byte by byte.
 // Include after examples/job_system.c (with JOB_SYSTEM_ONLY) and test.h.
 #ifndef WORKER_RUNS_H
 #define WORKER_RUNS_H
