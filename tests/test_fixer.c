@@ -43,7 +43,7 @@ static void draw_plane(const gsf_camera* camera, float* color, float* depth) {
         }
 }
 
-// A window of one frame; `window` points at the images beside it.
+// A window of one frame; `window` points to the images next to it.
 typedef struct one_frame {
     gsf_image color, restored, confidence;
     gsf_restore_window window;
@@ -85,7 +85,7 @@ static void test_warp(gsf_context* ctx) {
     double worst = 0.0;
     for (int i = 0; i < N; i++) {
         if (out_confidence[i] <= 0.0f) {
-            CHECK(out_color[3 * i] == 0.25f); // nobody sees it: the render stays
+            CHECK(out_color[3 * i] == 0.25f); // no reference sees it: the render is kept
             continue;
         }
         covered++;
@@ -93,7 +93,7 @@ static void test_warp(gsf_context* ctx) {
     }
     CHECK(covered > N * 9 / 10);
     CHECK_NEAR(worst, 0.0, 0.02); // bilinear sampling of the texture
-    // a reference that is far in front is refuted by the other and loses
+    // a reference with a much smaller depth contradicts the other and is rejected
     for (int i = 0; i < N; i++)
         if (i % W > 20 && i % W < 50) depth[0][i] = 1.5f;
     warp.end_fn(warp.user, ctx);
@@ -105,7 +105,7 @@ static void test_warp(gsf_context* ctx) {
         error += (double)out_confidence[i] * fabs((double)(out_color[3 * i] - color[2][3 * i]));
     }
     CHECK(weight > 0.5 * N && error / weight < 0.02);
-    // the frame that is a reference is that photo
+    // a frame with a reference's pose is that photo
     const int32_t known = 1;
     frame.window.cameras = &cameras[1];
     frame.window.reference_index = &known;
@@ -123,7 +123,7 @@ static void test_warp(gsf_context* ctx) {
     gsf_splat_destroy_warp(ctx, &warp);
 }
 
-// References with renders: what they lack of the photos is added to the frame, and a difference of exposure between photos
+// References with renders: the residual of the photos is added to the frame, a difference in exposure between photos
 // and frame is not. The splats here show the plane without its green, and the frame's exposure is 0.1 brighter.
 static void test_warp_residual(gsf_context* ctx) {
     enum { W = 96, H = 64, N = W * H };
@@ -161,7 +161,7 @@ static void test_warp_residual(gsf_context* ctx) {
     }
     CHECK(whole > N * 8 / 10);
     CHECK_NEAR(worst, 0.0, 0.02);
-    // the reference far off in viewing direction carries almost nothing by itself
+    // a reference with a very different viewing direction contributes almost nothing
     warp.end_fn(warp.user, ctx);
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references + 2, 1));
     CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
@@ -173,8 +173,8 @@ static void test_warp_residual(gsf_context* ctx) {
     gsf_splat_destroy_warp(ctx, &warp);
 }
 
-// A splat before the plane that both photos look through: the frame takes what they show behind it, and trusts that. One
-// photo alone, or one that shows the splat in its place, does not move it.
+// A splat in front of the plane that both photos see through: the frame takes what they show behind it, with full
+// confidence. A single photo, or one that shows the splat in place, does not change it.
 static void test_warp_refutes(gsf_context* ctx) {
     enum { W = 96, H = 64, N = W * H };
     static float color[3][3 * N], depth[3][N], shown_color[3 * N], shown_depth[N], out_color[3 * N], out_confidence[N];
@@ -212,10 +212,10 @@ static void test_warp_refutes(gsf_context* ctx) {
                 CHECK(photos == 2 ? out_confidence[at] > 0.95f : out_confidence[at] < 0.8f);
             }
         CHECK_NEAR(worst, 0.0, photos == 2 ? 0.03 : 1e-6);
-        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // beside it nothing changes
+        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // next to it, nothing changes
         warp.end_fn(warp.user, ctx);
     }
-    // the second photo shows leaves there, too, none further than 4 pixels away: then it stays
+    // the second photo shows leaves there as well, at most 4 pixels away: then it stays
     for (int i = 0; i < N; i++)
         if (i % W % 8 < 4) depth[1][i] /= 1.2f;
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
@@ -281,7 +281,7 @@ static gsf_result repair_begin(void* user, gsf_context* ctx, const gsf_reference
     return GSF_OK;
 }
 
-// All of the photo's field of view is in the frame, and nothing else where it is squashed to the frame's size.
+// The frame contains the photo's full field of view and, if it is squashed to the frame's size, nothing else.
 static void check_view(const repair* r, const gsf_camera* camera) {
     const gsf_camera* photo = &r->views[0].camera;
     const double left = camera->cx - photo->cx / photo->fx * camera->fx, top = camera->cy - photo->cy / photo->fy * camera->fy;
@@ -291,7 +291,7 @@ static void check_view(const repair* r, const gsf_camera* camera) {
         CHECK_NEAR(top, 0.0, 1e-9);
         CHECK_NEAR(right, camera->width, 1e-9);
         CHECK_NEAR(bottom, camera->height, 1e-9);
-    } else if (r->also.width_max) { // square pixels in a frame of one size: as large as it goes
+    } else if (r->also.width_max) { // square pixels in a frame of fixed size: scaled as large as possible
         CHECK(left > -1e-9 && top > -1e-9 && right < camera->width + 1e-9 && bottom < camera->height + 1e-9);
         CHECK(left < 1e-9 || top < 1e-9);
     }
@@ -434,7 +434,7 @@ static gsf_result masked_restore(void* user, gsf_context* ctx, const gsf_restore
 
 static void masked_end(void* user, gsf_context* ctx) { (void)user; (void)ctx; }
 
-// A photo's pixels that do not count are the splats' render in what restorers get, and have no depth there.
+// Masked pixels of a photo are replaced by the splats' render in what restorers get, and have no depth there.
 static void test_masked_references(gsf_context* ctx) {
     static repair r;
     static uint8_t weight[PIXELS];
@@ -465,7 +465,7 @@ static void test_masked_references(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-static void test_desc(gsf_context* ctx) { // what the loop says it runs by
+static void test_desc(gsf_context* ctx) { // the loop's desc with defaults filled in
     static repair r;
     gsf_fix_desc given, used;
     gsf_fixer* fixer;
@@ -481,7 +481,7 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
           used.train.render.near_plane == 0.01f * used.train.extent);
     gsf_splat_destroy_fixer(ctx, fixer);
     given.lambda = -1.0f; // 0
-    given.train.iterations = 150; // only one iteration comes shortly before a densification: rounds stay apart
+    given.train.iterations = 150; // only one iteration is shortly before a densification: rounds stay separate
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
     used = gsf_splat_get_fixer_desc(fixer);
     CHECK(used.first_round == 99 && used.last_round == 125 && used.lambda == 0.0f);
@@ -489,10 +489,10 @@ static void test_desc(gsf_context* ctx) { // what the loop says it runs by
     given = repair_desc();
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, NULL, &fixer));
     used = gsf_splat_get_fixer_desc(fixer);
-    CHECK(used.rounds == 0 && used.train.densify_interval == 20); // nobody to restore
+    CHECK(used.rounds == 0 && used.train.densify_interval == 20); // no restorer
     gsf_splat_destroy_fixer(ctx, fixer);
 
-    // descs that were not zeroed: each canary by itself, and a struct full of rubbish
+    // descs that were not zeroed: each canary separately, and a struct full of garbage
     uint32_t* const canaries[] = {&given._start_canary, &given._end_canary, &given.train._start_canary,
                                   &given.train._end_canary, &given.train.render._start_canary,
                                   &given.train.render._end_canary};
@@ -590,11 +590,10 @@ static void test_loop(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-// A restorer that was made for 13 frames of 96 x 40, for which the photos' 48 x 40 are squashed; at --quality fast's kind of
-// limit a smaller size with the same view; and one that keeps pixels square in frames of that one size, of which a half is
-// margin that is not to be trained on.
-// What path can be flown is known before anything is trained: a rig whose axes are parallel flies, cameras at one point are
-// refused at once, unless there are no rounds to fly in.
+// A restorer that was made for 13 frames of 96 x 40, for which the photos' 48 x 40 are squashed; at --quality fast's
+// kind of limit a smaller size with the same view; and one that keeps pixels square in frames of that one size, of
+// which a half is margin that is not to be trained on. Whether a path is possible is checked before any training: a rig
+// with parallel axes is accepted, coincident cameras are refused at once, unless there are no rounds.
 static void test_rigs(gsf_context* ctx) {
     for (int rig = 0; rig < 2; rig++) {
         static repair r;
@@ -614,7 +613,7 @@ static void test_rigs(gsf_context* ctx) {
         }
         gsf_fixer* fixer = NULL;
         const gsf_result made = gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer);
-        CHECK(made == (rig ? GSF_ERROR_DEGENERATE : GSF_OK)); // turned where it stands
+        CHECK(made == (rig ? GSF_ERROR_DEGENERATE : GSF_OK)); // rotated in place
         gsf_fix_stats now;
         memset(&now, 0, sizeof now);
         while (fixer && now.stage != GSF_FIX_DONE)
@@ -627,7 +626,7 @@ static void test_rigs(gsf_context* ctx) {
     }
 }
 
-// A given path is flown in every round: its poses in order, spread over the frames, through the first photo's camera.
+// A given path is used in every round: its poses in order, distributed over the frames, with the first photo's camera.
 static void test_given_path(gsf_context* ctx) {
     static const size_t counts[] = {1, 5, 18, 40}; // of 18 frames
     static repair r;
@@ -728,7 +727,7 @@ static void test_trouble(gsf_context* ctx) {
     gsf_fix_stats stats;
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &calm));
     CHECK(run_steps(ctx, calm, 1000, NULL));
-    // a restorer that fails once, and a cancel in between, change nothing in the end
+    // a restorer that fails once, and a cancellation in between, do not change the final result
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough));
     r.windows = 0;
     r.fail_at = 2;
@@ -748,7 +747,7 @@ static void test_trouble(gsf_context* ctx) {
     CHECK(same_splats(calm, rough));
     gsf_splat_destroy_fixer(ctx, rough);
     r.fail_at = 0;
-    // every window agrees well enough with the references when next to nothing is asked for
+    // with a very low threshold, every window agrees well enough with the references
     desc.skip_psnr = 1.0f;
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough));
     r.checked = 0;
@@ -783,8 +782,8 @@ static int saves_as(gsf_context* ctx, const gsf_fixer* fixer, const gsf_buffer* 
     return same;
 }
 
-// A checkpoint that cannot be restored for want of memory leaves the loop as it was; a round that cannot be planned after
-// one was restored is planned by the next step.
+// A checkpoint that cannot be restored because memory is short leaves the loop unchanged; a round that could not be
+// planned after a restore is planned by the next step.
 static void test_failed_restore(void) {
     static repair r;
     gsf_context ctx;
@@ -832,8 +831,8 @@ static void test_failed_restore(void) {
     CHECK(memory.live == 0);
 }
 
-// The start is the truth, so what photos 0 and 1 show is what is rendered there. Photos 2 and 3 show something else,
-// each its own: the references do not explain what lies between them.
+// The start is the ground truth, so photos 0 and 1 match their renders. Photos 2 and 3 each show something else: the
+// references do not explain what lies between them.
 static void mixed_setup(gsf_context* ctx, repair* r) {
     repair_setup(ctx, r);
     uint64_t seed = 11;
@@ -913,7 +912,7 @@ static void test_mixed_windows(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-// A host's restorer that has warp do the work: what its query says, and nothing else, tells the loop what to make of it.
+// A host's restorer that delegates to warp: only what its query reports tells the loop how to treat it.
 typedef struct wrapped { gsf_restorer warp; int hides, begun, restored; } wrapped;
 
 static gsf_result wrapped_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
@@ -949,7 +948,7 @@ static void test_explaining_restorer(gsf_context* ctx) {
     desc.first_round = 3;
     desc.last_round = 6;
     desc.skip_psnr = 17.0f; // two of the four windows agree, in each of the two rounds
-    for (int i = 0; i < 3; i++) { // it explains; it does not say so; warp itself
+    for (int i = 0; i < 3; i++) { // reports `explains`; does not report it; warp itself
         wrapped* w = all + i;
         const gsf_restorer host = {sizeof host, "wrapped", w, wrapped_query, wrapped_begin, wrapped_restore, wrapped_end};
         const gsf_restorer* used = i == 2 ? &w->warp : &outer[i];

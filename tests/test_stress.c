@@ -6,10 +6,10 @@
 //     test_stress --json     the same, and on standard output only the table: one JSON object per scene and CPU level
 //     test_stress --long     the long run with all its 30,000 iterations instead of 3,000
 //
-// A pixel is clear when the reference's yes/no decisions in it (alpha = 1/255 and 0.99, T = 1e-4) keep a margin of 1e-4
-// (relative) and neighbours in its blending order differ by more than 1e-6 in depth: that is ten times what float32 can
-// tell apart, and the fewest pixels are excused. Only clear pixels have loss weights, so gradients are compared under the
-// same decisions. Limits of ordinary scenes: see `ordinary`.
+// A pixel is clear if the reference's binary decisions in it (alpha = 1/255 and 0.99, T = 1e-4) have a margin of 1e-4
+// (relative) and neighbours in its blending order differ by more than 1e-6 in depth: ten times what float32 can
+// resolve, so that few pixels are excluded. Only clear pixels have loss weights, so gradients are compared under the
+// same decisions. Limits for ordinary scenes: see `ordinary`.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
 #include "test.h"
@@ -27,7 +27,7 @@ static size_t level_count;
 typedef struct row { // worst errors of one scene at one CPU level; -1 = not measured
     const char *test, *level;
     char name[64];
-    size_t pixels, unclear;   // unclear: with a decision that float32 may take otherwise
+    size_t pixels, unclear;   // unclear: with a decision that may differ in float32
     double clear_error;       // largest |colour or alpha - reference|, colour over max(1, brightest)
     double unclear_error;
     double depth_error;       // of clear pixels, relative to the largest depth
@@ -80,7 +80,7 @@ static double now(void) {
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
-// One line: what the rows from `first` on have as their worst.
+// One line with the worst values of the rows from `first` on.
 static void print_worst(FILE* out, const char* test, size_t first, double seconds) {
     row worst;
     memset(&worst, 0, sizeof worst);
@@ -107,7 +107,7 @@ static void print_worst(FILE* out, const char* test, size_t first, double second
 
 // ---- scenes --------------------------------------------------------------------
 
-// Splats are drawn in the camera's image: u, v evenly over a little more than the picture, z over a range.
+// Splats are placed in the camera's image: u, v uniform over slightly more than the image, z over a range.
 typedef struct recipe { // zero = the default in brackets
     const char* name;
     size_t count;                 // [200]
@@ -131,10 +131,10 @@ typedef struct limits {
     double clear, unclear, share, gradient; // share: of unclear pixels
 } limits;
 
-// The default quality that is promised.
+// The guaranteed default quality.
 static const limits ordinary = {2e-5, 8e-3, 1e-3, 2e-4};
-// The same where many large splats lie over each other: every blend makes about 1e-4 of the pixels unclear, so their number
-// says nothing about the rasterizer.
+// The same for many large overlapping splats: every blend makes about 1e-4 of the pixels unclear, so their number says
+// nothing about the rasterizer.
 static const limits crowded = {2e-5, 8e-3, 1, 2e-4};
 
 typedef struct scene {
@@ -142,7 +142,7 @@ typedef struct scene {
     gsf_camera camera;
     gsf_render_desc desc;
     const char* name;
-    int exact_ties; // depths are either the same number or far apart: order is never unclear
+    int exact_ties; // depths are either equal or far apart: the order is never unclear
 } scene;
 
 static double or_default(double value, double fallback) { return value != 0 ? value : fallback; }
@@ -201,8 +201,8 @@ static void draw_splat(scene* s, const recipe* r, size_t i, uint64_t* state) {
         s->splats.sh[3 * K * i + k] = (float)test_random_in(state, k < 3 ? -1.5 : -0.15, k < 3 ? 1.5 : 0.15);
 }
 
-// Whether a splat is drawn at all, and on which side of a kink of the gradient it is, are decisions, too: splats are drawn
-// again until theirs are clear.
+// Whether a splat is drawn at all, and on which side of a kink of the gradient it is, are decisions as well: splats are
+// re-drawn at random until theirs are clear.
 static void draw_clear_splat(scene* s, const recipe* r, size_t i, uint64_t* state) {
     for (int attempt = 0; attempt < 1000; attempt++) {
         draw_splat(s, r, i, state);
@@ -269,8 +269,8 @@ static oracle oracle_make(const scene* s) {
         o.farthest = fmax(o.farthest, o.image.depth[i]);
     }
     for (size_t i = 0; i < o.pixels; i++) {
-        // Expected depth is a quotient by alpha, which float32 knows to 6e-8: its gradient fades with alpha, as that of a
-        // loss that does not ask for the depth of nothing. Depths are measured in units of the farthest.
+        // Expected depth is divided by alpha, which float32 represents to 6e-8: its gradient is faded out with alpha,
+        // like that of a loss that ignores the depth of empty pixels. Depths are in units of the farthest one.
         o.l.d_depth[i] = (double)(float)(o.l.d_depth[i] * (1 - o.image.T[i]) / fmax(o.farthest, 1e-30));
         o.skip[i] = o.image.margin[i] < MARGIN || (!s->exact_ties && o.image.depth_gap[i] < DEPTH_GAP);
         if (!o.skip[i]) continue;
@@ -309,8 +309,9 @@ static void difference(const float* actual, const double* expected, size_t count
     *error = sqrt(*error);
 }
 
-// Relative L2 of the worst parameter tensor. Log-scales and quaternions have the same unit; where all splats are round the
-// gradient of the quaternions vanishes, so it counts as at least a hundredth of that of the scales.
+// Relative L2 of the worst parameter tensor. Log-scales and quaternions have the same unit; if all splats are
+// spherical, the gradient of the quaternions vanishes, so its norm is taken as at least a hundredth of that of the
+// scales.
 static double gradient_error(const oracle* o, const result* r) {
     const size_t n = o->s->splats.count;
     const struct { const float* actual; const double* expected; size_t rows, width; } list[] = {
@@ -452,7 +453,7 @@ static void test_opacities(void) {
 
 // ---- stacks, quaternions, offsets, ties, image sizes, values that are no numbers ---
 
-// Splats as large as the image and larger, one behind the other in mixed order.
+// Splats as large as the image and larger, one behind another in shuffled order.
 static void test_stacks(void) {
     const recipe list[] = {
         {.name = "5000 layers of 0.0043", .logit_low = -5.45, .logit_high = -5.44, .count = 5000},
@@ -614,7 +615,7 @@ static void test_not_finite(void) {
     }
 }
 
-// Finite, but out of all measure: picture, depth, alpha and the other splats' gradients stay finite.
+// Finite but extreme values: image, depth, alpha and the other splats' gradients stay finite.
 static void test_huge_values(void) {
     enum { PARAMETERS = 3 + 3 + 4 + 1 + 3 };
     static const float values[] = {1e30f, -1e30f, 3e38f, -3e38f, 100, -100, 1e-42f, -1e-42f};
@@ -666,8 +667,8 @@ static void test_huge_values(void) {
 
 // ---- the oracle swept over conditions ------------------------------------------
 
-// Aspect ratio of the splats, near plane (and with it where they begin), and focal length over the image's longer side: from
-// 120 degrees wide to a telescope of half a degree. Cut-offs are those of production.
+// Aspect ratio of the splats, near plane (and with it where they begin), and focal length over the image's longer side:
+// from 120 degrees wide to a telescope of half a degree. Cut-offs are those of production.
 static void test_sweep(void) {
     static const double aspects[] = {1, 10, 100, 1e3, 1e4}, nears[] = {0.01, 0.2, 20}, focals[] = {0.3, 1, 10, 100};
     const size_t first = row_count;
@@ -703,8 +704,8 @@ static void test_sweep(void) {
 
 // ---- culling, by brute force ---------------------------------------------------
 
-// Every splat alone in the picture, the others hidden: the set of pixels that it reaches is that of the reference, which
-// looks at every pixel. So no tile list, no row span and no image border loses a (splat, pixel) pair, or adds one.
+// Every splat alone in the image, the others hidden: the set of pixels that it reaches is that of the reference, which
+// tests every pixel. So no tile list, row span or image border drops or adds a (splat, pixel) pair.
 static void test_culling(void) {
     static const recipe list[] = {
         {.name = "ordinary"},
@@ -819,8 +820,9 @@ static double relative_l2(const float* a, const float* b, double b_scale, size_t
     return error > 0 ? sqrt(error / size) : error;
 }
 
-// The base scene's picture and gradients against those of the same scene scaled by `scale`. Its parameters are rounded anew
-// (log-scales by 2^-24 of their value, which scales a splat by up to 5e-7), so the limits are those of the accuracy.
+// The base scene's picture and gradients against those of the same scene scaled by `scale`. Its parameters are rounded
+// anew (log-scales by 2^-24 of their value, which scales a splat by up to 5e-7), so the limits are those of the
+// accuracy.
 static void compare_scaled(const char* name, const machine* m, const oracle* base, const result* a, const result* b,
                            double scale) {
     row* w = add_row("invariance", name, m->name);
@@ -945,9 +947,9 @@ static double difference_error(const difference_case* d, double* parameters, con
     return sqrt(error / size);
 }
 
-// Gradients over a background that is not black, in every mode: the reference's against central differences in double, the
-// rasterizer's against the reference's. Inria's gradient is not a derivative where it passes the 0.99 clamp or holds a
-// clamped x/z: where it should be one, no splat does either.
+// Gradients over a background that is not black, in every mode: the reference's against central differences in double,
+// the rasterizer's against the reference's. Inria's gradient is not a derivative where it passes the 0.99 clamp or
+// holds a clamped x/z: where it should be one, no splat does either.
 static void test_backgrounds(void) {
     static const recipe modes[] = {
         {.name = "plain", .logit_high = 7},
@@ -1149,8 +1151,8 @@ static void test_training_bits(void) {
 
 // ---- invisible splats ----------------------------------------------------------
 
-// The splats of `t` with others between them that no camera sees: behind all of them, beside every picture, or fainter than
-// 1/255. Visible ones have odd ids, the others even ones below the largest, so that new splats get the same ids.
+// The splats of `t` with others between them that no camera sees: behind all of them, beside every picture, or fainter
+// than 1/255. Visible ones have odd ids, the others even ones below the largest, so that new splats get the same ids.
 static gsf_splats interleave(gsf_context* ctx, const gsf_splats* start) {
     gsf_splats all;
     uint64_t state = 31;
@@ -1178,8 +1180,8 @@ static gsf_splats interleave(gsf_context* ctx, const gsf_splats* start) {
     return all;
 }
 
-// Every splat of the smaller model is in the larger one, bit for bit: parameters, moments, gradients, statistics. Others in
-// the larger one must be of those that were put in. Both are in the same order.
+// Every splat of the smaller model is in the larger one, bit for bit: parameters, moments, gradients, statistics.
+// Others in the larger one must be of those that were put in. Both are in the same order.
 static size_t compare_models(const gsf__model* small, const gsf__model* large, int iteration, const char* level) {
     size_t j = 0, wrong = 0;
     for (size_t i = 0; i < small->count; i++, j++) {
@@ -1242,8 +1244,8 @@ static void test_invisible(void) {
 
 // ---- training at other scales ---------------------------------------------------
 
-// The scene, its cameras and near plane scaled or moved together: training goes the same way but for rounding, which it
-// amplifies, so losses are compared and not bits.
+// The scene with its cameras and near plane, scaled or moved together: training is the same up to rounding, which it
+// amplifies, so losses are compared instead of bits.
 static void test_scaled_training(void) {
     static const double scales[] = {1, 1.0 / 1024, 1e-3, 1e3, 1};
     for (size_t k = 0; k < level_count; k++) {
@@ -1293,7 +1295,8 @@ static void test_scaled_training(void) {
 
 static int long_run; // all 30,000 iterations
 
-// Every parameter and moment stays finite, nothing is rejected, the number of splats stays in bounds, and it learns.
+// Every parameter and moment stays finite, nothing is rejected, the number of splats stays bounded, and the loss
+// decreases.
 static void test_long_run(void) {
     const int32_t iterations = long_run ? 30000 : 3000;
     for (size_t k = 0; k < level_count; k++) {

@@ -1,5 +1,5 @@
-// test_trainer.c - loss and regularisers by finite differences; training on a scene made here: it learns, it is the
-// same bits for any workers, after a resume and after failures; bad input is refused.
+// test_trainer.c - loss and regularisers by finite differences; training on a synthetic scene: it learns, and is
+// bit-identical for any workers, after a resume and after failures; bad input is refused.
 // gcc -O2 -std=c11 -I. -Itests tests/test_trainer.c -lm
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -136,9 +136,9 @@ static double exact_ssim(int width, int height, const float* x, const float* t, 
 enum { LOSS_NOISE, LOSS_DARK, LOSS_SMOOTH, LOSS_BRIGHT, LOSS_LEVEL, LOSS_FLAT_LEVEL, LOSS_FLAT, LOSS_FLAT_FAR, LOSS_EDGES,
        LOSS_EDGES_MOVED, LOSS_HDR, LOSS_CASES };
 
-// What the loss may be off: the mean SSIM, its gradient (as a share of the largest one) in images of 37 x 141 and in
-// smaller ones, and the gradient with weights. At most twice what was measured over all CPU levels. Where images are flat
-// or equal on both sides of an edge, the gradient is what C2 = 9e-4 leaves of large terms.
+// Error bounds of the loss: the mean SSIM; its gradient (relative to the largest one) in images of 37 x 141 and in
+// smaller ones; and the gradient with weights. At most twice the values measured over all CPU levels. Where images are
+// flat or equal on both sides of an edge, the gradient is what C2 = 9e-4 leaves of large terms.
 static const struct loss_bar { const char* name; double ssim, gradient, small_gradient, weighted_gradient; }
     loss_bars[LOSS_CASES] = {
         {"noise", 2.5e-8, 4.2e-7, 4.4e-7, 7.3e-7},
@@ -167,8 +167,8 @@ static void loss_values(int kind, int width, int i, uint64_t* state, float* phot
     *render = (float)pairs[kind][1];
 }
 
-// Mean SSIM and gradient against double precision, whatever is in the images and however small they are. Three bands of
-// rows, the last ones in any order by any worker: the same bits.
+// Mean SSIM and gradient against double precision, for any image content and small sizes. Three bands of rows, the last
+// ones in any order by any worker: bit-identical.
 static void test_loss_accuracy(gsf_cpu_level level) {
     enum { N = 3 * 37 * 141 };
     static const int sizes[][2] = {{37, 141}, {1, 1}, {2, 1}, {1, 9}, {11, 3}, {13, 29}};
@@ -209,8 +209,8 @@ static void test_loss_accuracy(gsf_cpu_level level) {
     gsf__loss_destroy_scratch(&shuffled, &another);
 }
 
-// The same with weights, a third of which is 0: black in both images of the reference, whatever is rendered there, and
-// without a gradient. What is rendered there changes no bit.
+// The same with weights, a third of which is 0: black in both images of the reference, and without a gradient. What is
+// rendered there changes no bit.
 static void test_loss_weights(gsf_cpu_level level) {
     enum { W = 37, H = 141, PIXELS = W * H, N = 3 * PIXELS };
     static float render[N], photo[N], d[N], other[N], weight[PIXELS];
@@ -303,7 +303,7 @@ static gsf__model make_model(gsf_context* ctx, size_t count, int32_t sh_degree) 
     return model;
 }
 
-// Bad gradients do nothing and are counted, rows behind stay untouched.
+// Bad gradients have no effect and are counted; rows after them are unchanged.
 static void test_adam_rejects(gsf_context* ctx) {
     for (int32_t degree = 0; degree <= 3; degree++) {
         gsf__model model = make_model(ctx, 37, degree);
@@ -320,7 +320,7 @@ static void test_adam_rejects(gsf_context* ctx) {
         CHECK(sh->value[2] == before && model.groups[GSF__QUATS].value[147] == quat && sh->m[2] == 0.0f);
         CHECK_NEAR(model.groups[GSF__MEANS].value[0], mean + 0.5f, 1e-6); // the first step is the rate
         CHECK(sh->grad[37 * sh->width] == 1.0f && sh->value[37 * sh->width] == 0.0f);
-        rates.means = 5e37; // would leave the floats
+        rates.means = 5e37; // would overflow float
         model.groups[GSF__MEANS].value[0] = 3e38f;
         model.groups[GSF__MEANS].grad[0] = -2.0f;
         CHECK(gsf__adam_step(ctx, &model, &rates, 2, degree + 1) == 1);
@@ -329,7 +329,7 @@ static void test_adam_rejects(gsf_context* ctx) {
     }
 }
 
-static void test_adam_bands(gsf_context* ctx) { // leaving out bands that never had a gradient changes nothing
+static void test_adam_bands(gsf_context* ctx) { // skipping bands that never had a gradient changes nothing
     for (int32_t degree = 1; degree <= 3; degree++)
         for (int32_t bands = 1; bands <= degree; bands++) {
             gsf__model a = make_model(ctx, 21, degree), b = make_model(ctx, 21, degree);
@@ -353,8 +353,9 @@ static double relative(float actual, double expected) { // a value around zero: 
     return fabs((double)actual - expected) / fmax(fabs(expected), 0.2);
 }
 
-// SH rows in blocks that rest for 1 to 500 steps against rows that take part in every one, both with the same gradients, of
-// sizes from far below eps on; as values are when their block is drawn and at the end. Also the dense model in double.
+// SH rows in blocks that are skipped for 1 to 500 steps against rows updated in every step, both with the same
+// gradients, of magnitudes from far below eps upwards; compared when their block is drawn and at the end. Also the
+// dense model in double.
 static void test_lazy_adam(gsf_context* ctx) {
     enum { BLOCKS = 33, DRAWN = 3, COUNT = BLOCKS * GSF__BLOCK - 7, STEPS = 1000, WIDE = 48 };
     gsf__model dense = make_model(ctx, COUNT, 3), lazy = make_model(ctx, COUNT, 3);
@@ -373,7 +374,7 @@ static void test_lazy_adam(gsf_context* ctx) {
     for (int32_t t = 1; t <= STEPS; t++) {
         const int32_t bands = 1 + t / 150 < 4 ? 1 + t / 150 : 4;
         for (size_t i = 0; i < BLOCKS; i++) {
-            if (left[i]-- <= 0) { // rests of 1 to 500 steps, short ones oftener; drawn for 1 to 20
+            if (left[i]-- <= 0) { // skipped for 1 to 500 steps, mostly few; drawn for 1 to 20
                 drawn[i] = !drawn[i];
                 left[i] = (int)exp(test_random_in(&random, 0.0, drawn[i] ? log(20.0) : log(500.9))) - 1;
                 if (!drawn[i] && left[i] + 1 > longest) longest = left[i] + 1;
@@ -469,7 +470,7 @@ static void test_regularisers(gsf_context* ctx) {
     gsf__model_destroy(ctx, &model);
 }
 
-static void test_cap(gsf_context* ctx) { // near the largest number of splats those with the largest gradients grow
+static void test_cap(gsf_context* ctx) { // close to max_splats, only splats with the largest gradients are densified
     gsf__model model = make_model(ctx, 100, 0);
     for (size_t i = 0; i < 100; i++) {
         model.grad_sum[0][i] = (float)((i * 37) % 100);
@@ -499,7 +500,7 @@ static void test_cap(gsf_context* ctx) { // near the largest number of splats th
 
 // ---- MCMC on a bare model --------------------------------------------------------
 
-// The copies together: as opaque in the middle, and as much along a ray through it, as the one splat was.
+// The copies together are as opaque as the single splat was, in the centre and on average along a ray through it.
 static void test_mcmc_share(void) {
     static const double opacities[] = {0.006, 0.3, 0.9, 0.9999};
     static const uint32_t numbers[] = {1, 2, 3, 10, 51};
@@ -510,7 +511,7 @@ static void test_mcmc_share(void) {
             double each, sum = 0.0, ray = 0.0;
             const double factor = gsf__mcmc_share(1.0 - o, n, &each);
             CHECK_NEAR(1.0 - pow(1.0 - each, n), o, 1e-12);
-            for (uint32_t i = 1; i <= n; i++) { // the formula of the paper as it stands
+            for (uint32_t i = 1; i <= n; i++) { // the paper's formula, verbatim
                 double binomial = 1.0;
                 for (uint32_t j = 0; j < i; j++) {
                     sum += binomial * (j % 2 ? -1.0 : 1.0) * pow(each, j + 1) / sqrt(j + 1.0);
@@ -524,7 +525,8 @@ static void test_mcmc_share(void) {
         }
 }
 
-// Faint splats become copies of others, new ones come up to the budget, and what lies at a place stays as opaque.
+// Faint splats are relocated as copies of others, new ones are added up to the budget, and opacity at each position is
+// preserved.
 static void test_mcmc_densify(gsf_context* ctx) {
     enum { COUNT = 400, DEAD = 90, BUDGET = 415 };
     gsf__model model = make_model(ctx, COUNT, 1);
@@ -532,7 +534,7 @@ static void test_mcmc_densify(gsf_context* ctx) {
     double before[COUNT];
     for (size_t i = 0; i < COUNT; i++) {
         if (i % 4 == 0 && i < 4 * DEAD) logits[i] = -6.0f - (float)i;
-        model.groups[GSF__MEANS].value[3 * i] = (float)i; // says where a copy came from
+        model.groups[GSF__MEANS].value[3 * i] = (float)i; // identifies a copy's source
         before[i] = 1.0 / (1.0 + exp(-(double)logits[i]));
         for (int g = 0; g < GSF__GROUPS; g++)
             for (size_t k = 0; k < model.groups[g].width; k++)
@@ -582,7 +584,7 @@ static void test_mcmc_densify(gsf_context* ctx) {
     gsf__model_destroy(ctx, &model);
 }
 
-// The spread of the noise is the covariance times the rate, and faint splats have all of it, opaque ones none.
+// The covariance of the noise is that of the splat times the rate; faint splats get the full noise, opaque ones none.
 static void test_mcmc_noise(gsf_context* ctx) {
     enum { COUNT = 4000 };
     gsf__model model = make_model(ctx, COUNT, 0);
@@ -648,7 +650,7 @@ static void render_to(gsf_context* ctx, const gsf_splats* splats, const gsf_came
     gsf_splat_destroy_rasterizer(ctx, rasterizer);
 }
 
-// Five copies are drawn like the one they share: in the middle, and along the row through it. (Each ends at 3 sigma.)
+// Five copies render like the splat they share: in the centre, and along the row through it. (Each ends at 3 sigma.)
 static void test_mcmc_render(gsf_context* ctx) {
     static float one[WIDTH * HEIGHT * 3], five[WIDTH * HEIGHT * 3];
     const gsf_camera camera = make_camera(0.0, 0.0, WIDTH, HEIGHT);
@@ -720,8 +722,8 @@ static scene make_scene(gsf_context* ctx) {
     return s;
 }
 
-// The pixels left of the middle are garbage and weigh nothing: which garbage changes no bit, and the rest is learnt as if the
-// photos were smaller. Weights in bytes are those in floats.
+// The pixels in the left half are garbage with weight zero: their values change no bit, and the rest is learnt as if
+// the photos were smaller. Weights in bytes give the same result as in floats.
 static void test_masked_training(gsf_context* ctx, const scene* s) {
     enum { PIXELS = WIDTH * HEIGHT };
     static float photos[VIEWS][3 * PIXELS], shown[3 * PIXELS], weight[PIXELS];
@@ -878,7 +880,7 @@ static void test_learns(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
-// A third of the splats starts where nothing is to be seen, too faint to learn.
+// A third of the splats start where nothing is visible, too faint to learn.
 static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
     enum { BUDGET = SPLATS + 11 };
     gsf_train_desc desc;
@@ -915,7 +917,7 @@ static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy(ctx, &start);
 }
 
-// Every photo once in each round; each render counts as one visit.
+// Each photo is used once per permutation; each render counts as one visit.
 static void test_order_and_visits(gsf_context* ctx, const scene* s) {
     gsf_train_desc desc = busy_desc();
     desc.densify_from = 1000;
@@ -935,7 +937,7 @@ static void test_order_and_visits(gsf_context* ctx, const scene* s) {
     take_steps(ctx, trainer, 3);
     size_t three = 0;
     for (size_t i = 0; i < trainer->model.count; i++) three += trainer->model.visits[0][i] == 3;
-    CHECK(three == SPLATS); // all are in sight of all cameras
+    CHECK(three == SPLATS); // all are visible in all cameras
     CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
     gsf_splat_set_restored_weight(trainer, 0.0f);
     take_steps(ctx, trainer, 1);
@@ -953,9 +955,9 @@ static void test_order_and_visits(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
-// A restored view's gradient is that of the same photo times lambda.
-// The first step's statistic is the norm of the gradient that backward makes of the same picture; without cancelling it is
-// never smaller, and for most splats larger.
+// The gradient of a restored view is that of the same photo times lambda. The first step's statistic is the norm of the
+// gradient from the backward pass of the same image; without cancellation it is never smaller, and for most splats
+// larger.
 static void test_absolute_statistic(gsf_context* ctx, const scene* s) {
     float sums[2][SPLATS];
     for (int absolute = 0; absolute < 2; absolute++) {
@@ -1141,7 +1143,7 @@ static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
         take_steps(ctx, trainer, stops[k]);
         gsf_buffer state = save_state(ctx, trainer);
         gsf_splat_destroy_trainer(ctx, trainer);
-        // the caller gives views and settings again, some before and some after
+        // the caller provides views and settings again, some before and some after
         gsf_train_desc desc = mcmc ? busy_mcmc_desc() : busy_desc();
         if (!CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, VIEWS, &s->truth, &trainer))) exit(2);
         if (k % 2) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
@@ -1225,7 +1227,7 @@ static void test_damaged_checkpoints(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
-// Views so narrow that each sees a part of the splats, which lie in the order of their place.
+// Views so narrow that each sees only part of the splats, which are in spatial order.
 enum { LAZY_STEPS = 300, LAZY_SPLATS = 700 };
 static gsf_trainer* make_narrow(gsf_context* ctx, const scene* s, int lazy) {
     gsf_train_view views[VIEWS + 2];
@@ -1275,8 +1277,8 @@ static float* export_sh(gsf_context* ctx, const gsf_trainer* trainer, size_t* co
     return sh;
 }
 
-// Lazy training gives what dense training gives; with any workers, when it is looked at, and when it is continued from a
-// checkpoint, it gives the same bits.
+// Lazy training gives the result of dense training. It is bit-identical for any workers, when its state is read in
+// between, and when it resumes from a checkpoint.
 static void test_lazy_training(const scene* s, gsf_cpu_level level) {
     int workers = 5;
     gsf_context ctx = open_context(level, NULL), other = open_context(level, &workers);
@@ -1480,7 +1482,7 @@ static void test_degenerate(gsf_context* ctx, const scene* s) {
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, &view, 1, &s->start, &trainer));
     CHECK(trainer->desc.extent == 1.0f);
     take_steps(ctx, trainer, 60);
-    CHECK(trainer->model.count == 0); // faded and pruned; training goes on with nothing
+    CHECK(trainer->model.count == 0); // faded and pruned; training continues without splats
     gsf_buffer state = save_state(ctx, trainer);
     CHECK_OK(ctx, gsf_splat_parse_trainer(ctx, trainer, "empty", state.data, state.size));
     gsf_destroy_buffer(ctx, &state);
@@ -1506,7 +1508,7 @@ static void failing_free(void* user, void* memory) {
     free(memory);
 }
 
-// A small run in which allocation `fail_at` fails. A failed step is taken again: it must have changed nothing.
+// A small run in which allocation `fail_at` fails. A failed step is repeated: it must not have changed anything.
 static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_buffer* end) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
@@ -1566,7 +1568,7 @@ static void test_out_of_memory(const scene* s, int mcmc) {
     free(end.data);
 }
 
-// Once all photos were visited, steps between densifications take no memory.
+// Once all photos have been used, steps between densifications do not allocate.
 static void test_steady(const scene* s) {
     failing f = {0, 0, 0};
     gsf_context ctx;
@@ -1592,8 +1594,8 @@ static void test_steady(const scene* s) {
 
 // ---- order ---------------------------------------------------------------------
 
-// Every row moves as a whole (its id says where it was), neighbours in memory come near each other, odd values are kept, and
-// a second sort changes nothing.
+// Every row is moved as a whole (its id tells its old index), neighbours in memory become closer in space, special
+// values are kept, and a second sort changes nothing.
 static void test_sort(gsf_context* ctx) {
     enum { COUNT = 3000 };
     gsf_splats s, was;
