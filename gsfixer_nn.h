@@ -2710,8 +2710,8 @@ static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
 // `depth`: that much of its rows lies in the L2 cache, of one panel in L1, each tile of 6 x 16 sums is held in registers.
 // AVX-512 takes two groups by two panels at a time, 12 x 32 sums, and pairs of bf16 where floats stand if it is asked to.
 // After the last step a tile goes through bias, activation, gate and residual into y while it is hot. The weights are
-// packed once per call for all blocks, or, where one block has all rows, by the worker that needs them. Up to 4 rows are a
-// matter of reading the weights once: they are not packed but multiplied as they lie in the file.
+// packed once per call for all blocks, or, where one block has all rows, by the worker that needs them. Up to 4 rows
+// (GEMV) are bound by reading the weights once: these are not packed but multiplied as they lie in the file.
 // Sums: of each `depth` by itself, these then added in order; the same for any number of workers.
 
 enum {
@@ -2724,15 +2724,15 @@ enum {
     GSF__LINEAR_COLUMNS = 768,
     GSF__LINEAR_LONE_ROWS = 320,      // up to here one block has all rows
     GSF__LINEAR_LONE_COLUMNS = 192,
-    GSF__FEW_ROWS = 4,                // up to here weights are not packed
-    GSF__FEW_CHUNKS = 32,             // so many units of work, as reading starts slowly in each,
-    GSF__FEW_BYTES = 1 << 16,         // but not of less weights than this
-    GSF__FEW_COLUMNS = 1008,          // nor of more outputs; both a multiple of 6 and 16
-    GSF__FEW_UNIT = 48,
-    GSF__FEW_PAD = 32,                // values of x are padded to a multiple of this
-    GSF__FEW_AHEAD = 1280,            // AVX-512: bytes ahead that each row of weights is asked for,
-    GSF__FEW_AHEAD16 = 2048,          // where they have 16 bits;
-    GSF__FEW_STEP = 1024              // so many values of four rows of x are gone through at a time
+    GSF__GEMV_ROWS = 4,               // up to here weights are not packed
+    GSF__GEMV_CHUNKS = 32,            // so many units of work, as reading starts slowly in each,
+    GSF__GEMV_BYTES = 1 << 16,        // but not of less weights than this
+    GSF__GEMV_COLUMNS = 1008,         // nor of more outputs; both a multiple of 6 and 16
+    GSF__GEMV_UNIT = 48,
+    GSF__GEMV_PAD = 32,               // values of x are padded to a multiple of this
+    GSF__GEMV_AHEAD = 1280,           // AVX-512: bytes ahead that each row of weights is asked for,
+    GSF__GEMV_AHEAD16 = 2048,         // where they have 16 bits;
+    GSF__GEMV_STEP = 1024             // so many values of four rows of x are gone through at a time
 };
 
 #ifndef GSF__LINEAR_PACKED // a test makes it small
@@ -2753,11 +2753,11 @@ typedef struct gsf__linear_kernels { // one set per instruction set
     void (*four_tiles)(const float* a, const float* b, int64_t count, int add, float* sums, int64_t next,
                        const float* ahead, int64_t ahead_count);
     // Sums (row stride `pitch`, readable to the next multiple of 8 columns) to outputs row ..., column ... of y
-    void (*finish)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows, int64_t column,
+    void (*epilogue)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows, int64_t column,
                    int64_t columns);
     // sums[m*pitch + c] = row m of x times row column + c of the weights
-    void (*few)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
-    int64_t few_lanes; // `few` reads x from job->few, [k / lanes][rows][lanes]; 0: from the description
+    void (*gemv)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
+    int64_t gemv_lanes; // `gemv` reads x from job->gemv_x, [k / lanes][rows][lanes]; 0: from the description
     int64_t unit;      // values in a packed float: 1, or 2 in bf16; counts of packed values are of units
 } gsf__linear_kernels;
 
@@ -2765,7 +2765,7 @@ typedef struct gsf__linear_plan { // how a product is cut; depends on its sizes 
     int64_t depth;                // of a step through the inner dimension
     int64_t block_rows, block_columns, row_blocks;
     int64_t group_columns;        // packed at a time
-    int few, lone;                // up to 4 rows; one block has all rows
+    int gemv, lone;                // up to 4 rows; one block has all rows
     size_t shared, per_worker;    // floats of scratch
 } gsf__linear_plan;
 
@@ -2776,7 +2776,7 @@ struct gsf__linear_job {
     int64_t in, out;
     int64_t length;               // units of `in` values
     int64_t first, columns;       // the group of outputs in work
-    float *bias, *packed, *few;   // bias: zeros where there is none, 16 more than `out`
+    float *bias, *packed, *gemv_x; // bias: zeros where there is none, 16 more than `out`
     float* workers;
 };
 
@@ -2786,7 +2786,7 @@ static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
 }
 
 // That there are kernels for.
-static int64_t gsf__few_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__FEW_ROWS; }
+static int64_t gsf__gemv_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__GEMV_ROWS; }
 
 static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f32, bf16 or f16 at any address
     float value;
@@ -2833,8 +2833,8 @@ static void gsf__tile_scalar(const float* a, const float* b, int64_t count, int 
     for (int i = 0; i < GSF__TILE_SUMS; i++) sums[i] = add ? sums[i] + c[i] : c[i];
 }
 
-static void gsf__finish_scalar(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows,
-                               int64_t column, int64_t columns) {
+static void gsf__epilogue_scalar(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows,
+                                 int64_t column, int64_t columns) {
     const gsf__nn_linear_desc* d = &job->desc;
     for (int64_t r = 0; r < rows; r++) {
         float* y = d->y + (row + r) * d->ldy + column;
@@ -2845,7 +2845,7 @@ static void gsf__finish_scalar(const gsf__linear_job* job, const float* sums, in
     }
 }
 
-static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch) {
+static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch) {
     const gsf__nn_linear_desc* d = &job->desc;
     const size_t size = gsf_nn_get_dtype_size(d->weight->dtype);
     for (int64_t c = 0; c < columns; c++)
@@ -2859,9 +2859,9 @@ static void gsf__few_scalar(const gsf__linear_job* job, int64_t column, int64_t 
 }
 
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
-                                                       NULL, gsf__finish_scalar, gsf__few_scalar, 0, 1};
+                                                       NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
 
-// The end of a tile: what `finish` does.
+// The epilogue: what follows the product.
 #define GSF__KERNELS "gsfixer_nn.h"
 #define GSF__KERNELS_EPILOGUE
 #define GSF__KERNELS_AVX512
@@ -2873,8 +2873,8 @@ static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar,
 #if GSF__LANES > 1
 
 // `left` outputs from column `column` on; sums, too, begin there.
-GSF__V_INLINE void GSF__V(gsf__finish_columns)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
-                                               int64_t rows, int64_t column, size_t left) {
+GSF__V_INLINE void GSF__V(gsf__epilogue_columns)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
+                                                 int64_t rows, int64_t column, size_t left) {
     const gsf__nn_linear_desc* d = &job->desc;
     const gsf__vf bias = gsf__v_load_first(job->bias + column, left);
     const gsf__vf gate = d->gate ? gsf__v_load_first(d->gate + column, left) : gsf__v_set(1.0f);
@@ -2886,13 +2886,13 @@ GSF__V_INLINE void GSF__V(gsf__finish_columns)(const gsf__linear_job* job, const
     }
 }
 
-GSF__V_KERNEL void GSF__V(gsf__finish)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
-                                       int64_t rows, int64_t column, int64_t columns) {
+GSF__V_KERNEL void GSF__V(gsf__epilogue)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
+                                         int64_t rows, int64_t column, int64_t columns) {
     int64_t c = 0;
     for (; c + GSF__LANES <= columns; c += GSF__LANES)
-        GSF__V(gsf__finish_columns)(job, sums + c, pitch, row, rows, column + c, GSF__LANES);
+        GSF__V(gsf__epilogue_columns)(job, sums + c, pitch, row, rows, column + c, GSF__LANES);
     const size_t left = (size_t)(columns - c);
-    if (left) GSF__V(gsf__finish_columns)(job, sums + c, pitch, row, rows, column + c, left);
+    if (left) GSF__V(gsf__epilogue_columns)(job, sums + c, pitch, row, rows, column + c, left);
 }
 
 #endif
@@ -3018,10 +3018,10 @@ GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int6
 #undef GSF_X
 }
 
-// Few rows. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so the more of them
-// go to x, so several rows of weights share what is loaded of it, and weights are asked for early. The processor drops such
-// requests when too many wait, hence each is made twice, `ahead` bytes (the rows of a tile) and twice that before its use.
-GSF__INLINE_AVX2 void gsf__few_fetch(const char* p, size_t ahead) {
+// GEMV, of up to 4 rows of x. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so
+// the more of them go to x: so several rows of weights share what is loaded of x, and weights are prefetched. The processor
+// drops prefetches when too many wait, hence each is issued twice, `ahead` bytes (the rows of a tile) and twice that ahead.
+GSF__INLINE_AVX2 void gsf__gemv_fetch(const char* p, size_t ahead) {
     _mm_prefetch(p + ahead, _MM_HINT_T1);
     _mm_prefetch(p + 2 * ahead, _MM_HINT_T1);
 }
@@ -3031,25 +3031,25 @@ GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { //
     return _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
 }
 
-GSF__INLINE_AVX2 void gsf__few_add(float* sums, __m256 a, __m256 b, __m256 c, __m256 d) {
+GSF__INLINE_AVX2 void gsf__gemv_add(float* sums, __m256 a, __m256 b, __m256 c, __m256 d) {
     _mm_storeu_ps(sums, _mm_add_ps(_mm_loadu_ps(sums), gsf__sum8x4(a, b, c, d)));
 }
 
 // Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows] (one row of x: also
 // two numbers behind them). `count` is a multiple of 32, `line` the weights of a cache line.
-GSF__INLINE_AVX2 void gsf__few_six(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
-                                   int64_t count, float* sums) {
+GSF__INLINE_AVX2 void gsf__gemv_six(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
+                                    int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
     const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 32 : 16; // weights; bytes
     __m256 s00 = _mm256_setzero_ps(), s10 = s00, s20 = s00, s30 = s00, s40 = s00, s50 = s00;
     __m256 s01 = s00, s11 = s00, s21 = s00, s31 = s00, s41 = s00, s51 = s00;
     for (int64_t at = 0; count > 0; count -= line) {
-        gsf__few_fetch(w0 + at, ahead);
-        gsf__few_fetch(w1 + at, ahead);
-        gsf__few_fetch(w2 + at, ahead);
-        gsf__few_fetch(w3 + at, ahead);
-        gsf__few_fetch(w4 + at, ahead);
-        gsf__few_fetch(w5 + at, ahead);
+        gsf__gemv_fetch(w0 + at, ahead);
+        gsf__gemv_fetch(w1 + at, ahead);
+        gsf__gemv_fetch(w2 + at, ahead);
+        gsf__gemv_fetch(w3 + at, ahead);
+        gsf__gemv_fetch(w4 + at, ahead);
+        gsf__gemv_fetch(w5 + at, ahead);
         for (int64_t i = 0; i < line; i += 8, at += vector, x += 8 * rows) {
             const __m256 x0 = _mm256_load_ps(x), x1 = rows > 1 ? _mm256_load_ps(x + 8) : x0;
             __m256 v;
@@ -3062,26 +3062,26 @@ GSF__INLINE_AVX2 void gsf__few_six(const char* const w[6], gsf_nn_dtype dtype, s
         }
     }
     if (rows == 1) {
-        gsf__few_add(sums, s00, s10, s20, s30);
-        gsf__few_add(sums + 4, s40, s50, s01, s11);
+        gsf__gemv_add(sums, s00, s10, s20, s30);
+        gsf__gemv_add(sums + 4, s40, s50, s01, s11);
         return;
     }
-    gsf__few_add(sums, s00, s01, s10, s11);
-    gsf__few_add(sums + 4, s20, s21, s30, s31);
-    gsf__few_add(sums + 8, s40, s41, s50, s51);
+    gsf__gemv_add(sums, s00, s01, s10, s11);
+    gsf__gemv_add(sums + 4, s20, s21, s30, s31);
+    gsf__gemv_add(sums + 8, s40, s41, s50, s51);
 }
 
 // Three rows of weights times four rows of x, as above.
-GSF__INLINE_AVX2 void gsf__few_three(const char* const w[3], gsf_nn_dtype dtype, size_t ahead, const float* x,
-                                     int64_t count, float* sums) {
+GSF__INLINE_AVX2 void gsf__gemv_three(const char* const w[3], gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                      int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2];
     const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 32 : 16;
     __m256 s00 = _mm256_setzero_ps(), s01 = s00, s02 = s00, s03 = s00, s10 = s00, s11 = s00;
     __m256 s12 = s00, s13 = s00, s20 = s00, s21 = s00, s22 = s00, s23 = s00;
     for (int64_t at = 0; count > 0; count -= line) {
-        gsf__few_fetch(w0 + at, ahead);
-        gsf__few_fetch(w1 + at, ahead);
-        gsf__few_fetch(w2 + at, ahead);
+        gsf__gemv_fetch(w0 + at, ahead);
+        gsf__gemv_fetch(w1 + at, ahead);
+        gsf__gemv_fetch(w2 + at, ahead);
         for (int64_t i = 0; i < line; i += 8, at += vector, x += 32) {
             const __m256 a = gsf__load8(w0 + at, dtype), b = gsf__load8(w1 + at, dtype), c = gsf__load8(w2 + at, dtype);
             __m256 v;
@@ -3094,52 +3094,52 @@ GSF__INLINE_AVX2 void gsf__few_three(const char* const w[3], gsf_nn_dtype dtype,
 #undef GSF_X
         }
     }
-    gsf__few_add(sums, s00, s01, s02, s03);
-    gsf__few_add(sums + 4, s10, s11, s12, s13);
-    gsf__few_add(sums + 8, s20, s21, s22, s23);
+    gsf__gemv_add(sums, s00, s01, s02, s03);
+    gsf__gemv_add(sums + 4, s10, s11, s12, s13);
+    gsf__gemv_add(sums + 8, s20, s21, s22, s23);
 }
 
-GSF__INLINE_AVX2 void gsf__few_tile(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
-                                    int64_t count, float* sums) {
-    if (rows == 1) gsf__few_six(w, dtype, ahead, x, 1, count, sums);
-    else if (rows == 2) gsf__few_six(w, dtype, ahead, x, 2, count, sums);
-    else gsf__few_three(w, dtype, ahead, x, count, sums);
+GSF__INLINE_AVX2 void gsf__gemv_tile(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
+                                     int64_t count, float* sums) {
+    if (rows == 1) gsf__gemv_six(w, dtype, ahead, x, 1, count, sums);
+    else if (rows == 2) gsf__gemv_six(w, dtype, ahead, x, 2, count, sums);
+    else gsf__gemv_three(w, dtype, ahead, x, count, sums);
 }
 
-GSF__INLINE_AVX2 void gsf__few8(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t column,
-                                int64_t columns, float* sums, int64_t pitch) {
+GSF__INLINE_AVX2 void gsf__gemv8(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t column,
+                                 int64_t columns, float* sums, int64_t pitch) {
     const size_t bytes = (size_t)job->in * size;
     const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
-    const int64_t rows = gsf__few_rows(job->desc.rows), height = rows > 2 ? 3 : 6; // of x, of weights
-    const int64_t whole = job->in / GSF__FEW_PAD * GSF__FEW_PAD;
+    const int64_t rows = gsf__gemv_rows(job->desc.rows), height = rows > 2 ? 3 : 6; // of x, of weights
+    const int64_t whole = job->in / GSF__GEMV_PAD * GSF__GEMV_PAD;
     const size_t left = (size_t)(job->in - whole) * size;
     const char* w[6];
-    char tails[6][4 * GSF__FEW_PAD];
+    char tails[6][4 * GSF__GEMV_PAD];
     memset(tails, 0, sizeof tails);
     for (int64_t c = 0; c < columns; c += height) {
         float tile[12] = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0}; // [weights][x]
         for (int64_t r = 0; r < height; r++) w[r] = first + (size_t)gsf__least(c + r, columns - 1) * bytes;
-        gsf__few_tile(w, dtype, (size_t)height * bytes, job->few, rows, whole, tile);
+        gsf__gemv_tile(w, dtype, (size_t)height * bytes, job->gemv_x, rows, whole, tile);
         for (int64_t r = 0; left > 0 && r < height; r++) {
             memcpy(tails[r], w[r] + (size_t)whole * size, left);
             w[r] = tails[r];
         }
-        if (left > 0) gsf__few_tile(w, dtype, 0, job->few + whole * rows, rows, GSF__FEW_PAD, tile);
+        if (left > 0) gsf__gemv_tile(w, dtype, 0, job->gemv_x + whole * rows, rows, GSF__GEMV_PAD, tile);
         for (int64_t r = 0; r < gsf__least(height, columns - c); r++)
             for (int64_t m = 0; m < job->desc.rows; m++) sums[m * pitch + c + r] = tile[r * rows + m];
     }
 }
 
-GSF__TARGET_AVX2 static void gsf__few_avx2(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
-                                           int64_t pitch) {
+GSF__TARGET_AVX2 static void gsf__gemv_avx2(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
+                                            int64_t pitch) {
     const gsf_nn_dtype dtype = job->desc.weight->dtype;
-    if (dtype == GSF_NN_F32) gsf__few8(job, GSF_NN_F32, 4, column, columns, sums, pitch);
-    else if (dtype == GSF_NN_BF16) gsf__few8(job, GSF_NN_BF16, 2, column, columns, sums, pitch);
-    else gsf__few8(job, GSF_NN_F16, 2, column, columns, sums, pitch);
+    if (dtype == GSF_NN_F32) gsf__gemv8(job, GSF_NN_F32, 4, column, columns, sums, pitch);
+    else if (dtype == GSF_NN_BF16) gsf__gemv8(job, GSF_NN_BF16, 2, column, columns, sums, pitch);
+    else gsf__gemv8(job, GSF_NN_F16, 2, column, columns, sums, pitch);
 }
 
 static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
-                                                     NULL, gsf__finish_avx2, gsf__few_avx2, 8, 1};
+                                                     NULL, gsf__epilogue_avx2, gsf__gemv_avx2, 8, 1};
 
 // ---- linear: AVX-512 kernels
 
@@ -3200,7 +3200,7 @@ GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // si
 }
 
 // One row of weights times one row of x: read in order, as the processor foresees best. `count` is a multiple of 32.
-GSF__INLINE_AVX512 float gsf__few_one16(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
+GSF__INLINE_AVX512 float gsf__gemv_one16(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
     const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
     __m512 s0 = _mm512_setzero_ps(), s1 = s0, s2 = s0, s3 = s0;
     for (; count >= 64; count -= 64, x += 64, w += 4 * vector) {
@@ -3218,8 +3218,8 @@ GSF__INLINE_AVX512 float gsf__few_one16(const char* w, gsf_nn_dtype dtype, const
 
 // Two rows of x, laid out as [k / 16][2][16], times four rows of weights, added to sums[4][2]. `count` is a multiple of 32.
 // The more there is to multiply, the less far ahead the processor looks by itself: what lies `ahead` bytes on is asked for.
-GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t count,
-                                       float* sums) {
+GSF__INLINE_AVX512 void gsf__gemv_two16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                        int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3];
     const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3)
@@ -3251,8 +3251,8 @@ GSF__INLINE_AVX512 void gsf__few_two16(const char* const w[4], gsf_nn_dtype dtyp
 }
 
 // Four rows of x, as [k / 16][4][16], times six rows of weights, added to sums[6][4]. What lies `ahead` bytes on is asked for.
-GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t count,
-                                       float* sums) {
+GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x,
+                                        int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
     const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 64 : 32; // weights; bytes
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
@@ -3290,36 +3290,39 @@ GSF__INLINE_AVX512 void gsf__few_six16(const char* const w[6], gsf_nn_dtype dtyp
 // Weights are read fastest as long streams: the columns are cut into as many parts as are taken at once, and each part is
 // read from end to end. Only where x, far larger than the weights beside it, would not stay in the first level cache
 // (four rows and 16 bits) is it gone through in steps, with neighbours at once and the next ones asked for.
-GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
-                                   int64_t column, int64_t columns, float* sums, int64_t pitch) {
+GSF__INLINE_AVX512 void gsf__gemv16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
+                                    int64_t column, int64_t columns, float* sums, int64_t pitch) {
     const int64_t taken = rows == 1 ? 1 : rows == 2 ? 4 : 6, turns = gsf__ceil_div(columns, taken);
     const int streams = rows <= 2 || size == 4;
-    const int64_t apart = streams ? turns : 1, next = streams ? 1 : taken, step = streams ? job->in : (int64_t)GSF__FEW_STEP;
+    const int64_t apart = streams ? turns : 1, next = streams ? 1 : taken;
+    const int64_t step = streams ? job->in : (int64_t)GSF__GEMV_STEP;
     const size_t bytes = (size_t)job->in * size;
-    const size_t ahead = !streams ? (size_t)taken * bytes : size == 4 ? (size_t)GSF__FEW_AHEAD : (size_t)GSF__FEW_AHEAD16;
+    const size_t ahead = !streams    ? (size_t)taken * bytes
+                         : size == 4 ? (size_t)GSF__GEMV_AHEAD
+                                     : (size_t)GSF__GEMV_AHEAD16;
     const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
-    char tails[6][4 * GSF__FEW_PAD];
+    char tails[6][4 * GSF__GEMV_PAD];
     memset(tails, 0, sizeof tails);
     for (int64_t m = 0; m < job->desc.rows; m++) memset(sums + m * pitch, 0, (size_t)columns * sizeof(float));
     for (int64_t k = 0; k < job->in; k += step) {
-        const int64_t count = gsf__least(step, job->in - k), whole = count / GSF__FEW_PAD * GSF__FEW_PAD;
+        const int64_t count = gsf__least(step, job->in - k), whole = count / GSF__GEMV_PAD * GSF__GEMV_PAD;
         const size_t left = (size_t)(count - whole) * size;
         for (int64_t turn = 0; turn < turns; turn++) {
-            float tile[6 * GSF__FEW_ROWS]; // [weights][x]
+            float tile[6 * GSF__GEMV_ROWS]; // [weights][x]
             const char* w[6];
             memset(tile, 0, sizeof tile);
             for (int64_t r = 0; r < taken; r++)
                 w[r] = first + (size_t)gsf__least(turn * next + r * apart, columns - 1) * bytes + (size_t)k * size;
             for (int part = 0; part < (left ? 2 : 1); part++) { // the second: what is left, and zeros
-                const float* x = job->few + (k + part * whole) * rows;
-                const int64_t n = part ? (int64_t)GSF__FEW_PAD : whole;
+                const float* x = job->gemv_x + (k + part * whole) * rows;
+                const int64_t n = part ? (int64_t)GSF__GEMV_PAD : whole;
                 for (int64_t r = 0; part && r < taken; r++) {
                     memcpy(tails[r], w[r] + (size_t)whole * size, left);
                     w[r] = tails[r];
                 }
-                if (rows == 1) tile[0] += gsf__few_one16(w[0], dtype, x, n);
-                else if (rows == 2) gsf__few_two16(w, dtype, ahead, x, n, tile);
-                else gsf__few_six16(w, dtype, ahead, x, n, tile);
+                if (rows == 1) tile[0] += gsf__gemv_one16(w[0], dtype, x, n);
+                else if (rows == 2) gsf__gemv_two16(w, dtype, ahead, x, n, tile);
+                else gsf__gemv_six16(w, dtype, ahead, x, n, tile);
             }
             for (int64_t r = 0; r < taken && turn * next + r * apart < columns; r++)
                 for (int64_t m = 0; m < job->desc.rows; m++)
@@ -3328,13 +3331,13 @@ GSF__INLINE_AVX512 void gsf__few16(const gsf__linear_job* job, gsf_nn_dtype dtyp
     }
 }
 
-GSF__TARGET_AVX512 static void gsf__few_avx512(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
-                                               int64_t pitch) {
-    const int64_t rows = gsf__few_rows(job->desc.rows);
-#define GSF_X(dtype, size)                                                                 \
-    if (rows == 1) gsf__few16(job, dtype, size, 1, column, columns, sums, pitch);          \
-    else if (rows == 2) gsf__few16(job, dtype, size, 2, column, columns, sums, pitch);     \
-    else gsf__few16(job, dtype, size, GSF__FEW_ROWS, column, columns, sums, pitch);
+GSF__TARGET_AVX512 static void gsf__gemv_avx512(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums,
+                                                int64_t pitch) {
+    const int64_t rows = gsf__gemv_rows(job->desc.rows);
+#define GSF_X(dtype, size)                                                                  \
+    if (rows == 1) gsf__gemv16(job, dtype, size, 1, column, columns, sums, pitch);          \
+    else if (rows == 2) gsf__gemv16(job, dtype, size, 2, column, columns, sums, pitch);     \
+    else gsf__gemv16(job, dtype, size, GSF__GEMV_ROWS, column, columns, sums, pitch);
     switch (job->desc.weight->dtype) {
         case GSF_NN_F32: GSF_X(GSF_NN_F32, 4) break;
         case GSF_NN_BF16: GSF_X(GSF_NN_BF16, 2) break;
@@ -3344,7 +3347,7 @@ GSF__TARGET_AVX512 static void gsf__few_avx512(const gsf__linear_job* job, int64
 }
 
 static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, gsf__pack_rows_avx2, gsf__tile_avx2,
-                                                       gsf__four_tiles_avx512, gsf__finish_avx512, gsf__few_avx512,
+                                                       gsf__four_tiles_avx512, gsf__epilogue_avx512, gsf__gemv_avx512,
                                                        16, 1};
 
 // ---- linear: kernels for pairs of bf16
@@ -3366,7 +3369,8 @@ GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, in
     float tile[8 * GSF__TILE_ROWS + 2];
     for (int64_t k = 0; k < count; k += 8, out += 8 * GSF__TILE_ROWS) {
 #define GSF_X(i) gsf__bf16_units(x + (i) * ldx, 2 * k, i < rows ? 2 * count : 0)
-        __m256 r[8] = {GSF_X(0), GSF_X(1), GSF_X(2), GSF_X(3), GSF_X(4), GSF_X(5), _mm256_setzero_ps(), _mm256_setzero_ps()};
+        __m256 r[8] = {GSF_X(0), GSF_X(1), GSF_X(2),            GSF_X(3),
+                       GSF_X(4), GSF_X(5), _mm256_setzero_ps(), _mm256_setzero_ps()};
 #undef GSF_X
         float* to = k + 8 <= count ? out : tile;
         gsf__store_steps(to, r);
@@ -3402,7 +3406,7 @@ GSF__TARGET_BF16 static void gsf__four_tiles_bf16(const float* a, const float* b
 }
 
 static const gsf__linear_kernels gsf__linear_bf16 = {gsf__pack_weights_bf16, gsf__pack_rows_bf16, gsf__tile_bf16,
-                                                     gsf__four_tiles_bf16, gsf__finish_avx512, gsf__few_avx512, 16, 2};
+                                                     gsf__four_tiles_bf16, gsf__epilogue_avx512, gsf__gemv_avx512, 16, 2};
 
 #endif
 
@@ -3456,8 +3460,8 @@ static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const
         if (k + count < job->length) continue;
         for (int64_t t = 0; t < step * panels; t++) {
             const int64_t p = t / step, r = (g + t % step) * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
-            kernels->finish(job, sums + p * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS, row + r,
-                            gsf__least(rows - r, GSF__TILE_ROWS), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS));
+            kernels->epilogue(job, sums + p * next + r * GSF__TILE_COLUMNS, GSF__TILE_COLUMNS, row + r,
+                              gsf__least(rows - r, GSF__TILE_ROWS), column + c, gsf__least(columns - c, GSF__TILE_COLUMNS));
         }
     }
 }
@@ -3493,24 +3497,24 @@ static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a bl
     }
 }
 
-static void gsf__linear_few(void* arg, size_t index, int32_t worker) { // some outputs of all rows
+static void gsf__linear_gemv(void* arg, size_t index, int32_t worker) { // some outputs of all rows
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const int64_t at = (int64_t)index * job->plan.block_columns;
     const int64_t columns = gsf__least(job->out - at, job->plan.block_columns);
     float* sums = job->workers + (size_t)worker * job->plan.per_worker;
-    job->kernels->few(job, at, columns, sums, job->plan.block_columns);
-    job->kernels->finish(job, sums, job->plan.block_columns, 0, job->desc.rows, at, columns);
+    job->kernels->gemv(job, at, columns, sums, job->plan.block_columns);
+    job->kernels->epilogue(job, sums, job->plan.block_columns, 0, job->desc.rows, at, columns);
 }
 
-// x as the kernels of few rows want it, with zeros behind.
-static void gsf__few_order(gsf__linear_job* job) {
+// x as the GEMV kernels want it, with zeros behind.
+static void gsf__gemv_order(gsf__linear_job* job) {
     const gsf__nn_linear_desc* d = &job->desc;
-    const int64_t rows = gsf__few_rows(d->rows), lanes = job->kernels->few_lanes;
-    float* to = job->few;
+    const int64_t rows = gsf__gemv_rows(d->rows), lanes = job->kernels->gemv_lanes;
+    float* to = job->gemv_x;
     for (int64_t first = 0; lanes > 0 && first < job->in; first += lanes)
         for (int64_t m = 0; m < rows; m++)
             for (int64_t k = first; k < first + lanes; k++) *to++ = m < d->rows && k < job->in ? d->x[m * d->ldx + k] : 0.0f;
-    float* end = job->few + gsf__round_up(job->in, GSF__FEW_PAD) * rows;
+    float* end = job->gemv_x + gsf__round_up(job->in, GSF__GEMV_PAD) * rows;
     while (lanes > 0 && to < end) *to++ = 0.0f;
 }
 
@@ -3519,12 +3523,12 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
     memset(plan, 0, sizeof *plan);
     if (in > INT64_MAX / 256 || out > INT64_MAX / 256 || rows > INT64_MAX / 256) return 0;
     size_t shared = 0;
-    if (rows <= GSF__FEW_ROWS) {
-        const int64_t least = GSF__FEW_BYTES / (in * (int64_t)weight_size) + 1, share = gsf__ceil_div(out, GSF__FEW_CHUNKS);
-        plan->few = 1;
-        plan->block_columns = gsf__round_up(gsf__least(share < least ? least : share, GSF__FEW_COLUMNS), GSF__FEW_UNIT);
-        plan->per_worker = (size_t)(plan->block_columns * GSF__FEW_ROWS);
-        shared = (size_t)gsf__round_up(in, GSF__FEW_PAD) * GSF__FEW_ROWS;
+    if (rows <= GSF__GEMV_ROWS) {
+        const int64_t least = GSF__GEMV_BYTES / (in * (int64_t)weight_size) + 1, share = gsf__ceil_div(out, GSF__GEMV_CHUNKS);
+        plan->gemv = 1;
+        plan->block_columns = gsf__round_up(gsf__least(share < least ? least : share, GSF__GEMV_COLUMNS), GSF__GEMV_UNIT);
+        plan->per_worker = (size_t)(plan->block_columns * GSF__GEMV_ROWS);
+        shared = (size_t)gsf__round_up(in, GSF__GEMV_PAD) * GSF__GEMV_ROWS;
     } else {
         plan->lone = rows <= GSF__LINEAR_LONE_ROWS;
         plan->depth = gsf__even_piece(in, GSF__LINEAR_DEPTH, 8);
@@ -3568,9 +3572,9 @@ static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch
     const gsf__linear_plan* plan = &job->plan;
     memset(job->bias, 0, (size_t)(job->out + 16) * sizeof(float));
     if (job->desc.bias) gsf_nn_convert_tensor(job->desc.bias, 0, job->out, job->bias);
-    if (plan->few) {
-        gsf__few_order(job);
-        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->out, plan->block_columns), gsf__linear_few, job);
+    if (plan->gemv) {
+        gsf__gemv_order(job);
+        gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->out, plan->block_columns), gsf__linear_gemv, job);
         return;
     }
     for (job->first = 0; job->first < job->out; job->first += plan->group_columns) {
@@ -3593,8 +3597,9 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
     job.desc = *desc;
     if (!job.desc.ldx) job.desc.ldx = job.in;
     if (!job.desc.ldy) job.desc.ldy = job.out;
-    const int few = desc->rows <= GSF__FEW_ROWS, pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0;
-    job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !few);
+    const int gemv = desc->rows <= GSF__GEMV_ROWS;
+    const int pairs = desc->bf16 && desc->weight->dtype == GSF_NN_BF16 && job.in % 2 == 0;
+    job.kernels = gsf__linear_kernels_of(ctx->cpu_level, pairs && !gemv);
     job.length = job.in / job.kernels->unit;
     if (!gsf__plan_linear(desc->rows, job.length, job.out, gsf_nn_get_dtype_size(desc->weight->dtype), &job.plan) ||
         !gsf__mul_size(job.plan.per_worker, (size_t)ctx->parallel.worker_count, &floats) ||
@@ -3605,7 +3610,7 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
     if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
     job.workers = scratch;
     job.bias = scratch + floats;
-    job.packed = job.few = job.bias + gsf__round_up(job.out + 16, 16);
+    job.packed = job.gemv_x = job.bias + gsf__round_up(job.out + 16, 16);
     gsf__run_linear(ctx, &job);
     gsf__nn_destroy_workspace(ctx, &own);
     return GSF_OK;
@@ -3660,9 +3665,9 @@ typedef struct gsf__int8_kernels { // one set per instruction set
     // Meanwhile fetches `ahead_count` bytes that are needed next.
     void (*four_tiles)(const void* a, int64_t a_next, const int8_t* b, int64_t b_next, int64_t count, int add, int32_t* sums,
                        int64_t next, const int8_t* ahead, int64_t ahead_count);
-    // sums[rows][16] = a [k/4][rows][4], up to few_rows rows, times w [k/4][16][4]
-    void (*few)(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums);
-    int64_t few_rows;
+    // sums[rows][16] = a [k/4][rows][4], up to gemv_rows rows, times w [k/4][16][4]
+    void (*gemv)(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums);
+    int64_t gemv_rows;
     // out[6][16] = (sums - offsets[16], where qx is unsigned) * rows[6] * columns[16]
     void (*scale)(const int32_t* sums, const int32_t* offsets, const float* rows, const float* columns, float* out);
 } gsf__int8_kernels;
@@ -3737,7 +3742,7 @@ static void gsf__int8_tile_scalar(const void* a, const void* b, int64_t count, i
             }
 }
 
-static void gsf__int8_few_scalar(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+static void gsf__int8_gemv_scalar(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
     const int16_t* x = (const int16_t*)a;
     memset(sums, 0, (size_t)(rows * GSF__TILE_COLUMNS) * sizeof *sums);
     for (int64_t k = 0; k < count; k += 4, x += 4 * rows, w += 4 * GSF__TILE_COLUMNS)
@@ -3758,7 +3763,7 @@ static void gsf__int8_scale_scalar(const int32_t* sums, const int32_t* offsets, 
 
 static const gsf__int8_kernels gsf__int8_scalar = {
     gsf__int8_rotate_scalar, gsf__int8_quantize_scalar, gsf__int8_quantize_scalar, sizeof(int16_t), gsf__int8_widen_scalar,
-    gsf__int8_tile_scalar, NULL, gsf__int8_few_scalar, 2, gsf__int8_scale_scalar};
+    gsf__int8_tile_scalar, NULL, gsf__int8_gemv_scalar, 2, gsf__int8_scale_scalar};
 
 // The rotation.
 #define GSF__KERNELS "gsfixer_nn.h"
@@ -3882,17 +3887,17 @@ GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const void* a, const void* b, i
     }
 }
 
-GSF__INLINE_AVX2 void gsf__int8_few_sums(__m256i a, __m256i b, int32_t* to) { // of 8 columns by 2 pairs
+GSF__INLINE_AVX2 void gsf__int8_gemv_sums(__m256i a, __m256i b, int32_t* to) { // of 8 columns by 2 pairs
     const __m256i v = _mm256_permute4x64_epi64(_mm256_hadd_epi32(a, b), 0xd8);
     _mm256_storeu_si256((__m256i*)(void*)to, v);
 }
 
-GSF__INLINE_AVX2 void gsf__int8_few8(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+GSF__INLINE_AVX2 void gsf__int8_gemv8(const int16_t* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
     __m256i c00 = _mm256_setzero_si256(), c01 = c00, c02 = c00, c03 = c00, c10 = c00, c11 = c00, c12 = c00, c13 = c00;
     for (int64_t k = 0; k < count; k += 4, a += 4 * rows, w += 64) {
         const __m256i a0 = gsf__int8_broadcast4(a), a1 = rows > 1 ? gsf__int8_broadcast4(a + 4) : a0;
         __m256i v;
-        _mm_prefetch((const char*)w + GSF__INT8_AHEAD, _MM_HINT_T1); // twice: see gsf__few_fetch
+        _mm_prefetch((const char*)w + GSF__INT8_AHEAD, _MM_HINT_T1); // twice: see gsf__gemv_fetch
         _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T1);
 #define GSF_X(i)                                                                                \
         v = _mm256_cvtepi8_epi16(_mm_loadu_si128((const __m128i*)(const void*)(w + 16 * i)));   \
@@ -3901,17 +3906,17 @@ GSF__INLINE_AVX2 void gsf__int8_few8(const int16_t* a, int64_t rows, const int8_
         GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3)
 #undef GSF_X
     }
-    gsf__int8_few_sums(c00, c01, sums);
-    gsf__int8_few_sums(c02, c03, sums + 8);
+    gsf__int8_gemv_sums(c00, c01, sums);
+    gsf__int8_gemv_sums(c02, c03, sums + 8);
     if (rows == 1) return;
-    gsf__int8_few_sums(c10, c11, sums + 16);
-    gsf__int8_few_sums(c12, c13, sums + 24);
+    gsf__int8_gemv_sums(c10, c11, sums + 16);
+    gsf__int8_gemv_sums(c12, c13, sums + 24);
 }
 
-GSF__TARGET_AVX2 static void gsf__int8_few_avx2(const void* a, int64_t rows, const int8_t* w, int64_t count,
-                                                int32_t* sums) {
-    if (rows == 1) gsf__int8_few8((const int16_t*)a, 1, w, count, sums);
-    else gsf__int8_few8((const int16_t*)a, 2, w, count, sums);
+GSF__TARGET_AVX2 static void gsf__int8_gemv_avx2(const void* a, int64_t rows, const int8_t* w, int64_t count,
+                                                 int32_t* sums) {
+    if (rows == 1) gsf__int8_gemv8((const int16_t*)a, 1, w, count, sums);
+    else gsf__int8_gemv8((const int16_t*)a, 2, w, count, sums);
 }
 
 GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const int32_t* offsets, const float* rows,
@@ -3926,7 +3931,7 @@ GSF__TARGET_AVX2 static void gsf__int8_scale_avx2(const int32_t* sums, const int
 
 static const gsf__int8_kernels gsf__int8_avx2 = {
     gsf__int8_rotate_avx2, gsf__int8_quantize_avx2, gsf__int8_quantize_avx2, sizeof(int16_t), gsf__int8_widen_avx2,
-    gsf__int8_tile_avx2, NULL, gsf__int8_few_avx2, 2, gsf__int8_scale_avx2};
+    gsf__int8_tile_avx2, NULL, gsf__int8_gemv_avx2, 2, gsf__int8_scale_avx2};
 
 // ---- int8: AVX-512 kernels with dot products of bytes
 
@@ -4004,7 +4009,7 @@ GSF__TARGET_VNNI static void gsf__int8_four_tiles_vnni(const void* a, int64_t a_
 #undef GSF_ROWS
 
 // Two sums of each row, taken in turns: one would wait for itself. `rows` had better be a constant.
-GSF__INLINE_VNNI void gsf__int8_few_rows(const uint8_t* x, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+GSF__INLINE_VNNI void gsf__int8_gemv_rows(const uint8_t* x, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
     __m512i even0 = _mm512_setzero_si512(), even1 = even0, even2 = even0, even3 = even0;
     __m512i odd0 = even0, odd1 = even0, odd2 = even0, odd3 = even0, v;
 #define GSF_ROWS(X) X(0) X(1) X(2) X(3)
@@ -4032,12 +4037,13 @@ GSF__INLINE_VNNI void gsf__int8_few_rows(const uint8_t* x, int64_t rows, const i
 #undef GSF_ROWS
 }
 
-GSF__TARGET_VNNI static void gsf__int8_few_vnni(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
+GSF__TARGET_VNNI static void gsf__int8_gemv_vnni(const void* a, int64_t rows, const int8_t* w, int64_t count,
+                                                 int32_t* sums) {
     const uint8_t* x = (const uint8_t*)a;
-    if (rows == 1) gsf__int8_few_rows(x, 1, w, count, sums);
-    else if (rows == 2) gsf__int8_few_rows(x, 2, w, count, sums);
-    else if (rows == 3) gsf__int8_few_rows(x, 3, w, count, sums);
-    else gsf__int8_few_rows(x, 4, w, count, sums);
+    if (rows == 1) gsf__int8_gemv_rows(x, 1, w, count, sums);
+    else if (rows == 2) gsf__int8_gemv_rows(x, 2, w, count, sums);
+    else if (rows == 3) gsf__int8_gemv_rows(x, 3, w, count, sums);
+    else gsf__int8_gemv_rows(x, 4, w, count, sums);
 }
 
 GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const int32_t* offsets, const float* rows,
@@ -4052,7 +4058,7 @@ GSF__TARGET_AVX512 static void gsf__int8_scale_vnni(const int32_t* sums, const i
 
 static const gsf__int8_kernels gsf__int8_vnni = {
     gsf__int8_rotate_avx512, gsf__int8_quantize_avx2, gsf__int8_quantize_x_vnni, sizeof(uint8_t), NULL,
-    gsf__int8_tile_vnni, gsf__int8_four_tiles_vnni, gsf__int8_few_vnni, GSF__FEW_ROWS, gsf__int8_scale_vnni};
+    gsf__int8_tile_vnni, gsf__int8_four_tiles_vnni, gsf__int8_gemv_vnni, GSF__GEMV_ROWS, gsf__int8_scale_vnni};
 
 #endif
 
@@ -4200,11 +4206,11 @@ static void gsf__int8_fetch(const int8_t* p, int64_t count) { // panels come fro
 }
 
 // The end of a tile: its sums to y.
-static void gsf__int8_finish(const gsf__int8_job* job, const int32_t* sums, int64_t row, int64_t rows, int64_t column,
-                             int64_t columns, float* tile) {
+static void gsf__int8_epilogue(const gsf__int8_job* job, const int32_t* sums, int64_t row, int64_t rows, int64_t column,
+                               int64_t columns, float* tile) {
     const gsf__nn_quantized* w = job->weight;
     job->kernels->scale(sums, w->offsets + column, job->scales + row, w->scales + column, tile);
-    job->linear.kernels->finish(&job->linear, tile, GSF__TILE_COLUMNS, job->first + row, rows, column, columns);
+    job->linear.kernels->epilogue(&job->linear, tile, GSF__TILE_COLUMNS, job->first + row, rows, column, columns);
 }
 
 // All tiles of one or two panels at one step, as gsf__linear_panels.
@@ -4234,9 +4240,9 @@ static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows
         if (k + count < job->padded) continue;
         for (int64_t t = 0; t < step * panels; t++) {
             const int64_t p = t / step, down = t % step * GSF__TILE_ROWS, c = p * GSF__TILE_COLUMNS;
-            gsf__int8_finish(job, s + p * next + t % step * GSF__TILE_SUMS, r + down,
-                             gsf__least(row + rows - r - down, GSF__TILE_ROWS), column + c,
-                             gsf__least(columns - c, GSF__TILE_COLUMNS), tile);
+            gsf__int8_epilogue(job, s + p * next + t % step * GSF__TILE_SUMS, r + down,
+                               gsf__least(row + rows - r - down, GSF__TILE_ROWS), column + c,
+                               gsf__least(columns - c, GSF__TILE_COLUMNS), tile);
         }
     }
 }
@@ -4264,34 +4270,34 @@ static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a bloc
     }
 }
 
-static void gsf__int8_few(void* arg, size_t index, int32_t worker) { // some panels of outputs of all rows
+static void gsf__int8_gemv(void* arg, size_t index, int32_t worker) { // some panels of outputs of all rows
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
-    const int64_t rows = job->rows, few = job->kernels->few_rows, first = (int64_t)index * job->block_columns;
+    const int64_t rows = job->rows, most = job->kernels->gemv_rows, first = (int64_t)index * job->block_columns;
     const int64_t end = gsf__least(first + job->block_columns, job->weight->out);
     int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
     float* tile = (float*)(void*)(sums + GSF__TILE_SUMS);
     memset(sums, 0, GSF__TILE_SUMS * sizeof *sums); // also of rows that are not there
     for (int64_t column = first; column < end; column += GSF__TILE_COLUMNS) {
-        for (int64_t r = 0; r < rows; r += few)
-            job->kernels->few(job->x + (size_t)(r * job->padded) * job->kernels->x_size, gsf__least(rows - r, few),
-                              job->weight->data + column * job->padded, job->padded, sums + r * GSF__TILE_COLUMNS);
-        gsf__int8_finish(job, sums, 0, rows, column, gsf__least(end - column, GSF__TILE_COLUMNS), tile);
+        for (int64_t r = 0; r < rows; r += most)
+            job->kernels->gemv(job->x + (size_t)(r * job->padded) * job->kernels->x_size, gsf__least(rows - r, most),
+                               job->weight->data + column * job->padded, job->padded, sums + r * GSF__TILE_COLUMNS);
+        gsf__int8_epilogue(job, sums, 0, rows, column, gsf__least(end - column, GSF__TILE_COLUMNS), tile);
     }
 }
 
-static void gsf__int8_run_few(gsf_context* ctx, gsf__int8_job* job) {
+static void gsf__int8_run_gemv(gsf_context* ctx, gsf__int8_job* job) {
     const gsf__nn_linear_desc* d = &job->linear.desc;
     float* x = (float*)(void*)job->workers;
     job->rows = d->rows;
     memset(job->scales, 0, GSF__TILE_ROWS * sizeof *job->scales);
     for (int64_t r = 0; r < d->rows; r++) {
-        const int64_t first = r - r % job->kernels->few_rows, width = gsf__least(d->rows - first, job->kernels->few_rows);
+        const int64_t first = r - r % job->kernels->gemv_rows, width = gsf__least(d->rows - first, job->kernels->gemv_rows);
         memcpy(x, d->x + r * d->ldx, (size_t)job->weight->in * sizeof *x);
         job->scales[r] = gsf__int8_row(job->kernels, 0, x, job->weight->in, job->padded, job->weight->block,
                                        job->x + (size_t)(first * job->padded + 4 * (r - first)) * job->kernels->x_size,
                                        4 * width);
     }
-    gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->weight->out, job->block_columns), gsf__int8_few, job);
+    gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->weight->out, job->block_columns), gsf__int8_gemv, job);
 }
 
 // Cuts the work by its sizes; bytes of scratch for `workers`, or 0 where they cannot be counted.
@@ -4304,8 +4310,8 @@ static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     job->held = gsf__even_piece(rows, most, GSF__TILE_ROWS);
     job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, 2 * GSF__TILE_ROWS);
     job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__LINEAR_PAIR);
-    if (rows <= GSF__FEW_ROWS) { // all at once; outputs in GSF__FEW_CHUNKS parts
-        const int64_t least = GSF__FEW_BYTES / job->padded + 1, share = gsf__ceil_div(out, GSF__FEW_CHUNKS);
+    if (rows <= GSF__GEMV_ROWS) { // all at once; outputs in GSF__GEMV_CHUNKS parts
+        const int64_t least = GSF__GEMV_BYTES / job->padded + 1, share = gsf__ceil_div(out, GSF__GEMV_CHUNKS);
         job->block_columns = gsf__round_up(gsf__least(share < least ? least : share, out), GSF__TILE_COLUMNS);
     }
     const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__LINEAR_PAIR;
@@ -4358,8 +4364,8 @@ static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* w
     if (desc->bias) gsf_nn_convert_tensor(desc->bias, 0, weight->out, linear->bias);
     linear->kernels = gsf__linear_kernels_of(ctx->cpu_level, 0);
     const int64_t column_blocks = gsf__ceil_div(weight->out, job.block_columns);
-    if (desc->rows <= GSF__FEW_ROWS) gsf__int8_run_few(ctx, &job);
-    for (; job.first < desc->rows && desc->rows > GSF__FEW_ROWS; job.first += job.held) {
+    if (desc->rows <= GSF__GEMV_ROWS) gsf__int8_run_gemv(ctx, &job);
+    for (; job.first < desc->rows && desc->rows > GSF__GEMV_ROWS; job.first += job.held) {
         job.rows = gsf__least(desc->rows - job.first, job.held);
         job.row_blocks = gsf__ceil_div(job.rows, job.block_rows);
         gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job.rows, GSF__TILE_ROWS), gsf__int8_quantize_rows, &job);

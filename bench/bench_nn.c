@@ -274,7 +274,7 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     l.in = in;
     l.out = out;
     const size_t bytes = (size_t)in * (size_t)out * gsf_nn_get_dtype_size(dtype);
-    l.copies = rows <= GSF__FEW_ROWS ? (int64_t)(size / bytes) : 1;
+    l.copies = rows <= GSF__GEMV_ROWS ? (int64_t)(size / bytes) : 1;
     bench_fill(memory, l.copies > 1 ? size : bytes, dtype, 1);
     l.weight.name = "weight";
     l.weight.data = memory;
@@ -297,7 +297,7 @@ static void bench_one_linear(const bench_options* o, gsf_cpu_level level, int th
     l.desc.y = y;
     l.desc.bf16 = bf16;
     const double flops = 2.0 * (double)rows * (double)in * (double)out;
-    const int few = rows <= GSF__FEW_ROWS;
+    const int few = rows <= GSF__GEMV_ROWS;
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? (double)bytes : flops, few ? "B" : "flop");
     if (few) row.bytes = (double)bytes;
     else row.flops = flops;
@@ -339,7 +339,7 @@ static void bench_linears(const bench_options* o, char* memory, size_t size) {
             for (size_t i = 0; i < GSF__COUNT(shapes); i++) {
                 const bench_shape* s = &shapes[i];
                 if (o->quick && !s->quick) continue;
-                for (int bf16 = 0; bf16 <= bench_has_bf16(o, dtypes[t]) && (!bf16 || s->rows > GSF__FEW_ROWS); bf16++)
+                for (int bf16 = 0; bf16 <= bench_has_bf16(o, dtypes[t]) && (!bf16 || s->rows > GSF__GEMV_ROWS); bf16++)
                     bench_one_linear(o, o->level, threads, dtypes[t], bf16, s->rows, s->out, s->in, s->activation, memory,
                                      size);
             }
@@ -396,7 +396,7 @@ static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int thre
     l.linear.copies = 1;
     bench_run_quantize(&ctx, &l);
     bench_run_int8(&ctx, &l);
-    const int few = rows <= GSF__FEW_ROWS;
+    const int few = rows <= GSF__GEMV_ROWS;
     const double ops = 2.0 * (double)rows * (double)in * (double)out, bytes = (double)l.weight.bytes;
     bench_row row = bench_make_row(name, level, threads, 0.0, 0.0, few ? bytes : ops, few ? "B" : "op");
     bench_linear_error(&l.linear, w, bias, &row);

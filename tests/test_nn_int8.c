@@ -276,7 +276,7 @@ static void test_extremes(gsf_cpu_level best) {
             kernels->tile(a, panel, COUNT, 1, sums);
             int wrong = 0;
             for (int i = 0; i < GSF__TILE_SUMS; i++) wrong += (uint32_t)sums[i] != 2 * once;
-            kernels->few(a, FEW, w, COUNT, sums);
+            kernels->gemv(a, FEW, w, COUNT, sums);
             for (int i = 0; i < FEW * GSF__TILE_COLUMNS; i++) wrong += (uint32_t)sums[i] != once;
             CHECK(wrong == 0);
         }
