@@ -42,6 +42,36 @@
                context.
    THREADS     One thread at a time per context. Work is split through the parallel hook on a grid of chunks that depends
                on sizes only, so results do not depend on the number of workers.
+   NAMES       Functions are gsf_VERB_NOUN, in the modules gsf_traj_VERB_NOUN, gsf_splat_VERB_NOUN and gsf_nn_VERB_NOUN;
+               without a noun the object is the module's own (gsf_splat_load loads splats). One verb per idea in all
+               modules; tests/api.py checks every public name against this table:
+       init                 fill in a struct of the caller's; it owns nothing, so there is no counterpart
+       make destroy         create an object that owns memory, from a desc or from data; free it
+       load save            read an object from a file or folder; write it to one
+       parse format         read an object from bytes in memory; append its bytes to a gsf_buffer
+       read write           a whole file as bytes
+       append               add to a gsf_buffer
+       encode decode        turn pixels and text into PNG, tokens, features or latents, and back
+       query                tell sizes, costs or a plan without doing the work: a struct ..._info, or numbers
+       resolve              fill in every default of a desc
+       get set copy         borrow, replace or duplicate one property of an object
+       find count           look something up (NULL, 0 or an error if there is none); tell how many there are
+       check                validate; the error says what is wrong
+       wrap                 make a view of the caller's memory
+       convert resize project split sort filter quantize    turn data into other data
+       step                 advance an object that the host drives by one step: trainer, fixer, sampler
+       render restore sample caption run    compute a result with splats, a restorer, a path or a model
+       measure              compute a figure of some data
+       draw                 draw a random number
+       look                 make a pose from what it looks at
+       describe             name a value in words
+       alloc free fail log request clear is    memory, errors and cancellation, through the context
+               Internal names begin with gsf__ or GSF__ and are never exported. Types are gsf_NOUN, gsf_traj_NOUN and
+               gsf_nn_NOUN: ..._desc is what the caller asks for, with zero as the default; ..._stats is what a call did;
+               ..._info is what query answers. Enumerators carry the type's name (GSF_LOG_ERROR of gsf_log_level), dtypes
+               their own (GSF_U8). Flags are int32_t, counts of elements in memory size_t, sizes of tensors and images
+               int64_t. Bytes are passed as (data, size) with a name for error messages, and grow in a gsf_buffer. The words
+               are the field's: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v; tokens, positions, latents.
    SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images
                >>resize >>metrics >>cameras >>clips >>glm >>oiio
 */
@@ -143,8 +173,8 @@ typedef struct gsf_io { // both or neither (neither: stdio; files are written un
     gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size);
     gsf_result (*write_fn)(void* user, gsf_context* ctx, const char* path, const void* data, size_t size);
     void* user;
-    int32_t plain_files; // 1: read_fn reads ordinary files of the platform (and only logs or counts reads, for example); the
-                     // library may then also list folders, map files and read parts of them, as with stdio
+    int32_t plain_files; // 1: read_fn reads ordinary files of the platform (and only logs or counts reads, for example);
+                         // the library may then also list folders, map files and read parts of them, as with stdio
 } gsf_io;
 
 typedef struct gsf_progress { // called on the calling thread, at most a few times per second of work
@@ -198,17 +228,18 @@ GSF_API double gsf_draw_normal(uint64_t seed, uint64_t stream, uint64_t index); 
 
 // ---- text and files ------------------------------------------------------------
 
-typedef struct gsf_buffer { // growing UTF-8 buffer, zero-terminated as soon as anything has been appended
+typedef struct gsf_buffer { // growing bytes or UTF-8 text, zero-terminated as soon as anything has been appended
     char* data;
     size_t size, capacity;
     int32_t failed; // an allocation failed; later calls do nothing
 } gsf_buffer;
 
-GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* text, const char* format, ...) GSF_PRINTF(3, 4);
-GSF_API void gsf_append_bytes(gsf_context* ctx, gsf_buffer* text, const char* data, size_t size);
-GSF_API void gsf_append_json_string(gsf_context* ctx, gsf_buffer* text, const char* string); // quoted and escaped
-GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* text, double value);   // NaN, inf become null
-GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* text);
+// Text as printf formats it, bytes as they are, values as JSON spells them.
+GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* out, const char* format, ...) GSF_PRINTF(3, 4);
+GSF_API void gsf_append_bytes(gsf_context* ctx, gsf_buffer* out, const char* data, size_t size);
+GSF_API void gsf_append_json_string(gsf_context* ctx, gsf_buffer* out, const char* string); // quoted and escaped
+GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* out, double value);       // NaN, inf become null
+GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* buffer);
 
 // Whole-file input and output through the io hook. `*data` is freed with gsf_free. Only regular files are read: pipes and
 // devices are refused instead of blocking.

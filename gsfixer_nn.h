@@ -34,7 +34,8 @@
        gsf_nn_sample(&ctx, &transformer, &vae, &schedule, &desc, restored, NULL);   // check every result
 
    MEMORY      Weight files are mapped where the platform can (else read whole) and used in place; what no layer touches
-               never leaves the disk. Kernels take a gsf__nn_workspace that grows to the largest need and stays there.
+               never leaves the disk. The kernels' scratch memory grows to the
+               largest need of a call and is reused within it.
    THREADS     As gsfixer.h: the same bits for any number of workers.
    PROCESSORS  Every kernel is there in scalar C and for AVX2, those that count for AVX-512; 8-bit layers use its dot
                products of bytes (VNNI), layers and attention those of bfloat16 where a descriptor's member `bf16` asks for
@@ -42,8 +43,8 @@
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
-   SECTIONS    >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn norms >>nn linear >>nn int8
-               >>nn attention >>nn convolution >>nn positions >>nn image encoders >>nn bpe >>nn captioner
+   SECTIONS    >>nn kernels >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn norms >>nn linear
+               >>nn int8 >>nn attention >>nn convolution >>nn positions >>nn image encoders >>nn bpe >>nn captioner
                >>nn tokenizer >>nn t5 >>nn vae >>nn transformer >>nn scheduler >>nn sampling >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
@@ -250,7 +251,6 @@ typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that 
 // none, FOLDER/added_tokens.json; without either file T5's 100. Every length and offset is checked: a malformed file gives
 // GSF_ERROR_FORMAT with its name and byte offset, another model than a unigram GSF_ERROR_UNSUPPORTED.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
-// The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
 GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer);
 
 // `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
@@ -474,6 +474,7 @@ typedef struct gsf_nn_sampler {
 
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule,
                                                      const gsf_nn_sampler_desc* desc, gsf_nn_sampler* out);
+// Frees the time steps and earlier predictions; the schedule is the caller's.
 GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler);
 // One step: x (value_count), the latents at timesteps[index], becomes those at the next one; v is the model's output for
 // x. x0 (NULL allowed) gets the predicted clean latents. eta is 0: nothing is random. A latent that is NaN or infinite
@@ -9197,6 +9198,7 @@ static void gsf__sp_end_making(gsf_context* ctx, gsf_result result, gsf__nn_conf
 }
 
 // The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
+// From the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
 GSF__SHARED gsf_result gsf__nn_parse_tokenizer(gsf_context* ctx, const char* name, const void* model, size_t model_size,
                                                const char* config, size_t config_size, gsf_nn_tokenizer* out) {
     gsf__nn_config files[2];

@@ -28,7 +28,7 @@
        photos, COLMAP model or transforms.json                 .ply .splat .spz
              | gsf_splat_load_scene                                  ^ gsf_splat_save
              v                                                       | gsf_splat_load
-         gsf_scene ---- gsf_splat_make_initial_splats ------------> gsf_splats ---- gsf_splat_render ----> colour, depth, alpha
+         gsf_scene ---- gsf_splat_make_initial_splats -------> gsf_splats ---- gsf_splat_render ----> colour, depth, alpha
              |            visible points, dense stereo             |
              | gsf_splat_load_train_views                          |
              v                                                     v
@@ -41,7 +41,7 @@
    STEP BY STEP
        gsf_splat_load_scene(&ctx, "scene", NULL, &scene);                                // cameras and points
        gsf_splat_load_train_views(&ctx, &scene, NULL, scene.view_count, &views);         // photos
-       gsf_splat_make_initial_splats(&ctx, &scene, NULL, scene.view_count, NULL, &start, NULL); // points -> splats
+       gsf_splat_make_initial_splats(&ctx, &scene, NULL, scene.view_count, NULL, &start, NULL);   // points -> splats
        desc = gsf_splat_resolve_few_view_desc(&scene, GSF_QUALITY_BALANCED);
        gsf_splat_make_warp(&ctx, &warp);                                                 // or your own gsf_restorer
        gsf_splat_make_fixer(&ctx, &desc, views, scene.view_count, &start, &warp, &fixer);
@@ -154,6 +154,7 @@ typedef struct gsf_splat_save_desc {
                           // and for glTF's KHR_gaussian_splatting_compression_spz_2
 } gsf_splat_save_desc;
 
+// Any of the formats.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const void* data, size_t size,
                                                  gsf_splats* out);
@@ -628,11 +629,11 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fix
 // ---- from photos to splats -----------------------------------------------------
 /* The choices of the program `gsfix fix`, based on measurements (bench/QUALITY.md) with scenes of 3 to 50 photos. A host
    that makes the same calls gets bit-identical splats; every value may be changed in between.
-       gsf_splat_load_scene         cameras and points
-       gsf_splat_load_train_views   photos
+       gsf_splat_load_scene              cameras and points
+       gsf_splat_load_train_views        photos
        gsf_splat_make_initial_splats     points -> splats to begin with
-       gsf_splat_resolve_few_view_desc      settings of the loop and of the trainer
-       gsf_splat_make_fixer         or gsf_splat_make_trainer with the desc's `train`, to train without repair
+       gsf_splat_resolve_few_view_desc   settings of the loop and of the trainer
+       gsf_splat_make_fixer              or gsf_splat_make_trainer with the desc's `train`, to train without repair
    `views` are indices into scene->views; NULL = all of them in their order (view_count is then scene->view_count). */
 
 // Decodes the photos of these views, unless already present, and lists them for a trainer or fixer. *out is freed with

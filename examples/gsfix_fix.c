@@ -726,8 +726,8 @@ static gsf_result resume(fix_run* run) {
     gsf_result result = open_checkpoint(run, path.s, &data, &size, &json);
     if (result == GSF_OK)
         result = compare_switches(run, path.s, &json, gsf_find_json_member(&json, &json.values[0], "switches"));
-    if (result == GSF_OK) result = compare_inputs(run, path.s, &json,
-                                                  gsf_find_json_member(&json, &json.values[0], "inputs"));
+    if (result == GSF_OK)
+        result = compare_inputs(run, path.s, &json, gsf_find_json_member(&json, &json.values[0], "inputs"));
     if (result == GSF_OK) result = read_history(run, path.s, &json);
     if (result == GSF_OK) result = start_fixer(run); // without the restorer if it was comparing
     if (result == GSF_OK) result = gsf_splat_parse_fixer(ctx, run->fixer, path.s, data, size);
