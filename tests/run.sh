@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # tests/run.sh [CTEST ARGUMENTS]: runs all tests, also on a fresh Debian machine.
-#   build/        gcc, Release: all tests, and again with the scalar kernels; compile matrix; consumers; fuzz corpora
+#   build/        gcc, Release: all tests, and again with the scalar kernels; compile matrix; style; consumers; fuzz corpora
 #   build/asan/   clang, AddressSanitizer and UndefinedBehaviorSanitizer: all tests and fuzz corpora
 #   build/tsan/   clang, ThreadSanitizer: the threaded tests, on a pthread job system
 #   build/all/    one ctest run over the three; its log is build/all/Testing/Temporary/LastTest.log

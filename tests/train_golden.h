@@ -358,6 +358,9 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
     CHECK(opacity.count == model.count);
     test_compare_floats("after_reset.opacity", model.groups[GSF__OPACITY].value, opacity.v, model.count, 1e-5);
     test_compare_floats("after_reset.exp_avg.opacity", model.groups[GSF__OPACITY].m, moment.v, model.count, 0.0);
+    size_t kept = 0; // of the second moments, which the file leaves out
+    for (size_t i = 0; i < model.count; i++) kept += model.groups[GSF__OPACITY].v[i] != 0.0f;
+    CHECK(kept == 0 && model.count > 0);
     gsf__model_destroy(ctx, &model);
     free(given);
     test_free_tensor(&sum); test_free_tensor(&denominator); test_free_tensor(&normals);

@@ -1,0 +1,98 @@
+#!/usr/bin/env bash
+# mutants.sh [TEXT]: do the tests notice? Each mutant is one wrong line in a copy of the headers, and a test that has to fail
+# on it. Fails when a mutant survives, does not compile or no longer applies. With TEXT only the mutants whose line in the
+# table below contains it. Not part of run.sh: about 30 programs are compiled, JOBS (default: all cores) at a time.
+# CC (default gcc) and CFLAGS (default -O1) as usual.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+# FILE | TEST (tests/TEST.c) | what is wrong | substitution, as perl takes it (over the whole file; it must change something)
+table() {
+    cat << 'END'
+gsfixer.h|test_gsfixer|JSON strings hold raw characters from 0x10 on|s/if \(c < 0x20\) return gsf__json_fail/if (c < 0x10) return gsf__json_fail/
+gsfixer.h|test_gsfixer|JSON escapes of control characters are short|s/\\\\u%04x/\\\\u%03x/
+gsfixer.h|test_resize|bicubic with a = -0.75, as OpenCV has it|s/const double a = -0\.5;/const double a = -0.75;/
+gsfixer.h|golden_metrics|SSIM: constants without their squares|s/c1 = 0\.01 \* 0\.01, c2 = 0\.03 \* 0\.03/c1 = 0.01, c2 = 0.03/
+gsfixer_traj.h|golden_traj|slerp is a straight line|s/wa = sin\(angle \* \(1\.0 - t\)\) \/ sin\(angle\);/wa = 1.0 - t;/
+gsfixer_traj.h|golden_traj|windows overlap by one frame less|s/each = shared \/ \((\w+\.)?windows - 1\);/each = shared \/ ($1windows - 1) - 1;/
+gsfixer_traj.h|test_rules|restored views weigh t^2, not t (2 - t)|s/t \* \(2\.0f - t\)/t * t/
+gsfixer_splat.h|test_rules|photos and restored views averaged together|s/grad_sum\[k\]\[i\] \/ \(float\)model->visits\[k\]\[i\]/grad_sum[k][i] \/ (float)(model->visits[0][i] + model->visits[1][i])/
+gsfixer_splat.h|test_rules|restored views counted as photos|s/model->grad_sum\[k\]\[i\] \+= norm/model->grad_sum[0][i] += norm/
+gsfixer_splat.h|test_rules|an origin from 2000 extents on|s/distance > 1000\.0 \* extent/distance > 2000.0 * extent/
+gsfixer_splat.h|test_rules|warp: a nearer group needs half the weight|s/(define GSF__WARP_GROUP_SHARE) 0\.35f/$1 0.5f/
+gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/d\.min_angle = 1\.0f/d.min_angle = 2.0f/
+gsfixer_splat.h|test_rules|dense points: max_normal_angle of 60 degrees|s/d\.max_normal_angle = 40\.0f/d.max_normal_angle = 60.0f/
+gsfixer_splat.h|test_stereo|dense points: normals are not compared|s/return dot >= job->min_normal_dot/return dot >= -1.0f/
+gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/basis\[10\] = 2\.890611442640554f/basis[10] = -2.890611442640554f/
+gsfixer_splat.h|golden_splat|densification splits what it should clone|s/<= clone_log \? GSF__CLONE : GSF__SPLIT/<= clone_log ? GSF__SPLIT : GSF__CLONE/
+gsfixer_splat.h|golden_splat|opacity reset raises opacities|s/if \(group->value\[i\] > logit\)/if (group->value[i] < logit)/
+gsfixer_splat.h|golden_splat|opacity reset keeps the second moments|s/(group->value\[i\] = logit;\s*memset\(group->m,[^;]*;)\s*memset\(group->v,[^;]*;/$1/
+gsfixer_splat.h|test_scene|PLY: f_rest is written coefficient by coefficient|s/gsf__put_f32\(p, sh\[3 \* k \+ channel\]\)/gsf__put_f32(p, sh[3 * (1 + (channel * (bands - 1) + k - 1) \/ 3) + (channel * (bands - 1) + k - 1) % 3])/
+gsfixer_splat.h|test_scene|undistortion: tangential terms swapped|s/\*u = x \* scale \+ 2\.0 \* k\[2\] \* x \* y \+ k\[3\] \*/*u = x * scale + 2.0 * k[3] * x * y + k[2] */
+gsfixer_nn.h|golden_restorer|RoPE: frequencies of the next pair|s/exponent = \(float\)k \/ \(float\)dim/exponent = (float)(k + 2) \/ (float)dim/
+gsfixer_nn.h|golden_restorer|adaLN: the text takes the video's shift and scale|s/m \+ 4 \* d, m \+ 3 \* d/m + d, m/
+gsfixer_nn.h|golden_restorer|schedule: betas are not rescaled to zero terminal SNR|s/no_zero_snr = !rescale/no_zero_snr = 1/
+gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/
+END
+}
+
+work=$(mktemp -d)
+chmod 755 "$work" # test_scene reads as another user
+trap 'rm -rf "$work"' EXIT
+export OMP_NUM_THREADS=1
+
+# As tests/CMakeLists.txt builds a program that stands alone, but for the optional libraries.
+build() { # TEST HEADERS PROGRAM
+    mkdir "$3.tmp"
+    ${CC:-gcc} -std=c11 ${CFLAGS:--O1} -w -DNDEBUG -DGSFIXER_STATIC -DGSFIXER_IMPLEMENTATION= -I"$2" -Itests \
+        -DTEST_GOLDEN="\"$PWD/tests/golden\"" -DTEST_TMP="\"$3.tmp\"" "tests/$1.c" -o "$3" -lm -pthread 2> "$3.log"
+}
+
+# The tests pass on the headers as they are, else a failure says nothing.
+baseline() { # TEST
+    local program=$work/baseline.${1//\//.}
+    build "$1" . "$program" || { echo "$1: does not compile"; return 1; }
+    timeout 600 "$program" > "$program.log" 2>&1 || { echo "$1: fails on the headers as they are"; tail -n 5 "$program.log"; return 1; }
+}
+
+mutant() { # NUMBER LINE
+    local file test what edit verdict headers=$work/$1
+    IFS='|' read -r file test what edit <<< "$2"
+    mkdir "$headers"
+    cp gsfixer*.h "$headers"
+    if ! perl -0pi -e "$edit" "$headers/$file" || cmp -s "$file" "$headers/$file"; then
+        verdict="DOES NOT APPLY"
+    elif ! build "$test" "$headers" "$headers/program"; then
+        verdict="DOES NOT COMPILE"
+    elif timeout 600 "$headers/program" > "$headers/log" 2>&1; then
+        verdict=SURVIVED
+    else
+        verdict=killed
+    fi
+    printf '%-16s  %-16s  %-19s  %s\n' "$verdict" "$file" "$test" "$what" > "$work/result.$1"
+    rm -rf "$headers"
+}
+
+all() { # COMMAND ITEM...: JOBS of them at a time
+    local command=$1 item n=0
+    shift
+    for item in "$@"; do
+        while [ "$(jobs -rp | wc -l)" -ge "${JOBS:-$(nproc)}" ]; do wait -n || true; done
+        n=$((n + 1))
+        $command "$item" $n &
+    done
+    wait
+}
+checked_baseline() { baseline "$1" > "$work/note.$2" || mv "$work/note.$2" "$work/bad.$2"; }
+numbered_mutant() { mutant "$(printf '%03d' "$2")" "$1"; }
+
+mapfile -t lines < <(table | grep -F -- "${1:-}")
+[ ${#lines[@]} -gt 0 ] || { echo "mutants.sh: no mutant of that name" >&2; exit 2; }
+mapfile -t tests < <(printf '%s\n' "${lines[@]}" | cut -d'|' -f2 | sort -u)
+all checked_baseline "${tests[@]}"
+if compgen -G "$work/bad.*" > /dev/null; then cat "$work"/bad.*; exit 1; fi
+all numbered_mutant "${lines[@]}"
+cat "$work"/result.*
+killed=$(cat "$work"/result.* | grep '^killed' | wc -l)
+echo "${#lines[@]} mutants, $killed killed"
+[ "$killed" = ${#lines[@]} ]
