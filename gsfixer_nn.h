@@ -43,9 +43,12 @@
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
-   SECTIONS    >>nn kernels >>nn numbers >>nn workspace >>nn files >>nn vector >>nn activations >>nn norms >>nn linear
-               >>nn int8 >>nn attention >>nn convolution >>nn positions >>nn image encoders >>nn bpe >>nn captioner
-               >>nn tokenizer >>nn t5 >>nn vae >>nn transformer >>nn scheduler >>nn sampling >>nn restorer
+   SECTIONS    files      >>nn kernels (declared) >>nn numbers >>nn workspace >>nn files: safetensors, config.json
+               lanes      >>nn vector
+               kernels    >>nn activations >>nn norms >>nn linear >>nn int8 >>nn attention >>nn convolution >>nn positions
+               layers     >>nn layers
+               networks   >>nn image encoders >>nn bpe >>nn captioner >>nn tokenizer >>nn t5 >>nn vae >>nn transformer
+               restoring  >>nn scheduler >>nn sampling >>nn restorer
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -5754,15 +5757,13 @@ static gsf_result gsf__nn_bind(gsf__nn_loader* loader, const gsf__nn_sizes* size
     return gsf__nn_visit(sizes, entries, prefix, where, gsf__nn_take_visited, loader);
 }
 
-// `count` blocks of `size` bytes called NAMES0., NAMES1., ...; *blocks is to be freed, also on error.
-static gsf_result gsf__nn_bind_blocks(gsf__nn_loader* loader, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
-                                      const char* names, int64_t count, size_t size, void** blocks) {
+// `count` structs of `size` bytes at `blocks`, called NAMES0., NAMES1., ...
+static gsf_result gsf__nn_bind_each(gsf__nn_loader* loader, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
+                                    const char* names, int64_t count, size_t size, void* blocks) {
     char prefix[96];
-    *blocks = gsf_alloc_zeroed(loader->ctx, (size_t)count, size);
-    if (!*blocks) return GSF_ERROR_OUT_OF_MEMORY;
     for (int64_t i = 0; i < count; i++) {
         snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
-        GSF__TRY(gsf__nn_bind(loader, sizes, entries, prefix, (char*)*blocks + (size_t)i * size));
+        GSF__TRY(gsf__nn_bind(loader, sizes, entries, prefix, (char*)blocks + (size_t)i * size));
     }
     return GSF_OK;
 }
@@ -5990,34 +5991,29 @@ static void gsf__nn_patch(gsf_context* ctx, const gsf__nn_patch_job* job, int64_
 
 // ---- layers: rotation by row and column
 
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_TURN
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_TURN
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_TURN
+
 // Pairs (x[i], x[i + count]) turned by the angles of cos and sin (count).
+GSF__V_KERNEL void GSF__V(gsf__nn_turn)(float* x, int64_t count, const float* cos, const float* sin) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t n = (size_t)(count - i);
+        const gsf__vf a = gsf__v_load_first(x + i, n), b = gsf__v_load_first(x + i + count, n);
+        const gsf__vf c = gsf__v_load_first(cos + i, n), s = gsf__v_load_first(sin + i, n);
+        gsf__v_store_first(x + i, gsf__v_msub(a, c, b * s), n);
+        gsf__v_store_first(x + i + count, gsf__v_madd(b, c, a * s), n);
+    }
+}
+
+#endif // GSF__KERNELS_TURN
+#ifndef GSF__ISA
+
 typedef void (*gsf__nn_turn_fn)(float* x, int64_t count, const float* cos, const float* sin);
-
-static void gsf__nn_turn_scalar(float* x, int64_t count, const float* cos, const float* sin) {
-    for (int64_t i = 0; i < count; i++) {
-        const float a = x[i], b = x[i + count];
-        x[i] = a * cos[i] - b * sin[i];
-        x[i + count] = b * cos[i] + a * sin[i];
-    }
-}
-
-#if GSF__X86
-GSF__TARGET_AVX2 static void gsf__nn_turn_avx2(float* x, int64_t count, const float* cos, const float* sin) {
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8) {
-        const __m256 a = _mm256_loadu_ps(x + i), b = _mm256_loadu_ps(x + i + count);
-        const __m256 c = _mm256_loadu_ps(cos + i), s = _mm256_loadu_ps(sin + i);
-        _mm256_storeu_ps(x + i, _mm256_fmsub_ps(a, c, b * s));
-        _mm256_storeu_ps(x + i + count, _mm256_fmadd_ps(b, c, a * s));
-    }
-    if (i == count) return;
-    const __m256i mask = gsf__nn_mask8(count - i);
-    const __m256 a = _mm256_maskload_ps(x + i, mask), b = _mm256_maskload_ps(x + i + count, mask);
-    const __m256 c = _mm256_maskload_ps(cos + i, mask), s = _mm256_maskload_ps(sin + i, mask);
-    _mm256_maskstore_ps(x + i, mask, _mm256_fmsub_ps(a, c, b * s));
-    _mm256_maskstore_ps(x + i + count, mask, _mm256_fmadd_ps(b, c, a * s));
-}
-#endif
 
 static gsf__nn_turn_fn gsf__nn_turn_of(gsf_cpu_level level) {
 #if GSF__X86
@@ -6180,6 +6176,15 @@ static gsf__nn_sizes gsf__nn_sizes_of_block(const gsf__nn_block_sizes* s) {
     return sizes;
 }
 
+// `count` blocks called NAMES0., NAMES1., ...; *out is to be freed, also on error.
+static gsf_result gsf__nn_bind_blocks(gsf__nn_loader* loader, const gsf__nn_block_sizes* s, const gsf__nn_entry* entries,
+                                      const char* names, int64_t count, gsf__nn_block** out) {
+    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(s);
+    *out = (gsf__nn_block*)gsf_alloc_zeroed(loader->ctx, (size_t)count, sizeof **out);
+    if (!*out) return GSF_ERROR_OUT_OF_MEMORY;
+    return gsf__nn_bind_each(loader, &sizes, entries, names, count, sizeof **out, *out);
+}
+
 // Floats that run->wide needs for `rows` rows, of which those of the MLP may come in runs of `most`.
 static size_t gsf__nn_wide(const gsf__nn_block_sizes* s, int64_t rows, int64_t most) {
     const size_t inner = (size_t)s->heads * (size_t)s->head_dim;
@@ -6285,22 +6290,12 @@ static gsf__nn_sizes gsf__vggt_sizes(const gsf__vggt* net) {
     return sizes;
 }
 
-// `count` blocks called names0, names1, ...; *out is to be freed, also on error.
-static gsf_result gsf__vit_bind_blocks(gsf__nn_loader* loader, const gsf__nn_block_sizes* s, const gsf__nn_entry* entries,
-                                       const char* names, int64_t count, gsf__nn_block** out) {
-    const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(s);
-    void* blocks;
-    const gsf_result result = gsf__nn_bind_blocks(loader, &sizes, entries, names, count, sizeof **out, &blocks);
-    *out = (gsf__nn_block*)blocks;
-    return result;
-}
-
 // A vision transformer: what is below `prefix`, and its blocks.
 static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* entries, const gsf__nn_entry* block_entries,
                                 const char* prefix, gsf__vit* vit) {
     const gsf__nn_sizes sizes = gsf__vit_sizes(vit);
     GSF__TRY(gsf__nn_bind(loader, &sizes, entries, prefix, vit));
-    return gsf__vit_bind_blocks(loader, &vit->sizes, block_entries, vit->block_names, vit->layers, &vit->blocks);
+    return gsf__nn_bind_blocks(loader, &vit->sizes, block_entries, vit->block_names, vit->layers, &vit->blocks);
 }
 
 // ---- image encoders: from pixels to tokens
@@ -6651,8 +6646,8 @@ static gsf_result gsf__vggt_bind(gsf__nn_loader* loader, gsf__vggt* net) {
     const gsf__nn_entry* entries = gsf__vggt_block_entries;
     const gsf__nn_sizes sizes = gsf__vggt_sizes(net);
     GSF__TRY(gsf__vit_bind(loader, gsf__vggt_embed_entries, entries, "", &net->embed));
-    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, gsf__vggt_frame_names, net->layers, &net->frame));
-    GSF__TRY(gsf__vit_bind_blocks(loader, &net->sizes, entries, gsf__vggt_global_names, net->layers, &net->global));
+    GSF__TRY(gsf__nn_bind_blocks(loader, &net->sizes, entries, gsf__vggt_frame_names, net->layers, &net->frame));
+    GSF__TRY(gsf__nn_bind_blocks(loader, &net->sizes, entries, gsf__vggt_global_names, net->layers, &net->global));
     return gsf__nn_bind(loader, &sizes, gsf__vggt_entries, "", net);
 }
 
@@ -6957,13 +6952,11 @@ GSF_API gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov
         if (!result) result = gsf_nn_encode_vggt(ctx, vggt, &in, f->vggt);
     }
     gsf_free(ctx, pixels);
-    if (result && dinov2) {
-        gsf_free(ctx, f->dino);
-        f->dino = NULL;
-    }
-    if (result && vggt) {
-        gsf_free(ctx, f->vggt);
-        f->vggt = NULL;
+    float** const made[2] = {dinov2 ? &f->dino : NULL, vggt ? &f->vggt : NULL};
+    for (int i = 0; result && i < 2; i++) {
+        if (!made[i]) continue;
+        gsf_free(ctx, *made[i]);
+        *made[i] = NULL;
     }
     return result;
 }
@@ -7571,24 +7564,28 @@ GSF_API gsf_result gsf_nn_load_bpe(gsf_context* ctx, const char* folder, gsf_nn_
 
 // ---- encoding
 
+typedef struct gsf__nn_ids { // what a text becomes
+    int32_t* ids;
+    size_t count, capacity;
+} gsf__nn_ids;
+
+static gsf_result gsf__nn_emit(gsf_context* ctx, gsf__nn_ids* out, int32_t id) {
+    GSF__TRY(gsf__reserve(ctx, (void**)&out->ids, &out->capacity, out->count, out->count + 1, sizeof *out->ids));
+    out->ids[out->count++] = id;
+    return GSF_OK;
+}
+
 typedef struct gsf__bpe_run {
     gsf_context* ctx;
     const gsf__bpe_tables* t;
     int32_t unk;
-    int32_t* ids;       // the result
-    size_t count, capacity;
+    gsf__nn_ids out;
     void* scratch;      // of a word; see gsf__bpe_place
     size_t word_capacity;
     int32_t *symbols, *before, *after, *found, *batch; // per byte of a word
     uint64_t* heap;     // rank << 32 | place
     size_t heap_size;
 } gsf__bpe_run;
-
-static gsf_result gsf__bpe_emit(gsf__bpe_run* run, int32_t id) {
-    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->capacity, run->count, run->count + 1, sizeof *run->ids));
-    run->ids[run->count++] = id;
-    return GSF_OK;
-}
 
 static void gsf__bpe_sift(uint64_t* heap, size_t size, size_t at) { // down to its place in a heap with the least on top
     const uint64_t value = heap[at];
@@ -7685,7 +7682,7 @@ static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size
         if (symbol < 0 && run->unk < 0)
             return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "byte 0x%02x of the text is no token of this vocabulary",
                             (unsigned)(unsigned char)word[i]);
-        GSF__TRY(gsf__bpe_emit(run, symbol < 0 ? run->unk : run->t->tokens[symbol].id));
+        GSF__TRY(gsf__nn_emit(run->ctx, &run->out, symbol < 0 ? run->unk : run->t->tokens[symbol].id));
     }
     return GSF_OK;
 }
@@ -7753,7 +7750,7 @@ static gsf_result gsf__bpe_text(gsf__bpe_run* run, const char* text, size_t size
         gsf__bpe_strip(t, text, strip, token && token->flags & GSF__BPE_LSTRIP, &start, &end);
         GSF__TRY(gsf__bpe_piece(run, text + start, end - start));
         if (!token) break;
-        GSF__TRY(gsf__bpe_emit(run, token->id));
+        GSF__TRY(gsf__nn_emit(run->ctx, &run->out, token->id));
         start = at + token->size;
         at = start - 1;
         strip = token->flags & GSF__BPE_RSTRIP;
@@ -7777,8 +7774,8 @@ GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
         if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "text:%zu: byte 0x%02x is no UTF-8", i,
                                    (unsigned)(unsigned char)text[i]);
     }
-    gsf_result result = gsf__reserve(ctx, (void**)&run.ids, &run.capacity, 0, 16, sizeof *run.ids);
-    if (!result && bpe->add_bos && !no_bos) result = gsf__bpe_emit(&run, bpe->bos);
+    gsf_result result = gsf__reserve(ctx, (void**)&run.out.ids, &run.out.capacity, 0, 16, sizeof *run.out.ids);
+    if (!result && bpe->add_bos && !no_bos) result = gsf__nn_emit(ctx, &run.out, bpe->bos);
     if (!result && run.t->prefix_space) {
         gsf_buffer spaced;
         memset(&spaced, 0, sizeof spaced);
@@ -7790,12 +7787,11 @@ GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
         result = gsf__bpe_text(&run, text, size);
     }
     gsf_free(ctx, run.scratch);
-    if (result) gsf_free(ctx, run.ids);
-    else {
-        *ids = run.ids;
-        *count = run.count;
-    }
-    return result;
+    if (result) gsf_free(ctx, run.out.ids);
+    if (result) return result;
+    *ids = run.out.ids;
+    *count = run.out.count;
+    return GSF_OK;
 }
 
 // ---- decoding
@@ -8182,7 +8178,7 @@ static gsf_result gsf__blip_bind(gsf__nn_loader* loader, void* network) {
         opt->head.weight = opt->tokens;
         gsf__nn_ignore(loader, "language_model.lm_head."); // the words again
     }
-    return gsf__vit_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, "language_model.model.decoder.layers.",
+    return gsf__nn_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, "language_model.model.decoder.layers.",
                                 opt->layers, &opt->blocks);
 }
 
@@ -8802,6 +8798,20 @@ static int32_t gsf__sp_find(const gsf__sp_node* nodes, const char* text, size_t 
     return node ? node->id : -1;
 }
 
+// Id and *length of the longest text of the trie that `text` begins with, -1 and 0: none. types: user-defined pieces only.
+static int32_t gsf__sp_longest(const gsf__sp_node* nodes, const unsigned char* types, const char* text, size_t left,
+                               size_t* length) {
+    int32_t found = -1;
+    const gsf__sp_node* node = nodes;
+    *length = 0;
+    for (size_t i = 0; i < left && (node = gsf__sp_child(nodes, node, (unsigned char)text[i])) != NULL; i++) {
+        if (node->id < 0 || (types && types[node->id] != GSF__SP_USER)) continue;
+        found = node->id;
+        *length = i + 1;
+    }
+    return found;
+}
+
 // ---- the model
 
 typedef struct gsf__sp_added { // a text that is an id of its own
@@ -9256,18 +9266,10 @@ static size_t gsf__sp_match(const gsf__sp_model* m, const char* text, size_t lef
     return length;
 }
 
-static size_t gsf__sp_match_user(const gsf__sp_model* m, const char* text, size_t left) { // pieces that stay as they are
-    size_t length = 0;
-    const gsf__sp_node* node = m->pieces;
-    for (size_t i = 0; i < left && (node = gsf__sp_child(m->pieces, node, (unsigned char)text[i])) != NULL; i++)
-        if (node->id >= 0 && m->types[node->id] == GSF__SP_USER) length = i + 1;
-    return length;
-}
-
 static gsf__sp_step gsf__sp_next(const gsf__sp_model* m, const char* text, size_t left) {
     gsf__sp_step step = {text, 0, 0};
     uint32_t value = 0;
-    step.used = m->has_user_pieces ? gsf__sp_match_user(m, text, left) : 0;
+    if (m->has_user_pieces) gsf__sp_longest(m->pieces, m->types, text, left, &step.used); // these stay as they are
     if (!step.used && m->unit_count) {
         step.used = gsf__sp_match(m, text, left, &value);
         if (step.used) {
@@ -9299,8 +9301,7 @@ typedef struct gsf__sp_run {
     size_t size, capacity;
     gsf__sp_best* best;
     size_t best_capacity;
-    int32_t* ids;
-    size_t count, ids_capacity;
+    gsf__nn_ids out;
 } gsf__sp_run;
 
 static gsf_result gsf__sp_put(gsf__sp_run* run, const char* text, size_t size) { // spaces escaped
@@ -9396,12 +9397,6 @@ static void gsf__sp_spell(gsf__sp_run* run) {
     for (size_t end = n; end > 0; end = run->best[end].start) run->best[run->best[end].start].next = (uint32_t)end;
 }
 
-static gsf_result gsf__sp_emit(gsf__sp_run* run, int32_t id) {
-    GSF__TRY(gsf__reserve(run->ctx, (void**)&run->ids, &run->ids_capacity, run->count, run->count + 1, sizeof *run->ids));
-    run->ids[run->count++] = id;
-    return GSF_OK;
-}
-
 // The ids of a stretch of text without added tokens.
 static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size) {
     const gsf__sp_model* m = run->m;
@@ -9412,7 +9407,7 @@ static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size
         end = run->best[at].next;
         int32_t id = run->best[end].id;
         if (id == m->unknown_id && m->byte_fallback) {
-            for (size_t i = at; i < end; i++) GSF__TRY(gsf__sp_emit(run, m->bytes[(unsigned char)run->normal[i]]));
+            for (size_t i = at; i < end; i++) GSF__TRY(gsf__nn_emit(run->ctx, &run->out, m->bytes[(unsigned char)run->normal[i]]));
             continue;
         }
         if (id == m->unknown_id) { // a run of them is one; its text may be that of a piece which no spelling uses
@@ -9420,7 +9415,7 @@ static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size
             id = gsf__sp_find(m->pieces, run->normal + at, end - at);
             if (id < 0) id = m->unknown_id;
         }
-        GSF__TRY(gsf__sp_emit(run, id));
+        GSF__TRY(gsf__nn_emit(run->ctx, &run->out, id));
     }
     return GSF_OK;
 }
@@ -9445,26 +9440,18 @@ static size_t gsf__sp_white_before(const char* text, size_t end) { // of the one
     return 0;
 }
 
-// The longest added token that the text begins with, or NULL.
-static const gsf__sp_added* gsf__sp_match_added(const gsf__sp_model* m, const char* text, size_t left) {
-    const gsf__sp_added* found = NULL;
-    const gsf__sp_node* node = m->added;
-    for (size_t i = 0; i < left && (node = gsf__sp_child(m->added, node, (unsigned char)text[i])) != NULL; i++)
-        if (node->id >= 0) found = &m->added_list[node->id];
-    return found;
-}
-
 static gsf_result gsf__sp_encode_all(gsf__sp_run* run, const char* text, size_t size) {
     size_t from = 0; // of the stretch since the last added token
     for (size_t at = 0; at <= size; at++) {
-        const gsf__sp_added* found = at < size ? gsf__sp_match_added(run->m, text + at, size - at) : NULL;
         size_t end = at, white;
+        const int32_t place = at < size ? gsf__sp_longest(run->m->added, NULL, text + at, size - at, &white) : -1;
+        const gsf__sp_added* found = place >= 0 ? &run->m->added_list[place] : NULL;
         if (at < size && !found) continue;
         while (found && found->trim_left && end > from && (white = gsf__sp_white_before(text + from, end - from)) != 0)
             end -= white;
         if (end > from) GSF__TRY(gsf__sp_encode(run, text + from, end - from));
         if (!found) break;
-        GSF__TRY(gsf__sp_emit(run, found->id));
+        GSF__TRY(gsf__nn_emit(run->ctx, &run->out, found->id));
         from = at + found->size;
         while (found->trim_right && (white = gsf__sp_white(text + from, size - from)) != 0) from += white;
         at = from - 1;
@@ -9481,17 +9468,17 @@ GSF_API gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* 
     const gsf_result result = gsf__sp_encode_all(&run, text, size);
     const int32_t end = tokenizer->end_id;
     // where there is an end already, the official code adds none
-    const size_t all = run.count + !(run.count && run.ids[run.count - 1] == end);
+    const size_t made = run.out.count, all = made + !(made && run.out.ids[made - 1] == end);
     if (result == GSF_OK && count) *count = all;
     if (result == GSF_OK && room) {
-        size_t n = all <= room ? run.count : room - 1;
-        for (size_t i = 0; i < n; i++) ids[i] = run.ids[i];
+        size_t n = all <= room ? made : room - 1;
+        for (size_t i = 0; i < n; i++) ids[i] = run.out.ids[i];
         if (!(n && ids[n - 1] == end)) ids[n++] = end;
         for (; n < room; n++) ids[n] = tokenizer->pad_id;
     }
     gsf_free(ctx, run.normal);
     gsf_free(ctx, run.best);
-    gsf_free(ctx, run.ids);
+    gsf_free(ctx, run.out.ids);
     return result;
 }
 
@@ -9504,16 +9491,16 @@ typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
     gsf__nn_layer norm;
 } gsf__t5_nets;
 
-static const gsf__nn_entry gsf__t5_block_entries[] = { // below encoder.block.N.layer.
-    {"0.layer_norm", "d", GSF__NN_BLOCK_AS(norm1, GSF__NN_WEIGHT, 0)},
-    {"0.SelfAttention.q", "id", GSF__NN_BLOCK_AS(q, GSF__NN_WEIGHT, 0)},
-    {"0.SelfAttention.k", "id", GSF__NN_BLOCK_AS(k, GSF__NN_WEIGHT, 0)},
-    {"0.SelfAttention.v", "id", GSF__NN_BLOCK_AS(v, GSF__NN_WEIGHT, 0)},
-    {"0.SelfAttention.o", "di", GSF__NN_BLOCK_AS(out, GSF__NN_WEIGHT, 0)},
-    {"1.layer_norm", "d", GSF__NN_BLOCK_AS(norm2, GSF__NN_WEIGHT, 0)},
-    {"1.DenseReluDense.wi_0", "md", GSF__NN_BLOCK_AS(gate, GSF__NN_WEIGHT, 0)},
-    {"1.DenseReluDense.wi_1", "md", GSF__NN_BLOCK_AS(up, GSF__NN_WEIGHT, 0)},
-    {"1.DenseReluDense.wo", "dm", GSF__NN_BLOCK_AS(down, GSF__NN_WEIGHT, 0)},
+static const gsf__nn_entry gsf__t5_block_entries[] = { // below encoder.block.N.
+    {"layer.0.layer_norm", "d", GSF__NN_BLOCK_AS(norm1, GSF__NN_WEIGHT, 0)},
+    {"layer.0.SelfAttention.q", "id", GSF__NN_BLOCK_AS(q, GSF__NN_WEIGHT, 0)},
+    {"layer.0.SelfAttention.k", "id", GSF__NN_BLOCK_AS(k, GSF__NN_WEIGHT, 0)},
+    {"layer.0.SelfAttention.v", "id", GSF__NN_BLOCK_AS(v, GSF__NN_WEIGHT, 0)},
+    {"layer.0.SelfAttention.o", "di", GSF__NN_BLOCK_AS(out, GSF__NN_WEIGHT, 0)},
+    {"layer.1.layer_norm", "d", GSF__NN_BLOCK_AS(norm2, GSF__NN_WEIGHT, 0)},
+    {"layer.1.DenseReluDense.wi_0", "md", GSF__NN_BLOCK_AS(gate, GSF__NN_WEIGHT, 0)},
+    {"layer.1.DenseReluDense.wi_1", "md", GSF__NN_BLOCK_AS(up, GSF__NN_WEIGHT, 0)},
+    {"layer.1.DenseReluDense.wo", "dm", GSF__NN_BLOCK_AS(down, GSF__NN_WEIGHT, 0)},
     GSF__NN_END,
 };
 
@@ -9546,22 +9533,14 @@ static gsf__nn_block_sizes gsf__t5_block_sizes(const gsf_nn_t5* c) {
 
 static gsf_result gsf__t5_bind(gsf__nn_loader* loader, void* network) {
     gsf_nn_t5* c = (gsf_nn_t5*)network;
-    const gsf__nn_block_sizes block_sizes = gsf__t5_block_sizes(c);
-    const gsf__nn_sizes sizes = gsf__t5_sizes(c), block = gsf__nn_sizes_of_block(&block_sizes);
-    char prefix[48];
+    const gsf__nn_sizes sizes = gsf__t5_sizes(c);
     gsf__t5_nets* nets = (gsf__t5_nets*)gsf_alloc_zeroed(loader->ctx, 1, sizeof *nets);
     c->nets = nets;
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
-    nets->sizes = block_sizes;
-    nets->blocks = (gsf__nn_block*)gsf_alloc_zeroed(loader->ctx, (size_t)c->layers, sizeof *nets->blocks);
-    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->sizes = gsf__t5_block_sizes(c);
     GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__t5_entries, "", nets));
     gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
-    for (int32_t i = 0; i < c->layers; i++) {
-        snprintf(prefix, sizeof prefix, "encoder.block.%d.layer.", (int)i);
-        GSF__TRY(gsf__nn_bind(loader, &block, gsf__t5_block_entries, prefix, &nets->blocks[i]));
-    }
-    return GSF_OK;
+    return gsf__nn_bind_blocks(loader, &nets->sizes, gsf__t5_block_entries, "encoder.block.", c->layers, &nets->blocks);
 }
 
 static gsf_result gsf__t5_read_config(const gsf__nn_config* file, void* network) {
@@ -10412,22 +10391,14 @@ static float* gsf__vae_row(const gsf__vae_planes* p, int64_t c, int64_t t, int64
     return p->data + c * p->channel_stride + t * p->frame_stride + y * p->row_stride;
 }
 
-// Frames of a clip to channels-last.
-static void gsf__vae_gather(const gsf__vae_planes* in, int64_t first, int64_t frames, float* out) {
+// Frames of a clip, from `first` on, to channels-last; or back.
+static void gsf__vae_swap(const gsf__vae_planes* clip, int64_t first, int64_t frames, float* last, int back) {
     for (int64_t t = 0; t < frames; t++)
-        for (int64_t y = 0; y < in->height; y++, out += in->width * in->channels)
-            for (int64_t c = 0; c < in->channels; c++) {
-                const float* row = gsf__vae_row(in, c, first + t, y);
-                for (int64_t x = 0; x < in->width; x++) out[x * in->channels + c] = row[x];
-            }
-}
-
-static void gsf__vae_scatter(const float* x, int64_t first, int64_t frames, const gsf__vae_planes* out) {
-    for (int64_t t = 0; t < frames; t++)
-        for (int64_t y = 0; y < out->height; y++, x += out->width * out->channels)
-            for (int64_t c = 0; c < out->channels; c++) {
-                float* row = gsf__vae_row(out, c, first + t, y);
-                for (int64_t i = 0; i < out->width; i++) row[i] = x[i * out->channels + c];
+        for (int64_t y = 0; y < clip->height; y++, last += clip->width * clip->channels)
+            for (int64_t c = 0; c < clip->channels; c++) {
+                float* row = gsf__vae_row(clip, c, first + t, y);
+                for (int64_t x = 0; !back && x < clip->width; x++) last[x * clip->channels + c] = row[x];
+                for (int64_t x = 0; back && x < clip->width; x++) row[x] = last[x * clip->channels + c];
             }
 }
 
@@ -10469,10 +10440,10 @@ static gsf_result gsf__vae_clip(gsf__vae_run* run, const gsf__vae_planes* in, co
         x.width = in->width;
         x.channels = in->channels;
         GSF__TRY(gsf__vae_grow(run, &run->slots[GSF__VAE_INPUT], x.frames * gsf__vae_plane(&x)));
-        if (!run->dry) gsf__vae_gather(in, first, x.frames, run->slots[GSF__VAE_INPUT].data);
+        if (!run->dry) gsf__vae_swap(in, first, x.frames, run->slots[GSF__VAE_INPUT].data, 0);
         GSF__TRY(gsf__vae_chunk(run, &x, &y));
         if (!run->dry) {
-            gsf__vae_scatter(run->slots[y.slot].data, out_first, y.frames, out);
+            gsf__vae_swap(out, out_first, y.frames, run->slots[y.slot].data, 1);
             gsf__progress(run->ctx, run->stage, (double)++run->done, (double)run->total);
         }
         first += x.frames;
@@ -10882,18 +10853,17 @@ static gsf_result gsf__dit_read_config(const gsf__nn_config* file, void* network
 static gsf_result gsf__dit_bind(gsf__nn_loader* loader, void* network) {
     gsf_nn_transformer* net = (gsf_nn_transformer*)network;
     const gsf__nn_sizes sizes = gsf__dit_tensor_sizes(net);
-    void* blocks;
     gsf__dit_nets* nets = (gsf__dit_nets*)gsf_alloc_zeroed(loader->ctx, 1, sizeof *nets);
     net->nets = nets;
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
+    nets->blocks = (gsf__dit_block*)gsf_alloc_zeroed(loader->ctx, (size_t)net->layers, sizeof *nets->blocks);
+    if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__dit_entries, "", nets));
-    const gsf_result result = gsf__nn_bind_blocks(loader, &sizes, gsf__dit_block_entries, "transformer_blocks.",
-                                                  net->layers, sizeof *nets->blocks, &blocks);
-    nets->blocks = (gsf__dit_block*)blocks;
     if (!net->learned_positions) gsf__nn_ignore(loader, "patch_embed.pos_embedding"); // computed
     net->dino_channels = (int32_t)nets->dino.linear.weight->shape[1];
     net->vggt_channels = (int32_t)nets->vggt.linear.weight->shape[1];
-    return result;
+    return gsf__nn_bind_each(loader, &sizes, gsf__dit_block_entries, "transformer_blocks.", net->layers,
+                             sizeof *nets->blocks, nets->blocks);
 }
 
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer) {

@@ -492,10 +492,10 @@ static void model_add_entries(model_list* list, const gsf__nn_sizes* sizes, cons
 }
 
 static void model_add_blocks(model_list* list, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries, const char* names,
-                             const char* below, int64_t count) {
+                             int64_t count) {
     char prefix[80];
     for (int64_t i = 0; i < count; i++) {
-        snprintf(prefix, sizeof prefix, "%s%lld.%s", names, (long long)i, below);
+        snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)i);
         model_add_entries(list, sizes, entries, prefix);
     }
 }
@@ -505,7 +505,7 @@ static void model_add_transformer(model_list* list, const gsf_nn_transformer* c)
     list->dino = c->dino_channels;
     list->vggt = c->vggt_channels;
     model_add_entries(list, &sizes, gsf__dit_entries, "");
-    model_add_blocks(list, &sizes, gsf__dit_block_entries, "transformer_blocks.", "", c->layers);
+    model_add_blocks(list, &sizes, gsf__dit_block_entries, "transformer_blocks.", c->layers);
 }
 
 // The loader walks the autoencoder instead of using a table; this is the same walk. Opening the model afterwards checks
@@ -578,7 +578,7 @@ static void model_add_vit(model_list* list, const gsf__vit* vit, const gsf__nn_e
 static void model_add_vit_blocks(model_list* list, const gsf__nn_block_sizes* s, const gsf__nn_entry* entries,
                                  const char* names, int64_t layers) {
     const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(s);
-    model_add_blocks(list, &sizes, entries, names, "", layers);
+    model_add_blocks(list, &sizes, entries, names, layers);
 }
 
 static void model_add_dinov2(model_list* list, const gsf__vit* vit) {
@@ -605,7 +605,7 @@ static void model_add_t5(model_list* list, const gsf_nn_t5* c) {
     const gsf__nn_block_sizes block = gsf__t5_block_sizes(c);
     const gsf__nn_sizes sizes = gsf__t5_sizes(c), block_sizes = gsf__nn_sizes_of_block(&block);
     model_add_entries(list, &sizes, gsf__t5_entries, "");
-    model_add_blocks(list, &block_sizes, gsf__t5_block_entries, "encoder.block.", "layer.", c->layers);
+    model_add_blocks(list, &block_sizes, gsf__t5_block_entries, "encoder.block.", c->layers);
 }
 
 static void model_add_blip2(model_list* list, const gsf__blip* net) {
