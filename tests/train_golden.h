@@ -58,12 +58,12 @@ static inline void train_golden_ssim_gradient(gsf_context* ctx) {
     gsf_json json;
     CHECK_OK(ctx, gsf_parse_json(ctx, file.path, file.data + 8, (size_t)header, &json));
     size_t pairs = 0;
-    for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
-        const size_t length = strlen(json.values[i].key);
-        if (length < sizeof suffix || strcmp(json.values[i].key + length - (sizeof suffix - 1), suffix) != 0) continue;
+    for (uint32_t entry = json.values[0].child; entry; entry = json.values[entry].next) {
+        const size_t length = strlen(json.values[entry].key);
+        if (length < sizeof suffix || strcmp(json.values[entry].key + length - (sizeof suffix - 1), suffix) != 0) continue;
         pairs++;
         char pair[96], label[160];
-        snprintf(pair, sizeof pair, "%.*s", (int)(length - (sizeof suffix - 1)), json.values[i].key);
+        snprintf(pair, sizeof pair, "%.*s", (int)(length - (sizeof suffix - 1)), json.values[entry].key);
         snprintf(label, sizeof label, "%s.a", pair);
         test_tensor a = test_get_tensor(&file, label);
         snprintf(label, sizeof label, "%s.b", pair);
