@@ -305,7 +305,8 @@ GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const 
 
 typedef enum gsf_dtype { GSF_U8 = 0, GSF_U16, GSF_F16, GSF_F32, GSF_F64 } gsf_dtype;
 typedef enum gsf_color_space { GSF_COLOR_SRGB = 0,
-                              GSF_COLOR_LINEAR } gsf_color_space; // a label; no function converts silently
+                              GSF_COLOR_LINEAR } gsf_color_space; // a label; converted only where a
+                                                                           // function's comment says so
 
 // A view of pixels. Strides are in bytes, so packed, padded, planar and flipped images are all just views.
 // `owned` is non-NULL only in images made by this library, and is what gsf_destroy_image frees.

@@ -233,8 +233,8 @@ GSF_API const char* gsf_splat_get_view_path(const gsf_scene* scene, size_t view)
 // do not bleed into others.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_load_view_image(gsf_context* ctx, gsf_scene* scene, size_t view);
 // The same for a photo decoded by the host: any dtype and layout, 1 to 4 channels (the second of two or the fourth is
-// alpha, which can also carry a mask), distorted as taken, of any size (it is resized to the camera's). The photo is
-// borrowed for the call; an existing image and weight are replaced.
+// alpha, which can also carry a mask), distorted as taken, of any size (it is resized to the camera's); one labelled
+// GSF_COLOR_LINEAR is encoded as sRGB. The photo is borrowed for the call; an existing image and weight are replaced.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_set_view_image(gsf_context* ctx, gsf_scene* scene, size_t view,
                                                           const gsf_image* photo);
 // Writes <folder>/sparse/0/{cameras,images,points3D}.bin; <folder>/sparse/0 must exist. Cameras are PINHOLE; tracks are
@@ -440,7 +440,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, co
 
 typedef struct gsf_train_view {
     gsf_camera camera;
-    gsf_image image;   // u8 or f32 RGB, same size as the camera; copied. Values beyond 0..1 count as 0 and 1 in the loss
+    gsf_image image;   // u8 or f32 RGB, same size as the camera; copied. Values beyond 0..1 count as 0 and 1 in the loss.
+                       // An image labelled GSF_COLOR_LINEAR is encoded as sRGB, and its copy is f32
     gsf_image weight;  // 1 channel, u8 (255 = 1) or f32: per-pixel weight of the loss (a photo's mask or alpha, a
                        // restorer's confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A
                        // pixel of weight 0 is one outside the image: it counts as already right, and its colour is
@@ -3936,6 +3937,28 @@ static gsf_result gsf__straighten_photo(gsf_context* ctx, const gsf__rectify* r,
 }
 
 // mask: u8, one channel, packed, of the photo's size, or NULL.
+// The transfer function of sRGB (IEC 61966-2-1), continued beyond 1; linear below 0.
+static void gsf__encode_srgb(float* values, size_t count) {
+    for (size_t i = 0; i < count; i++) {
+        const float v = values[i];
+        values[i] = v <= 0.0031308f ? 12.92f * v : 1.055f * powf(v, 1.0f / 2.4f) - 0.055f;
+    }
+}
+
+// `colors` as packed u8 RGB; a linear image is encoded as sRGB.
+static gsf_result gsf__photo_bytes(gsf_context* ctx, const gsf_image* colors, const gsf_image* rgb) {
+    if (colors->color_space != GSF_COLOR_LINEAR) return gsf_convert_image(ctx, colors, rgb);
+    gsf_image floats;
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, rgb->width, rgb->height, 3, &floats));
+    gsf_result result = gsf_convert_image(ctx, colors, &floats);
+    if (result == GSF_OK) {
+        gsf__encode_srgb((float*)floats.data, 3 * (size_t)rgb->width * (size_t)rgb->height);
+        result = gsf_convert_image(ctx, &floats, rgb);
+    }
+    gsf_destroy_image(ctx, &floats);
+    return result;
+}
+
 static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view, const gsf_image* photo,
                                 const gsf_image* mask) {
     const gsf__scene_state* state = (const gsf__scene_state*)scene->state;
@@ -3946,7 +3969,7 @@ static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view,
     memset(&weight, 0, sizeof weight);
     memset(&joint, 0, sizeof joint);
     gsf_result result = gsf_make_image(ctx, GSF_U8, photo->width, photo->height, 3, &rgb);
-    if (result == GSF_OK) result = gsf_convert_image(ctx, &colors, &rgb);
+    if (result == GSF_OK) result = gsf__photo_bytes(ctx, &colors, &rgb);
     if (result == GSF_OK && !state->no_masks) result = gsf__view_weight(ctx, photo, mask, &weight);
     const int fits = photo->width == r->lens.width && photo->height == r->lens.height && r->lens.kind == GSF__LENS_PINHOLE;
     if (result == GSF_OK && !weight.data) {
@@ -10695,11 +10718,19 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     out->camera = *camera;
     out->target.width = camera->width;
     out->target.height = camera->height;
-    out->pixels = gsf_alloc(ctx, pixels, 3 * gsf__dtype_size(image->dtype));
+    const int linear = image->color_space == GSF_COLOR_LINEAR; // is encoded, and so kept as floats
+    const gsf_dtype kept = linear ? GSF_F32 : image->dtype;
+    out->pixels = gsf_alloc(ctx, pixels, 3 * gsf__dtype_size(kept));
     if (!out->pixels) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
-    if (image->dtype == GSF_U8) out->target.u8 = (const uint8_t*)out->pixels;
+    if (kept == GSF_U8) out->target.u8 = (const uint8_t*)out->pixels;
     else out->target.f32 = (const float*)out->pixels;
+    if (kept == image->dtype) {
+        GSF__TRY(gsf__photo_copy(ctx, image, what, index, -FLT_MAX, FLT_MAX, out->pixels));
+    } else {
+        const gsf_image floats = gsf_wrap_image(out->pixels, GSF_F32, image->width, image->height, 3);
+        GSF__TRY(gsf_convert_image(ctx, image, &floats));
+    }
+    if (linear) gsf__encode_srgb((float*)out->pixels, 3 * pixels);
     return weight->data ? gsf__photo_weigh(ctx, weight, index, out) : GSF_OK;
 }
 
@@ -12177,7 +12208,6 @@ struct gsf_fixer {
     gsf_trainer* trainer;
     size_t view_count;
     gsf_camera* cameras;
-    gsf_image* photos;              // f32 copies
     int32_t round, skipped;
     int restoring;                  // a round is under way
     int planned;                    // its path and buffers are there; a restored checkpoint's are not yet
@@ -12220,8 +12250,6 @@ GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     gsf__drop_window(ctx, f);
     gsf__drop_frames(ctx, &f->active);
     gsf__drop_frames(ctx, &f->pending);
-    for (size_t i = 0; f->photos && i < f->view_count; i++) gsf_destroy_image(ctx, f->photos + i);
-    gsf_free(ctx, f->photos);
     gsf_free(ctx, f->cameras);
     gsf_free(ctx, f->path);
     gsf_free(ctx, f->reference_index);
@@ -12403,15 +12431,8 @@ GSF_API gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* de
     gsf_result result = gsf_splat_make_trainer(ctx, &f->desc.train, views, view_count, initial, &f->trainer);
     if (result != GSF_OK) goto cleanup;
     f->cameras = (gsf_camera*)gsf_alloc(ctx, view_count, sizeof(gsf_camera));
-    f->photos = (gsf_image*)gsf_alloc_zeroed(ctx, view_count, sizeof(gsf_image));
-    result = f->cameras && f->photos ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; i < view_count && result == GSF_OK && f->desc.rounds > 0; i++) {
-        const gsf_image* image = &views[i].image;
-        f->cameras[i] = views[i].camera;
-        f->view_count = i + 1;
-        result = gsf_make_image(ctx, GSF_F32, image->width, image->height, 3, f->photos + i);
-        if (result == GSF_OK) result = gsf_convert_image(ctx, image, f->photos + i);
-    }
+    if (!f->cameras) result = GSF_ERROR_OUT_OF_MEMORY;
+    for (; f->cameras && f->view_count < view_count; f->view_count++) f->cameras[f->view_count] = views[f->view_count].camera;
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__ask_restorer(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0) result = gsf__check_paths(ctx, f);
     if (result == GSF_OK && f->desc.rounds > 0 && f->desc.skip_psnr > 0.0f && !f->limits.explains)
@@ -12477,6 +12498,7 @@ static gsf_result gsf__patch_reference(gsf_context* ctx, const float* weight, co
         for (size_t k = 3 * i; k < 3 * i + 3; k++) out[k] = w * photo[k] + (1.0f - w) * shown[k];
         if (depth && w < 0.5f) depth[i] = 0.0f;
     }
+    gsf_destroy_image(ctx, &to->color);
     to->color = patched;
     return GSF_OK;
 }
@@ -12484,10 +12506,12 @@ static gsf_result gsf__patch_reference(gsf_context* ctx, const float* weight, co
 // The photo of view i, and what the splats show there if that is asked for.
 static gsf_result gsf__make_reference(gsf_context* ctx, gsf_fixer* f, size_t i, int needs_depth, gsf_reference* out) {
     const gsf_camera* camera = f->cameras + i;
-    const float* weight = f->trainer->photos.photos[i].target.weight;
+    const gsf__photo* photo = &f->trainer->photos.photos[i];
+    const gsf_image kept = gsf_wrap_image(photo->pixels, photo->target.u8 ? GSF_U8 : GSF_F32, camera->width, camera->height, 3);
+    const float* weight = photo->target.weight;
     out->camera = *camera;
-    out->color = f->photos[i];
-    out->color.owned = NULL; // the fixer's
+    GSF__TRY(gsf_make_image(ctx, GSF_F32, camera->width, camera->height, 3, &out->color));
+    GSF__TRY(gsf_convert_image(ctx, &kept, &out->color));
     if (!needs_depth && !weight) return GSF_OK;
     gsf_render_output shown;
     memset(&shown, 0, sizeof shown);

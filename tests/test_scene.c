@@ -952,6 +952,18 @@ static void test_photo_alpha(void) {
         photo = gsf_wrap_image(opaque, GSF_U8, 60, 40, 4);
         CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo));
         CHECK(view->weight.data == NULL && memcmp(kept, view->image.data, bytes) == 0);
+        if (m == 0) { // linear floats are encoded: the same photo, whose alpha is linear in both
+            float* linear = (float*)malloc(4 * 60 * 40 * sizeof *linear);
+            for (int i = 0; i < 4 * 60 * 40; i++) {
+                const double v = opaque[i] / 255.0;
+                linear[i] = (float)(i % 4 == 3 ? v : v <= 0.04045 ? v / 12.92 : pow((v + 0.055) / 1.055, 2.4));
+            }
+            gsf_image encoded = gsf_wrap_image(linear, GSF_F32, 60, 40, 4);
+            encoded.color_space = GSF_COLOR_LINEAR;
+            CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &encoded));
+            CHECK(view->weight.data == NULL && memcmp(kept, view->image.data, bytes) == 0);
+            free(linear);
+        }
         photo.channels = 5;
         CHECK_RESULT(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo), GSF_ERROR_INVALID_ARGUMENT);
         CHECK(memcmp(kept, view->image.data, bytes) == 0);

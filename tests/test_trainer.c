@@ -1041,6 +1041,36 @@ static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
     }
 }
 
+// Linear images are encoded as sRGB: known pairs, and for all 8-bit values the way there and back.
+static void test_linear_photos(gsf_context* ctx, const scene* s) {
+    enum { N = 3 * WIDTH * HEIGHT };
+    static const float known[6][2] = {{0.0f, 0.0f}, {0.002f, 0.02584f}, {0.0031308f, 0.04045f},
+                                      {0.2140411f, 0.5f}, {1.0f, 1.0f}, {-0.1f, -1.292f}};
+    static uint8_t bytes[N];
+    static float floats[N];
+    for (size_t i = 0; i < N; i++) {
+        bytes[i] = (uint8_t)(i * 7 + i / 256);
+        floats[i] = i < 6 ? known[i][0] : (float)bytes[i] / 255.0f;
+    }
+    gsf_train_view views[2] = {s->views[0], s->views[1]};
+    gsf_trainer* trainer;
+    views[0].image = gsf_wrap_image(bytes, GSF_U8, WIDTH, HEIGHT, 3);
+    views[1].image = gsf_wrap_image(floats, GSF_F32, WIDTH, HEIGHT, 3);
+    views[0].image.color_space = views[1].image.color_space = GSF_COLOR_LINEAR;
+    CHECK_OK(ctx, gsf_splat_make_trainer(ctx, NULL, views, 2, &s->start, &trainer));
+    const float *a = trainer->photos.photos[0].target.f32, *b = trainer->photos.photos[1].target.f32;
+    CHECK(a && b && !trainer->photos.photos[0].target.u8);
+    for (int i = 0; i < 6; i++) CHECK_NEAR(b[i], known[i][1], 1e-6);
+    for (size_t i = 6; i < N; i++) {
+        const double v = (double)b[i], back = v <= 0.04045 ? v / 12.92 : pow((v + 0.055) / 1.055, 2.4);
+        CHECK_NEAR(back, bytes[i] / 255.0, 1e-6);
+        CHECK(a[i] == b[i]);
+    }
+    gsf_splat_destroy_trainer(ctx, trainer);
+    floats[9] = INFINITY;
+    CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, NULL, views, 2, &s->start, &trainer), GSF_ERROR_NUMERIC);
+}
+
 static void test_settings(gsf_context* ctx, const scene* s) {
     gsf_trainer* trainer;
     gsf_train_desc desc;
@@ -1674,6 +1704,7 @@ int main(void) {
     test_absolute_statistic(&ctx, &s);
     test_restored_gradient(&ctx, &s);
     test_settings(&ctx, &s);
+    test_linear_photos(&ctx, &s);
     for (int lazy = 0; lazy < 2; lazy++) test_zero_rates(&ctx, &s, lazy);
     for (int mcmc = 0; mcmc < 2; mcmc++) test_workers(&s, ctx.cpu_level, mcmc);
     for (int level = GSF_CPU_SCALAR; level <= (int)ctx.cpu_level; level++) test_lazy_training(&s, (gsf_cpu_level)level);
