@@ -35,7 +35,7 @@ expect 2 "$gsfix" fix "$scene" --out x --init nonsense
 expect 2 "$gsfix" fix "$scene" --out x --iterations 0
 expect 2 "$gsfix" fix "$scene" --out x --iterations 10x
 expect 2 "$gsfix" fix "$scene" --out x --set nonsense=1
-for setting in rounds=1.5 rounds=1e9 rounds=nan rounds= lambda_ssim=-5 dropout=1 dropout=-0.1 sh_degree=4 random_points=0 lr_means=-1 \
+for setting in rounds=1.5 rounds=1e9 rounds=nan rounds= lambda_ssim=-5 dropout=1 dropout=-0.1 sh_degree=4 random_points=0 lr_means=-2 \
     mcmc=2 max_splats=-1 max_splats=1e10 windows=-1 lazy_adam=0.5; do
     expect 2 "$gsfix" fix "$scene" --out x --set $setting
 done
