@@ -9407,7 +9407,8 @@ static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size
         end = run->best[at].next;
         int32_t id = run->best[end].id;
         if (id == m->unknown_id && m->byte_fallback) {
-            for (size_t i = at; i < end; i++) GSF__TRY(gsf__nn_emit(run->ctx, &run->out, m->bytes[(unsigned char)run->normal[i]]));
+            for (size_t i = at; i < end; i++)
+                GSF__TRY(gsf__nn_emit(run->ctx, &run->out, m->bytes[(unsigned char)run->normal[i]]));
             continue;
         }
         if (id == m->unknown_id) { // a run of them is one; its text may be that of a piece which no spelling uses

@@ -1,8 +1,8 @@
-// fuzz_spiece.c - the SentencePiece tokenizer. Build line: fuzz.h. The first byte tells what the rest is: 255 a
-// spiece.model, else a text for the model of made_spiece.h with the flags in the low six bits.
+// fuzz_spiece.c - the SentencePiece tokenizer. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION. The first byte tells
+// what the rest is: 255 a spiece.model, else a text for the model of made_spiece.h with the flags in the low six bits.
+#define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 #include "made_spiece.h"
 
