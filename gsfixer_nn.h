@@ -37,9 +37,10 @@
                never leaves the disk. The kernels' scratch memory grows to the
                largest need of a call and is reused within it.
    THREADS     As gsfixer.h: the same bits for any number of workers.
-   PROCESSORS  Every kernel is there in scalar C and for AVX2, those that count for AVX-512; 8-bit layers use its dot
-               products of bytes (VNNI), layers and attention those of bfloat16 where a descriptor's member `bf16` asks for
-               them. gsf_context.cpu_level chooses; results differ between levels by the rounding of float32 sums.
+   PROCESSORS  Elementwise kernels are written once over the lanes of gsfixer.h, beside a scalar reference; the inner loops
+               of GEMM, GEMV, attention and convolution by hand for AVX2 and AVX-512. 8-bit layers use the dot products of
+               bytes (VNNI), layers and attention those of bfloat16 where a descriptor's member `bf16` asks for them.
+               gsf_context.cpu_level chooses; results differ between levels by the rounding of float32 sums.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
