@@ -71,6 +71,8 @@
                because it was cancelled or is out of memory, changes nothing and may be repeated.
    MEMORY      Everything comes from the context's allocator, except scratch memory of Embree and stb. A trainer takes about
                1 kB per splat of SH degree 3 and, per pixel of a photo, 3 bytes (u8) or 12 (f32), and 4 more with a weight.
+               The repair loop holds no other copy: while a round begins the restorer is shown photos as floats (with the
+               splats' render and depth 28 bytes per pixel); `warp` keeps 32 bytes per pixel until the round ends.
                Buffers grow and are kept, so that rendering and training allocate only when the splats become more.
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
