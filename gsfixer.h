@@ -1019,6 +1019,7 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__v_largest GSF__V(gsf__v_largest)       // over the lanes, none of which is a NaN
 #define gsf__v_transpose GSF__V(gsf__v_transpose)   // GSF__LANES vectors, in place
 #define gsf__v_pin GSF__V(gsf__v_pin)               // a constant that stays in a register, else loops load it each time
+#define gsf__v_fetch GSF__V(gsf__v_fetch)           // memory that will be needed soon
 #define gsf__v_bits GSF__V(gsf__v_bits)             // bit patterns of floats
 #define gsf__v_to_int GSF__V(gsf__v_to_int)         // rounded as gsf__v_round
 #define gsf__v_truncate GSF__V(gsf__v_truncate)
@@ -1027,6 +1028,7 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__vi_index GSF__V(gsf__vi_index)         // 0 1 2 ...
 #define gsf__vi_load GSF__V(gsf__vi_load)
 #define gsf__vi_store GSF__V(gsf__vi_store)
+#define gsf__vi_store_pairs GSF__V(gsf__vi_store_pairs) // a[0] b[0] a[1] b[1] ...
 #define gsf__vi_add GSF__V(gsf__vi_add)
 #define gsf__vi_sub GSF__V(gsf__vi_sub)
 #define gsf__vi_mul GSF__V(gsf__vi_mul)
@@ -1045,6 +1047,7 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__vm_not GSF__V(gsf__vm_not)
 
 #define gsf__vd_set GSF__V(gsf__vd_set)
+#define gsf__vd_load GSF__V(gsf__vd_load)           // as many floats
 #define gsf__vd_half GSF__V(gsf__vd_half)           // half h < GSF__HALVES of the floats of v
 #define gsf__vd_floats GSF__V(gsf__vd_floats)       // GSF__HALVES halves, rounded
 #define gsf__vd_madd GSF__V(gsf__vd_madd)
@@ -1095,6 +1098,7 @@ GSF__SHARED inline float gsf__v_sum_scalar(float x) { return x; }
 GSF__SHARED inline float gsf__v_largest_scalar(float x) { return x; }
 GSF__SHARED inline void gsf__v_transpose_scalar(float* m) { (void)m; }
 GSF__SHARED inline void gsf__v_pin_scalar(float* v) { (void)v; }
+GSF__SHARED inline void gsf__v_fetch_scalar(const float* p) { (void)p; }
 GSF__SHARED inline int32_t gsf__v_bits_scalar(float x) {
     int32_t bits;
     memcpy(&bits, &x, sizeof bits);
@@ -1107,6 +1111,10 @@ GSF__SHARED inline int32_t gsf__vi_set_scalar(int32_t x) { return x; }
 GSF__SHARED inline int32_t gsf__vi_index_scalar(void) { return 0; }
 GSF__SHARED inline int32_t gsf__vi_load_scalar(const int32_t* p) { return *p; }
 GSF__SHARED inline void gsf__vi_store_scalar(int32_t* p, int32_t x) { *p = x; }
+GSF__SHARED inline void gsf__vi_store_pairs_scalar(int32_t* p, int32_t a, int32_t b) {
+    p[0] = a;
+    p[1] = b;
+}
 GSF__SHARED inline int32_t gsf__vi_add_scalar(int32_t a, int32_t b) { return (int32_t)((uint32_t)a + (uint32_t)b); }
 GSF__SHARED inline int32_t gsf__vi_sub_scalar(int32_t a, int32_t b) { return (int32_t)((uint32_t)a - (uint32_t)b); }
 GSF__SHARED inline int32_t gsf__vi_mul_scalar(int32_t a, int32_t b) { return (int32_t)((uint32_t)a * (uint32_t)b); }
@@ -1129,6 +1137,7 @@ GSF__SHARED inline int gsf__vm_or_scalar(int a, int b) { return a | b; }
 GSF__SHARED inline int gsf__vm_not_scalar(int mask) { return !mask; }
 
 GSF__SHARED inline double gsf__vd_set_scalar(double x) { return x; }
+GSF__SHARED inline double gsf__vd_load_scalar(const float* p) { return (double)*p; }
 GSF__SHARED inline double gsf__vd_half_scalar(float v, int h) { return h ? 0.0 : (double)v; }
 GSF__SHARED inline float gsf__vd_floats_scalar(const double* halves) { return (float)*halves; }
 GSF__SHARED inline double gsf__vd_madd_scalar(double a, double b, double c) { return a * b + c; }
@@ -1156,6 +1165,11 @@ GSF__INLINE_AVX2 __m256i gsf__vi_set_avx2(int32_t x) { return _mm256_set1_epi32(
 GSF__INLINE_AVX2 __m256i gsf__vi_index_avx2(void) { return _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7); }
 GSF__INLINE_AVX2 __m256i gsf__vi_load_avx2(const int32_t* p) { return _mm256_loadu_si256((const __m256i*)(const void*)p); }
 GSF__INLINE_AVX2 void gsf__vi_store_avx2(int32_t* p, __m256i x) { _mm256_storeu_si256((__m256i*)(void*)p, x); }
+GSF__INLINE_AVX2 void gsf__vi_store_pairs_avx2(int32_t* p, __m256i a, __m256i b) {
+    const __m256i low = _mm256_unpacklo_epi32(a, b), high = _mm256_unpackhi_epi32(a, b);
+    gsf__vi_store_avx2(p, _mm256_permute2x128_si256(low, high, 0x20));
+    gsf__vi_store_avx2(p + 8, _mm256_permute2x128_si256(low, high, 0x31));
+}
 GSF__INLINE_AVX2 __m256i gsf__vi_add_avx2(__m256i a, __m256i b) { return _mm256_add_epi32(a, b); }
 GSF__INLINE_AVX2 __m256i gsf__vi_sub_avx2(__m256i a, __m256i b) { return _mm256_sub_epi32(a, b); }
 GSF__INLINE_AVX2 __m256i gsf__vi_mul_avx2(__m256i a, __m256i b) { return _mm256_mullo_epi32(a, b); }
@@ -1250,11 +1264,13 @@ GSF__INLINE_AVX2 void gsf__v_transpose_avx2(__m256 m[8]) {
     m[7] = _mm256_permute2f128_ps(b3, b7, 0x31);
 }
 GSF__INLINE_AVX2 void gsf__v_pin_avx2(__m256* v) { __asm__("" : "+x"(*v)); }
+GSF__INLINE_AVX2 void gsf__v_fetch_avx2(const float* p) { _mm_prefetch((const char*)p, _MM_HINT_T0); }
 GSF__INLINE_AVX2 __m256i gsf__v_bits_avx2(__m256 x) { return _mm256_castps_si256(x); }
 GSF__INLINE_AVX2 __m256i gsf__v_to_int_avx2(__m256 x) { return _mm256_cvtps_epi32(x); }
 GSF__INLINE_AVX2 __m256i gsf__v_truncate_avx2(__m256 x) { return _mm256_cvttps_epi32(x); }
 
 GSF__INLINE_AVX2 __m256d gsf__vd_set_avx2(double x) { return _mm256_set1_pd(x); }
+GSF__INLINE_AVX2 __m256d gsf__vd_load_avx2(const float* p) { return _mm256_cvtps_pd(_mm_loadu_ps(p)); }
 GSF__INLINE_AVX2 __m256d gsf__vd_half_avx2(__m256 v, int h) {
     return _mm256_cvtps_pd(h ? _mm256_extractf128_ps(v, 1) : _mm256_castps256_ps128(v));
 }
@@ -1294,6 +1310,12 @@ GSF__INLINE_AVX512 __m512i gsf__vi_index_avx512(void) {
 }
 GSF__INLINE_AVX512 __m512i gsf__vi_load_avx512(const int32_t* p) { return _mm512_loadu_si512(p); }
 GSF__INLINE_AVX512 void gsf__vi_store_avx512(int32_t* p, __m512i x) { _mm512_storeu_si512(p, x); }
+GSF__INLINE_AVX512 void gsf__vi_store_pairs_avx512(int32_t* p, __m512i a, __m512i b) {
+    const __m512i first = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    const __m512i second = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+    gsf__vi_store_avx512(p, _mm512_permutex2var_epi32(a, first, b));
+    gsf__vi_store_avx512(p + 16, _mm512_permutex2var_epi32(a, second, b));
+}
 GSF__INLINE_AVX512 __m512i gsf__vi_add_avx512(__m512i a, __m512i b) { return _mm512_add_epi32(a, b); }
 GSF__INLINE_AVX512 __m512i gsf__vi_sub_avx512(__m512i a, __m512i b) { return _mm512_sub_epi32(a, b); }
 GSF__INLINE_AVX512 __m512i gsf__vi_mul_avx512(__m512i a, __m512i b) { return _mm512_mullo_epi32(a, b); }
@@ -1382,11 +1404,13 @@ GSF__INLINE_AVX512 __m512 gsf__v_ceil_avx512(__m512 x) {
 #pragma GCC diagnostic pop
 #endif
 GSF__INLINE_AVX512 void gsf__v_pin_avx512(__m512* v) { __asm__("" : "+v"(*v)); }
+GSF__INLINE_AVX512 void gsf__v_fetch_avx512(const float* p) { _mm_prefetch((const char*)p, _MM_HINT_T0); }
 GSF__INLINE_AVX512 __m512i gsf__v_bits_avx512(__m512 x) { return _mm512_castps_si512(x); }
 GSF__INLINE_AVX512 __m512i gsf__v_to_int_avx512(__m512 x) { return _mm512_cvtps_epi32(x); }
 GSF__INLINE_AVX512 __m512i gsf__v_truncate_avx512(__m512 x) { return _mm512_cvttps_epi32(x); }
 
 GSF__INLINE_AVX512 __m512d gsf__vd_set_avx512(double x) { return _mm512_set1_pd(x); }
+GSF__INLINE_AVX512 __m512d gsf__vd_load_avx512(const float* p) { return _mm512_cvtps_pd(_mm256_loadu_ps(p)); }
 GSF__INLINE_AVX512 __m512d gsf__vd_half_avx512(__m512 v, int h) {
     return _mm512_cvtps_pd(h ? gsf__v_upper_avx512(v) : _mm512_castps512_ps256(v));
 }

@@ -1868,7 +1868,6 @@ GSF__SHARED void gsf__nn_prefetch(const float* at) {
 }
 
 #define gsf__v_put GSF__V(gsf__v_put)               // stores, with `stream` past the caches to an aligned place
-#define gsf__vd_load GSF__V(gsf__vd_load)           // as many floats as gsf__vd has lanes, widened
 #define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) of each pair of lanes (a, b)
 #define gsf__v_hadamard GSF__V(gsf__v_hadamard)     // of each block of so many lanes (1, 2, 4 ...), unscaled
 #define gsf__vi_max GSF__V(gsf__vi_max)
@@ -1886,8 +1885,6 @@ GSF__INLINE_AVX512 void gsf__v_put_avx512(float* y, __m512 v, int stream) {
     else _mm512_storeu_ps(y, v);
 }
 
-GSF__INLINE_AVX2 __m256d gsf__vd_load_avx2(const float* p) { return _mm256_cvtps_pd(_mm_loadu_ps(p)); }
-GSF__INLINE_AVX512 __m512d gsf__vd_load_avx512(const float* p) { return _mm512_cvtps_pd(_mm256_loadu_ps(p)); }
 
 GSF__INLINE_AVX2 __m256 gsf__v_turn_pairs_avx2(__m256 v, __m256 cos, __m256 sin) {
     return _mm256_fmaddsub_ps(v, cos, _mm256_permute_ps(v, 0xb1) * sin);

@@ -705,8 +705,11 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
 #define GSFIXER_SPLAT_IMPLEMENTATION
 #endif
 #if defined(GSFIXER_SPLAT_IMPLEMENTATION) || defined(__INTELLISENSE__) || defined(__JETBRAINS_IDE__)
-#ifndef GSF_SPLAT_IMPLEMENTED
+#if !defined(GSF_SPLAT_IMPLEMENTED) || defined(GSF__ISA)
 #define GSF_SPLAT_IMPLEMENTED
+
+// Under GSF__ISA this header includes itself for one of its parts GSF__KERNELS_...: see >>lanes of gsfixer.h.
+#ifndef GSF__ISA
 
 #include "gsfixer.h" // again: internals and implementations, if all was included before without the macro
 #include "gsfixer_traj.h"
@@ -7113,21 +7116,6 @@ static float gsf__sigmoid(float x) {
     return x < 0.0f ? e / (1.0f + e) : 1.0f / (1.0f + e);
 }
 
-// Everything the projection of one splat computes on its way and backward needs again.
-typedef struct gsf__projection {
-    float t[3];             // mean in camera space
-    float u, v, u_low, v_low; // on the screen, as in gsf__record
-    float x, y;             // t.x, t.y after the frustum clamp
-    int clamped_x, clamped_y;
-    float q[4], inv_norm;   // unit quaternion
-    float scale[3];
-    float Q[9];             // W R, row-major
-    float T[9];             // W R S, row-major
-    float V[6];             // J T: two rows, so that cov2d = V V^T before the blur
-    float cov_a, cov_b, cov_c, det_raw, det; // blurred covariance [[a,b],[b,c]]; det without / with blur
-    float opacity, compensation; // sigmoid * opacity_scale; antialiasing factor
-} gsf__projection;
-
 typedef struct gsf__view { // what is constant over a frame
     double rotation[9], t[3]; // world (relative to the splats' origin) to camera
     double focal[2], middle[2]; // fx fy, and cx cy minus 0.5
@@ -7180,172 +7168,6 @@ static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* came
     return view;
 }
 
-// Rotation of a unit quaternion, row-major.
-static void gsf__rotation(const float q[4], float R[9]) {
-    const float w = q[0], x = q[1], y = q[2], z = q[3];
-    R[0] = 1.0f - 2.0f * (y * y + z * z); R[1] = 2.0f * (x * y - w * z); R[2] = 2.0f * (x * z + w * y);
-    R[3] = 2.0f * (x * y + w * z); R[4] = 1.0f - 2.0f * (x * x + z * z); R[5] = 2.0f * (y * z - w * x);
-    R[6] = 2.0f * (x * z - w * y); R[7] = 2.0f * (y * z + w * x); R[8] = 1.0f - 2.0f * (x * x + y * y);
-}
-
-static float gsf__dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-static void gsf__cross3(const float* a, const float* b, float* out) {
-    out[0] = a[1] * b[2] - a[2] * b[1];
-    out[1] = a[2] * b[0] - a[0] * b[2];
-    out[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-// Place and covariance of splat i on the screen. Returns 0 when it is culled by the near plane or not finite. The place is
-// found in double: in float, a camera far from the splats' origin, a long lens or a large image would cost digits.
-static int gsf__project_splat(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__projection* p) {
-    const float* mean = splats->means + 3 * i;
-    double t[3];
-    for (int r = 0; r < 3; r++) {
-        const double* w = view->rotation + 3 * r;
-        t[r] = w[0] * (double)mean[0] + w[1] * (double)mean[1] + w[2] * (double)mean[2] + view->t[r];
-        p->t[r] = (float)t[r];
-    }
-    if (!(p->t[2] > view->near_plane)) return 0;
-    const double u = view->focal[0] * t[0] / t[2] + view->middle[0], v = view->focal[1] * t[1] / t[2] + view->middle[1];
-    p->u = (float)u;
-    p->v = (float)v;
-    p->u_low = gsf__low_part(u, p->u);
-    p->v_low = gsf__low_part(v, p->v);
-
-    const float* raw = splats->quats + 4 * i;
-    const double norm = sqrt((double)raw[0] * raw[0] + (double)raw[1] * raw[1] + (double)raw[2] * raw[2] +
-                             (double)raw[3] * raw[3]); // in double: neither tiny nor huge quaternions lose digits
-    const double inv_norm = 1.0 / (norm > 1e-12 ? norm : 1e-12);
-    for (int k = 0; k < 4; k++) p->q[k] = (float)(raw[k] * inv_norm);
-    p->inv_norm = norm > 1e-12 ? (float)inv_norm : 0.0f;
-
-    float R[9];
-    gsf__rotation(p->q, R);
-    for (int k = 0; k < 3; k++) p->scale[k] = gsf__exp(splats->log_scales[3 * i + (size_t)k]);
-    for (int r = 0; r < 3; r++)
-        for (int c = 0; c < 3; c++) {
-            const float* w = view->W + 3 * r;
-            p->Q[3 * r + c] = w[0] * R[c] + w[1] * R[3 + c] + w[2] * R[6 + c];
-            p->T[3 * r + c] = p->Q[3 * r + c] * p->scale[c];
-        }
-
-    const float inv_z = 1.0f / p->t[2];
-    const float rx = p->t[0] * inv_z, ry = p->t[1] * inv_z;
-    p->clamped_x = !(fabsf(rx) <= view->limit_x);
-    p->clamped_y = !(fabsf(ry) <= view->limit_y);
-    p->x = p->clamped_x ? (rx < 0.0f ? -view->limit_x : view->limit_x) : rx; // per unit depth
-    p->y = p->clamped_y ? (ry < 0.0f ? -view->limit_y : view->limit_y) : ry;
-    const float jx = view->fx * inv_z, jy = view->fy * inv_z;
-    for (int c = 0; c < 3; c++) {
-        p->V[c] = jx * (p->T[c] - p->x * p->T[6 + c]);
-        p->V[3 + c] = jy * (p->T[3 + c] - p->y * p->T[6 + c]);
-    }
-    const float* V = p->V;
-    const float a = gsf__dot3(V, V), b = gsf__dot3(V, V + 3), c = gsf__dot3(V + 3, V + 3);
-    // determinant as the sum of squared 2x2 minors (Cauchy-Binet): no cancellation, however thin the ellipse
-    const float m0 = V[1] * V[5] - V[2] * V[4], m1 = V[2] * V[3] - V[0] * V[5], m2 = V[0] * V[4] - V[1] * V[3];
-    p->det_raw = m0 * m0 + m1 * m1 + m2 * m2;
-    p->det = p->det_raw + GSF__BLUR * (a + c) + GSF__BLUR * GSF__BLUR;
-    p->cov_a = a + GSF__BLUR;
-    p->cov_b = b;
-    p->cov_c = c + GSF__BLUR;
-
-    p->opacity = gsf__sigmoid(splats->opacity_logits[i]) * view->opacity_scale;
-    p->compensation = 1.0f;
-    if (view->antialiased) {
-        const float ratio = p->det_raw / p->det;
-        p->compensation = sqrtf(ratio > GSF__AA_FLOOR ? ratio : GSF__AA_FLOOR);
-    }
-    const float sum = p->det + p->cov_a + p->cov_c + p->opacity + p->t[0] + p->t[1] + p->t[2];
-    for (size_t k = 0; k < 3; k++) // -inf would pass as a flat splat, an infinite logit as an opaque one
-        if (!isfinite(splats->log_scales[3 * i + k])) return 0;
-    return isfinite(sum) && isfinite(splats->opacity_logits[i]) && p->det > 0.0f;
-}
-
-// Real spherical harmonics of the 3DGS convention for a unit direction; fills `count` values (1, 4, 9 or 16).
-static void gsf__sh_basis(const float d[3], int32_t count, float basis[16]) {
-    const float x = d[0], y = d[1], z = d[2];
-    basis[0] = 0.28209479177387814f;
-    if (count < 4) return;
-    basis[1] = -0.4886025119029199f * y;
-    basis[2] = 0.4886025119029199f * z;
-    basis[3] = -0.4886025119029199f * x;
-    if (count < 9) return;
-    const float xx = x * x, yy = y * y, zz = z * z;
-    basis[4] = 1.0925484305920792f * x * y;
-    basis[5] = -1.0925484305920792f * y * z;
-    basis[6] = 0.31539156525252005f * (2.0f * zz - xx - yy);
-    basis[7] = -1.0925484305920792f * x * z;
-    basis[8] = 0.5462742152960396f * (xx - yy);
-    if (count < 16) return;
-    basis[9] = -0.5900435899266435f * y * (3.0f * xx - yy);
-    basis[10] = 2.890611442640554f * x * y * z;
-    basis[11] = -0.4570457994644658f * y * (4.0f * zz - xx - yy);
-    basis[12] = 0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy);
-    basis[13] = -0.4570457994644658f * x * (4.0f * zz - xx - yy);
-    basis[14] = 1.445305721320277f * z * (xx - yy);
-    basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
-}
-
-// Derivatives of the basis with respect to x, y, z (as polynomials, before the direction's normalisation).
-static void gsf__sh_basis_gradient(const float d[3], int32_t count, float gx[16], float gy[16], float gz[16]) {
-    const float x = d[0], y = d[1], z = d[2];
-    memset(gx, 0, 16 * sizeof(float));
-    memset(gy, 0, 16 * sizeof(float));
-    memset(gz, 0, 16 * sizeof(float));
-    if (count < 4) return;
-    gy[1] = -0.4886025119029199f;
-    gz[2] = 0.4886025119029199f;
-    gx[3] = -0.4886025119029199f;
-    if (count < 9) return;
-    gx[4] = 1.0925484305920792f * y;  gy[4] = 1.0925484305920792f * x;
-    gy[5] = -1.0925484305920792f * z; gz[5] = -1.0925484305920792f * y;
-    gx[6] = -0.6307831305050401f * x; gy[6] = -0.6307831305050401f * y; gz[6] = 1.2615662610100802f * z;
-    gx[7] = -1.0925484305920792f * z; gz[7] = -1.0925484305920792f * x;
-    gx[8] = 1.0925484305920792f * x;  gy[8] = -1.0925484305920792f * y;
-    if (count < 16) return;
-    const float xx = x * x, yy = y * y, zz = z * z;
-    gx[9] = -3.540261539559861f * x * y;
-    gy[9] = -1.7701307697799305f * (xx - yy);
-    gx[10] = 2.890611442640554f * y * z; gy[10] = 2.890611442640554f * x * z; gz[10] = 2.890611442640554f * x * y;
-    gx[11] = 0.9140915989289316f * x * y;
-    gy[11] = -0.4570457994644658f * (4.0f * zz - xx - 3.0f * yy);
-    gz[11] = -3.6563663957157264f * y * z;
-    gx[12] = -2.2390579955406924f * x * z; gy[12] = -2.2390579955406924f * y * z;
-    gz[12] = 1.1195289977703462f * (2.0f * zz - xx - yy);
-    gx[13] = -0.4570457994644658f * (4.0f * zz - 3.0f * xx - yy);
-    gy[13] = 0.9140915989289316f * x * y;
-    gz[13] = -3.6563663957157264f * x * z;
-    gx[14] = 2.890611442640554f * x * z; gy[14] = -2.890611442640554f * y * z; gz[14] = 1.445305721320277f * (xx - yy);
-    gx[15] = -1.7701307697799305f * (xx - yy);
-    gy[15] = 3.540261539559861f * x * y;
-}
-
-// Unit direction from the camera to splat i and its distance; (0,0,1) and 0 when they coincide.
-static float gsf__view_direction(const gsf__view* view, const float* mean, float d[3]) {
-    for (int k = 0; k < 3; k++) d[k] = (mean[k] - view->center[k]) - view->center_low[k];
-    const float length = sqrtf(gsf__dot3(d, d));
-    if (!(length > 0.0f)) {
-        d[0] = d[1] = 0.0f;
-        d[2] = 1.0f;
-        return 0.0f;
-    }
-    const float inv = 1.0f / length;
-    for (int k = 0; k < 3; k++) d[k] *= inv;
-    return length;
-}
-
-static void gsf__splat_color(const gsf__view* view, const gsf_splats* splats, size_t i, float rgb[3]) {
-    const int32_t stored = gsf_splat_count_sh(splats->sh_degree);
-    const float* sh = splats->sh + 3 * (size_t)stored * i;
-    float d[3], basis[16];
-    gsf__view_direction(view, splats->means + 3 * i, d);
-    gsf__sh_basis(d, view->sh_coefficients, basis);
-    rgb[0] = rgb[1] = rgb[2] = 0.5f;
-    for (int32_t k = 0; k < view->sh_coefficients; k++)
-        for (int c = 0; c < 3; c++) rgb[c] += basis[k] * sh[3 * k + c];
-}
-
 // Tiles of the official rasterizer: 16x16 tiles of the square of half side `radius` (float division, truncation).
 static gsf__tile_rect gsf__official_rect(const gsf__record* rec, int32_t tiles_x, int32_t tiles_y) {
     const float radius = (float)rec->radius, tile = (float)GSF__TILE;
@@ -7365,382 +7187,358 @@ static gsf__tile_rect gsf__official_rect(const gsf__record* rec, int32_t tiles_x
 // Half height of alpha >= 1/255: where h0 - h1 dy^2 is zero.
 static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->h1); }
 
-typedef enum gsf__show { GSF__CULLED, GSF__TOO_FAINT, GSF__DRAWN } gsf__show;
+#define gsf__projection GSF__V(gsf__projection)
+#define gsf__v_dot GSF__V(gsf__v_dot)
+#define gsf__v_minor GSF__V(gsf__v_minor)
+#define gsf__v_finite GSF__V(gsf__v_finite)
+#define gsf__v_any GSF__V(gsf__v_any)
+#define gsf__v_column GSF__V(gsf__v_column)
 
-// Fills the record of splat i but for its colour. TOO_FAINT: alpha never reaches 1/255; only place and radius are filled,
-// for the official footprint, where such a splat still has a radius (and counts as a visit in densification).
-static gsf__show gsf__make_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) {
-    gsf__projection p;
-    if (!gsf__project_splat(view, splats, i, &p)) return GSF__CULLED;
-    rec->u = p.u;
-    rec->v = p.v;
-    rec->u_low = p.u_low;
-    rec->v_low = p.v_low;
-    const float mid = 0.5f * (p.cov_a + p.cov_c);
-    const float half_gap = 0.5f * (p.cov_a - p.cov_c); // root = mid^2 - det without cancellation
-    const float root = half_gap * half_gap + p.cov_b * p.cov_b;
-    const float radius = ceilf(3.0f * sqrtf(mid + sqrtf(root > 0.1f ? root : 0.1f)));
-    rec->radius = radius < 1e9f ? (int32_t)radius : 1000000000;
-    if (!isfinite(rec->u + rec->v)) return GSF__CULLED;
-    const float opacity = p.opacity * p.compensation;
-    if (!(opacity >= GSF__ALPHA_MIN)) return GSF__TOO_FAINT;
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_PROJECT
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_PROJECT
 
-    rec->log2_opacity = gsf__log2(opacity);
-    // alpha >= 1/255 <=> mahalanobis^2 <= t2; a little more, so that rounding never hides a pixel that passes
-    const float t2 = 2.0f * 0.69314718f * (rec->log2_opacity - GSF__LOG2_ALPHA_MIN) * 1.0001f + 1e-4f;
-    const float conic_a = p.cov_c / p.det;    // of the inverse covariance [[a,b],[b,c]]
-    rec->kx = p.cov_b / p.cov_c;
-    rec->ee = -0.72134752f * conic_a;         // -log2(e)/2 times a
-    rec->yy = -0.72134752f / p.cov_c;         // (ac - b^2)/a of the inverse is 1/cov_c
-    rec->h0 = t2 / conic_a;
-    rec->h1 = (1.0f / p.cov_c) / conic_a;
-    rec->reach_x = sqrtf(t2 * p.cov_a);
-    rec->depth = p.t[2];
-    return isfinite(rec->kx + rec->ee + rec->h0 + rec->h1 + rec->reach_x) ? GSF__DRAWN : GSF__CULLED;
-}
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_PROJECT
 
-static int gsf__color_record(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__record* rec) { // finite?
-    float rgb[3];
-    gsf__splat_color(view, splats, i, rgb);
-    rec->r = rgb[0] > 0.0f ? rgb[0] : 0.0f;
-    rec->g = rgb[1] > 0.0f ? rgb[1] : 0.0f;
-    rec->b = rgb[2] > 0.0f ? rgb[2] : 0.0f;
-    return isfinite(rgb[0] + rgb[1] + rgb[2]);
-}
+// Everything the projection of a splat computes on its way and backward needs again; a lane per splat.
+typedef struct gsf__projection {
+    gsf__vf t[3];                   // mean in camera space
+    gsf__vf u, v, u_low, v_low;     // on the screen, as in gsf__record
+    gsf__vf x, y;                   // t.x / t.z, t.y / t.z after the frustum clamp
+    gsf__vm clamped_x, clamped_y;
+    gsf__vf q[4], inv_norm;         // unit quaternion
+    gsf__vf scale[3];
+    gsf__vf T[9];                   // W R S, row-major
+    gsf__vf V[6];                   // J T: two rows, so that cov2d = V V^T before the blur
+    gsf__vf cov_a, cov_b, cov_c, det_raw, det; // blurred covariance [[a,b],[b,c]]; det without / with blur
+    gsf__vf logit, opacity, compensation; // opacity: sigmoid * opacity_scale; antialiasing factor
+} gsf__projection;
 
-#if GSF__X86
+#if GSF__LANES == 1
+GSF__V_INLINE float GSF__V(gsf__exp)(float x) { return gsf__exp(x); }
+GSF__V_INLINE float GSF__V(gsf__log2)(float x) { return gsf__log2(x); }
+GSF__V_INLINE double GSF__V(gsf__low)(double x, float high, int h) { return h ? 0.0 : (double)gsf__low_part(x, high); }
+#else
 
-/* Eight splats at a time: the formulas above, a lane per splat. GCC and Clang define + - * / on __m256. Lanes past the last
-   splat repeat it. */
-typedef struct gsf__projection8 {
-    __m256 t[3], u, v, u_low, v_low, x, y, clamped_x, clamped_y;
-    __m256 q[4], inv_norm, scale[3], T[9], V[6];
-    __m256 cov_a, cov_b, cov_c, det_raw, det;
-    __m256 logit, opacity, compensation;
-    __m256 shown; // mask: in front of the near plane and finite
-} gsf__projection8;
-
-GSF__TARGET_AVX2 static inline __m256 gsf__all8(float x) { return _mm256_set1_ps(x); }
-GSF__TARGET_AVX2 static inline __m256 gsf__abs8(__m256 x) { return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), x); }
-GSF__TARGET_AVX2 static inline __m256 gsf__select8(__m256 mask, __m256 yes, __m256 no) {
-    return _mm256_blendv_ps(no, yes, mask);
-}
-GSF__TARGET_AVX2 static inline __m256 gsf__dot8(__m256 ax, __m256 ay, __m256 az, __m256 bx, __m256 by, __m256 bz) {
-    return _mm256_fmadd_ps(ax, bx, _mm256_fmadd_ps(ay, by, az * bz));
-}
-GSF__TARGET_AVX2 static inline __m256 gsf__minor8(__m256 a, __m256 b, __m256 c, __m256 d) { // ad - bc
-    return _mm256_fmsub_ps(a, d, b * c);
-}
-GSF__TARGET_AVX2 static inline __m256 gsf__finite8(__m256 x) { // mask
-    return _mm256_cmp_ps(x - x, _mm256_setzero_ps(), _CMP_EQ_OQ);
-}
-
-// Float `c` of eight rows of `stride` floats.
-GSF__TARGET_AVX2 static inline __m256 gsf__column8(const float* rows, __m256i lane, int stride, int c) {
-    return _mm256_i32gather_ps(rows + c, _mm256_mullo_epi32(lane, _mm256_set1_epi32(stride)), 4);
-}
-
-GSF__TARGET_AVX2 static inline __m256i gsf__lanes8(size_t left) { // 0 1 2 ..., at most left - 1
-    const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
-    return left < 8 ? _mm256_min_epi32(lane, _mm256_set1_epi32((int)left - 1)) : lane;
-}
-
-GSF__TARGET_AVX2 static inline void gsf__transpose8(__m256 m[8]) {
-    __m256 a[8], b[8];
-    for (int i = 0; i < 4; i++) {
-        a[2 * i] = _mm256_unpacklo_ps(m[2 * i], m[2 * i + 1]);
-        a[2 * i + 1] = _mm256_unpackhi_ps(m[2 * i], m[2 * i + 1]);
-    }
-    for (int i = 0; i < 2; i++) {
-        b[4 * i] = _mm256_shuffle_ps(a[4 * i], a[4 * i + 2], 0x44);
-        b[4 * i + 1] = _mm256_shuffle_ps(a[4 * i], a[4 * i + 2], 0xee);
-        b[4 * i + 2] = _mm256_shuffle_ps(a[4 * i + 1], a[4 * i + 3], 0x44);
-        b[4 * i + 3] = _mm256_shuffle_ps(a[4 * i + 1], a[4 * i + 3], 0xee);
-    }
-    for (int i = 0; i < 4; i++) {
-        m[i] = _mm256_permute2f128_ps(b[i], b[4 + i], 0x20);
-        m[4 + i] = _mm256_permute2f128_ps(b[i], b[4 + i], 0x31);
-    }
-}
-
-// p->t, u, v, u_low and v_low, in double.
-GSF__TARGET_AVX2 static inline void gsf__place8(const gsf__view* view, const __m256 mean[3], gsf__projection8* p) {
-    __m128 half[2][7];
-    for (int h = 0; h < 2; h++) {
-        __m256d m[3], t[3];
-        for (int k = 0; k < 3; k++)
-            m[k] = _mm256_cvtps_pd(h ? _mm256_extractf128_ps(mean[k], 1) : _mm256_castps256_ps128(mean[k]));
-        for (int r = 0; r < 3; r++) {
-            const double* w = view->rotation + 3 * r;
-            t[r] = _mm256_fmadd_pd(_mm256_set1_pd(w[0]), m[0], _mm256_set1_pd(view->t[r]));
-            t[r] = _mm256_fmadd_pd(_mm256_set1_pd(w[1]), m[1], t[r]);
-            t[r] = _mm256_fmadd_pd(_mm256_set1_pd(w[2]), m[2], t[r]);
-            half[h][r] = _mm256_cvtpd_ps(t[r]);
-        }
-        const __m256d inv_z = _mm256_set1_pd(1.0) / t[2];
-        for (int k = 0; k < 2; k++) {
-            const __m256d slope = t[k] * inv_z;
-            const __m256d at = _mm256_fmadd_pd(_mm256_set1_pd(view->focal[k]), slope, _mm256_set1_pd(view->middle[k]));
-            half[h][3 + k] = _mm256_cvtpd_ps(at);
-            half[h][5 + k] = _mm256_cvtpd_ps(at - _mm256_cvtps_pd(half[h][3 + k]));
-        }
-    }
-    for (int r = 0; r < 3; r++) p->t[r] = _mm256_set_m128(half[1][r], half[0][r]);
-    p->u = _mm256_set_m128(half[1][3], half[0][3]);
-    p->v = _mm256_set_m128(half[1][4], half[0][4]);
-    p->u_low = _mm256_set_m128(half[1][5], half[0][5]);
-    p->v_low = _mm256_set_m128(half[1][6], half[0][6]);
-}
+// What half h of `high` leaves over of x.
+GSF__V_INLINE gsf__vd GSF__V(gsf__low)(gsf__vd x, gsf__vf high, int h) { return x - gsf__vd_half(high, h); }
 
 // e^x for x in [-87, 88], clamped to it; relative error below 2e-7. NaN stays.
-GSF__TARGET_AVX2 static inline __m256 gsf__exp8(__m256 x) {
-    x = _mm256_min_ps(gsf__all8(88.0f), _mm256_max_ps(gsf__all8(-87.0f), x)); // a NaN is the second operand of both
-    const __m256 k = _mm256_round_ps(x * gsf__all8(1.44269504f), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    __m256 r = _mm256_fnmadd_ps(k, gsf__all8(0.693359375f), x); // ln 2 in two parts, the first exact
-    r = _mm256_fnmadd_ps(k, gsf__all8(-2.12194440e-4f), r);
-    __m256 p = gsf__all8(1.0f / 5040.0f);
-    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 720.0f));
-    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 120.0f));
-    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 24.0f));
-    p = _mm256_fmadd_ps(p, r, gsf__all8(1.0f / 6.0f));
-    p = _mm256_fmadd_ps(p, r, gsf__all8(0.5f));
-    p = _mm256_fmadd_ps(p * r, r, r) + gsf__all8(1.0f);
-    const __m256i scale = _mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(k), _mm256_set1_epi32(127)), 23);
-    return p * _mm256_castsi256_ps(scale);
+GSF__V_INLINE gsf__vf GSF__V(gsf__exp)(gsf__vf x) {
+    x = gsf__v_min(gsf__v_set(88.0f), gsf__v_max(gsf__v_set(-87.0f), x));
+    const gsf__vf k = gsf__v_round(x * gsf__v_set(1.44269504f));
+    gsf__vf r = gsf__v_nmadd(k, gsf__v_set(0.693359375f), x); // ln 2 in two parts, the first exact
+    r = gsf__v_nmadd(k, gsf__v_set(-2.12194440e-4f), r);
+    gsf__vf p = gsf__v_set(1.0f / 5040.0f);
+    p = gsf__v_madd(p, r, gsf__v_set(1.0f / 720.0f));
+    p = gsf__v_madd(p, r, gsf__v_set(1.0f / 120.0f));
+    p = gsf__v_madd(p, r, gsf__v_set(1.0f / 24.0f));
+    p = gsf__v_madd(p, r, gsf__v_set(1.0f / 6.0f));
+    p = gsf__v_madd(p, r, gsf__v_set(0.5f));
+    p = gsf__v_madd(p * r, r, r) + gsf__v_set(1.0f);
+    return p * gsf__vi_as_floats(gsf__vi_shl(gsf__vi_add(gsf__v_to_int(k), gsf__vi_set(127)), 23));
 }
 
 // log2 of a normal x > 0, within 1 ulp of the result or 1e-7.
-GSF__TARGET_AVX2 static inline __m256 gsf__log2_8(__m256 x) {
-    const __m256i bits = _mm256_castps_si256(x);
-    const __m256i offset = _mm256_sub_epi32(bits, _mm256_set1_epi32(0x3f3504f3)); // sqrt(1/2): the mantissa ends up in
-    const __m256i e = _mm256_srai_epi32(offset, 23);                              // [sqrt(1/2), sqrt(2))
-    const __m256 m = _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(e, 23)));
-    const __m256 one = gsf__all8(1.0f), t = (m - one) / (m + one), t2 = t * t;
-    __m256 p = gsf__all8(1.0f / 9.0f);
-    p = _mm256_fmadd_ps(p, t2, gsf__all8(1.0f / 7.0f));
-    p = _mm256_fmadd_ps(p, t2, gsf__all8(1.0f / 5.0f));
-    p = _mm256_fmadd_ps(p, t2, gsf__all8(1.0f / 3.0f));
-    p = _mm256_fmadd_ps(p, t2, one);
-    return _mm256_fmadd_ps(gsf__all8(2.88539008f) * t, p, _mm256_cvtepi32_ps(e));
+GSF__V_INLINE gsf__vf GSF__V(gsf__log2)(gsf__vf x) {
+    const gsf__vi bits = gsf__v_bits(x);
+    const gsf__vi e = gsf__vi_sar(gsf__vi_sub(bits, gsf__vi_set(0x3f3504f3)), 23); // sqrt(1/2): the mantissa ends up in
+    const gsf__vf m = gsf__vi_as_floats(gsf__vi_sub(bits, gsf__vi_shl(e, 23)));    // [sqrt(1/2), sqrt(2))
+    const gsf__vf one = gsf__v_set(1.0f), t = (m - one) / (m + one), t2 = t * t;
+    gsf__vf p = gsf__v_set(1.0f / 9.0f);
+    p = gsf__v_madd(p, t2, gsf__v_set(1.0f / 7.0f));
+    p = gsf__v_madd(p, t2, gsf__v_set(1.0f / 5.0f));
+    p = gsf__v_madd(p, t2, gsf__v_set(1.0f / 3.0f));
+    p = gsf__v_madd(p, t2, one);
+    return gsf__v_madd(gsf__v_set(2.88539008f) * t, p, gsf__vi_floats(e));
 }
 
-GSF__TARGET_AVX2 static inline __m256 gsf__sigmoid8(__m256 x) {
-    const __m256 e = gsf__exp8(_mm256_or_ps(x, gsf__all8(-0.0f))); // of -|x|
-    return gsf__select8(x, e, gsf__all8(1.0f)) / (gsf__all8(1.0f) + e);
+#endif
+
+GSF__V_INLINE gsf__vf GSF__V(gsf__sigmoid)(gsf__vf x) {
+    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f);
+    const gsf__vf e = GSF__V(gsf__exp)(zero - gsf__v_abs(x)); // no overflow on either side
+    return gsf__v_select(gsf__v_lt(x, zero), e, one) / (one + e);
 }
 
-// Unit quaternions and the inverse of their norms (0 where that is at most 1e-12), in double as gsf__project_splat.
-GSF__TARGET_AVX2 static inline void gsf__unit8(const __m256 raw[4], __m256 q[4], __m256* inv_norm) {
-    const __m256d least = _mm256_set1_pd(1e-12), one = _mm256_set1_pd(1.0);
-    __m128 half[2][5];
-    for (int h = 0; h < 2; h++) {
-        __m256d wide[4], norm2 = _mm256_setzero_pd();
-        for (int k = 0; k < 4; k++) {
-            wide[k] = _mm256_cvtps_pd(h ? _mm256_extractf128_ps(raw[k], 1) : _mm256_castps256_ps128(raw[k]));
-            norm2 = _mm256_fmadd_pd(wide[k], wide[k], norm2);
+GSF__V_INLINE gsf__vf gsf__v_dot(gsf__vf ax, gsf__vf ay, gsf__vf az, gsf__vf bx, gsf__vf by, gsf__vf bz) {
+    return gsf__v_madd(ax, bx, gsf__v_madd(ay, by, az * bz));
+}
+
+GSF__V_INLINE gsf__vf gsf__v_minor(gsf__vf a, gsf__vf b, gsf__vf c, gsf__vf d) { return gsf__v_msub(a, d, b * c); }
+
+GSF__V_INLINE gsf__vm gsf__v_finite(gsf__vf x) { return gsf__v_eq(x - x, gsf__v_set(0.0f)); }
+
+GSF__V_INLINE int gsf__v_any(gsf__vm mask) { return gsf__vm_bits(mask) != 0; }
+
+// Float `c` of rows of `stride` floats.
+GSF__V_INLINE gsf__vf gsf__v_column(const float* rows, gsf__vi lane, int stride, int c) {
+    return gsf__v_gather(rows + c, gsf__vi_mul(lane, gsf__vi_set(stride)));
+}
+
+// Rows of the lanes: 0 1 2 ... Those past the last of `left` splats repeat it.
+GSF__V_INLINE gsf__vi GSF__V(gsf__splat_lanes)(size_t left) {
+    return left < GSF__LANES ? gsf__vi_min(gsf__vi_index(), gsf__vi_set((int32_t)left - 1)) : gsf__vi_index();
+}
+
+// p->t, u, v, u_low and v_low, in double: in float, a camera far from the splats' origin, a long lens or a large image would
+// cost digits.
+GSF__V_INLINE void GSF__V(gsf__place)(const gsf__view* view, const gsf__vf mean[3], gsf__projection* p) {
+    gsf__vd t[3][GSF__HALVES], at[2][GSF__HALVES], low[2][GSF__HALVES];
+    for (int h = 0; h < GSF__HALVES; h++) {
+        gsf__vd m[3];
+        for (int k = 0; k < 3; k++) m[k] = gsf__vd_half(mean[k], h);
+        for (int r = 0; r < 3; r++) {
+            const double* w = view->rotation + 3 * r;
+            t[r][h] = gsf__vd_madd(gsf__vd_set(w[0]), m[0], gsf__vd_set(view->t[r]));
+            t[r][h] = gsf__vd_madd(gsf__vd_set(w[1]), m[1], t[r][h]);
+            t[r][h] = gsf__vd_madd(gsf__vd_set(w[2]), m[2], t[r][h]);
         }
-        const __m256d norm = _mm256_sqrt_pd(norm2), inv = one / _mm256_max_pd(least, norm); // a NaN stays
-        for (int k = 0; k < 4; k++) half[h][k] = _mm256_cvtpd_ps(wide[k] * inv);
-        half[h][4] = _mm256_cvtpd_ps(_mm256_and_pd(inv, _mm256_cmp_pd(norm, least, _CMP_GT_OQ)));
+        const gsf__vd inv_z = gsf__vd_set(1.0) / t[2][h];
+        for (int k = 0; k < 2; k++)
+            at[k][h] = gsf__vd_madd(gsf__vd_set(view->focal[k]), t[k][h] * inv_z, gsf__vd_set(view->middle[k]));
     }
-    for (int k = 0; k < 4; k++) q[k] = _mm256_set_m128(half[1][k], half[0][k]);
-    *inv_norm = _mm256_set_m128(half[1][4], half[0][4]);
+    for (int r = 0; r < 3; r++) p->t[r] = gsf__vd_floats(t[r]);
+    p->u = gsf__vd_floats(at[0]);
+    p->v = gsf__vd_floats(at[1]);
+    for (int h = 0; h < GSF__HALVES; h++) {
+        low[0][h] = GSF__V(gsf__low)(at[0][h], p->u, h);
+        low[1][h] = GSF__V(gsf__low)(at[1][h], p->v, h);
+    }
+    p->u_low = gsf__vd_floats(low[0]);
+    p->v_low = gsf__vd_floats(low[1]);
 }
 
-GSF__TARGET_AVX2 static inline void gsf__project8(const gsf__view* view, const gsf_splats* splats, size_t i, __m256i lane,
-                                                  gsf__projection8* p) {
-    const __m256 one = gsf__all8(1.0f), two = gsf__all8(2.0f), zero = _mm256_setzero_ps();
-    __m256 W[9], mean[3], raw[4];
-    for (int k = 0; k < 9; k++) W[k] = gsf__all8(view->W[k]);
-    for (int k = 0; k < 3; k++) mean[k] = gsf__column8(splats->means + 3 * i, lane, 3, k);
-    gsf__place8(view, mean, p);
-    p->shown = _mm256_cmp_ps(p->t[2], gsf__all8(view->near_plane), _CMP_GT_OQ);
-    if (_mm256_testz_ps(p->shown, p->shown)) return;
-
-    for (int k = 0; k < 4; k++) raw[k] = gsf__column8(splats->quats + 4 * i, lane, 4, k);
-    gsf__unit8(raw, p->q, &p->inv_norm);
-
-    __m256 finite = one;
-    for (int k = 0; k < 3; k++) {
-        const __m256 log_scale = gsf__column8(splats->log_scales + 3 * i, lane, 3, k);
-        finite = finite + (log_scale - log_scale);
-        p->scale[k] = gsf__exp8(log_scale);
+// Unit quaternions and the inverse of their norms (0 where that is at most 1e-12), in double: neither tiny nor huge ones
+// lose digits.
+GSF__V_INLINE void GSF__V(gsf__unit)(const gsf__vf raw[4], gsf__vf q[4], gsf__vf* inv_norm) {
+    const gsf__vd least = gsf__vd_set(1e-12), one = gsf__vd_set(1.0);
+    gsf__vd unit[4][GSF__HALVES], inverse[GSF__HALVES];
+    for (int h = 0; h < GSF__HALVES; h++) {
+        gsf__vd wide[4], norm2 = gsf__vd_set(0.0);
+        for (int k = 0; k < 4; k++) {
+            wide[k] = gsf__vd_half(raw[k], h);
+            norm2 = gsf__vd_madd(wide[k], wide[k], norm2);
+        }
+        const gsf__vd norm = gsf__vd_sqrt(norm2), inv = one / gsf__vd_max(least, norm); // a NaN stays
+        for (int k = 0; k < 4; k++) unit[k][h] = wide[k] * inv;
+        inverse[h] = gsf__vd_keep_above(norm, least, inv);
     }
-    const __m256 w = p->q[0], x = p->q[1], y = p->q[2], z = p->q[3];
-    const __m256 R[9] = {one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
-                         two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
-                         two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)};
+    for (int k = 0; k < 4; k++) q[k] = gsf__vd_floats(unit[k]);
+    *inv_norm = gsf__vd_floats(inverse);
+}
+
+// Place and covariance on the screen of the splats from i on. Returns those that are in front of the near plane and finite;
+// when there are none, nothing else is filled in.
+GSF__V_KERNEL gsf__vm GSF__V(gsf__project)(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__vi lane,
+                                           gsf__projection* p) {
+    const gsf__vf one = gsf__v_set(1.0f), two = gsf__v_set(2.0f), zero = gsf__v_set(0.0f);
+    gsf__vf W[9], mean[3], raw[4];
+    for (int k = 0; k < 9; k++) W[k] = gsf__v_set(view->W[k]);
+    for (int k = 0; k < 3; k++) mean[k] = gsf__v_column(splats->means + 3 * i, lane, 3, k);
+    GSF__V(gsf__place)(view, mean, p);
+    const gsf__vm in_front = gsf__v_gt(p->t[2], gsf__v_set(view->near_plane));
+    if (!gsf__v_any(in_front)) return in_front;
+
+    for (int k = 0; k < 4; k++) raw[k] = gsf__v_column(splats->quats + 4 * i, lane, 4, k);
+    GSF__V(gsf__unit)(raw, p->q, &p->inv_norm);
+
+    gsf__vf finite = one; // -inf would pass as a flat splat, an infinite logit as an opaque one
+    for (int k = 0; k < 3; k++) {
+        const gsf__vf log_scale = gsf__v_column(splats->log_scales + 3 * i, lane, 3, k);
+        finite = finite + (log_scale - log_scale);
+        p->scale[k] = GSF__V(gsf__exp)(log_scale);
+    }
+    const gsf__vf w = p->q[0], x = p->q[1], y = p->q[2], z = p->q[3];
+    const gsf__vf R[9] = {one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
+                          two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
+                          two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)};
     for (int r = 0; r < 3; r++)
         for (int c = 0; c < 3; c++)
-            p->T[3 * r + c] = gsf__dot8(W[3 * r], W[3 * r + 1], W[3 * r + 2], R[c], R[3 + c], R[6 + c]) * p->scale[c];
+            p->T[3 * r + c] = gsf__v_dot(W[3 * r], W[3 * r + 1], W[3 * r + 2], R[c], R[3 + c], R[6 + c]) * p->scale[c];
 
-    const __m256 inv_z = one / p->t[2], rx = p->t[0] * inv_z, ry = p->t[1] * inv_z;
-    const __m256 limit_x = gsf__all8(view->limit_x), limit_y = gsf__all8(view->limit_y);
-    p->clamped_x = _mm256_cmp_ps(gsf__abs8(rx), limit_x, _CMP_NLE_UQ);
-    p->clamped_y = _mm256_cmp_ps(gsf__abs8(ry), limit_y, _CMP_NLE_UQ);
-    p->x = _mm256_max_ps(zero - limit_x, _mm256_min_ps(limit_x, rx));
-    p->y = _mm256_max_ps(zero - limit_y, _mm256_min_ps(limit_y, ry));
-    const __m256 jx = gsf__all8(view->fx) * inv_z, jy = gsf__all8(view->fy) * inv_z;
+    const gsf__vf inv_z = one / p->t[2], rx = p->t[0] * inv_z, ry = p->t[1] * inv_z;
+    const gsf__vf limit_x = gsf__v_set(view->limit_x), limit_y = gsf__v_set(view->limit_y);
+    p->clamped_x = gsf__vm_not(gsf__v_le(gsf__v_abs(rx), limit_x));
+    p->clamped_y = gsf__vm_not(gsf__v_le(gsf__v_abs(ry), limit_y));
+    p->x = gsf__v_max(zero - limit_x, gsf__v_min(limit_x, rx));
+    p->y = gsf__v_max(zero - limit_y, gsf__v_min(limit_y, ry));
+    const gsf__vf jx = gsf__v_set(view->fx) * inv_z, jy = gsf__v_set(view->fy) * inv_z;
     for (int c = 0; c < 3; c++) {
-        p->V[c] = jx * _mm256_fnmadd_ps(p->x, p->T[6 + c], p->T[c]);
-        p->V[3 + c] = jy * _mm256_fnmadd_ps(p->y, p->T[6 + c], p->T[3 + c]);
+        p->V[c] = jx * gsf__v_nmadd(p->x, p->T[6 + c], p->T[c]);
+        p->V[3 + c] = jy * gsf__v_nmadd(p->y, p->T[6 + c], p->T[3 + c]);
     }
-    const __m256* V = p->V;
-    const __m256 a = gsf__dot8(V[0], V[1], V[2], V[0], V[1], V[2]), b = gsf__dot8(V[0], V[1], V[2], V[3], V[4], V[5]);
-    const __m256 c = gsf__dot8(V[3], V[4], V[5], V[3], V[4], V[5]), blur = gsf__all8(GSF__BLUR);
-    const __m256 m0 = gsf__minor8(V[1], V[2], V[4], V[5]), m1 = gsf__minor8(V[2], V[0], V[5], V[3]);
-    const __m256 m2 = gsf__minor8(V[0], V[1], V[3], V[4]);
-    p->det_raw = gsf__dot8(m0, m1, m2, m0, m1, m2);
+    const gsf__vf* V = p->V;
+    const gsf__vf a = gsf__v_dot(V[0], V[1], V[2], V[0], V[1], V[2]), b = gsf__v_dot(V[0], V[1], V[2], V[3], V[4], V[5]);
+    const gsf__vf c = gsf__v_dot(V[3], V[4], V[5], V[3], V[4], V[5]), blur = gsf__v_set(GSF__BLUR);
+    // determinant as the sum of squared 2x2 minors (Cauchy-Binet): no cancellation, however thin the ellipse
+    const gsf__vf m0 = gsf__v_minor(V[1], V[2], V[4], V[5]), m1 = gsf__v_minor(V[2], V[0], V[5], V[3]);
+    const gsf__vf m2 = gsf__v_minor(V[0], V[1], V[3], V[4]);
+    p->det_raw = gsf__v_dot(m0, m1, m2, m0, m1, m2);
     p->det = p->det_raw + blur * (a + c) + blur * blur;
     p->cov_a = a + blur;
     p->cov_b = b;
     p->cov_c = c + blur;
 
-    p->logit = gsf__column8(splats->opacity_logits + i, lane, 1, 0);
-    p->opacity = gsf__sigmoid8(p->logit) * gsf__all8(view->opacity_scale);
+    p->logit = gsf__v_column(splats->opacity_logits + i, lane, 1, 0);
+    p->opacity = GSF__V(gsf__sigmoid)(p->logit) * gsf__v_set(view->opacity_scale);
     p->compensation = one;
-    if (view->antialiased)
-        p->compensation = _mm256_sqrt_ps(_mm256_max_ps(p->det_raw / p->det, gsf__all8(GSF__AA_FLOOR)));
+    if (view->antialiased) p->compensation = gsf__v_sqrt(gsf__v_max(p->det_raw / p->det, gsf__v_set(GSF__AA_FLOOR)));
     finite = finite + (p->det + p->cov_a + p->cov_c + p->opacity + p->t[0] + p->t[1] + p->t[2] + (p->logit - p->logit));
-    p->shown = _mm256_and_ps(p->shown, gsf__finite8(finite));
-    p->shown = _mm256_and_ps(p->shown, _mm256_cmp_ps(p->det, zero, _CMP_GT_OQ));
+    return gsf__vm_and(gsf__vm_and(in_front, gsf__v_finite(finite)), gsf__v_gt(p->det, zero));
 }
 
-GSF__TARGET_AVX2 static inline void gsf__sh_basis8(__m256 x, __m256 y, __m256 z, int32_t count, __m256 basis[16]) {
-    basis[0] = gsf__all8(0.28209479177387814f);
+// Real spherical harmonics of the 3DGS convention for a unit direction; fills `count` values (1, 4, 9 or 16).
+GSF__V_INLINE void GSF__V(gsf__sh_basis)(gsf__vf x, gsf__vf y, gsf__vf z, int32_t count, gsf__vf basis[16]) {
+    basis[0] = gsf__v_set(0.28209479177387814f);
     if (count < 4) return;
-    basis[1] = gsf__all8(-0.4886025119029199f) * y;
-    basis[2] = gsf__all8(0.4886025119029199f) * z;
-    basis[3] = gsf__all8(-0.4886025119029199f) * x;
+    basis[1] = gsf__v_set(-0.4886025119029199f) * y;
+    basis[2] = gsf__v_set(0.4886025119029199f) * z;
+    basis[3] = gsf__v_set(-0.4886025119029199f) * x;
     if (count < 9) return;
-    const __m256 xx = x * x, yy = y * y, zz = z * z, two = gsf__all8(2.0f), three = gsf__all8(3.0f), four = gsf__all8(4.0f);
-    basis[4] = gsf__all8(1.0925484305920792f) * x * y;
-    basis[5] = gsf__all8(-1.0925484305920792f) * y * z;
-    basis[6] = gsf__all8(0.31539156525252005f) * (two * zz - xx - yy);
-    basis[7] = gsf__all8(-1.0925484305920792f) * x * z;
-    basis[8] = gsf__all8(0.5462742152960396f) * (xx - yy);
+    const gsf__vf xx = x * x, yy = y * y, zz = z * z;
+    const gsf__vf two = gsf__v_set(2.0f), three = gsf__v_set(3.0f), four = gsf__v_set(4.0f);
+    basis[4] = gsf__v_set(1.0925484305920792f) * x * y;
+    basis[5] = gsf__v_set(-1.0925484305920792f) * y * z;
+    basis[6] = gsf__v_set(0.31539156525252005f) * (two * zz - xx - yy);
+    basis[7] = gsf__v_set(-1.0925484305920792f) * x * z;
+    basis[8] = gsf__v_set(0.5462742152960396f) * (xx - yy);
     if (count < 16) return;
-    basis[9] = gsf__all8(-0.5900435899266435f) * y * (three * xx - yy);
-    basis[10] = gsf__all8(2.890611442640554f) * x * y * z;
-    basis[11] = gsf__all8(-0.4570457994644658f) * y * (four * zz - xx - yy);
-    basis[12] = gsf__all8(0.3731763325901154f) * z * (two * zz - three * (xx + yy));
-    basis[13] = gsf__all8(-0.4570457994644658f) * x * (four * zz - xx - yy);
-    basis[14] = gsf__all8(1.445305721320277f) * z * (xx - yy);
-    basis[15] = gsf__all8(-0.5900435899266435f) * x * (xx - three * yy);
+    basis[9] = gsf__v_set(-0.5900435899266435f) * y * (three * xx - yy);
+    basis[10] = gsf__v_set(2.890611442640554f) * x * y * z;
+    basis[11] = gsf__v_set(-0.4570457994644658f) * y * (four * zz - xx - yy);
+    basis[12] = gsf__v_set(0.3731763325901154f) * z * (two * zz - three * (xx + yy));
+    basis[13] = gsf__v_set(-0.4570457994644658f) * x * (four * zz - xx - yy);
+    basis[14] = gsf__v_set(1.445305721320277f) * z * (xx - yy);
+    basis[15] = gsf__v_set(-0.5900435899266435f) * x * (xx - three * yy);
 }
 
 // Unit directions from the camera; returns the distances, 0 (and the direction 0 0 1) where a mean is at the camera.
-GSF__TARGET_AVX2 static inline __m256 gsf__view_direction8(const gsf__view* view, const gsf_splats* splats, size_t i,
-                                                           __m256i lane, __m256 d[3]) {
+GSF__V_INLINE gsf__vf GSF__V(gsf__view_direction)(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__vi lane,
+                                                  gsf__vf d[3]) {
     for (int k = 0; k < 3; k++) {
-        const __m256 mean = gsf__column8(splats->means + 3 * i, lane, 3, k);
-        d[k] = (mean - gsf__all8(view->center[k])) - gsf__all8(view->center_low[k]);
+        const gsf__vf mean = gsf__v_column(splats->means + 3 * i, lane, 3, k);
+        d[k] = (mean - gsf__v_set(view->center[k])) - gsf__v_set(view->center_low[k]);
     }
-    const __m256 length = _mm256_sqrt_ps(gsf__dot8(d[0], d[1], d[2], d[0], d[1], d[2]));
-    const __m256 apart = _mm256_cmp_ps(length, _mm256_setzero_ps(), _CMP_GT_OQ);
-    const __m256 inv = _mm256_and_ps(apart, gsf__all8(1.0f) / length);
+    const gsf__vf length = gsf__v_sqrt(gsf__v_dot(d[0], d[1], d[2], d[0], d[1], d[2]));
+    const gsf__vm apart = gsf__v_gt(length, gsf__v_set(0.0f));
+    const gsf__vf inv = gsf__v_keep(apart, gsf__v_set(1.0f) / length);
     for (int k = 0; k < 3; k++) d[k] = d[k] * inv;
-    d[2] = gsf__select8(apart, d[2], gsf__all8(1.0f));
-    return _mm256_and_ps(apart, length);
+    d[2] = gsf__v_select(apart, d[2], gsf__v_set(1.0f));
+    return gsf__v_keep(apart, length);
 }
 
-// The first `count` floats of eight rows of SH coefficients, as columns.
-GSF__TARGET_AVX2 static inline void gsf__sh_columns8(const gsf_splats* splats, size_t i, __m256i lane, int count,
-                                                     __m256 sh[48]) {
+// The first `count` floats of rows of SH coefficients, as columns.
+GSF__V_INLINE void GSF__V(gsf__sh_columns)(const gsf_splats* splats, size_t i, gsf__vi lane, int count, gsf__vf sh[48]) {
     const int stored = 3 * gsf_splat_count_sh(splats->sh_degree);
     const float* rows = splats->sh + (size_t)stored * i;
-    int32_t at[8];
+    int32_t at[GSF__LANES];
     int k = 0;
-    _mm256_storeu_si256((__m256i*)(void*)at, lane);
-    for (; k < count && k + 8 <= stored; k += 8) {
-        for (int l = 0; l < 8; l++) sh[k + l] = _mm256_loadu_ps(rows + stored * at[l] + k);
-        gsf__transpose8(sh + k);
+    gsf__vi_store(at, lane);
+    for (; k < count && k + GSF__LANES <= stored; k += GSF__LANES) {
+        for (int l = 0; l < GSF__LANES; l++) sh[k + l] = gsf__v_load(rows + stored * at[l] + k);
+        gsf__v_transpose(sh + k);
     }
-    for (; k < count; k++) sh[k] = gsf__column8(rows, lane, stored, k);
+    for (; k < count; k++) sh[k] = gsf__v_column(rows, lane, stored, k);
 }
 
-GSF__TARGET_AVX2 static inline void gsf__colors8(const gsf__view* view, const gsf_splats* splats, size_t i, __m256i lane,
-                                                 __m256 rgb[3]) {
-    __m256 d[3], basis[16], sh[48];
-    gsf__view_direction8(view, splats, i, lane, d);
-    gsf__sh_basis8(d[0], d[1], d[2], view->sh_coefficients, basis);
-    gsf__sh_columns8(splats, i, lane, 3 * view->sh_coefficients, sh);
+GSF__V_INLINE void GSF__V(gsf__colors)(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__vi lane,
+                                       gsf__vf rgb[3]) {
+    gsf__vf d[3], basis[16], sh[48];
+    (void)GSF__V(gsf__view_direction)(view, splats, i, lane, d);
+    GSF__V(gsf__sh_basis)(d[0], d[1], d[2], view->sh_coefficients, basis);
+    GSF__V(gsf__sh_columns)(splats, i, lane, 3 * view->sh_coefficients, sh);
     for (int c = 0; c < 3; c++) {
-        rgb[c] = gsf__all8(0.5f);
-        for (int32_t k = 0; k < view->sh_coefficients; k++) rgb[c] = _mm256_fmadd_ps(basis[k], sh[3 * k + c], rgb[c]);
+        rgb[c] = gsf__v_set(0.5f);
+        for (int32_t k = 0; k < view->sh_coefficients; k++) rgb[c] = gsf__v_madd(basis[k], sh[3 * k + c], rgb[c]);
     }
 }
 
-// Records and radii of up to eight splats from i on (full footprint).
-GSF__TARGET_AVX2 static void gsf__records_avx2(gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
-                                               const uint8_t* hidden, size_t i, size_t left) {
-    const __m256i lane = gsf__lanes8(left);
-    const __m256 one = gsf__all8(1.0f), zero = _mm256_setzero_ps(), half = gsf__all8(0.5f);
-    const size_t count = left < 8 ? left : 8;
-    gsf__projection8 p;
-    gsf__project8(view, splats, i, lane, &p);
-    __m256 drawn = p.shown;
-    if (hidden)
-        for (size_t l = 0; l < count; l++)
-            if (hidden[i + l]) {
-                const __m256i other = _mm256_cmpeq_epi32(_mm256_set1_epi32((int)l), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
-                drawn = _mm256_andnot_ps(_mm256_castsi256_ps(other), drawn);
-            }
-    __m256 row[16], rgb[3];
-    if (!_mm256_testz_ps(drawn, drawn)) {
-        const __m256 opacity = p.opacity * p.compensation;
-        const __m256 log2_opacity = gsf__log2_8(_mm256_max_ps(opacity, gsf__all8(1e-30f)));
-        const __m256 t2 = _mm256_fmadd_ps(gsf__all8(2.0f * 0.69314718f * 1.0001f),
-                                          log2_opacity - gsf__all8(GSF__LOG2_ALPHA_MIN), gsf__all8(1e-4f));
-        const __m256 conic_a = p.cov_c / p.det, inv_c = one / p.cov_c;
-        const __m256 half_gap = half * (p.cov_a - p.cov_c), root = _mm256_fmadd_ps(half_gap, half_gap, p.cov_b * p.cov_b);
-        const __m256 longest = half * (p.cov_a + p.cov_c) + _mm256_sqrt_ps(_mm256_max_ps(root, gsf__all8(0.1f)));
-        const __m256 radius = _mm256_min_ps(_mm256_ceil_ps(gsf__all8(3.0f) * _mm256_sqrt_ps(longest)), gsf__all8(1e9f));
+// Where the square about `center` meets one of `tiles` tiles in a row, as gsf__official_rect has it.
+GSF__V_INLINE gsf__vm GSF__V(gsf__official_meets)(gsf__vf center, gsf__vf radius, int32_t tiles) {
+    const gsf__vf tile = gsf__v_set((float)GSF__TILE), most = gsf__v_set((float)tiles), zero = gsf__v_set(0.0f);
+    const gsf__vf lo = (center - radius) / tile, hi = (center + radius + tile - gsf__v_set(1.0f)) / tile;
+    return gsf__v_lt(gsf__v_floor(gsf__v_min(gsf__v_max(lo, zero), most)),
+                     gsf__v_floor(gsf__v_min(gsf__v_max(hi, zero), most)));
+}
+
+// Records and radii of the splats from i on. A splat whose alpha never reaches 1/255 is not drawn; in the official footprint
+// it still has a radius (and counts as a visit in densification).
+GSF__V_KERNEL void GSF__V(gsf__records)(gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
+                                        const uint8_t* hidden, size_t i, size_t left) {
+    const gsf__vi lane = GSF__V(gsf__splat_lanes)(left);
+    const gsf__vf one = gsf__v_set(1.0f), zero = gsf__v_set(0.0f), half = gsf__v_set(0.5f);
+    const size_t count = left < GSF__LANES ? left : GSF__LANES;
+    gsf__projection p;
+    gsf__vm drawn = GSF__V(gsf__project)(view, splats, i, lane, &p), faint = gsf__vm_of_bits(0);
+    uint32_t dropped = 0;
+    for (size_t l = 0; hidden && l < count; l++) dropped |= (uint32_t)(hidden[i + l] != 0) << l;
+    drawn = gsf__vm_and(drawn, gsf__vm_not(gsf__vm_of_bits(dropped)));
+    gsf__vf row[16], rgb[3];
+    if (gsf__v_any(drawn)) {
+        const gsf__vf opacity = p.opacity * p.compensation;
+        const gsf__vf log2_opacity = GSF__V(gsf__log2)(gsf__v_max(opacity, gsf__v_set(1e-30f)));
+        // alpha >= 1/255 <=> mahalanobis^2 <= t2; a little more, so that rounding never hides a pixel that passes
+        const gsf__vf t2 = gsf__v_madd(gsf__v_set(2.0f * 0.69314718f * 1.0001f),
+                                       log2_opacity - gsf__v_set(GSF__LOG2_ALPHA_MIN), gsf__v_set(1e-4f));
+        const gsf__vf conic_a = p.cov_c / p.det, inv_c = one / p.cov_c; // of the inverse covariance [[a,b],[b,c]]
+        const gsf__vf half_gap = half * (p.cov_a - p.cov_c); // root = (half trace)^2 - det without cancellation
+        const gsf__vf root = gsf__v_madd(half_gap, half_gap, p.cov_b * p.cov_b);
+        const gsf__vf longest = half * (p.cov_a + p.cov_c) + gsf__v_sqrt(gsf__v_max(root, gsf__v_set(0.1f)));
         row[0] = p.u;
         row[1] = p.v;
         row[2] = p.cov_b * inv_c;
-        row[3] = gsf__all8(-0.72134752f) * conic_a;
-        row[4] = gsf__all8(-0.72134752f) * inv_c;
+        row[3] = gsf__v_set(-0.72134752f) * conic_a; // -log2(e)/2 times a
+        row[4] = gsf__v_set(-0.72134752f) * inv_c;   // (ac - b^2)/a of the inverse is 1/cov_c
         row[5] = log2_opacity;
         row[6] = t2 / conic_a;
         row[7] = inv_c / conic_a;
         row[11] = p.t[2];
-        row[12] = _mm256_sqrt_ps(t2 * p.cov_a);
+        row[12] = gsf__v_sqrt(t2 * p.cov_a);
         row[13] = p.u_low;
         row[14] = p.v_low;
-        const __m256 reach_y = _mm256_sqrt_ps(t2 * p.cov_c);
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(opacity, gsf__all8(GSF__ALPHA_MIN), _CMP_GE_OQ));
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[0] + row[12], zero, _CMP_GE_OQ));
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[0] - row[12], gsf__all8((float)(r->width - 1)), _CMP_LE_OQ));
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] + reach_y, zero, _CMP_GE_OQ));
-        drawn = _mm256_and_ps(drawn, _mm256_cmp_ps(row[1] - reach_y, gsf__all8((float)(r->height - 1)), _CMP_LE_OQ));
-        row[15] = radius;
+        row[15] = gsf__v_min(gsf__v_ceil(gsf__v_set(3.0f) * gsf__v_sqrt(longest)), gsf__v_set(1e9f));
+        const gsf__vm opaque = gsf__v_ge(opacity, gsf__v_set(GSF__ALPHA_MIN));
+        if (view->official_footprint) {
+            drawn = gsf__vm_and(drawn, gsf__v_finite(p.u + p.v));
+            drawn = gsf__vm_and(drawn, GSF__V(gsf__official_meets)(p.u, row[15], r->tiles_x));
+            drawn = gsf__vm_and(drawn, GSF__V(gsf__official_meets)(p.v, row[15], r->tiles_y));
+            faint = gsf__vm_and(drawn, gsf__vm_not(opaque));
+        } else {
+            const gsf__vf reach_y = gsf__v_sqrt(t2 * p.cov_c);
+            drawn = gsf__vm_and(drawn, gsf__v_ge(row[0] + row[12], zero));
+            drawn = gsf__vm_and(drawn, gsf__v_le(row[0] - row[12], gsf__v_set((float)(r->width - 1))));
+            drawn = gsf__vm_and(drawn, gsf__v_ge(row[1] + reach_y, zero));
+            drawn = gsf__vm_and(drawn, gsf__v_le(row[1] - reach_y, gsf__v_set((float)(r->height - 1))));
+        }
+        drawn = gsf__vm_and(drawn, opaque);
     }
-    if (_mm256_testz_ps(drawn, drawn)) {
+    if (!gsf__v_any(gsf__vm_or(drawn, faint))) {
         for (size_t l = 0; l < count; l++) r->radii[i + l] = r->records[i + l].radius = 0;
         return;
     }
-    if (r->wake) r->wake(r->wake_user, i);
-    gsf__colors8(view, splats, i, lane, rgb);
-    for (int c = 0; c < 3; c++) row[8 + c] = _mm256_max_ps(rgb[c], zero);
-    __m256 sum = rgb[0] + rgb[1] + rgb[2] + row[0] + row[1];
+    if (r->wake && gsf__v_any(drawn)) r->wake(r->wake_user, i);
+    GSF__V(gsf__colors)(view, splats, i, lane, rgb);
+    for (int c = 0; c < 3; c++) row[8 + c] = gsf__v_max(rgb[c], zero);
+    gsf__vf sum = rgb[0] + rgb[1] + rgb[2] + row[0] + row[1];
     for (int k = 2; k < 15; k++) sum = sum + row[k];
-    drawn = _mm256_and_ps(drawn, gsf__finite8(sum));
-    const __m256i radius = _mm256_and_si256(_mm256_castps_si256(drawn), _mm256_cvtps_epi32(row[15]));
-    row[15] = _mm256_castsi256_ps(radius);
-    int32_t radii[8];
-    _mm256_storeu_si256((__m256i*)(void*)radii, radius);
-    gsf__transpose8(row);
-    gsf__transpose8(row + 8);
+    drawn = gsf__vm_and(drawn, gsf__v_finite(sum));
+    const gsf__vi radius = gsf__v_to_int(row[15]);
+    int32_t radii[GSF__LANES];
+    gsf__vi_store(radii, gsf__vi_keep(gsf__vm_or(drawn, faint), radius));
+    row[15] = gsf__vi_as_floats(gsf__vi_keep(drawn, radius));
+    for (int k = 0; k < 16; k += GSF__LANES) gsf__v_transpose(row + k);
     for (size_t l = 0; l < count; l++) {
         float* out = (float*)(void*)(r->records + i + l);
-        _mm256_storeu_ps(out, row[l]);
-        _mm256_storeu_ps(out + 8, row[8 + l]);
+        for (size_t k = 0; k < 16; k += GSF__LANES) gsf__v_store(out + k, row[k + l]);
         r->radii[i + l] = radii[l];
     }
 }
 
-#endif // GSF__X86
+#endif // GSF__KERNELS_PROJECT
+#ifndef GSF__ISA
 
 typedef struct gsf__project_job {
     gsf_rasterizer* r;
@@ -7750,16 +7548,6 @@ typedef struct gsf__project_job {
     gsf_cpu_level level;
 } gsf__project_job;
 
-static int gsf__meets_image(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
-    if (view->official_footprint) {
-        const gsf__tile_rect rect = gsf__official_rect(rec, r->tiles_x, r->tiles_y);
-        return rect.x0 < rect.x1 && rect.y0 < rect.y1;
-    }
-    const float reach_y = gsf__reach_y(rec);
-    return rec->u + rec->reach_x >= 0.0f && rec->u - rec->reach_x <= (float)(r->width - 1) &&
-           rec->v + reach_y >= 0.0f && rec->v - reach_y <= (float)(r->height - 1);
-}
-
 static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__project_job* job = (const gsf__project_job*)arg;
@@ -7768,24 +7556,12 @@ static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
 #if GSF__X86
     if (job->level >= GSF_CPU_AVX2 && !job->view->official_footprint) {
-        for (size_t i = begin; i < end; i += 8)
+        for (size_t i = begin; i < end; i += GSF__LANES_avx2)
             gsf__records_avx2(r, job->view, job->splats, job->hidden, i, end - i);
         return;
     }
 #endif
-    for (size_t i = begin; i < end; i++) {
-        gsf__record* rec = r->records + i;
-        const gsf__show show =
-            job->hidden && job->hidden[i] ? GSF__CULLED : gsf__make_record(job->view, job->splats, i, rec);
-        int kept = show == GSF__DRAWN || (show == GSF__TOO_FAINT && job->view->official_footprint);
-        kept = kept && gsf__meets_image(r, job->view, rec);
-        if (kept && show == GSF__DRAWN) {
-            if (r->wake) r->wake(r->wake_user, i);
-            kept = gsf__color_record(job->view, job->splats, i, rec);
-        }
-        r->radii[i] = kept ? rec->radius : 0;
-        rec->radius = show == GSF__DRAWN ? r->radii[i] : 0;
-    }
+    for (size_t i = begin; i < end; i++) gsf__records_scalar(r, job->view, job->splats, job->hidden, i, end - i);
 }
 
 // ---- >>bin ---------------------------------------------------------------------
@@ -7809,71 +7585,49 @@ static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* v
     return rows;
 }
 
-// Tiles of tile row ty that the ellipse alpha >= 1/255 meets (exact up to the margin of t2), empty if x1 <= x0.
-static gsf__tile_span gsf__tile_columns(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec,
-                                        int32_t ty) {
-    gsf__tile_span span = {0, 0};
-    const float reach_y = gsf__reach_y(rec);
-    float ya = (float)(ty * GSF__TILE) - rec->v, yb = ya + (float)(GSF__TILE - 1);
-    if (ya < -reach_y) ya = -reach_y;
-    if (yb > reach_y) yb = reach_y;
-    const float da = rec->h0 - rec->h1 * ya * ya, db = rec->h0 - rec->h1 * yb * yb;
-    const float ha = sqrtf(da > 0.0f ? da : 0.0f), hb = sqrtf(db > 0.0f ? db : 0.0f);
-    const float top = rec->kx * reach_y * (reach_y / rec->reach_x); // dy of the rightmost point; the leftmost is opposite
-    float right = rec->kx * ya + ha, left = rec->kx * ya - ha;
-    if (rec->kx * yb + hb > right) right = rec->kx * yb + hb;
-    if (rec->kx * yb - hb < left) left = rec->kx * yb - hb;
-    if (top >= ya && top <= yb) right = rec->reach_x;
-    if (-top >= ya && -top <= yb) left = -rec->reach_x;
-    const float lo = ceilf(rec->u + left - 0.02f), hi = floorf(rec->u + right + 0.02f);
-    if (!(hi >= 0.0f) || !(lo <= (float)(r->width - 1)) || lo > hi) return span;
-    span.x0 = lo <= 0.0f ? 0 : (int32_t)lo / GSF__TILE;
-    span.x1 = (hi >= (float)(r->width - 1) ? r->width - 1 : (int32_t)hi) / GSF__TILE + 1;
-    if (view->official_footprint) {
-        const gsf__tile_rect rect = gsf__official_rect(rec, r->tiles_x, r->tiles_y);
-        if (span.x0 < rect.x0) span.x0 = rect.x0;
-        if (span.x1 > rect.x1) span.x1 = rect.x1;
-    }
-    return span;
-}
+enum { GSF__SPANS = 8 }; // tile rows whose columns are found at a time: a multiple of the lanes
 
-enum { GSF__SPANS = 8 }; // tile rows whose columns are found at a time
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_BIN
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_BIN
 
-#if GSF__X86
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_BIN
 
-// Same as gsf__tile_columns, a lane per tile row (full footprint only).
-GSF__TARGET_AVX2 static void gsf__tile_spans_avx2(const gsf_rasterizer* r, const gsf__record* rec, int32_t ty,
-                                                  gsf__tile_span spans[GSF__SPANS]) {
-    const __m256 row = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), zero = _mm256_setzero_ps(), tile = gsf__all8(GSF__TILE);
-    const __m256 u = gsf__all8(rec->u), kx = gsf__all8(rec->kx), h0 = gsf__all8(rec->h0), h1 = gsf__all8(rec->h1);
+// Tiles of the tile rows from ty on that the ellipse alpha >= 1/255 meets (exact up to the margin of t2), empty if x1 <= x0;
+// a lane per row.
+GSF__V_KERNEL void GSF__V(gsf__tile_columns)(const gsf_rasterizer* r, const gsf__record* rec, int32_t ty, int32_t left,
+                                             gsf__tile_span spans[GSF__SPANS]) {
+    const gsf__vf zero = gsf__v_set(0.0f), tile = gsf__v_set((float)GSF__TILE), u = gsf__v_set(rec->u);
+    const gsf__vf kx = gsf__v_set(rec->kx), h0 = gsf__v_set(rec->h0), h1 = gsf__v_set(rec->h1);
     const float half_height = gsf__reach_y(rec);
-    const __m256 reach_x = gsf__all8(rec->reach_x), reach_y = gsf__all8(half_height);
-    const __m256 first = _mm256_fmadd_ps(row, tile, gsf__all8((float)(ty * GSF__TILE) - rec->v));
-    const __m256 ya = _mm256_max_ps(first, zero - reach_y);
-    const __m256 yb = _mm256_min_ps(first + gsf__all8(GSF__TILE - 1), reach_y);
-    const __m256 ha = _mm256_sqrt_ps(_mm256_max_ps(_mm256_fnmadd_ps(h1 * ya, ya, h0), zero));
-    const __m256 hb = _mm256_sqrt_ps(_mm256_max_ps(_mm256_fnmadd_ps(h1 * yb, yb, h0), zero));
-    const __m256 top = gsf__all8(rec->kx * half_height * (half_height / rec->reach_x)), bottom = zero - top;
-    __m256 right = _mm256_max_ps(_mm256_fmadd_ps(kx, ya, ha), _mm256_fmadd_ps(kx, yb, hb));
-    __m256 left = _mm256_min_ps(_mm256_fmsub_ps(kx, ya, ha), _mm256_fmsub_ps(kx, yb, hb));
-    right = gsf__select8(_mm256_and_ps(_mm256_cmp_ps(top, ya, _CMP_GE_OQ), _mm256_cmp_ps(top, yb, _CMP_LE_OQ)), reach_x, right);
-    left = gsf__select8(_mm256_and_ps(_mm256_cmp_ps(bottom, ya, _CMP_GE_OQ), _mm256_cmp_ps(bottom, yb, _CMP_LE_OQ)),
-                        zero - reach_x, left);
-    const __m256 margin = gsf__all8(0.02f), last = gsf__all8((float)(r->width - 1));
-    const __m256 lo = _mm256_ceil_ps(u + left - margin), hi = _mm256_floor_ps(u + right + margin);
-    __m256 met = _mm256_and_ps(_mm256_cmp_ps(hi, zero, _CMP_GE_OQ), _mm256_cmp_ps(lo, last, _CMP_LE_OQ));
-    met = _mm256_and_ps(met, _mm256_cmp_ps(lo, hi, _CMP_LE_OQ));
-    const __m256i inside = _mm256_castps_si256(met), one = _mm256_set1_epi32(1);
-    __m256i x0 = _mm256_srai_epi32(_mm256_cvttps_epi32(_mm256_max_ps(lo, zero)), 4); // GSF__TILE is 2^4
-    __m256i x1 = _mm256_add_epi32(_mm256_srai_epi32(_mm256_cvttps_epi32(_mm256_min_ps(hi, last)), 4), one);
-    x0 = _mm256_and_si256(x0, inside);
-    x1 = _mm256_and_si256(x1, inside);
-    const __m256i a = _mm256_unpacklo_epi32(x0, x1), b = _mm256_unpackhi_epi32(x0, x1);
-    _mm256_storeu_si256((__m256i*)(void*)spans, _mm256_permute2x128_si256(a, b, 0x20));
-    _mm256_storeu_si256((__m256i*)(void*)(spans + 4), _mm256_permute2x128_si256(a, b, 0x31));
+    const gsf__vf reach_x = gsf__v_set(rec->reach_x), reach_y = gsf__v_set(half_height);
+    // dy of the rightmost point; the leftmost is opposite
+    const gsf__vf top = gsf__v_set(rec->kx * half_height * (half_height / rec->reach_x)), bottom = zero - top;
+    const gsf__vf margin = gsf__v_set(0.02f), last = gsf__v_set((float)(r->width - 1));
+    for (int32_t k = 0; k < GSF__SPANS && k < left; k += GSF__LANES) {
+        const gsf__vf row = gsf__vi_floats(gsf__vi_add(gsf__vi_index(), gsf__vi_set(k)));
+        const gsf__vf first = gsf__v_madd(row, tile, gsf__v_set((float)(ty * GSF__TILE) - rec->v));
+        const gsf__vf ya = gsf__v_max(first, zero - reach_y);
+        const gsf__vf yb = gsf__v_min(first + gsf__v_set((float)(GSF__TILE - 1)), reach_y);
+        const gsf__vf ha = gsf__v_sqrt(gsf__v_max(gsf__v_nmadd(h1 * ya, ya, h0), zero));
+        const gsf__vf hb = gsf__v_sqrt(gsf__v_max(gsf__v_nmadd(h1 * yb, yb, h0), zero));
+        gsf__vf right = gsf__v_max(gsf__v_madd(kx, ya, ha), gsf__v_madd(kx, yb, hb));
+        gsf__vf left_most = gsf__v_min(gsf__v_msub(kx, ya, ha), gsf__v_msub(kx, yb, hb));
+        right = gsf__v_select(gsf__vm_and(gsf__v_ge(top, ya), gsf__v_le(top, yb)), reach_x, right);
+        left_most = gsf__v_select(gsf__vm_and(gsf__v_ge(bottom, ya), gsf__v_le(bottom, yb)), zero - reach_x, left_most);
+        const gsf__vf lo = gsf__v_ceil(u + left_most - margin), hi = gsf__v_floor(u + right + margin);
+        gsf__vm met = gsf__vm_and(gsf__v_ge(hi, zero), gsf__v_le(lo, last));
+        met = gsf__vm_and(met, gsf__v_le(lo, hi));
+        const gsf__vi x0 = gsf__vi_sar(gsf__v_truncate(gsf__v_max(lo, zero)), 4); // GSF__TILE is 2^4
+        const gsf__vi x1 = gsf__vi_add(gsf__vi_sar(gsf__v_truncate(gsf__v_min(hi, last)), 4), gsf__vi_set(1));
+        gsf__vi_store_pairs(&spans[k].x0, gsf__vi_keep(met, x0), gsf__vi_keep(met, x1));
+    }
 }
 
-#endif // GSF__X86
+#endif // GSF__KERNELS_BIN
+#ifndef GSF__ISA
 
 typedef struct gsf__bin_job {
     gsf_rasterizer* r;
@@ -7887,11 +7641,17 @@ static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int
                             gsf__tile_span spans[GSF__SPANS]) {
 #if GSF__X86
     if (job->level >= GSF_CPU_AVX2 && !job->view->official_footprint) {
-        gsf__tile_spans_avx2(job->r, rec, ty, spans);
+        gsf__tile_columns_avx2(job->r, rec, ty, left, spans);
         return;
     }
 #endif
-    for (int32_t i = 0; i < left && i < GSF__SPANS; i++) spans[i] = gsf__tile_columns(job->r, job->view, rec, ty + i);
+    gsf__tile_columns_scalar(job->r, rec, ty, left, spans);
+    if (!job->view->official_footprint) return;
+    const gsf__tile_rect rect = gsf__official_rect(rec, job->r->tiles_x, job->r->tiles_y);
+    for (int32_t i = 0; i < left && i < GSF__SPANS; i++) {
+        if (spans[i].x0 < rect.x0) spans[i].x0 = rect.x0;
+        if (spans[i].x1 > rect.x1) spans[i].x1 = rect.x1;
+    }
 }
 
 static void gsf__bin_chunk(void* arg, size_t chunk, int32_t worker) {
@@ -8501,146 +8261,32 @@ static const gsf__raster_kernels* gsf__raster_kernels_of(gsf_cpu_level level) {
 
 // ---- >>project backward --------------------------------------------------------
 
-// Gradient of splat i from the sums of its slots, back through covariance, projection and colour.
-static void gsf__project_backward(const gsf__view* view, const gsf_splats* splats, size_t i, const gsf__record* rec,
-                                  const double sums[GSF__SLOT_FLOATS], const gsf_splat_grads* grads) {
-    gsf__projection p;
-    if (!gsf__project_splat(view, splats, i, &p)) return;
-    const float sp = (float)sums[GSF__SLOT_P], se = (float)sums[GSF__SLOT_E], see = (float)sums[GSF__SLOT_EE];
-    const float sy = (float)sums[GSF__SLOT_Y], sey = (float)sums[GSF__SLOT_EY], syy = (float)sums[GSF__SLOT_YY];
-    const float a = rec->ee * -1.3862944f, q = rec->yy * -1.3862944f, b = -rec->kx * a; // inverse covariance
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_GATHER
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_GATHER
 
-    // ln alpha = -1/2 (a e^2 + q dy^2): derivatives with respect to the screen mean
-    const float du = a * se, dv = b * se + q * sy;
-    // and to V (cov = V V^T + blur): sum p (K d)(K d)^T V. With K d = (a e, b e + q dy) and K V_c = (a g_c, b g_c + q V1c),
-    // g = V0 - kx V1, everything is a sum of like-sized terms. g itself comes from the minors n = V0 x V1,
-    // cov_c g = blur V0 + V1 x n: for a needle the plain difference has no digit left.
-    const float *V0 = p.V, *V1 = p.V + 3;
-    float n[3], g[3], dV[6], d_log_scale[3];
-    gsf__cross3(V0, V1, n);
-    float V1_n[3], n_V0[3];
-    gsf__cross3(V1, n, V1_n);
-    gsf__cross3(n, V0, n_V0);
-    for (int c = 0; c < 3; c++) {
-        g[c] = (GSF__BLUR * V0[c] + V1_n[c]) / p.cov_c;
-        const float ag = a * g[c], qv = q * V1[c];
-        dV[c] = a * (ag * see + qv * sey);
-        dV[3 + c] = b * (ag * see + qv * sey) + q * (ag * sey + qv * syy);
-        d_log_scale[c] = ag * ag * see + 2.0f * ag * qv * sey + qv * qv * syy; // (K d . V_c)^2
-    }
-    if (view->antialiased && p.det_raw > GSF__AA_FLOOR * p.det) {
-        // ln compensation = 1/2 (ln det_raw - ln det); 1/2 ln det_raw by V0: V1 x n / det_raw, by ln s_c: 1 - n_c^2 / det_raw
-        const float raw = sp / p.det_raw;
-        for (int c = 0; c < 3; c++) {
-            dV[c] += raw * V1_n[c] - sp * a * g[c];
-            dV[3 + c] += raw * n_V0[c] - sp * (b * g[c] + q * V1[c]);
-            const float others = n[(c + 1) % 3] * n[(c + 1) % 3] + n[(c + 2) % 3] * n[(c + 2) % 3];
-            d_log_scale[c] += raw * others - sp * (a * g[c] * g[c] + q * V1[c] * V1[c]);
-        }
-    }
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_GATHER
 
-    // V = J T with rows jx (T0 - x T2), jy (T1 - y T2)
-    const float inv_z = 1.0f / p.t[2], jx = view->fx * inv_z, jy = view->fy * inv_z;
-    float dT[9];
-    float d_jx = 0.0f, d_jy = 0.0f, d_x = 0.0f, d_y = 0.0f;
-    for (int c = 0; c < 3; c++) {
-        d_jx += dV[c] * (p.T[c] - p.x * p.T[6 + c]);
-        d_jy += dV[3 + c] * (p.T[3 + c] - p.y * p.T[6 + c]);
-        d_x -= dV[c] * jx * p.T[6 + c];
-        d_y -= dV[3 + c] * jy * p.T[6 + c];
-        dT[c] = jx * dV[c];
-        dT[3 + c] = jy * dV[3 + c];
-        dT[6 + c] = -jx * p.x * dV[c] - jy * p.y * dV[3 + c];
-    }
-
-    // mean in camera space: through u, v, the focal scale jx = fx/z and the slope x = t.x/z (constant where clamped; the
-    // official code holds t.x = x z constant instead, which leaves -x/z)
-    float d_t[3];
-    d_t[0] = du * jx;
-    d_t[1] = dv * jy;
-    d_t[2] = -(du * jx * p.t[0] + dv * jy * p.t[1]) * inv_z - (d_jx * jx + d_jy * jy) * inv_z;
-    if (!p.clamped_x) d_t[0] += d_x * inv_z;
-    if (!p.clamped_y) d_t[1] += d_y * inv_z;
-    if (!p.clamped_x || view->official_gradient) d_t[2] -= d_x * p.x * inv_z;
-    if (!p.clamped_y || view->official_gradient) d_t[2] -= d_y * p.y * inv_z;
-    d_t[2] += (float)sums[GSF__SLOT_Z];
-
-    float d_mean[3];
-    for (int c = 0; c < 3; c++) d_mean[c] = view->W[c] * d_t[0] + view->W[3 + c] * d_t[1] + view->W[6 + c] * d_t[2];
-
-    // colour
-    const float rgb[3] = {rec->r, rec->g, rec->b};
-    float d_rgb[3];
-    for (int c = 0; c < 3; c++) d_rgb[c] = rgb[c] > 0.0f ? (float)sums[GSF__SLOT_R + c] : 0.0f;
-    const size_t stored = (size_t)gsf_splat_count_sh(splats->sh_degree);
-    const float* sh = splats->sh + 3 * stored * i;
-    float d[3], basis[16], gx[16], gy[16], gz[16];
-    const float distance = gsf__view_direction(view, splats->means + 3 * i, d);
-    gsf__sh_basis(d, view->sh_coefficients, basis);
-    if (grads->sh)
-        for (int32_t k = 0; k < view->sh_coefficients; k++)
-            for (int c = 0; c < 3; c++) grads->sh[3 * (stored * i + (size_t)k) + (size_t)c] += basis[k] * d_rgb[c];
-    if (grads->means && view->sh_coefficients > 1 && distance > 0.0f) {
-        gsf__sh_basis_gradient(d, view->sh_coefficients, gx, gy, gz);
-        float d_dir[3] = {0.0f, 0.0f, 0.0f};
-        for (int32_t k = 1; k < view->sh_coefficients; k++) {
-            const float weight = sh[3 * k] * d_rgb[0] + sh[3 * k + 1] * d_rgb[1] + sh[3 * k + 2] * d_rgb[2];
-            d_dir[0] += gx[k] * weight;
-            d_dir[1] += gy[k] * weight;
-            d_dir[2] += gz[k] * weight;
-        }
-        const float along = gsf__dot3(d, d_dir); // direction = (mean - centre) / distance
-        for (int c = 0; c < 3; c++) d_mean[c] += (d_dir[c] - along * d[c]) / distance;
-    }
-    if (grads->means)
-        for (int c = 0; c < 3; c++) grads->means[3 * i + (size_t)c] += d_mean[c];
-    if (grads->means2d) {
-        grads->means2d[2 * i] += du;
-        grads->means2d[2 * i + 1] += dv;
-    }
-    if (grads->means2d_abs) {
-        grads->means2d_abs[2 * i] += (float)sums[GSF__SLOT_ABS_X];
-        grads->means2d_abs[2 * i + 1] += (float)sums[GSF__SLOT_ABS_Y];
-    }
-    if (grads->opacity_logits) // d ln(sigmoid) / d logit = 1 - sigmoid = sigmoid(-logit)
-        grads->opacity_logits[i] += sp * gsf__sigmoid(-splats->opacity_logits[i]);
-
-    if (grads->log_scales)
-        for (int c = 0; c < 3; c++) grads->log_scales[3 * i + (size_t)c] += d_log_scale[c];
-    if (grads->quats) {
-        float dR[9]; // T = Q S, Q = W R: W^T dQ, dQ = dT S
-        for (int r = 0; r < 3; r++)
-            for (int c = 0; c < 3; c++)
-                dR[3 * r + c] = (view->W[r] * dT[c] + view->W[3 + r] * dT[3 + c] + view->W[6 + r] * dT[6 + c]) * p.scale[c];
-        const float w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
-        float dq[4];
-        dq[0] = 2.0f * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
-        dq[1] = 2.0f * (y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) + w * (dR[7] - dR[5])) - 4.0f * x * (dR[4] + dR[8]);
-        dq[2] = 2.0f * (x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) + w * (dR[2] - dR[6])) - 4.0f * y * (dR[0] + dR[8]);
-        dq[3] = 2.0f * (x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) + w * (dR[3] - dR[1])) - 4.0f * z * (dR[0] + dR[4]);
-        const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
-        for (int k = 0; k < 4; k++) grads->quats[4 * i + (size_t)k] += (dq[k] - along * p.q[k]) * p.inv_norm;
-    }
-}
-
-#if GSF__X86
-
-// Derivative of sum(weight basis) by the direction: the polynomials of gsf__sh_basis_gradient. count >= 4.
-GSF__TARGET_AVX2 static inline void gsf__sh_direction_gradient8(const __m256 d[3], int32_t count, const __m256 weight[16],
-                                                                __m256 out[3]) {
-    const __m256 x = d[0], y = d[1], z = d[2], two = gsf__all8(2.0f), three = gsf__all8(3.0f), four = gsf__all8(4.0f);
-    out[0] = gsf__all8(-0.4886025119029199f) * weight[3];
-    out[1] = gsf__all8(-0.4886025119029199f) * weight[1];
-    out[2] = gsf__all8(0.4886025119029199f) * weight[2];
+// Derivative of sum(weight basis) by the direction, before its normalisation. count >= 4.
+GSF__V_INLINE void GSF__V(gsf__sh_direction_gradient)(const gsf__vf d[3], int32_t count, const gsf__vf weight[16],
+                                                      gsf__vf out[3]) {
+    const gsf__vf x = d[0], y = d[1], z = d[2];
+    const gsf__vf two = gsf__v_set(2.0f), three = gsf__v_set(3.0f), four = gsf__v_set(4.0f);
+    out[0] = gsf__v_set(-0.4886025119029199f) * weight[3];
+    out[1] = gsf__v_set(-0.4886025119029199f) * weight[1];
+    out[2] = gsf__v_set(0.4886025119029199f) * weight[2];
     if (count < 9) return;
-    const __m256 c4 = gsf__all8(1.0925484305920792f), c6 = gsf__all8(0.6307831305050401f);
+    const gsf__vf c4 = gsf__v_set(1.0925484305920792f), c6 = gsf__v_set(0.6307831305050401f);
     out[0] = out[0] + c4 * (y * weight[4] - z * weight[7] + x * weight[8]) - c6 * x * weight[6];
     out[1] = out[1] + c4 * (x * weight[4] - z * weight[5] - y * weight[8]) - c6 * y * weight[6];
     out[2] = out[2] - c4 * (y * weight[5] + x * weight[7]) + two * c6 * z * weight[6];
     if (count < 16) return;
-    const __m256 xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
-    const __m256 a = gsf__all8(0.5900435899266435f), b = gsf__all8(2.890611442640554f), c = gsf__all8(0.4570457994644658f);
-    const __m256 e = gsf__all8(0.3731763325901154f), six = gsf__all8(6.0f), eight = gsf__all8(8.0f);
+    const gsf__vf xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
+    const gsf__vf a = gsf__v_set(0.5900435899266435f), b = gsf__v_set(2.890611442640554f);
+    const gsf__vf c = gsf__v_set(0.4570457994644658f), e = gsf__v_set(0.3731763325901154f);
+    const gsf__vf six = gsf__v_set(6.0f), eight = gsf__v_set(8.0f);
     out[0] = out[0] - six * a * xy * weight[9] + b * yz * weight[10] + two * c * xy * weight[11] -
              six * e * xz * weight[12] - c * (four * zz - three * xx - yy) * weight[13] + b * xz * weight[14] -
              three * a * (xx - yy) * weight[15];
@@ -8648,92 +8294,96 @@ GSF__TARGET_AVX2 static inline void gsf__sh_direction_gradient8(const __m256 d[3
              c * (four * zz - xx - three * yy) * weight[11] - six * e * yz * weight[12] + two * c * xy * weight[13] -
              b * yz * weight[14] + six * a * xy * weight[15];
     out[2] = out[2] + b * xy * weight[10] - eight * c * yz * weight[11] + three * e * (two * zz - xx - yy) * weight[12] -
-             eight * c * xz * weight[13] + gsf__all8(1.445305721320277f) * (xx - yy) * weight[14];
+             eight * c * xz * weight[13] + gsf__v_set(1.445305721320277f) * (xx - yy) * weight[14];
 }
 
-GSF__TARGET_AVX2 static inline void gsf__add_column8(float* rows, size_t stride, __m256 value, size_t count) {
-    float lanes[8];
-    _mm256_storeu_ps(lanes, value);
+// Adds the lanes that count to a column of rows.
+GSF__V_INLINE void GSF__V(gsf__add_column)(float* rows, size_t stride, gsf__vf value, size_t count) {
+    float lanes[GSF__LANES];
+    gsf__v_store(lanes, value);
     for (size_t l = 0; l < count; l++) rows[stride * l] += lanes[l];
 }
 
-// Sums up the slots of up to eight splats from i on (12 floats of 16 in each row). Returns the mask of those that have any.
-GSF__TARGET_AVX2 static inline uint32_t gsf__sum_slots_avx2(const gsf_rasterizer* r, size_t i, size_t count, __m256 rows[16]) {
+// Sums of the slots of the splats from i on, in double and in the order of the tiles: GSF__SLOT_FLOATS columns of 16.
+// Returns bits of those that have any.
+GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i, size_t count, gsf__vf columns[16]) {
+    enum { WIDE = GSF__LANES / GSF__HALVES };
     uint32_t touched = 0;
-    for (size_t l = 0; l < 8; l++) {
-        __m256d a = _mm256_setzero_pd(), b = a, c = a;
+    for (size_t l = 0; l < GSF__LANES; l++) {
+        gsf__vd sums[16 / WIDE];
+        for (size_t k = 0; k < 16 / WIDE; k++) sums[k] = gsf__vd_set(0.0);
         if (l < count && r->records[i + l].radius > 0) {
             for (size_t s = r->splat_begin[i + l]; s < r->splat_begin[i + l + 1]; s++) {
                 const size_t pair = r->splat_pairs[s];
                 if (!r->slot_used[pair]) continue;
                 const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
-                a = _mm256_add_pd(a, _mm256_cvtps_pd(_mm_loadu_ps(slot)));
-                b = _mm256_add_pd(b, _mm256_cvtps_pd(_mm_loadu_ps(slot + 4)));
-                c = _mm256_add_pd(c, _mm256_cvtps_pd(_mm_loadu_ps(slot + 8)));
+                for (size_t k = 0; k < GSF__SLOT_FLOATS / WIDE; k++) sums[k] = sums[k] + gsf__vd_load(slot + WIDE * k);
                 touched |= 1u << l;
             }
         }
-        rows[l] = _mm256_set_m128(_mm256_cvtpd_ps(b), _mm256_cvtpd_ps(a));
-        rows[8 + l] = _mm256_castps128_ps256(_mm256_cvtpd_ps(c));
+        for (size_t k = 0; k < GSF__SLOT_FLOATS; k += GSF__LANES) columns[k + l] = gsf__vd_floats(sums + k / WIDE);
     }
-    gsf__transpose8(rows);
-    gsf__transpose8(rows + 8);
+    for (size_t k = 0; k < GSF__SLOT_FLOATS; k += GSF__LANES) gsf__v_transpose(columns + k);
     return touched;
 }
 
-// Fetches what the eight splats from i on will need: their slots lie all over memory, and rows of SH are long.
-static inline void gsf__gather_ahead(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads,
-                                     size_t i) {
-    for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + 8]; s++) {
-        const char* slot = (const char*)(r->slots + GSF__SLOT_FLOATS * r->splat_pairs[s]);
-        _mm_prefetch(slot, _MM_HINT_T0);
-        _mm_prefetch(slot + GSF__SLOT_FLOATS * sizeof(float) - 1, _MM_HINT_T0);
+// Fetches what the splats from i on will need: their slots lie all over memory, and rows of SH are long.
+GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads,
+                                             size_t i) {
+    for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + GSF__LANES]; s++) {
+        const float* slot = r->slots + GSF__SLOT_FLOATS * r->splat_pairs[s];
+        gsf__v_fetch(slot);
+        gsf__v_fetch(slot + GSF__SLOT_FLOATS - 1);
     }
     const size_t row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree);
-    for (size_t k = 0; k < 8 * row; k += 16) {
-        _mm_prefetch((const char*)(splats->sh + row * i + k), _MM_HINT_T0);
-        if (grads->sh) _mm_prefetch((const char*)(grads->sh + row * i + k), _MM_HINT_T0);
+    for (size_t k = 0; k < GSF__LANES * row; k += 16) {
+        gsf__v_fetch(splats->sh + row * i + k);
+        if (grads->sh) gsf__v_fetch(grads->sh + row * i + k);
     }
 }
 
-// gsf__project_backward of up to eight splats from i on.
-GSF__TARGET_AVX2 static void gsf__gather_avx2(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
-                                              const gsf_splat_grads* grads, size_t i, size_t left) {
-    const size_t count = left < 8 ? left : 8;
-    if (left >= 16) gsf__gather_ahead(r, splats, grads, i + 8);
-    __m256 sums[16];
-    const uint32_t touched = gsf__sum_slots_avx2(r, i, count, sums);
+// Gradients of the splats from i on from the sums of their slots, back through covariance, projection and colour.
+GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
+                                       const gsf_splat_grads* grads, size_t i, size_t left) {
+    const size_t count = left < GSF__LANES ? left : GSF__LANES;
+    if (GSF__LANES > 1 && left >= 2 * GSF__LANES) GSF__V(gsf__gather_ahead)(r, splats, grads, i + GSF__LANES);
+    gsf__vf sums[16];
+    const uint32_t touched = GSF__V(gsf__sum_slots)(r, i, count, sums);
     if (!touched) return;
-    const __m256i bits = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128), lane = gsf__lanes8(left);
-    const __m256 one = gsf__all8(1.0f), two = gsf__all8(2.0f), four = gsf__all8(4.0f), zero = _mm256_setzero_ps();
-    gsf__projection8 p;
-    gsf__project8(view, splats, i, lane, &p);
-    const __m256 live = _mm256_and_ps(p.shown, _mm256_castsi256_ps(_mm256_cmpeq_epi32(
-                                                   _mm256_and_si256(_mm256_set1_epi32((int)touched), bits), bits)));
-    const __m256 sp = sums[GSF__SLOT_P], se = sums[GSF__SLOT_E], see = sums[GSF__SLOT_EE];
-    const __m256 sy = sums[GSF__SLOT_Y], sey = sums[GSF__SLOT_EY], syy = sums[GSF__SLOT_YY];
-    const __m256 a = p.cov_c / p.det, q = one / p.cov_c, b = zero - p.cov_b * q * a;
+    const gsf__vi lane = GSF__V(gsf__splat_lanes)(left);
+    const gsf__vf one = gsf__v_set(1.0f), two = gsf__v_set(2.0f), four = gsf__v_set(4.0f), zero = gsf__v_set(0.0f);
+    gsf__projection p;
+    const gsf__vm live = gsf__vm_and(GSF__V(gsf__project)(view, splats, i, lane, &p), gsf__vm_of_bits(touched));
+    if (!gsf__v_any(live)) return;
+    const gsf__vf sp = sums[GSF__SLOT_P], se = sums[GSF__SLOT_E], see = sums[GSF__SLOT_EE];
+    const gsf__vf sy = sums[GSF__SLOT_Y], sey = sums[GSF__SLOT_EY], syy = sums[GSF__SLOT_YY];
+    const gsf__vf a = p.cov_c / p.det, q = one / p.cov_c, b = zero - p.cov_b * q * a; // inverse covariance
 
-    const __m256 du = a * se, dv = b * se + q * sy;
-    const __m256 *V0 = p.V, *V1 = p.V + 3;
-    __m256 n[3], V1_n[3], n_V0[3], g[3], dV[6], d_log_scale[3];
+    // ln alpha = -1/2 (a e^2 + q dy^2): derivatives with respect to the screen mean
+    const gsf__vf du = a * se, dv = b * se + q * sy;
+    // and to V (cov = V V^T + blur): sum p (K d)(K d)^T V. With K d = (a e, b e + q dy) and K V_c = (a g_c, b g_c + q V1c),
+    // g = V0 - kx V1, everything is a sum of like-sized terms. g itself comes from the minors n = V0 x V1,
+    // cov_c g = blur V0 + V1 x n: for a needle the plain difference has no digit left.
+    const gsf__vf *V0 = p.V, *V1 = p.V + 3;
+    gsf__vf n[3], V1_n[3], n_V0[3], g[3], dV[6], d_log_scale[3];
     for (int c = 0; c < 3; c++) {
         const int c1 = (c + 1) % 3, c2 = (c + 2) % 3;
-        n[c] = gsf__minor8(V0[c1], V0[c2], V1[c1], V1[c2]);
+        n[c] = gsf__v_minor(V0[c1], V0[c2], V1[c1], V1[c2]);
     }
     for (int c = 0; c < 3; c++) {
         const int c1 = (c + 1) % 3, c2 = (c + 2) % 3;
-        V1_n[c] = gsf__minor8(V1[c1], V1[c2], n[c1], n[c2]);
-        n_V0[c] = gsf__minor8(n[c1], n[c2], V0[c1], V0[c2]);
-        g[c] = (gsf__all8(GSF__BLUR) * V0[c] + V1_n[c]) * q;
-        const __m256 ag = a * g[c], qv = q * V1[c], along_e = ag * see + qv * sey;
+        V1_n[c] = gsf__v_minor(V1[c1], V1[c2], n[c1], n[c2]);
+        n_V0[c] = gsf__v_minor(n[c1], n[c2], V0[c1], V0[c2]);
+        g[c] = (gsf__v_set(GSF__BLUR) * V0[c] + V1_n[c]) * q;
+        const gsf__vf ag = a * g[c], qv = q * V1[c], along_e = ag * see + qv * sey;
         dV[c] = a * along_e;
         dV[3 + c] = b * along_e + q * (ag * sey + qv * syy);
-        d_log_scale[c] = ag * ag * see + two * ag * qv * sey + qv * qv * syy;
+        d_log_scale[c] = ag * ag * see + two * ag * qv * sey + qv * qv * syy; // (K d . V_c)^2
     }
     if (view->antialiased) {
-        const __m256 shrunk = _mm256_cmp_ps(p.det_raw, gsf__all8(GSF__AA_FLOOR) * p.det, _CMP_GT_OQ);
-        const __m256 by_det = _mm256_and_ps(shrunk, sp), raw = _mm256_and_ps(shrunk, sp / p.det_raw);
+        // ln compensation = 1/2 (ln det_raw - ln det); 1/2 ln det_raw by V0: V1 x n / det_raw, by ln s_c: 1 - n_c^2 / det_raw
+        const gsf__vm shrunk = gsf__v_gt(p.det_raw, gsf__v_set(GSF__AA_FLOOR) * p.det);
+        const gsf__vf by_det = gsf__v_keep(shrunk, sp), raw = gsf__v_keep(shrunk, sp / p.det_raw);
         for (int c = 0; c < 3; c++) {
             const int c1 = (c + 1) % 3, c2 = (c + 2) % 3;
             dV[c] = dV[c] + raw * V1_n[c] - by_det * a * g[c];
@@ -8743,8 +8393,9 @@ GSF__TARGET_AVX2 static void gsf__gather_avx2(const gsf_rasterizer* r, const gsf
         }
     }
 
-    const __m256 inv_z = one / p.t[2], jx = gsf__all8(view->fx) * inv_z, jy = gsf__all8(view->fy) * inv_z;
-    __m256 dT[9], d_jx = zero, d_jy = zero, d_x = zero, d_y = zero;
+    // V = J T with rows jx (T0 - x T2), jy (T1 - y T2)
+    const gsf__vf inv_z = one / p.t[2], jx = gsf__v_set(view->fx) * inv_z, jy = gsf__v_set(view->fy) * inv_z;
+    gsf__vf dT[9], d_jx = zero, d_jy = zero, d_x = zero, d_y = zero;
     for (int c = 0; c < 3; c++) {
         d_jx = d_jx + dV[c] * (p.T[c] - p.x * p.T[6 + c]);
         d_jy = d_jy + dV[3 + c] * (p.T[3 + c] - p.y * p.T[6 + c]);
@@ -8754,94 +8405,103 @@ GSF__TARGET_AVX2 static void gsf__gather_avx2(const gsf_rasterizer* r, const gsf
         dT[3 + c] = jy * dV[3 + c];
         dT[6 + c] = zero - jx * p.x * dV[c] - jy * p.y * dV[3 + c];
     }
-    const __m256 free_x = _mm256_andnot_ps(p.clamped_x, d_x) * inv_z, free_y = _mm256_andnot_ps(p.clamped_y, d_y) * inv_z;
-    __m256 slope_x = free_x, slope_y = free_y;
-    if (view->official_gradient) { // see gsf__project_backward
+
+    // mean in camera space: through u, v, the focal scale jx = fx/z and the slope x = t.x/z (constant where clamped; the
+    // official code holds t.x = x z constant instead, which leaves -x/z)
+    const gsf__vf free_x = gsf__v_keep(gsf__vm_not(p.clamped_x), d_x) * inv_z;
+    const gsf__vf free_y = gsf__v_keep(gsf__vm_not(p.clamped_y), d_y) * inv_z;
+    gsf__vf slope_x = free_x, slope_y = free_y;
+    if (view->official_gradient) {
         slope_x = d_x * inv_z;
         slope_y = d_y * inv_z;
     }
-    __m256 d_t[3], d_mean[3];
+    gsf__vf d_t[3], d_mean[3];
     d_t[0] = du * jx + free_x;
     d_t[1] = dv * jy + free_y;
     d_t[2] = sums[GSF__SLOT_Z] - slope_x * p.x - slope_y * p.y -
              (du * jx * p.t[0] + dv * jy * p.t[1] + d_jx * jx + d_jy * jy) * inv_z;
     for (int c = 0; c < 3; c++)
-        d_mean[c] = gsf__dot8(gsf__all8(view->W[c]), gsf__all8(view->W[3 + c]), gsf__all8(view->W[6 + c]), d_t[0], d_t[1],
-                              d_t[2]);
+        d_mean[c] = gsf__v_dot(gsf__v_set(view->W[c]), gsf__v_set(view->W[3 + c]), gsf__v_set(view->W[6 + c]), d_t[0],
+                               d_t[1], d_t[2]);
 
+    // colour
     const int32_t bands = view->sh_coefficients;
     const int stored = 3 * gsf_splat_count_sh(splats->sh_degree);
-    __m256 d_rgb[3], d[3], basis[16];
+    gsf__vf d_rgb[3], d[3], basis[16];
     for (int c = 0; c < 3; c++) {
-        const __m256 shown = gsf__column8(&r->records[i].r, lane, sizeof(gsf__record) / sizeof(float), c);
-        d_rgb[c] = _mm256_and_ps(live, _mm256_and_ps(_mm256_cmp_ps(shown, zero, _CMP_GT_OQ), sums[GSF__SLOT_R + c]));
+        const gsf__vf shown = gsf__v_column(&r->records[i].r, lane, sizeof(gsf__record) / sizeof(float), c);
+        d_rgb[c] = gsf__v_keep(gsf__vm_and(live, gsf__v_gt(shown, zero)), sums[GSF__SLOT_R + c]);
     }
-    const __m256 distance = gsf__view_direction8(view, splats, i, lane, d);
-    for (int c = 0; c < 3; c++) d[c] = _mm256_and_ps(live, d[c]); // a NaN times a gradient of 0 is a NaN
-    gsf__sh_basis8(d[0], d[1], d[2], bands, basis);
+    const gsf__vf distance = GSF__V(gsf__view_direction)(view, splats, i, lane, d);
+    for (int c = 0; c < 3; c++) d[c] = gsf__v_keep(live, d[c]); // a NaN times a gradient of 0 is a NaN
+    GSF__V(gsf__sh_basis)(d[0], d[1], d[2], bands, basis);
     if (grads->sh) {
         float* rows = grads->sh + (size_t)stored * i;
         int k = 0;
-        for (; k < 3 * bands && k + 8 <= stored; k += 8) {
-            __m256 block[8];
-            for (int j = 0; j < 8; j++) {
+        for (; k < 3 * bands && k + GSF__LANES <= stored; k += GSF__LANES) {
+            gsf__vf block[GSF__LANES];
+            for (int j = 0; j < GSF__LANES; j++) {
                 block[j] = zero;
                 if (k + j < 3 * bands) block[j] = basis[(k + j) / 3] * d_rgb[(k + j) % 3];
             }
-            gsf__transpose8(block);
+            gsf__v_transpose(block);
             for (size_t l = 0; l < count; l++) {
                 float* row = rows + (size_t)stored * l + k;
-                if (touched >> l & 1u) _mm256_storeu_ps(row, _mm256_loadu_ps(row) + block[l]);
+                if (touched >> l & 1u) gsf__v_store(row, gsf__v_load(row) + block[l]);
             }
         }
-        for (; k < 3 * bands; k++) gsf__add_column8(rows + k, (size_t)stored, basis[k / 3] * d_rgb[k % 3], count);
+        for (; k < 3 * bands; k++) GSF__V(gsf__add_column)(rows + k, (size_t)stored, basis[k / 3] * d_rgb[k % 3], count);
     }
     if (grads->means) {
         if (bands > 1) {
-            __m256 sh[48], weight[16], d_dir[3];
-            gsf__sh_columns8(splats, i, lane, 3 * bands, sh);
+            gsf__vf sh[48], weight[16], d_dir[3];
+            GSF__V(gsf__sh_columns)(splats, i, lane, 3 * bands, sh);
             for (int k = 1; k < bands; k++)
-                weight[k] = gsf__dot8(sh[3 * k], sh[3 * k + 1], sh[3 * k + 2], d_rgb[0], d_rgb[1], d_rgb[2]);
-            gsf__sh_direction_gradient8(d, bands, weight, d_dir);
-            const __m256 along = gsf__dot8(d[0], d[1], d[2], d_dir[0], d_dir[1], d_dir[2]);
-            const __m256 apart = _mm256_cmp_ps(distance, zero, _CMP_GT_OQ);
-            for (int c = 0; c < 3; c++)
-                d_mean[c] = d_mean[c] + _mm256_and_ps(apart, (d_dir[c] - along * d[c]) / distance);
+                weight[k] = gsf__v_dot(sh[3 * k], sh[3 * k + 1], sh[3 * k + 2], d_rgb[0], d_rgb[1], d_rgb[2]);
+            GSF__V(gsf__sh_direction_gradient)(d, bands, weight, d_dir);
+            const gsf__vf along = gsf__v_dot(d[0], d[1], d[2], d_dir[0], d_dir[1], d_dir[2]);
+            const gsf__vm apart = gsf__v_gt(distance, zero); // direction = (mean - centre) / distance
+            for (int c = 0; c < 3; c++) d_mean[c] = d_mean[c] + gsf__v_keep(apart, (d_dir[c] - along * d[c]) / distance);
         }
         for (size_t c = 0; c < 3; c++)
-            gsf__add_column8(grads->means + 3 * i + c, 3, _mm256_and_ps(live, d_mean[c]), count);
+            GSF__V(gsf__add_column)(grads->means + 3 * i + c, 3, gsf__v_keep(live, d_mean[c]), count);
     }
     if (grads->means2d) {
-        gsf__add_column8(grads->means2d + 2 * i, 2, _mm256_and_ps(live, du), count);
-        gsf__add_column8(grads->means2d + 2 * i + 1, 2, _mm256_and_ps(live, dv), count);
+        GSF__V(gsf__add_column)(grads->means2d + 2 * i, 2, gsf__v_keep(live, du), count);
+        GSF__V(gsf__add_column)(grads->means2d + 2 * i + 1, 2, gsf__v_keep(live, dv), count);
     }
     if (grads->means2d_abs) {
-        gsf__add_column8(grads->means2d_abs + 2 * i, 2, _mm256_and_ps(live, sums[GSF__SLOT_ABS_X]), count);
-        gsf__add_column8(grads->means2d_abs + 2 * i + 1, 2, _mm256_and_ps(live, sums[GSF__SLOT_ABS_Y]), count);
+        GSF__V(gsf__add_column)(grads->means2d_abs + 2 * i, 2, gsf__v_keep(live, sums[GSF__SLOT_ABS_X]), count);
+        GSF__V(gsf__add_column)(grads->means2d_abs + 2 * i + 1, 2, gsf__v_keep(live, sums[GSF__SLOT_ABS_Y]), count);
     }
-    if (grads->opacity_logits)
-        gsf__add_column8(grads->opacity_logits + i, 1, _mm256_and_ps(live, sp * gsf__sigmoid8(zero - p.logit)), count);
+    if (grads->opacity_logits) { // d ln(sigmoid) / d logit = 1 - sigmoid = sigmoid(-logit)
+        const gsf__vf d_logit = sp * GSF__V(gsf__sigmoid)(zero - p.logit);
+        GSF__V(gsf__add_column)(grads->opacity_logits + i, 1, gsf__v_keep(live, d_logit), count);
+    }
     if (grads->log_scales)
         for (size_t c = 0; c < 3; c++)
-            gsf__add_column8(grads->log_scales + 3 * i + c, 3, _mm256_and_ps(live, d_log_scale[c]), count);
+            GSF__V(gsf__add_column)(grads->log_scales + 3 * i + c, 3, gsf__v_keep(live, d_log_scale[c]), count);
     if (grads->quats) {
-        __m256 dR[9], dq[4];
+        gsf__vf dR[9], dq[4]; // T = Q S, Q = W R: W^T dQ, dQ = dT S
         for (int row = 0; row < 3; row++)
             for (int c = 0; c < 3; c++)
-                dR[3 * row + c] = p.scale[c] * gsf__dot8(gsf__all8(view->W[row]), gsf__all8(view->W[3 + row]),
-                                                         gsf__all8(view->W[6 + row]), dT[c], dT[3 + c], dT[6 + c]);
-        const __m256 w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
+                dR[3 * row + c] = p.scale[c] * gsf__v_dot(gsf__v_set(view->W[row]), gsf__v_set(view->W[3 + row]),
+                                                          gsf__v_set(view->W[6 + row]), dT[c], dT[3 + c], dT[6 + c]);
+        const gsf__vf w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
         dq[0] = two * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
         dq[1] = two * (y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) + w * (dR[7] - dR[5])) - four * x * (dR[4] + dR[8]);
         dq[2] = two * (x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) + w * (dR[2] - dR[6])) - four * y * (dR[0] + dR[8]);
         dq[3] = two * (x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) + w * (dR[3] - dR[1])) - four * z * (dR[0] + dR[4]);
-        const __m256 along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
-        for (size_t k = 0; k < 4; k++)
-            gsf__add_column8(grads->quats + 4 * i + k, 4, _mm256_and_ps(live, (dq[k] - along * p.q[k]) * p.inv_norm), count);
+        const gsf__vf along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
+        for (size_t k = 0; k < 4; k++) {
+            const gsf__vf d_quat = (dq[k] - along * p.q[k]) * p.inv_norm;
+            GSF__V(gsf__add_column)(grads->quats + 4 * i + k, 4, gsf__v_keep(live, d_quat), count);
+        }
     }
 }
 
-#endif // GSF__X86
+#endif // GSF__KERNELS_GATHER
+#ifndef GSF__ISA
 
 typedef struct gsf__gather_job {
     const gsf_rasterizer* r;
@@ -8860,25 +8520,12 @@ static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
 #if GSF__X86
     if (job->level >= GSF_CPU_AVX2) {
-        for (size_t i = begin; i < end; i += 8)
+        for (size_t i = begin; i < end; i += GSF__LANES_avx2)
             gsf__gather_avx2(r, job->view, job->splats, job->grads, i, end - i);
         return;
     }
 #endif
-    for (size_t i = begin; i < end; i++) {
-        if (r->records[i].radius <= 0) continue;
-        double sums[GSF__SLOT_FLOATS];
-        memset(sums, 0, sizeof sums);
-        int touched = 0;
-        for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + 1]; s++) {
-            const size_t pair = r->splat_pairs[s];
-            if (!r->slot_used[pair]) continue;
-            const float* slot = r->slots + GSF__SLOT_FLOATS * pair;
-            for (int k = 0; k < GSF__SLOT_FLOATS; k++) sums[k] += (double)slot[k];
-            touched = 1;
-        }
-        if (touched) gsf__project_backward(job->view, job->splats, i, r->records + i, sums, job->grads);
-    }
+    for (size_t i = begin; i < end; i++) gsf__gather_scalar(r, job->view, job->splats, job->grads, i, end - i);
 }
 
 // ---- >>render ------------------------------------------------------------------
@@ -9291,157 +8938,131 @@ typedef struct gsf__loss_kernels {
 
 static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) : 0.0f; } // NaN: 0
 
-static void gsf__loss_load_ref(const float* render, const float* f32, const uint8_t* u8, const float* b, const float* c,
-                               size_t valid, size_t n, float* images, size_t step) {
-    for (size_t i = 0; i < n; i++) {
-        const float x = i < valid ? gsf__loss_clamp(render[i]) : 0.0f;
-        const float t = i >= valid ? 0.0f : u8 ? (float)u8[i] / 255.0f : gsf__loss_clamp(f32[i]);
-        const float s = (x - b[i]) + t, d = x - t;
-        images[i] = s;
-        images[step + i] = d;
-        images[2 * step + i] = s * s;
-        images[3 * step + i] = (d - c[i]) * (d - c[i]);
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_LOSS
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_LOSS
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_LOSS
+
+GSF__V_INLINE gsf__vf GSF__V(gsf__loss_clamp)(gsf__vf v) { // a NaN becomes 0
+    return gsf__v_min(gsf__v_max(v, gsf__v_set(0.0f)), gsf__v_set(1.0f));
+}
+
+GSF__V_KERNEL void GSF__V(gsf__loss_load)(const float* render, const float* f32, const uint8_t* u8, const float* b,
+                                          const float* c, size_t valid, size_t n, float* images, size_t step) {
+    for (size_t i = 0; i < n; i += GSF__LANES) {
+        const size_t left = i < valid ? valid - i : 0;
+        gsf__vf x = gsf__v_set(0.0f), t = x;
+        if (left) {
+            x = GSF__V(gsf__loss_clamp)(gsf__v_load_first(render + i, left));
+            if (u8) t = gsf__v_load_bytes(u8 + i, left) / gsf__v_set(255.0f);
+            else t = GSF__V(gsf__loss_clamp)(gsf__v_load_first(f32 + i, left));
+        }
+        const gsf__vf s = (x - gsf__v_load(b + i)) + t, d = x - t, e = d - gsf__v_load(c + i);
+        gsf__v_store(images + i, s);
+        gsf__v_store(images + step + i, d);
+        gsf__v_store(images + 2 * step + i, s * s);
+        gsf__v_store(images + 3 * step + i, e * e);
     }
 }
 
-static void gsf__loss_down_ref(const float* const v[4], size_t stride, size_t n, float* sums) {
-    for (size_t row = 0; row < GSF__LOSS_GROUP; row++)
-        for (size_t i = 0; i < n; i++) {
-            float s = 0.0f;
-            for (size_t k = 0; k <= 2 * GSF__LOSS_RADIUS; k++) {
-                const size_t at = row + k, away = k < GSF__LOSS_RADIUS ? GSF__LOSS_RADIUS - k : k - GSF__LOSS_RADIUS;
-                s += gsf__loss_window[away] * v[at / GSF__LOSS_GROUP][at % GSF__LOSS_GROUP * stride + i];
-            }
-            sums[row * stride + i] = s;
-        }
+GSF__V_INLINE gsf__vf GSF__V(gsf__loss_taps)(int k, gsf__vf a, gsf__vf b, gsf__vf sum) {
+    return gsf__v_madd(gsf__v_set(gsf__loss_window[k]), a + b, sum);
 }
 
-static void gsf__loss_across_ref(const float* v, size_t n, float* sums) {
+// Each of the 14 rows is loaded once, from the outermost to the middle.
+GSF__V_KERNEL void GSF__V(gsf__loss_down)(const float* const v[4], size_t stride, size_t n, float* sums) {
+    const gsf__vf zero = gsf__v_set(0.0f), middle = gsf__v_set(gsf__loss_window[0]);
+    const float *v0 = v[0], *v1 = v[1], *v2 = v[2], *v3 = v[3];
+    for (size_t i = 0; i < n; i += GSF__LANES) {
+#define GSF__LOSS_ROW(k, block) const gsf__vf r##k = gsf__v_load(block + k % GSF__LOSS_GROUP * stride + i)
+#define GSF__LOSS_TAPS GSF__V(gsf__loss_taps)
+        GSF__LOSS_ROW(0, v0); GSF__LOSS_ROW(1, v0); GSF__LOSS_ROW(2, v0); GSF__LOSS_ROW(3, v0);
+        GSF__LOSS_ROW(10, v2); GSF__LOSS_ROW(11, v2); GSF__LOSS_ROW(12, v3); GSF__LOSS_ROW(13, v3);
+        gsf__vf a = GSF__LOSS_TAPS(5, r0, r10, zero), b = GSF__LOSS_TAPS(5, r1, r11, zero);
+        gsf__vf c = GSF__LOSS_TAPS(5, r2, r12, zero), d = GSF__LOSS_TAPS(5, r3, r13, zero);
+        GSF__LOSS_ROW(4, v1); GSF__LOSS_ROW(9, v2);
+        a = GSF__LOSS_TAPS(4, r1, r9, a), b = GSF__LOSS_TAPS(4, r2, r10, b);
+        c = GSF__LOSS_TAPS(4, r3, r11, c), d = GSF__LOSS_TAPS(4, r4, r12, d);
+        GSF__LOSS_ROW(5, v1); GSF__LOSS_ROW(8, v2);
+        a = GSF__LOSS_TAPS(3, r2, r8, a), b = GSF__LOSS_TAPS(3, r3, r9, b);
+        c = GSF__LOSS_TAPS(3, r4, r10, c), d = GSF__LOSS_TAPS(3, r5, r11, d);
+        GSF__LOSS_ROW(6, v1); GSF__LOSS_ROW(7, v1);
+        a = GSF__LOSS_TAPS(2, r3, r7, a), b = GSF__LOSS_TAPS(2, r4, r8, b);
+        c = GSF__LOSS_TAPS(2, r5, r9, c), d = GSF__LOSS_TAPS(2, r6, r10, d);
+        a = GSF__LOSS_TAPS(1, r4, r6, a), b = GSF__LOSS_TAPS(1, r5, r7, b);
+        c = GSF__LOSS_TAPS(1, r6, r8, c), d = GSF__LOSS_TAPS(1, r7, r9, d);
+#undef GSF__LOSS_TAPS
+#undef GSF__LOSS_ROW
+        gsf__v_store(sums + i, gsf__v_madd(middle, r5, a));
+        gsf__v_store(sums + stride + i, gsf__v_madd(middle, r6, b));
+        gsf__v_store(sums + 2 * stride + i, gsf__v_madd(middle, r7, c));
+        gsf__v_store(sums + 3 * stride + i, gsf__v_madd(middle, r8, d));
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__loss_map)(const float* sums, size_t sums_step, const float* d, const float* b, const float* c,
+                                         const float* weight, size_t n, float* slopes, size_t step, double totals[2]) {
+    const gsf__vf c1 = gsf__v_set(2.0f * GSF__SSIM_C1), c2 = gsf__v_set(2.0f * GSF__SSIM_C2);
+    const gsf__vf one = gsf__v_set(1.0f), lack = gsf__v_set(GSF__SSIM_LACK), zero = gsf__v_set(0.0f);
+    gsf__vd l1 = gsf__vd_set(0.0), dssim = l1;
+    gsf__vf l1_part = zero, dssim_part = zero;
+    for (size_t i = 0; i < n; i += GSF__LANES) {
+        const gsf__vf S = gsf__v_load(sums + i), D = gsf__v_load(sums + sums_step + i);
+        const gsf__vf P = gsf__v_load(sums + 2 * sums_step + i), Q = gsf__v_load(sums + 3 * sums_step + i);
+        const gsf__vf z = S + gsf__v_load(b + i), Dc = D - gsf__v_load(c + i), w = gsf__v_load(weight + i);
+        const gsf__vf zz = gsf__v_madd(z, z, c1), DD = D * D, B1 = zz + DD;
+        const gsf__vf vs = gsf__v_nmadd(S, S, P), vd = gsf__v_madd(lack, DD, gsf__v_nmadd(Dc, Dc, Q));
+        const gsf__vf B2 = (vs + vd) + gsf__v_madd(lack, zz, c2); // of zz: the window's lack times c1 is nothing
+        const gsf__vf r = one / (B1 * B2), r1 = B2 * r, r2 = B1 * r, p = DD * r1, q = vd * r2; // halves of p and q
+        const gsf__vf like = one - (p + p), con = one - (q + q);
+        const gsf__vf e = w * (like * r2), es = e * q, ed = e - es;
+        gsf__vf a = (w * (con * r1)) * gsf__v_nmadd(p, z + D, D);
+        a = gsf__v_madd(gsf__v_nmadd(lack, z, S), es, a);
+        gsf__v_store(slopes + i, gsf__v_nmadd(gsf__v_nmadd(lack, D, Dc), ed, a));
+        gsf__v_store(slopes + step + i, ed);
+        gsf__v_store(slopes + 2 * step + i, es);
+        l1_part = gsf__v_madd(w, gsf__v_abs(gsf__v_load(d + i)), l1_part);
+        dssim_part = gsf__v_madd(w, gsf__v_madd(q, like, p), dssim_part);
+        if (GSF__LANES > 1 && i / GSF__LANES % 8 != 7 && i + GSF__LANES < n) continue; // short sums in float
+        l1 = gsf__vd_add_folded(l1, l1_part);
+        dssim = gsf__vd_add_folded(dssim, dssim_part);
+        l1_part = dssim_part = zero;
+    }
+    totals[0] += gsf__vd_sum(l1);
+    totals[1] += gsf__vd_sum(dssim);
+}
+
+GSF__V_KERNEL void GSF__V(gsf__loss_gradient)(const float* sums, size_t sums_step, const float* s, const float* d,
+                                              const float* c, const float* weight, const float* render, float l1_scale,
+                                              float ssim_scale, size_t valid, float* d_render) {
+    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f);
+    const gsf__vf l1 = gsf__v_set(l1_scale), ssim = gsf__v_set(4.0f * ssim_scale);
+    for (size_t i = 0; i < valid; i += GSF__LANES) {
+        const gsf__vf diff = gsf__v_load(d + i), e = diff - gsf__v_load(c + i);
+        gsf__vf quarter = gsf__v_madd(e, gsf__v_load(sums + sums_step + i), gsf__v_load(sums + i));
+        quarter = gsf__v_nmadd(gsf__v_load(s + i), gsf__v_load(sums + 2 * sums_step + i), quarter);
+        const gsf__vf l1_slope = gsf__v_with_sign(l1 * gsf__v_load(weight + i), diff);
+        const gsf__vf slope = gsf__v_madd(ssim, quarter, gsf__v_keep(gsf__vm_not(gsf__v_eq(diff, zero)), l1_slope));
+        const gsf__vf r = gsf__v_load_first(render + i, valid - i); // d clamp(r)/dr; 0 for NaN
+        const gsf__vm inside = gsf__vm_and(gsf__v_ge(r, zero), gsf__v_le(r, one));
+        gsf__v_store_first(d_render + i, gsf__v_keep(inside, slope), valid - i);
+    }
+}
+
+#endif // GSF__KERNELS_LOSS
+#ifndef GSF__ISA
+
+static void gsf__loss_across_scalar(const float* v, size_t n, float* sums) {
     for (size_t i = 0; i < n; i++, v++) {
         sums[i] = gsf__loss_window[0] * v[0];
         for (int k = 1; k <= GSF__LOSS_RADIUS; k++) sums[i] += gsf__loss_window[k] * (v[-3 * k] + v[3 * k]);
     }
 }
 
-static void gsf__loss_map_ref(const float* sums, size_t sums_step, const float* d, const float* b, const float* c,
-                              const float* weight, size_t n, float* slopes, size_t step, double totals[2]) {
-    for (size_t i = 0; i < n; i++) {
-        const float S = sums[i], D = sums[sums_step + i], z = S + b[i], Dc = D - c[i], w = weight[i];
-        const float vs = sums[2 * sums_step + i] - S * S + GSF__SSIM_LACK * (z * z);
-        const float vd = sums[3 * sums_step + i] - Dc * Dc + GSF__SSIM_LACK * (D * D);
-        const float B1 = z * z + D * D + 2.0f * GSF__SSIM_C1, B2 = vs + vd + 2.0f * GSF__SSIM_C2;
-        const float r = 1.0f / (B1 * B2), r1 = B2 * r, r2 = B1 * r, p = D * D * r1, q = vd * r2; // halves of p and q
-        const float like = 1.0f - 2.0f * p, con = 1.0f - 2.0f * q, e = w * (like * r2), es = e * q, ed = e - es;
-        slopes[i] = w * (con * r1) * (D - p * (z + D)) + (S - GSF__SSIM_LACK * z) * es - (Dc - GSF__SSIM_LACK * D) * ed;
-        slopes[step + i] = ed;
-        slopes[2 * step + i] = es;
-        totals[0] += (double)(w * fabsf(d[i]));
-        totals[1] += (double)(w * (p + q * like));
-    }
-}
-
-static void gsf__loss_gradient_ref(const float* sums, size_t sums_step, const float* s, const float* d, const float* c,
-                                   const float* weight, const float* render, float l1_scale, float ssim_scale,
-                                   size_t valid, float* d_render) {
-    for (size_t i = 0; i < valid; i++) {
-        const float quarter = sums[i] + (d[i] - c[i]) * sums[sums_step + i] - s[i] * sums[2 * sums_step + i];
-        const float sign = d[i] > 0.0f ? 1.0f : d[i] < 0.0f ? -1.0f : 0.0f;
-        const float slope = l1_scale * weight[i] * sign + 4.0f * ssim_scale * quarter;
-        d_render[i] = render[i] >= 0.0f && render[i] <= 1.0f ? slope : 0.0f; // d clamp(r)/dr; 0 for NaN
-    }
-}
-
 #if GSF__X86
-// Lanes below `count` set; count >= 8 sets all.
-GSF__TARGET_AVX2 static inline __m256i gsf__avx2_lanes(size_t count) {
-    const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
-    return _mm256_cmpgt_epi32(_mm256_set1_epi32(count < 8 ? (int)count : 8), lane);
-}
-
-// The first `count` floats, then zeros.
-GSF__TARGET_AVX2 static inline __m256 gsf__loss_first_avx2(const float* p, size_t count) {
-    return count >= 8 ? _mm256_loadu_ps(p) : _mm256_maskload_ps(p, gsf__avx2_lanes(count));
-}
-
-GSF__TARGET_AVX2 static inline double gsf__avx2_sum_pd(__m256d v) { // ((0 + 2) + (1 + 3))
-    const __m128d pair = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd(v, 1));
-    return _mm_cvtsd_f64(_mm_add_sd(pair, _mm_unpackhi_pd(pair, pair)));
-}
-
-GSF__TARGET_AVX2 static inline __m256 gsf__loss_clamp_avx2(__m256 v) { // max(NaN, 0) is 0
-    return _mm256_min_ps(_mm256_max_ps(v, _mm256_setzero_ps()), _mm256_set1_ps(1.0f));
-}
-
-GSF__TARGET_AVX2 static inline __m256 gsf__loss_bytes_avx2(const uint8_t* p, size_t count) { // the first `count`, of 255
-    const __m256 high = _mm256_set1_ps(1.0f / 255.0f), low = _mm256_set1_ps((float)(1.0 / 255.0 - (double)(1.0f / 255.0f)));
-    uint64_t bytes = 0;
-    if (count >= 8) memcpy(&bytes, p, 8);
-    else memcpy(&bytes, p, count);
-    const __m256 v = _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_cvtsi64_si128((long long)bytes)));
-    return _mm256_fmadd_ps(v, high, _mm256_mul_ps(v, low)); // all 256 as v / 255 gives them
-}
-
-GSF__TARGET_AVX2 static inline void gsf__loss_store_avx2(__m256 x, __m256 t, const float* b, const float* c, float* images,
-                                                         size_t step) {
-    const __m256 s = _mm256_add_ps(_mm256_sub_ps(x, _mm256_loadu_ps(b)), t), d = _mm256_sub_ps(x, t);
-    const __m256 e = _mm256_sub_ps(d, _mm256_loadu_ps(c));
-    _mm256_storeu_ps(images, s);
-    _mm256_storeu_ps(images + step, d);
-    _mm256_storeu_ps(images + 2 * step, _mm256_mul_ps(s, s));
-    _mm256_storeu_ps(images + 3 * step, _mm256_mul_ps(e, e));
-}
-
-GSF__TARGET_AVX2 static void gsf__loss_load_avx2(const float* render, const float* f32, const uint8_t* u8, const float* b,
-                                                 const float* c, size_t valid, size_t n, float* images, size_t step) {
-    size_t i = 0;
-    for (; u8 && i + 8 <= valid; i += 8)
-        gsf__loss_store_avx2(gsf__loss_clamp_avx2(_mm256_loadu_ps(render + i)), gsf__loss_bytes_avx2(u8 + i, 8), b + i, c + i,
-                             images + i, step);
-    for (; i + 8 <= valid; i += 8)
-        gsf__loss_store_avx2(gsf__loss_clamp_avx2(_mm256_loadu_ps(render + i)),
-                             gsf__loss_clamp_avx2(_mm256_loadu_ps(f32 + i)), b + i, c + i, images + i, step);
-    for (; i < n; i += 8) {
-        const size_t left = i < valid ? valid - i : 0;
-        __m256 x = _mm256_setzero_ps(), t = x;
-        if (left) x = gsf__loss_clamp_avx2(gsf__loss_first_avx2(render + i, left));
-        if (left) t = u8 ? gsf__loss_bytes_avx2(u8 + i, left) : gsf__loss_clamp_avx2(gsf__loss_first_avx2(f32 + i, left));
-        gsf__loss_store_avx2(x, t, b + i, c + i, images + i, step);
-    }
-}
-
-GSF__TARGET_AVX2 static inline __m256 gsf__loss_taps_avx2(int k, __m256 a, __m256 b, __m256 sum) {
-    return _mm256_fmadd_ps(_mm256_set1_ps(gsf__loss_window[k]), _mm256_add_ps(a, b), sum);
-}
-
-// Each of the 14 rows is loaded once, from the outermost to the middle.
-GSF__TARGET_AVX2 static void gsf__loss_down_avx2(const float* const v[4], size_t stride, size_t n, float* sums) {
-    const __m256 zero = _mm256_setzero_ps(), middle = _mm256_set1_ps(gsf__loss_window[0]);
-    const float *v0 = v[0], *v1 = v[1], *v2 = v[2], *v3 = v[3];
-    for (size_t i = 0; i < n; i += 8) {
-#define GSF__LOSS_ROW(k, block) const __m256 r##k = _mm256_loadu_ps(block + k % GSF__LOSS_GROUP * stride + i)
-        GSF__LOSS_ROW(0, v0); GSF__LOSS_ROW(1, v0); GSF__LOSS_ROW(2, v0); GSF__LOSS_ROW(3, v0);
-        GSF__LOSS_ROW(10, v2); GSF__LOSS_ROW(11, v2); GSF__LOSS_ROW(12, v3); GSF__LOSS_ROW(13, v3);
-        __m256 a = gsf__loss_taps_avx2(5, r0, r10, zero), b = gsf__loss_taps_avx2(5, r1, r11, zero);
-        __m256 c = gsf__loss_taps_avx2(5, r2, r12, zero), d = gsf__loss_taps_avx2(5, r3, r13, zero);
-        GSF__LOSS_ROW(4, v1); GSF__LOSS_ROW(9, v2);
-        a = gsf__loss_taps_avx2(4, r1, r9, a), b = gsf__loss_taps_avx2(4, r2, r10, b);
-        c = gsf__loss_taps_avx2(4, r3, r11, c), d = gsf__loss_taps_avx2(4, r4, r12, d);
-        GSF__LOSS_ROW(5, v1); GSF__LOSS_ROW(8, v2);
-        a = gsf__loss_taps_avx2(3, r2, r8, a), b = gsf__loss_taps_avx2(3, r3, r9, b);
-        c = gsf__loss_taps_avx2(3, r4, r10, c), d = gsf__loss_taps_avx2(3, r5, r11, d);
-        GSF__LOSS_ROW(6, v1); GSF__LOSS_ROW(7, v1);
-        a = gsf__loss_taps_avx2(2, r3, r7, a), b = gsf__loss_taps_avx2(2, r4, r8, b);
-        c = gsf__loss_taps_avx2(2, r5, r9, c), d = gsf__loss_taps_avx2(2, r6, r10, d);
-        a = gsf__loss_taps_avx2(1, r4, r6, a), b = gsf__loss_taps_avx2(1, r5, r7, b);
-        c = gsf__loss_taps_avx2(1, r6, r8, c), d = gsf__loss_taps_avx2(1, r7, r9, d);
-#undef GSF__LOSS_ROW
-        _mm256_storeu_ps(sums + i, _mm256_fmadd_ps(middle, r5, a));
-        _mm256_storeu_ps(sums + stride + i, _mm256_fmadd_ps(middle, r6, b));
-        _mm256_storeu_ps(sums + 2 * stride + i, _mm256_fmadd_ps(middle, r7, c));
-        _mm256_storeu_ps(sums + 3 * stride + i, _mm256_fmadd_ps(middle, r8, d));
-    }
-}
-
 // The eight floats from the one `by` (1..3) behind the start of `low` on; high: those 4 behind low.
 #define GSF__LOSS_BETWEEN(low, high, by) _mm256_castsi256_ps(_mm256_alignr_epi8(high, low, 4 * (by)))
 
@@ -9467,83 +9088,22 @@ GSF__TARGET_AVX2 static void gsf__loss_across_avx2(const float* v, size_t n, flo
 #undef GSF__LOSS_EIGHT
 }
 
-GSF__TARGET_AVX2 static inline __m256d gsf__loss_add_avx2(__m256d sum, __m256 v) { // pairs are added as floats
-    return _mm256_add_pd(sum, _mm256_cvtps_pd(_mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1))));
-}
-
-GSF__TARGET_AVX2 static void gsf__loss_map_avx2(const float* sums, size_t sums_step, const float* d, const float* b,
-                                                const float* c, const float* weight, size_t n, float* slopes, size_t step,
-                                                double totals[2]) {
-    const __m256 c1 = _mm256_set1_ps(2.0f * GSF__SSIM_C1), c2 = _mm256_set1_ps(2.0f * GSF__SSIM_C2);
-    const __m256 one = _mm256_set1_ps(1.0f), lack = _mm256_set1_ps(GSF__SSIM_LACK), sign = _mm256_set1_ps(-0.0f);
-    __m256d l1 = _mm256_setzero_pd(), dssim = l1;
-    __m256 l1_part = _mm256_setzero_ps(), dssim_part = l1_part;
-    for (size_t i = 0; i < n; i += 8) {
-        const __m256 S = _mm256_loadu_ps(sums + i), D = _mm256_loadu_ps(sums + sums_step + i);
-        const __m256 P = _mm256_loadu_ps(sums + 2 * sums_step + i), Q = _mm256_loadu_ps(sums + 3 * sums_step + i);
-        const __m256 z = _mm256_add_ps(S, _mm256_loadu_ps(b + i)), Dc = _mm256_sub_ps(D, _mm256_loadu_ps(c + i));
-        const __m256 zz = _mm256_fmadd_ps(z, z, c1), DD = _mm256_mul_ps(D, D), B1 = _mm256_add_ps(zz, DD);
-        const __m256 vs = _mm256_fnmadd_ps(S, S, P), vd = _mm256_fmadd_ps(lack, DD, _mm256_fnmadd_ps(Dc, Dc, Q));
-        const __m256 B2 = _mm256_add_ps(_mm256_add_ps(vs, vd), _mm256_fmadd_ps(lack, zz, c2));
-        const __m256 r = _mm256_div_ps(one, _mm256_mul_ps(B1, B2)), r1 = _mm256_mul_ps(B2, r), r2 = _mm256_mul_ps(B1, r);
-        const __m256 p = _mm256_mul_ps(DD, r1), q = _mm256_mul_ps(vd, r2), w = _mm256_loadu_ps(weight + i);
-        const __m256 like = _mm256_sub_ps(one, _mm256_add_ps(p, p)), con = _mm256_sub_ps(one, _mm256_add_ps(q, q));
-        const __m256 e = _mm256_mul_ps(w, _mm256_mul_ps(like, r2)), es = _mm256_mul_ps(e, q), ed = _mm256_sub_ps(e, es);
-        __m256 a = _mm256_mul_ps(_mm256_mul_ps(w, _mm256_mul_ps(con, r1)), _mm256_fnmadd_ps(p, _mm256_add_ps(z, D), D));
-        a = _mm256_fnmadd_ps(_mm256_fnmadd_ps(lack, D, Dc), ed, _mm256_fmadd_ps(_mm256_fnmadd_ps(lack, z, S), es, a));
-        _mm256_storeu_ps(slopes + i, a);
-        _mm256_storeu_ps(slopes + step + i, ed);
-        _mm256_storeu_ps(slopes + 2 * step + i, es);
-        l1_part = _mm256_fmadd_ps(w, _mm256_andnot_ps(sign, _mm256_loadu_ps(d + i)), l1_part);
-        dssim_part = _mm256_fmadd_ps(w, _mm256_fmadd_ps(q, like, p), dssim_part);
-        if ((i & 56) != 56 && i + 8 < n) continue;
-        l1 = gsf__loss_add_avx2(l1, l1_part), dssim = gsf__loss_add_avx2(dssim, dssim_part);
-        l1_part = dssim_part = _mm256_setzero_ps();
-    }
-    totals[0] += gsf__avx2_sum_pd(l1);
-    totals[1] += gsf__avx2_sum_pd(dssim);
-}
-
-GSF__TARGET_AVX2 static void gsf__loss_gradient_avx2(const float* sums, size_t sums_step, const float* s, const float* d,
-                                                     const float* c, const float* weight, const float* render,
-                                                     float l1_scale, float ssim_scale, size_t valid, float* d_render) {
-    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), minus = _mm256_set1_ps(-0.0f);
-    const __m256 l1 = _mm256_set1_ps(l1_scale), ssim = _mm256_set1_ps(4.0f * ssim_scale);
-    for (size_t i = 0; i < valid; i += 8) {
-        const __m256 diff = _mm256_loadu_ps(d + i), e = _mm256_sub_ps(diff, _mm256_loadu_ps(c + i));
-        __m256 quarter = _mm256_fmadd_ps(e, _mm256_loadu_ps(sums + sums_step + i), _mm256_loadu_ps(sums + i));
-        quarter = _mm256_fnmadd_ps(_mm256_loadu_ps(s + i), _mm256_loadu_ps(sums + 2 * sums_step + i), quarter);
-        const __m256 w = _mm256_mul_ps(l1, _mm256_loadu_ps(weight + i));
-        const __m256 signed_w = _mm256_xor_ps(w, _mm256_and_ps(diff, minus));
-        const __m256 slope = _mm256_fmadd_ps(ssim, quarter, _mm256_and_ps(signed_w, _mm256_cmp_ps(diff, zero, _CMP_NEQ_OQ)));
-        const __m256 r = gsf__loss_first_avx2(render + i, valid - i);
-        const __m256 inside = _mm256_and_ps(_mm256_cmp_ps(r, zero, _CMP_GE_OQ), _mm256_cmp_ps(r, one, _CMP_LE_OQ));
-        const __m256 out = _mm256_and_ps(slope, inside);
-        if (valid - i >= 8) _mm256_storeu_ps(d_render + i, out); // masked stores are slow
-        else _mm256_maskstore_ps(d_render + i, gsf__avx2_lanes(valid - i), out);
-    }
-}
 #endif
 
-static gsf__loss_kernels gsf__loss_kernels_of(const gsf_context* ctx) {
-    gsf__loss_kernels k = {gsf__loss_load_ref, gsf__loss_down_ref, gsf__loss_across_ref, gsf__loss_map_ref,
-                           gsf__loss_gradient_ref};
+static const gsf__loss_kernels* gsf__loss_kernels_of(gsf_cpu_level level) {
+    static const gsf__loss_kernels scalar = {gsf__loss_load_scalar, gsf__loss_down_scalar, gsf__loss_across_scalar,
+                                             gsf__loss_map_scalar, gsf__loss_gradient_scalar};
 #if GSF__X86
-    if (ctx->cpu_level >= GSF_CPU_AVX2) {
-        k.load = gsf__loss_load_avx2;
-        k.down = gsf__loss_down_avx2;
-        k.across = gsf__loss_across_avx2;
-        k.map = gsf__loss_map_avx2;
-        k.gradient = gsf__loss_gradient_avx2;
-    }
-#else
-    (void)ctx;
+    static const gsf__loss_kernels avx2 = {gsf__loss_load_avx2, gsf__loss_down_avx2, gsf__loss_across_avx2,
+                                           gsf__loss_map_avx2, gsf__loss_gradient_avx2};
+    if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
-    return k;
+    (void)level;
+    return &scalar;
 }
 
 typedef struct gsf__loss_job {
-    gsf__loss_kernels k;
+    const gsf__loss_kernels* k;
     const gsf__target* target;
     const float* render;
     float* rows;
@@ -9627,7 +9187,7 @@ static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buff
         for (size_t i = 0; i < 3; i++) row[i] = wide ? sorted[3 * p + (i + 2) % 3][count / 2] : 0.0f;
         for (size_t i = 3; i < job->n + 2 * margin; i++) row[i] = row[i - 3];
     }
-    job->k.load(NULL, NULL, NULL, b->middle[0] - margin, b->middle[1] - margin, 0, job->n + 2 * margin, b->outside - margin,
+    job->k->load(NULL, NULL, NULL, b->middle[0] - margin, b->middle[1] - margin, 0, job->n + 2 * margin, b->outside - margin,
                 job->row);
 }
 
@@ -9639,7 +9199,7 @@ static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b,
     for (size_t p = 0; p < planes; p++) {
         const float* v[4];
         for (size_t k = 0; k < 4; k++) v[k] = ring + (p * ring_rows + (g + k) * GSF__LOSS_GROUP % ring_rows) * job->row;
-        job->k.down(v, job->row, job->n, b->vertical);
+        job->k->down(v, job->row, job->n, b->vertical);
         for (size_t j = 0; j < GSF__LOSS_GROUP; j++) {
             float* sums = b->vertical + j * job->row;
             if (outside) {
@@ -9649,7 +9209,7 @@ static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b,
                 memset(sums - GSF__LOSS_MARGIN, 0, margin);
                 memset(sums + job->n, 0, margin);
             }
-            job->k.across(sums, job->n, b->sums + (p * GSF__LOSS_GROUP + j) * job->row);
+            job->k->across(sums, job->n, b->sums + (p * GSF__LOSS_GROUP + j) * job->row);
         }
     }
 }
@@ -9661,7 +9221,7 @@ static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffe
         const int32_t y = b->first - 2 * GSF__LOSS_RADIUS + at;
         const int inside = y >= 0 && y < target->height;
         const size_t from = inside ? (size_t)y * job->valid : 0;
-        job->k.load(inside ? gsf__loss_render(job, y, b->render) : NULL, target->f32 ? target->f32 + from : NULL,
+        job->k->load(inside ? gsf__loss_render(job, y, b->render) : NULL, target->f32 ? target->f32 + from : NULL,
                     target->u8 ? target->u8 + from : NULL, b->middle[0], b->middle[1], inside ? job->valid : 0, job->n,
                     b->images + (size_t)(at % GSF__LOSS_IMAGES) * job->row, GSF__LOSS_IMAGES * job->row);
     }
@@ -9677,7 +9237,7 @@ static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffer
         float* slopes = b->slopes + (size_t)(at % GSF__LOSS_SLOPES) * job->row;
         double other[2] = {0.0, 0.0};
         if (y >= 0 && y < job->target->height)
-            job->k.map(sums, GSF__LOSS_GROUP * job->row, s + GSF__LOSS_IMAGES * job->row, b->middle[0], b->middle[1],
+            job->k->map(sums, GSF__LOSS_GROUP * job->row, s + GSF__LOSS_IMAGES * job->row, b->middle[0], b->middle[1],
                        gsf__loss_weights(job, y, b->weight), job->n, slopes, GSF__LOSS_SLOPES * job->row,
                        y >= b->first && y < b->end ? totals : other);
         else
@@ -9691,7 +9251,7 @@ static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_b
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP && b->first + at < b->end; at++) {
         const size_t packed = (size_t)(b->first + at) * job->valid;
         const float* s = b->images + (size_t)((at + 2 * GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
-        job->k.gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, s,
+        job->k->gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, s,
                         s + GSF__LOSS_IMAGES * job->row, b->middle[1], gsf__loss_weights(job, b->first + at, b->weight),
                         gsf__loss_render(job, b->first + at, b->render), job->l1_scale, job->ssim_scale, job->valid,
                         job->d_render + packed);
@@ -9746,7 +9306,7 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const 
                             float lambda, float scale, float* d_render, gsf__loss_value* out) {
     GSF__TRY(gsf__loss_reserve(ctx, scratch, target->width, target->height));
     gsf__loss_job job;
-    job.k = gsf__loss_kernels_of(ctx);
+    job.k = gsf__loss_kernels_of(ctx->cpu_level);
     job.target = target;
     job.render = render;
     job.rows = scratch->rows;
@@ -10014,88 +9574,6 @@ typedef struct gsf__adam_job {
 #define GSF__ADAM_TINY_V 1e-36f
 #define GSF__ADAM_LARGEST 1e18f // larger gradients overflow when squared; they count as not finite
 
-// Updates `rows` runs of n values, `stride` apart; rates: `period` (a multiple of 8) step sizes, repeated along a run.
-// Non-finite gradients count as 0, a step to a non-finite value is not taken; returns how many of either.
-static uint32_t gsf__adam_update_ref(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
-                                     const float* rates, size_t period, float inv_correction2) {
-    uint32_t rejected = 0;
-    for (size_t row = 0; row < rows; row++) {
-        const size_t begin = row * stride;
-        for (size_t i = begin, r = 0; i < begin + n; i++, r = r + 1 == period ? 0 : r + 1) {
-            float g = grad[i];
-            if (!(fabsf(g) <= GSF__ADAM_LARGEST)) {
-                g = 0.0f;
-                rejected++;
-            }
-            const float mi = m[i] + (g - m[i]) * 0.1f;
-            const float vi = v[i] * 0.999f + (g * 0.001f) * g;
-            m[i] = fabsf(mi) < GSF__ADAM_TINY_M ? 0.0f : mi;
-            v[i] = vi < GSF__ADAM_TINY_V ? 0.0f : vi;
-            const float next = value[i] - rates[r] * (m[i] / (sqrtf(v[i]) * inv_correction2 + GSF__ADAM_EPS));
-            if (fabsf(next) <= FLT_MAX) value[i] = next;
-            else rejected++;
-            grad[i] = 0.0f;
-        }
-    }
-    return rejected;
-}
-
-#if GSF__X86
-// One vector of eight; lanes: NULL = all, else only those set are read and written. Returns how many were neutralised.
-GSF__TARGET_AVX2 static inline uint32_t gsf__adam_vector_avx2(float* value, float* m, float* v, float* grad, __m256 rate,
-                                                              __m256 correction, const __m256i* lanes) {
-    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff)), zero = _mm256_setzero_ps();
-    __m256 g = lanes ? _mm256_maskload_ps(grad, *lanes) : _mm256_loadu_ps(grad);
-    const __m256 old = lanes ? _mm256_maskload_ps(value, *lanes) : _mm256_loadu_ps(value);
-    __m256 mi = lanes ? _mm256_maskload_ps(m, *lanes) : _mm256_loadu_ps(m);
-    __m256 vi = lanes ? _mm256_maskload_ps(v, *lanes) : _mm256_loadu_ps(v);
-    const __m256 good = _mm256_cmp_ps(_mm256_and_ps(g, magnitude), _mm256_set1_ps(GSF__ADAM_LARGEST), _CMP_LE_OQ);
-    g = _mm256_and_ps(g, good);
-    mi = _mm256_fmadd_ps(_mm256_sub_ps(g, mi), _mm256_set1_ps(0.1f), mi);
-    vi = _mm256_fmadd_ps(_mm256_mul_ps(g, _mm256_set1_ps(0.001f)), g, _mm256_mul_ps(vi, _mm256_set1_ps(0.999f)));
-    const __m256 tiny_m = _mm256_set1_ps(GSF__ADAM_TINY_M), tiny_v = _mm256_set1_ps(GSF__ADAM_TINY_V);
-    mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), tiny_m, _CMP_GE_OQ));
-    vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, tiny_v, _CMP_GE_OQ));
-    const __m256 root = _mm256_fmadd_ps(_mm256_sqrt_ps(vi), correction, _mm256_set1_ps(GSF__ADAM_EPS));
-    const __m256 next = _mm256_fnmadd_ps(rate, _mm256_div_ps(mi, root), old);
-    const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
-    const __m256 chosen = _mm256_blendv_ps(old, next, kept);
-    if (lanes) {
-        _mm256_maskstore_ps(value, *lanes, chosen);
-        _mm256_maskstore_ps(m, *lanes, mi);
-        _mm256_maskstore_ps(v, *lanes, vi);
-        _mm256_maskstore_ps(grad, *lanes, zero);
-    } else {
-        _mm256_storeu_ps(value, chosen);
-        _mm256_storeu_ps(m, mi);
-        _mm256_storeu_ps(v, vi);
-        _mm256_storeu_ps(grad, zero);
-    }
-    const int bad = ~_mm256_movemask_ps(good) & 255, bad_next = ~_mm256_movemask_ps(kept) & 255;
-    if (!(bad | bad_next)) return 0;
-    return (uint32_t)(__builtin_popcount((unsigned)bad) + __builtin_popcount((unsigned)bad_next));
-}
-
-GSF__TARGET_AVX2 static uint32_t gsf__adam_update_avx2(float* value, float* m, float* v, float* grad, size_t rows,
-                                                       size_t stride, size_t n, const float* rates, size_t period,
-                                                       float inv_correction2) {
-    const __m256 correction = _mm256_set1_ps(inv_correction2);
-    uint32_t rejected = 0;
-    for (size_t row = 0; row < rows; row++) {
-        size_t i = row * stride, r = 0;
-        const size_t end = i + n;
-        for (; i + 8 <= end; i += 8, r = r + 8 == period ? 0 : r + 8)
-            rejected += gsf__adam_vector_avx2(value + i, m + i, v + i, grad + i, _mm256_loadu_ps(rates + r), correction,
-                                              NULL);
-        if (i == end) continue;
-        const __m256i lanes = gsf__avx2_lanes(end - i);
-        rejected += gsf__adam_vector_avx2(value + i, m + i, v + i, grad + i, _mm256_loadu_ps(rates + r), correction,
-                                          &lanes);
-    }
-    return rejected;
-}
-#endif
-
 /* Catching up. Step j with a zero gradient: m *= b1, v *= b2, value -= rate m / (c1_j (sqrt(v) / c2_j + eps)), where
    c1_j = 1 - b1^j and c2_j = sqrt(1 - b2^j). With m and v of before the n steps, the k-th of them (j = t - n + k) takes
        rate m / sqrt(v) * q^k c2_j / c1_j / (1 + x_k eps / sqrt(v)),   q = b1 / sqrt(b2),   x_k = c2_j b2^(-k/2).
@@ -10105,68 +9583,103 @@ GSF__TARGET_AVX2 static uint32_t gsf__adam_update_avx2(float* value, float* m, f
    row where eps is not small takes the steps one by one. */
 #define GSF__LAZY_LEAST_V 1e-24f // sqrt(v) is 1000 eps: the second order is below 1e-7
 
+static uint32_t gsf__count_bits(uint32_t bits) {
+    uint32_t count = 0;
+    for (; bits; bits &= bits - 1) count++;
+    return count;
+}
+
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_ADAM
+#include "gsfixer.h" // compiles what follows, once per instruction set
+#undef GSF__KERNELS_ADAM
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_ADAM
+
+// Stores the moments, what is too small to count flushed to zero.
+GSF__V_INLINE gsf__vf GSF__V(gsf__adam_m)(float* m, gsf__vf value, size_t n) {
+    value = gsf__v_keep(gsf__v_ge(gsf__v_abs(value), gsf__v_set(GSF__ADAM_TINY_M)), value);
+    gsf__v_store_first(m, value, n);
+    return value;
+}
+
+GSF__V_INLINE gsf__vf GSF__V(gsf__adam_v)(float* v, gsf__vf value, size_t n) {
+    value = gsf__v_keep(gsf__v_ge(value, gsf__v_set(GSF__ADAM_TINY_V)), value);
+    gsf__v_store_first(v, value, n);
+    return value;
+}
+
+// Stores `next` where it is finite. Returns bits of the lanes where it is not.
+GSF__V_INLINE uint32_t GSF__V(gsf__adam_value)(float* value, gsf__vf old, gsf__vf next, size_t n) {
+    const gsf__vm kept = gsf__v_le(gsf__v_abs(next), gsf__v_set(FLT_MAX));
+    gsf__v_store_first(value, gsf__v_select(kept, next, old), n);
+    return gsf__vm_bits(gsf__vm_not(kept));
+}
+
+// The first n lanes of one vector; returns how many values were neutralised.
+GSF__V_INLINE uint32_t GSF__V(gsf__adam_vector)(float* value, float* m, float* v, float* grad, const float* rates,
+                                                float inv_correction2, size_t n) {
+    gsf__vf g = gsf__v_load_first(grad, n), mi = gsf__v_load_first(m, n), vi = gsf__v_load_first(v, n);
+    const gsf__vf old = gsf__v_load_first(value, n);
+    const gsf__vm good = gsf__v_le(gsf__v_abs(g), gsf__v_set(GSF__ADAM_LARGEST));
+    g = gsf__v_keep(good, g);
+    mi = GSF__V(gsf__adam_m)(m, gsf__v_madd(g - mi, gsf__v_set(0.1f), mi), n);
+    vi = gsf__v_madd(g * gsf__v_set(0.001f), g, vi * gsf__v_set(0.999f));
+    vi = GSF__V(gsf__adam_v)(v, vi, n);
+    const gsf__vf root = gsf__v_madd(gsf__v_sqrt(vi), gsf__v_set(inv_correction2), gsf__v_set(GSF__ADAM_EPS));
+    const gsf__vf next = gsf__v_nmadd(gsf__v_load(rates), mi / root, old);
+    const uint32_t bad_value = GSF__V(gsf__adam_value)(value, old, next, n);
+    gsf__v_store_first(grad, gsf__v_set(0.0f), n);
+    const uint32_t bad_grad = gsf__vm_bits(gsf__vm_not(good));
+    return bad_value | bad_grad ? gsf__count_bits(bad_value) + gsf__count_bits(bad_grad) : 0;
+}
+
+// Updates `rows` runs of n values, `stride` apart; rates: `period` (a multiple of 8) step sizes, repeated along a run.
+// Non-finite gradients count as 0, a step to a non-finite value is not taken; returns how many of either.
+GSF__V_KERNEL uint32_t GSF__V(gsf__adam_update)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride,
+                                                size_t n, const float* rates, size_t period, float inv_correction2) {
+    uint32_t rejected = 0;
+    for (size_t row = 0; row < rows; row++) {
+        size_t i = row * stride, r = 0;
+        const size_t end = i + n;
+        for (; i + GSF__LANES <= end; i += GSF__LANES, r = r + GSF__LANES == period ? 0 : r + GSF__LANES)
+            rejected += GSF__V(gsf__adam_vector)(value + i, m + i, v + i, grad + i, rates + r, inv_correction2, GSF__LANES);
+        if (i < end)
+            rejected += GSF__V(gsf__adam_vector)(value + i, m + i, v + i, grad + i, rates + r, inv_correction2, end - i);
+    }
+    return rejected;
+}
+
+GSF__V_INLINE void GSF__V(gsf__lazy_vector)(float* value, float* m, float* v, const float* rates, const gsf__rest* rest,
+                                            size_t n) {
+    const gsf__vf old = gsf__v_load_first(value, n), mi = gsf__v_load_first(m, n), vi = gsf__v_load_first(v, n);
+    const gsf__vf root = gsf__v_sqrt(vi) + gsf__v_set(rest->eps);
+    const gsf__vf reach = gsf__v_load(rates) * gsf__v_set(rest->drift);
+    (void)GSF__V(gsf__adam_value)(value, old, gsf__v_nmadd(reach, mi / root, old), n);
+    (void)GSF__V(gsf__adam_m)(m, mi * gsf__v_set(rest->decay1), n);
+    (void)GSF__V(gsf__adam_v)(v, vi * gsf__v_set(rest->decay2), n);
+}
+
 // Returns 0, with nothing changed, where a step is to be taken that eps counts in.
-static int gsf__lazy_catch_up_ref(float* value, float* m, float* v, size_t n, const float* rates, const gsf__rest* rest) {
-    for (size_t i = 0; i < n; i++)
-        if (m[i] != 0.0f && !(v[i] >= GSF__LAZY_LEAST_V)) return 0;
-    for (size_t i = 0; i < n; i++) {
-        const float next = value[i] - rates[i] * rest->drift * (m[i] / (sqrtf(v[i]) + rest->eps));
-        if (fabsf(next) <= FLT_MAX) value[i] = next;
-        const float mi = m[i] * rest->decay1, vi = v[i] * rest->decay2;
-        m[i] = fabsf(mi) < GSF__ADAM_TINY_M ? 0.0f : mi;
-        v[i] = vi < GSF__ADAM_TINY_V ? 0.0f : vi;
+GSF__V_KERNEL int GSF__V(gsf__lazy_catch_up)(float* value, float* m, float* v, size_t n, const float* rates,
+                                             const gsf__rest* rest) {
+    const gsf__vf zero = gsf__v_set(0.0f), least = gsf__v_set(GSF__LAZY_LEAST_V);
+    const size_t whole = n - n % GSF__LANES;
+    gsf__vm small = gsf__vm_of_bits(0);
+    for (size_t i = 0; i < n; i += GSF__LANES) {
+        const gsf__vf mi = gsf__v_load_first(m + i, n - i), vi = gsf__v_load_first(v + i, n - i);
+        small = gsf__vm_or(small, gsf__vm_not(gsf__vm_or(gsf__v_eq(mi, zero), gsf__v_ge(vi, least))));
     }
+    if (gsf__vm_bits(small)) return 0;
+    for (size_t i = 0; i < whole; i += GSF__LANES)
+        GSF__V(gsf__lazy_vector)(value + i, m + i, v + i, rates + i, rest, GSF__LANES);
+    if (whole < n) GSF__V(gsf__lazy_vector)(value + whole, m + whole, v + whole, rates + whole, rest, n - whole);
     return 1;
 }
 
-#if GSF__X86
-// One vector of eight, as gsf__adam_vector_avx2. Masked accesses are slow on some processors.
-GSF__TARGET_AVX2 static inline void gsf__lazy_vector_avx2(float* value, float* m, float* v, __m256 rate,
-                                                          const gsf__rest* rest, const __m256i* lanes) {
-    const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
-    const __m256 old = lanes ? _mm256_maskload_ps(value, *lanes) : _mm256_loadu_ps(value);
-    __m256 mi = lanes ? _mm256_maskload_ps(m, *lanes) : _mm256_loadu_ps(m);
-    __m256 vi = lanes ? _mm256_maskload_ps(v, *lanes) : _mm256_loadu_ps(v);
-    const __m256 root = _mm256_add_ps(_mm256_sqrt_ps(vi), _mm256_set1_ps(rest->eps));
-    const __m256 reach = _mm256_mul_ps(rate, _mm256_set1_ps(rest->drift));
-    const __m256 next = _mm256_fnmadd_ps(reach, _mm256_div_ps(mi, root), old);
-    const __m256 kept = _mm256_cmp_ps(_mm256_and_ps(next, magnitude), _mm256_set1_ps(FLT_MAX), _CMP_LE_OQ);
-    const __m256 chosen = _mm256_blendv_ps(old, next, kept);
-    mi = _mm256_mul_ps(mi, _mm256_set1_ps(rest->decay1));
-    vi = _mm256_mul_ps(vi, _mm256_set1_ps(rest->decay2));
-    mi = _mm256_and_ps(mi, _mm256_cmp_ps(_mm256_and_ps(mi, magnitude), _mm256_set1_ps(GSF__ADAM_TINY_M), _CMP_GE_OQ));
-    vi = _mm256_and_ps(vi, _mm256_cmp_ps(vi, _mm256_set1_ps(GSF__ADAM_TINY_V), _CMP_GE_OQ));
-    if (lanes) {
-        _mm256_maskstore_ps(value, *lanes, chosen);
-        _mm256_maskstore_ps(m, *lanes, mi);
-        _mm256_maskstore_ps(v, *lanes, vi);
-    } else {
-        _mm256_storeu_ps(value, chosen);
-        _mm256_storeu_ps(m, mi);
-        _mm256_storeu_ps(v, vi);
-    }
-}
-
-GSF__TARGET_AVX2 static int gsf__lazy_catch_up_avx2(float* value, float* m, float* v, size_t n, const float* rates,
-                                                    const gsf__rest* rest) {
-    const __m256 zero = _mm256_setzero_ps(), least = _mm256_set1_ps(GSF__LAZY_LEAST_V);
-    const size_t whole = n & ~(size_t)7;
-    const __m256i lanes = gsf__avx2_lanes(n - whole);
-    __m256 small = zero;
-    for (size_t i = 0; i < n; i += 8) {
-        const __m256 mi = i < whole ? _mm256_loadu_ps(m + i) : _mm256_maskload_ps(m + i, lanes);
-        const __m256 vi = i < whole ? _mm256_loadu_ps(v + i) : _mm256_maskload_ps(v + i, lanes);
-        small = _mm256_or_ps(small, _mm256_and_ps(_mm256_cmp_ps(mi, zero, _CMP_NEQ_UQ),
-                                                  _mm256_cmp_ps(vi, least, _CMP_NGE_UQ)));
-    }
-    if (_mm256_movemask_ps(small)) return 0;
-    for (size_t i = 0; i < whole; i += 8)
-        gsf__lazy_vector_avx2(value + i, m + i, v + i, _mm256_loadu_ps(rates + i), rest, NULL);
-    if (whole < n)
-        gsf__lazy_vector_avx2(value + whole, m + whole, v + whole, _mm256_loadu_ps(rates + whole), rest, &lanes);
-    return 1;
-}
-#endif
+#endif // GSF__KERNELS_ADAM
+#ifndef GSF__ISA
 
 // For rows as they are after step t; the rates of SH are the same in all steps.
 static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* model, const gsf__adam_rates* rates,
@@ -10174,8 +9687,8 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
     lazy->model = model;
     lazy->active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
     for (int i = 0; i < 48; i++) lazy->rates[i] = (float)(i < 3 ? rates->sh_dc : rates->sh_rest);
-    lazy->update = gsf__adam_update_ref;
-    lazy->catch_up = gsf__lazy_catch_up_ref;
+    lazy->update = gsf__adam_update_scalar;
+    lazy->catch_up = gsf__lazy_catch_up_scalar;
 #if GSF__X86
     if (level >= GSF_CPU_AVX2) {
         lazy->update = gsf__adam_update_avx2;
@@ -10318,7 +9831,7 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
     for (size_t i = 0; i < 8 * width; i++)
         job.sh_rates[i] = (float)((i % width < 3 ? rates->sh_dc : rates->sh_rest) / correction1);
     job.active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
-    job.update = gsf__adam_update_ref;
+    job.update = gsf__adam_update_scalar;
 #if GSF__X86
     if (ctx->cpu_level >= GSF_CPU_AVX2) job.update = gsf__adam_update_avx2;
 #endif
@@ -13137,5 +12650,6 @@ GSF_API gsf_fix_desc gsf_splat_resolve_few_view_desc(const gsf_scene* scene, gsf
 
 GSF__END_IMPLEMENTATION
 
+#endif // GSF__ISA
 #endif // GSF_SPLAT_IMPLEMENTED
 #endif // GSFIXER_SPLAT_IMPLEMENTATION

@@ -105,6 +105,9 @@ GSF__V_KERNEL void GSF__V(check_integers)(void) {
         CHECK(INTS(gsf__vi_mul(p, q))[i] == (int32_t)(u * v) && INTS(gsf__vi_min(p, q))[i] == (a[i] < b[i] ? a[i] : b[i]));
         CHECK(INTS(gsf__vi_shl(p, 23))[i] == (int32_t)(u << 23) && INTS(gsf__vi_sar(p, 7))[i] == a[i] >> 7);
         CHECK(INTS(gsf__vi_keep(odd, p))[i] == (i % 2 ? a[i] : 0));
+        int32_t pairs[2 * MOST];
+        gsf__vi_store_pairs(pairs, p, q);
+        CHECK(pairs[2 * i] == a[i] && pairs[2 * i + 1] == b[i]);
         CHECK(INTS(gsf__vi_index())[i] == i && INTS(gsf__vi_set(-5))[i] == -5);
         CHECK(ARRAY(gsf__vi_floats(p))[i] == (float)a[i]);
         CHECK(INTS(gsf__v_bits(gsf__vi_as_floats(p)))[i] == a[i]);
@@ -164,7 +167,8 @@ GSF__V_KERNEL void GSF__V(check_across)(void) {
 
     gsf__vd halves[GSF__HALVES], roots[GSF__HALVES], sum = gsf__vd_set(0.0), folded = gsf__vd_set(0.0);
     for (int h = 0; h < GSF__HALVES; h++) {
-        halves[h] = gsf__vd_half(v, h);
+        halves[h] = gsf__vd_load(x + h * (GSF__LANES / GSF__HALVES));
+        CHECK(gsf__vd_sum(halves[h] - gsf__vd_half(v, h)) == 0.0);
         sum = sum + halves[h];
         roots[h] = gsf__vd_keep_above(halves[h], gsf__vd_set(0.0), gsf__vd_sqrt(gsf__vd_max(gsf__vd_set(4.0), halves[h])));
         halves[h] = gsf__vd_madd(halves[h], gsf__vd_set(2.0), gsf__vd_set(1e-9));
@@ -181,6 +185,7 @@ GSF__V_KERNEL void GSF__V(check_across)(void) {
     CHECK_NEAR(gsf__vd_sum(folded), expected, GSF__LANES * 1e-3);
     gsf__vf pinned = v;
     gsf__v_pin(&pinned);
+    gsf__v_fetch(x);
     for (int i = 0; i < GSF__LANES; i++) CHECK(ARRAY(pinned)[i] == x[i]);
 }
 
