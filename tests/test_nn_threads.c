@@ -1,9 +1,9 @@
 // The networks on a pthread job system behind the parallel hook: 1, 2 and 3 workers give the same bytes, kernel by
 // kernel and for a complete run of the small golden model. Built with ThreadSanitizer, this is also the test for data
 // races.
+#define GSFIXER_IMPLEMENTATION
 #define JOB_SYSTEM_ONLY
 #include "../examples/job_system.c"
-#define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 #include "test.h"
 #include "worker_runs.h"
