@@ -5576,57 +5576,61 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_vi
 
 // ---- >>stereo ------------------------------------------------------------------
 
-/* PatchMatch stereo in the manner of Zheng et al. 2014 and Schoenberger et al. 2016 (COLMAP), Galliani et al. 2015 (Gipuma:
-   red-black propagation), Xu and Tao 2019 (ACMH: eight propagation regions, views weighted per pixel; geometric
-   consistency). A plane is inverse depth as an affine function of the pixel, 1/z = w + gx dx + gy dy: so a pixel (x,y) maps
-   to another view by (X,Y,Z) = M (x,y,1) + t (1/z), which makes the homography of a window three multiply-adds a corner.
+/* PatchMatch stereo after Zheng et al. 2014 and Schoenberger et al. 2016 (COLMAP), Galliani et al. 2015 (Gipuma:
+   red-black propagation) and Xu and Tao 2019 (ACMH: eight propagation regions, source views weighted per pixel,
+   geometric consistency). A plane is stored as inverse depth, an affine function of the pixel: 1/z = w + gx dx + gy dy.
+   A pixel (x,y) then maps to another view by (X,Y,Z) = M (x,y,1) + t (1/z), so computing the homography of a window
+   takes nine multiply-adds.
 
-       prepare   photos to the working sizes (grey, the 2x2 neighbours of a texel in one word); which views to compare
-       match     per level, coarse to fine: start planes, then iterations of (red pixels, black pixels)
-       fuse      pixels whose planes lead there and back, thinned by marking the pixels around every point taken
+       prepare   scale photos to the working sizes (grey, each texel packed with its 2x2 neighbours in one word);
+                 choose the source views of every view
+       match     per level, coarse to fine: initial planes, then iterations of (red pixels, black pixels)
+       fuse      keep pixels that pass the consistency checks in other views; thin them out by marking the pixels
+                 around every point taken
 
-   Work is split by blocks of rows over all views together. A red pixel reads planes of black ones only, so neither order
-   nor number of workers matters. Pixel centres are at integers here. */
+   Work is split into blocks of rows across all views. A red pixel reads the planes of black pixels only, and vice
+   versa, so the result depends neither on the order of the blocks nor on the number of workers. Pixel centres are at
+   integers here. */
 
 enum {
     GSF__DENSE_SOURCES = 8,
     GSF__DENSE_SAMPLES = 256,
-    GSF__DENSE_ROWS = 4,       // of a chunk
-    GSF__DENSE_PLANES = 9,     // own, and one from each region
-    GSF__DENSE_MIN_SIDE = 40,  // of the coarsest level, pixels
+    GSF__DENSE_ROWS = 4,       // rows per chunk
+    GSF__DENSE_PLANES = 9,     // candidates: the pixel's own plane and one from each of eight regions
+    GSF__DENSE_MIN_SIDE = 40,  // minimum width and height of the coarsest level, pixels
 };
 
-#define GSF__DENSE_BAD 2.0f        // cost of a plane that cannot be judged
-#define GSF__DENSE_MIN_VARIANCE 2.0f // grey levels squared; less is noise
-#define GSF__DENSE_MIN_COS 0.15f   // between plane normal and ray
+#define GSF__DENSE_BAD 2.0f        // cost of a plane that cannot be evaluated
+#define GSF__DENSE_MIN_VARIANCE 2.0f // grey levels squared; anything below is noise
+#define GSF__DENSE_MIN_COS 0.15f   // between plane normal and viewing ray
 
 typedef struct gsf__dense_plane { float w, gx, gy, cost; } gsf__dense_plane;
 
-typedef struct gsf__dense_source { // another view, as this one's pixels map to it
-    int32_t view;            // place in the list of views
-    float m[9], t[3];        // row-major; w times Z is 1/depth there
-    float back_m[9], back_t[3];
-    float rotation[9];       // this camera's axes to the other's
+typedef struct gsf__dense_source { // another view and the mapping of pixels to it
+    int32_t view;            // index into gsf__dense_job.views
+    float m[9], t[3];        // M (row-major) and t; the inverse depth in the other view is w / Z
+    float back_m[9], back_t[3]; // the mapping from the other view to this one
+    float rotation[9];       // from this camera's axes to the other's
 } gsf__dense_source;
 
 typedef struct gsf__dense_view {
-    uint32_t index;          // of the scene's views
-    int32_t width, height;   // at this level, as the camera
-    gsf_camera camera;
-    float fx, fy, cx, cy;    // its, pixel centres at integers
+    uint32_t index;          // into the scene's views
+    int32_t width, height;   // at this level
+    gsf_camera camera;       // at this level
+    float fx, fy, cx, cy;    // of `camera`, for pixel centres at integers
     gsf_image color;         // u8 RGB
-    gsf_image weight;        // u8; data NULL where all pixels count
-    size_t first;            // pixel of the level's arrays
+    gsf_image weight;        // u8; data is NULL if all pixels count fully
+    size_t first;            // index of the view's first pixel in the level's arrays
     int32_t source_count;
     gsf__dense_source sources[GSF__DENSE_SOURCES];
-    float w_min, w_max;
+    float w_min, w_max;      // range of inverse depth
 } gsf__dense_view;
 
-typedef struct gsf__dense_window { // samples of the matching window, padded to whole eights by samples without weight
+typedef struct gsf__dense_window { // samples of the matching window, padded with zero-weight samples to a multiple of 8
     int32_t count;
     float dx[GSF__DENSE_SAMPLES], dy[GSF__DENSE_SAMPLES];
     float spatial[GSF__DENSE_SAMPLES];
-    float tonal[256];        // weight by difference in grey
+    float tonal[256];        // weight by absolute grey difference from the window's centre
 } gsf__dense_window;
 
 typedef struct gsf__dense_patch { // the window around one pixel of the reference
@@ -5634,13 +5638,13 @@ typedef struct gsf__dense_patch { // the window around one pixel of the referenc
     float center, weight_sum;
 } gsf__dense_patch;
 
-typedef struct gsf__dense_warp { // homography of a window: (X,Y,Z) at its middle and per step in x and y
+typedef struct gsf__dense_warp { // homography of a window: (X,Y,Z) at its centre, and its change per pixel in x and y
     float middle[3], along_x[3], along_y[3];
     const uint32_t* texels;
     int32_t width, height;
 } gsf__dense_warp;
 
-// 1 - correlation between a patch and what a warp shows of another photo, 0..2.
+// Matching cost, 0..2: 1 - normalised cross-correlation between a patch and the other photo sampled through a warp.
 typedef float (*gsf__dense_cost_fn)(const gsf__dense_window* window, const gsf__dense_patch* patch,
                                     const gsf__dense_warp* warp);
 
@@ -5658,19 +5662,19 @@ typedef struct gsf__dense_job {
     size_t pixel_count;            // of all views at this level
     uint32_t* texels;
     gsf__dense_plane* planes;
-    gsf__dense_plane* others;      // planes as they were before a geometric iteration, else NULL
+    gsf__dense_plane* others;      // copy of the planes before a geometric iteration, NULL in other iterations
     float* source_costs;           // (pixels,GSF__DENSE_SOURCES)
-    uint8_t* links;                // per pixel: bit s = source s agrees, 0 where too few do
+    uint8_t* links;                // per pixel: bit s is set if source s confirms it; 0 if too few sources do
     size_t block_count;
     gsf__dense_block* blocks;
-    // the coarser level, while planes are taken over from it
+    // the coarser level, while its planes are upsampled
     gsf__dense_view* coarse_views;
     gsf__dense_plane* coarse_planes;
     float* seeds;                  // coarsest level: inverse depth of the nearest sparse point, 0 = none
     int32_t level, iteration, color;
-    float step_pixels, step_normal; // perturbation at this iteration: pixels in the other view; of the unit normal
-    float min_normal_dot;          // of two views' normals that agree
-    int32_t roam;                  // also try planes from the whole range
+    float step_pixels, step_normal; // perturbation in this iteration: pixels in the source view; of the unit normal
+    float min_normal_dot;          // minimum dot product of normals that count as consistent
+    int32_t roam;                  // also try random planes from the whole depth range
 } gsf__dense_job;
 
 static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
@@ -5743,9 +5747,9 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
 
 // ---- matching cost
 
-// sums: weight, weighted value and its square of the reference; value and square of the other photo; product.
+// sums, all weighted: weight; value and square in the reference; value and square in the other photo; product.
 static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sums[6]) {
-    if (!(sums[0] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // too much of the window is outside
+    if (!(sums[0] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // half of the window's weight or more lies outside
     const float inv = 1.0f / sums[0], mean_r = sums[1] * inv, mean_s = sums[3] * inv;
     const float var_r = sums[2] * inv - mean_r * mean_r, var_s = sums[4] * inv - mean_s * mean_s;
     if (!(var_r > GSF__DENSE_MIN_VARIANCE && var_s > GSF__DENSE_MIN_VARIANCE)) return GSF__DENSE_BAD;
@@ -5753,7 +5757,7 @@ static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sum
     return cost < 0.0f ? 0.0f : cost < GSF__DENSE_BAD ? cost : GSF__DENSE_BAD;
 }
 
-// Eight partial sums side by side, added at the end as the vector twin does: both give the same bits.
+// Keeps eight partial sums and adds them in the order of the AVX2 version, so that both give the same bits.
 static float gsf__dense_cost_scalar(const gsf__dense_window* window, const gsf__dense_patch* patch,
                                     const gsf__dense_warp* warp) {
     float lanes[6][8], sums[6];
@@ -5791,7 +5795,7 @@ static float gsf__dense_cost_scalar(const gsf__dense_window* window, const gsf__
 }
 
 #if GSF__X86
-// No fused multiply-adds, so that the bits are the scalar twin's.
+// Without fused multiply-adds, so that the result has the same bits as the scalar version.
 __attribute__((target("avx2"))) static float gsf__dense_cost_avx2(const gsf__dense_window* window,
                                                                   const gsf__dense_patch* patch,
                                                                   const gsf__dense_warp* warp) {
@@ -5817,7 +5821,7 @@ __attribute__((target("avx2"))) static float gsf__dense_cost_avx2(const gsf__den
         inside = _mm256_and_ps(inside, _mm256_cmp_ps(v, zero, _CMP_GE_OQ));
         inside = _mm256_and_ps(inside, _mm256_cmp_ps(v, v_max, _CMP_LE_OQ));
         inside = _mm256_and_ps(inside, _mm256_cmp_ps(Z, zero, _CMP_GT_OQ));
-        u = _mm256_and_ps(u, inside); // a sample outside reads the first texel and weighs nothing
+        u = _mm256_and_ps(u, inside); // samples outside read the first texel with weight 0
         v = _mm256_and_ps(v, inside);
         const __m256i iu = _mm256_cvttps_epi32(u), iv = _mm256_cvttps_epi32(v);
         const __m256 fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(iu)), fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(iv));
@@ -5870,7 +5874,7 @@ static void gsf__dense_make_window(const gsf_dense_desc* d, gsf__dense_window* w
     for (int i = 0; i < 256; i++) window->tonal[i] = (float)exp(-(double)i / (double)d->color_sigma);
 }
 
-// Returns 0 where the window shows nothing to match.
+// Returns 0 if the window has too little texture to match.
 static int gsf__dense_make_patch(const gsf__dense_window* window, const gsf__dense_view* view, const uint32_t* texels,
                                  int x, int y, gsf__dense_patch* patch) {
     const int center = (int)(texels[y * view->width + x] & 255u);
@@ -5896,17 +5900,17 @@ static int gsf__dense_make_patch(const gsf__dense_window* window, const gsf__den
 
 // ---- planes
 
-// Within the depth range, and not seen edge-on?
+// Whether the plane lies within the depth range and is not seen edge-on.
 static int gsf__dense_plane_valid(const gsf__dense_view* view, int x, int y, const gsf__dense_plane* plane) {
     if (!(plane->w >= view->w_min && plane->w <= view->w_max)) return 0;
-    const float ex = view->cx - (float)x, ey = view->cy - (float)y; // the normal is (fx gx, fy gy, 1/z at the axis)
+    const float ex = view->cx - (float)x, ey = view->cy - (float)y; // normal: (fx gx, fy gy, 1/z at cx, cy)
     const float nx = view->fx * plane->gx, ny = view->fy * plane->gy, nz = plane->w + plane->gx * ex + plane->gy * ey;
     const float rx = ex / view->fx, ry = ey / view->fy;
     const float squares = (nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + 1.0f);
     return plane->w * plane->w >= GSF__DENSE_MIN_COS * GSF__DENSE_MIN_COS * squares;
 }
 
-// Unit normal in camera axes, pointing away from the camera.
+// Unit normal in camera coordinates, pointing away from the camera.
 static void gsf__dense_normal(const gsf__dense_view* view, int x, int y, const gsf__dense_plane* plane, float n[3]) {
     n[0] = view->fx * plane->gx;
     n[1] = view->fy * plane->gy;
@@ -5915,7 +5919,7 @@ static void gsf__dense_normal(const gsf__dense_view* view, int x, int y, const g
     for (int k = 0; k < 3; k++) n[k] *= inv;
 }
 
-// The plane of inverse depth w at the pixel with a normal of any length; returns 0 where it faces away.
+// Makes the plane with inverse depth w at the pixel and normal n (of any length). Returns 0 if it is not valid.
 static int gsf__dense_plane_of(const gsf__dense_view* view, int x, int y, float w, const float n[3],
                                gsf__dense_plane* plane) {
     const float rx = ((float)x - view->cx) / view->fx, ry = ((float)y - view->cy) / view->fy;
@@ -5928,7 +5932,7 @@ static int gsf__dense_plane_of(const gsf__dense_view* view, int x, int y, float 
     return gsf__dense_plane_valid(view, x, y, plane);
 }
 
-// Four numbers in (-1,1).
+// Four uniform random numbers in (-1,1).
 static void gsf__dense_random(uint64_t seed, uint64_t stream, uint64_t index, float out[4]) {
     const uint64_t bits = gsf_draw_bits(seed, stream, index);
     for (int k = 0; k < 4; k++) out[k] = ((float)(bits >> (16 * k) & 65535u) - 32767.5f) * (1.0f / 32768.0f);
@@ -5946,11 +5950,11 @@ typedef struct gsf__dense_pixel {
     int x, y;
     gsf__dense_patch patch;
     float base[GSF__DENSE_SOURCES][3];  // M (x,y,1)
-    float weights[GSF__DENSE_SOURCES];  // of the sources, sum 1
-    float motion;                       // pixels in the other view per unit of inverse depth, the largest
+    float weights[GSF__DENSE_SOURCES];  // of the sources; they sum to 1
+    float motion;                       // largest image motion in a source view, pixels per unit of inverse depth
 } gsf__dense_pixel;
 
-// Returns 0 where there is nothing to match.
+// Returns 0 if the pixel has too little texture to match.
 static int gsf__dense_begin(gsf__dense_pixel* p, const gsf__dense_job* job, const gsf__dense_view* view, int x, int y) {
     p->job = job;
     p->view = view;
@@ -5982,7 +5986,8 @@ static float gsf__dense_cost(const gsf__dense_pixel* p, int s, const gsf__dense_
     return p->job->cost_fn(&p->job->window, &p->patch, &warp);
 }
 
-// How far the pixel's way to the other view's plane there and back ends from where it began, at most 3 pixels.
+// Forward-backward reprojection error, at most 3 pixels: the pixel is mapped to source s by `plane` and back by the
+// plane found there.
 static float gsf__dense_detour(const gsf__dense_pixel* p, int s, const gsf__dense_plane* plane) {
     const gsf__dense_source* source = &p->view->sources[s];
     const gsf__dense_view* other = &p->job->views[source->view];
@@ -6004,8 +6009,8 @@ static float gsf__dense_detour(const gsf__dense_pixel* p, int s, const gsf__dens
     return squared < 9.0f ? sqrtf(squared) : 3.0f;
 }
 
-// Weights of the sources: how well the best three of the planes that the neighbourhood proposes match there. An occluded
-// view matches none of them.
+// Weights the sources by how well the best three of the candidate planes match in each. No candidate matches in a view
+// where the pixel is occluded.
 static void gsf__dense_weigh(gsf__dense_pixel* p, float costs[][GSF__DENSE_SOURCES], int count) {
     float sum = 0.0f, best = 0.0f;
     for (int s = 0; s < p->view->source_count; s++) {
@@ -6037,7 +6042,8 @@ static float gsf__dense_mean(const gsf__dense_pixel* p, const float* costs) {
     return sum;
 }
 
-// Weighted cost of a plane with the geometric term, per source in `costs` (without it); stops when above `limit`.
+// Weighted cost of a plane including the geometric term. costs: matching cost per source, without that term. Stops
+// early once the sum reaches `limit`.
 static float gsf__dense_judge(const gsf__dense_pixel* p, const gsf__dense_plane* plane, float limit, float* costs) {
     float sum = 0.0f;
     for (int s = 0; s < p->view->source_count; s++) {
@@ -6064,14 +6070,14 @@ static void gsf__dense_measure_motion(gsf__dense_pixel* p, float w) {
     p->motion = sqrtf(best);
 }
 
-// Planes worth a try at the pixel: from each of eight regions the one of the lowest cost (Xu and Tao 2019): four
-// V-shaped ones near it and four straight ones up to 23 pixels away, all of the other colour.
+// Candidate planes for the pixel: the cheapest one of each of eight regions (Xu and Tao 2019), which are four V-shaped
+// ones close to the pixel and four straight ones that reach 23 pixels. All their pixels are of the other colour.
 static int gsf__dense_gather(const gsf__dense_pixel* p, gsf__dense_plane* planes) {
     static const int8_t near_offsets[7][2] = {{0, 1}, {-1, 2}, {1, 2}, {-2, 3}, {2, 3}, {-3, 4}, {3, 4}};
     const gsf__dense_view* view = p->view;
     const gsf__dense_plane* all = p->job->planes + view->first;
     int count = 0;
-    const int regions = p->job->roam ? 8 : 4; // what the coarsest level brought far need not travel again
+    const int regions = p->job->roam ? 8 : 4; // the coarsest level has propagated over long distances
     for (int region = 0; region < regions; region++) {
         const int side = region & 3; // down, up, right, left
         const int steps = region < 4 ? 7 : 11;
@@ -6100,14 +6106,14 @@ static int gsf__dense_gather(const gsf__dense_pixel* p, gsf__dense_plane* planes
     return count;
 }
 
-// Do two planes differ by less than a few hundredths of a pixel in every other view, all over the window?
+// Whether two planes map the whole window to within a few hundredths of a pixel of each other in every source view.
 static int gsf__dense_same(const gsf__dense_pixel* p, const gsf__dense_plane* a, const gsf__dense_plane* b) {
     const float limit = 0.03f, reach = (float)p->job->desc.radius;
     const float dw = a->w - b->w, dx = a->gx - b->gx, dy = a->gy - b->gy;
     return ((dw < 0.0f ? -dw : dw) + reach * (dx < 0.0f ? -dx : dx) + reach * (dy < 0.0f ? -dy : dy)) * p->motion < limit;
 }
 
-// Tries planes near the best one, and at the coarsest level planes from anywhere.
+// Tries random perturbations of the best plane, and at the coarsest level also random depths and normals.
 static void gsf__dense_refine(const gsf__dense_pixel* p, gsf__dense_plane* best, float* best_costs, float* best_sum) {
     const gsf__dense_job* job = p->job;
     const gsf__dense_view* view = p->view;
@@ -6139,7 +6145,7 @@ static void gsf__dense_refine(const gsf__dense_pixel* p, gsf__dense_plane* best,
         for (int s = 0; s < view->source_count; s++)
             if (p->weights[s] > 0.0f) best_costs[s] = costs[s];
     }
-    for (int s = 0; s < view->source_count; s++) // those that were not asked while it changed
+    for (int s = 0; s < view->source_count; s++) // gsf__dense_judge skips these
         if (p->weights[s] == 0.0f) best_costs[s] = gsf__dense_cost(p, s, best);
 }
 
@@ -6185,7 +6191,7 @@ static void gsf__dense_sweep_chunk(void* arg, size_t chunk, int32_t worker) {
         for (int x = (y + job->color) & 1; x < view->width; x += 2) gsf__dense_visit(job, view, x, y);
 }
 
-// Start planes: of the coarser level, or near the sparse points and at random.
+// Initial planes: upsampled from the coarser level, or random ones, most of them near the depth of the sparse points.
 static void gsf__dense_start_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__dense_job* job = (const gsf__dense_job*)arg;
@@ -6216,7 +6222,7 @@ static void gsf__dense_start_chunk(void* arg, size_t chunk, int32_t worker) {
                 gsf__dense_random(job->desc.seed, stream, 8 * (uint64_t)pixel + attempt, r);
                 const float seed = job->seeds ? job->seeds[at] : 0.0f, spread = 0.5f * (view->w_max - view->w_min);
                 float w = view->w_min + spread * (r[3] + 1.0f);
-                if (seed > 0.0f && r[2] > -0.5f) w = seed * (1.0f + 0.05f * r[3]); // three in four
+                if (seed > 0.0f && r[2] > -0.5f) w = seed * (1.0f + 0.05f * r[3]); // in three of four attempts
                 n[0] = r[0] + ((float)x - view->cx) / view->fx;
                 n[1] = r[1] + ((float)y - view->cy) / view->fy;
                 n[2] = 1.0f;
@@ -6255,8 +6261,9 @@ static int gsf__dense_usable(const gsf__dense_job* job, size_t i) {
     return (!job->keep || job->keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]);
 }
 
-// Depth range of a view: that of the sparse points in it with a margin, or what the distances between the views can
-// measure: from a third to sixty times the median one.
+// Depth range of a view: from 0.7 times the 2nd to 1.4 times the 98th percentile of the depths of its sparse points.
+// With fewer than 20 of them, from 1/3 to 60 times the median baseline, beyond which parallax is too small. The
+// caller's limits override both.
 static void gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double* depths, double* low, double* high) {
     const gsf_scene* scene = job->scene;
     size_t n = 0;
@@ -6284,13 +6291,13 @@ static void gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double*
     if (job->desc.depth_min > 0.0) *low = job->desc.depth_min;
     if (job->desc.depth_max > 0.0) *high = job->desc.depth_max;
     if (!(*low > 0.0 && *high > *low && isfinite(*high)))
-        *low = *high = 0.0; // all views at one place, or a range that the caller's excludes
+        *low = *high = 0.0; // all cameras at one position, or the caller's limits leave no range
     view->w_min = *high > 0.0 ? (float)(1.0 / *high) : 0.0f;
     view->w_max = *low > 0.0 ? (float)(1.0 / *low) : 0.0f;
 }
 
-// What a point says for comparing two views: 0 where the rays are closer than min_angle, most around ten degrees, less
-// where they are far apart or the scale differs.
+// How strongly a point speaks for matching two views: 0 if its viewing rays differ by less than min_angle, highest
+// around ten degrees, lower for wider angles and for different image scales.
 static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, const gsf_camera* b, const double point[3],
                               double depth_a, double depth_b) {
     double ca[3], cb[3], dot = 0.0, aa = 0.0, bb = 0.0;
@@ -6309,8 +6316,9 @@ static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, co
     return (scale < 1.0 ? scale : 1.0 / scale) / (1.0 + off * off);
 }
 
-// Fills in view->sources (their view only): the best by the sparse points that both see, or without such by points spread
-// through the depth range.
+// Chooses view->sources (sets only their `view`): the views with the highest scores over the sparse points visible in
+// both, where points not tracked in both count a fifth. With fewer than 20 points, a grid through the view's depth
+// range is scored as well.
 static void gsf__dense_choose_sources(gsf__dense_job* job, size_t r, double low, double high, double* scores) {
     const gsf_scene* scene = job->scene;
     gsf__dense_view* view = job->views + r;
@@ -6351,7 +6359,7 @@ static void gsf__dense_choose_sources(gsf__dense_job* job, size_t r, double low,
     }
 }
 
-// m, t, rotation of camera `from` to camera `to`, pixel centres at integers.
+// m, t and rotation of gsf__dense_source, from camera `from` to camera `to`. rotation may be NULL.
 static void gsf__dense_relate(const gsf_camera* from, const gsf_camera* to, float m[9], float t[3], float rotation[9]) {
     double c2w[16], rel[16];
     gsf_get_camera_c2w(from, c2w);
@@ -6403,7 +6411,7 @@ static void gsf__dense_texels(const gsf__dense_view* view, uint32_t* texels) {
     const int32_t width = view->width, height = view->height;
     for (size_t i = 0; i < (size_t)width * (size_t)height; i++)
         texels[i] = (77u * rgb[3 * i] + 150u * rgb[3 * i + 1] + 29u * rgb[3 * i + 2] + 128u) >> 8;
-    for (int32_t y = 0; y < height; y++) // the words below and to the right still hold plain grey in their low byte
+    for (int32_t y = 0; y < height; y++) // packing in place: low bytes keep each texel's own grey
         for (int32_t x = 0; x < width; x++) {
             const int32_t right = x + 1 < width, below = y + 1 < height ? width : 0;
             uint32_t* t = texels + (size_t)y * (size_t)width + (size_t)x;
@@ -6411,7 +6419,7 @@ static void gsf__dense_texels(const gsf__dense_view* view, uint32_t* texels) {
         }
 }
 
-// The working size of a view at a level.
+// Working size of a view at a level: at most max_size, halved per level.
 static void gsf__dense_size(const gsf_camera* camera, int32_t max_size, int32_t level, int32_t* width, int32_t* height) {
     const int32_t longer = camera->width > camera->height ? camera->width : camera->height;
     const double scale = (longer > max_size ? (double)max_size / longer : 1.0) / (double)(1 << level);
@@ -6431,7 +6439,7 @@ static gsf_result gsf__dense_resize(gsf_context* ctx, const gsf__dense_view* vie
     return result;
 }
 
-// Photo of a view at its working size: u8 RGB, black where it does not count.
+// Loads view->color and view->weight at the working size. Colours are resized premultiplied by their weight.
 static gsf_result gsf__dense_load_color(gsf__dense_job* job, gsf__dense_view* view) {
     gsf_context* ctx = job->ctx;
     const gsf_scene_view* from = &job->scene->views[view->index];
@@ -6454,7 +6462,7 @@ static gsf_result gsf__dense_load_color(gsf__dense_job* job, gsf__dense_view* vi
     return result;
 }
 
-// Inverse depths of the sparse points at their pixels, spread to the nearest pixels (two passes, city block distance).
+// Gives every pixel the inverse depth of the nearest projected sparse point: a two-pass city-block distance transform.
 static void gsf__dense_spread_seeds(gsf__dense_job* job, gsf__dense_view* view, int32_t* distance) {
     const gsf_scene* scene = job->scene;
     const int32_t width = view->width, height = view->height, none = 1 << 28;
@@ -6469,7 +6477,7 @@ static void gsf__dense_spread_seeds(gsf__dense_job* job, gsf__dense_view* view, 
             distance[at] = 0;
             seeds[at] = w;
         } else if (!distance[at] && w > seeds[at] && w <= view->w_max) {
-            seeds[at] = w; // the nearer one hides the other
+            seeds[at] = w; // the nearer point occludes the other
         }
     }
     for (int pass = 0; pass < 2; pass++)
@@ -6485,7 +6493,7 @@ static void gsf__dense_spread_seeds(gsf__dense_job* job, gsf__dense_view* view, 
         }
 }
 
-// Sets the views up for a level. The coarser level's arrays are the caller's by then.
+// Sets up the views and arrays of a level. The caller has already taken over or freed those of the coarser level.
 static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int with_seeds) {
     gsf_context* ctx = job->ctx;
     job->level = level;
@@ -6541,7 +6549,7 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
 }
 
 static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int finest, double* done, double total) {
-    const int32_t geometric = 2; // of the finest level's, after the others
+    const int32_t geometric = 2; // iterations with the geometric term, at the finest level only, after the others
     const int32_t some = finest ? (job->desc.iterations + 1) / 2 : job->desc.iterations;
     const int32_t count = coarsest ? job->desc.iterations + 2 : some;
     float scale = 1.0f;
@@ -6579,7 +6587,7 @@ static gsf_result gsf__dense_match(gsf__dense_job* job, int32_t levels) {
             total += (double)width * height * (job->desc.iterations + 2);
         }
     for (int32_t level = levels - 1; level >= 0 && result == GSF_OK; level--) {
-        gsf__dense_plane* coarse_planes = job->planes; // of the level before, NULL at the first
+        gsf__dense_plane* coarse_planes = job->planes; // of the coarser level, NULL at the coarsest
         memcpy(coarse_views, job->views, job->view_count * sizeof *coarse_views);
         job->planes = NULL;
         gsf__dense_free_level(job);
@@ -6599,7 +6607,8 @@ static gsf_result gsf__dense_match(gsf__dense_job* job, int32_t levels) {
 
 // ---- consistency and fusion
 
-// Does source s confirm the plane at a pixel? *pixel: where in the other view.
+// Whether source s confirms the plane at a pixel: its plane there matches well and agrees in depth, reprojection and
+// normal. *pixel: index of the corresponding pixel in the source view.
 static int gsf__dense_confirmed(const gsf__dense_job* job, const gsf__dense_view* view, int x, int y, int s,
                                 size_t* pixel) {
     const gsf__dense_plane* plane = job->planes + view->first + (size_t)y * (size_t)view->width + (size_t)x;
@@ -6673,7 +6682,7 @@ static void gsf__dense_cover(const gsf__dense_job* job, size_t pixel, int32_t sp
             covered[view->first + (size_t)v * (size_t)view->width + (size_t)u] = 1;
 }
 
-// Marks the pixels around the sparse points, where the depths agree (else something hides the point).
+// Marks the pixels around the sparse points where the depths agree; where they differ, the point is occluded.
 static void gsf__dense_cover_sparse(const gsf__dense_job* job, int32_t spacing, uint8_t* covered) {
     for (size_t i = 0; i < job->scene->point_count; i++)
         for (size_t k = 0; k < job->view_count && gsf__dense_usable(job, i); k++) {
@@ -6687,7 +6696,8 @@ static void gsf__dense_cover_sparse(const gsf__dense_job* job, int32_t spacing, 
         }
 }
 
-// The pixels to make points of, best match first, none closer than `spacing` to another in any view that confirms it.
+// Chooses the pixels that become points, best match first. Each one marks all pixels closer than `spacing`, in its own
+// view and around the corresponding pixels of the views that confirm it, so that none of those is chosen later.
 static size_t gsf__dense_thin(const gsf__dense_job* job, const uint32_t* order, size_t count, int32_t spacing,
                               uint8_t* covered, uint32_t* chosen) {
     size_t n = 0;
@@ -6708,7 +6718,7 @@ static size_t gsf__dense_thin(const gsf__dense_job* job, const uint32_t* order, 
     return n;
 }
 
-// World position, and world normal towards the camera, of a pixel's plane.
+// World position of a pixel's plane, and its world normal, pointing towards the camera.
 static void gsf__dense_locate(const gsf__dense_job* job, size_t pixel, double point[3], double normal[3]) {
     int x, y;
     const gsf__dense_view* view = gsf__dense_view_of(job, pixel, &x, &y);
@@ -6785,7 +6795,7 @@ static gsf_result gsf__dense_make_maps(const gsf__dense_job* job, gsf_dense* out
     return GSF_OK;
 }
 
-// Pixels that count for less than half have no depth: neither to give nor to confirm.
+// Pixels of weight below one half get no depth and confirm none.
 static void gsf__dense_hide(gsf__dense_job* job) {
     for (size_t i = 0; i < job->view_count; i++) {
         const gsf__dense_view* view = job->views + i;
@@ -6848,7 +6858,8 @@ cleanup:
     return result;
 }
 
-// The different views of the list, their depth ranges and sources. *pairs: how many there are.
+// Removes duplicates from the list of views and finds the depth range and the sources of each. *pairs: number of (view,
+// source) pairs.
 static gsf_result gsf__dense_prepare(gsf__dense_job* job, const uint32_t* views, size_t view_count, size_t* pairs) {
     gsf_context* ctx = job->ctx;
     const size_t room = job->scene->point_count > view_count ? job->scene->point_count : view_count;
