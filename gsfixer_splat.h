@@ -6952,23 +6952,24 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
 
 // ---- >>rasterizer state --------------------------------------------------------
 
-/* How a frame goes through:
-       project   every splat -> one 64-byte record (screen ellipse, colour) or radius 0
-       bin       into the lists of the 16x16 tiles that the ellipse meets, in index order; each (splat, tile) pair has a
-                 slot where backward leaves that tile's share of the gradient
-       sort      each tile's list by depth, ties by index (radix sort of the float's bits)
-       forward   per tile, front to back, 8 pixels of a row at a time
-       backward  per tile: forward again, keeping alpha and T of every 8-pixel step; then back to front
-       gather    per splat: sum of its slots in tile order, then through the projection to the parameters
-   Each stage is a loop over a chunk grid that depends on sizes only, and every sum has one fixed order. */
+/* Stages of a frame:
+       project   every splat -> one 64-byte record (screen ellipse, colour), with radius 0 if it is not drawn
+       bin       append each splat, in index order, to the lists of the 16x16 tiles that its ellipse overlaps; each
+                 (splat, tile) pair owns a slot for that tile's share of the splat's gradient
+       sort      sort each tile's list by depth, ties by index (radix sort of the float's bits)
+       forward   per tile: blend front to back, 8 pixels of a row at a time
+       backward  per tile: repeat forward, keeping alpha and T of every 8-pixel step; then go back to front
+       gather    per splat: sum its slots in tile order, then backpropagate through the projection to the parameters
+   Each stage is a parallel loop over chunks whose number depends only on sizes, never on the number of workers, and
+   every sum has a fixed order. */
 
 enum {
     GSF__TILE = 16,
     GSF__TILE_PIXELS = GSF__TILE * GSF__TILE,
-    GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 8 pixels of a row; step s: row s & 15, columns 8*(s >> 4) ...
+    GSF__STEPS = GSF__TILE_PIXELS / 8,   // a step is 8 pixels of a row; step s: row s & 15, from column 8*(s >> 4)
     GSF__SLOT_FLOATS = 12,
-    GSF__PROJECT_CHUNK = 256,
-    GSF__BUCKET = 4096,                  // kept steps per backward bucket
+    GSF__PROJECT_CHUNK = 256,            // splats
+    GSF__BUCKET = 4096,                  // steps that backward keeps at a time
 };
 
 #define GSF__ALPHA_MAX 0.99f
@@ -6976,25 +6977,25 @@ enum {
 #define GSF__T_MIN 1e-4f
 #define GSF__BLUR 0.3f
 #define GSF__LOG2_ALPHA_MIN (-7.99435344f)
-#define GSF__AA_FLOOR 2.5e-5f // squared compensation below which antialiasing no longer shrinks a splat
+#define GSF__AA_FLOOR 2.5e-5f // lower bound of the squared antialiasing compensation
 
-// The ellipse in the coordinates that keep every digit for needles: with dy = y - v and e = (x - u) - kx*dy, the
-// exponent is a sum of two negative squares, log2(alpha) = ee*e*e + yy*dy*dy + log2_opacity. A row's extent is
-// |e| <= sqrt(h0 - h1*dy*dy). In an image 2000 wide a float places a splat to 1e-4 of a pixel, and the flank of a small one
-// is off by as much: u and v have a second float.
+// The ellipse, in sheared coordinates that lose no precision for needle-shaped splats: with dy = y - v and e = (x - u)
+// - kx*dy the exponent is a sum of two negative squares, log2(alpha) = ee*e*e + yy*dy*dy + log2_opacity. The ellipse
+// covers |e| <= sqrt(h0 - h1*dy*dy) of a row. In an image 2000 pixels wide a float resolves positions to only 1e-4 of a
+// pixel, which shows on the flanks of small splats; so u and v have a low-order float each.
 typedef struct gsf__record {
-    float u, v;            // pixel centres are integers here (COLMAP coordinate minus 0.5)
+    float u, v;            // pixel centres are at integers here (COLMAP coordinate minus 0.5)
     float kx, ee, yy, log2_opacity;
     float h0, h1;
     float r, g, b, depth;
-    float reach_x;         // half width of alpha >= 1/255; half height: gsf__reach_y
-    float u_low, v_low;    // to be added to u and v
-    int32_t radius;        // official radius in pixels; 0 = not drawn
+    float reach_x;         // half width of the region with alpha >= 1/255; for the half height see gsf__reach_y
+    float u_low, v_low;    // low-order parts of u and v
+    int32_t radius;        // 3 sigma in pixels, as in the Inria 3DGS code; 0 = not drawn
 } gsf__record;
 
 typedef struct gsf__tile_rect { int32_t x0, y0, x1, y1; } gsf__tile_rect; // tiles, end exclusive
 
-typedef struct gsf__step { // what backward keeps of 8 pixels
+typedef struct gsf__step { // what backward keeps per splat and 8 pixels
     float alpha[8];        // before the 0.99 clamp; 0 where not blended
     float T[8];            // transmittance in front of the splat
 } gsf__step;
@@ -7002,39 +7003,39 @@ typedef struct gsf__step { // what backward keeps of 8 pixels
 typedef struct gsf__step_head { uint32_t entry; uint32_t step; } gsf__step_head;
 
 typedef struct gsf__worker_scratch { // one per worker
-    gsf__step* steps;          // GSF__BUCKET + GSF__STEPS
-    gsf__step_head* heads;
-    float* checkpoints;        // T of the tile at each bucket's start
-    uint32_t* checkpoint_entry;
+    gsf__step* steps;          // (GSF__BUCKET + GSF__STEPS + 1)
+    gsf__step_head* heads;     // of the steps
+    float* checkpoints;        // T of the tile's pixels at the start of each bucket
+    uint32_t* checkpoint_entry; // the list entry that each bucket starts with
     size_t checkpoint_capacity;
 } gsf__worker_scratch;
 
-typedef struct gsf__pair { uint32_t splat, slot; } gsf__pair; // slot: counted from the tile's first
+typedef struct gsf__pair { uint32_t splat, slot; } gsf__pair; // slot: relative to the tile's first
 
 struct gsf_rasterizer {
     size_t splat_capacity;
     gsf__record* records;      // per splat
     int32_t* radii;            // per splat
-    size_t* splat_begin;       // per splat, + 1: into splat_pairs
+    size_t* splat_begin;       // (splats + 1) start of each splat's part of splat_pairs
     size_t pair_count;
 
     size_t tile_capacity;      // of tile_begin
-    size_t* tile_begin;        // per tile, + 1
+    size_t* tile_begin;        // (tiles + 1) start of each tile's list
     size_t count_capacity;
     size_t* tile_counts;       // (chunks, tiles) while binning
     size_t pair_capacity;
-    uint32_t* pair_splat;      // per tile and there in index order: the splat
-    size_t* splat_pairs;       // the places of each splat in pair_splat, in tile order
-    uint64_t* pair_keys;       // the same pairs in depth order: depth bits << 32 | place in the tile's part of pair_splat
-    uint64_t* pair_spare;      // while sorting
-    gsf__pair* pairs;          // what the raster loops read: the lists in depth order
+    uint32_t* pair_splat;      // the splats of each tile, in index order
+    size_t* splat_pairs;       // the indices of each splat in pair_splat, in tile order
+    uint64_t* pair_keys;       // sort keys: depth bits << 32 | index in the tile's part of pair_splat
+    uint64_t* pair_spare;      // scratch of the sort
+    gsf__pair* pairs;          // the lists in depth order, for the raster loops
     size_t slot_capacity;
-    float* slots;              // (pairs, GSF__SLOT_FLOATS) by place in pair_splat: the pair's gradient
-    uint8_t* slot_used;        // (pairs) 1 where backward found a pixel and filled the slot
+    float* slots;              // (pairs, GSF__SLOT_FLOATS) gradient of each pair, indexed like pair_splat
+    uint8_t* slot_used;        // (pairs) 1 if backward blended the splat into some pixel and filled the slot
 
     size_t pixel_capacity;
     float* final_T;            // per pixel, of the last render
-    float* depth_sum;          // per pixel: sum of w z
+    float* depth_sum;          // per pixel, of the last render: sum of weight times depth
     double* tile_background;   // (tiles, 3)
     size_t tile_background_capacity;
 
@@ -7046,8 +7047,8 @@ struct gsf_rasterizer {
     size_t splat_count;
     int has_depth;
 
-    // The trainer's (lazy Adam), else NULL: called before the SH of `splat`, and of those after it up to the next multiple
-    // of 8, are read to draw some of them. Splats of different chunks may be woken at the same time.
+    // Set by the trainer (lazy Adam), else NULL. Called before the SH of `splat` and of the splats after it up to the
+    // next multiple of 8 are read, if any of them is drawn. May be called for different chunks at the same time.
     void (*wake)(void* user, size_t splat);
     void* wake_user;
 };
@@ -7081,7 +7082,7 @@ GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
 
 // ---- >>project -----------------------------------------------------------------
 
-// exp and log with the same bits on every machine; relative error below 1.2e-7 (float rounding of a double result).
+// exp and log2 with the same bits on every machine; relative error below 1.2e-7 (a double result rounded to float).
 static float gsf__exp(float x) {
     if (!(x > -87.0f)) return x != x ? x : 0.0f;
     if (x > 88.0f) return INFINITY;
@@ -7127,21 +7128,21 @@ static float gsf__sigmoid(float x) {
     return x < 0.0f ? e / (1.0f + e) : 1.0f / (1.0f + e);
 }
 
-typedef struct gsf__view { // what is constant over a frame
+typedef struct gsf__view { // constants of a frame
     double rotation[9], t[3]; // world (relative to the splats' origin) to camera
     double focal[2], middle[2]; // fx fy, and cx cy minus 0.5
-    float W[9], fx, fy;     // the same, rounded
-    float limit_x, limit_y; // the Jacobian's x/z and y/z are clamped to +- this
+    float W[9], fx, fy;     // rotation and focal, rounded
+    float limit_x, limit_y; // x/z and y/z in the Jacobian are clamped to +- these
     float near_plane, opacity_scale;
-    float center[3], center_low[3]; // of the camera, relative to the splats' origin: a sum of two
+    float center[3], center_low[3]; // camera centre relative to the splats' origin; high and low part, to be added
     float background[3];
     int32_t width, height, sh_coefficients;
     int antialiased, official_footprint, official_gradient;
 } gsf__view;
 
-// What x leaves over when it is rounded to the float `high`. Out of line because of a bug in gcc 12: the SLP vectoriser
-// (-O2) turns two neighbouring splits into one of two lanes, and value numbering then folds (double2)(float2)x into x, as
-// if it did not round, so that the rest is 0.
+// The remainder of x after rounding to the float `high`. Not inlined because of a bug in gcc 12: the SLP vectoriser
+// (-O2) merges two adjacent splits into one of two lanes, and value numbering then folds (double2)(float2)x into x, as
+// if the conversion did not round, so that the remainder becomes 0.
 static GSF__NOINLINE float gsf__low_part(double x, float high) { return (float)(x - (double)high); }
 
 static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* camera, const gsf_render_desc* desc) {
@@ -7179,7 +7180,8 @@ static gsf__view gsf__make_view(const gsf_splats* splats, const gsf_camera* came
     return view;
 }
 
-// Tiles of the official rasterizer: 16x16 tiles of the square of half side `radius` (float division, truncation).
+// Tiles by the rule of the Inria 3DGS code: those that overlap the square of half side `radius`, with the same float
+// division and truncation.
 static gsf__tile_rect gsf__official_rect(const gsf__record* rec, int32_t tiles_x, int32_t tiles_y) {
     const float radius = (float)rec->radius, tile = (float)GSF__TILE;
     const float lo[2] = {(rec->u - radius) / tile, (rec->v - radius) / tile};
@@ -7195,7 +7197,7 @@ static gsf__tile_rect gsf__official_rect(const gsf__record* rec, int32_t tiles_x
     return rect;
 }
 
-// Half height of alpha >= 1/255: where h0 - h1 dy^2 is zero.
+// Half height of the region with alpha >= 1/255: the dy at which h0 - h1 dy^2 is zero.
 static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->h1); }
 
 #define gsf__projection GSF__V(gsf__projection)
@@ -7213,18 +7215,18 @@ static float gsf__reach_y(const gsf__record* rec) { return sqrtf(rec->h0 / rec->
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_PROJECT
 
-// Everything the projection of a splat computes on its way and backward needs again; a lane per splat.
+// Intermediate results of the projection that backward needs again. One splat per lane.
 typedef struct gsf__projection {
     gsf__vf t[3];                   // mean in camera space
-    gsf__vf u, v, u_low, v_low;     // on the screen, as in gsf__record
+    gsf__vf u, v, u_low, v_low;     // mean on the screen, as in gsf__record
     gsf__vf x, y;                   // t.x / t.z, t.y / t.z after the frustum clamp
     gsf__vm clamped_x, clamped_y;
     gsf__vf q[4], inv_norm;         // unit quaternion
     gsf__vf scale[3];
     gsf__vf T[9];                   // W R S, row-major
     gsf__vf V[6];                   // J T: two rows, so that cov2d = V V^T before the blur
-    gsf__vf cov_a, cov_b, cov_c, det_raw, det; // blurred covariance [[a,b],[b,c]]; det without / with blur
-    gsf__vf logit, opacity, compensation; // opacity: sigmoid * opacity_scale; antialiasing factor
+    gsf__vf cov_a, cov_b, cov_c, det_raw, det; // blurred covariance [[a,b],[b,c]]; determinant without and with blur
+    gsf__vf logit, opacity, compensation; // opacity: sigmoid * opacity_scale; compensation: antialiasing factor
 } gsf__projection;
 
 #if GSF__LANES == 1
@@ -7233,14 +7235,14 @@ GSF__V_INLINE float GSF__V(gsf__log2)(float x) { return gsf__log2(x); }
 GSF__V_INLINE double GSF__V(gsf__low)(double x, float high, int h) { return h ? 0.0 : (double)gsf__low_part(x, high); }
 #else
 
-// What half h of `high` leaves over of x.
+// The remainder of x after rounding to half h of `high`.
 GSF__V_INLINE gsf__vd GSF__V(gsf__low)(gsf__vd x, gsf__vf high, int h) { return x - gsf__vd_half(high, h); }
 
-// e^x for x in [-87, 88], clamped to it; relative error below 2e-7. NaN stays.
+// e^x with x clamped to [-87, 88]; relative error below 2e-7. Propagates NaN.
 GSF__V_INLINE gsf__vf GSF__V(gsf__exp)(gsf__vf x) {
     x = gsf__v_min(gsf__v_set(88.0f), gsf__v_max(gsf__v_set(-87.0f), x));
     const gsf__vf k = gsf__v_round(x * gsf__v_set(1.44269504f));
-    gsf__vf r = gsf__v_nmadd(k, gsf__v_set(0.693359375f), x); // ln 2 in two parts, the first exact
+    gsf__vf r = gsf__v_nmadd(k, gsf__v_set(0.693359375f), x); // ln 2 as a sum; k times the first part is exact
     r = gsf__v_nmadd(k, gsf__v_set(-2.12194440e-4f), r);
     gsf__vf p = gsf__v_set(1.0f / 5040.0f);
     p = gsf__v_madd(p, r, gsf__v_set(1.0f / 720.0f));
@@ -7252,7 +7254,7 @@ GSF__V_INLINE gsf__vf GSF__V(gsf__exp)(gsf__vf x) {
     return p * gsf__vi_as_floats(gsf__vi_shl(gsf__vi_add(gsf__v_to_int(k), gsf__vi_set(127)), 23));
 }
 
-// log2 of a normal x > 0, within 1 ulp of the result or 1e-7.
+// log2 of a normal x > 0, accurate to 1 ulp or 1e-7, whichever is larger.
 GSF__V_INLINE gsf__vf GSF__V(gsf__log2)(gsf__vf x) {
     const gsf__vi bits = gsf__v_bits(x);
     const gsf__vi e = gsf__vi_sar(gsf__vi_sub(bits, gsf__vi_set(0x3f3504f3)), 23); // sqrt(1/2): the mantissa ends up in
@@ -7284,18 +7286,18 @@ GSF__V_INLINE gsf__vm gsf__v_finite(gsf__vf x) { return gsf__v_eq(x - x, gsf__v_
 
 GSF__V_INLINE int gsf__v_any(gsf__vm mask) { return gsf__vm_bits(mask) != 0; }
 
-// Float `c` of rows of `stride` floats.
+// Column c of the lanes' rows; a row has `stride` floats.
 GSF__V_INLINE gsf__vf gsf__v_column(const float* rows, gsf__vi lane, int stride, int c) {
     return gsf__v_gather(rows + c, gsf__vi_mul(lane, gsf__vi_set(stride)));
 }
 
-// Rows of the lanes: 0 1 2 ... Those past the last of `left` splats repeat it.
+// Row indices of the lanes: 0 1 2 ... Lanes past the last of `left` splats repeat it.
 GSF__V_INLINE gsf__vi GSF__V(gsf__splat_lanes)(size_t left) {
     return left < GSF__LANES ? gsf__vi_min(gsf__vi_index(), gsf__vi_set((int32_t)left - 1)) : gsf__vi_index();
 }
 
-// p->t, u, v, u_low and v_low, in double: in float, a camera far from the splats' origin, a long lens or a large image would
-// cost digits.
+// Computes p->t, u, v, u_low and v_low, in double: float would lose precision if the camera is far from the splats'
+// origin, the focal length is long or the image is large.
 GSF__V_INLINE void GSF__V(gsf__place)(const gsf__view* view, const gsf__vf mean[3], gsf__projection* p) {
     gsf__vd t[3][GSF__HALVES], at[2][GSF__HALVES], low[2][GSF__HALVES];
     for (int h = 0; h < GSF__HALVES; h++) {
@@ -7322,8 +7324,8 @@ GSF__V_INLINE void GSF__V(gsf__place)(const gsf__view* view, const gsf__vf mean[
     p->v_low = gsf__vd_floats(low[1]);
 }
 
-// Unit quaternions and the inverse of their norms (0 where that is at most 1e-12), in double: neither tiny nor huge ones
-// lose digits.
+// Unit quaternions and the inverse of their norms (0 if the norm is at most 1e-12), in double so that neither tiny nor
+// huge quaternions lose precision.
 GSF__V_INLINE void GSF__V(gsf__unit)(const gsf__vf raw[4], gsf__vf q[4], gsf__vf* inv_norm) {
     const gsf__vd least = gsf__vd_set(1e-12), one = gsf__vd_set(1.0);
     gsf__vd unit[4][GSF__HALVES], inverse[GSF__HALVES];
@@ -7333,7 +7335,7 @@ GSF__V_INLINE void GSF__V(gsf__unit)(const gsf__vf raw[4], gsf__vf q[4], gsf__vf
             wide[k] = gsf__vd_half(raw[k], h);
             norm2 = gsf__vd_madd(wide[k], wide[k], norm2);
         }
-        const gsf__vd norm = gsf__vd_sqrt(norm2), inv = one / gsf__vd_max(least, norm); // a NaN stays
+        const gsf__vd norm = gsf__vd_sqrt(norm2), inv = one / gsf__vd_max(least, norm); // propagates NaN
         for (int k = 0; k < 4; k++) unit[k][h] = wide[k] * inv;
         inverse[h] = gsf__vd_keep_above(norm, least, inv);
     }
@@ -7341,8 +7343,8 @@ GSF__V_INLINE void GSF__V(gsf__unit)(const gsf__vf raw[4], gsf__vf q[4], gsf__vf
     *inv_norm = gsf__vd_floats(inverse);
 }
 
-// Place and covariance on the screen of the splats from i on. Returns those that are in front of the near plane and finite;
-// when there are none, nothing else is filled in.
+// Mean and covariance on the screen of the splats from i on. Returns the mask of those that are finite and in front of
+// the near plane. If none is in front of it, only t, u, v, u_low and v_low are filled in.
 GSF__V_KERNEL gsf__vm GSF__V(gsf__project)(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__vi lane,
                                            gsf__projection* p) {
     const gsf__vf one = gsf__v_set(1.0f), two = gsf__v_set(2.0f), zero = gsf__v_set(0.0f);
@@ -7356,7 +7358,7 @@ GSF__V_KERNEL gsf__vm GSF__V(gsf__project)(const gsf__view* view, const gsf_spla
     for (int k = 0; k < 4; k++) raw[k] = gsf__v_column(splats->quats + 4 * i, lane, 4, k);
     GSF__V(gsf__unit)(raw, p->q, &p->inv_norm);
 
-    gsf__vf finite = one; // -inf would pass as a flat splat, an infinite logit as an opaque one
+    gsf__vf finite = one; // else -inf would pass as a flat splat, and a logit of +inf as opaque
     for (int k = 0; k < 3; k++) {
         const gsf__vf log_scale = gsf__v_column(splats->log_scales + 3 * i, lane, 3, k);
         finite = finite + (log_scale - log_scale);
@@ -7384,7 +7386,7 @@ GSF__V_KERNEL gsf__vm GSF__V(gsf__project)(const gsf__view* view, const gsf_spla
     const gsf__vf* V = p->V;
     const gsf__vf a = gsf__v_dot(V[0], V[1], V[2], V[0], V[1], V[2]), b = gsf__v_dot(V[0], V[1], V[2], V[3], V[4], V[5]);
     const gsf__vf c = gsf__v_dot(V[3], V[4], V[5], V[3], V[4], V[5]), blur = gsf__v_set(GSF__BLUR);
-    // determinant as the sum of squared 2x2 minors (Cauchy-Binet): no cancellation, however thin the ellipse
+    // determinant as the sum of squared 2x2 minors (Cauchy-Binet): no cancellation even for very thin ellipses
     const gsf__vf m0 = gsf__v_minor(V[1], V[2], V[4], V[5]), m1 = gsf__v_minor(V[2], V[0], V[5], V[3]);
     const gsf__vf m2 = gsf__v_minor(V[0], V[1], V[3], V[4]);
     p->det_raw = gsf__v_dot(m0, m1, m2, m0, m1, m2);
@@ -7401,7 +7403,7 @@ GSF__V_KERNEL gsf__vm GSF__V(gsf__project)(const gsf__view* view, const gsf_spla
     return gsf__vm_and(gsf__vm_and(in_front, gsf__v_finite(finite)), gsf__v_gt(p->det, zero));
 }
 
-// Real spherical harmonics of the 3DGS convention for a unit direction; fills `count` values (1, 4, 9 or 16).
+// Real spherical harmonics in the 3DGS convention at a unit direction; writes `count` values (1, 4, 9 or 16).
 GSF__V_INLINE void GSF__V(gsf__sh_basis)(gsf__vf x, gsf__vf y, gsf__vf z, int32_t count, gsf__vf basis[16]) {
     basis[0] = gsf__v_set(0.28209479177387814f);
     if (count < 4) return;
@@ -7426,7 +7428,7 @@ GSF__V_INLINE void GSF__V(gsf__sh_basis)(gsf__vf x, gsf__vf y, gsf__vf z, int32_
     basis[15] = gsf__v_set(-0.5900435899266435f) * x * (xx - three * yy);
 }
 
-// Unit directions from the camera; returns the distances, 0 (and the direction 0 0 1) where a mean is at the camera.
+// Unit directions from the camera centre to the means. Returns the distances; where one is 0, the direction is 0 0 1.
 GSF__V_INLINE gsf__vf GSF__V(gsf__view_direction)(const gsf__view* view, const gsf_splats* splats, size_t i, gsf__vi lane,
                                                   gsf__vf d[3]) {
     for (int k = 0; k < 3; k++) {
@@ -7441,7 +7443,7 @@ GSF__V_INLINE gsf__vf GSF__V(gsf__view_direction)(const gsf__view* view, const g
     return gsf__v_keep(apart, length);
 }
 
-// The first `count` floats of rows of SH coefficients, as columns.
+// Loads the first `count` floats of each lane's SH row, transposed to columns.
 GSF__V_INLINE void GSF__V(gsf__sh_columns)(const gsf_splats* splats, size_t i, gsf__vi lane, int count, gsf__vf sh[48]) {
     const int stored = 3 * gsf_splat_count_sh(splats->sh_degree);
     const float* rows = splats->sh + (size_t)stored * i;
@@ -7467,7 +7469,7 @@ GSF__V_INLINE void GSF__V(gsf__colors)(const gsf__view* view, const gsf_splats* 
     }
 }
 
-// Where the square about `center` meets one of `tiles` tiles in a row, as gsf__official_rect has it.
+// Whether center +- radius overlaps any of `tiles` tiles along one axis, by the rule of gsf__official_rect.
 GSF__V_INLINE gsf__vm GSF__V(gsf__official_meets)(gsf__vf center, gsf__vf radius, int32_t tiles) {
     const gsf__vf tile = gsf__v_set((float)GSF__TILE), most = gsf__v_set((float)tiles), zero = gsf__v_set(0.0f);
     const gsf__vf lo = (center - radius) / tile, hi = (center + radius + tile - gsf__v_set(1.0f)) / tile;
@@ -7475,8 +7477,8 @@ GSF__V_INLINE gsf__vm GSF__V(gsf__official_meets)(gsf__vf center, gsf__vf radius
                      gsf__v_floor(gsf__v_min(gsf__v_max(hi, zero), most)));
 }
 
-// Records and radii of the splats from i on. A splat whose alpha never reaches 1/255 is not drawn; in the official footprint
-// it still has a radius (and counts as a visit in densification).
+// Records and radii of the splats from i on. A splat whose alpha never reaches 1/255 is not drawn. With
+// GSF_FOOTPRINT_OFFICIAL it still has a radius, as in the Inria 3DGS code, and so counts as visible in densification.
 GSF__V_KERNEL void GSF__V(gsf__records)(gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                         const uint8_t* hidden, size_t i, size_t left) {
     const gsf__vi lane = GSF__V(gsf__splat_lanes)(left);
@@ -7491,10 +7493,10 @@ GSF__V_KERNEL void GSF__V(gsf__records)(gsf_rasterizer* r, const gsf__view* view
     if (gsf__v_any(drawn)) {
         const gsf__vf opacity = p.opacity * p.compensation;
         const gsf__vf log2_opacity = GSF__V(gsf__log2)(gsf__v_max(opacity, gsf__v_set(1e-30f)));
-        // alpha >= 1/255 <=> mahalanobis^2 <= t2; a little more, so that rounding never hides a pixel that passes
+        // alpha >= 1/255 <=> mahalanobis^2 <= t2; slightly enlarged, so that rounding never drops a pixel
         const gsf__vf t2 = gsf__v_madd(gsf__v_set(2.0f * 0.69314718f * 1.0001f),
                                        log2_opacity - gsf__v_set(GSF__LOG2_ALPHA_MIN), gsf__v_set(1e-4f));
-        const gsf__vf conic_a = p.cov_c / p.det, inv_c = one / p.cov_c; // of the inverse covariance [[a,b],[b,c]]
+        const gsf__vf conic_a = p.cov_c / p.det, inv_c = one / p.cov_c; // conic [[a,b],[b,c]]: inverse covariance
         const gsf__vf half_gap = half * (p.cov_a - p.cov_c); // root = (half trace)^2 - det without cancellation
         const gsf__vf root = gsf__v_madd(half_gap, half_gap, p.cov_b * p.cov_b);
         const gsf__vf longest = half * (p.cov_a + p.cov_c) + gsf__v_sqrt(gsf__v_max(root, gsf__v_set(0.1f)));
@@ -7502,7 +7504,7 @@ GSF__V_KERNEL void GSF__V(gsf__records)(gsf_rasterizer* r, const gsf__view* view
         row[1] = p.v;
         row[2] = p.cov_b * inv_c;
         row[3] = gsf__v_set(-0.72134752f) * conic_a; // -log2(e)/2 times a
-        row[4] = gsf__v_set(-0.72134752f) * inv_c;   // (ac - b^2)/a of the inverse is 1/cov_c
+        row[4] = gsf__v_set(-0.72134752f) * inv_c;   // (ac - b^2)/a of the conic is 1/cov_c
         row[5] = log2_opacity;
         row[6] = t2 / conic_a;
         row[7] = inv_c / conic_a;
@@ -7579,7 +7581,7 @@ static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
 
 typedef struct gsf__tile_span { int32_t x0, x1; } gsf__tile_span; // end exclusive
 
-// Tile rows that the splat meets: first and one past the last.
+// Tile rows that the splat overlaps: first and one past the last.
 static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* view, const gsf__record* rec) {
     const float reach_y = gsf__reach_y(rec);
     const float lo = ceilf(rec->v - reach_y - 0.01f), hi = floorf(rec->v + reach_y + 0.01f);
@@ -7596,7 +7598,7 @@ static gsf__tile_span gsf__tile_rows(const gsf_rasterizer* r, const gsf__view* v
     return rows;
 }
 
-enum { GSF__SPANS = 8 }; // tile rows whose columns are found at a time: a multiple of the lanes
+enum { GSF__SPANS = 8 }; // tile rows processed at a time; a multiple of the number of lanes
 
 #define GSF__KERNELS "gsfixer_splat.h"
 #define GSF__KERNELS_BIN
@@ -7606,15 +7608,15 @@ enum { GSF__SPANS = 8 }; // tile rows whose columns are found at a time: a multi
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_BIN
 
-// Tiles of the tile rows from ty on that the ellipse alpha >= 1/255 meets (exact up to the margin of t2), empty if x1 <= x0;
-// a lane per row.
+// The tiles that the ellipse alpha >= 1/255 overlaps in the tile rows from ty on (exact up to the margins); empty if
+// x1 <= x0. One tile row per lane.
 GSF__V_KERNEL void GSF__V(gsf__tile_columns)(const gsf_rasterizer* r, const gsf__record* rec, int32_t ty, int32_t left,
                                              gsf__tile_span spans[GSF__SPANS]) {
     const gsf__vf zero = gsf__v_set(0.0f), tile = gsf__v_set((float)GSF__TILE), u = gsf__v_set(rec->u);
     const gsf__vf kx = gsf__v_set(rec->kx), h0 = gsf__v_set(rec->h0), h1 = gsf__v_set(rec->h1);
     const float half_height = gsf__reach_y(rec);
     const gsf__vf reach_x = gsf__v_set(rec->reach_x), reach_y = gsf__v_set(half_height);
-    // dy of the rightmost point; the leftmost is opposite
+    // dy of the rightmost point; the leftmost is at -dy
     const gsf__vf top = gsf__v_set(rec->kx * half_height * (half_height / rec->reach_x)), bottom = zero - top;
     const gsf__vf margin = gsf__v_set(0.02f), last = gsf__v_set((float)(r->width - 1));
     for (int32_t k = 0; k < GSF__SPANS && k < left; k += GSF__LANES) {
@@ -7703,7 +7705,7 @@ static void gsf__sort_tile(void* arg, size_t index, int32_t worker) {
     const uint32_t* splats = r->pair_splat + first;
     uint64_t* keys = r->pair_keys + first;
     for (size_t i = 0; i < count; i++) {
-        uint32_t depth; // positive, so its bits are in its order
+        uint32_t depth; // positive, so its bits sort like the float
         memcpy(&depth, &r->records[splats[i]].depth, sizeof depth);
         keys[i] = (uint64_t)depth << 32 | i;
     }
@@ -7744,7 +7746,7 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     if (chunks) memset(r->tile_counts, 0, chunks * tiles * sizeof(size_t));
     gsf__parallel_for(ctx, chunks, gsf__bin_chunk, &job);
 
-    size_t total = 0; // counts become the places where each chunk writes
+    size_t total = 0; // prefix sums: each count becomes the index at which its chunk writes
     for (size_t t = 0; t < tiles; t++) {
         r->tile_begin[t] = total;
         for (size_t c = 0; c < chunks; c++) {
@@ -7757,7 +7759,7 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     r->splat_begin[0] = 0;
     for (size_t i = 0; i < r->splat_count; i++) r->splat_begin[i + 1] += r->splat_begin[i];
     r->pair_count = total;
-    if (total > r->pair_capacity || !r->splat_pairs) { // never NULL, so that empty lists are pointers too
+    if (total > r->pair_capacity || !r->splat_pairs) { // allocated even if empty: never NULL
         const size_t capacity = total + total / 4;
         r->pair_capacity = 0;
         GSF__TRY(gsf__grow(ctx, (void**)&r->pair_splat, capacity, sizeof(uint32_t)));
