@@ -5674,16 +5674,16 @@ static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out) {
 }
 
 // ---- >>nn layers ----------------------------------------------------------------
-/* What the networks are built of. A network is
-     a struct whose members are gsf__nn_layer, or const gsf_nn_tensor* where a tensor stands alone;
-     a table of gsf__nn_entry: the name, shape and place of each of them. gsf__nn_visit walks it for whoever wants all
-       tensors of a network: gsf__nn_bind opens them, bench/make_model.c makes them up;
-     a gsf__nn_run: what a pass needs beside the layers, from the context to the scratch memory.
-   A forward pass calls gsf__nn_linear, gsf__nn_add, gsf__nn_norm, gsf__nn_attend and the like, and nothing below them.
-   Networks of equal blocks with the norms before the layers have gsf__nn_block in common: DINOv2, VGGT and BLIP-2's vision
+/* The building blocks that the networks share. A network consists of
+     a struct whose members are gsf__nn_layer, or const gsf_nn_tensor* for tensors without a layer;
+     a table of gsf__nn_entry: the name, shape and struct offset of each member. gsf__nn_visit walks it: gsf__nn_bind
+       to look up all tensors in a file, bench/make_model.c to generate them;
+     a gsf__nn_run: what a forward pass needs besides the layers, from the context to the scratch memory.
+   A forward pass calls gsf__nn_linear, gsf__nn_add, gsf__nn_norm, gsf__nn_attend and the like, but no kernels.
+   Networks made of identical pre-norm blocks share gsf__nn_block: DINOv2, VGGT, BLIP-2's vision encoder
    (>>nn image encoders), OPT (>>nn captioner) and T5 (>>nn t5). */
 
-typedef struct gsf__nn_layer { // linear: (out, in), (out); a norm: (width), (width). What the network lacks is NULL
+typedef struct gsf__nn_layer { // linear: (out, in), (out); norm: (width), (width); NULL: not in this network
     const gsf_nn_tensor *weight, *bias;
 } gsf__nn_layer;
 
@@ -5691,22 +5691,22 @@ typedef struct gsf__nn_layer { // linear: (out, in), (out); a norm: (width), (wi
 
 typedef enum gsf__nn_form {
     GSF__NN_PAIR = 0, // a gsf__nn_layer: NAME.weight of the entry's shape, NAME.bias of its first dimension
-    GSF__NN_BIASED,   // the same, but without a bias where the network lacks the option
-    GSF__NN_WEIGHT,   // NAME.weight alone
+    GSF__NN_BIASED,   // the same, but without a bias where the network lacks the entry's option
+    GSF__NN_WEIGHT,   // NAME.weight only
     GSF__NN_TENSOR,   // NAME itself
 } gsf__nn_form;
 
-typedef struct gsf__nn_entry { // a table ends with a name of NULL
-    const char *name, *shape;  // a letter for each dimension: of gsf__nn_sizes, '1': one, '?': any
-    size_t offset;          // of its gsf__nn_layer or const gsf_nn_tensor*
+typedef struct gsf__nn_entry { // a table ends with an entry whose name is NULL
+    const char *name, *shape;  // one letter per dimension: a letter of gsf__nn_sizes, '1': one, '?': any
+    size_t offset;          // of the gsf__nn_layer or const gsf_nn_tensor* in the network's struct
     gsf__nn_form form;
-    char option;               // a letter whose size is 0 where the network lacks this; 0: none does
+    char option;               // a letter whose size is 0 if the network lacks this entry; 0: always present
 } gsf__nn_entry;
 
 #define GSF__NN_AT(type, member) offsetof(type, member), GSF__NN_PAIR, 0
 #define GSF__NN_END {NULL, NULL, 0, GSF__NN_PAIR, 0}
 
-typedef struct gsf__nn_sizes { // of a network, by letter; ended by letter 0
+typedef struct gsf__nn_sizes { // dimensions of a network, by letter; letter 0 ends the list
     struct { char letter; int64_t size; } of[16];
 } gsf__nn_sizes;
 
@@ -5716,7 +5716,7 @@ static int64_t gsf__nn_size_of(const gsf__nn_sizes* sizes, char letter) {
     return letter == '1' ? 1 : -1;
 }
 
-// Told of one tensor after another; *to belongs to the network.
+// Called once per tensor; *to is a member of the network's struct.
 typedef gsf_result (*gsf__nn_visit_fn)(void* user, const char* name, int32_t rank, const int64_t* shape,
                                        const gsf_nn_tensor** to);
 
@@ -5737,7 +5737,7 @@ static gsf_result gsf__nn_visit_entry(const gsf__nn_sizes* sizes, const gsf__nn_
     return fn(user, name, 1, shape, to + 1);
 }
 
-// All tensors of a table below `prefix`, for the struct at `where`.
+// Visits all tensors of a table, with `prefix` before each name, for the struct at `where`.
 static gsf_result gsf__nn_visit(const gsf__nn_sizes* sizes, const gsf__nn_entry* entries, const char* prefix, void* where,
                                 gsf__nn_visit_fn fn, void* user) {
     for (const gsf__nn_entry* e = entries; e->name; e++)
@@ -5755,7 +5755,7 @@ static gsf_result gsf__nn_bind(gsf__nn_loader* loader, const gsf__nn_sizes* size
     return gsf__nn_visit(sizes, entries, prefix, where, gsf__nn_take_visited, loader);
 }
 
-// `count` structs of `size` bytes at `blocks`, called NAMES0., NAMES1., ...
+// Binds `count` structs of `size` bytes at `blocks`, whose tensors are named NAMES0.*, NAMES1.*, ...
 static gsf_result gsf__nn_bind_each(gsf__nn_loader* loader, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
                                     const char* names, int64_t count, size_t size, void* blocks) {
     char prefix[96];
@@ -5766,8 +5766,8 @@ static gsf_result gsf__nn_bind_each(gsf__nn_loader* loader, const gsf__nn_sizes*
     return GSF_OK;
 }
 
-// A network from FOLDER/config.json and FOLDER/PREFIX*.safetensors: `read` fills in what the config tells, `bind` takes the
-// tensors. A part of it that was opened before an error is the caller's to destroy.
+// Loads a network from FOLDER/config.json and FOLDER/PREFIX*.safetensors: `read` parses the config, `bind` looks up the
+// tensors. On error the caller destroys whatever has been loaded by then.
 static gsf_result gsf__nn_open_network(gsf_context* ctx, const char* folder, const char* prefix,
                                        gsf_result (*read)(const gsf__nn_config* file, void* network),
                                        gsf_result (*bind)(gsf__nn_loader* loader, void* network), void* network,
@@ -5785,49 +5785,50 @@ static gsf_result gsf__nn_open_network(gsf_context* ctx, const char* folder, con
 
 // ---- layers: a pass
 
-typedef struct gsf__nn_block_sizes { // of the blocks at work
-    int64_t width, mlp;              // of a token, of the MLP's hidden layer
+typedef struct gsf__nn_block_sizes { // of the network's blocks
+    int64_t width, mlp;              // of a token; of the MLP's hidden layer
     int32_t heads, head_dim;
-    float eps, head_eps;             // of the norms, of those of q and k
+    float eps, head_eps;             // of the block's norms; of the norms of q and k
     gsf__nn_activation activation;
-    int qkv_bias, head_norm;         // there is a bias of q, k, v; q and k have LayerNorms over each head
-    int rms, gated;                  // RMSNorm in place of LayerNorm; the MLP's hidden layer has a gate
+    int qkv_bias, head_norm;         // q, k and v have biases; q and k have a LayerNorm per head
+    int rms, gated;                  // RMSNorm instead of LayerNorm; gated MLP
 } gsf__nn_block_sizes;
 
-typedef struct gsf__nn_cache { // keys and values of the tokens before
-    int64_t capacity, past;    // tokens; of these in use
+typedef struct gsf__nn_cache { // keys and values of earlier tokens
+    int64_t capacity, past;    // in tokens: allocated; in use
     float *keys, *values;      // (layers, capacity, width)
-    unsigned char* mask;       // (heads, tokens, tokens) for several new tokens: each sees itself and those before
+    unsigned char* mask;       // (heads, tokens, tokens), causal; used when several tokens are added at once
 } gsf__nn_cache;
 
 typedef struct gsf__nn_run {
     gsf_context* ctx;
-    const char *name, *stage;          // of the network, for errors; for progress
-    const gsf_nn_weights* weights;     // where a NaN may come from
-    const gsf__nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
+    const char *name, *stage;          // of the network, for error messages; for progress
+    const gsf_nn_weights* weights;     // searched for the source of a NaN
+    const gsf__nn_quantized* quantized; // one per tensor of the file, empty if not quantized; NULL: no tensor is
     int32_t bf16;                     // see gsf__nn_linear_desc
     const gsf__nn_tap* tap;
-    char label[48];                    // before the names of a block's intermediates; empty: those are not shown
+    char label[48];                    // prefix for the names of a block's intermediates; empty: not shown to the tap
     gsf__nn_workspace workspace;
-    float* vectors;                    // the layer's vectors at work, widened: two of the longest
+    float* vectors;                    // the current layer's vectors as float32; room for the two longest
     size_t vectors_size;
     double done, steps;                // progress, in blocks
-    // of networks of gsf__nn_block
+    // only for networks of gsf__nn_block:
     const gsf__nn_block_sizes* sizes;
     float* normed;                     // (rows, the larger of width and heads * head_dim)
-    float* wide;                       // (rows, 3 heads * head_dim): q | k | v of each row; hidden rows of the MLP
-    int64_t wide_count;                // floats there
-    const float* bias;                 // (heads, tokens, tokens) of the logits, or NULL
+    float* wide;                       // (rows, 3 heads * head_dim): q | k | v of each row; also the MLP's hidden rows
+    int64_t wide_count;                // capacity of `wide` in floats
+    const float* bias;                 // (heads, tokens, tokens), added to the logits, or NULL
     float scale;                       // of the logits; 0: 1 / sqrt(head_dim)
     gsf__nn_cache* cache;              // NULL: none
     const float *cos, *sin;            // (positions, head_dim / 4) for positions 1, 2, ...; NULL: no rotation
-    int64_t image_tokens, special, across; // the rotation's grid: tokens of an image, those without place, of a row
+    // patch grid of RoPE: tokens per image, leading ones without position, patches per row
+    int64_t image_tokens, special, across;
 } gsf__nn_run;
 
-// Memory that is shared out twice: without `memory` it is only counted.
+// Divides one allocation into parts. The layout runs twice: without `memory` it only counts.
 typedef struct gsf__nn_arena {
     float* memory;
-    size_t used; // floats; SIZE_MAX, which no allocator gives: too many to count
+    size_t used; // in floats; SIZE_MAX, which no allocator can provide, on overflow
 } gsf__nn_arena;
 
 static float* gsf__nn_share(gsf__nn_arena* arena, size_t count) {
@@ -5839,7 +5840,8 @@ static float* gsf__nn_share(gsf__nn_arena* arena, size_t count) {
 static size_t gsf__nn_product(size_t a, size_t b) { return b != 0 && a > SIZE_MAX / b ? SIZE_MAX : a * b; }
 static size_t gsf__nn_larger(size_t a, size_t b) { return a > b ? a : b; }
 
-// Shows the tap `count` samples of (rows, columns), numbered from `first`, under the run's label and a name (printf style).
+// Shows the tap `count` samples of (rows, columns), numbered from `first`, named by the run's label and a printf
+// format.
 GSF_PRINTF(7, 8)
 static void gsf__nn_reveal(const gsf__nn_run* run, const float* data, int64_t first, int64_t count, int64_t rows,
                            int64_t columns, const char* format, ...) {
@@ -5854,13 +5856,13 @@ static void gsf__nn_reveal(const gsf__nn_run* run, const float* data, int64_t fi
         run->tap->fn(run->tap->user, name, (int32_t)(first + i), data + i * rows * columns, rows, columns);
 }
 
-// A value that is not finite is named with the tensor below `prefix` that it comes from, else with the stage.
+// Fails on a value that is not finite; the message names the tensor below `prefix` that caused it, or else the stage.
 static gsf_result gsf__nn_check(const gsf__nn_run* run, const char* stage, const char* prefix, const float* x,
                                 int64_t count) {
     return gsf__nn_check_finite(run->ctx, run->weights, run->name, prefix, stage, x, count);
 }
 
-// What follows block `index` of those called `names`: check, progress, cancel.
+// Runs after block `index` of the blocks called `names`: finite check, progress, cancellation.
 static gsf_result gsf__nn_end_block(gsf__nn_run* run, const char* names, int64_t index, const float* x, int64_t count) {
     char prefix[96];
     snprintf(prefix, sizeof prefix, "%s%lld.", names, (long long)index);
@@ -5873,7 +5875,7 @@ static gsf_result gsf__nn_end_block(gsf__nn_run* run, const char* names, int64_t
 
 typedef struct gsf__nn_vectors { const float *weight, *bias; } gsf__nn_vectors;
 
-// A small tensor as floats, which last until another layer's vectors are widened; NULL: NULL.
+// Converts a small tensor to float32; valid until the vectors of another layer are converted. NULL gives NULL.
 static const float* gsf__nn_widen(gsf__nn_run* run, const gsf_nn_tensor* tensor, size_t at) {
     if (!tensor) return NULL;
     GSF_ASSERT(at + (size_t)tensor->count <= run->vectors_size);
@@ -5888,7 +5890,7 @@ static gsf__nn_vectors gsf__nn_widen_layer(gsf__nn_run* run, const gsf__nn_layer
     return v;
 }
 
-// The one place where a network's linear layer is computed, in whatever precision.
+// Every linear layer of a network is computed here, in int8, bfloat16 or float32.
 static gsf_result gsf__nn_apply(gsf__nn_run* run, const gsf__nn_layer* layer, gsf__nn_linear_desc* d) {
     const gsf__nn_quantized* q = run->quantized ? run->quantized + (layer->weight - run->weights->tensors) : NULL;
     d->weight = layer->weight;
@@ -5898,7 +5900,7 @@ static gsf_result gsf__nn_apply(gsf__nn_run* run, const gsf__nn_layer* layer, gs
                         : gsf__nn_run_linear(run->ctx, &run->workspace, d);
 }
 
-// y (rows of ldy, 0: dense) = activation(x w^T + b)
+// y = activation(x w^T + b); rows of y are ldy floats apart (0: dense)
 static gsf_result gsf__nn_linear(gsf__nn_run* run, const gsf__nn_layer* layer, gsf__nn_activation activation,
                                  const float* x, int64_t rows, float* y, int64_t ldy) {
     gsf__nn_linear_desc d;
@@ -5911,7 +5913,7 @@ static gsf_result gsf__nn_linear(gsf__nn_run* run, const gsf__nn_layer* layer, g
     return gsf__nn_apply(run, layer, &d);
 }
 
-// y += gate * (x w^T + b), or without a gate.
+// y += gate * (x w^T + b); gate NULL: 1.
 static gsf_result gsf__nn_add(gsf__nn_run* run, const gsf__nn_layer* layer, const float* gate, const float* x, int64_t rows,
                               float* y) {
     gsf__nn_linear_desc d;
@@ -5924,13 +5926,14 @@ static gsf_result gsf__nn_add(gsf__nn_run* run, const gsf__nn_layer* layer, cons
     return gsf__nn_apply(run, layer, &d);
 }
 
-// LayerNorm of (rows, the layer's width); y may be x.
+// LayerNorm over (rows, the layer's width); y may equal x.
 static void gsf__nn_norm(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, const float* x, int64_t rows, float* y) {
     const gsf__nn_vectors v = gsf__nn_widen_layer(run, layer);
     gsf__nn_layer_norm(run->ctx, x, rows, layer->weight->count, v.weight, v.bias, eps, y);
 }
 
-// LayerNorm of each head of q or k where the network has one, then the rotation: see gsf__nn_head_norm_rope.
+// LayerNorm of each head of q or k, then RoPE; does nothing if the network has no such norm. See
+// gsf__nn_head_norm_rope.
 static void gsf__nn_norm_heads(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, int32_t heads, int32_t head_dim,
                                const float* cosine, const float* sine, int64_t rope_first, float* x, int64_t rows,
                                int64_t ldx) {
@@ -5939,7 +5942,7 @@ static void gsf__nn_norm_heads(gsf__nn_run* run, const gsf__nn_layer* layer, flo
     gsf__nn_head_norm_rope(run->ctx, x, rows, ldx, heads, head_dim, v.weight, v.bias, eps, cosine, sine, rope_first);
 }
 
-// Attention within each of `samples` samples, which follow each other in q, k, v and out.
+// Attention within each of `samples` samples, which are stored one after another in q, k, v and out.
 static gsf_result gsf__nn_attend(gsf__nn_run* run, const gsf__nn_attention_desc* desc, int64_t samples) {
     gsf__nn_attention_desc d = *desc;
     const int64_t width = (int64_t)d.heads * d.head_dim;
@@ -5960,15 +5963,15 @@ typedef struct gsf__nn_patch_job { // images (channels, height, width) and rows 
     const float* from;
     float* to;
     int64_t channels, height, width, patch;
-    int back;                      // rows to images
-    const float *mean, *deviation; // of each channel, taken out; NULL: neither
+    int back;                      // from rows to images
+    const float *mean, *deviation; // of each channel, for normalization; NULL: none
 } gsf__nn_patch_job;
 
-static void gsf__nn_patch_row(void* arg, size_t index, int32_t worker) { // the patches of one row of them
+static void gsf__nn_patch_row(void* arg, size_t index, int32_t worker) { // one row of patches
     const gsf__nn_patch_job* job = (const gsf__nn_patch_job*)arg;
     const int64_t p = job->patch, across = job->width / p, down = job->height / p, row = (int64_t)index;
     const int64_t plane = job->height * job->width, image = row / down * job->channels * plane;
-    int64_t at = row * across * job->channels * p * p; // in the rows
+    int64_t at = row * across * job->channels * p * p; // offset in the rows
     (void)worker;
     for (int64_t column = 0; column < across; column++)
         for (int64_t c = 0; c < job->channels; c++) {
@@ -5987,17 +5990,17 @@ static void gsf__nn_patch(gsf_context* ctx, const gsf__nn_patch_job* job, int64_
     gsf__parallel_for(ctx, (size_t)(images * (job->height / job->patch)), gsf__nn_patch_row, (void*)(uintptr_t)job);
 }
 
-// ---- layers: rotation by row and column
+// ---- layers: 2D RoPE
 
 #define GSF__KERNELS "gsfixer_nn.h"
 #define GSF__KERNELS_TURN
-#include "gsfixer.h" // compiles what follows, once per instruction set
+#include "gsfixer.h" // compiles the code below once per instruction set
 #undef GSF__KERNELS_TURN
 
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_TURN
 
-// Pairs (x[i], x[i + count]) turned by the angles of cos and sin (count).
+// Rotates the pairs (x[i], x[i + count]) by the angles given by cos and sin (count).
 GSF__V_KERNEL void GSF__V(gsf__nn_turn)(float* x, int64_t count, const float* cos, const float* sin) {
     for (int64_t i = 0; i < count; i += GSF__LANES) {
         const size_t n = (size_t)(count - i);
@@ -6021,17 +6024,17 @@ static gsf__nn_turn_fn gsf__nn_turn_of(gsf_cpu_level level) {
     return gsf__nn_turn_scalar;
 }
 
-enum { GSF__NN_TURN_ROWS = 32 }; // in a chunk
+enum { GSF__NN_TURN_ROWS = 32 }; // per chunk
 
 typedef struct gsf__nn_turn_job {
     const gsf__nn_run* run;
     gsf__nn_turn_fn turn;
-    float* x;       // q | k in rows of `stride`
+    float* x;       // rows of `stride` floats that start with q | k
     int64_t rows, stride;
 } gsf__nn_turn_job;
 
-// The first half of every head turns with the row of the patch, counted from 1, the second half with its column. Tokens
-// without a place stand at 0, where nothing turns.
+// Rotates the first half of every head by the patch's row, counted from 1, and the second half by its column. Tokens
+// without a position count as position 0, whose rotation is the identity.
 static void gsf__nn_turn_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__nn_turn_job* job = (const gsf__nn_turn_job*)arg;
     const gsf__nn_run* run = job->run;
@@ -6053,7 +6056,7 @@ static void gsf__nn_turn_chunk(void* arg, size_t chunk, int32_t worker) {
 // ---- layers: blocks
 
 typedef struct gsf__nn_block { // x += scale1 * out(attention(norm1(x))); x += scale2 * down(hidden(norm2(x)))
-    gsf__nn_layer norm1, norm2, qkv, q, k, v; // qkv (3 heads * head_dim, width), or three of their own
+    gsf__nn_layer norm1, norm2, qkv, q, k, v; // qkv (3 heads * head_dim, width), or separate q, k, v
     gsf__nn_layer q_norm, k_norm;             // (head_dim)
     gsf__nn_layer out, gate, up, down;        // hidden: activation(up(x)), or activation(gate(x)) * up(x)
     const gsf_nn_tensor *scale1, *scale2;     // LayerScale or NULL
@@ -6065,7 +6068,7 @@ static void gsf__nn_norm_block(gsf__nn_run* run, const gsf__nn_layer* norm, cons
     else gsf__nn_norm(run, norm, s->eps, x, rows, run->normed);
 }
 
-// q, k and v of run->normed side by side in run->wide, q and k normed and turned.
+// Stores q, k and v of run->normed side by side in run->wide, then normalizes and rotates q and k.
 static gsf_result gsf__nn_project_block(gsf__nn_run* run, const gsf__nn_block* b, int64_t rows) {
     const gsf__nn_block_sizes* s = run->sizes;
     const int64_t inner = (int64_t)s->heads * s->head_dim, ld = 3 * inner;
@@ -6085,7 +6088,7 @@ static gsf_result gsf__nn_project_block(gsf__nn_run* run, const gsf__nn_block* b
     return GSF_OK;
 }
 
-// The new tokens' keys and values go behind those of layer `index` in the cache, which are what they look at.
+// Appends the new tokens' keys and values to the cache of layer `index` and makes the attention read the cache.
 static void gsf__nn_look_back(gsf__nn_run* run, int64_t index, int64_t rows, gsf__nn_attention_desc* a) {
     const gsf__nn_cache* cache = run->cache;
     const int64_t inner = (int64_t)a->heads * a->head_dim, first = index * cache->capacity * inner;
@@ -6114,7 +6117,7 @@ static void gsf__nn_multiply_chunk(void* arg, size_t chunk, int32_t worker) { //
     for (int64_t i = begin; i < end; i++) job->a[i] *= job->b[i];
 }
 
-// x += scale * down(hidden(run->normed)), in runs of rows whose hidden layer fits run->wide.
+// x += scale * down(hidden(run->normed)), in groups of rows whose hidden layer fits in run->wide.
 static gsf_result gsf__nn_feed_forward(gsf__nn_run* run, const gsf__nn_block* b, const float* scale, float* x,
                                        int64_t rows) {
     const gsf__nn_block_sizes* s = run->sizes;
@@ -6133,7 +6136,7 @@ static gsf_result gsf__nn_feed_forward(gsf__nn_run* run, const gsf__nn_block* b,
     return GSF_OK;
 }
 
-// Block `index` of a network on x (samples, tokens, width), in place; tokens of a sample see each other.
+// Block `index` of a network on x (samples, tokens, width), in place; tokens attend within their sample.
 static gsf_result gsf__nn_block_forward(gsf__nn_run* run, const gsf__nn_block* b, int64_t index, float* x, int64_t samples,
                                         int64_t tokens) {
     const gsf__nn_block_sizes* s = run->sizes;
@@ -6162,8 +6165,8 @@ static gsf_result gsf__nn_block_forward(gsf__nn_run* run, const gsf__nn_block* b
     return gsf__nn_feed_forward(run, b, gsf__nn_widen(run, b->scale2, 0), x, rows);
 }
 
-// Blocks of a vision transformer under the names that files have for them: sizes d width, m MLP, t 3 width, h head_dim,
-// b 0 without biases of q, k, v, n 0 without norms of q and k.
+// Table entries of a block, whose names differ between files. Letters: d width, m MLP, i heads * head_dim, t 3 * i, h
+// head_dim, b 0 if q, k, v have no biases, n 0 if q and k have no norms.
 #define GSF__NN_BLOCK(member) GSF__NN_AT(gsf__nn_block, member)
 #define GSF__NN_BLOCK_AS(member, form, option) offsetof(gsf__nn_block, member), form, option
 
@@ -6174,7 +6177,7 @@ static gsf__nn_sizes gsf__nn_sizes_of_block(const gsf__nn_block_sizes* s) {
     return sizes;
 }
 
-// `count` blocks called NAMES0., NAMES1., ...; *out is to be freed, also on error.
+// Allocates and binds `count` blocks called NAMES0., NAMES1., ...; the caller frees *out, also on error.
 static gsf_result gsf__nn_bind_blocks(gsf__nn_loader* loader, const gsf__nn_block_sizes* s, const gsf__nn_entry* entries,
                                       const char* names, int64_t count, gsf__nn_block** out) {
     const gsf__nn_sizes sizes = gsf__nn_sizes_of_block(s);
@@ -6183,7 +6186,7 @@ static gsf_result gsf__nn_bind_blocks(gsf__nn_loader* loader, const gsf__nn_bloc
     return gsf__nn_bind_each(loader, &sizes, entries, names, count, sizeof **out, *out);
 }
 
-// Floats that run->wide needs for `rows` rows, of which those of the MLP may come in runs of `most`.
+// Floats that run->wide needs for `rows` rows if the MLP processes at most `most` rows at a time.
 static size_t gsf__nn_wide(const gsf__nn_block_sizes* s, int64_t rows, int64_t most) {
     const size_t inner = (size_t)s->heads * (size_t)s->head_dim;
     const size_t hidden = gsf__nn_product((size_t)gsf__least(rows, most), (size_t)(s->mlp * (1 + s->gated)));
@@ -6198,14 +6201,14 @@ static double gsf__nn_block_flops(const gsf__nn_block_sizes* s, double samples, 
 // ---- >>nn image encoders --------------------------------------------------------
 //
 // DINOv2 with registers (Oquab et al. 2023; Darcet et al. 2023) and the aggregator of VGGT (Wang et al. 2025): a DINOv2
-// embeds each image, then blocks that look within an image take turns with blocks that look at all images together. All
-// are vision transformers of gsf__nn_block. The facts are those of transformers 4.51.3
-// (modeling_dinov2_with_registers.py) and of VGGT's aggregator.py, block.py, attention.py and rope.py.
+// embeds each image, then blocks that attend within each image alternate with blocks that attend across all images.
+// Both are vision transformers built of gsf__nn_block. The details follow transformers 4.51.3
+// (modeling_dinov2_with_registers.py) and VGGT's aggregator.py, block.py, attention.py and rope.py.
 
-typedef struct gsf__vit { // from pixels to tokens: a DINOv2
+typedef struct gsf__vit { // pixels to tokens: a DINOv2
     gsf__nn_block_sizes sizes;
     int64_t channels, patch, registers, grid, layers;
-    const char *block_names, *prefix; // of its tensors; of those before and after the blocks
+    const char *block_names, *prefix; // tensor names of the blocks; of the embeddings
     const gsf_nn_tensor *class_token, *register_tokens, *positions;
     gsf__nn_layer patches, norm;
     gsf__nn_block* blocks;
@@ -6213,7 +6216,7 @@ typedef struct gsf__vit { // from pixels to tokens: a DINOv2
 
 typedef struct gsf__vggt {
     gsf__vit embed;
-    gsf__nn_block_sizes sizes; // of the blocks
+    gsf__nn_block_sizes sizes; // of frame and global blocks
     int64_t registers, layers;
     double rope_base;          // 0: no rotation
     gsf__nn_block *frame, *global; // (layers)
@@ -6222,7 +6225,7 @@ typedef struct gsf__vggt {
 
 // ---- image encoders: tables of tensors
 
-// Sizes beside those of a block: c channels, p patch, r registers, s positions.
+// Letters in addition to those of a block: c channels, p patch, r registers, s positions.
 #define GSF__VIT_COMMON                                 \
     {"norm1", "d", GSF__NN_BLOCK(norm1)},               \
     {"norm2", "d", GSF__NN_BLOCK(norm2)},               \
@@ -6288,7 +6291,7 @@ static gsf__nn_sizes gsf__vggt_sizes(const gsf__vggt* net) {
     return sizes;
 }
 
-// A vision transformer: what is below `prefix`, and its blocks.
+// Binds the tensors below `prefix` and the blocks of a vision transformer.
 static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* entries, const gsf__nn_entry* block_entries,
                                 const char* prefix, gsf__vit* vit) {
     const gsf__nn_sizes sizes = gsf__vit_sizes(vit);
@@ -6298,8 +6301,9 @@ static gsf_result gsf__vit_bind(gsf__nn_loader* loader, const gsf__nn_entry* ent
 
 // ---- image encoders: from pixels to tokens
 
-// Positions of the class token and of (down, across) patches, interpolated from the square grid: out (1 + patches, width).
-// The weights are PyTorch's for bicubic, antialias, align_corners=False, which are Pillow's.
+// Position embeddings of the class token and of (down, across) patches, interpolated from the square grid of the file:
+// out (1 + patches, width). PyTorch's resampling (bicubic, antialias, align_corners=False) has the same weights as
+// Pillow's.
 static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int64_t down, int64_t across, float* out) {
     const int64_t d = vit->sizes.width, grid = vit->grid;
     if (down == grid && across == grid) {
@@ -6319,7 +6323,7 @@ static gsf_result gsf__vit_positions(gsf_context* ctx, const gsf__vit* vit, int6
 
 static const float gsf__imagenet_mean[3] = {0.485f, 0.456f, 0.406f}, gsf__imagenet_deviation[3] = {0.229f, 0.224f, 0.225f};
 
-// Tokens of image `image` before the blocks: class, registers, patches.
+// Tokens of one image before the blocks: class, registers, patches.
 static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in, int64_t image,
                                  int normalize, const float* positions, float* x) {
     const int64_t d = vit->sizes.width, p = vit->patch, down = in->height / p, across = in->width / p;
@@ -6337,7 +6341,7 @@ static gsf_result gsf__vit_embed(gsf__nn_run* run, const gsf__vit* vit, const gs
     return gsf__nn_check(run, vit->prefix, vit->prefix, x, tokens * d);
 }
 
-// Images first ... through embedding and blocks: x (count, tokens, width), before the last norm.
+// Embeds `count` images from `first` on and runs the blocks: x (count, tokens, width), before the final norm.
 static gsf_result gsf__vit_forward(gsf__nn_run* run, const gsf__vit* vit, const gsf_nn_encoder_desc* in, int64_t first,
                                    int64_t count, int normalize, const float* positions, float* x) {
     const int64_t d = vit->sizes.width;
@@ -6355,16 +6359,16 @@ static gsf_result gsf__vit_forward(gsf__nn_run* run, const gsf__vit* vit, const 
 
 // ---- image encoders: memory
 
-enum { GSF__VIT_GROUP_ROWS = 4096, GSF__VIT_MLP_ROWS = 2048 }; // tokens of images that go together; hidden rows held
+enum { GSF__VIT_GROUP_ROWS = 4096, GSF__VIT_MLP_ROWS = 2048 }; // tokens of a group of images; hidden rows of the MLP
 
 typedef struct gsf__vit_plan {
-    int64_t patches, tokens, group;        // of an image; of one in the DINOv2; images that go through it together
-    float *positions, *x, *stream, *turns; // stream, turns: the aggregator's tokens and its rotation
-    size_t turn_count;                     // cosines, and as many sines
-    size_t floats, square;                 // all of them; held only while positions are interpolated
+    int64_t patches, tokens, group;        // per image; tokens per image in the DINOv2; images per group
+    float *positions, *x, *stream, *turns; // stream, turns: the aggregator's tokens and its RoPE tables
+    size_t turn_count;                     // number of cosines, and of sines
+    size_t floats, square;                 // of the whole layout; temporary, while positions are interpolated
 } gsf__vit_plan;
 
-// Shares out `memory`, or counts what a run will take. net: the aggregator around the DINOv2, or NULL.
+// Divides `memory` for a run, or counts what a run needs if it is NULL. net: the aggregator around the DINOv2, or NULL.
 static gsf__vit_plan gsf__vit_lay_out(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
                                       const gsf_nn_encoder_desc* in, float* memory) {
     const size_t d = (size_t)vit->sizes.width, longer = (size_t)(in->height > in->width ? in->height : in->width);
@@ -6395,7 +6399,7 @@ static gsf__vit_plan gsf__vit_lay_out(gsf__nn_run* run, const gsf__vit* vit, con
     return p;
 }
 
-// Memory for a run, shared out; *memory is to be freed. The positions are in it already.
+// Allocates and divides the memory of a run and interpolates the positions; the caller frees *memory, also on error.
 static gsf_result gsf__vit_open_run(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
                                     const gsf_nn_encoder_desc* in, gsf__vit_plan* plan, float** memory) {
     *memory = (float*)gsf_alloc(run->ctx, gsf__vit_lay_out(run, vit, net, in, NULL).floats, sizeof(float));
@@ -6422,7 +6426,7 @@ static double gsf__vit_flops(const gsf__vit* vit, const gsf_nn_encoder_desc* in)
 
 static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64_t channels, int64_t patch,
                                        const gsf_nn_encoder_desc* in, const float* out) {
-    enum { MOST = 1 << 15 }; // pixels along a side
+    enum { MOST = 1 << 15 }; // pixels per side
     if (!in->pixels || !out || in->images < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: images are missing", name);
     if (in->height < patch || in->width < patch || in->height % patch || in->width % patch || in->height > MOST ||
@@ -6439,7 +6443,7 @@ static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64
 
 // ---- image encoders: DINOv2
 
-// Keys that are missing have the defaults of transformers' Dinov2WithRegistersConfig.
+// Missing keys take the defaults of transformers' Dinov2WithRegistersConfig.
 static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, void* network) {
     gsf__vit* vit = (gsf__vit*)network;
     int64_t image;
@@ -6469,7 +6473,7 @@ static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, void* netw
 }
 
 static gsf_result gsf__dinov2_bind(gsf__nn_loader* loader, void* network) {
-    gsf__nn_ignore(loader, "embeddings.mask_token"); // for training
+    gsf__nn_ignore(loader, "embeddings.mask_token"); // used in training only
     return gsf__vit_bind(loader, gsf__dinov2_entries, gsf__dinov2_block_entries, "", (gsf__vit*)network);
 }
 
@@ -6531,7 +6535,7 @@ static gsf_result gsf__dinov2_run(gsf__nn_run* run, const gsf__vit* vit, const g
 static const char gsf__vggt_frame_names[] = "aggregator.frame_blocks.";
 static const char gsf__vggt_global_names[] = "aggregator.global_blocks.";
 
-// One more than the highest number that follows `names` in a tensor's name.
+// One more than the highest block number that follows `names` in a tensor's name.
 static int64_t gsf__vggt_count_blocks(const gsf_nn_weights* weights, const char* names) {
     const size_t size = strlen(names);
     int64_t count = 0;
@@ -6545,7 +6549,7 @@ static int64_t gsf__vggt_count_blocks(const gsf_nn_weights* weights, const char*
     return count;
 }
 
-// Sizes from the shapes of some tensors; config.json may say otherwise, then all tensors are checked.
+// Sizes from the shapes of a few tensors. config.json may override them; binding then checks every tensor against them.
 static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) {
     const gsf_nn_weights* w = loader->weights;
     const int64_t any[4] = {-1, -1, -1, -1};
@@ -6583,7 +6587,7 @@ static gsf_result gsf__vggt_read_shapes(gsf__nn_loader* loader, gsf__vggt* net) 
     return GSF_OK;
 }
 
-// What config.json tells; where it is silent, the sizes of the tensors stand.
+// Keys of config.json override the sizes read from the tensors; missing keys leave them unchanged.
 static gsf_result gsf__vggt_read_config(const gsf__nn_config* file, gsf__vggt* net) {
     gsf__vit* vit = &net->embed;
     gsf__nn_block_sizes* s = &net->sizes;
@@ -6654,9 +6658,9 @@ static gsf_result gsf__vggt_open(gsf_context* ctx, const char* path, gsf_nn_vggt
     gsf__nn_loader loader;
     GSF__TRY(gsf_nn_load_weights(ctx, path, "model", &out->weights));
     GSF__TRY(gsf__nn_begin_loading(ctx, &out->weights, &loader));
-    for (size_t i = 0; i < out->weights.tensor_count; i++) // heads for cameras, depths, points and tracks
+    for (size_t i = 0; i < out->weights.tensor_count; i++) // heads for cameras, depths, points and tracks are not used
         if (strncmp(out->weights.tensors[i].name, "aggregator.", 11) != 0) loader.taken[i] = 1;
-    gsf__nn_ignore(&loader, "aggregator.patch_embed.mask_token"); // for training
+    gsf__nn_ignore(&loader, "aggregator.patch_embed.mask_token"); // used in training only
     gsf_result result = gsf__vggt_read_shapes(&loader, net);
     net->rope_base = 100.0;
     if (!result && !gsf__nn_ends_in(path, ".safetensors")) {
@@ -6700,8 +6704,8 @@ GSF_API gsf_result gsf_nn_load_vggt(gsf_context* ctx, const char* path, gsf_nn_v
     return result;
 }
 
-// Bytes of memory (beside input, output, mapped weights and some 70 MB of the kernels' scratch) at the peak, and floating-
-// point operations, of such a call; either may be NULL. Reads the input's sizes only.
+// Peak memory in bytes (in addition to input, output, mapped weights and about 70 MB of kernel scratch) and
+// floating-point operations of an encoder call; either may be NULL. Reads only the sizes of the input.
 static void gsf__nn_query_vggt(const gsf_nn_vggt* vggt, const gsf_nn_encoder_desc* input, double* bytes,
                                double* flops) {
     const gsf__vggt* net = (const gsf__vggt*)vggt->nets;
@@ -6714,7 +6718,7 @@ static void gsf__nn_query_vggt(const gsf_nn_vggt* vggt, const gsf_nn_encoder_des
                                     gsf__nn_block_flops(&net->sizes, 1.0, images * tokens));
 }
 
-// Angles position * base^(-i / count) of positions 1, 2, ...: cos, sin (positions, count).
+// RoPE tables of positions 1, 2, ...: angle position * base^(-i / count); cosine, sine (positions, count).
 static void gsf__vggt_make_rotation(double base, int64_t positions, int64_t count, float* cosine, float* sine) {
     for (int64_t p = 0; p < positions; p++)
         for (int64_t i = 0; i < count; i++) {
@@ -6724,7 +6728,7 @@ static void gsf__vggt_make_rotation(double base, int64_t positions, int64_t coun
         }
 }
 
-// The stream (images, tokens, width): camera token, registers and the embedded patches of each image.
+// Fills the stream (images, tokens, width): camera token, registers and the embedded patches of each image.
 static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const gsf_nn_encoder_desc* in,
                                   const gsf__vit_plan* plan) {
     const gsf__vit* vit = &net->embed;
@@ -6745,7 +6749,7 @@ static gsf_result gsf__vggt_embed(gsf__nn_run* run, const gsf__vggt* net, const 
     return gsf__nn_check(run, "aggregator.", "aggregator.", plan->stream, in->images * tokens * d);
 }
 
-// One half of the output: rows of the stream to every other `width` floats.
+// Stores the tokens in one half of each output row: rows of `d` floats, 2 d apart (frame half first, then global).
 static void gsf__vggt_store(const gsf__vit_plan* plan, const float* stream, int64_t images, int64_t special, int64_t skip,
                             int64_t d, float* out) {
     const int64_t tokens = special + plan->patches;
@@ -6784,7 +6788,7 @@ static gsf_result gsf__vggt_run(gsf__nn_run* run, const gsf__vggt* net, const gs
     return GSF_OK;
 }
 
-// Both encoders; net NULL: the DINOv2 alone.
+// Runs either encoder; net NULL: the DINOv2 alone.
 static gsf_result gsf__vit_encode(gsf_context* ctx, const char* name, const gsf_nn_weights* weights, const gsf__vit* vit,
                                   const gsf__vggt* net, const gsf_nn_encoder_desc* in, float* out) {
     gsf__nn_run run;
@@ -6823,13 +6827,13 @@ GSF_API gsf_result gsf_nn_encode_vggt(gsf_context* ctx, const gsf_nn_vggt* vggt,
 
 enum { GSF__REFERENCE_SIDE = 518, GSF__REFERENCE_PATCH = 14 };
 
-// One channel of Pillow's Image.alpha_composite over opaque white (AlphaComposite.c: 7 bits below the point).
+// One channel of Pillow's Image.alpha_composite over opaque white (AlphaComposite.c, with 7 fractional bits).
 static uint8_t gsf__over_white(uint32_t value, uint32_t alpha) {
     const uint32_t weighted = (value * alpha + 255u * (255u - alpha)) * 128u + (0x80u << 7);
     return (uint8_t)(((weighted >> 8) + weighted) >> 8 >> 7);
 }
 
-// The photo as u8 with 3 channels, at its size.
+// Converts the photo to u8 with 3 channels, at its size.
 static gsf_result gsf__reference_rgb(gsf_context* ctx, const gsf_image* photo, gsf_image* out) {
     gsf_image bytes;
     memset(&bytes, 0, sizeof bytes);
@@ -6845,10 +6849,10 @@ static gsf_result gsf__reference_rgb(gsf_context* ctx, const gsf_image* photo, g
     return result;
 }
 
-// The official preprocessing of a reference: transparency over white, 518 pixels wide with PIL's bicubic filter, the
-// height rounded to a multiple of 14 (half to even), and cut around its middle where it is above 518. Photos with 1, 3 or
-// 4 channels; float ones are rounded to 8 bits first. out: u8, 3 channels; destroy it.
-// (GSFixer, vggt/utils/load_fn.py load_and_preprocess_images, mode "crop")
+// Preprocesses a reference as the GSFixer release does (vggt/utils/load_fn.py load_and_preprocess_images, mode "crop"):
+// alpha composited over white, resized to 518 pixels wide with PIL's bicubic filter, the height rounded to a multiple
+// of 14 (half to even) and center-cropped if above 518. Photos have 1, 3 or 4 channels; float ones are rounded to 8
+// bits first. out: u8, 3 channels; the caller destroys it.
 static gsf_result gsf__nn_prepare_reference(gsf_context* ctx, const gsf_image* photo, gsf_image* out) {
     gsf_image rgb, whole;
     memset(&rgb, 0, sizeof rgb);
@@ -6877,7 +6881,7 @@ static gsf_result gsf__nn_prepare_reference(gsf_context* ctx, const gsf_image* p
     return result;
 }
 
-// The photos prepared, as (count, 3, height, width) in [0,1]; *pixels is to be freed.
+// Preprocesses the photos to (count, 3, height, width) in [0,1]; the caller frees *pixels, also on error.
 static gsf_result gsf__load_references(gsf_context* ctx, const gsf_image* photos, int32_t count, float** pixels,
                                        gsf_nn_encoder_desc* in) {
     size_t floats = 0, plane = 0;
@@ -6910,7 +6914,8 @@ static gsf_result gsf__load_references(gsf_context* ctx, const gsf_image* photos
     return GSF_OK;
 }
 
-// Room for (images, tokens, channels) in the features, which earlier calls must have left alike.
+// Allocates (images, tokens, channels) values in the features; features of an earlier call must have the same images
+// and tokens.
 static gsf_result gsf__room_for_features(gsf_context* ctx, gsf_nn_features* f, const gsf_nn_encoder_desc* in,
                                          int64_t patch, int64_t channels, float** values, int64_t* of) {
     size_t count;
@@ -6967,20 +6972,21 @@ GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features
 
 // ---- >>nn bpe -------------------------------------------------------------------
 
-/* Byte-level byte-pair encoding (Sennrich et al. 2016; Radford et al. 2019) as transformers 4.51.3 runs it in
+/* Byte-level byte-pair encoding (Sennrich et al. 2016; Radford et al. 2019) as transformers 4.51.3 does it in
    models/gpt2/tokenization_gpt2.py and tokenization_utils.py:
-       text | added tokens are cut out | words, by a pattern | bytes | neighbours merged, lowest rank first | ids
-   The files spell a byte as a character: printable Latin-1 as itself, the other 68 bytes as U+0100 and on, in order.
+       text | cut out added tokens | split into words by a pattern | bytes | merge neighbours, lowest rank first | ids
+   The files spell each byte as a character: printable Latin-1 as itself, the other 68 bytes as U+0100 and up, in order.
        vocab.json    {"token": id, ...}
-       merges.txt    a comment line, then lines "left right", the lowest rank first
-   A word's merges are done rank by rank, all places of a rank from left to right, with a heap of places, so that a word of
-   a megabyte takes n log n steps. Merges lie sorted by left token, then by right one. */
+       merges.txt    a comment line, then lines "left right", lowest rank first
+   The merges of a word are applied rank by rank, and within a rank from left to right. Candidates are kept in a heap,
+   so that a word of a megabyte takes O(n log n). The merge table is sorted by left token, then by right token. */
 
-enum { GSF__BPE_OTHER, GSF__BPE_LETTER, GSF__BPE_NUMBER, GSF__BPE_SPACE }; // kinds of characters in the pattern
+enum { GSF__BPE_OTHER, GSF__BPE_LETTER, GSF__BPE_NUMBER, GSF__BPE_SPACE }; // character classes of the pattern
 
-// Kinds of all characters as runs from U+0000 on, 4 * length + kind; behind the last all are GSF__BPE_OTHER. A tokenizer
-// unpacks these 3.3 KB to 2 bits for each character. Made with the `regex` package, which the official tokenizer asks
-// (2026.11.15, Unicode 18; for characters that unicodedata knows, its categories L* and N* and White_Space):
+// Classes of all characters as runs from U+0000 on, each 4 * length + class; characters after the last run are
+// GSF__BPE_OTHER. Loading a tokenizer unpacks these 3.3 KB to 2 bits per character. Generated with the `regex` package,
+// which transformers' GPT2Tokenizer uses (2026.11.15, Unicode 18; for characters that unicodedata knows these are its
+// categories L* and N* and White_Space):
 //     import regex
 //     kind = [next((k for k, p in ((1, r"\p{L}"), (2, r"\p{N}"), (3, r"\s")) if regex.match(p, chr(c))), 0)
 //             for c in range(0x110000)]
@@ -7035,15 +7041,15 @@ static const uint16_t gsf__bpe_kinds[] = {
     42,4120,65533,65533,39817,128,17533,4,23097,8,29893,60,2489,9864,2169,6024,19757,20,33961,65532,65532,28192,45313
 };
 
-enum { GSF__BPE_CHARACTERS = 0x40000 }; // those behind are all GSF__BPE_OTHER
+enum { GSF__BPE_CHARACTERS = 0x40000 }; // all characters above are GSF__BPE_OTHER
 
 enum { // flags of tokens
-    GSF__BPE_ADDED = 1,   // cut out of texts, and spelt as it is
-    GSF__BPE_SPECIAL = 2, // may be left out when decoding
-    GSF__BPE_LSTRIP = 4,  // takes the white space before, behind it along
+    GSF__BPE_ADDED = 1,   // cut out of texts before splitting, and spelled literally
+    GSF__BPE_SPECIAL = 2, // omitted when decoding without special tokens
+    GSF__BPE_LSTRIP = 4,  // also consumes the white space before / behind it
     GSF__BPE_RSTRIP = 8,
-    GSF__BPE_APART = 16,  // stands between spaces in decoded text
-    GSF__BPE_OBJECT = 32  // was given as an object
+    GSF__BPE_APART = 16,  // surrounded by spaces in decoded text
+    GSF__BPE_OBJECT = 32  // given as an object in the JSON files
 };
 
 enum { GSF__BPE_ADDED_MAX = 4096 };
@@ -7060,14 +7066,14 @@ typedef struct gsf__bpe_merge {
 } gsf__bpe_merge;
 
 typedef struct gsf__bpe_tables { // behind gsf_nn_bpe.tables
-    gsf__nn_config config, special_map, added_tokens; // hold the texts of added tokens
-    char* strings;           // those of the vocabulary
+    gsf__nn_config config, special_map, added_tokens; // own the texts of added tokens
+    char* strings;           // texts of the vocabulary
     gsf__bpe_token* tokens;  // (vocabulary) sorted by text
     gsf__bpe_token* added;   // (added_count) sorted by text
-    gsf__bpe_token* by_id;   // (by_id_count) all of them
-    gsf__bpe_merge* merges;  // (first[vocabulary]) by left, then right
-    int32_t* first;          // merges of the left token t: first[t] ... first[t + 1] - 1
-    unsigned char* kinds;    // 2 bits for each character
+    gsf__bpe_token* by_id;   // (by_id_count) all tokens
+    gsf__bpe_merge* merges;  // (first[vocabulary]) sorted by left, then right
+    int32_t* first;          // merges whose left token is t: first[t] ... first[t + 1] - 1
+    unsigned char* kinds;    // 2 bits per character
     size_t added_capacity;
     int32_t vocabulary, added_count, by_id_count;
     int32_t bytes[256];      // tokens of single bytes, -1: none
@@ -7076,20 +7082,20 @@ typedef struct gsf__bpe_tables { // behind gsf_nn_bpe.tables
 
 // ---- bytes and characters
 
-static uint32_t gsf__bpe_character(unsigned byte) { // that spells the byte
+static uint32_t gsf__bpe_character(unsigned byte) { // the character that spells the byte
     if (byte <= 32) return 256 + byte;
     if (byte >= 127 && byte <= 160) return 289 + byte - 127;
     return byte == 173 ? 323 : byte;
 }
 
-static int gsf__bpe_byte(uint32_t character) { // -1: spells none
+static int gsf__bpe_byte(uint32_t character) { // -1: the character spells no byte
     if (character >= 256 && character <= 288) return (int)character - 256;
     if (character >= 289 && character <= 322) return (int)character - 289 + 127;
     if (character == 323) return 173;
     return character > 255 || character != gsf__bpe_character(character) ? -1 : (int)character;
 }
 
-static size_t gsf__bpe_store_character(uint32_t character, char* out) { // below U+0800
+static size_t gsf__bpe_store_character(uint32_t character, char* out) { // of a character below U+0800
     if (character < 0x80) {
         out[0] = (char)character;
         return 1;
@@ -7099,7 +7105,7 @@ static size_t gsf__bpe_store_character(uint32_t character, char* out) { // below
     return 2;
 }
 
-static uint32_t gsf__bpe_load_character(const char* text, size_t size) { // a well-formed character of `size` bytes
+static uint32_t gsf__bpe_load_character(const char* text, size_t size) { // of a well-formed character of `size` bytes
     static const unsigned char first[] = {0, 0x7f, 0x1f, 0x0f, 0x07};
     uint32_t character = (unsigned char)text[0] & first[size];
     for (size_t i = 1; i < size; i++) character = character << 6 | ((unsigned char)text[i] & 0x3f);
@@ -7112,12 +7118,12 @@ static int gsf__bpe_kind(const gsf__bpe_tables* t, const char* text, size_t left
     return character < GSF__BPE_CHARACTERS ? t->kinds[character >> 2] >> 2 * (character & 3) & 3 : GSF__BPE_OTHER;
 }
 
-// White space to Python's str.strip: that of the pattern and four control characters.
+// What Python's str.strip removes: the pattern's white space and four control characters.
 static int gsf__bpe_strips(const gsf__bpe_tables* t, const char* text, size_t left, size_t* size) {
     return gsf__bpe_kind(t, text, left, size) == GSF__BPE_SPACE || (text[0] >= 0x1c && text[0] <= 0x1f);
 }
 
-// [*begin, *end) of well-formed UTF-8 without the white space at its left and right ends.
+// Shrinks [*begin, *end) of well-formed UTF-8 by the white space at its left and / or right end.
 static void gsf__bpe_strip(const gsf__bpe_tables* t, const char* text, int left, int right, size_t* begin, size_t* end) {
     size_t size;
     while (left && *begin < *end && gsf__bpe_strips(t, text + *begin, *end - *begin, &size)) *begin += size;
@@ -7135,7 +7141,7 @@ static gsf_result gsf__bpe_unpack_kinds(gsf_context* ctx, gsf__bpe_tables* t) {
     if (!t->kinds) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < GSF__COUNT(gsf__bpe_kinds); i++) {
         const uint32_t kind = gsf__bpe_kinds[i] & 3u, end = character + gsf__bpe_kinds[i] / 4;
-        while (character < end) { // four at a time where they share a byte
+        while (character < end) { // four at a time when they share a byte
             const int four = character % 4 == 0 && end - character >= 4;
             t->kinds[character >> 2] |= (unsigned char)(four ? 0x55 * kind : kind << 2 * (character & 3));
             character += four ? 4 : 1;
@@ -7164,7 +7170,8 @@ static int gsf__bpe_compare_texts(const void* a, const void* b) {
     return gsf__bpe_compare(x->text, x->size, y->text, y->size);
 }
 
-static int gsf__bpe_compare_ids(const void* a, const void* b) { // an added token before one of the vocabulary
+// an added token precedes a vocabulary token of the same id
+static int gsf__bpe_compare_ids(const void* a, const void* b) {
     const gsf__bpe_token *x = (const gsf__bpe_token*)a, *y = (const gsf__bpe_token*)b;
     if (x->id != y->id) return x->id < y->id ? -1 : 1;
     if ((x->flags & GSF__BPE_ADDED) != (y->flags & GSF__BPE_ADDED)) return x->flags & GSF__BPE_ADDED ? -1 : 1;
@@ -7178,7 +7185,7 @@ static int gsf__bpe_compare_merges(const void* a, const void* b) {
     return x->rank < y->rank ? -1 : x->rank > y->rank;
 }
 
-// Index of a vocabulary token, -1 where there is none.
+// Index of a vocabulary token, or -1.
 static int32_t gsf__bpe_find(const gsf__bpe_tables* t, const char* text, size_t size) {
     int32_t low = 0, high = t->vocabulary;
     while (low < high) {
@@ -7191,13 +7198,14 @@ static int32_t gsf__bpe_find(const gsf__bpe_tables* t, const char* text, size_t 
     return -1;
 }
 
-static int32_t gsf__bpe_find_added(const gsf__bpe_tables* t, const char* text, size_t size) { // while they are unsorted
+// linear search, as they are not sorted yet
+static int32_t gsf__bpe_find_added(const gsf__bpe_tables* t, const char* text, size_t size) {
     for (int32_t i = 0; i < t->added_count; i++)
         if (t->added[i].size == size && memcmp(t->added[i].text, text, size) == 0) return i;
     return -1;
 }
 
-// First token of a sorted list whose id is not below `id`.
+// First entry of by_id whose id is at least `id`.
 static int32_t gsf__bpe_find_id(const gsf__bpe_tables* t, int32_t id) {
     int32_t low = 0, high = t->by_id_count;
     while (low < high) {
@@ -7261,7 +7269,7 @@ static gsf_result gsf__bpe_need_token(gsf__bpe_loader* l, int32_t line, const ch
 
 static int gsf__bpe_is_blank(char c) { return c == ' ' || c == '\t' || c == '\v' || c == '\f'; }
 
-// One line, numbered from 1. A blank one is nothing.
+// Parses one line; lines are numbered from 1. A blank line sets *found to 0.
 static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size_t size, int32_t number,
                                       gsf__bpe_merge* out, int* found) {
     const char* parts[2] = {NULL, NULL};
@@ -7293,8 +7301,8 @@ static gsf_result gsf__bpe_read_merge(gsf__bpe_loader* l, const char* line, size
     return gsf__bpe_need_token(l, number, l->scratch.data, l->scratch.size, &out->result);
 }
 
-// Lines end in \n, \r\n or \r. As in the official code the first one is a comment whatever it holds, what stands behind
-// the last line's end does not count, and of two equal merges the later one holds.
+// Lines end in \n, \r\n or \r. As in transformers' GPT2Tokenizer the first line is always skipped as a comment, text
+// after the last line end is ignored, and of two equal merges the later one wins.
 static gsf_result gsf__bpe_parse_merges(gsf__bpe_loader* l, const char* text, size_t size) {
     gsf__bpe_tables* t = l->t;
     size_t lines = 0, count = 0, kept = 0;
@@ -7338,7 +7346,7 @@ static gsf_result gsf__bpe_read_merges(gsf__bpe_loader* l) {
 
 // ---- loading: added and special tokens
 
-// A token as text, or as an object with its text in "content" and flags. Its id stays open.
+// A token is a string, or an object with the string in "content" plus flags. The caller sets the id.
 static gsf_result gsf__bpe_read_token(const gsf__nn_config* file, const gsf_json_value* value, gsf__bpe_token* out) {
     const gsf_json* json = &file->json;
     static const struct { const char* key; int flag; } keys[] = {
@@ -7376,7 +7384,8 @@ static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) 
     return GSF_OK;
 }
 
-// "added_tokens_decoder" of tokenizer_config.json: {"id": token, ...}; else added_tokens.json: {"token": id, ...}.
+// Reads "added_tokens_decoder" of tokenizer_config.json, {"id": token, ...}, or else added_tokens.json, {"token": id,
+// ...}.
 static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
     gsf__bpe_tables* t = l->t;
     const gsf__nn_config* file = l->decoder ? &t->config : &t->added_tokens;
@@ -7411,8 +7420,9 @@ static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
     return GSF_OK;
 }
 
-// Marks a token as special; one that is neither added nor in the vocabulary yet gets the id *next. `more`: it is one of
-// additional_special_tokens. What an object says of white space holds; for the other ones the decoder has the last word.
+// Marks a token as special; a token that is neither added nor in the vocabulary yet is added with the id *next. `more`:
+// it is from additional_special_tokens. The strip flags of an object replace those of the added token, except that
+// added_tokens_decoder takes precedence over bos_token and the like.
 static gsf_result gsf__bpe_add_special(gsf__bpe_loader* l, const gsf__bpe_token* token, int more, int32_t* next,
                                        int32_t* id) {
     gsf__bpe_tables* t = l->t;
@@ -7448,8 +7458,8 @@ static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf__nn_co
     return GSF_OK;
 }
 
-// As the official loader: tokenizer_config.json alone where it lists the added tokens, else special_tokens_map.json goes
-// before it.
+// As transformers loads it: only tokenizer_config.json if it lists the added tokens, otherwise special_tokens_map.json
+// takes precedence over it.
 static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
     static const char* const keys[] = {"bos_token", "eos_token", "unk_token", "sep_token", "pad_token", "cls_token",
                                        "mask_token"};
@@ -7469,7 +7479,7 @@ static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
         *ids[i] = -1;
         if (value) {
             GSF__TRY(gsf__bpe_read_token(file, value, &token));
-        } else if (i < 3 && !given) { // GPT2Tokenizer's own
+        } else if (i < 3 && !given) { // the default of GPT2Tokenizer
             memset(&token, 0, sizeof token);
             token.text = "<|endoftext|>";
             token.size = strlen(token.text);
@@ -7562,7 +7572,7 @@ GSF_API gsf_result gsf_nn_load_bpe(gsf_context* ctx, const char* folder, gsf_nn_
 
 // ---- encoding
 
-typedef struct gsf__nn_ids { // what a text becomes
+typedef struct gsf__nn_ids { // the result of encoding a text
     int32_t* ids;
     size_t count, capacity;
 } gsf__nn_ids;
@@ -7578,14 +7588,14 @@ typedef struct gsf__bpe_run {
     const gsf__bpe_tables* t;
     int32_t unk;
     gsf__nn_ids out;
-    void* scratch;      // of a word; see gsf__bpe_place
+    void* scratch;      // per word, see gsf__bpe_place
     size_t word_capacity;
-    int32_t *symbols, *before, *after, *found, *batch; // per byte of a word
+    int32_t *symbols, *before, *after, *found, *batch; // one per byte of a word
     uint64_t* heap;     // rank << 32 | place
     size_t heap_size;
 } gsf__bpe_run;
 
-static void gsf__bpe_sift(uint64_t* heap, size_t size, size_t at) { // down to its place in a heap with the least on top
+static void gsf__bpe_sift(uint64_t* heap, size_t size, size_t at) { // restores a min-heap downwards from `at`
     const uint64_t value = heap[at];
     for (size_t child; (child = 2 * at + 1) < size; at = child) {
         if (child + 1 < size && heap[child + 1] < heap[child]) child++;
@@ -7601,7 +7611,7 @@ static void gsf__bpe_push(gsf__bpe_run* run, uint64_t value) {
     run->heap[at] = value;
 }
 
-// Looks up how the symbol at `place` merges with the one after it; 1 when it does.
+// Looks up the merge of the symbol at `place` with the next one; returns 1 if there is one.
 static int gsf__bpe_look(gsf__bpe_run* run, int32_t place) {
     const gsf__bpe_tables* t = run->t;
     const int32_t left = run->symbols[place], next = run->after[place];
@@ -7632,7 +7642,8 @@ static void gsf__bpe_merge_at(gsf__bpe_run* run, int32_t place) {
     if (before >= 0 && gsf__bpe_look(run, before)) gsf__bpe_push(run, gsf__bpe_key(run, before));
 }
 
-// Per byte of a word: 5 numbers of 32 bits and two places in the heap, as a merge takes one entry and adds two at most.
+// Allocates scratch, per byte of a word: 5 32-bit integers and two heap entries, as a merge removes one entry and adds
+// at most two.
 static gsf_result gsf__bpe_place(gsf__bpe_run* run, size_t size) {
     if (size <= run->word_capacity) return GSF_OK;
     size = size < 64 ? 64 : size;
@@ -7665,12 +7676,12 @@ static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size
     while (run->heap_size) {
         const int32_t rank = (int32_t)(run->heap[0] >> 32);
         int32_t places = 0;
-        while (run->heap_size && (int32_t)(run->heap[0] >> 32) == rank) { // they come from left to right
+        while (run->heap_size && (int32_t)(run->heap[0] >> 32) == rank) { // popped from left to right
             run->batch[places++] = (int32_t)(run->heap[0] & 0x7fffffffu);
             run->heap[0] = run->heap[--run->heap_size];
             if (run->heap_size) gsf__bpe_sift(run->heap, run->heap_size, 0);
         }
-        for (int32_t i = 0; i < places; i++) { // unless another merge has changed the pair meanwhile
+        for (int32_t i = 0; i < places; i++) { // skip pairs changed by an earlier merge of this batch
             const int32_t found = run->found[run->batch[i]];
             if (found >= 0 && run->t->merges[found].rank == rank) gsf__bpe_merge_at(run, run->batch[i]);
         }
@@ -7685,7 +7696,7 @@ static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size
     return GSF_OK;
 }
 
-// Bytes of the first word:  's|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+
+// Size in bytes of the first match of  's|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+
 static size_t gsf__bpe_next_word(const gsf__bpe_tables* t, const char* text, size_t size) {
     static const char* const endings[] = {"s", "t", "re", "ve", "m", "ll", "d"};
     size_t step, last = 0;
@@ -7700,11 +7711,11 @@ static size_t gsf__bpe_next_word(const gsf__bpe_tables* t, const char* text, siz
         last = at;
         at += step;
     }
-    // Of white space before a word the last one is left, for it may belong to the word.
+    // The last of several spaces before a word is left for the next match, which may include it.
     return kind == GSF__BPE_SPACE && at < size && last > 0 ? last : at;
 }
 
-static gsf_result gsf__bpe_piece(gsf__bpe_run* run, const char* text, size_t size) { // without added tokens
+static gsf_result gsf__bpe_piece(gsf__bpe_run* run, const char* text, size_t size) { // text without added tokens
     while (size) {
         const size_t word = gsf__bpe_next_word(run->t, text, size);
         GSF__TRY(gsf__bpe_word(run, text, word));
@@ -7714,15 +7725,15 @@ static gsf_result gsf__bpe_piece(gsf__bpe_run* run, const char* text, size_t siz
     return GSF_OK;
 }
 
-// The longest added token that `text` begins with, or NULL. They are sorted: those that begin with the bytes seen so far
-// stand side by side, the shortest first.
+// The longest added token that is a prefix of `text`, or NULL. As they are sorted, those that match the bytes so far
+// are contiguous, the shortest first.
 static const gsf__bpe_token* gsf__bpe_match(const gsf__bpe_tables* t, const char* text, size_t left) {
     const gsf__bpe_token* best = NULL;
     int32_t low = 0, high = t->added_count;
     for (size_t d = 0; low < high; d++) {
         if (t->added[low].size == d) best = &t->added[low++];
         if (d == left) break;
-        for (int side = 0; side < 2; side++) { // to those with text[d] next
+        for (int side = 0; side < 2; side++) { // narrow to those with text[d] next: lower, then upper bound
             int32_t a = low, b = high;
             while (a < b) {
                 const int32_t middle = a + (b - a) / 2;
@@ -7740,7 +7751,7 @@ static const gsf__bpe_token* gsf__bpe_match(const gsf__bpe_tables* t, const char
 static gsf_result gsf__bpe_text(gsf__bpe_run* run, const char* text, size_t size) {
     const gsf__bpe_tables* t = run->t;
     size_t start = 0;
-    int strip = 0; // the token before takes white space along
+    int strip = 0; // the previous token also consumes the white space after it
     for (size_t at = 0; at <= size; at++) {
         const gsf__bpe_token* token = at < size && !t->split_special ? gsf__bpe_match(t, text + at, size - at) : NULL;
         if (!token && at < size) continue;
@@ -7794,7 +7805,7 @@ GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
 
 // ---- decoding
 
-// Appends bytes as UTF-8. What is none becomes U+FFFD, one for each longest beginning of a character, as in Python.
+// Appends bytes as UTF-8, with U+FFFD for each maximal invalid part, as Python's errors="replace" does.
 static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_buffer* out, const char* text, size_t size) {
     const unsigned char* p = (const unsigned char*)text;
     for (size_t i = 0; i < size;) {
@@ -7805,14 +7816,15 @@ static void gsf__bpe_append_replaced(gsf_context* ctx, gsf_buffer* out, const ch
         if (i == size) break;
         const unsigned c = p[i++];
         const unsigned low = c == 0xe0 ? 0xa0 : c == 0xf0 ? 0x90 : 0x80, high = c == 0xed ? 0x9f : c == 0xf4 ? 0x8f : 0xbf;
-        const size_t more = c >= 0xf0 && c <= 0xf4 ? 2 : c >= 0xe0 && c <= 0xef; // bytes before the last that may be there
+        // continuation bytes a truncated character may have
+        const size_t more = c >= 0xf0 && c <= 0xf4 ? 2 : c >= 0xe0 && c <= 0xef;
         for (size_t k = 0; k < more && i < size; k++, i++)
             if (k == 0 ? p[i] < low || p[i] > high : (p[i] & 0xc0) != 0x80) break;
         gsf_append_bytes(ctx, out, "\xef\xbf\xbd", 3);
     }
 }
 
-// The bytes that a token of the vocabulary spells.
+// Appends the bytes that a vocabulary token spells.
 static void gsf__bpe_append_bytes(gsf_context* ctx, gsf_buffer* out, const gsf__bpe_token* token) {
     for (size_t i = 0, step; i < token->size; i += step) {
         step = gsf__utf8_size(token->text + i, token->size - i);
@@ -7822,7 +7834,7 @@ static void gsf__bpe_append_bytes(gsf_context* ctx, gsf_buffer* out, const gsf__
     }
 }
 
-// Replaces all `from` by the shorter `to` behind `start`.
+// Replaces every `from` after `start` by `to`, which must not be longer.
 static void gsf__bpe_replace(gsf_buffer* text, size_t start, const char* from, const char* to) {
     const size_t from_size = strlen(from), to_size = strlen(to);
     size_t end = start;
@@ -7879,25 +7891,26 @@ GSF_API gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
 
 // ---- >>nn captioner -------------------------------------------------------------
 //
-// BLIP-2 (Li et al. 2023) with OPT (Zhang et al. 2022): a vision transformer, learned queries that look at its tokens
-// (Q-Former), a projection of what they found to words of the language model, and that model, which goes on from there.
-// As transformers 4.51.3 has it: models/blip_2/modeling_blip_2.py, models/opt/modeling_opt.py, image_processing_blip.py.
+// BLIP-2 (Li et al. 2023) with OPT (Zhang et al. 2022): a vision transformer, learned queries that attend to its tokens
+// (Q-Former), a projection of the queries to token embeddings of the language model, and the language model, which
+// continues them. Follows transformers 4.51.3: models/blip_2/modeling_blip_2.py, models/opt/modeling_opt.py,
+// image_processing_blip.py.
 
 typedef struct gsf__qformer_attention {
     gsf__nn_layer q, k, v, out, norm;
 } gsf__qformer_attention;
 
 typedef struct gsf__qformer_layer {
-    gsf__qformer_attention self, cross; // cross.q.weight NULL: this layer has none
+    gsf__qformer_attention self, cross; // cross.q.weight NULL: no cross-attention
     gsf__nn_layer up, down, norm;
 } gsf__qformer_layer;
 
 typedef struct gsf__qformer {
-    int64_t queries, width, mlp, layers, cross_every; // every so many layers look at the image
+    int64_t queries, width, mlp, layers, cross_every; // every cross_every-th layer has cross-attention to the image
     int32_t heads;
     float eps;
     gsf__nn_activation activation;
-    int text_input;                                   // the file holds tensors for texts, which nobody needs here
+    int text_input;                                   // the file also holds tensors for text input, which are ignored
     const gsf_nn_tensor* tokens;
     gsf__nn_layer norm;
     gsf__qformer_layer* all;
@@ -7923,12 +7936,13 @@ typedef struct gsf__blip { // behind gsf_nn_captioner.nets
     gsf__opt text;
 } gsf__blip;
 
-enum { GSF__OPT_OFFSET = 2, GSF__CAPTION_TOKENS = 20 }; // rows of OPT's position table before position 0; new tokens
-static const float gsf__opt_eps = 1e-5f;                // PyTorch's, which no file of OPT's can change
+// rows of OPT's position table before position 0; default caption length
+enum { GSF__OPT_OFFSET = 2, GSF__CAPTION_TOKENS = 20 };
+static const float gsf__opt_eps = 1e-5f;                // PyTorch's default; OPT's config has no key for it
 
 // ---- captioner: configuration
 
-// Of a part of config.json: `heads` divide `width`.
+// Fails unless `heads` divides `width`.
 static gsf_result gsf__blip_check_heads(const gsf__nn_config* file, int64_t width, int32_t heads) {
     if (width % heads == 0) return GSF_OK;
     return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: %d heads do not divide hidden_size %lld", file->json.name,
@@ -8021,7 +8035,7 @@ static gsf_result gsf__blip_read_config(const gsf__nn_config* file, void* networ
     return gsf__blip_read_text(&part, net, out);
 }
 
-// Three numbers, or one for all.
+// Reads three numbers, or one for all channels.
 static gsf_result gsf__blip_read_colour(const gsf__nn_config* file, const char* key, const float fallback[3], double low,
                                         float out[3]) {
     const gsf_json_value* value = gsf__nn_config_find(file, key);
@@ -8042,7 +8056,7 @@ static gsf_result gsf__blip_read_processor(const gsf__nn_config* file, gsf__blip
     static const float mean[3] = {0.48145466f, 0.4578275f, 0.40821073f};
     static const float deviation[3] = {0.26862954f, 0.26130258f, 0.27577711f};
     static const gsf_resize_filter filters[] = {GSF_RESIZE_PIL_LANCZOS, GSF_RESIZE_PIL_BILINEAR, GSF_RESIZE_PIL_BICUBIC};
-    int64_t filter; // PIL's number of it
+    int64_t filter; // PIL's enum value
     const gsf__nn_key keys[] = {
         GSF__KEY_FLAG_IS("do_resize", 1, 1), GSF__KEY_FLAG_IS("do_rescale", 1, 1), GSF__KEY_FLAG_IS("do_normalize", 1, 1),
         GSF__KEY_FLAG_IS("do_convert_rgb", 1, 1), GSF__KEY_INT_OR("resample", filter, 3, 1, 3),
@@ -8097,7 +8111,7 @@ static const gsf__nn_entry gsf__blip_vision_entries[] = { // below vision_model.
     GSF__NN_END,
 };
 
-// Sizes: d width, m MLP, e width of what is looked at, q queries, x 0 where a layer does not look at the image.
+// Letters: d width, m MLP, e width of the vision tokens, x 0 if the layer has no cross-attention.
 #define GSF__QFORMER_AT(member) offsetof(gsf__qformer_layer, member), GSF__NN_PAIR
 static const gsf__nn_entry gsf__qformer_layer_entries[] = { // below qformer.encoder.layer.N.
     {"attention.attention.query", "dd", GSF__QFORMER_AT(self.q), 0},
@@ -8117,8 +8131,8 @@ static const gsf__nn_entry gsf__qformer_layer_entries[] = { // below qformer.enc
 };
 #undef GSF__QFORMER_AT
 
-// Sizes: d width of the language model, e of the Q-Former, q queries, v words, s rows of the position table, h 0 where the
-// words are the head as well, n 0 without a last norm.
+// Letters: d width of the language model, e width of the Q-Former, q queries, v vocabulary, s rows of the position
+// table, h 0 if the head is tied to the token embeddings, n 0 without a final norm.
 static const gsf__nn_entry gsf__blip_entries[] = {
     {"query_tokens", "1qe", offsetof(gsf__blip, qformer.tokens), GSF__NN_TENSOR, 0},
     {"qformer.layernorm", "e", GSF__NN_AT(gsf__blip, qformer.norm)},
@@ -8138,7 +8152,7 @@ static gsf__nn_sizes gsf__blip_sizes(const gsf__blip* net) {
     return sizes;
 }
 
-// Of layer `index` of the Q-Former.
+// Sizes of layer `index` of the Q-Former.
 static gsf__nn_sizes gsf__qformer_sizes(const gsf__blip* net, int64_t index) {
     const gsf__qformer* q = &net->qformer;
     const gsf__nn_sizes sizes = {{{'d', q->width}, {'m', q->mlp}, {'e', net->vision.sizes.width},
@@ -8169,12 +8183,12 @@ static gsf_result gsf__blip_bind(gsf__nn_loader* loader, void* network) {
     gsf__opt* opt = &net->text;
     const gsf__nn_sizes sizes = gsf__blip_sizes(net);
     GSF__TRY(gsf__vit_bind(loader, gsf__blip_vision_entries, gsf__blip_block_entries, "vision_model.", &net->vision));
-    net->vision.register_tokens = net->vision.class_token; // there are none
+    net->vision.register_tokens = net->vision.class_token; // never read, as there are 0 registers
     GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__blip_entries, "", net));
     GSF__TRY(gsf__qformer_bind(loader, net));
     if (!opt->own_head) {
         opt->head.weight = opt->tokens;
-        gsf__nn_ignore(loader, "language_model.lm_head."); // the words again
+        gsf__nn_ignore(loader, "language_model.lm_head."); // tied to the token embeddings
     }
     return gsf__nn_bind_blocks(loader, &opt->sizes, gsf__opt_block_entries, "language_model.model.decoder.layers.",
                                 opt->layers, &opt->blocks);
@@ -8214,12 +8228,12 @@ GSF_API gsf_result gsf_nn_load_captioner(gsf_context* ctx, const char* folder, g
     return result;
 }
 
-// ---- captioner: from the image to the queries' words
+// ---- captioner: from the image to embedded queries
 
 typedef struct gsf__nn_caption_desc {
     const gsf_image* image;
-    const char* prompt;     // NULL: none
-    int32_t max_new_tokens; // 0: as gsf_nn_caption_image
+    const char* prompt;     // or NULL
+    int32_t max_new_tokens; // 0: the default of gsf_nn_caption_image
     const gsf__nn_tap* _tap; // private
 } gsf__nn_caption_desc;
 
@@ -8230,7 +8244,7 @@ typedef struct gsf__caption_run {
     const gsf__nn_caption_desc* desc;
 } gsf__caption_run;
 
-// The image, resized as PIL does it, as normalised floats (3, image_size, image_size).
+// Resizes the image as PIL does and normalizes it to floats (3, image_size, image_size).
 static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const gsf_image* image, float* out) {
     const int64_t side = net->image_size;
     gsf_image coloured, small;
@@ -8252,7 +8266,7 @@ static gsf_result gsf__blip_pixels(gsf_context* ctx, const gsf__blip* net, const
     return result;
 }
 
-// Tokens of the image: out (1 + patches, width), after the last norm.
+// Vision tokens of the image: out (1 + patches, width), after the final norm.
 static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, float* out) {
     const gsf__vit* vit = &run->net->vision;
     const gsf__nn_tap* tap = run->nn.tap;
@@ -8263,7 +8277,7 @@ static gsf_result gsf__blip_look(gsf__caption_run* run, const float* pixels, flo
     in.pixels = pixels;
     in.images = 1;
     in.height = in.width = (int32_t)run->net->image_size;
-    run->nn.tap = NULL; // only the result is shown
+    run->nn.tap = NULL; // only the final result is shown
     gsf_result result = gsf__vit_open_run(&run->nn, vit, NULL, &in, &plan, &memory);
     if (!result) result = gsf__vit_forward(&run->nn, vit, &in, 0, 1, 0, plan.positions, plan.x);
     if (!result) {
@@ -8286,7 +8300,7 @@ static gsf_result gsf__qformer_add(gsf__caption_run* run, const float* h, const 
     return GSF_OK;
 }
 
-// The queries x look at `rows` rows of `from`. scratch: q (queries, width), then k and v (rows, width).
+// Updates the queries x by attention to `rows` rows of `from`. scratch: q (queries, width), then k and v (rows, width).
 static gsf_result gsf__qformer_attend(gsf__caption_run* run, const gsf__qformer_attention* a, const float* from,
                                       int64_t rows, float* scratch, float* x) {
     const gsf__qformer* q = &run->net->qformer;
@@ -8336,7 +8350,7 @@ static gsf_result gsf__qformer_layers(gsf__caption_run* run, const float* image,
     return GSF_OK;
 }
 
-// What the queries find in the image's tokens, as words of the language model: out (queries, text width).
+// Lets the queries attend to the vision tokens and projects them to the language model: out (queries, text width).
 static gsf_result gsf__qformer_ask(gsf__caption_run* run, const float* image, float* out) {
     const int64_t d = run->net->qformer.width;
     const size_t floats = gsf__qformer_floats(run->net);
@@ -8356,7 +8370,7 @@ typedef struct gsf__opt_run {
     float *x, *logits; // (rows, width); (vocabulary), or with a tap (rows, vocabulary)
 } gsf__opt_run;
 
-// Shares out `memory`, or counts its floats.
+// Divides `memory`, or counts the floats it needs if it is NULL.
 static size_t gsf__opt_lay_out(gsf__nn_run* run, const gsf__opt* opt, int64_t rows, int64_t logits, gsf__opt_run* o,
                                float* memory) {
     gsf__nn_arena arena = {memory, 0};
@@ -8376,7 +8390,8 @@ static size_t gsf__opt_lay_out(gsf__nn_run* run, const gsf__opt* opt, int64_t ro
     return arena.used;
 }
 
-// x (count, width): words, those of `ids` unless it is NULL and they are there, at the places from `place` on.
+// x (count, width): adds position embeddings from `place` on to the token embeddings of `ids`; with ids NULL, x already
+// holds the token embeddings.
 static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t count, int64_t place, float* scratch,
                            float* x) {
     const int64_t d = opt->sizes.width;
@@ -8387,7 +8402,8 @@ static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t coun
     }
 }
 
-// All layers on the rows of x; then o->logits has those of the last row, with a tap and several rows those of all.
+// Runs all layers on the rows of x. o->logits receives the last row's logits; with a tap and several rows the tap gets
+// all.
 static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64_t rows) {
     const gsf__opt* opt = &run->net->text;
     gsf__nn_run* nn = &run->nn;
@@ -8409,7 +8425,7 @@ static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64
     return GSF_OK;
 }
 
-// Greedy continuation of the queries' words and the text's ids, which x holds already without places.
+// Greedy decoding after the prefix in x (`rows` embeddings of queries and text, still without positions).
 static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int64_t rows, int32_t most, int32_t* ids,
                                     size_t* count) {
     const gsf__opt* opt = &run->net->text;
@@ -8431,7 +8447,8 @@ static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int6
     return GSF_OK;
 }
 
-// `words` (queries, width) and the text's ids are given; *count of at most `most` new ids go to `ids`.
+// Generates up to `most` new ids after the prefix of `words` (queries, width) and the text's ids; ids receives *count
+// ids.
 static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, const int32_t* text, size_t text_count,
                                  int32_t most, int32_t* ids, size_t* count) {
     const gsf__opt* opt = &run->net->text;
@@ -8453,9 +8470,9 @@ static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, cons
     return result;
 }
 
-// ---- captioner: all of it
+// ---- captioner: API
 
-// Ids of the text behind the queries' words: bos alone, or what the tokenizer makes of the prompt.
+// Ids of the text that follows the queries: only bos, or the tokenized prompt.
 static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* captioner, const char* prompt, int32_t** ids,
                                     size_t* count) {
     *ids = NULL;
@@ -8483,8 +8500,8 @@ static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* ca
     return result;
 }
 
-// New tokens at most. The default of a folder without image_token_index is what the official code makes of its limit of 20
-// tokens in all: the text counts twice.
+// Maximal number of new tokens. The default for a folder without image_token_index is what transformers makes of its
+// limit of 20 tokens in total: it counts the text twice.
 static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t wanted) {
     const int64_t usual = GSF__CAPTION_TOKENS;
     if (wanted > 0) return wanted;
@@ -8526,7 +8543,7 @@ static gsf_result gsf__caption_write(gsf__caption_run* run, const int32_t* text,
     return result;
 }
 
-// The caption's new tokens, `eos` included where it ends there; *ids is freed with gsf_free.
+// Generates the caption's tokens, with `eos` if it ends there; free *ids with gsf_free.
 static gsf_result gsf__nn_caption_ids(gsf_context* ctx, const gsf_nn_captioner* captioner,
                                       const gsf__nn_caption_desc* desc, int32_t** ids, size_t* count) {
     gsf__caption_run run;
@@ -8575,7 +8592,7 @@ GSF_API gsf_result gsf_nn_caption_image(gsf_context* ctx, const gsf_nn_captioner
     const gsf_result result = gsf_nn_decode_bpe(ctx, &captioner->tokenizer, ids, count, 1, &text);
     size_t end = text.size, used = 0;
     if (!result) gsf__bpe_strip((const gsf__bpe_tables*)captioner->tokenizer.tables, text.data, 1, 1, &begin, &end);
-    for (size_t step; !result && begin < end; begin += step) { // whole characters; U+FFFD for a zero byte
+    for (size_t step; !result && begin < end; begin += step) { // only whole characters; U+FFFD replaces a zero byte
         step = gsf__utf8_size(text.data + begin, end - begin);
         const int zero = text.data[begin] == 0;
         if (used + (zero ? 3 : step) >= size) break;
@@ -8588,8 +8605,8 @@ GSF_API gsf_result gsf_nn_caption_image(gsf_context* ctx, const gsf_nn_captioner
     return result;
 }
 
-// Bytes of memory (beside the mapped weights and the kernels' scratch) and floating-point operations of one caption behind
-// `text_tokens` tokens of prompt (0: none).
+// Peak memory in bytes (in addition to mapped weights and kernel scratch) and floating-point operations of one caption
+// with a prompt of `text_tokens` tokens (0: no prompt).
 static void gsf__nn_query_captioner(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t max_new_tokens,
                                     double* bytes, double* flops) {
     const gsf__blip* net = (const gsf__blip*)captioner->nets;
@@ -8629,37 +8646,37 @@ static void gsf__nn_query_captioner(const gsf_nn_captioner* captioner, int64_t t
 
 // ---- >>nn tokenizer -------------------------------------------------------------
 
-/* spiece.model is a protobuf message: fields, each a varint (field number << 3 | wire type) and its value. Of those read
+/* spiece.model is a protobuf message: fields, each a varint (field number << 3 | wire type) and its value. Read are
        1 piece, repeated   1 text, 2 score (float), 3 type: 1 normal, 2 unknown, 3 control, 4 user-defined, 5 unused, 6 byte
-       2 trainer           3 kind of model: 1 unigram; 24 spaces go behind words; 35 unknown characters become bytes
-       3 normaliser        2 character map, 3 dummy prefix, 4 remove extra spaces, 5 escape spaces; the three default to 1
-   Encoding a text: added tokens are cut out of it; what stands between is normalised, and of all ways to spell that with
-   pieces the one with the largest sum of scores is taken. A character that is no piece costs the lowest score - 10.
+       2 trainer           3 model type: 1 unigram; 24 space follows the word; 35 unknown characters as bytes
+       3 normalizer        2 character map, 3 dummy prefix, 4 remove extra spaces, 5 escape spaces; 3 to 5 default to 1
+   To encode a text, added tokens are cut out; the text between them is normalized and segmented into the pieces with
+   the largest sum of scores (Viterbi). A character that is not a piece scores 10 less than the lowest score.
    (github.com/google/sentencepiece: src/sentencepiece_model.proto, normalizer.cc, unigram_model.cc EncodeOptimized,
    sentencepiece_processor.cc; transformers 4.51.3: tokenization_utils.py, tokenization_t5.py) */
 enum {
     GSF__SP_NORMAL = 1, GSF__SP_UNKNOWN, GSF__SP_CONTROL, GSF__SP_USER, GSF__SP_UNUSED, GSF__SP_BYTE, GSF__SP_TYPES,
-    GSF__SP_PIECE = 1024,       // most bytes of a piece, of an added token,
-    GSF__SP_REPLACEMENT = 255,  //   of what the character map puts in
-    GSF__SP_MATCH = 256,        //   and looks at: bounds the time per byte of text whatever a file may hold
-    GSF__SP_EXTRA = 100,        // <extra_id_...> of T5
+    GSF__SP_PIECE = 1024,       // limit in bytes of a piece and of an added token
+    GSF__SP_REPLACEMENT = 255,  // of a replacement in the character map
+    GSF__SP_MATCH = 256,        // of a match of the character map: bounds the time per byte of text for any file
+    GSF__SP_EXTRA = 100,        // number of T5's <extra_id_...> tokens
 };
 
-static const char gsf__sp_space[] = "\xe2\x96\x81"; // U+2581 stands for a space
+static const char gsf__sp_space[] = "\xe2\x96\x81"; // U+2581 represents a space
 
 // ---- protobuf
 
 typedef struct gsf__pb {
     gsf_context* ctx;
-    const char* name; // for errors
+    const char* name; // for error messages
     const unsigned char* data;
     size_t at, end;
 } gsf__pb;
 
 typedef struct gsf__pb_field {
-    uint64_t number, value; // value: of all wire types but 2
-    int wire;               // 0 varint, 1 eight bytes, 2 a length and as many bytes, 5 four bytes
-    size_t at, size;        // of those bytes
+    uint64_t number, value; // value: for all wire types except 2
+    int wire;               // 0 varint, 1 eight bytes, 2 length-prefixed bytes, 5 four bytes
+    size_t at, size;        // of the bytes of wire types 1, 2 and 5
 } gsf__pb_field;
 
 static gsf_result gsf__pb_varint(gsf__pb* in, uint64_t* out) {
@@ -8675,7 +8692,7 @@ static gsf_result gsf__pb_varint(gsf__pb* in, uint64_t* out) {
     return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number of more than ten bytes", in->name, begin);
 }
 
-static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // in->at < in->end
+static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // requires in->at < in->end
     const size_t begin = in->at;
     uint64_t key, size = 0;
     memset(out, 0, sizeof *out);
@@ -8706,7 +8723,7 @@ static gsf_result gsf__pb_expect(const gsf__pb* in, const gsf__pb_field* field, 
                     (int)field->number, field->wire, wire);
 }
 
-static gsf__pb gsf__pb_inside(const gsf__pb* in, const gsf__pb_field* field) { // the message that a field holds
+static gsf__pb gsf__pb_inside(const gsf__pb* in, const gsf__pb_field* field) { // the message inside a field
     gsf__pb out = *in;
     out.at = field->at;
     out.end = field->at + field->size;
@@ -8721,14 +8738,14 @@ typedef struct gsf__sp_key {
     int32_t id;
 } gsf__sp_key;
 
-typedef struct gsf__sp_node { // children stand one after another, sorted by byte
+typedef struct gsf__sp_node { // children are contiguous, sorted by byte
     uint32_t first;
-    int32_t id; // of the text that ends here; -1: none
+    int32_t id; // of the text that ends at this node; -1: none
     uint16_t count;
     unsigned char byte;
 } gsf__sp_node;
 
-typedef struct gsf__sp_range { uint32_t begin, end, depth; } gsf__sp_range; // of sorted keys, below a node
+typedef struct gsf__sp_range { uint32_t begin, end, depth; } gsf__sp_range; // of the sorted keys below a node
 
 static int gsf__sp_compare(const void* a, const void* b) { // by bytes, then by id
     const gsf__sp_key *x = (const gsf__sp_key*)a, *y = (const gsf__sp_key*)b;
@@ -8738,13 +8755,13 @@ static int gsf__sp_compare(const void* a, const void* b) { // by bytes, then by 
     return x->id < y->id ? -1 : x->id > y->id;
 }
 
-static uint32_t gsf__sp_shared(const gsf__sp_key* a, const gsf__sp_key* b) { // bytes that both begin with
+static uint32_t gsf__sp_shared(const gsf__sp_key* a, const gsf__sp_key* b) { // length of the common prefix
     uint32_t n = 0;
     while (n < a->size && n < b->size && a->text[n] == b->text[n]) n++;
     return n;
 }
 
-// From sorted keys of different, nonempty texts. *out is freed by the caller.
+// Builds a trie in breadth-first order from sorted keys with distinct, nonempty texts; the caller frees *out.
 static gsf_result gsf__sp_build_trie(gsf_context* ctx, const gsf__sp_key* keys, size_t count, gsf__sp_node** out) {
     size_t total = 1, made = 1;
     for (size_t i = 0; i < count; i++) total += keys[i].size - (i ? gsf__sp_shared(&keys[i - 1], &keys[i]) : 0);
@@ -8790,13 +8807,14 @@ static const gsf__sp_node* gsf__sp_child(const gsf__sp_node* nodes, const gsf__s
     return low < end && nodes[low].byte == byte ? &nodes[low] : NULL;
 }
 
-static int32_t gsf__sp_find(const gsf__sp_node* nodes, const char* text, size_t size) { // the id of a text, or -1
+static int32_t gsf__sp_find(const gsf__sp_node* nodes, const char* text, size_t size) { // id of a text, or -1
     const gsf__sp_node* node = nodes;
     for (size_t i = 0; node && i < size; i++) node = gsf__sp_child(nodes, node, (unsigned char)text[i]);
     return node ? node->id : -1;
 }
 
-// Id and *length of the longest text of the trie that `text` begins with, -1 and 0: none. types: user-defined pieces only.
+// Id and *length of the longest text in the trie that is a prefix of `text`; -1 and 0 if there is none. types:
+// restricts the search to user-defined pieces.
 static int32_t gsf__sp_longest(const gsf__sp_node* nodes, const unsigned char* types, const char* text, size_t left,
                                size_t* length) {
     int32_t found = -1;
@@ -8812,25 +8830,25 @@ static int32_t gsf__sp_longest(const gsf__sp_node* nodes, const unsigned char* t
 
 // ---- the model
 
-typedef struct gsf__sp_added { // a text that is an id of its own
-    size_t at, size;           // in gsf__sp_model.texts, while opening
+typedef struct gsf__sp_added { // a text with an id of its own
+    size_t at, size;           // in gsf__sp_model.texts, while loading
     int32_t id;
-    int trim_left, trim_right; // takes white space beside it along
+    int trim_left, trim_right; // also removes the white space on that side
 } gsf__sp_added;
 
 typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
-    gsf__sp_node *pieces, *added; // ids of `added` are places in added_list
+    gsf__sp_node *pieces, *added; // ids of `added` are indices into added_list
     gsf__sp_added* added_list;
     gsf_buffer texts;
     size_t added_count, added_capacity;
-    float* scores;                // of each piece
+    float* scores;                // per piece, like types
     unsigned char* types;
     size_t count, scores_capacity, types_capacity;
     float unknown_score;
     int32_t unknown_id, bytes[256];
-    uint32_t* units;              // character map: a double-array trie, 0 units: none
+    uint32_t* units;              // character map: a double-array trie; unit_count 0: none
     size_t unit_count;
-    char* replacements;           // its values are places in here, each a zero-terminated text
+    char* replacements;           // the trie's values are offsets into this, each of a zero-terminated text
     size_t replacements_size;
     int prefix, trim, escape, suffix, byte_fallback, has_user_pieces;
 } gsf__sp_model;
@@ -8853,9 +8871,9 @@ GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokeni
     memset(tokenizer, 0, sizeof *tokenizer);
 }
 
-// ---- opening: pieces
+// ---- loading: pieces
 
-static int gsf__sp_is_text(const char* text, size_t size) { // UTF-8 without zeros
+static int gsf__sp_is_text(const char* text, size_t size) { // UTF-8 without zero bytes
     for (size_t at = 0, step; at < size; at += step) {
         step = text[at] ? gsf__utf8_size(text + at, size - at) : 0;
         if (!step) return 0;
@@ -8893,7 +8911,7 @@ static gsf_result gsf__sp_read_piece(gsf__pb in, gsf__sp_key* key, float* score,
     return GSF_OK;
 }
 
-// "<0x1F>" to 31; -1: not of that form
+// "<0x1F>" gives 31; -1: not of that form
 static int gsf__sp_byte_of(const gsf__sp_key* key) {
     static const char digits[] = "0123456789ABCDEF";
     if (key->size != 6 || memcmp(key->text, "<0x", 3) != 0 || key->text[5] != '>') return -1;
@@ -8933,15 +8951,16 @@ static gsf_result gsf__sp_read_trainer(gsf__pb in, gsf__sp_model* m) {
     return GSF_OK;
 }
 
-// ---- opening: the character map
+// ---- loading: the character map
 
-/* u32 bytes of the trie | its units, each u32 | texts, each ending in a zero
-   A unit of the double array: label in bits 0-7 and 31 (a byte, or 1 << 31 for a value), 8: a value is among the children,
-   offset in bits 10-31, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b, if that one's
-   label is b; the value is in bits 0-30 of the child for 0. (github.com/s-yata/darts-clone) */
+/* Layout: u32 bytes of the trie | its units, each u32 | zero-terminated texts
+   A unit of the double array: label in bits 0-7 and 31 (a byte, or 1 << 31 for a value), bit 8: one of the children is
+   a value, offset in bits 10-31, times 256 if bit 9 is set. The child of unit i for byte b is unit i ^ offset ^ b if
+   its label is b; a value is stored in bits 0-30 of the child for byte 0. (github.com/s-yata/darts-clone) */
 static uint32_t gsf__sp_offset(uint32_t unit) { return unit >> 10 << ((unit & 512u) >> 6); }
 
-// Checks every unit, so that no walk leaves the array: children of a unit lie in one block of 256.
+// Checks every unit, so that no lookup leaves the array. The children of a unit share a block of 256, and the number of
+// units is a multiple of 256, so it is enough to check the base.
 static gsf_result gsf__sp_check_units(const gsf__pb* in, size_t at, const gsf__sp_model* m) {
     for (size_t i = 0; i < m->unit_count; i++) {
         const uint32_t unit = m->units[i];
@@ -8963,7 +8982,7 @@ static gsf_result gsf__sp_check_units(const gsf__pb* in, size_t at, const gsf__s
 
 static gsf_result gsf__sp_read_map(const gsf__pb* in, const gsf__pb_field* field, gsf__sp_model* m) {
     const unsigned char* data = in->data + field->at;
-    gsf_free(in->ctx, m->units); // of an earlier field
+    gsf_free(in->ctx, m->units); // replaces that of an earlier field
     gsf_free(in->ctx, m->replacements);
     m->units = NULL;
     m->replacements = NULL;
@@ -8998,9 +9017,9 @@ static gsf_result gsf__sp_read_normalizer(gsf__pb in, gsf__sp_model* m) {
     return GSF_OK;
 }
 
-// ---- opening: the file as a whole
+// ---- loading: the whole file
 
-typedef struct gsf__sp_keys { // texts of the pieces, in the caller's bytes
+typedef struct gsf__sp_keys { // the texts point into the caller's buffer
     gsf__sp_key* keys;
     size_t count, capacity;
 } gsf__sp_keys;
@@ -9059,7 +9078,7 @@ static gsf_result gsf__sp_read_model(gsf__pb in, gsf__sp_model* m) {
     return result;
 }
 
-// ---- opening: added tokens
+// ---- loading: added tokens
 
 static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* text, size_t size, int64_t id, int trim_left,
                               int trim_right) {
@@ -9081,7 +9100,7 @@ static gsf_result gsf__sp_fail_added(const gsf__nn_config* file, const gsf_json_
     return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no added token", file->json.name, (unsigned)value->offset);
 }
 
-// {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
+// Parses {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
 static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json_value* all, gsf__sp_model* m) {
     const gsf_json* json = &file->json;
     for (uint32_t i = all->child; i; i = json->values[i].next) {
@@ -9107,7 +9126,7 @@ static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json
     return GSF_OK;
 }
 
-// added_tokens.json: {"<extra_id_0>": 32099, ...}
+// Parses added_tokens.json: {"<extra_id_0>": 32099, ...}
 static gsf_result gsf__sp_add_list(const gsf__nn_config* file, gsf__sp_model* m) {
     for (uint32_t i = file->json.values[0].child; i; i = file->json.values[i].next) {
         const gsf_json_value* entry = &file->json.values[i];
@@ -9122,13 +9141,13 @@ static gsf_result gsf__sp_add_list(const gsf__nn_config* file, gsf__sp_model* m)
 static gsf_result gsf__sp_add_extra(gsf_context* ctx, gsf__sp_model* m, int64_t extra) {
     for (int64_t i = 0; i < extra; i++) {
         char text[32];
-        const int size = snprintf(text, sizeof text, "<extra_id_%d>", (int)i); // extra_id_0 is the last one
+        const int size = snprintf(text, sizeof text, "<extra_id_%d>", (int)i); // extra_id_0 has the highest id
         GSF__TRY(gsf__sp_add(ctx, m, text, (size_t)size, (int64_t)m->count - 1 + extra - i, 1, 1));
     }
     return GSF_OK;
 }
 
-// Sorts the added tokens' texts into a trie; of those with the same text the one added last counts.
+// Sorts the added tokens into a trie; of tokens with the same text, the one added last wins.
 static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
     size_t kept = 0;
     gsf__sp_key* keys = (gsf__sp_key*)gsf_alloc(ctx, m->added_count, sizeof *keys);
@@ -9150,7 +9169,7 @@ static gsf_result gsf__sp_sort_added(gsf_context* ctx, gsf__sp_model* m) {
     return result;
 }
 
-// "eos_token": "</s>", or an object with that as its "content"
+// Text of a key such as "eos_token": a string, or an object with the string in "content".
 static const char* gsf__sp_token_text(const gsf__nn_config* file, const char* key, const char* fallback) {
     const gsf_json_value* value = gsf__nn_config_find(file, key);
     if (value && value->type == GSF_JSON_OBJECT) value = gsf_find_json_member(&file->json, value, "content");
@@ -9187,7 +9206,7 @@ static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf_
     return GSF_OK;
 }
 
-// files: tokenizer_config.json and added_tokens.json, empty objects where there is no such file
+// files: tokenizer_config.json and added_tokens.json, or empty objects if the file does not exist.
 static gsf_result gsf__sp_make(gsf_context* ctx, const char* name, const void* data, size_t size,
                                const gsf__nn_config files[2], gsf_nn_tokenizer* out) {
     const gsf__pb in = {ctx, gsf__nn_path_end(name), (const unsigned char*)data, 0, size};
@@ -9205,8 +9224,8 @@ static void gsf__sp_end_making(gsf_context* ctx, gsf_result result, gsf__nn_conf
     if (result) gsf_nn_destroy_tokenizer(ctx, out);
 }
 
-// The same from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
-// From the bytes of a spiece.model and of a tokenizer_config.json (NULL: none). Nothing is kept of either.
+// Like gsf_nn_load_tokenizer, from the bytes of a spiece.model and of a tokenizer_config.json (NULL: none), which are
+// not referenced afterwards.
 GSF__SHARED gsf_result gsf__nn_parse_tokenizer(gsf_context* ctx, const char* name, const void* model, size_t model_size,
                                                const char* config, size_t config_size, gsf_nn_tokenizer* out) {
     gsf__nn_config files[2];
@@ -9238,14 +9257,14 @@ GSF_API gsf_result gsf_nn_load_tokenizer(gsf_context* ctx, const char* folder, g
     return result;
 }
 
-// ---- normalising
+// ---- normalizing
 
-typedef struct gsf__sp_step { // what stands for the next `used` bytes
+typedef struct gsf__sp_step { // replacement of the next `used` bytes
     const char* text;
     size_t size, used;
 } gsf__sp_step;
 
-// Length of the longest entry of the character map that the text begins with, 0: none.
+// Length of the longest entry of the character map that is a prefix of the text, 0: none.
 static size_t gsf__sp_match(const gsf__sp_model* m, const char* text, size_t left, uint32_t* value) {
     size_t length = 0;
     if (left > GSF__SP_MATCH) left = GSF__SP_MATCH;
@@ -9267,7 +9286,8 @@ static size_t gsf__sp_match(const gsf__sp_model* m, const char* text, size_t lef
 static gsf__sp_step gsf__sp_next(const gsf__sp_model* m, const char* text, size_t left) {
     gsf__sp_step step = {text, 0, 0};
     uint32_t value = 0;
-    if (m->has_user_pieces) gsf__sp_longest(m->pieces, m->types, text, left, &step.used); // these stay as they are
+    // user-defined pieces are not normalized
+    if (m->has_user_pieces) gsf__sp_longest(m->pieces, m->types, text, left, &step.used);
     if (!step.used && m->unit_count) {
         step.used = gsf__sp_match(m, text, left, &value);
         if (step.used) {
@@ -9279,17 +9299,17 @@ static gsf__sp_step gsf__sp_next(const gsf__sp_model* m, const char* text, size_
     if (!step.used) step.used = gsf__utf8_size(text, left);
     step.size = step.used;
     if (step.used) return step;
-    step.text = "\xef\xbf\xbd"; // U+FFFD for a malformed byte
+    step.text = "\xef\xbf\xbd"; // U+FFFD replaces a malformed byte
     step.size = 3;
     step.used = 1;
     return step;
 }
 
-typedef struct gsf__sp_best { // the best spelling of all bytes before this one
+typedef struct gsf__sp_best { // best segmentation of all bytes before this one
     float score;
-    int32_t id;     // its last piece; -1: there is none so far
-    uint32_t start; // where that begins
-    uint32_t next;  // on the way back: where the piece that begins here ends
+    int32_t id;     // its last piece; -1: none yet
+    uint32_t start; // where the last piece begins
+    uint32_t next;  // for the backtrace: end of the piece that begins here
 } gsf__sp_best;
 
 typedef struct gsf__sp_run {
@@ -9302,7 +9322,7 @@ typedef struct gsf__sp_run {
     gsf__nn_ids out;
 } gsf__sp_run;
 
-static gsf_result gsf__sp_put(gsf__sp_run* run, const char* text, size_t size) { // spaces escaped
+static gsf_result gsf__sp_put(gsf__sp_run* run, const char* text, size_t size) { // escapes spaces
     GSF__TRY(gsf__reserve(run->ctx, (void**)&run->normal, &run->capacity, run->size, run->size + 3 * size, 1));
     for (size_t i = 0; i < size; i++) {
         if (text[i] == ' ' && run->m->escape) {
@@ -9344,27 +9364,28 @@ static gsf_result gsf__sp_normalize(gsf__sp_run* run, const char* text, size_t l
     return m->prefix && m->suffix ? gsf__sp_put(run, " ", 1) : GSF_OK;
 }
 
-// ---- spelling
+// ---- segmenting
 
 static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32_t id) {
-    if (best->id >= 0 && !(score > best->score)) return; // the first of equals stays
+    if (best->id >= 0 && !(score > best->score)) return; // on ties the first one wins
     best->score = score;
     best->start = start;
     best->id = id;
 }
 
-// Sums that have grown large, of all bytes from `at` that some spelling reaches, begin anew: floats would run out of
-// digits.
+// Subtracts the score at `at` from those of all reached positions from there on, before large sums lose float
+// precision.
 static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
     const float base = run->best[at].score;
     for (size_t i = at; i <= reached; i++)
         if (i == at || run->best[i].id >= 0) run->best[i].score -= base;
 }
 
-// Viterbi over the bytes of run->normal. Sums are floats that are rebased where sentencepiece 0.2.3 does it, since their
-// rounding decides between spellings of nearly equal score.
+// Viterbi over the bytes of run->normal. Scores are summed in float and rebased exactly where sentencepiece 0.2.3 does
+// it, since rounding decides between segmentations of nearly equal score.
 static void gsf__sp_spell(gsf__sp_run* run) {
-    static const unsigned char widths[17] = "\1\1\1\1\1\1\1\1\1\1\1\1\2\2\3\4"; // of a character, by its upper four bits
+    // bytes of a character, by its upper four bits
+    static const unsigned char widths[17] = "\1\1\1\1\1\1\1\1\1\1\1\1\2\2\3\4";
     const gsf__sp_model* m = run->m;
     const unsigned char* text = (const unsigned char*)run->normal;
     const size_t n = run->size;
@@ -9375,7 +9396,7 @@ static void gsf__sp_spell(gsf__sp_run* run) {
         if (fabsf(run->best[at].score) > 100000.0f) gsf__sp_rebase(run, at, reached);
         const float here = run->best[at].score;
         const gsf__sp_node* node = m->pieces;
-        int known = 0; // this character alone is a piece
+        int known = 0; // this character on its own is a piece
         width = widths[text[at] >> 4];
         if (width > n - at) width = n - at;
         for (size_t k = at; k < n && (node = gsf__sp_child(m->pieces, node, text[k])) != NULL; k++) {
@@ -9395,7 +9416,7 @@ static void gsf__sp_spell(gsf__sp_run* run) {
     for (size_t end = n; end > 0; end = run->best[end].start) run->best[run->best[end].start].next = (uint32_t)end;
 }
 
-// The ids of a stretch of text without added tokens.
+// Encodes a part of the text that contains no added tokens.
 static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size) {
     const gsf__sp_model* m = run->m;
     GSF__TRY(gsf__sp_normalize(run, text, size));
@@ -9409,7 +9430,8 @@ static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size
                 GSF__TRY(gsf__nn_emit(run->ctx, &run->out, m->bytes[(unsigned char)run->normal[i]]));
             continue;
         }
-        if (id == m->unknown_id) { // a run of them is one; its text may be that of a piece which no spelling uses
+        // merge consecutive ones; their text may be a piece excluded from segmentation, such as a control piece
+        if (id == m->unknown_id) {
             while (end < run->size && run->best[run->best[end].next].id == id) end = run->best[end].next;
             id = gsf__sp_find(m->pieces, run->normal + at, end - at);
             if (id < 0) id = m->unknown_id;
@@ -9419,9 +9441,9 @@ static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size
     return GSF_OK;
 }
 
-// ---- added tokens within a text
+// ---- added tokens in a text
 
-// Bytes of the white space character that the text begins with, as Python's str.isspace has it; 0: none.
+// Bytes of the leading white space character, as defined by Python's str.isspace; 0: none.
 static size_t gsf__sp_white(const char* text, size_t left) {
     const unsigned char* p = (const unsigned char*)text;
     const size_t size = gsf__utf8_size(p, left);
@@ -9433,14 +9455,14 @@ static size_t gsf__sp_white(const char* text, size_t left) {
            c == 0x3000 ? 3 : 0;
 }
 
-static size_t gsf__sp_white_before(const char* text, size_t end) { // of the one that the text ends with
+static size_t gsf__sp_white_before(const char* text, size_t end) { // bytes of the trailing white space character
     for (size_t size = 1; size <= 3 && size <= end; size++)
         if (gsf__sp_white(text + end - size, size) == size) return size;
     return 0;
 }
 
 static gsf_result gsf__sp_encode_all(gsf__sp_run* run, const char* text, size_t size) {
-    size_t from = 0; // of the stretch since the last added token
+    size_t from = 0; // end of the last added token
     for (size_t at = 0; at <= size; at++) {
         size_t end = at, white;
         const int32_t place = at < size ? gsf__sp_longest(run->m->added, NULL, text + at, size - at, &white) : -1;
@@ -9466,7 +9488,7 @@ GSF_API gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* 
     run.m = (const gsf__sp_model*)tokenizer->model;
     const gsf_result result = gsf__sp_encode_all(&run, text, size);
     const int32_t end = tokenizer->end_id;
-    // where there is an end already, the official code adds none
+    // transformers' T5Tokenizer appends no end if there is one already
     const size_t made = run.out.count, all = made + !(made && run.out.ids[made - 1] == end);
     if (result == GSF_OK && count) *count = all;
     if (result == GSF_OK && room) {
@@ -9486,7 +9508,7 @@ GSF_API gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* 
 typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
     gsf__nn_block_sizes sizes;
     gsf__nn_block* blocks;
-    const gsf_nn_tensor *embedding, *positions; // positions: (buckets, heads), for all blocks
+    const gsf_nn_tensor *embedding, *positions; // (buckets, heads), shared by all blocks
     gsf__nn_layer norm;
 } gsf__t5_nets;
 
@@ -9504,7 +9526,7 @@ static const gsf__nn_entry gsf__t5_block_entries[] = { // below encoder.block.N.
 };
 
 #define GSF__T5_AT(member) offsetof(gsf__t5_nets, member), GSF__NN_WEIGHT, 0
-static const gsf__nn_entry gsf__t5_entries[] = { // sizes: d width, v vocabulary, u buckets, h heads
+static const gsf__nn_entry gsf__t5_entries[] = { // letters: d width, v vocabulary, u buckets, h heads
     {"shared", "vd", GSF__T5_AT(embedding)},
     {"encoder.block.0.layer.0.SelfAttention.relative_attention_bias", "uh", GSF__T5_AT(positions)},
     {"encoder.final_layer_norm", "d", GSF__T5_AT(norm)},
@@ -9538,7 +9560,7 @@ static gsf_result gsf__t5_bind(gsf__nn_loader* loader, void* network) {
     if (!nets) return GSF_ERROR_OUT_OF_MEMORY;
     nets->sizes = gsf__t5_block_sizes(c);
     GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__t5_entries, "", nets));
-    gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some writers store the shared table twice
+    gsf__nn_ignore(loader, "encoder.embed_tokens.weight"); // some files store the shared table twice
     return gsf__nn_bind_blocks(loader, &nets->sizes, gsf__t5_block_entries, "encoder.block.", c->layers, &nets->blocks);
 }
 
@@ -9551,7 +9573,8 @@ static gsf_result gsf__t5_read_config(const gsf__nn_config* file, void* network)
         GSF__KEY_INT_OR("relative_attention_num_buckets", c->buckets, 32, 4, 1 << 16),
         GSF__KEY_INT_OR("relative_attention_max_distance", c->max_distance, 128, 1, 1 << 24),
         GSF__KEY_REAL_OR("layer_norm_epsilon", c->norm_eps, 1e-6, 1e-12, 1.0),
-        GSF__KEY_WORD_IS("feed_forward_proj", NULL, "gated-gelu"), // T5 v1.0 has relu and no gate
+        // T5 v1.0 has relu and no gate, which is not supported
+        GSF__KEY_WORD_IS("feed_forward_proj", NULL, "gated-gelu"),
         GSF__KEY_WORD_IS("dense_act_fn", "gelu_new", "gelu_new")};
     GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
     if (c->buckets % 4 || c->max_distance <= c->buckets / 4)
@@ -9576,10 +9599,11 @@ GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5) {
     memset(t5, 0, sizeof *t5);
 }
 
-// ---- relative positions
+// ---- relative position bias
 
-// The bucket of key - query: half of them for keys behind the query. Of a side's, the lower half are distances, the rest
-// their logarithm up to max_distance. In float, as the reference rounds it. (modeling_t5.py _relative_position_bucket)
+// Bucket of the offset key - query: the upper half of the buckets is for keys after the query. Within a half, the lower
+// half of the buckets are exact distances, the others logarithmic up to max_distance. Computed in float, as rounding
+// matters. (modeling_t5.py _relative_position_bucket)
 static int32_t gsf__t5_bucket(const gsf_nn_t5* c, int64_t offset) {
     const int32_t side = c->buckets / 2, exact = side / 2;
     const int64_t distance = offset < 0 ? -offset : offset;
@@ -9592,10 +9616,10 @@ static int32_t gsf__t5_bucket(const gsf_nn_t5* c, int64_t offset) {
     return (int32_t)bucket + (offset > 0 ? side : 0);
 }
 
-// bias (heads, tokens, tokens), the same for every block; scratch: 2 tokens + buckets * heads floats.
+// Fills bias (heads, tokens, tokens), which all blocks share; scratch: 2 tokens + buckets * heads floats.
 static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_nn_tensor* positions, int64_t tokens, float* scratch,
                               float* bias) {
-    float *line = scratch, *table = scratch + 2 * tokens; // line: by key - query, from 1 - tokens up
+    float *line = scratch, *table = scratch + 2 * tokens; // line: indexed by key - query + tokens - 1
     gsf_nn_convert_tensor(positions, 0, positions->count, table);
     for (int64_t h = 0; h < c->heads; h++) {
         for (int64_t i = 0; i < 2 * tokens - 1; i++) line[i] = table[gsf__t5_bucket(c, i + 1 - tokens) * c->heads + h];
@@ -9604,16 +9628,16 @@ static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_nn_tensor* positions
     }
 }
 
-// ---- one pass
+// ---- forward pass
 
-// Shares out `memory`, or counts its floats.
+// Divides `memory`, or counts the floats it needs if it is NULL.
 static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_desc* in, float** x, float** bias,
                               float* memory) {
     gsf__nn_arena arena = {memory, 0};
     const gsf__nn_block_sizes s = gsf__t5_block_sizes(c);
     const int64_t rows = (int64_t)in->batch * in->tokens, inner = (int64_t)c->heads * c->head_dim;
     const size_t d = (size_t)c->width, n = (size_t)in->tokens, heads = (size_t)c->heads;
-    const size_t scratch = 2 * n + (size_t)c->buckets * heads; // of gsf__t5_fill_bias
+    const size_t scratch = 2 * n + (size_t)c->buckets * heads; // for gsf__t5_fill_bias
     const size_t wide = gsf__nn_larger(gsf__nn_wide(&s, rows, rows), scratch);
     run->wide_count = (int64_t)wide;
     run->vectors_size = d;
@@ -9625,8 +9649,8 @@ static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn
     return arena.used;
 }
 
-// Bytes of memory at the peak (beside out, the mapped weights and some 70 MB of the kernels' scratch) and floating-point
-// operations of one such call. T5-XXL, two prompts of 226 tokens: 65 MB, 4.2e12 operations.
+// Peak memory in bytes (in addition to out, mapped weights and about 70 MB of kernel scratch) and floating-point
+// operations of a gsf_nn_encode_t5 call. T5-XXL with two prompts of 226 tokens: 65 MB, 4.2e12 operations.
 static void gsf__nn_query_t5(const gsf_nn_t5* t5, const gsf_nn_t5_desc* input, double* bytes, double* flops) {
     const gsf__nn_block_sizes s = gsf__t5_block_sizes(t5);
     gsf__nn_run run;
@@ -9645,7 +9669,7 @@ static gsf_result gsf__t5_forward(gsf__nn_run* run, const gsf_nn_t5* c, const gs
     gsf__t5_fill_bias(c, nets->positions, in->tokens, run->wide, bias);
     run->sizes = &nets->sizes;
     run->bias = bias;
-    run->scale = 1.0f; // of the logits, which are not scaled
+    run->scale = 1.0f; // T5 does not scale its logits
     run->steps = c->layers;
     for (int32_t i = 0; i < c->layers; i++) {
         snprintf(run->label, sizeof run->label, "block%d.", (int)i);
@@ -9689,16 +9713,18 @@ GSF_API gsf_result gsf_nn_encode_t5(gsf_context* ctx, const gsf_nn_t5* t5, const
 
 // ---- >>nn vae -------------------------------------------------------------------
 
-// A run keeps few large arrays (gsf__vae_run), each grown to the largest need: three activations (a block's input, the
-// middle of its resnet, and the result of a widening shortcut), one bordered frame, the widened weights of one layer. Norm
-// and SiLU are applied while a frame is given its border, so that normalised activations exist for three frames only, two
-// of which are the cache that the next chunk needs anyway. Sums for a group norm are taken while its input is written.
-// The same walk with `dry` set takes no memory and computes nothing, but counts both.
+// A run keeps few large buffers (gsf__vae_run), each grown to its largest use: three activations (a block's input, the
+// middle of its resnet, the result of a shortcut to more channels), one padded frame, the widened weights of one layer.
+// Norm and SiLU are applied while a frame is copied into its padded buffer, so that normalized activations exist for
+// only three frames, two of which form the cache for the next chunk anyway. The sums of a group norm are accumulated
+// while its input is written. With `dry` set the same traversal allocates and computes nothing, but counts bytes and
+// operations.
 
-enum { GSF__VAE_ENCODER_FRAMES = 8, GSF__VAE_DECODER_FRAMES = 2 }; // frames of a chunk
-enum { GSF__VAE_SLOTS = 4, GSF__VAE_INPUT = 3 };                   // activations; the last one is the chunk's input
+enum { GSF__VAE_ENCODER_FRAMES = 8, GSF__VAE_DECODER_FRAMES = 2 }; // frames per chunk
+enum { GSF__VAE_SLOTS = 4, GSF__VAE_INPUT = 3 }; // activation buffers; the last one holds the chunk's input
 
-typedef struct gsf__vae_norm { // a group norm; spatial.out > 0: its result times y(z) plus b(z), z the latents
+// A group norm; with y.out > 0 (decoder) a spatial norm: the normalized input times y(z) plus b(z), z the latents.
+typedef struct gsf__vae_norm {
     const gsf_nn_tensor *weight, *bias;
     gsf__conv_layer y, b;
     double eps;
@@ -9706,14 +9732,14 @@ typedef struct gsf__vae_norm { // a group norm; spatial.out > 0: its result time
 
 typedef struct gsf__vae_resnet { // x + conv2(silu(norm2(conv1(silu(norm1(x))))))
     gsf__vae_norm norm1, norm2;
-    gsf__conv_layer conv1, conv2, shortcut; // shortcut.out 0: x itself
+    gsf__conv_layer conv1, conv2, shortcut; // shortcut.out 0: identity
 } gsf__vae_resnet;
 
 typedef struct gsf__vae_block {
     gsf__vae_resnet* resnets;
     int32_t count;
-    gsf__conv_layer sampler; // out 0: none. The encoder's halves, the decoder's doubles
-    int time;                // frames, too
+    gsf__conv_layer sampler; // out 0: none; halves the resolution in the encoder, doubles it in the decoder
+    int time;                // also halves or doubles the number of frames
 } gsf__vae_block;
 
 typedef struct gsf__vae_net { // encoder or decoder
@@ -9722,14 +9748,14 @@ typedef struct gsf__vae_net { // encoder or decoder
     gsf__conv_layer conv_in, conv_out;
     gsf__vae_norm norm_out;
     gsf__vae_block blocks[GSF_NN_VAE_LEVELS + 1];
-    int32_t block_count, causal_count; // causal_count: layers that keep frames for the next chunk
+    int32_t block_count, causal_count; // causal_count: layers that cache frames for the next chunk
 } gsf__vae_net;
 
 typedef struct gsf__vae_nets {
     gsf__vae_net encoder, decoder;
 } gsf__vae_nets;
 
-// ---- opening a model
+// ---- loading a model
 
 typedef struct gsf__vae_loader {
     gsf_context* ctx;
@@ -9763,7 +9789,7 @@ static gsf_result gsf__vae_load_norm(gsf__vae_loader* l, const char* name, int64
     const char* layer = l->net->decoder ? ".norm_layer" : "";
     GSF__TRY(gsf__nn_need(l->tensors, &norm->weight, 1, &channels, "%s%s.weight", name, layer));
     GSF__TRY(gsf__nn_need(l->tensors, &norm->bias, 1, &channels, "%s%s.bias", name, layer));
-    norm->eps = l->net->decoder ? 1e-6 : eps; // the spatial norm ignores the config's
+    norm->eps = l->net->decoder ? 1e-6 : eps; // CogVideoXSpatialNorm3D ignores the config's
     if (!l->net->decoder) return GSF_OK;
     snprintf(full, sizeof full, "%s.conv_y.conv", name);
     GSF__TRY(gsf__vae_load_conv(l, full, l->vae->latent_channels, channels, 1, 1, &norm->y));
@@ -9787,7 +9813,7 @@ static gsf_result gsf__vae_load_resnet(gsf__vae_loader* l, const char* name, int
     return gsf__vae_load_conv(l, full, in, out, 1, 1, &resnet->shortcut);
 }
 
-// `count` resnets, the first of which changes the channels.
+// Loads `count` resnets, the first of which changes the number of channels.
 static gsf_result gsf__vae_load_block(gsf__vae_loader* l, const char* name, int64_t in, int64_t out, int32_t count) {
     char full[96];
     gsf__vae_block* block = &l->net->blocks[l->net->block_count++];
@@ -9847,7 +9873,7 @@ static gsf_result gsf__vae_check_types(const gsf__nn_config* config, const char*
                     (unsigned)list->offset, key, levels, type);
 }
 
-// Fallbacks are the class's own.
+// Missing keys take the defaults of diffusers' AutoencoderKLCogVideoX.
 static gsf_result gsf__vae_take_config(const gsf__nn_config* config, void* network) {
     gsf_nn_vae* vae = (gsf_nn_vae*)network;
     static const char classname[] = "AutoencoderKLCogVideoX";
@@ -9872,7 +9898,7 @@ static gsf_result gsf__vae_take_config(const gsf__nn_config* config, void* netwo
     GSF__TRY(gsf__vae_check_types(config, "up_block_types", "CogVideoXUpBlock3D", levels));
     vae->levels = (int32_t)levels;
     vae->spatial_ratio = 1 << (levels - 1);
-    int32_t temporal = 1; // the nearest power of two from below, and no more than there are samplers
+    int32_t temporal = 1; // rounded down to a power of two, at most one doubling per sampler
     while (2 * temporal <= vae->temporal_ratio && 2 * temporal <= vae->spatial_ratio) temporal *= 2;
     vae->temporal_ratio = temporal;
     for (size_t i = 0; i < levels; i++) {
@@ -9919,16 +9945,16 @@ GSF_API void gsf_nn_destroy_vae(gsf_context* ctx, gsf_nn_vae* vae) {
     memset(vae, 0, sizeof *vae);
 }
 
-// ---- one run
+// ---- a run
 
 typedef struct gsf__vae_buffer {
     float* data;
     size_t size; // bytes
 } gsf__vae_buffer;
 
-typedef struct gsf__vae_cache { // of one causal layer: its last two input frames, normalised and bordered
+typedef struct gsf__vae_cache { // the last two input frames of a causal layer, normalized and padded
     gsf__vae_buffer frames[2];
-    int last[2]; // which of them comes last but one, and last; -1: none yet
+    int last[2]; // indices of the last but one and of the last frame; -1: none yet
 } gsf__vae_cache;
 
 typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
@@ -9936,8 +9962,8 @@ typedef struct gsf__vae_map { // an activation (frames, height, width, channels)
     int64_t frames, height, width, channels;
 } gsf__vae_map;
 
-// For tests: a layer's result (frame -1, in slot layout), or a frame of what a norm and SiLU made (with its border).
-// `weight` names the layer.
+// For tests: receives a layer's result (frame -1, in slot layout), or one frame after norm and SiLU (padded). `weight`
+// identifies the layer.
 typedef struct gsf__vae_watch {
     void (*fn)(void* user, const gsf_nn_tensor* weight, int64_t chunk, const gsf__vae_map* map, int64_t frame,
                const float* data);
@@ -9951,16 +9977,16 @@ typedef struct gsf__vae_run {
     double flops;
     size_t bytes, peak;
     gsf__vae_buffer slots[GSF__VAE_SLOTS], spare, packed, table, partial, sums;
-    gsf__vae_cache* caches;  // per causal layer; a clip of one chunk uses only the first, for all
+    gsf__vae_cache* caches;  // one per causal layer; with a single chunk all layers share the first
     int32_t cache_at;
-    gsf__vae_map z;          // the chunk's latents (decoder)
-    int64_t chunk, chunks, done, total; // done, total: chunks of all tiles
+    gsf__vae_map z;          // the chunk's latents, for the decoder's spatial norms
+    int64_t chunk, chunks, done, total; // done, total: in chunks of all tiles
     const char* stage;
     gsf__vae_watch watch;
 } gsf__vae_run;
 
 static gsf_result gsf__vae_grow(gsf__vae_run* run, gsf__vae_buffer* buffer, int64_t count) {
-    const size_t size = (size_t)count * sizeof(float); // gsf__vae_plan has bounded it
+    const size_t size = (size_t)count * sizeof(float); // cannot overflow: gsf__vae_check_size limits it
     if (size <= buffer->size) return GSF_OK;
     run->bytes += size - buffer->size;
     if (run->bytes > run->peak) run->peak = run->bytes;
@@ -9993,26 +10019,27 @@ static void gsf__vae_end(gsf__vae_run* run) {
     gsf__vae_release(run->ctx, &run->sums);
 }
 
-static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots, one frame and its part; groups, 2) doubles
+static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots, one frame, part of a frame; groups, 2) doubles
     run->caches = (gsf__vae_cache*)gsf_alloc_zeroed(run->ctx, (size_t)run->net->causal_count, sizeof *run->caches);
     if (!run->caches) return GSF_ERROR_OUT_OF_MEMORY;
     return gsf__vae_grow(run, &run->sums, (GSF__VAE_SLOTS + 2) * run->net->groups * 2 * 2);
 }
 
 static int64_t gsf__vae_plane(const gsf__vae_map* map) { return map->height * map->width * map->channels; }
-static double* gsf__vae_sums(const gsf__vae_run* run, int slot) { // slot GSF__VAE_SLOTS: of one frame, + 1: a part of it
+// slot GSF__VAE_SLOTS: of one frame, + 1: of part of it
+static double* gsf__vae_sums(const gsf__vae_run* run, int slot) {
     return (double*)(void*)run->sums.data + slot * run->net->groups * 2;
 }
 static int64_t gsf__vae_groups(const gsf__vae_run* run, int64_t channels) {
     return channels % run->net->groups == 0 ? run->net->groups : 1;
 }
-static int gsf__vae_free_slot(int a, int b) { // the first that is neither
+static int gsf__vae_free_slot(int a, int b) { // the first slot that is neither a nor b
     int slot = 0;
     while (slot == a || slot == b) slot++;
     return slot;
 }
 
-// `tensor`: the weight of the layer whose result is at fault; its name loses ".conv.weight".
+// Reports NaN or infinity in the result of the layer with weight `tensor`, whose name is cut at ".conv.weight".
 static gsf_result gsf__vae_fail_nan(const gsf__vae_run* run, const gsf_nn_tensor* tensor) {
     char name[160];
     snprintf(name, sizeof name, "%s", tensor->name);
@@ -10025,9 +10052,9 @@ static gsf_result gsf__vae_fail_nan(const gsf__vae_run* run, const gsf_nn_tensor
                     name, (long long)run->chunk + 1, (long long)run->chunks);
 }
 
-typedef struct gsf__vae_blend { // table (pixels, 2, channels): y and b become factors and summands of the normalised input
+typedef struct gsf__vae_blend { // table (pixels, 2, channels): turns y and b into scale and shift of the centered input
     float* table;
-    const float *scale, *shift; // of the group norm: inverse deviation * weight, and bias
+    const float *scale, *shift; // of the group norm: weight / standard deviation, and bias
     int64_t width, channels;
 } gsf__vae_blend;
 
@@ -10044,7 +10071,7 @@ static void gsf__vae_blend_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
-// conv_y and conv_b over the latents, at their own resolution: pointwise, so the nearest resize may follow.
+// conv_y and conv_b over the latents, at the latents' resolution: pointwise, so they commute with the nearest resize.
 static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const float* scale, const float* shift,
                              float* table) {
     const int64_t c = norm->y.out;
@@ -10055,7 +10082,7 @@ static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const
         gsf__conv_job job = gsf__conv_begin(run->ctx, layers[i], run->z.frames * run->z.height, run->z.width, 0,
                                             run->packed.data);
         job.in[0] = run->slots[GSF__VAE_INPUT].data;
-        job.in_stride = run->z.width * run->z.channels; // no border
+        job.in_stride = run->z.width * run->z.channels; // not padded
         job.origin = 0;
         job.out = table + i * c;
         job.ldo = 2 * c;
@@ -10065,7 +10092,7 @@ static void gsf__vae_spatial(gsf__vae_run* run, const gsf__vae_norm* norm, const
     gsf__parallel_for(run->ctx, (size_t)(run->z.frames * run->z.height), gsf__vae_blend_row, &blend);
 }
 
-// run->table becomes (mean, scale, shift) per channel, and for the decoder the table of factors and summands after them.
+// Fills run->table with (mean, scale, shift) per channel and, in the decoder, the table of gsf__vae_blend after them.
 static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* norm, const gsf__vae_map* in) {
     const int64_t c = in->channels, groups = run->net->groups, per = c / groups;
     const int64_t pixels = norm->y.out ? run->z.frames * run->z.height * run->z.width : 0;
@@ -10080,7 +10107,8 @@ static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* 
     const double count = (double)in->frames * (double)in->height * (double)in->width * (double)per;
     gsf_nn_convert_tensor(norm->weight, 0, c, scale);
     gsf_nn_convert_tensor(norm->bias, 0, c, shift);
-    for (int64_t i = 0; i < c; i++) { // E[x^2] - E[x]^2 in double, of floats: good to 1e-8 at a mean of 1e4 deviations
+    // E[x^2] - E[x]^2 in double, of float values: accurate to 1e-8 even if the mean is 1e4 deviations
+    for (int64_t i = 0; i < c; i++) {
         const double m = sums[i / per * 2] / count, v = sums[i / per * 2 + 1] / count - m * m;
         mean[i] = (float)m;
         scale[i] = (float)((double)scale[i] / sqrt((v > 0.0 ? v : 0.0) + norm->eps));
@@ -10089,13 +10117,13 @@ static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* 
     return GSF_OK;
 }
 
-// The latent frame that frame t of n sees: nearest, the first frame apart where n is odd.
+// Latent frame for frame t of n: nearest, but the first frame separately if n is odd.
 static int64_t gsf__vae_latent_frame(int64_t t, int64_t n, int64_t latents) {
     if (n % 2 == 0 || n == 1) return t * latents / n;
     return t == 0 ? 0 : 1 + (t - 1) * (latents - 1) / (n - 1);
 }
 
-// Frame `t` of `in`, normalised where there is a norm, into `out` with a border.
+// Copies frame `t` of `in` into `out` with padding, normalized if there is a norm.
 static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gsf__vae_map* in, int64_t t, float* out) {
     gsf__conv_fill fill;
     memset(&fill, 0, sizeof fill);
@@ -10107,7 +10135,7 @@ static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gs
     fill.out = out;
     if (norm) {
         fill.mean = run->table.data;
-        fill.table = fill.mean + in->channels; // scale, shift
+        fill.table = fill.mean + in->channels; // then shift
         if (norm->y.out) {
             const int64_t z = gsf__vae_latent_frame(t, in->frames, run->z.frames);
             fill.table_width = run->z.width;
@@ -10119,7 +10147,7 @@ static void gsf__vae_fill(gsf__vae_run* run, const gsf__vae_norm* norm, const gs
     if (norm && run->watch.fn) run->watch.fn(run->watch.user, norm->weight, run->chunk, in, t, out);
 }
 
-// Room for a layer's result in slot out->slot, its weights and its sums; starts the job. The weights are not packed yet.
+// Grows the buffers for a layer's result (slot out->slot), weights and sums, and sets up the job. Packs no weights yet.
 static gsf_result gsf__vae_start(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in, int halve,
                                  gsf__vae_map* out, gsf__conv_job* job) {
     GSF__TRY(gsf__check_cancel(run->ctx));
@@ -10154,7 +10182,7 @@ static gsf_result gsf__vae_finish(gsf__vae_run* run, const gsf__conv_layer* laye
     return GSF_OK;
 }
 
-// The frames that the next chunk's layer starts from; one that stands in the spare frame moves.
+// Keeps the last two frames for the layer's next chunk; if one of them is in the spare buffer it is copied.
 static void gsf__vae_keep(gsf__vae_run* run, gsf__vae_cache* cache, int before, int last, size_t bytes) {
     if (before == 2 || last == 2) {
         const int other = before == 2 ? last : before;
@@ -10167,7 +10195,8 @@ static void gsf__vae_keep(gsf__vae_run* run, gsf__vae_cache* cache, int before, 
     cache->last[1] = last;
 }
 
-// A causal layer, `norm` and SiLU before it (NULL: neither); the result goes to out->slot, or is added to it.
+// A causal layer with optional norm and SiLU before it (NULL: neither); the result is stored in, or added to,
+// out->slot.
 static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_norm* norm,
                                   const gsf__vae_map* in, int accumulate, gsf__vae_map* out) {
     gsf__conv_job job;
@@ -10194,7 +10223,7 @@ static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* laye
         int now = 0;
         while (now == before || now == last) now++;
         gsf__vae_fill(run, norm, in, t, ring[now]);
-        if (last < 0) before = last = now; // before the first frame: itself
+        if (last < 0) before = last = now; // the first frame is its own predecessor
         job.in[0] = ring[before];
         job.in[1] = ring[last];
         job.in[2] = ring[now];
@@ -10208,7 +10237,8 @@ static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* laye
     return gsf__vae_finish(run, layer, out);
 }
 
-// Pointwise: to slot `slot`, or, where that is the input's and the channels get fewer, in place, frame by frame.
+// Pointwise shortcut to slot out->slot. If that is the input's slot, in place frame by frame, as channels do not
+// increase.
 static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in,
                                     gsf__vae_map* out) {
     gsf__conv_job job;
@@ -10224,7 +10254,7 @@ static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* la
     gsf__conv_pack(run->ctx, layer, run->packed.data);
     job.in_stride = in->width * in->channels;
     job.origin = 0;
-    job.partial = NULL; // conv2 will be added
+    job.partial = NULL; // conv2 is added later and computes the sums
     for (int64_t t = 0; t < in->frames; t++) {
         float* y = run->slots[slot].data + t * plane;
         job.in[0] = run->slots[in->slot].data + t * gsf__vae_plane(in);
@@ -10248,12 +10278,13 @@ static gsf_result gsf__vae_resnet_run(gsf__vae_run* run, const gsf__vae_resnet* 
     return GSF_OK;
 }
 
-// Source frame of frame t of a doubled clip; an odd clip's first frame is not doubled.
+// Source frame of frame t after temporal doubling; the first frame of an odd clip is not doubled.
 static int64_t gsf__vae_double_source(int64_t t, int64_t frames, int time) {
     return !time || frames == 1 ? t : frames % 2 ? (t + 1) / 2 : t / 2;
 }
 
-// One frame of gsf__vae_double: `job` for parity (0, 0) of a `width` wide input, packed weights of all four.
+// One frame of gsf__vae_double: `job` is set up for parity (0, 0) of the input; its packed weights cover all four
+// parities.
 static void gsf__vae_double_frame(gsf__vae_run* run, const gsf__conv_layer* quarter, const gsf__conv_job* job, float* out) {
     double* sums = gsf__vae_sums(run, GSF__VAE_SLOTS);
     double* part = gsf__vae_sums(run, GSF__VAE_SLOTS + 1);
@@ -10272,8 +10303,9 @@ static void gsf__vae_double_frame(gsf__vae_run* run, const gsf__conv_layer* quar
     }
 }
 
-// Nearest resize to twice the size and, with `time`, twice the frames, then a 2D convolution, once for frames that are
-// alike.
+// Nearest resize to twice the size and, with `time`, twice the frames, followed by a 2D convolution, which is computed
+// once for duplicated frames. The two are fused into four convolutions on the input's grid, one for each parity of the
+// output.
 static gsf_result gsf__vae_double(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
     const gsf__conv_layer quarter = gsf__conv_quarter(&block->sampler);
     gsf__conv_job job;
@@ -10305,7 +10337,8 @@ static gsf_result gsf__vae_double(gsf__vae_run* run, const gsf__vae_block* block
     return gsf__vae_finish(run, &block->sampler, x);
 }
 
-// With `time`, means of two frames (an odd clip's first frame stays alone), then a 2D convolution of stride 2.
+// With `time`, averages pairs of frames (the first frame of an odd clip is kept as is); then a 2D convolution of stride
+// 2.
 static gsf_result gsf__vae_halve(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
     gsf__conv_job job;
     gsf__conv_fill fill;
@@ -10339,7 +10372,7 @@ static gsf_result gsf__vae_halve(gsf__vae_run* run, const gsf__vae_block* block,
     return gsf__vae_finish(run, &block->sampler, x);
 }
 
-// One chunk, whose input stands in slot GSF__VAE_INPUT.
+// Runs one chunk, whose input is in slot GSF__VAE_INPUT.
 static gsf_result gsf__vae_chunk(gsf__vae_run* run, const gsf__vae_map* in, gsf__vae_map* out) {
     const gsf__vae_net* net = run->net;
     gsf__vae_map x;
@@ -10358,7 +10391,7 @@ static gsf_result gsf__vae_chunk(gsf__vae_run* run, const gsf__vae_map* in, gsf_
     return gsf__vae_causal(run, &net->conv_out, &net->norm_out, &x, 0, out);
 }
 
-// ---- clips
+// ---- clips and tiles
 
 typedef struct gsf__vae_planes { // a view of (channels, frames, height, width) floats
     float* data;
@@ -10390,7 +10423,7 @@ static float* gsf__vae_row(const gsf__vae_planes* p, int64_t c, int64_t t, int64
     return p->data + c * p->channel_stride + t * p->frame_stride + y * p->row_stride;
 }
 
-// Frames of a clip, from `first` on, to channels-last; or back.
+// Copies frames of a clip, from `first` on, to channels-last layout, or back.
 static void gsf__vae_swap(const gsf__vae_planes* clip, int64_t first, int64_t frames, float* last, int back) {
     for (int64_t t = 0; t < frames; t++)
         for (int64_t y = 0; y < clip->height; y++, last += clip->width * clip->channels)
@@ -10406,7 +10439,7 @@ static int64_t gsf__vae_chunk_count(int64_t frames, int decoder) {
     return frames < per ? 1 : frames / per;
 }
 
-// Frames of chunk k: the remainder joins the first.
+// Frames of chunk k; the first chunk also takes the remainder.
 static int64_t gsf__vae_chunk_frames(int64_t frames, int decoder, int64_t k) {
     const int64_t per = decoder ? GSF__VAE_DECODER_FRAMES : GSF__VAE_ENCODER_FRAMES;
     if (frames < per) return frames;
@@ -10416,7 +10449,7 @@ static int64_t gsf__vae_chunk_frames(int64_t frames, int decoder, int64_t k) {
 static int64_t gsf__vae_out_frames(const gsf_nn_vae* vae, int64_t frames, int decoder) {
     int64_t sum = 0;
     const int64_t chunks = gsf__vae_chunk_count(frames, decoder);
-    for (int64_t k = 0; k < 2 && k < chunks; k++) { // all but the first are alike
+    for (int64_t k = 0; k < 2 && k < chunks; k++) { // all chunks except the first have the same size
         int64_t n = gsf__vae_chunk_frames(frames, decoder, k);
         for (int32_t ratio = vae->temporal_ratio; ratio > 1; ratio /= 2) {
             if (!decoder) n = (n + 1) / 2;
@@ -10427,7 +10460,7 @@ static int64_t gsf__vae_out_frames(const gsf_nn_vae* vae, int64_t frames, int de
     return sum;
 }
 
-// All chunks of a clip or tile.
+// Runs all chunks of a clip or tile.
 static gsf_result gsf__vae_clip(gsf__vae_run* run, const gsf__vae_planes* in, const gsf__vae_planes* out) {
     int64_t first = 0, out_first = 0;
     run->chunks = gsf__vae_chunk_count(in->frames, run->net->decoder);
@@ -10451,14 +10484,14 @@ static gsf_result gsf__vae_clip(gsf__vae_run* run, const gsf__vae_planes* in, co
     return GSF_OK;
 }
 
-typedef struct gsf__vae_plan { // how a job is tiled; an untiled one is a single tile
+typedef struct gsf__vae_plan { // tiling of a task; without tiling a single tile
     int64_t out_frames, out_height, out_width, out_channels;
     int64_t rows, columns;                 // tiles
-    int64_t tile[2], step[2];              // height, width of a tile of the input; distance of two
-    int64_t out_step[2], blend[2];         // the same distance and the overlap in the result
+    int64_t tile[2], step[2];              // height, width of an input tile; distance between tiles
+    int64_t out_step[2], blend[2];         // distance and overlap in the output
 } gsf__vae_plan;
 
-// int() of a Python float.
+// int() of a nonnegative Python float.
 static int64_t gsf__vae_whole(double value) { return (int64_t)floor(value); }
 
 static gsf_result gsf__vae_plan_axis(gsf_context* ctx, const gsf_nn_vae* vae, int decoder, const char* axis, int64_t tile,
@@ -10491,7 +10524,8 @@ static gsf_result gsf__vae_check_size(gsf_context* ctx, const gsf_nn_vae* vae, i
     for (int32_t i = 0; i < vae->levels; i++)
         if (vae->channels[i] > widest) widest = vae->channels[i];
     const double scale = decoder ? (double)vae->spatial_ratio * vae->spatial_ratio * vae->temporal_ratio : 1.0;
-    if ((double)frames * ((double)height + 2.0) * ((double)width + 2.0) * scale * widest > 1e15) // sizes below 2^63
+    // keeps all sizes below 2^63
+    if ((double)frames * ((double)height + 2.0) * ((double)width + 2.0) * scale * widest > 1e15)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "vae: %lld frames of %lld x %lld are too large", (long long)frames,
                         (long long)width, (long long)height);
     return GSF_OK;
@@ -10531,7 +10565,7 @@ static gsf_result gsf__vae_make_plan(gsf_context* ctx, const gsf_nn_vae* vae, in
     return GSF_OK;
 }
 
-// b's first lines fade from a's last ones, in place. `across`: columns instead of rows.
+// Cross-fades b's first rows with a's last ones, in place. `across`: columns instead of rows.
 static void gsf__vae_fade(const gsf__vae_planes* a, const gsf__vae_planes* b, int64_t extent, int across) {
     const int64_t a_size = across ? a->width : a->height, b_size = across ? b->width : b->height;
     if (extent > a_size) extent = a_size;
@@ -10550,7 +10584,7 @@ static void gsf__vae_fade(const gsf__vae_planes* a, const gsf__vae_planes* b, in
     }
 }
 
-static void gsf__vae_copy(const gsf__vae_planes* from, const gsf__vae_planes* to) { // what both have
+static void gsf__vae_copy(const gsf__vae_planes* from, const gsf__vae_planes* to) { // copies the common area
     const int64_t height = from->height < to->height ? from->height : to->height;
     const int64_t width = from->width < to->width ? from->width : to->width;
     for (int64_t c = 0; c < to->channels; c++)
@@ -10559,14 +10593,14 @@ static void gsf__vae_copy(const gsf__vae_planes* from, const gsf__vae_planes* to
                 memcpy(gsf__vae_row(to, c, t, y), gsf__vae_row(from, c, t, y), (size_t)width * sizeof(float));
 }
 
-// Height (axis 0) or width of tile k of an input of `size`.
+// Height (axis 0) or width (axis 1) of tile k of an input of `size`.
 static int64_t gsf__vae_tile_size(const gsf__vae_plan* plan, int axis, int64_t size, int64_t k) {
     const int64_t left = size - k * plan->step[axis];
     return left < plan->tile[axis] ? left : plan->tile[axis];
 }
 
-// Tile after tile, each over all frames. A tile is blended with the blended ones above and to the left, which is why two
-// rows of tiles are kept: tiles (2, columns).
+// Runs the tiles one by one, each over all frames. A tile is blended with the already blended tiles above and to its
+// left, so two rows of tiles are kept: tiles (2, columns).
 static gsf_result gsf__vae_tiles(gsf__vae_run* run, const gsf__vae_plan* plan, const gsf__vae_planes* in,
                                  const gsf__vae_planes* out, gsf__vae_buffer* tiles) {
     const int64_t ratio_up = run->net->decoder ? plan->out_step[0] / plan->step[0] : 1;
@@ -10617,7 +10651,7 @@ static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const fl
                                plan->out_channels * plan->out_frames * plan->out_height * plan->out_width));
         out = task->moments.data;
     }
-    // The input is only read; gsf__vae_planes serves both ways.
+    // The input is only read, but gsf__vae_planes is not const.
     const gsf__vae_planes from =
         gsf__vae_wrap((float*)(uintptr_t)in, task->decoder ? vae->latent_channels : vae->in_channels, task->frames,
                       task->height, task->width);
@@ -10628,7 +10662,7 @@ static gsf_result gsf__vae_walk(gsf__vae_run* run, gsf__vae_task* task, const fl
     return gsf__vae_tiles(run, plan, &from, &to, task->tiles);
 }
 
-// Runs, or with in == NULL only counts: *flops and *bytes.
+// Runs the task; with in == NULL it only counts *flops and *bytes.
 static gsf_result gsf__vae_execute(gsf_context* ctx, gsf__vae_task* task, const float* in, float* out, float* mean,
                                    float* logvar, double* flops, double* bytes) {
     const gsf__vae_nets* nets = (const gsf__vae_nets*)task->vae->nets;
@@ -10731,25 +10765,25 @@ GSF_API gsf_result gsf_nn_decode_vae(gsf_context* ctx, const gsf_nn_vae* vae, co
 
 // ---- >>nn transformer -----------------------------------------------------------
 
-typedef struct gsf__dit_attention { // its keys and values come from the stream itself, or from the references
+typedef struct gsf__dit_attention { // keys and values: from the sample itself or the references
     gsf__nn_layer q, k, v, out, norm_q, norm_k;
 } gsf__dit_attention;
 
-typedef struct gsf__dit_norm { // LayerNorm whose scale, shift and gates come from the time step
+typedef struct gsf__dit_norm { // LayerNorm whose scale, shift and gates depend on the time step
     gsf__nn_layer linear, norm;
 } gsf__dit_norm;
 
 typedef struct gsf__dit_block {
     gsf__dit_norm norm1, norm2;
     gsf__dit_attention self, cross;
-    gsf__nn_layer norm_cross, up, down; // feed-forward
+    gsf__nn_layer norm_cross, up, down; // up, down: feed-forward
 } gsf__dit_block;
 
 typedef struct gsf__dit_projector { gsf__nn_layer linear, norm; } gsf__dit_projector;
 
 typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
     gsf__dit_block* blocks;
-    gsf__nn_quantized* quantized; // for each tensor of the file, empty where it stays as it is; NULL: all do
+    gsf__nn_quantized* quantized; // one per tensor of the file, empty if not quantized; NULL: no tensor is
     gsf__dit_projector dino, vggt;
     gsf__dit_norm norm_out;
     gsf__nn_layer patch, text, time1, time2, norm_final, out;
@@ -10758,7 +10792,7 @@ typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
 
 static int64_t gsf__dit_width(const gsf_nn_transformer* c) { return (int64_t)c->heads * c->head_dim; }
 
-// ---- opening: which tensor goes where, and its shape
+// ---- loading: tables of tensors
 
 #define GSF__DIT_AT(member) GSF__NN_AT(gsf__dit_block, member)
 #define GSF__DIT_ATTENTION(prefix, member)                                                           \
@@ -10803,8 +10837,9 @@ static const gsf__nn_entry gsf__dit_entries[] = {
 };
 #undef GSF__DIT_AT
 
-// d width, h head_dim, f 4 width, m 6 width, n 2 width, t time channels, x text channels, i in_channels, k patch, p outputs
-// of a token, s text and video tokens of the learned table, b 0 without biases of q, k, v, l 0 without that table.
+// Letters: d width, h head_dim, f 4 width, m 6 width, n 2 width, t time channels, x text channels, i in_channels, k
+// patch, p outputs of a token, s text and video tokens of the learned position table, b 0 if q, k, v have no biases, l
+// 0 without that table.
 static gsf__nn_sizes gsf__dit_tensor_sizes(const gsf_nn_transformer* c) {
     const int64_t d = gsf__dit_width(c), frames = c->temporal_ratio ? (c->sample_frames - 1) / c->temporal_ratio + 1 : 0;
     const int64_t places = c->text_tokens + frames * (c->sample_height / c->patch) * (c->sample_width / c->patch);
@@ -10858,7 +10893,7 @@ static gsf_result gsf__dit_bind(gsf__nn_loader* loader, void* network) {
     nets->blocks = (gsf__dit_block*)gsf_alloc_zeroed(loader->ctx, (size_t)net->layers, sizeof *nets->blocks);
     if (!nets->blocks) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__nn_bind(loader, &sizes, gsf__dit_entries, "", nets));
-    if (!net->learned_positions) gsf__nn_ignore(loader, "patch_embed.pos_embedding"); // computed
+    if (!net->learned_positions) gsf__nn_ignore(loader, "patch_embed.pos_embedding"); // computed instead
     net->dino_channels = (int32_t)nets->dino.linear.weight->shape[1];
     net->vggt_channels = (int32_t)nets->vggt.linear.weight->shape[1];
     return gsf__nn_bind_each(loader, &sizes, gsf__dit_block_entries, "transformer_blocks.", net->layers,
@@ -10910,29 +10945,30 @@ GSF_API gsf_result gsf_nn_load_transformer(gsf_context* ctx, const char* folder,
     return result;
 }
 
-// ---- one forward pass
+// ---- forward pass
 
 typedef struct gsf__dit_run {
     gsf__nn_run nn;
     const gsf_nn_transformer* net;
     const gsf__dit_nets* nets;
     const gsf_nn_transformer_desc* in;
-    int64_t width, text, video, tokens; // tokens = text + video: rows of a sample
+    int64_t width, text, video, tokens; // tokens = text + video: rows per sample
     float* x;       // (batch, tokens, width): the residual stream, text first
     float* normed;  // (tokens, width)
-    float* qkv;     // 3 x (rows, width), rows the larger of tokens and reference tokens; the feed-forward's hidden rows
+    // 3 x (rows, width), rows: the larger of tokens and reference tokens; also the feed-forward's hidden rows
+    float* qkv;
     int64_t qkv_rows;
     float* time;    // (batch, time_channels): SiLU of the time embedding
     float* modulation; // (6 width)
     float *cos, *sin; // (video, head_dim) or NULL
-    float* probe;   // (tokens, width): what a gated layer adds; only with a tap
+    float* probe;   // (tokens, width): output of a gated layer before the gate; only with a tap
 } gsf__dit_run;
 
 static gsf_result gsf__dit_linear(gsf__dit_run* run, const gsf__nn_layer* layer, const float* x, int64_t rows, float* y) {
     return gsf__nn_linear(&run->nn, layer, GSF__NN_LINEAR, x, rows, y, 0);
 }
 
-// x += gate * (h w^T + b), or without a gate. What is added goes to `probe` as well unless that is NULL.
+// x += gate * (h w^T + b); gate NULL: 1. Also stores the ungated output in `probe` unless that is NULL.
 static gsf_result gsf__dit_add(gsf__dit_run* run, const gsf__nn_layer* layer, const float* gate, const float* h, int64_t rows,
                                float* x, float* probe) {
     if (probe) GSF__TRY(gsf__dit_linear(run, layer, h, rows, probe));
@@ -10941,13 +10977,13 @@ static gsf_result gsf__dit_add(gsf__dit_run* run, const gsf__nn_layer* layer, co
 
 static void gsf__dit_norm_heads(gsf__dit_run* run, const gsf__nn_layer* norm, int rotate, float* x, int64_t rows) {
     const gsf_nn_transformer* c = run->net;
-    const float eps = 1e-6f; // fixed in the official code
+    const float eps = 1e-6f; // hard-coded in the GSFixer release
     gsf__nn_norm_heads(&run->nn, norm, eps, c->heads, c->head_dim, rotate ? run->cos : NULL, rotate ? run->sin : NULL,
                        rotate ? run->text : 0, x, rows, run->width);
 }
 
 static gsf_result gsf__dit_attend(gsf__dit_run* run, int64_t queries, int64_t keys, const float* q, const float* k,
-                                  const float* v) { // into run->normed
+                                  const float* v) { // result in run->normed
     gsf__nn_attention_desc a;
     memset(&a, 0, sizeof a);
     a.queries = queries;
@@ -10961,8 +10997,8 @@ static gsf_result gsf__dit_attend(gsf__dit_run* run, int64_t queries, int64_t ke
     return gsf__nn_attend(&run->nn, &a, 1);
 }
 
-// Both streams of a sample through LN(x) (1 + scale) + shift with their own shift and scale. The six parts of the
-// modulation: shift, scale, gate of the video, then of the text.
+// LN(x) (1 + scale) + shift for the text and the video tokens of a sample, each with its own shift and scale. The
+// modulation has six parts: shift, scale, gate of the video, then those of the text.
 static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t row, const gsf__dit_norm* norm) {
     const int64_t d = run->width;
     const float *x = run->x + row * run->tokens * d, *time = run->time + row * run->net->time_channels;
@@ -10980,9 +11016,9 @@ static gsf_result gsf__dit_modulate(gsf__dit_run* run, const char* name, int32_t
     return GSF_OK;
 }
 
-enum { GSF__DIT_TEXT_GATE = 5, GSF__DIT_VIDEO_GATE = 2 }; // places in the modulation
+enum { GSF__DIT_TEXT_GATE = 5, GSF__DIT_VIDEO_GATE = 2 }; // indices of parts of the modulation
 
-// x += gate * attention over text and video together.
+// x += gate * attention over text and video tokens together.
 static gsf_result gsf__dit_self_attention(gsf__dit_run* run, int32_t row, const gsf__dit_attention* a) {
     const int64_t d = run->width, n = run->tokens;
     const float *text_gate = run->modulation + GSF__DIT_TEXT_GATE * d, *gate = run->modulation + GSF__DIT_VIDEO_GATE * d;
@@ -11011,7 +11047,7 @@ static gsf_result gsf__dit_reference_kv(gsf__dit_run* run, const gsf__dit_attent
     return GSF_OK;
 }
 
-// The video's tokens look at the references: x += attention(norm(x), references), no gate, no rotation.
+// Video tokens attend to the references: x += attention(norm(x), references), without gate or rotation.
 static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32_t index, const gsf__dit_block* block) {
     const gsf__dit_attention* a = &block->cross;
     const int64_t d = run->width, r = run->in->reference_tokens;
@@ -11034,7 +11070,7 @@ static gsf_result gsf__dit_cross_attention(gsf__dit_run* run, int32_t row, int32
     return GSF_OK;
 }
 
-// x += gate * down(gelu(up(normed))), in row chunks whose hidden layer fits the room of q, k and v.
+// x += gate * down(gelu(up(normed))), in groups of rows whose hidden layer fits in the buffer of q, k and v.
 static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gsf__dit_block* block) {
     const int64_t d = run->width, most = run->qkv_rows * 3 / 4;
     float* x = run->x + row * run->tokens * d;
@@ -11053,7 +11089,7 @@ static gsf_result gsf__dit_feed_forward(gsf__dit_run* run, int32_t row, const gs
     return GSF_OK;
 }
 
-// One block for all samples, layer by layer so that they share the keys and values of the references.
+// Runs one block on all samples, layer by layer, so that they can share the keys and values of the references.
 static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
     const gsf__dit_block* block = &run->nets->blocks[index];
     const int32_t batch = run->in->batch;
@@ -11081,9 +11117,9 @@ static gsf_result gsf__dit_block_forward(gsf__dit_run* run, int32_t index) {
     return GSF_OK;
 }
 
-// ---- first and last layers
+// ---- input and output layers
 
-// SiLU of the embedding of each sample's time step.
+// SiLU of the time embedding of each sample.
 static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
     const int64_t d = run->width, t = run->net->time_channels;
     for (int32_t b = 0; b < run->in->batch; b++) {
@@ -11098,8 +11134,8 @@ static gsf_result gsf__dit_embed_time(gsf__dit_run* run) {
     return GSF_OK;
 }
 
-// Adds the position table to text and video: the stored one for the configured frame count, else sines and cosines (video
-// only), as the official code does.
+// Adds position embeddings: the learned table (text and video) for the configured number of frames, otherwise sines and
+// cosines (video only), as diffusers' CogVideoXPatchEmbed does.
 static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
     const gsf_nn_transformer* c = run->net;
     const gsf_nn_transformer_desc* in = run->in;
@@ -11107,7 +11143,7 @@ static gsf_result gsf__dit_add_positions(gsf__dit_run* run) {
     const int64_t d = run->width;
     const int same_frames = (in->frames - 1) * c->temporal_ratio + 1 == c->sample_frames;
     if (c->learned_positions && same_frames && run->text == c->text_tokens) {
-        for (int64_t r = 0; r < run->tokens; r++) { // a row at a time: the table may be bf16
+        for (int64_t r = 0; r < run->tokens; r++) { // row by row, as the table may be bf16
             gsf_nn_convert_tensor(run->nets->positions, r * d, d, run->qkv);
             for (int32_t b = 0; b < in->batch; b++)
                 for (int64_t i = 0; i < d; i++) run->x[(b * run->tokens + r) * d + i] += run->qkv[i];
@@ -11139,7 +11175,7 @@ static gsf_result gsf__dit_embed(gsf__dit_run* run) {
     return gsf__nn_check(&run->nn, "the embedding", "patch_embed.", run->x, in->batch * run->tokens * d);
 }
 
-// Video tokens to velocities: two layer norms in a row, the second modulated, then the output projection.
+// Video tokens to velocities: two LayerNorms in sequence, the second one modulated, then the output projection.
 static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
     const gsf_nn_transformer* c = run->net;
     const int64_t d = run->width, outputs = (int64_t)c->out_channels * c->patch * c->patch;
@@ -11159,14 +11195,14 @@ static gsf_result gsf__dit_head(gsf__dit_run* run, int32_t row, float* out) {
     return GSF_OK;
 }
 
-// ---- blocks, and the skip of those whose work would repeat the last step's
+// ---- blocks, and the cache that skips them if they would repeat the previous step
 
 GSF_API void gsf_nn_destroy_block_cache(gsf_context* ctx, gsf_nn_block_cache* cache) {
     gsf_free(ctx, cache->first);
     memset(cache, 0, sizeof *cache);
 }
 
-enum { GSF__DIT_CACHE_ROWS = 8 }; // the change is measured on every 8th row
+enum { GSF__DIT_CACHE_ROWS = 8 }; // the change is measured on every 8th row only
 
 static gsf_result gsf__dit_open_cache(gsf__dit_run* run, gsf_nn_block_cache* cache) {
     const size_t rows = (size_t)run->in->batch * (size_t)run->tokens, width = (size_t)run->width;
@@ -11189,7 +11225,8 @@ static void gsf__dit_note_before(const gsf__dit_run* run, gsf_nn_block_cache* ca
     for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, to += d) memcpy(to, run->x + r * d, (size_t)d * sizeof(float));
 }
 
-// 1 if what the first block added is close enough to what it added last time (relative L1); notes it for the next time.
+// Returns 1 if the first block's residual is close to that of the previous call (relative L1), and stores it for the
+// next.
 static int gsf__dit_is_similar(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
     const int64_t rows = run->in->batch * run->tokens, d = run->width;
     double change = 0.0, size = 0.0;
@@ -11219,7 +11256,7 @@ static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
         if (!cache || i > 0) continue;
         const int similar = gsf__dit_is_similar(run, cache);
         cache->calls++;
-        if (similar) { // what the other blocks added last time
+        if (similar) { // reuse what the other blocks added in the last full call
             cache->hits++;
             for (int64_t j = 0; j < count; j++) run->x[j] += cache->rest[j];
             return GSF_OK;
@@ -11230,7 +11267,7 @@ static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
     return GSF_OK;
 }
 
-// ---- the pass as a whole
+// ---- the whole pass
 
 static gsf_result gsf__dit_check_size(gsf_context* ctx, const gsf_nn_transformer* c, int32_t height, int32_t width) {
     if (height < c->patch || width < c->patch || height % c->patch || width % c->patch)
@@ -11280,10 +11317,10 @@ static void gsf__dit_set_input(gsf__dit_run* run, const gsf_nn_transformer_desc*
     run->video = (int64_t)in->frames * (in->height / c->patch) * (in->width / c->patch);
     run->tokens = run->text + run->video;
     run->qkv_rows = in->references && in->reference_tokens > run->tokens ? in->reference_tokens : run->tokens;
-    if (run->qkv_rows < 4) run->qkv_rows = 4; // a chunk of the feed-forward is 3/4 of them
+    if (run->qkv_rows < 4) run->qkv_rows = 4; // a group of the feed-forward has 3/4 of them, which must not be 0
 }
 
-// Shares out `memory`, or counts its floats.
+// Divides `memory`, or counts the floats it needs if it is NULL.
 static size_t gsf__dit_lay_out(gsf__dit_run* run, float* memory) {
     const gsf_nn_transformer* c = run->net;
     const size_t d = (size_t)run->width, rows = (size_t)run->tokens, time = (size_t)c->time_channels;
@@ -11346,15 +11383,15 @@ GSF_API gsf_result gsf_nn_run_transformer(gsf_context* ctx, const gsf_nn_transfo
     return result;
 }
 
-// Floats of reference_kv: every block's keys and values of all reference tokens.
+// Number of floats in reference_kv: keys and values of all reference tokens for every block.
 static size_t gsf__nn_query_reference_kv(const gsf_nn_transformer* transformer, int64_t reference_tokens,
                                          int32_t reference_batch) {
     return (size_t)transformer->layers * (size_t)reference_batch * 2 * (size_t)reference_tokens *
            (size_t)gsf__dit_width(transformer);
 }
 
-// Bytes of memory (beside the mapped weights and some 70 MB of the kernels' scratch) and floating-point operations of one
-// such call.
+// Memory in bytes (in addition to mapped weights and about 70 MB of kernel scratch) and floating-point operations of
+// one gsf_nn_run_transformer call.
 static void gsf__nn_query_transformer(const gsf_nn_transformer* transformer, const gsf_nn_transformer_desc* input,
                                       double* bytes, double* flops) {
     const gsf_nn_transformer* c = transformer;
@@ -11388,10 +11425,10 @@ GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_tran
     run.nn.vectors_size = (size_t)(2 * d);
     gsf_result result = GSF_OK;
     for (int i = 0; i < 2 && !result; i++) {
-        float* to = i && dino ? memory : out; // the second is added to the first
+        float* to = i && dino ? memory : out; // the second projection is added to the first
         if (!parts[i].from) continue;
         result = gsf__dit_linear(&run, &parts[i].by->linear, parts[i].from, tokens, to);
-        if (!result) gsf__nn_norm(&run.nn, &parts[i].by->norm, 1e-5f, to, tokens, to); // torch's default eps
+        if (!result) gsf__nn_norm(&run.nn, &parts[i].by->norm, 1e-5f, to, tokens, to); // PyTorch's default eps
         for (int64_t j = 0; !result && to == memory && j < tokens * d; j++) out[j] += memory[j];
     }
     gsf__nn_destroy_workspace(ctx, &run.nn.workspace);
@@ -11401,8 +11438,9 @@ GSF_API gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_tran
 
 // ---- >>nn scheduler -------------------------------------------------------------
 
-// Zero SNR: sqrt(abar) is shifted and scaled to end at 0 (Lin et al. 2024, algorithm 1). diffusers' DDIMScheduler, which
-// the official pipeline runs, does this in float32 and is up to 5e-7 away; its CogVideoXDDIMScheduler does it in double.
+// Zero terminal SNR: sqrt(abar) is shifted and scaled to end at 0 (Lin et al. 2024, algorithm 1). diffusers'
+// DDIMScheduler, which the GSFixer release uses, does this in float32 and differs by up to 5e-7; its
+// CogVideoXDDIMScheduler uses double.
 static void gsf__nn_fill_table(const gsf_nn_schedule_desc* d, double* alpha_bar) {
     const int32_t n = d->train_steps;
     const double begin = d->linear_betas ? d->beta_start : sqrt(d->beta_start);
@@ -11453,7 +11491,7 @@ GSF_API gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_
     double* table = (double*)gsf_alloc(ctx, (size_t)d.train_steps, sizeof(double));
     if (!table) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__nn_fill_table(&d, table);
-    int falls = table[0] < 1.0 && table[d.train_steps - 1] >= 0.0; // a NaN fails
+    int falls = table[0] < 1.0 && table[d.train_steps - 1] >= 0.0; // a NaN fails, too
     for (int32_t i = 1; falls && i < d.train_steps; i++) falls = table[i] <= table[i - 1];
     if (!falls) {
         gsf_free(ctx, table);
@@ -11482,7 +11520,7 @@ static gsf_result gsf__nn_read_schedule(const gsf__nn_config* config, gsf_nn_sch
         GSF__KEY_FLAG_OR("rescale_betas_zero_snr", rescale, 0), GSF__KEY_FLAG_OR("set_alpha_to_one", alpha_one, 1),
         GSF__KEY_WORD_OR("timestep_spacing", d->spacing, "leading", "trailing|leading|linspace")};
     GSF__TRY(gsf__nn_config_read(config, keys, GSF__COUNT(keys)));
-    const gsf__nn_key rest[] = { // whose bounds the others tell
+    const gsf__nn_key rest[] = { // with bounds that depend on the keys above
         GSF__KEY_INT_OR("steps_offset", d->steps_offset, 0, 0, (double)(d->train_steps - 1)),
         GSF__KEY_REAL_OR("beta_end", d->beta_end, 0.02, d->beta_start, 0.999)};
     d->no_zero_snr = !rescale;
@@ -11513,11 +11551,11 @@ GSF_API gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_
     return result;
 }
 
-// One of the `steps` times before the cut by strength; numpy's arithmetic, half to even.
+// Time step i of `steps`, before strength is applied; follows numpy, which rounds half to even.
 static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, int32_t i) {
     const double n = d->train_steps;
     switch (d->spacing) {
-        case GSF_NN_SPACING_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange adds multiples of its first difference
+        case GSF_NN_SPACING_TRAILING: { // round(arange(n, 0, -n/steps)) - 1; arange multiplies its first difference
             const double difference = (n - n / steps) - n;
             return (int32_t)rint(n + i * difference) - 1;
         }
@@ -11530,8 +11568,8 @@ static int32_t gsf__nn_timestep(const gsf_nn_schedule_desc* d, int32_t steps, in
     return 0;
 }
 
-// Time steps for `steps` (1..train_steps) model calls, falling. strength in (0, 1] (0: 1) keeps the last
-// (int)(steps * strength) of them, for latents that start as the noised render. out: room for `steps`.
+// Decreasing time steps for `steps` (1..train_steps) model calls. strength in (0, 1] (0: 1) keeps only the last
+// (int)(steps * strength) of them, for sampling that starts from the noised render. out: room for `steps`.
 static gsf_result gsf__nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t steps,
                                          double strength, int32_t* out, int32_t* count) {
     const gsf_nn_schedule_desc* d = &schedule->desc;
@@ -11551,16 +11589,16 @@ static gsf_result gsf__nn_make_timesteps(gsf_context* ctx, const gsf_nn_schedule
     return GSF_OK;
 }
 
-// ---- elementwise work
+// ---- elementwise updates
 
-typedef struct gsf__nn_step { // m: predicted clean latents; m0, m1: those of the last two steps; last: corrected latents
+typedef struct gsf__nn_step { // m: predicted clean latents; m0, m1: of the last two steps; last: last corrected latents
     double m_x, m_v;                        // m = m_x x + m_v v
     double c_last, c_m, c_m0, c_m1;         // x = c_last last + c_m m + c_m0 m0 + c_m1 m1, if `correct`
     double p_x, p_m, p_m0;                  // next x = p_x x + p_m m + p_m0 m0
     int correct;
     size_t count;
     const float *x_in, *v;
-    float *x, *x0, *m0, *m1, *last;         // all but x may be NULL
+    float *x, *x0, *m0, *m1, *last;         // all except x may be NULL
 } gsf__nn_step;
 
 static void gsf__nn_step_chunk(void* arg, size_t chunk, int32_t worker) {
@@ -11581,7 +11619,7 @@ static void gsf__nn_step_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// out = a * x + b * y
+// out = a x + b y
 static void gsf__nn_mix(gsf_context* ctx, double a, const float* x, double b, const float* y, size_t count, float* out) {
     gsf__nn_step job;
     memset(&job, 0, sizeof job);
@@ -11607,7 +11645,7 @@ GSF__SHARED void gsf__nn_make_velocity(gsf_context* ctx, const gsf_nn_schedule* 
     gsf__nn_mix(ctx, -sqrt(1.0 - bar), x0, sqrt(bar), noise, count, out);
 }
 
-// Elementwise over `count` values; out may be an input. timestep: 0..train_steps-1.
+// Elementwise over `count` values; out may be one of the inputs. timestep: 0..train_steps-1.
 GSF__SHARED void gsf__nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* schedule, int32_t timestep, const float* x,
                                     const float* v, size_t count, float* out) {
     const double bar = schedule->alpha_bar[timestep];
@@ -11617,9 +11655,10 @@ GSF__SHARED void gsf__nn_predict_x0(gsf_context* ctx, const gsf_nn_schedule* sch
 // ---- solvers
 /* With a = sqrt(abar), s = sqrt(1 - abar) and D(x) the predicted clean latents, the probability flow is
        d(x/s) = D du,  u = a/s = exp(lambda).
-   DDIM holds D fixed over a step; DPM-Solver++(2M) and UniPC take it as linear (the corrector: as quadratic) in lambda. At
-   zero SNR u is 0 and lambda -infinity. From there the first step is exact for constant D; a linear D is then taken in u,
-   not in lambda, by the one step that would need that point. The last step ends at s = 0, where x is D. */
+   DDIM assumes D is constant over a step; DPM-Solver++(2M) and UniPC assume it is linear in lambda (the UniPC
+   corrector: quadratic). At zero SNR u is 0 and lambda -infinity: the first step from there is exact for constant
+   D, and the one later step that would need lambda at that point takes D as linear in u instead. The last step ends at
+   s = 0, where x equals D. */
 
 typedef struct gsf__nn_point { double a, s; } gsf__nn_point;
 
@@ -11634,7 +11673,7 @@ static gsf__nn_point gsf__nn_sampler_point(const gsf_nn_sampler* sampler, int32_
     return gsf__nn_point_at(sampler->schedule->alpha_bar[sampler->timesteps[index]]);
 }
 
-// Where the step from `index` leads.
+// The point that the step from `index` leads to.
 static gsf__nn_point gsf__nn_sampler_target(const gsf_nn_sampler* sampler, int32_t index) {
     const gsf_nn_schedule* schedule = sampler->schedule;
     const int32_t next = sampler->desc.solver == GSF_NN_SOLVER_DDIM
@@ -11643,16 +11682,16 @@ static gsf__nn_point gsf__nn_sampler_target(const gsf_nn_sampler* sampler, int32
     return gsf__nn_point_at(next >= 0 ? schedule->alpha_bar[next] : schedule->final_alpha_bar);
 }
 
-// lambda(q) - lambda(p), both finite.
+// lambda(q) - lambda(p); both must be finite.
 static double gsf__nn_lambda(gsf__nn_point p, gsf__nn_point q) { return log(q.a * p.s / (q.s * p.a)); }
 
-// Predictor from p to t; q is the point before p, if second order is wanted.
+// Predictor from p to t; q: the point before p for second order, or NULL.
 static void gsf__nn_predictor(gsf__nn_step* step, gsf__nn_point p, gsf__nn_point t, const gsf__nn_point* q) {
     step->p_x = t.s / p.s;
     step->p_m = t.a - p.a * step->p_x; // t.a (1 - exp(-h))
     step->p_m0 = 0.0;
     if (!q || t.s == 0.0 || p.a == 0.0) return;
-    double weight; // of m - m0
+    double weight; // coefficient of m - m0
     if (q->a == 0.0) {
         const double u = p.a / p.s, rise = t.a / t.s - u;
         weight = t.s * rise * rise / (2.0 * u);
@@ -11664,14 +11703,14 @@ static void gsf__nn_predictor(gsf__nn_step* step, gsf__nn_point p, gsf__nn_point
     step->p_m0 = -weight;
 }
 
-// UniC-2 with B(h) = exp(-h) - 1 at p, the step's own point, which was reached from m0's point o (before it m1's point n,
-// NULL in the second step, where the corrector has first order): n -> o -> p.
+// UniC-2 with B(h) = exp(-h) - 1 at the current point p. m0 was predicted at the previous point o, m1 at the point n
+// before it; n is NULL in the second step, where the corrector is first order.
 static void gsf__nn_corrector(gsf__nn_step* step, const gsf__nn_point* n, gsf__nn_point o, gsf__nn_point p) {
     const double rise = p.a - o.a * p.s / o.s; // p.a (1 - exp(-h))
-    double weight = 0.5, earlier = 0.0;        // of m - m0 and of m1 - m0
+    double weight = 0.5, earlier = 0.0;        // coefficients of m - m0 and of m1 - m0
     if (n) {
         const double h = gsf__nn_lambda(o, p), phi = expm1(-h);
-        const double phi2 = phi / -h - 1.0, phi3 = phi2 / -h - 0.5; // h_phi_2, h_phi_3 of UniPC's code
+        const double phi2 = phi / -h - 1.0, phi3 = phi2 / -h - 0.5; // h_phi_2, h_phi_3 in UniPC's code
         weight = phi2 / phi;
         if (n->a != 0.0) {
             const double ratio = -gsf__nn_lambda(*n, o) / h, rho = (2.0 * phi3 / phi - weight) / (ratio - 1.0);
@@ -11688,7 +11727,7 @@ static void gsf__nn_corrector(gsf__nn_step* step, const gsf__nn_point* n, gsf__n
 
 GSF_API gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule, const gsf_nn_sampler_desc* desc,
                                        gsf_nn_sampler* out) {
-    static const size_t kept[] = {0, 1, 3}; // blocks of memory for each solver
+    static const size_t kept[] = {0, 1, 3}; // buffers of value_count floats, by solver
     gsf_nn_sampler sampler;
     memset(out, 0, sizeof *out);
     memset(&sampler, 0, sizeof sampler);
@@ -11717,12 +11756,12 @@ GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler) {
     memset(sampler, 0, sizeof *sampler);
 }
 
-// A schedule that is no longer stretched to zero SNR, or a start below it, never meets a = 0.
+// a = 0 occurs only at the zero-SNR end of the schedule, so not if the schedule or the first time step avoids it.
 static void gsf__nn_plan_step(const gsf_nn_sampler* sampler, gsf__nn_step* step) {
     const int32_t i = sampler->index;
     const size_t n = sampler->desc.value_count;
     const gsf__nn_point p = gsf__nn_sampler_point(sampler, i), t = gsf__nn_sampler_target(sampler, i);
-    gsf__nn_point before[2]; // one and two steps earlier
+    gsf__nn_point before[2]; // points one and two steps earlier
     memset(before, 0, sizeof before);
     if (i > 0) before[0] = gsf__nn_sampler_point(sampler, i - 1);
     if (i > 1) before[1] = gsf__nn_sampler_point(sampler, i - 2);
@@ -11761,25 +11800,25 @@ GSF_API gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler
 
 // ---- >>nn sampling --------------------------------------------------------------
 
-enum { GSF__SAMPLE_STREAM = 0x6e6f6973 }; // of the random numbers: the initial noise
+enum { GSF__SAMPLE_STREAM = 0x6e6f6973 }; // random stream of the initial noise
 
 typedef struct gsf__sample_run {
     gsf_context* ctx;
     const gsf_nn_transformer* net;
     const gsf_nn_vae* vae;
     const gsf_nn_schedule* schedule;
-    gsf_nn_sample_desc desc;       // defaults filled in
+    gsf_nn_sample_desc desc;       // with defaults filled in
     gsf_nn_sample_stats stats;
     int32_t frames, height, width; // of the latents
     int32_t channels;              // of the latents
-    int64_t count;                 // values of the latents
-    float *latents, *control;      // (frames, channels, height, width), control scaled as the network takes it
+    int64_t count;                 // number of latent values
+    float *latents, *control;      // (frames, channels, height, width), control in the network's scale
     float *input, *prediction;     // (2, frames, 2 channels, height, width), (2, frames, channels, height, width)
     float* reference_kv;
     int32_t reference_kv_ready;
     gsf_nn_block_cache cache;
     gsf_nn_sampler sampler;
-    uint32_t settings, clip; // checksums of everything that the result depends on; with a checkpoint
+    uint32_t settings, clip; // checksums of everything the result depends on; only with a checkpoint
 } gsf__sample_run;
 
 GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample_desc(const gsf_nn_sample_desc* desc) {
@@ -11809,7 +11848,7 @@ static gsf_result gsf__sample_defaults(gsf_context* ctx, gsf_nn_sample_desc* d) 
     return GSF_OK;
 }
 
-// Frames that the VAE gives back as many: 1, 9, 17, ... at the usual compression of 4.
+// Clip lengths that the VAE reproduces exactly: 1, 9, 17, ... for a temporal compression of 4.
 static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transformer* t, const gsf_nn_vae* v,
                                          const gsf_nn_sample_desc* d) {
     const int32_t step = 2 * v->temporal_ratio, square = v->spatial_ratio * t->patch;
@@ -11839,7 +11878,7 @@ static gsf_result gsf__sample_check(gsf_context* ctx, const gsf_nn_transformer* 
     return GSF_OK;
 }
 
-// Between (channels, frames, plane) and (frames, channels, plane), times a factor.
+// Transposes (channels, frames, plane) to (frames, channels, plane) or back, and multiplies by `factor`.
 static void gsf__swap_frames(const float* from, int64_t outer, int64_t inner, int64_t plane, float factor, float* to) {
     for (int64_t i = 0; i < inner; i++)
         for (int64_t o = 0; o < outer; o++, to += plane) {
@@ -11863,7 +11902,7 @@ static gsf_result gsf__sample_decode(gsf__sample_run* run, float* out) {
     return gsf_nn_decode_vae(run->ctx, run->vae, NULL, run->prediction, run->frames, run->height, run->width, out);
 }
 
-// Pure noise, or at strength < 1 the control latents with the noise of the first step.
+// Pure noise, or for strength < 1 the control latents with the noise level of the first step.
 static void gsf__sample_begin(gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     for (int64_t i = 0; i < run->count; i++)
@@ -11873,10 +11912,10 @@ static void gsf__sample_begin(gsf__sample_run* run) {
                           (size_t)run->count, run->latents);
 }
 
-// ---- checkpoint: what identifies the job, the step, the latents and what the solver remembers
+// ---- checkpoint: identity of the job, step, latents and solver state
 
-// Tells weights apart without reading all of them: every tensor's name, type and shape, and 64 bytes from its beginning,
-// middle and end.
+// Checksum that distinguishes weights without reading all of them: name, type and shape of every tensor, and 64 bytes
+// each from its beginning, middle and end.
 static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weights) {
     for (size_t i = 0; i < weights->tensor_count; i++) {
         const gsf_nn_tensor* t = &weights->tensors[i];
@@ -11890,7 +11929,7 @@ static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weig
     return crc;
 }
 
-// What every clip of a run has in common: model, precision, schedule and settings.
+// Checksum of what all clips of a run share: model, precision, schedule and settings.
 static uint32_t gsf__sample_sum_settings(const gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     const gsf_nn_transformer* t = run->net;
@@ -11909,7 +11948,7 @@ static uint32_t gsf__sample_sum_settings(const gsf__sample_run* run) {
     return gsf__sample_sum_weights(crc, &run->vae->weights);
 }
 
-// What this clip is made of.
+// Checksum of the inputs of this clip.
 static uint32_t gsf__sample_sum_clip(const gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     const gsf_nn_transformer* t = run->net;
@@ -11965,17 +12004,18 @@ static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size
     }
     if (latents.size != (size_t)run->count * sizeof(float) ||
         memory.size != run->sampler.memory_count * sizeof(float) || gsf__load_le(head.data, 4) != run->clip)
-        return; // of the clip before this
+        return; // from another clip
     const int64_t index = (int64_t)gsf__load_le((const char*)head.data + 4, 4);
     if (index < 1 || index > run->sampler.count) return;
-    if (!gsf__sample_is_finite(&latents) || !gsf__sample_is_finite(&memory)) return; // it would fail the same way each time
+    // would fail the same way on every run
+    if (!gsf__sample_is_finite(&latents) || !gsf__sample_is_finite(&memory)) return;
     memcpy(run->latents, latents.data, latents.size);
     if (memory.size) memcpy(run->sampler.memory, memory.data, memory.size);
     run->sampler.index = (int32_t)index;
 }
 
-// Goes on from the checkpoint if there is one of this very job; one of another job, or a broken one, is overwritten after
-// the first step.
+// Resumes from the checkpoint if it belongs to this job. A checkpoint of another job, or a damaged one, is overwritten
+// after the first step.
 static gsf_result gsf__sample_resume(gsf__sample_run* run) {
     void* data;
     size_t size;
@@ -11988,20 +12028,20 @@ static gsf_result gsf__sample_resume(gsf__sample_run* run) {
     return GSF_OK;
 }
 
-// ---- the steps
+// ---- sampling steps
 
-// Guidance of step `index`; 1: the prompt alone.
+// Guidance of step `index`; 1: without the negative prompt.
 static float gsf__sample_guidance(const gsf__sample_run* run, int32_t index) {
     const gsf_nn_sample_desc* d = &run->desc;
     const float at = ((float)index + 0.5f) / (float)run->sampler.count;
     if (at < d->guidance_begin || at > d->guidance_end) return 1.0f;
     if (!d->dynamic_guidance) return d->guidance;
-    // The official code mixes units: the time step counts to 1000, n is the number of steps.
+    // As in diffusers' CogVideoXPipeline, which mixes units: t is a time step of up to 1000, n the number of steps.
     const double n = d->steps, t = run->sampler.timesteps[index];
     return (float)(1.0 + (double)d->guidance * (1.0 - cos(3.14159265358979323846 * pow((n - t) / n, 5.0))) / 2.0);
 }
 
-// Noisy latents and control side by side, for each of `rows` samples.
+// Concatenates noisy latents and control along the channels, for each of `rows` samples.
 static void gsf__sample_fill_input(gsf__sample_run* run, int32_t rows) {
     const size_t frame = (size_t)run->channels * (size_t)run->height * (size_t)run->width;
     float* to = run->input;
@@ -12024,7 +12064,8 @@ static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
     in.height = run->height;
     in.width = run->width;
     in.hidden = run->input;
-    in.text = rows == 2 ? d->text : d->text + (int64_t)t->text_tokens * t->text_channels; // negative prompt, prompt
+    // order in d->text: negative prompt, prompt
+    in.text = rows == 2 ? d->text : d->text + (int64_t)t->text_tokens * t->text_channels;
     in.timesteps = steps;
     in.references = d->references;
     in.reference_tokens = d->reference_tokens;
@@ -12035,7 +12076,7 @@ static gsf_result gsf__sample_predict(gsf__sample_run* run, float guidance) {
     const int64_t hits = run->cache.hits;
     gsf__sample_fill_input(run, rows);
     GSF__TRY(gsf_nn_run_transformer(run->ctx, t, &in, run->prediction));
-    // A step that the cache cut short after the first block has not filled the other blocks' keys and values.
+    // If the cache skipped the blocks after the first one, their keys and values have not been computed yet.
     if (run->cache.hits == hits) run->reference_kv_ready = 1;
     run->stats.network_rows += rows;
     run->stats.cached_steps += run->cache.hits - hits;
@@ -12053,7 +12094,7 @@ static gsf_result gsf__sample_steps(gsf__sample_run* run) {
         gsf__progress(run->ctx, "restore", index, run->sampler.count);
         GSF__TRY(gsf__sample_predict(run, gsf__sample_guidance(run, index)));
         GSF__TRY(gsf_nn_step_sampler(run->ctx, &run->sampler, run->prediction, run->latents, NULL));
-        if (run->desc._tap) { // the latents, and what the network predicted (guided)
+        if (run->desc._tap) { // the latents after the step, and the (guided) prediction
             run->desc._tap->fn(run->desc._tap->user, "latents", index, run->latents, 1, run->count);
             run->desc._tap->fn(run->desc._tap->user, "prediction", index, run->prediction, 1, run->count);
         }
@@ -12097,7 +12138,7 @@ static size_t gsf__sample_kv_size(const gsf__sample_run* run) {
     return gsf__nn_query_reference_kv(run->net, run->desc.reference_tokens, 1);
 }
 
-enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents, control, input 2 x 2, prediction 2
+enum { GSF__SAMPLE_BUFFERS = 8 }; // of run->count floats: latents 1, control 1, input 2 x 2, prediction 2
 
 GSF_API gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transformer* transformer, const gsf_nn_vae* vae,
                                        const gsf_nn_sample_desc* desc, gsf_nn_sample_info* out) {
@@ -12134,7 +12175,7 @@ GSF_API gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transforme
         out->flops += step_flops;
         if (step_bytes > bytes) bytes = step_bytes;
     }
-    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // what the last step's blocks added, beside the stream itself
+    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // residuals of the blocks, as large as the stream
     if (encode.bytes > bytes) bytes = encode.bytes;
     if (decode.bytes > bytes) bytes = decode.bytes;
     const double own = (double)GSF__SAMPLE_BUFFERS * (double)run.count + (double)gsf__sample_kv_size(&run);
@@ -12184,31 +12225,31 @@ GSF_API gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* tra
 
 // ---- >>nn restorer --------------------------------------------------------------
 
-typedef struct gsf__dit_kept { // features under the name that they have in a file
+typedef struct gsf__dit_kept { // features under the name they have in a features file
     char* name;
     float* values;
     int64_t shape[3];
-    int encoded;               // here, from the photos at hand; else they came from a file
+    int encoded;               // 1: encoded by this restorer from the photos; 0: read from a file
 } gsf__dit_kept;
 
 typedef struct gsf__dit_restorer {
-    gsf_nn_dit_desc desc;      // texts point into `texts`
+    gsf_nn_dit_desc desc;      // strings point into `texts`
     char* texts;
     gsf_nn_transformer transformer;
     gsf_nn_vae vae;
     gsf_nn_schedule schedule;
     gsf__dit_kept* kept;
     size_t kept_count, kept_capacity;
-    int unsaved;               // something was kept that the file of saved features lacks
+    int unsaved;               // `kept` has changed since the features were saved
     float *prompt, *references; // (2, text tokens, text channels); (reference_tokens, width) or NULL
-    gsf_buffer caption;        // that `prompt` was made of
-    gsf_buffer shown;          // which photos `references` were made of
+    gsf_buffer caption;        // the caption that `prompt` was encoded from
+    gsf_buffer shown;          // names the photos that `references` were encoded from
     int64_t reference_tokens;
-    double encoder_bytes, encoder_flops; // at the configured size: at the peak; of all
-    gsf_reference* photos;     // colours (u8) and cameras, between begin and end
+    double encoder_bytes, encoder_flops; // at the configured size: largest peak; sum
+    gsf_reference* photos;     // images (u8) and cameras, between begin and end
     int32_t photo_count;
-    uint32_t photo_sum;        // of their pixels
-    double length;             // that tells near cameras from far ones
+    uint32_t photo_sum;        // checksum of their pixels
+    double length;             // unit of camera distances, see gsf__dit_measure
 } gsf__dit_restorer;
 
 static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
@@ -12227,7 +12268,7 @@ static gsf_result gsf__dit_query(void* user, gsf_context* ctx, int32_t frame_cou
         if (t->sample_frames < out->frame_count_min) out->frame_count_max = out->frame_count_min;
     }
     out->width_multiple = out->height_multiple = square;
-    if (t->learned_positions) { // one size only
+    if (t->learned_positions) { // only this size
         out->width_multiple = out->width_max = out->width;
         out->height_multiple = out->height_max = out->height;
     }
@@ -12260,9 +12301,10 @@ static int gsf__dit_compare(const void* a, const void* b) {
     return (x > y) - (x < y);
 }
 
-// The median distance of the photos' cameras to the middle of what they look at, which the official code makes 1 before it
-// chooses references: there, a camera that far away counts as much as one turned by 180 degrees. The middle is the mean of
-// the points where the optical axes come closest to the mean camera.
+// Sets r->length to the median distance of the photos' cameras from the point they look at. The GSFixer release scales
+// the scene so that this distance is 1 before it chooses references; a camera at that distance then counts as much as
+// one turned by 180 degrees. The point is the mean of the points on the optical axes that are closest to the mean
+// camera.
 static gsf_result gsf__dit_measure(gsf_context* ctx, gsf__dit_restorer* r) {
     const int32_t n = r->photo_count;
     double mean[3] = {0.0, 0.0, 0.0}, focus[3] = {0.0, 0.0, 0.0}, center[3];
@@ -12276,7 +12318,7 @@ static gsf_result gsf__dit_measure(gsf_context* ctx, gsf__dit_restorer* r) {
         const double* m = r->photos[i].camera.w2c;
         double along = 0.0;
         gsf_get_camera_center(&r->photos[i].camera, center);
-        for (int k = 0; k < 3; k++) along += m[4 * k + 2] * (mean[k] - center[k]); // third row: forward
+        for (int k = 0; k < 3; k++) along += m[4 * k + 2] * (mean[k] - center[k]); // third row of the rotation: forward
         for (int k = 0; k < 3; k++) focus[k] += (center[k] + along * m[4 * k + 2]) / n;
     }
     for (int32_t i = 0; i < n; i++) {
@@ -12287,7 +12329,7 @@ static gsf_result gsf__dit_measure(gsf_context* ctx, gsf__dit_restorer* r) {
     }
     qsort(distances, (size_t)n, sizeof *distances, gsf__dit_compare);
     r->length = 0.5 * (distances[n / 2] + distances[(n - 1) / 2]);
-    if (!(r->length > 0.0)) r->length = 1.0; // all in one place: only directions tell them apart
+    if (!(r->length > 0.0)) r->length = 1.0; // all cameras in one place: only directions count
     gsf_free(ctx, distances);
     return GSF_OK;
 }
@@ -12323,18 +12365,18 @@ static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_referen
     return GSF_OK;
 }
 
-// The photo whose view a frame is, or NULL.
+// The photo that was taken from the frame's view, or NULL.
 static const gsf_reference* gsf__dit_photo(const gsf__dit_restorer* r, const gsf_restore_window* window, int32_t frame) {
     const int32_t photo = window->reference_index ? window->reference_index[frame] : -1;
     return photo >= 0 && photo < r->photo_count && r->photos[photo].color.data ? &r->photos[photo] : NULL;
 }
 
-typedef struct gsf__dit_control { // one frame of the video that is to be restored
+typedef struct gsf__dit_control { // one frame of the control video
     const gsf_image* image;
-    const gsf_image* photo;      // what stands before the image where it reaches, or NULL
-    double at[2], step[2];       // photo's pixel of the frame's first one, and from one to the next
-    float* out;                  // (3, frames, height, width), at this frame
-    int64_t plane;               // from channel to channel
+    const gsf_image* photo;      // replaces the image where it covers the frame, or NULL
+    double at[2], step[2];       // photo coordinates of the frame's first pixel; distance between pixels
+    float* out;                  // (3, frames, height, width), offset to this frame
+    int64_t plane;               // distance between channels
 } gsf__dit_control;
 
 static float gsf__dit_channel(const gsf_image* image, int64_t x, int64_t y, int64_t c) {
@@ -12345,7 +12387,7 @@ static float gsf__dit_channel(const gsf_image* image, int64_t x, int64_t y, int6
 
 static int64_t gsf__dit_clamp(double v, int64_t count) { return v <= 0.0 ? 0 : gsf__least((int64_t)v, count - 1); }
 
-// Bilinear; 0 outside the photo.
+// Bilinear lookup in the photo; returns 0 outside it.
 static int gsf__dit_sample(const gsf__dit_control* control, int64_t x, int64_t y, float out[3]) {
     const gsf_image* p = control->photo;
     const double u = control->at[0] + control->step[0] * (double)x, v = control->at[1] + control->step[1] * (double)y;
@@ -12361,7 +12403,7 @@ static int gsf__dit_sample(const gsf__dit_control* control, int64_t x, int64_t y
     return 1;
 }
 
-static void gsf__dit_control_row(void* arg, size_t row, int32_t worker) { // to [-1,1]; a NaN is black
+static void gsf__dit_control_row(void* arg, size_t row, int32_t worker) { // in [-1,1]; NaN becomes black
     const gsf__dit_control* control = (const gsf__dit_control*)arg;
     const gsf_image* image = control->image;
     const int64_t y = (int64_t)row;
@@ -12376,8 +12418,8 @@ static void gsf__dit_control_row(void* arg, size_t row, int32_t worker) { // to 
     }
 }
 
-// The photo as floats at the size at which the frame's camera sees it, by the filter of the official code, and where in it
-// the frame's pixels lie. Without cameras the frame shows all of the photo.
+// Resizes the photo to the scale of the frame's camera, with the filter of the GSFixer release (PIL's bicubic),
+// converts it to float and computes where the frame's pixels fall in it. Without cameras the photo fills the frame.
 static gsf_result gsf__dit_fit_photo(gsf_context* ctx, const gsf_reference* photo, const gsf_camera* to, gsf_image* fitted,
                                      gsf__dit_control* control) {
     const gsf_camera* from = &photo->camera;
@@ -12412,8 +12454,8 @@ static gsf_result gsf__dit_fit_photo(gsf_context* ctx, const gsf_reference* phot
     return result;
 }
 
-// The frames as (3, frames, height, width). A frame that is a reference's view is that photo, as in the paper's benchmark,
-// through the frame's camera, which scales each axis by itself and may crop.
+// Converts the frames to (3, frames, height, width). A frame at a reference's view is replaced by that photo, as in the
+// paper's benchmark, seen through the frame's camera, which scales the axes independently and may crop.
 static gsf_result gsf__dit_fill_control(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
                                         float* out) {
     for (int32_t f = 0; f < window->frame_count; f++) {
@@ -12453,9 +12495,9 @@ static void gsf__dit_store_frames(const gsf_restore_window* window, const float*
     }
 }
 
-// ---- restorer: conditions of a clip
+// ---- restorer: encoding the conditions of a clip
 
-// As trained: behind a caption, and against it.
+// Prompt texts of the GSFixer release and of its training: appended to every caption; the negative prompt.
 static const char gsf__dit_praise[] = ". The video is of high quality, and the view is very clear. High quality, "
                                       "masterpiece, best quality, highres, ultra-detailed, fantastic.";
 static const char gsf__dit_negative[] = "The video is not of a high quality, it has a low resolution. Watermark present in "
@@ -12464,16 +12506,17 @@ static const char gsf__dit_negative[] = "The video is not of a high quality, it 
 
 enum { GSF__DIT_CAPTION_BYTES = 1024 };
 
-typedef struct gsf__dit_part { // an encoder: `photos` NULL only opens it, checks that it fits and counts its cost
+// a call of an encoder; `photos` NULL: only load it, check that it fits and add up its cost
+typedef struct gsf__dit_part {
     gsf_context* ctx;
     gsf__dit_restorer* r;
-    const char* name;          // of what it makes in a features file
+    const char* name;          // of its result in a features file
     const gsf_image* photos;
     int32_t count;
     gsf_nn_features* out;
 } gsf__dit_part;
 
-// To the error of a folder that is not there: what it is for, and what does without it.
+// Extends the error about a missing folder: what it is needed for and what can be given instead.
 static gsf_result gsf__dit_absent(const gsf__dit_part* p, gsf_result result, const char* makes, const char* instead) {
     char before[sizeof p->ctx->error];
     if (result != GSF_ERROR_NOT_FOUND) return result;
@@ -12493,7 +12536,7 @@ static void gsf__dit_add_cost(gsf__dit_restorer* r, double bytes, double flops) 
     r->encoder_flops += flops;
 }
 
-// Two photos of the aspect that the transformer was made for, prepared.
+// Input size of two preprocessed photos with the aspect ratio of the transformer's frames, to estimate costs.
 static gsf_nn_encoder_desc gsf__dit_usual_references(const gsf__dit_restorer* r) {
     const gsf_nn_transformer* t = &r->transformer;
     gsf_nn_encoder_desc in;
@@ -12506,7 +12549,7 @@ static gsf_nn_encoder_desc gsf__dit_usual_references(const gsf__dit_restorer* r)
     return in;
 }
 
-typedef struct gsf__dit_kind { // of reference tokens
+typedef struct gsf__dit_kind { // a kind of reference tokens
     const char *name, *folder, *makes, *instead; // see gsf__dit_absent
 } gsf__dit_kind;
 
@@ -12515,7 +12558,7 @@ static const gsf__dit_kind gsf__dit_kinds[2] = {
     {"dino_latents", "dinov2", "the 2D reference tokens", ", or condition 3d or none,"},
     {"vggt_latents", "vggt", "the 3D reference tokens", ", or condition 2d or none,"}};
 
-// Encodes p->photos by DINOv2 or VGGT.
+// Encodes p->photos with DINOv2 or VGGT.
 static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
     const gsf__dit_kind* k = &gsf__dit_kinds[kind];
     const gsf_nn_transformer* t = &p->r->transformer;
@@ -12541,7 +12584,7 @@ static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
     return result;
 }
 
-// Ids of both prompts; caption NULL: only opens the tokenizer.
+// Token ids of both prompts; caption NULL: only loads the tokenizer.
 static gsf_result gsf__dit_tokenize(const gsf__dit_part* p, const char* caption, int32_t* ids) {
     gsf_buffer text;
     gsf_nn_tokenizer model;
@@ -12563,7 +12606,7 @@ static gsf_result gsf__dit_tokenize(const gsf__dit_part* p, const char* caption,
     return result;
 }
 
-static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids) { // NULL: only opens the encoder
+static gsf_result gsf__dit_encode_ids(const gsf__dit_part* p, const int32_t* ids) { // ids NULL: only loads the encoder
     gsf_buffer folder;
     gsf_nn_t5 model;
     gsf_nn_t5_desc in;
@@ -12606,7 +12649,7 @@ static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
     return gsf__dit_absent(p, result, "the prompts' embeddings", "");
 }
 
-// What the photo shows, as `out` (GSF__DIT_CAPTION_BYTES); without a photo the captioner is only opened.
+// Captions the photo, out: GSF__DIT_CAPTION_BYTES; without a photo it only loads the captioner.
 static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     gsf_buffer folder;
     gsf_nn_captioner model;
@@ -12622,8 +12665,9 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     return result;
 }
 
-// The photo nearest to a camera (GSFixer's reference choice): by distance, in lengths that do not depend on the scene's unit
-// (gsf__dit_measure), and half of 1 - the cosine between the views. Of equal ones the first.
+// The photo nearest to a camera, as GSFixer chooses references: by distance in units of r->length, which makes it
+// independent of the scene's unit, plus half of 1 - cosine of the angle between the viewing directions. The first one
+// wins a tie.
 static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* camera) {
     int32_t best = 0;
     double least = 0.0, center[3], other[3];
@@ -12634,7 +12678,7 @@ static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* ca
         gsf_get_camera_center(c, other);
         for (int k = 0; k < 3; k++) {
             square += (center[k] - other[k]) * (center[k] - other[k]);
-            cosine += camera->w2c[4 * k + 2] * c->w2c[4 * k + 2]; // third row: forward
+            cosine += camera->w2c[4 * k + 2] * c->w2c[4 * k + 2]; // third row of the rotation: forward
         }
         const double score = sqrt(square) / r->length + 0.5 * (1.0 - cosine);
         if (i == 0 || score < least - 1e-9) {
@@ -12645,8 +12689,8 @@ static int32_t gsf__dit_nearest(const gsf__dit_restorer* r, const gsf_camera* ca
     return best;
 }
 
-// The photos that a clip's tokens are of, at most `photo_count` or 2: whose view its ends are, or those nearest to them;
-// without cameras nobody knows, and all of them count.
+// Chooses the reference photos of a clip, at most max(photo_count, 2): those at the views of its first and last frame,
+// or else those nearest to them. Without cameras all photos are used.
 static int32_t gsf__dit_choose(const gsf__dit_restorer* r, const gsf_restore_window* window, int32_t* chosen) {
     const int32_t ends[2] = {0, window->frame_count - 1};
     if (r->photo_count < 1) return 0;
@@ -12659,8 +12703,8 @@ static int32_t gsf__dit_choose(const gsf__dit_restorer* r, const gsf_restore_win
     return 2;
 }
 
-// Photos squashed to the model's size first, as the official loop feeds them: whatever their aspect, each gives as many
-// tokens as a frame would.
+// Encodes the chosen photos. They are first resized to the model's frame size regardless of aspect ratio, as in the
+// GSFixer release, so that each one gives the same number of tokens.
 static gsf_result gsf__dit_encode(const gsf__dit_part* part, int kind, const int32_t* chosen, int32_t count) {
     gsf__dit_restorer* r = part->r;
     gsf_context* ctx = part->ctx;
@@ -12685,13 +12729,13 @@ static gsf_result gsf__dit_encode(const gsf__dit_part* part, int kind, const int
     return result;
 }
 
-// ---- restorer: what was encoded, by name
-/* Features of a whole run, in memory and in a file of safetensors, each under the name of what it depends on:
-       dino_latents.photo4       (1, tokens, channels): of photo 4, from 0 in the order of the references
-       vggt_latents.photo4,7     (2, tokens, channels): of photos 4 and 7 together, which see one another
-       prompt_embeds.clip12      (2, text tokens, text channels): negative prompt and prompt of clip 12, from 0
-   A file of a single clip may say dino_latents, vggt_latents (images, tokens, channels) and prompt_embeds instead: these
-   count for clip 0 and for no other. */
+// ---- restorer: stored features, by name
+/* Features of a whole run, in memory and in a safetensors file, each named by what it depends on:
+       dino_latents.photo4       (1, tokens, channels): of photo 4, counted from 0 in the order of the references
+       vggt_latents.photo4,7     (2, tokens, channels): of photos 4 and 7, which attend to each other
+       prompt_embeds.clip12      (2, text tokens, text channels): negative prompt and prompt of clip 12, counted from 0
+   A file for a single clip may use the bare names dino_latents, vggt_latents (images, tokens, channels) and
+   prompt_embeds, which apply to clip 0 only. */
 
 static const gsf__dit_kept* gsf__dit_find(const gsf__dit_restorer* r, const char* name) {
     for (size_t i = 0; i < r->kept_count; i++)
@@ -12699,7 +12743,7 @@ static const gsf__dit_kept* gsf__dit_find(const gsf__dit_restorer* r, const char
     return NULL;
 }
 
-// What goes by its own name, or for the first clip by the bare one.
+// Finds a feature by its own name or, for the first clip, by the bare name.
 static const gsf__dit_kept* gsf__dit_find_own(const gsf__dit_restorer* r, const char* bare, const char* name, int32_t clip) {
     const gsf__dit_kept* own = gsf__dit_find(r, name);
     return own || clip ? own : gsf__dit_find(r, bare);
@@ -12711,7 +12755,7 @@ static void gsf__dit_drop(gsf_context* ctx, gsf__dit_restorer* r, size_t index) 
     r->kept[index] = r->kept[--r->kept_count];
 }
 
-// Drops what was encoded here and whose name begins so.
+// Drops features encoded by this restorer whose name starts with `begin`.
 static void gsf__dit_drop_encoded(gsf_context* ctx, gsf__dit_restorer* r, const char* begin) {
     for (size_t i = r->kept_count; i-- > 0;)
         if (r->kept[i].encoded && strncmp(r->kept[i].name, begin, strlen(begin)) == 0) gsf__dit_drop(ctx, r, i);
@@ -12722,7 +12766,7 @@ static void gsf__dit_forget_photos(gsf_context* ctx, gsf__dit_restorer* r) {
     r->shown.size = 0;
 }
 
-// Room for a feature in place of any of that name; its values are to be filled in.
+// Adds a feature, replacing any of the same name; the caller fills in its values.
 static gsf_result gsf__dit_keep(gsf_context* ctx, gsf__dit_restorer* r, const char* name, int64_t a, int64_t b, int64_t c,
                                 int encoded, float** values) {
     for (size_t i = r->kept_count; i-- > 0;)
@@ -12753,7 +12797,8 @@ static int gsf__dit_compare_names(const void* a, const void* b) {
 
 static gsf_result gsf__dit_save(gsf_context* ctx, gsf__dit_restorer* r) {
     if (!r->desc.save_features || !r->unsaved) return GSF_OK;
-    if (r->kept_count) qsort(r->kept, r->kept_count, sizeof *r->kept, gsf__dit_compare_names); // in whatever order they came
+    // deterministic order in the file
+    if (r->kept_count) qsort(r->kept, r->kept_count, sizeof *r->kept, gsf__dit_compare_names);
     gsf_nn_tensor* tensors = (gsf_nn_tensor*)gsf_alloc(ctx, r->kept_count + 1, sizeof *tensors);
     if (!tensors) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < r->kept_count; i++)
@@ -12764,7 +12809,7 @@ static gsf_result gsf__dit_save(gsf_context* ctx, gsf__dit_restorer* r) {
     return result;
 }
 
-// "dino_latents.photo4,7"
+// Composes a name such as "dino_latents.photo4,7".
 static gsf_result gsf__dit_name_photos(gsf_context* ctx, const char* bare, const int32_t* photos, int32_t count,
                                        gsf_buffer* out) {
     out->size = 0;
@@ -12773,13 +12818,13 @@ static gsf_result gsf__dit_name_photos(gsf_context* ctx, const char* bare, const
     return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
 
-// ---- restorer: conditions of a clip, from what is kept or anew
+// ---- restorer: conditions of a clip, stored or encoded on demand
 
-typedef struct gsf__dit_clip { // whose features are wanted
+typedef struct gsf__dit_clip { // the clip whose features are collected
     gsf_context* ctx;
     gsf__dit_restorer* r;
     int32_t clip;
-    int32_t* chosen;           // photos
+    int32_t* chosen;           // photo indices
     int32_t count;
     gsf_buffer name;           // scratch
     gsf_nn_features features;
@@ -12790,7 +12835,7 @@ static gsf_result gsf__dit_need_photos(const gsf__dit_clip* c) {
     return gsf_fail(c->ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no reference photos (condition none does without them)");
 }
 
-// Rows of `kept` behind those of earlier photos.
+// Appends the rows of `kept` to those of earlier photos.
 static gsf_result gsf__dit_append(gsf__dit_clip* c, const gsf__dit_kept* kept, int64_t images, float** values) {
     const size_t each = (size_t)(kept->shape[0] * kept->shape[1] * kept->shape[2]);
     if (!*values) {
@@ -12806,15 +12851,15 @@ static gsf_result gsf__dit_append(gsf__dit_clip* c, const gsf__dit_kept* kept, i
     return GSF_OK;
 }
 
-/* DINOv2 sees each photo by itself, so that each has a name and is encoded once in a run; VGGT sees a clip's photos together,
-   so that they have one name: groups of `per` photos. */
+/* DINOv2 encodes photos independently, so each photo has its own name and is encoded once per run. VGGT encodes the
+   photos of a clip together, under a common name. Both are handled as groups of `per` photos. */
 
-// c->name of the group that begins with photo number `first` of `photos`.
+// Sets c->name to the name of the group that starts at photos[first].
 static gsf_result gsf__dit_name_group(gsf__dit_clip* c, int kind, const int32_t* photos, int32_t first, int32_t per) {
     return gsf__dit_name_photos(c->ctx, gsf__dit_kinds[kind].name, photos + first, per, &c->name);
 }
 
-// Encodes those of the clip's photos of which nothing is kept, all in one go, and keeps them group by group.
+// Encodes those of the clip's photos that are not stored yet, in one call, and stores them group by group.
 static gsf_result gsf__dit_encode_missing(gsf__dit_clip* c, int kind, int32_t per) {
     gsf_nn_features made;
     gsf_result result = GSF_OK;
@@ -12822,7 +12867,8 @@ static gsf_result gsf__dit_encode_missing(gsf__dit_clip* c, int kind, int32_t pe
     memset(&made, 0, sizeof made);
     int32_t* list = (int32_t*)gsf_alloc(c->ctx, (size_t)c->count, sizeof *list);
     if (!list) return GSF_ERROR_OUT_OF_MEMORY;
-    if (per > 1 && !c->r->desc.save_features) gsf__dit_drop_encoded(c->ctx, c->r, "vggt_latents."); // there may be many
+    // limits memory, as there may be many pairs
+    if (per > 1 && !c->r->desc.save_features) gsf__dit_drop_encoded(c->ctx, c->r, "vggt_latents.");
     for (int32_t i = 0; i < c->count && !result; i += per) {
         int known = 0;
         for (int32_t k = 0; k < missing && per == 1; k++) known |= list[k] == c->chosen[i];
@@ -12850,7 +12896,7 @@ static gsf_result gsf__dit_encode_missing(gsf__dit_clip* c, int kind, int32_t pe
     return result;
 }
 
-// The clip's tokens of a kind, as kept or encoded now.
+// Collects the clip's features of one kind, stored or encoded now.
 static gsf_result gsf__dit_gather(gsf__dit_clip* c, int kind, float** values, int64_t* channels) {
     const int32_t per = kind == GSF__DIT_VGGT && c->count > 0 ? c->count : 1;
     const gsf__dit_kept* bare = c->clip ? NULL : gsf__dit_find(c->r, gsf__dit_kinds[kind].name);
@@ -12877,7 +12923,7 @@ static gsf_result gsf__dit_gather(gsf__dit_clip* c, int kind, float** values, in
                     (long long)c->features.images);
 }
 
-// Reference tokens from the clip's features, through the transformer's projectors.
+// Projects the clip's features to reference tokens.
 static gsf_result gsf__dit_project(gsf_context* ctx, gsf__dit_restorer* r, const gsf_nn_features* f) {
     r->reference_tokens = f->images * f->tokens;
     gsf_free(ctx, r->references);
@@ -12887,7 +12933,7 @@ static gsf_result gsf__dit_project(gsf_context* ctx, gsf__dit_restorer* r, const
     return gsf_nn_project_references(ctx, &r->transformer, r->reference_tokens, f->dino, f->vggt, r->references);
 }
 
-static int32_t gsf__dit_clip_number(const gsf_restore_window* window) { // 0 where the host knows no such members
+static int32_t gsf__dit_clip_number(const gsf_restore_window* window) { // 0 if the host's struct lacks this member
     return window->struct_size >= sizeof *window ? window->clip : 0;
 }
 
@@ -12922,7 +12968,7 @@ static gsf_result gsf__dit_refer(gsf_context* ctx, gsf__dit_restorer* r, const g
     return result;
 }
 
-// Negative prompt and prompt of the clip, as kept or encoded.
+// Embeddings of the clip's negative prompt and prompt, stored or encoded now.
 static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const gsf_restore_window* window,
                                   const float** text) {
     char described[GSF__DIT_CAPTION_BYTES], name[40];
@@ -12933,7 +12979,7 @@ static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const 
     snprintf(name, sizeof name, "prompt_embeds.clip%d", (int)clip);
     const gsf__dit_part part = {ctx, r, name, photo ? &photo->color : &window->color[0], 1, NULL};
     const gsf__dit_kept* kept = gsf__dit_find_own(r, "prompt_embeds", name, clip);
-    if (kept && !kept->encoded) { // else it is of a clip that only had the same number
+    if (kept && !kept->encoded) { // an encoded one may be from an earlier clip with the same number
         *text = kept->values;
         return GSF_OK;
     }
@@ -12950,7 +12996,7 @@ static gsf_result gsf__dit_prompt(gsf_context* ctx, gsf__dit_restorer* r, const 
     return GSF_OK;
 }
 
-// File of the part's steps: each part of a clip has its own, so that those that are done need not be done again.
+// Each part of a clip has a checkpoint of its own, so that finished parts are not sampled again.
 static gsf_result gsf__dit_checkpoint(gsf_context* ctx, const gsf__dit_restorer* r, const gsf_restore_window* window,
                                       gsf_buffer* path, gsf_nn_sample_desc* d) {
     if (!d->checkpoint || window->struct_size < sizeof *window || !window->part) return GSF_OK;
@@ -12987,16 +13033,16 @@ static gsf_result gsf__dit_restore(void* user, gsf_context* ctx, const gsf_resto
     return result;
 }
 
-// ---- restorer: opening
+// ---- restorer: loading
 
-// Is this the bare name, or that of one photo, group of photos or clip?
+// 1 if `name` is the bare name, or the bare name followed by "." and `of`.
 static int gsf__dit_is_name(const char* name, const char* bare, const char* of) {
     const size_t length = strlen(bare);
     if (strncmp(name, bare, length) != 0) return 0;
     return !name[length] || (name[length] == '.' && strncmp(name + length + 1, of, strlen(of)) == 0);
 }
 
-// Is anything kept under that name or behind it?
+// 1 if any stored feature has such a name.
 static int gsf__dit_has(const gsf__dit_restorer* r, const char* bare, const char* of) {
     for (size_t i = 0; i < r->kept_count; i++)
         if (gsf__dit_is_name(r->kept[i].name, bare, of)) return 1;
@@ -13020,7 +13066,7 @@ static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, 
     return GSF_OK;
 }
 
-// data: the file's bytes where they have been read already, else NULL.
+// data: the file's bytes if they have been read already, or NULL.
 static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r, const char* path, const void* data,
                                          size_t size) {
     gsf_nn_weights file;
@@ -13037,7 +13083,8 @@ static gsf_result gsf__dit_read_features(gsf_context* ctx, gsf__dit_restorer* r,
     return result;
 }
 
-// The files of features, and a look at every folder that clips will need for what they do not hold at all.
+// Reads the features files, and loads every model once that is needed for features missing from the first one, to
+// report missing folders early and to add up costs.
 static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* r) {
     const gsf_nn_condition condition = r->desc.condition;
     const gsf__dit_part prompt = {ctx, r, "prompt_embeds", NULL, 0, NULL}, dino = {ctx, r, "dino_latents", NULL, 0, NULL};
@@ -13056,7 +13103,8 @@ static gsf_result gsf__dit_open_conditions(gsf_context* ctx, gsf__dit_restorer* 
     if (condition != GSF_NN_CONDITION_NONE && condition != GSF_NN_CONDITION_2D && !gsf__dit_has(r, "vggt_latents",
                                                                                                 "photo"))
         GSF__TRY(gsf__dit_see(&vggt, GSF__DIT_VGGT));
-    if (r->desc.keep_saved && r->desc.save_features) // last, so that a run that goes on looks where it did before
+    // read last, so that a resumed run checks the same folders as before
+    if (r->desc.keep_saved && r->desc.save_features)
         GSF__TRY(gsf__nn_read_if_there(ctx, r->desc.save_features, &saved, &size));
     const gsf_result result = saved ? gsf__dit_read_features(ctx, r, r->desc.save_features, saved, size) : GSF_OK;
     gsf_free(ctx, saved);
@@ -13098,7 +13146,7 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer) {
     gsf_free(ctx, r);
 }
 
-// The desc's texts, one after another in memory of the restorer's own.
+// Copies the desc and its strings, which are stored one after another in r->texts.
 static gsf_result gsf__dit_copy_desc(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf__dit_restorer* r) {
     r->desc = *desc;
     const char** const texts[] = {&r->desc.model, &r->desc.features, &r->desc.caption, &r->desc.save_features,
