@@ -6979,10 +6979,10 @@ enum {
 #define GSF__LOG2_ALPHA_MIN (-7.99435344f)
 #define GSF__AA_FLOOR 2.5e-5f // lower bound of the squared antialiasing compensation
 
-// The ellipse, in sheared coordinates that lose no precision for needle-shaped splats: with dy = y - v and e = (x - u)
-// - kx*dy the exponent is a sum of two negative squares, log2(alpha) = ee*e*e + yy*dy*dy + log2_opacity. The ellipse
-// covers |e| <= sqrt(h0 - h1*dy*dy) of a row. In an image 2000 pixels wide a float resolves positions to only 1e-4 of a
-// pixel, which shows on the flanks of small splats; so u and v have a low-order float each.
+// The ellipse, in sheared coordinates that lose no precision for needle-shaped splats: with dy = y - v and
+// e = (x - u) - kx*dy the exponent is a sum of two negative squares, log2(alpha) = ee*e*e + yy*dy*dy + log2_opacity.
+// The ellipse covers |e| <= sqrt(h0 - h1*dy*dy) of a row. In an image 2000 pixels wide a float resolves positions to
+// only 1e-4 of a pixel, which shows on the flanks of small splats; so u and v have a low-order float each.
 typedef struct gsf__record {
     float u, v;            // pixel centres are at integers here (COLMAP coordinate minus 0.5)
     float kx, ee, yy, log2_opacity;
@@ -7776,8 +7776,8 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
 
 // ---- >>raster forward ----------------------------------------------------------
 
-/* A tile's pixels are kept as 32 steps of 8: arrays [step][lane]. T > 0: pixel still open; T < 0: finished, |T| is its
-   final transmittance. `live` has a bit per step that has an open pixel. */
+/* A tile's pixels are stored as 32 steps of 8 pixels: arrays [step][lane]. T > 0: the pixel is still open; T < 0: it is
+   finished, and |T| is its final transmittance. `live` has a bit set for every step that has an open pixel. */
 typedef struct gsf__tile {
     const gsf__record* records; // per splat
     const gsf__pair* pairs;     // the tile's list, front to back
@@ -7789,10 +7789,10 @@ typedef struct gsf__tile_state {
     float T[GSF__TILE_PIXELS], r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS], z[GSF__TILE_PIXELS];
 } gsf__tile_state;
 
-typedef struct gsf__tile_gradient { // derivatives of the loss per pixel, and the gradient-weighted feature behind
+typedef struct gsf__tile_gradient { // derivatives of the loss, per pixel
     float r[GSF__TILE_PIXELS], g[GSF__TILE_PIXELS], b[GSF__TILE_PIXELS];
-    float z[GSF__TILE_PIXELS], a[GSF__TILE_PIXELS]; // of sum(w z) and sum(w)
-    float behind[GSF__TILE_PIXELS];
+    float z[GSF__TILE_PIXELS], a[GSF__TILE_PIXELS]; // with respect to sum(w z) and sum(w)
+    float behind[GSF__TILE_PIXELS];                 // B of gsf__reverse_scalar
 } gsf__tile_gradient;
 
 enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2, GSF__WITH_ABS = 4 };
@@ -7800,16 +7800,18 @@ enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2, GSF__WITH_ABS = 4 };
 typedef struct gsf__raster_kernels {
     // Blends the tile's list into `state`.
     void (*blend)(const gsf__tile* tile, gsf__tile_state* state, int flags);
-    // Repeats the blending of T from list entry `first` on and keeps the steps. Stops after an entry when more than
-    // GSF__BUCKET steps are kept. Returns the entry to go on with, or tile->count.
+    // Repeats the blending of T for list entries from `first` to `last` and keeps the steps. Stops after the entry with
+    // which more than GSF__BUCKET steps are kept. Returns the entry to continue with, or tile->count when done.
     size_t (*keep)(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps, gsf__step_head* heads,
                    size_t* step_count);
-    // Back to front over kept steps: adds up the gradient moments of each entry into its slot (12 floats).
+    // Goes back to front over kept steps and writes the sums of the gradient moments of each entry to its slot (12
+    // floats).
     void (*reverse)(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads, size_t step_count,
                     gsf__tile_gradient* gradient, float* slots, uint8_t* slot_used, int flags);
 } gsf__raster_kernels;
 
-// Slot layout. With p = dL/d(ln alpha) of a pixel, w = alpha*T, d = (e, dy) its place in the record's coordinates:
+// Slot layout. Sums over pixels, where p = dL/d(ln alpha), w = alpha*T, (e, dy) is the pixel's position in the record's
+// coordinates and D = sum(w z):
 enum {
     GSF__SLOT_P, GSF__SLOT_E, GSF__SLOT_EE, GSF__SLOT_Y, GSF__SLOT_EY, GSF__SLOT_YY, // sums of p times 1 e ee dy e*dy dy*dy
     GSF__SLOT_R, GSF__SLOT_G, GSF__SLOT_B, GSF__SLOT_Z,                              // sums of w times dL/dcolor, dL/dD
@@ -7831,7 +7833,8 @@ static float gsf__exp2_fast(float x) {
     return p * scale;
 }
 
-// Rows of a splat in a tile: centre column per row, exponent at the centre, and the steps that the ellipse meets.
+// Finds, per row of the tile, the column of the ellipse's centre and the exponent there. Returns a bit per step that
+// the ellipse overlaps.
 static uint32_t gsf__rows_scalar(const gsf__record* rec, const gsf__tile* tile, float center[GSF__TILE],
                                  float exponent[GSF__TILE]) {
     const float u = rec->u - tile->x0 + rec->u_low, v = rec->v - tile->y0 + rec->v_low;
@@ -7868,7 +7871,7 @@ static int gsf__lowest_bit(uint32_t mask) {
 #endif
 }
 
-// One pixel of one splat: returns alpha before the clamp (0 = not blended) and moves T on.
+// Blends a splat into the T of one pixel. Returns its alpha before the clamp, or 0 if it is not blended.
 static float gsf__blend_pixel(const gsf__record* rec, float column, float center, float exponent, float* T) {
     const float e = column - center;
     const float x = rec->ee * e * e + exponent;
@@ -7912,7 +7915,8 @@ static void gsf__blend_scalar(const gsf__tile* tile, gsf__tile_state* state, int
 
 #if GSF__X86
 
-// Same as gsf__rows_scalar, 8 rows at a time; centres (relative to the step's first pixel) and exponents by step.
+// Like gsf__rows_scalar, 8 rows at a time, but with a centre (relative to the step's first pixel) and exponent per
+// step.
 GSF__INLINE_AVX2 uint32_t gsf__rows_avx2(const gsf__record* rec, const gsf__tile* tile, float center[GSF__STEPS],
                                          float exponent[GSF__STEPS]) {
     const __m256 u = _mm256_set1_ps(rec->u - tile->x0 + rec->u_low), v = _mm256_set1_ps(rec->v - tile->y0 + rec->v_low);
@@ -7954,10 +7958,10 @@ GSF__INLINE_AVX2 __m256 gsf__exp2_avx2(__m256 x) {
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), shift));
 }
 
-// The row tests of eight list entries, ahead of the work on them, which then waits neither for a record to come from memory
-// nor for the tests. To be called for every entry i >= first in turn.
+// Runs the row tests of eight list entries ahead of blending them, which then waits neither for records from memory nor
+// for the tests. Must be called for every entry i >= first in turn.
 enum { GSF__AHEAD = 8 };
-typedef struct gsf__row_tests { // by i % GSF__AHEAD
+typedef struct gsf__row_tests { // indexed by i % GSF__AHEAD
     float center[GSF__AHEAD][GSF__STEPS], exponent[GSF__AHEAD][GSF__STEPS];
     uint32_t mask[GSF__AHEAD];
 } gsf__row_tests;
@@ -7973,8 +7977,8 @@ GSF__INLINE_AVX2 void gsf__rows_ahead_avx2(const gsf__tile* tile, size_t first, 
     }
 }
 
-// Alpha before the clamp at the steps of `mask`, 0 where it is below 1/255. Apart from the blending, whose chain of
-// operations through T is short, so that the long one here runs ahead of it.
+// Alpha before the clamp at the steps of `mask`, 0 where it is below 1/255. Kept out of the blending loop, where each
+// splat depends on the T of the one before: this long computation does not, so the CPU can run ahead with it.
 GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float center[GSF__STEPS],
                                        const float exponent[GSF__STEPS], uint32_t mask, float raw[GSF__TILE_PIXELS]) {
     const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), threshold = _mm256_set1_ps(GSF__LOG2_ALPHA_MIN);
@@ -7988,14 +7992,15 @@ GSF__INLINE_AVX2 void gsf__alphas_avx2(const gsf__record* rec, const float cente
     }
 }
 
-// In here a finished pixel has T = 0, which nothing changes, so that only the step in which a pixel ends looks at it.
+// While this runs, a finished pixel has T = 0, which later splats leave unchanged, and its final T is in `ends`. So a
+// step needs extra work only when another of its pixels finishes.
 GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_state* state, int with_depth) {
     const __m256 zero = _mm256_setzero_ps(), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 t_min = _mm256_set1_ps(GSF__T_MIN), minus = _mm256_set1_ps(-0.0f);
     gsf__row_tests tests;
     float raws[GSF__TILE_PIXELS];
-    float ends[GSF__TILE_PIXELS]; // T of the finished pixels, as `state` has it
-    int ended[GSF__STEPS];        // bits of them
+    float ends[GSF__TILE_PIXELS]; // T of the finished pixels, as `state` stores it
+    int ended[GSF__STEPS];        // per step a bit for every finished pixel
     uint32_t live = 0;
     for (uint32_t s = 0; s < GSF__STEPS; s++) {
         const __m256 T = _mm256_loadu_ps(state->T + 8 * s), open = _mm256_cmp_ps(T, zero, _CMP_GT_OQ);
@@ -8016,7 +8021,7 @@ GSF__INLINE_AVX2 void gsf__blend_avx2_body(const gsf__tile* tile, gsf__tile_stat
             const __m256 T = _mm256_loadu_ps(state->T + at);
             __m256 alpha = _mm256_min_ps(_mm256_loadu_ps(raws + at), alpha_max), next = _mm256_fnmadd_ps(T, alpha, T);
             const __m256 low = _mm256_cmp_ps(next, t_min, _CMP_LT_OQ);
-            if (_mm256_movemask_ps(low) != ended[s]) { // a pixel ends in front of this splat
+            if (_mm256_movemask_ps(low) != ended[s]) { // a pixel finishes in front of this splat
                 const __m256 stop = _mm256_and_ps(low, _mm256_cmp_ps(T, zero, _CMP_GT_OQ));
                 _mm256_storeu_ps(ends + at, _mm256_blendv_ps(_mm256_loadu_ps(ends + at), _mm256_xor_ps(T, minus), stop));
                 alpha = _mm256_andnot_ps(stop, alpha);
@@ -8078,9 +8083,9 @@ static size_t gsf__keep_scalar(const gsf__tile* tile, float* T, size_t first, si
     return live && i < last ? i : tile->count;
 }
 
-/* Reverse pass. With F = what the splat adds per unit weight, weighted by the loss gradient (c.g + z gz + ga), and B the
-   same for everything behind (the background at last), the pixel's gradient-weighted value is alpha F + (1 - alpha) B
-   seen through T, so
+/* Reverse pass. Let F be the splat's contribution per unit of weight, multiplied by the loss gradient
+   (c.g + z gz + ga), and B the same for everything behind the splat (at first the background). The splat and everything
+   behind it contribute T (alpha F + (1 - alpha) B), so
        dL/dalpha = T (F - B),   B <- B + alpha (F - B)
    without any division by 1 - alpha. */
 static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, const gsf__step_head* heads,
@@ -8124,7 +8129,7 @@ static void gsf__reverse_scalar(const gsf__tile* tile, const gsf__step* steps, c
             }
         }
         const size_t slot = tile->pairs[entry].slot;
-        memcpy(slots + GSF__SLOT_FLOATS * slot, sums, sizeof sums); // all of an entry's steps are in one bucket
+        memcpy(slots + GSF__SLOT_FLOATS * slot, sums, sizeof sums); // complete: an entry's steps are all in one bucket
         slot_used[slot] = 1;
     }
 }
@@ -8152,7 +8157,7 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_ti
             const __m256 next = _mm256_fnmadd_ps(T, _mm256_min_ps(raw, alpha_max), T);
             const __m256 stop = _mm256_and_ps(open, _mm256_cmp_ps(next, t_min, _CMP_LT_OQ));
             __m256 T_new = next, alpha = raw;
-            if (_mm256_movemask_ps(stop)) { // a pixel ends in front of this splat
+            if (_mm256_movemask_ps(stop)) { // a pixel finishes in front of this splat
                 T_new = _mm256_blendv_ps(next, _mm256_xor_ps(T, minus), stop);
                 alpha = _mm256_andnot_ps(stop, raw);
                 if (_mm256_movemask_ps(T_new) == 255) live &= ~(1u << s);
@@ -8169,7 +8174,7 @@ GSF__TARGET_AVX2 static size_t gsf__keep_avx2(const gsf__tile* tile, float* T_ti
     return live && i < last ? i : tile->count;
 }
 
-// Sums of eight vectors, one per lane of the result.
+// Horizontal sums of eight vectors, one per lane of the result.
 GSF__TARGET_AVX2 static inline __m256 gsf__sum8_avx2(__m256 a, __m256 b, __m256 c, __m256 d, __m256 e, __m256 f, __m256 g,
                                                      __m256 h) {
     const __m256 abcd = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
@@ -8187,7 +8192,7 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
                                              uint8_t* slot_used, int with_depth, int straight_through, int with_abs) {
     const __m256 lanes = _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7), alpha_max = _mm256_set1_ps(GSF__ALPHA_MAX);
     const __m256 magnitude = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fffffff));
-    float center[GSF__STEPS], below[GSF__STEPS]; // as in gsf__rows_avx2, and dy, by step
+    float center[GSF__STEPS], below[GSF__STEPS]; // per step: centre as in gsf__rows_avx2; dy
     for (size_t k = step_count; k > 0;) {
         const uint32_t entry = heads[k - 1].entry;
         const gsf__record* rec = tile->records + tile->pairs[entry].splat;
@@ -8241,7 +8246,7 @@ GSF__INLINE_AVX2 void gsf__reverse_avx2_body(const gsf__tile* tile, const gsf__s
         const size_t slot = tile->pairs[entry].slot;
         float* to = slots + GSF__SLOT_FLOATS * slot;
         const __m256 first = gsf__sum8_avx2(sp, se, see, sy, sey, syy, sr, sg);
-        _mm256_storeu_ps(to, first); // all of an entry's steps are in one bucket
+        _mm256_storeu_ps(to, first); // complete: an entry's steps are all in one bucket
         _mm_storeu_ps(to + 8, gsf__sum4_avx2(sb, sz, _mm256_mul_ps(sax, _mm256_set1_ps(conic_a)), say));
         slot_used[slot] = 1;
     }
@@ -8282,7 +8287,7 @@ static const gsf__raster_kernels* gsf__raster_kernels_of(gsf_cpu_level level) {
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_GATHER
 
-// Derivative of sum(weight basis) by the direction, before its normalisation. count >= 4.
+// Derivative of sum(weight * basis) with respect to the direction, without that of the normalisation. count >= 4.
 GSF__V_INLINE void GSF__V(gsf__sh_direction_gradient)(const gsf__vf d[3], int32_t count, const gsf__vf weight[16],
                                                       gsf__vf out[3]) {
     const gsf__vf x = d[0], y = d[1], z = d[2];
@@ -8310,15 +8315,15 @@ GSF__V_INLINE void GSF__V(gsf__sh_direction_gradient)(const gsf__vf d[3], int32_
              eight * c * xz * weight[13] + gsf__v_set(1.445305721320277f) * (xx - yy) * weight[14];
 }
 
-// Adds the lanes that count to a column of rows.
+// Adds the first `count` lanes to one column of an array of rows.
 GSF__V_INLINE void GSF__V(gsf__add_column)(float* rows, size_t stride, gsf__vf value, size_t count) {
     float lanes[GSF__LANES];
     gsf__v_store(lanes, value);
     for (size_t l = 0; l < count; l++) rows[stride * l] += lanes[l];
 }
 
-// Sums of the slots of the splats from i on, in double and in the order of the tiles: GSF__SLOT_FLOATS columns of 16.
-// Returns bits of those that have any.
+// Sums the slots of each splat from i on, in double and in tile order, into the first GSF__SLOT_FLOATS columns. Returns
+// a bit for every splat that has a slot in use.
 GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i, size_t count, gsf__vf columns[16]) {
     enum { WIDE = GSF__LANES / GSF__HALVES };
     uint32_t touched = 0;
@@ -8340,7 +8345,7 @@ GSF__V_INLINE uint32_t GSF__V(gsf__sum_slots)(const gsf_rasterizer* r, size_t i,
     return touched;
 }
 
-// Fetches what the splats from i on will need: their slots lie all over memory, and rows of SH are long.
+// Prefetches data of the splats from i on: their slots are scattered over memory, and rows of SH are long.
 GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf_splats* splats, const gsf_splat_grads* grads,
                                              size_t i) {
     for (size_t s = r->splat_begin[i]; s < r->splat_begin[i + GSF__LANES]; s++) {
@@ -8355,7 +8360,7 @@ GSF__V_INLINE void GSF__V(gsf__gather_ahead)(const gsf_rasterizer* r, const gsf_
     }
 }
 
-// Gradients of the splats from i on from the sums of their slots, back through covariance, projection and colour.
+// Gradients of the splats from i on: backpropagates the sums of their slots through covariance, projection and colour.
 GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view* view, const gsf_splats* splats,
                                        const gsf_splat_grads* grads, size_t i, size_t left) {
     const size_t count = left < GSF__LANES ? left : GSF__LANES;
@@ -8374,9 +8379,9 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
 
     // ln alpha = -1/2 (a e^2 + q dy^2): derivatives with respect to the screen mean
     const gsf__vf du = a * se, dv = b * se + q * sy;
-    // and to V (cov = V V^T + blur): sum p (K d)(K d)^T V. With K d = (a e, b e + q dy) and K V_c = (a g_c, b g_c + q V1c),
-    // g = V0 - kx V1, everything is a sum of like-sized terms. g itself comes from the minors n = V0 x V1,
-    // cov_c g = blur V0 + V1 x n: for a needle the plain difference has no digit left.
+    // and to V (cov = V V^T + blur): sum p (K d)(K d)^T V. With K d = (a e, b e + q dy), K V_c = (a g_c, b g_c + q V1c)
+    // and g = V0 - kx V1, all sums have terms of similar size. g itself is computed from the minors n = V0 x V1 as
+    // cov_c g = blur V0 + V1 x n, because for a needle the plain difference cancels completely.
     const gsf__vf *V0 = p.V, *V1 = p.V + 3;
     gsf__vf n[3], V1_n[3], n_V0[3], g[3], dV[6], d_log_scale[3];
     for (int c = 0; c < 3; c++) {
@@ -8394,7 +8399,8 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
         d_log_scale[c] = ag * ag * see + two * ag * qv * sey + qv * qv * syy; // (K d . V_c)^2
     }
     if (view->antialiased) {
-        // ln compensation = 1/2 (ln det_raw - ln det); 1/2 ln det_raw by V0: V1 x n / det_raw, by ln s_c: 1 - n_c^2 / det_raw
+        // ln compensation = 1/2 (ln det_raw - ln det). Derivatives of 1/2 ln det_raw: V1 x n / det_raw with respect to
+        // V0, 1 - n_c^2 / det_raw with respect to ln s_c.
         const gsf__vm shrunk = gsf__v_gt(p.det_raw, gsf__v_set(GSF__AA_FLOOR) * p.det);
         const gsf__vf by_det = gsf__v_keep(shrunk, sp), raw = gsf__v_keep(shrunk, sp / p.det_raw);
         for (int c = 0; c < 3; c++) {
@@ -8420,7 +8426,7 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
     }
 
     // mean in camera space: through u, v, the focal scale jx = fx/z and the slope x = t.x/z (constant where clamped; the
-    // official code holds t.x = x z constant instead, which leaves -x/z)
+    // Inria 3DGS code holds t.x = x z constant instead, which leaves -x/z)
     const gsf__vf free_x = gsf__v_keep(gsf__vm_not(p.clamped_x), d_x) * inv_z;
     const gsf__vf free_y = gsf__v_keep(gsf__vm_not(p.clamped_y), d_y) * inv_z;
     gsf__vf slope_x = free_x, slope_y = free_y;
@@ -8446,7 +8452,7 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
         d_rgb[c] = gsf__v_keep(gsf__vm_and(live, gsf__v_gt(shown, zero)), sums[GSF__SLOT_R + c]);
     }
     const gsf__vf distance = GSF__V(gsf__view_direction)(view, splats, i, lane, d);
-    for (int c = 0; c < 3; c++) d[c] = gsf__v_keep(live, d[c]); // a NaN times a gradient of 0 is a NaN
+    for (int c = 0; c < 3; c++) d[c] = gsf__v_keep(live, d[c]); // a NaN would survive multiplication by a gradient of 0
     GSF__V(gsf__sh_basis)(d[0], d[1], d[2], bands, basis);
     if (grads->sh) {
         float* rows = grads->sh + (size_t)stored * i;
@@ -8612,13 +8618,13 @@ static gsf__tile gsf__tile_of(const gsf_rasterizer* r, size_t index) {
     return tile;
 }
 
-// Columns and rows of the tile inside the image.
+// Number of columns and rows of the tile that lie inside the image.
 static void gsf__tile_extent(const gsf_rasterizer* r, const gsf__tile* tile, int* columns, int* rows) {
     *columns = r->width - (int)tile->x0 < GSF__TILE ? r->width - (int)tile->x0 : GSF__TILE;
     *rows = r->height - (int)tile->y0 < GSF__TILE ? r->height - (int)tile->y0 : GSF__TILE;
 }
 
-// The steps of a tile that lie inside the image: how many pixels of step s do; 0 where none.
+// Number of pixels of step s that lie inside the image, 0..8.
 static int gsf__step_width(int s, int columns, int rows) {
     const int left = columns - 8 * (s >> 4);
     return (s & 15) >= rows || left <= 0 ? 0 : left < 8 ? left : 8;
@@ -8773,7 +8779,7 @@ static void gsf__reverse_chunk(void* arg, size_t index, int32_t worker) {
     gsf__tile_extent(r, &tile, &columns, &rows);
     gsf__load_tile_gradient(job, &tile, columns, rows, &gradient, background);
 
-    // forward over the whole list, remembering where each bucket of kept steps begins
+    // forward over the whole list, with a checkpoint at the start of every bucket of kept steps
     gsf__open_tile(T, columns, rows);
     size_t buckets = 0, next = 0, kept = 0;
     while (next < tile.count) {
@@ -8781,7 +8787,8 @@ static void gsf__reverse_chunk(void* arg, size_t index, int32_t worker) {
         scratch->checkpoint_entry[buckets++] = (uint32_t)next;
         next = job->kernels->keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
     }
-    // the last bucket's steps are at hand; earlier ones are made again from their checkpoint
+    // the last bucket's steps are still in the scratch memory; those of earlier buckets are recomputed from the
+    // checkpoints
     while (buckets > 0) {
         job->kernels->reverse(&tile, scratch->steps, scratch->heads, kept, &gradient, slots, slot_used, job->flags);
         if (--buckets == 0) break;
