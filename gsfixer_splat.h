@@ -708,10 +708,11 @@ GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t str
 #if !defined(GSF_SPLAT_IMPLEMENTED) || defined(GSF__ISA)
 #define GSF_SPLAT_IMPLEMENTED
 
-// Under GSF__ISA this header includes itself for one of its parts GSF__KERNELS_...: see >>lanes of gsfixer.h.
+// With GSF__ISA defined, the header is including itself to compile one of its GSF__KERNELS_... parts for an instruction
+// set: see >>lanes in gsfixer.h.
 #ifndef GSF__ISA
 
-#include "gsfixer.h" // again: internals and implementations, if all was included before without the macro
+#include "gsfixer.h" // adds internals and implementation if it was first included without the implementation macro
 #include "gsfixer_traj.h"
 
 #include <time.h>
@@ -734,14 +735,14 @@ GSF__BEGIN_IMPLEMENTATION
 
 // ---- >>splats ------------------------------------------------------------------
 
-// Of a desc of the caller's; a macro, since the three types only share the members' names.
+// Checks the canaries of a caller's desc. A macro because the three desc types share only the names of these members.
 #define GSF__CHECK_CANARIES(ctx, name, desc)                                                                          \
     do {                                                                                                              \
         if ((desc)->_start_canary != 0 || (desc)->_end_canary != 0)                                                   \
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s desc: was not zeroed (its canaries are not)", name); \
     } while (0)
 
-// A field of a desc where zero is legal: zero is the default, a negative value is zero.
+// Resolves a desc field for which zero is a legal value: zero selects the default, a negative value means zero.
 static float gsf__or_zero(float value, float fallback) {
     if (value == 0.0f) return fallback;
     return value < 0.0f ? 0.0f : value;
@@ -777,7 +778,8 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats) {
 
 // ---- >>order -------------------------------------------------------------------
 
-// Sorts n keys by their upper half, stable. The lower halves ascend and break ties. Returns the array that holds the result.
+// Sorts n keys by their upper 32 bits. The sort is stable and the lower 32 bits must ascend on input, so ties end up
+// ordered by the lower bits. Returns whichever of the two arrays holds the result.
 static uint64_t* gsf__sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
     enum { SMALL = 48 };
     if (n <= SMALL) {
@@ -795,7 +797,8 @@ static uint64_t* gsf__sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
         for (int pass = 0; pass < 4; pass++) counts[pass][keys[i] >> (32 + 8 * pass) & 255u]++;
     for (int pass = 0; pass < 4; pass++) {
         const int shift = 32 + 8 * pass;
-        if (counts[pass][keys[0] >> shift & 255u] == n) continue; // all the same here, as the first bits of a depth often are
+        // All keys share this byte; common for the high byte of depths.
+        if (counts[pass][keys[0] >> shift & 255u] == n) continue;
         uint32_t sum = 0;
         for (int b = 0; b < 256; b++) {
             const uint32_t count = counts[pass][b];
@@ -810,7 +813,7 @@ static uint64_t* gsf__sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
     return keys;
 }
 
-// Every third bit of the result is one of the 10 bits of v.
+// Spreads the 10 bits of v to every third bit of the result.
 static uint64_t gsf__spread_bits(uint64_t v) {
     v = (v | v << 16) & 0x030000ff;
     v = (v | v << 8) & 0x0300f00f;
@@ -818,9 +821,9 @@ static uint64_t gsf__spread_bits(uint64_t v) {
     return (v | v << 2) & 0x09249249;
 }
 
-// Keys (code << 32 | index) in Morton order of the means: 1024 cells along each side of the box of three standard deviations
-// around their mean, what lies outside in the cells of its faces. keys, spare: room for `count`; returns the one that holds
-// the result.
+// Sorts the means in Morton order. The keys are (code << 32 | index); the grid has 1024 cells along each axis of a box
+// that extends three standard deviations either side of the average position. Points outside are clamped to the box.
+// keys, spare: room for `count` keys each; returns whichever holds the result.
 static uint64_t* gsf__morton_order(const float* means, size_t count, uint64_t* keys, uint64_t* spare) {
     double low[3], scale[3];
     for (size_t c = 0; c < 3; c++) {
@@ -848,7 +851,7 @@ static uint64_t* gsf__morton_order(const float* means, size_t count, uint64_t* k
     return gsf__sort_keys(keys, spare, count);
 }
 
-// Row i becomes the row that order[i] names; `spare` has room for the rows.
+// Permutes rows: row i becomes the row whose index is in the low 32 bits of order[i]. spare: room for all rows.
 static void gsf__reorder(void* rows, size_t row_size, const uint64_t* order, size_t count, void* spare) {
     for (size_t i = 0; i < count; i++)
         memcpy((char*)spare + i * row_size, (const char*)rows + (size_t)(uint32_t)order[i] * row_size, row_size);
@@ -878,11 +881,11 @@ GSF_API gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats) {
 // ---- >>ply ---------------------------------------------------------------------
 
 /* A splat file:  "ply" | format line | "element vertex N" | property lines | "end_header" | N rows
-   Columns are found by name, so any order and additional columns do. Elements before the vertices are skipped, elements
-   after them are never reached. f_rest is channel-major in the file (all of red, then green, then blue), while
-   gsf_splats.sh is coefficient-major. */
+   Columns are found by name, so they may come in any order and unknown ones are ignored. Elements before the vertices
+   are skipped; elements after them are never read. f_rest is channel-major in the file (all of red, then green, then
+   blue), while gsf_splats.sh is coefficient-major. */
 
-enum { // slots of the columns somebody asks for
+enum { // slots of the columns that a reader can use
     GSF__PLY_X = 0,
     GSF__PLY_DC = 3,
     GSF__PLY_OPACITY = 6,
@@ -901,22 +904,22 @@ typedef enum gsf__ply_type {
 
 typedef enum gsf__ply_format { GSF__PLY_ASCII, GSF__PLY_LITTLE, GSF__PLY_BIG } gsf__ply_format;
 
-typedef struct gsf__ply { // a checked header; in binary files count rows of row_bytes lie inside the data
-    const char* name; // for error texts
+typedef struct gsf__ply { // a validated header; in binary files `count` rows of `row_bytes` fit into the data
+    const char* name; // for error messages
     const unsigned char* data;
     size_t size;
     gsf__ply_format format;
-    size_t body;      // byte offset of the first vertex row (ascii: of the text that holds it)
-    size_t count;     // vertices
-    size_t columns;   // properties of a vertex
+    size_t body;      // byte offset of the first vertex row (ASCII: of its text)
+    size_t count;     // number of vertices
+    size_t columns;   // number of properties per vertex
     size_t row_bytes; // binary only
     gsf__ply_type type[GSF__PLY_SLOTS];
-    size_t offset[GSF__PLY_SLOTS]; // bytes into the row, or index of the column (ascii)
+    size_t offset[GSF__PLY_SLOTS]; // byte offset within the row (ASCII: column index)
 } gsf__ply;
 
 static int gsf__is_blank(unsigned char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; }
 
-// Next word of [*at, end), which *at then points behind; its length, 0 at the end.
+// Finds the next word in [*at, end) and moves *at past it. Returns its length, 0 at the end of the text.
 static size_t gsf__next_word(const char** at, const char* end, const char** word) {
     const char* p = *at;
     while (p < end && gsf__is_blank((unsigned char)*p)) p++;
@@ -930,7 +933,7 @@ static int gsf__word_is(const char* word, size_t length, const char* text) {
     return strlen(text) == length && memcmp(word, text, length) == 0;
 }
 
-// Decimal digits only; 0 on anything else and on overflow.
+// Parses a word of decimal digits only. Returns 0 on any other character and on overflow.
 static int gsf__word_u64(const char* word, size_t length, uint64_t* out) {
     uint64_t value = 0;
     if (length == 0) return 0;
@@ -954,8 +957,8 @@ static int gsf__word_is_nan_or_inf(const char* word, size_t length, double* out)
     return 1;
 }
 
-// A decimal number filling the whole word; nan and inf (sign ignored) are taken too, for the caller to reject. 0 when
-// malformed.
+// Parses a decimal number that fills the whole word. Also accepts nan and inf (ignoring their sign), which the caller
+// must reject. Returns 0 when malformed.
 static int gsf__word_double(const char* word, size_t length, double* out) {
     const size_t used = gsf__scan_double(word, length, out);
     return used ? used == length : gsf__word_is_nan_or_inf(word, length, out);
@@ -975,7 +978,7 @@ static size_t gsf__ply_type_size(gsf__ply_type type) {
     return sizes[type];
 }
 
-// Slot of a column name, GSF__PLY_SLOTS when nobody wants it, -1 for an f_rest beyond degree 3.
+// Returns the slot of a column name, GSF__PLY_SLOTS for an unused column, -1 for an f_rest beyond SH degree 3.
 static int gsf__ply_slot(const char* word, size_t length) {
     static const char* const names[GSF__PLY_REST] = {"x",      "y",       "z",       "f_dc_0",  "f_dc_1",
                                                      "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
@@ -1020,7 +1023,7 @@ static gsf_result gsf__ply_property(gsf_context* ctx, gsf__ply* ply, gsf__ply_el
             return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: f_rest beyond SH degree 3 (0..44)", ply->name, line);
         if (slot < GSF__PLY_SLOTS) {
             if (ply->type[slot] != GSF__PLY_ABSENT)
-                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: column \"%.*s\" stands twice", ply->name, line,
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: column \"%.*s\" occurs twice", ply->name, line,
                                 (int)(name_size < 40 ? name_size : 40), name_word);
             ply->type[slot] = type;
             ply->offset[slot] = ply->format == GSF__PLY_ASCII ? element->columns : element->row_bytes;
@@ -1031,7 +1034,8 @@ static gsf_result gsf__ply_property(gsf_context* ctx, gsf__ply* ply, gsf__ply_el
     return GSF_OK;
 }
 
-// Called when the properties of `element` are complete. before: bytes (ascii: words) to skip ahead of the vertices.
+// Called after the last property of `element`. Adds the size of elements that precede the vertices to *before, in bytes
+// (ASCII: words).
 static gsf_result gsf__ply_finish_element(gsf_context* ctx, gsf__ply* ply, const gsf__ply_element* element, int* found,
                                           size_t* before) {
     if (!element->seen || *found) return GSF_OK;
@@ -1042,7 +1046,7 @@ static gsf_result gsf__ply_finish_element(gsf_context* ctx, gsf__ply* ply, const
         return GSF_OK;
     }
     if (element->has_list && element->rows)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: an element with lists stands before the vertices", ply->name);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: an element with lists precedes the vertices", ply->name);
     const size_t unit = ply->format == GSF__PLY_ASCII ? element->columns : element->row_bytes;
     size_t skip;
     if (element->rows > SIZE_MAX || !gsf__mul_size((size_t)element->rows, unit, &skip) || skip > ply->size ||
@@ -1067,7 +1071,7 @@ static gsf_result gsf__ply_read_format(gsf_context* ctx, gsf__ply* ply, size_t l
                     "%s:%zu: expected format ascii, binary_little_endian or binary_big_endian 1.0", ply->name, line);
 }
 
-// Moves ply->body behind `words` words.
+// Moves ply->body past `words` words.
 static gsf_result gsf__ply_skip_words(gsf_context* ctx, gsf__ply* ply, size_t words) {
     const char *at = (const char*)ply->data + ply->body, *end = (const char*)ply->data + ply->size, *word;
     for (; words; words--)
@@ -1077,7 +1081,7 @@ static gsf_result gsf__ply_skip_words(gsf_context* ctx, gsf__ply* ply, size_t wo
     return GSF_OK;
 }
 
-// Places the body and checks that `count` rows can lie in the rest of the file.
+// Sets the start of the vertex rows and checks that the rest of the file has room for `rows` of them.
 static gsf_result gsf__ply_place_body(gsf_context* ctx, gsf__ply* ply, uint64_t rows, size_t before) {
     if (ply->format == GSF__PLY_ASCII) {
         GSF__TRY(gsf__ply_skip_words(ctx, ply, before));
@@ -1087,7 +1091,7 @@ static gsf_result gsf__ply_place_body(gsf_context* ctx, gsf__ply* ply, uint64_t 
         ply->body += before;
     }
     const size_t left = ply->size - ply->body;
-    // In text a value takes at least a digit and a separator, the last of the file the digit only.
+    // In text, a value takes at least a digit and a separator; the last value of the file needs no separator.
     const size_t fit = ply->columns == 0 ? 0
                        : ply->format == GSF__PLY_ASCII ? (left + 1) / (2 * ply->columns) : left / ply->row_bytes;
     if (rows > fit)
@@ -1112,7 +1116,7 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
     int found = 0, has_format = 0, has_vertex = 0;
     for (size_t line = 0, number = 0;; number++) {
         const char* stop = line < size ? (const char*)memchr(text + line, '\n', size - line) : NULL;
-        if (!stop && number == 0) stop = text + size; // so that any other short file is "no PLY", not "cut"
+        if (!stop && number == 0) stop = text + size; // so a short foreign file is "not a PLY file", not truncated
         if (!stop) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: header without end_header", name, line);
         const char *at = text + line, *word;
         const size_t length = gsf__next_word(&at, stop, &word);
@@ -1135,7 +1139,7 @@ static gsf_result gsf__ply_read_header(gsf_context* ctx, const char* name, const
                 return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element count \"%.*s\" is not a 64-bit count", name,
                                 line, (int)(n < 40 ? n : 40), word);
             if (element.is_vertex && has_vertex)
-                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element vertex stands twice", name, line);
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: element vertex occurs twice", name, line);
             if (element.is_vertex) vertices = element.rows, has_vertex = 1;
         } else if (gsf__word_is(word, length, "property")) {
             GSF__TRY(gsf__ply_property(ctx, ply, &element, line, at, stop));
@@ -1179,7 +1183,7 @@ static double gsf__ply_value(const unsigned char* p, gsf__ply_type type, int big
     return 0.0;
 }
 
-static void gsf__ply_position(const gsf__ply* ply, size_t row, double out[3]) { // binary files
+static void gsf__ply_position(const gsf__ply* ply, size_t row, double out[3]) { // binary files only
     const unsigned char* p = ply->data + ply->body + row * ply->row_bytes;
     for (int k = 0; k < 3; k++)
         out[k] = gsf__ply_value(p + ply->offset[k], ply->type[k], ply->format == GSF__PLY_BIG);
@@ -1192,9 +1196,10 @@ static int gsf__compare_doubles(const void* a, const void* b) {
 
 enum { GSF__ORIGIN_SAMPLES = 1024 };
 
-// The origin that positions deserve: zero, or their rounded centre where float32 would cost precision (centre beyond
-// 1e5, or beyond 1000 times the extent). Centre and extent are the median and the 5..95 % range of at most 1024 evenly
-// spread positions, so stray splats do not move it. axis: n samples of x, then of y, then of z; sorted in place.
+// Chooses an origin: zero, or the rounded centre of the positions where float32 would lose precision (centre farther
+// than 1e5 from zero, or than 1000 times the extent). Centre and extent are the median and the 5..95 % range of at most
+// 1024 evenly spaced samples, so that outliers do not move them. axis: n samples of x, then of y, then of z; sorted in
+// place.
 static void gsf__choose_origin(double* axis, size_t n, double origin[3]) {
     double centre[3], extent = 0.0, distance = 0.0;
     memset(origin, 0, 3 * sizeof(double));
@@ -1210,7 +1215,7 @@ static void gsf__choose_origin(double* axis, size_t n, double origin[3]) {
         for (int k = 0; k < 3; k++) origin[k] = floor(centre[k] + 0.5);
 }
 
-// position_fn(arg, i, xyz) gives position i of count.
+// Chooses the origin of `count` positions; position_fn(arg, i, xyz) returns position i.
 static gsf_result gsf__sample_origin(gsf_context* ctx, size_t count, void (*position_fn)(const void*, size_t, double*),
                                      const void* arg, double origin[3]) {
     const size_t stride = count / GSF__ORIGIN_SAMPLES + 1;
@@ -1221,7 +1226,7 @@ static gsf_result gsf__sample_origin(gsf_context* ctx, size_t count, void (*posi
     for (size_t i = 0; i < count; i += stride) {
         double p[3];
         position_fn(arg, i, p);
-        // beyond 1e12 nothing is a coordinate any more
+        // Skips NaN, infinity and garbage: no real coordinate is beyond 1e12.
         if (!(fabs(p[0]) < 1e12 && fabs(p[1]) < 1e12 && fabs(p[2]) < 1e12)) continue;
         for (size_t k = 0; k < 3; k++) axis[k * room + n] = p[k];
         n++;
@@ -1240,19 +1245,19 @@ static void gsf__array_sample_position(const void* arg, size_t i, double* out) {
     memcpy(out, (const double*)arg + 3 * i, 3 * sizeof(double));
 }
 
-typedef struct gsf__ply_target { // where a column's values go
+typedef struct gsf__ply_target { // destination of a column's values
     int slot;
     float* first;
     size_t stride; // floats
-    size_t offset; // of the column in a row, as in gsf__ply
+    size_t offset; // of the column within a row, as in gsf__ply
 } gsf__ply_target;
 
 typedef struct gsf__ply_job {
     const gsf__ply* ply;
-    gsf__ply_target targets[GSF__PLY_RED]; // all but x y z
+    gsf__ply_target targets[GSF__PLY_RED]; // all columns except x y z
     size_t target_count;
     gsf_splats* splats;
-    uint8_t* bad;     // (count) rows with a value that is NaN or infinite
+    uint8_t* bad;     // (count) 1 for rows with a NaN or infinite value
     int all_f32;      // every target column is little-endian float32, as in nearly all files
 } gsf__ply_job;
 
@@ -1294,7 +1299,7 @@ static void gsf__ply_list_targets(gsf__ply_job* job) {
     }
 }
 
-// One row of little-endian float32 columns; the or of all bits that would make a value NaN or infinite is looked at once.
+// Decodes a row of little-endian float32 columns. NaN and infinity are collected in one bit to avoid a branch per value.
 static int gsf__ply_decode_f32(const gsf__ply_job* job, const unsigned char* row, size_t i) {
     uint32_t bad = 0;
     for (size_t t = 0; t < job->target_count; t++) {
@@ -1302,7 +1307,7 @@ static int gsf__ply_decode_f32(const gsf__ply_job* job, const unsigned char* row
         const unsigned char* at = row + target->offset;
         const uint32_t bits =
             (uint32_t)at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
-        bad |= (bits & 0x7f800000u) + 0x00800000u; // carries into the top bit
+        bad |= (bits & 0x7f800000u) + 0x00800000u; // an exponent of all ones carries into the top bit
         memcpy(target->first + i * target->stride, &bits, sizeof bits);
     }
     return (int)(bad >> 31);
@@ -1344,7 +1349,7 @@ static void gsf__ply_decode_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// Reads row after row of an ascii body. values: (columns), of the row; *at moves on.
+// Parses the next row of an ASCII body into values (columns) and advances *at.
 static gsf_result gsf__ply_ascii_row(gsf_context* ctx, const gsf__ply* ply, const char** at, double* values) {
     const char *end = (const char*)ply->data + ply->size, *word;
     for (size_t c = 0; c < ply->columns; c++) {
@@ -1389,7 +1394,7 @@ static gsf_result gsf__ply_decode_ascii(gsf_context* ctx, gsf__ply_job* job) {
     return result;
 }
 
-// Removes the bad rows; ids stay 0..count-1.
+// Removes the bad rows. The ids remain consecutive, since gsf_splat_make has numbered them and they are not moved.
 static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* bad, gsf_splats* s) {
     const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree);
     size_t kept = 0;
@@ -1410,7 +1415,7 @@ static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* ba
     s->count = kept;
 }
 
-// Checks that all columns of a splat are there. *sh_degree from the number of f_rest columns.
+// Checks that all columns of a splat are present and derives *sh_degree from the number of f_rest columns.
 static gsf_result gsf__ply_check_columns(gsf_context* ctx, const gsf__ply* ply, int32_t* sh_degree) {
     static const char* const names[5] = {"x, y, z", "f_dc_0..2", "opacity", "scale_0..2", "rot_0..3"};
     static const unsigned char group[GSF__PLY_REST] = {0, 0, 0, 1, 1, 1, 2, 3, 3, 3, 4, 4, 4, 4};
@@ -1461,7 +1466,7 @@ typedef struct gsf__ply_write_job {
     const gsf_splats* splats;
     unsigned char* rows;
     size_t row_bytes;
-    int wide; // x y z as double
+    int wide; // write x y z as double
 } gsf__ply_write_job;
 
 static unsigned char* gsf__put_f32(unsigned char* p, float value) {
@@ -1543,10 +1548,10 @@ static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gs
 
 // ---- >>formats -----------------------------------------------------------------
 
-/* What follows the PLY files: which format a name means, .splat, .spz. Both hold positions as float32 or 24-bit fixed
-   point around zero, so origin + mean is rounded; gsf__pack_plan measures by how much. */
+/* Choosing the format by file name, and the compact formats .splat and .spz. These store positions as float32 or 24-bit
+   fixed point relative to zero, so origin + mean is rounded; gsf__pack_plan measures what that costs. */
 
-static const float gsf__dc_scale = 0.28209479177387814f; // SH band 0: colour = 0.5 + this * coefficient
+static const float gsf__dc_scale = 0.28209479177387814f; // SH band 0: colour = 0.5 + gsf__dc_scale * coefficient
 
 static gsf_splat_type gsf__type_of_name(const char* name) {
     static const char* const endings[3] = {".ply", ".splat", ".spz"};
@@ -1562,14 +1567,15 @@ static gsf_splat_type gsf__type_of_name(const char* name) {
     return GSF_SPLAT_AUTO;
 }
 
-// To the nearest whole number in 0..255, halves up; NaN to 0.
+// Rounds to the nearest integer in 0..255, halves up; NaN becomes 0.
 static unsigned char gsf__to_u8(float value) {
     return value >= 255.0f ? (unsigned char)255 : value > 0.0f ? (unsigned char)(value + 0.5f) : (unsigned char)0;
 }
 
 static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + expf(-logit)); }
 
-// Logits of the 256 opacities; the ends, which stand for half a step, are taken in its middle, so that they are finite.
+// Logits of the 256 opacity codes. Codes 0 and 255 cover half a step each and decode to its middle, so that their
+// logits are finite.
 static void gsf__make_logits(float logits[256]) {
     for (int i = 0; i < 256; i++) {
         const double p = (i == 0 ? 0.25 : i == 255 ? 254.75 : (double)i) / 255.0;
@@ -1577,24 +1583,24 @@ static void gsf__make_logits(float logits[256]) {
     }
 }
 
-// Unit quaternion; zero gives the identity, as when it is used.
+// Normalises a quaternion. Zero becomes the identity, as in the rasterizer.
 static void gsf__unit_quat(const float* q, float out[4]) {
     float largest = 0.0f;
     for (int k = 0; k < 4; k++) largest = fmaxf(largest, fabsf(q[k]));
-    const float scale = largest > 1e-15f && largest < 1e15f ? 1.0f : largest; // else the squares leave float32
+    const float scale = largest > 1e-15f && largest < 1e15f ? 1.0f : largest; // else the squares over- or underflow
     const float v[4] = {q[0] / scale, q[1] / scale, q[2] / scale, q[3] / scale};
     const float norm = sqrtf(v[1] * v[1] + v[2] * v[2] + v[3] * v[3] + v[0] * v[0]);
     for (int k = 0; k < 4; k++) out[k] = largest > 0.0f ? v[k] / norm : k == 0 ? 1.0f : 0.0f;
 }
 
-// Splats on the way into a file of less precision.
+// Splats being written to a format of lower precision.
 typedef struct gsf__pack {
     const gsf_splats* splats;
     const char* name;
-    size_t count;         // that are written
-    uint32_t* rows;       // which ones; NULL = all
-    uint8_t* bad;         // (splats->count) a value is NaN or infinite
-    double farthest;      // largest |coordinate| of a position
+    size_t count;         // number of splats written
+    uint32_t* rows;       // their indices; NULL = all
+    uint8_t* bad;         // (splats->count) 1 where a value is NaN or infinite
+    double farthest;      // largest |coordinate| of any position
     double typical;       // median scale
     unsigned char* out;
     int version, fraction; // .spz
@@ -1639,7 +1645,7 @@ static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_s
     if (splats->sh_degree < 0 || splats->sh_degree > 3)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SH degree %d is not 0..3", name, (int)splats->sh_degree);
     if (splats->count > UINT32_MAX)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, the format holds 2^32", name, splats->count);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, more than the format's 2^32", name, splats->count);
     job->bad = (uint8_t*)gsf_alloc(ctx, splats->count ? splats->count : 1, 1);
     if (!job->bad) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__parallel_for(ctx, (splats->count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__pack_check_chunk, job);
@@ -1672,7 +1678,7 @@ static void gsf__pack_free(gsf_context* ctx, gsf__pack* job) {
     gsf_free(ctx, job->bad);
 }
 
-// step: between neighbouring values of a coordinate.
+// Warns when positions are too coarse for the size of the splats. step: distance between adjacent coordinate values.
 static void gsf__pack_warn_coarse(gsf_context* ctx, const gsf__pack* job, double step) {
     if (job->count && step > 0.25 * job->typical)
         gsf_log(ctx, GSF_LOG_WARNING,
@@ -1681,7 +1687,7 @@ static void gsf__pack_warn_coarse(gsf_context* ctx, const gsf__pack* job, double
                 job->name, job->farthest, step, job->typical);
 }
 
-/* .splat: nothing but rows of 32 bytes, little-endian
+/* .splat: no header, only rows of 32 bytes, little-endian:
        position 3 x float32 | scale 3 x float32, linear | red green blue opacity u8 | quaternion w x y z u8, 128 + 128 q */
 
 enum { GSF__SPLAT_ROW = 32 };
@@ -1717,7 +1723,7 @@ static void gsf__splat_decode_chunk(void* arg, size_t chunk, int32_t worker) {
             const float scale = gsf__get_f32(row + 12 + 4 * k);
             bad |= gsf__float_is_bad(mean) | gsf__float_is_bad(scale) | (scale < 0.0f);
             s->means[3 * i + k] = mean;
-            s->log_scales[3 * i + k] = logf(fmaxf(scale, FLT_MIN)); // a scale of 0 is in use, its logarithm is not
+            s->log_scales[3 * i + k] = logf(fmaxf(scale, FLT_MIN)); // files contain zero scales; log(0) is infinite
             s->sh[3 * i + k] = ((float)row[24 + k] / 255.0f - 0.5f) / gsf__dc_scale;
         }
         s->opacity_logits[i] = job->logits[row[27]];
@@ -1728,7 +1734,7 @@ static void gsf__splat_decode_chunk(void* arg, size_t chunk, int32_t worker) {
 
 static gsf_result gsf__splat_parse(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_splats* out) {
     if (size % GSF__SPLAT_ROW != 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: .splat is cut: a row has 32 bytes, the last one %zu", name,
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: truncated .splat: a row has 32 bytes, the last one %zu", name,
                         size - size % GSF__SPLAT_ROW, size % GSF__SPLAT_ROW);
     const size_t count = size / GSF__SPLAT_ROW;
     if (count > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, ids hold 2^32", name, count);
@@ -1772,7 +1778,7 @@ static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gs
     gsf__pack job;
     size_t bytes = 0;
     GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
-    gsf__pack_warn_coarse(ctx, &job, job.farthest / 8388608.0); // 24 bits
+    gsf__pack_warn_coarse(ctx, &job, job.farthest / 8388608.0); // float32 has a 24-bit significand
     gsf_result result = GSF_OK;
     if (!gsf__mul_size(job.count, GSF__SPLAT_ROW, &bytes) || bytes > SIZE_MAX / 2)
         result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", job.count);
@@ -1791,7 +1797,7 @@ static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gs
 /* gzip (RFC 1952) around DEFLATE:
        1f 8b 08 flags | mtime 4 | xfl | os | [extra] [name] [comment] [crc16] | DEFLATE | crc32 4 | size modulo 2^32 4 */
 
-enum { GSF__DEFLATE_RATIO = 1032 }; // bytes that one of DEFLATE can stand for, at most
+enum { GSF__DEFLATE_RATIO = 1032 }; // upper bound of DEFLATE's compression ratio
 
 static gsf_result gsf__gzip_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
                                       size_t* body) {
@@ -1800,9 +1806,9 @@ static gsf_result gsf__gzip_read_head(gsf_context* ctx, const char* name, const 
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not gzip (1f 8b expected)", name);
     if (size < 18) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut", name, size);
     if (p[2] != 8 || (p[3] & 0xe0) != 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:2: gzip method %d, flags %d: not known", name, p[2], p[3]);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:2: gzip method %d, flags %d: not supported", name, p[2], p[3]);
     if (p[3] & 4) at += 2 + (size_t)gsf__load_le(p + 10, 2);
-    for (int text = 8; text <= 16; text *= 2) // name, comment
+    for (int text = 8; text <= 16; text *= 2) // optional NUL-terminated name and comment
         if (p[3] & text) {
             while (at < size && p[at]) at++;
             at++;
@@ -1813,8 +1819,8 @@ static gsf_result gsf__gzip_read_head(gsf_context* ctx, const char* name, const 
     return GSF_OK;
 }
 
-// Content of a gzip file, *out_size > 0 bytes, freed by the caller. How long it is only the end of the file says; more
-// than DEFLATE can make of the file is not believed.
+// Inflates a gzip file into *out (freed by the caller), *out_size > 0 bytes. The size comes from the file's trailer; it
+// is rejected when DEFLATE could not have compressed that much into a file of this size.
 static gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
                                  unsigned char** out, size_t* out_size) {
     size_t body = 0;
@@ -1822,7 +1828,7 @@ static gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsig
     *out_size = 0;
     GSF__TRY(gsf__gzip_read_head(ctx, name, data, size, &body));
     const size_t whole = (size_t)gsf__load_le(data + size - 4, 4);
-    if (whole == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: gzip file of nothing", name, size - 4);
+    if (whole == 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: gzip file without content", name, size - 4);
     if (whole / GSF__DEFLATE_RATIO > size - body - 8)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes of content claimed, more than %zu can inflate to", name,
                         size - 4, whole, size - body - 8);
@@ -1840,9 +1846,10 @@ static gsf_result gsf__gzip_read(gsf_context* ctx, const char* name, const unsig
     return GSF_OK;
 }
 
-// Appends `data` (size > 0) as a gzip file, or leaves `out` as it was.
+// Appends `data` (size > 0) as a gzip file; leaves `out` unchanged on error.
 static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out) {
-    static const unsigned char head[10] = {0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255}; // no time, no system: same bytes always
+    // Reproducible bytes: no modification time, unknown operating system.
+    static const unsigned char head[10] = {0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255};
     const size_t before = out->size;
     char tail[8];
     gsf_append_bytes(ctx, out, (const char*)head, sizeof head);
@@ -1862,11 +1869,11 @@ static gsf_result gsf__gzip_append(gsf_context* ctx, const char* name, const voi
        colours     count x 3 x u8: 127.5 + 255 * 0.15 * coefficient of SH band 0
        scales      count x 3 x u8: 16 * (logarithm + 10)
        rotations   count x 3 x u8: 127.5 + 127.5 * x, y, z of the unit quaternion whose w is not negative;
-                   version 3: count x u32: index (x y z w) of the largest component in the top 2 bits, then sign and 9 bits
-                   of each other one in units of sqrt(1/2) / 511, the largest taken as positive
-       SH          count x (K - 1) x 3 x u8: 128 + 128 * coefficient, written rounded to 5 (band 1) or 4 bits
-   Axes are right, up, back; ours (and PLY's) right, down, front: y and z change sign, so do x of the rotation's other two
-   axes, and the SH coefficients that are odd in y or z, as gsf__spz_signs has it. */
+                   version 3: count x u32: index (x y z w) of the largest component in the top 2 bits, then sign and
+                   9 bits of each other component in units of sqrt(1/2) / 511; the largest is positive
+       SH          count x (K - 1) x 3 x u8: 128 + 128 * coefficient, rounded to 5 (band 1) or 4 bits when writing
+   SPZ's axes are right, up, back; ours (and PLY's) are right, down, front. So y and z of positions and quaternions
+   change sign, and so do the SH coefficients listed in gsf__spz_signs. */
 
 enum { GSF__SPZ_HEAD = 16, GSF__SPZ_ANTIALIASED = 1, GSF__SPZ_EXTENDED = 2, GSF__SPZ_FRACTION_MAX = 23 };
 
@@ -1875,10 +1882,10 @@ static const float gsf__spz_signs[15] = {-1.0f, -1.0f, 1.0f, -1.0f, 1.0f, 1.0f, 
 static const float gsf__spz_axes[3] = {1.0f, -1.0f, -1.0f};
 static const float gsf__spz_color = 0.15f, gsf__sqrt_half = 0.70710678118654752440f;
 
-typedef struct gsf__spz { // a file's content
+typedef struct gsf__spz { // decompressed content of a file
     const char* name;
-    int version, fraction, degree, flags; // degree: the file's, 0..4
-    size_t count, size;                   // size: of the content without extensions
+    int version, fraction, degree, flags; // degree: of the file, 0..4
+    size_t count, size;                   // size: bytes of content without extensions
     double unit;                          // 2^-fraction
     const unsigned char *positions, *alphas, *colors, *scales, *rotations, *sh;
     gsf_splats* splats;
@@ -1895,10 +1902,10 @@ static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const u
     memset(spz, 0, sizeof *spz);
     spz->name = name;
     if (size < GSF__SPZ_HEAD || memcmp(p, "NGSP", 4) != 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 0: no SPZ (magic NGSP expected)", name);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 0: not an SPZ file (magic NGSP expected)", name);
     const unsigned version = (unsigned)gsf__load_le(p + 4, 4);
     if (version < 1 || version > 3)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: content byte 4: SPZ version %u, 1 to 3 are read", name, version);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: content byte 4: SPZ version %u, expected 1 to 3", name, version);
     spz->version = (int)version;
     spz->count = (size_t)gsf__load_le(p + 8, 4);
     spz->degree = p[12];
@@ -1908,7 +1915,7 @@ static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const u
     if (spz->degree > 4)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 12: SH degree %d is not 0..4", name, spz->degree);
     if (version > 1 && spz->fraction > 30)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 13: %d fraction bits, at most 30 make sense", name,
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: content byte 13: %d fraction bits, expected at most 30", name,
                         spz->fraction);
     if (!gsf__mul_size(spz->count, gsf__spz_row(spz->version, spz->degree), &spz->size) ||
         spz->size > SIZE_MAX - GSF__SPZ_HEAD)
@@ -1926,7 +1933,7 @@ static void gsf__spz_place(gsf__spz* spz, const unsigned char* content) {
     spz->sh = spz->rotations + spz->count * (spz->version == 3 ? 4u : 3u);
 }
 
-// Inflates the content into *out (freed by the caller) and finds what is where in it.
+// Inflates the content into *out (freed by the caller) and sets the pointers of *spz to its arrays.
 static gsf_result gsf__spz_inflate(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
                                    gsf__spz* spz, unsigned char** out) {
     size_t whole = 0;
@@ -1965,7 +1972,7 @@ static void gsf__spz_position(const void* arg, size_t i, double* out) {
     }
 }
 
-// p: as the file has it; q: w x y z in our axes.
+// p: encoded rotation; q: w x y z in our axes.
 static void gsf__spz_decode_rotation(const unsigned char* p, int version, float q[4]) {
     float sum = 0.0f;
     if (version < 3) {
@@ -1976,7 +1983,7 @@ static void gsf__spz_decode_rotation(const unsigned char* p, int version, float 
         q[0] = sqrtf(fmaxf(0.0f, 1.0f - sum));
     } else {
         uint32_t word = (uint32_t)gsf__load_le(p, 4);
-        const int largest = (int)(word >> 30); // of x y z w; component c is q[(c + 1) & 3]
+        const int largest = (int)(word >> 30); // index into x y z w; component c is q[(c + 1) & 3]
         for (int c = 3; c >= 0; c--) {
             if (c == largest) continue;
             const float value = gsf__sqrt_half * (float)(word & 511u) / 511.0f;
@@ -2065,7 +2072,7 @@ static void gsf__spz_encode_rotation(const float* quat, int version, unsigned ch
     gsf__store_le(p, word, 4);
 }
 
-// To the nearest multiple of `bucket` on the scale of 128 per unit around 128.
+// Encodes value as 128 + 128 * value, rounded to the nearest multiple of `bucket`.
 static unsigned char gsf__spz_encode_sh(float value, int bucket) {
     const float scaled = value * 128.0f;
     if (scaled >= 127.0f) return 255;
@@ -2087,7 +2094,7 @@ static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
         unsigned char* sh = job->sh + 3 * (bands - 1) * row;
         for (size_t k = 0; k < 3; k++) {
             const double p = (s->origin[k] + (double)s->means[3 * i + k]) * units * (double)gsf__spz_axes[k];
-            const int32_t fixed = (int32_t)(p < 0.0 ? p - 0.5 : p + 0.5); // in range by the choice of fraction
+            const int32_t fixed = (int32_t)(p < 0.0 ? p - 0.5 : p + 0.5); // gsf__spz_choose_fraction keeps it in range
             gsf__store_le(job->positions + 9 * row + 3 * k, (uint32_t)fixed & 0xffffffu, 3);
             job->scales[3 * row + k] = gsf__to_u8((s->log_scales[3 * i + k] + 10.0f) * 16.0f);
             job->colors[3 * row + k] = gsf__to_u8(s->sh[3 * bands * i + k] * (gsf__spz_color * 255.0f) + 127.5f);
@@ -2101,8 +2108,8 @@ static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// Fraction bits: the official 12, more where splats are small (a step is then at most 1/32 of the median scale), fewer
-// where positions do not fit 24 bits otherwise.
+// Chooses the fraction bits: 12 as in Niantic's encoder; more where splats are small, so that a step is at most 1/32 of
+// the median scale; fewer where positions would not fit into 24 bits otherwise.
 static gsf_result gsf__spz_choose_fraction(gsf_context* ctx, gsf__pack* job) {
     const double most = 8388607.0;
     if (job->farthest > most)
@@ -2116,7 +2123,7 @@ static gsf_result gsf__spz_choose_fraction(gsf_context* ctx, gsf__pack* job) {
     return GSF_OK;
 }
 
-// Scales beyond what 8 bits hold; thin ones may be thinner than that without anybody seeing it.
+// Warns about splats whose largest scale does not fit into 8 bits. Clamping the thinner axes is not visible.
 static void gsf__spz_warn_scales(gsf_context* ctx, const gsf__pack* job) {
     const gsf_splats* s = job->splats;
     size_t clamped = 0;
@@ -2135,7 +2142,7 @@ static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_
     gsf__pack job;
     size_t size = 0;
     if (version != 2 && version != 3)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SPZ version %d: 2 and 3 are written", name, version);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SPZ version %d, expected 2 or 3", name, version);
     GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
     job.version = version;
     gsf_result result = gsf__spz_choose_fraction(ctx, &job);
@@ -2179,7 +2186,7 @@ GSF_API gsf_result gsf_splat_parse(gsf_context* ctx, const char* name, const voi
     if (size >= 4 && memcmp(p, "ply", 3) == 0) return gsf__parse_ply(ctx, name, data, size, out);
     if (size >= 4 && ((p[0] == 0x1f && p[1] == 0x8b) || memcmp(p, "NGSP", 4) == 0))
         return gsf__spz_parse(ctx, name, data, size, out);
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: neither PLY nor SPZ, and .splat is known by its name only", name);
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: neither PLY nor SPZ (.splat is detected only by name)", name);
 }
 
 GSF_API gsf_result gsf_splat_load(gsf_context* ctx, const char* path, gsf_splats* out) {
@@ -2221,8 +2228,8 @@ GSF_API gsf_result gsf_splat_save(gsf_context* ctx, const char* path, const gsf_
 
 // ---- >>colmap ------------------------------------------------------------------
 
-/* COLMAP's three files are first read into a gsf__sfm (still in file order, tracks naming image ids), which >>scene
-   turns into a gsf_scene. transforms.json takes the same way. Binary files, all little-endian:
+/* COLMAP's three files are first read into a gsf__sfm (in file order, with tracks of image ids), which >>scene converts
+   to a gsf_scene. transforms.json is read the same way. Binary files, all little-endian:
        cameras.bin   u64 n | n x { u32 id, i32 model, u64 width, u64 height, f64 params[of the model] }
        images.bin    u64 n | n x { u32 id, f64 qw qx qy qz, f64 tx ty tz, u32 camera, char name[] NUL,
                                    u64 m, m x { f64 x y, u64 point } }
@@ -2233,13 +2240,13 @@ typedef enum gsf__lens_kind {
     GSF__LENS_RATIONAL,
     GSF__LENS_FISHEYE,
     GSF__LENS_FOV,
-    GSF__LENS_FISHEYE624, // as Project Aria calls it: 6 radial, 2 tangential, 4 thin prism coefficients
+    GSF__LENS_FISHEYE624, // Project Aria's name: 6 radial, 2 tangential, 4 thin prism coefficients
     GSF__LENS_DIVISION,
     GSF__LENS_EUCM,
-    GSF__LENS_PANORAMA    // has no pinhole image: no gsf__lens is of this kind
+    GSF__LENS_PANORAMA    // cannot be rectified to a pinhole image, so no gsf__lens is of this kind
 } gsf__lens_kind;
 
-typedef struct gsf__lens { // any COLMAP camera, brought to one of a few kinds; formulas in gsf__lens_distort
+typedef struct gsf__lens { // any COLMAP camera, reduced to one of a few kinds; formulas in gsf__lens_distort
     gsf__lens_kind kind;
     int32_t width, height;
     double fx, fy, cx, cy;
@@ -2251,15 +2258,15 @@ typedef struct gsf__lens { // any COLMAP camera, brought to one of a few kinds; 
 typedef struct gsf__sfm_camera {
     uint32_t id;
     gsf__lens lens;
-    // transforms.json may leave open what only the photo tells; see gsf__camera_lens
-    int open;                // width = height = 0: the photo's; cx, cy NaN: its middle
+    // transforms.json may omit what can be derived from the photo; see gsf__camera_lens
+    int open;                // width = height = 0: the photo's size; cx, cy NaN: its centre
     double angle_x, angle_y; // fields of view in radians, for fx, fy = 0
 } gsf__sfm_camera;
 
 typedef struct gsf__sfm_image {
     uint32_t id, camera_id;
     size_t camera;    // index into cameras
-    size_t at;        // byte offset or line, for error texts
+    size_t at;        // byte offset or line, for error messages
     double w2c[16];
     const char* name; // inside the source text, not terminated
     size_t name_size;
@@ -2271,11 +2278,11 @@ typedef struct gsf__sfm {
     double* points;
     uint8_t* colors;
     uint64_t* point_ids;
-    size_t* track_begin; // end of the tracks so far, after each point; the scene's array has a zero before
+    size_t* track_begin; // track_count after each point; gsf_scene's array has a leading zero
     uint32_t* tracks;    // image ids
     size_t camera_count, image_count, point_count, track_count;
     size_t camera_room, image_room, point_room, color_room, id_room, begin_room, track_room;
-    size_t dropped_points; // with a NaN or infinite position
+    size_t dropped_points; // points with a NaN or infinite position
     const char* images_name;
 } gsf__sfm;
 
@@ -2296,7 +2303,7 @@ typedef struct gsf__lens_model { // COLMAP's camera models by id
     const char* name;
     unsigned char param_count, focal_count;
     gsf__lens_kind kind;
-    signed char slot[12]; // where each parameter after the principal point goes in gsf__lens.k
+    signed char slot[12]; // index into gsf__lens.k of each parameter after the principal point
 } gsf__lens_model;
 
 static const gsf__lens_model gsf__lens_models[18] = { // COLMAP 3.12 writes the first 12, 4.1 all of them
@@ -2320,7 +2327,7 @@ static const gsf__lens_model gsf__lens_models[18] = { // COLMAP 3.12 writes the 
     {"EQUIRECTANGULAR", 2, 0, GSF__LENS_PANORAMA, {0}},
 };
 
-// What makes the lens of a camera meaningless, as the end of a sentence; NULL if nothing does.
+// Returns what makes the lens of a camera invalid, as the end of an error message; NULL if it is valid.
 static const char* gsf__lens_fault(const gsf__lens* lens) {
     const double* k = lens->k;
     if (!(lens->fx > 0.0 && lens->fy > 0.0)) return "a focal length is not above 0";
@@ -2330,7 +2337,8 @@ static const char* gsf__lens_fault(const gsf__lens* lens) {
     return NULL;
 }
 
-// The lens of a model with its parameters. What bends no ray becomes a pinhole, whose photos are used as they are.
+// Builds a lens from a camera model and its parameters. A lens without distortion becomes a pinhole, so that its photos
+// are used without resampling.
 static gsf__lens gsf__lens_from_params(const gsf__lens_model* info, int32_t width, int32_t height,
                                        const double* params) {
     gsf__lens lens;
@@ -2352,7 +2360,7 @@ static gsf__lens gsf__lens_from_params(const gsf__lens_model* info, int32_t widt
     return lens;
 }
 
-// Checks a camera and adds it. name, at: where it stands, for error texts. params: as many as the model has.
+// Validates and adds a camera. name, at: its file and position, for error messages. params: as many as the model has.
 static gsf_result gsf__sfm_add_camera(gsf_context* ctx, gsf__sfm* m, const char* name, size_t at, uint32_t id,
                                       int model, uint64_t width, uint64_t height, const double* params) {
     const gsf__lens_model* info = &gsf__lens_models[model];
@@ -2390,11 +2398,12 @@ static gsf_result gsf__sfm_finish_cameras(gsf_context* ctx, gsf__sfm* m, const c
     qsort(m->cameras, m->camera_count, sizeof *m->cameras, gsf__compare_cameras);
     for (size_t i = 1; i < m->camera_count; i++)
         if (m->cameras[i].id == m->cameras[i - 1].id)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: camera %u stands twice", name, (unsigned)m->cameras[i].id);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: camera %u occurs twice", name, (unsigned)m->cameras[i].id);
     return GSF_OK;
 }
 
-// World-to-camera matrix of a quaternion (w x y z, any length but zero) and a translation. 0 if they are no pose.
+// Converts a quaternion (w x y z, any non-zero length) and a translation to a world-to-camera matrix. Returns 0 if they
+// are not a valid pose.
 static int gsf__pose_from_quaternion(const double q_in[4], const double t[3], double w2c[16]) {
     double q[4], largest = 0.0, norm = 0.0;
     for (int i = 0; i < 4; i++) {
@@ -2406,13 +2415,13 @@ static int gsf__pose_from_quaternion(const double q_in[4], const double t[3], do
     norm = sqrt(norm);
     for (int i = 0; i < 4; i++) q[i] /= norm;
     const double w = q[0], x = q[1], y = q[2], z = q[3];
-    const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y + w * z),     2 * (x * z - w * y), // column by column
+    const double r[9] = {1 - 2 * (y * y + z * z), 2 * (x * y + w * z),     2 * (x * z - w * y), // column-major
                          2 * (x * y - w * z),     1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
                          2 * (x * z + w * y),     2 * (y * z - w * x),     1 - 2 * (x * x + y * y)};
     memset(w2c, 0, 16 * sizeof(double));
     for (int c = 0; c < 3; c++) {
         for (int i = 0; i < 3; i++) w2c[4 * c + i] = r[3 * c + i];
-        if (!(fabs(t[c]) < 1e100)) return 0; // so that no centre overflows
+        if (!(fabs(t[c]) < 1e100)) return 0; // keeps the camera centre finite
         w2c[12 + c] = t[c];
     }
     w2c[15] = 1.0;
@@ -2449,7 +2458,7 @@ static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* 
     return GSF_OK;
 }
 
-// Adds a point without track; a position that is not finite is counted instead (*added = 0).
+// Adds a point with an empty track. A point with a non-finite position is only counted (*added = 0).
 static gsf_result gsf__sfm_add_point(gsf_context* ctx, gsf__sfm* m, uint64_t id, const double xyz[3],
                                      const uint8_t rgb[3], int* added) {
     const size_t n = m->point_count;
@@ -2471,7 +2480,7 @@ static gsf_result gsf__sfm_add_point(gsf_context* ctx, gsf__sfm* m, uint64_t id,
     return GSF_OK;
 }
 
-static gsf_result gsf__sfm_add_track(gsf_context* ctx, gsf__sfm* m, uint32_t image_id) {  // to the last point
+static gsf_result gsf__sfm_add_track(gsf_context* ctx, gsf__sfm* m, uint32_t image_id) { // of the last point
     GSF__TRY(
         gsf__reserve(ctx, (void**)&m->tracks, &m->track_room, m->track_count, m->track_count + 1, sizeof(uint32_t)));
     m->tracks[m->track_count++] = image_id;
@@ -2494,7 +2503,7 @@ static gsf__cursor gsf__make_cursor(const gsf_bytes* bytes, const char* fallback
     return c;
 }
 
-// The next `bytes` bytes; NULL (and the error) when the file ends before.
+// Consumes and returns the next `bytes` bytes; NULL, with the error set, when the file is too short.
 static const unsigned char* gsf__take(gsf_context* ctx, gsf__cursor* c, size_t bytes, const char* what) {
     if (bytes > c->size - c->at) {
         (void)gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file ends inside %s", c->name, c->at, what);
@@ -2504,7 +2513,7 @@ static const unsigned char* gsf__take(gsf_context* ctx, gsf__cursor* c, size_t b
     return c->data + c->at - bytes;
 }
 
-// A count of records of at least `record` bytes each, checked against what is left of the file.
+// Reads a count of records of at least `record` bytes each and checks it against the rest of the file.
 static gsf_result gsf__take_count(gsf_context* ctx, gsf__cursor* c, size_t record, const char* what, size_t* out) {
     const unsigned char* p = gsf__take(ctx, c, 8, what);
     if (!p) return GSF_ERROR_FORMAT;
@@ -2525,7 +2534,7 @@ static double gsf__load_f64(const unsigned char* p) {
 
 static gsf_result gsf__cursor_end(gsf_context* ctx, const gsf__cursor* c) {
     if (c->at == c->size) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes behind the last record", c->name, c->at, c->size - c->at);
+    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: %zu bytes after the last record", c->name, c->at, c->size - c->at);
 }
 
 static gsf_result gsf__colmap_cameras_bin(gsf_context* ctx, gsf__cursor* c, gsf__sfm* m) {
@@ -2561,7 +2570,7 @@ static gsf_result gsf__colmap_images_bin(gsf_context* ctx, gsf__cursor* c, gsf__
         for (int k = 0; k < 7; k++) pose[k] = gsf__load_f64(p + 4 + 8 * k);
         const char* image = (const char*)c->data + c->at;
         const char* stop = c->at < c->size ? (const char*)memchr(image, 0, c->size - c->at) : NULL;
-        if (!stop) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image name without end", c->name, c->at);
+        if (!stop) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: unterminated image name", c->name, c->at);
         c->at += (size_t)(stop - image) + 1;
         GSF__TRY(gsf__take_count(ctx, c, 24, "2D points", &observations));
         c->at += 24 * observations;
@@ -2575,7 +2584,7 @@ static gsf_result gsf__colmap_points_bin(gsf_context* ctx, gsf__cursor* c, gsf__
     size_t count, track;
     int added;
     GSF__TRY(gsf__take_count(ctx, c, 43 + 8, "points", &count));
-    // Sized once: what no record head takes must be track entries.
+    // Allocates the tracks once: all bytes that are not the fixed part of a record are track entries.
     GSF__TRY(gsf__reserve(ctx, (void**)&m->points, &m->point_room, 0, count, 3 * sizeof(double)));
     GSF__TRY(gsf__reserve(ctx, (void**)&m->colors, &m->color_room, 0, count, 3));
     GSF__TRY(gsf__reserve(ctx, (void**)&m->point_ids, &m->id_room, 0, count, sizeof(uint64_t)));
@@ -2597,7 +2606,7 @@ static gsf_result gsf__colmap_points_bin(gsf_context* ctx, gsf__cursor* c, gsf__
 
 typedef struct gsf__line { // a text file being read line by line
     const char* name;
-    const char *next, *file_end; // not yet read
+    const char *next, *file_end; // the lines not yet read
     const char *at, *end;        // rest of the current line
     size_t number;               // from 1
 } gsf__line;
@@ -2621,7 +2630,7 @@ static int gsf__next_line(gsf__line* l) { // 0 at the end of the file
     return 1;
 }
 
-static int gsf__next_record(gsf__line* l) { // the same without empty lines and comments
+static int gsf__next_record(gsf__line* l) { // as gsf__next_line, but skips empty lines and comments
     while (gsf__next_line(l)) {
         while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
         if (l->at < l->end && *l->at != '#') return 1;
@@ -2664,7 +2673,7 @@ static gsf_result gsf__colmap_cameras_txt(gsf_context* ctx, gsf__line* l, gsf__s
         for (int k = 0; k < gsf__lens_models[model].param_count; k++)
             GSF__TRY(gsf__take_double(ctx, l, "a camera parameter", &params[k]));
         if (gsf__next_word(&l->at, l->end, &word))
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %llu: %s has %d parameters, there are more", l->name,
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: camera %llu: %s takes %d parameters, found more", l->name,
                             l->number, (unsigned long long)id, gsf__lens_models[model].name,
                             (int)gsf__lens_models[model].param_count);
         GSF__TRY(gsf__sfm_add_camera(ctx, m, l->name, l->number, (uint32_t)id, model, width, height, params));
@@ -2681,11 +2690,11 @@ static gsf_result gsf__colmap_images_txt(gsf_context* ctx, gsf__line* l, gsf__sf
         GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "an image id", &id));
         for (int k = 0; k < 7; k++) GSF__TRY(gsf__take_double(ctx, l, "a pose (QW QX QY QZ TX TY TZ)", &pose[k]));
         GSF__TRY(gsf__take_u64(ctx, l, UINT32_MAX, "a camera id", &camera));
-        // The name is the rest of the line, so it may hold spaces.
+        // The name is the rest of the line and may contain spaces.
         while (l->at < l->end && gsf__is_blank((unsigned char)*l->at)) l->at++;
         const char *image = l->at, *stop = l->end;
         while (stop > image && gsf__is_blank((unsigned char)stop[-1])) stop--;
-        size_t values = 0; // of the line of 2D points, which may be empty; the last one may be missing
+        size_t values = 0; // in the line of 2D points, which may be empty, or missing at the end of the file
         if (gsf__next_line(l))
             while (gsf__next_word(&l->at, l->end, &word)) values++;
         if (values % 3)
@@ -2723,7 +2732,7 @@ static gsf_result gsf__colmap_points_txt(gsf_context* ctx, gsf__line* l, gsf__sf
     return GSF_OK;
 }
 
-// points NULL = none. The model's names point into `images`. To be destroyed also after an error.
+// points: may be NULL. The image names in *m point into `images`. *m must be destroyed even after an error.
 static gsf_result gsf__colmap_read(gsf_context* ctx, int32_t is_text, const gsf_bytes* cameras, const gsf_bytes* images,
                                    const gsf_bytes* points, gsf__sfm* m) {
     memset(m, 0, sizeof *m);
@@ -2757,13 +2766,13 @@ static gsf_result gsf__colmap_read(gsf_context* ctx, int32_t is_text, const gsf_
 
 /* transforms.json of nerfstudio and instant-ngp: an object with "frames": [{"file_path", "transform_matrix" (camera to
    world, OpenGL axes: x right, y up, z backward)}]. Intrinsics (w h fl_x fl_y cx cy k1..k4 p1 p2 camera_model, or
-   camera_angle_x / camera_angle_y) stand at the top, or in a frame, which then wins. The world stays the file's:
-   nerfstudio's applied_transform has already been applied to the cameras and to the points of ply_file_path, and
-   instant-ngp's scale, offset and aabb_scale only place its own grid. */
+   camera_angle_x / camera_angle_y) are given at the top level; a frame may override them. World coordinates are kept as
+   in the file: nerfstudio's applied_transform has already been applied to the cameras and to the points of
+   ply_file_path, and instant-ngp's scale, offset and aabb_scale only place its own grid. */
 
 static const char* gsf__json_where(const gsf_json* json) { return json->name; }
 
-// A number from the frame, else from the root, else `fallback`.
+// Reads a number from the frame, else from the top level, else `fallback`.
 static gsf_result gsf__json_setting(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                     const char* key, double fallback, double* out) {
     const gsf_json_value* value = gsf_find_json_member(json, frame, key);
@@ -2797,7 +2806,7 @@ static gsf_result gsf__transforms_lens_kind(gsf_context* ctx, const gsf_json* js
                     (unsigned)model->offset, name);
 }
 
-// The camera of a frame (frame NULL: of the top level), added to the model.
+// Adds the camera of a frame (NULL: of the top level) to the model.
 static gsf_result gsf__transforms_add_camera(gsf_context* ctx, const gsf_json* json, const gsf_json_value* frame,
                                              gsf__sfm* m) {
     static const char* const keys[8] = {"k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"};
@@ -2851,7 +2860,8 @@ static int gsf__transforms_has_camera(const gsf_json* json, const gsf_json_value
     return 0;
 }
 
-// OpenGL camera-to-world rows to an OpenCV world-to-camera matrix; 0 if the 3x3 part is no rotation (times a scale).
+// Converts a row-major OpenGL camera-to-world matrix to an OpenCV world-to-camera matrix. Returns 0 if the 3x3 part is
+// not a rotation (times a scale).
 static int gsf__pose_from_opengl(const double rows[12], double w2c[16]) {
     double axis[3][3], c2w[16];
     for (int c = 0; c < 3; c++) {
@@ -2869,7 +2879,7 @@ static int gsf__pose_from_opengl(const double rows[12], double w2c[16]) {
     const double cross[3] = {x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]};
     if (cross[0] * z[0] + cross[1] * z[1] + cross[2] * z[2] < 0.0) return 0; // mirrored
     const double norm = sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]);
-    for (int r = 0; r < 3; r++) z[r] = cross[r] / norm; // exactly orthonormal: z from x, y, then y from z, x
+    for (int r = 0; r < 3; r++) z[r] = cross[r] / norm; // orthonormalise: z from x and y, then y from z and x
     y[0] = z[1] * x[2] - z[2] * x[1];
     y[1] = z[2] * x[0] - z[0] * x[2];
     y[2] = z[0] * x[1] - z[1] * x[0];
@@ -2903,7 +2913,7 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
             const gsf_json_value* value =
                 row && row->type == GSF_JSON_ARRAY && row->count == 4 ? gsf_find_json_element(json, row, c) : NULL;
             if (!value || value->type != GSF_JSON_NUMBER)
-                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is no 4x4 matrix of numbers", where,
+                return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is not a 4x4 matrix of numbers", where,
                                 (unsigned)matrix->offset);
             rows[4 * r + c] = value->number;
         }
@@ -2912,7 +2922,7 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
         gsf__reserve(ctx, (void**)&m->images, &m->image_room, m->image_count, m->image_count + 1, sizeof *m->images));
     gsf__sfm_image* image = &m->images[m->image_count];
     if (!gsf__pose_from_opengl(rows, image->w2c))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is no rotation and translation", where,
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: transform_matrix is not a rotation and translation", where,
                         (unsigned)matrix->offset);
     image->name = path->string;
     image->name_size = path->string_size;
@@ -2926,7 +2936,7 @@ static gsf_result gsf__transforms_add_frame(gsf_context* ctx, const gsf_json* js
     return GSF_OK;
 }
 
-// The model's names point into `json`. To be destroyed also after an error.
+// The image names in *m point into `json`. *m must be destroyed even after an error.
 static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, gsf__sfm* m) {
     const gsf_json_value* frames = gsf_find_json_member(json, &json->values[0], "frames");
     size_t shared = SIZE_MAX;
@@ -2937,7 +2947,7 @@ static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, g
     for (uint32_t i = frames->child; i; i = json->values[i].next) {
         const gsf_json_value* frame = &json->values[i];
         if (frame->type != GSF_JSON_OBJECT)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: a frame is no object", gsf__json_where(json),
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%u: a frame is not an object", gsf__json_where(json),
                             (unsigned)frame->offset);
         const int own = gsf__transforms_has_camera(json, frame);
         size_t camera = own ? m->camera_count : shared;
@@ -2948,7 +2958,7 @@ static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, g
     return GSF_OK;
 }
 
-// A plain point cloud (x y z, and red green blue where present: 0..255, or 0..1 as float) into the model's points.
+// Reads a plain point cloud into the model: x y z and optional red green blue (0..255, or 0..1 for float types).
 static gsf_result gsf__transforms_read_points(gsf_context* ctx, const char* name, const void* data, size_t size,
                                               gsf__sfm* m) {
     gsf__ply ply;
@@ -2956,7 +2966,7 @@ static gsf_result gsf__transforms_read_points(gsf_context* ctx, const char* name
     GSF__TRY(gsf__ply_read_header(ctx, name, data, size, &ply));
     for (int k = 0; k < 3; k++)
         if (ply.type[k] == GSF__PLY_ABSENT)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: no points: a column of x, y, z is missing", name, ply.body);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: no points: column x, y or z is missing", name, ply.body);
     double* values = NULL;
     const char* at = (const char*)ply.data + ply.body;
     if (ply.format == GSF__PLY_ASCII && !(values = (double*)gsf_alloc(ctx, ply.columns, sizeof(double))))
@@ -2988,7 +2998,7 @@ static gsf_result gsf__transforms_read_points(gsf_context* ctx, const char* name
 
 // ---- >>undistort ---------------------------------------------------------------
 
-// atan(t)/t for t >= 0: two exact reductions to |z| <= tan(pi/8), then the series; error below 1e-12.
+// atan(t)/t for t >= 0: two exact range reductions to |z| <= tan(pi/8), then the power series; error below 1e-12.
 static double gsf__atan_ratio(double t) {
     const double pi = 3.14159265358979323846;
     double z = t, base = 0.0, sign = 1.0;
@@ -3008,9 +3018,9 @@ static double gsf__atan_ratio(double t) {
     return (base + sign * z * series) / t;
 }
 
-// Undistorted ray (x, y, 1) to the distorted normalised image point; pixels are then fx u + cx, fy v + cy. The formulas
-// of COLMAP's sensor/models.h, whose RATIONAL is OpenCV's. Difference: no Taylor branches near zero in FOV. NaN where
-// the lens shows no such ray.
+// Maps the undistorted ray (x, y, 1) to the distorted normalised image point (u, v), which is the pixel
+// (fx u + cx, fy v + cy). The formulas are those of COLMAP's sensor/models.h (RATIONAL: OpenCV's), without the Taylor
+// expansions near zero in FOV. NaN for rays that the lens cannot image.
 static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double* u, double* v) {
     const double* k = lens->k;
     const double r2 = x * x + y * y;
@@ -3025,7 +3035,7 @@ static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double*
             return;
         case GSF__LENS_FISHEYE: {
             scale = gsf__atan_ratio(sqrt(r2));
-            const double a = x * scale, b = y * scale, t2 = r2 * scale * scale; // t = angle to the axis
+            const double a = x * scale, b = y * scale, t2 = r2 * scale * scale; // t = angle to the optical axis
             const double radial = 1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[4] + t2 * k[5])));
             *u = a * radial + 2.0 * k[2] * a * b + k[3] * (t2 + 2.0 * a * a) + k[6] * t2;
             *v = b * radial + 2.0 * k[3] * a * b + k[2] * (t2 + 2.0 * b * b) + k[7] * t2;
@@ -3036,7 +3046,7 @@ static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double*
             *u = x * scale;
             *v = y * scale;
             return;
-        case GSF__LENS_FISHEYE624: { // unlike in FISHEYE, the radial distortion is part of what the others bend
+        case GSF__LENS_FISHEYE624: { // unlike in FISHEYE, the other terms act on the radially distorted point
             scale = gsf__atan_ratio(sqrt(r2));
             const double t2 = r2 * scale * scale;
             scale *= 1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * (k[3] + t2 * (k[4] + t2 * k[5])))));
@@ -3060,15 +3070,15 @@ static void gsf__lens_distort(const gsf__lens* lens, double x, double y, double*
     *v = y;
 }
 
-typedef struct gsf__rectify { // how a photo becomes a pinhole image
+typedef struct gsf__rectify { // how a photo is resampled to a pinhole image
     gsf__lens lens;       // of the photo
     double fx, fy, cx, cy;// of the pinhole image
     int32_t width, height;// of the pinhole image
-    double centre;        // coordinate of the first pixel's centre in both images' intrinsics
+    double centre;        // where both images' intrinsics place the centre of the first pixel: 0 or 0.5
 } gsf__rectify;
 
-// cv::undistortPoints' five steps of the fixed-point iteration for a RATIONAL lens. Not run to convergence, since the
-// rectangle, and so the new camera, should be the official one.
+// Undistorts a pixel of a RATIONAL lens with the five fixed-point iterations of cv::undistortPoints. Not iterated to
+// convergence, so that gsf__rectify_like_opencv finds the same rectangle, and hence the same camera, as OpenCV.
 static void gsf__undistort_point(const gsf__lens* lens, double px, double py, double* x_out, double* y_out) {
     const double* k = lens->k;
     const double x0 = (px - lens->cx) / lens->fx, y0 = (py - lens->cy) / lens->fy;
@@ -3091,7 +3101,7 @@ static void gsf__undistort_point(const gsf__lens* lens, double px, double py, do
     *y_out = y;
 }
 
-// Where pixel (i, j) of the pinhole image lies in the photo, counted in pixel centres (0 = centre of the first).
+// Maps pixel (i, j) of the pinhole image to its position in the photo, in pixels (0 = centre of the first pixel).
 static void gsf__rectify_map(const gsf__rectify* r, double i, double j, double* sx, double* sy) {
     double u, v;
     gsf__lens_distort(&r->lens, (i + r->centre - r->cx) / r->fx, (j + r->centre - r->cy) / r->fy, &u, &v);
@@ -3099,7 +3109,7 @@ static void gsf__rectify_map(const gsf__rectify* r, double i, double j, double* 
     *sy = r->lens.fy * v + r->lens.cy - r->centre;
 }
 
-// Does the border of the pinhole image come from the photo, or from at most 5 % of its size outside?
+// Returns whether the border of the pinhole image maps into the photo, or at most 5 % of the photo's size outside it.
 static int gsf__rectify_is_sound(const gsf__rectify* r) {
     const int samples = 32;
     const double w = r->lens.width, h = r->lens.height;
@@ -3115,9 +3125,9 @@ static int gsf__rectify_is_sound(const gsf__rectify* r) {
 }
 
 // cv::getOptimalNewCameraMatrix(alpha = 0): the rectangle inscribed in the undistorted 9x9 grid fills the image. The
-// region of interest it returns is then always (0, 0, width - 1, height - 1). OpenCV numbers pixel centres 0, 1, ...;
-// the official parser hands it COLMAP's intrinsics, which mean 0.5, 1.5, ...; so does this function (the image shifts
-// by a few hundredths of a pixel, the same in both). 0 when nothing is left.
+// region of interest that OpenCV returns is then always (0, 0, width - 1, height - 1). OpenCV puts pixel centres at 0,
+// 1, ..., but the COLMAP parser of the GSFixer release passes it COLMAP's intrinsics, which assume 0.5, 1.5, ...; this
+// function does the same (it shifts both images alike by a few hundredths of a pixel). Returns 0 when no image is left.
 static int gsf__rectify_like_opencv(gsf__rectify* r) {
     const gsf__lens* lens = &r->lens;
     double x0 = -DBL_MAX, x1 = DBL_MAX, y0 = -DBL_MAX, y1 = DBL_MAX;
@@ -3144,8 +3154,8 @@ static int gsf__rectify_like_opencv(gsf__rectify* r) {
     return gsf__rectify_is_sound(r);
 }
 
-// Does the pinhole image with focal lengths `zoom` times the lens's show only what lies inside the photo, on its
-// border?
+// Returns whether the border of the pinhole image lies inside the photo when its focal lengths are `zoom` times those
+// of the lens.
 static int gsf__rectify_fits(const gsf__rectify* r, double zoom, double radius_max) {
     const gsf__lens* lens = &r->lens;
     const int samples = 32;
@@ -3165,8 +3175,8 @@ static int gsf__rectify_fits(const gsf__rectify* r, double zoom, double radius_m
     return 1;
 }
 
-// The tangent of the largest angle to the axis that a pinhole image may show: at most 75 degrees, and less where the
-// lens's polynomial folds back.
+// Returns the tangent of the largest angle to the optical axis that a pinhole image may show: at most 75 degrees, and
+// less where the lens's distortion polynomial stops increasing.
 static double gsf__lens_radius_max(const gsf__lens* lens) {
     static const double directions[8][2] = {{1, 0},  {0.6, 0.8},   {0, 1},  {-0.8, 0.6},
                                             {-1, 0}, {-0.6, -0.8}, {0, -1}, {0.8, -0.6}};
@@ -3188,9 +3198,9 @@ static double gsf__lens_radius_max(const gsf__lens* lens) {
     return limit;
 }
 
-// For lenses the official parser has no sound way for (all but RATIONAL) and where OpenCV's rectangle fails: same size,
-// principal point and pixel aspect as the photo, the smallest zoom at which no pixel falls outside of it. Exact pixel
-// centres. 0 when nothing is left.
+// Rectifies the lenses that the parser of the GSFixer release has no sound method for (all but RATIONAL), and those for
+// which OpenCV's rectangle fails. Size, principal point and pixel aspect are those of the photo; the zoom is the smallest
+// at which no pixel falls outside the photo. Pixel centres are exact. Returns 0 when no image is left.
 static int gsf__rectify_by_zoom(gsf__rectify* r) {
     const double radius_max = gsf__lens_radius_max(&r->lens);
     double low = 1.0 / 1024, high = 64.0;
@@ -3210,7 +3220,7 @@ static int gsf__rectify_by_zoom(gsf__rectify* r) {
     return 1;
 }
 
-// The pinhole camera of a lens; 0 when its distortion leaves no usable image.
+// Chooses the pinhole camera for a lens. Returns 0 when its distortion leaves no usable image.
 static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
     memset(r, 0, sizeof *r);
     r->lens = *lens;
@@ -3234,15 +3244,15 @@ static int gsf__rectify_make(const gsf__lens* lens, gsf__rectify* r) {
 
 typedef struct gsf__rectify_job {
     const gsf__rectify* r;
-    const uint8_t* src; // packed u8 of the lens's size
-    uint8_t* dst;       // packed u8 of the rectangle's size
+    const uint8_t* src; // photo: packed u8
+    uint8_t* dst;       // pinhole image: packed u8
     int32_t channels;
 } gsf__rectify_job;
 
 enum { GSF__RECTIFY_ROWS = 16 };
 
-// One bilinear sample per pixel, weights in 1/1024 from positions in 1/32 pixel as cv::remap has them; beyond the
-// border the nearest pixel counts.
+// One bilinear sample per pixel. Positions are rounded to 1/32 pixel as in cv::remap, so weights are multiples of
+// 1/1024; positions outside the photo are clamped to its border.
 static void gsf__rectify_rows(void* arg, size_t chunk, int32_t worker) {
     const gsf__rectify_job* job = (const gsf__rectify_job*)arg;
     const gsf__rectify* r = job->r;
@@ -3270,7 +3280,7 @@ static void gsf__rectify_rows(void* arg, size_t chunk, int32_t worker) {
         }
 }
 
-// photo: packed u8 of the lens's size. out: new image of the rectangle's size.
+// photo: packed u8, of the size in r->lens. out: new image of r->width x r->height pixels.
 static gsf_result gsf__rectify_image(gsf_context* ctx, const gsf__rectify* r, const gsf_image* photo, gsf_image* out) {
     GSF__TRY(gsf_make_image(ctx, GSF_U8, r->width, r->height, photo->channels, out));
     gsf__rectify_job job;

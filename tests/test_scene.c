@@ -566,7 +566,7 @@ static void test_colmap_text(void) {
     static const char images[] = "# y\n4 2 0 0 0 1 2 3 7 b c.png\n\n  3 1 0 0 0 0 0 0 7 a.png  \n1 2 -1 3 4 9";
     static const struct { const char *cameras, *images, *points, *says; } bad[] = {
         {"7 SIMPLE_PINHOLE 40 30 35 20", images, NULL, "cameras.txt:1: expected a camera parameter"},
-        {"7 SIMPLE_PINHOLE 40 30 35 20 15 1", images, NULL, "there are more"},
+        {"7 SIMPLE_PINHOLE 40 30 35 20 15 1", images, NULL, "found more"},
         {"7 SIMPLE_PINHOLE 40 30 -35 20 15", images, NULL, "focal length"},
         {"7 FOV 40 30 35 35 20 15 3.2", images, NULL, "omega"},
         {"7 SIMPLE_PINHOLE 40 0 35 20 15", images, NULL, "image size"},
@@ -576,7 +576,7 @@ static void test_colmap_text(void) {
         {"7 EUCM 40 30 35 35 20 15 0.5 0", images, NULL, "beta is not above 0"},
         {"7 EQUIRECTANGULAR 40 20 40 20", images, NULL, "EQUIRECTANGULAR photos are panoramas"},
         {"7 RAD_TAN_THIN_PRISM_FISHEYE 40 30 35 35 20 15 0 0 0 0 0 0 0 0 0 0 0", images, NULL, "expected a camera param"},
-        {"7 PINHOLE 40 30 1 1 0 0\n7 PINHOLE 40 30 1 1 0 0", images, NULL, "camera 7 stands twice"},
+        {"7 PINHOLE 40 30 1 1 0 0\n7 PINHOLE 40 30 1 1 0 0", images, NULL, "camera 7 occurs twice"},
         {"", images, NULL, "no camera"},
         {cameras, "", NULL, "no image"},
         {cameras, "4 1 0 0 0 0 0 0 7 a\n\n4 1 0 0 0 0 0 0 7 b\n", NULL, "image id 4 stands twice"},
@@ -1252,7 +1252,7 @@ static void test_transforms(void) {
         {"[]", "no \"frames\""},
         {"{\"frames\":{}}", "no \"frames\""},
         {"{\"frames\":[]}", "no image"},
-        {"{\"frames\":[1]}", "a frame is no object"},
+        {"{\"frames\":[1]}", "a frame is not an object"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{" POSE "}]}", "without file_path"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\"}]}", "transform_matrix"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\",\"transform_matrix\":"
