@@ -8893,74 +8893,80 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
 }
 
 // ---- >>loss --------------------------------------------------------------------
-// L = (1 - lambda) mean(w |x - t|) + lambda mean(w (1 - SSIM(x, t))), x the render and t the photo, both clamped to 0..1, w
-// a weight per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts as already right.
-// Such a pixel is one outside the image: black in x and t, as the 3DGS code has it, so that neither what it shows nor what
-// is rendered there enters its neighbours' windows. Hence its gradient is 0.
-// SSIM as in the 3DGS code: 11x11 Gaussian window, sigma 1.5, zeros outside the image, variances not clamped.
+// L = (1 - lambda) mean(w |x - t|) + lambda mean(w (1 - SSIM(x, t))), where x is the render, t the photo (both clamped
+// to 0..1) and w a weight per pixel. Both means are over all H*W*3 values whatever w is, so a pixel of weight 0 counts
+// as already correct. Such a pixel is treated as if it were outside the image: black in both x and t, so that neither
+// image affects the windows of its neighbours there. Hence its gradient is 0.
+// SSIM as in the 3DGS code: 11x11 Gaussian window, sigma 1.5, zero padding, variances not clamped.
 //
-// A variance is a difference of squares, and SSIM holds it against C2 = 9e-4: floats do only if the squares are small. So
-// everything is taken from the sum and the difference of the images, s = x + t - b and d = x - t, squares of d about c, with
-// b and c near the middle of them. With window sums S = G*s, D = G*d, P = G*s^2, Q = G*(d - c)^2:
+// A variance is a difference of squares, and SSIM compares it with C2 = 9e-4, so float is precise enough only if the
+// squares are small. Therefore everything is computed from the sum and the difference of the images, s = x + t - b and
+// d = x - t, and from the squares of s and d - c, where b and c are close to the medians of x + t and x - t. With the
+// window sums S = G*s, D = G*d, P = G*s^2, Q = G*(d - c)^2:
 //     z = S + b = mu + mu_t,  vs = P - S^2 + k z^2,  vd = Q - (D - c)^2 + k D^2
 //     B1 = z^2 + D^2 + 2 C1,  B2 = vs + vd + 2 C2,  p = 2 D^2 / B1,  q = 2 vd / B2,  1 - SSIM = p + q - p q
-// where p and q are small with D and d, however bright the images are. k = 6.94e-8: the window of the 3DGS code is rounded
-// to float32 and sums up to 1 - k, which adds k mu^2 to its variances; more than 1e-6 of the mean SSIM of bright noise.
+// where p and q are small if D and d are, however bright the images are. k = 6.94e-8: the window of the 3DGS code,
+// rounded to float32, sums to 1 - k, which adds k mu^2 to its variances; for bright noise this changes the mean SSIM by
+// more than 1e-6.
 //     e = (1 - p) / B2,  e_s = e q / 2,  e_d = e - e_s
 //     a = (1 - q) (D - p mu) / B1 + (S - k z) e_s - (D - c - k D) e_d
-// and the pixel i collects 1/4 d(1 - SSIM)/dx(i) = G*a + (d(i) - c) G*e_d - s(i) G*e_s.
+// and the gradient at pixel i is 1/4 d(1 - SSIM)/dx(i) = G*a + (d(i) - c) G*e_d - s(i) G*e_s.
 //
-// Images stay interleaved: a row is 3W floats, padded to a multiple of 8, and horizontal taps lie 3 floats apart. Rows go
-// in groups of four, which share the loads of their vertical sums. A band of rows goes through rings of a worker:
-//     images   s, d, s^2, (d - c)^2                         5 groups, from row first - 10 of the band on
-//     slopes   w a, w e_d, w e_s                            4 groups, from row first - 5 on
+// Images stay interleaved: a row is 3W floats, padded to a multiple of 8, and horizontal taps are 3 floats apart. Rows
+// are processed in groups of four, which share the loads of their vertical sums. Each worker streams a band of rows
+// through two ring buffers:
+//     images   s, d, s^2, (d - c)^2                         5 groups, starting at row first - 10 of the band
+//     slopes   w a, w e_d, w e_s                            4 groups, starting at row first - 5
 // so that images g .. g + 3 give slopes g, and slopes g .. g + 3 the gradient of rows first + 4 g .. first + 4 g + 3.
-// Bands overlap: 20 rows are loaded and 10 mapped twice.
+// Bands overlap: per band, 20 additional rows are loaded and 10 are mapped.
 
 enum {
     GSF__LOSS_RADIUS = 5, GSF__LOSS_MARGIN = 16, GSF__LOSS_GROUP = 4,
-    GSF__LOSS_IMAGES = 5 * GSF__LOSS_GROUP, GSF__LOSS_SLOPES = 4 * GSF__LOSS_GROUP, // rows of a ring
-    GSF__LOSS_BAND = 64,                                                            // rows of a band at most
-    // of a worker: rings, sums of four planes, of one plane, four planes outside, b and c, weights, the render
+    GSF__LOSS_IMAGES = 5 * GSF__LOSS_GROUP, GSF__LOSS_SLOPES = 4 * GSF__LOSS_GROUP, // rows of the rings
+    GSF__LOSS_BAND = 64,                                                            // maximum rows of a band
+    // per worker: rings, sums of four planes, vertical sums of one, four planes outside the image, b and c, weights,
+    // render
     GSF__LOSS_WORKER_ROWS = 4 * GSF__LOSS_IMAGES + 3 * GSF__LOSS_SLOPES + (4 + 1) * GSF__LOSS_GROUP + 4 + 2 + 1 + 1
 };
 
 #define GSF__SSIM_C1 0.0001f // (0.01 * 1)^2
 #define GSF__SSIM_C2 0.0009f // (0.03 * 1)^2
-#define GSF__SSIM_LACK 6.94426e-8f // k: what the window of the 3DGS code lacks of 1
+#define GSF__SSIM_LACK 6.94426e-8f // k: 1 minus the sum of the window of the 3DGS code
 
-// exp(-k^2 / (2 * 1.5^2)) / sum over k = -5..5
+// exp(-k^2 / (2 * 1.5^2)) for k = 0..5, divided by its sum over k = -5..5
 static const float gsf__loss_window[GSF__LOSS_RADIUS + 1] = {0.2660117249f,  0.2130055377f,   0.1093606895f,
                                                              0.03600077213f, 0.007598758135f, 0.001028380084f};
 
 typedef struct gsf__target { // a photo to be matched
     int32_t width, height;
     const uint8_t* u8;       // (H,W,3) packed, or NULL
-    const float* f32;        // (H,W,3) packed where u8 is NULL
-    const float* weight;     // (H,W), NULL = 1; where it is 0 the photo is black
+    const float* f32;        // (H,W,3) packed, used if u8 is NULL
+    const float* weight;     // (H,W), NULL = 1 everywhere; where it is 0 the photo is black
 } gsf__target;
 
-typedef struct gsf__loss_scratch { // grows to the largest photo, then stays
-    float* rows;             // per worker GSF__LOSS_WORKER_ROWS, with margins
-    double* sums;            // per band 2
+typedef struct gsf__loss_scratch { // grows to fit the largest photo and is then reused
+    float* rows;             // GSF__LOSS_WORKER_ROWS rows with margins per worker
+    double* sums;            // 2 per band
     size_t row_capacity, sum_capacity; // floats, doubles
 } gsf__loss_scratch;
 
-typedef struct gsf__loss_value { double total, l1, ssim; } gsf__loss_value; // total without the caller's scale
+typedef struct gsf__loss_value { double total, l1, ssim; } gsf__loss_value; // total is not multiplied by `scale`
 
-// n: padded row length, valid: 3W, or 0 outside the image; planes lie `step` floats apart.
+// n: padded row length; valid: 3W, or 0 for rows outside the image; planes are `step` floats apart.
 typedef struct gsf__loss_kernels {
-    // s, d, s^2 and (d - c)^2 of the render, where NaN becomes 0, and the photo; from valid to n of zeros.
+    // Computes s, d, s^2 and (d - c)^2 from the render (NaN counts as 0) and the photo, both 0 from valid to n.
     void (*load)(const float* render, const float* f32, const uint8_t* u8, const float* b, const float* c, size_t valid,
                  size_t n, float* images, size_t step);
-    // Vertical sums of a group of rows from four groups; the first is centred on the sixth row. Rows are `stride` apart.
+    // Vertical sums of a group of rows from four groups v; the first is centred on the sixth row of v. Rows are
+    // `stride` floats apart.
     void (*down)(const float* const v[4], size_t stride, size_t n, float* sums);
-    // Horizontal sums of a row, which begins at a cache line and has margins.
+    // Horizontal sums of a row that starts at a cache line and has margins.
     void (*across)(const float* v, size_t n, float* sums);
-    // From window sums the SSIM map: its three slopes, sums of w |d| and w/2 (1 - SSIM). weight: 0 from valid to n.
+    // Computes the three slopes of the SSIM map from the window sums and adds the sums of w |d| and w/2 (1 - SSIM) to
+    // totals. weight: 0 from valid to n.
     void (*map)(const float* sums, size_t sums_step, const float* d, const float* b, const float* c, const float* weight,
                 size_t n, float* slopes, size_t step, double totals[2]);
-    // From window sums of the slopes the gradient of the render.
+    // Computes the gradient with respect to the render from the window sums of the slopes.
     void (*gradient)(const float* sums, size_t sums_step, const float* s, const float* d, const float* c,
                      const float* weight, const float* render, float l1_scale, float ssim_scale, size_t valid,
                      float* d_render);
@@ -8976,7 +8982,7 @@ static float gsf__loss_clamp(float v) { return v > 0.0f ? (v < 1.0f ? v : 1.0f) 
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_LOSS
 
-GSF__V_INLINE gsf__vf GSF__V(gsf__loss_clamp)(gsf__vf v) { // a NaN becomes 0
+GSF__V_INLINE gsf__vf GSF__V(gsf__loss_clamp)(gsf__vf v) { // NaN: 0
     return gsf__v_min(gsf__v_max(v, gsf__v_set(0.0f)), gsf__v_set(1.0f));
 }
 
@@ -9002,7 +9008,7 @@ GSF__V_INLINE gsf__vf GSF__V(gsf__loss_taps)(int k, gsf__vf a, gsf__vf b, gsf__v
     return gsf__v_madd(gsf__v_set(gsf__loss_window[k]), a + b, sum);
 }
 
-// Each of the 14 rows is loaded once, from the outermost to the middle.
+// Loads each of the 14 rows once, from the outermost to the middle ones.
 GSF__V_KERNEL void GSF__V(gsf__loss_down)(const float* const v[4], size_t stride, size_t n, float* sums) {
     const gsf__vf zero = gsf__v_set(0.0f), middle = gsf__v_set(gsf__loss_window[0]);
     const float *v0 = v[0], *v1 = v[1], *v2 = v[2], *v3 = v[3];
@@ -9045,7 +9051,7 @@ GSF__V_KERNEL void GSF__V(gsf__loss_map)(const float* sums, size_t sums_step, co
         const gsf__vf z = S + gsf__v_load(b + i), Dc = D - gsf__v_load(c + i), w = gsf__v_load(weight + i);
         const gsf__vf zz = gsf__v_madd(z, z, c1), DD = D * D, B1 = zz + DD;
         const gsf__vf vs = gsf__v_nmadd(S, S, P), vd = gsf__v_madd(lack, DD, gsf__v_nmadd(Dc, Dc, Q));
-        const gsf__vf B2 = (vs + vd) + gsf__v_madd(lack, zz, c2); // of zz: the window's lack times c1 is nothing
+        const gsf__vf B2 = (vs + vd) + gsf__v_madd(lack, zz, c2); // zz includes c1; lack * c1 is negligible
         const gsf__vf r = one / (B1 * B2), r1 = B2 * r, r2 = B1 * r, p = DD * r1, q = vd * r2; // halves of p and q
         const gsf__vf like = one - (p + p), con = one - (q + q);
         const gsf__vf e = w * (like * r2), es = e * q, ed = e - es;
@@ -9056,7 +9062,7 @@ GSF__V_KERNEL void GSF__V(gsf__loss_map)(const float* sums, size_t sums_step, co
         gsf__v_store(slopes + 2 * step + i, es);
         l1_part = gsf__v_madd(w, gsf__v_abs(gsf__v_load(d + i)), l1_part);
         dssim_part = gsf__v_madd(w, gsf__v_madd(q, like, p), dssim_part);
-        if (GSF__LANES > 1 && i / GSF__LANES % 8 != 7 && i + GSF__LANES < n) continue; // short sums in float
+        if (GSF__LANES > 1 && i / GSF__LANES % 8 != 7 && i + GSF__LANES < n) continue; // sum 8 vectors in float
         l1 = gsf__vd_add_folded(l1, l1_part);
         dssim = gsf__vd_add_folded(dssim, dssim_part);
         l1_part = dssim_part = zero;
@@ -9076,7 +9082,7 @@ GSF__V_KERNEL void GSF__V(gsf__loss_gradient)(const float* sums, size_t sums_ste
         quarter = gsf__v_nmadd(gsf__v_load(s + i), gsf__v_load(sums + 2 * sums_step + i), quarter);
         const gsf__vf l1_slope = gsf__v_with_sign(l1 * gsf__v_load(weight + i), diff);
         const gsf__vf slope = gsf__v_madd(ssim, quarter, gsf__v_keep(gsf__vm_not(gsf__v_eq(diff, zero)), l1_slope));
-        const gsf__vf r = gsf__v_load_first(render + i, valid - i); // d clamp(r)/dr; 0 for NaN
+        const gsf__vf r = gsf__v_load_first(render + i, valid - i); // no gradient where r was clamped or is NaN
         const gsf__vm inside = gsf__vm_and(gsf__v_ge(r, zero), gsf__v_le(r, one));
         gsf__v_store_first(d_render + i, gsf__v_keep(inside, slope), valid - i);
     }
@@ -9093,11 +9099,11 @@ static void gsf__loss_across_scalar(const float* v, size_t n, float* sums) {
 }
 
 #if GSF__X86
-// The eight floats from the one `by` (1..3) behind the start of `low` on; high: those 4 behind low.
+// Eight consecutive floats that start `by` (1..3) floats after those of `low`; `high` starts 4 floats after `low`.
 #define GSF__LOSS_BETWEEN(low, high, by) _mm256_castsi256_ps(_mm256_alignr_epi8(high, low, 4 * (by)))
 
-// Half of all loads that are not aligned cross a cache line. So the outer taps are put together from aligned ones, and what
-// is needed again stays in registers: m16 .. p16 are the eight floats from i - 16 .. i + 16 on.
+// About half of all unaligned loads cross a cache line. So the outer taps are assembled from aligned loads, and what is
+// needed again stays in registers: m16 .. p16 hold the eight floats that start at i - 16 .. i + 16.
 GSF__TARGET_AVX2 static void gsf__loss_across_avx2(const float* v, size_t n, float* sums) {
     const __m256 middle = _mm256_set1_ps(gsf__loss_window[0]);
 #define GSF__LOSS_EIGHT(at) _mm256_loadu_si256((const __m256i*)(const void*)(at))
@@ -9140,23 +9146,23 @@ typedef struct gsf__loss_job {
     double* sums;
     float* d_render;
     float l1_scale, ssim_scale;
-    size_t valid, n, row; // floats: of a row of the image, padded, with margins
+    size_t valid, n, row; // floats of a row: in the image, padded, with margins
 } gsf__loss_job;
 
-typedef struct gsf__loss_buffers { // of a worker at a band; they point to column 0 of row 0
-    float *images, *slopes, *sums, *vertical, *weight; // vertical: sums of one plane, not yet horizontal
-    float *middle[2], *outside, *render;               // b and c of each float; the images' planes beyond the image
+typedef struct gsf__loss_buffers { // of a worker processing a band; pointers are to column 0 of row 0
+    float *images, *slopes, *sums, *vertical, *weight; // vertical: vertical sums of one plane
+    float *middle[2], *outside, *render;               // middle: b and c; outside: planes of `images` outside it
     int32_t first, end;                                // rows of the band
 } gsf__loss_buffers;
 
 static size_t gsf__loss_padded(int32_t width) { return (3 * (size_t)width + 7) & ~(size_t)7; }
 
-// Floats of a row with its margins: an odd number of cache lines, so that rows do not compete for the same places.
+// Floats of a row with its margins: an odd number of cache lines, so that rows do not compete for the same cache sets.
 static size_t gsf__loss_row(int32_t width) {
     return ((gsf__loss_padded(width) + 2 * GSF__LOSS_MARGIN + 15) & ~(size_t)15) | 16;
 }
 
-// Bands are about equally high.
+// Rows per band: at most GSF__LOSS_BAND, chosen to give bands of about equal height.
 static int32_t gsf__loss_band_rows(int32_t height) {
     const int32_t bands = (height - 1) / GSF__LOSS_BAND + 1;
     return (height - 1) / bands + 1;
@@ -9164,16 +9170,16 @@ static int32_t gsf__loss_band_rows(int32_t height) {
 
 static size_t gsf__loss_band_count(int32_t height) { return (size_t)((height - 1) / gsf__loss_band_rows(height)) + 1; }
 
-// The weights of row y, one for each float.
+// The weights of row y, one for each float. Without weights returns `out` as it is: ones.
 static const float* gsf__loss_weights(const gsf__loss_job* job, int32_t y, float* out) {
     const size_t width = (size_t)job->target->width;
-    if (!job->target->weight) return out; // ones
+    if (!job->target->weight) return out;
     const float* weight = job->target->weight + (size_t)y * width;
     for (size_t i = 0; i < width; i++) out[3 * i] = out[3 * i + 1] = out[3 * i + 2] = weight[i];
     return out;
 }
 
-// Row y of the render, NaN where the weight is 0: the kernels take it as black and without a gradient.
+// Row y of the render, with NaN where the weight is 0: the kernels treat NaN as black and give it no gradient.
 static const float* gsf__loss_render(const gsf__loss_job* job, int32_t y, float* out) {
     const size_t width = (size_t)job->target->width;
     const float* render = job->render + (size_t)y * job->valid;
@@ -9184,9 +9190,9 @@ static const float* gsf__loss_render(const gsf__loss_job* job, int32_t y, float*
     return out;
 }
 
-// b and c of each float of a row and its margins: medians over a grid of the band's pixels, by channel. Any values would be
-// right; these leave nothing of flat images or a flat background. Where every window reaches far over the border, zeros are
-// near enough.
+// Fills in b and c for each float of a row and its margins: per channel, the medians over a grid of the band's pixels.
+// Any values give a correct result; medians make s and d - c vanish for flat images or backgrounds. In an image that is
+// no larger than the window's radius, every window reaches beyond the border and zeros serve as well.
 static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buffers* b) {
     enum { GRID = 4 };
     const gsf__target* target = job->target;
@@ -9213,7 +9219,7 @@ static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buff
         }
     const int wide = count > 0 && target->width > GSF__LOSS_RADIUS && target->height > GSF__LOSS_RADIUS;
     for (size_t p = 0; p < 2; p++) {
-        float* row = b->middle[p] - margin; // begins with channel 2: 3 floats to a pixel, 16 of margin
+        float* row = b->middle[p] - margin; // starts with channel 2, as the margin is 16 floats and a pixel 3
         for (size_t i = 0; i < 3; i++) row[i] = wide ? sorted[3 * p + (i + 2) % 3][count / 2] : 0.0f;
         for (size_t i = 3; i < job->n + 2 * margin; i++) row[i] = row[i - 3];
     }
@@ -9221,8 +9227,8 @@ static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buff
                 job->row);
 }
 
-// Window sums of the group of rows in the middle of groups g .. g + 3 of a ring. outside: the planes' rows beyond the image,
-// NULL = zeros.
+// Window sums of the four rows in the middle of groups g .. g + 3 of a ring. outside: values of the planes outside the
+// image, NULL = zeros.
 static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b, const float* ring, size_t ring_rows,
                            size_t g, size_t planes, const float* outside) {
     const size_t margin = GSF__LOSS_MARGIN * sizeof(float);
@@ -9244,7 +9250,7 @@ static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b,
     }
 }
 
-// Group g of the images.
+// Loads group g of the images.
 static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g) {
     const gsf__target* target = job->target;
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP; at++) {
@@ -9257,7 +9263,7 @@ static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffe
     }
 }
 
-// Group g of the slopes, zeros outside the image; rows of the band are counted.
+// Computes group g of the slopes, zeros outside the image. Only rows of the band itself are added to `totals`.
 static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g, double* totals) {
     gsf__loss_blur(job, b, b->images, GSF__LOSS_IMAGES, (size_t)g, 4, b->outside);
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP; at++) {
@@ -9275,7 +9281,7 @@ static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffer
     }
 }
 
-// Group g of the band's rows.
+// Computes the gradient of group g of the band's rows.
 static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_buffers* b, int32_t g) {
     gsf__loss_blur(job, b, b->slopes, GSF__LOSS_SLOPES, (size_t)g, 3, NULL);
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP && b->first + at < b->end; at++) {
@@ -9330,8 +9336,8 @@ static void gsf__loss_destroy_scratch(gsf_context* ctx, gsf__loss_scratch* scrat
     memset(scratch, 0, sizeof *scratch);
 }
 
-// Loss of `render` (H,W,3) against the target and its derivative times `scale`, written to d_render (H,W,3).
-// lambda: share of the SSIM term.
+// Computes the loss of `render` (H,W,3) against the target and writes its gradient times `scale` to d_render (H,W,3).
+// lambda: weight of the SSIM term.
 static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const gsf__target* target, const float* render,
                             float lambda, float scale, float* d_render, gsf__loss_value* out) {
     GSF__TRY(gsf__loss_reserve(ctx, scratch, target->width, target->height));
@@ -9356,15 +9362,16 @@ static gsf_result gsf__loss(gsf_context* ctx, gsf__loss_scratch* scratch, const 
         dssim += scratch->sums[2 * i + 1];
     }
     out->l1 = l1 / n;
-    dssim *= 2.0 / n; // sums are of halves
+    dssim *= 2.0 / n; // the kernels sum (1 - SSIM) / 2
     out->ssim = 1.0 - dssim;
     out->total = (1.0 - (double)lambda) * out->l1 + (double)lambda * dssim;
     return GSF_OK;
 }
 
-// Edge-aware smoothness of inverse depth: weight / (H W) times the sum over neighbouring pixels p, q (right and below)
-// of e_pq |D_p - D_q| with D = extent / depth and e_pq = 1 / (1 + (|t_p - t_q| / 0.1)^2), |.| the mean over RGB. Pairs in
-// which a pixel has no depth are left out. d_depth (H,W) is written. Scratch: as gsf__loss left it for this photo.
+// Edge-aware smoothness of inverse depth: weight / (H W) times the sum over pairs of neighbours p, q (q to the right of
+// or below p) of e_pq |D_p - D_q| with D = extent / depth and e_pq = 1 / (1 + (|t_p - t_q| / 0.1)^2), where |.| is the
+// mean over RGB. Pairs in which a pixel has no depth are left out. Writes the gradient to d_depth (H,W). `scratch` must
+// be as gsf__loss left it for this photo.
 typedef struct gsf__smooth_job {
     const gsf__target* target;
     const float* depth;
@@ -9373,7 +9380,7 @@ typedef struct gsf__smooth_job {
     float extent, factor;
 } gsf__smooth_job;
 
-// e_pq of two pixels.
+// e_pq for two pixels.
 static float gsf__smooth_edge(const gsf__target* target, size_t p, size_t q) {
     const float *f = target->f32, scale = (f ? 1.0f : 1.0f / 255.0f) * (10.0f / 3.0f);
     float d = 0.0f;
@@ -9392,7 +9399,7 @@ static void gsf__smooth_band(void* arg, size_t band, int32_t worker) {
         for (int32_t x = 0; x < width; x++) {
             const size_t at = (size_t)y * (size_t)width + (size_t)x;
             const float z = job->depth[at], here = z > 0.0f ? job->extent / z : 0.0f;
-            float slope = 0.0f; // of the sum with respect to D here
+            float slope = 0.0f; // derivative of the sum with respect to D at this pixel
             const int inside[4] = {x + 1 < width, y + 1 < height, x > 0, y > 0};
             const ptrdiff_t pixel[4] = {1, width, -1, -(ptrdiff_t)width};
             for (int k = 0; z > 0.0f && k < 4; k++) {
