@@ -9433,45 +9433,47 @@ static double gsf__depth_smoothness(gsf_context* ctx, const gsf__loss_scratch* s
 }
 
 // ---- >>adam --------------------------------------------------------------------
-// The parameters under training and Adam (Kingma & Ba 2015; betas 0.9, 0.999, eps 1e-15 as 3DGS has them). A splat that no
-// view touched moves on by its momentum, as in the official code. One pass reads parameters, moments and gradients, writes
-// the first two and zeroes the gradients for the next step.
+// The trained parameters and the Adam optimizer (Kingma & Ba 2015; betas 0.9 and 0.999, eps 1e-15 as in the Inria 3DGS
+// code). Splats that are not visible in a step still move by their momentum, as they do there. A single pass reads
+// parameters, moments and gradients, writes parameters and moments, and zeroes the gradients for the next step.
 //
-// The SH coefficients, 48 of 59 parameters, can be lazy: those of a block of splats none of which is drawn rest, and when one
-// is drawn again (or the block has rested for GSF__REST_MOST steps, or all are needed) they catch up with the steps in
-// between, whose gradients were zero, at once. All that decides what is drawn stays dense. In blocks, because rows here and
-// there cost as much memory traffic as all of them.
+// Updates of the SH coefficients (48 of 59 parameters) can be lazy: a block of splats skips them while none of its
+// splats is drawn. Once one is drawn again, or the block has skipped GSF__REST_MOST steps, or all SH are needed, the
+// block makes up for the skipped steps, whose gradients were zero, in closed form. All other parameters are updated in
+// every step, because they decide which splats are drawn. The unit is a block because updating scattered rows costs as
+// much memory traffic as updating all of them.
 //
 // Memory per splat of SH degree 3: 59 parameters x (value, first and second moment, gradient) + 40 bytes = 984 bytes.
 
 enum { GSF__MEANS = 0, GSF__SCALES, GSF__QUATS, GSF__OPACITY, GSF__SH, GSF__GROUPS };
-enum { GSF__MODEL_CHUNK = 512 }; // splats of one unit of parallel work
+enum { GSF__MODEL_CHUNK = 512 }; // splats per unit of parallel work
 enum {
-    GSF__BLOCK = 32,       // splats that rest together; of a chunk here and in the projection a whole number
-    GSF__REST_MOST = 254,  // steps
-    GSF__AWAKE = 255,      // in gsf__model.rest: has no step to catch up with, and is drawn in this one
+    GSF__BLOCK = 32,       // splats per block; divides the chunk sizes used here and in the projection
+    GSF__REST_MOST = 254,  // a block catches up after skipping this many steps
+    GSF__AWAKE = 255,      // value of gsf__model.rest: the block is up to date and drawn in this step
 };
 
-typedef struct gsf__group { // one parameter tensor (count, width)
+typedef struct gsf__group { // one parameter tensor of shape (count, width)
     size_t width;
     float *value, *m, *v, *grad;
 } gsf__group;
 
 typedef struct gsf__model {
-    size_t count, capacity;  // capacity is a multiple of 64, so every array starts 64-byte aligned
+    size_t count, capacity;  // capacity is a multiple of 64
     int32_t sh_degree;
     gsf__group groups[GSF__GROUPS];
     uint32_t* ids;
-    float* grad_sum[2];      // densification, photos and restored views apart: sum of screen-space gradient norms ...
-    uint32_t* visits[2];     // ... over this many renders in which the splat was visible
-    float* screen[2];        // (count,2) gradient of the pixel mean in this step's photo and restored view
-    uint8_t* seen[2];        // visible there?
-    uint8_t* hidden;         // dropped out of this render
-    uint8_t* rest;           // per block: Adam steps that the SH are behind, or GSF__AWAKE
-    struct gsf__lazy* lazy;  // how SH catch up after the last step; NULL: all SH take part in every step
-    uint8_t* action;         // densification: gsf__densify_action
-    uint32_t* rejected;      // per chunk: values neutralised in this step
-    void* block;             // all of the above
+    // Densification statistics, the next four: [0] of photos, [1] of restored views.
+    float* grad_sum[2];      // sum of screen-space gradient norms
+    uint32_t* visits[2];     // number of renders in that sum: those in which the splat was visible
+    float* screen[2];        // (count,2) gradient with respect to the projected mean in this step's render
+    uint8_t* seen[2];        // visible in this step's render?
+    uint8_t* hidden;         // excluded from this render by dropout
+    uint8_t* rest;           // per block: Adam steps that its SH have skipped, or GSF__AWAKE
+    struct gsf__lazy* lazy;  // how to catch up to the last step; NULL: SH are updated in every step
+    uint8_t* action;         // gsf__densify_action
+    uint32_t* rejected;      // per chunk: non-finite gradients and updates discarded in this step
+    void* block;             // the allocation that holds all arrays above
     uint32_t next_id;
 } gsf__model;
 
@@ -9484,7 +9486,8 @@ static size_t gsf__model_chunk_end(size_t count, size_t chunk) {
     return end < count ? end : count;
 }
 
-// Places the arrays of a model of `capacity` splats in `block`; returns the bytes used (block NULL: only counts).
+// Lays out the arrays of a model of `capacity` splats in `block`, each 64-byte aligned relative to it. Returns the
+// number of bytes needed. If block is NULL, only computes that number.
 static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block) {
     const size_t widths[GSF__GROUPS] = {3, 3, 4, 1, 3 * (size_t)gsf_splat_count_sh(model->sh_degree)};
     size_t at = 0;
@@ -9514,10 +9517,10 @@ static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block)
     return at;
 }
 
-// Makes room for `needed` splats; keeps the rows there are. The model is unchanged when memory runs out.
+// Grows the capacity to at least `needed` splats and keeps the existing rows. Out of memory: the model is unchanged.
 static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t needed) {
     if (needed <= model->capacity && model->block) return GSF_OK;
-    if (needed > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "trainer: %zu splats", needed);
+    if (needed > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "trainer: %zu splats are too many", needed);
     size_t capacity = model->capacity + model->capacity / 2;
     capacity = ((needed > capacity ? needed : capacity) + 64) & ~(size_t)63;
     gsf__model grown = *model;
@@ -9557,8 +9560,8 @@ static void gsf__model_destroy(gsf_context* ctx, gsf__model* model) {
     memset(model, 0, sizeof *model);
 }
 
-// Learning rate at `step`: log-linear from `first` at 0 to `last` at max_steps, held there; with delay_steps > 0 it is
-// eased in from delay_factor * rate (the official get_expon_lr_func).
+// Learning rate at `step`: log-linear from `first` at step 0 to `last` at max_steps, constant from there on. With
+// delay_steps > 0 it is eased in, starting at delay_factor times that rate. Inria 3DGS: get_expon_lr_func.
 static double gsf__exponential_rate(int32_t step, double first, double last, int32_t delay_steps, double delay_factor,
                                     int32_t max_steps) {
     if (step < 0 || (first == 0.0 && last == 0.0)) return 0.0;
@@ -9575,50 +9578,52 @@ typedef struct gsf__adam_rates { // learning rates of one step
     double means, scales, quats, opacity, sh_dc, sh_rest;
 } gsf__adam_rates;
 
-enum { GSF__ADAM_PERIOD = 384 }; // floats in which the pattern of rates repeats: 8 rows of (16,3)
+enum { GSF__ADAM_PERIOD = 384 }; // the pattern of SH rates repeats after at most this many floats: 8 rows of (16,3)
 
 typedef uint32_t (*gsf__adam_update_fn)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride, size_t n,
                                         const float* rates, size_t period, float inv_correction2);
 
-typedef struct gsf__rest { // what n steps without a gradient do to a value, and how the first of them was taken
-    float drift, eps;      // the value falls by rate * drift * m / (sqrt(v) + eps)
-    float decay1, decay2;  // m and v are multiplied by these
-    float rate, inv_correction2;
+typedef struct gsf__rest { // the effect of n consecutive steps with zero gradient
+    float drift, eps;      // the value decreases by rate * drift * m / (sqrt(v) + eps)
+    float decay1, decay2;  // factors of m and v
+    float rate, inv_correction2; // 1 / (1 - beta1^j) and 1 / sqrt(1 - beta2^j), where j is the first of these steps
 } gsf__rest;
 
-typedef struct gsf__lazy { // after step t: how to catch up
+typedef struct gsf__lazy { // how to catch up to step t
     gsf__model* model;
     gsf__adam_update_fn update;
     int (*catch_up)(float* value, float* m, float* v, size_t n, const float* rates, const gsf__rest* rest);
     size_t active_sh;
-    float rates[48];                      // of an SH row
-    gsf__rest rests[GSF__REST_MOST + 1];  // by the number of steps, the last of which was step t; none of 0
+    float rates[48];                      // learning rates of an SH row
+    gsf__rest rests[GSF__REST_MOST + 1];  // [n]: n steps, the last of which is step t; [0] is all zero
 } gsf__lazy;
 
 typedef struct gsf__adam_job {
     gsf__model* model;
     float inv_correction2;           // 1 / sqrt(1 - beta2^t)
-    size_t active_sh;                // floats of an SH row that can be non-zero
-    float rates[4];                  // of the other groups, divided by 1 - beta1^t
-    float sh_rates[GSF__ADAM_PERIOD];
+    size_t active_sh;                // leading floats of an SH row that can have a gradient
+    float rates[4];                  // learning rates of the groups before SH, divided by 1 - beta1^t
+    float sh_rates[GSF__ADAM_PERIOD]; // likewise of 8 SH rows
     gsf__adam_update_fn update;
 } gsf__adam_job;
 
 #define GSF__ADAM_EPS 1e-15f
-// What changes nothing is flushed to zero, since it would decay to denormal numbers, on which processors are slow: first
-// moments below 1e-30 and second moments below 1e-36 (its root is 1000 times below eps).
+// Moments too small to matter are flushed to zero; otherwise they would decay to denormals, which are slow on many
+// CPUs. The root of the second threshold is 1000 times below eps.
 #define GSF__ADAM_TINY_M 1e-30f
 #define GSF__ADAM_TINY_V 1e-36f
-#define GSF__ADAM_LARGEST 1e18f // larger gradients overflow when squared; they count as not finite
+#define GSF__ADAM_LARGEST 1e18f // larger gradients could overflow when squared, so they are treated as non-finite
 
-/* Catching up. Step j with a zero gradient: m *= b1, v *= b2, value -= rate m / (c1_j (sqrt(v) / c2_j + eps)), where
-   c1_j = 1 - b1^j and c2_j = sqrt(1 - b2^j). With m and v of before the n steps, the k-th of them (j = t - n + k) takes
+/* Catching up in closed form. Step j with a zero gradient is
+       m *= b1,  v *= b2,  value -= rate m / (c1_j (sqrt(v) / c2_j + eps)),   c1_j = 1 - b1^j,  c2_j = sqrt(1 - b2^j).
+   In terms of m and v before the n skipped steps, the k-th of them (j = t - n + k) decreases the value by
        rate m / sqrt(v) * q^k c2_j / c1_j / (1 + x_k eps / sqrt(v)),   q = b1 / sqrt(b2),   x_k = c2_j b2^(-k/2).
-   Where eps is small beside sqrt(v), x_k may be replaced by its mean with the weights q^k c2_j / c1_j: the error is of
-   second order. So all values need two sums, drift = sum(q^k c2_j / c1_j) and eps sum(q^k c2_j / c1_j x_k) / drift, for the
-   given t and n. With its first step taken out such a sum is the one for n - 1, times q: one pass makes those of all n. A
-   row where eps is not small takes the steps one by one. */
-#define GSF__LAZY_LEAST_V 1e-24f // sqrt(v) is 1000 eps: the second order is below 1e-7
+   If eps is small compared to sqrt(v), x_k can be replaced by its mean with weights q^k c2_j / c1_j; the error is of
+   second order. For given t and n all values then share
+       drift = sum(q^k c2_j / c1_j)   and   eps' = eps sum(q^k c2_j / c1_j x_k) / drift.
+   Without its first term, either sum is the one for n - 1 times a constant, so a single pass computes them for all n.
+   Rows in which eps is not small take the steps one by one. */
+#define GSF__LAZY_LEAST_V 1e-24f // sqrt(v) = 1000 eps: the second-order error is below 1e-7
 
 static uint32_t gsf__count_bits(uint32_t bits) {
     uint32_t count = 0;
@@ -9634,7 +9639,7 @@ static uint32_t gsf__count_bits(uint32_t bits) {
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_ADAM
 
-// Stores the moments, what is too small to count flushed to zero.
+// gsf__adam_m and gsf__adam_v store moments, tiny ones as zero, and return what was stored.
 GSF__V_INLINE gsf__vf GSF__V(gsf__adam_m)(float* m, gsf__vf value, size_t n) {
     value = gsf__v_keep(gsf__v_ge(gsf__v_abs(value), gsf__v_set(GSF__ADAM_TINY_M)), value);
     gsf__v_store_first(m, value, n);
@@ -9647,14 +9652,14 @@ GSF__V_INLINE gsf__vf GSF__V(gsf__adam_v)(float* v, gsf__vf value, size_t n) {
     return value;
 }
 
-// Stores `next` where it is finite. Returns bits of the lanes where it is not.
+// Stores `next` where it is finite, else `old`. Returns a bit mask of the lanes where `next` is not finite.
 GSF__V_INLINE uint32_t GSF__V(gsf__adam_value)(float* value, gsf__vf old, gsf__vf next, size_t n) {
     const gsf__vm kept = gsf__v_le(gsf__v_abs(next), gsf__v_set(FLT_MAX));
     gsf__v_store_first(value, gsf__v_select(kept, next, old), n);
     return gsf__vm_bits(gsf__vm_not(kept));
 }
 
-// The first n lanes of one vector; returns how many values were neutralised.
+// Updates the first n lanes of one vector. Returns the number of gradients and updates discarded as non-finite.
 GSF__V_INLINE uint32_t GSF__V(gsf__adam_vector)(float* value, float* m, float* v, float* grad, const float* rates,
                                                 float inv_correction2, size_t n) {
     gsf__vf g = gsf__v_load_first(grad, n), mi = gsf__v_load_first(m, n), vi = gsf__v_load_first(v, n);
@@ -9672,8 +9677,9 @@ GSF__V_INLINE uint32_t GSF__V(gsf__adam_vector)(float* value, float* m, float* v
     return bad_value | bad_grad ? gsf__count_bits(bad_value) + gsf__count_bits(bad_grad) : 0;
 }
 
-// Updates `rows` runs of n values, `stride` apart; rates: `period` (a multiple of 8) step sizes, repeated along a run.
-// Non-finite gradients count as 0, a step to a non-finite value is not taken; returns how many of either.
+// Updates `rows` runs of n values each, which start `stride` apart. rates: `period` (a multiple of 8) step sizes,
+// repeated along each run. Non-finite gradients are treated as 0, and updates to a non-finite value are skipped.
+// Returns how many of both there were.
 GSF__V_KERNEL uint32_t GSF__V(gsf__adam_update)(float* value, float* m, float* v, float* grad, size_t rows, size_t stride,
                                                 size_t n, const float* rates, size_t period, float inv_correction2) {
     uint32_t rejected = 0;
@@ -9698,7 +9704,8 @@ GSF__V_INLINE void GSF__V(gsf__lazy_vector)(float* value, float* m, float* v, co
     (void)GSF__V(gsf__adam_v)(v, vi * gsf__v_set(rest->decay2), n);
 }
 
-// Returns 0, with nothing changed, where a step is to be taken that eps counts in.
+// Applies the steps of `rest` to a row of n values. Returns 0 and changes nothing if eps is not negligible for a value
+// that has momentum; the steps must then be taken one by one.
 GSF__V_KERNEL int GSF__V(gsf__lazy_catch_up)(float* value, float* m, float* v, size_t n, const float* rates,
                                              const gsf__rest* rest) {
     const gsf__vf zero = gsf__v_set(0.0f), least = gsf__v_set(GSF__LAZY_LEAST_V);
@@ -9718,7 +9725,7 @@ GSF__V_KERNEL int GSF__V(gsf__lazy_catch_up)(float* value, float* m, float* v, s
 #endif // GSF__KERNELS_ADAM
 #ifndef GSF__ISA
 
-// For rows as they are after step t; the rates of SH are the same in all steps.
+// Prepares catching up to step t. `rates` are those of step t; the SH rates are the same in all steps.
 static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* model, const gsf__adam_rates* rates,
                               int32_t t, int32_t sh_bands) {
     lazy->model = model;
@@ -9734,7 +9741,7 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
 #endif
     (void)level;
     memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
-    const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // as the updates multiply
+    const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // rounded as in gsf__adam_vector
     double power1 = pow(0.9, t), power2 = pow(0.999, t), decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
     for (int32_t n = 1; n <= GSF__REST_MOST && n <= t; n++) {
         gsf__rest* rest = &lazy->rests[n];
@@ -9772,7 +9779,7 @@ static void gsf__lazy_catch_up_block(const gsf__lazy* lazy, size_t block) {
     lazy->model->rest[block] = 0;
 }
 
-static void gsf__lazy_wake(void* user, size_t splat) { // for gsf_rasterizer.wake
+static void gsf__lazy_wake(void* user, size_t splat) { // gsf_rasterizer.wake: block of a drawn splat
     const gsf__lazy* lazy = (const gsf__lazy*)user;
     const size_t block = splat / GSF__BLOCK;
     if (lazy->model->rest[block] == GSF__AWAKE) return;
@@ -9780,14 +9787,14 @@ static void gsf__lazy_wake(void* user, size_t splat) { // for gsf_rasterizer.wak
     lazy->model->rest[block] = GSF__AWAKE;
 }
 
-static void gsf__lazy_all_chunk(void* arg, size_t chunk, int32_t worker) { // all of the chunk catch up
+static void gsf__lazy_all_chunk(void* arg, size_t chunk, int32_t worker) { // brings a chunk up to date
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     (void)worker;
     const size_t end = gsf__model_blocks(gsf__model_chunk_end(lazy->model->count, chunk));
     for (size_t b = chunk * (GSF__MODEL_CHUNK / GSF__BLOCK); b < end; b++) gsf__lazy_catch_up_block(lazy, b);
 }
 
-// Puts what the SH are, caught up, where their gradients are in a step.
+// Writes up-to-date SH to the gradient buffer, which is free between steps, and leaves the model's SH unchanged.
 static void gsf__lazy_show_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__lazy* lazy = (const gsf__lazy*)arg;
     const gsf__group* sh = &lazy->model->groups[GSF__SH];
@@ -9804,7 +9811,7 @@ static void gsf__lazy_show_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// The SH of splats begin to end - 1 in a lazy step: runs of awake blocks are updated, the others rest.
+// Lazy step for the SH of splats begin to end - 1: updates runs of awake blocks, counts a skipped step for the others.
 static uint32_t gsf__adam_lazy_sh(const gsf__adam_job* job, size_t begin, size_t end) {
     const gsf__group* sh = &job->model->groups[GSF__SH];
     const size_t width = sh->width, whole = job->active_sh == width, blocks = gsf__model_blocks(end);
@@ -9850,9 +9857,9 @@ static void gsf__adam_chunk(void* arg, size_t chunk, int32_t worker) {
     model->rejected[chunk] = rejected;
 }
 
-// One Adam step, the t-th (from 1). sh_bands: bands with a gradient so far; the moments of the others are zero, so leaving
-// them out is exact. Lazy models: only splats of GSF__AWAKE blocks may have a gradient of their SH. Returns the number of
-// values neutralised.
+// Takes Adam step t (counted from 1). sh_bands: number of SH bands that have had a gradient so far; the moments of the
+// others are zero, so skipping them is exact. In lazy models, only splats of GSF__AWAKE blocks may have an SH gradient.
+// Returns the number of gradients and updates discarded as non-finite.
 static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__adam_rates* rates, int32_t t,
                              int32_t sh_bands) {
     gsf__adam_job job;
@@ -9881,24 +9888,25 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
 }
 
 // ---- >>densify -----------------------------------------------------------------
-// Adaptive density control of 3DGS: where the mean screen-space gradient is large, small splats are cloned and large ones
-// are split in two (scales / 1.6, means drawn from the splat itself); then transparent and oversized splats go.
-// Row order as in the official code: kept originals, clones, first halves, second halves. Its test of screen size never
-// fires there (the radii are zeroed before it) and does not exist here. MCMC instead of all that: see there.
+// Adaptive density control of 3DGS: splats with a large mean screen-space gradient are cloned if small and split in
+// two if large (scales / 1.6, means sampled from the splat's Gaussian), then transparent and oversized splats are
+// pruned. Row order as in the Inria 3DGS code: kept originals, clones, first halves, second halves. Its pruning by
+// screen size is omitted, because it never triggers there (the radii are zeroed before the test). The alternative,
+// MCMC, follows below.
 
 typedef enum gsf__densify_action { GSF__KEEP = 0, GSF__CLONE, GSF__SPLIT } gsf__densify_action;
 
 typedef struct gsf__densify_rule {
     float grad;            // threshold of the mean gradient norm
-    double clone_scale;    // splats up to this size (largest axis) are cloned, others split
-    double prune_opacity;  // below this splats are removed
-    double prune_scale;    // above this size too; 0 = off
+    double clone_scale;    // splats up to this size (largest axis) are cloned, larger ones split
+    double prune_opacity;  // splats with a lower opacity are removed
+    double prune_scale;    // splats larger than this are removed, too; 0 = off
     size_t max_splats;
-    uint64_t seed, stream; // of the random positions: a function of the splat's id
-    const float* normals;  // (2, splits, 3) given standard normals instead; NULL = drawn
+    uint64_t seed, stream; // of the random offsets, which also depend on the splat's id
+    const float* normals;  // (2, splits, 3) standard normal samples to use instead; NULL = draw them
 } gsf__densify_rule;
 
-// The larger of the means over photos and over restored views: neither dilutes the other.
+// The larger of the means over photos and over restored views. A common mean would let one kind dilute the other.
 static float gsf__densify_mean_grad(const gsf__model* model, size_t i) {
     float largest = 0.0f;
     for (int k = 0; k < 2; k++) {
@@ -9914,15 +9922,15 @@ static float gsf__model_max_log_scale(const gsf__model* model, size_t i) {
     return m > s[2] ? m : s[2];
 }
 
-static float gsf__positive_float(uint32_t bits) { // floats >= 0 are ordered like their bits
+static float gsf__positive_float(uint32_t bits) { // floats >= 0 are ordered like their bit patterns
     float value;
     memcpy(&value, &bits, sizeof value);
     return value;
 }
 
-// Smallest threshold >= `threshold` that at most `room` splats reach.
+// Smallest threshold >= `threshold` that at most `room` splats reach, found by bisection over the bit patterns.
 static float gsf__densify_cap(const gsf__model* model, float threshold, size_t room) {
-    uint32_t low, high = 0x7f800000u; // +inf, which none reaches
+    uint32_t low, high = 0x7f800000u; // +inf, which no splat reaches
     memcpy(&low, &threshold, sizeof low);
     while (low < high) {
         const uint32_t middle = low + (high - low) / 2;
@@ -9935,7 +9943,8 @@ static float gsf__densify_cap(const gsf__model* model, float threshold, size_t r
     return gsf__positive_float(low);
 }
 
-// Decides model->action of every splat and counts clones and splits. Near max_splats the largest gradients win.
+// Sets model->action of every splat and counts clones and splits. If max_splats leaves no room for all candidates,
+// those with the largest gradients are taken.
 static void gsf__densify_select(const gsf__model* model, const gsf__densify_rule* rule, size_t* clones, size_t* splits) {
     const float clone_log = (float)log(rule->clone_scale);
     float threshold = rule->grad;
@@ -9964,7 +9973,7 @@ static void gsf__model_clear_moments(gsf__model* model, size_t i) {
     }
 }
 
-static void gsf__model_copy_row(gsf__model* model, size_t from, size_t to) { // a new splat: moments zero, a new id
+static void gsf__model_copy_row(gsf__model* model, size_t from, size_t to) { // as a new splat: zero moments, new id
     for (int g = 0; g < GSF__GROUPS; g++) {
         gsf__group* group = &model->groups[g];
         const size_t width = group->width;
@@ -9975,7 +9984,7 @@ static void gsf__model_copy_row(gsf__model* model, size_t from, size_t to) { // 
     model->ids[to] = model->next_id++;
 }
 
-// Rotation matrix (row-major) of a raw quaternion w x y z; the zero quaternion is the identity.
+// Rotation matrix (row-major) of a raw quaternion w x y z; the zero quaternion gives the identity.
 static void gsf__densify_rotation(const float* q, double r[9]) {
     double w = (double)q[0], x = (double)q[1], y = (double)q[2], z = (double)q[3];
     const double norm = sqrt(w * w + x * x + y * y + z * z);
@@ -9986,7 +9995,7 @@ static void gsf__densify_rotation(const float* q, double r[9]) {
     r[6] = 2.0 * (x * z - w * y), r[7] = 2.0 * (y * z + w * x), r[8] = 1.0 - 2.0 * (x * x + y * y);
 }
 
-static void gsf__densify_clear(gsf__model* model) { // the statistics
+static void gsf__densify_clear(gsf__model* model) { // resets the statistics
     for (int k = 0; k < 2; k++) memset(model->grad_sum[k], 0, model->count * sizeof(float));
     for (int k = 0; k < 2; k++) memset(model->visits[k], 0, model->count * sizeof(uint32_t));
 }
@@ -10006,7 +10015,7 @@ static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, c
     }
 }
 
-// Removes split parents and what the pruning rule names, keeping the order.
+// Removes split parents and the splats to be pruned; the order of the others is kept. Resets the statistics.
 static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rule) {
     const float opacity_logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
     const float scale_log = rule->prune_scale > 0.0 ? (float)log(rule->prune_scale) : FLT_MAX;
@@ -10016,7 +10025,7 @@ static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rul
             gsf__model_max_log_scale(model, i) > scale_log)
             continue;
         if (kept != i) {
-            for (int g = 0; g < GSF__GROUPS; g++) { // gradients are all zero between steps
+            for (int g = 0; g < GSF__GROUPS; g++) { // gradients need no copy: all are zero between steps
                 gsf__group* group = &model->groups[g];
                 const size_t width = group->width;
                 memcpy(group->value + kept * width, group->value + i * width, width * sizeof(float));
@@ -10031,7 +10040,7 @@ static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rul
     gsf__densify_clear(model);
 }
 
-// Carries out what gsf__densify_select decided. There must be room for count + clones + 2 splits.
+// Carries out the actions set by gsf__densify_select. Needs capacity for count + clones + 2 splits.
 static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule, size_t clones, size_t splits) {
     const size_t count = model->count;
     size_t clone = count, child = count + clones;
@@ -10052,15 +10061,17 @@ static void gsf__densify_apply(gsf__model* model, const gsf__densify_rule* rule,
     gsf__densify_compact(model, rule);
 }
 
-/* 3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024). Splats that are all but transparent, and new ones up to a
-   budget, become copies of others, drawn with probability proportional to opacity. A splat of opacity o that N now stand
-   for: each copy gets o' = 1 - (1 - o)^(1/N), so that in the middle all together are as opaque as before, and scales times
+/* 3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024). Nearly transparent splats are relocated, and new splats
+   are added up to a budget: both become copies of other splats, drawn with probability proportional to opacity. When a
+   splat of opacity o is replaced by N copies, each gets opacity o' = 1 - (1 - o)^(1/N), so that together they are as
+   opaque at the centre as before, and its scales are multiplied by
        o / sum_{i=1..N} sum_{k=0..i-1} C(i-1,k) (-1)^k o'^(k+1) / sqrt(k+1),
-   so that a ray along which they blend to 1 - (1 - o' g)^N collects what it did from o g. The inner coefficients of a k add
-   up to C(N,k+1): with j = k + 1 one sum of (-1)^(j+1) C(N,j) o'^j / sqrt(j) is left. */
-enum { GSF__MCMC_MOST = 51 }; // copies that the correction counts, as the official code does
+   so that 1 - (1 - o' g)^N, what the copies blend to, has the same integral across the splat as o g had. For each k the
+   binomials add up to C(N,k+1), so with j = k + 1 a single sum of (-1)^(j+1) C(N,j) o'^j / sqrt(j) remains. */
+enum { GSF__MCMC_MOST = 51 }; // N is clamped to this, as in gsplat
 
-// transparency: 1 - o. Returns the factor of the scales. The sum alternates; in double it is good to 1e-12.
+// Sets *opacity to o' and returns the factor of the scales. transparency: 1 - o. The sum alternates; its error in
+// double is below 1e-12.
 static double gsf__mcmc_share(double transparency, uint32_t copies, double* opacity) {
     double term = 1.0, sum = 0.0;
     *opacity = -expm1(log(transparency) / (double)copies);
@@ -10071,10 +10082,11 @@ static double gsf__mcmc_share(double transparency, uint32_t copies, double* opac
     return (1.0 - transparency) / sum;
 }
 
-// Draws `draws` of the splats above `logit`, into visits[1]; how often each was drawn is in visits[0], sums of opacities
-// are in screen[0], which all are free. Returns the draws made: none where there is no such splat.
+// Draws `draws` splats (with repetition) among those with an opacity logit above `logit` and stores their indices in
+// visits[1] and how often each was drawn in visits[0]. screen[0] holds the cumulative opacities. MCMC uses none of
+// these for statistics. Returns the number of draws made: 0 if there is no such splat.
 static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t index) {
-    double *sums = (double*)(void*)model->screen[0], total = 0.0; // two floats a splat
+    double *sums = (double*)(void*)model->screen[0], total = 0.0; // two floats per splat hold a double
     memset(model->visits[0], 0, model->count * sizeof(uint32_t));
     for (size_t i = 0; i < model->count; i++) {
         const float x = model->groups[GSF__OPACITY].value[i];
@@ -10085,7 +10097,7 @@ static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, f
     for (size_t k = 0; k < draws; k++) {
         const double at = total * gsf_draw_uniform(rule->seed, rule->stream, index + k); // < total
         size_t low = 0, high = model->count - 1;
-        while (low < high) { // the first sum above
+        while (low < high) { // first cumulative sum above `at`
             const size_t middle = low + (high - low) / 2;
             if (sums[middle] > at) high = middle;
             else low = middle + 1;
@@ -10096,7 +10108,8 @@ static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, f
     return draws;
 }
 
-// Shares what every drawn splat is among it and its copies to be. Copies are not made so faint that they were next to move.
+// Gives every drawn splat the opacity and scales that it will share with its copies. Opacities are clamped to at least
+// least_opacity, as in gsplat.
 static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
     for (size_t i = 0; i < model->count; i++) {
         if (model->visits[0][i] == 0) continue;
@@ -10113,12 +10126,13 @@ static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
     }
 }
 
-static size_t gsf__mcmc_growth(size_t count, size_t budget) { // splats to be added
+static size_t gsf__mcmc_growth(size_t count, size_t budget) { // number of splats to add: 5 %, within the budget
     const size_t room = budget > count ? budget - count : 0;
     return count / 20 < room ? count / 20 : room;
 }
 
-// `draws` copies; they take the rows from `first` on that are at or below `logit`, or behind the last one.
+// Makes `draws` copies of drawn splats. They overwrite the rows from `first` on whose opacity logit is at most `logit`,
+// and continue past the last splat. Drawn splats are not overwritten, even if their correction lowered them to `logit`.
 static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t first) {
     const float* logits = model->groups[GSF__OPACITY].value;
     const size_t count = model->count, drawn = gsf__mcmc_draw(model, rule, logit, draws, first);
@@ -10129,7 +10143,7 @@ static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, f
     return drawn;
 }
 
-// There must be room for the growth.
+// Needs capacity for the splats that gsf__mcmc_growth adds.
 static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) {
     const float logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
     const size_t count = model->count;
@@ -10140,7 +10154,7 @@ static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) 
     gsf__densify_clear(model);
 }
 
-// Opacities above `limit` fall to it; the moments of all opacities are zeroed.
+// Lowers opacities above `limit` to it and zeroes the moments of all opacities.
 static void gsf__reset_opacity(gsf__model* model, double limit) {
     const float logit = (float)log(limit / (1.0 - limit));
     gsf__group* group = &model->groups[GSF__OPACITY];
@@ -10151,11 +10165,11 @@ static void gsf__reset_opacity(gsf__model* model, double limit) {
 }
 
 // ---- >>trainer -----------------------------------------------------------------
-// One step: photo of a random permutation (reshuffled when used up; the official loader draws with replacement) -> render
-// -> loss -> backward, the same for one restored view, then Adam on the summed gradients, then density control.
+// One step: photo of a random permutation (reshuffled when used up; the official loader draws with replacement) ->
+// render -> loss -> backward, the same for one restored view, then Adam on the summed gradients, then density control.
 // The official order differs in one point: there Adam comes last, and after densification its step is lost because the
-// fresh tensors have no gradient yet. Here no step is lost.
-// A step that fails (memory, cancel) leaves the trainer as it was.
+// fresh tensors have no gradient yet. Here no step is lost. A step that fails (memory, cancel) leaves the trainer as
+// it was.
 
 enum { // streams of random numbers; the iteration or epoch is added
     GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED,
@@ -10668,9 +10682,9 @@ static void gsf__penalty_chunk(void* arg, size_t chunk, int32_t worker) {
         logits->grad[i] += job->opacity * gsf__sigmoid(logits->value[i]) * gsf__sigmoid(-logits->value[i]);
 }
 
-/* MCMC shakes the means: by covariance * normal noise * rate, next to nothing where a splat is opaque. The official rate is
-   noise * lr_means * extent, which depends on the unit of length; divided by extent^2 it is what it is for scenes of extent
-   1, to which gsplat scales all. */
+/* MCMC shakes the means: by covariance * normal noise * rate, next to nothing where a splat is opaque. The official
+   rate is noise * lr_means * extent, which depends on the unit of length; divided by extent^2 it is what it is for
+   scenes of extent 1, to which gsplat scales all. */
 typedef struct gsf__noise_job {
     gsf__model* model;
     uint64_t seed, stream;
@@ -10725,9 +10739,9 @@ static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration)
     return !trainer->desc.mcmc && iteration < trainer->desc.densify_until;
 }
 
-/* The splats with all SH caught up, for everyone but the trainer. That must not change the state, or a run would depend (in
-   its rounding) on who looked when; so the SH are shown where their gradients are in a step, which are zero between steps.
-   ctx NULL: by the calling thread. */
+/* The splats with all SH caught up, for everyone but the trainer. That must not change the state, or a run would
+   depend (in its rounding) on who looked when; so the SH are shown where their gradients are in a step, which are zero
+   between steps. ctx NULL: by the calling thread. */
 static const gsf_splats* gsf__trainer_show(gsf_context* ctx, gsf_trainer* trainer) {
     gsf__model* model = &trainer->model;
     if (!model->lazy) return &trainer->view;
@@ -11197,14 +11211,14 @@ GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
 
 // ---- >>warp --------------------------------------------------------------------
 
-/* Training-free restorer: restored = render + residual. What the splats do not yet explain of a photo, photo - render at
-   the photo's own camera, is carried over to the novel frame. Carrying the photo itself would bring its exposure and
-   view-dependent light along, and shift all detail by the error of the depth: on real photos (a third of the way through
-   training, held-out views, 3/6/9 photos) such frames are 1.2/1.6/2.6 dB worse than the render, frames made of residuals
-   0.3/0.7/0.8 dB better. The exception is a floater, which a residual would keep: where two references look through what
-   the frame shows, and none sees it there, the photos are carried (squared error there at 3/6/9 photos, held-out views:
-   0.51/0.68/0.85 of the render's). The geometry is the references' own depth maps, rendered from the splats: floaters in
-   front of the novel camera do not touch them.
+/* Training-free restorer: restored = render + residual. What the splats do not yet explain of a photo, photo - render
+   at the photo's own camera, is carried over to the novel frame. Carrying the photo itself would bring its exposure
+   and view-dependent light along, and shift all detail by the error of the depth: on real photos (a third of the way
+   through training, held-out views, 3/6/9 photos) such frames are 1.2/1.6/2.6 dB worse than the render, frames made of
+   residuals 0.3/0.7/0.8 dB better. The exception is a floater, which a residual would keep: where two references look
+   through what the frame shows, and none sees it there, the photos are carried (squared error there at 3/6/9 photos,
+   held-out views: 0.51/0.68/0.85 of the render's). The geometry is the references' own depth maps, rendered from the
+   splats: floaters in front of the novel camera do not touch them.
        begin     per reference: a score per pixel from the other references. A point that another reference sees at the
                  same depth is supported; one that lies in front of what another reference sees is refuted, since that
                  reference looks through it (free-space violation).
@@ -11383,8 +11397,8 @@ static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_refere
 
 typedef struct gsf__warp_vertex { float u, v, inv_z; } gsf__warp_vertex; // inv_z 0: no surface here
 
-// Draws a triangle of inverse depths into the z-buffer (largest inverse depth wins). Triangles seen from behind, or torn
-// wide open, are not surface.
+// Draws a triangle of inverse depths into the z-buffer (largest inverse depth wins). Triangles seen from behind, or
+// torn wide open, are not surface.
 static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex* b, const gsf__warp_vertex* c,
                                float* inv_z, int32_t width, int32_t height) {
     const float area = (b->u - a->u) * (c->v - a->v) - (b->v - a->v) * (c->u - a->u);
@@ -11485,8 +11499,8 @@ typedef struct gsf__warp_job {
     size_t scratch_floats, row_floats;
 } gsf__warp_job;
 
-// 1 where what the frame shows at camera depth `z` cannot be there: two references look through it. One that shows a surface
-// there, give or take a few pixels (leaves, edges), speaks for it.
+// 1 where what the frame shows at camera depth `z` cannot be there: two references look through it. One that shows a
+// surface there, give or take a few pixels (leaves, edges), speaks for it.
 static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
                              int32_t x, int32_t y, double z) {
     int through = 0;
@@ -11516,8 +11530,8 @@ typedef struct gsf__warp_candidate {
     float weight;
 } gsf__warp_candidate;
 
-// What the references carry to one pixel that shows rgb at depth `shown`. Returns the confidence; 0 and rgb untouched where
-// no reference reaches.
+// What the references carry to one pixel that shows rgb at depth `shown`. Returns the confidence; 0 and rgb untouched
+// where no reference reaches.
 static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
                              const double center[3], int32_t x, int32_t y, const float* inv_z, size_t plane, float shown,
                              float rgb[3]) {
@@ -12037,8 +12051,8 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
-// A reference shows the splats' render in place of a photo's pixels that do not count, in proportion, and no depth where
-// those are the most: nothing is carried from there.
+// A reference shows the splats' render in place of a photo's pixels that do not count, in proportion, and no depth
+// where those are the most: nothing is carried from there.
 static gsf_result gsf__patch_reference(gsf_context* ctx, const float* weight, const gsf_image* render, gsf_reference* to) {
     gsf_image patched;
     const size_t pixels = (size_t)render->width * (size_t)render->height;
@@ -12111,8 +12125,8 @@ static gsf_result gsf__fit_image(gsf_context* ctx, gsf_image* image, const gsf_c
     return gsf_make_image(ctx, GSF_F32, camera->width, camera->height, channels, image);
 }
 
-// How well the render of these frames agrees with what the references explain (out_color, out_confidence), in dB over the
-// explained pixels, weighted by confidence; 0 when less than half of the pixels are explained at all.
+// How well the render of these frames agrees with what the references explain (out_color, out_confidence), in dB over
+// the explained pixels, weighted by confidence; 0 when less than half of the pixels are explained at all.
 static double gsf__window_agreement(const gsf_restore_window* window) {
     double error = 0.0, weight = 0.0, pixels = 0.0, explained = 0.0;
     for (int32_t i = 0; i < window->frame_count; i++)
@@ -12304,9 +12318,9 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
     return GSF_OK;
 }
 
-/* Checkpoint: the trainer's chunks, "FIXR" (7 x i32: version, iteration, which is the trainer's, round, restoring, window,
-   windows, skipped) and two lists of frames "FIXA" (active), "FIXP" (pending): u64 count, then per frame 20 doubles (w2c,
-   fx, fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
+/* Checkpoint: the trainer's chunks, "FIXR" (7 x i32: version, iteration, which is the trainer's, round, restoring,
+   window, windows, skipped) and two lists of frames "FIXA" (active), "FIXP" (pending): u64 count, then per frame 20
+   doubles (w2c, fx, fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
 static void gsf__save_frames(gsf_context* ctx, gsf_buffer* chunks, const char* tag, const gsf__kept_frames* list) {
@@ -12505,8 +12519,8 @@ static void gsf__destroy_points(gsf_context* ctx, gsf__colored_points* points) {
     memset(points, 0, sizeof *points);
 }
 
-// A pixel of the view and a depth from 0.3 to 2 times the focus' (even in volume), with the pixel's colour, or grey where the
-// photo does not count.
+// A pixel of the view and a depth from 0.3 to 2 times the focus' (even in volume), with the pixel's colour, or grey
+// where the photo does not count.
 static void gsf__random_point(const gsf_scene_view* view, const double* focus, uint64_t seed, uint64_t i, double point[3],
                               uint8_t color[3]) {
     const gsf_camera* camera = &view->camera;
