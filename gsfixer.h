@@ -9,15 +9,16 @@
        only. Define GSFIXER_STATIC before every include to make all functions private to one file.
 
    WHAT IT DOES NOT DO
-       It never prints, exits, aborts, keeps global state or starts threads.
+       It never prints, exits, aborts or keeps global state. It starts no threads except through OpenMP, if compiled
+       with it and the host sets no parallel hook.
 
    CONVENTIONS
        camera axes     OpenCV: x right, y down, z forward
        matrices        double[16], column-major (the layout of glm::dmat4); w2c maps world to camera, c2w back
        pixels          (0,0) is the top left corner of the top left pixel; its centre is (0.5, 0.5). COLMAP cx, cy.
        quaternions     w, x, y, z
-       colour          sRGB-coded values as in the photo, [0,1] if float; nothing is linearised
-       lengths         those of the scene file
+       colour          sRGB-encoded values as in the photo, [0,1] if float; nothing is linearised
+       lengths         in the units of the scene file
        paths, text     UTF-8
 
    CONFIGURATION (define before the implementation)
@@ -45,33 +46,34 @@
    NAMES       Functions are gsf_VERB_NOUN, in the modules gsf_traj_VERB_NOUN, gsf_splat_VERB_NOUN and gsf_nn_VERB_NOUN;
                without a noun the object is the module's own (gsf_splat_load loads splats). One verb per idea in all
                modules; tests/api.py checks every public name against this table:
-       init                 fill in a struct of the caller's; it owns nothing, so there is no counterpart
+       init                 fill in the caller's struct; it owns nothing, so there is no destroy
        make destroy         create an object that owns memory, from a desc or from data; free it
        load save            read an object from a file or folder; write it to one
        parse format         read an object from bytes in memory; append its bytes to a gsf_buffer
        read write           a whole file as bytes
        append               add to a gsf_buffer
        encode decode        turn pixels and text into PNG, tokens, features or latents, and back
-       query                tell sizes, costs or a plan without doing the work: a struct ..._info, or numbers
+       query                report sizes, costs or a plan without doing the work, in an ..._info struct or as numbers
        resolve              fill in every default of a desc
        get set copy         borrow, replace or duplicate one property of an object
-       find count           look something up (NULL, 0 or an error if there is none); tell how many there are
+       find count           look something up (NULL, 0 or an error if there is none); return how many there are
        check                validate; the error says what is wrong
        wrap                 make a view of the caller's memory
        convert resize project split sort filter quantize    turn data into other data
-       step                 advance an object that the host drives by one step: trainer, fixer, sampler
+       step                 advance a trainer, fixer or sampler, which the host drives, by one step
        render restore sample caption run    compute a result with splats, a restorer, a path or a model
-       measure              compute a figure of some data
+       measure              compute a metric or statistic
        draw                 draw a random number
-       look                 make a pose from what it looks at
-       describe             name a value in words
+       look                 make a pose that looks at a point
+       describe             return the text of an enumerator
        alloc free fail log request clear is    memory, errors and cancellation, through the context
                Internal names begin with gsf__ or GSF__ and are never exported. Types are gsf_NOUN, gsf_traj_NOUN and
-               gsf_nn_NOUN: ..._desc is what the caller asks for, with zero as the default; ..._stats is what a call did;
-               ..._info is what query answers. Enumerators carry the type's name (GSF_LOG_ERROR of gsf_log_level), dtypes
-               their own (GSF_U8). Flags are int32_t, counts of elements in memory size_t, sizes of tensors and images
-               int64_t. Bytes are passed as (data, size) with a name for error messages, and grow in a gsf_buffer. The words
-               are the field's: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v; tokens, positions, latents.
+               gsf_nn_NOUN: a ..._desc holds a call's options, with zero as the default; ..._stats reports what a call did;
+               ..._info is the result of a query. Enumerators begin with their type's name (GSF_LOG_ERROR of
+               gsf_log_level), except for dtypes (GSF_U8). Flags are int32_t, counts of elements in memory size_t, sizes of
+               tensors and images int64_t. Bytes are passed as (data, size) with a name for error messages; output of
+               unknown size goes to a gsf_buffer. Terms: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v;
+               tokens, positions, latents.
    SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images
                >>resize >>metrics >>cameras >>clips >>glm >>oiio
 */
@@ -85,7 +87,7 @@
 
 #ifndef GSF_API
 #if defined(GSFIXER_STATIC) && (defined(__GNUC__) || defined(__clang__))
-#define GSF_API static __attribute__((unused)) // a file need not call all of them
+#define GSF_API static __attribute__((unused)) // a file may call only some of them
 #elif defined(GSFIXER_STATIC)
 #define GSF_API static
 #else
@@ -292,11 +294,11 @@ typedef struct gsf_json { // a parsed document; values[0] is the root
 } gsf_json;
 
 // RFC 8259, strictly: UTF-8 checked, duplicate keys refused, at most 64 levels deep, finite numbers.
-// Takes memory in proportion to the text only.
+// Memory use is proportional to the size of the text.
 GSF_API GSF_NODISCARD gsf_result gsf_parse_json(gsf_context* ctx, const char* name, const char* text, size_t size,
                                                 gsf_json* out);
 GSF_API void gsf_destroy_json(gsf_context* ctx, gsf_json* json);
-// Member of an object or NULL (also when `object` is NULL or no object).
+// Member of an object; NULL if there is none, or if `object` is NULL or not an object.
 GSF_API const gsf_json_value* gsf_find_json_member(const gsf_json* json, const gsf_json_value* object, const char* key);
 // Element of an array or NULL. Linear in index; walk `child` and `next` for long arrays.
 GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const gsf_json_value* array, size_t index);
@@ -328,7 +330,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_make_image(gsf_context* ctx, gsf_dtype dtyp
 GSF_API void gsf_destroy_image(gsf_context* ctx, gsf_image* image);
 
 // Copies pixels between dtypes and layouts. u8 to float divides by 255; float to u8 is clamp(x*255 + 0.5) truncated
-// (torchvision save_image); NaN becomes 0. 1 channel spreads to 3; 4 to 3 drops alpha; other counts are an error.
+// (torchvision save_image); NaN becomes 0. 1 channel is replicated to 3; 4 to 3 drops alpha; other counts are an error.
 GSF_API GSF_NODISCARD gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, const gsf_image* dst);
 
 // Reads PNG, JPEG, BMP, TGA, PNM (stb) and, with GSF_USE_OIIO, whatever OpenImageIO reads. channels: 1, 3, 4 or
@@ -354,8 +356,8 @@ typedef enum gsf_resize_filter {
     GSF_RESIZE_PIL_LANCZOS,    //   (a = 3)
 } gsf_resize_filter;
 
-// Resizes src into dst (sizes taken from the views, which must not overlap; same dtype, u8 or f32, and channels). Channels
-// are resized one by one: PIL itself multiplies colours by alpha first when it resizes RGBA.
+// Resizes src to the size of dst. The views must not overlap and have the same channel count and dtype, u8 or f32. Channels
+// are resized independently, while PIL premultiplies RGBA by alpha.
 GSF_API GSF_NODISCARD gsf_result gsf_resize_image(gsf_context* ctx, const gsf_image* src, gsf_resize_filter filter,
                                                   const gsf_image* dst);
 
@@ -364,14 +366,15 @@ GSF_API GSF_NODISCARD gsf_result gsf_resize_image(gsf_context* ctx, const gsf_im
 typedef enum gsf_ssim_kind {
     GSF_SSIM_3DGS,         // 11x11 Gaussian sigma 1.5, zero padding, variances not clamped: the 3DGS papers' figure
     GSF_SSIM_TORCHMETRICS, // the same kernel, reflect padding, variances clamped at 0 (gsplat's trainer)
-    GSF_SSIM_SKIMAGE,      // scikit-image's default: 7x7 uniform window, sample covariance, mean over the valid inside
+    GSF_SSIM_SKIMAGE,      // scikit-image's default: 7x7 uniform window, sample covariance, mean over the interior
 } gsf_ssim_kind;
 
-// Images of any dtype, also of two (floats in [0,1], integers stand for value / maximum), equal sizes and channels. All
-// sums in double, in a fixed order. A NaN or infinity that counts gives GSF_ERROR_NUMERIC.
+// Both images must have the same size and channel count; dtypes may differ (floats in [0,1], integers are scaled to
+// value / maximum). All sums are in double and in a fixed order. A NaN or infinity in a counted pixel gives
+// GSF_ERROR_NUMERIC.
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
 // them). With no pixel to count, or an image smaller than the window needs (6 pixels for TORCHMETRICS, 7 for SKIMAGE),
-// the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), of identical images +infinity.
+// the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), and +infinity for identical images.
 GSF_API GSF_NODISCARD gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
                                                   const gsf_image* mask, double* out);
 GSF_API GSF_NODISCARD gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a,
@@ -582,8 +585,8 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #include <omp.h>
 #endif
 
-// Between these two, multiplications and additions round separately unless an FMA is written out, so that C11 and
-// C++17 builds and all compilers agree; the includer's mode is restored. Every implementation stands between them.
+// Every implementation is enclosed in these two. In between, the compiler must not contract a * b + c into an FMA, so that
+// C11 and C++17 builds give the same bits with all compilers; the code that follows gets the compiler's mode back.
 #if defined(__clang__)
 #define GSF__BEGIN_IMPLEMENTATION _Pragma("STDC FP_CONTRACT OFF")
 #define GSF__END_IMPLEMENTATION _Pragma("STDC FP_CONTRACT DEFAULT")
@@ -596,7 +599,7 @@ inline void gsf_from_glm_projection(const glm::dmat4& p, int32_t width, int32_t 
 #endif
 
 #if defined(__GNUC__) || defined(__clang__)
-#define GSF__SHARED static __attribute__((unused)) // a translation unit need not use all of them
+#define GSF__SHARED static __attribute__((unused)) // a translation unit may use only some of them
 #define GSF__NOINLINE __attribute__((noinline))
 #define GSF__ATOMIC_LOAD(p) __atomic_load_n((p), __ATOMIC_RELAXED)
 #define GSF__ATOMIC_STORE(p, v) __atomic_store_n((p), (v), __ATOMIC_RELAXED)
@@ -673,8 +676,9 @@ GSF__SHARED void gsf__store_le(void* data, uint64_t value, int bytes) {
     for (int i = 0; i < bytes; i++, value >>= 8) p[i] = (unsigned char)(value & 255u);
 }
 
-// CRC-32 of gzip and PNG (reflected 0xedb88320), continued from `crc`, which starts as 0. Long inputs go 16 bytes at a
-// time; tables[k][b] is byte b followed by k zero bytes.
+// CRC-32 of gzip and PNG (reflected polynomial 0xedb88320), continued from `crc`, which starts as 0. Inputs of 32 KiB and
+// more, which are worth building the tables, are processed 16 bytes at a time (slicing-by-16): tables[k][b] is the CRC of
+// byte b followed by k zero bytes.
 GSF__SHARED uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
     static const uint32_t nibble[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
                                         0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
@@ -712,8 +716,8 @@ GSF__SHARED uint32_t gsf__crc32(uint32_t crc, const void* data, size_t size) {
 
 enum { GSF__DECIMAL_DIGITS = 800 }; // more than the 767 that can decide how a double rounds
 
-// Reads [+-]digits[.digits][e[+-]digits] at the start of `text`: correctly rounded and independent of the locale
-// (strtod only ever sees digits and an exponent). Returns the bytes read, 0 where there is no number. Too large gives
+// Reads [+-]digits[.digits][e[+-]digits] at the start of `text`. Correctly rounded and independent of the locale, because
+// strtod only ever gets digits and an exponent. Returns the number of bytes read, 0 if there is no number. Overflow gives
 // infinity.
 GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) {
     static const double powers[23] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
@@ -728,7 +732,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
         if (c == '.' && !point) { point = 1; continue; }
         if (c < '0' || c > '9') break;
         seen++;
-        if (kept == GSF__DECIMAL_DIGITS) { // only matters as "a little more"
+        if (kept == GSF__DECIMAL_DIGITS) { // any further non-zero digit only breaks ties: see `lost` below
             lost |= c != '0';
             exponent += !point;
         } else {
@@ -753,7 +757,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
     if (kept == 0) {
         result = 0.0;
     } else if (FLT_EVAL_METHOD == 0 && kept <= 19 && mantissa <= (uint64_t)1 << 53 && exponent >= -22 &&
-               exponent <= 22) { // both factors exact, so one rounding
+               exponent <= 22) { // both operands are exact, so the result is rounded once
         result = exponent < 0 ? (double)mantissa / powers[-exponent] : (double)mantissa * powers[exponent];
     } else {
         if (lost) {
@@ -769,7 +773,7 @@ GSF__SHARED size_t gsf__scan_double(const char* text, size_t size, double* out) 
     return at;
 }
 
-// Length of the well-formed UTF-8 sequence at p (Unicode table 3-7), 0 where there is none.
+// Length of the UTF-8 sequence at the start of `text`, 0 if it is not well-formed (Unicode Standard, table 3-7).
 GSF__SHARED size_t gsf__utf8_size(const void* text, size_t left) {
     const unsigned char* p = (const unsigned char*)text;
     if (left == 0) return 0;
@@ -781,11 +785,11 @@ GSF__SHARED size_t gsf__utf8_size(const void* text, size_t left) {
         if ((p[i] & 0xc0) != 0x80) return 0;
     if ((c == 0xe0 && p[1] < 0xa0) || (c == 0xed && p[1] > 0x9f) || (c == 0xf0 && p[1] < 0x90) ||
         (c == 0xf4 && p[1] > 0x8f))
-        return 0; // overlong, surrogate, above 10ffff
+        return 0; // overlong, a surrogate, or above U+10FFFF
     return size;
 }
 
-// IEEE half precision: to float exactly; from float rounded to nearest, ties to even, overflow to infinity.
+// IEEE half precision. To float is exact; from float rounds to nearest, ties to even, and overflows to infinity.
 GSF__SHARED float gsf__half_to_float(uint16_t half) {
     const uint32_t sign = (uint32_t)(half & 0x8000u) << 16, exponent = half >> 10 & 31u, fraction = half & 1023u;
     uint32_t bits;
@@ -809,8 +813,8 @@ GSF__SHARED uint16_t gsf__float_to_half(float value) {
     const uint32_t sign = bits >> 16 & 0x8000u;
     bits &= 0x7fffffffu;
     if (bits > 0x7f800000u) return (uint16_t)(sign | 0x7e00u); // NaN
-    if (bits >= 0x477ff000u) return (uint16_t)(sign | 0x7c00u); // 65520 and above
-    if (bits < 0x38800000u) { // below 2^-14: adding 0.5 leaves fraction * 2^-24 in the low bits, rounded by the FPU
+    if (bits >= 0x477ff000u) return (uint16_t)(sign | 0x7c00u); // 65520 and above round to infinity
+    if (bits < 0x38800000u) { // subnormal: adding 0.5 leaves value * 2^24 in the low bits, rounded by the FPU
         float magnitude;
         memcpy(&magnitude, &bits, sizeof magnitude);
         magnitude += 0.5f;
@@ -832,7 +836,7 @@ GSF__SHARED size_t gsf__dtype_size(gsf_dtype dtype) {
     return 0;
 }
 
-// out = a * b for column-major 4x4.
+// out = a * b for column-major 4x4 matrices; out may be a or b.
 GSF__SHARED void gsf__mat4_mul(const double a[16], const double b[16], double out[16]) {
     double m[16];
     for (int c = 0; c < 4; c++)
@@ -844,7 +848,7 @@ GSF__SHARED void gsf__mat4_mul(const double a[16], const double b[16], double ou
     memcpy(out, m, sizeof m);
 }
 
-// Inverse of a rigid transform (rotation transposed).
+// Inverse of a rigid transform; out may be m.
 GSF__SHARED void gsf__mat4_rigid_inverse(const double m[16], double out[16]) {
     double inv[16];
     for (int c = 0; c < 3; c++) {
@@ -861,7 +865,7 @@ GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double po
     for (int r = 0; r < 3; r++) out[r] = m[r] * point[0] + m[4 + r] * point[1] + m[8 + r] * point[2] + m[12 + r];
 }
 
-// The nearest of least, least + step, ... up to `most` (0: any).
+// The count nearest to `wanted` out of least, least + step, ... up to `most` (0: no limit).
 GSF__SHARED int32_t gsf__legal_count(int32_t wanted, int32_t least, int32_t most, int32_t step) {
     if (step < 1) step = 1;
     if (most > 0 && wanted > most) wanted = most;
@@ -870,29 +874,30 @@ GSF__SHARED int32_t gsf__legal_count(int32_t wanted, int32_t least, int32_t most
     return legal < least ? least : legal;
 }
 
-// Likewise a side of an image.
+// The multiple of `multiple` nearest to `wanted`, up to `most` (0: no limit): a legal width or height.
 GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t most) {
     if (multiple < 1) multiple = 1;
     return gsf__legal_count((int32_t)(wanted + 0.5), multiple, most, multiple);
 }
 
-// What the platform says of a file that it does not open. What lies below a file (ENOTDIR) is not there, either.
+// Result for the errno of a failed fopen. A path below a regular file (ENOTDIR) does not exist, either.
 GSF__SHARED gsf_result gsf__open_result(int reason) {
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
 }
 
 enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 
-// A chunk whose bytes are appended to `out` piece by piece: open, gsf_append_bytes ..., close what open returned.
+// Begins a chunk whose bytes are then appended to `out` piece by piece with gsf_append_bytes. Returns the position that
+// gsf__close_chunk takes.
 GSF__SHARED size_t gsf__open_chunk(gsf_context* ctx, gsf_buffer* out, const char* tag) {
-    char head[GSF__CHUNK_HEAD]; // or the file's, which is as long
+    char head[GSF__CHUNK_HEAD]; // first the file's, which has the same size
     if (out->size == 0) {
         memcpy(head, "GSFCHUNK", 8);
         gsf__store_le(head + 8, 1, 4);
         gsf_append_bytes(ctx, out, head, GSF__CHUNK_FILE_HEAD);
     }
     const size_t opened = out->size;
-    memset(head, 0, sizeof head); // the size is filled in by close
+    memset(head, 0, sizeof head); // gsf__close_chunk fills in the size
     memcpy(head, tag, 4);
     gsf_append_bytes(ctx, out, head, GSF__CHUNK_HEAD);
     return opened;
@@ -906,53 +911,55 @@ GSF__SHARED void gsf__close_chunk(gsf_context* ctx, gsf_buffer* out, size_t open
     gsf_append_bytes(ctx, out, crc, sizeof crc);
 }
 
-// What only gsfixer.h's own implementation can do. Other implementations, which may stand in other files or libraries, find
-// it through the context, so that no name of an internal function is ever exported.
+// Functions of gsfixer.h's implementation that other modules use. A module may be compiled in another file or library, so
+// it calls them through the context; this way no internal function is ever exported.
 typedef struct gsf__services {
     gsf_result (*inflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body, void* out,
                              size_t room);
     gsf_result (*deflate_fn)(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out);
     gsf_result (*parse_json_fn)(gsf_context* ctx, const char* name, const char* text, size_t size, size_t start,
                                 gsf_json* out);
-    gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size); // the default hook
+    gsf_result (*read_fn)(void* user, gsf_context* ctx, const char* path, void** data, size_t* size); // of the default io hook
 } gsf__services;
 
-// DEFLATE (RFC 1951): in through stb (2^31 bytes; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB), out by the same
-// bytes on every machine (2^30). Inflates what starts at byte `body` of a file to exactly `room` > 0 bytes. The 8 bytes of a
-// gzip file's end must follow it within `size`: stb 2.27 reads ahead, and takes an end too near for a cut.
+// Inflates the DEFLATE stream (RFC 1951) that starts at byte `body` of a file into exactly `room` > 0 bytes. stb does it:
+// at most 2^31 - 1 bytes, compressed or not; GSF_ERROR_UNSUPPORTED beyond that and under GSF_NO_STB. At least 8 bytes, such
+// as the trailer of a gzip file, must follow the stream within `size`: stb 2.27 reads ahead and otherwise takes a complete
+// stream for a truncated one.
 GSF__SHARED gsf_result gsf__inflate(gsf_context* ctx, const char* name, const void* data, size_t size, size_t body,
                                     void* out, size_t room) {
     return ctx->services->inflate_fn(ctx, name, data, size, body, out, room);
 }
 
-// Appends `data` (size > 0) compressed.
+// Appends `data` (0 < size <= 2^30) as a DEFLATE stream; the bytes are the same on every machine.
 GSF__SHARED gsf_result gsf__deflate(gsf_context* ctx, const char* name, const void* data, size_t size,
                                     gsf_buffer* out) {
     return ctx->services->deflate_fn(ctx, name, data, size, out);
 }
 
-// JSON that begins at byte `start` of a file: offsets, also in error texts, count from the file's first byte.
+// Parses JSON that begins at byte `start` of a file. Offsets, including those in error messages, count from the start of
+// the file.
 GSF__SHARED gsf_result gsf__parse_json_from(gsf_context* ctx, const char* name, const char* text, size_t size,
                                             size_t start, gsf_json* out) {
     return ctx->services->parse_json_fn(ctx, name, text, size, start, out);
 }
 
-// Are files those of the platform, which may list or map them?
+// Whether paths name ordinary files of the platform, so that folders can be listed and files mapped or read in part.
 GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
     return ctx->io.read_fn == ctx->services->read_fn || ctx->io.plain_files;
 }
 
 // ---- >>lanes: the vector vocabulary --------------------------------------------
 
-/* A kernel that treats many values alike is written once, over the names below, and compiled once per instruction set:
-   the header that holds it includes itself, with the kernel's part selected and GSF__ISA set to scalar, avx2 or avx512.
-   Each copy is ordinary code at its own lines, so that a debugger steps through it. In a module:
+/* An elementwise kernel is written once, in terms of the names below, and compiled once per instruction set: its header
+   includes itself with the kernel's section selected and GSF__ISA set to scalar, avx2 or avx512. Kernels are ordinary code
+   rather than macro bodies, so a debugger can step through each copy. In a module:
 
-       #ifndef GSF__ISA                         // plain code, read once
+       #ifndef GSF__ISA                         // everything else, compiled once
        ...
-       #define GSF__KERNELS "gsfixer_x.h"       // where the kernels are
-       #define GSF__KERNELS_BLUR                // which of them
-       #define GSF__KERNELS_AVX512              // only if a 16-lane copy is wanted besides the scalar and the AVX2 one
+       #define GSF__KERNELS "gsfixer_x.h"       // the file with the kernels
+       #define GSF__KERNELS_BLUR                // the section to compile
+       #define GSF__KERNELS_AVX512              // optional: compile a 16-lane copy, too
        #include "gsfixer.h"                     // includes gsfixer_x.h once per instruction set
        #undef GSF__KERNELS_BLUR
        #endif
@@ -965,23 +972,24 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
        }
        #endif
 
-   Types       gsf__vf  GSF__LANES floats      gsf__vi  as many int32_t        gsf__vm  mask: a truth value per lane
-               gsf__vd  doubles, GSF__LANES / GSF__HALVES of them (one at one lane)
-   Names       gsf__v_ works on floats, gsf__vi_, gsf__vm_ and gsf__vd_ on the others. + - * / work on gsf__vf and gsf__vd:
-               they are floats and doubles themselves or vectors for which the compiler defines operators (GCC and Clang;
-               a compiler that does not would have them as C++ overloads). Nothing else relies on vector extensions.
-   madd        a * b + c; msub a * b - c; nmadd c - a * b: rounded once where the instruction set can, twice at one lane.
-   min, max    b where either is a NaN: max(limit, x) keeps a NaN, max(x, limit) replaces it.
-   _first      only the first n lanes (all if n >= GSF__LANES) are read or written; the others are 0.
-   sum         v[i] + v[i + n / 2] until one is left: ((0+4)+(2+6)) + ((1+5)+(3+7)) of eight lanes.
+   Types       gsf__vf  GSF__LANES floats      gsf__vi  GSF__LANES int32_t     gsf__vm  mask, one bool per lane
+               gsf__vd  GSF__LANES / GSF__HALVES doubles
+   Names       gsf__v_ operates on floats, gsf__vi_, gsf__vm_ and gsf__vd_ on the other types. + - * / work on gsf__vf and
+               gsf__vd, which are plain float and double or vector types for which GCC and Clang define operators (another
+               compiler would need C++ overloads). No other vector extension is used.
+   madd        a * b + c; msub: a * b - c; nmadd: c - a * b. Fused, except in the scalar version.
+   min, max    return b if either operand is a NaN: max(limit, x) propagates a NaN in x, max(x, limit) replaces it.
+   _first      reads or writes only the first n lanes (all if n >= GSF__LANES); other lanes are loaded as 0.
+   sum         adds the upper half to the lower until one lane is left; 8 lanes: ((0+4)+(2+6)) + ((1+5)+(3+7)).
 
-   An instruction set is added by defining all of it with a new suffix and one more inclusion at the end of this file. */
+   To add an instruction set, define all names with a new suffix and include the kernels once more at the end of this
+   file. */
 
 #define GSF__PASTE_(a, b) a##_##b
 #define GSF__PASTE(a, b) GSF__PASTE_(a, b)
-#define GSF__V(name) GSF__PASTE(name, GSF__ISA) // `name` as the instruction set that is being compiled has it
-#define GSF__V_KERNEL GSF__V(GSF__V_KERNEL) static // begins the definition of a kernel ...
-#define GSF__V_INLINE GSF__V(GSF__V_INLINE) // ... and of a function that is part of the kernels which call it
+#define GSF__V(name) GSF__PASTE(name, GSF__ISA)    // `name` for the instruction set being compiled
+#define GSF__V_KERNEL GSF__V(GSF__V_KERNEL) static // begins the definition of a kernel
+#define GSF__V_INLINE GSF__V(GSF__V_INLINE)        // begins the definition of a function to be inlined into kernels
 #define GSF__LANES GSF__V(GSF__LANES)
 #define GSF__HALVES GSF__V(GSF__HALVES)
 
@@ -995,20 +1003,20 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__v_store GSF__V(gsf__v_store)
 #define gsf__v_load_first GSF__V(gsf__v_load_first)
 #define gsf__v_store_first GSF__V(gsf__v_store_first)
-#define gsf__v_load_bytes GSF__V(gsf__v_load_bytes) // the first n of uint8_t
+#define gsf__v_load_bytes GSF__V(gsf__v_load_bytes) // the first n of uint8_t, converted to float
 #define gsf__v_gather GSF__V(gsf__v_gather)         // p[i]
 #define gsf__v_madd GSF__V(gsf__v_madd)
 #define gsf__v_msub GSF__V(gsf__v_msub)
 #define gsf__v_nmadd GSF__V(gsf__v_nmadd)
 #define gsf__v_sqrt GSF__V(gsf__v_sqrt)
 #define gsf__v_abs GSF__V(gsf__v_abs)
-#define gsf__v_with_sign GSF__V(gsf__v_with_sign)   // x, its sign flipped where that of `of` is set
+#define gsf__v_with_sign GSF__V(gsf__v_with_sign)   // x, negated where the sign bit of `of` is set
 #define gsf__v_min GSF__V(gsf__v_min)
 #define gsf__v_max GSF__V(gsf__v_max)
 #define gsf__v_round GSF__V(gsf__v_round)           // to the nearest integer, ties to even
 #define gsf__v_floor GSF__V(gsf__v_floor)
 #define gsf__v_ceil GSF__V(gsf__v_ceil)
-#define gsf__v_eq GSF__V(gsf__v_eq)                 // comparisons are false where either is a NaN
+#define gsf__v_eq GSF__V(gsf__v_eq)                 // comparisons with a NaN are false
 #define gsf__v_lt GSF__V(gsf__v_lt)
 #define gsf__v_le GSF__V(gsf__v_le)
 #define gsf__v_gt GSF__V(gsf__v_gt)
@@ -1016,12 +1024,12 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__v_select GSF__V(gsf__v_select)         // mask ? yes : no
 #define gsf__v_keep GSF__V(gsf__v_keep)             // mask ? x : 0
 #define gsf__v_sum GSF__V(gsf__v_sum)
-#define gsf__v_largest GSF__V(gsf__v_largest)       // over the lanes, none of which is a NaN
-#define gsf__v_transpose GSF__V(gsf__v_transpose)   // GSF__LANES vectors, in place
-#define gsf__v_pin GSF__V(gsf__v_pin)               // a constant that stays in a register, else loops load it each time
-#define gsf__v_fetch GSF__V(gsf__v_fetch)           // memory that will be needed soon
-#define gsf__v_bits GSF__V(gsf__v_bits)             // bit patterns of floats
-#define gsf__v_to_int GSF__V(gsf__v_to_int)         // rounded as gsf__v_round
+#define gsf__v_largest GSF__V(gsf__v_largest)       // over the lanes, which must not contain a NaN
+#define gsf__v_transpose GSF__V(gsf__v_transpose)   // GSF__LANES vectors, as a square matrix, in place
+#define gsf__v_pin GSF__V(gsf__v_pin)               // keeps a constant in a register that loops would reload otherwise
+#define gsf__v_fetch GSF__V(gsf__v_fetch)           // prefetch
+#define gsf__v_bits GSF__V(gsf__v_bits)             // reinterprets the bits as int32_t
+#define gsf__v_to_int GSF__V(gsf__v_to_int)         // rounded like gsf__v_round
 #define gsf__v_truncate GSF__V(gsf__v_truncate)
 
 #define gsf__vi_set GSF__V(gsf__vi_set)
@@ -1034,30 +1042,30 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__vi_mul GSF__V(gsf__vi_mul)
 #define gsf__vi_min GSF__V(gsf__vi_min)
 #define gsf__vi_shl GSF__V(gsf__vi_shl)             // by the same constant in all lanes
-#define gsf__vi_sar GSF__V(gsf__vi_sar)             // arithmetic
+#define gsf__vi_sar GSF__V(gsf__vi_sar)             // arithmetic shift
 #define gsf__vi_keep GSF__V(gsf__vi_keep)
-#define gsf__vi_floats GSF__V(gsf__vi_floats)       // converted
-#define gsf__vi_as_floats GSF__V(gsf__vi_as_floats) // the inverse of gsf__v_bits
+#define gsf__vi_floats GSF__V(gsf__vi_floats)       // converts to float
+#define gsf__vi_as_floats GSF__V(gsf__vi_as_floats) // reinterprets the bits as float
 
 #define gsf__vm_first GSF__V(gsf__vm_first)         // the first n lanes
-#define gsf__vm_of_bits GSF__V(gsf__vm_of_bits)     // lane i: bit i
+#define gsf__vm_of_bits GSF__V(gsf__vm_of_bits)     // lane i is set if bit i is
 #define gsf__vm_bits GSF__V(gsf__vm_bits)
 #define gsf__vm_and GSF__V(gsf__vm_and)
 #define gsf__vm_or GSF__V(gsf__vm_or)
 #define gsf__vm_not GSF__V(gsf__vm_not)
 
 #define gsf__vd_set GSF__V(gsf__vd_set)
-#define gsf__vd_load GSF__V(gsf__vd_load)           // as many floats
-#define gsf__vd_half GSF__V(gsf__vd_half)           // half h < GSF__HALVES of the floats of v
-#define gsf__vd_floats GSF__V(gsf__vd_floats)       // GSF__HALVES halves, rounded
+#define gsf__vd_load GSF__V(gsf__vd_load)           // from floats
+#define gsf__vd_half GSF__V(gsf__vd_half)           // half h < GSF__HALVES of the floats v, converted
+#define gsf__vd_floats GSF__V(gsf__vd_floats)       // GSF__HALVES halves, rounded to one gsf__vf
 #define gsf__vd_madd GSF__V(gsf__vd_madd)
 #define gsf__vd_sqrt GSF__V(gsf__vd_sqrt)
 #define gsf__vd_max GSF__V(gsf__vd_max)
 #define gsf__vd_keep_above GSF__V(gsf__vd_keep_above) // a > limit ? x : 0
-#define gsf__vd_add_folded GSF__V(gsf__vd_add_folded) // sum + v, whose halves are added to each other as floats before
+#define gsf__vd_add_folded GSF__V(gsf__vd_add_folded) // sum + (lower + upper half of v, added as floats)
 #define gsf__vd_sum GSF__V(gsf__vd_sum)
 
-// One lane.
+// Scalar: one lane.
 
 #define GSF__LANES_scalar 1
 #define GSF__HALVES_scalar 1
@@ -1149,7 +1157,7 @@ GSF__SHARED inline double gsf__vd_sum_scalar(double x) { return x; }
 
 #if GSF__X86
 
-// Eight lanes.
+// AVX2: eight lanes.
 
 #define GSF__LANES_avx2 8
 #define GSF__HALVES_avx2 2
@@ -1158,7 +1166,7 @@ GSF__SHARED inline double gsf__vd_sum_scalar(double x) { return x; }
 
 typedef __m256 gsf__vf_avx2;
 typedef __m256i gsf__vi_avx2;
-typedef __m256 gsf__vm_avx2; // all bits of a lane or none
+typedef __m256 gsf__vm_avx2; // each lane has all bits set or none
 typedef __m256d gsf__vd_avx2;
 
 GSF__INLINE_AVX2 __m256i gsf__vi_set_avx2(int32_t x) { return _mm256_set1_epi32(x); }
@@ -1202,7 +1210,8 @@ GSF__INLINE_AVX2 void gsf__v_store_avx2(float* p, __m256 x) { _mm256_storeu_ps(p
 GSF__INLINE_AVX2 __m256 gsf__v_load_first_avx2(const float* p, size_t n) {
     return n >= 8 ? _mm256_loadu_ps(p) : _mm256_maskload_ps(p, _mm256_castps_si256(gsf__vm_first_avx2(n)));
 }
-GSF__INLINE_AVX2 void gsf__v_store_first_avx2(float* p, __m256 x, size_t n) { // a masked store takes several times as long
+// A masked store is several times slower than a full one.
+GSF__INLINE_AVX2 void gsf__v_store_first_avx2(float* p, __m256 x, size_t n) {
     if (n >= 8) _mm256_storeu_ps(p, x);
     else _mm256_maskstore_ps(p, _mm256_castps_si256(gsf__vm_first_avx2(n)), x);
 }
@@ -1292,7 +1301,7 @@ GSF__INLINE_AVX2 double gsf__vd_sum_avx2(__m256d v) {
     return _mm_cvtsd_f64(_mm_add_sd(s, _mm_unpackhi_pd(s, s)));
 }
 
-// Sixteen lanes.
+// AVX-512: sixteen lanes.
 
 #define GSF__LANES_avx512 16
 #define GSF__HALVES_avx512 2
@@ -1372,7 +1381,8 @@ GSF__INLINE_AVX512 float gsf__v_sum_avx512(__m512 v) {
 GSF__INLINE_AVX512 float gsf__v_largest_avx512(__m512 v) {
     return gsf__v_largest_avx2(_mm256_max_ps(_mm512_castps512_ps256(v), gsf__v_upper_avx512(v)));
 }
-GSF__INLINE_AVX512 void gsf__v_transpose_avx512(__m512 m[16]) { // quarters of 8 x 8, of which two change places
+// Transposes the four 8 x 8 quarters and swaps the off-diagonal ones.
+GSF__INLINE_AVX512 void gsf__v_transpose_avx512(__m512 m[16]) {
     __m256 quarter[4][8];
     for (int i = 0; i < 8; i++) {
         quarter[0][i] = _mm512_castps512_ps256(m[i]);
@@ -1386,7 +1396,7 @@ GSF__INLINE_AVX512 void gsf__v_transpose_avx512(__m512 m[16]) { // quarters of 8
         m[8 + i] = _mm512_insertf32x8(_mm512_castps256_ps512(quarter[1][i]), quarter[3][i], 1);
     }
 }
-#if !defined(__clang__) // gcc's headers have these as macros where it does not optimise, and then warn of their own masks
+#if !defined(__clang__) // without optimisation, these intrinsics are macros in GCC's headers and trigger this warning
 #pragma GCC diagnostic push
 #pragma GCC diagnostic ignored "-Wsign-conversion"
 #endif
@@ -1432,7 +1442,7 @@ GSF__INLINE_AVX512 double gsf__vd_sum_avx512(__m512d v) {
 
 #endif // GSF__X86
 
-// What follows from the vocabulary: powers. At one lane, where nothing is fused, they are libm's.
+// Powers, in terms of the vocabulary. The scalar versions, which have no FMA, call libm.
 
 #define gsf__v_exp2_terms GSF__V(gsf__v_exp2_terms)
 #define gsf__v_exp2_of GSF__V(gsf__v_exp2_of)
@@ -1547,7 +1557,7 @@ GSF_API void* gsf_alloc(gsf_context* ctx, size_t count, size_t size) {
         (void)gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu x %zu bytes", count, size);
         return NULL;
     }
-    // [padding][pointer given by the hook][aligned block]
+    // layout: [padding][pointer returned by the hook][aligned block]
     char* base = (char*)ctx->allocator.alloc_fn(ctx->allocator.user, bytes + GSF__ALIGN + sizeof(void*));
     if (!base) {
         (void)gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu bytes", bytes);
@@ -1576,7 +1586,7 @@ GSF_API void gsf_free(gsf_context* ctx, void* memory) {
 
 #ifdef _OPENMP
 static void gsf__for_openmp(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
-    const int workers = (int)(intptr_t)user; // not the context: its struct may be moved by the host
+    const int workers = (int)(intptr_t)user; // not a pointer to the context: the host may move that struct
     const int64_t count = (int64_t)chunk_count;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(workers)
     for (int64_t i = 0; i < count; i++) body(arg, (size_t)i, omp_get_thread_num());
@@ -1630,13 +1640,14 @@ GSF_API gsf_result gsf_init_context(gsf_context* ctx) {
 
 // ---- >>random ------------------------------------------------------------------
 
-// Three rounds of the splitmix64 finaliser (Steele et al. 2014), one key word mixed in before each.
+// The finaliser of splitmix64 (Steele et al. 2014).
 static uint64_t gsf__mix64(uint64_t x) {
     x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
     x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
     return x ^ (x >> 31);
 }
 
+// Three rounds; each mixes in another word of the key first.
 GSF_API uint64_t gsf_draw_bits(uint64_t seed, uint64_t stream, uint64_t index) {
     uint64_t x = gsf__mix64(seed + 0x9e3779b97f4a7c15u);
     x = gsf__mix64(x ^ (stream * 0xd1342543de82ef95u + 0x2545f4914f6cdd1du));
@@ -1708,12 +1719,12 @@ GSF_API void gsf_append_json_string(gsf_context* ctx, gsf_buffer* text, const ch
         left--;
         if (c == '"' || c == '\\') gsf_append_text(ctx, text, "\\%c", c);
         else if (c < 0x20) gsf_append_text(ctx, text, "\\u%04x", (unsigned)c);
-        else gsf_append_bytes(ctx, text, "\\ufffd", 6); // a byte that is no UTF-8
+        else gsf_append_bytes(ctx, text, "\\ufffd", 6); // not UTF-8
     }
     gsf_append_bytes(ctx, text, "\"", 1);
 }
 
-// The shortest of 15, 16 or 17 digits that reads back as the same double; the point is a point in every locale.
+// Prints as few of 15 to 17 digits as read back as the same double, with '.' as the decimal point in every locale.
 GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* text, double value) {
     if (!isfinite(value)) {
         gsf_append_bytes(ctx, text, "null", 4);
@@ -1726,7 +1737,7 @@ GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* text, double v
         size = 0;
         for (const char* p = printed; *p; p++) {
             if ((*p >= '0' && *p <= '9') || *p == '-' || *p == '+' || *p == 'e') plain[size++] = *p;
-            else if (size == 0 || plain[size - 1] != '.') plain[size++] = '.'; // the locale's, maybe of several bytes
+            else if (size == 0 || plain[size - 1] != '.') plain[size++] = '.'; // the locale's may be several bytes
         }
         double back = 0.0;
         if (gsf__scan_double(plain, size, &back) == size && back == value) break;
@@ -1743,12 +1754,13 @@ GSF_API void gsf_destroy_buffer(gsf_context* ctx, gsf_buffer* text) {
 
 #if defined(__unix__) || defined(__APPLE__)
 #include <sys/stat.h>
-static int gsf__is_device(const char* path) { // /dev/stdout, a pipe: nothing to rename onto
+// Whether path is a device (/dev/stdout) or a pipe, which has to be written in place: a rename would replace it.
+static int gsf__is_device(const char* path) {
     struct stat info;
     return stat(path, &info) == 0 && !S_ISREG(info.st_mode) && !S_ISDIR(info.st_mode);
 }
 
-// NULL, or why `path` is not read although it is there: a pipe would wait for its writer, a device never end.
+// Why an existing file must not be read, or NULL: opening a pipe blocks until it has a writer, and a device may never end.
 static const char* gsf__why_unreadable(const char* path) {
     struct stat info;
     if (stat(path, &info) != 0 || S_ISREG(info.st_mode)) return NULL;
@@ -1759,7 +1771,7 @@ static int gsf__is_device(const char* path) { (void)path; return 0; }
 static const char* gsf__why_unreadable(const char* path) { (void)path; return NULL; }
 #endif
 
-// For reading; *out is NULL on failure.
+// Opens a file for reading; *out is NULL on failure.
 static gsf_result gsf__open_file(gsf_context* ctx, const char* path, FILE** out) {
     const char* reason = gsf__why_unreadable(path);
     errno = 0;
@@ -1768,7 +1780,8 @@ static gsf_result gsf__open_file(gsf_context* ctx, const char* path, FILE** out)
     return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, reason ? reason : strerror(errno));
 }
 
-// Reads a first piece before it believes the size that the file claims.
+// Reads 64 KiB first and then the rest at once. The reported size only sets how much is read at a time, because it can be
+// wrong (files in /proc report 0).
 static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     (void)user;
     FILE* file;
@@ -1787,10 +1800,10 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
             if (ferror(file)) result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
             break;
         }
-        if (first && fseek(file, 0, SEEK_END) == 0) { // the rest at once where the file can tell
+        if (first && fseek(file, 0, SEEK_END) == 0) {
             const long end = ftell(file);
             if (end >= 0 && (unsigned long)end >= buffer.size)
-                step = (size_t)end - buffer.size + 1;  // + 1: sees the end
+                step = (size_t)end - buffer.size + 1;  // + 1, so that fread reaches the end of the file
             if (fseek(file, (long)buffer.size, SEEK_SET) != 0) {
                 result = gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
                 break;
@@ -1808,7 +1821,8 @@ static gsf_result gsf__stdio_read(void* user, gsf_context* ctx, const char* path
     return GSF_OK;
 }
 
-// A new file beside `path`, whose name goes to `name`: a file or link that is there already is someone's, and stays.
+// Creates a temporary file next to `path` and stores its name in `name`. Existing files and links are never opened: they
+// may belong to somebody else.
 static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name) {
     for (int i = 0; i < 100; i++) {
         name->size = 0;
@@ -1820,8 +1834,8 @@ static FILE* gsf__open_new(gsf_context* ctx, const char* path, gsf_buffer* name)
     return NULL;
 }
 
-// Writes <path>.tmp and renames it, so that path always holds a whole file, also after a kill (not after a power cut:
-// the data is not forced to the disk).
+// Writes a temporary file and renames it, so that `path` always holds a complete file, even if the process is killed. A
+// power failure can still lose data, because there is no fsync.
 static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* path, const void* data, size_t size) {
     (void)user;
     const int device = gsf__is_device(path);
@@ -1842,7 +1856,7 @@ static gsf_result gsf__stdio_write(void* user, gsf_context* ctx, const char* pat
             reason = errno;
         }
         if (ok && !device && rename(name.data, path) != 0) {
-#ifdef _WIN32 // rename does not replace there
+#ifdef _WIN32 // rename does not replace existing files there
             ok = remove(path) == 0 && rename(name.data, path) == 0;
 #else
             ok = 0;
@@ -1932,7 +1946,7 @@ typedef struct gsf__json_parser {
     gsf_json* out;
     size_t value_capacity;
     char* free_string;     // next unused byte of out->strings
-    uint64_t* order;       // scratch of the search for duplicate keys: hash << 32 | index
+    uint64_t* order;       // scratch for finding duplicate keys: hash << 32 | index
     size_t order_capacity;
 } gsf__json_parser;
 
@@ -1954,8 +1968,8 @@ static gsf_result gsf__json_fail(const gsf__json_parser* p, const char* expected
     return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%zu: expected %s, got %s", p->name, p->at, expected, got);
 }
 
-// Upper bounds from one look at the text: every value but the root follows a '[', '{' or ','; a decoded string is never
-// longer than its source.
+// Upper bounds from one pass over the text: every value but the root follows a '[', '{' or ',', and a decoded string is
+// never longer than its source.
 static void gsf__json_measure(const char* text, size_t size, size_t* values, size_t* string_bytes) {
     *values = 1;
     *string_bytes = 1;
@@ -1983,7 +1997,7 @@ static gsf_result gsf__json_read_hex4(gsf__json_parser* p, uint32_t* out) {
     return GSF_OK;
 }
 
-// After the backslash; appends the character's UTF-8 to p->free_string.
+// Reads an escape sequence from after its backslash and appends the character to p->free_string as UTF-8.
 static gsf_result gsf__json_read_escape(gsf__json_parser* p) {
     static const char from[] = "\"\\/bfnrt", to[] = "\"\\/\b\f\n\r\t";
     const int c = gsf__json_peek(p);
@@ -2029,7 +2043,7 @@ static gsf_result gsf__json_read_escape(gsf__json_parser* p) {
     return GSF_OK;
 }
 
-// At the opening quote.
+// Reads a string from its opening quote.
 static gsf_result gsf__json_read_string(gsf__json_parser* p, const char** string, size_t* size) {
     char* const start = p->free_string;
     for (p->at++;;) {
@@ -2064,7 +2078,7 @@ static gsf_result gsf__json_skip_digits(gsf__json_parser* p) {
 static gsf_result gsf__json_read_number(gsf__json_parser* p, double* out) {
     const size_t start = p->at;
     if (gsf__json_peek(p) == '-') p->at++;
-    if (gsf__json_peek(p) == '0') p->at++; // no digit may follow
+    if (gsf__json_peek(p) == '0') p->at++; // leading zeros are not allowed
     else GSF__TRY(gsf__json_skip_digits(p));
     if (gsf__json_peek(p) == '.') {
         p->at++;
@@ -2115,7 +2129,7 @@ static gsf_result gsf__json_read_key(gsf__json_parser* p, gsf_json_value* value)
     return GSF_OK;
 }
 
-// Order of two entries by hash, then by key, so that equal keys end up side by side whatever the hashes are.
+// Orders two entries by hash, then by key, so that equal keys become neighbours even if other keys have the same hash.
 static int gsf__json_compare_keys(const gsf_json_value* values, uint64_t a, uint64_t b) {
     if (a >> 32 != b >> 32) return a >> 32 < b >> 32 ? -1 : 1;
     const gsf_json_value *x = &values[a & 0xffffffffu], *y = &values[b & 0xffffffffu];
@@ -2142,6 +2156,7 @@ static uint64_t* gsf__json_sort_keys(const gsf_json_value* values, uint64_t* ord
     return from;
 }
 
+// Compares few keys pairwise and sorts many, so that the time is O(n log n) for any file.
 static gsf_result gsf__json_refuse_duplicates(gsf__json_parser* p, const gsf_json_value* object) {
     const gsf_json_value* values = p->out->values;
     const size_t n = object->count;
@@ -2175,7 +2190,7 @@ static gsf_result gsf__json_refuse_duplicates(gsf__json_parser* p, const gsf_jso
 }
 
 static gsf_result gsf__json_read_document(gsf__json_parser* p) {
-    uint32_t parent[GSF__JSON_DEPTH], last[GSF__JSON_DEPTH]; // open containers, and the last child of each so far
+    uint32_t parent[GSF__JSON_DEPTH], last[GSF__JSON_DEPTH]; // of the open containers: index, and last child so far
     size_t depth = 0;
     gsf_json_value* values = p->out->values;
     for (;;) {
@@ -2208,7 +2223,7 @@ static gsf_result gsf__json_read_document(gsf__json_parser* p) {
         } else {
             GSF__TRY(gsf__json_read_scalar(p, value));
         }
-        for (;;) { // a value is complete: close what ends here
+        for (;;) { // a value is complete: close the containers that end after it
             gsf__json_skip_space(p);
             if (depth == 0) return p->at == p->size ? GSF_OK : gsf__json_fail(p, "the end of the text");
             const gsf_json_value* owner = &values[parent[depth - 1]];
@@ -2283,7 +2298,7 @@ GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const 
 }
 
 // ---- >>deflate -----------------------------------------------------------------
-// DEFLATE (RFC 1951) with memory that is asked for once and checked. Each block has Huffman codes of its own.
+// DEFLATE encoder (RFC 1951). All its memory is one allocation. Each compressed block has its own Huffman codes.
 
 enum {
     GSF__LZ_WINDOW = 1 << 15, GSF__LZ_SHORTEST = 3, GSF__LZ_LONGEST = 258, GSF__LZ_GOOD = 32, GSF__LZ_TRIES = 16,
@@ -2294,17 +2309,17 @@ enum {
 typedef struct gsf__deflater {
     gsf_context* ctx;
     gsf_buffer* out;
-    uint64_t bits; // not yet in `buffer`
+    uint64_t bits; // not yet moved to `buffer`
     int bit_count;
     size_t used;
-    unsigned char buffer[4096]; // not yet in `out`
+    unsigned char buffer[4096]; // not yet appended to `out`
     const unsigned char* data;
     size_t size;
-    int32_t head[GSF__LZ_WINDOW];     // last position of a hash of three bytes, -1 = none
-    int32_t previous[GSF__LZ_WINDOW]; // by position modulo the window: the one before it with the same hash
+    int32_t head[GSF__LZ_WINDOW];     // by hash of three bytes: their latest position, -1 = none
+    int32_t previous[GSF__LZ_WINDOW]; // by position modulo the window: the previous one of that hash
     uint32_t tokens[GSF__LZ_TOKENS];  // literal, or length << 16 | distance
     size_t token_count;
-    size_t block_begin; // first byte of the tokens
+    size_t block_begin; // position in `data` of the first token
     uint32_t literal_counts[GSF__LITERALS], distance_counts[GSF__DISTANCES];
 } gsf__deflater;
 
@@ -2318,7 +2333,7 @@ static void gsf__put_bits(gsf__deflater* d, uint32_t value, int count) {
     }
 }
 
-// The classes of lengths and distances: code, number of extra bits and their value.
+// A length or distance as DEFLATE codes it: symbol, and extra bits with their number.
 typedef struct gsf__lz_class { uint32_t code, extra; int extra_bits; } gsf__lz_class;
 
 static gsf__lz_class gsf__lz_class_of(uint32_t value, int fraction_bits) {
@@ -2331,7 +2346,7 @@ static gsf__lz_class gsf__lz_class_of(uint32_t value, int fraction_bits) {
 
 static gsf__lz_class gsf__length_class(uint32_t length) {
     gsf__lz_class c = gsf__lz_class_of(length - GSF__LZ_SHORTEST, 2);
-    if (length == GSF__LZ_LONGEST) { // has a code of its own
+    if (length == GSF__LZ_LONGEST) { // the longest match has its own code
         c.code = 28;
         c.extra = 0;
         c.extra_bits = 0;
@@ -2342,8 +2357,9 @@ static gsf__lz_class gsf__length_class(uint32_t length) {
 
 static gsf__lz_class gsf__distance_class(uint32_t distance) { return gsf__lz_class_of(distance - 1, 1); }
 
-// Lengths of Huffman codes of at most `limit` bits. Two symbols at least get one, since some readers refuse a lone code.
-// Counts grow coarser until the longest code fits; with equal ones it has nine bits.
+// Lengths of Huffman codes, of at most `limit` bits. At least two symbols get a code, because some decoders reject a single
+// one. Counts are made coarser until the longest code fits. That ends: once all counts are equal, the 286 literal codes have
+// at most nine bits (limit 15) and the 19 length codes at most five (limit 7).
 static void gsf__huffman_lengths(uint32_t* counts, int symbols, int limit, uint8_t* lengths) {
     int32_t order[GSF__LITERALS], parent[2 * GSF__LITERALS];
     uint32_t weight[2 * GSF__LITERALS];
@@ -2354,7 +2370,7 @@ static void gsf__huffman_lengths(uint32_t* counts, int symbols, int limit, uint8
         if (!counts[s]) counts[s] = 1, used++;
     for (int coarse = 0;; coarse++) {
         int n = 0;
-        for (int s = 0; s < symbols; s++) { // sorted by insertion
+        for (int s = 0; s < symbols; s++) { // insertion sort by weight
             if (!counts[s]) continue;
             const uint32_t w = ((counts[s] - 1) >> coarse) + 1;
             int at = n++;
@@ -2362,7 +2378,7 @@ static void gsf__huffman_lengths(uint32_t* counts, int symbols, int limit, uint8
             weight[at] = w;
             order[at] = s;
         }
-        for (int node = n, leaf = 0, inner = n; node < 2 * n - 1; node++) { // both queues are sorted
+        for (int node = n, leaf = 0, inner = n; node < 2 * n - 1; node++) { // leaves and inner nodes: two sorted queues
             weight[node] = 0;
             for (int child = 0; child < 2; child++) {
                 const int taken = leaf < n && (inner >= node || weight[leaf] <= weight[inner]) ? leaf++ : inner++;
@@ -2379,7 +2395,7 @@ static void gsf__huffman_lengths(uint32_t* counts, int symbols, int limit, uint8
     }
 }
 
-// Canonical codes, their first bit lowest, as they are written.
+// Canonical codes, bit-reversed: DEFLATE stores the first bit of a Huffman code as the lowest.
 static void gsf__huffman_codes(const uint8_t* lengths, int symbols, uint16_t* codes) {
     uint32_t code = 0;
     for (int bits = 1; bits < 16; bits++, code <<= 1)
@@ -2392,8 +2408,8 @@ static void gsf__huffman_codes(const uint8_t* lengths, int symbols, uint16_t* co
         }
 }
 
-// The code lengths of a block: repeats as symbols 16 (of the last), 17 and 18 (of zero), Huffman coded in their turn.
-// Returns their bits, and writes them where `write` says so.
+// The code lengths of a block, run-length coded (symbol 16 repeats the previous length, 17 and 18 repeat zero) and then
+// Huffman coded. Returns their size in bits; writes them if `write` is set.
 static size_t gsf__put_lengths(gsf__deflater* d, const uint8_t* lengths, int count, int write) {
     static const uint8_t sent[GSF__LENGTH_CODES] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
     uint8_t symbols[GSF__LITERALS + GSF__DISTANCES], repeats[GSF__LITERALS + GSF__DISTANCES];
@@ -2430,7 +2446,7 @@ static size_t gsf__put_lengths(gsf__deflater* d, const uint8_t* lengths, int cou
     return total;
 }
 
-// Bits of a block's tokens, and of their end.
+// Size in bits of a block's tokens, including the end-of-block symbol.
 static size_t gsf__token_bits(const gsf__deflater* d, const uint8_t* bits, const uint8_t* distance_bits) {
     size_t total = 0;
     for (int i = 0; i < GSF__LITERALS; i++) total += (size_t)d->literal_counts[i] * bits[i];
@@ -2457,7 +2473,7 @@ static void gsf__put_packed(gsf__deflater* d, int last, const uint8_t* bits) {
     uint16_t codes[GSF__LITERALS], distance_codes[GSF__DISTANCES];
     gsf__huffman_codes(bits, GSF__LITERALS, codes);
     gsf__huffman_codes(distance_bits, GSF__DISTANCES, distance_codes);
-    gsf__put_bits(d, (uint32_t)last | 2u << 1, 3); // codes of its own
+    gsf__put_bits(d, (uint32_t)last | 2u << 1, 3); // block type 2: dynamic Huffman codes
     gsf__put_bits(d, GSF__LITERALS - 257, 5);
     gsf__put_bits(d, GSF__DISTANCES - 1, 5);
     gsf__put_bits(d, GSF__LENGTH_CODES - 4, 4);
@@ -2477,7 +2493,7 @@ static void gsf__put_packed(gsf__deflater* d, int last, const uint8_t* bits) {
     gsf__put_bits(d, codes[GSF__BLOCK_END], bits[GSF__BLOCK_END]);
 }
 
-// Writes the tokens up to `end`, as they are where packing gains nothing.
+// Writes the block of all pending tokens, which ends before byte `end`; uncompressed if that is smaller.
 static void gsf__put_block(gsf__deflater* d, int last, size_t end) {
     enum { PACKED_HEAD = 17, STORED_HEAD = 3 + 7 + 32, STORED_MOST = 65535 };
     uint8_t bits[GSF__LITERALS + GSF__DISTANCES], *distance_bits = bits + GSF__LITERALS;
@@ -2515,7 +2531,7 @@ static void gsf__lz_remember(gsf__deflater* d, size_t at) {
     *head = (int32_t)at;
 }
 
-// Length of the longest of the last matches before `at`, 0 where there is none longer than `best`.
+// Length of the longest match among the GSF__LZ_TRIES latest candidates before `at`, 0 if none is longer than `best`.
 static size_t gsf__lz_match(gsf__deflater* d, size_t at, size_t best, uint32_t* distance) {
     const size_t most = d->size - at < GSF__LZ_LONGEST ? d->size - at : (size_t)GSF__LZ_LONGEST;
     size_t found = 0;
@@ -2551,13 +2567,14 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
         uint32_t distance = 0, ignored = 0;
         size_t length = gsf__lz_match(d, at, GSF__LZ_SHORTEST - 1, &distance);
         gsf__lz_remember(d, at);
-        if (length && length < GSF__LZ_GOOD && gsf__lz_match(d, at + 1, length, &ignored)) length = 0; // better next
+        // Lazy matching: a literal here if the next byte starts a longer match.
+        if (length && length < GSF__LZ_GOOD && gsf__lz_match(d, at + 1, length, &ignored)) length = 0;
         gsf__put_token(d, at, (uint32_t)length, length ? distance : d->data[at]);
         for (size_t i = 1; i < length; i++) gsf__lz_remember(d, at + i);
         at += length ? length : 1;
     }
     gsf__put_block(d, 1, size);
-    gsf__put_bits(d, 0, 7); // the last byte's rest
+    gsf__put_bits(d, 0, 7); // flush the last, partial byte
     gsf_append_bytes(ctx, out, (const char*)d->buffer, d->used);
     gsf_free(ctx, d);
     return out->failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
@@ -2584,11 +2601,11 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
 #endif
 #endif
-#if defined(__clang__) // stb shifts bits out of signed integers on purpose
+#if defined(__clang__) // stb shifts bits out of signed integers by design
 #pragma clang attribute push(__attribute__((no_sanitize("shift"))), apply_to = function)
 #endif
-// Private copies, so that they never clash with the host's own. A host that includes stb in this very file before us
-// keeps its copy, and we use that one.
+// Private (static) copies of stb, which never clash with the host's. If this file has already included stb, that copy is
+// used.
 #ifndef STBI_INCLUDE_STB_IMAGE_H
 #define STB_IMAGE_IMPLEMENTATION
 #define STB_IMAGE_STATIC
@@ -2600,8 +2617,9 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
 #define STBI_ONLY_PNM
 #define STBI_NO_GIF
 #define STBI_NO_STDIO
-#define STBI_ASSERT(x) ((void)0) // damaged files reach some of them
-// Memory that a damaged file leaves unwritten (a scan's tables, the end of a row) is zero, not what was there before.
+#define STBI_ASSERT(x) ((void)0) // damaged files trigger some of them
+// Zeroed memory makes the pixels of damaged files deterministic: stb leaves parts unwritten, such as the tables of a scan or
+// the end of a row.
 #define STBI_MALLOC(size) calloc(1, size)
 #define STBI_REALLOC_SIZED(p, old_size, size) gsf__stb_grow(p, old_size, size)
 #define STBI_FREE(p) free(p)
@@ -2610,7 +2628,7 @@ static void* gsf__stb_grow(void* block, size_t old_size, size_t size) {
     if (grown && size > old_size) memset(grown + old_size, 0, size - old_size);
     return grown;
 }
-#define stbi__unpremultiply_on_load_thread stbi_set_unpremultiply_on_load_thread // declared, but misnamed in 2.27
+#define stbi__unpremultiply_on_load_thread stbi_set_unpremultiply_on_load_thread // stb 2.27 defines it under another name
 #include GSF_STB_IMAGE_INCLUDE
 #undef stbi__unpremultiply_on_load_thread
 #undef STBI_MALLOC
@@ -2678,7 +2696,7 @@ static gsf_result gsf__check_image(gsf_context* ctx, const char* what, const gsf
     return GSF_OK;
 }
 
-// Parallel work on an image goes by chunks of rows, from sizes only: about 64k values each.
+// Parallel work on an image is split into chunks of rows of about 64k values, which depend on its size only.
 typedef struct gsf__rows { int64_t begin, end; } gsf__rows;
 
 static int64_t gsf__rows_per_chunk(const gsf_image* image) {
@@ -2699,7 +2717,7 @@ static gsf__rows gsf__chunk_rows(const gsf_image* image, size_t chunk) {
     return rows;
 }
 
-// ---- conversion: runs of pixels of one channel pass through double, integers as value / maximum
+// ---- conversion: one channel at a time, in runs of pixels, through double; integers are scaled to value / maximum
 
 static void gsf__load_pixels(const char* p, int64_t stride, gsf_dtype dtype, size_t n, double* out) {
     switch (dtype) {
@@ -2729,7 +2747,7 @@ static double gsf__quantize(double scaled, double maximum) { // NaN becomes 0
     return scaled >= maximum ? maximum : scaled > 0.0 ? scaled : 0.0;
 }
 
-// in_float: the values were floats, so x*255 + 0.5 is rounded to float as torchvision does it.
+// in_float: the source has dtype f16 or f32, so x*255 + 0.5 is computed in float, as in torchvision.
 static void gsf__store_pixels(char* p, int64_t stride, gsf_dtype dtype, size_t n, const double* in, int in_float) {
     switch (dtype) {
         case GSF_U8:
@@ -2809,7 +2827,8 @@ GSF_API gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, con
 enum { GSF__IMAGE_PIXELS_PER_BYTE = 8256, GSF__JPEG_QUALITY = 95 };
 
 #if !defined(GSF_NO_STB) || defined(GSF_USE_OIIO)
-// No honest file holds more: deflate packs 1032:1 at most, a byte of 1-bit PNG is 8 pixels.
+// Refuses a file that claims more pixels than its size can hold, before memory is allocated for them. The densest format
+// is 1-bit PNG: 8 pixels per byte, and DEFLATE compresses by 1032:1 at most.
 static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int64_t width, int64_t height,
                                          size_t file_size) {
     if (width < 1 || height < 1 || width > (int64_t)1 << 28 || height > ((int64_t)1 << 28) / width ||
@@ -2819,8 +2838,8 @@ static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int
     return GSF_OK;
 }
 
-// Lengths and checksums of all chunks of a PNG (stb checks neither the sums nor that the file is whole; libpng prints), and
-// that no more than `most` bytes of them are image data.
+// Checks lengths and checksums of all chunks of a PNG, and that at most `most` bytes are image data. stb checks neither the
+// checksums nor that the file is complete, and libpng prints its errors.
 static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char* data, size_t size, uint64_t most) {
     uint64_t packed = 0;
     for (size_t at = 8;;) {
@@ -2856,13 +2875,13 @@ static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const cha
 
 #ifndef GSF_NO_STB
 
-// Bytes for stb, from memory or a stdio file. `overrun` tells that it wanted more than there is: stb itself goes on
-// with zeros, which would turn a cut photo into a half grey one.
+// Input of stb, from memory or a stdio file. `overrun` is set when stb reads past the end: stb itself continues with zeros,
+// which would turn a truncated photo into a half-grey one.
 typedef struct gsf__stb_source {
     const char* data;
     size_t size, at;
     FILE* file;         // instead of data
-    const char* buffer; // stb's own, which may be filled in part; what it reads elsewhere it needs whole, but does not check
+    const char* buffer; // stb's own, may be filled in part; reads to other places must be complete, which stb does not check
     int overrun;
 } gsf__stb_source;
 
@@ -2876,7 +2895,7 @@ static int gsf__stb_read(void* user, char* out, int size) {
         memcpy(out, s->data + s->at, got);
     }
     s->at += got;
-    if (!s->buffer) s->buffer = out; // the first that stb fills
+    if (!s->buffer) s->buffer = out; // stb fills its own buffer first
     if (got == 0 || (got < (size_t)size && out != s->buffer)) s->overrun = 1;
     return (int)got;
 }
@@ -2946,9 +2965,9 @@ typedef enum gsf__image_kind {
     GSF__IMAGE_OTHER = 0, GSF__IMAGE_PNG, GSF__IMAGE_BMP, GSF__IMAGE_JPEG, GSF__IMAGE_PNM, GSF__IMAGE_TGA
 } gsf__image_kind;
 
-// What stb's own tests would take the file for, decided by as many bytes as tell the formats apart; the source is left
-// behind them. A JPEG's start marker may stand behind any number of fill bytes. What else a host's copy of stb reads
-// (GIF, PSD, PIC, HDR) is never handed to it: none of them has a second byte below two, as every TGA.
+// The format that stb would detect, from as few bytes as tell the formats apart; the source is left after them. A JPEG may
+// begin with any number of fill bytes. Other formats that a host's copy of stb may read (GIF, PSD, PIC, HDR) are not taken
+// for TGA, since only there the second byte is 0 or 1; they are never passed to stb.
 static gsf__image_kind gsf__image_kind_of(gsf__stb_source* source) {
     const int first = gsf__source_byte(source);
     int second = gsf__source_byte(source);
@@ -2965,16 +2984,16 @@ static gsf__image_kind gsf__image_kind_of(gsf__stb_source* source) {
     return GSF__IMAGE_OTHER;
 }
 
-// Tables and number of scans of a JPEG, from the byte behind its start marker: stb writes past its arrays when a table
-// claims more than 256 symbols, and goes over the whole image for each scan. Visits every place where stb may see a
-// marker; a file that ends early is left to the decoder's own detection.
+// Checks Huffman tables and the number of scans of a JPEG; `at` is the position after its start marker. stb writes past its
+// arrays if a table claims more than 256 symbols, and makes a pass over the whole image for each scan. Visits every
+// position where stb may see a marker; truncation is left to the decoder, except inside a table.
 static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsigned char* data, size_t size, size_t at) {
     enum { MOST_SCANS = 500 }; // encoders write about ten
     int scans = 0;
     while (at + 4 <= size) {
         const unsigned marker = data[at + 1];
         if (data[at] != 0xff || marker == 0xff || marker == 0 || (marker >= 0xd0 && marker <= 0xd7)) {
-            at++; // padding, image data
+            at++; // padding or entropy-coded data
             continue;
         }
         if (marker == 0xd9) return GSF_OK; // end of image
@@ -2997,7 +3016,8 @@ static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsi
     return GSF_OK;
 }
 
-// Size of a JPEG from its frame header, behind its start marker. stb would parse tables on the way there.
+// Size of a JPEG from its frame header; the source is positioned after the start marker. stb's own query would parse the
+// unchecked tables before it.
 static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_source* source, int64_t* width,
                                   int64_t* height, int32_t* channels) {
     for (;;) {
@@ -3024,13 +3044,13 @@ static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_s
     }
 }
 
-// Width, height and largest value of a binary PNM, behind its two letters; 0 where they are no numbers of at most nine
-// digits (stb counts on in an int).
+// Reads width, height and maximum value of a binary PNM; the source is positioned after the two letters. Returns 0 unless
+// they are numbers of at most nine digits (stb would overflow an int).
 static int gsf__pnm_head(gsf__stb_source* source, int32_t head[3]) {
     int c = gsf__source_byte(source);
     for (int i = 0; i < 3; i++) {
         while (c == ' ' || (c >= '\t' && c <= '\r') || c == '#') {
-            if (c == '#') // a comment up to the line's end
+            if (c == '#') // a comment, up to the end of the line
                 while (c >= 0 && c != '\n' && c != '\r') c = gsf__source_byte(source);
             else
                 c = gsf__source_byte(source);
@@ -3053,7 +3073,7 @@ static gsf_result gsf__pnm_query(gsf_context* ctx, const char* name, gsf__stb_so
     if (!gsf__pnm_head(source, head))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNM header is %s", name, source->at,
                         source->overrun ? "cut" : "malformed");
-    if (head[2] > 255) // stb 2.27 mixes the sizes up
+    if (head[2] > 255) // stb 2.27 confuses 8-bit and 16-bit sizes there
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: PNM of 16 bits", name);
     *width = head[0];
     *height = head[1];
@@ -3080,33 +3100,34 @@ static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_so
     return GSF_OK;
 }
 
-// stb looks up colours in 256 entries of which it fills as many as the file has; the others are whatever was there before.
-// So it gets the file with a whole palette, black behind its end.
+// Appends a copy of the file whose palette is filled up with black. stb accepts all 256 indices but initialises only the
+// entries that the file has; the others would hold whatever was in memory. Appends nothing if no copy is needed.
 static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t size, gsf_buffer* out) {
     enum { FULL = 768 };
     static const char zeros[FULL] = {0}, head[8] = {0, 0, FULL >> 8, FULL & 255, 'P', 'L', 'T', 'E'};
-    for (size_t at = 8; at + 12 <= size;) { // lengths are checked
+    for (size_t at = 8; at + 12 <= size;) { // gsf__check_png has checked the lengths
         const unsigned char* p = (const unsigned char*)data + at;
         const size_t bytes = (size_t)p[0] << 24 | (size_t)p[1] << 16 | (size_t)p[2] << 8 | p[3];
         if (memcmp(p + 4, "IDAT", 4) == 0) return;
         if (memcmp(p + 4, "PLTE", 4) == 0) {
-            if (bytes >= FULL || bytes % 3) return; // stb refuses others
+            if (bytes >= FULL || bytes % 3) return; // complete, or refused by stb
             gsf_append_bytes(ctx, out, data, at);
             gsf_append_bytes(ctx, out, head, sizeof head);
             gsf_append_bytes(ctx, out, data + at + 8, bytes);
             gsf_append_bytes(ctx, out, zeros, FULL - bytes);
-            gsf_append_bytes(ctx, out, data + at + 8 + bytes, size - at - 8 - bytes); // stb skips the sum
+            gsf_append_bytes(ctx, out, data + at + 8 + bytes, size - at - 8 - bytes); // stb skips the checksum
             return;
         }
         at += 12 + bytes;
     }
 }
 
-// The same for a BMP. Of the old header (12 bytes) stb counts four colours less than there are, as if it had 24.
+// The same for a BMP. With the old 12-byte header, stb counts four colours too few, as if the header had 24 bytes; 12 bytes
+// more make up for that.
 static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, const char* data, size_t size,
                                         gsf_buffer* out) {
     static const char zeros[1024 + 12] = {0};
-    if (size < 32) return GSF_OK; // stb says that it is cut
+    if (size < 32) return GSF_OK; // stb reports that it is truncated
     const unsigned char* p = (const unsigned char*)data;
     const uint64_t offset = gsf__load_le(data + 10, 4), header = gsf__load_le(data + 14, 4), entry = header == 12 ? 3 : 4;
     const unsigned bits = header == 12 ? p[24] | (unsigned)p[25] << 8 : p[28] | (unsigned)p[29] << 8;
@@ -3127,8 +3148,8 @@ static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, cons
     return GSF_OK;
 }
 
-// stb's own scratch memory and the decoded pixels come from malloc (it has no hook with a context) and are gone on
-// return.
+// stb allocates its scratch memory and decoded pixels with malloc, because its allocation hooks take no context; both are
+// freed before this returns.
 static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* data, size_t size, int32_t channels,
                                 gsf_image* out) {
     gsf__stb_source source = gsf__stb_memory(data, size);
@@ -3136,7 +3157,8 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     int32_t file_channels = 0;
     GSF__TRY(gsf__stb_query(ctx, name, &source, &width, &height, &file_channels));
     GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
-    // stb inflates all data before it counts rows: not more than twice what four channels of 16 bits would take unpacked
+    // stb inflates all image data before it checks the number of rows. The limit on the compressed data is twice the size of
+    // uncompressed rows of four 16-bit channels.
     const uint64_t most = 65536 + 2 * (uint64_t)height * (8 * (uint64_t)width + 1);
     gsf__source_rewind(&source);
     const gsf__image_kind kind = gsf__image_kind_of(&source);
@@ -3161,7 +3183,8 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
 }
 
 #ifdef GSF_USE_OIIO
-// Files of eight bits, which then give the same pixels in all builds.
+// Whether stb decodes this file even if OpenImageIO could: it gets all 8-bit files, so that their pixels are the same in all
+// builds.
 static int gsf__stb_reads(const void* data, size_t size) {
     gsf__stb_source source = gsf__stb_memory(data, size);
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
@@ -3178,7 +3201,7 @@ static int gsf__stb_reads(const void* data, size_t size) {
 #endif
 
 static void gsf__stb_write(void* user, void* data, int size) {
-    void** both = (void**)user; // context, text
+    void** both = (void**)user; // context, buffer
     gsf_append_bytes((gsf_context*)both[0], (gsf_buffer*)both[1], (const char*)data, (size_t)size);
 }
 
@@ -3193,7 +3216,7 @@ static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const voi
     if (size - body > (size_t)INT32_MAX || room > (size_t)INT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %zu compressed bytes for %zu: at most 2^31-1 are read", name,
                         body, size - body, room);
-    memset(out, 0, room); // stb 2.27 takes the two distance codes that mean nothing for 0: repeats what `out` holds
+    memset(out, 0, room); // stb 2.27 takes the two invalid distance codes for distance 0 and copies what `out` holds
     const int got = stbi_zlib_decode_noheader_buffer((char*)out, (int)room, (const char*)data + body, (int)(size - body));
     if (got < 0)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data is malformed, cut or longer than %zu bytes", name,
@@ -3204,7 +3227,7 @@ static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const voi
 #endif
 }
 
-// The last ".xyz" of a path in lower case, "" if there is none or it is long.
+// The extension of a path with its dot, in lower case; "" if there is none or it is longer than 7 characters.
 static void gsf__path_extension(const char* path, char out[8]) {
     const char* dot = strrchr(path, '.');
     size_t n = dot ? strlen(dot) : 0;
@@ -3249,7 +3272,7 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
     *width = *height = 0;
     *channels = 0;
 #ifndef GSF_NO_STB
-    if (gsf__io_is_plain(ctx)) { // only as many bytes as the header has
+    if (gsf__io_is_plain(ctx)) { // reads only the header
         gsf__stb_source source = gsf__stb_memory(NULL, 0);
         GSF__TRY(gsf__open_file(ctx, path, &source.file));
         const gsf_result result = gsf__stb_query(ctx, path, &source, width, height, channels);
@@ -3280,7 +3303,7 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
     return result;
 }
 
-// ---- PNG, eight bits a channel
+// ---- PNG encoder, 8 bits per channel
 
 static int gsf__paeth(int left, int up, int corner) {
     const int estimate = left + up - corner;
@@ -3288,8 +3311,8 @@ static int gsf__paeth(int left, int up, int corner) {
     return l <= u && l <= c ? left : u <= c ? up : corner;
 }
 
-// One row by one of PNG's five filters (`step` bytes a pixel; `up`: the row above, zeros above the first). Returns the sum
-// of magnitudes: the least compresses best, as a rule.
+// Applies one of PNG's five filters to a row (`step`: bytes per pixel; `up`: the row above, zeros for the first row).
+// Returns the sum of absolute differences: the filter with the smallest sum usually compresses best.
 static uint64_t gsf__png_filter(int filter, const unsigned char* row, const unsigned char* up, size_t size, size_t step,
                                 unsigned char* out) {
     uint64_t sum = 0;
@@ -3306,7 +3329,7 @@ static uint64_t gsf__png_filter(int filter, const unsigned char* row, const unsi
     return sum;
 }
 
-// All rows, each behind the number of its filter. `room`: two rows.
+// Filters all rows; the number of its filter precedes each. `room`: scratch for two rows.
 static void gsf__png_filter_rows(const gsf_image* image, unsigned char* room, unsigned char* out) {
     const size_t size = (size_t)image->stride_y, step = (size_t)image->channels;
     unsigned char *zeros = room, *tried = room + size;
@@ -3331,7 +3354,7 @@ static void gsf__store_be32(void* out, uint32_t value) {
 static uint32_t gsf__adler32(const unsigned char* data, size_t size) {
     uint32_t a = 1, b = 0;
     for (size_t i = 0; i < size;) {
-        const size_t end = size - i < 5552 ? size : i + 5552; // as many as fit 32 bits
+        const size_t end = size - i < 5552 ? size : i + 5552; // the most bytes for which b fits 32 bits
         for (; i < end; i++) b += a += data[i];
         a %= 65521u;
         b %= 65521u;
@@ -3348,9 +3371,9 @@ static void gsf__png_close(gsf_context* ctx, gsf_buffer* out, size_t begin) {
     gsf_append_bytes(ctx, out, sum, sizeof sum);
 }
 
-// `image`: packed, of 1 to 4 channels.
+// Appends a PNG file. `image`: u8, packed, 1 to 4 channels.
 static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_buffer* out) {
-    static const char kinds[5] = {0, 0, 4, 2, 6}; // by channels
+    static const char kinds[5] = {0, 0, 4, 2, 6}; // PNG colour type by channel count
     char head[33] = "\x89PNG\r\n\x1a\n\0\0\0\0IHDR", sum[4];
     const size_t row = (size_t)image->stride_y, filtered_size = (row + 1) * (size_t)image->height;
     unsigned char* filtered = (unsigned char*)gsf_alloc(ctx, filtered_size + 2 * row, 1);
@@ -3364,7 +3387,7 @@ static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_
     gsf_append_bytes(ctx, out, head, 8 + 8 + 13);
     gsf__png_close(ctx, out, begin);
     begin = out->size;
-    gsf_append_bytes(ctx, out, "\0\0\0\0IDAT\x78\x5e", 10); // zlib: a window of 32 KiB
+    gsf_append_bytes(ctx, out, "\0\0\0\0IDAT\x78\x5e", 10); // zlib header: 32 KiB window
     gsf_result result = gsf__deflate(ctx, name, filtered, filtered_size, out);
     gsf__store_be32(sum, gsf__adler32(filtered, filtered_size));
     gsf_append_bytes(ctx, out, sum, sizeof sum);
@@ -3381,7 +3404,7 @@ static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf
     (void)image, (void)out;
     return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no JPEG (GSF_NO_STB)", name);
 #else
-    void* user[2]; // stb asks for no memory here
+    void* user[2]; // stb itself allocates nothing here: only `out` can run out of memory
     user[0] = ctx;
     user[1] = out;
     if (!stbi_write_jpg_to_func(gsf__stb_write, user, (int)image->width, (int)image->height, image->channels, image->data,
@@ -3392,7 +3415,7 @@ static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf
 #endif
 }
 
-// Appends the encoded file to `out`, or leaves it as it was.
+// Appends the encoded file to `out`, which is unchanged on error.
 static gsf_result gsf__encode_image(gsf_context* ctx, const char* name, const gsf_image* image, const char* extension,
                                     gsf_buffer* out) {
     GSF__TRY(gsf__check_image(ctx, name, image));
@@ -3447,10 +3470,10 @@ GSF_API gsf_result gsf_save_image(gsf_context* ctx, const char* path, const gsf_
 }
 
 // ---- >>resize ------------------------------------------------------------------
-// What PIL.Image.resize does (Pillow's Resample.c): the filter is widened by the shrink factor and sampled at pixel
-// centres, weights are normalised in double, then rounded to 22-bit fixed point for u8; first along x,
-// rounded to u8 again, then along y, or, as Pillow 13 does it, the other way round where the height shrinks by more than
-// twice the pixels that the width does. An axis whose size stays is left alone.
+// PIL.Image.resize (Pillow's Resample.c). When shrinking, the filter is widened by the shrink factor. It is sampled at pixel
+// centres; weights are normalised in double and, for u8, rounded to 22-bit fixed point. The first pass goes along x, the
+// second along y, with u8 rounding in between. As in Pillow 13, y comes first if the height shrinks by more than twice as
+// many pixels as the width. There is no pass along an axis whose size does not change.
 
 enum { GSF__PIL_BITS = 32 - 8 - 2, GSF__RESIZE_RUN = 256 };
 
@@ -3518,8 +3541,8 @@ static gsf_result gsf__make_pil_axis(gsf_context* ctx, gsf_resize_filter filter,
     return GSF_OK;
 }
 
-static uint8_t gsf__pil_clip(int32_t sum) { // half was added before
-    sum >>= GSF__PIL_BITS; // arithmetic
+static uint8_t gsf__pil_clip(int32_t sum) { // the sum includes the half that rounds it
+    sum >>= GSF__PIL_BITS; // arithmetic shift
     return (uint8_t)(sum < 0 ? 0 : sum > 255 ? 255 : sum);
 }
 
@@ -3528,7 +3551,7 @@ typedef struct gsf__resize_job {
     const gsf__resize_axis* axis;
 } gsf__resize_job;
 
-// Along x, same height.
+// The pass along x; the heights are the same.
 static void gsf__resize_rows_x(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
@@ -3561,7 +3584,7 @@ static void gsf__resize_rows_x(void* arg, size_t chunk, int32_t worker) {
             }
 }
 
-// Along y, same width: runs of pixels, so that the memory is walked along rows.
+// The pass along y; the widths are the same. Works on runs of pixels, so that memory is read along rows.
 static void gsf__resize_rows_y(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__resize_job* job = (const gsf__resize_job*)arg;
@@ -3686,7 +3709,7 @@ typedef struct gsf__metric_sum { // of one chunk of rows
     uint64_t count;
 } gsf__metric_sum;
 
-// Adds the chunks in order. what: for the error text.
+// Adds up the chunks in order. what: for the error message.
 static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf__metric_sum* sums, size_t chunks,
                                    double* mean) {
     double sum = 0.0;
@@ -3749,13 +3772,14 @@ GSF_API gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const 
     return result;
 }
 
-/* SSIM, separable: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring of as many
-   rows as the window is high; a map row is the ring blurred along y. Chunks of rows warm up their own ring. */
+/* SSIM with a separable window: each source row is blurred along x once (five quantities: a, b, aa, bb, ab) into a ring
+   buffer with as many rows as the window; blurring the ring along y gives a row of the SSIM map. Each chunk of rows fills
+   its own ring, so that chunks are independent. */
 
 enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
 
-// out[i] = sum over t of weights[t] * rows[t][i], t ascending; the AVX2 twin does the same operations on four i at
-// once.
+// out[i] = sum over t of weights[t] * rows[t][i], t ascending. The AVX2 version does the same operations in the same order,
+// four i at a time.
 static void gsf__ssim_blur_ref(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
     for (size_t i = 0; i < n; i++) {
         double sum = weights[0] * rows[0][i];
@@ -3796,22 +3820,22 @@ typedef struct gsf__ssim_job {
     int64_t inset;           // map rows and columns left out at each border
     size_t chunks_per_channel;
     gsf__metric_sum* sums;   // one per (channel, chunk)
-    double* scratch;         // per worker: padded source rows, ring, map row quantities
+    double* scratch;         // per worker: padded source rows, ring, quantities of a map row
     size_t scratch_size;     // doubles per worker
     void (*blur)(double* out, const double* const* rows, const double* weights, int taps, size_t n);
 } gsf__ssim_job;
 
 static int64_t gsf__reflect(int64_t i, int64_t n) { return i < 0 ? -i : i >= n ? 2 * n - 2 - i : i; }
 
-// Row y of both images, blurred along x, into five rows of `out` that lie `pitch` doubles apart.
-// padded: 5 rows of width + 2 radius.
+// Blurs row y of both images along x, into five rows of `out` that are `pitch` doubles apart.
+// padded: scratch, 5 rows of width + 2 radius.
 static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_t y, double* padded, double* out,
                                size_t pitch) {
     const gsf_image *a = job->a, *b = job->b;
     const int64_t radius = job->radius;
     const size_t width = (size_t)a->width, wide = width + 2 * (size_t)radius;
     if (y < 0 || y >= a->height) {
-        if (job->kind == GSF_SSIM_3DGS) { // beyond the border all is zero
+        if (job->kind == GSF_SSIM_3DGS) { // zero padding
             for (size_t q = 0; q < GSF__SSIM_QUANTITIES; q++) memset(out + q * pitch, 0, width * sizeof(double));
             return;
         }
@@ -3822,8 +3846,8 @@ static void gsf__ssim_blur_row(const gsf__ssim_job* job, int32_t channel, int64_
                      pa + radius);
     gsf__load_pixels((const char*)b->data + y * b->stride_y + channel * b->stride_c, b->stride_x, b->dtype, width,
                      pb + radius);
-    for (int64_t x = -radius; x < 0; x++) { // zeros or the mirror image on both sides
-        const int64_t right = a->width - 1 - x; // as far beyond the right border as x is beyond the left one
+    for (int64_t x = -radius; x < 0; x++) { // pad both sides with zeros or the reflection
+        const int64_t right = a->width - 1 - x; // as far outside the right border as x is outside the left
         const int mirror = job->kind == GSF_SSIM_TORCHMETRICS;
         for (int i = 0; i < 2; i++) {
             double* p = (i ? pb : pa) + radius;
@@ -3850,7 +3874,7 @@ static double gsf__ssim_value(gsf_ssim_kind kind, double ma, double mb, double m
     if (kind == GSF_SSIM_TORCHMETRICS) {
         if (va < 0.0) va = 0.0;
         if (vb < 0.0) vb = 0.0;
-    } else if (kind == GSF_SSIM_SKIMAGE) { // sample covariance of 7 x 7 values
+    } else if (kind == GSF_SSIM_SKIMAGE) { // unbiased covariance of 7 x 7 samples
         va *= 49.0 / 48.0;
         vb *= 49.0 / 48.0;
         cov *= 49.0 / 48.0;
@@ -3870,7 +3894,7 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
     double* map = ring + GSF__SSIM_QUANTITIES * taps * width;                     // (quantity, width)
     double sum = 0.0;
     uint64_t count = 0;
-    for (int64_t y = first - radius; y < end + radius; y++) { // source rows; map row y - radius is complete after each
+    for (int64_t y = first - radius; y < end + radius; y++) { // source rows; each completes map row y - radius
         const size_t slot = (size_t)(y - (first - radius)) % taps;
         gsf__ssim_blur_row(job, channel, y, padded, ring + slot * width, taps * width);
         const int64_t row = y - radius;
@@ -3893,9 +3917,9 @@ static void gsf__ssim_rows(void* arg, size_t chunk, int32_t worker) {
 
 GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a, const gsf_image* b,
                                     const gsf_image* mask, double* out) {
-    // exp(-x^2 / (2 1.5^2)) / sum for x = 0..5. The 3DGS code rounds these to float32 and their products once more, so that
-    // its window sums up to 1 - 6.94e-8, which adds as much of mu^2 to its variances: here the rounded taps, scaled to that
-    // sum. The others in double as torchmetrics has them for double images.
+    // exp(-x^2 / (2 * 1.5^2)) / sum for x = 0..5. First row: the Inria 3DGS code rounds these taps to float32 and then their
+    // products once more, so its window sums to 1 - 6.94e-8, which adds 6.94e-8 mu^2 to its variances. These are the rounded
+    // taps, scaled to give that sum. Second row: in double, as torchmetrics computes them for double images.
     static const double gauss[2][6] = {{0.2660117139984044, 0.21300552710375625, 0.1093606870495029, 0.03600077318386591,
                                         0.007598758182733767, 0.0010283801202764127},
                                        {0.26601172486179436, 0.21300553771125369, 0.10936068950970002,
@@ -4120,19 +4144,20 @@ GSF_API gsf_result gsf_load_cameras(gsf_context* ctx, const char* path, gsf_came
 
 // ---- >>clips -------------------------------------------------------------------
 
-typedef struct gsf__clip { // a clip on its way through a restorer
+typedef struct gsf__clip { // state of gsf_restore_clip
     const gsf_restorer* restorer;
     const gsf_restore_window* window;
     gsf_restorer_info limits;
-    int32_t taken, shown;       // the clip's frames in a part; frames that the restorer sees of them
+    int32_t taken, shown;       // frames of the clip per part; frames passed to the restorer for them
     int32_t parts, width, height;
-    gsf_image *color, *depth, *alpha, *out_color, *out_confidence; // (shown)
+    gsf_image *color, *depth, *alpha, *out_color, *out_confidence; // (shown) each: one part
     gsf_camera* cameras;
     int32_t* reference_index;
-    float* weight;              // of what each frame of the clip has got so far
+    float* weight;              // (frame_count) sum of blend weights of each frame so far
 } gsf__clip;
 
-static int32_t gsf__clip_spread(int64_t i, int64_t from, int64_t to) { // place i of `from` places among `to`, rounded
+// Spreads `from` indices evenly over 0..to-1 and returns where index i goes, rounded.
+static int32_t gsf__clip_spread(int64_t i, int64_t from, int64_t to) {
     return from > 1 ? (int32_t)((2 * i * (to - 1) + (from - 1)) / (2 * (from - 1))) : 0;
 }
 
@@ -4142,13 +4167,13 @@ static void gsf__clip_plan_length(gsf__clip* c) {
     const int32_t least = l->frame_count_min > 0 ? l->frame_count_min : 1;
     const int32_t step = l->frame_count_step > 1 ? l->frame_count_step : 1;
     c->taken = frames;
-    c->shown = frames <= least ? least : least + (frames - least + step - 1) / step * step; // this many or the next above
+    c->shown = frames <= least ? least : least + (frames - least + step - 1) / step * step; // rounded up to a legal count
     c->parts = 1;
     if (most <= 0 || c->shown <= most) return;
     c->taken = c->shown = gsf__legal_count(l->frame_count > 0 ? l->frame_count : most, least, most, step);
     const int32_t overlap = c->taken > 5 ? c->taken / 6 : c->taken > 1;
     if (frames > c->taken) c->parts = 1 + (frames - overlap - 1) / (c->taken - overlap);
-    else c->taken = frames; // its limits allow no more
+    else c->taken = frames; // only if frame_count_min > frame_count_max
 }
 
 static gsf_result gsf__clip_plan_size(gsf_context* ctx, gsf__clip* c) {
@@ -4175,7 +4200,7 @@ static gsf_result gsf__clip_plan_size(gsf_context* ctx, gsf__clip* c) {
                     width, height, (int)c->width, (int)c->height);
 }
 
-// Nearest pixels, which are all that a depth may become.
+// Nearest-neighbour resize, for depths: an interpolated depth at an edge would lie on neither surface.
 static void gsf__clip_pick(const gsf_image* from, const gsf_image* to) {
     for (int64_t y = 0; y < to->height; y++)
         for (int64_t x = 0; x < to->width; x++) {
@@ -4185,9 +4210,9 @@ static void gsf__clip_pick(const gsf_image* from, const gsf_image* to) {
         }
 }
 
-enum { GSF__CLIP_FLOATS, GSF__CLIP_BYTES, GSF__CLIP_NEAREST }; // how to resize: BYTES as pictures in files are
+enum { GSF__CLIP_FLOATS, GSF__CLIP_BYTES, GSF__CLIP_NEAREST }; // how to resize: BYTES in u8, as PIL resizes photos
 
-// *to becomes `from` in this size: itself, or an image of its own.
+// Resizes `from` into a new image *to. If the size is already right, *to is a view of `from`.
 static gsf_result gsf__clip_fit(gsf_context* ctx, const gsf_image* from, int64_t width, int64_t height, int how,
                                 gsf_image* to) {
     gsf_image bytes[2];
@@ -4212,7 +4237,7 @@ static gsf_result gsf__clip_fit(gsf_context* ctx, const gsf_image* from, int64_t
         return result;
     }
     GSF__TRY(gsf_resize_image(ctx, from, GSF_RESIZE_PIL_BICUBIC, to));
-    float* v = (float*)to->data; // at edges the filter goes beyond what is there
+    float* v = (float*)to->data; // bicubic overshoots at edges
     for (int64_t i = 0; i < width * height * from->channels; i++) v[i] = v[i] >= 1.0f ? 1.0f : v[i] > 0.0f ? v[i] : 0.0f;
     return GSF_OK;
 }
@@ -4226,7 +4251,7 @@ static void gsf__clip_drop_frames(gsf_context* ctx, gsf__clip* c) {
         }
 }
 
-// The part's frames as the restorer takes them; the clip's frame `begin` is its first.
+// Prepares the restorer's frames for the part that starts at frame `begin` of the clip.
 static gsf_result gsf__clip_take(gsf_context* ctx, gsf__clip* c, int32_t begin) {
     const gsf_restore_window* w = c->window;
     for (int32_t i = 0; i < c->shown; i++) {
@@ -4242,7 +4267,7 @@ static gsf_result gsf__clip_take(gsf_context* ctx, gsf__clip* c, int32_t begin) 
     return GSF_OK;
 }
 
-// *to of weight `before` and *from of weight `weight` become their mean in *to.
+// *to = mean of *to, with weight `before`, and *from, with weight `weight`.
 static void gsf__clip_blend(const gsf_image* from, float weight, float before, const gsf_image* to) {
     for (int64_t y = 0; y < to->height; y++)
         for (int64_t x = 0; x < to->width; x++)
@@ -4256,7 +4281,8 @@ static void gsf__clip_blend(const gsf_image* from, float weight, float before, c
             }
 }
 
-// What came back, into the clip's frames.
+// Blends the restored part into the clip's output frames. Weights decrease linearly towards both ends of a part, which
+// cross-fades parts where they overlap.
 static gsf_result gsf__clip_give(gsf_context* ctx, gsf__clip* c, int32_t begin) {
     for (int32_t i = 0; i < c->taken; i++) {
         const int32_t at = begin + i, shown = gsf__clip_spread(i, c->taken, c->shown);
@@ -4334,8 +4360,8 @@ GSF_API gsf_result gsf_restore_clip(gsf_context* ctx, const gsf_restorer* restor
 }
 
 // ---- >>oiio --------------------------------------------------------------------
-// Everything passes through memory, so the io hook and the atomic write serve these formats too. OpenImageIO allocates
-// with new and keeps its own worker threads; nothing it throws leaves this section.
+// Files are decoded from and encoded to memory, so that the io hook and the atomic write also cover these formats.
+// OpenImageIO allocates with new and has its own worker threads. All its exceptions are caught in this section.
 
 #ifdef GSF_USE_OIIO
 
@@ -4348,7 +4374,7 @@ static gsf_result gsf__oiio_fail(gsf_context* ctx, const char* name, gsf_result 
     return gsf_fail(ctx, result, "%s:0: %s (%s)", name, what, line);
 }
 
-// Told by the first bytes, as the name of an image in memory says nothing.
+// Format by the first bytes, because an image in memory may have any name.
 static const char* gsf__oiio_format(const void* data, size_t size) {
     static const struct { const char *magic, *format; } formats[] = {{"\x76\x2f\x31\x01", "openexr"},
                                                                      {"II*\0", "tiff"}, {"MM\0*", "tiff"},
@@ -4374,7 +4400,7 @@ static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void*
                         input->format_name());
     if (format) {
         OIIO::ImageSpec spec, config;
-        config.attribute("oiio:UnassociatedAlpha", 1); // colours as they stand in the file
+        config.attribute("oiio:UnassociatedAlpha", 1); // colours as stored, not premultiplied
         if (!input->set_ioproxy(memory) || !input->open(name, spec, config))
             return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "image is malformed", input->geterror());
     }
@@ -4394,7 +4420,7 @@ static gsf_dtype gsf__oiio_dtype(OIIO::TypeDesc type) {
         case OIIO::TypeDesc::UINT16: return GSF_U16;
         case OIIO::TypeDesc::HALF: return GSF_F16;
         case OIIO::TypeDesc::DOUBLE: return GSF_F64;
-        default: return GSF_F32; // wider integers become value / maximum
+        default: return GSF_F32; // wider integers are scaled to value / maximum
     }
 }
 
@@ -4409,8 +4435,8 @@ static OIIO::TypeDesc gsf__oiio_type(gsf_dtype dtype) {
     return OIIO::TypeDesc::UNKNOWN;
 }
 
-// src (n channels) to dst (1, 3 or 4) of the same dtype, by the rules stb has for its files: grey spreads, colour
-// becomes luma (77 R + 150 G + 29 B) / 256, a missing alpha is 1.
+// Converts src (any channel count) to dst (1, 3 or 4 channels) of the same dtype, with the rules of stb: grey is replicated,
+// colour becomes luma (77 R + 150 G + 29 B) / 256, a missing alpha is 1.
 static void gsf__oiio_channels(const gsf_image* src, const gsf_image* dst) {
     double run[3][GSF__CONVERT_RUN];
     const int is_color = src->channels >= 3;
@@ -4489,7 +4515,7 @@ static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char
     if (image->channels > 4 || image->width > 1 << 24 || image->height > 1 << 24)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %lld x %lld with %d channels", name, (long long)image->width,
                         (long long)image->height, (int)image->channels);
-    gsf_dtype dtype = image->dtype; // the nearest the format has
+    gsf_dtype dtype = image->dtype; // the nearest one that the format supports
     if (exr && dtype != GSF_F16) dtype = GSF_F32;
     if (tiff && dtype == GSF_F16) dtype = GSF_F32;
     if (png && dtype != GSF_U16) dtype = GSF_U8;
@@ -4505,7 +4531,7 @@ static gsf_result gsf__oiio_write(gsf_context* ctx, const char* name, const char
     if (result == GSF_OK) {
         OIIO::Filesystem::IOVecOutput memory(bytes);
         OIIO::ImageSpec spec((int)image->width, (int)image->height, (int)image->channels, gsf__oiio_type(dtype));
-        if (!tiff) // there it becomes an EXIF directory, whose writing into memory breaks the file (OpenImageIO 2.4)
+        if (!tiff) // in TIFF it becomes an EXIF directory; writing that to memory corrupts the file (OpenImageIO 2.4)
             spec.attribute("oiio:ColorSpace", image->color_space == GSF_COLOR_LINEAR ? "Linear" : "sRGB");
         if (!exr) spec.attribute("oiio:UnassociatedAlpha", 1);
         spec.attribute("CompressionQuality", (int)GSF__JPEG_QUALITY);
@@ -4535,19 +4561,19 @@ GSF__END_IMPLEMENTATION
 #endif // GSF_BASE_IMPLEMENTED
 #endif // GSFIXER_BASE_IMPLEMENTATION
 
-// ---- >>lanes: what is compiled per instruction set ------------------------------
+// ---- >>lanes: code compiled once per instruction set ----------------------------
 
 #ifdef GSF_INTERNALS_INCLUDED
 
 #ifdef GSF__KERNELS_POWERS
 #if GSF__LANES > 1
 
-// Constants of 2^x. Loops that hold them in registers, where they would rather be read again and again, pin them.
+// Constants of 2^x. Long loops pin them to registers, because compilers otherwise reload them in each iteration.
 typedef struct gsf__v_exp2_terms { gsf__vf lowest, rounder, c[7]; } gsf__v_exp2_terms;
 
-// The rounder, added to a number of [-126, 129], leaves the nearest integer n in the low bits as n + 126, which shifted by
-// 23 are the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial (that of Cephes' exp2f) therefore gives
-// 2 * 2^f, and all finite powers come out of one multiplication.
+// Adding the rounder (1.5 * 2^23 + 126) to x in [-126, 129] leaves n + 126 in the low bits, where n is the integer nearest
+// to x. Shifted left by 23, these are the bits of 2^(n - 1): 0 for n = -126, inf for n = 129. The polynomial (Cephes' exp2f)
+// therefore gives 2 * 2^f, so that one multiplication yields every finite power.
 GSF__V_INLINE gsf__v_exp2_terms gsf__v_exp2_of(int pinned) {
     gsf__v_exp2_terms t;
     t.lowest = gsf__v_set(-126.0f);
@@ -4584,24 +4610,24 @@ GSF__V_INLINE gsf__vf gsf__v_power(const gsf__v_exp2_terms* t, gsf__vf rounded, 
     return p * gsf__vi_as_floats(gsf__vi_shl(gsf__v_bits(rounded), 23));
 }
 
-// 2^x for x <= 129 or NaN: relative error below 2e-7, 2^0 = 1, results below 2^-125.5 (1.7e-38) are 0, a NaN stays.
+// 2^x for x <= 129 or NaN. Relative error below 2e-7; 2^0 = 1; results below 2^-125.5 (1.7e-38) are 0; NaN gives NaN.
 GSF__V_INLINE gsf__vf gsf__v_exp2_low(const gsf__v_exp2_terms* t, gsf__vf x) {
     x = gsf__v_max(t->lowest, x);
     const gsf__vf rounded = x + t->rounder;
     return gsf__v_power(t, rounded, x - (rounded - t->rounder));
 }
 
-// 2^x, as above, for all x; inf above 128.
+// 2^x for all x, with the same properties; inf above 128.
 GSF__V_INLINE gsf__vf gsf__v_exp2(gsf__vf x) {
     const gsf__v_exp2_terms t = gsf__v_exp2_of(0);
     return gsf__v_exp2_low(&t, gsf__v_min(gsf__v_set(129.0f), x));
 }
 
-// e^x for all x: relative error below 2e-7, results below 1.7e-38 are 0, inf above the largest float, a NaN stays.
+// e^x for all x. Relative error below 2e-7; results below 1.7e-38 are 0 and above the largest float inf; NaN gives NaN.
 GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
     const gsf__v_exp2_terms t = gsf__v_exp2_of(0);
     const gsf__vf log2_e = gsf__v_set(1.44269504f), log2_e_low = gsf__v_set(1.92596299e-8f);
-    x = gsf__v_min(gsf__v_set(89.4f), gsf__v_max(gsf__v_set(-87.4f), x)); // -126.1 and 129 in powers of 2
+    x = gsf__v_min(gsf__v_set(89.4f), gsf__v_max(gsf__v_set(-87.4f), x)); // exponents of 2: -126.1 and 129
     const gsf__vf rounded = gsf__v_madd(x, log2_e, t.rounder), n = rounded - t.rounder;
     return gsf__v_power(&t, rounded, gsf__v_madd(x, log2_e_low, gsf__v_msub(x, log2_e, n)));
 }
@@ -4616,12 +4642,12 @@ GSF__V_INLINE gsf__vf gsf__v_exp(gsf__vf x) {
 #define GSF__KERNELS_POWERS
 #define GSF__KERNELS_AVX512
 GSF__BEGIN_IMPLEMENTATION
-#include "gsfixer.h" // these kernels
+#include "gsfixer.h" // compiles the kernels above
 GSF__END_IMPLEMENTATION
 #undef GSF__KERNELS_POWERS
 #endif
 
-#ifdef GSF__KERNELS // a module's, see the vocabulary; the module has begun its implementation
+#ifdef GSF__KERNELS // of a module, as described in >>lanes; it has already opened GSF__BEGIN_IMPLEMENTATION
 #define GSF__ISA scalar
 #include GSF__KERNELS
 #undef GSF__ISA
