@@ -6431,8 +6431,9 @@ static gsf_result gsf__vit_check_input(gsf_context* ctx, const char* name, int64
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: images are missing", name);
     if (in->height < patch || in->width < patch || in->height % patch || in->width % patch || in->height > MOST ||
         in->width > MOST)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: sides of %d x %d are no multiples of %lld up to %d", name,
-                        (int)in->width, (int)in->height, (long long)patch, MOST);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "%s: %d x %d pixels, but sides must be multiples of %lld up to %d",
+                        name, (int)in->width, (int)in->height, (long long)patch, MOST);
     const int64_t count = in->images * channels * in->height * in->width;
     const int64_t at = gsf__nn_find_not_finite(ctx, in->pixels, count);
     if (at >= 0)
@@ -6462,7 +6463,7 @@ static gsf_result gsf__dinov2_read_config(const gsf__nn_config* file, void* netw
     GSF__TRY(gsf__nn_config_read(file, keys, GSF__COUNT(keys)));
     if (vit->sizes.width % vit->sizes.heads || image < vit->patch || (double)vit->sizes.width * ratio < 1.0)
         return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
-                        "%s: hidden_size %lld is no multiple of %d heads, or image_size %lld below a patch",
+                        "%s: hidden_size %lld is not a multiple of %d heads, or image_size %lld is below patch_size",
                         file->json.name, (long long)vit->sizes.width, (int)vit->sizes.heads, (long long)image);
     vit->sizes.head_dim = (int32_t)(vit->sizes.width / vit->sizes.heads);
     vit->sizes.mlp = (int64_t)((double)vit->sizes.width * ratio);
@@ -6920,7 +6921,7 @@ static gsf_result gsf__room_for_features(gsf_context* ctx, gsf_nn_features* f, c
                                          int64_t patch, int64_t channels, float** values, int64_t* of) {
     size_t count;
     if (in->height % patch || in->width % patch)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "references: %d x %d pixels are no multiple of a patch of %lld",
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "references: %d x %d pixels are not multiples of a patch of %lld",
                         (int)in->width, (int)in->height, (long long)patch);
     const int64_t tokens = in->height / patch * (in->width / patch);
     if ((f->dino || f->vggt) && (f->images != in->images || f->tokens != tokens))
@@ -6944,7 +6945,7 @@ GSF_API gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov
     gsf_nn_encoder_desc in;
     float* pixels = NULL;
     memset(&in, 0, sizeof in);
-    if (!photos || count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no photos are given");
+    if (!photos || count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "references: no photos given");
     gsf_result result = gsf__load_references(ctx, photos, count, &pixels, &in);
     if (!result && dinov2) {
         result = gsf__room_for_features(ctx, f, &in, dinov2->patch, dinov2->width, &f->dino, &f->dino_channels);
@@ -7230,7 +7231,7 @@ static gsf_result gsf__bpe_copy_tokens(gsf__bpe_loader* l, const gsf_json* json)
         const gsf_json_value* value = &json->values[i];
         if (value->type != GSF_JSON_NUMBER || !(value->number >= 0.0) || value->number > (double)INT32_MAX ||
             floor(value->number) != value->number)
-            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the id of %s is no whole number from 0 to %d", json->name,
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the id of %s is not an integer from 0 to %d", json->name,
                             (unsigned)value->offset, gsf__nn_show(value->key).text, (int)INT32_MAX);
         if (value->key_size == 0)
             return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: an empty token", json->name, (unsigned)value->offset);
@@ -7354,7 +7355,8 @@ static gsf_result gsf__bpe_read_token(const gsf__nn_config* file, const gsf_json
     const gsf_json_value* text = value->type == GSF_JSON_OBJECT ? gsf_find_json_member(json, value, "content") : value;
     memset(out, 0, sizeof *out);
     if (!text || text->type != GSF_JSON_STRING || text->string_size == 0)
-        return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no token, as text or with its \"content\"", json->name,
+        return gsf_fail(file->ctx, GSF_ERROR_FORMAT,
+                        "%s:%u: not a token: expected a string or an object with \"content\"", json->name,
                         (unsigned)value->offset);
     out->text = text->string;
     out->size = text->string_size;
@@ -7392,7 +7394,7 @@ static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
     const gsf_json* json = &file->json;
     const gsf_json_value* map = l->decoder ? l->decoder : json->values;
     if (map->type != GSF_JSON_OBJECT)
-        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are no object", json->name,
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are not an object", json->name,
                         (unsigned)map->offset);
     for (uint32_t i = map->child; i; i = json->values[i].next) {
         const gsf_json_value* value = &json->values[i];
@@ -7411,7 +7413,7 @@ static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
             if (value->type != GSF_JSON_NUMBER || floor(id) != id || token.size == 0) id = -1.0;
         }
         if (!(id >= 0.0) || id > (double)INT32_MAX)
-            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: no token with an id from 0 to %d", json->name,
+            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: not a token with an id from 0 to %d", json->name,
                             (unsigned)value->offset, (int)INT32_MAX);
         token.id = (int32_t)id;
         token.flags |= GSF__BPE_APART;
@@ -7447,7 +7449,7 @@ static gsf_result gsf__bpe_add_more_special(gsf__bpe_loader* l, const gsf__nn_co
     const gsf_json_value* list = gsf__nn_config_find(file, "additional_special_tokens");
     if (!list) return GSF_OK;
     if (list->type != GSF_JSON_ARRAY)
-        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: additional_special_tokens is no list", json->name,
+        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: additional_special_tokens is not an array", json->name,
                         (unsigned)list->offset);
     for (uint32_t i = list->child; i; i = json->values[i].next) {
         gsf__bpe_token token;
@@ -7689,8 +7691,8 @@ static gsf_result gsf__bpe_word(gsf__bpe_run* run, const char* word, size_t size
     for (int32_t i = 0; i >= 0; i = run->after[i]) {
         const int32_t symbol = run->symbols[i];
         if (symbol < 0 && run->unk < 0)
-            return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT, "byte 0x%02x of the text is no token of this vocabulary",
-                            (unsigned)(unsigned char)word[i]);
+            return gsf_fail(run->ctx, GSF_ERROR_INVALID_ARGUMENT,
+                            "byte 0x%02x of the text is not in this vocabulary", (unsigned)(unsigned char)word[i]);
         GSF__TRY(gsf__nn_emit(run->ctx, &run->out, symbol < 0 ? run->unk : run->t->tokens[symbol].id));
     }
     return GSF_OK;
@@ -7780,7 +7782,7 @@ GSF_API gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, co
     if (!size) text = "";
     for (size_t i = 0, step; i < size; i += step) {
         step = gsf__utf8_size(text + i, size - i);
-        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "text:%zu: byte 0x%02x is no UTF-8", i,
+        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "text:%zu: byte 0x%02x is not valid UTF-8", i,
                                    (unsigned)(unsigned char)text[i]);
     }
     gsf_result result = gsf__reserve(ctx, (void**)&run.out.ids, &run.out.capacity, 0, 16, sizeof *run.out.ids);
@@ -8485,13 +8487,14 @@ static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* ca
     }
     GSF__TRY(gsf_nn_encode_bpe(ctx, &captioner->tokenizer, prompt, strlen(prompt), 0, ids, count));
     gsf_result result = GSF_OK;
-    if (!*count) result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt has no token");
+    if (!*count) result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt has no tokens");
     for (size_t i = 0; i < *count && !result; i++) {
         if ((*ids)[i] >= captioner->vocabulary)
-            result = gsf_fail(ctx, GSF_ERROR_FORMAT, "caption: the tokenizer gives id %d, but the model has %d words",
+            result = gsf_fail(ctx, GSF_ERROR_FORMAT,
+                              "caption: the tokenizer returned id %d, but the model has %d tokens",
                               (int)(*ids)[i], (int)captioner->vocabulary);
         else if ((*ids)[i] == captioner->image_token)
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt holds the image's token");
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "caption: the prompt contains the image token");
     }
     if (!result) return GSF_OK;
     gsf_free(ctx, *ids);
@@ -8684,12 +8687,12 @@ static gsf_result gsf__pb_varint(gsf__pb* in, uint64_t* out) {
     *out = 0;
     for (int shift = 0; shift < 70; shift += 7) {
         if (in->at == in->end)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number is cut off", in->name, begin);
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a varint is truncated", in->name, begin);
         const unsigned char byte = in->data[in->at++];
         if (shift < 64) *out |= (uint64_t)(byte & 127u) << shift;
         if (!(byte & 128u)) return GSF_OK;
     }
-    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a number of more than ten bytes", in->name, begin);
+    return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: a varint of more than ten bytes", in->name, begin);
 }
 
 static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // requires in->at < in->end
@@ -8700,7 +8703,7 @@ static gsf_result gsf__pb_next(gsf__pb* in, gsf__pb_field* out) { // requires in
     out->number = key >> 3;
     out->wire = (int)(key & 7);
     if (out->number < 1 || out->number >= 1u << 29)
-        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: no field has the number %llu", in->name, begin,
+        return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: invalid field number %llu", in->name, begin,
                         (unsigned long long)out->number);
     if (out->wire == 0) return gsf__pb_varint(in, &out->value);
     if (out->wire == 1) size = 8;
@@ -8891,7 +8894,7 @@ static gsf_result gsf__sp_read_piece(gsf__pb in, gsf__sp_key* key, float* score,
         if (field.number == 1) {
             GSF__TRY(gsf__pb_expect(&in, &field, 2));
             if (field.size > GSF__SP_PIECE || !gsf__sp_is_text((const char*)in.data + field.at, field.size))
-                return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d is no UTF-8, or longer than %d bytes",
+                return gsf_fail(in.ctx, GSF_ERROR_FORMAT, "%s:%zu: piece %d is not valid UTF-8 or longer than %d bytes",
                                 in.name, field.at, (int)key->id, (int)GSF__SP_PIECE);
             key->text = (const char*)in.data + field.at;
             key->size = (uint32_t)field.size;
@@ -8923,12 +8926,14 @@ static gsf_result gsf__sp_note_piece(const gsf__pb* in, gsf__sp_model* m, const 
     const int type = m->types[key->id];
     if (type == GSF__SP_UNKNOWN) {
         if (m->unknown_id >= 0)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d are both the unknown one", in->name,
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: pieces %d and %d are both of type unknown", in->name,
                             (int)m->unknown_id, (int)key->id);
         m->unknown_id = key->id;
     } else if (type == GSF__SP_BYTE) {
         const int byte = gsf__sp_byte_of(key);
-        if (byte < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: piece %d is no byte", in->name, (int)key->id);
+        if (byte < 0)
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: piece %d of type byte is not of the form <0xNN>", in->name,
+                            (int)key->id);
         m->bytes[byte] = key->id;
     } else if (type == GSF__SP_USER) {
         m->has_user_pieces = 1;
@@ -8945,7 +8950,7 @@ static gsf_result gsf__sp_read_trainer(gsf__pb in, gsf__sp_model* m) {
         if (field.number == 24) m->suffix = field.value != 0;
         else if (field.number == 35) m->byte_fallback = field.value != 0;
         else if (field.value != 1)
-            return gsf_fail(in.ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: a model of kind %llu, not a unigram", in.name, in.at,
+            return gsf_fail(in.ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: model type %llu is not unigram (1)", in.name, in.at,
                             (unsigned long long)field.value);
     }
     return GSF_OK;
@@ -8974,7 +8979,7 @@ static gsf_result gsf__sp_check_units(const gsf__pb* in, size_t at, const gsf__s
             ok = most && memchr(m->replacements + value, 0, most) != NULL;
         }
         if (!ok)
-            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: unit %zu of the character map leads nowhere", in->name,
+            return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s:%zu: unit %zu of the character map is invalid", in->name,
                             at + 4 * i, i);
     }
     return GSF_OK;
@@ -9043,7 +9048,7 @@ static gsf_result gsf__sp_check_pieces(const gsf__pb* in, gsf__sp_model* m, cons
     for (size_t i = 0; i < m->count; i++)
         if (m->types[i] == GSF__SP_NORMAL && m->scores[i] < low) low = m->scores[i];
     m->unknown_score = low - 10.0f;
-    if (m->unknown_id < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece is the unknown one", in->name);
+    if (m->unknown_id < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece is of type unknown", in->name);
     for (int i = 0; m->byte_fallback && i < 256; i++)
         if (m->bytes[i] < 0) return gsf_fail(in->ctx, GSF_ERROR_FORMAT, "%s: no piece for the byte %d", in->name, i);
     qsort(all->keys, all->count, sizeof *all->keys, gsf__sp_compare);
@@ -9097,7 +9102,8 @@ static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* te
 }
 
 static gsf_result gsf__sp_fail_added(const gsf__nn_config* file, const gsf_json_value* value) {
-    return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: no added token", file->json.name, (unsigned)value->offset);
+    return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: not a valid added token", file->json.name,
+                    (unsigned)value->offset);
 }
 
 // Parses {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
@@ -9118,7 +9124,7 @@ static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json
         }
         if (!ok) return gsf__sp_fail_added(file, entry);
         if (single && single->type == GSF_JSON_TRUE)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: an added token that is a single word", json->name,
+            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: an added token with single_word set", json->name,
                             (unsigned)entry->offset);
         GSF__TRY(gsf__sp_add(file->ctx, m, content->string, content->string_size, id, left && left->type == GSF_JSON_TRUE,
                              right && right->type == GSF_JSON_TRUE));
@@ -9904,7 +9910,7 @@ static gsf_result gsf__vae_take_config(const gsf__nn_config* config, void* netwo
     for (size_t i = 0; i < levels; i++) {
         vae->channels[i] = (int32_t)channels[i];
         if (channels[i] % vae->norm_groups != 0)
-            return gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s: %lld channels are no multiple of norm_num_groups %d",
+            return gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s: %lld channels are not a multiple of norm_num_groups %d",
                             config->json.name, (long long)channels[i], (int)vae->norm_groups);
     }
     return GSF_OK;
@@ -10559,7 +10565,7 @@ static gsf_result gsf__vae_make_plan(gsf_context* ctx, const gsf_nn_vae* vae, in
     const int64_t bottom = height - (tiled.rows - 1) * tiled.step[0], right = width - (tiled.columns - 1) * tiled.step[1];
     if (!decoder && (bottom % ratio != 0 || right % ratio != 0))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "tiling: %lld x %lld leaves a last tile of %lld x %lld, which is no multiple of %lld",
+                        "tiling: %lld x %lld leaves a last tile of %lld x %lld, which is not a multiple of %lld",
                         (long long)width, (long long)height, (long long)right, (long long)bottom, (long long)ratio);
     *plan = tiled;
     return GSF_OK;
@@ -10739,7 +10745,7 @@ static gsf_result gsf__vae_apply(gsf_context* ctx, const gsf_nn_vae* vae, int de
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: an array is missing", stage);
     GSF__TRY(gsf__vae_make_task(ctx, vae, decoder, desc, frames, height, width, &task, &info));
     if (desc && desc->max_bytes > 0.0 && info.bytes > desc->max_bytes)
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: needs %.0f MiB, %.0f are allowed", stage,
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: needs %.0f MiB, but only %.0f are allowed", stage,
                         ceil(info.bytes / 1048576.0), desc->max_bytes / 1048576.0);
     GSF__TRY(gsf__vae_check_finite(ctx, decoder ? "latents" : "video", in,
                                    decoder ? vae->latent_channels : vae->in_channels, frames, height, width));
@@ -10879,7 +10885,7 @@ static gsf_result gsf__dit_read_config(const gsf__nn_config* file, void* network
     if (shift != 0.0) return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s: freq_shift is not 0", file->json.name);
     if (c->head_dim % 16 || c->sample_width % c->patch || c->sample_height % c->patch)
         return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED,
-                        "%s: attention_head_dim %d is no multiple of 16, or the sample no multiple of the patch",
+                        "%s: attention_head_dim %d is not a multiple of 16, or the sample size not of the patch size",
                         file->json.name, (int)c->head_dim);
     return GSF_OK;
 }
@@ -11271,11 +11277,12 @@ static gsf_result gsf__dit_blocks(gsf__dit_run* run) {
 
 static gsf_result gsf__dit_check_size(gsf_context* ctx, const gsf_nn_transformer* c, int32_t height, int32_t width) {
     if (height < c->patch || width < c->patch || height % c->patch || width % c->patch)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "transformer: %d x %d latents are no multiple of the patch %d",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "transformer: %d x %d latents are not multiples of the patch %d",
                         (int)width, (int)height, (int)c->patch);
     if (c->learned_positions && (height != c->sample_height || width != c->sample_width))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
-                        "transformer: latents of %d x %d; its learned positions are for %d x %d (the official code refuses "
+                        "transformer: latents of %d x %d; its learned positions are for %d x %d (diffusers refuses "
                         "other sizes as well)", (int)width, (int)height, (int)c->sample_width, (int)c->sample_height);
     return GSF_OK;
 }
@@ -11495,7 +11502,8 @@ GSF_API gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_
     for (int32_t i = 1; falls && i < d.train_steps; i++) falls = table[i] <= table[i - 1];
     if (!falls) {
         gsf_free(ctx, table);
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "schedule: betas from %g to %g over %d steps do not take 1 down to 0",
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE,
+                        "schedule: betas from %g to %g over %d steps: alpha_bar does not fall to 0",
                         d.beta_start, d.beta_end, (int)d.train_steps);
     }
     out->desc = d;
@@ -11854,17 +11862,17 @@ static gsf_result gsf__sample_check_size(gsf_context* ctx, const gsf_nn_transfor
     const int32_t step = 2 * v->temporal_ratio, square = v->spatial_ratio * t->patch;
     if (t->temporal_ratio != v->temporal_ratio || t->in_channels != 2 * v->latent_channels ||
         t->out_channels != v->latent_channels)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent) do not fit",
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "sample: transformer (%d in, %d out) and VAE (%d latent) do not match",
                         (int)t->in_channels, (int)t->out_channels, (int)v->latent_channels);
     if (d->frames < 1 || (d->frames - 1) % step)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: %d frames; it takes 1, %d, %d, ...", (int)d->frames,
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: %d frames; must be 1, %d, %d, ...", (int)d->frames,
                         (int)(1 + step), (int)(1 + 2 * step));
     if (d->height < square || d->width < square || d->height % square || d->width % square)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are no multiple of %d", (int)d->width,
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "sample: frames of %d x %d are not multiples of %d", (int)d->width,
                         (int)d->height, (int)square);
     if (t->learned_positions && d->frames != t->sample_frames && !d->any_frames)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED,
-                        "sample: %d frames; the model's positions are learned for %d (any_frames puts sines in their place)",
+                        "sample: %d frames; the model's positions are learned for %d (any_frames: use sines instead)",
                         (int)d->frames, (int)t->sample_frames);
     return gsf__dit_check_size(ctx, t, d->height / v->spatial_ratio, d->width / v->spatial_ratio);
 }
@@ -11998,7 +12006,7 @@ static void gsf__sample_take(gsf__sample_run* run, const void* data, size_t size
         !gsf_find_chunk(data, size, "MEMO", &memory))
         return;
     if (head.size != 12 || gsf__load_le((const char*)head.data + 8, 4) != run->settings) {
-        gsf_log(run->ctx, GSF_LOG_WARNING, "%s: made with another model, precision or other settings: the clip starts anew",
+        gsf_log(run->ctx, GSF_LOG_WARNING, "%s: made with another model, precision or settings: the clip is restarted",
                 run->desc.checkpoint);
         return;
     }
@@ -12190,7 +12198,7 @@ static gsf_result gsf__sample_check_memory(gsf_context* ctx, const gsf_nn_transf
     GSF__TRY(gsf_nn_query_sample(ctx, t, v, d, &cost));
     if (cost.bytes <= d->max_bytes) return GSF_OK;
     return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY,
-                    "sample: %d frames of %d x %d need %.2f GB of memory, at most %.2f GB are allowed",
+                    "sample: %d frames of %d x %d need %.2f GB of memory, but only %.2f GB are allowed",
                     (int)d->frames, (int)d->width, (int)d->height, 1e-9 * cost.bytes, 1e-9 * d->max_bytes);
 }
 
@@ -12340,7 +12348,7 @@ static gsf_result gsf__dit_begin(void* user, gsf_context* ctx, const gsf_referen
     gsf__dit_restorer* r = (gsf__dit_restorer*)user;
     gsf_result result = GSF_OK;
     uint32_t sum = gsf__crc32(0, &reference_count, sizeof reference_count);
-    if (r->photos) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: begun, and not yet ended, by another run");
+    if (r->photos) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: already in use by another run");
     if (reference_count > 0) {
         r->photos = (gsf_reference*)gsf_alloc_zeroed(ctx, (size_t)reference_count, sizeof *r->photos);
         if (!r->photos) return GSF_ERROR_OUT_OF_MEMORY;
@@ -12437,7 +12445,7 @@ static gsf_result gsf__dit_fit_photo(gsf_context* ctx, const gsf_reference* phot
     for (int k = 0; k < 2; k++) {
         const double wanted = rint(sides[k] / step[k]);
         if (!(wanted < 65536.0))
-            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dit: a frame shows a photo %g-fold", 1.0 / step[k]);
+            return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dit: a frame magnifies a photo %g times", 1.0 / step[k]);
         size[k] = wanted < 1.0 ? 1 : (int64_t)wanted;
         const double scale = (double)size[k] / sides[k];
         control->step[k] = step[k] * scale;
@@ -12521,13 +12529,14 @@ static gsf_result gsf__dit_absent(const gsf__dit_part* p, gsf_result result, con
     char before[sizeof p->ctx->error];
     if (result != GSF_ERROR_NOT_FOUND) return result;
     memcpy(before, p->ctx->error, sizeof before);
-    return gsf_fail(p->ctx, result, "%.250s (which makes %s; %.100s in the features file%s does without it)", before, makes,
+    return gsf_fail(p->ctx, result,
+                    "%.250s (needed for %s; not needed with %.100s in the features file%s)", before, makes,
                     p->name, instead);
 }
 
 static gsf_result gsf__dit_misfit(const gsf__dit_part* p, const char* part, int64_t channels, int64_t expected) {
     if (channels == expected) return GSF_OK;
-    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s/%s: gives %lld channels, but the transformer takes %lld",
+    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s/%s: outputs %lld channels, but the transformer expects %lld",
                     p->r->desc.model, part, (long long)channels, (long long)expected);
 }
 
@@ -12555,8 +12564,8 @@ typedef struct gsf__dit_kind { // a kind of reference tokens
 
 enum { GSF__DIT_DINO, GSF__DIT_VGGT };
 static const gsf__dit_kind gsf__dit_kinds[2] = {
-    {"dino_latents", "dinov2", "the 2D reference tokens", ", or condition 3d or none,"},
-    {"vggt_latents", "vggt", "the 3D reference tokens", ", or condition 2d or none,"}};
+    {"dino_latents", "dinov2", "the 2D reference tokens", ", or with condition 3d or none"},
+    {"vggt_latents", "vggt", "the 3D reference tokens", ", or with condition 2d or none"}};
 
 // Encodes p->photos with DINOv2 or VGGT.
 static gsf_result gsf__dit_see(const gsf__dit_part* p, int kind) {
@@ -12646,7 +12655,7 @@ static gsf_result gsf__dit_text(const gsf__dit_part* p, const char* caption) {
     if (!result) result = gsf__dit_encode_ids(p, ids);
     gsf_free(p->ctx, ids);
     if (!result && caption) gsf_append_text(p->ctx, &r->caption, "%s", caption);
-    return gsf__dit_absent(p, result, "the prompts' embeddings", "");
+    return gsf__dit_absent(p, result, "the prompt embeddings", "");
 }
 
 // Captions the photo, out: GSF__DIT_CAPTION_BYTES; without a photo it only loads the captioner.
@@ -12657,7 +12666,7 @@ static gsf_result gsf__dit_describe(const gsf__dit_part* p, char* out) {
     gsf_result result = gsf__nn_join(p->ctx, p->r->desc.model, "blip2", &folder);
     if (!result) result = gsf_nn_load_captioner(p->ctx, folder.data, &model);
     gsf_destroy_buffer(p->ctx, &folder);
-    if (result) return gsf__dit_absent(p, result, "the caption", ", or a caption,");
+    if (result) return gsf__dit_absent(p, result, "the caption", ", or with a caption");
     gsf__nn_query_captioner(&model, 0, 0, &bytes, &flops);
     if (!p->photos) gsf__dit_add_cost(p->r, bytes, flops);
     else result = gsf_nn_caption_image(p->ctx, &model, p->photos, NULL, 0, out, GSF__DIT_CAPTION_BYTES);
@@ -12832,7 +12841,7 @@ typedef struct gsf__dit_clip { // the clip whose features are collected
 
 static gsf_result gsf__dit_need_photos(const gsf__dit_clip* c) {
     if (c->count > 0) return GSF_OK;
-    return gsf_fail(c->ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no reference photos (condition none does without them)");
+    return gsf_fail(c->ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no reference photos (only condition none needs none)");
 }
 
 // Appends the rows of `kept` to those of earlier photos.
@@ -13059,7 +13068,7 @@ static gsf_result gsf__dit_read_feature(gsf_context* ctx, gsf__dit_restorer* r, 
     if (!prompt && !dino && !gsf__dit_is_name(t->name, "vggt_latents", "photo")) return GSF_OK;
     if (t->rank != 3 || t->count < 1 || t->shape[2] != channels ||
         (prompt && (t->shape[0] != 2 || t->shape[1] != c->text_tokens)))
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is no list of rows of %lld values", file, t->name,
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s does not consist of rows of %lld values", file, t->name,
                         (long long)channels);
     GSF__TRY(gsf__dit_keep(ctx, r, t->name, t->shape[0], t->shape[1], t->shape[2], 0, &values));
     gsf_nn_convert_tensor(t, 0, t->count, values);
@@ -13169,7 +13178,7 @@ static gsf_result gsf__dit_copy_desc(gsf_context* ctx, const gsf_nn_dit_desc* de
 GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out) {
     memset(out, 0, sizeof *out);
     if (!desc || !desc->model)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no model folder is given");
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dit: no model folder given");
     gsf__dit_restorer* r = (gsf__dit_restorer*)gsf_alloc_zeroed(ctx, 1, sizeof *r);
     if (!r) return GSF_ERROR_OUT_OF_MEMORY;
     gsf_result result = gsf__dit_copy_desc(ctx, desc, r);

@@ -93,7 +93,7 @@ expect() { # STATUS TEXT COMMAND...
     [ "$got" = "$status" ] || fail "exit status $got, not $status: $*"
     grep -q -- "$text" "$log" || fail "does not say \"$text\": $*"
 }
-expect 1 "does without it" "$gsfix" restore "$scratch/clip" --out "$scratch/x" --restorer "dit:$scratch/model"
+expect 1 "; not needed with " "$gsfix" restore "$scratch/clip" --out "$scratch/x" --restorer "dit:$scratch/model"
 expect 2 "--solver" "$gsfix" restore "$scratch/clip" --out "$scratch/x" --restorer warp --solver ddim
 expect 1 "config.json" "$gsfix" restore "$scratch/clip" --out "$scratch/x" "${dit[@]}" --restorer "dit:$scratch/none"
 head -c 1000 "$scratch/all/features.safetensors" > "$scratch/cut.safetensors"

@@ -50,12 +50,12 @@ static void test_bad_tokenizers(void) {
         {small_vocabulary, merges, "{\"errors\": \"strict\"}", GSF_ERROR_UNSUPPORTED, "errors"},
         {small_vocabulary, merges, "{\"add_bos_token\": 1}", GSF_ERROR_FORMAT, "add_bos_token is not true or false"},
         {small_vocabulary, merges, "{\"add_bos_token\": true, \"bos_token\": null}", GSF_ERROR_FORMAT, "no bos_token"},
-        {small_vocabulary, merges, "{\"bos_token\": 5}", GSF_ERROR_FORMAT, "tokenizer_config.json:14: no token"},
-        {small_vocabulary, merges, "{\"bos_token\": {\"content\": \"\"}}", GSF_ERROR_FORMAT, "no token"},
+        {small_vocabulary, merges, "{\"bos_token\": 5}", GSF_ERROR_FORMAT, "tokenizer_config.json:14: not a token"},
+        {small_vocabulary, merges, "{\"bos_token\": {\"content\": \"\"}}", GSF_ERROR_FORMAT, "not a token"},
         {small_vocabulary, merges, "{\"bos_token\": {\"content\": \"x\", \"single_word\": true}}", GSF_ERROR_UNSUPPORTED,
          "single_word of token x"},
-        {small_vocabulary, merges, "{\"additional_special_tokens\": {}}", GSF_ERROR_FORMAT, "is no list"},
-        {small_vocabulary, merges, "{\"added_tokens_decoder\": []}", GSF_ERROR_FORMAT, "are no object"},
+        {small_vocabulary, merges, "{\"additional_special_tokens\": {}}", GSF_ERROR_FORMAT, "is not an array"},
+        {small_vocabulary, merges, "{\"added_tokens_decoder\": []}", GSF_ERROR_FORMAT, "are not an object"},
         {small_vocabulary, merges, "{\"added_tokens_decoder\": {\"99999999999\": \"x\"}}", GSF_ERROR_FORMAT, "id from 0"},
         {small_vocabulary, merges, "{\"added_tokens_decoder\": {\"-1\": \"x\"}}", GSF_ERROR_FORMAT, "id from 0"},
         {small_vocabulary, merges, "{\"added_tokens_decoder\": {\"20\": \"x\", \"21\": \"x\"}}", GSF_ERROR_FORMAT,
@@ -334,7 +334,7 @@ static void test_arguments(gsf_context* ctx, const gsf_nn_captioner* net, const 
     char caption[256], whole[1024];
     static const struct { const char* prompt; int32_t most; const char* named; } bad[] = {
         {NULL, -1, "max_new_tokens"}, {NULL, INT32_MAX, "positions"}, {NULL, 1000000, "positions"},
-        {"\xff", 0, "text:0"}, {"a <image> of", 0, "image's token"}};
+        {"\xff", 0, "text:0"}, {"a <image> of", 0, "contains the image token"}};
     for (size_t i = 0; i < sizeof bad / sizeof *bad; i++) {
         strcpy(caption, "before");
         CHECK_RESULT(ctx, gsf_nn_caption_image(ctx, net, photo, bad[i].prompt, bad[i].most, caption, sizeof caption),

@@ -252,8 +252,8 @@ static void test_refusals(void) {
     text[1025] = 0;
     const struct { const char* text; float score; int type; const char* words; } pieces[] = {
         {"ab", 0, 1, "same text"}, {"", 0, 1, "has 0 bytes"}, {"d", NAN, 1, "score"}, {"d", INFINITY, 1, "score"},
-        {"d", 0, 9, "type 9"}, {"d", 0, 2, "both the unknown"}, {"<0x1g>", 0, 6, "no byte"}, {"\xff", 0, 1, "UTF-8"},
-        {text, 0, 1, "longer than"}};
+        {"d", 0, 9, "type 9"}, {"d", 0, 2, "both of type unknown"}, {"<0x1g>", 0, 6, "not of the form"},
+        {"\xff", 0, 1, "UTF-8"}, {text, 0, 1, "longer than"}};
     for (size_t i = 0; i < sizeof pieces / sizeof pieces[0]; i++) {
         made_spiece(0, &m);
         made_piece(&m, pieces[i].text, pieces[i].score, pieces[i].type);
@@ -264,7 +264,7 @@ static void test_refusals(void) {
         part.size = 0;
         made_varint(&part, 3, (uint64_t)kind);
         made_field(&m, 2, part.data, part.size);
-        expect_refused(&m, GSF_ERROR_UNSUPPORTED, "not a unigram");
+        expect_refused(&m, GSF_ERROR_UNSUPPORTED, "is not unigram");
     }
     made_spiece(0, &m);
     part.size = 0;
@@ -279,7 +279,7 @@ static void test_refusals(void) {
     expect_refused(&m, GSF_ERROR_FORMAT, "wire type 3");
     m.size = 0;
     made_piece(&m, "a", 0, 1);
-    expect_refused(&m, GSF_ERROR_FORMAT, "unknown one");
+    expect_refused(&m, GSF_ERROR_FORMAT, "no piece is of type unknown");
     made_piece(&m, "<unk>", 0, 2);
     expect_refused(&m, GSF_ERROR_FORMAT, "</s>");
 }
