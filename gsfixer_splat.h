@@ -5716,27 +5716,31 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
         d->iterations > 100 || d->sources < 1 || d->sources > GSF__DENSE_SOURCES || d->radius < 1 || d->radius > 15 ||
         d->stride < 1 || d->stride > d->radius || d->min_consistent < 1 || d->spacing < 1 || d->spacing > 1024)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "dense points: max_size %d, levels %d, iterations %d, sources %d, radius %d, stride %d, "
-                        "min_consistent %d, spacing %d", (int)d->max_size, (int)d->levels, (int)d->iterations,
-                        (int)d->sources, (int)d->radius, (int)d->stride, (int)d->min_consistent, (int)d->spacing);
+                        "dense points: setting out of range: max_size %d, levels %d, iterations %d, sources %d, "
+                        "radius %d, stride %d, min_consistent %d, spacing %d",
+                        (int)d->max_size, (int)d->levels, (int)d->iterations, (int)d->sources,
+                        (int)d->radius, (int)d->stride, (int)d->min_consistent, (int)d->spacing);
     const int side = 2 * (d->radius / d->stride) + 1;
     if (side * side > GSF__DENSE_SAMPLES)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: radius %d by stride %d is more than %d samples",
-                        (int)d->radius, (int)d->stride, (int)GSF__DENSE_SAMPLES);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "dense points: radius %d with stride %d needs more than %d samples", (int)d->radius,
+                        (int)d->stride, (int)GSF__DENSE_SAMPLES);
     if (!(d->color_sigma > 0.0f && d->min_angle >= 0.0f && d->max_cost > 0.0f && d->max_cost_many < GSF__DENSE_BAD &&
           d->max_reprojection > 0.0f && d->max_depth_error > 0.0f && d->max_normal_angle > 0.0f &&
           d->max_normal_angle <= 180.0f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "dense points: color_sigma %g, min_angle %g, max_cost %g, max_reprojection %g, max_depth_error %g, "
-                        "max_normal_angle %g", (double)d->color_sigma, (double)d->min_angle, (double)d->max_cost,
+                        "dense points: setting out of range: color_sigma %g, min_angle %g, max_cost %g, "
+                        "max_reprojection %g, max_depth_error %g, max_normal_angle %g",
+                        (double)d->color_sigma, (double)d->min_angle, (double)d->max_cost,
                         (double)d->max_reprojection, (double)d->max_depth_error, (double)d->max_normal_angle);
     if (!(d->depth_min >= 0.0 && isfinite(d->depth_max) && (d->depth_max == 0.0 || d->depth_max > d->depth_min)))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: depths from %g to %g", d->depth_min, d->depth_max);
-    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: no list of views");
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: invalid depth range %g to %g", d->depth_min,
+                        d->depth_max);
+    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: views is NULL");
     for (size_t i = 0; i < view_count; i++) {
         if (views[i] >= scene->view_count)
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u, the scene has %zu", (unsigned)views[i],
-                            scene->view_count);
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u does not exist, the scene has %zu",
+                            (unsigned)views[i], scene->view_count);
         const gsf_scene_view* view = &scene->views[views[i]];
         GSF__TRY(gsf_check_camera(ctx, &view->camera));
         if (!view->image.data)
@@ -5759,7 +5763,7 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
 
 // sums, all weighted: weight; value and square in the reference; value and square in the other photo; product.
 static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sums[6]) {
-    if (!(sums[0] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // half of the window's weight or more lies outside
+    if (!(sums[0] > 0.5f * patch->weight_sum)) return GSF__DENSE_BAD; // at least half of the weight is outside
     const float inv = 1.0f / sums[0], mean_r = sums[1] * inv, mean_s = sums[3] * inv;
     const float var_r = sums[2] * inv - mean_r * mean_r, var_s = sums[4] * inv - mean_s * mean_s;
     if (!(var_r > GSF__DENSE_MIN_VARIANCE && var_s > GSF__DENSE_MIN_VARIANCE)) return GSF__DENSE_BAD;
@@ -6951,7 +6955,7 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     if (result == GSF_OK && counted.pairs) result = gsf__dense_fuse(job, out, &counted);
     counted.seconds_fuse = gsf__vis_seconds() - start;
     if (result == GSF_OK && !counted.pairs)
-        gsf_log(ctx, GSF_LOG_WARNING, "dense points: no two of %zu views overlap, so there are none", job->view_count);
+        gsf_log(ctx, GSF_LOG_WARNING, "dense points: none, because no two of the %zu views overlap", job->view_count);
     gsf__dense_free_level(job);
     gsf_free(ctx, job->views);
     gsf_free(ctx, job);
@@ -7123,7 +7127,7 @@ static float gsf__log2(float x) { // x > 0, normal
         d *= 0.5;
         e++;
     }
-    const double t = (d - 1.0) / (d + 1.0), t2 = t * t; // log(d) = 2 atanh(t), |t| < 0.1716
+    const double t = (d - 1.0) / (d + 1.0), t2 = t * t; // ln d = 2 atanh(t), |t| < 0.1716
     double p = 1.0 / 11.0;
     p = p * t2 + 1.0 / 9.0;
     p = p * t2 + 1.0 / 7.0;
@@ -8435,8 +8439,8 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
         dT[6 + c] = zero - jx * p.x * dV[c] - jy * p.y * dV[3 + c];
     }
 
-    // mean in camera space: through u, v, the focal scale jx = fx/z and the slope x = t.x/z (constant where clamped; the
-    // Inria 3DGS code holds t.x = x z constant instead, which leaves -x/z)
+    // mean in camera space: through u, v, the focal scale jx = fx/z and the slope x = t.x/z (constant where clamped;
+    // there the Inria 3DGS code treats t.x = x z as constant instead, which leaves -x/z)
     const gsf__vf free_x = gsf__v_keep(gsf__vm_not(p.clamped_x), d_x) * inv_z;
     const gsf__vf free_y = gsf__v_keep(gsf__vm_not(p.clamped_y), d_y) * inv_z;
     gsf__vf slope_x = free_x, slope_y = free_y;
@@ -8572,7 +8576,7 @@ static gsf_result gsf__check_render(gsf_context* ctx, const gsf_splats* splats, 
     if (desc->sh_bands < 0 || desc->sh_bands > 4)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: sh_bands is %d, expected 0..4", (int)desc->sh_bands);
     if (camera->width > 65536 || camera->height > 65536)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: image of %d x %d is larger than 65536 pixels",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render: image of %d x %d is larger than 65536 x 65536",
                         (int)camera->width, (int)camera->height);
     for (int c = 0; c < 3; c++)
         if (!isfinite(desc->background[c]))
@@ -8856,7 +8860,7 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
     if (!desc) desc = &defaults;
     GSF__TRY(gsf__check_render(ctx, splats, camera, desc));
     if (splats->count != r->splat_count || camera->width != r->width || camera->height != r->height)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render backward: not the splats and camera of the last render");
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render backward: splats or camera differ from the last render");
     if (d_depth && !r->has_depth)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "render backward: d_depth given, but no depth was rendered");
     GSF__TRY(gsf__reserve_backward(ctx, r));
