@@ -5783,7 +5783,7 @@ static gsf_result gsf__nn_open_network(gsf_context* ctx, const char* folder, con
     return gsf__nn_end_loading(&loader, bind(&loader, network));
 }
 
-// ---- layers: a pass
+// ---- layers: state of a forward pass
 
 typedef struct gsf__nn_block_sizes { // of the network's blocks
     int64_t width, mlp;              // of a token; of the MLP's hidden layer
@@ -5840,8 +5840,7 @@ static float* gsf__nn_share(gsf__nn_arena* arena, size_t count) {
 static size_t gsf__nn_product(size_t a, size_t b) { return b != 0 && a > SIZE_MAX / b ? SIZE_MAX : a * b; }
 static size_t gsf__nn_larger(size_t a, size_t b) { return a > b ? a : b; }
 
-// Shows the tap `count` samples of (rows, columns), numbered from `first`, named by the run's label and a printf
-// format.
+// Shows the tap `count` samples of (rows, columns), numbered from `first`; name: the run's label and a printf format.
 GSF_PRINTF(7, 8)
 static void gsf__nn_reveal(const gsf__nn_run* run, const float* data, int64_t first, int64_t count, int64_t rows,
                            int64_t columns, const char* format, ...) {
@@ -5871,7 +5870,7 @@ static gsf_result gsf__nn_end_block(gsf__nn_run* run, const char* names, int64_t
     return gsf__check_cancel(run->ctx);
 }
 
-// ---- layers: forward
+// ---- layers: steps of a forward pass
 
 typedef struct gsf__nn_vectors { const float *weight, *bias; } gsf__nn_vectors;
 
@@ -5932,8 +5931,7 @@ static void gsf__nn_norm(gsf__nn_run* run, const gsf__nn_layer* layer, float eps
     gsf__nn_layer_norm(run->ctx, x, rows, layer->weight->count, v.weight, v.bias, eps, y);
 }
 
-// LayerNorm of each head of q or k, then RoPE; does nothing if the network has no such norm. See
-// gsf__nn_head_norm_rope.
+// LayerNorm of each head of q or k, then RoPE (gsf__nn_head_norm_rope); does nothing if the network has no such norm.
 static void gsf__nn_norm_heads(gsf__nn_run* run, const gsf__nn_layer* layer, float eps, int32_t heads, int32_t head_dim,
                                const float* cosine, const float* sine, int64_t rope_first, float* x, int64_t rows,
                                int64_t ldx) {
@@ -6165,8 +6163,8 @@ static gsf_result gsf__nn_block_forward(gsf__nn_run* run, const gsf__nn_block* b
     return gsf__nn_feed_forward(run, b, gsf__nn_widen(run, b->scale2, 0), x, rows);
 }
 
-// Table entries of a block, whose names differ between files. Letters: d width, m MLP, i heads * head_dim, t 3 * i, h
-// head_dim, b 0 if q, k, v have no biases, n 0 if q and k have no norms.
+// Table entries of a block, whose names differ between files. Letters: d width, m MLP, i heads * head_dim, t 3 * i,
+// h head_dim, b 0 if q, k, v have no biases, n 0 if q and k have no norms.
 #define GSF__NN_BLOCK(member) GSF__NN_AT(gsf__nn_block, member)
 #define GSF__NN_BLOCK_AS(member, form, option) offsetof(gsf__nn_block, member), form, option
 
@@ -6368,7 +6366,7 @@ typedef struct gsf__vit_plan {
     size_t floats, square;                 // of the whole layout; temporary, while positions are interpolated
 } gsf__vit_plan;
 
-// Divides `memory` for a run, or counts what a run needs if it is NULL. net: the aggregator around the DINOv2, or NULL.
+// Divides `memory` into buffers; NULL: only counts the floats needed. net: the aggregator around the DINOv2, or NULL.
 static gsf__vit_plan gsf__vit_lay_out(gsf__nn_run* run, const gsf__vit* vit, const gsf__vggt* net,
                                       const gsf_nn_encoder_desc* in, float* memory) {
     const size_t d = (size_t)vit->sizes.width, longer = (size_t)(in->height > in->width ? in->height : in->width);
@@ -6824,7 +6822,7 @@ GSF_API gsf_result gsf_nn_encode_vggt(gsf_context* ctx, const gsf_nn_vggt* vggt,
     return gsf__vit_encode(ctx, "vggt", &vggt->weights, &net->embed, net, input, out);
 }
 
-// ---- image encoders: from photos to a file of features
+// ---- image encoders: from photos to features
 
 enum { GSF__REFERENCE_SIDE = 518, GSF__REFERENCE_PATCH = 14 };
 
@@ -7047,8 +7045,8 @@ enum { GSF__BPE_CHARACTERS = 0x40000 }; // all characters above are GSF__BPE_OTH
 enum { // flags of tokens
     GSF__BPE_ADDED = 1,   // cut out of texts before splitting, and spelled literally
     GSF__BPE_SPECIAL = 2, // omitted when decoding without special tokens
-    GSF__BPE_LSTRIP = 4,  // also consumes the white space before / behind it
-    GSF__BPE_RSTRIP = 8,
+    GSF__BPE_LSTRIP = 4,  // also consumes the white space before it
+    GSF__BPE_RSTRIP = 8,  // also consumes the white space after it
     GSF__BPE_APART = 16,  // surrounded by spaces in decoded text
     GSF__BPE_OBJECT = 32  // given as an object in the JSON files
 };
@@ -7056,7 +7054,7 @@ enum { // flags of tokens
 enum { GSF__BPE_ADDED_MAX = 4096 };
 
 typedef struct gsf__bpe_token {
-    const char* text; // as the files spell it
+    const char* text; // as spelled in the files
     size_t size;
     int32_t id, flags;
 } gsf__bpe_token;
@@ -7066,7 +7064,7 @@ typedef struct gsf__bpe_merge {
     int32_t rank;
 } gsf__bpe_merge;
 
-typedef struct gsf__bpe_tables { // behind gsf_nn_bpe.tables
+typedef struct gsf__bpe_tables { // what gsf_nn_bpe.tables points to
     gsf__nn_config config, special_map, added_tokens; // own the texts of added tokens
     char* strings;           // texts of the vocabulary
     gsf__bpe_token* tokens;  // (vocabulary) sorted by text
@@ -7386,8 +7384,8 @@ static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) 
     return GSF_OK;
 }
 
-// Reads "added_tokens_decoder" of tokenizer_config.json, {"id": token, ...}, or else added_tokens.json, {"token": id,
-// ...}.
+// Reads "added_tokens_decoder" of tokenizer_config.json, {"id": token, ...}, or else added_tokens.json,
+// {"token": id, ...}.
 static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
     gsf__bpe_tables* t = l->t;
     const gsf__nn_config* file = l->decoder ? &t->config : &t->added_tokens;
@@ -7593,7 +7591,7 @@ typedef struct gsf__bpe_run {
     void* scratch;      // per word, see gsf__bpe_place
     size_t word_capacity;
     int32_t *symbols, *before, *after, *found, *batch; // one per byte of a word
-    uint64_t* heap;     // rank << 32 | place
+    uint64_t* heap;     // rank << 32 | index of the left symbol
     size_t heap_size;
 } gsf__bpe_run;
 
@@ -7927,7 +7925,7 @@ typedef struct gsf__opt {
     gsf__nn_block* blocks;
 } gsf__opt;
 
-typedef struct gsf__blip { // behind gsf_nn_captioner.nets
+typedef struct gsf__blip { // what gsf_nn_captioner.nets points to
     int64_t image_size;
     gsf_resize_filter filter;
     double rescale;
@@ -8372,7 +8370,7 @@ typedef struct gsf__opt_run {
     float *x, *logits; // (rows, width); (vocabulary), or with a tap (rows, vocabulary)
 } gsf__opt_run;
 
-// Divides `memory`, or counts the floats it needs if it is NULL.
+// Divides `memory` into buffers; NULL: only counts the floats needed.
 static size_t gsf__opt_lay_out(gsf__nn_run* run, const gsf__opt* opt, int64_t rows, int64_t logits, gsf__opt_run* o,
                                float* memory) {
     gsf__nn_arena arena = {memory, 0};
@@ -8404,8 +8402,7 @@ static void gsf__opt_embed(const gsf__opt* opt, const int32_t* ids, int64_t coun
     }
 }
 
-// Runs all layers on the rows of x. o->logits receives the last row's logits; with a tap and several rows the tap gets
-// all.
+// Runs all layers on the rows of x. o->logits receives the logits of the last row; a tap is shown all rows of a prefix.
 static gsf_result gsf__opt_forward(gsf__caption_run* run, gsf__opt_run* o, int64_t rows) {
     const gsf__opt* opt = &run->net->text;
     gsf__nn_run* nn = &run->nn;
@@ -8449,8 +8446,7 @@ static gsf_result gsf__opt_continue(gsf__caption_run* run, gsf__opt_run* o, int6
     return GSF_OK;
 }
 
-// Generates up to `most` new ids after the prefix of `words` (queries, width) and the text's ids; ids receives *count
-// ids.
+// Generates up to `most` new ids after the prefix of `words` (queries, width) and the text's ids; *count of them.
 static gsf_result gsf__opt_write(gsf__caption_run* run, const float* words, const int32_t* text, size_t text_count,
                                  int32_t most, int32_t* ids, size_t* count) {
     const gsf__opt* opt = &run->net->text;
@@ -8839,7 +8835,7 @@ typedef struct gsf__sp_added { // a text with an id of its own
     int trim_left, trim_right; // also removes the white space on that side
 } gsf__sp_added;
 
-typedef struct gsf__sp_model { // behind gsf_nn_tokenizer.model
+typedef struct gsf__sp_model { // what gsf_nn_tokenizer.model points to
     gsf__sp_node *pieces, *added; // ids of `added` are indices into added_list
     gsf__sp_added* added_list;
     gsf_buffer texts;
@@ -9379,8 +9375,7 @@ static void gsf__sp_offer(gsf__sp_best* best, float score, uint32_t start, int32
     best->id = id;
 }
 
-// Subtracts the score at `at` from those of all reached positions from there on, before large sums lose float
-// precision.
+// Subtracts the score at `at` from all scores from there on, as floats lose precision when the sums grow large.
 static void gsf__sp_rebase(gsf__sp_run* run, size_t at, size_t reached) {
     const float base = run->best[at].score;
     for (size_t i = at; i <= reached; i++)
@@ -9436,7 +9431,7 @@ static gsf_result gsf__sp_encode(gsf__sp_run* run, const char* text, size_t size
                 GSF__TRY(gsf__nn_emit(run->ctx, &run->out, m->bytes[(unsigned char)run->normal[i]]));
             continue;
         }
-        // merge consecutive ones; their text may be a piece excluded from segmentation, such as a control piece
+        // merge consecutive unknowns; their text may be a piece excluded from segmentation, such as a control
         if (id == m->unknown_id) {
             while (end < run->size && run->best[run->best[end].next].id == id) end = run->best[end].next;
             id = gsf__sp_find(m->pieces, run->normal + at, end - at);
@@ -9511,7 +9506,7 @@ GSF_API gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* 
 
 // ---- >>nn t5 --------------------------------------------------------------------
 
-typedef struct gsf__t5_nets { // behind gsf_nn_t5.nets
+typedef struct gsf__t5_nets { // what gsf_nn_t5.nets points to
     gsf__nn_block_sizes sizes;
     gsf__nn_block* blocks;
     const gsf_nn_tensor *embedding, *positions; // (buckets, heads), shared by all blocks
@@ -9636,7 +9631,7 @@ static void gsf__t5_fill_bias(const gsf_nn_t5* c, const gsf_nn_tensor* positions
 
 // ---- forward pass
 
-// Divides `memory`, or counts the floats it needs if it is NULL.
+// Divides `memory` into buffers; NULL: only counts the floats needed.
 static size_t gsf__t5_lay_out(gsf__nn_run* run, const gsf_nn_t5* c, const gsf_nn_t5_desc* in, float** x, float** bias,
                               float* memory) {
     gsf__nn_arena arena = {memory, 0};
@@ -10025,14 +10020,14 @@ static void gsf__vae_end(gsf__vae_run* run) {
     gsf__vae_release(run->ctx, &run->sums);
 }
 
-static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (slots, one frame, part of a frame; groups, 2) doubles
+static gsf_result gsf__vae_begin(gsf__vae_run* run) { // sums: (GSF__VAE_SLOTS + 2, groups, 2) doubles
     run->caches = (gsf__vae_cache*)gsf_alloc_zeroed(run->ctx, (size_t)run->net->causal_count, sizeof *run->caches);
     if (!run->caches) return GSF_ERROR_OUT_OF_MEMORY;
     return gsf__vae_grow(run, &run->sums, (GSF__VAE_SLOTS + 2) * run->net->groups * 2 * 2);
 }
 
 static int64_t gsf__vae_plane(const gsf__vae_map* map) { return map->height * map->width * map->channels; }
-// slot GSF__VAE_SLOTS: of one frame, + 1: of part of it
+// Sums of a slot's activation; slot GSF__VAE_SLOTS: of one frame, GSF__VAE_SLOTS + 1: of part of a frame.
 static double* gsf__vae_sums(const gsf__vae_run* run, int slot) {
     return (double*)(void*)run->sums.data + slot * run->net->groups * 2;
 }
@@ -10113,7 +10108,7 @@ static gsf_result gsf__vae_prepare_norm(gsf__vae_run* run, const gsf__vae_norm* 
     const double count = (double)in->frames * (double)in->height * (double)in->width * (double)per;
     gsf_nn_convert_tensor(norm->weight, 0, c, scale);
     gsf_nn_convert_tensor(norm->bias, 0, c, shift);
-    // E[x^2] - E[x]^2 in double, of float values: accurate to 1e-8 even if the mean is 1e4 deviations
+    // E[x^2] - E[x]^2 in double, of float values: accurate to 1e-8 even for a mean of 1e4 standard deviations
     for (int64_t i = 0; i < c; i++) {
         const double m = sums[i / per * 2] / count, v = sums[i / per * 2 + 1] / count - m * m;
         mean[i] = (float)m;
@@ -10201,8 +10196,7 @@ static void gsf__vae_keep(gsf__vae_run* run, gsf__vae_cache* cache, int before, 
     cache->last[1] = last;
 }
 
-// A causal layer with optional norm and SiLU before it (NULL: neither); the result is stored in, or added to,
-// out->slot.
+// A causal layer with optional norm and SiLU before it (NULL: neither); stores the result in out->slot, or adds it.
 static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_norm* norm,
                                   const gsf__vae_map* in, int accumulate, gsf__vae_map* out) {
     gsf__conv_job job;
@@ -10243,8 +10237,7 @@ static gsf_result gsf__vae_causal(gsf__vae_run* run, const gsf__conv_layer* laye
     return gsf__vae_finish(run, layer, out);
 }
 
-// Pointwise shortcut to slot out->slot. If that is the input's slot, in place frame by frame, as channels do not
-// increase.
+// Pointwise shortcut into out->slot; in place, frame by frame, if that is the input's slot (channels do not increase).
 static gsf_result gsf__vae_shortcut(gsf__vae_run* run, const gsf__conv_layer* layer, const gsf__vae_map* in,
                                     gsf__vae_map* out) {
     gsf__conv_job job;
@@ -10289,8 +10282,7 @@ static int64_t gsf__vae_double_source(int64_t t, int64_t frames, int time) {
     return !time || frames == 1 ? t : frames % 2 ? (t + 1) / 2 : t / 2;
 }
 
-// One frame of gsf__vae_double: `job` is set up for parity (0, 0) of the input; its packed weights cover all four
-// parities.
+// One frame of gsf__vae_double. `job` is set up for parity (0, 0); its packed weights cover all four parities.
 static void gsf__vae_double_frame(gsf__vae_run* run, const gsf__conv_layer* quarter, const gsf__conv_job* job, float* out) {
     double* sums = gsf__vae_sums(run, GSF__VAE_SLOTS);
     double* part = gsf__vae_sums(run, GSF__VAE_SLOTS + 1);
@@ -10343,8 +10335,7 @@ static gsf_result gsf__vae_double(gsf__vae_run* run, const gsf__vae_block* block
     return gsf__vae_finish(run, &block->sampler, x);
 }
 
-// With `time`, averages pairs of frames (the first frame of an odd clip is kept as is); then a 2D convolution of stride
-// 2.
+// With `time`, averages pairs of frames (keeping the first one of an odd clip); then a 2D convolution of stride 2.
 static gsf_result gsf__vae_halve(gsf__vae_run* run, const gsf__vae_block* block, gsf__vae_map* x) {
     gsf__conv_job job;
     gsf__conv_fill fill;
@@ -10787,7 +10778,7 @@ typedef struct gsf__dit_block {
 
 typedef struct gsf__dit_projector { gsf__nn_layer linear, norm; } gsf__dit_projector;
 
-typedef struct gsf__dit_nets { // behind gsf_nn_transformer.nets
+typedef struct gsf__dit_nets { // what gsf_nn_transformer.nets points to
     gsf__dit_block* blocks;
     gsf__nn_quantized* quantized; // one per tensor of the file, empty if not quantized; NULL: no tensor is
     gsf__dit_projector dino, vggt;
@@ -10843,9 +10834,9 @@ static const gsf__nn_entry gsf__dit_entries[] = {
 };
 #undef GSF__DIT_AT
 
-// Letters: d width, h head_dim, f 4 width, m 6 width, n 2 width, t time channels, x text channels, i in_channels, k
-// patch, p outputs of a token, s text and video tokens of the learned position table, b 0 if q, k, v have no biases, l
-// 0 without that table.
+// Letters: d width, h head_dim, f 4 width, m 6 width, n 2 width, t time channels, x text channels, i in_channels,
+// k patch, p outputs of a token, s text and video tokens of the learned position table, b 0 if q, k, v have no biases,
+// l 0 without that table.
 static gsf__nn_sizes gsf__dit_tensor_sizes(const gsf_nn_transformer* c) {
     const int64_t d = gsf__dit_width(c), frames = c->temporal_ratio ? (c->sample_frames - 1) / c->temporal_ratio + 1 : 0;
     const int64_t places = c->text_tokens + frames * (c->sample_height / c->patch) * (c->sample_width / c->patch);
@@ -11231,8 +11222,7 @@ static void gsf__dit_note_before(const gsf__dit_run* run, gsf_nn_block_cache* ca
     for (int64_t r = 0; r < rows; r += GSF__DIT_CACHE_ROWS, to += d) memcpy(to, run->x + r * d, (size_t)d * sizeof(float));
 }
 
-// Returns 1 if the first block's residual is close to that of the previous call (relative L1), and stores it for the
-// next.
+// 1 if the first block's residual is close to that of the previous call (relative L1); stores it for the next call.
 static int gsf__dit_is_similar(const gsf__dit_run* run, gsf_nn_block_cache* cache) {
     const int64_t rows = run->in->batch * run->tokens, d = run->width;
     double change = 0.0, size = 0.0;
@@ -11327,7 +11317,7 @@ static void gsf__dit_set_input(gsf__dit_run* run, const gsf_nn_transformer_desc*
     if (run->qkv_rows < 4) run->qkv_rows = 4; // a group of the feed-forward has 3/4 of them, which must not be 0
 }
 
-// Divides `memory`, or counts the floats it needs if it is NULL.
+// Divides `memory` into buffers; NULL: only counts the floats needed.
 static size_t gsf__dit_lay_out(gsf__dit_run* run, float* memory) {
     const gsf_nn_transformer* c = run->net;
     const size_t d = (size_t)run->width, rows = (size_t)run->tokens, time = (size_t)c->time_channels;
@@ -11764,7 +11754,7 @@ GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler) {
     memset(sampler, 0, sizeof *sampler);
 }
 
-// a = 0 occurs only at the zero-SNR end of the schedule, so not if the schedule or the first time step avoids it.
+// a = 0 occurs only at zero SNR, which a schedule without zero SNR or a start below it (strength < 1) never reaches.
 static void gsf__nn_plan_step(const gsf_nn_sampler* sampler, gsf__nn_step* step) {
     const int32_t i = sampler->index;
     const size_t n = sampler->desc.value_count;
@@ -12183,7 +12173,7 @@ GSF_API gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transforme
         out->flops += step_flops;
         if (step_bytes > bytes) bytes = step_bytes;
     }
-    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // residuals of the blocks, as large as the stream
+    if (run.desc.block_cache > 0.0f) bytes *= 1.3; // for the cached residuals, each as large as the stream
     if (encode.bytes > bytes) bytes = encode.bytes;
     if (decode.bytes > bytes) bytes = decode.bytes;
     const double own = (double)GSF__SAMPLE_BUFFERS * (double)run.count + (double)gsf__sample_kv_size(&run);
