@@ -5,21 +5,21 @@
        In exactly one C (C11) or C++ (C++17) file:
            #define GSFIXER_IMPLEMENTATION      // or GSFIXER_NN_IMPLEMENTATION for this module only
            #include "gsfixer_nn.h"             // includes gsfixer.h by itself
-       Everywhere else include it without the define. It knows nothing of splats: the repair loop sees the restorer
-       only through the interface of gsfixer.h.
+       Everywhere else include it without the define. This module does not depend on splats: the repair loop sees the
+       restorer only through the interface in gsfixer.h.
 
    WHAT IT DOES NOT DO
-       No training, no automatic differentiation, no graph: the networks are straight-line C. It converts no weight
-       file and fetches none.
+       No training, no automatic differentiation, no graph: the networks are straight-line C. It neither converts nor
+       downloads weight files.
 
    CONVENTIONS
        tensors         dense, row-major, the last dimension contiguous; shapes are written (rows, columns)
-       activations     float32; weights as the file has them (f32, bf16 or f16), widened while they are packed
+       activations     float32; weights as stored in the file (f32, bf16 or f16), widened to float32 while being packed
        linear layers   y = x w^T + b with w (out, in), as PyTorch stores it
        video           VAE: (channels, frames, height, width); transformer and latents: (frames, channels, height, width)
-       pixels          [-1, 1] at the VAE's border, [0, 1] at the restorer's
+       pixels          [-1, 1] for the VAE, [0, 1] for the restorer
 
-   STEP BY STEP (a clip restored by the paper's model; gsf_nn_make_dit puts the same behind gsfixer.h's interface)
+   STEP BY STEP (restore a clip with the paper's model; gsf_nn_make_dit does the same behind gsfixer.h's interface)
        gsf_nn_transformer transformer;
        gsf_nn_vae vae;
        gsf_nn_schedule schedule;
@@ -33,14 +33,15 @@
        desc.control = rendered; desc.text = embeddings; desc.references = references; desc.reference_tokens = tokens;
        gsf_nn_sample(&ctx, &transformer, &vae, &schedule, &desc, restored, NULL);   // check every result
 
-   MEMORY      Weight files are mapped where the platform can (else read whole) and used in place; what no layer touches
-               never leaves the disk. The kernels' scratch memory grows to the
+   MEMORY      Weight files are memory-mapped where the platform supports it (otherwise read whole) and used in place:
+               mapped tensors that are never used are not read from disk. The kernels' scratch memory grows to the
                largest need of a call and is reused within it.
-   THREADS     As gsfixer.h: the same bits for any number of workers.
-   PROCESSORS  Elementwise kernels are written once over the lanes of gsfixer.h, beside a scalar reference; the inner loops
-               of GEMM, GEMV, attention and convolution by hand for AVX2 and AVX-512. 8-bit layers use the dot products of
-               bytes (VNNI), layers and attention those of bfloat16 where a descriptor's member `bf16` asks for them.
-               gsf_context.cpu_level chooses; results differ between levels by the rounding of float32 sums.
+   THREADS     As in gsfixer.h: results are bit-identical for any number of workers.
+   PROCESSORS  Elementwise kernels are written once over the lanes of gsfixer.h, next to a scalar reference. The inner
+               loops of GEMM, GEMV, attention and convolution are hand-written for AVX2 and AVX-512. 8-bit layers use
+               byte dot products (VNNI); linear layers and attention use bfloat16 dot products if the `bf16` member of
+               their descriptor is set. gsf_context.cpu_level selects the level; results differ between levels by the
+               rounding of float32 sums.
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
@@ -72,118 +73,120 @@ enum { GSF_NN_MAX_RANK = 8 };
 
 typedef struct gsf_nn_tensor { // a view; owns nothing
     const char* name;
-    const void* data;       // row-major; in weight files of ANY alignment
+    const void* data;       // row-major; of ANY alignment in weight files
     gsf_nn_dtype dtype;
     int32_t rank;           // 0: one element
     int64_t shape[GSF_NN_MAX_RANK];
     int64_t count;          // product of the shape
 } gsf_nn_tensor;
 
-// A float tensor over the caller's memory, for arguments.
+// Wraps the caller's float array as a tensor, to pass it as an argument.
 GSF_API gsf_nn_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32_t rank, const int64_t* shape);
 
 typedef struct gsf_nn_weights { // an open file or folder of safetensors; tensors sorted by name
-    char name[256];             // of the file or folder, for error texts
+    char name[256];             // of the file or folder, for error messages
     gsf_nn_tensor* tensors;
     size_t tensor_count;
-    uint64_t mapped_bytes;      // file-backed: the system may drop them at any time
-    uint64_t read_bytes;        // held in memory because the platform or the io hook cannot map
+    uint64_t mapped_bytes;      // file-backed: the operating system may drop these pages at any time
+    uint64_t read_bytes;        // held in memory because the platform or the io hook cannot map files
     void* files;                // private
 } gsf_nn_weights;
 
-// Opens one .safetensors file, or a folder: its *.safetensors.index.json with all shards, else its only .safetensors
-// file. `prefix` (may be NULL) is the file name's start when a folder holds several ("diffusion_pytorch_model").
-// Every length, offset, shape and dtype is checked: malformed files give GSF_ERROR_FORMAT with file and byte offset. The
-// tensors of a file must cover its data exactly. BOOL reads as U8; other dtypes are unsupported. With the default io hook
-// files are mapped where the platform can: nobody may shorten them while they are open.
+// Opens one .safetensors file, or a folder: its *.safetensors.index.json with all shards, otherwise its only
+// .safetensors file. `prefix` (may be NULL) is the start of the file name, for a folder that holds several models
+// ("diffusion_pytorch_model"). Every length, offset, shape and dtype is checked: a malformed file gives
+// GSF_ERROR_FORMAT with the file name and byte offset. The tensors must cover the file's data exactly. BOOL is read as
+// U8; other dtypes are unsupported. With the default io hook, files are mapped where the platform supports it: do not
+// truncate an open file.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix,
                                                      gsf_nn_weights* out);
-// The same over one file's bytes, which the caller keeps until the weights are closed.
+// The same for one file in memory; the caller keeps the bytes until the weights are destroyed.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_weights(gsf_context* ctx, const char* name, const void* data,
                                                       size_t size, gsf_nn_weights* out);
 GSF_API void gsf_nn_destroy_weights(gsf_context* ctx, gsf_nn_weights* weights);
-GSF_API const gsf_nn_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name); // NULL when absent
-// Writes a safetensors file (names must differ; 8-byte aligned data, as the official writer does).
+GSF_API const gsf_nn_tensor* gsf_nn_find_tensor(const gsf_nn_weights* weights, const char* name); // NULL if absent
+// Writes a safetensors file. Names must be unique; data is 8-byte aligned, as Hugging Face's safetensors writes it.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const gsf_nn_tensor* tensors,
                                                      size_t count);
-// Widens `count` elements from `first` to float (f32, bf16, f16, f64 and the integers).
+// Converts `count` elements starting at `first` to float (f32, bf16, f16, f64 and the integers).
 GSF_API void gsf_nn_convert_tensor(const gsf_nn_tensor* tensor, int64_t first, int64_t count, float* out);
 
-// Private, for tests: shown every named intermediate of a network's pass, (rows, columns) of sample `index`.
+// Private, for tests: called with every named intermediate of a network, (rows, columns) of sample `index`.
 typedef struct gsf__nn_tap {
     void (*fn)(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns);
     void* user;
 } gsf__nn_tap;
 
-// ---- image encoders: what the references show -----------------------------------
-// DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per square of 14 x 14 pixels, row by row.
+// ---- image encoders for the reference photos ------------------------------------
+// DINOv2 with registers and VGGT's aggregator turn photos into tokens, one per 14 x 14 patch, in row-major order.
 
 typedef struct gsf_nn_dinov2 { // an open model; its weights stay in the mapped files
     int32_t width, heads, layers, mlp_width;
-    int32_t channels, patch;     // of the images; side of the square that makes a token
-    int32_t special;             // tokens before the patches': the class token and the registers
-    int32_t grid;                // squares along a side of the images that it was trained with
+    int32_t channels, patch;     // of the images; side of a patch in pixels
+    int32_t special;             // tokens that precede the patch tokens: the class token and the registers
+    int32_t grid;                // patches along a side of the training images
     double norm_eps;
     gsf_nn_weights weights;
     void* nets;                  // private
 } gsf_nn_dinov2;
 
-// Opens a Hugging Face folder of Dinov2WithRegistersModel: config.json and model*.safetensors. Missing, misshaped and
-// surplus tensors are named. Its SwiGLU variant (use_swiglu_ffn) is unsupported.
+// Opens a Hugging Face folder of Dinov2WithRegistersModel: config.json and model*.safetensors. The error names missing,
+// misshaped and surplus tensors. The SwiGLU variant (use_swiglu_ffn) is unsupported.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_dinov2(gsf_context* ctx, const char* folder, gsf_nn_dinov2* out);
 GSF_API void gsf_nn_destroy_dinov2(gsf_context* ctx, gsf_nn_dinov2* dinov2);
 
 typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapped files
     int32_t width, heads, layers, mlp_width; // of its blocks; layers: pairs of a frame and a global block
-    int32_t patch, embed_layers; // side of the square that makes a token; blocks of the DINOv2 that embeds the images
-    int32_t special;             // patch_start_idx: a camera token and registers stand before the patches' tokens
-    int32_t grid;                // squares along a side of the images that the embedding was trained with
-    double rope_base;            // of the rotation of q and k, 0: none
+    int32_t patch, embed_layers; // side of a patch in pixels; blocks of the DINOv2 that embeds the images
+    int32_t special;             // patch_start_idx: the camera token and registers that precede the patch tokens
+    int32_t grid;                // patches along a side of the images that the embedding was trained with
+    double rope_base;            // of the rotary embedding of q and k; 0: none
     gsf_nn_weights weights;
     void* nets;                  // private
 } gsf_nn_vggt;
 
-// Opens a folder with model*.safetensors, or one .safetensors file: the tensors aggregator.* under their released names,
-// all others are passed over. Where the folder has a config.json, VGGT's own keys in it count, which are embed_dim, depth,
-// num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq; what it does not tell comes from
-// the shapes of tensors, but for num_heads (width / 64 where q and k have no norms) and rope_freq (100).
+// Opens a folder with model*.safetensors, or one .safetensors file. It uses the tensors aggregator.* under their
+// released names and ignores all others. If the folder has a config.json, these keys of VGGT are read from it:
+// embed_dim, depth, num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq. Anything it
+// does not specify is inferred from tensor shapes, except num_heads (width / 64 if q and k have no norms) and rope_freq
+// (100).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
 GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
 
 typedef struct gsf_nn_encoder_desc {
     const float* pixels;           // (images, 3, height, width) in [0,1]
-    int32_t images, height, width; // sides in pixels, multiples of the patch
-    int32_t all_tokens;            // the special tokens, too; else those of the patches alone
+    int32_t images, height, width; // height and width in pixels, multiples of the patch size
+    int32_t all_tokens;            // return the special tokens as well; 0: only the patch tokens
     const gsf__nn_tap* _tap;       // private
 } gsf_nn_encoder_desc;
 
-// The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, and `special`
-// before them with all_tokens. Images are taken as they are. Positions are interpolated from the square grid as PyTorch
-// does it (bicubic, antialiased, align_corners=False). A NaN or infinity gives GSF_ERROR_NUMERIC and the layer's name. On
-// error `out` is zeroed. The context is asked for cancelling and told of progress after every block.
+// The last hidden state after its norm: out (images, tokens, width), tokens = height/patch * width/patch, preceded by
+// the `special` tokens if all_tokens is set. Images are not resized. Position embeddings are interpolated from the
+// square grid as PyTorch does it (bicubic, antialiased, align_corners=False). A NaN or infinity gives GSF_ERROR_NUMERIC
+// and the name of the layer. On error `out` is zeroed. Cancellation is checked and progress reported after every block.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_dinov2(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
                                                       const gsf_nn_encoder_desc* input, float* out);
-// The last pair's outputs: out (images, tokens, 2 width), frame block | global block, for all images together, which see
-// one another. ImageNet's mean and deviation are taken out here. Otherwise as above.
+// The outputs of the last pair of blocks: out (images, tokens, 2 width), frame block | global block. All images are
+// encoded together and attend to one another. Normalises with ImageNet's mean and deviation. Otherwise as above.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_vggt(gsf_context* ctx, const gsf_nn_vggt* vggt,
                                                     const gsf_nn_encoder_desc* input, float* out);
 
-typedef struct gsf_nn_features { // of reference photos; zero to begin with, destroy it
+typedef struct gsf_nn_features { // of reference photos; zero-initialise, then destroy it
     int64_t images, tokens;               // tokens of each image
     int64_t dino_channels, vggt_channels; // 0: not computed
     float *dino, *vggt;                   // (images, tokens, channels)
 } gsf_nn_features;
 
-// Prepares the photos and encodes them with the models that are given. A later call with the other model (of which only one
-// need then be open at a time) adds its tokens. All photos must come out in one size. On error the tokens that were to be
-// made are NULL.
+// Prepares the photos and encodes them with the models given. A later call with the other model adds its tokens, so
+// only one model need be open at a time. All photos must have the same size after preparation. On error the tokens that
+// the call would have computed are NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_references(gsf_context* ctx, const gsf_nn_dinov2* dinov2,
                                                           const gsf_nn_vggt* vggt, const gsf_image* photos, int32_t count,
                                                           gsf_nn_features* features);
 GSF_API void gsf_nn_destroy_features(gsf_context* ctx, gsf_nn_features* features);
 
 // ---- tokens: byte-level pair encoding -----------------------------------------------
-// What GPT-2 and OPT read, as transformers 4.51.3 does it (GPT2Tokenizer).
+// The tokenizer of GPT-2 and OPT, as in transformers 4.51.3 (GPT2Tokenizer).
 
 typedef struct gsf_nn_bpe {     // an open tokenizer
     int32_t bos, eos, unk, pad; // ids, -1: none
@@ -192,112 +195,115 @@ typedef struct gsf_nn_bpe {     // an open tokenizer
     void* tables;               // private
 } gsf_nn_bpe;
 
-// Opens FOLDER/vocab.json and merges.txt and, where they are there, tokenizer_config.json, special_tokens_map.json and
-// added_tokens.json. What is malformed, or names a token that there is not, gives GSF_ERROR_FORMAT with file and place.
+// Opens FOLDER/vocab.json and merges.txt and, if present, tokenizer_config.json, special_tokens_map.json and
+// added_tokens.json. Malformed content, or the name of an unknown token, gives GSF_ERROR_FORMAT with file and position.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_bpe(gsf_context* ctx, const char* folder, gsf_nn_bpe* out);
 GSF_API void gsf_nn_destroy_bpe(gsf_context* ctx, gsf_nn_bpe* bpe);
 
-// Ids of a text of `size` bytes, which must be UTF-8; *ids is freed with gsf_free. `no_bos` leaves the first token out even
-// where add_bos says otherwise. Time n log n whatever the text. Any number of threads, each with its context, may use one
+// Encodes `size` bytes of text, which must be UTF-8; free *ids with gsf_free. `no_bos` omits the leading bos token even
+// if add_bos is set. Takes O(n log n) time for any text. Any number of threads, each with its own context, may share a
 // tokenizer.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, size_t size,
                                                    int32_t no_bos, int32_t** ids, size_t* count);
-// Appends the text of `count` ids to `out`, which may come to hold zero bytes; bytes that are no UTF-8 become U+FFFD.
-// Ids that no token has are left out, with `skip_special` the special tokens (bos, eos, pad, <image> ...) as well.
+// Appends the text of `count` ids to `out`; the text may contain zero bytes. Invalid UTF-8 becomes U+FFFD. Ids without
+// a token are skipped; `skip_special` also skips the special tokens (bos, eos, pad, <image> ...).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_nn_bpe* bpe, const int32_t* ids,
                                                    size_t count, int32_t skip_special, gsf_buffer* out);
 
 // ---- captions ------------------------------------------------------------------------
-// BLIP-2 with OPT, which says in a few words what an image shows (transformers 4.51.3, Blip2ForConditionalGeneration). The
-// restorer's prompt begins with such a caption.
+// BLIP-2 with OPT (transformers 4.51.3, Blip2ForConditionalGeneration): a short caption for an image. The restorer's
+// prompt begins with such a caption.
 
 typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
-    int32_t image_size;           // side of the square that images are resized to, whatever their shape
-    int32_t query_tokens;         // words that stand for the image
-    int32_t vocabulary, positions; // of the language model: words, and the most tokens of image, prompt and caption
-    int32_t bos, eos;             // begins a caption without prompt; ends every caption
-    int32_t image_token;          // "image_token_index"; -1: an older folder without it, whose default length is less
+    int32_t image_size;           // images are resized to a square of this side, whatever their aspect ratio
+    int32_t query_tokens;         // tokens that represent the image in the language model's input
+    int32_t vocabulary, positions; // of the language model: ids; the most tokens of image, prompt and caption together
+    int32_t bos, eos;             // starts a caption without prompt; ends every caption
+    int32_t image_token;          // "image_token_index"; -1: an older folder without it, with a shorter default length
     gsf_nn_bpe tokenizer;
     gsf_nn_weights weights;
     void* nets;                   // private
 } gsf_nn_captioner;
 
 // Opens a Hugging Face folder: config.json, preprocessor_config.json, the tokenizer's files (gsf_nn_load_bpe) and
-// model*.safetensors in f32, bf16 or f16, which are computed with in float32. Keys that are absent have the defaults of
-// transformers. Missing, misshaped and surplus tensors are named (GSF_ERROR_FORMAT), as is what this code does not do
-// (GSF_ERROR_UNSUPPORTED): another language model than OPT, norms behind the layers (do_layer_norm_before false).
+// model*.safetensors in f32, bf16 or f16; it computes in float32. Absent keys get the defaults of transformers. The
+// error names missing, misshaped and surplus tensors (GSF_ERROR_FORMAT) and unsupported settings
+// (GSF_ERROR_UNSUPPORTED): a language model other than OPT, or norms after the layers (do_layer_norm_before false).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_captioner(gsf_context* ctx, const char* folder, gsf_nn_captioner* out);
 GSF_API void gsf_nn_destroy_captioner(gsf_context* ctx, gsf_nn_captioner* captioner);
 
-// The caption of an image (1, 3 or 4 channels, any dtype; alpha is left out) as zero-terminated UTF-8 without white space
-// at its ends. With a prompt, it goes on from there, and the prompt is not repeated; NULL: none. At most `max_new_tokens`
-// tokens, 0: 20 (older folders: 17, or 19 less two for each token of the prompt), the most likely one each time. The
-// text is cut behind a whole character where it does not fit `size` bytes; a zero byte in it becomes U+FFFD.
-// A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the tensor's or layer's name. Progress and
-// cancel after every layer. Any number of threads, each with its context, may use one captioner.
+// Captions an image (1, 3 or 4 channels, any dtype; alpha is ignored). The caption is zero-terminated UTF-8 without
+// leading or trailing white space. With a prompt (may be NULL), the caption continues it and does not repeat it.
+// Decoding is greedy and stops after `max_new_tokens` tokens; 0: 20 (older folders: 17, or 19 minus two per token of
+// the prompt). Text that does not fit into `size` bytes is cut after a whole character; a zero byte in it becomes
+// U+FFFD. A NaN or infinity in weights or between layers gives GSF_ERROR_NUMERIC and the name of the tensor or layer.
+// Progress and cancellation after every layer. Any number of threads, each with its own context, may share a captioner.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_caption_image(gsf_context* ctx, const gsf_nn_captioner* captioner,
                                                       const gsf_image* image, const char* prompt,
                                                       int32_t max_new_tokens, char* out, size_t size);
 
 // ---- text: tokenizer ------------------------------------------------------------------
-// SentencePiece's unigram model as the official pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) over
-// sentencepiece 0.2.3. Ids are those, exactly; other versions of it round otherwise, and may choose another of two
-// spellings of equal score.
+// SentencePiece's unigram model as GSFixer's pipeline runs it: transformers 4.51.3 T5Tokenizer (slow, legacy) with
+// sentencepiece 0.2.3. The ids match these versions exactly; other versions of sentencepiece round differently and may
+// pick the other of two segmentations with equal score.
 
-typedef struct gsf_nn_tokenizer { // owns what it needs; never changes, so that threads may share it
-    int32_t piece_count;                // of spiece.model: they have the ids 0 ... piece_count - 1
-    int32_t id_count;                   // all ids, those of added tokens as well, are smaller
+typedef struct gsf_nn_tokenizer { // self-contained and immutable: threads may share it
+    int32_t piece_count;                // of spiece.model; their ids are 0 ... piece_count - 1
+    int32_t id_count;                   // all ids, including those of added tokens, are smaller
     int32_t unknown_id, end_id, pad_id; // of <unk>, </s>, <pad>
     void* model;                        // private
 } gsf_nn_tokenizer;
 
-// Opens FOLDER/spiece.model, with the added tokens (<extra_id_0> ...) of FOLDER/tokenizer_config.json or, where that lists
-// none, FOLDER/added_tokens.json; without either file T5's 100. Every length and offset is checked: a malformed file gives
-// GSF_ERROR_FORMAT with its name and byte offset, another model than a unigram GSF_ERROR_UNSUPPORTED.
+// Opens FOLDER/spiece.model. The added tokens (<extra_id_0> ...) come from FOLDER/tokenizer_config.json or, if that
+// lists none, FOLDER/added_tokens.json; without either file they are T5's 100. Every length and offset is checked: a
+// malformed file gives GSF_ERROR_FORMAT with its name and byte offset, a model other than unigram
+// GSF_ERROR_UNSUPPORTED.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_tokenizer(gsf_context* ctx, const char* folder, gsf_nn_tokenizer* out);
 GSF_API void gsf_nn_destroy_tokenizer(gsf_context* ctx, gsf_nn_tokenizer* tokenizer);
 
-// `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD) to ids, the last of which is end_id. ids (room):
-// the first room - 1 and end_id where there are more, filled up with pad_id where there are fewer. The official room is
-// 226. *count (NULL allowed): how many there are, end_id included, had there been room. ids NULL and room 0 only count.
-// Time and memory are in proportion to the text: some 20 bytes for each of its own. Fails only for want of memory, and with
-// GSF_ERROR_INVALID_ARGUMENT for texts that are 2 GiB normalised.
+// Encodes `size` bytes of UTF-8 (zeros allowed; a malformed byte counts as U+FFFD); the last id is end_id. If there are
+// more than `room` ids, `ids` gets the first room - 1 and end_id; if there are fewer, it is padded with pad_id. GSFixer
+// uses a room of 226. *count (may be NULL) is the untruncated number of ids, including end_id. ids NULL with room 0
+// only counts. Time and memory are proportional to the text: about 20 bytes per byte of text. Fails only when out of
+// memory, or with GSF_ERROR_INVALID_ARGUMENT if the normalised text reaches 2 GiB.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* tokenizer,
                                                     const char* text, size_t size, int32_t* ids, size_t room,
                                                     size_t* count);
 
 // ---- text: T5 encoder -------------------------------------------------------------------
-// The encoder of T5 v1.1 (Raffel et al. 2020; transformers 4.51.3 T5EncoderModel). As the official pipeline runs it, there
-// is no attention mask: padding is looked at like any other token. Every size comes from the folder's config.json.
+// The encoder of T5 v1.1 (Raffel et al. 2020; transformers 4.51.3 T5EncoderModel). As in GSFixer's pipeline there is no
+// attention mask: padding is attended to like any other token. Every size is read from the folder's config.json.
 
 typedef struct gsf_nn_t5 { // an open model; its weights stay in the mapped files. Threads may share it
-    int32_t width, heads, head_dim, hidden, layers; // hidden: of the feed-forward
-    int32_t vocabulary;                             // ids are smaller
-    int32_t buckets, max_distance;                  // of the relative positions
+    int32_t width, heads, head_dim, hidden, layers; // hidden: width of the feed-forward layers
+    int32_t vocabulary;                             // all ids are smaller
+    int32_t buckets, max_distance;                  // of the relative position bias
     double norm_eps;
     gsf_nn_weights weights;
     void* nets;                                     // private
 } gsf_nn_t5;
 
-// Opens FOLDER/config.json and FOLDER/model*.safetensors. Missing, misshaped and surplus tensors are named in the error.
+// Opens FOLDER/config.json and FOLDER/model*.safetensors. The error names missing, misshaped and surplus tensors.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_t5(gsf_context* ctx, const char* folder, gsf_nn_t5* out);
 GSF_API void gsf_nn_destroy_t5(gsf_context* ctx, gsf_nn_t5* t5);
 
 typedef struct gsf_nn_t5_desc {
     const int32_t* ids; // (batch, tokens), from gsf_nn_encode_text
-    int32_t batch, tokens; // prompts of a batch share each layer's way from disk through the cache
+    int32_t batch, tokens; // each layer's weights are loaded once for all prompts of a batch
     const gsf__nn_tap* _tap; // private
 } gsf_nn_t5_desc;
 
-// The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so that of the mapped weights only one
-// layer's need be in memory at a time. An id that the vocabulary lacks: GSF_ERROR_INVALID_ARGUMENT. A NaN or infinity is
-// reported with the block where it first appears (GSF_ERROR_NUMERIC). Cancelled between layers; progress "text".
+// The prompts' embeddings: out (batch, tokens, width). Layers run one after another, so of the mapped weights only one
+// layer has to be in memory at a time. An id outside the vocabulary gives GSF_ERROR_INVALID_ARGUMENT. A NaN or infinity
+// is reported with the block where it first appears (GSF_ERROR_NUMERIC). Can be cancelled between layers; progress
+// "text".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_encode_t5(gsf_context* ctx, const gsf_nn_t5* t5, const gsf_nn_t5_desc* input,
                                                   float* out);
 // ---- video autoencoder ----------------------------------------------------------
-// AutoencoderKLCogVideoX as diffusers 0.32.1 runs it: clips go through in chunks of 8 frames (encoder) or 2 latent frames
-// (decoder), the remainder joins the first chunk, causal convolutions see the last two frames of the chunk before, and the
-// group norms' statistics are each chunk's own. latents are (latent_channels, frames, height/8, width/8), unscaled.
+// AutoencoderKLCogVideoX as diffusers 0.32.1 runs it: clips are processed in chunks of 8 frames (encoder) or 2 latent
+// frames (decoder), with the remainder added to the first chunk. Causal convolutions see the last two frames of the
+// previous chunk; group norms compute their statistics per chunk. latents are (latent_channels, frames, height/8,
+// width/8), unscaled.
 
 enum { GSF_NN_VAE_LEVELS = 8 };
 
@@ -306,35 +312,35 @@ typedef struct gsf_nn_vae { // an open model; its weights stay in the mapped fil
     int32_t levels, channels[GSF_NN_VAE_LEVELS]; // of the encoder's levels, finest first
     int32_t layers_per_block, norm_groups;
     int32_t spatial_ratio, temporal_ratio;       // pixels per latent pixel; frames per latent frame
-    int32_t sample_height, sample_width;         // the pixels that the model was made for; tiles are half of them
+    int32_t sample_height, sample_width;         // trained size in pixels; tiles are half of it
     double norm_eps, scaling_factor;             // the diffusion model sees latents * scaling_factor
     gsf_nn_weights weights;
     void* nets;                                  // private
 } gsf_nn_vae;
 
-// Opens a diffusers folder: config.json and diffusion_pytorch_model*.safetensors. A missing, misshaped or surplus tensor
-// gives GSF_ERROR_FORMAT and is named.
+// Opens a diffusers folder: config.json and diffusion_pytorch_model*.safetensors. A missing, misshaped or surplus
+// tensor gives GSF_ERROR_FORMAT and its name.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_vae(gsf_context* ctx, const char* folder, gsf_nn_vae* out);
 GSF_API void gsf_nn_destroy_vae(gsf_context* ctx, gsf_nn_vae* vae);
 
 typedef struct gsf_nn_vae_desc {
-    int32_t tiled;             // in overlapping tiles, blended linearly: less memory, other values (statistics per tile)
+    int32_t tiled;             // overlapping, linearly blended tiles: less memory, other values (statistics per tile)
     int32_t tile_height, tile_width;   // pixels, 0: half of sample_height, sample_width
     double overlap_height, overlap_width; // parts of a tile, 0: 1/6 and 1/5. Tile times overlap must be whole latents.
-    double max_bytes;          // refuse before starting, with GSF_ERROR_OUT_OF_MEMORY, what needs more; 0: no limit
+    double max_bytes;          // needing more fails with GSF_ERROR_OUT_OF_MEMORY before it starts; 0: no limit
 } gsf_nn_vae_desc;
 
 typedef enum gsf_nn_vae_way { GSF_NN_VAE_ENCODE = 0, GSF_NN_VAE_DECODE } gsf_nn_vae_way;
 
 typedef struct gsf_nn_vae_info {
-    int64_t frames, height, width; // of the result. 2 latent frames give 8 frames, 3 give 9: the official code's way
-    int64_t chunks;                // steps of progress
+    int64_t frames, height, width; // of the result. As in diffusers, 2 latent frames decode to 8 frames, 3 to 9
+    int64_t chunks;                // number of progress steps
     double flops;                  // 2 per multiply-add of the convolutions that will be computed
-    double bytes;                  // memory taken besides input, output and mapped weights, at the peak
+    double bytes;                  // peak memory, excluding input, output and mapped weights
 } gsf_nn_vae_info;
 
-// Sizes and cost of a run over `frames` x `height` x `width` (latents when decoding), without running it. `desc` may be
-// NULL.
+// Output size and cost of a run over `frames` x `height` x `width` (of the latents when decoding), without running it.
+// `desc` may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_query_vae(gsf_context* ctx, const gsf_nn_vae* vae, gsf_nn_vae_way way,
                                                   const gsf_nn_vae_desc* desc, int64_t frames, int64_t height,
                                                   int64_t width, gsf_nn_vae_info* out);
@@ -351,45 +357,46 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_vae(gsf_context* ctx, const gsf_n
                                                    float* video);
 
 // ---- the restorer's transformer ----------------------------------------------------
-// CogVideoX 5B I2V with a cross-attention to reference tokens in every block (GSFixer, sec. 3.2). Every size comes from
+// CogVideoX 5B I2V with cross-attention to reference tokens in every block (GSFixer, sec. 3.2). Every size is read from
 // the folder's config.json.
 
 typedef struct gsf_nn_transformer { // an open model; its weights stay in the mapped files
     int32_t heads, head_dim, layers;                        // width = heads * head_dim
-    int32_t in_channels, out_channels;                      // of the latents: noisy and control together, velocity
+    int32_t in_channels, out_channels;                      // of the latents: noisy and control concatenated; velocity
     int32_t text_channels, text_tokens, time_channels;
-    int32_t dino_channels, vggt_channels;                   // of the two kinds of reference token
-    int32_t patch;                                          // side of the square of latents that makes a token
-    int32_t sample_width, sample_height, sample_frames;     // latents across and down, video frames: what it was made for
+    int32_t dino_channels, vggt_channels;                   // of the two kinds of reference tokens
+    int32_t patch;                                          // side of the square of latents that one token covers
+    int32_t sample_width, sample_height, sample_frames;     // trained size: latents across and down, video frames
     int32_t temporal_ratio;                                 // video frames per latent frame
     int32_t attention_bias, learned_positions, rotary_positions;
-    double spatial_scale, temporal_scale;                   // of the sine-cosine positions
+    double spatial_scale, temporal_scale;                   // of the sine-cosine position embedding
     double norm_eps;
     gsf_nn_weights weights;
-    int32_t bf16;                                           // set it at any time: linear layers and attention by the
-                                                            //   members `bf16` of their descriptions
+    int32_t bf16;                                           // the `bf16` member of its linear layers and attention;
+                                                            // may be changed at any time
     void* nets;                                             // private
 } gsf_nn_transformer;
 
-// Opens FOLDER/config.json and FOLDER/diffusion_pytorch_model*.safetensors. Missing, misshaped and surplus tensors are
-// named in the error.
+// Opens FOLDER/config.json and FOLDER/diffusion_pytorch_model*.safetensors. The error names missing, misshaped and
+// surplus tensors.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_transformer(gsf_context* ctx, const char* folder, gsf_nn_transformer* out);
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer);
 
-// From now on the blocks' linear layers work in 8-bit integers (gsf__nn_run_linear_int8). Takes about a byte for each of their
-// weights, 7.1 GB at the release's size, which *bytes (NULL allowed) tells; the mapped ones are not touched any more.
+// Switches the blocks' linear layers to 8-bit integers (gsf__nn_run_linear_int8). Allocates about one byte per weight
+// (7.1 GB at the size of the GSFixer release), returned in *bytes (may be NULL); the mapped originals are no longer
+// accessed.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer,
                                                              size_t* bytes);
 
 // Reference tokens for the cross-attention: the sum of both projections. dino (tokens, dino_channels), vggt (tokens,
-// vggt_channels), either NULL: left out (the paper's ablation). out: (tokens, width).
+// vggt_channels); either may be NULL to leave it out (the paper's ablation). out: (tokens, width).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_project_references(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                            int64_t tokens, const float* dino, const float* vggt,
                                                            float* out);
 
-typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_desc; zero it, set threshold, destroy when done
-    float threshold; // a step whose first block changes less than this (relative L1) reuses what the others did; 0: never
-    float *first, *before, *rest; // private: what the first block, and all others, added
+typedef struct gsf_nn_block_cache { // for gsf_nn_transformer_desc; zero it, set threshold, destroy it when done
+    float threshold; // reuse the others' residuals if the first block's changes by less (relative L1); 0: never
+    float *first, *before, *rest; // private: residuals of the first block and of all others
     size_t size;
     int64_t hits, calls;
 } gsf_nn_block_cache;
@@ -400,22 +407,24 @@ typedef struct gsf_nn_transformer_desc {
     int32_t batch, frames, height, width; // of the latents
     const float* hidden;                  // (batch, frames, in_channels, height, width)
     const float* text;                    // (batch, text tokens, text_channels)
-    int32_t text_tokens;                  // 0: as configured
+    int32_t text_tokens;                  // 0: the configured number
     const double* timesteps;              // (batch), 0 .. 999
     const float* references;              // (reference_batch, reference_tokens, width); NULL: no cross-attention
     int64_t reference_tokens;
-    int32_t reference_batch;              // batch, or 1: all rows of the batch share them
-    int32_t no_rotary;                    // leave the rotation out even if the configuration has it
+    int32_t reference_batch;              // batch, or 1: shared by all rows of the batch
+    int32_t no_rotary;                    // disable the rotary embedding even if it is configured
     gsf_nn_block_cache* cache;            // NULL: every block runs
-    float* reference_kv;                // gsf__nn_query_reference_kv floats that hold the references' keys and values
-    int32_t reference_kv_ready;           // from an earlier call; NULL: computed anew in every call
+    float* reference_kv;                  // the references' keys and values, gsf__nn_query_reference_kv floats;
+                                          // NULL: recompute them in every call
+    int32_t reference_kv_ready;           // reference_kv was filled by an earlier call
     const gsf__nn_tap* _tap;              // private
 } gsf_nn_transformer_desc;
 
 // Predicted velocity: out (batch, frames, out_channels, height, width). A NaN or infinity is reported with the block
-// where it first appears (GSF_ERROR_NUMERIC). Other sizes than the configured ones: GSF_ERROR_UNSUPPORTED where the
-// position table is learned. For other frame counts (or text tokens) sines and cosines stand in for that table, as the
-// official code has it: positions that the model was not trained with, which gsf_nn_sample_desc.any_frames asks for.
+// where it first appears (GSF_ERROR_NUMERIC). If the position table is learned, a height or width other than the
+// configured one gives GSF_ERROR_UNSUPPORTED. For another number of frames (or text tokens) sine-cosine positions
+// replace the table, as in diffusers; the model was not trained with them. gsf_nn_sample_desc.any_frames opts in to
+// this.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_run_transformer(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                         const gsf_nn_transformer_desc* input, float* out);
 
@@ -426,14 +435,14 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_run_transformer(gsf_context* ctx, const 
 typedef enum gsf_nn_spacing { GSF_NN_SPACING_TRAILING = 0, GSF_NN_SPACING_LEADING,
                              GSF_NN_SPACING_LINSPACE } gsf_nn_spacing;
 
-typedef struct gsf_nn_schedule_desc { // all zero: CogVideoX-5B's
+typedef struct gsf_nn_schedule_desc { // all zero: the values of CogVideoX-5B
     int32_t train_steps;           // 0: 1000
     double beta_start, beta_end;   // 0: 0.00085, 0.012
-    int32_t linear_betas;          // else linear in sqrt(beta) ("scaled_linear")
-    int32_t no_zero_snr;           // else the table is stretched so that abar ends at 0
-    int32_t no_alpha_one;          // else the last step goes to abar = 1, not to abar of time step 0
+    int32_t linear_betas;          // 0: linear in sqrt(beta) ("scaled_linear")
+    int32_t no_zero_snr;           // 0: rescale the table so that abar ends at 0
+    int32_t no_alpha_one;          // 0: the last step goes to abar = 1, otherwise to abar of time step 0
     gsf_nn_spacing spacing;
-    int32_t steps_offset;  // added to the time steps of GSF_NN_SPACING_LEADING
+    int32_t steps_offset;  // added to the time steps; GSF_NN_SPACING_LEADING only
     double snr_shift_scale;        // 0: 1; CogVideoX-2B was trained with 3
 } gsf_nn_schedule_desc;
 
@@ -445,17 +454,17 @@ typedef struct gsf_nn_schedule {
 
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_schedule(gsf_context* ctx, const gsf_nn_schedule_desc* desc,
                                                       gsf_nn_schedule* out);
-// From a scheduler_config.json; keys that are missing have the defaults of diffusers' DDIMScheduler. The class it names
-// is not looked at, as the official pipeline does not either. What is not v-prediction or clips is unsupported.
+// Reads a scheduler_config.json; missing keys get the defaults of diffusers' DDIMScheduler. As in GSFixer's pipeline,
+// the class name in the file is ignored. Anything but v-prediction, and clipping, is unsupported.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_parse_schedule(gsf_context* ctx, const char* name, const char* text, size_t size,
                                                        gsf_nn_schedule* out);
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_schedule(gsf_context* ctx, const char* path, gsf_nn_schedule* out);
 GSF_API void gsf_nn_destroy_schedule(gsf_context* ctx, gsf_nn_schedule* schedule);
 
 typedef enum gsf_nn_solver {
-    GSF_NN_SOLVER_DDIM = 0, // first order; the next time is t - train_steps/steps (whole division), as diffusers has it
-    GSF_NN_SOLVER_DPMPP_2M, // DPM-Solver++(2M): second order, remembers one prediction (Lu et al. 2022b)
-    GSF_NN_SOLVER_UNIPC, // UniPC, B2, order 2: that and a corrector which needs no further model call (Zhao et al. 2023)
+    GSF_NN_SOLVER_DDIM = 0, // first order; the next time is t - train_steps/steps (integer division), as in diffusers
+    GSF_NN_SOLVER_DPMPP_2M, // DPM-Solver++(2M): second order, keeps one earlier prediction (Lu et al. 2022b)
+    GSF_NN_SOLVER_UNIPC, // UniPC, B2, order 2: adds a corrector that needs no further model call (Zhao et al. 2023)
 } gsf_nn_solver;
 
 typedef struct gsf_nn_sampler_desc {
@@ -465,24 +474,24 @@ typedef struct gsf_nn_sampler_desc {
     size_t value_count; // of the latents
 } gsf_nn_sampler_desc;
 
-// A run of a solver. `index` and `memory` are all that a checkpoint must keep beside the latents: make the sampler anew
-// with the same desc and fill them in.
+// The state of a solver. To resume from a checkpoint, make a sampler with the same desc and restore `index` and
+// `memory` (and the latents); nothing else changes during a run.
 typedef struct gsf_nn_sampler {
     gsf_nn_sampler_desc desc;
     const gsf_nn_schedule* schedule; // borrowed
     int32_t* timesteps;              // (count)
     int32_t count, index;            // the next model call is for timesteps[index]
-    float* memory;                   // (memory_count): earlier predictions
+    float* memory;                   // (memory_count): earlier predictions of the solver
     size_t memory_count;             // 0, 1 or 3 times value_count
 } gsf_nn_sampler;
 
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_sampler(gsf_context* ctx, const gsf_nn_schedule* schedule,
                                                      const gsf_nn_sampler_desc* desc, gsf_nn_sampler* out);
-// Frees the time steps and earlier predictions; the schedule is the caller's.
+// Frees the time steps and earlier predictions; does not free the schedule.
 GSF_API void gsf_nn_destroy_sampler(gsf_context* ctx, gsf_nn_sampler* sampler);
-// One step: x (value_count), the latents at timesteps[index], becomes those at the next one; v is the model's output for
-// x. x0 (NULL allowed) gets the predicted clean latents. eta is 0: nothing is random. A latent that is NaN or infinite
-// afterwards gives GSF_ERROR_NUMERIC, which names the step.
+// One step: x (value_count), the latents at timesteps[index], is advanced to the next time step; v is the model's
+// output for x. x0 (may be NULL) receives the predicted clean latents. eta is 0, so nothing is random. A latent that is
+// NaN or infinite afterwards gives GSF_ERROR_NUMERIC with the number of the step.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sampler* sampler, const float* v, float* x,
                                                      float* x0);
 
@@ -490,48 +499,49 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_step_sampler(gsf_context* ctx, gsf_nn_sa
 
 typedef struct gsf_nn_sample_desc {
     uint32_t _start_canary;
-    int32_t frames, height, width;  // of the video; frames 1, 9, 17, ... so that the VAE gives back as many
-    int32_t any_frames;             // take other counts than the trained one where positions are learned: see
-                                    //   gsf_nn_run_transformer
-    const float* control;           // (3, frames, height, width) in [-1,1]: what is to be restored
+    int32_t frames, height, width;  // of the video; frames 1, 9, 17, ..., the counts that the VAE reproduces
+    int32_t any_frames;             // allow other frame counts than the trained one if positions are learned: see
+                                    // gsf_nn_run_transformer
+    const float* control;           // (3, frames, height, width) in [-1,1]: the video to restore
     const float* text;              // (2, text tokens, text channels): negative prompt, prompt
     const float* references;        // (reference_tokens, width) from gsf_nn_project_references; NULL: none
     int64_t reference_tokens;
     int32_t steps;                  // default 50
     gsf_nn_solver solver;           // default DDIM
-    float guidance;                 // classifier-free guidance; default 6, 1: none (half the work)
-    float guidance_begin, guidance_end; // part of the steps, in [0,1], that is guided; default 0 to 1
-    int32_t dynamic_guidance;       // the official code's cosine ramp of the guidance
-    float strength;                 // (0,1]: how much of the noise schedule is run; default 1: from pure noise
+    float guidance;                 // classifier-free guidance; default 6; 1: none (half the cost)
+    float guidance_begin, guidance_end; // fraction of the steps, in [0,1], that is guided; default 0 to 1
+    int32_t dynamic_guidance;       // cosine ramp of the guidance, as in diffusers' CogVideoX (use_dynamic_cfg)
+    float strength;                 // (0,1]: fraction of the noise schedule to run; default 1: start from pure noise
     float block_cache;              // gsf_nn_block_cache.threshold; default 0: off
-    int32_t no_reference_cache;     // project the references' keys and values anew in every step, to save memory
+    int32_t no_reference_cache;     // project the references' keys and values again in every step, to save memory
     uint64_t seed;
-    const float* noise;             // (latent frames, latent channels, height/8, width/8) or NULL: from the seed
-    double max_bytes;               // refuse before starting what needs more memory (GSF_ERROR_OUT_OF_MEMORY); 0: no limit
-    const char* checkpoint;         // file written after every step and resumed from when model, precision, settings and
-                                    //   inputs are the same; NULL: none
+    const float* noise;             // (latent frames, latent channels, height/8, width/8); NULL: drawn from the seed
+    double max_bytes;               // needing more fails with GSF_ERROR_OUT_OF_MEMORY before it starts; 0: no limit
+    const char* checkpoint;         // file written after every step, and resumed from if the model, precision, settings
+                                    // and inputs match; NULL: none
     const gsf__nn_tap* _tap;        // private
     uint32_t _end_canary;
 } gsf_nn_sample_desc;
 
-// A desc with its defaults filled in.
+// Returns the desc with its defaults filled in.
 GSF_API gsf_nn_sample_desc gsf_nn_resolve_sample_desc(const gsf_nn_sample_desc* desc);
 
 typedef struct gsf_nn_sample_stats {
-    int32_t steps, resumed_from;    // steps run in this call; first step of it
-    int32_t network_rows;           // samples that went through the transformer: 2 for a guided step
-    int64_t cached_steps;           // steps whose blocks the cache skipped
+    int32_t steps, resumed_from;    // steps run in this call; index of the first of them
+    int32_t network_rows;           // samples run through the transformer: 2 per guided step
+    int64_t cached_steps;           // steps in which the block cache skipped blocks
 } gsf_nn_sample_stats;
 
-// The restored video (3, frames, height, width), not clamped, about [-1,1]. stats may be NULL.
+// The restored video (3, frames, height, width), roughly in [-1,1] but not clamped. stats may be NULL.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                const gsf_nn_vae* vae, const gsf_nn_schedule* schedule,
                                                const gsf_nn_sample_desc* desc, float* out, gsf_nn_sample_stats* stats);
 
 typedef struct gsf_nn_sample_info { double bytes,
-                                   flops; } gsf_nn_sample_info; // anonymous memory at the peak; operations
+                                   flops; } gsf_nn_sample_info; // peak anonymous memory; floating-point operations
 
-// What gsf_nn_sample will take, before it runs; refuses what it would refuse.
+// The cost of gsf_nn_sample, without running it; fails with the errors that gsf_nn_sample would report before it
+// starts.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                      const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
                                                      gsf_nn_sample_info* out);
@@ -542,40 +552,43 @@ typedef enum gsf_nn_condition { GSF_NN_CONDITION_BOTH = 0, GSF_NN_CONDITION_2D, 
                                GSF_NN_CONDITION_NONE } gsf_nn_condition;
 
 typedef struct gsf_nn_dit_desc {
-    const char* model;       // folder as released: transformer/, vae/, scheduler/; and, for what `features` does not hold,
-                             //   dinov2/ and vggt/ (reference tokens), tokenizer/ and text_encoder/ (prompts)
-    const char* features;    // NULL, or safetensors of what was encoded before: see FEATURES below
-    const char* caption;     // what all clips show; NULL: the window's, else blip2/ describes the first frame
-    const char* save_features; // file that gets the features of all photos and clips, as `features` takes them; NULL: none
-    int32_t keep_saved;      // what it holds already is kept and used: a run goes on. Else it is replaced
-    gsf_nn_condition condition; // which reference tokens guide (the paper's ablation)
+    const char* model;       // folder as released: transformer/, vae/, scheduler/; for whatever `features` lacks, also
+                             // dinov2/ and vggt/ (reference tokens), tokenizer/ and text_encoder/ (prompts)
+    const char* features;    // NULL, or a safetensors file of precomputed features: see FEATURES below
+    const char* caption;     // for all clips; NULL: the window's, or else blip2/ captions the first frame
+    const char* save_features; // file to write all photos' and clips' features to, usable as `features`; NULL: none
+    int32_t keep_saved;      // keep and use what this file already holds, to continue a run; 0: replace the file
+    gsf_nn_condition condition; // which reference tokens condition the model (the paper's ablation)
     int32_t int8;            // gsf_nn_quantize_transformer
     int32_t bf16;            // gsf_nn_transformer.bf16
-    gsf_nn_sample_desc sample;  // steps, solver, guidance, any_frames ...; sizes, pointers and seed are filled in for each
-                                //   window
+    gsf_nn_sample_desc sample;  // steps, solver, guidance, any_frames ...; sizes, pointers and seed are set per window
 } gsf_nn_dit_desc;
 
-/* The paper's restorer behind the interface of gsfixer.h. `desc`'s texts are copied.
+/* The paper's restorer behind the interface of gsfixer.h. The strings of `desc` are copied.
 
-   FRAMES      It asks for what the model was trained on: as many frames, of that size, into which the whole photo is
-               squashed (limits.frame_count, width, height, squash; 49 of 720 x 480 at the release). A frame that is a
-               photo's view is replaced by the photo, resized likewise with PIL's bicubic filter. sample.any_frames allows 9,
-               17, ... frames: then sines stand in for the learned positions, as the official code has it silently. On the
-               tests' small model of random weights that alone moves the same clip's frames by 0.67 (relative L2).
-               That tells that positions count, not what it does to the released model: nobody has measured that here.
-   REFERENCES  A clip's references are the photos whose view its first and last frame are, or those nearest to their cameras
-               in units of the photos' own median distance to what they look at; without cameras, all photos. They are
-               squashed to the model's size before they are encoded: 925 tokens each at the release, whatever their aspect.
-   FEATURES    What files lack is encoded before a clip is restored: captioner, text encoder, DINOv2 and VGGT are opened one
-               after another, run and closed. In a file, features go by photo and clip, both counted from 0:
+   FRAMES      It requests clips as the model was trained: that many frames of that size, with the whole photo squashed
+               into it (limits.frame_count, width, height, squash; 49 frames of 720 x 480 at the release). A frame that
+               shows a photo's view is replaced by the photo, resized likewise with PIL's bicubic filter.
+               sample.any_frames allows 9, 17, ... frames: sine-cosine positions then replace the learned ones, which
+               diffusers does silently. With the tests' small model of random weights that alone changes the same clip's
+               frames by 0.67 (relative L2). This shows that positions matter; the effect on the released model has not
+               been measured.
+   REFERENCES  The references of a clip are the photos taken from its first and last frame's views, or the photos nearest
+               to those cameras, with distances in units of the photos' own median distance to what they look at; without
+               cameras, all photos. They are squashed to the model's size before encoding: 925 tokens each at the
+               release, whatever their aspect ratio.
+   FEATURES    Features missing from the file are encoded before a clip is restored: captioner, text encoder, DINOv2 and
+               VGGT are opened, run and closed one after another. In a file, features are named by photo and clip, both
+               counted from 0:
                    dino_latents.photo4     (1, tokens, channels)
-                   vggt_latents.photo4,7   (2, tokens, channels): these two together, first and last
+                   vggt_latents.photo4,7   (2, tokens, channels): first and last photo, encoded together
                    prompt_embeds.clip12    (2, text tokens, text channels): negative prompt, prompt
-               A file of a single clip may have dino_latents, vggt_latents (images, tokens, channels) and prompt_embeds:
-               they count for clip 0 alone. A folder that will be needed and is absent is named when the restorer is made,
-               or, where a file has features but not those of a clip, with their name when it comes to that clip. */
-// Progress: "clip" (0 of 1: it begins), then behind each unit of its work "caption", "text", "dinov2", "vggt",
-// "vae encode", "transformer", "restore" (steps), "vae decode".
+               A file for a single clip may have dino_latents, vggt_latents (images, tokens, channels) and
+               prompt_embeds, which apply to clip 0 only. A folder that will be needed but is missing is reported when
+               the restorer is made; if the file has features but lacks those of some clip, the error comes at that clip
+               and names them. */
+// Progress: "clip" (0 of 1, at its start), then after each unit of work "caption", "text", "dinov2", "vggt", "vae
+// encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -594,24 +607,25 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 #if !defined(GSF_NN_IMPLEMENTED) || defined(GSF__ISA)
 #define GSF_NN_IMPLEMENTED
 
-// Under GSF__ISA this header includes itself for one of its parts GSF__KERNELS_...: see >>lanes of gsfixer.h.
+// When GSF__ISA is defined, this header includes itself for one of its GSF__KERNELS_... parts: see >>lanes of
+// gsfixer.h.
 #ifndef GSF__ISA
 
-#include "gsfixer.h" // again: its internals, if all was included before without an implementation macro
+#include "gsfixer.h" // again, for its internals, in case it was included before without an implementation macro
 
 GSF__BEGIN_IMPLEMENTATION
 
 // ---- >>nn kernels: what the layers are made of --------------------------------
-// All pointers are float32 and 4-byte aligned; outputs do not overlap inputs unless a comment allows it.
+// All pointers are to float32 and 4-byte aligned; outputs must not overlap inputs unless a comment allows it.
 
-typedef struct gsf__nn_workspace { // scratch memory of kernels; zero to begin with, grows, and is reused
+typedef struct gsf__nn_workspace { // scratch memory of kernels; zero-initialise; grows on demand and is reused
     void* memory;
     size_t size;
 } gsf__nn_workspace;
 
 static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* workspace);
 
-// GELU is x/2 (1 + erf(x / sqrt 2)) with a relative error below 1e-6 for all x, GELU_TANH the usual approximation of it.
+// GELU is x/2 (1 + erf(x / sqrt 2)), with a relative error below 1e-6 for all x; GELU_TANH is its usual approximation.
 typedef enum gsf__nn_activation {
     GSF__NN_LINEAR = 0, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU, GSF__NN_RELU,
 } gsf__nn_activation;
@@ -619,44 +633,46 @@ typedef enum gsf__nn_activation {
 typedef struct gsf__nn_linear_desc {
     const float* x;            // (rows, in), row stride ldx
     int64_t rows, ldx;         // ldx 0: in
-    const gsf_nn_tensor* weight; // (out, in); f32, bf16 or f16. Higher ranks: (out, product of the rest)
+    const gsf_nn_tensor* weight; // (out, in); f32, bf16 or f16. Higher ranks: (out, product of the other dimensions)
     const gsf_nn_tensor* bias; // (out) or NULL
     gsf__nn_activation activation;
     const float* gate;         // (out) or NULL: y += gate * activation(x w^T + b) instead of y = ...
     int32_t accumulate;        // y += activation(x w^T + b) instead of y = ...
     float* y;                  // (rows, out), row stride ldy
     int64_t ldy;               // 0: out
-    int32_t bf16;              // bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: x is rounded to bf16, too, and products
-                               //   are summed in pairs. Relative L2 error 1.7e-3. Else nothing changes.
+    int32_t bf16;              // for bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: also rounds x to bf16 and sums
+                               // products in pairs (relative L2 error 1.7e-3). Otherwise no effect
 } gsf__nn_linear_desc;
 
-// A linear layer with its activation and residual. `workspace` NULL: scratch for this call only.
+// A linear layer with its activation and residual. `workspace` may be NULL: scratch is then allocated for this call
+// only.
 static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* workspace,
                                      const gsf__nn_linear_desc* desc);
 
-typedef struct gsf__nn_quantized { // a weight in 8 bits; owns its memory: destroy it
+typedef struct gsf__nn_quantized { // an 8-bit weight matrix; owns its memory: destroy it
     int64_t out, in;
-    int32_t block;             // values that the rotation mixes: a power of two up to 256; 1: none
+    int32_t block;             // size of the rotated blocks of values: a power of two up to 256; 1: no rotation
     int8_t* data;              // private: whole tiles, [out/16][in/4][16][4]
-    float* scales;             // private: of each output
+    float* scales;             // private: per output
     int32_t* offsets;          // private: 128 times the sum of each output's weights
-    size_t bytes;              // of all three: about out*in
+    size_t bytes;              // size of all three: about out*in
 } gsf__nn_quantized;
 
-// Symmetric 8-bit integers per output from (out, in) weights in f32, bf16 or f16, after a Hadamard rotation of blocks of
-// inputs (the largest power of two up to 256 that divides `in`), which spreads outliers. `no_rotation` leaves it out. A NaN
-// or infinity gives GSF_ERROR_NUMERIC, and the tensor's name.
+// Quantises (out, in) weights in f32, bf16 or f16 to symmetric 8-bit integers with one scale per output. First a
+// Hadamard rotation of blocks of inputs (the largest power of two up to 256 that divides `in`) spreads outliers;
+// `no_rotation` leaves it out. A NaN or infinity gives GSF_ERROR_NUMERIC and the tensor's name.
 static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor* weight, int32_t no_rotation,
                                           gsf__nn_quantized* out);
 static void gsf__nn_destroy_quantized(gsf_context* ctx, gsf__nn_quantized* weight);
-// gsf__nn_run_linear with such a weight; desc->weight is not looked at. Each row of x is rotated and rounded to 8 bits by a
-// scale of its own; sums are exact. Relative L2 error for gaussian values: 1.2e-2. A row with a NaN or infinity gives NaNs.
+// gsf__nn_run_linear with such a weight; desc->weight is ignored. Each row of x is rotated and rounded to 8 bits with
+// its own scale; sums are exact. Relative L2 error for Gaussian values: 1.2e-2. A row with a NaN or infinity gives
+// NaNs.
 static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* workspace,
                                           const gsf__nn_linear_desc* desc, const gsf__nn_quantized* weight);
 
 typedef struct gsf__nn_attention_desc {
     int64_t queries, keys;     // rows of q and out; of k and v
-    int32_t heads, head_dim;   // head h stands in columns h*head_dim ...
+    int32_t heads, head_dim;   // head h occupies columns h*head_dim ...
     const float *q, *k, *v;
     int64_t ldq, ldk, ldv;     // row strides, 0: heads*head_dim
     const unsigned char* mask; // (heads, queries, keys), 1 = may attend; NULL = all. A row of zeros gives 0.
@@ -664,34 +680,34 @@ typedef struct gsf__nn_attention_desc {
     float scale;               // of the logits, 0: 1/sqrt(head_dim)
     float* out;                // (queries, heads*head_dim), row stride ldo; may be q
     int64_t ldo;
-    int32_t bf16;              // GSF_CPU_AVX512_BF16, even head_dim: q, k, v and the weights are rounded to bf16
+    int32_t bf16;              // GSF_CPU_AVX512_BF16, even head_dim: rounds q, k, v and the softmax weights to bf16
 } gsf__nn_attention_desc;
 
-// softmax(scale q k^T + bias) v for every head, without the matrix of logits. A NaN comes out as NaN; one in a row of v may
-// reach queries that the mask keeps from it.
+// softmax(scale q k^T + bias) v for every head, without storing the logits. NaNs propagate; a NaN in a row of v may
+// also reach queries for which that row is masked.
 static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* workspace,
                                         const gsf__nn_attention_desc* desc);
 
-// Normalisations over the last dimension of (rows, dim); y may be x; weight, bias (dim) or NULL. Variances are biased,
-// sums are in double.
+// Normalisations over the last dimension of (rows, dim); y may be x; weight and bias are (dim) or NULL. Variances are
+// biased; sums are in double.
 static void gsf__nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
                                const float* bias, float eps, float* y);
 static void gsf__nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
                              float eps, float* y);
-// y = layer_norm(x) * (1 + scale) + shift, scale and shift (dim): one pass of an adaptive layer norm.
+// y = layer_norm(x) * (1 + scale) + shift, scale and shift (dim): an adaptive layer norm in one pass.
 static void gsf__nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim,
                                          const float* weight, const float* bias, float eps, const float* scale,
                                          const float* shift, float* y);
-// x: (channels, count); statistics over the channels of a group and all their values; y may be x.
+// x: (channels, count); statistics are over all values of the channels of a group; y may be x.
 GSF__SHARED void gsf__nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
                                     const float* weight, const float* bias, float eps, float* y);
-// LayerNorm over each head of q or k, then the rotation of interleaved pairs on rows `rope_first` and up, in place.
-// cos, sin: (rows - rope_first, head_dim) or NULL: no rotation. weight, bias (head_dim) or NULL.
+// In place: LayerNorm over each head of q or k, then the rotary embedding of interleaved pairs from row `rope_first`
+// on. cos, sin: (rows - rope_first, head_dim) or NULL: no rotation. weight, bias: (head_dim) or NULL.
 static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads,
                                    int32_t head_dim, const float* weight, const float* bias, float eps,
                                    const float* cos, const float* sin, int64_t rope_first);
 static void gsf__nn_activate(gsf_context* ctx, gsf__nn_activation activation, const float* x, int64_t count, float* y);
-// Rows of (rows, columns) to softmax(scale * row); y may be x.
+// Replaces each row of (rows, columns) by softmax(scale * row); y may be x.
 GSF__SHARED void gsf__nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale,
                                  float* y);
 
@@ -701,44 +717,47 @@ GSF__SHARED void gsf__nn_softmax(gsf_context* ctx, const float* x, int64_t rows,
 typedef struct gsf__nn_conv_desc {
     const float* x;            // (frames, height, width, in)
     int64_t frames, height, width;
-    const gsf_nn_tensor* weight; // (out, in, kh, kw): frame by frame; (out, in, kt, kh, kw), kt 1 or 3: causal in time.
-    const gsf_nn_tensor* bias; // (out) or NULL                      kh = kw is 1 or 3; f32, bf16 or f16
+    const gsf_nn_tensor* weight; // (out, in, kh, kw): per frame; (out, in, kt, kh, kw), kt 1 or 3: causal in time.
+                               // kh = kw is 1 or 3; f32, bf16 or f16
+    const gsf_nn_tensor* bias; // (out) or NULL
     const float* before;       // (2, height, width, in): the frames before x; NULL: x's first frame, twice. kt = 3 only
-    int32_t halve;             // stride 2 and one row and column of zeros below and to the right, instead of stride 1
-    int32_t accumulate;        //   and a border of zeros. y += instead of y = ...
+    int32_t halve;             // stride 2, zeros below and to the right; 0: stride 1, zeros on all four sides
+    int32_t accumulate;        // y += instead of y = ...
     float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
 } gsf__nn_conv_desc;
 
-// A convolution, 3D ones causal in time. `workspace` (or, where it is NULL, memory for this call) holds the widened
-// weights and three frames of the input with their borders.
+// A convolution; 3D ones are causal in time. `workspace` holds the widened weights and three frames of the input with
+// their borders; if it is NULL, memory is allocated for this call.
 GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* workspace,
                                         const gsf__nn_conv_desc* desc);
 
 // ---- positions ----
-// Tables of the video transformer. Tokens stand in the order frame, row, column.
+// Tables for the video transformer. Tokens are ordered by frame, row, column.
 
 typedef struct gsf__nn_rope_desc {
     int32_t frames, height, width;   // of the grid of tokens: latent frames, latent height and width / patch size
     int32_t base_height, base_width; // the grid the model was trained with: sample_height, sample_width / patch size
-    int32_t head_dim;                // a multiple of 16: time has head_dim/4 of it, rows and columns 3*head_dim/8 each
+    int32_t head_dim;                // a multiple of 16: time gets head_dim/4 of it, rows and columns 3*head_dim/8 each
     double theta;                    // 0: 10000
 } gsf__nn_rope_desc;
 
-// Rotary table: cos, sin (frames*height*width, head_dim), every value twice, for interleaved pairs. Pair i of an axis of
-// d values turns by position * theta^(-2i/d). Positions: frames 0, 1, ...; rows linspace(top, bottom*(h-1)/h, h) where
-// the grid, resized to fit into the base grid with its aspect ratio kept, lies from top to bottom in it; columns alike.
-// Angles are float32 products in the order of the reference, so they match its tables, not the exact ones.
-// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
+// Rotary table: cos, sin (frames*height*width, head_dim), with every value twice, for interleaved pairs. Pair i of an
+// axis with d values is rotated by position * theta^(-2i/d). Positions of frames are 0, 1, ...; those of rows are
+// linspace(top, bottom*(h-1)/h, h), where top and bottom are those of the grid after it is resized to fit into the base
+// grid with its aspect ratio kept; columns alike. Angles are float32 products in diffusers' order, to match its tables
+// rather than the exact values. (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py
+// get_resize_crop_region_for_grid)
 static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* desc, float* cos, float* sin);
 
-// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is time dim/4 | columns 3*dim/8 | rows
-// 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. scales: 0 = 1.
-// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
+// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is split into time dim/4 | columns
+// 3*dim/8 | rows 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. A scale of 0 means
+// 1. (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
 static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width,
                                       int32_t dim, double spatial_scale, double temporal_scale, float* out);
 
-// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)), an odd last
-// value 0. Angles in float32 as the reference has them. (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
+// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)); the last
+// value of an odd dim is 0. Angles are float32, as in diffusers. (diffusers 0.32.1 get_timestep_embedding,
+// flip_sin_to_cos)
 static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out);
 
 // ---- >>nn numbers ---------------------------------------------------------------
