@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# mutants.sh [TEXT]: do the tests notice? Each mutant is one wrong line in a copy of the headers, and a test that has to fail
+# mutants.sh [--applies] [TEXT]: do the tests notice? Each mutant is one wrong line in a copy of the headers, and a test that has to fail
 # on it. Fails when a mutant survives, does not compile or no longer applies. With TEXT only the mutants whose line in the
 # table below contains it. Not part of run.sh: about 30 programs are compiled, JOBS (default: all cores) at a time.
-# CC (default gcc) and CFLAGS (default -O1) as usual.
+# CC (default gcc) and CFLAGS (default -O1) as usual. With --applies nothing is compiled: it only checks that each
+# substitution still changes its file, which run.sh does.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -23,7 +24,7 @@ gsfixer_splat.h|test_rules|warp: a nearer group needs half the weight|s/(define 
 gsfixer_splat.h|test_rules|dense points: min_angle of 2 degrees|s/(d\.min_angle = \D*)1\.0f/${1}2.0f/
 gsfixer_splat.h|test_rules|dense points: max_normal_angle of 60 degrees|s/d\.max_normal_angle = 40\.0f/d.max_normal_angle = 60.0f/
 gsfixer_splat.h|test_stereo|dense points: normals are not compared|s/return dot >= job->min_normal_dot/return dot >= -1.0f/
-gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/basis\[10\] = 2\.890611442640554f/basis[10] = -2.890611442640554f/
+gsfixer_splat.h|compile/render_only|SH: a basis function of degree 3 changes sign|s/(basis\[10\] = gsf__v_set\()2\.890611442640554f/${1}-2.890611442640554f/
 gsfixer_splat.h|golden_splat|densification splits what it should clone|s/<= clone_log \? GSF__CLONE : GSF__SPLIT/<= clone_log ? GSF__SPLIT : GSF__CLONE/
 gsfixer_splat.h|golden_splat|opacity reset raises opacities|s/if \(group->value\[i\] > logit\)/if (group->value[i] < logit)/
 gsfixer_splat.h|golden_splat|opacity reset keeps the second moments|s/(group->value\[i\] = logit;\s*memset\(group->m,[^;]*;)\s*memset\(group->v,[^;]*;/$1/
@@ -86,8 +87,23 @@ all() { # COMMAND ITEM...: JOBS of them at a time
 checked_baseline() { baseline "$1" > "$work/note.$2" || mv "$work/note.$2" "$work/bad.$2"; }
 numbered_mutant() { mutant "$(printf '%03d' "$2")" "$1"; }
 
+applies() { # LINE NUMBER
+    local file test what edit
+    IFS='|' read -r file test what edit <<< "$1"
+    perl -0pe "$edit" "$file" > "$work/$2"
+    ! cmp -s "$file" "$work/$2" || echo "DOES NOT APPLY  $file  $test  $what" > "$work/bad.$2"
+}
+
+only_applies=0
+[ "${1:-}" != --applies ] || { only_applies=1; shift; }
 mapfile -t lines < <(table | grep -F -- "${1:-}")
 [ ${#lines[@]} -gt 0 ] || { echo "mutants.sh: no mutant of that name" >&2; exit 2; }
+if [ $only_applies = 1 ]; then
+    all applies "${lines[@]}"
+    if compgen -G "$work/bad.*" > /dev/null; then cat "$work"/bad.*; exit 1; fi
+    echo "${#lines[@]} mutants apply"
+    exit 0
+fi
 mapfile -t tests < <(printf '%s\n' "${lines[@]}" | cut -d'|' -f2 | sort -u)
 all checked_baseline "${tests[@]}"
 if compgen -G "$work/bad.*" > /dev/null; then cat "$work"/bad.*; exit 1; fi
