@@ -10169,13 +10169,13 @@ static void gsf__reset_opacity(gsf__model* model, double limit) {
 }
 
 // ---- >>trainer -----------------------------------------------------------------
-// One step: photo of a random permutation (reshuffled when used up; the official loader draws with replacement) ->
-// render -> loss -> backward, the same for one restored view, then Adam on the summed gradients, then density control.
-// The official order differs in one point: there Adam comes last, and after densification its step is lost because the
-// fresh tensors have no gradient yet. Here no step is lost. A step that fails (memory, cancel) leaves the trainer as
-// it was.
+// A step renders the next photo of a random permutation, computes the loss and its gradient, does the same for one
+// restored view, takes an Adam step with the summed gradients and then runs density control. Two points differ from the
+// GSFixer release. Its loader samples photos with replacement. And it runs Adam after density control, so the Adam step
+// of every densification is lost, because the new tensors have no gradient yet; here no step is lost.
+// If a step fails (out of memory, cancelled), the trainer is unchanged.
 
-enum { // streams of random numbers; the iteration or epoch is added
+enum { // kinds of random streams; gsf__stream combines them with the iteration or epoch
     GSF__STREAM_PHOTOS = 1, GSF__STREAM_RESTORED, GSF__STREAM_SPLIT, GSF__STREAM_DROPOUT, GSF__STREAM_DROPOUT_RESTORED,
     GSF__STREAM_NOISE, GSF__STREAM_BACKGROUND
 };
@@ -10185,31 +10185,31 @@ enum { GSF__DECAY_INTERVAL = 10 }; // iterations from one opacity decay to the n
 typedef struct gsf__photo {
     gsf_camera camera;
     gsf__target target;
-    void *pixels, *weight;   // what target points to
+    void *pixels, *weight;   // owned; `target` points to them
 } gsf__photo;
 
 typedef struct gsf__photo_set {
     size_t count;
     gsf__photo* photos;
-    uint32_t* order;         // permutation of epoch order_epoch - 1; 0 = none yet
-    uint64_t order_epoch;
+    uint32_t* order;         // random permutation of the photos
+    uint64_t order_epoch;    // 1 + the epoch of `order`; 0 = none yet
     int32_t max_width, max_height;
 } gsf__photo_set;
 
 struct gsf_trainer {
-    gsf_train_desc desc;     // resolved
+    gsf_train_desc desc;     // with defaults filled in
     gsf__photo_set photos, restored;
     gsf__model model;
     gsf__loss_scratch loss;
     gsf_rasterizer* rasterizer;
-    float *color, *d_color, *depth, *d_depth; // packed images of the step
+    float *color, *d_color, *depth, *d_depth; // packed images of the current render
     size_t color_capacity, d_color_capacity, depth_capacity, d_depth_capacity;
-    gsf_splats view;         // the model as splats; SH of resting splats are behind
-    gsf__lazy lazy;          // where the model points, if desc.lazy_adam
-    gsf_splats shown;        // the view with all SH caught up, if shows
-    int shows;
-    int32_t iteration;       // steps done
-    int32_t first_bands;     // SH bands that the initial splats already use
+    gsf_splats view;         // the model's arrays as splats; with lazy_adam, some SH are out of date
+    gsf__lazy lazy;          // model.lazy points here if desc.lazy_adam is set
+    gsf_splats shown;        // `view` with all SH up to date
+    int shows;               // is `shown` valid?
+    int32_t iteration;       // number of steps taken
+    int32_t first_bands;     // number of SH bands that the initial splats use
     uint64_t restored_steps;
     float restored_weight;
     size_t rejected;
@@ -10227,7 +10227,7 @@ static void gsf__photo_set_destroy(gsf_context* ctx, gsf__photo_set* set) {
     memset(set, 0, sizeof *set);
 }
 
-// Copies an image to packed (H,W,C) of its own dtype; a value that is not finite, or outside [low, high], is an error.
+// Copies an image to packed (H,W,C) of the same dtype. Floats that are NaN or outside [low, high] are an error.
 static gsf_result gsf__photo_copy(gsf_context* ctx, const gsf_image* image, const char* what, size_t index, float low,
                                   float high, void* out) {
     const size_t channels = (size_t)image->channels;
@@ -10251,7 +10251,7 @@ static gsf_result gsf__photo_copy(gsf_context* ctx, const gsf_image* image, cons
     return GSF_OK;
 }
 
-// The weights of a photo whose pixels are copied; where one is 0 they become black.
+// Sets the weights of a photo, after its pixels. Pixels with weight 0 become black, as gsf__loss expects.
 static gsf_result gsf__photo_weigh(gsf_context* ctx, const gsf_image* weight, size_t index, gsf__photo* photo) {
     const size_t pixels = (size_t)weight->width * (size_t)weight->height;
     const size_t bytes = 3 * gsf__dtype_size(photo->target.u8 ? GSF_U8 : GSF_F32);
@@ -10288,7 +10288,7 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     out->camera = *camera;
     out->target.width = camera->width;
     out->target.height = camera->height;
-    const int linear = image->color_space == GSF_COLOR_LINEAR; // is encoded, and so kept as floats
+    const int linear = image->color_space == GSF_COLOR_LINEAR; // stored sRGB-encoded, as floats
     const gsf_dtype kept = linear ? GSF_F32 : image->dtype;
     out->pixels = gsf_alloc(ctx, pixels, 3 * gsf__dtype_size(kept));
     if (!out->pixels) return GSF_ERROR_OUT_OF_MEMORY;
@@ -10304,7 +10304,7 @@ static gsf_result gsf__photo_make(gsf_context* ctx, const gsf_train_view* view, 
     return weight->data ? gsf__photo_weigh(ctx, weight, index, out) : GSF_OK;
 }
 
-// Memory: 3 bytes (u8) or 12 (f32) per pixel, and 4 with a weight.
+// Memory: 3 bytes (u8) or 12 (f32) per pixel, and 4 more with a weight.
 static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* views, size_t count, const char* what,
                                       gsf__photo_set* out) {
     memset(out, 0, sizeof *out);
@@ -10326,7 +10326,7 @@ static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* vi
     return result;
 }
 
-// The photo of step `step` (from 0): a new permutation every `count` steps, a function of seed, stream and step only.
+// The photo of step `step` (from 0). Every `count` steps there is a new permutation, which depends only on the arguments.
 static gsf__photo* gsf__photo_at(gsf__photo_set* set, uint64_t seed, uint64_t kind, uint64_t step) {
     const uint64_t epoch = step / set->count;
     if (set->order_epoch != epoch + 1) {
@@ -10359,7 +10359,7 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     if (d.densify_interval == 0) d.densify_interval = 100;
     d.opacity_reset_interval = gsf__scaled_interval(d.opacity_reset_interval, 3000, d.iterations, 1000);
     d.lr_means = gsf__or_zero(d.lr_means, 1.6e-4f);
-    if (d.lr_means_final == 0.0f) d.lr_means_final = 1.6e-6f; // decays exponentially, so never to 0
+    if (d.lr_means_final == 0.0f) d.lr_means_final = 1.6e-6f; // exponential decay cannot reach 0
     d.lr_sh_dc = gsf__or_zero(d.lr_sh_dc, 2.5e-3f);
     d.lr_sh_rest = gsf__or_zero(d.lr_sh_rest, 1.25e-4f);
     d.lr_opacity = gsf__or_zero(d.lr_opacity, 0.025f);
@@ -10371,7 +10371,7 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     d.prune_opacity = gsf__or_zero(d.prune_opacity, 0.005f);
     if (d.prune_scale == 0.0f) d.prune_scale = 0.1f;
     if (d.max_splats == 0) d.max_splats = d.mcmc ? 1000000 : 2000000;
-    if (d.mcmc) { // as the official code of MCMC has them
+    if (d.mcmc) { // defaults of the MCMC authors' code (3dgs-mcmc)
         d.opacity_reset_interval = -1;
         d.mcmc_noise = gsf__or_zero(d.mcmc_noise, 5e5f);
         d.scale_penalty = gsf__or_zero(d.scale_penalty, 0.01f);
@@ -10381,7 +10381,7 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     return d;
 }
 
-// `d` is resolved but for the extent.
+// `d` has its defaults filled in, except for the extent.
 static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* d) {
     const struct { const char* name; double value, low, high; } fields[] = {
         {"iterations", (double)d->iterations, 1, 1e9},
@@ -10424,7 +10424,7 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
                             fields[i].value, fields[i].low, fields[i].high);
     if (d->render.hidden || d->render.sh_bands || (d->render.opacity_scale != 0.0f && d->render.opacity_scale != 1.0f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "train desc: render.hidden, sh_bands and opacity_scale belong to the trainer");
+                        "train desc: render.hidden, sh_bands and opacity_scale are set by the trainer");
     if (d->max_splats > UINT32_MAX / 4)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: max_splats is %zu", d->max_splats);
     return GSF_OK;
@@ -10442,7 +10442,7 @@ static int gsf__all_finite(const float* v, size_t count) {
     return 1;
 }
 
-// Copies the initial splats; those with a non-finite value are left out and counted.
+// Copies the initial splats. Those with a non-finite value are dropped and counted in trainer->rejected.
 static gsf_result gsf__trainer_take_splats(gsf_context* ctx, gsf_trainer* trainer, const gsf_splats* initial) {
     if (!initial || initial->sh_degree < 0 || initial->sh_degree > 3)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: no initial splats");
@@ -10455,7 +10455,7 @@ static gsf_result gsf__trainer_take_splats(gsf_context* ctx, gsf_trainer* traine
     const size_t from_sh = 3 * (size_t)gsf_splat_count_sh(initial->sh_degree);
     const float* from[GSF__GROUPS] = {initial->means, initial->log_scales, initial->quats, initial->opacity_logits,
                                       initial->sh};
-    size_t used_sh = 3; // floats of an SH row up to the last one that is not zero anywhere
+    size_t used_sh = 3; // floats of an SH row up to the last one that is non-zero in any splat
     for (size_t i = 0; i < initial->count; i++) {
         int finite = 1;
         for (int g = 0; g < GSF__GROUPS; g++) {
@@ -10476,14 +10476,14 @@ static gsf_result gsf__trainer_take_splats(gsf_context* ctx, gsf_trainer* traine
         }
         const uint32_t id = initial->ids ? initial->ids[i] : (uint32_t)i;
         if (id >= UINT32_MAX / 2)
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: splat id %u leaves no room for new ones", id);
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: splat id %u leaves no room for new ids", id);
         if (id >= model->next_id) model->next_id = id + 1;
         model->ids[model->count++] = id;
     }
     if (model->count == 0)
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "trainer: none of %zu initial splats can be used", initial->count);
     if (trainer->rejected)
-        gsf_log(ctx, GSF_LOG_WARNING, "trainer: %zu initial splats with a non-finite value left out", trainer->rejected);
+        gsf_log(ctx, GSF_LOG_WARNING, "trainer: %zu initial splats with a non-finite value dropped", trainer->rejected);
     for (trainer->first_bands = 1; 3 * (size_t)trainer->first_bands * (size_t)trainer->first_bands < used_sh;)
         trainer->first_bands++;
     memcpy(trainer->view.origin, initial->origin, sizeof initial->origin);
@@ -10502,7 +10502,7 @@ static void gsf__trainer_refresh_view(gsf_trainer* trainer) {
     trainer->view.ids = model->ids;
 }
 
-// Median camera depth of the splats in front of the training cameras (a sample of each camera's); 0 when none is.
+// Median depth of the splats in front of the training cameras, from a sample of both; 0 if there are no such splats.
 static gsf_result gsf__trainer_median_depth(gsf_context* ctx, const gsf_trainer* trainer, double* out) {
     const gsf__model* model = &trainer->model;
     const size_t step = model->count / 2048 + 1, per_view = (model->count + step - 1) / step;
@@ -10518,7 +10518,7 @@ static gsf_result gsf__trainer_median_depth(gsf_context* ctx, const gsf_trainer*
             gsf__camera_transform(&trainer->photos.photos[v].camera, world, p);
             if (p[2] > 0.0 && p[2] <= (double)FLT_MAX) depths[count++] = (float)p[2];
         }
-    uint32_t low = 0, high = 0x7f800000u; // bisection over the bits, which are ordered like positive floats
+    uint32_t low = 0, high = 0x7f800000u; // bisection over bit patterns, ordered like positive floats
     while (low < high) {
         const uint32_t middle = low + (high - low) / 2;
         size_t below = 0;
@@ -10531,12 +10531,12 @@ static gsf_result gsf__trainer_median_depth(gsf_context* ctx, const gsf_trainer*
     return GSF_OK;
 }
 
-// 1.1 times the largest distance of a camera from their mean; where that is (nearly) zero, as for a single camera, the
-// median depth of the initial splats stands in, and 1 where no splat is in front of a camera.
+// Sets desc.extent to 1.1 times the largest distance of a camera from their mean. If that is (nearly) zero, as for a
+// single camera, uses the median depth of the initial splats instead, or 1 if no splat is in front of a camera.
 static gsf_result gsf__trainer_find_extent(gsf_context* ctx, gsf_trainer* trainer) {
     double mean[3] = {0.0, 0.0, 0.0}, largest = 0.0, median = 0.0;
     const size_t count = trainer->photos.count;
-    double first[3]; // summed relative to the first centre, so that large coordinates cost no precision
+    double first[3]; // centres are taken relative to the first one, so that large coordinates cost no precision
     gsf_get_camera_center(&trainer->photos.photos[0].camera, first);
     for (int pass = 0; pass < 2; pass++)
         for (size_t i = 0; i < count; i++) {
@@ -10589,7 +10589,7 @@ static gsf__adam_rates gsf__trainer_rates(const gsf_trainer* trainer, int32_t it
     return rates;
 }
 
-static void gsf__trainer_prepare_lazy(const gsf_context* ctx, gsf_trainer* trainer) { // for the iterations done
+static void gsf__trainer_prepare_lazy(const gsf_context* ctx, gsf_trainer* trainer) { // for steps taken so far
     const gsf__adam_rates rates = gsf__trainer_rates(trainer, trainer->iteration);
     gsf__lazy_prepare(ctx->cpu_level, &trainer->lazy, &trainer->model, &rates, trainer->iteration,
                       gsf__trainer_bands(trainer, trainer->iteration));
@@ -10614,7 +10614,7 @@ static gsf_result gsf__trainer_setup(gsf_context* ctx, gsf_trainer* trainer, con
     return gsf_splat_make_rasterizer(ctx, &trainer->rasterizer);
 }
 
-// Hides a random share of the splats in this render: a function of seed, iteration and splat id.
+// Hides a random share of the splats in a render. The choice depends only on seed, stream and splat id.
 typedef struct gsf__dropout_job {
     const gsf__model* model;
     uint64_t seed, stream;
@@ -10630,10 +10630,10 @@ static void gsf__dropout_chunk(void* arg, size_t chunk, int32_t worker) {
         model->hidden[i] = gsf_draw_uniform(job->seed, job->stream, model->ids[i]) < job->share;
 }
 
-// Densification statistics of this step, and the means' screen gradients back to zero.
+// Adds this step's screen-space gradients to the densification statistics and zeroes them.
 typedef struct gsf__visit_job {
     gsf__model* model;
-    int counts[2];           // was there a photo / a restored view?
+    int counts[2];           // [0] photo, [1] restored view: is it counted in this step?
     float half[2][2];        // half width and height of each
 } gsf__visit_job;
 
@@ -10656,7 +10656,7 @@ static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// e^x for x <= 88 within 2e-7 (relative): 2^n times a Taylor polynomial on [-ln2/2, ln2/2].
+// e^x for x <= 88 with a relative error below 2e-7: 2^n times a Taylor polynomial on [-ln2/2, ln2/2].
 static float gsf__exp_poly(float x) {
     if (x < -87.0f) return 0.0f;
     const float n = floorf(x * 1.44269504f + 0.5f), r = (x - n * 0.693359375f) + n * 2.12194440e-4f;
@@ -10668,11 +10668,11 @@ static float gsf__exp_poly(float x) {
     return p * power;
 }
 
-// Gradients of weight * mean(exp(log_scale)) / extent and of weight * mean(opacity).
+// Adds the gradients of weight * mean(exp(log_scale)) / extent and of weight * mean(opacity).
 typedef struct gsf__penalty_job {
     gsf__model* model;
-    float scale;   // weight / (3 count extent); 0 = none
-    float opacity; // weight / count; 0 = none
+    float scale;   // weight / (3 count extent); 0 = off
+    float opacity; // weight / count; 0 = off
 } gsf__penalty_job;
 
 static void gsf__penalty_chunk(void* arg, size_t chunk, int32_t worker) {
@@ -10686,9 +10686,10 @@ static void gsf__penalty_chunk(void* arg, size_t chunk, int32_t worker) {
         logits->grad[i] += job->opacity * gsf__sigmoid(logits->value[i]) * gsf__sigmoid(-logits->value[i]);
 }
 
-/* MCMC shakes the means: by covariance * normal noise * rate, next to nothing where a splat is opaque. The official
-   rate is noise * lr_means * extent, which depends on the unit of length; divided by extent^2 it is what it is for
-   scenes of extent 1, to which gsplat scales all. */
+/* MCMC perturbs the means by covariance * standard normal noise * rate, with a factor that vanishes for opaque splats.
+   The rate of the authors' code, noise * lr_means * extent, depends on the unit of length. Dividing it by extent^2
+   makes the noise the same in every unit, equal to that of a scene of extent 1, the size to which gsplat normalises
+   scenes. */
 typedef struct gsf__noise_job {
     gsf__model* model;
     uint64_t seed, stream;
@@ -10702,7 +10703,7 @@ static void gsf__noise_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t end = gsf__model_chunk_end(model->count, chunk);
     for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++) {
         const float steep = 100.0f * (0.005f - gsf__sigmoid(model->groups[GSF__OPACITY].value[i]));
-        if (steep < -30.0f) continue; // opacities above 0.305: a factor below 1e-13
+        if (steep < -30.0f) continue; // opacity above 0.305: the factor is below 1e-13
         float* mean = model->groups[GSF__MEANS].value + 3 * i;
         const float* scale = model->groups[GSF__SCALES].value + 3 * i;
         double r[9], normal[3], axis[3];
@@ -10722,7 +10723,7 @@ static void gsf__noise_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// Multiplies every opacity by `factor`, on the logits: with e = exp(-logit), log(f / (1 + e - f)).
+// Multiplies every opacity by f = `factor`. In logits: logit' = log(f / (1 + e - f)), where e = exp(-logit).
 typedef struct gsf__decay_job {
     gsf__model* model;
     double factor;
@@ -10735,17 +10736,17 @@ static void gsf__decay_chunk(void* arg, size_t chunk, int32_t worker) {
     const size_t count = job->model->count;
     const size_t end = gsf__model_chunk_end(count, chunk);
     for (size_t i = chunk * GSF__MODEL_CHUNK; i < end; i++)
-        if (logits[i] > -30.0f) // what is smaller was invisible long ago
+        if (logits[i] > -30.0f) // lower ones are invisible anyway
             logits[i] = (float)(log(job->factor) - log(exp(-(double)logits[i]) + 1.0 - job->factor));
 }
 
-static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are statistics needed?
+static int gsf__trainer_densifies(const gsf_trainer* trainer, int32_t iteration) { // are gradient statistics needed?
     return !trainer->desc.mcmc && iteration < trainer->desc.densify_until;
 }
 
-/* The splats with all SH caught up, for everyone but the trainer. That must not change the state, or a run would
-   depend (in its rounding) on who looked when; so the SH are shown where their gradients are in a step, which are zero
-   between steps. ctx NULL: by the calling thread. */
+/* Returns the splats with all SH up to date, for use outside of a step. This must not change the model, or the rounding
+   of a run would depend on when its splats were read. So the up-to-date SH are written to the SH gradients, which are
+   zero between steps; gsf__trainer_hide zeroes them again. ctx NULL: runs on the calling thread. */
 static const gsf_splats* gsf__trainer_show(gsf_context* ctx, gsf_trainer* trainer) {
     gsf__model* model = &trainer->model;
     if (!model->lazy) return &trainer->view;
@@ -10759,13 +10760,13 @@ static const gsf_splats* gsf__trainer_show(gsf_context* ctx, gsf_trainer* traine
     return &trainer->shown;
 }
 
-static void gsf__trainer_hide(gsf_trainer* trainer) { // before the gradients are needed
+static void gsf__trainer_hide(gsf_trainer* trainer) { // ends gsf__trainer_show; call before computing gradients
     const gsf__group* sh = &trainer->model.groups[GSF__SH];
     if (trainer->shows && trainer->model.count) memset(sh->grad, 0, trainer->model.count * sh->width * sizeof(float));
     trainer->shows = 0;
 }
 
-// Renders one photo, and adds the gradient of its loss times `scale`. which: 0 photo, 1 restored view.
+// Renders a photo's view and adds the gradient of its loss, times `scale`. which: 0 photo, 1 restored view.
 static gsf_result gsf__trainer_pass(gsf_context* ctx, gsf_trainer* trainer, gsf__photo* photo, int which, int32_t iteration,
                                     float scale, gsf__loss_value* value) {
     const gsf_train_desc* d = &trainer->desc;
@@ -10834,7 +10835,7 @@ static gsf__densify_rule gsf__trainer_rule(const gsf_trainer* trainer, int32_t i
     return rule;
 }
 
-// The part of a step that can fail: gradients into the model. Nothing else has changed when it fails.
+// The part of a step that can fail: accumulates the gradients in the model. On failure, nothing else has changed.
 static gsf_result gsf__trainer_gradients(gsf_context* ctx, gsf_trainer* trainer, int32_t iteration,
                                          gsf__visit_job* visits, gsf_train_stats* stats) {
     const gsf_train_desc* d = &trainer->desc;
@@ -10916,7 +10917,7 @@ GSF_API gsf_result gsf_splat_step_trainer(gsf_context* ctx, gsf_trainer* trainer
     const int densify = iteration < d->densify_until && iteration > d->densify_from &&
                         iteration % d->densify_interval == 0;
     gsf_result result = gsf__trainer_gradients(ctx, trainer, iteration, &visits, &local);
-    if (result == GSF_OK && densify) { // room for the worst case now, so that nothing can fail after Adam
+    if (result == GSF_OK && densify) { // reserve the worst case now: nothing may fail after Adam
         const size_t room = d->max_splats > model->count ? d->max_splats - model->count : 0;
         const size_t grown = d->mcmc ? gsf__mcmc_growth(model->count, d->max_splats)
                                      : 2 * (room < model->count ? room : model->count);
@@ -10955,17 +10956,18 @@ GSF_API gsf_result gsf_splat_step_trainer(gsf_context* ctx, gsf_trainer* trainer
 }
 
 // A checkpoint holds, as chunks:
-//     "TRNR"  u32 byte-order mark 0x01020304 as the machine stores it; then little-endian: u32 iteration, sh degree,
-//             next id, first bands, bits of the restored weight; u64 splats, restored steps, rejected, settings; f64 bits of
-//             the origin (3)
-//     "TV0 ".."TV4 ", "TM0 ".., "TS0 .."   value, first and second moment of means, log-scales, quats, opacities, SH
-//     "TIDS"                               ids
-//     "TGRD", "TVIS", "TGRR", "TVIR"       densification sums and visits, of photos and of restored views
-//     "TRST"                               u8 per block of 32 splats: steps that their SH are behind
+//     "TRNR"                                   u32 byte order mark 0x01020304 in native order; then, little-endian:
+//                                              u32 iteration, SH degree, next id, first bands; f32 restored weight;
+//                                              u64 splats, restored steps, rejected, settings; f64 origin (3)
+//     "TV0 ".."TV4 ", "TM0 "..., "TS0 "...     value, first and second moment of means, log scales, quaternions,
+//                                              opacity logits, SH; native byte order, like the following
+//     "TIDS"                                   ids
+//     "TGRD", "TVIS", "TGRR", "TVIR"           gradient sums and visits for densification: photos, restored views
+//     "TRST"                                   u8 per block of 32 splats: Adam steps that its SH have skipped
 enum { GSF__STATE_SIZE = 24 + 4 * 8 + 3 * 8 };
 #define GSF__BYTE_ORDER_MARK 0x01020304u
 
-// Fingerprint of the settings and photos, to tell a continuation under other settings.
+// Hash of the settings and the number of photos, to detect that a run is continued with different ones.
 static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
     const gsf_train_desc* d = &trainer->desc;
     const double values[] = {
@@ -10989,7 +10991,7 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
     return hash;
 }
 
-// Tag, start and bytes per splat of the i-th array of a checkpoint; 0 after the last.
+// Tag, data and bytes per splat of array i of a checkpoint. Returns 0 after the last one.
 static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void** data, size_t* row) {
     if (i < 3 * GSF__GROUPS) {
         const gsf__group* group = &model->groups[i % GSF__GROUPS];
@@ -11041,7 +11043,7 @@ GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* train
     gsf_append_chunk(ctx, chunks, "TRST", model->rest, gsf__model_blocks(model->count));
 }
 
-// Checks what a damaged or foreign file could hold: sizes, finite values, second moments and sums >= 0, known ids.
+// Validates an array of an untrusted file: size, finite values, second moments and gradient sums >= 0, ids < next_id.
 static gsf_result gsf__trainer_check_array(gsf_context* ctx, const char* name, int i, const gsf_chunk* chunk,
                                            size_t count, size_t row, uint32_t next_id) {
     if (chunk->size != count * row)
@@ -11073,7 +11075,7 @@ GSF_API gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* traine
     uint32_t mark;
     memcpy(&mark, state, 4);
     if (mark != GSF__BYTE_ORDER_MARK)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: written on a machine of another byte order", name);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: written on a machine with a different byte order", name);
     const uint64_t iteration = gsf__load_le(state + 4, 4), sh_degree = gsf__load_le(state + 8, 4);
     const uint32_t next_id = (uint32_t)gsf__load_le(state + 12, 4), weight = (uint32_t)gsf__load_le(state + 20, 4);
     const uint64_t first_bands = gsf__load_le(state + 16, 4), count = gsf__load_le(state + 24, 8);
@@ -11127,7 +11129,7 @@ GSF_API gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* traine
     gsf__trainer_prepare_lazy(ctx, trainer);
     if (!model->lazy) gsf__parallel_for(ctx, gsf__model_chunks(model->count), gsf__lazy_all_chunk, &trainer->lazy);
     if (gsf__load_le(state + 48, 8) != gsf__trainer_settings(trainer))
-        gsf_log(ctx, GSF_LOG_WARNING, "%s: continues with other settings or views than it was written with", name);
+        gsf_log(ctx, GSF_LOG_WARNING, "%s: the settings or views differ from those of the checkpoint", name);
     return GSF_OK;
 }
 
@@ -11161,7 +11163,7 @@ GSF_API void gsf_splat_destroy_trainer(gsf_context* ctx, gsf_trainer* trainer) {
 
 GSF_API gsf_train_desc gsf_splat_get_trainer_desc(const gsf_trainer* trainer) { return trainer->desc; }
 
-// Replacing the restored views in two steps: all that can fail, and the exchange.
+// Restored views are replaced in two steps: gsf__restored_make does all that can fail, gsf__restored_take swaps them.
 static gsf_result gsf__restored_make(gsf_context* ctx, gsf_trainer* trainer, const gsf_train_view* views, size_t count,
                                      gsf__photo_set* out) {
     GSF__TRY(gsf__photo_set_make(ctx, views, count, "restored view", out));
@@ -11215,31 +11217,32 @@ GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer) {
 
 // ---- >>warp --------------------------------------------------------------------
 
-/* Training-free restorer: restored = render + residual. What the splats do not yet explain of a photo, photo - render
-   at the photo's own camera, is carried over to the novel frame. Carrying the photo itself would bring its exposure
-   and view-dependent light along, and shift all detail by the error of the depth: on real photos (a third of the way
-   through training, held-out views, 3/6/9 photos) such frames are 1.2/1.6/2.6 dB worse than the render, frames made of
-   residuals 0.3/0.7/0.8 dB better. The exception is a floater, which a residual would keep: where two references look
-   through what the frame shows, and none sees it there, the photos are carried (squared error there at 3/6/9 photos,
-   held-out views: 0.51/0.68/0.85 of the render's). The geometry is the references' own depth maps, rendered from the
-   splats: floaters in front of the novel camera do not touch them.
+/* Training-free restorer: restored = render + residual. The residual, photo - render at the photo's own camera, is
+   what the splats do not yet explain of a photo; it is warped to the novel frame. Warping the photo itself would also
+   transfer its exposure and view-dependent shading, and displace all detail by the depth error. Measured on real
+   photos (a third of the way through training, held-out views, 3/6/9 photos), frames of warped photos are 1.2/1.6/2.6
+   dB worse than the render, frames with warped residuals 0.3/0.7/0.8 dB better. Floaters are the exception, since a
+   residual would keep them: where two references look through the surface that the frame shows and none sees it there,
+   the photos are warped (squared error of these pixels at 3/6/9 photos, held-out views: 0.51/0.68/0.85 of the
+   render's). The geometry is the references' own depth maps, rendered from the splats, so floaters in front of the
+   novel camera do not affect it.
        begin     per reference: a score per pixel from the other references. A point that another reference sees at the
-                 same depth is supported; one that lies in front of what another reference sees is refuted, since that
-                 reference looks through it (free-space violation).
-       restore   per frame: the depth maps of the nearest references, cut at depth edges, are drawn as triangle meshes into
-                 z-buffers of the frame; per pixel the candidates are grouped by depth, the nearest group of enough weight
-                 wins (occlusion), and its residuals are blended by score and angle, or its colours with confidence 1 where
-                 it lies behind something refuted. Pixels that no reference reaches keep the render and get confidence 0,
-                 so they are not trained on.
-   Where a reference comes without its render, the photos themselves are carried. */
+                 same depth is supported. A point in front of the surface that another reference sees is refuted,
+                 because that reference looks through it (free-space violation).
+       restore   per frame: the depth maps of the nearest references, cut at depth edges, are rasterized as triangle
+                 meshes into z-buffers of the frame. Per pixel, the candidates are grouped by depth, and the nearest
+                 group with enough weight wins (occlusion). Its residuals are blended, weighted by score and angle, or,
+                 if the frame shows a floater in front of it, its colours, with confidence 1. Pixels that no reference
+                 reaches keep the render and get confidence 0, so they are not trained on.
+   If a reference has no render, the photos themselves are warped. */
 
 typedef struct gsf__warp_reference {
     gsf_camera camera;
     double center[3];
-    double focus[3]; // world point in the middle of what it sees
+    double focus[3]; // world point at the image centre, at the mean inverse depth
     float* color;    // (H,W,3)
     float* carried;  // (H,W,3): colour - render, or the colour itself
-    float* depth;    // (H,W), 0 = nothing
+    float* depth;    // (H,W), 0 = no surface
     float* score;    // (H,W), 0..1
 } gsf__warp_reference;
 
@@ -11249,15 +11252,15 @@ typedef struct gsf__warp {
     int carries_residual;
 } gsf__warp;
 
-#define GSF__WARP_DEPTH_TOLERANCE 0.04f // relative: the same surface
+#define GSF__WARP_DEPTH_TOLERANCE 0.04f // relative depth difference up to which points lie on the same surface
 #define GSF__WARP_EDGE 1.06f            // depth ratio across one pixel above which a surface ends
-#define GSF__WARP_ANGLE 0.2f            // radians: a reference this far off in viewing direction weighs exp(-1/2)
-#define GSF__WARP_GROUP_SHARE 0.35f     // of the heaviest group's weight that a nearer group must have to hide it
-#define GSF__WARP_TRUST 0.5f            // weight from which on a residual is carried over whole
-#define GSF__WARP_BEHIND_MIN 1.02f      // depth ratios between which a carried surface lies behind what the frame shows
+#define GSF__WARP_ANGLE 0.2f            // radians: a reference whose viewing direction differs by this weighs exp(-1/2)
+#define GSF__WARP_GROUP_SHARE 0.35f     // share of the heaviest group's weight that a nearer group needs to occlude it
+#define GSF__WARP_TRUST 0.5f            // total weight below which a residual is attenuated
+#define GSF__WARP_BEHIND_MIN 1.02f      // range of depth ratios in which a warped surface counts as behind the frame's
 #define GSF__WARP_BEHIND_MAX 2.0f
-#define GSF__WARP_CLEARANCE 4.0         // pixels around a point within which a reference must look through it, too
-enum { GSF__WARP_NEAREST = 4 };         // references drawn per frame
+#define GSF__WARP_CLEARANCE 4.0         // pixels: a reference must look through this neighbourhood of a point, too
+enum { GSF__WARP_NEAREST = 4 };         // number of references warped per frame
 
 static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_count, int32_t width, int32_t height,
                                   gsf_restorer_info* out) {
@@ -11300,7 +11303,7 @@ static float gsf__sample(const float* plane, int32_t width, int32_t height, int 
     return top * (1.0f - ay) + bottom * ay;
 }
 
-// Depth of the pixel that contains a continuous position; 0 outside.
+// Depth of the pixel that contains a continuous position; 0 outside the image.
 static float gsf__nearest_depth(const gsf__warp_reference* ref, double u, double v) {
     if (!(u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height)) return 0.0f;
     return ref->depth[(size_t)v * (size_t)ref->camera.width + (size_t)u];
@@ -11336,7 +11339,7 @@ static void gsf__warp_score_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
-static void gsf__warp_find_focus(gsf__warp_reference* ref) { // its middle pixel at its mean inverse depth
+static void gsf__warp_find_focus(gsf__warp_reference* ref) { // middle pixel at the mean inverse depth
     const size_t pixels = (size_t)ref->camera.width * (size_t)ref->camera.height;
     double sum = 0.0, count = 0.0;
     for (size_t p = 0; p < pixels; p++)
@@ -11351,7 +11354,7 @@ static void gsf__warp_find_focus(gsf__warp_reference* ref) { // its middle pixel
 static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
     gsf__warp* warp = (gsf__warp*)user;
     if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
-    if (warp->references) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: begun, and not yet ended, by another run");
+    if (warp->references) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: in use by a run that has not ended");
     warp->references = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__warp_reference));
     if (!warp->references) return GSF_ERROR_OUT_OF_MEMORY;
     warp->count = count;
@@ -11399,10 +11402,10 @@ static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_refere
     return GSF_OK;
 }
 
-typedef struct gsf__warp_vertex { float u, v, inv_z; } gsf__warp_vertex; // inv_z 0: no surface here
+typedef struct gsf__warp_vertex { float u, v, inv_z; } gsf__warp_vertex; // inv_z 0: no surface
 
-// Draws a triangle of inverse depths into the z-buffer (largest inverse depth wins). Triangles seen from behind, or
-// torn wide open, are not surface.
+// Rasterizes a triangle of inverse depths into the z-buffer (the largest inverse depth wins). Triangles that face away
+// or are stretched over more than 32 pixels are skipped: they are not a surface that the reference saw.
 static void gsf__warp_triangle(const gsf__warp_vertex* a, const gsf__warp_vertex* b, const gsf__warp_vertex* c,
                                float* inv_z, int32_t width, int32_t height) {
     const float area = (b->u - a->u) * (c->v - a->v) - (b->v - a->v) * (c->u - a->u);
@@ -11433,7 +11436,7 @@ static int gsf__warp_connected(float a, float b, float c) {
     return lo > 0.0f && hi <= lo * GSF__WARP_EDGE;
 }
 
-// The reference's depth map as a mesh, seen by `camera`. `rows` holds two rows of vertices.
+// Rasterizes the reference's depth map as a mesh seen by `camera`. `rows` has room for two rows of vertices.
 static void gsf__warp_draw(const gsf__warp_reference* ref, const gsf_camera* camera, gsf__warp_vertex* rows, float* inv_z) {
     const int32_t width = ref->camera.width, height = ref->camera.height;
     for (int32_t y = 0; y < height; y++) {
@@ -11476,7 +11479,8 @@ static double gsf__warp_cosine(const double point[3], const double a[3], const d
     return along / sqrt(n0 * n1 + 1e-300);
 }
 
-// The references that see their focus most nearly as a camera at `center` does; ties go to the lower index.
+// Finds the references whose viewing direction to their focus is closest to that of a camera at `center`. Ties go to
+// the lower index. Returns their number.
 static int gsf__warp_nearest(const gsf__warp* warp, const double center[3], int32_t nearest[GSF__WARP_NEAREST]) {
     double best[GSF__WARP_NEAREST];
     int count = 0;
@@ -11499,12 +11503,12 @@ static int gsf__warp_nearest(const gsf__warp* warp, const double center[3], int3
 typedef struct gsf__warp_job {
     const gsf__warp* warp;
     const gsf_restore_window* window;
-    float* scratch;        // per worker: nearest references x pixels inverse depths, then two rows of vertices
+    float* scratch;        // per worker: (GSF__WARP_NEAREST, pixels) inverse depths, then two rows of vertices
     size_t scratch_floats, row_floats;
 } gsf__warp_job;
 
-// 1 where what the frame shows at camera depth `z` cannot be there: two references look through it. One that shows a
-// surface there, give or take a few pixels (leaves, edges), speaks for it.
+// Returns 1 if the surface that the frame shows at camera depth `z` is a floater: at least two references look through
+// it, and none shows a surface at that depth within GSF__WARP_CLEARANCE (tolerance for leaves and edges).
 static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
                              int32_t x, int32_t y, double z) {
     int through = 0;
@@ -11529,13 +11533,13 @@ static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int 
 
 typedef struct gsf__warp_candidate {
     const gsf__warp_reference* ref;
-    double u, v; // where the reference sees it
-    float depth; // in the frame
+    double u, v; // position in the reference
+    float depth; // camera depth in the frame
     float weight;
 } gsf__warp_candidate;
 
-// What the references carry to one pixel that shows rgb at depth `shown`. Returns the confidence; 0 and rgb untouched
-// where no reference reaches.
+// Restores one pixel, whose render is rgb at depth `shown`, from the references. Returns the confidence; if no
+// reference reaches the pixel, returns 0 and leaves rgb unchanged.
 static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int near_count, const gsf_camera* camera,
                              const double center[3], int32_t x, int32_t y, const float* inv_z, size_t plane, float shown,
                              float rgb[3]) {
@@ -11550,7 +11554,7 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
         gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
         if (!gsf_project_point(&at->ref->camera, point, &at->u, &at->v, &z)) continue;
         const double cosine = gsf__warp_cosine(point, center, at->ref->center);
-        const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // angle squared, to second order
+        const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // the squared angle, to second order
         const float score = gsf__sample(at->ref->score, at->ref->camera.width, at->ref->camera.height, 1, 0, at->u, at->v);
         if (!(score > 0.0f)) continue;
         at->depth = (float)(1.0 / (double)inverse);
@@ -11616,7 +11620,7 @@ static void gsf__warp_frame(void* arg, size_t frame, int32_t worker) {
             float rgb[3], weight;
             const size_t at = (size_t)y * (size_t)camera->width + (size_t)x;
             for (int c = 0; c < 3; c++) rgb[c] = gsf__get_pixel(window->color + frame, x, y, c);
-            if (known >= 0) { // the frame is that photo's own view
+            if (known >= 0) { // the frame is a reference's own view: use its photo
                 const gsf__warp_reference* ref = warp->references + known;
                 const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
                 const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
@@ -11683,8 +11687,8 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer) {
 typedef struct gsf__seen_job {
     const gsf_camera *camera, *seeing;
     size_t seeing_count;
-    const float *depth, *alpha;     // of `camera`
-    const gsf__warp_reference* others;
+    const float *depth, *alpha;        // rendered from `camera`
+    const gsf__warp_reference* others; // cameras and depth maps of `seeing`
     const gsf_image* mask;
 } gsf__seen_job;
 
@@ -11761,9 +11765,9 @@ GSF_API gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, const gsf_splats
 
 // ---- >>fixer -------------------------------------------------------------------
 
-typedef struct gsf__kept_frame { // a restored frame as it is trained on
+typedef struct gsf__kept_frame { // a restored frame in the form in which it is trained on
     gsf_camera camera;
-    uint8_t* pixels;  // (H,W,3) colour, then (H,W) confidence, 1/255 steps
+    uint8_t* pixels;  // (H,W,3) colour, then (H,W) confidence 0..255
 } gsf__kept_frame;
 
 typedef struct gsf__kept_frames {
@@ -11772,22 +11776,22 @@ typedef struct gsf__kept_frames {
 } gsf__kept_frames;
 
 struct gsf_fixer {
-    gsf_fix_desc desc;              // resolved
+    gsf_fix_desc desc;              // with defaults filled in
     const gsf_restorer* restorer;
-    gsf_restorer explain;           // a warp of our own, for the skip test; unless the restorer explains
+    gsf_restorer explain;           // internal warp for the skip test, made only if the restorer does not explain
     gsf_trainer* trainer;
     size_t view_count;
     gsf_camera* cameras;
     int32_t round, skipped;
-    int restoring;                  // a round is under way
-    int planned;                    // its path and buffers are there; a restored checkpoint's are not yet
-    int32_t window;                 // next one of this round
-    int32_t frames;                 // per window: desc.window_frames
-    gsf_camera* path;               // windows x frames
+    int restoring;                  // a round is in progress
+    int planned;                    // the round has its path and buffers; not yet after loading a checkpoint
+    int32_t window;                 // next window of this round
+    int32_t frames;                 // frames per window, desc.window_frames
+    gsf_camera* path;               // (windows, frames)
     int32_t* reference_index;
     int references_open;
-    gsf_image *rendered, *depth, *alpha, *restored, *confidence; // one window
-    gsf__kept_frames active, pending; // what the trainer has; what this round collected so far
+    gsf_image *rendered, *depth, *alpha, *restored, *confidence; // frames of one window
+    gsf__kept_frames active, pending; // frames in training; frames of this round so far
     gsf_restorer_info limits;
 };
 
@@ -11827,7 +11831,7 @@ GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     gsf_free(ctx, f);
 }
 
-// The iteration just before the next density control: right after one, renders are at their worst.
+// The iteration just before the nearest densification, because renders are at their worst right after one.
 static int32_t gsf__calm_iteration(const gsf_train_desc* d, int32_t iteration) {
     const int32_t interval = d->densify_interval > 0 ? d->densify_interval : 100;
     const int32_t calm = (iteration + interval / 2) / interval * interval - 1;
@@ -11839,10 +11843,10 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
     if (d.train.iterations == 0) d.train.iterations = 30000;
     if (d.rounds == 0) d.rounds = 3;
     if (d.rounds < 0 || !has_restorer) d.rounds = 0;
-    if (d.rounds == 0 && d.window_frames == 0) d.window_frames = 17; // else the restorer is asked
+    if (d.rounds == 0 && d.window_frames == 0) d.window_frames = 17; // otherwise chosen by gsf__ask_restorer
     if (d.first_round == 0) d.first_round = gsf__calm_iteration(&d.train, d.train.iterations / 3);
     if (d.last_round == 0) d.last_round = gsf__calm_iteration(&d.train, (int32_t)((int64_t)d.train.iterations * 5 / 6));
-    if (d.last_round <= d.first_round) { // a short run has no two calm iterations
+    if (d.last_round <= d.first_round) { // too short a run for two calm iterations
         const int32_t late = (int32_t)((int64_t)d.train.iterations * 5 / 6);
         d.last_round = desc->last_round == 0 && late > d.first_round ? late : d.first_round;
     }
@@ -11862,15 +11866,15 @@ static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, c
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: lambda %g, skip_psnr %g, max_pixels %d", (double)d->lambda,
                         (double)d->skip_psnr, (int)d->max_pixels);
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: a path of %zu cameras", d->path_count);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
     if (restorer && (restorer->struct_size < sizeof(gsf_restorer) || !restorer->query_fn || !restorer->begin_fn ||
                      !restorer->restore_fn || !restorer->end_fn))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer lacks struct_size or a function");
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer's struct_size or a function is missing");
     return GSF_OK;
 }
 
-// What the restorer takes, and so how long windows are.
+// Queries the restorer's limits and chooses the window length accordingly.
 static gsf_result gsf__ask_restorer(gsf_context* ctx, gsf_fixer* f) {
     const gsf_camera* first = f->cameras;
     gsf_restorer_info* limits = &f->limits;
@@ -11893,7 +11897,8 @@ static gsf_result gsf__ask_restorer(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
-// All of the path camera's field of view, each axis scaled to the restorer's own size, or to a smaller one.
+// Camera with the full field of view of the path's camera, each axis scaled to the restorer's own frame size, or to a
+// smaller one within max_pixels.
 static gsf_camera gsf__squashed_camera(const gsf_fixer* f, const gsf_camera* camera) {
     const gsf_restorer_info* limits = &f->limits;
     const double pixels = (double)limits->width * limits->height, most = f->desc.max_pixels;
@@ -11902,8 +11907,8 @@ static gsf_camera gsf__squashed_camera(const gsf_fixer* f, const gsf_camera* cam
                              gsf__legal_side(limits->height * scale, limits->height_multiple, limits->height_max));
 }
 
-// Size of a frame with square pixels for a view of width x height, and the scale of both axes. Where the smallest legal
-// size is larger than what was wanted, the view fills it as far as it can.
+// Finds the frame size that keeps the aspect ratio of a view of width x height, and returns the scale of both axes. If
+// the legal size is larger than the view wanted, the view is scaled up to fit into it.
 static double gsf__square_size(const gsf_fixer* f, int32_t width, int32_t height, int32_t* frame_width,
                                int32_t* frame_height) {
     const gsf_restorer_info* limits = &f->limits;
@@ -11919,7 +11924,7 @@ static double gsf__square_size(const gsf_fixer* f, int32_t width, int32_t height
     return scale;
 }
 
-// The path camera with one scale for both axes, then a little more or less field of view on each side.
+// The path's camera with both axes scaled alike. Each side gains or loses a little field of view to reach a legal size.
 static gsf_camera gsf__square_camera(const gsf_fixer* f, const gsf_camera* camera) {
     gsf_camera out = *camera;
     const double scale = gsf__square_size(f, camera->width, camera->height, &out.width, &out.height);
@@ -11934,7 +11939,7 @@ static gsf_camera gsf__frame_camera(const gsf_fixer* f, const gsf_camera* camera
     return f->limits.squash ? gsf__squashed_camera(f, camera) : gsf__square_camera(f, camera);
 }
 
-static void gsf__spread_path(gsf_fixer* f) { // the host's
+static void gsf__spread_path(gsf_fixer* f) { // samples desc.path evenly, for all frames of a round
     const size_t total = (size_t)f->desc.windows * (size_t)f->frames, given = f->desc.path_count;
     for (size_t i = 0; i < total; i++) {
         f->path[i] = f->cameras[0];
@@ -11968,7 +11973,7 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
     return result;
 }
 
-// A path that cannot be flown is found out before anything is trained: every round's is sampled once.
+// Samples the path of every round once, so that an impossible path is reported before training starts.
 static gsf_result gsf__check_paths(gsf_context* ctx, gsf_fixer* f) {
     const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
     f->path = (gsf_camera*)gsf_alloc(ctx, total, sizeof(gsf_camera));
@@ -12033,7 +12038,7 @@ static int gsf__round_is_due(const gsf_fixer* f) {
            f->trainer->iteration >= gsf_traj_query_repair_round(d->first_round, d->last_round, d->rounds, f->round);
 }
 
-// Path of this round, its frames' sizes and buffers.
+// Samples the path of this round, adapts its cameras to the restorer, and allocates the window's image arrays.
 static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     f->planned = 0;
     gsf__drop_window(ctx, f);
@@ -12055,8 +12060,8 @@ static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     return GSF_OK;
 }
 
-// A reference shows the splats' render in place of a photo's pixels that do not count, in proportion, and no depth
-// where those are the most: nothing is carried from there.
+// Blends the render into pixels of the reference photo according to how far their weight is below 1. Pixels with a
+// weight below 0.5 also lose their depth, so that nothing is warped from there.
 static gsf_result gsf__patch_reference(gsf_context* ctx, const float* weight, const gsf_image* render, gsf_reference* to) {
     gsf_image patched;
     const size_t pixels = (size_t)render->width * (size_t)render->height;
@@ -12073,7 +12078,7 @@ static gsf_result gsf__patch_reference(gsf_context* ctx, const float* weight, co
     return GSF_OK;
 }
 
-// The photo of view i, and what the splats show there if that is asked for.
+// Makes the reference of view i: its photo and, if needs_depth, the splats' render and depth at its camera.
 static gsf_result gsf__make_reference(gsf_context* ctx, gsf_fixer* f, size_t i, int needs_depth, gsf_reference* out) {
     const gsf_camera* camera = f->cameras + i;
     const gsf__photo* photo = &f->trainer->photos.photos[i];
@@ -12098,7 +12103,7 @@ static gsf_result gsf__make_reference(gsf_context* ctx, gsf_fixer* f, size_t i, 
     return result;
 }
 
-// Hands the photos, and what the splats show at their cameras, to the restorer.
+// Makes the references of all views and begins the restorer (and the internal warp) with them.
 static gsf_result gsf__open_references(gsf_context* ctx, gsf_fixer* f) {
     if (f->references_open) return GSF_OK;
     gsf_reference* references = (gsf_reference*)gsf_alloc_zeroed(ctx, f->view_count, sizeof(gsf_reference));
@@ -12129,8 +12134,8 @@ static gsf_result gsf__fit_image(gsf_context* ctx, gsf_image* image, const gsf_c
     return gsf_make_image(ctx, GSF_F32, camera->width, camera->height, channels, image);
 }
 
-// How well the render of these frames agrees with what the references explain (out_color, out_confidence), in dB over
-// the explained pixels, weighted by confidence; 0 when less than half of the pixels are explained at all.
+// PSNR in dB of the window's render against what the references explain (out_color), over the explained pixels,
+// weighted by out_confidence. 0 if less than half of the pixels are explained.
 static double gsf__window_agreement(const gsf_restore_window* window) {
     double error = 0.0, weight = 0.0, pixels = 0.0, explained = 0.0;
     for (int32_t i = 0; i < window->frame_count; i++)
@@ -12150,7 +12155,7 @@ static double gsf__window_agreement(const gsf_restore_window* window) {
     return error > 0.0 ? -10.0 * log10(error / weight) : INFINITY;
 }
 
-// Has the window restored, unless its render agrees with the photos.
+// Restores the window, or skips it (*skip = 1) if its render already agrees with the photos.
 static gsf_result gsf__restore_or_skip(gsf_context* ctx, const gsf_fixer* f, const gsf_restore_window* window, int* skip) {
     *skip = 0;
     if (f->desc.skip_psnr > 0.0f) {
@@ -12182,7 +12187,7 @@ static gsf_result gsf__keep_frame(gsf_context* ctx, gsf_fixer* f, const gsf_came
     return GSF_OK;
 }
 
-// The frames as what the trainer takes in place of its restored views.
+// Converts kept frames to a photo set for gsf__restored_take.
 static gsf_result gsf__frames_to_photos(gsf_context* ctx, gsf_fixer* f, const gsf__kept_frames* list,
                                         gsf__photo_set* out) {
     gsf_train_view* views = (gsf_train_view*)gsf_alloc_zeroed(ctx, list->count + 1, sizeof(gsf_train_view));
@@ -12200,9 +12205,9 @@ static gsf_result gsf__frames_to_photos(gsf_context* ctx, gsf_fixer* f, const gs
     return result;
 }
 
-// No confidence in what a frame shows beyond the field of view that the path's cameras have, the photos'.
+// Zeroes the confidence outside the field of view of the path's cameras, which have the photos' intrinsics.
 static void gsf__distrust_margin(const gsf_fixer* f, gsf_image* confidence) {
-    const gsf_camera* view = f->cameras; // of its size are all on the path
+    const gsf_camera* view = f->cameras; // all cameras of the path have its size
     int32_t width, height;
     if (f->limits.squash) return;
     const double scale = gsf__square_size(f, view->width, view->height, &width, &height);
@@ -12213,7 +12218,7 @@ static void gsf__distrust_margin(const gsf_fixer* f, gsf_image* confidence) {
                 ((float*)confidence->data)[(size_t)y * (size_t)width + (size_t)x] = 0.0f;
 }
 
-// The splats as the frames' cameras see them, in buffers of their sizes.
+// Renders the splats for all frames of a window, and fits its images to the frame sizes.
 static gsf_result gsf__render_window(gsf_context* ctx, gsf_fixer* f, const gsf_camera* cameras) {
     for (int32_t i = 0; i < f->frames; i++) {
         const gsf_camera* camera = cameras + i;
@@ -12233,7 +12238,7 @@ static gsf_result gsf__render_window(gsf_context* ctx, gsf_fixer* f, const gsf_c
     return GSF_OK;
 }
 
-// All frames of the restored window, or none of them.
+// Keeps all frames of the restored window or, if one fails, none of them.
 static gsf_result gsf__keep_window(gsf_context* ctx, gsf_fixer* f, const gsf_restore_window* window) {
     const size_t before = f->pending.count;
     for (int32_t i = 0; i < f->frames; i++) {
@@ -12322,14 +12327,15 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
     return GSF_OK;
 }
 
-/* Checkpoint: the trainer's chunks, "FIXR" (7 x i32: version, iteration, which is the trainer's, round, restoring,
-   window, windows, skipped) and two lists of frames "FIXA" (active), "FIXP" (pending): u64 count, then per frame 20
-   doubles (w2c, fx, fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W of confidence. */
+/* A checkpoint holds the trainer's chunks and, little-endian:
+       "FIXR"           7 x i32: version, iteration (of the trainer), round, restoring, window, windows, skipped
+       "FIXA", "FIXP"   active and pending frames: u64 count, then per frame 20 x f64 (w2c, fx, fy, cx, cy), 2 x i32
+                        (width, height), H*W*3 bytes of colour, H*W bytes of confidence */
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
 static void gsf__save_frames(gsf_context* ctx, gsf_buffer* chunks, const char* tag, const gsf__kept_frames* list) {
     char head[GSF__FRAME_HEAD];
-    const size_t opened = gsf__open_chunk(ctx, chunks, tag); // frames are most of a checkpoint: copied only once
+    const size_t opened = gsf__open_chunk(ctx, chunks, tag); // written in place: frames make up most of a checkpoint
     gsf__store_le(head, list->count, 8);
     gsf_append_bytes(ctx, chunks, head, 8);
     for (size_t i = 0; i < list->count; i++) {
@@ -12430,7 +12436,7 @@ GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const c
     if (numbers[5] != f->desc.windows || numbers[2] < 0 || numbers[2] > f->desc.rounds || numbers[4] < 0 ||
         numbers[4] > numbers[5] || (numbers[3] && numbers[2] >= f->desc.rounds) || numbers[6] < 0 ||
         numbers[6] > (int64_t)numbers[2] * numbers[5] + numbers[4])
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: made with other rounds or windows", name);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: the checkpoint has different rounds or windows", name);
     gsf__kept_frames active, pending;
     GSF__TRY(gsf__load_frames(ctx, name, data, size, "FIXA", &active));
     gsf__photo_set photos;
@@ -12438,7 +12444,7 @@ GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const c
     gsf_result result = gsf__load_frames(ctx, name, data, size, "FIXP", &pending);
     if (result == GSF_OK) result = gsf__frames_to_photos(ctx, f, &active, &photos);
     if (result == GSF_OK) result = gsf_splat_parse_trainer(ctx, f->trainer, name, data, size);
-    if (result != GSF_OK) { // nothing has changed
+    if (result != GSF_OK) { // the fixer is unchanged
         gsf__photo_set_destroy(ctx, &photos);
         gsf__drop_frames(ctx, &active);
         gsf__drop_frames(ctx, &pending);
@@ -12454,7 +12460,7 @@ GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const c
     f->restoring = numbers[3] != 0;
     f->window = numbers[4];
     f->skipped = numbers[6];
-    f->planned = 0; // the path is a function of views, round and seed
+    f->planned = 0; // the path only depends on views, round and seed, so it is not saved
     return GSF_OK;
 }
 
@@ -12481,7 +12487,7 @@ GSF_API gsf_result gsf_splat_load_train_views(gsf_context* ctx, gsf_scene* scene
     return GSF_OK;
 }
 
-enum { GSF__DENSE_FROM_VIEWS = 6, GSF__STREAM_POINTS = 0x72616e64 }; // a stream apart from the trainer's
+enum { GSF__DENSE_FROM_VIEWS = 6, GSF__STREAM_POINTS = 0x72616e64 }; // differs from the trainer's streams
 
 static gsf_initial_desc gsf__initial_desc_defaults(const gsf_initial_desc* desc, const gsf_scene* scene, size_t view_count) {
     gsf_initial_desc d;
@@ -12523,8 +12529,8 @@ static void gsf__destroy_points(gsf_context* ctx, gsf__colored_points* points) {
     memset(points, 0, sizeof *points);
 }
 
-// A pixel of the view and a depth from 0.3 to 2 times the focus' (even in volume), with the pixel's colour, or grey
-// where the photo does not count.
+// A random point in the view's frustum, at 0.3 to 2 times the depth of the focus, uniform in volume. It takes the
+// colour of the pixel it projects to, or grey where the photo's weight is below 0.5.
 static void gsf__random_point(const gsf_scene_view* view, const double* focus, uint64_t seed, uint64_t i, double point[3],
                               uint8_t color[3]) {
     const gsf_camera* camera = &view->camera;
@@ -12547,7 +12553,7 @@ static void gsf__random_point(const gsf_scene_view* view, const double* focus, u
     }
 }
 
-// Around what all views look at, in turns from each view.
+// Random points around the focus of all views; the views take turns.
 static gsf_result gsf__random_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                      const gsf_initial_desc* desc, gsf__colored_points* out) {
     if (desc->random_points < 1 || view_count == 0)
@@ -12569,7 +12575,7 @@ static gsf_result gsf__random_points(gsf_context* ctx, const gsf_scene* scene, c
     return GSF_OK;
 }
 
-// The scene's points marked by `keep`, then `dense`.
+// Concatenates the scene's points marked in `keep` and the dense points.
 static gsf_result gsf__merge_points(gsf_context* ctx, const gsf_scene* scene, const uint8_t* keep, const gsf_dense* dense,
                                     gsf__colored_points* out) {
     size_t n = 0;
@@ -12597,25 +12603,25 @@ static gsf_result gsf__dense_and_kept(gsf_context* ctx, const gsf_scene* scene, 
     gsf_result result = gsf__merge_points(ctx, scene, keep, &dense, out);
     stats->new_points = dense.count;
     if (result == GSF_OK && out->count == 0)
-        result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: no point of the scene is seen by one of the %zu views, "
-                          "and no two of them agree anywhere (random points do without)", view_count);
+        result = gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: none of the %zu views sees a point of the scene, "
+                          "and no two of them agree anywhere (try random points)", view_count);
     gsf_splat_destroy_dense(ctx, &dense);
     return result;
 }
 
-// Of every kind but RANDOM.
+// Initial splats of every kind except GSF_INITIAL_RANDOM.
 static gsf_result gsf__scene_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                     const gsf_initial_desc* d, uint8_t* keep, gsf_splats* out, gsf_initial_stats* stats) {
     if (scene->point_count == 0 && d->kind != GSF_INITIAL_DENSE)
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (random ones do without)",
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (try random points)",
                         scene->folder ? scene->folder : "initial splats");
     if (d->kind == GSF_INITIAL_ALL) memset(keep, 1, scene->point_count);
     else GSF__TRY(gsf_splat_filter_points(ctx, scene, views, view_count, &d->visibility, keep, &stats->visibility));
     for (size_t i = 0; i < scene->point_count; i++) stats->scene_points += keep[i] != 0;
     if (d->kind != GSF_INITIAL_DENSE) {
         if (stats->scene_points == 0)
-            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: no point of the scene is seen by one of the %zu views "
-                            "(all points, or random ones, do without)", view_count);
+            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: none of the %zu views sees a point of "
+                            "the scene (try all points, or random ones)", view_count);
         return gsf_splat_make_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, d->sh_degree,
                                           scene->origin, out);
     }
