@@ -86,7 +86,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_find_focus(gsf_context* ctx, const dou
 // ---- ellipse -------------------------------------------------------------------
 
 typedef struct gsf_traj_ellipse_desc {
-    int32_t frames;       // 85
+    int32_t frames;       // 0 = 85
     double z_variation;   // fraction of the cameras' height range (10th to 90th percentile) covered; 0 = flat, at z = 0
     double z_phase;       // [0,1): phase of the height along the loop
     double pitch_degrees; // rotation of every view about its own x axis
@@ -164,7 +164,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_sample_path(gsf_context* ctx, const gs
 #ifndef GSF_TRAJ_IMPLEMENTED
 #define GSF_TRAJ_IMPLEMENTED
 
-#include "gsfixer.h" // again: its internals, if all was included before without an implementation macro
+#include "gsfixer.h" // again, for its internals, in case it was first included without an implementation macro
 
 GSF__BEGIN_IMPLEMENTATION
 
@@ -186,7 +186,7 @@ static double gsf__traj_max_abs(const double v[3]) {
     return m;
 }
 
-// Length without overflow or underflow on the way.
+// Length, without intermediate overflow or underflow.
 static double gsf__traj_length(const double v[3]) {
     const double m = gsf__traj_max_abs(v);
     if (!(m > 0.0)) return 0.0;
@@ -423,7 +423,7 @@ static gsf_result gsf__traj_check_path(gsf_context* ctx, double* poses, size_t c
     return gsf_fail(ctx, GSF_ERROR_NUMERIC, "path: coordinates are too large to compute with");
 }
 
-// The same from directions: forward becomes column 2, column 1 points to the side of down (the release's `viewmatrix`).
+// Pose from directions: forward becomes column 2, and column 1 points towards down (the release's `viewmatrix`).
 static gsf_result gsf__traj_view_pose(gsf_context* ctx, const double forward[3], const double down[3],
                                       const double position[3], double pose[16]) {
     if (!gsf__traj_finite(forward, 3) || !gsf__traj_finite(down, 3) || !gsf__traj_finite(position, 3))
@@ -446,6 +446,7 @@ GSF_API gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const
 
 // ---- >>rotations ---------------------------------------------------------------
 
+// Unit quaternion (w x y z, w >= 0) of a pose's rotation.
 static void gsf__traj_pose_quat(const double m[16], double quat[4]) {
     // Four times the squares of w, x, y, z; dividing by the largest is well conditioned (Shepperd 1978).
     const double s[4] = {1.0 + m[0] + m[5] + m[10], 1.0 + m[0] - m[5] - m[10], 1.0 - m[0] + m[5] - m[10],
@@ -465,7 +466,7 @@ static void gsf__traj_pose_quat(const double m[16], double quat[4]) {
     for (int i = 0; i < 4; i++) quat[i] = q[i] * scale;
 }
 
-// The rotation of a quaternion of any non-zero length.
+// Sets the rotation of a pose from a quaternion of any non-zero length; the position is unchanged.
 static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
     const double w = q[0], x = q[1], y = q[2], z = q[3];
     const double s = 2.0 / (w * w + x * x + y * y + z * z);
@@ -482,7 +483,7 @@ static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
     pose[15] = 1.0;
 }
 
-// Unit quaternion (w x y z, w >= 0) of a pose's rotation, and back (any non-zero length; position untouched).
+// The same with checks, for quaternions of any magnitude.
 GSF__SHARED gsf_result gsf__traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]) {
     if (!gsf__traj_finite(quat, 4)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "quaternion: a value is not finite");
     double most = 0.0, unit[4];
@@ -530,7 +531,7 @@ static void gsf__traj_blend_poses(const double a[16], const double b[16], double
     memcpy(out + 12, position, sizeof position);
 }
 
-// Position linear, rotation slerp. out may be a or b.
+// Linear interpolation of the position, slerp of the rotation. out may be a or b.
 GSF__SHARED gsf_result gsf__traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
                                             double out[16]) {
     GSF__TRY(gsf__traj_check_poses(ctx, a, 1));
@@ -557,7 +558,7 @@ static void gsf__traj_mean_column(const double* poses, size_t count, int column,
 }
 
 // Solves mean(M^T M) x = mean(M^T M o), M = I - d d^T, o position and d direction of a view, relative to the mean o.
-// Returns the least eigenvalue, the mean squared sine of the angles to the common direction. If it is not above
+// Returns the smallest eigenvalue: the mean squared sine of the angles to the common direction. If it is not above
 // `least`, the axes are parallel, and the position of the focus along them is taken from `prior`.
 static double gsf__traj_solve_focus(const double* poses, size_t count, double least, const double prior[3],
                                     double focus[3]) {
@@ -624,7 +625,8 @@ GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* 
     for (size_t n = 0; n < count; n++) {
         double local[16];
         memcpy(local, poses + 16 * n, sizeof local);
-        for (int i = 0; i < 3; i++) local[12 + i] -= average[12 + i]; // first, to keep precision far from the origin
+        // Subtracted before the rotation, to keep precision far from the origin.
+        for (int i = 0; i < 3; i++) local[12 + i] -= average[12 + i];
         double rotation[16];
         memcpy(rotation, transform, sizeof rotation);
         memset(rotation + 12, 0, 3 * sizeof(double));
@@ -705,7 +707,7 @@ typedef struct gsf__traj_similarity_desc {
 
 static size_t gsf__traj_similarity_scratch(size_t count) { return gsf__traj_size_mul(count, 7 * sizeof(double)); }
 
-// magnitude: size of the coordinates before an origin was subtracted; anything smaller by a factor of 1e-13 is rounding.
+// magnitude: largest coordinate before the origin was subtracted; lengths below 1e-13 of it are rounding errors.
 static gsf_result gsf__traj_solve_similarity(gsf_context* ctx, const double* poses, size_t count,
                                        const gsf__traj_similarity_desc* desc, double magnitude, double* work,
                                        double transform[16]) {
@@ -790,7 +792,7 @@ typedef struct gsf__traj_cloud { // points after subtracting the origin and tran
     size_t count, stride; // stride in doubles
     double origin[3];
     double transform[16];
-    int robust; // leave out outliers
+    int robust; // exclude outliers
 } gsf__traj_cloud;
 
 static void gsf__traj_cloud_point(const gsf__traj_cloud* cloud, size_t n, double out[3]) {
@@ -862,7 +864,7 @@ static gsf_result gsf__traj_cloud_axes(gsf_context* ctx, const gsf__traj_cloud* 
         for (int i = 0; i < 3; i++) rows[6 + i] = up[i] - along * rows[i];
         (void)gsf__traj_unit(rows + 6, rows + 6);
         gsf__traj_cross(rows + 6, rows, rows + 3);
-        values[1] = 0.5 * values[0]; // no tie left
+        values[1] = 0.5 * values[0]; // so that gsf__traj_fix_axes finds no equal eigenvalues
         values[2] = 0.0;
     }
     gsf__traj_fix_axes(values, rows);
@@ -902,7 +904,7 @@ static size_t gsf__traj_normalize_scratch(size_t count, size_t point_count) {
 static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, size_t count, const double* points,
                                       size_t point_count, const double origin[3], double magnitude,
                                       const gsf__traj_similarity_desc* desc, double* work, double transform[16]) {
-    static const double up[3] = {0.0, -1.0, 0.0}; // where the similarity turns the mean up vector
+    static const double up[3] = {0.0, -1.0, 0.0}; // the similarity rotates the mean up vector to this
     double first[16], second[16];
     GSF__TRY(gsf__traj_solve_similarity(ctx, poses, count, desc, magnitude, work, first));
     gsf__traj_cloud cloud;
@@ -921,7 +923,7 @@ static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, s
 
 // Similarity, then principal axes of the points (NULL: of the camera positions; where these lie on a line, the mean up
 // vector determines the third axis). `transform` is the product, as in the release's parser. Points farther from the
-// median than five times the 90th percentile are left out (official: none).
+// median than five times the 90th percentile of distances are excluded (official: none).
 GSF__SHARED gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
                                            size_t point_count, const gsf__traj_similarity_desc* desc, void* scratch,
                                            double transform[16]) {
@@ -1071,7 +1073,7 @@ static size_t gsf__traj_basis(const gsf__traj_curve* curve, double u, double bas
         }
         basis[j] = saved;
     }
-    return low - k; // index of the first
+    return low - k; // index of the first basis function
 }
 
 // Makes the curve through values[i] (stride doubles apart) at sites. Collocation matrices of B-splines are totally
@@ -1142,7 +1144,7 @@ static size_t gsf__traj_spline_scratch(size_t count, int32_t degree, size_t dims
 
 // Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending
 // sites, with not-a-knot ends (knots as in FITPACK with s = 0 and scipy's make_interp_spline). Evaluated at `at`
-// (at_count), which is clamped to the range of the sites; out (at_count,dims).
+// (at_count), clamped to the range of the sites; out (at_count,dims).
 GSF__SHARED gsf_result gsf__traj_spline(gsf_context* ctx, const double* sites, const double* values, size_t count,
                                         size_t dims, int32_t degree, const double* at, size_t at_count, void* scratch,
                                         double* out) {
@@ -1164,9 +1166,9 @@ GSF__SHARED gsf_result gsf__traj_spline(gsf_context* ctx, const double* sites, c
 }
 
 typedef struct gsf__traj_spline_desc {
-    int32_t frames_per_leg; // 16
-    int32_t degree;         // 5 (lowered to count - 1)
-    double axis_length;     // 0.1: distance of the look-at and up points from the position
+    int32_t frames_per_leg; // 0 = 16
+    int32_t degree;         // 0 = 5; at most count - 1 is used
+    double axis_length;     // distance of the look-at and up points from the position; 0 = 0.1
 } gsf__traj_spline_desc;
 
 static gsf__traj_spline_desc gsf__traj_spline_desc_defaults(const gsf__traj_spline_desc* desc, size_t count) {
@@ -1267,7 +1269,7 @@ static int gsf__traj_make_glide(gsf__traj_curve* curve, const double* poses, siz
                                 positions + 3 * count);
 }
 
-// u from 0 to count - 1.
+// The pose at u in [0, count - 1]: poses are at integer u.
 static void gsf__traj_eval_glide(const gsf__traj_curve* curve, const double* poses, size_t count, double u,
                                  double out[16]) {
     size_t leg = (size_t)u;
@@ -1309,7 +1311,7 @@ static gsf_traj_ellipse_desc gsf__traj_round_ellipse(int32_t round, uint64_t see
     desc.frames = frames;
     desc.z_variation = 1.5 - 0.2 * round;
     if (desc.z_variation < 0.5) desc.z_variation = 0.5;
-    desc.z_phase = gsf_draw_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // a random stream of its own
+    desc.z_phase = gsf_draw_uniform(seed, 0x74726a00u, (uint64_t)(uint32_t)round); // in a separate random stream
     desc.pitch_degrees = 2.0 * round;
     return desc;
 }
@@ -1341,7 +1343,7 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
         for (size_t n = 0; n < count; n++) work[n] = fabs(poses[16 * n + 12 + (size_t)i] - focus[i]);
         gsf__traj_sort(work, count);
         const double half_axis = gsf__traj_percentile(work, count, 0.9);
-        low[i] = (focus[i] - half_axis) * 1.2; // the release enlarges the offset, too
+        low[i] = (focus[i] - half_axis) * 1.2; // as in the release, this also scales the focus
         high[i] = (focus[i] + half_axis) * 1.2;
     }
     for (size_t n = 0; n < count; n++) work[n] = poses[16 * n + 14];
@@ -1368,7 +1370,7 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
             return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ellipse: view %d of %d looks along its up vector", (int)f,
                             (int)d.frames);
         }
-        for (int i = 0; i < 3; i++) { // times [1 0 0; 0 c -s; 0 s c]
+        for (int i = 0; i < 3; i++) { // multiply by [1 0 0; 0 c -s; 0 s c]
             const double y = pose[4 + i], z = pose[8 + i];
             pose[4 + i] = c * y + s * z;
             pose[8 + i] = c * z - s * y;
@@ -1398,7 +1400,8 @@ static void gsf__traj_split_window(int32_t window_length, int32_t* side, int32_t
     *middle = window_length - 2 * *side;
 }
 
-typedef struct gsf__traj_table { int64_t middle, windows, each, last; } gsf__traj_table; // each, last: shared poses
+// Windows of `middle` poses. A window shares `each` poses with the previous one, the final window `last` poses.
+typedef struct gsf__traj_table { int64_t middle, windows, each, last; } gsf__traj_table;
 
 // generate_overlapping_indices of outpaint/base.py; total >= middle >= 1.
 static gsf__traj_table gsf__traj_make_table(int64_t total, int64_t middle) {
@@ -1417,8 +1420,8 @@ static int64_t gsf__traj_table_start(gsf__traj_table table, int64_t w) {
                                  : (w - 1) * (table.middle - table.each) + table.middle - table.last;
 }
 
-// The release's table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (NULL =
-// only the count is wanted). Fails if the table exceeds the sequence (usually total < middle).
+// The release's table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (count each;
+// NULL: not needed). Fails if the table exceeds the sequence (usually total < middle).
 GSF__SHARED gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
                                                   int32_t* overlaps, int32_t* count) {
     *count = 0;
@@ -1666,8 +1669,8 @@ static void gsf__traj_localize(gsf__traj_job* job) {
         for (int i = 0; i < 3; i++) job->views[16 * n + 12 + (size_t)i] -= job->origin[i];
 }
 
-// Mean of the points that the views (normalised, by `transform`) look at: for each, at the median depth of the points in
-// front of it or, without any, at four times the radius of the cameras. A few thousand evenly sampled points suffice.
+// Mean of the points that the views (normalised, by `transform`) look at. A view looks at the median depth of the points in
+// front of it or, without any, at four times the radius of the cameras. At most 4096 evenly spaced points are used.
 static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform[16], double out[3]) {
     double center[3], radius = 0.0;
     gsf__traj_cloud cloud;
@@ -1695,8 +1698,8 @@ static void gsf__traj_looked_at(const gsf__traj_job* job, const double transform
     }
 }
 
-// The point that the loop looks at. Axes within half a degree of each other meet far behind the scene, if at all; their
-// loop looks at the depth of the scene. The release does not handle this case.
+// The point that the loop looks at. Axes within half a degree of each other intersect far behind the scene, if at all; in
+// this case the loop looks at the depth of the scene. The release does not handle it.
 static gsf_result gsf__traj_focus(const gsf__traj_job* job, const double transform[16], double focus[3]) {
     const double parallel = 1e-4;
     if (job->desc.official) return gsf_traj_find_focus(job->ctx, job->views, job->count, focus);

@@ -3,24 +3,24 @@
 
        make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]
 
-   --noise is the standard deviation of a feature's place in pixels, --arc the part of the full circle in degrees that
-   the camera walks around the table. `--views 12 --width 96 --height 64` takes less than two seconds.
+   --noise: standard deviation of feature positions in pixels; --arc: angle in degrees of the camera's path around the
+   table. `--views 12 --width 96 --height 64` takes less than two seconds.
        OUT/images/frame_001.png ...
-       OUT/sparse/0/{cameras,images,points3D}.bin   points as feature matching would find them: at textured places,
-                                                    triangulated from noisy pixels, seen in only part of the views that
-                                                    could see them, a few of them wrong
+       OUT/sparse/0/{cameras,images,points3D}.bin   points as feature matching would find them: in textured areas,
+                                                    triangulated from noisy pixels, matched in only some of the views
+                                                    that can see them, a few of them outliers
        OUT/truth/depth_001.npy ...                  float32 (height,width) camera depth at pixel centres, 0 = sky
        OUT/truth/visibility.bin                     see write_truth
-       OUT/truth/scene.json                         the options that made it
-   OUT is a new or an empty folder, or one that make_scene wrote: nobody else's files are replaced.
+       OUT/truth/scene.json                         the options it was made with
+   OUT must be a new folder, an empty one or one written by make_scene, so that no other files are replaced.
 
        make_scene SCENE --render CAMERAS.json --out PICTURES
 
-   photographs a scene that was made before at other cameras (the format of `gsfix path`), as if they were further photos
-   of it: with the same light, noise included. The scene's own cameras give its photos.
+   renders an existing scene from other cameras (the format of `gsfix path`) like additional photos of it, with the same
+   light and sensor noise. With the scene's own cameras, it reproduces the scene's photos.
        PICTURES/00000.png ...        in the order of the cameras
        PICTURES/depth/00000.npy ...  as in OUT/truth
-   PICTURES is a new or an empty folder. */
+   PICTURES must be a new or an empty folder. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L // mkdir
 #endif
@@ -54,7 +54,7 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
 #ifndef MAKE_SCENE_NO_MAIN
 static int render_scene(gsf_context* ctx, const char* folder, const char* cameras, const char* out) {
     (void)cameras, (void)out;
-    return make_scene(ctx, &make_scene_defaults, folder); // says so
+    return make_scene(ctx, &make_scene_defaults, folder); // prints the error
 }
 #endif
 
@@ -74,7 +74,7 @@ static int render_scene(gsf_context* ctx, const char* folder, const char* camera
 
 typedef struct v3 { float x, y, z; } v3;
 
-static float maxf(float a, float b) { return a > b ? a : b; } // fmaxf is a call where NaN counts
+static float maxf(float a, float b) { return a > b ? a : b; } // fmaxf has to handle NaN and is a call
 static float minf(float a, float b) { return a < b ? a : b; }
 
 static v3 v(float x, float y, float z) { const v3 r = {x, y, z}; return r; }
@@ -87,7 +87,7 @@ static v3 cross(v3 a, v3 b) { return v(a.y * b.z - a.z * b.y, a.z * b.x - a.x * 
 static v3 unit(v3 a) { return mul(a, 1.0f / sqrtf(maxf(dot(a, a), 1e-20f))); }
 static v3 mix(v3 a, v3 b, float t) { return add(mul(a, 1.0f - t), mul(b, t)); }
 static float clampf(float x, float lo, float hi) { return x < lo ? lo : x > hi ? hi : x; }
-static float step_between(float lo, float hi, float x) { // smooth 0 -> 1
+static float step_between(float lo, float hi, float x) { // smoothstep
     const float t = clampf((x - lo) / (hi - lo), 0.0f, 1.0f);
     return t * t * (3.0f - 2.0f * t);
 }
@@ -122,8 +122,8 @@ static float noise(v3 p) { // value noise, [0,1]
     const float below = a + q * (b - a), above = c + q * (d - c);
     return below + t * (above - below);
 }
-// `width` here and below: size of a pixel in the noise's units. What is finer is replaced by its mean, so that the
-// texture is the same place by place in near and far photos.
+// `width` here and below: size of a pixel in units of the noise. Detail finer than a pixel is replaced by its mean, so that
+// a place has the same texture in near and far photos.
 static float soft_noise(v3 p, float width) {
     return width >= 1.0f ? 0.5f : width <= 0.5f ? noise(p) : 0.5f + (2.0f - 2.0f * width) * (noise(p) - 0.5f);
 }
@@ -137,7 +137,7 @@ static float fbm(v3 p, int octaves, float width) { // [0,1], mean 0.5
     return sum / total;
 }
 
-typedef struct cell { float edge; uint32_t id; } cell; // distance to the cell's border, its name
+typedef struct cell { float edge; uint32_t id; } cell; // edge: distance to the cell's border; id: hash
 
 static cell voronoi(float x, float y, int32_t salt) {
     const int32_t cx = floor_int(x), cy = floor_int(y);
@@ -159,7 +159,8 @@ static cell voronoi(float x, float y, int32_t salt) {
     out.edge = second - best;
     return out;
 }
-static float part(uint32_t id, int which) { return (float)(id >> (8 * which) & 255u) / 255.0f; } // random of a name
+// One of four random numbers in [0,1] from a hash.
+static float part(uint32_t id, int which) { return (float)(id >> (8 * which) & 255u) / 255.0f; }
 
 // ---- materials -----------------------------------------------------------------
 
@@ -169,7 +170,7 @@ typedef enum material {
 
 typedef struct look {
     v3 albedo;    // linear
-    float height; // of the relief, for bumps, in metres
+    float height; // of the relief in metres, for bump mapping
     float gloss;  // 0 matt .. 1 glazed
 } look;
 
@@ -212,7 +213,7 @@ static look look_brick(float s, float z, v3 p, int32_t salt, float w) { // s alo
     return l;
 }
 
-static look look_plaster(float s, float z, v3 p, float w) { // old ochre plaster, bricks where it fell off, ivy over it
+static look look_plaster(float s, float z, v3 p, float w) { // old ochre plaster over bricks, with ivy
     look l = {{0, 0, 0}, 0, 0.0f};
     const float stain = fbm(v(2.2f * s, 2.0f * p.x, 0.7f * z), 4, 2.2f * w), fine = fbm(mul(p, 22.0f), 3, 22.0f * w);
     l.albedo =
@@ -329,8 +330,8 @@ static look look_fruit(material m, v3 p, uint32_t seed, float w) {
     return l;
 }
 
-// Appearance of a material at `p` in the object's own axes (n: its normal there); `seed` tells objects apart; w: width of
-// a pixel.
+// Appearance of a material at point `p` with normal `n`, both in the object's axes. `seed` distinguishes objects; w: width
+// of a pixel.
 static look look_at(material m, v3 p, v3 n, uint32_t seed, float w) {
     look l = {{0.5f, 0.5f, 0.5f}, 0.0f, 0.0f};
     switch (m) {
@@ -415,7 +416,7 @@ static void* grown(void* array, size_t* room, size_t needed, size_t size, int* f
     return fresh ? fresh : array;
 }
 
-// A grid of nu x nw cells over a patch; normals by differences, pointing along d/du x d/dw.
+// Adds a patch as a grid of nu x nw cells. Normals are finite differences and point along d/du x d/dw.
 static void add_patch(world* s, patch_fn fn, const float* shape, int nu, int nw, material m, uint32_t seed, place where) {
     const size_t first = s->vertex_count, points = (size_t)(nu + 1) * (size_t)(nw + 1);
     s->vertices = (vertex*)grown(s->vertices, &s->vertex_room, first + points, sizeof(vertex), &s->failed);
@@ -479,7 +480,7 @@ static v3 patch_torus(float u, float w, const float* s) {
     const float a = 6.2831853f * u, b = 6.2831853f * w, r = s[1] * (1.0f + 0.08f * sinf(26.0f * a + 3.0f * b));
     return v(cosf(a) * (s[0] + r * cosf(b)), sinf(a) * (s[0] + r * cosf(b)), r * sinf(b));
 }
-static v3 patch_lathe(float u, float w, const float* s) { // s[0] pairs of (radius, height), smooth between them
+static v3 patch_lathe(float u, float w, const float* s) { // a smooth profile through s[0] pairs of (radius, height)
     const int n = (int)s[0];
     const float t = w * (float)(n - 1);
     const int i = t >= (float)(n - 1) ? n - 2 : (int)t;
@@ -679,7 +680,7 @@ static v3 around(v3 n, float u, float w, float spread) { // spread 1: cosine-wei
     return unit(add(add(mul(t, r * cosf(a)), mul(b, r * sinf(a))), mul(n, sqrtf(1.0f - r * r))));
 }
 
-// Mean colour of what light bounces off; the small things do not matter.
+// Mean albedo for light that bounces once; small objects do not matter.
 static v3 mean_albedo(material m) {
     switch (m) {
         case PAVING: return v(0.25f, 0.21f, 0.16f);
@@ -692,7 +693,7 @@ static v3 mean_albedo(material m) {
     }
 }
 
-// Light from the sky and, after one bounce, from the sunlit surroundings, at every vertex.
+// Bakes diffuse light into every vertex: from the sky and, after one bounce, from sunlit surroundings.
 typedef struct bake_job { world* s; int rays; } bake_job;
 enum { BAKE_CHUNK = 512 };
 
@@ -722,12 +723,12 @@ static void bake_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// Colour of what the ray met. r1, r2: random place on the sun's disc (made large for soft shadows).
+// Colour of a ray's hit. r1, r2: random position on the sun's disc, which is enlarged for soft shadows.
 static v3 shade(const world* s, const hit* h, v3 d, float r1, float r2) {
     const float width = h->t * s->pixel_angle / maxf(fabsf(dot(h->normal, d)), 0.3f);
     const look l = look_at(h->what->m, h->local, h->local_normal, h->what->seed, width);
     v3 n = h->normal;
-    if (l.height != 0.0f && h->t < 6.0f) { // bump: the relief's slope tilts the normal
+    if (l.height != 0.0f && h->t < 6.0f) { // bump mapping: the slope of the relief tilts the normal
         const float e = maxf(0.005f, width);
         const v3 t = unit(fabsf(n.z) < 0.8f ? cross(n, v(0, 0, 1)) : cross(n, v(1, 0, 0))), b = cross(n, t);
         const v3 lt = mul(rotate_z(t, -h->what->yaw), e), lb = mul(rotate_z(b, -h->what->yaw), e);
@@ -742,7 +743,7 @@ static v3 shade(const world* s, const hit* h, v3 d, float r1, float r2) {
     const int lit = facing > 0 && dot(h->normal, to_sun) > 0 && !blocked(s, from, to_sun, 1e-3f, INFINITY);
     v3 light = h->light;
     if (lit) light = add(light, mul(sun_color, facing));
-    if (h->what->m == LEAF && !lit) light = add(light, mul(sun_color, 0.10f)); // light through the leaf
+    if (h->what->m == LEAF && !lit) light = add(light, mul(sun_color, 0.10f)); // translucency
     v3 c = times(l.albedo, light);
     if (l.gloss > 0) {
         const float cosine = clampf(-dot(n, d), 0, 1), fresnel = 0.04f + 0.96f * powf(1 - cosine, 5.0f);
@@ -777,7 +778,7 @@ static v3 eye_of(const gsf_camera* camera) {
     gsf_get_camera_center(camera, c);
     return v((float)c[0], (float)c[1], (float)c[2]);
 }
-static v3 ray_through(const gsf_camera* camera, double x, double y, float* z) { // z: camera depth per unit of length
+static v3 ray_through(const gsf_camera* camera, double x, double y, float* z) { // z: camera depth per unit of ray length
     const double *m = camera->w2c, a = (x - camera->cx) / camera->fx, b = (y - camera->cy) / camera->fy;
     const v3 d = v((float)(m[0] * a + m[1] * b + m[2]), (float)(m[4] * a + m[5] * b + m[6]),
                    (float)(m[8] * a + m[9] * b + m[10]));
@@ -785,7 +786,7 @@ static v3 ray_through(const gsf_camera* camera, double x, double y, float* z) { 
     return unit(d);
 }
 
-static float film(float x) { // Narkowicz's fit of the ACES curve, then sRGB coding
+static float film(float x) { // Narkowicz's fit of the ACES curve, then sRGB encoding
     x *= 0.50f;
     x = clampf(x * (2.51f * x + 0.03f) / (x * (2.43f * x + 0.59f) + 0.14f), 0, 1);
     return x <= 0.0031308f ? 12.92f * x : 1.055f * powf(x, 1.0f / 2.4f) - 0.055f;
@@ -811,7 +812,7 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
             v3 c = sky(d);
             if (trace(job->s, eye, d, 0.01f, &h)) {
                 const float r1 =
-                    ((float)k + random3(at, 1, (int32_t)job->view)) / SAMPLES;  // one of each ring of the sun's disc
+                    ((float)k + random3(at, 1, (int32_t)job->view)) / SAMPLES;  // one sample per ring of the sun's disc
                 c = shade(job->s, &h, d, r1, random3((int32_t)pixel, 2, (int32_t)job->view) + 0.381966f * (float)k);
                 c = mix(c, v(0.55f, 0.62f, 0.70f), 0.012f * h.t); // a little haze
             }
@@ -828,7 +829,7 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
-// A walk around the table, camera in hand: distance, height, aim and roll all waver.
+// Camera of a walk around the table with a handheld camera: distance, height, aim and roll vary.
 static gsf_camera camera_of(world* s, const make_scene_options* o, int view) {
     gsf_camera c;
     memset(&c, 0, sizeof c);
@@ -845,7 +846,7 @@ static gsf_camera camera_of(world* s, const make_scene_options* o, int view) {
     const v3 flat_down = cross(forward, level);
     const v3 right = unit(add(mul(level, cosf(roll)), mul(flat_down, sinf(roll)))), down = cross(forward, right);
     const v3 axes[3] = {right, down, forward};
-    for (int r = 0; r < 3; r++) { // doubles made orthonormal again below
+    for (int r = 0; r < 3; r++) { // only as orthonormal as floats; Gram-Schmidt in double follows
         c.w2c[r] = (double)axes[r].x, c.w2c[4 + r] = (double)axes[r].y, c.w2c[8 + r] = (double)axes[r].z;
     }
     double* m = c.w2c;
@@ -877,7 +878,7 @@ typedef struct cloud {
     uint8_t* outlier; // (point_count)
 } cloud;
 
-// What the view sees of a place: bits of TRUTH_*.
+// Whether a view sees a point: TRUTH_* flags.
 static uint8_t truth_of(const world* s, const gsf_camera* camera, v3 at) {
     const double p[3] = {(double)at.x, (double)at.y, (double)at.z};
     double x, y, z;
@@ -887,7 +888,7 @@ static uint8_t truth_of(const world* s, const gsf_camera* camera, v3 at) {
     return TRUTH_IN_FRAME | (blocked(s, eye, mul(d, 1.0f / distance), 0.01f, distance - 4e-3f) ? 0 : TRUTH_VISIBLE);
 }
 
-// Least squares over the rays of noisy observations, as triangulation does it. Returns 0 where rays are near parallel.
+// Triangulates a point: least squares over the rays of its noisy observations. Returns 0 if the rays are nearly parallel.
 static int triangulate(const gsf_scene* scene, const uint32_t* views, const double (*seen)[2], size_t count,
                        double out[3]) {
     double a[3][3] = {{0}}, b[3] = {0};
@@ -920,7 +921,7 @@ static int triangulate(const gsf_scene* scene, const uint32_t* views, const doub
     return 1;
 }
 
-static float texture_at(const uint8_t* pixels, int width, int x, int y) { // strength of the weaker gradient direction
+static float texture_at(const uint8_t* pixels, int width, int x, int y) { // smaller eigenvalue of the structure tensor
     float xx = 1e-6f, yy = 1e-6f, xy = 0;
     for (int j = y - 1; j <= y + 1; j++)
         for (int i = x - 1; i <= x + 1; i++) {
@@ -931,8 +932,8 @@ static float texture_at(const uint8_t* pixels, int width, int x, int y) { // str
     return 0.5f * (xx + yy - sqrtf((xx - yy) * (xx - yy) + 4 * xy * xy));
 }
 
-// One candidate: a pixel of a view, preferably at a corner; where its ray ends; who sees and who finds that place.
-// Returns the length of its track, below 2 when nothing came of it.
+// Tries one candidate: takes a pixel of a view, preferably at a corner, traces its ray, and decides which views see the
+// point and which detect it. Returns the length of its track, less than 2 if the candidate is rejected.
 static size_t find_point(const world* s, const make_scene_options* o, const cloud* c, uint8_t* const* photos, uint64_t try_,
                          uint32_t* track, double (*seen)[2], double at[3], uint8_t* truth, uint8_t* color, int* outlier) {
     const gsf_scene* scene = &c->scene;
@@ -948,7 +949,8 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
     hit h;
     const v3 eye = eye_of(camera), d = ray_through(camera, x, y, &z);
     if (!trace(s, eye, d, 0.01f, &h)) return 0;
-    for (int i = 0; i < 4; i++) { // what looks like a corner but is an edge before something farther off is not found again
+    // A corner in the image that is really an occlusion edge is rarely matched in another view.
+    for (int i = 0; i < 4; i++) {
         hit near;
         const v3 side = ray_through(camera, x + (i & 1 ? 3.0 : -3.0), y + (i & 2 ? 3.0 : -3.0), &z);
         const int jump = !trace(s, eye, side, 0.01f, &near) || fabsf(near.t - h.t) > 0.06f * h.t;
@@ -958,8 +960,8 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
     if (*outlier) h.at = add(eye, mul(d, h.t * (float)exp((gsf_draw_uniform(s->seed, 2, k + 5) - 0.5) * 1.2)));
     memcpy(color, pixel, 3);
     size_t length = 0;
-    int wrong_left = 1 + (gsf_draw_uniform(s->seed, 2, k + 6) < 0.3); // a wrong match joins two views, rarely three
-    float widest = 0.0f; // angle between the anchor's ray and another's
+    int wrong_left = 1 + (gsf_draw_uniform(s->seed, 2, k + 6) < 0.3); // a wrong match joins two views, sometimes three
+    float widest = 0.0f; // largest angle between the anchor's ray and another view's
     for (int i = 0; i < o->views; i++) {
         const gsf_camera* other = &scene->views[i].camera;
         const uint64_t j = k + 8 + 4 * (uint64_t)(i % 120);
@@ -980,8 +982,8 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
         widest = maxf(widest, angle);
     }
     if (length < 2 || widest < 0.026f || !triangulate(scene, track, (const double(*)[2])seen, length, at))
-        return 0;                         // 1.5 degrees
-    for (size_t i = 0; i < length; i++) { // COLMAP's filter of 4 pixels
+        return 0;                         // 0.026: 1.5 degrees
+    for (size_t i = 0; i < length; i++) { // COLMAP's limit on the reprojection error: 4 pixels
         double u, w, depth;
         if (!gsf_project_point(&scene->views[track[i]].camera, at, &u, &w, &depth) ||
             hypot(u - seen[i][0], w - seen[i][1]) > 4.0)
@@ -1046,10 +1048,10 @@ static gsf_result write_depth(gsf_context* ctx, const char* path, const float* d
 
 /* OUT/truth/visibility.bin, little-endian:
        char magic[8] "GSFTRUTH" | u64 points | u64 views
-       u8 seen[points][views]   bit 0: nothing stands before the place, bit 1: it is inside the frame (bit 0 implies bit 1)
+       u8 seen[points][views]   bit 0: visible, not occluded; bit 1: inside the frame (bit 0 implies bit 1)
        u8 outlier[points]       1: a wrong match
-   Points as in points3D.bin, views sorted by name. The place is the surface point that the noisy point stands for; of an
-   outlier, where the wrong match lies. */
+   Points are in the order of points3D.bin, views in the order of their names. Visibility is that of the exact surface
+   point, before noise; for an outlier, that of the position of the wrong match. */
 static gsf_result write_truth(gsf_context* ctx, const char* path, const cloud* c) {
     gsf_buffer out;
     memset(&out, 0, sizeof out);
@@ -1063,7 +1065,7 @@ static gsf_result write_truth(gsf_context* ctx, const char* path, const cloud* c
     return result;
 }
 
-// OUT/truth/scene.json: what the scene is a function of.
+// OUT/truth/scene.json: all options that determine the scene.
 static gsf_result write_options(gsf_context* ctx, const char* path, const make_scene_options* o) {
     char text[256];
     const int size = snprintf(text, sizeof text, "{\"views\":%d,\"width\":%d,\"height\":%d,\"points\":%d,\"noise\":%.17g,"
@@ -1072,10 +1074,10 @@ static gsf_result write_options(gsf_context* ctx, const char* path, const make_s
     return gsf_write_file(ctx, path, text, (size_t)size);
 }
 
-// ---- all of it -----------------------------------------------------------------
+// ---- scene ---------------------------------------------------------------------
 
 static int start_world(gsf_context* ctx, world* s, const make_scene_options* o) {
-    const int bake_rays = o->width * o->height < 20000 ? 8 : 32; // small photos do not show the difference
+    const int bake_rays = o->width * o->height < 20000 ? 8 : 32; // the difference is invisible in small photos
     s->seed = o->seed;
     s->pixel_angle = 1.0f / (0.9f * (float)o->width);
     make_lattice();
@@ -1097,7 +1099,7 @@ static int start_world(gsf_context* ctx, world* s, const make_scene_options* o) 
     rtcCommitScene(s->scene);
     if (rtcGetDeviceError(s->device) != RTC_ERROR_NONE) {
         fprintf(stderr, "make_scene: Embree cannot build the scene\n");
-        s->scene = NULL; // not to be released: it may hold a TBB task that never ran, and would wait for it
+        s->scene = NULL; // leaked on purpose: releasing it could wait for a TBB task that never ran
         return 0;
     }
     bake_job bake = {s, bake_rays};
@@ -1140,7 +1142,7 @@ static int take_photos(gsf_context* ctx, world* s, const make_scene_options* o, 
     return ok;
 }
 
-// Makes everything. 0 when it went well, else a line on stderr says what did not.
+// Makes the scene and writes all files. Returns 0, or 1 after printing the error.
 static int make_scene(gsf_context* ctx, const make_scene_options* options, const char* folder) {
     const make_scene_options* o = options;
     world s;
@@ -1184,9 +1186,9 @@ static int make_scene(gsf_context* ctx, const make_scene_options* options, const
 
 #ifndef MAKE_SCENE_NO_MAIN
 
-// ---- further photos of a made scene ---------------------------------------------
+// ---- further photos of an existing scene ----------------------------------------
 
-// What decides how the scene looks. Seeds are below 1e9, so that a number of JSON holds them.
+// Reads the options that determine the appearance of the scene. Seeds are below 1e9, which JSON numbers represent exactly.
 static gsf_result read_options(gsf_context* ctx, const char* path, make_scene_options* o) {
     static const char* const keys[] = {"width", "height", "seed"};
     double values[3] = {0};
@@ -1213,7 +1215,7 @@ static gsf_result read_options(gsf_context* ctx, const char* path, make_scene_op
     return result;
 }
 
-// Picture and depth of camera i, as if it had taken photo i.
+// Renders the picture and depth map of camera i, with the random numbers of photo i.
 static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_camera* camera, size_t i, const char* out) {
     char path[2048];
     const size_t pixels = (size_t)camera->width * (size_t)camera->height;
@@ -1237,7 +1239,7 @@ static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_came
     return result;
 }
 
-// Photographs the scene in `folder` at the cameras of a file. 0 when it went well, else a line on stderr says what did not.
+// Renders the scene in `folder` from the cameras of a file. Returns 0, or 1 after printing the error.
 static int render_scene(gsf_context* ctx, const char* folder, const char* cameras, const char* out) {
     char path[2048];
     make_scene_options o = make_scene_defaults;
@@ -1251,7 +1253,7 @@ static int render_scene(gsf_context* ctx, const char* folder, const char* camera
     int ok = result == GSF_OK && make_folder(out, "") && make_folder(out, "/depth") && start_world(ctx, &s, &o);
     const float angle = s.pixel_angle;
     for (size_t i = 0; ok && i < count; i++) {
-        s.pixel_angle = angle * (float)(0.9 * o.width / list[i].fx); // texture as fine as these pixels show it
+        s.pixel_angle = angle * (float)(0.9 * o.width / list[i].fx); // texture detail for the pixel size of this camera
         result = render_camera(ctx, &s, list + i, i, out);
         ok = result == GSF_OK;
     }
@@ -1267,7 +1269,7 @@ static int render_scene(gsf_context* ctx, const char* folder, const char* camera
 
 #ifndef MAKE_SCENE_NO_MAIN
 
-static int is_vacant(const char* folder) { // not there, or empty
+static int is_vacant(const char* folder) { // does not exist or is empty
     DIR* list = opendir(folder);
     if (!list) return errno == ENOENT;
     int empty = 1;
@@ -1277,7 +1279,7 @@ static int is_vacant(const char* folder) { // not there, or empty
     return empty;
 }
 
-// Of make_scene's own making, as its truth shows?
+// Whether make_scene wrote the folder, judging by its visibility.bin.
 static int is_made_scene(const char* folder) {
     char path[2048], magic[8] = "";
     snprintf(path, sizeof path, "%s/truth/visibility.bin", folder);
