@@ -1299,7 +1299,7 @@ static void gsf__ply_list_targets(gsf__ply_job* job) {
     }
 }
 
-// Decodes a row of little-endian float32 columns. NaN and infinity are collected in one bit to avoid a branch per value.
+// Decodes a row of little-endian float32 columns. Collects NaN and infinity in one bit to avoid a branch per value.
 static int gsf__ply_decode_f32(const gsf__ply_job* job, const unsigned char* row, size_t i) {
     uint32_t bad = 0;
     for (size_t t = 0; t < job->target_count; t++) {
@@ -3154,8 +3154,8 @@ static int gsf__rectify_like_opencv(gsf__rectify* r) {
     return gsf__rectify_is_sound(r);
 }
 
-// Returns whether the border of the pinhole image lies inside the photo when its focal lengths are `zoom` times those
-// of the lens.
+// Returns whether the border of the pinhole image lies inside the photo, and inside radius_max, when its focal lengths
+// are `zoom` times those of the lens.
 static int gsf__rectify_fits(const gsf__rectify* r, double zoom, double radius_max) {
     const gsf__lens* lens = &r->lens;
     const int samples = 32;
@@ -3199,8 +3199,8 @@ static double gsf__lens_radius_max(const gsf__lens* lens) {
 }
 
 // Rectifies the lenses that the parser of the GSFixer release has no sound method for (all but RATIONAL), and those for
-// which OpenCV's rectangle fails. Size, principal point and pixel aspect are those of the photo; the zoom is the smallest
-// at which no pixel falls outside the photo. Pixel centres are exact. Returns 0 when no image is left.
+// which OpenCV's rectangle fails. Size, principal point and pixel aspect are those of the photo; the zoom is the
+// smallest at which no pixel falls outside the photo. Pixel centres are exact. Returns 0 when no image is left.
 static int gsf__rectify_by_zoom(gsf__rectify* r) {
     const double radius_max = gsf__lens_radius_max(&r->lens);
     double low = 1.0 / 1024, high = 64.0;
@@ -3294,16 +3294,16 @@ static gsf_result gsf__rectify_image(gsf_context* ctx, const gsf__rectify* r, co
 
 // ---- >>scene -------------------------------------------------------------------
 
-typedef struct gsf__view_source { // what gsf_splat_load_view_image needs of a view
-    gsf__rectify rectify;    // lens: of the photo at the size at which it is undistorted
-    size_t path, mask;       // offsets in paths, of the mask as it is called without .png; SIZE_MAX: parsed from memory
+typedef struct gsf__view_source { // what gsf_splat_load_view_image needs to load the photo of a view
+    gsf__rectify rectify;    // lens: scaled to the size at which the photo is undistorted
+    size_t path, mask;       // offsets into paths; mask: path without .png; SIZE_MAX: scene parsed from memory
     int64_t file_width, file_height;
 } gsf__view_source;
 
 typedef struct gsf__scene_state {
-    gsf__view_source* sources; // per view
-    char* names;               // what the views' names point to
-    gsf_buffer paths;          // of photos and masks, each terminated
+    gsf__view_source* sources; // one per view
+    char* names;               // storage of the views' names
+    gsf_buffer paths;          // paths of photos and masks, NUL-terminated
     int32_t no_masks;
 } gsf__scene_state;
 
@@ -3331,7 +3331,7 @@ GSF_API void gsf_splat_destroy_scene(gsf_context* ctx, gsf_scene* scene) {
 
 // ---- files ----
 
-// Runs without the log hook what may fail without harm; ctx->error is left as it was.
+// Suspends the log hook while something runs that is allowed to fail, and saves ctx->error to restore it afterwards.
 typedef struct gsf__hush {
     gsf_logger logger;
     char error[512];
@@ -3343,14 +3343,14 @@ static void gsf__hush_begin(gsf_context* ctx, gsf__hush* hush) {
     memset(&ctx->logger, 0, sizeof ctx->logger);
 }
 
-// Takes the error back if `forget`, else reports it now.
+// Restores the log hook. With `forget`, also restores ctx->error; otherwise logs the new error now.
 static void gsf__hush_end(gsf_context* ctx, const gsf__hush* hush, int forget) {
     ctx->logger = hush->logger;
     if (forget) memcpy(ctx->error, hush->error, sizeof hush->error);
     else gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
 }
 
-// Reads <folder><relative>; *data NULL where there is no such file.
+// Reads <folder><relative>. *data is NULL if the file does not exist.
 static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const char* relative, gsf_buffer* path,
                                      void** data, size_t* size) {
     gsf__hush hush;
@@ -3364,7 +3364,7 @@ static gsf_result gsf__read_if_there(gsf_context* ctx, const char* folder, const
     return absent ? GSF_OK : result;
 }
 
-// Names come from files, so they must not lead out of the folder: relative, no "..", no drive.
+// Names come from untrusted files, so they must not lead out of the folder: relative, no "..", no drive letter.
 static gsf_result gsf__check_relative(gsf_context* ctx, const char* where, size_t at, const char* name, size_t size) {
     int bad = size == 0 || name[0] == '/' || name[0] == '\\';
     bad = bad || (size >= 2 && name[1] == ':' && ((name[0] | 32) >= 'a' && (name[0] | 32) <= 'z'));
@@ -3379,13 +3379,13 @@ static gsf_result gsf__check_relative(gsf_context* ctx, const char* where, size_
                     (int)(size < 100 ? size : 100), name);
 }
 
-typedef struct gsf__photos { // where the photos of a model lie; NULL instead: nowhere (parsed from memory)
-    const char* folder;   // with a separator at its end, or empty
-    const char* prefix;   // "images/" (COLMAP) or "" (transforms.json, whose paths hold the folder)
+typedef struct gsf__photos { // location of a model's photos; a NULL pointer to it means parsed from memory, no photos
+    const char* folder;   // ends with a separator, or is empty
+    const char* prefix;   // "images/" (COLMAP) or "" (transforms.json, whose paths include the folder)
     int32_t factor, max_size, no_masks;
 } gsf__photos;
 
-// Is there an image at `path`? Its size then; *width 0 otherwise.
+// Returns the size of the image at `path`; *width is 0 if there is none.
 static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_buffer* path, int64_t* width, int64_t* height) {
     gsf__hush hush;
     int32_t channels;
@@ -3398,9 +3398,9 @@ static gsf_result gsf__query_photo(gsf_context* ctx, const gsf_buffer* path, int
     return absent ? GSF_OK : result;
 }
 
-// Finds a view's photo. With a factor first in <first folder>_<factor>/, under its own name or with another extension
-// (downscaled copies often are .png of .jpg); then the full-size one; transforms.json may leave the extension out.
-// *reduced: it is the downscaled copy. *width 0: not there.
+// Finds a view's photo. With a factor, looks first in <first folder>_<factor>/, under the same name or with another
+// extension (downscaled copies of .jpg files are often .png); then for the full-size photo. transforms.json may omit
+// the extension. *reduced is set if the downscaled copy was found; *width is 0 if nothing was.
 static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, const char* name, gsf_buffer* path,
                                   int64_t* width, int64_t* height, int* reduced) {
     static const char* const extensions[6] = {".png", ".jpg", ".JPG", ".jpeg", ".PNG", ".JPEG"};
@@ -3433,7 +3433,7 @@ static gsf_result gsf__find_photo(gsf_context* ctx, const gsf__photos* photos, c
 
 // ---- from model to scene ----
 
-static double gsf__round_half_even(double x) { // for x >= 0 well below 2^52, as Python's round and numpy's
+static double gsf__round_half_even(double x) { // as Python's and numpy's round; for x >= 0 well below 2^52
     const double down = floor(x), rest = x - down;
     if (rest != 0.5) return rest < 0.5 ? down : down + 1.0;
     return fmod(down, 2.0) == 0.0 ? down : down + 1.0;
@@ -3447,7 +3447,8 @@ static int gsf__compare_image_names(const void* a, const void* b) {
     return (x->name_size > y->name_size) - (x->name_size < y->name_size);
 }
 
-// The lens of a camera with what transforms.json left open taken from the photo (width 0: no photo). 0: size unknown.
+// Completes the lens of a camera: takes what transforms.json omits from the photo's size (width 0: no photo). Returns 0
+// if the size or focal length cannot be determined.
 static int gsf__camera_lens(const gsf__sfm_camera* camera, int64_t width, int64_t height, gsf__lens* out) {
     *out = camera->lens;
     if (!camera->open) return 1;
@@ -3463,7 +3464,7 @@ static int gsf__camera_lens(const gsf__sfm_camera* camera, int64_t width, int64_
     return isfinite(out->fx) && isfinite(out->fy) && out->fx > 0.0 && out->fy > 0.0;
 }
 
-// The size at which a photo is used.
+// Computes the size to which a photo is scaled.
 static void gsf__target_size(const gsf__photos* photos, int64_t width, int64_t height, int reduced, int32_t* out_width,
                              int32_t* out_height) {
     double scale = 1.0;
@@ -3474,9 +3475,9 @@ static void gsf__target_size(const gsf__photos* photos, int64_t width, int64_t h
     *out_height = (int32_t)fmax(1.0, gsf__round_half_even((double)height * scale));
 }
 
-// Fills view `out` and its source from a model image. *present = 0: its photo is missing.
-// The official parser divides K by the factor and multiplies by actual / (COLMAP size / factor, rounded down); taken
-// here without the rounding down, K simply follows the ratio of the sizes, each axis and each view for itself.
+// Fills *view and *source from an image of the model. *present = 0 if its photo is missing.
+// The parser of the GSFixer release divides K by the factor and multiplies it by actual / (COLMAP size / factor,
+// rounded down). Here nothing is rounded, so K is simply scaled by the ratio of the sizes, per axis and view.
 static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, const gsf__sfm_image* image,
                                        const gsf__photos* photos, gsf_buffer* path, gsf_scene_view* view,
                                        gsf__view_source* source, int* present) {
@@ -3489,7 +3490,7 @@ static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, cons
     if (width > GSF__LENS_SIZE_MAX || height > GSF__LENS_SIZE_MAX)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: image size %lld x %lld", path->data, (long long)width,
                         (long long)height);
-    const int64_t full = reduced ? photos->factor : 1; // an open size means the full photo's
+    const int64_t full = reduced ? photos->factor : 1; // an omitted size is that of the full-size photo
     if (!gsf__camera_lens(&m->cameras[image->camera], width * full, height * full, &lens))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: \"%s\": no usable w, h or focal length", m->images_name,
                         image->at, view->name);
@@ -3521,8 +3522,8 @@ static gsf_result gsf__scene_make_view(gsf_context* ctx, const gsf__sfm* m, cons
     return gsf_check_camera(ctx, camera);
 }
 
-// Names, views and sources of all images whose photo is there, sorted by name. m->images is sorted too; its `camera`
-// becomes the index of the view (UINT32_MAX: left out).
+// Makes names, views and sources of all images whose photo exists, sorted by name. Also sorts m->images and overwrites
+// their `camera` with the index of the view (UINT32_MAX: omitted).
 static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_scene* scene) {
     gsf__scene_state* state = (gsf__scene_state*)scene->state;
     gsf_buffer path;
@@ -3557,7 +3558,7 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
         names += image->name_size + 1;
         result = gsf__scene_make_view(ctx, m, image, photos, &path, view, source, &present);
         if (result == GSF_OK && !present) {
-            if (!missing++) gsf_log(ctx, GSF_LOG_WARNING, "%s%s%s: no such photo; the view is left out", photos->folder,
+            if (!missing++) gsf_log(ctx, GSF_LOG_WARNING, "%s%s%s: no such photo; the view is omitted", photos->folder,
                                     photos->prefix, view->name);
             memset(view, 0, sizeof *view);
         }
@@ -3567,7 +3568,7 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
             const char* slash = photos->prefix[0] ? NULL : strchr(view->name, '/');
             source->path = state->paths.size;
             gsf_append_bytes(ctx, &state->paths, path.data, path.size + 1);
-            source->mask = state->paths.size; // the folder masks takes the place of the photos' own
+            source->mask = state->paths.size; // masks/ replaces the photos' top folder
             gsf_append_text(ctx, &state->paths, "%smasks/%s", photos->folder, slash ? slash + 1 : view->name);
             gsf_append_bytes(ctx, &state->paths, "", 1);
             if (state->paths.failed) result = GSF_ERROR_OUT_OF_MEMORY;
@@ -3599,7 +3600,7 @@ static void gsf__sift_u32(uint32_t* v, size_t root, size_t n) {
     }
 }
 
-// In place, O(n log n) for every input. Short ones, as tracks are, by insertion.
+// Sorts in place, in O(n log n) for every input. Short arrays, as most tracks are, use insertion sort.
 static void gsf__sort_u32(uint32_t* v, size_t n) {
     if (n <= 32) {
         for (size_t i = 1; i < n; i++) {
@@ -3619,16 +3620,16 @@ static void gsf__sort_u32(uint32_t* v, size_t n) {
     }
 }
 
-// Tracks from image ids to view indices, ascending, each once. Ids of images that are left out, and ids that no image
-// has, fall away; the latter are counted in a warning. Sorts m->images by id.
+// Converts tracks from image ids to view indices, sorted and without duplicates. Ids of omitted images are dropped, as
+// are ids that no image has, which are also counted in a warning. Sorts m->images by id.
 static gsf_result gsf__scene_map_tracks(gsf_context* ctx, gsf__sfm* m) {
     qsort(m->images, m->image_count, sizeof *m->images, gsf__compare_image_ids);
     for (size_t i = 1; i < m->image_count; i++)
         if (m->images[i].id == m->images[i - 1].id)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image id %u stands twice", m->images_name, m->images[i].at,
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image id %u occurs twice", m->images_name, m->images[i].at,
                             (unsigned)m->images[i].id);
     if (m->track_count == 0) return GSF_OK;
-    // Ids are mostly dense, so a table serves; else binary search.
+    // Ids are usually dense, so they index a table; sparse ids use binary search.
     const uint32_t last = m->images[m->image_count - 1].id;
     uint32_t* table = NULL;
     if (last / 8 <= m->image_count) {
@@ -3666,7 +3667,7 @@ static gsf_result gsf__scene_map_tracks(gsf_context* ctx, gsf__sfm* m) {
     return GSF_OK;
 }
 
-// The model becomes a scene (the model loses its points to it). photos NULL: parsed from memory.
+// Converts a model to a scene, which takes over the model's points. photos: NULL if parsed from memory.
 static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__photos* photos, gsf_scene* scene) {
     memset(scene, 0, sizeof *scene);
     scene->state = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__scene_state));
@@ -3686,7 +3687,7 @@ static gsf_result gsf__scene_build(gsf_context* ctx, gsf__sfm* m, const gsf__pho
         m->point_ids = NULL;
         m->track_begin = NULL;
         m->tracks = NULL;
-        // No array is NULL, so that nobody has to ask.
+        // Allocates empty arrays too, so that callers need no NULL checks.
         if (!scene->points) scene->points = (double*)gsf_alloc_zeroed(ctx, 1, 3 * sizeof(double));
         if (!scene->colors) scene->colors = (uint8_t*)gsf_alloc_zeroed(ctx, 1, 3);
         if (!scene->point_ids) scene->point_ids = (uint64_t*)gsf_alloc_zeroed(ctx, 1, sizeof(uint64_t));
@@ -3733,7 +3734,7 @@ GSF_API gsf_result gsf_splat_parse_transforms(gsf_context* ctx, const gsf_bytes*
     return result;
 }
 
-// folder: with a separator at its end. path: scratch.
+// photos->folder must end with a separator. path: scratch.
 static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const void* data, size_t size,
                                        gsf__photos* photos, gsf_buffer* path, gsf_scene* out) {
     gsf_json document;
@@ -3758,7 +3759,7 @@ static gsf_result gsf__load_transforms(gsf_context* ctx, const char* name, const
     return result;
 }
 
-// Reads the three files of the first model found. *found = 0: none.
+// Reads the three files of the first model found. *found is 0 if there is none.
 static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, gsf_buffer* path, int* found,
                                    gsf_scene* out) {
     static const char* const folders[3] = {"sparse/0/", "sparse/", ""};
@@ -3772,7 +3773,7 @@ static gsf_result gsf__load_colmap(gsf_context* ctx, const gsf__photos* photos, 
     memset(names, 0, sizeof names);
     memset(&m, 0, sizeof m);
     *found = 0;
-    for (int i = 0; i < 6 && !*found && result == GSF_OK; i++) { // binary before text in each folder
+    for (int i = 0; i < 6 && !*found && result == GSF_OK; i++) { // in each folder, binary before text
         const char* extension = i & 1 ? ".txt" : ".bin";
         char relative[32];
         snprintf(relative, sizeof relative, "%scameras%s", folders[i / 2], extension);
@@ -3866,7 +3867,8 @@ static gsf_image gsf__channels_of(const gsf_image* image, int32_t first, int32_t
     return view;
 }
 
-// Alpha times mask (either may be missing), of the photo's size; data NULL where all pixels count.
+// Makes a view's pixel weights, alpha times mask, at the photo's size. Either may be missing; out->data is NULL if all
+// pixels have full weight.
 static gsf_result gsf__view_weight(gsf_context* ctx, const gsf_image* photo, const gsf_image* mask, gsf_image* out) {
     memset(out, 0, sizeof *out);
     const int has_alpha = photo->channels == 2 || photo->channels == 4;
@@ -3889,7 +3891,8 @@ static gsf_result gsf__view_weight(gsf_context* ctx, const gsf_image* photo, con
     return result;
 }
 
-// Colours and weights in one image, colours times weights, so that neighbours mix in proportion.
+// Premultiplies colours by weights, in one image of four channels, so that resampling mixes neighbours in proportion to
+// their weights.
 static gsf_result gsf__join_weight(gsf_context* ctx, const gsf_image* rgb, const gsf_image* weight, gsf_image* out) {
     GSF__TRY(gsf_make_image(ctx, GSF_F32, rgb->width, rgb->height, 4, out));
     const uint8_t *c = (const uint8_t*)rgb->data, *w = (const uint8_t*)weight->data;
@@ -3903,7 +3906,8 @@ static gsf_result gsf__join_weight(gsf_context* ctx, const gsf_image* rgb, const
 
 static uint8_t gsf__byte_of(float v) { return (uint8_t)(v > 0.0f ? v < 255.0f ? v + 0.5f : 255.0f : 0.0f); }
 
-// To bytes. A bicubic filter overshoots: a weight that is cut to 255 takes its colours along.
+// Converts to bytes. Bicubic filters overshoot: where a weight is clamped to 255, its premultiplied colours are scaled
+// with it.
 static gsf_result gsf__joint_bytes(gsf_context* ctx, gsf_image* joint) {
     gsf_image bytes;
     GSF__TRY(gsf_make_image(ctx, GSF_U8, joint->width, joint->height, 4, &bytes));
@@ -3930,7 +3934,7 @@ static gsf_result gsf__part_weight(gsf_context* ctx, const gsf_image* joint, gsf
     return GSF_OK;
 }
 
-// To the size at which the camera was read.
+// Resizes a photo to the size for which the camera was scaled.
 static gsf_result gsf__size_photo(gsf_context* ctx, const gsf__rectify* r, gsf_image* image) {
     gsf_image sized;
     if (image->width == r->lens.width && image->height == r->lens.height) return GSF_OK;
@@ -3941,7 +3945,7 @@ static gsf_result gsf__size_photo(gsf_context* ctx, const gsf__rectify* r, gsf_i
     return result;
 }
 
-// Then without distortion. *image: u8.
+// Undistorts a photo after gsf__size_photo. *image: u8.
 static gsf_result gsf__straighten_photo(gsf_context* ctx, const gsf__rectify* r, gsf_image* image) {
     gsf_image straight;
     if (r->lens.kind == GSF__LENS_PINHOLE) return GSF_OK;
@@ -3951,8 +3955,7 @@ static gsf_result gsf__straighten_photo(gsf_context* ctx, const gsf__rectify* r,
     return GSF_OK;
 }
 
-// mask: u8, one channel, packed, of the photo's size, or NULL.
-// The transfer function of sRGB (IEC 61966-2-1), continued beyond 1; linear below 0.
+// The sRGB transfer function (IEC 61966-2-1), extended above 1; linear below 0.
 static void gsf__encode_srgb(float* values, size_t count) {
     for (size_t i = 0; i < count; i++) {
         const float v = values[i];
@@ -3960,7 +3963,7 @@ static void gsf__encode_srgb(float* values, size_t count) {
     }
 }
 
-// `colors` as packed u8 RGB; a linear image is encoded as sRGB.
+// Converts `colors` to packed u8 RGB; a linear image is encoded as sRGB.
 static gsf_result gsf__photo_bytes(gsf_context* ctx, const gsf_image* colors, const gsf_image* rgb) {
     if (colors->color_space != GSF_COLOR_LINEAR) return gsf_convert_image(ctx, colors, rgb);
     gsf_image floats;
@@ -3974,6 +3977,7 @@ static gsf_result gsf__photo_bytes(gsf_context* ctx, const gsf_image* colors, co
     return result;
 }
 
+// mask: packed u8 with one channel, of the photo's size; or NULL.
 static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view, const gsf_image* photo,
                                 const gsf_image* mask) {
     const gsf__scene_state* state = (const gsf__scene_state*)scene->state;
@@ -4010,7 +4014,8 @@ static gsf_result gsf__set_view(gsf_context* ctx, gsf_scene* scene, size_t view,
     return result;
 }
 
-// Reads NAME.png or NAME.EXT.png, `name` being NAME.EXT with its path; *data NULL where there is neither. *path: which.
+// Reads the mask NAME.png, or else NAME.EXT.png, where `name` is NAME.EXT with its path. *path receives the one found;
+// *data is NULL if neither exists.
 static gsf_result gsf__read_mask(gsf_context* ctx, const char* name, gsf_buffer* path, void** data, size_t* size) {
     const char *dot = strrchr(name, '.'), *slash = strrchr(name, '/');
     const size_t length = strlen(name), stem = dot && (!slash || dot > slash) ? (size_t)(dot - name) : length;
@@ -4027,13 +4032,13 @@ static gsf_result gsf__read_mask(gsf_context* ctx, const char* name, gsf_buffer*
     return result;
 }
 
-// But for the rounding of a size to whole pixels.
+// Returns whether two images have the same aspect ratio, up to the rounding of a size to whole pixels.
 static int gsf__same_shape(const gsf_image* a, const gsf_image* b) {
     const int64_t bent = llabs(a->width * b->height - a->height * b->width);
     return bent <= a->width || bent <= a->height || bent <= b->width || bent <= b->height;
 }
 
-// The mask of the photo that the folder of masks calls `name`, at the photo's size; *out without data: it has none.
+// Loads the mask file `name` (see gsf__read_mask), resized to the photo's size. out->data is NULL if there is none.
 static gsf_result gsf__load_mask(gsf_context* ctx, const char* name, const gsf_image* photo, gsf_image* out) {
     gsf_buffer path;
     void* data = NULL;
@@ -4048,7 +4053,7 @@ static gsf_result gsf__load_mask(gsf_context* ctx, const char* name, const gsf_i
     result = gsf_decode_image(ctx, path.data, data, size, 1, &file);
     if (result != GSF_OK) goto cleanup;
     if (!gsf__same_shape(&file, photo)) {
-        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld pixels have not the shape of the photo's, %lld x %lld",
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %lld x %lld pixels differ in shape from the photo's %lld x %lld",
                           path.data, (long long)file.width, (long long)file.height, (long long)photo->width,
                           (long long)photo->height);
         goto cleanup;
@@ -4120,7 +4125,8 @@ static void gsf__put_double(gsf_context* ctx, gsf_buffer* out, double value) {
     gsf__put_le(ctx, out, bits, 8);
 }
 
-// Unit quaternion w x y z, w >= 0, of the rotation in a column-major matrix: from the largest of its four squares.
+// Converts the rotation of a column-major matrix to a unit quaternion w x y z, w >= 0. Divides by the largest component
+// for accuracy.
 static void gsf__quaternion_from_pose(const double m[16], double q[4]) {
     const double squares[4] = {1 + m[0] + m[5] + m[10], 1 + m[0] - m[5] - m[10], 1 - m[0] + m[5] - m[10],
                                1 - m[0] - m[5] + m[10]};
@@ -4142,13 +4148,14 @@ static int gsf__same_intrinsics(const gsf_camera* a, const gsf_camera* b) {
            a->height == b->height;
 }
 
-// camera_of: (view_count) index of each view's camera. Cameras are numbered in the order of their first view.
+// Formats cameras.bin. camera_of: (view_count) receives the index of each view's camera. Cameras are numbered in the
+// order of their first view. Returns their number.
 static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint32_t* camera_of, gsf_buffer* out) {
     size_t count = 0;
     for (size_t i = 0; i < scene->view_count; i++) {
         const gsf_camera* c = &scene->views[i].camera;
         camera_of[i] = (uint32_t)count;
-        // Compared with the view before and the first one: enough for one camera, or for photos sorted by camera.
+        // Comparing with the previous and the first view suffices for a single camera and for photos sorted by camera.
         if (i && gsf__same_intrinsics(c, &scene->views[i - 1].camera)) camera_of[i] = camera_of[i - 1];
         else if (i && gsf__same_intrinsics(c, &scene->views[0].camera)) camera_of[i] = 0;
         if (camera_of[i] != count) continue;
@@ -4164,8 +4171,8 @@ static size_t gsf__format_cameras(gsf_context* ctx, const gsf_scene* scene, uint
     return count;
 }
 
-// Counting sort of the observations by view. first: (view_count + 1); point_of, slot_of: (observations). The k-th
-// observation of view v is point point_of[first[v] + k]; the track entry e is number slot_of[e] in its view.
+// Sorts the observations by view (counting sort). first: (view_count + 1); point_of, slot_of: (observations). The k-th
+// observation of view v is point point_of[first[v] + k]; track entry e is observation slot_of[e] of its view.
 static void gsf__sort_observations(const gsf_scene* scene, const uint8_t* keep, size_t* first, size_t* point_of,
                                    uint32_t* slot_of) {
     memset(first, 0, (scene->view_count + 1) * sizeof *first);
@@ -4243,7 +4250,7 @@ GSF_API gsf_result gsf_splat_save_colmap(gsf_context* ctx, const gsf_scene* scen
     }
     for (int k = 0; k < 3; k++)
         if (files[k].failed) result = GSF_ERROR_OUT_OF_MEMORY;
-    for (int k = 2; k >= 0 && result == GSF_OK; k--) { // cameras last: a reader looks for them first
+    for (int k = 2; k >= 0 && result == GSF_OK; k--) { // cameras last: readers look for them first
         path.size = 0;
         gsf_append_text(ctx, &path, "%s/sparse/0/%s.bin", folder, names[k]);
         result = path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path.data, files[k].data, files[k].size);
@@ -4270,12 +4277,12 @@ GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_tar
         }
     }
     const size_t count = train_target && rest ? train_target : rest;
-    // The j-th of the others is view j + j / (test_every - 1) + 1 (without test views: view j). With test_every = 1
-    // there are no others.
+    // The j-th view that is not a test view is view j + j / (test_every - 1) + 1 (without test views: view j). With
+    // test_every = 1 there are none.
     const double step = count > 1 ? (double)(rest ? rest - 1 : 0) / (double)(count - 1) : 0.0;
     for (size_t i = 0; i < count && train; i++) {
         size_t j = train_target ? (size_t)gsf__round_half_even((double)i * step) : i;
-        if (train_target && i == count - 1 && i > 0) j = rest - 1; // numpy.linspace sets its end exactly
+        if (train_target && i == count - 1 && i > 0) j = rest - 1; // numpy.linspace sets its last value exactly
         train[i] = (uint32_t)(test_every ? j + j / (test_every - 1) + 1 : j);
     }
     if (train_count) *train_count = count;
@@ -4284,14 +4291,14 @@ GSF_API void gsf_splat_split_views(size_t n, size_t test_every, size_t train_tar
 
 // ---- >>neighbours --------------------------------------------------------------
 
-/* Exact nearest neighbours: a balanced kd-tree without pointers. Node i of level l covers the rows
-   [n i / 2^l, n (i+1) / 2^l) of a permutation of the points and stands at 2^l - 1 + i of `boxes`; it is split at the
-   median of the widest axis of its bounding box. So the depth is log2(n / 8) for any cloud, clustered or not. */
+/* Exact nearest neighbours with a balanced, pointerless kd-tree. Node i of level l covers the rows
+   [n i / 2^l, n (i+1) / 2^l) of a permutation of the points; its bounding box is boxes[2^l - 1 + i]. A node is split at
+   the median along the widest axis of its box, so the depth is log2(n / 8) for any cloud, clustered or not. */
 typedef struct gsf__knn_tree {
     size_t count;
-    uint32_t levels;  // the leaves are the nodes of this level
+    uint32_t levels;  // level of the leaves
     double* points;   // (count,3) in tree order
-    uint32_t* rows;   // (count) caller's row of each point in tree order
+    uint32_t* rows;   // (count) the caller's row of each point, in tree order
     double* boxes;    // (2^(levels+1) - 1, 6): minimum xyz, maximum xyz
 } gsf__knn_tree;
 
@@ -4313,8 +4320,8 @@ static void gsf__knn_swap(gsf__knn_tree* tree, size_t a, size_t b) {
     tree->rows[b] = row;
 }
 
-// Partial sort: afterwards nothing in [begin,nth) is above and nothing in [nth,end) is below point nth along the axis.
-// Three-way, so equal coordinates cost nothing; the pivots are random but reproducible.
+// Quickselect: afterwards no point in [begin,nth) is above, and none in [nth,end) below, point nth along the axis. The
+// three-way partition handles equal coordinates in linear time; the pivots are pseudorandom but reproducible.
 static void gsf__knn_select(gsf__knn_tree* tree, size_t begin, size_t nth, size_t end, int axis) {
     while (end - begin > 1) {
         const size_t pick = begin + (size_t)(gsf_draw_bits(begin, end, nth) % (end - begin));
@@ -4369,13 +4376,13 @@ static void gsf__knn_destroy(gsf_context* ctx, gsf__knn_tree* tree) {
     memset(tree, 0, sizeof *tree);
 }
 
-// Tree over those of the `count` points (stride 3) whose byte in `keep` is not zero (NULL: all). Points with a
-// non-finite coordinate are left out; tree->count says how many are in.
+// Builds a tree of those of the `count` points (stride 3) whose byte in `keep` is not zero (NULL: all). Points with a
+// non-finite coordinate are skipped; tree->count is the number of points in the tree.
 static gsf_result gsf__knn_build(gsf_context* ctx, const double* points, size_t count, const uint8_t* keep,
                                  gsf__knn_tree* tree) {
     memset(tree, 0, sizeof *tree);
     if ((uint64_t)count >= UINT32_MAX)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "points: %zu are more than 32-bit rows can name", count);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "points: %zu do not fit 32-bit indices", count);
     size_t n = 0;
     for (size_t i = 0; i < count; i++) {
         const double* p = points + 3 * i;
@@ -4415,9 +4422,9 @@ static double gsf__knn_box_distance2(const double box[6], const double q[3]) {
     return sum;
 }
 
-// The k points nearest to q (k <= GSF__KNN_MAX), nearest first: squared distances and places in tree order. `skip` is a
-// place to leave out (SIZE_MAX: none). Returns how many were found (fewer than k when the tree holds fewer).
-// Among equally distant points the choice is fixed by the tree.
+// Finds the k points nearest to q (k <= GSF__KNN_MAX), nearest first: squared distances and positions in tree order.
+// The point at position `skip` is excluded (SIZE_MAX: none). Returns the number found, which is less than k only if the
+// tree has too few points. Ties depend only on the tree.
 static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t skip, int k, double* distance2,
                           size_t* places) {
     struct { size_t node; double distance2; uint32_t level; } stack[40];
@@ -4431,7 +4438,7 @@ static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t s
         size_t node = stack[depth].node;
         uint32_t level = stack[depth].level;
         if (found == k && stack[depth].distance2 >= distance2[k - 1]) continue;
-        while (level < tree->levels) { // down to the nearer child, the farther waits
+        while (level < tree->levels) { // descend to the nearer child, push the farther
             level++;
             const double* boxes = tree->boxes + 6 * (((size_t)1 << level) - 1 + 2 * node);
             const double left = gsf__knn_box_distance2(boxes, q), right = gsf__knn_box_distance2(boxes + 6, q);
@@ -4461,7 +4468,7 @@ static int gsf__knn_query(const gsf__knn_tree* tree, const double q[3], size_t s
 
 typedef struct gsf__init_job {
     const gsf__knn_tree* tree;
-    float* log_scales; // by place in the tree
+    float* log_scales; // in tree order
 } gsf__init_job;
 
 static void gsf__init_scales_chunk(void* arg, size_t chunk, int32_t worker) {
@@ -4492,7 +4499,7 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
     gsf__knn_tree tree;
     GSF__TRY(gsf__knn_build(ctx, points, count, keep, &tree));
     float* log_scales = (float*)gsf_alloc(ctx, tree.count ? tree.count : 1, sizeof(float));
-    uint32_t* order = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t)); // row -> place in the tree
+    uint32_t* order = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t)); // row -> position in the tree
     gsf_result result = log_scales && order ? gsf_splat_make(ctx, tree.count, sh_degree, out) : GSF_ERROR_OUT_OF_MEMORY;
     if (result != GSF_OK) goto cleanup;
     {
@@ -4519,7 +4526,7 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
             out->ids[n++] = (uint32_t)i;
         }
         if (n < kept)
-            gsf_log(ctx, GSF_LOG_WARNING, "%zu points with a non-finite coordinate make no splat", kept - n);
+            gsf_log(ctx, GSF_LOG_WARNING, "%zu points with a non-finite coordinate were skipped", kept - n);
     }
 cleanup:
     gsf_free(ctx, order);
@@ -4530,15 +4537,15 @@ cleanup:
 
 // ---- >>visibility --------------------------------------------------------------
 
-typedef struct gsf__discs { // the points as oriented discs, in tree order (neighbours lie close in memory)
+typedef struct gsf__discs { // the points as oriented discs, in tree order (neighbours are close in memory)
     size_t count;
-    double origin[3];  // float coordinates are relative to it
-    float* spheres;    // (count + 1,4) centre, radius; one spare row since Embree loads 16 bytes at a time
-    float* normals;    // (count + 2,3) unit
-    uint32_t* rows;    // (count) row of the scene's point
-    uint32_t* nearest; // (count,near_count) places of the neighbours
+    double origin[3];  // origin of the float coordinates
+    float* spheres;    // (count + 1,4) centre, radius; padded by a row because Embree loads 16 bytes at a time
+    float* normals;    // (count + 2,3) unit normals, padded likewise
+    uint32_t* rows;    // (count) index of the scene's point
+    uint32_t* nearest; // (count,near_count) indices of the neighbours in tree order
     int near_count;
-    uint8_t* oriented; // (count) 1: the normal points to where the neighbours' tracks were seen from
+    uint8_t* oriented; // (count) 1: the normal points towards the views in the neighbours' tracks
 } gsf__discs;
 
 static double gsf__vis_seconds(void) { // for the statistics only
@@ -4582,7 +4589,7 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
     return GSF_OK;
 }
 
-// Unit eigenvector of the smallest eigenvalue of a symmetric 3x3 matrix, by Jacobi rotations. a is overwritten.
+// Computes the unit eigenvector of the smallest eigenvalue of a symmetric 3x3 matrix by Jacobi rotations. Overwrites a.
 static void gsf__smallest_eigenvector(double a[3][3], double out[3]) {
     double v[3][3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
     for (int sweep = 0; sweep < 12; sweep++) {
@@ -4636,7 +4643,7 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
         size_t places[GSF__KNN_MAX];
         const int found = gsf__knn_query(tree, p, i, wanted, distance2, places);
         const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
-        double mean[3] = {0.0, 0.0, 0.0}, cov[3][3]; // about the mean of the neighbours and the point, relative to p
+        double mean[3] = {0.0, 0.0, 0.0}, cov[3][3]; // of the point p and its neighbours; mean is relative to p
         memset(cov, 0, sizeof cov);
         for (int k = 0; k < used; k++)
             for (int a = 0; a < 3; a++) mean[a] += (tree->points[3 * places[k] + (size_t)a] - p[a]) / (used + 1);
@@ -4677,8 +4684,9 @@ static int gsf__compare_floats(const void* a, const void* b) {
     return (x > y) - (x < y);
 }
 
-// Normals by PCA of the neighbours; radius = distance to a neighbour, at most 3 times the median (lone points would
-// hide whole walls) and at least 1e-5 of the coordinates (below that float ray tests miss, measured on Embree 3.13.5).
+// Makes the discs. Normals come from a PCA of the neighbours. The radius is the distance to a neighbour, at most 3
+// times the median (else isolated points would hide whole walls) and at least 1e-5 of the coordinates (ray tests in
+// float miss smaller discs, as measured with Embree 3.13.5).
 static gsf_result gsf__discs_make(gsf_context* ctx, const gsf_scene* scene, const double origin[3],
                                   const gsf_visibility_desc* desc, gsf__discs* discs) {
     memset(discs, 0, sizeof *discs);
@@ -4706,7 +4714,7 @@ static gsf_result gsf__discs_make(gsf_context* ctx, const gsf_scene* scene, cons
     }
     {
         size_t n = 0;
-        for (size_t i = 0; i < discs->count; i++) // piles of equal points have radius 0 and do not count
+        for (size_t i = 0; i < discs->count; i++) // clusters of identical points have radius 0 and are ignored
             if (discs->spheres[4 * i + 3] > 0.0f) radii[n++] = discs->spheres[4 * i + 3];
         qsort(radii, n, sizeof(float), gsf__compare_floats);
         const float most = n ? 3.0f * radii[n / 2] : 0.0f;
@@ -4725,7 +4733,7 @@ cleanup:
     return result;
 }
 
-typedef struct gsf__eye { // a view, prepared
+typedef struct gsf__eye { // a view, prepared for ray tests
     gsf_camera camera;
     double center[3]; // relative to the discs' origin
     uint32_t view;
@@ -4739,11 +4747,12 @@ typedef struct gsf__sight { // a point as seen from an eye
 
 typedef struct gsf__disc_box { int16_t x0, x1, y0, y1; } gsf__disc_box; // cells [x0,x1) x [y0,y1)
 
-enum { GSF__VIS_BINS = 41 }; // of 0.05 of the distance between two unit directions, which is at most 2
+enum { GSF__VIS_BINS = 41 }; // each covers 0.05 of the distance between two unit directions, which is at most 2
 
 typedef struct gsf__vis_counts {
     size_t rays, culled;
-    uint32_t tries[GSF__VIS_BINS], finds[GSF__VIS_BINS]; // pairs in frame by distance from the nearest other track view
+    // Points in frame, and those whose track has the view, by gsf__vis_apart.
+    uint32_t tries[GSF__VIS_BINS], finds[GSF__VIS_BINS];
 } gsf__vis_counts;
 
 typedef struct gsf__rays8 gsf__rays8;
@@ -4754,28 +4763,28 @@ typedef struct gsf__vis_job {
     gsf__discs discs;
     gsf__eye* eyes;
     size_t eye_count;
-    uint8_t* seen;             // by place in the discs; what is set on entry gets no ray
-    gsf__vis_counts* counts;   // per chunk of discs, so that their sum needs no atomics
+    uint8_t* seen;             // (count) points set on entry are not traced
+    gsf__vis_counts* counts;   // per chunk of discs, so that summing needs no atomics
     void* embree_scene;
     int (*hide8)(gsf__rays8* rays, const gsf__hider* hider); // scalar or AVX2: see >>embree
-    // what the tracks say
+    // evidence from the tracks
     const gsf_scene* scene;
-    double* centers;           // (view_count,3) of all views, relative to the discs' origin
-    float* regions;            // (chunks,6) minimum and maximum of a chunk's centres
-    float* facing;             // (count,3) sum of the directions in which the point's track looks at it
-    float* apart;              // (count) to the current eye: see gsf__vis_apart
-    float* evidence;           // (count) log likelihood of being seen by the current eye against not; NULL: no tracks
-    double found[GSF__VIS_BINS], missed[GSF__VIS_BINS]; // that log likelihood where the track has the view, has it not
-    const gsf__eye* eye;       // the current one
-    // without Embree: one eye's image as a grid of cells that hold the points to decide
+    double* centers;           // (view_count,3) centres of all views, relative to the discs' origin
+    float* regions;            // (chunks,6) bounding box of a chunk's disc centres: minimum, maximum
+    float* facing;             // (count,3) sum of the unit directions to the point from the views of its track
+    float* apart;              // (count) gsf__vis_apart for the current eye
+    float* evidence;           // (count) log likelihood ratio of being visible from the current eye; NULL: no tracks
+    double found[GSF__VIS_BINS], missed[GSF__VIS_BINS]; // that ratio if the view is, or is not, in the track
+    const gsf__eye* eye;       // the current eye
+    // without Embree: the eye's image as a grid of cells, each with the points to test
     int32_t* cells;            // (count) cell of the point, -1 = none
     gsf__disc_box* boxes;      // (count) cells that the disc touches
-    uint32_t* cell_begin;      // (cells + 1) into cell_points
+    uint32_t* cell_begin;      // (cells + 2) offsets into cell_points
     uint32_t* cell_points;
-    gsf__sight* sights;        // (count) of the points with a cell
+    gsf__sight* sights;        // (count) valid for points that have a cell
     float* limits;             // (count) their gsf__vis_limit
-    double* cover;             // (count) sum of the discs before the point
-    int32_t side;              // cells along each side of the image
+    double* cover;             // (count) accumulated cover of the discs in front of the point
+    int32_t side;              // number of cells along each side of the image
 } gsf__vis_job;
 
 enum { GSF__VIS_CHUNK = 1024, GSF__VIS_BANDS = 32, GSF__VIS_MAX_SIDE = 512 };
@@ -4794,11 +4803,12 @@ static void gsf__vis_region(const gsf__discs* discs, size_t first, size_t end, f
         }
 }
 
-// -1: no point of the region is in the eye's frustum, since all lie beyond one of its five planes; 1: all are; 0: perhaps.
+// Tests a bounding box against the eye's frustum: -1 if it is entirely outside one of the five planes, 1 if it is
+// entirely inside all of them, else 0.
 static int gsf__vis_side(const gsf__eye* eye, const float region[6]) {
     const gsf_camera* camera = &eye->camera;
     const double w = (double)camera->width, h = (double)camera->height;
-    const double planes[5][3] = { // times a point in the camera's axes: positive inside
+    const double planes[5][3] = { // the dot product with a point in camera axes is positive inside
         {0.0, 0.0, 1.0},
         {camera->fx, 0.0, camera->cx}, {-camera->fx, 0.0, w - camera->cx},
         {0.0, camera->fy, camera->cy}, {0.0, -camera->fy, h - camera->cy},
@@ -4820,7 +4830,7 @@ static int gsf__vis_side(const gsf__eye* eye, const float region[6]) {
     return side;
 }
 
-// Frustum and grazing-angle tests; nonzero where a ray is worth shooting.
+// Frustum and grazing-angle tests; returns 0 if the point needs no ray.
 static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i, gsf__sight* out) {
     const float* sphere = job->discs.spheres + 4 * i;
     const float* normal = job->discs.normals + 3 * i;
@@ -4839,14 +4849,14 @@ static int gsf__vis_sight(const gsf__vis_job* job, const gsf__eye* eye, size_t i
     return fabs(cosine) >= (double)job->desc->min_grazing_cos;
 }
 
-// Length of the difference of the unit directions to point i from the eye and from that other view of its track that is
-// nearest in this (0.1 is about 6 degrees); -1 where there is none. *tracked: the eye's own view is in the track.
+// Distance between the unit directions to point i from the eye and from another view of its track, minimised over these
+// views (0.1 is about 6 degrees); -1 if there is no other view. *tracked: whether the eye's own view is in the track.
 static float gsf__vis_apart(const gsf__vis_job* job, const gsf__eye* eye, size_t i, const gsf__sight* sight,
                             int* tracked) {
     const gsf_scene* scene = job->scene;
     const float* sphere = job->discs.spheres + 4 * i;
     const size_t row = job->discs.rows[i];
-    double best = -2.0; // largest cosine, as its square with its sign
+    double best = -2.0; // largest cosine, as cosine * |cosine| to avoid a square root per view
     *tracked = 0;
     for (size_t t = scene->track_begin[row]; t < scene->track_begin[row + 1]; t++) {
         const uint32_t view = scene->track_views[t];
@@ -4870,7 +4880,8 @@ static int gsf__vis_bin(float apart) {
     return bin < GSF__VIS_BINS ? bin : GSF__VIS_BINS - 1;
 }
 
-// Region of each chunk, mean direction of each track, how often tracks hold the eyes' views.
+// Computes the bounding box of each chunk, the directions from which each track sees its point, and how often tracks
+// contain the eyes' views.
 static void gsf__vis_survey_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
@@ -4909,7 +4920,7 @@ static void gsf__vis_survey_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// Turns each normal to the side from which the neighbours were seen; the point's own track is left out.
+// Turns each normal towards the views that see the point's neighbours, without regard to the point's own track.
 static void gsf__vis_orient_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
@@ -4928,8 +4939,9 @@ static void gsf__vis_orient_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// How often a track holds a view, by the distance from the nearest other one, gives the likelihoods: a visible point is
-// found so often, a hidden one (by a wrong match, or since its neighbour is not) in 3 of 100 views.
+// Estimates the likelihoods. How often tracks contain a view, binned by gsf__vis_apart, is taken as the probability
+// that the track of a visible point contains it. For a hidden point that probability is set to 0.03 (a wrong match, or
+// a visible neighbour).
 static void gsf__vis_likelihoods(gsf__vis_job* job) {
     const double wrong = 0.03;
     for (int b = 0; b < GSF__VIS_BINS; b++) {
@@ -4963,22 +4975,22 @@ static void gsf__vis_evidence_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// Cover at which the current eye does not see point i. The weights are a logistic fit on three ray-traced scenes, in
-// units of the coverage; the constant one is chosen for the union over several views.
+// Returns the cover at which point i counts as hidden from the current eye. The weights are a logistic fit on three
+// ray-traced scenes, in units of desc->coverage; the constant term is tuned for the union over several views.
 static float gsf__vis_limit(const gsf__vis_job* job, size_t i) {
     const gsf__discs* discs = &job->discs;
     if (!job->evidence) return (float)(double)job->desc->coverage;
     const size_t near_count = (size_t)discs->near_count;
     const float *sphere = discs->spheres + 4 * i, *normal = discs->normals + 3 * i;
     double sum = 0.0, along = 0.0, length2 = 0.0, limit = 1.0;
-    for (size_t n = 0; n < near_count; n++) { // neighbours on a surface of another slope say less
+    for (size_t n = 0; n < near_count; n++) { // weighted by how parallel the neighbour's disc is
         const size_t j = discs->nearest[near_count * i + n];
         const float* other = discs->normals + 3 * j;
         const double same = (double)(normal[0] * other[0] + normal[1] * other[1] + normal[2] * other[2]);
         sum += same * same * (double)job->evidence[j];
     }
     if (near_count) sum *= 12.0 / (double)near_count;
-    limit += 0.095 * (sum < 12.0 ? sum : 12.0); // neighbours may be seen past what hides the point
+    limit += 0.095 * (sum < 12.0 ? sum : 12.0); // capped, as neighbours may be visible where the point is hidden
     if (job->apart[i] >= 0.0f) limit -= 0.15 + 0.85 * (double)(job->apart[i] < 1.0f ? job->apart[i] : 1.0f);
     for (int k = 0; k < 3; k++) {
         const double d = (double)sphere[k] - job->eye->center[k];
@@ -4998,7 +5010,7 @@ static void gsf__vis_look(gsf_context* ctx, gsf__vis_job* job, size_t e) {
     if (job->evidence) gsf__vis_run(ctx, job, gsf__vis_evidence_chunk);
 }
 
-// What disc j adds to the cover of the ray from the eye to point i. The one definition behind both ways to find the discs.
+// Returns what disc j adds to the cover of the ray from the eye to point i. Used with Embree and without.
 static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const gsf__sight* sight, size_t i, size_t j) {
     const float *sphere = job->discs.spheres + 4 * j, *normal = job->discs.normals + 3 * j;
     double d[3], plane = 0.0, slope = 0.0, q2 = 0.0;
@@ -5017,8 +5029,8 @@ static double gsf__vis_cover(const gsf__vis_job* job, const gsf__eye* eye, const
     return q2 < radius * radius ? 1.0 - q2 / (radius * radius) : 0.0;
 }
 
-// Cells of [0,side) that hold projections of c - e .. c + e, depths z0..z1 (both > 0). `scale` and `center` in cells; a
-// hundredth of a cell more on both sides, so that rounding loses nothing.
+// Computes the cells of [0,side) that the interval c - e .. c + e projects to at depths z0..z1 (both > 0). `scale` and
+// `center` are in cells. The range is widened by 0.01 cells on both sides to be safe from rounding.
 static void gsf__vis_span(double c, double e, double z0, double z1, double scale, double center, int32_t side,
                           int16_t* begin, int16_t* end) {
     const double lo = scale * (c - e) / (c - e < 0.0 ? z0 : z1) + center - 0.01;
@@ -5027,7 +5039,7 @@ static void gsf__vis_span(double c, double e, double z0, double z1, double scale
     *end = (int16_t)(hi < 0.0 ? 0 : hi >= side ? side : (int32_t)hi + 1);
 }
 
-// Cell of every point that is worth a ray, cells of every disc.
+// Computes the cell of every point that needs a ray, and the box of cells of every disc.
 static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
@@ -5060,7 +5072,7 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
         gsf__disc_box* box = job->boxes + i;
         box->x0 = box->x1 = box->y0 = box->y1 = 0;
         if (c[2] + e[2] <= 0.0) continue;
-        if (c[2] - e[2] <= 1e-3 * (double)sphere[3]) { // reaches behind the eye: anywhere
+        if (c[2] - e[2] <= 1e-3 * (double)sphere[3]) { // reaches behind the eye: may project anywhere
             box->x1 = box->y1 = (int16_t)job->side;
             continue;
         }
@@ -5071,7 +5083,8 @@ static void gsf__vis_project_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// A band of rows of cells: its points meet the discs in the discs' order, whatever the number of workers.
+// Tests a band of rows of cells. Every point is tested against the discs in their order, so the sum of its cover does
+// not depend on the number of workers.
 static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
     (void)worker;
     const gsf__vis_job* job = (const gsf__vis_job*)arg;
@@ -5082,7 +5095,7 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
         const gsf__disc_box* box = job->boxes + j;
         if (box->x0 >= box->x1) continue;
         for (int32_t y = box->y0 > y0 ? box->y0 : y0; y < box->y1 && y < y1; y++) {
-            const uint32_t* row = job->cell_begin + y * job->side; // the cells of a row lie one after the other
+            const uint32_t* row = job->cell_begin + y * job->side; // the points of a row of cells are contiguous
             for (uint32_t k = row[box->x0]; k < row[box->x1]; k++) {
                 const uint32_t i = job->cell_points[k];
                 if (i != j && job->cover[i] < (double)job->limits[i])
@@ -5094,12 +5107,12 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
         job->seen[job->cell_points[k]] = job->cover[job->cell_points[k]] < (double)job->limits[job->cell_points[k]];
 }
 
-// Ray tests without Embree: per eye, every disc meets the points whose cells its projection touches.
+// Ray tests without Embree: for each eye, tests every disc against the points in the cells that its projection touches.
 static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
     const size_t n = job->discs.count ? job->discs.count : 1, most = GSF__VIS_MAX_SIDE;
     gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
     job->side = GSF__VIS_BANDS;
-    while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points in a cell
+    while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points a cell
     const size_t cell_count = (size_t)job->side * (size_t)job->side;
     job->sights = (gsf__sight*)gsf_alloc(ctx, n, sizeof(gsf__sight));
     job->cells = (int32_t*)gsf_alloc(ctx, n, sizeof(int32_t));
@@ -5113,7 +5126,8 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_project_chunk);
-        uint32_t* begin = job->cell_begin; // counting sort; begin[c + 2] counts cell c, then begin[c + 1] walks through it
+        // Counting sort: begin[c + 2] counts the points of cell c, then begin[c + 1] is its insertion point.
+        uint32_t* begin = job->cell_begin;
         memset(begin, 0, (cell_count + 2) * sizeof(uint32_t));
         for (size_t i = 0; i < job->discs.count; i++)
             if (job->cells[i] >= 0) begin[job->cells[i] + 2]++;
@@ -5156,7 +5170,7 @@ static void gsf__vis_end(gsf_context* ctx, gsf__vis_job* job) {
     memset(job, 0, sizeof *job);
 }
 
-// Discs, eyes and what the tracks say. gsf__vis_end also after a failure.
+// Prepares discs, eyes and the evidence from the tracks. Call gsf__vis_end even after an error.
 static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                  const gsf_visibility_desc* desc, const uint8_t* keep, gsf__vis_job* job,
                                  gsf_visibility_stats* stats) {
@@ -5225,7 +5239,7 @@ static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, con
             keep[job.discs.rows[i]] = job.seen[i];
         }
         if (job.discs.count < scene->point_count)
-            gsf_log(ctx, GSF_LOG_WARNING, "visible points: %zu points with a non-finite coordinate get no ray",
+            gsf_log(ctx, GSF_LOG_WARNING, "visible points: %zu points with a non-finite coordinate are not traced",
                     scene->point_count - job.discs.count);
     }
     gsf__vis_end(ctx, &job);
@@ -5267,24 +5281,27 @@ GSF_API gsf_result gsf_splat_filter_points(gsf_context* ctx, const gsf_scene* sc
 
 #ifdef GSF_USE_EMBREE
 
-/* Most pairs of point and view in a dense cloud are hidden, and what hides one point hides those about it. So eight points
-   of a neighbourhood first meet the discs that hid those before them, then the neighbours of the discs that helped, in
-   float with a bound on every error; a ray is shot at the points that these do not hide for certain. */
+/* In a dense cloud most points are hidden from most views, and neighbouring points are hidden by the same discs. So
+   groups of eight neighbouring points are first tested, in float with bounds on all rounding errors, against the discs
+   that hid the previous group, then against the neighbours of those discs that cover a point. Only points that these
+   tests do not prove hidden are traced with Embree. */
 struct gsf__rays8 {
     float direction[3][8], distance[8];
-    float own[8];              // tolerance times the point's radius
-    float cover[8], need[8];   // certain so far; enough to be hidden
+    float own[8];              // tolerance times the radius of the point's own disc
+    float cover[8], need[8];   // lower bound of the cover so far; cover at which the point is hidden
 };
 
-struct gsf__hider { // a disc, ready to be met; relative to the eye
-    float center[3], normal[3], plane, inverse2, reach; // distance of its plane, 1 / radius^2, tolerance times radius
+struct gsf__hider { // a disc that may hide points, relative to the eye
+    // plane: distance of the disc's plane from the eye; inverse2: 1 / radius^2; reach: tolerance times radius
+    float center[3], normal[3], plane, inverse2, reach;
     uint32_t disc;
-    int32_t covered; // of the present rays, as bits
+    int32_t covered; // the bits that hide8 returned for the current group
 };
 
 enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
-// Adds to each ray's cover what the disc covers at the least. Bits 0-7: it covers the ray; 8-15: the ray needs more.
+// Adds a lower bound of the disc's cover to each ray. Returns bits 0-7: the disc covers the ray; 8-15: the ray is not
+// yet proved hidden.
 static int gsf__hide8_scalar(gsf__rays8* rays, const gsf__hider* hider) {
     const float *c = hider->center, *n = hider->normal;
     int bits = 0;
@@ -5294,7 +5311,7 @@ static int gsf__hide8_scalar(gsf__rays8* rays, const gsf__hider* hider) {
         const float error = 1e-6f * rays->distance[l] * fabsf(inverse);
         const float gap = rays->distance[l] - t - (rays->own[l] > hider->reach ? rays->own[l] : hider->reach);
         const float qx = t * x - c[0], qy = t * y - c[1], qz = t * z - c[2];
-        const float q2 = 1.01f * (qx * qx + qy * qy + qz * qz) + 101.0f * error * error; // (q + error)^2 is at most that
+        const float q2 = 1.01f * (qx * qx + qy * qy + qz * qz) + 101.0f * error * error; // >= (q + error)^2
         const float cover = 1.0f - q2 * hider->inverse2;
         if (t > error && gap > 2.0f * error && cover > 0.0f) {
             rays->cover[l] += cover;
@@ -5334,7 +5351,7 @@ GSF__TARGET_AVX2 static int gsf__hide8_avx2(gsf__rays8* rays, const gsf__hider* 
 }
 #endif
 
-typedef struct gsf__embree_query { // Embree hands the filter a pointer to its own part, which comes first
+typedef struct gsf__embree_query { // starts with Embree's context, whose address Embree passes to the filter
 #if RTC_VERSION_MAJOR < 4
     struct RTCIntersectContext context;
 #else
@@ -5342,17 +5359,17 @@ typedef struct gsf__embree_query { // Embree hands the filter a pointer to its o
 #endif
     const gsf__vis_job* job;
     const gsf__eye* eye;
-    // the ray under way
+    // the current ray
     gsf__sight sight;
     size_t point;
-    double cover, limit;              // of the discs met so far; where the point is hidden
-    // eight points
+    double cover, limit;              // cover of the discs hit so far; cover at which the point is hidden
+    // the current group of up to eight points
     size_t points[8];
     int ray_count;
     gsf__rays8 rays;
-    gsf__hider queue[GSF__VIS_QUEUE]; // first the discs that hid the points before
+    gsf__hider queue[GSF__VIS_QUEUE]; // starts with discs that covered points of the previous group
     int queue_count;
-    uint64_t queued[16];              // a bit for each disc in the queue, which it shares with others
+    uint64_t queued[16];              // bit set of the discs in the queue, by disc modulo 1024
 } gsf__embree_query;
 
 static void gsf__embree_enqueue(gsf__embree_query* q, uint32_t disc) {
@@ -5371,7 +5388,8 @@ static void gsf__embree_enqueue(gsf__embree_query* q, uint32_t disc) {
     hider->disc = disc;
 }
 
-// Called at every disc on the ray, in no order: refused (so that the search goes on) until the cover is full.
+// Embree calls this for every disc that the ray hits, in no particular order. Rejecting the hit continues the
+// traversal; it is accepted once the cover reaches the limit.
 static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
     gsf__embree_query* q = (gsf__embree_query*)(void*)args->context;
     const struct RTCHit* hit = (const struct RTCHit*)(const void*)args->hit; // single rays only: N is 1
@@ -5388,8 +5406,8 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
     q->point = i;
     q->cover = 0.0;
     q->limit = (double)gsf__vis_limit(job, i);
-    // From the eye and not to the end, so that the point's own disc is never met (an origin inside a disc is a trap:
-    // some versions report it, some do not).
+    // The ray starts at the eye and ends short of the point, so that it never hits the point's own disc. (Starting at
+    // the point would depend on Embree's version: some report a disc that contains the origin, others do not.)
     const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs.spheres[4 * i + 3]);
     if (reach > 0.0) {
         struct RTCRay ray;
@@ -5414,8 +5432,8 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
     job->seen[i] = q->cover < q->limit;
 }
 
-// Meets the discs of the queue from *next on, and the neighbours of those that cover an open ray; returns the rays of
-// `open` that stay open, as bits.
+// Tests the rays against the queued discs from *next on, and enqueues the neighbours of discs that cover an open ray.
+// `open`: bits of the rays not yet proved hidden; returns those that remain.
 static int gsf__embree_meet(gsf__embree_query* q, int* next, int* expanded, int open) {
     const gsf__discs* discs = &q->job->discs;
     while (open) {
@@ -5436,7 +5454,7 @@ static int gsf__embree_meet(gsf__embree_query* q, int* next, int* expanded, int 
 }
 
 static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
-    for (int l = q->ray_count; l < 8; l++) { // lanes that nothing covers
+    for (int l = q->ray_count; l < 8; l++) { // unused lanes
         q->rays.direction[0][l] = q->rays.direction[1][l] = q->rays.direction[2][l] = 0.0f;
         q->rays.distance[l] = q->rays.own[l] = q->rays.cover[l] = q->rays.need[l] = 0.0f;
     }
@@ -5446,7 +5464,7 @@ static void gsf__embree_group(gsf__embree_query* q, gsf__vis_counts* counts) {
         counts->culled += !(open >> l & 1);
         if (!(open >> l & 1)) continue;
         gsf__embree_ray(q, q->points[l]);
-        open = gsf__embree_meet(q, &next, &expanded, open & ~(1 << l)); // what hides this point may hide the others
+        open = gsf__embree_meet(q, &next, &expanded, open & ~(1 << l)); // discs that the ray found may hide the others
     }
     memset(q->queued, 0, sizeof q->queued);
     q->queue_count = q->ray_count = 0;
@@ -5485,7 +5503,7 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
         const float distance = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), inverse = 1.0f / distance;
         for (int k = 0; k < 3; k++) rays->direction[k][l] = d[k] * inverse;
         const float cosine = (d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]) * inverse;
-        const int clear = side > 0 && fabsf(cosine) > grazing; // else in double
+        const int clear = side > 0 && fabsf(cosine) > grazing; // otherwise gsf__vis_sight decides in double
         float limit = 0.0f;
         if (clear || (side >= 0 && gsf__vis_sight(job, query.eye, i, &query.sight))) limit = gsf__vis_limit(job, i);
         if (!(limit > 0.0f)) {
@@ -5502,19 +5520,20 @@ static void gsf__vis_embree_chunk(void* arg, size_t chunk, int32_t worker) {
     if (query.ray_count) gsf__embree_group(&query, counts);
 }
 
-// Where memory ends inside Embree or the TBB below it, not every way out is an error code: a C++ exception that meets a
-// destructor or an error handler ends the program. So Embree is refused memory as long as this much is left for those.
+// Running out of memory inside Embree or TBB does not always end in an error code: a C++ exception that reaches a
+// destructor or an error handler terminates the program. So Embree's allocations are already refused while this much
+// memory is left.
 enum { GSF__EMBREE_MARGIN = 16 << 20 };
 
-// Could so much be allocated? By malloc, not the context's allocator: Embree does not use that either.
+// Returns whether `bytes` could be allocated. Probes malloc, since Embree does not use the context's allocator either.
 static int gsf__embree_has_room(size_t bytes) {
-    void* volatile probe = malloc(bytes); // volatile: else the compiler may take the answer to be yes
+    void* volatile probe = malloc(bytes); // volatile, or the compiler may assume success
     const int room = probe != NULL;
     free(probe);
     return room;
 }
 
-// Embree asks before it allocates and tells when it frees. On the calling thread, as the device has no other.
+// Embree's memory monitor, which may refuse allocations. It runs on the calling thread, the only one of the device.
 static bool gsf__embree_may_allocate(void* refused, ssize_t bytes, bool post) {
     if (bytes <= 0 || gsf__embree_has_room((post ? 0 : (size_t)bytes) + GSF__EMBREE_MARGIN)) return true;
     *(int*)refused = 1;
@@ -5531,7 +5550,7 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
         rtcSetGeometryOccludedFilterFunction(geometry, gsf__embree_filter);
         rtcCommitGeometry(geometry);
         rtcAttachGeometry(scene, geometry);
-        rtcReleaseGeometry(geometry); // the scene holds it
+        rtcReleaseGeometry(geometry); // the scene keeps a reference
         rtcCommitScene(scene);
     }
     return rtcGetDeviceError(device);
@@ -5551,7 +5570,7 @@ static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     return result;
 }
 
-// stats->used_embree stays 0, with a warning, where Embree cannot do it.
+// If Embree fails, logs a warning and leaves stats->used_embree 0.
 static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_visibility_stats* stats) {
     const double start = gsf__vis_seconds();
     int refused = 0;
@@ -5560,7 +5579,7 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_vi
     RTCDevice device = NULL;
     enum RTCError error = RTC_ERROR_OUT_OF_MEMORY;
     if (gsf__embree_has_room(2 * (size_t)GSF__EMBREE_MARGIN)) {
-        device = rtcNewDevice("threads=1,set_affinity=0"); // builds on the calling thread; rays run on the host's
+        device = rtcNewDevice("threads=1,set_affinity=0"); // for the build; rays use the host's threads
         error = rtcGetDeviceError(device);
     }
     if (device) {
@@ -5574,9 +5593,9 @@ static gsf_result gsf__vis_by_embree(gsf_context* ctx, gsf__vis_job* job, gsf_vi
         job->embree_scene = scene;
         result = gsf__embree_run(ctx, job);
     } else
-        gsf_log(ctx, GSF_LOG_WARNING, "visible points: Embree cannot take %zu discs (%s); they are projected instead",
+        gsf_log(ctx, GSF_LOG_WARNING, "visible points: Embree cannot build %zu discs (%s); they are projected instead",
                 job->discs.count, error == RTC_ERROR_OUT_OF_MEMORY ? "too little memory" : "no usable device");
-    // A build that failed by itself may have left a TBB task behind that never ran, for which a release would wait.
+    // A build that failed on its own may have left a TBB task that never runs; releasing the scene would wait for it.
     if (scene && (error == RTC_ERROR_NONE || refused)) rtcReleaseScene(scene);
     if (device) rtcReleaseDevice(device);
     return result;

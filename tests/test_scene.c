@@ -579,7 +579,7 @@ static void test_colmap_text(void) {
         {"7 PINHOLE 40 30 1 1 0 0\n7 PINHOLE 40 30 1 1 0 0", images, NULL, "camera 7 occurs twice"},
         {"", images, NULL, "no camera"},
         {cameras, "", NULL, "no image"},
-        {cameras, "4 1 0 0 0 0 0 0 7 a\n\n4 1 0 0 0 0 0 0 7 b\n", NULL, "image id 4 stands twice"},
+        {cameras, "4 1 0 0 0 0 0 0 7 a\n\n4 1 0 0 0 0 0 0 7 b\n", NULL, "image id 4 occurs twice"},
         {cameras, "4 1 0 0 0 0 0 0 7 a\n\n5 1 0 0 0 0 0 0 7 a\n", NULL, "two images are named \"a\""},
         {cameras, "4 1 0 0 0 0 0 0 7 a\n5 1 0 0 0 0 0 0 7 b\n", NULL, "images.txt:2: 10 values"},
         {cameras, "4 1 0 0 0 0 0 0 7 ../a\n", NULL, "leads out"},
