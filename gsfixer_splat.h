@@ -1688,7 +1688,8 @@ static void gsf__pack_warn_coarse(gsf_context* ctx, const gsf__pack* job, double
 }
 
 /* .splat: no header, only rows of 32 bytes, little-endian:
-       position 3 x float32 | scale 3 x float32, linear | red green blue opacity u8 | quaternion w x y z u8, 128 + 128 q */
+       position 3 x float32 | scale 3 x float32, linear | red green blue opacity u8 |
+       quaternion w x y z u8, 128 + 128 q */
 
 enum { GSF__SPLAT_ROW = 32 };
 
@@ -1795,7 +1796,8 @@ static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gs
 }
 
 /* gzip (RFC 1952) around DEFLATE:
-       1f 8b 08 flags | mtime 4 | xfl | os | [extra] [name] [comment] [crc16] | DEFLATE | crc32 4 | size modulo 2^32 4 */
+       1f 8b 08 flags | mtime 4 | xfl | os | [extra] [name] [comment] [crc16] |
+       DEFLATE | crc32 4 | size modulo 2^32 4 */
 
 enum { GSF__DEFLATE_RATIO = 1032 }; // upper bound of DEFLATE's compression ratio
 
@@ -2446,7 +2448,7 @@ static gsf_result gsf__sfm_add_image(gsf_context* ctx, gsf__sfm* m, const char* 
     out = &m->images[m->image_count];
     if (!gsf__pose_from_quaternion(pose, pose + 4, out->w2c))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC,
-                        "%s:%zu: image %u: pose %g %g %g %g, %g %g %g is no rotation and translation", name, at,
+                        "%s:%zu: image %u: pose %g %g %g %g, %g %g %g is not a rotation and translation", name, at,
                         (unsigned)id, pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]);
     out->id = id;
     out->camera_id = camera_id;
@@ -3579,7 +3581,7 @@ static gsf_result gsf__scene_make_views(gsf_context* ctx, gsf__sfm* m, const gsf
     if (missing > 1)
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu photos are missing", photos->folder, missing, m->image_count);
     if (result == GSF_OK && scene->view_count == 0)
-        result = gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s%s: none of the %zu photos is there", photos->folder, photos->prefix,
+        result = gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s%s: all %zu photos are missing", photos->folder, photos->prefix,
                           m->image_count);
     gsf_destroy_buffer(ctx, &path);
     return result;
@@ -4579,7 +4581,7 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "visible points: radius_scale %g, tolerance %g, coverage %g, min_grazing_cos %g",
                         (double)d->radius_scale, (double)d->tolerance, (double)d->coverage, (double)d->min_grazing_cos);
-    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: no list of views");
+    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: views is NULL");
     for (size_t i = 0; i < view_count; i++) {
         if (views[i] >= scene->view_count)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: view %u, the scene has %zu",
