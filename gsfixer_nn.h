@@ -573,8 +573,8 @@ typedef struct gsf_nn_dit_desc {
                diffusers does silently. With the tests' small model of random weights that alone changes the same clip's
                frames by 0.67 (relative L2). This shows that positions matter; the effect on the released model has not
                been measured.
-   REFERENCES  The references of a clip are the photos taken from its first and last frame's views, or the photos nearest
-               to those cameras, with distances in units of the photos' own median distance to what they look at; without
+   REFERENCES  A clip's references are the photos taken from its first and last frame's views, or the photos nearest to
+               those cameras, with distances in units of the photos' own median distance to what they look at; without
                cameras, all photos. They are squashed to the model's size before encoding: 925 tokens each at the
                release, whatever their aspect ratio.
    FEATURES    Features missing from the file are encoded before a clip is restored: captioner, text encoder, DINOv2 and
@@ -640,7 +640,7 @@ typedef struct gsf__nn_linear_desc {
     int32_t accumulate;        // y += activation(x w^T + b) instead of y = ...
     float* y;                  // (rows, out), row stride ldy
     int64_t ldy;               // 0: out
-    int32_t bf16;              // for bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: also rounds x to bf16 and sums
+    int32_t bf16;              // for bf16 weights, GSF_CPU_AVX512_BF16, more than 4 rows: also rounds x to bf16, sums
                                // products in pairs (relative L2 error 1.7e-3). Otherwise no effect
 } gsf__nn_linear_desc;
 
@@ -773,7 +773,7 @@ static float gsf__bf16_to_float(uint16_t value) {
     return out;
 }
 
-// Round to nearest, ties to even; a NaN stays one.
+// Round to nearest, ties to even; a NaN remains a NaN.
 GSF__SHARED uint16_t gsf__float_to_bf16(float value) {
     uint32_t bits;
     memcpy(&bits, &value, sizeof bits);
@@ -791,7 +791,7 @@ GSF_API size_t gsf_nn_get_dtype_size(gsf_nn_dtype dtype) {
     return 0;
 }
 
-// as safetensors spells it: "BF16"
+// safetensors' name for it: "BF16"
 static const char* gsf__nn_dtype_name(gsf_nn_dtype dtype) {
     switch (dtype) {
         case GSF_NN_F32: return "F32";
@@ -841,7 +841,7 @@ GSF_API void gsf_nn_convert_tensor(const gsf_nn_tensor* tensor, int64_t first, i
 
 // ---- >>nn workspace -------------------------------------------------------------
 
-// At least `size` bytes; what the workspace held before is lost. NULL when out of memory.
+// Returns at least `size` bytes, discarding the workspace's previous contents. NULL when out of memory.
 static void* gsf__nn_scratch(gsf_context* ctx, gsf__nn_workspace* workspace, size_t size) {
     if (size <= workspace->size) return workspace->memory;
     gsf__nn_destroy_workspace(ctx, workspace);
@@ -860,10 +860,11 @@ static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* works
 /* A safetensors file:
        u64 n (little-endian) | n bytes of JSON, padded with spaces | data
        {"__metadata__": {"key": "text", ...}, "name": {"dtype": "BF16", "shape": [2, 3], "data_offsets": [begin, end]}, ...}
-   Offsets count from the data's first byte. As the official reader does, this one demands that the tensors cover the data
-   without hole, overlap or rest. (github.com/huggingface/safetensors, README and safetensors/src/tensor.rs) */
+   Offsets are relative to the first byte of the data. As in Hugging Face's reader, the tensors must cover the data
+   without holes, overlap or trailing bytes.
+   (github.com/huggingface/safetensors, README and safetensors/src/tensor.rs) */
 
-enum { GSF__NN_FILE_HEAD = 8, GSF__NN_HEADER_MAX = 100000000 }; // bytes; the limit is the official reader's
+enum { GSF__NN_FILE_HEAD = 8, GSF__NN_HEADER_MAX = 100000000 }; // bytes; the limit is that of Hugging Face's reader
 
 typedef enum gsf__nn_holder { GSF__NN_BORROWED, GSF__NN_READ, GSF__NN_MAPPED } gsf__nn_holder;
 
@@ -871,7 +872,7 @@ typedef struct gsf__nn_file {
     const unsigned char* data;
     size_t size;
     gsf__nn_holder holder;
-    char* names; // of its tensors, one after the other
+    char* names; // of its tensors, zero-terminated, one after the other
     size_t names_size;
 } gsf__nn_file;
 
@@ -880,11 +881,11 @@ typedef struct gsf__nn_files {
     size_t count, capacity, tensor_capacity;
 } gsf__nn_files;
 
-// ---- platform: what a path leads to, what a folder holds, mapping a file
+// ---- platform: the kind of a path, listing a folder, mapping a file
 
 typedef enum gsf__nn_path_kind { GSF__NN_UNKNOWN, GSF__NN_IS_FILE, GSF__NN_IS_FOLDER } gsf__nn_path_kind;
 
-// Name of the one file of `folder` that ends in `suffix`; its size is 0 where there is none. More than one is an error.
+// The name of the only file in `folder` that ends in `suffix`; empty if there is none. More than one is an error.
 typedef struct gsf__nn_listing {
     const char *folder, *suffix;
     gsf_buffer found;
@@ -926,12 +927,12 @@ static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing
     return result;
 }
 
-// *data is NULL where the file cannot be mapped, but may be readable.
+// *data is NULL if the file cannot be mapped; it may still be readable.
 static gsf_result gsf__nn_map(gsf_context* ctx, const char* path, const unsigned char** data, size_t* size) {
     struct stat info;
     *data = NULL;
     *size = 0;
-    const int file = open(path, O_RDONLY | O_NONBLOCK); // a pipe is not waited for
+    const int file = open(path, O_RDONLY | O_NONBLOCK); // do not block on a pipe
     if (file < 0) return gsf_fail(ctx, gsf__open_result(errno), "%s: %s", path, strerror(errno));
     if (fstat(file, &info) == 0 && S_ISREG(info.st_mode) && info.st_size > 0 &&
         (uint64_t)info.st_size <= SIZE_MAX / 2) {
@@ -969,7 +970,7 @@ static void gsf__nn_unmap(const unsigned char* data, size_t size) {
 }
 #endif
 
-// FOLDER/NAME; `out` is to be freed, also on error.
+// FOLDER/NAME; the caller frees `out`, also on error.
 static gsf_result gsf__nn_join(gsf_context* ctx, const char* folder, const char* name, gsf_buffer* out) {
     memset(out, 0, sizeof *out);
     gsf_append_text(ctx, out, "%s%s%s", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
@@ -978,7 +979,7 @@ static gsf_result gsf__nn_join(gsf_context* ctx, const char* folder, const char*
 
 // ---- reading the header
 
-// A name for one line of text: ASCII, and not too long.
+// A name made safe for a one-line message: ASCII, truncated.
 typedef struct gsf__nn_shown { char text[100]; } gsf__nn_shown;
 
 static gsf__nn_shown gsf__nn_show(const char* name) {
@@ -989,17 +990,17 @@ static gsf__nn_shown gsf__nn_show(const char* name) {
     return shown;
 }
 
-// The end of a path that a document's name (gsf_json) can hold.
+// The end of a path that fits into a document's name (gsf_json).
 static const char* gsf__nn_path_end(const char* path) {
     const size_t size = strlen(path), room = sizeof ((gsf_json*)0)->name - 1;
     return size > room ? path + (size - room) : path;
 }
 
-// A whole number as it stands in the text, without sign, fraction or exponent, up to 2^63 - 1. 0 where it is none.
+// Parses a non-negative integer written without sign, fraction or exponent, up to 2^63 - 1. Returns 0 if it is none.
 static int gsf__nn_read_size(const char* text, const gsf_json_value* value, uint64_t* out) {
     *out = 0;
     if (value->type != GSF_JSON_NUMBER) return 0;
-    const char* p = text + value->offset; // what follows it in a checked document is no digit
+    const char* p = text + value->offset; // cannot overrun: in a checked document a non-digit follows
     if (*p == '-') return 0;
     for (; *p >= '0' && *p <= '9'; p++) {
         if (*out > ((uint64_t)INT64_MAX - (uint64_t)(*p - '0')) / 10) return 0;
@@ -1008,11 +1009,11 @@ static int gsf__nn_read_size(const char* text, const gsf_json_value* value, uint
     return *p != '.' && *p != 'e' && *p != 'E';
 }
 
-typedef struct gsf__nn_header { // one file's header while it is read
+typedef struct gsf__nn_header { // the header of one file while it is being read
     gsf_context* ctx;
     const char* name;
-    const char* text;       // the whole file's first byte
-    const char* data;       // the first byte behind the header
+    const char* text;       // first byte of the file
+    const char* data;       // first byte after the header
     uint64_t data_size;
     gsf_json json;
 } gsf__nn_header;
@@ -1103,7 +1104,7 @@ static uint64_t gsf__nn_bytes(const gsf_nn_tensor* tensor) {
     return (uint64_t)tensor->count * gsf_nn_get_dtype_size(tensor->dtype);
 }
 
-static int gsf__nn_compare_places(const void* a, const void* b) { // an empty tensor before what begins where it stands
+static int gsf__nn_compare_places(const void* a, const void* b) { // empty tensors first where places tie
     const gsf_nn_tensor *x = (const gsf_nn_tensor*)a, *y = (const gsf_nn_tensor*)b;
     if (x->data != y->data) return (const char*)x->data < (const char*)y->data ? -1 : 1;
     return gsf__nn_bytes(x) < gsf__nn_bytes(y) ? -1 : gsf__nn_bytes(x) > gsf__nn_bytes(y);
@@ -1131,17 +1132,18 @@ static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_nn_tensor* te
     return GSF_OK;
 }
 
-// Adds the tensors of a parsed header, which begins with '{' and so is an object. Their names go to the file's block.
+// Adds the tensors of a parsed header, which begins with '{' and so is an object. Their names are copied to
+// file->names.
 static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weights, gsf__nn_file* file) {
     gsf__nn_files* files = (gsf__nn_files*)weights->files;
     const gsf_json_value* root = &h->json.values[0];
     const size_t first = weights->tensor_count;
-    size_t names = 1; // so that there always is a block
+    size_t names = 1; // 1 so that the block is never empty
     for (uint32_t i = root->child; i; i = h->json.values[i].next) names += h->json.values[i].key_size + 1;
     file->names = (char*)gsf_alloc(h->ctx, names, 1);
     if (!file->names) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__reserve(h->ctx, (void**)&weights->tensors, &files->tensor_capacity, first, first + root->count + 1,
-                          sizeof *weights->tensors)); // + 1: there always is an array
+                          sizeof *weights->tensors)); // + 1 so that the array is never empty
     for (uint32_t i = root->child; i; i = h->json.values[i].next) {
         const gsf_json_value* entry = &h->json.values[i];
         if (entry->key_size == 12 && memcmp(entry->key, "__metadata__", 12) == 0) {
@@ -1189,7 +1191,7 @@ static void gsf__nn_release(gsf_context* ctx, const unsigned char* data, size_t 
     if (holder == GSF__NN_MAPPED) gsf__nn_unmap(data, size);
 }
 
-// Takes over the bytes, also on failure.
+// Takes ownership of the bytes, also on failure.
 static gsf_result gsf__nn_add_bytes(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
                                     gsf__nn_holder holder, gsf_nn_weights* weights) {
     gsf__nn_files* files = (gsf__nn_files*)weights->files;
@@ -1219,13 +1221,13 @@ static gsf_result gsf__nn_add_file(gsf_context* ctx, const char* path, gsf_nn_we
     return gsf__nn_add_bytes(ctx, path, (const unsigned char*)data, size, GSF__NN_READ, weights);
 }
 
-// A shard's name must stay inside the index's folder.
+// Rejects shard names that would lead outside the index's folder.
 static int gsf__nn_is_plain_name(const gsf_json_value* value) {
     return value->type == GSF_JSON_STRING && value->string_size > 0 && strlen(value->string) == value->string_size &&
            !strpbrk(value->string, "/\\:") && value->string[0] != '.';
 }
 
-typedef struct gsf__nn_index { // weight_map of a sharded model while it is read
+typedef struct gsf__nn_index { // weight_map of a sharded model while it is being read
     gsf_context* ctx;
     const char* name;
     size_t folder_size;       // the shards' names follow this many bytes of `path`
@@ -1243,7 +1245,7 @@ static gsf_result gsf__nn_open_shards(gsf__nn_index* index, gsf_nn_weights* weig
         if (!gsf__nn_is_plain_name(value))
             return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s: no plain file name", index->name,
                             (unsigned)value->offset, gsf__nn_show(value->key).text);
-        size_t k = files->count; // from the latest: mostly that one
+        size_t k = files->count; // search from the latest, which usually is the one
         while (k > 0 && strcmp(index->shards[k - 1], value->string) != 0) k--;
         if (k > 0) continue;
         GSF__TRY(gsf__reserve(index->ctx, (void**)&index->shards, &index->shard_capacity, files->count, files->count + 1,
@@ -1267,7 +1269,7 @@ static gsf_result gsf__nn_sort_names(gsf_context* ctx, gsf_nn_weights* weights) 
     return GSF_OK;
 }
 
-// Every tensor of the map must have come from the file that the map says.
+// Checks that every tensor of the map came from the file that the map names.
 static gsf_result gsf__nn_check_index(const gsf__nn_index* index, const gsf_nn_weights* weights) {
     const gsf__nn_files* files = (const gsf__nn_files*)weights->files;
     for (uint32_t i = index->map->child; i; i = index->json.values[i].next) {
@@ -1311,14 +1313,14 @@ static gsf_result gsf__nn_read_index(gsf_context* ctx, const char* path, const v
     return result;
 }
 
-// Ends a stretch without the log hook, in which a file was allowed to be absent.
+// Restores the log hook after reading a file that was allowed to be missing.
 static gsf_result gsf__nn_end_quiet(gsf_context* ctx, const gsf_logger* logger, gsf_result result) {
     ctx->logger = *logger;
     if (result != GSF_OK && result != GSF_ERROR_NOT_FOUND) gsf_log(ctx, GSF_LOG_ERROR, "%s", ctx->error);
     return result;
 }
 
-// A file that may be absent: *data is NULL then, and neither log nor ctx->error tell of it.
+// Reads a file that may be missing: *data is then NULL, and neither the log nor ctx->error mentions it.
 static gsf_result gsf__nn_read_if_there(gsf_context* ctx, const char* path, void** data, size_t* size) {
     const gsf_logger logger = ctx->logger;
     char error[sizeof ctx->error];
@@ -1331,7 +1333,7 @@ static gsf_result gsf__nn_read_if_there(gsf_context* ctx, const char* path, void
     return GSF_OK;
 }
 
-// Opens <path>.index.json, else <path>. *found 0: neither is there, which is an error unless `may_lack`.
+// Opens <path>.index.json, else <path>. *found is 0 if neither exists, which is an error unless `may_lack`.
 static gsf_result gsf__nn_open_either(gsf_context* ctx, gsf_buffer* path, int may_lack, int* found,
                                       gsf_nn_weights* weights) {
     const gsf_logger logger = ctx->logger;
@@ -1367,7 +1369,7 @@ static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const
     return result;
 }
 
-// Without a prefix: the folder's only index, else its only file; where folders cannot be listed, the usual names.
+// Without a prefix: the folder's only index, else its only file; if folders cannot be listed, the usual file names.
 static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_nn_weights* weights) {
     static const char* const suffixes[] = {".safetensors.index.json", ".safetensors"};
     static const char* const usual[] = {"diffusion_pytorch_model", "model"};
@@ -1488,7 +1490,7 @@ static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_nn_tensor* ten
                     gsf__nn_show(name).text);
 }
 
-static int gsf__nn_compare_saved(const void* a, const void* b) { // wide types first, so that all stay aligned
+static int gsf__nn_compare_saved(const void* a, const void* b) { // wide types first, so that all tensors stay aligned
     const gsf_nn_tensor *x = *(const gsf_nn_tensor* const*)a, *y = *(const gsf_nn_tensor* const*)b;
     const size_t p = gsf_nn_get_dtype_size(x->dtype), q = gsf_nn_get_dtype_size(y->dtype);
     return p != q ? (p > q ? -1 : 1) : strcmp(x->name, y->name);
@@ -1501,7 +1503,7 @@ static int gsf__nn_compare_saved_names(const void* a, const void* b) {
 static gsf_result gsf__nn_format_header(gsf_context* ctx, const gsf_nn_tensor* const* order, size_t count,
                                         gsf_buffer* out) {
     size_t begin = 0;
-    gsf_append_bytes(ctx, out, "        {", 9); // the length goes where the spaces are
+    gsf_append_bytes(ctx, out, "        {", 9); // the spaces are overwritten with the length
     for (size_t i = 0; i < count; i++) {
         const gsf_nn_tensor* t = order[i];
         const size_t bytes = (size_t)gsf__nn_bytes(t);
@@ -1543,7 +1545,7 @@ GSF_API gsf_result gsf_nn_save_tensors(gsf_context* ctx, const char* path, const
     return result;
 }
 
-// ---- for the networks: taking tensors one by one, and noticing what is left over
+// ---- for the networks: taking tensors one by one, and detecting tensors left over
 
 typedef struct gsf__nn_loader {
     gsf_context* ctx;
@@ -1558,7 +1560,7 @@ GSF__SHARED gsf_result gsf__nn_begin_loading(gsf_context* ctx, const gsf_nn_weig
     return out->taken ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
 }
 
-// "[2, 3, 64]"; a negative size, which stands for any, prints as "?".
+// "[2, 3, 64]"; a negative size, which matches any, is printed as "?".
 static void gsf__nn_print_shape(int32_t rank, const int64_t* shape, char* out, size_t room) {
     size_t at = (size_t)snprintf(out, room, "[");
     for (int32_t i = 0; i < rank && at < room; i++) {
@@ -1600,7 +1602,7 @@ static gsf_result gsf__nn_take(gsf__nn_loader* loader, const char* name, const g
 }
 
 // Finds the tensor of that name (printf style), which must be F32, BF16 or F16 and have exactly this shape; a negative
-// size means any.
+// size matches any.
 GSF_PRINTF(5, 6)
 GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_nn_tensor** out, int32_t rank,
                                     const int64_t* shape, const char* format, ...) {
@@ -1612,13 +1614,14 @@ GSF__SHARED gsf_result gsf__nn_need(gsf__nn_loader* loader, const gsf_nn_tensor*
     return gsf__nn_take(loader, name, out, rank, shape);
 }
 
-// Counts all tensors whose names begin so as taken: parts of a file that the caller has no use for.
+// Marks all tensors whose names start with `prefix` as taken: parts of a file that the caller does not use.
 GSF__SHARED void gsf__nn_ignore(gsf__nn_loader* loader, const char* prefix) {
     for (size_t i = 0; i < loader->weights->tensor_count; i++)
         if (strncmp(loader->weights->tensors[i].name, prefix, strlen(prefix)) == 0) loader->taken[i] = 1;
 }
 
-// Frees the loader. If `result` is GSF_OK but tensors were left over, the error names the first few; else returns it.
+// Frees the loader. If `result` is GSF_OK but tensors are left over, fails naming the first few; otherwise returns
+// `result`.
 GSF__SHARED gsf_result gsf__nn_end_loading(gsf__nn_loader* loader, gsf_result result) {
     enum { NAMED = 3 };
     gsf__nn_shown names[NAMED];
@@ -1634,12 +1637,12 @@ GSF__SHARED gsf_result gsf__nn_end_loading(gsf__nn_loader* loader, gsf_result re
                     names[2].text, left > NAMED ? ", ..." : "");
 }
 
-// ---- for the networks: config.json. A key that is null counts as absent, as diffusers writes it.
+// ---- for the networks: config.json. A null value counts as absent, as diffusers writes it.
 
 typedef struct gsf__nn_config {
     gsf_context* ctx;
     gsf_json json;
-    const gsf_json_value* root; // the object whose keys are read; NULL: all are absent
+    const gsf_json_value* root; // the object whose keys are read; NULL: all keys are absent
 } gsf__nn_config;
 
 static gsf_result gsf__nn_check_config(gsf__nn_config* config) {
@@ -1684,7 +1687,7 @@ static gsf_result gsf__nn_config_whole(const gsf__nn_config* config, const gsf_j
     return gsf__nn_config_fail(config, value, key, wanted);
 }
 
-// Whole numbers, |low| and |high| up to 2^53. Here and below the function with `fallback` takes a key that may be absent.
+// Integers, |low| and |high| up to 2^53. Here and below, the variant with `fallback` allows the key to be absent.
 GSF__SHARED gsf_result gsf__nn_config_int(const gsf__nn_config* config, const char* key, int64_t low, int64_t high,
                                           int64_t* out) {
     return gsf__nn_config_whole(config, gsf__nn_config_find(config, key), key, low, high, out);
@@ -1715,7 +1718,7 @@ GSF__SHARED gsf_result gsf__nn_config_number_or(const gsf__nn_config* config, co
     return gsf__nn_config_find(config, key) ? gsf__nn_config_number(config, key, low, high, out) : GSF_OK;
 }
 
-// Of any object: null counts as absent.
+// The flag `value` of any object; null counts as absent.
 static gsf_result gsf__nn_config_flag(const gsf__nn_config* config, const gsf_json_value* value, const char* key,
                                       int fallback, int* out) {
     *out = fallback;
@@ -1730,7 +1733,7 @@ GSF__SHARED gsf_result gsf__nn_config_bool_or(const gsf__nn_config* config, cons
     return gsf__nn_config_flag(config, gsf__nn_config_find(config, key), key, fallback, out);
 }
 
-// *out points into the config, or to the fallback; NULL as fallback: the key must be there.
+// *out points into the config or to `fallback`; if `fallback` is NULL, the key is required.
 GSF__SHARED gsf_result gsf__nn_config_string(const gsf__nn_config* config, const char* key, const char* fallback,
                                              const char** out) {
     const gsf_json_value* value = gsf__nn_config_find(config, key);
@@ -1741,7 +1744,7 @@ GSF__SHARED gsf_result gsf__nn_config_string(const gsf__nn_config* config, const
     return GSF_OK;
 }
 
-// The object under `key`, as a config that lives as long as the whole; where there is none, all its keys are absent.
+// The object under `key` as a config that is valid as long as the whole; if there is none, all its keys are absent.
 static gsf_result gsf__nn_config_part(const gsf__nn_config* config, const char* key, gsf__nn_config* part) {
     *part = *config;
     part->root = gsf__nn_config_find(config, key);
@@ -1749,7 +1752,7 @@ static gsf_result gsf__nn_config_part(const gsf__nn_config* config, const char* 
     return gsf__nn_config_fail(config, part->root, key, "an object");
 }
 
-// Between 1 and `room` whole numbers.
+// Reads between 1 and `room` integers.
 GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const char* key, int64_t low, int64_t high,
                                            size_t room, int64_t* out, size_t* count) {
     const gsf_json_value* value = gsf__nn_config_find(config, key);
@@ -1766,7 +1769,8 @@ GSF__SHARED gsf_result gsf__nn_config_ints(const gsf__nn_config* config, const c
 
 // ---- for the networks: a config.json as a table of keys
 
-// FOLDER/NAME. One that may be absent, and is, counts as an empty object. gsf__nn_close_config also takes what failed.
+// Reads FOLDER/NAME; with `may_lack` a missing file counts as an empty object. gsf__nn_close_config accepts
+// the result of a failed call.
 GSF__SHARED gsf_result gsf__nn_open_config(gsf_context* ctx, const char* folder, const char* name, int may_lack,
                                            gsf__nn_config* out) {
     gsf_buffer path;
@@ -1792,10 +1796,10 @@ typedef enum gsf__nn_key_kind {
 typedef struct gsf__nn_key {
     const char* key;
     gsf__nn_key_kind kind;
-    void* to;                   // of `size` bytes: int32_t or int64_t, float or double, int
+    void* to;                   // `size` bytes: int32_t or int64_t, float or double, int
     size_t size;
-    double fallback, low, high; // of a flag that must be as the code has it: `low`
-    const char *word, *words;   // the fallback, NULL: the key must be there; the words that are known: "a|b|c"
+    double fallback, low, high; // a fixed flag must equal `low`
+    const char *word, *words;   // default word (NULL: the key is required); allowed words: "a|b|c"
 } gsf__nn_key;
 
 #define GSF__KEY_INT(key, to, low, high) {key, GSF__NN_NEEDED_INT, &(to), sizeof(to), 0.0, low, high, NULL, NULL}
@@ -1804,12 +1808,12 @@ typedef struct gsf__nn_key {
 #define GSF__KEY_FLAG_OR(key, to, usual) {key, GSF__NN_FLAG, &(to), sizeof(to), usual, 0.0, 0.0, NULL, NULL}
 #define GSF__KEY_WORD_OR(key, to, usual, words) {key, GSF__NN_WORD, &(to), sizeof(to), 0.0, 0.0, 0.0, usual, words}
 #define GSF__KEY_ACTIVATION_OR(key, to, usual) {key, GSF__NN_ACTIVATION, &(to), sizeof(to), 0.0, 0.0, 0.0, usual, NULL}
-// What the code does in one way only must not be configured otherwise.
+// For settings that the code supports with one value only.
 #define GSF__KEY_FLAG_IS(key, usual, must) {key, GSF__NN_FIXED_FLAG, NULL, 0, usual, must, 0.0, NULL, NULL}
 #define GSF__KEY_WORD_IS(key, usual, must) {key, GSF__NN_WORD, NULL, 0, 0.0, 0.0, 0.0, usual, must}
 #define GSF__KEY_ABSENT(key) {key, GSF__NN_ABSENT, NULL, 0, 0.0, 0.0, 0.0, NULL, NULL}
 
-// The place of the key's word among k->words.
+// The index of the key's word among k->words.
 static gsf_result gsf__nn_config_word(const gsf__nn_config* config, const gsf__nn_key* k, const char* words, int* out) {
     const char* text;
     GSF__TRY(gsf__nn_config_string(config, k->key, k->word, &text));
@@ -1876,9 +1880,9 @@ static gsf_result gsf__nn_config_read(const gsf__nn_config* config, const gsf__n
     return GSF_OK;
 }
 
-// ---- >>nn vector: what the vocabulary of >>lanes lacks ----------------------------
+// ---- >>nn vector: additions to the vector vocabulary of >>lanes ----------------------------
 
-// Asks for a line that is used soon, which may lie outside of what is there.
+// Prefetches a cache line; `at` may lie outside of the array.
 GSF__SHARED void gsf__nn_prefetch(const float* at) {
 #if GSF__X86
     _mm_prefetch((const char*)at, _MM_HINT_T0);
@@ -1886,9 +1890,9 @@ GSF__SHARED void gsf__nn_prefetch(const float* at) {
     (void)at;
 }
 
-#define gsf__v_put GSF__V(gsf__v_put)               // stores, with `stream` past the caches to an aligned place
-#define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) of each pair of lanes (a, b)
-#define gsf__v_hadamard GSF__V(gsf__v_hadamard)     // of each block of so many lanes (1, 2, 4 ...), unscaled
+#define gsf__v_put GSF__V(gsf__v_put)               // stores; `stream` bypasses the caches and needs an aligned address
+#define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) for each pair of lanes (a, b)
+#define gsf__v_hadamard GSF__V(gsf__v_hadamard)     // of each block of 1, 2, 4 ... lanes, unscaled
 #define gsf__vi_max GSF__V(gsf__vi_max)
 #define gsf__vi_largest GSF__V(gsf__vi_largest)     // over the lanes
 
@@ -1913,8 +1917,8 @@ GSF__INLINE_AVX512 __m512 gsf__v_turn_pairs_avx512(__m512 v, __m512 cos, __m512 
     return _mm512_fmaddsub_ps(v, cos, _mm512_permute_ps(v, 0xb1) * sin);
 }
 
-// Each value gets its partner, plus itself or (the upper one) minus itself. The FMAs are exact there, so these are the bits
-// of the scalar kernel.
+// Adds to each value its partner, or (upper half) subtracts the value from it. The FMAs are exact here, so the result
+// is bit-identical to the scalar kernel's.
 GSF__INLINE_AVX2 __m256 gsf__v_hadamard_avx2(__m256 v, int64_t block) {
     if (block > 1) v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, -1, 1, -1, 1, -1, 1, -1), _mm256_permute_ps(v, 0xb1));
     if (block > 2) v = _mm256_fmadd_ps(v, _mm256_setr_ps(1, 1, -1, -1, 1, 1, -1, -1), _mm256_permute_ps(v, 0x4e));
@@ -1944,16 +1948,16 @@ GSF__INLINE_AVX512 int32_t gsf__vi_largest_avx512(__m512i v) {
     return gsf__vi_largest_avx2(_mm256_max_epi32(_mm512_castsi512_si256(v), _mm512_extracti32x8_epi32(v, 1)));
 }
 
-// Lanes below `left` (at most 8 count) as a mask for _mm256_maskload_ps and _mm256_maskstore_ps.
+// Mask of the lanes below `left` (clamped to 8) for _mm256_maskload_ps and _mm256_maskstore_ps.
 GSF__INLINE_AVX2 __m256i gsf__nn_mask8(int64_t left) {
     return _mm256_cmpgt_epi32(_mm256_set1_epi32(left < 8 ? (int)left : 8), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
 }
 
 GSF__INLINE_AVX512 __mmask16 gsf__nn_mask16(int64_t left) { return gsf__vm_first_avx512((size_t)left); } // left >= 0
 
-enum { GSF__NN_WHOLE16 = 0xffff }; // every lane
+enum { GSF__NN_WHOLE16 = 0xffff }; // all lanes
 
-GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { // a masked store takes several times as long
+GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { // a masked store is several times slower
     if (mask == GSF__NN_WHOLE16) _mm512_storeu_ps(y, v);
     else _mm512_mask_storeu_ps(y, mask, v);
 }
@@ -1977,7 +1981,7 @@ GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, __m256 c
     _mm256_storeu_ps(to + 7 * to_ld, m[7]);
 }
 
-// Pairs of bfloat16 lie in the lanes of floats.
+// Pairs of bfloat16 are held in float lanes.
 
 GSF__INLINE_BF16 __m512 gsf__nn_add_pairs(__m512 sum, __m512 a, __m512 b) { // sum + a[0] b[0] + a[1] b[1]
     return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_castps_si512(a), (__m512bh)_mm512_castps_si512(b));
@@ -1989,9 +1993,9 @@ GSF__INLINE_BF16 __m256i gsf__nn_round_bf16(__m512 v) { return (__m256i)_mm512_c
 
 // ---- >>nn activations -----------------------------------------------------------
 
-// GELU is x for x > 0, else 0, minus z q with z = |x| and q = exp(-z^2/2) R(z), the normal distribution's tail beyond z.
-// R, which falls slowly, is t P(t - 1/2) with t = 3.5 / (z + 3.5): least-squares coefficients, refitted until the relative
-// errors for z up to 13.25 were level, 4e-8. Beyond 13.19 the power of 2 is below float's range, so q is 0.
+// GELU is max(x, 0) - z q with z = |x| and q = exp(-z^2/2) R(z), the tail of the normal distribution beyond z. R varies
+// slowly and is computed as t P(t - 1/2) with t = 3.5 / (z + 3.5): least-squares coefficients, refitted until the
+// relative errors for z up to 13.25 were level, 4e-8. Beyond 13.19 the power of 2 underflows float, so q is 0.
 static const float gsf__nn_gelu_tail[10] = {0.212690309f, 0.323178142f, 0.360485673f, 0.2652632f, 0.0795778036f,
                                             -0.0593477674f, -0.0581759363f, 0.0180590637f, 0.0315735899f, -0.016954517f};
 
@@ -2014,7 +2018,7 @@ static float gsf__nn_activation_ref(gsf__nn_activation activation, float x) {
     switch (activation) {
         case GSF__NN_LINEAR: return x;
         case GSF__NN_GELU_TANH: { // x/2 (1 + tanh(u)) = x / (1 + exp(-2u))
-            if (x < -12.0f) return -0.0f * (x == x); // below float's resolution of the limit, and no inf * 0
+            if (x < -12.0f) return -0.0f * (x == x); // the limit to within float's resolution, and avoids inf * 0
             const float u = 0.7978845608028654f * (x + 0.044715f * x * x * x);
             return x / (1.0f + expf(-2.0f * u));
         }
@@ -2025,7 +2029,7 @@ static float gsf__nn_activation_ref(gsf__nn_activation activation, float x) {
     return x;
 }
 
-// Results of 32 MiB and more bypass the caches (`stream`): lines that are written whole need not be read before.
+// Results of 32 MiB and more bypass the caches (`stream`): lines that are fully overwritten need not be read first.
 enum { GSF__NN_STREAM = 1 << 23 }; // values
 
 static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_t row) { // pieces are multiples of `row`
@@ -2052,7 +2056,7 @@ static void gsf__softmax_scalar(const float* x, int64_t count, float scale, floa
     for (int64_t i = 0; i < count; i++) y[i] *= inverse;
 }
 
-GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may read what was written
+GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may read the results
 #if GSF__X86
     if (stream) _mm_sfence();
 #endif
@@ -2075,10 +2079,10 @@ GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may re
 GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
     const gsf__v_exp2_terms terms = gsf__v_exp2_of(0);
     const gsf__vf half_log2_e = gsf__v_set(-0.72134752f), k = gsf__v_set(3.5f);
-    const gsf__vf z = gsf__v_min(gsf__v_set(13.2f), gsf__v_abs(x)); // a NaN stays, as below
+    const gsf__vf z = gsf__v_min(gsf__v_set(13.2f), gsf__v_abs(x)); // a NaN stays a NaN, as below
     const gsf__vf t = k / (z + k), s = t - gsf__v_set(0.5f), square = z * z;
     const gsf__vf rounded = gsf__v_madd(square, half_log2_e, terms.rounder), n = rounded - terms.rounder;
-    // what rounding took from the square and from the factor
+    // the rounding errors of the square and of the factor
     const gsf__vf lost = gsf__v_msub(z, z, square) * half_log2_e;
     const gsf__vf low = gsf__v_madd(square, gsf__v_set(-9.62981495e-9f), lost);
     const gsf__vf power = gsf__v_power(&terms, rounded, gsf__v_msub(square, half_log2_e, n) + low);
@@ -2087,11 +2091,12 @@ GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
     return gsf__v_nmadd(z, power * (t * tail), gsf__v_max(gsf__v_set(0.0f), x));
 }
 
-// As gsf__nn_activation_ref; at -inf the limit -0, a NaN stays. Pass a compile-time constant as `activation` in loops.
+// As gsf__nn_activation_ref; -0, the limit, at -inf; a NaN stays a NaN. In loops pass a compile-time constant
+// `activation`.
 GSF__V_INLINE gsf__vf gsf__v_activate(gsf__nn_activation activation, gsf__vf x) {
     const gsf__vf one = gsf__v_set(1.0f);
     if (activation == GSF__NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
-        x = gsf__v_max(gsf__v_set(-12.0f), x); // from where on the power is inf
+        x = gsf__v_max(gsf__v_set(-12.0f), x); // below, the power overflows to inf
         const gsf__vf slope = gsf__v_madd(x * x, gsf__v_set(-0.10294324f), gsf__v_set(-2.30220819f));
         return x / (one + gsf__v_exp2(x * slope));
     }
@@ -2133,12 +2138,12 @@ GSF__V_KERNEL void GSF__V(gsf__activate)(gsf__nn_activation activation, const fl
 
 GSF__V_KERNEL void GSF__V(gsf__softmax)(const float* x, int64_t count, float scale, float* y) {
     const gsf__v_exp2_terms terms = gsf__v_exp2_of(1);
-    const gsf__vf factor = gsf__v_set(scale * 1.44269504f), lowest = gsf__v_set(-FLT_MAX); // powers of 2 instead of e
+    const gsf__vf factor = gsf__v_set(scale * 1.44269504f), lowest = gsf__v_set(-FLT_MAX); // base 2 instead of e
     const int64_t whole = count / GSF__LANES * GSF__LANES;
     const size_t left = (size_t)(count - whole);
     const gsf__vm first = gsf__vm_first(left);
     const gsf__vf tail = gsf__v_load_first(x + whole, left);
-    gsf__vf top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest), top1 = top0; // NaNs do not count
+    gsf__vf top0 = gsf__v_max(gsf__v_select(first, factor * tail, lowest), lowest), top1 = top0; // NaNs are ignored
     for (int64_t i = 0; i + GSF__LANES < whole; i += 2 * GSF__LANES) {
         top0 = gsf__v_max(factor * gsf__v_load(x + i), top0);
         top1 = gsf__v_max(factor * gsf__v_load(x + i + GSF__LANES), top1);
@@ -2147,7 +2152,7 @@ GSF__V_KERNEL void GSF__V(gsf__softmax)(const float* x, int64_t count, float sca
     const gsf__vf top = gsf__v_set(gsf__v_largest(gsf__v_max(top0, top1)));
     const gsf__vf last = gsf__v_keep(first, gsf__v_exp2_low(&terms, gsf__v_msub(tail, factor, top)));
     double sum = (double)gsf__v_sum(last);
-    for (int64_t begin = 0; begin < whole; begin += 64 * GSF__LANES) { // float sums of short stretches
+    for (int64_t begin = 0; begin < whole; begin += 64 * GSF__LANES) { // sum short runs in float
         const int64_t end = gsf__least(begin + 64 * GSF__LANES, whole);
         gsf__vf part = gsf__v_set(0.0f);
         for (int64_t i = begin; i < end; i += GSF__LANES) {
@@ -2180,14 +2185,14 @@ static const gsf__activation_kernels* gsf__activation_kernels_of(gsf_cpu_level l
 
 enum { GSF__NN_CHUNK = 1 << 15 }; // values per chunk of elementwise work
 
-// Rows of `dim` values in a chunk of elementwise work, and the number of such chunks: sizes alone decide.
+// Rows of `dim` values per chunk of elementwise work, and the number of chunks: independent of the number of workers.
 static int64_t gsf__nn_chunk_rows(int64_t dim) { return dim < GSF__NN_CHUNK ? GSF__NN_CHUNK / (dim > 0 ? dim : 1) : 1; }
 static size_t gsf__nn_chunks(int64_t count, int64_t per_chunk) { return (size_t)gsf__ceil_div(count, per_chunk); }
 
 typedef struct gsf__finite_job {
     const float* x;
     int64_t count, part;
-    int64_t first[64]; // per part, -1: none
+    int64_t first[64]; // per part; -1: none
 } gsf__finite_job;
 
 static void gsf__finite_part(void* arg, size_t index, int32_t worker) {
@@ -2202,7 +2207,7 @@ static void gsf__finite_part(void* arg, size_t index, int32_t worker) {
     }
 }
 
-// Index of the first value that is NaN or infinite, -1 when there is none.
+// Index of the first value that is NaN or infinite; -1 if there is none.
 static int64_t gsf__nn_find_not_finite(gsf_context* ctx, const float* x, int64_t count) {
     gsf__finite_job job;
     job.x = x;
@@ -2227,8 +2232,8 @@ static int gsf__nn_tensor_is_finite(const gsf_nn_tensor* tensor) {
     return 1;
 }
 
-// After a stage of the network `name`: a value that is not finite ends the run. A tensor whose name begins with `prefix`
-// and that is not finite itself is to blame, else the stage.
+// Called after each stage of network `name`: a non-finite value is an error. It names the first tensor with prefix
+// `prefix` that contains a non-finite value, or else the stage.
 static gsf_result gsf__nn_check_finite(gsf_context* ctx, const gsf_nn_weights* weights, const char* name,
                                        const char* prefix, const char* stage, const float* x, int64_t count) {
     const int64_t at = gsf__nn_find_not_finite(ctx, x, count);
@@ -2302,7 +2307,7 @@ typedef struct gsf__norm_vectors { const float *weight, *bias, *scale, *shift; }
 
 typedef struct gsf__norm_job gsf__norm_job;
 typedef struct gsf__norm_kernels {
-    gsf__moments (*moments)(const float* x, int64_t count, int centre); // centre 0: mean is taken as 0
+    gsf__moments (*moments)(const float* x, int64_t count, int centre); // centre 0: the mean is taken as 0
     void (*row)(const gsf__norm_job* job, const float* x, float* y);
     void (*head)(const gsf__norm_job* job, float* x, const float* cos, const float* sin); // cos NULL: no rotation
     // y = weight (x - mean) inverse + bias; y may be x
@@ -2316,11 +2321,11 @@ struct gsf__norm_job {
     gsf__norm_vectors by;
     float* y;
     int64_t rows, dim, stride, chunk_rows, rope_first;
-    int64_t group_size, part_size, parts, first_group; // group norm: values of a group, of a part of it, parts of a group
+    int64_t group_size, part_size, parts, first_group; // for group norm: values per group and per part; parts per group
     gsf__moments* part_moments;
     int32_t heads;
     float eps;
-    int centre; // 0: root mean square only
+    int centre; // 0: RMS norm
     int stream;
 };
 
@@ -2365,8 +2370,8 @@ static void gsf__norm_affine_scalar(const float* x, int64_t count, gsf__moments 
     for (int64_t i = 0; i < count; i++) y[i] = (float)((double)x[i] - m.mean) * inverse * weight + bias;
 }
 
-// One pass, in double. Values are taken relative to one of them, so (mean - pivot)^2 is at most `count` times the variance,
-// and subtracting it costs no more than log2(count) of the 53 bits.
+// One-pass moments, in double. Values are taken relative to a pivot, one of them, so (mean - pivot)^2 is at most
+// `count` times the variance, and the subtraction loses at most log2(count) of the 53 bits.
 GSF__SHARED gsf__moments gsf__moments_of(double pivot, double sum, double square, int64_t count, int centre) {
     gsf__moments m = {0.0, square};
     if (!centre) return m;
@@ -2422,7 +2427,7 @@ GSF__V_INLINE gsf__moments GSF__V(gsf__moments_all)(const float* x, int64_t coun
         gsf__moments_add(&m, gsf__vd_load(x + i) - p, gsf__vd_load(x + i + half) - p);
         i += 2 * half;
     }
-    if (i < count) { // lanes beyond the last value hold the pivot: they add nothing
+    if (i < count) { // lanes past the last value hold the pivot and so contribute nothing
         const size_t left = (size_t)(count - i);
         const gsf__vf v = gsf__v_select(gsf__vm_first(left), gsf__v_load_first(x + i, left), gsf__v_set(pivot));
         gsf__moments_add(&m, gsf__vd_half(v, 0) - p, gsf__vd_half(v, 1) - p);
@@ -2435,7 +2440,7 @@ GSF__V_KERNEL gsf__moments GSF__V(gsf__moments)(const float* x, int64_t count, i
     return GSF__V(gsf__moments_all)(x, count, centre);
 }
 
-typedef struct gsf__norm_terms { gsf__vf mean, low, inverse; } gsf__norm_terms; // mean + low: the mean in two floats
+typedef struct gsf__norm_terms { gsf__vf mean, low, inverse; } gsf__norm_terms; // mean + low: the mean as two floats
 
 GSF__V_INLINE gsf__norm_terms gsf__norm_terms_of(gsf__moments m, float inverse) {
     const float mean = (float)m.mean;
@@ -2446,10 +2451,10 @@ GSF__V_INLINE gsf__norm_terms gsf__norm_terms_of(gsf__moments m, float inverse) 
     return n;
 }
 
-// (x - mean) inverse: exact to float's resolution of the difference, as x - mean is exact where they are close.
+// (x - mean) inverse, accurate to the resolution of the difference, as x - mean is exact if the two are close.
 GSF__V_INLINE gsf__vf gsf__norm_apply(const gsf__norm_terms* n, gsf__vf x) { return ((x - n->mean) - n->low) * n->inverse; }
 
-// Of the values from x[i] on, `left` of which are there; in loops over whole vectors that is a constant.
+// Normalises the `left` values from x[i] on; in loops over whole vectors `left` is a constant.
 GSF__V_INLINE gsf__vf gsf__norm_value(gsf__norm_vectors by, const gsf__norm_terms* n, const float* x, int64_t i,
                                       size_t left) {
     gsf__vf v = gsf__norm_apply(n, gsf__v_load_first(x + i, left));
@@ -2467,7 +2472,7 @@ GSF__V_INLINE void GSF__V(gsf__norm_row_all)(const gsf__norm_job* job, const flo
     const int64_t dim = job->dim;
     int64_t i = 0;
     for (; i + GSF__LANES <= dim; i += GSF__LANES) {
-        gsf__nn_prefetch(x + dim + i); // of the next row
+        gsf__nn_prefetch(x + dim + i); // the next row
         gsf__v_put(y + i, gsf__norm_value(by, &n, x, i, GSF__LANES), stream);
     }
     if (i < dim) gsf__v_store_first(y + i, gsf__norm_value(by, &n, x, i, (size_t)(dim - i)), (size_t)(dim - i));
@@ -2493,7 +2498,7 @@ GSF__V_KERNEL void GSF__V(gsf__norm_head)(const gsf__norm_job* job, float* x, co
     if (i == dim) return;
     const size_t left = (size_t)(dim - i);
     gsf__vf v = gsf__norm_value(by, &n, x, i, left);
-    if (cos) { // an odd last value stays
+    if (cos) { // an odd last value is not rotated
         const gsf__vf turned = gsf__v_turn_pairs(v, gsf__v_load_first(cos + i, left), gsf__v_load_first(sin + i, left));
         v = gsf__v_select(gsf__vm_first(left / 2 * 2), turned, v);
     }
@@ -2596,16 +2601,16 @@ static void gsf__nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int
     gsf__norm_rows(ctx, x, rows, dim, by, eps, 0, y);
 }
 
-// Groups are cut into parts that fit a core's cache, so that each is read once for both moments, and few large groups still
-// employ all workers. The moments of parts are put together in order (Chan et al. 1979). As many groups as a shared cache
-// holds are normalised before the next ones are read.
-enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values of a part; most parts of a group
-enum { GSF__NORM_BATCH = 1 << 21 };                        // values of the groups of a batch
+// Groups are split into parts that fit a core's cache, so that each part is read once for both moments and even a few
+// large groups keep all workers busy. The moments of the parts are combined in order (Chan et al. 1979). Groups are
+// processed in batches that fit the shared cache, so that normalising finds them still cached.
+enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values per part; most parts per group
+enum { GSF__NORM_BATCH = 1 << 21 };                        // values per batch of groups
 
 static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
-    const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: within the group
+    const int64_t begin = part * job->part_size, first = group * job->group_size; // within the group
     const int64_t end = gsf__least(begin + job->part_size, job->group_size);
-    for (int64_t i = begin; i < end;) { // by channel
+    for (int64_t i = begin; i < end;) { // channel by channel
         const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
         const int64_t count = gsf__least(next, end) - i;
         job->kernels->affine(job->x + first + i, count, m, inverse, job->by.weight ? job->by.weight[channel] : 1.0f,
