@@ -10201,7 +10201,7 @@ enum { // kinds of random streams; gsf__stream combines them with the iteration 
     GSF__STREAM_NOISE, GSF__STREAM_BACKGROUND
 };
 
-enum { GSF__DECAY_INTERVAL = 10 }; // iterations from one opacity decay to the next
+enum { GSF__DECAY_INTERVAL = 10 }; // iterations between opacity decays
 
 typedef struct gsf__photo {
     gsf_camera camera;
@@ -10265,8 +10265,8 @@ static gsf_result gsf__photo_copy(gsf_context* ctx, const gsf_image* image, cons
                 float value;
                 memcpy(&value, from, sizeof value);
                 if (!(value >= low && value <= high))
-                    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s %zu: pixel (%lld, %lld) is %g", what, index,
-                                    (long long)x, (long long)y, (double)value);
+                    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s %zu: pixel (%lld, %lld) has the invalid value %g",
+                                    what, index, (long long)x, (long long)y, (double)value);
                 ((float*)out)[to] = value;
             }
     return GSF_OK;
@@ -10331,7 +10331,8 @@ static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* vi
     memset(out, 0, sizeof *out);
     if (count == 0) return GSF_OK;
     if (!views || count > UINT32_MAX)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: %zu %ss at %p", count, what, (const void*)views);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "trainer: invalid list of %zu %ss at %p", count, what,
+                        (const void*)views);
     out->count = count;
     out->photos = (gsf__photo*)gsf_alloc_zeroed(ctx, count, sizeof *out->photos);
     out->order = (uint32_t*)gsf_alloc(ctx, count, sizeof *out->order);
@@ -10347,7 +10348,7 @@ static gsf_result gsf__photo_set_make(gsf_context* ctx, const gsf_train_view* vi
     return result;
 }
 
-// The photo of step `step` (from 0). Every `count` steps there is a new permutation, which depends only on the arguments.
+// The photo of step `step` (from 0). Every `count` steps there is a new permutation, a function of the arguments only.
 static gsf__photo* gsf__photo_at(gsf__photo_set* set, uint64_t seed, uint64_t kind, uint64_t step) {
     const uint64_t epoch = step / set->count;
     if (set->order_epoch != epoch + 1) {
@@ -10363,6 +10364,7 @@ static gsf__photo* gsf__photo_at(gsf__photo_set* set, uint64_t seed, uint64_t ki
     return &set->photos[set->order[step % set->count]];
 }
 
+// The interval `set` in the desc; if 0, the default for 30000 iterations, scaled to `iterations`, but at least `least`.
 static int32_t gsf__scaled_interval(int32_t set, int32_t official, int32_t iterations, int32_t least) {
     if (set != 0) return set;
     const double scaled = floor((double)official * ((double)iterations / 30000.0) + 0.5);
@@ -10447,7 +10449,7 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "train desc: render.hidden, sh_bands and opacity_scale are set by the trainer");
     if (d->max_splats > UINT32_MAX / 4)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: max_splats is %zu", d->max_splats);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: max_splats %zu is too large", d->max_splats);
     return GSF_OK;
 }
 
@@ -10588,6 +10590,7 @@ static gsf_result gsf__trainer_reserve_images(gsf_context* ctx, gsf_trainer* tra
     return gsf__loss_reserve(ctx, &trainer->loss, set->max_width, set->max_height);
 }
 
+// Number of SH bands trained in an iteration: one more every sh_interval, but never fewer than the initial splats use.
 static int32_t gsf__trainer_bands(const gsf_trainer* trainer, int32_t iteration) {
     const int32_t grown = iteration / trainer->desc.sh_interval + 1, all = trainer->model.sh_degree + 1;
     const int32_t bands = grown > trainer->first_bands ? grown : trainer->first_bands;
@@ -11106,7 +11109,7 @@ GSF_API gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* traine
     if (iteration > (uint64_t)trainer->desc.iterations || sh_degree != (uint64_t)model->sh_degree || first_bands < 1 ||
         first_bands > 4 || count > size || restored_steps > iteration || !(fabsf(restored_weight) <= FLT_MAX))
         return gsf_fail(ctx, GSF_ERROR_FORMAT,
-                        "%s: iteration %llu of %d, %llu with restored views, SH degree %llu (here %d), %llu splats", name,
+                        "%s: does not fit: iteration %llu of %d, %llu restored, SH degree %llu (here %d), %llu splats", name,
                         (unsigned long long)iteration, (int)trainer->desc.iterations, (unsigned long long)restored_steps,
                         (unsigned long long)sh_degree, (int)model->sh_degree, (unsigned long long)count);
     double origin[3];
@@ -11303,7 +11306,7 @@ static void gsf__warp_end(void* user, gsf_context* ctx) {
     warp->count = 0;
 }
 
-// World point of pixel centre (x,y) at camera depth z.
+// World point at image position (x,y) and camera depth z.
 static void gsf__unproject(const gsf_camera* camera, double x, double y, double z, double out[3]) {
     const double* m = camera->w2c;
     const double p[3] = {(x - camera->cx) / camera->fx * z - m[12], (y - camera->cy) / camera->fy * z - m[13], z - m[14]};
@@ -11713,6 +11716,8 @@ typedef struct gsf__seen_job {
     const gsf_image* mask;
 } gsf__seen_job;
 
+// A pixel shows a surface if its alpha is at least 0.5. Another camera sees that surface if it is at most 5 % farther
+// away than the depth rendered from that camera.
 static void gsf__seen_row(void* arg, size_t row, int32_t worker) {
     (void)worker;
     const gsf__seen_job* job = (const gsf__seen_job*)arg;
@@ -11878,14 +11883,14 @@ static gsf_fix_desc gsf__fix_desc_defaults(const gsf_fix_desc* desc, size_t view
 
 static gsf_result gsf__check_fix_desc(gsf_context* ctx, const gsf_fix_desc* d, const gsf_restorer* restorer) {
     if (d->first_round < 0 || d->first_round > d->train.iterations || d->last_round > d->train.iterations)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: rounds at %d..%d of %d iterations", (int)d->first_round,
-                        (int)d->last_round, (int)d->train.iterations);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid rounds %d..%d of %d iterations",
+                        (int)d->first_round, (int)d->last_round, (int)d->train.iterations);
     if (d->windows < 1 || d->windows > 4096 || (d->window_frames && (d->window_frames < 3 || d->window_frames > 4096)))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: %d windows of %d frames", (int)d->windows,
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid %d windows of %d frames", (int)d->windows,
                         (int)d->window_frames);
     if (!(d->lambda >= 0.0f && d->lambda <= 1e6f) || !(d->skip_psnr >= 0.0f) || d->max_pixels < 0)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: lambda %g, skip_psnr %g, max_pixels %d", (double)d->lambda,
-                        (double)d->skip_psnr, (int)d->max_pixels);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid lambda %g, skip_psnr %g or max_pixels %d",
+                        (double)d->lambda, (double)d->skip_psnr, (int)d->max_pixels);
     if (d->path_count > 0x7fffffff || (d->path_count && !d->path))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: invalid path of %zu cameras", d->path_count);
     for (size_t i = 0; i < d->path_count; i++) GSF__TRY(gsf_check_camera(ctx, d->path + i));
@@ -11904,13 +11909,14 @@ static gsf_result gsf__ask_restorer(gsf_context* ctx, gsf_fixer* f) {
     const int32_t usual = f->desc.window_frames > 0 ? f->desc.window_frames : 17;
     GSF__TRY(f->restorer->query_fn(f->restorer->user, ctx, usual, first->width, first->height, limits));
     if (limits->squash && (limits->width < 1 || limits->height < 1 || limits->width > 65536 || limits->height > 65536))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer wants frames squashed to %d x %d",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer has an invalid frame size of %d x %d",
                         (int)limits->width, (int)limits->height);
     const int32_t wanted = f->desc.window_frames == 0 && limits->frame_count > 0 ? limits->frame_count : usual;
     f->frames = gsf__legal_count(wanted, limits->frame_count_min > 0 ? limits->frame_count_min : 1, limits->frame_count_max,
                                  limits->frame_count_step);
     if (f->frames < 3 || f->frames > 4096)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer takes windows of %d frames", (int)f->frames);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "fix: the restorer needs unsupported windows of %d frames",
+                        (int)f->frames);
     if (f->desc.window_frames && f->desc.window_frames != f->frames)
         gsf_log(ctx, GSF_LOG_WARNING, "windows of %d frames: the restorer takes %d instead", (int)f->desc.window_frames,
                 (int)f->frames);
@@ -12047,7 +12053,7 @@ GSF_API gsf_fix_desc gsf_splat_get_fixer_desc(const gsf_fixer* fixer) {
 
 GSF_API gsf_trainer* gsf_splat_get_trainer(const gsf_fixer* fixer) { return fixer->trainer; }
 
-// Rises from 0 at the first round to desc.lambda at the end.
+// Weight of the restored views; rises from 0 at the first round to desc.lambda at the last iteration.
 static float gsf__restored_weight(const gsf_fixer* f) {
     return (float)gsf_traj_query_generative_weight(f->trainer->iteration, f->desc.first_round, f->desc.train.iterations,
                                                    (double)f->desc.lambda, 0);
@@ -12264,7 +12270,7 @@ static gsf_result gsf__keep_window(gsf_context* ctx, gsf_fixer* f, const gsf_res
     const size_t before = f->pending.count;
     for (int32_t i = 0; i < f->frames; i++) {
         gsf__distrust_margin(f, f->confidence + i);
-        if (window->reference_index[i] >= 0) continue; // the photo itself is trained on anyway
+        if (window->reference_index[i] >= 0) continue; // a photo, which is trained on anyway
         const gsf_result result = gsf__keep_frame(ctx, f, window->cameras + i, f->restored + i, f->confidence + i);
         if (result == GSF_OK) continue;
         while (f->pending.count > before) gsf_free(ctx, f->pending.frames[--f->pending.count].pixels);
@@ -12453,7 +12459,8 @@ GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const c
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no FIXR chunk: not a checkpoint of the repair loop", name);
     for (int k = 0; k < 7; k++) numbers[k] = (int32_t)gsf__load_le((const char*)chunk.data + 4 * k, 4);
     if (numbers[0] != 1)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: repair loop state version %d", name, (int)numbers[0]);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: unknown version %d of the repair loop's state", name,
+                        (int)numbers[0]);
     if (numbers[5] != f->desc.windows || numbers[2] < 0 || numbers[2] > f->desc.rounds || numbers[4] < 0 ||
         numbers[4] > numbers[5] || (numbers[3] && numbers[2] >= f->desc.rounds) || numbers[6] < 0 ||
         numbers[6] > (int64_t)numbers[2] * numbers[5] + numbers[4])
@@ -12578,7 +12585,7 @@ static void gsf__random_point(const gsf_scene_view* view, const double* focus, u
 static gsf_result gsf__random_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                      const gsf_initial_desc* desc, gsf__colored_points* out) {
     if (desc->random_points < 1 || view_count == 0)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: %d random points in %zu views",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: cannot place %d random points in %zu views",
                         (int)desc->random_points, view_count);
     for (size_t i = 0; i < view_count; i++)
         if (views[i] >= scene->view_count || !scene->views[views[i]].image.data)
@@ -12679,7 +12686,8 @@ GSF_API gsf_result gsf_splat_make_initial_splats(gsf_context* ctx, const gsf_sce
     const gsf_initial_desc d = gsf__initial_desc_defaults(desc, scene, view_count);
     stats->used = d;
     if (d.sh_degree > 3 || (int)d.kind < 0 || d.kind > GSF_INITIAL_RANDOM || (!views && view_count != scene->view_count))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "initial splats: kind %d, SH degree %d, %zu of %zu views",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "initial splats: invalid kind %d, SH degree %d or views (%zu of %zu)",
                         (int)d.kind, (int)d.sh_degree, view_count, scene->view_count);
     uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count + 1, 1);
     uint32_t* all = views ? NULL : (uint32_t*)gsf_alloc(ctx, view_count + 1, sizeof *all);
