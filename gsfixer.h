@@ -74,8 +74,8 @@
                tensors and images int64_t. Bytes are passed as (data, size) with a name for error messages; output of
                unknown size goes to a gsf_buffer. Terms: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v;
                tokens, positions, latents.
-   SECTIONS    >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate >>images
-               >>resize >>metrics >>cameras >>clips >>glm >>oiio
+   SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
+               >>images >>resize >>metrics >>cameras >>clips >>oiio
 */
 #ifndef GSF_BASE_INCLUDED
 #define GSF_BASE_INCLUDED
@@ -1901,7 +1901,7 @@ GSF_API gsf_result gsf_check_chunks(gsf_context* ctx, const char* name, const vo
                         (unsigned)gsf__load_le(p + 8, 4));
     for (size_t at = GSF__CHUNK_FILE_HEAD;;) {
         if (size - at < GSF__CHUNK_HEAD + GSF__CHUNK_TAIL)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is cut (no END chunk)", name, at);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: file is truncated (no END chunk)", name, at);
         const uint64_t bytes = gsf__load_le(p + at + 4, 8);
         if (bytes > size - at - GSF__CHUNK_HEAD - GSF__CHUNK_TAIL)
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: chunk of %llu bytes does not fit the file", name, at,
@@ -2185,7 +2185,7 @@ static gsf_result gsf__json_refuse_duplicates(gsf__json_parser* p, const gsf_jso
     snprintf(key, sizeof key, "%.40s", twice->key);
     for (char* c = key; *c; c++)
         if (*c < 0x20 || *c > 0x7e) *c = '?';
-    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%u: key \"%s\" stands twice in one object", p->name,
+    return gsf_fail(p->ctx, GSF_ERROR_FORMAT, "%s:%u: key \"%s\" occurs twice in one object", p->name,
                     (unsigned)twice->offset, key);
 }
 
@@ -2555,7 +2555,7 @@ static size_t gsf__lz_match(gsf__deflater* d, size_t at, size_t best, uint32_t* 
 
 static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const void* data, size_t size, gsf_buffer* out) {
     if (size > (size_t)1 << 30)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, at most 2^30 are", name, size);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu bytes to compress, more than 2^30", name, size);
     gsf__deflater* d = (gsf__deflater*)gsf_alloc_zeroed(ctx, 1, sizeof *d);
     if (!d) return GSF_ERROR_OUT_OF_MEMORY;
     d->ctx = ctx;
@@ -2844,7 +2844,7 @@ static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char*
     uint64_t packed = 0;
     for (size_t at = 8;;) {
         if (size < at || size - at < 12)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is cut (no IEND)", name, at);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG is truncated (no IEND)", name, at);
         const unsigned char* head = (const unsigned char*)data + at;
         const size_t bytes = (size_t)head[0] << 24 | (size_t)head[1] << 16 | (size_t)head[2] << 8 | head[3];
         if (bytes > size - at - 12)
@@ -2857,7 +2857,7 @@ static gsf_result gsf__check_png(gsf_context* ctx, const char* name, const char*
         if (memcmp(head + 4, "IEND", 4) == 0) return GSF_OK;
         if (memcmp(head + 4, "IDAT", 4) == 0) packed += bytes;
         if (packed > most)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG with more data than its pixels take", name, at);
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNG has more data than its pixels need", name, at);
         at += 12 + bytes;
     }
 }
@@ -2938,8 +2938,8 @@ static gsf_result gsf__stb_fail(gsf_context* ctx, const char* name, const gsf__s
     if (!reason) reason = "unknown reason";
     if (source->file && ferror(source->file)) return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", name, strerror(errno));
     if (strcmp(reason, "unknown image type") == 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not an image that this build reads", name);
-    if (source->overrun) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is cut", name, source->at);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not an image format that this build can read", name);
+    if (source->overrun) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is truncated", name, source->at);
     if (strcmp(reason, "outofmem") == 0) return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: out of memory", name);
     return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is malformed (%s)", name, source->at, reason);
 }
@@ -3005,7 +3005,7 @@ static gsf_result gsf__check_jpeg(gsf_context* ctx, const char* name, const unsi
             for (size_t table = at + 4; table < end;) {
                 size_t symbols = 0;
                 if (size < 17 || table > size - 17)
-                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is cut", name, size);
+                    return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG is truncated", name, size);
                 for (size_t i = 1; i <= 16; i++) symbols += data[table + i];
                 if (symbols > 256 || table + 17 + symbols > end)
                     return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG table of %zu symbols", name, table, symbols);
@@ -3025,7 +3025,8 @@ static gsf_result gsf__jpeg_query(gsf_context* ctx, const char* name, gsf__stb_s
         if (marker >= 0 && marker != 0xff) continue; // padding
         while (marker == 0xff) marker = gsf__source_byte(source);
         const int bytes = gsf__source_u16(source);
-        if (marker < 0 || bytes < 0) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is cut", name, source->at);
+        if (marker < 0 || bytes < 0)
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: image is truncated", name, source->at);
         if (bytes < 2 || marker == 0xd9 || marker == 0xda)
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: JPEG without a frame header", name, source->at);
         if (marker < 0xc0 || marker > 0xcf || marker == 0xc4 || marker == 0xc8 || marker == 0xcc) {
@@ -3072,9 +3073,9 @@ static gsf_result gsf__pnm_query(gsf_context* ctx, const char* name, gsf__stb_so
     const int color = gsf__source_u16(source) == ('P' << 8 | '6');
     if (!gsf__pnm_head(source, head))
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: PNM header is %s", name, source->at,
-                        source->overrun ? "cut" : "malformed");
+                        source->overrun ? "truncated" : "malformed");
     if (head[2] > 255) // stb 2.27 confuses 8-bit and 16-bit sizes there
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: PNM of 16 bits", name);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: 16-bit PNM", name);
     *width = head[0];
     *height = head[1];
     *channels = color ? 3 : 1;
@@ -3089,7 +3090,7 @@ static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_so
     if (kind == GSF__IMAGE_OTHER && source->file && ferror(source->file))
         return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", name, strerror(errno));
     if (kind == GSF__IMAGE_OTHER)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not an image that this build reads", name);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: not an image format that this build can read", name);
     gsf__source_rewind(source);
     const stbi_io_callbacks callbacks = gsf__stb_callbacks();
     int w, h, c;
@@ -3135,7 +3136,7 @@ static gsf_result gsf__bmp_full_palette(gsf_context* ctx, const char* name, cons
     const uint64_t begin = 14 + header, colors = offset > begin ? (offset - begin) / entry : 0;
     if (colors < 1 || colors > 256 || offset > size)
         return gsf_fail(ctx, GSF_ERROR_FORMAT,
-                        "%s:10: BMP of %u bits whose pixels begin at byte %llu, not behind a palette", name,
+                        "%s:10: %u-bit BMP whose pixels begin at byte %llu, not after a palette", name,
                         bits, (unsigned long long)offset);
     const size_t old = header == 12 ? 12 : 0, full = (size_t)entry * 256, used = (size_t)(colors * entry);
     const uint64_t moved = begin + full + old;
@@ -3211,7 +3212,7 @@ static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const voi
                                    size_t room) {
 #ifdef GSF_NO_STB
     (void)data, (void)size, (void)body, (void)out, (void)room;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no compressed files (GSF_NO_STB)", name);
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build cannot read compressed files (GSF_NO_STB)", name);
 #else
     if (size - body > (size_t)INT32_MAX || room > (size_t)INT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %zu compressed bytes for %zu: at most 2^31-1 are read", name,
@@ -3219,8 +3220,8 @@ static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const voi
     memset(out, 0, room); // stb 2.27 takes the two invalid distance codes for distance 0 and copies what `out` holds
     const int got = stbi_zlib_decode_noheader_buffer((char*)out, (int)room, (const char*)data + body, (int)(size - body));
     if (got < 0)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data is malformed, cut or longer than %zu bytes", name,
-                        body, room);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data is malformed, truncated or longer than %zu bytes",
+                        name, body, room);
     if ((size_t)got != room)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data holds %d bytes, not %zu", name, body, got, room);
     return GSF_OK;
@@ -3253,7 +3254,7 @@ GSF_API gsf_result gsf_decode_image(gsf_context* ctx, const char* name, const vo
     return gsf__stb_load(ctx, name, data, size, channels, out);
 #elif !defined(GSF_USE_OIIO)
     (void)data;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no images (GSF_NO_STB)", name);
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build cannot read images (GSF_NO_STB)", name);
 #endif
 }
 
@@ -3297,7 +3298,7 @@ GSF_API gsf_result gsf_query_image(gsf_context* ctx, const char* path, int64_t* 
 #elif defined(GSF_USE_OIIO)
     result = gsf__oiio_query(ctx, path, data, size, width, height, channels);
 #else
-    result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build reads no images (GSF_NO_STB)", path);
+    result = gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build cannot read images (GSF_NO_STB)", path);
 #endif
     gsf_free(ctx, data);
     return result;
@@ -3402,7 +3403,7 @@ static gsf_result gsf__png_append(gsf_context* ctx, const char* name, const gsf_
 static gsf_result gsf__jpeg_append(gsf_context* ctx, const char* name, const gsf_image* image, gsf_buffer* out) {
 #ifdef GSF_NO_STB
     (void)image, (void)out;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build writes no JPEG (GSF_NO_STB)", name);
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: this build cannot write JPEG (GSF_NO_STB)", name);
 #else
     void* user[2]; // stb itself allocates nothing here: only `out` can run out of memory
     user[0] = ctx;
@@ -3718,7 +3719,7 @@ static gsf_result gsf__metric_mean(gsf_context* ctx, const char* what, const gsf
         sum += sums[i].sum;
         count += sums[i].count;
     }
-    if (count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: no pixel to count", what);
+    if (count == 0) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the mask excludes all pixels", what);
     if (!isfinite(sum)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: an image holds a NaN or infinite value", what);
     *mean = sum / (double)count;
     return GSF_OK;
@@ -4196,7 +4197,7 @@ static gsf_result gsf__clip_plan_size(gsf_context* ctx, gsf__clip* c) {
     if (fabs(c->width - width * scale) <= 0.5 + 0.5 * l->width_multiple &&
         fabs(c->height - height * scale) <= 0.5 + 0.5 * l->height_multiple)
         return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "clip: frames of %g x %g; the restorer keeps pixels square and takes %d x %d",
+    return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "clip: frames of %g x %g; the restorer needs square pixels and %d x %d",
                     width, height, (int)c->width, (int)c->height);
 }
 
@@ -4394,7 +4395,7 @@ static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void*
     std::unique_ptr<OIIO::ImageInput> input =
         format ? OIIO::ImageInput::create(format) : OIIO::ImageInput::open(name, nullptr, memory);
     if (!input)
-        return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "not an image that this build reads", OIIO::geterror());
+        return gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "not an image format that this build can read", OIIO::geterror());
     if (!input->supports("ioproxy"))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: OpenImageIO does not read %s from memory", name,
                         input->format_name());
@@ -4469,7 +4470,7 @@ static gsf_result gsf__oiio_read(gsf_context* ctx, const char* name, const void*
     GSF__TRY(gsf_make_image(ctx, gsf__oiio_dtype(spec.format), spec.width, spec.height, spec.nchannels, &file));
     gsf_result result = GSF_OK;
     if (!input->read_image(0, 0, 0, spec.nchannels, gsf__oiio_type(file.dtype), file.data))
-        result = gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "image is cut or malformed", input->geterror());
+        result = gsf__oiio_fail(ctx, name, GSF_ERROR_FORMAT, "image is truncated or malformed", input->geterror());
     file.color_space = spec.get_string_attribute("oiio:ColorSpace") == "Linear" ? GSF_COLOR_LINEAR : GSF_COLOR_SRGB;
     if (result == GSF_OK && (channels == 0 || channels == spec.nchannels)) {
         *out = file;
@@ -4489,7 +4490,7 @@ static gsf_result gsf__oiio_load(gsf_context* ctx, const char* name, const void*
     try {
         return gsf__oiio_read(ctx, name, data, size, channels, out);
     } catch (...) {
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO gave up", name);
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO threw an exception", name);
     }
 }
 
@@ -4504,7 +4505,7 @@ static gsf_result gsf__oiio_query(gsf_context* ctx, const char* name, const void
         *channels = input->spec().nchannels;
         return GSF_OK;
     } catch (...) {
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO gave up", name);
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO threw an exception", name);
     }
 }
 
@@ -4550,7 +4551,7 @@ static gsf_result gsf__oiio_encode(gsf_context* ctx, const char* name, const cha
     try {
         return gsf__oiio_write(ctx, name, extension, image, out);
     } catch (...) {
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO gave up", name);
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "%s: OpenImageIO threw an exception", name);
     }
 }
 

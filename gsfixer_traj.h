@@ -440,7 +440,7 @@ GSF_API gsf_result gsf_traj_look_at(gsf_context* ctx, const double eye[3], const
     const double forward[3] = {target[0] - eye[0], target[1] - eye[1], target[2] - eye[2]};
     const double down[3] = {-up[0], -up[1], -up[2]};
     if (!(gsf__traj_length(forward) > 1e-14 * (gsf__traj_max_abs(eye) + gsf__traj_max_abs(target))))
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "look-at: the target is where the eye is");
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "look-at: target and eye coincide");
     return gsf__traj_view_pose(ctx, forward, down, eye, pose);
 }
 
@@ -1431,7 +1431,7 @@ GSF__SHARED gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t tota
     const gsf__traj_table table = gsf__traj_make_table(total, middle);
     const int64_t last_start = gsf__traj_table_start(table, table.windows - 1);
     if (table.each > middle || last_start < 0 || last_start + middle > total || table.windows > INT32_MAX)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "windows: the released table of %d in %d poses leaves them",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "windows: the release's table of %d in %d poses exceeds them",
                         (int)middle, (int)total);
     for (int64_t w = 0; w < table.windows; w++) {
         if (starts) starts[w] = (int32_t)gsf__traj_table_start(table, w);
@@ -1512,11 +1512,11 @@ static gsf_result gsf__traj_resolve_official(gsf_context* ctx, const gsf_traj_pa
     const int32_t poses = (int32_t)gsf__traj_or(d->ellipse_poses, GSF__TRAJ_ELLIPSE_DEFAULT);
     if (length < 7 || length % 3 != 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "path: the released windows have 3n + 1 frames, at least 7, not %d", (int)length);
+                        "path: the release's windows have 3n + 1 frames, at least 7, not %d", (int)length);
     int32_t windows;
     GSF__TRY(gsf__traj_official_windows(ctx, poses, length / 3 + 1, NULL, NULL, &windows));
     if (d->window_count && d->window_count != windows)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: the released table has %d windows here, not %d",
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: the release's table has %d windows here, not %d",
                         (int)windows, (int)d->window_count);
     if ((int64_t)windows * length > INT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "path: %d windows of %d frames are too many", (int)windows,

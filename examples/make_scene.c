@@ -47,7 +47,7 @@ static const make_scene_options make_scene_defaults = {40, 320, 240, 10000, 0.5,
 
 static int make_scene(gsf_context* ctx, const make_scene_options* options, const char* folder) {
     (void)ctx, (void)options, (void)folder;
-    fprintf(stderr, "make_scene: this build has no Embree (compile with GSF_USE_EMBREE), nothing else traces the rays\n");
+    fprintf(stderr, "make_scene: built without Embree, which traces the rays (compile with GSF_USE_EMBREE)\n");
     return 1;
 }
 
@@ -1084,7 +1084,7 @@ static int start_world(gsf_context* ctx, world* s, const make_scene_options* o) 
     build_world(s);
     s->device = rtcNewDevice("threads=1,set_affinity=0");
     if (s->failed || !s->device) {
-        fprintf(stderr, "make_scene: %s\n", s->failed ? "out of memory" : "Embree gives no device");
+        fprintf(stderr, "make_scene: %s\n", s->failed ? "out of memory" : "Embree cannot create a device");
         return 0;
     }
     RTCGeometry mesh = rtcNewGeometry(s->device, RTC_GEOMETRY_TYPE_TRIANGLE);
@@ -1293,9 +1293,9 @@ static int usage(FILE* to) {
     fprintf(
         to,
         "usage: make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]\n"
-        "Writes a ray-traced courtyard as photos with a COLMAP model, and the truth about it, into the folder OUT.\n"
+        "Writes a ray-traced courtyard as photos with a COLMAP model and ground truth into the folder OUT.\n"
         "       make_scene SCENE --render CAMERAS.json --out PICTURES\n"
-        "Photographs a scene that was made before at other cameras, into the folder PICTURES.\n");
+        "Renders an existing scene from other cameras into the folder PICTURES.\n");
     return to == stdout ? 0 : 2;
 }
 
@@ -1336,11 +1336,11 @@ int main(int argc, char** argv) {
         return usage(stderr);
     if (!cameras != !pictures) return usage(stderr);
     if (pictures && !is_vacant(pictures)) {
-        fprintf(stderr, "make_scene: %s: is there already (choose a new folder)\n", pictures);
+        fprintf(stderr, "make_scene: %s: already exists (choose a new folder)\n", pictures);
         return 1;
     }
     if (!pictures && !is_vacant(folder) && !is_made_scene(folder)) {
-        fprintf(stderr, "make_scene: %s: is there already, and not of make_scene's making (choose a new folder)\n", folder);
+        fprintf(stderr, "make_scene: %s: already exists and was not written by make_scene (choose a new folder)\n", folder);
         return 1;
     }
     gsf_context ctx;

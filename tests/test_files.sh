@@ -283,7 +283,7 @@ works "$gsfix" render "$splats" --scene T --out OUT; [ "$(ls OUT/*.png | wc -l)"
 
 # ---- make_scene and make_model
 folder=$(dirname "$gsfix")
-new "a scene over a scene"; rm -r S/truth; refused 1 "not of make_scene's making" "$folder/make_scene" S --views 4 --width 32 --height 32
+new "a scene over a scene"; rm -r S/truth; refused 1 "not written by make_scene" "$folder/make_scene" S --views 4 --width 32 --height 32
 mkdir E; works "$folder/make_scene" E --views 4 --width 32 --height 32 --points 40; works "$folder/make_scene" E --views 5 --width 32 --height 32 --points 40
 if [ -x "$folder/make_model" ]; then
     new "a model over a model"; mkdir -p M/scheduler; echo mine > M/scheduler/scheduler_config.json

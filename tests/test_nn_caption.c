@@ -36,7 +36,7 @@ static void test_bad_tokenizers(void) {
         {"{\"a\": 1, \"b\": -1, \"ab\": 4}", merges, small_config, GSF_ERROR_FORMAT, "the id of b"},
         {"{\"a\": 1, \"b\": 1.5, \"ab\": 4}", merges, small_config, GSF_ERROR_FORMAT, "the id of b"},
         {"{\"a\": 1, \"b\": \"2\", \"ab\": 4}", merges, small_config, GSF_ERROR_FORMAT, "the id of b"},
-        {"{\"a\": 1, \"a\": 2}", merges, small_config, GSF_ERROR_FORMAT, "stands twice"},
+        {"{\"a\": 1, \"a\": 2}", merges, small_config, GSF_ERROR_FORMAT, "key \"a\" occurs twice"},
         {"{\"a\": 1, \"b\": 1, \"ab\": 4}", merges, small_config, GSF_ERROR_FORMAT, "both have the id 1"},
         {"{\"a\": 1, \"\": 2}", merges, small_config, GSF_ERROR_FORMAT, "an empty token"},
         {"{\"a\xff\": 1}", merges, small_config, GSF_ERROR_FORMAT, "vocab.json:3: expected UTF-8"},

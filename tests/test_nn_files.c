@@ -197,7 +197,7 @@ static const broken broken_files[] = {
     {"{}", 3, GSF_ERROR_FORMAT, "f:10: 3 bytes belong to no tensor"},
     {"{\"__metadata__\":1}", 0, GSF_ERROR_FORMAT, "f:24: __metadata__"},
     {"{\"__metadata__\":{\"a\":1}}", 0, GSF_ERROR_FORMAT, "__metadata__"},
-    {"{\"x\":{\"dtype\":\"F32\"},\"x\":{}}", 0, GSF_ERROR_FORMAT, "stands twice"},
+    {"{\"x\":{\"dtype\":\"F32\"},\"x\":{}}", 0, GSF_ERROR_FORMAT, "key \"x\" occurs twice"},
     {"{\"x\xff\":{}}", 0, GSF_ERROR_FORMAT, "UTF-8"},
     {"{\"x\\u0000y\":{}}", 0, GSF_ERROR_FORMAT, "zero byte"},
     {ENTRY("\"F8_E4M3\"", "[4]", "[0,4]"), 4, GSF_ERROR_UNSUPPORTED, "tensor x: dtype F8_E4M3"},
