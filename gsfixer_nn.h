@@ -2608,7 +2608,7 @@ enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values per part; m
 enum { GSF__NORM_BATCH = 1 << 21 };                        // values per batch of groups
 
 static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
-    const int64_t begin = part * job->part_size, first = group * job->group_size; // within the group
+    const int64_t begin = part * job->part_size, first = group * job->group_size; // begin, end: in the group
     const int64_t end = gsf__least(begin + job->part_size, job->group_size);
     for (int64_t i = begin; i < end;) { // channel by channel
         const int64_t channel = (first + i) / job->dim, next = (channel + 1) * job->dim - first;
@@ -2727,71 +2727,73 @@ static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int
 
 // ---- >>nn linear ----------------------------------------------------------------
 //
-// Products x w^T by blocks (Goto and van de Geijn 2008; BLIS, Van Zee and van de Geijn 2015). What the innermost kernel
-// reads is packed so that it lies in a line, the weights transposed and widened to float on the way:
+// Products x w^T by blocks (Goto and van de Geijn 2008; BLIS, Van Zee and van de Geijn 2015). The operands of the
+// innermost kernel are packed so that it reads them sequentially; the weights are transposed and widened to float while
+// packing:
 //
 //     x [group of 6 rows][k][6]        w [panel of 16 outputs][k][16]        sums [panel][group][6][16]
 //
-// A block of some hundred rows and outputs is one unit of parallel work. It goes through the inner dimension in steps of
-// `depth`: that much of its rows lies in the L2 cache, of one panel in L1, each tile of 6 x 16 sums is held in registers.
-// AVX-512 takes two groups by two panels at a time, 12 x 32 sums, and pairs of bf16 where floats stand if it is asked to.
-// After the last step a tile goes through bias, activation, gate and residual into y while it is hot. The weights are
-// packed once per call for all blocks, or, where one block has all rows, by the worker that needs them. Up to 4 rows
-// (GEMV) are bound by reading the weights once: these are not packed but multiplied as they lie in the file.
-// Sums: of each `depth` by itself, these then added in order; the same for any number of workers.
+// A block of a few hundred rows and outputs is one unit of parallel work. It traverses the inner dimension in steps of
+// `depth`, so that this much of its rows fits the L2 cache and of one panel the L1 cache; each tile of 6 x 16 sums is
+// held in registers. AVX-512 computes two groups by two panels at a time, 12 x 32 sums, on request with pairs of bf16
+// in the place of floats. After the last step a tile goes through bias, activation, gate and residual into y while it
+// is still in cache. The weights are packed once per call for all blocks, or, if one block covers all rows, by the
+// worker that needs them. With up to 4 rows (GEMV) reading the weights once is the bottleneck, so they are not packed
+// but used as stored in the file. Each `depth` is summed by itself and these sums are added in order, so the result
+// does not depend on the number of workers.
 
 enum {
     GSF__TILE_ROWS = 6,
     GSF__TILE_COLUMNS = 16,
     GSF__TILE_SUMS = GSF__TILE_ROWS * GSF__TILE_COLUMNS,
-    GSF__LINEAR_PAIR = 2 * GSF__TILE_COLUMNS, // panels are gone through in pairs
-    GSF__LINEAR_DEPTH = 256,          // a panel of it is 16 KiB: half of an L1 cache
-    GSF__LINEAR_ROWS = 192,           // of a block, two groups or more; times depth: 192 KiB
+    GSF__LINEAR_PAIR = 2 * GSF__TILE_COLUMNS, // panels are processed in pairs
+    GSF__LINEAR_DEPTH = 256,          // this much of a panel is 16 KiB, half of an L1 cache
+    GSF__LINEAR_ROWS = 192,           // of a block, at least two groups; times depth: 192 KiB
     GSF__LINEAR_COLUMNS = 768,
-    GSF__LINEAR_LONE_ROWS = 320,      // up to here one block has all rows
+    GSF__LINEAR_LONE_ROWS = 320,      // up to this many rows form a single block
     GSF__LINEAR_LONE_COLUMNS = 192,
-    GSF__GEMV_ROWS = 4,               // up to here weights are not packed
-    GSF__GEMV_CHUNKS = 32,            // so many units of work, as reading starts slowly in each,
-    GSF__GEMV_BYTES = 1 << 16,        // but not of less weights than this
-    GSF__GEMV_COLUMNS = 1008,         // nor of more outputs; both a multiple of 6 and 16
+    GSF__GEMV_ROWS = 4,               // up to this many rows, weights are not packed
+    GSF__GEMV_CHUNKS = 32,            // units of work; few, as the hardware prefetcher has to restart in each,
+    GSF__GEMV_BYTES = 1 << 16,        // of at least this many bytes of weights
+    GSF__GEMV_COLUMNS = 1008,         // and at most this many outputs; like the unit a multiple of 6 and 16
     GSF__GEMV_UNIT = 48,
     GSF__GEMV_PAD = 32,               // values of x are padded to a multiple of this
-    GSF__GEMV_AHEAD = 1280,           // AVX-512: bytes ahead that each row of weights is asked for,
-    GSF__GEMV_AHEAD16 = 2048,         // where they have 16 bits;
-    GSF__GEMV_STEP = 1024             // so many values of four rows of x are gone through at a time
+    GSF__GEMV_AHEAD = 1280,           // AVX-512: prefetch distance in bytes within each row of weights,
+    GSF__GEMV_AHEAD16 = 2048,         // and for 16-bit weights
+    GSF__GEMV_STEP = 1024             // values of four rows of x that are processed at a time
 };
 
-#ifndef GSF__LINEAR_PACKED // a test makes it small
-#define GSF__LINEAR_PACKED ((int64_t)1 << 24) // most floats of packed weights held at a time: 64 MiB
+#ifndef GSF__LINEAR_PACKED // a test lowers it
+#define GSF__LINEAR_PACKED ((int64_t)1 << 24) // most floats of packed weights in memory at a time: 64 MiB
 #endif
 
 typedef struct gsf__linear_job gsf__linear_job;
 
 typedef struct gsf__linear_kernels { // one set per instruction set
-    // out[k][16]: `columns` rows of weights, `pitch` bytes apart, as columns; zeros beyond them
+    // out[k][16]: `columns` rows of weights, `pitch` bytes apart, transposed; missing columns are zero
     void (*pack_weights)(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count, float* out);
-    // out[k][6]: `rows` rows of x as columns, zeros beyond them; may write two floats more
+    // out[k][6]: `rows` rows of x, transposed; missing rows are zero; may write two floats more
     void (*pack_rows)(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out);
-    // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; meanwhile fetches `ahead_count` floats that are needed next
+    // sums[6][16] = a[k][6]^T b[k][16], or += with `add`; also prefetches `ahead_count` floats that are needed next
     void (*tile)(const float* a, const float* b, int64_t count, int add, float* sums, const float* ahead,
                  int64_t ahead_count);
-    // As much for two groups, which follow one another, and two panels, whose sums are `next` floats apart; or NULL
+    // The same for two consecutive groups and two panels, whose sums are `next` floats apart; may be NULL
     void (*four_tiles)(const float* a, const float* b, int64_t count, int add, float* sums, int64_t next,
                        const float* ahead, int64_t ahead_count);
-    // Sums (row stride `pitch`, readable to the next multiple of 8 columns) to outputs row ..., column ... of y
+    // Writes sums (row stride `pitch`, readable up to the next multiple of 8 columns) to y from `row`, `column` on
     void (*epilogue)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row, int64_t rows, int64_t column,
                    int64_t columns);
     // sums[m*pitch + c] = row m of x times row column + c of the weights
     void (*gemv)(const gsf__linear_job* job, int64_t column, int64_t columns, float* sums, int64_t pitch);
-    int64_t gemv_lanes; // `gemv` reads x from job->gemv_x, [k / lanes][rows][lanes]; 0: from the description
-    int64_t unit;      // values in a packed float: 1, or 2 in bf16; counts of packed values are of units
+    int64_t gemv_lanes; // layout of job->gemv_x, which `gemv` reads: [k / lanes][rows][lanes]; 0: it reads desc.x
+    int64_t unit;      // values per packed float: 1, or 2 in bf16; counts of packed values are in units
 } gsf__linear_kernels;
 
-typedef struct gsf__linear_plan { // how a product is cut; depends on its sizes only
+typedef struct gsf__linear_plan { // how a product is divided; depends on its sizes only
     int64_t depth;                // of a step through the inner dimension
     int64_t block_rows, block_columns, row_blocks;
-    int64_t group_columns;        // packed at a time
-    int gemv, lone;                // up to 4 rows; one block has all rows
+    int64_t group_columns;        // outputs packed at a time
+    int gemv, lone;                // up to 4 rows; one block covers all rows
     size_t shared, per_worker;    // floats of scratch
 } gsf__linear_plan;
 
@@ -2800,18 +2802,18 @@ struct gsf__linear_job {
     gsf__linear_plan plan;
     const gsf__linear_kernels* kernels;
     int64_t in, out;
-    int64_t length;               // units of `in` values
-    int64_t first, columns;       // the group of outputs in work
-    float *bias, *packed, *gemv_x; // bias: zeros where there is none, 16 more than `out`
+    int64_t length;               // `in` in units
+    int64_t first, columns;       // the current group of outputs
+    float *bias, *packed, *gemv_x; // bias: zeros if there is none, 16 more than `out`
     float* workers;
 };
 
-// `total` in equal pieces of at most `most`, rounded up to a multiple of `unit`.
+// Size of the pieces if `total` is split evenly into pieces of at most `most`; rounded up to a multiple of `unit`.
 static int64_t gsf__even_piece(int64_t total, int64_t most, int64_t unit) {
     return gsf__round_up(gsf__ceil_div(total, gsf__ceil_div(total, most)), unit);
 }
 
-// That there are kernels for.
+// The number of rows of the GEMV kernel that handles `rows` rows.
 static int64_t gsf__gemv_rows(int64_t rows) { return rows < 3 ? rows : (int64_t)GSF__GEMV_ROWS; }
 
 static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f32, bf16 or f16 at any address
@@ -2827,7 +2829,7 @@ static float gsf__nn_load(const char* p, gsf_nn_dtype dtype) { // one weight: f3
 
 // ---- linear: scalar kernels
 
-// The part of a panel at steps k ... and columns first ...
+// Packs the part of a panel from step k and column `first` on.
 static void gsf__pack_corner(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t first, int64_t columns, int64_t k,
                              int64_t count, float* out) {
     const size_t size = gsf_nn_get_dtype_size(dtype);
@@ -2887,7 +2889,7 @@ static void gsf__gemv_scalar(const gsf__linear_job* job, int64_t column, int64_t
 static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar, gsf__pack_rows_scalar, gsf__tile_scalar,
                                                        NULL, gsf__epilogue_scalar, gsf__gemv_scalar, 0, 1};
 
-// The epilogue: what follows the product.
+// The epilogue: bias, activation, gate and residual.
 #define GSF__KERNELS "gsfixer_nn.h"
 #define GSF__KERNELS_EPILOGUE
 #define GSF__KERNELS_AVX512
@@ -2898,7 +2900,7 @@ static const gsf__linear_kernels gsf__linear_scalar = {gsf__pack_weights_scalar,
 #ifdef GSF__KERNELS_EPILOGUE
 #if GSF__LANES > 1
 
-// `left` outputs from column `column` on; sums, too, begin there.
+// Writes `left` outputs from column `column` on; `sums` starts at that column.
 GSF__V_INLINE void GSF__V(gsf__epilogue_columns)(const gsf__linear_job* job, const float* sums, int64_t pitch, int64_t row,
                                                  int64_t rows, int64_t column, size_t left) {
     const gsf__nn_linear_desc* d = &job->desc;
@@ -2973,7 +2975,7 @@ GSF__TARGET_AVX2 static void gsf__pack_weights_avx2(const char* w, gsf_nn_dtype 
     else gsf__pack_weights8(w, GSF_NN_F16, 2, pitch, columns, count, out);
 }
 
-// Eight steps of six rows, the rows in r[0] ... r[5]; each step writes two floats too many, which the next one takes back.
+// Writes eight steps of six rows, r[0] ... r[5]; each step writes two floats too many, which the next one overwrites.
 GSF__INLINE_AVX2 void gsf__store_steps(float* to, __m256 r[8]) {
     gsf__v_transpose_avx2(r);
     _mm256_storeu_ps(to, r[0]);
@@ -2989,7 +2991,7 @@ GSF__INLINE_AVX2 void gsf__store_steps(float* to, __m256 r[8]) {
 GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
     static const float zeros[8] = {0, 0, 0, 0, 0, 0, 0, 0};
     const float* p[GSF__TILE_ROWS];
-    int64_t step[GSF__TILE_ROWS]; // all bits, or 0 for a row that is not there
+    int64_t step[GSF__TILE_ROWS]; // all bits set, or 0 for a missing row
     const int64_t whole = count & ~(int64_t)7;
     float* to = out;
     for (int64_t r = 0; r < GSF__TILE_ROWS; r++) {
@@ -3007,8 +3009,8 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
 }
 
-// The micro-kernel of the GEMM and of attention: c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...]
-// for 6 rows r. 12 registers of sums, 2 of b, 1 or 2 of a; named, as gcc would keep an array in memory.
+// The micro-kernel of GEMM and attention: c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...]
+// for 6 rows r. 12 registers of sums, 2 of b, 1 or 2 of a; named variables, as gcc would keep an array in memory.
 GSF__INLINE_AVX2 void gsf__nn_tile(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
                                    __m256 c[12]) {
     __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
@@ -3044,15 +3046,16 @@ GSF__TARGET_AVX2 static void gsf__tile_avx2(const float* a, const float* b, int6
 #undef GSF_X
 }
 
-// GEMV, of up to 4 rows of x. A core that multiplies on the way has too few loads in flight to keep memory busy, the less so
-// the more of them go to x: so several rows of weights share what is loaded of x, and weights are prefetched. The processor
-// drops prefetches when too many wait, hence each is issued twice, `ahead` bytes (the rows of a tile) and twice that ahead.
+// GEMV with up to 4 rows of x. A core that multiplies while reading has too few loads in flight to saturate memory, and
+// loads of x make that worse. So several rows of weights share each load of x, and weights are prefetched. The
+// processor drops prefetches when too many are pending; hence each is issued twice, `ahead` bytes (the rows of a tile)
+// and twice that ahead.
 GSF__INLINE_AVX2 void gsf__gemv_fetch(const char* p, size_t ahead) {
     _mm_prefetch(p + ahead, _MM_HINT_T1);
     _mm_prefetch(p + 2 * ahead, _MM_HINT_T1);
 }
 
-GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { // the sums of four
+GSF__INLINE_AVX2 __m128 gsf__sum8x4(__m256 a, __m256 b, __m256 c, __m256 d) { // the horizontal sums of four vectors
     const __m256 v = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
     return _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
 }
@@ -3061,8 +3064,9 @@ GSF__INLINE_AVX2 void gsf__gemv_add(float* sums, __m256 a, __m256 b, __m256 c, _
     _mm_storeu_ps(sums, _mm_add_ps(_mm_loadu_ps(sums), gsf__sum8x4(a, b, c, d)));
 }
 
-// Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows] (one row of x: also
-// two numbers behind them). `count` is a multiple of 32, `line` the weights of a cache line.
+// Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows] (with one row of
+// x, also writes two floats past the end). `count` is a multiple of 32; `line` is the number of weights in a cache
+// line.
 GSF__INLINE_AVX2 void gsf__gemv_six(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
                                     int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
@@ -3136,7 +3140,7 @@ GSF__INLINE_AVX2 void gsf__gemv8(const gsf__linear_job* job, gsf_nn_dtype dtype,
                                  int64_t columns, float* sums, int64_t pitch) {
     const size_t bytes = (size_t)job->in * size;
     const char* first = (const char*)job->desc.weight->data + (size_t)column * bytes;
-    const int64_t rows = gsf__gemv_rows(job->desc.rows), height = rows > 2 ? 3 : 6; // of x, of weights
+    const int64_t rows = gsf__gemv_rows(job->desc.rows), height = rows > 2 ? 3 : 6; // rows of x and of weights
     const int64_t whole = job->in / GSF__GEMV_PAD * GSF__GEMV_PAD;
     const size_t left = (size_t)(job->in - whole) * size;
     const char* w[6];
@@ -3169,15 +3173,15 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
 
 // ---- linear: AVX-512 kernels
 
-// 24 registers of sums, 2 of b, 1 or 2 of a; multiply(sum, a, b) adds the products to a sum.
+// 24 registers of sums, 2 of b, 1 or 2 of a; multiply(sum, a, b) adds the products to `sum`.
 #define GSF__FOUR_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
 #define GSF__FOUR_ZEROS(i) __m512 c##i = _mm512_setzero_ps(), d##i = c##i, e##i = c##i, f##i = c##i;
 #define GSF__FOUR_PUT(to, v) _mm512_store_ps(to, add ? _mm512_add_ps(_mm512_load_ps(to), v) : v);
 #define GSF__FOUR_STORE(i)                                                                                              \
     GSF__FOUR_PUT(sums + 16 * (i), c##i) GSF__FOUR_PUT(right + 16 * (i), d##i)                                          \
     GSF__FOUR_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF__FOUR_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
-// As gsf__nn_tile for two groups of rows, `a_next` apart, and two panels, `b_next` apart. Sums are added to c, d (first group,
-// by panel) and e, f; each takes its products in the same order as there. `each` is done in every step.
+// As gsf__nn_tile, for two groups of rows, `a_next` apart, and two panels, `b_next` apart. Sums are added to c, d
+// (first group, by panel) and e, f, in the same order as there. `each` is executed in every step.
 #define GSF__FOUR_TILES(multiply, each, a, a_row, a_step, a_next, b, b_next, count)                                     \
     for (int64_t k_ = 0; k_ < (count); k_++, a += a_step, b += GSF__TILE_COLUMNS) {                                     \
         const __m512 w0 = _mm512_loadu_ps(b), w1 = _mm512_loadu_ps(b + (b_next));                                       \
@@ -3212,7 +3216,7 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
 
 GSF__INLINE_AVX512 __m512 gsf__nn_add_product(__m512 sum, __m512 a, __m512 b) { return _mm512_fmadd_ps(a, b, sum); }
 
-// Each sum takes its products in the order of gsf__tile_avx2: the same bits.
+// Each sum adds its products in the order of gsf__tile_avx2, so the results are bit-identical.
 GSF__TARGET_AVX512 static void gsf__four_tiles_avx512(const float* a, const float* b, int64_t count, int add, float* sums,
                                                       int64_t next, const float* ahead, int64_t ahead_count) {
     GSF__LINEAR_FOUR(gsf__nn_add_product)
@@ -3225,7 +3229,8 @@ GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // si
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(bits), 16));
 }
 
-// One row of weights times one row of x: read in order, as the processor foresees best. `count` is a multiple of 32.
+// One row of weights times one row of x: sequential reads, which the hardware prefetches best. `count` is a multiple of
+// 32.
 GSF__INLINE_AVX512 float gsf__gemv_one16(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
     const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
     __m512 s0 = _mm512_setzero_ps(), s1 = s0, s2 = s0, s3 = s0;
@@ -3242,8 +3247,9 @@ GSF__INLINE_AVX512 float gsf__gemv_one16(const char* w, gsf_nn_dtype dtype, cons
     return gsf__v_sum_avx512((s0 + s1) + (s2 + s3));
 }
 
-// Two rows of x, laid out as [k / 16][2][16], times four rows of weights, added to sums[4][2]. `count` is a multiple of 32.
-// The more there is to multiply, the less far ahead the processor looks by itself: what lies `ahead` bytes on is asked for.
+// Four rows of weights times two rows of x, laid out as [k / 16][2][16], added to sums[4][2]. `count` is a multiple of
+// 32. The more arithmetic per load, the less far the hardware runs ahead, so data `ahead` bytes further on is
+// prefetched.
 GSF__INLINE_AVX512 void gsf__gemv_two16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x,
                                         int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3];
@@ -3276,7 +3282,7 @@ GSF__INLINE_AVX512 void gsf__gemv_two16(const char* const w[4], gsf_nn_dtype dty
 #undef GSF_ROWS
 }
 
-// Four rows of x, as [k / 16][4][16], times six rows of weights, added to sums[6][4]. What lies `ahead` bytes on is asked for.
+// Six rows of weights times four rows of x, as [k / 16][4][16], added to sums[6][4]; prefetches `ahead` bytes ahead.
 GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x,
                                         int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
@@ -3313,9 +3319,10 @@ GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dty
 #undef GSF_ROWS
 }
 
-// Weights are read fastest as long streams: the columns are cut into as many parts as are taken at once, and each part is
-// read from end to end. Only where x, far larger than the weights beside it, would not stay in the first level cache
-// (four rows and 16 bits) is it gone through in steps, with neighbours at once and the next ones asked for.
+// Weights are read fastest as long sequential streams: the columns are divided into as many parts as are read at once,
+// and each part is read from end to end. Only if x, far larger than the weights next to it, would not stay in the L1
+// cache (four rows and 16-bit weights) is it processed in steps; neighbouring columns are then read together and the
+// next ones prefetched.
 GSF__INLINE_AVX512 void gsf__gemv16(const gsf__linear_job* job, gsf_nn_dtype dtype, size_t size, int64_t rows,
                                     int64_t column, int64_t columns, float* sums, int64_t pitch) {
     const int64_t taken = rows == 1 ? 1 : rows == 2 ? 4 : 6, turns = gsf__ceil_div(columns, taken);
@@ -3339,7 +3346,7 @@ GSF__INLINE_AVX512 void gsf__gemv16(const gsf__linear_job* job, gsf_nn_dtype dty
             memset(tile, 0, sizeof tile);
             for (int64_t r = 0; r < taken; r++)
                 w[r] = first + (size_t)gsf__least(turn * next + r * apart, columns - 1) * bytes + (size_t)k * size;
-            for (int part = 0; part < (left ? 2 : 1); part++) { // the second: what is left, and zeros
+            for (int part = 0; part < (left ? 2 : 1); part++) { // the second part: the remainder, padded with zeros
                 const float* x = job->gemv_x + (k + part * whole) * rows;
                 const int64_t n = part ? (int64_t)GSF__GEMV_PAD : whole;
                 for (int64_t r = 0; part && r < taken; r++) {
@@ -3378,14 +3385,14 @@ static const gsf__linear_kernels gsf__linear_avx512 = {gsf__pack_weights_avx2, g
 
 // ---- linear: kernels for pairs of bf16
 
-// The pairs stand in the file as they are needed.
+// The weights are already stored as pairs.
 static void gsf__pack_weights_bf16(const char* w, gsf_nn_dtype dtype, size_t pitch, int64_t columns, int64_t count,
                                    float* out) {
     (void)dtype;
     gsf__pack_weights_avx2(w, GSF_NN_F32, pitch, columns, count, out);
 }
 
-// Eight units of a row of `values` values from first on, zeros beyond.
+// Eight units of a row with `values` values, from value `first` on; zeros beyond the end.
 GSF__INLINE_BF16 __m256 gsf__bf16_units(const float* row, int64_t first, int64_t values) {
     const __m512 v = _mm512_maskz_loadu_ps(gsf__nn_mask16(values > first ? values - first : 0), row + first);
     return _mm256_castsi256_ps(gsf__nn_round_bf16(v));
@@ -3436,7 +3443,7 @@ static const gsf__linear_kernels gsf__linear_bf16 = {gsf__pack_weights_bf16, gsf
 
 #endif
 
-static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level, int pairs) { // pairs: of bf16, if there are
+static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level, int pairs) { // pairs: prefer bf16
 #if GSF__X86
     if (level >= GSF_CPU_AVX512_BF16 && pairs) return &gsf__linear_bf16;
     if (level >= GSF_CPU_AVX512) return &gsf__linear_avx512;
@@ -3447,14 +3454,14 @@ static const gsf__linear_kernels* gsf__linear_kernels_of(gsf_cpu_level level, in
     return &gsf__linear_scalar;
 }
 
-// ---- linear: the parts put together
+// ---- linear: blocks and scheduling
 
-// The panel from output `at` of the group on, at step k: panels of one step follow one another.
+// The panel that starts at output `at` of the group, at step k: panels of one step are adjacent.
 static float* gsf__packed_panel(const gsf__linear_job* job, int64_t at, int64_t k, int64_t count) {
     return job->packed + k * gsf__round_up(job->columns, GSF__TILE_COLUMNS) + at * count;
 }
 
-static void gsf__linear_pack_panel(void* arg, size_t panel, int32_t worker) { // of the group in work, all of its depth
+static void gsf__linear_pack_panel(void* arg, size_t panel, int32_t worker) { // of the current group, its full depth
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const gsf_nn_tensor* w = job->desc.weight;
     const int64_t at = (int64_t)panel * GSF__TILE_COLUMNS, width = gsf__least(job->columns - at, GSF__TILE_COLUMNS);
@@ -3468,12 +3475,12 @@ static void gsf__linear_pack_panel(void* arg, size_t panel, int32_t worker) { //
     }
 }
 
-// All tiles of one or two panels at one step; `next`: between the sums of the two.
+// All tiles of one or two panels at one step; `next` is the distance between the sums of the two.
 static void gsf__linear_panels(const gsf__linear_job* job, const float* x, const float* w, float* sums, int64_t next,
                                int64_t k, int64_t count, int64_t row, int64_t rows, int64_t column, int64_t columns) {
     const gsf__linear_kernels* kernels = job->kernels;
     const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
-    const float* ahead = w + panels * count * GSF__TILE_COLUMNS; // the panels after these, as a rule
+    const float* ahead = w + panels * count * GSF__TILE_COLUMNS; // usually the panels after these
     const int64_t share = job->plan.lone ? 0 : gsf__round_up(gsf__ceil_div(panels * count * GSF__TILE_COLUMNS, groups), 16);
     for (int64_t g = 0, step; g < groups; g += step) {
         const float* a = x + g * GSF__TILE_ROWS * count;
@@ -3497,13 +3504,13 @@ static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a bl
     const gsf__linear_plan* plan = &job->plan;
     const gsf__nn_linear_desc* d = &job->desc;
     const int64_t row = (int64_t)index % plan->row_blocks * plan->block_rows;
-    const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // in the group
+    const int64_t at = (int64_t)index / plan->row_blocks * plan->block_columns; // within the group
     const int64_t rows = gsf__least(d->rows - row, plan->block_rows);
     const int64_t columns = gsf__least(job->columns - at, plan->block_columns);
     const int64_t groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
     const size_t size = gsf_nn_get_dtype_size(d->weight->dtype), pitch = (size_t)job->in * size;
     float* sums = job->workers + (size_t)worker * plan->per_worker;
-    float* panel = sums + plan->block_rows * plan->block_columns; // both whole tiles
+    float* panel = sums + plan->block_rows * plan->block_columns; // both are padded to whole tiles
     float* x = panel + (plan->lone ? plan->depth * GSF__LINEAR_PAIR : 0);
     for (int64_t k = 0; k < job->length; k += plan->depth) {
         const int64_t count = gsf__least(job->length - k, plan->depth), value = k * job->kernels->unit;
@@ -3523,7 +3530,7 @@ static void gsf__linear_block(void* arg, size_t index, int32_t worker) { // a bl
     }
 }
 
-static void gsf__linear_gemv(void* arg, size_t index, int32_t worker) { // some outputs of all rows
+static void gsf__linear_gemv(void* arg, size_t index, int32_t worker) { // some outputs, all rows
     const gsf__linear_job* job = (const gsf__linear_job*)arg;
     const int64_t at = (int64_t)index * job->plan.block_columns;
     const int64_t columns = gsf__least(job->out - at, job->plan.block_columns);
@@ -3532,7 +3539,7 @@ static void gsf__linear_gemv(void* arg, size_t index, int32_t worker) { // some 
     job->kernels->epilogue(job, sums, job->plan.block_columns, 0, job->desc.rows, at, columns);
 }
 
-// x as the GEMV kernels want it, with zeros behind.
+// Rearranges x for the GEMV kernels, padded with zeros.
 static void gsf__gemv_order(gsf__linear_job* job) {
     const gsf__nn_linear_desc* d = &job->desc;
     const int64_t rows = gsf__gemv_rows(d->rows), lanes = job->kernels->gemv_lanes;
@@ -3544,7 +3551,7 @@ static void gsf__gemv_order(gsf__linear_job* job) {
     while (lanes > 0 && to < end) *to++ = 0.0f;
 }
 
-// Cuts (rows, in) x (out, in)^T; 0 where the scratch would not be addressable.
+// Plans (rows, in) x (out, in)^T; returns 0 if the size of the scratch memory overflows.
 static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight_size, gsf__linear_plan* plan) {
     memset(plan, 0, sizeof *plan);
     if (in > INT64_MAX / 256 || out > INT64_MAX / 256 || rows > INT64_MAX / 256) return 0;
@@ -3569,7 +3576,7 @@ static int gsf__plan_linear(int64_t rows, int64_t in, int64_t out, size_t weight
         if (plan->lone) plan->per_worker += (size_t)(plan->depth * GSF__LINEAR_PAIR);
         else if (!gsf__mul_size((size_t)packed, (size_t)in, &shared)) return 0;
     }
-    plan->per_worker = (size_t)gsf__round_up((int64_t)plan->per_worker, 16); // workers begin on cache lines
+    plan->per_worker = (size_t)gsf__round_up((int64_t)plan->per_worker, 16); // workers start on cache lines
     plan->shared = shared + (size_t)gsf__round_up(out + 16, 16);
     return plan->shared >= shared;
 }
@@ -3594,7 +3601,7 @@ static gsf_result gsf__check_linear(gsf_context* ctx, const gsf__nn_linear_desc*
     return GSF_OK;
 }
 
-static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch is there
+static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch is allocated already
     const gsf__linear_plan* plan = &job->plan;
     memset(job->bias, 0, (size_t)(job->out + 16) * sizeof(float));
     if (job->desc.bias) gsf_nn_convert_tensor(job->desc.bias, 0, job->out, job->bias);
@@ -3644,76 +3651,77 @@ static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* worksp
 
 // ---- >>nn int8 ------------------------------------------------------------------
 //
-// Linear layers in 8-bit integers: y[m][n] = sx[m] sw[n] sum_k qx[m][k] qw[n][k], q = round(value / s), s = the row's
-// largest size / 127. One large value makes s large and all others inexact, so both operands are first rotated by blocks:
-// with H the Hadamard matrix of n x n signs, (H x) . (H w) = n x . w, and an outlier is spread over its block (QuaRot,
-// Ashkboos et al. 2024). H is applied without its 1/sqrt(n); sw holds the 1/n, a power of two, so that nothing is rounded
-// for it.
+// Linear layers in 8-bit integers: y[m][n] = sx[m] sw[n] sum_k qx[m][k] qw[n][k], with q = round(value / s) and s = the
+// row's largest magnitude / 127. One outlier makes s large and all other values inexact, so both operands are first
+// rotated in blocks: with H the Hadamard matrix of n x n signs, (H x) . (H w) = n x . w, and an outlier is spread over
+// its block (QuaRot, Ashkboos et al. 2024). H is applied without its 1/sqrt(n); sw includes the 1/n, a power of two, so
+// this adds no rounding.
 //
 //     qw [panel of 16 outputs][k/4][16][4] int8         qx [group of 6 rows][k/4][6][4] int16, or uint8
 //
-// Up to 4 rows, in groups of 2 or 4 then, meet the 8-bit weights as they are read, one panel after another.
-// Fours are what dot-product instructions (VNNI) take, of unsigned by signed bytes: qx is stored as qx + 128 for them, and
-// 128 sum_k qw is taken off the sums, which may wrap around on the way. As with floats two groups meet two panels.
-// AVX2 has no such instruction, and its products of bytes add pairs in 16 bits, which 2 * 127 * 127 fills: signs moved to
-// one operand, multiply, widen, add are 4 instructions for 32 products. With both operands widened to 16 bits, a panel once
-// per block, it is 2 multiplications (vpmaddwd) and 2 additions, also 4, of which nothing but the 12 sums needs a register;
-// alone in L1 that gave 146 against 115 Gop/s a core. Either way two multiplications per cycle bound it to twice the
-// multiply-adds of float; more needs the dot-product instructions.
-// Sums are integers: the same bits for any cut, instruction set and number of workers.
+// Up to 4 rows, then in groups of 2 or 4, are multiplied with the 8-bit weights as they are read, one panel after
+// another. Dot-product instructions (VNNI) take fours of unsigned by signed bytes: for them qx is stored as qx + 128,
+// and 128 sum_k qw is subtracted from the sums, which may wrap around on the way. As with floats, two groups by two
+// panels. AVX2 has no such instruction, and its byte products add pairs in 16 bits, which 2 * 127 * 127 just fits:
+// moving the signs to one operand, multiply, widen and add are 4 instructions for 32 products. With both operands
+// widened to 16 bits (a panel once per block) it takes 2 multiplications (vpmaddwd) and 2 additions, also 4, but only
+// the 12 sums need registers; measured alone in L1, 146 against 115 Gop/s per core. Either way, two multiplications per
+// cycle limit it to twice the multiply-adds of float; exceeding that takes the dot-product instructions. Sums are
+// integers: bit-identical for any division of the work, instruction set and number of workers.
 
 enum {
     GSF__INT8_BLOCK = 256,    // longest rotation
-    GSF__INT8_DEPTH = 512,    // of a step through the inner dimension: a widened panel is 16 KiB; else it is twice as long
+    GSF__INT8_DEPTH = 512,    // step in the inner dimension: a widened panel is 16 KiB; doubled if not widened
     GSF__INT8_ROWS = 192,     // of a block; times depth: 192 KiB
-    GSF__INT8_COLUMNS = 384,  // its sums: 288 KiB
-    GSF__INT8_AHEAD = 4096,   // bytes ahead of which weights are asked for
-    GSF__INT8_LONGEST = 131072 // 127 * 127 * this stays below 2^31
+    GSF__INT8_COLUMNS = 384,  // of a block; its sums: 288 KiB
+    GSF__INT8_AHEAD = 4096,   // prefetch distance of the weights in bytes
+    GSF__INT8_LONGEST = 131072 // 127 * 127 times this is below 2^31
 };
 
-#ifndef GSF__INT8_HELD // a test makes it small
-#define GSF__INT8_HELD ((int64_t)1 << 24) // most 8-bit activations held at a time, 2 bytes each
+#ifndef GSF__INT8_HELD // a test lowers it
+#define GSF__INT8_HELD ((int64_t)1 << 24) // most 8-bit activations in memory at a time, 2 bytes each
 #endif
 
 typedef struct gsf__int8_kernels { // one set per instruction set
-    // Rotates blocks of `block` of the `count` values in place; their largest size then, or inf where one is NaN or inf
+    // Rotates blocks of `block` of the `count` values in place; returns their largest magnitude, inf if one is NaN or
+    // inf
     float (*rotate)(float* x, int64_t count, int64_t block);
-    // Fours of round(x * factor), `pitch` apart, as int16; count is a multiple of 4
+    // Writes round(x * factor) as int16 in fours that are `pitch` apart; count is a multiple of 4
     void (*quantize)(const float* x, int64_t count, float factor, void* out, int64_t pitch);
-    // The same in the type that the products want of x, x_size bytes of each value
+    // The same, in the type that `tile` takes for x, x_size bytes per value
     void (*quantize_x)(const float* x, int64_t count, float factor, void* out, int64_t pitch);
     size_t x_size;
-    // w [k/4][16][4] to out [2][k/4][8][4]; NULL: `tile` takes w as it is
+    // w [k/4][16][4] to out [2][k/4][8][4]; NULL: `tile` takes w unchanged
     void (*widen)(const int8_t* w, int64_t count, int16_t* out);
     // sums[6][16] = a [k/4][6][4] times b, or += with `add`
     void (*tile)(const void* a, const void* b, int64_t count, int add, int32_t* sums);
-    // As much for two groups, `a_next` bytes apart, and two panels, `b_next` bytes apart, their sums `next`; or NULL.
-    // Meanwhile fetches `ahead_count` bytes that are needed next.
+    // The same for two groups, `a_next` bytes apart, and two panels, `b_next` bytes apart, with sums `next` apart; may
+    // be NULL. Also prefetches `ahead_count` bytes that are needed next.
     void (*four_tiles)(const void* a, int64_t a_next, const int8_t* b, int64_t b_next, int64_t count, int add, int32_t* sums,
                        int64_t next, const int8_t* ahead, int64_t ahead_count);
     // sums[rows][16] = a [k/4][rows][4], up to gemv_rows rows, times w [k/4][16][4]
     void (*gemv)(const void* a, int64_t rows, const int8_t* w, int64_t count, int32_t* sums);
     int64_t gemv_rows;
-    // out[6][16] = (sums - offsets[16], where qx is unsigned) * rows[6] * columns[16]
+    // out[6][16] = (sums - offsets[16], if qx is unsigned) * rows[6] * columns[16]
     void (*scale)(const int32_t* sums, const int32_t* offsets, const float* rows, const float* columns, float* out);
 } gsf__int8_kernels;
 
 typedef struct gsf__int8_job {
-    gsf__linear_job linear;      // desc and bias, for the end of a tile
+    gsf__linear_job linear;      // desc and bias, for the epilogue
     const gsf__int8_kernels* kernels;
     const gsf__nn_quantized* weight;
-    int64_t padded;              // in, up to a multiple of 4
+    int64_t padded;              // `in` rounded up to a multiple of 4
     int64_t depth, block_rows, block_columns, row_blocks;
-    int64_t held, first, rows;   // rows of x quantised at a time; those in work
+    int64_t held, first, rows;   // most rows of x quantised at a time; the current ones
     char* x;
-    float* scales;               // of the rows in work
+    float* scales;               // of the current rows
     char* workers;
     size_t per_worker;           // bytes
 } gsf__int8_job;
 
 // ---- int8: scalar kernels
 
-static void gsf__int8_butterflies(float* x, int64_t block, int64_t half) { // one of the log2(block) steps
+static void gsf__int8_butterflies(float* x, int64_t block, int64_t half) { // one of log2(block) steps
     for (int64_t i = 0; i < block; i += 2 * half)
         for (int64_t j = i; j < i + half; j++) {
             const float a = x[j], b = x[j + half];
@@ -3722,7 +3730,7 @@ static void gsf__int8_butterflies(float* x, int64_t block, int64_t half) { // on
         }
 }
 
-static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // bits of sizes are ordered, NaN and inf last
+static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // bits order magnitudes; NaN, inf last
     for (int64_t i = 0; i < count; i++) {
         uint32_t bits;
         memcpy(&bits, x + i, sizeof bits);
@@ -3746,7 +3754,7 @@ static float gsf__int8_rotate_scalar(float* x, int64_t count, int64_t block) {
 }
 
 static void gsf__int8_quantize_scalar(const float* x, int64_t count, float factor, void* out, int64_t pitch) {
-    const float rounder = 12582912.0f; // 1.5 * 2^23: its sums are whole numbers, ties to even
+    const float rounder = 12582912.0f; // 1.5 * 2^23: adding it rounds to integers, ties to even
     int16_t* to = (int16_t*)out;
     for (int64_t k = 0; k < count; k++) to[(k >> 2) * pitch + (k & 3)] = (int16_t)((x[k] * factor + rounder) - rounder);
 }
@@ -3802,7 +3810,7 @@ static const gsf__int8_kernels gsf__int8_scalar = {
 #ifdef GSF__KERNELS_INT8
 #if GSF__LANES > 1
 
-// Two steps, of `half` and twice that; half is a multiple of GSF__LANES.
+// Two butterfly steps, of `half` and twice `half`, a multiple of GSF__LANES.
 GSF__V_INLINE void GSF__V(gsf__int8_two_steps)(float* x, int64_t block, int64_t half) {
     for (int64_t i = 0; i < block; i += 4 * half)
         for (int64_t j = i; j < i + half; j += GSF__LANES) {
@@ -3838,7 +3846,7 @@ GSF__V_KERNEL float GSF__V(gsf__int8_rotate)(float* x, int64_t count, int64_t bl
         for (; 4 * half <= block; half *= 4) GSF__V(gsf__int8_two_steps)(p, block, half);
         if (half < block) GSF__V(gsf__int8_one_step)(p, block, half);
     }
-    gsf__vi top = gsf__vi_set(0); // bits of sizes, see gsf__int8_top
+    gsf__vi top = gsf__vi_set(0); // bits of magnitudes, see gsf__int8_top
     int64_t k = 0;
     for (; k + GSF__LANES <= count; k += GSF__LANES) top = gsf__vi_max(top, gsf__v_bits(gsf__v_abs(gsf__v_load(x + k))));
     if (k < count) top = gsf__vi_max(top, gsf__v_bits(gsf__v_abs(gsf__v_load_first(x + k, (size_t)(count - k)))));
@@ -3880,7 +3888,7 @@ GSF__INLINE_AVX2 __m256i gsf__int8_broadcast4(const int16_t* p) {
     return _mm256_set1_epi64x(four);
 }
 
-// Without this gcc reorders the additions and runs out of registers.
+// Keeps gcc from reordering the additions, which would make it run out of registers.
 #define GSF__INT8_ADD(sum, product)              \
     sum = _mm256_add_epi32(sum, product);        \
     __asm__("" : "+x"(sum));
@@ -3888,7 +3896,7 @@ GSF__INLINE_AVX2 __m256i gsf__int8_broadcast4(const int16_t* p) {
 GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
     for (int half = 0; half < 2; half++, sums += 8) {
         const int16_t *p = (const int16_t*)a, *q = (const int16_t*)b + half * 8 * count;
-        // 12 registers of sums, each of 4 columns by 2 pairs; 2 of b, 1 of a
+        // 12 registers of sums, each 4 columns by 2 pairs; 2 of b, 1 of a
         __m256i c00 = _mm256_setzero_si256(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
         __m256i c30 = c00, c31 = c00, c40 = c00, c41 = c00, c50 = c00, c51 = c00;
         for (int64_t k = 0; k < count; k += 4, p += 24, q += 32) {
@@ -3913,7 +3921,7 @@ GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const void* a, const void* b, i
     }
 }
 
-GSF__INLINE_AVX2 void gsf__int8_gemv_sums(__m256i a, __m256i b, int32_t* to) { // of 8 columns by 2 pairs
+GSF__INLINE_AVX2 void gsf__int8_gemv_sums(__m256i a, __m256i b, int32_t* to) { // 8 columns by 2 pairs
     const __m256i v = _mm256_permute4x64_epi64(_mm256_hadd_epi32(a, b), 0xd8);
     _mm256_storeu_si256((__m256i*)(void*)to, v);
 }
@@ -4034,7 +4042,7 @@ GSF__TARGET_VNNI static void gsf__int8_four_tiles_vnni(const void* a, int64_t a_
 #undef GSF_PUT
 #undef GSF_ROWS
 
-// Two sums of each row, taken in turns: one would wait for itself. `rows` had better be a constant.
+// Two alternating sums per row, as a single one would be latency-bound. Pass a compile-time constant as `rows`.
 GSF__INLINE_VNNI void gsf__int8_gemv_rows(const uint8_t* x, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
     __m512i even0 = _mm512_setzero_si512(), even1 = even0, even2 = even0, even3 = even0;
     __m512i odd0 = even0, odd1 = even0, odd2 = even0, odd3 = even0, v;
@@ -4042,7 +4050,7 @@ GSF__INLINE_VNNI void gsf__int8_gemv_rows(const uint8_t* x, int64_t rows, const 
 #define GSF_EVEN(r) if (rows > r) even##r = _mm512_dpbusd_epi32(even##r, gsf__int8_four(x + 4 * (r)), v);
 #define GSF_ODD(r) if (rows > r) odd##r = _mm512_dpbusd_epi32(odd##r, gsf__int8_four(x + 4 * (rows + (r))), v);
     for (; count >= 8; count -= 8, x += 8 * rows, w += 8 * GSF__TILE_COLUMNS) {
-        if (rows > 1) { // for one the processor itself is soon enough
+        if (rows > 1) { // for one row the hardware prefetches early enough
             _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD, _MM_HINT_T0);
             _mm_prefetch((const char*)w + 2 * GSF__INT8_AHEAD + 64, _MM_HINT_T0);
         }
@@ -4097,11 +4105,11 @@ static const gsf__int8_kernels* gsf__int8_kernels_of(gsf_cpu_level level) {
     return &gsf__int8_scalar;
 }
 
-// ---- int8: the parts put together
+// ---- int8: blocks and scheduling
 
-// Rotates and rounds a row (`in` values, which it changes, then room up to `padded`) to fours `pitch` apart, as int16 for a
-// weight. Returns the scale: NaN, and zeros, for a row with a NaN or infinity; 0 for one below 1e-30, as 127 / size would
-// leave float's range.
+// Rotates and rounds a row (`in` values, modified in place, with room up to `padded`) to fours that are `pitch` apart;
+// as int16 if it is a weight. Returns the scale: NaN, with zeros, for a row with a NaN or infinity; 0 for a row whose
+// largest magnitude is below 1e-30, as 127 divided by it would overflow float.
 static float gsf__int8_row(const gsf__int8_kernels* kernels, int weight, float* x, int64_t in, int64_t padded, int64_t block,
                            void* out, int64_t pitch) {
     const float top = kernels->rotate(x, in, block);
@@ -4179,7 +4187,7 @@ static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor*
         !gsf__mul_size(job.per_worker, (size_t)ctx->parallel.worker_count, &scratch))
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "int8: %lld x %lld", (long long)made.out, (long long)made.in);
     made.bytes = values + columns * (sizeof(float) + sizeof(int32_t));
-    made.data = (int8_t*)gsf_alloc(ctx, made.bytes, 1); // scales and offsets stand behind: values is a multiple of 64
+    made.data = (int8_t*)gsf_alloc(ctx, made.bytes, 1); // scales and offsets follow; `values` is a multiple of 64
     if (!made.data) return GSF_ERROR_OUT_OF_MEMORY;
     made.scales = (float*)(void*)(made.data + values);
     made.offsets = (int32_t*)(void*)(made.scales + columns);
@@ -4223,7 +4231,7 @@ static void gsf__int8_quantize_rows(void* arg, size_t group, int32_t worker) { /
     }
 }
 
-static void gsf__int8_fetch(const int8_t* p, int64_t count) { // panels come from far: without this, widening waits
+static void gsf__int8_fetch(const int8_t* p, int64_t count) { // otherwise widening stalls on distant panels
 #if defined(__GNUC__) || defined(__clang__)
     for (int64_t i = 0; i < count; i += 64) __builtin_prefetch(p + i, 0, 2);
 #endif
@@ -4231,7 +4239,7 @@ static void gsf__int8_fetch(const int8_t* p, int64_t count) { // panels come fro
     (void)count;
 }
 
-// The end of a tile: its sums to y.
+// Scales the sums of a tile and writes them to y through the epilogue.
 static void gsf__int8_epilogue(const gsf__int8_job* job, const int32_t* sums, int64_t row, int64_t rows, int64_t column,
                                int64_t columns, float* tile) {
     const gsf__nn_quantized* w = job->weight;
@@ -4239,21 +4247,21 @@ static void gsf__int8_epilogue(const gsf__int8_job* job, const int32_t* sums, in
     job->linear.kernels->epilogue(&job->linear, tile, GSF__TILE_COLUMNS, job->first + row, rows, column, columns);
 }
 
-// All tiles of one or two panels at one step, as gsf__linear_panels.
+// All tiles of one or two panels at one step, like gsf__linear_panels.
 static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows, int64_t column, int64_t columns, int64_t k,
                              int64_t count, int32_t* sums, int64_t next, int16_t* panel, float* tile) {
     const gsf__int8_kernels* kernels = job->kernels;
     const int64_t panels = gsf__ceil_div(columns, GSF__TILE_COLUMNS), groups = gsf__ceil_div(rows, GSF__TILE_ROWS);
     const int64_t panel_size = job->padded * GSF__TILE_COLUMNS, group_size = job->padded * GSF__TILE_ROWS;
     const int8_t* w = job->weight->data + column * job->padded + k * GSF__TILE_COLUMNS;
-    const int64_t share = count * GSF__TILE_COLUMNS / groups; // of a panel needed next, fetched beside each tile
+    const int64_t share = count * GSF__TILE_COLUMNS / groups; // of a panel needed next, prefetched with each tile
     const int8_t* ahead = column + 2 * columns <= job->weight->out ? w + panels * panel_size : w;
     for (int64_t g = 0, step; g < groups; g += step) {
         const int64_t r = row + g * GSF__TILE_ROWS;
         const char* x = job->x + (size_t)(r * job->padded + k * GSF__TILE_ROWS) * kernels->x_size;
         int32_t* s = sums + g * GSF__TILE_SUMS;
         step = kernels->four_tiles && panels == 2 && g + 2 <= groups ? 2 : 1;
-        // two groups fetch one after the other the two panels
+        // each half of the groups prefetches one of the two panels
         const int8_t* wanted = g < groups / 2 ? ahead + 2 * g * share : ahead + panel_size + (2 * g - groups) * share;
         if (step == 2)
             kernels->four_tiles(x, group_size * (int64_t)kernels->x_size, w, panel_size, count, k > 0, s, next, wanted,
@@ -4275,11 +4283,11 @@ static void gsf__int8_panels(const gsf__int8_job* job, int64_t row, int64_t rows
 
 static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a block of rows and outputs
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
-    const int64_t row = (int64_t)index % job->row_blocks * job->block_rows; // of those in work
+    const int64_t row = (int64_t)index % job->row_blocks * job->block_rows; // among the current rows
     const int64_t column = (int64_t)index / job->row_blocks * job->block_columns;
     const int64_t rows = gsf__least(job->rows - row, job->block_rows);
     const int64_t columns = gsf__least(job->weight->out - column, job->block_columns);
-    const int64_t next = gsf__ceil_div(rows, GSF__TILE_ROWS) * GSF__TILE_SUMS; // from panel to panel
+    const int64_t next = gsf__ceil_div(rows, GSF__TILE_ROWS) * GSF__TILE_SUMS; // between panels
     int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
     float* tile = (float*)(void*)(sums + job->block_rows * job->block_columns);
     int16_t* panel = (int16_t*)(void*)(tile + GSF__TILE_SUMS);
@@ -4296,13 +4304,13 @@ static void gsf__int8_block(void* arg, size_t index, int32_t worker) { // a bloc
     }
 }
 
-static void gsf__int8_gemv(void* arg, size_t index, int32_t worker) { // some panels of outputs of all rows
+static void gsf__int8_gemv(void* arg, size_t index, int32_t worker) { // some panels of outputs, all rows
     const gsf__int8_job* job = (const gsf__int8_job*)arg;
     const int64_t rows = job->rows, most = job->kernels->gemv_rows, first = (int64_t)index * job->block_columns;
     const int64_t end = gsf__least(first + job->block_columns, job->weight->out);
     int32_t* sums = (int32_t*)(void*)(job->workers + (size_t)worker * job->per_worker);
     float* tile = (float*)(void*)(sums + GSF__TILE_SUMS);
-    memset(sums, 0, GSF__TILE_SUMS * sizeof *sums); // also of rows that are not there
+    memset(sums, 0, GSF__TILE_SUMS * sizeof *sums); // also of missing rows
     for (int64_t column = first; column < end; column += GSF__TILE_COLUMNS) {
         for (int64_t r = 0; r < rows; r += most)
             job->kernels->gemv(job->x + (size_t)(r * job->padded) * job->kernels->x_size, gsf__least(rows - r, most),
@@ -4326,7 +4334,7 @@ static void gsf__int8_run_gemv(gsf_context* ctx, gsf__int8_job* job) {
     gsf__parallel_for(ctx, (size_t)gsf__ceil_div(job->weight->out, job->block_columns), gsf__int8_gemv, job);
 }
 
-// Cuts the work by its sizes; bytes of scratch for `workers`, or 0 where they cannot be counted.
+// Divides the work, by its sizes; returns the bytes of scratch for `workers` workers, or 0 on overflow.
 static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     const int64_t out = job->weight->out;
     size_t x, bytes;
@@ -4336,12 +4344,12 @@ static size_t gsf__int8_plan(gsf__int8_job* job, int64_t rows, size_t workers) {
     job->held = gsf__even_piece(rows, most, GSF__TILE_ROWS);
     job->block_rows = gsf__even_piece(job->held, GSF__INT8_ROWS, 2 * GSF__TILE_ROWS);
     job->block_columns = gsf__even_piece(out, GSF__INT8_COLUMNS, GSF__LINEAR_PAIR);
-    if (rows <= GSF__GEMV_ROWS) { // all at once; outputs in GSF__GEMV_CHUNKS parts
+    if (rows <= GSF__GEMV_ROWS) { // all rows at once; outputs in GSF__GEMV_CHUNKS parts
         const int64_t least = GSF__GEMV_BYTES / job->padded + 1, share = gsf__ceil_div(out, GSF__GEMV_CHUNKS);
         job->block_columns = gsf__round_up(gsf__least(share < least ? least : share, out), GSF__TILE_COLUMNS);
     }
     const int64_t block = 4 * (job->block_rows * job->block_columns + GSF__TILE_SUMS) + 2 * job->depth * GSF__LINEAR_PAIR;
-    const int64_t row = 4 * job->padded; // the two kinds of work do not overlap
+    const int64_t row = 4 * job->padded; // the two phases share the memory
     job->per_worker = (size_t)gsf__round_up(block > row ? block : row, 64);
     if (!gsf__mul_size(job->per_worker, workers, &bytes)) return 0;
     if (!gsf__mul_size((size_t)job->held, 2 * (size_t)job->padded + sizeof(float), &x)) return 0;
