@@ -159,7 +159,8 @@ typedef struct gsf_logger {
     void* user;
 } gsf_logger;
 
-// One unit of parallel work. `worker` is below the hook's worker_count; no two chunks run on one worker at a time.
+// One unit of parallel work. `worker` is less than the hook's worker_count; two chunks that run at the same time never have
+// the same worker.
 typedef void (*gsf_chunk_fn)(void* arg, size_t chunk, int32_t worker);
 
 typedef struct gsf_parallel { // run body for chunks 0..chunk_count-1, return when all are done; never nested
@@ -198,8 +199,8 @@ struct gsf_context {
     char error[512];         // message of the last error
 };
 
-// Fills in every hook that is zero and resolves cpu_level (a level that the machine lacks is lowered).
-// Call once on a zeroed or filled-in struct. Owns nothing, so there is no counterpart.
+// Fills in every hook that is zero and resolves cpu_level (a level that the machine does not support is lowered).
+// Call once on a zeroed or filled-in struct. A context owns nothing, so there is no destroy function.
 GSF_API GSF_NODISCARD gsf_result gsf_init_context(gsf_context* ctx);
 
 // Requests that running work stop at its next safe point with GSF_ERROR_CANCELLED. Safe to call from signal handlers and
@@ -222,7 +223,7 @@ GSF_API void* gsf_alloc_zeroed(gsf_context* ctx, size_t count, size_t size);
 GSF_API void gsf_free(gsf_context* ctx, void* memory); // NULL is fine
 
 // ---- random numbers ------------------------------------------------------------
-// Counter-based: a pure function of (seed, stream, index), so threads, skipping and resuming change nothing.
+// Counter-based: pure functions of (seed, stream, index), so results do not depend on threads, skipped draws or resuming.
 
 GSF_API uint64_t gsf_draw_bits(uint64_t seed, uint64_t stream, uint64_t index);
 GSF_API double gsf_draw_uniform(uint64_t seed, uint64_t stream, uint64_t index); // [0,1)
@@ -236,7 +237,7 @@ typedef struct gsf_buffer { // growing bytes or UTF-8 text, zero-terminated as s
     int32_t failed; // an allocation failed; later calls do nothing
 } gsf_buffer;
 
-// Text as printf formats it, bytes as they are, values as JSON spells them.
+// Append printf-style text, raw bytes or JSON values. Running out of memory sets out->failed; check it once at the end.
 GSF_API void gsf_append_text(gsf_context* ctx, gsf_buffer* out, const char* format, ...) GSF_PRINTF(3, 4);
 GSF_API void gsf_append_bytes(gsf_context* ctx, gsf_buffer* out, const char* data, size_t size);
 GSF_API void gsf_append_json_string(gsf_context* ctx, gsf_buffer* out, const char* string); // quoted and escaped
@@ -279,7 +280,7 @@ typedef struct gsf_json_value { // one node; children of arrays and objects foll
     uint32_t child;      // index of the first child, 0 = none
     uint32_t count;      // number of children
     uint32_t key_size;   // length of the key in bytes (members of objects)
-    uint32_t offset;     // byte offset in the source, for error texts
+    uint32_t offset;     // byte offset in the source, for error messages
     const char* key;     // decoded, zero-terminated; NULL outside objects
     const char* string;  // decoded, zero-terminated; strings only
     size_t string_size;
@@ -290,7 +291,7 @@ typedef struct gsf_json { // a parsed document; values[0] is the root
     gsf_json_value* values;
     size_t count;
     char* strings;
-    char name[128]; // for error texts
+    char name[128]; // for error messages
 } gsf_json;
 
 // RFC 8259, strictly: UTF-8 checked, duplicate keys refused, at most 64 levels deep, finite numbers.
@@ -306,9 +307,8 @@ GSF_API const gsf_json_value* gsf_find_json_element(const gsf_json* json, const 
 // ---- images --------------------------------------------------------------------
 
 typedef enum gsf_dtype { GSF_U8 = 0, GSF_U16, GSF_F16, GSF_F32, GSF_F64 } gsf_dtype;
-typedef enum gsf_color_space { GSF_COLOR_SRGB = 0,
-                              GSF_COLOR_LINEAR } gsf_color_space; // a label; converted only where a
-                                                                           // function's comment says so
+// A label: pixels are converted only where a function's comment says so.
+typedef enum gsf_color_space { GSF_COLOR_SRGB = 0, GSF_COLOR_LINEAR } gsf_color_space;
 
 // A view of pixels. Strides are in bytes, so packed, padded, planar and flipped images are all just views.
 // `owned` is non-NULL only in images made by this library, and is what gsf_destroy_image frees.
@@ -373,8 +373,8 @@ typedef enum gsf_ssim_kind {
 // value / maximum). All sums are in double and in a fixed order. A NaN or infinity in a counted pixel gives
 // GSF_ERROR_NUMERIC.
 // mask: NULL, or u8 one-channel of the same size; only pixels with mask != 0 count (for SSIM: mean of the SSIM map over
-// them). With no pixel to count, or an image smaller than the window needs (6 pixels for TORCHMETRICS, 7 for SKIMAGE),
-// the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), and +infinity for identical images.
+// them). If the mask excludes all pixels, or the image is smaller than the window needs (6 pixels for TORCHMETRICS, 7 for
+// SKIMAGE), the result is GSF_ERROR_DEGENERATE. PSNR is 10 log10(1/mse), and +infinity for identical images.
 GSF_API GSF_NODISCARD gsf_result gsf_measure_psnr(gsf_context* ctx, const gsf_image* a, const gsf_image* b,
                                                   const gsf_image* mask, double* out);
 GSF_API GSF_NODISCARD gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const gsf_image* a,
@@ -413,7 +413,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_load_cameras(gsf_context* ctx, const char* 
 // gsfixer_nn.h).
 
 typedef struct gsf_restorer_info { // what a restorer accepts; zero = any
-    uint32_t struct_size;           // set by the caller, which zeroes the rest: nothing is written beyond it
+    uint32_t struct_size;           // set by the caller, which zeroes the rest; nothing is written beyond it
     int32_t frame_count_min, frame_count_max;
     int32_t frame_count_step;       // legal counts: min, min + step, ... up to max
     int32_t width_multiple, height_multiple;
@@ -447,7 +447,7 @@ typedef struct gsf_restore_window { // one clip; all pointers are borrowed for t
     uint64_t seed;
     gsf_image* out_color;             // f32, 3 channels, same size; written by the restorer
     gsf_image* out_confidence;        // f32, 1 channel, [0,1]; weight of each restored pixel in training
-    int32_t clip;                     // index of the clip in its run, from 0: the loop's windows, round after round
+    int32_t clip;                     // index of the clip in its run, from 0; continues across the loop's rounds
     int32_t part;                     // index of the part if a clip is restored in several parts, from 0
 } gsf_restore_window;
 
@@ -890,7 +890,7 @@ enum { GSF__CHUNK_FILE_HEAD = 12, GSF__CHUNK_HEAD = 12, GSF__CHUNK_TAIL = 4 };
 // Begins a chunk whose bytes are then appended to `out` piece by piece with gsf_append_bytes. Returns the position that
 // gsf__close_chunk takes.
 GSF__SHARED size_t gsf__open_chunk(gsf_context* ctx, gsf_buffer* out, const char* tag) {
-    char head[GSF__CHUNK_HEAD]; // first the file's, which has the same size
+    char head[GSF__CHUNK_HEAD]; // also holds the file header, which has the same size
     if (out->size == 0) {
         memcpy(head, "GSFCHUNK", 8);
         gsf__store_le(head + 8, 1, 4);
@@ -2628,7 +2628,7 @@ static void* gsf__stb_grow(void* block, size_t old_size, size_t size) {
     if (grown && size > old_size) memset(grown + old_size, 0, size - old_size);
     return grown;
 }
-#define stbi__unpremultiply_on_load_thread stbi_set_unpremultiply_on_load_thread // stb 2.27 defines it under another name
+#define stbi__unpremultiply_on_load_thread stbi_set_unpremultiply_on_load_thread // stb 2.27 defines it under the wrong name
 #include GSF_STB_IMAGE_INCLUDE
 #undef stbi__unpremultiply_on_load_thread
 #undef STBI_MALLOC
@@ -2881,7 +2881,7 @@ typedef struct gsf__stb_source {
     const char* data;
     size_t size, at;
     FILE* file;         // instead of data
-    const char* buffer; // stb's own, may be filled in part; reads to other places must be complete, which stb does not check
+    const char* buffer; // stb's own, may be filled in part; reads into other memory must be complete, but stb does not check
     int overrun;
 } gsf__stb_source;
 
@@ -3217,7 +3217,7 @@ static gsf_result gsf__stb_inflate(gsf_context* ctx, const char* name, const voi
     if (size - body > (size_t)INT32_MAX || room > (size_t)INT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:%zu: %zu compressed bytes for %zu: at most 2^31-1 are read", name,
                         body, size - body, room);
-    memset(out, 0, room); // stb 2.27 takes the two invalid distance codes for distance 0 and copies what `out` holds
+    memset(out, 0, room); // stb 2.27 takes the two invalid distance codes for distance 0 and copies what `out` held before
     const int got = stbi_zlib_decode_noheader_buffer((char*)out, (int)room, (const char*)data + body, (int)(size - body));
     if (got < 0)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: compressed data is malformed, truncated or longer than %zu bytes",

@@ -829,7 +829,7 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
     }
 }
 
-// Camera of a walk around the table with a handheld camera: distance, height, aim and roll vary.
+// A handheld camera carried around the table: distance, height, aim and roll vary.
 static gsf_camera camera_of(world* s, const make_scene_options* o, int view) {
     gsf_camera c;
     memset(&c, 0, sizeof c);
@@ -982,7 +982,7 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
         widest = maxf(widest, angle);
     }
     if (length < 2 || widest < 0.026f || !triangulate(scene, track, (const double(*)[2])seen, length, at))
-        return 0;                         // 0.026: 1.5 degrees
+        return 0;                         // 0.026 rad: 1.5 degrees
     for (size_t i = 0; i < length; i++) { // COLMAP's limit on the reprojection error: 4 pixels
         double u, w, depth;
         if (!gsf_project_point(&scene->views[track[i]].camera, at, &u, &w, &depth) ||
