@@ -4411,42 +4411,43 @@ static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* w
 
 // ---- >>nn attention -------------------------------------------------------------
 
-/* Online softmax over blocks of keys, as FlashAttention. A chunk of work is a head and a range of its queries. Its queries
-   are packed once; then for every block of keys: pack them, and for every few groups of queries
-       logits   p = q k^T             (log2 e and the scale are in the packed queries)
-       weights  p = 2^(p - top)       with the largest logit so far; what stood before is scaled by 2^(top before - top)
+/* Online softmax over blocks of keys, as in FlashAttention. A unit of work is one head and a range of its queries. The
+   queries are packed once. Then each block of keys is packed and, for every few groups of queries:
+       logits   p = q k^T             (the packed queries include log2 e and the scale)
+       weights  p = 2^(p - top)       top: the largest logit so far; earlier results are scaled by 2^(old top - top)
        values   out = out * that + p v
-   Packed queries, sums and one block of keys stay in cache however many keys there are.
+   Packed queries, sums and one block of keys stay in cache for any number of keys.
        q    [group][dim][8], 6 used    out  [group][panel][6][16]      panel: 16 columns of v, padded with zeros
        k    [panel of 16 keys][dim][16]    v    [panel][key][16]      p    [query][key]
-   AVX-512 takes two groups by two panels at a time. In bf16 the places of q and k hold pairs along dim, those of v and of the
-   weights pairs along the keys, so that there are half as many. */
+   AVX-512 computes two groups by two panels at a time. In bf16 each float slot holds a pair of values: of q and k along
+   dim, of v and the weights along the keys. This halves the number of slots. */
 enum {
-    GSF__ATT_GROUP = 6,       // queries of a register tile: 6 x 16 sums, two of keys and a broadcast are 15 registers
+    GSF__ATT_GROUP = 6,       // queries per register tile: 6 x 16 sums, two vectors of keys, a broadcast: 15 registers
     GSF__ATT_PANEL = 16,
-    GSF__ATT_KEYS = 256,      // keys of a block
-    GSF__ATT_GROUPS = 8,      // groups of queries whose weights are held at a time
+    GSF__ATT_KEYS = 256,      // keys per block
+    GSF__ATT_GROUPS = 8,      // groups of queries whose weights are in memory at a time
     GSF__ATT_TILE = GSF__ATT_GROUP * GSF__ATT_PANEL,
     GSF__ATT_QUERIES = GSF__ATT_GROUP * GSF__ATT_GROUPS,
-    GSF__ATT_RANGE = 1536,    // most queries of a chunk: more hide the packing better, but leave the cache
+    GSF__ATT_RANGE = 1536,    // most queries per chunk: more would hide the packing better, but no longer fit the cache
     GSF__ATT_LEAST_RANGE = 384,
-    GSF__ATT_ROWS = 16,       // queries of the scalar kernel that see a key together
-    GSF__ATT_AHEAD = 16,      // rows to ask for ahead of use
-    GSF__ATT_CHUNKS = 64,     // so many chunks employ the workers evenly
+    GSF__ATT_ROWS = 16,       // queries of the scalar kernel that are processed together for each key
+    GSF__ATT_AHEAD = 16,      // prefetch distance in rows
+    GSF__ATT_CHUNKS = 64,     // enough chunks to balance the load of the workers
 };
 
 typedef struct gsf__attention_job {
     gsf__nn_attention_desc desc;
     const struct gsf__attention_parts* parts; // NULL: the scalar kernel
     float* scratch;             // of all workers
-    size_t scratch_floats;      // of one
+    size_t scratch_floats;      // per worker
     int64_t ranges, range_size; // of the queries
-    int64_t panels;             // of 16 columns of v
+    int64_t panels;             // of v, 16 columns each
 } gsf__attention_job;
 
-// Softmax is blind to what all keys have in common, which adds the same to each logit of a query, but their rounding is not.
-// So keys count from a value in their midst: the middle one of the means of three times five keys, which one wild key does
-// not move, where it is finite. Of the head that stands in the columns from `column` on.
+// Softmax is invariant to an offset shared by all keys, as it adds the same to each logit of a query, but a large
+// offset costs precision. So a typical key is subtracted from all keys: per dimension the median of the means of three
+// groups of five keys, which a single outlier cannot dominate, or 0 if it is not finite. `column` is the head's first
+// column.
 static void gsf__attention_center(const gsf__nn_attention_desc* d, int64_t column, float* center) {
     const float* keys[15];
     for (int64_t n = 0; n < 15; n++) keys[n] = d->k + n * d->keys / 15 * d->ldk + column;
@@ -4460,8 +4461,8 @@ static void gsf__attention_center(const gsf__nn_attention_desc* d, int64_t colum
     }
 }
 
-// Logits of a head's `queries` rows from `first` on, to p (queries, keys). Four queries at a time share a key's centring, and
-// their sums do not wait for each other.
+// Logits of `queries` rows of a head, from row `first` on, to p (queries, keys). Four queries at a time share the
+// centring of a key and have independent sums.
 static void gsf__attention_logits_scalar(const gsf__nn_attention_desc* d, int64_t head, int64_t first, int64_t queries,
                                          const float* center, float* p) {
     const int64_t dim = d->head_dim, column = head * dim;
@@ -4492,10 +4493,10 @@ static void gsf__attention_logits_scalar(const gsf__nn_attention_desc* d, int64_
     }
 }
 
-// One query from its logits p; sum: (head_dim), scratch.
+// Attention of one query, given its logits p; sum: (head_dim), scratch.
 static void gsf__attention_row(const gsf__nn_attention_desc* d, int64_t head, int64_t row, float* p, float* sum) {
     const int64_t dim = d->head_dim, column = head * dim;
-    const int64_t at = (head * d->queries + row) * d->keys; // in mask and bias
+    const int64_t at = (head * d->queries + row) * d->keys; // into mask and bias
     const unsigned char* mask = d->mask ? d->mask + at : NULL;
     float top = -FLT_MAX, total = 0.0f;
     for (int64_t j = 0; j < d->keys; j++) {
@@ -4511,7 +4512,7 @@ static void gsf__attention_row(const gsf__nn_attention_desc* d, int64_t head, in
         for (int64_t i = 0; i < dim; i++) sum[i] += weight * v[i];
     }
     float* out = d->out + row * d->ldo + column;
-    for (int64_t i = 0; i < dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN goes through
+    for (int64_t i = 0; i < dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN propagates
 }
 
 static void gsf__attention_chunk_scalar(const gsf__attention_job* job, size_t chunk, int32_t worker) {
@@ -4528,23 +4529,24 @@ static void gsf__attention_chunk_scalar(const gsf__attention_job* job, size_t ch
     }
 }
 
-typedef struct gsf__attention_scratch { // of one worker
+typedef struct gsf__attention_scratch { // per worker
     float *q, *out, *k, *v, *p;
     float* top;    // [query] largest logit so far
     float* sum;    // [query][8] sum of the weights so far, by lane
-    float* center; // [dim] what is taken off every key
+    float* center; // [dim] subtracted from every key
 } gsf__attention_scratch;
 
-typedef struct gsf__attention_parts { // what instruction sets do differently; in bf16 pairs lie in the places of floats
-    int64_t unit; // values in a place along head_dim: 1, or 2 in bf16
-    // Places of eight rows, of which `rows` are there, less `center` (NULL: nothing) and times `factor`: to[place to_ld + row]
+typedef struct gsf__attention_parts { // what differs between instruction sets; in bf16 each float slot holds a pair
+    int64_t unit; // values per slot along head_dim: 1, or 2 in bf16
+    // Transposes slots of eight rows, `rows` of which exist, minus `center` (or NULL), times `factor`: to[slot to_ld +
+    // row]
     void (*pack_rows)(const float* from, int64_t rows, int64_t ld, const float* center, float factor, int64_t dim, float* to,
                       int64_t to_ld);
     void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
     // p of `groups` groups of queries against `panels` panels of keys
     void (*logits)(const float* q, int64_t groups, const float* k, int64_t panels, int64_t dim, float* p);
-    // Logits of `queries` rows to weights; raises `top`, updates `sum`, and gives in `fade` what earlier values are to be
-    // multiplied with. A NaN does not become the top, but its weight and with it sum and output are NaN.
+    // Turns the logits of `queries` rows into weights, raises `top`, updates `sum`, and sets `fade` to the factor for
+    // earlier results. NaNs are ignored for `top`, but the weight of a NaN, and with it sum and output, is NaN.
     void (*weights)(float* p, int64_t queries, int64_t columns, float* top, float* sum, float fade[GSF__ATT_QUERIES]);
     // out = out * fade + p v
     void (*values)(const float* p, int64_t groups, const float* v, int64_t keys, int64_t panels, const float* fade,
@@ -4567,7 +4569,8 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
     return s;
 }
 
-// A head's rows are a few lines each, far apart, which no hardware foresees: asks for one of them ahead of its use.
+// A head's rows are a few cache lines each and far apart, which defeats the hardware prefetcher: prefetches one such
+// row.
 static void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
     for (int64_t i = 0; row < rows && i < dim; i += 16) gsf__nn_prefetch(from + row * ld + i);
 }
@@ -4593,7 +4596,7 @@ GSF__TARGET_AVX2 static void gsf__attention_pack_rows(const float* from, int64_t
 static void gsf__attention_pack_queries(const gsf__attention_job* job, const gsf__attention_parts* parts, const float* from,
                                         int64_t queries, float* packed) {
     const int64_t ld = job->desc.ldq, dim = job->desc.head_dim;
-    const float factor = job->desc.scale * 1.44269504f; // powers of 2 instead of e
+    const float factor = job->desc.scale * 1.44269504f; // base 2 instead of e
     for (int64_t first = 0; first < queries; first += GSF__ATT_GROUP, packed += 8 * dim / parts->unit) {
         for (int64_t r = first; r < first + GSF__ATT_GROUP; r++)
             gsf__attention_fetch(from, r + GSF__ATT_AHEAD, queries, ld, dim);
@@ -4601,7 +4604,7 @@ static void gsf__attention_pack_queries(const gsf__attention_job* job, const gsf
     }
 }
 
-// Keys of `from`, less `center`, to panels of 16, the last one filled up.
+// Packs the keys of `from`, minus `center`, into panels of 16, padding the last one.
 static void gsf__attention_pack_keys(const gsf__attention_job* job, const gsf__attention_parts* parts, const float* from,
                                      const float* center, int64_t keys, float* packed) {
     const int64_t ld = job->desc.ldk, dim = job->desc.head_dim, panel = GSF__ATT_PANEL * dim / parts->unit;
@@ -4640,7 +4643,7 @@ GSF__TARGET_AVX2 static void gsf__attention_logits_avx2(const float* q, int64_t 
         }
 }
 
-// Pairs of panels by pairs of groups; an odd one that is left is done by `rest`, a function for any number of both.
+// Computes pairs of panels by pairs of groups; `rest`, a function for any number of both, handles the odd ones.
 #define GSF__ATT_LOGITS(multiply, rest)                                                                                 \
     const int64_t even = groups & ~(int64_t)1, height = GSF__ATT_GROUP * GSF__ATT_KEYS;                                 \
     for (int64_t panel = 0; panel + 2 <= panels; panel += 2, k += 2 * GSF__ATT_PANEL * dim) {                           \
@@ -4665,7 +4668,7 @@ GSF__TARGET_AVX512 static void gsf__attention_logits_avx512(const float* q, int6
     GSF__ATT_LOGITS(gsf__nn_add_product, gsf__attention_logits_avx2)
 }
 
-// Adds the bias to the logits of `queries` rows and `keys` columns, as powers of 2.
+// Adds the bias, times log2 e, to the logits of `queries` rows and `keys` columns.
 GSF__TARGET_AVX2 static void gsf__attention_bias(const float* bias, int64_t bias_stride, int64_t queries, int64_t keys,
                                                  float* p) {
     const __m256 factor = _mm256_set1_ps(1.44269504f);
@@ -4677,7 +4680,7 @@ GSF__TARGET_AVX2 static void gsf__attention_bias(const float* bias, int64_t bias
         }
 }
 
-// Logits that do not count become -inf: those of masked keys and of the columns `keys` to `columns`, past the last key.
+// Sets the logits of masked keys, and of the padding columns `keys` to `columns`, to -inf.
 static void gsf__attention_hide(const unsigned char* mask, int64_t mask_stride, int64_t queries, int64_t keys,
                                 int64_t columns, float* p) {
     for (int64_t r = 0; r < GSF__ATT_QUERIES; r++, p += GSF__ATT_KEYS) {
@@ -4693,7 +4696,7 @@ GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queri
     for (int64_t r = 0; r < queries; r++) {
         const float* row = p + r * GSF__ATT_KEYS;
         __m256 top0 = _mm256_set1_ps(top[r]), top1 = top0;
-        for (int64_t j = 0; j < columns; j += 16) { // max returns its second operand where the first is NaN
+        for (int64_t j = 0; j < columns; j += 16) { // max returns its second operand if the first is NaN
             top0 = _mm256_max_ps(_mm256_loadu_ps(row + j), top0);
             top1 = _mm256_max_ps(_mm256_loadu_ps(row + j + 8), top1);
         }
@@ -4718,7 +4721,7 @@ GSF__TARGET_AVX2 static void gsf__attention_weights_avx2(float* p, int64_t queri
     }
 }
 
-// Raises `top` to the largest logit of each row; fade = 2^(top before - top).
+// Raises `top` to the largest logit of each row; fade = 2^(old top - top).
 GSF__INLINE_AVX512 void gsf__attention_tops_avx512(const float* p, int64_t queries, int64_t columns, float* top,
                                                    float fade[GSF__ATT_QUERIES]) {
     const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(0);
@@ -4773,7 +4776,7 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
         }
 }
 
-// Pairs of panels by pairs of groups; what is left by `rest`. `places`: of the keys, in a row of p.
+// Computes pairs of panels by pairs of groups; `rest` handles the odd ones. `places`: slots per row of p.
 #define GSF__ATT_VALUES(multiply, rest, places)                                                                         \
     const int64_t height = GSF__ATT_GROUP * GSF__ATT_KEYS, width = panels * GSF__ATT_TILE;                              \
     const int64_t even = panels % 2 ? 0 : groups & ~(int64_t)1; /* odd panels: sizes of no model */                     \
@@ -4805,7 +4808,7 @@ GSF__TARGET_AVX512 static void gsf__attention_values_avx512(const float* p, int6
     GSF__ATT_VALUES(gsf__nn_add_product, gsf__attention_values_avx2, keys)
 }
 
-// ---- attention in bf16: q and k are packed in pairs along head_dim, v and the weights along the keys
+// ---- attention in bf16: q and k are packed as pairs along head_dim, v and the weights as pairs along the keys
 
 GSF__TARGET_BF16 static void gsf__attention_pack_pairs(const float* from, int64_t rows, int64_t ld, const float* center,
                                                        float factor, int64_t dim, float* to, int64_t to_ld) {
@@ -4860,7 +4863,7 @@ GSF__TARGET_BF16 static void gsf__attention_logits_bf16(const float* q, int64_t 
     GSF__ATT_LOGITS(gsf__nn_add_pairs, gsf__attention_logits_one_bf16)
 }
 
-// The weights are written as bf16 over the logits, those of 16 keys in 8 places; sums are of what was written.
+// Overwrites the logits with the weights in bf16, 16 keys in 8 slots; `sum` adds up the rounded weights.
 GSF__TARGET_BF16 static void gsf__attention_weights_bf16(float* p, int64_t queries, int64_t columns, float* top, float* sum,
                                                          float fade[GSF__ATT_QUERIES]) {
     const gsf__v_exp2_terms_avx512 terms = gsf__v_exp2_of_avx512(1);
@@ -4917,7 +4920,7 @@ static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t ch
     const int64_t head = (int64_t)chunk / job->ranges, first = (int64_t)chunk % job->ranges * job->range_size;
     const int64_t rows = gsf__least(job->range_size, d->queries - first);
     const int64_t groups = (rows + GSF__ATT_GROUP - 1) / GSF__ATT_GROUP, column = head * d->head_dim;
-    const int64_t length = d->head_dim / parts->unit; // places of a query or key
+    const int64_t length = d->head_dim / parts->unit; // slots per query or key
     float fade[GSF__ATT_QUERIES];
     gsf__attention_center(d, column, s.center);
     gsf__attention_pack_queries(job, parts, d->q + first * d->ldq + column, rows, s.q);
@@ -4932,7 +4935,7 @@ static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t ch
         for (int64_t g = 0; g < groups; g += GSF__ATT_GROUPS) {
             const int64_t count = gsf__least(GSF__ATT_GROUPS, groups - g), r = g * GSF__ATT_GROUP;
             parts->logits(s.q + g * 8 * length, count, s.k, key_panels, length, s.p);
-            const int64_t at = (head * d->queries + first + r) * d->keys + key; // in mask and bias
+            const int64_t at = (head * d->queries + first + r) * d->keys + key; // into mask and bias
             const unsigned char* mask = d->mask ? d->mask + at : NULL;
             if (d->bias) gsf__attention_bias(d->bias + at, d->keys, rows - r, keys, s.p);
             if (mask || keys < columns) gsf__attention_hide(mask, d->keys, rows - r, keys, columns, s.p);
@@ -4973,7 +4976,7 @@ static void gsf__attention_chunk(void* arg, size_t chunk, int32_t worker) {
     if (!job->parts) gsf__attention_chunk_scalar(job, chunk, worker);
 }
 
-// Chooses the ranges of queries, from sizes alone; returns the number of chunks.
+// Chooses the ranges of queries by the sizes only; returns the number of chunks.
 static size_t gsf__attention_plan(gsf__attention_job* job) {
     const gsf__nn_attention_desc* d = &job->desc;
     const int64_t wanted = (GSF__ATT_CHUNKS - 1) / d->heads + 1, most = d->queries / GSF__ATT_LEAST_RANGE;
@@ -4986,12 +4989,12 @@ static size_t gsf__attention_plan(gsf__attention_job* job) {
     return (size_t)(d->heads * job->ranges);
 }
 
-// Floats that one worker needs, a multiple of 16; 0 on overflow.
+// Floats of scratch per worker, a multiple of 16; 0 on overflow.
 static size_t gsf__attention_floats(const gsf__attention_job* job) {
     const gsf__nn_attention_desc* d = &job->desc;
     const size_t dim = (size_t)d->head_dim, padded = (size_t)job->panels * GSF__ATT_PANEL;
     size_t total;
-    if (job->parts) { // p, k, v; then a query's share of out, sum, q (8 places for 6) and top
+    if (job->parts) { // p, k, v; then per query: out, sum, q (8 slots for 6 queries) and top
         if (!gsf__mul_size((size_t)job->range_size, padded + 8 + dim + (dim + 2) / 3 + 1, &total)) return 0;
         total += GSF__ATT_QUERIES * GSF__ATT_KEYS + GSF__ATT_KEYS * (dim + padded) + dim;
     } else {
@@ -5035,30 +5038,31 @@ static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* wor
 
 // ---- >>nn convolution -----------------------------------------------------------
 
-// Channels-last, a convolution of 3 x 3 (x 3) is 3 (9) matrix products: the 3C values left of, at and right of a pixel lie
-// together, so for each kernel row (kt, ky) a row of output pixels is A (pixels, 3C), whose rows overlap by 2C, times
-// B (3C, outputs). Frames get a column of zeros at either side for that; rows above and below the frame are skipped.
-// Work is cut into segments of 8 x 30 output pixels. A segment goes through 16 outputs at a time: their weights are
-// packed as (kernel row, 3C, 16), cut into panels of up to 256 values x 16 (16 KiB, first level cache), and each panel is
-// multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers. Sums of panels are added up one by one, so
-// that rounding errors grow with 256 + the number of panels, not with their product.
+// In channels-last layout the 3C values left of, at and right of a pixel are contiguous, so a convolution of 3 x 3 (x
+// 3) is 3 (9) matrix products: for each kernel row (kt, ky), a row of output pixels is A (pixels, 3C), whose rows
+// overlap by 2C, times B (3C, outputs). For this, frames get a column of zeros on either side; rows above and below the
+// frame are skipped. Work is divided into segments of 8 x 30 output pixels. A segment computes 16 outputs at a time.
+// Their weights are packed as (kernel row, 3C, 16) and divided into panels of up to 256 values x 16 (16 KiB, L1 cache).
+// Each panel is multiplied with all pixels of the segment, 6 pixels x 16 outputs in registers. The sums of the panels
+// are added one after another, so rounding errors grow with 256 + the number of panels instead of their product.
 
 enum {
-    GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs, values of a product
-    GSF__CONV_M10 = 10,                                   // pixels of a product with two panels
-    GSF__CONV_ROWS = 8, GSF__CONV_COLUMNS = 30,           // pixels of a segment; columns: a multiple of M
-    GSF__CONV_SHARE = GSF__CONV_N / GSF__CONV_ROWS,       // floats of the next panel to fetch a step
+    GSF__CONV_M = 6, GSF__CONV_N = 16, GSF__CONV_K = 256, // pixels, outputs and values per product
+    GSF__CONV_M10 = 10,                                   // pixels per product with two panels
+    GSF__CONV_ROWS = 8, GSF__CONV_COLUMNS = 30,           // pixels per segment; columns: a multiple of M
+    GSF__CONV_SHARE = GSF__CONV_N / GSF__CONV_ROWS,       // floats of the next panel to prefetch per step
     GSF__CONV_TAPS = 27,
 };
 
 typedef struct gsf__conv_kernels {
-    // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last rows
-    // repeat the last pixel. Meanwhile fetches GSF__CONV_SHARE k floats from `ahead` on.
+    // c += a b. a: `count` pixels, lda apart, k values each; b: (k, 16); c: (count rounded up to 6, 16), whose last
+    // rows repeat the last pixel. Also prefetches GSF__CONV_SHARE k floats from `ahead` on.
     void (*multiply)(const float* a, int64_t lda, int64_t count, const float* b, int64_t k, float* c, const float* ahead);
-    // The same for two panels, `b_next` floats apart, and their sums, `c_next` apart; or NULL.
+    // The same for two panels, `b_next` floats apart, with sums `c_next` apart; may be NULL.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
                          int64_t c_next, const float* ahead);
-    // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and their squares.
+    // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += the values and their
+    // squares.
     void (*store)(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo, double* sums);
     // y = silu((x - mean) * scale + offset)
     void (*norm_silu)(const float* x, int64_t count, const float* mean, const float* scale, const float* offset, float* y);
@@ -5094,7 +5098,7 @@ static void gsf__conv_store_ref(const float* c, int64_t count, int64_t n, int ac
 #if GSF__X86
 GSF__INLINE_AVX2 void gsf__conv_add8(float* c, __m256 v) { _mm256_storeu_ps(c, _mm256_add_ps(_mm256_loadu_ps(c), v)); }
 
-// Six pixels at a time; a missing one reads the last one's values.
+// Six pixels at a time; missing pixels repeat the last one.
 GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda, int64_t count, const float* b, int64_t k,
                                                      float* c, const float* ahead) {
     for (int64_t m = 0; m < count; m += GSF__CONV_M, a += GSF__CONV_M * lda, c += GSF__CONV_M * GSF__CONV_N) {
@@ -5136,8 +5140,8 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
     }
 }
 
-// Ten pixels by two panels: 20 registers of sums. There are none for ten pointers, so three reach all pixels. The last ten
-// of a row may overlap others, whose sums are left alone.
+// Ten pixels by two panels: 20 registers of sums. That leaves too few registers for ten pointers, so all pixels are
+// addressed from three. The last ten pixels of a row may overlap earlier ones, whose sums are not added again.
 GSF__TARGET_AVX512 static void gsf__conv_multiply_two_avx512(const float* a, int64_t lda, int64_t count, const float* b,
                                                              int64_t b_next, int64_t k, float* c, int64_t c_next,
                                                              const float* ahead) {
@@ -5187,7 +5191,7 @@ GSF__INLINE_AVX2 void gsf__conv_add_squares(__m256d v, __m256d* sum, __m256d* sq
     *square = _mm256_fmadd_pd(v, v, *square);
 }
 
-// Eight outputs of `count` pixels.
+// Stores eight outputs of `count` pixels.
 GSF__INLINE_AVX2 void gsf__conv_store8(const float* c, int64_t count, int accumulate, float* out, int64_t ldo,
                                        double* sums) {
     __m256d s0 = _mm256_loadu_pd(sums), s1 = _mm256_loadu_pd(sums + 4), q0 = _mm256_loadu_pd(sums + GSF__CONV_N),
@@ -5225,14 +5229,14 @@ static const gsf__conv_kernels* gsf__conv_kernels_of(gsf_cpu_level level) {
     return &scalar;
 }
 
-typedef struct gsf__conv_layer { // weight: (out, in, kt, kernel, kernel), or without kt
+typedef struct gsf__conv_layer { // weight: (out, in, kt, kernel, kernel); 2D: without kt
     const gsf_nn_tensor *weight, *bias;
     int64_t in, out, kt, kernel;
 } gsf__conv_layer;
 
 static int64_t gsf__conv_taps(const gsf__conv_layer* layer) { return layer->kt * layer->kernel * layer->kernel; }
 static int64_t gsf__conv_blocks(const gsf__conv_layer* layer) { return (layer->out + GSF__CONV_N - 1) / GSF__CONV_N; }
-// Values per 16 outputs: their bias, then their weights.
+// Floats per packed panel of 16 outputs: their bias, then their weights.
 static int64_t gsf__conv_panel(const gsf__conv_layer* layer) {
     return GSF__CONV_N * (1 + gsf__conv_taps(layer) * layer->in);
 }
@@ -5245,8 +5249,8 @@ typedef struct gsf__conv_pack_job {
     float* out; // (blocks, panel)
 } gsf__conv_pack_job;
 
-// Sixteen outputs: (out, in, taps) to (taps, in, 16), absent outputs zero. A few input channels at a time, so that both
-// sides stay in the first level cache.
+// Packs sixteen outputs: (out, in, taps) to (taps, in, 16), missing outputs zero. A few input channels at a time, so
+// that both source and destination stay in the L1 cache.
 static void gsf__conv_pack_block(void* arg, size_t block, int32_t worker) {
     enum { CHANNELS = 16 };
     const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
@@ -5275,16 +5279,17 @@ static void gsf__conv_pack(gsf_context* ctx, const gsf__conv_layer* layer, float
     gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer), gsf__conv_pack_block, &job);
 }
 
-// A 3 x 3 convolution of a frame doubled by nearest resize is four 2 x 2 convolutions of the frame itself, one for each
-// parity (py, px) of the output pixel: kernel rows that fall on the same input row are added. The two rows take the
-// kernel's rows {0} and {1, 2} at parity 0, {0, 1} and {2} at parity 1. 4/9 of the products.
-static gsf__conv_layer gsf__conv_quarter(const gsf__conv_layer* layer) { // what one parity computes
+// A 3 x 3 convolution of a frame upscaled 2x by nearest neighbour equals four 2 x 2 convolutions of the frame itself,
+// one per parity (py, px) of the output pixel: kernel rows that fall on the same input row are added up. At parity 0
+// the two rows are the sums of the kernel's rows {0} and {1, 2}, at parity 1 of {0, 1} and {2}. This takes 4/9 of the
+// multiply-adds.
+static gsf__conv_layer gsf__conv_quarter(const gsf__conv_layer* layer) { // the convolution for one parity
     gsf__conv_layer quarter = *layer;
     quarter.kernel = 2;
     return quarter;
 }
 
-static void gsf__conv_pack_quarter(void* arg, size_t chunk, int32_t worker) { // chunk: parity and 16 outputs
+static void gsf__conv_pack_quarter(void* arg, size_t chunk, int32_t worker) { // chunk: one parity and 16 outputs
     const gsf__conv_pack_job* job = (const gsf__conv_pack_job*)arg;
     const gsf__conv_layer* layer = job->layer;
     const gsf__conv_layer quarter = gsf__conv_quarter(layer);
@@ -5306,7 +5311,7 @@ static void gsf__conv_pack_quarter(void* arg, size_t chunk, int32_t worker) { //
         }
 }
 
-// (parities, blocks, panel of a quarter)
+// out: (parities, blocks, panel of a quarter)
 static void gsf__conv_pack_quarters(gsf_context* ctx, const gsf__conv_layer* layer, float* out) {
     gsf__conv_pack_job job = {layer, out};
     gsf__parallel_for(ctx, (size_t)gsf__conv_blocks(layer) * 4, gsf__conv_pack_quarter, &job);
@@ -5316,17 +5321,17 @@ typedef struct gsf__conv_job { // one frame of output
     const gsf__conv_kernels* kernels;
     const float* in[3];              // kt input frames, oldest first
     int64_t in_height, in_stride;    // rows and floats per row of an input frame
-    int64_t origin, step;            // floats from a row's start to what output column 0 reads; from column to column
-    int64_t kt, kh, k;               // kernel rows kt x kh of k values
+    int64_t origin, step;            // floats from a row's start to the input of output column 0; between columns
+    int64_t kt, kh, k;               // kt x kh kernel rows of k values
     int64_t stride, pad;             // of rows
     const float* packed;
     int64_t panel;
     int64_t height, width, outputs;
-    float* out;                      // pixels ldo apart, rows out_row
+    float* out;                      // ldo floats between pixels, out_row between rows
     int64_t ldo, out_row;
     int32_t accumulate;
     int64_t groups;                  // of outputs
-    double* partial;                 // (segments, groups, 2): sums and sums of squares, or NULL
+    double* partial;                 // (segments, groups, 2): sums and sums of squares; may be NULL
 } gsf__conv_job;
 
 static int64_t gsf__conv_columns(const gsf__conv_job* job) {
@@ -5338,7 +5343,7 @@ static int64_t gsf__conv_segments(const gsf__conv_job* job) {
 
 enum { GSF__CONV_TILE = GSF__CONV_ROWS * GSF__CONV_COLUMNS * GSF__CONV_N };
 
-// tiles (panels, rows, 30, 16) += all kernel rows of one or two panels of outputs.
+// tiles (panels, rows, 30, 16) += the products of all kernel rows with one or two panels of outputs.
 static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, int64_t x0, int64_t columns, int64_t panels,
                           const float* b, float* tile) {
     for (int64_t kt = 0; kt < job->kt; kt++)
@@ -5349,7 +5354,7 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
                     const int64_t y = (y0 + r) * job->stride + kh - job->pad;
                     if (y < 0 || y >= job->in_height) continue;
                     const float* a = job->in[kt] + y * job->in_stride + job->origin + x0 * job->step + k0;
-                    const float* ahead = b + (GSF__CONV_N + r * GSF__CONV_SHARE) * k; // the rows share what comes next
+                    const float* ahead = b + (GSF__CONV_N + r * GSF__CONV_SHARE) * k; // the rows share the prefetching
                     float* c = tile + r * GSF__CONV_COLUMNS * GSF__CONV_N;
                     if (panels == 2)
                         job->kernels->multiply_two(a, job->step, columns, b, job->panel, k, c, GSF__CONV_TILE, ahead);
@@ -5359,7 +5364,7 @@ static void gsf__conv_sum(const gsf__conv_job* job, int64_t y0, int64_t rows, in
             }
 }
 
-// A tile to outputs n0 ... of its pixels; sums of its values and their squares to `partial`, unless NULL.
+// Writes a tile to outputs n0 ... of its pixels; adds its values and their squares to `partial` (may be NULL).
 static void gsf__conv_store(const gsf__conv_job* job, const float* tile, int64_t y0, int64_t rows, int64_t x0,
                             int64_t columns, int64_t n0, double* partial) {
     const int64_t n = gsf__least(job->outputs - n0, GSF__CONV_N);
@@ -5397,7 +5402,7 @@ static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
     }
 }
 
-// One frame; its sums (groups, 2), where asked for through job->partial, are written to `sums`.
+// Convolves one frame; if job->partial is not NULL, writes the sums per group to `sums` (groups, 2).
 static void gsf__conv_frame(gsf_context* ctx, gsf__conv_job* job, double* sums) {
     const int64_t segments = gsf__conv_segments(job);
     gsf__parallel_for(ctx, (size_t)segments, gsf__conv_segment, job);
@@ -5407,13 +5412,13 @@ static void gsf__conv_frame(gsf_context* ctx, gsf__conv_job* job, double* sums) 
         for (int64_t i = 0; i < job->groups * 2; i++) sums[i] += job->partial[s * job->groups * 2 + i];
 }
 
-typedef struct gsf__conv_fill { // one frame, made ready to be convolved
+typedef struct gsf__conv_fill { // prepares one frame: norm and activation, averaging, border
     const gsf__conv_kernels* kernels;
     const float *x, *x2;             // (height, width, channels); x2: averaged with x, or NULL
     int64_t height, width, channels;
-    const float *mean, *table;       // mean NULL: values as they are. table: scale and offset of each pixel of a coarser
-    int64_t table_width;             //   frame (.., table_width, 2, channels), or of all pixels where that is 0
-    int32_t shift;                   // log2 of pixels per pixel of the table
+    const float *mean, *table;       // mean NULL: no norm. table: scale and offset per pixel of a coarser frame
+    int64_t table_width;             // (.., table_width, 2, channels); 0: one scale and offset for all pixels
+    int32_t shift;                   // log2 of the pixels per pixel of the table, along a side
     float* out;                      // (height, width + 2, channels)
 } gsf__conv_fill;
 
@@ -5452,11 +5457,11 @@ static void gsf__conv_fill_frame(gsf_context* ctx, gsf__conv_fill* job) {
                       job);
 }
 
-static int64_t gsf__conv_frame_size(int64_t height, int64_t width, int64_t channels) { // floats, with the border
+static int64_t gsf__conv_frame_size(int64_t height, int64_t width, int64_t channels) { // floats, including the border
     return height * (width + 2) * channels;
 }
 
-// The part of a job that frames of one size share: input with a border at either side, `in_height` x `in_width`.
+// Initialises what is common to frames of one size: bordered input frames of `in_height` x `in_width`.
 static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* layer, int64_t in_height, int64_t in_width,
                                      int halve, const float* packed) {
     gsf__conv_job job;
@@ -5535,7 +5540,7 @@ GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* wor
         fill.out = memory + (size_t)((t + 3) % 3) * frame;
         gsf__conv_fill_frame(ctx, &fill);
         if (t < 0) continue;
-        for (int64_t i = 0; i < layer.kt; i++) { // frames before the first one repeat it
+        for (int64_t i = 0; i < layer.kt; i++) { // the first frame is repeated before itself
             const int64_t source = t - layer.kt + 1 + i;
             job.in[i] = memory + (size_t)(source < 0 && !desc->before ? 0 : (source + 3) % 3) * frame;
         }
@@ -5548,15 +5553,15 @@ GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* wor
 
 // ---- >>nn positions -------------------------------------------------------------
 
-// torch.linspace in float32: from both ends towards the middle, multiplied and added with one rounding.
+// torch.linspace in float32: computed from both ends towards the middle, with fused multiply-adds.
 static float gsf__nn_linspace(float start, float end, int32_t count, int32_t i) {
     if (count == 1) return start;
     const float step = (end - start) / (float)(count - 1);
     return i < count / 2 ? fmaf(step, (float)i, start) : fmaf(-step, (float)(count - 1 - i), end);
 }
 
-// Where a grid of height x width lies in the base grid when it is resized to fit: first[0], last[0] rows, [1] columns,
-// last exclusive. Rounding is Python's, half to even, which rint is in the default rounding mode.
+// The position of a height x width grid in the base grid after resizing it to fit: first[0], last[0] are rows, [1]
+// columns; last is exclusive. Rounds half to even as Python does; so does rint in the default rounding mode.
 static void gsf__nn_fit_grid(const gsf__nn_rope_desc* desc, double first[2], double last[2]) {
     const double th = desc->base_height, tw = desc->base_width, h = desc->height, w = desc->width;
     const int tall = h / w > th / tw;
@@ -5567,7 +5572,7 @@ static void gsf__nn_fit_grid(const gsf__nn_rope_desc* desc, double first[2], dou
     last[1] = first[1] + columns;
 }
 
-// cosine, sine (count, dim) of one axis at positions linspace(start, end).
+// cosine, sine: (count, dim), of one axis at the positions linspace(start, end, count).
 static void gsf__nn_rope_axis(float start, float end, int32_t count, int32_t dim, double theta, float* cosine,
                               float* sine) {
     for (int32_t k = 0; k < dim; k += 2) {
@@ -5617,7 +5622,7 @@ static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* d
     const int32_t counts[3] = {desc->frames, desc->height, desc->width};
     const double theta = desc->theta != 0.0 ? desc->theta : 10000.0;
     double first[3] = {0.0, 0.0, 0.0}, last[3] = {(double)desc->frames, 0.0, 0.0};
-    float* table[3]; // of each axis the cosines, then the sines
+    float* table[3]; // per axis the cosines, then the sines
     gsf__nn_fit_grid(desc, first + 1, last + 1);
     const size_t width = (size_t)desc->head_dim;
     float* block = (float*)gsf_alloc(ctx, (size_t)desc->frames + (size_t)desc->height + (size_t)desc->width,
@@ -5644,7 +5649,7 @@ static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* d
     return GSF_OK;
 }
 
-// (count, dim) of one axis: [sin | cos]. The positions are float32, as numpy's there.
+// out: (count, dim) of one axis, [sin | cos]. Positions are float32, as in diffusers' numpy code.
 static void gsf__nn_sincos_axis(int32_t count, int32_t dim, double scale, double* out) {
     const int32_t half = dim / 2;
     for (int32_t k = 0; k < half; k++) {
@@ -5657,7 +5662,7 @@ static void gsf__nn_sincos_axis(int32_t count, int32_t dim, double scale, double
     }
 }
 
-// To `wide` or `narrow`, whichever is not NULL.
+// Writes to `wide` or `narrow`, whichever is not NULL.
 static gsf_result gsf__nn_sincos(gsf_context* ctx, const gsf__nn_axes* axes, double spatial_scale, double temporal_scale,
                                  double* wide, float* narrow) {
     GSF__TRY(gsf__nn_check_grid(ctx, "sincos", axes->frames, axes->height, axes->width, axes->dim));
