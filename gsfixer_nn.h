@@ -147,9 +147,8 @@ typedef struct gsf_nn_vggt { // an open aggregator; its weights stay in the mapp
 
 // Opens a folder with model*.safetensors, or one .safetensors file. It uses the tensors aggregator.* under their
 // released names and ignores all others. If the folder has a config.json, these keys of VGGT are read from it:
-// embed_dim, depth, num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq. Anything it
-// does not specify is inferred from tensor shapes, except num_heads (width / 64 if q and k have no norms) and rope_freq
-// (100).
+// embed_dim, depth, num_heads, patch_size, img_size, mlp_ratio, num_register_tokens, qk_norm and rope_freq. The rest
+// is inferred from tensor shapes, except num_heads (width / 64 if q and k have no norms) and rope_freq (100).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_vggt(gsf_context* ctx, const char* path, gsf_nn_vggt* out);
 GSF_API void gsf_nn_destroy_vggt(gsf_context* ctx, gsf_nn_vggt* vggt);
 
@@ -327,7 +326,7 @@ typedef struct gsf_nn_vae_desc {
     int32_t tiled;             // overlapping, linearly blended tiles: less memory, other values (statistics per tile)
     int32_t tile_height, tile_width;   // pixels, 0: half of sample_height, sample_width
     double overlap_height, overlap_width; // parts of a tile, 0: 1/6 and 1/5. Tile times overlap must be whole latents.
-    double max_bytes;          // needing more fails with GSF_ERROR_OUT_OF_MEMORY before it starts; 0: no limit
+    double max_bytes;          // runs that need more fail with GSF_ERROR_OUT_OF_MEMORY before starting; 0: no limit
 } gsf_nn_vae_desc;
 
 typedef enum gsf_nn_vae_way { GSF_NN_VAE_ENCODE = 0, GSF_NN_VAE_DECODE } gsf_nn_vae_way;
@@ -383,8 +382,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_load_transformer(gsf_context* ctx, const
 GSF_API void gsf_nn_destroy_transformer(gsf_context* ctx, gsf_nn_transformer* transformer);
 
 // Switches the blocks' linear layers to 8-bit integers (gsf__nn_run_linear_int8). Allocates about one byte per weight
-// (7.1 GB at the size of the GSFixer release), returned in *bytes (may be NULL); the mapped originals are no longer
-// accessed.
+// (7.1 GB at the GSFixer release's size), returned in *bytes (may be NULL); the mapped originals are not used any more.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_quantize_transformer(gsf_context* ctx, gsf_nn_transformer* transformer,
                                                              size_t* bytes);
 
@@ -423,8 +421,7 @@ typedef struct gsf_nn_transformer_desc {
 // Predicted velocity: out (batch, frames, out_channels, height, width). A NaN or infinity is reported with the block
 // where it first appears (GSF_ERROR_NUMERIC). If the position table is learned, a height or width other than the
 // configured one gives GSF_ERROR_UNSUPPORTED. For another number of frames (or text tokens) sine-cosine positions
-// replace the table, as in diffusers; the model was not trained with them. gsf_nn_sample_desc.any_frames opts in to
-// this.
+// replace the table, as in diffusers; the model was not trained with them (see gsf_nn_sample_desc.any_frames).
 GSF_API GSF_NODISCARD gsf_result gsf_nn_run_transformer(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                         const gsf_nn_transformer_desc* input, float* out);
 
@@ -516,7 +513,7 @@ typedef struct gsf_nn_sample_desc {
     int32_t no_reference_cache;     // project the references' keys and values again in every step, to save memory
     uint64_t seed;
     const float* noise;             // (latent frames, latent channels, height/8, width/8); NULL: drawn from the seed
-    double max_bytes;               // needing more fails with GSF_ERROR_OUT_OF_MEMORY before it starts; 0: no limit
+    double max_bytes;               // runs that need more fail with GSF_ERROR_OUT_OF_MEMORY before starting; 0: no limit
     const char* checkpoint;         // file written after every step, and resumed from if the model, precision, settings
                                     // and inputs match; NULL: none
     const gsf__nn_tap* _tap;        // private
@@ -540,8 +537,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_sample(gsf_context* ctx, const gsf_nn_tr
 typedef struct gsf_nn_sample_info { double bytes,
                                    flops; } gsf_nn_sample_info; // peak anonymous memory; floating-point operations
 
-// The cost of gsf_nn_sample, without running it; fails with the errors that gsf_nn_sample would report before it
-// starts.
+// The cost of gsf_nn_sample, without running it; fails if gsf_nn_sample would refuse to start.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_query_sample(gsf_context* ctx, const gsf_nn_transformer* transformer,
                                                      const gsf_nn_vae* vae, const gsf_nn_sample_desc* desc,
                                                      gsf_nn_sample_info* out);
@@ -587,8 +583,8 @@ typedef struct gsf_nn_dit_desc {
                prompt_embeds, which apply to clip 0 only. A folder that will be needed but is missing is reported when
                the restorer is made; if the file has features but lacks those of some clip, the error comes at that clip
                and names them. */
-// Progress: "clip" (0 of 1, at its start), then after each unit of work "caption", "text", "dinov2", "vggt", "vae
-// encode", "transformer", "restore" (steps), "vae decode".
+// Progress: "clip" (0 of 1, at its start), then after each unit of work "caption", "text", "dinov2", "vggt",
+// "vae encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
@@ -644,8 +640,7 @@ typedef struct gsf__nn_linear_desc {
                                // products in pairs (relative L2 error 1.7e-3). Otherwise no effect
 } gsf__nn_linear_desc;
 
-// A linear layer with its activation and residual. `workspace` may be NULL: scratch is then allocated for this call
-// only.
+// A linear layer with its activation and residual. `workspace` NULL: scratch is allocated for this call only.
 static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* workspace,
                                      const gsf__nn_linear_desc* desc);
 
@@ -721,7 +716,8 @@ typedef struct gsf__nn_conv_desc {
                                // kh = kw is 1 or 3; f32, bf16 or f16
     const gsf_nn_tensor* bias; // (out) or NULL
     const float* before;       // (2, height, width, in): the frames before x; NULL: x's first frame, twice. kt = 3 only
-    int32_t halve;             // stride 2, zeros below and to the right; 0: stride 1, zeros on all four sides
+    int32_t halve;             // stride 2, padded by one row of zeros below and one column to the right;
+                               // 0: stride 1, padded on all four sides
     int32_t accumulate;        // y += instead of y = ...
     float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
 } gsf__nn_conv_desc;
@@ -745,19 +741,19 @@ typedef struct gsf__nn_rope_desc {
 // axis with d values is rotated by position * theta^(-2i/d). Positions of frames are 0, 1, ...; those of rows are
 // linspace(top, bottom*(h-1)/h, h), where top and bottom are those of the grid after it is resized to fit into the base
 // grid with its aspect ratio kept; columns alike. Angles are float32 products in diffusers' order, to match its tables
-// rather than the exact values. (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py
-// get_resize_crop_region_for_grid)
+// rather than the exact values.
+// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
 static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* desc, float* cos, float* sin);
 
 // Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is split into time dim/4 | columns
-// 3*dim/8 | rows 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. A scale of 0 means
-// 1. (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
+// 3*dim/8 | rows 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. Scale 0 means 1.
+// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
 static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width,
                                       int32_t dim, double spatial_scale, double temporal_scale, float* out);
 
 // Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)); the last
-// value of an odd dim is 0. Angles are float32, as in diffusers. (diffusers 0.32.1 get_timestep_embedding,
-// flip_sin_to_cos)
+// value of an odd dim is 0. Angles are float32, as in diffusers.
+// (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
 static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out);
 
 // ---- >>nn numbers ---------------------------------------------------------------
@@ -1132,8 +1128,7 @@ static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_nn_tensor* te
     return GSF_OK;
 }
 
-// Adds the tensors of a parsed header, which begins with '{' and so is an object. Their names are copied to
-// file->names.
+// Adds the tensors of a parsed header, which begins with '{' and so is an object. Copies their names to file->names.
 static gsf_result gsf__nn_read_entries(gsf__nn_header* h, gsf_nn_weights* weights, gsf__nn_file* file) {
     gsf__nn_files* files = (gsf__nn_files*)weights->files;
     const gsf_json_value* root = &h->json.values[0];
@@ -1620,8 +1615,7 @@ GSF__SHARED void gsf__nn_ignore(gsf__nn_loader* loader, const char* prefix) {
         if (strncmp(loader->weights->tensors[i].name, prefix, strlen(prefix)) == 0) loader->taken[i] = 1;
 }
 
-// Frees the loader. If `result` is GSF_OK but tensors are left over, fails naming the first few; otherwise returns
-// `result`.
+// Frees the loader. If `result` is GSF_OK but tensors are left over, fails and names the first few; else returns it.
 GSF__SHARED gsf_result gsf__nn_end_loading(gsf__nn_loader* loader, gsf_result result) {
     enum { NAMED = 3 };
     gsf__nn_shown names[NAMED];
@@ -2091,8 +2085,8 @@ GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
     return gsf__v_nmadd(z, power * (t * tail), gsf__v_max(gsf__v_set(0.0f), x));
 }
 
-// As gsf__nn_activation_ref; -0, the limit, at -inf; a NaN stays a NaN. In loops pass a compile-time constant
-// `activation`.
+// As gsf__nn_activation_ref, and -0, the limit, at -inf; a NaN stays a NaN. `activation` must be a compile-time
+// constant in loops, for speed.
 GSF__V_INLINE gsf__vf gsf__v_activate(gsf__nn_activation activation, gsf__vf x) {
     const gsf__vf one = gsf__v_set(1.0f);
     if (activation == GSF__NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
@@ -3065,8 +3059,7 @@ GSF__INLINE_AVX2 void gsf__gemv_add(float* sums, __m256 a, __m256 b, __m256 c, _
 }
 
 // Six rows of weights times one or two rows of x, laid out as [k / 8][rows][8], added to sums[6][rows] (with one row of
-// x, also writes two floats past the end). `count` is a multiple of 32; `line` is the number of weights in a cache
-// line.
+// x, also writes two floats past the end). `count` is a multiple of 32; a cache line holds `line` weights.
 GSF__INLINE_AVX2 void gsf__gemv_six(const char* const w[6], gsf_nn_dtype dtype, size_t ahead, const float* x, int64_t rows,
                                     int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
@@ -3229,8 +3222,7 @@ GSF__INLINE_AVX512 __m512 gsf__load16(const char* p, gsf_nn_dtype dtype) { // si
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(bits), 16));
 }
 
-// One row of weights times one row of x: sequential reads, which the hardware prefetches best. `count` is a multiple of
-// 32.
+// One row of weights times one row of x: sequential reads suit the hardware prefetcher. `count` is a multiple of 32.
 GSF__INLINE_AVX512 float gsf__gemv_one16(const char* w, gsf_nn_dtype dtype, const float* x, int64_t count) {
     const int64_t vector = dtype == GSF_NN_F32 ? 64 : 32; // bytes
     __m512 s0 = _mm512_setzero_ps(), s1 = s0, s2 = s0, s3 = s0;
@@ -3248,8 +3240,7 @@ GSF__INLINE_AVX512 float gsf__gemv_one16(const char* w, gsf_nn_dtype dtype, cons
 }
 
 // Four rows of weights times two rows of x, laid out as [k / 16][2][16], added to sums[4][2]. `count` is a multiple of
-// 32. The more arithmetic per load, the less far the hardware runs ahead, so data `ahead` bytes further on is
-// prefetched.
+// 32. The more arithmetic per load, the less far the hardware runs ahead, so this prefetches `ahead` bytes ahead.
 GSF__INLINE_AVX512 void gsf__gemv_two16(const char* const w[4], gsf_nn_dtype dtype, size_t ahead, const float* x,
                                         int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3];
@@ -3683,8 +3674,7 @@ enum {
 #endif
 
 typedef struct gsf__int8_kernels { // one set per instruction set
-    // Rotates blocks of `block` of the `count` values in place; returns their largest magnitude, inf if one is NaN or
-    // inf
+    // Rotates blocks of `block` of the `count` values in place; returns their largest magnitude (inf if NaN or inf)
     float (*rotate)(float* x, int64_t count, int64_t block);
     // Writes round(x * factor) as int16 in fours that are `pitch` apart; count is a multiple of 4
     void (*quantize)(const float* x, int64_t count, float factor, void* out, int64_t pitch);
@@ -3730,7 +3720,7 @@ static void gsf__int8_butterflies(float* x, int64_t block, int64_t half) { // on
         }
 }
 
-static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // bits order magnitudes; NaN, inf last
+static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // their bits order magnitudes; NaN is last
     for (int64_t i = 0; i < count; i++) {
         uint32_t bits;
         memcpy(&bits, x + i, sizeof bits);
@@ -4446,8 +4436,7 @@ typedef struct gsf__attention_job {
 
 // Softmax is invariant to an offset shared by all keys, as it adds the same to each logit of a query, but a large
 // offset costs precision. So a typical key is subtracted from all keys: per dimension the median of the means of three
-// groups of five keys, which a single outlier cannot dominate, or 0 if it is not finite. `column` is the head's first
-// column.
+// groups of five keys, which a single outlier cannot dominate, or 0 if it is not finite. `column`: the head's first.
 static void gsf__attention_center(const gsf__nn_attention_desc* d, int64_t column, float* center) {
     const float* keys[15];
     for (int64_t n = 0; n < 15; n++) keys[n] = d->k + n * d->keys / 15 * d->ldk + column;
@@ -4538,8 +4527,7 @@ typedef struct gsf__attention_scratch { // per worker
 
 typedef struct gsf__attention_parts { // what differs between instruction sets; in bf16 each float slot holds a pair
     int64_t unit; // values per slot along head_dim: 1, or 2 in bf16
-    // Transposes slots of eight rows, `rows` of which exist, minus `center` (or NULL), times `factor`: to[slot to_ld +
-    // row]
+    // to[slot to_ld + row] = slots of eight rows, `rows` of which exist, minus `center` (or NULL), times `factor`
     void (*pack_rows)(const float* from, int64_t rows, int64_t ld, const float* center, float factor, int64_t dim, float* to,
                       int64_t to_ld);
     void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
@@ -4569,8 +4557,7 @@ static gsf__attention_scratch gsf__attention_scratch_of(const gsf__attention_job
     return s;
 }
 
-// A head's rows are a few cache lines each and far apart, which defeats the hardware prefetcher: prefetches one such
-// row.
+// Prefetches a row of a head: rows are a few cache lines each and far apart, which defeats the hardware prefetcher.
 static void gsf__attention_fetch(const float* from, int64_t row, int64_t rows, int64_t ld, int64_t dim) {
     for (int64_t i = 0; row < rows && i < dim; i += 16) gsf__nn_prefetch(from + row * ld + i);
 }
@@ -5038,8 +5025,8 @@ static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* wor
 
 // ---- >>nn convolution -----------------------------------------------------------
 
-// In channels-last layout the 3C values left of, at and right of a pixel are contiguous, so a convolution of 3 x 3 (x
-// 3) is 3 (9) matrix products: for each kernel row (kt, ky), a row of output pixels is A (pixels, 3C), whose rows
+// In channels-last layout the 3C values left of, at and right of a pixel are contiguous, so a 3 x 3 (x 3) convolution
+// is 3 (9) matrix products: for each kernel row (kt, ky), a row of output pixels is A (pixels, 3C), whose rows
 // overlap by 2C, times B (3C, outputs). For this, frames get a column of zeros on either side; rows above and below the
 // frame are skipped. Work is divided into segments of 8 x 30 output pixels. A segment computes 16 outputs at a time.
 // Their weights are packed as (kernel row, 3C, 16) and divided into panels of up to 256 values x 16 (16 KiB, L1 cache).
@@ -5061,8 +5048,7 @@ typedef struct gsf__conv_kernels {
     // The same for two panels, `b_next` floats apart, with sums `c_next` apart; may be NULL.
     void (*multiply_two)(const float* a, int64_t lda, int64_t count, const float* b, int64_t b_next, int64_t k, float* c,
                          int64_t c_next, const float* ahead);
-    // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += the values and their
-    // squares.
+    // out = c, or out += c, for `count` pixels, ldo apart, and n <= 16 outputs; sums (2, 16) += values and squares.
     void (*store)(const float* c, int64_t count, int64_t n, int accumulate, float* out, int64_t ldo, double* sums);
     // y = silu((x - mean) * scale + offset)
     void (*norm_silu)(const float* x, int64_t count, const float* mean, const float* scale, const float* offset, float* y);
