@@ -912,7 +912,7 @@ static gsf_result gsf__nn_list_folder(gsf_context* ctx, gsf__nn_listing* listing
     for (const struct dirent* entry; result == GSF_OK && (entry = readdir(folder)) != NULL;) {
         if (entry->d_name[0] == '.' || !gsf__nn_ends_in(entry->d_name, listing->suffix)) continue;
         if (listing->found.size) {
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: holds %s and %s: name one by its prefix",
+            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: contains both %s and %s: pass a prefix",
                               listing->folder, listing->found.data, entry->d_name);
         } else {
             gsf_append_bytes(ctx, &listing->found, entry->d_name, strlen(entry->d_name));
@@ -1023,7 +1023,7 @@ static gsf_result gsf__nn_entry_fail(const gsf__nn_header* h, const gsf_json_val
 static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
     const gsf_json_value* value = gsf_find_json_member(&h->json, entry, "dtype");
     if (!value || value->type != GSF_JSON_STRING)
-        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"dtype\" is not given as text");
+        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"dtype\" is not given as a string");
     for (int i = GSF_NN_F32; i <= GSF_NN_I64; i++) {
         out->dtype = (gsf_nn_dtype)i;
         if (strcmp(value->string, gsf__nn_dtype_name(out->dtype)) == 0) return GSF_OK;
@@ -1044,7 +1044,7 @@ static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_val
     uint64_t count = 1, size;
     for (uint32_t i = value->child; i; i = h->json.values[i].next) {
         if (!gsf__nn_read_size(h->text, &h->json.values[i], &size))
-            return gsf__nn_entry_fail(h, &h->json.values[i], entry, GSF_ERROR_FORMAT, "a dimension is no whole number");
+            return gsf__nn_entry_fail(h, &h->json.values[i], entry, GSF_ERROR_FORMAT, "a dimension is not a non-negative integer");
         if (size != 0 && count > (uint64_t)INT64_MAX / size)
             return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, "the shape overflows");
         count *= size;
@@ -1061,7 +1061,7 @@ static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_val
         !gsf__nn_read_size(h->text, gsf_find_json_element(&h->json, value, 0), &begin) ||
         !gsf__nn_read_size(h->text, gsf_find_json_element(&h->json, value, 1), &end))
         return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT,
-                                  "\"data_offsets\" are not two whole numbers");
+                                  "\"data_offsets\" is not a list of two non-negative integers");
     char text[160];
     if (begin > end || end > h->data_size) {
         snprintf(text, sizeof text, "bytes %llu to %llu do not lie in the %llu bytes of data", (unsigned long long)begin,
@@ -1080,9 +1080,9 @@ static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_val
 
 static gsf_result gsf__nn_read_entry(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
     memset(out, 0, sizeof *out);
-    if (entry->type != GSF_JSON_OBJECT) return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "no object");
+    if (entry->type != GSF_JSON_OBJECT) return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "not an object");
     if (strlen(entry->key) != entry->key_size)
-        return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "a zero byte in its name");
+        return gsf__nn_entry_fail(h, entry, entry, GSF_ERROR_FORMAT, "its name contains a zero byte");
     GSF__TRY(gsf__nn_read_dtype(h, entry, out));
     GSF__TRY(gsf__nn_read_shape(h, entry, out));
     return gsf__nn_read_place(h, entry, out);
@@ -1092,7 +1092,7 @@ static gsf_result gsf__nn_check_metadata(const gsf__nn_header* h, const gsf_json
     int ok = metadata->type == GSF_JSON_OBJECT;
     for (uint32_t i = metadata->child; ok && i; i = h->json.values[i].next)
         ok = h->json.values[i].type == GSF_JSON_STRING;
-    return ok ? GSF_OK : gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%u: __metadata__ does not map names to texts", h->name,
+    return ok ? GSF_OK : gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%u: __metadata__ does not map strings to strings", h->name,
                                   (unsigned)metadata->offset);
 }
 
@@ -1119,7 +1119,7 @@ static gsf_result gsf__nn_check_cover(const gsf__nn_header* h, gsf_nn_tensor* te
         if (begin != next)
             return gsf_fail(h->ctx, GSF_ERROR_FORMAT, "%s:%zu: tensor %s %s", h->name, (size_t)(begin - h->text),
                             gsf__nn_show(tensors[i].name).text,
-                            begin < next ? "overlaps the one before it" : "follows bytes of no tensor");
+                            begin < next ? "overlaps the one before it" : "follows bytes that belong to no tensor");
         next = begin + gsf__nn_bytes(&tensors[i]);
     }
     if (next != end)
@@ -1162,7 +1162,7 @@ static gsf_result gsf__nn_read_header(gsf_context* ctx, const char* name, gsf_nn
     h.name = gsf__nn_path_end(name);
     h.text = (const char*)file->data;
     if (file->size < GSF__NN_FILE_HEAD)
-        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: %zu bytes are no safetensors file", h.name, file->size);
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: %zu bytes are not a safetensors file", h.name, file->size);
     const uint64_t size = gsf__load_le(file->data, GSF__NN_FILE_HEAD);
     if (size > GSF__NN_HEADER_MAX || size > file->size - GSF__NN_FILE_HEAD)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: a header of %llu bytes in a file of %zu (at most %d)", h.name,
@@ -1238,7 +1238,7 @@ static gsf_result gsf__nn_open_shards(gsf__nn_index* index, gsf_nn_weights* weig
     for (uint32_t i = index->map->child; i; i = index->json.values[i].next) {
         const gsf_json_value* value = &index->json.values[i];
         if (!gsf__nn_is_plain_name(value))
-            return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s: no plain file name", index->name,
+            return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s: not a plain file name", index->name,
                             (unsigned)value->offset, gsf__nn_show(value->key).text);
         size_t k = files->count; // search from the latest, which usually is the one
         while (k > 0 && strcmp(index->shards[k - 1], value->string) != 0) k--;
@@ -1259,7 +1259,7 @@ static gsf_result gsf__nn_sort_names(gsf_context* ctx, gsf_nn_weights* weights) 
         qsort(weights->tensors, weights->tensor_count, sizeof *weights->tensors, gsf__nn_compare_names);
     for (size_t i = 1; i < weights->tensor_count; i++)
         if (strcmp(weights->tensors[i - 1].name, weights->tensors[i].name) == 0)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s stands in two shards", weights->name,
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is in two shards", weights->name,
                             gsf__nn_show(weights->tensors[i].name).text);
     return GSF_OK;
 }
@@ -1387,7 +1387,7 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
         }
         gsf_destroy_buffer(ctx, &listing.found);
     }
-    if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: no .safetensors file in it", folder);
+    if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: contains no .safetensors file", folder);
     return result;
 }
 
@@ -1468,7 +1468,7 @@ static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_nn_tensor* ten
     int64_t count = 1;
     for (const char* p = name; left;) {
         const size_t step = gsf__utf8_size(p, left);
-        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name is no UTF-8", gsf__nn_show(name).text);
+        if (!step) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name is not UTF-8", gsf__nn_show(name).text);
         p += step;
         left -= step;
     }
@@ -1481,7 +1481,7 @@ static gsf_result gsf__nn_check_saved(gsf_context* ctx, const gsf_nn_tensor* ten
     ok = ok && count == tensor->count && (count == 0 || tensor->data) &&
          (uint64_t)count <= SIZE_MAX / 2 / gsf_nn_get_dtype_size(tensor->dtype);
     if (ok) return GSF_OK;
-    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name, dtype, shape, count and data do not fit",
+    return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "tensor %s: name, dtype, shape, count and data are inconsistent",
                     gsf__nn_show(name).text);
 }
 
@@ -1642,7 +1642,7 @@ typedef struct gsf__nn_config {
 static gsf_result gsf__nn_check_config(gsf__nn_config* config) {
     config->root = &config->json.values[0];
     if (config->root->type == GSF_JSON_OBJECT) return GSF_OK;
-    const gsf_result result = gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s:0: no object", config->json.name);
+    const gsf_result result = gsf_fail(config->ctx, GSF_ERROR_FORMAT, "%s:0: not an object", config->json.name);
     gsf_destroy_json(config->ctx, &config->json);
     return result;
 }
@@ -3578,7 +3578,7 @@ static gsf_result gsf__check_linear(gsf_context* ctx, const gsf__nn_linear_desc*
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: x, y or weight is missing");
     const char* name = w->name ? w->name : "weight";
     if (w->rank < 2 || w->shape[0] < 1 || w->count / w->shape[0] < 1 || w->count % w->shape[0])
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: %s is no matrix", name);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: %s is not a matrix", name);
     if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "linear: %s is %s", name, gsf__nn_dtype_name(w->dtype));
     *out = w->shape[0];
@@ -4148,7 +4148,7 @@ static gsf_result gsf__check_quantize(gsf_context* ctx, const gsf_nn_tensor* w) 
     if (!w || !w->data) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: the weight is missing");
     const char* name = w->name ? w->name : "weight";
     if (w->rank < 2 || w->shape[0] < 1 || w->count / w->shape[0] < 1 || w->count % w->shape[0])
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: %s is no matrix", name);
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "int8: %s is not a matrix", name);
     if (w->dtype != GSF_NN_F32 && w->dtype != GSF_NN_BF16 && w->dtype != GSF_NN_F16)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "int8: %s is %s", name, gsf__nn_dtype_name(w->dtype));
     if (w->count / w->shape[0] > GSF__INT8_LONGEST)
@@ -5481,7 +5481,7 @@ static gsf_result gsf__check_conv(gsf_context* ctx, const gsf__nn_conv_desc* des
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s is %s", w->name, gsf__nn_dtype_name(w->dtype));
     const int64_t kernel = w->rank == 4 || w->rank == 5 ? w->shape[w->rank - 1] : 0, kt = w->rank == 5 ? w->shape[2] : 1;
     if ((kernel != 1 && kernel != 3) || w->shape[w->rank - 2] != kernel || (kt != 1 && kt != 3) || w->count < 1)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s is no kernel of 1 or 3 x 1 or 3 x 3", w->name);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s is not a kernel of 1 or 3 x 1 or 3 x 3", w->name);
     if (desc->halve && (kernel != 3 || kt != 1 || desc->height < 2 || desc->width < 2))
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "convolution: %s cannot halve %lld x %lld", w->name,
                         (long long)desc->width, (long long)desc->height);
@@ -5580,7 +5580,7 @@ static gsf_result gsf__nn_check_grid(gsf_context* ctx, const char* what, int32_t
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: a grid of %d frames, %d x %d tokens", what, (int)frames,
                         (int)height, (int)width);
     if (dim < 16 || dim % 16 != 0)
-        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: dimension %d is no multiple of 16", what, (int)dim);
+        return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: dimension %d is not a multiple of 16", what, (int)dim);
     return GSF_OK;
 }
 

@@ -29,7 +29,7 @@ static void test_bad_tokenizers(void) {
     static const struct { const char *vocabulary, *merges, *config; gsf_result wanted; const char* named; } cases[] = {
         {NULL, merges, small_config, GSF_ERROR_NOT_FOUND, "vocab.json"},
         {small_vocabulary, NULL, small_config, GSF_ERROR_NOT_FOUND, "merges.txt"},
-        {"[1]", merges, small_config, GSF_ERROR_FORMAT, "vocab.json:0: no object"},
+        {"[1]", merges, small_config, GSF_ERROR_FORMAT, "vocab.json:0: not an object"},
         {"{}", merges, small_config, GSF_ERROR_FORMAT, "0 tokens"},
         {"{\"a\": 1, \"b\": 2, \"ab\": 4294967296}", merges, small_config, GSF_ERROR_FORMAT, "the id of ab"},
         {"{\"a\": 1, \"b\": 1e300, \"ab\": 4}", merges, small_config, GSF_ERROR_FORMAT, "vocab.json:14: the id of b"},
@@ -46,7 +46,7 @@ static void test_bad_tokenizers(void) {
         {small_vocabulary, "#\r\na b\r\nab z\r\n", small_config, GSF_ERROR_FORMAT, "merges.txt:3: z is not in vocab.json"},
         {small_vocabulary, "#\nb a\n", small_config, GSF_ERROR_FORMAT, "merges.txt:2: ba is not in vocab.json"},
         {small_vocabulary, "#\n\xff b\n", small_config, GSF_ERROR_FORMAT, "merges.txt:2: ? is not in vocab.json"},
-        {small_vocabulary, merges, "[]", GSF_ERROR_FORMAT, "tokenizer_config.json:0: no object"},
+        {small_vocabulary, merges, "[]", GSF_ERROR_FORMAT, "tokenizer_config.json:0: not an object"},
         {small_vocabulary, merges, "{\"errors\": \"strict\"}", GSF_ERROR_UNSUPPORTED, "errors"},
         {small_vocabulary, merges, "{\"add_bos_token\": 1}", GSF_ERROR_FORMAT, "add_bos_token is not true or false"},
         {small_vocabulary, merges, "{\"add_bos_token\": true, \"bos_token\": null}", GSF_ERROR_FORMAT, "no bos_token"},

@@ -221,7 +221,7 @@ static void test_configs(gsf_context* ctx) {
          GSF_ERROR_FORMAT, "beta_end is not a number from 0.5"},
         {"{\"prediction_type\":\"v_prediction\",\"clip_sample\":false,\"num_train_timesteps\":1}", GSF_ERROR_FORMAT,
          "num_train_timesteps"},
-        {"[]", GSF_ERROR_FORMAT, "no object"},
+        {"[]", GSF_ERROR_FORMAT, "not an object"},
         {"{", GSF_ERROR_FORMAT, "sched.json:1"},
     };
     for (size_t i = 0; i < COUNT_OF(cases); i++) {
