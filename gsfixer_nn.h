@@ -2026,7 +2026,8 @@ static float gsf__nn_activation_ref(gsf__nn_activation activation, float x) {
 // Results of 32 MiB and more bypass the caches (`stream`): lines that are fully overwritten need not be read first.
 enum { GSF__NN_STREAM = 1 << 23 }; // values
 
-static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_t row) { // pieces are multiples of `row`
+// pieces are multiples of `row`
+static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_t row) {
     return x != y && count >= GSF__NN_STREAM && row % 16 == 0 && (uintptr_t)y % 64 == 0;
 }
 
@@ -5980,7 +5981,8 @@ static gsf_result gsf__nn_attend(gsf__nn_run* run, const gsf__nn_attention_desc*
 
 // ---- layers: patches
 
-typedef struct gsf__nn_patch_job { // images (channels, height, width) and rows (channels, patch, patch) of their patches
+// images (channels, height, width) and rows (channels, patch, patch) of their patches
+typedef struct gsf__nn_patch_job {
     const float* from;
     float* to;
     int64_t channels, height, width, patch;

@@ -1,5 +1,5 @@
-// The captioner and its tokenizer on the small golden model: files and texts that are wrong or odd, images of other kinds,
-// workers, memory, cancelling. Their values are golden_encoders' matter.
+// The captioner and its tokenizer on the small golden model: damaged and unusual files and texts, image layouts,
+// workers, memory, cancellation. golden_encoders checks the values.
 //     test_nn_caption encode FOLDER FILE    prints the tokens of texts for compare_bpe.py
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
@@ -89,8 +89,9 @@ static int same_ids(gsf_context* ctx, const gsf_nn_bpe* bpe, const char* text, c
         CHECK(same_ids(&ctx, &bpe, text, expected, sizeof expected / sizeof *expected));           \
     } while (0)
 
-// Ranks that a trained file would not have: a merge's result is in one of a lower rank. As GPT2Tokenizer, all places of a
-// rank come before whatever they make possible. Expected ids are GPT2Tokenizer's.
+// Ranks that training would never produce: a merge whose result is part of a merge of lower rank. As in GPT2Tokenizer,
+// all pairs of one rank are merged before any pair that these merges make possible. Expected ids are from
+// GPT2Tokenizer.
 static void test_small_tokenizer(void) {
     blip2_folder f;
     gsf_context ctx;
@@ -107,7 +108,7 @@ static void test_small_tokenizer(void) {
     CHECK_IDS("z<unk>a", 9, 9, 0);
     CHECK(same_ids(&ctx, &bpe, "", NULL, 0));
     gsf_nn_destroy_bpe(&ctx, &bpe);
-    small_folder(&f, &ctx, small_vocabulary, "\na b\n\xc4\xa0 a\nb c", // the last line has no end, and is not read
+    small_folder(&f, &ctx, small_vocabulary, "\na b\n\xc4\xa0 a\nb c", // the last line lacks a line feed and is ignored
                  "{\"unk_token\": null, \"bos_token\": {\"content\": \"new\", \"lstrip\": true, \"rstrip\": true}, "
                  "\"eos_token\": \"<end>\", \"add_bos_token\": true, \"add_prefix_space\": true, "
                  "\"clean_up_tokenization_spaces\": true}");
@@ -161,7 +162,7 @@ static void test_odd_texts(void) {
     check_round_trip(&ctx, &bpe, NULL, 0);
     const size_t most = 1 << 20;
     char* text = (char*)malloc(most);
-    for (size_t i = 0; i < sizeof parts / sizeof *parts; i++) { // seconds, were a word's merging quadratic
+    for (size_t i = 0; i < sizeof parts / sizeof *parts; i++) { // would take seconds if merging a word were quadratic
         const size_t step = strlen(parts[i]), size = (i < 3 ? most : most / 8) / step * step;
         for (size_t k = 0; k < size; k += step) memcpy(text + k, parts[i], step);
         check_round_trip(&ctx, &bpe, text, size);
@@ -179,8 +180,8 @@ static void test_odd_texts(void) {
     gsf_nn_destroy_bpe(&ctx, &bpe);
 }
 
-// Bytes that are no UTF-8, as Python's bytes.decode(errors="replace") has them ('?'), with a vocabulary where a byte's id
-// is the byte.
+// Bytes that are not valid UTF-8 decode as in Python's bytes.decode(errors="replace") ('?'), with a vocabulary in which
+// a byte's id is the byte itself.
 static void test_broken_bytes(void) {
     static const struct { const char *bytes, *text; } cases[] = {
         {"\x80", "?"}, {"\xc3", "?"}, {"a\xe3\x81z", "a?z"}, {"\xe3\xc3\xa9", "?\xc3\xa9"}, {"\xf0\x9f\x98", "?"},
@@ -221,7 +222,7 @@ static void test_broken_bytes(void) {
     gsf_nn_destroy_bpe(&ctx, &bpe);
 }
 
-// ---- the captioner: folders -----------------------------------------------------------
+// ---- the captioner: model folders -----------------------------------------------------
 
 static void test_bad_configs(void) {
     static const struct { const char *file, *from, *to; gsf_result wanted; const char* named; } cases[] = {
@@ -272,7 +273,7 @@ static gsf_image make_photo(gsf_context* ctx) {
     return image;
 }
 
-// Weights changed one at a time; kind 0: missing, 1: surplus, 2: with a NaN.
+// Weights changed one at a time; kind 0: missing, 1: unexpected, 2: containing a NaN.
 static void test_bad_weights(void) {
     static const struct { const char* name; int kind; } cases[] = {
         {"query_tokens", 0}, {"qformer.encoder.layer.0.crossattention.output.LayerNorm.bias", 0},
@@ -351,7 +352,7 @@ static void test_arguments(gsf_context* ctx, const gsf_nn_captioner* net, const 
     CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, photo, "a photo of", 12, whole, sizeof whole));
     const size_t size = strlen(whole);
     CHECK(size > 0);
-    for (size_t room = 1; room <= size + 1; room++) { // the longest beginning of whole characters that fits
+    for (size_t room = 1; room <= size + 1; room++) { // expects the longest prefix of whole characters that fits
         CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, photo, "a photo of", 12, caption, room));
         const size_t kept = strlen(caption);
         CHECK(kept < room && memcmp(caption, whole, kept) == 0 && ((unsigned char)whole[kept] & 0xc0) != 0x80);
@@ -364,7 +365,7 @@ static void test_arguments(gsf_context* ctx, const gsf_nn_captioner* net, const 
     CHECK(bytes[0] > 0.0 && flops[0] > 0.0 && flops[1] > flops[0] && bytes[1] >= bytes[0]);
 }
 
-// The same picture as floats, with an alpha channel, upside down in memory.
+// The same image as floats, with an alpha channel, stored bottom-up.
 static void test_image_kinds(gsf_context* ctx, const gsf_nn_captioner* net, const gsf_image* photo) {
     char expected[512], caption[512];
     CHECK_OK(ctx, gsf_nn_caption_image(ctx, net, photo, NULL, 0, expected, sizeof expected));
@@ -393,7 +394,7 @@ static void test_image_kinds(gsf_context* ctx, const gsf_nn_captioner* net, cons
     }
 }
 
-typedef struct seen { uint64_t sum; int stages; } seen; // of all intermediates' bits
+typedef struct seen { uint64_t sum; int stages; } seen; // checksum of the bits of all intermediates
 
 static void see_tap(void* user, const char* name, int32_t index, const float* data, int64_t rows, int64_t columns) {
     seen* s = (seen*)user;
@@ -418,7 +419,7 @@ static void watch_progress(void* user, const char* stage, double done, double to
     if (w->stop_at > 0.0 && done >= w->stop_at) gsf_request_cancel(w->ctx);
 }
 
-// Workers, progress, cancelling at every step, and memory that runs out at every call.
+// Workers, progress, cancellation at every step, and failure of every allocation.
 static void test_runs(const gsf_image* photo) {
     seen sums[2];
     memset(sums, 0, sizeof sums);
@@ -484,7 +485,7 @@ static void test_memory(const gsf_image* photo) {
     }
 }
 
-// ---- for compare_bpe.py: records of a size (32 bits) and as many bytes ---------------------
+// ---- for compare_bpe.py: records of a 32-bit size and that many bytes -----------------------
 
 static int encode_file(const char* from, const char* path) {
     gsf_context ctx;

@@ -1,4 +1,4 @@
-// The encoders of reference photos on the small golden models: bad folders and inputs, workers, groups of images,
+// The encoders of reference photos on the small golden models: invalid folders and inputs, workers, groups of images,
 // memory, cancellation, saving and loading features. golden_encoders checks their values.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
@@ -10,13 +10,13 @@ enum { HEIGHT = 28, WIDTH = 42, IMAGES = 3, ROOM = 1 << 20 };
 
 static float pixels[IMAGES * 3 * HEIGHT * WIDTH];
 
-typedef struct edit { // of a model's files; NULL: as they are
-    const char *drop, *widen, *add, *poison; // tensors: left out, with a dimension more, added, with a NaN
-    const char *from, *to;                   // in config.json
+typedef struct edit { // changes to a model's files; NULL: unchanged
+    const char *drop, *widen, *add, *poison; // tensors to remove, to give an extra dimension, to add, to put a NaN into
+    const char *from, *to;                   // replacement in config.json
     int no_config;
 } edit;
 
-// The golden model of that name in the scratch folder, changed.
+// Copies the golden model of that name to the scratch folder with these changes.
 static const char* write_model(gsf_context* ctx, const char* name, const edit* e) {
     static const float one[1] = {1.0f};
     static const int64_t single[1] = {1};
@@ -79,7 +79,7 @@ static gsf_nn_encoder_desc small_input(void) {
 typedef struct bad_folder {
     edit e;
     gsf_result wanted;
-    const char* named; // in the error
+    const char* named; // expected in the error message
 } bad_folder;
 
 static void test_bad_dinov2(gsf_context* ctx) {
@@ -124,7 +124,7 @@ static void test_bad_vggt(gsf_context* ctx) {
     }
 }
 
-// Without config.json, with tensors of other parts, as one file: the same model.
+// The model is the same without config.json, with additional tensors of other parts, and as one file.
 static void test_vggt_alone(gsf_context* ctx, const float* expected, float* out) {
     const edit e = {0, 0, "depth_head.norm.weight", 0, 0, 0, 1};
     const gsf_nn_encoder_desc in = small_input();
@@ -140,7 +140,7 @@ static void test_vggt_alone(gsf_context* ctx, const float* expected, float* out)
     }
 }
 
-// A NaN among the weights is named.
+// The error names the weight that contains a NaN.
 static void test_poison(gsf_context* ctx, float* out) {
     static const char* const dino[] = {"embeddings.register_tokens", "encoder.layer.1.norm2.weight", "layernorm.bias"};
     static const char* const vggt[] = {"aggregator.patch_embed.pos_embed", "aggregator.patch_embed.blocks.1.ls2.gamma",
@@ -195,7 +195,7 @@ static void test_bad_inputs(gsf_context* ctx, const gsf_nn_dinov2* dino, const g
 
 // ---- workers, groups, memory, cancelling --------------------------------------------
 
-// `expected` is left with VGGT's tokens of the small images.
+// On return, `expected` holds VGGT's tokens of the small images.
 static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, float* expected, float* out) {
     gsf_context three;
     test_context_zero(&three);
@@ -205,7 +205,8 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
     test_context_zero(&one);
     one.threads = 1;
     if (gsf_init_context(&one) != GSF_OK) exit(2);
-    enum { MORE = 5, HIGH = 98, WIDE = 182 }; // rows enough for several blocks of the linear layers, and the small images
+    // enough rows for several blocks of the linear layers; then the small images
+    enum { MORE = 5, HIGH = 98, WIDE = 182 };
     float* more = (float*)malloc(MORE * 3 * HIGH * WIDE * sizeof(float));
     for (size_t i = 0; i < MORE * 3 * HIGH * WIDE; i++) more[i] = pixels[i * 7 % (sizeof pixels / sizeof pixels[0])];
     for (int small = 0; small < 2; small++) {
@@ -228,7 +229,7 @@ static void test_workers(const gsf_nn_dinov2* dino, const gsf_nn_vggt* vggt, flo
     free(more);
 }
 
-// More images than go together: each as it is alone.
+// More images than one group holds: each is encoded as it is alone.
 static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out) {
     enum { MANY = 420 };
     gsf_nn_encoder_desc in = small_input();
@@ -252,7 +253,7 @@ static void test_groups(gsf_context* ctx, const gsf_nn_dinov2* dino, float* out)
     free(whole);
 }
 
-// Each allocation fails once; what is counted is what the cost tells and the kernels' scratch.
+// Each allocation fails once. The bytes counted are those that the cost query reports plus the kernels' scratch memory.
 static void test_memory(float* out) {
     const gsf_nn_encoder_desc in = small_input();
     gsf_context ctx;
@@ -325,7 +326,7 @@ static void test_features(gsf_context* ctx, const gsf_nn_dinov2* dino, const gsf
     uint64_t seed = 3;
     memset(&both, 0, sizeof both);
     memset(&turns, 0, sizeof turns);
-    for (int i = 0; i < 2; i++) { // wide, so that few tokens come of them
+    for (int i = 0; i < 2; i++) { // wide, so that they give few tokens
         CHECK_OK(ctx, gsf_make_image(ctx, GSF_U8, 60, 5, 3, &photos[i]));
         for (int k = 0; k < 3 * 60 * 5; k++) ((uint8_t*)photos[i].data)[k] = (uint8_t)test_random_bits(&seed);
     }
@@ -340,7 +341,7 @@ static void test_features(gsf_context* ctx, const gsf_nn_dinov2* dino, const gsf
     CHECK(memcmp(both.vggt, turns.vggt, tokens * (size_t)both.vggt_channels * sizeof(float)) == 0);
 
     CHECK_RESULT(ctx, gsf_nn_encode_references(ctx, NULL, vggt, photos, 1, &turns), GSF_ERROR_INVALID_ARGUMENT);
-    CHECK(turns.dino && !turns.vggt); // other photos than before
+    CHECK(turns.dino && !turns.vggt); // not the photos of the first call
     photos[1].height = 3;
     CHECK_RESULT(ctx, gsf_nn_encode_references(ctx, dino, NULL, photos, 2, &turns), GSF_ERROR_UNSUPPORTED);
     CHECK_RESULT(ctx, gsf_nn_encode_references(ctx, dino, NULL, photos, 0, &turns), GSF_ERROR_INVALID_ARGUMENT);
@@ -348,7 +349,7 @@ static void test_features(gsf_context* ctx, const gsf_nn_dinov2* dino, const gsf
     photos[0].channels = 2;
     CHECK_RESULT(ctx, gsf_nn_encode_references(ctx, dino, NULL, photos, 2, &turns), GSF_ERROR_INVALID_ARGUMENT);
     photos[0].channels = 3;
-    photos[0].width = 1; // 518 times as high as it is
+    photos[0].width = 1; // the height is 518 times the width
     photos[0].height = 300;
     gsf_image image;
     CHECK_RESULT(ctx, gsf__nn_prepare_reference(ctx, &photos[0], &image), GSF_ERROR_UNSUPPORTED);
@@ -381,7 +382,7 @@ int main(void) {
     test_bad_vggt(&ctx);
     test_poison(&ctx, out);
     gsf_nn_destroy_dinov2(&ctx, &dino);
-    gsf_nn_destroy_dinov2(&ctx, &dino); // twice is fine
+    gsf_nn_destroy_dinov2(&ctx, &dino); // destroying twice is allowed
     gsf_nn_destroy_vggt(&ctx, &vggt);
     free(expected);
     free(out);

@@ -1,4 +1,5 @@
-// Weight files of gsfixer_nn.h: safetensors, single and sharded, valid and damaged; and the loader of the networks.
+// Weight files of gsfixer_nn.h: safetensors, single and sharded, valid and damaged; and the weight loader of the
+// networks.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
@@ -31,7 +32,7 @@ static made make_file(const char* header, size_t data) {
 
 enum { ALL = 11 };
 
-static void make_tensors(gsf_nn_tensor t[ALL]) { // every dtype; ranks 0 to 8; no value; odd sizes
+static void make_tensors(gsf_nn_tensor t[ALL]) { // every dtype; ranks 0 to 8; empty tensors; odd sizes
     static const char* const names[ALL] = {"f32", "bf16", "f16", "f64",   "u8",          "i8",
                                            "i16", "i32",  "i64", "empty", "\xc3\xa9\"\n"};
     static const int64_t shapes[ALL][8] = {{2, 3}, {5}, {3}, {0}, {1, 1, 1, 1, 1, 1, 1, 3}, {7},
@@ -89,13 +90,13 @@ static void test_round_trip(gsf_context* ctx) {
     if (!CHECK_OK(ctx, gsf_nn_load_weights(ctx, path, NULL, &w))) return;
     check_same(&w, tensors, ALL);
     CHECK(HAS_FOLDERS ? w.mapped_bytes > 0 && w.read_bytes == 0 : w.read_bytes > 0);
-    for (size_t i = 0; i < w.tensor_count; i++) // a file of ours is aligned
+    for (size_t i = 0; i < w.tensor_count; i++) // tensors in files written by the library are aligned
         CHECK((uintptr_t)w.tensors[i].data % gsf_nn_get_dtype_size(w.tensors[i].dtype) == 0);
     gsf_nn_destroy_weights(ctx, &w);
     CHECK(w.tensors == NULL && w.tensor_count == 0);
     gsf_nn_destroy_weights(ctx, &w);
 
-    size_t size; // from memory, at every alignment
+    size_t size; // opened from memory, at every alignment
     char* data = test_read_file(path, &size);
     for (size_t shift = 0; shift < 8; shift++) {
         char* moved = (char*)malloc(size + shift);
@@ -110,10 +111,11 @@ static void test_round_trip(gsf_context* ctx) {
         }
         free(moved);
     }
-    CHECK(memcmp(data + 8, "{\"", 2) == 0 && ((unsigned char)data[0] & 7) == 0); // the header fills whole words
+    // the header is padded to a multiple of 8 bytes
+    CHECK(memcmp(data + 8, "{\"", 2) == 0 && ((unsigned char)data[0] & 7) == 0);
     free(data);
 
-    int calls = 0; // through a host's own files
+    int calls = 0; // through the host's io hook
     gsf_context hooked;
     test_context_zero(&hooked);
     hooked.io.read_fn = hooked_read;
@@ -126,7 +128,7 @@ static void test_round_trip(gsf_context* ctx) {
         gsf_nn_destroy_weights(&hooked, &w);
     }
     CHECK_RESULT(&hooked, gsf_nn_save_tensors(&hooked, path, tensors, ALL), GSF_ERROR_IO);
-    CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("none.safetensors"), NULL, 0)); // no tensor at all
+    CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("none.safetensors"), NULL, 0)); // a file without tensors
     if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_scratch("none.safetensors"), NULL, &w))) {
         CHECK(w.tensor_count == 0 && gsf_nn_find_tensor(&w, "x") == NULL);
         gsf_nn_destroy_weights(ctx, &w);
@@ -152,7 +154,8 @@ static void test_bad_save(gsf_context* ctx) {
     }
 }
 
-static void test_values(gsf_context* ctx) { // a header of no whole number of words, and the types that read as others
+// a header whose size is no multiple of 8, and dtypes that are converted to others
+static void test_values(gsf_context* ctx) {
     made m = make_file("{\"a\":{\"dtype\":\"I16\",\"shape\":[3],\"data_offsets\":[1,7]},"
                        "\"b\" : {\"shape\":[],\"more\":[1,{}],\"dtype\":\"BOOL\",\"data_offsets\":[0,1]},"
                        "\"__metadata__\":{\"k\":\"v\"}} ", 7);
@@ -172,13 +175,13 @@ static void test_values(gsf_context* ctx) { // a header of no whole number of wo
     free(m.data);
 }
 
-// ---- broken files
+// ---- damaged files
 
 typedef struct broken {
     const char* header;
     size_t data;
     gsf_result result;
-    const char* text; // part of the error
+    const char* text; // expected part of the error message
 } broken;
 
 #define ENTRY(dtype, shape, offsets) "{\"x\":{\"dtype\":" dtype ",\"shape\":" shape ",\"data_offsets\":" offsets "}}"
@@ -216,7 +219,8 @@ static const broken broken_files[] = {
     {ENTRY("\"F32\"", "[4294967296,4294967296]", "[0,4]"), 4, GSF_ERROR_FORMAT, "overflows"},
     {ENTRY("\"F32\"", "[4294967296,4294967296,0]", "[0,0]"), 0, GSF_ERROR_FORMAT, "overflows"},
     {ENTRY("\"F64\"", "[9223372036854775807]", "[0,8]"), 8, GSF_ERROR_FORMAT, "values of F64"},
-    {ENTRY("\"F64\"", "[2305843009213693953]", "[0,8]"), 8, GSF_ERROR_FORMAT, "values of F64"}, // 8n = 8 mod 2^64
+    // 8 n overflows to 8 (mod 2^64)
+    {ENTRY("\"F64\"", "[2305843009213693953]", "[0,8]"), 8, GSF_ERROR_FORMAT, "values of F64"},
     {ENTRY("\"U8\"", "[1,1,1,1,1,1,1,1,1]", "[0,1]"), 1, GSF_ERROR_UNSUPPORTED, "8 dimensions"},
     {ENTRY("\"F32\"", "[1]", "[0]"), 4, GSF_ERROR_FORMAT, "two non-negative integers"},
     {ENTRY("\"F32\"", "[1]", "[0,4,4]"), 4, GSF_ERROR_FORMAT, "two non-negative integers"},
@@ -246,14 +250,14 @@ static void test_broken(gsf_context* ctx) {
         free(m.data);
     }
     static const uint64_t claims[] = {3, 100000001, 10000000000u, UINT64_MAX, UINT64_MAX - 7};
-    for (size_t i = 0; i < GSF__COUNT(claims); i++) { // the header's length
+    for (size_t i = 0; i < GSF__COUNT(claims); i++) { // the size of the header
         made m = make_file("{}", 0);
         for (int k = 0; k < 8; k++) m.data[k] = (unsigned char)(claims[i] >> 8 * k);
         CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "f", m.data, m.size, &w), GSF_ERROR_FORMAT);
         CHECK(strstr(ctx->error, "f:0: a header of") != NULL);
         free(m.data);
     }
-    gsf_buffer deep; // nesting
+    gsf_buffer deep; // nesting depth
     memset(&deep, 0, sizeof deep);
     gsf_append_bytes(ctx, &deep, "{\"x\":", 5);
     for (int i = 0; i < 200; i++) gsf_append_bytes(ctx, &deep, "[", 1);
@@ -270,7 +274,7 @@ static void test_broken(gsf_context* ctx) {
     CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, test_scratch("empty.safetensors"), NULL, &w), GSF_ERROR_FORMAT);
 }
 
-// Whatever was accepted is inside the file.
+// The data of accepted tensors lies inside the file.
 static void read_all(const gsf_nn_weights* w) {
     float sum = 0.0f, value;
     for (size_t i = 0; i < w->tensor_count; i++)
@@ -288,7 +292,7 @@ static void test_cut_and_flipped(gsf_context* ctx) {
     make_tensors(tensors);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, test_scratch("flip.safetensors"), tensors, ALL));
     char* data = test_read_file(test_scratch("flip.safetensors"), &size);
-    for (size_t cut = 0; cut < size; cut++) { // every length, in a block of exactly that size
+    for (size_t cut = 0; cut < size; cut++) { // every truncated length, in a block of exactly that size
         unsigned char* part = (unsigned char*)malloc(cut ? cut : 1);
         memcpy(part, data, cut);
         CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "cut", part, cut, &w), GSF_ERROR_FORMAT);
@@ -310,7 +314,7 @@ static void test_cut_and_flipped(gsf_context* ctx) {
             *(r == GSF_OK ? &accepted : &refused) += 1;
             gsf_nn_destroy_weights(ctx, &w);
         }
-    CHECK(refused > 5 * accepted && accepted > 0); // only letters of names can change without harm
+    CHECK(refused > 5 * accepted && accepted > 0); // only changed letters of names can be accepted
     free(copy);
     free(data);
 }
@@ -333,12 +337,13 @@ static void test_shards(gsf_context* ctx) {
     char folder[1024];
     snprintf(folder, sizeof folder, "%s", test_scratch(""));
     for (int way = 0; way < 3; way++) {
-        if (way == 1) folder[strlen(folder) - 1] = 0; // without its slash
+        if (way == 1) folder[strlen(folder) - 1] = 0; // without its trailing slash
         const char* path = way == 2 ? test_scratch("s.safetensors.index.json") : folder;
         if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, path, way == 2 ? NULL : "s", &w))) check_same(&w, tensors, 7);
         gsf_nn_destroy_weights(ctx, &w);
     }
-    if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "s-2", &w))) check_same(&w, tensors + 4, 3); // one file by prefix
+    // a prefix that matches a single file
+    if (CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "s-2", &w))) check_same(&w, tensors + 4, 3);
     gsf_nn_destroy_weights(ctx, &w);
 
     static const broken indices[] = {
@@ -372,7 +377,7 @@ static void test_shards(gsf_context* ctx) {
         CHECK(w.tensors == NULL && w.files == NULL);
     }
     remove(test_scratch("b.safetensors.index.json"));
-    write_text(ctx, "b.safetensors.index.json", "{\"weight_map\":{}}"); // a map of nothing opens nothing
+    write_text(ctx, "b.safetensors.index.json", "{\"weight_map\":{}}"); // an empty weight map opens no file
     CHECK_OK(ctx, gsf_nn_load_weights(ctx, folder, "b", &w));
     CHECK(w.tensor_count == 0);
     gsf_nn_destroy_weights(ctx, &w);
@@ -430,7 +435,7 @@ static void test_folders(gsf_context* ctx) { // without a prefix
 #endif
 }
 
-// ---- memory
+// ---- memory failures
 
 static void test_memory(gsf_context* plain) {
     gsf_nn_tensor tensors[ALL];
@@ -467,7 +472,7 @@ static void test_memory(gsf_context* plain) {
     free(m.data);
 }
 
-static void test_large_header(gsf_context* ctx) { // some 10 MB, as no model has it
+static void test_large_header(gsf_context* ctx) { // about 10 MB, more than any real model has
     enum { TENSORS = 100000 };
     gsf_buffer text;
     gsf_nn_weights w;
@@ -508,7 +513,7 @@ static void test_golden_model(gsf_context* ctx, const char* part, const char* pr
     CHECK(w.tensor_count > 10 && (!HAS_FOLDERS || w.mapped_bytes > 1000));
     snprintf(path, sizeof path, "%s/diffusion_pytorch_model.safetensors", folder);
     FILE* single = fopen(test_golden(path), "rb");
-    if (single) { // against the test's own reader
+    if (single) { // compared with the test's own reader
         fclose(single);
         test_tensors reference = test_open_tensors(test_golden(path));
         CHECK(w.mapped_bytes + w.read_bytes == reference.size);
@@ -530,11 +535,11 @@ static void test_golden_model(gsf_context* ctx, const char* part, const char* pr
         CHECK(files == 0 || ((gsf__nn_files*)w.files)->count >= files);
     }
     gsf_nn_destroy_weights(ctx, &w);
-    CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden(folder), NULL, &w)); // the prefix is found
+    CHECK_OK(ctx, gsf_nn_load_weights(ctx, test_golden(folder), NULL, &w)); // the prefix is detected
     gsf_nn_destroy_weights(ctx, &w);
 }
 
-// ---- what the networks use
+// ---- the loader that the networks use
 
 static void test_loader(gsf_context* ctx) {
     gsf_nn_tensor tensors[ALL];
@@ -558,11 +563,13 @@ static void test_loader(gsf_context* ctx) {
     CHECK(strstr(ctx->error, "[2, 3], not [?]") != NULL);
     CHECK_RESULT(ctx, gsf__nn_need(&loader, &t, 0, NULL, "f64"), GSF_ERROR_UNSUPPORTED);
     CHECK(strstr(ctx->error, "tensor f64 is F64") != NULL);
-    CHECK_RESULT(ctx, gsf__nn_end_loading(&loader, GSF_OK), GSF_ERROR_FORMAT); // empty, f16, i.., u8 and the odd name
+    // unused: empty, f16, i.., u8 and the tensor with the odd name
+    CHECK_RESULT(ctx, gsf__nn_end_loading(&loader, GSF_OK), GSF_ERROR_FORMAT);
     CHECK(strstr(ctx->error, "8 tensors that this model does not have: empty, f16, i16, ...") != NULL);
 
     CHECK_OK(ctx, gsf__nn_begin_loading(ctx, &w, &loader));
-    CHECK_RESULT(ctx, gsf__nn_end_loading(&loader, GSF_ERROR_NUMERIC), GSF_ERROR_NUMERIC); // an error stays what it is
+    // an earlier error is passed on unchanged
+    CHECK_RESULT(ctx, gsf__nn_end_loading(&loader, GSF_ERROR_NUMERIC), GSF_ERROR_NUMERIC);
     CHECK_OK(ctx, gsf__nn_begin_loading(ctx, &w, &loader));
     gsf__nn_ignore(&loader, "i");
     gsf__nn_ignore(&loader, "f");
@@ -623,7 +630,8 @@ static void test_config(gsf_context* ctx) {
     gsf__nn_close_config(&c);
     CHECK_RESULT(ctx, gsf__nn_parse_config(ctx, "config.json", "[]", 2, &c), GSF_ERROR_FORMAT);
     CHECK_RESULT(ctx, gsf__nn_open_config(ctx, test_scratch("."), "absent.json", 0, &c), GSF_ERROR_NOT_FOUND);
-    if (CHECK_OK(ctx, gsf__nn_open_config(ctx, test_scratch("."), "absent.json", 1, &c))) { // as an empty object
+    // treated as an empty object
+    if (CHECK_OK(ctx, gsf__nn_open_config(ctx, test_scratch("."), "absent.json", 1, &c))) {
         CHECK_OK(ctx, gsf__nn_config_int_or(&c, "heads", 7, 1, 64, &n));
         CHECK(n == 7);
         CHECK_RESULT(ctx, gsf__nn_config_int(&c, "heads", 1, 64, &n), GSF_ERROR_FORMAT);

@@ -1,14 +1,14 @@
 // 8-bit linear layers: the scalar kernels against integers computed here; bit-identical for all instruction sets and
 // workers; total error against sums in double, with and without outliers and rotation; every epilogue; NaN and
-// infinity; bad arguments; failing allocations.
-#define GSF__INT8_HELD 3000 // so that few rows are quantised at a time
+// infinity; invalid arguments; failing allocations.
+#define GSF__INT8_HELD 3000 // so that only a few rows are quantised at a time
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "test.h"
 #include "test_hooks.h"
 
-typedef struct layer { // everything in blocks of its exact size, so that ASan sees a step too far
+typedef struct layer { // every buffer is a block of exactly its size, so that ASan detects any overrun
     gsf__nn_linear_desc desc;
     gsf_nn_tensor weight, bias;
     float *x, *w, *y, *gate, *before, *bias_values;
@@ -18,7 +18,7 @@ typedef struct layer { // everything in blocks of its exact size, so that ASan s
 
 static uint64_t seed = 1;
 
-static double gaussian(void) { // Box and Muller
+static double gaussian(void) { // Box-Muller transform
     return sqrt(-2.0 * log(1.0 - test_random(&seed))) * cos(6.283185307179586 * test_random(&seed));
 }
 
@@ -76,7 +76,8 @@ static double activation_of(gsf__nn_activation activation, double x) {
     return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
-// What the definition says, in double but for the rounding to 8 bits: a rotation by the signs of the bits that i and j share.
+// The definition in double, before rounding to 8 bits: a Walsh-Hadamard rotation, whose signs are the parity of the
+// bits that i and j share.
 static void round_row(const float* x, int64_t count, int64_t block, double* q, double* scale) {
     double top = 0.0;
     for (int64_t k = 0; k < count; k++) {
@@ -89,12 +90,12 @@ static void round_row(const float* x, int64_t count, int64_t block, double* q, d
         q[k] = sum;
         if (fabs(sum) > top) top = fabs(sum);
     }
-    for (int64_t k = 0; k < count; k++) q[k] = top > 0.0 ? q[k] * 127.0 / top : 0.0; // the caller rounds
+    for (int64_t k = 0; k < count; k++) q[k] = top > 0.0 ? q[k] * 127.0 / top : 0.0; // rounding is left to the caller
     *scale = top / 127.0;
 }
 
-// Odd shapes, strides and epilogues against the definition. Where a value lies at the edge between two integers, float and
-// double may differ, so what is allowed has one such step in it for each of them.
+// Odd shapes, strides and epilogues against the definition. Where a value lies halfway between two integers, float and
+// double may round differently, so the tolerance includes one quantization step for each such value.
 static void test_definition(gsf_context* ctx) {
     static const int64_t rows[] = {1, 2, 3, 4, 5, 6, 7, 13, 40};
     static const int64_t ins[] = {1, 2, 3, 4, 6, 8, 13, 16, 24, 40, 64, 100, 128, 192, 256, 320, 512, 520, 768};
@@ -157,7 +158,7 @@ static void test_definition(gsf_context* ctx) {
     gsf__nn_destroy_workspace(ctx, &workspace);
 }
 
-// Error of the layer against the product of the unrounded values in double.
+// Relative error of the layer against the product of the unquantised values in double.
 static double error_of(gsf_context* ctx, layer* l, int32_t no_rotation) {
     gsf__nn_quantized q;
     double difference = 0.0, square = 0.0;
@@ -175,7 +176,7 @@ static double error_of(gsf_context* ctx, layer* l, int32_t no_rotation) {
     return sqrt(difference / square);
 }
 
-// Gaussian values; then one input in a hundred 20 times as large.
+// Gaussian values; then with one input in a hundred 20 times as large.
 static void test_error(gsf_context* ctx) {
     layer l = make_layer(24, 3072, 48, 0);
     const double plain = error_of(ctx, &l, 1), rotated = error_of(ctx, &l, 0);
@@ -193,7 +194,7 @@ static void test_error(gsf_context* ctx) {
     free_layer(&l);
 }
 
-// Weights of all types at any address have the same 8 bits as the floats they stand for.
+// Weights of every dtype at any address are quantised to the same 8 bits as the floats that they represent.
 static void test_types(gsf_context* ctx) {
     const int64_t in = 72, out = 21;
     for (int t = 0; t < 2; t++)
@@ -218,8 +219,9 @@ static void test_types(gsf_context* ctx) {
         }
 }
 
-// All levels, with one worker and with three, give the same weights and the same bits. Sizes: several blocks of rows and
-// outputs, several steps of depth, several groups of rows held. Linear epilogues only, as activations differ by rounding.
+// All CPU levels give the same quantised weights and bit-identical outputs, with one worker and with three. The sizes
+// need several blocks of rows and outputs, several steps of depth and several groups of quantised rows. Only linear
+// epilogues, as activations round differently per level.
 static void test_same_bits(gsf_cpu_level best) {
     static const int64_t sizes[][3] = {{1, 300, 700}, {4, 1030, 900}, {3, 5, 40}, {7, 1, 5}, {13, 7, 3}, {6, 1024, 400},
                                        {50, 1044, 33}, {401, 130, 500},
@@ -256,7 +258,7 @@ static void test_same_bits(gsf_cpu_level best) {
     }
 }
 
-// The kernels themselves on the largest sums that there are, which those of unsigned bytes leave wrapped around.
+// The kernels alone on operands of the largest magnitude, at which 16-bit sums of two unsigned products would overflow.
 static void test_extremes(gsf_cpu_level best) {
     enum { COUNT = 1028, FEW = 2 };
     static int8_t w[16 * COUNT];
@@ -283,7 +285,7 @@ static void test_extremes(gsf_cpu_level best) {
     }
 }
 
-// Four tiles at once are what each gives by itself.
+// The kernel for four tiles gives the same results as one tile at a time.
 static void test_four_tiles(gsf_cpu_level best) {
     enum { COUNT = 52, GROUP = 6 * COUNT, PANEL = 16 * COUNT };
     uint8_t a[2 * GROUP];
@@ -303,21 +305,21 @@ static void test_four_tiles(gsf_cpu_level best) {
     }
 }
 
-// A row with a NaN or an infinity gives NaNs, and no other does; rows of zeros and of tiny values give the bias.
+// A row with a NaN or an infinity gives NaNs and affects no other row; rows of zeros and of tiny values give the bias.
 static void test_special(gsf_context* ctx) {
     const float bad[] = {NAN, -NAN, INFINITY, -INFINITY, 3e38f};
     const int64_t sizes[] = {5, 64, 256, 300};
     for (size_t i = 0; i < GSF__COUNT(bad); i++)
         for (size_t s = 0; s < GSF__COUNT(sizes); s++) {
             const int64_t in = sizes[s], rows = 15, out = 19;
-            if (i == 4 && in == 5) continue; // no rotation, so nothing adds the large values up
+            if (i == 4 && in == 5) continue; // no rotation, which would add up the large values
             layer l = make_layer(rows, in, out, 0);
             gsf__nn_quantized q;
             l.desc.bias = &l.bias;
             l.desc.activation = s == 3 ? GSF__NN_GELU_TANH : s == 2 ? GSF__NN_SILU : GSF__NN_LINEAR;
             quantize(ctx, &l, 0, &q);
             l.x[7 * in + (i % 2 ? in - 1 : 2)] = bad[i];
-            if (i == 4) l.x[7 * in] = l.x[7 * in + 1] = l.x[7 * in + 3] = bad[i]; // their sum is infinite
+            if (i == 4) l.x[7 * in] = l.x[7 * in + 1] = l.x[7 * in + 3] = bad[i]; // finite, but their sum is infinite
             memset(l.x + 9 * in, 0, (size_t)in * sizeof(float));
             for (int64_t k = 0; k < in; k++) l.x[10 * in + k] = 1e-42f;
             run(ctx, NULL, &l, &q);
@@ -378,7 +380,7 @@ static void test_bad_arguments(gsf_context* ctx) {
     REFUSED(QUANTIZE, weight.dtype = GSF_NN_F64, GSF_ERROR_UNSUPPORTED);
     REFUSED(QUANTIZE, (weight.shape[0] = 1, weight.count = 131073), GSF_ERROR_UNSUPPORTED);
     REFUSED(QUANTIZE, (weight.shape[0] = INT64_MAX / 4, weight.count = INT64_MAX / 4 * 4), GSF_ERROR_OUT_OF_MEMORY);
-    l.desc.rows = 0; // nothing to do
+    l.desc.rows = 0; // nothing to compute
     run(ctx, NULL, &l, &q);
     CHECK(memcmp(l.y, l.before, l.y_count * sizeof(float)) == 0);
     gsf__nn_destroy_quantized(ctx, &q);
@@ -416,7 +418,7 @@ static void test_memory(void) {
     quantize(&ctx, &l, 0, &q);
     run(&ctx, &workspace, &l, &q);
     const size_t calls = count.calls;
-    run(&ctx, &workspace, &l, &q); // what is there is enough
+    run(&ctx, &workspace, &l, &q); // the workspace is large enough already
     CHECK(count.calls == calls && count.live == 2);
     gsf__nn_destroy_workspace(&ctx, &workspace);
     gsf__nn_destroy_quantized(&ctx, &q);

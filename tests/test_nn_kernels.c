@@ -7,7 +7,7 @@
 #include "test.h"
 #include "test_hooks.h"
 
-static gsf_context one, three; // one worker; three, whose chunks come in a muddled order
+static gsf_context one, three; // one worker; three workers that run chunks in shuffled order
 static uint64_t seed = 5;
 
 static int open_contexts(gsf_cpu_level level) { // 0: the machine lacks the level
@@ -60,7 +60,7 @@ static void check_exp(void) {
                     CHECK(y[i] >= 0.0f && y[i] <= 1.7e-38f);
                 else if (expected > (double)FLT_MAX * (1.0 + 3e-8))
                     CHECK(y[i] == INFINITY);
-                else if (expected < (double)FLT_MAX * (1.0 - 2e-7)) // between, both are right
+                else if (expected < (double)FLT_MAX * (1.0 - 2e-7)) // near the limit both are correct
                     worst = fmax(worst, fabs((double)y[i] - expected) / expected);
             }
         }
@@ -83,7 +83,7 @@ static double activation_of(gsf__nn_activation activation, double x) {
     return activation == GSF__NN_RELU && x < 0.0 ? 0.0 : x;
 }
 
-// GELU's relative error, from where results become too small for it to where they are x.
+// GELU's relative error, between where results are too small for one and where they equal x.
 static void check_gelu(void) {
     enum { COUNT = 400000 };
     float *x = make_floats(COUNT, -14.0, 7.0), *y = make_floats(COUNT, 0, 1);
@@ -193,7 +193,7 @@ static void check_row_norms(void) {
                 }
             }
             gsf_context* contexts[2] = {&one, &three};
-            for (int k = 0; k < 2; k++) { // the second time in place
+            for (int k = 0; k < 2; k++) { // in place the second time
                 float *in = k ? z : x, *out = k ? z : y;
                 if (way == 5) gsf__nn_rms_norm(contexts[k], in, (int64_t)rows, (int64_t)dim, pw, eps, out);
                 else if (with_m)
@@ -210,7 +210,7 @@ static void check_row_norms(void) {
             free(x); free(y); free(z); free(w); free(b); free(scale); free(shift); free(expected);
         }
     float before[1];
-    gsf__nn_layer_norm(&one, before + 1, 3, 0, NULL, NULL, 1e-6f, before + 1); // reads nothing
+    gsf__nn_layer_norm(&one, before + 1, 3, 0, NULL, NULL, 1e-6f, before + 1); // must not read
 }
 
 static void check_group_norm(void) {
@@ -250,7 +250,7 @@ static void run_large(gsf_context* ctx, int kind, const float* x, const float* w
     if (kind == 2) gsf__nn_activate(ctx, GSF__NN_GELU, x, LARGE, y);
 }
 
-// Results larger than any cache bypass it, if they are aligned: the same bits as of those that do not.
+// Aligned results larger than any cache are written with non-temporal stores: the same bits as those of unaligned ones.
 static void check_streams(void) {
     float *x = make_floats(LARGE, -3, 3), *w = make_floats(LARGE_DIM, 0.5, 2), *memory = make_floats(LARGE + 32, 0, 1);
     float* aligned = memory + (64 - (uintptr_t)memory % 64) % 64 / sizeof(float);
@@ -270,7 +270,7 @@ static void check_streams(void) {
 }
 
 static void check_head_norm_rope(void) {
-    static const int64_t cases[][5] = { // rows, heads, dim, extra columns, first row that is turned (-1: none)
+    static const int64_t cases[][5] = { // rows, heads, dim, extra columns, first row that is rotated (-1: none)
         {1, 1, 2, 0, 0}, {9, 3, 6, 5, 4}, {7, 2, 64, 0, 7}, {300, 4, 40, 3, 17}, {5, 3, 13, 1, 2}, {6, 2, 16, 0, -1}};
     for (size_t c = 0; c < sizeof cases / sizeof cases[0]; c++) {
         const size_t rows = (size_t)cases[c][0], heads = (size_t)cases[c][1], dim = (size_t)cases[c][2];
@@ -308,10 +308,10 @@ static void check_head_norm_rope(void) {
 typedef struct attention_case {
     int64_t queries, keys;
     int32_t heads, dim;
-    int64_t extra; // columns between rows
+    int64_t extra; // padding columns between rows
     int masked;
     float scale, range; // of q and k
-    float bias;         // range of what is added to the logits; 0: nothing
+    float bias;         // range of the bias added to the logits; 0: none
 } attention_case;
 
 typedef struct attention_data {
@@ -335,7 +335,7 @@ static attention_data make_attention(const attention_case* c) {
         const size_t n = (size_t)(c->heads * c->queries * c->keys);
         a.mask = (unsigned char*)malloc(n);
         for (size_t i = 0; i < n; i++) a.mask[i] = test_random(&seed) < 0.4;
-        for (int64_t j = 0; j < c->keys; j++) a.mask[j] = 0; // the first query sees nothing
+        for (int64_t j = 0; j < c->keys; j++) a.mask[j] = 0; // the first query has all keys masked
         for (int64_t j = 0; j < c->keys; j++) a.mask[(c->queries - 1) * c->keys + j] = j == c->keys - 1;
     }
     if (c->bias != 0.0f) a.bias = make_floats((size_t)(c->heads * c->queries * c->keys), -c->bias, c->bias);
@@ -371,9 +371,9 @@ static double attention_operand(const attention_data* a, float value, float fact
 static void attention_of(const attention_case* c, const attention_data* a, double* out) { // (queries, heads * dim)
     const int64_t dim = c->dim, width = c->heads * dim, ld = width + c->extra;
     const double scale = c->scale != 0.0f ? (double)c->scale : 1.0 / sqrt((double)dim);
-    const float factor = (float)scale * 1.44269504f; // what queries are multiplied with before they are rounded
+    const float factor = (float)scale * 1.44269504f; // factor that queries are multiplied by before rounding
     double* p = make_doubles((size_t)c->keys);
-    float* center = (float*)calloc((size_t)width, sizeof(float)); // keys are rounded as what they differ from this
+    float* center = (float*)calloc((size_t)width, sizeof(float)); // keys are rounded as differences from this centre
     for (int64_t i = 0; i < width && attention_rounds(a); i++) {
         float mean[3] = {0.0f, 0.0f, 0.0f};
         for (int64_t n = 0; n < 15; n++) mean[n % 3] += a->k[n * c->keys / 15 * ld + i];
@@ -404,7 +404,7 @@ static void attention_of(const attention_case* c, const attention_data* a, doubl
     free(center);
 }
 
-static float* dense_rows(const attention_case* c, const float* x) { // without the columns between rows
+static float* dense_rows(const attention_case* c, const float* x) { // without the padding columns
     const int64_t width = (int64_t)c->heads * c->dim;
     float* out = (float*)malloc((size_t)(c->queries * width) * sizeof(float));
     for (int64_t r = 0; r < c->queries; r++)
@@ -424,7 +424,7 @@ static void check_attention(void) {
         const size_t values = (size_t)(c->queries * c->heads * c->dim);
         attention_data a = make_attention(c);
         a.desc.bf16 = n % 2;
-        // the weights are rounded, too: 2^-9 of each, of numerator and denominator; values differ by up to 3
+        // the weights are rounded, too: 2^-9 relative error in numerator and in denominator; values span up to 3
         const double rounding = attention_rounds(&a) ? 3.0 / 256 : 0.0;
         double* expected = make_doubles(values);
         gsf__nn_workspace workspace;
@@ -434,15 +434,16 @@ static void check_attention(void) {
         float* dense = dense_rows(c, a.out);
         char what[80];
         snprintf(what, sizeof what, "attention case %zu%s", n / 2, n % 2 ? " bf16" : "");
-        test_compare_floats(what, dense, expected, values, rounding + (c->range > 10 ? 3e-4 : 3e-6)); // logits up to 1500
-        if (rounding > 0.0 && c->keys > 200 && !c->masked && c->range < 10) { // it was rounded, but averages are better
+        // logits up to 1500
+        test_compare_floats(what, dense, expected, values, rounding + (c->range > 10 ? 3e-4 : 3e-6));
+        if (rounding > 0.0 && c->keys > 200 && !c->masked && c->range < 10) { // rounding is visible, but averages out
             double square = 0.0;
             for (size_t i = 0; i < values; i++) square += ((double)dense[i] - expected[i]) * ((double)dense[i] - expected[i]);
             CHECK(square > 1e-12 * (double)values && square < 1e-6 * (double)values);
         }
-        for (int64_t r = 0; c->extra && r < c->queries; r++) // gaps keep what stood there
+        for (int64_t r = 0; c->extra && r < c->queries; r++) // padding is not written
             CHECK(a.out[r * (c->heads * c->dim + c->extra) + c->heads * c->dim] >= 7.0f);
-        a.desc.out = a.q; // in place, other workers, scratch for this call only
+        a.desc.out = a.q; // in place, with three workers and scratch memory for this call only
         CHECK_OK(&three, gsf__nn_run_attention(&three, NULL, &a.desc));
         float* again = dense_rows(c, a.q);
         CHECK(same_bits(dense, again, values));
@@ -463,7 +464,7 @@ static int none_nan(const float* x, size_t count) {
     return 1;
 }
 
-// What all keys have in common is no concern of softmax: within a few times what they are off without it, in bf16 too.
+// Softmax ignores an offset that all keys share: the error is within a few times that without the offset, in bf16 too.
 static void check_attention_offset(void) {
     static const attention_case cases[] = {{9, 13, 2, 64, 0, 0, 0, 1, 0}, {49, 513, 2, 72, 1, 0, 0, 1, 0},
                                            {7, 5, 2, 3, 0, 0, 0, 1, 0},   {30, 33, 2, 24, 2, 1, 0, 1, 0}};
@@ -513,14 +514,14 @@ static void check_attention_values(int bf16) {
         }
         CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         CHECK(all_nan(a.out, 24) && none_nan(a.out + width + 24, 24));
-        for (size_t i = 0; i < 24; i++) a.k[(size_t)key * width + i] = -1e30f; // weight 0 at -inf
+        for (size_t i = 0; i < 24; i++) a.k[(size_t)key * width + i] = -1e30f; // a logit of -inf, weight 0
         CHECK_OK(&one, gsf__nn_run_attention(&one, NULL, &a.desc));
         CHECK(none_nan(a.out, 20 * width));
         free_attention(&a);
     }
 }
 
-// -inf in the bias hides a key as the mask does; a query that sees none gives 0.
+// A bias of -inf hides a key as the mask does; a query with all keys hidden gives 0.
 static void check_attention_bias(void) {
     const attention_case c = {20, 300, 2, 24, 0, 0, 0, 1, 1};
     const size_t width = 48;

@@ -1,25 +1,25 @@
 // Linear layers against sums in double: odd shapes, all weight dtypes at any alignment, strides, every epilogue, all
-// instruction sets; bit-identical for any number of workers; NaN and infinity; bad arguments; failing allocations.
-#define GSF__LINEAR_PACKED 20000 // so that small layers take several groups of outputs
+// instruction sets; bit-identical for any number of workers; NaN and infinity; invalid arguments; failing allocations.
+#define GSF__LINEAR_PACKED 20000 // so that even small layers take several groups of outputs
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
 #include "test.h"
 #include "test_hooks.h"
 
-typedef struct layer { // everything in blocks of its exact size, so that ASan sees a step too far
+typedef struct layer { // every buffer is a block of exactly its size, so that ASan detects any overrun
     gsf__nn_linear_desc desc;
     gsf_nn_tensor weight, bias;
     float *x, *y, *gate, *before;
     char *weight_block, *bias_block;
-    double *w, *b; // as read
+    double *w, *b; // values after conversion from the dtype
     int64_t in, out;
     size_t y_count;
 } layer;
 
 static uint64_t seed = 1;
 
-// `count` values of `dtype`, `offset` bytes into a block; *wide gets what they stand for.
+// `count` values of `dtype`, `offset` bytes into a block; *wide receives the same values in double.
 static char* make_values(gsf_nn_dtype dtype, int64_t count, size_t offset, double** wide, gsf_nn_tensor* tensor) {
     const size_t size = gsf_nn_get_dtype_size(dtype);
     char* block = (char*)malloc(offset + (size_t)count * size);
@@ -82,7 +82,7 @@ static void free_layer(layer* l) {
 }
 
 static void run(gsf_context* ctx, gsf__nn_workspace* workspace, layer* l) {
-    l->desc.weight = &l->weight; // here, as layers are copied
+    l->desc.weight = &l->weight; // set here because layers are copied
     memcpy(l->y, l->before, l->y_count * sizeof(float));
     CHECK_OK(ctx, gsf__nn_run_linear(ctx, workspace, &l->desc));
 }
@@ -94,7 +94,7 @@ static double activation_of(gsf__nn_activation activation, double x) {
     return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
 }
 
-// Every value of y, and that what stands between its rows is as before. At most `most` rows are looked at.
+// Checks every value of y, and that the padding between its rows is unchanged; looks at up to `most` rows.
 static void check_layer(const layer* l, int64_t most) {
     const gsf__nn_linear_desc* d = &l->desc;
     const int64_t ldx = d->ldx ? d->ldx : l->in, ldy = d->ldy ? d->ldy : l->out;
@@ -142,7 +142,7 @@ static void test_shapes(gsf_context* ctx) {
         l.desc.bias = test_random_bits(&seed) % 3 ? &l.bias : NULL;
         l.desc.gate = test_random_bits(&seed) % 3 ? NULL : l.gate;
         l.desc.accumulate = test_random_bits(&seed) % 3 == 0;
-        if (i >= 150) { // values that rounding to bf16 leaves as they are
+        if (i >= 150) { // values that bf16 represents exactly
             const size_t count = (size_t)((m - 1) * (l.desc.ldx ? l.desc.ldx : in) + in);
             l.desc.bf16 = 1;
             for (size_t k = 0; k < count; k++) l.x[k] = gsf__bf16_to_float(gsf__float_to_bf16(l.x[k]));
@@ -154,7 +154,7 @@ static void test_shapes(gsf_context* ctx) {
     gsf__nn_destroy_workspace(ctx, &workspace);
 }
 
-// What rounding x to bf16 costs where it is rounded, and that it is not elsewhere.
+// The error of rounding x to bf16 where the kernels round it, and none where they do not.
 static void test_bf16(gsf_context* ctx) {
     for (int dtype = GSF_NN_F32; dtype <= GSF_NN_F16; dtype++)
         for (int64_t rows = 4; rows <= 40; rows += 36) {
@@ -177,7 +177,7 @@ static void test_bf16(gsf_context* ctx) {
         }
 }
 
-// Sizes at which the work is cut: several blocks of rows, groups of outputs, blocks of outputs.
+// Sizes at which the work is split: several blocks of rows, groups of outputs, blocks of outputs.
 static void test_blocks(gsf_context* ctx) {
     static const int64_t sizes[][3] = {{320, 40, 400}, {321, 70, 300}, {400, 300, 90}, {650, 13, 1600},
                                        {330, 2100, 20}, {4, 2100, 250}, {1, 2100, 250}, {2, 1040, 33}};
@@ -219,7 +219,7 @@ static void test_workers(gsf_cpu_level level) {
         }
 }
 
-// A NaN or an infinity comes out where it belongs, and nowhere else.
+// A NaN or an infinity appears in the outputs that depend on it and in no others.
 static void test_special(gsf_context* ctx) {
     static const int64_t rows[] = {1, 3, 7, 330};
     for (size_t i = 0; i < GSF__COUNT(rows); i++)
@@ -276,7 +276,7 @@ static void test_bad_arguments(gsf_context* ctx) {
     REFUSED((l.weight.count = INT64_MAX / 7 * 7, d.rows = INT64_MAX), GSF_ERROR_OUT_OF_MEMORY);
     memcpy(l.y, l.before, l.y_count * sizeof(float));
     d = l.desc;
-    d.rows = 0; // nothing to do
+    d.rows = 0; // nothing to compute
     CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
     CHECK(memcmp(l.y, l.before, l.y_count * sizeof(float)) == 0);
     free_layer(&l);
@@ -306,7 +306,7 @@ static void test_memory(void) {
         count.fail_at = 0;
         run(&ctx, &workspace, &l);
         const size_t calls = count.calls;
-        run(&ctx, &workspace, &l); // what is there is enough
+        run(&ctx, &workspace, &l); // the workspace is large enough already
         CHECK(count.calls == calls && count.live == 1);
         gsf__nn_destroy_workspace(&ctx, &workspace);
         CHECK(count.live == 0);

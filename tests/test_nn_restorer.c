@@ -1,5 +1,5 @@
-// The restorer `dit` behind the interface of gsfixer.h, on the small golden model: accepted inputs, skipped work,
-// workers, cancelling and resuming, bad weights and features.
+// The restorer `dit` through the restorer interface of gsfixer.h, on the small golden model: accepted inputs, skipped
+// work, workers, cancelling and resuming, invalid weights and features.
 #include "gsfixer_nn.h"
 
 #include "test.h"
@@ -16,7 +16,8 @@ typedef struct clip {
 
 static const char* model_folder(void) { return test_golden("restorer/model"); }
 
-// The features of the golden pipeline in one file, as --ref-features takes it; `without` leaves a tensor out.
+// Writes the features of the golden pipeline to one file, as --ref-features takes it; `without` names a tensor to leave
+// out.
 static const char* write_features(gsf_context* ctx, const char* name, const char* without) {
     const char* path = test_scratch(name);
     gsf_nn_weights inputs, expected;
@@ -83,7 +84,7 @@ static gsf_nn_dit_desc small_desc(const char* features, int32_t steps) {
     return d;
 }
 
-// One clip through a restorer of this desc; the checksum of what comes out, 0 when it failed.
+// Runs one clip through a restorer made from this desc; returns the checksum of the result, or 0 if it failed.
 static uint32_t restore(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c, gsf_result wanted) {
     gsf_restorer r;
     if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, desc, &r))) return 0;
@@ -103,12 +104,15 @@ static void test_limits(gsf_context* ctx, const char* features, clip* c) {
     if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) return;
     CHECK(r.struct_size == sizeof r && strcmp(r.name, "dit") == 0);
     CHECK_OK(ctx, r.query_fn(r.user, ctx, c->frames, c->width, c->height, &limits));
-    CHECK(limits.frame_count_min == 9 && limits.frame_count_max == 9 && limits.frame_count == 9); // as it was trained
+    // the count that it was trained with
+    CHECK(limits.frame_count_min == 9 && limits.frame_count_max == 9 && limits.frame_count == 9);
     CHECK(limits.squash && limits.width == c->width && limits.height == c->height);
-    CHECK(limits.width_multiple == c->width && limits.height_multiple == c->height); // learned positions: one size
+    // learned position embeddings allow one size only
+    CHECK(limits.width_multiple == c->width && limits.height_multiple == c->height);
     CHECK(limits.bytes > 0.0 && limits.flops > 0.0 && !limits.needs_depth && !limits.needs_alpha);
     limits.bytes = 0.0;
-    CHECK_OK(ctx, r.query_fn(r.user, ctx, 10, c->width + 1, c->height, &limits)); // not legal: no cost, but limits
+    // an unsupported size: no cost is reported, but the limits are
+    CHECK_OK(ctx, r.query_fn(r.user, ctx, 10, c->width + 1, c->height, &limits));
     CHECK(limits.bytes == 0.0 && limits.frame_count_min == 9);
     CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
     for (int32_t f = 0; f < c->frames; f++)
@@ -124,10 +128,10 @@ static void test_limits(gsf_context* ctx, const char* features, clip* c) {
     CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_UNSUPPORTED);
     c->window.frame_count = c->frames;
     gsf_nn_destroy_dit(ctx, &r);
-    gsf_nn_destroy_dit(ctx, &r); // twice is fine
+    gsf_nn_destroy_dit(ctx, &r); // destroying twice is allowed
 }
 
-// A frame that is a reference's view is replaced by the photo.
+// A frame at the view of a reference is replaced by the photo.
 static void test_references(gsf_context* ctx, const char* features, clip* c) {
     const gsf_nn_dit_desc desc = small_desc(features, 2);
     gsf_restorer r;
@@ -153,8 +157,8 @@ static void test_references(gsf_context* ctx, const char* features, clip* c) {
     gsf_nn_destroy_dit(ctx, &r);
 }
 
-// What the restorer makes of a clip whose first frame is the view of `photo`, seen by `camera` (NULL: all of it), and what
-// of one whose first frame is `seen`.
+// Compares the restored clip whose first frame is the view of `photo` as `camera` sees it (NULL: the whole photo) with
+// that of a clip whose first frame is `seen`.
 static void check_photo_frame(gsf_context* ctx, gsf_restorer* r, clip* c, const gsf_reference* photo,
                               const gsf_camera* camera, const gsf_image* seen) {
     gsf_camera cameras[MAX_FRAMES];
@@ -178,8 +182,8 @@ static void check_photo_frame(gsf_context* ctx, gsf_restorer* r, clip* c, const 
     c->color[0] = frame;
 }
 
-// A photo of another size and aspect becomes a frame as PIL resizes it: all of it, squashed, or what a camera sees of it,
-// which is all but 8 columns, and as many beyond its other side.
+// A photo of another size and aspect ratio becomes a frame as PIL resizes it: either the whole photo, squashed, or the
+// part that a camera sees, which lacks 8 columns on one side and extends 8 columns beyond the other.
 static void test_photo_frames(gsf_context* ctx, const char* features, clip* c) {
     const gsf_nn_dit_desc desc = small_desc(features, 1);
     gsf_restorer r;
@@ -220,7 +224,7 @@ static void test_photo_frames(gsf_context* ctx, const char* features, clip* c) {
     gsf_nn_destroy_dit(ctx, &r);
 }
 
-// Every condition gives something else; leaving the cache of the references' keys out changes no bit.
+// Every condition gives a different result; disabling the cache of the references' keys changes no bit.
 static void test_conditions(gsf_context* ctx, const char* features, clip* c) {
     uint32_t sums[4];
     for (int i = 0; i < 4; i++) {
@@ -234,19 +238,21 @@ static void test_conditions(gsf_context* ctx, const char* features, clip* c) {
     const char* no_vggt = write_features(ctx, "no_vggt.safetensors", "vggt_latents");
     gsf_nn_dit_desc desc = small_desc(no_vggt, 2);
     desc.condition = GSF_NN_CONDITION_2D;
-    CHECK(restore(ctx, &desc, c, GSF_OK) == sums[GSF_NN_CONDITION_2D]); // what is not asked for need not be there
+    // features that the condition does not use may be missing
+    CHECK(restore(ctx, &desc, c, GSF_OK) == sums[GSF_NN_CONDITION_2D]);
     gsf_restorer r;
     desc.condition = GSF_NN_CONDITION_BOTH;
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND); // the folder has no encoder, either
+    // the folder has no encoder to compute them
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "/vggt/") != NULL && strstr(ctx->error, "vggt_latents") != NULL && r.user == NULL);
 }
 
-// Prompts by the folder's tokenizer and text encoder; what is saved of them does without both.
+// Prompts computed with the folder's tokenizer and text encoder; once saved, they are used without either.
 static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     char saved[1100];
     gsf_nn_dit_desc desc = small_desc(write_features(ctx, "no_text.safetensors", "prompt_embeds"), 2);
     gsf_restorer r;
-    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND); // no caption, and no captioner
+    CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND); // neither a caption nor a captioner
     CHECK(strstr(ctx->error, "/blip2/") != NULL && strstr(ctx->error, "a caption") != NULL && r.user == NULL);
     snprintf(saved, sizeof saved, "%s", test_scratch("saved.safetensors"));
     desc.caption = "a wall";
@@ -256,7 +262,7 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     CHECK(restore(ctx, &again, c, GSF_OK) == wall);
     desc.caption = "a view of trees";
     CHECK(restore(ctx, &desc, c, GSF_OK) != wall);
-    desc.features = features; // prompts from the file count more than a caption
+    desc.features = features; // prompts in the file take precedence over a caption
     const gsf_nn_dit_desc plain = small_desc(features, 2);
     CHECK(restore(ctx, &desc, c, GSF_OK) == restore(ctx, &plain, c, GSF_OK));
     desc.features = NULL;
@@ -264,7 +270,7 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
     CHECK(strstr(ctx->error, "/dinov2/") != NULL && strstr(ctx->error, "dino_latents") != NULL);
     desc.condition = GSF_NN_CONDITION_NONE;
     CHECK(restore(ctx, &desc, c, GSF_OK) != 0);
-    desc.model = test_golden("restorer/model/transformer"); // names the part that is missing first
+    desc.model = test_golden("restorer/model/transformer"); // the error names the first missing part
     CHECK_RESULT(ctx, gsf_nn_make_dit(ctx, &desc, &r), GSF_ERROR_NOT_FOUND);
 }
 
@@ -272,8 +278,8 @@ static void test_prompts(gsf_context* ctx, const char* features, clip* c) {
 
 enum { PHOTOS = 6, CLIPS = 3, PHOTO_TOKENS = 5 };
 
-// Cameras of six photos: on a circle about the middle, all but the last, which stands in the first one's place and looks
-// away. Scaled, turned about z and moved as a whole.
+// Cameras of six photos on a circle around the centre, except for the last, which is at the position of the first and
+// looks away. All are scaled, rotated about z and translated together.
 static void place_photos(gsf_camera* cameras, double scale, double turn, double shift) {
     for (int i = 0; i < PHOTOS; i++) {
         const double a = i == PHOTOS - 1 ? 0.0 : 0.4 * i, view = i == PHOTOS - 1 ? 2.2 : a; // looks along +z at a = 0
@@ -306,7 +312,7 @@ static void lend_photos(gsf_context* ctx, gsf_restorer* r, const gsf_camera* cam
         photos[i].camera = cameras[i];
     }
     CHECK_OK(ctx, r->begin_fn(r->user, ctx, photos, PHOTOS));
-    CHECK_RESULT(ctx, r->begin_fn(r->user, ctx, photos, 1), GSF_ERROR_INVALID_ARGUMENT); // another run's
+    CHECK_RESULT(ctx, r->begin_fn(r->user, ctx, photos, 1), GSF_ERROR_INVALID_ARGUMENT); // not the photos of this run
 }
 
 static void save_random(gsf_context* ctx, const char* path, char (*names)[40], const int64_t (*shapes)[3], size_t count,
@@ -324,8 +330,8 @@ static void save_random(gsf_context* ctx, const char* path, char (*names)[40], c
     for (size_t i = 0; i < count; i++) free((void*)tensors[i].data);
 }
 
-// The photo that a clip between two cameras is short of first, told by what is missing in a file with but one photo's tokens;
-// -1: none.
+// The photo that a clip between two cameras looks up first, found from the missing tensor that the error names when the
+// file has the tokens of only one photo; -1: none.
 static int missing_photo(gsf_context* ctx, gsf_restorer* r, clip* c, const gsf_camera* from, const gsf_camera* to) {
     gsf_camera cameras[MAX_FRAMES];
     int photo = -1;
@@ -340,7 +346,7 @@ static int missing_photo(gsf_context* ctx, gsf_restorer* r, clip* c, const gsf_c
     return photo;
 }
 
-// Which photos are near does not depend on the unit of length, nor on how the world is turned, nor on where it lies.
+// The choice of the nearest photos does not depend on scale, rotation or translation of the scene.
 static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* net) {
     char names[2][40] = {"dino_latents.photo63", "prompt_embeds.clip1"};
     const int64_t shapes[2][3] = {{1, PHOTO_TOKENS, net->dino_channels}, {2, net->text_tokens, net->text_channels}};
@@ -359,7 +365,8 @@ static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* ne
         place_photos(photos, worlds[w].scale, worlds[w].turn, worlds[w].shift);
         lend_photos(ctx, &r, photos);
         uint64_t state = 3;
-        for (int k = 0; k < 32; k++) { // the place of one photo, drawn towards another's, with the direction of a third
+        // the position of one photo, moved towards another's, with the direction of a third
+        for (int k = 0; k < 32; k++) {
             const gsf_camera* a = &photos[(size_t)(test_random(&state) * PHOTOS)];
             const gsf_camera* b = &photos[(size_t)(test_random(&state) * PHOTOS)];
             gsf_camera camera = photos[(size_t)(test_random(&state) * PHOTOS)];
@@ -380,7 +387,8 @@ static void test_nearest(gsf_context* ctx, clip* c, const gsf_nn_transformer* ne
     gsf_nn_destroy_dit(ctx, &r);
 }
 
-// Frames of a restorer of this desc for three clips, each between other photos; zero where `wanted` is an error.
+// Checksums of three clips, each between different photos, from a restorer made from this desc; zero where an error is
+// expected.
 static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c, uint32_t sums[CLIPS]) {
     gsf_restorer r;
     gsf_camera photos[PHOTOS], cameras[MAX_FRAMES];
@@ -394,10 +402,10 @@ static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c
         CHECK_OK(ctx, r.restore_fn(r.user, ctx, &c->window));
         sums[k] = checksum(c);
     }
-    c->window.clip = CLIPS; // of this one the file has nothing
+    c->window.clip = CLIPS; // a clip that is not in the file
     CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "prompt_embeds.clip3") != NULL);
-    c->window.clip = 1; // of these photos together neither
+    c->window.clip = 1; // nor does it have this combination of photos
     cameras[0] = photos[4];
     CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx->error, "dino_latents.photo4") != NULL);
@@ -410,7 +418,7 @@ static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c
     c->window.clip = 0;
 }
 
-// What the numbered file holds of clip k, under bare names.
+// Writes what the file for all clips holds for clip k, under names without suffixes.
 static void write_bare(gsf_context* ctx, const char* all, const char* path, int k, const gsf_nn_transformer* net) {
     gsf_nn_weights file;
     char name[40];
@@ -434,8 +442,8 @@ static void write_bare(gsf_context* ctx, const char* all, const char* path, int 
     free(dino);
 }
 
-// Three clips, each between other photos and with prompts of its own: from one file, from what was saved of that, and from
-// a file for each clip alone.
+// Three clips, each between different photos and with its own prompts: from one file, from the features saved in that
+// run, and from a separate file for each clip.
 static void test_clips(gsf_context* ctx, clip* c, const gsf_nn_transformer* net) {
     char names[10][40], path[1100], saved[1100], bare[1100];
     int64_t shapes[10][3];
@@ -467,7 +475,7 @@ static void test_clips(gsf_context* ctx, clip* c, const gsf_nn_transformer* net)
         desc.features = bare;
         CHECK(restore(ctx, &desc, c, GSF_OK) == sums[k]);
         if (!CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &r))) continue;
-        c->window.clip = 1; // a bare name is no other clip's
+        c->window.clip = 1; // a name without suffix is not used for another clip
         CHECK_RESULT(ctx, r.restore_fn(r.user, ctx, &c->window), GSF_ERROR_NOT_FOUND);
         CHECK(strstr(ctx->error, "prompt_embeds.clip1") != NULL);
         c->window.clip = 0;
@@ -545,10 +553,10 @@ static void test_skips(gsf_context* ctx, sample_case* s) {
     CHECK(stats.network_rows == 12 && difference(s->video, reference, s->values) > 1e-4);
     s->desc.guidance_begin = s->desc.guidance_end = 0.0f;
 
-    s->desc.block_cache = 1e-9f; // so small that no step is like the last one: the same bits as without
+    s->desc.block_cache = 1e-9f; // so small that no two steps are similar enough: the same bits as without the cache
     stats = run_sample(ctx, s, s->video);
     CHECK(stats.cached_steps == 0 && memcmp(s->video, reference, s->values * sizeof(float)) == 0);
-    s->desc.block_cache = 0.8f; // with random weights the steps are not much alike
+    s->desc.block_cache = 0.8f; // with random weights, successive steps differ a lot
     stats = run_sample(ctx, s, s->video);
     CHECK(stats.cached_steps > 0 && stats.cached_steps < 8);
     CHECK(difference(s->video, reference, s->values) < 1.0);
@@ -559,7 +567,8 @@ static void test_skips(gsf_context* ctx, sample_case* s) {
     CHECK(stats.steps == 4 && stats.network_rows == 8);
     s->desc.strength = 0.0f;
 
-    for (int solver = GSF_NN_SOLVER_DDIM; solver <= GSF_NN_SOLVER_UNIPC; solver++) { // all near each other with many steps
+    // solvers nearly agree at many steps
+    for (int solver = GSF_NN_SOLVER_DDIM; solver <= GSF_NN_SOLVER_UNIPC; solver++) {
         s->desc.solver = (gsf_nn_solver)solver;
         s->desc.steps = 40;
         run_sample(ctx, s, solver ? s->video : reference);
@@ -597,7 +606,7 @@ static void test_bad_sample(gsf_context* ctx, sample_case* s) {
     CHECK(cost.bytes > 1e5 && cost.flops > 1e9);
 }
 
-// A NaN in a weight is named, with the block where it shows.
+// The error names the weight that contains a NaN, or the block in which it appears.
 static void test_bad_weight(gsf_context* ctx, sample_case* s) {
     const char* name = "transformer_blocks.1.ff.net.2.weight";
     gsf_nn_tensor* tensor = NULL;
@@ -643,13 +652,13 @@ static void test_resume(gsf_context* ctx, sample_case* s) {
         gsf_nn_sample_stats stats = run_sample(ctx, s, s->video);
         CHECK(stats.resumed_from == 3 && stats.steps == 3);
         CHECK(memcmp(s->video, reference, s->values * sizeof(float)) == 0);
-        stats = run_sample(ctx, s, s->video); // nothing is left to do but to decode
+        stats = run_sample(ctx, s, s->video); // only decoding is left
         CHECK(stats.steps == 0 && memcmp(s->video, reference, s->values * sizeof(float)) == 0);
-        s->desc.seed++; // another job: the file does not fit
+        s->desc.seed++; // another seed: the checkpoint does not match
         stats = run_sample(ctx, s, s->video);
         CHECK(stats.resumed_from == 0 && stats.steps == 6);
         s->desc.seed--;
-        CHECK_OK(ctx, gsf_write_file(ctx, path, "GSFCHUNKgarbage", 15)); // a broken one neither
+        CHECK_OK(ctx, gsf_write_file(ctx, path, "GSFCHUNKgarbage", 15)); // nor is a damaged checkpoint used
         stats = run_sample(ctx, s, s->video);
         CHECK(stats.resumed_from == 0 && memcmp(s->video, reference, s->values * sizeof(float)) == 0);
     }
@@ -665,7 +674,7 @@ static void hear(void* user, gsf_log_level level, const char* text) {
     if (level == GSF_LOG_WARNING) snprintf(last_warning, sizeof last_warning, "%s", text);
 }
 
-// A checkpoint of another precision, schedule or weight is not gone on from, and a line tells.
+// A checkpoint of another precision, schedule or weights is ignored, and the log says so.
 static void test_other_models(gsf_context* ctx, sample_case* s) {
     const char* path = test_scratch("models.checkpoint");
     sample_case other;
@@ -704,7 +713,7 @@ static void test_other_models(gsf_context* ctx, sample_case* s) {
     s->desc.steps = 0;
 }
 
-// Frame counts that it was not trained on are to be asked for.
+// Frame counts other than the trained one must be enabled with any_frames.
 static void test_any_frames(gsf_context* ctx, sample_case* s) {
     s->desc.frames = 1;
     s->desc.steps = 1;
@@ -712,7 +721,7 @@ static void test_any_frames(gsf_context* ctx, sample_case* s) {
     CHECK(strstr(ctx->error, "any_frames") != NULL);
     s->desc.any_frames = 1;
     CHECK(run_sample(ctx, s, s->video).steps == 1);
-    s->desc.frames = 9; // the same clip, once as if 9 were another count
+    s->desc.frames = 9; // the same clip, then as if 9 were not the trained count
     s->desc.guidance = 1.0f;
     run_sample(ctx, s, s->video);
     float* sines = (float*)malloc(s->values * sizeof(float));
@@ -743,7 +752,8 @@ static void test_workers(const char* features, clip* c) {
     CHECK(sums[0] == sums[1]);
 }
 
-static void test_memory(const char* features, clip* c) { // each of the first ten allocations fails, then some later ones
+// each of the first ten allocations fails, then some later ones
+static void test_memory(const char* features, clip* c) {
     counter count;
     memset(&count, 0, sizeof count);
     gsf_context ctx;

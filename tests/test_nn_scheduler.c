@@ -8,7 +8,7 @@
 
 #define COUNT_OF(array) (sizeof(array) / sizeof((array)[0]))
 
-// ---- clean latents that are Gaussian, mean MEAN and deviation s: what the best model predicts, and where the flow goes
+// ---- Gaussian clean latents with mean MEAN and deviation s: the ideal model's prediction and the exact flow
 
 #define MEAN 0.5
 
@@ -27,8 +27,8 @@ static const double drawn[VALUES] = {-1.0, 0.3, 1.5, -2.2};
 
 typedef struct flow_error { double at_199, at_end; } flow_error;
 
-// Runs a solver on the Gaussian flow; largest error on arrival at time step 199, which all grids used here hold, and at the
-// end, after the jump to abar = 1.
+// Runs a solver on the Gaussian flow. Returns the largest error at time step 199, which all grids used here contain,
+// and at the end, after the jump to abar = 1.
 static flow_error run_flow(gsf_context* ctx, const gsf_nn_schedule* schedule, gsf_nn_solver solver, int steps,
                            double strength, double s) {
     flow_error error = {-1.0, -1.0};
@@ -70,19 +70,19 @@ static void test_order(gsf_context* ctx, const gsf_nn_schedule* schedule) {
             CHECK(order < high[solver]);
             CHECK(fine.at_end < coarse.at_end);
         }
-    for (int k = 0; k < 2; k++) { // few steps, where it counts
+    for (int k = 0; k < 2; k++) { // few steps, where the order matters most
         const double s = k ? 1.0 : 0.3;
         double error[3];
         for (int solver = 0; solver < 3; solver++)
             error[solver] = run_flow(ctx, schedule, (gsf_nn_solver)solver, 10, 1.0, s).at_199;
         CHECK(error[1] < 0.6 * error[0] && error[2] < 0.6 * error[1]);
     }
-    for (int solver = 0; solver < 3; solver++) // as few as can be
+    for (int solver = 0; solver < 3; solver++) // the smallest numbers of steps
         for (int steps = 1; steps <= 3; steps++)
             CHECK(run_flow(ctx, schedule, (gsf_nn_solver)solver, steps, 1.0, 0.3).at_end < 1.0);
 }
 
-// ---- the formulas as diffusers has them, in lambda; only where no lambda is infinite
+// ---- the formulas as in diffusers, in lambda; only where every lambda is finite
 
 typedef struct lambda_point { double a, s, l; } lambda_point;
 
@@ -91,14 +91,15 @@ static lambda_point lambda_at(double bar) {
     return p;
 }
 
-// multistep_dpm_solver_second_order_update (dpmsolver++, midpoint); p[0] is where x is, p[1] before it (order 2).
+// multistep_dpm_solver_second_order_update (dpmsolver++, midpoint); p[0] is the point of x, p[1] the one before it
+// (order 2).
 static double plain_predictor(int order, lambda_point t, const lambda_point p[2], double x, const double m[2]) {
     const double h = t.l - p[0].l, r0 = order > 1 ? (p[0].l - p[1].l) / h : 1.0;
     const double d1 = order > 1 ? (m[0] - m[1]) / r0 : 0.0;
     return t.s / p[0].s * x - t.a * (exp(-h) - 1.0) * m[0] - 0.5 * t.a * (exp(-h) - 1.0) * d1;
 }
 
-// multistep_uni_c_bh_update (bh2): x at p[0] is corrected at t by the model's m_t there.
+// multistep_uni_c_bh_update (bh2): corrects x, from p[0] to t, with the model's output m_t at t.
 static double plain_corrector(int order, lambda_point t, const lambda_point p[2], double x, const double m[2],
                               double m_t) {
     const double h = t.l - p[0].l, hh = -h, phi1 = expm1(hh), b_h = expm1(hh);
@@ -112,7 +113,7 @@ static double plain_corrector(int order, lambda_point t, const lambda_point p[2]
     return t.s / p[0].s * x - t.a * phi1 * m[0] - t.a * b_h * (rho[0] * d1 + rho[1] * (m_t - m[0]));
 }
 
-// A model that is no linear function, so that every term counts.
+// A nonlinear model, so that every term contributes.
 static double some_model(double bar, double x) { return 0.4 * sin(3.0 * x + bar) - 0.2 * x * sqrt(1.0 - bar); }
 
 static void test_formulas(gsf_context* ctx) {
@@ -120,7 +121,7 @@ static void test_formulas(gsf_context* ctx) {
     gsf_nn_schedule schedule;
     memset(&schedule_desc, 0, sizeof schedule_desc);
     schedule_desc.no_zero_snr = 1;
-    schedule_desc.no_alpha_one = 1; // the last lambda is finite, too
+    schedule_desc.no_alpha_one = 1; // so that the last lambda is finite, too
     CHECK_OK(ctx, gsf_nn_make_schedule(ctx, &schedule_desc, &schedule));
     for (int solver = GSF_NN_SOLVER_DPMPP_2M; solver <= GSF_NN_SOLVER_UNIPC; solver++)
         for (int steps = 1; steps <= 12; steps++) {
@@ -163,7 +164,7 @@ static void test_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule) {
         for (int i = 1; i < steps; i++) ok &= t[i] < t[i - 1];
         CHECK(ok);
     }
-    // halves, where numpy's way of counting decides (np.round(np.arange(1000, 0, -1000/48)) - 1)
+    // values at .5, where numpy's arithmetic decides (np.round(np.arange(1000, 0, -1000/48)) - 1)
     static const int32_t by_48[] = {999, 978, 957, 936, 916, 895, 874, 853};
     CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, schedule, 48, 0.0, t, &count));
     for (size_t i = 0; i < COUNT_OF(by_48); i++) CHECK(t[i] == by_48[i]);
@@ -192,7 +193,8 @@ static void test_timesteps(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     CHECK_OK(ctx, gsf_nn_make_schedule(ctx, &desc, &other));
     CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 4, 1.0, t, &count));
     CHECK(t[0] == 999 && t[1] == 666 && t[2] == 333 && t[3] == 0);
-    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 7, 1.0, t, &count)); // 832.5, 666, 499.5, ...: half to even
+    // 832.5, 666, 499.5, ...: rounded half to even
+    CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 7, 1.0, t, &count));
     CHECK(t[1] == 832 && t[2] == 666 && t[3] == 500 && t[4] == 333 && t[5] == 166 && t[6] == 0);
     CHECK_OK(ctx, gsf__nn_make_timesteps(ctx, &other, 1, 1.0, t, &count));
     CHECK(count == 1 && t[0] == 0);
@@ -252,7 +254,7 @@ static void test_configs(gsf_context* ctx) {
         if (fault == 5) desc.spacing = (gsf_nn_spacing)3;
         CHECK_RESULT(ctx, gsf_nn_make_schedule(ctx, &desc, &schedule), GSF_ERROR_INVALID_ARGUMENT);
     }
-    gsf_nn_schedule_desc still; // betas that leave 1 as it is
+    gsf_nn_schedule_desc still; // betas so small that 1 - beta rounds to 1
     memset(&still, 0, sizeof still);
     still.beta_start = still.beta_end = 1e-20;
     CHECK_RESULT(ctx, gsf_nn_make_schedule(ctx, &still, &schedule), GSF_ERROR_DEGENERATE);
@@ -260,7 +262,7 @@ static void test_configs(gsf_context* ctx) {
     CHECK_RESULT(ctx, gsf_nn_load_schedule(ctx, test_scratch("absent.json"), &schedule), GSF_ERROR_NOT_FOUND);
 }
 
-// Betas so large that abar is 0 long before the last of the steps.
+// Betas so large that abar reaches 0 long before the last step.
 static void test_steep_config(gsf_context* ctx) {
     static const char text[] = "{\"prediction_type\":\"v_prediction\",\"clip_sample\":false,\"beta_start\":0.9,"
                                "\"beta_end\":0.99,\"rescale_betas_zero_snr\":true}";
@@ -281,12 +283,13 @@ static void fill_noise(float* x, size_t count, uint64_t stream) {
     for (size_t i = 0; i < count; i++) x[i] = (float)gsf_draw_normal(7, stream, i);
 }
 
-static void backward_for(void* user, size_t chunks, gsf_chunk_fn body, void* arg) { // another order, other workers
+// another order of work, other workers
+static void backward_for(void* user, size_t chunks, gsf_chunk_fn body, void* arg) {
     for (size_t i = chunks; i-- > 0;) body(arg, i, (int)(i % 3));
     ++*(int*)user;
 }
 
-// The same bits in another order of work, and when a run is taken up again from what a checkpoint keeps.
+// The same bits with another order of work, and when a run resumes from the state that a checkpoint stores.
 static void test_repeatable(gsf_context* ctx, const gsf_nn_schedule* schedule) {
     enum { COUNT = 2 * 65536 + 77, STEPS = 7, STOP = 4 };
     float* x[3];
@@ -307,7 +310,7 @@ static void test_repeatable(gsf_context* ctx, const gsf_nn_schedule* schedule) {
             fill_noise(x[k], COUNT, 1);
         }
         for (int i = 0; i < STEPS; i++) {
-            if (i == STOP) { // x[2] goes on in a new sampler
+            if (i == STOP) { // x[2] continues in a new sampler
                 gsf_nn_sampler resumed;
                 CHECK_OK(ctx, gsf_nn_make_sampler(ctx, schedule, &desc, &resumed));
                 CHECK(resumed.memory_count == s[2].memory_count);
@@ -380,7 +383,7 @@ static void test_memory(void) {
     }
 }
 
-// ---- positions: what the golden tables do not ask
+// ---- positions: what the golden tables do not cover
 
 static void test_positions(gsf_context* ctx) {
     gsf__nn_rope_desc d = {2, 3, 4, 3, 4, 16, 0.0};

@@ -1,5 +1,5 @@
-// The text half of the restorer: tokenizer and T5 encoder on made and golden models; bad files, odd texts, out of memory,
-// workers, cancelling. (golden_restorer compares with transformers.)
+// The text half of the restorer: tokenizer and T5 encoder on synthetic and golden models; damaged files, unusual texts,
+// out of memory, workers, cancellation. (golden_restorer compares with transformers.)
 //
 //     test_nn_text --tokenize FOLDER    reads texts from stdin, each a 32-bit size and as many bytes, and prints the ids of
 //                                       each on a line: what tests/compare_tokenizer.py runs
@@ -13,7 +13,7 @@
 static gsf_context ctx;
 static uint64_t seed = 11;
 
-// ---- tokenizer: what it says --------------------------------------------------------
+// ---- tokenizer: expected ids --------------------------------------------------------
 
 static gsf_result open_made(gsf_context* c, int flags, gsf_nn_tokenizer* t) {
     made_bytes m;
@@ -21,7 +21,7 @@ static gsf_result open_made(gsf_context* c, int flags, gsf_nn_tokenizer* t) {
     return gsf__nn_parse_tokenizer(c, "made", m.data, m.size, NULL, 0, t);
 }
 
-// ids: of the text without the end.
+// ids: those of the text without </s>.
 static void expect_ids(int flags, const char* text, size_t size, const int32_t* ids, size_t count) {
     gsf_nn_tokenizer t;
     int32_t got[64];
@@ -43,16 +43,16 @@ static void test_made(void) {
     static const struct { int flags; const char* text; size_t count; int32_t ids[12]; } cases[] = {
         {0, "", 0, {0}},
         {0, "   ", 0, {0}},
-        {0, "ab", 1, {8}},                   // -5, not -3 -3
-        {0, "  ab \t ab  ", 2, {8, 8}},      // spaces of the text and of the map
+        {0, "ab", 1, {8}},                   // the piece of score -5 beats two of -3
+        {0, "  ab \t ab  ", 2, {8, 8}},      // spaces of the text and those that the map produces
         {0, "a", 2, {3, 4}},
         {0, "abc", 2, {8, 6}},
-        {0, "A", 4, {3, 5, 3, 6}},           // "b c"
-        {0, "QQa", 2, {3, 4}},               // nothing
-        {0, "Q", 0, {0}},                    // the prefix alone goes, too
-        {0, "xyz", 2, {3, 2}},               // a run of unknown ones
+        {0, "A", 4, {3, 5, 3, 6}},           // mapped to "b c"
+        {0, "QQa", 2, {3, 4}},               // Q is mapped to nothing
+        {0, "Q", 0, {0}},                    // the remaining prefix is removed, too
+        {0, "xyz", 2, {3, 2}},               // a run of unknown characters is one token
         {0, "xuz", 2, {3, 2}},
-        {0, "u", 2, {3, 11}},                // unknown to the spelling, but a piece's text
+        {0, "u", 2, {3, 11}},                // segmentation skips unused pieces, but the text equals one
         {0, "xayb", 5, {3, 2, 4, 2, 5}},
         {0, "[K]a[K]", 4, {3, 10, 4, 10}},
         {0, "[K", 2, {3, 2}},
@@ -66,7 +66,7 @@ static void test_made(void) {
         {MADE_NO_MAP, "A\t", 2, {3, 2}},
         {MADE_BYTES, "xa", 3, {3, 14 + 'x', 4}},
         {MADE_BYTES, "\xc3\xa9", 3, {3, 14 + 0xc3, 14 + 0xa9}},
-        // added tokens: no pieces of the text around them, each stretch with a prefix of its own
+        // Added tokens: pieces never extend across them, and each stretch between them has its own prefix.
         {0, "ab<pad>ab", 3, {8, 0, 8}},
         {0, "<pad></s><unk>", 3, {0, 1, 2}},
         {0, "ab <extra_id_0> ab", 3, {8, 113, 8}},
@@ -78,7 +78,7 @@ static void test_made(void) {
         size_t count = cases[i].count;
         int32_t ids[12];
         memcpy(ids, cases[i].ids, sizeof ids);
-        if (strcmp(cases[i].text, "<extra_id_1") == 0) count = 4, ids[2] = 4, ids[3] = 2; // the "a" within
+        if (strcmp(cases[i].text, "<extra_id_1") == 0) count = 4, ids[2] = 4, ids[3] = 2; // the "a" in the middle
         expect_ids(cases[i].flags, cases[i].text, strlen(cases[i].text), ids, count);
     }
     static const int32_t zero[] = {3, 4, 2, 5}, malformed[] = {3, 4, 2, 5};
@@ -102,22 +102,22 @@ static void test_room(void) {
             CHECK(ids[i] == (i >= room ? -7 : i < kept ? (i ? 7 : 8) : i == kept ? t.end_id : t.pad_id));
         }
     }
-    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ab</s>", 6, ids, 8, &count)); // no second end
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ab</s>", 6, ids, 8, &count)); // </s> is not added twice
     CHECK(count == 2 && ids[0] == 8 && ids[1] == 1 && ids[2] == 0);
-    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ab</s>ab", 8, ids, 3, &count)); // nor where it is cut off
+    CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "ab</s>ab", 8, ids, 3, &count)); // nor when the text is truncated there
     CHECK(count == 4 && ids[0] == 8 && ids[1] == 1 && ids[2] == 0);
     CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, NULL, 0, ids, 2, &count));
     CHECK(count == 1 && ids[0] == 1 && ids[1] == 0);
     gsf_nn_destroy_tokenizer(&ctx, &t);
-    gsf_nn_destroy_tokenizer(&ctx, &t); // twice is fine
+    gsf_nn_destroy_tokenizer(&ctx, &t); // destroying twice is allowed
 }
 
-// ---- tokenizer: odd texts -----------------------------------------------------------
+// ---- tokenizer: unusual texts -------------------------------------------------------
 
 static void check_ids(const gsf_nn_tokenizer* t, const char* text, size_t size) {
     size_t count = 0;
     int32_t padded[226];
-    char* exact = (char*)malloc(size ? size : 1); // so that a sanitizer sees the first byte read past it
+    char* exact = (char*)malloc(size ? size : 1); // so that a sanitizer detects a read past the end
     memcpy(exact, text, size);
     CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, t, exact, size, padded, 226, &count));
     int32_t* all = (int32_t*)malloc(count * sizeof *all);
@@ -150,7 +150,7 @@ static void test_odd_texts(const gsf_nn_tokenizer* t) {
     }
 }
 
-// A megabyte of the same few characters: the time per byte must not grow, nor the memory.
+// A megabyte of the same few characters: neither time per byte nor memory per byte may grow.
 static void test_long_texts(const char* folder) {
     static const char* const units[] = {"a", " ", "The video ", "<", "<pad>x", "\xf0\x9f\x98\x80", "\xff", "\xef\xb7\xba"};
     enum { SIZE = 1 << 20 };
@@ -176,7 +176,7 @@ static void test_long_texts(const char* folder) {
     free(text);
 }
 
-// ---- tokenizer: bad files -----------------------------------------------------------
+// ---- tokenizer: damaged files -------------------------------------------------------
 
 static int accepted, refused;
 
@@ -205,7 +205,7 @@ static void test_bad_made(void) {
     for (size_t size = 0; size < m.size; size++) try_model(m.data, size);
     for (size_t i = 0; i < m.size; i++) {
         static const unsigned char flips[] = {1, 2, 4, 128, 255};
-        if (i > 300 && i + 300 < m.size && i % 5) continue; // most of it is the map's empty units
+        if (i > 300 && i + 300 < m.size && i % 5) continue; // most of the file is empty units of the map
         for (size_t k = 0; k < sizeof flips; k++) {
             changed = m;
             changed.data[i] ^= flips[k];
@@ -237,7 +237,7 @@ static void test_bad_golden(const char* folder) {
     }
 }
 
-// One thing wrong at a time, each with its own sentence.
+// One fault at a time, each with its own error message.
 static void expect_refused(const made_bytes* m, gsf_result wanted, const char* words) {
     gsf_nn_tokenizer t;
     CHECK_RESULT(&ctx, gsf__nn_parse_tokenizer(&ctx, "bad.model", m->data, m->size, NULL, 0, &t), wanted);
@@ -268,7 +268,7 @@ static void test_refusals(void) {
     }
     made_spiece(0, &m);
     part.size = 0;
-    made_varint(&part, 35, 1); // bytes for unknown characters, but no byte pieces
+    made_varint(&part, 35, 1); // byte fallback without byte pieces
     made_field(&m, 2, part.data, part.size);
     expect_refused(&m, GSF_ERROR_FORMAT, "byte 0");
     made_spiece(0, &m);
@@ -386,7 +386,7 @@ static void test_t5_runs(void) {
     CHECK_OK(&three, gsf_init_context(&three));
     CHECK_OK(&three, gsf_nn_encode_t5(&three, &net, &in, other));
     CHECK(memcmp(one, other, values * sizeof(float)) == 0);
-    for (int b = 0; b < BATCH; b++) { // a batch is its prompts
+    for (int b = 0; b < BATCH; b++) { // a batch gives the same as its prompts one by one
         gsf_nn_t5_desc single = in;
         single.batch = 1;
         single.ids = ids + b * TOKENS;
@@ -414,7 +414,7 @@ static void cancel_at_first(void* user, const char* stage, double done, double t
     gsf_request_cancel((gsf_context*)user);
 }
 
-static size_t largest; // of the blocks asked for
+static size_t largest; // of the requested blocks
 static void* measured_alloc(void* user, size_t size) {
     if (size > largest) largest = size;
     return counted_alloc(user, size);
@@ -475,7 +475,7 @@ static void test_t5_hooks(void) {
     free(out);
 }
 
-// ---- T5: folders that are wrong
+// ---- T5: invalid folders
 
 typedef struct changed_model { // the golden model with one tensor changed, in one file
     gsf_nn_weights weights;
@@ -497,7 +497,7 @@ static void open_changed(changed_model* m) {
     memcpy(m->tensors, m->weights.tensors, m->count * sizeof *m->tensors);
 }
 
-static void expect_t5(changed_model* m, gsf_result wanted, const char* words) { // of opening, or else of running
+static void expect_t5(changed_model* m, gsf_result wanted, const char* words) { // on loading or else on encoding
     gsf_nn_t5 net;
     CHECK_OK(&ctx, gsf_nn_save_tensors(&ctx, test_scratch("model.safetensors"), m->tensors, m->count));
     gsf_result result = gsf_nn_load_t5(&ctx, test_scratch("."), &net);
@@ -542,7 +542,7 @@ static void test_t5_weights(void) {
     t = changed_tensor(&m, down);
     t->data = values;
     t->dtype = GSF_NN_F32;
-    for (int64_t i = 0; i < t->count; i++) values[i] = 3e38f; // finite, but its products are not
+    for (int64_t i = 0; i < t->count; i++) values[i] = 3e38f; // finite, but their products are not
     expect_t5(&m, GSF_ERROR_NUMERIC, "encoder.block.1.");
     free(values);
     open_changed(&m);
@@ -570,7 +570,7 @@ static void test_t5_configs(void) {
         {"{\"d_model\":64,\"d_kv\":16,\"num_heads\":4,\"d_ff\":128,\"num_layers\":2,\"vocab_size\":9,"
          "\"feed_forward_proj\":\"gated-gelu\",\"relative_attention_max_distance\":8}", GSF_ERROR_UNSUPPORTED},
         {"{\"d_model\":64,\"d_kv\":16,\"num_heads\":4,\"d_ff\":128,\"num_layers\":2,\"vocab_size\":9,"
-         "\"feed_forward_proj\":\"gated-gelu\"}", GSF_ERROR_FORMAT}, // another vocabulary than the table's
+         "\"feed_forward_proj\":\"gated-gelu\"}", GSF_ERROR_FORMAT}, // not the vocabulary size of the embedding table
         {"{\"d_model\":-64}", GSF_ERROR_FORMAT}};
     gsf_nn_t5 net;
     for (size_t i = 0; i < sizeof configs / sizeof configs[0]; i++) {

@@ -38,7 +38,7 @@ static void run_linear(gsf_context* ctx, run_output* run) {
     d.accumulate = 1;
     d.y = y;
     CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
-    d.rows = 2; // a product of its own
+    d.rows = 2; // few rows take the GEMV kernels
     CHECK_OK(ctx, gsf__nn_run_linear(ctx, NULL, &d));
     d.rows = ROWS;
     if (CHECK_OK(ctx, gsf__nn_quantize_weight(ctx, &weight, 0, &quantized))) {

@@ -1,5 +1,5 @@
-// test_nn_vae.c - convolutions against a double reference; a small random autoencoder: cpu levels, workers, tiles, chunks,
-// bad files, NaN, cancel and lack of memory. golden_restorer compares with diffusers.
+// test_nn_vae.c - convolutions against a double-precision reference; a small random autoencoder: CPU levels, workers,
+// tiles, chunks, damaged files, NaN, cancellation, out of memory. golden_restorer compares with diffusers.
 // gcc -O2 -std=c11 -fopenmp -I. -Itests tests/test_nn_vae.c -lm
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
@@ -59,7 +59,7 @@ static double case_output(const conv_case* c, const float* x, const float* befor
     return sum;
 }
 
-// Weights as bf16 or f16 at an odd address; `w` becomes what they stand for.
+// Weights as bf16 or f16 at an odd address; `w` is rounded to the values that they represent.
 static void* narrow_weights(float* w, size_t count, gsf_nn_dtype dtype, char** base) {
     *base = (char*)malloc(count * 2 + 1);
     for (size_t i = 0; i < count; i++) {
@@ -178,7 +178,8 @@ static void add_conv(vae_file* f, int64_t in, int64_t out, int64_t kt, int64_t k
     add_tensor(f, 1, shape, 0.0, 0.2, "%s.bias", name);
 }
 
-static void add_norm(vae_file* f, int64_t channels, int64_t latents, const char* name) { // latents 0: a plain group norm
+// latents 0: a plain group norm
+static void add_norm(vae_file* f, int64_t channels, int64_t latents, const char* name) {
     char full[96];
     add_tensor(f, 1, &channels, 1.0, 0.5, "%s%s.weight", name, latents ? ".norm_layer" : "");
     add_tensor(f, 1, &channels, 0.0, 0.5, "%s%s.bias", name, latents ? ".norm_layer" : "");
@@ -281,7 +282,7 @@ typedef struct vae_result {
 
 static void free_result(vae_result* r) { free(r->mean), free(r->logvar), free(r->video); }
 
-// Encodes random frames, and decodes the mean.
+// Encodes random frames and decodes the mean.
 static vae_result both_ways(gsf_context* ctx, const gsf_nn_vae_desc* desc, int64_t frames, int64_t height, int64_t width) {
     gsf_nn_vae vae;
     vae_result r;
@@ -317,7 +318,8 @@ static void compare_results(const vae_result* a, const vae_result* b, double tol
     }
 }
 
-// Other channels, groups, levels and layers than the golden model's: AVX2 against scalar, one worker against three.
+// Channels, groups, levels and layers that differ from the golden model's: AVX2 against scalar, one worker against
+// three.
 static void test_levels_and_workers(void) {
     static const vae_shape shapes[] = {{{6, 12, 20, 0}, 3, 2, 1, 4, 4}, {{5, 10, 0, 0}, 2, 5, 2, 3, 2},
                                        {{16, 0, 0, 0}, 1, 1, 1, 2, 4}, {{8, 8, 16, 24}, 4, 4, 1, 5, 8}};
@@ -382,7 +384,7 @@ static void metered_free(void* user, void* memory) {
     free(p);
 }
 
-// The bytes that the query promises are those that a run takes, but for small change; more than max_bytes is refused.
+// A run takes the bytes that the query reports, apart from small allocations; more than max_bytes is refused.
 static void test_memory(void) {
     gsf_context ctx;
     gsf_nn_vae vae;
@@ -443,13 +445,13 @@ static void test_tiles(gsf_context* ctx, const gsf_nn_vae* vae) {
     vae_result whole = both_ways(ctx, NULL, 5, 44, 56);
     compare_results(&b, &a, 5e-6);
     CHECK(rel_l2(b.mean, whole.mean, b.latents) > 1e-3);
-    // A picture no larger than a tile is not tiled.
+    // An image no larger than a tile is not tiled.
     vae_result small = both_ways(ctx, &desc, 5, 24, 20), untiled = both_ways(ctx, NULL, 5, 24, 20);
     compare_results(&small, &untiled, 0.0);
     free_result(&a), free_result(&b), free_result(&whole), free_result(&small), free_result(&untiled);
 }
 
-// ---- bad files
+// ---- damaged files
 
 static void expect_bad(gsf_context* ctx, const vae_file* f, gsf_result code, const char* text) {
     gsf_nn_vae vae;
@@ -505,7 +507,7 @@ static void test_bad_configs(gsf_context* ctx) {
     save_config(ctx, &tiny, "");
 }
 
-// ---- NaN, cancel, lack of memory
+// ---- NaN, cancellation, out of memory
 
 static int all_zero(const float* x, size_t count) {
     for (size_t i = 0; i < count; i++)
@@ -528,7 +530,7 @@ static void test_nan(gsf_context* ctx) {
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = NAN;
     CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_ERROR_NUMERIC);
     CHECK(strstr(ctx->error, "channel 2, frame 4, row 1, column 2") != NULL);
-    latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = 1e30f; // finite, but not for long
+    latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = 1e30f; // finite, but overflows later
     CHECK_RESULT(ctx, gsf_nn_decode_vae(ctx, &vae, NULL, latents, FRAMES, SIDE, SIDE, video), GSF_OK);
     latents[2 * FRAMES * SIDE * SIDE + 4 * SIDE * SIDE + 1 * SIDE + 2] = 3e38f;
     for (int i = 0; i < 4; i++) latents[(i * FRAMES + 4) * SIDE * SIDE + 5] = i % 2 ? -3.4e38f : 3.4e38f;
@@ -592,7 +594,7 @@ static void test_cancel(void) {
     free(mean);
 }
 
-// Opening, and decoding in tiles; `fail_at`-th allocation fails.
+// Opening, and decoding in tiles, while allocation `fail_at` fails.
 static gsf_result run_short_of_memory(counter* c) {
     gsf_context ctx;
     gsf_nn_vae vae;
