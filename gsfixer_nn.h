@@ -1023,7 +1023,7 @@ static gsf_result gsf__nn_entry_fail(const gsf__nn_header* h, const gsf_json_val
 static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
     const gsf_json_value* value = gsf_find_json_member(&h->json, entry, "dtype");
     if (!value || value->type != GSF_JSON_STRING)
-        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"dtype\" is not given as a string");
+        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"dtype\" is not a string");
     for (int i = GSF_NN_F32; i <= GSF_NN_I64; i++) {
         out->dtype = (gsf_nn_dtype)i;
         if (strcmp(value->string, gsf__nn_dtype_name(out->dtype)) == 0) return GSF_OK;
@@ -1038,7 +1038,7 @@ static gsf_result gsf__nn_read_dtype(const gsf__nn_header* h, const gsf_json_val
 static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_value* entry, gsf_nn_tensor* out) {
     const gsf_json_value* value = gsf_find_json_member(&h->json, entry, "shape");
     if (!value || value->type != GSF_JSON_ARRAY)
-        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"shape\" is not given as a list");
+        return gsf__nn_entry_fail(h, value ? value : entry, entry, GSF_ERROR_FORMAT, "\"shape\" is not a list");
     if (value->count > GSF_NN_MAX_RANK)
         return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_UNSUPPORTED, "more than 8 dimensions");
     uint64_t count = 1, size;
@@ -1064,7 +1064,7 @@ static gsf_result gsf__nn_read_place(const gsf__nn_header* h, const gsf_json_val
                                   "\"data_offsets\" is not a list of two non-negative integers");
     char text[160];
     if (begin > end || end > h->data_size) {
-        snprintf(text, sizeof text, "bytes %llu to %llu do not lie in the %llu bytes of data", (unsigned long long)begin,
+        snprintf(text, sizeof text, "bytes %llu to %llu are outside the %llu bytes of data", (unsigned long long)begin,
                  (unsigned long long)end, (unsigned long long)h->data_size);
         return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, text);
     }
@@ -1733,7 +1733,7 @@ GSF__SHARED gsf_result gsf__nn_config_string(const gsf__nn_config* config, const
     const gsf_json_value* value = gsf__nn_config_find(config, key);
     *out = fallback;
     if (!value && fallback) return GSF_OK;
-    if (!value || value->type != GSF_JSON_STRING) return gsf__nn_config_fail(config, value, key, "a text");
+    if (!value || value->type != GSF_JSON_STRING) return gsf__nn_config_fail(config, value, key, "a string");
     *out = value->string;
     return GSF_OK;
 }
@@ -2026,7 +2026,7 @@ static float gsf__nn_activation_ref(gsf__nn_activation activation, float x) {
 // Results of 32 MiB and more bypass the caches (`stream`): lines that are fully overwritten need not be read first.
 enum { GSF__NN_STREAM = 1 << 23 }; // values
 
-// pieces are multiples of `row`
+// Whether to stream the results to y; the pieces of work are multiples of `row`.
 static int gsf__nn_streams(const float* x, const float* y, int64_t count, int64_t row) {
     return x != y && count >= GSF__NN_STREAM && row % 16 == 0 && (uintptr_t)y % 64 == 0;
 }
@@ -2086,8 +2086,8 @@ GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
     return gsf__v_nmadd(z, power * (t * tail), gsf__v_max(gsf__v_set(0.0f), x));
 }
 
-// As gsf__nn_activation_ref, and -0, the limit, at -inf; a NaN stays a NaN. `activation` must be a compile-time
-// constant in loops, for speed.
+// As gsf__nn_activation_ref, and -0, the limit, at -inf; a NaN stays a NaN.
+// In loops pass `activation` as a compile-time constant.
 GSF__V_INLINE gsf__vf gsf__v_activate(gsf__nn_activation activation, gsf__vf x) {
     const gsf__vf one = gsf__v_set(1.0f);
     if (activation == GSF__NN_GELU_TANH) { // x / (1 + 2^-(a x + b x^3)), a = 2 sqrt(2 / pi) log2 e, b = 0.044715 a
@@ -3721,7 +3721,7 @@ static void gsf__int8_butterflies(float* x, int64_t block, int64_t half) { // on
         }
 }
 
-static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // their bits order magnitudes; NaN is last
+static uint32_t gsf__int8_top(const float* x, int64_t count, uint32_t top) { // bits order magnitudes: inf, NaN last
     for (int64_t i = 0; i < count; i++) {
         uint32_t bits;
         memcpy(&bits, x + i, sizeof bits);

@@ -210,7 +210,7 @@ static void test_configs(gsf_context* ctx) {
         {"{\"prediction_type\":\"v_prediction\"}", GSF_ERROR_UNSUPPORTED, "clip_sample"},
         {"{\"prediction_type\":\"sample\",\"clip_sample\":false}", GSF_ERROR_UNSUPPORTED,
          "prediction_type is sample, not v_prediction"},
-        {"{\"prediction_type\":7}", GSF_ERROR_FORMAT, "prediction_type is not a text"},
+        {"{\"prediction_type\":7}", GSF_ERROR_FORMAT, "prediction_type is not a string"},
         {"{\"prediction_type\":\"v_prediction\",\"clip_sample\":false,\"thresholding\":true}", GSF_ERROR_UNSUPPORTED,
          "thresholding"},
         {"{\"prediction_type\":\"v_prediction\",\"clip_sample\":false,\"trained_betas\":[0.1]}", GSF_ERROR_UNSUPPORTED,
