@@ -513,7 +513,7 @@ typedef struct gsf_nn_sample_desc {
     int32_t no_reference_cache;     // project the references' keys and values again in every step, to save memory
     uint64_t seed;
     const float* noise;             // (latent frames, latent channels, height/8, width/8); NULL: drawn from the seed
-    double max_bytes;               // runs that need more fail with GSF_ERROR_OUT_OF_MEMORY before starting; 0: no limit
+    double max_bytes;               // larger needs fail with GSF_ERROR_OUT_OF_MEMORY before starting; 0: no limit
     const char* checkpoint;         // file written after every step, and resumed from if the model, precision, settings
                                     // and inputs match; NULL: none
     const gsf__nn_tap* _tap;        // private
@@ -1044,7 +1044,8 @@ static gsf_result gsf__nn_read_shape(const gsf__nn_header* h, const gsf_json_val
     uint64_t count = 1, size;
     for (uint32_t i = value->child; i; i = h->json.values[i].next) {
         if (!gsf__nn_read_size(h->text, &h->json.values[i], &size))
-            return gsf__nn_entry_fail(h, &h->json.values[i], entry, GSF_ERROR_FORMAT, "a dimension is not a non-negative integer");
+            return gsf__nn_entry_fail(h, &h->json.values[i], entry, GSF_ERROR_FORMAT,
+                                      "a dimension is not a non-negative integer");
         if (size != 0 && count > (uint64_t)INT64_MAX / size)
             return gsf__nn_entry_fail(h, value, entry, GSF_ERROR_FORMAT, "the shape overflows");
         count *= size;
