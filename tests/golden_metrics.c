@@ -64,7 +64,7 @@ static double at(const gsf_image* image, int64_t x, int64_t y, int32_t c) {
     return image->dtype == GSF_U8 ? *(const uint8_t*)p / 255.0 : (double)*(const float*)(const void*)p;
 }
 
-// scikit-image's default SSIM, as its documentation defines it, written without any cleverness. mask may be NULL.
+// scikit-image's default SSIM as its documentation defines it, implemented directly. mask may be NULL.
 static double plain_ssim_skimage(const gsf_image* a, const gsf_image* b, const gsf_image* mask) {
     double sum = 0.0;
     int64_t count = 0;
@@ -91,8 +91,8 @@ static double plain_ssim_skimage(const gsf_image* a, const gsf_image* b, const g
     return sum / (double)count;
 }
 
-// The 3DGS SSIM with its full 11x11 window, zeros outside. The window is the product of two float32 rows, rounded to
-// float32 once more; gsf_measure_ssim has a product of two rows of the same sum.
+// The 3DGS SSIM with its full 11x11 window, zeros outside. The window is the outer product of two float32 rows,
+// rounded to float32 again; gsf_measure_ssim applies the two rows separately, with the same sum.
 static double plain_ssim_3dgs(const gsf_image* a, const gsf_image* b, const gsf_image* mask) {
     // float32 of exp(-x^2/4.5) / sum, the sum taken in torch's order
     static const float kernel[11] = {0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f,
@@ -131,7 +131,7 @@ static uint64_t hash_pixels(const pair* p) { // FNV-1a of both images
 }
 
 // structural_similarity(a / 255, b / 255, data_range=1.0, channel_axis=0) of scikit-image 0.26.0 on the committed
-// pairs; the hash tells whether the golden folder in use holds the same pixels.
+// pairs; the hash verifies that the golden folder in use holds the same pixels.
 static const struct { const char* name; uint64_t hash; double ssim; } skimage[] = {
     {"black_white", 14272087802833798949u, 9.9990000999899988e-05},
     {"blur", 11848061275429587887u, 0.70729096266230229},
@@ -148,7 +148,7 @@ static void check_pair(gsf_context* ctx, const gsf_json* json, const gsf_json_va
     const char* name = e->key;
     double got = NAN;
     const double psnr = number_or_inf(json, e, "psnr"), tg = number_or_inf(json, e, "ssim_3dgs");
-    // The references read the photo as float32, so on the f32 images only rounding is left; the u8 images stand for the
+    // The references read the photo as float32, so on the f32 images only rounding differs; the u8 images represent the
     // exact v/255, which moves a PSNR by up to 1e-6 dB.
     CHECK_OK(ctx, gsf_measure_psnr(ctx, &p->fa, &p->fb, NULL, &got));
     test_compare(name, &got, &psnr, 1, 1e-9);
@@ -191,7 +191,7 @@ static void check_masks(gsf_context* ctx, const pair* p) {
         CHECK_OK(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, NULL, &all));
         CHECK(got == all);
         memset(bytes, 0, n);
-        bytes[0] = kind != GSF_SSIM_SKIMAGE; // the corner has no skimage window
+        bytes[0] = kind != GSF_SSIM_SKIMAGE; // no window of scikit-image fits at the corner
         CHECK_RESULT(ctx, gsf_measure_ssim(ctx, (gsf_ssim_kind)kind, &p->a, &p->b, &mask, &got),
                      kind == GSF_SSIM_SKIMAGE ? GSF_ERROR_DEGENERATE : GSF_OK);
     }
@@ -218,7 +218,7 @@ static void check_masks(gsf_context* ctx, const pair* p) {
     free(bytes);
 }
 
-// Same bits for any worker count and instruction set; noise of a size that takes several chunks.
+// Bit-identical for any worker count and instruction set, on a noise image large enough for several chunks.
 static void check_determinism(gsf_context* ctx) {
     enum { W = 211, H = 173 };
     static float a[W * H * 3], b[W * H * 3];

@@ -4,7 +4,7 @@
 //
 // Comparisons bind where the reference's yes/no decisions (1/255, 0.99, 1e-4, depth order) are clear of their
 // thresholds: other pixels get no incoming gradient, are not compared, and are counted.
-// Loss, Adam, learning rates and densification are held against their golden data, too (train_golden.h, which needs the
+// Loss, Adam, learning rates and densification are compared with their golden data, too (train_golden.h, which needs the
 // implementation in this file).
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -16,7 +16,7 @@
 
 // ---- comparison ----------------------------------------------------------------
 
-typedef struct worst { double image, alpha, depth, gradient; } worst; // errors as shares of their tolerances
+typedef struct worst { double image, alpha, depth, gradient; } worst; // errors divided by their tolerances
 
 // max |actual - expected| over rows (of `width` values) with skip[row] == 0; rows scaled by row_scale where given.
 static double max_error(const float* actual, const double* expected, size_t rows, size_t width, const uint8_t* skip,
@@ -37,7 +37,7 @@ static double max_scaled(const double* v, size_t rows, size_t width, const doubl
     return m;
 }
 
-// One check of error <= tolerance; returns their quotient.
+// Checks error <= tolerance; returns error / tolerance.
 static double check_error(const char* label, const char* what, double error, double tolerance) {
     if (!CHECK(error <= tolerance))
         fprintf(stderr, "%s: %s is off by %.3g, allowed %.3g\n", label, what, error, tolerance);
@@ -97,7 +97,7 @@ static void golden_scene(machine* m, const splat_golden* g, int official, worst*
 
 // ---- against the reference -----------------------------------------------------
 
-typedef struct oracle { // a scene with what the reference makes of it
+typedef struct oracle { // a scene with the reference's image and gradients
     gsf_splats* splats;
     gsf_camera* camera;
     gsf_render_desc* desc;
@@ -106,18 +106,18 @@ typedef struct oracle { // a scene with what the reference makes of it
     ref_grads grads;
     loss l;
     double* alpha;
-    double* quat_norm; // quaternion gradients are compared times |q|: small quaternions do not hide the others
+    double* quat_norm; // quaternion gradients are scaled by |q|, or those of small quaternions would dominate
     uint8_t* skip;     // pixels with an unclear decision
     size_t skipped, pixels;
 } oracle;
 
-// Tolerances of every scene against the reference, needles included, and the margin below which a pixel does not count.
+// Tolerances against the reference for every scene, needles included; pixels within MARGIN of a decision are skipped.
 #define IMAGE_TOLERANCE 5e-5
 #define GRADIENT_TOLERANCE 1e-4
 #define MARGIN 1e-4
 #define DEPTH_GAP 1e-6
 
-// d_color: of the golden scene, or NULL for random.
+// d_color: the incoming gradient of the golden scene; NULL: random.
 static oracle oracle_make(const char* label, gsf_splats* splats, gsf_camera* camera, gsf_render_desc* desc,
                           const double* d_color, uint64_t seed) {
     oracle o;
@@ -140,8 +140,8 @@ static oracle oracle_make(const char* label, gsf_splats* splats, gsf_camera* cam
     o.skip = (uint8_t*)calloc(o.pixels + 1, 1);
     for (size_t i = 0; i < o.pixels; i++) {
         o.alpha[i] = 1 - o.image.T[i];
-        // Expected depth is a quotient by alpha, known to 6e-8 / alpha in float32: its gradient fades with alpha, as
-        // that of a loss which does not ask for the depth of nothing.
+        // Expected depth is divided by alpha, so in float32 its error is 6e-8 / alpha. Scale its gradient by alpha, as a
+        // loss would that ignores the depth of empty pixels.
         o.l.d_depth[i] = (double)(float)(o.l.d_depth[i] * o.alpha[i]);
         o.skip[i] = o.image.margin[i] < MARGIN || o.image.depth_gap[i] < DEPTH_GAP;
         if (!o.skip[i]) continue;
@@ -211,7 +211,7 @@ static void oracle_compare(const oracle* o, const char* level, const result* r, 
 typedef enum kind {
     ORDINARY,   // aspect up to 20, in front of the camera
     CROSSERS,   // depths from behind the camera through the near plane
-    AROUND,     // the camera stands in the cloud
+    AROUND,     // the camera is inside the cloud
     OPACITIES,  // logits of +-20
     QUATERNIONS,// lengths 1e-8 .. 1e8, and zero
     SIZES,      // far below a pixel and far above the image
@@ -266,7 +266,7 @@ static random_scene random_scene_make(gsf_context* ctx, uint64_t seed) {
     random_scene r;
     memset(&r, 0, sizeof r);
     uint64_t state = seed * 7919 + 1;
-    r.what = (kind)(seed % KINDS); // every kind meets every size and option in time
+    r.what = (kind)(seed % KINDS); // successive seeds combine every kind with every size and option
     const int32_t* size = sizes[(seed + seed / KINDS) % 7];
     const size_t count = counts[(seed + seed / 7) % 8];
     const int32_t degree = (int32_t)(test_random(&state) * 4);
@@ -289,7 +289,7 @@ static random_scene random_scene_make(gsf_context* ctx, uint64_t seed) {
     }
     const double pixel = 3 / r.camera.fx;
     const ref_options options = ref_options_from(&r.desc);
-    for (size_t i = 0; i < count; i++) { // until no decision about the whole splat is close
+    for (size_t i = 0; i < count; i++) { // redraw until no per-splat decision is near its threshold
         gsf_splats one = r.splats;
         double near_margin, kink_margin, official_margin;
         do {
@@ -324,8 +324,8 @@ static void random_scene_free(gsf_context* ctx, random_scene* r) {
 
 // ---- properties ----------------------------------------------------------------
 
-// What is asked for does not change the values: single outputs, planar views, gradients that accumulate or are not
-// wanted.
+// Values do not depend on which outputs are requested: single outputs, planar views, accumulated gradients, only some of
+// the gradients.
 static void test_requests(machine* m, const random_scene* scene, const oracle* o, const result* whole) {
     gsf_context* ctx = &m->ctx;
     const int64_t W = scene->camera.width, H = scene->camera.height;
@@ -345,7 +345,7 @@ static void test_requests(machine* m, const random_scene* scene, const oracle* o
     CHECK_OK(ctx, gsf_splat_render(ctx, m->rasterizer, &scene->splats, &scene->camera, &scene->desc, &out));
     CHECK(memcmp(planar, whole->depth, whole->pixels * sizeof(float)) == 0);
 
-    // only some gradients, on top of what is there
+    // only the means' gradient, accumulated twice
     const size_t n = scene->splats.count;
     float* d_color = narrow(o->l.d_color, 3 * o->pixels);
     float* d_depth = narrow(o->l.d_depth, o->pixels);
@@ -363,7 +363,7 @@ static void test_requests(machine* m, const random_scene* scene, const oracle* o
     free(d_color); free(d_depth); free(d_alpha); free(means); free(planar);
 }
 
-// Once warm, rendering and its backward take no memory from the allocator.
+// After the first pass, forward and backward passes allocate no memory.
 static void test_steady_memory(machine* m, const random_scene* scene, const oracle* o) {
     result r = render(m, &scene->splats, &scene->camera, &scene->desc, &o->l);
     result_free(&r);
@@ -373,7 +373,7 @@ static void test_steady_memory(machine* m, const random_scene* scene, const orac
     result_free(&r);
 }
 
-// A splat with a NaN or infinity is as good as hidden, and gets no gradient.
+// A splat with a NaN or infinity is treated as hidden, gradients included.
 static void test_not_finite(machine* m, const random_scene* scene, const oracle* o) {
     const size_t n = scene->splats.count, K = (size_t)gsf_splat_count_sh(scene->splats.sh_degree);
     gsf_splats bad;
@@ -475,7 +475,7 @@ static void test_random_scene(machine* levels, size_t level_count, uint64_t seed
     t->pixels += o.pixels;
     t->skipped += o.skipped;
     for (size_t i = 0; i < o.pixels; i++) t->blends += (size_t)o.image.blended[i];
-    if (o.pixels > 1000) CHECK(o.skipped < o.pixels / 4); // the comparison still means something
+    if (o.pixels > 1000) CHECK(o.skipped < o.pixels / 4); // enough pixels are left to compare
     oracle_free(&o);
     random_scene_free(ctx, &scene);
 }
@@ -498,7 +498,7 @@ int main(void) {
     print_worst("golden scenes, full footprint", &t.full);
     print_worst("random scenes", &t.random);
     print_worst("random scenes of needles", &t.needles);
-    CHECK(t.blends > 2 * t.pixels); // the scenes show something
+    CHECK(t.blends > 2 * t.pixels); // the scenes are not nearly empty
     printf("%zu CPU levels, %zu pixels, %zu with an unclear decision, %.1f splats blended in each\n", level_count,
            t.pixels, t.skipped, (double)t.blends / (double)t.pixels);
     train_golden_checks();

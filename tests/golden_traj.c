@@ -17,7 +17,7 @@ static test_tensors file;
 static test_tensor loaded[512];
 static size_t loaded_count;
 
-static const test_tensor* find(const char* name) { // NULL where the file has none
+static const test_tensor* find(const char* name) { // NULL when absent
     for (size_t i = 0; i < loaded_count; i++)
         if (strcmp(loaded[i].name, name) == 0) return &loaded[i];
     if (loaded_count == 512) { fprintf(stderr, "too many tensors\n"); exit(2); }
@@ -37,7 +37,7 @@ static void close_file(void) {
     test_close_tensors(&file);
 }
 
-static void* take(size_t bytes) { // memory that is needed; exact, so that a sanitizer sees the first byte too many
+static void* take(size_t bytes) { // of exactly that size, so that a sanitizer detects any overrun
     void* memory = malloc(bytes ? bytes : 1);
     if (!memory) { fprintf(stderr, "out of memory: %zu bytes\n", bytes); exit(2); }
     return memory;
@@ -313,7 +313,7 @@ static void check_windows(int round, const double* c2w, size_t n, const gsf_traj
     free(overlaps);
 }
 
-static int check_round(int round) { // 1 where the file has it
+static int check_round(int round) { // 1 if the file has this round
     const test_tensor* loop = get_round(round, "ellipse_c2w", 0);
     if (!loop) return 0;
     size_t n;
@@ -365,7 +365,7 @@ static void check_cameras(void) {
         snprintf(name, sizeof name, "cam%d.fov_xy", camera_count);
         compare_values(name, fov, 2, tolerance);
         CHECK_NEAR(gsf__traj_focal_from_fov(fov[0], camera.width), camera.fx, tolerance * camera.fx);
-        double projection[16], full[16]; // stored transposed and row-major, so column-major as they are
+        double projection[16], full[16]; // stored transposed and row-major, which is column-major
         CHECK_OK(&ctx, gsf__traj_projection(&ctx, &camera, 0.01, 100.0, projection));
         gsf__mat4_mul(projection, camera.w2c, full);
         snprintf(name, sizeof name, "cam%d.world_view_transform_T", camera_count);
@@ -444,7 +444,7 @@ static void check_tables(void) {
                                                     (int64_t)number(weight, "until"), number(weight, "lambda_reg"), 1),
                    v->number, tolerance);
     for (const gsf_json_value* v = first_of(member(root, "sample_steps")); v; v = next_of(v)) {
-        long start, every, until; // in the key: "script (7000,10000,30000)"; the list has iteration 0 in front
+        long start, every, until; // from the key "script (7000,10000,30000)"; the list also has iteration 0
         const char* numbers = strchr(v->key, '(');
         if (!CHECK(numbers && sscanf(numbers, "(%ld,%ld,%ld)", &start, &every, &until) == 3)) continue;
         const long count = (until - start) / every + 1, last = start + (count - 1) * every;

@@ -43,7 +43,7 @@ static int error_lines(gsf_context* ctx) {
     return lines;
 }
 
-// Puts the file in place as the program would have written it.
+// Writes the checkpoint to the output folder as the program would have.
 static void put_checkpoint(const void* data, size_t size) {
     gsfix_app app;
     memset(&app, 0, sizeof app);
@@ -57,7 +57,7 @@ static void put_checkpoint(const void* data, size_t size) {
     gsfix_end_files(&app);
 }
 
-// The checkpoint `data` with other JSON.
+// Writes the checkpoint `data` with its JSON replaced.
 static void forge(gsf_context* ctx, const void* data, size_t size, const char* json, size_t json_size) {
     gsf_buffer file = {0};
     const char* p = (const char*)data + 12; // after magic and version
@@ -76,12 +76,12 @@ static void forge(gsf_context* ctx, const void* data, size_t size, const char* j
     gsf_destroy_buffer(ctx, &file);
 }
 
-static size_t number_at(const char* text) { // its length, or that of null
+static size_t number_at(const char* text) { // length of the number or of "null" at text; 0 if neither
     const size_t n = strspn(text, "+-.0123456789eE");
     return n ? n : strncmp(text, "null", 4) == 0 ? 4 : 0;
 }
 
-// Each number of the first row of a list (or the number itself), with each value in its place.
+// Replaces each number of the first row of a list (or the single number) by each of the values in turn.
 static void forge_list(gsf_context* ctx, const void* data, size_t size, const char* json, size_t json_size, const char* key,
                        const char* wholes) {
     static const char* const values[] = {"-1e300", "1e300", "1.5", "-7", "4294967296", "[]", "null", "\"x\""};
@@ -91,7 +91,7 @@ static void forge_list(gsf_context* ctx, const void* data, size_t size, const ch
     at += strspn(at, ":[");
     for (size_t column = 0; number_at(at); column++) {
         for (size_t v = 0; v < sizeof values / sizeof *values; v++) {
-            if (wholes[column] != 'w' && v % 2 == 0) continue; // little can go wrong with those
+            if (wholes[column] != 'w' && v % 2 == 0) continue; // every other value is enough for non-integers
             gsf_buffer text = {0};
             gsf_append_bytes(ctx, &text, json, (size_t)(at - json));
             gsf_append_bytes(ctx, &text, values[v], strlen(values[v]));
@@ -117,7 +117,7 @@ static void test_forged(gsf_context* ctx) {
     if (CHECK(gsf_find_chunk(data, size, "GFIX", &chunk))) {
         gsf_buffer json = {0};
         gsf_append_bytes(ctx, &json, (const char*)chunk.data, chunk.size);
-        forge(ctx, data, size, json.data, json.size); // as it was
+        forge(ctx, data, size, json.data, json.size); // restore the original
         CHECK(resume("--resume") == 0);
         forge_list(ctx, data, size, json.data, json.size, "\"iteration\"", "w");
         forge_list(ctx, data, size, json.data, json.size, "\"resumed\"", "w");
@@ -149,5 +149,5 @@ int main(void) {
 }
 
 #else
-int main(void) { return 77; } // the scene is traced with Embree
+int main(void) { return 77; } // the test scene needs Embree
 #endif

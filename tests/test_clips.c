@@ -5,13 +5,13 @@
 
 enum { MOST = 160, SHOWN = 64 };
 
-typedef struct fake { // gives back what it gets, a little brighter with every part
+typedef struct fake { // returns its input, a little brighter with each part
     gsf_restorer restorer;
     gsf_restorer_info limits;
     int calls, counts[SHOWN];
     int32_t width, height;
     int fail_at, seen_reference;
-    float first[SHOWN], last[SHOWN], depth; // of each part: red of the first and the last frame
+    float first[SHOWN], last[SHOWN], depth; // per part: red of its first and of its last frame
 } fake;
 
 static gsf_result fake_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
@@ -72,7 +72,7 @@ typedef struct clip {
 
 static float shade(int frame) { return (float)(frame + 40) / 255.0f; }
 
-// Frame i is of one colour that tells i; its right half is darker.
+// Frame i has a colour that identifies i; its right half is darker.
 static void make_clip(gsf_context* ctx, clip* c, int frames, int width, int height) {
     memset(c, 0, sizeof *c);
     for (int i = 0; i < frames; i++) {
@@ -109,7 +109,7 @@ static void free_clip(gsf_context* ctx, clip* c) {
     }
 }
 
-// Every frame is there again at its own place in time, within `frames_off` frames and what parts added.
+// Every frame comes back in its place, to within `frames_off` frames and the brightness that the parts added.
 static void check_back(const clip* c, int parts, double frames_off) {
     for (int i = 0; i < c->window.frame_count; i++) {
         const gsf_image* out = &c->out[i];
@@ -126,7 +126,7 @@ static void test_lengths(gsf_context* ctx) {
         for (int frames = 1; frames <= MOST; frames += frames < 60 ? 1 : 17) {
             static clip c;
             fake f = make_fake();
-            f.limits.frame_count_min = step == 1 ? 49 : 9; // one count, or several
+            f.limits.frame_count_min = step == 1 ? 49 : 9; // a fixed frame count, or a range
             f.limits.frame_count_max = f.limits.frame_count = 49;
             f.limits.frame_count_step = step;
             f.restorer.user = &f;
@@ -139,7 +139,7 @@ static void test_lengths(gsf_context* ctx) {
             if (frames <= 49)
                 CHECK(f.calls == 1 && f.counts[0] >= frames && (step == 1 || f.counts[0] - frames < 8 || frames < 9));
             else CHECK(f.calls == 1 + (frames - 8 - 1) / 41);
-            CHECK_NEAR(f.first[0], shade(0), 1e-6); // both ends of the clip are seen, and parts overlap
+            CHECK_NEAR(f.first[0], shade(0), 1e-6); // the parts include both ends of the clip, and overlap
             CHECK_NEAR(f.last[f.calls - 1], shade(frames - 1), 1e-6);
             for (int p = 1; p < f.calls; p++) CHECK(f.first[p] < f.last[p - 1] - 6.5f / 255.0f);
             CHECK(f.seen_reference >= 1);
@@ -152,12 +152,12 @@ static void test_sizes(gsf_context* ctx) {
     static const struct {
         int squash, width, height, multiple, most_width, in_width, in_height, out_width, out_height;
     } cases[] = {
-        {1, 72, 48, 72, 72, 26, 48, 72, 48}, // another aspect, squashed, larger and smaller than it came
+        {1, 72, 48, 72, 72, 26, 48, 72, 48}, // other aspects (squashed), larger and smaller than the input
         {1, 72, 48, 72, 72, 96, 54, 72, 48},
         {1, 72, 48, 8, 0, 200, 90, 72, 48},
         {0, 0, 0, 8, 0, 61, 43, 64, 40},     // the nearest multiples
-        {0, 0, 0, 0, 50, 100, 60, 50, 30},   // smaller as a whole
-        {0, 0, 0, 40, 40, 100, 20, 0, 0},    // square pixels, but no size of that aspect
+        {0, 0, 0, 0, 50, 100, 60, 50, 30},   // scaled down, aspect kept
+        {0, 0, 0, 40, 40, 100, 20, 0, 0},    // square pixels required, but no allowed size has that aspect
         {0, 0, 0, 0, 0, 33, 21, 33, 21},
     };
     for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
@@ -184,7 +184,7 @@ static void test_sizes(gsf_context* ctx) {
     }
 }
 
-static void test_trouble(void) { // a part that fails, too little memory at every place
+static void test_trouble(void) { // a failing part, and allocation failure at every call
     static clip c;
     counter count;
     gsf_context ctx;

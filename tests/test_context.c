@@ -71,7 +71,7 @@ static void test_chunks(gsf_context* ctx) {
     CHECK(gsf_find_chunk(data, size, "TWO ", &chunk) && chunk.size == 0);
     CHECK(!gsf_find_chunk(data, size, "NONE", &chunk));
 
-    for (size_t cut = 0; cut < size; cut++) { // every length, in a block of exactly that size
+    for (size_t cut = 0; cut < size; cut++) { // every truncation, in a block of exactly that size
         char* part = (char*)malloc(cut ? cut : 1);
         memcpy(part, data, cut);
         CHECK_RESULT(ctx, gsf_check_chunks(ctx, "cut", part, cut), GSF_ERROR_FORMAT);
@@ -113,7 +113,7 @@ static void test_files(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_read_file(ctx, path, &data, &size));
     CHECK(size == 3 && memcmp(data, "old", 3) == 0);
     gsf_free(ctx, data);
-    // A file under the temporary's name is someone's, and so is what a link of that name leads to.
+    // A file with the temporary's name may belong to someone else, and so may the target of a link with that name.
     const char* temporary = test_scratch("kept.bin.tmp");
     const char* mine = test_scratch("mine.bin");
     remove(temporary);

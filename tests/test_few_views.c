@@ -6,7 +6,7 @@
 
 enum { VIEWS = 7, POINTS = 300, WIDTH = 64, HEIGHT = 48 };
 
-typedef struct host { // a scene that a host holds in memory: nothing of it came from a loader
+typedef struct host { // a scene that the host built in memory, without a loader
     gsf_scene scene;
     gsf_scene_view views[VIEWS];
     double points[3 * POINTS];
@@ -15,8 +15,8 @@ typedef struct host { // a scene that a host holds in memory: nothing of it came
     uint32_t track_views[VIEWS * POINTS];
 } host;
 
-// A textured wall at z = 4, cameras in a row before it. Every third point is on no track, the others on those of three
-// neighbouring views.
+// A textured wall at z = 4 with a row of cameras in front of it. Every third point has no track; the others have a track
+// of three neighbouring views.
 static void make_host(host* h) {
     uint64_t random = 5;
     memset(h, 0, sizeof *h);
@@ -77,7 +77,7 @@ static size_t count_kind(gsf_context* ctx, const host* h, gsf_initial_kind kind,
 
 static void test_kinds(gsf_context* ctx, const host* h) {
     gsf_initial_stats stats, both;
-    size_t on_track = 0; // of the first three views
+    size_t on_track = 0; // points with a track in the first three views
     for (size_t i = 0; i < POINTS; i++) on_track += i % 3 != 0 && i % 5 < 3;
     CHECK(count_kind(ctx, h, GSF_INITIAL_ALL, 3, &stats) == POINTS && stats.visibility.points == 0);
     CHECK(count_kind(ctx, h, GSF_INITIAL_TRACKS, 3, &stats) == on_track && stats.visibility.rays == 0);
@@ -86,7 +86,7 @@ static void test_kinds(gsf_context* ctx, const host* h) {
     CHECK(count_kind(ctx, h, GSF_INITIAL_RANDOM, 3, &stats) == 50 && stats.scene_points == 0);
     CHECK(count_kind(ctx, h, GSF_INITIAL_DENSE, 3, &stats) > both.scene_points);
     CHECK(stats.scene_points == both.scene_points && stats.dense.pairs > 0 && stats.new_points <= 40000);
-    // what is chosen where nothing is said
+    // what GSF_INITIAL_AUTO selects
     count_kind(ctx, h, GSF_INITIAL_AUTO, 5, &stats);
     CHECK(stats.used.kind == GSF_INITIAL_BOTH);
     count_kind(ctx, h, GSF_INITIAL_AUTO, 6, &stats);
@@ -103,13 +103,14 @@ static void test_random_points(gsf_context* ctx, const host* h) {
     desc.kind = GSF_INITIAL_RANDOM;
     desc.random_points = 70;
     CHECK_OK(ctx, gsf_splat_make_initial_splats(ctx, &h->scene, NULL, VIEWS, &desc, &splats, NULL));
-    for (size_t i = 0; i < splats.count; i++) { // each in its view, with the colour that stands there
+    for (size_t i = 0; i < splats.count; i++) { // each projects into its view and has the colour of that pixel
         const float* mean = splats.means + 3 * i;
         const double point[3] = {mean[0], mean[1], mean[2]};
         double u, v, z;
         const int inside = gsf_project_point(&h->views[i % VIEWS].camera, point, &u, &v, &z);
         if (!CHECK(inside && u > -1e-3 && u < WIDTH + 1e-3 && v > -1e-3 && v < HEIGHT + 1e-3)) continue;
-        if (fabs(u - floor(u) - 0.5) > 0.49 || fabs(v - floor(v) - 0.5) > 0.49) continue; // float32 may cross an edge
+        // near an edge, float32 rounding may move the point to the next pixel
+        if (fabs(u - floor(u) - 0.5) > 0.49 || fabs(v - floor(v) - 0.5) > 0.49) continue;
         const uint8_t* pixel = h->pixels[i % VIEWS] + 3 * ((size_t)v * WIDTH + (size_t)u);
         CHECK_NEAR(splats.sh[48 * i] * 0.28209479177387814 + 0.5, pixel[0] / 255.0, 1e-5);
     }
@@ -171,7 +172,7 @@ static void test_memory(const host* h) {
         desc.random_points = 20;
         desc.dense.max_size = 40;
         desc.dense.levels = desc.dense.iterations = desc.dense.sources = 1;
-        desc.visibility.use_zbuffer = 1; // Embree has memory of its own
+        desc.visibility.use_zbuffer = 1; // Embree allocates outside the context's allocator
         const uint32_t list[2] = {2, 3};
         gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
         size_t failures = 0;
@@ -199,7 +200,7 @@ static void test_settings(gsf_context* ctx, host* h) {
     CHECK(desc.points == h->points && desc.point_count == POINTS);
     CHECK_NEAR(desc.train.render.near_plane, 0.011 * 0.9, 1e-4); // the outer cameras are 0.9 from the middle
     gsf_camera far_apart[2] = {h->views[0].camera, h->views[0].camera};
-    CHECK(gsf_splat_measure_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f); // at one place: no extent
+    CHECK(gsf_splat_measure_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f); // cameras in one place: no extent
     far_apart[1].w2c[12] += 1000.0;
     CHECK(gsf_splat_measure_near_plane(far_apart, sizeof *far_apart, 2) == 0.2f);
 

@@ -10,7 +10,7 @@
 #include "gsfixer.h"
 #include "test.h"
 
-// ---- a counting allocator that fails at the k-th call --------------------------
+// ---- a counting allocator that fails on the k-th call --------------------------
 
 typedef struct heap {
     size_t calls, fail_at; // fail_at: 1-based, 0 = never
@@ -62,7 +62,7 @@ static void log_line(void* user, gsf_log_level level, const char* text) {
 static void test_hooks(void) {
     gsf_context ctx;
     test_context_zero(&ctx);
-    ctx.allocator.alloc_fn = heap_alloc; // half a pair
+    ctx.allocator.alloc_fn = heap_alloc; // only one of the two functions
     CHECK_RESULT(&ctx, gsf_init_context(&ctx), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(strstr(ctx.error, "allocator") != NULL);
     test_context_zero(&ctx);
@@ -88,7 +88,7 @@ static void test_hooks(void) {
     ctx.logger.user = logged;
     CHECK(gsf_fail(&ctx, GSF_ERROR_FORMAT, "x %d", 5) == GSF_ERROR_FORMAT);
     CHECK(strcmp(ctx.error, "x 5") == 0 && strcmp(logged, "x 5") == 0);
-    CHECK(gsf_fail(&ctx, GSF_ERROR_IO, "again: %s", ctx.error) == GSF_ERROR_IO); // may quote itself
+    CHECK(gsf_fail(&ctx, GSF_ERROR_IO, "again: %s", ctx.error) == GSF_ERROR_IO); // an argument may be ctx->error
     CHECK(strcmp(ctx.error, "again: x 5") == 0);
     char huge[2000];
     memset(huge, 'a', sizeof huge - 1);
@@ -101,7 +101,7 @@ static void test_hooks(void) {
     CHECK(!gsf_is_cancelled(&ctx));
     for (int r = 0; r <= GSF_ERROR_RESTORER + 1; r++) CHECK(strlen(gsf_describe_result((gsf_result)r)) > 0);
 
-    // a context whose struct was moved still works, with whatever workers it had
+    // a context whose struct was moved keeps working, with its workers if it had any
     gsf_context moved = ctx;
     memset(&ctx, 0xff, sizeof ctx);
     gsf_image a, b;
@@ -114,7 +114,7 @@ static void test_hooks(void) {
 
 // ---- failing memory ------------------------------------------------------------
 
-// Everything of the header that allocates, in one go. Returns the first result that is not OK.
+// Calls every function of the header that allocates. Returns the first result that is not GSF_OK.
 static gsf_result use_everything(gsf_context* ctx, const char* png, const char* jpg, const char* cameras) {
     gsf_image image, small, packed;
     gsf_json json;
@@ -195,7 +195,7 @@ static void test_out_of_memory(void) {
         if (!CHECK(h.live == 0)) fprintf(stderr, "allocation %zu: %lld bytes live\n", k, (long long)h.live);
     }
     h.fail_at = 0;
-    CHECK_OK(&ctx, use_everything(&ctx, png, jpg, cameras)); // the files survived it all
+    CHECK_OK(&ctx, use_everything(&ctx, png, jpg, cameras)); // the failures left the files intact
     CHECK(h.live == 0);
 }
 
@@ -204,21 +204,21 @@ static void test_out_of_memory(void) {
 static void test_damaged_chunks(gsf_context* ctx) {
     gsf_buffer file;
     memset(&file, 0, sizeof file);
-    static char payload[40000]; // long enough for the fast checksum
+    static char payload[40000]; // long enough for the fast CRC code path
     for (size_t i = 0; i < sizeof payload; i++) payload[i] = (char)(i * 31 >> 3);
     gsf_append_chunk(ctx, &file, "ABCD", "hello", 5);
     gsf_append_chunk(ctx, &file, "NONE", NULL, 0);
     const size_t small_end = file.size;
     gsf_append_chunk(ctx, &file, "LONG", payload, sizeof payload);
     const size_t long_end = file.size;
-    uint32_t crc = 0xffffffffu, stored = 0; // bit by bit, over tag, size and bytes
+    uint32_t crc = 0xffffffffu, stored = 0; // bitwise CRC-32 of tag, size and payload
     for (size_t i = small_end; i < long_end - 4; i++) {
         crc ^= (unsigned char)file.data[i];
         for (int bit = 0; bit < 8; bit++) crc = crc & 1u ? 0xedb88320u ^ crc >> 1 : crc >> 1;
     }
     for (size_t i = 0; i < 4; i++) stored |= (uint32_t)(unsigned char)file.data[long_end - 4 + i] << 8 * i;
     CHECK(stored == ~crc);
-    const size_t opened = gsf__open_chunk(ctx, &file, "LONG"); // the same chunk in pieces
+    const size_t opened = gsf__open_chunk(ctx, &file, "LONG"); // the same chunk, appended in pieces
     for (size_t i = 0; i < sizeof payload; i += 999)
         gsf_append_bytes(ctx, &file, payload + i, sizeof payload - i < 999 ? sizeof payload - i : 999);
     gsf__close_chunk(ctx, &file, opened);
@@ -246,14 +246,14 @@ static void test_damaged_chunks(gsf_context* ctx) {
             CHECK(gsf_check_chunks(ctx, "flipped", file.data, file.size) != GSF_OK);
             file.data[i] = (char)(file.data[i] ^ 1 << bit);
         }
-    gsf_append_bytes(ctx, &file, "x", 1); // something behind the end
+    gsf_append_bytes(ctx, &file, "x", 1); // trailing data
     CHECK_RESULT(ctx, gsf_check_chunks(ctx, "longer", file.data, file.size), GSF_ERROR_FORMAT);
     gsf_destroy_buffer(ctx, &file);
 }
 
 // ---- JSON ----------------------------------------------------------------------
 
-static gsf_result parse(gsf_context* ctx, const char* text, size_t size) { // from a block of exactly that size
+static gsf_result parse(gsf_context* ctx, const char* text, size_t size) { // in a block of exactly that size, for ASan
     char* copy = (char*)malloc(size ? size : 1);
     memcpy(copy, text, size);
     gsf_json json;
@@ -294,13 +294,13 @@ static void test_json_conformance(gsf_context* ctx) {
     }
     CHECK_RESULT(ctx, parse(ctx, "[1,\0]", 5), GSF_ERROR_FORMAT);
     CHECK_RESULT(ctx, parse(ctx, "\"\0\"", 3), GSF_ERROR_FORMAT);
-    // the offset points at what is wrong
+    // the offset points at the offending byte
     CHECK_RESULT(ctx, parse(ctx, "{\"abc\": tru}", 12), GSF_ERROR_FORMAT);
     CHECK(strncmp(ctx->error, "text:8:", 7) == 0);
-    gsf_json json; // more than offsets can count: refused before a byte is read
+    gsf_json json; // longer than 32-bit offsets can address: refused before a byte is read
     CHECK_RESULT(ctx, gsf_parse_json(ctx, "text", "1", (size_t)0xfffffff1u, &json), GSF_ERROR_UNSUPPORTED);
     CHECK(json.values == NULL && strncmp(ctx->error, "text: JSON of", 13) == 0);
-    // every cut of a whole document is refused
+    // every proper prefix of a document is refused
     static const char whole[] = "{\"name\":\"\\u00e9\xc3\xa9\",\"list\":[1,-2.5e3,true,null,{\"k\":\"v\"}]}";
     CHECK_OK(ctx, parse(ctx, whole, sizeof whole - 1));
     for (size_t n = 0; n < sizeof whole - 1; n++) CHECK_RESULT(ctx, parse(ctx, whole, n), GSF_ERROR_FORMAT);
@@ -332,7 +332,7 @@ static void test_json_values(gsf_context* ctx) {
     CHECK(gsf_find_json_member(&json, a, "a") == NULL);
     gsf_destroy_json(ctx, &json);
 
-    enum { MEMBERS = 50000 }; // many members, and one that comes back
+    enum { MEMBERS = 50000 }; // many members, then a duplicate key
     gsf_buffer big;
     memset(&big, 0, sizeof big);
     for (int twice = 0; twice < 2; twice++) {
@@ -365,7 +365,7 @@ static void check_number_round_trip(gsf_context* ctx, double value) {
 }
 
 static void test_json_numbers(gsf_context* ctx) {
-    // decided by the digit far behind the point: just at, below and above the middle of two doubles
+    // a digit far behind the point decides the rounding: exactly, just below and just above the midpoint of two doubles
     CHECK(number_of(ctx, "9007199254740993") == 9007199254740992.0);
     CHECK(number_of(ctx, "9007199254740993.00000000000000000000000000000000000000001") == 9007199254740994.0);
     CHECK(number_of(ctx, "1.00000000000000011102230246251565404236316680908203125") == 1.0);
@@ -377,7 +377,7 @@ static void test_json_numbers(gsf_context* ctx) {
     CHECK(number_of(ctx, "1e-99999999999999999999999") == 0.0);
     gsf_buffer text;
     memset(&text, 0, sizeof text);
-    gsf_append_bytes(ctx, &text, "1", 1); // 1000 zeros, a one far out, and the exponent that undoes it
+    gsf_append_bytes(ctx, &text, "1", 1); // 1000 zeros, then a 1, and an exponent that compensates for them
     for (int i = 0; i < 1000; i++) gsf_append_bytes(ctx, &text, "0", 1);
     gsf_append_bytes(ctx, &text, "1e-1001", 7);
     CHECK(number_of(ctx, text.data) == 1.0);
@@ -388,7 +388,7 @@ static void test_json_numbers(gsf_context* ctx) {
     CHECK(number_of(ctx, text.data) == 5.0);
     gsf_destroy_buffer(ctx, &text);
     uint64_t seed = 21;
-    for (int i = 0; i < 20000; i++) { // against strtod of the C locale, and back
+    for (int i = 0; i < 20000; i++) { // compare with strtod in the C locale, and round-trip
         const uint64_t bits = test_random_bits(&seed);
         double value;
         memcpy(&value, &bits, sizeof value);
@@ -400,7 +400,7 @@ static void test_json_numbers(gsf_context* ctx) {
         check_number_round_trip(ctx, value);
         check_number_round_trip(ctx, (double)(int64_t)(bits >> 40) / 1000.0);
     }
-    // a locale with a comma, where the machine has one
+    // a locale with a decimal comma, if the system has one
     static const char* const locales[] = {"de_DE.UTF-8", "fr_FR.UTF-8", "de_DE", "nl_NL.UTF-8"};
     for (size_t i = 0; i < sizeof locales / sizeof *locales; i++)
         if (setlocale(LC_ALL, locales[i])) {
@@ -411,7 +411,7 @@ static void test_json_numbers(gsf_context* ctx) {
         }
 }
 
-// A control character in a string is refused as it is and written as an escape of four digits.
+// A raw control character in a string is refused; the writer emits it as a \uXXXX escape.
 static void test_json_control_characters(gsf_context* ctx) {
     for (unsigned c = 1; c < 0x20; c++) {
         const char raw[] = {'"', 'a', (char)c, 'b', '"', 0}, plain[] = {(char)c, 0};
@@ -431,7 +431,7 @@ static void test_json_text(gsf_context* ctx) {
     gsf_buffer text;
     memset(&text, 0, sizeof text);
     char all[256];
-    for (int i = 1; i < 256; i++) all[i - 1] = (char)i; // bytes from 0x80 on are no UTF-8 in this order
+    for (int i = 1; i < 256; i++) all[i - 1] = (char)i; // from 0x80 on this sequence is not valid UTF-8
     all[255] = 0;
     gsf_append_json_string(ctx, &text, all);
     gsf_json json;
@@ -464,7 +464,7 @@ static void test_conversions(gsf_context* ctx) {
     gsf_image u8 = gsf_wrap_image(bytes, GSF_U8, 256, 1, 1), out = gsf_wrap_image(back, GSF_U8, 256, 1, 1);
     const gsf_image others[] = {gsf_wrap_image(floats, GSF_F32, 256, 1, 1), gsf_wrap_image(doubles, GSF_F64, 256, 1, 1),
                                 gsf_wrap_image(halves, GSF_F16, 256, 1, 1), gsf_wrap_image(shorts, GSF_U16, 256, 1, 1)};
-    for (int k = 0; k < 4; k++) { // all bytes survive every type
+    for (int k = 0; k < 4; k++) { // every byte value survives conversion to any type and back
         CHECK_OK(ctx, gsf_convert_image(ctx, &u8, &others[k]));
         memset(back, 0, sizeof back);
         CHECK_OK(ctx, gsf_convert_image(ctx, &others[k], &out));
@@ -482,7 +482,7 @@ static void test_conversions(gsf_context* ctx) {
     out.width = 11;
     CHECK_OK(ctx, gsf_convert_image(ctx, &f, &out));
     for (int i = 0; i < 11; i++) CHECK(back[i] == expected[i]);
-    // every float in a fine sweep: the float32 arithmetic of torchvision
+    // a fine sweep of floats: the same float32 arithmetic as torchvision
     for (int i = 0; i < 100000; i++) {
         floats[0] = (float)i / 99999.0f;
         f.width = out.width = 1;
@@ -567,7 +567,7 @@ static void test_image_files(gsf_context* ctx) {
         }
         gsf_destroy_image(ctx, &image);
     }
-    // the other formats stb reads, written out here
+    // the other formats that stb reads, as byte arrays
     static const uint8_t pnm[] = "P6\n2 1\n255\n\x01\x02\x03\xff\xfe\xfd";
     gsf_image out;
     CHECK_OK(ctx, gsf_decode_image(ctx, "a.ppm", pnm, sizeof pnm - 1, 0, &out));
@@ -587,7 +587,8 @@ static void test_image_files(gsf_context* ctx) {
     gsf_destroy_image(ctx, &image);
 }
 
-// Every cut is refused; every changed byte gives an error or an image. Exact-size blocks, so ASan sees a byte too many.
+// Truncated files are refused; a changed byte gives an error or an image. Blocks have exact sizes, so that ASan detects
+// any overread.
 static void test_damaged_images(gsf_context* ctx, heap* h) {
     static const char* const extensions[] = {".png", ".jpg"};
     const int64_t live = h->live;
@@ -600,7 +601,7 @@ static void test_damaged_images(gsf_context* ctx, heap* h) {
             char* copy = (char*)malloc(n ? n : 1);
             memcpy(copy, file.data, n);
             if (gsf_decode_image(ctx, "cut", copy, n, 3, &out) == GSF_OK) {
-                CHECK(k == 1 && n + 2 >= file.size); // a JPEG that only lacks its end marker
+                CHECK(k == 1 && n + 2 >= file.size); // a JPEG that lacks only its end marker
                 gsf_destroy_image(ctx, &out);
             } else {
                 CHECK(strncmp(ctx->error, "cut:", 4) == 0 && out.data == NULL);
@@ -624,7 +625,7 @@ static void test_damaged_images(gsf_context* ctx, heap* h) {
         gsf_destroy_image(ctx, &image);
     }
     CHECK(h->live == live);
-    // a PNG head that claims 16384 x 16384
+    // a PNG header that claims 16384 x 16384
     uint8_t huge[8 + 25 + 12 + 12] = {0x89, 'P', 'N', 'G', '\r', '\n', 0x1a, '\n', 0, 0, 0, 13, 'I', 'H', 'D', 'R',
                                       0, 0, 0x40, 0, 0, 0, 0x40, 0, 8, 2};
     gsf_image out;
@@ -632,8 +633,9 @@ static void test_damaged_images(gsf_context* ctx, heap* h) {
     CHECK(strstr(ctx->error, "cannot hold") != NULL);
 }
 
-// The guards run for whatever stb would parse: fill bytes before a JPEG's start, pixels that end within a row's last read
-// (every cut, so that reads of every length are met), sizes that do not fit an int. A size comes without any table parsed.
+// Every input that stb would parse passes the guards first: fill bytes before a JPEG's start, pixel data that ends within
+// a row's last read (all truncations, which covers reads of every length), sizes that do not fit an int. gsf_query_image
+// returns the size without parsing any table.
 static void test_image_guards(gsf_context* ctx) {
     gsf_image image = noise_image(ctx, 19, 17, 3), out;
     gsf_buffer file;
@@ -654,10 +656,10 @@ static void test_image_guards(gsf_context* ctx) {
     char bad[] = "\xff\xff\xd8\xff\xc4\x0b\x13\x00\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff";
     char* table = (char*)calloc(1, 3000);
     memcpy(table, bad, sizeof bad - 1);
-    for (int fill = 0; fill < 2; fill++) { // by stb alone a write past its arrays
+    for (int fill = 0; fill < 2; fill++) { // stb without the guards writes past its arrays
         CHECK_RESULT(ctx, gsf_decode_image(ctx, "table", table + fill, (size_t)(3000 - fill), 3, &out),
                      GSF_ERROR_FORMAT);
-        memcpy(table + 2836, "\xff\xc0\0\x0b\x08\0\1\0\1\1\1\x11\0", 13); // with a frame header behind it
+        memcpy(table + 2836, "\xff\xc0\0\x0b\x08\0\1\0\1\1\1\x11\0", 13); // now followed by a frame header
         CHECK_RESULT(ctx, gsf_decode_image(ctx, "table", table + fill, (size_t)(3000 - fill), 3, &out),
                      GSF_ERROR_FORMAT);
         memset(table + 2836, 0, 13);
@@ -686,8 +688,8 @@ static void test_image_guards(gsf_context* ctx) {
     CHECK(strstr(ctx->error, "PNM header") != NULL);
 }
 
-// What the PNG writer has of its own: filters and compression. Runs, noise, repeats from just within the window and beyond
-// it, few values: the reader is stb's, which shares nothing with it.
+// The PNG writer's own filters and compression, on runs, noise, repeats at distances just inside and just outside the
+// DEFLATE window, and data with few distinct values. Read back with stb, which shares no code with the writer.
 static void test_png_writing(gsf_context* ctx) {
     static const int64_t sizes[][2] = {{1, 1}, {700, 3}, {1, 700}, {211, 190}};
     for (int pattern = 0; pattern < 6; pattern++)
@@ -709,7 +711,7 @@ static void test_png_writing(gsf_context* ctx) {
                 gsf_buffer file;
                 memset(&file, 0, sizeof file);
                 CHECK_OK(ctx, gsf_encode_image(ctx, &image, ".png", &file));
-                const size_t rows = (size_t)image.height; // a byte each for the filter
+                const size_t rows = (size_t)image.height; // one filter byte per row
                 CHECK(file.size < n + rows + n / 100 + 300 && (pattern || file.size < 300 + n / 100 + rows));
                 CHECK_OK(ctx, gsf_decode_image(ctx, "back", file.data, file.size, 0, &back));
                 CHECK(back.channels == channels && back.width == image.width && memcmp(back.data, p, n) == 0);
@@ -728,7 +730,7 @@ static void test_png_writing(gsf_context* ctx) {
 #ifndef HAVE_NO_LIMIT
 #include <sys/resource.h>
 #include <sys/wait.h>
-// A process with `spare` bytes left to ask for encodes an image, or says that memory is out.
+// A child process that can allocate only `spare` more bytes either encodes an image or reports out of memory.
 static int encode_in(size_t spare, const char* extension) {
     const pid_t child = fork();
     if (child == 0) {
@@ -811,7 +813,7 @@ static size_t put_png_chunk(uint8_t* at, const char* tag, const uint8_t* data, s
     return size + 12;
 }
 
-// The same as PNG, with so many bytes of image data, of which 16 hold the picture (one stored block).
+// The same picture as a PNG with the given number of IDAT bytes, 16 of which hold the picture (one stored block).
 static size_t make_palette_png(uint8_t* file, size_t colors, const uint8_t pixels[4], size_t bytes) {
     static const uint8_t header[13] = {0, 0, 0, 4, 0, 0, 0, 1, 8, 3, 0, 0, 0};
     static uint8_t data[70000];
@@ -826,17 +828,17 @@ static size_t make_palette_png(uint8_t* file, size_t colors, const uint8_t pixel
     data[1] = data[2] = 1;
     put_little(data + 3, 5, 2);
     put_little(data + 5, ~5u, 2);
-    memcpy(data + 8, pixels, 4); // behind the row's filter, 0
+    memcpy(data + 8, pixels, 4); // after the row's filter byte, 0
     at += put_png_chunk(file + at, "IDAT", data, bytes);
     return at + put_png_chunk(file + at, "IEND", NULL, 0);
 }
 
-// Pixels beyond the palette's end are black, whatever stood in memory; a palette of no size or less is refused.
+// Indices beyond the end of the palette give black, whatever memory contained; a palette size of 0 or less is refused.
 static void test_palettes(gsf_context* ctx) {
     static uint8_t file[80000];
     static const uint8_t pixels[4] = {0, 1, 2, 200}, whole[4] = {0, 1, 254, 255};
     gsf_image out;
-    for (int way = 0; way < 6; way++) { // BMP with either header, PNG; each with three colours, then all
+    for (int way = 0; way < 6; way++) { // BMP with either header, then PNG; each with 3 and with 256 colours
         const size_t colors = way % 2 ? 256 : 3, head = way < 2 ? 12 : 40;
         const uint32_t offset = (uint32_t)(14 + head + colors * (head == 12 ? 3 : 4));
         const uint8_t* used = way % 2 ? whole : pixels;
@@ -869,7 +871,7 @@ static void check_survives(gsf_context* ctx, const char* path) {
     gsf_free(ctx, data);
 }
 
-// Only regular files are read, at once: a pipe that nobody writes to, a folder, a device, a link to itself.
+// Only regular files are read. A pipe without a writer, a folder, a device and a link to itself fail without blocking.
 static void test_unreadable_files(gsf_context* ctx) {
 #ifdef __linux__
     static const char* const says[4] = {"not a regular file", "is a folder", "not a regular file", "symbolic links"};
@@ -913,7 +915,7 @@ static void test_write_failures(gsf_context* ctx) {
     CHECK_OK(&refusing, gsf_init_context(&refusing));
     check_survives(&refusing, path);
 #ifdef __linux__
-    CHECK(mkdir(temporary, 0700) == 0); // in the way: another name is taken
+    CHECK(mkdir(temporary, 0700) == 0); // occupies the temporary's name: another one is used
     CHECK_OK(ctx, gsf_write_file(ctx, path, "old", 3));
     CHECK(rmdir(temporary) == 0);
     CHECK_RESULT(ctx, gsf_write_file(ctx, "/dev/full", "x", 1), GSF_ERROR_IO);
@@ -929,7 +931,7 @@ static void test_write_failures(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_write_file(ctx, path, "new", 3));
 }
 
-static void test_long_files(gsf_context* ctx) { // around the first piece that the reader takes
+static void test_long_files(gsf_context* ctx) { // sizes around the reader's first block
     static const size_t sizes[] = {0, 1, 65535, 65536, 65537, 131072, 200001};
     for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++) {
         char* bytes = (char*)malloc(sizes[i] + 1);
@@ -964,7 +966,7 @@ static void test_random_statistics(void) {
             for (int k = 1; k <= 4; k++) moments[k] += power *= n;
         }
         for (int b = 0; b < BINS; b++) chi += pow(count[b] - N / BINS, 2.0) / (N / BINS);
-        CHECK(chi > 255 - 6 * sqrt(510.0) && chi < 255 + 6 * sqrt(510.0)); // 6 sigma everywhere
+        CHECK(chi > 255 - 6 * sqrt(510.0) && chi < 255 + 6 * sqrt(510.0)); // within 6 sigma
         CHECK_NEAR(serial / N * 12.0, 0.0, 6.0 / sqrt(N));
         for (int b = 0; b < 64; b++) CHECK_NEAR(ones[b] / N, 0.5, 3.0 / sqrt(N));
         CHECK_NEAR(moments[1] / N, 0.0, 6.0 / sqrt(N));
@@ -972,7 +974,7 @@ static void test_random_statistics(void) {
         CHECK_NEAR(moments[3] / N, 0.0, 6.0 * sqrt(15.0 / N));
         CHECK_NEAR(moments[4] / N, 3.0, 6.0 * sqrt(96.0 / N));
     }
-    double across = 0.0, seeds = 0.0; // neighbouring streams and seeds, and swapped roles, have nothing in common
+    double across = 0.0, seeds = 0.0; // neighbouring streams and seeds, also swapped, are uncorrelated
     int swapped = 0;
     for (uint64_t i = 0; i < N; i++) {
         across += (gsf_draw_uniform(1, i, 0) - 0.5) * (gsf_draw_uniform(1, i + 1, 0) - 0.5);
@@ -1035,7 +1037,7 @@ static void test_camera_functions(gsf_context* ctx) {
     bad.w2c[5] = NAN;
     CHECK_RESULT(ctx, gsf_check_camera(ctx, &bad), GSF_ERROR_NUMERIC);
     bad = plain_camera();
-    bad.w2c[0] = -1.0; // a mirror
+    bad.w2c[0] = -1.0; // a reflection
     CHECK_RESULT(ctx, gsf_check_camera(ctx, &bad), GSF_ERROR_INVALID_ARGUMENT);
     CHECK(strstr(ctx->error, "reflection") != NULL);
     bad = plain_camera();
@@ -1095,7 +1097,7 @@ static void test_camera_files(gsf_context* ctx) {
         "{\"cameras\":[{\"w2c\":" M ",\"fx\":1,\"fy\":1,\"cx\":0,\"cy\":0,\"width\":4}]}"};
     CHECK_OK(ctx, gsf_write_file(ctx, path, good, sizeof good - 1));
     CHECK_OK(ctx, gsf_load_cameras(ctx, path, &back, &count));
-    CHECK(count == 1 && back[0].w2c[12] == 0.5 && back[0].w2c[13] == 2.0 && back[0].w2c[14] == 3.0); // row-major there
+    CHECK(count == 1 && back[0].w2c[12] == 0.5 && back[0].w2c[13] == 2.0 && back[0].w2c[14] == 3.0); // row-major file
     gsf_free(ctx, back);
     for (size_t i = 0; i < sizeof bad / sizeof *bad; i++) {
         CHECK_OK(ctx, gsf_write_file(ctx, path, bad[i], strlen(bad[i])));
