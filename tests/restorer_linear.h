@@ -1,7 +1,8 @@
-// restorer_linear.h - products of matrices against restorer/numerics.
-// Errors are judged against the sums of the products' sizes, times 1e-6: gemm_cancel's README.
+// restorer_linear.h - matrix products against restorer/numerics. Errors are relative to the sums of the products'
+// magnitudes; the tolerance is 1e-6 (see the README about gemm_cancel).
 
-static gsf_nn_tensor linear_weight(const test_tensor* t, uint16_t** bits, float** floats) { // as the file has it
+// with the dtype that the file has
+static gsf_nn_tensor linear_weight(const test_tensor* t, uint16_t** bits, float** floats) {
     gsf_nn_tensor w;
     memset(&w, 0, sizeof w);
     w.name = t->name;
@@ -29,7 +30,8 @@ static void check_linear_case(gsf_context* ctx, const test_tensors* file, const 
     uint16_t* bits;
     float *floats, *once = test_tensor_floats(&a);
     const gsf_nn_tensor w = linear_weight(&b, &bits, &floats);
-    float* x = (float*)malloc(copies * a.count * sizeof(float)); // the same rows again: other ways through the kernels
+    // the same rows repeated, so that larger batches take other kernels
+    float* x = (float*)malloc(copies * a.count * sizeof(float));
     float* y = (float*)malloc(copies * rows * out * sizeof(float));
     for (size_t i = 0; i < copies; i++) memcpy(x + i * a.count, once, a.count * sizeof(float));
     gsf__nn_linear_desc d;

@@ -1,10 +1,11 @@
-// restorer_numerics.h - activations, norms, attention and half floats against restorer/numerics; products are in
-// restorer_linear.h.
-// Bars are the reference's own float32 errors of the README twice over; norms must do better, as their sums are double.
+// restorer_numerics.h - activations, norms, attention and half floats against restorer/numerics; matrix products are in
+// restorer_linear.h. Tolerances are twice the reference's own float32 errors from the README, except that norms, which
+// sum in double, must do better.
 
 static gsf_context numerics_ctx;
 
-// The next name in the file's header that begins with `prefix` and ends with `suffix`: what stands between goes to `name`.
+// Finds the next name in the file's header that begins with `prefix` and ends with `suffix`; `name` receives the part
+// between.
 static int numerics_next(const test_tensors* file, const char* prefix, const char* suffix, size_t* at, char name[64]) {
     uint64_t header;
     memcpy(&header, file->data, 8);
@@ -36,7 +37,8 @@ static float* numerics_floats(const test_tensors* file, const char* group, const
 
 // ---- attention -----------------------------------------------------------------
 
-static float* numerics_to_columns(const float* x, int64_t heads, int64_t rows, int64_t dim) { // (heads, rows, dim): frees x
+// (heads, rows, dim): frees x
+static float* numerics_to_columns(const float* x, int64_t heads, int64_t rows, int64_t dim) {
     float* out = (float*)malloc((size_t)(heads * rows * dim) * sizeof(float));
     for (int64_t h = 0; h < heads; h++)
         for (int64_t r = 0; r < rows; r++)
@@ -63,11 +65,13 @@ static double numerics_logit_spread(const float* q, const float* k, int64_t head
     return spread;
 }
 
-// Largest error. What logits of all keys have in common does not count; torch's float32 run loses to it, 8.862e-06.
+// Largest error allowed. An offset that all logits share does not count, although torch's float32 run loses accuracy to
+// it (8.862e-06).
 static double numerics_attention_bar(int64_t keys, double spread) {
     if (keys == 1) return 0.0;
     if (spread == 0.0) return 2 * 7.390e-08;                  // the mean of the values
-    return spread < 1000.0 ? 2 * 5.532e-07 : 2.9e-7 * spread; // beyond, a float32 logit's own error decides
+    // larger spreads: dominated by the float32 rounding of a logit
+    return spread < 1000.0 ? 2 * 5.532e-07 : 2.9e-7 * spread;
 }
 
 static void check_numerics_attention(const test_tensors* file) {
@@ -119,7 +123,8 @@ static void numerics_compare(const char* group, const char* name, const float* o
     snprintf(what, sizeof what, "%s.%s", group, name);
     const double largest = test_max_abs(expected->v, expected->count);
     test_compare_floats(what, out, expected->v, expected->count, 4e-7 * fmax(largest, 1.0));
-    check_rel_l2(what, out, expected->v, expected->count, 2 * 8.233e-08); // ln.huge: where float32 is at its best
+    // the error of ln.huge, the reference's smallest
+    check_rel_l2(what, out, expected->v, expected->count, 2 * 8.233e-08);
 }
 
 static void check_numerics_rows(const test_tensors* file, const char* group, int centre) {
@@ -131,7 +136,7 @@ static void check_numerics_rows(const test_tensors* file, const char* group, int
         test_tensor shape, expected = numerics_get(file, group, name, "out_f64");
         float* x = numerics_floats(file, group, name, "x", &shape);
         const int64_t rows = (int64_t)shape.dim[0], dim = (int64_t)shape.dim[1];
-        const int plain = shape.dim[1] != wide.count; // no weight of this width
+        const int plain = shape.dim[1] != wide.count; // there is no weight of this width
         if (centre) {
             test_tensor eps = numerics_get(file, group, name, "eps");
             gsf__nn_layer_norm(&numerics_ctx, x, rows, dim, plain ? NULL : weight, plain ? NULL : bias, (float)eps.v[0],

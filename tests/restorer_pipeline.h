@@ -1,12 +1,13 @@
-// restorer_pipeline.h - frames to restored frames: control latents, every step, the decoded video, and the release's
-// variants (ten steps, no guidance, dynamic guidance).
+// restorer_pipeline.h - from frames to restored frames: control latents, every step, the decoded video, and variants of
+// the release's settings (ten steps, no guidance, dynamic guidance).
 #ifndef RESTORER_PIPELINE_H
 #define RESTORER_PIPELINE_H
 
 #include "restorer_golden.h"
 #include "restorer_transformer.h"
 
-static const double pipeline_bar = 10.0 * 2.5e-6;      // relative L2: ten times the error of the reference's float32 run
+// relative L2: ten times the error of the reference's float32 run
+static const double pipeline_bar = 10.0 * 2.5e-6;
 static const double pipeline_bf16_bar = 2.0 * 3.0e-2;  // final latents with weights rounded to bf16
 
 typedef struct pipeline_case {
@@ -18,11 +19,11 @@ typedef struct pipeline_case {
     float *control, *noise, *text, *references, *video;
     gsf_nn_sample_desc desc;
     int compare_steps; // against latents_after_step*
-    int seen_latents, seen_prediction; // compared
+    int seen_latents, seen_prediction; // number of intermediates compared
     float* latents;    // after the last step
 } pipeline_case;
 
-// The latents after a step, and what the network predicted in it (guided).
+// Compares the latents after a step, and the network's (guided) prediction in it.
 static void see_step(void* user, const char* what, int32_t step, const float* data, int64_t rows, int64_t columns) {
     pipeline_case* c = (pipeline_case*)user;
     const size_t count = (size_t)(rows * columns);
@@ -35,7 +36,7 @@ static void see_step(void* user, const char* what, int32_t step, const float* da
         check_rel_l2(name, data, wanted, count, pipeline_bar);
         free(wanted);
         c->seen_latents++;
-    } else if (c->compare_steps && step == 0) { // the file has the two halves before guidance
+    } else if (c->compare_steps && step == 0) { // the file has both predictions, before guidance combines them
         double* halves = golden_doubles(&c->expected, "step0_noise_pred", NULL);
         for (size_t i = 0; i < count; i++) halves[i] += (double)c->desc.guidance * (halves[count + i] - halves[i]);
         check_rel_l2("step0_noise_pred", data, halves, count, pipeline_bar);
@@ -44,7 +45,7 @@ static void see_step(void* user, const char* what, int32_t step, const float* da
     }
 }
 
-// Artifact frames with the reference images as first and last one, (3, frames, height, width) in [-1,1].
+// Artifact frames, with the reference images as the first and the last frame: (3, frames, height, width) in [-1,1].
 static float* pipeline_control(const pipeline_case* c, int32_t frames, int32_t height, int32_t width) {
     test_tensor artifact = test_get_tensor(&c->inputs, "artifact_frames_u8");
     test_tensor photos = test_get_tensor(&c->inputs, "ref_images_u8");
@@ -73,7 +74,7 @@ static void run_pipeline(pipeline_case* c, const char* what, const char* wanted_
     free(wanted);
 }
 
-// decoded_first_mid_last: raw output of the first, middle and last frame; frames_u8: all of them as bytes.
+// decoded_first_mid_last: float output of the first, middle and last frame; frames_u8: all frames as bytes.
 static void check_video(const pipeline_case* c) {
     const size_t frames = (size_t)c->desc.frames, plane = (size_t)c->desc.height * (size_t)c->desc.width;
     size_t count, worst = 0, differ = 0;
@@ -98,7 +99,7 @@ static void check_video(const pipeline_case* c) {
                 differ += error > 0;
                 if (error > worst) worst = error;
             }
-    CHECK(worst <= 1 && differ <= count / 1000); // rounding on the edge between two bytes
+    CHECK(worst <= 1 && differ <= count / 1000); // values that round to either of two bytes
     free(bytes);
 }
 

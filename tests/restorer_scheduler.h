@@ -1,6 +1,6 @@
-// The noise schedule and DDIM against diffusers': time steps exact, the float64 table 1e-12, the float32 one 1e-6,
-// trajectories 4e-6 of float32's size (the reference's own float32 runs differ from float64 by up to 1.2e-6), noise and
-// velocity what float32 rounds off and the two tables' difference explains.
+// The noise schedule and DDIM against those of diffusers: time steps exact, the float64 table within 1e-12, the float32
+// table within 1e-6, trajectories within 4e-6 relative to magnitude (the reference's own float32 runs differ from
+// float64 by up to 1.2e-6), noise and velocity within float32 rounding plus the difference of the two tables.
 #ifndef RESTORER_SCHEDULER_H
 #define RESTORER_SCHEDULER_H
 
@@ -15,7 +15,7 @@ static double scheduler_worst(const float* a, const test_tensor* b, size_t first
 
 static void scheduler_check_trajectory(gsf_context* ctx, const test_tensors* file, int steps, const char* family,
                                        const gsf_nn_schedule* schedule) {
-    static const char* const parts[] = {"x_f64", "x", "x0"}; // double, single, and the predictions
+    static const char* const parts[] = {"x_f64", "x", "x0"}; // float64, float32, and the predictions
     char name[80];
     snprintf(name, sizeof name, "traj%d.x_init", steps);
     test_tensor start = test_get_tensor(file, name);
@@ -60,7 +60,7 @@ static void scheduler_check_table(const test_tensors* file, const char* name, co
     test_free_tensor(&t);
 }
 
-// The formula once more in long double: within one float32 ulp.
+// Recomputes the formula in long double: within one float32 ulp.
 static void scheduler_check_exact(const gsf_nn_schedule* schedule) {
     const gsf_nn_schedule_desc* d = &schedule->desc;
     const int n = d->train_steps;
@@ -89,9 +89,9 @@ static scheduler_roots scheduler_roots_of(double alpha_bar) {
     return r;
 }
 
-// Our a x + s y (or minus s y) against theirs. What is rounded off goes with the size of the two products, which may
-// cancel in the sum: float32 takes up to six roundings of 6e-8 each, those of a and s among them. The roots' own
-// difference is all that may come on top.
+// Our a x + s y (or minus s y) against theirs. The rounding error scales with the two products, which may cancel in the
+// sum: float32 takes up to six roundings of 6e-8 each, including those of a and s. Beyond that, only the difference
+// between our roots and theirs is allowed.
 static void scheduler_check_mix(float actual, double expected, const scheduler_roots* ours,
                                 const scheduler_roots* theirs, double x, double y) {
     const double size = ours->a * fabs(x) + ours->s * fabs(y);
@@ -117,7 +117,7 @@ static void scheduler_check_noise(gsf_context* ctx, const test_tensors* file, co
         for (size_t k = 0, at = i * row; k < row; k++, at++) {
             scheduler_check_mix(out[k], noisy.v[at], &ours, &theirs, x0.v[at], eps.v[at]);
             scheduler_check_mix(v[k], velocity.v[at], &ours, &theirs, eps.v[at], x0.v[at]);
-            CHECK_NEAR(back[k], x0.v[at], 4e-7 * fmax(1.0, fabs(x0.v[at]))); // no table of theirs in it
+            CHECK_NEAR(back[k], x0.v[at], 4e-7 * fmax(1.0, fabs(x0.v[at]))); // does not depend on their table
         }
     }
     free(out);

@@ -4,18 +4,19 @@
 
 #include "restorer_golden.h"
 
-static const double t5_bar = 10.0 * 3.211e-7;     // relative L2 against float64: ten times that of transformers' float32 run
-static const double t5_long_bar = 10.0 * 5.275e-7; // the same for 226 tokens, against the float32 run
-static const double t5_bf16_bar = 2.0 * 7.022e-3; // against the run whose activations are bf16 as well
+// relative L2 against float64: ten times that of transformers' float32 run
+static const double t5_bar = 10.0 * 3.211e-7;
+static const double t5_long_bar = 10.0 * 5.275e-7; // for 226 tokens, against the float32 run
+static const double t5_bf16_bar = 2.0 * 7.022e-3; // against the run that also has bf16 activations
 
 typedef struct t5_case {
     gsf_context ctx;
     gsf_nn_t5 net;
     test_tensors inputs, f32, f64, taps;
-    size_t seen; // intermediates compared
+    size_t seen; // number of intermediates compared
 } t5_case;
 
-// Intermediates are of prompts `first` to `last` - 1: "block0.out[rows 1:3]"; the last block is "last_block".
+// Intermediates cover prompts `first` to `last` - 1: "block0.out[rows 1:3]"; the last block is "last_block".
 static void see_t5(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns) {
     t5_case* c = (t5_case*)user;
     char last_block[32], whole[96];
@@ -60,7 +61,7 @@ static void check_t5_output(t5_case* c, const gsf_nn_t5* net, const gsf_nn_t5_de
     test_free_tensor(&t);
 }
 
-// Every tensor as `dtype` in one file: f32 holds the same values as bf16, f16 nearly.
+// Writes every tensor as `dtype` to one file: f32 holds the same values as bf16, f16 nearly.
 static gsf_nn_t5 open_t5_as(gsf_context* ctx, const char* folder, gsf_nn_dtype dtype) {
     gsf_nn_weights weights;
     gsf_nn_t5 net;
@@ -94,7 +95,8 @@ static gsf_nn_t5 open_t5_as(gsf_context* ctx, const char* folder, gsf_nn_dtype d
 }
 
 static void check_t5_positions(const t5_case* c) {
-    test_tensor buckets = test_get_tensor(&c->f32, "bucket_of_distance"); // key - query = 0, 1, ...; 0, -1, ...
+    // key - query = 0, 1, 2, ... and 0, -1, -2, ...
+    test_tensor buckets = test_get_tensor(&c->f32, "bucket_of_distance");
     const int64_t n = (int64_t)buckets.dim[1];
     for (int64_t i = 0; i < n; i++) {
         CHECK(gsf__t5_bucket(&c->net, i) == (int32_t)buckets.v[i]);
@@ -134,7 +136,7 @@ static void check_t5(void) {
     check_t5_output(&c, &c.net, &in, &c.f64, "out", t5_bar);
     in._tap = NULL;
     if (CHECK_OK(&c.ctx, gsf_nn_load_weights(&c.ctx, c.taps.path, NULL, &names))) {
-        size_t rows = 0; // each tensor holds that many prompts
+        size_t rows = 0; // a tensor covers as many prompts as its first dimension
         for (size_t i = 0; i < names.tensor_count; i++) rows += (size_t)names.tensors[i].shape[0];
         CHECK(c.seen == rows && rows > 0);
         gsf_nn_destroy_weights(&c.ctx, &names);
@@ -142,7 +144,7 @@ static void check_t5(void) {
     check_t5_output(&c, &c.net, &in, &c.f32, "out_bf16", t5_bf16_bar);
     check_t5_output(&c, &c.net, &in226, &c.f32, "out226", t5_long_bar);
     static const gsf_nn_dtype dtypes[] = {GSF_NN_F32, GSF_NN_F16};
-    for (size_t i = 0; i < GSF__COUNT(dtypes); i++) { // the smallest f16 values are rounded
+    for (size_t i = 0; i < GSF__COUNT(dtypes); i++) { // f16 rounds the smallest values
         gsf_nn_t5 net = open_t5_as(&c.ctx, folder, dtypes[i]);
         if (net.nets) check_t5_output(&c, &net, &in, &c.f64, "out", i ? 1e-5 : t5_bar);
         gsf_nn_destroy_t5(&c.ctx, &net);

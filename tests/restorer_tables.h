@@ -1,6 +1,6 @@
-// Position tables against those of diffusers: rotary 3e-6, sine-cosine 1e-12, time sinusoid 1e-4, all absolute. And
-// against the exact formula: within one float32 ulp of the value plus what the float32 angles of the reference, which
-// are kept on purpose, can cost.
+// Position tables against those of diffusers: rotary 3e-6, sine-cosine 1e-12, time sinusoid 1e-4, all absolute. Also
+// against the exact formula: within one float32 ulp of the value plus the error due to float32 angles, which the
+// reference has and the library keeps on purpose.
 #ifndef RESTORER_TABLES_H
 #define RESTORER_TABLES_H
 
@@ -9,8 +9,8 @@ static inline double tables_ulp(double v) { // spacing of floats at v
     return (double)(nextafterf(f, INFINITY) - f);
 }
 
-// Exact: cos and sin of position * theta^(-2i/d); the angle is allowed (5 + 10 e) half ulps: position, frequency, product,
-// and the exponent e = 2i/d, whose rounding counts ln(10000) times.
+// Exact values: cos and sin of position * theta^(-2i/d). The angle may be off by (5 + 10 e) half ulps: from position,
+// frequency, product, and the exponent e = 2i/d, whose rounding error is multiplied by ln(10000).
 static void tables_check_rope_exact(const gsf__nn_rope_desc* d, const float* c, const float* s) {
     const double tall = (double)d->height / d->width > (double)d->base_height / d->base_width;
     const double rows = tall ? d->base_height : rint((double)d->base_width / d->width * d->height);
@@ -41,7 +41,8 @@ static void tables_check_rope_exact(const gsf__nn_rope_desc* d, const float* c, 
 static void tables_check_rope(gsf_context* ctx, const test_tensors* file, int index, int pixels_per_token, int patch) {
     char name[64];
     snprintf(name, sizeof name, "rope%d.meta", index);
-    test_tensor meta = test_get_tensor(file, name); // sample height and width (latent), height and width in pixels, frames
+    // sample height and width (latent), height and width in pixels, frames
+    test_tensor meta = test_get_tensor(file, name);
     snprintf(name, sizeof name, "rope%d.cos", index);
     test_tensor c = test_get_tensor(file, name);
     snprintf(name, sizeof name, "rope%d.sin", index);
@@ -72,7 +73,7 @@ static void tables_check_rope(gsf_context* ctx, const test_tensors* file, int in
     test_free_tensor(&s);
 }
 
-// The file does not say how its h*w columns split: some split must fit.
+// The file does not say how h*w splits into height and width: one of the splits must match.
 static void tables_check_sincos(gsf_context* ctx, const test_tensors* file, const char* name, double spatial,
                                 double temporal) {
     test_tensor t = test_get_tensor(file, name);
@@ -99,7 +100,8 @@ static void tables_check_sincos(gsf_context* ctx, const test_tensors* file, cons
     test_free_tensor(&t);
 }
 
-// Rows belong to a subset of `times`, in their order. Exact: the angle is allowed (3 + 2 e) half ulps, e its exponent.
+// Rows are for a subset of `times`, in the same order. Exact values: the angle may be off by (3 + 2 e) half ulps, where
+// e is the exponent.
 static void tables_check_timesteps(const test_tensors* file, const char* name, const test_tensor* times) {
     test_tensor t = test_get_tensor(file, name);
     const int dim = (int)t.dim[1];

@@ -1,10 +1,10 @@
-// restorer_tokenizer.h - token ids against those of transformers' tokenizer, exactly.
+// restorer_tokenizer.h - token ids must equal those of transformers' tokenizer.
 #ifndef RESTORER_TOKENIZER_H
 #define RESTORER_TOKENIZER_H
 
 #include "restorer_golden.h"
 
-// ids: an array of the file. Whatever follows it in `actual` must be padding.
+// ids: an array in the file. All further ids in `actual` must be padding.
 static void check_ids(const gsf_json* file, const gsf_json_value* ids, const gsf_nn_tokenizer* t, const int32_t* actual,
                       size_t room, const char* text) {
     int same = ids && ids->type == GSF_JSON_ARRAY && ids->count <= room;

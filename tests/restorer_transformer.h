@@ -6,8 +6,9 @@
 
 static const double transformer_bar = 1e-5;    // relative L2 against float64
 static const double intermediate_bar = 1e-5;   // against the float32 run
-static const double int8_bar = 5e-2;           // the blocks' linear layers in 8 bits
-static const double bf16_bar = 2.0 * 8.8e-3;   // against float64, weights rounded to bf16; twice that of the release's bf16 run
+static const double int8_bar = 5e-2;           // with 8-bit linear layers in the blocks
+// against float64, weights rounded to bf16; twice that of the release's bf16 run
+static const double bf16_bar = 2.0 * 8.8e-3;
 
 typedef struct transformer_case {
     gsf_context ctx;
@@ -21,7 +22,8 @@ typedef struct transformer_case {
 static void see_tap(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns) {
     transformer_case* c = (transformer_case*)user;
     char whole[128];
-    // Every row of the batch, or one that the name tells; a single row without a tag is the batch's last (block1.*).
+    // Intermediates have every row of the batch, or the row in their name's tag; a single row without a tag (block1.*)
+    // is the last.
     for (int tagged = 0; tagged < 2; tagged++) {
         if (tagged) snprintf(whole, sizeof whole, "%s[b=%d]", name, (int)row);
         else snprintf(whole, sizeof whole, "%s", name);
@@ -37,7 +39,7 @@ static void see_tap(void* user, const char* name, int32_t row, const float* data
     }
 }
 
-// The projectors' tensors carry the image they are of: "projector_dino[image 3]".
+// The projectors' tensors are tagged with their image: "projector_dino[image 3]".
 static void check_projectors(transformer_case* c, const float* dino, const float* vggt, int64_t tokens, int64_t width) {
     const gsf_nn_transformer* net = &c->net;
     float* out = (float*)malloc((size_t)(tokens * width) * sizeof(float));
@@ -59,7 +61,7 @@ static void check_projectors(transformer_case* c, const float* dino, const float
     free(out);
 }
 
-// bars: of the float32 path; the same run with other weights (net) takes its own.
+// bar: the tolerance of the float32 path, or that of other weights (net).
 static void check_output(transformer_case* c, const gsf_nn_transformer* net, const gsf_nn_transformer_desc* in,
                          const char* name, double bar) {
     test_tensor t = test_get_tensor(&c->f64, name);
@@ -152,7 +154,7 @@ static void check_transformer(void) {
         check_output(&c, &c.net, &in, name, transformer_bar);
         in._tap = NULL;
         check_output(&c, &rounded, &in, name, bf16_bar);
-        rounded.bf16 = 1; // products of bf16 as well, where the processor has them
+        rounded.bf16 = 1; // also with bf16 products where the processor supports them
         check_output(&c, &rounded, &in, name, bf16_bar);
         rounded.bf16 = 0;
     }
@@ -163,7 +165,7 @@ static void check_transformer(void) {
     for (size_t i = 0; i < c.names.tensor_count; i++)
         if (!CHECK(c.seen[i])) fprintf(stderr, "    no intermediate is called %s\n", c.names.tensors[i].name);
 
-    steps[0] = 479.0; // case C: time steps of their own, no rotation
+    steps[0] = 479.0; // case C: different time steps, no rotary embedding
     for (int b = 1; b < batch; b++) steps[b] = 3.0;
     in.no_rotary = 1;
     check_output(&c, &c.net, &in, "caseC_out", transformer_bar);

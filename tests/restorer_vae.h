@@ -1,5 +1,5 @@
 // restorer_vae.h - encoder and decoder of the video autoencoder against the output of diffusers.
-// Included by golden_restorer.c. Clips, shapes and values are found in GSF_GOLDEN/restorer/vae and model/vae.
+// Included by golden_restorer.c. Clips, shapes and values are read from GSF_GOLDEN/restorer/vae and model/vae.
 #ifndef RESTORER_VAE_H
 #define RESTORER_VAE_H
 
@@ -36,7 +36,7 @@ static float* vae_video(const test_tensor* frames) {
     return video;
 }
 
-// Compares with <clip>.<what> where the file has it; returns whether it had.
+// Compares with <clip>.<what> if the file contains it; returns whether it does.
 static int vae_compare_with(const test_tensors* file, const char* clip, const char* what, const float* actual,
                             size_t count) {
     char name[80];
@@ -139,7 +139,8 @@ static void vae_check_tiled(gsf_context* ctx, const gsf_nn_vae* vae, const vae_f
     f = (int64_t)latent.dim[2], h = (int64_t)latent.dim[3], w = (int64_t)latent.dim[4];
     for (desc.tiled = 0; desc.tiled < 2; desc.tiled++) {
         CHECK_OK(ctx, gsf_nn_query_vae(ctx, vae, GSF_NN_VAE_DECODE, &desc, f, h, w, &info));
-        const char* prefix = desc.tiled ? "tiled.decoded_frames_" : "tiled.plain_decoded_frame"; // then their numbers: 0_4_8
+        // followed by frame numbers: 0_4_8
+        const char* prefix = desc.tiled ? "tiled.decoded_frames_" : "tiled.plain_decoded_frame";
         char numbers[64], what[96];
         int64_t frames[16], picked = 0;
         size_t at = 0;
@@ -159,18 +160,18 @@ static void vae_check_tiled(gsf_context* ctx, const gsf_nn_vae* vae, const vae_f
     test_free_tensor(&latent);
 }
 
-// ---- intermediates: "dec.up0.chunk1" is what up block 0 of the decoder made of the second chunk
+// ---- intermediates: "dec.up0.chunk1" is the output of the decoder's up block 0 for the second chunk
 
 typedef struct vae_watcher {
     const test_tensors* file;
     const gsf_nn_vae* vae;
     const char* clip;
     int decoder, seen;
-    int trial;    // is it this clip's at all?
-    double worst; // of a trial
+    int trial;    // only determines whether the intermediates are of this clip
+    double worst; // of such a trial
 } vae_watcher;
 
-// The layer whose result is the intermediate `part`, as the weight file calls it.
+// Name, in the weight file, of the layer whose output is the intermediate `part`.
 static void vae_layer_name(const vae_watcher* w, const char* part, char* out, size_t room) {
     const char* side = w->decoder ? "decoder" : "encoder";
     const int level = atoi(part + strcspn(part, "0123456789")), last = w->vae->layers_per_block - 1;
@@ -209,7 +210,7 @@ static void vae_compare_map(vae_watcher* w, const char* what, const gsf__vae_map
                 const int64_t row = i / map->width, column = i % map->width + border;
                 const double e = expected.v[(c * map->frames + first + t) * plane + i];
                 planes[n] = data[((t * map->height + row) * (map->width + 2 * border) + column) * map->channels + c];
-                part[n] = frame < 0 ? e : e / (1.0 + exp(-e)); // the file has norms before SiLU
+                part[n] = frame < 0 ? e : e / (1.0 + exp(-e)); // the file has norms before SiLU is applied
             }
     test_tensor picked = expected;
     picked.v = part;
@@ -237,7 +238,7 @@ static void vae_watch(void* user, const gsf_nn_tensor* weight, int64_t chunk, co
     }
 }
 
-// Runs both halves of the network on a clip under watch; returns the worst error of a trial.
+// Runs both halves of the network on a clip and compares the intermediates; returns the worst error of a trial.
 static double vae_watch_clip(gsf_context* ctx, const gsf_nn_vae* vae, const vae_files* files, const test_tensors* file,
                              const char* clip, int trial) {
     char name[80];
@@ -275,14 +276,14 @@ static double vae_watch_clip(gsf_context* ctx, const gsf_nn_vae* vae, const vae_
     return worst;
 }
 
-// The next clip of the inputs; those for tiles are no clip by themselves.
+// The next clip of the inputs; skips the inputs for tiles, which are not a clip of their own.
 static int vae_next_clip(const vae_files* files, size_t* at, char name[64]) {
     while (numerics_next(&files->inputs, "", ".frames_u8", at, name))
         if (strcmp(name, "tiled") != 0) return 1;
     return 0;
 }
 
-// The intermediates do not say whose they are: they are held against the clip that they fit best.
+// The intermediates do not say which clip they are of: they are compared with the clip that fits best.
 static void vae_check_intermediates(gsf_context* ctx, const gsf_nn_vae* vae, const vae_files* files) {
     test_tensors file = test_open_tensors(test_golden("restorer/vae/intermediates_f32.safetensors"));
     char name[64], best[64] = "";

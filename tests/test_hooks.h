@@ -3,8 +3,8 @@
 #ifndef TEST_HOOKS_H
 #define TEST_HOOKS_H
 
-typedef struct counter { size_t live, calls, fail_at, asked; int stays; } counter; // fail_at: 1 = the first call; 0 = never;
-                                                                        // stays: and so do all that follow
+// fail_at: 1 = the first call, 0 = never; stays: all later calls fail, too
+typedef struct counter { size_t live, calls, fail_at, asked; int stays; } counter;
 
 static inline void* counted_alloc(void* user, size_t size) {
     counter* c = (counter*)user;

@@ -1,5 +1,5 @@
-// test_rules.c - rules that hang on a number, each tried on both sides of it: where a wrong number would cost quality and
-// nothing else would fail.
+// test_rules.c - rules with a numeric threshold, each tried on both sides of it: a wrong number would cost quality
+// without making any other test fail.
 // gcc -O2 -std=c11 -I. -Itests tests/test_rules.c -lm
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_splat.h"
@@ -38,16 +38,16 @@ static gsf__model make_model(gsf_context* ctx, size_t count) {
     return model;
 }
 
-// Photos and restored views have means of their own, of which the larger one decides: many visits of the one kind do not
-// hide what few of the other say.
+// Photos and restored views have separate means, of which the larger one decides: many visits of one kind do not dilute
+// the gradients of a few of the other.
 static void test_densify_means(gsf_context* ctx) {
     enum { COUNT = 5 };
     static const struct { float sum[2]; uint32_t visits[2]; float mean; int grows; } cases[COUNT] = {
         {{3e-3f, 0.0f}, {10, 0}, 3e-4f, 1},     // photos only
         {{0.0f, 3e-3f}, {0, 10}, 3e-4f, 1},     // restored views only
-        {{3e-3f, 1e-3f}, {10, 90}, 3e-4f, 1},   // together 4e-5
+        {{3e-3f, 1e-3f}, {10, 90}, 3e-4f, 1},   // 4e-5 if averaged together
         {{1e-3f, 3e-3f}, {90, 10}, 3e-4f, 1},
-        {{1e-3f, 1.5e-3f}, {10, 10}, 1.5e-4f, 0}}; // added up they would pass
+        {{1e-3f, 1.5e-3f}, {10, 10}, 1.5e-4f, 0}}; // their sum would exceed the threshold
     gsf__model model = make_model(ctx, COUNT);
     for (size_t i = 0; i < COUNT; i++) {
         for (int k = 0; k < 2; k++) {
@@ -68,7 +68,7 @@ static void test_densify_means(gsf_context* ctx) {
     gsf__model_destroy(ctx, &model);
 }
 
-// What a step leaves in the two sums: each kind of view in its own.
+// A step adds to two sums: one for each kind of view.
 static void test_visits(gsf_context* ctx) {
     gsf__model model = make_model(ctx, 2);
     gsf__visit_job job;
@@ -95,7 +95,7 @@ static void test_visits(gsf_context* ctx) {
 
 // ---- origins -------------------------------------------------------------------
 
-// An origin of its own from 1e5 away, or from 1000 times the extent.
+// A scene gets an origin of its own from 1e5 away, or from 1000 times its extent.
 static void test_origin(void) {
     static const struct { double centre, extent; int moved; } cases[] = {
         {990.0, 1.0, 0}, {1010.0, 1.0, 1}, {-990.0, 1.0, 0}, {-1010.0, 1.0, 1}, {9900.0, 10.0, 0}, {10100.0, 10.0, 1},
@@ -105,7 +105,7 @@ static void test_origin(void) {
         for (int far_axis = 0; far_axis < 3; far_axis++) {
             double axis[3 * N], origin[3];
             for (int k = 0; k < 3; k++)
-                for (int j = 0; j < N; j++) // 5 % stand out at either end and do not count
+                for (int j = 0; j < N; j++) // 5 % at either end are ignored as outliers
                     axis[k * N + j] = (k == far_axis ? cases[i].centre : 0.0) + cases[i].extent * (j - 100) / 180.0;
             axis[far_axis * N] -= 1e7;
             gsf__choose_origin(axis, N, origin);
@@ -118,8 +118,8 @@ static void test_origin(void) {
 
 enum { SIDE = 8, PIXELS = SIDE * SIDE };
 
-// Two references at the frame's own place carry red at depth 1 and green at depth 2 with the given weights. The nearer one
-// shows where it has 0.35 of the farther one's weight.
+// Two references at the frame's own position show red at depth 1 and green at depth 2, with the given weights. The
+// nearer surface is shown if it has at least 0.35 of the farther one's weight.
 static int warp_shows_near(float near_weight, float far_weight) {
     static float color[2][3 * PIXELS], depth[2][PIXELS], score[2][PIXELS], inv_z[2 * PIXELS];
     gsf__warp_reference references[2];
@@ -159,7 +159,7 @@ static int warp_shows_near(float near_weight, float far_weight) {
 static void test_warp_groups(void) {
     CHECK(warp_shows_near(1.0f, 1.0f) && warp_shows_near(0.36f, 1.0f) && warp_shows_near(0.19f, 0.5f));
     CHECK(!warp_shows_near(0.34f, 1.0f) && !warp_shows_near(0.16f, 0.5f) && !warp_shows_near(0.01f, 1.0f));
-    CHECK(warp_shows_near(1.0f, 0.1f)); // the heavier group in front hides the other
+    CHECK(warp_shows_near(1.0f, 0.1f)); // in front and heavier: the other is hidden
 }
 
 // ---- dense points --------------------------------------------------------------
@@ -175,7 +175,7 @@ static double dense_vote(const gsf_dense_desc* desc, double degrees) {
     a.fx = a.fy = 100.0;
     b = a;
     const double angle = degrees * 3.14159265358979323846 / 180.0;
-    b.w2c[12] = -100.0 * sin(angle);                   // minus its place
+    b.w2c[12] = -100.0 * sin(angle);                   // minus its position
     b.w2c[14] = -(100.0 - 100.0 * cos(angle));
     const double point[3] = {0.0, 0.0, 100.0};
     return gsf__dense_vote(&job, &a, &b, point, 100.0, 100.0);

@@ -1,4 +1,4 @@
-// Dense points by PatchMatch stereo: planes of known depth, a ray-traced scene, and what must not happen.
+// Dense points by PatchMatch stereo: planes of known depth, a ray-traced scene, and invalid or degenerate input.
 // gcc -O2 -std=c11 -fopenmp -I. -Itests -DGSF_USE_EMBREE -DGSFIXER_IMPLEMENTATION tests/test_stereo.c -lembree3 -lm
 #define _XOPEN_SOURCE 700 // mkdir
 #define _POSIX_C_SOURCE 200809L
@@ -165,13 +165,13 @@ static void check_plane(double tilt, double offset) {
     free_plane(&s);
 }
 
-// The views' rays are 8 and 16 degrees apart: fewer pairs are compared where min_angle is between, none where it is above.
-// Normals that may not differ at all leave few points; those that may differ by anything leave more than the default.
+// The views' rays meet at 8 and 16 degrees: a min_angle between the two leaves fewer pairs, one above them leaves none.
+// If normals may not differ at all, few points are left; if they may differ by any angle, more than by default.
 static void test_angles(void) {
     static const struct { float min_angle, max_normal_angle; uint32_t pairs; } cases[] = {
         {0.0f, 0.0f, 6}, {12.0f, 0.0f, 2}, {25.0f, 0.0f, 0}, {0.0f, 2.0f, 6}, {0.0f, 180.0f, 6}};
     enum { CASES = (int)(sizeof cases / sizeof *cases), POINTS = 60 };
-    static double points[3 * POINTS]; // by which views are paired
+    static double points[3 * POINTS]; // points that decide which views are paired
     static uint8_t colors[3 * POINTS];
     static size_t tracks[POINTS + 1];
     size_t consistent[CASES];
@@ -201,8 +201,8 @@ static void test_angles(void) {
     free_plane(&s);
 }
 
-// The left of view 1 does not count. What is there, and how it is called that, makes no point: none projects there with that
-// view's confirmation, its map is empty there, and the colours there change no bit.
+// The left 40 columns of view 1 have weight 0: they yield no points, that view's depth map is empty there, and random
+// colours there change no bit of the points and their colours.
 static void test_masked(void) {
     plane_scene s;
     gsf_dense dense[2];
@@ -248,12 +248,12 @@ static void test_nothing_to_see(void) {
 
     make_plane(&s, 0.0, 220.0, 0.0);
     static const uint32_t same[3] = {1, 1, 1};
-    for (size_t n = 0; n <= 3; n++) { // no view, one view, and one that is named again
+    for (size_t n = 0; n <= 3; n++) { // no view, one view, and a view that is listed repeatedly
         CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, same, n, NULL, NULL, &dense, &stats));
         CHECK(dense.count == 0 && stats.views == (n > 0) && stats.pairs == 0);
         gsf_splat_destroy_dense(&ctx, &dense);
     }
-    double c2w[16]; // the third looks away: two views of one pair are left
+    double c2w[16]; // the third looks away: one pair of two views is left
     gsf_get_camera_c2w(&s.views[2].camera, c2w);
     for (int k = 0; k < 3; k++) c2w[k] = -c2w[k], c2w[8 + k] = -c2w[8 + k];
     gsf_set_camera_c2w(&s.views[2].camera, c2w);
@@ -317,7 +317,7 @@ static void test_same_bits(void) {
     gsf_dense first, again;
     const gsf_dense_desc desc = quick_desc();
     make_plane(&s, 0.5, 220.0, 0.0);
-    gsf_context other[4]; // as given, one worker, backwards, scalar
+    gsf_context other[4]; // defaults, one worker, reverse order, scalar
     memset(other, 0, sizeof other);
     other[1].threads = 1;
     work_backwards(&other[2]);
@@ -337,7 +337,7 @@ static void test_same_bits(void) {
         if (!CHECK(same)) fprintf(stderr, "  run %d differs\n", i);
         gsf_splat_destroy_dense(&other[i], &again);
     }
-    gsf_dense_desc seeded = desc; // and another seed is another run
+    gsf_dense_desc seeded = desc; // another seed gives other results
     seeded.seed = 1;
     CHECK_OK(&ctx, gsf_splat_make_dense(&ctx, &s.scene, all_views, VIEWS, NULL, &seeded, &again, NULL));
     CHECK(again.count != first.count || memcmp(again.points, first.points, first.count * 3 * sizeof(double)) != 0);
@@ -353,7 +353,7 @@ static void test_same_bits(void) {
     free_plane(&s);
 }
 
-// Sparse points guide the search, and none of the dense ones comes close to those in use.
+// Sparse points guide the search, and no dense point is closer to a sparse one than the spacing.
 static void test_beside_sparse_points(void) {
     enum { POINTS = 60 };
     plane_scene s;
@@ -386,7 +386,8 @@ static void test_beside_sparse_points(void) {
         }
     printf("beside sparse points: %zu points, %.3f from those in use, %.3f from others\n", dense.count, nearest_kept,
            nearest_left);
-    CHECK(dense.count > 300 && nearest_kept > 0.08 && nearest_left < 0.05); // a pixel is 0.05 wide, the spacing 3
+    // a pixel covers 0.05, the spacing is 3 pixels
+    CHECK(dense.count > 300 && nearest_kept > 0.08 && nearest_left < 0.05);
     gsf_splat_destroy_dense(&ctx, &dense);
     free_plane(&s);
 }
@@ -447,7 +448,7 @@ static int compare_floats(const void* a, const void* b) {
     return (x > y) - (x < y);
 }
 
-// Does another of the maps see the surface that pixel (x,y) of map m truly shows?
+// Does one of the other maps see the surface that pixel (x,y) of map m really shows?
 static int seen_elsewhere(const gsf_dense* dense, float* const* truth, size_t m, int x, int y) {
     const gsf_camera* camera = &dense->maps[m].camera;
     const double z = (double)truth[m][y * camera->width + x];
@@ -489,7 +490,8 @@ static void check_courtyard(const gsf_scene* scene, const char* folder, const co
                 const int at = y * dense.maps[m].camera.width + x;
                 const float z = dense.maps[m].depth[at], t = truth[m][at];
                 if (z > 0.0f) {
-                    const float error = t > 0.0f ? fabsf(z - t) / t : 1.0f; // a point in the sky is as wrong as it gets
+                    // a point in the sky counts as an error of 100 %
+                    const float error = t > 0.0f ? fabsf(z - t) / t : 1.0f;
                     errors[n++] = error;
                     within[0] += error < 0.01f;
                     within[1] += error < 0.02f;

@@ -30,14 +30,14 @@ static const char* in(const char* folder, const char* name) { // static buffers,
 
 // ---- the hooks -----------------------------------------------------------------
 
-typedef enum fault { // what becomes of the k-th read or write
+typedef enum fault { // how the k-th read or write fails
     NO_FAULT, READ_FAILS, READ_ABSENT, READ_CUT, READ_NO_HANDLE, WRITE_FAILS, WRITE_FULL_DISK, WRITE_ONTO_FOLDER
 } fault;
 
 typedef struct disk {
     gsf_io plain;
     fault kind;
-    size_t reads, writes, fail_at; // of reads or writes, as the kind says; 1 = the first
+    size_t reads, writes, fail_at; // counts reads or writes, depending on the kind; 1 = the first
     char failed[800];              // path of the call that was made to fail
 } disk;
 
@@ -72,7 +72,7 @@ static gsf_result disk_write(void* user, gsf_context* ctx, const char* path, con
     if (now && d->kind == WRITE_ONTO_FOLDER) CHECK(remove(path) == 0 && mkdir(path, 0700) == 0);
     const gsf_result result = d->plain.write_fn(d->plain.user, ctx, path, data, size);
     if (now && d->kind == WRITE_FULL_DISK) CHECK(setrlimit(RLIMIT_FSIZE, &was) == 0);
-    if (now && d->kind == WRITE_ONTO_FOLDER) CHECK(rmdir(path) == 0); // still a folder, and nothing in it
+    if (now && d->kind == WRITE_ONTO_FOLDER) CHECK(rmdir(path) == 0); // fails unless it is still an empty folder
     return result;
 }
 
@@ -82,10 +82,10 @@ typedef struct loop {
     gsf_context ctx;
     counter memory;
     disk disk;
-    int repeat;                 // the first call that fails is called again
+    int repeat;                 // repeat the first call that fails
     size_t failures;
-    gsf_result first;           // of the call that failed first,
-    char message[512], call[100]; // what ctx->error said, and which it was
+    gsf_result first;           // result of the first call that failed
+    char message[512], call[100]; // ctx->error after that call, and the call's name
     gsf_scene scene;
     gsf_dense dense;
     gsf_splats start, result, again;
@@ -140,7 +140,7 @@ static gsf_result load(loop* l) {
     uint32_t all[VIEWS];
     gsf_visibility_desc discs = {0};
     gsf_dense_desc stereo = {0};
-    discs.use_zbuffer = 1; // Embree asks elsewhere for its memory
+    discs.use_zbuffer = 1; // Embree allocates without the hook
     stereo.levels = stereo.iterations = 1;
     stereo.radius = 2;
     stereo.sources = 1;
@@ -183,7 +183,8 @@ static gsf_result repair(loop* l) {
     STEP(gsf_splat_make_warp(ctx, &l->warp));
     STEP(gsf_splat_make_fixer(ctx, &desc, l->views, l->scene.view_count, &l->start, &l->warp, &l->fixer));
     do STEP(gsf_splat_step_fixer(ctx, l->fixer, &stats));
-    while (stats.stage != GSF_FIX_RESTORE || stats.round != 2); // the first round's frames are in use, the second's pending
+    // the first round's frames are being trained on, the second round's are next
+    while (stats.stage != GSF_FIX_RESTORE || stats.round != 2);
     STEP(write_checkpoint(l));
     gsf_splat_destroy_fixer(ctx, l->fixer);
     l->fixer = NULL;
@@ -252,9 +253,9 @@ static void begin(loop* l, int repeat) {
 
 // ---- what is on disk -----------------------------------------------------------
 
-static struct { char* data; size_t size; } wanted[OUTPUTS]; // of a run without failures
+static struct { char* data; size_t size; } wanted[OUTPUTS]; // contents after a run without failures
 
-static void put_old(int i) { // before a run each output is something else
+static void put_old(int i) { // outputs have other contents before each run
     FILE* file = fopen(in(out_folder, outputs[i]), "wb");
     if (!CHECK(file != NULL)) return;
     fprintf(file, "old %s", outputs[i]);
@@ -277,15 +278,15 @@ static int files_below(const char* folder) {
     return count;
 }
 
-// Each output is as it was or as it shall be, those that shall be come first, and nothing else is there. Then puts back what
-// was.
+// Each output is either the old or the new one, new ones come before old ones in the order of writing, and there are no
+// other files. Then restores the old outputs.
 static int outputs_are_whole(const char* failed, int all_new) {
     int whole = 1, old_seen = 0;
     for (int i = 0; i < OUTPUTS; i++) {
         const char* path = in(out_folder, outputs[i]);
         char old[100];
         snprintf(old, sizeof old, "old %s", outputs[i]);
-        if (access(path, F_OK) != 0 && strcmp(path, failed) == 0) { // a folder was there
+        if (access(path, F_OK) != 0 && strcmp(path, failed) == 0) { // there was a folder in its place
             old_seen = 1;
             put_old(i);
             continue;
@@ -358,7 +359,7 @@ static void tell(const loop* l, const char* sweep, size_t k, int ok) {
                      gsf_describe_result(l->first), l->message);
 }
 
-// Each of the first calls, then some: with strides that are drawn anew, so that no rhythm of the loop is missed.
+// Every one of the first 200 calls, then some with random strides, so that no periodic pattern of the loop is skipped.
 static size_t next(size_t k, size_t stride) {
     uint64_t state = k;
     return k < 200 || stride < 2 ? k + 1 : k + 1 + test_random_bits(&state) % (2 * stride - 1);
@@ -390,7 +391,8 @@ static void sweep_files(fault kind, size_t total, int plain_files, int repeat) {
         l.disk.kind = kind;
         l.disk.fail_at = k;
         const gsf_result result = run(&l);
-        const int may_pass = kind == READ_ABSENT || kind == READ_CUT; // a photo less, a shorter list of points
+        // reads that may be missing: one photo less, a shorter list of points
+        const int may_pass = kind == READ_ABSENT || kind == READ_CUT;
         int ok = CHECK(l.memory.live == 0 && l.disk.failed[0]);
         if (may_pass) {
             for (int i = 0; i < OUTPUTS; i++) put_old(i);

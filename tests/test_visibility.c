@@ -36,7 +36,7 @@ static int compare_doubles(const void* a, const void* b) {
     return (x > y) - (x < y);
 }
 
-// Every query against brute force: same distances bit for bit, places that have these distances, no place twice.
+// Every query against brute force: bit-identical distances, points at exactly these distances, no point twice.
 static void check_neighbours(int kind, size_t count, int k) {
     double* points = (double*)malloc((count + 1) * 3 * sizeof(double));
     double* brute = (double*)malloc((count + 1) * sizeof(double));
@@ -83,7 +83,7 @@ static void test_neighbours(void) {
         }
     check_neighbours(CLOUD_CLUSTERED, 3000, GSF__KNN_MAX);
 
-    // No cloud costs much more than another: nested clusters, piles of equal points, a line.
+    // No cloud takes much longer than others: nested clusters, piles of equal points, a line.
     const size_t many = 100000;
     double* points = (double*)malloc(many * 3 * sizeof(double));
     for (int kind = 0; kind < CLOUD_KINDS; kind++) {
@@ -106,7 +106,7 @@ static void test_neighbours(void) {
     }
     free(points);
 
-    // Points with a non-finite coordinate and points not kept are left out.
+    // Points with a non-finite coordinate and points that are not kept are ignored.
     double few[12] = {0, 0, 0, 1, NAN, 0, 0, 2, 0, 5, 5, INFINITY};
     const uint8_t keep[4] = {1, 1, 1, 1};
     gsf__knn_tree tree;
@@ -214,7 +214,8 @@ static size_t training_views(const gsf_scene* scene, size_t k, uint32_t* views) 
     return train_count;
 }
 
-// Two parallel walls before a camera, the second half hidden by the first, which is smaller; tracks say otherwise.
+// Two parallel walls in front of a camera: the first and smaller one hides the middle of the second. The track of one
+// more point proves it visible, although no ray reaches it.
 static void test_walls(void) {
     enum { SIDE = 30, WALL = SIDE * SIDE, COUNT = 2 * WALL + 3 };
     double* points = (double*)malloc(COUNT * 3 * sizeof *points);
@@ -224,17 +225,19 @@ static void test_walls(void) {
     const double shift[3] = {3.2e6, -1.1e6, 250.0}; // georeferenced
     for (size_t i = 0; i < 2 * WALL; i++) {
         const size_t at = i % WALL;
-        const double z = i < WALL ? 2.0 : 4.0, size = i < WALL ? 0.8 : 3.2; // half the second wall's image is free
+        // the first wall covers half the width of the second
+        const double z = i < WALL ? 2.0 : 4.0, size = i < WALL ? 0.8 : 3.2;
         points[3 * i] = size * ((double)(at % SIDE) / (SIDE - 1) - 0.5) + test_random_in(&state, -0.002, 0.002);
         points[3 * i + 1] = size * ((double)(at / SIDE) / (SIDE - 1) - 0.5) + test_random_in(&state, -0.002, 0.002);
         points[3 * i + 2] = z + test_random_in(&state, -0.004, 0.004);
     }
-    const double others[9] = {0.0, 0.0, 3.0, 0.0, 0.0, -1.0, 9.0, 0.0, 3.0}; // behind the first wall; behind the eye; aside
+    // behind the first wall; behind the camera; outside the image
+    const double others[9] = {0.0, 0.0, 3.0, 0.0, 0.0, -1.0, 9.0, 0.0, 3.0};
     memcpy(points + 6 * WALL, others, sizeof others);
     for (size_t i = 0; i < COUNT; i++)
         for (size_t k = 0; k < 3; k++) points[3 * i + k] += shift[k];
     uint32_t track[1] = {1};
-    begin[COUNT] = 1; // the last point, which no ray reaches, is in the track of view 1
+    begin[COUNT] = 1; // the last point, which no ray reaches, is in view 1's track
     gsf_scene_view views[2];
     memset(views, 0, sizeof views);
     for (int v = 0; v < 2; v++) {
@@ -262,7 +265,8 @@ static void test_walls(void) {
         for (size_t i = 0; i < 2 * WALL; i++) {
             const double x = fabs(points[3 * i] - shift[0]), y = fabs(points[3 * i + 1] - shift[1]);
             if (i < WALL) near_kept += keep[i];
-            else if (fmax(x, y) < 0.7) { hidden++; hidden_kept += keep[i]; } // the first wall's shadow is 0.8 wide
+            // the first wall's shadow on the second is 0.8 wide
+            else if (fmax(x, y) < 0.7) { hidden++; hidden_kept += keep[i]; }
             else if (fmax(x, y) > 0.95) { open++; open_kept += keep[i]; }
         }
         for (size_t i = 0; i < COUNT; i++) kept += keep[i];
@@ -286,7 +290,7 @@ static void test_walls(void) {
         free(again);
         free(keep);
     }
-    // A NaN point is not seen and disturbs nothing; a pile of equal points neither.
+    // A NaN point is not visible and changes no other result; a pile of equal points does no harm either.
     points[3 * 7] = NAN;
     for (size_t i = 20; i < 60; i++) memcpy(points + 3 * i, points + 3 * 19, 3 * sizeof(double));
     for (int z = 0; z < 2; z++) {
@@ -320,9 +324,9 @@ static void test_walls(void) {
     free(begin);
 }
 
-// ---- the same answers as every disc against every point ------------------------
+// ---- the same results as testing every disc against every point -----------------
 
-// What the filter means, without any way to find or to skip discs: keep[i], and near[i] = 1 where rounding could decide.
+// The definition of the filter, without any search structure: keep[i], and near[i] = 1 where rounding may decide.
 static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t count, uint8_t* keep, uint8_t* near) {
     const gsf_visibility_desc desc = gsf__visibility_desc_defaults(NULL);
     gsf_visibility_stats stats;
@@ -351,7 +355,7 @@ static void test_naive(void) {
     enum { SIZES = 4, VIEWS = 12 };
     static const size_t sizes[SIZES] = {9, 300, 3000, 6000};
     size_t points_met = 0, undecided = 0;
-    for (int s = 0; s < 2 * SIZES; s++) { // balls behind each other, with tracks and without
+    for (int s = 0; s < 2 * SIZES; s++) { // balls one behind the other, with and without tracks
         const size_t n = sizes[s / 2];
         uint64_t state = 500 + (uint64_t)s;
         gsf_scene_view views[VIEWS];
@@ -363,7 +367,7 @@ static void test_naive(void) {
         memset(views, 0, sizeof views);
         for (int v = 0; v < VIEWS; v++) {
             const double angle = 0.2 * v + 0.1, up[3] = {0.0, -1.0, 0.0}, target[3] = {0.0, 0.0, 0.0};
-            const double eye[3] = {4.0 * cos(angle), -1.0, 4.0 * sin(angle)}; // a part is out of the frame
+            const double eye[3] = {4.0 * cos(angle), -1.0, 4.0 * sin(angle)}; // part of it is outside the frame
             double pose[16];
             CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, pose));
             gsf_camera* c = &views[v].camera;
@@ -418,11 +422,11 @@ static void test_naive(void) {
     printf("naive loop: same answers for %zu points of 8 scenes, %zu left to rounding\n", points_met - undecided, undecided);
 }
 
-// ---- where memory ends ---------------------------------------------------------
+// ---- memory limits -------------------------------------------------------------
 
 #if defined(__has_feature)
 #if __has_feature(address_sanitizer)
-#define HAVE_NO_LIMIT // its shadow is larger than any limit
+#define HAVE_NO_LIMIT // AddressSanitizer's shadow memory exceeds any limit
 #endif
 #endif
 #if defined(GSF_USE_EMBREE) && defined(__linux__) && !defined(__SANITIZE_ADDRESS__) && !defined(HAVE_NO_LIMIT)
@@ -431,7 +435,7 @@ static void test_naive(void) {
 
 enum { BY_EMBREE, PROJECTED, NO_MEMORY, WRONG };
 
-static int answer_within(const gsf_scene* scene, size_t spare, const uint8_t* expected) { // in a process of its own
+static int answer_within(const gsf_scene* scene, size_t spare, const uint8_t* expected) { // in a separate process
     static const uint32_t view[1] = {0};
     gsf_context own;
     gsf_visibility_desc desc;
@@ -453,8 +457,8 @@ static int answer_within(const gsf_scene* scene, size_t spare, const uint8_t* ex
     return stats.used_embree ? BY_EMBREE : PROJECTED;
 }
 
-// However little is left, the program goes on: by Embree, without it, or with a result code. To be called before OpenMP
-// and Embree have started threads, which no child would have.
+// With any memory limit, the filter works with Embree or without it, or returns an error code. Must be called before
+// OpenMP and Embree start threads, which forked processes do not inherit.
 static void test_little_memory(void) {
     enum { SIDE = 100, COUNT = 2 * SIDE * SIDE };
     static double points[3 * COUNT];
@@ -464,7 +468,7 @@ static void test_little_memory(void) {
     gsf_scene scene;
     memset(&view, 0, sizeof view);
     memset(&scene, 0, sizeof scene);
-    for (size_t i = 0; i < COUNT; i++) { // a wall that hides another of the same angular size
+    for (size_t i = 0; i < COUNT; i++) { // a wall that hides another wall of the same angular size
         const size_t at = i % (SIDE * SIDE);
         const double z = i < COUNT / 2 ? 2.0 : 4.0;
         points[3 * i] = 0.4 * z * ((double)(at % SIDE) / (SIDE - 1) - 0.5);
@@ -536,7 +540,7 @@ static void test_recall(void) {
             free(tracks);
             free(rays);
         }
-    // The tracks of other points are evidence too. Points whose whole track is taken away must be found as well.
+    // The tracks of other points count as evidence, too. Points whose entire track is removed must be found as well.
     uint8_t* proven[3];
     for (size_t k = 0; k < 3; k++)
         proven[k] = visible(&scene, views, training_views(&scene, 3 * k + 3, views), GSF_VISIBILITY_TRACKS, 0, NULL);
@@ -581,7 +585,7 @@ static void count_answers(accuracy* a, const uint8_t* kept, const uint8_t* truth
     const uint8_t* outlier = truth + points * views;
     for (size_t i = 0; i < points; i++) {
         int seen = 0;
-        if (outlier[i]) continue; // stands for no place of the scene
+        if (outlier[i]) continue; // not on a surface of the scene
         for (size_t v = 0; v < count; v++) seen |= truth[i * views + chosen[v]] & 1;
         if (seen) { a->shown++; a->shown_kept += kept[i]; }
         else { a->hidden++; a->hidden_kept += kept[i]; }
@@ -603,9 +607,9 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
     while (count-- > 0) fn(arg, count, 0);
 }
 
-// The generator's own scene, through its files, against the visibility that it traced. The photos are smaller than the
-// program's and the pixel noise with them, so that the points are as good. `split` sums up, per K, the views of the
-// papers' split, `choices` random choices of as many.
+// The generator's own scene, read from its files, against the visibility that it traced. The photos and with them the
+// pixel noise are smaller than by default, so that the points are as accurate. `split` accumulates, per K, the views of
+// the papers' split, `choices` random choices of as many.
 static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3]) {
     char folder[1024], path[1100], what[64];
     snprintf(folder, sizeof folder, "%s", test_scratch("procedural"));
@@ -630,7 +634,7 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
     CHECK(memcmp(file, "GSFTRUTH", 8) == 0 && sizes[0] == n && sizes[1] == views && size == 24 + n * (views + 1));
     CHECK(n == (size_t)options.points && views == (size_t)options.views);
     size_t tracked = 0, shown = 0, outliers = 0, long_enough = 0;
-    for (size_t i = 0; i < n; i++) { // tracks hold only what is seen, and by far not all of it
+    for (size_t i = 0; i < n; i++) { // tracks contain only visible points, and far from all of them
         outliers += outlier[i];
         long_enough += scene.track_begin[i + 1] - scene.track_begin[i] >= 2;
         for (size_t v = 0; v < views && !outlier[i]; v++) shown += truth[i * views + v] & 1u;
@@ -658,7 +662,7 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
         }
         size_t differ = 0;
         for (size_t i = 0; i < n; i++) differ += rays[i] != projected[i];
-        CHECK(differ * 1000 <= n); // both ways to find the discs
+        CHECK(differ * 1000 <= n); // both methods to find the discs
         count_answers(&a, rays, truth, n, views, chosen, count);
         count_answers(split + k / 3 - 1, rays, truth, n, views, chosen, count);
         snprintf(what, sizeof what, "seed %d, K = %zu", (int)seed, k);
@@ -673,7 +677,7 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
             free(kept);
         }
     }
-    accuracy pairs; // single views, the harder question: no second view makes good a wrong answer
+    accuracy pairs; // single views are harder: no second view corrects an error
     memset(&pairs, 0, sizeof pairs);
     for (uint32_t v = 0; v < views; v += 8) {
         uint8_t* rays = visible(&scene, &v, 1, GSF_VISIBILITY_RAYS, 0, NULL);
@@ -684,9 +688,9 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
         }
         free(rays);
     }
-    CHECK(balanced("single views", &pairs) >= 0.855); // the limit suits the union of several views
+    CHECK(balanced("single views", &pairs) >= 0.855); // the limit is tuned for the union of several views
     memset(scene.track_begin, 0, (n + 1) * sizeof *scene.track_begin);
-    accuracy bare; // the discs alone, no tracks to help
+    accuracy bare; // discs only, without tracks
     memset(&bare, 0, sizeof bare);
     const size_t count = training_views(&scene, 3, chosen);
     uint8_t* rays = visible(&scene, chosen, count, GSF_VISIBILITY_RAYS, 0, NULL);
@@ -706,11 +710,11 @@ static void test_accuracy(int seeds) {
     memset(choices, 0, sizeof choices);
     for (int seed = 1; seed <= seeds; seed++) test_procedural((uint64_t)seed, split, choices);
     for (int k = 0; k < 3; k++) {
-        // Of six and nine views spread over the arc hardly a point is hidden from all: one seed has 77 to 183 of six
-        // views and 20 to 60 of nine, so that three points move its figure by up to 0.06. Hence all seeds together,
-        // and random choices of views, which hide more.
+        // With six or nine views spread over the arc, few points are hidden from all of them: 77 to 183 per seed with
+        // six views, 20 to 60 with nine, so that three points change a seed's figure by up to 0.06. Hence all seeds are
+        // evaluated together, and random choices of views as well, which hide more.
         snprintf(what, sizeof what, "%d seeds, K = %d", seeds, 3 * k + 3);
-        CHECK(balanced(what, split + k) >= (k == 0 ? 0.93 : 0.90)); // reached: 0.943, 0.919, 0.914
+        CHECK(balanced(what, split + k) >= (k == 0 ? 0.93 : 0.90)); // measured: 0.943, 0.919, 0.914
         snprintf(what, sizeof what, "%d seeds, %d random choices of %d views", seeds, (int)CHOICES, 3 * k + 3);
         CHECK(balanced(what, choices + k) >= 0.91); // 0.937, 0.946, 0.918
     }
