@@ -27,7 +27,7 @@ static char* exact_copy(const void* data, size_t size) { // so that ASan sees a 
     return p;
 }
 
-// A result that a reader may give for a file it does not take.
+// Results with which a reader may refuse an invalid file.
 static int is_refusal(gsf_result r) {
     return r == GSF_ERROR_FORMAT || r == GSF_ERROR_UNSUPPORTED || r == GSF_ERROR_NUMERIC || r == GSF_ERROR_DEGENERATE;
 }
@@ -123,7 +123,7 @@ static void test_ply_bad(void) {
     CHECK(count.live == 0);
 }
 
-// Every truncation; the header's bytes each replaced by all other values, the body's by a few.
+// Every truncation; each byte of the header replaced by all other values, each byte of the body by a few.
 static void test_ply_damage(const char* relative, int all_values) {
     size_t size;
     char* file = test_read_file(test_golden(relative), &size);
@@ -134,7 +134,7 @@ static void test_ply_damage(const char* relative, int all_values) {
     for (size_t cut = 0; cut < size; cut++) {
         char* part = exact_copy(file, cut);
         const gsf_result r = gsf_splat_parse(&ctx, "cut.ply", part, cut, &s);
-        // of a text file the last number may lose digits and its line feed
+        // the last number of a text file may lose digits and its line feed
         CHECK(is_text && cut + 32 > size ? r == GSF_OK || r == GSF_ERROR_FORMAT : r == GSF_ERROR_FORMAT);
         gsf_splat_destroy(&ctx, &s);
         free(part);
@@ -169,7 +169,7 @@ static void test_ply_out_of_memory(const char* relative) {
         if (r == GSF_OK) {
             gsf_buffer text;
             memset(&text, 0, sizeof text);
-            for (size_t j = 1;; j++) { // the same for writing
+            for (size_t j = 1;; j++) { // then failures while writing
                 count.fail_at = count.calls + j;
                 const gsf_result w = gsf_splat_format(&ctx, "x.ply", &s, NULL, &text);
                 gsf_destroy_buffer(&ctx, &text);
@@ -185,7 +185,7 @@ static void test_ply_out_of_memory(const char* relative) {
     free(file);
 }
 
-// Positions far from zero keep their precision through save and load; near ones give float32 columns again.
+// Positions far from zero keep their precision when saved and loaded; those near zero are saved as float32.
 static void test_ply_origin(void) {
     counter count;
     gsf_context ctx = make_context(&count);
@@ -220,7 +220,7 @@ static void test_ply_origin(void) {
     CHECK(count.live == 0);
 }
 
-static void test_ply_variants(void) { // elements before and after, carriage returns, numbers of all kinds
+static void test_ply_variants(void) { // elements before and after the vertices, carriage returns, all kinds of numbers
     static const char text[] =
         "ply\r\nformat ascii 1.0\r\nobj_info x\r\nelement camera 2\r\nproperty int a\r\nproperty float b\r\n"
         "element nothing 18446744073709551615\r\nelement vertex 2\r\nproperty char x\r\nproperty int16 y\r\n"
@@ -491,7 +491,7 @@ static void test_colmap_bad(void) {
         gsf_splat_destroy_scene(&ctx, &scene);
         free_model(&files);
     }
-    // as a folder the missing points are an error
+    // in a folder, missing points are an error
     CHECK_RESULT(&ctx, gsf_splat_load_scene(&ctx, test_golden("splat/bad/colmap/13_points_missing"), NULL, &scene),
                  GSF_ERROR_NOT_FOUND);
     CHECK(strstr(ctx.error, "points3D.bin") != NULL);
@@ -502,7 +502,7 @@ static void test_colmap_bad(void) {
     CHECK(count.live == 0);
 }
 
-// Every truncation of each file; then every byte with a few, the first 64 with all other values.
+// Every truncation of each file; then each byte replaced by a few others, the first 64 by all other values.
 static void test_colmap_damage(int32_t is_text) {
     model_files files = read_model(is_text ? "splat/colmap/txt" : "splat/colmap/bin", is_text ? "txt" : "bin");
     counter count;
@@ -514,7 +514,7 @@ static void test_colmap_damage(int32_t is_text) {
             cut.data[f] = exact_copy(files.data[f], size);
             cut.size[f] = size;
             const gsf_result r = parse_model(&ctx, is_text, &cut, &scene);
-            if (!cut.data[f] && f == 2) CHECK(r == GSF_OK); // that is "no points"
+            if (!cut.data[f] && f == 2) CHECK(r == GSF_OK); // no file means no points
             else CHECK(is_text ? r == GSF_OK || is_refusal(r) : r == GSF_ERROR_FORMAT);
             gsf_splat_destroy_scene(&ctx, &scene);
             free(cut.data[f]);
@@ -618,7 +618,7 @@ static void test_colmap_text(void) {
 
 // ---- lenses --------------------------------------------------------------------
 
-// COLMAP's formulas once more, straight from its sensor/models.h, with libm.
+// COLMAP's formulas, written again from its sensor/models.h, with libm.
 static int is_fisheye(int model) { return model == 5 || (model >= 8 && model <= 11) || model == 14 || model == 15; }
 static int has_one_focal(int model) {
     return model == 0 || model == 2 || model == 3 || model == 8 || model == 9 || model == 12 || model == 14;
@@ -696,7 +696,8 @@ static void test_lenses(void) {
                 least = fmin(least, fmin(fmin(x, y), fmin(99 - x, 71 - y)));
             }
         CHECK_NEAR(worst, 0.0, 1e-9);
-        // nothing from outside the photo shows, and the image reaches its border (OpenCV's five steps: almost)
+        // no pixel comes from outside the photo, and the image reaches the photo's border (with OpenCV's five
+        // iterations: almost)
         if (!CHECK(least > (r.lens.kind == GSF__LENS_RATIONAL ? -0.5 : -0.01) && least < 0.5))
             fprintf(stderr, "  model %d: distance to the photo's border %g\n", model, least);
         if (model < 2) CHECK(r.fx == params[model][0] && r.width == 100);
@@ -706,15 +707,16 @@ static void test_lenses(void) {
     CHECK(count.live == 0);
 }
 
-// The committed copy, whatever GSF_GOLDEN says: other copies of the golden data are without it.
+// Always the committed copy, since other golden folders (GSF_GOLDEN) may lack these files.
 #ifdef TEST_GOLDEN
 #define LENSES TEST_GOLDEN "/lenses"
 #else
 #define LENSES "tests/golden/lenses"
 #endif
 
-// Models that COLMAP itself wrote, a camera of every kind in them, two to a rig. Each observation of images.bin is where
-// COLMAP sees the point, and the points come from its inverse distortion: both ways end in the same pixel.
+// Models written by COLMAP itself, with a camera of every kind, two per rig. Each observation in images.bin is where
+// COLMAP projects the point. The points come from COLMAP's inverse distortion, so both directions must give the same
+// pixel.
 static void test_colmap_lenses(const char* folder, size_t camera_count) {
     counter count;
     gsf_context ctx = make_context(&count);
@@ -747,7 +749,7 @@ static void test_colmap_lenses(const char* folder, size_t camera_count) {
     CHECK(count.live == 0);
 }
 
-// A camera of two parameters, fewer than any other has, must be refused for what it is.
+// A camera model with two parameters, fewer than any other model has, must be refused as unsupported, not as damaged.
 static void test_panorama(void) {
     char bytes[8 + 24 + 16] = {1};
     counter count;
@@ -780,7 +782,7 @@ static void compare_scenes(const gsf_scene* a, const gsf_scene* b) {
     CHECK(memcmp(a->track_views, b->track_views, 4 * a->track_begin[a->point_count]) == 0);
 }
 
-// A folder as COLMAP leaves it, with rigs and frames beside the model, once binary and once as text.
+// A folder as COLMAP writes it, with rigs and frames beside the model; once binary, once text.
 static void test_rigs(void) {
     static const char* const names[5] = {"rigs", "cameras", "frames", "images", "points3D"};
     static memory_disk disk;
@@ -834,7 +836,7 @@ static void test_save_load(void) {
         CHECK(strcmp(again.folder, "out") == 0 && warnings == 0);
         gsf_splat_destroy_scene(&ctx, &again);
     }
-    // without some points; the 2D points and the track indices of the file must name each other
+    // without some of the points: 2D points and track indices in the files must still refer to each other
     uint8_t* keep = (uint8_t*)calloc(scene.point_count, 1);
     for (size_t p = 0; p < scene.point_count; p += 2) keep[p] = 1;
     CHECK_OK(&ctx, gsf_splat_save_colmap(&ctx, &scene, keep, "out"));
@@ -856,7 +858,7 @@ static void test_save_load(void) {
                   gsf__load_le(images->data + i + 8 + 24 * index + 16, 8) == id);
         }
     }
-    for (size_t k = 1;; k++) { // failing allocations while writing and reading a folder
+    for (size_t k = 1;; k++) { // failing allocations while a folder is written and read
         counter inner;
         gsf_context small = make_disk_context(&inner, &disk);
         inner.fail_at = k;
@@ -884,7 +886,7 @@ static gsf_scene load_folder(gsf_context* ctx, const char* path, int factor, int
     return scene;
 }
 
-// An object with a soft edge before what is transparent and green, as RGBA. In pixels.
+// An object with a soft edge in front of a transparent green background, as RGBA. Size in pixels.
 static void draw_object(int width, int height, uint8_t* rgba) {
     static const uint8_t object[3] = {200, 60, 120};
     for (int i = 0; i < width * height; i++) {
@@ -895,8 +897,8 @@ static void draw_object(int width, int height, uint8_t* rgba) {
     }
 }
 
-// Every pixel that counts shows the object (colours of small weight are coarse); some count in part, and `share` of them
-// fully.
+// Every pixel with weight shows the object (colours of small weight are coarse); a share of `share` has full weight,
+// and some pixels have partial weight.
 static void check_object(const gsf_scene_view* view, double share, double tolerance) {
     const uint8_t *c = (const uint8_t*)view->image.data, *w = (const uint8_t*)view->weight.data;
     const size_t pixels = (size_t)(view->camera.width * view->camera.height);
@@ -952,7 +954,7 @@ static void test_photo_alpha(void) {
         photo = gsf_wrap_image(opaque, GSF_U8, 60, 40, 4);
         CHECK_OK(&ctx, gsf_splat_set_view_image(&ctx, &scene, 0, &photo));
         CHECK(view->weight.data == NULL && memcmp(kept, view->image.data, bytes) == 0);
-        if (m == 0) { // linear floats are encoded: the same photo, whose alpha is linear in both
+        if (m == 0) { // linear floats are encoded as sRGB: the same photo; alpha is linear in both
             float* linear = (float*)malloc(4 * 60 * 40 * sizeof *linear);
             for (int i = 0; i < 4 * 60 * 40; i++) {
                 const double v = opaque[i] / 255.0;
@@ -995,8 +997,8 @@ static void save_picture(gsf_context* ctx, const char* folder, const char* name,
     CHECK_OK(ctx, gsf_save_image(ctx, path, &image));
 }
 
-// masks/a.png (twice the photo's size) and masks/b.jpg.png as COLMAP has it; c.png has alpha and a mask, d.png no mask. One
-// of another shape is an error that names it, as is one that is no image.
+// masks/a.png (twice the photo's size) and masks/b.jpg.png, as COLMAP names it; c.png has alpha and a mask, d.png no
+// mask. A mask with another aspect ratio and a file that is not an image are errors that name the file.
 static void test_photo_masks(void) {
 #ifdef __linux__
     static uint8_t rgba[4 * 60 * 40], rgb[3 * 60 * 40], half[60 * 40], large[120 * 80];
@@ -1040,7 +1042,7 @@ static void test_photo_masks(void) {
             int wrong = 0;
             for (int i = 0; w && i < 60 * 40; i++) {
                 const int wanted = half[i] ? v == 2 ? rgba[4 * i + 3] : 255 : 0;
-                wrong += w[i] != wanted && !(v == 0 && (i % 60 == 29 || i % 60 == 30)); // where it is shrunk, it is soft
+                wrong += w[i] != wanted && !(v == 0 && (i % 60 == 29 || i % 60 == 30)); // downscaling softens the edge
             }
             CHECK(wrong == 0);
         }
@@ -1054,15 +1056,15 @@ static void test_photo_masks(void) {
     CHECK_OK(&ctx, gsf_write_file(&ctx, path, "none", 4));
     CHECK_RESULT(&ctx, gsf_splat_load_view_image(&ctx, &scene, 3), GSF_ERROR_FORMAT);
     snprintf(path, sizeof path, "cd '%s/masks' && rm d.png && mkdir d.png", folder);
-    CHECK(system(path) == 0); // what is there and cannot be read is no missing mask
+    CHECK(system(path) == 0); // an unreadable mask is not a missing one
     CHECK_RESULT(&ctx, gsf_splat_load_view_image(&ctx, &scene, 3), GSF_ERROR_IO);
     gsf_splat_destroy_scene(&ctx, &scene);
     CHECK(count.live == 0);
 #endif
 }
 
-// Of the platform's files only those that are not there are missing; what is there and cannot be read is an error, since
-// the views that are left, and the split, would be others.
+// Only photos that do not exist count as missing. One that exists but cannot be read is an error, since leaving it out
+// would change the views and the split.
 static void test_unreadable_photos(void) {
 #ifdef __linux__
     counter count;
@@ -1098,7 +1100,7 @@ static void test_unreadable_photos(void) {
         CHECK(strstr(ctx.error, path) && !scene.views);
         CHECK(remove(path) == 0);
     }
-    // another user's: as root the process becomes one, and where that cannot be nothing is refused
+    // a file without read permission: root switches to another user; where the file is still readable, nothing is tested
     CHECK_OK(&ctx, gsf_write_file(&ctx, path, "x", 1));
     CHECK(chmod(path, 0) == 0);
     const int root = geteuid() == 0;
@@ -1112,7 +1114,7 @@ static void test_unreadable_photos(void) {
         CHECK(!root || seteuid(0) == 0);
     }
     CHECK(remove(path) == 0);
-    CHECK(symlink("elsewhere.png", path) == 0); // a link to nothing
+    CHECK(symlink("elsewhere.png", path) == 0); // a dangling link
     scene = load_folder(&ctx, folder, 0, 0, GSF_OK);
     CHECK(scene.missing_count == 1);
     gsf_splat_destroy_scene(&ctx, &scene);
@@ -1129,9 +1131,9 @@ static void test_image_folders(void) {
              "d.png\n\n");
     disk_put(&disk, "s/sparse/points3D.txt", "3 0 0 5 1 2 3 0 1 0 9 0 5 0 2 0\n");
     disk_put_photo(&disk, "s/images/sub/a.jpg", 41, 30, 1);
-    disk_put_photo(&disk, "s/images/b.png", 82, 60, 2); // larger than COLMAP says
+    disk_put_photo(&disk, "s/images/b.png", 82, 60, 2); // larger than in COLMAP's model
     disk_put_photo(&disk, "s/images/c.png", 40, 30, 3);
-    // downscaled with another extension; b and c are not there
+    // downscaled photos with another extension; b and c have none
     disk_put_photo(&disk, "s/images_2/sub/a.png", 20, 15, 4);
     gsf_context ctx = make_disk_context(&count, &disk);
     gsf_scene scene = load_folder(&ctx, "s", 0, 0, GSF_OK);
@@ -1139,7 +1141,7 @@ static void test_image_folders(void) {
     CHECK(scene.missing_count == 1);
     if (scene.view_count == 3) {
         CHECK(strcmp(scene.views[0].name, "b.png") == 0 && strcmp(scene.views[2].name, "sub/a.jpg") == 0);
-        CHECK(scene.track_begin[1] == 3); // of images 1 9 5 2 without 1
+        CHECK(scene.track_begin[1] == 3); // images 1 9 5 2 without 1
         check_view(&ctx, &scene, 0, 82, 60, 70, 40, 30);
         check_view(&ctx, &scene, 2, 41, 30, 35, 20, 15);
         CHECK(scene.views[1].camera.width == 39 && scene.views[1].camera.height == 29);
@@ -1149,18 +1151,19 @@ static void test_image_folders(void) {
     gsf_splat_destroy_scene(&ctx, &scene);
     scene = load_folder(&ctx, "s", 2, 0, GSF_OK);
     check_view(&ctx, &scene, 0, 41, 30, 35, 20, 15);                                   // 82 x 60 halved
-    check_view(&ctx, &scene, 2, 20, 15, 35 * 20.0 / 41, 20 * 20.0 / 41, 7.5);          // from images_2
+    check_view(&ctx, &scene, 2, 20, 15, 35 * 20.0 / 41, 20 * 20.0 / 41, 7.5);          // read from images_2
     if (scene.view_count == 3) CHECK(scene.views[1].camera.width == 19 && scene.views[1].camera.height == 14);
     gsf_splat_destroy_scene(&ctx, &scene);
     scene = load_folder(&ctx, "s", 4, 0, GSF_OK);
-    check_view(&ctx, &scene, 0, 20, 15, 35 * 20.0 / 41, 20 * 20.0 / 41, 7.5);          // 82 / 4 = 20.5: half to even
+    // 82 / 4 = 20.5: rounded half to even
+    check_view(&ctx, &scene, 0, 20, 15, 35 * 20.0 / 41, 20 * 20.0 / 41, 7.5);
     check_view(&ctx, &scene, 2, 10, 8, 35 * 10.0 / 41, 20 * 10.0 / 41, 4);             // 30 / 4 = 7.5
     gsf_splat_destroy_scene(&ctx, &scene);
     scene = load_folder(&ctx, "s", 0, 41, GSF_OK);
     check_view(&ctx, &scene, 0, 41, 30, 35, 20, 15);
     check_view(&ctx, &scene, 2, 41, 30, 35, 20, 15); // not enlarged
     gsf_splat_destroy_scene(&ctx, &scene);
-    // the host's, too: a file that is there and cannot be read is not taken for one that is not there
+    // the same for the host's io hook: an unreadable file does not count as missing
     static const char* const unreadable[] = {"s/images/b.png", "s/sparse/points3D.txt", "s/sparse/0/cameras.bin"};
     for (int i = 0; i < 3; i++) {
         disk.unreadable = unreadable[i];
@@ -1210,7 +1213,7 @@ static void test_transforms(void) {
         const gsf_camera *a = &scene.views[0].camera, *b = &scene.views[1].camera;
         CHECK(strcmp(scene.views[0].name, "images/a.png") == 0 && strcmp(scene.views[1].name, "images/b.png") == 0);
         CHECK(b->fx == 35.5 && b->fy == 36.5 && b->cx == 20.25 && b->cy == 14.5 && b->width == 40 && b->height == 30);
-        CHECK(a->width == 39 && fabs(a->fx / 70 - 1) < 0.05); // its own lens, undistorted
+        CHECK(a->width == 39 && fabs(a->fx / 70 - 1) < 0.05); // undistorted with its own lens parameters
         double centre[3], u, v, depth;
         gsf_get_camera_center(b, centre);
         CHECK(centre[0] == 1 && centre[1] == 2 && centre[2] == 3);
@@ -1223,7 +1226,7 @@ static void test_transforms(void) {
     }
     gsf_splat_destroy_scene(&ctx, &scene);
 
-    // from a folder, with points; instant-ngp's field of view needs the photo's size
+    // from a folder, with points; instant-ngp's field of view needs the size of the photo
     disk_put(&disk, "n/transforms.json", nerfstudio);
     disk_put(&disk, "n/points.ply", "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
              "property float z\nproperty uchar red\nproperty uint8 green\nproperty uint8 blue\nend_header\n"
@@ -1396,7 +1399,7 @@ static void test_fox_photos(void) {
             gsf_splat_split_views(48, 8, 3 * (k + 1), train, &n_train, NULL, NULL);
             check_split_list(&json, keys[k], &scene, train, n_train);
         }
-        size_t inside = 0, all = 0; // the points of the tracks project into their photos
+        size_t inside = 0, all = 0; // the points project to where the photos observe them
         for (size_t p = 0; p < scene.point_count; p++)
             for (size_t e = scene.track_begin[p]; e < scene.track_begin[p + 1]; e++, all++) {
                 const gsf_camera* c = &scene.views[scene.track_views[e]].camera;

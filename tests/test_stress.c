@@ -28,7 +28,7 @@ typedef struct row { // worst errors of one scene at one CPU level; -1 = not mea
     const char *test, *level;
     char name[64];
     size_t pixels, unclear;   // unclear: with a decision that may differ in float32
-    double clear_error;       // largest |colour or alpha - reference|, colour over max(1, brightest)
+    double clear_error;       // largest |colour or alpha - reference|, colour relative to max(1, brightest)
     double unclear_error;
     double depth_error;       // of clear pixels, relative to the largest depth
     double gradient;          // relative L2 of the worst parameter tensor
@@ -113,11 +113,11 @@ typedef struct recipe { // zero = the default in brackets
     size_t count;                 // [200]
     int32_t width, height;        // [120 x 80]
     double focal;                 // over the longer side [1]
-    double z_low, z_high;         // [2, 5]; even where z_low is negative, else logarithmic
+    double z_low, z_high;         // [2, 5]; uniform if z_low is negative, else logarithmic
     double size_low, size_high;   // longest axis in pixels at the splat's own depth [1, 15]
     double aspect_low, aspect_high; // longest over shortest axis [1, 5]
     int shape;                    // 0: the middle axis anywhere between, 1: needles, 2: pancakes
-    double spread;                // how far outside the picture centres may lie, in pictures [0.1]
+    double spread;                // how far outside the image centres may lie, in image sizes [0.1]
     double logit_low, logit_high; // [-3, 4]
     double near_plane;            // [0.2]
     double origin;                // the splats' origin is at (1, -0.7, 0.3) times this
@@ -131,10 +131,10 @@ typedef struct limits {
     double clear, unclear, share, gradient; // share: of unclear pixels
 } limits;
 
-// The guaranteed default quality.
+// The accuracy guaranteed by default.
 static const limits ordinary = {2e-5, 8e-3, 1e-3, 2e-4};
-// The same for many large overlapping splats: every blend makes about 1e-4 of the pixels unclear, so their number says
-// nothing about the rasterizer.
+// The same for many large overlapping splats: every blend makes about 1e-4 of the pixels unclear, so the share of
+// unclear pixels says nothing about the rasterizer.
 static const limits crowded = {2e-5, 8e-3, 1, 2e-4};
 
 typedef struct scene {
@@ -404,9 +404,9 @@ static void test_shapes(void) {
         shape_recipe("pancakes 1e4", 1e4, 2, 12), shape_recipe("pancakes 1e6", 1e6, 2, 12),
     };
     check_recipes("shapes", list, COUNT(list), &ordinary);
-    // Needles of up to 3000 pixels, half a pixel thin, through the whole picture and with their centres far outside: in
-    // float32 their direction is known to 3e-7, which at a lever of 100 pixels moves the flank by 3e-5 pixels, and alpha
-    // changes there by 1.1 per pixel.
+    // Needles of up to 3000 pixels, half a pixel thin, across the whole image and with centres far outside: float32
+    // knows their direction to 3e-7, which at a distance of 100 pixels shifts the edge by 3e-5 pixels, where alpha
+    // changes by 1.1 per pixel.
     const limits long_needles = {5e-5, 8e-3, 1e-3, 2e-4};
     recipe far_out[] = {shape_recipe("long needles 1e4", 1e4, 1, 1e3), shape_recipe("long needles 1e6", 1e6, 1, 1e3)};
     far_out[0].seed = 7;
@@ -451,7 +451,7 @@ static void test_opacities(void) {
     check_recipes("opacities", list, COUNT(list), &ordinary);
 }
 
-// ---- stacks, quaternions, offsets, ties, image sizes, values that are no numbers ---
+// ---- stacks, quaternions, offsets, ties, image sizes, non-finite values -------------
 
 // Splats as large as the image and larger, one behind another in shuffled order.
 static void test_stacks(void) {
@@ -513,8 +513,8 @@ static void test_offsets(void) {
     check_recipes("offsets", list, COUNT(list), &ordinary);
 }
 
-// Depths are multiples of 1/16 and the camera looks along z: many are the same number in float32 as in float64, and among
-// these the order is that of the indices. Turned round in memory, the splats make another picture.
+// Depths are multiples of 1/16 and the camera looks along z, so that many depths are equal in float32 as well as in
+// float64; equal ones are ordered by index. With the splats reversed in memory, the image is different.
 static void test_ties(void) {
     recipe r;
     memset(&r, 0, sizeof r);
@@ -572,7 +572,7 @@ static void test_image_sizes(void) {
     check_recipes("image sizes", list, COUNT(list), &ordinary);
 }
 
-// Every parameter is NaN or infinite in some splat: these are as good as hidden, and nothing gets a gradient from them.
+// Every parameter is NaN or infinite in some splat: such splats are treated as hidden, and no gradient comes from them.
 static void test_not_finite(void) {
     enum { PARAMETERS = 3 + 3 + 4 + 1 + 48, BROKEN = 3 * PARAMETERS };
     static const float values[3] = {NAN, INFINITY, -INFINITY};
@@ -637,7 +637,8 @@ static void test_huge_values(void) {
                             : p < 11 ? s.splats.opacity_logits + i
                                      : s.splats.sh + 3 * i + p - 11;
                 *at = values[v];
-                if (p >= 11 && fabsf(values[v]) > 1e20f) *at *= 1e-10f; // a colour times a weight must stay a float
+                // the product of colour and weight must not overflow float
+                if (p >= 11 && fabsf(values[v]) > 1e20f) *at *= 1e-10f;
                 w->pixels += 9600;
                 loss l;
                 uint64_t state = 1;
@@ -665,10 +666,10 @@ static void test_huge_values(void) {
     }
 }
 
-// ---- the oracle swept over conditions ------------------------------------------
+// ---- comparison with the reference over many conditions -----------------------
 
-// Aspect ratio of the splats, near plane (and with it where they begin), and focal length over the image's longer side:
-// from 120 degrees wide to a telescope of half a degree. Cut-offs are those of production.
+// Aspect ratio of the splats; near plane, and with it the splats' smallest depth; focal length relative to the image's
+// longer side, from a field of view of 120 degrees to half a degree. Cut-offs are the defaults.
 static void test_sweep(void) {
     static const double aspects[] = {1, 10, 100, 1e3, 1e4}, nears[] = {0.01, 0.2, 20}, focals[] = {0.3, 1, 10, 100};
     const size_t first = row_count;
@@ -704,8 +705,8 @@ static void test_sweep(void) {
 
 // ---- culling, by brute force ---------------------------------------------------
 
-// Every splat alone in the image, the others hidden: the set of pixels that it reaches is that of the reference, which
-// tests every pixel. So no tile list, row span or image border drops or adds a (splat, pixel) pair.
+// Each splat alone in the image, the others hidden: the set of pixels that it reaches equals that of the reference,
+// which tests every pixel. So no tile list, row span or image border adds or drops a (splat, pixel) pair.
 static void test_culling(void) {
     static const recipe list[] = {
         {.name = "ordinary"},
@@ -820,9 +821,9 @@ static double relative_l2(const float* a, const float* b, double b_scale, size_t
     return error > 0 ? sqrt(error / size) : error;
 }
 
-// The base scene's picture and gradients against those of the same scene scaled by `scale`. Its parameters are rounded
-// anew (log-scales by 2^-24 of their value, which scales a splat by up to 5e-7), so the limits are those of the
-// accuracy.
+// The image and gradients of the base scene against those of the same scene scaled by `scale`. Scaled parameters are
+// rounded again (log-scales by 2^-24 of their value, which changes a splat's size by up to 5e-7), so the limits are
+// those of the accuracy.
 static void compare_scaled(const char* name, const machine* m, const oracle* base, const result* a, const result* b,
                            double scale) {
     row* w = add_row("invariance", name, m->name);
@@ -886,7 +887,7 @@ static void test_invariance(void) {
     }
     oracle_free(&o);
 
-    // where the offset is exact in double (axes along the world's, whole numbers), nothing changes at all
+    // where the offset is exact in double (axes parallel to the world's, integers), the results are identical
     memset(base.camera.w2c, 0, sizeof base.camera.w2c);
     base.camera.w2c[1] = base.camera.w2c[6] = base.camera.w2c[8] = base.camera.w2c[15] = 1;
     base.camera.w2c[14] = 3.5;
@@ -947,9 +948,9 @@ static double difference_error(const difference_case* d, double* parameters, con
     return sqrt(error / size);
 }
 
-// Gradients over a background that is not black, in every mode: the reference's against central differences in double,
-// the rasterizer's against the reference's. Inria's gradient is not a derivative where it passes the 0.99 clamp or
-// holds a clamped x/z: where it should be one, no splat does either.
+// Gradients with a background that is not black, in every mode: the reference's against central differences in double,
+// the rasterizer's against the reference's. Inria's gradient is not a derivative where it ignores the 0.99 clamp or
+// treats a clamped x/z as constant: where differences are taken, no splat is clamped.
 static void test_backgrounds(void) {
     static const recipe modes[] = {
         {.name = "plain", .logit_high = 7},
@@ -981,7 +982,7 @@ static void test_backgrounds(void) {
         d.o = ref_options_from(&s.desc);
         d.l = &o.l;
         d.pixels = o.pixels;
-        for (size_t i = 0; i < o.pixels; i++) // a step must not reach a decision
+        for (size_t i = 0; i < o.pixels; i++) // a step must not change a binary decision
             if (o.image.margin[i] < 1e-3 || o.image.depth_gap[i] < 1e-4)
                 o.l.d_color[3 * i] = o.l.d_color[3 * i + 1] = o.l.d_color[3 * i + 2] = o.l.d_depth[i] = o.l.d_alpha[i] = 0;
         ref_grads g = ref_make_grads(d.s.count, d.s.sh_count);
@@ -1006,7 +1007,7 @@ static void test_backgrounds(void) {
 
 enum { VIEWS = 5, TRUTH = 90, TRAIN_W = 48, TRAIN_H = 40 };
 
-typedef struct training { // photos of a made-up scene, and splats to begin with
+typedef struct training { // photos of a synthetic scene, and the initial splats
     gsf_splats start;
     gsf_train_view views[VIEWS];
     float* pixels[VIEWS];
@@ -1070,7 +1071,7 @@ static void training_free(training* t) {
     for (int v = 0; v < VIEWS; v++) free(t->pixels[v]);
 }
 
-// Densifies, prunes, resets and regularises within 80 iterations.
+// Within 80 iterations it densifies, prunes, resets and regularises.
 static gsf_train_desc busy_desc(void) {
     gsf_train_desc desc;
     memset(&desc, 0, sizeof desc);
@@ -1095,7 +1096,7 @@ static gsf_trainer* trainer_make(gsf_context* ctx, const gsf_train_desc* desc, c
     return trainer;
 }
 
-// The whole state after training, and the picture of the first camera behind it.
+// The complete state after training, followed by an image from the first camera.
 static gsf_buffer train_whole(machine* m, const training* t, size_t* splats) {
     const gsf_train_desc desc = busy_desc();
     gsf_trainer* trainer = trainer_make(&m->ctx, &desc, t, &t->start);
@@ -1117,7 +1118,7 @@ static gsf_buffer train_whole(machine* m, const training* t, size_t* splats) {
     return text;
 }
 
-// Parameters, moments, statistics and picture are the same bits in every run, with 1, 2 and 3 workers, in any order.
+// Parameters, moments, statistics and image are bit-identical in every run, with 1, 2 and 3 workers, in any order.
 static void test_training_bits(void) {
     static const int workers[] = {1, 1, 2, 3, 2, 3};
     for (size_t k = 0; k < level_count; k++) {
@@ -1151,8 +1152,9 @@ static void test_training_bits(void) {
 
 // ---- invisible splats ----------------------------------------------------------
 
-// The splats of `t` with others between them that no camera sees: behind all of them, beside every picture, or fainter
-// than 1/255. Visible ones have odd ids, the others even ones below the largest, so that new splats get the same ids.
+// The splats of `t` interleaved with others that no camera sees: behind all cameras, outside every image, or fainter
+// than 1/255. Visible ones have odd ids; the others have even ids below the largest, so that new splats get the same
+// ids.
 static gsf_splats interleave(gsf_context* ctx, const gsf_splats* start) {
     gsf_splats all;
     uint64_t state = 31;
@@ -1180,12 +1182,12 @@ static gsf_splats interleave(gsf_context* ctx, const gsf_splats* start) {
     return all;
 }
 
-// Every splat of the smaller model is in the larger one, bit for bit: parameters, moments, gradients, statistics.
-// Others in the larger one must be of those that were put in. Both are in the same order.
+// Every splat of the smaller model is in the larger one, bit for bit: parameters, moments, gradients, statistics. All
+// others in the larger one must be inserted ones. Both models are in the same order.
 static size_t compare_models(const gsf__model* small, const gsf__model* large, int iteration, const char* level) {
     size_t j = 0, wrong = 0;
     for (size_t i = 0; i < small->count; i++, j++) {
-        while (j < large->count && large->ids[j] != small->ids[i]) wrong += large->ids[j++] % 2; // even: put in
+        while (j < large->count && large->ids[j] != small->ids[i]) wrong += large->ids[j++] % 2; // even: inserted
         if (j == large->count) { wrong++; break; }
         for (int g = 0; g < GSF__GROUPS; g++) {
             const gsf__group *a = &small->groups[g], *b = &large->groups[g];
@@ -1210,7 +1212,7 @@ static void test_invisible(void) {
             gsf_splats more = interleave(ctx, &t.start);
             gsf_train_desc desc = busy_desc();
             desc.render.footprint = official ? GSF_FOOTPRINT_OFFICIAL : GSF_FOOTPRINT_FULL;
-            desc.prune_scale = 1e6f; // far splats put in may be large
+            desc.prune_scale = 1e6f; // inserted splats that are far away may be large
             gsf_trainer *a = trainer_make(ctx, &desc, &t, &t.start), *b = trainer_make(ctx, &desc, &t, &more);
             size_t put_in = 0, wrong = 0;
             for (int i = 1; i <= desc.iterations; i++) {
@@ -1218,7 +1220,7 @@ static void test_invisible(void) {
                 gsf_train_stats stats[2];
                 memset(visits, 0, sizeof visits);
                 memset(stats, 0, sizeof stats);
-                if (i == 7 || i == 60) { // raw gradients before Adam uses them up
+                if (i == 7 || i == 60) { // raw gradients, before Adam clears them
                     CHECK_OK(ctx, gsf__trainer_gradients(ctx, a, i, &visits[0], &stats[0]));
                     CHECK_OK(ctx, gsf__trainer_gradients(ctx, b, i, &visits[1], &stats[1]));
                     wrong += compare_models(&a->model, &b->model, i, levels[k].name);
@@ -1307,7 +1309,8 @@ static void test_long_run(void) {
         memset(&desc, 0, sizeof desc);
         desc.iterations = iterations;
         desc.seed = 1;
-        desc.densify_grad = 2e-3f; // Inria's 2e-4 is meant for photos of a megapixel; here it would produce 8,400 splats
+        // Inria's 2e-4 is meant for photos of a megapixel; here it would produce 8,400 splats
+        desc.densify_grad = 2e-3f;
         gsf_trainer* trainer = trainer_make(ctx, &desc, &t, &t.start);
         gsf_train_stats stats;
         double first = 0, last = 0;

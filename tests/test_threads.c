@@ -193,7 +193,7 @@ static void run_render(gsf_context* ctx, run_output* run) {
     free(d_alpha);
 }
 
-// Pictures of splats that training does not know. The pixels are the caller's to free.
+// Images of splats that the trainer does not start from. The caller frees the pixels.
 static float* make_views(gsf_context* ctx, gsf_train_view views[VIEWS]) {
     gsf_splats truth;
     make_splats(ctx, 8, &truth);
@@ -214,7 +214,7 @@ static float* make_views(gsf_context* ctx, gsf_train_view views[VIEWS]) {
     return pixels;
 }
 
-// Through densification, pruning and an opacity reset, with a restored view.
+// Training with densification, pruning, an opacity reset and a restored view.
 static void run_training(gsf_context* ctx, run_output* run) {
     gsf_splats start;
     make_splats(ctx, 9, &start);
@@ -239,7 +239,7 @@ static void run_training(gsf_context* ctx, run_output* run) {
         for (int i = 0; i < desc.iterations; i++) {
             gsf_train_stats stats;
             memset(&stats, 0, sizeof stats);
-            if (i == 24) { // the third view comes in as a restored one
+            if (i == 24) { // the third view is added as a restored view
                 views[2].weight = gsf_wrap_image(weight, GSF_F32, WIDTH, HEIGHT, 1);
                 CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, views + 2, 1));
                 gsf_splat_set_restored_weight(trainer, 0.5f);
@@ -266,7 +266,7 @@ static void run_training(gsf_context* ctx, run_output* run) {
     free(weight);
 }
 
-// The whole loop with the warp restorer: one round, after the first half.
+// The whole repair loop with the warp restorer: one round, after half of the training.
 static void run_repair(gsf_context* ctx, run_output* run) {
     gsf_splats start;
     make_splats(ctx, 9, &start);

@@ -12,7 +12,7 @@ static void for_backwards(void* user, size_t chunk_count, gsf_chunk_fn body, voi
     for (size_t i = chunk_count; i-- > 0;) body(arg, i, (int)((i * 7 + 3) % (size_t)workers));
 }
 
-// One thread; or, with workers, chunks in reverse order and dealt to them.
+// One thread, or several workers that get chunks in reverse order.
 static gsf_context open_context(gsf_cpu_level level, int* workers) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);
@@ -153,7 +153,7 @@ static const struct loss_bar { const char* name; double ssim, gradient, small_gr
         {"moved edges", 1.5e-7, 1e-6, 1e-6, 8.8e-7},
         {"beyond 0..1", 2.2e-8, 4.6e-7, 3.4e-7, 6.4e-7}};
 
-// Value i of the photo and of the render in a row of `width` pixels.
+// Value i of the photo and of the render; rows have `width` pixels.
 static void loss_values(int kind, int width, int i, uint64_t* state, float* photo, float* render) {
     const double x = i / 3 % width, y = i / 3 / width, wave = 0.5 + 0.45 * sin(0.07 * x + i % 3) * cos(0.05 * y);
     const double a = test_random(state), b = test_random(state), grey = floor(250.0 * a);
@@ -209,7 +209,7 @@ static void test_loss_accuracy(gsf_cpu_level level) {
     gsf__loss_destroy_scratch(&shuffled, &another);
 }
 
-// The same with weights, a third of which is 0: black in both images of the reference, and without a gradient. What is
+// The same with weights, a third of which are 0: the reference has black in both images there, and no gradient. What is
 // rendered there changes no bit.
 static void test_loss_weights(gsf_cpu_level level) {
     enum { W = 37, H = 141, PIXELS = W * H, N = 3 * PIXELS };
@@ -367,7 +367,7 @@ static void test_lazy_adam(gsf_context* ctx) {
     double* exact = (double*)calloc(3 * COUNT * WIDE, sizeof(double));
     double *m = exact + COUNT * WIDE, *v = m + COUNT * WIDE;
     for (size_t i = 0; i < COUNT * WIDE; i++) exact[i] = (double)a->value[i];
-    int left[BLOCKS], drawn[BLOCKS], longest = 0, replayed = 0; // the first DRAWN splats of a block are drawn with it
+    int left[BLOCKS], drawn[BLOCKS], longest = 0, replayed = 0; // a block is drawn when its first DRAWN splats are
     uint64_t random = 31;
     double worst = 0.0, sum[3] = {0.0, 0.0, 0.0}, total = 0.0, worst_exact[2] = {0.0, 0.0};
     for (int i = 0; i < BLOCKS; i++) left[i] = i % 7, drawn[i] = i % 2;
@@ -560,7 +560,7 @@ static void test_mcmc_densify(gsf_context* ctx) {
         copies[at]++;
         CHECK(logits[i] > -5.3f && model.visits[0][i] == 0 && model.visits[1][i] == 0);
     }
-    for (size_t i = 0; i < BUDGET; i++) { // only what was neither copied nor a copy keeps its moments
+    for (size_t i = 0; i < BUDGET; i++) { // only splats that are neither copies nor copied keep their moments
         const size_t at = (size_t)model.groups[GSF__MEANS].value[3 * i];
         for (int g = 0; g < GSF__GROUPS; g++) {
             const float expected = copies[at] > 1 ? 0.0f : 1.0f;
@@ -722,8 +722,8 @@ static scene make_scene(gsf_context* ctx) {
     return s;
 }
 
-// The pixels in the left half are garbage with weight zero: their values change no bit, and the rest is learnt as if
-// the photos were smaller. Weights in bytes give the same result as in floats.
+// The pixels in the left half are garbage with weight zero: their values change no bit, and the rest is learned as if
+// the photos were smaller. Byte weights give the same result as float weights.
 static void test_masked_training(gsf_context* ctx, const scene* s) {
     enum { PIXELS = WIDTH * HEIGHT };
     static float photos[VIEWS][3 * PIXELS], shown[3 * PIXELS], weight[PIXELS];
@@ -794,7 +794,7 @@ static gsf_train_desc busy_desc(void) {
     return desc;
 }
 
-static gsf_train_desc busy_mcmc_desc(void) { // moves, grows to its budget and shakes
+static gsf_train_desc busy_mcmc_desc(void) { // relocates, grows to its budget and adds noise
     gsf_train_desc desc = busy_desc();
     desc.mcmc = 1;
     desc.max_splats = SPLATS + 8;
@@ -880,7 +880,7 @@ static void test_learns(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, trainer);
 }
 
-// A third of the splats start where nothing is visible, too faint to learn.
+// A third of the splats start where no camera sees them, too faint to learn.
 static void test_mcmc_learns(gsf_context* ctx, const scene* s) {
     enum { BUDGET = SPLATS + 11 };
     gsf_train_desc desc;
@@ -1011,7 +1011,8 @@ static void test_restored_gradient(gsf_context* ctx, const scene* s) {
     gsf_splat_destroy_trainer(ctx, one);
 }
 
-// A negative rate is 0: that parameter stays as it was, and all others learn. lazy: the SH catch up by rates of 0.
+// A negative learning rate means 0: that parameter keeps its values, all others learn. lazy: the SH catch up with rates
+// of 0.
 static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
     for (int rate = 0; rate < 6; rate++) {
         gsf_train_desc desc = busy_desc();
@@ -1109,7 +1110,7 @@ static void test_settings(gsf_context* ctx, const scene* s) {
     CHECK(trainer->desc.lambda_ssim == 0.0f && trainer->desc.densify_grad == 0.0f && trainer->desc.densify_scale == 0.0f);
     CHECK(trainer->desc.prune_opacity == 0.0f && trainer->desc.densify_from == 0);
     gsf_splat_destroy_trainer(ctx, trainer);
-    zeros.lr_means_final = -1.0f; // decays exponentially: never to 0
+    zeros.lr_means_final = -1.0f; // decays exponentially, so it cannot be 0
     CHECK_RESULT(ctx, gsf_splat_make_trainer(ctx, &zeros, s->views, 1, &s->start, &trainer), GSF_ERROR_INVALID_ARGUMENT);
 
     desc.mcmc = 1;
@@ -1124,7 +1125,7 @@ static void test_settings(gsf_context* ctx, const scene* s) {
     desc.scale_penalty = 0.0f;
 
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
-    CHECK(trainer->first_bands == 2 && gsf__trainer_bands(trainer, 1) == 2); // bands in use stay on
+    CHECK(trainer->first_bands == 2 && gsf__trainer_bands(trainer, 1) == 2); // bands in use remain in use
     gsf_splat_destroy_trainer(ctx, trainer);
     desc.sh_degree = 3;
     CHECK_OK(ctx, gsf_splat_make_trainer(ctx, &desc, s->views, 2, &s->truth, &trainer));
@@ -1146,7 +1147,7 @@ static void test_workers(const scene* s, gsf_cpu_level level, int mcmc) {
         if (run == 0) printf("busy run (%s): %zu splats, %u ids\n", gsf_describe_cpu_level(ctx.cpu_level),
                              trainer->model.count, (unsigned)trainer->model.next_id);
         if (run == 0 && !mcmc) CHECK(trainer->model.count > SPLATS + 10);
-        if (run == 0 && mcmc) { // all of the budget; more ids than splats came from moves
+        if (run == 0 && mcmc) { // uses the whole budget; relocation assigns further ids
             CHECK(trainer->model.count == SPLATS + 8);
             CHECK(trainer->model.next_id > 1000 + 3 * (SPLATS - 1) + 1 + 8);
         }
@@ -1538,7 +1539,8 @@ static void failing_free(void* user, void* memory) {
     free(memory);
 }
 
-// A small run in which allocation `fail_at` fails. A failed step is repeated: it must not have changed anything.
+// A short run in which allocation `fail_at` fails. The failed step is repeated: the failure must not have changed any
+// state.
 static gsf_result run_failing(const scene* s, failing* f, int mcmc, gsf_buffer* end) {
     gsf_context ctx;
     memset(&ctx, 0, sizeof ctx);

@@ -154,7 +154,8 @@ static void check_reference_windows(const scene* s, const path* p, int official)
                 for (int i = 0; i < 3; i++) uneven += !(fabs(a[i] - 2.0 * b[i] + c[i]) < 1e-10);
             }
         }
-        if (official) CHECK(pose_distance(&frames[side - 1], &frames[side]) < 1e-12); // the released seams
+        // the seams of the GSFixer release
+        if (official) CHECK(pose_distance(&frames[side - 1], &frames[side]) < 1e-12);
         if (official) CHECK(pose_distance(&frames[side + middle - 1], &frames[side + middle]) < 1e-12);
     }
     CHECK(wrong == 0);
@@ -298,11 +299,11 @@ static void test_invariance(void) {
         check_following(&s, &desc, 1.0, near_by, 1e-11);
         check_following(&s, &desc, 1.0, far_off, 1e-7); // coordinates are rounded to 1e-10 there
         check_following(&s, &desc, 1e3, far_off, 1e-10);
-        desc.official = 1; // the released one follows scale about the origin only
+        desc.official = 1; // the GSFixer release follows scaling about the origin only
         check_following(&s, &desc, 1e-3, none, 1e-11);
         check_following(&s, &desc, 1e3, none, 1e-11);
     }
-    for (size_t count = 3; count <= 12; count++) { // an exact ring: every axis and every nearest view is a tie
+    for (size_t count = 3; count <= 12; count++) { // an exact ring: all axes and all nearest views are tied
         scene s;
         make_scene(&s, count);
         for (size_t i = 0; i < count; i++) {
@@ -354,28 +355,29 @@ static void test_degenerate_cameras(void) {
         for (int i = 1; i < 9; i++) c[i] = c[0]; // one view nine times
         CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
         CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
-        for (int i = 0; i < 9; i++) { // a line of parallel views
+        for (int i = 0; i < 9; i++) { // a line of cameras with parallel axes
             const double eye[3] = {(double)i, 0.0, 0.0}, target[3] = {(double)i, 0.0, 5.0};
             look(eye, target, up, &c[i]);
         }
-        const gsf_result parallel = official ? GSF_ERROR_DEGENERATE : GSF_OK; // the released code has no answer
+        const gsf_result parallel = official ? GSF_ERROR_DEGENERATE : GSF_OK; // the GSFixer release gives no result
         CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == parallel);
         CHECK(result_of(c, 2, GSF_TRAJ_ELLIPSE, official) == parallel);
         CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
-        for (int i = 0; i < 9; i++) { // a line of views that converge: the up vector says which way the loop lies
+        // a line of cameras with converging axes: the up vector decides on which side the loop runs
+        for (int i = 0; i < 9; i++) {
             const double eye[3] = {(double)i - 4.0, 1.0, 0.0}, target[3] = {0.2 * i, 0.5, 5.0};
             look(eye, target, up, &c[i]);
         }
         CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
-        for (int i = 0; i < 9; i++) { // a vertical line: nothing says
+        for (int i = 0; i < 9; i++) { // a vertical line: nothing decides that
             const double eye[3] = {0.0, (double)i, 0.0}, target[3] = {0.0, 4.0, 5.0};
             look(eye, target, up, &c[i]);
         }
         const gsf_result vertical = result_of(c, 9, GSF_TRAJ_REFERENCE, official);
         CHECK(vertical == GSF_OK || vertical == GSF_ERROR_DEGENERATE);
-        for (int i = 0; i < 9; i++) { // straight down, as a drone
+        for (int i = 0; i < 9; i++) { // looking straight down, like a drone
             const double eye[3] = {(double)(i % 3), 10.0, (double)(i / 3)}, target[3] = {1.0, 0.0, 1.0};
             look(eye, target, x_axis, &c[i]);
         }
@@ -386,7 +388,7 @@ static void test_degenerate_cameras(void) {
             look(eye, at_origin, flipped, &c[i]);
         }
         CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
-        scene s; // upside down: the released code mirrors the world when exactly so
+        scene s; // upside down: the GSFixer release mirrors the world if exactly so
         make_scene(&s, 6);
         for (size_t i = 0; i < 6; i++) {
             const double angle = (double)i, eye[3] = {cos(angle), 0.0, sin(angle)}, down[3] = {0.0, -1.0, 0.0};
@@ -396,7 +398,8 @@ static void test_degenerate_cameras(void) {
             s.cameras[i] = camera_at(pose);
         }
         CHECK(result_of(s.cameras, 6, GSF_TRAJ_REFERENCE, official) == GSF_OK);
-        for (int power = -150; power <= 150; power += 10) { // sizes at which squares overflow: a path or an error
+        // sizes at which squares overflow: either a path or an error
+        for (int power = -150; power <= 150; power += 10) {
             scene big;
             make_scene(&s, 5);
             move_scene(&s, pow(10.0, power), at_origin, &big);
@@ -406,8 +409,8 @@ static void test_degenerate_cameras(void) {
     CHECK(result_of(c, 0, GSF_TRAJ_REFERENCE, 0) == GSF_ERROR_DEGENERATE);
 }
 
-// A rig of cameras on a line before a wall, their axes turned by up to `wobble` radians, paired with a cloud of `count`
-// points on that wall: the loop looks at the wall, as the cameras do, in any unit and with a point far off.
+// A row of cameras in front of a wall, their axes rotated by up to `wobble` radians, with a cloud of `count` points on
+// that wall: the loop looks at the wall, as the cameras do, at any scale and with an outlier.
 static void check_rig(double wobble, double unit, size_t count, int outlier) {
     gsf_camera c[5];
     double points[3 * 50];
@@ -451,7 +454,7 @@ static void test_parallel_axes(void) {
             check_rig(wobbles[w], units[u], 50, 0);
             if (units[u] < 1e19) check_rig(wobbles[w], units[u], 50, 1);
         }
-    gsf_camera pair[2]; // face to face
+    gsf_camera pair[2]; // facing each other
     const double up[3] = {0.0, 1.0, 0.0}, left[3] = {-1.0, 0.0, 0.0}, right[3] = {1.0, 0.0, 0.0};
     look(left, right, up, &pair[0]);
     look(right, left, up, &pair[1]);
@@ -459,7 +462,8 @@ static void test_parallel_axes(void) {
     CHECK(result_of(pair, 2, GSF_TRAJ_INTERPOLATE, 0) == GSF_OK);
 }
 
-// One point far off among sixty moves no frame by more than a few hundredths of the scene, however far off it is.
+// One outlier among sixty points moves no frame by more than a few hundredths of the scene's size, however far away it
+// is.
 static void test_outliers(void) {
     for (int trial = 0; trial < 40; trial++) {
         scene s;
@@ -496,10 +500,10 @@ static void test_outliers(void) {
 static void test_degenerate_primitives(void) {
     const double o[3] = {0, 0, 0}, x[3] = {1, 0, 0}, y[3] = {0, 1, 0}, nearly[3] = {1e-7, 1, 0};
     double pose[16], a[16], b[16], out[64 * 16], transform[16], scratch[512], focus[3];
-    CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, o, y, y, pose), GSF_ERROR_DEGENERATE); // along up
+    CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, o, y, y, pose), GSF_ERROR_DEGENERATE); // parallel to up
     CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, x, x, y, pose), GSF_ERROR_DEGENERATE);
     CHECK_RESULT(&ctx, gsf_traj_look_at(&ctx, o, x, o, pose), GSF_ERROR_DEGENERATE);
-    CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, nearly, y, pose)); // nearly along up is still a rotation
+    CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, nearly, y, pose)); // nearly parallel to up: still a rotation
     CHECK(rigidity(pose) < 1e-14);
     for (int trial = 0; trial < 200; trial++) {
         double forward[3], down[3];
@@ -512,7 +516,7 @@ static void test_degenerate_primitives(void) {
         else CHECK(apart < 1e-6);
     }
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, x, y, a));
-    for (int i = 0; i < 3; i++) { // distances 0.1 + 0.2, 0.3, 0.3: equal but for rounding, so the first
+    for (int i = 0; i < 3; i++) { // distances 0.1 + 0.2, 0.3, 0.3: equal up to rounding, so the first wins
         memcpy(out + 16 * i, a, sizeof a);
         out[16 * i + 12] = i ? 0.3 : 0.1 + 0.2;
     }
@@ -530,12 +534,12 @@ static void test_degenerate_primitives(void) {
     for (int i = 0; i < 8; i++) CHECK(rigidity(out + 16 * i) < 1e-14);
     const double back[3] = {-1, 0, 0};
     CHECK_OK(&ctx, gsf_traj_look_at(&ctx, o, back, y, b));
-    memcpy(two + 16, b, sizeof b); // opposite directions: the released blend passes zero at u = 1/2
+    memcpy(two + 16, b, sizeof b); // opposite directions: the blend of the GSFixer release is zero at u = 1/2
     CHECK_RESULT(&ctx, gsf__traj_leg_path(&ctx, two, 2, 8, 1, out), GSF_ERROR_DEGENERATE);
     for (int i = 0; i < 8 * 16; i++) CHECK(out[i] == 0.0);
     CHECK_OK(&ctx, gsf__traj_leg_path(&ctx, two, 2, 9, 0, out));
     for (int i = 0; i < 9; i++) CHECK(rigidity(out + 16 * i) < 1e-14);
-    CHECK_NEAR(fabs(out[4 * 16 + 8]), 0.0, 1e-12); // half way it looks sideways
+    CHECK_NEAR(fabs(out[4 * 16 + 8]), 0.0, 1e-12); // half way, it looks sideways
     CHECK_RESULT(&ctx, gsf__traj_average_pose(&ctx, two, 2, 0, pose), GSF_ERROR_DEGENERATE);
     memcpy(two + 16, a, sizeof a);
     CHECK_RESULT(&ctx, gsf__traj_spline_path(&ctx, two, 2, NULL, scratch, out), GSF_ERROR_DEGENERATE);
@@ -557,7 +561,7 @@ static void test_degenerate_primitives(void) {
     CHECK_RESULT(&ctx, gsf__traj_spline(&ctx, sites, values, 2, 1, 2, sites, 3, scratch, out), GSF_ERROR_DEGENERATE);
     CHECK_RESULT(&ctx, gsf__traj_spline(&ctx, sites, values, 3, 1, 6, sites, 3, scratch, out),
                  GSF_ERROR_INVALID_ARGUMENT);
-    a[0] = -a[0]; a[1] = -a[1]; a[2] = -a[2]; // a mirror
+    a[0] = -a[0]; a[1] = -a[1]; a[2] = -a[2]; // a reflection
     CHECK_RESULT(&ctx, gsf__traj_check_poses(&ctx, a, 1), GSF_ERROR_INVALID_ARGUMENT);
 }
 
@@ -578,7 +582,7 @@ static void test_not_finite(void) {
             desc.point_count = POINTS;
             gsf_camera intrinsics = s.cameras[0];
             desc.intrinsics = &intrinsics;
-            double* fields[4 * 20 + 3 * POINTS + 4]; // every number that goes in
+            double* fields[4 * 20 + 3 * POINTS + 4]; // every input number
             size_t n = 0;
             for (size_t i = 0; i < 4; i++) {
                 for (int k = 0; k < 16; k++) fields[n++] = &s.cameras[i].w2c[k];
@@ -666,7 +670,7 @@ static void test_not_finite_primitives(void) {
     CHECK_RESULT(&ctx, gsf__traj_projection(&ctx, &s.cameras[0], 2.0, 1.0, out), GSF_ERROR_INVALID_ARGUMENT);
 }
 
-// ---- the pieces against plain formulas -----------------------------------------
+// ---- building blocks against plain formulas ------------------------------------
 
 static void test_order_and_eigen(void) {
     for (int trial = 0; trial < 300; trial++) {
@@ -719,7 +723,7 @@ static void test_rotations(void) {
         double dot = 0.0;
         for (int i = 0; i < 4; i++) dot += back[i] * q[i] / length;
         CHECK_NEAR(fabs(dot), 1.0, 1e-14);
-        // slerp: ends, and the angle grows evenly
+        // slerp: reaches both ends, and the angle grows at a constant rate
         double angle[5];
         for (int k = 0; k < 5; k++) {
             gsf__traj_slerp(back, p, 0.25 * k, out);
@@ -741,7 +745,7 @@ static void test_rotations(void) {
     }
 }
 
-// A spline of degree k gives back every polynomial up to degree k, passes through its values, and stays C(k-1).
+// A spline of degree k reproduces polynomials up to degree k, passes through its values, and is C(k-1) continuous.
 static void test_splines(void) {
     for (int trial = 0; trial < 200; trial++) {
         const int32_t degree = 1 + trial % 5;
@@ -772,7 +776,8 @@ static void test_splines(void) {
     CHECK(gsf__traj_spline_scratch(SIZE_MAX / 8, 3, 3) == SIZE_MAX);
     CHECK(gsf__traj_spline_scratch(4, 9, 3) == SIZE_MAX);
     CHECK(gsf__traj_normalize_scratch(4, SIZE_MAX / 4) == SIZE_MAX);
-    for (size_t count = 2; count <= 20; count++) { // spline paths pass through their poses, in exact scratch
+    // spline paths pass through their poses, with scratch memory of exactly the size queried
+    for (size_t count = 2; count <= 20; count++) {
         scene s;
         make_scene(&s, count);
         double poses[32 * 16];
@@ -808,7 +813,7 @@ static void test_sets_of_views(void) {
                 eye[k] = target[k] + uniform(0.5, 2.0) * (test_random_bits(&rng) % 2 ? 1.0 : -1.0);
             CHECK_OK(&ctx, gsf_traj_look_at(&ctx, eye, target, up, poses + 16 * i));
         }
-        CHECK_OK(&ctx, gsf_traj_find_focus(&ctx, poses, n, focus)); // axes that meet
+        CHECK_OK(&ctx, gsf_traj_find_focus(&ctx, poses, n, focus)); // intersecting axes
         test_compare("focus", focus, target, 3, 1e-10);
         int32_t index;
         for (size_t i = 0; i < n; i++) {
@@ -849,7 +854,7 @@ static void test_intrinsics(void) {
     double projection[16], full[16];
     CHECK_OK(&ctx, gsf__traj_projection(&ctx, &camera, 0.01, 100.0, projection));
     gsf__mat4_mul(projection, camera.w2c, full);
-    for (int i = 0; i < 50; i++) { // clip space against pixels
+    for (int i = 0; i < 50; i++) { // clip space compared with pixels
         const double p[3] = {uniform(-0.3, 0.3), uniform(-0.3, 0.3), uniform(-0.3, 0.3)};
         double u, v, depth, clip[4];
         if (!CHECK(gsf_project_point(&camera, p, &u, &v, &depth))) continue;
@@ -871,7 +876,7 @@ static void test_schedule(void) {
     CHECK(gsf_traj_query_generative_weight(10, 10, 20, 1.0, 0) == 0.0);
     CHECK(gsf_traj_query_generative_weight(20, 10, 20, 0.75, 0) == 0.75 && gsf_traj_query_generative_weight(20, 10, 20,
                                                                                                             0.75, 1) == 0.0);
-    for (int i = 12; i < 20; i++) // rises all the way; the released one falls again
+    for (int i = 12; i < 20; i++) // keeps rising; that of the GSFixer release falls again
         CHECK(gsf_traj_query_generative_weight(i, 10, 20, 2.0, 0) > gsf_traj_query_generative_weight(i - 1, 10, 20, 2.0,
                                                                                                      0));
     for (int i = 11; i < 20; i++) {
@@ -879,7 +884,8 @@ static void test_schedule(void) {
         CHECK_NEAR(gsf_traj_query_generative_weight(i, 10, 20, 2.0, 0), 2.0 * t * (2.0 - t), 1e-6);
     }
     CHECK(gsf_traj_query_generative_weight(19, 10, 20, 2.0, 1) < gsf_traj_query_generative_weight(15, 10, 20, 2.0, 1));
-    for (int32_t total = 1; total < 300; total++) // released tables: inside the sequence, or refused
+    // the tables of the GSFixer release: indices inside the sequence, or an error
+    for (int32_t total = 1; total < 300; total++)
         for (int32_t middle = 1; middle < 40; middle++) {
             int32_t windows, starts[310], overlaps[310];
             if (gsf__traj_official_windows(&ctx, total, middle, NULL, NULL, &windows) != GSF_OK) {
