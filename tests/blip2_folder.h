@@ -4,10 +4,10 @@
 
 #include "test.h"
 
-typedef struct blip2_file { const char *name, *text; size_t size; } blip2_file; // size 0: a string; text NULL: not there
+typedef struct blip2_file { const char *name, *text; size_t size; } blip2_file; // size 0: a string; text NULL: absent
 
 typedef struct blip2_folder {
-    gsf_context plain; // reads what is not replaced
+    gsf_context plain; // reads the files that are not replaced
     blip2_file files[6];
     size_t count;
 } blip2_folder;
@@ -56,7 +56,7 @@ static void blip2_put(blip2_folder* f, const char* name, const char* text, size_
     f->files[f->count++].size = size;
 }
 
-// The golden file with `from` replaced by `to`; to be freed.
+// The golden file with `from` replaced by `to`; freed by the caller.
 static char* blip2_edit(const char* name, const char* from, const char* to) {
     char path[256];
     size_t size;

@@ -5,7 +5,7 @@
 #include "blip2_folder.h"
 #include "encoders_golden.h"
 
-// Largest errors allowed; reached: 0, 2e-6, 2e-6, 5e-6, 5e-6 for values of about 1.
+// Tolerances. Measured errors: 0, 2e-6, 2e-6, 5e-6, 5e-6, for values of about 1.
 static const struct { const char *tap, *expected; double bar; } blip2_stages[] = {
     {"pixel_values", "pixel_values", 0.0}, {"vision", "vision_last", 4e-5}, {"qformer", "qformer_last", 4e-5},
     {"projection", "language_projection", 4e-5}, {"logits", "logits_prompt", 4e-5}};
@@ -36,7 +36,7 @@ static void see_blip2_tap(void* user, const char* name, int32_t index, const flo
     }
 }
 
-// Numbers of a JSON list from `skip` on; -1 where there are no more.
+// Numbers of a JSON list from index `skip` on; -1 past its end.
 static int32_t blip2_id(const gsf_json* json, const gsf_json_value* list, size_t index) {
     const gsf_json_value* value = gsf_find_json_element(json, list, index);
     return value ? (int32_t)value->number : -1;
@@ -60,7 +60,7 @@ static size_t blip2_strip(const char** text, size_t size) { // ASCII white space
     return size;
 }
 
-// The text of a caption, where a zero byte has become U+FFFD.
+// The text of a caption, with U+FFFD in place of a zero byte.
 static void check_blip2_text(const gsf_json_value* expected, const char* caption) {
     const char* text = expected->string;
     const size_t size = blip2_strip(&text, expected->string_size);
@@ -108,7 +108,7 @@ static void check_blip2_run(blip2_case* c, const gsf_nn_captioner* net, const gs
     if (CHECK(text && text->type == GSF_JSON_STRING)) check_blip2_text(text, caption);
 }
 
-// The folder once more without image_token_index: its default is three tokens less.
+// Repeats the run without image_token_index in config.json: the default length is then three tokens less.
 static void check_blip2_legacy(const gsf_image* image, const gsf_json* json, const gsf_json_value* expected,
                                size_t queries) {
     blip2_folder folder;

@@ -11,15 +11,15 @@ static inline void check_rows(const char* what, const float* actual, int64_t row
     for (int64_t r = 0; r < rows; r++)
         for (int64_t i = 0; i < columns; i++) {
             const double error = fabs((double)actual[r * ld + i] - expected[r * expected_ld + i]);
-            if (!(error <= worst)) worst = error; // a NaN wins
+            if (!(error <= worst)) worst = error; // a NaN is kept
         }
     if (getenv("GSF_TEST_VERBOSE")) printf("%-40s %.3g (bar %.3g)\n", what, worst, bar);
     if (!test_check(worst <= bar, what, __FILE__, __LINE__))
         fprintf(stderr, "    largest error %.3g, allowed %.3g\n", worst, bar);
 }
 
-// Images as an encoder takes them; a leading dimension of 1 is passed over.
-static inline float* golden_images(const test_tensor* t, gsf_nn_encoder_desc* in) { // to be freed
+// Images in the encoder's layout; a leading dimension of 1 is dropped.
+static inline float* golden_images(const test_tensor* t, gsf_nn_encoder_desc* in) { // freed by the caller
     float* pixels = test_tensor_floats(t);
     const size_t* dim = t->dim + (t->rank - 4);
     memset(in, 0, sizeof *in);
@@ -30,7 +30,7 @@ static inline float* golden_images(const test_tensor* t, gsf_nn_encoder_desc* in
     return pixels;
 }
 
-// An encoder of images, and where its cases stand: caseN.INPUT gives caseN.OUTPUT.
+// An image encoder and the names of its test cases: caseN.INPUT must give caseN.OUTPUT.
 typedef struct golden_encoder {
     const void* net;
     const char *input, *output;
@@ -39,7 +39,7 @@ typedef struct golden_encoder {
     gsf_result (*encode)(gsf_context* ctx, const void* net, const gsf_nn_encoder_desc* in, float* out);
     void (*see_tap)(void* encoder, const char* name, int32_t image, const float* data, int64_t rows, int64_t columns);
     test_tensors expected;
-    int index, images, seen; // of the case at work: number, images, intermediates compared
+    int index, images, seen; // of the current case: its number, images, intermediates compared
 } golden_encoder;
 
 static inline test_tensor golden_case(const golden_encoder* e, const char* name) { // .v NULL when absent
@@ -71,7 +71,7 @@ static inline void check_encoder_case(gsf_context* ctx, golden_encoder* e, gsf_n
     free(out);
 }
 
-// All cases of a file; leaves it open, and their count in e->index.
+// Runs all cases of a file; leaves the file open and the number of cases in e->index.
 static inline void check_encoder(gsf_context* ctx, golden_encoder* e, const char* file) {
     e->expected = test_open_tensors(test_golden(file));
     for (e->index = 0;; e->index++) {

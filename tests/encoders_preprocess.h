@@ -49,7 +49,7 @@ static void check_photo(gsf_context* ctx, const gsf_json* json, const gsf_json_v
               memcmp(expected.data, pixels, count) == 0);
         gsf_destroy_image(ctx, &expected);
     }
-    // a photo in float comes to the same
+    // a float photo gives the same result
     CHECK_OK(ctx, gsf_make_image(ctx, GSF_F32, photo.width, photo.height, photo.channels, &wide));
     CHECK_OK(ctx, gsf_convert_image(ctx, &photo, &wide));
     gsf_destroy_image(ctx, &image);

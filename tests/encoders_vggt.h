@@ -4,9 +4,9 @@
 
 #include "encoders_golden.h"
 
-static const double vggt_bar = 4e-5; // of values about 1; 3.3e-6 is reached
+static const double vggt_bar = 4e-5; // for values of about 1; measured error 3.3e-6
 
-// Frame and global block of the first pair are the two halves of out_first.
+// The outputs of the first frame block and the first global block are the two halves of out_first.
 static void see_vggt_tap(void* encoder, const char* name, int32_t image, const float* data, int64_t rows,
                          int64_t columns) {
     golden_encoder* e = (golden_encoder*)encoder;

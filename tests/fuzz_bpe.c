@@ -56,7 +56,7 @@ static void use_tokenizer(gsf_context* ctx, const gsf_nn_bpe* bpe, bytes text) {
     size_t count;
     const gsf_result result = gsf_nn_encode_bpe(ctx, bpe, (const char*)text.data, text.size, 0, &ids, &count);
     if (result == GSF_OK) {
-        FUZZ_CHECK(count <= text.size + 2); // a first token, a space before
+        FUZZ_CHECK(count <= text.size + 2); // plus a bos token and a leading space
         for (size_t i = 0; i < count; i++) FUZZ_CHECK(ids[i] >= 0 && ids[i] <= bpe->highest_id);
         check_decoded(ctx, bpe, ids, count < 64 ? count : 64); // each may be a token as long as the input
     } else {

@@ -16,7 +16,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     fuzz_file files[] = {{"fuzz", data, size}, {NULL, NULL, 0}};
     gsf_camera *cameras, *again;
     size_t count, again_count;
-    fuzz_limit += 64 * size; // the file beside its values
+    fuzz_limit += 64 * size; // the saved file
     fuzz_hook_files(&ctx, files);
     const gsf_result result = gsf_load_cameras(&ctx, "fuzz", &cameras, &count);
     if (result == GSF_OK) {

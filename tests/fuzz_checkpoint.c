@@ -1,7 +1,7 @@
 // fuzz_checkpoint.c - checkpoints of the repair loop. Build line: fuzz.h. Input: a byte below 128, the number of steps
 // after which a small loop is saved, followed by patches to that checkpoint (fuzz_patch_chunks); or a byte from 128 on,
 // followed by a whole file. Checksums are corrected. A refused checkpoint leaves the loop unchanged; an accepted one is
-// saved again as the same bytes, and the loop continues from it.
+// written back byte-identically, and the loop continues from it.
 #include "fuzz.h"
 
 enum { SIDE = 8, VIEWS = 3, SPLATS = 5, STEPS = 16 };
@@ -121,7 +121,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     if (size == 0) return 0;
     gsf_context ctx = fuzz_context(size);
-    fuzz_limit += (size_t)4 << 20; // the loop's own
+    fuzz_limit += (size_t)4 << 20; // for the loop itself
     gsf_buffer file = make_file(&ctx, data, size);
     gsf_fixer* loop = make_loop(&ctx);
     gsf_buffer before = save(&ctx, loop);
@@ -131,7 +131,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
         FUZZ_CHECK(result == GSF_ERROR_FORMAT || result == GSF_ERROR_UNSUPPORTED);
         fuzz_check_error(&ctx, "fuzz:");
         check_same(&before, &after);
-        FUZZ_CHECK(size > 1 || data[0] >= 128); // no patch: it is what the loop saved
+        FUZZ_CHECK(size > 1 || data[0] >= 128); // without patches, the checkpoint must be accepted
     } else {
         FUZZ_CHECK(gsf_splat_parse_fixer(&ctx, loop, "again", after.data, after.size) == GSF_OK);
         gsf_buffer again = save(&ctx, loop);

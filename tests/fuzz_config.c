@@ -1,6 +1,6 @@
 // fuzz_config.c - configurations of the networks and of the tokenizer. Build line: fuzz.h, with -DTEST_GOLDEN=
 // '"tests/golden"'. The first byte selects the network, the rest is its configuration; the weights are those of the
-// small golden model. Accepted models can run; refused ones give one line of error.
+// small golden model. Accepted models can run; refused ones give a one-line error.
 #include "gsfixer_nn.h"
 
 #include "fuzz.h"
@@ -23,9 +23,9 @@ static const struct kind { const char *folder, *config; } kinds[KINDS] = {
     {"", "/added_tokens.json"}};
 
 static float values[1 << 15], results[1 << 20]; // any input, any output
-static int runs; // a network's pass takes as long as a hundred openings: one in 64 inputs, by their bytes, gets so far
+static int runs; // a forward pass takes as long as loading 100 times, so only one input in 64 (by hash) runs it
 
-// Every other file that stands in the golden folder, read once.
+// Reads all the other files of the golden folder, once.
 static void load_folder(const char* folder, fuzz_file* files) {
     static const char* const names[FILES] = {
         "/config.json", "/model.safetensors", "/model.safetensors.index.json", "/model-00001-of-00002.safetensors",
@@ -49,7 +49,7 @@ static void load_folder(const char* folder, fuzz_file* files) {
     }
 }
 
-// The folder of a kind: `config` goes before what stands there under its name.
+// Lists the files of a kind's folder; the fuzzed config comes before the file of the same name.
 static size_t fill_folder(size_t kind, fuzz_file* files) {
     static fuzz_file folders[KINDS][FILES + 1];
     static made_bytes spiece;
@@ -211,7 +211,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     for (size_t i = 0; i < size; i++) hash = (hash ^ data[i]) * 16777619u;
     runs = hash >> 26 == 0;
     gsf_context ctx = fuzz_context(size);
-    fuzz_limit += 3 * fill_folder(kind, files + 1) + ((size_t)16 << 20); // weights, a run's memory, a table of a million steps
+    fuzz_limit += 3 * fill_folder(kind, files + 1) + ((size_t)16 << 20); // weights, a pass, a schedule of a million steps
     files[0].name = kinds[kind].config;
     files[0].data = data + 1;
     files[0].size = size - 1;

@@ -18,7 +18,7 @@ static int replay_file(const char* path, size_t size) {
     int ok = file && data && fread(data, 1, size, file) == size;
     if (file) fclose(file);
     if (ok) {
-        fprintf(stderr, "%s\n", path); // a crash is then known by its input
+        fprintf(stderr, "%s\n", path); // names the input of a crash
         if (size) {
             LLVMFuzzerTestOneInput(data, size);
         } else {

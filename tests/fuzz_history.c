@@ -51,7 +51,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     memset(&app, 0, sizeof app);
     app.ctx = fuzz_context(size);
     app.o.compare = 1;
-    fuzz_limit += 128 * size; // its lists, what they print as, and their values
+    fuzz_limit += 128 * size; // its lists, their JSON, and the parsed values
     begin(&run, &app);
     const gsf_result result = read_back(&run, size ? (const char*)data : "", size);
     if (result == GSF_OK) {

@@ -1,5 +1,5 @@
 // fuzz_json.c - the JSON parser. Build line: fuzz.h. Accepted documents print as text that parses to the same values;
-// refused ones give one line of error and leave no memory allocated.
+// refused ones give a one-line error and leave no memory allocated.
 #include "fuzz.h"
 
 static void print_value(gsf_context* ctx, const gsf_json* json, const gsf_json_value* value, gsf_buffer* out) {
@@ -27,14 +27,15 @@ static int same_value(const gsf_json_value* a, const gsf_json_value* b) {
     return a->type != GSF_JSON_STRING || strcmp(a->string, b->string) == 0;
 }
 
-// Members are found by their keys and elements by their places, and nothing else is.
+// Members are found by their keys and elements by their indices; absent ones are not found.
 static void check_access(const gsf_json* json, const gsf_json_value* value) {
     size_t place = 0;
     const int is_object = value->type == GSF_JSON_OBJECT, is_array = value->type == GSF_JSON_ARRAY;
     FUZZ_CHECK(value->type != GSF_JSON_STRING || value->string[value->string_size] == 0);
     FUZZ_CHECK(gsf_find_json_element(json, value, value->count) == NULL);
     FUZZ_CHECK(is_object || gsf_find_json_member(json, value, "") == NULL);
-    for (uint32_t i = value->child; i && place < 40; i = json->values[i].next, place++) { // both walk the whole list
+    // only the first 40, as both lookups walk the list
+    for (uint32_t i = value->child; i && place < 40; i = json->values[i].next, place++) {
         const gsf_json_value* child = &json->values[i];
         FUZZ_CHECK(gsf_find_json_element(json, value, place) == (is_array ? child : NULL));
         FUZZ_CHECK((child->key != NULL) == is_object);
@@ -69,7 +70,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     gsf_context ctx = fuzz_context(size);
     if (!data) data = (const uint8_t*)"";
-    fuzz_limit = 192 * size + ((size_t)1 << 20); // the values, the text that they print as, and its values
+    fuzz_limit = 192 * size + ((size_t)1 << 20); // the values, their text, and the values parsed from it
     check_parser(&ctx, (const char*)data, size);
     FUZZ_CHECK(fuzz_live == 0);
     return 0;

@@ -1,7 +1,7 @@
-// fuzz_safetensors.c - safetensors files and the index of a sharded model. Build line: fuzz.h. The input is taken twice:
-//   as a file; and, split at its first zero byte, as an index.json and its shards: a u16 (little-endian) tells the size of
-//   the one that is asked for first, what follows that one is each of the others. The index is opened by its name and as
-//   a folder's. What was accepted is written and read again.
+// fuzz_safetensors.c - safetensors files and the index of a sharded model. Build line: fuzz.h. The input is used twice:
+//   as a file; and, split at its first zero byte, as index.json and shards: a u16 (little-endian) gives the size of the
+//   first shard that is read, and the rest serves as each of the other shards. The index is opened by name and through its
+//   folder. Accepted tensors are written and read again.
 #include "gsfixer_nn.h"
 
 #include "fuzz.h"
@@ -9,7 +9,7 @@
 typedef struct bytes { const uint8_t* data; size_t size; } bytes;
 typedef struct fuzz_files { bytes index, first, others, written; int reads; } fuzz_files;
 
-enum { FOLDER = 16 }; // files that the folder of shards holds: whichever are asked for first
+enum { FOLDER = 16 }; // files that can be read, index.json included, under whatever names
 
 static gsf_result read_fn(void* user, gsf_context* ctx, const char* path, void** data, size_t* size) {
     fuzz_files* files = (fuzz_files*)user;
@@ -35,7 +35,7 @@ static gsf_result write_fn(void* user, gsf_context* ctx, const char* path, const
 
 static uint64_t bytes_of(const gsf_nn_tensor* t) { return (uint64_t)t->count * gsf_nn_get_dtype_size(t->dtype); }
 
-// Sorted names, shapes that fit, and data inside [begin, end) where that is known. Every value is read.
+// Checks that names are sorted, shapes match sizes, and data lies in [begin, end) if given. Reads every value.
 static void check_tensors(const gsf_nn_weights* w, const uint8_t* begin, const uint8_t* end) {
     for (size_t i = 0; i < w->tensor_count; i++) {
         const gsf_nn_tensor* t = &w->tensors[i];
@@ -73,7 +73,7 @@ static void check_refused(const gsf_context* ctx, const gsf_nn_weights* w, gsf_r
     for (const char* c = ctx->error; *c; c++) FUZZ_CHECK((unsigned char)*c >= 0x20); // one line
 }
 
-// The index and its shards, opened by `path`. Returns the number of tensors, or the result.
+// Opens the index and its shards by `path`. Returns the number of tensors, or the error.
 static int64_t open_shards(gsf_context* ctx, fuzz_files* files, const char* path) {
     gsf_nn_weights w;
     files->reads = 0;

@@ -1,12 +1,12 @@
-// fuzz_spiece.c - the SentencePiece tokenizer. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION. The first byte tells
-// what the rest is: 255 a spiece.model, else a text for the model of made_spiece.h with the flags in the low six bits.
+// fuzz_spiece.c - the SentencePiece tokenizer. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION. The first byte selects
+// the rest: 255 a spiece.model; otherwise a text for the model of made_spiece.h with the flags of the low six bits.
 #define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
 #include "gsfixer_nn.h"
 #include "made_spiece.h"
 
-// Ids in range, one end, the same with any room.
+// Ids are in range, with a single </s>, and do not depend on the capacity of the output.
 static void check_text(gsf_context* ctx, const gsf_nn_tokenizer* t, const char* text, size_t size) {
     size_t count = 0, again = 0;
     FUZZ_CHECK(gsf_nn_encode_text(ctx, t, text, size, NULL, 0, &count) == GSF_OK && count > 0);

@@ -1,14 +1,14 @@
 // fuzz_spz.c - SPZ files, and the gzip inside. Build line: fuzz.h, without -DGSFIXER_IMPLEMENTATION.
-//   The input is taken three times: as a file; as the content of a file (whose checksum no mutation would hit); and as
-//   DEFLATE data of a content whose length the first two bytes say. A few bytes inflate to a thousand times as many, and
-//   every splat of them is read, packed and read again: what takes more than a quarter of a MiB finds no memory. Packing
-//   takes ten times as long as reading: one in eight inputs, by their bytes, gets so far.
+//   The input is used three times: as a file; as the content of a file (whose checksum mutations would never match); and
+//   as DEFLATE data, with the size of its content in the first two bytes. A few bytes may inflate a thousandfold, and all
+//   these splats are read, packed and read again, so allocations beyond a quarter of a MiB fail. Packing takes ten times as
+//   long as reading, so only one input in eight (by hash) is packed.
 #define GSFIXER_IMPLEMENTATION
 #include "fuzz.h"
 
 static int packs;
 
-// What was accepted is finite and, unless a coordinate is out of SPZ's range, survives being written and read again.
+// Accepted splats are finite and, unless a coordinate is out of SPZ's range, survive being written and read again.
 static void use(gsf_context* ctx, gsf_splats* splats) {
     gsf_splats again;
     gsf_buffer text;
@@ -42,14 +42,14 @@ static void parse(gsf_context* ctx, const void* data, size_t size) {
     FUZZ_CHECK(splats.owned == NULL);
 }
 
-// What is packed unpacks to the same.
+// Packing and unpacking gives the same bytes.
 static void check_gzip(gsf_context* ctx, const uint8_t* data, size_t size) {
     gsf_buffer packed;
     unsigned char* back;
     size_t back_size;
     memset(&packed, 0, sizeof packed);
     FUZZ_CHECK(gsf__gzip_append(ctx, "packed", data, size, &packed) == GSF_OK);
-    FUZZ_CHECK(packed.size <= size + 6 * (size / 32767 + 1) + 18); // per block a stored one's head, and bits rounded up
+    FUZZ_CHECK(packed.size <= size + 6 * (size / 32767 + 1) + 18); // a header per stored block, padded to whole bytes
     const unsigned char* bytes = (const unsigned char*)packed.data;
     FUZZ_CHECK(gsf__gzip_read(ctx, "packed", bytes, packed.size, &back, &back_size) == GSF_OK);
     FUZZ_CHECK(back_size == size && memcmp(back, data, size) == 0);
@@ -57,7 +57,7 @@ static void check_gzip(gsf_context* ctx, const uint8_t* data, size_t size) {
     gsf_destroy_buffer(ctx, &packed);
 }
 
-// A gzip file of the bytes as they are: blocks of DEFLATE that are not compressed.
+// A gzip file with the bytes in stored (uncompressed) DEFLATE blocks.
 static gsf_buffer store(gsf_context* ctx, const uint8_t* data, size_t size) {
     static const char head[10] = "\x1f\x8b\x08\0\0\0\0\0\0";
     gsf_buffer file;
@@ -83,7 +83,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     packs = size > 0 && gsf__crc32(0, data, size) % 8 == 0;
     gsf_context ctx = fuzz_context(size);
-    fuzz_limit = (size_t)(16 * GSF__DEFLATE_RATIO) * size + ((size_t)4 << 20); // as much as DEFLATE can hold, unpacked
+    fuzz_limit = (size_t)(16 * GSF__DEFLATE_RATIO) * size + ((size_t)4 << 20); // DEFLATE's largest expansion
     fuzz_room = 16 * size + ((size_t)1 << 18) + sizeof(gsf__deflater);
     parse(&ctx, data, size);
 
@@ -96,9 +96,9 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     if (size > 2) {
         const size_t room = 1 + data[0] + 256u * (data[1] & 15u);
         unsigned char *out = (unsigned char*)malloc(room), *body = (unsigned char*)malloc(size - 2 + 8);
-        FUZZ_CHECK(out && body); // of exactly these sizes: a sanitizer sees the byte behind them
+        FUZZ_CHECK(out && body); // of exact sizes, so that a sanitizer detects any overrun
         memcpy(body, data + 2, size - 2);
-        memset(body + size - 2, 0xa5, 8); // where a file has its checksum and size
+        memset(body + size - 2, 0xa5, 8); // in place of the checksum and size of a file
         (void)gsf__inflate(&ctx, "raw", body, size - 2 + 8, 0, out, room);
         free(body);
         free(out);

@@ -50,7 +50,7 @@ static inline void made_map(made_bytes* normalizer) {
     unsigned char map[4 + 4 * MADE_UNITS + 7] = {0};
     uint32_t units[MADE_UNITS] = {0};
     static const struct { unsigned char byte, value; } entries[] = {{'A', 0}, {'Q', 4}, {'\t', 5}};
-    units[0] = 128u << 10; // children stand at 128 ^ byte, their values at 1, 2, 3
+    units[0] = 128u << 10; // children are at 128 ^ byte, their values at 1, 2, 3
     for (uint32_t i = 0; i < 3; i++) {
         const uint32_t at = 128u ^ entries[i].byte;
         units[at] = entries[i].byte | 256u | (at ^ (i + 1)) << 10;
@@ -64,7 +64,7 @@ static inline void made_map(made_bytes* normalizer) {
     made_field(normalizer, 2, map, sizeof map);
 }
 
-// Ids: 0 <pad>, 1 </s>, 2 <unk>, 3 ... as listed; with MADE_BYTES 256 more behind them.
+// Ids: 0 <pad>, 1 </s>, 2 <unk>, 3 ... as listed; with MADE_BYTES, 256 byte pieces follow.
 static inline void made_spiece(int flags, made_bytes* out) {
     made_bytes part;
     out->size = 0;

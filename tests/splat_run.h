@@ -26,7 +26,7 @@ static inline void counting_free(void* user, void* memory) { (void)user; free(me
 
 typedef struct machine { gsf_context ctx; gsf_rasterizer* rasterizer; const char* name; } machine;
 
-// Returns 0 if the machine lacks the level.
+// Returns 0 if the CPU lacks the level.
 static inline int machine_open(machine* m, gsf_cpu_level level, int reversed) {
     memset(m, 0, sizeof *m);
     m->ctx.cpu_level = level;

@@ -85,7 +85,7 @@ static void test_warp(gsf_context* ctx) {
     double worst = 0.0;
     for (int i = 0; i < N; i++) {
         if (out_confidence[i] <= 0.0f) {
-            CHECK(out_color[3 * i] == 0.25f); // no reference sees it: the render is kept
+            CHECK(out_color[3 * i] == 0.25f); // not seen by any reference: the render is kept
             continue;
         }
         covered++;
@@ -114,8 +114,8 @@ static void test_warp(gsf_context* ctx) {
     warp.end_fn(warp.user, ctx);
     CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 0), GSF_ERROR_INVALID_ARGUMENT);
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
-    CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 1), GSF_ERROR_INVALID_ARGUMENT); // another run's
-    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window)); // still has its two
+    CHECK_RESULT(ctx, warp.begin_fn(warp.user, ctx, references, 1), GSF_ERROR_INVALID_ARGUMENT); // already begun
+    CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window)); // keeps its two references
     CHECK_NEAR(out_color[0], color[1][0], 1e-6);
     warp.end_fn(warp.user, ctx);
     references[1].depth.data = NULL;
@@ -173,8 +173,8 @@ static void test_warp_residual(gsf_context* ctx) {
     gsf_splat_destroy_warp(ctx, &warp);
 }
 
-// A splat in front of the plane that both photos see through: the frame takes what they show behind it, with full
-// confidence. A single photo, or one that shows the splat in place, does not change it.
+// A splat in front of the plane that neither photo shows: the frame takes the plane behind it from the photos, with full
+// confidence. A single photo, or a second photo that shows the splat in place, does not change the frame.
 static void test_warp_refutes(gsf_context* ctx) {
     enum { W = 96, H = 64, N = W * H };
     static float color[3][3 * N], depth[3][N], shown_color[3 * N], shown_depth[N], out_color[3 * N], out_confidence[N];
@@ -212,10 +212,10 @@ static void test_warp_refutes(gsf_context* ctx) {
                 CHECK(photos == 2 ? out_confidence[at] > 0.95f : out_confidence[at] < 0.8f);
             }
         CHECK_NEAR(worst, 0.0, photos == 2 ? 0.03 : 1e-6);
-        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // next to it, nothing changes
+        CHECK_NEAR(out_color[3 * (10 * W + 48)], color[2][3 * (10 * W + 48)], 1e-6); // pixels next to it do not change
         warp.end_fn(warp.user, ctx);
     }
-    // the second photo shows leaves there as well, at most 4 pixels away: then it stays
+    // the second photo shows leaves at most 4 pixels away as well: the splat is kept
     for (int i = 0; i < N; i++)
         if (i % W % 8 < 4) depth[1][i] /= 1.2f;
     CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
@@ -237,13 +237,13 @@ typedef struct repair {
     gsf_rasterizer* rasterizer;
     gsf_train_view views[VIEWS];
     float photos[VIEWS][3 * PIXELS];
-    gsf_restorer restorer;          // renders the truth
+    gsf_restorer restorer;          // renders the ground truth
     int32_t multiple, frames_step;  // the restorer's limits
-    gsf_restorer_info also;         // further ones: what it was made for
+    gsf_restorer_info also;         // further limits: the frames that the restorer was trained for
     int begun, ended, windows, fail_at, checked, restored;
 } repair;
 
-static gsf_camera around(double angle, double height) { // on a circle of radius 4, looking at the middle
+static gsf_camera around(double angle, double height) { // on a circle of radius 4, looking at the centre
     const double eye[3] = {4.0 * sin(angle), height, -4.0 * cos(angle)}, target[3] = {0, 0, 0}, up[3] = {0, -1, 0};
     double pose[16];
     gsf_camera c = look(0, 0, 0, WIDTH, HEIGHT);
@@ -380,7 +380,7 @@ static gsf_fix_desc repair_desc(void) {
     return desc;
 }
 
-// Steps until done or `stop` steps; counts the stages.
+// Steps until done, at most `stop` times; counts the stages.
 static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]) {
     gsf_fix_stats stats;
     for (int i = 0; i < stop; i++) {
@@ -393,7 +393,7 @@ static int run_steps(gsf_context* ctx, gsf_fixer* fixer, int stop, int counts[4]
     return 0;
 }
 
-typedef struct masked { // references as a restorer is given them
+typedef struct masked { // checks the references that a restorer receives
     repair* r;
     int32_t needs_depth, begun;
 } masked;
@@ -434,7 +434,7 @@ static gsf_result masked_restore(void* user, gsf_context* ctx, const gsf_restore
 
 static void masked_end(void* user, gsf_context* ctx) { (void)user; (void)ctx; }
 
-// Masked pixels of a photo are replaced by the splats' render in what restorers get, and have no depth there.
+// In the references passed to a restorer, masked pixels of a photo show the splats' render and have no depth.
 static void test_masked_references(gsf_context* ctx) {
     static repair r;
     static uint8_t weight[PIXELS];
@@ -481,7 +481,7 @@ static void test_desc(gsf_context* ctx) { // the loop's desc with defaults fille
           used.train.render.near_plane == 0.01f * used.train.extent);
     gsf_splat_destroy_fixer(ctx, fixer);
     given.lambda = -1.0f; // 0
-    given.train.iterations = 150; // only one iteration is shortly before a densification: rounds stay separate
+    given.train.iterations = 150; // only one iteration is just before a densification, so rounds stay separate
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &given, r.views, VIEWS, &r.start, &r.restorer, &fixer));
     used = gsf_splat_get_fixer_desc(fixer);
     CHECK(used.first_round == 99 && used.last_round == 125 && used.lambda == 0.0f);
@@ -559,12 +559,12 @@ static void test_loop(gsf_context* ctx) {
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixed));
     CHECK(run_steps(ctx, fixed, 1000, counts));
     CHECK(counts[GSF_FIX_TRAIN] == 240 && counts[GSF_FIX_PLAN] == 2 && counts[GSF_FIX_RESTORE] == 4);
-    CHECK(r.begun == 2 && r.ended == 2 && r.checked == 4); // the path's ends are photos: one in each window
+    CHECK(r.begun == 2 && r.ended == 2 && r.checked == 4); // the path begins and ends at photos: one in each window
     const double before = held_out_psnr(ctx, &r, plain), after = held_out_psnr(ctx, &r, fixed);
     printf("held-out PSNR: plain %.2f dB, with a perfect restorer %.2f dB\n", before, after);
     CHECK(after > before + 0.3);
 
-    // continue from a checkpoint taken after every few steps, in all stages
+    // resume from checkpoints taken every few steps, in all stages
     for (int stop = 1; stop < 126; stop += stop > 38 && stop < 48 ? 1 : 13) {
         gsf_fixer *first, *second;
         gsf_buffer chunks;
@@ -590,10 +590,8 @@ static void test_loop(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-// A restorer that was made for 13 frames of 96 x 40, for which the photos' 48 x 40 are squashed; at --quality fast's
-// kind of limit a smaller size with the same view; and one that keeps pixels square in frames of that one size, of
-// which a half is margin that is not to be trained on. Whether a path is possible is checked before any training: a rig
-// with parallel axes is accepted, coincident cameras are refused at once, unless there are no rounds.
+// Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
+// refused immediately, unless there are no rounds.
 static void test_rigs(gsf_context* ctx) {
     for (int rig = 0; rig < 2; rig++) {
         static repair r;
@@ -637,7 +635,7 @@ static void test_given_path(gsf_context* ctx) {
     desc.path = path;
     for (int i = 0; i < 40; i++) {
         path[i] = around(0.03 * i - 0.6, 0.1);
-        path[i].width /= 2; // not what frames have
+        path[i].width /= 2; // differs from the frames' width
     }
     for (size_t k = 0; k < sizeof counts / sizeof *counts; k++) {
         desc.path_count = counts[k];
@@ -654,7 +652,7 @@ static void test_given_path(gsf_context* ctx) {
                 while (at < counts[k] && memcmp(path[at].w2c, camera->w2c, sizeof camera->w2c) != 0) at++;
                 wrong += at == counts[k] || now.reference_index[i] != -1 || camera->width != WIDTH ||
                          camera->fx != r.views[0].camera.fx;
-                if (frames % 18 == 0) last = at; // a round begins
+                if (frames % 18 == 0) last = at; // first frame of a round
                 wrong += at < last;
                 jumps += at != last;
                 last = at;
@@ -672,6 +670,9 @@ static void test_given_path(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
+// Restorers trained for 13 frames of 96 x 40, with photos of 48 x 40. Kind 0 squashes the photos to the frame; 1 does so
+// at a lower pixel limit, as --quality fast sets; 2 and 3 need square pixels in frames of one size, half of which is margin
+// and excluded from training.
 static void test_native_frames(gsf_context* ctx) {
     static repair r;
     gsf_fixer* fixer;
@@ -689,7 +690,7 @@ static void test_native_frames(gsf_context* ctx) {
         r.also.squash = kind < 2;
         if (kind == 1) desc.max_pixels = 1100; // an exact fit would be 51 x 21
         if (kind >= 2) r.also.width_max = 96, r.also.height_max = 40;
-        if (kind == 2) r.multiple = 40, r.also.width_max = 120, desc.max_pixels = 100; // as if to shrink photos to a corner
+        if (kind == 2) r.multiple = 40, r.also.width_max = 120, desc.max_pixels = 100; // would shrink photos to a corner
         CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &fixer));
         CHECK(gsf_splat_get_fixer_desc(fixer).window_frames == 13);
         int windows = 0, wrong = 0;
@@ -747,7 +748,7 @@ static void test_trouble(gsf_context* ctx) {
     CHECK(same_splats(calm, rough));
     gsf_splat_destroy_fixer(ctx, rough);
     r.fail_at = 0;
-    // with a very low threshold, every window agrees well enough with the references
+    // with a very low threshold, every window agrees with the references and is skipped
     desc.skip_psnr = 1.0f;
     CHECK_OK(ctx, gsf_splat_make_fixer(ctx, &desc, r.views, VIEWS, &r.start, &r.restorer, &rough));
     r.checked = 0;
@@ -782,8 +783,8 @@ static int saves_as(gsf_context* ctx, const gsf_fixer* fixer, const gsf_buffer* 
     return same;
 }
 
-// A checkpoint that cannot be restored because memory is short leaves the loop unchanged; a round that could not be
-// planned after a restore is planned by the next step.
+// If loading a checkpoint runs out of memory, the loop is unchanged. If planning the round fails after a load, the next
+// step plans it.
 static void test_failed_restore(void) {
     static repair r;
     gsf_context ctx;
@@ -842,7 +843,7 @@ static void mixed_setup(gsf_context* ctx, repair* r) {
     r->start = r->truth;
 }
 
-// Frames in the checkpoint's list `tag`, as drawn above gsf__save_frames.
+// Number of frames in the checkpoint's chunk `tag` (layout: above gsf__save_frames).
 static uint64_t frames_in(const gsf_buffer* chunks, const char* tag) {
     gsf_chunk chunk;
     uint64_t count = 0;
@@ -891,7 +892,7 @@ static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int sk
     CHECK(windows == 8 && r->restored == 8 - 2 * skips);
     chunks.size = 0;
     gsf_splat_format_fixer(ctx, fixer, &chunks);
-    CHECK(frames_in(&chunks, "FIXA") == pending); // what the second round restored, and only that, is trained on
+    CHECK(frames_in(&chunks, "FIXA") == pending); // only the second round's restored frames are trained on
     gsf_destroy_buffer(ctx, &chunks);
     return fixer;
 }
@@ -900,15 +901,15 @@ static void test_mixed_windows(gsf_context* ctx) {
     static repair r;
     mixed_setup(ctx, &r);
     gsf_fixer* all = run_mixed(ctx, &r, 0.0f, 0, 0);
-    CHECK(r.checked == 4); // photos at the path's two ends
-    gsf_fixer* some = run_mixed(ctx, &r, 17.0f, 2, 0); // 28 and 20 dB of agreement, then 13 and 11
-    CHECK(r.checked == 2); // the second end
+    CHECK(r.checked == 4); // the photos at both ends of the path
+    gsf_fixer* some = run_mixed(ctx, &r, 17.0f, 2, 0); // the windows agree to 28 and 20 dB, then 13 and 11
+    CHECK(r.checked == 2); // only the second end's window is restored
     gsf_fixer* resumed = run_mixed(ctx, &r, 17.0f, 2, 1);
     CHECK(same_splats(some, resumed) && !same_splats(some, all));
     gsf_splat_destroy_fixer(ctx, all);
     gsf_splat_destroy_fixer(ctx, some);
     gsf_splat_destroy_fixer(ctx, resumed);
-    memset(&r.start, 0, sizeof r.start); // was the truth
+    memset(&r.start, 0, sizeof r.start); // shares the arrays of r.truth
     repair_teardown(ctx, &r);
 }
 
@@ -947,8 +948,8 @@ static void test_explaining_restorer(gsf_context* ctx) {
     desc.train.iterations = 12;
     desc.first_round = 3;
     desc.last_round = 6;
-    desc.skip_psnr = 17.0f; // two of the four windows agree, in each of the two rounds
-    for (int i = 0; i < 3; i++) { // reports `explains`; does not report it; warp itself
+    desc.skip_psnr = 17.0f; // two of the four windows agree and are skipped, in each of the two rounds
+    for (int i = 0; i < 3; i++) { // a wrapper that reports `explains`; one that does not; warp itself
         wrapped* w = all + i;
         const gsf_restorer host = {sizeof host, "wrapped", w, wrapped_query, wrapped_begin, wrapped_restore, wrapped_end};
         const gsf_restorer* used = i == 2 ? &w->warp : &outer[i];
@@ -967,7 +968,7 @@ static void test_explaining_restorer(gsf_context* ctx) {
         gsf_splat_destroy_fixer(ctx, fixers[i]);
         gsf_splat_destroy_warp(ctx, &all[i].warp);
     }
-    memset(&r.start, 0, sizeof r.start); // was the truth
+    memset(&r.start, 0, sizeof r.start); // shares the arrays of r.truth
     repair_teardown(ctx, &r);
 }
 
@@ -981,7 +982,7 @@ static void test_seen_mask(gsf_context* ctx) {
     gsf_image mask = gsf_wrap_image(seen, GSF_U8, WIDTH, HEIGHT, 1),
               full = gsf_wrap_image(all, GSF_U8, WIDTH, HEIGHT, 1);
     CHECK_OK(ctx, gsf_splat_render_seen_mask(ctx, &r.truth, &novel, cameras, VIEWS, &full));
-    CHECK_OK(ctx, gsf_splat_render_seen_mask(ctx, &r.truth, &novel, &novel, 1, &mask)); // a camera sees what it sees
+    CHECK_OK(ctx, gsf_splat_render_seen_mask(ctx, &r.truth, &novel, &novel, 1, &mask)); // sees all of its own view
     int self = 0, more = 0, covered = 0;
     static float alpha[PIXELS];
     gsf_render_output out;

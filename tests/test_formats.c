@@ -24,7 +24,7 @@ static gsf_context make_context(counter* c, int odd) {
     return ctx;
 }
 
-static unsigned char* exact_copy(const void* data, size_t size) { // so that ASan sees a read one byte behind the end
+static unsigned char* exact_copy(const void* data, size_t size) { // so that ASan detects a read past the end
     unsigned char* p = (unsigned char*)malloc(size ? size : 1);
     if (size) memcpy(p, data, size);
     return p;
@@ -34,7 +34,7 @@ static int is_refusal(gsf_result r) {
     return r == GSF_ERROR_FORMAT || r == GSF_ERROR_UNSUPPORTED || r == GSF_ERROR_NUMERIC;
 }
 
-// A gzip file with the content in one stored block, by a CRC of its own; freed by the caller.
+// A gzip file with the content in one stored block; computes its own CRC. Freed by the caller.
 static unsigned char* wrap(const void* content, size_t size, size_t* out_size) {
     static const unsigned char head[11] = {0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3, 1};
     unsigned char* p = (unsigned char*)malloc(size + 23);
@@ -70,7 +70,7 @@ static void test_splat_by_hand(void) {
                                            0, 0, 0,    0x40, 0, 0, 0x80, 0x3e, 255, 0, 51, 204,  255, 128, 0,    192};
     static const unsigned char written[64] = {
         0, 0, 0x80, 0x3f, 0, 0, 0, 0xc0, 0, 0, 0, 0x3f, 0, 0, 0x80, 0x3f, 0, 0, 0x80, 0x3f, 0, 0, 0x80, 0x3f,
-        255, 0, 128, 128, 255, 128, 128, 128, // colours 3.3, -2.3, 0.5; opacity 0.5; w = 1, which does not fit
+        255, 0, 128, 128, 255, 128, 128, 128, // colours 3.3, -2.3, 0.5; opacity 0.5; w = 1, which saturates
         0, 0, 0x40, 0x40, 0, 0, 0, 0, 0, 0, 0x80, 0xc0, 0, 0, 0x80, 0x3f, 0, 0, 0x80, 0x3f, 0, 0, 0x80, 0x3f,
         128, 128, 128, 255, 128, 128, 0, 128}; // 3, 0, -4; opacity 1 - 5e-5; y = -2 before it is normalised
     counter count;
@@ -89,7 +89,7 @@ static void test_splat_by_hand(void) {
         CHECK(s.quats[0] == 127.0f / 128.0f && s.quats[1] == 0.0f && s.quats[2] == -1.0f && s.quats[3] == 0.5f);
         gsf_splat_destroy(&ctx, &s);
     }
-    CHECK_OK(&ctx, gsf_splat_make(&ctx, 2, 1, &s)); // band 1 is lost
+    CHECK_OK(&ctx, gsf_splat_make(&ctx, 2, 1, &s)); // band 1 is not stored
     const float means[6] = {1.0f, -2.0f, 0.5f, 3.0f, 0.0f, -4.0f};
     const float quats[8] = {1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, -2.0f, 0.0f};
     memcpy(s.means, means, sizeof means);
@@ -116,9 +116,9 @@ enum { HEAD = 16 };
 // 1.5, -0.25, 2 as 24 bits in units of 1/4096, y and z negated
 #define SPZ_FIXED 0x00, 0x18, 0x00, 0x00, 0x04, 0x00, 0x00, 0xe0, 0xff
 static const unsigned char spz_by_hand[3][45] = {
-    {SPZ_HEAD(1, 1), 0x00, 0x3e, 0x00, 0x34, 0x00, 0xc0, SPZ_MIDDLE, 191, 64, 64, SPZ_SH}, // float16; x y z halves
+    {SPZ_HEAD(1, 1), 0x00, 0x3e, 0x00, 0x34, 0x00, 0xc0, SPZ_MIDDLE, 191, 64, 64, SPZ_SH}, // float16 x, y, z
     {SPZ_HEAD(2, 1), SPZ_FIXED, SPZ_MIDDLE, 191, 64, 64, SPZ_SH},
-    // x is the largest (the first of equals): 0 | -361 | -361 | 361 in 10 bits each, 361 = 511 * 0.5 / sqrt(0.5)
+    // x is the largest (first of equals): index 0 | -361 | -361 | 361 in 10 bits each, 361 = 511 * 0.5 / sqrt(0.5)
     {SPZ_HEAD(3, 1), SPZ_FIXED, SPZ_MIDDLE, 0x69, 0xa5, 0x9d, 0x36, SPZ_SH},
 };
 static const size_t spz_by_hand_size[3] = {41, 44, 45};
@@ -131,7 +131,7 @@ static gsf_splats hand_splats(gsf_context* ctx) {
     memcpy(s.means, mean, sizeof mean);
     memcpy(s.log_scales, scale, sizeof scale);
     memcpy(s.sh, sh, sizeof sh);
-    for (int k = 0; k < 4; k++) s.quats[k] = -0.5f; // the same rotation as 0.5
+    for (int k = 0; k < 4; k++) s.quats[k] = -0.5f; // the same rotation as +0.5
     s.antialiased = 1;
     return s;
 }
@@ -151,7 +151,8 @@ static void test_spz_by_hand(void) {
             CHECK(s.log_scales[0] == -5.0f && s.log_scales[1] == 0.0f && s.log_scales[2] == -9.0f);
             CHECK_NEAR(s.opacity_logits[0], log(128.0 / 127.0), 1e-6);
             test_compare_floats("sh by hand", s.sh, sh, 12, 1e-6);
-            for (int k = 0; k < 4; k++) { // 191 / 127.5 - 1, or sqrt(0.5) * 361 / 511, but one follows from the other three
+            // 191 / 127.5 - 1, or sqrt(0.5) * 361 / 511; one component is derived from the other three
+            for (int k = 0; k < 4; k++) {
                 const int derived = version < 3 ? 0 : 1;
                 CHECK_NEAR(s.quats[k], version < 3 ? (k == derived ? 0.505837 : 0.498039)
                                                    : (k == derived ? 0.501374 : 0.499541), 1e-5);
@@ -178,7 +179,7 @@ static void test_spz_by_hand(void) {
 }
 
 // Niantic's library (nianticlabs/spz 21715c3: loadSplatFromPly and saveSpz with RDF axes, antialiased set) made
-// corpus/spz/official_v2 and _v3 from a golden PLY: the content that we make of it is the same byte by byte.
+// corpus/spz/official_v2 and _v3 from a golden PLY. Our decompressed content must equal theirs byte for byte.
 static void test_official(void) {
     counter count;
     gsf_context ctx = make_context(&count, 0);
@@ -203,10 +204,10 @@ static void test_official(void) {
             CHECK(differ == 0 && content[13] == ours[13]);
             gsf_free(&ctx, content);
             gsf_free(&ctx, ours);
-            CHECK(text.size <= file_size + file_size / 4); // zlib's is smaller by what codes of its own save
+            CHECK(text.size <= file_size + file_size / 4); // zlib's files are smaller, with dynamic Huffman codes
         }
         gsf_destroy_buffer(&ctx, &text);
-        if (CHECK_OK(&ctx, gsf_splat_load(&ctx, path, &official))) { // known by its content
+        if (CHECK_OK(&ctx, gsf_splat_load(&ctx, path, &official))) { // format detected from the content
             CHECK(official.count == s.count && official.sh_degree == 3 && official.antialiased == 1);
             gsf_splat_destroy(&ctx, &official);
         }
@@ -233,7 +234,7 @@ static gsf_splats random_splats(gsf_context* ctx, size_t n, int32_t degree, doub
 
 static double sigmoid(double x) { return 1.0 / (1.0 + exp(-x)); }
 
-typedef struct bounds { double mean, log_scale, opacity, dc, band1, rest, quat; } bounds; // quat: of unit ones, up to sign
+typedef struct bounds { double mean, log_scale, opacity, dc, band1, rest, quat; } bounds; // quat: normalised, up to sign
 
 static void check_close(const gsf_splats* a, const gsf_splats* b, bounds most) {
     bounds worst = {0, 0, 0, 0, 0, 0, 0};
@@ -304,7 +305,7 @@ static void test_round_trips(void) {
             }
 }
 
-// Chunks in any order on any worker give the same file.
+// The file does not depend on the order of chunks or the worker that runs them.
 static void test_workers(void) {
     counter count, odd_count;
     gsf_context ctx = make_context(&count, 0), odd = make_context(&odd_count, 1);
@@ -329,7 +330,7 @@ static void test_workers(void) {
     CHECK(count.live == 0 && odd_count.live == 0);
 }
 
-// ---- what does not fit ---------------------------------------------------------
+// ---- out of range ---------------------------------------------------------
 
 static void test_not_finite(void) {
     static const float evil[3] = {NAN, INFINITY, -INFINITY};
@@ -349,14 +350,14 @@ static void test_not_finite(void) {
                 CHECK(warnings == 1 && strstr(warning, "1 of 5 splats left out"));
                 if (CHECK_OK(&ctx, gsf_splat_parse(&ctx, names[f], text.data, text.size, &again))) {
                     CHECK(again.count == 4 && again.ids[3] == 3);
-                    CHECK_NEAR(again.means[3 * 2], s.means[3 * 3], 1.0 / 4096); // the others moved up
+                    CHECK_NEAR(again.means[3 * 2], s.means[3 * 3], 1.0 / 4096); // the splats after it moved up
                     gsf_splat_destroy(&ctx, &again);
                 }
                 gsf_destroy_buffer(&ctx, &text);
                 gsf_splat_destroy(&ctx, &s);
                 CHECK(count.live == 0);
             }
-    // Read: a NaN position, a negative and an infinite scale; a scale of 0 is in use. Everything at its limits is written.
+    // Reading: a NaN position, a negative and an infinite scale; scales of 0 are accepted. Writing: all limits.
     counter count;
     gsf_context ctx = make_context(&count, 0);
     unsigned char rows[5 * 32];
@@ -420,19 +421,19 @@ static void test_extent(void) {
     CHECK(fraction_of(&ctx, &s, NULL) == 12 && warnings == 0);
     s.means[5] = -2048.0f;
     CHECK(fraction_of(&ctx, &s, NULL) == 11 && warnings == 0);
-    s.means[5] = 8388607.0f; // one stray splat costs all the others their precision, and that is said
+    s.means[5] = 8388607.0f; // one outlier reduces the precision of all the others, with a warning
     CHECK(fraction_of(&ctx, &s, NULL) == 0 && warnings == 1 && strstr(warning, "steps of 1 here"));
     s.means[5] = 8388608.0f;
     CHECK(fraction_of(&ctx, &s, NULL) == -1 && strstr(ctx.error, "8388608") && strstr(ctx.error, "x.spz"));
     s.means[5] = 0.0f;
     CHECK(fraction_of(&ctx, &s, &wrong) == -1 && strstr(ctx.error, "version 1"));
-    // Small scenes get more bits, the same share of their scale
+    // Small scenes get more fraction bits, for the same relative precision
     for (size_t i = 0; i < 3 * s.count; i++) {
         s.means[i] *= 1e-3f;
         s.log_scales[i] -= 6.9f;
     }
     CHECK(fraction_of(&ctx, &s, NULL) == 21);
-    // Far from zero: both formats warn, and keep everything when written locally
+    // Far from the origin: both formats warn, and keep every splat in local coordinates
     warnings = 0;
     for (size_t i = 0; i < 3 * s.count; i++) {
         s.means[i] *= 1e3f;
@@ -517,7 +518,7 @@ static void test_damage(void) {
         parse_damaged(&ctx, "cut.spz", part, cut, 0);
         free(part);
     }
-    // A flip that passes means the same: gzip's time and hints, bits behind the last block, another place to repeat from.
+    // An accepted flip must not change the splats: gzip's time and hints, bits after the last block, an equivalent distance.
     unsigned char* whole = exact_copy(text.data, text.size);
     gsf_splats sound, damaged;
     size_t passed = 0;
@@ -541,7 +542,7 @@ static void test_damage(void) {
     CHECK(passed < 10 * 255);
     gsf_splat_destroy(&ctx, &sound);
     free(whole);
-    // the content's head and a few of its bytes: the checksum is right again
+    // flips in the header and a few bytes of the content, with the checksum corrected
     for (int version = 1; version <= 3; version++) {
         unsigned char content[64];
         const size_t size = spz_by_hand_size[version - 1];
@@ -553,7 +554,7 @@ static void test_damage(void) {
                 unsigned char* file = wrap(content, size, &file_size);
                 unsigned char* exact = exact_copy(file, file_size);
                 count.asked = 0;
-                // fraction, flags but "extensions", the byte that nobody reads, and all values
+                // fractional bits, flags other than "extensions", the reserved byte, and all values
                 parse_damaged(&ctx, "head.spz", exact, file_size, at >= 13 || (version == 2 && at == 12));
                 CHECK(count.asked < (GSF__DEFLATE_RATIO + 10) * file_size + 10000);
                 free(exact);
@@ -578,7 +579,7 @@ static void test_damage(void) {
     CHECK(count.live == 0);
 }
 
-// A head that claims 4 billion splats, extensions (whose bytes are passed over), band 4.
+// A header that claims 4 billion splats, extensions (which are skipped), band 4.
 static void test_claims(void) {
     counter count;
     gsf_context ctx = make_context(&count, 0);
@@ -592,7 +593,7 @@ static void test_claims(void) {
     CHECK_RESULT(&ctx, gsf_splat_parse(&ctx, "x.spz", file, size, &s), GSF_ERROR_FORMAT);
     CHECK(count.asked < 1000 && strstr(ctx.error, "4294967295 splats"));
     free(file);
-    file = wrap(content, spz_by_hand_size[1], &size); // gzip's size: 4 GB, and what is just too much
+    file = wrap(content, spz_by_hand_size[1], &size); // gzip's size field: 4 GB, then just above the limit
     memset(file + size - 4, 255, 4);
     count.asked = 0;
     CHECK_RESULT(&ctx, gsf_splat_parse(&ctx, "x.spz", file, size, &s), GSF_ERROR_FORMAT);
@@ -608,7 +609,7 @@ static void test_claims(void) {
     CHECK_OK(&ctx, gsf_splat_parse(&ctx, "x.spz", file, size, &s));
     CHECK(s.count == 1 && warnings == 1 && strstr(warning, "20 bytes of extensions") && s.log_scales[0] == -5.0f);
     gsf_splat_destroy(&ctx, &s);
-    content[14] = 0; // the same bytes unannounced
+    content[14] = 0; // the same bytes without the flag
     free(file);
     file = wrap(content, spz_by_hand_size[1] + 20, &size);
     CHECK_RESULT(&ctx, gsf_splat_parse(&ctx, "x.spz", file, size, &s), GSF_ERROR_FORMAT);
@@ -634,7 +635,7 @@ static void test_out_of_memory(void) {
                 gsf_buffer text;
                 memset(&text, 0, sizeof text);
                 memset(&again, 0, sizeof again);
-                s.means[0] = NAN; // so that rows are left out
+                s.means[0] = NAN; // so that rows are dropped
                 if (!reading) count.fail_at = count.calls + k;
                 gsf_result r = gsf_splat_format(&ctx, names[f], &s, NULL, &text);
                 if (reading) {
@@ -675,11 +676,11 @@ static void test_gzip(void) {
     for (size_t i = 0; i < room; i++) data[i] = (unsigned char)test_random_bits(&seed);
     check_gzip(&ctx, data, room, 1.001); // stored
     for (size_t size = 1; size < 300; size++) check_gzip(&ctx, data, size, 1.0);
-    for (size_t i = 0; i < room; i++) // repetitions of all lengths and distances
+    for (size_t i = 0; i < room; i++) // matches of all lengths and distances
         data[i] = i < 40000 || i % 701 < 9 ? data[i] : data[i - 1 - (i / 701 * 97) % 33000];
     check_gzip(&ctx, data, room, 0.9);
     free(data);
-    // zlib 1.2.13's: a block with codes of its own; name, comment, extra field and checksum of the header before it
+    // From zlib 1.2.13: a block with dynamic Huffman codes, after a header with name, comment, extra field and checksum
     static const unsigned char zlib_body[] = {
         45, 146, 89, 146, 197, 32, 12, 3, 19, 192, 236, 102, 199, 64, 222, 253, 239, 57, 206, 84, 196, 127, 151, 218,
         226, 186, 174, 91, 72, 48, 46, 164, 58, 110, 112, 216, 46, 8, 245, 210, 56, 84, 28, 128, 100, 171, 74, 119, 32,
@@ -707,15 +708,15 @@ static void test_gzip(void) {
     CHECK(size == 600);
     for (size_t i = 0; i < size; i++) CHECK(content[i] == (unsigned char)((i * i / 7) % 23 + i / 100));
     gsf_free(&ctx, content);
-    // streams that are none: an error, whatever is claimed of their content, and nothing read or written beside the blocks
+    // Invalid streams give an error for any claimed content size, without any access out of bounds.
     static const struct { const char* bytes; size_t size; } bad[] = {
         {"\7\0\0", 3},                         // block of unknown type
-        {"\1\1\0\0\0x", 6},                   // stored block of contradictory length
-        {"\1\5\0\xfa\xffxy", 7},             // cut
-        {"\x63\x00\x42\x00\x00", 5},         // repetition of what is before the start
+        {"\1\1\0\0\0x", 6},                   // stored block with inconsistent LEN and NLEN
+        {"\1\5\0\xfa\xffxy", 7},             // truncated
+        {"\x63\x00\x42\x00\x00", 5},         // match before the start of the output
         {"\xf5\xff\xff\xff", 4},             // too many codes
-        {"\5\0\xfe\xff\xff\xff\xff\xff", 8}, // code lengths that are no code
-        {"\5\0", 2},                           // cut
+        {"\5\0\xfe\xff\xff\xff\xff\xff", 8}, // code lengths that do not form a prefix code
+        {"\5\0", 2},                           // truncated
         {"", 0},
     };
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++)

@@ -1,5 +1,5 @@
 // The vector vocabulary of gsfixer.h (>>lanes) at each instruction set of the machine: every operation on every lane
-// against one lane's plain C, special values included; tails in exact-size buffers; sums in the stated order; powers.
+// against scalar C, special values included; tails in exact-size buffers; sums in the documented order; powers.
 // The checks are themselves kernels: this file includes itself once per instruction set, as the headers do.
 #ifndef GSF__ISA
 

@@ -1,5 +1,5 @@
-// bench/make_model.c, which makes restorer models with random weights: the same bytes regardless of shards and threads,
-// the tensor lists of the released models, values that run, and vocabularies that encode their words.
+// bench/make_model.c, which makes restorer models with random weights: the same bytes for any number of
+// shards and threads, the tensor lists of the released models, values that run, and vocabularies that encode their words.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
@@ -58,7 +58,8 @@ static int exists(const folder* f, const char* name) {
     return file != NULL;
 }
 
-// How many values of b are those of a, of all tensors; -1 if names or shapes differ. `narrow`: a's rounded to bf16.
+// Fraction of the values of b that equal those of a, over all tensors; -1 if names or shapes differ. narrow: a is rounded
+// to bf16 first.
 static double same_values(gsf_context* ctx, const folder* a, const folder* b, const char* name, int narrow) {
     gsf_nn_weights x, y;
     double same = 0.0, count = 0.0;
@@ -84,7 +85,7 @@ static double same_values(gsf_context* ctx, const folder* a, const folder* b, co
 
 // ---- the same bytes ----------------------------------------------------------------
 
-// Every file that the table of parts promises, and its weights in one file.
+// Every file listed in the table of parts exists, with the weights in a single file.
 static void check_same_parts(const folder* a, const folder* b) {
     for (size_t i = 0; i < MODEL_PARTS; i++) {
         const model_part* part = &model_parts[i];
@@ -112,7 +113,7 @@ static void check_same(gsf_context* ctx) {
     work_backwards(&three);
     CHECK_OK(&three, gsf_init_context(&three));
     o.out = again.path;
-    o.shards = 3; // and then one: the index must go
+    o.shards = 3; // then one: the index must be removed
     o.parts = MODEL_TRANSFORMER | MODEL_TEXT | MODEL_BLIP2;
     CHECK_OK(&three, model_make(&three, &o, reports));
     CHECK(exists(&again, "transformer" INDEX) && exists(&again, "blip2" ENCODER ".index.json"));
@@ -136,10 +137,10 @@ static void check_same(gsf_context* ctx) {
     o.out = wide.path;
     o.shards = 1;
     o.dtype = GSF_NN_F32;
-    o.parts = MODEL_VAE; // by itself
+    o.parts = MODEL_VAE; // this part only
     CHECK_OK(ctx, model_make(ctx, &o, reports));
     CHECK(!exists(&wide, "features.safetensors") && !exists(&wide, "text_encoder/config.json"));
-    CHECK(!same_file(&first, &wide, "model_index.json")); // has no text encoder
+    CHECK(!same_file(&first, &wide, "model_index.json")); // it does not list a text encoder
     CHECK(same_values(ctx, &wide, &first, "vae", 1) == 1.0);
 
     o.out = other.path;
@@ -157,7 +158,7 @@ static double list_values(const model_list* list) {
     return values;
 }
 
-// Counted with the classes of diffusers and transformers.
+// Counts taken from the classes of diffusers and transformers.
 static void check_full(gsf_context* ctx) {
     static const struct { size_t tensors; double values; } known[MODEL_PARTS] = {
         {1621, 7166167104.0 + 54607872.0}, {436, 215583907.0}, {0, 0.0}, {0, 0.0}, {440, 304372736.0}, {1210, 909112320.0},
@@ -227,7 +228,7 @@ static float* made_noise(uint64_t seed, size_t count) {
     return x;
 }
 
-static int gates; // seen
+static int gates; // gate tensors seen
 static void see_tap(void* user, const char* name, int32_t row, const float* data, int64_t rows, int64_t columns) {
     (void)user;
     (void)row;
@@ -312,7 +313,7 @@ static void check_vae(gsf_context* ctx, const folder* model) {
     gsf_nn_destroy_vae(ctx, &vae);
 }
 
-// Not constant: rows of what an encoder gives differ from each other.
+// The output of an encoder is not constant: its rows differ from each other.
 static void check_rows(const char* what, const float* x, int64_t rows, int64_t columns) {
     double change = 0.0;
     check_rms(what, x, (size_t)(rows * columns), 0.5, 3.0);
@@ -351,7 +352,7 @@ static void check_images(gsf_context* ctx, const folder* model) {
     free(pixels);
 }
 
-// A word of the list is one piece, other text goes by characters, and all of ASCII is known.
+// A listed word is one piece, other text is encoded by characters, and no ASCII character is unknown.
 static void check_text(gsf_context* ctx, const folder* model) {
     static const char sentence[] = "A red house by the river: 12% \"x\" <extra_id_0>";
     static const char* const pieces[] = {"", "A", " red", " house", " by", " the", " river", ":"};
@@ -364,7 +365,7 @@ static void check_text(gsf_context* ctx, const folder* model) {
     CHECK(tokenizer.piece_count == MODEL_PIECES && tokenizer.id_count == MODEL_PIECES + 100);
     CHECK_OK(ctx, gsf_nn_encode_text(ctx, &tokenizer, sentence, strlen(sentence), ids, GSF__COUNT(ids), &count));
     CHECK(count == GSF__COUNT(pieces) + 10 && ids[count - 1] == 1 && ids[count - 2] == tokenizer.id_count - 1);
-    CHECK(ids[0] == 3 && ids[1] == MODEL_PIECES - '~' - 1 + 'A'); // a space, and characters
+    CHECK(ids[0] == 3 && ids[1] == MODEL_PIECES - '~' - 1 + 'A'); // a space, then single characters
     for (size_t i = 2; i < 7; i++) {
         size_t word = 0;
         while (word < GSF__COUNT(model_words) && strcmp(model_words[word], pieces[i] + 1) != 0) word++;
@@ -424,7 +425,7 @@ static void check_runs(gsf_context* ctx) {
     snprintf(path[0], sizeof path[0], "%s", model.path);
     snprintf(path[1], sizeof path[1], "%s", inside(&model, "features.safetensors"));
     desc.model = path[0];
-    for (int i = 0; i < 2; i++, desc.features = path[1]) // with the encoders; with their features
+    for (int i = 0; i < 2; i++, desc.features = path[1]) // with the encoders, then with their precomputed features
         if (CHECK_OK(ctx, gsf_nn_make_dit(ctx, &desc, &restorer))) gsf_nn_destroy_dit(ctx, &restorer);
 }
 
@@ -453,7 +454,7 @@ static void check_errors(gsf_context* ctx) {
     o.shards = 999;
     CHECK_RESULT(ctx, model_make(ctx, &o, reports), GSF_ERROR_INVALID_ARGUMENT);
     o.shards = 1;
-    char left[1200]; // by an earlier run of this test
+    char left[1200]; // left by an earlier run of this test
     snprintf(left, sizeof left, "%s/transformer" SINGLE, program.path);
     remove(left);
     gsf_request_cancel(ctx);

@@ -92,7 +92,7 @@ static inline void train_golden_ssim_gradient(gsf_context* ctx) {
     gsf__loss_destroy_scratch(ctx, &scratch);
 }
 
-// ---- the model as the golden files name it --------------------------------------
+// ---- the model's tensors by their golden names --------------------------------------
 
 typedef struct train_golden_tensor { const char* name; int group; size_t begin, end; } train_golden_tensor;
 static const train_golden_tensor train_golden_tensors[] = { // order of the columns of `lr`; floats of a row
@@ -358,7 +358,7 @@ static inline void train_golden_densify(gsf_context* ctx, const char* name) {
     CHECK(opacity.count == model.count);
     test_compare_floats("after_reset.opacity", model.groups[GSF__OPACITY].value, opacity.v, model.count, 1e-5);
     test_compare_floats("after_reset.exp_avg.opacity", model.groups[GSF__OPACITY].m, moment.v, model.count, 0.0);
-    size_t kept = 0; // of the second moments, which the file leaves out
+    size_t kept = 0; // nonzero second moments, which the file does not contain
     for (size_t i = 0; i < model.count; i++) kept += model.groups[GSF__OPACITY].v[i] != 0.0f;
     CHECK(kept == 0 && model.count > 0);
     gsf__model_destroy(ctx, &model);
