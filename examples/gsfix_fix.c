@@ -161,21 +161,21 @@ typedef struct fix_run {
     gsf_scene scene;
     gsfix_split split;
     gsf_image* masks; // per test view, or NULL
-    gsf_camera* path; // of --path, or NULL
+    gsf_camera* path; // from --path, or NULL
     size_t path_count;
     gsf_splats initial;
     gsf_restorer restorer;
     int has_restorer;
-    int comparing; // in the run without repair, which comes first with --compare
+    int comparing; // set during the run without repair, the first one of --compare
     gsf_fixer* fixer;
     gsf_buffer switches; // JSON object
     const gsfix_read_file* inputs;
     size_t input_count;
     int resuming;
     int checkpoint_failed; // the last checkpoint could not be written
-    const char* rays; // what traced the visibility rays
+    const char* rays; // backend that traced the visibility rays
     gsfix_history history;
-    double total_before; // seconds of earlier runs that this one continues
+    double total_before; // seconds spent by the earlier runs that this one continues
     int32_t iteration, iterations, eval_every, checkpoint_every;
     size_t checkpoint_bytes; // size of the last checkpoint
     double checkpoint_last, checkpoint_sum, checkpoint_end; // seconds for the last one and for all; end time of the last

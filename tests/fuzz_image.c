@@ -1,5 +1,5 @@
-// Fuzz target for the image decoders: the pixels behind gsf_decode_image, the size behind gsf_query_image, which
-// parses headers by another path and must not contradict the pixels.
+// Fuzz target for the image decoders: gsf_decode_image, and gsf_query_image, which parses headers separately and must
+// report the size that is decoded.
 //   clang -g -O1 -fsanitize=fuzzer,address,undefined -DGSFIXER_IMPLEMENTATION -I. tests/fuzz_image.c -o fuzz_image -lm
 //   ./fuzz_image tests/corpus/image
 #include "gsfixer.h"
@@ -41,7 +41,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     if (query != GSF_OK && strncmp(ctx.error, "fuzz:", 5) != 0) abort();
     const gsf_result result = gsf_decode_image(&ctx, "fuzz", data, size, channels[size % 4], &image);
     if (result == GSF_OK) {
-        unsigned sum = 0; // every pixel is readable
+        unsigned sum = 0; // reads every pixel
         for (int64_t i = 0; i < image.stride_y * image.height; i++) sum += ((const uint8_t*)image.data)[i];
         if (image.width < 1 || image.height < 1 || sum == 0xffffffffu) abort();
         if (query != GSF_OK || image.width != width || image.height != height) abort();

@@ -55,7 +55,7 @@ static double* poses_of(const test_tensor* t, size_t* count) {
     return out;
 }
 
-// Compares (n,16) column-major with a tensor; D = signs of its rows (NULL: as it is).
+// Compares (n,16) column-major with a tensor; D = signs of its rows (NULL: all 1).
 static void compare_poses(const char* name, const double* actual, const double* signs, double tol) {
     size_t n;
     const test_tensor* t = get(name);

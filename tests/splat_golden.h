@@ -17,7 +17,7 @@ typedef struct splat_golden {
     double background[3];
     size_t pixels;
     double* d_color;    // (H,W,3): grad.dL_dimage
-    int fragile;        // some pixels lose up to 3 digits in float32, the reference's own too (out.fragile)
+    int fragile;        // some pixels lose up to 3 digits in float32, in the reference as well (out.fragile)
 } splat_golden;
 
 static inline float* splat_golden_floats(const test_tensors* file, const char* name) {

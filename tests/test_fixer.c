@@ -591,7 +591,7 @@ static void test_loop(gsf_context* ctx) {
 }
 
 // Whether a path is possible is checked before any training: a rig with parallel axes is accepted; coincident cameras are
-// refused immediately, unless there are no rounds.
+// refused immediately, unless no rounds are requested.
 static void test_rigs(gsf_context* ctx) {
     for (int rig = 0; rig < 2; rig++) {
         static repair r;
@@ -853,7 +853,7 @@ static uint64_t frames_in(const gsf_buffer* chunks, const char* tag) {
 }
 
 // One run of mixed_setup's scene: two rounds of four windows of 9 frames, of which the first `skips` are skipped in
-// each. resumed: every window is followed by a checkpoint and a new fixer that goes on from it.
+// each. resumed: every window is followed by a checkpoint and a new fixer that continues from it.
 static gsf_fixer* run_mixed(gsf_context* ctx, repair* r, float skip_psnr, int skips, int resumed) {
     gsf_fix_desc desc = repair_desc();
     gsf_fixer *fixer, *next;
@@ -913,7 +913,7 @@ static void test_mixed_windows(gsf_context* ctx) {
     repair_teardown(ctx, &r);
 }
 
-// A host's restorer that delegates to warp: only what its query reports tells the loop how to treat it.
+// A host's restorer that delegates to warp: the loop treats it according to what its query reports, nothing else.
 typedef struct wrapped { gsf_restorer warp; int hides, begun, restored; } wrapped;
 
 static gsf_result wrapped_query(void* user, gsf_context* ctx, int32_t frames, int32_t width, int32_t height,
