@@ -74,6 +74,12 @@
                tensors and images int64_t. Bytes are passed as (data, size) with a name for error messages; output of
                unknown size goes to a gsf_buffer. Terms: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v;
                tokens, positions, latents.
+   WHERE TO ADD
+       a restorer       gsf_restorer under "restorer interface", all four functions. query_fn runs before begin_fn; begin_fn
+                        and end_fn run once per round. restore_fn writes every pixel of out_color and out_confidence, which
+                        are undefined before. gsf_splat_make_warp in gsfixer_splat.h is an example
+       a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
+       an image format  gsf__image_kind_of in >>images
    SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
                >>images >>resize >>metrics >>cameras >>clips >>oiio
 */
@@ -1737,7 +1743,7 @@ GSF_API void gsf_append_json_number(gsf_context* ctx, gsf_buffer* text, double v
         size = 0;
         for (const char* p = printed; *p; p++) {
             if ((*p >= '0' && *p <= '9') || *p == '-' || *p == '+' || *p == 'e') plain[size++] = *p;
-            else if (size == 0 || plain[size - 1] != '.') plain[size++] = '.'; // the locale's may be several bytes
+            else if (size == 0 || plain[size - 1] != '.') plain[size++] = '.'; // some locales' takes several bytes
         }
         double back = 0.0;
         if (gsf__scan_double(plain, size, &back) == size && back == value) break;
@@ -2604,8 +2610,8 @@ static gsf_result gsf__lz_compress(gsf_context* ctx, const char* name, const voi
 #if defined(__clang__) // stb shifts bits out of signed integers by design
 #pragma clang attribute push(__attribute__((no_sanitize("shift"))), apply_to = function)
 #endif
-// Private (static) copies of stb, which never clash with the host's. If this file has already included stb, that copy is
-// used.
+// Private (static) copies of stb, which never clash with the host's. If this translation unit already includes
+// stb, that copy is used.
 #ifndef STBI_INCLUDE_STB_IMAGE_H
 #define STB_IMAGE_IMPLEMENTATION
 #define STB_IMAGE_STATIC
@@ -3101,8 +3107,8 @@ static gsf_result gsf__stb_query(gsf_context* ctx, const char* name, gsf__stb_so
     return GSF_OK;
 }
 
-// Appends a copy of the file whose palette is filled up with black. stb accepts all 256 indices but initialises only the
-// entries that the file has; the others would hold whatever was in memory. Appends nothing if no copy is needed.
+// Appends a copy of the file with its palette padded with black to 256 entries. stb accepts all 256 indices but
+// initialises only the entries in the file; the others would be uninitialised memory. Appends nothing if no copy is needed.
 static void gsf__png_full_palette(gsf_context* ctx, const char* data, size_t size, gsf_buffer* out) {
     enum { FULL = 768 };
     static const char zeros[FULL] = {0}, head[8] = {0, 0, FULL >> 8, FULL & 255, 'P', 'L', 'T', 'E'};

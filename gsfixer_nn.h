@@ -45,6 +45,14 @@
    SOURCES     GSFixer (Yin et al. 2025); CogVideoX (Yang et al. 2024); DDIM (Song et al. 2021), zero terminal SNR (Lin et
                al. 2024); online softmax (Milakov and Gimelshein 2018), FlashAttention (Dao et al. 2022); SentencePiece
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
+   WHERE TO ADD
+       an activation    gsf__nn_activation in >>nn kernels; in >>nn activations the scalar gsf__nn_activation_ref, the vector
+                        gsf__v_activate (without a case it returns x) and the list in gsf__activate; its name in
+                        config.json: gsf__nn_config_read_key in >>nn files, an array and a string in the same order.
+                        Linear and 8-bit layers need no change. VGGT, T5, VAE and transformer have fixed activations
+       a network        a table of layers as in >>nn image encoders, opened by gsf__nn_open_network, run with the layers
+                        of >>nn layers
+       a solver         gsf_nn_solver, in >>nn scheduler
    SECTIONS    files      >>nn kernels (declared) >>nn numbers >>nn workspace >>nn files: safetensors, config.json
                lanes      >>nn vector
                kernels    >>nn activations >>nn norms >>nn linear >>nn int8 >>nn attention >>nn convolution >>nn positions
@@ -2749,18 +2757,18 @@ enum {
     GSF__LINEAR_LONE_ROWS = 320,      // up to this many rows form a single block
     GSF__LINEAR_LONE_COLUMNS = 192,
     GSF__GEMV_ROWS = 4,               // up to this many rows, weights are not packed
-    GSF__GEMV_CHUNKS = 32,            // units of work; few, as the hardware prefetcher has to restart in each,
-    GSF__GEMV_BYTES = 1 << 16,        // of at least this many bytes of weights
-    GSF__GEMV_COLUMNS = 1008,         // and at most this many outputs; like the unit a multiple of 6 and 16
+    GSF__GEMV_CHUNKS = 32,            // maximum number of work units; few, as the hardware prefetcher restarts in each
+    GSF__GEMV_BYTES = 1 << 16,        // minimum bytes of weights per unit
+    GSF__GEMV_COLUMNS = 1008,         // maximum outputs per unit; a multiple of 6 and 16, like GSF__GEMV_UNIT
     GSF__GEMV_UNIT = 48,
     GSF__GEMV_PAD = 32,               // values of x are padded to a multiple of this
-    GSF__GEMV_AHEAD = 1280,           // AVX-512: prefetch distance in bytes within each row of weights,
-    GSF__GEMV_AHEAD16 = 2048,         // and for 16-bit weights
+    GSF__GEMV_AHEAD = 1280,           // AVX-512: prefetch distance in bytes within each row of weights
+    GSF__GEMV_AHEAD16 = 2048,         // the same for 16-bit weights
     GSF__GEMV_STEP = 1024             // values of four rows of x that are processed at a time
 };
 
 #ifndef GSF__LINEAR_PACKED // a test lowers it
-#define GSF__LINEAR_PACKED ((int64_t)1 << 24) // most floats of packed weights in memory at a time: 64 MiB
+#define GSF__LINEAR_PACKED ((int64_t)1 << 24) // maximum number of packed weights (floats) in memory at a time: 64 MiB
 #endif
 
 typedef struct gsf__linear_job gsf__linear_job;
@@ -4529,11 +4537,11 @@ typedef struct gsf__attention_scratch { // per worker
 
 typedef struct gsf__attention_parts { // what differs between instruction sets; in bf16 each float slot holds a pair
     int64_t unit; // values per slot along head_dim: 1, or 2 in bf16
-    // to[slot to_ld + row] = slots of eight rows, `rows` of which exist, minus `center` (or NULL), times `factor`
+    // Packs (x - center) * factor of eight rows, `rows` of which exist, as to[slot * to_ld + row]; center may be NULL
     void (*pack_rows)(const float* from, int64_t rows, int64_t ld, const float* center, float factor, int64_t dim, float* to,
                       int64_t to_ld);
     void (*pack_values)(const gsf__attention_job* job, const float* from, int64_t keys, float* packed);
-    // p of `groups` groups of queries against `panels` panels of keys
+    // Computes the logits p of `groups` groups of queries and `panels` panels of keys
     void (*logits)(const float* q, int64_t groups, const float* k, int64_t panels, int64_t dim, float* p);
     // Turns the logits of `queries` rows into weights, raises `top`, updates `sum`, and sets `fade` to the factor for
     // earlier results. NaNs are ignored for `top`, but the weight of a NaN, and with it sum and output, is NaN.
@@ -4937,7 +4945,7 @@ static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t ch
 
 #endif // GSF__X86
 
-static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, int pairs) { // pairs: of bf16
+static const gsf__attention_parts* gsf__attention_parts_of(gsf_cpu_level level, int pairs) { // pairs: bf16 operands
 #if GSF__X86
     static const gsf__attention_parts avx2 = {
         1, gsf__attention_pack_rows, gsf__attention_pack_values,

@@ -60,10 +60,18 @@
    WHERE TO ADD
        a regulariser    on the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass; on parameters:
                         beside gsf__penalty_chunk in >>trainer, called by gsf__trainer_update. Its weight is a field of
-                        gsf_train_desc, in gsf__train_desc_check and (for checkpoints) in gsf__trainer_settings
-       a camera model   gsf__lens_kind and the table of COLMAP's models in >>colmap, the distortion in >>undistort
+                        gsf_train_desc, in gsf__train_desc_check and (for checkpoints) in gsf__trainer_settings; a
+                        default other than zero in gsf__train_desc_defaults, for few views in
+                        gsf_splat_resolve_few_view_desc. Image terms are multiplied by `scale` and added to d_color
+                        after gsf__loss; gsf__depth_smoothness overwrites d_depth, so that a second depth term adds to
+                        it afterwards. New image buffers: gsf__trainer_reserve_images, gsf_splat_destroy_trainer. With
+                        lazy_adam, gsf__penalty_chunk must not write gradients of SH
+       a camera model   a row of gsf__lens_models in >>colmap, at the index that is COLMAP's model id; if its formula is
+                        new, also gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (when it is a
+                        pinhole) and, in >>undistort, gsf__lens_distort. For transforms.json: gsf__transforms_lens_kind
        a file format    gsf_splat_type, a reader and a writer in >>formats
-       a restorer       outside this file: fill in a gsf_restorer; >>warp is an example
+       a restorer       outside this file: fill in a gsf_restorer (gsfixer.h, "restorer interface"); >>warp is an example,
+                        gsf__open_references and gsf__restore_or_skip in >>fixer make the calls
        a start          gsf_initial_kind, in >>few views
 
    ERRORS      As in gsfixer.h. Loaders report file and position and return only checked data; splats, pixels and gradients
@@ -5703,7 +5711,7 @@ typedef struct gsf__dense_job {
     gsf__dense_plane* coarse_planes;
     float* seeds;                  // coarsest level: inverse depth of the nearest sparse point, 0 = none
     int32_t level, iteration, color;
-    float step_pixels, step_normal; // perturbation in this iteration: pixels in the source view; of the unit normal
+    float step_pixels, step_normal; // size of the perturbations: depth, in source-view pixels; unit normal
     float min_normal_dot;          // minimum dot product of normals that count as consistent
     int32_t roam;                  // also try random planes from the whole depth range
 } gsf__dense_job;
@@ -7835,8 +7843,8 @@ enum { GSF__WITH_DEPTH = 1, GSF__STRAIGHT_THROUGH = 2, GSF__WITH_ABS = 4 };
 typedef struct gsf__raster_kernels {
     // Blends the tile's list into `state`.
     void (*blend)(const gsf__tile* tile, gsf__tile_state* state, int flags);
-    // Repeats the blending of T for list entries from `first` to `last` and keeps the steps. Stops after the entry with
-    // which more than GSF__BUCKET steps are kept. Returns the entry to continue with, or tile->count when done.
+    // Repeats the blending of T for list entries from `first` to `last` and keeps the steps. Stops after the entry
+    // that brings the kept steps above GSF__BUCKET. Returns the entry to continue with, or tile->count when done.
     size_t (*keep)(const gsf__tile* tile, float* T, size_t first, size_t last, gsf__step* steps, gsf__step_head* heads,
                    size_t* step_count);
     // Goes back to front over kept steps and writes the sums of the gradient moments of each entry to its slot (12

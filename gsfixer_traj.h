@@ -373,8 +373,8 @@ static void gsf__traj_fix_axes(const double values[3], double rows[9]) {
 GSF__SHARED double gsf__traj_fov_from_focal(double focal, double pixels) { return 2.0 * atan(pixels / (2.0 * focal)); }
 GSF__SHARED double gsf__traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
 
-// Clip matrix (column-major, z in [0, w], w = camera depth) with the principal point's shift; times w2c it is the
-// full projection of Inria's 3DGS (near 0.01, far 100). Needs 0 < near_plane < far_plane.
+// Projection to clip space (column-major; z in [0, w], w = camera depth), including the principal-point offset. Multiplied
+// by w2c it is the full projection of Inria's 3DGS (near 0.01, far 100). Needs 0 < near_plane < far_plane.
 GSF__SHARED gsf_result gsf__traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane,
                                             double far_plane, double out[16]) {
     GSF__TRY(gsf_check_camera(ctx, camera));
@@ -1601,7 +1601,7 @@ typedef struct gsf__traj_job { // shared by the three kinds
     const gsf_camera* cameras;
     size_t count;
     gsf_camera frame;    // size and intrinsics of the frames
-    double origin[3];    // world position of the local frame, which the poses below use until they are normalised
+    double origin[3];    // of local coordinates, in the world; the poses below are local until normalised
     double magnitude;    // of the world coordinates
     double to_local[16]; // normalised to local
     double* views;       // (count,16) poses of the cameras: local, then normalised

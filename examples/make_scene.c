@@ -960,7 +960,7 @@ static size_t find_point(const world* s, const make_scene_options* o, const clou
     if (*outlier) h.at = add(eye, mul(d, h.t * (float)exp((gsf_draw_uniform(s->seed, 2, k + 5) - 0.5) * 1.2)));
     memcpy(color, pixel, 3);
     size_t length = 0;
-    int wrong_left = 1 + (gsf_draw_uniform(s->seed, 2, k + 6) < 0.3); // a wrong match joins two views, sometimes three
+    int wrong_left = 1 + (gsf_draw_uniform(s->seed, 2, k + 6) < 0.3); // further views of this outlier: 1, sometimes 2
     float widest = 0.0f; // largest angle between the anchor's ray and another view's
     for (int i = 0; i < o->views; i++) {
         const gsf_camera* other = &scene->views[i].camera;
