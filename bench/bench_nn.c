@@ -43,7 +43,7 @@ static int bench_wanted(const bench_options* o, const char* name, int threads) {
 
 // ---- peaks of the machine -------------------------------------------------------
 
-// Reading `size` bytes of `memory` once.
+// Reads `size` bytes of `memory` once.
 static bench_sweep bench_make_read(const gsf_context* ctx, char* memory, size_t size) {
     bench_sweep read;
     memset(&read, 0, sizeof read);
@@ -58,11 +58,12 @@ static void bench_read_all(gsf_context* ctx, bench_sweep* read) {
     bench_sink += read->sums[0];
 }
 
-// Integers: one dot product per step in each 32-bit lane, of four bytes if there are instructions for it, else of two
-// words.
+// Integers: in each 32-bit lane, one dot product per step, of four bytes if the processor has instructions for it, else
+// of two 16-bit words.
 
 #if GSF__X86
-#define BENCH_DOT_STEP(k) v##k = BENCH_DOT(v##k); __asm__("" : "+v"(v##k)); // keeps them apart
+// prevents the compiler from merging the chains
+#define BENCH_DOT_STEP(k) v##k = BENCH_DOT(v##k); __asm__("" : "+v"(v##k));
 GSF__TARGET_AVX2 static void bench_dot_avx2(void* arg, size_t chunk, int32_t worker) {
     const __m256i a = _mm256_set1_epi32(0x10001);
     (void)worker;
@@ -110,7 +111,7 @@ GSF__TARGET_BF16 static void bench_dot_bf16(void* arg, size_t chunk, int32_t wor
     (void)worker;
 #define BENCH_WIDE_PAIRS(k) __m512 v##k = _mm512_set1_ps((float)k), w##k = _mm512_set1_ps((float)k + 32.0f);
     BENCH_TEN(BENCH_WIDE_PAIRS)
-    for (int i = 0; i < FMA_ROUNDS / 2; i++) { // the latency exceeds that of multiply-adds: twice the chains
+    for (int i = 0; i < FMA_ROUNDS / 2; i++) { // latency exceeds that of multiply-adds, so twice as many chains
 #define BENCH_PAIRS_STEP(k) v##k = _mm512_dpbf16_ps(v##k, a, a); w##k = _mm512_dpbf16_ps(w##k, a, a);
         BENCH_TEN(BENCH_PAIRS_STEP)
     }
@@ -150,9 +151,9 @@ static void bench_machine(const bench_options* o, gsf_cpu_level level, int threa
 
 typedef void (*bench_body)(gsf_context* ctx, void* arg);
 
-// One warm-up round, then at least three rounds, for about a second (quick: 0.2). Each runs `repeats` units of the row.
-// With `read`, that memory is read before each round, and the row's bandwidth is relative to that: other users of the
-// memory bus then affect both alike.
+// One warm-up round, then at least three rounds, for about a second (quick: 0.2 s). Each runs `repeats` units of the
+// row. If `read` is set, that memory is read before each round and the row's bandwidth is relative to the bandwidth of
+// these reads: other users of the memory bus then affect both alike.
 static void bench_time_beside(const bench_options* o, gsf_context* ctx, bench_row* row, bench_body body, void* arg,
                               double repeats, bench_sweep* read) {
     enum { MOST = 101 };
@@ -368,7 +369,8 @@ static void bench_run_quantize(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf__nn_quantize_weight(ctx, &l->linear.weight, 0, &l->weight));
 }
 
-// Float input; the time includes rotation, rounding, product, scales and bias. Errors are those of the quantization.
+// Float input; the time includes rotation, rounding, product, scales and bias. Errors include those of the
+// quantization.
 static void bench_one_int8(const bench_options* o, gsf_cpu_level level, int threads, int64_t rows, int64_t out, int64_t in,
                            char* memory, size_t size) {
     char name[96];
@@ -771,7 +773,7 @@ static void bench_one_resnet(const bench_options* o, int threads, int64_t channe
     bench_require(&ctx, gsf__vae_begin(&r.run));
     bench_require(&ctx, gsf__vae_grow(&r.run, &r.run.slots[0], (int64_t)values));
     bench_fill(r.run.slots[0].data, values * sizeof(float), GSF_NN_F32, 1);
-    for (int64_t g = 0; g < 2 * r.net.groups; g++) // the sums that filling it would have given: mean 0, deviation 3/8
+    for (int64_t g = 0; g < 2 * r.net.groups; g++) // the sums that such inputs would have given: mean 0, deviation 3/8
         gsf__vae_sums(&r.run, 0)[g] = g % 2 ? 0.140625 * (double)values / 32.0 : 0.0;
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, 2.0 * 54.0 * (double)values * (double)channels, "flop");
     row.flops = row.work;
@@ -794,13 +796,13 @@ static void bench_convs(const bench_options* o) {
 
 typedef struct bench_weights {
     gsf_nn_tensor tensors[64];
-    size_t count, used; // used: bytes
+    size_t count, used; // used: size in bytes
     gsf_nn_dtype dtype;
-    char* memory;       // NULL: only counts
+    char* memory;       // NULL: only determine the size
 } bench_weights;
 
-// Of a size that keeps the stream's: values of [1/4, 1/2) in a vector; of a matrix all bits but the exponent's, which makes
-// them 1/128 and less.
+// Values that keep the magnitude of the residual stream: [1/4, 1/2) in vectors; in matrices fixed exponent
+// bits limit magnitudes to 1/128.
 static gsf_result bench_add_weight(void* user, const char* name, int32_t rank, const int64_t* shape,
                                    const gsf_nn_tensor** to) {
     bench_weights* w = (bench_weights*)user;
@@ -824,7 +826,7 @@ static gsf_result bench_add_weight(void* user, const char* name, int32_t rank, c
     return GSF_OK;
 }
 
-// The tensors of `entries` for the struct at `where`; returns their memory, which is to be freed.
+// Fills the struct at `where` with the tensors of `entries`; returns their memory, which the caller frees.
 static char* bench_make_weights(gsf_context* ctx, bench_weights* w, gsf_nn_dtype dtype, const gsf__nn_sizes* sizes,
                                 const gsf__nn_entry* entries, void* where) {
     for (int pass = 0; pass < 2; pass++) {
@@ -902,7 +904,8 @@ static void bench_one_block(const bench_options* o, int threads, gsf_nn_dtype dt
     bench_fill(memory, (floats + stream) * sizeof(float), GSF_NN_F32, 6); // includes the rotation table
     double bytes, flops;
     gsf__nn_query_transformer(&b.net, &b.in, &bytes, &flops);
-    flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072; // first and last layer
+    // first and last layer
+    flops -= 2.0 * (double)b.run.video * (32 + 16) * 3072 + 2.0 * BENCH_BLOCK_TEXT * 4096 * 3072;
     bench_row row = bench_make_row(name, o->level, threads, 0.0, 0.0, flops, "flop");
     row.flops = flops;
     if (bf16) row.variant = BENCH_BF16;
@@ -930,12 +933,13 @@ static void bench_blocks(const bench_options* o) {
 
 // ---- image encoders -------------------------------------------------------------------
 
-enum { BENCH_VIT_WIDTH = 1024, BENCH_VIT_HEADS = 16, BENCH_VIT_ROWS = 25, BENCH_VIT_ACROSS = 37 }; // patches of 350 x 518
+// patches of 350 x 518
+enum { BENCH_VIT_WIDTH = 1024, BENCH_VIT_HEADS = 16, BENCH_VIT_ROWS = 25, BENCH_VIT_ACROSS = 37 };
 
 typedef struct bench_vit {
     gsf_nn_dinov2 net;
     gsf__vit vit;
-    gsf__nn_block blocks[24]; // all share one block's weights, which exceed every cache
+    gsf__nn_block blocks[24]; // all layers share the weights of one block, which exceed every cache
     bench_weights block_weights, weights;
     gsf_nn_encoder_desc in;
     gsf__nn_run run;
@@ -1416,7 +1420,7 @@ typedef struct bench_t5 {
     gsf_nn_t5_desc in;
     gsf__nn_block block;
     bench_weights weights;
-    float *x, *first; // at work; the layer's input
+    float *x, *first; // the stream that the layer changes; its initial value
 } bench_t5;
 
 static void bench_run_t5(gsf_context* ctx, void* arg) {
@@ -1493,7 +1497,7 @@ static void bench_run_opt(gsf_context* ctx, void* arg) {
     bench_require(ctx, gsf__nn_block_forward(&b->run, &b->block, 0, b->state.x, 1, b->rows));
 }
 
-// One layer of OPT-2.7b: the prefill of an image's query tokens and bos, or the decoding of one token, which is bound by
+// One layer of OPT-2.7b: prefill of an image's query tokens and bos, or decoding of one token, which is limited by
 // reading the weights.
 static void bench_one_opt(const bench_options* o, int threads, int64_t rows) {
     char name[96];

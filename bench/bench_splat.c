@@ -74,8 +74,8 @@ static gsf_camera bench_camera(int width, int height) {
 
 // ---- the stages of a step ---------------------------------------------------------
 
-// Floating-point operations per pair, counted from the kernels' source (an FMA is two): position and exponent 6, 2^x 13,
-// transmittance 4, colour 7; backward: the first three again, then gradient of alpha 12 and ten sums 20.
+// Floating-point operations per pair, counted in the kernels' source (an FMA counts as two): position and exponent 6,
+// 2^x 13, transmittance 4, colour 7; backward: the first three again, then the gradient of alpha 12 and ten sums 20.
 #define BENCH_FORWARD_FLOPS 30.0
 #define BENCH_BACKWARD_FLOPS 55.0
 
@@ -88,7 +88,7 @@ typedef struct bench_count {
     uint64_t* pairs; // per tile
 } bench_count;
 
-// Pairs of one tile: lanes with an alpha in the steps that the backward pass keeps.
+// Pairs of one tile: lanes with an alpha, in the steps that the backward pass stores.
 static void bench_count_tile(void* arg, size_t index, int32_t worker) {
     const bench_count* job = (const bench_count*)arg;
     const gsf__tile tile = gsf__tile_of(job->r, index);
@@ -105,7 +105,7 @@ static void bench_count_tile(void* arg, size_t index, int32_t worker) {
     }
 }
 
-// Of the last render; its backward pass has made the scratch memory.
+// Of the last render, whose backward pass has allocated the scratch memory.
 static double bench_pairs(gsf_context* ctx, gsf_rasterizer* r) {
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
     bench_count job;
@@ -348,7 +348,7 @@ static void bench_error(const float* actual, const double* expected, const doubl
                         bench_row* row) {
     double worst = 0.0, difference = 0.0, total = 0.0;
     for (size_t i = 0; i < count; i++) {
-        // A binary decision of this pixel is within rounding of its threshold.
+        // A binary decision of this pixel is so close to its threshold that rounding may change it.
         if (margin && margin[i / per_pixel] < 1e-4) continue;
         const double d = fabs((double)actual[i] - expected[i]);
         if (d > worst) worst = d;
@@ -364,7 +364,8 @@ static void bench_render(const bench_options* o, const char* name, size_t count,
     char forward_name[64], backward_name[64];
     snprintf(forward_name, sizeof forward_name, "forward %s", name);
     snprintf(backward_name, sizeof backward_name, "backward %s", name);
-    if (o->filter && !strstr(forward_name, o->filter) && !strstr(backward_name, o->filter)) return; // the reference is slow
+    // the reference is slow
+    if (o->filter && !strstr(forward_name, o->filter) && !strstr(backward_name, o->filter)) return;
     gsf_context ctx;
     if (!bench_context(&ctx, level, threads)) return;
 

@@ -37,12 +37,13 @@
 
 // ---- sizes and configurations ----------------------------------------------------
 
-typedef struct model_blocks { int width, heads, hidden, layers; } model_blocks; // hidden: width of the feed-forward layers
+// hidden: width of the feed-forward layers
+typedef struct model_blocks { int width, heads, hidden, layers; } model_blocks;
 
 typedef struct model_size {
     const char* name;
     int heads, layers, time_channels, text_tokens; // heads of 64
-    int sample_height, sample_width, frames;       // latents; video frames
+    int sample_height, sample_width, frames;       // latents; frames of a clip
     int reference_tokens;                          // per image
     int channels[4], vae_layers, vae_groups;
     int vae_height, vae_width; // pixels; multiples of 96 and 80, so that tiles overlap by whole latents
@@ -246,7 +247,7 @@ static const char* const model_words[] = { // of captions; sorted, as model_prin
 };
 
 static void model_print_token(gsf_context* ctx, gsf_buffer* out, int id, const char* text,
-                              int strip) { // an added token
+                              int strip) { // a token of added_tokens_decoder
     const char* flag = strip ? "true" : "false";
     gsf_append_text(ctx, out,
                     "    \"%d\": {\"content\": \"%s\", \"lstrip\": %s, \"normalized\": false, \"rstrip\": %s, "
@@ -254,7 +255,7 @@ static void model_print_token(gsf_context* ctx, gsf_buffer* out, int id, const c
                     id, text, flag, flag);
 }
 
-// ---- T5's: a unigram model. gsfixer_nn.h draws its messages at >>nn tokenizer; these are all shorter than 128 bytes
+// ---- T5's vocabulary: a unigram model (for its messages see gsfixer_nn.h, >>nn tokenizer; all shorter than 128 bytes)
 
 enum { MODEL_PIECES = 4 + (int)GSF__COUNT(model_words) + '~' - '!' + 1 }; // <pad>, </s>, <unk>, space, words, ASCII
 
@@ -319,7 +320,7 @@ static void model_print_t5_tokenizer(gsf_context* ctx, const model_size* s, gsf_
                     (int)GSF__SP_EXTRA, s->text_tokens);
 }
 
-// ---- BLIP-2's: pairs of bytes
+// ---- BLIP-2's vocabulary: byte pair encoding
 
 static void model_print_entry(gsf_context* ctx, gsf_buffer* out, const char* text, int id) {
     gsf_append_text(ctx, out, "%s  ", id ? ",\n" : "{\n");
@@ -387,7 +388,7 @@ static void model_print_blip2_tokenizer(gsf_context* ctx, const model_size* s, g
     gsf_append_text(ctx, out, "\n  },\n  \"tokenizer_class\": \"GPT2Tokenizer\",\n" MODEL_BLIP2_SPECIAL);
 }
 
-// ---- the lists of tensors --------------------------------------------------------
+// ---- the tensors of a part -------------------------------------------------------
 
 typedef struct model_tensor {
     char name[104];
@@ -426,11 +427,12 @@ static int model_ends_in(const char* text, const char* end) {
 
 typedef struct model_range { const char* end; double middle, spread, factor; } model_range;
 
-// Ranges by the end of a tensor's name: uniform in middle - spread .. middle + spread or, without a spread, `factor`
-// times the default range. The first match applies.
+// Ranges by suffix of a tensor's name: uniform in middle - spread .. middle + spread or, if spread is 0, `factor` times
+// the default range. The first match applies.
 static const model_range model_ranges[] = {
-    {".conv_y.conv.bias", 1.0, 0.05, 0.0}, {".conv_y.conv.weight", 0.0, 0.0, 0.25}, // also yields a factor
-    {".pos_embedding", 0.0, 0.05, 0.0}, // is added to the transformer's tokens
+    // its output is used as a factor as well
+    {".conv_y.conv.bias", 1.0, 0.05, 0.0}, {".conv_y.conv.weight", 0.0, 0.0, 0.25},
+    {".pos_embedding", 0.0, 0.05, 0.0}, // added to the transformer's tokens
     {"_latents", 0.0, 1.7320508075688772, 0.0}, {"_embeds", 0.0, 1.7320508075688772, 0.0}, // variance 1
     {".lambda1", 1.0, 0.1, 0.0}, {".gamma", 1.0, 0.1, 0.0}, // LayerScale
     {"SelfAttention.q.weight", 0.0, 0.0, 0.125},            // T5 does not scale the logits of its heads of 64
@@ -473,7 +475,7 @@ static void model_add(model_list* list, int32_t rank, const int64_t* shape, cons
     model_choose_range(t);
 }
 
-// The tables by which a network is opened have every name and shape, but for the channels of reference tokens.
+// The tables that the loaders use have every name and shape, except for the channels of the reference tokens.
 static gsf_result model_add_visited(void* user, const char* name, int32_t rank, const int64_t* shape,
                                     const gsf_nn_tensor** to) {
     model_list* list = (model_list*)user;
@@ -487,7 +489,7 @@ static gsf_result model_add_visited(void* user, const char* name, int32_t rank, 
 static void model_add_entries(model_list* list, const gsf__nn_sizes* sizes, const gsf__nn_entry* entries,
                               const char* prefix) {
     union { gsf__vit vit; gsf__vggt vggt; gsf__blip blip; gsf__qformer_layer qformer; gsf__nn_block block; gsf__t5_nets t5;
-            gsf__dit_nets dit; gsf__dit_block dit_block; } unused; // is told where its tensors would be
+            gsf__dit_nets dit; gsf__dit_block dit_block; } unused; // receives the tensors' addresses
     (void)gsf__nn_visit(sizes, entries, prefix, &unused, model_add_visited, list);
 }
 
@@ -508,8 +510,8 @@ static void model_add_transformer(model_list* list, const gsf_nn_transformer* c)
     model_add_blocks(list, &sizes, gsf__dit_block_entries, "transformer_blocks.", c->layers);
 }
 
-// The loader walks the autoencoder instead of using a table; this is the same walk. Opening the model afterwards checks
-// it.
+// The loader traverses the autoencoder without a table; this is the same traversal. Opening the model afterwards
+// verifies it.
 static void model_add_conv(model_list* list, const char* prefix, const char* name, int64_t in, int64_t out, int64_t kt,
                            int64_t kernel) { // kt 0: a 2D layer
     char full[96];
@@ -521,7 +523,8 @@ static void model_add_conv(model_list* list, const char* prefix, const char* nam
 
 static void model_add_norm(model_list* list, const char* prefix, const char* name, int64_t channels, int64_t latents) {
     char full[96];
-    snprintf(full, sizeof full, "%s%s%s", prefix, name, latents ? ".norm_layer" : ""); // latents > 0: the decoder's
+    // latents > 0: a norm of the decoder
+    snprintf(full, sizeof full, "%s%s%s", prefix, name, latents ? ".norm_layer" : "");
     model_add(list, 1, &channels, full, ".weight");
     model_add(list, 1, &channels, full, ".bias");
     if (!latents) return;
@@ -660,7 +663,7 @@ static void model_list_dinov2(model_list* list, const model_size* s, gsf__nn_con
     model_add_dinov2(list, &vit);
 }
 
-// Its loader takes most sizes from the tensors.
+// The loader of VGGT takes most sizes from the tensors.
 static void model_list_vggt(model_list* list, const model_size* s, gsf__nn_config* config) {
     gsf__vggt net;
     (void)config;
@@ -766,7 +769,7 @@ typedef struct model_options {
 typedef struct model_writer {
     gsf_context* ctx;
     const model_options* options;
-    const char* part;     // for the progress
+    const char* part;     // for progress messages
     const char *folder, *stem; // files are STEM.safetensors or STEM-00001-of-00002.safetensors
     int shards;
     unsigned char* block; // MODEL_BLOCK values
@@ -785,7 +788,7 @@ static gsf_result model_format_header(const model_writer* w, const model_tensor*
                                       gsf_buffer* out) {
     const gsf_nn_dtype dtype = w->options->dtype;
     long long begin = 0;
-    gsf_append_bytes(w->ctx, out, "        ", GSF__NN_FILE_HEAD); // room for the length
+    gsf_append_bytes(w->ctx, out, "        ", GSF__NN_FILE_HEAD); // reserved for the size of the header
     gsf_append_text(w->ctx, out, "{\"__metadata__\":{\"format\":\"pt\"}");
     for (size_t i = 0; i < count; i++) {
         const long long end = begin + (long long)tensors[i]->count * (long long)gsf_nn_get_dtype_size(dtype);
@@ -866,7 +869,7 @@ static void model_deal(const model_writer* w, model_list* list) {
     double before = 0.0;
     int shard = 0;
     for (size_t i = 0; i < list->count; i++) {
-        const int left = w->shards - 1 - shard; // shards still to begin
+        const int left = w->shards - 1 - shard; // shards not yet started
         if (i && left > 0 && (before * w->shards >= w->total * (shard + 1) || list->count - i == (size_t)left)) shard++;
         list->tensors[i].shard = shard;
         before += model_bytes(w, &list->tensors[i]);
@@ -887,7 +890,7 @@ static gsf_result model_write_text(gsf_context* ctx, const char* folder, const c
     return result;
 }
 
-// The same of a text that goes with it.
+// Writes the text and frees it.
 static gsf_result model_end_text(gsf_context* ctx, const char* folder, const char* name, gsf_buffer* text) {
     const gsf_result result =
         text->failed ? GSF_ERROR_OUT_OF_MEMORY : model_write_text(ctx, folder, name, text->data, text->size);
@@ -918,7 +921,7 @@ static void model_remove(const model_writer* w, const char* end) {
     gsf_destroy_buffer(w->ctx, &path);
 }
 
-// Writes the files of a list: a single one, or shards with their index. Removes files that a loader would prefer to them.
+// Writes the files of a list: one file, or shards with their index. Removes files that a loader would prefer over them.
 static gsf_result model_write_shards(model_writer* w, model_list* list) {
     const model_tensor** picked = (const model_tensor**)gsf_alloc(w->ctx, list->count, sizeof *picked);
     gsf_result result = picked ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
@@ -977,7 +980,7 @@ typedef struct model_part {
     model_file files[9];                                         // the first one is read by list_fn
 } model_part;
 
-// Opens what was written, which checks names and shapes.
+// Opens the written files with the library's loader, which checks names and shapes.
 #define MODEL_OPENS(net)                                                            \
     static gsf_result model_open_##net(gsf_context* ctx, const char* folder) {      \
         gsf_nn_##net net;                                                           \
@@ -1086,7 +1089,7 @@ static gsf_result model_make_part(gsf_context* ctx, const model_options* o, cons
 
 static gsf_result model_write_pipeline(gsf_context* ctx, const char* out) {
     gsf_buffer path, text;
-    void* encoder = NULL; // its configuration, if the folder has one
+    void* encoder = NULL; // its config.json, if the folder has one
     size_t size;
     memset(&path, 0, sizeof path);
     memset(&text, 0, sizeof text);
@@ -1148,7 +1151,7 @@ static void model_interrupt(int number) {
 }
 
 static void model_show_progress(void* user, const char* stage, double done, double total) {
-    int* shown = (int*)user; // percentage shown last
+    int* shown = (int*)user; // percentage last shown
     const int percent = (int)(100.0 * done / total);
     if (percent == *shown) return;
     *shown = percent;

@@ -1,4 +1,5 @@
-// oracle.c - restorers that know the truth, for bench/headroom.py: what the repair loop gains from which information
+// oracle.c - restorers that know the ground truth, for bench/headroom.py: how much the repair loop gains from which
+// information
 //
 //     oracle cameras SCENE OUT.json [--max-size N | --factor N]     writes the cameras of the scene's views
 //     oracle render SPLATS CAMERAS.json OUT [--near Z]              renders the truth from a model of all photos
@@ -39,8 +40,8 @@ typedef struct oracle_options {
 
 typedef struct truth_view {
     gsf_camera camera;
-    gsf_image color; // f32; no data where only depth is asked for
-    gsf_image depth; // f32, 0: nothing there
+    gsf_image color; // f32; without data if only depth is needed
+    gsf_image depth; // f32; 0: no surface
     double center[3];
 } truth_view;
 
@@ -121,7 +122,7 @@ static void unproject(const gsf_camera* camera, int64_t x, int64_t y, double z, 
     for (int c = 0; c < 3; c++) out[c] = m[4 * c] * p[0] + m[4 * c + 1] * p[1] + m[4 * c + 2] * p[2];
 }
 
-// Does the photo see a point? u, v: where, also if not.
+// Does the photo see the point? u, v receive its position, even if it does not.
 static int sees(const truth_view* photo, const double point[3], double tolerance, double* u, double* v) {
     double z;
     if (!gsf_project_point(&photo->camera, point, u, v, &z)) return 0;
@@ -145,11 +146,11 @@ typedef struct job {
     gsf_context* ctx;
     const oracle_options* o;
     const char* folder;
-    view_list truth;        // at the frames
+    view_list truth;        // of the frames
     view_list photos;       // true depth at the photos, with the photos' own colours
     gsf_image *color, *depth, *out_color, *out_confidence; // of the frames, f32
     gsf_camera* cameras;
-    int32_t* reference;     // photo that a frame is, or -1
+    int32_t* reference;     // index of the photo at this frame's view, or -1
 } job;
 
 static gsf_image* make_list(gsf_context* ctx, size_t count) {
@@ -234,7 +235,7 @@ static gsf_result save_job(const job* j) {
 
 // ---- the rows --------------------------------------------------------------------
 
-// The toolkit's warp, on the job's files.
+// The library's warp restorer, run on the job's files.
 static gsf_result run_warp(job* j) {
     gsf_context* ctx = j->ctx;
     gsf_restorer warp;
@@ -297,7 +298,7 @@ static void mark_seen(job* j, size_t i) { // confidence 1 where a photo sees the
             row_of(out, y)[x] = (float)seen_by_any(&j->photos, j->truth.views + i, x, y, j->o->tolerance);
 }
 
-// One pass of a Gaussian along x or y; what lies outside is left out of the mean.
+// One pass of a Gaussian along x or y; pixels outside the image are excluded from the mean.
 static void blur_pass(const gsf_image* from, const gsf_image* to, double sigma, int along_y) {
     const int64_t reach = (int64_t)ceil(3.0 * sigma), length = along_y ? from->height : from->width;
     for (int64_t y = 0; y < from->height; y++)
@@ -326,10 +327,11 @@ static gsf_result blur_truth(job* j, size_t i) {
 }
 
 #define CARRY_ANGLE 0.2 // radians, as GSF__WARP_ANGLE: a photo this far off in viewing direction weighs exp(-1/2)
-#define CARRY_EDGE 0.1  // of the depth: pixels farther than this before or behind the point show another surface
+// relative to depth: pixels farther than this in front of or behind the point show another surface
+#define CARRY_EDGE 0.1
 
-// Colour of the photo at (u, v), where it shows a point at camera depth z: bilinear, from those of the four neighbouring
-// pixels that show the same surface. Returns 0 if none does.
+// Colour of the photo at (u, v) if it shows a point at camera depth z: interpolated bilinearly from those of the four
+// neighbouring pixels that show the same surface. Returns 0 if none does.
 static int carried_color(const truth_view* photo, double u, double v, double z, double rgb[3]) {
     const double fx = floor(u - 0.5), fy = floor(v - 0.5);
     double sum[3] = {0}, total = 0.0;
@@ -381,7 +383,7 @@ static void carry_photos(job* j, size_t i) {
         }
 }
 
-static void keep_render(job* j, size_t i) { // where there is no confidence
+static void keep_render(job* j, size_t i) { // where the confidence is 0
     const gsf_image* confidence = j->out_confidence + i;
     for (int64_t y = 0; y < confidence->height; y++)
         for (int64_t x = 0; x < confidence->width; x++)
@@ -405,7 +407,7 @@ static gsf_result restore_window(job* j, int row) {
     return GSF_OK;
 }
 
-// ---- what the frames are worth ---------------------------------------------------
+// ---- quality of the frames -------------------------------------------------------
 
 enum {
     PIXELS, RENDER_ERROR, RESTORED_ERROR, // squared errors against the truth, mean over the channels
@@ -445,7 +447,7 @@ static void add_sums(const job* j, size_t i, double sums[SUMS]) {
         }
 }
 
-static void print_sums(const job* j) { // of the frames that are trained on; those at a photo's view are not
+static void print_sums(const job* j) { // of the frames used for training, which excludes those at a photo's view
     gsf_buffer text = {0};
     double sums[SUMS] = {0};
     size_t frames = 0;
@@ -524,7 +526,7 @@ static gsf_result render_one(gsf_context* ctx, gsf_rasterizer* rasterizer, const
     if (result == GSF_OK) result = gsf_splat_render(ctx, rasterizer, splats, camera, desc, &out);
     for (int64_t y = 0; y < camera->height && result == GSF_OK; y++)
         for (int64_t x = 0; x < camera->width; x++)
-            if (row_of(&out.alpha, y)[x] < 0.5f) row_of(&out.depth, y)[x] = 0.0f; // nothing that could be seen
+            if (row_of(&out.alpha, y)[x] < 0.5f) row_of(&out.depth, y)[x] = 0.0f; // no surface
     if (result == GSF_OK) result = gsf_save_image(ctx, gsfix_pathf("%s/%05zu.png", folder, i).s, &out.color);
     if (result == GSF_OK) result = gsfix_save_npy(ctx, gsfix_pathf("%s/depth/%05zu.npy", folder, i).s, &out.depth);
     gsf_destroy_image(ctx, &out.color);

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# tests/compare_tokenizers.sh [COUNT]: both tokenizers beside the sentencepiece and transformers packages on COUNT random
-# texts (10,000), ids and decoded texts equal. Installs the packages from PyPI into build/tokenizers; not part of CTest.
+# tests/compare_tokenizers.sh [COUNT]: compares both tokenizers with the sentencepiece and transformers packages on
+# COUNT (10,000) random texts: ids and decoded texts must be equal. Installs the packages from PyPI into
+# build/tokenizers; not part of CTest.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 build=${GSF_BUILD:-build}

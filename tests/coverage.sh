@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# tests/coverage.sh [-v]: line coverage of the parsers of JSON and safetensors by their tests and the replayed fuzz corpora
-# (-v: and the lines that nothing reached). By hand only; needs clang-14 and llvm-14. COVERAGE=folder keeps the programs.
+# tests/coverage.sh [-v]: line coverage of the parsers of JSON and safetensors by their tests and the replayed fuzz
+# corpora (-v: also lists the lines not covered). Run by hand; needs clang-14 and llvm-14. COVERAGE=folder keeps the
+# compiled programs.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 out=${COVERAGE:-$(mktemp -d)}

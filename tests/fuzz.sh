@@ -40,7 +40,7 @@ fuzz() { # TARGET SECONDS BUILD: one line of the table in run/TARGET/row
     local folder=$3/run/$1 status=0 TIMEFORMAT='cpu: %U %S'
     rm -rf "$folder"
     cp -r "tests/corpus/$1/." "$(mkdir -p "$folder/corpus" && echo "$folder/corpus")"
-    cp "$3/tests/fuzz_$1" "$folder/target" # a later build does not disturb
+    cp "$3/tests/fuzz_$1" "$folder/target" # so that a later build does not replace it
     { time "$folder/target" -max_total_time="$2" -max_len=8192 -timeout=5 -rss_limit_mb=1024 -malloc_limit_mb=256 \
         -print_final_stats=1 -artifact_prefix="$folder/" "$folder/corpus" > "$folder/log" 2>&1; } 2> "$folder/time" || status=$?
     awk -v target="$1" -v status="$status" -v log_file="$folder/log" '

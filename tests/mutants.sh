@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# mutants.sh [--applies] [TEXT]: do the tests notice? Each mutant is one wrong line in a copy of the headers, and a test that has to fail
-# on it. Fails when a mutant survives, does not compile or no longer applies. With TEXT only the mutants whose line in the
-# table below contains it. Not part of run.sh: about 30 programs are compiled, JOBS (default: all cores) at a time.
+# mutants.sh [--applies] [TEXT]: do the tests detect bugs? Each mutant is one wrong line in a copy of the headers and a
+# test that must fail with it. Fails if a mutant survives, does not compile or no longer applies. With TEXT, only the
+# mutants whose line in the table below contains it. Not part of run.sh: about 30 programs are compiled, JOBS (default:
+# all cores) at a time.
 # CC (default gcc) and CFLAGS (default -O1) as usual. With --applies nothing is compiled: it only checks that each
 # substitution still changes its file, which run.sh does.
 set -euo pipefail
@@ -42,14 +43,14 @@ chmod 755 "$work" # test_scene reads as another user
 trap 'rm -rf "$work"' EXIT
 export OMP_NUM_THREADS=1
 
-# As tests/CMakeLists.txt builds a program that stands alone, but for the optional libraries.
+# Builds a standalone test program as tests/CMakeLists.txt does, but without the optional libraries.
 build() { # TEST HEADERS PROGRAM
     mkdir "$3.tmp"
     ${CC:-gcc} -std=c11 ${CFLAGS:--O1} -w -DNDEBUG -DGSFIXER_STATIC -DGSFIXER_IMPLEMENTATION= -I"$2" -Itests \
         -DTEST_GOLDEN="\"$PWD/tests/golden\"" -DTEST_TMP="\"$3.tmp\"" "tests/$1.c" -o "$3" -lm -pthread 2> "$3.log"
 }
 
-# The tests pass on the headers as they are, else a failure says nothing.
+# The tests must pass on the unchanged headers, otherwise a failure proves nothing.
 baseline() { # TEST
     local program=$work/baseline.${1//\//.}
     build "$1" . "$program" || { echo "$1: does not compile"; return 1; }
@@ -74,7 +75,7 @@ mutant() { # NUMBER LINE
     rm -rf "$headers"
 }
 
-all() { # COMMAND ITEM...: JOBS of them at a time
+all() { # COMMAND ITEM...: runs JOBS of them at a time
     local command=$1 item n=0
     shift
     for item in "$@"; do

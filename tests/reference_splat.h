@@ -1,6 +1,6 @@
 // reference_splat.h - double-precision reference of the splat rasterizer: the oracle of tests and benches.
 //
-// Plain scalar C, one pixel at a time, without optimisations: it serves correctness only. It follows the conventions
+// Plain scalar C, one pixel at a time, not optimised: only correctness matters. It follows the conventions
 // of golden/splat/README.md (3D Gaussian Splatting as Inria's CUDA rasterizer computes it):
 //     u = fx X/Z + cx - 0.5 (pixel centres are integers), J with x/z clamped at +-1.3 W/(2 fx), 0.3 px^2 of blur,
 //     front to back in order of Z (ties by index), alpha = min(0.99, o G), skipped below 1/255,
@@ -387,8 +387,8 @@ static inline ref_projected ref_project(const ref_splats* s, const gsf_camera* c
     return p;
 }
 
-// Gradients of one splat: from the screen (mean2d, conic as a b c, opacity with compensation, colour, depth) to
-// parameters.
+// Gradients of one splat: from the screen (mean2d, conic as a b c, opacity with compensation, colour, depth) back to
+// the parameters.
 typedef struct ref_screen_grads { double mean2d[2], conic[3], opacity, color[3], z; } ref_screen_grads;
 
 static inline void ref_project_backward(const ref_splats* s, const gsf_camera* camera, const ref_options* o, size_t i,
@@ -449,7 +449,7 @@ static inline void ref_project_backward(const ref_splats* s, const gsf_camera* c
         if (!g.clamped[a]) { // ratio = p[a] / z
             dp[a] -= dJ2 * f / (z * z);
             dp[2] += 2 * dJ2 * f * r / (z * z);
-        } else {             // ratio constant; Inria's: ratio z constant
+        } else {             // ratio constant; Inria: ratio times z constant
             dp[2] += (o->official_gradient ? 2 : 1) * dJ2 * f * r / (z * z);
         }
         // u = f p[a] / z + c
@@ -480,14 +480,14 @@ typedef struct ref_hit { // one blended splat of a pixel
     double dx, dy;    // projected mean - pixel
     double gauss;     // exp(power)
     double alpha;     // min(0.99, opacity gauss)
-    int saturated;    // the 0.99 clamp acted
+    int saturated;    // clamped to 0.99
     double T;         // transmittance in front of it
 } ref_hit;
 
 typedef struct ref_decisions { double margin, depth_gap, cancellation; } ref_decisions;
 
-// Splats blended in pixel (x, y), front to back; returns their number. hits: room for order_count. T_final: what is
-// left.
+// Splats blended in pixel (x, y), front to back; returns their number. hits: room for order_count. T_final: the
+// transmittance behind the last one.
 static inline size_t ref_trace(const ref_image* image, const ref_splats* s, const ref_options* o, int x, int y,
                                ref_hit* hits, double* T_final, ref_decisions* decisions) {
     size_t n = 0;
@@ -607,7 +607,7 @@ static inline void ref_destroy_image(ref_image* image) {
 }
 
 // Derivatives of a loss with respect to colour (H,W,3), expected depth (H,W) and alpha = 1 - T (H,W) to all parameters.
-// `image` is what ref_render gave for the same arguments. NULL derivative = zero. Adds to *out.
+// `image` is the result of ref_render for the same arguments. A NULL derivative means zero. Adds to *out.
 static inline void ref_render_backward(const ref_splats* s, const gsf_camera* camera, const ref_options* o,
                                        const ref_image* image, const double* d_color, const double* d_depth,
                                        const double* d_alpha, ref_grads* out) {
@@ -623,11 +623,12 @@ static inline void ref_render_backward(const ref_splats* s, const gsf_camera* ca
         for (int c = 0; c < 3; c++) dc[c] = d_color ? d_color[3 * at + c] : 0;
         for (int c = 0; c < 3; c++) out->background[c] += T * dc[c];
         if (n == 0) continue;
-        // alpha = A and depth = Z / A with A = sum w, Z = sum w z
+        // alpha = A and depth = Z / A, where A = sum w and Z = sum w z
         const double A = 1 - T;
         const double dZ = d_depth ? d_depth[at] / A : 0;
         const double dA = (d_alpha ? d_alpha[at] : 0) - (d_depth ? d_depth[at] * image->depth[at] / A : 0);
-        // The loss changes by f_k per unit of weight of splat k; behind: sum of w f over what lies behind it.
+        // f_k: the loss' derivative with respect to the weight of splat k; behind: the sum of w f over everything
+        // behind it.
         double behind = T * (dc[0] * o->background[0] + dc[1] * o->background[1] + dc[2] * o->background[2]);
         for (size_t k = n; k-- > 0;) {
             const ref_hit* h = &hits[k];

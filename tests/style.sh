@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# style.sh: what .clang-format says and needs no clang-format to hold: no line of C or C++ is longer than its ColumnLimit
-# (lines that begin with a string literal and gsfix_report.c, a page of HTML in such literals, apart), no tabs, no blanks at
-# line ends, a newline at the end of each file.
+# style.sh: the rules of .clang-format that can be checked without clang-format: no line of C or C++ longer than its
+# ColumnLimit (except lines that begin with a string literal, and gsfix_report.c, an HTML page in such literals), no tabs,
+# no trailing blanks, a newline at the end of each file.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 limit=$(sed -n 's/^ColumnLimit: //p' .clang-format)

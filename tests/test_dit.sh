@@ -10,7 +10,7 @@ export OMP_WAIT_POLICY=passive
 log=$scratch/log
 fail() { echo "$0: $*"; tail -n 5 "$log"; exit 1; }
 "$make_model" "$scratch/all" --size tiny > "$log" 2>&1 || fail "make_model failed"
-mkdir "$scratch/model" # the same without encoders
+mkdir "$scratch/model" # the same model without encoders
 for part in transformer vae scheduler; do ln -s "../all/$part" "$scratch/model/$part"; done
 from_photos=(--restorer "dit:$scratch/all")
 saved=$scratch/saved.safetensors
@@ -57,7 +57,7 @@ kill_clips "$scratch/photos_killed" 1 "${from_photos[@]}" --save-features "$scra
 cmp "$scratch/whole/splats.ply" "$scratch/photos_killed/splats.ply" || fail "from photos: differs after a kill"
 cmp "$saved" "$scratch/again.safetensors" || fail "other features are saved after a kill"
 
-# One clip: the frames of the scene's first window, from a folder of images, with a feature file for that clip only.
+# One clip: the frames of the scene's first window, from a folder of images, with a feature file for this clip only.
 dit=(--restorer "dit:$scratch/model" --ref-features "$scratch/all/features.safetensors")
 mkdir -p "$scratch/clip"
 for frame in "$scratch"/whole/fixed/*window1*.png; do cp "$frame" "$scratch/clip/"; done
@@ -123,7 +123,7 @@ wait "$pid" 2> /dev/null || true
 expect 0 "restored by" "$gsfix" restore "$scratch/clip21" --out "$scratch/long" "${dit[@]}" --steps 2
 for frame in "$scratch"/back21/*.png; do cmp "$frame" "${frame/back21/long}" || fail "a long clip differs after a kill"; done
 
-# Missing features of a clip are named in the message; window lengths other than the trained one must be requested.
+# The error names missing features of a clip; window lengths other than the trained one must be requested.
 expect 1 "prompt_embeds.clip3" "$gsfix" fix "$scene" --out "$scratch/x" "${options[@]}" --ref-features "$saved" \
     --restorer "dit:$scratch/model" --set "rounds=2,windows=3,first_round=20,last_round=40"
 expect 1 "prompt_embeds.clip1" "$gsfix" fix "$scene" --out "$scratch/bare" "${options[@]}" "${dit[@]}"

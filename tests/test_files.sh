@@ -181,7 +181,7 @@ works fix S --out OUT --restart
 
 # ---- restorers that misbehave
 exec_fix() { fix S --out OUT --restorer "exec:$1" --set rounds=1,windows=2,window_frames=4,first_round=1,last_round=3; }
-copy='cp "$1"/frames/*.png "$1"/out/; true' # the command gets the folder as its last argument
+copy='cp "$1"/frames/*.png "$1"/out/; true' # the job folder is the command's last argument
 hostile() { # NAME TEXT SCRIPT: exit status 1, the folder docs as it was
     new "a restorer that $1"
     mkdir docs; echo mine > docs/mine; cp S/images/*.png docs/

@@ -201,7 +201,7 @@ done
 [ "$(numbers psnr stdout | tail -n 1)" != "$(numbers psnr_seen stdout | tail -n 1)" ] || fail "metrics: the masks change nothing"
 expect 0 "$gsfix" info a/splats.ply
 splats=$(grep '^splats' stdout)
-for file in splats.splat splats.spz; do # as many splats
+for file in splats.splat splats.spz; do # the same number of splats
     expect 0 "$gsfix" info a/$file
     [ "$(grep -o '^splats *[0-9]*' stdout)" = "$(echo "$splats" | grep -o '^splats *[0-9]*')" ] || fail "a/$file has other splats"
     expect 0 "$gsfix" render a/$file --scene "$scene" --max-size 48 --out frames_$file

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# test_headroom.sh GSFIX SCENE SCRATCH: further photos of a made scene equal those that it has; bench/headroom.py runs all
-# its rows, its oracles know what they claim to know, and a second call repeats no run. SCENE: make_scene's.
+# test_headroom.sh GSFIX SCENE SCRATCH: additional photos of a synthetic scene equal those that it has;
+# bench/headroom.py runs all its rows, its oracles use the information that they claim to use, and a second call repeats
+# no run. SCENE: made by make_scene.
 set -euo pipefail
 gsfix=$1 scene=$2 scratch=$3
 command -v python3 > /dev/null && [ -x "$gsfix" ] && [ -d "$scene" ] ||
@@ -84,7 +85,7 @@ sums, = rows["blurred"]["rounds"]
 assert 0.0 < sums["restored_error"] < 0.3 * sums["render_error"], sums
 assert abs(rows["warp8"]["psnr"] - rows["warp"]["psnr"]) < 0.05, "8 bits change warp"
 
-# the frames are where they are said to be
+# the frames are at the paths reported
 others, test = (headroom.read_cameras("%s/%s.json" % (folder, name)) for name in ("capture", "test"))
 diameter = json.load(open(folder + "/split.json"))["diameter"]
 for view, (distance, _) in zip(test, rows["capture"]["distances"]):
@@ -102,7 +103,7 @@ all_rows
 if (all_rows --sigma 3) > /dev/null; then fail "mixes runs of different settings"; fi
 grep -q "begun with other settings" log || fail "does not name the cause"
 
-# in a run of some length the truth helps; two windows a round
+# in a longer run the truth improves the result; two windows per round
 headroom gain "rounds=2,windows=2,window_frames=8" --iterations 200 --rows none,truth
 cat > gain.py << 'PY'
 import glob, json
@@ -115,7 +116,7 @@ PY
 python3 gain.py || { cat log; fail "the truth does not help"; }
 grep -q '^| truth | .* | 100 % | 100 % | 1 |$' gain/headroom.md || fail "the oracle does not convert all of its gain"
 
-# the way of real scenes: truth from a model of all photos
+# as for real scenes: truth from a model of all photos
 headroom model "rounds=1,windows=1,window_frames=6" --iterations 40 --truth model --model-iterations 60 --rows none,seen
 cat > model.py << 'PY'
 import glob, json

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# test_readme.sh PROGRAM GSFIX MAKE_SCENE SCRATCH: the program in README.md (at most 25 lines in main) writes the same splats,
-# byte for byte, as gsfix fix with the same photos; with 3 photos, and with 6, from where on the start is another.
+# test_readme.sh PROGRAM GSFIX MAKE_SCENE SCRATCH: the program in README.md (at most 25 lines in main) writes the same
+# splats, byte for byte, as gsfix fix with the same photos; with 3 photos, and with 6, from which on the initial splats
+# are chosen differently.
 set -euo pipefail
 program=$1 gsfix=$2 make_scene=$3 scratch=$4
 [ -x "$program" ] && [ -x "$gsfix" ] && [ -x "$make_scene" ] || { echo "SKIPPED: a program is missing"; exit 77; }

@@ -1100,7 +1100,7 @@ static void test_unreadable_photos(void) {
         CHECK(strstr(ctx.error, path) && !scene.views);
         CHECK(remove(path) == 0);
     }
-    // a file without read permission: root switches to another user; where the file is still readable, nothing is tested
+    // a file without read permission: root switches to another user; if it can still be read, nothing is tested
     CHECK_OK(&ctx, gsf_write_file(&ctx, path, "x", 1));
     CHECK(chmod(path, 0) == 0);
     const int root = geteuid() == 0;
