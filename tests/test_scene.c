@@ -587,7 +587,7 @@ static void test_colmap_text(void) {
         {cameras, "4 1 0 0 0 0 0 0 7 x\\..\\a\n", NULL, "leads out"},
         {cameras, "4 1 0 0 0 0 0 0 7 c:a\n", NULL, "leads out"},
         {cameras, "4 1 0 0 0 0 0 0 7\n", NULL, "empty or malformed name"},
-        {cameras, "4 1 0 0 0 0 inf 0 7 a\n", NULL, "no rotation"},
+        {cameras, "4 1 0 0 0 0 inf 0 7 a\n", NULL, "is not a rotation"},
         {cameras, "4 1 0 0 0 0 1,5 0 7 a\n", NULL, "expected a pose"},
         {cameras, images, "1 0 0 0 256 0 0 0", "points3D.txt:1: expected a colour"},
         {cameras, images, "1 0 0 0 25 0 0 0 4", "expected a 2D point index"},
@@ -1176,7 +1176,7 @@ static void test_image_folders(void) {
     CHECK(strstr(ctx.error, "s/images/b.png") != NULL);
     disk_put(&disk, "s/sparse/images.txt", "5 1 0 0 0 0 0 0 1 nothing.jpg\n");
     scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_NOT_FOUND);
-    CHECK(strstr(ctx.error, "none of the 1 photos") != NULL);
+    CHECK(strstr(ctx.error, "all 1 photos are missing") != NULL);
     disk_put(&disk, "s/sparse/images.txt", "5 1 0 0 0 0 0 0 1 x/../../b.png\n");
     scene = load_folder(&ctx, "s", 0, 0, GSF_ERROR_FORMAT);
     CHECK(strstr(ctx.error, "leads out of its folder") != NULL && scene.views == NULL);
@@ -1263,7 +1263,7 @@ static void test_transforms(void) {
          "4x4 matrix of numbers"},
         {"{\"fl_x\":1,\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\",\"transform_matrix\":"
          "[[1,0,0,0],[0,1,0,0],[0,0,-1,0]]}]}",
-         "no rotation"},
+         "is not a rotation"},
         {"{\"w\":4,\"h\":4,\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "neither fl_x"},
         {"{\"fl_x\":1,\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "no usable w, h"},
         {"{\"fl_x\":\"1\",\"frames\":[{\"file_path\":\"a\"," POSE "}]}", "\"fl_x\" is not a number"},
