@@ -75,7 +75,8 @@ static const option_spec option_specs[] = {
      "dit: allow window lengths other than the 49 frames the model was trained on. Sinusoidal embeddings, which the model\n"
      "has never seen, then replace its learned positions"},
     {"--regularize", TEXT, AT(regularize), 0, 0, "on|off", "fix",
-     "regularisers for few views (default on); off gives plain 3DGS"},
+     "regularisers for few views (default on); off gives plain 3DGS, or with --set mcmc=1 plain MCMC, which has\n"
+     "penalties of its own"},
     {"--trajectory", TEXT, AT(trajectory), 0, 0, "reference|ellipse|interpolate", "fix",
      "camera path of the frames to repair (default reference)"},
     {"--iterations", INT, AT(iterations), 1, 1e7, "N", "fix", "total number of training steps (default 1200)"},

@@ -137,7 +137,7 @@ static int resolve_setup(gsfix_app* app, fix_setup* setup) { // 0 or an exit cod
     if (app->o.iterations) train->iterations = app->o.iterations;
     train->seed = app->o.seed;
     if (app->o.regularize && strcmp(app->o.regularize, "off") == 0)
-        train->dropout = train->opacity_decay = train->scale_penalty = train->depth_smoothness = 0.0f;
+        train->dropout = train->opacity_decay = train->scale_penalty = train->opacity_penalty = train->depth_smoothness = 0.0f;
     setup->fix.trajectory = gsfix_path_kind(app->o.trajectory);
     int code = apply_settings(app, setup);
     if (!code) code = gsfix_background(app, train->background, &train->background_random);

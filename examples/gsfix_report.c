@@ -400,7 +400,7 @@ static const struct { const char *key, *group, *zero, *unit; } switches[] = {
     {"random_points", "Start", NULL, ""}, {"extent", "Start", NULL, ""}, {"near_plane", "Start", NULL, ""},
     {"regularize", "Regularisers for few views", NULL, ""}, {"dropout", "Regularisers for few views", "off", ""},
     {"opacity_decay", "Regularisers for few views", "off", " per step"},
-    {"scale_penalty", "Regularisers for few views", "off", ""},
+    {"scale_penalty", "Regularisers for few views", "off", ""}, {"opacity_penalty", "Regularisers for few views", "off", ""},
     {"depth_smoothness", "Regularisers for few views", "off", ""}, {"restorer", "Repair", NULL, ""}, {"compare", "Repair", NULL, ""},
     {"trajectory", "Repair", NULL, ""}, {"rounds", "Repair", "none", ""}, {"first_round", "Repair", NULL, "<step "},
     {"last_round", "Repair", NULL, "<step "}, {"windows", "Repair", NULL, " per round"},

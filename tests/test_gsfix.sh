@@ -128,6 +128,12 @@ expect 1 "$gsfix" fix "$scene" --out given2 "${small[@]}" --restorer warp --path
 holds "no cameras" stderr
 expect 0 "$gsfix" fix "$scene" --out e --views 3 --iterations 5 --max-size 48 --regularize off
 [ ! -e e/fixed ] || fail "frames without a restorer"
+for name in dropout opacity_decay scale_penalty opacity_penalty depth_smoothness; do
+    holds "\"$name\":0," e/metrics.json
+    holds "<dt>$name</dt><dd>off</dd>" e/report.html
+done
+expect 0 "$gsfix" fix "$scene" --out e --restart --views 3 --iterations 2 --max-size 48 --regularize off --set mcmc=1
+for name in scale_penalty opacity_penalty; do holds "\"$name\":0.01," e/metrics.json; done # MCMC's own
 
 # a list of names with a byte order mark
 printf '\xef\xbb\xbfframe_002.png\r\nframe_003.png\nframe_004.png\n' > names
