@@ -486,7 +486,7 @@ typedef struct gsf_train_desc {
     float prune_scale;             // 0.1 of extent, after the first opacity reset
     int32_t opacity_reset_interval;// 3000 s, but at least 1000, so that opacities recover in between; negative = never
     size_t max_splats;             // densification stops growing here; 0 = 2 million (mcmc: 1 million)
-    int32_t mcmc;                  // 0; 1: densification as in "3DGS as Markov Chain Monte Carlo": splats with at most
+    int32_t mcmc;                  // 0; 1: densification as in "3DGS as Markov Chain Monte Carlo": splats below
                                    // prune_opacity are relocated to others, up to 5 % are added at a time until there
                                    // are max_splats, and noise is added to the means in every step. Nothing is pruned,
                                    // no opacity is reset; densify_grad, densify_absolute, densify_scale and
@@ -10115,7 +10115,7 @@ static double gsf__mcmc_share(double transparency, uint32_t copies, double* opac
     return (1.0 - transparency) / sum;
 }
 
-// Draws `draws` splats (with repetition) among those with an opacity logit above `logit` and stores their indices in
+// Draws `draws` splats (with repetition) among those with an opacity logit of at least `logit` and stores their indices in
 // visits[1] and how often each was drawn in visits[0]. screen[0] holds the cumulative opacities. MCMC uses none of
 // these for statistics. Returns the number of draws made: 0 if there is no such splat.
 static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t index) {
@@ -10123,7 +10123,7 @@ static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, f
     memset(model->visits[0], 0, model->count * sizeof(uint32_t));
     for (size_t i = 0; i < model->count; i++) {
         const float x = model->groups[GSF__OPACITY].value[i];
-        if (x > logit) total += (double)gsf__sigmoid(x);
+        if (x >= logit) total += (double)gsf__sigmoid(x);
         sums[i] = total;
     }
     if (!(total > 0.0)) return 0;
@@ -10142,7 +10142,7 @@ static size_t gsf__mcmc_draw(gsf__model* model, const gsf__densify_rule* rule, f
 }
 
 // Gives every drawn splat the opacity and scales that it will share with its copies. Opacities are clamped to at least
-// least_opacity, as in gsplat.
+// least_opacity, as in gsplat; unlike there, a splat of exactly that opacity is not relocated.
 static void gsf__mcmc_correct(gsf__model* model, double least_opacity) {
     for (size_t i = 0; i < model->count; i++) {
         if (model->visits[0][i] == 0) continue;
@@ -10164,14 +10164,14 @@ static size_t gsf__mcmc_growth(size_t count, size_t budget) { // number of splat
     return count / 20 < room ? count / 20 : room;
 }
 
-// Makes `draws` copies of drawn splats. They overwrite the rows from `first` on whose opacity logit is at most `logit`,
-// and continue past the last splat. Drawn splats are not overwritten, even if their correction lowered them to `logit`.
+// Makes `draws` copies of drawn splats. They overwrite the rows from `first` on whose opacity logit is below `logit`,
+// and continue past the last splat. Drawn splats are not overwritten: their correction lowers them to `logit` at most.
 static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t first) {
     const float* logits = model->groups[GSF__OPACITY].value;
     const size_t count = model->count, drawn = gsf__mcmc_draw(model, rule, logit, draws, first);
     gsf__mcmc_correct(model, rule->prune_opacity);
     for (size_t k = 0, to = first; k < drawn; to++)
-        if (to >= count || (logits[to] <= logit && model->visits[0][to] == 0))
+        if (to >= count || logits[to] < logit)
             gsf__model_copy_row(model, model->visits[1][k++], to);
     return drawn;
 }
@@ -10181,7 +10181,7 @@ static void gsf__mcmc_densify(gsf__model* model, const gsf__densify_rule* rule) 
     const float logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
     const size_t count = model->count;
     size_t dead = 0;
-    for (size_t i = 0; i < count; i++) dead += model->groups[GSF__OPACITY].value[i] <= logit;
+    for (size_t i = 0; i < count; i++) dead += model->groups[GSF__OPACITY].value[i] < logit;
     (void)gsf__mcmc_copy(model, rule, logit, dead, 0);
     model->count += gsf__mcmc_copy(model, rule, logit, gsf__mcmc_growth(count, rule->max_splats), count);
     gsf__densify_clear(model);

@@ -584,6 +584,27 @@ static void test_mcmc_densify(gsf_context* ctx) {
     gsf__model_destroy(ctx, &model);
 }
 
+// A splat that is shared among so many copies that they are clamped to prune_opacity is not dead: the next densification
+// relocates none of them.
+static void test_mcmc_clamped(gsf_context* ctx) {
+    enum { COUNT = 60 };
+    gsf__model model = make_model(ctx, COUNT, 0);
+    float* logits = model.groups[GSF__OPACITY].value;
+    for (size_t i = 0; i < COUNT; i++) logits[i] = i == 7 ? -2.0f : -9.0f;
+    gsf__densify_rule rule;
+    memset(&rule, 0, sizeof rule);
+    rule.prune_opacity = 0.005;
+    rule.max_splats = COUNT;
+    rule.seed = 8;
+    gsf__mcmc_densify(&model, &rule);
+    CHECK(model.count == COUNT && model.next_id == COUNT + COUNT - 1);
+    for (size_t i = 0; i < COUNT; i++) CHECK_NEAR(1.0 / (1.0 + exp(-(double)logits[i])), 0.005, 1e-8);
+    logits[7] = 2.0f; // now there is a splat that dead ones would be relocated to
+    gsf__mcmc_densify(&model, &rule);
+    CHECK(model.count == COUNT && model.next_id == COUNT + COUNT - 1 && logits[7] == 2.0f);
+    gsf__model_destroy(ctx, &model);
+}
+
 // The covariance of the noise is that of the splat times the rate; faint splats get the full noise, opaque ones none.
 static void test_mcmc_noise(gsf_context* ctx) {
     enum { COUNT = 4000 };
@@ -1697,6 +1718,7 @@ int main(void) {
     test_cap(&ctx);
     test_mcmc_share();
     test_mcmc_densify(&ctx);
+    test_mcmc_clamped(&ctx);
     test_mcmc_noise(&ctx);
     test_mcmc_render(&ctx);
     test_learns(&ctx, &s);
