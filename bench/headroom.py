@@ -39,15 +39,18 @@ import argparse
 import collections
 import concurrent.futures
 import csv
+import functools
 import hashlib
 import json
 import math
 import os
 import shlex
 import shutil
-import subprocess
 import sys
 import threading
+
+import runs
+from runs import mean_and_error, read_json, write_json
 
 ROWS = [
     ("none", "--restorer none"),
@@ -76,46 +79,7 @@ PATHS_TEXT = ("Held-out views and the path: distance to the nearest frame, in di
               "nearest in direction, in degrees:")
 
 Scene = collections.namedtuple("Scene", "name folder out made")
-
-
-def run(command):
-    """Standard output and CPU seconds."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               env=dict(os.environ, OMP_NUM_THREADS="1"))
-    with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        errors = pool.submit(process.stderr.read)
-        text = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        errors = errors.result()
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if status != 0:
-        sys.exit("failed (%d): %s\n  %s" % (process.returncode, " ".join(command),
-                                            (errors.strip().splitlines() or ["no message"])[-1]))
-    return text, usage.ru_utime + usage.ru_stime
-
-
-def read_json(path):
-    try:
-        with open(path) as file:
-            return json.load(file)
-    except OSError:
-        return None
-
-
-def write_json(path, value):
-    with open(path + ".part", "w") as file:
-        json.dump(value, file)
-    os.rename(file.name, path)
-
-
-def mean_and_error(values):
-    n = len(values)
-    if n == 0:
-        return float("nan"), float("nan")
-    mean = sum(values) / n
-    if n < 2:
-        return mean, float("nan")
-    return mean, math.sqrt(sum((v - mean) ** 2 for v in values) / (n - 1) / n)
+run = functools.partial(runs.run, OMP_NUM_THREADS="1")
 
 
 def decibels(error):

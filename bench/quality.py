@@ -31,13 +31,13 @@ import argparse
 import concurrent.futures
 import csv
 import json
-import math
 import os
 import shlex
 import shutil
 import struct
-import subprocess
 import sys
+
+from runs import mean_and_error, read_json, run, write_json
 
 DEFAULT_ARMS = [
     ("plain", "--restorer none --regularize off"),
@@ -48,43 +48,6 @@ STARTS = {"tracks": ("--init tracks", "tracks"), "default": ("", "both")}  # opt
 PEER_ARMS = [("OpenSplat", ""),
              ("OpenSplat+", "--densify-from 100 --densify-until {steps} --refine-every 100 --sh-degree-interval 300")]
 FIGURES = ("psnr", "ssim", "psnr_seen", "ssim_seen")
-
-
-def run(command, environment=None):
-    """Returns standard output and CPU seconds."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-    with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        errors = pool.submit(process.stderr.read)
-        text = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        errors = errors.result()
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if status != 0:
-        sys.exit("failed (%d): %s\n  %s" % (process.returncode, " ".join(command),
-                                            (errors.strip().splitlines() or ["no message"])[-1]))
-    return text, usage.ru_utime + usage.ru_stime
-
-
-def read_json(path):
-    try:
-        with open(path) as file:
-            return json.load(file)
-    except OSError:
-        return None
-
-
-def write_json(path, value):
-    with open(path + ".part", "w") as file:
-        json.dump(value, file)
-    os.rename(file.name, path)
-
-
-def mean_and_error(values):
-    n = len(values)
-    mean = sum(values) / n
-    if n < 2:
-        return mean, float("nan")
-    return mean, math.sqrt(sum((v - mean) ** 2 for v in values) / (n - 1) / n)
 
 
 def mean_of(rows, figure):
@@ -157,7 +120,7 @@ def train_peer(options, job, extra, out, ply):
     shutil.rmtree(os.path.join(out, "scene"), ignore_errors=True)
     points = training_scene(options, start, views, os.path.join(out, "scene"))
     command = [options.opensplat, os.path.join(out, "scene"), "-n", str(options.iterations), "-o", ply]
-    _, cpu = run(command + shlex.split(extra.format(steps=options.iterations)), dict(os.environ, OMP_NUM_THREADS="1"))
+    _, cpu = run(command + shlex.split(extra.format(steps=options.iterations)), OMP_NUM_THREADS="1")
     return {"points": points, "cpu_seconds": cpu}
 
 
