@@ -285,9 +285,9 @@ typedef struct gsf_visibility_desc {
     int32_t neighbours;    // for normals, default 12
     int32_t radius_neighbour; // disc radius = distance to this neighbour (at most 3 times the median), default 6
     float radius_scale;    // factor on that radius, default 1.4
-    float tolerance;       // in radii, default 0.7
-    float coverage;        // default 2; smaller values occlude more (tiny: any disc occludes)
-    float min_grazing_cos; // |cos| between ray and normal below which no ray is traced, default 0.02
+    float tolerance;       // in radii, default 0.7; negative = 0: discs at any distance in front of the point count
+    float coverage;        // default 2; smaller values occlude more; negative = 0: any disc occludes
+    float min_grazing_cos; // |cos| between ray and normal below which no ray is traced, default 0.02; negative = 0
     int32_t use_zbuffer;   // project the discs and test depth at each point, even if Embree is compiled in
 } gsf_visibility_desc;
 
@@ -4563,6 +4563,8 @@ static double gsf__vis_seconds(void) { // for the statistics only
     return timespec_get(&t, TIME_UTC) ? (double)t.tv_sec + 1e-9 * (double)t.tv_nsec : 0.0;
 }
 
+#define GSF__VIS_ANY_DISC 1e-30f // coverage below that of any disc that a ray hits, but not zero: no disc hides nothing
+
 static gsf_visibility_desc gsf__visibility_desc_defaults(const gsf_visibility_desc* desc) {
     gsf_visibility_desc d;
     memset(&d, 0, sizeof d);
@@ -4570,9 +4572,9 @@ static gsf_visibility_desc gsf__visibility_desc_defaults(const gsf_visibility_de
     if (d.neighbours == 0) d.neighbours = 12;
     if (d.radius_neighbour == 0) d.radius_neighbour = 6;
     if (d.radius_scale == 0.0f) d.radius_scale = 1.4f;
-    if (d.tolerance == 0.0f) d.tolerance = 0.7f;
-    if (d.coverage == 0.0f) d.coverage = 2.0f;
-    if (d.min_grazing_cos == 0.0f) d.min_grazing_cos = 0.02f;
+    d.tolerance = gsf__or_zero(d.tolerance, 0.7f);
+    d.coverage = d.coverage < 0.0f ? GSF__VIS_ANY_DISC : gsf__or_zero(d.coverage, 2.0f);
+    d.min_grazing_cos = gsf__or_zero(d.min_grazing_cos, 0.02f);
     return d;
 }
 
@@ -4584,8 +4586,8 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
         d->radius_neighbour > GSF__KNN_MAX)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: neighbours %d, radius_neighbour %d (at most %d)",
                         (int)d->neighbours, (int)d->radius_neighbour, (int)GSF__KNN_MAX);
-    if (!(d->radius_scale > 0.0f && d->radius_scale < 1e6f && d->tolerance > 0.0f && d->tolerance < 1e6f &&
-          d->coverage > 0.0f && d->min_grazing_cos > 0.0f && d->min_grazing_cos < 1.0f))
+    if (!(d->radius_scale > 0.0f && d->radius_scale < 1e6f && d->tolerance >= 0.0f && d->tolerance < 1e6f &&
+          d->coverage > 0.0f && d->min_grazing_cos >= 0.0f && d->min_grazing_cos < 1.0f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "visible points: radius_scale %g, tolerance %g, coverage %g, min_grazing_cos %g",
                         (double)d->radius_scale, (double)d->tolerance, (double)d->coverage, (double)d->min_grazing_cos);
@@ -5404,6 +5406,10 @@ static void gsf__embree_filter(const struct RTCFilterFunctionNArguments* args) {
     gsf__embree_query* q = (gsf__embree_query*)(void*)args->context;
     const struct RTCHit* hit = (const struct RTCHit*)(const void*)args->hit; // single rays only: N is 1
     if (args->valid[0] == 0) return;
+    if (hit->primID == q->point) { // with tolerance 0, the ray may reach the point's own disc
+        args->valid[0] = 0;
+        return;
+    }
     const double cover = gsf__vis_cover(q->job, q->eye, &q->sight, q->point, hit->primID);
     q->cover += cover;
     if (q->cover < q->limit) args->valid[0] = 0;
@@ -5416,8 +5422,8 @@ static void gsf__embree_ray(gsf__embree_query* q, size_t i) {
     q->point = i;
     q->cover = 0.0;
     q->limit = (double)gsf__vis_limit(job, i);
-    // The ray starts at the eye and ends short of the point, so that it never hits the point's own disc. (Starting at
-    // the point would depend on Embree's version: some report a disc that contains the origin, others do not.)
+    // The ray starts at the eye and ends `tolerance` short of the point. (Starting at the point would depend on Embree's
+    // version: some report a disc that contains the origin, others do not.)
     const double reach = q->sight.distance - (double)(job->desc->tolerance * job->discs.spheres[4 * i + 3]);
     if (reach > 0.0) {
         struct RTCRay ray;
