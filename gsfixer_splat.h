@@ -80,7 +80,8 @@
    MEMORY      Everything comes from the context's allocator, except scratch memory of Embree and stb. A trainer takes about
                1 kB per splat of SH degree 3 and, per pixel of a photo, 3 bytes (u8) or 12 (f32), and 4 more with a weight.
                The repair loop holds no other copy: while a round begins the restorer is shown photos as floats (with the
-               splats' render and depth 28 bytes per pixel); `warp` keeps 32 bytes per pixel until the round ends.
+               splats' render and depth 28 bytes per pixel); `warp` keeps 20 bytes per pixel until the round ends (29 of
+               photos that are not 8-bit or have masks). A restored frame takes 7 bytes per pixel while it is trained on.
                Buffers grow and are kept, so that rendering and training allocate only when the splats become more.
    THREADS     An object serves one thread at a time, together with the context of the call. Work inside a call is split
                through the parallel hook; results are bit-identical for any number of workers. To render while another
@@ -11278,16 +11279,18 @@ typedef struct gsf__warp_reference {
     gsf_camera camera;
     double center[3];
     double focus[3]; // world point at the image centre, at the mean inverse depth
-    float* color;    // (H,W,3)
-    float* carried;  // (H,W,3): colour - render, or the colour itself
+    // Per reference, as small as it can be without changing a value: references of all views are kept during a round.
+    uint8_t* bytes;  // (H,W,3): 255 times the colour, or NULL
+    float* color;    // (H,W,3), only if `bytes` could not represent it exactly
+    float* residual; // (H,W,3): colour - render; NULL without renders
     float* depth;    // (H,W), 0 = no surface
-    float* score;    // (H,W), 0..1
+    uint8_t* score;  // (H,W), percent
 } gsf__warp_reference;
 
 typedef struct gsf__warp {
     gsf__warp_reference* references;
     int32_t count;
-    int carries_residual;
+    int has_residuals;
 } gsf__warp;
 
 #define GSF__WARP_DEPTH_TOLERANCE 0.04f // relative depth difference up to which points lie on the same surface
@@ -11307,14 +11310,21 @@ static gsf_result gsf__warp_query(void* user, gsf_context* ctx, int32_t frame_co
     out->needs_depth = 1;
     out->explains = 1;
     const int32_t count = warp->count > 0 ? warp->count : 3, drawn = count < GSF__WARP_NEAREST ? count : GSF__WARP_NEAREST;
-    out->bytes = (double)width * height * (8 * count + drawn) * sizeof(float);
+    out->bytes = (double)width * height * (20.0 * count + 4.0 * drawn);
     out->flops = (double)width * height * frame_count * 200.0 * drawn;
     return GSF_OK;
 }
 
 static void gsf__warp_end(void* user, gsf_context* ctx) {
     gsf__warp* warp = (gsf__warp*)user;
-    for (int32_t i = 0; i < warp->count; i++) gsf_free(ctx, warp->references[i].color);
+    for (int32_t i = 0; i < warp->count; i++) {
+        gsf__warp_reference* ref = warp->references + i;
+        gsf_free(ctx, ref->bytes);
+        gsf_free(ctx, ref->color);
+        gsf_free(ctx, ref->residual);
+        gsf_free(ctx, ref->depth);
+        gsf_free(ctx, ref->score);
+    }
     gsf_free(ctx, warp->references);
     warp->references = NULL;
     warp->count = 0;
@@ -11327,18 +11337,48 @@ static void gsf__unproject(const gsf_camera* camera, double x, double y, double 
     for (int c = 0; c < 3; c++) out[c] = m[4 * c] * p[0] + m[4 * c + 1] * p[1] + m[4 * c + 2] * p[2];
 }
 
-// Bilinear sample of one channel at a continuous position (pixel centres at .5); 0 outside the image.
-static float gsf__sample(const float* plane, int32_t width, int32_t height, int channels, int channel, double x, double y) {
+// Bilinear interpolation at a continuous position: the four pixels around it (pixel centres at .5) and its offset.
+typedef struct gsf__taps {
+    size_t at[4]; // top left and right, bottom left and right
+    float x, y;
+} gsf__taps;
+
+static int gsf__find_taps(const gsf_camera* image, double x, double y, gsf__taps* out) { // returns 0 outside the image
+    const int32_t width = image->width, height = image->height;
     const double fx = x - 0.5, fy = y - 0.5;
-    if (!(fx > -0.5 && fy > -0.5 && fx < width - 0.5 && fy < height - 0.5)) return 0.0f;
+    if (!(fx > -0.5 && fy > -0.5 && fx < width - 0.5 && fy < height - 0.5)) return 0;
     const int32_t x0 = fx < 0.0 ? 0 : (int32_t)fx, y0 = fy < 0.0 ? 0 : (int32_t)fy;
     const int32_t x1 = x0 + 1 < width ? x0 + 1 : x0, y1 = y0 + 1 < height ? y0 + 1 : y0;
-    const float ax = fx < 0.0 ? 0.0f : (float)(fx - x0), ay = fy < 0.0 ? 0.0f : (float)(fy - y0);
-    const float* p = plane + channel;
-    const size_t w = (size_t)width, c = (size_t)channels;
-    const float top = p[((size_t)y0 * w + (size_t)x0) * c] * (1.0f - ax) + p[((size_t)y0 * w + (size_t)x1) * c] * ax;
-    const float bottom = p[((size_t)y1 * w + (size_t)x0) * c] * (1.0f - ax) + p[((size_t)y1 * w + (size_t)x1) * c] * ax;
-    return top * (1.0f - ay) + bottom * ay;
+    const size_t top = (size_t)y0 * (size_t)width, bottom = (size_t)y1 * (size_t)width;
+    out->x = fx < 0.0 ? 0.0f : (float)(fx - x0);
+    out->y = fy < 0.0 ? 0.0f : (float)(fy - y0);
+    out->at[0] = top + (size_t)x0;
+    out->at[1] = top + (size_t)x1;
+    out->at[2] = bottom + (size_t)x0;
+    out->at[3] = bottom + (size_t)x1;
+    return 1;
+}
+
+static float gsf__blend_taps(const gsf__taps* taps, const float v[4]) {
+    const float top = v[0] * (1.0f - taps->x) + v[1] * taps->x, bottom = v[2] * (1.0f - taps->x) + v[3] * taps->x;
+    return top * (1.0f - taps->y) + bottom * taps->y;
+}
+
+static float gsf__sample_floats(const float* plane, size_t channels, size_t channel, const gsf__taps* taps) {
+    float v[4];
+    for (int k = 0; k < 4; k++) v[k] = plane[taps->at[k] * channels + channel];
+    return gsf__blend_taps(taps, v);
+}
+
+static float gsf__sample_bytes(const uint8_t* plane, size_t channels, size_t channel, double one, const gsf__taps* taps) {
+    float v[4];
+    for (int k = 0; k < 4; k++) v[k] = (float)(plane[taps->at[k] * channels + channel] / one);
+    return gsf__blend_taps(taps, v);
+}
+
+static float gsf__sample_color(const gsf__warp_reference* ref, size_t channel, const gsf__taps* taps) {
+    return ref->bytes ? gsf__sample_bytes(ref->bytes, 3, channel, 255.0, taps)
+                      : gsf__sample_floats(ref->color, 3, channel, taps);
 }
 
 // Depth of the pixel that contains a continuous position; 0 outside the image.
@@ -11358,7 +11398,7 @@ static void gsf__warp_score_row(void* arg, size_t row, int32_t worker) {
     const gsf__warp_reference* ref = job->warp->references + job->reference;
     for (int32_t x = 0; x < ref->camera.width; x++) {
         const size_t at = row * (size_t)ref->camera.width + (size_t)x;
-        ref->score[at] = 0.0f;
+        ref->score[at] = 0;
         if (!(ref->depth[at] > 0.0f)) continue;
         double point[3];
         gsf__unproject(&ref->camera, x + 0.5, (double)row + 0.5, (double)ref->depth[at], point);
@@ -11373,7 +11413,7 @@ static void gsf__warp_score_row(void* arg, size_t row, int32_t worker) {
             support += fabsf(off) <= GSF__WARP_DEPTH_TOLERANCE;
             refuted += off < -2.0f * GSF__WARP_DEPTH_TOLERANCE;
         }
-        ref->score[at] = support > refuted ? 1.0f : refuted > support ? 0.1f : 0.5f;
+        ref->score[at] = (uint8_t)(support > refuted ? 100 : refuted > support ? 10 : 50);
     }
 }
 
@@ -11389,47 +11429,62 @@ static void gsf__warp_find_focus(gsf__warp_reference* ref) { // middle pixel at 
                    ref->focus);
 }
 
+// Copies a reference. What it allocates is freed by gsf__warp_end, also after an error.
+static gsf_result gsf__warp_take(gsf_context* ctx, const gsf_reference* from, int has_residuals, gsf__warp_reference* ref) {
+    const gsf_camera* camera = &from->camera;
+    GSF__TRY(gsf_check_camera(ctx, camera));
+    const int32_t width = camera->width, height = camera->height;
+    const size_t pixels = (size_t)width * (size_t)height;
+    ref->camera = *camera;
+    gsf_get_camera_center(camera, ref->center);
+    ref->bytes = (uint8_t*)gsf_alloc(ctx, pixels, 3);
+    ref->color = (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float));
+    ref->residual = has_residuals ? (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float)) : NULL;
+    ref->depth = (float*)gsf_alloc(ctx, pixels, sizeof(float));
+    ref->score = (uint8_t*)gsf_alloc(ctx, pixels, 1);
+    if (!ref->bytes || !ref->color || (has_residuals && !ref->residual) || !ref->depth || !ref->score)
+        return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_image color = gsf_wrap_image(ref->color, GSF_F32, width, height, 3);
+    const gsf_image bytes = gsf_wrap_image(ref->bytes, GSF_U8, width, height, 3);
+    const gsf_image depth = gsf_wrap_image(ref->depth, GSF_F32, width, height, 1);
+    GSF__TRY(gsf_convert_image(ctx, &from->color, &color));
+    GSF__TRY(gsf_convert_image(ctx, &color, &bytes));
+    GSF__TRY(gsf_convert_image(ctx, &from->depth, &depth));
+    if (has_residuals) {
+        const gsf_image residual = gsf_wrap_image(ref->residual, GSF_F32, width, height, 3);
+        GSF__TRY(gsf_convert_image(ctx, &from->render, &residual));
+        for (size_t p = 0; p < 3 * pixels; p++) ref->residual[p] = ref->color[p] - ref->residual[p];
+    }
+    int exact = 1;
+    for (size_t p = 0; p < 3 * pixels && exact; p++) exact = (float)(ref->bytes[p] / 255.0) == ref->color[p];
+    if (exact) {
+        gsf_free(ctx, ref->color);
+        ref->color = NULL;
+    } else {
+        gsf_free(ctx, ref->bytes);
+        ref->bytes = NULL;
+    }
+    gsf__warp_find_focus(ref);
+    return GSF_OK;
+}
+
 static gsf_result gsf__warp_begin(void* user, gsf_context* ctx, const gsf_reference* references, int32_t count) {
     gsf__warp* warp = (gsf__warp*)user;
     if (count < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: no references");
     if (warp->references) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: in use by a run that has not ended");
+    for (int32_t i = 0; i < count; i++)
+        if (!references[i].color.data || !references[i].depth.data)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: reference %d needs colour and depth", (int)i);
     warp->references = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, (size_t)count, sizeof(gsf__warp_reference));
     if (!warp->references) return GSF_ERROR_OUT_OF_MEMORY;
     warp->count = count;
-    warp->carries_residual = 1;
-    for (int32_t i = 0; i < count; i++) warp->carries_residual &= references[i].render.data != NULL;
+    warp->has_residuals = 1;
+    for (int32_t i = 0; i < count; i++) warp->has_residuals &= references[i].render.data != NULL;
     for (int32_t i = 0; i < count; i++) {
-        gsf__warp_reference* ref = warp->references + i;
-        const gsf_camera* camera = &references[i].camera;
-        const size_t pixels = (size_t)camera->width * (size_t)camera->height;
-        gsf_result result = gsf_check_camera(ctx, camera);
-        if (result == GSF_OK && (!references[i].color.data || !references[i].depth.data))
-            result = gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "warp: reference %d needs colour and depth", (int)i);
-        if (result == GSF_OK) {
-            ref->camera = *camera;
-            gsf_get_camera_center(camera, ref->center);
-            ref->color = (float*)gsf_alloc(ctx, pixels, 8 * sizeof(float));
-            if (!ref->color) result = GSF_ERROR_OUT_OF_MEMORY;
-        }
-        if (result == GSF_OK) {
-            ref->carried = ref->color + 3 * pixels;
-            ref->depth = ref->carried + 3 * pixels;
-            ref->score = ref->depth + pixels;
-            gsf_image color = gsf_wrap_image(ref->color, GSF_F32, camera->width, camera->height, 3);
-            gsf_image depth = gsf_wrap_image(ref->depth, GSF_F32, camera->width, camera->height, 1);
-            result = gsf_convert_image(ctx, &references[i].color, &color);
-            if (result == GSF_OK) result = gsf_convert_image(ctx, &references[i].depth, &depth);
-            gsf_image carried = gsf_wrap_image(ref->carried, GSF_F32, camera->width, camera->height, 3);
-            if (result == GSF_OK)
-                result = gsf_convert_image(ctx, warp->carries_residual ? &references[i].render : &color, &carried);
-            for (size_t p = 0; p < 3 * pixels && result == GSF_OK && warp->carries_residual; p++)
-                ref->carried[p] = ref->color[p] - ref->carried[p];
-            if (result == GSF_OK) gsf__warp_find_focus(ref);
-        }
-        if (result != GSF_OK) {
-            gsf__warp_end(user, ctx);
-            return result;
-        }
+        const gsf_result result = gsf__warp_take(ctx, references + i, warp->has_residuals, warp->references + i);
+        if (result == GSF_OK) continue;
+        gsf__warp_end(user, ctx);
+        return result;
     }
     for (int32_t i = 0; i < count; i++) {
         gsf__warp_score_job job;
@@ -11571,8 +11626,8 @@ static int gsf__warp_refutes(const gsf__warp* warp, const int32_t* nearest, int 
 
 typedef struct gsf__warp_candidate {
     const gsf__warp_reference* ref;
-    double u, v; // position in the reference
-    float depth; // camera depth in the frame
+    gsf__taps taps; // in the reference
+    float depth;    // camera depth in the frame
     float weight;
 } gsf__warp_candidate;
 
@@ -11588,12 +11643,13 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
         if (!(inverse > 0.0f)) continue;
         gsf__warp_candidate* at = candidates + count;
         at->ref = warp->references + nearest[k];
-        double point[3], z;
+        double point[3], u, v, z;
         gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
-        if (!gsf_project_point(&at->ref->camera, point, &at->u, &at->v, &z)) continue;
+        if (!gsf_project_point(&at->ref->camera, point, &u, &v, &z)) continue;
+        if (!gsf__find_taps(&at->ref->camera, u, v, &at->taps)) continue;
         const double cosine = gsf__warp_cosine(point, center, at->ref->center);
         const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // the squared angle, to second order
-        const float score = gsf__sample(at->ref->score, at->ref->camera.width, at->ref->camera.height, 1, 0, at->u, at->v);
+        const float score = gsf__sample_bytes(at->ref->score, 1, 0, 100.0, &at->taps);
         if (!(score > 0.0f)) continue;
         at->depth = (float)(1.0 / (double)inverse);
         at->weight = score * gsf__exp(-0.5f * angle2 / (GSF__WARP_ANGLE * GSF__WARP_ANGLE)) + 1e-6f;
@@ -11616,14 +11672,15 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
 
     const int refuted = front > shown * GSF__WARP_BEHIND_MIN && front < shown * GSF__WARP_BEHIND_MAX &&
                         gsf__warp_refutes(warp, nearest, near_count, camera, x, y, (double)shown);
+    const int colors = refuted || !warp->has_residuals;
     float total = 0.0f, sum[3] = {0.0f, 0.0f, 0.0f}, square = 0.0f;
     for (int i = 0; i < count; i++) {
         const gsf__warp_candidate* at = candidates + i;
         if (!(fabsf(at->depth - front) <= GSF__WARP_DEPTH_TOLERANCE * front)) continue;
-        const float* source = refuted ? at->ref->color : at->ref->carried;
         total += at->weight;
-        for (int c = 0; c < 3; c++) {
-            const float value = gsf__sample(source, at->ref->camera.width, at->ref->camera.height, 3, c, at->u, at->v);
+        for (size_t c = 0; c < 3; c++) {
+            const float value = colors ? gsf__sample_color(at->ref, c, &at->taps)
+                                       : gsf__sample_floats(at->ref->residual, 3, c, &at->taps);
             sum[c] += at->weight * value;
             square += at->weight * value * value;
         }
@@ -11632,7 +11689,7 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
     for (int c = 0; c < 3; c++) spread -= sum[c] / total * (sum[c] / total);
     const float agreement = gsf__exp(-fmaxf(spread, 0.0f) / (3.0f * 0.15f * 0.15f));
     for (int c = 0; c < 3; c++)
-        rgb[c] = refuted || !warp->carries_residual ? sum[c] / total : rgb[c] + sum[c] / fmaxf(total, GSF__WARP_TRUST);
+        rgb[c] = colors ? sum[c] / total : rgb[c] + sum[c] / fmaxf(total, GSF__WARP_TRUST);
     return (refuted || total > 1.0f ? 1.0f : total) * agreement;
 }
 
@@ -11663,8 +11720,9 @@ static void gsf__warp_frame(void* arg, size_t frame, int32_t worker) {
                 const double u = (x + 0.5 - camera->cx) / camera->fx * ref->camera.fx + ref->camera.cx;
                 const double v = (y + 0.5 - camera->cy) / camera->fy * ref->camera.fy + ref->camera.cy;
                 weight = u >= 0.0 && v >= 0.0 && u < ref->camera.width && v < ref->camera.height ? 1.0f : 0.0f;
-                for (int c = 0; c < 3 && weight > 0.0f; c++)
-                    rgb[c] = gsf__sample(ref->color, ref->camera.width, ref->camera.height, 3, c, u, v);
+                gsf__taps taps;
+                const int inside = gsf__find_taps(&ref->camera, u, v, &taps);
+                for (size_t c = 0; c < 3 && weight > 0.0f; c++) rgb[c] = inside ? gsf__sample_color(ref, c, &taps) : 0.0f;
             } else {
                 const float shown = window->depth ? gsf__get_pixel(window->depth + frame, x, y, 0) : 0.0f;
                 weight = gsf__warp_pixel(warp, nearest, near_count, camera, center, x, y, inv_z + at, plane, shown, rgb);

@@ -173,6 +173,48 @@ static void test_warp_residual(gsf_context* ctx) {
     gsf_splat_destroy_warp(ctx, &warp);
 }
 
+// 8-bit photos are kept as bytes. One other value per photo, and they are kept as floats: bit-identical frames elsewhere.
+static void test_warp_bytes(gsf_context* ctx) {
+    enum { W = 96, H = 64, N = W * H };
+    static float color[2][3 * N], depth[2][N], gray[3 * N], out_color[2][3 * N], out_confidence[2][N];
+    static uint8_t bytes[3 * N];
+    const gsf_camera cameras[3] = {look(-0.5, 0.0, 0.1, W, H), look(0.5, 0.1, -0.1, W, H), look(0.1, 0.05, 0.0, W, H)};
+    gsf_reference references[2];
+    memset(references, 0, sizeof references);
+    const gsf_image packed = gsf_wrap_image(bytes, GSF_U8, W, H, 3);
+    for (int i = 0; i < 2; i++) {
+        draw_plane(&cameras[i], color[i], depth[i]);
+        references[i].camera = cameras[i];
+        references[i].color = gsf_wrap_image(color[i], GSF_F32, W, H, 3);
+        references[i].depth = gsf_wrap_image(depth[i], GSF_F32, W, H, 1);
+        CHECK_OK(ctx, gsf_convert_image(ctx, &references[i].color, &packed));
+        CHECK_OK(ctx, gsf_convert_image(ctx, &packed, &references[i].color));
+    }
+    gsf_restorer warp;
+    CHECK_OK(ctx, gsf_splat_make_warp(ctx, &warp));
+    for (int32_t known = -1; known < 1; known++) { // between the photos; at the first one
+        for (int floats = 0; floats < 2; floats++) {
+            const float was[2] = {color[0][0], color[1][0]};
+            one_frame frame;
+            one_frame_init(&frame, &cameras[known < 0 ? 2 : known], gray, out_color[floats], out_confidence[floats]);
+            if (known >= 0) frame.window.reference_index = &known;
+            for (int i = 0; i < 2 && floats; i++) color[i][0] += 1e-3f;
+            CHECK_OK(ctx, warp.begin_fn(warp.user, ctx, references, 2));
+            CHECK_OK(ctx, warp.restore_fn(warp.user, ctx, &frame.window));
+            warp.end_fn(warp.user, ctx);
+            for (int i = 0; i < 2; i++) color[i][0] = was[i];
+        }
+        int differ = 0, covered = 0;
+        for (int i = 0; i < N; i++) {
+            differ += memcmp(out_color[0] + 3 * i, out_color[1] + 3 * i, 3 * sizeof(float)) != 0;
+            covered += out_confidence[0][i] > 0.0f;
+        }
+        CHECK(differ <= (known < 0 ? 8 : 1) && covered > N * 9 / 10);
+        if (known == 0) CHECK(memcmp(out_color[0], color[0], sizeof color[0]) == 0 && differ == 1);
+    }
+    gsf_splat_destroy_warp(ctx, &warp);
+}
+
 // A splat in front of the plane that neither photo shows: the frame takes the plane behind it from the photos, with full
 // confidence. A single photo, or a second photo that shows the splat in place, does not change the frame.
 static void test_warp_refutes(gsf_context* ctx) {
@@ -1007,6 +1049,7 @@ int main(void) {
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     test_warp(&ctx);
     test_warp_residual(&ctx);
+    test_warp_bytes(&ctx);
     test_warp_refutes(&ctx);
     test_seen_mask(&ctx);
     test_desc(&ctx);

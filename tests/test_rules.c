@@ -118,10 +118,11 @@ static void test_origin(void) {
 
 enum { SIDE = 8, PIXELS = SIDE * SIDE };
 
-// Two references at the frame's own position show red at depth 1 and green at depth 2, with the given weights. The
+// Two references at the frame's own position show red at depth 1 and green at depth 2, with the given scores. The
 // nearer surface is shown if it has at least 0.35 of the farther one's weight.
-static int warp_shows_near(float near_weight, float far_weight) {
-    static float color[2][3 * PIXELS], depth[2][PIXELS], score[2][PIXELS], inv_z[2 * PIXELS];
+static int warp_shows_near(int near_percent, int far_percent) {
+    static float color[2][3 * PIXELS], depth[2][PIXELS], inv_z[2 * PIXELS];
+    static uint8_t score[2][PIXELS];
     gsf__warp_reference references[2];
     gsf__warp warp;
     gsf_camera camera;
@@ -134,13 +135,13 @@ static int warp_shows_near(float near_weight, float far_weight) {
     camera.cx = camera.cy = SIDE / 2.0;
     for (int k = 0; k < 2; k++) {
         references[k].camera = camera;
-        references[k].color = references[k].carried = color[k];
+        references[k].color = color[k];
         references[k].depth = depth[k];
         references[k].score = score[k];
         for (int i = 0; i < PIXELS; i++) {
             for (int c = 0; c < 3; c++) color[k][3 * i + c] = c == k ? 1.0f : 0.0f;
             depth[k][i] = (float)(k + 1);
-            score[k][i] = k == 0 ? near_weight : far_weight;
+            score[k][i] = (uint8_t)(k == 0 ? near_percent : far_percent);
             inv_z[k * PIXELS + i] = 1.0f / (float)(k + 1);
         }
     }
@@ -157,9 +158,9 @@ static int warp_shows_near(float near_weight, float far_weight) {
 }
 
 static void test_warp_groups(void) {
-    CHECK(warp_shows_near(1.0f, 1.0f) && warp_shows_near(0.36f, 1.0f) && warp_shows_near(0.19f, 0.5f));
-    CHECK(!warp_shows_near(0.34f, 1.0f) && !warp_shows_near(0.16f, 0.5f) && !warp_shows_near(0.01f, 1.0f));
-    CHECK(warp_shows_near(1.0f, 0.1f)); // in front and heavier: the other is hidden
+    CHECK(warp_shows_near(100, 100) && warp_shows_near(36, 100) && warp_shows_near(19, 50));
+    CHECK(!warp_shows_near(34, 100) && !warp_shows_near(16, 50) && !warp_shows_near(1, 100));
+    CHECK(warp_shows_near(100, 10)); // in front and heavier: the other is hidden
 }
 
 // ---- dense points --------------------------------------------------------------
