@@ -11863,7 +11863,7 @@ GSF_API gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, const gsf_splats
 
 // ---- >>fixer -------------------------------------------------------------------
 
-typedef struct gsf__kept_frame { // a restored frame in the form in which it is trained on
+typedef struct gsf__kept_frame { // a restored frame as it is stored until the round ends and in checkpoints
     gsf_camera camera;
     uint8_t* pixels;  // (H,W,3) colour, then (H,W) confidence 0..255
 } gsf__kept_frame;
@@ -11889,7 +11889,7 @@ struct gsf_fixer {
     int32_t* reference_index;
     int references_open;
     gsf_image *rendered, *depth, *alpha, *restored, *confidence; // frames of one window
-    gsf__kept_frames active, pending; // frames in training; frames of this round so far
+    gsf__kept_frames pending;       // frames of this round so far; those in training are trainer->restored
     gsf_restorer_info limits;
 };
 
@@ -11920,7 +11920,6 @@ GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     gsf__close_references(ctx, f);
     gsf_splat_destroy_warp(ctx, &f->explain);
     gsf__drop_window(ctx, f);
-    gsf__drop_frames(ctx, &f->active);
     gsf__drop_frames(ctx, &f->pending);
     gsf_free(ctx, f->cameras);
     gsf_free(ctx, f->path);
@@ -12384,12 +12383,11 @@ static gsf_result gsf__restore_window(gsf_context* ctx, gsf_fixer* f, gsf_fix_st
 
 static gsf_result gsf__finish_round(gsf_context* ctx, gsf_fixer* f) {
     gsf__photo_set photos;
+    gsf__close_references(ctx, f);
+    gsf__drop_window(ctx, f);
     GSF__TRY(gsf__frames_to_photos(ctx, f, &f->pending, &photos));
     gsf__restored_take(ctx, f->trainer, &photos);
-    gsf__close_references(ctx, f);
-    gsf__drop_frames(ctx, &f->active);
-    f->active = f->pending;
-    memset(&f->pending, 0, sizeof f->pending);
+    gsf__drop_frames(ctx, &f->pending);
     f->restoring = 0;
     f->round++;
     return GSF_OK;
@@ -12418,7 +12416,7 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
         stats->stage = GSF_FIX_DONE;
     } else {
         stats->stage = GSF_FIX_TRAIN;
-        stats->lambda = f->active.count ? gsf__restored_weight(f) : 0.0f;
+        stats->lambda = f->trainer->restored.count ? gsf__restored_weight(f) : 0.0f;
         gsf_splat_set_restored_weight(f->trainer, stats->lambda);
         GSF__TRY(gsf_splat_step_trainer(ctx, f->trainer, &stats->train));
     }
@@ -12428,35 +12426,64 @@ GSF_API gsf_result gsf_splat_step_fixer(gsf_context* ctx, gsf_fixer* f, gsf_fix_
 
 /* A checkpoint holds the trainer's chunks and, little-endian:
        "FIXR"           7 x i32: version, iteration (of the trainer), round, restoring, window, windows, skipped
-       "FIXA", "FIXP"   active and pending frames: u64 count, then per frame 20 x f64 (w2c, fx, fy, cx, cy), 2 x i32
-                        (width, height), H*W*3 bytes of colour, H*W bytes of confidence */
+       "FIXA", "FIXP"   frames in training and those of the current round: u64 count, then per frame 20 x f64 (w2c, fx,
+                        fy, cx, cy), 2 x i32 (width, height), H*W*3 bytes of colour, H*W bytes of confidence */
 enum { GSF__FRAME_HEAD = 20 * 8 + 2 * 4 };
 
-static void gsf__save_frames(gsf_context* ctx, gsf_buffer* chunks, const char* tag, const gsf__kept_frames* list) {
-    char head[GSF__FRAME_HEAD];
+static size_t gsf__open_frames(gsf_context* ctx, gsf_buffer* chunks, const char* tag, size_t count) {
+    char head[8];
     const size_t opened = gsf__open_chunk(ctx, chunks, tag); // written in place: frames make up most of a checkpoint
-    gsf__store_le(head, list->count, 8);
-    gsf_append_bytes(ctx, chunks, head, 8);
-    for (size_t i = 0; i < list->count; i++) {
-        const gsf_camera* camera = &list->frames[i].camera;
-        double numbers[20];
-        memcpy(numbers, camera->w2c, sizeof camera->w2c);
-        numbers[16] = camera->fx;
-        numbers[17] = camera->fy;
-        numbers[18] = camera->cx;
-        numbers[19] = camera->cy;
-        for (int k = 0; k < 20; k++) {
-            uint64_t bits;
-            memcpy(&bits, numbers + k, sizeof bits);
-            gsf__store_le(head + 8 * k, bits, 8);
-        }
-        gsf__store_le(head + 160, (uint32_t)camera->width, 4);
-        gsf__store_le(head + 164, (uint32_t)camera->height, 4);
-        gsf_append_bytes(ctx, chunks, head, sizeof head);
-        gsf_append_bytes(ctx, chunks, (const char*)list->frames[i].pixels,
-                         4 * (size_t)camera->width * (size_t)camera->height);
+    gsf__store_le(head, count, 8);
+    gsf_append_bytes(ctx, chunks, head, sizeof head);
+    return opened;
+}
+
+static void gsf__save_frame(gsf_context* ctx, gsf_buffer* chunks, const gsf_camera* camera, const uint8_t* pixels) {
+    char head[GSF__FRAME_HEAD];
+    double numbers[20];
+    memcpy(numbers, camera->w2c, sizeof camera->w2c);
+    numbers[16] = camera->fx;
+    numbers[17] = camera->fy;
+    numbers[18] = camera->cx;
+    numbers[19] = camera->cy;
+    for (int k = 0; k < 20; k++) {
+        uint64_t bits;
+        memcpy(&bits, numbers + k, sizeof bits);
+        gsf__store_le(head + 8 * k, bits, 8);
     }
+    gsf__store_le(head + 160, (uint32_t)camera->width, 4);
+    gsf__store_le(head + 164, (uint32_t)camera->height, 4);
+    gsf_append_bytes(ctx, chunks, head, sizeof head);
+    gsf_append_bytes(ctx, chunks, (const char*)pixels, 4 * (size_t)camera->width * (size_t)camera->height);
+}
+
+static void gsf__save_pending(gsf_context* ctx, gsf_buffer* chunks, const gsf__kept_frames* list) {
+    const size_t opened = gsf__open_frames(ctx, chunks, "FIXP", list->count);
+    for (size_t i = 0; i < list->count; i++) gsf__save_frame(ctx, chunks, &list->frames[i].camera, list->frames[i].pixels);
     gsf__close_chunk(ctx, chunks, opened);
+}
+
+// The frames in training were kept as bytes before, so that they can be converted back without loss.
+static void gsf__save_restored(gsf_context* ctx, gsf_buffer* chunks, const gsf__photo_set* set) {
+    uint8_t* pixels = (uint8_t*)gsf_alloc(ctx, (size_t)set->max_width * (size_t)set->max_height + 1, 4);
+    const size_t opened = gsf__open_frames(ctx, chunks, "FIXA", set->count);
+    for (size_t i = 0; i < set->count && pixels; i++) {
+        const gsf__photo* photo = set->photos + i;
+        const int32_t width = photo->camera.width, height = photo->camera.height;
+        const size_t count = (size_t)width * (size_t)height;
+        const gsf_image color = gsf_wrap_image(photo->pixels, photo->target.u8 ? GSF_U8 : GSF_F32, width, height, 3);
+        const gsf_image weight = gsf_wrap_image(photo->weight, GSF_F32, width, height, 1);
+        const gsf_image bytes = gsf_wrap_image(pixels, GSF_U8, width, height, 3);
+        const gsf_image confidence = gsf_wrap_image(pixels + 3 * count, GSF_U8, width, height, 1);
+        memset(confidence.data, 255, count);
+        if (gsf_convert_image(ctx, &color, &bytes) != GSF_OK ||
+            (photo->weight && gsf_convert_image(ctx, &weight, &confidence) != GSF_OK))
+            chunks->failed = 1;
+        gsf__save_frame(ctx, chunks, &photo->camera, pixels);
+    }
+    if (!pixels) chunks->failed = 1;
+    gsf__close_chunk(ctx, chunks, opened);
+    gsf_free(ctx, pixels);
 }
 
 static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const void* data, size_t size, const char* tag,
@@ -12518,8 +12545,8 @@ GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* f, gsf_bu
     char body[28];
     for (int k = 0; k < 7; k++) gsf__store_le(body + 4 * k, (uint32_t)numbers[k], 4);
     gsf_append_chunk(ctx, chunks, "FIXR", body, sizeof body);
-    gsf__save_frames(ctx, chunks, "FIXA", &f->active);
-    gsf__save_frames(ctx, chunks, "FIXP", &f->pending);
+    gsf__save_restored(ctx, chunks, &f->trainer->restored);
+    gsf__save_pending(ctx, chunks, &f->pending);
 }
 
 GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const char* name, const void* data,
@@ -12541,20 +12568,19 @@ GSF_API gsf_result gsf_splat_parse_fixer(gsf_context* ctx, gsf_fixer* f, const c
     GSF__TRY(gsf__load_frames(ctx, name, data, size, "FIXA", &active));
     gsf__photo_set photos;
     memset(&photos, 0, sizeof photos);
-    gsf_result result = gsf__load_frames(ctx, name, data, size, "FIXP", &pending);
-    if (result == GSF_OK) result = gsf__frames_to_photos(ctx, f, &active, &photos);
+    gsf_result result = gsf__frames_to_photos(ctx, f, &active, &photos);
+    gsf__drop_frames(ctx, &active);
+    memset(&pending, 0, sizeof pending);
+    if (result == GSF_OK) result = gsf__load_frames(ctx, name, data, size, "FIXP", &pending);
     if (result == GSF_OK) result = gsf_splat_parse_trainer(ctx, f->trainer, name, data, size);
     if (result != GSF_OK) { // the fixer is unchanged
         gsf__photo_set_destroy(ctx, &photos);
-        gsf__drop_frames(ctx, &active);
         gsf__drop_frames(ctx, &pending);
         return result;
     }
     gsf__restored_take(ctx, f->trainer, &photos);
     gsf__close_references(ctx, f);
-    gsf__drop_frames(ctx, &f->active);
     gsf__drop_frames(ctx, &f->pending);
-    f->active = active;
     f->pending = pending;
     f->round = numbers[2];
     f->restoring = numbers[3] != 0;
