@@ -48,8 +48,9 @@
                - all frames have the first camera's intrinsics; corrected: a frame at a photo's pose has that photo's
                One quirk is corrected in both: exactly upside-down views are rotated by half a turn, where the release
                mirrors the world.
-               Functions of the release that these paths do not use (other splines and alignments) are internal. They are
-               next to the code that they share, and tests/golden_traj.c checks them against data of the release.
+               Functions marked GSF__GOLDEN are not part of these paths (other splines and alignments of the release, and
+               steps of the paths one by one). They are next to the code that they share, and tests/golden_traj.c checks
+               them, and with them that code, against data of the release.
    ERRORS      GSF_ERROR_NUMERIC for NaN and infinity anywhere in the input, GSF_ERROR_DEGENERATE if the geometry does not
                determine a result (one view, parallel axes, coincident cameras, a view along its up vector),
                GSF_ERROR_INVALID_ARGUMENT otherwise. The rotation of every returned pose is orthonormal to 1e-12. On an
@@ -57,7 +58,7 @@
    MEMORY      Allocates nothing. `scratch` belongs to the caller: aligned for double, layout.scratch_bytes long, contents
                undefined before and after the call. Inputs and outputs must not overlap unless stated.
    THREADS     Pure functions; the context is used for error messages only.
-   SECTIONS    >>vectors >>order statistics >>eigen >>intrinsics >>poses >>rotations >>views >>normalisation >>splines
+   SECTIONS    >>vectors >>order statistics >>eigen >>poses >>rotations >>views >>normalisation >>splines
                >>ellipse >>windows >>legs >>schedule >>paths
    SOURCES     GSFixer (its released code: datasets/normalize.py, outpaint/sample_utils.py, sparse.py, base.py),
                multinerf's camera_utils (ellipse, focus point), de Boor (B-splines), Shoemake 1985 (slerp)
@@ -167,6 +168,8 @@ GSF_API GSF_NODISCARD gsf_result gsf_traj_sample_path(gsf_context* ctx, const gs
 #include "gsfixer.h" // again, for its internals, in case it was first included without an implementation macro
 
 GSF__BEGIN_IMPLEMENTATION
+
+#define GSF__GOLDEN GSF__SHARED // called only by tests, against data of the release: see OFFICIAL above
 
 // ---- >>vectors -----------------------------------------------------------------
 
@@ -367,33 +370,6 @@ static void gsf__traj_fix_axes(const double values[3], double rows[9]) {
     gsf__traj_cross(rows, rows + 3, rows + 6);
 }
 
-// ---- >>intrinsics --------------------------------------------------------------
-
-// Field of view of `pixels` pixels at a focal length in pixels, and back.
-GSF__SHARED double gsf__traj_fov_from_focal(double focal, double pixels) { return 2.0 * atan(pixels / (2.0 * focal)); }
-GSF__SHARED double gsf__traj_focal_from_fov(double fov, double pixels) { return pixels / (2.0 * tan(0.5 * fov)); }
-
-// Projection to clip space (column-major; z in [0, w], w = camera depth), including the principal-point offset. Multiplied
-// by w2c it is the full projection of Inria's 3DGS (near 0.01, far 100). Needs 0 < near_plane < far_plane.
-GSF__SHARED gsf_result gsf__traj_projection(gsf_context* ctx, const gsf_camera* camera, double near_plane,
-                                            double far_plane, double out[16]) {
-    GSF__TRY(gsf_check_camera(ctx, camera));
-    if (!isfinite(near_plane) || !isfinite(far_plane))
-        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "projection: planes %g, %g", near_plane, far_plane);
-    if (!(near_plane > 0.0 && near_plane < far_plane))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "projection: near plane %g, far plane %g", near_plane,
-                        far_plane);
-    memset(out, 0, 16 * sizeof(double));
-    out[0] = 2.0 * camera->fx / camera->width;
-    out[5] = 2.0 * camera->fy / camera->height;
-    out[8] = (2.0 * camera->cx - camera->width) / camera->width;
-    out[9] = (2.0 * camera->cy - camera->height) / camera->height;
-    out[10] = far_plane / (far_plane - near_plane);
-    out[14] = -far_plane * near_plane / (far_plane - near_plane);
-    out[11] = 1.0;
-    return GSF_OK;
-}
-
 // ---- >>poses -------------------------------------------------------------------
 
 // Checks that poses are finite, rigid (to 1e-4) and no reflections; otherwise the error names the pose.
@@ -483,18 +459,6 @@ static void gsf__traj_quat_axes(const double q[4], double pose[16]) {
     pose[15] = 1.0;
 }
 
-// The same with checks, for quaternions of any magnitude.
-GSF__SHARED gsf_result gsf__traj_set_pose_quat(gsf_context* ctx, const double quat[4], double pose[16]) {
-    if (!gsf__traj_finite(quat, 4)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "quaternion: a value is not finite");
-    double most = 0.0, unit[4];
-    for (int i = 0; i < 4; i++)
-        if (fabs(quat[i]) > most) most = fabs(quat[i]);
-    if (!(most > 0.0)) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "quaternion: zero");
-    for (int i = 0; i < 4; i++) unit[i] = quat[i] / most;
-    gsf__traj_quat_axes(unit, pose);
-    return GSF_OK;
-}
-
 // Spherical interpolation of unit quaternions along the shorter arc; t outside [0,1] extrapolates. For rotations half a
 // turn apart, one of the two arcs is chosen.
 static void gsf__traj_slerp(const double a[4], const double b[4], double t, double out[4]) {
@@ -521,6 +485,7 @@ static void gsf__traj_slerp(const double a[4], const double b[4], double t, doub
     for (int i = 0; i < 4; i++) out[i] = q[i] / length;
 }
 
+// Linear interpolation of the position, slerp of the rotation. out may be a or b.
 static void gsf__traj_blend_poses(const double a[16], const double b[16], double t, double out[16]) {
     double qa[4], qb[4], q[4], position[3];
     gsf__traj_pose_quat(a, qa);
@@ -529,16 +494,6 @@ static void gsf__traj_blend_poses(const double a[16], const double b[16], double
     for (int i = 0; i < 3; i++) position[i] = a[12 + i] + (b[12 + i] - a[12 + i]) * t;
     gsf__traj_quat_axes(q, out);
     memcpy(out + 12, position, sizeof position);
-}
-
-// Linear interpolation of the position, slerp of the rotation. out may be a or b.
-GSF__SHARED gsf_result gsf__traj_slerp_pose(gsf_context* ctx, const double a[16], const double b[16], double t,
-                                            double out[16]) {
-    GSF__TRY(gsf__traj_check_poses(ctx, a, 1));
-    GSF__TRY(gsf__traj_check_poses(ctx, b, 1));
-    if (!isfinite(t)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "slerp: t is %g", t);
-    gsf__traj_blend_poses(a, b, t, out);
-    return gsf__traj_check_path(ctx, out, 1);
 }
 
 // ---- >>views -------------------------------------------------------------------
@@ -617,7 +572,7 @@ static gsf_result gsf__traj_average_pose(gsf_context* ctx, const double* poses, 
 }
 
 // Poses relative to their average pose; transform = inverse of that. out may be poses.
-GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* poses, size_t count, int32_t official,
+GSF__GOLDEN gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* poses, size_t count, int32_t official,
                                                 double* out, double transform[16]) {
     double average[16];
     GSF__TRY(gsf__traj_average_pose(ctx, poses, count, official, average));
@@ -637,7 +592,7 @@ GSF__SHARED gsf_result gsf__traj_recenter_poses(gsf_context* ctx, const double* 
 
 // Mean camera position and the largest distance from it. The release's scene_scale is the radius of all cameras, 3DGS's
 // cameras_extent is 1.1 times the radius of the training cameras.
-GSF__SHARED gsf_result gsf__traj_camera_radius(gsf_context* ctx, const double* poses, size_t count, double center[3],
+GSF__GOLDEN gsf_result gsf__traj_camera_radius(gsf_context* ctx, const double* poses, size_t count, double center[3],
                                                double* radius) {
     GSF__TRY(gsf__traj_check_views(ctx, "camera radius", poses, count));
     gsf__traj_mean_column(poses, count, 3, center);
@@ -777,7 +732,7 @@ static gsf__traj_similarity_desc gsf__traj_similarity_desc_defaults(const gsf__t
 
 // T that rotates the mean camera up vector (minus column 1) to world -y, moves the centre to 0 and scales cameras to
 // distance 1 (the release's similarity_from_cameras). Degenerate if up vectors cancel or all cameras are at the centre.
-GSF__SHARED gsf_result gsf__traj_similarity(gsf_context* ctx, const double* poses, size_t count,
+GSF__GOLDEN gsf_result gsf__traj_similarity(gsf_context* ctx, const double* poses, size_t count,
                                             const gsf__traj_similarity_desc* desc, void* scratch, double transform[16]) {
     GSF__TRY(gsf__traj_check_center(ctx, desc));
     GSF__TRY(gsf__traj_check_views(ctx, "similarity", poses, count));
@@ -889,7 +844,7 @@ static size_t gsf__traj_principal_axes_scratch(size_t count) { return gsf__traj_
 // Rigid T that moves the points' median to 0 and their principal axes to x, y, z by descending variance (the release's
 // align_principle_axes). Signs of the eigenvectors: the largest component of rows 0 and 1 is positive, the determinant is
 // +1. points (count,3). Degenerate for coincident and collinear points.
-GSF__SHARED gsf_result gsf__traj_principal_axes(gsf_context* ctx, const double* points, size_t count, void* scratch,
+GSF__GOLDEN gsf_result gsf__traj_principal_axes(gsf_context* ctx, const double* points, size_t count, void* scratch,
                                                 double transform[16]) {
     gsf__traj_cloud cloud;
     gsf__traj_cloud_init(&cloud, points, points ? count : 0, 3);
@@ -924,7 +879,7 @@ static gsf_result gsf__traj_solve_frame(gsf_context* ctx, const double* poses, s
 // Similarity, then principal axes of the points (NULL: of the camera positions; where these lie on a line, the mean up
 // vector determines the third axis). `transform` is the product, as in the release's parser. Points farther from the
 // median than five times the 90th percentile of distances are excluded (official: none).
-GSF__SHARED gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
+GSF__GOLDEN gsf_result gsf__traj_normalize(gsf_context* ctx, const double* poses, size_t count, const double* points,
                                            size_t point_count, const gsf__traj_similarity_desc* desc, void* scratch,
                                            double transform[16]) {
     static const double origin[3] = {0.0, 0.0, 0.0};
@@ -951,14 +906,9 @@ static void gsf__traj_transform_poses(const double transform[16], const double* 
     }
 }
 
-GSF__SHARED void gsf__traj_transform_points(const double transform[16], const double* points, size_t count,
-                                            double* out) {
-    for (size_t n = 0; n < count; n++) gsf__traj_apply(transform, points + 3 * n, out + 3 * n);
-}
-
 // Principal axes of the positions about their mean, y down on average, largest coordinate 1 (the release's
 // transform_poses_pca; the same sign rule). out may be poses.
-GSF__SHARED gsf_result gsf__traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
+GSF__GOLDEN gsf_result gsf__traj_pca_poses(gsf_context* ctx, const double* poses, size_t count, double* out,
                                            double transform[16]) {
     GSF__TRY(gsf__traj_check_views(ctx, "principal axes", poses, count));
     double mean[3], scatter[9], values[3], rows[9], y_axis[3];
@@ -1076,7 +1026,8 @@ static size_t gsf__traj_basis(const gsf__traj_curve* curve, double u, double bas
     return low - k; // index of the first basis function
 }
 
-// Makes the curve through values[i] (stride doubles apart) at sites. Collocation matrices of B-splines are totally
+// Makes the B-spline of `degree` (at most count - 1) through values[i] (stride doubles apart) at sites, with not-a-knot
+// ends (knots as in FITPACK with s = 0 and scipy's make_interp_spline). Collocation matrices of B-splines are totally
 // positive, so elimination within the band needs no pivoting. Returns 0 if sites are not strictly ascending.
 static int gsf__traj_make_curve(gsf__traj_curve* curve, const double* sites, const double* values, size_t stride,
                                 size_t count, size_t dims, int degree, double* work) {
@@ -1125,6 +1076,7 @@ static int gsf__traj_make_curve(gsf__traj_curve* curve, const double* sites, con
     return 1;
 }
 
+// Evaluates the curve at u, clamped to the range of the sites.
 static void gsf__traj_eval_curve(const gsf__traj_curve* curve, double u, double* out) {
     double basis[GSF__TRAJ_DEGREE_MAX + 1];
     const double first_site = curve->knots[0], last_site = curve->knots[curve->count];
@@ -1135,34 +1087,6 @@ static void gsf__traj_eval_curve(const gsf__traj_curve* curve, double u, double*
             sum += basis[j] * curve->coefficients[(first + j) * curve->dims + d];
         out[d] = sum;
     }
-}
-
-static size_t gsf__traj_spline_scratch(size_t count, int32_t degree, size_t dims) {
-    if (degree < 1 || degree > GSF__TRAJ_DEGREE_MAX) return SIZE_MAX;
-    return gsf__traj_size_mul(gsf__traj_curve_doubles(count, degree, dims), sizeof(double));
-}
-
-// Interpolating B-spline of `degree` (1..5, at most count - 1) through values (count,dims) at strictly ascending
-// sites, with not-a-knot ends (knots as in FITPACK with s = 0 and scipy's make_interp_spline). Evaluated at `at`
-// (at_count), clamped to the range of the sites; out (at_count,dims).
-GSF__SHARED gsf_result gsf__traj_spline(gsf_context* ctx, const double* sites, const double* values, size_t count,
-                                        size_t dims, int32_t degree, const double* at, size_t at_count, void* scratch,
-                                        double* out) {
-    if (degree < 1 || degree > GSF__TRAJ_DEGREE_MAX)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline: degree %d is not 1..5", (int)degree);
-    if (count < (size_t)degree + 1)
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline: %zu values for degree %d", count, (int)degree);
-    if (gsf__traj_spline_scratch(count, degree, dims) == SIZE_MAX)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "spline: %zu x %zu values", count, dims);
-    if (!gsf__traj_finite(sites, count) || !gsf__traj_finite(values, count * dims) || !gsf__traj_finite(at, at_count))
-        return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline: a value is not finite");
-    gsf__traj_curve curve;
-    if (!gsf__traj_make_curve(&curve, sites, values, dims, count, dims, (int)degree, (double*)scratch))
-        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "spline: sites do not ascend");
-    for (size_t i = 0; i < at_count; i++) gsf__traj_eval_curve(&curve, at[i], out + i * dims);
-    if (gsf__traj_finite(out, at_count * dims)) return GSF_OK;
-    memset(out, 0, at_count * dims * sizeof(double));
-    return gsf_fail(ctx, GSF_ERROR_NUMERIC, "spline: values are too large to compute with");
 }
 
 typedef struct gsf__traj_spline_desc {
@@ -1194,7 +1118,7 @@ static gsf_result gsf__traj_check_spline(gsf_context* ctx, const gsf__traj_splin
     return GSF_OK;
 }
 
-GSF__SHARED size_t gsf__traj_spline_path_scratch(size_t count, const gsf__traj_spline_desc* desc) {
+GSF__GOLDEN size_t gsf__traj_spline_path_scratch(size_t count, const gsf__traj_spline_desc* desc) {
     const gsf__traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
     if (d.degree < 1 || d.degree > GSF__TRAJ_DEGREE_MAX) return SIZE_MAX;
     const size_t rows = gsf__traj_size_mul(count, 10); // 9 coordinates and the site of each pose
@@ -1204,7 +1128,7 @@ GSF__SHARED size_t gsf__traj_spline_path_scratch(size_t count, const gsf__traj_s
 // Spline through (position, position - arm * forward, position + arm * down) of the poses, by chord length;
 // frames_per_leg * (count - 1) poses, the last one excluded (the release's generate_interpolated_path with smoothness
 // 0; for two poses, with any smoothness). Degenerate if neighbouring poses coincide or directions cancel.
-GSF__SHARED gsf_result gsf__traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
+GSF__GOLDEN gsf_result gsf__traj_spline_path(gsf_context* ctx, const double* poses, size_t count,
                                              const gsf__traj_spline_desc* desc, void* scratch, double* out) {
     const gsf__traj_spline_desc d = gsf__traj_spline_desc_defaults(desc, count);
     GSF__TRY(gsf__traj_check_spline(ctx, &d));
@@ -1283,7 +1207,7 @@ static void gsf__traj_eval_glide(const gsf__traj_curve* curve, const double* pos
 // Positions by a spline over evenly spaced sites (degree 1, 2, 3 for 2, 3, more views), rotations by slerp, then each
 // pose moved by `push` along its forward axis (the release's interpolate_camera_path, which draws push from [0, 0.5)).
 // `frames` poses (>= 1), both ends included.
-GSF__SHARED gsf_result gsf__traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames,
+GSF__GOLDEN gsf_result gsf__traj_slerp_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames,
                                             double push, void* scratch, double* out) {
     GSF__TRY(gsf__traj_check_views(ctx, "slerp path", poses, count));
     if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "slerp path: one view");
@@ -1382,7 +1306,7 @@ static gsf_result gsf__traj_ellipse(gsf_context* ctx, const double* poses, size_
 // Closed loop in the xy plane about the focus point of the poses, which must be normalised. Half axes are 1.2 times the
 // 90th percentile of |position - focus|; views look at the focus; down is the coordinate axis nearest to the mean
 // column 1.
-GSF__SHARED gsf_result gsf__traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
+GSF__GOLDEN gsf_result gsf__traj_ellipse_path(gsf_context* ctx, const double* poses, size_t count,
                                               const gsf_traj_ellipse_desc* desc, void* scratch, double* out) {
     const gsf_traj_ellipse_desc d = gsf__traj_ellipse_desc_defaults(desc);
     double focus[3];
@@ -1422,7 +1346,7 @@ static int64_t gsf__traj_table_start(gsf__traj_table table, int64_t w) {
 
 // The release's table of overlapping windows of `middle` poses over a sequence of `total`: starts and overlaps (count each;
 // NULL: not needed). Fails if the table exceeds the sequence (usually total < middle).
-GSF__SHARED gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
+static gsf_result gsf__traj_official_windows(gsf_context* ctx, int32_t total, int32_t middle, int32_t* starts,
                                                   int32_t* overlaps, int32_t* count) {
     *count = 0;
     if (middle < 1 || total < middle)
@@ -1457,7 +1381,7 @@ static int gsf__traj_blend_axes(const double a[16], const double b[16], double t
 // From pose to pose with linear positions: (count - 1) * (frames_per_leg - 1) + 1 poses, both ends included (the
 // release's interp_traj). official: its spacing u = 0, 1/n .. (n-2)/n of each leg, n = frames_per_leg >= 2, and its
 // interpolation of axes with arm 0.1; zero: even spacing and slerp.
-GSF__SHARED gsf_result gsf__traj_leg_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames_per_leg,
+GSF__GOLDEN gsf_result gsf__traj_leg_path(gsf_context* ctx, const double* poses, size_t count, int32_t frames_per_leg,
                                           int32_t official, double* out) {
     GSF__TRY(gsf__traj_check_views(ctx, "leg path", poses, count));
     if (count < 2) return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "leg path: one view");
