@@ -65,10 +65,12 @@
                         gsf_splat_resolve_few_view_desc. Image terms are multiplied by `scale` and added to d_color
                         after gsf__loss; gsf__depth_smoothness overwrites d_depth, so that a second depth term adds to
                         it afterwards. New image buffers: gsf__trainer_reserve_images, gsf_splat_destroy_trainer. With
-                        lazy_adam, gsf__penalty_chunk must not write gradients of SH
+                        lazy_adam, gsf__penalty_chunk must not write gradients of SH. For `gsfix fix`: `settings` and
+                        --regularize in examples/gsfix_fix.c, `switches` in examples/gsfix_report.c
        a camera model   a row of gsf__lens_models in >>colmap, at the index that is COLMAP's model id; if its formula is
                         new, also gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (when it is a
-                        pinhole) and, in >>undistort, gsf__lens_distort. For transforms.json: gsf__transforms_lens_kind
+                        pinhole) and, in >>undistort, gsf__lens_distort and, for constants that it needs,
+                        gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind
        a file format    gsf_splat_type, a reader and a writer in >>formats
        a restorer       outside this file: fill in a gsf_restorer (gsfixer.h, "restorer interface"); >>warp is an example,
                         gsf__open_references and gsf__restore_or_skip in >>fixer make the calls
