@@ -886,7 +886,7 @@ GSF__SHARED int32_t gsf__legal_side(double wanted, int32_t multiple, int32_t mos
     return gsf__legal_count((int32_t)(wanted + 0.5), multiple, most, multiple);
 }
 
-// Result for the errno of a failed fopen. A path below a regular file (ENOTDIR) does not exist, either.
+// Result for the errno of a failed fopen. A path below a regular file (ENOTDIR) does not exist either.
 GSF__SHARED gsf_result gsf__open_result(int reason) {
     return reason == ENOENT || reason == ENOTDIR ? GSF_ERROR_NOT_FOUND : GSF_ERROR_IO;
 }
@@ -2972,8 +2972,8 @@ typedef enum gsf__image_kind {
 } gsf__image_kind;
 
 // The format that stb would detect, from as few bytes as tell the formats apart; the source is left after them. A JPEG may
-// begin with any number of fill bytes. Other formats that a host's copy of stb may read (GIF, PSD, PIC, HDR) are not taken
-// for TGA, since only there the second byte is 0 or 1; they are never passed to stb.
+// begin with any number of fill bytes. Other formats that a host's copy of stb may read (GIF, PSD, PIC, HDR) are not
+// mistaken for TGA, since only there the second byte is 0 or 1; they are never passed to stb.
 static gsf__image_kind gsf__image_kind_of(gsf__stb_source* source) {
     const int first = gsf__source_byte(source);
     int second = gsf__source_byte(source);
@@ -3361,7 +3361,7 @@ static void gsf__store_be32(void* out, uint32_t value) {
 static uint32_t gsf__adler32(const unsigned char* data, size_t size) {
     uint32_t a = 1, b = 0;
     for (size_t i = 0; i < size;) {
-        const size_t end = size - i < 5552 ? size : i + 5552; // the most bytes for which b fits 32 bits
+        const size_t end = size - i < 5552 ? size : i + 5552; // as many bytes as b can sum in 32 bits
         for (; i < end; i++) b += a += data[i];
         a %= 65521u;
         b %= 65521u;

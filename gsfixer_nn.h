@@ -224,7 +224,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_n
 typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
     int32_t image_size;           // images are resized to a square of this side, whatever their aspect ratio
     int32_t query_tokens;         // tokens that represent the image in the language model's input
-    int32_t vocabulary, positions; // of the language model: ids; the most tokens of image, prompt and caption together
+    int32_t vocabulary, positions; // of the language model: ids; maximum number of tokens, with the image's
     int32_t bos, eos;             // starts a caption without prompt; ends every caption
     int32_t image_token;          // "image_token_index"; -1: an older folder without it, with a shorter default length
     gsf_nn_bpe tokenizer;
@@ -1249,7 +1249,7 @@ static gsf_result gsf__nn_open_shards(gsf__nn_index* index, gsf_nn_weights* weig
         if (!gsf__nn_is_plain_name(value))
             return gsf_fail(index->ctx, GSF_ERROR_FORMAT, "%s:%u: tensor %s: not a plain file name", index->name,
                             (unsigned)value->offset, gsf__nn_show(value->key).text);
-        size_t k = files->count; // search from the latest, which usually is the one
+        size_t k = files->count; // from the last one, which usually matches
         while (k > 0 && strcmp(index->shards[k - 1], value->string) != 0) k--;
         if (k > 0) continue;
         GSF__TRY(gsf__reserve(index->ctx, (void**)&index->shards, &index->shard_capacity, files->count, files->count + 1,
@@ -2608,7 +2608,7 @@ static void gsf__nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int
 // Groups are split into parts that fit a core's cache, so that each part is read once for both moments and even a few
 // large groups keep all workers busy. The moments of the parts are combined in order (Chan et al. 1979). Groups are
 // processed in batches that fit the shared cache, so that normalising finds them still cached.
-enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values per part; most parts per group
+enum { GSF__NORM_PART = 1 << 16, GSF__NORM_PARTS = 1024 }; // values per part; maximum number of parts per group
 enum { GSF__NORM_BATCH = 1 << 21 };                        // values per batch of groups
 
 static void gsf__norm_group_values(const gsf__norm_job* job, int64_t group, int64_t part, gsf__moments m, float inverse) {
@@ -3204,7 +3204,7 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
 
 #define GSF__LINEAR_FOUR(multiply)                                                                                      \
     const int64_t a_next = GSF__TILE_ROWS * count, b_next = GSF__TILE_COLUMNS * count;                                  \
-    const int64_t share = gsf__ceil_div(ahead_count, count); /* a request a step: the processor drops most of a burst */ \
+    const int64_t share = gsf__ceil_div(ahead_count, count); /* one per step: the processor drops most of a burst */     \
     float* right = sums + next;                                                                                         \
     for (int i = 0; i < 2 * GSF__TILE_SUMS; i += 16) {                                                                  \
         _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);                                                             \
@@ -3680,7 +3680,7 @@ enum {
 };
 
 #ifndef GSF__INT8_HELD // a test lowers it
-#define GSF__INT8_HELD ((int64_t)1 << 24) // most 8-bit activations in memory at a time, 2 bytes each
+#define GSF__INT8_HELD ((int64_t)1 << 24) // maximum number of 8-bit activations in memory, 2 bytes each
 #endif
 
 typedef struct gsf__int8_kernels { // one set per instruction set
@@ -3712,7 +3712,7 @@ typedef struct gsf__int8_job {
     const gsf__nn_quantized* weight;
     int64_t padded;              // `in` rounded up to a multiple of 4
     int64_t depth, block_rows, block_columns, row_blocks;
-    int64_t held, first, rows;   // most rows of x quantised at a time; the current ones
+    int64_t held, first, rows;   // number of rows of x quantised at a time; the current rows
     char* x;
     float* scales;               // of the current rows
     char* workers;
@@ -4428,7 +4428,7 @@ enum {
     GSF__ATT_GROUPS = 8,      // groups of queries whose weights are in memory at a time
     GSF__ATT_TILE = GSF__ATT_GROUP * GSF__ATT_PANEL,
     GSF__ATT_QUERIES = GSF__ATT_GROUP * GSF__ATT_GROUPS,
-    GSF__ATT_RANGE = 1536,    // most queries per chunk: more would hide the packing better, but no longer fit the cache
+    GSF__ATT_RANGE = 1536,    // queries per chunk, at most: more hide the packing better, but do not fit the cache
     GSF__ATT_LEAST_RANGE = 384,
     GSF__ATT_ROWS = 16,       // queries of the scalar kernel that are processed together for each key
     GSF__ATT_AHEAD = 16,      // prefetch distance in rows
@@ -4776,7 +4776,7 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
 // Computes pairs of panels by pairs of groups; `rest` handles the odd ones. `places`: slots per row of p.
 #define GSF__ATT_VALUES(multiply, rest, places)                                                                         \
     const int64_t height = GSF__ATT_GROUP * GSF__ATT_KEYS, width = panels * GSF__ATT_TILE;                              \
-    const int64_t even = panels % 2 ? 0 : groups & ~(int64_t)1; /* odd panels: sizes of no model */                     \
+    const int64_t even = panels % 2 ? 0 : groups & ~(int64_t)1; /* odd numbers occur in no model */                     \
     for (int64_t panel = 0; panel < panels; panel += 2)                                                                 \
         for (int64_t g = 0; g < even; g += 2) {                                                                         \
             const float *a = p + g * height, *b = v + panel * GSF__ATT_KEYS * GSF__ATT_PANEL;                           \

@@ -389,7 +389,7 @@ typedef enum gsf_footprint {
 } gsf_footprint;
 
 typedef enum gsf_gradient {
-    GSF_GRADIENT_TRUE = 0,  // the derivative of what was rendered
+    GSF_GRADIENT_TRUE = 0,  // the exact derivative of the image
     GSF_GRADIENT_OFFICIAL,  // as in Inria's: ignores the 0.99 clamp of alpha; treats the clamped x/z as constant
 } gsf_gradient;
 
@@ -457,8 +457,8 @@ typedef struct gsf_train_view {
                        // An image labelled GSF_COLOR_LINEAR is encoded as sRGB, and its copy is f32
     gsf_image weight;  // 1 channel, u8 (255 = 1) or f32: per-pixel weight of the loss (a photo's mask or alpha, a
                        // restorer's confidence); data NULL = 1; copied. The loss is sum(weight * term) / (3 W H). A
-                       // pixel of weight 0 is one outside the image: it counts as already right, and its colour is
-                       // looked at by nobody, nor is what is rendered there. Colours are not multiplied by alpha
+                       // pixel of weight 0 is treated as outside the image: it has no error, and neither its colour
+                       // nor the render there is read. Colours are not multiplied by alpha
 } gsf_train_view;
 
 // Zero = the value given beside each field, that of Inria's 3DGS; s = iterations / 30000. Negative = zero for all learning
@@ -546,11 +546,11 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_render_trainer(gsf_context* ctx, gsf_
                                                           const gsf_camera* camera, const gsf_render_output* out);
 // A copy of the current splats.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_copy_trained(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out);
-// The current splats, borrowed until the next step or call of restore.
+// The current splats, borrowed until the next step or gsf_splat_parse_trainer.
 GSF_API const gsf_splats* gsf_splat_get_trained(const gsf_trainer* trainer);
-// Saves the complete state as chunks / restores it; training then continues bit-identically. The caller provides the
+// Appends the complete state as chunks / restores it; training then continues bit-identically. The caller provides the
 // same views and desc again (views in any order; a difference causes only a warning); the weight of the restored views
-// is part of the state. restore takes a complete chunk file and checks it; if it is refused, the trainer is unchanged.
+// is part of the state. parse takes a complete chunk file and checks it; if it is refused, the trainer is unchanged.
 GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* trainer, gsf_buffer* chunks);
 GSF_API GSF_NODISCARD gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* trainer, const char* name,
                                                          const void* chunks, size_t size);
@@ -568,10 +568,10 @@ GSF_API void gsf_splat_destroy_warp(gsf_context* ctx, gsf_restorer* restorer);
 // ---- the repair loop -----------------------------------------------------------
 /* Trains, and at certain iterations runs a round: sample a path, render it window by window, have the restorer repair the
    frames, and continue training on photos and repaired frames: L = L_recon + lambda * L_gen. The frames of a new round
-   replace the old ones. A frame shows all that a photo's field of view holds. Where the restorer asks for that
-   (limits.squash), it is rendered at the restorer's own size with fx and fy scaled by themselves, and trained on through
-   that camera; else pixels stay square, the frame may lack or add a margin, and what lies beyond the photo's field of
-   view is not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at
+   replace the old ones. A frame covers a photo's full field of view. If the restorer asks for it
+   (limits.squash), it is rendered at the restorer's own size, with fx and fy scaled independently, and trained on with
+   that camera; otherwise pixels stay square, the frame may lack or add a margin, and pixels beyond the photo's field of
+   view are not trained on. The loop is a state machine that the host steps, so it can show, cancel, checkpoint or stop at
    any time.
        gsf_splat_make_fixer -> gsf_splat_step_fixer until stats.stage is GSF_FIX_DONE -> gsf_splat_copy_trained */
 
@@ -579,13 +579,14 @@ typedef struct gsf_fix_desc {
     uint32_t _start_canary;
     gsf_train_desc train;         // for the whole run; train.iterations is the total number of steps
     gsf_traj_kind trajectory;     // zero: the paper's reference-guided path
-    const double* points;         // (point_count,3) world points for the path's axes and depth; NULL = cameras only.
-    size_t point_count;           //   Borrowed until the fixer is destroyed
-    const gsf_camera* path;       // (path_count) poses of the frames to repair, in place of the trajectory, in every
-                                  // round;
-    size_t path_count;            //   NULL = the trajectory. Spread evenly over windows x window_frames: where the
-                                  // counts differ, poses are left out or repeated. Frames have the first photo's size
-                                  // and field of view. Borrowed likewise
+    const double* points;         // (point_count,3) world points for the path's axes and depth; NULL = cameras only;
+                                  // borrowed until the fixer is destroyed
+    size_t point_count;
+    const gsf_camera* path;       // (path_count) poses of the frames to repair in every round, in place of the
+                                  // trajectory; NULL = the trajectory. Spread evenly over windows x window_frames: where
+                                  // the counts differ, poses are left out or repeated. Frames have the first photo's
+                                  // size and field of view. Borrowed until the fixer is destroyed
+    size_t path_count;
     int32_t rounds;               // repair rounds, default 3; negative = none
     int32_t first_round;          // iteration after which the first round runs; 0 = about 1/3 of the iterations, shortly
                                   // before a densification
@@ -596,8 +597,8 @@ typedef struct gsf_fix_desc {
     float lambda;                 // weight of the restored views at the end of training, default 1; negative = 0
     float skip_psnr;              // skip windows whose render agrees with the warped references by this many dB, over the
                                   // pixels that the references explain; 0 = never skip
-    int32_t max_pixels;           // frames of more are rendered smaller for the restorer, with the same field of view,
-                                  // where it takes smaller ones; 0 = its own size, or the photos'
+    int32_t max_pixels;           // larger frames are rendered smaller, with the same field of view, if the restorer
+                                  // accepts smaller ones; 0 = the restorer's own size, or the photos'
     uint32_t _end_canary;
 } gsf_fix_desc;
 
@@ -620,7 +621,7 @@ typedef struct gsf_fix_stats { // what the last step did
 typedef struct gsf_fixer gsf_fixer;
 
 // Views and splats are copied; the restorer (NULL: plain training) is borrowed until the fixer is destroyed.
-// The path of every round is sampled once: cameras among which none can be flown are GSF_ERROR_DEGENERATE before any
+// The path of every round is sampled once: cameras that admit no path give GSF_ERROR_DEGENERATE before any
 // training.
 GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gsf_fix_desc* desc,
                                                       const gsf_train_view* views, size_t view_count,
@@ -628,7 +629,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_splat_make_fixer(gsf_context* ctx, const gs
                                                       gsf_fixer** out);
 GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* fixer);
 // The loop's desc with defaults filled in, with `train` from gsf_splat_get_trainer_desc (rounds is 0 without a restorer). For
-// display, too.
+// display only, likewise.
 GSF_API gsf_fix_desc gsf_splat_get_fixer_desc(const gsf_fixer* fixer);
 // Runs one training iteration, plans a round, or restores one window. After an error or cancellation the fixer stays
 // usable.
@@ -4566,7 +4567,7 @@ static double gsf__vis_seconds(void) { // for the statistics only
     return timespec_get(&t, TIME_UTC) ? (double)t.tv_sec + 1e-9 * (double)t.tv_nsec : 0.0;
 }
 
-#define GSF__VIS_ANY_DISC 1e-30f // coverage below that of any disc that a ray hits, but not zero: no disc hides nothing
+#define GSF__VIS_ANY_DISC 1e-30f // less than any disc adds, yet positive: a cover of 0 reaches a limit of 0
 
 static gsf_visibility_desc gsf__visibility_desc_defaults(const gsf_visibility_desc* desc) {
     gsf_visibility_desc d;
@@ -10174,7 +10175,7 @@ static size_t gsf__mcmc_growth(size_t count, size_t budget) { // number of splat
 }
 
 // Makes `draws` copies of drawn splats. They overwrite the rows from `first` on whose opacity logit is below `logit`,
-// and continue past the last splat. Drawn splats are not overwritten: their correction lowers them to `logit` at most.
+// and continue past the last splat. Drawn splats are not overwritten: their correction does not go below `logit`.
 static size_t gsf__mcmc_copy(gsf__model* model, const gsf__densify_rule* rule, float logit, size_t draws, size_t first) {
     const float* logits = model->groups[GSF__OPACITY].value;
     const size_t count = model->count, drawn = gsf__mcmc_draw(model, rule, logit, draws, first);
@@ -11281,7 +11282,7 @@ typedef struct gsf__warp_reference {
     gsf_camera camera;
     double center[3];
     double focus[3]; // world point at the image centre, at the mean inverse depth
-    // Per reference, as small as it can be without changing a value: references of all views are kept during a round.
+    // The smallest types that represent the values exactly, since the references of all views are kept during a round.
     uint8_t* bytes;  // (H,W,3): 255 times the colour, or NULL
     float* color;    // (H,W,3), only if `bytes` could not represent it exactly
     float* residual; // (H,W,3): colour - render; NULL without renders
@@ -12465,7 +12466,7 @@ static void gsf__save_pending(gsf_context* ctx, gsf_buffer* chunks, const gsf__k
     gsf__close_chunk(ctx, chunks, opened);
 }
 
-// The frames in training were kept as bytes before, so that they can be converted back without loss.
+// Frames in training were made from bytes, so that converting them back is lossless.
 static void gsf__save_restored(gsf_context* ctx, gsf_buffer* chunks, const gsf__photo_set* set) {
     uint8_t* pixels = (uint8_t*)gsf_alloc(ctx, (size_t)set->max_width * (size_t)set->max_height + 1, 4);
     const size_t opened = gsf__open_frames(ctx, chunks, "FIXA", set->count);

@@ -153,7 +153,7 @@ def restore(config_path, job):
     if os.path.exists(config["log"]):
         with open(config["log"]) as file:
             log = [json.loads(line) for line in file]
-    mark = os.path.join(job, "window")  # the job's folder is a round's: the first window of a round finds none
+    mark = os.path.join(job, "window")  # a job folder serves one round, whose first window finds no mark
     is_next = os.path.exists(mark)
     open(mark, "w").close()
     last = log[-1]["round"] if log else 0
@@ -346,7 +346,7 @@ def fix(options, job, arm):
     metrics = read_json(os.path.join(out, "run", "metrics.json"))
     row = {figure: metrics.get(figure) for figure in FIGURES}
     row.update(psnr_unseen=unseen_psnr(metrics, split["seen"]), splats=metrics["splats"], cpu_seconds=cpu, arguments=arm)
-    if os.path.exists(log_path):  # else all windows were skipped, or no oracle was asked
+    if os.path.exists(log_path):  # else all windows were skipped, or no oracle was used
         with open(log_path) as file:
             log = [json.loads(line) for line in file]
         frames = [frame for window in log for frame in window["path"]]

@@ -959,7 +959,7 @@ static gsf_result model_make_folder(gsf_context* ctx, const char* path) {
     return gsf_fail(ctx, GSF_ERROR_IO, "%s: %s", path, strerror(errno));
 }
 
-typedef struct model_report { // what was written for one part
+typedef struct model_report { // the files written for one part
     const char* part;
     size_t tensors;
     double values, bytes, seconds; // bytes: without the headers

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# examples/demo.sh: the whole job on a scene of its own making; leaves build/demo/report.html.
+# examples/demo.sh: the complete job on a generated scene; leaves build/demo/report.html.
 # Installs what is missing with apt-get (as root or by sudo), builds gsfix and the scene generator, ray-traces a small
-# courtyard into 40 photos with a COLMAP model, repairs the splats that 3 of the photos give, and trains them without repair
-# as well, so that the report shows what the repair alone gives. About two minutes on two cores. GSF_BUILD=folder builds
+# courtyard into 40 photos with a COLMAP model, trains splats on 3 of them with repair, and also without,
+# so that the report shows what the repair alone gains. About two minutes on two cores. GSF_BUILD=folder builds
 # elsewhere than in build/.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -42,7 +42,7 @@ quietly cmake --build "$out/tree" --parallel 2 --target gsfix --target make_scen
 say "ray-tracing a scene"
 "$out/tree/make_scene" "$out/scene" --views 40 --width 320 --height 240
 
-export OMP_WAIT_POLICY=passive # workers that wait do not take the cores from others
+export OMP_WAIT_POLICY=passive # idle workers must not occupy the cores
 say "training on 3 of 40 photos without repair, then with it"
 "$out/tree/gsfix" fix "$out/scene" --out "$out" --restart --views 3 --restorer warp --compare --iterations 900
 

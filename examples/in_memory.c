@@ -1,6 +1,6 @@
 // in_memory.c - cc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -I. examples/in_memory.c -o in_memory -lm
 // For hosts with an asset system of their own: the library opens no file. The model and the photos are given as bytes, a
-// frame that the host has repaired by itself is trained on beside the photos, and the splats come back as bytes.
+// frame that the host has repaired by itself is trained on alongside the photos, and the splats come back as bytes.
 //     in_memory SCENE OUT.ply      SCENE: images/ with sparse/0/*.bin, or a transforms.json
 #include "gsfixer_splat.h"
 
@@ -18,7 +18,7 @@ typedef struct host {
     gsf_trainer* trainer;
 } host;
 
-// Stands for the host's archive. data NULL: there is no such file. Freed with free.
+// Stands in for the host's archive. data NULL: there is no such file. Freed with free.
 static gsf_bytes fetch(const char* folder, const char* name) {
     gsf_bytes bytes = {NULL, 0, name};
     char path[1024];
@@ -91,7 +91,7 @@ static gsf_result repair(host* h) {
     gsf_result result = gsf_make_image(ctx, GSF_F32, between.camera.width, between.camera.height, 3, &between.image);
     out.color = between.image;
     if (result == GSF_OK) result = gsf_splat_render_trainer(ctx, h->trainer, &between.camera, &out);
-    // here the host mends the picture in between.image; this program leaves it as it is
+    // here a host would repair between.image; this program leaves it unchanged
     if (result == GSF_OK) result = gsf_splat_set_restored_views(ctx, h->trainer, &between, 1);
     gsf_splat_set_restored_weight(h->trainer, 0.5f);
     gsf_destroy_image(ctx, &between.image);

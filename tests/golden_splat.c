@@ -2,8 +2,8 @@
 // golden/splat/README.md, and against the double-precision reference (reference_splat.h) on the golden and on random
 // scenes, at every CPU level of the machine; the same bits for any number and order of workers.
 //
-// Comparisons bind where the reference's yes/no decisions (1/255, 0.99, 1e-4, depth order) are clear of their
-// thresholds: other pixels get no incoming gradient, are not compared, and are counted.
+// Only pixels in which the reference's binary decisions (1/255, 0.99, 1e-4, depth order) are clear of their thresholds
+// are compared; the others get no incoming gradient and are counted.
 // Loss, Adam, learning rates and densification are compared with their golden data, too (train_golden.h, which needs the
 // implementation in this file).
 #define GSFIXER_IMPLEMENTATION

@@ -5,8 +5,8 @@
 //     u = fx X/Z + cx - 0.5 (pixel centres are integers), J with x/z clamped at +-1.3 W/(2 fx), 0.3 px^2 of blur,
 //     front to back in order of Z (ties by index), alpha = min(0.99, o G), skipped below 1/255,
 //     stop before a splat that would bring the transmittance below 1e-4.
-// Include gsfixer_splat.h (declarations are enough) before this file. tests/test_reference.c holds it against the
-// golden data and against finite differences.
+// Include gsfixer_splat.h (declarations are enough) before this file. tests/test_reference.c compares it with the
+// golden data and with finite differences.
 //
 //     ref_splats s = ref_splats_from(&splats);                 // parameters widened to double
 //     ref_options o = ref_options_from(&desc);                 // or {0} for the defaults

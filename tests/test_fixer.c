@@ -885,7 +885,7 @@ static void mixed_setup(gsf_context* ctx, repair* r) {
     r->start = r->truth;
 }
 
-// Number of frames in the checkpoint's chunk `tag` (layout: above gsf__save_frames).
+// Number of frames in the checkpoint's chunk `tag` (layout: above gsf__open_frames).
 static uint64_t frames_in(const gsf_buffer* chunks, const char* tag) {
     gsf_chunk chunk;
     uint64_t count = 0;

@@ -80,7 +80,7 @@ static void check_channels(gsf_context* ctx) { // what the `channels` argument d
     gsf_destroy_image(ctx, &image);
 }
 
-// Cut and damaged files: an error or an image, never a crash; nothing of ours stays allocated (the sanitizer tells).
+// Cut and damaged files: an error or an image, never a crash; nothing of ours remains allocated (the sanitizer checks).
 static void check_damage(gsf_context* ctx) {
     static const char* const names[] = {"x.exr", "x.tif", "x.png"};
     for (int k = 0; k < 3; k++) {

@@ -20,7 +20,7 @@ static gsf_context make_context(counter* c) {
     return ctx;
 }
 
-static char* exact_copy(const void* data, size_t size) { // so that ASan sees a read one byte behind the end
+static char* exact_copy(const void* data, size_t size) { // so that ASan detects a read one byte past the end
     char* p = (char*)malloc(size ? size : 1);
     if (size) memcpy(p, data, size);
     if (!size) { free(p); return NULL; }

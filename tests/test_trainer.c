@@ -97,8 +97,8 @@ static void test_loss_derivative(gsf_context* ctx) {
     gsf__loss_destroy_scratch(ctx, &scratch);
 }
 
-// Mean of 1 - weight (1 - SSIM) and the gradient of the mean of weight (1 - SSIM) in double precision, as the formula has
-// them, with the window of the 3DGS code: taps and their products rounded to float32. weight: (height,width), NULL = 1.
+// Mean of 1 - weight (1 - SSIM) and the gradient of the mean of weight (1 - SSIM) in double precision, directly from the
+// formulas, with the window of the 3DGS code: taps and their products rounded to float32. weight: (height,width), NULL = 1.
 static double exact_ssim(int width, int height, const float* x, const float* t, const float* weight, double* gradient) {
     const size_t n = 3 * (size_t)width * (size_t)height;
     double ssim = 0.0, *slopes = (double*)calloc(3 * n, sizeof(double));
@@ -1063,7 +1063,7 @@ static void test_zero_rates(gsf_context* ctx, const scene* s, int lazy) {
     }
 }
 
-// Linear images are encoded as sRGB: known pairs, and for all 8-bit values the way there and back.
+// Linear images are encoded as sRGB: known pairs, and a round trip of all 8-bit values.
 static void test_linear_photos(gsf_context* ctx, const scene* s) {
     enum { N = 3 * WIDTH * HEIGHT };
     static const float known[6][2] = {{0.0f, 0.0f}, {0.002f, 0.02584f}, {0.0031308f, 0.04045f},
@@ -1202,7 +1202,7 @@ static void test_resume(gsf_context* ctx, const scene* s, int mcmc) {
         CHECK_OK(ctx, gsf_splat_parse_trainer(ctx, trainer, "state", state.data, state.size));
         if (k % 2 == 0) CHECK_OK(ctx, gsf_splat_set_restored_views(ctx, trainer, s->views + VIEWS, 2));
         gsf_buffer again = save_state(ctx, trainer);
-        CHECK(same_text(&state, &again)); // save of restore is the identity
+        CHECK(same_text(&state, &again)); // formatting what was parsed gives the same bytes
         take_steps(ctx, trainer, 60 - stops[k]);
         gsf_buffer end = save_state(ctx, trainer);
         if (!CHECK(same_text(&whole, &end))) fprintf(stderr, "resumed at %d\n", stops[k]);

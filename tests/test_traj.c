@@ -371,7 +371,7 @@ static void test_degenerate_cameras(void) {
         CHECK(result_of(c, 9, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_OK);
         CHECK(result_of(c, 9, GSF_TRAJ_INTERPOLATE, official) == GSF_OK);
-        for (int i = 0; i < 9; i++) { // a vertical line: nothing decides that
+        for (int i = 0; i < 9; i++) { // a vertical line: nothing determines the side
             const double eye[3] = {0.0, (double)i, 0.0}, target[3] = {0.0, 4.0, 5.0};
             look(eye, target, up, &c[i]);
         }
@@ -388,7 +388,7 @@ static void test_degenerate_cameras(void) {
             look(eye, at_origin, flipped, &c[i]);
         }
         CHECK(result_of(c, 2, GSF_TRAJ_REFERENCE, official) == GSF_ERROR_DEGENERATE);
-        scene s; // upside down: the GSFixer release mirrors the world if exactly so
+        scene s; // exactly upside down, where the GSFixer release mirrors the world
         make_scene(&s, 6);
         for (size_t i = 0; i < 6; i++) {
             const double angle = (double)i, eye[3] = {cos(angle), 0.0, sin(angle)}, down[3] = {0.0, -1.0, 0.0};

@@ -135,7 +135,7 @@ static void test_from_points(void) {
         test_compare_floats("quats", splats.quats, rotation.v, rotation.count, 1e-5);
         test_compare_floats("opacity_logits", splats.opacity_logits, opacity.v, opacity.count, 1e-5);
         for (size_t i = 0; i < n; i++)
-            for (size_t c = 0; c < 3; c++) { // the file's colours are floats: compare after moving them onto the bytes
+            for (size_t c = 0; c < 3; c++) { // the file's colours are floats: compare after shifting to those of the bytes
                 const double shift = (bytes[3 * i + c] / 255.0 - colors.v[3 * i + c]) / 0.28209479177387814;
                 error = fmax(error, fabs((double)splats.sh[48 * i + c] - (dc.v[3 * i + c] + shift)));
                 for (size_t k = 1; k < 16; k++)
@@ -343,7 +343,7 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
             gsf__sight sight;
             if (!gsf__vis_sight(&job, job.eye, i, &sight)) continue;
             const double limit = (double)gsf__vis_limit(&job, i);
-            double cover[3] = {0.0, 0.0, 0.0}; // the outer two if rounding errors alone may put a disc in front of the point
+            double cover[3] = {0.0, 0.0, 0.0}; // outer two: with zero tolerance, rounding decides about discs in the plane
             for (int k = tolerance > 0.0f; k < 3 - (tolerance > 0.0f); k++) {
                 desc.tolerance = tolerance + close * (float)(k - 1);
                 for (size_t j = 0; j < job.discs.count; j++)
@@ -702,7 +702,7 @@ static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3
         }
         size_t differ = 0;
         for (size_t i = 0; i < n; i++) differ += rays[i] != projected[i];
-        CHECK(differ * 1000 <= n); // both methods to find the discs
+        CHECK(differ * 1000 <= n); // both methods find the same discs
         count_answers(&a, rays, truth, n, views, chosen, count);
         count_answers(split + k / 3 - 1, rays, truth, n, views, chosen, count);
         snprintf(what, sizeof what, "seed %d, K = %zu", (int)seed, k);

@@ -1,5 +1,5 @@
 // render_only.c - the renderer in a unit of its own: all functions private and only gsf_splat_render used, so that each
-// function has one caller and everything is inlined. Optimisers treat that unit unlike any other. Held against the
+// function has one caller and everything is inlined. Optimisers treat such a unit differently. Compared with the
 // double-precision reference at every CPU level; prints a hash of each level's images. Built by render_only.sh.
 #define GSFIXER_STATIC
 #define GSFIXER_SPLAT_IMPLEMENTATION
@@ -58,8 +58,8 @@ static void check_golden(renderer* r, const char* name) {
     splat_golden_close(&g);
 }
 
-// A picture of 20,000 columns of splats about a pixel wide, seen from far away: places on the screen and the camera's own
-// place need more digits than a float has.
+// An image 20,000 pixels wide of splats about a pixel wide, seen from far away: positions on the screen and of the camera
+// need more digits than a float has.
 static void check_wide(renderer* r) {
     enum { COUNT = 3000, WIDTH = 20000, HEIGHT = 8 };
     const double distance = 3e4, focal = 1e6;
