@@ -224,7 +224,7 @@ GSF_API GSF_NODISCARD gsf_result gsf_nn_decode_bpe(gsf_context* ctx, const gsf_n
 typedef struct gsf_nn_captioner { // an open model; its weights stay in the mapped files
     int32_t image_size;           // images are resized to a square of this side, whatever their aspect ratio
     int32_t query_tokens;         // tokens that represent the image in the language model's input
-    int32_t vocabulary, positions; // of the language model: ids; maximum number of tokens, with the image's
+    int32_t vocabulary, positions; // of the language model: ids; maximum number of tokens, including the image's
     int32_t bos, eos;             // starts a caption without prompt; ends every caption
     int32_t image_token;          // "image_token_index"; -1: an older folder without it, with a shorter default length
     gsf_nn_bpe tokenizer;
@@ -3204,7 +3204,7 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
 
 #define GSF__LINEAR_FOUR(multiply)                                                                                      \
     const int64_t a_next = GSF__TILE_ROWS * count, b_next = GSF__TILE_COLUMNS * count;                                  \
-    const int64_t share = gsf__ceil_div(ahead_count, count); /* one per step: the processor drops most of a burst */     \
+    const int64_t share = gsf__ceil_div(ahead_count, count); /* one per step: the processor drops most of a burst */    \
     float* right = sums + next;                                                                                         \
     for (int i = 0; i < 2 * GSF__TILE_SUMS; i += 16) {                                                                  \
         _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);                                                             \

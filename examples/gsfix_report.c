@@ -608,7 +608,7 @@ static void put_scene(page* p) {
 
 // ---- page ------------------------------------------------------------------------
 
-static const char* const style[] = { // in pieces, since C guarantees string literals of 4095 characters only
+static const char* const style[] = { // in pieces, since C guarantees string literals of up to 4095 characters only
     ":root{--bg:#fbfaf8;--card:#fff;--ink:#1d1c1a;--soft:#6b6862;--line:#e4e1da;--accent:#0d7a6f;--warm:#c2570c;--good:#15803d;--bad:#b91c1c}",
     "@media(prefers-color-scheme:dark){:root{--bg:#161614;--card:#201f1d;--ink:#eceae4;--soft:#a09c93;--line:#35332f;--accent:#35b8a8;",
     "--warm:#f09149;--good:#4cc274;--bad:#f07575}}",
@@ -672,7 +672,7 @@ static const char* const style[] = { // in pieces, since C guarantees string lit
     "section{margin-top:22px}h2,h2+p{break-after:avoid}.cards.broad{grid-template-columns:1fr 1fr}svg,.stage3{break-inside:avoid}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}",
     NULL};
 
-static const char* const script[] = { // in pieces, since C guarantees string literals of 4095 characters only
+static const char* const script[] = { // in pieces, since C guarantees string literals of up to 4095 characters only
     "(function(){'use strict';var all=function(q){return Array.prototype.slice.call(document.querySelectorAll(q))};\n",
     "all('.cmp input').forEach(function(i){var f=function(){i.parentNode.style.setProperty('--x',i.value/10+'%')};i.addEventListener('input',f);f()});\n",
     "all('.choice button').forEach(function(b){b.addEventListener('click',function(){\n",

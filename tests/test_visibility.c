@@ -648,7 +648,7 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
 }
 
 // The generator's own scene, read from its files, against the visibility that it traced. The photos and with them the
-// pixel noise are smaller than by default, so that the points are as accurate. `split` accumulates, per K, the views of
+// pixel noise are smaller than by default, so that the points are equally accurate. `split` accumulates, per K, the views of
 // the papers' split, `choices` random choices of as many.
 static void test_procedural(uint64_t seed, accuracy split[3], accuracy choices[3]) {
     char folder[1024], path[1100], what[64];
