@@ -53,7 +53,7 @@
        a network        a table of layers as in >>nn image encoders, opened by gsf__nn_open_network, run with the layers
                         of >>nn layers
        a solver         gsf_nn_solver, in >>nn scheduler
-   SECTIONS    files      >>nn kernels (declared) >>nn numbers >>nn workspace >>nn files: safetensors, config.json
+   SECTIONS    files      >>nn kernels (types) >>nn numbers >>nn workspace >>nn files: safetensors, config.json
                lanes      >>nn vector
                kernels    >>nn activations >>nn norms >>nn linear >>nn int8 >>nn attention >>nn convolution >>nn positions
                layers     >>nn layers
@@ -619,15 +619,14 @@ GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
 
 GSF__BEGIN_IMPLEMENTATION
 
-// ---- >>nn kernels: what the layers are made of --------------------------------
-// All pointers are to float32 and 4-byte aligned; outputs must not overlap inputs unless a comment allows it.
+// ---- >>nn kernels: their data types ---------------------------------------------
+// The functions are described in their own sections. All pointers are to float32 and 4-byte aligned; outputs must not
+// overlap inputs unless a comment allows it.
 
 typedef struct gsf__nn_workspace { // scratch memory of kernels; zero-initialise; grows on demand and is reused
     void* memory;
     size_t size;
 } gsf__nn_workspace;
-
-static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* workspace);
 
 // GELU is x/2 (1 + erf(x / sqrt 2)), with a relative error below 1e-6 for all x; GELU_TANH is its usual approximation.
 typedef enum gsf__nn_activation {
@@ -648,10 +647,6 @@ typedef struct gsf__nn_linear_desc {
                                // products in pairs (relative L2 error 1.7e-3). Otherwise no effect
 } gsf__nn_linear_desc;
 
-// A linear layer with its activation and residual. `workspace` NULL: scratch is allocated for this call only.
-static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* workspace,
-                                     const gsf__nn_linear_desc* desc);
-
 typedef struct gsf__nn_quantized { // an 8-bit weight matrix; owns its memory: destroy it
     int64_t out, in;
     int32_t block;             // size of the rotated blocks of values: a power of two up to 256; 1: no rotation
@@ -660,18 +655,6 @@ typedef struct gsf__nn_quantized { // an 8-bit weight matrix; owns its memory: d
     int32_t* offsets;          // private: 128 times the sum of each output's weights
     size_t bytes;              // size of all three: about out*in
 } gsf__nn_quantized;
-
-// Quantises (out, in) weights in f32, bf16 or f16 to symmetric 8-bit integers with one scale per output. First a
-// Hadamard rotation of blocks of inputs (the largest power of two up to 256 that divides `in`) spreads outliers;
-// `no_rotation` leaves it out. A NaN or infinity gives GSF_ERROR_NUMERIC and the tensor's name.
-static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor* weight, int32_t no_rotation,
-                                          gsf__nn_quantized* out);
-static void gsf__nn_destroy_quantized(gsf_context* ctx, gsf__nn_quantized* weight);
-// gsf__nn_run_linear with such a weight; desc->weight is ignored. Each row of x is rotated and rounded to 8 bits with
-// its own scale; sums are exact. Relative L2 error for Gaussian values: 1.2e-2. A row with a NaN or infinity gives
-// NaNs.
-static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* workspace,
-                                          const gsf__nn_linear_desc* desc, const gsf__nn_quantized* weight);
 
 typedef struct gsf__nn_attention_desc {
     int64_t queries, keys;     // rows of q and out; of k and v
@@ -685,34 +668,6 @@ typedef struct gsf__nn_attention_desc {
     int64_t ldo;
     int32_t bf16;              // GSF_CPU_AVX512_BF16, even head_dim: rounds q, k, v and the softmax weights to bf16
 } gsf__nn_attention_desc;
-
-// softmax(scale q k^T + bias) v for every head, without storing the logits. NaNs propagate; a NaN in a row of v may
-// also reach queries for which that row is masked.
-static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* workspace,
-                                        const gsf__nn_attention_desc* desc);
-
-// Normalisations over the last dimension of (rows, dim); y may be x; weight and bias are (dim) or NULL. Variances are
-// biased; sums are in double.
-static void gsf__nn_layer_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                               const float* bias, float eps, float* y);
-static void gsf__nn_rms_norm(gsf_context* ctx, const float* x, int64_t rows, int64_t dim, const float* weight,
-                             float eps, float* y);
-// y = layer_norm(x) * (1 + scale) + shift, scale and shift (dim): an adaptive layer norm in one pass.
-static void gsf__nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim,
-                                         const float* weight, const float* bias, float eps, const float* scale,
-                                         const float* shift, float* y);
-// x: (channels, count); statistics are over all values of the channels of a group; y may be x.
-GSF__SHARED void gsf__nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
-                                    const float* weight, const float* bias, float eps, float* y);
-// In place: LayerNorm over each head of q or k, then the rotary embedding of interleaved pairs from row `rope_first`
-// on. cos, sin: (rows - rope_first, head_dim) or NULL: no rotation. weight, bias: (head_dim) or NULL.
-static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads,
-                                   int32_t head_dim, const float* weight, const float* bias, float eps,
-                                   const float* cos, const float* sin, int64_t rope_first);
-static void gsf__nn_activate(gsf_context* ctx, gsf__nn_activation activation, const float* x, int64_t count, float* y);
-// Replaces each row of (rows, columns) by softmax(scale * row); y may be x.
-GSF__SHARED void gsf__nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale,
-                                 float* y);
 
 // ---- convolution ----
 // Activations of convolutions are channels-last: (frames, height, width, channels).
@@ -730,11 +685,6 @@ typedef struct gsf__nn_conv_desc {
     float* y;                  // (frames, height, width, out); halve: (frames, height/2, width/2, out), rounded down
 } gsf__nn_conv_desc;
 
-// A convolution; 3D ones are causal in time. `workspace` holds the widened weights and three frames of the input with
-// their borders; if it is NULL, memory is allocated for this call.
-GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* workspace,
-                                        const gsf__nn_conv_desc* desc);
-
 // ---- positions ----
 // Tables for the video transformer. Tokens are ordered by frame, row, column.
 
@@ -744,25 +694,6 @@ typedef struct gsf__nn_rope_desc {
     int32_t head_dim;                // a multiple of 16: time gets head_dim/4 of it, rows and columns 3*head_dim/8 each
     double theta;                    // 0: 10000
 } gsf__nn_rope_desc;
-
-// Rotary table: cos, sin (frames*height*width, head_dim), with every value twice, for interleaved pairs. Pair i of an
-// axis with d values is rotated by position * theta^(-2i/d). Positions of frames are 0, 1, ...; those of rows are
-// linspace(top, bottom*(h-1)/h, h), where top and bottom are those of the grid after it is resized to fit into the base
-// grid with its aspect ratio kept; columns alike. Angles are float32 products in diffusers' order, to match its tables
-// rather than the exact values.
-// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
-static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* desc, float* cos, float* sin);
-
-// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is split into time dim/4 | columns
-// 3*dim/8 | rows 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. Scale 0 means 1.
-// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
-static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width,
-                                      int32_t dim, double spatial_scale, double temporal_scale, float* out);
-
-// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)); the last
-// value of an odd dim is 0. Angles are float32, as in diffusers.
-// (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
-static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out);
 
 // ---- >>nn numbers ---------------------------------------------------------------
 
@@ -845,6 +776,11 @@ GSF_API void gsf_nn_convert_tensor(const gsf_nn_tensor* tensor, int64_t first, i
 
 // ---- >>nn workspace -------------------------------------------------------------
 
+static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* workspace) {
+    gsf_free(ctx, workspace->memory);
+    memset(workspace, 0, sizeof *workspace);
+}
+
 // Returns at least `size` bytes, discarding the workspace's previous contents. NULL when out of memory.
 static void* gsf__nn_scratch(gsf_context* ctx, gsf__nn_workspace* workspace, size_t size) {
     if (size <= workspace->size) return workspace->memory;
@@ -852,11 +788,6 @@ static void* gsf__nn_scratch(gsf_context* ctx, gsf__nn_workspace* workspace, siz
     workspace->memory = gsf_alloc(ctx, size, 1);
     workspace->size = workspace->memory ? size : 0;
     return workspace->memory;
-}
-
-static void gsf__nn_destroy_workspace(gsf_context* ctx, gsf__nn_workspace* workspace) {
-    gsf_free(ctx, workspace->memory);
-    memset(workspace, 0, sizeof *workspace);
 }
 
 // ---- >>nn files -----------------------------------------------------------------
@@ -2289,6 +2220,7 @@ static void gsf__softmax_chunk(void* arg, size_t chunk, int32_t worker) {
         job->kernels->softmax(job->x + r * n, n, job->scale, job->y + r * n);
 }
 
+// Replaces each row of (rows, columns) by softmax(scale * row); y may be x.
 GSF__SHARED void gsf__nn_softmax(gsf_context* ctx, const float* x, int64_t rows, int64_t columns, float scale,
                                  float* y) {
     gsf__activate_job job;
@@ -2587,6 +2519,10 @@ static void gsf__norm_rows(gsf_context* ctx, const float* x, int64_t rows, int64
     gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__norm_chunk, &job);
 }
 
+// Normalisations over the last dimension of (rows, dim); y may be x; weight and bias are (dim) or NULL. Variances are
+// biased; sums are in double.
+
+// y = layer_norm(x) * (1 + scale) + shift, scale and shift (dim): an adaptive layer norm in one pass.
 static void gsf__nn_layer_norm_modulated(gsf_context* ctx, const float* x, int64_t rows, int64_t dim,
                                          const float* weight, const float* bias, float eps, const float* scale,
                                          const float* shift, float* y) {
@@ -2661,6 +2597,7 @@ static void gsf__norm_part_values(void* arg, size_t chunk, int32_t worker) {
                            gsf__norm_inverse(m, job->group_size, job->eps));
 }
 
+// x: (channels, count); statistics are over all values of the channels of a group; y may be x.
 GSF__SHARED void gsf__nn_group_norm(gsf_context* ctx, const float* x, int64_t channels, int64_t count, int64_t groups,
                                     const float* weight, const float* bias, float eps, float* y) {
     gsf__moments part_moments[GSF__NORM_PARTS];
@@ -2707,6 +2644,8 @@ static void gsf__head_norm_rope_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
+// In place: LayerNorm over each head of q or k, then the rotary embedding of interleaved pairs from row `rope_first`
+// on. cos, sin: (rows - rope_first, head_dim) or NULL: no rotation. weight, bias: (head_dim) or NULL.
 static void gsf__nn_head_norm_rope(gsf_context* ctx, float* x, int64_t rows, int64_t ldx, int32_t heads,
                                    int32_t head_dim, const float* weight, const float* bias, float eps,
                                    const float* cos, const float* sin, int64_t rope_first) {
@@ -3620,6 +3559,7 @@ static void gsf__run_linear(gsf_context* ctx, gsf__linear_job* job) { // scratch
     }
 }
 
+// A linear layer with its activation and residual. `workspace` NULL: scratch is allocated for this call only.
 static gsf_result gsf__nn_run_linear(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_linear_desc* desc) {
     gsf__nn_workspace own;
     gsf__linear_job job;
@@ -4167,6 +4107,14 @@ static gsf_result gsf__check_quantize(gsf_context* ctx, const gsf_nn_tensor* w) 
     return GSF_OK;
 }
 
+static void gsf__nn_destroy_quantized(gsf_context* ctx, gsf__nn_quantized* weight) {
+    gsf_free(ctx, weight->data);
+    memset(weight, 0, sizeof *weight);
+}
+
+// Quantises (out, in) weights in f32, bf16 or f16 to symmetric 8-bit integers with one scale per output. First a
+// Hadamard rotation of blocks of inputs (the largest power of two up to 256 that divides `in`) spreads outliers;
+// `no_rotation` leaves it out. A NaN or infinity gives GSF_ERROR_NUMERIC and the tensor's name.
 static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor* weight, int32_t no_rotation,
                                           gsf__nn_quantized* out) {
     gsf__quantize_job job;
@@ -4209,11 +4157,6 @@ static gsf_result gsf__nn_quantize_weight(gsf_context* ctx, const gsf_nn_tensor*
         }
     *out = made;
     return GSF_OK;
-}
-
-static void gsf__nn_destroy_quantized(gsf_context* ctx, gsf__nn_quantized* weight) {
-    gsf_free(ctx, weight->data);
-    memset(weight, 0, sizeof *weight);
 }
 
 static void gsf__int8_quantize_rows(void* arg, size_t group, int32_t worker) { // six rows of x
@@ -4370,6 +4313,9 @@ static gsf_result gsf__check_int8(gsf_context* ctx, const gsf__nn_linear_desc* d
     return GSF_OK;
 }
 
+// gsf__nn_run_linear with such a weight; desc->weight is ignored. Each row of x is rotated and rounded to 8 bits with
+// its own scale; sums are exact. Relative L2 error for Gaussian values: 1.2e-2. A row with a NaN or infinity gives
+// NaNs.
 static gsf_result gsf__nn_run_linear_int8(gsf_context* ctx, gsf__nn_workspace* workspace,
                                           const gsf__nn_linear_desc* desc, const gsf__nn_quantized* weight) {
     gsf__nn_workspace own;
@@ -5001,6 +4947,8 @@ static size_t gsf__attention_floats(const gsf__attention_job* job) {
     return total < SIZE_MAX / 8 ? (total + 15) / 16 * 16 : 0;
 }
 
+// softmax(scale q k^T + bias) v for every head, without storing the logits. NaNs propagate; a NaN in a row of v may
+// also reach queries for which that row is masked.
 static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* workspace,
                                         const gsf__nn_attention_desc* desc) {
     const int pairs = desc->bf16 && desc->head_dim % 2 == 0;
@@ -5511,6 +5459,8 @@ static gsf_result gsf__check_conv(gsf_context* ctx, const gsf__nn_conv_desc* des
     return GSF_OK;
 }
 
+// A convolution; 3D ones are causal in time. `workspace` holds the widened weights and three frames of the input with
+// their borders; if it is NULL, memory is allocated for this call.
 GSF__SHARED gsf_result gsf__nn_convolve(gsf_context* ctx, gsf__nn_workspace* workspace, const gsf__nn_conv_desc* desc) {
     gsf__conv_layer layer;
     gsf__nn_workspace own;
@@ -5609,6 +5559,12 @@ static void gsf__nn_join_axes(const gsf__nn_axes* axes, size_t row, int32_t part
     *at = part == 0 ? t * time : ((part == 1) != axes->columns_first ? h : w) * space;
 }
 
+// Rotary table: cos, sin (frames*height*width, head_dim), with every value twice, for interleaved pairs. Pair i of an
+// axis with d values is rotated by position * theta^(-2i/d). Positions of frames are 0, 1, ...; those of rows are
+// linspace(top, bottom*(h-1)/h, h), where top and bottom are those of the grid after it is resized to fit into the base
+// grid with its aspect ratio kept; columns alike. Angles are float32 products in diffusers' order, to match its tables
+// rather than the exact values.
+// (diffusers 0.32.1 embeddings.py get_3d_rotary_pos_embed, pipeline_cogvideox.py get_resize_crop_region_for_grid)
 static gsf_result gsf__nn_make_rope(gsf_context* ctx, const gsf__nn_rope_desc* desc, float* cosine, float* sine) {
     GSF__TRY(gsf__nn_check_grid(ctx, "rope", desc->frames, desc->height, desc->width, desc->head_dim));
     if (desc->base_height < 1 || desc->base_width < 1 || !(desc->theta >= 0.0) || desc->theta > 1e30)
@@ -5688,6 +5644,9 @@ static gsf_result gsf__nn_sincos(gsf_context* ctx, const gsf__nn_axes* axes, dou
     return GSF_OK;
 }
 
+// Sine-cosine positions: out (frames*height*width, dim); dim, a multiple of 16, is split into time dim/4 | columns
+// 3*dim/8 | rows 3*dim/8, each [sin | cos] of position/scale * 10000^(-i/(d/2)). Computed in double. Scale 0 means 1.
+// (diffusers 0.32.1 embeddings.py get_3d_sincos_pos_embed)
 static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t height, int32_t width, int32_t dim,
                                       double spatial_scale, double temporal_scale, float* out) {
     const gsf__nn_axes axes = {frames, height, width, dim, 1};
@@ -5695,6 +5654,9 @@ static gsf_result gsf__nn_make_sincos(gsf_context* ctx, int32_t frames, int32_t 
                           temporal_scale != 0.0 ? temporal_scale : 1.0, NULL, out);
 }
 
+// Embedding of a diffusion time step (0..999): out (dim) = [cos | sin] of t * exp(-ln(10000) i / (dim/2)); the last
+// value of an odd dim is 0. Angles are float32, as in diffusers.
+// (diffusers 0.32.1 get_timestep_embedding, flip_sin_to_cos)
 static void gsf__nn_embed_timestep(double timestep, int32_t dim, float* out) {
     const int32_t half = dim / 2;
     if (dim % 2 != 0) out[dim - 1] = 0.0f;
