@@ -1898,21 +1898,24 @@ GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { //
 
 GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
 
+// For the rows of a tile, in named variables: gcc would keep an array in memory.
+#define GSF__SIX(X) X(0) X(1) X(2) X(3) X(4) X(5)
+
+// to[j to_ld + i] = m[i][j]
+GSF__INLINE_AVX2 void gsf__nn_store_columns(__m256 m[8], float* to, int64_t to_ld) {
+    gsf__v_transpose_avx2(m);
+#define GSF_X(r) _mm256_storeu_ps(to + (r) * to_ld, m[r]);
+    GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5) GSF_X(6) GSF_X(7)
+#undef GSF_X
+}
+
 // to[j to_ld + i] = (from[i ld + j] - center[j]) factor for i, j < 8
 GSF__INLINE_AVX2 void gsf__nn_transpose8(const float* from, int64_t ld, __m256 center, __m256 factor, float* to,
                                          int64_t to_ld) {
 #define GSF_X(r) (_mm256_loadu_ps(from + (r) * ld) - center) * factor
     __m256 m[8] = {GSF_X(0), GSF_X(1), GSF_X(2), GSF_X(3), GSF_X(4), GSF_X(5), GSF_X(6), GSF_X(7)};
 #undef GSF_X
-    gsf__v_transpose_avx2(m);
-    _mm256_storeu_ps(to, m[0]);
-    _mm256_storeu_ps(to + to_ld, m[1]);
-    _mm256_storeu_ps(to + 2 * to_ld, m[2]);
-    _mm256_storeu_ps(to + 3 * to_ld, m[3]);
-    _mm256_storeu_ps(to + 4 * to_ld, m[4]);
-    _mm256_storeu_ps(to + 5 * to_ld, m[5]);
-    _mm256_storeu_ps(to + 6 * to_ld, m[6]);
-    _mm256_storeu_ps(to + 7 * to_ld, m[7]);
+    gsf__nn_store_columns(m, to, to_ld);
 }
 
 // Pairs of bfloat16 are held in float lanes.
@@ -2897,15 +2900,7 @@ GSF__INLINE_AVX2 void gsf__pack_weights8(const char* w, gsf_nn_dtype dtype, size
                            gsf__load8(p + 2 * pitch, dtype), gsf__load8(p + 3 * pitch, dtype),
                            gsf__load8(p + 4 * pitch, dtype), gsf__load8(p + 5 * pitch, dtype),
                            gsf__load8(p + 6 * pitch, dtype), gsf__load8(p + 7 * pitch, dtype)};
-            gsf__v_transpose_avx2(r);
-            _mm256_store_ps(to, r[0]);
-            _mm256_store_ps(to + 16, r[1]);
-            _mm256_store_ps(to + 32, r[2]);
-            _mm256_store_ps(to + 48, r[3]);
-            _mm256_store_ps(to + 64, r[4]);
-            _mm256_store_ps(to + 80, r[5]);
-            _mm256_store_ps(to + 96, r[6]);
-            _mm256_store_ps(to + 112, r[7]);
+            gsf__nn_store_columns(r, to, GSF__TILE_COLUMNS);
         }
         gsf__pack_corner(w, dtype, pitch, c, 8, whole, count, out);
     }
@@ -2916,19 +2911,6 @@ GSF__TARGET_AVX2 static void gsf__pack_weights_avx2(const char* w, gsf_nn_dtype 
     if (dtype == GSF_NN_F32) gsf__pack_weights8(w, GSF_NN_F32, 4, pitch, columns, count, out);
     else if (dtype == GSF_NN_BF16) gsf__pack_weights8(w, GSF_NN_BF16, 2, pitch, columns, count, out);
     else gsf__pack_weights8(w, GSF_NN_F16, 2, pitch, columns, count, out);
-}
-
-// Writes eight steps of six rows, r[0] ... r[5]; each step writes two floats too many, which the next one overwrites.
-GSF__INLINE_AVX2 void gsf__store_steps(float* to, __m256 r[8]) {
-    gsf__v_transpose_avx2(r);
-    _mm256_storeu_ps(to, r[0]);
-    _mm256_storeu_ps(to + 6, r[1]);
-    _mm256_storeu_ps(to + 12, r[2]);
-    _mm256_storeu_ps(to + 18, r[3]);
-    _mm256_storeu_ps(to + 24, r[4]);
-    _mm256_storeu_ps(to + 30, r[5]);
-    _mm256_storeu_ps(to + 36, r[6]);
-    _mm256_storeu_ps(to + 42, r[7]);
 }
 
 GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, int64_t rows, int64_t count, float* out) {
@@ -2946,14 +2928,14 @@ GSF__TARGET_AVX2 static void gsf__pack_rows_avx2(const float* x, int64_t ldx, in
                        _mm256_loadu_ps(p[2] + (k & step[2])), _mm256_loadu_ps(p[3] + (k & step[3])),
                        _mm256_loadu_ps(p[4] + (k & step[4])), _mm256_loadu_ps(p[5] + (k & step[5])),
                        _mm256_setzero_ps(), _mm256_setzero_ps()};
-        gsf__store_steps(to, r);
+        gsf__nn_store_columns(r, to, GSF__TILE_ROWS); // each step's last two floats are overwritten by the next step
     }
     for (int64_t k = whole; k < count; k++)
         for (int i = 0; i < GSF__TILE_ROWS; i++) out[k * GSF__TILE_ROWS + i] = i < rows ? p[i][k] : 0.0f;
 }
 
 // The micro-kernel of GEMM and attention: c[2 r], c[2 r + 1] = the 16 sums over k of a[r a_row + k a_step] b[16 k ...]
-// for 6 rows r. 12 registers of sums, 2 of b, 1 or 2 of a; named variables, as gcc would keep an array in memory.
+// for 6 rows r. 12 registers of sums, 2 of b, 1 or 2 of a.
 GSF__INLINE_AVX2 void gsf__nn_tile(const float* a, int64_t a_row, int64_t a_step, const float* b, int64_t count,
                                    __m256 c[12]) {
     __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00;
@@ -3016,12 +2998,9 @@ GSF__INLINE_AVX2 void gsf__gemv_six(const char* const w[6], gsf_nn_dtype dtype, 
     __m256 s00 = _mm256_setzero_ps(), s10 = s00, s20 = s00, s30 = s00, s40 = s00, s50 = s00;
     __m256 s01 = s00, s11 = s00, s21 = s00, s31 = s00, s41 = s00, s51 = s00;
     for (int64_t at = 0; count > 0; count -= line) {
-        gsf__gemv_fetch(w0 + at, ahead);
-        gsf__gemv_fetch(w1 + at, ahead);
-        gsf__gemv_fetch(w2 + at, ahead);
-        gsf__gemv_fetch(w3 + at, ahead);
-        gsf__gemv_fetch(w4 + at, ahead);
-        gsf__gemv_fetch(w5 + at, ahead);
+#define GSF_X(r) gsf__gemv_fetch(w##r + at, ahead);
+        GSF__SIX(GSF_X)
+#undef GSF_X
         for (int64_t i = 0; i < line; i += 8, at += vector, x += 8 * rows) {
             const __m256 x0 = _mm256_load_ps(x), x1 = rows > 1 ? _mm256_load_ps(x + 8) : x0;
             __m256 v;
@@ -3029,7 +3008,7 @@ GSF__INLINE_AVX2 void gsf__gemv_six(const char* const w[6], gsf_nn_dtype dtype, 
             v = gsf__load8(w##r + at, dtype);              \
             s##r##0 = _mm256_fmadd_ps(v, x0, s##r##0);     \
             if (rows > 1) s##r##1 = _mm256_fmadd_ps(v, x1, s##r##1);
-            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+            GSF__SIX(GSF_X)
 #undef GSF_X
         }
     }
@@ -3116,7 +3095,6 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
 // ---- linear: AVX-512 kernels
 
 // 24 registers of sums, 2 of b, 1 or 2 of a; multiply(sum, a, b) adds the products to `sum`.
-#define GSF__FOUR_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
 #define GSF__FOUR_ZEROS(i) __m512 c##i = _mm512_setzero_ps(), d##i = c##i, e##i = c##i, f##i = c##i;
 #define GSF__FOUR_PUT(to, v) _mm512_store_ps(to, add ? _mm512_add_ps(_mm512_load_ps(to), v) : v);
 #define GSF__FOUR_STORE(i)                                                                                              \
@@ -3149,9 +3127,9 @@ static const gsf__linear_kernels gsf__linear_avx2 = {gsf__pack_weights_avx2, gsf
         _mm_prefetch((const char*)(sums + i), _MM_HINT_T0);                                                             \
         _mm_prefetch((const char*)(right + i), _MM_HINT_T0);                                                            \
     }                                                                                                                   \
-    GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                                     \
+    GSF__SIX(GSF__FOUR_ZEROS)                                                                                     \
     GSF__FOUR_TILES(multiply, GSF__LINEAR_AHEAD, a, 1, GSF__TILE_ROWS, a_next, b, b_next, count)                        \
-    GSF__FOUR_ROWS(GSF__FOUR_STORE)
+    GSF__SIX(GSF__FOUR_STORE)
 #define GSF__LINEAR_AHEAD                              \
     _mm_prefetch((const char*)ahead, _MM_HINT_T1);     \
     ahead += share;
@@ -3227,13 +3205,12 @@ GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dty
                                         int64_t count, float* sums) {
     const char *w0 = w[0], *w1 = w[1], *w2 = w[2], *w3 = w[3], *w4 = w[4], *w5 = w[5];
     const int64_t line = dtype == GSF_NN_F32 ? 16 : 32, vector = dtype == GSF_NN_F32 ? 64 : 32; // weights; bytes
-#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
 #define GSF_X(r) __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, s##r##2 = s##r##0, s##r##3 = s##r##0;
-    GSF_ROWS(GSF_X)
+    GSF__SIX(GSF_X)
 #undef GSF_X
     for (int64_t at = 0; count > 0; count -= line) {
 #define GSF_X(r) _mm_prefetch(w##r + at + ahead, _MM_HINT_T0);
-        GSF_ROWS(GSF_X)
+        GSF__SIX(GSF_X)
 #undef GSF_X
         for (int64_t i = 0; i < line; i += 16, at += vector, x += 64) {
             const __m512 x0 = _mm512_load_ps(x), x1 = _mm512_load_ps(x + 16);
@@ -3245,7 +3222,7 @@ GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dty
             s##r##1 = _mm512_fmadd_ps(v, x1, s##r##1);     \
             s##r##2 = _mm512_fmadd_ps(v, x2, s##r##2);     \
             s##r##3 = _mm512_fmadd_ps(v, x3, s##r##3);
-            GSF_ROWS(GSF_X)
+            GSF__SIX(GSF_X)
 #undef GSF_X
         }
     }
@@ -3254,9 +3231,8 @@ GSF__INLINE_AVX512 void gsf__gemv_six16(const char* const w[6], gsf_nn_dtype dty
     sums[4 * r + 1] += gsf__v_sum_avx512(s##r##1);    \
     sums[4 * r + 2] += gsf__v_sum_avx512(s##r##2);    \
     sums[4 * r + 3] += gsf__v_sum_avx512(s##r##3);
-    GSF_ROWS(GSF_X)
+    GSF__SIX(GSF_X)
 #undef GSF_X
-#undef GSF_ROWS
 }
 
 // Weights are read fastest as long sequential streams: the columns are divided into as many parts as are read at once,
@@ -3346,7 +3322,7 @@ GSF__TARGET_BF16 static void gsf__pack_rows_bf16(const float* x, int64_t ldx, in
                        GSF_X(4), GSF_X(5), _mm256_setzero_ps(), _mm256_setzero_ps()};
 #undef GSF_X
         float* to = k + 8 <= count ? out : tile;
-        gsf__store_steps(to, r);
+        gsf__nn_store_columns(r, to, GSF__TILE_ROWS); // as in gsf__pack_rows_avx2
         if (to == tile) memcpy(out, tile, (size_t)((count - k) * GSF__TILE_ROWS) * sizeof(float));
     }
 }
@@ -3357,7 +3333,7 @@ GSF__INLINE_BF16 void gsf__nn_tile_bf16(const float* a, int64_t a_row, int64_t a
     for (; count > 0; count--, a += a_step, b += GSF__TILE_COLUMNS) {
         const __m512 w = _mm512_loadu_ps(b);
 #define GSF_X(r) c##r = gsf__nn_add_pairs(c##r, _mm512_set1_ps(a[(r) * a_row]), w);
-        GSF__FOUR_ROWS(GSF_X)
+        GSF__SIX(GSF_X)
 #undef GSF_X
     }
     c[0] = c0; c[1] = c1; c[2] = c2; c[3] = c3; c[4] = c4; c[5] = c5;
@@ -3369,7 +3345,7 @@ GSF__TARGET_BF16 static void gsf__tile_bf16(const float* a, const float* b, int6
     for (int64_t i = 0; i < ahead_count; i += 16) _mm_prefetch((const char*)(ahead + i), _MM_HINT_T1);
     gsf__nn_tile_bf16(a, 1, GSF__TILE_ROWS, b, count, c);
 #define GSF_X(i) GSF__FOUR_PUT(sums + 16 * (i), c[i])
-    GSF__FOUR_ROWS(GSF_X)
+    GSF__SIX(GSF_X)
 #undef GSF_X
 }
 
@@ -3847,7 +3823,7 @@ GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const void* a, const void* b, i
             v = gsf__int8_broadcast4(p + 4 * i);            \
             GSF__INT8_ADD(c##i##0, _mm256_madd_epi16(v, b0)) \
             GSF__INT8_ADD(c##i##1, _mm256_madd_epi16(v, b1))
-            GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+            GSF__SIX(GSF_X)
 #undef GSF_X
         }
 #define GSF_X(i)                                                                                                        \
@@ -3856,7 +3832,7 @@ GSF__TARGET_AVX2 static void gsf__int8_tile_avx2(const void* a, const void* b, i
             const __m256i v = _mm256_permute4x64_epi64(_mm256_hadd_epi32(c##i##0, c##i##1), 0xd8);                      \
             _mm256_storeu_si256(to, add ? _mm256_add_epi32(_mm256_loadu_si256(to), v) : v);                             \
         }
-        GSF_X(0) GSF_X(1) GSF_X(2) GSF_X(3) GSF_X(4) GSF_X(5)
+        GSF__SIX(GSF_X)
 #undef GSF_X
     }
 }
@@ -3929,23 +3905,22 @@ GSF__INLINE_AVX512 __m512i gsf__int8_four(const uint8_t* p) {
     return _mm512_set1_epi32(four);
 }
 
-#define GSF_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5)
 #define GSF_PUT(to, v) _mm512_storeu_si512(to, add ? _mm512_add_epi32(_mm512_loadu_si512(to), v) : v);
 
 GSF__TARGET_VNNI static void gsf__int8_tile_vnni(const void* a, const void* b, int64_t count, int add, int32_t* sums) {
     const uint8_t* x = (const uint8_t*)a;
     const int8_t* w = (const int8_t*)b;
 #define GSF_X(i) __m512i c##i = _mm512_setzero_si512();
-    GSF_ROWS(GSF_X)
+    GSF__SIX(GSF_X)
 #undef GSF_X
     for (; count > 0; count -= 4, x += 4 * GSF__TILE_ROWS, w += 4 * GSF__TILE_COLUMNS) {
         const __m512i v = _mm512_loadu_si512(w);
 #define GSF_X(i) c##i = _mm512_dpbusd_epi32(c##i, gsf__int8_four(x + 4 * (i)), v);
-        GSF_ROWS(GSF_X)
+        GSF__SIX(GSF_X)
 #undef GSF_X
     }
 #define GSF_X(i) GSF_PUT(sums + GSF__TILE_COLUMNS * (i), c##i)
-    GSF_ROWS(GSF_X)
+    GSF__SIX(GSF_X)
 #undef GSF_X
 }
 
@@ -3956,7 +3931,7 @@ GSF__TARGET_VNNI static void gsf__int8_four_tiles_vnni(const void* a, int64_t a_
     const int64_t share = gsf__ceil_div(4 * ahead_count, count);
     int32_t* right = sums + next;
 #define GSF_X(i) __m512i c##i = _mm512_setzero_si512(), d##i = c##i, e##i = c##i, f##i = c##i;
-    GSF_ROWS(GSF_X) // as in gsf__four_tiles_avx512
+    GSF__SIX(GSF_X) // as in gsf__four_tiles_avx512
 #undef GSF_X
     for (; count > 0; count -= 4, x0 += 4 * GSF__TILE_ROWS, x1 += 4 * GSF__TILE_ROWS, b += 4 * GSF__TILE_COLUMNS) {
         const __m512i w0 = _mm512_loadu_si512(b), w1 = _mm512_loadu_si512(b + b_next);
@@ -3970,17 +3945,16 @@ GSF__TARGET_VNNI static void gsf__int8_four_tiles_vnni(const void* a, int64_t a_
         v = gsf__int8_four(x1 + 4 * (i));                                                \
         e##i = _mm512_dpbusd_epi32(e##i, v, w0);                                         \
         f##i = _mm512_dpbusd_epi32(f##i, v, w1);
-        GSF_ROWS(GSF_X)
+        GSF__SIX(GSF_X)
 #undef GSF_X
     }
 #define GSF_X(i)                                                                         \
     GSF_PUT(sums + 16 * (i), c##i) GSF_PUT(right + 16 * (i), d##i)                       \
     GSF_PUT(sums + GSF__TILE_SUMS + 16 * (i), e##i) GSF_PUT(right + GSF__TILE_SUMS + 16 * (i), f##i)
-    GSF_ROWS(GSF_X)
+    GSF__SIX(GSF_X)
 #undef GSF_X
 }
 #undef GSF_PUT
-#undef GSF_ROWS
 
 // Two alternating sums per row, as a single one would be latency-bound. Pass a compile-time constant as `rows`.
 GSF__INLINE_VNNI void gsf__int8_gemv_rows(const uint8_t* x, int64_t rows, const int8_t* w, int64_t count, int32_t* sums) {
@@ -4593,9 +4567,9 @@ GSF__TARGET_AVX2 static void gsf__attention_logits_avx2(const float* q, int64_t 
         float* to = p + panel * GSF__ATT_PANEL;                                                                         \
         for (int64_t g = 0; g < even; g += 2, to += 2 * height) {                                                       \
             const float *a = q + g * 8 * dim, *b = k;                                                                   \
-            GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                             \
+            GSF__SIX(GSF__FOUR_ZEROS)                                                                             \
             GSF__FOUR_TILES(multiply, , a, 1, 8, 8 * dim, b, GSF__ATT_PANEL * dim, dim)                               \
-            GSF__FOUR_ROWS(GSF__ATT_STORE)                                                                              \
+            GSF__SIX(GSF__ATT_STORE)                                                                              \
         }                                                                                                               \
         if (even < groups) rest(q + even * 8 * dim, 1, k, 2, dim, to);                                                  \
     }                                                                                                                   \
@@ -4732,9 +4706,9 @@ GSF__TARGET_AVX2 static void gsf__attention_values_avx2(const float* p, int64_t 
                 _mm_prefetch((const char*)(to + i), _MM_HINT_T0);                                                       \
                 _mm_prefetch((const char*)(to + width + i), _MM_HINT_T0);                                               \
             }                                                                                                           \
-            GSF__FOUR_ROWS(GSF__FOUR_ZEROS)                                                                             \
+            GSF__SIX(GSF__FOUR_ZEROS)                                                                             \
             GSF__FOUR_TILES(multiply, , a, GSF__ATT_KEYS, 1, height, b, GSF__ATT_KEYS * GSF__ATT_PANEL, places)       \
-            GSF__FOUR_ROWS(GSF__ATT_FADE)                                                                               \
+            GSF__SIX(GSF__ATT_FADE)                                                                               \
         }                                                                                                               \
     if (even < groups)                                                                                                  \
         rest(p + even * height, groups - even, v, keys, panels, fade + even * GSF__ATT_GROUP, out + even * width);
@@ -5047,40 +5021,27 @@ GSF__TARGET_AVX2 static void gsf__conv_multiply_avx2(const float* a, int64_t lda
                                                      float* c, const float* ahead) {
     for (int64_t m = 0; m < count; m += GSF__CONV_M, a += GSF__CONV_M * lda, c += GSF__CONV_M * GSF__CONV_N) {
         const int64_t last = count - m - 1, share = m == 0 ? GSF__CONV_SHARE : 0;
-        const float *a0 = a, *a1 = a + (last < 1 ? last : 1) * lda, *a2 = a + (last < 2 ? last : 2) * lda,
-                    *a3 = a + (last < 3 ? last : 3) * lda, *a4 = a + (last < 4 ? last : 4) * lda,
-                    *a5 = a + (last < 5 ? last : 5) * lda, *w = b;
-        __m256 c00 = _mm256_setzero_ps(), c01 = c00, c10 = c00, c11 = c00, c20 = c00, c21 = c00, c30 = c00, c31 = c00,
-               c40 = c00, c41 = c00, c50 = c00, c51 = c00;
+        const float* w = b;
+#define GSF_X(r)                                            \
+        const float* a##r = a + gsf__least(r, last) * lda;  \
+        __m256 c##r##0 = _mm256_setzero_ps(), c##r##1 = c##r##0;
+        GSF__SIX(GSF_X)
+#undef GSF_X
         for (int64_t i = 0; i < k; i++, w += GSF__CONV_N) {
             const __m256 w0 = _mm256_loadu_ps(w), w1 = _mm256_loadu_ps(w + 8);
             _mm_prefetch((const char*)ahead, _MM_HINT_T1);
             ahead += share;
-            __m256 v = _mm256_broadcast_ss(a0 + i);
-            c00 = _mm256_fmadd_ps(v, w0, c00);
-            c01 = _mm256_fmadd_ps(v, w1, c01);
-            v = _mm256_broadcast_ss(a1 + i);
-            c10 = _mm256_fmadd_ps(v, w0, c10);
-            c11 = _mm256_fmadd_ps(v, w1, c11);
-            v = _mm256_broadcast_ss(a2 + i);
-            c20 = _mm256_fmadd_ps(v, w0, c20);
-            c21 = _mm256_fmadd_ps(v, w1, c21);
-            v = _mm256_broadcast_ss(a3 + i);
-            c30 = _mm256_fmadd_ps(v, w0, c30);
-            c31 = _mm256_fmadd_ps(v, w1, c31);
-            v = _mm256_broadcast_ss(a4 + i);
-            c40 = _mm256_fmadd_ps(v, w0, c40);
-            c41 = _mm256_fmadd_ps(v, w1, c41);
-            v = _mm256_broadcast_ss(a5 + i);
-            c50 = _mm256_fmadd_ps(v, w0, c50);
-            c51 = _mm256_fmadd_ps(v, w1, c51);
+            __m256 v;
+#define GSF_X(r)                                           \
+            v = _mm256_broadcast_ss(a##r + i);             \
+            c##r##0 = _mm256_fmadd_ps(v, w0, c##r##0);     \
+            c##r##1 = _mm256_fmadd_ps(v, w1, c##r##1);
+            GSF__SIX(GSF_X)
+#undef GSF_X
         }
-        gsf__conv_add8(c, c00), gsf__conv_add8(c + 8, c01);
-        gsf__conv_add8(c + 16, c10), gsf__conv_add8(c + 24, c11);
-        gsf__conv_add8(c + 32, c20), gsf__conv_add8(c + 40, c21);
-        gsf__conv_add8(c + 48, c30), gsf__conv_add8(c + 56, c31);
-        gsf__conv_add8(c + 64, c40), gsf__conv_add8(c + 72, c41);
-        gsf__conv_add8(c + 80, c50), gsf__conv_add8(c + 88, c51);
+#define GSF_X(r) gsf__conv_add8(c + GSF__CONV_N * r, c##r##0), gsf__conv_add8(c + GSF__CONV_N * r + 8, c##r##1);
+        GSF__SIX(GSF_X)
+#undef GSF_X
     }
 }
 
