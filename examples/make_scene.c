@@ -10,6 +10,9 @@
                                                     triangulated from noisy pixels, matched in only some of the views
                                                     that can see them, a few of them outliers
        OUT/truth/depth_001.npy ...                  float32 (height,width) camera depth at pixel centres, 0 = sky
+       OUT/truth/normal_001.npy ...                 float32 (height,width,3) unit normals of the triangles there, as
+                                                    flat as the depth is, in the axes of the COLMAP model, towards the
+                                                    camera; 0 = sky
        OUT/truth/visibility.bin                     see write_truth
        OUT/truth/scene.json                         the options it was made with
    OUT must be a new folder, an empty one or one written by make_scene, so that no other files are replaced.
@@ -19,7 +22,7 @@
    renders an existing scene from other cameras (the format of `gsfix path`) like additional photos of it, with the same
    light and sensor noise. With the scene's own cameras, it reproduces the scene's photos.
        PICTURES/00000.png ...        in the order of the cameras
-       PICTURES/depth/00000.npy ...  as in OUT/truth
+       PICTURES/depth/00000.npy, PICTURES/normal/00000.npy ...  as in OUT/truth
    PICTURES must be a new or an empty folder. */
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L // mkdir
@@ -623,6 +626,7 @@ typedef struct hit {
     const surface* what;
     float t;
     v3 at, normal, local, local_normal, light; // normal faces the ray
+    v3 face; // normal of the triangle, of any length and sign
 } hit;
 
 static struct RTCRay make_ray(v3 from, v3 d, float near, float far) {
@@ -665,6 +669,7 @@ static int trace(const world* s, v3 from, v3 d, float near, hit* out) {
     const float u = r.hit.u, w = r.hit.v, o = 1.0f - u - w;
     out->what = s->surfaces + r.hit.primID;
     out->t = r.ray.tfar;
+    out->face = v(r.hit.Ng_x, r.hit.Ng_y, r.hit.Ng_z);
     out->at = add(from, mul(d, r.ray.tfar));
     out->normal = unit(add(add(mul(a->normal, o), mul(b->normal, u)), mul(c->normal, w)));
     out->local = add(add(mul(a->local, o), mul(b->local, u)), mul(c->local, w));
@@ -771,6 +776,7 @@ typedef struct photo_job {
     uint64_t view;
     uint8_t* pixels; // (height,width,3)
     float* depth;    // (height,width)
+    float* normal;   // (height,width,3)
 } photo_job;
 
 static v3 eye_of(const gsf_camera* camera) {
@@ -805,7 +811,11 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
         float z;
         hit h;
         v3 d = ray_through(&job->camera, x + 0.5, (double)row + 0.5, &z);
-        job->depth[pixel] = trace(job->s, eye, d, 0.01f, &h) ? h.t * z : 0.0f;
+        const int found = trace(job->s, eye, d, 0.01f, &h);
+        const v3 face = found ? unit(dot(h.face, d) > 0.0f ? mul(h.face, -1.0f) : h.face) : v(0, 0, 0);
+        const float normal[3] = {face.x, face.y, face.z};
+        job->depth[pixel] = found ? h.t * z : 0.0f;
+        memcpy(job->normal + 3 * pixel, normal, sizeof normal);
         for (int k = 0; k < SAMPLES; k++) {
             const int32_t at = (int32_t)(4 * pixel) + k;
             d = ray_through(&job->camera, (double)x + (double)jitter[k][0], (double)row + (double)jitter[k][1], &z);
@@ -1033,14 +1043,16 @@ static int make_folder(const char* folder, const char* below) {
     return 0;
 }
 
-static gsf_result write_depth(gsf_context* ctx, const char* path, const float* depth, int width, int height) {
+// Writes an array of shape (height,width) or, with more than one channel, (height,width,channels).
+static gsf_result write_npy(gsf_context* ctx, const char* path, const float* values, int width, int height, int channels) {
     gsf_buffer out;
-    char head[128];
+    char head[128], last[16] = "";
     memset(&out, 0, sizeof out);
-    snprintf(head, sizeof head, "{'descr': '<f4', 'fortran_order': False, 'shape': (%d, %d), }", height, width);
+    if (channels > 1) snprintf(last, sizeof last, ", %d", channels);
+    snprintf(head, sizeof head, "{'descr': '<f4', 'fortran_order': False, 'shape': (%d, %d%s), }", height, width, last);
     gsf_append_bytes(ctx, &out, "\x93NUMPY\x01\x00\x76\x00", 10); // version 1.0, header of 118 bytes
     gsf_append_text(ctx, &out, "%-117s\n", head);
-    gsf_append_bytes(ctx, &out, (const char*)depth, (size_t)width * (size_t)height * sizeof(float));
+    gsf_append_bytes(ctx, &out, (const char*)values, (size_t)width * (size_t)height * (size_t)channels * sizeof(float));
     const gsf_result result = out.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_write_file(ctx, path, out.data, out.size);
     gsf_destroy_buffer(ctx, &out);
     return result;
@@ -1118,8 +1130,9 @@ static void end_world(world* s) {
 static int take_photos(gsf_context* ctx, world* s, const make_scene_options* o, const char* folder, gsf_scene* scene,
                        uint8_t** photos) {
     const size_t pixels = (size_t)o->width * (size_t)o->height;
-    float* depth = (float*)gsf_alloc(ctx, pixels, sizeof(float));
-    int ok = depth != NULL;
+    float *depth = (float*)gsf_alloc(ctx, pixels, sizeof(float)),
+          *normal = (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float));
+    int ok = depth && normal;
     for (int i = 0; ok && i < o->views; i++) {
         char path[2048];
         gsf_scene_view* view = scene->views + i;
@@ -1129,16 +1142,19 @@ static int take_photos(gsf_context* ctx, world* s, const make_scene_options* o, 
         photos[i] = (uint8_t*)gsf_alloc(ctx, pixels, 3);
         if (!(ok = view->name && photos[i])) break;
         snprintf(view->name, 32, "frame_%03d.png", i + 1);
-        photo_job job = {s, view->camera, (uint64_t)i, photos[i], depth};
+        photo_job job = {s, view->camera, (uint64_t)i, photos[i], depth, normal};
         ctx->parallel.for_fn(ctx->parallel.user, (size_t)o->height, photo_row, &job);
         const gsf_image image = gsf_wrap_image(photos[i], GSF_U8, o->width, o->height, 3);
         snprintf(path, sizeof path, "%s/images/%s", folder, view->name);
         ok = gsf_save_image(ctx, path, &image) == GSF_OK;
         snprintf(path, sizeof path, "%s/truth/depth_%03d.npy", folder, i + 1);
-        ok = ok && write_depth(ctx, path, depth, o->width, o->height) == GSF_OK;
+        ok = ok && write_npy(ctx, path, depth, o->width, o->height, 1) == GSF_OK;
+        snprintf(path, sizeof path, "%s/truth/normal_%03d.npy", folder, i + 1);
+        ok = ok && write_npy(ctx, path, normal, o->width, o->height, 3) == GSF_OK;
         if (isatty(2)) fprintf(stderr, "\rmake_scene: photo %d of %d%s", i + 1, o->views, i + 1 == o->views ? "\n" : "");
     }
     gsf_free(ctx, depth);
+    gsf_free(ctx, normal);
     return ok;
 }
 
@@ -1215,15 +1231,15 @@ static gsf_result read_options(gsf_context* ctx, const char* path, make_scene_op
     return result;
 }
 
-// Renders the picture and depth map of camera i, with the random numbers of photo i.
+// Renders the picture, depth map and normals of camera i, with the random numbers of photo i.
 static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_camera* camera, size_t i, const char* out) {
     char path[2048];
     const size_t pixels = (size_t)camera->width * (size_t)camera->height;
     gsf_result result = gsf_check_camera(ctx, camera);
     if (result != GSF_OK) return result;
     photo_job job = {s, *camera, (uint64_t)i, (uint8_t*)gsf_alloc(ctx, pixels, 3),
-                     (float*)gsf_alloc(ctx, pixels, sizeof(float))};
-    result = job.pixels && job.depth ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+                     (float*)gsf_alloc(ctx, pixels, sizeof(float)), (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float))};
+    result = job.pixels && job.depth && job.normal ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
         ctx->parallel.for_fn(ctx->parallel.user, (size_t)camera->height, photo_row, &job);
         const gsf_image image = gsf_wrap_image(job.pixels, GSF_U8, camera->width, camera->height, 3);
@@ -1232,10 +1248,15 @@ static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_came
     }
     if (result == GSF_OK) {
         snprintf(path, sizeof path, "%s/depth/%05zu.npy", out, i);
-        result = write_depth(ctx, path, job.depth, camera->width, camera->height);
+        result = write_npy(ctx, path, job.depth, camera->width, camera->height, 1);
+    }
+    if (result == GSF_OK) {
+        snprintf(path, sizeof path, "%s/normal/%05zu.npy", out, i);
+        result = write_npy(ctx, path, job.normal, camera->width, camera->height, 3);
     }
     gsf_free(ctx, job.pixels);
     gsf_free(ctx, job.depth);
+    gsf_free(ctx, job.normal);
     return result;
 }
 
@@ -1250,7 +1271,8 @@ static int render_scene(gsf_context* ctx, const char* folder, const char* camera
     snprintf(path, sizeof path, "%s/truth/scene.json", folder);
     gsf_result result = read_options(ctx, path, &o);
     if (result == GSF_OK) result = gsf_load_cameras(ctx, cameras, &list, &count);
-    int ok = result == GSF_OK && make_folder(out, "") && make_folder(out, "/depth") && start_world(ctx, &s, &o);
+    int ok = result == GSF_OK && make_folder(out, "") && make_folder(out, "/depth") && make_folder(out, "/normal") &&
+             start_world(ctx, &s, &o);
     const float angle = s.pixel_angle;
     for (size_t i = 0; ok && i < count; i++) {
         s.pixel_angle = angle * (float)(0.9 * o.width / list[i].fx); // texture detail for the pixel size of this camera

@@ -16,6 +16,8 @@ static void remove_scene(const char* folder, int views) {
         remove(path);
         snprintf(path, sizeof path, "%s/truth/depth_%03d.npy", folder, i + 1);
         remove(path);
+        snprintf(path, sizeof path, "%s/truth/normal_%03d.npy", folder, i + 1);
+        remove(path);
     }
     for (size_t i = 0; i < sizeof files / sizeof *files; i++) {
         snprintf(path, sizeof path, "%s/%s", folder, files[i]);

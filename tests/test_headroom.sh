@@ -30,6 +30,7 @@ assert len(images) == int(sys.argv[1]), images
 assert all(image["psnr"] is None or image["psnr"] > 60.0 for image in images), images  # null: identical
 PY
 cmp again/depth/00001.npy "$scene/truth/depth_002.npy" || fail "not the truth's depth"
+cmp again/normal/00001.npy "$scene/truth/normal_002.npy" || fail "not the truth's normals"
 if "$build/make_scene" "$scene" --render cameras.json --out again 2> log; then fail "writes into an existing folder"; fi
 mkdir bare
 if "$build/make_scene" bare --render cameras.json --out new 2> log; then fail "renders a folder that is no made scene"; fi
