@@ -59,6 +59,7 @@
                layers     >>nn layers
                networks   >>nn image encoders >>nn bpe >>nn captioner >>nn tokenizer >>nn t5 >>nn vae >>nn transformer
                restoring  >>nn scheduler >>nn sampling >>nn restorer
+               training   >>nn training: gradients of layers, compiled with GSF_NN_TRAINING only
 */
 #ifndef GSF_NN_INCLUDED
 #define GSF_NN_INCLUDED
@@ -13140,6 +13141,270 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
     if (result) gsf_nn_destroy_dit(ctx, out);
     return result;
 }
+
+// ---- >>nn training --------------------------------------------------------------
+
+// Only with GSF_NN_TRAINING. Gradients of a loss L: `dy` is dL/dy, `dx` is dL/dx. Sums over rows have a fixed order, so
+// results do not depend on the number of workers.
+#ifdef GSF_NN_TRAINING
+
+static double gsf__nn_activation_slope(gsf__nn_activation activation, double x) {
+    switch (activation) {
+        case GSF__NN_LINEAR: return 1.0;
+        case GSF__NN_GELU_TANH: {
+            const double u = 0.7978845608028654 * (x + 0.044715 * x * x * x), s = 1.0 / (1.0 + exp(-2.0 * u));
+            return s + 2.0 * x * s * (1.0 - s) * 0.7978845608028654 * (1.0 + 3.0 * 0.044715 * x * x);
+        }
+        case GSF__NN_SILU: {
+            const double s = 1.0 / (1.0 + exp(-x));
+            return s * (1.0 + x * (1.0 - s));
+        }
+        case GSF__NN_GELU:
+            return 0.5 * erfc(-0.7071067811865476 * x) + x * exp(-0.5 * x * x) * 0.3989422804014327;
+        case GSF__NN_RELU: return x > 0.0 ? 1.0 : 0.0;
+    }
+    return 1.0;
+}
+
+typedef struct gsf__grad_job {
+    gsf__nn_activation activation;
+    const float *x, *dy, *weight, *scale; // softmax: x is the forward pass's result
+    const char* data;                     // the matrix to transpose
+    gsf_nn_dtype dtype;
+    float* dx;
+    int64_t rows, columns, ld, chunk_rows;
+    double *sums, *products; // per chunk and column: of dy, of dy and the normalised x
+    float eps, factor;
+    int centre;
+} gsf__grad_job;
+
+static void gsf__activate_grad_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__grad_job* job = (const gsf__grad_job*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->columns);
+    (void)worker;
+    for (int64_t i = begin; i < end; i++)
+        job->dx[i] = (float)((double)job->dy[i] * gsf__nn_activation_slope(job->activation, (double)job->x[i]));
+}
+
+// x: what the activation was applied to; dx may be dy
+GSF__SHARED void gsf__nn_activate_grad(gsf_context* ctx, gsf__nn_activation activation, const float* x, const float* dy,
+                                       int64_t count, float* dx) {
+    gsf__grad_job job;
+    memset(&job, 0, sizeof job);
+    job.activation = activation;
+    job.x = x;
+    job.dy = dy;
+    job.dx = dx;
+    job.columns = count;
+    gsf__parallel_for(ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__activate_grad_chunk, &job);
+}
+
+static void gsf__softmax_grad_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__grad_job* job = (const gsf__grad_job*)arg;
+    const int64_t n = job->columns, begin = (int64_t)chunk * job->chunk_rows;
+    (void)worker;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
+        const float *y = job->x + r * n, *dy = job->dy + r * n;
+        double sum = 0.0;
+        for (int64_t i = 0; i < n; i++) sum += (double)y[i] * (double)dy[i];
+        for (int64_t i = 0; i < n; i++)
+            job->dx[r * n + i] = (float)((double)job->factor * (double)y[i] * ((double)dy[i] - sum));
+    }
+}
+
+// y: softmax(scale * x) per row; dx may be dy
+GSF__SHARED void gsf__nn_softmax_grad(gsf_context* ctx, const float* y, const float* dy, int64_t rows, int64_t columns,
+                                      float scale, float* dx) {
+    gsf__grad_job job;
+    memset(&job, 0, sizeof job);
+    job.x = y;
+    job.dy = dy;
+    job.dx = dx;
+    job.rows = rows;
+    job.columns = columns;
+    job.factor = scale;
+    job.chunk_rows = gsf__nn_chunk_rows(columns);
+    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__softmax_grad_chunk, &job);
+}
+
+enum { GSF__GRAD_PARTS = 64 }; // of the rows of a norm, each with its own sums over rows
+
+typedef struct gsf__nn_norm_grad_desc {
+    const float* x;           // (rows, dim)
+    int64_t rows, dim;
+    gsf__norm_vectors by;     // as in the forward pass
+    float eps;
+    int32_t rms;              // RMS norm: the mean is taken as 0
+    const float* dy;
+    float* dx;                // may be dy
+    float *dweight, *dbias, *dscale, *dshift; // (dim), added to; each may be NULL
+} gsf__nn_norm_grad_desc;
+
+static void gsf__norm_grad_part(void* arg, size_t part, int32_t worker) {
+    const gsf__grad_job* job = (const gsf__grad_job*)arg;
+    const int64_t n = job->columns, begin = (int64_t)part * job->chunk_rows;
+    double *sums = job->sums + (int64_t)part * n, *products = job->products + (int64_t)part * n;
+    (void)worker;
+    memset(sums, 0, (size_t)n * sizeof(double));
+    memset(products, 0, (size_t)n * sizeof(double));
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
+        const float *x = job->x + r * n, *dy = job->dy + r * n;
+        const gsf__moments m = gsf__moments_scalar(x, n, job->centre);
+        const double inverse = 1.0 / sqrt(m.square / (double)n + (double)job->eps);
+        double mean = 0.0, slope = 0.0;
+        for (int pass = 0; pass < 2; pass++) {
+            for (int64_t i = 0; i < n; i++) {
+                const double normal = ((double)x[i] - m.mean) * inverse, d = (double)dy[i];
+                const double h = d * (job->weight ? (double)job->weight[i] : 1.0) *
+                                 (job->scale ? 1.0 + (double)job->scale[i] : 1.0);
+                if (pass) {
+                    job->dx[r * n + i] = (float)(inverse * (h - mean - normal * slope));
+                    continue;
+                }
+                mean += h;
+                slope += h * normal;
+                sums[i] += d;
+                products[i] += d * normal;
+            }
+            if (pass) break;
+            mean = job->centre ? mean / (double)n : 0.0;
+            slope /= (double)n;
+        }
+    }
+}
+
+// y = (normalised x * weight + bias) * (1 + scale) + shift over the last dimension: layer norm, adaptive layer norm, RMS norm
+GSF__SHARED gsf_result gsf__nn_norm_grad(gsf_context* ctx, const gsf__nn_norm_grad_desc* d) {
+    gsf__grad_job job;
+    size_t count;
+    memset(&job, 0, sizeof job);
+    if (d->rows < 0 || d->dim < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "norm: rows < 0 or dim < 1");
+    if (d->rows == 0) return GSF_OK;
+    job.x = d->x;
+    job.dy = d->dy;
+    job.dx = d->dx;
+    job.rows = d->rows;
+    job.columns = d->dim;
+    job.weight = d->by.weight;
+    job.scale = d->by.scale;
+    job.eps = d->eps;
+    job.centre = !d->rms;
+    job.chunk_rows = gsf__ceil_div(d->rows, GSF__GRAD_PARTS);
+    const size_t parts = gsf__nn_chunks(d->rows, job.chunk_rows);
+    if (!gsf__mul_size(2 * parts, (size_t)d->dim, &count))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "norm: %lld values per row", (long long)d->dim);
+    job.sums = (double*)gsf_alloc(ctx, count, sizeof(double));
+    if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
+    job.products = job.sums + count / 2;
+    gsf__parallel_for(ctx, parts, gsf__norm_grad_part, &job);
+    for (int64_t i = 0; i < d->dim; i++) {
+        double sum = 0.0, product = 0.0;
+        for (size_t part = 0; part < parts; part++) {
+            sum += job.sums[(int64_t)part * d->dim + i];
+            product += job.products[(int64_t)part * d->dim + i];
+        }
+        const double weight = d->by.weight ? (double)d->by.weight[i] : 1.0, bias = d->by.bias ? (double)d->by.bias[i] : 0.0;
+        const double scale = d->by.scale ? 1.0 + (double)d->by.scale[i] : 1.0;
+        if (d->dweight) d->dweight[i] += (float)(scale * product);
+        if (d->dbias) d->dbias[i] += (float)(scale * sum);
+        if (d->dscale) d->dscale[i] += (float)(weight * product + bias * sum);
+        if (d->dshift) d->dshift[i] += (float)sum;
+    }
+    gsf_free(ctx, job.sums);
+    return GSF_OK;
+}
+
+enum { GSF__GRAD_TILE = 32 };
+
+static void gsf__transpose_chunk(void* arg, size_t chunk, int32_t worker) { // GSF__GRAD_TILE columns
+    const gsf__grad_job* job = (const gsf__grad_job*)arg;
+    const size_t size = gsf_nn_get_dtype_size(job->dtype);
+    const int64_t first = (int64_t)chunk * GSF__GRAD_TILE, last = gsf__least(first + GSF__GRAD_TILE, job->columns);
+    (void)worker;
+    for (int64_t top = 0; top < job->rows; top += GSF__GRAD_TILE)
+        for (int64_t c = first; c < last; c++)
+            for (int64_t r = top; r < top + GSF__GRAD_TILE && r < job->rows; r++)
+                job->dx[c * job->rows + r] = gsf__nn_load(job->data + (size_t)(r * job->ld + c) * size, job->dtype);
+}
+
+// out (columns, rows) = the transpose of data (rows, columns) with row stride ld, widened to float
+static void gsf__nn_transpose(gsf_context* ctx, const void* data, gsf_nn_dtype dtype, int64_t rows, int64_t columns, int64_t ld,
+                              float* out) {
+    gsf__grad_job job;
+    memset(&job, 0, sizeof job);
+    job.data = (const char*)data;
+    job.dtype = dtype;
+    job.rows = rows;
+    job.columns = columns;
+    job.ld = ld;
+    job.dx = out;
+    gsf__parallel_for(ctx, (size_t)gsf__ceil_div(columns, GSF__GRAD_TILE), gsf__transpose_chunk, &job);
+}
+
+typedef struct gsf__nn_linear_grad_desc {
+    const float* x;            // (rows, in), row stride ldx
+    int64_t rows, ldx;         // ldx 0: in
+    const gsf_nn_tensor* weight; // (out, in); f32, bf16 or f16
+    const float* dy;           // (rows, out)
+    float* dx;                 // (rows, in) or NULL
+    float *dweight, *dbias;    // (out, in), (out), added to; each may be NULL
+} gsf__nn_linear_grad_desc;
+
+// y = x w^T + b: dx = dy w, dw = dy^T x, db = the sum of dy's rows
+GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linear_grad_desc* d) {
+    gsf__nn_linear_desc multiply;
+    int64_t in, out;
+    size_t inner, outer, product;
+    memset(&multiply, 0, sizeof multiply);
+    multiply.x = d->x;
+    multiply.rows = d->rows;
+    multiply.ldx = d->ldx;
+    multiply.weight = d->weight;
+    multiply.y = d->dx ? d->dx : d->dweight ? d->dweight : d->dbias;
+    GSF__TRY(gsf__check_linear(ctx, &multiply, &in, &out));
+    if (!d->dy) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "linear: dy is missing");
+    if (d->rows == 0) return GSF_OK;
+    if (!gsf__mul_size((size_t)in, (size_t)d->rows, &inner) || !gsf__mul_size((size_t)out, (size_t)d->rows, &outer) ||
+        inner > SIZE_MAX - outer)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "linear: %lld rows", (long long)d->rows);
+    product = (size_t)d->weight->count; // of the transposed weight, then of the transposed x and dy
+    float* scratch = (float*)gsf_alloc(ctx, inner + outer > product ? inner + outer : product, sizeof(float));
+    if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = GSF_OK;
+    if (d->dx) {
+        const int64_t shape[2] = {in, out};
+        const gsf_nn_tensor weight = gsf_nn_wrap_tensor(NULL, scratch, 2, shape);
+        gsf__nn_transpose(ctx, d->weight->data, d->weight->dtype, out, in, in, scratch);
+        memset(&multiply, 0, sizeof multiply);
+        multiply.x = d->dy;
+        multiply.rows = d->rows;
+        multiply.weight = &weight;
+        multiply.y = d->dx;
+        result = gsf__nn_run_linear(ctx, NULL, &multiply);
+    }
+    if (!result && d->dweight) {
+        const int64_t shape[2] = {in, d->rows};
+        const gsf_nn_tensor x = gsf_nn_wrap_tensor(NULL, scratch, 2, shape);
+        gsf__nn_transpose(ctx, d->x, GSF_NN_F32, d->rows, in, d->ldx ? d->ldx : in, scratch);
+        gsf__nn_transpose(ctx, d->dy, GSF_NN_F32, d->rows, out, out, scratch + inner);
+        memset(&multiply, 0, sizeof multiply);
+        multiply.x = scratch + inner;
+        multiply.rows = out;
+        multiply.weight = &x;
+        multiply.accumulate = 1;
+        multiply.y = d->dweight;
+        result = gsf__nn_run_linear(ctx, NULL, &multiply);
+    }
+    gsf_free(ctx, scratch);
+    for (int64_t c = 0; !result && d->dbias && c < out; c++) {
+        double sum = 0.0;
+        for (int64_t r = 0; r < d->rows; r++) sum += (double)d->dy[r * out + c];
+        d->dbias[c] += (float)sum;
+    }
+    return result;
+}
+
+#endif // GSF_NN_TRAINING
 
 GSF__END_IMPLEMENTATION
 

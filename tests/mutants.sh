@@ -38,6 +38,11 @@ gsfixer_nn.h|golden_restorer|RoPE: frequencies of the next pair|s/exponent = \(f
 gsfixer_nn.h|golden_restorer|adaLN: the text takes the video's shift and scale|s/m \+ 4 \* d, m \+ 3 \* d/m + d, m/
 gsfixer_nn.h|golden_restorer|schedule: betas are not rescaled to zero terminal SNR|s/no_zero_snr = !rescale/no_zero_snr = 1/
 gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/
+gsfixer_nn.h|test_nn_training|gradients: SiLU without its second term|s/return s \* \(1\.0 \+ x \* \(1\.0 - s\)\);/return s;/
+gsfixer_nn.h|test_nn_training|gradients: softmax as if its values were independent|s/\(\(double\)dy\[i\] - sum\)/(double)dy[i]/
+gsfixer_nn.h|test_nn_training|gradients: the mean of a norm is taken as constant|s/\(h - mean - normal \* slope\)/(h - normal * slope)/
+gsfixer_nn.h|test_nn_training|gradients: a norm's scale without its bias|s/weight \* product \+ bias \* sum\)/weight * product)/
+gsfixer_nn.h|test_nn_training|gradients: rows of x taken without their stride|s/d->ldx \? d->ldx : in, scratch\);/in, scratch);/
 END
 }
 

@@ -1,0 +1,194 @@
+// Gradients of layers against central differences of the layers in double: odd sizes, single rows, strides, optional vectors,
+// all instruction sets; bit-identical for any number of workers; failing allocations. Prints the worst relative L2 errors.
+#define GSF_NN_TRAINING
+#define GSFIXER_IMPLEMENTATION
+#include "gsfixer_nn.h"
+
+#include "test.h"
+#include "test_hooks.h"
+
+enum { LINEAR, NORM, SOFTMAX, ACTIVATE, KINDS };
+static const char* const kind_names[KINDS] = {"linear", "norm", "softmax", "activation"};
+static double worst[KINDS];
+static uint64_t seed = 1;
+
+// A layer in double and its loss, the sum of y * dy. p: x, weight, bias, scale, shift, one after another from `at`.
+typedef struct made {
+    int kind, option;          // option: bits of the norm's vectors and RMS; the activation
+    int64_t rows, in, out, gap, at[6];
+    double* p;
+    float *values, *dy, *grad, *spare; // grad: as p
+} made;
+
+static double activation_of(int activation, double x) {
+    switch (activation) {
+        case GSF__NN_GELU_TANH: return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
+        case GSF__NN_SILU: return x / (1.0 + exp(-x));
+        case GSF__NN_GELU: return 0.5 * x * erfc(-x / sqrt(2.0));
+        case GSF__NN_RELU: return x > 0.0 ? x : 0.0;
+        default: return x;
+    }
+}
+
+static double loss(const made* m) {
+    double total = 0.0;
+    for (int64_t r = 0; r < m->rows; r++) {
+        const double *x = m->p + r * (m->in + m->gap), *v[4];
+        const float* dy = m->dy + r * m->out;
+        double mean = 0.0, square = 0.0, sum = 0.0;
+        for (int i = 0; i < 4; i++) v[i] = m->p + m->at[i + 1];
+        for (int64_t i = 0; i < m->in; i++) mean += x[i] / (double)m->in;
+        if (m->option & 16) mean = 0.0;
+        for (int64_t i = 0; i < m->in; i++) square += (x[i] - mean) * (x[i] - mean) / (double)m->in;
+        for (int64_t i = 0; i < m->in; i++) sum += exp(0.7 * x[i]);
+        for (int64_t o = 0; o < m->out; o++) {
+            double y = 0.0;
+            if (m->kind == LINEAR) {
+                y = v[1][o];
+                for (int64_t i = 0; i < m->in; i++) y += x[i] * v[0][o * m->in + i];
+            } else if (m->kind == NORM) {
+                y = (x[o] - mean) / sqrt(square + (double)1e-5f);
+                y = y * (m->option & 1 ? v[0][o] : 1.0) + (m->option & 2 ? v[1][o] : 0.0);
+                y = y * (m->option & 4 ? 1.0 + v[2][o] : 1.0) + (m->option & 8 ? v[3][o] : 0.0);
+            } else if (m->kind == SOFTMAX) y = exp(0.7 * x[o]) / sum;
+            else y = activation_of(m->option, x[o]);
+            total += y * (double)dy[o];
+        }
+    }
+    return total;
+}
+
+static made make(int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, int option) {
+    made m = {kind, option, rows, in, out, gap, {0}, NULL, NULL, NULL, NULL, NULL};
+    m.at[1] = rows * (in + gap);
+    m.at[2] = m.at[1] + (kind == LINEAR ? in * out : out);
+    for (int i = 3; i < 6; i++) m.at[i] = m.at[i - 1] + out;
+    const size_t count = (size_t)m.at[5], results = (size_t)(rows * out);
+    m.p = (double*)malloc(count * sizeof(double));
+    m.values = (float*)malloc(count * sizeof(float));
+    m.grad = (float*)calloc(count, sizeof(float));
+    m.spare = (float*)malloc(results * sizeof(float));
+    m.dy = (float*)malloc(results * sizeof(float));
+    for (size_t i = 0; i < count; i++) m.p[i] = (double)(m.values[i] = (float)test_random_in(&seed, -2.0, 2.0));
+    for (size_t i = 0; i < results; i++) m.dy[i] = (float)test_random_in(&seed, -1.0, 1.0);
+    return m;
+}
+
+static void free_made(made* m) {
+    free(m->p); free(m->values); free(m->grad); free(m->spare); free(m->dy);
+}
+
+static gsf_result backward(gsf_context* ctx, const made* m) {
+    const float* v[6];
+    float* g[6];
+    for (int i = 0; i < 6; i++) {
+        v[i] = m->values + m->at[i];
+        g[i] = m->grad + m->at[i];
+    }
+    memset(m->grad, 0, (size_t)m->at[5] * sizeof(float));
+    if (m->kind == LINEAR) {
+        const int64_t shape[2] = {m->out, m->in};
+        const gsf_nn_tensor weight = gsf_nn_wrap_tensor("weight", v[1], 2, shape);
+        float* dx = m->gap ? NULL : m->grad; // with a gap only the weights' gradients
+        const gsf__nn_linear_grad_desc d = {v[0], m->rows, m->in + m->gap, &weight, m->dy, dx, g[1], g[2]};
+        return gsf__nn_linear_grad(ctx, &d);
+    }
+    if (m->kind == NORM) {
+        const int o = m->option;
+        const gsf__nn_norm_grad_desc d = {v[0], m->rows, m->in, {o & 1 ? v[1] : NULL, o & 2 ? v[2] : NULL,
+                                          o & 4 ? v[3] : NULL, o & 8 ? v[4] : NULL}, 1e-5f, o & 16, m->dy, g[0],
+                                          o & 1 ? g[1] : NULL, o & 2 ? g[2] : NULL, o & 4 ? g[3] : NULL, o & 8 ? g[4] : NULL};
+        return gsf__nn_norm_grad(ctx, &d);
+    }
+    if (m->kind == SOFTMAX) {
+        gsf__nn_softmax(ctx, v[0], m->rows, m->in, 0.7f, m->spare);
+        gsf__nn_softmax_grad(ctx, m->spare, m->dy, m->rows, m->in, 0.7f, g[0]);
+    } else gsf__nn_activate_grad(ctx, (gsf__nn_activation)m->option, v[0], m->dy, m->rows * m->in, g[0]);
+    return GSF_OK;
+}
+
+static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t out, int64_t gap, int option) {
+    made m = make(kind, rows, in, out, gap, option);
+    CHECK_OK(ctx, backward(ctx, &m));
+    double scale = 0.0; // of all gradients of the layer: some are zero or nearly so
+    double error = 0.0;
+    for (int64_t i = gap ? m.at[1] : 0; i < m.at[5]; i++) {
+        const double before = m.p[i], step = 1e-4;
+        m.p[i] = before + step;
+        const double above = loss(&m);
+        m.p[i] = before - step;
+        const double slope = (above - loss(&m)) / (2.0 * step);
+        m.p[i] = before;
+        if (kind == ACTIVATE && option == GSF__NN_RELU && fabs(before) < 2.0 * step) continue;
+        scale += slope * slope;
+        error += (slope - (double)m.grad[i]) * (slope - (double)m.grad[i]);
+    }
+    error = scale > 0.0 ? sqrt(error / scale) : sqrt(error);
+    if (error > worst[kind]) worst[kind] = error;
+    CHECK_NEAR(error, 0.0, 1e-5);
+    gsf_context others; // workers in another order
+    memset(&others, 0, sizeof others);
+    others.cpu_level = ctx->cpu_level;
+    work_backwards(&others);
+    CHECK_OK(&others, gsf_init_context(&others));
+    made again = m;
+    again.grad = (float*)malloc((size_t)m.at[5] * sizeof(float));
+    CHECK_OK(&others, backward(&others, &again));
+    CHECK(memcmp(again.grad, m.grad, (size_t)m.at[5] * sizeof(float)) == 0);
+    free(again.grad);
+    free_made(&m);
+}
+
+static void test_memory(void) {
+    counter count;
+    memset(&count, 0, sizeof count);
+    gsf_context ctx;
+    test_context_zero(&ctx);
+    count_memory(&ctx, &count);
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    for (int kind = LINEAR; kind <= NORM; kind++) {
+        made m = make(kind, 9, 20, 20, 0, 15);
+        for (size_t k = 1;; k++) {
+            count.calls = 0;
+            count.fail_at = k;
+            const gsf_result result = backward(&ctx, &m);
+            CHECK(count.live == 0);
+            if (result == GSF_OK) break;
+            if (!CHECK(result == GSF_ERROR_OUT_OF_MEMORY)) break;
+        }
+        count.fail_at = 0;
+        m.rows = -1;
+        CHECK_RESULT(&ctx, backward(&ctx, &m), GSF_ERROR_INVALID_ARGUMENT);
+        free_made(&m);
+    }
+}
+
+int main(void) {
+    gsf_context ctx;
+    test_context_init(&ctx);
+    const gsf_cpu_level best = ctx.cpu_level;
+    static const int64_t sizes[][2] = {{1, 1}, {1, 17}, {2, 8}, {5, 33}, {67, 7}};
+    for (int level = GSF_CPU_SCALAR; level <= (int)best; level++) {
+        memset(&ctx, 0, sizeof ctx);
+        ctx.cpu_level = (gsf_cpu_level)level;
+        CHECK_OK(&ctx, gsf_init_context(&ctx));
+        if ((int)ctx.cpu_level != level) continue;
+        for (size_t i = 0; i < GSF__COUNT(sizes); i++) {
+            const int64_t rows = sizes[i][0], in = sizes[i][1];
+            check(&ctx, LINEAR, rows, in, 1, 0, 0);
+            check(&ctx, LINEAR, rows, in, 19, 0, 0);
+            check(&ctx, LINEAR, rows, in, 13, 3, 0);
+            if (in > 1) { // the norm of a single value is constant
+                check(&ctx, NORM, rows, in, in, 0, 0);
+                check(&ctx, NORM, rows, in, in, 0, 3);
+                check(&ctx, NORM, rows, in, in, 0, 15);
+                check(&ctx, NORM, rows, in, in, 0, 17);
+                check(&ctx, SOFTMAX, rows, in, in, 0, 0);
+            }
+            for (int a = GSF__NN_LINEAR; a <= GSF__NN_RELU; a++) check(&ctx, ACTIVATE, rows, in, in, 0, a);
+        }
+    }
+    test_memory();
+    for (int kind = 0; kind < KINDS; kind++) printf("%-10s worst relative L2 error %.2e\n", kind_names[kind], worst[kind]);
+    return test_report();
+}
