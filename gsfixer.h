@@ -866,6 +866,49 @@ GSF__SHARED void gsf__mat4_rigid_inverse(const double m[16], double out[16]) {
     memcpy(out, inv, sizeof inv);
 }
 
+// Eigenvalues of a symmetric 3x3 matrix (row-major), descending, and unit eigenvectors as rows. Cyclic Jacobi:
+// eigenvectors are products of plane rotations, so they are orthonormal up to rounding for any matrix.
+GSF__SHARED void gsf__mat3_eigen(const double matrix[9], double values[3], double rows[9]) {
+    double a[9], v[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+    memcpy(a, matrix, sizeof a);
+    for (int sweep = 0; sweep < 64; sweep++) {
+        const double off = fabs(a[1]) + fabs(a[2]) + fabs(a[5]);
+        if (!(off > 1e-300) || off < 1e-20 * (fabs(a[0]) + fabs(a[4]) + fabs(a[8]))) break;
+        for (int p = 0; p < 2; p++)
+            for (int q = p + 1; q < 3; q++) {
+                const double apq = a[3 * p + q];
+                if (apq == 0.0) continue;
+                const double half = 0.5 * (a[4 * q] - a[4 * p]) / apq;
+                const double t = (half < 0.0 ? -1.0 : 1.0) / (fabs(half) + sqrt(half * half + 1.0));
+                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
+                const int r = 3 - p - q;
+                const double arp = a[3 * r + p], arq = a[3 * r + q];
+                a[4 * p] -= t * apq;
+                a[4 * q] += t * apq;
+                a[3 * p + q] = a[3 * q + p] = 0.0;
+                a[3 * r + p] = a[3 * p + r] = c * arp - s * arq;
+                a[3 * r + q] = a[3 * q + r] = s * arp + c * arq;
+                for (int i = 0; i < 3; i++) {
+                    const double vp = v[3 * p + i], vq = v[3 * q + i];
+                    v[3 * p + i] = c * vp - s * vq;
+                    v[3 * q + i] = s * vp + c * vq;
+                }
+            }
+    }
+    int order[3] = {0, 1, 2};
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 2 - i; j++)
+            if (a[4 * order[j]] < a[4 * order[j + 1]]) {
+                const int swap = order[j];
+                order[j] = order[j + 1];
+                order[j + 1] = swap;
+            }
+    for (int i = 0; i < 3; i++) {
+        values[i] = a[4 * order[i]];
+        memcpy(rows + 3 * i, v + 3 * order[i], 3 * sizeof(double));
+    }
+}
+
 GSF__SHARED void gsf__camera_transform(const gsf_camera* camera, const double point[3], double out[3]) {
     const double* m = camera->w2c;
     for (int r = 0; r < 3; r++) out[r] = m[r] * point[0] + m[4 + r] * point[1] + m[8 + r] * point[2] + m[12 + r];
@@ -1042,6 +1085,8 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define gsf__vi_index GSF__V(gsf__vi_index)         // 0 1 2 ...
 #define gsf__vi_load GSF__V(gsf__vi_load)
 #define gsf__vi_store GSF__V(gsf__vi_store)
+#define gsf__vi_gather GSF__V(gsf__vi_gather)       // p[i]
+#define gsf__vi_byte GSF__V(gsf__vi_byte)           // byte k of each lane, 0 the lowest; 0..255
 #define gsf__vi_store_pairs GSF__V(gsf__vi_store_pairs) // a[0] b[0] a[1] b[1] ...
 #define gsf__vi_add GSF__V(gsf__vi_add)
 #define gsf__vi_sub GSF__V(gsf__vi_sub)
@@ -1125,6 +1170,8 @@ GSF__SHARED inline int32_t gsf__vi_set_scalar(int32_t x) { return x; }
 GSF__SHARED inline int32_t gsf__vi_index_scalar(void) { return 0; }
 GSF__SHARED inline int32_t gsf__vi_load_scalar(const int32_t* p) { return *p; }
 GSF__SHARED inline void gsf__vi_store_scalar(int32_t* p, int32_t x) { *p = x; }
+GSF__SHARED inline int32_t gsf__vi_gather_scalar(const uint32_t* p, int32_t i) { return (int32_t)p[i]; }
+GSF__SHARED inline int32_t gsf__vi_byte_scalar(int32_t x, int k) { return (int32_t)((uint32_t)x >> 8 * k & 255u); }
 GSF__SHARED inline void gsf__vi_store_pairs_scalar(int32_t* p, int32_t a, int32_t b) {
     p[0] = a;
     p[1] = b;
@@ -1179,6 +1226,12 @@ GSF__INLINE_AVX2 __m256i gsf__vi_set_avx2(int32_t x) { return _mm256_set1_epi32(
 GSF__INLINE_AVX2 __m256i gsf__vi_index_avx2(void) { return _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7); }
 GSF__INLINE_AVX2 __m256i gsf__vi_load_avx2(const int32_t* p) { return _mm256_loadu_si256((const __m256i*)(const void*)p); }
 GSF__INLINE_AVX2 void gsf__vi_store_avx2(int32_t* p, __m256i x) { _mm256_storeu_si256((__m256i*)(void*)p, x); }
+GSF__INLINE_AVX2 __m256i gsf__vi_gather_avx2(const uint32_t* p, __m256i i) {
+    return _mm256_i32gather_epi32((const int*)(const void*)p, i, 4);
+}
+GSF__INLINE_AVX2 __m256i gsf__vi_byte_avx2(__m256i x, int k) {
+    return _mm256_and_si256(_mm256_srli_epi32(x, 8 * k), _mm256_set1_epi32(255));
+}
 GSF__INLINE_AVX2 void gsf__vi_store_pairs_avx2(int32_t* p, __m256i a, __m256i b) {
     const __m256i low = _mm256_unpacklo_epi32(a, b), high = _mm256_unpackhi_epi32(a, b);
     gsf__vi_store_avx2(p, _mm256_permute2x128_si256(low, high, 0x20));
@@ -1325,6 +1378,9 @@ GSF__INLINE_AVX512 __m512i gsf__vi_index_avx512(void) {
 }
 GSF__INLINE_AVX512 __m512i gsf__vi_load_avx512(const int32_t* p) { return _mm512_loadu_si512(p); }
 GSF__INLINE_AVX512 void gsf__vi_store_avx512(int32_t* p, __m512i x) { _mm512_storeu_si512(p, x); }
+GSF__INLINE_AVX512 __m512i gsf__vi_byte_avx512(__m512i x, int k) {
+    return _mm512_and_si512(_mm512_srli_epi32(x, (unsigned)(8 * k)), _mm512_set1_epi32(255));
+}
 GSF__INLINE_AVX512 void gsf__vi_store_pairs_avx512(int32_t* p, __m512i a, __m512i b) {
     const __m512i first = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
     const __m512i second = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
@@ -1407,6 +1463,9 @@ GSF__INLINE_AVX512 void gsf__v_transpose_avx512(__m512 m[16]) {
 #pragma GCC diagnostic ignored "-Wsign-conversion"
 #endif
 GSF__INLINE_AVX512 __m512 gsf__v_gather_avx512(const float* p, __m512i i) { return _mm512_i32gather_ps(i, p, 4); }
+GSF__INLINE_AVX512 __m512i gsf__vi_gather_avx512(const uint32_t* p, __m512i i) {
+    return _mm512_castps_si512(gsf__v_gather_avx512((const float*)(const void*)p, i));
+}
 GSF__INLINE_AVX512 __m512 gsf__v_round_avx512(__m512 x) {
     return _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
 }

@@ -4605,41 +4605,6 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
     return GSF_OK;
 }
 
-// Computes the unit eigenvector of the smallest eigenvalue of a symmetric 3x3 matrix by Jacobi rotations. Overwrites a.
-static void gsf__smallest_eigenvector(double a[3][3], double out[3]) {
-    double v[3][3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
-    for (int sweep = 0; sweep < 12; sweep++) {
-        const double off = fabs(a[0][1]) + fabs(a[0][2]) + fabs(a[1][2]);
-        if (!(off > 1e-14 * (a[0][0] + a[1][1] + a[2][2]))) break;
-        for (int p = 0; p < 2; p++)
-            for (int q = p + 1; q < 3; q++) {
-                if (a[p][q] == 0.0) continue;
-                const double theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-                const double t = (theta < 0.0 ? -1.0 : 1.0) / (fabs(theta) + sqrt(theta * theta + 1.0));
-                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
-                for (int k = 0; k < 3; k++) { // columns p, q
-                    const double x = a[k][p], y = a[k][q];
-                    a[k][p] = c * x - s * y;
-                    a[k][q] = s * x + c * y;
-                }
-                for (int k = 0; k < 3; k++) { // rows p, q
-                    const double x = a[p][k], y = a[q][k];
-                    a[p][k] = c * x - s * y;
-                    a[q][k] = s * x + c * y;
-                }
-                for (int k = 0; k < 3; k++) {
-                    const double x = v[k][p], y = v[k][q];
-                    v[k][p] = c * x - s * y;
-                    v[k][q] = s * x + c * y;
-                }
-            }
-    }
-    int least = 0;
-    for (int k = 1; k < 3; k++)
-        if (a[k][k] < a[least][least]) least = k;
-    for (int k = 0; k < 3; k++) out[k] = v[k][least];
-}
-
 typedef struct gsf__disc_job {
     const gsf__knn_tree* tree;
     const gsf_visibility_desc* desc;
@@ -4659,7 +4624,7 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
         size_t places[GSF__KNN_MAX];
         const int found = gsf__knn_query(tree, p, i, wanted, distance2, places);
         const int used = found < job->desc->neighbours ? found : job->desc->neighbours;
-        double mean[3] = {0.0, 0.0, 0.0}, cov[3][3]; // of the point p and its neighbours; mean is relative to p
+        double mean[3] = {0.0, 0.0, 0.0}, cov[9]; // of the point p and its neighbours; mean is relative to p
         memset(cov, 0, sizeof cov);
         for (int k = 0; k < used; k++)
             for (int a = 0; a < 3; a++) mean[a] += (tree->points[3 * places[k] + (size_t)a] - p[a]) / (used + 1);
@@ -4667,10 +4632,11 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
             double d[3];
             for (int a = 0; a < 3; a++) d[a] = (k < 0 ? 0.0 : tree->points[3 * places[k] + (size_t)a] - p[a]) - mean[a];
             for (int a = 0; a < 3; a++)
-                for (int b = 0; b < 3; b++) cov[a][b] += d[a] * d[b];
+                for (int b = 0; b < 3; b++) cov[3 * a + b] += d[a] * d[b];
         }
-        double normal[3];
-        gsf__smallest_eigenvector(cov, normal);
+        double values[3], axes[9];
+        gsf__mat3_eigen(cov, values, axes);
+        const double* normal = axes + 6; // the direction of least variance
         uint32_t* nearest = job->discs->nearest + (size_t)job->discs->near_count * i;
         for (int k = 0; k < used; k++) nearest[k] = (uint32_t)places[k];
         const int at = found < job->desc->radius_neighbour ? found : job->desc->radius_neighbour;
@@ -5316,56 +5282,46 @@ struct gsf__hider { // a disc that may hide points, relative to the eye
 
 enum { GSF__VIS_HIDERS = 32, GSF__VIS_QUEUE = 128 };
 
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_HIDE
+#include "gsfixer.h"
+#undef GSF__KERNELS_HIDE
+#endif // GSF_USE_EMBREE
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_HIDE
+
 // Adds a lower bound of the disc's cover to each ray. Returns bits 0-7: the disc covers the ray; 8-15: the ray is not
 // yet proved hidden.
-static int gsf__hide8_scalar(gsf__rays8* rays, const gsf__hider* hider) {
+GSF__V_KERNEL int GSF__V(gsf__hide8)(gsf__rays8* rays, const gsf__hider* hider) {
     const float *c = hider->center, *n = hider->normal;
-    int bits = 0;
-    for (int l = 0; l < 8; l++) {
-        const float x = rays->direction[0][l], y = rays->direction[1][l], z = rays->direction[2][l];
-        const float inverse = 1.0f / (x * n[0] + y * n[1] + z * n[2]), t = hider->plane * inverse;
-        const float error = 1e-6f * rays->distance[l] * fabsf(inverse);
-        const float gap = rays->distance[l] - t - (rays->own[l] > hider->reach ? rays->own[l] : hider->reach);
-        const float qx = t * x - c[0], qy = t * y - c[1], qz = t * z - c[2];
-        const float q2 = 1.01f * (qx * qx + qy * qy + qz * qz) + 101.0f * error * error; // >= (q + error)^2
-        const float cover = 1.0f - q2 * hider->inverse2;
-        if (t > error && gap > 2.0f * error && cover > 0.0f) {
-            rays->cover[l] += cover;
-            bits |= 1 << l;
-        }
-        bits |= (rays->cover[l] < rays->need[l]) << (8 + l);
+    const gsf__vf one = gsf__v_set(1.0f), zero = gsf__v_set(0.0f);
+    uint32_t bits = 0;
+    for (int l = 0; l < 8; l += GSF__LANES) {
+        const gsf__vf distance = gsf__v_load(rays->distance + l), x = gsf__v_load(rays->direction[0] + l);
+        const gsf__vf y = gsf__v_load(rays->direction[1] + l), z = gsf__v_load(rays->direction[2] + l);
+        const gsf__vf slope = gsf__v_madd(x, gsf__v_set(n[0]), gsf__v_madd(y, gsf__v_set(n[1]), z * gsf__v_set(n[2])));
+        const gsf__vf inverse = one / slope, t = gsf__v_set(hider->plane) * inverse;
+        const gsf__vf error = gsf__v_set(1e-6f) * distance * gsf__v_abs(inverse);
+        const gsf__vf gap = distance - t - gsf__v_max(gsf__v_load(rays->own + l), gsf__v_set(hider->reach));
+        const gsf__vf qx = gsf__v_msub(t, x, gsf__v_set(c[0])), qy = gsf__v_msub(t, y, gsf__v_set(c[1]));
+        const gsf__vf qz = gsf__v_msub(t, z, gsf__v_set(c[2]));
+        const gsf__vf length2 = gsf__v_madd(qx, qx, gsf__v_madd(qy, qy, qz * qz));
+        const gsf__vf q2 = gsf__v_madd(gsf__v_set(1.01f), length2, // >= (q + error)^2
+                                       gsf__v_set(101.0f) * (error * error));
+        const gsf__vf cover = gsf__v_nmadd(q2, gsf__v_set(hider->inverse2), one);
+        const gsf__vm hit = gsf__vm_and(gsf__v_gt(t, error),
+                                        gsf__vm_and(gsf__v_gt(gap, error + error), gsf__v_gt(cover, zero)));
+        const gsf__vf sum = gsf__v_load(rays->cover + l) + gsf__v_keep(hit, cover);
+        gsf__v_store(rays->cover + l, sum);
+        bits |= gsf__vm_bits(hit) << l | gsf__vm_bits(gsf__v_lt(sum, gsf__v_load(rays->need + l))) << (8 + l);
     }
-    return bits;
+    return (int)bits;
 }
 
-#if GSF__X86
-GSF__TARGET_AVX2 static int gsf__hide8_avx2(gsf__rays8* rays, const gsf__hider* hider) {
-    const float *c = hider->center, *n = hider->normal;
-    const __m256 one = _mm256_set1_ps(1.0f), zero = _mm256_setzero_ps(), distance = _mm256_loadu_ps(rays->distance);
-    const __m256 x = _mm256_loadu_ps(rays->direction[0]), y = _mm256_loadu_ps(rays->direction[1]);
-    const __m256 z = _mm256_loadu_ps(rays->direction[2]);
-    const __m256 slope = _mm256_fmadd_ps(x, _mm256_set1_ps(n[0]),
-                         _mm256_fmadd_ps(y, _mm256_set1_ps(n[1]), _mm256_mul_ps(z, _mm256_set1_ps(n[2]))));
-    const __m256 inverse = _mm256_div_ps(one, slope), t = _mm256_mul_ps(_mm256_set1_ps(hider->plane), inverse);
-    const __m256 error = _mm256_mul_ps(_mm256_mul_ps(_mm256_set1_ps(1e-6f), distance),
-                                       _mm256_andnot_ps(_mm256_set1_ps(-0.0f), inverse));
-    const __m256 gap = _mm256_sub_ps(_mm256_sub_ps(distance, t),
-                                     _mm256_max_ps(_mm256_loadu_ps(rays->own), _mm256_set1_ps(hider->reach)));
-    const __m256 qx = _mm256_fmsub_ps(t, x, _mm256_set1_ps(c[0])), qy = _mm256_fmsub_ps(t, y, _mm256_set1_ps(c[1]));
-    const __m256 qz = _mm256_fmsub_ps(t, z, _mm256_set1_ps(c[2]));
-    const __m256 length2 = _mm256_fmadd_ps(qx, qx, _mm256_fmadd_ps(qy, qy, _mm256_mul_ps(qz, qz)));
-    const __m256 q2 = _mm256_fmadd_ps(_mm256_set1_ps(1.01f), length2,
-                                      _mm256_mul_ps(_mm256_set1_ps(101.0f), _mm256_mul_ps(error, error)));
-    const __m256 cover = _mm256_fnmadd_ps(q2, _mm256_set1_ps(hider->inverse2), one);
-    const __m256 hit = _mm256_and_ps(_mm256_cmp_ps(t, error, _CMP_GT_OQ),
-                                     _mm256_and_ps(_mm256_cmp_ps(gap, _mm256_add_ps(error, error), _CMP_GT_OQ),
-                                                   _mm256_cmp_ps(cover, zero, _CMP_GT_OQ)));
-    const __m256 sum = _mm256_add_ps(_mm256_loadu_ps(rays->cover), _mm256_and_ps(cover, hit));
-    _mm256_storeu_ps(rays->cover, sum);
-    return _mm256_movemask_ps(hit) |
-           _mm256_movemask_ps(_mm256_cmp_ps(sum, _mm256_loadu_ps(rays->need), _CMP_LT_OQ)) << 8;
-}
-#endif
+#endif // GSF__KERNELS_HIDE
+#ifndef GSF__ISA
+#ifdef GSF_USE_EMBREE
 
 typedef struct gsf__embree_query { // starts with Embree's context, whose address Embree passes to the filter
 #if RTC_VERSION_MAJOR < 4
@@ -5810,100 +5766,74 @@ static float gsf__dense_correlate(const gsf__dense_patch* patch, const float sum
     return cost < 0.0f ? 0.0f : cost < GSF__DENSE_BAD ? cost : GSF__DENSE_BAD;
 }
 
-// Keeps eight partial sums and adds them in the order of the AVX2 version, so that both give the same bits.
-static float gsf__dense_cost_scalar(const gsf__dense_window* window, const gsf__dense_patch* patch,
-                                    const gsf__dense_warp* warp) {
-    float lanes[6][8], sums[6];
-    memset(lanes, 0, sizeof lanes);
-    const float u_max = (float)(warp->width - 1), v_max = (float)(warp->height - 1);
-    for (int i = 0; i < window->count; i++) {
-        const float dx = window->dx[i], dy = window->dy[i];
-        const float X = warp->middle[0] + dx * warp->along_x[0] + dy * warp->along_y[0];
-        const float Y = warp->middle[1] + dx * warp->along_x[1] + dy * warp->along_y[1];
-        const float Z = warp->middle[2] + dx * warp->along_x[2] + dy * warp->along_y[2];
-        const float inv = 1.0f / Z, u = X * inv, v = Y * inv;
-        if (!(Z > 0.0f && u >= 0.0f && u <= u_max && v >= 0.0f && v <= v_max)) continue;
-        const int32_t iu = (int32_t)u, iv = (int32_t)v;
-        const float fu = u - (float)iu, fv = v - (float)iv;
-        const uint32_t texel = warp->texels[iv * warp->width + iu];
-        const float a = (float)(texel & 255u), b = (float)(texel >> 8 & 255u);
-        const float c = (float)(texel >> 16 & 255u), d = (float)(texel >> 24);
-        const float top = a + fu * (b - a), bottom = c + fu * (d - c);
-        const float s = top + fv * (bottom - top) - patch->center;
-        const float weight = patch->weight[i], r = patch->value[i];
-        const float wr = weight * r, ws = weight * s;
-        const int lane = i & 7;
-        lanes[0][lane] += weight;
-        lanes[1][lane] += wr;
-        lanes[2][lane] += wr * r;
-        lanes[3][lane] += ws;
-        lanes[4][lane] += ws * s;
-        lanes[5][lane] += wr * s;
-    }
-    for (int k = 0; k < 6; k++) {
-        const float* p = lanes[k];
-        sums[k] = ((p[0] + p[1]) + (p[2] + p[3])) + ((p[4] + p[5]) + (p[6] + p[7]));
-    }
-    return gsf__dense_correlate(patch, sums);
+#define gsf__dense_part GSF__V(gsf__dense_part)
+
+#define GSF__KERNELS "gsfixer_splat.h"
+#define GSF__KERNELS_STEREO
+#include "gsfixer.h"
+#undef GSF__KERNELS_STEREO
+
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_STEREO
+
+// Partial sum i of the sums k, k + 1, ... k + GSF__LANES - 1, which have been transposed.
+GSF__V_INLINE gsf__vf gsf__dense_part(gsf__vf sums[8 / GSF__LANES][8], int k, int i) {
+    return sums[i / GSF__LANES][k + i % GSF__LANES];
 }
 
-#if GSF__X86
-// Without fused multiply-adds, so that the result has the same bits as the scalar version.
-__attribute__((target("avx2"))) static float gsf__dense_cost_avx2(const gsf__dense_window* window,
-                                                                  const gsf__dense_patch* patch,
-                                                                  const gsf__dense_warp* warp) {
-    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f);
-    const __m256 u_max = _mm256_set1_ps((float)(warp->width - 1)), v_max = _mm256_set1_ps((float)(warp->height - 1));
-    const __m256i width = _mm256_set1_epi32(warp->width), byte = _mm256_set1_epi32(255);
-    const __m256 x0 = _mm256_set1_ps(warp->middle[0]), xx = _mm256_set1_ps(warp->along_x[0]);
-    const __m256 xy = _mm256_set1_ps(warp->along_y[0]);
-    const __m256 y0 = _mm256_set1_ps(warp->middle[1]), yx = _mm256_set1_ps(warp->along_x[1]);
-    const __m256 yy = _mm256_set1_ps(warp->along_y[1]);
-    const __m256 z0 = _mm256_set1_ps(warp->middle[2]), zx = _mm256_set1_ps(warp->along_x[2]);
-    const __m256 zy = _mm256_set1_ps(warp->along_y[2]);
-    const __m256 center = _mm256_set1_ps(patch->center);
-    __m256 sw = zero, sr = zero, srr = zero, ss = zero, sss = zero, srs = zero;
-    for (int i = 0; i < window->count; i += 8) {
-        const __m256 dx = _mm256_loadu_ps(window->dx + i), dy = _mm256_loadu_ps(window->dy + i);
-        const __m256 X = _mm256_add_ps(_mm256_add_ps(x0, _mm256_mul_ps(dx, xx)), _mm256_mul_ps(dy, xy));
-        const __m256 Y = _mm256_add_ps(_mm256_add_ps(y0, _mm256_mul_ps(dx, yx)), _mm256_mul_ps(dy, yy));
-        const __m256 Z = _mm256_add_ps(_mm256_add_ps(z0, _mm256_mul_ps(dx, zx)), _mm256_mul_ps(dy, zy));
-        const __m256 inv = _mm256_div_ps(one, Z);
-        __m256 u = _mm256_mul_ps(X, inv), v = _mm256_mul_ps(Y, inv);
-        __m256 inside = _mm256_and_ps(_mm256_cmp_ps(u, zero, _CMP_GE_OQ), _mm256_cmp_ps(u, u_max, _CMP_LE_OQ));
-        inside = _mm256_and_ps(inside, _mm256_cmp_ps(v, zero, _CMP_GE_OQ));
-        inside = _mm256_and_ps(inside, _mm256_cmp_ps(v, v_max, _CMP_LE_OQ));
-        inside = _mm256_and_ps(inside, _mm256_cmp_ps(Z, zero, _CMP_GT_OQ));
-        u = _mm256_and_ps(u, inside); // samples outside read the first texel with weight 0
-        v = _mm256_and_ps(v, inside);
-        const __m256i iu = _mm256_cvttps_epi32(u), iv = _mm256_cvttps_epi32(v);
-        const __m256 fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(iu)), fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(iv));
-        const __m256i at = _mm256_add_epi32(_mm256_mullo_epi32(iv, width), iu);
-        const __m256i texel = _mm256_i32gather_epi32((const int*)(const void*)warp->texels, at, 4);
-        const __m256 a = _mm256_cvtepi32_ps(_mm256_and_si256(texel, byte));
-        const __m256 b = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32(texel, 8), byte));
-        const __m256 c = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32(texel, 16), byte));
-        const __m256 d = _mm256_cvtepi32_ps(_mm256_srli_epi32(texel, 24));
-        const __m256 top = _mm256_add_ps(a, _mm256_mul_ps(fu, _mm256_sub_ps(b, a)));
-        const __m256 bottom = _mm256_add_ps(c, _mm256_mul_ps(fu, _mm256_sub_ps(d, c)));
-        const __m256 s = _mm256_sub_ps(_mm256_add_ps(top, _mm256_mul_ps(fv, _mm256_sub_ps(bottom, top))), center);
-        const __m256 weight = _mm256_and_ps(_mm256_loadu_ps(patch->weight + i), inside);
-        const __m256 r = _mm256_loadu_ps(patch->value + i);
-        const __m256 wr = _mm256_mul_ps(weight, r), ws = _mm256_mul_ps(weight, s);
-        sw = _mm256_add_ps(sw, weight);
-        sr = _mm256_add_ps(sr, wr);
-        srr = _mm256_add_ps(srr, _mm256_mul_ps(wr, r));
-        ss = _mm256_add_ps(ss, ws);
-        sss = _mm256_add_ps(sss, _mm256_mul_ps(ws, s));
-        srs = _mm256_add_ps(srs, _mm256_mul_ps(wr, s));
+// One pixel of the window per lane. Eight partial sums for any number of lanes, and no fused multiply-add, so that all
+// instruction sets give the same bits.
+GSF__V_KERNEL float GSF__V(gsf__dense_cost)(const gsf__dense_window* window, const gsf__dense_patch* patch,
+                                            const gsf__dense_warp* warp) {
+    const float *base = warp->middle, *along_x = warp->along_x, *along_y = warp->along_y;
+    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f), center = gsf__v_set(patch->center);
+    const gsf__vf u_max = gsf__v_set((float)(warp->width - 1)), v_max = gsf__v_set((float)(warp->height - 1));
+    gsf__vf sums[8 / GSF__LANES][8]; // indexed by constants with AVX2, so that they stay in registers
+    for (int part = 0; part < 8 / GSF__LANES; part++) {
+        gsf__vf* sum = sums[part];
+        sum[0] = sum[1] = sum[2] = sum[3] = sum[4] = sum[5] = sum[6] = sum[7] = zero;
     }
-    const __m256 abcd = _mm256_hadd_ps(_mm256_hadd_ps(sw, sr), _mm256_hadd_ps(srr, ss));
-    const __m256 ef = _mm256_hadd_ps(_mm256_hadd_ps(sss, srs), zero);
-    float sums[8];
-    _mm256_storeu_ps(sums, _mm256_add_ps(_mm256_permute2f128_ps(abcd, ef, 0x20), _mm256_permute2f128_ps(abcd, ef, 0x31)));
-    return gsf__dense_correlate(patch, sums);
+    for (int i = 0; i < window->count; i += GSF__LANES) {
+        const gsf__vf dx = gsf__v_load(window->dx + i), dy = gsf__v_load(window->dy + i);
+        const gsf__vf X = gsf__v_set(base[0]) + dx * gsf__v_set(along_x[0]) + dy * gsf__v_set(along_y[0]);
+        const gsf__vf Y = gsf__v_set(base[1]) + dx * gsf__v_set(along_x[1]) + dy * gsf__v_set(along_y[1]);
+        const gsf__vf Z = gsf__v_set(base[2]) + dx * gsf__v_set(along_x[2]) + dy * gsf__v_set(along_y[2]);
+        const gsf__vf inv = one / Z;
+        gsf__vf u = X * inv, v = Y * inv;
+        const gsf__vm inside = gsf__vm_and(gsf__v_gt(Z, zero),
+            gsf__vm_and(gsf__vm_and(gsf__v_ge(u, zero), gsf__v_le(u, u_max)),
+                        gsf__vm_and(gsf__v_ge(v, zero), gsf__v_le(v, v_max))));
+        u = gsf__v_keep(inside, u); // samples outside read the first texel with weight 0
+        v = gsf__v_keep(inside, v);
+        const gsf__vi iu = gsf__v_truncate(u), iv = gsf__v_truncate(v);
+        const gsf__vf fu = u - gsf__vi_floats(iu), fv = v - gsf__vi_floats(iv);
+        const gsf__vi texel = gsf__vi_gather(warp->texels, gsf__vi_add(gsf__vi_mul(iv, gsf__vi_set(warp->width)), iu));
+        const gsf__vf a = gsf__vi_floats(gsf__vi_byte(texel, 0)), b = gsf__vi_floats(gsf__vi_byte(texel, 1));
+        const gsf__vf c = gsf__vi_floats(gsf__vi_byte(texel, 2)), d = gsf__vi_floats(gsf__vi_byte(texel, 3));
+        const gsf__vf top = a + fu * (b - a), bottom = c + fu * (d - c);
+        const gsf__vf s = top + fv * (bottom - top) - center, r = gsf__v_load(patch->value + i);
+        const gsf__vf weight = gsf__v_keep(inside, gsf__v_load(patch->weight + i)), wr = weight * r, ws = weight * s;
+        gsf__vf* sum = sums[i / GSF__LANES % (8 / GSF__LANES)];
+        sum[0] += weight;
+        sum[1] += wr;
+        sum[2] += wr * r;
+        sum[3] += ws;
+        sum[4] += ws * s;
+        sum[5] += wr * s;
+    }
+    float totals[8];
+    for (int k = 0; k < 8; k += GSF__LANES) {
+        for (int part = 0; part < 8 / GSF__LANES; part++) gsf__v_transpose(sums[part] + k); // now a sum per lane
+        gsf__v_store(totals + k, ((gsf__dense_part(sums, k, 0) + gsf__dense_part(sums, k, 1)) +
+                                  (gsf__dense_part(sums, k, 2) + gsf__dense_part(sums, k, 3))) +
+                                 ((gsf__dense_part(sums, k, 4) + gsf__dense_part(sums, k, 5)) +
+                                  (gsf__dense_part(sums, k, 6) + gsf__dense_part(sums, k, 7))));
+    }
+    return gsf__dense_correlate(patch, totals);
 }
-#endif
+
+#endif // GSF__KERNELS_STEREO
+#ifndef GSF__ISA
 
 static gsf__dense_cost_fn gsf__dense_cost_of(gsf_cpu_level level) {
 #if GSF__X86

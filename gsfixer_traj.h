@@ -298,49 +298,6 @@ static double gsf__traj_median(double* v, size_t n) {
 
 // ---- >>eigen -------------------------------------------------------------------
 
-// Eigenvalues of a symmetric 3x3 matrix (row-major), descending, and unit eigenvectors as rows. Cyclic Jacobi:
-// eigenvectors are products of plane rotations, so they are orthonormal up to rounding for any matrix.
-static void gsf__traj_eigen(const double matrix[9], double values[3], double rows[9]) {
-    double a[9], v[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
-    memcpy(a, matrix, sizeof a);
-    for (int sweep = 0; sweep < 64; sweep++) {
-        const double off = fabs(a[1]) + fabs(a[2]) + fabs(a[5]);
-        if (!(off > 1e-300) || off < 1e-20 * (fabs(a[0]) + fabs(a[4]) + fabs(a[8]))) break;
-        for (int p = 0; p < 2; p++)
-            for (int q = p + 1; q < 3; q++) {
-                const double apq = a[3 * p + q];
-                if (apq == 0.0) continue;
-                const double half = 0.5 * (a[4 * q] - a[4 * p]) / apq;
-                const double t = (half < 0.0 ? -1.0 : 1.0) / (fabs(half) + sqrt(half * half + 1.0));
-                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
-                const int r = 3 - p - q;
-                const double arp = a[3 * r + p], arq = a[3 * r + q];
-                a[4 * p] -= t * apq;
-                a[4 * q] += t * apq;
-                a[3 * p + q] = a[3 * q + p] = 0.0;
-                a[3 * r + p] = a[3 * p + r] = c * arp - s * arq;
-                a[3 * r + q] = a[3 * q + r] = s * arp + c * arq;
-                for (int i = 0; i < 3; i++) {
-                    const double vp = v[3 * p + i], vq = v[3 * q + i];
-                    v[3 * p + i] = c * vp - s * vq;
-                    v[3 * q + i] = s * vp + c * vq;
-                }
-            }
-    }
-    int order[3] = {0, 1, 2};
-    for (int i = 0; i < 2; i++)
-        for (int j = 0; j < 2 - i; j++)
-            if (a[4 * order[j]] < a[4 * order[j + 1]]) {
-                const int swap = order[j];
-                order[j] = order[j + 1];
-                order[j + 1] = swap;
-            }
-    for (int i = 0; i < 3; i++) {
-        values[i] = a[4 * order[i]];
-        memcpy(rows + 3 * i, v + 3 * order[i], 3 * sizeof(double));
-    }
-}
-
 // The coordinate axis least aligned with `away`, made perpendicular to it.
 static void gsf__traj_side_axis(const double away[3], double out[3]) {
     const int axis = fabs(away[0]) < 0.7 ? 0 : 1;
@@ -533,7 +490,7 @@ static double gsf__traj_solve_focus(const double* poses, size_t count, double le
                 b[r] += entry * (poses[16 * n + 12 + (size_t)c] - center[c]) / (double)count;
             }
     }
-    gsf__traj_eigen(a, values, rows);
+    gsf__mat3_eigen(a, values, rows);
     double x[3] = {0.0, 0.0, 0.0};
     for (int k = 0; k < 3; k++) {
         const double* row = rows + 3 * k;
@@ -808,7 +765,7 @@ static gsf_result gsf__traj_cloud_axes(gsf_context* ctx, const gsf__traj_cloud* 
     gsf__traj_cloud_moments(cloud, median, gsf__traj_cloud_reach(cloud, median, work), mean, covariance);
     if (!gsf__traj_finite(covariance, 9))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "principal axes: coordinates are too large");
-    gsf__traj_eigen(covariance, values, rows);
+    gsf__mat3_eigen(covariance, values, rows);
     const double rounding = 1e-13 * gsf__traj_max_abs(median);
     if (!(sqrt(values[0] > 0.0 ? values[0] : 0.0) > rounding) || !(values[0] > 0.0))
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "principal axes: the %zu points coincide", cloud->count);
@@ -921,7 +878,7 @@ GSF__GOLDEN gsf_result gsf__traj_pca_poses(gsf_context* ctx, const double* poses
     }
     if (!gsf__traj_finite(scatter, 9))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "principal axes: coordinates are too large");
-    gsf__traj_eigen(scatter, values, rows);
+    gsf__mat3_eigen(scatter, values, rows);
     const double rounding = 1e-13 * gsf__traj_magnitude(poses + 12, count, 16);
     if (!(values[0] > rounding * rounding) || values[1] <= 1e-14 * values[0])
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "principal axes: the %zu cameras lie on a line or a point", count);

@@ -682,7 +682,7 @@ static void test_order_and_eigen(void) {
             for (int j = 0; j <= i; j++) a[3 * i + j] = a[3 * j + i] = scale * uniform(-1.0, 1.0);
         if (trial % 5 == 0) a[0] = a[4] = a[8] = scale;
         if (trial % 7 == 0) a[1] = a[3] = a[2] = a[6] = 0.0;
-        gsf__traj_eigen(a, values, rows);
+        gsf__mat3_eigen(a, values, rows);
         CHECK(values[0] >= values[1] && values[1] >= values[2]);
         for (int k = 0; k < 3; k++)
             for (int i = 0; i < 3; i++) {
