@@ -13404,6 +13404,68 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linea
     return result;
 }
 
+typedef struct gsf__nn_attention_grad_desc {
+    const gsf__nn_attention_desc* forward; // without mask and bias; `out` is not read, nor are ldo and bf16
+    const float* dy;        // (queries, heads*head_dim)
+    float *dq, *dk, *dv;    // (queries or keys, heads*head_dim)
+    double* scratch;        // private: per worker two rows of keys
+} gsf__nn_attention_grad_desc;
+
+// The weights of one query at a time are recomputed, so no matrix of queries and keys is held. With p = softmax(s), s the
+// logits: dp = dy v^T, ds = p (dp - sum(p dp)), dv += p dy, dq = scale ds k, dk += scale ds q.
+static void gsf__attention_grad_head(void* arg, size_t head, int32_t worker) {
+    const gsf__nn_attention_grad_desc* g = (const gsf__nn_attention_grad_desc*)arg;
+    const gsf__nn_attention_desc* d = g->forward;
+    const int64_t dim = d->head_dim, width = d->heads * dim, column = (int64_t)head * dim;
+    const int64_t ldq = d->ldq ? d->ldq : width, ldk = d->ldk ? d->ldk : width, ldv = d->ldv ? d->ldv : width;
+    const double scale = d->scale != 0.0f ? (double)d->scale : 1.0 / sqrt((double)dim);
+    double *p = g->scratch + 2 * (int64_t)worker * d->keys, *dp = p + d->keys;
+    for (int64_t j = 0; j < d->keys; j++) {
+        memset(g->dk + j * width + column, 0, (size_t)dim * sizeof(float));
+        memset(g->dv + j * width + column, 0, (size_t)dim * sizeof(float));
+    }
+    for (int64_t r = 0; r < d->queries; r++) {
+        const float *q = d->q + r * ldq + column, *dy = g->dy + r * width + column;
+        float* dq = g->dq + r * width + column;
+        double top = -DBL_MAX, total = 0.0, sum = 0.0;
+        for (int64_t j = 0; j < d->keys; j++) {
+            const float *k = d->k + j * ldk + column, *v = d->v + j * ldv + column;
+            p[j] = dp[j] = 0.0;
+            for (int64_t i = 0; i < dim; i++) p[j] += (double)q[i] * (double)k[i];
+            for (int64_t i = 0; i < dim; i++) dp[j] += (double)dy[i] * (double)v[i];
+            p[j] *= scale;
+            if (p[j] > top) top = p[j];
+        }
+        for (int64_t j = 0; j < d->keys; j++) total += p[j] = exp(p[j] - top);
+        for (int64_t j = 0; j < d->keys; j++) sum += (p[j] /= total) * dp[j];
+        memset(dq, 0, (size_t)dim * sizeof(float));
+        for (int64_t j = 0; j < d->keys; j++) {
+            const float *k = d->k + j * ldk + column, weight = (float)p[j], ds = (float)(scale * p[j] * (dp[j] - sum));
+            float *dk = g->dk + j * width + column, *dv = g->dv + j * width + column;
+            for (int64_t i = 0; i < dim; i++) {
+                dq[i] += ds * k[i];
+                dk[i] += ds * q[i];
+                dv[i] += weight * dy[i];
+            }
+        }
+    }
+}
+
+GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_attention_grad_desc* desc) {
+    const gsf__nn_attention_desc* d = desc->forward;
+    gsf__nn_attention_grad_desc job = *desc;
+    size_t count;
+    if (d->mask || d->bias || d->queries < 1 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "attention: gradients take no mask, no bias and no empty input");
+    if (!gsf__mul_size(2 * (size_t)ctx->parallel.worker_count, (size_t)d->keys, &count))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld keys", (long long)d->keys);
+    job.scratch = (double*)gsf_alloc(ctx, count, sizeof(double));
+    if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__parallel_for(ctx, (size_t)d->heads, gsf__attention_grad_head, &job);
+    gsf_free(ctx, job.scratch);
+    return GSF_OK;
+}
+
 #endif // GSF_NN_TRAINING
 
 GSF__END_IMPLEMENTATION

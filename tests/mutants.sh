@@ -43,6 +43,7 @@ gsfixer_nn.h|test_nn_training|gradients: softmax as if its values were independe
 gsfixer_nn.h|test_nn_training|gradients: the mean of a norm is taken as constant|s/\(h - mean - normal \* slope\)/(h - normal * slope)/
 gsfixer_nn.h|test_nn_training|gradients: a norm's scale without its bias|s/weight \* product \+ bias \* sum\)/weight * product)/
 gsfixer_nn.h|test_nn_training|gradients: rows of x taken without their stride|s/d->ldx \? d->ldx : in, scratch\);/in, scratch);/
+gsfixer_nn.h|test_nn_training|gradients: attention's weights as if independent|s/\(dp\[j\] - sum\)/dp[j]/
 END
 }
 

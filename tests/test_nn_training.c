@@ -139,6 +139,68 @@ static void check(gsf_context* ctx, int kind, int64_t rows, int64_t in, int64_t 
     free_made(&m);
 }
 
+static double attention_loss(const double* p, const float* dy, int64_t queries, int64_t keys, int heads, int dim) {
+    const int64_t width = (int64_t)heads * dim;
+    const double *key = p + queries * width, *value = key + keys * width;
+    double total = 0.0;
+    for (int64_t n = 0; n < queries * heads; n++) {
+        double sum = 0.0, weighted = 0.0;
+        for (int64_t j = 0; j < keys; j++) {
+            double s = 0.0, t = 0.0;
+            for (int64_t i = 0; i < dim; i++) {
+                s += p[n * dim + i] * key[j * width + n % heads * dim + i];
+                t += (double)dy[n * dim + i] * value[j * width + n % heads * dim + i];
+            }
+            sum += exp(s / sqrt((double)dim));
+            weighted += exp(s / sqrt((double)dim)) * t;
+        }
+        total += weighted / sum;
+    }
+    return total;
+}
+
+static void test_attention(gsf_context* ctx, int64_t queries, int64_t keys, int heads, int dim) {
+    float values[2000], dy[2000], grad[2][2000];
+    double p[2000], scale = 0.0, error = 0.0;
+    const int64_t width = (int64_t)heads * dim, count = (queries + 2 * keys) * width;
+    for (int64_t i = 0; i < count; i++) {
+        p[i] = (double)(values[i] = (float)test_random_in(&seed, -1.5, 1.5));
+        dy[i] = (float)test_random_in(&seed, -1.0, 1.0);
+    }
+    gsf_context others;
+    memset(&others, 0, sizeof others);
+    work_backwards(&others);
+    CHECK_OK(&others, gsf_init_context(&others));
+    gsf__nn_attention_desc d;
+    memset(&d, 0, sizeof d);
+    d.queries = queries;
+    d.keys = keys;
+    d.heads = heads;
+    d.head_dim = dim;
+    d.q = values;
+    d.k = values + queries * width;
+    d.v = d.k + keys * width;
+    for (int i = 0; i < 2; i++) {
+        float* g = grad[i];
+        const gsf__nn_attention_grad_desc desc = {&d, dy, g, g + queries * width, g + (queries + keys) * width, NULL};
+        CHECK_OK(i ? &others : ctx, gsf__nn_attention_grad(i ? &others : ctx, &desc));
+    }
+    CHECK(memcmp(grad[0], grad[1], (size_t)count * sizeof(float)) == 0);
+    for (int64_t i = 0; i < count; i++) {
+        const double before = p[i], step = 1e-4;
+        p[i] = before + step;
+        const double above = attention_loss(p, dy, queries, keys, heads, dim);
+        p[i] = before - step;
+        const double slope = (above - attention_loss(p, dy, queries, keys, heads, dim)) / (2.0 * step);
+        p[i] = before;
+        scale += slope * slope;
+        error += (slope - (double)grad[0][i]) * (slope - (double)grad[0][i]);
+    }
+    error = sqrt(error / scale);
+    printf("attention  %d x %d, %d heads of %d: relative L2 error %.2e\n", (int)queries, (int)keys, heads, dim, error);
+    CHECK_NEAR(error, 0.0, 1e-5);
+}
+
 static void test_memory(void) {
     counter count;
     memset(&count, 0, sizeof count);
@@ -188,6 +250,11 @@ int main(void) {
             for (int a = GSF__NN_LINEAR; a <= GSF__NN_RELU; a++) check(&ctx, ACTIVATE, rows, in, in, 0, a);
         }
     }
+    memset(&ctx, 0, sizeof ctx);
+    CHECK_OK(&ctx, gsf_init_context(&ctx));
+    test_attention(&ctx, 1, 1, 1, 1);
+    test_attention(&ctx, 7, 7, 3, 5);
+    test_attention(&ctx, 3, 19, 2, 8); // cross attention
     test_memory();
     for (int kind = 0; kind < KINDS; kind++) printf("%-10s worst relative L2 error %.2e\n", kind_names[kind], worst[kind]);
     return test_report();
