@@ -2,9 +2,11 @@
    gcc -O2 -std=c11 -fopenmp -DGSFIXER_IMPLEMENTATION -DGSF_USE_EMBREE -I. examples/make_scene.c -o make_scene -lembree3 -lm
 
        make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]
+           [--drift 0]
 
    --noise: standard deviation of feature positions in pixels; --arc: angle in degrees of the camera's path around the
-   table. `--views 12 --width 96 --height 64` takes less than two seconds.
+   table; --drift: the exposure rises and falls by so many stops from photo to photo. `--views 12 --width 96 --height 64`
+   takes less than two seconds.
        OUT/images/frame_001.png ...
        OUT/sparse/0/{cameras,images,points3D}.bin   points as feature matching would find them: in textured areas,
                                                     triangulated from noisy pixels, matched in only some of the views
@@ -42,9 +44,10 @@ typedef struct make_scene_options {
     int views, width, height, points;
     double noise, arc;
     uint64_t seed;
+    double drift;
 } make_scene_options;
 
-static const make_scene_options make_scene_defaults = {40, 320, 240, 10000, 0.5, 150.0, 1};
+static const make_scene_options make_scene_defaults = {40, 320, 240, 10000, 0.5, 150.0, 1, 0.0};
 
 #ifndef GSF_USE_EMBREE
 
@@ -777,7 +780,13 @@ typedef struct photo_job {
     uint8_t* pixels; // (height,width,3)
     float* depth;    // (height,width)
     float* normal;   // (height,width,3)
+    float exposure;  // factor
 } photo_job;
+
+// Between -drift/2 and drift/2 stops, about 17 photos per period.
+static float exposure_of(const make_scene_options* o, uint64_t view) {
+    return exp2f(0.5f * (float)o->drift * sinf(0.37f * (float)(view % 4096) + 0.5f));
+}
 
 static v3 eye_of(const gsf_camera* camera) {
     double c[3];
@@ -831,7 +840,7 @@ static void photo_row(void* arg, size_t row, int32_t worker) {
         const float px = 2.0f * ((float)x + 0.5f) / (float)width - 1.0f,
                     py = 2.0f * ((float)row + 0.5f) / (float)height - 1.0f;
         sum = mul(sum, (1.0f - 0.11f * (px * px + py * py)) / SAMPLES); // vignetting
-        const float c[3] = {film(sum.x), film(sum.y), film(sum.z)};
+        const float c[3] = {film(job->exposure * sum.x), film(job->exposure * sum.y), film(job->exposure * sum.z)};
         for (size_t k = 0; k < 3; k++) { // sensor noise
             const float grain = 1.1f * (float)gsf_draw_normal(job->s->seed, 100 + job->view, 3 * pixel + k);
             job->pixels[3 * pixel + k] = (uint8_t)clampf(255.0f * c[k] + grain + 0.5f, 0, 255);
@@ -1079,10 +1088,11 @@ static gsf_result write_truth(gsf_context* ctx, const char* path, const cloud* c
 
 // OUT/truth/scene.json: all options that determine the scene.
 static gsf_result write_options(gsf_context* ctx, const char* path, const make_scene_options* o) {
-    char text[256];
+    char text[320], drift[48] = "";
+    if (o->drift != 0.0) snprintf(drift, sizeof drift, ",\"drift\":%.17g", o->drift);
     const int size = snprintf(text, sizeof text, "{\"views\":%d,\"width\":%d,\"height\":%d,\"points\":%d,\"noise\":%.17g,"
-                              "\"arc\":%.17g,\"seed\":%llu}\n", o->views, o->width, o->height, o->points, o->noise, o->arc,
-                              (unsigned long long)o->seed);
+                              "\"arc\":%.17g,\"seed\":%llu%s}\n", o->views, o->width, o->height, o->points, o->noise, o->arc,
+                              (unsigned long long)o->seed, drift);
     return gsf_write_file(ctx, path, text, (size_t)size);
 }
 
@@ -1142,7 +1152,7 @@ static int take_photos(gsf_context* ctx, world* s, const make_scene_options* o, 
         photos[i] = (uint8_t*)gsf_alloc(ctx, pixels, 3);
         if (!(ok = view->name && photos[i])) break;
         snprintf(view->name, 32, "frame_%03d.png", i + 1);
-        photo_job job = {s, view->camera, (uint64_t)i, photos[i], depth, normal};
+        photo_job job = {s, view->camera, (uint64_t)i, photos[i], depth, normal, exposure_of(o, (uint64_t)i)};
         ctx->parallel.for_fn(ctx->parallel.user, (size_t)o->height, photo_row, &job);
         const gsf_image image = gsf_wrap_image(photos[i], GSF_U8, o->width, o->height, 3);
         snprintf(path, sizeof path, "%s/images/%s", folder, view->name);
@@ -1221,24 +1231,31 @@ static gsf_result read_options(gsf_context* ctx, const char* path, make_scene_op
         if (value && value->type == GSF_JSON_NUMBER && value->number >= 0.0 && value->number < 1e9) values[i] = value->number;
         else result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid \"%s\"", path, keys[i]);
     }
+    const gsf_json_value* drift = result == GSF_OK ? gsf_find_json_member(&json, &json.values[0], "drift") : NULL;
+    const double stops = !drift ? 0.0 : drift->type == GSF_JSON_NUMBER ? drift->number : -1.0;
     gsf_destroy_json(ctx, &json);
+    if (result == GSF_OK && !(stops >= 0.0 && stops <= 8.0))
+        result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no valid \"drift\"", path);
     if (result == GSF_OK && !(values[0] >= 16.0 && values[1] >= 16.0 && values[0] <= 8192.0 && values[1] <= 8192.0))
         result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: %g x %g", path, values[0], values[1]);
     *o = make_scene_defaults;
     o->width = (int)values[0];
     o->height = (int)values[1];
     o->seed = (uint64_t)values[2];
+    o->drift = stops;
     return result;
 }
 
 // Renders the picture, depth map and normals of camera i, with the random numbers of photo i.
-static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_camera* camera, size_t i, const char* out) {
+static gsf_result render_camera(gsf_context* ctx, const world* s, const gsf_camera* camera, size_t i, float exposure,
+                                const char* out) {
     char path[2048];
     const size_t pixels = (size_t)camera->width * (size_t)camera->height;
     gsf_result result = gsf_check_camera(ctx, camera);
     if (result != GSF_OK) return result;
     photo_job job = {s, *camera, (uint64_t)i, (uint8_t*)gsf_alloc(ctx, pixels, 3),
-                     (float*)gsf_alloc(ctx, pixels, sizeof(float)), (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float))};
+                     (float*)gsf_alloc(ctx, pixels, sizeof(float)), (float*)gsf_alloc(ctx, pixels, 3 * sizeof(float)),
+                     exposure};
     result = job.pixels && job.depth && job.normal ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
         ctx->parallel.for_fn(ctx->parallel.user, (size_t)camera->height, photo_row, &job);
@@ -1276,7 +1293,7 @@ static int render_scene(gsf_context* ctx, const char* folder, const char* camera
     const float angle = s.pixel_angle;
     for (size_t i = 0; ok && i < count; i++) {
         s.pixel_angle = angle * (float)(0.9 * o.width / list[i].fx); // texture detail for the pixel size of this camera
-        result = render_camera(ctx, &s, list + i, i, out);
+        result = render_camera(ctx, &s, list + i, i, exposure_of(&o, i), out);
         ok = result == GSF_OK;
     }
     if (result != GSF_OK)
@@ -1315,6 +1332,7 @@ static int usage(FILE* to) {
     fprintf(
         to,
         "usage: make_scene OUT [--views 40] [--width 320] [--height 240] [--seed 1] [--points 10000] [--noise 0.5] [--arc 150]\n"
+        "       [--drift 0]\n"
         "Writes a ray-traced courtyard as photos with a COLMAP model and ground truth into the folder OUT.\n"
         "       make_scene SCENE --render CAMERAS.json --out PICTURES\n"
         "Renders an existing scene from other cameras into the folder PICTURES.\n");
@@ -1350,11 +1368,12 @@ int main(int argc, char** argv) {
         else if (strcmp(argv[i], "--seed") == 0) o.seed = (uint64_t)x;
         else if (strcmp(argv[i], "--noise") == 0) o.noise = x;
         else if (strcmp(argv[i], "--arc") == 0) o.arc = x;
+        else if (strcmp(argv[i], "--drift") == 0) o.drift = x;
         else return usage(stderr);
         i++;
     }
     if (!folder || o.views < 2 || o.views > 999 || o.width < 16 || o.height < 16 || o.width > 8192 || o.height > 8192 ||
-        o.points < 1 || o.arc > 360.0)
+        o.points < 1 || o.arc > 360.0 || o.drift > 8.0)
         return usage(stderr);
     if (!cameras != !pictures) return usage(stderr);
     if (pictures && !is_vacant(pictures)) {

@@ -31,6 +31,17 @@ assert all(image["psnr"] is None or image["psnr"] > 60.0 for image in images), i
 PY
 cmp again/depth/00001.npy "$scene/truth/depth_002.npy" || fail "not the truth's depth"
 cmp again/normal/00001.npy "$scene/truth/normal_002.npy" || fail "not the truth's normals"
+"$build/make_scene" drift --views 3 --width 48 --height 32 --points 50 --drift 2
+"$build/oracle" cameras drift drift.json
+"$build/make_scene" drift --render drift.json --out drifted
+cmp drifted/00002.png drift/images/frame_003.png || fail "not the exposure of the scene"
+for stops in 9 -1 nan x; do
+    if "$build/make_scene" wrong --drift $stops 2> log; then fail "takes --drift $stops"; fi
+    grep -q '^usage: ' log && [ ! -e wrong ] || fail "--drift $stops"
+done
+sed -i 's/"drift":2/"drift":9/' drift/truth/scene.json
+if "$build/make_scene" drift --render drift.json --out wild 2> log; then fail "takes a drift of 9 stops"; fi
+grep -q 'no valid "drift"' log || fail "does not name the drift"
 if "$build/make_scene" "$scene" --render cameras.json --out again 2> log; then fail "writes into an existing folder"; fi
 mkdir bare
 if "$build/make_scene" bare --render cameras.json --out new 2> log; then fail "renders a folder that is no made scene"; fi

@@ -30,8 +30,8 @@ static void backwards(void* user, size_t count, gsf_chunk_fn fn, void* arg) {
     while (count-- > 0) fn(arg, count, 0);
 }
 
-static void take(gsf_context* ctx, const world* s, const gsf_camera* camera, truth* out) {
-    photo_job job = {s, *camera, 0, out->pixels, out->depth, out->normal};
+static void take(gsf_context* ctx, const world* s, const gsf_camera* camera, float exposure, truth* out) {
+    photo_job job = {s, *camera, 0, out->pixels, out->depth, out->normal, exposure};
     ctx->parallel.for_fn(ctx->parallel.user, HEIGHT, photo_row, &job);
 }
 
@@ -83,6 +83,30 @@ static void check_slope(const gsf_camera* camera, const truth* got, int x, int y
     *wrong += fabsf(dot(unit(cross(sub(at[1], at[0]), sub(at[2], at[0]))), v(n[0], n[1], n[2]))) < 0.94f; // 20 degrees
 }
 
+// --drift changes the photos alone, within its range and in both directions.
+static void test_exposure(gsf_context* ctx, const world* s, make_scene_options o) {
+    static truth even, bright;
+    const gsf_camera camera = camera_of((world*)s, &o, 0);
+    float lowest = 1.0f, highest = 1.0f;
+    for (uint64_t view = 0; view < 40; view++) CHECK(exposure_of(&o, view) == 1.0f);
+    o.drift = 2.0;
+    for (uint64_t view = 0; view < 40; view++) {
+        lowest = minf(lowest, exposure_of(&o, view));
+        highest = maxf(highest, exposure_of(&o, view));
+    }
+    CHECK(lowest >= 0.5f && lowest < 0.52f && highest <= 2.0f && highest > 1.94f);
+    take(ctx, s, &camera, 1.0f, &even);
+    take(ctx, s, &camera, 2.0f, &bright);
+    double sums[2] = {0, 0};
+    for (size_t i = 0; i < 3 * PIXELS; i++) {
+        CHECK(bright.pixels[i] >= even.pixels[i]); // the same noise
+        sums[0] += even.pixels[i], sums[1] += bright.pixels[i];
+    }
+    CHECK(sums[1] > 1.15 * sums[0]);
+    CHECK(memcmp(even.depth, bright.depth, sizeof even.depth) == 0);
+    CHECK(memcmp(even.normal, bright.normal, sizeof even.normal) == 0);
+}
+
 // The files hold what the camera saw.
 static void test_files(gsf_context* ctx, make_scene_options* o) {
     static const char folder[] = TEST_TMP "/scene";
@@ -96,7 +120,7 @@ static void test_files(gsf_context* ctx, make_scene_options* o) {
     CHECK(make_scene(ctx, o, folder) == 0);
     CHECK(start_world(ctx, &s, o));
     const gsf_camera camera = camera_of(&s, o, 0);
-    take(ctx, &s, &camera, &photo);
+    take(ctx, &s, &camera, 1.0f, &photo);
     end_world(&s);
     for (int i = 0; i < 2; i++) {
         char path[1200], head[128];
@@ -137,8 +161,8 @@ int main(void) {
     size_t wrong = 0;
     for (int view = 0; started && view < VIEWS; view++) {
         const gsf_camera camera = camera_of(&s, &o, view);
-        take(&ctx, &s, &camera, &one);
-        take(&reversed, &again, &camera, &other);
+        take(&ctx, &s, &camera, 1.0f, &one);
+        take(&reversed, &again, &camera, 1.0f, &other);
         CHECK(memcmp(&one, &other, sizeof one) == 0);
         for (int y = 0; y < HEIGHT; y++)
             for (int x = 0; x < WIDTH; x++) {
@@ -150,6 +174,7 @@ int main(void) {
            wrong);
     CHECK(seen.sky > 5 && seen.wall > 1000 && seen.ball > 100);
     CHECK(seen.faces > 20000 && wrong < seen.faces / 10); // bushes and edges
+    if (started) test_exposure(&ctx, &s, o);
     end_world(&s);
     end_world(&again);
     test_files(&ctx, &o);
