@@ -317,7 +317,7 @@ typedef enum gsf_dtype { GSF_U8 = 0, GSF_U16, GSF_F16, GSF_F32, GSF_F64 } gsf_dt
 typedef enum gsf_color_space { GSF_COLOR_SRGB = 0, GSF_COLOR_LINEAR } gsf_color_space;
 
 // A view of pixels. Strides are in bytes, so packed, padded, planar and flipped images are all just views.
-// `owned` is non-NULL only in images made by this library, and is what gsf_destroy_image frees.
+// `owned` is non-NULL only in images made by this library; gsf_destroy_image frees it.
 typedef struct gsf_image {
     void* data;
     gsf_dtype dtype;

@@ -5367,7 +5367,7 @@ static int64_t gsf__conv_frame_size(int64_t height, int64_t width, int64_t chann
     return height * (width + 2) * channels;
 }
 
-// Initialises what is common to frames of one size: bordered input frames of `in_height` x `in_width`.
+// Initialises the members that frames of one size share: bordered input frames of `in_height` x `in_width`.
 static gsf__conv_job gsf__conv_begin(gsf_context* ctx, const gsf__conv_layer* layer, int64_t in_height, int64_t in_width,
                                      int halve, const float* packed) {
     gsf__conv_job job;
@@ -7022,7 +7022,7 @@ typedef struct gsf__bpe_merge {
     int32_t rank;
 } gsf__bpe_merge;
 
-typedef struct gsf__bpe_tables { // what gsf_nn_bpe.tables points to
+typedef struct gsf__bpe_tables { // pointed to by gsf_nn_bpe.tables
     gsf__nn_config config, special_map, added_tokens; // own the texts of added tokens
     char* strings;           // texts of the vocabulary
     gsf__bpe_token* tokens;  // (vocabulary) sorted by text
@@ -7883,7 +7883,7 @@ typedef struct gsf__opt {
     gsf__nn_block* blocks;
 } gsf__opt;
 
-typedef struct gsf__blip { // what gsf_nn_captioner.nets points to
+typedef struct gsf__blip { // pointed to by gsf_nn_captioner.nets
     int64_t image_size;
     gsf_resize_filter filter;
     double rescale;
@@ -8457,8 +8457,8 @@ static gsf_result gsf__caption_text(gsf_context* ctx, const gsf_nn_captioner* ca
     return result;
 }
 
-// Maximal number of new tokens. The default for a folder without image_token_index is what transformers makes of its
-// limit of 20 tokens in total: it counts the text twice.
+// Maximal number of new tokens. The default for a folder without image_token_index follows from transformers'
+// limit of 20 tokens in total, which counts the text twice.
 static int64_t gsf__caption_most(const gsf_nn_captioner* captioner, int64_t text_tokens, int32_t wanted) {
     const int64_t usual = GSF__CAPTION_TOKENS;
     if (wanted > 0) return wanted;
@@ -8793,7 +8793,7 @@ typedef struct gsf__sp_added { // a text with an id of its own
     int trim_left, trim_right; // also removes the white space on that side
 } gsf__sp_added;
 
-typedef struct gsf__sp_model { // what gsf_nn_tokenizer.model points to
+typedef struct gsf__sp_model { // pointed to by gsf_nn_tokenizer.model
     gsf__sp_node *pieces, *added; // ids of `added` are indices into added_list
     gsf__sp_added* added_list;
     gsf_buffer texts;
@@ -9464,7 +9464,7 @@ GSF_API gsf_result gsf_nn_encode_text(gsf_context* ctx, const gsf_nn_tokenizer* 
 
 // ---- >>nn t5 --------------------------------------------------------------------
 
-typedef struct gsf__t5_nets { // what gsf_nn_t5.nets points to
+typedef struct gsf__t5_nets { // pointed to by gsf_nn_t5.nets
     gsf__nn_block_sizes sizes;
     gsf__nn_block* blocks;
     const gsf_nn_tensor *embedding, *positions; // (buckets, heads), shared by all blocks
@@ -10736,7 +10736,7 @@ typedef struct gsf__dit_block {
 
 typedef struct gsf__dit_projector { gsf__nn_layer linear, norm; } gsf__dit_projector;
 
-typedef struct gsf__dit_nets { // what gsf_nn_transformer.nets points to
+typedef struct gsf__dit_nets { // pointed to by gsf_nn_transformer.nets
     gsf__dit_block* blocks;
     gsf__nn_quantized* quantized; // one per tensor of the file, empty if not quantized; NULL: no tensor is
     gsf__dit_projector dino, vggt;
@@ -11885,7 +11885,7 @@ static uint32_t gsf__sample_sum_weights(uint32_t crc, const gsf_nn_weights* weig
     return crc;
 }
 
-// Checksum of what all clips of a run share: model, precision, schedule and settings.
+// Checksum of everything that all clips of a run share: model, precision, schedule and settings.
 static uint32_t gsf__sample_sum_settings(const gsf__sample_run* run) {
     const gsf_nn_sample_desc* d = &run->desc;
     const gsf_nn_transformer* t = run->net;

@@ -3308,7 +3308,7 @@ static gsf_result gsf__rectify_image(gsf_context* ctx, const gsf__rectify* r, co
 
 // ---- >>scene -------------------------------------------------------------------
 
-typedef struct gsf__view_source { // what gsf_splat_load_view_image needs to load the photo of a view
+typedef struct gsf__view_source { // a view's photo, for gsf_splat_load_view_image
     gsf__rectify rectify;    // lens: scaled to the size at which the photo is undistorted
     size_t path, mask;       // offsets into paths; mask: path without .png; SIZE_MAX: scene parsed from memory
     int64_t file_width, file_height;
@@ -6978,7 +6978,7 @@ typedef struct gsf__record {
 
 typedef struct gsf__tile_rect { int32_t x0, y0, x1, y1; } gsf__tile_rect; // tiles, end exclusive
 
-typedef struct gsf__step { // what backward keeps per splat and 8 pixels
+typedef struct gsf__step { // kept by backward per splat and 8 pixels
     float alpha[8];        // before the 0.99 clamp; 0 where not blended
     float T[8];            // transmittance in front of the splat
 } gsf__step;
@@ -9075,8 +9075,8 @@ static void gsf__loss_across_scalar(const float* v, size_t n, float* sums) {
 // Eight consecutive floats that start `by` (1..3) floats after those of `low`; `high` starts 4 floats after `low`.
 #define GSF__LOSS_BETWEEN(low, high, by) _mm256_castsi256_ps(_mm256_alignr_epi8(high, low, 4 * (by)))
 
-// About half of all unaligned loads cross a cache line. So the outer taps are assembled from aligned loads, and what is
-// needed again stays in registers: m16 .. p16 hold the eight floats that start at i - 16 .. i + 16.
+// About half of all unaligned loads cross a cache line. So the outer taps are assembled from aligned loads, and values
+// that are needed again stay in registers: m16 .. p16 hold the eight floats that start at i - 16 .. i + 16.
 GSF__TARGET_AVX2 static void gsf__loss_across_avx2(const float* v, size_t n, float* sums) {
     const __m256 middle = _mm256_set1_ps(gsf__loss_window[0]);
 #define GSF__LOSS_EIGHT(at) _mm256_loadu_si256((const __m256i*)(const void*)(at))

@@ -140,7 +140,7 @@ def render_truth(config, cameras, out):
 
 
 def restore(config_path, job):
-    """What `gsfix fix --restorer exec:` calls: one window."""
+    """Restores one window; called by `gsfix fix --restorer exec:`."""
     config = read_json(config_path)
     cameras = read_cameras(os.path.join(job, "cameras.json"))
     for camera in cameras:
@@ -163,7 +163,7 @@ def restore(config_path, job):
         file.write(json.dumps(window) + "\n")
 
 
-# ---- what a scene needs once -----------------------------------------------------------
+# ---- preparation of a scene ------------------------------------------------------------
 
 def size_of(options):
     return ["--max-size", str(options.max_size)] if options.max_size else []
@@ -184,7 +184,7 @@ def truth_config(options, scene):
 
 
 def check_settings(options, scene):
-    """What all rows have in common is the same as when the folder was begun."""
+    """Checks that the settings shared by all rows are those with which the folder was begun."""
     path = os.path.join(scene.out, "settings.json")
     settings = {"scene": os.path.abspath(scene.folder), "made": scene.made, "iterations": options.iterations,
                 "max_size": options.max_size, "sigma": options.sigma, "common": options.common,
@@ -365,7 +365,7 @@ def work(options, job, arm):
     if done and done["arguments"] != arm:
         sys.exit("%s: made with other arguments: %s" % (out, done["arguments"]))
     if not done:
-        shutil.rmtree(out, ignore_errors=True)  # what a stopped call left
+        shutil.rmtree(out, ignore_errors=True)  # left by a stopped call
         os.makedirs(out)
         write_json(os.path.join(out, "result.json"), fix(options, job, arm))
         if not options.keep:
@@ -414,7 +414,7 @@ def figure_lines(found, arms):
 
 
 def round_cells(sums):
-    """What a round's frames are worth; sums over its windows and the seeds."""
+    """Table cells of a round, from its sums over windows and seeds."""
     pixels, reached = sums["pixels"], sums["reached"]
     psnr = [decibels(sums[key] / pixels) for key in ("render_error", "restored_error")]
     psnr += [decibels(sums[key] / reached) if reached else float("nan")

@@ -7,11 +7,11 @@
 //     oracle restore ROW JOBDIR TRUTH PHOTO_TRUTH                   restores a window of gsfix fix --restorer exec:
 //         [--tolerance T] [--far Z] [--sigma S]
 //
-// TRUTH contains what each camera really sees: images 00000.png ... and depth/00000.npy ..., camera depth at pixel centres,
+// TRUTH contains the ground truth at each camera: images 00000.png ... and depth/00000.npy ..., camera depth at pixel centres,
 // 0 where there is nothing. `oracle render` and `make_scene --render` write it. PHOTO_TRUTH is the same at the cameras of
 // the photos; only its depth is read. ROW is one of
 //
-//     warp      what the restorer warp makes of the frames
+//     warp      the frames as the restorer warp returns them
 //     carried   colours of the photos, carried over with the true depth and blended by angle as in warp; confidence 1
 //               where a photo sees the surface
 //     masked    the truth with warp's confidence

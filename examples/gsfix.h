@@ -125,7 +125,7 @@ const gsfix_read_file* gsfix_end_inputs(gsfix_app* app, size_t* count);
 gsf_result gsfix_claim(gsfix_app* app, const char* format, ...) GSF_PRINTF(2, 3);
 gsf_result gsfix_open_out(gsfix_app* app);
 gsf_result gsfix_claim_file(gsfix_app* app, const char* path); // a new file outside OUT; call after gsfix_open_out
-// Removes what an earlier run of the same command wrote and this one does not write again.
+// Removes files that an earlier run of the same command wrote and this one does not write again.
 gsf_result gsfix_remove_stale(gsfix_app* app);
 gsf_result gsfix_remove_output(gsfix_app* app, const char* name); // if it exists and is ours
 int gsfix_has_output(gsfix_app* app, const char* name);           // does it exist and is it ours?

@@ -417,7 +417,7 @@ static int is_written(const out_line* line, const struct stat* s) {
            line->changed.tv_sec == s->st_ctim.tv_sec && line->changed.tv_nsec == s->st_ctim.tv_nsec;
 }
 
-// Is the file `base` in the folder, listed as `name`, what gsfix wrote? -1: there is no such file. *which: its line.
+// Is the file `base` in the folder, listed as `name`, as gsfix wrote it? -1: there is no such file. *which: its line.
 static int look_at(const gsfix_out* o, int folder, const char* base, const char* name, struct stat* s, size_t* which) {
     uint64_t size = 0, digest = 0;
     int known = 0;

@@ -5,7 +5,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { // what made_spiece leaves out or adds
+enum { // parts that made_spiece leaves out or adds
     MADE_NO_PREFIX = 1, MADE_NO_TRIM = 2, MADE_NO_ESCAPE = 4, MADE_SUFFIX = 8, MADE_BYTES = 16, MADE_NO_MAP = 32
 };
 

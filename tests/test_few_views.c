@@ -86,7 +86,7 @@ static void test_kinds(gsf_context* ctx, const host* h) {
     CHECK(count_kind(ctx, h, GSF_INITIAL_RANDOM, 3, &stats) == 50 && stats.scene_points == 0);
     CHECK(count_kind(ctx, h, GSF_INITIAL_DENSE, 3, &stats) > both.scene_points);
     CHECK(stats.scene_points == both.scene_points && stats.dense.pairs > 0 && stats.new_points <= 40000);
-    // what GSF_INITIAL_AUTO selects
+    // the kind that GSF_INITIAL_AUTO selects
     count_kind(ctx, h, GSF_INITIAL_AUTO, 5, &stats);
     CHECK(stats.used.kind == GSF_INITIAL_BOTH);
     count_kind(ctx, h, GSF_INITIAL_AUTO, 6, &stats);

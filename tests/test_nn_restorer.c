@@ -418,7 +418,7 @@ static void restore_clips(gsf_context* ctx, const gsf_nn_dit_desc* desc, clip* c
     c->window.clip = 0;
 }
 
-// Writes what the file for all clips holds for clip k, under names without suffixes.
+// Writes the features of clip k from the file for all clips, under names without suffixes.
 static void write_bare(gsf_context* ctx, const char* all, const char* path, int k, const gsf_nn_transformer* net) {
     gsf_nn_weights file;
     char name[40];

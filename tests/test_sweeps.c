@@ -251,7 +251,7 @@ static void begin(loop* l, int repeat) {
     l->repeat = repeat;
 }
 
-// ---- what is on disk -----------------------------------------------------------
+// ---- files on disk -------------------------------------------------------------
 
 static struct { char* data; size_t size; } wanted[OUTPUTS]; // contents after a run without failures
 

@@ -138,7 +138,7 @@ enum { LOSS_NOISE, LOSS_DARK, LOSS_SMOOTH, LOSS_BRIGHT, LOSS_LEVEL, LOSS_FLAT_LE
 
 // Error bounds of the loss: the mean SSIM; its gradient (relative to the largest one) in images of 37 x 141 and in
 // smaller ones; and the gradient with weights. At most twice the values measured over all CPU levels. Where images are
-// flat or equal on both sides of an edge, the gradient is what C2 = 9e-4 leaves of large terms.
+// flat or equal on both sides of an edge, large terms of the gradient nearly cancel.
 static const struct loss_bar { const char* name; double ssim, gradient, small_gradient, weighted_gradient; }
     loss_bars[LOSS_CASES] = {
         {"noise", 2.5e-8, 4.2e-7, 4.4e-7, 7.3e-7},
