@@ -2889,15 +2889,15 @@ GSF_API gsf_result gsf_convert_image(gsf_context* ctx, const gsf_image* src, con
 
 // ---- files
 
-enum { GSF__IMAGE_PIXELS_PER_BYTE = 8256, GSF__JPEG_QUALITY = 95 };
+enum { GSF__PIXELS_PER_BYTE = 8256, GSF__JPEG_QUALITY = 95 };
 
 #if !defined(GSF_NO_STB) || defined(GSF_USE_OIIO)
 // Refuses a file that claims more pixels than its size can hold, before memory is allocated for them. The densest format
-// is 1-bit PNG: 8 pixels per byte, and DEFLATE compresses by 1032:1 at most.
+// is 1-bit PNG, GSF__PIXELS_PER_BYTE: 8 pixels per byte, and DEFLATE compresses by 1032:1 at most.
 static gsf_result gsf__check_image_claim(gsf_context* ctx, const char* name, int64_t width, int64_t height,
-                                         size_t file_size) {
+                                         size_t file_size, uint64_t pixels_per_byte) {
     if (width < 1 || height < 1 || width > (int64_t)1 << 28 || height > ((int64_t)1 << 28) / width ||
-        (uint64_t)(width * height) / GSF__IMAGE_PIXELS_PER_BYTE > file_size)
+        (uint64_t)(width * height) / pixels_per_byte > file_size)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: a file of %zu bytes cannot hold %lld x %lld pixels", name,
                         file_size, (long long)width, (long long)height);
     return GSF_OK;
@@ -3222,12 +3222,16 @@ static gsf_result gsf__stb_load(gsf_context* ctx, const char* name, const void* 
     int64_t width = 0, height = 0;
     int32_t file_channels = 0;
     GSF__TRY(gsf__stb_query(ctx, name, &source, &width, &height, &file_channels));
-    GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size));
+    gsf__source_rewind(&source);
+    const gsf__image_kind kind = gsf__image_kind_of(&source);
+    const uint64_t densest = kind == GSF__IMAGE_PNM   ? 1
+                             : kind == GSF__IMAGE_BMP ? 8  // 1 bit per pixel
+                             : kind == GSF__IMAGE_TGA ? 64 // a packet of two bytes repeats a pixel up to 128 times
+                                                      : GSF__PIXELS_PER_BYTE;
+    GSF__TRY(gsf__check_image_claim(ctx, name, width, height, size, densest));
     // stb inflates all image data before it checks the number of rows. The limit on the compressed data is twice the size of
     // uncompressed rows of four 16-bit channels.
     const uint64_t most = 65536 + 2 * (uint64_t)height * (8 * (uint64_t)width + 1);
-    gsf__source_rewind(&source);
-    const gsf__image_kind kind = gsf__image_kind_of(&source);
     if (kind == GSF__IMAGE_PNG) GSF__TRY(gsf__check_png(ctx, name, (const char*)data, size, most));
     if (kind == GSF__IMAGE_JPEG) GSF__TRY(gsf__check_jpeg(ctx, name, (const unsigned char*)data, size, source.at));
     gsf__source_rewind(&source);
@@ -4473,7 +4477,7 @@ static gsf_result gsf__oiio_open(gsf_context* ctx, const char* name, const void*
     const OIIO::ImageSpec& spec = input->spec();
     if (spec.deep || spec.depth > 1 || spec.nchannels < 1)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s:0: deep, volume or empty image", name);
-    GSF__TRY(gsf__check_image_claim(ctx, name, spec.width, spec.height, size));
+    GSF__TRY(gsf__check_image_claim(ctx, name, spec.width, spec.height, size, GSF__PIXELS_PER_BYTE));
     if ((size_t)spec.nchannels > size)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:0: %d channels", name, spec.nchannels);
     *out = std::move(input);

@@ -683,6 +683,14 @@ static void test_image_guards(gsf_context* ctx) {
         CHECK_RESULT(ctx, gsf_decode_image(ctx, "cut.tga", tga, 18 + n, 0, &out), GSF_ERROR_FORMAT);
         free(tga);
     }
+    // A run-length TGA holds at most 64 pixels per byte: refused before 6 million pixels are decoded.
+    char runs[256] = {0};
+    runs[2] = 10;
+    runs[13] = 0x10;
+    runs[15] = 0x06;
+    runs[16] = 24;
+    CHECK_RESULT(ctx, gsf_decode_image(ctx, "runs.tga", runs, sizeof runs, 0, &out), GSF_ERROR_FORMAT);
+    CHECK(strstr(ctx->error, "256 bytes cannot hold 4096 x 1536 pixels") != NULL);
     static const char wide[] = "P5\n99999999999 1\n255\nxxxxxxxxxxxxxxxx";
     CHECK_RESULT(ctx, gsf_decode_image(ctx, "wide.pgm", wide, sizeof wide - 1, 0, &out), GSF_ERROR_FORMAT);
     CHECK(strstr(ctx->error, "PNM header") != NULL);
