@@ -7329,7 +7329,8 @@ static gsf_result gsf__bpe_read_token(const gsf__nn_config* file, const gsf_json
     return GSF_OK;
 }
 
-static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) {
+static gsf_result gsf__bpe_add(void* user, const gsf__bpe_token* token) {
+    gsf__bpe_loader* l = (gsf__bpe_loader*)user;
     gsf__bpe_tables* t = l->t;
     const size_t count = (size_t)t->added_count;
     if (count == GSF__BPE_ADDED_MAX)
@@ -7342,21 +7343,22 @@ static gsf_result gsf__bpe_add(gsf__bpe_loader* l, const gsf__bpe_token* token) 
     return GSF_OK;
 }
 
-// Reads "added_tokens_decoder" of tokenizer_config.json, {"id": token, ...}, or else added_tokens.json,
-// {"token": id, ...}.
-static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
-    gsf__bpe_tables* t = l->t;
-    const gsf__nn_config* file = l->decoder ? &t->config : &t->added_tokens;
+// Calls `add` for each member of `decoder`, "added_tokens_decoder" of tokenizer_config.json, {"id": token, ...}; if that
+// is NULL, of added_tokens.json, {"token": id, ...}.
+static gsf_result gsf__nn_read_added(const gsf__nn_config* config, const gsf_json_value* decoder,
+                                     const gsf__nn_config* added,
+                                     gsf_result (*add)(void* user, const gsf__bpe_token* token), void* user) {
+    const gsf__nn_config* file = decoder ? config : added;
     const gsf_json* json = &file->json;
-    const gsf_json_value* map = l->decoder ? l->decoder : json->values;
+    const gsf_json_value* map = decoder ? decoder : json->values;
     if (map->type != GSF_JSON_OBJECT)
-        return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are not an object", json->name,
+        return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: the added tokens are not an object", json->name,
                         (unsigned)map->offset);
     for (uint32_t i = map->child; i; i = json->values[i].next) {
         const gsf_json_value* value = &json->values[i];
         gsf__bpe_token token;
         double id = value->number;
-        if (l->decoder) {
+        if (decoder) {
             GSF__TRY(gsf__bpe_read_token(file, value, &token));
             id = value->key_size > 0 && value->key_size <= 10 ? 0.0 : -1.0;
             for (uint32_t k = 0; k < value->key_size && id >= 0.0; k++)
@@ -7368,12 +7370,12 @@ static gsf_result gsf__bpe_read_added(gsf__bpe_loader* l) {
             token.flags = GSF__BPE_ADDED;
             if (value->type != GSF_JSON_NUMBER || floor(id) != id || token.size == 0) id = -1.0;
         }
-        if (!(id >= 0.0) || id > (double)INT32_MAX)
-            return gsf_fail(l->ctx, GSF_ERROR_FORMAT, "%s:%u: not a token with an id from 0 to %d", json->name,
-                            (unsigned)value->offset, (int)INT32_MAX);
+        if (!(id >= 0.0) || id >= (double)INT32_MAX)
+            return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: not a token with an id from 0 to %d", json->name,
+                            (unsigned)value->offset, (int)INT32_MAX - 1);
         token.id = (int32_t)id;
         token.flags |= GSF__BPE_APART;
-        GSF__TRY(gsf__bpe_add(l, &token));
+        GSF__TRY(add(user, &token));
     }
     return GSF_OK;
 }
@@ -7424,7 +7426,7 @@ static gsf_result gsf__bpe_read_special(gsf__bpe_loader* l, gsf_nn_bpe* out) {
     gsf__bpe_tables* t = l->t;
     int32_t other, *const ids[GSF__COUNT(keys)] = {&out->bos, &out->eos, &out->unk, &other, &out->pad, &other, &other};
     l->decoder = gsf__nn_config_find(&t->config, "added_tokens_decoder");
-    GSF__TRY(gsf__bpe_read_added(l));
+    GSF__TRY(gsf__nn_read_added(&t->config, l->decoder, &t->added_tokens, gsf__bpe_add, l));
     int32_t next = t->vocabulary;
     for (int32_t i = 0; i < t->added_count; i++)
         next += gsf__bpe_find(t, t->added[i].text, t->added[i].size) < 0;
@@ -9039,70 +9041,39 @@ static gsf_result gsf__sp_read_model(gsf__pb in, gsf__sp_model* m) {
 
 // ---- loading: added tokens
 
-static gsf_result gsf__sp_add(gsf_context* ctx, gsf__sp_model* m, const char* text, size_t size, int64_t id, int trim_left,
-                              int trim_right) {
+typedef struct gsf__sp_adding {
+    gsf_context* ctx;
+    gsf__sp_model* m;
+    const char* name; // for error messages
+} gsf__sp_adding;
+
+static gsf_result gsf__sp_add(void* user, const gsf__bpe_token* token) {
+    gsf__sp_model* m = ((gsf__sp_adding*)user)->m;
+    gsf_context* ctx = ((gsf__sp_adding*)user)->ctx;
     const size_t n = m->added_count;
-    if (size == 0) return GSF_OK;
+    if (token->size == 0) return GSF_OK;
+    if (token->size > GSF__SP_PIECE)
+        return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: added token %s is longer than %d bytes",
+                        ((gsf__sp_adding*)user)->name, gsf__nn_show(token->text).text, (int)GSF__SP_PIECE);
     GSF__TRY(gsf__reserve(ctx, (void**)&m->added_list, &m->added_capacity, n, n + 1, sizeof *m->added_list));
     gsf__sp_added* a = &m->added_list[n];
     a->at = m->texts.size;
-    a->size = size;
-    a->id = (int32_t)id;
-    a->trim_left = trim_left;
-    a->trim_right = trim_right;
-    gsf_append_bytes(ctx, &m->texts, text, size);
+    a->size = token->size;
+    a->id = token->id;
+    a->trim_left = (token->flags & GSF__BPE_LSTRIP) != 0;
+    a->trim_right = (token->flags & GSF__BPE_RSTRIP) != 0;
+    gsf_append_bytes(ctx, &m->texts, token->text, token->size);
     m->added_count++;
     return m->texts.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
 }
 
-static gsf_result gsf__sp_fail_added(const gsf__nn_config* file, const gsf_json_value* value) {
-    return gsf_fail(file->ctx, GSF_ERROR_FORMAT, "%s:%u: not a valid added token", file->json.name,
-                    (unsigned)value->offset);
-}
-
-// Parses {"32099": {"content": "<extra_id_0>", "lstrip": true, "rstrip": true, ...}, ...}
-static gsf_result gsf__sp_add_decoder(const gsf__nn_config* file, const gsf_json_value* all, gsf__sp_model* m) {
-    const gsf_json* json = &file->json;
-    for (uint32_t i = all->child; i; i = json->values[i].next) {
-        const gsf_json_value* entry = &json->values[i];
-        const gsf_json_value* content = gsf_find_json_member(json, entry, "content");
-        const gsf_json_value* left = gsf_find_json_member(json, entry, "lstrip");
-        const gsf_json_value* right = gsf_find_json_member(json, entry, "rstrip");
-        const gsf_json_value* single = gsf_find_json_member(json, entry, "single_word");
-        int64_t id = 0;
-        int ok = entry->key_size > 0 && entry->key_size < 10 && content && content->type == GSF_JSON_STRING &&
-                 content->string_size <= GSF__SP_PIECE;
-        for (uint32_t k = 0; ok && k < entry->key_size; k++) {
-            ok = entry->key[k] >= '0' && entry->key[k] <= '9';
-            id = 10 * id + (entry->key[k] - '0');
-        }
-        if (!ok) return gsf__sp_fail_added(file, entry);
-        if (single && single->type == GSF_JSON_TRUE)
-            return gsf_fail(file->ctx, GSF_ERROR_UNSUPPORTED, "%s:%u: an added token with single_word set", json->name,
-                            (unsigned)entry->offset);
-        GSF__TRY(gsf__sp_add(file->ctx, m, content->string, content->string_size, id, left && left->type == GSF_JSON_TRUE,
-                             right && right->type == GSF_JSON_TRUE));
-    }
-    return GSF_OK;
-}
-
-// Parses added_tokens.json: {"<extra_id_0>": 32099, ...}
-static gsf_result gsf__sp_add_list(const gsf__nn_config* file, gsf__sp_model* m) {
-    for (uint32_t i = file->json.values[0].child; i; i = file->json.values[i].next) {
-        const gsf_json_value* entry = &file->json.values[i];
-        if (entry->type != GSF_JSON_NUMBER || !(entry->number >= 0 && entry->number < 1e9) ||
-            floor(entry->number) != entry->number || entry->key_size > GSF__SP_PIECE)
-            return gsf__sp_fail_added(file, entry);
-        GSF__TRY(gsf__sp_add(file->ctx, m, entry->key, entry->key_size, (int64_t)entry->number, 0, 0));
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__sp_add_extra(gsf_context* ctx, gsf__sp_model* m, int64_t extra) {
+static gsf_result gsf__sp_add_extra(gsf__sp_adding* adding, int64_t extra) {
     for (int64_t i = 0; i < extra; i++) {
         char text[32];
         const int size = snprintf(text, sizeof text, "<extra_id_%d>", (int)i); // extra_id_0 has the highest id
-        GSF__TRY(gsf__sp_add(ctx, m, text, (size_t)size, (int64_t)m->count - 1 + extra - i, 1, 1));
+        const gsf__bpe_token token = {text, (size_t)size, (int32_t)((int64_t)adding->m->count - 1 + extra - i),
+                                      GSF__BPE_LSTRIP | GSF__BPE_RSTRIP};
+        GSF__TRY(gsf__sp_add(adding, &token));
     }
     return GSF_OK;
 }
@@ -9141,17 +9112,17 @@ static gsf_result gsf__sp_add_all(gsf_context* ctx, const char* name, const gsf_
     static const char* const names[][2] = {{"unk_token", "<unk>"}, {"eos_token", "</s>"}, {"pad_token", "<pad>"}};
     int32_t* const ids[] = {NULL, &out->end_id, &out->pad_id};
     int64_t extra = GSF__SP_EXTRA;
-    const gsf_json_value* decoder = gsf__nn_config_find(config, "added_tokens_decoder");
+    gsf__sp_adding adding = {ctx, m, name};
     for (size_t i = 0; i < GSF__COUNT(names); i++) {
         const char* text = gsf__sp_token_text(config, names[i][0], names[i][1]);
         const int32_t id = strlen(text) <= GSF__SP_PIECE ? gsf__sp_find(m->pieces, text, strlen(text)) : -1;
-        if (id >= 0) GSF__TRY(gsf__sp_add(ctx, m, text, strlen(text), id, 0, 0));
+        const gsf__bpe_token token = {text, strlen(text), id, 0};
+        if (id >= 0) GSF__TRY(gsf__sp_add(&adding, &token));
     }
     GSF__TRY(gsf__nn_config_int_or(config, "extra_ids", extra, 0, 100000, &extra));
     if ((int64_t)m->count > INT32_MAX - extra) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: too many pieces", name);
-    GSF__TRY(gsf__sp_add_extra(ctx, m, extra));
-    if (decoder && decoder->type == GSF_JSON_OBJECT) GSF__TRY(gsf__sp_add_decoder(config, decoder, m));
-    else GSF__TRY(gsf__sp_add_list(added, m));
+    GSF__TRY(gsf__sp_add_extra(&adding, extra));
+    GSF__TRY(gsf__nn_read_added(config, gsf__nn_config_find(config, "added_tokens_decoder"), added, gsf__sp_add, &adding));
     GSF__TRY(gsf__sp_sort_added(ctx, m));
     out->id_count = (int32_t)m->count;
     for (size_t i = 0; i < m->added_count; i++)

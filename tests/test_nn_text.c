@@ -314,11 +314,15 @@ static void test_configs(void) {
     CHECK_OK(&ctx, gsf_nn_encode_text(&ctx, &t, "<extra_id_0>", 12, ids, 4, NULL));
     CHECK(t.id_count == 41 && ids[0] == 15 && ids[1] == 40 && ids[2] == 1 && ids[3] == 1);
     gsf_nn_destroy_tokenizer(&ctx, &t);
-    static const char* const bad[] = {
+    char too_long[1200]; // an added token of 1025 bytes
+    snprintf(too_long, sizeof too_long, "{\"added_tokens_decoder\": {\"1\": {\"content\": \"%01025d\"}}}", 0);
+    const char* const bad[] = {
         "{\"extra_ids\": -1}", "{\"extra_ids\": 1e9}", "[]", "{", "{\"eos_token\": \"[nowhere]\"}",
         "{\"added_tokens_decoder\": {\"x\": {\"content\": \"y\"}}}",
         "{\"added_tokens_decoder\": {\"1\": {\"content\": 2}}}",
-        "{\"added_tokens_decoder\": {\"12345678901\": {\"content\": \"y\"}}}"};
+        "{\"added_tokens_decoder\": {\"12345678901\": {\"content\": \"y\"}}}",
+        "{\"added_tokens_decoder\": {\"2147483647\": {\"content\": \"y\"}}}",
+        "{\"added_tokens_decoder\": {\"1\": {\"content\": \"\"}}}", "{\"added_tokens_decoder\": 5}", too_long};
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
         CHECK_RESULT(&ctx, gsf__nn_parse_tokenizer(&ctx, "m", m.data, m.size, bad[i], strlen(bad[i]), &t),
                      GSF_ERROR_FORMAT);
