@@ -322,8 +322,8 @@ static void put_curve(page* p) {
     put(p, "<text x=%d y=14>dB</text><text x=%d y=%d text-anchor=end>step</text>", 12, RIGHT, BOTTOM + 36);
     for (size_t i = 0; i < h->round_count; i++) {
         const double x = f.x0 + f.sx * h->rounds[i].iteration;
-        put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>round %d</text>", x, x, TOP - 18, BOTTOM,
-            x + 5.0, TOP - 9, (int)h->rounds[i].round);
+        put(p, "<line class=round x1=%.1f x2=%.1f y1=%d y2=%d /><text class=round x=%.1f y=%d>%s%d</text>", x, x, TOP - 18, BOTTOM,
+            x + 5.0, TOP - 9, i ? "" : "round ", (int)h->rounds[i].round); // rounds can be too close for more text
     }
     if (has_seen && h->without_count) put_line(p, &f, h->without_curve, h->without_count, 1, "seen without", "seen pixels, without repair");
     if (h->without_count) put_line(p, &f, h->without_curve, h->without_count, 0, "all without", "all pixels, without repair");
