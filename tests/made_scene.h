@@ -2,7 +2,6 @@
 #ifndef MADE_SCENE_H
 #define MADE_SCENE_H
 
-#ifdef GSF_USE_EMBREE
 #define MAKE_SCENE_NO_MAIN
 #include "../examples/make_scene.c"
 
@@ -25,5 +24,4 @@ static void remove_scene(const char* folder, int views) {
     }
 }
 
-#endif
 #endif

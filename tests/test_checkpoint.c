@@ -1,7 +1,9 @@
 // test_checkpoint.c - gsfix fix --resume with forged numbers in the checkpoint: refused with one line, or harmless
 #include "../examples/gsfix.h"
 
+#ifdef GSF_USE_EMBREE
 #include "made_scene.h"
+#endif
 #include "test.h"
 
 #include <unistd.h>

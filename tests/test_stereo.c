@@ -6,7 +6,9 @@
 
 #include "test.h"
 #include "test_hooks.h"
+#ifdef GSF_USE_EMBREE
 #include "made_scene.h"
+#endif
 
 #include <unistd.h>
 

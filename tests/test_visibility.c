@@ -6,7 +6,9 @@
 #include "gsfixer_splat.h"
 
 #include "test.h"
+#ifdef GSF_USE_EMBREE
 #include "made_scene.h"
+#endif
 
 #include <unistd.h>
 
