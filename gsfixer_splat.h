@@ -916,6 +916,13 @@ typedef enum gsf__ply_type {
 
 typedef enum gsf__ply_format { GSF__PLY_ASCII, GSF__PLY_LITTLE, GSF__PLY_BIG } gsf__ply_format;
 
+typedef struct gsf__ply_target { // destination of a column's values
+    int slot;
+    float* first;
+    size_t stride; // floats
+    size_t offset; // of the column within a row
+} gsf__ply_target;
+
 typedef struct gsf__ply { // a validated header; in binary files `count` rows of `row_bytes` fit into the data
     const char* name; // for error messages
     const unsigned char* data;
@@ -924,9 +931,12 @@ typedef struct gsf__ply { // a validated header; in binary files `count` rows of
     size_t body;      // byte offset of the first vertex row (ASCII: of its text)
     size_t count;     // number of vertices
     size_t columns;   // number of properties per vertex
-    size_t row_bytes; // binary only
+    size_t row_bytes; // ASCII: of a row of doubles, see gsf__ply_parse_text
     gsf__ply_type type[GSF__PLY_SLOTS];
-    size_t offset[GSF__PLY_SLOTS]; // byte offset within the row (ASCII: column index)
+    size_t offset[GSF__PLY_SLOTS];         // byte offset within the row
+    gsf__ply_target targets[GSF__PLY_RED]; // all columns of a splat except x y z
+    size_t target_count;
+    int all_f32;                           // every target column is little-endian float32, as in nearly all files
 } gsf__ply;
 
 static int gsf__is_blank(unsigned char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; }
@@ -1038,11 +1048,11 @@ static gsf_result gsf__ply_property(gsf_context* ctx, gsf__ply* ply, gsf__ply_el
                 return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: column \"%.*s\" occurs twice", ply->name, line,
                                 (int)(name_size < 40 ? name_size : 40), name_word);
             ply->type[slot] = type;
-            ply->offset[slot] = ply->format == GSF__PLY_ASCII ? element->columns : element->row_bytes;
+            ply->offset[slot] = element->row_bytes;
         }
     }
     element->columns++;
-    element->row_bytes += gsf__ply_type_size(type);
+    element->row_bytes += ply->format == GSF__PLY_ASCII ? sizeof(double) : gsf__ply_type_size(type);
     return GSF_OK;
 }
 
@@ -1195,10 +1205,36 @@ static double gsf__ply_value(const unsigned char* p, gsf__ply_type type, int big
     return 0.0;
 }
 
-static void gsf__ply_position(const gsf__ply* ply, size_t row, double out[3]) { // binary files only
-    const unsigned char* p = ply->data + ply->body + row * ply->row_bytes;
-    for (int k = 0; k < 3; k++)
-        out[k] = gsf__ply_value(p + ply->offset[k], ply->type[k], ply->format == GSF__PLY_BIG);
+static double gsf__ply_cell(const gsf__ply* ply, size_t row, int slot) {
+    const unsigned char* p = ply->data + ply->body + row * ply->row_bytes + ply->offset[slot];
+    double value;
+    if (ply->format != GSF__PLY_ASCII) return gsf__ply_value(p, ply->type[slot], ply->format == GSF__PLY_BIG);
+    memcpy(&value, p, sizeof value);
+    return value;
+}
+
+static void gsf__ply_position(const void* arg, size_t i, double* out) {
+    for (int k = 0; k < 3; k++) out[k] = gsf__ply_cell((const gsf__ply*)arg, i, k);
+}
+
+// Replaces the text of an ASCII file's rows by *values, which the caller frees even after an error. Binary: *values = NULL.
+static gsf_result gsf__ply_parse_text(gsf_context* ctx, gsf__ply* ply, double** values) {
+    const char *at = (const char*)ply->data + ply->body, *end = (const char*)ply->data + ply->size, *word;
+    const size_t cells = ply->count * ply->columns; // fits: the text has a digit and a separator for each
+    *values = NULL;
+    if (ply->format != GSF__PLY_ASCII) return GSF_OK;
+    *values = (double*)gsf_alloc(ctx, cells, sizeof **values);
+    if (!*values) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t c = 0; c < cells; c++) {
+        const size_t length = gsf__next_word(&at, end, &word);
+        if (length == 0 || !gsf__word_double(word, length, *values + c))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected a number, got %s\"%.*s\"", ply->name,
+                            (size_t)(word - (const char*)ply->data), length ? "" : "the end of the file ",
+                            (int)(length < 40 ? length : 40), word);
+    }
+    ply->data = (const unsigned char*)*values;
+    ply->body = 0;
+    return GSF_OK;
 }
 
 static int gsf__compare_doubles(const void* a, const void* b) {
@@ -1231,47 +1267,20 @@ static void gsf__choose_origin(double* axis, size_t n, double origin[3]) {
 static gsf_result gsf__sample_origin(gsf_context* ctx, size_t count, void (*position_fn)(const void*, size_t, double*),
                                      const void* arg, double origin[3]) {
     const size_t stride = count / GSF__ORIGIN_SAMPLES + 1;
-    const size_t room = count / stride + 1;
-    double* axis = (double*)gsf_alloc(ctx, room, 3 * sizeof(double));
+    double* axis = (double*)gsf_alloc(ctx, count / stride + 1, 3 * sizeof(double));
     if (!axis) return GSF_ERROR_OUT_OF_MEMORY;
     size_t n = 0;
-    for (size_t i = 0; i < count; i += stride) {
-        double p[3];
-        position_fn(arg, i, p);
-        // Skips NaN, infinity and garbage: no real coordinate is beyond 1e12.
-        if (!(fabs(p[0]) < 1e12 && fabs(p[1]) < 1e12 && fabs(p[2]) < 1e12)) continue;
-        for (size_t k = 0; k < 3; k++) axis[k * room + n] = p[k];
-        n++;
-    }
-    memmove(axis + n, axis + room, n * sizeof(double));
-    memmove(axis + 2 * n, axis + 2 * room, n * sizeof(double));
-    gsf__choose_origin(axis, n, origin);
+    for (size_t k = 0; k < 3; k++)
+        for (size_t i = 0; i < count; i += stride) {
+            double p[3];
+            position_fn(arg, i, p);
+            // Skips NaN, infinity and garbage: no real coordinate is beyond 1e12.
+            if (fabs(p[0]) < 1e12 && fabs(p[1]) < 1e12 && fabs(p[2]) < 1e12) axis[n++] = p[k];
+        }
+    gsf__choose_origin(axis, n / 3, origin);
     gsf_free(ctx, axis);
     return GSF_OK;
 }
-
-static void gsf__ply_sample_position(const void* arg, size_t i, double* out) {
-    gsf__ply_position((const gsf__ply*)arg, i, out);
-}
-static void gsf__array_sample_position(const void* arg, size_t i, double* out) {
-    memcpy(out, (const double*)arg + 3 * i, 3 * sizeof(double));
-}
-
-typedef struct gsf__ply_target { // destination of a column's values
-    int slot;
-    float* first;
-    size_t stride; // floats
-    size_t offset; // of the column within a row, as in gsf__ply
-} gsf__ply_target;
-
-typedef struct gsf__ply_job {
-    const gsf__ply* ply;
-    gsf__ply_target targets[GSF__PLY_RED]; // all columns except x y z
-    size_t target_count;
-    gsf_splats* splats;
-    uint8_t* bad;     // (count) 1 for rows with a NaN or infinite value
-    int all_f32;      // every target column is little-endian float32, as in nearly all files
-} gsf__ply_job;
 
 static int gsf__float_is_bad(float f) {
     uint32_t bits;
@@ -1279,43 +1288,58 @@ static int gsf__float_is_bad(float f) {
     return (bits & 0x7f800000u) == 0x7f800000u;
 }
 
-static void gsf__ply_list_targets(gsf__ply_job* job) {
-    static const unsigned char first[5] = {GSF__PLY_DC, GSF__PLY_OPACITY, GSF__PLY_SCALE, GSF__PLY_ROT, GSF__PLY_REST};
-    gsf_splats* s = job->splats;
-    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree);
-    float* base[4];
-    base[0] = s->sh;
-    base[1] = s->opacity_logits;
-    base[2] = s->log_scales;
-    base[3] = s->quats;
-    const size_t stride[4] = {3 * bands, 1, 3, 4};
-    for (int group = 0; group < 4; group++)
-        for (int slot = first[group]; slot < first[group + 1]; slot++) {
-            gsf__ply_target* t = &job->targets[job->target_count++];
-            t->slot = slot;
-            t->first = base[group] + (slot - first[group]);
-            t->stride = stride[group];
-        }
-    for (size_t channel = 0; channel < 3; channel++)
-        for (size_t k = 1; k < bands; k++) {
-            gsf__ply_target* t = &job->targets[job->target_count++];
-            t->slot = GSF__PLY_REST + (int)(channel * (bands - 1) + k - 1);
-            t->first = s->sh + 3 * k + channel;
-            t->stride = 3 * bands;
-        }
-    job->all_f32 = job->ply->format == GSF__PLY_LITTLE;
-    for (size_t i = 0; i < job->target_count; i++) {
-        gsf__ply_target* t = &job->targets[i];
-        t->offset = job->ply->offset[t->slot];
-        job->all_f32 = job->all_f32 && job->ply->type[t->slot] == GSF__PLY_F32;
+// Sets the mean of splat i to position p, relative to the origin. Returns whether it is NaN or infinite.
+static int gsf__place_mean(const gsf_splats* s, size_t i, const double p[3]) {
+    int bad = 0;
+    for (size_t k = 0; k < 3; k++) {
+        s->means[3 * i + k] = (float)(p[k] - s->origin[k]);
+        bad |= gsf__float_is_bad(s->means[3 * i + k]);
     }
+    return bad;
+}
+
+typedef struct gsf__decoder { // a file of any format whose rows become splats
+    const void* file;
+    gsf_splats* splats;
+    uint8_t* bad;      // (count) 1 for rows with a NaN or infinite value, which are dropped
+    float logits[256]; // of the opacity codes of .splat and .spz
+} gsf__decoder;
+
+enum { GSF__CODEC_CHUNK = 4096 }; // rows
+
+static size_t gsf__codec_chunks(size_t count) { return (count + GSF__CODEC_CHUNK - 1) / GSF__CODEC_CHUNK; }
+
+static size_t gsf__codec_end(size_t count, size_t begin) {
+    return begin + GSF__CODEC_CHUNK < count ? begin + GSF__CODEC_CHUNK : count;
+}
+
+static void gsf__ply_add_target(gsf__ply* ply, int slot, float* first, size_t stride) {
+    gsf__ply_target* t = &ply->targets[ply->target_count++];
+    t->slot = slot;
+    t->first = first;
+    t->stride = stride;
+    t->offset = ply->offset[slot];
+    ply->all_f32 = ply->all_f32 && ply->type[slot] == GSF__PLY_F32;
+}
+
+static void gsf__ply_list_targets(gsf__ply* ply, const gsf_splats* s) {
+    const int bands = gsf_splat_count_sh(s->sh_degree);
+    const size_t sh = 3 * (size_t)bands;
+    ply->all_f32 = ply->format == GSF__PLY_LITTLE;
+    for (int k = 0; k < 3; k++) gsf__ply_add_target(ply, GSF__PLY_DC + k, s->sh + k, sh);
+    gsf__ply_add_target(ply, GSF__PLY_OPACITY, s->opacity_logits, 1);
+    for (int k = 0; k < 3; k++) gsf__ply_add_target(ply, GSF__PLY_SCALE + k, s->log_scales + k, 3);
+    for (int k = 0; k < 4; k++) gsf__ply_add_target(ply, GSF__PLY_ROT + k, s->quats + k, 4);
+    for (int channel = 0, slot = GSF__PLY_REST; channel < 3; channel++)
+        for (int k = 1; k < bands; k++) gsf__ply_add_target(ply, slot++, s->sh + 3 * k + channel, sh);
 }
 
 // Decodes a row of little-endian float32 columns. Collects NaN and infinity in one bit to avoid a branch per value.
-static int gsf__ply_decode_f32(const gsf__ply_job* job, const unsigned char* row, size_t i) {
+static int gsf__ply_decode_f32(const gsf__ply* ply, size_t i) {
+    const unsigned char* row = ply->data + ply->body + i * ply->row_bytes;
     uint32_t bad = 0;
-    for (size_t t = 0; t < job->target_count; t++) {
-        const gsf__ply_target* target = &job->targets[t];
+    for (size_t t = 0; t < ply->target_count; t++) {
+        const gsf__ply_target* target = &ply->targets[t];
         const unsigned char* at = row + target->offset;
         const uint32_t bits =
             (uint32_t)at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
@@ -1325,85 +1349,28 @@ static int gsf__ply_decode_f32(const gsf__ply_job* job, const unsigned char* row
     return (int)(bad >> 31);
 }
 
-static int gsf__ply_decode_any(const gsf__ply_job* job, const unsigned char* row, size_t i) {
-    const gsf__ply* ply = job->ply;
+static int gsf__ply_decode_any(const gsf__ply* ply, size_t i) {
     int bad = 0;
-    for (size_t t = 0; t < job->target_count; t++) {
-        const gsf__ply_target* target = &job->targets[t];
-        const float f =
-            (float)gsf__ply_value(row + target->offset, ply->type[target->slot], ply->format == GSF__PLY_BIG);
+    for (size_t t = 0; t < ply->target_count; t++) {
+        const gsf__ply_target* target = &ply->targets[t];
+        const float f = (float)gsf__ply_cell(ply, i, target->slot);
         bad |= gsf__float_is_bad(f);
         target->first[i * target->stride] = f;
     }
     return bad;
 }
 
-enum { GSF__PLY_CHUNK = 4096 }; // rows
-
 static void gsf__ply_decode_chunk(void* arg, size_t chunk, int32_t worker) {
-    const gsf__ply_job* job = (const gsf__ply_job*)arg;
-    const gsf__ply* ply = job->ply;
-    const gsf_splats* s = job->splats;
-    const size_t begin = chunk * GSF__PLY_CHUNK;
-    const size_t end = begin + GSF__PLY_CHUNK < ply->count ? begin + GSF__PLY_CHUNK : ply->count;
+    const gsf__decoder* job = (const gsf__decoder*)arg;
+    const gsf__ply* ply = (const gsf__ply*)job->file;
+    const size_t begin = chunk * GSF__CODEC_CHUNK;
     (void)worker;
-    for (size_t i = begin; i < end; i++) {
-        const unsigned char* row = ply->data + ply->body + i * ply->row_bytes;
+    for (size_t i = begin; i < gsf__codec_end(ply->count, begin); i++) {
         double p[3];
-        int bad = job->all_f32 ? gsf__ply_decode_f32(job, row, i) : gsf__ply_decode_any(job, row, i);
+        const int bad = ply->all_f32 ? gsf__ply_decode_f32(ply, i) : gsf__ply_decode_any(ply, i);
         gsf__ply_position(ply, i, p);
-        for (size_t k = 0; k < 3; k++) {
-            const float f = (float)(p[k] - s->origin[k]);
-            bad |= gsf__float_is_bad(f);
-            s->means[3 * i + k] = f;
-        }
-        job->bad[i] = (uint8_t)bad;
+        job->bad[i] = (uint8_t)(bad | gsf__place_mean(job->splats, i, p));
     }
-}
-
-// Parses the next row of an ASCII body into values (columns) and advances *at.
-static gsf_result gsf__ply_ascii_row(gsf_context* ctx, const gsf__ply* ply, const char** at, double* values) {
-    const char *end = (const char*)ply->data + ply->size, *word;
-    for (size_t c = 0; c < ply->columns; c++) {
-        const size_t length = gsf__next_word(at, end, &word);
-        if (length == 0 || !gsf__word_double(word, length, &values[c]))
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: expected a number, got %s\"%.*s\"", ply->name,
-                            (size_t)(word - (const char*)ply->data), length ? "" : "the end of the file ",
-                            (int)(length < 40 ? length : 40), word);
-    }
-    return GSF_OK;
-}
-
-static gsf_result gsf__ply_decode_ascii(gsf_context* ctx, gsf__ply_job* job) {
-    const gsf__ply* ply = job->ply;
-    gsf_splats* s = job->splats;
-    double* values = (double*)gsf_alloc(ctx, ply->columns, sizeof(double));
-    double* positions = (double*)gsf_alloc(ctx, ply->count ? ply->count : 1, 3 * sizeof(double));
-    gsf_result result = values && positions ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    const char* at = (const char*)ply->data + ply->body;
-    for (size_t i = 0; i < ply->count && result == GSF_OK; i++) {
-        result = gsf__ply_ascii_row(ctx, ply, &at, values);
-        if (result != GSF_OK) break;
-        int bad = 0;
-        for (size_t k = 0; k < 3; k++) positions[3 * i + k] = values[ply->offset[k]];
-        for (size_t t = 0; t < job->target_count; t++) {
-            const float f = (float)values[job->targets[t].offset];
-            bad |= gsf__float_is_bad(f);
-            job->targets[t].first[i * job->targets[t].stride] = f;
-        }
-        job->bad[i] = (uint8_t)bad;
-    }
-    if (result == GSF_OK)
-        result = gsf__sample_origin(ctx, ply->count, gsf__array_sample_position, positions, s->origin);
-    for (size_t i = 0; i < ply->count && result == GSF_OK; i++)
-        for (size_t k = 0; k < 3; k++) {
-            const float f = (float)(positions[3 * i + k] - s->origin[k]);
-            job->bad[i] |= (uint8_t)gsf__float_is_bad(f);
-            s->means[3 * i + k] = f;
-        }
-    gsf_free(ctx, positions);
-    gsf_free(ctx, values);
-    return result;
 }
 
 // Removes the bad rows. The ids remain consecutive, since gsf_splat_make has numbered them and they are not moved.
@@ -1425,6 +1392,37 @@ static void gsf__drop_rows(gsf_context* ctx, const char* name, const uint8_t* ba
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats dropped: a value is NaN, infinite or beyond float32",
                 name, s->count - kept, s->count);
     s->count = kept;
+}
+
+// Logits of the 256 opacity codes. Codes 0 and 255 cover half a step each and decode to its middle, so that their
+// logits are finite.
+static void gsf__make_logits(float logits[256]) {
+    for (int i = 0; i < 256; i++) {
+        const double p = (i == 0 ? 0.25 : i == 255 ? 254.75 : (double)i) / 255.0;
+        logits[i] = (float)log(p / (1.0 - p));
+    }
+}
+
+// Decodes the rows of a file into *out, which has room for them and is destroyed on error. position_fn(file, i, xyz)
+// returns the position of row i; decode_chunk is called with a gsf__decoder.
+static gsf_result gsf__decode_splats(gsf_context* ctx, const char* name, const void* file,
+                                     void (*position_fn)(const void*, size_t, double*), gsf_chunk_fn decode_chunk,
+                                     gsf_splats* out) {
+    gsf__decoder job;
+    job.file = file;
+    job.splats = out;
+    job.bad = (uint8_t*)gsf_alloc(ctx, out->count, 1);
+    gsf__make_logits(job.logits);
+    const gsf_result result =
+        job.bad ? gsf__sample_origin(ctx, out->count, position_fn, file, out->origin) : GSF_ERROR_OUT_OF_MEMORY;
+    if (result == GSF_OK) {
+        gsf__parallel_for(ctx, gsf__codec_chunks(out->count), decode_chunk, &job);
+        gsf__drop_rows(ctx, name, job.bad, out);
+    } else {
+        gsf_splat_destroy(ctx, out);
+    }
+    gsf_free(ctx, job.bad);
+    return result;
 }
 
 // Checks that all columns of a splat are present and derives *sh_degree from the number of f_rest columns.
@@ -1453,24 +1451,14 @@ static gsf_result gsf__parse_ply(gsf_context* ctx, const char* name, const void*
     GSF__TRY(gsf__ply_check_columns(ctx, &ply, &degree));
     if (ply.count > UINT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, ids hold 2^32", name, ply.count);
-    GSF__TRY(gsf_splat_make(ctx, ply.count, degree, out));
-    gsf__ply_job job;
-    memset(&job, 0, sizeof job);
-    job.ply = &ply;
-    job.splats = out;
-    job.bad = (uint8_t*)gsf_alloc_zeroed(ctx, ply.count ? ply.count : 1, 1);
-    gsf_result result = job.bad ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    gsf__ply_list_targets(&job);
-    if (result == GSF_OK && ply.format == GSF__PLY_ASCII) {
-        result = gsf__ply_decode_ascii(ctx, &job);
-    } else if (result == GSF_OK) {
-        result = gsf__sample_origin(ctx, ply.count, gsf__ply_sample_position, &ply, out->origin);
-        if (result == GSF_OK)
-            gsf__parallel_for(ctx, (ply.count + GSF__PLY_CHUNK - 1) / GSF__PLY_CHUNK, gsf__ply_decode_chunk, &job);
+    double* values;
+    gsf_result result = gsf__ply_parse_text(ctx, &ply, &values);
+    if (result == GSF_OK) result = gsf_splat_make(ctx, ply.count, degree, out);
+    if (result == GSF_OK) {
+        gsf__ply_list_targets(&ply, out);
+        result = gsf__decode_splats(ctx, name, &ply, gsf__ply_position, gsf__ply_decode_chunk, out);
     }
-    if (result == GSF_OK) gsf__drop_rows(ctx, name, job.bad, out);
-    else gsf_splat_destroy(ctx, out);
-    gsf_free(ctx, job.bad);
+    gsf_free(ctx, values);
     return result;
 }
 
@@ -1502,10 +1490,9 @@ static void gsf__ply_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__ply_write_job* job = (const gsf__ply_write_job*)arg;
     const gsf_splats* s = job->splats;
     const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree);
-    const size_t begin = chunk * GSF__PLY_CHUNK;
-    const size_t end = begin + GSF__PLY_CHUNK < s->count ? begin + GSF__PLY_CHUNK : s->count;
+    const size_t begin = chunk * GSF__CODEC_CHUNK;
     (void)worker;
-    for (size_t i = begin; i < end; i++) {
+    for (size_t i = begin; i < gsf__codec_end(s->count, begin); i++) {
         unsigned char* p = job->rows + i * job->row_bytes;
         const float* sh = s->sh + 3 * bands * i;
         for (size_t k = 0; k < 3; k++) {
@@ -1520,6 +1507,22 @@ static void gsf__ply_encode_chunk(void* arg, size_t chunk, int32_t worker) {
         for (size_t k = 0; k < 3; k++) p = gsf__put_f32(p, s->log_scales[3 * i + k]);
         for (size_t k = 0; k < 4; k++) p = gsf__put_f32(p, s->quats[4 * i + k]);
     }
+}
+
+// Appends room for `count` rows to `out`. Returns where they begin; NULL when out of memory.
+static unsigned char* gsf__append_rows(gsf_context* ctx, gsf_buffer* out, size_t count, size_t row_bytes) {
+    const size_t before = out->size;
+    size_t bytes;
+    if (!gsf__mul_size(count, row_bytes, &bytes) || bytes > SIZE_MAX / 2) {
+        (void)gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", count);
+        return NULL;
+    }
+    if (out->failed ||
+        gsf__reserve(ctx, (void**)&out->data, &out->capacity, before, before + bytes + 1, 1) != GSF_OK)
+        return NULL;
+    out->size += bytes;
+    out->data[out->size] = 0;
+    return (unsigned char*)out->data + before;
 }
 
 static void gsf__splats_sample_position(const void* arg, size_t i, double* out) {
@@ -1546,15 +1549,9 @@ static gsf_result gsf__format_ply(gsf_context* ctx, const gsf_splats* splats, gs
     for (int k = 0; k < 3; k++) gsf_append_text(ctx, out, "property float scale_%d\n", k);
     for (int k = 0; k < 4; k++) gsf_append_text(ctx, out, "property float rot_%d\n", k);
     gsf_append_text(ctx, out, "end_header\n");
-    size_t bytes;
-    if (!gsf__mul_size(splats->count, job.row_bytes, &bytes) || bytes > SIZE_MAX / 2)
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", splats->count);
-    if (out->failed) return GSF_ERROR_OUT_OF_MEMORY;
-    GSF__TRY(gsf__reserve(ctx, (void**)&out->data, &out->capacity, out->size, out->size + bytes + 1, 1));
-    job.rows = (unsigned char*)out->data + out->size;
-    gsf__parallel_for(ctx, (splats->count + GSF__PLY_CHUNK - 1) / GSF__PLY_CHUNK, gsf__ply_encode_chunk, &job);
-    out->size += bytes;
-    out->data[out->size] = 0;
+    job.rows = gsf__append_rows(ctx, out, splats->count, job.row_bytes);
+    if (!job.rows) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__parallel_for(ctx, gsf__codec_chunks(splats->count), gsf__ply_encode_chunk, &job);
     return GSF_OK;
 }
 
@@ -1586,15 +1583,6 @@ static unsigned char gsf__to_u8(float value) {
 
 static float gsf__logistic_u8(float logit) { return 255.0f / (1.0f + expf(-logit)); }
 
-// Logits of the 256 opacity codes. Codes 0 and 255 cover half a step each and decode to its middle, so that their
-// logits are finite.
-static void gsf__make_logits(float logits[256]) {
-    for (int i = 0; i < 256; i++) {
-        const double p = (i == 0 ? 0.25 : i == 255 ? 254.75 : (double)i) / 255.0;
-        logits[i] = (float)log(p / (1.0 - p));
-    }
-}
-
 // Normalises a quaternion. Zero becomes the identity, as in the rasterizer.
 static void gsf__unit_quat(const float* q, float out[4]) {
     float largest = 0.0f;
@@ -1604,6 +1592,10 @@ static void gsf__unit_quat(const float* q, float out[4]) {
     const float norm = sqrtf(v[1] * v[1] + v[2] * v[2] + v[3] * v[3] + v[0] * v[0]);
     for (int k = 0; k < 4; k++) out[k] = largest > 0.0f ? v[k] / norm : k == 0 ? 1.0f : 0.0f;
 }
+
+typedef struct gsf__spz_arrays { // see ".spz (Niantic)" below
+    unsigned char *positions, *alphas, *colors, *scales, *rotations, *sh;
+} gsf__spz_arrays;
 
 // Splats being written to a format of lower precision.
 typedef struct gsf__pack {
@@ -1615,15 +1607,9 @@ typedef struct gsf__pack {
     double farthest;      // largest |coordinate| of any position
     double typical;       // median scale
     unsigned char* out;
-    int version, fraction; // .spz
-    unsigned char *positions, *alphas, *colors, *scales, *rotations, *sh;
+    int version, fraction;  // .spz
+    gsf__spz_arrays arrays; // .spz
 } gsf__pack;
-
-enum { GSF__PACK_CHUNK = 4096 }; // splats
-
-static size_t gsf__pack_end(size_t count, size_t begin) {
-    return begin + GSF__PACK_CHUNK < count ? begin + GSF__PACK_CHUNK : count;
-}
 
 static int gsf__any_bad(const float* values, size_t count) {
     int bad = 0;
@@ -1634,9 +1620,9 @@ static int gsf__any_bad(const float* values, size_t count) {
 static void gsf__pack_check_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__pack* job = (const gsf__pack*)arg;
     const gsf_splats* s = job->splats;
-    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__CODEC_CHUNK;
     (void)worker;
-    for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
+    for (size_t i = begin; i < gsf__codec_end(s->count, begin); i++) {
         int bad = gsf__any_bad(s->log_scales + 3 * i, 3) | gsf__any_bad(s->quats + 4 * i, 4) |
                   gsf__any_bad(s->opacity_logits + i, 1) | gsf__any_bad(s->sh + sh * i, sh);
         for (size_t k = 0; k < 3; k++) bad |= gsf__float_is_bad((float)(s->origin[k] + (double)s->means[3 * i + k]));
@@ -1660,7 +1646,7 @@ static gsf_result gsf__pack_plan(gsf_context* ctx, const char* name, const gsf_s
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, more than the format's 2^32", name, splats->count);
     job->bad = (uint8_t*)gsf_alloc(ctx, splats->count ? splats->count : 1, 1);
     if (!job->bad) return GSF_ERROR_OUT_OF_MEMORY;
-    gsf__parallel_for(ctx, (splats->count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__pack_check_chunk, job);
+    gsf__parallel_for(ctx, gsf__codec_chunks(splats->count), gsf__pack_check_chunk, job);
     for (size_t i = 0; i < splats->count; i++) job->count += !job->bad[i];
     if (job->count < splats->count) {
         gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu of %zu splats left out: a value is NaN, infinite or beyond float32", name,
@@ -1705,13 +1691,6 @@ static void gsf__pack_warn_coarse(gsf_context* ctx, const gsf__pack* job, double
 
 enum { GSF__SPLAT_ROW = 32 };
 
-typedef struct gsf__splat_job {
-    const unsigned char* rows;
-    gsf_splats* splats;
-    uint8_t* bad; // as in gsf__pack
-    float logits[256];
-} gsf__splat_job;
-
 static float gsf__get_f32(const unsigned char* p) {
     const uint32_t bits = (uint32_t)gsf__load_le(p, 4);
     float value;
@@ -1719,23 +1698,23 @@ static float gsf__get_f32(const unsigned char* p) {
     return value;
 }
 
-static void gsf__splat_sample_position(const void* arg, size_t i, double* out) {
+static void gsf__splat_position(const void* arg, size_t i, double* out) {
     for (int k = 0; k < 3; k++) out[k] = (double)gsf__get_f32((const unsigned char*)arg + GSF__SPLAT_ROW * i + 4 * k);
 }
 
 static void gsf__splat_decode_chunk(void* arg, size_t chunk, int32_t worker) {
-    const gsf__splat_job* job = (const gsf__splat_job*)arg;
+    const gsf__decoder* job = (const gsf__decoder*)arg;
     const gsf_splats* s = job->splats;
-    const size_t begin = chunk * GSF__PACK_CHUNK;
+    const size_t begin = chunk * GSF__CODEC_CHUNK;
     (void)worker;
-    for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
-        const unsigned char* row = job->rows + GSF__SPLAT_ROW * i;
-        int bad = 0;
+    for (size_t i = begin; i < gsf__codec_end(s->count, begin); i++) {
+        const unsigned char* row = (const unsigned char*)job->file + GSF__SPLAT_ROW * i;
+        double p[3];
+        gsf__splat_position(job->file, i, p);
+        int bad = gsf__place_mean(s, i, p);
         for (size_t k = 0; k < 3; k++) {
-            const float mean = (float)((double)gsf__get_f32(row + 4 * k) - s->origin[k]);
             const float scale = gsf__get_f32(row + 12 + 4 * k);
-            bad |= gsf__float_is_bad(mean) | gsf__float_is_bad(scale) | (scale < 0.0f);
-            s->means[3 * i + k] = mean;
+            bad |= gsf__float_is_bad(scale) | (scale < 0.0f);
             s->log_scales[3 * i + k] = logf(fmaxf(scale, FLT_MIN)); // files contain zero scales; log(0) is infinite
             s->sh[3 * i + k] = ((float)row[24 + k] / 255.0f - 0.5f) / gsf__dc_scale;
         }
@@ -1752,29 +1731,15 @@ static gsf_result gsf__splat_parse(gsf_context* ctx, const char* name, const voi
     const size_t count = size / GSF__SPLAT_ROW;
     if (count > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "%s: %zu splats, ids hold 2^32", name, count);
     GSF__TRY(gsf_splat_make(ctx, count, 0, out));
-    gsf__splat_job job;
-    job.rows = (const unsigned char*)data;
-    job.splats = out;
-    job.bad = (uint8_t*)gsf_alloc(ctx, count ? count : 1, 1);
-    gsf__make_logits(job.logits);
-    gsf_result result = job.bad ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    if (result == GSF_OK) result = gsf__sample_origin(ctx, count, gsf__splat_sample_position, data, out->origin);
-    if (result == GSF_OK) {
-        gsf__parallel_for(ctx, (count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__splat_decode_chunk, &job);
-        gsf__drop_rows(ctx, name, job.bad, out);
-    } else {
-        gsf_splat_destroy(ctx, out);
-    }
-    gsf_free(ctx, job.bad);
-    return result;
+    return gsf__decode_splats(ctx, name, data, gsf__splat_position, gsf__splat_decode_chunk, out);
 }
 
 static void gsf__splat_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__pack* job = (const gsf__pack*)arg;
     const gsf_splats* s = job->splats;
-    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
+    const size_t sh = 3 * (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__CODEC_CHUNK;
     (void)worker;
-    for (size_t row = begin; row < gsf__pack_end(job->count, begin); row++) {
+    for (size_t row = begin; row < gsf__codec_end(job->count, begin); row++) {
         const size_t i = job->rows ? job->rows[row] : row;
         unsigned char* p = job->out + GSF__SPLAT_ROW * row;
         float q[4];
@@ -1789,22 +1754,12 @@ static void gsf__splat_encode_chunk(void* arg, size_t chunk, int32_t worker) {
 
 static gsf_result gsf__splat_format(gsf_context* ctx, const char* name, const gsf_splats* splats, gsf_buffer* out) {
     gsf__pack job;
-    size_t bytes = 0;
     GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
     gsf__pack_warn_coarse(ctx, &job, job.farthest / 8388608.0); // float32 has a 24-bit significand
-    gsf_result result = GSF_OK;
-    if (!gsf__mul_size(job.count, GSF__SPLAT_ROW, &bytes) || bytes > SIZE_MAX / 2)
-        result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", job.count);
-    else
-        result = gsf__reserve(ctx, (void**)&out->data, &out->capacity, out->size, out->size + bytes + 1, 1);
-    if (result == GSF_OK) {
-        job.out = (unsigned char*)out->data + out->size;
-        gsf__parallel_for(ctx, (job.count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__splat_encode_chunk, &job);
-        out->size += bytes;
-        out->data[out->size] = 0;
-    }
+    job.out = gsf__append_rows(ctx, out, job.count, GSF__SPLAT_ROW);
+    if (job.out) gsf__parallel_for(ctx, gsf__codec_chunks(job.count), gsf__splat_encode_chunk, &job);
     gsf__pack_free(ctx, &job);
-    return result;
+    return job.out ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
 }
 
 /* gzip (RFC 1952) around DEFLATE:
@@ -1901,14 +1856,27 @@ typedef struct gsf__spz { // decompressed content of a file
     int version, fraction, degree, flags; // degree: of the file, 0..4
     size_t count, size;                   // size: bytes of content without extensions
     double unit;                          // 2^-fraction
-    const unsigned char *positions, *alphas, *colors, *scales, *rotations, *sh;
-    gsf_splats* splats;
-    uint8_t* bad;
-    float logits[256];
+    gsf__spz_arrays arrays;
 } gsf__spz;
 
+static size_t gsf__spz_position_size(int version) { return version == 1 ? 6 : 9; }
+
+static size_t gsf__spz_rotation_size(int version) { return version == 3 ? 4 : 3; }
+
 static size_t gsf__spz_row(int version, int degree) {
-    return (version == 1 ? 6u : 9u) + 1 + 3 + 3 + (version == 3 ? 4u : 3u) + 3 * (size_t)(degree * (degree + 2));
+    return gsf__spz_position_size(version) + 1 + 3 + 3 + gsf__spz_rotation_size(version) +
+           3 * (size_t)(degree * (degree + 2));
+}
+
+static gsf__spz_arrays gsf__spz_place(unsigned char* content, size_t count, int version) {
+    gsf__spz_arrays a;
+    a.positions = content + GSF__SPZ_HEAD;
+    a.alphas = a.positions + count * gsf__spz_position_size(version);
+    a.colors = a.alphas + count;
+    a.scales = a.colors + 3 * count;
+    a.rotations = a.scales + 3 * count;
+    a.sh = a.rotations + count * gsf__spz_rotation_size(version);
+    return a;
 }
 
 static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const unsigned char* p, size_t size,
@@ -1938,15 +1906,6 @@ static gsf_result gsf__spz_read_head(gsf_context* ctx, const char* name, const u
     return GSF_OK;
 }
 
-static void gsf__spz_place(gsf__spz* spz, const unsigned char* content) {
-    spz->positions = content + GSF__SPZ_HEAD;
-    spz->alphas = spz->positions + spz->count * (spz->version == 1 ? 6u : 9u);
-    spz->colors = spz->alphas + spz->count;
-    spz->scales = spz->colors + 3 * spz->count;
-    spz->rotations = spz->scales + 3 * spz->count;
-    spz->sh = spz->rotations + spz->count * (spz->version == 3 ? 4u : 3u);
-}
-
 // Inflates the content into *out (freed by the caller) and sets the pointers of *spz to its arrays.
 static gsf_result gsf__spz_inflate(gsf_context* ctx, const char* name, const unsigned char* data, size_t size,
                                    gsf__spz* spz, unsigned char** out) {
@@ -1965,7 +1924,7 @@ static gsf_result gsf__spz_inflate(gsf_context* ctx, const char* name, const uns
         if (spz->flags & GSF__SPZ_EXTENDED)
             gsf_log(ctx, GSF_LOG_WARNING, "%s: %zu bytes of extensions ignored (one of them can change the axes)", name,
                     whole - spz->size);
-        gsf__spz_place(spz, *out);
+        spz->arrays = gsf__spz_place(*out, spz->count, spz->version);
     } else {
         gsf_free(ctx, *out);
         *out = NULL;
@@ -1977,9 +1936,9 @@ static void gsf__spz_position(const void* arg, size_t i, double* out) {
     const gsf__spz* spz = (const gsf__spz*)arg;
     for (size_t k = 0; k < 3; k++) {
         if (spz->version == 1) {
-            out[k] = (double)gsf__half_to_float((uint16_t)gsf__load_le(spz->positions + 6 * i + 2 * k, 2));
+            out[k] = (double)gsf__half_to_float((uint16_t)gsf__load_le(spz->arrays.positions + 6 * i + 2 * k, 2));
         } else {
-            const int32_t fixed = (int32_t)gsf__load_le(spz->positions + 9 * i + 3 * k, 3);
+            const int32_t fixed = (int32_t)gsf__load_le(spz->arrays.positions + 9 * i + 3 * k, 3);
             out[k] = (double)(fixed < 0x800000 ? fixed : fixed - 0x1000000) * spz->unit;
         }
         out[k] *= (double)gsf__spz_axes[k];
@@ -2012,29 +1971,28 @@ static void gsf__spz_decode_rotation(const unsigned char* p, int version, float 
 }
 
 static void gsf__spz_decode_chunk(void* arg, size_t chunk, int32_t worker) {
-    const gsf__spz* spz = (const gsf__spz*)arg;
-    const gsf_splats* s = spz->splats;
-    const size_t begin = chunk * GSF__PACK_CHUNK, rotation = spz->version == 3 ? 4 : 3;
+    const gsf__decoder* job = (const gsf__decoder*)arg;
+    const gsf__spz* spz = (const gsf__spz*)job->file;
+    const gsf__spz_arrays* from = &spz->arrays;
+    const gsf_splats* s = job->splats;
+    const size_t begin = chunk * GSF__CODEC_CHUNK, rotation = gsf__spz_rotation_size(spz->version);
     const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), stored = (size_t)(spz->degree * (spz->degree + 2));
     (void)worker;
-    for (size_t i = begin; i < gsf__pack_end(s->count, begin); i++) {
-        const unsigned char* sh = spz->sh + 3 * stored * i;
+    for (size_t i = begin; i < gsf__codec_end(s->count, begin); i++) {
+        const unsigned char* sh = from->sh + 3 * stored * i;
         double p[3];
-        int bad = 0;
         gsf__spz_position(spz, i, p);
+        job->bad[i] = (uint8_t)gsf__place_mean(s, i, p);
         for (size_t k = 0; k < 3; k++) {
-            s->means[3 * i + k] = (float)(p[k] - s->origin[k]);
-            bad |= gsf__float_is_bad(s->means[3 * i + k]);
-            s->log_scales[3 * i + k] = (float)spz->scales[3 * i + k] / 16.0f - 10.0f;
-            s->sh[3 * bands * i + k] = ((float)spz->colors[3 * i + k] / 255.0f - 0.5f) / gsf__spz_color;
+            s->log_scales[3 * i + k] = (float)from->scales[3 * i + k] / 16.0f - 10.0f;
+            s->sh[3 * bands * i + k] = ((float)from->colors[3 * i + k] / 255.0f - 0.5f) / gsf__spz_color;
         }
         for (size_t k = 1; k < bands; k++)
             for (size_t c = 0; c < 3; c++)
                 s->sh[3 * (bands * i + k) + c] =
                     gsf__spz_signs[k - 1] * ((float)sh[3 * (k - 1) + c] - 128.0f) / 128.0f;
-        gsf__spz_decode_rotation(spz->rotations + rotation * i, spz->version, s->quats + 4 * i);
-        s->opacity_logits[i] = spz->logits[spz->alphas[i]];
-        spz->bad[i] = (uint8_t)bad;
+        gsf__spz_decode_rotation(from->rotations + rotation * i, spz->version, s->quats + 4 * i);
+        s->opacity_logits[i] = job->logits[from->alphas[i]];
     }
 }
 
@@ -2044,21 +2002,10 @@ static gsf_result gsf__spz_parse(gsf_context* ctx, const char* name, const void*
     GSF__TRY(gsf__spz_inflate(ctx, name, (const unsigned char*)data, size, &spz, &content));
     gsf_result result = gsf_splat_make(ctx, spz.count, spz.degree < 3 ? spz.degree : 3, out);
     if (result == GSF_OK) {
-        spz.splats = out;
-        spz.bad = (uint8_t*)gsf_alloc(ctx, spz.count ? spz.count : 1, 1);
-        gsf__make_logits(spz.logits);
         out->antialiased = (spz.flags & GSF__SPZ_ANTIALIASED) != 0;
-        result = spz.bad ? gsf__sample_origin(ctx, spz.count, gsf__spz_position, &spz, out->origin)
-                         : GSF_ERROR_OUT_OF_MEMORY;
-        if (result == GSF_OK) {
-            gsf__parallel_for(ctx, (spz.count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__spz_decode_chunk, &spz);
-            gsf__drop_rows(ctx, name, spz.bad, out);
-            if (spz.degree > 3) gsf_log(ctx, GSF_LOG_WARNING, "%s: SH band 4 ignored", name);
-        } else {
-            gsf_splat_destroy(ctx, out);
-        }
-        gsf_free(ctx, spz.bad);
+        result = gsf__decode_splats(ctx, name, &spz, gsf__spz_position, gsf__spz_decode_chunk, out);
     }
+    if (result == GSF_OK && spz.degree > 3) gsf_log(ctx, GSF_LOG_WARNING, "%s: SH band 4 ignored", name);
     gsf_free(ctx, content);
     return result;
 }
@@ -2099,22 +2046,23 @@ static unsigned char gsf__spz_encode_sh(float value, int bucket) {
 static void gsf__spz_encode_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__pack* job = (const gsf__pack*)arg;
     const gsf_splats* s = job->splats;
-    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__PACK_CHUNK;
-    const size_t rotation = job->version == 3 ? 4 : 3;
+    const size_t bands = (size_t)gsf_splat_count_sh(s->sh_degree), begin = chunk * GSF__CODEC_CHUNK;
+    const size_t rotation = gsf__spz_rotation_size(job->version);
+    const gsf__spz_arrays* to = &job->arrays;
     const double units = ldexp(1.0, job->fraction);
     (void)worker;
-    for (size_t row = begin; row < gsf__pack_end(job->count, begin); row++) {
+    for (size_t row = begin; row < gsf__codec_end(job->count, begin); row++) {
         const size_t i = job->rows ? job->rows[row] : row;
-        unsigned char* sh = job->sh + 3 * (bands - 1) * row;
+        unsigned char* sh = to->sh + 3 * (bands - 1) * row;
         for (size_t k = 0; k < 3; k++) {
             const double p = (s->origin[k] + (double)s->means[3 * i + k]) * units * (double)gsf__spz_axes[k];
             const int32_t fixed = (int32_t)(p < 0.0 ? p - 0.5 : p + 0.5); // gsf__spz_choose_fraction keeps it in range
-            gsf__store_le(job->positions + 9 * row + 3 * k, (uint32_t)fixed & 0xffffffu, 3);
-            job->scales[3 * row + k] = gsf__to_u8((s->log_scales[3 * i + k] + 10.0f) * 16.0f);
-            job->colors[3 * row + k] = gsf__to_u8(s->sh[3 * bands * i + k] * (gsf__spz_color * 255.0f) + 127.5f);
+            gsf__store_le(to->positions + 9 * row + 3 * k, (uint32_t)fixed & 0xffffffu, 3);
+            to->scales[3 * row + k] = gsf__to_u8((s->log_scales[3 * i + k] + 10.0f) * 16.0f);
+            to->colors[3 * row + k] = gsf__to_u8(s->sh[3 * bands * i + k] * (gsf__spz_color * 255.0f) + 127.5f);
         }
-        job->alphas[row] = gsf__to_u8(gsf__logistic_u8(s->opacity_logits[i]));
-        gsf__spz_encode_rotation(s->quats + 4 * i, job->version, job->rotations + rotation * row);
+        to->alphas[row] = gsf__to_u8(gsf__logistic_u8(s->opacity_logits[i]));
+        gsf__spz_encode_rotation(s->quats + 4 * i, job->version, to->rotations + rotation * row);
         for (size_t k = 1; k < bands; k++)
             for (size_t c = 0; c < 3; c++)
                 sh[3 * (k - 1) + c] = gsf__spz_encode_sh(gsf__spz_signs[k - 1] * s->sh[3 * (bands * i + k) + c],
@@ -2153,37 +2101,32 @@ static void gsf__spz_warn_scales(gsf_context* ctx, const gsf__pack* job) {
 
 static gsf_result gsf__spz_format(gsf_context* ctx, const char* name, const gsf_splats* splats, int version,
                                   gsf_buffer* out) {
+    const char head[GSF__SPZ_HEAD] = {'N', 'G', 'S', 'P'};
     gsf__pack job;
-    size_t size = 0;
+    gsf_buffer raw;
+    memset(&raw, 0, sizeof raw);
     if (version != 2 && version != 3)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: SPZ version %d, expected 2 or 3", name, version);
     GSF__TRY(gsf__pack_plan(ctx, name, splats, &job));
     job.version = version;
     gsf_result result = gsf__spz_choose_fraction(ctx, &job);
     gsf__spz_warn_scales(ctx, &job);
-    if (result == GSF_OK &&
-        (!gsf__mul_size(job.count, gsf__spz_row(version, splats->sh_degree), &size) || size > SIZE_MAX / 2))
-        result = gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "out of memory: %zu splats", job.count);
-    if (result == GSF_OK && !(job.out = (unsigned char*)gsf_alloc(ctx, GSF__SPZ_HEAD + size, 1)))
-        result = GSF_ERROR_OUT_OF_MEMORY;
     if (result == GSF_OK) {
-        memset(job.out, 0, GSF__SPZ_HEAD);
-        memcpy(job.out, "NGSP", 4);
-        gsf__store_le(job.out + 4, (uint64_t)version, 4);
-        gsf__store_le(job.out + 8, job.count, 4);
-        job.out[12] = (unsigned char)splats->sh_degree;
-        job.out[13] = (unsigned char)job.fraction;
-        job.out[14] = splats->antialiased ? GSF__SPZ_ANTIALIASED : 0;
-        job.positions = job.out + GSF__SPZ_HEAD;
-        job.alphas = job.positions + 9 * job.count;
-        job.colors = job.alphas + job.count;
-        job.scales = job.colors + 3 * job.count;
-        job.rotations = job.scales + 3 * job.count;
-        job.sh = job.rotations + (version == 3 ? 4u : 3u) * job.count;
-        gsf__parallel_for(ctx, (job.count + GSF__PACK_CHUNK - 1) / GSF__PACK_CHUNK, gsf__spz_encode_chunk, &job);
-        result = gsf__gzip_append(ctx, name, job.out, GSF__SPZ_HEAD + size, out);
+        gsf_append_bytes(ctx, &raw, head, sizeof head);
+        job.out = gsf__append_rows(ctx, &raw, job.count, gsf__spz_row(version, splats->sh_degree));
+        if (!job.out) result = GSF_ERROR_OUT_OF_MEMORY;
     }
-    gsf_free(ctx, job.out);
+    if (result == GSF_OK) {
+        gsf__store_le(raw.data + 4, (uint64_t)version, 4);
+        gsf__store_le(raw.data + 8, job.count, 4);
+        raw.data[12] = (char)splats->sh_degree;
+        raw.data[13] = (char)job.fraction;
+        raw.data[14] = splats->antialiased ? GSF__SPZ_ANTIALIASED : 0;
+        job.arrays = gsf__spz_place((unsigned char*)raw.data, job.count, version);
+        gsf__parallel_for(ctx, gsf__codec_chunks(job.count), gsf__spz_encode_chunk, &job);
+        result = gsf__gzip_append(ctx, name, raw.data, raw.size, out);
+    }
+    gsf_destroy_buffer(ctx, &raw);
     gsf__pack_free(ctx, &job);
     return result;
 }
@@ -2976,33 +2919,22 @@ static gsf_result gsf__transforms_read(gsf_context* ctx, const gsf_json* json, g
 static gsf_result gsf__transforms_read_points(gsf_context* ctx, const char* name, const void* data, size_t size,
                                               gsf__sfm* m) {
     gsf__ply ply;
-    gsf_result result = GSF_OK;
+    double* values;
     GSF__TRY(gsf__ply_read_header(ctx, name, data, size, &ply));
     for (int k = 0; k < 3; k++)
         if (ply.type[k] == GSF__PLY_ABSENT)
             return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s:%zu: no points: column x, y or z is missing", name, ply.body);
-    double* values = NULL;
-    const char* at = (const char*)ply.data + ply.body;
-    if (ply.format == GSF__PLY_ASCII && !(values = (double*)gsf_alloc(ctx, ply.columns, sizeof(double))))
-        return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = gsf__ply_parse_text(ctx, &ply, &values);
     for (size_t i = 0; i < ply.count && result == GSF_OK; i++) {
-        const unsigned char* row = ply.data + ply.body + i * ply.row_bytes;
         double xyz[3];
         uint8_t rgb[3];
         int added;
-        if (values) result = gsf__ply_ascii_row(ctx, &ply, &at, values);
-        if (result != GSF_OK) break;
-        for (int k = 0; k < 6; k++) {
-            const int slot = k < 3 ? k : GSF__PLY_RED + k - 3;
-            const gsf__ply_type type = ply.type[slot];
-            double value = 128.0;
-            if (type != GSF__PLY_ABSENT) {
-                value = values ? values[ply.offset[slot]]
-                               : gsf__ply_value(row + ply.offset[slot], type, ply.format == GSF__PLY_BIG);
-                if (k >= 3 && (type == GSF__PLY_F32 || type == GSF__PLY_F64)) value *= 255.0;
-            }
-            if (k < 3) xyz[k] = value;
-            else rgb[k - 3] = (uint8_t)(value > 0.0 ? (value < 255.0 ? value + 0.5 : 255.0) : 0.0);
+        gsf__ply_position(&ply, i, xyz);
+        for (int k = 0; k < 3; k++) {
+            const gsf__ply_type type = ply.type[GSF__PLY_RED + k];
+            double value = type == GSF__PLY_ABSENT ? 128.0 : gsf__ply_cell(&ply, i, GSF__PLY_RED + k);
+            if (type == GSF__PLY_F32 || type == GSF__PLY_F64) value *= 255.0;
+            rgb[k] = (uint8_t)(value > 0.0 ? (value < 255.0 ? value + 0.5 : 255.0) : 0.0);
         }
         result = gsf__sfm_add_point(ctx, m, i, xyz, rgb, &added);
     }
