@@ -667,6 +667,7 @@ typedef struct gsf__nn_attention_desc {
     float scale;               // of the logits, 0: 1/sqrt(head_dim)
     float* out;                // (queries, heads*head_dim), row stride ldo; may be q
     int64_t ldo;
+    float* lse;                // NULL, or (heads, queries): what gsf__nn_attention_grad needs to recompute the weights
     int32_t bf16;              // GSF_CPU_AVX512_BF16, even head_dim: rounds q, k, v and the softmax weights to bf16
 } gsf__nn_attention_desc;
 
@@ -1825,6 +1826,9 @@ GSF__SHARED void gsf__nn_prefetch(const float* at) {
     (void)at;
 }
 
+// For the rows of a tile, in named variables: gcc would keep an array in memory.
+#define GSF__SIX(X) X(0) X(1) X(2) X(3) X(4) X(5)
+
 #define gsf__v_put GSF__V(gsf__v_put)               // stores; `stream` bypasses the caches and needs an aligned address
 #define gsf__v_turn_pairs GSF__V(gsf__v_turn_pairs) // (a c - b s, b c + a s) for each pair of lanes (a, b)
 #define gsf__v_hadamard GSF__V(gsf__v_hadamard)     // of each block of 1, 2, 4 ... lanes, unscaled
@@ -1898,9 +1902,6 @@ GSF__INLINE_AVX512 void gsf__nn_store16(float* y, __mmask16 mask, __m512 v) { //
 }
 
 GSF__INLINE_AVX512 __m256 gsf__nn_fold16(__m512 v) { return _mm512_castps512_ps256(v) + _mm512_extractf32x8_ps(v, 1); }
-
-// For the rows of a tile, in named variables: gcc would keep an array in memory.
-#define GSF__SIX(X) X(0) X(1) X(2) X(3) X(4) X(5)
 
 // to[j to_ld + i] = m[i][j]
 GSF__INLINE_AVX2 void gsf__nn_store_columns(__m256 m[8], float* to, int64_t to_ld) {
@@ -2002,6 +2003,8 @@ GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may re
     (void)stream;
 }
 
+#define gsf__v_gelu_tail GSF__V(gsf__v_gelu_tail)
+#define gsf__v_gelu_limit GSF__V(gsf__v_gelu_limit)
 #define gsf__v_gelu GSF__V(gsf__v_gelu)
 #define gsf__v_activate GSF__V(gsf__v_activate)
 
@@ -2015,19 +2018,29 @@ GSF__SHARED void gsf__nn_end_stream(int stream) { // before other threads may re
 #ifdef GSF__KERNELS_ACTIVATIONS
 #if GSF__LANES > 1 // at one lane: the reference above
 
-GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) { // gsf__nn_gelu_ref
+// q of gsf__nn_gelu_ref for z in [0, 13.2]; power: exp(-z^2/2)
+GSF__V_INLINE gsf__vf gsf__v_gelu_tail(gsf__vf z, gsf__vf* power) {
     const gsf__v_exp2_terms terms = gsf__v_exp2_of(0);
     const gsf__vf half_log2_e = gsf__v_set(-0.72134752f), k = gsf__v_set(3.5f);
-    const gsf__vf z = gsf__v_min(gsf__v_set(13.2f), gsf__v_abs(x)); // a NaN stays a NaN, as below
     const gsf__vf t = k / (z + k), s = t - gsf__v_set(0.5f), square = z * z;
     const gsf__vf rounded = gsf__v_madd(square, half_log2_e, terms.rounder), n = rounded - terms.rounder;
     // the rounding errors of the square and of the factor
     const gsf__vf lost = gsf__v_msub(z, z, square) * half_log2_e;
     const gsf__vf low = gsf__v_madd(square, gsf__v_set(-9.62981495e-9f), lost);
-    const gsf__vf power = gsf__v_power(&terms, rounded, gsf__v_msub(square, half_log2_e, n) + low);
+    *power = gsf__v_power(&terms, rounded, gsf__v_msub(square, half_log2_e, n) + low);
     gsf__vf tail = gsf__v_set(gsf__nn_gelu_tail[9]);
     for (int i = 8; i >= 0; i--) tail = gsf__v_madd(tail, s, gsf__v_set(gsf__nn_gelu_tail[i]));
-    return gsf__v_nmadd(z, power * (t * tail), gsf__v_max(gsf__v_set(0.0f), x));
+    return *power * (t * tail);
+}
+
+GSF__V_INLINE gsf__vf gsf__v_gelu_limit(gsf__vf x) { // |x| up to where q is 0; a NaN stays a NaN, as below
+    return gsf__v_min(gsf__v_set(13.2f), gsf__v_abs(x));
+}
+
+GSF__V_INLINE gsf__vf gsf__v_gelu(gsf__vf x) {
+    gsf__vf power;
+    const gsf__vf z = gsf__v_gelu_limit(x);
+    return gsf__v_nmadd(z, gsf__v_gelu_tail(z, &power), gsf__v_max(gsf__v_set(0.0f), x));
 }
 
 // As gsf__nn_activation_ref, and -0, the limit, at -inf; a NaN stays a NaN.
@@ -2342,6 +2355,21 @@ static void gsf__norm_silu_scalar(const float* x, int64_t count, const float* me
 
 #endif // GSF__ISA
 #ifdef GSF__KERNELS_NORMS
+
+typedef struct gsf__norm_terms { gsf__vf mean, low, inverse; } gsf__norm_terms; // mean + low: the mean as two floats
+
+GSF__V_INLINE gsf__norm_terms gsf__norm_terms_of(gsf__moments m, float inverse) {
+    const float mean = (float)m.mean;
+    gsf__norm_terms n;
+    n.mean = gsf__v_set(mean);
+    n.low = gsf__v_set((float)(m.mean - (double)mean));
+    n.inverse = gsf__v_set(inverse);
+    return n;
+}
+
+// (x - mean) inverse, accurate to the resolution of the difference, as x - mean is exact if the two are close.
+GSF__V_INLINE gsf__vf gsf__norm_apply(const gsf__norm_terms* n, gsf__vf x) { return ((x - n->mean) - n->low) * n->inverse; }
+
 #if GSF__LANES > 1
 
 typedef struct gsf__moments_sums { gsf__vd sum0, sum1, square0, square1; } gsf__moments_sums;
@@ -2379,20 +2407,6 @@ GSF__V_INLINE gsf__moments GSF__V(gsf__moments_all)(const float* x, int64_t coun
 GSF__V_KERNEL gsf__moments GSF__V(gsf__moments)(const float* x, int64_t count, int centre) {
     return GSF__V(gsf__moments_all)(x, count, centre);
 }
-
-typedef struct gsf__norm_terms { gsf__vf mean, low, inverse; } gsf__norm_terms; // mean + low: the mean as two floats
-
-GSF__V_INLINE gsf__norm_terms gsf__norm_terms_of(gsf__moments m, float inverse) {
-    const float mean = (float)m.mean;
-    gsf__norm_terms n;
-    n.mean = gsf__v_set(mean);
-    n.low = gsf__v_set((float)(m.mean - (double)mean));
-    n.inverse = gsf__v_set(inverse);
-    return n;
-}
-
-// (x - mean) inverse, accurate to the resolution of the difference, as x - mean is exact if the two are close.
-GSF__V_INLINE gsf__vf gsf__norm_apply(const gsf__norm_terms* n, gsf__vf x) { return ((x - n->mean) - n->low) * n->inverse; }
 
 // Normalises the `left` values from x[i] on; in loops over whole vectors `left` is a constant.
 GSF__V_INLINE gsf__vf gsf__norm_value(gsf__norm_vectors by, const gsf__norm_terms* n, const float* x, int64_t i,
@@ -4413,6 +4427,9 @@ static void gsf__attention_logits_scalar(const gsf__nn_attention_desc* d, int64_
     }
 }
 
+// The base-2 logarithm of the sum of 2^logit over the keys: logits in base 2, of centred keys.
+static float gsf__attention_lse(float top, float total) { return (float)((double)top + log2((double)total)); }
+
 // Attention of one query, given its logits p; sum: (head_dim), scratch.
 static void gsf__attention_row(const gsf__nn_attention_desc* d, int64_t head, int64_t row, float* p, float* sum) {
     const int64_t dim = d->head_dim, column = head * dim;
@@ -4433,6 +4450,7 @@ static void gsf__attention_row(const gsf__nn_attention_desc* d, int64_t head, in
     }
     float* out = d->out + row * d->ldo + column;
     for (int64_t i = 0; i < dim; i++) out[i] = total == 0.0f ? 0.0f : sum[i] / total; // NaN propagates
+    if (d->lse) d->lse[head * d->queries + row] = gsf__attention_lse(top * 1.44269504f, total);
 }
 
 static void gsf__attention_chunk_scalar(const gsf__attention_job* job, size_t chunk, int32_t worker) {
@@ -4817,11 +4835,12 @@ GSF__TARGET_BF16 static void gsf__attention_values_bf16(const float* p, int64_t 
 }
 
 GSF__TARGET_AVX2 static void gsf__attention_finish(const gsf__attention_job* job, const gsf__attention_scratch* s,
-                                                   int64_t queries, float* out) {
+                                                   int64_t queries, float* out, float* lse) {
     const int64_t dim = job->desc.head_dim, ld = job->desc.ldo;
     for (int64_t r = 0; r < queries; r++) {
         gsf__attention_fetch(out, r + GSF__ATT_AHEAD, queries, ld, dim);
         const float total = gsf__v_sum_avx2(_mm256_loadu_ps(s->sum + 8 * r));
+        if (lse) lse[r] = gsf__attention_lse(s->top[r], total);
         const float* from = s->out + r / GSF__ATT_GROUP * job->panels * GSF__ATT_TILE + r % GSF__ATT_GROUP * GSF__ATT_PANEL;
         const __m256 divisor = _mm256_set1_ps(total);
         for (int64_t i = 0; i < dim; i += 8) {
@@ -4861,7 +4880,7 @@ static void gsf__attention_chunk_packed(const gsf__attention_job* job, size_t ch
             parts->values(s.p, count, s.v, keys, job->panels, fade, s.out + g * job->panels * GSF__ATT_TILE);
         }
     }
-    gsf__attention_finish(job, &s, rows, d->out + first * d->ldo + column);
+    gsf__attention_finish(job, &s, rows, d->out + first * d->ldo + column, d->lse ? d->lse + head * d->queries + first : NULL);
 }
 
 #endif // GSF__X86
@@ -4892,6 +4911,15 @@ static void gsf__attention_chunk(void* arg, size_t chunk, int32_t worker) {
     if (job->parts) gsf__attention_chunk_packed(job, chunk, worker);
 #endif
     if (!job->parts) gsf__attention_chunk_scalar(job, chunk, worker);
+}
+
+static void gsf__attention_fill_in(gsf__nn_attention_desc* d) { // defaults
+    const int64_t width = (int64_t)d->heads * d->head_dim;
+    if (!d->ldq) d->ldq = width;
+    if (!d->ldk) d->ldk = width;
+    if (!d->ldv) d->ldv = width;
+    if (!d->ldo) d->ldo = width;
+    if (d->scale == 0.0f) d->scale = 1.0f / sqrtf((float)d->head_dim);
 }
 
 // Chooses the ranges of queries by the sizes only; returns the number of chunks.
@@ -4937,12 +4965,7 @@ static gsf_result gsf__nn_run_attention(gsf_context* ctx, gsf__nn_workspace* wor
     gsf__nn_attention_desc* d = &job.desc;
     if (!d->q || !d->k || !d->v || !d->out || d->queries < 0 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "attention: a tensor or a size is missing");
-    const int64_t width = (int64_t)d->heads * d->head_dim;
-    if (!d->ldq) d->ldq = width;
-    if (!d->ldk) d->ldk = width;
-    if (!d->ldv) d->ldv = width;
-    if (!d->ldo) d->ldo = width;
-    if (d->scale == 0.0f) d->scale = 1.0f / sqrtf((float)d->head_dim);
+    gsf__attention_fill_in(d);
     job.panels = ((int64_t)d->head_dim + GSF__ATT_PANEL - 1) / GSF__ATT_PANEL;
     const size_t chunks = gsf__attention_plan(&job);
     job.scratch_floats = gsf__attention_floats(&job);
@@ -13115,9 +13138,43 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
 
 // ---- >>nn training --------------------------------------------------------------
 
-// Only with GSF_NN_TRAINING. Gradients of a loss L: `dy` is dL/dy, `dx` is dL/dx. Sums over rows have a fixed order, so
-// results do not depend on the number of workers.
+/* Only with GSF_NN_TRAINING. Gradients of a loss L: `dy` is dL/dy, `dx` is dL/dx. Gradients of weights are added to what
+   is there; those of activations replace it unless `accumulate` is set. Sums over rows have a fixed order, so results do
+   not depend on the number of workers. */
 #ifdef GSF_NN_TRAINING
+
+// ---- training: kernels
+
+typedef struct gsf__grad_product { // c[r ldc + j] += sum of a[r a_row + k a_step] b[k ldb + j] over k < count
+    const float *a, *b;
+    float* c;
+    int64_t a_row, a_step, ldb, ldc;
+    int64_t rows, columns, count;
+} gsf__grad_product;
+
+typedef struct gsf__grad_job {
+    const struct gsf__grad_kernels* kernels;
+    const gsf__norm_kernels* norms;
+    gsf__nn_activation activation;
+    const float *x, *dy, *weight, *scale; // softmax: x is the forward pass's result
+    const char* data;                     // the matrix to transpose
+    gsf_nn_dtype dtype;
+    float* dx;
+    int64_t rows, columns, ld, chunk_rows;
+    double *sums, *products; // per chunk and column: of dy, of dy and the normalised x
+    float *short_sums, *short_products; // the same, of a few rows
+    float eps, factor;
+    int centre, accumulate;
+} gsf__grad_job;
+
+typedef struct gsf__grad_kernels {
+    void (*multiply)(const gsf__grad_product* p);
+    void (*activate)(gsf__nn_activation activation, const float* x, const float* dy, int64_t count, float* dx);
+    void (*softmax)(const float* y, const float* dy, int64_t count, float scale, float* dx);
+    void (*norm)(const gsf__grad_job* job, int64_t row, float* sums, float* products);
+    // Turns logits into weights p = 2^(factor logit - lse) and dp into scale p (dp - delta)
+    void (*attention)(float* logits, float* dp, int64_t count, float factor, float scale, float lse, float delta);
+} gsf__grad_kernels;
 
 static double gsf__nn_activation_slope(gsf__nn_activation activation, double x) {
     switch (activation) {
@@ -13137,36 +13194,237 @@ static double gsf__nn_activation_slope(gsf__nn_activation activation, double x) 
     return 1.0;
 }
 
-typedef struct gsf__grad_job {
-    gsf__nn_activation activation;
-    const float *x, *dy, *weight, *scale; // softmax: x is the forward pass's result
-    const char* data;                     // the matrix to transpose
-    gsf_nn_dtype dtype;
-    float* dx;
-    int64_t rows, columns, ld, chunk_rows;
-    double *sums, *products; // per chunk and column: of dy, of dy and the normalised x
-    float eps, factor;
-    int centre;
-} gsf__grad_job;
+static void gsf__activate_grad_scalar(gsf__nn_activation activation, const float* x, const float* dy, int64_t count,
+                                      float* dx) {
+    for (int64_t i = 0; i < count; i++)
+        dx[i] = (float)((double)dy[i] * gsf__nn_activation_slope(activation, (double)x[i]));
+}
+
+static void gsf__attention_grad_row_scalar(float* logits, float* dp, int64_t count, float factor, float scale, float lse,
+                                           float delta) {
+    for (int64_t j = 0; j < count; j++) {
+        logits[j] = exp2f(factor * logits[j] - lse);
+        dp[j] = scale * logits[j] * (dp[j] - delta);
+    }
+}
+
+#define gsf__v_slope GSF__V(gsf__v_slope)
+#define gsf__norm_grad_terms GSF__V(gsf__norm_grad_terms)
+
+#define GSF__KERNELS "gsfixer_nn.h"
+#define GSF__KERNELS_GRADIENTS
+#define GSF__KERNELS_AVX512
+#include "gsfixer.h"
+#undef GSF__KERNELS_GRADIENTS
+
+#endif // GSF_NN_TRAINING
+#endif // GSF__ISA
+#ifdef GSF__KERNELS_GRADIENTS
+
+// Up to 6 rows and 2 vectors of c. Missing rows repeat the last one. In loops over whole vectors `left` is a constant.
+GSF__V_INLINE void GSF__V(gsf__multiply_tile)(const gsf__grad_product* p, int64_t row, int64_t column, size_t left) {
+    const size_t left1 = left > GSF__LANES ? left - GSF__LANES : 0;
+    const int64_t last = p->rows - row - 1, step = p->a_step;
+    const float *a = p->a + row * p->a_row, *b = p->b + column;
+    float* c = p->c + row * p->ldc + column;
+#define GSF_X(r)                                               \
+    const float* a##r = a + gsf__least(r, last) * p->a_row;    \
+    gsf__vf c##r = gsf__v_set(0.0f), d##r = c##r;
+    GSF__SIX(GSF_X)
+#undef GSF_X
+    for (int64_t k = 0, at = 0; k < p->count; k++, at += step, b += p->ldb) {
+        const gsf__vf b0 = gsf__v_load_first(b, left), b1 = gsf__v_load_first(b + GSF__LANES, left1);
+        gsf__vf v;
+#define GSF_X(r)                       \
+        v = gsf__v_set(a##r[at]);      \
+        c##r = gsf__v_madd(v, b0, c##r); \
+        d##r = gsf__v_madd(v, b1, d##r);
+        GSF__SIX(GSF_X)
+#undef GSF_X
+    }
+#define GSF_X(r)                                                                                          \
+    if (r <= last) {                                                                                      \
+        float* to = c + (r) * p->ldc;                                                                     \
+        gsf__v_store_first(to, gsf__v_load_first(to, left) + c##r, left);                                 \
+        if (left1) gsf__v_store_first(to + GSF__LANES, gsf__v_load_first(to + GSF__LANES, left1) + d##r, left1); \
+    }
+    GSF__SIX(GSF_X)
+#undef GSF_X
+}
+
+GSF__V_KERNEL void GSF__V(gsf__multiply)(const gsf__grad_product* p) {
+    for (int64_t j = 0; j < p->columns; j += 2 * GSF__LANES) {
+        const size_t left = (size_t)(p->columns - j);
+        for (int64_t r = 0; r < p->rows; r += 6) {
+            if (left >= 2 * GSF__LANES) GSF__V(gsf__multiply_tile)(p, r, j, 2 * GSF__LANES);
+            else GSF__V(gsf__multiply_tile)(p, r, j, left);
+        }
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__softmax_grad)(const float* y, const float* dy, int64_t count, float scale, float* dx) {
+    gsf__vd total = gsf__vd_set(0.0);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        total = gsf__vd_add_folded(total, gsf__v_load_first(y + i, left) * gsf__v_load_first(dy + i, left));
+    }
+    const gsf__vf sum = gsf__v_set((float)gsf__vd_sum(total)), factor = gsf__v_set(scale);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf slope = gsf__v_load_first(dy + i, left) - sum;
+        gsf__v_store_first(dx + i, factor * gsf__v_load_first(y + i, left) * slope, left);
+    }
+}
+
+typedef struct gsf__norm_grad_terms { gsf__vf normal, d, h; } gsf__norm_grad_terms; // h: the gradient of `normal`
+
+GSF__V_INLINE gsf__norm_grad_terms GSF__V(gsf__norm_grad_at)(const gsf__grad_job* job, const gsf__norm_terms* n,
+                                                             const float* x, const float* dy, int64_t i) {
+    const size_t left = (size_t)(job->columns - i);
+    gsf__norm_grad_terms t;
+    t.normal = gsf__norm_apply(n, gsf__v_load_first(x + i, left));
+    t.h = t.d = gsf__v_load_first(dy + i, left);
+    if (job->weight) t.h = t.h * gsf__v_load_first(job->weight + i, left);
+    if (job->scale) t.h = gsf__v_madd(t.h, gsf__v_load_first(job->scale + i, left), t.h);
+    return t;
+}
+
+GSF__V_KERNEL void GSF__V(gsf__norm_grad_row)(const gsf__grad_job* job, int64_t row, float* sums, float* products) {
+    const int64_t dim = job->columns;
+    const float *x = job->x + row * job->ld, *dy = job->dy + row * job->ld;
+    float* dx = job->dx + row * job->ld;
+    const gsf__moments m = job->norms->moments(x, dim, job->centre);
+    const float inverse = gsf__norm_inverse(m, dim, job->eps);
+    const gsf__norm_terms n = gsf__norm_terms_of(m, inverse);
+    gsf__vd total = gsf__vd_set(0.0), weighted = total;
+    for (int64_t i = 0; i < dim; i += GSF__LANES) {
+        const size_t left = (size_t)(dim - i);
+        const gsf__norm_grad_terms t = GSF__V(gsf__norm_grad_at)(job, &n, x, dy, i);
+        total = gsf__vd_add_folded(total, t.h);
+        weighted = gsf__vd_add_folded(weighted, t.h * t.normal);
+        gsf__v_store_first(sums + i, gsf__v_load_first(sums + i, left) + t.d, left);
+        gsf__v_store_first(products + i, gsf__v_madd(t.d, t.normal, gsf__v_load_first(products + i, left)), left);
+    }
+    const gsf__vf mean = gsf__v_set(job->centre ? (float)(gsf__vd_sum(total) / (double)dim) : 0.0f);
+    const gsf__vf slope = gsf__v_set((float)(gsf__vd_sum(weighted) / (double)dim));
+    for (int64_t i = 0; i < dim; i += GSF__LANES) {
+        const size_t left = (size_t)(dim - i);
+        const gsf__norm_grad_terms t = GSF__V(gsf__norm_grad_at)(job, &n, x, dy, i);
+        gsf__vf d = n.inverse * gsf__v_nmadd(t.normal, slope, t.h - mean);
+        if (job->accumulate) d = d + gsf__v_load_first(dx + i, left);
+        gsf__v_store_first(dx + i, d, left);
+    }
+}
+
+#if GSF__LANES > 1 // at one lane: the references above
+
+// gsf__nn_activation_slope. Beyond the clamping the slope is 0 or 1.
+GSF__V_INLINE gsf__vf gsf__v_slope(gsf__nn_activation activation, gsf__vf x) {
+    const gsf__vf zero = gsf__v_set(0.0f), one = gsf__v_set(1.0f);
+    if (activation == GSF__NN_GELU_TANH) {
+        const gsf__vf v = gsf__v_min(gsf__v_set(12.0f), gsf__v_max(gsf__v_set(-12.0f), x)), square = v * v;
+        const gsf__vf u = gsf__v_madd(square, gsf__v_set(-0.10294324f), gsf__v_set(-2.30220819f));
+        const gsf__vf power = gsf__v_exp2(v * u), s = one / (one + power), t = power * s; // t = 1 - s
+        const gsf__vf du = gsf__v_madd(square, gsf__v_set(0.214070916f), gsf__v_set(1.59576912f));
+        return gsf__v_madd(v * du, s * t, s);
+    }
+    if (activation == GSF__NN_SILU) {
+        const gsf__vf v = gsf__v_min(gsf__v_set(80.0f), gsf__v_max(gsf__v_set(-80.0f), x));
+        const gsf__vf power = gsf__v_exp(zero - v), s = one / (one + power);
+        return gsf__v_madd(v * s, power * s, s);
+    }
+    if (activation == GSF__NN_GELU) {
+        gsf__vf power;
+        const gsf__vf z = gsf__v_gelu_limit(x), tail = gsf__v_gelu_tail(z, &power);
+        const gsf__vf below = gsf__v_select(gsf__v_gt(x, zero), one - tail, tail); // of the normal distribution
+        return gsf__v_madd(gsf__v_with_sign(z, x), power * gsf__v_set(0.398942280f), below);
+    }
+    if (activation == GSF__NN_RELU) return gsf__v_keep(gsf__v_gt(x, zero), one);
+    return one;
+}
+
+GSF__V_INLINE void GSF__V(gsf__activate_grad_all)(gsf__nn_activation activation, const float* x, const float* dy,
+                                                  int64_t count, float* dx) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf slope = gsf__v_slope(activation, gsf__v_load_first(x + i, left));
+        gsf__v_store_first(dx + i, slope * gsf__v_load_first(dy + i, left), left);
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__activate_grad)(gsf__nn_activation activation, const float* x, const float* dy, int64_t count,
+                                              float* dx) {
+#define GSF_X(kind) case kind: GSF__V(gsf__activate_grad_all)(kind, x, dy, count, dx); break;
+    switch (activation) {
+        GSF_X(GSF__NN_LINEAR)
+        GSF_X(GSF__NN_GELU_TANH)
+        GSF_X(GSF__NN_SILU)
+        GSF_X(GSF__NN_GELU)
+        GSF_X(GSF__NN_RELU)
+    }
+#undef GSF_X
+}
+
+GSF__V_KERNEL void GSF__V(gsf__attention_grad_row)(float* logits, float* dp, int64_t count, float factor, float scale,
+                                                   float lse, float delta) {
+    const gsf__v_exp2_terms terms = gsf__v_exp2_of(1);
+    const gsf__vf f = gsf__v_set(factor), to = gsf__v_set(lse), by = gsf__v_set(scale), less = gsf__v_set(delta);
+    for (int64_t j = 0; j < count; j += GSF__LANES) {
+        const size_t left = (size_t)(count - j);
+        const gsf__vf p = gsf__v_exp2_low(&terms, gsf__v_msub(f, gsf__v_load_first(logits + j, left), to));
+        gsf__v_store_first(logits + j, p, left);
+        gsf__v_store_first(dp + j, by * p * (gsf__v_load_first(dp + j, left) - less), left);
+    }
+}
+
+#endif
+#endif // GSF__KERNELS_GRADIENTS
+#ifndef GSF__ISA
+#ifdef GSF_NN_TRAINING
+
+static const gsf__grad_kernels* gsf__grad_kernels_of(gsf_cpu_level level) {
+    static const gsf__grad_kernels scalar = {gsf__multiply_scalar, gsf__activate_grad_scalar, gsf__softmax_grad_scalar,
+                                             gsf__norm_grad_row_scalar, gsf__attention_grad_row_scalar};
+#if GSF__X86
+    static const gsf__grad_kernels avx2 = {gsf__multiply_avx2, gsf__activate_grad_avx2, gsf__softmax_grad_avx2,
+                                           gsf__norm_grad_row_avx2, gsf__attention_grad_row_avx2};
+    static const gsf__grad_kernels avx512 = {gsf__multiply_avx512, gsf__activate_grad_avx512, gsf__softmax_grad_avx512,
+                                             gsf__norm_grad_row_avx512, gsf__attention_grad_row_avx512};
+    if (level >= GSF_CPU_AVX512) return &avx512;
+    if (level >= GSF_CPU_AVX2) return &avx2;
+#endif
+    (void)level;
+    return &scalar;
+}
+
+static gsf__grad_job gsf__grad_begin(const gsf_context* ctx, const float* x, const float* dy, int64_t rows, int64_t columns,
+                                     float* dx) {
+    gsf__grad_job job;
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
+    job.x = x;
+    job.dy = dy;
+    job.rows = rows;
+    job.columns = job.ld = columns;
+    job.dx = dx;
+    job.chunk_rows = gsf__nn_chunk_rows(columns);
+    return job;
+}
+
+// ---- training: activations, softmax
 
 static void gsf__activate_grad_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__grad_job* job = (const gsf__grad_job*)arg;
-    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, end = gsf__least(begin + GSF__NN_CHUNK, job->columns);
+    const int64_t begin = (int64_t)chunk * GSF__NN_CHUNK, count = gsf__least(GSF__NN_CHUNK, job->columns - begin);
     (void)worker;
-    for (int64_t i = begin; i < end; i++)
-        job->dx[i] = (float)((double)job->dy[i] * gsf__nn_activation_slope(job->activation, (double)job->x[i]));
+    job->kernels->activate(job->activation, job->x + begin, job->dy + begin, count, job->dx + begin);
 }
 
 // x: what the activation was applied to; dx may be dy
 GSF__SHARED void gsf__nn_activate_grad(gsf_context* ctx, gsf__nn_activation activation, const float* x, const float* dy,
                                        int64_t count, float* dx) {
-    gsf__grad_job job;
-    memset(&job, 0, sizeof job);
+    gsf__grad_job job = gsf__grad_begin(ctx, x, dy, 1, count, dx);
     job.activation = activation;
-    job.x = x;
-    job.dy = dy;
-    job.dx = dx;
-    job.columns = count;
     gsf__parallel_for(ctx, gsf__nn_chunks(count, GSF__NN_CHUNK), gsf__activate_grad_chunk, &job);
 }
 
@@ -13174,31 +13432,22 @@ static void gsf__softmax_grad_chunk(void* arg, size_t chunk, int32_t worker) {
     const gsf__grad_job* job = (const gsf__grad_job*)arg;
     const int64_t n = job->columns, begin = (int64_t)chunk * job->chunk_rows;
     (void)worker;
-    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
-        const float *y = job->x + r * n, *dy = job->dy + r * n;
-        double sum = 0.0;
-        for (int64_t i = 0; i < n; i++) sum += (double)y[i] * (double)dy[i];
-        for (int64_t i = 0; i < n; i++)
-            job->dx[r * n + i] = (float)((double)job->factor * (double)y[i] * ((double)dy[i] - sum));
-    }
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++)
+        job->kernels->softmax(job->x + r * n, job->dy + r * n, n, job->factor, job->dx + r * n);
 }
 
 // y: softmax(scale * x) per row; dx may be dy
 GSF__SHARED void gsf__nn_softmax_grad(gsf_context* ctx, const float* y, const float* dy, int64_t rows, int64_t columns,
                                       float scale, float* dx) {
-    gsf__grad_job job;
-    memset(&job, 0, sizeof job);
-    job.x = y;
-    job.dy = dy;
-    job.dx = dx;
-    job.rows = rows;
-    job.columns = columns;
+    gsf__grad_job job = gsf__grad_begin(ctx, y, dy, rows, columns, dx);
     job.factor = scale;
-    job.chunk_rows = gsf__nn_chunk_rows(columns);
     gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__softmax_grad_chunk, &job);
 }
 
+// ---- training: norms
+
 enum { GSF__GRAD_PARTS = 64 }; // of the rows of a norm, each with its own sums over rows
+enum { GSF__GRAD_SHORT = 32 }; // rows summed in float before they are added to a sum in double
 
 typedef struct gsf__nn_norm_grad_desc {
     const float* x;           // (rows, dim)
@@ -13208,65 +13457,50 @@ typedef struct gsf__nn_norm_grad_desc {
     int32_t rms;              // RMS norm: the mean is taken as 0
     const float* dy;
     float* dx;                // may be dy
+    int32_t accumulate;       // dx += instead of dx = ...
     float *dweight, *dbias, *dscale, *dshift; // (dim), added to; each may be NULL
 } gsf__nn_norm_grad_desc;
 
 static void gsf__norm_grad_part(void* arg, size_t part, int32_t worker) {
     const gsf__grad_job* job = (const gsf__grad_job*)arg;
     const int64_t n = job->columns, begin = (int64_t)part * job->chunk_rows;
+    const int64_t end = gsf__least(begin + job->chunk_rows, job->rows);
     double *sums = job->sums + (int64_t)part * n, *products = job->products + (int64_t)part * n;
-    (void)worker;
+    float *short_sums = job->short_sums + (int64_t)worker * 2 * n, *short_products = short_sums + n;
     memset(sums, 0, (size_t)n * sizeof(double));
     memset(products, 0, (size_t)n * sizeof(double));
-    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++) {
-        const float *x = job->x + r * n, *dy = job->dy + r * n;
-        const gsf__moments m = gsf__moments_scalar(x, n, job->centre);
-        const double inverse = 1.0 / sqrt(m.square / (double)n + (double)job->eps);
-        double mean = 0.0, slope = 0.0;
-        for (int pass = 0; pass < 2; pass++) {
-            for (int64_t i = 0; i < n; i++) {
-                const double normal = ((double)x[i] - m.mean) * inverse, d = (double)dy[i];
-                const double h = d * (job->weight ? (double)job->weight[i] : 1.0) *
-                                 (job->scale ? 1.0 + (double)job->scale[i] : 1.0);
-                if (pass) {
-                    job->dx[r * n + i] = (float)(inverse * (h - mean - normal * slope));
-                    continue;
-                }
-                mean += h;
-                slope += h * normal;
-                sums[i] += d;
-                products[i] += d * normal;
-            }
-            if (pass) break;
-            mean = job->centre ? mean / (double)n : 0.0;
-            slope /= (double)n;
+    for (int64_t first = begin; first < end; first += GSF__GRAD_SHORT) {
+        memset(short_sums, 0, (size_t)(2 * n) * sizeof(float));
+        for (int64_t r = first; r < first + GSF__GRAD_SHORT && r < end; r++)
+            job->kernels->norm(job, r, short_sums, short_products);
+        for (int64_t i = 0; i < n; i++) {
+            sums[i] += (double)short_sums[i];
+            products[i] += (double)short_products[i];
         }
     }
 }
 
 // y = (normalised x * weight + bias) * (1 + scale) + shift over the last dimension: layer norm, adaptive layer norm, RMS norm
 GSF__SHARED gsf_result gsf__nn_norm_grad(gsf_context* ctx, const gsf__nn_norm_grad_desc* d) {
-    gsf__grad_job job;
-    size_t count;
-    memset(&job, 0, sizeof job);
+    gsf__grad_job job = gsf__grad_begin(ctx, d->x, d->dy, d->rows, d->dim, d->dx);
+    size_t count, shorts;
     if (d->rows < 0 || d->dim < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "norm: rows < 0 or dim < 1");
     if (d->rows == 0) return GSF_OK;
-    job.x = d->x;
-    job.dy = d->dy;
-    job.dx = d->dx;
-    job.rows = d->rows;
-    job.columns = d->dim;
+    job.norms = gsf__norm_kernels_of(ctx->cpu_level);
     job.weight = d->by.weight;
     job.scale = d->by.scale;
     job.eps = d->eps;
     job.centre = !d->rms;
+    job.accumulate = d->accumulate;
     job.chunk_rows = gsf__ceil_div(d->rows, GSF__GRAD_PARTS);
     const size_t parts = gsf__nn_chunks(d->rows, job.chunk_rows);
-    if (!gsf__mul_size(2 * parts, (size_t)d->dim, &count))
+    if (!gsf__mul_size(2 * parts, (size_t)d->dim, &count) ||
+        !gsf__mul_size((size_t)ctx->parallel.worker_count, (size_t)d->dim, &shorts) || shorts > SIZE_MAX / 2 - count)
         return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "norm: %lld values per row", (long long)d->dim);
-    job.sums = (double*)gsf_alloc(ctx, count, sizeof(double));
+    job.sums = (double*)gsf_alloc(ctx, count + shorts, sizeof(double)); // two floats in the place of a double
     if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
     job.products = job.sums + count / 2;
+    job.short_sums = (float*)(void*)(job.sums + count);
     gsf__parallel_for(ctx, parts, gsf__norm_grad_part, &job);
     for (int64_t i = 0; i < d->dim; i++) {
         double sum = 0.0, product = 0.0;
@@ -13285,6 +13519,8 @@ GSF__SHARED gsf_result gsf__nn_norm_grad(gsf_context* ctx, const gsf__nn_norm_gr
     return GSF_OK;
 }
 
+// ---- training: linear layers
+
 enum { GSF__GRAD_TILE = 32 };
 
 static void gsf__transpose_chunk(void* arg, size_t chunk, int32_t worker) { // GSF__GRAD_TILE columns
@@ -13301,14 +13537,10 @@ static void gsf__transpose_chunk(void* arg, size_t chunk, int32_t worker) { // G
 // out (columns, rows) = the transpose of data (rows, columns) with row stride ld, widened to float
 static void gsf__nn_transpose(gsf_context* ctx, const void* data, gsf_nn_dtype dtype, int64_t rows, int64_t columns, int64_t ld,
                               float* out) {
-    gsf__grad_job job;
-    memset(&job, 0, sizeof job);
+    gsf__grad_job job = gsf__grad_begin(ctx, NULL, NULL, rows, columns, out);
     job.data = (const char*)data;
     job.dtype = dtype;
-    job.rows = rows;
-    job.columns = columns;
     job.ld = ld;
-    job.dx = out;
     gsf__parallel_for(ctx, (size_t)gsf__ceil_div(columns, GSF__GRAD_TILE), gsf__transpose_chunk, &job);
 }
 
@@ -13318,6 +13550,7 @@ typedef struct gsf__nn_linear_grad_desc {
     const gsf_nn_tensor* weight; // (out, in); f32, bf16 or f16
     const float* dy;           // (rows, out)
     float* dx;                 // (rows, in) or NULL
+    int32_t accumulate;        // dx += instead of dx = ...
     float *dweight, *dbias;    // (out, in), (out), added to; each may be NULL
 } gsf__nn_linear_grad_desc;
 
@@ -13350,6 +13583,7 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linea
         multiply.x = d->dy;
         multiply.rows = d->rows;
         multiply.weight = &weight;
+        multiply.accumulate = d->accumulate;
         multiply.y = d->dx;
         result = gsf__nn_run_linear(ctx, NULL, &multiply);
     }
@@ -13375,62 +13609,145 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linea
     return result;
 }
 
+// ---- training: attention
+
+/* FlashAttention-2's backward pass (Dao 2023): per head and block of keys, blocks of queries recompute the weights from the
+   logits and the forward pass's lse. With p = softmax(s), s the logits:
+       dp = dy v^T    ds = p (dp - sum(p dp)) = p (dp - dy out^T)    dv += p^T dy    dq += scale ds k    dk += scale ds^T q
+   All five products are gsf__grad_product of blocks that stay in cache. A unit of work is one head. */
+enum { GSF__ATT_GRAD_KEYS = 128, GSF__ATT_GRAD_QUERIES = 96 }; // per block; queries: a multiple of 6
+
 typedef struct gsf__nn_attention_grad_desc {
-    const gsf__nn_attention_desc* forward; // without mask and bias; `out` is not read, nor are ldo and bf16
+    const gsf__nn_attention_desc* forward; // of the forward pass, with out and lse; without mask, bias and bf16
     const float* dy;        // (queries, heads*head_dim)
     float *dq, *dk, *dv;    // (queries or keys, heads*head_dim)
-    double* scratch;        // private: per worker two rows of keys
 } gsf__nn_attention_grad_desc;
 
-// The weights of one query at a time are recomputed, so no matrix of queries and keys is held. With p = softmax(s), s the
-// logits: dp = dy v^T, ds = p (dp - sum(p dp)), dv += p dy, dq = scale ds k, dk += scale ds q.
-static void gsf__attention_grad_head(void* arg, size_t head, int32_t worker) {
-    const gsf__nn_attention_grad_desc* g = (const gsf__nn_attention_grad_desc*)arg;
-    const gsf__nn_attention_desc* d = g->forward;
-    const int64_t dim = d->head_dim, width = d->heads * dim, column = (int64_t)head * dim;
-    const int64_t ldq = d->ldq ? d->ldq : width, ldk = d->ldk ? d->ldk : width, ldv = d->ldv ? d->ldv : width;
-    const double scale = d->scale != 0.0f ? (double)d->scale : 1.0 / sqrt((double)dim);
-    double *p = g->scratch + 2 * (int64_t)worker * d->keys, *dp = p + d->keys;
-    for (int64_t j = 0; j < d->keys; j++) {
-        memset(g->dk + j * width + column, 0, (size_t)dim * sizeof(float));
-        memset(g->dv + j * width + column, 0, (size_t)dim * sizeof(float));
-    }
+typedef struct gsf__attention_grad_job {
+    gsf__nn_attention_desc desc; // with its defaults filled in
+    const gsf__nn_attention_grad_desc* grad;
+    const gsf__grad_kernels* kernels;
+    float* scratch;
+    size_t scratch_floats;       // per worker
+    int64_t pitch;               // of rows of head_dim values in scratch
+} gsf__attention_grad_job;
+
+// Row stride of a block: an odd number of cache lines, so that the rows do not compete for the same cache sets.
+static int64_t gsf__grad_pitch(int64_t columns) { return (gsf__ceil_div(columns, 16) | 1) * 16; }
+
+enum { GSF__ATT_GRAD_PITCH = GSF__ATT_GRAD_KEYS + 16 };
+
+typedef struct gsf__attention_grad_blocks { // of one worker
+    float *q, *dy;           // (queries, dim), rows `pitch` apart
+    float *k, *dk, *dv;      // (keys, dim)
+    float *k_across, *v_across; // (dim, keys), rows GSF__ATT_GRAD_PITCH apart
+    float *p, *dp;           // (queries, keys)
+    float *center, *delta;   // (dim); (queries): dy out^T
+} gsf__attention_grad_blocks;
+
+// Divides the memory of a worker; returns the floats needed.
+static size_t gsf__attention_grad_lay_out(const gsf__attention_grad_job* job, float* memory,
+                                          gsf__attention_grad_blocks* b) {
+    const size_t pitch = (size_t)job->pitch, across = (size_t)job->desc.head_dim * GSF__ATT_GRAD_PITCH;
+    gsf__nn_arena arena = {memory, 0};
+    b->q = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * pitch);
+    b->dy = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * pitch);
+    b->k = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
+    b->dk = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
+    b->dv = gsf__nn_share(&arena, GSF__ATT_GRAD_KEYS * pitch);
+    b->k_across = gsf__nn_share(&arena, across);
+    b->v_across = gsf__nn_share(&arena, across);
+    b->p = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
+    b->dp = gsf__nn_share(&arena, GSF__ATT_GRAD_QUERIES * GSF__ATT_GRAD_PITCH);
+    b->center = gsf__nn_share(&arena, pitch);
+    b->delta = gsf__nn_share(&arena, (size_t)job->desc.queries);
+    return arena.used;
+}
+
+// to[r pitch + i] = from[r ld + i]
+static void gsf__attention_grad_copy(const float* from, int64_t ld, int64_t rows, int64_t dim, int64_t pitch, float* to) {
+    for (int64_t r = 0; r < rows; r++) memcpy(to + r * pitch, from + r * ld, (size_t)dim * sizeof(float));
+}
+
+// c = a b or, with `add`, c += a b
+static void gsf__attention_grad_multiply(const gsf__attention_grad_job* job, const float* a, int64_t a_row, int64_t a_step,
+                                         int64_t rows, const float* b, int64_t ldb, int64_t count, int64_t columns, float* c,
+                                         int64_t ldc, int add) {
+    const gsf__grad_product product = {a, b, c, a_row, a_step, ldb, ldc, rows, columns, count};
+    for (int64_t r = 0; r < rows && !add; r++) memset(c + r * ldc, 0, (size_t)columns * sizeof(float));
+    job->kernels->multiply(&product);
+}
+
+// Queries `first` ... of a head against the block of `keys` keys.
+static void gsf__attention_grad_block(const gsf__attention_grad_job* job, const gsf__attention_grad_blocks* b, int64_t head,
+                                      int64_t first, int64_t keys) {
+    const gsf__nn_attention_desc* d = &job->desc;
+    const int64_t dim = d->head_dim, width = d->heads * dim, column = head * dim, across = GSF__ATT_GRAD_PITCH;
+    const int64_t queries = gsf__least(GSF__ATT_GRAD_QUERIES, d->queries - first), pitch = job->pitch;
+    const float *lse = d->lse + head * d->queries + first, *delta = b->delta + first;
+    gsf__attention_grad_copy(d->q + first * d->ldq + column, d->ldq, queries, dim, pitch, b->q);
+    gsf__attention_grad_copy(job->grad->dy + first * width + column, width, queries, dim, pitch, b->dy);
+    gsf__attention_grad_multiply(job, b->q, pitch, 1, queries, b->k_across, across, dim, keys, b->p, across, 0);
+    gsf__attention_grad_multiply(job, b->dy, pitch, 1, queries, b->v_across, across, dim, keys, b->dp, across, 0);
+    for (int64_t r = 0; r < queries; r++)
+        job->kernels->attention(b->p + r * across, b->dp + r * across, keys, d->scale * 1.44269504f, d->scale, lse[r],
+                                delta[r]);
+    gsf__attention_grad_multiply(job, b->p, 1, across, keys, b->dy, pitch, queries, dim, b->dv, pitch, 1);
+    gsf__attention_grad_multiply(job, b->dp, 1, across, keys, b->q, pitch, queries, dim, b->dk, pitch, 1);
+    gsf__attention_grad_multiply(job, b->dp, across, 1, queries, b->k, pitch, keys, dim,
+                                 job->grad->dq + first * width + column, width, 1);
+}
+
+static void gsf__attention_grad_head(void* arg, size_t index, int32_t worker) {
+    const gsf__attention_grad_job* job = (const gsf__attention_grad_job*)arg;
+    const gsf__nn_attention_desc* d = &job->desc;
+    const int64_t dim = d->head_dim, width = d->heads * dim, head = (int64_t)index, column = head * dim;
+    gsf__attention_grad_blocks b;
+    gsf__attention_grad_lay_out(job, job->scratch + (size_t)worker * job->scratch_floats, &b);
+    gsf__attention_center(d, column, b.center);
     for (int64_t r = 0; r < d->queries; r++) {
-        const float *q = d->q + r * ldq + column, *dy = g->dy + r * width + column;
-        float* dq = g->dq + r * width + column;
-        double top = -DBL_MAX, total = 0.0, sum = 0.0;
-        for (int64_t j = 0; j < d->keys; j++) {
-            const float *k = d->k + j * ldk + column, *v = d->v + j * ldv + column;
-            p[j] = dp[j] = 0.0;
-            for (int64_t i = 0; i < dim; i++) p[j] += (double)q[i] * (double)k[i];
-            for (int64_t i = 0; i < dim; i++) dp[j] += (double)dy[i] * (double)v[i];
-            p[j] *= scale;
-            if (p[j] > top) top = p[j];
-        }
-        for (int64_t j = 0; j < d->keys; j++) total += p[j] = exp(p[j] - top);
-        for (int64_t j = 0; j < d->keys; j++) sum += (p[j] /= total) * dp[j];
-        memset(dq, 0, (size_t)dim * sizeof(float));
-        for (int64_t j = 0; j < d->keys; j++) {
-            const float *k = d->k + j * ldk + column, weight = (float)p[j], ds = (float)(scale * p[j] * (dp[j] - sum));
-            float *dk = g->dk + j * width + column, *dv = g->dv + j * width + column;
+        const float *dy = job->grad->dy + r * width + column, *out = d->out + r * d->ldo + column;
+        double delta = 0.0;
+        for (int64_t i = 0; i < dim; i++) delta += (double)dy[i] * (double)out[i];
+        b.delta[r] = (float)delta;
+        memset(job->grad->dq + r * width + column, 0, (size_t)dim * sizeof(float));
+    }
+    for (int64_t key = 0; key < d->keys; key += GSF__ATT_GRAD_KEYS) {
+        const int64_t keys = gsf__least(GSF__ATT_GRAD_KEYS, d->keys - key);
+        for (int64_t j = 0; j < keys; j++) {
+            const float *k = d->k + (key + j) * d->ldk + column, *v = d->v + (key + j) * d->ldv + column;
             for (int64_t i = 0; i < dim; i++) {
-                dq[i] += ds * k[i];
-                dk[i] += ds * q[i];
-                dv[i] += weight * dy[i];
+                b.k[j * job->pitch + i] = b.k_across[i * GSF__ATT_GRAD_PITCH + j] = k[i] - b.center[i];
+                b.v_across[i * GSF__ATT_GRAD_PITCH + j] = v[i];
             }
         }
+        memset(b.dk, 0, (size_t)(keys * job->pitch) * sizeof(float));
+        memset(b.dv, 0, (size_t)(keys * job->pitch) * sizeof(float));
+        for (int64_t first = 0; first < d->queries; first += GSF__ATT_GRAD_QUERIES)
+            gsf__attention_grad_block(job, &b, head, first, keys);
+        gsf__attention_grad_copy(b.dk, job->pitch, keys, dim, width, job->grad->dk + key * width + column);
+        gsf__attention_grad_copy(b.dv, job->pitch, keys, dim, width, job->grad->dv + key * width + column);
     }
 }
 
 GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_attention_grad_desc* desc) {
-    const gsf__nn_attention_desc* d = desc->forward;
-    gsf__nn_attention_grad_desc job = *desc;
+    gsf__attention_grad_blocks blocks;
+    gsf__attention_grad_job job;
     size_t count;
-    if (d->mask || d->bias || d->queries < 1 || d->keys < 1 || d->heads < 1 || d->head_dim < 1)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "attention: gradients take no mask, no bias and no empty input");
-    if (!gsf__mul_size(2 * (size_t)ctx->parallel.worker_count, (size_t)d->keys, &count))
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld keys", (long long)d->keys);
-    job.scratch = (double*)gsf_alloc(ctx, count, sizeof(double));
+    memset(&job, 0, sizeof job);
+    job.grad = desc;
+    job.desc = *desc->forward;
+    gsf__nn_attention_desc* d = &job.desc;
+    if (d->mask || d->bias || d->queries < 1 || d->keys < 1 || d->heads < 1 || d->head_dim < 1 || !d->out || !d->lse)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
+                        "attention: gradients need out and lse; they take no mask, no bias and no empty input");
+    gsf__attention_fill_in(d);
+    job.kernels = gsf__grad_kernels_of(ctx->cpu_level);
+    job.pitch = gsf__grad_pitch(d->head_dim);
+    job.scratch_floats = gsf__attention_grad_lay_out(&job, NULL, &blocks);
+    if (!gsf__mul_size(job.scratch_floats, (size_t)ctx->parallel.worker_count, &count))
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "attention: %lld queries", (long long)d->queries);
+    job.scratch = (float*)gsf_alloc(ctx, count, sizeof(float));
     if (!job.scratch) return GSF_ERROR_OUT_OF_MEMORY;
     gsf__parallel_for(ctx, (size_t)d->heads, gsf__attention_grad_head, &job);
     gsf_free(ctx, job.scratch);

@@ -39,11 +39,13 @@ gsfixer_nn.h|golden_restorer|adaLN: the text takes the video's shift and scale|s
 gsfixer_nn.h|golden_restorer|schedule: betas are not rescaled to zero terminal SNR|s/no_zero_snr = !rescale/no_zero_snr = 1/
 gsfixer_nn.h|test_nn_scheduler|schedule: trailing steps are one too late|s/\(int32_t\)rint\(n \+ i \* difference\) - 1/(int32_t)rint(n + i * difference)/
 gsfixer_nn.h|test_nn_training|gradients: SiLU without its second term|s/return s \* \(1\.0 \+ x \* \(1\.0 - s\)\);/return s;/
-gsfixer_nn.h|test_nn_training|gradients: softmax as if its values were independent|s/\(\(double\)dy\[i\] - sum\)/(double)dy[i]/
-gsfixer_nn.h|test_nn_training|gradients: the mean of a norm is taken as constant|s/\(h - mean - normal \* slope\)/(h - normal * slope)/
+gsfixer_nn.h|test_nn_training|gradients: softmax as if its values were independent|s/(gsf__vf slope = gsf__v_load_first\(dy \+ i, left\)) - sum;/$1;/
+gsfixer_nn.h|test_nn_training|gradients: the mean of a norm is taken as constant|s/t\.h - mean\)/t.h)/
 gsfixer_nn.h|test_nn_training|gradients: a norm's scale without its bias|s/weight \* product \+ bias \* sum\)/weight * product)/
 gsfixer_nn.h|test_nn_training|gradients: rows of x taken without their stride|s/d->ldx \? d->ldx : in, scratch\);/in, scratch);/
-gsfixer_nn.h|test_nn_training|gradients: attention's weights as if independent|s/\(dp\[j\] - sum\)/dp[j]/
+gsfixer_nn.h|test_nn_training|gradients: GELU without the density|s/gsf__v_madd\(gsf__v_with_sign\(z, x\), power \* gsf__v_set\(0\.398942280f\), below\)/below/
+gsfixer_nn.h|test_nn_training|gradients: attention's keys across blocks not centred alike|s/(b\.k\[j \* job->pitch \+ i\] = b\.k_across\[[^=]*= k\[i\]) - b\.center\[i\]/$1/
+gsfixer_nn.h|test_nn_training|gradients: attention's weights as if independent|s/\(gsf__v_load_first\(dp \+ j, left\) - less\)/gsf__v_load_first(dp + j, left)/
 END
 }
 

@@ -42,6 +42,7 @@ whole | unit "NDEBUG" -DNDEBUG
 whole | unit "GSF_NO_SIMD" -DGSF_NO_SIMD
 whole | unit "GSF_NO_STB" -DGSF_NO_STB
 whole | unit "GSFIXER_STATIC" -DGSFIXER_STATIC
+whole | unit "GSF_NN_TRAINING" -DGSF_NN_TRAINING
 if [ "$compiler" = gcc ] || have_include omp.h; then whole | unit "OpenMP" -fopenmp; fi
 if have_include embree4/rtcore.h || have_include embree3/rtcore.h; then
     whole | unit "GSF_USE_EMBREE" -DGSF_USE_EMBREE
