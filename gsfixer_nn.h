@@ -53,7 +53,7 @@
        a network        a table of layers as in >>nn image encoders, opened by gsf__nn_open_network, run with the layers
                         of >>nn layers
        a solver         gsf_nn_solver, in >>nn scheduler
-   SECTIONS    files      >>nn kernels (types) >>nn numbers >>nn workspace >>nn files: safetensors, config.json
+   SECTIONS    files      >>nn kernels (types) >>nn numbers >>nn workspace >>nn files: safetensors, PyTorch, config.json
                lanes      >>nn vector
                kernels    >>nn activations >>nn norms >>nn linear >>nn int8 >>nn attention >>nn convolution >>nn positions
                layers     >>nn layers
@@ -92,21 +92,25 @@ typedef struct gsf_nn_tensor { // a view; owns nothing
 // Wraps the caller's float array as a tensor, to pass it as an argument.
 GSF_API gsf_nn_tensor gsf_nn_wrap_tensor(const char* name, const float* data, int32_t rank, const int64_t* shape);
 
-typedef struct gsf_nn_weights { // an open file or folder of safetensors; tensors sorted by name
+typedef struct gsf_nn_weights { // an open weight file or folder of them; tensors sorted by name
     char name[256];             // of the file or folder, for error messages
     gsf_nn_tensor* tensors;
     size_t tensor_count;
     uint64_t mapped_bytes;      // file-backed: the operating system may drop these pages at any time
-    uint64_t read_bytes;        // held in memory because the platform or the io hook cannot map files
+    uint64_t read_bytes;        // held in memory: files that the platform or the io hook cannot map, copied tensors
     void* files;                // private
 } gsf_nn_weights;
 
-// Opens one .safetensors file, or a folder: its *.safetensors.index.json with all shards, otherwise its only
-// .safetensors file. `prefix` (may be NULL) is the start of the file name, for a folder that holds several models
-// ("diffusion_pytorch_model"). Every length, offset, shape and dtype is checked: a malformed file gives
-// GSF_ERROR_FORMAT with the file name and byte offset. The tensors must cover the file's data exactly. BOOL is read as
-// U8; other dtypes are unsupported. With the default io hook, files are mapped where the platform supports it: do not
-// truncate an open file.
+// Opens one weight file, or a folder: its *.safetensors.index.json with all shards, otherwise its only .safetensors file,
+// otherwise its only .pth file. `prefix` (may be NULL) is the file name without suffix, for a folder that holds several
+// models ("diffusion_pytorch_model"). Every length, offset, shape and dtype is checked: a malformed file gives
+// GSF_ERROR_FORMAT with the file name and byte offset. BOOL is read as U8; other dtypes are unsupported. With the default
+// io hook, files are mapped where the platform supports it: do not truncate an open file.
+// safetensors: the tensors must cover the file's data exactly.
+// PyTorch (.pth, .pt, .bin; told by content): zip and legacy containers, little-endian, uncompressed. The pickle is read as
+// data: nothing is executed, and a global that state dictionaries do not need gives GSF_ERROR_UNSUPPORTED. Names of nested
+// containers are joined by slashes ("optimizer/0/step"), without a first part that all tensors share ("state_dict/").
+// Values other than tensors are skipped. Tensors that are not dense are copied, up to 8 times the file's size.
 GSF_API GSF_NODISCARD gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix,
                                                      gsf_nn_weights* out);
 // The same for one file in memory; the caller keeps the bytes until the weights are destroyed.
@@ -811,6 +815,7 @@ typedef struct gsf__nn_file {
     gsf__nn_holder holder;
     char* names; // of its tensors, zero-terminated, one after the other
     size_t names_size;
+    unsigned char* copies; // of the tensors of a PyTorch file that are not dense there; or NULL
 } gsf__nn_file;
 
 typedef struct gsf__nn_files {
@@ -1121,6 +1126,951 @@ static gsf_result gsf__nn_read_header(gsf_context* ctx, const char* name, gsf_nn
     return result;
 }
 
+// ---- reading a PyTorch file
+
+/* torch.save puts a pickle, the byte code of a stack machine that builds Python objects, into one of two containers:
+       zip     TOP/data.pkl | TOP/byteorder | TOP/data/KEY, one per storage; entries are stored, TOP is any name
+       legacy  (before PyTorch 1.6) five pickles: magic number, 1001, platform, objects, list of keys | for each key of
+               the list: u64 number of elements, elements
+   A state dictionary maps names to _rebuild_tensor_v2(storage, offset, size, stride, ...); the pickle refers to a storage
+   by the persistent id ("storage", torch.FloatStorage, KEY, location, number of elements).
+   The pickle is read as data. Of all globals only those of gsf__pth_globals are accepted, and what they would do is done
+   here; every other global, and every opcode that would make an instance, is an error. Each opcode makes at most one node
+   and one member, so memory is proportional to the pickle; nothing recurses.
+   (Python: Lib/pickletools.py; PyTorch: torch/serialization.py, torch/_weights_only_unpickler.py) */
+
+typedef enum gsf__pth_kind {
+    GSF__PTH_OTHER = 0, // a value that no tensor needs: None, a float, bytes, a set ...
+    GSF__PTH_MARK, GSF__PTH_NUMBER, GSF__PTH_TEXT, GSF__PTH_SEQUENCE, GSF__PTH_DICT, GSF__PTH_GLOBAL, GSF__PTH_STORAGE,
+    GSF__PTH_TENSOR,
+} gsf__pth_kind;
+
+typedef struct gsf__pth_node {
+    gsf__pth_kind kind;
+    uint32_t first, last, count; // of a container: its members; 0: none
+    int32_t walked;              // of a container: the last walk that entered it
+    int64_t value;               // number; offset of a text (count: its bytes); index of a global or storage; arguments of
+                                 // a tensor (a node)
+} gsf__pth_node;
+
+typedef struct gsf__pth_member { uint32_t key, value, next; } gsf__pth_member; // nodes; next member, 0: none
+
+typedef struct gsf__pth_storage {
+    const char* key;
+    uint32_t key_size;
+    gsf_nn_dtype dtype;
+    int64_t count;             // elements
+    const unsigned char* data; // NULL: not found yet
+} gsf__pth_storage;
+
+typedef struct gsf__pth_entry { // of the zip container
+    const char* name;
+    size_t name_size, at, size; // offset in the file and bytes of the contents
+    unsigned flags, method;
+} gsf__pth_entry;
+
+typedef struct gsf__pth_frame { // a container being walked
+    uint32_t member, index; // the next one
+    int64_t path_size;      // of the container's own name
+} gsf__pth_frame;
+
+enum { GSF__PTH_NAME_MAX = 256 };
+
+typedef struct gsf__pth { // a file while it is being read
+    gsf_context* ctx;
+    const char* name;
+    const unsigned char* data;
+    size_t size;
+    size_t at, end, opcode; // the pickle: next byte, end, current opcode
+    gsf__pth_node* nodes;   // nodes[0] and members[0] are unused
+    gsf__pth_member* members;
+    uint32_t *stack, *memo; // nodes; memo: 0: not set
+    gsf__pth_storage* storages;
+    gsf__pth_entry* entries; // sorted by name
+    gsf__pth_frame* frames;
+    size_t node_count, node_room, member_count, member_room, depth, stack_room, memo_count, memo_room;
+    size_t storage_count, storage_room, entry_count, frame_count, frame_room;
+    char top[GSF__PTH_NAME_MAX]; // folder of the zip container, with its slash
+    int zip;
+    char path[GSF__PTH_NAME_MAX + 1];
+    int32_t walk;
+    size_t tensor_count, names_size, copies_size; // found by a walk
+} gsf__pth;
+
+GSF_PRINTF(4, 5)
+static gsf_result gsf__pth_fail(const gsf__pth* p, gsf_result result, size_t at, const char* format, ...) {
+    char text[300];
+    va_list args;
+    va_start(args, format);
+    vsnprintf(text, sizeof text, format, args);
+    va_end(args);
+    return gsf_fail(p->ctx, result, "%s:%zu: %s", p->name, at, text);
+}
+
+static gsf_result gsf__pth_bad(const gsf__pth* p, const char* what) { // at the current opcode
+    return gsf__pth_fail(p, GSF_ERROR_FORMAT, p->opcode, "pickle: %s", what);
+}
+
+// ---- PyTorch files: objects of the pickle
+
+typedef enum gsf__pth_role {
+    GSF__PTH_IGNORED, GSF__PTH_ORDERED_DICT, GSF__PTH_REBUILD, GSF__PTH_PARAMETER, GSF__PTH_SIZE, GSF__PTH_STORAGE_TYPE,
+} gsf__pth_role;
+
+static const struct gsf__pth_global {
+    const char *module, *name;
+    gsf__pth_role role;
+    gsf_nn_dtype dtype; // of a storage
+} gsf__pth_globals[] = {
+    {"collections", "OrderedDict", GSF__PTH_ORDERED_DICT, GSF_NN_F32},
+    {"torch._utils", "_rebuild_tensor_v2", GSF__PTH_REBUILD, GSF_NN_F32},
+    {"torch._utils", "_rebuild_tensor", GSF__PTH_REBUILD, GSF_NN_F32},
+    {"torch._utils", "_rebuild_parameter", GSF__PTH_PARAMETER, GSF_NN_F32},
+    {"torch", "Size", GSF__PTH_SIZE, GSF_NN_F32},
+    {"torch", "device", GSF__PTH_IGNORED, GSF_NN_F32},
+    {"torch", "FloatStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_F32},
+    {"torch", "DoubleStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_F64},
+    {"torch", "HalfStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_F16},
+    {"torch", "BFloat16Storage", GSF__PTH_STORAGE_TYPE, GSF_NN_BF16},
+    {"torch", "LongStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_I64},
+    {"torch", "IntStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_I32},
+    {"torch", "ShortStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_I16},
+    {"torch", "CharStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_I8},
+    {"torch", "ByteStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_U8},
+    {"torch", "BoolStorage", GSF__PTH_STORAGE_TYPE, GSF_NN_U8},
+};
+
+static gsf_result gsf__pth_push(gsf__pth* p, uint32_t node) {
+    GSF__TRY(gsf__reserve(p->ctx, (void**)&p->stack, &p->stack_room, p->depth, p->depth + 1, sizeof *p->stack));
+    p->stack[p->depth++] = node;
+    return GSF_OK;
+}
+
+// Makes a node and pushes it.
+static gsf_result gsf__pth_make(gsf__pth* p, gsf__pth_kind kind, int64_t value, uint32_t count) {
+    if (p->node_count >= UINT32_MAX / 2) return gsf__pth_bad(p, "too many objects");
+    GSF__TRY(gsf__reserve(p->ctx, (void**)&p->nodes, &p->node_room, p->node_count, p->node_count + 1, sizeof *p->nodes));
+    gsf__pth_node* node = &p->nodes[p->node_count];
+    memset(node, 0, sizeof *node);
+    node->kind = kind;
+    node->value = value;
+    node->count = count;
+    return gsf__pth_push(p, (uint32_t)p->node_count++);
+}
+
+static gsf_result gsf__pth_pop(gsf__pth* p, gsf__pth_kind kind, uint32_t* out) {
+    *out = p->depth ? p->stack[p->depth - 1] : 0;
+    if (!p->depth) return gsf__pth_bad(p, "nothing on the stack");
+    if (kind != GSF__PTH_OTHER && p->nodes[*out].kind != kind) return gsf__pth_bad(p, "a value of the wrong type");
+    if (kind != GSF__PTH_MARK && p->nodes[*out].kind == GSF__PTH_MARK) return gsf__pth_bad(p, "nothing above the mark");
+    p->depth--;
+    return GSF_OK;
+}
+
+static gsf_result gsf__pth_add(gsf__pth* p, uint32_t container, uint32_t key, uint32_t value) {
+    gsf__pth_node* to = &p->nodes[container];
+    if (p->member_count >= UINT32_MAX / 2) return gsf__pth_bad(p, "too many objects");
+    GSF__TRY(gsf__reserve(p->ctx, (void**)&p->members, &p->member_room, p->member_count, p->member_count + 1,
+                          sizeof *p->members));
+    const uint32_t index = (uint32_t)p->member_count++;
+    p->members[index].key = key;
+    p->members[index].value = value;
+    p->members[index].next = 0;
+    if (to->last) p->members[to->last].next = index;
+    else to->first = index;
+    to->last = index;
+    to->count++;
+    return GSF_OK;
+}
+
+// The nodes above the topmost mark become members of `container`, which for a dictionary is given in pairs; all of them and
+// the mark are popped.
+static gsf_result gsf__pth_gather(gsf__pth* p, size_t mark, uint32_t container, int pairs) {
+    if (pairs && (p->depth - mark) % 2 == 0) return gsf__pth_bad(p, "a key without a value");
+    for (size_t i = mark + 1; i < p->depth; i += pairs ? 2 : 1)
+        GSF__TRY(gsf__pth_add(p, container, pairs ? p->stack[i] : 0, p->stack[pairs ? i + 1 : i]));
+    p->depth = mark;
+    return GSF_OK;
+}
+
+static gsf_result gsf__pth_find_mark(gsf__pth* p, size_t* out) {
+    *out = 0;
+    for (size_t i = p->depth; i-- > 0;)
+        if (p->nodes[p->stack[i]].kind == GSF__PTH_MARK) {
+            *out = i;
+            return GSF_OK;
+        }
+    return gsf__pth_bad(p, "no mark on the stack");
+}
+
+// Replaces the nodes from the mark on (or the topmost `count`, if not negative) by a container of them.
+static gsf_result gsf__pth_collect(gsf__pth* p, gsf__pth_kind kind, int count) {
+    size_t mark;
+    if (count < 0) GSF__TRY(gsf__pth_find_mark(p, &mark));
+    else if (p->depth < (size_t)count) return gsf__pth_bad(p, "nothing on the stack");
+    else mark = p->depth - (size_t)count;
+    const size_t first = count < 0 ? mark + 1 : mark, depth = p->depth;
+    if (kind == GSF__PTH_DICT && (depth - first) % 2 != 0) return gsf__pth_bad(p, "a key without a value");
+    GSF__TRY(gsf__pth_make(p, kind, 0, 0));
+    const uint32_t node = p->stack[depth];
+    for (size_t i = first; i < depth; i += kind == GSF__PTH_DICT ? 2 : 1)
+        GSF__TRY(kind == GSF__PTH_DICT ? gsf__pth_add(p, node, p->stack[i], p->stack[i + 1])
+                                       : gsf__pth_add(p, node, 0, p->stack[i]));
+    p->depth = mark;
+    return gsf__pth_push(p, node);
+}
+
+// APPENDS, SETITEMS, ADDITEMS: the nodes above the mark are added to the container below it.
+static gsf_result gsf__pth_extend(gsf__pth* p, gsf__pth_kind kind) {
+    size_t mark;
+    GSF__TRY(gsf__pth_find_mark(p, &mark));
+    if (mark == 0 || p->nodes[p->stack[mark - 1]].kind != kind) return gsf__pth_bad(p, "a value of the wrong type");
+    return gsf__pth_gather(p, mark, p->stack[mark - 1], kind == GSF__PTH_DICT);
+}
+
+// APPEND, SETITEM
+static gsf_result gsf__pth_append(gsf__pth* p, gsf__pth_kind kind) {
+    uint32_t value, key = 0;
+    GSF__TRY(gsf__pth_pop(p, GSF__PTH_OTHER, &value));
+    if (kind == GSF__PTH_DICT) GSF__TRY(gsf__pth_pop(p, GSF__PTH_OTHER, &key));
+    if (!p->depth || p->nodes[p->stack[p->depth - 1]].kind != kind) return gsf__pth_bad(p, "a value of the wrong type");
+    return gsf__pth_add(p, p->stack[p->depth - 1], key, value);
+}
+
+static gsf_result gsf__pth_remember(gsf__pth* p, uint64_t index) {
+    const size_t known = p->memo_count;
+    if (!p->depth) return gsf__pth_bad(p, "nothing on the stack");
+    if (index >= p->size) return gsf__pth_bad(p, "a memo index larger than the file"); // writers count up from 0
+    if (index >= known) {
+        GSF__TRY(gsf__reserve(p->ctx, (void**)&p->memo, &p->memo_room, known, (size_t)index + 1, sizeof *p->memo));
+        memset(p->memo + known, 0, ((size_t)index + 1 - known) * sizeof *p->memo);
+        p->memo_count = (size_t)index + 1;
+    }
+    p->memo[index] = p->stack[p->depth - 1];
+    return GSF_OK;
+}
+
+static gsf_result gsf__pth_recall(gsf__pth* p, uint64_t index) {
+    if (index >= p->memo_count || !p->memo[index]) return gsf__pth_bad(p, "a memo entry that was never set");
+    return gsf__pth_push(p, p->memo[index]);
+}
+
+// ---- PyTorch files: tensors and storages
+
+// The member at `index` of a container, which must be of this kind; 0: it is not.
+static uint32_t gsf__pth_member_of(const gsf__pth* p, uint32_t container, uint32_t index, gsf__pth_kind kind) {
+    uint32_t at = p->nodes[container].first;
+    while (at && index--) at = p->members[at].next;
+    return at && p->nodes[p->members[at].value].kind == kind ? p->members[at].value : 0;
+}
+
+typedef struct gsf__pth_tensor {
+    const gsf__pth_storage* storage;
+    int64_t offset, shape[GSF_NN_MAX_RANK], stride[GSF_NN_MAX_RANK], count;
+    int32_t rank;
+    int dense; // row-major without gaps
+} gsf__pth_tensor;
+
+// Up to 8 non-negative integers.
+static gsf_result gsf__pth_read_dims(const gsf__pth* p, uint32_t tuple, int64_t* out, int32_t* rank) {
+    *rank = 0;
+    if (p->nodes[tuple].count > GSF_NN_MAX_RANK)
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "pickle: a tensor with more than %d dimensions",
+                             (int)GSF_NN_MAX_RANK);
+    for (uint32_t at = p->nodes[tuple].first; at; at = p->members[at].next) {
+        const gsf__pth_node* node = &p->nodes[p->members[at].value];
+        if (node->kind != GSF__PTH_NUMBER || node->value < 0)
+            return gsf__pth_bad(p, "a dimension or stride that is no number, or negative");
+        out[(*rank)++] = node->value;
+    }
+    return GSF_OK;
+}
+
+// Reads and checks the arguments of _rebuild_tensor and _rebuild_tensor_v2: storage, offset, size, stride, ...
+static gsf_result gsf__pth_read_tensor(const gsf__pth* p, uint32_t args, gsf__pth_tensor* out) {
+    const uint32_t storage = gsf__pth_member_of(p, args, 0, GSF__PTH_STORAGE);
+    const uint32_t offset = gsf__pth_member_of(p, args, 1, GSF__PTH_NUMBER);
+    const uint32_t size = gsf__pth_member_of(p, args, 2, GSF__PTH_SEQUENCE);
+    const uint32_t stride = gsf__pth_member_of(p, args, 3, GSF__PTH_SEQUENCE);
+    int32_t strides;
+    memset(out, 0, sizeof *out);
+    if (!storage || !offset || !size || !stride) return gsf__pth_bad(p, "a tensor with arguments of the wrong type");
+    GSF__TRY(gsf__pth_read_dims(p, size, out->shape, &out->rank));
+    GSF__TRY(gsf__pth_read_dims(p, stride, out->stride, &strides));
+    if (strides != out->rank) return gsf__pth_bad(p, "a tensor with more dimensions than strides, or fewer");
+    out->storage = &p->storages[p->nodes[storage].value];
+    out->offset = p->nodes[offset].value;
+    out->count = 1;
+    out->dense = 1;
+    const int64_t room = out->storage->count;
+    int64_t last = out->offset; // of the elements in use
+    int fits = out->offset >= 0 && out->offset <= room;
+    for (int32_t i = out->rank; i-- > 0;) {
+        const int64_t n = out->shape[i], step = n > 1 ? out->stride[i] : 0;
+        out->stride[i] = step;
+        if (n > 1 && step != out->count) out->dense = 0;
+        if (n > 0 && out->count > INT64_MAX / 16 / n) return gsf__pth_bad(p, "a tensor whose size overflows");
+        if (n > 1 && step > 0 && (n - 1 > (room - gsf__least(last, room)) / step)) fits = 0;
+        else if (n > 1) last += (n - 1) * step;
+        out->count *= n;
+    }
+    if (out->count == 0) return GSF_OK;
+    return fits && last < room ? GSF_OK : gsf__pth_bad(p, "a tensor that reaches beyond its storage");
+}
+
+static int gsf__pth_compare_entries(const void* a, const void* b) {
+    const gsf__pth_entry *x = (const gsf__pth_entry*)a, *y = (const gsf__pth_entry*)b;
+    const int order = memcmp(x->name, y->name, x->name_size < y->name_size ? x->name_size : y->name_size);
+    return order ? order : x->name_size < y->name_size ? -1 : x->name_size > y->name_size;
+}
+
+// The entry TOP/NAME of the zip container, which must be stored and not encrypted. *out is NULL if there is none.
+static gsf_result gsf__pth_find_entry(const gsf__pth* p, const char* folder, const char* name, size_t name_size,
+                                      const gsf__pth_entry** out) {
+    char whole[2 * GSF__PTH_NAME_MAX];
+    gsf__pth_entry wanted;
+    *out = NULL;
+    if (name_size >= GSF__PTH_NAME_MAX / 2 || memchr(name, 0, name_size)) return GSF_OK;
+    memset(&wanted, 0, sizeof wanted);
+    wanted.name = whole;
+    wanted.name_size = (size_t)snprintf(whole, sizeof whole, "%s%s%.*s", p->top, folder, (int)name_size, name);
+    *out = (const gsf__pth_entry*)bsearch(&wanted, p->entries, p->entry_count, sizeof wanted, gsf__pth_compare_entries);
+    if (*out && (((*out)->flags & 1u) || (*out)->method != 0))
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, (*out)->at, "zip: %s is %s", gsf__nn_show(whole).text,
+                             (*out)->method ? "compressed" : "encrypted");
+    return GSF_OK;
+}
+
+// BINPERSID: ("storage", type, key, location, number of elements, and in old files None)
+static gsf_result gsf__pth_make_storage(gsf__pth* p) {
+    const gsf__pth_entry* entry = NULL;
+    gsf__pth_storage s;
+    uint32_t tuple;
+    GSF__TRY(gsf__pth_pop(p, GSF__PTH_SEQUENCE, &tuple));
+    const uint32_t word = gsf__pth_member_of(p, tuple, 0, GSF__PTH_TEXT);
+    const uint32_t type = gsf__pth_member_of(p, tuple, 1, GSF__PTH_GLOBAL);
+    const uint32_t key = gsf__pth_member_of(p, tuple, 2, GSF__PTH_TEXT);
+    const uint32_t count = gsf__pth_member_of(p, tuple, 4, GSF__PTH_NUMBER);
+    const uint32_t members = p->nodes[tuple].count;
+    if (!word || !type || !key || !count || p->nodes[word].count != 7 ||
+        memcmp(p->data + p->nodes[word].value, "storage", 7) != 0 ||
+        gsf__pth_globals[p->nodes[type].value].role != GSF__PTH_STORAGE_TYPE)
+        return gsf__pth_bad(p, "a persistent id that is no storage");
+    if (members > 6 || (members == 6 && !gsf__pth_member_of(p, tuple, 5, GSF__PTH_OTHER)))
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "pickle: a view of another storage");
+    memset(&s, 0, sizeof s);
+    s.key = (const char*)p->data + p->nodes[key].value;
+    s.key_size = p->nodes[key].count;
+    s.dtype = gsf__pth_globals[p->nodes[type].value].dtype;
+    s.count = p->nodes[count].value;
+    const size_t width = gsf_nn_get_dtype_size(s.dtype);
+    if (s.count < 0 || (uint64_t)s.count > p->size / width) return gsf__pth_bad(p, "a storage larger than the file");
+    if (p->zip) {
+        GSF__TRY(gsf__pth_find_entry(p, "data/", s.key, s.key_size, &entry));
+        if (!entry) return gsf__pth_bad(p, "a storage that the file does not have");
+        if (entry->size != (size_t)s.count * width)
+            return gsf__pth_fail(p, GSF_ERROR_FORMAT, entry->at, "a storage of %zu bytes for %lld elements of %s", entry->size,
+                                 (long long)s.count, gsf__nn_dtype_name(s.dtype));
+        s.data = p->data + entry->at;
+    }
+    GSF__TRY(gsf__reserve(p->ctx, (void**)&p->storages, &p->storage_room, p->storage_count, p->storage_count + 1,
+                          sizeof *p->storages));
+    p->storages[p->storage_count] = s;
+    return gsf__pth_make(p, GSF__PTH_STORAGE, (int64_t)p->storage_count++, 0);
+}
+
+// OrderedDict(), or OrderedDict([[key, value], ...]) as Python 2 writes it
+static gsf_result gsf__pth_make_dict(gsf__pth* p, uint32_t args) {
+    GSF__TRY(gsf__pth_make(p, GSF__PTH_DICT, 0, 0));
+    const uint32_t dict = p->stack[p->depth - 1], list = gsf__pth_member_of(p, args, 0, GSF__PTH_SEQUENCE);
+    if (p->nodes[args].count == 0) return GSF_OK;
+    if (p->nodes[args].count > 1 || !list) return gsf__pth_bad(p, "an OrderedDict of the wrong arguments");
+    for (uint32_t at = p->nodes[list].first; at; at = p->members[at].next) {
+        const gsf__pth_node* pair = &p->nodes[p->members[at].value];
+        if (pair->kind != GSF__PTH_SEQUENCE || pair->count != 2) return gsf__pth_bad(p, "an OrderedDict of no pairs");
+        GSF__TRY(gsf__pth_add(p, dict, p->members[pair->first].value, p->members[pair->last].value));
+    }
+    p->nodes[list].first = p->nodes[list].last = p->nodes[list].count = 0; // used up, so that calls cannot multiply it
+    return GSF_OK;
+}
+
+// REDUCE: calls a global with a tuple of arguments.
+static gsf_result gsf__pth_call(gsf__pth* p) {
+    uint32_t args, callee;
+    gsf__pth_tensor tensor;
+    GSF__TRY(gsf__pth_pop(p, GSF__PTH_SEQUENCE, &args));
+    GSF__TRY(gsf__pth_pop(p, GSF__PTH_GLOBAL, &callee));
+    const uint32_t first = p->nodes[args].first ? p->members[p->nodes[args].first].value : 0;
+    switch (gsf__pth_globals[p->nodes[callee].value].role) {
+        case GSF__PTH_ORDERED_DICT: return gsf__pth_make_dict(p, args);
+        case GSF__PTH_REBUILD:
+            GSF__TRY(gsf__pth_read_tensor(p, args, &tensor));
+            return gsf__pth_make(p, GSF__PTH_TENSOR, args, 0);
+        case GSF__PTH_PARAMETER: // of a tensor
+            if (!first || p->nodes[first].kind != GSF__PTH_TENSOR) return gsf__pth_bad(p, "a Parameter of no tensor");
+            return gsf__pth_push(p, first);
+        case GSF__PTH_SIZE: // of a sequence
+            if (!first || p->nodes[first].kind != GSF__PTH_SEQUENCE) return gsf__pth_bad(p, "a Size of no sequence");
+            return gsf__pth_push(p, first);
+        case GSF__PTH_IGNORED: return gsf__pth_make(p, GSF__PTH_OTHER, 0, 0);
+        case GSF__PTH_STORAGE_TYPE: break;
+    }
+    return gsf__pth_bad(p, "a call of something that is no function");
+}
+
+static gsf_result gsf__pth_find_global(gsf__pth* p, const char* module, size_t module_size, const char* name,
+                                       size_t name_size) {
+    for (size_t i = 0; i < GSF__COUNT(gsf__pth_globals); i++)
+        if (strlen(gsf__pth_globals[i].module) == module_size && strlen(gsf__pth_globals[i].name) == name_size &&
+            memcmp(gsf__pth_globals[i].module, module, module_size) == 0 &&
+            memcmp(gsf__pth_globals[i].name, name, name_size) == 0)
+            return gsf__pth_make(p, GSF__PTH_GLOBAL, (int64_t)i, 0);
+    char whole[100];
+    snprintf(whole, sizeof whole, "%.*s.%.*s", (int)(module_size < 40 ? module_size : 40), module,
+             (int)(name_size < 40 ? name_size : 40), name);
+    return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "pickle: refers to %s, which weights do not need",
+                         gsf__nn_show(whole).text);
+}
+
+// ---- PyTorch files: opcodes
+
+static gsf_result gsf__pth_take(gsf__pth* p, uint64_t bytes, const unsigned char** out) {
+    *out = p->data + p->at;
+    if (bytes > p->end - p->at) return gsf__pth_bad(p, "cut off");
+    p->at += (size_t)bytes;
+    return GSF_OK;
+}
+
+// The little-endian integer of `bytes` bytes that follows an opcode.
+static gsf_result gsf__pth_take_number(gsf__pth* p, int bytes, uint64_t* out) {
+    const unsigned char* data;
+    *out = 0;
+    GSF__TRY(gsf__pth_take(p, (uint64_t)bytes, &data));
+    *out = gsf__load_le(data, bytes);
+    return GSF_OK;
+}
+
+static gsf_result gsf__pth_take_line(gsf__pth* p, const char** text, size_t* size) {
+    const unsigned char *data = p->data + p->at, *end = (const unsigned char*)memchr(data, '\n', p->end - p->at);
+    if (!end) return gsf__pth_bad(p, "cut off");
+    *text = (const char*)data;
+    *size = (size_t)(end - data);
+    p->at += *size + 1;
+    return GSF_OK;
+}
+
+// Text or bytes, after a length of `bytes` bytes.
+static gsf_result gsf__pth_make_text(gsf__pth* p, int bytes, gsf__pth_kind kind) {
+    const unsigned char* data;
+    uint64_t size;
+    GSF__TRY(gsf__pth_take_number(p, bytes, &size));
+    GSF__TRY(gsf__pth_take(p, size, &data));
+    if (size > INT32_MAX) return gsf__pth_bad(p, "a text of more than 2 GiB");
+    return gsf__pth_make(p, kind, data - p->data, kind == GSF__PTH_TEXT ? (uint32_t)size : 0);
+}
+
+// An integer of any length, in two's complement; more than 8 bytes, and no tensor needs it.
+static gsf_result gsf__pth_make_long(gsf__pth* p, int bytes) {
+    const unsigned char* data;
+    uint64_t size, value;
+    GSF__TRY(gsf__pth_take_number(p, bytes, &size));
+    GSF__TRY(gsf__pth_take(p, size, &data));
+    if (size > 8) return gsf__pth_make(p, GSF__PTH_OTHER, 0, 0);
+    value = gsf__load_le(data, (int)size);
+    if (size > 0 && size < 8 && (data[size - 1] & 0x80)) value |= UINT64_MAX << 8 * size;
+    int64_t number;
+    memcpy(&number, &value, sizeof number);
+    return gsf__pth_make(p, GSF__PTH_NUMBER, number, 0);
+}
+
+// Opcodes that push a constant. *done is 0 if `opcode` is none of them.
+static gsf_result gsf__pth_literal(gsf__pth* p, unsigned char opcode, int* done) {
+    uint64_t value;
+    *done = 1;
+    switch (opcode) {
+        case '(': return gsf__pth_make(p, GSF__PTH_MARK, 0, 0);
+        case 'N': return gsf__pth_make(p, GSF__PTH_OTHER, 0, 0);
+        case 0x88: case 0x89: return gsf__pth_make(p, GSF__PTH_NUMBER, opcode == 0x88, 0); // True, False
+        case 'K': case 'M': case 'J': // 1, 2 and 4 bytes, of which only the last have a sign
+            GSF__TRY(gsf__pth_take_number(p, opcode == 'K' ? 1 : opcode == 'M' ? 2 : 4, &value));
+            return gsf__pth_make(p, GSF__PTH_NUMBER, opcode == 'J' ? (int32_t)(uint32_t)value : (int64_t)value, 0);
+        case 0x8a: return gsf__pth_make_long(p, 1);
+        case 0x8b: return gsf__pth_make_long(p, 4);
+        case 'G': // a double
+            GSF__TRY(gsf__pth_take_number(p, 8, &value));
+            return gsf__pth_make(p, GSF__PTH_OTHER, 0, 0);
+        case 'U': case 0x8c: return gsf__pth_make_text(p, 1, GSF__PTH_TEXT);
+        case 'T': case 'X': return gsf__pth_make_text(p, 4, GSF__PTH_TEXT);
+        case 0x8d: return gsf__pth_make_text(p, 8, GSF__PTH_TEXT);
+        case 'C': return gsf__pth_make_text(p, 1, GSF__PTH_OTHER);
+        case 'B': return gsf__pth_make_text(p, 4, GSF__PTH_OTHER);
+        case 0x8e: return gsf__pth_make_text(p, 8, GSF__PTH_OTHER);
+        default: *done = 0; return GSF_OK;
+    }
+}
+
+// Opcodes for tuples, lists, dictionaries and sets.
+static gsf_result gsf__pth_container(gsf__pth* p, unsigned char opcode, int* done) {
+    *done = 1;
+    switch (opcode) {
+        case ')': case ']': case 0x8f: return gsf__pth_make(p, GSF__PTH_SEQUENCE, 0, 0);
+        case '}': return gsf__pth_make(p, GSF__PTH_DICT, 0, 0);
+        case 0x85: case 0x86: case 0x87: return gsf__pth_collect(p, GSF__PTH_SEQUENCE, opcode - 0x84);
+        case 't': case 'l': case 0x91: return gsf__pth_collect(p, GSF__PTH_SEQUENCE, -1);
+        case 'd': return gsf__pth_collect(p, GSF__PTH_DICT, -1);
+        case 'a': return gsf__pth_append(p, GSF__PTH_SEQUENCE);
+        case 's': return gsf__pth_append(p, GSF__PTH_DICT);
+        case 'e': case 0x90: return gsf__pth_extend(p, GSF__PTH_SEQUENCE);
+        case 'u': return gsf__pth_extend(p, GSF__PTH_DICT);
+        default: *done = 0; return GSF_OK;
+    }
+}
+
+// Opcodes for the memo and the stack.
+static gsf_result gsf__pth_memory(gsf__pth* p, unsigned char opcode, int* done) {
+    uint64_t index;
+    uint32_t node;
+    size_t mark;
+    *done = 1;
+    switch (opcode) {
+        case 'q': case 'r':
+            GSF__TRY(gsf__pth_take_number(p, opcode == 'q' ? 1 : 4, &index));
+            return gsf__pth_remember(p, index);
+        case 0x94: return gsf__pth_remember(p, p->memo_count);
+        case 'h': case 'j':
+            GSF__TRY(gsf__pth_take_number(p, opcode == 'h' ? 1 : 4, &index));
+            return gsf__pth_recall(p, index);
+        case '0': return gsf__pth_pop(p, GSF__PTH_OTHER, &node);
+        case '1':
+            GSF__TRY(gsf__pth_find_mark(p, &mark));
+            p->depth = mark;
+            return GSF_OK;
+        case '2':
+            GSF__TRY(gsf__pth_pop(p, GSF__PTH_OTHER, &node));
+            GSF__TRY(gsf__pth_push(p, node));
+            return gsf__pth_push(p, node);
+        default: *done = 0; return GSF_OK;
+    }
+}
+
+static gsf_result gsf__pth_object(gsf__pth* p, unsigned char opcode) { // globals and their instances
+    const char *module, *name;
+    size_t module_size, name_size;
+    uint32_t a, b;
+    switch (opcode) {
+        case 'c':
+            GSF__TRY(gsf__pth_take_line(p, &module, &module_size));
+            GSF__TRY(gsf__pth_take_line(p, &name, &name_size));
+            return gsf__pth_find_global(p, module, module_size, name, name_size);
+        case 0x93:
+            GSF__TRY(gsf__pth_pop(p, GSF__PTH_TEXT, &b));
+            GSF__TRY(gsf__pth_pop(p, GSF__PTH_TEXT, &a));
+            return gsf__pth_find_global(p, (const char*)p->data + p->nodes[a].value, p->nodes[a].count,
+                                        (const char*)p->data + p->nodes[b].value, p->nodes[b].count);
+        case 'Q': return gsf__pth_make_storage(p);
+        case 'R': return gsf__pth_call(p);
+        case 'b': // attributes: a state dictionary has versions of its modules, which tensors do not need
+            GSF__TRY(gsf__pth_pop(p, GSF__PTH_OTHER, &a));
+            if (p->depth && p->nodes[p->stack[p->depth - 1]].kind == GSF__PTH_DICT) return GSF_OK;
+            return gsf__pth_bad(p, "attributes of something else than a dictionary");
+        default: return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "pickle: opcode 0x%02x", (unsigned)opcode);
+    }
+}
+
+// Runs the pickle at p->at; *out is the object that it makes.
+static gsf_result gsf__pth_run(gsf__pth* p, size_t end, uint32_t* out) {
+    uint64_t ignored;
+    int done = 0;
+    p->end = end;
+    p->depth = p->memo_count = 0;
+    for (;;) {
+        p->opcode = p->at;
+        if (p->at >= p->end) return gsf__pth_bad(p, "ends without STOP");
+        const unsigned char opcode = p->data[p->at++];
+        if (opcode == '.') return gsf__pth_pop(p, GSF__PTH_OTHER, out);
+        if (opcode == 0x80 || opcode == 0x95) { // protocol, size of a frame
+            GSF__TRY(gsf__pth_take_number(p, opcode == 0x80 ? 1 : 8, &ignored));
+            continue;
+        }
+        GSF__TRY(gsf__pth_literal(p, opcode, &done));
+        if (!done) GSF__TRY(gsf__pth_container(p, opcode, &done));
+        if (!done) GSF__TRY(gsf__pth_memory(p, opcode, &done));
+        if (!done) GSF__TRY(gsf__pth_object(p, opcode));
+    }
+}
+
+// ---- PyTorch files: the zip container
+
+enum { GSF__ZIP_END = 22, GSF__ZIP_CENTRAL = 46, GSF__ZIP_LOCAL = 30, GSF__ZIP_END64 = 56, GSF__ZIP_LOCATOR = 20 };
+
+typedef struct gsf__zip_directory { uint64_t count, at, size; } gsf__zip_directory;
+
+// Replaces values that do not fit 32 bits by those of the zip64 extra field.
+static void gsf__zip_widen(const unsigned char* extra, size_t size, uint64_t* const* values, int count) {
+    for (size_t at = 0; size - at >= 4;) {
+        const size_t bytes = (size_t)gsf__load_le(extra + at + 2, 2);
+        const unsigned char *from = extra + at + 4, *end = from + bytes;
+        if (bytes > size - at - 4) return;
+        for (int i = 0; gsf__load_le(extra + at, 2) == 1 && i < count; i++) {
+            if (*values[i] != UINT32_MAX || end - from < 8) continue;
+            *values[i] = gsf__load_le(from, 8);
+            from += 8;
+        }
+        at += 4 + bytes;
+    }
+}
+
+static gsf_result gsf__zip_find_directory(const gsf__pth* p, gsf__zip_directory* out) {
+    const unsigned char* data = p->data;
+    size_t end = p->size;
+    memset(out, 0, sizeof *out);
+    for (size_t back = GSF__ZIP_END; back <= p->size && back <= GSF__ZIP_END + 65535; back++)
+        if (memcmp(data + p->size - back, "PK\5\6", 4) == 0 &&
+            gsf__load_le(data + p->size - back + 20, 2) == back - GSF__ZIP_END) {
+            end = p->size - back;
+            break;
+        }
+    if (end == p->size) return gsf__pth_fail(p, GSF_ERROR_FORMAT, p->size, "zip: no end of the directory: truncated");
+    out->count = gsf__load_le(data + end + 10, 2);
+    out->size = gsf__load_le(data + end + 12, 4);
+    out->at = gsf__load_le(data + end + 16, 4);
+    if ((out->count == UINT16_MAX || out->size == UINT32_MAX || out->at == UINT32_MAX) && end >= GSF__ZIP_LOCATOR &&
+        memcmp(data + end - GSF__ZIP_LOCATOR, "PK\6\7", 4) == 0) {
+        const uint64_t wide = gsf__load_le(data + end - GSF__ZIP_LOCATOR + 8, 8);
+        if (wide > end || end - wide < GSF__ZIP_END64 || memcmp(data + wide, "PK\6\6", 4) != 0)
+            return gsf__pth_fail(p, GSF_ERROR_FORMAT, end, "zip: no end of the directory where the locator points");
+        out->count = gsf__load_le(data + wide + 32, 8);
+        out->size = gsf__load_le(data + wide + 40, 8);
+        out->at = gsf__load_le(data + wide + 48, 8);
+        end = (size_t)wide;
+    }
+    if (out->at > end || out->size > end - out->at || out->count > out->size / GSF__ZIP_CENTRAL)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, end, "zip: a directory of %llu entries and %llu bytes does not fit",
+                             (unsigned long long)out->count, (unsigned long long)out->size);
+    return GSF_OK;
+}
+
+// Reads an entry of the directory at `at` and the local header that it points to.
+static gsf_result gsf__zip_read_entry(const gsf__pth* p, const gsf__zip_directory* directory, size_t at,
+                                      gsf__pth_entry* out, size_t* next) {
+    const unsigned char* e = p->data + at;
+    const size_t left = (size_t)(directory->at + directory->size) - at;
+    if (left < GSF__ZIP_CENTRAL || memcmp(e, "PK\1\2", 4) != 0)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, at, "zip: no entry of the directory");
+    const size_t name = (size_t)gsf__load_le(e + 28, 2), extra = (size_t)gsf__load_le(e + 30, 2);
+    const size_t comment = (size_t)gsf__load_le(e + 32, 2);
+    if (name + extra + comment > left - GSF__ZIP_CENTRAL)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, at, "zip: an entry that is longer than the directory");
+    *next = at + GSF__ZIP_CENTRAL + name + extra + comment;
+    uint64_t packed = gsf__load_le(e + 20, 4), size = gsf__load_le(e + 24, 4), local = gsf__load_le(e + 42, 4);
+    uint64_t* const values[3] = {&size, &packed, &local};
+    gsf__zip_widen(e + GSF__ZIP_CENTRAL + name, extra, values, 3);
+    out->name = (const char*)e + GSF__ZIP_CENTRAL;
+    out->name_size = name;
+    out->flags = (unsigned)gsf__load_le(e + 8, 2);
+    out->method = (unsigned)gsf__load_le(e + 10, 2);
+    if (local > directory->at || directory->at - local < GSF__ZIP_LOCAL || memcmp(p->data + local, "PK\3\4", 4) != 0)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, at, "zip: an entry without local header");
+    const unsigned char* head = p->data + local;
+    const uint64_t begin = local + GSF__ZIP_LOCAL + gsf__load_le(head + 26, 2) + gsf__load_le(head + 28, 2);
+    if (gsf__load_le(head + 26, 2) != name || begin > directory->at ||
+        memcmp(head + GSF__ZIP_LOCAL, out->name, name) != 0)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, (size_t)local, "zip: a local header of another entry");
+    if (packed > directory->at - begin || (out->method == 0 && packed != size))
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, (size_t)local, "zip: an entry of %llu bytes that the file does not have",
+                             (unsigned long long)packed);
+    out->at = (size_t)begin;
+    out->size = (size_t)packed;
+    return GSF_OK;
+}
+
+static gsf_result gsf__zip_read(gsf__pth* p) {
+    gsf__zip_directory directory;
+    GSF__TRY(gsf__zip_find_directory(p, &directory));
+    p->entries = (gsf__pth_entry*)gsf_alloc(p->ctx, (size_t)directory.count + 1, sizeof *p->entries);
+    if (!p->entries) return GSF_ERROR_OUT_OF_MEMORY;
+    size_t at = (size_t)directory.at;
+    for (; p->entry_count < directory.count; p->entry_count++)
+        GSF__TRY(gsf__zip_read_entry(p, &directory, at, &p->entries[p->entry_count], &at));
+    if (p->entry_count) qsort(p->entries, p->entry_count, sizeof *p->entries, gsf__pth_compare_entries);
+    return GSF_OK;
+}
+
+// Finds TOP/data.pkl and runs it.
+static gsf_result gsf__pth_run_zip(gsf__pth* p, uint32_t* root) {
+    static const char pickle[] = "data.pkl";
+    const size_t size = sizeof pickle - 1;
+    const gsf__pth_entry *entry = NULL, *order;
+    p->zip = 1;
+    GSF__TRY(gsf__zip_read(p));
+    for (size_t i = 0; i < p->entry_count && !entry; i++) {
+        const gsf__pth_entry* e = &p->entries[i];
+        if (e->name_size < size || e->name_size - size >= GSF__PTH_NAME_MAX / 2 ||
+            memcmp(e->name + e->name_size - size, pickle, size) != 0 || memchr(e->name, 0, e->name_size))
+            continue;
+        if (e->name_size > size && e->name[e->name_size - size - 1] != '/') continue;
+        snprintf(p->top, sizeof p->top, "%.*s", (int)(e->name_size - size), e->name);
+        GSF__TRY(gsf__pth_find_entry(p, "", pickle, size, &entry));
+    }
+    if (!entry) return gsf__pth_fail(p, GSF_ERROR_FORMAT, 0, "zip: no data.pkl: not a PyTorch file");
+    GSF__TRY(gsf__pth_find_entry(p, "", "byteorder", 9, &order));
+    if (order && order->size == 3 && memcmp(p->data + order->at, "big", 3) == 0)
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, order->at, "big-endian");
+    p->at = entry->at;
+    return gsf__pth_run(p, entry->at + entry->size, root);
+}
+
+// ---- PyTorch files: the legacy container
+
+static const unsigned char gsf__pth_magic[15] = {0x80, 2, 0x8a, 10, 0x6c, 0xfc, 0x9c, 0x46, 0xf9, 0x20, 0x6a, 0xa8, 0x50,
+                                                 0x19, '.'};
+
+static int gsf__pth_compare_storages(const void* a, const void* b) {
+    const gsf__pth_storage *x = *(gsf__pth_storage* const*)a, *y = *(gsf__pth_storage* const*)b;
+    const int order = memcmp(x->key, y->key, x->key_size < y->key_size ? x->key_size : y->key_size);
+    return order ? order : x->key_size < y->key_size ? -1 : x->key_size > y->key_size;
+}
+
+// Gives the storages of one key, all of those in `order` that compare equal to it, the data at p->at.
+static gsf_result gsf__pth_place_storage(gsf__pth* p, gsf__pth_storage** order, const gsf__pth_node* key) {
+    gsf__pth_storage wanted, *address = &wanted;
+    memset(&wanted, 0, sizeof wanted);
+    wanted.key = (const char*)p->data + key->value;
+    wanted.key_size = key->count;
+    size_t low = 0, high = p->storage_count;
+    while (low < high) { // the first that is not smaller
+        const size_t middle = low + (high - low) / 2;
+        if (gsf__pth_compare_storages(&order[middle], &address) < 0) low = middle + 1;
+        else high = middle;
+    }
+    uint64_t count;
+    if (low == p->storage_count || gsf__pth_compare_storages(&order[low], &address) != 0)
+        return gsf__pth_bad(p, "the key of a storage that no tensor uses");
+    if (order[low]->data) return gsf__pth_bad(p, "a storage key occurs twice");
+    p->opcode = p->at;
+    GSF__TRY(gsf__pth_take_number(p, 8, &count));
+    const unsigned char* data = p->data + p->at;
+    const size_t width = gsf_nn_get_dtype_size(order[low]->dtype);
+    for (; low < p->storage_count && gsf__pth_compare_storages(&order[low], &address) == 0; low++) {
+        if ((uint64_t)order[low]->count != count || gsf_nn_get_dtype_size(order[low]->dtype) != width)
+            return gsf__pth_fail(p, GSF_ERROR_FORMAT, p->opcode, "a storage of %llu elements, not of %lld as its tensor says",
+                                 (unsigned long long)count, (long long)order[low]->count);
+        order[low]->data = data;
+    }
+    return gsf__pth_take(p, count * width, &data); // cannot overflow: gsf__pth_make_storage checked the count
+}
+
+static gsf_result gsf__pth_place_storages(gsf__pth* p, uint32_t keys) {
+    gsf__pth_storage** order = (gsf__pth_storage**)gsf_alloc(p->ctx, p->storage_count + 1, sizeof *order);
+    if (!order) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = GSF_OK;
+    for (size_t i = 0; i < p->storage_count; i++) order[i] = &p->storages[i];
+    if (p->storage_count) qsort((void*)order, p->storage_count, sizeof *order, gsf__pth_compare_storages);
+    p->end = p->size;
+    for (uint32_t at = p->nodes[keys].first; at && !result; at = p->members[at].next) {
+        const gsf__pth_node* key = &p->nodes[p->members[at].value];
+        result = key->kind == GSF__PTH_TEXT ? gsf__pth_place_storage(p, order, key)
+                                            : gsf__pth_bad(p, "a key that is no text");
+    }
+    for (size_t i = 0; i < p->storage_count && !result; i++)
+        if (!p->storages[i].data) result = gsf__pth_bad(p, "a storage without data");
+    gsf_free(p->ctx, (void*)order);
+    return result;
+}
+
+static gsf_result gsf__pth_run_legacy(gsf__pth* p, uint32_t* root) {
+    uint32_t version, platform, keys;
+    if (p->size < sizeof gsf__pth_magic || memcmp(p->data, gsf__pth_magic, sizeof gsf__pth_magic) != 0)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, 0, "neither safetensors nor PyTorch: a pickle without magic number");
+    p->at = sizeof gsf__pth_magic;
+    GSF__TRY(gsf__pth_run(p, p->size, &version));
+    if (p->nodes[version].kind != GSF__PTH_NUMBER || p->nodes[version].value != 1001)
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "not version 1001 of PyTorch's legacy format");
+    GSF__TRY(gsf__pth_run(p, p->size, &platform));
+    for (uint32_t at = p->nodes[platform].first; at; at = p->members[at].next) {
+        const gsf__pth_node *key = &p->nodes[p->members[at].key], *value = &p->nodes[p->members[at].value];
+        if (key->kind == GSF__PTH_TEXT && key->count == 13 && memcmp(p->data + key->value, "little_endian", 13) == 0 &&
+            value->value != 1)
+            return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "big-endian");
+    }
+    GSF__TRY(gsf__pth_run(p, p->size, root));
+    GSF__TRY(gsf__pth_run(p, p->size, &keys));
+    if (p->nodes[keys].kind != GSF__PTH_SEQUENCE) return gsf__pth_bad(p, "no list of storage keys");
+    return gsf__pth_place_storages(p, keys);
+}
+
+// ---- PyTorch files: from objects to tensors
+
+enum { GSF__PTH_NAMELESS = -1 };
+
+// Sets p->path to the name of a member below a container whose name has frame->path_size bytes. Returns its length, or
+// GSF__PTH_NAMELESS if it is empty, too long, not UTF-8, or if a key on the way is neither text nor number.
+static int64_t gsf__pth_name_member(gsf__pth* p, const gsf__pth_frame* frame, const gsf__pth_member* member) {
+    const gsf__pth_node* key = &p->nodes[member->key];
+    const char* text = (const char*)p->data + key->value;
+    char number[24];
+    int64_t size = key->count, at = frame->path_size;
+    if (member->key && key->kind != GSF__PTH_TEXT && key->kind != GSF__PTH_NUMBER) return GSF__PTH_NAMELESS;
+    if (!member->key || key->kind == GSF__PTH_NUMBER) {
+        size = snprintf(number, sizeof number, "%lld", member->key ? (long long)key->value : (long long)frame->index);
+        text = number;
+    }
+    if (at < 0 || size == 0 || at + 1 + size >= GSF__PTH_NAME_MAX) return GSF__PTH_NAMELESS;
+    for (int64_t i = 0, step; i < size; i += step) {
+        step = text[i] ? (int64_t)gsf__utf8_size(text + i, (size_t)(size - i)) : 0;
+        if (!step) return GSF__PTH_NAMELESS;
+    }
+    if (at > 0) p->path[at++] = '/';
+    memcpy(p->path + at, text, (size_t)size);
+    p->path[at + size] = 0;
+    return at + size;
+}
+
+static gsf_result gsf__pth_enter(gsf__pth* p, uint32_t container, int64_t path_size) {
+    gsf__pth_node* node = &p->nodes[container];
+    if (node->walked == p->walk) return GSF_OK; // reached before: tensors keep the first of their containers' names
+    node->walked = p->walk;
+    GSF__TRY(gsf__reserve(p->ctx, (void**)&p->frames, &p->frame_room, p->frame_count, p->frame_count + 1,
+                          sizeof *p->frames));
+    gsf__pth_frame* frame = &p->frames[p->frame_count++];
+    frame->member = node->first;
+    frame->index = 0;
+    frame->path_size = path_size;
+    return GSF_OK;
+}
+
+static void gsf__pth_copy(const gsf__pth_tensor* t, unsigned char* out) { // strided to dense
+    const size_t width = gsf_nn_get_dtype_size(t->storage->dtype);
+    int64_t index[GSF_NN_MAX_RANK], from = t->offset;
+    memset(index, 0, sizeof index);
+    for (int64_t i = 0; i < t->count; i++, out += width) {
+        memcpy(out, t->storage->data + (size_t)from * width, width);
+        for (int32_t d = t->rank; d-- > 0;) {
+            from += t->stride[d];
+            if (++index[d] < t->shape[d]) break;
+            from -= t->stride[d] * t->shape[d];
+            index[d] = 0;
+        }
+    }
+}
+
+// Counts a tensor called p->path, or with `weights` stores it.
+static gsf_result gsf__pth_found(gsf__pth* p, uint32_t node, int64_t name, gsf_nn_weights* weights, gsf__nn_file* file) {
+    gsf__pth_tensor t;
+    if (name == GSF__PTH_NAMELESS)
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "pickle: a tensor without a name of UTF-8 below %d bytes",
+                             (int)GSF__PTH_NAME_MAX);
+    const size_t name_size = (size_t)name;
+    GSF__TRY(gsf__pth_read_tensor(p, (uint32_t)p->nodes[node].value, &t));
+    const size_t bytes = (size_t)t.count * gsf_nn_get_dtype_size(t.storage->dtype), copied = t.dense ? 0 : bytes;
+    if (weights) {
+        gsf_nn_tensor* tensor = &weights->tensors[weights->tensor_count++];
+        memset(tensor, 0, sizeof *tensor);
+        memcpy(file->names + p->names_size, p->path, name_size + 1);
+        tensor->name = file->names + p->names_size;
+        tensor->dtype = t.storage->dtype;
+        tensor->rank = t.rank;
+        memcpy(tensor->shape, t.shape, sizeof tensor->shape);
+        tensor->count = t.count;
+        tensor->data = t.storage->data + (t.count ? (size_t)t.offset : 0) * gsf_nn_get_dtype_size(t.storage->dtype);
+        if (copied) {
+            tensor->data = file->copies + p->copies_size;
+            gsf__pth_copy(&t, file->copies + p->copies_size);
+        }
+    }
+    p->tensor_count++;
+    p->names_size += name_size + 1;
+    p->copies_size += copied;
+    if (p->names_size > 8 * p->size || p->copies_size > 8 * p->size)
+        return gsf__pth_fail(p, GSF_ERROR_UNSUPPORTED, p->opcode, "tensors that need more than 8 times the file's size");
+    return GSF_OK;
+}
+
+// Visits all tensors below the root, in the order of the file.
+static gsf_result gsf__pth_walk(gsf__pth* p, uint32_t root, gsf_nn_weights* weights, gsf__nn_file* file) {
+    p->walk++;
+    p->tensor_count = p->names_size = p->copies_size = 0;
+    if (p->nodes[root].kind != GSF__PTH_DICT && p->nodes[root].kind != GSF__PTH_SEQUENCE)
+        return gsf__pth_fail(p, GSF_ERROR_FORMAT, p->opcode, "pickle: neither a dictionary nor a list");
+    GSF__TRY(gsf__pth_enter(p, root, 0));
+    while (p->frame_count) {
+        gsf__pth_frame* frame = &p->frames[p->frame_count - 1];
+        if (!frame->member) {
+            p->frame_count--;
+            continue;
+        }
+        const gsf__pth_member member = p->members[frame->member];
+        const gsf__pth_node* value = &p->nodes[member.value];
+        const int inner = (value->kind == GSF__PTH_DICT || value->kind == GSF__PTH_SEQUENCE) && value->first;
+        const int64_t size = inner || value->kind == GSF__PTH_TENSOR ? gsf__pth_name_member(p, frame, &member) : 0;
+        frame->member = member.next;
+        frame->index++;
+        if (value->kind == GSF__PTH_TENSOR) GSF__TRY(gsf__pth_found(p, member.value, size, weights, file));
+        if (inner) GSF__TRY(gsf__pth_enter(p, member.value, size));
+    }
+    return GSF_OK;
+}
+
+// Names that all begin with the same "state_dict/" or the like lose it.
+static void gsf__pth_strip(gsf_nn_tensor* tensors, size_t count) {
+    for (;;) {
+        const char* slash = count ? strchr(tensors[0].name, '/') : NULL;
+        if (!slash || !slash[1]) return;
+        const size_t size = (size_t)(slash - tensors[0].name) + 1;
+        for (size_t i = 1; i < count; i++)
+            if (strncmp(tensors[i].name, tensors[0].name, size) != 0 || !tensors[i].name[size]) return;
+        for (size_t i = 0; i < count; i++) tensors[i].name += size;
+    }
+}
+
+static gsf_result gsf__pth_store(gsf__pth* p, uint32_t root, gsf_nn_weights* weights, gsf__nn_file* file) {
+    gsf__nn_files* files = (gsf__nn_files*)weights->files;
+    const size_t first = weights->tensor_count;
+    GSF__TRY(gsf__pth_walk(p, root, NULL, file));
+    file->names = (char*)gsf_alloc(p->ctx, p->names_size + 1, 1);
+    file->copies = p->copies_size ? (unsigned char*)gsf_alloc(p->ctx, p->copies_size, 1) : NULL;
+    if (!file->names || (p->copies_size && !file->copies)) return GSF_ERROR_OUT_OF_MEMORY;
+    GSF__TRY(gsf__reserve(p->ctx, (void**)&weights->tensors, &files->tensor_capacity, first, first + p->tensor_count + 1,
+                          sizeof *weights->tensors));
+    GSF__TRY(gsf__pth_walk(p, root, weights, file));
+    file->names_size = p->names_size;
+    weights->read_bytes += p->copies_size;
+    gsf__pth_strip(weights->tensors + first, p->tensor_count);
+    return GSF_OK;
+}
+
+// A zip file, or a pickle; a safetensors file may begin with the same bytes, but then continues with '{'.
+static int gsf__pth_is(const gsf__nn_file* file) {
+    if (file->size < 9 || file->data[8] == '{') return 0;
+    return memcmp(file->data, "PK\3\4", 4) == 0 || memcmp(file->data, "PK\5\6", 4) == 0 ||
+           (file->data[0] == 0x80 && file->data[1] < 6 && gsf__load_le(file->data, 8) > GSF__NN_HEADER_MAX);
+}
+
+static gsf_result gsf__pth_read(gsf_context* ctx, const char* name, gsf_nn_weights* weights, gsf__nn_file* file) {
+    gsf__pth* p = (gsf__pth*)gsf_alloc_zeroed(ctx, 1, sizeof *p);
+    uint32_t root = 0;
+    if (!p) return GSF_ERROR_OUT_OF_MEMORY;
+    p->ctx = ctx;
+    p->name = gsf__nn_path_end(name);
+    p->data = file->data;
+    p->size = file->size;
+    p->node_count = p->member_count = 1;
+    gsf_result result = gsf__reserve(ctx, (void**)&p->nodes, &p->node_room, 0, 1, sizeof *p->nodes);
+    if (!result) result = gsf__reserve(ctx, (void**)&p->members, &p->member_room, 0, 1, sizeof *p->members);
+    if (!result) memset(p->nodes, 0, sizeof *p->nodes), memset(p->members, 0, sizeof *p->members);
+    if (!result) result = p->data[0] == 'P' ? gsf__pth_run_zip(p, &root) : gsf__pth_run_legacy(p, &root);
+    if (!result) result = gsf__pth_store(p, root, weights, file);
+    gsf_free(ctx, p->nodes);
+    gsf_free(ctx, p->members);
+    gsf_free(ctx, p->stack);
+    gsf_free(ctx, p->memo);
+    gsf_free(ctx, p->storages);
+    gsf_free(ctx, p->entries);
+    gsf_free(ctx, p->frames);
+    gsf_free(ctx, p);
+    return result;
+}
+
 // ---- files and folders
 
 static void gsf__nn_release(gsf_context* ctx, const unsigned char* data, size_t size, gsf__nn_holder holder) {
@@ -1145,7 +2095,7 @@ static gsf_result gsf__nn_add_bytes(gsf_context* ctx, const char* name, const un
     file->holder = holder;
     if (holder == GSF__NN_MAPPED) weights->mapped_bytes += size;
     if (holder == GSF__NN_READ) weights->read_bytes += size;
-    return gsf__nn_read_header(ctx, name, weights, file);
+    return gsf__pth_is(file) ? gsf__pth_read(ctx, name, weights, file) : gsf__nn_read_header(ctx, name, weights, file);
 }
 
 static gsf_result gsf__nn_add_file(gsf_context* ctx, const char* path, gsf_nn_weights* weights) {
@@ -1201,7 +2151,7 @@ static gsf_result gsf__nn_sort_names(gsf_context* ctx, gsf_nn_weights* weights) 
         qsort(weights->tensors, weights->tensor_count, sizeof *weights->tensors, gsf__nn_compare_names);
     for (size_t i = 1; i < weights->tensor_count; i++)
         if (strcmp(weights->tensors[i - 1].name, weights->tensors[i].name) == 0)
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: tensor %s is in two shards", weights->name,
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: two tensors are called %s", weights->name,
                             gsf__nn_show(weights->tensors[i].name).text);
     return GSF_OK;
 }
@@ -1299,22 +2249,37 @@ static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const
                                      gsf_nn_weights* weights) {
     gsf_buffer path;
     memset(&path, 0, sizeof path);
-    gsf_append_text(ctx, &path, "%s%s%s.safetensors", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
+    gsf_append_text(ctx, &path, "%s%s%s", folder, gsf__nn_ends_in(folder, "/") ? "" : "/", name);
     const gsf_result result =
         path.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf__nn_open_either(ctx, &path, may_lack, found, weights);
     gsf_destroy_buffer(ctx, &path);
     return result;
 }
 
+// FOLDER/PREFIX.safetensors, whole or sharded, else FOLDER/PREFIX.pth.
+static gsf_result gsf__nn_open_prefix(gsf_context* ctx, const char* folder, const char* prefix, int may_lack, int* found,
+                                      gsf_nn_weights* weights) {
+    static const char* const suffixes[] = {".safetensors", ".pth", ".safetensors"}; // again, to report that it is missing
+    gsf_result result = GSF_OK;
+    char name[256];
+    *found = 0;
+    for (size_t i = 0; i < (may_lack ? 2 : 3) && !result && !*found; i++) {
+        if ((size_t)snprintf(name, sizeof name, "%s%s", prefix, suffixes[i]) >= sizeof name)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: a prefix of %zu bytes", folder, strlen(prefix));
+        result = gsf__nn_open_named(ctx, folder, name, i < 2, found, weights);
+    }
+    return result;
+}
+
 // Without a prefix: the folder's only index, else its only file; if folders cannot be listed, the usual file names.
 static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_nn_weights* weights) {
-    static const char* const suffixes[] = {".safetensors.index.json", ".safetensors"};
+    static const char* const suffixes[] = {".safetensors.index.json", ".safetensors", ".pth"};
     static const char* const usual[] = {"diffusion_pytorch_model", "model"};
     gsf_result result = GSF_OK;
     int found = 0;
     if (!gsf__io_is_plain(ctx) || gsf__nn_look_at_path(folder) == GSF__NN_UNKNOWN) {
         for (size_t i = 0; i < GSF__COUNT(usual) && result == GSF_OK && !found; i++)
-            result = gsf__nn_open_named(ctx, folder, usual[i], 1, &found, weights);
+            result = gsf__nn_open_prefix(ctx, folder, usual[i], 1, &found, weights);
     }
     for (size_t i = 0; i < GSF__COUNT(suffixes) && result == GSF_OK && !found; i++) {
         if (!gsf__io_is_plain(ctx)) break;
@@ -1324,12 +2289,13 @@ static gsf_result gsf__nn_open_folder(gsf_context* ctx, const char* folder, gsf_
         listing.suffix = suffixes[i];
         result = gsf__nn_list_folder(ctx, &listing);
         if (result == GSF_OK && listing.found.size) {
-            listing.found.data[listing.found.size - strlen(suffixes[i])] = 0;
+            if (i == 0) listing.found.data[listing.found.size - strlen(".index.json")] = 0;
             result = gsf__nn_open_named(ctx, folder, listing.found.data, 0, &found, weights);
         }
         gsf_destroy_buffer(ctx, &listing.found);
     }
-    if (result == GSF_OK && !found) return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: contains no .safetensors file", folder);
+    if (result == GSF_OK && !found)
+        return gsf_fail(ctx, GSF_ERROR_NOT_FOUND, "%s: contains no .safetensors or .pth file", folder);
     return result;
 }
 
@@ -1350,6 +2316,13 @@ static gsf_result gsf__nn_open_index_file(gsf_context* ctx, const char* path, gs
     return result;
 }
 
+static int gsf__nn_names_weights(const char* path) {
+    static const char* const suffixes[] = {".safetensors", ".pth", ".pth.tar", ".pt", ".bin"};
+    int found = 0;
+    for (size_t i = 0; i < GSF__COUNT(suffixes); i++) found |= gsf__nn_ends_in(path, suffixes[i]);
+    return found;
+}
+
 GSF_API gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const char* prefix, gsf_nn_weights* out) {
     gsf_result result = gsf__nn_begin_weights(ctx, path, out);
     if (result != GSF_OK) return result;
@@ -1357,11 +2330,11 @@ GSF_API gsf_result gsf_nn_load_weights(gsf_context* ctx, const char* path, const
     int found;
     if (kind != GSF__NN_IS_FOLDER && gsf__nn_ends_in(path, ".index.json")) {
         result = gsf__nn_open_index_file(ctx, path, out);
-    } else if (kind == GSF__NN_IS_FILE || (kind == GSF__NN_UNKNOWN && gsf__nn_ends_in(path, ".safetensors"))) {
+    } else if (kind == GSF__NN_IS_FILE || (kind == GSF__NN_UNKNOWN && gsf__nn_names_weights(path))) {
         result = gsf__nn_add_file(ctx, path, out);
         if (result == GSF_OK) result = gsf__nn_sort_names(ctx, out);
     } else if (prefix) {
-        result = gsf__nn_open_named(ctx, path, prefix, 0, &found, out);
+        result = gsf__nn_open_prefix(ctx, path, prefix, 0, &found, out);
     } else {
         result = gsf__nn_open_folder(ctx, path, out);
     }
@@ -1383,6 +2356,7 @@ GSF_API void gsf_nn_destroy_weights(gsf_context* ctx, gsf_nn_weights* weights) {
     for (size_t i = 0; files && i < files->count; i++) {
         gsf__nn_release(ctx, files->files[i].data, files->files[i].size, files->files[i].holder);
         gsf_free(ctx, files->files[i].names);
+        gsf_free(ctx, files->files[i].copies);
     }
     if (files) gsf_free(ctx, files->files);
     gsf_free(ctx, files);

@@ -1,5 +1,5 @@
-// Weight files of gsfixer_nn.h: safetensors, single and sharded, valid and damaged; and the weight loader of the
-// networks.
+// Weight files of gsfixer_nn.h: safetensors, single and sharded, and PyTorch files, valid and damaged; and the weight loader
+// of the networks.
 #define GSFIXER_IMPLEMENTATION
 #include "gsfixer_nn.h"
 
@@ -319,6 +319,109 @@ static void test_cut_and_flipped(gsf_context* ctx) {
     free(data);
 }
 
+// ---- PyTorch files; their values: golden_metricnets
+
+// Every truncated length, and every byte changed, in blocks of exactly the size.
+static void test_pth_damaged(gsf_context* ctx, const char* name) {
+    static const unsigned char masks[] = {0x01, 0x10, 0x80, 0xff};
+    gsf_nn_weights w;
+    size_t size, refused = 0;
+    char* data = test_read_file(test_golden(name), &size);
+    unsigned char* part = NULL;
+    for (size_t cut = 0; cut < size; cut++) {
+        part = (unsigned char*)malloc(cut ? cut : 1);
+        memcpy(part, data, cut);
+        CHECK_RESULT(ctx, gsf_nn_parse_weights(ctx, "cut", part, cut, &w), GSF_ERROR_FORMAT);
+        CHECK(strncmp(ctx->error, "cut:", 4) == 0);
+        free(part);
+    }
+    part = (unsigned char*)malloc(size);
+    for (size_t i = 0; i < size; i++)
+        for (size_t k = 0; k < GSF__COUNT(masks); k++) {
+            memcpy(part, data, size);
+            part[i] ^= masks[k];
+            const gsf_result r = gsf_nn_parse_weights(ctx, "flip", part, size, &w);
+            CHECK(r == GSF_OK || r == GSF_ERROR_FORMAT || r == GSF_ERROR_UNSUPPORTED);
+            CHECK(r == GSF_OK || strncmp(ctx->error, "flip:", 5) == 0);
+            if (r == GSF_OK) read_all(&w);
+            refused += r != GSF_OK;
+            gsf_nn_destroy_weights(ctx, &w);
+        }
+    CHECK(refused > size / 2);
+    free(part);
+    free(data);
+}
+
+// A legacy file around an object's pickle; one float storage "0" of `count` elements 0, 1, 2, ...
+static made make_pth(const char* pickle, size_t pickle_size, size_t count) {
+    static const char head[] = "\x80\2\x8a\12\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\2M\xe9\3.\x80\2}.";
+    static const char keys[] = "\x80\2](U\0010e.";
+    made m;
+    m.size = sizeof head - 1 + pickle_size + (count ? sizeof keys - 1 + 8 + 4 * count : 4);
+    m.data = (unsigned char*)malloc(m.size);
+    unsigned char* p = m.data;
+    memcpy(p, head, sizeof head - 1), p += sizeof head - 1;
+    memcpy(p, pickle, pickle_size), p += pickle_size;
+    if (!count) memcpy(p, "\x80\2].", 4);
+    else memcpy(p, keys, sizeof keys - 1), p += sizeof keys - 1;
+    for (size_t i = 0; i < 8 && count; i++) *p++ = (unsigned char)(count >> 8 * i);
+    for (size_t i = 0; i < count; i++, p += 4) {
+        const float value = (float)i;
+        memcpy(p, &value, 4);
+    }
+    return m;
+}
+
+#define PTH_STORAGE "(U\7storagectorch\nFloatStorage\nU\0010U\3cpuK\6tQ"
+#define PTH_TENSOR(dims) "ctorch._utils\n_rebuild_tensor_v2\n(" PTH_STORAGE dims "\x89}tR" // six elements
+#define PTH_2X3 PTH_TENSOR("K\0K\2K\3\x86K\3K\1\x86")
+
+static void test_pth(gsf_context* ctx) {
+    static const struct { const char* pickle; size_t size, storage; const char *text, *names; } cases[] = {
+#define PTH_CASE(pickle, storage, text, names) {"\x80\2" pickle ".", sizeof pickle + 2, storage, text, names}
+        PTH_CASE("}(U\1a" PTH_2X3 "u", 6, NULL, "a"),
+        PTH_CASE("}(U\5state}(U\1a" PTH_2X3 "uU\1x}(U\1bK\1uu", 6, NULL, "a"),               // the common part is omitted
+        PTH_CASE("}(U\5state}(U\1a" PTH_2X3 "uU\1b" PTH_2X3 "u", 6, NULL, "b state/a"),
+        PTH_CASE("}(U\1a" PTH_2X3 "2u", 6, "a key without a value", NULL),
+        PTH_CASE("}(U\1aNK\7" PTH_2X3 "q\0U\1bh\0u", 6, NULL, "7 b"),                         // one tensor, two names
+        PTH_CASE("ccollections\nOrderedDict\n(]U\1a" PTH_2X3 "\x86" "a\x85tR", 6, "of no pairs", NULL),
+        PTH_CASE("ccollections\nOrderedDict\n]](U\1a" PTH_2X3 "ea\x85R", 6, NULL, "a"),         // as Python 2 writes it
+        PTH_CASE("}(U\1a" PTH_2X3 "U\1a" PTH_2X3 "u", 6, "two tensors are called a", NULL),
+        PTH_CASE("}(}" PTH_2X3 "u", 6, "without a name", NULL),
+        PTH_CASE("}(U\1\xff" PTH_2X3 "u", 6, "without a name", NULL),
+        PTH_CASE("}(U\1a" PTH_2X3 "u", 5, "a storage of 5 elements, not of 6", NULL),
+        PTH_CASE("}(U\1a" PTH_TENSOR("K\1K\2K\3\x86K\3K\1\x86") "u", 6, "beyond its storage", NULL),
+        PTH_CASE("}(U\1a" PTH_TENSOR("K\0K\2K\4\x86K\2K\1\x86") "u", 6, NULL, "a"),            // overlapping windows
+        PTH_CASE("}(U\1a" PTH_TENSOR("K\0J\xff\xff\xff\x7f\x85K\0\x85") "u", 6, "8 times the file's size", NULL),
+        PTH_CASE("}(U\1a" PTH_TENSOR("K\0K\0J\xff\xff\xff\x7f\x86K\1K\1\x86") "u", 6, NULL, "a"), // empty
+        PTH_CASE("}(U\1a" PTH_STORAGE "u", 6, NULL, ""),
+        PTH_CASE("K\1", 0, "neither a dictionary nor a list", NULL),
+        PTH_CASE("cos\nsystem\n(U\2lstR", 0, "refers to os.system", NULL),
+        PTH_CASE("(U\2lsios\nsystem\n", 0, "opcode 0x69", NULL),
+        PTH_CASE("ctorch\nFloatStorage\n)R", 0, "no function", NULL),
+#undef PTH_CASE
+    };
+    for (size_t i = 0; i < GSF__COUNT(cases); i++) {
+        made m = make_pth(cases[i].pickle, cases[i].size, cases[i].storage);
+        gsf_nn_weights w;
+        char names[100] = "";
+        const gsf_result r = gsf_nn_parse_weights(ctx, "f", m.data, m.size, &w);
+        for (size_t k = 0; r == GSF_OK && k < w.tensor_count; k++)
+            snprintf(names + strlen(names), sizeof names - strlen(names), "%s%s", k ? " " : "", w.tensors[k].name);
+        const int ok = cases[i].names ? r == GSF_OK && strcmp(names, cases[i].names) == 0
+                                      : r != GSF_OK && strstr(ctx->error, cases[i].text) != NULL;
+        if (!CHECK(ok)) fprintf(stderr, "  case %zu: \"%s\", \"%s\"\n", i, names, r ? ctx->error : "");
+        if (ok && i == 12) {
+            const float windows[8] = {0, 1, 2, 3, 2, 3, 4, 5};
+            CHECK(w.tensors[0].count == 8 && memcmp(w.tensors[0].data, windows, sizeof windows) == 0 && w.read_bytes == 32);
+        }
+        gsf_nn_destroy_weights(ctx, &w);
+        free(m.data);
+    }
+    test_pth_damaged(ctx, "metricnets/pth/mixed_zip.pth");
+    test_pth_damaged(ctx, "metricnets/pth/mixed_legacy.pth");
+}
+
 // ---- shards
 
 static void write_text(gsf_context* ctx, const char* name, const char* text) {
@@ -362,7 +465,7 @@ static void test_shards(gsf_context* ctx) {
         {"{\"weight_map\":{\"f32\":7}}", 0, GSF_ERROR_FORMAT, "not a plain file name"},
         {"{\"weight_map\":{\"f32\":\"s-3.safetensors\"}}", 0, GSF_ERROR_NOT_FOUND, "s-3.safetensors"},
         {"{\"weight_map\":{\"f32\":\"s-1.safetensors\",\"f16\":\"s-4.safetensors\"}}", 0, GSF_ERROR_FORMAT,
-         "tensor f32 is in two"},
+         "two tensors are called f32"},
         {"{\"weight_map\":[]}", 0, GSF_ERROR_FORMAT, "weight_map"},
         {"{}", 0, GSF_ERROR_FORMAT, "weight_map"},
         {"[1]", 0, GSF_ERROR_FORMAT, "weight_map"},
@@ -411,7 +514,7 @@ static void test_folders(gsf_context* ctx) { // without a prefix
         remove(path);
     }
     CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
-    CHECK(strstr(ctx->error, "no .safetensors file") != NULL);
+    CHECK(strstr(ctx->error, "no .safetensors or .pth file") != NULL);
     CHECK_RESULT(&hooked, gsf_nn_load_weights(&hooked, folder, NULL, &w), GSF_ERROR_NOT_FOUND);
     snprintf(path, sizeof path, "%s/%s", folder, names[0]);
     CHECK_OK(ctx, gsf_nn_save_tensors(ctx, path, tensors, 3));
@@ -426,6 +529,20 @@ static void test_folders(gsf_context* ctx) { // without a prefix
     const char* index = "{\"weight_map\":{\"f32\":\"other.safetensors\"}}";
     CHECK_OK(ctx, gsf_write_file(ctx, path, index, strlen(index)));
     check_opens(ctx, folder, tensors, 2);
+    snprintf(folder, sizeof folder, "%s", test_scratch("pth_folder")); // PyTorch files only
+    make_folder(folder);
+    made m = make_pth("\x80\2}(U\1a" PTH_2X3 "u.", sizeof "\x80\2}(U\1a" PTH_2X3 "u." - 1, 6);
+    snprintf(path, sizeof path, "%s/model.pth", folder);
+    CHECK_OK(ctx, gsf_write_file(ctx, path, m.data, m.size));
+    free(m.data);
+    for (int way = 0; way < 4; way++) {
+        gsf_context* with = way & 1 ? &hooked : ctx;
+        if (CHECK_OK(with, gsf_nn_load_weights(with, folder, way & 2 ? "model" : NULL, &w))) CHECK(w.tensor_count == 1);
+        gsf_nn_destroy_weights(with, &w);
+    }
+    CHECK_RESULT(ctx, gsf_nn_load_weights(ctx, folder, "absent", &w), GSF_ERROR_NOT_FOUND);
+    CHECK(strstr(ctx->error, "absent.safetensors") != NULL);
+    snprintf(folder, sizeof folder, "%s", test_scratch("folder"));
     snprintf(path, sizeof path, "%s/%s", folder, names[0]);
     CHECK_OK(ctx, gsf_write_file(ctx, path, "junk", 4));
     CHECK_RESULT(&hooked, gsf_nn_load_weights(&hooked, folder, NULL, &w), GSF_ERROR_FORMAT);
@@ -443,7 +560,9 @@ static void test_memory(gsf_context* plain) {
     make_tensors(tensors);
     write_text(plain, "m.safetensors.index.json",
                "{\"weight_map\":{\"f32\":\"s-1.safetensors\",\"u8\":\"s-2.safetensors\"}}");
-    for (int job = 0; job < 4; job++) {
+    size_t zip_size;
+    char* zip = test_read_file(test_golden("metricnets/pth/mixed_zip.pth"), &zip_size);
+    for (int job = 0; job < 5; job++) {
         size_t k = 1;
         for (int done = 0; !done; k++) {
             gsf_context ctx;
@@ -459,6 +578,7 @@ static void test_memory(gsf_context* plain) {
             const gsf_result r = job == 0   ? gsf_nn_parse_weights(&ctx, "m", m.data, m.size, &w)
                                  : job == 1 ? gsf_nn_load_weights(&ctx, test_scratch(""), "m", &w)
                                  : job == 2 ? gsf_nn_load_weights(&ctx, test_scratch(""), "s-1", &w)
+                                 : job == 4 ? gsf_nn_parse_weights(&ctx, "m", zip, zip_size, &w)
                                             : gsf_nn_save_tensors(&ctx, out, tensors, ALL);
             done = r == GSF_OK;
             CHECK_RESULT(&ctx, r, done ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY);
@@ -469,6 +589,7 @@ static void test_memory(gsf_context* plain) {
         }
         CHECK(k > 3 && k < 200);
     }
+    free(zip);
     free(m.data);
 }
 
@@ -652,6 +773,7 @@ int main(void) {
     test_cut_and_flipped(&ctx);
     test_shards(&ctx);
     test_folders(&ctx);
+    test_pth(&ctx);
     test_memory(&ctx);
     test_large_header(&ctx);
     test_golden_model(&ctx, "transformer", "diffusion_pytorch_model", 1);
