@@ -6309,7 +6309,7 @@ static void gsf__conv_segment(void* arg, size_t segment, int32_t worker) {
 static void gsf__conv_frame(gsf_context* ctx, gsf__conv_job* job, double* sums) {
     const int64_t segments = gsf__conv_segments(job);
     gsf__parallel_for(ctx, (size_t)segments, gsf__conv_segment, job);
-    if (!job->partial) return;
+    if (!job->partial || !sums) return;
     memset(sums, 0, (size_t)job->groups * 2 * sizeof(double));
     for (int64_t s = 0; s < segments; s++)
         for (int64_t i = 0; i < job->groups * 2; i++) sums[i] += job->partial[s * job->groups * 2 + i];
@@ -14135,8 +14135,10 @@ typedef struct gsf__grad_job {
     gsf_nn_dtype dtype;
     float* dx;
     int64_t rows, columns, ld, chunk_rows;
-    double *sums, *products; // per chunk and column: of dy, of dy and the normalised x
-    float *short_sums, *short_products; // the same, of a few rows
+    // adds row `row` to the sums per column; norms: products are of dy and the normalised x
+    void (*add_row)(const struct gsf__grad_job* job, int64_t row, float* sums, float* products);
+    double *sums, *products; // of each part of the rows; once done, the first part's are the totals
+    float* short_sums;       // per worker, of a few rows: sums and products
     float eps, factor;
     int centre, accumulate;
 } gsf__grad_job;
@@ -14146,6 +14148,14 @@ typedef struct gsf__grad_kernels {
     void (*activate)(gsf__nn_activation activation, const float* x, const float* dy, int64_t count, float* dx);
     void (*softmax)(const float* y, const float* dy, int64_t count, float scale, float* dx);
     void (*norm)(const gsf__grad_job* job, int64_t row, float* sums, float* products);
+    void (*sum)(const gsf__grad_job* job, int64_t row, float* sums, float* products); // of dy, and of dy x unless x is NULL
+    void (*scale)(const float* x, const float* y, int64_t count, float* out); // out = x y
+    // Rotates pairs back: dx = dy turned by the negative angles; dx may be dy
+    void (*rope)(const float* dy, int64_t count, const float* cos, const float* sin, float* dx);
+    // sums[0] += sum of dy, sums[1] += sum of dy (x - mean) inverse
+    void (*channel_sums)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse, double* sums);
+    // dx = inverse (weight dy - mean - normalised x * slope); by: weight, mean, slope
+    void (*channel)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse, const float* by, float* dx);
     // Turns logits into weights p = 2^(factor logit - lse) and dp into scale p (dp - delta)
     void (*attention)(float* logits, float* dp, int64_t count, float factor, float scale, float lse, float delta);
 } gsf__grad_kernels;
@@ -14182,6 +14192,15 @@ static void gsf__attention_grad_row_scalar(float* logits, float* dp, int64_t cou
     }
 }
 
+static void gsf__rope_grad_scalar(const float* dy, int64_t count, const float* cos, const float* sin, float* dx) {
+    for (int64_t i = 0; i + 1 < count; i += 2) {
+        const float a = dy[i], b = dy[i + 1];
+        dx[i] = a * cos[i] + b * sin[i];
+        dx[i + 1] = b * cos[i + 1] - a * sin[i + 1];
+    }
+    if (count % 2) dx[count - 1] = dy[count - 1];
+}
+
 #define gsf__v_slope GSF__V(gsf__v_slope)
 #define gsf__norm_grad_terms GSF__V(gsf__norm_grad_terms)
 
@@ -14201,26 +14220,26 @@ GSF__V_INLINE void GSF__V(gsf__multiply_tile)(const gsf__grad_product* p, int64_
     const int64_t last = p->rows - row - 1, step = p->a_step;
     const float *a = p->a + row * p->a_row, *b = p->b + column;
     float* c = p->c + row * p->ldc + column;
-#define GSF_X(r)                                               \
-    const float* a##r = a + gsf__least(r, last) * p->a_row;    \
+#define GSF_X(r)                                            \
+    const float* a##r = a + gsf__least(r, last) * p->a_row; \
     gsf__vf c##r = gsf__v_set(0.0f), d##r = c##r;
     GSF__SIX(GSF_X)
 #undef GSF_X
     for (int64_t k = 0, at = 0; k < p->count; k++, at += step, b += p->ldb) {
         const gsf__vf b0 = gsf__v_load_first(b, left), b1 = gsf__v_load_first(b + GSF__LANES, left1);
         gsf__vf v;
-#define GSF_X(r)                       \
-        v = gsf__v_set(a##r[at]);      \
+#define GSF_X(r)                         \
+        v = gsf__v_set(a##r[at]);        \
         c##r = gsf__v_madd(v, b0, c##r); \
         d##r = gsf__v_madd(v, b1, d##r);
         GSF__SIX(GSF_X)
 #undef GSF_X
     }
-#define GSF_X(r)                                                                                          \
-    if (r <= last) {                                                                                      \
-        float* to = c + (r) * p->ldc;                                                                     \
-        gsf__v_store_first(to, gsf__v_load_first(to, left) + c##r, left);                                 \
-        if (left1) gsf__v_store_first(to + GSF__LANES, gsf__v_load_first(to + GSF__LANES, left1) + d##r, left1); \
+#define GSF_X(r)                                                                                              \
+    if (r <= last) {                                                                                          \
+        float *to = c + (r) * p->ldc, *next = to + GSF__LANES;                                                \
+        gsf__v_store_first(to, gsf__v_load_first(to, left) + c##r, left);                                     \
+        if (left1) gsf__v_store_first(next, gsf__v_load_first(next, left1) + d##r, left1);                    \
     }
     GSF__SIX(GSF_X)
 #undef GSF_X
@@ -14290,7 +14309,62 @@ GSF__V_KERNEL void GSF__V(gsf__norm_grad_row)(const gsf__grad_job* job, int64_t 
     }
 }
 
+GSF__V_KERNEL void GSF__V(gsf__sum_row)(const gsf__grad_job* job, int64_t row, float* sums, float* products) {
+    const float *x = job->x ? job->x + row * job->ld : NULL, *dy = job->dy + row * job->ld;
+    for (int64_t i = 0; i < job->columns; i += GSF__LANES) {
+        const size_t left = (size_t)(job->columns - i);
+        const gsf__vf d = gsf__v_load_first(dy + i, left);
+        gsf__v_store_first(sums + i, gsf__v_load_first(sums + i, left) + d, left);
+        if (!x) continue;
+        const gsf__vf product = gsf__v_madd(d, gsf__v_load_first(x + i, left), gsf__v_load_first(products + i, left));
+        gsf__v_store_first(products + i, product, left);
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__scale_row)(const float* x, const float* y, int64_t count, float* out) {
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        gsf__v_store_first(out + i, gsf__v_load_first(x + i, left) * gsf__v_load_first(y + i, left), left);
+    }
+}
+
+GSF__V_KERNEL void GSF__V(gsf__channel_sums)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse,
+                                             double* sums) {
+    const gsf__norm_terms n = gsf__norm_terms_of(m, inverse);
+    gsf__vd total = gsf__vd_set(0.0), weighted = total;
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf d = gsf__v_load_first(dy + i, left); // 0 beyond the end
+        total = gsf__vd_add_folded(total, d);
+        weighted = gsf__vd_add_folded(weighted, d * gsf__norm_apply(&n, gsf__v_load_first(x + i, left)));
+    }
+    sums[0] += gsf__vd_sum(total);
+    sums[1] += gsf__vd_sum(weighted);
+}
+
+GSF__V_KERNEL void GSF__V(gsf__channel_grad)(const float* x, const float* dy, int64_t count, gsf__moments m, float inverse,
+                                             const float* by, float* dx) {
+    const gsf__norm_terms n = gsf__norm_terms_of(m, inverse);
+    const gsf__vf weight = gsf__v_set(by[0]), mean = gsf__v_set(by[1]), slope = gsf__v_set(by[2]);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf h = gsf__v_msub(weight, gsf__v_load_first(dy + i, left), mean);
+        const gsf__vf normal = gsf__norm_apply(&n, gsf__v_load_first(x + i, left));
+        gsf__v_store_first(dx + i, n.inverse * gsf__v_nmadd(normal, slope, h), left);
+    }
+}
+
 #if GSF__LANES > 1 // at one lane: the references above
+
+GSF__V_KERNEL void GSF__V(gsf__rope_grad)(const float* dy, int64_t count, const float* cos, const float* sin, float* dx) {
+    const gsf__vf zero = gsf__v_set(0.0f);
+    for (int64_t i = 0; i < count; i += GSF__LANES) {
+        const size_t left = (size_t)(count - i);
+        const gsf__vf d = gsf__v_load_first(dy + i, left);
+        const gsf__vf turned = gsf__v_turn_pairs(d, gsf__v_load_first(cos + i, left), zero - gsf__v_load_first(sin + i, left));
+        gsf__v_store_first(dx + i, gsf__v_select(gsf__vm_first(left / 2 * 2), turned, d), left); // an odd last one stays
+    }
+}
 
 // gsf__nn_activation_slope. Beyond the clamping the slope is 0 or 1.
 GSF__V_INLINE gsf__vf gsf__v_slope(gsf__nn_activation activation, gsf__vf x) {
@@ -14357,13 +14431,19 @@ GSF__V_KERNEL void GSF__V(gsf__attention_grad_row)(float* logits, float* dp, int
 #ifdef GSF_NN_TRAINING
 
 static const gsf__grad_kernels* gsf__grad_kernels_of(gsf_cpu_level level) {
-    static const gsf__grad_kernels scalar = {gsf__multiply_scalar, gsf__activate_grad_scalar, gsf__softmax_grad_scalar,
-                                             gsf__norm_grad_row_scalar, gsf__attention_grad_row_scalar};
+    static const gsf__grad_kernels scalar = {
+        gsf__multiply_scalar, gsf__activate_grad_scalar, gsf__softmax_grad_scalar, gsf__norm_grad_row_scalar,
+        gsf__sum_row_scalar, gsf__scale_row_scalar, gsf__rope_grad_scalar, gsf__channel_sums_scalar,
+        gsf__channel_grad_scalar, gsf__attention_grad_row_scalar};
 #if GSF__X86
-    static const gsf__grad_kernels avx2 = {gsf__multiply_avx2, gsf__activate_grad_avx2, gsf__softmax_grad_avx2,
-                                           gsf__norm_grad_row_avx2, gsf__attention_grad_row_avx2};
-    static const gsf__grad_kernels avx512 = {gsf__multiply_avx512, gsf__activate_grad_avx512, gsf__softmax_grad_avx512,
-                                             gsf__norm_grad_row_avx512, gsf__attention_grad_row_avx512};
+    static const gsf__grad_kernels avx2 = {
+        gsf__multiply_avx2, gsf__activate_grad_avx2, gsf__softmax_grad_avx2, gsf__norm_grad_row_avx2,
+        gsf__sum_row_avx2, gsf__scale_row_avx2, gsf__rope_grad_avx2, gsf__channel_sums_avx2,
+        gsf__channel_grad_avx2, gsf__attention_grad_row_avx2};
+    static const gsf__grad_kernels avx512 = {
+        gsf__multiply_avx512, gsf__activate_grad_avx512, gsf__softmax_grad_avx512, gsf__norm_grad_row_avx512,
+        gsf__sum_row_avx512, gsf__scale_row_avx512, gsf__rope_grad_avx512, gsf__channel_sums_avx512,
+        gsf__channel_grad_avx512, gsf__attention_grad_row_avx512};
     if (level >= GSF_CPU_AVX512) return &avx512;
     if (level >= GSF_CPU_AVX2) return &avx2;
 #endif
@@ -14418,10 +14498,104 @@ GSF__SHARED void gsf__nn_softmax_grad(gsf_context* ctx, const float* y, const fl
     gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__softmax_grad_chunk, &job);
 }
 
-// ---- training: norms
+// ---- training: sums over rows
 
-enum { GSF__GRAD_PARTS = 64 }; // of the rows of a norm, each with its own sums over rows
+enum { GSF__GRAD_PARTS = 64 }; // of the rows, each with its own sums
 enum { GSF__GRAD_SHORT = 32 }; // rows summed in float before they are added to a sum in double
+
+static void gsf__grad_sum_part(void* arg, size_t part, int32_t worker) {
+    const gsf__grad_job* job = (const gsf__grad_job*)arg;
+    const int64_t n = job->columns, begin = (int64_t)part * job->chunk_rows;
+    const int64_t end = gsf__least(begin + job->chunk_rows, job->rows);
+    double *sums = job->sums + (int64_t)part * n, *products = job->products + (int64_t)part * n;
+    float *short_sums = job->short_sums + (int64_t)worker * 2 * n, *short_products = short_sums + n;
+    memset(sums, 0, (size_t)n * sizeof(double));
+    memset(products, 0, (size_t)n * sizeof(double));
+    for (int64_t first = begin; first < end; first += GSF__GRAD_SHORT) {
+        memset(short_sums, 0, (size_t)(2 * n) * sizeof(float));
+        for (int64_t r = first; r < first + GSF__GRAD_SHORT && r < end; r++) job->add_row(job, r, short_sums, short_products);
+        for (int64_t i = 0; i < n; i++) {
+            sums[i] += (double)short_sums[i];
+            products[i] += (double)short_products[i];
+        }
+    }
+}
+
+// Calls add_row for every row. Afterwards sums and products are (columns); the caller frees job->sums.
+static gsf_result gsf__grad_sum(gsf_context* ctx, gsf__grad_job* job) {
+    size_t count, shorts;
+    job->chunk_rows = gsf__ceil_div(job->rows, GSF__GRAD_PARTS);
+    const size_t parts = gsf__nn_chunks(job->rows, job->chunk_rows), columns = (size_t)job->columns;
+    if (!gsf__mul_size(2 * parts, columns, &count) ||
+        !gsf__mul_size((size_t)ctx->parallel.worker_count, columns, &shorts) || shorts > SIZE_MAX / 2 - count)
+        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "gradients: %lld values per row", (long long)job->columns);
+    job->sums = (double*)gsf_alloc(ctx, count + shorts, sizeof(double)); // two floats in the place of a double
+    if (!job->sums) return GSF_ERROR_OUT_OF_MEMORY;
+    job->products = job->sums + count / 2;
+    job->short_sums = (float*)(void*)(job->sums + count);
+    gsf__parallel_for(ctx, parts, gsf__grad_sum_part, job);
+    for (size_t i = columns; i < count / 2; i++) {
+        job->sums[i % columns] += job->sums[i];
+        job->products[i % columns] += job->products[i];
+    }
+    return GSF_OK;
+}
+
+// sum (columns) += the sum of the rows of dy or, unless x is NULL, of dy * x: gradients of a bias and of a gate
+GSF__SHARED gsf_result gsf__nn_sum_rows(gsf_context* ctx, const float* dy, const float* x, int64_t rows, int64_t columns,
+                                        float* sum) {
+    gsf__grad_job job = gsf__grad_begin(ctx, x, dy, rows, columns, NULL);
+    if (rows < 1) return GSF_OK;
+    job.add_row = job.kernels->sum;
+    GSF__TRY(gsf__grad_sum(ctx, &job));
+    for (int64_t i = 0; i < columns; i++) sum[i] += (float)(x ? job.products[i] : job.sums[i]);
+    gsf_free(ctx, job.sums);
+    return GSF_OK;
+}
+
+static void gsf__scale_rows_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__grad_job* job = (const gsf__grad_job*)arg;
+    const int64_t n = job->columns, begin = (int64_t)chunk * job->chunk_rows;
+    (void)worker;
+    for (int64_t r = begin; r < begin + job->chunk_rows && r < job->rows; r++)
+        job->kernels->scale(job->dy + r * n, job->scale, n, job->dx + r * n);
+}
+
+// y += gate * x, for each row: dx = gate * dy; dgate (columns), added to
+GSF__SHARED gsf_result gsf__nn_gate_grad(gsf_context* ctx, const float* gate, const float* x, const float* dy, int64_t rows,
+                                         int64_t columns, float* dx, float* dgate) {
+    gsf__grad_job job = gsf__grad_begin(ctx, x, dy, rows, columns, dx);
+    GSF__TRY(gsf__nn_sum_rows(ctx, dy, x, rows, columns, dgate));
+    job.scale = gate;
+    gsf__parallel_for(ctx, gsf__nn_chunks(rows, job.chunk_rows), gsf__scale_rows_chunk, &job);
+    return GSF_OK;
+}
+
+enum { GSF__GRAD_COLUMNS = 64 }; // of a table, per chunk
+
+typedef struct gsf__embed_grad_job {
+    const int32_t* ids;
+    const float* dy;
+    float* dtable;
+    int64_t rows, dim;
+} gsf__embed_grad_job;
+
+static void gsf__embed_grad_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__embed_grad_job* job = (const gsf__embed_grad_job*)arg;
+    const int64_t begin = (int64_t)chunk * GSF__GRAD_COLUMNS, end = gsf__least(begin + GSF__GRAD_COLUMNS, job->dim);
+    (void)worker;
+    for (int64_t r = 0; r < job->rows; r++)
+        for (int64_t i = begin; i < end; i++) job->dtable[job->ids[r] * job->dim + i] += job->dy[r * job->dim + i];
+}
+
+// Row r of the result is row ids[r] of the table (any, dim): dtable (any, dim), added to. Rows are added in order.
+GSF__SHARED void gsf__nn_embed_grad(gsf_context* ctx, const int32_t* ids, const float* dy, int64_t rows, int64_t dim,
+                                    float* dtable) {
+    gsf__embed_grad_job job = {ids, dy, dtable, rows, dim};
+    gsf__parallel_for(ctx, (size_t)gsf__ceil_div(dim, GSF__GRAD_COLUMNS), gsf__embed_grad_chunk, &job);
+}
+
+// ---- training: norms
 
 typedef struct gsf__nn_norm_grad_desc {
     const float* x;           // (rows, dim)
@@ -14435,55 +14609,22 @@ typedef struct gsf__nn_norm_grad_desc {
     float *dweight, *dbias, *dscale, *dshift; // (dim), added to; each may be NULL
 } gsf__nn_norm_grad_desc;
 
-static void gsf__norm_grad_part(void* arg, size_t part, int32_t worker) {
-    const gsf__grad_job* job = (const gsf__grad_job*)arg;
-    const int64_t n = job->columns, begin = (int64_t)part * job->chunk_rows;
-    const int64_t end = gsf__least(begin + job->chunk_rows, job->rows);
-    double *sums = job->sums + (int64_t)part * n, *products = job->products + (int64_t)part * n;
-    float *short_sums = job->short_sums + (int64_t)worker * 2 * n, *short_products = short_sums + n;
-    memset(sums, 0, (size_t)n * sizeof(double));
-    memset(products, 0, (size_t)n * sizeof(double));
-    for (int64_t first = begin; first < end; first += GSF__GRAD_SHORT) {
-        memset(short_sums, 0, (size_t)(2 * n) * sizeof(float));
-        for (int64_t r = first; r < first + GSF__GRAD_SHORT && r < end; r++)
-            job->kernels->norm(job, r, short_sums, short_products);
-        for (int64_t i = 0; i < n; i++) {
-            sums[i] += (double)short_sums[i];
-            products[i] += (double)short_products[i];
-        }
-    }
-}
-
 // y = (normalised x * weight + bias) * (1 + scale) + shift over the last dimension: layer norm, adaptive layer norm, RMS norm
 GSF__SHARED gsf_result gsf__nn_norm_grad(gsf_context* ctx, const gsf__nn_norm_grad_desc* d) {
     gsf__grad_job job = gsf__grad_begin(ctx, d->x, d->dy, d->rows, d->dim, d->dx);
-    size_t count, shorts;
     if (d->rows < 0 || d->dim < 1) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "norm: rows < 0 or dim < 1");
     if (d->rows == 0) return GSF_OK;
     job.norms = gsf__norm_kernels_of(ctx->cpu_level);
+    job.add_row = job.kernels->norm;
     job.weight = d->by.weight;
     job.scale = d->by.scale;
     job.eps = d->eps;
     job.centre = !d->rms;
     job.accumulate = d->accumulate;
-    job.chunk_rows = gsf__ceil_div(d->rows, GSF__GRAD_PARTS);
-    const size_t parts = gsf__nn_chunks(d->rows, job.chunk_rows);
-    if (!gsf__mul_size(2 * parts, (size_t)d->dim, &count) ||
-        !gsf__mul_size((size_t)ctx->parallel.worker_count, (size_t)d->dim, &shorts) || shorts > SIZE_MAX / 2 - count)
-        return gsf_fail(ctx, GSF_ERROR_OUT_OF_MEMORY, "norm: %lld values per row", (long long)d->dim);
-    job.sums = (double*)gsf_alloc(ctx, count + shorts, sizeof(double)); // two floats in the place of a double
-    if (!job.sums) return GSF_ERROR_OUT_OF_MEMORY;
-    job.products = job.sums + count / 2;
-    job.short_sums = (float*)(void*)(job.sums + count);
-    gsf__parallel_for(ctx, parts, gsf__norm_grad_part, &job);
+    GSF__TRY(gsf__grad_sum(ctx, &job));
     for (int64_t i = 0; i < d->dim; i++) {
-        double sum = 0.0, product = 0.0;
-        for (size_t part = 0; part < parts; part++) {
-            sum += job.sums[(int64_t)part * d->dim + i];
-            product += job.products[(int64_t)part * d->dim + i];
-        }
+        const double sum = job.sums[i], product = job.products[i], scale = d->by.scale ? 1.0 + (double)d->by.scale[i] : 1.0;
         const double weight = d->by.weight ? (double)d->by.weight[i] : 1.0, bias = d->by.bias ? (double)d->by.bias[i] : 0.0;
-        const double scale = d->by.scale ? 1.0 + (double)d->by.scale[i] : 1.0;
         if (d->dweight) d->dweight[i] += (float)(scale * product);
         if (d->dbias) d->dbias[i] += (float)(scale * sum);
         if (d->dscale) d->dscale[i] += (float)(weight * product + bias * sum);
@@ -14491,6 +14632,98 @@ GSF__SHARED gsf_result gsf__nn_norm_grad(gsf_context* ctx, const gsf__nn_norm_gr
     }
     gsf_free(ctx, job.sums);
     return GSF_OK;
+}
+
+typedef struct gsf__nn_head_grad_desc { // of gsf__nn_head_norm_rope with dense rows
+    const float* x;           // (rows, heads*head_dim), before the norm
+    int64_t rows, rope_first;
+    int32_t heads, head_dim;
+    const float *weight, *cos, *sin; // as in the forward pass
+    float eps;
+    const float* dy;
+    float* dx;                // may be dy
+    float *dweight, *dbias;   // (head_dim), added to; each may be NULL
+} gsf__nn_head_grad_desc;
+
+typedef struct gsf__rope_grad_job {
+    const gsf__nn_head_grad_desc* desc;
+    const gsf__grad_kernels* kernels;
+    int64_t chunk_rows;
+} gsf__rope_grad_job;
+
+static void gsf__rope_grad_chunk(void* arg, size_t chunk, int32_t worker) {
+    const gsf__rope_grad_job* job = (const gsf__rope_grad_job*)arg;
+    const gsf__nn_head_grad_desc* d = job->desc;
+    const int64_t begin = (int64_t)chunk * job->chunk_rows, end = gsf__least(begin + job->chunk_rows, d->rows);
+    const int64_t dim = d->head_dim, width = d->heads * dim;
+    (void)worker;
+    for (int64_t r = begin; r < end; r++) {
+        const float* dy = d->dy + r * width;
+        float* dx = d->dx + r * width;
+        const int64_t at = (r - d->rope_first) * dim;
+        if (d->cos && at >= 0)
+            for (int32_t h = 0; h < d->heads; h++)
+                job->kernels->rope(dy + h * dim, dim, d->cos + at, d->sin + at, dx + h * dim);
+        else if (dx != dy) memcpy(dx, dy, (size_t)width * sizeof(float));
+    }
+}
+
+GSF__SHARED gsf_result gsf__nn_head_grad(gsf_context* ctx, const gsf__nn_head_grad_desc* d) {
+    gsf__rope_grad_job job = {d, gsf__grad_kernels_of(ctx->cpu_level), gsf__nn_chunk_rows((int64_t)d->heads * d->head_dim)};
+    gsf__nn_norm_grad_desc norm;
+    gsf__parallel_for(ctx, gsf__nn_chunks(d->rows, job.chunk_rows), gsf__rope_grad_chunk, &job);
+    memset(&norm, 0, sizeof norm);
+    norm.x = d->x;
+    norm.rows = d->rows * d->heads;
+    norm.dim = d->head_dim;
+    norm.by.weight = d->weight;
+    norm.eps = d->eps;
+    norm.dy = norm.dx = d->dx;
+    norm.dweight = d->dweight;
+    norm.dbias = d->dbias;
+    return gsf__nn_norm_grad(ctx, &norm);
+}
+
+typedef struct gsf__group_grad_job {
+    const gsf__grad_kernels* kernels;
+    const gsf__norm_kernels* norms;
+    const float *x, *dy, *weight;
+    float *dx, *dweight, *dbias;
+    int64_t channels, count; // of a group; values per channel
+    float eps;
+} gsf__group_grad_job;
+
+// The sums over a channel are the gradients of its bias and weight; weighted, they add up to those over the group.
+static void gsf__group_grad(void* arg, size_t group, int32_t worker) {
+    const gsf__group_grad_job* job = (const gsf__group_grad_job*)arg;
+    const int64_t n = job->count, first = (int64_t)group * job->channels, size = job->channels * n;
+    const gsf__moments m = job->norms->moments(job->x + first * n, size, 1);
+    const float inverse = gsf__norm_inverse(m, size, job->eps);
+    double mean = 0.0, slope = 0.0;
+    (void)worker;
+    for (int64_t c = first; c < first + job->channels; c++) {
+        const double weight = job->weight ? (double)job->weight[c] : 1.0;
+        double sums[2] = {0.0, 0.0};
+        job->kernels->channel_sums(job->x + c * n, job->dy + c * n, n, m, inverse, sums);
+        mean += weight * sums[0] / (double)size;
+        slope += weight * sums[1] / (double)size;
+        if (job->dbias) job->dbias[c] += (float)sums[0];
+        if (job->dweight) job->dweight[c] += (float)sums[1];
+    }
+    for (int64_t c = first; c < first + job->channels; c++) {
+        const float by[3] = {job->weight ? job->weight[c] : 1.0f, (float)mean, (float)slope};
+        job->kernels->channel(job->x + c * n, job->dy + c * n, n, m, inverse, by, job->dx + c * n);
+    }
+}
+
+// gsf__nn_group_norm: x, dy, dx (channels, count); dx may be dy; dweight, dbias (channels), added to; each may be NULL
+GSF__SHARED void gsf__nn_group_norm_grad(gsf_context* ctx, const float* x, const float* dy, int64_t channels, int64_t count,
+                                         int64_t groups, const float* weight, float eps, float* dx, float* dweight,
+                                         float* dbias) {
+    if (channels < 1 || count < 1 || groups < 1) return;
+    gsf__group_grad_job job = {gsf__grad_kernels_of(ctx->cpu_level), gsf__norm_kernels_of(ctx->cpu_level), x, dy, weight,
+                               dx, dweight, dbias, channels / groups, count, eps};
+    gsf__parallel_for(ctx, (size_t)groups, gsf__group_grad, &job);
 }
 
 // ---- training: linear layers
@@ -14575,12 +14808,7 @@ GSF__SHARED gsf_result gsf__nn_linear_grad(gsf_context* ctx, const gsf__nn_linea
         result = gsf__nn_run_linear(ctx, NULL, &multiply);
     }
     gsf_free(ctx, scratch);
-    for (int64_t c = 0; !result && d->dbias && c < out; c++) {
-        double sum = 0.0;
-        for (int64_t r = 0; r < d->rows; r++) sum += (double)d->dy[r * out + c];
-        d->dbias[c] += (float)sum;
-    }
-    return result;
+    return !result && d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, d->rows, out, d->dbias) : result;
 }
 
 // ---- training: attention
@@ -14726,6 +14954,166 @@ GSF__SHARED gsf_result gsf__nn_attention_grad(gsf_context* ctx, const gsf__nn_at
     gsf__parallel_for(ctx, (size_t)d->heads, gsf__attention_grad_head, &job);
     gsf_free(ctx, job.scratch);
     return GSF_OK;
+}
+
+// ---- training: convolution
+
+typedef struct gsf__nn_conv_grad_desc {
+    const gsf__nn_conv_desc* forward; // `y`, `bias` and `accumulate` are not read
+    const float* dy;           // as y
+    float *dx, *dbefore;       // as x, as before; each may be NULL
+    int32_t accumulate;        // dx += instead of dx = ...
+    float *dweight, *dbias;    // (out, in, ...), (out), added to; each may be NULL
+} gsf__nn_conv_grad_desc;
+
+/* dx is itself a convolution, of dy by the transposed kernel, upside down and mirrored: forward frames s, s + 1, s + 2
+   contribute to frame s. Frames before the first are the first one again, or `before`. A convolution that halves is one
+   of dy with zeros between its pixels. */
+typedef struct gsf__conv_grad_job {
+    const gsf__nn_conv_grad_desc* desc;
+    const gsf__grad_kernels* kernels;
+    gsf__conv_layer layer;     // of the forward pass
+    int64_t height, width;     // of dy
+    int64_t bands, band_rows;  // of the rows of all of dy's frames
+    float* sums;               // (bands, taps, in, out)
+} gsf__conv_grad_job;
+
+static int64_t gsf__conv_flip(int64_t tap, int64_t kernel) { // within a frame of the kernel
+    return tap / (kernel * kernel) * kernel * kernel + kernel * kernel - 1 - tap % (kernel * kernel);
+}
+
+// out (in, out, taps): the transposed, mirrored kernel
+static void gsf__conv_flip_weight(const gsf__conv_layer* layer, float* out) {
+    const int64_t taps = gsf__conv_taps(layer);
+    float values[GSF__CONV_TAPS];
+    for (int64_t o = 0; o < layer->out; o++)
+        for (int64_t i = 0; i < layer->in; i++) {
+            gsf_nn_convert_tensor(layer->weight, (o * layer->in + i) * taps, taps, values);
+            for (int64_t t = 0; t < taps; t++)
+                out[(i * layer->out + o) * taps + gsf__conv_flip(t, layer->kernel)] = values[t];
+        }
+}
+
+// Writes dy (height, width, channels) into a bordered frame of zeros, at every second pixel from (1, 1) on.
+static void gsf__conv_spread(const float* dy, int64_t height, int64_t width, int64_t channels, int64_t out_width, float* out) {
+    for (int64_t y = 0; y < height; y++)
+        for (int64_t x = 0; x < width; x++)
+            memcpy(out + ((2 * y + 1) * (out_width + 2) + 2 * x + 2) * channels, dy + (y * width + x) * channels,
+                   (size_t)channels * sizeof(float));
+}
+
+static gsf_result gsf__conv_grad_input(gsf_context* ctx, const gsf__conv_grad_job* g) {
+    const gsf__nn_conv_desc* f = g->desc->forward;
+    const int64_t in = g->layer.in, out = g->layer.out, frame = gsf__conv_frame_size(f->height, f->width, out);
+    const int64_t plane = f->height * f->width * in, kt = g->layer.kt;
+    gsf__conv_layer layer = g->layer;
+    layer.in = out;
+    layer.out = in;
+    layer.bias = NULL;
+    const size_t taps = (size_t)layer.weight->count, packed = (size_t)gsf__conv_packed(&layer);
+    float* memory = (float*)gsf_alloc_zeroed(ctx, 4 * (size_t)frame + taps + packed, sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    float *flipped = memory + 4 * frame, *weights = flipped + taps; // three frames of dy and one of zeros
+    const int64_t shape[5] = {in, out, kt, layer.kernel, layer.kernel};
+    const gsf_nn_tensor weight = gsf_nn_wrap_tensor(f->weight->name, flipped, 5, shape);
+    gsf__conv_flip_weight(&g->layer, flipped);
+    layer.weight = &weight;
+    gsf__conv_pack(ctx, &layer, weights);
+    gsf__conv_job job = gsf__conv_begin(ctx, &layer, f->height, f->width, 0, weights);
+    gsf__conv_fill fill;
+    memset(&fill, 0, sizeof fill);
+    fill.kernels = job.kernels;
+    fill.height = f->height;
+    fill.width = f->width;
+    fill.channels = out;
+    for (int64_t s = f->frames - 1; s >= (kt == 3 ? -2 : 0); s--) {
+        if (s >= 0) {
+            fill.x = g->desc->dy + s * g->height * g->width * out;
+            fill.out = memory + s % 3 * frame;
+            if (f->halve) gsf__conv_spread(fill.x, g->height, g->width, out, f->width, fill.out);
+            else gsf__conv_fill_frame(ctx, &fill);
+        }
+        for (int64_t i = 0; i < kt; i++) {
+            const int64_t source = s + kt - 1 - i;
+            job.in[i] = memory + (source < 0 || source >= f->frames ? 3 : source % 3) * frame;
+        }
+        job.accumulate = s < 0 && !f->before ? 1 : s >= 0 && g->desc->accumulate;
+        job.out = s < 0 && f->before ? g->desc->dbefore ? g->desc->dbefore + (s + 2) * plane : NULL
+                                     : g->desc->dx + (s < 0 ? 0 : s) * plane;
+        if (job.out) gsf__conv_frame(ctx, &job, NULL);
+    }
+    gsf_free(ctx, memory);
+    return GSF_OK;
+}
+
+enum { GSF__CONV_GRAD_CHANNELS = 48, GSF__CONV_GRAD_BANDS = 16 }; // input channels per chunk; at most so many bands
+enum { GSF__CONV_GRAD_SUMS = 1 << 22 };                           // floats of all bands, unless one band has more
+
+// A chunk is one band, one tap and a few input channels: per row of dy, a product (in, pixels) by (pixels, out).
+static void gsf__conv_grad_weight(void* arg, size_t chunk, int32_t worker) {
+    const gsf__conv_grad_job* g = (const gsf__conv_grad_job*)arg;
+    const gsf__nn_conv_desc* f = g->desc->forward;
+    const int64_t in = g->layer.in, out = g->layer.out, kernel = g->layer.kernel, taps = gsf__conv_taps(&g->layer);
+    const int64_t pieces = gsf__ceil_div(in, GSF__CONV_GRAD_CHANNELS), unit = (int64_t)chunk / pieces; // of bands and taps
+    const int64_t channel = (int64_t)chunk % pieces * GSF__CONV_GRAD_CHANNELS, band = unit / taps, tap = unit % taps;
+    const int64_t stride = f->halve ? 2 : 1, pad = f->halve ? 0 : kernel / 2, last = g->band_rows * (band + 1);
+    const int64_t dx = tap % kernel - pad, dy = tap / kernel % kernel - pad, dt = tap / (kernel * kernel) - g->layer.kt + 1;
+    const int64_t room = f->width - 1 - dx, x0 = dx < 0 ? 1 : 0;
+    const int64_t x1 = room < 0 ? 0 : gsf__least(g->width, room / stride + 1);
+    gsf__grad_product p;
+    p.a_row = 1;
+    p.a_step = stride * in;
+    p.ldb = p.ldc = p.columns = out;
+    p.rows = gsf__least(in - channel, GSF__CONV_GRAD_CHANNELS);
+    p.count = x1 - x0;
+    p.c = g->sums + (unit * in + channel) * out;
+    (void)worker;
+    memset(p.c, 0, (size_t)(p.rows * out) * sizeof(float));
+    for (int64_t r = band * g->band_rows; p.count > 0 && r < last && r < f->frames * g->height; r++) {
+        const int64_t y = r % g->height * stride + dy, t = r / g->height + dt;
+        if (y < 0 || y >= f->height) continue;
+        const float* frame = t >= 0 ? f->x + t * f->height * f->width * in
+                                    : f->before ? f->before + (t + 2) * f->height * f->width * in : f->x;
+        p.a = frame + (y * f->width + x0 * stride + dx) * in + channel;
+        p.b = g->desc->dy + (r * g->width + x0) * out;
+        g->kernels->multiply(&p);
+    }
+}
+
+// Gradients of gsf__nn_convolve.
+GSF__SHARED gsf_result gsf__nn_conv_grad(gsf_context* ctx, const gsf__nn_conv_grad_desc* d) {
+    gsf__nn_conv_desc forward = *d->forward;
+    gsf__conv_grad_job g;
+    memset(&g, 0, sizeof g);
+    forward.y = d->dx ? d->dx : d->dweight ? d->dweight : d->dbias; // is not written
+    forward.bias = NULL;
+    GSF__TRY(gsf__check_conv(ctx, &forward, &g.layer));
+    if (!d->dy) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "convolution: dy is missing");
+    g.desc = d;
+    g.kernels = gsf__grad_kernels_of(ctx->cpu_level);
+    g.height = forward.halve ? forward.height / 2 : forward.height;
+    g.width = forward.halve ? forward.width / 2 : forward.width;
+    if (d->dx) GSF__TRY(gsf__conv_grad_input(ctx, &g));
+    const int64_t rows = forward.frames * g.height, taps = gsf__conv_taps(&g.layer), size = forward.weight->count;
+    if (d->dweight) {
+        const int64_t most = gsf__least(GSF__CONV_GRAD_BANDS, gsf__least(GSF__CONV_GRAD_SUMS / size, rows));
+        g.band_rows = gsf__ceil_div(rows, most > 1 ? most : 1);
+        g.bands = gsf__ceil_div(rows, g.band_rows);
+        g.sums = (float*)gsf_alloc(ctx, (size_t)g.bands, (size_t)size * sizeof(float));
+        if (!g.sums) return GSF_ERROR_OUT_OF_MEMORY;
+        const int64_t pieces = gsf__ceil_div(g.layer.in, GSF__CONV_GRAD_CHANNELS);
+        gsf__parallel_for(ctx, (size_t)(g.bands * taps * pieces), gsf__conv_grad_weight, &g);
+        for (int64_t o = 0; o < g.layer.out; o++)
+            for (int64_t i = 0; i < g.layer.in; i++)
+                for (int64_t t = 0; t < taps; t++) {
+                    double sum = 0.0;
+                    for (int64_t band = 0; band < g.bands; band++)
+                        sum += (double)g.sums[((band * taps + t) * g.layer.in + i) * g.layer.out + o];
+                    d->dweight[(o * g.layer.in + i) * taps + t] += (float)sum;
+                }
+        gsf_free(ctx, g.sums);
+    }
+    return d->dbias ? gsf__nn_sum_rows(ctx, d->dy, NULL, rows * g.width, g.layer.out, d->dbias) : GSF_OK;
 }
 
 #endif // GSF_NN_TRAINING
