@@ -59,6 +59,7 @@
                layers     >>nn layers
                networks   >>nn image encoders >>nn bpe >>nn captioner >>nn tokenizer >>nn t5 >>nn vae >>nn transformer
                restoring  >>nn scheduler >>nn sampling >>nn restorer
+               measuring  >>nn metrics
                training   >>nn training: gradients of layers, compiled with GSF_NN_TRAINING only
 */
 #ifndef GSF_NN_INCLUDED
@@ -600,6 +601,41 @@ typedef struct gsf_nn_dit_desc {
 // "vae encode", "transformer", "restore" (steps), "vae decode".
 GSF_API GSF_NODISCARD gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc, gsf_restorer* out);
 GSF_API void gsf_nn_destroy_dit(gsf_context* ctx, gsf_restorer* restorer);
+
+// ---- metrics that need networks -------------------------------------------------------
+/* One object measures one stream of frames, which are never held together: zero it, choose the kind and the folder with
+   the weights, pass the frames in order, read `score` at any time, destroy it.
+
+   WEIGHTS     The files as published, in one folder; for each name the first of NAME.safetensors, NAME.pth and NAME.pth.tar
+               that exists.
+                   LPIPS            alexnet-owt-7be5be79, vgg16-397923af or squeezenet1_1-b8a52dc0 (torchvision), and
+                                    alex, vgg or squeeze (linear layers, version 0.1: lpips/weights/v0.1)
+   CONVENTIONS Reported LPIPS values follow one of two: images scaled to [-1,1], as the lpips package documents it and as
+               gsplat's trainer uses AlexNet; or images in [0,1] taken as if they were in [-1,1] (`raw`), as 3DGS, GSFixer
+               and gsplat's trainer use VGG16. The values of the two cannot be compared. */
+
+typedef enum gsf_nn_metric_kind {
+    GSF_NN_METRIC_LPIPS_ALEX = 0, GSF_NN_METRIC_LPIPS_VGG, GSF_NN_METRIC_LPIPS_SQUEEZE, // Zhang et al. 2018; low is good
+} gsf_nn_metric_kind;
+
+typedef struct gsf_nn_metric { // zero it, set the first part, destroy it when done
+    gsf_nn_metric_kind kind;
+    const char* models;        // folder with the weights; needed until the first frame has been measured
+    int32_t raw;               // LPIPS: leave the images in [0,1]
+    // results
+    double score;              // of all frames so far; LPIPS: the mean
+    double last;               // of the last frame
+    int64_t count;             // frames measured
+    void* state;               // private
+    const gsf__nn_tap* _tap;   // private
+} gsf_nn_metric;
+
+// Measures the next frame, which has three channels; `reference` is its true image, of the same size. The first call opens
+// the weights; frame NULL only does that. A missing or misshaped tensor gives GSF_ERROR_FORMAT and its name, a NaN or
+// infinity GSF_ERROR_NUMERIC, frames that are too small for the network GSF_ERROR_DEGENERATE. On error `score` is as before.
+GSF_API GSF_NODISCARD gsf_result gsf_nn_measure_frame(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
+                                                      const gsf_image* reference);
+GSF_API void gsf_nn_destroy_metric(gsf_context* ctx, gsf_nn_metric* metric);
 
 #ifdef __cplusplus
 }
@@ -2256,17 +2292,17 @@ static gsf_result gsf__nn_open_named(gsf_context* ctx, const char* folder, const
     return result;
 }
 
-// FOLDER/PREFIX.safetensors, whole or sharded, else FOLDER/PREFIX.pth.
+// FOLDER/PREFIX.safetensors, whole or sharded, else FOLDER/PREFIX.pth or .pth.tar.
 static gsf_result gsf__nn_open_prefix(gsf_context* ctx, const char* folder, const char* prefix, int may_lack, int* found,
                                       gsf_nn_weights* weights) {
-    static const char* const suffixes[] = {".safetensors", ".pth", ".safetensors"}; // again, to report that it is missing
+    static const char* const suffixes[] = {".safetensors", ".pth", ".pth.tar", ".safetensors"}; // again, for the report
     gsf_result result = GSF_OK;
     char name[256];
     *found = 0;
-    for (size_t i = 0; i < (may_lack ? 2 : 3) && !result && !*found; i++) {
+    for (size_t i = 0; i < (may_lack ? 3 : 4) && !result && !*found; i++) {
         if ((size_t)snprintf(name, sizeof name, "%s%s", prefix, suffixes[i]) >= sizeof name)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: a prefix of %zu bytes", folder, strlen(prefix));
-        result = gsf__nn_open_named(ctx, folder, name, i < 2, found, weights);
+        result = gsf__nn_open_named(ctx, folder, name, i < 3, found, weights);
     }
     return result;
 }
@@ -5968,7 +6004,7 @@ enum {
     GSF__CONV_M10 = 10,                                   // pixels per product with two panels
     GSF__CONV_ROWS = 8, GSF__CONV_COLUMNS = 30,           // pixels per segment; columns: a multiple of M
     GSF__CONV_SHARE = GSF__CONV_N / GSF__CONV_ROWS,       // floats of the next panel to prefetch per step
-    GSF__CONV_TAPS = 27,
+    GSF__CONV_TAPS = 121,                                 // largest kernel: 11 x 11
 };
 
 typedef struct gsf__conv_kernels {
@@ -14108,6 +14144,428 @@ GSF_API gsf_result gsf_nn_make_dit(gsf_context* ctx, const gsf_nn_dit_desc* desc
     out->end_fn = gsf__dit_end;
     if (result) gsf_nn_destroy_dit(ctx, out);
     return result;
+}
+
+// ---- >>nn metrics ---------------------------------------------------------------
+// Networks that compare images, channels-last as in >>nn convolution. Every score is summed in double.
+
+// ---- metrics: layers of feature maps
+
+typedef struct gsf__map { // (images, height, width, channels)
+    float* data;
+    int64_t images, height, width, channels;
+} gsf__map;
+
+static size_t gsf__map_count(const gsf__map* map) { // floats; SIZE_MAX, which no allocator can provide, on overflow
+    return gsf__nn_product(gsf__nn_product((size_t)map->images, (size_t)map->height),
+                           gsf__nn_product((size_t)map->width, (size_t)map->channels));
+}
+
+typedef struct gsf__maps { // buffers of a network, reused from image to image
+    gsf_context* ctx;
+    gsf__nn_workspace rooms[2], conv; // the maps that a layer reads and writes; its weights and bordered input
+    int room;                         // that of the current map
+    gsf__map now;
+} gsf__maps;
+
+static void gsf__destroy_maps(gsf_context* ctx, gsf__maps* maps) {
+    gsf__nn_destroy_workspace(ctx, &maps->rooms[0]);
+    gsf__nn_destroy_workspace(ctx, &maps->rooms[1]);
+    gsf__nn_destroy_workspace(ctx, &maps->conv);
+}
+
+// Gives `map` the memory of the room that the current map does not use.
+static gsf_result gsf__map_make(gsf__maps* maps, gsf__map* map) {
+    map->data = (float*)gsf__nn_scratch(maps->ctx, &maps->rooms[!maps->room],
+                                        gsf__nn_product(gsf__map_count(map), sizeof(float)));
+    return map->data ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+}
+
+static void gsf__map_use(gsf__maps* maps, const gsf__map* map) {
+    maps->now = *map;
+    maps->room = !maps->room;
+}
+
+typedef struct gsf__map_conv { // a convolution; kernel and channels are those of the weight
+    const gsf__nn_layer* layer;
+    int64_t stride, pad;
+    int rectify;           // ReLU of the input
+    int64_t first, pitch;  // channel of the output's first, and channels per pixel of the output; pitch 0: 0, its own
+} gsf__map_conv;
+
+typedef struct gsf__map_fill { // the input with `pad` columns of zeros on either side
+    const float* x;
+    float* out;
+    int64_t width, channels, pad;
+    int rectify;
+} gsf__map_fill;
+
+static void gsf__map_fill_row(void* arg, size_t row, int32_t worker) {
+    const gsf__map_fill* job = (const gsf__map_fill*)arg;
+    const int64_t edge = job->pad * job->channels, count = job->width * job->channels;
+    const float* x = job->x + (int64_t)row * count;
+    float* out = job->out + (int64_t)row * (count + 2 * edge);
+    (void)worker;
+    memset(out, 0, (size_t)edge * sizeof(float));
+    memset(out + edge + count, 0, (size_t)edge * sizeof(float));
+    out += edge;
+    if (!job->rectify) memcpy(out, x, (size_t)count * sizeof(float));
+    else for (int64_t i = 0; i < count; i++) out[i] = x[i] < 0.0f ? 0.0f : x[i]; // a NaN remains
+}
+
+// y (its data and sizes) = the convolution of x; fails if the kernel does not fit.
+static gsf_result gsf__map_convolve(gsf__maps* maps, const gsf__map_conv* c, const gsf__map* x, gsf__map* y) {
+    const gsf_nn_tensor* w = c->layer->weight;
+    gsf__conv_layer layer = {w, c->layer->bias, w->shape[1], w->shape[0], 1, w->shape[2]};
+    const int64_t across = x->width + 2 * c->pad, bordered = x->height * across * layer.in;
+    float* memory = (float*)gsf__nn_scratch(maps->ctx, &maps->conv,
+                                            ((size_t)gsf__conv_packed(&layer) + (size_t)bordered) * sizeof(float));
+    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
+    gsf__conv_job job;
+    gsf__map_fill fill = {x->data, memory, x->width, layer.in, c->pad, c->rectify};
+    gsf__conv_pack(maps->ctx, &layer, memory + bordered);
+    memset(&job, 0, sizeof job);
+    job.kernels = gsf__conv_kernels_of(maps->ctx->cpu_level);
+    job.in[0] = memory;
+    job.in_height = x->height;
+    job.in_stride = across * layer.in;
+    job.step = c->stride * layer.in;
+    job.kt = 1;
+    job.kh = layer.kernel;
+    job.k = layer.kernel * layer.in;
+    job.stride = c->stride;
+    job.pad = c->pad;
+    job.packed = memory + bordered;
+    job.panel = gsf__conv_panel(&layer);
+    job.height = y->height;
+    job.width = y->width;
+    job.outputs = layer.out;
+    job.ldo = y->channels;
+    job.out_row = job.width * job.ldo;
+    job.groups = 1;
+    for (int64_t i = 0; i < x->images; i++, fill.x += x->height * x->width * layer.in) {
+        gsf__parallel_for(maps->ctx, (size_t)x->height, gsf__map_fill_row, &fill);
+        job.out = y->data + i * y->height * y->width * y->channels + c->first;
+        gsf__conv_frame(maps->ctx, &job, NULL);
+    }
+    return GSF_OK;
+}
+
+// Convolves the current map into a new one, which becomes the current one.
+static gsf_result gsf__map_conv_next(gsf__maps* maps, const gsf__map_conv* c) {
+    const gsf_nn_tensor* w = c->layer->weight;
+    const int64_t high = maps->now.height + 2 * c->pad - w->shape[2], wide = maps->now.width + 2 * c->pad - w->shape[2];
+    gsf__map y = {NULL, maps->now.images, high / c->stride + 1, wide / c->stride + 1, w->shape[0]};
+    if (high < 0 || wide < 0)
+        return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "%s: %lld x %lld values are too few", w->name,
+                        (long long)maps->now.width, (long long)maps->now.height);
+    GSF__TRY(gsf__map_make(maps, &y));
+    GSF__TRY(gsf__map_convolve(maps, c, &maps->now, &y));
+    gsf__map_use(maps, &y);
+    return gsf__check_cancel(maps->ctx);
+}
+
+// ---- metrics: LPIPS
+
+/* Learned perceptual image patch similarity, version 0.1 (Zhang et al. 2018; github.com/richzhang/PerceptualSimilarity,
+   lpips/lpips.py): both images go through the convolutions of a classifier. After some of its layers, the taps, the features
+   of each pixel are divided by their norm, and the squared differences are weighted by channel. The distance is the sum over
+   taps of the mean over pixels. The networks are tables; ReLU follows every convolution and is applied where its result is
+   used (it may move behind a max pool). */
+
+typedef enum gsf__lpips_form { GSF__LPIPS_END = 0, GSF__LPIPS_CONV, GSF__LPIPS_POOL, GSF__LPIPS_FIRE } gsf__lpips_form;
+
+typedef struct gsf__lpips_step {
+    gsf__lpips_form form;
+    int index;               // in torchvision's `features`
+    int kernel, stride, pad; // pool: a stride of 2, rounded up where `pad` is set
+    int tap;
+} gsf__lpips_step;
+
+#define GSF_C(index, kernel, stride, pad, tap) {GSF__LPIPS_CONV, index, kernel, stride, pad, tap}
+#define GSF_P(kernel, up) {GSF__LPIPS_POOL, 0, kernel, 2, up, 0}
+#define GSF_F(index, tap) {GSF__LPIPS_FIRE, index, 0, 1, 0, tap}
+static const gsf__lpips_step gsf__lpips_alex[] = {
+    GSF_C(0, 11, 4, 2, 1), GSF_P(3, 0), GSF_C(3, 5, 1, 2, 1), GSF_P(3, 0), GSF_C(6, 3, 1, 1, 1), GSF_C(8, 3, 1, 1, 1),
+    GSF_C(10, 3, 1, 1, 1), {GSF__LPIPS_END, 0, 0, 0, 0, 0},
+};
+static const gsf__lpips_step gsf__lpips_vgg[] = {
+    GSF_C(0, 3, 1, 1, 0), GSF_C(2, 3, 1, 1, 1), GSF_P(2, 0), GSF_C(5, 3, 1, 1, 0), GSF_C(7, 3, 1, 1, 1), GSF_P(2, 0),
+    GSF_C(10, 3, 1, 1, 0), GSF_C(12, 3, 1, 1, 0), GSF_C(14, 3, 1, 1, 1), GSF_P(2, 0), GSF_C(17, 3, 1, 1, 0),
+    GSF_C(19, 3, 1, 1, 0), GSF_C(21, 3, 1, 1, 1), GSF_P(2, 0), GSF_C(24, 3, 1, 1, 0), GSF_C(26, 3, 1, 1, 0),
+    GSF_C(28, 3, 1, 1, 1), {GSF__LPIPS_END, 0, 0, 0, 0, 0},
+};
+static const gsf__lpips_step gsf__lpips_squeeze[] = { // SqueezeNet 1.1
+    GSF_C(0, 3, 2, 0, 1), GSF_P(3, 1), GSF_F(3, 0), GSF_F(4, 1), GSF_P(3, 1), GSF_F(6, 0), GSF_F(7, 1), GSF_P(3, 1),
+    GSF_F(9, 1), GSF_F(10, 1), GSF_F(11, 1), GSF_F(12, 1), {GSF__LPIPS_END, 0, 0, 0, 0, 0},
+};
+#undef GSF_C
+#undef GSF_P
+#undef GSF_F
+
+static const struct {
+    const char *name, *backbone, *heads; // files
+    const gsf__lpips_step* steps;
+} gsf__lpips_nets[] = {
+    {"LPIPS (AlexNet)", "alexnet-owt-7be5be79", "alex", gsf__lpips_alex},
+    {"LPIPS (VGG16)", "vgg16-397923af", "vgg", gsf__lpips_vgg},
+    {"LPIPS (SqueezeNet)", "squeezenet1_1-b8a52dc0", "squeeze", gsf__lpips_squeeze},
+};
+
+enum { GSF__LPIPS_STEPS = 17, GSF__LPIPS_TAPS = 7 };
+
+typedef struct gsf__lpips {
+    gsf_nn_weights backbone, heads;
+    gsf__nn_layer layers[GSF__LPIPS_STEPS][3]; // a convolution; fire: squeeze, expand1x1, expand3x3
+    const gsf_nn_tensor* taps[GSF__LPIPS_TAPS];
+    gsf__maps maps;
+    double* partial; // (rows of the largest map)
+    float* vectors;  // weights of a tap
+    size_t partial_room, vectors_room;
+} gsf__lpips;
+
+static gsf_result gsf__lpips_need(gsf__nn_loader* loader, int index, const char* part, int64_t in, int64_t kernel,
+                                  gsf__nn_layer* out) {
+    const int64_t shape[4] = {-1, in, kernel, kernel};
+    GSF__TRY(gsf__nn_need(loader, &out->weight, 4, shape, "features.%d%s.weight", index, part));
+    if (out->weight->shape[0] < 1)
+        return gsf_fail(loader->ctx, GSF_ERROR_FORMAT, "%s: tensor %s is empty", loader->weights->name, out->weight->name);
+    return gsf__nn_need(loader, &out->bias, 1, out->weight->shape, "features.%d%s.bias", index, part);
+}
+
+// Looks up the tensors of a network; *channels follows the channels from step to step.
+static gsf_result gsf__lpips_bind(gsf__nn_loader* backbone, gsf__nn_loader* heads, const gsf__lpips_step* steps,
+                                  gsf__lpips* net) {
+    int64_t channels = 3;
+    int taps = 0;
+    for (int i = 0; steps[i].form; i++) {
+        const gsf__lpips_step* s = &steps[i];
+        gsf__nn_layer* layers = net->layers[i];
+        if (s->form == GSF__LPIPS_CONV) {
+            GSF__TRY(gsf__lpips_need(backbone, s->index, "", channels, s->kernel, &layers[0]));
+            channels = layers[0].weight->shape[0];
+        } else if (s->form == GSF__LPIPS_FIRE) {
+            GSF__TRY(gsf__lpips_need(backbone, s->index, ".squeeze", channels, 1, &layers[0]));
+            GSF__TRY(gsf__lpips_need(backbone, s->index, ".expand1x1", layers[0].weight->shape[0], 1, &layers[1]));
+            GSF__TRY(gsf__lpips_need(backbone, s->index, ".expand3x3", layers[0].weight->shape[0], 3, &layers[2]));
+            channels = layers[1].weight->shape[0] + layers[2].weight->shape[0];
+        }
+        const int64_t shape[4] = {1, channels, 1, 1};
+        if (s->tap) GSF__TRY(gsf__nn_need(heads, &net->taps[taps], 4, shape, "lin%d.model.1.weight", taps));
+        taps += s->tap;
+    }
+    gsf__nn_ignore(backbone, "classifier.");
+    return GSF_OK;
+}
+
+static gsf_result gsf__lpips_open(gsf_context* ctx, const char* models, int kind, gsf__lpips* net) {
+    gsf__nn_loader backbone, heads;
+    GSF__TRY(gsf_nn_load_weights(ctx, models, gsf__lpips_nets[kind].backbone, &net->backbone));
+    GSF__TRY(gsf_nn_load_weights(ctx, models, gsf__lpips_nets[kind].heads, &net->heads));
+    GSF__TRY(gsf__nn_begin_loading(ctx, &net->backbone, &backbone));
+    gsf_result result = gsf__nn_begin_loading(ctx, &net->heads, &heads);
+    if (!result) {
+        result = gsf__lpips_bind(&backbone, &heads, gsf__lpips_nets[kind].steps, net);
+        result = gsf__nn_end_loading(&heads, result);
+    }
+    return gsf__nn_end_loading(&backbone, result);
+}
+
+static void gsf__lpips_close(gsf_context* ctx, gsf__lpips* net) {
+    gsf_nn_destroy_weights(ctx, &net->backbone);
+    gsf_nn_destroy_weights(ctx, &net->heads);
+    gsf__destroy_maps(ctx, &net->maps);
+    gsf_free(ctx, net->partial);
+    gsf_free(ctx, net->vectors);
+}
+
+typedef struct gsf__map_pool_job {
+    const gsf__map *x, *y;
+    int64_t kernel;
+} gsf__map_pool_job;
+
+static void gsf__map_pool_row(void* arg, size_t row, int32_t worker) { // maxima of windows, 2 apart, cut at the border
+    const gsf__map_pool_job* job = (const gsf__map_pool_job*)arg;
+    const gsf__map *x = job->x, *y = job->y;
+    const int64_t c = x->channels, image = (int64_t)row / y->height, y0 = (int64_t)row % y->height * 2;
+    const int64_t y1 = gsf__least(y0 + job->kernel, x->height);
+    (void)worker;
+    for (int64_t column = 0; column < y->width; column++) {
+        float* out = y->data + ((int64_t)row * y->width + column) * c;
+        const int64_t x0 = column * 2, x1 = gsf__least(x0 + job->kernel, x->width);
+        for (int64_t v = y0; v < y1; v++)
+            for (int64_t u = x0; u < x1; u++) {
+                const float* from = x->data + ((image * x->height + v) * x->width + u) * c;
+                const int first = v == y0 && u == x0;
+                for (int64_t i = 0; i < c; i++) out[i] = first || !(from[i] <= out[i]) ? from[i] : out[i];
+            }
+    }
+}
+
+// Windows of a pool along one side; with `up` the last may be cut, but as in PyTorch none begins outside.
+static int64_t gsf__pool_size(int64_t size, int64_t kernel, int up) {
+    const int64_t past = size - kernel + up;
+    return past < 0 ? 0 : past / 2 * 2 < size ? past / 2 + 1 : past / 2;
+}
+
+static gsf_result gsf__map_pool_next(gsf__maps* maps, int64_t kernel, int up) {
+    const gsf__map x = maps->now;
+    gsf__map y = {NULL, x.images, gsf__pool_size(x.height, kernel, up), gsf__pool_size(x.width, kernel, up), x.channels};
+    gsf__map_pool_job job = {&x, &y, kernel};
+    if (y.height < 1 || y.width < 1)
+        return gsf_fail(maps->ctx, GSF_ERROR_DEGENERATE, "max pool: %lld x %lld values are too few", (long long)x.width,
+                        (long long)x.height);
+    GSF__TRY(gsf__map_make(maps, &y));
+    gsf__parallel_for(maps->ctx, (size_t)(y.images * y.height), gsf__map_pool_row, &job);
+    gsf__map_use(maps, &y);
+    return GSF_OK;
+}
+
+// Squeeze by 1 x 1; then 1 x 1 and 3 x 3 side by side.
+static gsf_result gsf__lpips_fire(gsf__maps* maps, const gsf__nn_layer* layers) {
+    const int64_t one = layers[1].weight->shape[0], three = layers[2].weight->shape[0];
+    const gsf__map_conv squeeze = {&layers[0], 1, 0, 1, 0, 0};
+    GSF__TRY(gsf__map_conv_next(maps, &squeeze));
+    const gsf__map_conv expand[2] = {{&layers[1], 1, 0, 1, 0, 0}, {&layers[2], 1, 1, 1, one, 0}};
+    gsf__map y = maps->now;
+    y.channels = one + three;
+    GSF__TRY(gsf__map_make(maps, &y));
+    for (int i = 0; i < 2; i++) GSF__TRY(gsf__map_convolve(maps, &expand[i], &maps->now, &y));
+    gsf__map_use(maps, &y);
+    return gsf__check_cancel(maps->ctx);
+}
+
+typedef struct gsf__lpips_tap_job {
+    const gsf__map* map; // of two images
+    const float* weights;
+    double* partial;     // (height)
+} gsf__lpips_tap_job;
+
+static double gsf__lpips_norm(const float* x, int64_t count) { // of the rectified features
+    double sums[4] = {0.0, 0.0, 0.0, 0.0};
+    for (int64_t i = 0; i < count; i++) {
+        const double v = x[i] < 0.0f ? 0.0 : (double)x[i];
+        sums[i & 3] += v * v;
+    }
+    return sqrt(sums[0] + sums[1] + (sums[2] + sums[3])) + 1e-10;
+}
+
+static void gsf__lpips_tap_row(void* arg, size_t row, int32_t worker) {
+    const gsf__lpips_tap_job* job = (const gsf__lpips_tap_job*)arg;
+    const int64_t c = job->map->channels, width = job->map->width;
+    const float *a = job->map->data + (int64_t)row * width * c, *b = a + job->map->height * width * c;
+    double sum = 0.0;
+    (void)worker;
+    for (int64_t x = 0; x < width; x++, a += c, b += c) {
+        const double of_a = 1.0 / gsf__lpips_norm(a, c), of_b = 1.0 / gsf__lpips_norm(b, c);
+        double sums[4] = {0.0, 0.0, 0.0, 0.0};
+        for (int64_t i = 0; i < c; i++) {
+            const double d = (a[i] < 0.0f ? 0.0 : (double)a[i]) * of_a - (b[i] < 0.0f ? 0.0 : (double)b[i]) * of_b;
+            sums[i & 3] += (double)job->weights[i] * d * d;
+        }
+        sum += sums[0] + sums[1] + (sums[2] + sums[3]);
+    }
+    job->partial[row] = sum;
+}
+
+// The weighted distance of the current map's two images.
+static gsf_result gsf__lpips_measure_tap(gsf__lpips* net, const gsf_nn_tensor* weight, double* out) {
+    gsf_context* ctx = net->maps.ctx;
+    const gsf__map* map = &net->maps.now;
+    GSF__TRY(gsf__reserve(ctx, (void**)&net->partial, &net->partial_room, 0, (size_t)map->height, sizeof(double)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&net->vectors, &net->vectors_room, 0, (size_t)weight->count, sizeof(float)));
+    gsf_nn_convert_tensor(weight, 0, weight->count, net->vectors);
+    gsf__lpips_tap_job job = {map, net->vectors, net->partial};
+    gsf__parallel_for(ctx, (size_t)map->height, gsf__lpips_tap_row, &job);
+    double sum = 0.0;
+    for (int64_t i = 0; i < map->height; i++) sum += net->partial[i];
+    *out = sum / ((double)map->height * (double)map->width);
+    return GSF_OK;
+}
+
+// Stores an image of [0,1], scaled to [-1,1] unless `raw`, and normalised as the classifiers were trained.
+static gsf_result gsf__lpips_store(gsf_context* ctx, const gsf_image* image, int raw, float* out) {
+    static const double shift[3] = {-0.030, -0.088, -0.188}, scale[3] = {0.458, 0.448, 0.450};
+    gsf_image packed = gsf_wrap_image(out, GSF_F32, image->width, image->height, 3);
+    GSF__TRY(gsf_convert_image(ctx, image, &packed));
+    for (int64_t i = 0; i < image->width * image->height; i++, out += 3)
+        for (int c = 0; c < 3; c++)
+            out[c] = (float)(((raw ? (double)out[c] : 2.0 * (double)out[c] - 1.0) - shift[c]) / scale[c]);
+    return GSF_OK;
+}
+
+static gsf_result gsf__lpips_measure(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* a, const gsf_image* b,
+                                     double* out) {
+    gsf__lpips* net = (gsf__lpips*)metric->state;
+    gsf__maps* maps = &net->maps;
+    const gsf__lpips_step* steps = gsf__lpips_nets[metric->kind].steps;
+    gsf__map pair = {NULL, 2, a->height, a->width, 3};
+    float terms[GSF__LPIPS_TAPS];
+    int taps = 0;
+    *out = 0.0;
+    maps->ctx = ctx;
+    GSF__TRY(gsf__map_make(maps, &pair));
+    GSF__TRY(gsf__lpips_store(ctx, a, metric->raw, pair.data));
+    GSF__TRY(gsf__lpips_store(ctx, b, metric->raw, pair.data + a->height * a->width * 3));
+    gsf__map_use(maps, &pair);
+    for (int i = 0; steps[i].form; i++) {
+        const gsf__lpips_step* s = &steps[i];
+        const gsf__map_conv conv = {&net->layers[i][0], s->stride, s->pad, i > 0, 0, 0};
+        double term;
+        if (s->form == GSF__LPIPS_CONV) GSF__TRY(gsf__map_conv_next(maps, &conv));
+        else if (s->form == GSF__LPIPS_POOL) GSF__TRY(gsf__map_pool_next(maps, s->kernel, s->pad));
+        else GSF__TRY(gsf__lpips_fire(maps, net->layers[i]));
+        if (!s->tap) continue;
+        GSF__TRY(gsf__lpips_measure_tap(net, net->taps[taps], &term));
+        if (metric->_tap)
+            for (int k = 0; k < 2; k++)
+                metric->_tap->fn(metric->_tap->user, "features", 2 * taps + k,
+                                 maps->now.data + k * maps->now.height * maps->now.width * maps->now.channels,
+                                 maps->now.height * maps->now.width, maps->now.channels);
+        terms[taps++] = (float)term;
+        *out += term;
+    }
+    if (metric->_tap) metric->_tap->fn(metric->_tap->user, "terms", 0, terms, 1, taps);
+    return GSF_OK;
+}
+
+// ---- metrics: streams of frames
+
+static gsf_result gsf__metric_open(gsf_context* ctx, gsf_nn_metric* metric) {
+    if (metric->state) return GSF_OK;
+    if ((int)metric->kind < 0 || metric->kind > GSF_NN_METRIC_LPIPS_SQUEEZE || !metric->models)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "metric %d: no such kind, or no folder of models", (int)metric->kind);
+    metric->state = gsf_alloc_zeroed(ctx, 1, sizeof(gsf__lpips));
+    if (!metric->state) return GSF_ERROR_OUT_OF_MEMORY;
+    const gsf_result result = gsf__lpips_open(ctx, metric->models, (int)metric->kind, (gsf__lpips*)metric->state);
+    if (result) {
+        gsf__lpips_close(ctx, (gsf__lpips*)metric->state);
+        gsf_free(ctx, metric->state);
+        metric->state = NULL;
+    }
+    return result;
+}
+
+GSF_API gsf_result gsf_nn_measure_frame(gsf_context* ctx, gsf_nn_metric* metric, const gsf_image* frame,
+                                        const gsf_image* reference) {
+    double value;
+    GSF__TRY(gsf__metric_open(ctx, metric));
+    if (!frame) return GSF_OK;
+    const char* name = gsf__lpips_nets[metric->kind].name;
+    if (!reference || frame->channels != 3 || reference->channels != 3 || frame->width != reference->width ||
+        frame->height != reference->height)
+        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: two images of one size with three channels are needed", name);
+    GSF__TRY(gsf__lpips_measure(ctx, metric, frame, reference, &value));
+    if (!(fabs(value) <= DBL_MAX)) return gsf_fail(ctx, GSF_ERROR_NUMERIC, "%s: the distance is %g", name, value);
+    metric->last = value;
+    metric->score += (value - metric->score) / (double)++metric->count;
+    return GSF_OK;
+}
+
+GSF_API void gsf_nn_destroy_metric(gsf_context* ctx, gsf_nn_metric* metric) {
+    if (metric->state) gsf__lpips_close(ctx, (gsf__lpips*)metric->state);
+    gsf_free(ctx, metric->state);
+    memset(metric, 0, sizeof *metric);
 }
 
 // ---- >>nn training --------------------------------------------------------------

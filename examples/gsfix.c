@@ -123,7 +123,9 @@ static const option_spec option_specs[] = {
     {"--refs", TEXT, AT(refs), 0, 0, "A.png,B.png", "restore",
      "photos that guide the repair (default FRAMES_DIR/refs/)"},
     {"--which", TEXT, AT(which), 0, 0, "NAME,...", "metrics",
-     "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage (default psnr,ssim_3dgs)"},
+     "psnr, ssim_3dgs, ssim_torchmetrics, ssim_skimage; with --models lpips_alex, lpips_vgg, lpips_squeeze on images in\n"
+     "[-1,1], lpips_alex_raw ... on images in [0,1] (default psnr,ssim_3dgs)"},
+    {"--models", TEXT, AT(models), 0, 0, "DIR", "metrics", "folder with the networks' weights, named as published"},
     {"--model", TEXT, AT(model), 0, 0, "ALL.ply", "masks", "splats of a good model, for example one trained on all views"},
     {"--threads", INT, AT(threads), 1, 1024, "N", ALL,
      "number of workers (default: all cores); results are bit-identical for any number"},
@@ -908,14 +910,31 @@ static int run_path(gsfix_app* app) {
 
 // ---- metrics ---------------------------------------------------------------------
 
-static const char* const metric_names[] = {"psnr", "ssim_3dgs", "ssim_torchmetrics", "ssim_skimage"};
-enum { METRIC_COUNT = 4 };
+static const char* const metric_names[] = {"psnr", "ssim_3dgs", "ssim_torchmetrics", "ssim_skimage", "lpips_alex", "lpips_vgg",
+                                           "lpips_squeeze", "lpips_alex_raw", "lpips_vgg_raw", "lpips_squeeze_raw"};
+enum { METRIC_COUNT = 10, PIXEL_METRICS = 4, LPIPS_NETS = 3 };
 
-static gsf_result measure(gsf_context* ctx, int metric, const gsf_image* a, const gsf_image* b, const gsf_image* mask,
-                          double* out) {
+static gsf_result measure(gsf_context* ctx, int metric, gsf_nn_metric* net, const gsf_image* a, const gsf_image* b,
+                          const gsf_image* mask, double* out) {
     if (metric == 0) return gsf_measure_psnr(ctx, a, b, mask, out);
     static const gsf_ssim_kind kinds[] = {GSF_SSIM_3DGS, GSF_SSIM_TORCHMETRICS, GSF_SSIM_SKIMAGE};
-    return gsf_measure_ssim(ctx, kinds[metric - 1], a, b, mask, out);
+    if (metric < PIXEL_METRICS) return gsf_measure_ssim(ctx, kinds[metric - 1], a, b, mask, out);
+    const gsf_result result = gsf_nn_measure_frame(ctx, net, a, b);
+    *out = net->last;
+    return result;
+}
+
+// Opens the networks of the wanted metrics, so that a missing file is reported before any work.
+static gsf_result open_networks(gsfix_app* app, const int* wanted, gsf_nn_metric* nets) {
+    gsf_result result = GSF_OK;
+    for (int m = PIXEL_METRICS; m < METRIC_COUNT && result == GSF_OK; m++) {
+        if (!wanted[m]) continue;
+        nets[m].kind = (gsf_nn_metric_kind)(GSF_NN_METRIC_LPIPS_ALEX + (m - PIXEL_METRICS) % LPIPS_NETS);
+        nets[m].raw = m >= PIXEL_METRICS + LPIPS_NETS;
+        nets[m].models = app->o.models;
+        result = gsf_nn_measure_frame(&app->ctx, &nets[m], NULL, NULL);
+    }
+    return result;
 }
 
 typedef struct metric_sums { // [0]: over all pixels, [1]: over those of the masks
@@ -937,8 +956,8 @@ static gsf_result load_pair_mask(gsfix_app* app, const char* stem, gsf_image* ma
     return result;
 }
 
-static gsf_result compare_pair(gsfix_app* app, const int* wanted, const char* stem, const char* left, const char* right,
-                               metric_sums* total) {
+static gsf_result compare_pair(gsfix_app* app, const int* wanted, gsf_nn_metric* nets, const char* stem, const char* left,
+                               const char* right, metric_sums* total) {
     gsf_context* ctx = &app->ctx;
     gsf_image x = {0}, y = {0}, mask = {0};
     char line[256] = "";
@@ -957,8 +976,8 @@ static gsf_result compare_pair(gsfix_app* app, const int* wanted, const char* st
         for (int m = 0; m < METRIC_COUNT && result == GSF_OK; m++) {
             double value = 0.0;
             gsfix_path name;
-            if (!wanted[m]) continue;
-            result = measure(ctx, m, &x, &y, seen ? &mask : NULL, &value);
+            if (!wanted[m] || (seen && m >= PIXEL_METRICS)) continue;
+            result = measure(ctx, m, &nets[m], &x, &y, seen ? &mask : NULL, &value);
             if (result != GSF_OK) break;
             total->sums[seen][m] += value;
             gsfix_json_number(ctx, &app->json, metric_name(m, seen, &name), value);
@@ -983,7 +1002,7 @@ static void print_means(gsfix_app* app, const int* wanted, const metric_sums* to
         for (int m = 0; m < METRIC_COUNT; m++) {
             const double mean = total->sums[seen][m] / (double)total->pairs[seen];
             gsfix_path name;
-            if (!wanted[m]) continue;
+            if (!wanted[m] || (seen && m >= PIXEL_METRICS)) continue;
             gsfix_json_number(&app->ctx, &app->json, metric_name(m, seen, &name), mean);
             gsfix_print(app, "  %-22s %.5f", name.s, mean);
         }
@@ -995,7 +1014,9 @@ static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
     const char *a = app->o.inputs[0], *b = app->o.inputs[1];
     gsfix_names left = {0}, right = {0};
     metric_sums total = {0};
-    gsf_result result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
+    gsf_nn_metric nets[METRIC_COUNT] = {0};
+    gsf_result result = open_networks(app, wanted, nets);
+    if (result == GSF_OK) result = gsfix_list(ctx, a, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &left);
     if (result == GSF_OK) result = gsfix_list(ctx, b, ".png.jpg.jpeg.bmp.tga.ppm.pgm", &right);
     gsfix_json_begin(ctx, &app->json, "per_image", '[');
     for (size_t i = 0; i < left.count && result == GSF_OK; i++) {
@@ -1003,7 +1024,7 @@ static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
         size_t k = 0;
         while (k < right.count && strcmp(gsfix_stem(right.names[k]).s, stem.s) != 0) k++;
         if (k < right.count)
-            result = compare_pair(app, wanted, stem.s, gsfix_pathf("%s/%s", a, left.names[i]).s,
+            result = compare_pair(app, wanted, nets, stem.s, gsfix_pathf("%s/%s", a, left.names[i]).s,
                                   gsfix_pathf("%s/%s", b, right.names[k]).s, &total);
     }
     gsfix_json_end(ctx, &app->json, ']');
@@ -1016,23 +1037,27 @@ static gsf_result compare_folders(gsfix_app* app, const int* wanted) {
         print_means(app, wanted, &total);
         if (unpaired) gsfix_note(app, "note: %zu pictures have no partner", unpaired);
     }
+    for (int m = PIXEL_METRICS; m < METRIC_COUNT; m++) gsf_nn_destroy_metric(ctx, &nets[m]);
     gsfix_free_names(ctx, &left);
     gsfix_free_names(ctx, &right);
     return result;
 }
 
 static int run_metrics(gsfix_app* app) {
-    int wanted[METRIC_COUNT] = {0};
+    int wanted[METRIC_COUNT] = {0}, nets = 0;
     const char* which = app->o.which ? app->o.which : "psnr,ssim_3dgs";
     for (const char* p = which;; p++) {
         const size_t n = strcspn(p, ",");
         int m = 0;
         while (m < METRIC_COUNT && !(strlen(metric_names[m]) == n && strncmp(metric_names[m], p, n) == 0)) m++;
         if (m == METRIC_COUNT) return gsfix_misused(app, "the metric \"%.*s\" is not in this version", (int)n, p);
+        if (m >= PIXEL_METRICS && !app->o.models) return gsfix_misused(app, "%s needs --models", metric_names[m]);
         wanted[m] = 1;
+        nets += m >= PIXEL_METRICS;
         p += n;
         if (!*p) break;
     }
+    if (app->o.models && !nets) return gsfix_misused(app, "--models: no metric of --which needs it");
     return compare_folders(app, wanted) == GSF_OK ? 0 : gsfix_failed(app);
 }
 

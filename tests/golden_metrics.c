@@ -1,8 +1,10 @@
-// PSNR and SSIM against golden/metrics (float64 runs of the reference implementations) and against direct loops in
-// double precision.
+// PSNR, SSIM and LPIPS against golden/metrics (float64 runs of the reference implementations), PSNR and SSIM also against
+// direct loops in double precision. GSF_TEST_VERBOSE=1 prints every value of LPIPS.
 #include "gsfixer.h"
 #include "test.h"
 #include "test_hooks.h"
+
+#include "metrics_lpips.h"
 
 typedef struct pair { // planar u8 views of the golden tensors, and packed f32 copies (value / 255)
     uint8_t *a8, *b8;
@@ -270,20 +272,28 @@ int main(void) {
     test_context_zero(&ctx);
     CHECK_OK(&ctx, gsf_init_context(&ctx));
     test_tensors file = test_open_tensors(test_golden("metrics/pairs.safetensors"));
+    test_tensors features = test_open_tensors(test_golden("metrics/lpips_small_features.safetensors"));
+    lpips_net nets[LPIPS_NETS] = {0};
     size_t size;
     char* text = test_read_file(test_golden("metrics/expected.json"), &size);
     gsf_json json;
     if (!CHECK_OK(&ctx, gsf_parse_json(&ctx, "expected.json", text, size, &json))) return test_report();
     CHECK(json.values[0].count > 0);
+    if (!lpips_open(&ctx, nets)) return test_report();
     for (uint32_t i = json.values[0].child; i; i = json.values[i].next) {
         pair p = open_pair(&ctx, &file, json.values[i].key);
         check_pair(&ctx, &json, &json.values[i], &p);
         check_masks(&ctx, &p);
+        lpips_check_pair(&ctx, nets, &features, &json, &json.values[i], &p.a, &p.b);
+        if (i == json.values[0].child)
+            for (int k = 0; k < LPIPS_NETS; k++) lpips_check_stream(&ctx, &nets[k], &p.a, &p.b);
         close_pair(&ctx, &p);
     }
     check_determinism(&ctx);
+    lpips_close(&ctx, nets);
     gsf_destroy_json(&ctx, &json);
     test_close_tensors(&file);
+    test_close_tensors(&features);
     free(text);
     return test_report();
 }

@@ -52,6 +52,8 @@ expect 2 "$gsfix" render x.ply --out x
 expect 2 "$gsfix" render x.ply --scene "$scene" --out x --background random
 expect 2 "$gsfix" metrics a b --which lpips
 expect 2 "$gsfix" metrics a b --models m
+expect 2 "$gsfix" metrics a b --which lpips_vgg
+expect 1 "$gsfix" metrics a b --which lpips_vgg --models nothing_here
 expect 2 "$gsfix" path "$scene" --out x.json --frames 10 --windows 3
 expect 2 "$gsfix" info "$scene" --out x
 expect 2 "$gsfix" fix "$scene" --out x --also ply
