@@ -656,6 +656,41 @@ GSF__SHARED gsf_result gsf__reserve(gsf_context* ctx, void** array, size_t* capa
     return GSF_OK;
 }
 
+// Arrays that are freed together. gsf__arena_alloc returns NULL when out of memory and sets `failed`, so that one check after the
+// last of them is enough.
+typedef struct gsf__arena {
+    gsf_context* ctx;
+    void* last; // the array taken last; in front of each is a pointer to the one before
+    int failed;
+} gsf__arena;
+
+enum { GSF__ARENA_HEAD = 64 }; // keeps the alignment
+
+GSF__SHARED void* gsf__arena_alloc(gsf__arena* arena, size_t count, size_t size) {
+    const size_t most = SIZE_MAX - GSF__ARENA_HEAD;
+    size_t bytes;
+    if (!gsf__mul_size(count, size, &bytes) || bytes > most) bytes = most; // which gsf_alloc refuses
+    char* block = (char*)gsf_alloc(arena->ctx, 1, bytes + GSF__ARENA_HEAD);
+    arena->failed |= !block;
+    if (!block) return NULL;
+    memcpy(block, &arena->last, sizeof arena->last);
+    return arena->last = block + GSF__ARENA_HEAD;
+}
+
+GSF__SHARED void* gsf__arena_alloc_zeroed(gsf__arena* arena, size_t count, size_t size) {
+    void* block = gsf__arena_alloc(arena, count, size);
+    if (block) memset(block, 0, count * size);
+    return block;
+}
+
+GSF__SHARED void gsf__arena_free(gsf__arena* arena) {
+    while (arena->last) {
+        char* block = (char*)arena->last - GSF__ARENA_HEAD;
+        memcpy(&arena->last, block, sizeof arena->last);
+        gsf_free(arena->ctx, block);
+    }
+}
+
 GSF__SHARED void gsf__for_serial(void* user, size_t chunk_count, gsf_chunk_fn body, void* arg) {
     (void)user;
     for (size_t i = 0; i < chunk_count; i++) body(arg, i, 0);
@@ -680,6 +715,19 @@ GSF__SHARED uint64_t gsf__load_le(const void* data, int bytes) {
 GSF__SHARED void gsf__store_le(void* data, uint64_t value, int bytes) {
     unsigned char* p = (unsigned char*)data;
     for (int i = 0; i < bytes; i++, value >>= 8) p[i] = (unsigned char)(value & 255u);
+}
+
+GSF__SHARED double gsf__load_f64(const void* data) { // little-endian
+    const uint64_t bits = gsf__load_le(data, 8);
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+GSF__SHARED void gsf__store_f64(void* data, double value) {
+    uint64_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    gsf__store_le(data, bits, 8);
 }
 
 // CRC-32 of gzip and PNG (reflected polynomial 0xedb88320), continued from `crc`, which starts as 0. Inputs of 32 KiB and
@@ -1041,6 +1089,13 @@ GSF__SHARED int gsf__io_is_plain(const gsf_context* ctx) {
 #define GSF__V_INLINE GSF__V(GSF__V_INLINE)        // begins the definition of a function to be inlined into kernels
 #define GSF__LANES GSF__V(GSF__LANES)
 #define GSF__HALVES GSF__V(GSF__HALVES)
+
+// The copy of a kernel, or of a constant, for a CPU level. Kernels with an AVX-512 copy have a table of their own.
+#if GSF__X86
+#define GSF__KERNEL_OF(level, name) ((level) >= GSF_CPU_AVX2 ? name##_avx2 : name##_scalar)
+#else
+#define GSF__KERNEL_OF(level, name) ((void)(level), name##_scalar)
+#endif
 
 #define gsf__vf GSF__V(gsf__vf)
 #define gsf__vi GSF__V(gsf__vi)
@@ -3850,7 +3905,7 @@ enum { GSF__SSIM_MAX_TAPS = 11, GSF__SSIM_ROWS = 48, GSF__SSIM_QUANTITIES = 5 };
 
 // out[i] = sum over t of weights[t] * rows[t][i], t ascending. The AVX2 version does the same operations in the same order,
 // four i at a time.
-static void gsf__ssim_blur_ref(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
+static void gsf__ssim_blur_scalar(double* out, const double* const* rows, const double* weights, int taps, size_t n) {
     for (size_t i = 0; i < n; i++) {
         double sum = weights[0] * rows[0][i];
         for (int t = 1; t < taps; t++) sum += weights[t] * rows[t][i];
@@ -4019,10 +4074,7 @@ GSF_API gsf_result gsf_measure_ssim(gsf_context* ctx, gsf_ssim_kind kind, const 
     if (a->width < least || a->height < least)
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "ssim: %lld x %lld is smaller than the window", (long long)a->width,
                         (long long)a->height);
-    job.blur = gsf__ssim_blur_ref;
-#if GSF__X86
-    if (ctx->cpu_level >= GSF_CPU_AVX2) job.blur = gsf__ssim_blur_avx2;
-#endif
+    job.blur = GSF__KERNEL_OF(ctx->cpu_level, gsf__ssim_blur);
     job.chunks_per_channel = (size_t)((a->height - 2 * job.inset + GSF__SSIM_ROWS - 1) / GSF__SSIM_ROWS);
     size_t chunks = 0;
     if (!gsf__mul_size(job.chunks_per_channel, (size_t)a->channels, &chunks) ||

@@ -788,6 +788,18 @@ GSF_API void gsf_splat_destroy(gsf_context* ctx, gsf_splats* splats) {
     memset(splats, 0, sizeof *splats);
 }
 
+typedef struct gsf__column { char* data; size_t row; } gsf__column; // an array with `row` bytes per splat
+
+enum { GSF__SPLAT_COLUMNS = 6 };
+
+static void gsf__splat_columns(const gsf_splats* splats, gsf__column out[GSF__SPLAT_COLUMNS]) { // ids last, may be NULL
+    const gsf__column columns[GSF__SPLAT_COLUMNS] = {
+        {(char*)splats->means, 12}, {(char*)splats->log_scales, 12}, {(char*)splats->quats, 16},
+        {(char*)splats->opacity_logits, 4}, {(char*)splats->sh, 12 * (size_t)gsf_splat_count_sh(splats->sh_degree)},
+        {(char*)splats->ids, 4}};
+    memcpy(out, columns, sizeof columns);
+}
+
 // ---- >>order -------------------------------------------------------------------
 
 // Sorts n keys by their upper 32 bits. The sort is stable and the lower 32 bits must ascend on input, so ties end up
@@ -871,22 +883,23 @@ static void gsf__reorder(void* rows, size_t row_size, const uint64_t* order, siz
 }
 
 GSF_API gsf_result gsf_splat_sort(gsf_context* ctx, gsf_splats* splats) {
-    const size_t count = splats->count, sh_row = 3 * (size_t)gsf_splat_count_sh(splats->sh_degree) * sizeof(float);
+    const size_t count = splats->count;
     if (count > UINT32_MAX) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "sort: %zu splats are too many", count);
-    uint64_t* keys = (uint64_t*)gsf_alloc(ctx, count ? count : 1, 2 * sizeof(uint64_t));
-    void* spare = gsf_alloc(ctx, count ? count : 1, sh_row > 16 ? sh_row : 16);
-    const gsf_result result = keys && spare ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    gsf__column columns[GSF__SPLAT_COLUMNS];
+    size_t widest = 0;
+    gsf__splat_columns(splats, columns);
+    for (int k = 0; k < GSF__SPLAT_COLUMNS; k++)
+        if (columns[k].row > widest) widest = columns[k].row;
+    gsf__arena arena = {ctx, NULL, 0};
+    uint64_t* keys = (uint64_t*)gsf__arena_alloc(&arena, count, 2 * sizeof(uint64_t));
+    void* spare = gsf__arena_alloc(&arena, count, widest);
+    const gsf_result result = arena.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
     if (result == GSF_OK && count) {
         const uint64_t* order = gsf__morton_order(splats->means, count, keys, keys + count);
-        gsf__reorder(splats->means, 3 * sizeof(float), order, count, spare);
-        gsf__reorder(splats->log_scales, 3 * sizeof(float), order, count, spare);
-        gsf__reorder(splats->quats, 4 * sizeof(float), order, count, spare);
-        gsf__reorder(splats->opacity_logits, sizeof(float), order, count, spare);
-        gsf__reorder(splats->sh, sh_row, order, count, spare);
-        if (splats->ids) gsf__reorder(splats->ids, sizeof(uint32_t), order, count, spare);
+        for (int k = 0; k < GSF__SPLAT_COLUMNS; k++)
+            if (columns[k].data) gsf__reorder(columns[k].data, columns[k].row, order, count, spare);
     }
-    gsf_free(ctx, keys);
-    gsf_free(ctx, spare);
+    gsf__arena_free(&arena);
     return result;
 }
 
@@ -2480,13 +2493,6 @@ static gsf_result gsf__take_count(gsf_context* ctx, gsf__cursor* c, size_t recor
                         (unsigned long long)count, what);
     *out = (size_t)count;
     return GSF_OK;
-}
-
-static double gsf__load_f64(const unsigned char* p) {
-    const uint64_t bits = gsf__load_le(p, 8);
-    double value;
-    memcpy(&value, &bits, sizeof value);
-    return value;
 }
 
 static gsf_result gsf__cursor_end(gsf_context* ctx, const gsf__cursor* c) {
@@ -4246,6 +4252,7 @@ typedef struct gsf__knn_tree {
     double* points;   // (count,3) in tree order
     uint32_t* rows;   // (count) the caller's row of each point, in tree order
     double* boxes;    // (2^(levels+1) - 1, 6): minimum xyz, maximum xyz
+    gsf__arena arena;
 } gsf__knn_tree;
 
 enum { GSF__KNN_LEAF = 8, GSF__KNN_MAX = 64, GSF__KNN_CHUNK = 1024 };
@@ -4315,18 +4322,12 @@ static void gsf__knn_build_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-static void gsf__knn_destroy(gsf_context* ctx, gsf__knn_tree* tree) {
-    gsf_free(ctx, tree->points);
-    gsf_free(ctx, tree->rows);
-    gsf_free(ctx, tree->boxes);
-    memset(tree, 0, sizeof *tree);
-}
-
 // Builds a tree of those of the `count` points (stride 3) whose byte in `keep` is not zero (NULL: all). Points with a
-// non-finite coordinate are skipped; tree->count is the number of points in the tree.
+// non-finite coordinate are skipped; tree->count is the number of points in the tree. Free tree->arena, also after an error.
 static gsf_result gsf__knn_build(gsf_context* ctx, const double* points, size_t count, const uint8_t* keep,
                                  gsf__knn_tree* tree) {
     memset(tree, 0, sizeof *tree);
+    tree->arena.ctx = ctx;
     if ((uint64_t)count >= UINT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "points: %zu do not fit 32-bit indices", count);
     size_t n = 0;
@@ -4335,13 +4336,10 @@ static gsf_result gsf__knn_build(gsf_context* ctx, const double* points, size_t 
         n += (!keep || keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]);
     }
     while (n >> tree->levels > GSF__KNN_LEAF) tree->levels++;
-    tree->points = (double*)gsf_alloc(ctx, n ? n : 1, 3 * sizeof(double));
-    tree->rows = (uint32_t*)gsf_alloc(ctx, n ? n : 1, sizeof(uint32_t));
-    tree->boxes = (double*)gsf_alloc(ctx, (size_t)2 << tree->levels, 6 * sizeof(double));
-    if (!tree->points || !tree->rows || !tree->boxes) {
-        gsf__knn_destroy(ctx, tree);
-        return GSF_ERROR_OUT_OF_MEMORY;
-    }
+    tree->points = (double*)gsf__arena_alloc(&tree->arena, n, 3 * sizeof(double));
+    tree->rows = (uint32_t*)gsf__arena_alloc(&tree->arena, n, sizeof(uint32_t));
+    tree->boxes = (double*)gsf__arena_alloc(&tree->arena, (size_t)2 << tree->levels, 6 * sizeof(double));
+    if (tree->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < count; i++) {
         const double* p = points + 3 * i;
         if (!((!keep || keep[i]) && isfinite(p[0]) && isfinite(p[1]) && isfinite(p[2]))) continue;
@@ -4443,12 +4441,15 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
     if (origin && !(isfinite(origin[0]) && isfinite(origin[1]) && isfinite(origin[2])))
         return gsf_fail(ctx, GSF_ERROR_NUMERIC, "splats from points: the origin is not finite");
     gsf__knn_tree tree;
-    GSF__TRY(gsf__knn_build(ctx, points, count, keep, &tree));
-    float* log_scales = (float*)gsf_alloc(ctx, tree.count ? tree.count : 1, sizeof(float));
-    uint32_t* order = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t)); // row -> position in the tree
-    gsf_result result = log_scales && order ? gsf_splat_make(ctx, tree.count, sh_degree, out) : GSF_ERROR_OUT_OF_MEMORY;
-    if (result != GSF_OK) goto cleanup;
-    {
+    gsf_result result = gsf__knn_build(ctx, points, count, keep, &tree);
+    float* log_scales = NULL;
+    uint32_t* order = NULL; // row -> position in the tree
+    if (result == GSF_OK) {
+        log_scales = (float*)gsf__arena_alloc(&tree.arena, tree.count, sizeof(float));
+        order = (uint32_t*)gsf__arena_alloc(&tree.arena, count, sizeof(uint32_t));
+        result = tree.arena.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_splat_make(ctx, tree.count, sh_degree, out);
+    }
+    if (result == GSF_OK) {
         gsf__init_job job;
         job.tree = &tree;
         job.log_scales = log_scales;
@@ -4474,10 +4475,7 @@ GSF_API gsf_result gsf_splat_make_from_points(gsf_context* ctx, const double* po
         if (n < kept)
             gsf_log(ctx, GSF_LOG_WARNING, "%zu points with a non-finite coordinate were skipped", kept - n);
     }
-cleanup:
-    gsf_free(ctx, order);
-    gsf_free(ctx, log_scales);
-    gsf__knn_destroy(ctx, &tree);
+    gsf__arena_free(&tree.arena);
     return result;
 }
 
@@ -4514,6 +4512,18 @@ static gsf_visibility_desc gsf__visibility_desc_defaults(const gsf_visibility_de
     return d;
 }
 
+static gsf_result gsf__check_views(gsf_context* ctx, const char* what, const gsf_scene* scene, const uint32_t* views,
+                                   size_t view_count) {
+    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: views is NULL", what);
+    for (size_t i = 0; i < view_count; i++) {
+        if (views[i] >= scene->view_count)
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: view %u does not exist, the scene has %zu", what,
+                            (unsigned)views[i], scene->view_count);
+        GSF__TRY(gsf_check_camera(ctx, &scene->views[views[i]].camera));
+    }
+    return GSF_OK;
+}
+
 static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
                                         size_t view_count, const gsf_visibility_desc* d) {
     if ((unsigned)d->method > GSF_VISIBILITY_RAYS)
@@ -4527,14 +4537,7 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "visible points: radius_scale %g, tolerance %g, coverage %g, min_grazing_cos %g",
                         (double)d->radius_scale, (double)d->tolerance, (double)d->coverage, (double)d->min_grazing_cos);
-    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: views is NULL");
-    for (size_t i = 0; i < view_count; i++) {
-        if (views[i] >= scene->view_count)
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: view %u, the scene has %zu",
-                            (unsigned)views[i], scene->view_count);
-        GSF__TRY(gsf_check_camera(ctx, &scene->views[views[i]].camera));
-    }
-    return GSF_OK;
+    return gsf__check_views(ctx, "visible points", scene, views, view_count);
 }
 
 typedef struct gsf__disc_job {
@@ -4582,15 +4585,6 @@ static void gsf__discs_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-static void gsf__discs_destroy(gsf_context* ctx, gsf__discs* discs) {
-    gsf_free(ctx, discs->spheres);
-    gsf_free(ctx, discs->normals);
-    gsf_free(ctx, discs->rows);
-    gsf_free(ctx, discs->nearest);
-    gsf_free(ctx, discs->oriented);
-    memset(discs, 0, sizeof *discs);
-}
-
 static int gsf__compare_floats(const void* a, const void* b) {
     float x, y;
     memcpy(&x, a, sizeof x);
@@ -4601,38 +4595,37 @@ static int gsf__compare_floats(const void* a, const void* b) {
 // Makes the discs. Normals come from a PCA of the neighbours. The radius is the distance to a neighbour, at most 3
 // times the median (else isolated points would hide whole walls) and at least 1e-5 of the coordinates (ray tests in
 // float miss smaller discs, as measured with Embree 3.13.5).
-static gsf_result gsf__discs_make(gsf_context* ctx, const gsf_scene* scene, const double origin[3],
+static gsf_result gsf__discs_make(gsf__arena* arena, const gsf_scene* scene, const double origin[3],
                                   const gsf_visibility_desc* desc, gsf__discs* discs) {
-    memset(discs, 0, sizeof *discs);
+    gsf_context* ctx = arena->ctx;
     gsf__knn_tree tree;
-    GSF__TRY(gsf__knn_build(ctx, scene->points, scene->point_count, NULL, &tree));
-    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
-    float* radii = (float*)gsf_alloc(ctx, tree.count ? tree.count : 1, sizeof(float));
+    gsf__disc_job job;
+    float* radii = NULL;
+    gsf_result result = gsf__knn_build(ctx, scene->points, scene->point_count, NULL, &tree);
+    const size_t count = tree.count;
+    if (result != GSF_OK) goto cleanup;
     memcpy(discs->origin, origin, sizeof discs->origin);
-    discs->spheres = (float*)gsf_alloc_zeroed(ctx, tree.count + 1, 4 * sizeof(float));
-    discs->normals = (float*)gsf_alloc_zeroed(ctx, tree.count + 2, 3 * sizeof(float));
-    discs->rows = (uint32_t*)gsf_alloc(ctx, tree.count ? tree.count : 1, sizeof(uint32_t));
-    discs->near_count = tree.count <= (size_t)desc->neighbours ? (int)tree.count - (tree.count > 0) : desc->neighbours;
-    discs->nearest = (uint32_t*)gsf_alloc(ctx, tree.count ? tree.count : 1,
-                                          (size_t)(discs->near_count + 1) * sizeof(uint32_t));
-    discs->oriented = (uint8_t*)gsf_alloc_zeroed(ctx, tree.count ? tree.count : 1, 1);
-    if (!radii || !discs->spheres || !discs->normals || !discs->rows || !discs->nearest || !discs->oriented)
-        goto cleanup;
-    discs->count = tree.count;
-    {
-        gsf__disc_job job;
-        job.tree = &tree;
-        job.desc = desc;
-        job.discs = discs;
-        gsf__parallel_for(ctx, (tree.count + GSF__KNN_CHUNK - 1) / GSF__KNN_CHUNK, gsf__discs_chunk, &job);
-    }
+    discs->near_count = count <= (size_t)desc->neighbours ? (int)count - (count > 0) : desc->neighbours;
+    discs->spheres = (float*)gsf__arena_alloc_zeroed(arena, count + 1, 4 * sizeof(float));
+    discs->normals = (float*)gsf__arena_alloc_zeroed(arena, count + 2, 3 * sizeof(float));
+    discs->rows = (uint32_t*)gsf__arena_alloc(arena, count, sizeof(uint32_t));
+    discs->nearest = (uint32_t*)gsf__arena_alloc(arena, count, (size_t)(discs->near_count + 1) * sizeof(uint32_t));
+    discs->oriented = (uint8_t*)gsf__arena_alloc_zeroed(arena, count, 1);
+    radii = (float*)gsf__arena_alloc(&tree.arena, count, sizeof(float));
+    result = arena->failed || !radii ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+    if (result != GSF_OK) goto cleanup;
+    discs->count = count;
+    job.tree = &tree;
+    job.desc = desc;
+    job.discs = discs;
+    gsf__parallel_for(ctx, (count + GSF__KNN_CHUNK - 1) / GSF__KNN_CHUNK, gsf__discs_chunk, &job);
     {
         size_t n = 0;
-        for (size_t i = 0; i < discs->count; i++) // clusters of identical points have radius 0 and are ignored
+        for (size_t i = 0; i < count; i++) // clusters of identical points have radius 0 and are ignored
             if (discs->spheres[4 * i + 3] > 0.0f) radii[n++] = discs->spheres[4 * i + 3];
         qsort(radii, n, sizeof(float), gsf__compare_floats);
         const float most = n ? 3.0f * radii[n / 2] : 0.0f;
-        for (size_t i = 0; i < discs->count; i++) {
+        for (size_t i = 0; i < count; i++) {
             float* s = discs->spheres + 4 * i;
             const float least = 1e-5f * (fabsf(s[0]) + fabsf(s[1]) + fabsf(s[2]));
             if (s[3] > most) s[3] = most;
@@ -4641,9 +4634,7 @@ static gsf_result gsf__discs_make(gsf_context* ctx, const gsf_scene* scene, cons
     }
     result = gsf__check_cancel(ctx);
 cleanup:
-    if (result != GSF_OK) gsf__discs_destroy(ctx, discs);
-    gsf_free(ctx, radii);
-    gsf__knn_destroy(ctx, &tree);
+    gsf__arena_free(&tree.arena);
     return result;
 }
 
@@ -4673,6 +4664,7 @@ typedef struct gsf__rays8 gsf__rays8;
 typedef struct gsf__hider gsf__hider;
 
 typedef struct gsf__vis_job {
+    gsf__arena arena;          // all arrays
     const gsf_visibility_desc* desc;
     gsf__discs discs;
     gsf__eye* eyes;
@@ -5023,21 +5015,19 @@ static void gsf__vis_band_of_cells(void* arg, size_t band, int32_t worker) {
 
 // Ray tests without Embree: for each eye, tests every disc against the points in the cells that its projection touches.
 static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
-    const size_t n = job->discs.count ? job->discs.count : 1, most = GSF__VIS_MAX_SIDE;
-    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
+    const size_t n = job->discs.count, most = GSF__VIS_MAX_SIDE;
     job->side = GSF__VIS_BANDS;
     while ((size_t)job->side < most && (size_t)job->side * (size_t)job->side * 8 < n) job->side *= 2; // 8 points a cell
     const size_t cell_count = (size_t)job->side * (size_t)job->side;
-    job->sights = (gsf__sight*)gsf_alloc(ctx, n, sizeof(gsf__sight));
-    job->cells = (int32_t*)gsf_alloc(ctx, n, sizeof(int32_t));
-    job->boxes = (gsf__disc_box*)gsf_alloc(ctx, n, sizeof(gsf__disc_box));
-    job->limits = (float*)gsf_alloc(ctx, n, sizeof(float));
-    job->cover = (double*)gsf_alloc(ctx, n, sizeof(double));
-    job->cell_points = (uint32_t*)gsf_alloc(ctx, n, sizeof(uint32_t));
-    job->cell_begin = (uint32_t*)gsf_alloc(ctx, cell_count + 2, sizeof(uint32_t));
-    if (job->sights && job->limits && job->cells && job->boxes && job->cover && job->cell_points && job->cell_begin)
-        result = GSF_OK;
-    for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
+    job->sights = (gsf__sight*)gsf__arena_alloc(&job->arena, n, sizeof(gsf__sight));
+    job->cells = (int32_t*)gsf__arena_alloc(&job->arena, n, sizeof(int32_t));
+    job->boxes = (gsf__disc_box*)gsf__arena_alloc(&job->arena, n, sizeof(gsf__disc_box));
+    job->limits = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
+    job->cover = (double*)gsf__arena_alloc(&job->arena, n, sizeof(double));
+    job->cell_points = (uint32_t*)gsf__arena_alloc(&job->arena, n, sizeof(uint32_t));
+    job->cell_begin = (uint32_t*)gsf__arena_alloc(&job->arena, cell_count + 2, sizeof(uint32_t));
+    if (job->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t e = 0; e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_project_chunk);
         // Counting sort: begin[c + 2] counts the points of cell c, then begin[c + 1] is its insertion point.
@@ -5049,16 +5039,9 @@ static gsf_result gsf__vis_by_cells(gsf_context* ctx, gsf__vis_job* job) {
         for (size_t i = 0; i < job->discs.count; i++)
             if (job->cells[i] >= 0) job->cell_points[begin[job->cells[i] + 1]++] = (uint32_t)i;
         gsf__parallel_for(ctx, GSF__VIS_BANDS, gsf__vis_band_of_cells, job);
-        result = gsf__check_cancel(ctx);
+        GSF__TRY(gsf__check_cancel(ctx));
     }
-    gsf_free(ctx, job->sights);
-    gsf_free(ctx, job->limits);
-    gsf_free(ctx, job->cells);
-    gsf_free(ctx, job->boxes);
-    gsf_free(ctx, job->cover);
-    gsf_free(ctx, job->cell_points);
-    gsf_free(ctx, job->cell_begin);
-    return result;
+    return GSF_OK;
 }
 
 #ifdef GSF_USE_EMBREE
@@ -5071,29 +5054,17 @@ static void gsf__vis_by_tracks(const gsf_scene* scene, const uint8_t* chosen, ui
             keep[i] = chosen[scene->track_views[t]];
 }
 
-static void gsf__vis_end(gsf_context* ctx, gsf__vis_job* job) {
-    gsf_free(ctx, job->seen);
-    gsf_free(ctx, job->counts);
-    gsf_free(ctx, job->centers);
-    gsf_free(ctx, job->regions);
-    gsf_free(ctx, job->facing);
-    gsf_free(ctx, job->apart);
-    gsf_free(ctx, job->evidence);
-    gsf_free(ctx, job->eyes);
-    gsf__discs_destroy(ctx, &job->discs);
-    memset(job, 0, sizeof *job);
-}
-
-// Prepares discs, eyes and the evidence from the tracks. Call gsf__vis_end even after an error.
+// Prepares discs, eyes and the evidence from the tracks. Free job->arena, also after an error.
 static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                  const gsf_visibility_desc* desc, const uint8_t* keep, gsf__vis_job* job,
                                  gsf_visibility_stats* stats) {
     memset(job, 0, sizeof *job);
+    job->arena.ctx = ctx;
     job->desc = desc;
     job->scene = scene;
-    job->eyes = (gsf__eye*)gsf_alloc(ctx, view_count, sizeof(gsf__eye));
-    job->centers = (double*)gsf_alloc(ctx, scene->view_count, 3 * sizeof(double));
-    if (!job->eyes || !job->centers) return GSF_ERROR_OUT_OF_MEMORY;
+    job->eyes = (gsf__eye*)gsf__arena_alloc(&job->arena, view_count, sizeof(gsf__eye));
+    job->centers = (double*)gsf__arena_alloc(&job->arena, scene->view_count, 3 * sizeof(double));
+    if (job->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     job->eye_count = view_count;
     double origin[3] = {0.0, 0.0, 0.0};
     for (size_t i = 0; i < view_count; i++) {
@@ -5111,19 +5082,18 @@ static gsf_result gsf__vis_begin(gsf_context* ctx, const gsf_scene* scene, const
     }
 
     const double start = gsf__vis_seconds();
-    GSF__TRY(gsf__discs_make(ctx, scene, origin, desc, &job->discs));
+    GSF__TRY(gsf__discs_make(&job->arena, scene, origin, desc, &job->discs));
     stats->seconds_normals = gsf__vis_seconds() - start;
-    const size_t n = job->discs.count ? job->discs.count : 1, chunks = (n + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
-    job->seen = (uint8_t*)gsf_alloc(ctx, n, 1);
-    job->counts = (gsf__vis_counts*)gsf_alloc_zeroed(ctx, chunks, sizeof *job->counts);
-    job->regions = (float*)gsf_alloc(ctx, chunks, 6 * sizeof(float));
-    if (!job->seen || !job->counts || !job->regions) return GSF_ERROR_OUT_OF_MEMORY;
+    const size_t n = job->discs.count, chunks = (n + GSF__VIS_CHUNK - 1) / GSF__VIS_CHUNK;
+    job->seen = (uint8_t*)gsf__arena_alloc(&job->arena, n, 1);
+    job->counts = (gsf__vis_counts*)gsf__arena_alloc_zeroed(&job->arena, chunks, sizeof *job->counts);
+    job->regions = (float*)gsf__arena_alloc(&job->arena, chunks, 6 * sizeof(float));
     if (scene->track_begin && scene->track_begin[scene->point_count] > scene->track_begin[0]) {
-        job->facing = (float*)gsf_alloc(ctx, n, 3 * sizeof(float));
-        job->apart = (float*)gsf_alloc(ctx, n, sizeof(float));
-        job->evidence = (float*)gsf_alloc(ctx, n, sizeof(float));
-        if (!job->facing || !job->apart || !job->evidence) return GSF_ERROR_OUT_OF_MEMORY;
+        job->facing = (float*)gsf__arena_alloc(&job->arena, n, 3 * sizeof(float));
+        job->apart = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
+        job->evidence = (float*)gsf__arena_alloc(&job->arena, n, sizeof(float));
     }
+    if (job->arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < job->discs.count; i++) job->seen[i] = keep[job->discs.rows[i]];
     gsf__vis_run(ctx, job, gsf__vis_survey_chunk);
     if (job->evidence) {
@@ -5156,7 +5126,7 @@ static gsf_result gsf__vis_by_rays(gsf_context* ctx, const gsf_scene* scene, con
             gsf_log(ctx, GSF_LOG_WARNING, "visible points: %zu points with a non-finite coordinate are not traced",
                     scene->point_count - job.discs.count);
     }
-    gsf__vis_end(ctx, &job);
+    gsf__arena_free(&job.arena);
     return result;
 }
 
@@ -5466,10 +5436,7 @@ static enum RTCError gsf__embree_build(RTCDevice device, RTCScene scene, const g
 
 static gsf_result gsf__embree_run(gsf_context* ctx, gsf__vis_job* job) {
     gsf_result result = GSF_OK;
-    job->hide8 = gsf__hide8_scalar;
-#if GSF__X86
-    if (ctx->cpu_level >= GSF_CPU_AVX2) job->hide8 = gsf__hide8_avx2;
-#endif
+    job->hide8 = GSF__KERNEL_OF(ctx->cpu_level, gsf__hide8);
     for (size_t e = 0; result == GSF_OK && e < job->eye_count; e++) {
         gsf__vis_look(ctx, job, e);
         gsf__vis_run(ctx, job, gsf__vis_embree_chunk);
@@ -5589,6 +5556,7 @@ typedef struct gsf__dense_block { uint32_t view; int32_t row; } gsf__dense_block
 
 typedef struct gsf__dense_job {
     gsf_context* ctx;
+    gsf__arena level_arena;        // the arrays of the level, except its planes, which the finer level starts from
     const gsf_scene* scene;
     gsf_dense_desc desc;
     const uint8_t* keep;
@@ -5663,13 +5631,9 @@ static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, con
     if (!(d->depth_min >= 0.0 && isfinite(d->depth_max) && (d->depth_max == 0.0 || d->depth_max > d->depth_min)))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: invalid depth range %g to %g", d->depth_min,
                         d->depth_max);
-    if (view_count && !views) return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: views is NULL");
+    GSF__TRY(gsf__check_views(ctx, "dense points", scene, views, view_count));
     for (size_t i = 0; i < view_count; i++) {
-        if (views[i] >= scene->view_count)
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: view %u does not exist, the scene has %zu",
-                            (unsigned)views[i], scene->view_count);
         const gsf_scene_view* view = &scene->views[views[i]];
-        GSF__TRY(gsf_check_camera(ctx, &view->camera));
         if (!view->image.data)
             return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: the photo of view %u is not loaded",
                             (unsigned)views[i]);
@@ -5766,14 +5730,6 @@ GSF__V_KERNEL float GSF__V(gsf__dense_cost)(const gsf__dense_window* window, con
 
 #endif // GSF__KERNELS_STEREO
 #ifndef GSF__ISA
-
-static gsf__dense_cost_fn gsf__dense_cost_of(gsf_cpu_level level) {
-#if GSF__X86
-    if (level >= GSF_CPU_AVX2) return gsf__dense_cost_avx2;
-#endif
-    (void)level;
-    return gsf__dense_cost_scalar;
-}
 
 static void gsf__dense_make_window(const gsf_dense_desc* d, gsf__dense_window* window) {
     memset(window, 0, sizeof *window);
@@ -6211,20 +6167,26 @@ static void gsf__dense_range(gsf__dense_job* job, gsf__dense_view* view, double*
     view->w_max = *low > 0.0 ? (float)(1.0 / *low) : 0.0f;
 }
 
+// Cosine of the angle at `point` between the directions to two camera centres.
+static double gsf__ray_cosine(const double point[3], const double a[3], const double b[3]) {
+    double along = 0.0, n0 = 0.0, n1 = 0.0;
+    for (int c = 0; c < 3; c++) {
+        const double p = point[c] - a[c], q = point[c] - b[c];
+        along += p * q;
+        n0 += p * p;
+        n1 += q * q;
+    }
+    return along / sqrt(n0 * n1 + 1e-300);
+}
+
 // How strongly a point speaks for matching two views: 0 if its viewing rays differ by less than min_angle, highest
 // around ten degrees, lower for wider angles and for different image scales.
 static double gsf__dense_vote(const gsf__dense_job* job, const gsf_camera* a, const gsf_camera* b, const double point[3],
                               double depth_a, double depth_b) {
-    double ca[3], cb[3], dot = 0.0, aa = 0.0, bb = 0.0;
+    double ca[3], cb[3];
     gsf_get_camera_center(a, ca);
     gsf_get_camera_center(b, cb);
-    for (int k = 0; k < 3; k++) {
-        const double x = point[k] - ca[k], y = point[k] - cb[k];
-        dot += x * y;
-        aa += x * x;
-        bb += y * y;
-    }
-    const double c = dot / sqrt(aa * bb);
+    const double c = gsf__ray_cosine(point, ca, cb);
     const double degrees = acos(c < -1.0 ? -1.0 : c > 1.0 ? 1.0 : c) * 57.29577951308232;
     if (!(degrees >= (double)job->desc.min_angle)) return 0.0;
     const double off = (degrees - 10.0) / (degrees < 10.0 ? 4.0 : 20.0), scale = a->fx / depth_a / (b->fx / depth_b);
@@ -6309,16 +6271,10 @@ static void gsf__dense_free_level(gsf__dense_job* job) {
         gsf_destroy_image(job->ctx, &job->views[i].color);
         gsf_destroy_image(job->ctx, &job->views[i].weight);
     }
-    gsf_free(job->ctx, job->texels);
     gsf_free(job->ctx, job->planes);
-    gsf_free(job->ctx, job->others);
-    gsf_free(job->ctx, job->source_costs);
-    gsf_free(job->ctx, job->blocks);
-    gsf_free(job->ctx, job->seeds);
-    job->texels = NULL;
+    gsf__arena_free(&job->level_arena);
     job->planes = job->others = NULL;
-    job->source_costs = job->seeds = NULL;
-    job->blocks = NULL;
+    job->seeds = NULL;
 }
 
 static void gsf__dense_texels(const gsf__dense_view* view, uint32_t* texels) {
@@ -6431,11 +6387,13 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
     }
     if (job->pixel_count >= UINT32_MAX)
         return gsf_fail(ctx, GSF_ERROR_UNSUPPORTED, "dense points: %zu pixels in all are too many", job->pixel_count);
-    job->texels = (uint32_t*)gsf_alloc(ctx, job->pixel_count, sizeof(uint32_t));
+    gsf__arena* arena = &job->level_arena;
     job->planes = (gsf__dense_plane*)gsf_alloc(ctx, job->pixel_count, sizeof(gsf__dense_plane));
-    job->source_costs = (float*)gsf_alloc(ctx, job->pixel_count, GSF__DENSE_SOURCES * sizeof(float));
-    job->blocks = (gsf__dense_block*)gsf_alloc(ctx, job->block_count, sizeof(gsf__dense_block));
-    if (!job->texels || !job->planes || !job->source_costs || !job->blocks) return GSF_ERROR_OUT_OF_MEMORY;
+    job->texels = (uint32_t*)gsf__arena_alloc(arena, job->pixel_count, sizeof(uint32_t));
+    job->source_costs = (float*)gsf__arena_alloc(arena, job->pixel_count, GSF__DENSE_SOURCES * sizeof(float));
+    job->blocks = (gsf__dense_block*)gsf__arena_alloc(arena, job->block_count, sizeof(gsf__dense_block));
+    if (with_seeds) job->seeds = (float*)gsf__arena_alloc_zeroed(arena, job->pixel_count, sizeof(float));
+    if (!job->planes || arena->failed) return GSF_ERROR_OUT_OF_MEMORY;
     size_t block = 0;
     for (size_t i = 0; i < job->view_count; i++) {
         gsf__dense_view* view = job->views + i;
@@ -6456,11 +6414,10 @@ static gsf_result gsf__dense_begin_level(gsf__dense_job* job, int32_t level, int
     }
     if (!with_seeds) return GSF_OK;
     int32_t* distance = (int32_t*)gsf_alloc(ctx, (size_t)most, sizeof(int32_t));
-    job->seeds = (float*)gsf_alloc_zeroed(ctx, job->pixel_count, sizeof(float));
-    if (distance && job->seeds)
-        for (size_t i = 0; i < job->view_count; i++) gsf__dense_spread_seeds(job, job->views + i, distance);
+    if (!distance) return GSF_ERROR_OUT_OF_MEMORY;
+    for (size_t i = 0; i < job->view_count; i++) gsf__dense_spread_seeds(job, job->views + i, distance);
     gsf_free(ctx, distance);
-    return distance && job->seeds ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    return GSF_OK;
 }
 
 static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int finest, double* done, double total) {
@@ -6473,7 +6430,7 @@ static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int fines
         GSF__TRY(gsf__check_cancel(job->ctx));
         if (job->iteration >= count) {
             if (!job->others)
-                job->others = (gsf__dense_plane*)gsf_alloc(job->ctx, job->pixel_count, sizeof(gsf__dense_plane));
+                job->others = (gsf__dense_plane*)gsf__arena_alloc(&job->level_arena, job->pixel_count, sizeof(gsf__dense_plane));
             if (!job->others) return GSF_ERROR_OUT_OF_MEMORY;
             memcpy(job->others, job->planes, job->pixel_count * sizeof(gsf__dense_plane));
             job->roam = 0;
@@ -6723,12 +6680,9 @@ static void gsf__dense_hide(gsf__dense_job* job) {
 static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense_stats* stats) {
     enum { BINS = 64 };
     gsf_context* ctx = job->ctx;
-    gsf_result result = GSF_ERROR_OUT_OF_MEMORY;
-    uint32_t *order = NULL, *chosen = NULL;
-    uint8_t* covered = NULL;
     size_t starts[BINS + 1], count = 0, n = 0;
-    job->links = (uint8_t*)gsf_alloc(ctx, job->pixel_count, 1);
-    if (!job->links) goto cleanup;
+    job->links = (uint8_t*)gsf__arena_alloc(&job->level_arena, job->pixel_count, 1);
+    if (!job->links) return GSF_ERROR_OUT_OF_MEMORY;
     job->min_normal_dot = (float)cos((double)job->desc.max_normal_angle * 0.017453292519943295);
     gsf__dense_hide(job);
     gsf__parallel_for(ctx, job->block_count, gsf__dense_link_chunk, job);
@@ -6743,10 +6697,10 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     }
     stats->consistent = count;
     for (int b = 0; b < BINS; b++) starts[b + 1] += starts[b];
-    order = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t));
-    chosen = (uint32_t*)gsf_alloc(ctx, count ? count : 1, sizeof(uint32_t));
-    covered = (uint8_t*)gsf_alloc(ctx, job->pixel_count, 1);
-    if (!order || !chosen || !covered) goto cleanup;
+    uint32_t* order = (uint32_t*)gsf__arena_alloc(&job->level_arena, count, sizeof(uint32_t));
+    uint32_t* chosen = (uint32_t*)gsf__arena_alloc(&job->level_arena, count, sizeof(uint32_t));
+    uint8_t* covered = (uint8_t*)gsf__arena_alloc(&job->level_arena, job->pixel_count, 1);
+    if (job->level_arena.failed) return GSF_ERROR_OUT_OF_MEMORY;
     for (size_t i = 0; i < job->pixel_count; i++)
         if (job->links[i])
             order[starts[(size_t)(job->planes[i].cost / job->desc.max_cost_many * ((float)BINS - 0.5f))]++] = (uint32_t)i;
@@ -6760,17 +6714,11 @@ static gsf_result gsf__dense_fuse(gsf__dense_job* job, gsf_dense* out, gsf_dense
     out->colors = (uint8_t*)gsf_alloc(ctx, n ? n : 1, 3);
     out->confidence = (float*)gsf_alloc(ctx, n ? n : 1, sizeof(float));
     out->view_counts = (uint8_t*)gsf_alloc(ctx, n ? n : 1, 1);
-    if (!out->points || !out->normals || !out->colors || !out->confidence || !out->view_counts) goto cleanup;
+    if (!out->points || !out->normals || !out->colors || !out->confidence || !out->view_counts)
+        return GSF_ERROR_OUT_OF_MEMORY;
     out->count = n;
     for (size_t i = 0; i < n; i++) gsf__dense_merge(job, chosen[i], out, i);
-    result = job->desc.want_maps ? gsf__dense_make_maps(job, out) : GSF_OK;
-cleanup:
-    gsf_free(ctx, order);
-    gsf_free(ctx, chosen);
-    gsf_free(ctx, covered);
-    gsf_free(ctx, job->links);
-    job->links = NULL;
-    return result;
+    return job->desc.want_maps ? gsf__dense_make_maps(job, out) : GSF_OK;
 }
 
 // Removes duplicates from the list of views and finds the depth range and the sources of each. *pairs: number of (view,
@@ -6829,11 +6777,11 @@ GSF_API gsf_result gsf_splat_make_dense(gsf_context* ctx, const gsf_scene* scene
     GSF__TRY(gsf__dense_check(ctx, scene, views, view_count, &d));
     gsf__dense_job* job = (gsf__dense_job*)gsf_alloc_zeroed(ctx, 1, sizeof(gsf__dense_job));
     if (!job) return GSF_ERROR_OUT_OF_MEMORY;
-    job->ctx = ctx;
+    job->ctx = job->level_arena.ctx = ctx;
     job->scene = scene;
     job->desc = d;
     job->keep = keep;
-    job->cost_fn = gsf__dense_cost_of(ctx->cpu_level);
+    job->cost_fn = GSF__KERNEL_OF(ctx->cpu_level, gsf__dense_cost);
     gsf__dense_make_window(&d, &job->window);
     double start = gsf__vis_seconds();
     gsf_result result = gsf__dense_prepare(job, views, view_count, &counted.pairs);
@@ -6922,7 +6870,6 @@ typedef struct gsf__worker_scratch { // one per worker
     gsf__step_head* heads;     // of the steps
     float* checkpoints;        // T of the tile's pixels at the start of each bucket
     uint32_t* checkpoint_entry; // the list entry that each bucket starts with
-    size_t checkpoint_capacity;
 } gsf__worker_scratch;
 
 typedef struct gsf__pair { uint32_t splat, slot; } gsf__pair; // slot: relative to the tile's first
@@ -6955,7 +6902,9 @@ struct gsf_rasterizer {
     size_t tile_background_capacity;
 
     int32_t worker_count;
+    size_t checkpoint_capacity; // of each worker
     gsf__worker_scratch* workers;
+    gsf__arena worker_arena;    // the workers and their arrays
 
     // the last render
     int32_t width, height, tiles_x, tiles_y, sh_bands;
@@ -6973,25 +6922,14 @@ GSF_API gsf_result gsf_splat_make_rasterizer(gsf_context* ctx, gsf_rasterizer** 
     return *out ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
 }
 
-static void gsf__free_workers(gsf_context* ctx, gsf_rasterizer* r) {
-    for (int i = 0; i < r->worker_count; i++) {
-        gsf_free(ctx, r->workers[i].steps);
-        gsf_free(ctx, r->workers[i].heads);
-        gsf_free(ctx, r->workers[i].checkpoints);
-        gsf_free(ctx, r->workers[i].checkpoint_entry);
-    }
-    gsf_free(ctx, r->workers);
-    r->workers = NULL;
-    r->worker_count = 0;
-}
-
 GSF_API void gsf_splat_destroy_rasterizer(gsf_context* ctx, gsf_rasterizer* r) {
     if (!r) return;
     void* const owned[] = {r->records, r->radii, r->splat_begin, r->tile_begin, r->tile_counts, r->pair_splat,
                            r->splat_pairs, r->pair_keys, r->pair_spare, r->pairs, r->slots, r->slot_used, r->final_T,
                            r->depth_sum, r->tile_background};
     for (size_t i = 0; i < GSF__COUNT(owned); i++) gsf_free(ctx, owned[i]);
-    gsf__free_workers(ctx, r);
+    r->worker_arena.ctx = ctx;
+    gsf__arena_free(&r->worker_arena);
     gsf_free(ctx, r);
 }
 
@@ -7468,28 +7406,42 @@ GSF__V_KERNEL void GSF__V(gsf__records)(gsf_rasterizer* r, const gsf__view* view
 #endif // GSF__KERNELS_PROJECT
 #ifndef GSF__ISA
 
-typedef struct gsf__project_job {
+typedef struct gsf__splat_loop { // a loop over all splats
     gsf_rasterizer* r;
     const gsf__view* view;
     const gsf_splats* splats;
-    const uint8_t* hidden;
+    const uint8_t* hidden;        // for gsf__project_chunk
+    const gsf_splat_grads* grads; // for gsf__gather_chunk
     gsf_cpu_level level;
-} gsf__project_job;
+} gsf__splat_loop;
+
+static gsf__splat_loop gsf__make_splat_loop(const gsf_context* ctx, gsf_rasterizer* r, const gsf__view* view,
+                                          const gsf_splats* splats) {
+    const gsf__splat_loop job = {r, view, splats, NULL, NULL, ctx->cpu_level};
+    return job;
+}
+
+static size_t gsf__splat_chunks(const gsf_rasterizer* r) {
+    return (r->splat_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK;
+}
+
+static size_t gsf__splat_chunk_end(const gsf_rasterizer* r, size_t chunk) {
+    const size_t end = (chunk + 1) * GSF__PROJECT_CHUNK;
+    return end < r->splat_count ? end : r->splat_count;
+}
+
+// The scalar kernels implement the rules of the Inria 3DGS code as well.
+static gsf_cpu_level gsf__footprint_level(const gsf__view* view, gsf_cpu_level level) {
+    return view->official_footprint ? GSF_CPU_SCALAR : level;
+}
 
 static void gsf__project_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
-    const gsf__project_job* job = (const gsf__project_job*)arg;
-    gsf_rasterizer* r = job->r;
-    const size_t begin = chunk * GSF__PROJECT_CHUNK;
-    const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
-#if GSF__X86
-    if (job->level >= GSF_CPU_AVX2 && !job->view->official_footprint) {
-        for (size_t i = begin; i < end; i += GSF__LANES_avx2)
-            gsf__records_avx2(r, job->view, job->splats, job->hidden, i, end - i);
-        return;
-    }
-#endif
-    for (size_t i = begin; i < end; i++) gsf__records_scalar(r, job->view, job->splats, job->hidden, i, end - i);
+    const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
+    const size_t end = gsf__splat_chunk_end(job->r, chunk);
+    const gsf_cpu_level level = gsf__footprint_level(job->view, job->level);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__KERNEL_OF(level, GSF__LANES))
+        GSF__KERNEL_OF(level, gsf__records)(job->r, job->view, job->splats, job->hidden, i, end - i);
 }
 
 // ---- >>bin ---------------------------------------------------------------------
@@ -7567,13 +7519,7 @@ typedef struct gsf__bin_job {
 
 static void gsf__tile_spans(const gsf__bin_job* job, const gsf__record* rec, int32_t ty, int32_t left,
                             gsf__tile_span spans[GSF__SPANS]) {
-#if GSF__X86
-    if (job->level >= GSF_CPU_AVX2 && !job->view->official_footprint) {
-        gsf__tile_columns_avx2(job->r, rec, ty, left, spans);
-        return;
-    }
-#endif
-    gsf__tile_columns_scalar(job->r, rec, ty, left, spans);
+    GSF__KERNEL_OF(gsf__footprint_level(job->view, job->level), gsf__tile_columns)(job->r, rec, ty, left, spans);
     if (!job->view->official_footprint) return;
     const gsf__tile_rect rect = gsf__official_rect(rec, job->r->tiles_x, job->r->tiles_y);
     for (int32_t i = 0; i < left && i < GSF__SPANS; i++) {
@@ -7648,16 +7594,8 @@ static gsf_result gsf__bin(gsf_context* ctx, gsf_rasterizer* r, const gsf__view*
     job.chunk_size = r->splat_count / 32 + 1;
     if (job.chunk_size < 1024) job.chunk_size = 1024;
     const size_t chunks = (r->splat_count + job.chunk_size - 1) / job.chunk_size;
-    if (tiles + 1 > r->tile_capacity) {
-        r->tile_capacity = 0;
-        GSF__TRY(gsf__grow(ctx, (void**)&r->tile_begin, tiles + 1, sizeof(size_t)));
-        r->tile_capacity = tiles + 1;
-    }
-    if (chunks * tiles > r->count_capacity) {
-        r->count_capacity = 0;
-        GSF__TRY(gsf__grow(ctx, (void**)&r->tile_counts, chunks * tiles, sizeof(size_t)));
-        r->count_capacity = chunks * tiles;
-    }
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_begin, &r->tile_capacity, 0, tiles + 1, sizeof(size_t)));
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_counts, &r->count_capacity, 0, chunks * tiles, sizeof(size_t)));
     if (chunks) memset(r->tile_counts, 0, chunks * tiles * sizeof(size_t));
     gsf__parallel_for(ctx, chunks, gsf__bin_chunk, &job);
 
@@ -8182,14 +8120,10 @@ GSF__TARGET_AVX2 static void gsf__reverse_avx2(const gsf__tile* tile, const gsf_
 
 #endif // GSF__X86
 
-static const gsf__raster_kernels* gsf__raster_kernels_of(gsf_cpu_level level) {
-    static const gsf__raster_kernels scalar = {gsf__blend_scalar, gsf__keep_scalar, gsf__reverse_scalar};
-#if GSF__X86
-    static const gsf__raster_kernels avx2 = {gsf__blend_avx2, gsf__keep_avx2, gsf__reverse_avx2};
-    if (level >= GSF_CPU_AVX2) return &avx2;
-#endif
-    (void)level;
-    return &scalar;
+static gsf__raster_kernels gsf__raster_kernels_of(gsf_cpu_level level) {
+    const gsf__raster_kernels kernels = {GSF__KERNEL_OF(level, gsf__blend), GSF__KERNEL_OF(level, gsf__keep),
+                                         GSF__KERNEL_OF(level, gsf__reverse)};
+    return kernels;
 }
 
 // ---- >>project backward --------------------------------------------------------
@@ -8437,29 +8371,13 @@ GSF__V_KERNEL void GSF__V(gsf__gather)(const gsf_rasterizer* r, const gsf__view*
 #endif // GSF__KERNELS_GATHER
 #ifndef GSF__ISA
 
-typedef struct gsf__gather_job {
-    const gsf_rasterizer* r;
-    const gsf__view* view;
-    const gsf_splats* splats;
-    const gsf_splat_grads* grads;
-    gsf_cpu_level level;
-} gsf__gather_job;
-
 // In index order, so that parameters and gradients stream through the cache.
 static void gsf__gather_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
-    const gsf__gather_job* job = (const gsf__gather_job*)arg;
-    const gsf_rasterizer* r = job->r;
-    const size_t begin = chunk * GSF__PROJECT_CHUNK;
-    const size_t end = begin + GSF__PROJECT_CHUNK < r->splat_count ? begin + GSF__PROJECT_CHUNK : r->splat_count;
-#if GSF__X86
-    if (job->level >= GSF_CPU_AVX2) {
-        for (size_t i = begin; i < end; i += GSF__LANES_avx2)
-            gsf__gather_avx2(r, job->view, job->splats, job->grads, i, end - i);
-        return;
-    }
-#endif
-    for (size_t i = begin; i < end; i++) gsf__gather_scalar(r, job->view, job->splats, job->grads, i, end - i);
+    const gsf__splat_loop* job = (const gsf__splat_loop*)arg;
+    const size_t end = gsf__splat_chunk_end(job->r, chunk);
+    for (size_t i = chunk * GSF__PROJECT_CHUNK; i < end; i += GSF__KERNEL_OF(job->level, GSF__LANES))
+        GSF__KERNEL_OF(job->level, gsf__gather)(job->r, job->view, job->splats, job->grads, i, end - i);
 }
 
 // ---- >>render ------------------------------------------------------------------
@@ -8516,7 +8434,7 @@ static gsf_result gsf__reserve_frame(gsf_context* ctx, gsf_rasterizer* r) {
 
 typedef struct gsf__raster_job {
     gsf_rasterizer* r;
-    const gsf__raster_kernels* kernels;
+    gsf__raster_kernels kernels;
     const gsf__view* view;
     const gsf_render_output* out;
     const float *d_color, *d_depth, *d_alpha;
@@ -8575,7 +8493,7 @@ static void gsf__blend_chunk(void* arg, size_t index, int32_t worker) {
     gsf__tile_extent(r, &tile, &columns, &rows);
     memset(&state, 0, sizeof state);
     gsf__open_tile(state.T, columns, rows);
-    job->kernels->blend(&tile, &state, job->flags);
+    job->kernels.blend(&tile, &state, job->flags);
     const gsf_image *color = &job->out->color, *depth = &job->out->depth, *alpha = &job->out->alpha;
     const int packed = color->stride_c == sizeof(float) && color->stride_x == 3 * sizeof(float);
     const float* background = job->view->background;
@@ -8623,13 +8541,9 @@ GSF_API gsf_result gsf_splat_render(gsf_context* ctx, gsf_rasterizer* r, const g
     GSF__TRY(gsf__reserve_frame(ctx, r));
 
     const gsf__view view = gsf__make_view(splats, camera, desc);
-    gsf__project_job project;
-    project.r = r;
-    project.view = &view;
-    project.splats = splats;
+    gsf__splat_loop project = gsf__make_splat_loop(ctx, r, &view, splats);
     project.hidden = desc->hidden;
-    project.level = ctx->cpu_level;
-    gsf__parallel_for(ctx, (splats->count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__project_chunk, &project);
+    gsf__parallel_for(ctx, gsf__splat_chunks(r), gsf__project_chunk, &project);
     GSF__TRY(gsf__bin(ctx, r, &view));
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
     gsf__parallel_for(ctx, tiles, gsf__sort_tile, r);
@@ -8700,17 +8614,39 @@ static void gsf__reverse_chunk(void* arg, size_t index, int32_t worker) {
     while (next < tile.count) {
         memcpy(scratch->checkpoints + buckets * GSF__TILE_PIXELS, T, sizeof T);
         scratch->checkpoint_entry[buckets++] = (uint32_t)next;
-        next = job->kernels->keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
+        next = job->kernels.keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
     }
     // the last bucket's steps are still in the scratch memory; those of earlier buckets are recomputed from the
     // checkpoints
     while (buckets > 0) {
-        job->kernels->reverse(&tile, scratch->steps, scratch->heads, kept, &gradient, slots, slot_used, job->flags);
+        job->kernels.reverse(&tile, scratch->steps, scratch->heads, kept, &gradient, slots, slot_used, job->flags);
         if (--buckets == 0) break;
         memcpy(T, scratch->checkpoints + (buckets - 1) * GSF__TILE_PIXELS, sizeof T);
-        job->kernels->keep(&tile, T, scratch->checkpoint_entry[buckets - 1], scratch->checkpoint_entry[buckets],
+        job->kernels.keep(&tile, T, scratch->checkpoint_entry[buckets - 1], scratch->checkpoint_entry[buckets],
                            scratch->steps, scratch->heads, &kept);
     }
+}
+
+// checkpoints: buckets of the longest list.
+static gsf_result gsf__reserve_workers(gsf_context* ctx, gsf_rasterizer* r, size_t checkpoints) {
+    gsf__arena* arena = &r->worker_arena;
+    const int32_t count = ctx->parallel.worker_count;
+    if (r->worker_count >= count && r->checkpoint_capacity >= checkpoints) return GSF_OK;
+    arena->ctx = ctx;
+    gsf__arena_free(arena);
+    arena->failed = r->worker_count = 0;
+    r->checkpoint_capacity = checkpoints + checkpoints / 4;
+    r->workers = (gsf__worker_scratch*)gsf__arena_alloc(arena, (size_t)count, sizeof(gsf__worker_scratch));
+    for (int i = 0; r->workers && i < count; i++) {
+        gsf__worker_scratch* w = r->workers + i;
+        w->steps = (gsf__step*)gsf__arena_alloc(arena, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step));
+        w->heads = (gsf__step_head*)gsf__arena_alloc(arena, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step_head));
+        w->checkpoints = (float*)gsf__arena_alloc(arena, r->checkpoint_capacity, GSF__TILE_PIXELS * sizeof(float));
+        w->checkpoint_entry = (uint32_t*)gsf__arena_alloc(arena, r->checkpoint_capacity, sizeof(uint32_t));
+    }
+    if (arena->failed) return GSF_ERROR_OUT_OF_MEMORY;
+    r->worker_count = count;
+    return GSF_OK;
 }
 
 static gsf_result gsf__reserve_backward(gsf_context* ctx, gsf_rasterizer* r) {
@@ -8722,35 +8658,11 @@ static gsf_result gsf__reserve_backward(gsf_context* ctx, gsf_rasterizer* r) {
         GSF__TRY(gsf__grow(ctx, (void**)&r->slot_used, capacity, 1));
         r->slot_capacity = capacity;
     }
-    if (tiles > r->tile_background_capacity) {
-        r->tile_background_capacity = 0;
-        GSF__TRY(gsf__grow(ctx, (void**)&r->tile_background, tiles, 3 * sizeof(double)));
-        r->tile_background_capacity = tiles;
-    }
-    if (r->worker_count < ctx->parallel.worker_count) {
-        gsf__free_workers(ctx, r);
-        r->workers = (gsf__worker_scratch*)gsf_alloc_zeroed(ctx, (size_t)ctx->parallel.worker_count,
-                                                            sizeof(gsf__worker_scratch));
-        if (!r->workers) return GSF_ERROR_OUT_OF_MEMORY;
-        r->worker_count = ctx->parallel.worker_count;
-    }
+    GSF__TRY(gsf__reserve(ctx, (void**)&r->tile_background, &r->tile_background_capacity, 0, tiles, 3 * sizeof(double)));
     size_t longest = 0;
     for (size_t t = 0; t < tiles; t++)
         if (r->tile_begin[t + 1] - r->tile_begin[t] > longest) longest = r->tile_begin[t + 1] - r->tile_begin[t];
-    const size_t checkpoints = longest * GSF__STEPS / GSF__BUCKET + 2;
-    for (int i = 0; i < r->worker_count; i++) {
-        gsf__worker_scratch* w = r->workers + i;
-        if (!w->steps) w->steps = (gsf__step*)gsf_alloc(ctx, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step));
-        if (!w->heads) w->heads = (gsf__step_head*)gsf_alloc(ctx, GSF__BUCKET + GSF__STEPS + 1, sizeof(gsf__step_head));
-        if (!w->steps || !w->heads) return GSF_ERROR_OUT_OF_MEMORY;
-        if (checkpoints > w->checkpoint_capacity) {
-            w->checkpoint_capacity = 0;
-            GSF__TRY(gsf__grow(ctx, (void**)&w->checkpoints, checkpoints, GSF__TILE_PIXELS * sizeof(float)));
-            GSF__TRY(gsf__grow(ctx, (void**)&w->checkpoint_entry, checkpoints, sizeof(uint32_t)));
-            w->checkpoint_capacity = checkpoints;
-        }
-    }
-    return GSF_OK;
+    return gsf__reserve_workers(ctx, r, longest * GSF__STEPS / GSF__BUCKET + 2);
 }
 
 GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r, const gsf_splats* splats,
@@ -8787,13 +8699,9 @@ GSF_API gsf_result gsf_splat_render_backward(gsf_context* ctx, gsf_rasterizer* r
             for (size_t t = 0; t < tiles; t++) sum += r->tile_background[3 * t + (size_t)c];
             grads->background[c] += (float)sum;
         }
-    gsf__gather_job gather;
-    gather.r = r;
-    gather.view = &view;
-    gather.splats = splats;
+    gsf__splat_loop gather = gsf__make_splat_loop(ctx, r, &view, splats);
     gather.grads = grads;
-    gather.level = ctx->cpu_level;
-    gsf__parallel_for(ctx, (r->splat_count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK, gsf__gather_chunk, &gather);
+    gsf__parallel_for(ctx, gsf__splat_chunks(r), gsf__gather_chunk, &gather);
     return GSF_OK;
 }
 
@@ -9031,20 +8939,15 @@ GSF__TARGET_AVX2 static void gsf__loss_across_avx2(const float* v, size_t n, flo
 
 #endif
 
-static const gsf__loss_kernels* gsf__loss_kernels_of(gsf_cpu_level level) {
-    static const gsf__loss_kernels scalar = {gsf__loss_load_scalar, gsf__loss_down_scalar, gsf__loss_across_scalar,
-                                             gsf__loss_map_scalar, gsf__loss_gradient_scalar};
-#if GSF__X86
-    static const gsf__loss_kernels avx2 = {gsf__loss_load_avx2, gsf__loss_down_avx2, gsf__loss_across_avx2,
-                                           gsf__loss_map_avx2, gsf__loss_gradient_avx2};
-    if (level >= GSF_CPU_AVX2) return &avx2;
-#endif
-    (void)level;
-    return &scalar;
+static gsf__loss_kernels gsf__loss_kernels_of(gsf_cpu_level level) {
+    const gsf__loss_kernels kernels = {GSF__KERNEL_OF(level, gsf__loss_load), GSF__KERNEL_OF(level, gsf__loss_down),
+                                       GSF__KERNEL_OF(level, gsf__loss_across), GSF__KERNEL_OF(level, gsf__loss_map),
+                                       GSF__KERNEL_OF(level, gsf__loss_gradient)};
+    return kernels;
 }
 
 typedef struct gsf__loss_job {
-    const gsf__loss_kernels* k;
+    gsf__loss_kernels k;
     const gsf__target* target;
     const float* render;
     float* rows;
@@ -9128,7 +9031,7 @@ static void gsf__loss_fill_middle(const gsf__loss_job* job, const gsf__loss_buff
         for (size_t i = 0; i < 3; i++) row[i] = wide ? sorted[3 * p + (i + 2) % 3][count / 2] : 0.0f;
         for (size_t i = 3; i < job->n + 2 * margin; i++) row[i] = row[i - 3];
     }
-    job->k->load(NULL, NULL, NULL, b->middle[0] - margin, b->middle[1] - margin, 0, job->n + 2 * margin, b->outside - margin,
+    job->k.load(NULL, NULL, NULL, b->middle[0] - margin, b->middle[1] - margin, 0, job->n + 2 * margin, b->outside - margin,
                 job->row);
 }
 
@@ -9140,7 +9043,7 @@ static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b,
     for (size_t p = 0; p < planes; p++) {
         const float* v[4];
         for (size_t k = 0; k < 4; k++) v[k] = ring + (p * ring_rows + (g + k) * GSF__LOSS_GROUP % ring_rows) * job->row;
-        job->k->down(v, job->row, job->n, b->vertical);
+        job->k.down(v, job->row, job->n, b->vertical);
         for (size_t j = 0; j < GSF__LOSS_GROUP; j++) {
             float* sums = b->vertical + j * job->row;
             if (outside) {
@@ -9150,7 +9053,7 @@ static void gsf__loss_blur(const gsf__loss_job* job, const gsf__loss_buffers* b,
                 memset(sums - GSF__LOSS_MARGIN, 0, margin);
                 memset(sums + job->n, 0, margin);
             }
-            job->k->across(sums, job->n, b->sums + (p * GSF__LOSS_GROUP + j) * job->row);
+            job->k.across(sums, job->n, b->sums + (p * GSF__LOSS_GROUP + j) * job->row);
         }
     }
 }
@@ -9162,7 +9065,7 @@ static void gsf__loss_load_group(const gsf__loss_job* job, const gsf__loss_buffe
         const int32_t y = b->first - 2 * GSF__LOSS_RADIUS + at;
         const int inside = y >= 0 && y < target->height;
         const size_t from = inside ? (size_t)y * job->valid : 0;
-        job->k->load(inside ? gsf__loss_render(job, y, b->render) : NULL, target->f32 ? target->f32 + from : NULL,
+        job->k.load(inside ? gsf__loss_render(job, y, b->render) : NULL, target->f32 ? target->f32 + from : NULL,
                     target->u8 ? target->u8 + from : NULL, b->middle[0], b->middle[1], inside ? job->valid : 0, job->n,
                     b->images + (size_t)(at % GSF__LOSS_IMAGES) * job->row, GSF__LOSS_IMAGES * job->row);
     }
@@ -9178,7 +9081,7 @@ static void gsf__loss_map_group(const gsf__loss_job* job, const gsf__loss_buffer
         float* slopes = b->slopes + (size_t)(at % GSF__LOSS_SLOPES) * job->row;
         double other[2] = {0.0, 0.0};
         if (y >= 0 && y < job->target->height)
-            job->k->map(sums, GSF__LOSS_GROUP * job->row, s + GSF__LOSS_IMAGES * job->row, b->middle[0], b->middle[1],
+            job->k.map(sums, GSF__LOSS_GROUP * job->row, s + GSF__LOSS_IMAGES * job->row, b->middle[0], b->middle[1],
                        gsf__loss_weights(job, y, b->weight), job->n, slopes, GSF__LOSS_SLOPES * job->row,
                        y >= b->first && y < b->end ? totals : other);
         else
@@ -9192,7 +9095,7 @@ static void gsf__loss_gradient_group(const gsf__loss_job* job, const gsf__loss_b
     for (int32_t at = g * GSF__LOSS_GROUP; at < (g + 1) * GSF__LOSS_GROUP && b->first + at < b->end; at++) {
         const size_t packed = (size_t)(b->first + at) * job->valid;
         const float* s = b->images + (size_t)((at + 2 * GSF__LOSS_RADIUS) % GSF__LOSS_IMAGES) * job->row;
-        job->k->gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, s,
+        job->k.gradient(b->sums + (size_t)(at % GSF__LOSS_GROUP) * job->row, GSF__LOSS_GROUP * job->row, s,
                         s + GSF__LOSS_IMAGES * job->row, b->middle[1], gsf__loss_weights(job, b->first + at, b->weight),
                         gsf__loss_render(job, b->first + at, b->render), job->l1_scale, job->ssim_scale, job->valid,
                         job->d_render + packed);
@@ -9422,6 +9325,32 @@ static size_t gsf__model_layout(gsf__model* model, size_t capacity, char* block)
     return at;
 }
 
+enum { // ranges of the model's columns
+    GSF__MOMENT_COLUMNS = GSF__GROUPS,                    // after the values of all groups
+    GSF__ID_COLUMN = 3 * GSF__GROUPS,                     // after first and second moments
+    GSF__SAVED_COLUMNS = GSF__ID_COLUMN + 5,              // with the statistics: all that a checkpoint holds
+    GSF__COLUMNS = GSF__SAVED_COLUMNS + GSF__GROUPS + 6,  // with what lives within a step
+};
+
+// All arrays of the model that have a row per splat.
+static void gsf__model_columns(const gsf__model* model, gsf__column out[GSF__COLUMNS]) {
+    const gsf__column rest[] = {
+        {(char*)model->ids, 4}, {(char*)model->grad_sum[0], 4}, {(char*)model->visits[0], 4},
+        {(char*)model->grad_sum[1], 4}, {(char*)model->visits[1], 4}, {(char*)model->screen[0], 8},
+        {(char*)model->screen[1], 8}, {(char*)model->seen[0], 1}, {(char*)model->seen[1], 1},
+        {(char*)model->hidden, 1}, {(char*)model->action, 1}};
+    memcpy(out + GSF__ID_COLUMN, rest, sizeof rest);
+    for (int g = 0; g < GSF__GROUPS; g++) {
+        const gsf__group* group = &model->groups[g];
+        float* const arrays[4] = {group->value, group->m, group->v, group->grad};
+        for (int k = 0; k < 4; k++) {
+            gsf__column* column = out + (k < 3 ? k * GSF__GROUPS : GSF__COLUMNS - GSF__GROUPS) + g;
+            column->data = (char*)arrays[k];
+            column->row = group->width * sizeof(float);
+        }
+    }
+}
+
 // Grows the capacity to at least `needed` splats and keeps the existing rows. Out of memory: the model is unchanged.
 static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t needed) {
     if (needed <= model->capacity && model->block) return GSF_OK;
@@ -9434,27 +9363,11 @@ static gsf_result gsf__model_reserve(gsf_context* ctx, gsf__model* model, size_t
     (void)gsf__model_layout(&grown, capacity, block);
     grown.block = block;
     grown.capacity = capacity;
-    const size_t n = model->count;
-    if (n) {
-        for (int g = 0; g < GSF__GROUPS; g++) {
-            const gsf__group *from = &model->groups[g], *to = &grown.groups[g];
-            const size_t bytes = n * from->width * sizeof(float);
-            memcpy(to->value, from->value, bytes);
-            memcpy(to->m, from->m, bytes);
-            memcpy(to->v, from->v, bytes);
-            memcpy(to->grad, from->grad, bytes);
-        }
-        memcpy(grown.ids, model->ids, n * sizeof(uint32_t));
-        for (int i = 0; i < 2; i++) {
-            memcpy(grown.grad_sum[i], model->grad_sum[i], n * sizeof(float));
-            memcpy(grown.visits[i], model->visits[i], n * sizeof(uint32_t));
-            memcpy(grown.screen[i], model->screen[i], 2 * n * sizeof(float));
-            memcpy(grown.seen[i], model->seen[i], n);
-        }
-        memcpy(grown.hidden, model->hidden, n);
-        memcpy(grown.rest, model->rest, gsf__model_blocks(n));
-        memcpy(grown.action, model->action, n);
-    }
+    gsf__column from[GSF__COLUMNS], to[GSF__COLUMNS];
+    gsf__model_columns(model, from);
+    gsf__model_columns(&grown, to);
+    for (int k = 0; k < GSF__COLUMNS && model->count; k++) memcpy(to[k].data, from[k].data, model->count * from[k].row);
+    if (model->count) memcpy(grown.rest, model->rest, gsf__model_blocks(model->count));
     gsf_free(ctx, model->block);
     *model = grown;
     return GSF_OK;
@@ -9636,15 +9549,8 @@ static void gsf__lazy_prepare(gsf_cpu_level level, gsf__lazy* lazy, gsf__model* 
     lazy->model = model;
     lazy->active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
     for (int i = 0; i < 48; i++) lazy->rates[i] = (float)(i < 3 ? rates->sh_dc : rates->sh_rest);
-    lazy->update = gsf__adam_update_scalar;
-    lazy->catch_up = gsf__lazy_catch_up_scalar;
-#if GSF__X86
-    if (level >= GSF_CPU_AVX2) {
-        lazy->update = gsf__adam_update_avx2;
-        lazy->catch_up = gsf__lazy_catch_up_avx2;
-    }
-#endif
-    (void)level;
+    lazy->update = GSF__KERNEL_OF(level, gsf__adam_update);
+    lazy->catch_up = GSF__KERNEL_OF(level, gsf__lazy_catch_up);
     memset(&lazy->rests[0], 0, sizeof lazy->rests[0]);
     const double b1 = 1.0 - (double)0.1f, b2 = (double)0.999f, root2 = sqrt(b2); // rounded as in gsf__adam_vector
     double power1 = pow(0.9, t), power2 = pow(0.999, t), decay1 = 1.0, decay2 = 1.0, drift = 0.0, scaled = 0.0;
@@ -9780,10 +9686,7 @@ static size_t gsf__adam_step(gsf_context* ctx, gsf__model* model, const gsf__ada
     for (size_t i = 0; i < 8 * width; i++)
         job.sh_rates[i] = (float)((i % width < 3 ? rates->sh_dc : rates->sh_rest) / correction1);
     job.active_sh = 3 * (size_t)sh_bands * (size_t)sh_bands;
-    job.update = gsf__adam_update_scalar;
-#if GSF__X86
-    if (ctx->cpu_level >= GSF_CPU_AVX2) job.update = gsf__adam_update_avx2;
-#endif
+    job.update = GSF__KERNEL_OF(ctx->cpu_level, gsf__adam_update);
     if (model->lazy) gsf__lazy_prepare(ctx->cpu_level, model->lazy, model, rates, t, sh_bands);
     const size_t chunks = gsf__model_chunks(model->count);
     gsf__parallel_for(ctx, chunks, gsf__adam_chunk, &job);
@@ -9871,18 +9774,16 @@ static void gsf__densify_select(const gsf__model* model, const gsf__densify_rule
 }
 
 static void gsf__model_clear_moments(gsf__model* model, size_t i) {
-    for (int g = 0; g < GSF__GROUPS; g++) {
-        gsf__group* group = &model->groups[g];
-        memset(group->m + i * group->width, 0, group->width * sizeof(float));
-        memset(group->v + i * group->width, 0, group->width * sizeof(float));
-    }
+    gsf__column columns[GSF__COLUMNS];
+    gsf__model_columns(model, columns);
+    for (int k = GSF__MOMENT_COLUMNS; k < GSF__ID_COLUMN; k++) memset(columns[k].data + i * columns[k].row, 0, columns[k].row);
 }
 
 static void gsf__model_copy_row(gsf__model* model, size_t from, size_t to) { // as a new splat: zero moments, new id
     for (int g = 0; g < GSF__GROUPS; g++) {
-        gsf__group* group = &model->groups[g];
-        const size_t width = group->width;
-        memcpy(group->value + to * width, group->value + from * width, width * sizeof(float));
+        const size_t width = model->groups[g].width;
+        float* value = model->groups[g].value;
+        memcpy(value + to * width, value + from * width, width * sizeof(float));
     }
     gsf__model_clear_moments(model, to);
     model->action[to] = GSF__KEEP;
@@ -9924,21 +9825,15 @@ static void gsf__densify_child(gsf__model* model, size_t parent, size_t child, c
 static void gsf__densify_compact(gsf__model* model, const gsf__densify_rule* rule) {
     const float opacity_logit = (float)log(rule->prune_opacity / (1.0 - rule->prune_opacity));
     const float scale_log = rule->prune_scale > 0.0 ? (float)log(rule->prune_scale) : FLT_MAX;
+    gsf__column columns[GSF__COLUMNS];
+    gsf__model_columns(model, columns);
     size_t kept = 0;
     for (size_t i = 0; i < model->count; i++) {
         if (model->action[i] == GSF__SPLIT || model->groups[GSF__OPACITY].value[i] < opacity_logit ||
             gsf__model_max_log_scale(model, i) > scale_log)
             continue;
-        if (kept != i) {
-            for (int g = 0; g < GSF__GROUPS; g++) { // gradients need no copy: all are zero between steps
-                gsf__group* group = &model->groups[g];
-                const size_t width = group->width;
-                memcpy(group->value + kept * width, group->value + i * width, width * sizeof(float));
-                memcpy(group->m + kept * width, group->m + i * width, width * sizeof(float));
-                memcpy(group->v + kept * width, group->v + i * width, width * sizeof(float));
-            }
-            model->ids[kept] = model->ids[i];
-        }
+        for (int k = 0; k <= GSF__ID_COLUMN && kept != i; k++) // gradients need no copy: all are zero between steps
+            memcpy(columns[k].data + kept * columns[k].row, columns[k].data + i * columns[k].row, columns[k].row);
         kept++;
     }
     model->count = kept;
@@ -10434,25 +10329,30 @@ static gsf_result gsf__trainer_median_depth(gsf_context* ctx, const gsf_trainer*
     return GSF_OK;
 }
 
-// Sets desc.extent to 1.1 times the largest distance of a camera from their mean. If that is (nearly) zero, as for a
-// single camera, uses the median depth of the initial splats instead, or 1 if no splat is in front of a camera.
-static gsf_result gsf__trainer_find_extent(gsf_context* ctx, gsf_trainer* trainer) {
-    double mean[3] = {0.0, 0.0, 0.0}, largest = 0.0, median = 0.0;
-    const size_t count = trainer->photos.count;
-    double first[3]; // centres are taken relative to the first one, so that large coordinates cost no precision
-    gsf_get_camera_center(&trainer->photos.photos[0].camera, first);
+// Largest distance of a camera centre from their mean. `stride`: bytes from one camera to the next.
+static double gsf__camera_spread(const gsf_camera* cameras, size_t stride, size_t count) {
+    double mean[3] = {0.0, 0.0, 0.0}, first[3], largest = 0.0;
     for (int pass = 0; pass < 2; pass++)
         for (size_t i = 0; i < count; i++) {
             double c[3], d2 = 0.0;
-            gsf_get_camera_center(&trainer->photos.photos[i].camera, c);
+            gsf_get_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
+            if (pass == 0 && i == 0) memcpy(first, c, sizeof first); // relative to it, large coordinates stay precise
             for (int a = 0; a < 3; a++) {
                 if (pass == 0) mean[a] += (c[a] - first[a]) / (double)count;
                 d2 += (c[a] - first[a] - mean[a]) * (c[a] - first[a] - mean[a]);
             }
             if (pass == 1 && sqrt(d2) > largest) largest = sqrt(d2);
         }
+    return largest;
+}
+
+// Sets desc.extent to 1.1 times the largest distance of a camera from their mean. If that is (nearly) zero, as for a
+// single camera, uses the median depth of the initial splats instead, or 1 if no splat is in front of a camera.
+static gsf_result gsf__trainer_find_extent(gsf_context* ctx, gsf_trainer* trainer) {
+    const gsf__photo_set* set = &trainer->photos;
+    double median = 0.0;
     GSF__TRY(gsf__trainer_median_depth(ctx, trainer, &median));
-    double extent = 1.1 * largest;
+    double extent = 1.1 * gsf__camera_spread(&set->photos->camera, sizeof *set->photos, set->count);
     if (!(extent > 1e-6 * median) || extent < 1e-20) extent = median > 1e-20 ? median : 1.0;
     trainer->desc.extent = extent < 1e30 ? (float)extent : 1e30f;
     return GSF_OK;
@@ -10560,18 +10460,6 @@ static void gsf__visit_chunk(void* arg, size_t chunk, int32_t worker) {
     }
 }
 
-// e^x for x <= 88 with a relative error below 2e-7: 2^n times a Taylor polynomial on [-ln2/2, ln2/2].
-static float gsf__exp_poly(float x) {
-    if (x < -87.0f) return 0.0f;
-    const float n = floorf(x * 1.44269504f + 0.5f), r = (x - n * 0.693359375f) + n * 2.12194440e-4f;
-    const float p = 1.0f + r * (1.0f + r * (0.5f + r * (0.166666667f + r * (0.0416666667f + r * (8.33333333e-3f +
-                                                                                                 r * 1.38888889e-3f)))));
-    const uint32_t bits = (uint32_t)((int32_t)n + 127) << 23;
-    float power;
-    memcpy(&power, &bits, sizeof power);
-    return p * power;
-}
-
 // Adds the gradients of weight * mean(exp(log_scale)) / extent and of weight * mean(opacity).
 typedef struct gsf__penalty_job {
     gsf__model* model;
@@ -10585,7 +10473,7 @@ static void gsf__penalty_chunk(void* arg, size_t chunk, int32_t worker) {
     (void)worker;
     const size_t begin = chunk * GSF__MODEL_CHUNK, end = gsf__model_chunk_end(job->model->count, chunk);
     for (size_t i = 3 * begin; job->scale > 0.0f && i < 3 * end; i++)
-        scales->grad[i] += job->scale * gsf__exp_poly(scales->value[i] < 80.0f ? scales->value[i] : 80.0f);
+        scales->grad[i] += job->scale * gsf__exp(scales->value[i] < 80.0f ? scales->value[i] : 80.0f);
     for (size_t i = begin; job->opacity > 0.0f && i < end; i++)
         logits->grad[i] += job->opacity * gsf__sigmoid(logits->value[i]) * gsf__sigmoid(-logits->value[i]);
 }
@@ -10615,7 +10503,7 @@ static void gsf__noise_chunk(void* arg, size_t chunk, int32_t worker) {
         for (size_t a = 0; a < 3; a++)
             normal[a] = gsf_draw_normal(job->seed, job->stream, (uint64_t)model->ids[i] * 3 + a);
         for (int a = 0; a < 3; a++) {
-            const double variance = (double)gsf__exp_poly(scale[a] < 40.0f ? 2.0f * scale[a] : 80.0f);
+            const double variance = (double)gsf__exp(scale[a] < 40.0f ? 2.0f * scale[a] : 80.0f);
             axis[a] = variance * (r[a] * normal[0] + r[3 + a] * normal[1] + r[6 + a] * normal[2]);
         }
         const double amount = job->rate * (double)gsf__sigmoid(steep);
@@ -10895,27 +10783,9 @@ static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
     return hash;
 }
 
-// Tag, data and bytes per splat of array i of a checkpoint. Returns 0 after the last one.
-static int gsf__trainer_array(const gsf__model* model, int i, char tag[5], void** data, size_t* row) {
-    if (i < 3 * GSF__GROUPS) {
-        const gsf__group* group = &model->groups[i % GSF__GROUPS];
-        float* const arrays[3] = {group->value, group->m, group->v};
-        memcpy(tag, "T?? ", 5);
-        tag[1] = "VMS"[i / GSF__GROUPS];
-        tag[2] = (char)('0' + i % GSF__GROUPS);
-        *data = arrays[i / GSF__GROUPS];
-        *row = group->width * sizeof(float);
-        return 1;
-    }
-    void* const rest[] = {model->ids, model->grad_sum[0], model->visits[0], model->grad_sum[1], model->visits[1]};
-    const char* const tags[] = {"TIDS", "TGRD", "TVIS", "TGRR", "TVIR"};
-    i -= 3 * GSF__GROUPS;
-    if (i >= (int)GSF__COUNT(rest)) return 0;
-    memcpy(tag, tags[i], 5);
-    *data = rest[i];
-    *row = 4;
-    return 1;
-}
+static const char gsf__column_tags[GSF__SAVED_COLUMNS][5] = {
+    "TV0 ", "TV1 ", "TV2 ", "TV3 ", "TV4 ", "TM0 ", "TM1 ", "TM2 ", "TM3 ", "TM4 ",
+    "TS0 ", "TS1 ", "TS2 ", "TS3 ", "TS4 ", "TIDS", "TGRD", "TVIS", "TGRR", "TVIR"};
 
 GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* trainer, gsf_buffer* chunks) {
     const gsf__model* model = &trainer->model;
@@ -10933,17 +10803,12 @@ GSF_API void gsf_splat_format_trainer(gsf_context* ctx, const gsf_trainer* train
     gsf__store_le(state + 32, trainer->restored_steps, 8);
     gsf__store_le(state + 40, trainer->rejected, 8);
     gsf__store_le(state + 48, gsf__trainer_settings(trainer), 8);
-    for (int a = 0; a < 3; a++) {
-        uint64_t bits;
-        memcpy(&bits, &trainer->view.origin[a], 8);
-        gsf__store_le(state + 56 + 8 * a, bits, 8);
-    }
+    for (int a = 0; a < 3; a++) gsf__store_f64(state + 56 + 8 * a, trainer->view.origin[a]);
     gsf_append_chunk(ctx, chunks, "TRNR", state, sizeof state);
-    char tag[5];
-    void* data;
-    size_t row;
-    for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
-        gsf_append_chunk(ctx, chunks, tag, data, model->count * row);
+    gsf__column columns[GSF__COLUMNS];
+    gsf__model_columns(model, columns);
+    for (int k = 0; k < GSF__SAVED_COLUMNS; k++)
+        gsf_append_chunk(ctx, chunks, gsf__column_tags[k], columns[k].data, model->count * columns[k].row);
     gsf_append_chunk(ctx, chunks, "TRST", model->rest, gsf__model_blocks(model->count));
 }
 
@@ -10960,9 +10825,9 @@ static gsf_result gsf__trainer_check_array(gsf_context* ctx, const char* name, i
         memcpy(&bits, p + 4 * k, 4);
         memcpy(&value, p + 4 * k, 4);
         int ok = 1;
-        if (i < 3 * GSF__GROUPS || i == 3 * GSF__GROUPS + 1)
+        if (i < GSF__ID_COLUMN || i == GSF__ID_COLUMN + 1)
             ok = fabsf(value) <= FLT_MAX && (i < 2 * GSF__GROUPS || value >= 0.0f);
-        else if (i == 3 * GSF__GROUPS) ok = bits < next_id;
+        else if (i == GSF__ID_COLUMN) ok = bits < next_id;
         if (!ok) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s: bad value at %zu", name, chunk->tag, 4 * k);
     }
     return GSF_OK;
@@ -10994,17 +10859,15 @@ GSF_API gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* traine
                         (unsigned long long)sh_degree, (int)model->sh_degree, (unsigned long long)count);
     double origin[3];
     for (int a = 0; a < 3; a++) {
-        const uint64_t bits = gsf__load_le(state + 56 + 8 * a, 8);
-        memcpy(&origin[a], &bits, 8);
+        origin[a] = gsf__load_f64(state + 56 + 8 * a);
         if (!isfinite(origin[a])) return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: origin is not finite", name);
     }
-    char tag[5];
-    void* data;
-    size_t row;
-    for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++) {
-        if (!gsf_find_chunk(chunks, size, tag, &chunk))
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s is missing", name, tag);
-        GSF__TRY(gsf__trainer_check_array(ctx, name, i, &chunk, (size_t)count, row, next_id));
+    gsf__column columns[GSF__COLUMNS];
+    gsf__model_columns(model, columns);
+    for (int k = 0; k < GSF__SAVED_COLUMNS; k++) {
+        if (!gsf_find_chunk(chunks, size, gsf__column_tags[k], &chunk))
+            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s is missing", name, gsf__column_tags[k]);
+        GSF__TRY(gsf__trainer_check_array(ctx, name, k, &chunk, (size_t)count, columns[k].row, next_id));
     }
     const size_t blocks = gsf__model_blocks((size_t)count);
     if (!gsf_find_chunk(chunks, size, "TRST", &chunk) || chunk.size != blocks)
@@ -11019,8 +10882,10 @@ GSF_API gsf_result gsf_splat_parse_trainer(gsf_context* ctx, gsf_trainer* traine
     gsf__trainer_hide(trainer);
     memset(model->rest, 0, gsf__model_blocks(model->capacity));
     if (blocks) memcpy(model->rest, chunk.data, blocks);
-    for (int i = 0; gsf__trainer_array(model, i, tag, &data, &row); i++)
-        if (gsf_find_chunk(chunks, size, tag, &chunk) && chunk.size) memcpy(data, chunk.data, chunk.size);
+    gsf__model_columns(model, columns); // anew, because the arrays may have been moved
+    for (int k = 0; k < GSF__SAVED_COLUMNS; k++)
+        if (gsf_find_chunk(chunks, size, gsf__column_tags[k], &chunk) && chunk.size)
+            memcpy(columns[k].data, chunk.data, chunk.size);
     model->count = (size_t)count;
     model->next_id = next_id;
     memcpy(trainer->view.origin, origin, sizeof origin);
@@ -11103,15 +10968,11 @@ GSF_API gsf_result gsf_splat_render_trainer(gsf_context* ctx, gsf_trainer* train
 GSF_API gsf_result gsf_splat_copy_trained(gsf_context* ctx, const gsf_trainer* trainer, gsf_splats* out) {
     const gsf_splats* view = gsf__trainer_show(ctx, (gsf_trainer*)trainer);
     GSF__TRY(gsf_splat_make(ctx, view->count, view->sh_degree, out));
-    const size_t n = view->count, sh = 3 * (size_t)gsf_splat_count_sh(view->sh_degree);
+    gsf__column from[GSF__SPLAT_COLUMNS], to[GSF__SPLAT_COLUMNS];
     memcpy(out->origin, view->origin, sizeof out->origin);
-    if (n == 0) return GSF_OK;
-    memcpy(out->means, view->means, 3 * n * sizeof(float));
-    memcpy(out->log_scales, view->log_scales, 3 * n * sizeof(float));
-    memcpy(out->quats, view->quats, 4 * n * sizeof(float));
-    memcpy(out->opacity_logits, view->opacity_logits, n * sizeof(float));
-    memcpy(out->sh, view->sh, sh * n * sizeof(float));
-    memcpy(out->ids, view->ids, n * sizeof(uint32_t));
+    gsf__splat_columns(view, from);
+    gsf__splat_columns(out, to);
+    for (int k = 0; k < GSF__SPLAT_COLUMNS && view->count; k++) memcpy(to[k].data, from[k].data, view->count * to[k].row);
     return GSF_OK;
 }
 
@@ -11425,25 +11286,13 @@ static void gsf__warp_draw(const gsf__warp_reference* ref, const gsf_camera* cam
     }
 }
 
-// Cosine of the angle at `point` between the directions to two camera centres.
-static double gsf__warp_cosine(const double point[3], const double a[3], const double b[3]) {
-    double along = 0.0, n0 = 0.0, n1 = 0.0;
-    for (int c = 0; c < 3; c++) {
-        const double p = point[c] - a[c], q = point[c] - b[c];
-        along += p * q;
-        n0 += p * p;
-        n1 += q * q;
-    }
-    return along / sqrt(n0 * n1 + 1e-300);
-}
-
 // Finds the references whose viewing direction to their focus is closest to that of a camera at `center`. Ties go to
 // the lower index. Returns their number.
 static int gsf__warp_nearest(const gsf__warp* warp, const double center[3], int32_t nearest[GSF__WARP_NEAREST]) {
     double best[GSF__WARP_NEAREST];
     int count = 0;
     for (int32_t k = 0; k < warp->count; k++) {
-        const double cosine = gsf__warp_cosine(warp->references[k].focus, center, warp->references[k].center);
+        const double cosine = gsf__ray_cosine(warp->references[k].focus, center, warp->references[k].center);
         int at = count < GSF__WARP_NEAREST ? count++ : GSF__WARP_NEAREST;
         for (; at > 0 && best[at - 1] < cosine; at--)
             if (at < GSF__WARP_NEAREST) {
@@ -11512,7 +11361,7 @@ static float gsf__warp_pixel(const gsf__warp* warp, const int32_t* nearest, int 
         gsf__unproject(camera, x + 0.5, y + 0.5, 1.0 / (double)inverse, point);
         if (!gsf_project_point(&at->ref->camera, point, &u, &v, &z)) continue;
         if (!gsf__find_taps(&at->ref->camera, u, v, &at->taps)) continue;
-        const double cosine = gsf__warp_cosine(point, center, at->ref->center);
+        const double cosine = gsf__ray_cosine(point, center, at->ref->center);
         const float angle2 = (float)(2.0 - 2.0 * (cosine < 1.0 ? cosine : 1.0)); // the squared angle, to second order
         const float score = gsf__sample_bytes(at->ref->score, 1, 0, 100.0, &at->taps);
         if (!(score > 0.0f)) continue;
@@ -11690,38 +11539,25 @@ GSF_API gsf_result gsf_splat_render_seen_mask(gsf_context* ctx, const gsf_splats
     if (mask->dtype != GSF_U8 || mask->channels != 1 || mask->width != camera->width || mask->height != camera->height)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "seen mask: mask must be u8, 1 channel, of the camera's size");
     gsf_rasterizer* rasterizer = NULL;
-    gsf__warp_reference* others = NULL;
-    gsf__seen_job job;
-    memset(&job, 0, sizeof job);
+    gsf__arena arena = {ctx, NULL, 0};
     const size_t pixels = (size_t)camera->width * (size_t)camera->height;
-    float* planes = (float*)gsf_alloc(ctx, pixels, 2 * sizeof(float));
-    gsf_result result = planes ? gsf_splat_make_rasterizer(ctx, &rasterizer) : GSF_ERROR_OUT_OF_MEMORY;
-    if (result == GSF_OK) {
-        others = (gsf__warp_reference*)gsf_alloc_zeroed(ctx, seeing_count + 1, sizeof *others);
-        if (!others) result = GSF_ERROR_OUT_OF_MEMORY;
-    }
+    float* planes = (float*)gsf__arena_alloc(&arena, pixels, 2 * sizeof(float));
+    gsf__warp_reference* others = (gsf__warp_reference*)gsf__arena_alloc_zeroed(&arena, seeing_count, sizeof *others);
+    gsf_result result = arena.failed ? GSF_ERROR_OUT_OF_MEMORY : gsf_splat_make_rasterizer(ctx, &rasterizer);
     if (result == GSF_OK) result = gsf__render_depth(ctx, rasterizer, splats, camera, planes, planes + pixels);
     for (size_t k = 0; k < seeing_count && result == GSF_OK; k++) {
         result = gsf_check_camera(ctx, seeing + k);
         if (result != GSF_OK) break;
         others[k].camera = seeing[k];
-        others[k].depth = (float*)gsf_alloc(ctx, (size_t)seeing[k].width * (size_t)seeing[k].height, sizeof(float));
+        others[k].depth = (float*)gsf__arena_alloc(&arena, (size_t)seeing[k].width * (size_t)seeing[k].height, sizeof(float));
         result = others[k].depth ? gsf__render_depth(ctx, rasterizer, splats, seeing + k, others[k].depth, NULL)
                                  : GSF_ERROR_OUT_OF_MEMORY;
     }
     if (result == GSF_OK) {
-        job.camera = camera;
-        job.seeing = seeing;
-        job.seeing_count = seeing_count;
-        job.depth = planes;
-        job.alpha = planes + pixels;
-        job.others = others;
-        job.mask = mask;
+        gsf__seen_job job = {camera, seeing, seeing_count, planes, planes + pixels, others, mask};
         gsf__parallel_for(ctx, (size_t)camera->height, gsf__seen_row, &job);
     }
-    for (size_t k = 0; others && k < seeing_count; k++) gsf_free(ctx, others[k].depth);
-    gsf_free(ctx, others);
-    gsf_free(ctx, planes);
+    gsf__arena_free(&arena);
     gsf_splat_destroy_rasterizer(ctx, rasterizer);
     return result;
 }
@@ -11773,6 +11609,13 @@ static void gsf__drop_window(gsf_context* ctx, gsf_fixer* f) {
     }
 }
 
+static void gsf__drop_path(gsf_context* ctx, gsf_fixer* f) {
+    gsf_free(ctx, f->path);
+    gsf_free(ctx, f->reference_index);
+    f->path = NULL;
+    f->reference_index = NULL;
+}
+
 static void gsf__close_references(gsf_context* ctx, gsf_fixer* f) {
     if (!f->references_open) return;
     f->restorer->end_fn(f->restorer->user, ctx);
@@ -11786,9 +11629,8 @@ GSF_API void gsf_splat_destroy_fixer(gsf_context* ctx, gsf_fixer* f) {
     gsf_splat_destroy_warp(ctx, &f->explain);
     gsf__drop_window(ctx, f);
     gsf__drop_frames(ctx, &f->pending);
+    gsf__drop_path(ctx, f);
     gsf_free(ctx, f->cameras);
-    gsf_free(ctx, f->path);
-    gsf_free(ctx, f->reference_index);
     gsf_splat_destroy_trainer(ctx, f->trainer);
     gsf_free(ctx, f);
 }
@@ -11911,7 +11753,12 @@ static void gsf__spread_path(gsf_fixer* f) { // samples desc.path evenly, for al
     }
 }
 
-static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
+static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) { // of round f->round
+    const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
+    gsf__drop_path(ctx, f);
+    f->path = (gsf_camera*)gsf_alloc(ctx, total, sizeof(gsf_camera));
+    f->reference_index = (int32_t*)gsf_alloc(ctx, total, sizeof(int32_t));
+    if (!f->path || !f->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
     if (f->desc.path_count) {
         gsf__spread_path(f);
         return GSF_OK;
@@ -11927,7 +11774,7 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
     desc.points = f->desc.points;
     desc.point_count = f->desc.point_count;
     GSF__TRY(gsf_traj_query_path(ctx, f->view_count, &desc, &layout));
-    GSF_ASSERT(layout.frame_count == (size_t)f->desc.windows * (size_t)f->frames);
+    GSF_ASSERT(layout.frame_count == total);
     void* scratch = gsf_alloc(ctx, layout.scratch_bytes, 1);
     if (!scratch) return GSF_ERROR_OUT_OF_MEMORY;
     const gsf_result result =
@@ -11938,15 +11785,9 @@ static gsf_result gsf__sample_path(gsf_context* ctx, gsf_fixer* f) {
 
 // Samples the path of every round once, so that an impossible path is reported before training starts.
 static gsf_result gsf__check_paths(gsf_context* ctx, gsf_fixer* f) {
-    const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
-    f->path = (gsf_camera*)gsf_alloc(ctx, total, sizeof(gsf_camera));
-    f->reference_index = (int32_t*)gsf_alloc(ctx, total, sizeof(int32_t));
-    gsf_result result = f->path && f->reference_index ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
+    gsf_result result = GSF_OK;
     for (f->round = 0; result == GSF_OK && f->round < f->desc.rounds; f->round++) result = gsf__sample_path(ctx, f);
-    gsf_free(ctx, f->path);
-    gsf_free(ctx, f->reference_index);
-    f->path = NULL;
-    f->reference_index = NULL;
+    gsf__drop_path(ctx, f);
     f->round = 0;
     return result;
 }
@@ -12005,14 +11846,8 @@ static int gsf__round_is_due(const gsf_fixer* f) {
 static gsf_result gsf__plan_round(gsf_context* ctx, gsf_fixer* f) {
     f->planned = 0;
     gsf__drop_window(ctx, f);
-    const size_t total = (size_t)f->desc.windows * (size_t)f->frames;
-    gsf_free(ctx, f->path);
-    gsf_free(ctx, f->reference_index);
-    f->path = (gsf_camera*)gsf_alloc(ctx, total, sizeof(gsf_camera));
-    f->reference_index = (int32_t*)gsf_alloc(ctx, total, sizeof(int32_t));
-    if (!f->path || !f->reference_index) return GSF_ERROR_OUT_OF_MEMORY;
     GSF__TRY(gsf__sample_path(ctx, f));
-    for (size_t i = 0; i < total; i++) f->path[i] = gsf__frame_camera(f, f->path + i);
+    for (int32_t i = 0; i < f->desc.windows * f->frames; i++) f->path[i] = gsf__frame_camera(f, f->path + i);
 
     gsf_image** const sets[] = {&f->rendered, &f->depth, &f->alpha, &f->restored, &f->confidence};
     for (size_t s = 0; s < GSF__COUNT(sets); s++) {
@@ -12130,24 +11965,28 @@ static gsf_result gsf__restore_or_skip(gsf_context* ctx, const gsf_fixer* f, con
     return f->restorer->restore_fn(f->restorer->user, ctx, window);
 }
 
+// Appends a frame. pixels: its bytes, NULL = to be filled in by the caller.
+static gsf_result gsf__add_frame(gsf_context* ctx, gsf__kept_frames* list, const gsf_camera* camera, const void* pixels) {
+    const size_t bytes = 4 * (size_t)camera->width * (size_t)camera->height;
+    GSF__TRY(gsf__reserve(ctx, (void**)&list->frames, &list->capacity, list->count, list->count + 1, sizeof *list->frames));
+    gsf__kept_frame* frame = list->frames + list->count;
+    frame->camera = *camera;
+    frame->pixels = (uint8_t*)gsf_alloc(ctx, bytes, 1);
+    if (!frame->pixels) return GSF_ERROR_OUT_OF_MEMORY;
+    if (pixels) memcpy(frame->pixels, pixels, bytes);
+    list->count++;
+    return GSF_OK;
+}
+
 static gsf_result gsf__keep_frame(gsf_context* ctx, gsf_fixer* f, const gsf_camera* camera, const gsf_image* color,
                                   const gsf_image* confidence) {
-    gsf__kept_frames* list = &f->pending;
-    const size_t pixels = (size_t)camera->width * (size_t)camera->height;
-    GSF__TRY(gsf__reserve(ctx, (void**)&list->frames, &list->capacity, list->count, list->count + 1, sizeof *list->frames));
-    uint8_t* memory = (uint8_t*)gsf_alloc(ctx, pixels, 4);
-    if (!memory) return GSF_ERROR_OUT_OF_MEMORY;
-    const gsf_image rgb = gsf_wrap_image(memory, GSF_U8, camera->width, camera->height, 3);
-    const gsf_image weight = gsf_wrap_image(memory + 3 * pixels, GSF_U8, camera->width, camera->height, 1);
-    gsf_result result = gsf_convert_image(ctx, color, &rgb);
-    if (result == GSF_OK) result = gsf_convert_image(ctx, confidence, &weight);
-    if (result != GSF_OK) {
-        gsf_free(ctx, memory);
-        return result;
-    }
-    list->frames[list->count].camera = *camera;
-    list->frames[list->count++].pixels = memory;
-    return GSF_OK;
+    GSF__TRY(gsf__add_frame(ctx, &f->pending, camera, NULL));
+    uint8_t* pixels = f->pending.frames[f->pending.count - 1].pixels;
+    const gsf_image rgb = gsf_wrap_image(pixels, GSF_U8, camera->width, camera->height, 3);
+    const gsf_image weight = gsf_wrap_image(pixels + 3 * (size_t)camera->width * (size_t)camera->height, GSF_U8,
+                                            camera->width, camera->height, 1);
+    GSF__TRY(gsf_convert_image(ctx, color, &rgb));
+    return gsf_convert_image(ctx, confidence, &weight);
 }
 
 // Converts kept frames to a photo set for gsf__restored_take.
@@ -12311,11 +12150,7 @@ static void gsf__save_frame(gsf_context* ctx, gsf_buffer* chunks, const gsf_came
     numbers[17] = camera->fy;
     numbers[18] = camera->cx;
     numbers[19] = camera->cy;
-    for (int k = 0; k < 20; k++) {
-        uint64_t bits;
-        memcpy(&bits, numbers + k, sizeof bits);
-        gsf__store_le(head + 8 * k, bits, 8);
-    }
+    for (int k = 0; k < 20; k++) gsf__store_f64(head + 8 * k, numbers[k]);
     gsf__store_le(head + 160, (uint32_t)camera->width, 4);
     gsf__store_le(head + 164, (uint32_t)camera->height, 4);
     gsf_append_bytes(ctx, chunks, head, sizeof head);
@@ -12351,57 +12186,43 @@ static void gsf__save_restored(gsf_context* ctx, gsf_buffer* chunks, const gsf__
     gsf_free(ctx, pixels);
 }
 
+// Reads a frame from the `left` bytes at p; returns its size there, 0 if it is malformed.
+static size_t gsf__parse_frame(gsf_context* ctx, const char* p, size_t left, gsf_camera* camera) {
+    double numbers[20];
+    if (left < GSF__FRAME_HEAD) return 0;
+    memset(camera, 0, sizeof *camera);
+    for (size_t k = 0; k < 20; k++) numbers[k] = gsf__load_f64(p + 8 * k);
+    memcpy(camera->w2c, numbers, sizeof camera->w2c);
+    camera->fx = numbers[16];
+    camera->fy = numbers[17];
+    camera->cx = numbers[18];
+    camera->cy = numbers[19];
+    camera->width = (int32_t)gsf__load_le(p + 160, 4);
+    camera->height = (int32_t)gsf__load_le(p + 164, 4);
+    if (gsf_check_camera(ctx, camera) != GSF_OK || camera->width > 65536 || camera->height > 65536) return 0;
+    const size_t bytes = GSF__FRAME_HEAD + 4 * (size_t)camera->width * (size_t)camera->height;
+    return bytes <= left ? bytes : 0;
+}
+
 static gsf_result gsf__load_frames(gsf_context* ctx, const char* name, const void* data, size_t size, const char* tag,
                                    gsf__kept_frames* out) {
     gsf_chunk chunk;
     memset(out, 0, sizeof *out);
     if (!gsf_find_chunk(data, size, tag, &chunk) || chunk.size < 8)
         return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: no %s chunk", name, tag);
-    const char* p = (const char*)chunk.data;
-    const uint64_t count = gsf__load_le(p, 8);
-    size_t at = 8;
-    for (uint64_t i = 0; i < count; i++) {
-        gsf__kept_frame frame;
-        memset(&frame, 0, sizeof frame);
-        gsf_result result = GSF_OK;
-        if (chunk.size - at < GSF__FRAME_HEAD) result = GSF_ERROR_FORMAT;
-        if (result == GSF_OK) {
-            double numbers[20];
-            for (int k = 0; k < 20; k++) {
-                const uint64_t bits = gsf__load_le(p + at + 8 * (size_t)k, 8);
-                memcpy(numbers + k, &bits, sizeof bits);
-            }
-            memcpy(frame.camera.w2c, numbers, sizeof frame.camera.w2c);
-            frame.camera.fx = numbers[16];
-            frame.camera.fy = numbers[17];
-            frame.camera.cx = numbers[18];
-            frame.camera.cy = numbers[19];
-            frame.camera.width = (int32_t)gsf__load_le(p + at + 160, 4);
-            frame.camera.height = (int32_t)gsf__load_le(p + at + 164, 4);
-            at += GSF__FRAME_HEAD;
-            if (gsf_check_camera(ctx, &frame.camera) != GSF_OK || frame.camera.width > 65536 ||
-                frame.camera.height > 65536 ||
-                (chunk.size - at) / 4 / (size_t)frame.camera.width < (size_t)frame.camera.height)
-                result = GSF_ERROR_FORMAT;
-        }
-        if (result != GSF_OK) {
-            gsf__drop_frames(ctx, out);
-            return gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s, frame %llu is malformed", name, tag,
-                            (unsigned long long)i);
-        }
-        const size_t bytes = 4 * (size_t)frame.camera.width * (size_t)frame.camera.height;
-        frame.pixels = (uint8_t*)gsf_alloc(ctx, bytes, 1);
-        if (!frame.pixels || gsf__reserve(ctx, (void**)&out->frames, &out->capacity, out->count, out->count + 1,
-                                          sizeof *out->frames) != GSF_OK) {
-            gsf_free(ctx, frame.pixels);
-            gsf__drop_frames(ctx, out);
-            return GSF_ERROR_OUT_OF_MEMORY;
-        }
-        memcpy(frame.pixels, p + at, bytes);
-        at += bytes;
-        out->frames[out->count++] = frame;
+    const char *p = (const char*)chunk.data + 8, *end = p + chunk.size - 8;
+    const uint64_t count = gsf__load_le(chunk.data, 8);
+    gsf_result result = GSF_OK;
+    for (uint64_t i = 0; result == GSF_OK && i < count; i++) {
+        gsf_camera camera;
+        const size_t bytes = gsf__parse_frame(ctx, p, (size_t)(end - p), &camera);
+        if (!bytes)
+            result = gsf_fail(ctx, GSF_ERROR_FORMAT, "%s: chunk %s, frame %llu is malformed", name, tag, (unsigned long long)i);
+        else result = gsf__add_frame(ctx, out, &camera, p + GSF__FRAME_HEAD);
+        p += bytes;
     }
-    return GSF_OK;
+    if (result != GSF_OK) gsf__drop_frames(ctx, out);
+    return result;
 }
 
 GSF_API void gsf_splat_format_fixer(gsf_context* ctx, const gsf_fixer* f, gsf_buffer* chunks) {
@@ -12514,12 +12335,6 @@ static gsf_result gsf__make_points(gsf_context* ctx, size_t count, gsf__colored_
     return out->points && out->colors ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
 }
 
-static void gsf__destroy_points(gsf_context* ctx, gsf__colored_points* points) {
-    gsf_free(ctx, points->points);
-    gsf_free(ctx, points->colors);
-    memset(points, 0, sizeof *points);
-}
-
 // A random point in the view's frustum, at 0.3 to 2 times the depth of the focus, uniform in volume. It takes the
 // colour of the pixel it projects to, or grey where the photo's weight is below 0.5.
 static void gsf__random_point(const gsf_scene_view* view, const double* focus, uint64_t seed, uint64_t i, double point[3],
@@ -12600,43 +12415,22 @@ static gsf_result gsf__dense_and_kept(gsf_context* ctx, const gsf_scene* scene, 
     return result;
 }
 
-// Initial splats of every kind except GSF_INITIAL_RANDOM.
-static gsf_result gsf__scene_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
-                                    const gsf_initial_desc* d, uint8_t* keep, gsf_splats* out, gsf_initial_stats* stats) {
+// The points of every kind except GSF_INITIAL_RANDOM: those of the scene that `keep` marks or, for GSF_INITIAL_DENSE, these
+// and the dense ones, in `merged`.
+static gsf_result gsf__scene_points(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
+                                    const gsf_initial_desc* d, uint8_t* keep, gsf__colored_points* merged,
+                                    gsf_initial_stats* stats) {
     if (scene->point_count == 0 && d->kind != GSF_INITIAL_DENSE)
         return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "%s: the scene has no points (try random points)",
                         scene->folder ? scene->folder : "initial splats");
     if (d->kind == GSF_INITIAL_ALL) memset(keep, 1, scene->point_count);
     else GSF__TRY(gsf_splat_filter_points(ctx, scene, views, view_count, &d->visibility, keep, &stats->visibility));
     for (size_t i = 0; i < scene->point_count; i++) stats->scene_points += keep[i] != 0;
-    if (d->kind != GSF_INITIAL_DENSE) {
-        if (stats->scene_points == 0)
-            return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: none of the %zu views sees a point of "
-                            "the scene (try all points, or random ones)", view_count);
-        return gsf_splat_make_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, d->sh_degree,
-                                          scene->origin, out);
-    }
-    gsf__colored_points merged;
-    memset(&merged, 0, sizeof merged);
-    gsf_result result = gsf__dense_and_kept(ctx, scene, views, view_count, d, keep, &merged, stats);
-    if (result == GSF_OK)
-        result = gsf_splat_make_from_points(ctx, merged.points, merged.colors, merged.count, NULL, d->sh_degree,
-                                            scene->origin, out);
-    gsf__destroy_points(ctx, &merged);
-    return result;
-}
-
-static gsf_result gsf__random_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
-                                     const gsf_initial_desc* d, gsf_splats* out, gsf_initial_stats* stats) {
-    gsf__colored_points random;
-    memset(&random, 0, sizeof random);
-    gsf_result result = gsf__random_points(ctx, scene, views, view_count, d, &random);
-    stats->new_points = random.count;
-    if (result == GSF_OK)
-        result = gsf_splat_make_from_points(ctx, random.points, random.colors, random.count, NULL, d->sh_degree,
-                                            scene->origin, out);
-    gsf__destroy_points(ctx, &random);
-    return result;
+    if (d->kind == GSF_INITIAL_DENSE) return gsf__dense_and_kept(ctx, scene, views, view_count, d, keep, merged, stats);
+    if (stats->scene_points == 0)
+        return gsf_fail(ctx, GSF_ERROR_DEGENERATE, "initial splats: none of the %zu views sees a point of "
+                        "the scene (try all points, or random ones)", view_count);
+    return GSF_OK;
 }
 
 GSF_API gsf_result gsf_splat_make_initial_splats(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views,
@@ -12652,33 +12446,32 @@ GSF_API gsf_result gsf_splat_make_initial_splats(gsf_context* ctx, const gsf_sce
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "initial splats: invalid kind %d, SH degree %d or views (%zu of %zu)",
                         (int)d.kind, (int)d.sh_degree, view_count, scene->view_count);
-    uint8_t* keep = (uint8_t*)gsf_alloc_zeroed(ctx, scene->point_count + 1, 1);
-    uint32_t* all = views ? NULL : (uint32_t*)gsf_alloc(ctx, view_count + 1, sizeof *all);
-    gsf_result result = keep && (views || all) ? GSF_OK : GSF_ERROR_OUT_OF_MEMORY;
-    for (size_t i = 0; all && i < view_count; i++) all[i] = (uint32_t)i;
-    if (!views) views = all;
-    if (result == GSF_OK && d.kind == GSF_INITIAL_RANDOM)
-        result = gsf__random_splats(ctx, scene, views, view_count, &d, out, stats);
+    gsf__colored_points made; // random, or dense with those of the scene
+    memset(&made, 0, sizeof made);
+    gsf__arena arena = {ctx, NULL, 0};
+    uint8_t* keep = (uint8_t*)gsf__arena_alloc_zeroed(&arena, scene->point_count, 1);
+    uint32_t* all = (uint32_t*)gsf__arena_alloc(&arena, view_count, sizeof *all);
+    gsf_result result = arena.failed ? GSF_ERROR_OUT_OF_MEMORY : GSF_OK;
+    for (size_t i = 0; all && i < view_count; i++) all[i] = views ? views[i] : (uint32_t)i;
+    if (result == GSF_OK && d.kind == GSF_INITIAL_RANDOM) {
+        result = gsf__random_points(ctx, scene, all, view_count, &d, &made);
+        stats->new_points = made.count;
+    } else if (result == GSF_OK) {
+        result = gsf__scene_points(ctx, scene, all, view_count, &d, keep, &made, stats);
+    }
+    if (result == GSF_OK && made.points)
+        result = gsf_splat_make_from_points(ctx, made.points, made.colors, made.count, NULL, d.sh_degree, scene->origin, out);
     else if (result == GSF_OK)
-        result = gsf__scene_splats(ctx, scene, views, view_count, &d, keep, out, stats);
-    gsf_free(ctx, all);
-    gsf_free(ctx, keep);
+        result = gsf_splat_make_from_points(ctx, scene->points, scene->colors, scene->point_count, keep, d.sh_degree,
+                                            scene->origin, out);
+    gsf_free(ctx, made.points);
+    gsf_free(ctx, made.colors);
+    gsf__arena_free(&arena);
     return result;
 }
 
 GSF_API float gsf_splat_measure_near_plane(const gsf_camera* cameras, size_t stride, size_t count) {
-    double mean[3] = {0.0, 0.0, 0.0}, most = 0.0;
-    for (int pass = 0; pass < 2; pass++)
-        for (size_t i = 0; i < count; i++) {
-            double c[3], d2 = 0.0;
-            gsf_get_camera_center((const gsf_camera*)(const void*)((const char*)cameras + i * stride), c);
-            for (int k = 0; k < 3; k++) {
-                if (pass == 0) mean[k] += c[k] / (double)count;
-                else d2 += (c[k] - mean[k]) * (c[k] - mean[k]);
-            }
-            if (d2 > most) most = d2;
-        }
-    const double near_plane = 0.01 * 1.1 * sqrt(most);
+    const double near_plane = 0.01 * 1.1 * gsf__camera_spread(cameras, stride, count);
     return near_plane > 1e-6 && near_plane < 0.2 ? (float)near_plane : 0.2f;
 }
 

@@ -84,7 +84,7 @@ static const char* const bench_stage_names[STAGES] = {"project", "bin", "sort", 
 
 typedef struct bench_count {
     gsf_rasterizer* r;
-    const gsf__raster_kernels* kernels;
+    gsf__raster_kernels kernels;
     uint64_t* pairs; // per tile
 } bench_count;
 
@@ -99,7 +99,7 @@ static void bench_count_tile(void* arg, size_t index, int32_t worker) {
     gsf__open_tile(T, columns, rows);
     job->pairs[index] = 0;
     for (size_t next = 0, kept = 0; next < tile.count;) {
-        next = job->kernels->keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
+        next = job->kernels.keep(&tile, T, next, tile.count, scratch->steps, scratch->heads, &kept);
         for (size_t k = 0; k < kept; k++)
             for (int lane = 0; lane < 8; lane++) job->pairs[index] += scratch->steps[k].alpha[lane] > 0.0f;
     }
@@ -180,12 +180,8 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     gsf_render_desc desc;
     memset(&desc, 0, sizeof desc);
     const gsf__view view = gsf__make_view(&trained, &camera, &desc);
-    gsf__project_job project;
-    memset(&project, 0, sizeof project);
-    project.r = r;
-    project.view = &view;
-    project.splats = &trained;
-    project.level = ctx.cpu_level;
+    gsf__splat_loop project = gsf__make_splat_loop(&ctx, r, &view, &trained);
+    project.grads = &grads;
     gsf__raster_job raster;
     memset(&raster, 0, sizeof raster);
     raster.r = r;
@@ -193,13 +189,6 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     raster.view = &view;
     raster.out = &out;
     raster.d_color = d_color;
-    gsf__gather_job gather;
-    memset(&gather, 0, sizeof gather);
-    gather.r = r;
-    gather.view = &view;
-    gather.splats = &trained;
-    gather.grads = &grads;
-    gather.level = ctx.cpu_level;
     gsf__loss_scratch scratch;
     gsf__target target;
     gsf__loss_value value;
@@ -211,7 +200,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
     gsf__adam_rates rates;
     memset(&rates, 0, sizeof rates); // full work with zero rates, so that every round has the same splats
 
-    const size_t splat_chunks = (count + GSF__PROJECT_CHUNK - 1) / GSF__PROJECT_CHUNK;
+    const size_t splat_chunks = gsf__splat_chunks(r);
     const size_t tiles = (size_t)r->tiles_x * (size_t)r->tiles_y;
     enum { MOST = 9 };
     const int rounds = o->quick ? 3 : MOST;
@@ -234,7 +223,7 @@ static void bench_stages(const bench_options* o, const char* name, size_t count,
         if (r->pair_count) memset(r->slot_used, 0, r->pair_count);
         gsf__parallel_for(&ctx, tiles, gsf__reverse_chunk, &raster);
         bench_lap(&clock, STAGE_REVERSE);
-        gsf__parallel_for(&ctx, splat_chunks, gsf__gather_chunk, &gather);
+        gsf__parallel_for(&ctx, splat_chunks, gsf__gather_chunk, &project);
         bench_lap(&clock, STAGE_GATHER);
         (void)gsf__adam_step(&ctx, &model, &rates, i + 2, 4);
         bench_lap(&clock, STAGE_ADAM);

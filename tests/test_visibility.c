@@ -71,7 +71,7 @@ static void check_neighbours(int kind, size_t count, int k) {
     if (!CHECK(wrong_count == 0 && wrong_distance == 0 && wrong_place == 0))
         fprintf(stderr, "  cloud %d of %zu points, k = %d: %d counts, %d distances, %d places\n", kind, count, k,
                 wrong_count, wrong_distance, wrong_place);
-    gsf__knn_destroy(&ctx, &tree);
+    gsf__arena_free(&tree.arena);
     free(points);
     free(brute);
 }
@@ -104,7 +104,7 @@ static void test_neighbours(void) {
         CHECK(isfinite(sum));
         printf("neighbours: cloud %d, %zu points: tree %.2f s, 12 nearest of all %.2f s\n", kind, many, built - start,
                gsf__vis_seconds() - built);
-        gsf__knn_destroy(&ctx, &tree);
+        gsf__arena_free(&tree.arena);
     }
     free(points);
 
@@ -114,7 +114,7 @@ static void test_neighbours(void) {
     gsf__knn_tree tree;
     CHECK_OK(&ctx, gsf__knn_build(&ctx, few, 4, keep, &tree));
     CHECK(tree.count == 2);
-    gsf__knn_destroy(&ctx, &tree);
+    gsf__arena_free(&tree.arena);
 }
 
 // ---- initial splats ------------------------------------------------------------
@@ -356,7 +356,7 @@ static void naive_visible(const gsf_scene* scene, const uint32_t* views, size_t 
             if (tolerance == 0.0f) near[row] |= (cover[0] < limit) != (cover[2] < limit);
         }
     }
-    gsf__vis_end(&ctx, &job);
+    gsf__arena_free(&job.arena);
 }
 
 // Returns the number of points that rounding may decide.
