@@ -75,9 +75,10 @@
                unknown size goes to a gsf_buffer. Terms: means, log_scales, quats, opacity_logits, sh; w2c, c2w; q, k, v;
                tokens, positions, latents.
    WHERE TO ADD
-       a restorer       gsf_restorer under "restorer interface", all four functions. query_fn runs before begin_fn; begin_fn
-                        and end_fn run once per round. restore_fn writes every pixel of out_color and out_confidence, which
-                        are undefined before. gsf_splat_make_warp in gsfixer_splat.h is an example
+       a restorer       gsf_restorer under "restorer interface": struct_size and all four functions. query_fn runs before
+                        begin_fn, and for every clip of gsf_restore_clip, so it changes nothing; begin_fn and end_fn run
+                        once per round. restore_fn writes every pixel of out_color and out_confidence, which are undefined
+                        before. gsf_splat_make_warp in gsfixer_splat.h is an example
        a kernel         over the vocabulary of >>lanes, written once and compiled per instruction set
        an image format  gsf__image_kind_of in >>images
    SECTIONS    >>glm >>internals >>lanes >>context >>memory >>parallel >>random >>text >>files >>chunks >>json >>deflate
@@ -656,8 +657,8 @@ GSF__SHARED gsf_result gsf__reserve(gsf_context* ctx, void** array, size_t* capa
     return GSF_OK;
 }
 
-// Arrays that are freed together. gsf__arena_alloc returns NULL when out of memory and sets `failed`, so that one check after the
-// last of them is enough.
+// Arrays that are freed together. gsf__arena_alloc returns NULL when out of memory and sets `failed`, so that one check
+// after the last of them is enough.
 typedef struct gsf__arena {
     gsf_context* ctx;
     void* last; // the array taken last; in front of each is a pointer to the one before

@@ -9,8 +9,8 @@
        restorer only through the interface in gsfixer.h.
 
    WHAT IT DOES NOT DO
-       No training, no automatic differentiation, no graph: the networks are straight-line C. It neither converts nor
-       downloads weight files.
+       No automatic differentiation, no graph: the networks are straight-line C, and the gradients of layers are written
+       by hand. It neither converts nor downloads weight files.
 
    CONVENTIONS
        tensors         dense, row-major, the last dimension contiguous; shapes are written (rows, columns)
@@ -47,9 +47,11 @@
                (Kudo and Richardson 2018), T5 (Raffel et al. 2020).
    WHERE TO ADD
        an activation    gsf__nn_activation in >>nn kernels; in >>nn activations the scalar gsf__nn_activation_ref, the vector
-                        gsf__v_activate (without a case it returns x) and the list in gsf__activate; its name in
-                        config.json: gsf__nn_config_read_key in >>nn files, an array and a string in the same order.
-                        Linear and 8-bit layers need no change. VGGT, T5, VAE and transformer have fixed activations
+                        gsf__v_activate (without a case it returns x) and the list in gsf__activate; its slope,
+                        gsf__nn_activation_slope in >>nn training; its name in config.json: gsf__nn_config_read_key in
+                        >>nn files, an array and a string in the same order. Linear and 8-bit layers need no change.
+                        DINOv2, BLIP-2 (encoder, Q-Former) and OPT choose theirs by config; the other networks have
+                        fixed ones. Tests: activation_of in tests/activation.h
        a network        a table of layers as in >>nn image encoders, opened by gsf__nn_open_network, run with the layers
                         of >>nn layers
        a solver         gsf_nn_solver, in >>nn scheduler

@@ -58,22 +58,30 @@
        >>adam       optimizer step; >>densify    every densify_interval steps: clone, split, prune (or MCMC)
 
    WHERE TO ADD
-       a regulariser    on the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass; on parameters:
-                        beside gsf__penalty_chunk in >>trainer, called by gsf__trainer_update. Its weight is a field of
-                        gsf_train_desc, in gsf__train_desc_check and (for checkpoints) in gsf__trainer_settings; a
-                        default other than zero in gsf__train_desc_defaults, for few views in
-                        gsf_splat_resolve_few_view_desc. Image terms are multiplied by `scale` and added to d_color
-                        after gsf__loss; gsf__depth_smoothness overwrites d_depth, so that a second depth term adds to
-                        it afterwards. New image buffers: gsf__trainer_reserve_images, gsf_splat_destroy_trainer. With
-                        lazy_adam, gsf__penalty_chunk must not write gradients of SH. For `gsfix fix`: `settings` and
-                        --regularize in examples/gsfix_fix.c, `switches` in examples/gsfix_report.c
-       a camera model   a row of gsf__lens_models in >>colmap, at the index that is COLMAP's model id; if its formula is
-                        new, also gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (when it is a
-                        pinhole) and, in >>undistort, gsf__lens_distort and, for constants that it needs,
-                        gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind
+       a regulariser    its weight: a field of gsf_train_desc, in gsf__train_desc_check and (for checkpoints) in
+                        gsf__trainer_settings; a default other than zero in gsf__train_desc_defaults, for few views in
+                        gsf_splat_resolve_few_view_desc. For `gsfix fix`: `settings` and --regularize in
+                        examples/gsfix_fix.c, `switches` in examples/gsfix_report.c.
+                        On parameters: gsf__penalty_job and gsf__penalty_chunk in >>trainer, and in gsf__trainer_update
+                        the condition under which they run. With lazy_adam, they must not write gradients of SH.
+                        On the image: beside gsf__depth_smoothness in >>loss, called by gsf__trainer_pass. Terms are
+                        multiplied by `scale` and added to d_color after gsf__loss; gsf__depth_smoothness overwrites
+                        d_depth, so that a second depth term adds to it afterwards. New image buffers:
+                        gsf__trainer_reserve_images, gsf_splat_destroy_trainer.
+                        Tests: test_regularisers, busy_desc and the bad values in tests/test_trainer.c; the names in
+                        tests/test_gsfix.sh
+       a camera model   a row of gsf__lens_models in >>colmap, at the index that is COLMAP's model id; its parameters are
+                        the focal lengths, cx, cy, then those of gsf__lens.k that it names. If its formula is new, also
+                        gsf__lens_kind, gsf__lens_fault (legal values), gsf__lens_from_params (unless it is a pinhole
+                        with all zeros) and, in >>undistort, gsf__lens_distort and, for constants that it needs,
+                        gsf__rectify_make. For transforms.json: gsf__transforms_lens_kind. The list at
+                        gsf_splat_load_scene. Tests: reference_distort and test_lenses in tests/test_scene.c
        a file format    gsf_splat_type, a reader and a writer in >>formats
-       a restorer       outside this file: fill in a gsf_restorer (gsfixer.h, "restorer interface"); >>warp is an example,
-                        gsf__open_references and gsf__restore_or_skip in >>fixer make the calls
+       a restorer       the host's own: fill in a gsf_restorer (gsfixer.h, "restorer interface"); gsf__open_references and
+                        gsf__restore_or_skip in >>fixer make the calls. A built-in one: gsf_splat_make_NAME and
+                        _destroy_NAME in a section like >>warp, and in examples/gsfix.c the help of --restorer,
+                        gsfix_check_restorer, gsfix_make_restorer and gsfix_destroy_restorer (`none` is NULL). Tests:
+                        tests/test_fixer.c, tests/test_gsfix.sh
        a start          gsf_initial_kind, in >>few views
 
    ERRORS      As in gsfixer.h. Loaders report file and position and return only checked data; splats, pixels and gradients
@@ -6429,10 +6437,10 @@ static gsf_result gsf__dense_sweeps(gsf__dense_job* job, int coarsest, int fines
     for (job->iteration = 0; job->iteration < count + (finest ? geometric : 0); job->iteration++, scale *= 0.5f) {
         GSF__TRY(gsf__check_cancel(job->ctx));
         if (job->iteration >= count) {
-            if (!job->others)
-                job->others = (gsf__dense_plane*)gsf__arena_alloc(&job->level_arena, job->pixel_count, sizeof(gsf__dense_plane));
+            const size_t bytes = job->pixel_count * sizeof(gsf__dense_plane);
+            if (!job->others) job->others = (gsf__dense_plane*)gsf__arena_alloc(&job->level_arena, bytes, 1);
             if (!job->others) return GSF_ERROR_OUT_OF_MEMORY;
-            memcpy(job->others, job->planes, job->pixel_count * sizeof(gsf__dense_plane));
+            memcpy(job->others, job->planes, bytes);
             job->roam = 0;
         }
         job->step_pixels = (coarsest ? 4.0f : 1.0f) * scale;

@@ -7,6 +7,7 @@
 
 #include "test.h"
 #include "test_hooks.h"
+#include "activation.h"
 
 typedef struct layer { // every buffer is a block of exactly its size, so that ASan detects any overrun
     gsf__nn_linear_desc desc;
@@ -69,13 +70,6 @@ static void quantize(gsf_context* ctx, layer* l, int32_t no_rotation, gsf__nn_qu
     CHECK_OK(ctx, gsf__nn_quantize_weight(ctx, &l->weight, no_rotation, q));
 }
 
-static double activation_of(gsf__nn_activation activation, double x) {
-    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    if (activation == GSF__NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
-    if (activation == GSF__NN_RELU) return x < 0.0 ? 0.0 : x;
-    return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
-}
-
 // The definition in double, before rounding to 8 bits: a Walsh-Hadamard rotation, whose signs are the parity of the
 // bits that i and j share.
 static void round_row(const float* x, int64_t count, int64_t block, double* q, double* scale) {
@@ -112,7 +106,7 @@ static void test_definition(gsf_context* ctx) {
         while (i % 4 != 3 && block < 256 && in % (2 * block) == 0) block *= 2;
         CHECK(q.block == block && q.in == in && q.out == out);
         CHECK(q.bytes == (size_t)(gsf__round_up(out, 16) * (gsf__round_up(in, 4) + 8)));
-        l.desc.activation = (gsf__nn_activation)(i / 5 % 5);
+        l.desc.activation = (gsf__nn_activation)(i / 5 % ACTIVATION_COUNT);
         l.desc.bias = i % 2 ? &l.bias : NULL;
         l.desc.gate = i % 7 < 2 ? l.gate : NULL;
         l.desc.accumulate = i % 3 == 0;

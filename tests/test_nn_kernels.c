@@ -6,6 +6,7 @@
 
 #include "test.h"
 #include "test_hooks.h"
+#include "activation.h"
 
 static gsf_context one, three; // one worker; three workers that run chunks in shuffled order
 static uint64_t seed = 5;
@@ -76,13 +77,6 @@ static void check_exp(void) {
 
 // ---- activations ---------------------------------------------------------------
 
-static double activation_of(gsf__nn_activation activation, double x) {
-    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    if (activation == GSF__NN_SILU) return x / (1.0 + exp(-x));
-    if (activation == GSF__NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
-    return activation == GSF__NN_RELU && x < 0.0 ? 0.0 : x;
-}
-
 // GELU's relative error, between where results are too small for one and where they equal x.
 static void check_gelu(void) {
     enum { COUNT = 400000 };
@@ -102,25 +96,24 @@ static void check_gelu(void) {
 
 static void check_activate(void) {
     static const size_t sizes[] = {0, 1, 7, 8, 9, 31, 70003};
-    static const gsf__nn_activation kinds[] = {GSF__NN_LINEAR, GSF__NN_GELU_TANH, GSF__NN_SILU, GSF__NN_GELU,
-                                               GSF__NN_RELU};
     for (size_t s = 0; s < sizeof sizes / sizeof sizes[0]; s++)
-        for (int k = 0; k < 5; k++) {
+        for (int k = 0; k < ACTIVATION_COUNT; k++) {
+            const gsf__nn_activation kind = (gsf__nn_activation)k;
             const size_t n = sizes[s];
             float *x = make_floats(n, -15.0, 15.0), *y = make_floats(n + 1, 0, 1), *z = copy_floats(x, n);
             double* expected = make_doubles(n);
             const float after = y[n];
-            for (size_t i = 0; i < n; i++) expected[i] = activation_of(kinds[k], (double)x[i]);
-            gsf__nn_activate(&one, kinds[k], x, (int64_t)n, y);
+            for (size_t i = 0; i < n; i++) expected[i] = activation_of(kind, (double)x[i]);
+            gsf__nn_activate(&one, kind, x, (int64_t)n, y);
             test_compare_floats("activate", y, expected, n, 2e-6);
-            gsf__nn_activate(&three, kinds[k], z, (int64_t)n, z);
+            gsf__nn_activate(&three, kind, z, (int64_t)n, z);
             CHECK(same_bits(y, z, n) && y[n] == after);
             free(x); free(y); free(z); free(expected);
         }
     const float x[9] = {INFINITY, -INFINITY, NAN, FLT_MAX, -FLT_MAX, 1e3f, -1e3f, 0.0f, NAN};
-    for (int k = 1; k < 5; k++) {
+    for (int k = GSF__NN_LINEAR + 1; k < ACTIVATION_COUNT; k++) {
         float y[9];
-        gsf__nn_activate(&one, kinds[k], x, 9, y);
+        gsf__nn_activate(&one, (gsf__nn_activation)k, x, 9, y);
         CHECK(y[0] == INFINITY && y[1] == 0.0f && y[2] != y[2] && y[3] == FLT_MAX && y[4] == 0.0f);
         CHECK(y[5] == 1e3f && y[6] == 0.0f && y[7] == 0.0f && y[8] != y[8]);
     }

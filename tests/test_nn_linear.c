@@ -6,6 +6,7 @@
 
 #include "test.h"
 #include "test_hooks.h"
+#include "activation.h"
 
 typedef struct layer { // every buffer is a block of exactly its size, so that ASan detects any overrun
     gsf__nn_linear_desc desc;
@@ -87,13 +88,6 @@ static void run(gsf_context* ctx, gsf__nn_workspace* workspace, layer* l) {
     CHECK_OK(ctx, gsf__nn_run_linear(ctx, workspace, &l->desc));
 }
 
-static double activation_of(gsf__nn_activation activation, double x) {
-    if (activation == GSF__NN_GELU_TANH) return 0.5 * x * (1.0 + tanh(0.7978845608028654 * (x + 0.044715 * x * x * x)));
-    if (activation == GSF__NN_GELU) return 0.5 * x * erfc(-x / sqrt(2.0));
-    if (activation == GSF__NN_RELU) return x < 0.0 ? 0.0 : x;
-    return activation == GSF__NN_SILU ? x / (1.0 + exp(-x)) : x;
-}
-
 // Checks every value of y, and that the padding between its rows is unchanged; looks at up to `most` rows.
 static void check_layer(const layer* l, int64_t most) {
     const gsf__nn_linear_desc* d = &l->desc;
@@ -138,7 +132,7 @@ static void test_shapes(gsf_context* ctx) {
         const int64_t in = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         const int64_t out = sizes[test_random_bits(&seed) % GSF__COUNT(sizes)];
         layer l = make_layer(m, in, out, dtypes[i / 3 % 3], i % 4 == 3 ? 1 + (size_t)(i % 7) : 0, i % 5 == 4 ? 3 : 0);
-        l.desc.activation = (gsf__nn_activation)(i / 5 % 5);
+        l.desc.activation = (gsf__nn_activation)(i / 5 % ACTIVATION_COUNT);
         l.desc.bias = test_random_bits(&seed) % 3 ? &l.bias : NULL;
         l.desc.gate = test_random_bits(&seed) % 3 ? NULL : l.gate;
         l.desc.accumulate = test_random_bits(&seed) % 3 == 0;
