@@ -58,9 +58,8 @@
        >>adam       optimizer step; >>densify    every densify_interval steps: clone, split, prune (or MCMC)
 
    WHERE TO ADD
-       a regulariser    its weight: a field of gsf_train_desc, in gsf__train_desc_check and (for checkpoints) in
-                        gsf__trainer_settings; a default other than zero in gsf__train_desc_defaults, for few views in
-                        gsf_splat_resolve_few_view_desc. For `gsfix fix`: `settings` and --regularize in
+       a regulariser    its weight: a field of gsf_train_desc and a row of gsf__train_fields; a default other than zero
+                        in gsf__train_desc_defaults, for few views in gsf_splat_resolve_few_view_desc. For `gsfix fix`: `settings` and --regularize in
                         examples/gsfix_fix.c, `switches` in examples/gsfix_report.c.
                         On parameters: gsf__penalty_job and gsf__penalty_chunk in >>trainer, and in gsf__trainer_update
                         the condition under which they run. With lazy_adam, they must not write gradients of SH.
@@ -766,6 +765,16 @@ GSF__BEGIN_IMPLEMENTATION
 static float gsf__or_zero(float value, float fallback) {
     if (value == 0.0f) return fallback;
     return value < 0.0f ? 0.0f : value;
+}
+
+typedef struct gsf__field { const char* name; double value, low, high; } gsf__field; // of a desc, with its legal range
+
+static gsf_result gsf__check_fields(gsf_context* ctx, const char* desc, const gsf__field* fields, size_t count) {
+    for (size_t i = 0; i < count; i++)
+        if (!(fields[i].value >= fields[i].low && fields[i].value <= fields[i].high))
+            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "%s: %s is %g, allowed %g to %g", desc, fields[i].name,
+                            fields[i].value, fields[i].low, fields[i].high);
+    return GSF_OK;
 }
 
 GSF_API int32_t gsf_splat_count_sh(int32_t sh_degree) { return (sh_degree + 1) * (sh_degree + 1); }
@@ -4536,15 +4545,15 @@ static gsf_result gsf__visibility_check(gsf_context* ctx, const gsf_scene* scene
                                         size_t view_count, const gsf_visibility_desc* d) {
     if ((unsigned)d->method > GSF_VISIBILITY_RAYS)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: method %d", (int)d->method);
-    if (d->neighbours < 3 || d->neighbours > GSF__KNN_MAX || d->radius_neighbour < 1 ||
-        d->radius_neighbour > GSF__KNN_MAX)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "visible points: neighbours %d, radius_neighbour %d (at most %d)",
-                        (int)d->neighbours, (int)d->radius_neighbour, (int)GSF__KNN_MAX);
-    if (!(d->radius_scale > 0.0f && d->radius_scale < 1e6f && d->tolerance >= 0.0f && d->tolerance < 1e6f &&
-          d->coverage > 0.0f && d->min_grazing_cos >= 0.0f && d->min_grazing_cos < 1.0f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "visible points: radius_scale %g, tolerance %g, coverage %g, min_grazing_cos %g",
-                        (double)d->radius_scale, (double)d->tolerance, (double)d->coverage, (double)d->min_grazing_cos);
+    const gsf__field fields[] = {
+        {"neighbours", (double)d->neighbours, 3, GSF__KNN_MAX},
+        {"radius_neighbour", (double)d->radius_neighbour, 1, GSF__KNN_MAX},
+        {"radius_scale", (double)d->radius_scale, FLT_MIN, 1e6},
+        {"tolerance", (double)d->tolerance, 0, 1e6},
+        {"coverage", (double)d->coverage, FLT_MIN, INFINITY},
+        {"min_grazing_cos", (double)d->min_grazing_cos, 0, 0.999999},
+    };
+    GSF__TRY(gsf__check_fields(ctx, "visible points", fields, GSF__COUNT(fields)));
     return gsf__check_views(ctx, "visible points", scene, views, view_count);
 }
 
@@ -5615,27 +5624,29 @@ static gsf_dense_desc gsf__dense_desc_defaults(const gsf_dense_desc* desc) {
 
 static gsf_result gsf__dense_check(gsf_context* ctx, const gsf_scene* scene, const uint32_t* views, size_t view_count,
                                    const gsf_dense_desc* d) {
-    if (d->max_size < GSF__DENSE_MIN_SIDE || d->max_size > 16384 || d->levels < 1 || d->levels > 8 || d->iterations < 1 ||
-        d->iterations > 100 || d->sources < 1 || d->sources > GSF__DENSE_SOURCES || d->radius < 1 || d->radius > 15 ||
-        d->stride < 1 || d->stride > d->radius || d->min_consistent < 1 || d->spacing < 1 || d->spacing > 1024)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "dense points: setting out of range: max_size %d, levels %d, iterations %d, sources %d, "
-                        "radius %d, stride %d, min_consistent %d, spacing %d",
-                        (int)d->max_size, (int)d->levels, (int)d->iterations, (int)d->sources,
-                        (int)d->radius, (int)d->stride, (int)d->min_consistent, (int)d->spacing);
+    const gsf__field fields[] = {
+        {"max_size", (double)d->max_size, GSF__DENSE_MIN_SIDE, 16384},
+        {"levels", (double)d->levels, 1, 8},
+        {"iterations", (double)d->iterations, 1, 100},
+        {"sources", (double)d->sources, 1, GSF__DENSE_SOURCES},
+        {"radius", (double)d->radius, 1, 15},
+        {"stride", (double)d->stride, 1, (double)d->radius},
+        {"min_consistent", (double)d->min_consistent, 1, 1e9},
+        {"spacing", (double)d->spacing, 1, 1024},
+        {"color_sigma", (double)d->color_sigma, FLT_MIN, INFINITY},
+        {"min_angle", (double)d->min_angle, 0, INFINITY},
+        {"max_cost", (double)d->max_cost, FLT_MIN, 1.999},
+        {"max_cost_many", (double)d->max_cost_many, 0, 1.999}, // GSF__DENSE_BAD is 2
+        {"max_reprojection", (double)d->max_reprojection, FLT_MIN, INFINITY},
+        {"max_depth_error", (double)d->max_depth_error, FLT_MIN, INFINITY},
+        {"max_normal_angle", (double)d->max_normal_angle, FLT_MIN, 180},
+    };
+    GSF__TRY(gsf__check_fields(ctx, "dense points", fields, GSF__COUNT(fields)));
     const int side = 2 * (d->radius / d->stride) + 1;
     if (side * side > GSF__DENSE_SAMPLES)
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "dense points: radius %d with stride %d needs more than %d samples", (int)d->radius,
                         (int)d->stride, (int)GSF__DENSE_SAMPLES);
-    if (!(d->color_sigma > 0.0f && d->min_angle >= 0.0f && d->max_cost > 0.0f && d->max_cost_many < GSF__DENSE_BAD &&
-          d->max_reprojection > 0.0f && d->max_depth_error > 0.0f && d->max_normal_angle > 0.0f &&
-          d->max_normal_angle <= 180.0f))
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
-                        "dense points: setting out of range: color_sigma %g, min_angle %g, max_cost %g, "
-                        "max_reprojection %g, max_depth_error %g, max_normal_angle %g",
-                        (double)d->color_sigma, (double)d->min_angle, (double)d->max_cost,
-                        (double)d->max_reprojection, (double)d->max_depth_error, (double)d->max_normal_angle);
     if (!(d->depth_min >= 0.0 && isfinite(d->depth_max) && (d->depth_max == 0.0 || d->depth_max > d->depth_min)))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "dense points: invalid depth range %g to %g", d->depth_min,
                         d->depth_max);
@@ -10187,14 +10198,19 @@ static gsf_train_desc gsf__train_desc_defaults(const gsf_train_desc* desc) {
     return d;
 }
 
-// `d` has its defaults filled in, except for the extent.
-static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* d) {
-    const struct { const char* name; double value, low, high; } fields[] = {
+enum { GSF__TRAIN_FIELDS = 41 };
+
+// Every field that a run depends on, with its legal range. `d` has its defaults filled in, except perhaps for the extent.
+static void gsf__train_fields(const gsf_train_desc* d, gsf__field out[GSF__TRAIN_FIELDS]) {
+    const gsf__field fields[GSF__TRAIN_FIELDS] = {
         {"iterations", (double)d->iterations, 1, 1e9},
+        {"seed", (double)d->seed, 0, INFINITY},
         {"sh_degree", (double)d->sh_degree, 0, 3},
         {"sh_interval", (double)d->sh_interval, 1, 1e9},
         {"densify_from", (double)d->densify_from, 0, 1e9},
+        {"densify_until", (double)d->densify_until, -1e9, 1e9},
         {"densify_interval", (double)d->densify_interval, 1, 1e9},
+        {"opacity_reset_interval", (double)d->opacity_reset_interval, -1e9, 1e9},
         {"lr_means", (double)d->lr_means, 0, 1e3},
         {"lr_means_final", (double)d->lr_means_final, 1e-30, 1e3},
         {"lr_means_delay_steps", (double)d->lr_means_delay_steps, 0, 1e9},
@@ -10212,10 +10228,15 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"background_random", (double)d->background_random, 0, 1},
         {"densify_grad", (double)d->densify_grad, 0, 1e30},
         {"densify_scale", (double)d->densify_scale, 0, 1e30},
+        {"densify_absolute", (double)d->densify_absolute, -INFINITY, INFINITY},
         {"prune_opacity", (double)d->prune_opacity, 0, 0.99},
         {"prune_scale", (double)d->prune_scale, 0, 1e30},
+        {"max_splats", (double)d->max_splats, 0, UINT32_MAX / 4},
         {"mcmc", (double)d->mcmc, 0, 1},
         {"mcmc_noise", (double)d->mcmc_noise, 0, 1e12},
+        {"render.footprint", (double)d->render.footprint, 0, GSF_FOOTPRINT_OFFICIAL},
+        {"render.gradient", (double)d->render.gradient, 0, GSF_GRADIENT_OFFICIAL},
+        {"render.antialiased", (double)d->render.antialiased, -INFINITY, INFINITY},
         {"render.near_plane", (double)d->render.near_plane, 0, 1e30},
         {"dropout", (double)d->dropout, 0, 0.9},
         {"opacity_decay", (double)d->opacity_decay, 0, 0.5},
@@ -10224,15 +10245,16 @@ static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* 
         {"depth_smoothness", (double)d->depth_smoothness, 0, 1e6},
         {"lazy_adam", (double)d->lazy_adam, 0, 1},
     };
-    for (size_t i = 0; i < GSF__COUNT(fields); i++)
-        if (!(fields[i].value >= fields[i].low && fields[i].value <= fields[i].high))
-            return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: %s is %g, allowed %g to %g", fields[i].name,
-                            fields[i].value, fields[i].low, fields[i].high);
+    memcpy(out, fields, sizeof fields);
+}
+
+static gsf_result gsf__train_desc_check(gsf_context* ctx, const gsf_train_desc* d) {
+    gsf__field fields[GSF__TRAIN_FIELDS];
+    gsf__train_fields(d, fields);
+    GSF__TRY(gsf__check_fields(ctx, "train desc", fields, GSF__TRAIN_FIELDS));
     if (d->render.hidden || d->render.sh_bands || (d->render.opacity_scale != 0.0f && d->render.opacity_scale != 1.0f))
         return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT,
                         "train desc: render.hidden, sh_bands and opacity_scale are set by the trainer");
-    if (d->max_splats > UINT32_MAX / 4)
-        return gsf_fail(ctx, GSF_ERROR_INVALID_ARGUMENT, "train desc: max_splats %zu is too large", d->max_splats);
     return GSF_OK;
 }
 
@@ -10769,23 +10791,12 @@ enum { GSF__STATE_SIZE = 24 + 4 * 8 + 3 * 8 };
 
 // Hash of the settings and the number of photos, to detect that a run is continued with different ones.
 static uint64_t gsf__trainer_settings(const gsf_trainer* trainer) {
-    const gsf_train_desc* d = &trainer->desc;
-    const double values[] = {
-        (double)d->iterations, (double)d->seed, (double)d->sh_interval, (double)d->lr_means,
-        (double)d->lr_means_final, (double)d->lr_sh_dc, (double)d->lr_sh_rest, (double)d->lr_opacity,
-        (double)d->lr_scales, (double)d->lr_quats, (double)d->extent, (double)d->lambda_ssim,
-        (double)d->background[0], (double)d->background[1], (double)d->background[2], (double)d->densify_from,
-        (double)d->densify_until, (double)d->densify_interval, (double)d->densify_grad, (double)d->densify_scale,
-        (double)d->prune_opacity, (double)d->prune_scale, (double)d->opacity_reset_interval, (double)d->max_splats,
-        (double)d->render.footprint, (double)d->render.gradient, (double)d->render.antialiased,
-        (double)d->render.near_plane, (double)d->dropout, (double)d->opacity_decay, (double)d->scale_penalty,
-        (double)d->depth_smoothness, (double)d->lr_means_delay_steps, (double)d->lr_means_delay,
-        (double)d->densify_absolute, (double)d->lazy_adam, (double)d->mcmc, (double)d->mcmc_noise,
-        (double)d->opacity_penalty, (double)trainer->photos.count, (double)d->background_random};
-    uint64_t hash = 0;
-    for (size_t i = 0; i < GSF__COUNT(values); i++) {
+    gsf__field fields[GSF__TRAIN_FIELDS];
+    gsf__train_fields(&trainer->desc, fields);
+    uint64_t hash = trainer->photos.count;
+    for (size_t i = 0; i < GSF__TRAIN_FIELDS; i++) {
         uint64_t bits;
-        memcpy(&bits, &values[i], sizeof bits);
+        memcpy(&bits, &fields[i].value, sizeof bits);
         hash = gsf_draw_bits(hash, bits, i);
     }
     return hash;
